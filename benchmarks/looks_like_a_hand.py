@@ -37,7 +37,7 @@ from render.color_sensor import sample_exposure
 from render.formats.writer import open_writer
 from render.painting.figures import sample_people
 from render.scenery.backgrounds import Background
-from render.scenery.lights import Lighting, expose_for, sample_surroundings
+from render.scenery.lights import Lighting, sample_surroundings
 from render.skin.look import TONES
 from render.studio import FrameChoices, Moment, Studio
 
@@ -144,7 +144,7 @@ def photograph(
     if shown:
         moment = studio.reaching(moment, [case.camera])
     exposure = sample_exposure(ExposureConfig(), rng=rng)
-    lighting = expose_for(lighting, people[0].skin)
+    lighting = lighting.turned(case.camera.T_world_camera[:3, :3])
     choices = FrameChoices(lighting, background, exposure, None, None, int(rng.integers(2**31)))
     return dataclasses.replace(studio.photograph(moment, case.camera, choices), number=number)
 
@@ -153,7 +153,7 @@ def frames_of(name: str, hands: int, empty: int, seed: int, cases: list[Case]) -
     """The pictures of one set, those without a hand last; what they show is added to `cases`."""
     for number in range(hands + empty):
         rng = np.random.default_rng([seed, list(SETS).index(name), number])
-        background, lighting = sample_surroundings(SETS[name], None, rng=rng)
+        background, lighting, _ = sample_surroundings(SETS[name], np.eye(3), rng=rng)
         cases.append(make_case(number, background.kind, rng))
         yield photograph(number, cases[-1], background, lighting, shown=number < hands, rng=rng)
         if sys.stderr.isatty():

@@ -26,6 +26,8 @@ from render.frames import Bytes, Floats
 
 _ROOTS: Final = 4096  # of light in the same table by its root, which stays in the processor's cache
 _SPREAD: Final = (3, 3)  # [px] that a point of light is spread over
+_GRAY: Final = 0.33  # mean light of pictures that keep the nominal exposure
+_METERED: Final = (0.25, 4.0)  # range of the ratio of light that is made up for
 _LEVELS: Final = 65536  # of light in the table of the sRGB curve: twenty to its narrowest step
 
 
@@ -47,6 +49,9 @@ class Exposure:
     """Quality of JPEG compression, 1 to 100; None without it."""
     blur: float = 0.0
     """Standard deviation of what lens and color filters spread a point of light by [px]."""
+    metering: float = 0.0
+    """Share of the difference between a picture's mean light and middle gray that the camera makes up for, a
+    stop at most."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,6 +59,8 @@ class ExposureConfig:
     """Ranges of exposures; drawn uniformly unless stated."""
 
     stops: tuple[float, float] = (-0.5, 0.4)
+    metering: float = 0.4
+    """Share of the difference between a picture's mean light and middle gray that cameras make up for."""
     balance: float = 0.05
     """Standard deviation of the logarithms of the factors of red and blue."""
     white_electrons: tuple[float, float] = (1000.0, 10000.0)
@@ -75,6 +82,7 @@ def sample_exposure(config: ExposureConfig, *, rng: np.random.Generator) -> Expo
     quality = int(rng.integers(config.jpeg_quality[0], config.jpeg_quality[1] + 1))
     return Exposure(
         stops=float(rng.uniform(*config.stops)),
+        metering=config.metering,
         balance=(float(red), 1.0, float(blue)),
         white_electrons=float(np.exp(rng.uniform(least, most))),
         read_noise=float(rng.uniform(*config.read_noise)),
@@ -98,7 +106,8 @@ def expose(
     white = exposure.white_electrons
     words = random_words(linear.shape if white > 0.0 else (0, 0, 0), rng=rng)
     away = np.repeat((np.arange(width) + 0.5 - 0.5 * width) ** 2, 3).astype(np.float32)
-    gain, lost = np.float32(2.0**exposure.stops), np.float32(exposure.vignetting)
+    gain = np.float32(2.0**exposure.stops * _metered(linear) ** exposure.metering)
+    lost = np.float32(exposure.vignetting)
     shot = np.float32(1.0 / white if white > 0.0 else 0.0)
     dark = np.float32((exposure.read_noise / white) ** 2 if white > 0.0 else 0.0)
     balance = np.tile(np.array(exposure.balance, dtype=np.float32), width)
@@ -114,6 +123,13 @@ def expose(
     done, file = cv2.imencode(".jpg", rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, exposure.jpeg_quality])
     assert done
     return np.asarray(cv2.cvtColor(cv2.imdecode(file, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB))
+
+
+def _metered(linear: Floats) -> float:
+    """Middle gray over the mean of the light that the lens lets in."""
+    values = linear.reshape(len(linear), -1)
+    mean = cv2.sumElems(values)[0] / max(cv2.countNonZero(values), 1)
+    return float(np.clip(_GRAY / max(mean, 1e-6), *_METERED))
 
 
 @kernel

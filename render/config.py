@@ -75,6 +75,9 @@ class RenderConfig(Settings):
     ] = "auto"
     """Sensor that adds noise to depth, or its name; auto: one whose range fits the placement, see
     `NEAR_SENSOR`; None: perfect depth alone."""
+    room_depth: bool = True
+    """Whether depth and normals have the room behind hands and objects, where there is one: with several
+    cameras, or one that moves before one background."""
     color_sensor: ExposureConfig | None = field(default_factory=ExposureConfig)
     """Exposure and noise of colors; None: perfect colors alone."""
     painter: PainterChoice = "auto"

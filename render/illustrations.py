@@ -149,7 +149,8 @@ def draw_things(
     K[:2] *= _OVERSAMPLING
     large = dataclasses.replace(camera, size=(_OVERSAMPLING * width, _OVERSAMPLING * height), K=K)
     surfaces = [surface for thing in things for surface in thing.surfaces()]
-    painted = cv2.resize(paint(large, surfaces, STUDIO), camera.size, interpolation=cv2.INTER_AREA)
+    lighting = STUDIO.turned(camera.T_world_camera[:3, :3])  # of the viewer
+    painted = cv2.resize(paint(large, surfaces, lighting), camera.size, interpolation=cv2.INTER_AREA)
     if isinstance(behind, tuple):
         behind = np.broadcast_to(np.array(byte_color(behind), dtype=np.uint8), (height, width, 3))
     return put_before(painted, np.ascontiguousarray(behind, dtype=np.float32))

@@ -57,11 +57,11 @@ from render.formats.writer import (
 )
 from render.frames import Doubles, RenderedFrame
 from render.painting.figures import sample_people
-from render.scenery.backgrounds import enclose, photo_files
+from render.scenery.backgrounds import photo_files
 from render.scenery.lights import sample_surroundings
-from render.skin.look import SkinLook
 from render.studio import FrameChoices, Moment, Studio
 from render.subject import Model, PoseFile, Source, Subject, load_subject, source_of
+from render.user_body import UserBody
 from render.viewpoints import ViewConfig, Viewpoints, check_hands_in_view
 
 _MOST_STUDIOS: Final = 32  # largest number of studios that are kept, some 5 MB each
@@ -136,7 +136,10 @@ class Drawing:
             raise ArgumentError("poses without times have no motion to blur; add the array times")
         self.subject, self.config = subject.upright(config.up), config
         self.take, rng = self.subject.take, SpawnKey.VIEWPOINTS.rng(config.seed)
-        self.viewpoints = Viewpoints(config.view, self.take, rng=rng, up=config.up)
+        # Poses that are no motion are many people's, except before one person's eyes.
+        has_user = self.subject.is_motion or config.view.placement == "head"
+        self._user = UserBody(self.take) if has_user else None
+        self.viewpoints = Viewpoints(config.view, self.take, rng=rng, up=config.up, user=self._user)
         self._studio_of = functools.lru_cache(maxsize=_MOST_STUDIOS)(self._studio_of_person)
 
     def chosen_frames(self, frames: Iterable[int] | None = None) -> list[int]:
@@ -168,11 +171,12 @@ class Drawing:
     ) -> Iterator[RenderedFrame]:
         """Pictures of frames by all cameras; the frames are given with their places in the shard."""
         config, cast = self.config, self.subject.cast
-        around = self.viewpoints.positions() if self.viewpoints.num_cameras > 1 else None
-        size = self.viewpoints.size
+        viewpoints = self.viewpoints
+        several = viewpoints.num_cameras > 1 or (viewpoints.moves and config.vary == "shard")
+        around = viewpoints.positions() if several else None
         rng = SpawnKey.SHARD.rng(config.seed, shard, 0)
         if cast is None:  # a take has its own hands, whose looks change with the shard
-            studio = open_studio(self.take.hands, config, bodies=self.take.bodies, rng=rng)
+            studio = self._open_studio(self.take.hands, rng)
         kept: dict[int, FrameChoices] = {}
         for place, frame in numbered:
             person = shard if cast is None else cast.person_in(frame, shard)
@@ -181,14 +185,15 @@ class Drawing:
                 rng = SpawnKey.SHARD.rng(config.seed, shard, 0)  # all people of a shard are in one place
             own = SpawnKey.SHARD.rng(config.seed, shard, 1 + place)
             if config.vary == "frame":
-                chosen = sample_choices(config, studio.skin, own, size, around)
+                chosen = sample_choices(config, viewpoints.viewer, viewpoints.size, around, rng=own)
             else:
                 if person not in kept:
-                    kept[person] = sample_choices(config, studio.skin, rng, size, around)
+                    scene = sample_choices(config, viewpoints.viewer, viewpoints.size, around, rng=rng)
+                    kept[person] = self._held(scene)
                 chosen = kept[person]
-            cameras = self.viewpoints.cameras(frame)
+            cameras = viewpoints.cameras(frame)
             moment = Moment(self.take, frame, None if cast is None else cast.person)
-            moment = studio.reaching(moment, cameras)
+            moment = studio.reaching(moment, cameras, self._user)
             if leave_out is not None and not studio.is_clear(moment, cameras):
                 leave_out(frame)
                 continue
@@ -197,12 +202,26 @@ class Drawing:
                 drawn = studio.photograph(moment, camera, fresh)
                 yield dataclasses.replace(drawn, choices={"person": person, **drawn.choices})
 
+    def _held(self, scene: FrameChoices) -> FrameChoices:
+        """The choices with a backdrop that stays where it is, behind the hands of all frames."""
+        backdrop = scene.background.backdrop
+        if backdrop is None:
+            return scene
+        level = self.viewpoints.nearest(backdrop.normal) - backdrop.gap
+        held = dataclasses.replace(backdrop, level=level)
+        return dataclasses.replace(scene, background=dataclasses.replace(scene.background, backdrop=held))
+
     def _studio_of_person(self, person: int) -> Studio:
         """The studio of one of the people of `subject.cast`."""
         cast = self.subject.cast
         assert cast is not None
         hands = cast.hands(person, self.take.hands)
-        return open_studio(hands, self.config, bodies=self.take.bodies, rng=cast.rng(person))
+        return self._open_studio(hands, cast.rng(person))
+
+    def _open_studio(self, hands: Sequence[GloveFit], rng: np.random.Generator) -> Studio:
+        return open_studio(
+            hands, self.config, bodies=self.take.bodies, rng=rng, has_user=self._user is not None
+        )
 
 
 def open_studio(
@@ -211,23 +230,31 @@ def open_studio(
     *,
     bodies: Sequence[RigidBody] = (),
     rng: np.random.Generator,
+    has_user: bool = False,
 ) -> Studio:
-    """A studio of one person with random looks."""
+    """A studio of one person with random looks, whose wrists a `UserBody` may bend."""
     people = sample_people(len(hands), config.dress == "glove", tones=config.tones, rng=rng)
+    if has_user:
+        straight = dataclasses.replace(people[0].forearm, flexion=0.0, deviation=0.0)
+        people = tuple(dataclasses.replace(one, forearm=straight) for one in people)
     colors = [tuple(rng.uniform(0.05, 0.9, 3).tolist()) for _ in bodies]
     assert config.painter != "auto"
-    return Studio(hands, people, bodies, colors, config.passes, config.painter)
+    return Studio(hands, people, bodies, colors, config.passes, config.painter, room_depth=config.room_depth)
 
 
 def sample_choices(
     config: RenderConfig,
-    skin: SkinLook | None,
-    rng: np.random.Generator,
+    viewer: Doubles,
     size: tuple[int, int],
     around: Doubles | None = None,
+    *,
+    rng: np.random.Generator,
 ) -> FrameChoices:
-    """Random choices of a picture; several cameras at positions `around` (N, 3) share an enclosure."""
-    background, lighting = sample_surroundings(config.background, skin, size, rng=rng)
+    """Random choices of a picture, with light for a viewer with these axes (3, 3).
+
+    Several places `around` (N, 3) of cameras and hands share an enclosure.
+    """
+    background, lighting, enclosure = sample_surroundings(config.background, viewer, size, around, rng=rng)
     sensor = config.depth_sensor
     assert sensor != "auto"
     return FrameChoices(
@@ -237,7 +264,7 @@ def sample_choices(
         shutter=None if config.shutter is None else sample_shutter(config.shutter, rng=rng),
         depth_noise=None if sensor is None else sample_depth_noise(sensor, rng=rng),
         seed=0,
-        enclosure=None if around is None else enclose(around, background.seed),
+        enclosure=enclosure,
     )
 
 

@@ -39,11 +39,12 @@ from render.frames import (
 )
 from render.painting.figures import Appearance, BodyFigure, Drawn, HandFigure
 from render.painting.painter import Painter, paint, put_before, whole_levels
-from render.painting.rasterizer import NEAR, faces_for, see, warp
+from render.painting.rasterizer import NEAR, see
 from render.painting.shading import GAMMA, light_behind
 from render.scenery.backgrounds import Background, Enclosure, draw_surroundings, enlarged, kept_background
 from render.scenery.lights import Lighting
 from render.skin.look import SkinLook, upper_arms
+from render.user_body import UserBody
 
 
 def _allowed_parts() -> Flags:
@@ -140,6 +141,8 @@ class Moment:
     """Number of the person in each frame; motion is not interpolated from one person to another."""
     upper_arms: Float[np.ndarray, "H 3"] | None = None
     """Unit direction of each hand's upper arm; see `Studio.reaching`."""
+    forearms: Float[np.ndarray, "H 3"] | None = None
+    """Unit direction of each hand's forearm; None for wrists at rest."""
 
     def hand(self, number: int, shift: float = 0.0) -> Doubles | None:
         """Pose (27,) of a hand `shift` seconds after the frame; None where the frame has none."""
@@ -194,8 +197,10 @@ class Studio:
         body_colors: Sequence[tuple[float, float, float]] = (),
         passes: Sequence[str] = PASSES,
         painter: Painter = "compiled",
+        *,
+        room_depth: bool = True,
     ) -> None:
-        self.passes, self.painter = tuple(passes), painter
+        self.passes, self.painter, self._room_depth = tuple(passes), painter, room_depth
         self._people = tuple(people)
         self._looks = [dataclasses.asdict(look) for look in people]
         first = np.cumsum([0, *(len(fit.attachment.points) for fit in hands)])
@@ -236,7 +241,7 @@ class Studio:
             rgb = self._colors_of(camera, drawn, choices)
             noisy_rgb = self._exposed(moment, camera, rgb, choices, rng)
         seen = truth
-        if choices.enclosure is not None:
+        if choices.enclosure is not None and self._room_depth:
             seen = draw_surroundings(choices.background, choices.enclosure, camera).put_behind(truth, camera)
         if sensor is not None:
             noisy_depth = self._noisy_depth(seen, rgb, present, camera, sensor, rng)
@@ -264,16 +269,21 @@ class Studio:
             choices=self._record(choices) if recorded else {},
         )
 
-    def reaching(self, moment: Moment, cameras: Sequence[Camera]) -> Moment:
-        """The moment with arms that leave the pictures of these cameras."""
+    def reaching(self, moment: Moment, cameras: Sequence[Camera], user: UserBody | None = None) -> Moment:
+        """The moment with the user's arms, or others, that leave the pictures of these cameras."""
         found = np.full((len(self._hands), 3), np.nan)
         poses = {number: moment.hand(number) for number in range(len(self._hands))}
         there = {number: pose for number, pose in poses.items() if pose is not None}
+        forearms = None if user is None else user.forearms(moment.take.qpos[moment.frame])
         if there:
-            lines = (self._hands[number].skin.forearm_line(pose) for number, pose in there.items())
-            elbows, forearms = zip(*lines, strict=True)
-            found[[*there]] = upper_arms(np.array(elbows), np.array(forearms), cameras)
-        return dataclasses.replace(moment, upper_arms=found)
+            lines = (
+                self._hands[number].skin.forearm_line(pose, None if forearms is None else forearms[number])
+                for number, pose in there.items()
+            )
+            elbows, ways = map(np.array, zip(*lines, strict=True))
+            shoulders = None if user is None else user.shoulders[[*there]]
+            found[[*there]] = upper_arms(elbows, ways, cameras, shoulders)
+        return dataclasses.replace(moment, upper_arms=found, forearms=forearms)
 
     def is_clear(self, moment: Moment, cameras: Sequence[Camera]) -> bool:
         """Whether all cameras are outside of hands and objects, so that the moment can be drawn."""
@@ -293,8 +303,8 @@ class Studio:
         for index, hand in enumerate(self._hands):
             pose = moment.hand(index, shift)
             if pose is not None:
-                upper_arm = None if moment.upper_arms is None else moment.upper_arms[index]
-                drawn += hand.drawn(pose, number, upper_arm)
+                arm = (None if ways is None else ways[index] for ways in (moment.upper_arms, moment.forearms))
+                drawn += hand.drawn(pose, number, *arm)
                 number += 1
         for index, body in enumerate(self._bodies):
             T_world_body = moment.body(index, shift)
@@ -344,8 +354,7 @@ class Studio:
     def _colors_of(self, camera: Camera, drawn: Sequence[Drawn], choices: FrameChoices) -> Bytes:
         """The perfect color picture."""
         background = choices.background
-        painted = [paint(face, drawn, choices.lighting, self.painter) for face in faces_for(camera)]
-        whole = warp(camera, painted, cv2.INTER_LINEAR)
+        whole = paint(camera, drawn, choices.lighting, self.painter)
         if choices.enclosure is not None:
             behind = draw_surroundings(background, choices.enclosure, camera).rgb.astype(np.float32)
             return put_before(whole, behind)

@@ -25,6 +25,7 @@ from handsim.space.rig import load_rig
 from handsim.space.rig_formats import load_cameras
 from handsim.space.transforms import UpAxis, quaternion_matrix, rigid, upright
 from render.frames import Doubles, Flags, Floats, Integers
+from render.user_body import UserBody
 
 _OUTLINE: Final = (0, 2, 4, 5, 6, 8, 10, 12, 14, 16, 17, 18, 20)  # keypoints that span a hand's outline
 _CHUNK: Final = 2048  # frames whose keypoints are computed at once
@@ -37,7 +38,11 @@ _WIDEST_TANGENT: Final = 2.0  # largest tangent of half an angle of view that ha
 class Framing:
     """Distances and directions at which cameras show the hands of a take."""
 
-    def __init__(self, take: Take) -> None:
+    def __init__(self, take: Take, user: UserBody | None = None) -> None:
+        self.user = user
+        straight = -quaternion_matrix(take.qpos[..., 3:7])[..., 0]
+        self.forearms: Doubles = straight if user is None else user.forearms(take.qpos)
+        """Unit direction (T, H, 3) from each wrist to its elbow; NaN where there is no hand."""
         shape = (take.num_frames, len(take.hands), len(_OUTLINE), 3)
         self.points: Floats = np.full(shape, np.nan, dtype=np.float32)
         """Keypoints of all hands in the world (T, H, P, 3) [m]; NaN where a hand is absent."""
@@ -152,8 +157,9 @@ def _transforms(positions: Doubles, rotations: Doubles) -> Doubles:
 
 
 Placement = Literal["still", "orbit", "head", "anywhere", "rig"]
-_EYES: Final = (0.32, 0.38)  # position of a head's camera behind and above the hands [m]
-_HEAD_CLEARANCE: Final = np.deg2rad(50.0)  # least angle between a head's line of sight and a forearm
+_MOUNTED: Final = 0.03  # largest distance of a head's camera from the eyes along each axis [m]
+_MOSTLY: Final = 0.92  # share of the frames that a head leans back for
+_LEAN: Final = 0.3  # distance by which a head leans back for hands that are far apart [m]
 _ORBIT_PERIOD: Final = 12.0  # time of one revolution of a camera in orbit [s]
 _LOWEST, _HIGHEST = np.deg2rad(-20.0), np.deg2rad(75.0)  # elevation of cameras that stand anywhere
 _TRIES: Final = 60  # random directions that are tried for one camera
@@ -260,8 +266,16 @@ class _Path(NamedTuple):
 class Viewpoints:
     """Cameras of every frame."""
 
-    def __init__(self, config: ViewConfig, take: Take, *, rng: np.random.Generator, up: UpAxis = "z") -> None:
-        framing, own = Framing(take), config.cameras
+    def __init__(
+        self,
+        config: ViewConfig,
+        take: Take,
+        *,
+        rng: np.random.Generator,
+        up: UpAxis = "z",
+        user: UserBody | None = None,
+    ) -> None:
+        framing, own = Framing(take, user), config.cameras
         if own is not None:
             cameras = list(load_cameras(own) if isinstance(own, str) else own)
             if up != "z":
@@ -273,7 +287,9 @@ class Viewpoints:
             paths = _PATHS[config.placement](config, take, framing, rng)
             cameras = [dataclasses.replace(path.camera, name=f"view{n}") for n, path in enumerate(paths)]
             self._paths = [path._replace(camera=camera) for path, camera in zip(paths, cameras, strict=True)]
-        self._centers = framing.centers
+        self._framing = framing
+        self.viewer: Doubles = looking(-_towards_user(framing.forearms)[None])[0]
+        """Axes of somebody before the user, as columns in the world's; light is drawn for them."""
 
     @property
     def num_cameras(self) -> int:
@@ -285,23 +301,28 @@ class Viewpoints:
         """Width and height of the first camera's pictures [px]."""
         return self._paths[0].camera.size
 
+    @property
+    def moves(self) -> bool:
+        """Whether a camera moves, turns or zooms."""
+        return any(path.zoom is not None or bool(np.ptp(path.poses, axis=0).any()) for path in self._paths)
+
+    def nearest(self, normal: Float[np.ndarray, "3"]) -> float:
+        """Least position of all frames' hands along a direction in the first camera's axes [m]."""
+        points = self._framing.points.reshape(-1, 3)
+        return float(np.nanmin(self.cameras(0)[0].local(points) @ normal)) - _SKIN
+
     def positions(self) -> Float[np.ndarray, "P 3"]:
         """Positions of the cameras and of the hands' centers in all frames [m]."""
-        return np.concatenate([self._centers, *(path.poses[:, :3, 3] for path in self._paths)])
+        return np.concatenate([self._framing.centers, *(path.poses[:, :3, 3] for path in self._paths)])
 
     def cameras(self, frame: int) -> list[Camera]:
         """The cameras of one frame: `view0`, `view1`, ..., or those of the file with their own names."""
         return [path.at(frame) for path in self._paths]
 
 
-def _along(take: Take) -> Doubles:
-    """Direction (T, H, 3) from each wrist to its fingers; NaN where there is no hand."""
-    return quaternion_matrix(take.qpos[..., 3:7])[..., 0]
-
-
-def _towards_user(take: Take) -> Doubles:
-    """Level unit direction (3,) from the hands to the user's body: where the forearms point."""
-    level = np.append(np.nanmean(-_along(take)[..., :2].reshape(-1, 2), axis=0), 0.0)
+def _towards_user(forearms: Doubles) -> Doubles:
+    """Level unit direction (3,) from the hands to the user's body: where the forearms (T, H, 3) point."""
+    level = np.append(np.nanmean(forearms[..., :2].reshape(-1, 2), axis=0), 0.0)
     length = float(np.linalg.norm(level))
     return level / length if length > 1e-3 else np.array([0.0, -1.0, 0.0])
 
@@ -318,7 +339,7 @@ def _still(config: ViewConfig, take: Take, framing: Framing, rng: np.random.Gene
 
     Hands that are far apart look large only from a side or from above, so several places are tried.
     """
-    user = _towards_user(take)
+    user = _towards_user(framing.forearms)
     front = np.arctan2(-user[1], -user[0])
     spread = np.deg2rad(40.0) * (np.arange(config.views) - 0.5 * (config.views - 1))
 
@@ -421,34 +442,19 @@ def _distance_of(camera: Camera, side: Doubles | float, share: Doubles | float) 
 
 def _head(config: ViewConfig, take: Take, framing: Framing, rng: np.random.Generator) -> list[_Path]:
     """At the user's eyes, turned to the hands; several cameras stand side by side, as two eyes do."""
-    centers, user = framing.followed(), _towards_user(take)
-    back, up = _EYES[0] + rng.uniform(-0.05, 0.05), _EYES[1] + rng.uniform(-0.05, 0.05)
-    direction = _past_forearms(take, back * user + [0.0, 0.0, up])
-    aside = np.cross(user, [0.0, 0.0, 1.0])
+    user = UserBody(take) if framing.user is None else framing.user
+    camera, eyes = preset(config.camera), user.eyes + rng.uniform(-_MOUNTED, _MOUNTED, 3)
+    _, distances, rotations = _turned_to(eyes, framing.followed())
+    lacking = np.quantile(framing.shortest(camera, framing.followed(), rotations) - distances, _MOSTLY)
+    eyes -= np.clip(lacking, 0.0, _LEAN) * rotations[..., 2].mean(axis=0)
     paths = []
     for number in range(config.views):
-        eyes = centers + direction
-        eyes += 0.064 * (number - 0.5 * (config.views - 1)) * aside
-        away = eyes - centers
-        directions = away / np.linalg.norm(away, axis=1, keepdims=True)
-        paths.append(_Path(preset(config.camera), _transforms(eyes, looking(directions))))
+        aside = 0.064 * (number - 0.5 * (config.views - 1)) * user.right
+        _, _, rotations = _turned_to(eyes + aside, framing.followed())
+        paths.append(
+            _Path(camera, _transforms(np.broadcast_to(eyes + aside, (len(rotations), 3)), rotations))
+        )
     return paths
-
-
-def _past_forearms(take: Take, offset: Doubles) -> Doubles:
-    """The offset (3,) [m] from the hands, rotated until no forearm usually lies in the line of sight."""
-    length = float(np.linalg.norm(offset))
-    direction = offset / length
-    medians = np.nanmedian(-_along(take), axis=0)
-    medians /= np.linalg.norm(medians, axis=1, keepdims=True)
-    for arm in [*medians] * 2:  # once more, because avoiding one arm may lead into the other
-        if direction @ arm > np.cos(_HEAD_CLEARANCE):
-            across = direction - (direction @ arm) * arm
-            if np.linalg.norm(across) < 1e-3:
-                across = np.cross(arm, [1.0, 0.0, 0.0])
-            sideways = np.sin(_HEAD_CLEARANCE) * across / np.linalg.norm(across)
-            direction = np.cos(_HEAD_CLEARANCE) * arm + sideways
-    return length * direction
 
 
 def _anywhere(config: ViewConfig, take: Take, framing: Framing, rng: np.random.Generator) -> list[_Path]:
@@ -477,7 +483,11 @@ def _anywhere(config: ViewConfig, take: Take, framing: Framing, rng: np.random.G
                 bad = np.maximum(np.nan_to_num(smaller, nan=1.0), _ENOUGH)
             else:
                 distance, bad = rng.uniform(*config.distance, count), np.ones(count)
-            bad = bad + _HIDDEN * _behind_arms(take.qpos[remaining], middles + distance[:, None] * directions)
+            bad = bad + _HIDDEN * _behind_arms(
+                take.qpos[remaining, :, :3],
+                framing.forearms[remaining],
+                middles + distance[:, None] * directions,
+            )
             better = bad < best[remaining]
             rows = remaining[better]
             best[rows], chosen[rows], distances[rows] = bad[better], directions[better], distance[better]
@@ -489,13 +499,12 @@ def _anywhere(config: ViewConfig, take: Take, framing: Framing, rng: np.random.G
     return paths
 
 
-def _behind_arms(qpos: Doubles, positions: Doubles) -> Flags:
+def _behind_arms(wrists: Doubles, forearms: Doubles, positions: Doubles) -> Flags:
     """Whether positions (T, 3) [m] are close to a forearm, or behind one, which would hide its hand."""
-    away = np.nan_to_num(positions)[:, None] - qpos[..., :3]
-    along = quaternion_matrix(qpos[..., 3:7])[..., 0]
-    back = -(away * along).sum(axis=-1)
+    away = np.nan_to_num(positions)[:, None] - wrists
+    back = (away * forearms).sum(axis=-1)
     behind = back > np.cos(_ARM_CLEARANCE) * np.linalg.norm(away, axis=-1)
-    beside = np.linalg.norm(away + np.clip(back, 0.0, _ARM)[..., None] * along, axis=-1) < _ARM_DISTANCE
+    beside = np.linalg.norm(away - np.clip(back, 0.0, _ARM)[..., None] * forearms, axis=-1) < _ARM_DISTANCE
     return np.asarray((behind | beside).any(axis=1))
 
 

@@ -72,6 +72,8 @@ class LiveTake(NamedTuple):
     """The take, only some blocks of a long one; None if nothing was recorded."""
     num_frames: int
     """Number of all frames."""
+    duration: float
+    """Time of all frames [s], those included that are missing."""
     notes: tuple[str, ...]
     """Lines to print at the end."""
 
@@ -139,17 +141,18 @@ def track_live(
                 status.show(line, now=frame.silent or dropping)
             doubt.tell()
         stream.end(until)
-        counts, take, step = stream.counts, None, 1
+        counts, take, step, duration = stream.counts, None, 1, 0.0
         if recorder is not None:
             status.show(f"writing {out}", now=True)
             kept = f"writing {out}; {recorder.part} is kept until then"
             take, step = recorder.finish(counts, told=lambda: status.show(kept))
+            duration = recorder.duration + 1.0 / take.rate
     after = counts["frames_in_order"] + counts["reordered_frames"] - counts["dropped_frames"]
     counts["frames_after_end"] = max(0, after - count)
     notes = [*_notes(counts, step, pace, stream.order.interval)]
     for output in outputs:
         notes += output.notes()
-    return LiveTake(take, count, (*notes, *filter(None, [stream.point_doubt])))
+    return LiveTake(take, count, duration, (*notes, *filter(None, [stream.point_doubt])))
 
 
 def _open_answering(address: str, ended: Callable[[], bool], status: LiveStatus) -> LiveStream:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from gloves.captures.capture import Capture
 from gloves.takes.archives import GrowingArchive, GrownArchive, finish_archive, growing_path
-from gloves.takes.points import FRAMES, KEYPOINTS, OPTIONAL, POINTS
+from gloves.takes.points import FRAMES, KEYPOINTS, NUMBERS, OPTIONAL, POINTS
 from gloves.takes.take import (
     RATED_FRAMES,
     Take,
@@ -204,7 +204,8 @@ class Recorder:
             self._settings["stream"] = dict(stream)
         try:
             grown = GrownArchive(self.part, check=False)
-            header = self._header(usual_rate(grown.first("times", RATED_FRAMES)))
+            first = (grown.first(name, RATED_FRAMES) for name in ("times", NUMBERS.name))
+            header = self._header(usual_rate(*first))
             step = grown.step_for(_SUMMARIZED)
             take = unpack_take(dict(header), grown.read(step))
             finish_archive(grown, self._out, header, told=told)

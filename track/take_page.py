@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 _TABLES: Final = (".frames.csv", ".joints.csv", ".markers.csv", ".doubts.csv")
 _RANGE: Final = {"least": 0.0, "5th": 5.0, "median": 50.0, "95th": 95.0, "largest": 100.0}
 """Columns of a range of motion, and the percentile in each."""
+_AT_LIMIT: Final = 0.5  # [deg] from a limit of the model, at which a joint stands at it
 _CHUNK: Final = 4096  # frames whose bones are posed at once
 _MOST_SPANS: Final = 100  # doubtful spans in the page's table; the table beside it has all
 _BINS: Final = 750  # bins of a long take's curve, which shows the least and the largest value of each
@@ -125,6 +126,14 @@ class HandFigures:
                 found[:, -1] = np.median(self.angle_spread[self.fitted], axis=0)
         return found
 
+    def at_limits(self) -> Float[np.ndarray, "20"]:
+        """Share of the fitted frames in which each joint stands at a limit of the model; NaN without any."""
+        low, high = np.array([(joint.low, joint.high) for joint in JOINTS]).T
+        angles = self.angles[self.fitted]
+        if not len(angles):
+            return np.full(len(JOINTS), np.nan)
+        return np.asarray(((angles < low + _AT_LIMIT) | (angles > high - _AT_LIMIT)).mean(axis=0))
+
     def markers(self) -> Iterator[MarkerFigures]:
         """What was seen of each marker, in the order of the glove."""
         seen = self.seen
@@ -192,7 +201,7 @@ def _lead(take: Take) -> str:
         user = f"size {user}"
     parts = [f"capture {settings['capture']}"] if "capture" in settings else []
     parts += [f"glove {glove}", f"hands {' and '.join(take.sides)}", *([user] if user else [])]
-    end = f"{take.num_frames:,} frames, {take.num_frames / take.rate:.1f} s at {take.rate:.4g} Hz."
+    end = f"{take.num_frames:,} frames, {take.duration:.1f} s at {take.rate:.4g} Hz."
     first = ", ".join(parts)
     return f"{first[0].upper()}{first[1:]}; {end}"
 
@@ -234,8 +243,9 @@ def _hand_sections(take: Take, hand: HandFigures) -> list[Section]:
     if not hand.fitted.any():
         return [Section(f"{side} hand", "It has no pose in any frame.")]
     angles = (
-        "Zero is the flat hand. Flexion counts positive towards the palm, extension negative. Abduction "
-        "counts positive towards the thumb; for the thumb itself away from the palm."
+        "Angles of the model (docs/angles.md): zero is the flat hand. Flexion counts positive towards the "
+        "palm, extension negative. Abduction counts positive towards the thumb; that of the first "
+        "metacarpal, which is relative to the hand, away from the palm."
     )
     if hand.angle_spread is not None:
         angles += " The band is one standard deviation to either side."
@@ -281,14 +291,16 @@ def _draw_angles(figure: Figure, times: Float[np.ndarray, "T"], hand: HandFigure
 
 
 def _range_section(title: str, hand: HandFigures) -> Section:
-    table = [["joint [deg]", *_RANGE, "range of the model", "usual spread"]]
-    for joint, row in zip(JOINTS, hand.joints(), strict=True):
+    table = [["joint [deg]", *_RANGE, "range of the model", "at its limits [%]", "usual spread"]]
+    for joint, row, share in zip(JOINTS, hand.joints(), hand.at_limits().tolist(), strict=True):
         *cells, spread = (NOTHING if np.isnan(value) else f"{value:.1f}" for value in row)
-        table.append([joint.name.replace("_", " "), *cells, f"{joint.low:g} to {joint.high:g}", spread])
+        limits = f"{joint.low:g} to {joint.high:g}", percent(share) if share > 0.0 else NOTHING
+        table.append([joint.name.replace("_", " "), *cells, *limits, spread])
     text = (
         f"Over the {int(hand.fitted.sum()):,} frames whose pose was fitted to points; 5th and 95th are "
-        "percentiles, which a single wrong frame does not move. Spread: the median standard deviation of the "
-        "angle, from what is not known of the hand, hidden markers and noise."
+        "percentiles, which a single wrong frame does not move. A joint at its limits may bend further than "
+        "its least and largest angle say, which are then the model's. Spread: the median standard deviation "
+        "of the angle, from what is not known of the hand, hidden markers and noise."
     )
     return Section(title, text, table=table)
 
@@ -426,10 +438,11 @@ def _frame_rows(take: Take, hands: Sequence[HandFigures]) -> _Rows:
 def _joint_rows(hands: Sequence[HandFigures]) -> _Rows:
     """The range of motion of each joint, beside the model's."""
     columns = [f"{name}_deg" for name in (*_RANGE, "model_low", "model_high", "spread")]
-    rows: _Rows = [["hand", "joint", *columns]]
+    rows: _Rows = [["hand", "joint", *columns, "at_limits_share"]]
     for hand in hands:
-        for joint, (*row, spread) in zip(JOINTS, hand.joints().tolist(), strict=True):
-            rows.append([hand.side, joint.name, *map(_number, (*row, joint.low, joint.high, spread))])
+        shares = hand.at_limits().tolist()
+        for joint, (*row, spread), share in zip(JOINTS, hand.joints().tolist(), shares, strict=True):
+            rows.append([hand.side, joint.name, *map(_number, (*row, joint.low, joint.high, spread, share))])
     return rows
 
 

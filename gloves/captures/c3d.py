@@ -1,8 +1,9 @@
 """C3D, the binary format of motion capture: read here, written through ezc3d.
 
 Reading does not use ezc3d because that library (1.7) can end the whole process on a damaged file, silently
-pads a file that was cut, and stops at 65,535 frames. Only the points, their labels, units and rate are read,
-no analog channels, events and force plates.
+pads a file that was cut, and stops at 65,535 frames. Only the points, their labels, units and rate are read.
+Analog channels, events, force plates and all other parameters are copied from the file that a capture was
+read from to the file of its labeled points.
 
 Header and parameters both state where the frames lie and how numbers are written, and some programs get one
 of them wrong. Where they contradict each other, the size of the data decides, with a warning; where it does
@@ -13,6 +14,8 @@ from __future__ import annotations
 
 import itertools
 import math
+import struct
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal
@@ -66,7 +69,8 @@ class Parameters:
             raise CaptureError("damaged: the parameter section is missing or in an unknown number format")
         processor = data[start + 3]
         try:
-            groups, found = _walk(data, start + 4, processor, tell)
+            found = list(_records(data, start + 4, processor, tell))
+            groups = {-group: name for group, name, _ in found if group < 0}
             read = [(groups[group], name, raw) for group, name, raw in found if groups.get(group) in _GROUPS]
             sizes = (
                 64 + math.prod(raw[2 : 2 + raw[1]]) * abs(int.from_bytes(raw[:1], "little", signed=True))
@@ -101,13 +105,9 @@ class Parameters:
         return [value for value in self.values.get((group, name), []) if isinstance(value, str)]
 
 
-def _walk(
-    data: bytes, at: int, processor: int, tell: Tell
-) -> tuple[dict[int, str], list[tuple[int, str, memoryview]]]:
-    """Names of groups by number, and (group, name, record from its type on) of each parameter."""
+def _records(data: bytes, at: int, processor: int, tell: Tell) -> Iterator[tuple[int, str, memoryview]]:
+    """Number of its group (negative for the group itself), name, and content of each record."""
     order: Literal["little", "big"] = "big" if processor == _SGI else "little"
-    groups: dict[int, str] = {}
-    found: list[tuple[int, str, memoryview]] = []
     view = memoryview(data)
     points_at = (int.from_bytes(data[16:18], order) - 1) * BLOCK
     end = points_at if points_at > at else len(data)  # of the section
@@ -119,17 +119,13 @@ def _walk(
         offset_at = at + 2 + name_length
         name = data[at + 2 : offset_at].decode("latin-1").upper().strip()
         offset = int.from_bytes(data[offset_at : offset_at + 2], order)
-        if group < 0:
-            groups[-group] = name
-        else:
-            found.append((group, name, view[offset_at + 2 : offset_at + 2 + _MAX_RECORD]))
+        yield group, name, view[offset_at + 2 : offset_at + 2 + _MAX_RECORD]
         if offset == 0:
             break
         at = offset_at + offset
         if at > end:
             tell(f"the parameter section ends with {shortened(name)!r}, which points behind it")
             break
-    return groups, found
 
 
 def _read_values(raw: bytes, processor: int) -> list[float] | list[str]:
@@ -218,6 +214,18 @@ def read_points(
     data: bytes, parameters: Parameters, header: Header, tell: Tell
 ) -> Float[np.ndarray, "T N 4"]:
     """Coordinates in the file's unit, and residuals."""
+    frames, num_points, scale = _read_frames(data, parameters, header, tell)
+    points = frames[:, : 4 * num_points].reshape(-1, num_points, 4)
+    if scale < 0.0:
+        return to_native(points, parameters.processor)
+    scaled: NDArray[np.float64] = points * np.array([scale, scale, scale, 1.0])
+    return scaled
+
+
+def _read_frames(
+    data: bytes, parameters: Parameters, header: Header, tell: Tell
+) -> tuple[NDArray[np.generic], int, float]:
+    """Numbers of frames as stored (T, K), those of points first; the number of points; `Header.scale`."""
     processor = parameters.processor
     num_points = int(parameters.number("POINT", "USED", default=header.num_points)) & 0xFFFF
     if not num_points:
@@ -239,11 +247,7 @@ def read_points(
         while end > max(MOST_FRAMES, len(frames) - most) and not frames[end - 1].any():
             end -= 1
         frames = frames[:end]
-    points = frames[:, : 4 * num_points].reshape(-1, num_points, 4)
-    if scale < 0.0:
-        return to_native(points, processor)
-    scaled: NDArray[np.float64] = points * np.array([scale, scale, scale, 1.0])
-    return scaled
+    return frames, num_points, scale
 
 
 def _scale(parameters: Parameters, header: Header, extent: _Extent, num_points: int, tell: Tell) -> float:
@@ -363,8 +367,12 @@ def read_c3d(data: bytes, tell: Tell = warn) -> Capture:
     return without_outputs(capture, [name for group in _OUTPUTS for name in _list(parameters, group)])
 
 
-def write_c3d(path: Path, capture: Capture) -> None:
+def write_c3d(path: Path, capture: Capture, source: bytes | None = None) -> None:
     """Write float32 millimeters; a missing point gets residual -1.
+
+    Of a `source`, the bytes of the C3D that the capture was made from, all but the points is kept: analog
+    channels, events, the number of the first frame and all parameters, but no rotations (group ROTATION).
+    Then lengths have its unit, as its force plates have.
 
     The length of a take of more than 65,535 frames stands in TRIAL:ACTUAL_END_FIELD; programs that ignore
     this field, such as ezc3d 1.7, see the first 65,535 frames.
@@ -378,27 +386,126 @@ def write_c3d(path: Path, capture: Capture) -> None:
     written = path if path.suffix == ".c3d" else path.with_name(f"{path.name}.c3d")
     try:
         written.touch()  # ezc3d does not report that it may not write
+        unit = "mm" if source is None else _unit(source)
         with plain_path(written) as plain:
-            _content(capture).write(str(plain))
+            _content(capture, unit).write(str(plain))
         _check_written(written, capture)
+        if source is not None:
+            written.write_bytes(_with_source(written.read_bytes(), capture.num_frames, source))
         written.replace(path)
     except BaseException:
         written.unlink(missing_ok=True)
         raise
 
 
-def _content(capture: Capture) -> ezc3d.c3d:
+def _unit(source: bytes) -> str:
+    """The unit of length of a C3D."""
+    parameters = Parameters.parse(source, (source[0] - 1) * BLOCK, _silent)
+    return next(iter(parameters.strings("POINT", "UNITS")), "") or "mm"
+
+
+_OF_POINTS: Final = ("USED", "SCALE", "RATE", "FRAMES", "LONG_FRAMES", "UNITS", "LABELS", "DESCRIPTIONS")
+"""How parameters of the group POINT begin that state what the points are."""
+_MOST_BLOCKS: Final = 255  # of a parameter section
+_EVENTS_AT: Final = slice(304, 376)  # bytes of the header with times of events; flags and labels follow
+
+
+def _with_source(written: bytes, num_frames: int, source: bytes) -> bytes:
+    """A written file with all of its source but the points: analogs, events, parameters, first frame."""
+    parameters = Parameters.parse(source, (source[0] - 1) * BLOCK, _silent)
+    processor = parameters.processor
+    header = Header.parse(source, processor)
+    frames, num_points, scale = _read_frames(source, parameters, header, _silent)
+    if len(frames) != num_frames:
+        raise CaptureError(f"the source has {len(frames)} frames and the capture {num_frames}")
+    analogs = frames[:, 4 * num_points :]
+    if scale < 0.0:
+        analogs = to_native(analogs, processor)
+    elif "UNSIGNED" in parameters.strings("ANALOG", "FORMAT"):
+        analogs = analogs.view(analogs.dtype.str.replace("i", "u"))
+    ours = Header.parse(written, _INTEL)
+    points = np.frombuffer(written, "<f4", 4 * num_frames * ours.num_points, ours.start)
+    data = np.concatenate([points.reshape(num_frames, -1), analogs], axis=1).astype("<f4").tobytes()
+    group, records = _merged_records(written, source, processor)
+    blocks = -(-(len(records) + len(_data_start(group, 0)) + 6) // BLOCK)
+    if blocks > _MOST_BLOCKS:
+        raise CaptureError(f"the parameters take {blocks} blocks, a C3D has {_MOST_BLOCKS} at most")
+    section = bytes([1, 0x50, blocks, _INTEL]) + records + _data_start(group, 2 + blocks)
+    words = np.frombuffer(source[:BLOCK], INTEGER_DTYPES[processor]).astype("<u2")
+    head = bytearray(words.tobytes())
+    times = np.frombuffer(source[_EVENTS_AT], FLOAT_DTYPES[processor])
+    head[_EVENTS_AT] = to_native(times, processor).astype("<f4").tobytes()
+    head[_EVENTS_AT.stop :] = source[_EVENTS_AT.stop : BLOCK]
+    first, channels = int(words[3]), int(parameters.number("ANALOG", "USED", default=0.0))
+    sizes = ours.num_points, analogs.shape[1], first, min(first + num_frames - 1, MOST_FRAMES)
+    struct.pack_into("<2B4H", head, 0, 2, 0x50, *sizes)
+    head[12:16], head[20:24] = written[12:16], written[20:24]  # scale and rate
+    samples = analogs.shape[1] // channels if channels > 0 else header.samples
+    struct.pack_into("<2H", head, 16, 2 + blocks, samples)
+    content = bytes(head) + section.ljust(blocks * BLOCK, b"\0") + data
+    return content + bytes(-len(content) % BLOCK)
+
+
+def _silent(text: str) -> None:
+    """What a source has that is odd was told when it was read."""
+
+
+def _data_start(group: int, block: int) -> bytes:
+    """The record of POINT:DATA_START."""
+    return _record(group, "DATA_START", struct.pack("<2BHB", _INTEGER, 0, block, 0))
+
+
+def _record(group: int, name: str, content: bytes) -> bytes:
+    """A record of a parameter section; the number of a group itself is negative."""
+    raw = name.encode("latin-1")
+    return struct.pack("<2b", len(raw), group) + raw + struct.pack("<H", len(content) + 2) + content
+
+
+def _merged_records(written: bytes, source: bytes, processor: int) -> tuple[int, bytes]:
+    """Number of the group POINT, and all records of a source; of those that state points the written ones."""
+    merged: list[bytes] = []
+    numbers: list[int] = []
+    for data, kind in ((source, processor), (written, _INTEL)):
+        records = list(_records(data, (data[0] - 1) * BLOCK + 4, kind, _silent))
+        groups = {-group: name for group, name, _ in records if group < 0}
+        numbers += [group for group, name in groups.items() if name == "POINT"]
+        values = {(groups.get(group), name): content[2:4] for group, name, content in records}
+        rotated = any(values.get(("ROTATION", "USED"), b""))
+        for group, name, content in records:
+            is_point = groups.get(group) == "POINT"
+            of_points = is_point and name.startswith(_OF_POINTS)
+            behind = rotated and groups.get(abs(group)) == "ROTATION"  # their numbers follow the frames
+            if of_points == (data is written) and not behind and not (is_point and name == "DATA_START"):
+                number = numbers[0] if of_points else group
+                kept = bytes(content[: 1 + content[0]]) if group < 0 else _in_intel(content, kind)
+                merged.append(_record(number, name, kept))
+    return numbers[0], b"".join(merged)
+
+
+def _in_intel(content: memoryview, processor: int) -> bytes:
+    """The content of a parameter's record up to its end, with numbers in Intel's format."""
+    kind, begin = int.from_bytes(content[:1], "little", signed=True), 2 + content[1]
+    end = begin + math.prod(content[2:begin]) * abs(kind)
+    values = bytes(content[begin:end])
+    if kind == _INTEGER:
+        values = np.frombuffer(values, INTEGER_DTYPES[processor]).astype("<i2").tobytes()
+    elif kind == _FLOAT:
+        values = to_native(np.frombuffer(values, FLOAT_DTYPES[processor]), processor).astype("<f4").tobytes()
+    return bytes(content[:begin]) + values + bytes(content[end : end + 1 + content[end]])
+
+
+def _content(capture: Capture, unit: str) -> ezc3d.c3d:
     """The capture as an ezc3d object."""
     import ezc3d
 
     missing = np.isnan(capture.positions[..., 0]).T
     points = np.ones((4, *missing.shape))
-    points[:3] = np.moveaxis(capture.positions, (0, 1, 2), (2, 1, 0)) * 1e3
+    points[:3] = np.moveaxis(capture.positions, (0, 1, 2), (2, 1, 0)) * (1.0 / meters_per(unit))
     content = ezc3d.c3d()
     group = content["parameters"]["POINT"]
     group["RATE"]["value"] = [capture.rate]
     group["LABELS"]["value"] = list(capture.names)
-    group["UNITS"]["value"] = ["mm"]
+    group["UNITS"]["value"] = [unit]
     content["data"]["points"] = points
     content["data"]["meta_points"]["residuals"] = np.where(missing, -1.0, 0.0)[None]
     if capture.num_frames > MOST_FRAMES:

@@ -596,7 +596,7 @@ def _checked(path: Path, capture: Capture) -> Capture:
     return capture
 
 
-def write_capture(path: str | Path, capture: Capture) -> None:
+def write_capture(path: str | Path, capture: Capture, *, source: str | Path | None = None) -> None:
     """Write a `.trc`, `.c3d` or Motive `.csv` file in millimeters, whole or not at all.
 
     A TRC keeps positions to 5e-9 m, a CSV to 5e-10 m; a C3D keeps single precision (6e-8 of the value).
@@ -604,6 +604,8 @@ def write_capture(path: str | Path, capture: Capture) -> None:
     Args:
         path: The file; its suffix decides the format.
         capture: Positions (T, N, 3) [m] at a rate [Hz].
+        source: The file that the points came from. If both files are C3D, all but the points is kept: analog
+            channels, events, the number of the first frame and all parameters.
 
     Raises:
         ArgumentError: An argument is of another type.
@@ -614,6 +616,11 @@ def write_capture(path: str | Path, capture: Capture) -> None:
     check_type("capture", capture, Capture, expected)
     path = Path(path)
     check_suffix(path, WRITABLE)
+    kept = None
+    if source is not None:
+        check_type("source", source, (str, Path), "the path of a file")
+        if Path(source).suffix.lower() == ".c3d":
+            kept = read_bytes(Path(source), error=CaptureError)
     for name in capture.names:
         if not name or name != name.strip() or not name.isprintable():
             raise CaptureError(
@@ -625,7 +632,7 @@ def write_capture(path: str | Path, capture: Capture) -> None:
             if path.suffix.lower() in _TEXT_WRITERS:
                 _TEXT_WRITERS[path.suffix.lower()](temporary, capture, title=as_text(path.name))
             else:
-                write_c3d(temporary, capture)
+                write_c3d(temporary, capture, kept)
     except OSError as error:
         raise CaptureError(f"{path}: cannot be written: {error.strerror or error}") from error
     except CaptureError as error:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -39,8 +40,9 @@ from gloves.takes.points import (
     spans,
 )
 from handsim._checks import check_choice, check_type
-from handsim.errors import ArgumentError
+from handsim.errors import ArgumentError, HandSimWarning
 from handsim.files.outputs import check_ending
+from handsim.hand.angles import ISB_NAMES, Convention, isb_angles
 from handsim.hand.model import (
     KEYPOINT_NAMES,
     HandModel,
@@ -137,6 +139,7 @@ _MAX_TIME: Final = 1e12  # [s], and the largest rate [Hz]; clocks of computers c
 _QUATERNION_TOLERANCE: Final = 1e-2  # of the unit length; our own files have 1e-6
 _CHUNK: Final = 4096  # frames whose markers are filled in at once
 _MAX_BIAS_FRAMES: Final = 2000  # frames that marker biases are learned from
+_STILL: Final = 3.0  # [deg], largest standard deviation of an angle of a hand that holds still
 _MIN_BIAS_FRAMES: Final = 30  # frames with a marker from which its bias is learned
 
 
@@ -411,7 +414,7 @@ class Take:
             columns = np.nonzero(present)[1]
             point_list = PointList(counts, **entries, columns=columns, num_columns=present.shape[1])
         return cls(
-            rate=usual_rate(arrays["times"]) if capture is None else capture.rate,
+            rate=usual_rate(arrays["times"], arrays[NUMBERS.name]) if capture is None else capture.rate,
             hands=hands,
             bodies=bodies,
             settings=dict(settings),
@@ -423,6 +426,11 @@ class Take:
     def num_frames(self) -> int:
         """Number of frames, T."""
         return len(self.times)
+
+    @property
+    def duration(self) -> float:
+        """Time from the first frame to the end of the last one [s]."""
+        return float(self.times[-1] - self.times[0]) + 1.0 / self.rate
 
     @property
     def made_by_tracker(self) -> bool:
@@ -439,9 +447,47 @@ class Take:
         """Names of the 21 keypoints of a hand, in the order of `keypoints()`."""
         return KEYPOINT_NAMES
 
-    def angles(self, side: Side) -> dict[str, Float[np.ndarray, "T"]]:
-        """The angles of a hand's joints over time [rad], by their names; NaN where it has no pose."""
-        return dict(zip(JOINT_NAMES, self.qpos[:, self.hand_index(side), 7:].T, strict=True))
+    def angles(
+        self, side: Side, *, convention: Convention = "model", neutral: tuple[float, float] | None = None
+    ) -> dict[str, Float[np.ndarray, "T"]]:
+        """The angles of a hand's joints over time [rad], by their names; NaN where it has no pose.
+
+        Args:
+            side: The hand.
+            convention: `model` for the hinges of the model, `isb` for angles as the ISB writes them.
+            neutral: The first and the last time [s] of a pose of which all angles are taken as zero, such as
+                the flat hand for a second; zero of the convention when not given.
+
+        Raises:
+            ArgumentError: The hand or the convention is unknown, or no pose is between these times.
+
+        Warns:
+            HandSimWarning: The hand moves between these times.
+        """
+        check_choice(convention, get_args(Convention), noun="convention")
+        angles = self.qpos[:, self.hand_index(side), 7:]
+        zero = None if neutral is None else self.mean_pose(side, neutral)
+        if convention == "isb":
+            shape = self.hands[self.hand_index(side)].model.shape
+            return dict(zip(ISB_NAMES, isb_angles(shape, angles, zero).T, strict=True))
+        return dict(zip(JOINT_NAMES, (angles if zero is None else angles - zero).T, strict=True))
+
+    def mean_pose(self, side: Side, between: tuple[float, float]) -> Float[np.ndarray, "20"]:
+        """The mean joint angles of a hand between two times [rad]; warns if it moves there."""
+        first, last = between
+        there = self.is_tracked(side) & (self.times >= first) & (self.times <= last)
+        if not there.any():
+            raise ArgumentError(
+                f"neutral is {first:g} to {last:g} s, where the {side} hand has no pose; expected a part of "
+                f"{self.times[0]:g} to {self.times[-1]:g} s in which it is tracked"
+            )
+        angles = self.qpos[there, self.hand_index(side), 7:]
+        spread = np.rad2deg(angles.std(axis=0))
+        if spread.max() > _STILL:
+            moving = f"{JOINT_NAMES[spread.argmax()]} by {spread.max():.1f} degrees (standard deviation)"
+            text = f"the {side} hand moves from {first:g} to {last:g} s, {moving}; expected a still pose"
+            warnings.warn(text, HandSimWarning, stacklevel=3)
+        return np.asarray(angles.mean(axis=0))
 
     def angle_spreads(self, side: Side) -> dict[str, Float[np.ndarray, "T"]]:
         """The standard deviation of each joint's angle over time [rad]; NaN where it is not known."""
@@ -621,7 +667,8 @@ class Take:
     def labeled_capture(self, *, sides: bool = True) -> Capture:
         """The labeled points, for `write_capture`: one column per marker, then columns of unlabeled points.
 
-        A hand without any label has no columns if the other hand has one.
+        A hand without any label has no columns if the other hand has one. Frames that a stream lacks are
+        there without points, because marker files have no times.
 
         Args:
             sides: Whether the names of columns begin with the hand, `right:ThumbTip`; if not, they are
@@ -643,7 +690,15 @@ class Take:
             labels = np.where(labels >= 0, (np.cumsum(kept) - 1)[labels], -1)
         begins = self.point_list.starts[1:-1]
         frames, rows = (np.split(values, begins) for values in (self.point_list.points, labels))
-        return labeled_columns(frames, rows, names, self.rate)
+        capture = labeled_columns(frames, rows, names, self.rate)
+        if self.numbers is None:
+            return capture
+        order, count = np.arange(self.num_frames), len(times_at(self.times, self.rate))
+        places = np.rint((self.times - self.times[0]) * self.rate).astype(np.intp) - order
+        places = np.maximum.accumulate(places) + order  # two late frames have two places
+        positions = np.full((max(count, places[-1] + 1), *capture.positions.shape[1:]), np.nan)
+        positions[places] = capture.positions
+        return dataclasses.replace(capture, positions=positions)
 
     def without_body(self) -> Take:
         """The take without rigid bodies and their points; many optical systems track bodies themselves."""
@@ -667,7 +722,14 @@ class Take:
         parts = {column.name: getattr(self, column.name)[first:last] for column in (*FRAMES, *self._known())}
         return dataclasses.replace(self, **parts, point_list=self.point_list.cut(first, last))
 
-    def export(self, path: str | Path, *, rate: float | None = None, up: UpAxis = "z") -> None:
+    def export(
+        self,
+        path: str | Path,
+        *,
+        rate: float | None = None,
+        up: UpAxis = "z",
+        neutral: tuple[float, float] | None = None,
+    ) -> None:
         """Write the motion for other programs, in a format by the ending of the file name.
 
         Args:
@@ -675,6 +737,8 @@ class Take:
                 positions), .trc (joint positions), .mot (joint angles for OpenSim) or .openxr.json file.
             rate: Frames per second of the file [Hz]; those of the take when not given.
             up: The axis of the take's world that points up.
+            neutral: The first and the last time [s] of a pose in which a table's angles of the ISB are zero;
+                see `angles`.
 
         Raises:
             ArgumentError: The ending or the axis is unknown, no hand has a pose, or the rate is out of range.
@@ -690,7 +754,12 @@ class Take:
                 f"up is {up} and the file {path}, expected a format with a direction that is up: "
                 f"{', '.join(ending for ending, one in MOTION_FORMATS.items() if not one.keeps_axes)}"
             )
-        form.write(path, posed_motion(form.take_of(self, None if rate is None else float(rate))), up)
+        if neutral is not None and not form.keeps_axes:
+            raise ArgumentError(
+                f"neutral is {neutral} and the file {path}, expected .csv or .parquet with the ISB's angles"
+            )
+        take = form.take_of(self, None if rate is None else float(rate))
+        form.write(path, posed_motion(take, neutral), up)
 
     def save(self, path: str | Path) -> None:
         """Write the take as an .npz file, whole or not at all, which `load_take` reads.
@@ -715,9 +784,10 @@ class Take:
         return tuple(column for column in OPTIONAL if getattr(self, column.name) is not None)
 
 
-def posed_motion(take: Take) -> Motion:
+def posed_motion(take: Take, neutral: tuple[float, float] | None = None) -> Motion:
     """The hands and bodies of a take as the writers of motion files need them; each has a pose somewhere."""
-    hands = [PosedHand.of(hand.model, take.qpos[:, n]) for n, hand in enumerate(take.hands)]
+    zeros = [None if neutral is None else take.mean_pose(side, neutral) for side in take.sides]
+    hands = [PosedHand.of(hand.model, take.qpos[:, n], zeros[n]) for n, hand in enumerate(take.hands)]
     bodies = [PosedBody.of(one.name, one.shape, take.body_poses[:, n]) for n, one in enumerate(take.bodies)]
     return Motion(take.rate, take.times, hands, bodies)
 
@@ -759,9 +829,15 @@ def keypoints_of(
     return keypoints
 
 
-def usual_rate(times: Float[np.ndarray, "T"]) -> float:
-    """Median rate of the first frames of a stream [Hz]."""
-    return 1.0 / float(np.median(np.diff(times[:RATED_FRAMES])))
+def usual_rate(times: Float[np.ndarray, "T"], numbers: Int[np.ndarray, "T"]) -> float:
+    """Median rate of the first frames of a stream [Hz], those included that are missing by their numbers.
+
+    It has seven digits: times are rounded, and 59.99999999997783 Hz is the rate of no system.
+    """
+    spans, steps = np.diff(times[:RATED_FRAMES]), np.diff(numbers[:RATED_FRAMES])
+    steps[steps <= 0] = 1  # the server began to count anew
+    steps //= np.gcd.reduce(steps)  # some servers number every n-th frame
+    return float(f"{np.median(steps / spans):.7g}")
 
 
 def take_header(
@@ -821,7 +897,7 @@ def unpack_take(header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Take
         columns, num_columns = arrays[POINT_COLUMNS.name], int(header["num_columns"])
         points = PointList(counted, **entries, columns=columns, num_columns=num_columns)
     return Take(
-        rate=usual_rate(arrays["times"]) if header["rate"] is None else float(header["rate"]),
+        rate=float(header["rate"] or usual_rate(arrays["times"], arrays[NUMBERS.name])),
         hands=hands,
         bodies=bodies,
         settings=settings_of(header),

@@ -15,7 +15,11 @@ from handsim.space.transforms import UpAxis
 
 
 def export(
-    source: Annotated[str, tyro.conf.Positional], out: Path, fps: float | None = None, up: UpAxis = "z"
+    source: Annotated[str, tyro.conf.Positional],
+    out: Path,
+    fps: float | None = None,
+    up: UpAxis = "z",
+    neutral: tuple[float, float] | None = None,
 ) -> None:
     """Write the motion of a take, a user's hand, or a trained labeler, for other programs.
 
@@ -29,15 +33,18 @@ def export(
         fps: Frames per second of the file, such as 30 or 60 for a game; those of the take when not given.
         up: The axis of the take that points up; y for captures of Motive's default. Files have y up, but
             .usda, .usdc, .csv and .parquet have the take's axes.
+        neutral: First and last time [s] at which the hands are flat, or in another pose in which the angles
+            of the ISB in a .csv or .parquet are to be zero.
     """
     from gloves.takes.archives import GROWING_SUFFIX
     from track.user import load_user
 
     if source.lower().endswith((".npz", f".npz{GROWING_SUFFIX}")):
-        _export_take(Path(source), out, fps, up)
+        _export_take(Path(source), out, fps, up, neutral)
         return
-    if fps is not None or up != "z":
-        given = f"--fps {fps:g}" if fps is not None else f"--up {up}"
+    if fps is not None or up != "z" or neutral is not None:
+        given = f"--neutral {neutral[0]:g} {neutral[1]:g}" if neutral else f"--up {up}"
+        given = f"--fps {fps:g}" if fps is not None else given
         raise ArgumentError(f"given {given} and {source}, expected a take with it, whose motion is written")
     if source.lower().endswith(".json"):
         check_outputs([source], [out])
@@ -48,7 +55,9 @@ def export(
         _export_labeler(source, out)
 
 
-def _export_take(source: Path, out: Path, fps: float | None, up: UpAxis) -> None:
+def _export_take(
+    source: Path, out: Path, fps: float | None, up: UpAxis, neutral: tuple[float, float] | None
+) -> None:
     from gloves.takes.take import load_take, motion_format
 
     form = motion_format(out)
@@ -57,7 +66,7 @@ def _export_take(source: Path, out: Path, fps: float | None, up: UpAxis) -> None
     if not np.isfinite(take.qpos[..., 0]).any():
         raise CaptureError(f"{source}: there is no hand in any frame, expected one to export")
     motion = form.take_of(take, fps)
-    motion.export(out, up=up)
+    motion.export(out, up=up, neutral=neutral)
     sides = " and ".join(motion.sides)
     things = "".join(f", {body.name}" for body in motion.bodies)
     print_line(

@@ -84,10 +84,11 @@ def track(
             tracked = track_live(str(live), setup, [sinks], out=out, seconds=seconds, on_frame=on_frame)
             if labeled is not None:  # last, because a failure must not cost the recording
                 write_capture(labeled, tracked.whole_take(out).labeled_capture())
-    assert tracked.take is not None  # it was recorded
+    take = tracked.take
+    assert take is not None  # it was recorded
     if options.shape is not None and options.glove is None:
-        print_line(f"{options.shape}: hands in the glove '{tracked.take.settings['glove']}'")
-    _print_take(out, tracked.take, tracked.num_frames, tracked.notes, 1e3 * float(np.median(times)))
+        print_line(f"{options.shape}: hands in the glove '{take.settings['glove']}'")
+    _print_take(out, take, tracked, 1e3 * float(np.median(times)))
 
 
 def _track_file(
@@ -122,13 +123,13 @@ def _track_file(
     with written_together():
         take.save(out)
         if labeled is not None:
-            write_capture(labeled, take.labeled_capture())
+            write_capture(labeled, take.labeled_capture(), source=capture)
     applied = len(take.settings.get("corrections", ()))
     notes = [f"{corrections}: {applied} correction{'s' * (applied != 1)} applied"] if applied else []
-    return LiveTake(take, take.num_frames, (*notes, *sinks.notes()))
+    return LiveTake(take, take.num_frames, take.duration, (*notes, *sinks.notes()))
 
 
-def _print_take(out: Path, take: Take, frames: int, notes: tuple[str, ...], milliseconds: float) -> None:
+def _print_take(out: Path, take: Take, tracked: LiveTake, milliseconds: float) -> None:
     """Print a summary of a take, and warn of signs of mistakes."""
     from track.take_summary import summarize, suspicions
     from track.user import MEASURED
@@ -137,8 +138,8 @@ def _print_take(out: Path, take: Take, frames: int, notes: tuple[str, ...], mill
     lines = [f"size of the hands: {user.removeprefix(MEASURED)}"] if user.startswith(MEASURED) else []
     if user.startswith("calibrated on"):
         lines = user.split("; ")
-    lines.append(f"{out}: {frames} frames, {frames / take.rate:.1f} s at {take.rate:.4g} Hz")
-    print_line(*lines, *notes, *summarize(take), f"{milliseconds:.2f} ms per frame")
+    lines.append(f"{out}: {tracked.num_frames} frames, {tracked.duration:.1f} s at {take.rate:.4g} Hz")
+    print_line(*lines, *tracked.notes, *summarize(take), f"{milliseconds:.2f} ms per frame")
     for suspicion in suspicions(take):
         warnings.warn(suspicion, HandSimWarning, stacklevel=3)
 

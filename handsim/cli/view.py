@@ -13,6 +13,7 @@ from handsim.cli.options import TrackerOptions, check_source, check_take_file
 from handsim.errors import ArgumentError
 from handsim.files.outputs import check_outputs
 from handsim.files.signals import interrupt_flag
+from handsim.space.transforms import UpAxis
 from track.streams import LOOPBACK
 from track.viewer import address_of, opened_server
 
@@ -32,6 +33,7 @@ def view(
     options: Annotated[TrackerOptions, tyro.conf.arg(name="")] = TrackerOptions(),  # noqa: B008 (frozen)
     video: Path | None = None,
     time: float | None = None,
+    up: UpAxis = "z",
 ) -> None:
     """Show a file or a live tracker in the browser; Ctrl-C ends it.
 
@@ -50,6 +52,7 @@ def view(
         options: Options of a live tracker; --size is also that of the hand that wears a layout.
         video: File for a video of a take, capture or training set (.mp4), which is drawn instead of a page.
         time: Time of a take, capture or training set that the page opens at [s]; its begin when not given.
+        up: The axis of a take, capture or stream that points up; y for Motive's default.
     """
     from track.settings import TrackerSetup
     from track.viewer.contents import open_content
@@ -65,12 +68,12 @@ def view(
             check_outputs((rig, *options.files()), (out,))
         with named_steps(""):  # a glove may have to be learned
             setup = TrackerSetup.of(options.settings())
-        _view_live(live, setup, host, port, rig, out)
+        _view_live(live, setup, host, port, rig, out, up)
         return
     _check_still(str(file), options, video, time)
-    content = open_content(str(file), out=out, size=options.size, rig=rig, time=time)
+    content = open_content(str(file), out=out, size=options.size, rig=rig, time=time, up=up)
     if video is not None:
-        _draw(str(file), content, video)
+        _draw(str(file), content, video, up)
         return
     with opened_server(host, port, "handsim view") as server:
         run = content.show(server)
@@ -89,7 +92,7 @@ def _check_still(file: str, options: TrackerOptions, video: Path | None, time: f
         raise ArgumentError(f"given --time {time:g} and --video {video}, expected one of them")
 
 
-def _draw(name: str, content: Content, video: Path) -> None:
+def _draw(name: str, content: Content, video: Path, up: UpAxis) -> None:
     """Draw the video of a recording."""
     check_outputs((name,), (video,))
     from render.illustrations import write_clip
@@ -100,12 +103,19 @@ def _draw(name: str, content: Content, video: Path) -> None:
     if recording is None:
         raise ArgumentError(f"--video is {video}, but {name} is a {content.kind}: nothing in it moves")
     with progress_bar("pictures") as bar:
-        count = write_video(video, recording, first_look(recording), write_clip=write_clip, progress=bar)
+        look = first_look(recording)
+        count = write_video(video, recording, look, up=up, write_clip=write_clip, progress=bar)
     print_line(f"{video}: {count} pictures of {name} ({content.kind})")
 
 
 def _view_live(
-    url: str, setup: TrackerSetup, host: str, port: int | None, rig: str | None, out: Path | None
+    url: str,
+    setup: TrackerSetup,
+    host: str,
+    port: int | None,
+    rig: str | None,
+    out: Path | None,
+    up: UpAxis,
 ) -> None:
     """Track a stream and show it until a signal or the stream ends it; record it if `out` is given."""
     from handsim.space.rig import load_rig
@@ -113,7 +123,7 @@ def _view_live(
     from track.viewer.timeline import LiveView
 
     cameras = None if rig is None else load_rig(rig)
-    with opened_server(host, port, "handsim view") as server, LiveView(server, cameras) as view:
+    with opened_server(host, port, "handsim view") as server, LiveView(server, cameras, up) as view:
         print_line(f"{url}: {address_of(server)} ; Ctrl-C ends it")
         tracked = track_live(url, setup, [view], out=out)
     print_line(*view.notes(), *([] if out is None else [f"{out}: {tracked.num_frames} frames"]))

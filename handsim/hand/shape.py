@@ -65,7 +65,7 @@ BONE_NAMES: Final[tuple[str, ...]] = tuple(bone.name for bone in BONES)
 NUM_BONES: Final = len(BONES)
 
 # Ranges [deg]: active ranges of the AAOS and e-hand tables, MCP extension and PIP flexion as in the wider of
-# the published sets (docs/anatomy.md lists them side by side). Thumb CMC angles count from the relaxed thumb.
+# the published sets (docs/angles.md lists them side by side). The thumb's first two count from its rest.
 _RANGES: Final = {
     "thumb": ((-33.0, 35.0), (-42.0, 45.0), (-15.0, 65.0), (-20.0, 85.0)),
     "index": ((-22.0, 22.0), (-25.0, 95.0), (-8.0, 112.0), (-12.0, 85.0)),
@@ -74,7 +74,7 @@ _RANGES: Final = {
     "little": ((-32.0, 22.0), (-25.0, 100.0), (-8.0, 115.0), (-12.0, 85.0)),
 }
 _SUFFIXES: Final = {
-    "thumb": ("CMC_abduction", "CMC_flexion", "MCP_flexion", "IP_flexion"),
+    "thumb": ("metacarpal_abduction", "metacarpal_flexion", "MCP_flexion", "IP_flexion"),
     "finger": ("MCP_abduction", "MCP_flexion", "PIP_flexion", "DIP_flexion"),
 }
 

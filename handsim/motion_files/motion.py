@@ -34,6 +34,7 @@ from scipy import sparse
 from handsim.errors import CaptureError, HandSimError, choices
 from handsim.files.inputs import read_bytes
 from handsim.files.outputs import as_text, atomic_write
+from handsim.hand.angles import ISB_NAMES, isb_angles
 from handsim.hand.model import KEYPOINT_NAMES, HandModel, hand_keypoints
 from handsim.hand.model_files import coordinate_names, coordinate_values
 from handsim.hand.shape import BONE_NAMES, BONES, DIGITS, JOINT_NAMES, PALM, SIDES, Side, bones_of
@@ -75,6 +76,8 @@ class PosedHand(NamedTuple):
     """Frames with a pose, at least one."""
     qpos: Float[np.ndarray, "T 27"]
     """Poses [m, rad]; missing ones repeat the last pose, or else the first."""
+    neutral: Float[np.ndarray, "20"] | None = None
+    """Joint angles [rad] of the pose in which those of the ISB are zero; None for the convention's zero."""
 
     @property
     def side(self) -> Side:
@@ -82,10 +85,12 @@ class PosedHand(NamedTuple):
         return self.model.shape.side
 
     @classmethod
-    def of(cls, model: HandModel, qpos: Float[np.ndarray, "T 27"]) -> PosedHand:
+    def of(
+        cls, model: HandModel, qpos: Float[np.ndarray, "T 27"], neutral: Float[np.ndarray, "20"] | None = None
+    ) -> PosedHand:
         """A hand with its poses, NaN where it has none."""
         present: NDArray[np.bool_] = np.isfinite(qpos[:, 0])
-        return cls(model, present, _held(qpos, present))
+        return cls(model, present, _held(qpos, present), neutral)
 
 
 class PosedBody(NamedTuple):
@@ -196,6 +201,8 @@ NUMBERS: Final[tuple[str, ...]] = (
     *(f"{keypoint}_{axis}_m" for keypoint in KEYPOINT_NAMES[1:] for axis in "xyz"),
 )
 """Columns after `frame`, `time_s` and `hand`, with positions in the world."""
+_FORMER: Final = {f"thumb_CMC_{n}_rad": f"thumb_metacarpal_{n}_rad" for n in ("abduction", "flexion")}
+"""Columns of earlier versions: markers on skin do not measure the carpometacarpal joint."""
 
 
 class JointTable(NamedTuple):
@@ -214,7 +221,7 @@ def read_joint_csv(path: Path) -> JointTable:
     text = read_bytes(path, error=CaptureError).decode("utf-8-sig", "replace")
     lines = csv.reader(text.splitlines())
     try:
-        titles = [title.strip() for title in next(lines, [])]
+        titles = [_FORMER.get(title.strip(), title.strip()) for title in next(lines, [])]
         wanted = [*_FIRST, *_QPOS]
         missing = [name for name in wanted if name not in titles]
         if missing:
@@ -260,13 +267,14 @@ def write_joint_csv(path: Path, motion: Motion, up: UpAxis = "z") -> None:
     """Write the table as text with nine digits, in the take's axes whatever `up` is."""
     hands = motion.hands
     tables = [_numbers(hand) for hand in hands]
-    row_format = ",%.9g" * len(NUMBERS)
+    titles = _titles(motion)
+    row_format = ",%.9g" * len(titles)
     with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8", newline="\n") as file:
-        file.write(",".join([*_FIRST, *NUMBERS]) + "\n")
+        file.write(",".join([*_FIRST, *titles]) + "\n")
         for frame, time in enumerate(motion.times.tolist()):
             for hand, table in zip(hands, tables, strict=True):
                 row = table[frame]
-                text = row_format % tuple(row.tolist()) if hand.present[frame] else "," * len(NUMBERS)
+                text = row_format % tuple(row.tolist()) if hand.present[frame] else "," * len(titles)
                 file.write(f"{frame},{time:.9g},{hand.side}{text}\n")
 
 
@@ -279,25 +287,33 @@ def write_joint_parquet(path: Path, motion: Motion, up: UpAxis = "z") -> None:
         raise HandSimError(".parquet needs pyarrow; run `pip install 'handsim[parquet]'`") from error
     hands = motion.hands
     count = len(hands)
-    numbers = np.stack([_numbers(hand) for hand in hands], axis=1).reshape(-1, len(NUMBERS))
+    titles = _titles(motion)
+    numbers = np.stack([_numbers(hand) for hand in hands], axis=1).reshape(-1, len(titles))
     columns = {
         "frame": pyarrow.array(np.repeat(np.arange(len(motion.times)), count)),
         "time_s": pyarrow.array(np.repeat(motion.times, count)),
         "hand": pyarrow.array([hand.side for hand in hands] * len(motion.times)),
         **{
             name: pyarrow.array(np.ascontiguousarray(column), from_pandas=True)  # NaN becomes null
-            for name, column in zip(NUMBERS, numbers.T, strict=True)
+            for name, column in zip(titles, numbers.T, strict=True)
         },
     }
     with atomic_write(path) as temporary, temporary.open("wb") as file:
         parquet.write_table(pyarrow.table(columns), file)
 
 
+def _titles(motion: Motion) -> tuple[str, ...]:
+    """The columns `NUMBERS`, and the angles of the ISB, whose names say if a neutral pose is zero."""
+    isb = "isb" if motion.hands[0].neutral is None else "isb_neutral"
+    return *NUMBERS, *(f"{name}_{isb}_rad" for name in ISB_NAMES)
+
+
 def _numbers(hand: PosedHand) -> Float[np.ndarray, "T K"]:
-    """The columns `NUMBERS`; NaN in frames without a pose."""
+    """The columns of `_titles`; NaN in frames without a pose."""
     qpos = hand.qpos
     keypoints = hand_keypoints(hand.model, qpos)[:, 1:].reshape(len(qpos), -1)
-    numbers = np.concatenate([qpos, keypoints], axis=1)
+    isb = isb_angles(hand.model.shape, qpos[:, 7:], hand.neutral)
+    numbers = np.concatenate([qpos, keypoints, isb], axis=1)
     numbers[~hand.present] = np.nan
     return numbers
 
@@ -316,6 +332,7 @@ def write_mot(path: Path, motion: Motion, up: UpAxis = "z") -> None:
         f"nRows={len(table)}",
         f"nColumns={table.shape[1]}",
         "inDegrees=yes",
+        "convention=model",
         "endheader",
         "\t".join(names),
     ]

@@ -69,6 +69,12 @@ _T: Final = ("T", "t", "tvec", "translation")
 _PAIRS: Final = {"intrinsics": "extrinsics", "intri": "extri"}
 """Files that belong together: of OpenCV's stereo sample, and of EasyMocap."""
 _OTHERS: Final = _PAIRS | {second: first for first, second in _PAIRS.items()}
+_FIELD: Final = "in units of their own; give the COLMAP reconstruction in meters that they were made of"
+_UNREAD: Final = {
+    "transform_matrix": f"the JSON of NeRF and nerfstudio, with poses {_FIELD}",
+    "img_name": f"the JSON of Gaussian Splatting, with poses {_FIELD}",
+}
+"""What files of other programs are, by a key of theirs."""
 _OF_ALL: Final = (*_WIDTH, *_HEIGHT, *_SIZE, *_FISHEYE, *_MODEL)
 _OF_ONE: Final = (*_K, *_D, "W", "H", *_OF_ALL, *_R, *_T)
 _SECTION: Final = re.compile(r"^[ \t]+[\"']?(?:" + "|".join(_K) + r")[\"']?[ \t]*:(?=\s)", re.M)
@@ -98,7 +104,9 @@ def read_opencv_cameras(path: Path) -> tuple[Camera, ...]:
         else:
             cameras = [_camera(values, "camera", _K, _D, _pose(values))]
     except HandSimError as error:
-        raise RigError(f"{path}: {error}") from error
+        alone = other != path and not other.is_file()
+        hint = f"; {other.name}, which belongs to it, is not beside it" if alone else ""
+        raise RigError(f"{path}: {error}{hint}") from error
     return checked_cameras(path, cameras)
 
 
@@ -277,7 +285,9 @@ def _check_baseline(vector: NDArray[np.float64]) -> None:
 def _matrix(values: Values, names: tuple[str, ...], shape: tuple[int, int]) -> NDArray[np.float64]:
     found = _find(values, names)
     if found is None:
-        raise RigError(f"no '{names[0]}', expected OpenCV's calibration with that name")
+        raise RigError(
+            f"no '{names[0]}' at the top level or in a table of each camera, expected OpenCV's calibration"
+        )
     return np.array(_value_numbers(values, found, shape)).reshape(shape)
 
 
@@ -314,16 +324,20 @@ def _read(path: Path) -> tuple[Values, Sections]:
         raise RigError(f"{path}: not a calibration: it is not UTF-8 text") from error
     if text.lstrip().startswith("<"):
         raise RigError(f"{path}: this is XML, expected OpenCV's YAML or JSON")
-    if not text.lstrip().startswith("{"):
+    if not text.lstrip().startswith(("{", "[")):
         return _yaml_tables(text)
     try:
         content = json.loads(text)
     except (ValueError, RecursionError) as error:
         raise RigError(f"{path}: not a calibration: it is no JSON") from error
-    if not isinstance(content, dict):
-        raise RigError(f"{path}: not a calibration: its JSON is no table")
+    if isinstance(content, list):
+        content = {"cameras": content}
     values = {str(key): _json_value(value) for key, value in content.items()}
-    return values, dict(_json_sections(content))
+    sections = dict(_json_sections(content))
+    known = next((what for key, what in _UNREAD.items() if f'"{key}"' in text), None)
+    if known is not None and not sections and _find(values, _K) is None:
+        raise RigError(f"{path}: this is {known}")
+    return values, sections
 
 
 def _yaml_tables(text: str) -> tuple[Values, Sections]:

@@ -150,10 +150,14 @@ class HandFigure:
             self.thickness = self.thickness + fit.layout.heights.max() + fit.layout.radius
 
     def drawn(
-        self, qpos: Float[np.ndarray, "27"], number: int, upper_arm: Float[np.ndarray, "3"] | None = None
+        self,
+        qpos: Float[np.ndarray, "27"],
+        number: int,
+        upper_arm: Float[np.ndarray, "3"] | None = None,
+        forearm: Float[np.ndarray, "3"] | None = None,
     ) -> list[Drawn]:
         """Skin, and markers where a glove is worn."""
-        skin, first_part = self.skin.posed(qpos, upper_arm), 1 + PARTS_A_HAND * number
+        skin, first_part = self.skin.posed(qpos, upper_arm, forearm), 1 + PARTS_A_HAND * number
         count = len(skin.faces)
         triangles = Triangles(
             skin.vertices,

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 
 from handsim._plugins import EGL_PACKAGES
 from handsim.errors import HandSimError
@@ -162,7 +162,7 @@ def paint_opengl(camera: Camera, drawn: Sequence[Drawn], lighting: Lighting) -> 
         scene.add(pyrender.Mesh([primitive]))
     lens = pyrender.IntrinsicsCamera(*camera.K[[0, 1, 0, 1], [0, 1, 2, 2]], znear=_NEAR, zfar=_FAR)
     scene.add(lens, pose=camera.T_world_camera @ OPENGL_FROM_OPENCV)
-    add_lights(pyrender, scene, lighting, camera.T_world_camera)
+    add_lights(pyrender, scene, lighting)
     flags = pyrender.RenderFlags
     return np.asarray(renderer.render(scene, flags=flags.RGBA | flags.SHADOWS_DIRECTIONAL)[0])
 
@@ -194,17 +194,11 @@ def pyrender_material(material: Material) -> Any:
     )
 
 
-def add_lights(
-    pyrender: Any, scene: Any, lighting: Lighting, T_world_camera: Float[np.ndarray, "4 4"]
-) -> None:
-    """Light a pyrender scene that holds its meshes already; its ambient light is replaced.
-
-    The lamps' directions are in the axes of the camera.
-    """
-    rotation = T_world_camera[:3, :3]
+def add_lights(pyrender: Any, scene: Any, lighting: Lighting) -> None:
+    """Light a pyrender scene that holds its meshes already; its ambient light is replaced."""
     scene.ambient_light = np.array(lighting.ambient)
     for number, lamp in enumerate(lighting.lamps):
-        towards = rotation @ (np.array(lamp.direction) / np.linalg.norm(lamp.direction))
+        towards = np.array(lamp.direction) / np.linalg.norm(lamp.direction)
         pose = np.eye(4)
         color, intensity = np.array(lamp.color), np.pi * lamp.strength
         if number == 0:
@@ -212,7 +206,7 @@ def add_lights(
             light = pyrender.DirectionalLight(color=color, intensity=intensity)
             _cast_shadows(pyrender, light, float(scene.scale))
         else:
-            pose[:3, 3] = T_world_camera[:3, 3] + towards * _DISTANCE
+            pose[:3, 3] = scene.centroid + towards * _DISTANCE
             light = pyrender.PointLight(color=color, intensity=intensity * _DISTANCE**2)
         scene.add(light, pose=pose)
 

@@ -10,6 +10,7 @@ import functools
 from collections.abc import Sequence
 from typing import Any, Final, Literal, NamedTuple
 
+import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
 from numpy.typing import NDArray
@@ -19,7 +20,7 @@ from handsim.space.camera import Camera
 from render.frames import Bytes, Doubles, Floats, Integers
 from render.painting.figures import Drawn
 from render.painting.opengl import opengl_has_hardware, paint_opengl
-from render.painting.rasterizer import NEAR, nearest_faces, project
+from render.painting.rasterizer import NEAR, cut_off, faces_for, nearest_faces, project, warp
 from render.painting.shading import (
     BUMP,
     COLOR,
@@ -31,11 +32,12 @@ from render.painting.shading import (
     TINT,
     TO_DISPLAY,
     TO_LINEAR,
+    ShadowMap,
     display,
     shade,
     shadow_map,
 )
-from render.scenery.lights import Lighting
+from render.scenery.lights import Lighting, turned_irradiance
 
 _SMOOTH: Final = 0.006  # share of the depth by which samples of one surface in a pixel differ
 _SHADED_AROUND: Final = 0.1  # border whose vertices may have faces in the picture, as a share of its size
@@ -55,22 +57,44 @@ class _Mesh(NamedTuple):
     finish: Doubles  # color, roughness, glow and scatter
 
 
-def paint_compiled(camera: Camera, drawn: Sequence[Drawn], lighting: Lighting) -> UInt8[np.ndarray, "H W 4"]:
-    """Colors and coverage, as `paint` has them, by our own code; machines differ by rounding alone."""
-    width, height = camera.size
-    meshes = _meshes(camera, drawn)
-    counts = np.cumsum([0, *(len(mesh.corners) for mesh in meshes)])
-    surfaces = [(mesh.corners, mesh.faces) for mesh in meshes]
-    nearness, first = nearest_faces(surfaces, (2 * width, 2 * height), farthest=0.0)
+def paint_compiled(
+    cameras: Sequence[Camera], drawn: Sequence[Drawn], lighting: Lighting
+) -> list[UInt8[np.ndarray, "H W 4"]]:
+    """Colors and coverage, as `paint` has them, by our own code; machines differ by rounding alone.
+
+    The cameras have one shadow map, so that shadows go on from one face of a lens to the next.
+    """
+    views = [_meshes(camera, drawn) for camera in cameras]
+    points = np.concatenate([one.triangles.vertices for one in drawn]).astype(np.float32, copy=False)
+    counts = np.cumsum([0, *(len(one.triangles.vertices) for one in drawn)])
+    casting = np.concatenate([one.casting + first for one, first in zip(drawn, counts, strict=False)])
+    seen = np.zeros(len(points), dtype=np.bool_)
+    for camera, meshes in zip(cameras, views, strict=True):
+        given = [mesh.corners[: len(one.triangles.vertices)] for mesh, one in zip(meshes, drawn, strict=True)]
+        sides = 2.0 * np.array(camera.size)
+        with np.errstate(invalid="ignore"):  # NaN behind the camera
+            inside = np.abs(np.concatenate(given)[:, :2] - 0.5 * sides) < (0.5 + _SHADED_AROUND) * sides
+        seen |= inside[:, 0] & inside[:, 1]
     lamps, around = _lamp_table(lighting), np.zeros((9, 3))
     around[: max(1, len(lighting.surroundings))] = lighting.surroundings or lighting.ambient
-    casting = np.concatenate([one.casting + first for one, first in zip(drawn, counts, strict=False)])
-    corners = np.concatenate([mesh.corners for mesh in meshes])
-    sides = 2.0 * np.array([width, height])
-    with np.errstate(invalid="ignore"):  # NaN behind the camera
-        inside = np.abs(corners[:, :2] - 0.5 * sides) < (0.5 + _SHADED_AROUND) * sides
-    points = np.concatenate([mesh.rows[:, :3] for mesh in meshes])
-    shadows = shadow_map(points, casting, lamps[0, :3], inside[:, 0] & inside[:, 1])
+    shadows = shadow_map(points, casting, lamps[0, :3], seen)
+    pictures = []
+    for camera, meshes in zip(cameras, views, strict=True):
+        rotation, turned = camera.T_world_camera[:3, :3], lamps.copy()
+        turned[:, :3] = lamps[:, :3] @ rotation
+        ambient = turned_irradiance(around, rotation.T)
+        own = shadows._replace(to_map=shadows.to_map @ camera.T_world_camera)
+        pictures.append(_painted(camera.size, meshes, turned, ambient, own))
+    return pictures
+
+
+def _painted(
+    size: tuple[int, int], meshes: Sequence[_Mesh], lamps: Doubles, around: Doubles, shadows: ShadowMap
+) -> Bytes:
+    """The picture of one camera, whose axes the light is in."""
+    width, height = size
+    surfaces = [(mesh.corners, mesh.faces) for mesh in meshes]
+    nearness, first = nearest_faces(surfaces, (2 * width, 2 * height), farthest=0.0)
     covered = _covered(first)
     sums = np.zeros((len(covered), 4), dtype=np.float32)  # sums over the four samples of a pixel
     for mesh in meshes:
@@ -96,16 +120,17 @@ def _meshes(camera: Camera, drawn: Sequence[Drawn]) -> list[_Mesh]:
     for one in drawn:
         triangles, material = one.triangles, one.material()
         local = camera.local(triangles.vertices)
+        cut = cut_off(local, triangles.faces)
         rows = np.zeros((len(local), 11), dtype=np.float32)
         rows[:, :3], rows[:, 3:6] = local, triangles.normals @ rotation
         rows[:, 6:9] = one.colors[:, :3]
         if one.uv is not None:
             rows[:, 9:] = one.uv
         texels = _NO_TEXELS if material.texels is None else material.texels.view(np.uint32)
-        faces = np.ascontiguousarray(triangles.faces, dtype=np.int64)
         finish = np.array([*material.color, material.roughness, material.glow, *material.scatter])
-        meshes.append(_Mesh(begin, faces, project(local, doubled), rows, texels, finish))
-        begin += len(faces)
+        corners = project(cut.local, doubled)
+        meshes.append(_Mesh(begin, cut.faces, corners, cut.mixed(rows), texels, finish))
+        begin += len(cut.faces)
     return meshes
 
 
@@ -279,15 +304,21 @@ def choose_painter() -> Painter:
 def paint(
     camera: Camera, drawn: Sequence[Drawn], lighting: Lighting, painter: Painter = "compiled"
 ) -> UInt8[np.ndarray, "H W 4"]:
-    """Colors over black (sRGB) by a pinhole camera, and as fourth channel the covered share of each pixel."""
-    paint_colors = {"compiled": paint_compiled, "opengl": paint_opengl}[painter]
-    width, height = camera.size
-    picture = np.zeros((height, width, 4), dtype=np.uint8)
-    left, top, right, bottom = _window(camera, drawn)
-    if left < right and top < bottom:
-        inner = camera.part(left, top, right - left, bottom - top)
-        picture[top:bottom, left:right] = paint_colors(inner, drawn, lighting)
-    return picture
+    """Colors over black (sRGB), and as fourth channel the covered share of each pixel, through any lens."""
+    faces, parts, inner = faces_for(camera), [], []
+    pictures = [np.zeros((*face.size[::-1], 4), dtype=np.uint8) for face in faces]
+    for face, picture in zip(faces, pictures, strict=True):
+        left, top, right, bottom = _window(face, drawn)
+        if left < right and top < bottom:
+            inner.append(face.part(left, top, right - left, bottom - top))
+            parts.append(picture[top:bottom, left:right])
+    if painter == "opengl":
+        painted = [paint_opengl(one, drawn, lighting) for one in inner]
+    else:
+        painted = paint_compiled(inner, drawn, lighting) if inner else []
+    for part, colors in zip(parts, painted, strict=True):
+        part[:] = colors
+    return np.asarray(warp(camera, pictures, cv2.INTER_LINEAR))
 
 
 def _window(camera: Camera, drawn: Sequence[Drawn]) -> tuple[int, int, int, int]:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import cv2
 import numpy as np
@@ -24,7 +24,7 @@ from handsim.space.camera import Camera, Lens, camera_matrix
 from render.frames import Bytes, Doubles, Flags, Floats, Geometry, Integers
 
 NEAR: Final = 0.01
-"""Triangles nearer to the camera's plane are not drawn [m]."""
+"""Distance of the plane before the camera at which triangles are cut off [m]."""
 _ROUNDING: Final = 1e-12  # of barycentric coordinates, so that no pixel on a common side falls between faces
 
 
@@ -73,19 +73,66 @@ def rasterize(camera: Camera, surface: Triangles, *, with_normals: bool = True) 
     The surface is closed; the backs of its faces are not drawn.
     """
     width, height = camera.size
-    local = camera.local(surface.vertices)
-    faces = np.ascontiguousarray(surface.faces, dtype=np.int64)
-    corners = project(local, camera.K)
+    cut = cut_off(camera.local(surface.vertices), surface.faces)
+    faces, corners = cut.faces, project(cut.local, camera.K)
     inverse, first = nearest_faces([(corners, faces)], camera.size, farthest=0.0)
     depth = np.zeros((height, width), dtype=np.float32)
     normals = np.zeros((height, width, 3), dtype=np.float32) if with_normals else None
     parts, instances, markers = (np.zeros((height, width), dtype=np.uint8) for _ in range(3))
-    labels = np.stack([surface.parts, surface.instances, surface.markers], axis=1)
+    labels = cut.owned(np.stack([surface.parts, surface.instances, surface.markers], axis=1))
     _write(inverse, first, labels, depth, parts, instances, markers)
     if normals is not None:
-        local_normals = surface.normals @ camera.T_world_camera[:3, :3]
+        local_normals = cut.mixed(surface.normals @ camera.T_world_camera[:3, :3])
         _interpolate(faces, local_normals, corners, first, normals)
     return Geometry(depth, normals, parts, instances, markers)
+
+
+class CutOff(NamedTuple):
+    """Triangles whose parts before the plane `NEAR` are further triangles behind the others."""
+
+    local: Float[np.ndarray, "V 3"]  # vertices in the camera's axes, those on the plane last [m]
+    faces: Int[np.ndarray, "F 3"]
+    owners: Int[np.ndarray, "N"]  # triangle that each further one is a part of
+    ends: Int[np.ndarray, "M 2"]  # vertices between which those on the plane lie
+    shares: Float[np.ndarray, "M 1"]  # places between them, from 0 to 1
+
+    def mixed(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Values of the vertices (V - M, ...), and of those on the plane."""
+        if not len(self.ends):
+            return values
+        first, second = values[self.ends[:, 0]], values[self.ends[:, 1]]
+        return np.concatenate([values, (first + self.shares * (second - first)).astype(values.dtype)])
+
+    def owned(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Values of the triangles (F - N, ...), and of the further ones."""
+        return np.concatenate([values, values[self.owners]]) if len(self.owners) else values
+
+
+def cut_off(local: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> CutOff:
+    """Triangles (in the camera's axes [m]) with those cut off that the plane `NEAR` crosses."""
+    faces = np.ascontiguousarray(faces, dtype=np.int64)
+    ahead = local[:, 2] >= NEAR
+    fronts = ahead[faces] if not ahead.all() else np.ones((len(faces), 3), dtype=np.bool_)
+    (crossed,) = np.nonzero(fronts.any(axis=1) & ~fronts.all(axis=1))
+    none = np.empty(0, dtype=np.int64)
+    if not len(crossed):
+        return CutOff(local, faces, none, none.reshape(0, 2), np.empty((0, 1)))
+    front = fronts[crossed]
+    one = front.sum(axis=1) == 1  # one corner is ahead, otherwise two are
+    lone = np.where(one, front.argmax(axis=1), front.argmin(axis=1))
+    around = faces[crossed[:, None], (lone[:, None] + np.arange(3)) % 3]
+    ends = np.sort(np.stack([around[:, :2], around[:, ::2]], axis=1).reshape(-1, 2), axis=1)
+    depths = local[ends, 2]
+    shares = ((NEAR - depths[:, 0]) / (depths[:, 1] - depths[:, 0]))[:, None]
+    left = len(local) + 2 * np.arange(len(crossed))
+    tips = np.stack([around[:, 0], left, left + 1], axis=1)
+    bases = np.stack([left, around[:, 1], around[:, 2]], axis=1)
+    rests = np.stack([left, around[:, 2], left + 1], axis=1)[~one]
+    pieces = np.concatenate([faces, np.where(one[:, None], tips, bases), rests])
+    cut = CutOff(local, pieces, np.concatenate([crossed, crossed[~one]]), ends, shares)
+    whole = cut.mixed(local)
+    whole[len(local) :, 2] = NEAR  # without rounding, so that `project` keeps them
+    return cut._replace(local=whole)
 
 
 def nearest_faces(

@@ -22,7 +22,7 @@ from handsim.space.camera import Camera
 from handsim.space.transforms import cross
 from render.frames import Doubles, Flags, Floats
 from render.painting.figures import Drawn
-from render.painting.rasterizer import NEAR, nearest_faces, project
+from render.painting.rasterizer import NEAR, cut_off, nearest_faces, project
 from render.scenery.backgrounds import Backdrop
 from render.scenery.lights import Lighting
 
@@ -118,7 +118,8 @@ def light_behind(
     """Share of its light that a backdrop keeps beside the first lamp's shadows; None without shadows."""
     if not drawn or not lighting.lamps:
         return None
-    normal = np.array([*backdrop.recedes, -1.0]) / np.linalg.norm([*backdrop.recedes, 1.0])
+    normal = backdrop.normal
+    lighting = lighting.turned(camera.T_world_camera[:3, :3].T)
     towards = np.array(lighting.lamps[0].direction) / np.linalg.norm(lighting.lamps[0].direction)
     if normal @ towards < _FLATTEST:
         return None
@@ -128,13 +129,15 @@ def light_behind(
     faces = np.concatenate([one.casting + start for one, start in zip(drawn, starts, strict=False)])
     size = np.array(camera.size, dtype=np.float64)
     fallen, distance = np.full_like(points, np.nan), np.zeros(2)
-    _fall(points, normal, towards, backdrop.gap, camera.K, size, fallen, distance)
+    level = np.nan if backdrop.level is None else backdrop.level
+    _fall(points, normal, towards, backdrop.gap, level, camera.K, size, fallen, distance)
     if distance[1] == 0.0:
         return None
     width, height = (-(-side // _COARSE) for side in camera.size)
-    corners = project(fallen, camera.K)
+    cut = cut_off(fallen, faces)
+    corners = project(cut.local, camera.K)
     corners[:, :2] /= _COARSE
-    _, front = nearest_faces([(corners, faces)], (width, height), farthest=0.0)
+    _, front = nearest_faces([(corners, cut.faces)], (width, height), farthest=0.0)
     mask = (front >= 0).astype(np.float32)
     if not mask.any():
         return None
@@ -156,6 +159,7 @@ def _fall(
     normal: Doubles,
     towards: Doubles,
     gap: float,
+    level: float,
     K: Doubles,
     size: Doubles,
     fallen: Doubles,
@@ -163,9 +167,10 @@ def _fall(
 ) -> None:
     """Write where the shadows of points (V, 3) fall on a backdrop, in the camera's axes [m].
 
-    The backdrop's normal looks towards the camera, and the gap separates it from the nearest point in the
-    picture. Points behind it have no shadow, and their rows are not written. `distance` (2,) gets the points'
-    mean distance from the backdrop and its mean depth behind them, or zeros if no point is in the picture.
+    The backdrop's normal looks towards the camera. It has this level along the normal; where that is NaN, the
+    gap separates it from the nearest point in the picture. Points behind it have no shadow, and their rows
+    are not written. `distance` (2,) gets the points' mean distance from the backdrop and its mean depth
+    behind them, or zeros if no point is in the picture.
     """
     seen = np.zeros(len(points), dtype=np.bool_)
     nearest = np.inf
@@ -177,11 +182,13 @@ def _fall(
             if -_MARGIN < across < 1.0 + _MARGIN and -_MARGIN < down < 1.0 + _MARGIN:
                 seen[number] = True
                 nearest = min(nearest, x * normal[0] + y * normal[1] + z * normal[2])
+    if np.isnan(level):
+        level = nearest - gap
     steep = normal[0] * towards[0] + normal[1] * towards[1] + normal[2] * towards[2]
     count = 0
     for number in range(len(points)):
         x, y, z = points[number]
-        height = x * normal[0] + y * normal[1] + z * normal[2] - nearest + gap
+        height = x * normal[0] + y * normal[1] + z * normal[2] - level
         if height >= 0.0:
             for axis in range(3):
                 fallen[number, axis] = points[number, axis] - height / steep * towards[axis]

@@ -29,7 +29,7 @@ from handsim.files.outputs import plain_path
 from handsim.kernels import kernel
 from handsim.space.camera import Camera, Lens
 from render.fields import normal_numbers
-from render.frames import Bytes, Doubles, Floats, Geometry
+from render.frames import Bytes, Doubles, Flags, Floats, Geometry
 from render.scenery.rooms import RoomLight, cast_room, draw_room, paint_tints
 
 PHOTO_SUFFIXES: Final = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
@@ -138,6 +138,13 @@ class Backdrop:
     gap: float  # distance from the nearest point of the hands [m]
     recedes: tuple[float, float] = (0.0, 0.0)  # slopes to the right and downwards
     softness: float = 0.1  # tangent of half the angle under which it sees the lamp
+    level: float | None = None
+    """Position along its normal in the camera's axes [m]; None: the gap is from the hands of each picture."""
+
+    @property
+    def normal(self) -> Float[np.ndarray, "3"]:
+        """Unit normal in the camera's axes, towards the camera."""
+        return np.asarray(np.array([*self.recedes, -1.0]) / np.linalg.norm([*self.recedes, 1.0]))
 
 
 def sample_backdrop(*, rng: np.random.Generator) -> Backdrop | None:
@@ -371,6 +378,7 @@ Corner = tuple[float, float, float]
 _MARGIN: Final = (0.8, 2.2)  # range of the distance between the outermost camera or hand and a wall [m]
 _FREE: Final = 0.5  # distance of furniture from the box around hands and cameras [m]
 _TEXTURE: Final = 512  # width and height of a wall's picture [px]
+_TO_WALL: Final = 0.95  # share of the way to a wall at which a room's lamp is
 _SHORTEST: Final = 1e-6  # least component of a ray, so that it meets a wall along each axis
 
 
@@ -381,6 +389,7 @@ class Enclosure:
     low: Corner  # [m]
     high: Corner
     free: tuple[Corner, Corner]  # low and high corner of the box that hands and cameras stay in [m]
+    lamp: Corner  # place of a room's lamp, which is the first lamp of the hands [m]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -397,17 +406,45 @@ class Surroundings:
         bare = (pictures.instances == 0) & (self.depth > 0.0)
         normals = pictures.normals
         if normals is not None:
-            normals = normals.copy()
-            normals[bare] = camera.T_world_camera[:3, :3][self.axes[bare]] * self.signs[bare][:, None]
+            normals, rotation = normals.copy(), camera.T_world_camera[:3, :3].astype(np.float32)
+            facing = np.concatenate([-rotation, rotation]).take(self.axes + 3 * (self.signs > 0), axis=0)
+            np.copyto(normals, facing, where=bare[..., None])
         return pictures._replace(depth=np.where(bare, self.depth, pictures.depth), normals=normals)
 
 
-def enclose(positions: Float[np.ndarray, "N 3"], seed: int) -> Enclosure:
-    """A random box around cameras and hands."""
+def enclose(
+    positions: Float[np.ndarray, "N 3"], seed: int, towards_lamp: Float[np.ndarray, "3"]
+) -> Enclosure:
+    """A random box around cameras and hands, with its lamp in this direction from their middle."""
     below, above = np.random.default_rng([seed, 0]).uniform(*_MARGIN, (2, 3))
     low, high = positions.min(axis=0), positions.max(axis=0)
-    free = _corner(low - _FREE), _corner(high + _FREE)
-    return Enclosure(_corner(low - below), _corner(high + above), free)
+    free, middle = (_corner(low - _FREE), _corner(high + _FREE)), 0.5 * (low + high)
+    low, high, towards = low - below, high + above, _sloping(towards_lamp)
+    way = (np.where(towards > 0.0, high - middle, low - middle) / towards).min()
+    return Enclosure(_corner(low), _corner(high), free, _corner(middle + _TO_WALL * way * towards))
+
+
+def _sloping(rays: NDArray[Any]) -> NDArray[Any]:
+    """Rays (..., 3) that meet a wall along each axis."""
+    return np.where(np.abs(rays) < _SHORTEST, np.asarray(_SHORTEST, rays.dtype), rays)
+
+
+def light_in(
+    background: Background, enclosure: Enclosure, directions: Float[np.ndarray, "D 3"]
+) -> Float[np.ndarray, "D 3"]:
+    """Linear light that comes to the middle of the free box from these directions."""
+    met = _meet(background, enclosure, np.mean(enclosure.free, axis=0), directions)
+    return np.asarray(np.clip(met.light, 0.0, 1.0))
+
+
+def _meet(background: Background, enclosure: Enclosure, eye: Doubles, rays: NDArray[Any]) -> RoomLight:
+    """What rays (N, 3) from an eye in the world [m] meet in the box."""
+    rays, low, high = _sloping(rays), np.array(enclosure.low), np.array(enclosure.high)
+    if background.kind != "room":
+        return _meet_walls(rays, eye - low, high - low, _wall_pictures(background, enclosure))
+    free, lamp = np.array(enclosure.free) - low, np.array(enclosure.lamp) - low
+    rng = np.random.default_rng([background.seed, 1])
+    return cast_room(rays.astype(np.float32, copy=False), eye - low, high - low, free, lamp, rng=rng)
 
 
 def _corner(point: Doubles) -> Corner:
@@ -430,27 +467,28 @@ def _drawn(
     lens: Lens,
     pose: bytes,
 ) -> Surroundings:
-    T_world_camera = np.frombuffer(pose).reshape(4, 4)
-    rays = Camera("rays", size, np.reshape(focal, (3, 3)), lens=lens).rays()
-    known = np.isfinite(rays).all(axis=-1)
-    world = (np.where(known[..., None], rays, 1.0) @ T_world_camera[:3, :3].T).reshape(-1, 3)
-    world[np.abs(world) < _SHORTEST] = _SHORTEST
-    low, high = np.array(enclosure.low), np.array(enclosure.high)
-    eye, rng = T_world_camera[:3, 3] - low, np.random.default_rng([background.seed, 1])
-    if background.kind == "room":
-        free = np.array(enclosure.free) - low
-        met = cast_room(world.astype(np.float32), eye, high - low, free, rng=rng)
-    else:
-        met = _meet_walls(world, eye, high - low, _wall_pictures(background, enclosure))
-    shape = size[::-1]
-    light = np.clip(met.light, 0.0, 1.0).reshape(*shape, 3) * known[..., None]
+    T_world_camera, (rays, known) = np.frombuffer(pose).reshape(4, 4), _rays(size, focal, lens)
+    world = rays @ T_world_camera[:3, :3].T.astype(np.float32)
+    met, shape = _meet(background, enclosure, T_world_camera[:3, 3], world), size[::-1]
+    light = np.clip(met.light, 0.0, 1.0).reshape(*shape, 3)
+    if not known.all():
+        light *= known[..., None]
     if background.blur * shape[0] > 0.3:
         light = cv2.GaussianBlur(light, (0, 0), background.blur * shape[0])
-    rgb = np.rint(255.0 * cv2.pow(light.astype(np.float32), 1.0 / _GAMMA)).astype(np.uint8)
-    depth = met.distances.reshape(shape) * np.where(known, rays[..., 2], 0.0)
-    along = np.take_along_axis(world, met.axes.reshape(-1, 1).astype(np.int64), axis=1)
-    signs = -np.sign(along).astype(np.int8).reshape(shape)
-    return Surroundings(rgb, np.maximum(depth, 0.0).astype(np.float32), met.axes.reshape(shape), signs)
+    light = cv2.pow(light, 1.0 / _GAMMA)
+    rgb = np.rint(np.multiply(light, np.float32(255.0), out=light), out=light).astype(np.uint8)
+    depth = np.where(known, np.maximum(met.distances * rays[:, 2], 0.0).reshape(shape), np.float32(0.0))
+    flat = np.arange(0, 3 * len(world), 3) + met.axes
+    signs = np.where(world.ravel().take(flat) > 0.0, np.int8(-1), np.int8(1)).reshape(shape)
+    return Surroundings(rgb, depth, met.axes.reshape(shape), signs)
+
+
+@functools.lru_cache(maxsize=4)
+def _rays(size: tuple[int, int], focal: tuple[float, ...], lens: Lens) -> tuple[Floats, Flags]:
+    """Rays (H W, 3) in a camera's axes, any where the lens sees nothing, and where (H, W) it sees."""
+    rays = Camera("rays", size, np.reshape(focal, (3, 3)), lens=lens).rays()
+    known = np.isfinite(rays).all(axis=-1)
+    return np.where(known[..., None], rays, 1.0).reshape(-1, 3).astype(np.float32), known
 
 
 @functools.lru_cache(maxsize=2)
@@ -471,22 +509,42 @@ def _wall_pictures(background: Background, enclosure: Enclosure) -> Float32[np.n
     return np.concatenate(pictures)
 
 
-def _meet_walls(rays: Doubles, eye: Doubles, room: Doubles, pictures: Floats) -> RoomLight:
+def _meet_walls(rays: NDArray[Any], eye: Doubles, room: Doubles, pictures: Floats) -> RoomLight:
     """Where rays (N, 3) from the eye (3,) meet the walls of an empty room (3,), and the pictures there."""
-    far = rays > 0.0
-    ways = (np.where(far, room, 0.0) - eye) / rays
-    axes = ways.argmin(axis=1)
-    row = np.arange(len(rays))
-    distances = ways[row, axes]
-    share = np.clip((eye + distances[:, None] * rays) / room, 0.0, 1.0)
-    across, up = share[row, np.where(axes == 0, 1, 0)], share[row, np.where(axes == 2, 1, 2)]
-    inner = _TEXTURE - 1.0
-    wall = 2 * axes + far[row, axes]
-    columns = (across * inner).astype(np.float32)
-    rows = (wall * _TEXTURE + (1.0 - up) * inner).astype(np.float32)
+    distances, axes = np.empty(len(rays), np.float32), np.empty(len(rays), np.int8)
+    places = np.empty((len(rays), 1, 2), np.float32)
+    _find_walls(rays, eye, room, distances, axes, places[:, 0])
     strip = 2**14  # pictures of `remap` have at most 32767 rows
-    light = np.empty((len(rays), 3), dtype=np.float32)
-    for begin in range(0, len(rays), strip):
-        part = slice(begin, begin + strip)
-        light[part] = cv2.remap(pictures, columns[part], rows[part], cv2.INTER_LINEAR).reshape(-1, 3)
-    return RoomLight(light, distances.astype(np.float32), axes.astype(np.int8))
+    parts = np.split(places, range(strip, len(rays), strip))
+    light = [cv2.remap(pictures, part, None, cv2.INTER_LINEAR)[:, 0] for part in parts]
+    return RoomLight(np.concatenate(light), distances, axes)
+
+
+@kernel
+def _find_walls(
+    rays: NDArray[Any],
+    eye: Doubles,
+    room: Doubles,
+    distances: Floats,
+    axes: NDArray[np.int8],
+    places: Floats,
+) -> None:
+    """Write distance (N,) [m] and axis (N,) of the wall that each ray meets, and its place in the pictures.
+
+    A place (N, 2) is a column and a row of the six walls' pictures, one below the other [px].
+    """
+    inner = _TEXTURE - 1.0
+    for ray in range(len(rays)):
+        distance, wall = np.inf, 0
+        for axis in range(3):
+            far = rays[ray, axis] > 0.0
+            way = ((room[axis] if far else 0.0) - eye[axis]) / rays[ray, axis]
+            if way < distance:
+                distance, wall = way, 2 * axis + int(far)
+        axis = wall // 2
+        wide, high = (1 if axis == 0 else 0), (1 if axis == 2 else 2)
+        across = (eye[wide] + distance * rays[ray, wide]) / room[wide]
+        up = (eye[high] + distance * rays[ray, high]) / room[high]
+        distances[ray], axes[ray] = distance, axis
+        places[ray, 0] = inner * min(max(across, 0.0), 1.0)
+        places[ray, 1] = wall * _TEXTURE + inner * (1.0 - min(max(up, 0.0), 1.0))

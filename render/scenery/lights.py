@@ -1,7 +1,7 @@
-"""The light in a picture: one lamp that casts shadows, a few that do not, and ambient light.
+"""The light of a scene: one lamp that casts shadows, a few that do not, and ambient light.
 
-Directions are in the camera's axes (x right, y down, z ahead)
-and point from the hand to the lamp, so that the same lighting suits every view.
+Directions are in the world's axes and point from the hand to the lamp. Random light is drawn in the axes of a
+viewer before the hands (x right, y down, z ahead), and then stays where it is for all cameras.
 """
 
 from __future__ import annotations
@@ -16,14 +16,20 @@ import numpy as np
 from jaxtyping import Float
 
 from render.frames import Doubles, Integers
-from render.scenery.backgrounds import Background, Backgrounds, kept_background, sample_background
-from render.skin.look import SkinLook
+from render.scenery.backgrounds import (
+    Background,
+    Backgrounds,
+    Enclosure,
+    enclose,
+    kept_background,
+    light_in,
+    sample_background,
+)
 
 _SIZE: Final = (64, 48)  # size of the picture that gives light [px]
 _DIRECTIONS: Final = 1024  # directions in which the picture's light is sampled
-_MIDDLE_SKIN: Final = 0.3  # reflectance of the skin that needs no compensation
-_METERED: Final = 0.5  # share of the difference between skins that exposure compensates
 _SHARE: Final = (0.1, 0.5)  # range of the share of ambient light that has the picture's colors
+_LEVEL: Final = 1.65  # usual light of a white surface before all lamps, 1 for the picture's full white
 _LUMINANCE: Final = np.array([0.2126, 0.7152, 0.0722])
 # Factors of a matt surface on each order, and integrals of the squared functions over the sphere.
 _MATT: Final = np.array([1.0, *[2.0 / 3.0] * 3, *[0.25] * 5])
@@ -35,7 +41,7 @@ class Lamp:
     """A far lamp."""
 
     direction: tuple[float, float, float]
-    """Direction towards the lamp in the camera's axes; of any length."""
+    """Direction towards the lamp in the world's axes; of any length."""
     strength: float
     """Light that a white surface facing the lamp reflects, 1 for the picture's full white."""
     color: tuple[float, float, float] = (1.0, 1.0, 1.0)  # linear color, about 1 in the mean
@@ -43,12 +49,20 @@ class Lamp:
 
 @dataclass(frozen=True, slots=True)
 class Lighting:
-    """All light of one picture."""
+    """All light of one scene."""
 
     lamps: tuple[Lamp, ...]  # the first casts shadows
     ambient: tuple[float, float, float]  # ambient light that a white surface reflects, linear
     surroundings: tuple[tuple[float, float, float], ...] = ()
-    """Ambient light by the surface's normal, see `surroundings.irradiance`; OpenGL uses `ambient` instead."""
+    """Ambient light by the surface's normal, see `irradiance`; OpenGL uses `ambient` instead."""
+
+    def turned(self, rotation: Float[np.ndarray, "3 3"]) -> Lighting:
+        """This light seen from other axes, to which the rotation turns vectors."""
+        lamps = (
+            dataclasses.replace(lamp, direction=_triple(rotation @ lamp.direction)) for lamp in self.lamps
+        )
+        rows = turned_irradiance(np.reshape(self.surroundings, (-1, 3)), rotation)
+        return Lighting(tuple(lamps), self.ambient, tuple(map(_triple, rows)))
 
 
 STUDIO: Final = Lighting(
@@ -59,13 +73,14 @@ STUDIO: Final = Lighting(
     ),
     (0.16, 0.16, 0.16),
 )
-"""Even light of ready-made pictures: a key light, a fill and a rim."""
+"""Even light of ready-made pictures in the viewer's axes: a key light, a fill and a rim."""
 
 
 def sample_lighting(*, rng: np.random.Generator) -> Lighting:
     """Random light: a key lamp from in front or above, fill, sky and ground, each with its color."""
-    exposure = float(np.exp(np.clip(rng.normal(0.06, 0.18), -0.35, 0.4)))
-    warmth = rng.normal(0.06, 0.06)  # lamps are warm, and white balances keep some of it
+    # The back of a hand sends back the light of its own color in the median of views.
+    exposure = _LEVEL * float(np.exp(np.clip(rng.normal(0.0, 0.18), -0.4, 0.4)))
+    warmth = rng.normal(0.0, 0.06)  # lamps are warm or cold, and white balances keep some of it
     # These shares give an open palm the standard deviation of lightness that photographs have, 3.6.
     key_share, ambient_share = rng.uniform(0.52, 0.86), rng.uniform(0.09, 0.19)
     # The key light comes from above more often than from below, and seldom from behind the hand.
@@ -107,59 +122,74 @@ def _triple(values: Doubles) -> tuple[float, float, float]:
 
 
 def sample_surroundings(
-    config: Backgrounds, skin: SkinLook | None, size: tuple[int, int] = _SIZE, *, rng: np.random.Generator
-) -> tuple[Background, Lighting]:
-    """A random background and random light, exposed for this skin; None stands for gloves.
+    config: Backgrounds,
+    viewer: Float[np.ndarray, "3 3"],
+    size: tuple[int, int] = _SIZE,
+    around: Float[np.ndarray, "N 3"] | None = None,
+    *,
+    rng: np.random.Generator,
+) -> tuple[Background, Lighting, Enclosure | None]:
+    """A random background and its light for a viewer with these axes, as columns in the world's.
 
-    The background is painted once if `size` is that of the picture [px].
+    Cameras and hands at positions `around` [m] are in an enclosure. Otherwise the background is a picture,
+    which is painted once if `size` is that of the camera's [px].
     """
-    background, lighting = sample_background(config, rng=rng), sample_lighting(rng=rng)
-    picture = cv2.resize(kept_background(background, size), _SIZE, interpolation=cv2.INTER_AREA)
-    lighting = surround(lighting, picture, rng.uniform(*_SHARE))
-    return background, lighting if skin is None else expose_for(lighting, skin)
+    background, lighting = sample_background(config, rng=rng), sample_lighting(rng=rng).turned(viewer)
+    share = float(rng.uniform(*_SHARE))
+    if around is None:
+        picture = cv2.resize(kept_background(background, size), _SIZE, interpolation=cv2.INTER_AREA)
+        return background, surround(lighting, turned_irradiance(irradiance(picture), viewer), share), None
+    enclosure = enclose(around, background.seed, np.array(lighting.lamps[0].direction))
+    light = light_in(background, enclosure, _sphere()[0])
+    return background, surround(lighting, _projected(light), share), enclosure
 
 
-def expose_for(lighting: Lighting, skin: SkinLook) -> Lighting:
-    """The lighting after automatic exposure, which makes half up for the difference between skins."""
-    reflectance = ((skin.lightness + 16.0) / 116.0) ** 3  # CIELAB's definition
-    gain = float((_MIDDLE_SKIN / reflectance) ** _METERED)
-    lamps = tuple(dataclasses.replace(lamp, strength=gain * lamp.strength) for lamp in lighting.lamps)
-    red, green, blue = (gain * level for level in lighting.ambient)
-    around = tuple((gain * r, gain * g, gain * b) for r, g, b in lighting.surroundings)
-    return Lighting(lamps, (red, green, blue), around)
-
-
-def surround(lighting: Lighting, picture: Float[np.ndarray, "H W 3"], share: float) -> Lighting:
-    """Give a share of the ambient light the colors of a picture; its luminance stays."""
+def surround(lighting: Lighting, rows: Float[np.ndarray, "9 3"], share: float) -> Lighting:
+    """Give a share of the ambient light the colors of an irradiance; its luminance stays."""
     ambient = np.array(lighting.ambient)
-    rows = irradiance(picture)
-    rows *= share * (ambient @ _LUMINANCE) / max(float(rows[0] @ _LUMINANCE), 1e-4)
+    rows = rows * share * (ambient @ _LUMINANCE) / max(float(rows[0] @ _LUMINANCE), 1e-4)
     rows[0] += (1.0 - share) * ambient
-    table = [(float(red), float(green), float(blue)) for red, green, blue in rows]
-    return dataclasses.replace(lighting, ambient=table[0], surroundings=tuple(table))
+    table = tuple(map(_triple, rows))
+    return dataclasses.replace(lighting, ambient=table[0], surroundings=table)
 
 
 def irradiance(picture: Float[np.ndarray, "H W 3"]) -> Float[np.ndarray, "9 3"]:
-    """Light of a white matt surface in a picture's light, by its normal (x, y, z) in the camera's axes.
+    """Light of a white matt surface in a picture's light, by its normal (x, y, z) in the viewer's axes.
 
     Rows are factors of 1, x, y, z, xy, yz, xz, x^2 - y^2 and 3 z^2 - 1.
     """
     height, width = picture.shape[:2]
-    pixels, functions = _looked_up(width, height)
-    light = picture.reshape(-1, 3).take(pixels, axis=0).astype(np.float64)
-    projected = functions.T @ light * (4.0 * np.pi / len(functions))
-    return (_MATT / _SQUARES)[:, None] * projected
+    return _projected(picture.reshape(-1, 3).take(_looked_up(width, height), axis=0).astype(np.float64))
+
+
+def _projected(light: Doubles) -> Doubles:
+    """The rows of `irradiance` for light (D, 3) from the directions of `_sphere`."""
+    functions = _sphere()[1]
+    return np.asarray((_MATT / _SQUARES)[:, None] * (functions.T @ light) * (4.0 * np.pi / len(functions)))
+
+
+def turned_irradiance(rows: Float[np.ndarray, "N 3"], rotation: Float[np.ndarray, "3 3"]) -> Doubles:
+    """Rows of `irradiance`, or of none of its rows, by the normal in axes that the rotation turns to."""
+    if not len(rows):
+        return rows
+    square = np.empty((3, 3, 3))  # the quadratic part as a symmetric matrix for each color
+    square[[0, 1, 0], [1, 2, 2]] = square[[1, 2, 2], [0, 1, 0]] = 0.5 * rows[4:7]
+    square[[0, 1, 2], [0, 1, 2]] = rows[7] - rows[8], -rows[7] - rows[8], 2.0 * rows[8]
+    square = np.einsum("ij,jkc,lk->ilc", rotation, square, rotation)
+    mixed = 2.0 * square[[0, 1, 0], [1, 2, 2]]
+    differences = [0.5 * (square[0, 0] - square[1, 1]), 0.5 * square[2, 2]]
+    return np.concatenate([rows[:1], rotation @ rows[1:4], mixed, differences])
 
 
 @functools.lru_cache(maxsize=4)
-def _looked_up(width: int, height: int) -> tuple[Integers, Doubles]:
-    """Pixel of a picture for each direction (D,), and the nine functions of the direction (D, 9)."""
-    directions, functions = _sphere()
+def _looked_up(width: int, height: int) -> Integers:
+    """Pixel of a picture for each direction of `_sphere` (D,)."""
+    directions, _ = _sphere()
     away = np.arccos(np.abs(directions[:, 2])) / (np.pi / 2)
     aside = directions[:, :2] / np.maximum(np.linalg.norm(directions[:, :2], axis=1, keepdims=True), 1e-9)
     points = 0.5 + 0.5 * away[:, None] * aside
     columns, rows = np.minimum((points * (width, height)).astype(int), (width - 1, height - 1)).T
-    return rows * width + columns, functions
+    return np.asarray(rows * width + columns)
 
 
 @functools.cache

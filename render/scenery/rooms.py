@@ -139,13 +139,13 @@ def _scene(seed: int) -> _Scene:
 
 
 def cast_room(
-    rays: Floats, eye: Doubles, room: Doubles, free: Doubles, *, rng: np.random.Generator
+    rays: Floats, eye: Doubles, room: Doubles, free: Doubles, lamp: Doubles, *, rng: np.random.Generator
 ) -> RoomLight:
-    """A random room of this size (3,) along rays (N, 3) from an eye, without furniture in the box `free`.
+    """A random room of this size (3,) with this lamp along rays (N, 3) from an eye; no furniture in `free`.
 
     An equal `rng` gives the same room for every eye.
     """
-    lamp, strength = room * rng.uniform((0.1, 0.1, 0.7), (0.9, 0.9, 1.0)), rng.uniform(0.55, 1.1)
+    strength = rng.uniform(0.55, 1.1)
     walls, boxes = _paint_walls(room, rng), _place_boxes(room, np.full(3, -np.inf), rng)
     kept = ((boxes.corners[:, 1] < free[0]) | (boxes.corners[:, 0] > free[1])).any(axis=1)
     return _cast_all(rays, eye, room, walls, _Boxes(*(part[kept] for part in boxes)), lamp, strength)

@@ -144,7 +144,7 @@ def sample_skin_look(tones: Sequence[float] = ALL_TONES, *, rng: np.random.Gener
     lightness = 50.0 + yellowness * float(np.tan(np.deg2rad(angle)))
     # The colors of all people's palms are alike, near the color of light skin on the back of the hand.
     paleness = rng.uniform(0.6, 0.75)
-    palm = max(lightness, (1.0 - paleness) * lightness + paleness * 66.0) + rng.uniform(0.0, 2.0)
+    palm = max(lightness, (1.0 - paleness) * lightness + paleness * 66.0) + rng.uniform(2.0, 4.0)
     polish = rng.uniform(0.75, 1.0) if rng.random() < 0.08 else 0.0
     color = rng.uniform((25.0, 10.0, -15.0), (75.0, 60.0, 30.0))
     strengths = np.exp(np.clip(rng.normal(0.0, 0.3, 5), -0.7, 0.7))
@@ -188,10 +188,12 @@ _HEM: Final = 0.004  # distance of this step from the next rings, so that shadin
 _SQUARE: Final = 0.8  # power of cosine and sine in an arm's section, which is squarer than an ellipse (1)
 _LONGER: Final = 1.04  # girth of this section over that of the ellipse with the same axes
 _BLEND: Final = 0.22  # length of the blend from the hand's section to the arm's [hand lengths]
-_BEND: Final = 0.20  # length of the bend of the wrist [hand lengths]
+BEND: Final = 0.20
+"""Length of the bend of the wrist [hand lengths]."""
 ELBOW: Final = _PLACES[4]
 """Place of the elbow behind the wrist [hand lengths]."""
-_ELBOW_BEND: Final = 0.07  # length on either side of the elbow that bends with it [m]
+ELBOW_BEND: Final = 0.07
+"""Length on either side of the elbow that bends with it [m]."""
 REACH: Final = 1.8
 """Length behind the elbow of arms that leave a picture [m]."""
 _TURNS: Final = np.deg2rad([0, 20, -20, 40, -40, 60, -60, 90, -90, 120, -120, 150, -150, 180])
@@ -277,22 +279,29 @@ def arm_places(forearm: Forearm, rings: int) -> Doubles:
     return places
 
 
-def bent_rings(rings: Doubles, elbow: float, towards: Doubles) -> Doubles:
-    """Rings (K, R, 3) of an arm that bends at its elbow to this direction and ends `REACH` behind it [m]."""
+def bent_rings(
+    rings: Doubles, at: float, half: float, towards: Doubles, reach: float | None = None
+) -> Doubles:
+    """Rings (K, R, 3) of an arm that bends to a direction, from `half` before to `half` behind a place.
+
+    Places are behind the first ring, where the arm is straight beyond the bend; with `reach`, it ends so far
+    behind the place [m].
+    """
     middles = rings.mean(axis=1)
     ahead = middles[-1] - middles[-2]
     ahead /= np.linalg.norm(ahead)
     steps = np.linalg.norm(np.diff(middles, axis=0), axis=1)
-    beyond = np.concatenate([[0.0], np.cumsum(steps)]) - elbow
-    turned = np.flatnonzero(beyond > -_ELBOW_BEND)
-    start = middles[turned[0]] - (beyond[turned[0]] + _ELBOW_BEND) * ahead
-    beyond[-1] = REACH
+    beyond = np.concatenate([[0.0], np.cumsum(steps)]) - at
+    turned = np.flatnonzero(beyond > -half)
+    start = middles[turned[0]] - (beyond[turned[0]] + half) * ahead
+    if reach is not None:
+        beyond[-1] = reach
     axis = cross(ahead, towards)
     sine = float(np.linalg.norm(axis))
     axis = axis / sine if sine > 1e-6 else cross(ahead, np.eye(3)[np.abs(ahead).argmin()])
     most, aside = np.arctan2(sine, ahead @ towards), cross(axis, ahead)
-    fine = np.concatenate([np.linspace(-_ELBOW_BEND, _ELBOW_BEND, 33), [REACH]])
-    angles = most * smooth(fine, -_ELBOW_BEND, _ELBOW_BEND)
+    fine = np.concatenate([np.linspace(-half, half, 33), beyond[-1:]])
+    angles = most * smooth(fine, -half, half)
     ways = np.cos(angles)[:, None] * ahead + np.sin(angles)[:, None] * aside
     course = np.zeros((len(fine), 3))
     course[1:] = np.cumsum(0.5 * (ways[1:] + ways[:-1]) * np.diff(fine)[:, None], axis=0)
@@ -307,8 +316,13 @@ def bent_rings(rings: Doubles, elbow: float, towards: Doubles) -> Doubles:
     return bent
 
 
-def upper_arms(elbows: Doubles, forearms: Doubles, cameras: Sequence[Camera]) -> Doubles:
-    """Unit directions (H, 3) from elbows in which arms leave the pictures of all cameras, if possible."""
+def upper_arms(
+    elbows: Doubles, forearms: Doubles, cameras: Sequence[Camera], shoulders: Doubles | None = None
+) -> Doubles:
+    """Unit directions (H, 3) from elbows in which arms leave the pictures of all cameras, if possible.
+
+    They are those to shoulders (H, 3) where these are known and the pictures allow it.
+    """
     axis = np.mean([camera.T_world_camera[:3, 2] for camera in cameras], axis=0)
     if np.linalg.norm(axis) < 0.2:  # the cameras stand all around the arms
         axis = cameras[0].T_world_camera[:3, 2]
@@ -317,6 +331,12 @@ def upper_arms(elbows: Doubles, forearms: Doubles, cameras: Sequence[Camera]) ->
     body -= (body @ axis) * axis
     body /= max(float(np.linalg.norm(body)), 1e-6)
     found = []
+    if shoulders is not None:
+        ways = shoulders - elbows
+        ways /= np.linalg.norm(ways, axis=1, keepdims=True)
+        return np.array(
+            [_out_of_pictures(*one, axis, cameras) for one in zip(elbows, forearms, ways, strict=True)]
+        )
     for elbow, forearm in zip(elbows, forearms, strict=True):
         flat = forearm - (forearm @ axis) * axis
         level = float(np.linalg.norm(flat))
@@ -365,7 +385,7 @@ def _half_axes(shape: HandShape, forearm: Forearm, behind: Doubles) -> tuple[Dou
 def _course(shape: HandShape, forearm: Forearm, behind: Doubles) -> tuple[Doubles, Doubles]:
     """Axes (K, 3, 3) and middles (K, 3) of the sections of an arm that bends at the wrist alone."""
     fine = np.linspace(0.0, behind[-1], 200)
-    share = smooth(fine, 0.0, _BEND * shape.length)
+    share = smooth(fine, 0.0, BEND * shape.length)
     # Seen from a hand that bends towards its palm (-z) or thumb (y), the arm bends there, too.
     up, aside = forearm.flexion * share, forearm.deviation * share
     ahead = np.stack([np.cos(up) * np.cos(aside), -np.sin(aside), np.sin(up) * np.cos(aside)], axis=-1)

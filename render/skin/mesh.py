@@ -36,7 +36,7 @@ from handsim.kernels import kernel
 from handsim.space.transforms import MIRROR, quaternion_matrix
 from render.fields import along_segment, bump, smooth
 from render.frames import FOREARM, Bytes, Doubles, Floats, Integers
-from render.skin.look import ELBOW, Forearm, bent_rings, forearm_rings
+from render.skin.look import BEND, ELBOW, ELBOW_BEND, REACH, Forearm, bent_rings, forearm_rings
 
 TILE: Final = 16
 """Texels along a tile's side."""
@@ -238,10 +238,10 @@ def _hills(model: HandModel, rest: Doubles, normals: Doubles) -> Iterator[_Hill]
     yield _Hill(None, 0.0, 1.0, skin.girth(2, -0.0013, middle, 0.0085))
     yield _Hill(None, 0.0, 1.0, skin.girth(3, 0.0013, 0.0125 * scale, 0.0075))
     muscle = skin.ball((0.062, 0.026), 0.0030, 0.0130, back=True)
-    yield _Hill("thumb_CMC_abduction", 15.0, -25.0, muscle)
+    yield _Hill("thumb_metacarpal_abduction", 15.0, -25.0, muscle)
     # The balls of thumb and little finger, and the hollow between them.
     for joint, start, full, center, height, width in (
-        ("thumb_CMC_flexion", -10.0, 35.0, (0.040, 0.020), 0.0035, 0.0150),
+        ("thumb_metacarpal_flexion", -10.0, 35.0, (0.040, 0.020), 0.0035, 0.0150),
         ("little_MCP_flexion", 10.0, 80.0, (0.035, -0.028), 0.0028, 0.0140),
         ("ring_MCP_flexion", 10.0, 80.0, (0.055, -0.004), -0.0025, 0.0120),
     ):
@@ -362,8 +362,13 @@ class PosableSkin:
         beyond = self._elbow - np.linalg.norm(np.diff(middles, axis=0), axis=1).sum()
         self._elbow_at: Doubles = middles[-1] + beyond * self._ahead
 
-    def forearm_line(self, qpos: Doubles) -> tuple[Doubles, Doubles]:
-        """The elbow (3,) [m], and the unit direction (3,) to it from the wrist, in the world."""
+    def forearm_line(self, qpos: Doubles, forearm: Doubles | None = None) -> tuple[Doubles, Doubles]:
+        """The elbow (3,) [m], and the unit direction (3,) to it from the wrist, in the world.
+
+        The direction is the one that is given, or that of a wrist at rest.
+        """
+        if forearm is not None:
+            return qpos[:3] + self._elbow * forearm, forearm
         rotation = quaternion_matrix(qpos[3:7])
         return qpos[:3] + rotation @ self._elbow_at, rotation @ self._ahead
 
@@ -371,13 +376,23 @@ class PosableSkin:
         """The arm's rings (K, R, 3)."""
         return rest[skin_atlas().num_hand : -1].reshape(RINGS, -1, 3)
 
-    def posed(self, qpos: Doubles, upper_arm: Doubles | None = None) -> DrawnSkin:
-        """The skin in one pose; without the upper arm's direction (3,) the arm is straight and short."""
+    def posed(
+        self, qpos: Doubles, upper_arm: Doubles | None = None, forearm: Doubles | None = None
+    ) -> DrawnSkin:
+        """The skin in one pose.
+
+        Without the upper arm's direction (3,) the arm is straight and short, and without the forearm's the
+        wrist is at rest.
+        """
         atlas = skin_atlas()
         transforms = self.model.forward_kinematics(qpos[None])
         shaped = self._flexion.shaped(self.rest, qpos[7:])
         if upper_arm is not None:
-            rings = bent_rings(self._rings(shaped), self._elbow, upper_arm @ quaternion_matrix(qpos[3:7]))
+            rings, rotation = self._rings(shaped), quaternion_matrix(qpos[3:7])
+            if forearm is not None:
+                half = 0.5 * BEND * self.model.shape.length
+                rings = bent_rings(rings, half, half, forearm @ rotation)
+            rings = bent_rings(rings, self._elbow, ELBOW_BEND, upper_arm @ rotation, REACH)
             shaped = np.concatenate([shaped[: atlas.num_hand], rings.reshape(-1, 3), rings[-1:].mean(axis=1)])
         points = self.merged(transforms, shaped)
         normals = vertex_normals(points, self.faces)

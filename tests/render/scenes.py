@@ -26,7 +26,7 @@ from render.skin.texture import SkinTexture
 def draw_back(
     side: Side, texture: SkinTexture, lighting: Lighting, size: tuple[int, int]
 ) -> tuple[np.ndarray, Camera]:
-    """A flat hand's back as pyrender draws it (H, W, 4), and the camera that sees it."""
+    """A flat hand's back as pyrender draws it (H, W, 4), and the camera in whose axes its light is."""
     pyrender = load_pyrender()
     skin = PosableSkin(HandModel.named("M", side=side)).posed(join_qpos(gesture("flat")[None])[0])
     view = view_along(np.array([0, 0, -1.0]), np.array([1.0, 0, 0]), skin.vertices, size)
@@ -42,7 +42,7 @@ def draw_back(
     scene.add(pyrender.Mesh([primitive]))
     camera = pyrender.PerspectiveCamera(np.deg2rad(24.0), znear=0.05, zfar=10.0)
     scene.add(camera, pose=view.T_world_camera @ OPENGL_FROM_OPENCV)
-    add_lights(pyrender, scene, lighting, view.T_world_camera)
+    add_lights(pyrender, scene, lighting.turned(view.T_world_camera[:3, :3]))
     flags = pyrender.RenderFlags.RGBA | pyrender.RenderFlags.SHADOWS_DIRECTIONAL
     return np.asarray(offscreen_renderer(*size).render(scene, flags=flags)[0]), view
 

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 from typing import get_args
 
@@ -22,6 +23,7 @@ from render.session import SHEET, Drawing, cut_off_pictures, left_out_frames, op
 from render.skin.look import TONES
 from render.studio import Moment
 from render.subject import subject_of_take
+from render.user_body import UserBody
 from render.viewpoints import Placement, Viewpoints
 from tests.programs import run_python
 from tests.render.formats.reading import depth_of
@@ -170,18 +172,19 @@ def test_no_arm_ends_in_a_picture(kind):
     take = simulate_take(kind=kind, num_frames=120, seed=2)
     studio = open_studio(take.hands, RenderConfig().resolved(), rng=np.random.default_rng(0))
     pictures = 0
-    for placement in get_args(Placement):
-        viewpoints = Viewpoints(ViewConfig(placement, "vga_wide"), take, rng=np.random.default_rng(1))
+    for placement, user in itertools.product(get_args(Placement), (None, UserBody(take))):
+        rng = np.random.default_rng(1)
+        viewpoints = Viewpoints(ViewConfig(placement, "vga_wide"), take, rng=rng, user=user)
         for frame in range(0, 120, 20):
             cameras = viewpoints.cameras(frame)
-            moment = studio.reaching(Moment(take, frame), cameras)
+            moment = studio.reaching(Moment(take, frame), cameras, user)
             ends = np.array([one.triangles.vertices[-1] for one in studio._drawn(moment, 0.0)])
             for camera in cameras:
                 pixels, ahead = camera.project(ends), camera.local(ends)[:, 2] > 0.0
                 inside = ((pixels >= 0.0) & (pixels <= camera.size)).all(axis=1) & ahead
                 assert not inside.any(), f"{placement}, frame {frame}, {camera.name}"
                 pictures += 1
-    assert pictures >= 60
+    assert pictures >= 120
 
 
 @pytest.fixture(scope="module")

@@ -385,7 +385,7 @@ def test_clients_get_the_header_and_every_frame(sink, message):
             sink.send(message(100))
             header, frame = received(late, 2)
     assert header["type"] == "header" and frame["number"] == 100
-    assert header["angles"][0] == "thumb_CMC_abduction"
+    assert header["angles"][0] == "thumb_metacarpal_abduction"
     assert sink.dropped == 0
     wait_for(lambda: sink.num_clients == 0)
 

@@ -89,6 +89,9 @@ def test_the_range_of_motion_is_that_of_the_fitted_poses(take, report):
         }
         for name, values in expected.items():
             np.testing.assert_allclose(numbers(rows, f"{name}_deg"), values, rtol=1e-5, atol=1e-5)
+        low, high = expected["model_low"] + 0.5, expected["model_high"] - 0.5
+        shares = ((degrees < low) | (degrees > high)).mean(axis=0)
+        np.testing.assert_allclose(numbers(rows, "at_limits_share"), shares, rtol=1e-5)
     assert f"<td>{np.rad2deg(take.qpos[fitted, 0, 10].max()):.1f}</td>" in page
     assert "Over the 50 frames" in page and "<td>-25 to 95</td>" in page
 

@@ -23,6 +23,7 @@ from handsim.files.outputs import check_outputs
 from handsim.hand.model import HandModel
 from handsim.hand.shape import NUM_QPOS, SIZES
 from handsim.space.rig import CameraRig, list_rigs, load_rig
+from handsim.space.transforms import UpAxis
 from track.settings import USUAL_SIZE
 from track.user import load_user
 from track.viewer.editors import Corrector, LabelEditor, LayoutEditor, edited_path
@@ -66,6 +67,7 @@ def open_content(
     size: str | None = None,
     rig: CameraRig | str | None = None,
     time: float | None = None,
+    up: UpAxis = "z",
 ) -> Content:
     """Read a file, folder or shipped layout or rig; parameters are those of `handsim view`."""
     path, given, keys = Path(name), cast("str | Path", name), set[str]()
@@ -90,17 +92,18 @@ def open_content(
         hands = load_user(path)
         content = Content("user", lambda server: _show_user(server, hands))
     else:
-        return _moving(path, name, None if rig is None else load_rig(rig), time)
-    if time is not None:
-        raise ArgumentError(f"--time is {time:g}, but {name} is a {content.kind}: nothing in it moves")
-    if rig is not None:
-        raise ArgumentError(
-            f"--rig is {rig}, but {name} is a {content.kind}, which no cameras are shown with"
-        )
+        return _moving(path, name, None if rig is None else load_rig(rig), time, up)
+    for option, value, why in (
+        ("--time", None if time is None else f"{time:g}", ": nothing in it moves"),
+        ("--rig", rig, ", which no cameras are shown with"),
+        ("--up", None if up == "z" else up, ", in which z points up"),
+    ):
+        if value is not None:
+            raise ArgumentError(f"{option} is {value}, but {name} is a {content.kind}{why}")
     return content
 
 
-def _moving(path: Path, name: str, rig: CameraRig | None, time: float | None) -> Content:
+def _moving(path: Path, name: str, rig: CameraRig | None, time: float | None, up: UpAxis) -> Content:
     """The frames of a file or folder, with the corrector of a tracked take."""
     recording: Recording
     corrector: Corrector | None = None
@@ -124,7 +127,7 @@ def _moving(path: Path, name: str, rig: CameraRig | None, time: float | None) ->
             raise ArgumentError(f"--time is {time:g} s, but {name} lasts from {begin:g} to {end:.3f} s")
         first = int(np.argmin(np.abs(recording.times - time)))
     kind = type(recording).__name__.removesuffix("Recording").lower()
-    return Content(kind, lambda server: show_recording(server, recording, corrector, first), recording)
+    return Content(kind, lambda server: show_recording(server, recording, corrector, first, up), recording)
 
 
 def _layout(given: str | Path, out: Path | None, size: str) -> Content:
@@ -156,7 +159,11 @@ def _rig(rig: CameraRig) -> Content:
 
 
 def show_recording(
-    server: ViserServer, recording: Recording, corrector: Corrector | None = None, first: int = 0
+    server: ViserServer,
+    recording: Recording,
+    corrector: Corrector | None = None,
+    first: int = 0,
+    up: UpAxis = "z",
 ) -> Run:
     """Put a recording into a page, opened at the frame `first`; returns the function that serves the page."""
 
@@ -180,7 +187,7 @@ def show_recording(
         editor = LabelEditor(server, recording, corrector, changed)
         view.on_pick = editor.pick
     panel.add_plots()
-    set_stage(server, first_look(recording))
+    set_stage(server, first_look(recording), up=up)
     timeline.go_to(first)
     timeline.update()
 

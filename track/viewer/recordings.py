@@ -21,6 +21,7 @@ from handsim.hand.model import HandModel
 from handsim.hand.shape import NUM_QPOS
 from handsim.pages import distinct_colors
 from handsim.space.rig import CameraRig, list_rigs, load_rig
+from handsim.space.transforms import UpAxis, turned_poses, upright
 from track.frames import StreamedFrame, TrackedFrame
 from track.rigid_body import RigidTemplate
 from track.take_summary import SuspectSpan, find_suspect_spans, frame_confidence
@@ -276,6 +277,7 @@ def write_video(
     recording: Recording,
     shown: Float[np.ndarray, "N 3"],
     *,
+    up: UpAxis = "z",
     write_clip: Callable[..., None],
     progress: Progress = no_progress,
 ) -> int:
@@ -284,17 +286,18 @@ def write_video(
     The view holds the points `shown` [m]; `write_clip` of `render.illustrations` draws and encodes.
     """
     rate, frames = chosen_frames(recording.times)
+    turn = upright(up)
     palette = label_colors(recording.label_names) / 255.0
 
     def pictures() -> Iterator[tuple[Any, ...]]:
         for number, index in enumerate(frames, start=1):
             frame = recording.frame(index)
-            hands = list(zip(frame.hands, frame.qpos, strict=True))
-            points, labels = frame.points[frame.seen], frame.labels[frame.seen]
+            hands = list(zip(frame.hands, turned_poses(frame.qpos, turn), strict=True))
+            points, labels = frame.points[frame.seen] @ turn.T, frame.labels[frame.seen]
             yield hands, points, palette[labels], f"frame {index}, {frame.time:.2f} s"
             progress(number, len(frames))
 
-    there = shown[np.isfinite(shown).all(axis=1)]
+    there = shown[np.isfinite(shown).all(axis=1)] @ turn.T
     write_clip(path, pictures(), rate=rate, shown=there, radius=recording.radius)
     return len(frames)
 

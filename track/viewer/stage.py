@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from handsim.hand.model import HandModel
 from handsim.hand.shape import NUM_QPOS
 from handsim.space.rig import ROOM_CENTER, CameraRig
-from handsim.space.transforms import rotation_quaternions
+from handsim.space.transforms import UpAxis, rotation_quaternions, upright
 from track.viewer.recordings import Recording, ShownFrame, label_colors
 
 if TYPE_CHECKING:
@@ -44,23 +44,31 @@ _BODY_COLOR: Final = (120, 124, 132)
 _RAY_COLOR: Final = (235, 170, 60)
 
 
-def set_stage(server: ViserServer, points: Float[np.ndarray, "N 3"], *, ground: float | None = None) -> None:
+def set_stage(
+    server: ViserServer,
+    points: Float[np.ndarray, "N 3"],
+    *,
+    ground: float | None = None,
+    up: UpAxis = "z",
+) -> None:
     """Set light, ground and a first look at points [m], with the ground at a height or below them."""
-    there = points[np.isfinite(points).all(axis=1)]
+    turn = upright(up).T  # of the stage, to the axes of the points
+    there = points[np.isfinite(points).all(axis=1)] @ turn
     low, high = np.percentile(there, [2, 98], axis=0) if len(there) else np.tile([[-0.1], [0.1]], 3)
     middle, size = (low + high) / 2, float(np.linalg.norm(high - low))
     height = float(low[2]) - 0.02 - 0.1 * size if ground is None else ground
     cell = 0.01 if size < 0.5 else 0.1
     scene = server.scene
-    scene.set_up_direction("+z")
+    scene.set_up_direction(turn[:, 2])
     # The light is soft, so that labels keep their colors.
     scene.configure_default_lights(enabled=False)
     scene.configure_environment_map("studio", environment_intensity=0.12)
     scene.add_light_hemisphere(
         "/light/sky", sky_color=(255, 255, 255), ground_color=(150, 140, 130), intensity=0.55
     )
-    scene.add_light_directional("/light/key", intensity=1.3, position=(1.5, -1.0, 2.5))
-    scene.add_light_directional("/light/fill", intensity=0.3, position=(-2.0, 1.5, 1.0))
+    for name, intensity, place in (("key", 1.3, (1.5, -1.0, 2.5)), ("fill", 0.3, (-2.0, 1.5, 1.0))):
+        x, y, z = (turn @ place).tolist()
+        scene.add_light_directional(f"/light/{name}", intensity=intensity, position=(x, y, z))
     scene.add_grid(
         "/ground",
         width=200 * cell,
@@ -73,13 +81,13 @@ def set_stage(server: ViserServer, points: Float[np.ndarray, "N 3"], *, ground: 
         section_thickness=1.0,
         fade_distance=30.0,
         plane_opacity=0.0,
-        position=(round(float(middle[0]), 1), round(float(middle[1]), 1), height),
+        position=turn @ (round(float(middle[0]), 1), round(float(middle[1]), 1), height),
+        wxyz=rotation_quaternions(turn[None])[0],
     )
     away = max(size, _NEAREST)
     camera = server.initial_camera
-    camera.position = middle + away * _FROM / np.linalg.norm(_FROM)
-    camera.look_at = middle
-    camera.up = np.array([0.0, 0.0, 1.0])
+    camera.position = turn @ (middle + away * _FROM / np.linalg.norm(_FROM))
+    camera.look_at, camera.up = turn @ middle, turn[:, 2]
     camera.near, camera.far = 0.005, 100.0
 
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from gloves.fit import GloveFit
 from handsim.callbacks import Closing
+from handsim.space.transforms import UpAxis
 from track.frames import StreamedFrame, TrackedFrame
 from track.rigid_body import RigidTemplate
 from track.viewer.recordings import LiveRecording, Recording, ShownFrame
@@ -231,8 +232,8 @@ def thinned(times: NDArray[np.float64], values: NDArray[np.float64]) -> tuple[np
 class LiveView(Closing):
     """A `FrameOutput` that shows a tracker's newest frame, from a thread of its own."""
 
-    def __init__(self, server: ViserServer, rig: CameraRig | None = None) -> None:
-        self._server, self._rig = server, rig
+    def __init__(self, server: ViserServer, rig: CameraRig | None = None, up: UpAxis = "z") -> None:
+        self._server, self._rig, self._up = server, rig, up
         self._newest: tuple[StreamedFrame, TrackedFrame] | None = None
         self._came, self._ending = threading.Event(), False
         self._thread: threading.Thread | None = None
@@ -283,7 +284,7 @@ class LiveView(Closing):
             self._view.show(shown)
             self.pictures += 1
             if not is_staged and len(shown.points) and np.isfinite(shown.qpos).any():
-                set_stage(self._server, shown.points)
+                set_stage(self._server, shown.points, up=self._up)
                 is_staged = True
             now = time.perf_counter()
             if now >= text_due:

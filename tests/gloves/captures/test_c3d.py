@@ -309,3 +309,64 @@ def test_damage_is_told(tmp_path: Path, case: str) -> None:
     path.write_bytes(content)
     with error_names(CaptureError, f"{path} | {words}"):
         read_capture(path)
+
+
+@pytest.mark.parametrize("unit", ["mm", "m"])
+def test_a_labeled_c3d_keeps_all_of_its_source_but_the_points(tmp_path: Path, unit: str) -> None:
+    rng, source, out = np.random.default_rng(0), tmp_path / "in.c3d", tmp_path / "out.c3d"
+    content = ezc3d.c3d()
+    content["header"]["points"]["first_frame"] = 41
+    parameters, data = content["parameters"], content["data"]
+    parameters["POINT"]["RATE"]["value"], parameters["POINT"]["UNITS"]["value"] = [100.0], [unit]
+    parameters["POINT"]["LABELS"]["value"] = ["*0", "*1", "*2"]
+    data["points"] = np.ones((4, 3, 50))
+    data["points"][:3] = rng.normal(size=(3, 3, 50)) * (1e3 if unit == "mm" else 1.0)
+    parameters["ANALOG"]["RATE"]["value"] = [1000.0]
+    parameters["ANALOG"]["LABELS"]["value"], parameters["ANALOG"]["UNITS"]["value"] = (
+        ["Fx", "EMG"],
+        ["N", "V"],
+    )
+    parameters["ANALOG"]["SCALE"]["value"] = np.array([0.5, 0.25])
+    data["analogs"] = rng.normal(size=(1, 2, 500))
+    content.add_parameter("EVENT", "LABELS", ["Touch", "Grasp"])
+    content.add_parameter("EVENT", "TIMES", np.array([[0.0, 0.0], [0.45, 0.5]]))
+    content.add_parameter("SUBJECTS", "NAMES", ["Anna"])
+    content.add_parameter("FORCE_PLATFORM", "CORNERS", rng.normal(size=(3, 4, 1)))
+    content.write(str(source))
+    with source.open("r+b") as file:  # ezc3d writes no events into the header
+        for word, value in ((150, struct.pack("<H", 1)), (152, struct.pack("<f", 0.45)), (198, b"GRSP")):
+            file.seek(2 * word)
+            file.write(value)
+    capture = read_capture(source)
+    names = ("right:ThumbTip", "right:IndexTip", "Unlabeled1")
+    write_capture(out, Capture(names, capture.positions[:, ::-1], capture.rate), source=source)
+    before, after = ezc3d.c3d(str(source)), ezc3d.c3d(str(out))
+    np.testing.assert_array_equal(after["data"]["analogs"], before["data"]["analogs"])
+    np.testing.assert_allclose(after["data"]["points"], before["data"]["points"][:, ::-1], rtol=1e-6)
+    assert after["parameters"]["POINT"]["LABELS"]["value"] == list(names)
+    for part in ("points", "analogs"):
+        assert after["header"][part] == before["header"][part]
+    assert out.read_bytes()[2 * 147 : 512] == source.read_bytes()[2 * 147 : 512], "events of the header"
+    for group, kept in before["parameters"].items():
+        for name in kept.keys() - {"__METADATA__", "DATA_START"}:
+            if (group, name) not in {("POINT", "LABELS"), ("POINT", "DESCRIPTIONS")}:
+                found = after["parameters"][group][name]
+                assert found["type"] == kept[name]["type"]
+                np.testing.assert_array_equal(found["value"], kept[name]["value"], err_msg=f"{group}:{name}")
+    with error_names(CaptureError, "the source has 50 frames and the capture 49"):
+        write_capture(out, Capture(names, capture.positions[1:], capture.rate), source=source)
+
+
+@pytest.mark.parametrize("processor", [INTEL, DEC, SGI])
+@pytest.mark.parametrize("scale", [-1.0, 0.125])
+def test_every_number_format_is_kept_as_floats(tmp_path: Path, processor: int, scale: float) -> None:
+    source, out = tmp_path / "in.c3d", tmp_path / "out.c3d"
+    source.write_bytes(c3d(processor=processor, scale=scale, analog=3))
+    capture = read_capture(source)
+    write_capture(out, Capture(("A", "B"), capture.positions, capture.rate), source=source)
+    again, data = read_capture(out), out.read_bytes()
+    assert again.names == ("A", "B")
+    np.testing.assert_allclose(again.positions, capture.positions, rtol=1e-6)
+    start = (struct.unpack_from("<H", data, 16)[0] - 1) * 512
+    numbers = np.frombuffer(data, "<f4", 2 * 11, start).reshape(2, 11)
+    assert (numbers[:, 8:] == 77.0).all() and struct.unpack_from("<H", data, 4)[0] == 3

@@ -18,9 +18,9 @@ from gloves import RigidBody, Take, attach, load_layout, load_take
 from gloves.fit import nominal_fit
 from gloves.takes.archives import SCHEMA
 from gloves.takes.points import FRAMES as COLUMNS_OF_FRAMES
-from gloves.takes.take import INITIALIZED, LOST, MOTION_FORMATS, STATUSES, SUFFIX, TRACKED
+from gloves.takes.take import INITIALIZED, LOST, MOTION_FORMATS, STATUSES, SUFFIX, TRACKED, usual_rate
 from handsim import HandModel, join_qpos, sample_shape
-from handsim.errors import ArgumentError, CaptureError
+from handsim.errors import ArgumentError, CaptureError, HandSimWarning
 from handsim.hand.model import KEYPOINT_NAMES, hand_keypoints, is_steady
 from handsim.space.transforms import random_quaternions
 
@@ -256,13 +256,47 @@ def test_angles_have_names_and_frames_a_status(take):
     angles = take.angles("right")
     assert tuple(angles) == take.joint_names and len(take.joint_names) == 20
     np.testing.assert_array_equal(angles["index_PIP_flexion"], take.qpos[:, 1, 7 + 6])
-    assert np.isnan(take.angle_spreads("left")["thumb_CMC_flexion"]).all(), "not known"
+    assert np.isnan(take.angle_spreads("left")["thumb_metacarpal_flexion"]).all(), "not known"
     known = dataclasses.replace(take, angle_spread=spread).angle_spreads("left")
-    np.testing.assert_allclose(known["thumb_CMC_flexion"], spread[:, 0, 1], rtol=1e-6)
+    np.testing.assert_allclose(known["thumb_metacarpal_flexion"], spread[:, 0, 1], rtol=1e-6)
     np.testing.assert_array_equal(take.is_tracked("left"), take.status[:, 0] >= INITIALIZED)
     assert not take.made_by_tracker
     with pytest.raises(ArgumentError, match="unknown hand 'middle'"):
         take.angles("middle")
+
+
+def test_angles_may_be_the_isbs_and_begin_at_a_neutral_pose(take):
+    found = take.angles("right", convention="isb")
+    assert len(found) == 25 and not any("CMC" in name for name in (*found, *take.joint_names))
+    there = np.isfinite(take.qpos[:, 1, 0])
+    assert np.isfinite(found["little_MCP_ulnar_deviation"]).tolist() == there.tolist()
+    still = dataclasses.replace(take, qpos=np.where(np.isfinite(take.qpos), take.qpos[there, 1][0], np.nan))
+    between = (take.times[0], take.times[-1])
+    for convention in ("model", "isb"):
+        for values in still.angles("right", convention=convention, neutral=between).values():
+            np.testing.assert_allclose(values[there], 0.0, atol=1e-9)
+    with pytest.raises(ArgumentError, match="unknown convention 'ISB'; valid names: model, isb"):
+        take.angles("right", convention="ISB")
+    with pytest.raises(ArgumentError, match="neutral is 900 to 901 s, where the right hand has no pose"):
+        take.angles("right", neutral=(900.0, 901.0))
+    moving = still.qpos.copy()
+    moving[:, 1, 7 + 6] += np.linspace(0.0, 0.5, FRAMES)
+    with pytest.warns(
+        HandSimWarning, match="the right hand moves from .* index_PIP_flexion by .*; expected a"
+    ):
+        dataclasses.replace(still, qpos=moving).angles("right", neutral=between)
+
+
+def test_frames_that_a_stream_lacks_count_in_its_rate_and_have_their_place_in_a_file(take):
+    numbers = 40 + np.array([0, 1, 3, 6, 9, 12, 15, 18, 21, 24, 27, 30])[:FRAMES]
+    times = 1e5 + numbers / 120.0
+    assert usual_rate(times, numbers) == 120.0 == usual_rate(times, 2 * numbers)
+    live = dataclasses.replace(take, numbers=numbers, times=times, rate=120.0)
+    assert live.duration == pytest.approx((numbers[-1] - numbers[0] + 1) / 120.0)
+    written, dense = live.labeled_capture(), take.labeled_capture()
+    assert written.num_frames == numbers[-1] - numbers[0] + 1 and written.rate == 120.0
+    np.testing.assert_array_equal(written.positions[numbers - 40], dense.positions)
+    assert np.isnan(np.delete(written.positions, numbers - 40, axis=0)).all()
 
 
 def test_what_does_not_fit_together_is_no_take(take):

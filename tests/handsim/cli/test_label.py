@@ -6,13 +6,14 @@ import dataclasses
 import json
 import signal
 
+import ezc3d
 import numpy as np
 import pytest
 
 from gloves import Capture, load_layout, read_capture, write_capture
 from handsim.cli.main import main
 from track.kinematics import pose_solver
-from train import simulate_take
+from train import load_labeler, simulate_take
 
 FRAMES = 40
 NAMES = load_layout("dense19").names
@@ -72,6 +73,51 @@ def test_one_hand_has_the_names_of_the_markers(take, tmp_path, capsys):
     assert np.isclose(labeled.positions[:30, :19], positions[:30], atol=1e-5, equal_nan=True).mean() > 0.97
 
 
+def test_a_folder_is_labeled_by_one_labeler_past_a_capture_that_cannot_be_read(
+    take, tmp_path, capsys, monkeypatch
+):
+    loaded = []
+    monkeypatch.setattr("track.user.load_labeler", lambda *of: loaded.append(of) or load_labeler(*of))
+    captures, out = tmp_path / "captures", tmp_path / "captures" / "labeled"
+    short = dataclasses.replace(take.capture(), positions=take.capture().positions[:4])
+    for name in ("a.c3d", "b.trc", "day/a.c3d"):
+        write_capture(captures / name, short)
+    (captures / "b.trc").write_text("no marker file")
+    for _ in range(2):  # what is labeled already is no capture of the second time
+        loaded.clear()
+        assert main(["label", str(captures), "--out", str(out)]) == 1
+        said = capsys.readouterr()
+        assert len([line for line in said.out.splitlines() if "two hands in 4 frames" in line]) == 2
+        assert f"{captures / 'b.trc'}: not labeled: not a TRC file" in said.err
+        assert said.err.splitlines()[-1] == "handsim label: 1 of 3 captures were not labeled"
+        assert len({id(of[1]) for of in loaded if hasattr(of[1], "label_frames")}) == 1
+        assert len([of for of in loaded if of[1] is None]) == 1
+    files = {path.relative_to(out).as_posix() for path in out.rglob("*.*")}
+    assert files == {"a.c3d", "day/a.c3d"}
+    assert read_capture(out / "day" / "a.c3d").names[0] == f"right:{NAMES[0]}"
+
+
+@pytest.mark.parametrize(
+    ("captures", "out", "words"),
+    [
+        ("a.c3d b.c3d", "labeled.c3d", "labeled.c3d for several captures, expected a folder"),
+        ("a.c3d a.tsv", "labeled", "two outputs are labeled/a.c3d, expected two files"),
+        ("a.c3d b.c3d", ".", "is the input"),
+        ("", "labeled", "no capture outside of labeled is given"),
+        ("a.c3d", "labeled.txt", "labeled.txt: unknown file type"),
+        ("empty", "labeled", "empty holds no capture"),
+    ],
+)
+def test_outputs_of_several_captures_are_checked_first(captures, out, words, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "empty").mkdir()
+    for name in captures.split():
+        if name != "empty":
+            (tmp_path / name).write_text("not read")
+    assert main(["label", *captures.split(), "--out", out]) == 1
+    assert words in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("side", ["right", "left"])
 def test_one_of_two_hands_is_labeled_where_it_is_named(side, take, tmp_path, capsys):
     write_capture(tmp_path / "in.c3d", take.capture())
@@ -124,3 +170,21 @@ def test_ctrl_c_in_compiled_code_is_no_mistake_of_ours(take, tmp_path, capsys, m
         signal.setitimer(signal.ITIMER_REAL, 0.0)
         signal.signal(signal.SIGALRM, before)
     assert wrapped and not (tmp_path / "out.trc").exists()
+
+
+def test_a_labeled_c3d_keeps_what_its_source_has_beside_points(tmp_path, rng):
+    source, out = tmp_path / "in.c3d", tmp_path / "out.c3d"
+    content = ezc3d.c3d()
+    content["header"]["points"]["first_frame"] = 41
+    parameters, data = content["parameters"], content["data"]
+    parameters["POINT"]["RATE"]["value"], parameters["POINT"]["UNITS"]["value"] = [100.0], ["mm"]
+    parameters["POINT"]["LABELS"]["value"] = [f"*{number}" for number in range(40)]
+    data["points"] = np.ones((4, 40, 10))
+    data["points"][:3] = rng.uniform(-900.0, 900.0, size=(3, 40, 1))
+    parameters["ANALOG"]["RATE"]["value"], parameters["ANALOG"]["LABELS"]["value"] = [1000.0], ["EMG"]
+    data["analogs"] = rng.normal(size=(1, 1, 100))
+    content.write(str(source))
+    assert main(["label", str(source), "--out", str(out)]) == 0
+    before, after = ezc3d.c3d(str(source)), ezc3d.c3d(str(out))
+    assert after["header"]["points"]["first_frame"] == before["header"]["points"]["first_frame"] == 41
+    np.testing.assert_array_equal(after["data"]["analogs"], before["data"]["analogs"])

@@ -35,7 +35,7 @@ ELSEWHERE = {
     "render": "out merge format workers cluster painter frames-per-shard",
 }  # fmt: skip
 """Options that say only where something is or goes, as what, or how quickly."""
-SHOWN = {"view": "rig time glove size shape hands body labeler", "glove improve": "captures"}
+SHOWN = {"view": "rig time up glove size shape hands body labeler", "glove improve": "captures"}
 """Options of what is shown and not written."""
 SEARCHED = {"glove improve": "keep rig minutes seed", "glove score": "labeler"}
 """Options of a search, whose outcome another value may leave as it is, and one that takes minutes to try."""
@@ -45,6 +45,7 @@ QUICK = [
     ("glove check", "dense19 --out g.png", "size XS"),
     ("rig import", "lab.xcp --out r.toml", "up y"),
     ("export", "take.npz --out x.bvh", "fps 30|up y"),
+    ("export", "take.npz --out x.csv", "neutral 0 0.1"),
     ("evaluate", "labeled.trc --json f.json --occlude 4 --ghosts 2",
      "glove sparse13|labeler run|occlude 1|ghosts 0|every 7|seed 4"),
     ("evaluate", "labeled.trc --json f.json", "truth single.truth.npz"),
@@ -205,6 +206,9 @@ REFUSED = {
     "evaluate labeled.trc --truth single.truth.npz --threads 2": "none of --glove, --labeler, --threads",
     "export user.json --out x.glb --fps 30": "given --fps 30 and user.json, expected a take",
     "export dense19 --out x.onnx --up y": "given --up y and dense19, expected a take",
+    "export user.json --out x.glb --neutral 0 1": "given --neutral 0 1 and user.json, expected a take",
+    "export take.npz --out x.mot --neutral 0 1": "neutral is (0.0, 1.0) and the file x.mot, expected .csv",
+    "export take.npz --out x.csv --neutral 7 9": "neutral is 7 to 9 s, where the ",
     "export take.npz --out x.csv --up y": "up is y and the file x.csv, expected a format",
     "render take.npz --out p --passes depth --tones dark": "given tones and the passes depth, expected rgb",
     "render take.npz --out p --passes depth --motion-blur": "given shutter and the passes depth",
@@ -220,6 +224,7 @@ REFUSED = {
     "view take.npz --glove dense19": "given --glove and the file take.npz, expected --live",
     "view take.npz --size XL": "--size is XL, but take.npz is no marker layout",
     "view user.json --rig six": "--rig is six, but user.json is a user",
+    "view dense19 --up y": "--up is y, but dense19 is a layout, in which z points up",
     "view take.npz --video v.mp4 --time 0": "given --time 0 and --video v.mp4",
     "train set --out r --labeler cnn --network.width 32": "given network with the labeler cnn",
     "train set --out r --knee 0.5": "given knee with the labeler set",

@@ -80,7 +80,11 @@ def test_positive_flexion_bends_towards_the_palm_and_the_thumb_opposes():
     assert fingertip(6, index_MCP_abduction=15.0)[1] > flat[1] + 0.01
     resting = fingertip(3)
     opposed = fingertip(
-        3, thumb_CMC_abduction=28.0, thumb_CMC_flexion=30.0, thumb_MCP_flexion=30.0, thumb_IP_flexion=30.0
+        3,
+        thumb_metacarpal_abduction=28.0,
+        thumb_metacarpal_flexion=30.0,
+        thumb_MCP_flexion=30.0,
+        thumb_IP_flexion=30.0,
     )
     little = fingertip(15, little_MCP_flexion=70.0, little_PIP_flexion=60.0, little_DIP_flexion=30.0)
     assert np.linalg.norm(opposed - little) < 0.6 * np.linalg.norm(resting - little)

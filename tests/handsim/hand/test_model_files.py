@@ -8,13 +8,14 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
+from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from gloves import Take, attach
+from gloves import Take, attach, read_capture
 from gloves.hand_files import write_hand
 from handsim import HandModel, join_qpos, sample_shape
 from handsim.hand.model import KEYPOINT_NAMES, hand_keypoints
-from handsim.hand.model_files import coordinate_names, hand_osim, hand_urdf
+from handsim.hand.model_files import coordinate_names, coordinate_values, hand_osim, hand_urdf
 from handsim.hand.shape import BONE_NAMES, JOINT_NAMES
 
 
@@ -204,6 +205,23 @@ def test_cylinders_lie_along_the_capsules_osim(fit):
             np.testing.assert_allclose(reached, capsules.ends[index], atol=1e-9)
             count += 1
     assert count == len(capsules.bones)
+
+
+def test_inverse_kinematics_by_the_osim_alone_finds_our_angles(fit, qpos, tmp_path):
+    """The joints of our .trc, fitted with axes, order and frames as the .osim states them, by scipy alone."""
+    Take.of_poses([fit], qpos[:, None], rate=60.0).export(tmp_path / "joints.trc")
+    trc, names = read_capture(tmp_path / "joints.trc"), coordinate_names(fit.side)
+    root = ET.fromstring(hand_osim(fit.model))
+    for frame in (0, FRAMES - 1):
+        expected = np.array([*coordinate_values(qpos[frame : frame + 1], "z")[0]])
+
+        def residuals(values, wanted=trc.positions[frame]):
+            markers = markers_of(root, bodies_of(root, dict(zip(names, values, strict=True))))
+            return np.ravel([markers[name] for name in trc.names] - wanted)
+
+        start = expected + np.deg2rad(10.0) * np.sin(np.arange(len(names)))
+        found = least_squares(residuals, start, x_scale="jac").x
+        np.testing.assert_allclose(np.rad2deg(found - expected)[3:], 0.0, atol=0.5)
 
 
 def test_opensim_has_bodies_and_markers_where_mujoco_has_them(fit, qpos, tmp_path):

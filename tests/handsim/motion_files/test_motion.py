@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import itertools
 import json
+import warnings
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from gloves.takes.take import posed_motion
-from handsim import HandModel, join_qpos
+from handsim import HandModel, HandSimWarning, join_qpos
 from handsim.errors import CaptureError
 from handsim.hand.model import KEYPOINT_NAMES, hand_keypoints
 from handsim.hand.shape import BONE_NAMES, DIGITS, JOINT_NAMES
@@ -113,6 +114,36 @@ def test_what_was_written_is_read(motion, tmp_path):
     np.testing.assert_allclose(table.qpos, motion.qpos, rtol=1e-8, atol=1e-9)  # NaN where ours are
 
 
+def test_names_of_earlier_versions_are_read(motion, tmp_path):
+    path = tmp_path / "poses.csv"
+    write_joint_csv(path, posed_motion(motion))
+    path.write_text(path.read_text().replace("thumb_metacarpal_", "thumb_CMC_"))
+    np.testing.assert_allclose(read_joint_csv(path).qpos, motion.qpos, rtol=1e-8, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["joints.csv", "joints.parquet"])
+def test_angles_of_the_isb_stand_beside_the_models(motion, tmp_path, name):
+    path, between = tmp_path / name, (motion.times[2], motion.times[4])
+    if path.suffix == ".parquet":
+        pytest.importorskip("pyarrow", reason="pyarrow is not installed")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", HandSimWarning)  # the hand moves
+        motion.export(path, neutral=between)
+        wanted = motion.angles("right", convention="isb", neutral=between)
+    if path.suffix == ".csv":
+        with path.open(newline="") as file:
+            rows = list(csv.DictReader(file))
+        assert read_joint_csv(path).qpos.shape == motion.qpos.shape
+    else:
+        from pyarrow import parquet
+
+        rows = parquet.read_table(path).to_pylist()
+    rows = [row for row in rows if row["hand"] == "right"]
+    for joint, values in wanted.items():
+        found = [float(row[f"{joint}_isb_neutral_rad"]) for row in rows]
+        np.testing.assert_allclose(found, values, atol=1e-8)
+
+
 def test_columns_may_come_in_any_order_and_be_more_or_fewer(motion, tmp_path):
     write_joint_csv(tmp_path / "poses.csv", posed_motion(motion))
     with (tmp_path / "poses.csv").open(newline="") as file:
@@ -159,6 +190,7 @@ def test_header_and_angles(motion, tmp_path):
     names = lines[end + 1].split("\t")
     table = np.array([line.split("\t") for line in lines[end + 2 :]], dtype=float)
     assert lines[0] == "hands" and stated["version"] == "1" and stated["inDegrees"] == "yes"
+    assert stated["convention"] == "model"
     assert (int(stated["nRows"]), int(stated["nColumns"])) == table.shape == (len(table), len(names))
     columns = dict(zip(names, table.T, strict=True))
     np.testing.assert_allclose(columns["time"], posed_motion(motion).seconds, atol=1e-8)

@@ -195,3 +195,37 @@ def test_damaged_calibrations_are_told(tmp_path, changes, message):
     path = stored(tmp_path / "c.yml", {key: value for key, value in values.items() if value is not None})
     with pytest.raises(RigError, match=message):
         load_cameras(path)
+
+
+def test_a_list_of_cameras(tmp_path):
+    one = {
+        "name": "left",
+        "K": K.tolist(),
+        "R": np.eye(3).tolist(),
+        "t": T.ravel().tolist(),
+        "size": [640, 480],
+    }
+    (tmp_path / "c.json").write_text(json.dumps([one, {**one, "name": "right"}]))
+    left, right = load_cameras(tmp_path / "c.json")
+    assert (left.name, right.name, left.size) == ("left", "right", (640, 480))
+    np.testing.assert_allclose(left.T_world_camera[:3, 3], -T.ravel())
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ([{"id": 0, "img_name": "a", "width": 8, "position": [0, 0, 1], "fx": 9.0}], "Gaussian Splatting"),
+        ({"camera_angle_x": 0.7, "frames": [{"file_path": "a", "transform_matrix": []}]}, "NeRF"),
+    ],
+)
+def test_cameras_of_unknown_scale_are_named(tmp_path, content, message):
+    (tmp_path / "c.json").write_text(json.dumps(content))
+    with pytest.raises(RigError, match=f"c.json: this is the JSON of {message}.*; give the COLMAP"):
+        load_cameras(tmp_path / "c.json")
+
+
+@pytest.mark.parametrize(("name", "other"), [("intri", "extri"), ("extri", "intri")])
+def test_half_of_a_calibration_asks_for_the_other(tmp_path, name, other):
+    values = {"K_1": K, "dist_1": D} if name == "intri" else {"R_1": np.zeros((3, 1)), "T_1": T}
+    with pytest.raises(RigError, match=rf"; {other}\.yml, which belongs to it, is not beside it"):
+        load_cameras(stored(tmp_path / f"{name}.yml", values))

@@ -265,7 +265,12 @@ def test_another_axis_up_is_told_and_turned(told):
     for one, expected in zip(cameras, CAMERAS, strict=True):
         np.testing.assert_allclose(one.T_world_camera, expected.T_world_camera, atol=1e-12)
         assert dataclasses.replace(one, T_world_camera=expected.T_world_camera) == expected
-    assert told([one._replace(y_up=True) for one in turned]) == (cameras, [])
+    stating = [one._replace(y_up=True) for one in turned]
+    assert told(stating) == (cameras, [])
+    on_side = np.array([[0, -1.0, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    sideways = [one._replace(camera=one.camera.at(one.camera.T_world_camera @ on_side)) for one in stating]
+    assert told(sideways)[1] == []  # pictures do not show what the file states
+    assert len(told(sideways, "z")[1]) == 1
 
 
 def test_video_cameras_see_no_markers(told):

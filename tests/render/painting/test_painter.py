@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 
+import cv2
 import numpy as np
 import pytest
 import trimesh
@@ -12,14 +13,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gloves import attach, load_layout
-from handsim import Camera, HandModel, join_qpos, look_at
+from handsim import Camera, HandModel, Lens, join_qpos, look_at
 from handsim.hand.shape import SIDES, Side
 from handsim.space.camera import pinhole
 from poses.shapes import gesture
 from render.painting.figures import Drawn, HandFigure, Material, sample_people
 from render.painting.painter import Painter, paint, put_before
 from render.painting.rasterizer import rasterize
-from render.scenery.lights import Lamp, Lighting, sample_lighting
+from render.scenery.lights import Lamp, Lighting, sample_lighting, surround
 from render.skin.look import TONES
 from tests.render.scenes import plain, thing
 
@@ -102,6 +103,70 @@ def test_a_ball_casts_no_shadow_on_its_lit_side() -> None:
     hidden = Lighting((Lamp((0.0, 0.0, 1.0), 0.0), Lamp((-0.5, -0.5, -1.0), 1.0)), DARK)
     shown, free = (paint(CAMERA, [ball(plain())], light).astype(int) for light in (lamp, hidden))
     assert np.abs(shown - free).max() <= 2
+
+
+def six_views() -> list[Camera]:
+    """Cameras all around, each with another roll."""
+    cameras = []
+    for number, way in enumerate(np.concatenate([np.eye(3), -np.eye(3)]) + 0.1):
+        turn = trimesh.transformations.rotation_matrix(np.deg2rad(47.0 * number), [0, 0, 1])
+        cameras.append(CAMERA.at(look_at(way / np.linalg.norm(way), np.zeros(3)) @ turn))
+    return cameras
+
+
+def test_light_stays_where_it_is_for_cameras_all_around_and_rolled_ones() -> None:
+    lighting = sample_lighting(rng=np.random.default_rng(5))
+    lighting = surround(lighting, np.random.default_rng(6).random((9, 3)) * 0.1, 0.5)
+    mesh = trimesh.creation.icosphere(subdivisions=4, radius=0.2)
+    for camera in six_views():
+        painted = paint(camera, [thing(mesh, plain(0.4))], lighting)
+        truth = rasterize(camera, thing(mesh, plain()).triangles)
+        assert truth.normals is not None
+        rows, columns = np.nonzero((painted[..., 3] == 255) & (truth.depth > 0.0))
+        normals = truth.normals[rows, columns] @ camera.T_world_camera[:3, :3].T
+        x, y, z = normals.T
+        around = [np.ones_like(x), x, y, z, x * y, y * z, x * z, x * x - y * y, 3 * z * z - 1]
+        light = 0.4 * np.maximum(np.stack(around, axis=1) @ np.array(lighting.surroundings), 0.0)
+        views = -truth.depth[rows, columns, None] * camera.rays()[rows, columns]
+        views = views / np.linalg.norm(views, axis=1, keepdims=True) @ camera.T_world_camera[:3, :3].T
+        facing, edge = (normals * views).sum(axis=1), np.zeros(len(rows), dtype=bool)
+        for lamp in lighting.lamps:
+            towards = np.array(lamp.direction) / np.linalg.norm(lamp.direction)
+            half = towards + views
+            fresnel = 0.04 + 0.96 * (1.0 - 0.5 * np.linalg.norm(half, axis=1)) ** 5
+            cosine = np.maximum(normals @ towards, 0.0)
+            mirrored = cosine * fresnel / (4.0 * (0.5 * facing + 0.5) * (0.5 * cosine + 0.5))
+            matt = 0.4 * 0.96 * (1.0 - fresnel) * cosine
+            light += (lamp.strength * (matt + mirrored))[:, None] * lamp.color
+            edge |= np.abs(normals @ towards) < 0.1  # beside the edge of a shadow
+        shown = (painted[rows, columns, :3] / 255.0) ** 2.2
+        ratio = (shown / light)[~edge & (light.min(axis=1) > 0.02) & (facing > 0.3)]
+        assert len(ratio) > 200
+        assert np.abs(np.median(ratio, axis=0) - 1.0).max() < 0.01
+        assert np.abs(np.quantile(ratio, [0.1, 0.9]) - 1.0).max() < 0.03
+
+
+def test_a_rolled_camera_and_the_faces_of_a_lens_see_the_same_shading() -> None:
+    rotation = np.linalg.qr(np.ones((3, 3)) + np.eye(3))[0]
+    lighting = sample_lighting(rng=np.random.default_rng(2)).turned(rotation)
+    drawn = [ball(plain(0.4)), ball(plain(0.4), (0.5, 0.0, 0.8))]
+    half_turn = CAMERA.at(np.diag([-1.0, -1.0, 1.0, 1.0]))
+    upright, rolled = (paint(camera, drawn, lighting).astype(int) for camera in (CAMERA, half_turn))
+    assert np.abs(upright - rolled[::-1, ::-1]).max() <= 2
+    # Straight ahead, and turned so that the edge of the cube's face runs through the first ball.
+    K = np.array([[90.0, 0, 150], [0, 90, 150], [0, 0, 1]])
+    fisheye = Camera("bent", (300, 300), K, lens=Lens("fisheye", (0.0,) * 4))
+    aside = fisheye.at(look_at(np.zeros(3), np.array([1.0, 0.0, 1.0])))
+    ahead, turned = (paint(camera, drawn, lighting).astype(int) for camera in (fisheye, aside))
+    rays = aside.rays() @ aside.T_world_camera[:3, :3].T
+    there = fisheye.project(rays.reshape(-1, 3)).reshape(300, 300, 2).astype(np.float32) - 0.5
+    again = cv2.remap(ahead.astype(np.float32), there, None, cv2.INTER_LINEAR)
+    whole = (
+        cv2.erode(((turned[..., 3] == 255) & (again[..., 3] == 255)).astype(np.uint8), np.ones((5, 5))) > 0
+    )
+    assert whole.sum() > 1000
+    off = np.abs(turned - again)[whole][:, :3]
+    assert off.mean() < 1.0 and np.quantile(off, 0.99) <= 5.0
 
 
 def hand(side: Side, tone: str, seed: int) -> tuple[Camera, list[Drawn]]:

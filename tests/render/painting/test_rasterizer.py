@@ -13,6 +13,8 @@ from handsim.hand.skin import vertex_normals
 from handsim.space.camera import pinhole, preset
 from handsim.space.transforms import euler_matrix
 from poses.shapes import sample_valid_angles
+from render.painting.figures import Drawn, Material
+from render.painting.painter import paint
 from render.painting.rasterizer import (
     Triangles,
     faces_for,
@@ -23,6 +25,7 @@ from render.painting.rasterizer import (
     warp_depth,
     warp_normals,
 )
+from render.scenery.lights import Lighting
 
 NO_EMBREE = pytest.mark.skipif(importlib.util.find_spec("embreex") is None, reason="embreex is not installed")
 
@@ -98,6 +101,33 @@ def test_a_hand_is_where_embree_finds_it(seed):
     off = np.abs(theirs - mine)[both]
     assert np.median(off) <= 1e-6 and np.quantile(off, 0.999) <= 1e-5
     assert (part.reshape(480, 640) == pictures.parts)[both].mean() >= 0.999
+
+
+@NO_EMBREE
+@pytest.mark.parametrize("away", [0.03, 0.1, 0.3, 1.0])
+def test_what_reaches_behind_the_camera_is_cut_off_and_not_left_out(away):
+    from trimesh.ray.ray_pyembree import RayMeshIntersector
+
+    arm = trimesh.creation.capsule(height=1.6, radius=0.05, count=[12, 8])  # with long triangles
+    camera = pinhole("wide", (640, 480), 210.0)
+    camera = camera.at(look_at(np.array([0.05 + away, 0.0, 0.0]), np.array([0.0, 0.0, 0.6])))
+    shown, white = surface(np.array(arm.vertices), np.array(arm.faces)), np.ones((len(arm.vertices), 4))
+    material = Drawn(shown, white.astype(np.float32), None, lambda: Material(np.ones(3), 1.0))
+    pictures = rasterize(camera, shown)
+    painted = paint(camera, [material], Lighting((), (0.5,) * 3))
+    directions = camera.rays().reshape(-1, 3) @ camera.T_world_camera[:3, :3].T
+    origins = np.broadcast_to(camera.T_world_camera[:3, 3], directions.shape)
+    places, rays, _ = RayMeshIntersector(arm).intersects_location(origins, directions, multiple_hits=False)
+    depth = np.zeros(len(directions))
+    depth[rays] = camera.local(places)[:, 2]
+    theirs = depth.reshape(480, 640)
+    assert (camera.local(arm.vertices)[:, 2] < 0.0).any() == (away < 1.0)
+    assert (theirs > 0).mean() > 0.005
+    assert ((theirs > 0) == (pictures.depth > 0)).mean() >= 0.9999
+    assert np.quantile(np.abs(theirs - pictures.depth)[theirs > 0], 0.999) < 1e-5
+    inside = cv2.erode((theirs > 0).astype(np.uint8), np.ones((3, 3))) > 0
+    assert (painted[..., 3][inside] == 255).all() and (pictures.parts[inside] == 1).all()
+    assert np.allclose(np.linalg.norm(pictures.normals[inside], axis=-1), 1.0, atol=1e-5)
 
 
 SPHERES = (

@@ -147,6 +147,9 @@ MIDDLE = np.array([0.1, -0.2, 1.1])
 POSITIONS = MIDDLE + np.array([[0.0, 0.0, 0.0], [0.5, -0.6, 0.3], [0.56, -0.55, 0.3], [-1.0, 0.3, 0.9]])
 
 
+LAMP = np.array([0.3, -0.2, 0.9])
+
+
 def pair(name: str = "vga") -> list[Camera]:
     return [preset(name).at(look_at(position, MIDDLE)) for position in POSITIONS[1:3]]
 
@@ -172,7 +175,7 @@ def looked_up(picture: np.ndarray, pixels: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("camera", ["vga", "headset_fisheye"])
 @pytest.mark.parametrize("kind", DRAWN)
 def test_two_cameras_see_one_place(kind: str, camera: str) -> None:
-    box = enclose(POSITIONS, 5)
+    box = enclose(POSITIONS, 5, LAMP)
     first, second = pair(camera)
     one, two = (draw_surroundings(background(kind), box, view) for view in (first, second))
     pixels, depth, inside = seen_twice(first, second, one.depth)
@@ -188,7 +191,7 @@ def test_two_cameras_see_one_place(kind: str, camera: str) -> None:
 
 
 def test_an_empty_box_is_where_it_says() -> None:
-    box = Enclosure((-1.0, -2.0, 0.0), (2.0, 1.5, 2.5), ((-0.5,) * 3, (0.5,) * 3))
+    box = Enclosure((-1.0, -2.0, 0.0), (2.0, 1.5, 2.5), ((-0.5,) * 3, (0.5,) * 3), (0.0, 0.0, 2.0))
     camera = preset("vga").at(look_at(np.array([0.0, 0.0, 1.2]), np.array([0.5, 0.9, 1.0])))
     seen = draw_surroundings(background("gradient"), box, camera)
     rays = camera.rays()
@@ -209,7 +212,7 @@ def test_an_empty_box_is_where_it_says() -> None:
 
 def test_furniture_keeps_away_from_hands_and_cameras() -> None:
     for seed in range(8):
-        box = enclose(POSITIONS, seed)
+        box = enclose(POSITIONS, seed, LAMP)
         for camera in pair("headset_fisheye"):
             seen = draw_surroundings(background("room", seed), box, camera)
             ahead = seen.depth > 0.0
@@ -253,6 +256,6 @@ def test_a_rig_sees_photographs_on_the_walls(tmp_path) -> None:
     assert cv2.imwrite(str(file), picture)
     photo = dataclasses.replace(background("photo"), photo=str(file))
     rig = load_rig("six")
-    box = enclose(np.concatenate([rig.positions, MIDDLE[None]]), 0)
+    box = enclose(np.concatenate([rig.positions, MIDDLE[None]]), 0, LAMP)
     seen = draw_surroundings(photo, box, preset("vga").at(rig.T_world_camera[0]))
     assert seen.rgb.min() < 60 and seen.rgb.max() > 200 and (seen.depth > 0.5).all()

@@ -10,8 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from render import Backgrounds, SkinLook
-from render.scenery.lights import expose_for, irradiance, sample_lighting, sample_surroundings, surround
+from render import Backgrounds
+from render.scenery.backgrounds import Background, enclose, light_in
+from render.scenery.lights import irradiance, sample_lighting, sample_surroundings, surround
 
 
 def test_lightings_are_plain_values_and_repeat() -> None:
@@ -24,7 +25,7 @@ def test_lightings_neither_blind_nor_leave_in_the_dark(rng: np.random.Generator)
     for _ in range(200):
         lighting = sample_lighting(rng=rng)
         total = sum(lamp.strength for lamp in lighting.lamps) + np.mean(lighting.ambient)
-        assert 0.5 < total < 2.2
+        assert 1.0 < total < 3.42
         assert lighting.lamps[0].direction == lighting.lamps[-1].direction  # the key light's unshadowed part
         assert all(0.6 < level < 1.6 for lamp in lighting.lamps for level in lamp.color)
 
@@ -65,7 +66,7 @@ def test_a_picture_lights_as_the_integral_over_it_says(rng: np.random.Generator)
 def test_light_keeps_its_strength_and_takes_the_pictures_colors(rng: np.random.Generator) -> None:
     lighting = sample_lighting(rng=rng)
     red = np.zeros((12, 16, 3)) + (0.8, 0.1, 0.1)
-    lit = surround(lighting, red, 0.5)
+    lit = surround(lighting, irradiance(red), 0.5)
     weights = np.array([0.2126, 0.7152, 0.0722])
     assert np.array(lit.ambient) @ weights == pytest.approx(np.array(lighting.ambient) @ weights, rel=0.01)
     assert lit.ambient[0] > lighting.ambient[0] and lit.ambient[1] < lighting.ambient[1]
@@ -74,21 +75,36 @@ def test_light_keeps_its_strength_and_takes_the_pictures_colors(rng: np.random.G
 
 def test_a_dark_picture_gives_no_light_that_is_none() -> None:
     lighting = sample_lighting(rng=np.random.default_rng(0))
-    lit = surround(lighting, np.zeros((12, 16, 3)), 0.5)
+    lit = surround(lighting, irradiance(np.zeros((12, 16, 3))), 0.5)
     assert np.isfinite(lit.surroundings).all() and min(lit.ambient) > 0.0
 
 
 def test_surroundings_repeat() -> None:
-    first, again = (sample_surroundings(Backgrounds(), None, rng=np.random.default_rng(3)) for _ in range(2))
+    first, again = (
+        sample_surroundings(Backgrounds(), np.eye(3), rng=np.random.default_rng(3)) for _ in range(2)
+    )
     assert first == again and len(first[1].surroundings) == 9
 
 
-def test_pictures_are_exposed_for_the_hand() -> None:
-    lighting = surround(sample_lighting(rng=np.random.default_rng(0)), np.full((4, 4, 3), 0.3), 0.5)
-    dark, light = (
-        expose_for(lighting, SkinLook(lightness=level, palm_lightness=66.0)) for level in (35.0, 75.0)
-    )
-    gain = np.array(dark.ambient) / light.ambient
-    np.testing.assert_allclose(gain, (((75 + 16) / (35 + 16)) ** 3) ** 0.5)  # half of what they differ by
-    np.testing.assert_allclose(dark.lamps[0].strength / light.lamps[0].strength, gain[0])
-    np.testing.assert_allclose(np.array(dark.surroundings), gain[0] * np.array(light.surroundings))
+def test_light_that_is_turned_lights_turned_surfaces_the_same(rng: np.random.Generator) -> None:
+    lighting = surround(sample_lighting(rng=rng), rng.random((9, 3)), 0.5)
+    rotation = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    turned, normals = lighting.turned(rotation), around(20, rng)
+    for lamp, other in zip(lighting.lamps, turned.lamps, strict=True):
+        np.testing.assert_allclose(rotation @ lamp.direction, other.direction)
+        assert (lamp.strength, lamp.color) == (other.strength, other.color)
+    there, here = np.array(turned.surroundings), np.array(lighting.surroundings)
+    np.testing.assert_allclose(sent_back(there, normals @ rotation.T), sent_back(here, normals), atol=1e-12)
+
+
+def test_an_enclosure_lights_hands_from_where_it_is_bright(rng: np.random.Generator) -> None:
+    background = Background("room", ((0.0,) * 3, (0.0,) * 3), 3)
+    towards = np.array([0.6, 0.0, 0.8])
+    box = enclose(np.array([[0.0, 0.0, 1.0], [0.4, 0.3, 1.3]]), 0, towards)
+    way = np.array(box.lamp) - np.mean(box.free, axis=0)
+    np.testing.assert_allclose(way / np.linalg.norm(way), towards, atol=1e-5)
+    assert (np.array(box.lamp) > box.low).all() and (np.array(box.lamp) < box.high).all()
+    directions = around(4000, rng)
+    light = light_in(background, box, directions)
+    assert light.shape == (4000, 3) and 0.0 <= light.min() and light.max() <= 1.0
+    assert light[directions @ towards > 0.5].mean() > light[directions @ towards < -0.5].mean()

@@ -7,8 +7,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from track.viewer.contents import show_recording
-from track.viewer.recordings import TakeRecording
+from handsim.space.transforms import quaternion_matrix, turned_poses, upright
+from track.viewer.contents import first_look, show_recording
+from track.viewer.recordings import TakeRecording, write_video
 from track.viewer.stage import FrameView
 
 
@@ -116,3 +117,36 @@ def test_a_slider_in_the_page_leads_to_a_frame(server, page_of, tracked):
     rows = [props["label"] for props in page.panel.values() if "label" in props]
     (doubt,) = [row for row in rows if ": " in row]
     assert "right:ThumbCMC without a label, " in doubt
+
+
+def test_a_take_with_y_up_stands_as_the_same_take_with_z_up(server, page_of, tracked):
+    back = upright("y").T
+    points = dataclasses.replace(tracked.point_list, points=tracked.point_list.points @ back.T)
+    lying = dataclasses.replace(
+        tracked,
+        qpos=turned_poses(tracked.qpos, back),
+        body_poses=turned_poses(tracked.body_poses, back),
+        point_list=points,
+    )
+    looks, clips = [], []
+    for take, up in ((tracked, "z"), (lying, "y")):
+        recording = TakeRecording(take)
+        show_recording(server, recording, up=up)
+        page, camera = page_of(server), server.initial_camera
+        turn = upright(up)
+        looks.append([turn @ getattr(camera, name) for name in ("position", "look_at", "up")])
+        looks[-1].append(turn @ page.places["/ground"])
+        looks[-1].append(turn @ quaternion_matrix(page.turns.get("/ground", np.eye(4)[0]))[:, 2])
+
+        def clip(path, pictures, *, shown, **_):
+            values = [shown]
+            for hands, points, *_ in pictures:
+                poses = np.array([pose for _, pose in hands])
+                values += [points, poses[:, :3], quaternion_matrix(poses[:, 3:7]), poses[:, 7:]]
+            clips.append(values)
+
+        write_video("v.mp4", recording, first_look(recording), up=up, write_clip=clip)
+    np.testing.assert_allclose(looks[1], looks[0], atol=1e-6)
+    np.testing.assert_allclose(looks[0][2], [0, 0, 1])
+    for one, other in zip(*clips, strict=True):
+        np.testing.assert_allclose(other, one, atol=1e-6)

@@ -1,0 +1,65 @@
+"""Joint angles as the International Society of Biomechanics, ISB, writes them (Wu and others 2005).
+
+The axes of a bone of the right hand are X to the palm's side, Y to the elbow and Z to the thumb's side. A
+joint turns about Z of the inner bone (flexion), about the axis that is perpendicular to the two others (ulnar
+deviation), and about Y of the outer bone (pronation). A left hand is mirrored first, so its signs are equal.
+
+A finger's metacarpal has the axes of the flat finger. Skin markers do not measure the trapezium, so the first
+metacarpal turns relative to the hand: towards the palm, to the thumb's side, and about its length.
+"""
+
+from __future__ import annotations
+
+from typing import Final, Literal
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
+
+from handsim.hand.shape import DIGITS, HandShape
+from handsim.space.transforms import axis_angle_matrix, euler_matrix
+
+Convention = Literal["model", "isb"]
+"""How angles are named and counted: as the model's hinges, or as the ISB does."""
+_THUMB: Final = (
+    *(f"thumb_metacarpal_{name}" for name in ("palmar_abduction", "radial_abduction", "pronation")),
+    "thumb_MCP_flexion",
+    "thumb_IP_flexion",
+)
+_FINGER: Final = ("MCP_flexion", "MCP_ulnar_deviation", "MCP_pronation", "PIP_flexion", "DIP_flexion")
+ISB_NAMES: Final = (*_THUMB, *(f"{digit}_{name}" for digit in DIGITS[1:] for name in _FINGER))
+_BONE_ISB: Final = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, 0.0, 0.0]])
+"""The ISB's axes X, Y and Z as columns, in our frame of a bone."""
+
+
+def isb_angles(
+    shape: HandShape, angles: Float[np.ndarray, "T 20"], neutral: Float[np.ndarray, "20"] | None = None
+) -> Float[np.ndarray, "T 25"]:
+    """The angles of `ISB_NAMES` [rad] of a hand whose hinges have these angles; NaN stays NaN.
+
+    In the pose `neutral` all of them are zero; if it is None, those of the fingers are zero in the flat hand,
+    and those of the first metacarpal where it points along the hand.
+    """
+    from scipy.spatial.transform import Rotation
+
+    known = np.isfinite(angles[:, 0])
+    outer, turns = angles[known], _first_bones(shape, angles[known])
+    if neutral is not None:
+        outer = outer - neutral
+        turns = turns @ np.swapaxes(_first_bones(shape, neutral[None]), -1, -2)
+    turns = _BONE_ISB.T @ turns @ _BONE_ISB
+    first = Rotation.from_matrix(turns.reshape(-1, 3, 3)).as_euler("ZXY").reshape(-1, len(DIGITS), 3)
+    first[:, 0, 1] *= -1.0  # radial abduction of the thumb is the opposite of ulnar deviation
+    found = np.full((len(angles), len(ISB_NAMES)), np.nan)
+    both = first, outer.reshape(len(outer), len(DIGITS), -1)[..., 2:]
+    found[known] = np.concatenate(both, axis=2).reshape(-1, len(ISB_NAMES))
+    return found
+
+
+def _first_bones(shape: HandShape, angles: Float[np.ndarray, "T 20"]) -> NDArray[np.float64]:
+    """Orientation (T, 5, 3, 3) of the first bone of each digit, as a right hand's: a shape is always one."""
+    by_digit = angles.reshape(len(angles), len(DIGITS), -1)
+    _, y, z = np.eye(3)
+    turns = axis_angle_matrix(z, by_digit[..., 0]) @ axis_angle_matrix(y, by_digit[..., 1])
+    turns[:, 0] = euler_matrix(shape.base_angles[0]) @ turns[:, 0]
+    return turns

@@ -1,0 +1,173 @@
+"""The person behind a take's hands: eyes, shoulders, and arms that bend as arms do.
+
+A take knows hands alone. The person is placed where the arms of all frames are most comfortable and hide the
+least of the hands, which people who work with them look at from above. Lengths are shares of the stature in
+Drillis and Contini (1966), Body segment parameters, over that of the hand.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from jaxtyping import Float
+
+from gloves import Take
+from handsim.space.transforms import quaternion_matrix
+from render.frames import Doubles
+from render.skin.look import ELBOW
+
+_HAND: Final = 0.108
+_UPPER_ARM: Final = 0.186 / _HAND  # [hand lengths], as all of these
+_SHOULDER: Final = 0.129 / _HAND  # from the neck's axis
+_EYES: Final = (0.5, 0.118 / _HAND)  # before and above the shoulders; a head that looks down leans forward
+_WRIST: Final = np.deg2rad([[76.0, 75.0], [36.0, 22.0]])
+"""Largest flexion and extension, ulnar and radial deviation of a wrist [rad], a little less than the means of
+the American Academy of Orthopaedic Surgeons (1965)."""
+
+_FRAMES: Final = 8  # frames that places of the person are compared in
+_COARSE: Final = (np.deg2rad(np.arange(0.0, 360.0, 20.0)), [0.5, 0.65], np.deg2rad([35.0]), [0.0])
+"""Places that are tried: azimuths of the line of sight [rad], distances of the eyes from the hands [m], and
+angles of that line below the horizon and from where the chest points [rad]."""
+_TURNS: Final = np.deg2rad([-25.0, 0.0, 25.0])
+_FINE: Final = (np.deg2rad([-13.0, 0.0, 13.0]), [0.4, 0.5, 0.6, 0.7], np.deg2rad([15.0, 35.0, 55.0]), _TURNS)
+"""The same around the best azimuth."""
+_NATURAL: Final = (0.5, np.deg2rad(40.0), 0.0)  # such distance and angles of people at work
+_SPREADS: Final = (0.12, np.deg2rad(15.0), np.deg2rad(30.0))
+_UNUSUAL: Final = 0.15  # weight of what is far from these
+
+_SWIVELS: Final = np.deg2rad(np.arange(-100.0, 101.0, 20.0))  # of an elbow, from its lowest place
+_SWIVEL: Final = np.deg2rad(50.0)  # their spread
+_SOFTNESS: Final = 0.3  # difference of costs within which elbows are averaged, so that they do not jump
+_OVERREACH: Final = 0.05  # distance by which a person reaches farther without much ado [m]
+_HIDING: Final = (0.12, 0.04)  # distance of a forearm from a line of sight that it hides, and its spread [m]
+_NEAR: Final = (0.36, 0.06)  # distance of an arm before the eyes that takes up the view, and its spread [m]
+_RISE: Final = 0.1  # spread of the tangent by which elbows are seen above the middle of the view
+_VIEW: Final = np.cos(np.deg2rad(40.0))
+_ALONG: Final = np.linspace(0.25, 1.0, 4)  # places between wrist and elbow that are looked at
+_WORST: Final = 12.0  # cost of an arm, beyond which another is no worse
+
+
+class UserBody:
+    """Eyes and shoulders of the person whose hands a take has."""
+
+    eyes: Doubles
+    """Position between the eyes (3,) [m]."""
+    shoulders: Doubles
+    """Position of each hand's shoulder (H, 3) [m]."""
+    right: Doubles
+    """Level unit direction (3,) to the person's right."""
+
+    def __init__(self, take: Take) -> None:
+        self._lengths = np.array([hand.shape.length for hand in take.hands])
+        self._mirrors = np.array([-1.0 if hand.side == "left" else 1.0 for hand in take.hands])
+        there = np.flatnonzero(np.isfinite(take.qpos[..., 0]).any(axis=1))
+        frames = there[np.linspace(0, len(there) - 1, min(_FRAMES, len(there))).astype(int)]
+        wrists, axes = take.qpos[frames, :, :3], quaternion_matrix(take.qpos[frames, :, 3:7])
+        middle = _middle(self._palms(wrists, axes).reshape(-1, 3))
+        best, azimuth = np.inf, 0.0
+        for azimuths, distances, downs, facings in (_COARSE, _FINE):
+            grids = np.meshgrid(azimuth + azimuths, distances, downs, facings)
+            tried = np.stack([grid.ravel() for grid in grids], axis=1)
+            eyes, shoulders, right = self._stand(middle, *tried.T)
+            _, costs = self._elbows(wrists, axes, shoulders[:, None], eyes[:, None])
+            means = np.nanmean(np.minimum(costs.min(axis=-1), _WORST), axis=(1, 2))
+            means += _UNUSUAL * np.square((tried[:, 1:] - _NATURAL) / _SPREADS).sum(axis=1)
+            first = int(means.argmin())
+            if means[first] < best:
+                best, azimuth = float(means[first]), float(tried[first, 0])
+                self.eyes, self.shoulders, self.right = eyes[first], shoulders[first], right[first]
+
+    def _stand(
+        self, middle: Doubles, azimuth: Doubles, distance: Doubles, down: Doubles, facing: Doubles
+    ) -> tuple[Doubles, Doubles, Doubles]:
+        """Eyes (K, 3), shoulders (K, H, 3) and right (K, 3) of people who look at a point from there."""
+        flat, length = np.cos(down), float(self._lengths.mean())
+        sight = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), -np.sin(down)], axis=1)
+        ahead = np.stack([np.cos(azimuth + facing), np.sin(azimuth + facing), 0.0 * facing], axis=1)
+        right = np.stack([ahead[:, 1], -ahead[:, 0], ahead[:, 2]], axis=1)
+        eyes = middle - distance[:, None] * sight
+        neck = eyes - length * (_EYES[0] * ahead + [0.0, 0.0, _EYES[1]])
+        aside = (_SHOULDER * self._lengths * self._mirrors)[:, None]
+        return eyes, neck[:, None] + aside * right[:, None], right
+
+    def _palms(self, wrists: Doubles, axes: Doubles) -> Doubles:
+        return np.asarray(wrists + 0.5 * self._lengths[:, None] * axes[..., 0])
+
+    def forearms(self, qpos: Float[np.ndarray, "*T H 27"]) -> Float[np.ndarray, "*T H 3"]:
+        """Unit directions from wrists to elbows; NaN where there is no hand."""
+        axes = quaternion_matrix(qpos[..., 3:7])
+        ways, costs = self._elbows(qpos[..., :3], axes, self.shoulders, self.eyes)
+        weights = np.exp((costs.min(axis=-1, keepdims=True) - costs) / _SOFTNESS)
+        mean = (weights[..., None] * ways).sum(axis=-2)
+        return np.asarray(mean / np.linalg.norm(mean, axis=-1, keepdims=True))
+
+    def _elbows(
+        self, wrists: Doubles, axes: Doubles, shoulders: Doubles, eyes: Doubles
+    ) -> tuple[Doubles, Doubles]:
+        """Unit directions (..., H, S, 3) from wrists to the elbows that are tried, and their costs."""
+        fore, upper = ELBOW * self._lengths, _UPPER_ARM * self._lengths
+        line = shoulders - wrists
+        distance = np.linalg.norm(line, axis=-1)
+        line /= distance[..., None]
+        span = np.clip(distance, np.abs(upper - fore) + 0.05, 0.995 * (upper + fore))
+        along = (fore**2 - upper**2 + span**2) / (2.0 * span * fore)
+        down = line * line[..., 2:] - [0.0, 0.0, 1.0]
+        down /= np.maximum(np.linalg.norm(down, axis=-1, keepdims=True), 1e-6)
+        swivel = _SWIVELS[:, None]
+        circle = np.cos(swivel) * down[..., None, :] + np.sin(swivel) * np.cross(line, down)[..., None, :]
+        radius = np.sqrt(np.maximum(1.0 - along**2, 0.0))
+        ways = (along[..., None] * line)[..., None, :] + radius[..., None, None] * circle
+        ways, load = _bent_wrists(ways, axes[..., None, :, :], self._mirrors[:, None])
+        costs = load**2 + np.square(_SWIVELS / _SWIVEL)
+        costs += np.square(np.maximum(distance - span, 0.0) / _OVERREACH)[..., None]
+        return ways, costs + self._in_view(ways, wrists, self._palms(wrists, axes), eyes)
+
+    def _in_view(self, ways: Doubles, wrists: Doubles, palms: Doubles, eyes: Doubles) -> Doubles:
+        """Costs (..., H, S) of forearms that hide a hand from the eyes or take up much of their view."""
+        reach = (ELBOW * self._lengths)[:, None, None, None] * _ALONG[:, None]
+        places = wrists[..., None, None, :] + reach * ways[..., None, :] - eyes[..., None, None, None, :]
+        far = np.linalg.norm(places, axis=-1)
+        ahead = _middle(palms) - eyes
+        ahead /= np.linalg.norm(ahead, axis=-1, keepdims=True)
+        above = np.eye(3)[2] - ahead[..., 2:] * ahead
+        elbows = places[..., -1, :]
+        rise = (elbows * above[..., None, None, :]).sum(axis=-1) / (elbows * ahead[..., None, None, :]).sum(
+            axis=-1
+        ).clip(0.1)
+        costs = np.square(np.maximum(rise, 0.0) / _RISE)
+        for hand in range(palms.shape[-2]):
+            sight = palms[..., hand, :] - eyes
+            length = np.linalg.norm(sight, axis=-1)
+            sight = np.nan_to_num(sight / length[..., None])[..., None, None, None, :]
+            length = np.nan_to_num(length)[..., None, None, None]
+            depth = (places * sight).sum(axis=-1)
+            beside = np.sqrt(np.maximum(far**2 - depth**2, 0.0))
+            hides = np.maximum(_HIDING[0] * depth / np.maximum(length, 0.1) - beside, 0.0) / _HIDING[1]
+            costs += np.square(np.where((depth > 0.0) & (depth < length), hides, 0.0)).max(axis=-1)
+            near = np.maximum(_NEAR[0] - far, 0.0) / _NEAR[1]
+            costs += np.square(np.where(depth > _VIEW * far, near, 0.0)).max(axis=-1)
+        return np.asarray(costs)
+
+
+def _middle(points: Doubles) -> Doubles:
+    """Mean (..., 3) of the points (..., N, 3) that are there; NaN where none is."""
+    there = np.isfinite(points)
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.where(there, points, 0.0).sum(axis=-2) / there.sum(axis=-2))
+
+
+def _bent_wrists(ways: Doubles, axes: Doubles, mirrors: Doubles) -> tuple[Doubles, Doubles]:
+    """Directions of forearms, turned as far as wrists cannot bend, and the bends over the largest ones."""
+    local = np.einsum("...ij,...i->...j", axes, ways)
+    flexion = np.arctan2(-local[..., 2], -local[..., 0])
+    radial = np.arcsin(np.clip(mirrors * local[..., 1], -1.0, 1.0))
+    most = np.where(flexion > 0.0, *_WRIST[0]), np.where(radial < 0.0, *_WRIST[1])
+    load = np.hypot(flexion / most[0], radial / most[1])
+    kept = 1.0 / np.maximum(load, 1.0)
+    straight = -np.broadcast_to(axes[..., 0], ways.shape)
+    angle = np.arccos(np.clip((straight * ways).sum(axis=-1), -1.0, 1.0))
+    sine = np.maximum(np.sin(angle), 1e-6)
+    shares = np.sin((1.0 - kept) * angle) / sine, np.sin(kept * angle) / sine
+    turned = shares[0][..., None] * straight + shares[1][..., None] * ways
+    return np.asarray(np.where(angle[..., None] > 1e-5, turned, straight)), load
