@@ -105,6 +105,17 @@ def regular(numbers: range, *, jump: int = 0) -> list[tuple[int, float, float]]:
     return [(number + jump, (number + jump) / RATE, number / RATE) for number in numbers]
 
 
+@pytest.mark.parametrize("time", [1e17, 1e9, 40.0, 0.3, -1e9, 1e300])
+@pytest.mark.parametrize("place", [0, 1, 5, 19])
+def test_a_wild_time_is_left_out_and_takes_nothing_with_it(time, place):
+    packets, order = regular(range(20)), FrameOrder()
+    packets.insert(place, (place, time, packets[place][2]))
+    gone = passed(order, packets)
+    assert [number for number, told in gone if told != time] == list(range(20))
+    assert (order.wild, order.missed, order.restarts) == (1, 0, 0)
+    assert len(gone) == 20
+
+
 @pytest.mark.parametrize("number", [400, 1000, 11_409_641])
 def test_a_damaged_header_whose_number_and_time_agree_is_left_out(number):
     packets, order = regular(range(20)), FrameOrder()
