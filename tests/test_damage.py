@@ -200,7 +200,9 @@ def test_damaged_pictures_are_not_merged(tmp_path, take):
     for folder in folders:
         render(take, folder, ("webdataset",))
     merge_renderings(folders, tmp_path / "c")
-    flip(tmp_path / "c" / "shard-00003.tar", 0.6, 0xFF)
-    with pytest.raises(DatasetError, match=r"shard-00003.tar are damaged"):
-        merge_renderings([folders[0], tmp_path / "c"], tmp_path / "d")
-    assert not (tmp_path / "d").exists()
+    for name in ("shard-00003.tar", "checksums-00003.json"):
+        damaged = shutil.copytree(tmp_path / "c", tmp_path / name)
+        flip(damaged / name, 0.6, 0xFF)
+        with pytest.raises(DatasetError, match=rf"{name} are damaged"):
+            merge_renderings([folders[0], damaged], tmp_path / "d")
+        assert not (tmp_path / "d").exists()
