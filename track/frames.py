@@ -56,6 +56,8 @@ class StreamedFrame:
     """The server's time began anew: it does not continue that of the frame before."""
     arrived: float = math.nan
     """Monotonic time of its arrival on this machine [s]; NaN where it did not come live."""
+    latency: float = math.nan
+    """Time from the middle of its exposure to its sending [s]; NaN where the source does not tell."""
 
 
 def capture_of(capture: AnyCapture) -> Capture:
@@ -212,6 +214,9 @@ class TrackedHand:
     """Indices of the markers that are filled in from the pose."""
     find_spreads: Callable[[], Spreads] = field(default=_unknown_spreads, repr=False)
     """Computes the standard deviations: only where they are asked for, since a frame has little time."""
+    velocity: Float[np.ndarray, "26"] = field(default_factory=lambda: np.full(26, np.nan))
+    """Velocity of the wrist [m/s], its angular velocity in its own frame and that of each joint [rad/s];
+    NaN where the hand is not tracked."""
 
     @property
     def angle_spread(self) -> Float[np.ndarray, "20"]:
@@ -236,6 +241,11 @@ class TrackedHand:
     def angles(self) -> dict[str, float]:
         """The angle of each joint by its name [rad]; NaN where the hand is lost."""
         return dict(zip(JOINT_NAMES, self.qpos[7:].tolist(), strict=True))
+
+    @property
+    def angle_velocities(self) -> dict[str, float]:
+        """The angular velocity of each joint by its name [rad/s]; NaN where the hand is not tracked."""
+        return dict(zip(JOINT_NAMES, self.velocity[6:].tolist(), strict=True))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

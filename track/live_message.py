@@ -6,7 +6,7 @@ import dataclasses
 import functools
 import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from time import monotonic
 from typing import Any, Final, NamedTuple, Protocol, TypeVar
@@ -22,6 +22,7 @@ from handsim import __version__
 from handsim._plugins import import_extra
 from handsim.hand.model import KEYPOINT_NAMES, HandModel, hand_keypoints
 from handsim.hand.shape import JOINT_NAMES, Side
+from handsim.kernels import move
 from handsim.motion_files.motion import OPENXR_JOINTS, joint_poses, joint_radii
 from handsim.space.transforms import ProgramAxes, UpAxis, program_axes, transform_poses
 from track.frames import StreamedFrame, TrackedFrame, TrackedHand
@@ -32,7 +33,12 @@ SCHEMA: Final = 1
 FORMATS: Final = ("json", "msgpack")
 WORLD: Final = "world"
 """The axes of the camera system."""
+LARGEST_DATAGRAM: Final = 1400
+"""Size up to which datagrams go through usual networks in one packet [bytes]."""
 _DECIMALS: Final = 6  # micrometers and microradians
+_STEP: Final = 1e-3  # time between the poses whose difference is a velocity [s]
+_POSE: Final = ("side", "status", "wrist", "angles", "positions")  # entries of a hand that stay together
+_HALF: Final = len(OPENXR_JOINTS) // 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,6 +77,10 @@ class LiveHand:
     """Standard deviation of each joint angle [rad]."""
     position_spread: Float[np.ndarray, "21"]
     """Standard deviation of each joint position in each direction [m]."""
+    angle_velocities: Float[np.ndarray, "20"]
+    """Angular velocity of each joint [rad/s]; NaN where it is not known."""
+    find_velocities: Callable[[], Float[np.ndarray, "21 3"]] = field(repr=False)
+    """Computes the velocity of each joint position in the world [m/s]; NaN where it is not known."""
     find_joints: Callable[[], Float[np.ndarray, "26 7"]] = field(repr=False)
     """Computes positions [m] and wxyz quaternions of OpenXR's joints in the world; for a hand with a pose."""
 
@@ -117,6 +127,8 @@ class LiveMessage:
     """Marker of each point, an index into `header.markers`; -1 for none."""
     lag: float
     """Time from the frame's arrival on this machine to this message [s]; NaN where it did not come live."""
+    latency: float
+    """Time from the middle of the frame's exposure to this message [s]; NaN where it is not known."""
 
 
 class LiveSink(Protocol):
@@ -151,6 +163,7 @@ class MessageEncoder:
 
     def encode(self, frame: StreamedFrame, tracked: TrackedFrame) -> LiveMessage:
         """Make the message on a frame."""
+        lag = monotonic() - frame.arrived
         return LiveMessage(
             header=self.header,
             number=frame.number,
@@ -162,7 +175,8 @@ class MessageEncoder:
             ),
             points=frame.points,
             labels=tracked.labels,
-            lag=monotonic() - frame.arrived,
+            lag=lag,
+            latency=frame.latency + lag,
         )
 
     def _hand(self, number: int, hand: TrackedHand) -> LiveHand:
@@ -171,8 +185,17 @@ class MessageEncoder:
             positions = hand_keypoints(self._models[number], hand.qpos[None])[0]
         pose = hand.qpos[:3], hand.qpos[3:7], hand.qpos[7:], positions
         spreads = hand.angle_spread, hand.keypoint_spread
+        velocities = functools.partial(_velocities, self._models[number], hand)
         joints = functools.partial(_openxr_joints, self._models[number], hand.qpos)
-        return LiveHand(hand.side, hand.status, *pose, *spreads, joints)
+        return LiveHand(hand.side, hand.status, *pose, *spreads, hand.velocity[6:], velocities, joints)
+
+
+def _velocities(model: HandModel, hand: TrackedHand) -> Float[np.ndarray, "21 3"]:
+    if np.isnan(hand.velocity).any():
+        return np.full((len(KEYPOINT_NAMES), 3), np.nan)
+    steps = np.outer([-0.5 * _STEP, 0.5 * _STEP], hand.velocity)
+    before, after = hand_keypoints(model, move(np.stack([hand.qpos] * 2), steps))
+    return np.asarray((after - before) / _STEP)
 
 
 def _openxr_joints(model: HandModel, qpos: Float[np.ndarray, "27"]) -> Float[np.ndarray, "26 7"]:
@@ -197,6 +220,7 @@ def in_axes(message: LiveMessage, axes: ProgramAxes) -> LiveMessage:
             placed(hand),
             positions=axes.positions(hand.positions),
             position_spread=axes.scale * hand.position_spread,
+            find_velocities=functools.partial(lambda one: axes.positions(one.find_velocities()), hand),
             find_joints=functools.partial(lambda one: turned(one.find_joints()), hand),
         )
         for hand in message.hands
@@ -210,11 +234,13 @@ def in_axes(message: LiveMessage, axes: ProgramAxes) -> LiveMessage:
 
 
 class MessageFormat(NamedTuple):
-    """How messages become bytes."""
+    """How messages become bytes, or several datagrams each."""
 
-    header: Callable[[LiveHeader], bytes]
-    frame: Callable[[LiveMessage], bytes]
-    end: Callable[[], bytes]
+    header: Callable[[LiveHeader], list[bytes]]
+    frame: Callable[[LiveMessage], list[bytes]]
+    end: Callable[[], list[bytes]]
+    lag: Callable[[float, int], bytes] = lambda lag, dropped: b""
+    """Tells a client how far it is behind [s], and how many frames it has not got."""
     is_text: bool = False
 
 
@@ -225,19 +251,30 @@ class Content(NamedTuple):
     """All points and their labels."""
     joints: bool = False
     """OpenXR's 26 joints of each hand."""
+    velocities: bool = False
+    """Velocities of joint angles and positions."""
     axes: str = WORLD
     """The program in whose axes and unit they are, one of `PROGRAMS`, or the world of the camera system."""
     up: UpAxis = "z"
     """The axis of the camera system that points up."""
+    unit: str = "auto"
+    """The unit of length, m or cm; auto is the program's."""
 
     @property
     def program(self) -> ProgramAxes | None:
-        """The axes of the program; None for those of the camera system."""
-        return None if self.axes == WORLD else program_axes(self.axes, self.up)
+        """The axes of the program; None for those of the camera system in meters."""
+        if self.axes == WORLD:
+            return program_axes("ros", "z", self.unit) if self.unit == "cm" else None
+        return program_axes(self.axes, self.up, self.unit)
 
 
-def document_format(name: str, content: Content = Content()) -> MessageFormat:  # noqa: B008 (immutable)
-    """Messages as documents in one of `FORMATS`."""
+def document_format(
+    name: str,
+    content: Content = Content(),  # noqa: B008 (immutable)
+    *,
+    largest: float = math.inf,
+) -> MessageFormat:
+    """Messages as documents in one of `FORMATS`, divided into parts of at most `largest` bytes."""
     encode: Callable[[dict[str, Any]], bytes]
     if name == "msgpack":
         encode = import_extra("msgpack", f"format={name}", "send").Packer().pack
@@ -248,11 +285,46 @@ def document_format(name: str, content: Content = Content()) -> MessageFormat:  
             return as_text(document).encode()
 
     return MessageFormat(
-        lambda header: encode(header_document(header, content)),
-        lambda message: encode(frame_document(message, content)),
-        lambda: encode({"type": "end", "schema": SCHEMA}),
+        lambda header: _divided(header_document(header, content), encode, largest),
+        lambda message: _divided(frame_document(message, content), encode, largest),
+        lambda: [encode({"type": "end", "schema": SCHEMA})],
+        lambda lag, dropped: encode(
+            {"type": "lag", "schema": SCHEMA, "lag": _known(lag), "dropped": dropped}
+        ),
         is_text=name == "json",
     )
+
+
+def _divided(document: dict[str, Any], encode: Callable[[Any], bytes], largest: float) -> list[bytes]:
+    """A document, or parts that hold the items of its lists between them, see docs/live_output.md."""
+    whole = encode(document)
+    if len(whole) <= largest:
+        return [whole]
+    alike = {name: value for name, value in document.items() if not isinstance(value, list)}
+    parts: list[dict[str, Any]] = [{}]
+    room = 0.0
+    for name in (name for name in document if name not in alike):
+        for item in _hand_parts(document[name]) if name == "hands" else document[name]:
+            needed = len(encode({name: [item]} if name not in parts[-1] else [item]))
+            if needed > room:
+                parts.append({**alike, "part": len(parts), "parts": len("???")})
+                room = largest - len(encode(parts[-1])) - len("???")
+                needed = len(encode({name: [item]}))
+            parts[-1].setdefault(name, []).append(item)
+            room -= needed
+    return [encode({**part, "parts": len(parts) - 1}) for part in parts[1:]]
+
+
+def _hand_parts(hands: list[dict[str, Any]]) -> Iterator[dict[str, Any]]:
+    """The poses of hands, then their other entries alone, joints in two halves."""
+    for hand in hands:
+        yield {name: hand[name] for name in _POSE}
+    for hand in hands:
+        whose = {name: hand[name] for name in _POSE[:2]}
+        for name in [name for name in hand if name not in _POSE]:
+            halves = name == "joints" and hand[name] is not None
+            for value in (hand[name][:_HALF], hand[name][_HALF:]) if halves else (hand[name],):
+                yield {**whose, name: value}
 
 
 def header_document(header: LiveHeader, content: Content = Content()) -> dict[str, Any]:  # noqa: B008
@@ -281,8 +353,9 @@ def frame_document(message: LiveMessage, content: Content = Content()) -> dict[s
         "number": int(message.number),
         "time": float(message.time),
         "silent": message.silent,
-        "lag": None if math.isnan(message.lag) else round(message.lag, _DECIMALS),
-        "hands": [_hand_document(hand, joints=content.joints) for hand in message.hands],
+        "lag": _known(message.lag),
+        "latency": _known(message.latency),
+        "hands": [_hand_document(hand, content) for hand in message.hands],
         "bodies": [
             {"name": body.name, "status": str(body.status), "pose": _pose(body)} for body in message.bodies
         ],
@@ -292,16 +365,18 @@ def frame_document(message: LiveMessage, content: Content = Content()) -> dict[s
     return document
 
 
-def _hand_document(hand: LiveHand, *, joints: bool) -> dict[str, Any]:
-    more = {"joints": _rounded(hand.find_joints()) if hand.has_pose else None} if joints else {}
-    spreads = {"angle_spread": hand.angle_spread, "position_spread": hand.position_spread}
+def _hand_document(hand: LiveHand, content: Content) -> dict[str, Any]:
+    more = {"joints": _rounded(hand.find_joints()) if hand.has_pose else None} if content.joints else {}
+    others = {"angle_spread": hand.angle_spread, "position_spread": hand.position_spread}
+    if content.velocities:
+        others |= {"angle_velocities": hand.angle_velocities, "velocities": hand.find_velocities()}
     return {
         "side": hand.side,
         "status": str(hand.status),
         "wrist": _pose(hand),
         "angles": _rounded(hand.angles) if hand.has_pose else None,
         "positions": _rounded(hand.positions) if hand.has_pose else None,
-        **{name: None if np.isnan(spread).any() else _rounded(spread) for name, spread in spreads.items()},
+        **{name: None if np.isnan(values).any() else _rounded(values) for name, values in others.items()},
         **more,
     }
 
@@ -309,6 +384,10 @@ def _hand_document(hand: LiveHand, *, joints: bool) -> dict[str, Any]:
 def _pose(thing: LiveHand | LiveBody) -> dict[str, Any] | None:
     pose = {"position": _rounded(thing.position), "quaternion": _rounded(thing.quaternion)}
     return pose if thing.has_pose else None
+
+
+def _known(seconds: float) -> float | None:
+    return None if math.isnan(seconds) else round(seconds, _DECIMALS)
 
 
 def _rounded(values: Float[np.ndarray, "..."]) -> Any:

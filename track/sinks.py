@@ -1,7 +1,6 @@
 """Live output: sinks take tracked frames to other programs as they are made.
 
-An address names a sink: `osc://host:port`, `udp://host:port`, `ws://:8765`, `lsl:NAME` or `module:name`. Each
-frame goes to all sinks, and a failing sink does not stop the tracker.
+An address names a sink, see `VALID`. Each frame goes to all sinks. A failing sink does not stop the tracker.
 """
 
 from __future__ import annotations
@@ -16,9 +15,10 @@ import threading
 import time
 import warnings
 from collections import deque
-from collections.abc import Awaitable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, suppress
-from typing import TYPE_CHECKING, Any, Final
+from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing, suppress
+from types import SimpleNamespace
+from typing import Any, Final
 
 import numpy as np
 
@@ -32,6 +32,7 @@ from handsim.space.transforms import PROGRAMS
 from track.frames import StreamedFrame, TrackedFrame
 from track.live_message import (
     FORMATS,
+    LARGEST_DATAGRAM,
     SCHEMA,
     WORLD,
     Content,
@@ -46,24 +47,34 @@ from track.live_message import (
 from track.rigid_body import RigidTemplate
 from track.streams import split_address
 
-if TYPE_CHECKING:
-    from websockets.asyncio.server import ServerConnection
-
-VALID: Final = ("osc://host:port", "udp://host:port", "ws://host:port", "lsl:NAME", "module:name")
+VALID: Final = (
+    *(f"{scheme}://host:port" for scheme in ("osc", "udp", "ws", "tcp")),
+    "lsl:NAME",
+    "module:name",
+)
 """What an address may be."""
 GROUP: Final = "handsim.sinks"
 """Entry points of packages that bring sinks."""
 STATUSES: Final = tuple(reversed(Status))
 """Values of a status channel of LSL are indices of these."""
 _METHODS: Final = (("send", "close"), "the methods send and close of a sink")
-_AXES_OF: Final = {"axes": (WORLD, *PROGRAMS), "up": ("z", "y")}  # valid values of each option
-_DOCUMENTS: Final = {"format": FORMATS, "points": ("no", "yes"), "joints": ("no", "openxr"), **_AXES_OF}
-_SERVED: Final = {**_DOCUMENTS, "every": ("no", "yes")}
+_YES: Final = ("no", "yes")  # valid values of an option
+_AXES: Final = {"axes": (WORLD, *PROGRAMS), "up": ("z", "y"), "unit": ("auto", "m", "cm"), "velocities": _YES}
+_LINES: Final = {"points": _YES, "joints": ("no", "openxr"), **_AXES}
+_DOCUMENTS: Final = {"format": FORMATS, **_LINES}
+_OPTIONS: Final[Mapping[str, Mapping[str, tuple[str, ...]]]] = {
+    "osc": _AXES,
+    "tcp": _LINES,
+    "udp": _DOCUMENTS,
+    "ws": {**_DOCUMENTS, "every": _YES},
+}
 _RESERVED: Final = re.compile(r"[^!-~]|[#*,/?\[\]{}]")  # not allowed in a part of an OSC address
+_BUNDLE_HEAD, _BUNDLE_ENTRY = 16, 4  # sizes of what an OSC bundle begins with, and each message in it [bytes]
 _LARGEST_INTEGER: Final = 0x7FFFFFFF  # largest integer of an OSC message
 _HEADER_PERIOD: Final = 1.0  # time after which the header is sent again, for receivers that came late [s]
 _WAITING: Final = 256  # largest number of frames that wait for a client that wants every frame
 _UNCONFIRMED: Final = 0.05  # A client that has not confirmed a frame for this time [s] gets no other one.
+_TELL: Final = 1.0  # least time between two messages on a client's lag [s]
 _ON_REQUEST: Final = "/newest"  # path of clients that ask for each frame
 _FLUSHED: Final = 0.01  # time between two looks whether clients have read what was left [s]
 _SEND_BUFFER: Final = 1 << 17  # size of the system's buffer for each client [bytes]
@@ -71,8 +82,8 @@ _LARGEST: Final = 1 << 10  # largest size of a client's message, which is ignore
 _FLUSH: Final = 1.0  # time for clients to read waiting frames at the end [s]
 _OWN_PAGES: Final = re.compile(r"https?://(localhost|127\.0\.0\.1|\[::1\])(:\d+)?")
 """Pages of this machine; any other page in its browser is refused."""
-_AXES: Final = ("x", "y", "z")
-_POSE: Final = (*[(f"position_{axis}", "meters") for axis in _AXES], *[(f"rotation_{c}", "") for c in "wxyz"])
+_XYZ: Final = ("x", "y", "z")
+_POSE: Final = (*[(f"position_{axis}", "meters") for axis in _XYZ], *[(f"rotation_{c}", "") for c in "wxyz"])
 
 _Content = tuple[str, str, Sequence[Any]]
 """Address, types and values of an OSC message."""
@@ -120,7 +131,8 @@ class SinkGroup(Closing):
         """What to print at the end, one line each."""
         sent = [f"{self._sent} frames sent to {', '.join(self._sinks)}"] if self._sinks and self._sent else []
         dropped = [f"{address}: {count} frames dropped" for address, count in self.counts.items() if count]
-        return (*sent, *dropped)
+        told = [f"{at}: {note}" for at, sink in self._all.items() if (note := getattr(sink, "note", ""))]
+        return (*sent, *dropped, *told)
 
     def close(self) -> None:
         """Close all sinks."""
@@ -142,8 +154,8 @@ def open_sinks(addresses: str | LiveSink | Sequence[str | LiveSink]) -> SinkGrou
     """Open a sink for each address, which gets positions in [m] and angles in [rad].
 
     Args:
-        addresses: One, or several, each as in `VALID`; `udp://` and `ws://` take `?format=json`,
-            `?format=msgpack` and `?points=yes`. A sink of your own may be given as an object.
+        addresses: One, or several, each as in `VALID`, with the options of docs/live_output.md. A sink of
+            your own may be given as an object.
 
     Raises:
         ArgumentError: An address is invalid or is given twice, a package is missing, or a port is taken.
@@ -167,21 +179,25 @@ def open_sinks(addresses: str | LiveSink | Sequence[str | LiveSink]) -> SinkGrou
 def open_sink(address: str) -> LiveSink:
     """Open the sink that an address names, see `open_sinks`."""
     scheme, _, rest = address.partition(":")
-    if scheme in ("osc", "udp", "ws") and rest.startswith("//"):
-        valid: Mapping[str, tuple[str, ...]] = {"osc": _AXES_OF, "udp": _DOCUMENTS, "ws": _SERVED}[scheme]
-        host, port, options = split_address(address, options=valid, any_port=scheme == "ws")
+    if scheme in _OPTIONS and rest.startswith("//"):
+        serves = scheme in ("ws", "tcp")
+        host, port, options = split_address(address, options=_OPTIONS[scheme], any_port=serves)
         content = Content(
             points=options.get("points") == "yes",
             joints=options.get("joints") == "openxr",
+            velocities=options["velocities"] == "yes",
             axes=options["axes"],
             up="y" if options["up"] == "y" else "z",
+            unit=options["unit"],
         )
         if scheme == "osc":
             return DatagramSink(host, port, osc_format(content))
-        format = document_format(options["format"], content)
+        largest = LARGEST_DATAGRAM if scheme == "udp" else math.inf
+        format = document_format(options.get("format", "json"), content, largest=largest)
         if scheme == "udp":
             return DatagramSink(host, port, format)
-        return WebSocketSink(host, port, format, every=options["every"] == "yes")
+        server = LineSink if scheme == "tcp" else WebSocketSink
+        return server(host, port, format, every=options.get("every") == "yes")
     if scheme == "lsl" and rest and not rest.startswith("//"):
         return LabStreamingSink(rest)
     name = address.partition("?")[0]
@@ -193,18 +209,26 @@ def open_sink(address: str) -> LiveSink:
 
 
 class DatagramSink:
-    """Sends each frame as one UDP datagram, and the header every second; it drops frames rather than wait."""
+    """Sends each frame as UDP datagrams, and the header every second; it drops them rather than wait."""
 
     def __init__(self, host: str, port: int, format: MessageFormat) -> None:
         try:
             family, kind, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
             self._socket = socket.socket(family, kind)
+            self._socket.connect(address)  # so that the system tells when nobody listens at a port
         except OSError as error:
             raise ArgumentError(f"host '{host}' cannot be sent to ({error.strerror or error})") from error
         self._socket.setblocking(False)
-        self._address, self._format, self._due = address, format, 0.0
-        self.dropped = 0
-        """Number of datagrams that were not sent."""
+        self._format, self._due = format, 0.0
+        self.dropped = self.refused = self.sent = 0
+        """Numbers of datagrams that were not sent, that came back because nobody listened, and of all."""
+
+    @property
+    def note(self) -> str:
+        """Whether somebody listened, as far as that is known."""
+        if self.refused:
+            return f"nobody listened to {self.refused} of {self.sent} datagrams"
+        return "UDP does not tell whether anybody listened"
 
     def send(self, message: LiveMessage) -> None:
         """Send a frame, after the header if that is due."""
@@ -219,11 +243,17 @@ class DatagramSink:
         self._put(self._format.end())
         self._socket.close()
 
-    def _put(self, datagram: bytes) -> None:
-        try:
-            self._socket.sendto(datagram, self._address)
-        except OSError:  # the buffer is full, the network is down, or the datagram is too large
-            self.dropped += 1
+    def _put(self, datagrams: Iterable[bytes]) -> None:
+        for datagram in datagrams:
+            self.sent += 1
+            try:
+                try:
+                    self._socket.send(datagram)
+                except ConnectionRefusedError:  # of an earlier one; this one was not sent
+                    self.refused += 1
+                    self._socket.send(datagram)
+            except OSError:  # the buffer is full, the network is down, or the datagram is too large
+                self.dropped += 1
 
 
 def osc_format(content: Content = Content()) -> MessageFormat:  # noqa: B008 (immutable)
@@ -232,20 +262,33 @@ def osc_format(content: Content = Content()) -> MessageFormat:  # noqa: B008 (im
     messages: Any = import_extra("pythonosc.osc_message_builder", "osc://", "send")
     bundles: Any = import_extra("pythonosc.osc_bundle_builder", "osc://", "send")
 
-    def bundle(contents: Iterable[_Content]) -> bytes:
-        made = bundles.OscBundleBuilder(bundles.IMMEDIATELY)
-        for address, types, values in contents:
-            message = messages.OscMessageBuilder(address)
-            for kind, value in zip(types, values, strict=True):
-                message.add_arg(value, kind)
-            made.add_content(message.build())
-        datagram: bytes = made.build().dgram
-        return datagram
+    def built(content: _Content) -> Any:
+        address, types, values = content
+        message = messages.OscMessageBuilder(address)
+        for kind, value in zip(types, values, strict=True):
+            message.add_arg(value, kind)
+        return message.build()
+
+    def divided(contents: Iterable[_Content]) -> list[bytes]:
+        """Bundles that fit into packets, each of which begins with the first message."""
+        first, *others = map(built, contents)
+        made, room = [], 0
+        for message in others or [first]:
+            if message.size + _BUNDLE_ENTRY > room:
+                made.append(bundles.OscBundleBuilder(bundles.IMMEDIATELY))
+                room = LARGEST_DATAGRAM - _BUNDLE_HEAD
+                if message is not first:
+                    made[-1].add_content(first)
+                    room -= first.size + _BUNDLE_ENTRY
+            made[-1].add_content(message)
+            room -= message.size + _BUNDLE_ENTRY
+        return [one.build().dgram for one in made]
+
+    def frame(message: LiveMessage) -> list[bytes]:
+        return divided(_osc_frame(message if program is None else in_axes(message, program), content))
 
     return MessageFormat(
-        lambda header: bundle(_osc_header(header)),
-        lambda message: bundle(_osc_frame(message if program is None else in_axes(message, program))),
-        lambda: bundle([("/handsim/end", "", [])]),
+        lambda header: divided(_osc_header(header)), frame, lambda: divided([("/handsim/end", "", [])])
     )
 
 
@@ -258,11 +301,12 @@ def _osc_header(header: LiveHeader) -> Iterator[_Content]:
     yield _strings("/handsim/bodies", [_part(name) for name in header.bodies])
 
 
-def _osc_frame(message: LiveMessage) -> Iterator[_Content]:
+def _osc_frame(message: LiveMessage, content: Content) -> Iterator[_Content]:
     """The messages of a frame; a hand or body without a pose only has a status."""
     yield "/handsim/frame", "idi", [message.number & _LARGEST_INTEGER, message.time, int(message.silent)]
-    if not math.isnan(message.lag):
-        yield "/handsim/lag", "f", [message.lag]
+    for name, seconds in (("lag", message.lag), ("latency", message.latency)):
+        if not math.isnan(seconds):
+            yield f"/handsim/{name}", "f", [seconds]
     for hand in message.hands:
         address = f"/handsim/{hand.side}"
         yield _strings(f"{address}/status", [str(hand.status)])
@@ -270,6 +314,9 @@ def _osc_frame(message: LiveMessage) -> Iterator[_Content]:
             yield _floats(f"{address}/wrist", hand.position, hand.quaternion)
             yield _floats(f"{address}/angles", hand.angles)
             yield _floats(f"{address}/positions", hand.positions.ravel())
+        if content.velocities and not np.isnan(hand.angle_velocities).any():
+            yield _floats(f"{address}/angle_velocities", hand.angle_velocities)
+            yield _floats(f"{address}/velocities", hand.find_velocities().ravel())
     for body in message.bodies:
         address = f"/handsim/body/{_part(body.name)}"
         yield _strings(f"{address}/status", [str(body.status)])
@@ -344,7 +391,7 @@ def channels_of(header: LiveHeader) -> Iterator[_Channel]:
         for joint in header.angles:
             yield (f"{side}_{joint}", "radians", "JointAngle")
         for place in header.positions:
-            for axis in _AXES:
+            for axis in _XYZ:
                 yield (f"{side}_{place}_{axis}", "meters", f"Position{axis.upper()}")
     for body in header.bodies:
         yield from _pose_channels(f"{body}_status", body)
@@ -373,13 +420,13 @@ def sample_of(message: LiveMessage) -> np.ndarray:
 
 
 class WebSocketSink:
-    """Serves messages to any number of clients from a thread of its own; port 0 is any free one.
+    """Serves messages to any number of WebSocket clients from a thread of its own; port 0 is any free one.
 
     A client gets the header, then the newest frame as soon as it has taken the one before. It confirms what
     it took by the protocol's pongs, which its library sends. A client of the path /newest gets one frame for
     each message that it sends. With `every` all frames wait for a client, and 256 at most. A slow client
-    loses frames and delays nobody. A loopback address serves pages of this machine and other programs;
-    another address serves everybody.
+    loses frames, is told how far it is behind, and delays nobody. A loopback address serves pages of this
+    machine and other programs; another address serves everybody.
     """
 
     def __init__(self, host: str, port: int, format: MessageFormat, *, every: bool = False) -> None:
@@ -392,7 +439,7 @@ class WebSocketSink:
         self.dropped = 0
         """Number of frames that were dropped for slow clients."""
         self._header = b""
-        self._clients: dict[ServerConnection, _Client] = {}
+        self._clients: dict[_Client, Any] = {}  # and their connections
         self._loop = asyncio.new_event_loop()
         self._ending, self._ready = asyncio.Event(), threading.Event()
         self._thread = threading.Thread(target=self._run, name="websocket server", daemon=True)
@@ -406,9 +453,11 @@ class WebSocketSink:
 
     def send(self, message: LiveMessage) -> None:
         """Hand a message over to the clients."""
-        self._header = self._header or self._format.header(message.header)
+        if not self._header:
+            (self._header,) = self._format.header(message.header)
         if self._clients:
-            self._loop.call_soon_threadsafe(self._spread, self._format.frame(message))
+            (frame,) = self._format.frame(message)
+            self._loop.call_soon_threadsafe(self._spread, frame)
 
     def close(self) -> None:
         """Give clients a second to read what waits for them and the end, and disconnect them."""
@@ -418,9 +467,11 @@ class WebSocketSink:
 
     def _spread(self, message: bytes) -> None:
         """Lay a message out for every client; where there is no room the oldest is dropped."""
-        for client in self._clients.values():
-            self.dropped += len(client.waiting) == client.waiting.maxlen
-            client.waiting.append(message)
+        for client in self._clients:
+            full = len(client.waiting) == client.waiting.maxlen
+            self.dropped += full
+            client.dropped += full
+            client.waiting.append((self._loop.time(), message))
             client.woken.set()
 
     def _run(self) -> None:
@@ -430,11 +481,11 @@ class WebSocketSink:
             self._loop.close()
             self._ready.set()
 
-    async def _listen_until_the_end(self) -> None:
+    async def _open(self) -> Any:
         quiet = logging.getLogger("handsim.websocket")  # invalid requests are not the user's mistakes
         quiet.setLevel(logging.CRITICAL + 1)
-        server = await self._serve(
-            self._talk,
+        return await self._serve(
+            lambda one: self._talk(one, only_asked=one.request.path == _ON_REQUEST),
             sock=self._socket,
             origins=self._origins,
             compression=None,  # costs more time than a local network does
@@ -442,25 +493,34 @@ class WebSocketSink:
             close_timeout=_FLUSH,
             logger=quiet,
         )
+
+    async def _listen_until_the_end(self) -> None:
+        server = await self._open()
         self._ready.set()
         await self._ending.wait()
-        self._spread(self._format.end())
-        for client in self._clients.values():
+        self._spread(*self._format.end())
+        for client in self._clients:
             client.ask()
-        until = self._loop.time() + _FLUSH
-        while any(client.waiting for client in self._clients.values()) and self._loop.time() < until:
-            await asyncio.sleep(_FLUSHED)
-        for connection, client in self._clients.items():
+        await self._wait_while(lambda: any(client.waiting for client in self._clients))
+        for client, connection in self._clients.items():
             if client.waiting:
                 connection.transport.abort()  # a closing handshake would wait, too
         server.close()
+        await self._wait_while(lambda: bool(self._clients))
+        for connection in self._clients.values():
+            connection.transport.abort()
         await server.wait_closed()
 
-    async def _talk(self, connection: ServerConnection) -> None:
+    async def _wait_while(self, there_is: Callable[[], bool]) -> None:
+        """Wait until something is over, or for a second."""
+        until = self._loop.time() + _FLUSH
+        while there_is() and self._loop.time() < until:
+            await asyncio.sleep(_FLUSHED)
+
+    async def _talk(self, connection: Any, *, only_asked: bool) -> None:
         """Send messages to a client until it leaves."""
-        path = connection.request.path if connection.request is not None else ""
-        client = _Client(_WAITING if self._every else 1, only_asked=path == _ON_REQUEST)
-        self._clients[connection] = client
+        client = _Client(_WAITING if self._every else 1, only_asked=only_asked)
+        self._clients[client] = connection
         sending = asyncio.ensure_future(self._deliver(connection, client))
         try:
             with suppress(self._closed_error):
@@ -468,33 +528,68 @@ class WebSocketSink:
                     await connection.recv()  # this notices pongs and the end of the connection
                     client.ask()
         finally:
-            del self._clients[connection]
+            del self._clients[client]
             sending.cancel()
 
-    async def _deliver(self, connection: ServerConnection, client: _Client) -> None:
+    async def _deliver(self, connection: Any, client: _Client) -> None:
         """Send a client the header, then message after message."""
         unconfirmed: deque[tuple[float, Awaitable[float]]] = deque()  # when frames were sent, and their pongs
-        with suppress(self._closed_error):
+        told, is_text = -math.inf, self._format.is_text
+        with suppress(self._closed_error, OSError):
             await client.woken.wait()
             if self._header:
-                await connection.send(self._header, text=self._format.is_text)
+                await connection.send(self._header, text=is_text)
             while True:
+                behind = 0.0
                 while unconfirmed and unconfirmed[0][0] < self._loop.time() - _UNCONFIRMED:
-                    await unconfirmed.popleft()[1]
+                    sent, pong = unconfirmed.popleft()
+                    await pong
+                    behind = max(behind, self._loop.time() - sent)
                 await client.next()
-                await connection.send(client.take(), text=self._format.is_text)
-                if not self._every:
+                laid_out, message = client.take()
+                now = self._loop.time()
+                behind = max(behind, now - laid_out)
+                # One who asks counts on one answer; it is never behind.
+                if behind > _UNCONFIRMED and now > told + _TELL and not client.only_asked:
+                    told = now
+                    await connection.send(self._format.lag(behind, client.dropped), text=is_text)
+                await connection.send(message, text=is_text)
+                if not (self._every or client.only_asked):
                     unconfirmed.append((self._loop.time(), await connection.ping()))
+
+
+class LineSink(WebSocketSink):
+    """Serves lines to TCP clients: the header, then the newest frame for each line that a client sends."""
+
+    async def _open(self) -> Any:
+        async def talk(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+            async def receive() -> None:
+                if not await reader.readline():
+                    raise ConnectionResetError
+
+            async def send(message: bytes, text: bool) -> None:
+                writer.write(message + b"\n")
+                if self._ending.is_set():
+                    writer.close()  # after what it still holds
+                await writer.drain()
+
+            connection = SimpleNamespace(recv=receive, send=send, transport=writer.transport)
+            with closing(writer), suppress(OSError, ValueError):  # it left, or sent a line that is too long
+                await self._talk(connection, only_asked=True)
+
+        return await asyncio.start_server(talk, sock=self._socket, limit=_LARGEST)
 
 
 class _Client:
     """What waits for a client of a WebSocket, and what it has asked for."""
 
     def __init__(self, most: int, *, only_asked: bool) -> None:
-        self.waiting: deque[bytes] = deque(maxlen=most)
+        self.waiting: deque[tuple[float, bytes]] = deque(maxlen=most)
+        """Messages, with the times at which they were laid out [s]."""
         self.woken = asyncio.Event()
+        self.dropped = 0
+        self.only_asked = only_asked
         self._asks = not only_asked
-        self._only_asked = only_asked
 
     def ask(self) -> None:
         """The client asks for a message."""
@@ -508,9 +603,9 @@ class _Client:
             self.woken.clear()
             await self.woken.wait()
 
-    def take(self) -> bytes:
-        """The oldest message that waits."""
-        self._asks = not self._only_asked
+    def take(self) -> tuple[float, bytes]:
+        """The oldest message that waits, with its time [s]."""
+        self._asks = not self.only_asked
         return self.waiting.popleft()
 
 

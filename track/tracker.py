@@ -354,4 +354,7 @@ def _tracked_hand(
     is_missing = np.isnan(seen[:, 0])
     markers, filled = np.where(is_missing[:, None], state.positions, seen), np.flatnonzero(is_missing)
     spreads = state.pose_spread(frame.time)
-    return TrackedHand(side, outcome.status, state.qpos.copy(), outcome.rms, markers, filled, spreads)
+    # A pose that stands still, or has just been found, tells nothing of the hand's velocity.
+    known = 1.0 if outcome.status is Status.TRACKED else np.nan
+    qpos, velocity = state.qpos.copy(), known * state.velocity
+    return TrackedHand(side, outcome.status, qpos, outcome.rms, markers, filled, spreads, velocity)

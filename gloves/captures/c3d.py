@@ -373,7 +373,6 @@ def write_c3d(path: Path, capture: Capture, source: bytes | None = None) -> None
     Of a `source`, the bytes of the C3D that the capture was made from, all but the points is kept: analog
     channels, events, the number of the first frame and all parameters, but no rotations (group ROTATION).
     Then lengths have its unit, as its force plates have.
-
     The length of a take of more than 65,535 frames stands in TRIAL:ACTUAL_END_FIELD; programs that ignore
     this field, such as ezc3d 1.7, see the first 65,535 frames.
     """

@@ -604,8 +604,7 @@ def write_capture(path: str | Path, capture: Capture, *, source: str | Path | No
     Args:
         path: The file; its suffix decides the format.
         capture: Positions (T, N, 3) [m] at a rate [Hz].
-        source: The file that the points came from. If both files are C3D, all but the points is kept: analog
-            channels, events, the number of the first frame and all parameters.
+        source: The file of the points. If both are C3D, all else of it is kept: analogs, events, parameters.
 
     Raises:
         ArgumentError: An argument is of another type.

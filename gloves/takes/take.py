@@ -658,17 +658,18 @@ class Take:
     def capture(self) -> Capture:
         """The points without labels, as an optical system exports them: one trajectory per column.
 
+        Frames that a stream lacks are there without points.
+
         Raises:
             CaptureError: There are no points.
         """
         names = tuple(f"*{column}" for column in range(self.point_list.num_columns))
-        return Capture(names, self.points, self.rate)
+        return self._steady(Capture(names, self.points, self.rate))
 
     def labeled_capture(self, *, sides: bool = True) -> Capture:
         """The labeled points, for `write_capture`: one column per marker, then columns of unlabeled points.
 
-        A hand without any label has no columns if the other hand has one. Frames that a stream lacks are
-        there without points, because marker files have no times.
+        A hand without any label has no columns if the other hand has one. See `capture` for streams.
 
         Args:
             sides: Whether the names of columns begin with the hand, `right:ThumbTip`; if not, they are
@@ -690,13 +691,17 @@ class Take:
             labels = np.where(labels >= 0, (np.cumsum(kept) - 1)[labels], -1)
         begins = self.point_list.starts[1:-1]
         frames, rows = (np.split(values, begins) for values in (self.point_list.points, labels))
-        capture = labeled_columns(frames, rows, names, self.rate)
+        return self._steady(labeled_columns(frames, rows, names, self.rate))
+
+    def _steady(self, capture: Capture) -> Capture:
+        """The capture with frames without points where a stream lacks some: marker files have no times."""
         if self.numbers is None:
             return capture
-        order, count = np.arange(self.num_frames), len(times_at(self.times, self.rate))
+        times_at(self.times, self.rate)  # refuses too many frames
+        order = np.arange(self.num_frames)
         places = np.rint((self.times - self.times[0]) * self.rate).astype(np.intp) - order
         places = np.maximum.accumulate(places) + order  # two late frames have two places
-        positions = np.full((max(count, places[-1] + 1), *capture.positions.shape[1:]), np.nan)
+        positions = np.full((places[-1] + 1, *capture.positions.shape[1:]), np.nan)
         positions[places] = capture.positions
         return dataclasses.replace(capture, positions=positions)
 
@@ -830,10 +835,7 @@ def keypoints_of(
 
 
 def usual_rate(times: Float[np.ndarray, "T"], numbers: Int[np.ndarray, "T"]) -> float:
-    """Median rate of the first frames of a stream [Hz], those included that are missing by their numbers.
-
-    It has seven digits: times are rounded, and 59.99999999997783 Hz is the rate of no system.
-    """
+    """Median rate of the first frames of a stream [Hz], missing ones included, to seven digits."""
     spans, steps = np.diff(times[:RATED_FRAMES]), np.diff(numbers[:RATED_FRAMES])
     steps[steps <= 0] = 1  # the server began to count anew
     steps //= np.gcd.reduce(steps)  # some servers number every n-th frame

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import ctypes.util
+import itertools
 import os
 import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import metadata, util
 from pathlib import Path
 from typing import Final
+from urllib.parse import parse_qsl, urlsplit
 
 from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
@@ -22,6 +25,10 @@ from handsim._plugins import EGL_PACKAGES
 from handsim.app.workers import usable_cores
 
 _PROBE_SECONDS: Final = 120.0
+_RATE: Final = 60.0  # [Hz] of the hand that points
+_POINTING: Final = 120  # frames for which it points along an axis
+_WRIST: Final = (0.1, 0.2, 0.3)  # its wrist in the receiver's axes [m]
+_BENT: Final = 1.2  # flexion of its other fingers [rad]
 # These programs run in processes of their own, because a broken driver kills its process.
 _DRAW: Final = """
 import os
@@ -54,17 +61,25 @@ class Finding:
     """Whether commands fail without the remedy."""
 
 
-def doctor(compile: bool = False) -> int:
+def doctor(compile: bool = False, send: str | None = None) -> int:
     """Say what is missing on this machine, and how to get it.
 
     Args:
         compile: Compile all kernels instead, so that no command has to wait for that.
+        send: Send a hand instead that points along the receiver's x, y and z in turn, to an address as of
+            handsim track --send, and say what should be seen; Ctrl-C ends it.
 
     Returns:
         0 when everything that the commands need is there, else 1.
     """
     from handsim.app.messages import named_steps, print_line
 
+    if send is not None:
+        from handsim.files.signals import interrupt_flag
+
+        with interrupt_flag() as ended:
+            send_pointing_hand(send, ended, print_line)
+        return 0
     if compile:
         from handsim.app.compiling import compile_kernels
 
@@ -77,6 +92,46 @@ def doctor(compile: bool = False) -> int:
         findings = examine()
     _print_report(findings)
     return int(any(finding.needed and finding.remedy for finding in findings))
+
+
+def send_pointing_hand(address: str, ended: Callable[[], bool], tell: Callable[[str], None]) -> None:
+    """Send a right hand whose index finger points along the receiver's axes in turn, until it is ended."""
+    import numpy as np
+
+    from gloves.fit import nominal_fit
+    from gloves.takes.points import Status
+    from handsim.hand.model import KEYPOINT_NAMES, hand_keypoints, join_qpos
+    from handsim.hand.shape import JOINT_NAMES
+    from handsim.space.transforms import UpAxis, program_axes, rotation_quaternions
+    from track.frames import StreamedFrame, TrackedFrame, TrackedHand
+    from track.live_message import WORLD, Content
+    from track.sinks import open_sinks
+
+    bent = [name.startswith(("middle", "ring", "little")) and "flexion" in name for name in JOINT_NAMES]
+    with open_sinks(address) as sinks:
+        asked = dict(parse_qsl(urlsplit(address).query))  # it was checked just now
+        up: UpAxis = "y" if asked.get("up") == "y" else "z"
+        content = Content(axes=asked.get("axes", WORLD), up=up, unit=asked.get("unit", "auto"))
+        axes, hand = content.program or program_axes("ros", "z"), nominal_fit("dense19", "M", "right")
+        sinks.start([hand], [])
+        for number in itertools.count():
+            along = number // _POINTING % 3
+            pointing, back = axes.turn[along], axes.turn[(along + 1) % 3]
+            turn = np.stack([pointing, np.cross(back, pointing), back], axis=1)[None]
+            qpos = join_qpos(
+                _BENT * np.array([bent]), position=_WRIST @ axes.turn, quaternion=rotation_quaternions(turn)
+            )
+            if number % _POINTING == 0:
+                tip = axes.positions(hand_keypoints(hand.model, qpos)[0, KEYPOINT_NAMES.index("index_tip")])
+                place = " ".join(f"{value:.3f}" for value in tip)
+                tell(f"the index finger points along +{'xyz'[along]}, its tip is at {place} {axes.unit}")
+            if ended():
+                break
+            nobody = np.empty((0, 3)), np.empty(0, dtype=np.int64)
+            frame = StreamedFrame(number, number / _RATE, *nobody, arrived=time.monotonic())
+            shown = TrackedHand("right", Status.TRACKED, qpos[0], np.nan, *nobody)
+            sinks.send(frame, TrackedFrame(frame.time, (shown,), nobody[1], np.empty(0)))
+            time.sleep(1.0 / _RATE)
 
 
 def examine() -> list[Finding]:

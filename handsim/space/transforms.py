@@ -51,7 +51,8 @@ class ProgramAxes(NamedTuple):
 _Z_UP: Final = {"z": np.eye(3), "y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])}
 _PROGRAMS: Final = {  # axes in a world with z up, what is mirrored in a thing's own axes, and the unit
     "ros": (((1, 0, 0), (0, 1, 0), (0, 0, 1)), (1, 1, 1), "m"),  # REP 103: x forward, y left, z up
-    "openxr": (((1, 0, 0), (0, 0, 1), (0, -1, 0)), (1, 1, 1), "m"),  # x right, y up, z backward, as OpenGL
+    "openxr": (((1, 0, 0), (0, 0, 1), (0, -1, 0)), (1, 1, 1), "m"),  # x right, y up, z backward
+    "opengl": (((1, 0, 0), (0, 0, 1), (0, -1, 0)), (1, 1, 1), "m"),
     "unity": (((1, 0, 0), (0, 0, 1), (0, 1, 0)), (1, 1, -1), "m"),  # x right, y up, z forward
     "unreal": (((1, 0, 0), (0, -1, 0), (0, 0, 1)), (1, -1, 1), "cm"),  # x forward, y right, z up
 }
@@ -60,13 +61,15 @@ PROGRAMS: Final = tuple(_PROGRAMS)
 
 
 @functools.cache
-def program_axes(name: str, up: UpAxis) -> ProgramAxes:
-    """The axes of one of `PROGRAMS`, from a world whose axis `up` points up."""
-    axes, mirror, unit = _PROGRAMS[name]
+def program_axes(name: str, up: UpAxis, unit: str = "auto") -> ProgramAxes:
+    """The axes of one of `PROGRAMS` in its own unit or another, from a world whose axis `up` points up."""
+    axes, mirror, own_unit = _PROGRAMS[name]
     turn = np.array(axes, dtype=float) @ _Z_UP[up]
     # A mirrored rotation keeps the part of its axis along the mirrored direction, and turns the other way.
     mirrored = np.diag([1.0, *np.prod(mirror) * np.array(mirror)])
-    return ProgramAxes(turn, _turning(turn @ np.diag(mirror)) @ mirrored, unit)
+    return ProgramAxes(
+        turn, _turning(turn @ np.diag(mirror)) @ mirrored, own_unit if unit == "auto" else unit
+    )
 
 
 def _turning(turn: Float[np.ndarray, "3 3"]) -> NDArray[np.float64]:

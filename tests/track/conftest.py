@@ -32,7 +32,8 @@ def tracked_hand(side, rng, *, lost: bool = False) -> TrackedHand:
         np.full(count, np.nan if lost else spread) for count, spread in ((20, 0.1), (21, 0.002))
     )
     nothing = np.zeros((19, 3)), np.zeros(0, dtype=int)
-    return TrackedHand(side, status, qpos, 0.001, *nothing, lambda: (angles, keypoints))
+    velocity = np.full(26, np.nan) if lost else rng.normal(0.0, 1.0, 26)
+    return TrackedHand(side, status, qpos, 0.001, *nothing, lambda: (angles, keypoints), velocity)
 
 
 def make_message(number: int = 0, *, lost: bool = False, seed: int = 0, points: int = 5) -> LiveMessage:
@@ -41,7 +42,9 @@ def make_message(number: int = 0, *, lost: bool = False, seed: int = 0, points: 
     hands = (tracked_hand("right", rng), tracked_hand("left", rng, lost=lost))
     place = np.full(7, np.nan) if lost else np.array([0.1, 0.2, 0.3, 1.0, 0.0, 0.0, 0.0])
     mug = TrackedBody("mug", Status.LOST if lost else Status.TRACKED, place[:3], place[3:], 0.001)
-    frame = StreamedFrame(number, number / 120.0, rng.normal(size=(points, 3)), np.arange(points))
+    frame = StreamedFrame(
+        number, number / 120.0, rng.normal(size=(points, 3)), np.arange(points), latency=0.01
+    )
     labels = np.arange(points) - 1
     return encoder().encode(frame, TrackedFrame(frame.time, hands, labels, np.ones(points), (mug,)))
 

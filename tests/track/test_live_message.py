@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import time
 from pathlib import Path
 
 import msgpack
@@ -15,9 +16,20 @@ from scipy.spatial.transform import Rotation
 
 from gloves import load_layout
 from gloves.fit import nominal_fit
+from handsim.hand.model import hand_keypoints
 from handsim.hand.shape import BONE_NAMES, JOINT_NAMES
 from handsim.motion_files.motion import OPENXR_JOINTS
-from track.live_message import FORMATS, Content, document_format, frame_document, header_document, in_axes
+from track import StreamedFrame, TrackedFrame
+from track.live_message import (
+    FORMATS,
+    LARGEST_DATAGRAM,
+    Content,
+    MessageEncoder,
+    document_format,
+    frame_document,
+    header_document,
+    in_axes,
+)
 
 DECODE = {"json": json.loads, "msgpack": msgpack.unpackb}
 
@@ -27,7 +39,8 @@ DECODE = {"json": json.loads, "msgpack": msgpack.unpackb}
 @given(number=st.integers(0, 2**40), seed=st.integers(0, 99), lost=st.booleans(), points=st.integers(0, 9))
 def test_a_frame_comes_back(name, message, number, seed, lost, points):
     one = message(number, seed=seed, lost=lost, points=points)
-    there = DECODE[name](document_format(name, Content(points=True)).frame(one))
+    (sent,) = document_format(name, Content(points=True)).frame(one)
+    there = DECODE[name](sent)
     assert there == frame_document(one, Content(points=True))
     assert (there["type"], there["schema"], there["number"]) == ("frame", 1, number)
     assert there["time"] == one.time and there["silent"] is False
@@ -51,7 +64,8 @@ def test_a_frame_comes_back(name, message, number, seed, lost, points):
 @pytest.mark.parametrize("name", FORMATS)
 def test_the_header_names_everything(name, message):
     header = message().header
-    document = DECODE[name](document_format(name).header(header))
+    (sent,) = document_format(name).header(header)
+    document = DECODE[name](sent)
     assert (document["type"], document["schema"]) == ("header", 1)
     assert document["units"] == {"length": "m", "angle": "rad", "time": "s", "quaternion": "wxyz"}
     for key in ("sides", "angles", "positions", "bodies", "markers"):
@@ -60,8 +74,96 @@ def test_the_header_names_everything(name, message):
 
 def test_a_frame_of_two_hands_takes_three_kilobytes_and_has_points_only_if_asked_for(message):
     assert not {"points", "labels"} & set(frame_document(message()))
-    assert len(document_format("msgpack").frame(message())) < 3000
-    assert len(document_format("json").frame(message())) < 3500
+    assert sum(map(len, document_format("msgpack").frame(message()))) < 3000
+    assert sum(map(len, document_format("json").frame(message()))) < 3500
+
+
+def put_together(parts: list[dict]) -> dict:
+    """The message of which these are the parts, by docs/live_output.md and without handsim's code."""
+    whole, hands = {}, {}
+    for number, part in enumerate(parts, start=1):
+        assert part.pop("part") == number and part.pop("parts") == len(parts)
+        for hand in part.get("hands", []):
+            mine = hands.setdefault(hand["side"], {})
+            mine |= {
+                name: mine[name] + value if name == "joints" and mine.get(name) else value
+                for name, value in hand.items()
+            }
+        for name, value in part.items():
+            if name != "hands":
+                whole[name] = whole.get(name, []) + value if isinstance(value, list) else value
+    return whole | ({"hands": list(hands.values())} if hands else {})
+
+
+@pytest.mark.parametrize("lost", [False, True])
+@pytest.mark.parametrize("name", FORMATS)
+def test_parts_of_at_most_1400_bytes_hold_everything_between_them(name, lost, message):
+    content = Content(points=True, joints=True, velocities=True, axes="unreal")
+    largest = 0
+    for points in (0, 40, 300):
+        one = message(2**31, seed=points, lost=lost, points=points)
+        header, frame = header_document(one.header, content), frame_document(one, content)
+        divided = document_format(name, content, largest=LARGEST_DATAGRAM)
+        for sent, expected in ((divided.header(one.header), header), (divided.frame(one), frame)):
+            largest = max(largest, *map(len, sent))
+            parts = [DECODE[name](part) for part in sent]
+            if "hands" in expected:  # whoever needs poses alone needs no other part
+                poses = [hand for part in parts for hand in part.get("hands", []) if "wrist" in hand]
+                assert [set(hand) for hand in poses] == [
+                    {"side", "status", "wrist", "angles", "positions"}
+                ] * 2
+            whole = put_together(parts)
+            assert whole == {key: value for key, value in expected.items() if value != []}
+    assert 1000 < largest <= LARGEST_DATAGRAM
+
+
+def test_velocities_are_those_of_the_moving_hand(message):
+    """The hand is moved on by MuJoCo's integrator, and its joints are compared."""
+    import mujoco
+
+    one = message(seed=3)
+    for hand in one.hands:
+        model = nominal_fit("dense19", "M", hand.side).model
+        qpos = np.concatenate([hand.position, hand.quaternion, hand.angles])
+        velocity = tracked_velocity(hand)
+        later = qpos.copy()
+        mujoco.mj_integratePos(model.mj_model, later, velocity, 1e-5)
+        moved = (hand_keypoints(model, later[None]) - hand_keypoints(model, qpos[None]))[0] / 1e-5
+        np.testing.assert_allclose(hand.find_velocities(), moved, atol=1e-3)
+        np.testing.assert_array_equal(hand.angle_velocities, velocity[6:])
+    document = frame_document(one, Content(velocities=True, axes="unreal"))["hands"][0]
+    there = one.hands[0].find_velocities() * [100.0, -100.0, 100.0]
+    np.testing.assert_allclose(document["velocities"], there, atol=1e-6)
+    assert np.shape(document["angle_velocities"]) == (20,)
+    lost = frame_document(message(lost=True), Content(velocities=True))["hands"][1]
+    assert lost["velocities"] is lost["angle_velocities"] is None
+
+
+def tracked_velocity(hand):
+    """The velocity that the message was made with."""
+    return hand.find_velocities.args[1].velocity
+
+
+@pytest.mark.parametrize("program", ["world", "ros", "unity", "unreal"])
+def test_the_unit_of_length_may_be_chosen(program, message):
+    one = message(seed=5)
+    sent = {
+        unit: frame_document(one, Content(joints=True, axes=program, unit=unit))["hands"][0]
+        for unit in ("m", "cm")
+    }
+    for name in ("positions", "position_spread"):
+        np.testing.assert_allclose(100.0 * np.array(sent["m"][name]), sent["cm"][name], atol=6e-5)
+    assert sent["m"]["wrist"]["quaternion"] == sent["cm"]["wrist"]["quaternion"]
+    assert header_document(one.header, Content(axes=program, unit="cm"))["units"]["length"] == "cm"
+
+
+def test_latency_counts_from_exposure(message):
+    one = message()
+    assert np.isnan(one.latency) and frame_document(one)["latency"] is None, "it did not come live"
+    now = time.monotonic()
+    frame = StreamedFrame(1, 2.0, np.zeros((0, 3)), np.zeros(0, dtype=int), arrived=now - 0.5, latency=0.25)
+    live = MessageEncoder([], []).encode(frame, TrackedFrame(2.0, (), np.zeros(0, dtype=int), np.zeros(0)))
+    assert live.latency == pytest.approx(live.lag + 0.25) and live.lag >= 0.5
 
 
 def test_the_page_shows_what_is_sent(message):
@@ -137,6 +239,7 @@ def as_unreal(position, rotation):
 BY_HAND = {
     "ros": lambda position, rotation: (position, rotation.as_quat(scalar_first=True)),
     "openxr": lambda *pose: (as_openxr(*pose)[0], as_openxr(*pose)[1].as_quat(scalar_first=True)),
+    "opengl": lambda *pose: (as_openxr(*pose)[0], as_openxr(*pose)[1].as_quat(scalar_first=True)),
     "unity": as_unity,
     "unreal": as_unreal,
 }

@@ -31,6 +31,7 @@ from handsim.errors import ArgumentError
 from tests.sentences import error_names
 from tests.waiting import LONG, wait_for
 from track import SinkGroup, StreamedFrame, TrackedFrame, TrackedHand, open_sinks, sinks
+from track.live_message import Content
 from track.sinks import VALID, channels_of, open_sink, osc_format, sample_of
 
 SOURCE = """
@@ -69,9 +70,11 @@ NO_ADDRESSES = ("", "osc", "http://localhost:80", "wss://localhost:1", "lsl:", "
         ("udp://localhost:9000?format", "expected udp://host:port"),
         ("ws://:1?format=xml", "unknown format 'xml'; valid names: json, msgpack"),
         ("ws://:1?point=yes", "unknown option 'point' (did you mean 'points'?) | format | axes | every"),
+        ("tcp://:1?format=msgpack", "unknown option 'format'; valid names: points, joints"),
+        ("ws://:1?unit=mm", "unknown unit 'mm' | auto, m, cm"),
         ("udp://:1?every=yes", "udp://:1?every=yes: unknown option 'every'; valid names: format, points"),
         ("osc://:1?format=json", "osc://:1?format=json: unknown option 'format'; valid names: axes, up"),
-        ("ws://:1?axes=maya", "unknown axes 'maya' | world, ros, openxr, unity, unreal"),
+        ("ws://:1?axes=maya", "unknown axes 'maya' | world, ros, openxr, opengl, unity, unreal"),
     ],
 )
 def test_wrong_parts_are_told(address, words):
@@ -171,7 +174,9 @@ def test_a_sink_that_fails_is_told_and_left_out():
             "bad failed and gets no further frame (RuntimeError: full)",
             "bad could not be closed (OSError: gone)",
         ]
-        assert sinks.notes() == ("5 frames sent to good", "good: 3 frames dropped")
+        good.note = "nobody heard them"
+        told = "5 frames sent to good", "good: 3 frames dropped", "good: nobody heard them"
+        assert sinks.notes() == told
     assert [one.number for one in good.got] == list(range(5)) and len(bad.got) == 2
     assert good.got[0].header is good.got[-1].header
     assert (good.closed, bad.closed) == (1, 1)
@@ -218,10 +223,19 @@ def test_documents_reach_a_socket(query, decode, receiver, message):
     sink = open_sink(f"udp://:{receiver.getsockname()[1]}{query}")
     for number in range(3):
         sink.send(message(number))
-    got = [decode(receiver.recv(65536)) for _ in range(4)]
-    assert got[0]["type"] == "header" and [one["number"] for one in got[1:]] == [0, 1, 2]
-    assert "points" not in got[1]
+    got = documents(receiver, sink.sent, decode)
+    assert [one["type"] for one in got] == sorted([one["type"] for one in got], reverse=True)
+    frames = [one for one in got if one["type"] == "frame"]
+    assert sorted({one["number"] for one in frames}) == [0, 1, 2] and "points" not in frames[0]
+    assert all({hand["side"] for hand in one.get("hands", [])} <= {"right", "left"} for one in frames)
     sink.close()
+    assert decode(receiver.recv(1401)) == {"type": "end", "schema": 1}
+
+
+def documents(receiver, count: int, decode=json.loads) -> list[dict]:
+    datagrams = [receiver.recv(65536) for _ in range(count)]
+    assert max(map(len, datagrams)) <= 1400
+    return [decode(one) for one in datagrams]
 
 
 def test_who_listens_later_hears_the_header_too(receiver, message, monkeypatch):
@@ -231,21 +245,31 @@ def test_who_listens_later_hears_the_header_too(receiver, message, monkeypatch):
     for number in range(8):
         sink.send(message(number))
         now[0] += 0.25
-    got = [json.loads(receiver.recv(65536)) for _ in range(10)]
-    assert [one["type"] for one in got] == ["header", *["frame"] * 4] * 2
-    assert len(got[1]["points"]) == len(got[1]["labels"]) == 5
+    got = documents(receiver, sink.sent)
+    heard = [one["type"] if one["type"] == "header" else one["number"] for one in got if one["part"] == 1]
+    assert heard == ["header", 0, 1, 2, 3, "header", 4, 5, 6, 7]
+    of_one = [one for one in got if one.get("number") == 3]
+    assert sum(len(one.get("points", [])) for one in of_one) == 5
+    assert sum(len(one.get("labels", [])) for one in of_one) == 5
     sink.close()
 
 
-def test_nobody_listening_is_no_error_and_too_much_is_counted(receiver, message):
+def test_that_nobody_listens_is_no_error_and_is_told(receiver, message):
     port = receiver.getsockname()[1]
+    sink = open_sink(f"udp://127.0.0.1:{port}")
+    sink.send(message(0))
+    assert "UDP does not tell" in sink.note
     receiver.close()
-    sink = open_sink(f"udp://127.0.0.1:{port}?points=yes")
-    for number in range(5):
+    for number in range(1, 20):
         sink.send(message(number))
-    assert sink.dropped == 0
-    sink.send(message(5, points=5000))  # no datagram holds it
-    assert sink.dropped == 1
+    assert sink.dropped == 0 and 10 < sink.refused <= sink.sent
+    assert sink.note == f"nobody listened to {sink.refused} of {sink.sent} datagrams"
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as late:  # a receiver that comes gets what follows
+        late.bind(("127.0.0.1", port))
+        late.settimeout(LONG)
+        sink.send(message(20))
+        numbers = {one["number"] for one in documents(late, sink.sent - 1 and 3) if "number" in one}
+        assert numbers == {20}
     sink.close()
 
 
@@ -256,7 +280,8 @@ def read(datagram: bytes) -> dict[str, list]:
 
 def test_a_frame(message):
     one = message(7)
-    got = read(ENCODER.frame(one))
+    (sent,) = ENCODER.frame(one)
+    got = read(sent)
     assert got.pop("/handsim/frame") == [7, one.time, 0]
     for hand in one.hands:
         assert got.pop(f"/handsim/{hand.side}/status") == ["tracked"]
@@ -271,14 +296,16 @@ def test_a_frame(message):
 
 
 def test_of_what_is_lost_only_the_status_is_sent(message):
-    got = read(ENCODER.frame(message(lost=True)))
+    (sent,) = ENCODER.frame(message(lost=True))
+    got = read(sent)
     lost = {address: words for address, words in got.items() if "left" in address or "mug" in address}
     assert lost == {"/handsim/left/status": ["lost"], "/handsim/body/mug/status": ["lost"]}
 
 
 def test_the_names(message):
     header = message().header
-    got = read(ENCODER.header(header))
+    (sent,) = ENCODER.header(header)
+    got = read(sent)
     assert got["/handsim/schema"] == [1] and got["/handsim/sides"] == ["right", "left"]
     assert got["/handsim/angles"] == list(header.angles)
     assert got["/handsim/positions"] == list(header.positions)
@@ -288,10 +315,25 @@ def test_the_names(message):
 def test_odd_names_and_late_numbers_are_ones_of_osc_in_one_packet_of_ethernet(message):
     one = message(2**31 + 5)
     odd = dataclasses.replace(one.bodies[0], name="my pen #2/ä")
-    packet = ENCODER.frame(dataclasses.replace(one, bodies=(odd,)))
+    (packet,) = ENCODER.frame(dataclasses.replace(one, bodies=(odd,)))
     got = read(packet)
     assert "/handsim/body/my_pen__2__/status" in got and got["/handsim/frame"][0] == 5
-    assert len(packet) < 1472
+    assert len(packet) <= 1400
+
+
+def test_a_frame_with_more_than_a_packet_holds_is_several_bundles(message):
+    one = message(9)
+    bodies = tuple(dataclasses.replace(one.bodies[0], name=f"body{number}") for number in range(20))
+    sent = osc_format(Content(velocities=True)).frame(dataclasses.replace(one, bodies=bodies))
+    assert len(sent) > 2 and max(map(len, sent)) <= 1400
+    assert all(read(packet)["/handsim/frame"] == [9, one.time, 0] for packet in sent)
+    addresses = [address for packet in sent for address in read(packet) if address != "/handsim/frame"]
+    assert len(addresses) == len(set(addresses)) == 2 * (4 + 2) + 2 * 20
+    got = {address: values for packet in sent for address, values in read(packet).items()}
+    np.testing.assert_array_equal(
+        got["/handsim/left/angle_velocities"], np.float32(one.hands[1].angle_velocities)
+    )
+    assert len(got["/handsim/right/velocities"]) == 63
 
 
 def test_every_channel_has_a_name_and_a_unit(message):
@@ -512,8 +554,11 @@ def test_a_client_that_does_not_read_gets_no_old_frames_but_the_end(message, mon
             time.sleep(0.001)
         closing = threading.Thread(target=sink.close)
         closing.start()
-        header, *frames, end = map(json.loads, read_until_closed(client))
+        header, *others, end = map(json.loads, read_until_closed(client))
     closing.join()
+    frames = [one for one in others if one["type"] == "frame"]
+    lags = [one for one in others if one["type"] == "lag"]
+    assert all(one["lag"] > 0.05 and one["dropped"] > 0 for one in lags) and len(lags) >= 1
     assert (header["type"], end["type"]) == ("header", "end")
     assert len(frames) + sink.dropped == sent
 
@@ -531,6 +576,42 @@ def test_a_client_may_ask_for_the_newest_frame(message):
             client.send("")
             assert received(client, 1)[0]["number"] == last
     sink.close()
+
+
+def test_a_tcp_client_gets_the_newest_line_for_each_line(message):
+    sink = open_sink("tcp://:0?axes=unreal")
+    with socket.create_connection(("127.0.0.1", sink.port)) as client, client.makefile("rwb") as lines:
+        wait_for(lambda: sink.num_clients == 1)
+        sink.send(message(0))
+        header = json.loads(lines.readline())
+        assert (header["type"], header["axes"]) == ("header", "unreal")
+        for last in range(10, 60, 10):
+            for number in range(last - 10, last + 1):
+                sink.send(message(number))
+            wait_for(lambda last=last: sink.dropped == last + 1)
+            lines.write(b"\n")
+            lines.flush()
+            assert json.loads(lines.readline())["number"] == last
+        closing = threading.Thread(target=sink.close)
+        closing.start()
+        assert json.loads(lines.readline()) == {"type": "end", "schema": 1}
+        assert lines.readline() == b""
+        closing.join()
+
+
+def test_tcp_clients_that_leave_or_babble_are_let_go(message):
+    sink = open_sink("tcp://:0")
+    with socket.create_connection(("127.0.0.1", sink.port)) as babbler:
+        wait_for(lambda: sink.num_clients == 1)
+        babbler.sendall(b"x" * 10_000)
+        wait_for(lambda: sink.num_clients == 0)
+    socket.create_connection(("127.0.0.1", sink.port)).close()
+    with socket.create_connection(("127.0.0.1", sink.port)) as stalled:
+        wait_for(lambda: sink.num_clients == 1)
+        for number in range(50):
+            sink.send(message(number))
+        sink.close()
+        stalled.settimeout(LONG)
 
 
 def test_a_stalled_client_does_not_hold_up_the_end(sink, message):

@@ -164,6 +164,23 @@ def test_hands_are_initialized_and_tracked_and_what_was_said_stays_said(tracker,
         tracked[-1].hand("middle")
 
 
+def test_velocities_are_those_of_the_tracked_motion(tracker, take):
+    """They are smoothed, so over two seconds they add up to the motion."""
+    poses, velocities = [], []
+    for number in range(240):
+        hand = tracker.step(take.points[number], take.ids[number], number / take.rate).hand("right")
+        assert np.isfinite(hand.velocity).all() == (hand.status is Status.TRACKED)
+        poses.append(hand.qpos)
+        velocities.append(hand.velocity)
+    moved, added = np.diff(poses, axis=0), np.array(velocities[1:]) / take.rate
+    known = np.isfinite(added[:, 0])
+    assert known.mean() > 0.9
+    for ours, theirs in ((added[known, :3], moved[known, :3]), (added[known, 6:], moved[known, 7:])):
+        total, error = np.abs(theirs).sum(axis=0), np.abs(ours - theirs).sum(axis=0)
+        assert np.median(error / total) < 0.6 and np.abs(ours.sum(0) - theirs.sum(0)).max() < 0.2
+    assert list(hand.angle_velocities) == list(hand.angles)
+
+
 def test_the_rms_is_the_distance_from_the_given_hand_in_the_first_frames_too(take, labeler):
     """Biases are learned there, and a frame's own must not count as known before it."""
     tracker = Tracker([nominal_fit(hand.layout, "M", hand.side) for hand in take.hands], labeler)

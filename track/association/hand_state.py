@@ -124,7 +124,8 @@ class HandState:
         """Positions (M, 3) of the pose's markers [m]."""
         self.confirmed = np.zeros(len(DIGITS), dtype=bool)
         """Digits that have had a settled label since the hand was initialized."""
-        self._velocity = np.zeros(6 + NUM_JOINTS)  # [m/s, rad/s] in MuJoCo's order
+        self.velocity = np.zeros(6 + NUM_JOINTS)
+        """Velocity in MuJoCo's order, smoothed [m/s, rad/s]."""
         self._joint_covariance = resting_prior().covariance  # [rad^2] of the last estimate
         self._bias = np.zeros((count, 3))  # [m] in the frames of the bones
         self._bias_frames = np.zeros(count)  # that each bias is averaged over
@@ -146,7 +147,7 @@ class HandState:
         doubt = self._typical_bias * np.minimum((time - self._last_seen) / _BIAS_DOUBT_TIME, 1.0)
         self.variance = self._variance + doubt**2
         moved: NDArray[np.float64] = move(
-            self.qpos[None], min(span, _LONGEST_EXTRAPOLATION) * self._velocity[None]
+            self.qpos[None], min(span, _LONGEST_EXTRAPOLATION) * self.velocity[None]
         )[0]
         wrist_spread = (
             _WRIST_SPREAD + 0.5 * _WRIST_ACCELERATION * span**2,
@@ -223,7 +224,7 @@ class HandState:
         self, qpos: Float[np.ndarray, "27"], targets: Float[np.ndarray, "M 3"], time: float
     ) -> HandEstimate:
         """Start from a pose without history; the biases are kept if they still fit."""
-        self._velocity[:] = 0.0
+        self.velocity[:] = 0.0
         self._last_seen[:] = time
         self._last_label[:] = -np.inf
         self.confirmed[:] = False
@@ -269,8 +270,8 @@ class HandState:
         assert self.qpos is not None
         qpos, span = estimate.qpos, time - self.time
         if span > 0.0:
-            change = velocity_of(self.qpos, qpos, span) - self._velocity
-            self._velocity += _VELOCITY_SMOOTHING * change
+            change = velocity_of(self.qpos, qpos, span) - self.velocity
+            self.velocity += _VELOCITY_SMOOTHING * change
         self._store(estimate, time)
         _learn_bias(
             estimate.residuals,
@@ -289,9 +290,7 @@ class HandState:
         self.qpos, self.time, self.positions = estimate.qpos, time, estimate.positions
         self.rms = estimate.rms
         self._joint_covariance = estimate.predicted.joint_covariance
-        _note_markers(
-            estimate.residuals, self.digits, time, self._last_seen, self._last_label, self._velocity
-        )
+        _note_markers(estimate.residuals, self.digits, time, self._last_seen, self._last_label, self.velocity)
         square = self.rms_without_bias(estimate) ** 2
         if np.isnan(self._usual_square):
             self._usual_square = square

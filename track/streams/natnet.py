@@ -59,6 +59,8 @@ _ATTENDED: Final = 0.1  # time without a read after which the thread empties the
 _BUFFER: Final = 1 << 22  # size of the socket's receive buffer [bytes]
 _STAMPS: Final = 35 if sys.platform == "linux" else None  # SO_TIMESTAMPNS, which Python does not name
 _STAMP: Final = struct.Struct("@ll")  # seconds and nanoseconds
+_TICKS: Final = 1_000_000  # of our clock in a second
+_LONGEST_LATENCY: Final = 10.0  # after a longer one the server's times are of another clock [s]
 _LONGEST_STAY: Final = 60.0  # after a longer stay in the socket the clock was set [s]
 VERSIONS: Final[tuple[Version, ...]] = ((3, 0), (3, 1), (4, 0), (4, 1))
 _MOST_POINTS: Final = 1500  # points that fit into a datagram
@@ -92,6 +94,8 @@ class ServerInfo:
     data_port: int
     group: str | None
     """Multicast address of its frames; None with unicast."""
+    clock: int = _TICKS
+    """Ticks of its clock in a second."""
 
 
 def pack(kind: Kind, payload: bytes = b"") -> bytes:
@@ -118,11 +122,11 @@ def pack_connect() -> bytes:
 
 
 def pack_server_info(info: ServerInfo) -> bytes:
-    """A server's description of itself; its clock has a million ticks per second."""
+    """A server's description of itself."""
     group = bytes(int(part) for part in info.group.split(".")) if info.group else bytes(4)
     name = info.application.encode()[: _NAME - 1].ljust(_NAME, b"\0")
     versions = bytes((1, 0, 0, 0, *info.version, 0, 0))
-    ending = struct.pack("<QH?", 1_000_000, info.data_port, info.group is not None) + group
+    ending = struct.pack("<QH?", info.clock, info.data_port, info.group is not None) + group
     return pack(Kind.SERVER_INFO, name + versions + ending)
 
 
@@ -132,10 +136,9 @@ def parse_server_info(payload: bytes) -> ServerInfo:
     application = reader.take(_NAME).split(b"\0")[0].decode(errors="replace")
     reader.take(4)
     major, minor = reader.take(4)[:2]
-    reader.take(8)
-    data_port, multicast = struct.unpack("<H?", reader.take(3))
+    clock, data_port, multicast = struct.unpack("<QH?", reader.take(11))
     group = ".".join(str(part) for part in reader.take(4)) if multicast else None
-    return ServerInfo(application, (major, minor), data_port, group)
+    return ServerInfo(application, (major, minor), data_port, group, clock)
 
 
 def pack_frame(frame: StreamedFrame, version: Version) -> bytes:
@@ -150,7 +153,8 @@ def pack_frame(frame: StreamedFrame, version: Version) -> bytes:
     parts += [_section(0, b"", sized)] * (3 if sized else 2)  # rigid bodies, skeletons, assets
     parts += [_section(len(markers), markers.tobytes(), sized)]
     parts += [_section(0, b"", sized)] * 2  # force plates, other devices
-    parts += [struct.pack("<IId3Q", 0, 0, frame.time, 0, 0, 0), bytes(8 if sized else 0), bytes(2 + 4)]
+    ticks = (1, 1, 1 + round(_TICKS * frame.latency)) if np.isfinite(frame.latency) else (0, 0, 0)
+    parts += [struct.pack("<IId3Q", 0, 0, frame.time, *ticks), bytes(8 if sized else 0), bytes(2 + 4)]
     return pack(Kind.FRAME, b"".join(parts))
 
 
@@ -159,9 +163,14 @@ def _section(count: int, content: bytes, sized: bool) -> bytes:
 
 
 def parse_frame(
-    payload: bytes, version: Version, arrived: float = np.nan, *, assets: bool = False
+    payload: bytes,
+    version: Version,
+    arrived: float = np.nan,
+    *,
+    assets: bool = False,
+    clock: int = _TICKS,
 ) -> StreamedFrame:
-    """Read the observed markers of a frame, or those of its `assets`, without what the server filled in."""
+    """Read the observed markers of a frame, or of its `assets`, without what the server filled in."""
     reader, extra, size = _Reader(payload), 4 if version >= _SIZED else 0, _MARKER.itemsize
     number = reader.integer()
     in_sets, in_assets = b"", b""
@@ -184,8 +193,8 @@ def parse_frame(
             for _ in range(reader.count(4)):
                 reader.items(4)
     reader.take(8)  # time code
-    (time,) = struct.unpack("<d", reader.take(8))
-    reader.take(24 + 2 * extra + 2)  # clocks, flags
+    time, exposed, _, sent = struct.unpack("<d3Q", reader.take(32))  # in ticks: exposed, received, sent
+    reader.take(2 * extra + 2)  # another clock, flags
     if reader.integer() != 0 or reader.left > 4 or not np.isfinite(time):
         raise DamagedPacket("no end where it should be")
     if assets:
@@ -193,7 +202,9 @@ def parse_frame(
         older = np.frombuffer(in_sets, dtype="<f4").reshape(-1, 3)
         older = older[older.any(axis=1)]  # zeros stand for a marker that is not seen
     points, ids = _seen(markers, older)
-    return StreamedFrame(number, time, points, ids, arrived=arrived)
+    latency = (sent - exposed) / clock if clock and exposed else np.nan
+    known = 0.0 <= latency < _LONGEST_LATENCY
+    return StreamedFrame(number, time, points, ids, arrived=arrived, latency=latency if known else np.nan)
 
 
 def _seen(
@@ -372,15 +383,16 @@ class PointStream(ArrivingFrames):
                 self._version = min(self.server.version, NEWEST)
             if kind != Kind.FRAME:
                 return None
+            clock = self.server.clock
             try:
-                frame = parse_frame(payload, self._version, arrived)
+                frame = parse_frame(payload, self._version, arrived, clock=clock)
             except DamagedPacket:  # some servers send another version than they announce
                 other: Version = OLDEST if self._version == NEWEST else NEWEST
-                frame = parse_frame(payload, other, arrived)
+                frame = parse_frame(payload, other, arrived, clock=clock)
                 self._version = other
             self._has_lists |= len(frame.points) > 0
             if not self._has_lists:
-                frame = parse_frame(payload, self._version, arrived, assets=True)
+                frame = parse_frame(payload, self._version, arrived, assets=True, clock=clock)
         except DamagedPacket:
             self.damaged += 1
             return None

@@ -1,8 +1,12 @@
 from __future__ import annotations
 
+import json
+import re
+import socket
 import sys
 from importlib import metadata
 
+import numpy as np
 import pytest
 
 from handsim.cli import doctor
@@ -95,3 +99,37 @@ def test_this_machine_is_examined() -> None:
     else:
         assert findings["Python"].remedy == ""
         assert findings["numpy"].found == metadata.version("numpy")
+
+
+@pytest.mark.parametrize("axes", ["world", "ros", "openxr", "unity", "unreal"])
+def test_a_hand_points_along_the_receivers_axes_in_turn(axes, monkeypatch):
+    """What is received, by the numbers alone: the tip lies ahead of the wrist along x, y and z."""
+    monkeypatch.setattr(doctor, "_POINTING", 3)
+    monkeypatch.setattr(doctor, "_RATE", 1e3)
+    told, frames = [], []
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
+        receiver.bind(("127.0.0.1", 0))
+        receiver.setblocking(False)
+
+        def ended() -> bool:
+            try:
+                while True:
+                    document = json.loads(receiver.recv(1401))
+                    frames.extend(document.get("hands", []))
+            except BlockingIOError:
+                return len(told) > 3
+
+        address = f"udp://127.0.0.1:{receiver.getsockname()[1]}?axes={axes}&up=y&velocities=yes"
+        doctor.send_pointing_hand(address, ended, told.append)
+    poses = [hand for hand in frames if "positions" in hand]
+    unit = 100.0 if axes == "unreal" else 1.0
+    for along in range(3):
+        hand = poses[3 * along]
+        wrist, tip = np.array(hand["wrist"]["position"]), np.array(hand["positions"][8])
+        np.testing.assert_allclose(wrist, unit * np.array([0.1, 0.2, 0.3]), atol=1e-6 * unit)
+        ahead = (tip - wrist) / unit
+        assert 0.15 < ahead[along] < 0.22 and np.abs(np.delete(ahead, along)).max() < 0.04
+        assert f"along +{'xyz'[along]}," in told[along]
+        said = [float(one) for one in re.findall(r"-?\d+\.\d+", told[along])]
+        np.testing.assert_allclose(said, tip, atol=6e-4)
+    assert hand["angles"][4:8] == [0.0] * 4

@@ -203,6 +203,29 @@ def test_server_infos_are_read(info):
     assert parse_server_info(payload) == info
 
 
+@pytest.mark.parametrize("version", VERSIONS)
+def test_the_latency_is_from_the_middle_of_the_exposure_to_the_sending(version):
+    nothing = np.zeros((0, 3)), np.zeros(0, dtype=int)
+    frame = StreamedFrame(5, 2.5, *nothing, latency=0.0042)
+    _, payload = unpack(pack_frame(frame, version))
+    assert parse_frame(payload, version).latency == pytest.approx(0.0042, abs=1e-6)
+    assert parse_frame(payload, version, clock=10_000_000).latency == pytest.approx(0.00042, abs=1e-7)
+    _, unknown = unpack(pack_frame(StreamedFrame(5, 2.5, *nothing), version))
+    assert math.isnan(parse_frame(unknown, version).latency)
+
+
+@pytest.mark.parametrize(
+    ("exposed", "sent", "clock"), [(100, 50, 1000), (1, 2**64 - 1, 1000), (5, 6, 0), (0, 900, 1000)]
+)
+def test_times_that_cannot_be_of_one_clock_are_no_latency(exposed, sent, clock):
+    payload = full_frame([], [], sized=False)
+    before = struct.pack("<d3Q", 12.5, 3, 4, 5)
+    assert payload.count(before) == 1
+    payload = payload.replace(before, struct.pack("<d3Q", 12.5, exposed, 0, sent))
+    assert math.isnan(parse_frame(payload, (3, 0), clock=clock).latency)
+    assert parse_frame(payload, (3, 0), clock=clock).time == 12.5
+
+
 def test_a_greeting_says_which_layout_is_wanted():
     kind, payload = unpack(pack_connect())
     assert kind == Kind.CONNECT and len(payload) == 270
