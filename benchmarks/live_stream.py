@@ -42,7 +42,7 @@ RARE = 0.002  # of the packets, for junk, wild times and other senders
 AHEAD = 40  # frames that may wait for the reader
 RESTARTS = 4
 WARM = 10.0  # [s] of the stream before memory is measured
-SETTLED = 12.0  # [s] of a recording before it is killed: the size of the hands is measured first
+SETTLED = 12.0  # [s] of a recording before it is killed, in which the size of the hands is measured
 PROGRAM = "import sys; from handsim.cli.main import main; sys.exit(main(sys.argv[1:]))"
 WILD = (1e17, 1e9, -1e9, np.inf, 7e4, -3.0)
 

@@ -54,7 +54,7 @@ if TYPE_CHECKING:
     from track.streams.live_stream import open_source as open_source
     from track.streams.natnet import PointFrames as PointFrames
     from track.streams.natnet import ReplayServer as ReplayServer
-    from track.take_summary import SuspectSpan as SuspectSpan
+    from track.take_faults import SuspectSpan as SuspectSpan
     from track.take_summary import find_suspect_spans as find_suspect_spans
     from track.tracker import Tracker as Tracker
     from track.user import User as User

@@ -14,7 +14,7 @@ import math
 import warnings
 from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -26,7 +26,7 @@ from gloves.layout import MarkerLayout, list_layouts, load_layout
 from gloves.takes.points import Status
 from handsim.errors import ArgumentError, HandSimError, HandSimWarning
 from handsim.hand.model import HandModel
-from handsim.hand.shape import SIZES, Side, shape_from_measures
+from handsim.hand.shape import SIZES, HandShape, Side, shape_from_measures
 from handsim.space.transforms import MIRROR
 from track.association.hand_state import HandState
 from track.association.initialization import FEWEST_POINTS, HandInitializer, distances_to_nearest
@@ -145,6 +145,19 @@ def measured_user(
         none = f"no hand was found to measure its size; size {user.notes} is used, or name a size"
         warnings.warn(none, HandSimWarning, stacklevel=3)
     return user
+
+
+def hand_between(one: GloveFit, other: GloveFit, share: float) -> GloveFit:
+    """The hand at a share of the way from one size of a hand in its glove to another."""
+
+    def mixed(first: Any, last: Any, *names: str) -> dict[str, Any]:
+        return {name: (1.0 - share) * getattr(first, name) + share * getattr(last, name) for name in names}
+
+    measures = [field.name for field in dataclasses.fields(HandShape) if field.name != "side"]
+    shape = dataclasses.replace(other.shape, **mixed(one.shape, other.shape, *measures))
+    worn = mixed(one.attachment, other.attachment, "points", "normals")
+    worn["normals"] /= np.linalg.norm(worn["normals"], axis=1, keepdims=True)
+    return GloveFit(HandModel(shape), dataclasses.replace(other.attachment, **worn))
 
 
 def _fit_from(

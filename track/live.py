@@ -1,4 +1,4 @@
-"""Tracking of a live stream: hands are measured in its first frames, then tracked, sent on and recorded."""
+"""Tracking of a live stream: hands are tracked, sent on and recorded, and measured beside that."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from handsim.app.messages import LiveStatus, named_steps
 from handsim.files.signals import InterruptFlag, Stopped, interrupt_flag, interrupts_bare
 from track.captures import OnFrame
 from track.frames import StreamedFrame, TrackedFrame
+from track.live_sizing import LiveSizing
 from track.recorder import Recorder
 from track.rigid_body import RigidTemplate
 from track.settings import TrackerSetup
 from track.streams import NoServerError
-from track.streams.live_stream import MOST_LAG, LiveStream, open_source
+from track.streams.live_stream import LiveStream, open_source
+from track.tracker import Tracker
 
-_MEASURED: Final = 1.0  # [s] of frames with enough points to measure hands
-_LONGEST_WAIT: Final = 10.0  # [s] for such frames
 _PACE_PERIOD: Final = 1.0  # [s] between two lines about dropped frames
 _LAGS: Final = 100_000  # newest frames whose lag is kept
 _FOREIGN: Final = "foreign_packets"
@@ -56,7 +56,7 @@ class FrameOutput(Protocol):
         """Numbers of dropped frames, by their destination."""
 
     def start(self, hands: Sequence[GloveFit], bodies: Sequence[RigidTemplate]) -> None:
-        """Take on the tracker's hands and bodies."""
+        """Take on the tracker's hands and bodies; again when their size changes."""
 
     def send(self, frame: StreamedFrame, tracked: TrackedFrame) -> None:
         """Take a frame, without waiting."""
@@ -99,7 +99,10 @@ def track_live(
     if out is not None:
         check_unused(growing_path(out))
     with named_steps("getting ready"):
-        setup.tracker().warm_up()
+        tracker = setup.tracker()
+        tracker.warm_up()
+        _start(outputs, tracker)
+        gc.freeze()  # the collector would otherwise stop us for 0.25 s now and then
     until = math.inf  # [s], the end of the tracking by the monotonic clock
     interrupted = InterruptFlag()
     with (
@@ -108,32 +111,32 @@ def track_live(
         ExitStack() as stack,
     ):
         doubt = _Doubt(stream, status)
-        setup, frames = _measured_setup(stream, setup, status, seconds, doubt)
-        tracker = setup.tracker()
-        for output in outputs:
-            output.start(tracker.hands, tracker.bodies)
         stack.enter_context(interrupt_flag(interrupted))  # from here on a signal keeps the frames so far
         recorder = None
         if out is not None:
             recorder = stack.enter_context(Recorder(out, tracker, {"capture": address, **setup.settings}))
             stack.enter_context(_recording_kept(recorder))
             status.say(f"recording to {recorder.part}, which becomes {out} at the end; Ctrl-C ends it")
+        sizing = stack.enter_context(LiveSizing(setup))
         status.show("waiting for the first frame")
-        pace, count = _Pace(), 0
-        for frame in frames:
+        stream.forgive()
+        pace = _Pace()
+        for frame in stream:
             if seconds is not None and not frame.silent:
                 until = min(until, frame.arrived + seconds)
             if interrupted() or frame.arrived > until:
                 break
             tracked = tracker.step(frame.points, frame.ids, frame.time)
-            is_recent = not pace.catches_up(frame, stream.forgiven_until)
-            for output in outputs if is_recent else ():
+            for output in outputs:
                 output.send(frame, tracked)
-            pace.add(frame, is_recent)
+            pace.add(frame)
             if recorder is not None:
                 recorder.add(frame, tracked)
-            count += not frame.silent
             on_frame(frame, tracked)
+            if sizing.step(frame, tracked, tracker):
+                _start(outputs, tracker)
+                if sizing.is_settled:
+                    _note_size(tracker, recorder, status)
             dropping = pace.tick(stream.counts)
             if frame.silent or dropping or status.due:
                 unsent = sum(sum(output.counts.values()) for output in outputs)
@@ -141,18 +144,26 @@ def track_live(
                 status.show(line, now=frame.silent or dropping)
             doubt.tell()
         stream.end(until)
-        counts, take, step, duration = stream.counts, None, 1, 0.0
-        if recorder is not None:
-            status.show(f"writing {out}", now=True)
-            kept = f"writing {out}; {recorder.part} is kept until then"
-            take, step = recorder.finish(counts, told=lambda: status.show(kept))
-            duration = recorder.duration + 1.0 / take.rate
+        counts = stream.counts
+        take, step, duration = (None, 1, 0.0) if recorder is None else _written(recorder, out, counts, status)
     after = counts["frames_in_order"] + counts["reordered_frames"] - counts["dropped_frames"]
-    counts["frames_after_end"] = max(0, after - count)
-    notes = [*_notes(counts, step, pace, stream.order.interval)]
+    counts["frames_after_end"] = max(0, after - pace.frames)
+    notes = _notes(counts, step, pace, stream.order.interval)
+    sent = (note for output in outputs for note in output.notes())
+    return LiveTake(take, pace.frames, duration, (*notes, *sent, *filter(None, [stream.point_doubt])))
+
+
+def _start(outputs: Sequence[FrameOutput], tracker: Tracker) -> None:
+    """Have outputs take on a tracker's hands and bodies."""
     for output in outputs:
-        notes += output.notes()
-    return LiveTake(take, count, duration, (*notes, *filter(None, [stream.point_doubt])))
+        output.start(tracker.hands, tracker.bodies)
+
+
+def _note_size(tracker: Tracker, recorder: Recorder | None, status: LiveStatus) -> None:
+    """Print and record the size that a tracker's hands have from now on."""
+    status.say(f"size of the hands: {tracker.user}")
+    if recorder is not None:
+        recorder.resize()
 
 
 def _open_answering(address: str, ended: Callable[[], bool], status: LiveStatus) -> LiveStream:
@@ -164,50 +175,14 @@ def _open_answering(address: str, ended: Callable[[], bool], status: LiveStatus)
             status.show(f"{error}; it is waited for, Ctrl-C ends it", now=True)
 
 
-def _measured_setup(
-    stream: LiveStream, setup: TrackerSetup, status: LiveStatus, seconds: float | None, doubt: _Doubt
-) -> tuple[TrackerSetup, Iterator[StreamedFrame]]:
-    """The setup with the hands as measured in the first frames of a stream, and all its frames."""
-    gc.freeze()  # the collector would otherwise stop us for 0.25 s now and then
-    if not setup.is_auto:
-        stream.forgive()
-        return setup, stream
-    first = _first_frames(stream, setup.fewest_points, seconds, status, doubt)
-    setup = setup.measured([frame for frame in first if len(frame.points) >= setup.fewest_points])
-    status.say(f"size of the hands: {setup.user}")
-    return setup, _first_and_others(first, stream)
-
-
-def _first_and_others(first: list[StreamedFrame], stream: LiveStream) -> Iterator[StreamedFrame]:
-    """All frames of a stream, also those that came while hands were measured in the first ones."""
-    stream.forgive(math.inf)
-    yield from first
-    stream.forgive()
-    yield from stream
-
-
-def _first_frames(
-    stream: LiveStream, fewest_points: float, seconds: float | None, status: LiveStatus, doubt: _Doubt
-) -> list[StreamedFrame]:
-    """The first frames of a stream, until there were enough points for one second, or for ten seconds."""
-    frames: list[StreamedFrame] = []
-    began = shown = np.inf
-    status.show("waiting for hands, to measure their size")
-    for frame in stream:
-        now = monotonic()
-        doubt.tell()
-        if frame.silent and frames:
-            break
-        if frame.silent:
-            status.show(_silence_line(stream.counts), now=True)
-        else:
-            frames.append(frame)
-            began = min(began, now)
-        if len(frame.points) >= fewest_points:
-            shown = min(shown, now)
-        if now >= min(began + min(_LONGEST_WAIT, seconds or np.inf), shown + _MEASURED):
-            break
-    return frames
+def _written(
+    recorder: Recorder, out: Path | None, counts: dict[str, int], status: LiveStatus
+) -> tuple[Take, int, float]:
+    """Write the take of a recording, see `Recorder.finish`; also the time of all its frames [s]."""
+    status.show(f"writing {out}", now=True)
+    kept = f"writing {out}; {recorder.part} is kept until then"
+    take, step = recorder.finish(counts, told=lambda: status.show(kept))
+    return take, step, recorder.duration + 1.0 / take.rate
 
 
 @contextmanager
@@ -240,21 +215,17 @@ class _Pace:
     def __init__(self) -> None:
         self.lags: deque[float] = deque(maxlen=_LAGS)
         """Times from the arrival of frames to their output [s]."""
-        self.first_lags: list[float] = []
-        """Lags [s] of the frames that came while hands were measured."""
+        self.frames = 0
+        """Number of frames."""
         self.words = ""
         """A summary of the last second."""
         self._begin, self._received, self._dropped = monotonic(), 0, 0
 
-    def catches_up(self, frame: StreamedFrame, forgiven_until: float) -> bool:
-        """Whether a frame came while hands were measured; its lag is forgiven until that time [s]."""
-        now = monotonic()
-        return now < forgiven_until and now - frame.arrived > MOST_LAG and not (frame.silent or self.lags)
-
-    def add(self, frame: StreamedFrame, is_recent: bool) -> None:
+    def add(self, frame: StreamedFrame) -> None:
         """Add the lag of a frame."""
         if not frame.silent:
-            (self.lags if is_recent else self.first_lags).append(monotonic() - frame.arrived)
+            self.lags.append(monotonic() - frame.arrived)
+            self.frames += 1
 
     def tick(self, counts: dict[str, int]) -> bool:
         """Once a second renew the summary; returns whether frames were dropped in that second."""
@@ -264,7 +235,7 @@ class _Pace:
             return False
         received = counts["received_frames"] - self._received
         dropped = counts["dropped_frames"] - self._dropped
-        newest = [*self.first_lags, *self.lags][-max(received, 1) :]
+        newest = list(self.lags)[-max(received, 1) :]
         lag = float(np.median(newest)) if newest else 0.0
         share = f"{100.0 * dropped / max(received, dropped, 1):.0f} % dropped, " if dropped else ""
         self.words = f"{received / span:.0f} Hz, {share}{1e3 * lag:.0f} ms behind"
@@ -283,11 +254,6 @@ def _notes(counts: dict[str, int], step: int, pace: _Pace, interval: float) -> I
         yield (
             f"output {median:.0f} ms behind the arrival of frames (median), {late:.0f} ms in the worst "
             f"hundredth, {most:.0f} ms at most"
-        )
-    if pace.first_lags:
-        yield (
-            f"the first {len(pace.first_lags)} frames, which came while hands were measured, were up to "
-            f"{max(pace.first_lags):.1f} s behind"
         )
     if lacking := counts["missing_at_end"]:
         quiet = f"no frame came in the last {lacking * interval:.2f} s"

@@ -120,13 +120,13 @@ class Recorder:
         remove_abandoned(out)  # left by a run that was killed in `finish`
         self.part = growing_path(out)
         """The file of the recording."""
-        self._out, self._hands, self._bodies = out, tracker.hands, tracker.bodies
+        self._out, self._tracker = out, tracker
         self._settings = {**settings_of(tracker), **settings}
-        sizes = {"H": len(self._hands), "B": len(self._bodies)}
+        sizes = {"H": len(tracker.hands), "B": len(tracker.bodies)}
         self._archive = GrowingArchive(
             self.part,
             self._header(None),
-            worn_arrays(self._hands, self._bodies),
+            worn_arrays(tracker.hands, tracker.bodies),
             [column.sized(sizes) for column in (*FRAMES, *POINTS, *OPTIONAL, KEYPOINTS)],
         )
         self._times: tuple[float, float] | None = None
@@ -166,7 +166,7 @@ class Recorder:
             if not usable.all():
                 kept = usable.all(axis=1)
                 values |= {column.name: values[column.name][kept] for column in POINTS}
-            keypoints = keypoints_of(self._hands, values["qpos"][None])[0]
+            keypoints = keypoints_of(self._tracker.hands, values["qpos"][None])[0]
             self._archive.add({**values, KEYPOINTS.name: keypoints}, len(values["points"]))
         except OSError as error:
             raise CaptureError(
@@ -174,6 +174,16 @@ class Recorder:
                 f"kept in {self.part}"
             ) from error
         self._times = (self._times[0] if self._times else frame.time, frame.time)
+
+    def resize(self) -> None:
+        """Note that the tracker's hands have another size from here on; the take has hands of the last one.
+
+        `sizes` in the settings has all of them, with the frames from which on poses are of that size.
+        """
+        sizes = self._settings.setdefault("sizes", [[0, self._settings.get("user", "")]])
+        self._settings["user"] = self._tracker.user.notes
+        sizes.append([self.num_frames, self._settings["user"]])
+        self._archive.replace_head(self._header(None), worn_arrays(self._tracker.hands, self._tracker.bodies))
 
     def close(self) -> None:
         """Write what still waits, and close the recording without writing the take."""
@@ -218,7 +228,7 @@ class Recorder:
         return take, step
 
     def _header(self, rate: float | None) -> dict[str, Any]:
-        return take_header(self._hands, self._bodies, rate, self._settings)
+        return take_header(self._tracker.hands, self._tracker.bodies, rate, self._settings)
 
     def __enter__(self) -> Self:
         return self

@@ -20,10 +20,11 @@ from jaxtyping import Bool, Float, Int
 from gloves.captures.capture import runs_of
 from gloves.takes.take import COASTING, INITIALIZED, LOST, STATUSES, Take
 from handsim.files.outputs import atomic_write, check_ending, written_together
-from handsim.hand.shape import DIGITS, JOINT_NAMES, JOINTS, Side
+from handsim.hand.shape import BONES, DIGITS, JOINT_NAMES, JOINTS, Side
 from handsim.pages import NOTHING, Paint, Section, html_list, picture, write_sections
 from track.config import Size
-from track.take_summary import SuspectSpan, find_suspect_spans, summarize, suspicions
+from track.take_faults import AT_LIMIT, SuspectSpan
+from track.take_summary import find_suspect_spans, summarize, suspicions, vouch
 from track.user import MEASURED
 from train.evaluation import percent
 
@@ -34,8 +35,8 @@ if TYPE_CHECKING:
 _TABLES: Final = (".frames.csv", ".joints.csv", ".markers.csv", ".doubts.csv")
 _RANGE: Final = {"least": 0.0, "5th": 5.0, "median": 50.0, "95th": 95.0, "largest": 100.0}
 """Columns of a range of motion, and the percentile in each."""
-_AT_LIMIT: Final = 0.5  # [deg] from a limit of the model, at which a joint stands at it
 _CHUNK: Final = 4096  # frames whose bones are posed at once
+_WANTED: Final = (0.99, 0.999)  # shares of right frames that a person may want
 _MOST_SPANS: Final = 100  # doubtful spans in the page's table; the table beside it has all
 _BINS: Final = 750  # bins of a long take's curve, which shows the least and the largest value of each
 _STROKES: Final = (Paint.VIOLET, Paint.BLUE, Paint.WARM, Paint.GREEN)
@@ -98,6 +99,8 @@ class HandFigures:
     """Distance of each labeled point from the pose's marker [m]; NaN without a point or a pose."""
     confidence: Float[np.ndarray, "T M"]
     """Probability of each marker's label; NaN where the marker has no point."""
+    beyond: Bool[np.ndarray, "20 M"]
+    """Which markers each joint moves."""
 
     @property
     def seen(self) -> Bool[np.ndarray, "T M"]:
@@ -117,13 +120,23 @@ class HandFigures:
         count = np.where(known.any(axis=1), known.sum(axis=1), np.nan)
         return np.asarray(np.sqrt(total / count))
 
+    @property
+    def measured(self) -> Bool[np.ndarray, "T 20"]:
+        """Fitted frames in which a joint moves a marker that is seen, or which the glove has no marker for.
+
+        In the others its angle is predicted.
+        """
+        told = ~self.beyond.any(axis=1) | (self.seen @ self.beyond.T)
+        return np.asarray(self.fitted[:, None] & told)
+
     def joints(self) -> Float[np.ndarray, "20 6"]:
-        """`_RANGE` of each angle over the fitted frames, and its median spread [deg]; NaN if unknown."""
+        """`_RANGE` of each angle over its measured frames, and its median spread [deg]; NaN if unknown."""
         found = np.full((self.angles.shape[1], len(_RANGE) + 1), np.nan)
-        if self.fitted.any():
-            found[:, :-1] = np.percentile(self.angles[self.fitted], list(_RANGE.values()), axis=0).T
-            if self.angle_spread is not None:
-                found[:, -1] = np.median(self.angle_spread[self.fitted], axis=0)
+        for row, angles, measured in zip(found, self.angles.T, self.measured.T, strict=True):
+            if measured.any():
+                row[:-1] = np.percentile(angles[measured], list(_RANGE.values()))
+        if self.angle_spread is not None and self.fitted.any():
+            found[:, -1] = np.median(self.angle_spread[self.fitted], axis=0)
         return found
 
     def at_limits(self) -> Float[np.ndarray, "20"]:
@@ -132,22 +145,24 @@ class HandFigures:
         angles = self.angles[self.fitted]
         if not len(angles):
             return np.full(len(JOINTS), np.nan)
-        return np.asarray(((angles < low + _AT_LIMIT) | (angles > high - _AT_LIMIT)).mean(axis=0))
+        return np.asarray(((angles < low + AT_LIMIT) | (angles > high - AT_LIMIT)).mean(axis=0))
 
     def markers(self) -> Iterator[MarkerFigures]:
         """What was seen of each marker, in the order of the glove."""
         seen = self.seen
+        there = np.flatnonzero(self.status != LOST)
+        hidden = np.zeros_like(seen)
+        if len(there):
+            hidden[there[0] : there[-1] + 1] = ~seen[there[0] : there[-1] + 1]
         for marker, name in enumerate(self.marker_names):
             frames = np.flatnonzero(seen[:, marker])
-            gaps = np.diff(frames) - 1  # frames between one in which it is seen and the next
+            gaps = [last - first + 1 for first, last in runs_of(hidden[:, marker])]
             residuals = self.residuals[:, marker]
             known = residuals[np.isfinite(residuals)]
             median, high = np.percentile(known, (50.0, 95.0)).tolist() if len(known) else (np.nan, np.nan)
             confidence = float(np.median(self.confidence[frames, marker])) if len(frames) else np.nan
-            num_gaps, longest = int((gaps > 0).sum()), int(gaps.max(initial=0))
-            yield MarkerFigures(
-                name, float(seen[:, marker].mean()), num_gaps, longest, median, high, confidence
-            )
+            share, longest = float(seen[:, marker].mean()), max(gaps, default=0)
+            yield MarkerFigures(name, share, len(gaps), longest, median, high, confidence)
 
 
 class MarkerFigures(NamedTuple):
@@ -157,7 +172,7 @@ class MarkerFigures(NamedTuple):
     seen: float
     """Share of all frames in which it has a point."""
     num_gaps: int
-    """How often it was lost and seen again."""
+    """How often it is not seen between the hand's first pose and its last."""
     longest_gap: int
     """Frames."""
     median_residual: float
@@ -172,7 +187,7 @@ def hand_figures(take: Take) -> tuple[HandFigures, ...]:
     """The figures of each hand of a take, simulated or tracked, in their order."""
     found = []
     for number, (hand, labels) in enumerate(zip(take.hands, take.hand_labels, strict=True)):
-        there = take.status[:, number] != LOST
+        there, bones = take.status[:, number] != LOST, hand.attachment.main_bones
         angles = np.where(there[:, None], np.rad2deg(take.qpos[:, number, 7:]), np.nan)
         confidence = np.full((take.num_frames, len(labels)), np.nan)
         points = take.point_list
@@ -186,7 +201,13 @@ def hand_figures(take: Take) -> tuple[HandFigures, ...]:
             residuals[part] = np.linalg.norm(observed[part] - expected, axis=2)
         spread = None if take.angle_spread is None else np.rad2deg(take.angle_spread[:, number])
         status, names = take.status[:, number], hand.layout.names
-        found.append(HandFigures(hand.side, names, status, angles, spread, residuals, confidence))
+        beyond = np.array(
+            [
+                [bone >= joint.bone and BONES[bone].digit == BONES[joint.bone].digit for bone in bones]
+                for joint in JOINTS
+            ]
+        )
+        found.append(HandFigures(hand.side, names, status, angles, spread, residuals, confidence, beyond))
     return tuple(found)
 
 
@@ -297,7 +318,8 @@ def _range_section(title: str, hand: HandFigures) -> Section:
         limits = f"{joint.low:g} to {joint.high:g}", percent(share) if share > 0.0 else NOTHING
         table.append([joint.name.replace("_", " "), *cells, *limits, spread])
     text = (
-        f"Over the {int(hand.fitted.sum()):,} frames whose pose was fitted to points; 5th and 95th are "
+        f"Over the {int(hand.fitted.sum()):,} frames whose pose was fitted to points, of a joint those in "
+        "which a marker beyond it is seen, if the glove has one: others are predicted. 5th and 95th are "
         "percentiles, which a single wrong frame does not move. A joint at its limits may bend further than "
         "its least and largest angle say, which are then the model's. Spread: the median standard deviation "
         "of the angle, from what is not known of the hand, hidden markers and noise."
@@ -318,8 +340,9 @@ def _markers_section(title: str, take: Take, hand: HandFigures) -> Section:
         table.append([*first, *residuals, percent(marker.median_confidence)])
     drawn = picture((9.6, 1.0 + 0.17 * len(hand.marker_names)), _draw_presence, take.times, hand)
     text = (
-        "Seen: the share of all frames in which a point has the marker's label. A gap is between two frames "
-        "that have it. Residual: how far the point is from the marker of the pose."
+        "Seen: the share of all frames in which a point has the marker's label. A gap is a run of frames "
+        "without it, from the hand's first pose to its last. Residual: how far the point is from the marker "
+        "of the pose."
     )
     caption = "Blue where the marker was seen; pale where it was seen in some of the frames of a column."
     return Section(title, text, pictures=[(drawn, caption)], table=table)
@@ -406,12 +429,18 @@ def _spans_section(take: Take, spans: Sequence[SuspectSpan], source: str) -> Sec
         look = f"frame {span.worst}, {worst} s"
         table.append([frames, start, end, span.of, span.why, look, f"{command} --time {worst}"])
     text = (
-        "Spans in which a label is probably wrong or a marker lacks its own, those with the most such frames "
-        "first; the percentage is the least confidence in a point. "
+        "Faults of the take, then spans in which a label is probably wrong or a marker lacks its own, those "
+        "with the most such frames first; the percentage is the least confidence in a point. "
         f"<code>{escape(command)}</code> lists the first of them too; a click leads there, "
         "and a wrong label can be corrected."
     )
     more = f"These are the first {_MOST_SPANS} of {len(spans):,}; the table beside the page has all."
+    vouched = vouch(take, spans)
+    for share in _WANTED if take.made_by_tracker else ():
+        looks = vouched.looks(share)
+        if looks:
+            text += f" After a look at the first {looks}, {100 * share:g} % of all frames should be right."
+            break
     return Section("Doubtful frames", text, table=table, notes=[more] if len(spans) > _MOST_SPANS else [])
 
 

@@ -123,6 +123,21 @@ class Tracker:
         for cloud in unsure:  # labels that a pose has to verify
             self.labeler.label_frames([cloud])
 
+    def resize(self, user: User, keep: float = 0.0) -> None:
+        """Go on with the same hands of another size; they keep their poses and labels.
+
+        Args:
+            user: The hands, in the order of those before.
+            keep: Share of the learned biases of markers that is kept, from 0 to 1. More than 0 is a step on
+                the way to another size, which takes a tenth of the time.
+        """
+        self.user, self.hands = user, user.hands
+        for state, hand in zip(self._states, self.hands, strict=True):
+            state.resize(hand, user.origin(hand.side), keep)
+        self._digits = digit_table(self._states, self._numbering)
+        if not keep:
+            self._initializer = HandInitializer(self._states, self.labeler, self.config)
+
     def step(
         self,
         points: Float[np.ndarray, "N 3"],

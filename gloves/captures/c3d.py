@@ -370,9 +370,8 @@ def read_c3d(data: bytes, tell: Tell = warn) -> Capture:
 def write_c3d(path: Path, capture: Capture, source: bytes | None = None) -> None:
     """Write float32 millimeters; a missing point gets residual -1.
 
-    Of a `source`, the bytes of the C3D that the capture was made from, all but the points is kept: analog
-    channels, events, the number of the first frame and all parameters, but no rotations (group ROTATION).
-    Then lengths have its unit, as its force plates have.
+    All of a `source` is kept, the bytes of the C3D that the capture was made from, but points and rotations
+    (group ROTATION): analogs, events, first frame, parameters, and the unit, which its force plates have.
     The length of a take of more than 65,535 frames stands in TRIAL:ACTUAL_END_FIELD; programs that ignore
     this field, such as ezc3d 1.7, see the first 65,535 frames.
     """
@@ -405,15 +404,13 @@ def _unit(source: bytes) -> str:
 
 _OF_POINTS: Final = ("USED", "SCALE", "RATE", "FRAMES", "LONG_FRAMES", "UNITS", "LABELS", "DESCRIPTIONS")
 """How parameters of the group POINT begin that state what the points are."""
-_MOST_BLOCKS: Final = 255  # of a parameter section
 _EVENTS_AT: Final = slice(304, 376)  # bytes of the header with times of events; flags and labels follow
 
 
 def _with_source(written: bytes, num_frames: int, source: bytes) -> bytes:
     """A written file with all of its source but the points: analogs, events, parameters, first frame."""
     parameters = Parameters.parse(source, (source[0] - 1) * BLOCK, _silent)
-    processor = parameters.processor
-    header = Header.parse(source, processor)
+    header = Header.parse(source, processor := parameters.processor)
     frames, num_points, scale = _read_frames(source, parameters, header, _silent)
     if len(frames) != num_frames:
         raise CaptureError(f"the source has {len(frames)} frames and the capture {num_frames}")
@@ -424,11 +421,11 @@ def _with_source(written: bytes, num_frames: int, source: bytes) -> bytes:
         analogs = analogs.view(analogs.dtype.str.replace("i", "u"))
     ours = Header.parse(written, _INTEL)
     points = np.frombuffer(written, "<f4", 4 * num_frames * ours.num_points, ours.start)
-    data = np.concatenate([points.reshape(num_frames, -1), analogs], axis=1).astype("<f4").tobytes()
+    data = np.concatenate([points.reshape(num_frames, -1), analogs.astype("<f4")], axis=1).tobytes()
     group, records = _merged_records(written, source, processor)
     blocks = -(-(len(records) + len(_data_start(group, 0)) + 6) // BLOCK)
-    if blocks > _MOST_BLOCKS:
-        raise CaptureError(f"the parameters take {blocks} blocks, a C3D has {_MOST_BLOCKS} at most")
+    if blocks > 255:  # the number is a byte
+        raise CaptureError(f"the parameters take {blocks} blocks, a C3D has 255 at most")
     section = bytes([1, 0x50, blocks, _INTEL]) + records + _data_start(group, 2 + blocks)
     words = np.frombuffer(source[:BLOCK], INTEGER_DTYPES[processor]).astype("<u2")
     head = bytearray(words.tobytes())
@@ -476,13 +473,17 @@ def _merged_records(written: bytes, source: bytes, processor: int) -> tuple[int,
             behind = rotated and groups.get(abs(group)) == "ROTATION"  # their numbers follow the frames
             if of_points == (data is written) and not behind and not (is_point and name == "DATA_START"):
                 number = numbers[0] if of_points else group
-                kept = bytes(content[: 1 + content[0]]) if group < 0 else _in_intel(content, kind)
-                merged.append(_record(number, name, kept))
+                try:
+                    kept = bytes(content[: 1 + content[0]]) if group < 0 else _in_intel(content, kind)
+                    merged.append(_record(number, name, kept))
+                except (ValueError, IndexError, struct.error):
+                    warn(f"the source's parameter {shortened(name)!r} is damaged, and left out")
     return numbers[0], b"".join(merged)
 
 
 def _in_intel(content: memoryview, processor: int) -> bytes:
     """The content of a parameter's record up to its end, with numbers in Intel's format."""
+    _read_values(bytes(content), processor)  # raises a ValueError if it is damaged
     kind, begin = int.from_bytes(content[:1], "little", signed=True), 2 + content[1]
     end = begin + math.prod(content[2:begin]) * abs(kind)
     values = bytes(content[begin:end])

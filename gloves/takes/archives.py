@@ -42,6 +42,7 @@ _BLOCK: Final = struct.Struct("<4s4I")  # mark, number of the block, frames, poi
 _MARK: Final = b"blk\n"
 _CHECKSUM: Final = "checksum"
 _INTERVAL: Final = 0.5  # [s] between two blocks
+_SPARE: Final = 4096  # bytes by which the header may grow while blocks follow
 _MAX_HEADER: Final = 1 << 26  # bytes
 _FULL_FRAMES: Final = 1 << 16  # frames after which a block is written early; half a second has far fewer
 _FULL_POINTS: Final = 1 << 21  # points after which a block is written early
@@ -76,14 +77,8 @@ class GrowingArchive(Closing):
         self._waiting: list[list[bytes]] = []  # each frame's entry of every column
         self._points = self._block = self._written = 0
         self._due = math.inf
-        text = {**header, "arrays": list(arrays), "columns": [column._asdict() for column in columns]}
-        parts = list[bytes]()
-        for array in arrays.values():
-            buffer = io.BytesIO()
-            np.lib.format.write_array(buffer, np.ascontiguousarray(array), version=(1, 0), allow_pickle=False)
-            parts.append(buffer.getvalue())
-        parts.insert(0, json.dumps(text | {_CHECKSUM: _head_checksum(text, parts)}).encode())
-        if max(map(len, parts)) > _MAX_HEADER:  # it could not be read again
+        self._head = self._packed_head(header, arrays)
+        if max(map(len, self._head)) > _MAX_HEADER:  # it could not be read again
             raise CaptureError(f"{path}: the settings take more than {_MAX_HEADER} bytes")
         make_folder_of(path)
         try:
@@ -91,7 +86,7 @@ class GrowingArchive(Closing):
         except FileExistsError:
             check_unused(path)
             raise
-        self._write(_MAGIC + b"".join(_SIZE.pack(len(part)) + part for part in parts))
+        self._write_head()
 
     @property
     def num_frames(self) -> int:
@@ -111,6 +106,16 @@ class GrowingArchive(Closing):
         self._points += num_points
         self._due = min(self._due, time.monotonic() + _INTERVAL)
         self.flush_due()
+
+    def replace_head(self, header: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> None:
+        """Replace the header and the arrays that do not grow; not if they need more room than there is."""
+        head = self._packed_head(header, arrays, len(self._head[0]))
+        if list(map(len, head)) == list(map(len, self._head)):
+            self._head = head
+            with signals_wait():  # until the file can be read again
+                self._file.seek(0)
+                self._write_head()
+                self._file.seek(0, os.SEEK_END)
 
     def flush_due(self) -> None:
         """Write the waiting frames if they are many, or half a second old."""
@@ -137,6 +142,22 @@ class GrowingArchive(Closing):
             self.flush()
         finally:
             self._file.close()
+
+    def _packed_head(
+        self, header: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], size: int = 0
+    ) -> list[bytes]:
+        """The header, of at least so many bytes, by default with some to spare, and the arrays."""
+        text = {**header, "arrays": list(arrays), "columns": [one._asdict() for one in self._columns[1:]]}
+        parts = list[bytes]()
+        for array in arrays.values():
+            buffer = io.BytesIO()
+            np.lib.format.write_array(buffer, np.ascontiguousarray(array), version=(1, 0), allow_pickle=False)
+            parts.append(buffer.getvalue())
+        told = json.dumps(text | {_CHECKSUM: _head_checksum(text, parts)}).encode()
+        return [told.ljust(size or len(told) + _SPARE), *parts]
+
+    def _write_head(self) -> None:
+        self._write(_MAGIC + b"".join(_SIZE.pack(len(part)) + part for part in self._head))
 
     def _write(self, content: bytes) -> None:
         rest = memoryview(content)

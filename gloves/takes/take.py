@@ -598,18 +598,23 @@ class Take:
         fits poses to markers with these offsets, so markers computed from its poses need them too.
         """
         number = self.hand_index(side)
-        worn, qpos = self.hands[number], self.qpos[:, number]
         fits = np.flatnonzero((self.status[:, number] == TRACKED) & np.isfinite(self.rms[:, number]))
         fits = fits[:: -(-len(fits) // _MAX_BIAS_FRAMES) or 1]
-        bias = np.zeros((worn.layout.num_markers, 3))
+        bias = np.zeros((self.hands[number].layout.num_markers, 3))
         if len(fits) < _MIN_BIAS_FRAMES:
             return bias
-        seen = self.point_list.labeled(self.hand_labels[number], fits)
-        rotations = worn.model.forward_kinematics(qpos[fits])[:, worn.attachment.main_bones, :3, :3]
-        local = np.einsum("tmji,tmj->tmi", rotations, worn.markers(qpos[fits])[0] - seen)
+        local = self.marker_offsets(side, fits)
         enough = np.isfinite(local[..., 0]).sum(axis=0) >= _MIN_BIAS_FRAMES
         bias[enough] = np.nanmedian(local[:, enough], axis=0)
         return bias
+
+    def marker_offsets(self, side: Side, frames: Int[np.ndarray, "F"]) -> Float[np.ndarray, "F M 3"]:
+        """Offset of a hand's markers from where they were seen, in the frames of their bones [m]; or NaN."""
+        number = self.hand_index(side)
+        worn, qpos = self.hands[number], self.qpos[frames, number]
+        seen = self.point_list.labeled(self.hand_labels[number], frames)
+        rotations = worn.model.forward_kinematics(qpos)[:, worn.attachment.main_bones, :3, :3]
+        return np.asarray(np.einsum("tmji,tmj->tmi", rotations, worn.markers(qpos)[0] - seen))
 
     def markers_present(self) -> Bool[np.ndarray, "T M"]:
         """Whether each marker of all hands has a point in each frame."""

@@ -168,9 +168,14 @@ class LocalProcesses(ProcessPoolExecutor):
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if kind is not None:
-            self._ours.close()
-        self.shutdown(wait=True, cancel_futures=kind is not None)
+            self.end()
+        self.shutdown(wait=True)
         self._ours.close()
+
+    def end(self) -> None:
+        """End the processes at once."""
+        self._ours.close()
+        self.shutdown(wait=False, cancel_futures=True)
 
 
 def _end_with(channel: Connection) -> None:

@@ -25,7 +25,7 @@ class TrackerOptions:
     """Marker layout: a shipped name or the path of a .toml file; that of --shape, or dense19, when not
     given."""
     size: Size | None = None
-    """Size of the hands; auto, which is the default, measures it in the capture or in the first second of a
+    """Size of the hands; auto, which is the default, measures it in the capture, or beside the tracking of a
     stream."""
     shape: Path | None = None
     """The user's file from handsim calibrate: hands and gloves."""

@@ -84,8 +84,9 @@ def digit_ranges(hand: GloveFit) -> DigitRanges:
     shares = np.indices((_ANGLES_PER_HINGE,) * 4).reshape(4, -1).T / (_ANGLES_PER_HINGE - 1)
     low, high = hand.model.skeleton.ranges.T
     markers, _ = hand.markers(join_qpos(low + np.tile(shares, 5) * (high - low)))
-    apart = np.linalg.norm(markers[:, :, None] - markers[:, None], axis=-1)
-    return DigitRanges(apart.min(axis=0), apart.max(axis=0))
+    x, y, z = np.ascontiguousarray(markers.T)  # poses last, which is six times as fast
+    squares = (x[:, None] - x) ** 2 + (y[:, None] - y) ** 2 + (z[:, None] - z) ** 2
+    return DigitRanges(np.sqrt(squares.min(axis=-1)), np.sqrt(squares.max(axis=-1)))
 
 
 def empty_hypotheses(num_digits: int, num_candidates: int, num_markers: int) -> DigitHypotheses:

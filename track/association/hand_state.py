@@ -261,6 +261,19 @@ class HandState:
         self._bias[:], self._bias_frames[:], self._variance[:], self.variance[:] = biases
         self._shift_markers()
 
+    def resize(self, hand: GloveFit, origin: HandOrigin, keep: float) -> None:
+        """Go on as the same hand of another size, with a share of the biases."""
+        self.hand, self.solver, self._spread_model = hand, PoseSolver(hand), SpreadModel(hand, origin)
+        self.digits = np.array([BONES[bone].digit for bone in hand.attachment.main_bones])
+        self.adapted = self.solver.hand
+        self._designed = self.adapted.positions[:, 0].copy()
+        if not keep:
+            self._ranges = digit_ranges(hand)
+        self._bias *= keep
+        self._bias_frames[:] = self._bias_frames if keep else 0.0
+        np.maximum(self._variance, _INITIAL_SPREAD_LEAST**2, out=self._variance)
+        self._shift_markers()
+
     def rms_without_bias(self, estimate: HandEstimate) -> float:
         """RMS distance of the markers from their positions on the hand as it was given [m]."""
         return float(_rms_without_bias(estimate.residuals, estimate.predicted.rotations, self._bias))

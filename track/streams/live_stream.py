@@ -236,15 +236,15 @@ class LiveStream(Closing, Iterator[StreamedFrame]):
             raise self._frames.error
         raise StopIteration
 
-    def forgive(self, most: float = _FORGIVEN) -> None:
+    def forgive(self) -> None:
         """Drop nothing for the time that the reader needed until now, if it catches up.
 
-        The lag may be what it is, but for the most [s], less a second for every second from now on.
+        The lag may be what it is, two seconds at most, less a second for every second from now on.
         """
         self._line_up(0.0)
         now = time.monotonic()
         oldest = min((since for _, since in self._ready), default=now)
-        self.forgiven_until = now + min(now - oldest, most) / _CATCHING_UP
+        self.forgiven_until = now + min(now - oldest, _FORGIVEN) / _CATCHING_UP
 
     def end(self, at: float = math.inf) -> None:
         """End the stream after what has arrived; `at` is the monotonic time of its end, if before now [s]."""

@@ -24,7 +24,8 @@ from handsim.space.rig import CameraRig, list_rigs, load_rig
 from handsim.space.transforms import UpAxis, turned_poses, upright
 from track.frames import StreamedFrame, TrackedFrame
 from track.rigid_body import RigidTemplate
-from track.take_summary import SuspectSpan, find_suspect_spans, frame_confidence
+from track.take_faults import SuspectSpan
+from track.take_summary import find_suspect_spans, frame_confidence
 from train.data.shards import Dataset
 
 GHOST_COLOR: Final = (128, 128, 128)

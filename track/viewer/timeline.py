@@ -246,8 +246,10 @@ class LiveView(Closing):
         return {}
 
     def start(self, hands: Sequence[GloveFit], bodies: Sequence[RigidTemplate]) -> None:
-        """Take on a tracker's hands and bodies."""
+        """Take on a tracker's hands and bodies; again when their size changes."""
         self._recording = LiveRecording(hands, bodies, self._rig)
+        if self._thread is not None:
+            return
         self._view = FrameView(self._server, self._recording)
         self._text = self._server.gui.add_markdown("waiting for the first frame")
         self._thread = threading.Thread(target=self._draw, name="live view", daemon=True)

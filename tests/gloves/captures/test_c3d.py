@@ -9,7 +9,7 @@ import pytest
 
 from gloves import Capture, read_capture, write_capture
 from gloves.captures.c3d import read_c3d
-from handsim.errors import CaptureError
+from handsim.errors import CaptureError, HandSimWarning
 from tests.sentences import error_names
 
 INTEL, DEC, SGI = 84, 85, 86
@@ -353,6 +353,12 @@ def test_a_labeled_c3d_keeps_all_of_its_source_but_the_points(tmp_path: Path, un
                 found = after["parameters"][group][name]
                 assert found["type"] == kept[name]["type"]
                 np.testing.assert_array_equal(found["value"], kept[name]["value"], err_msg=f"{group}:{name}")
+    damaged = source.read_bytes()
+    at = damaged.index(b"NAMES") + len(b"NAMES") + 2
+    (tmp_path / "damaged.c3d").write_bytes(damaged[:at] + b"\x64" + damaged[at + 1 :])  # 100 bytes a number
+    with pytest.warns(HandSimWarning, match="'NAMES' is damaged, and left out"):
+        write_capture(out, Capture(names, capture.positions, capture.rate), source=tmp_path / "damaged.c3d")
+    assert "NAMES" not in ezc3d.c3d(str(out))["parameters"]["SUBJECTS"]
     with error_names(CaptureError, "the source has 50 frames and the capture 49"):
         write_capture(out, Capture(names, capture.positions[1:], capture.rate), source=source)
 

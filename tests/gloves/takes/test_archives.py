@@ -84,6 +84,24 @@ def test_what_was_added_is_read_and_finished(rng, tmp_path):
         assert json.loads(str(stored["header"])) == {"kind": "test", "rate": 100.0}
 
 
+def test_the_head_of_a_recording_is_replaced_while_it_grows(rng, tmp_path):
+    path, other = tmp_path / "x.part", {**FIXED, "places": -FIXED["places"]}
+    row = {"times": 0.0, "nothing": np.zeros((0, 7)), "points": rng.normal(size=(2, 3)), "ids": np.arange(2)}
+    with GrowingArchive(path, {"kind": "test"}, FIXED, COLUMNS) as archive:
+        archive.add(row, 2)
+        archive.flush()
+        archive.replace_head({"kind": "test", "sizes": [1, 2]}, other)
+        archive.add(row, 2)
+    grown = GrownArchive(path)
+    assert grown.header == {"kind": "test", "sizes": [1, 2]} and grown.num_lost_bytes == 0
+    np.testing.assert_array_equal(grown.read()["places"], other["places"])
+    np.testing.assert_array_equal(grown.read()["points"], [*row["points"], *row["points"]])
+    with GrowingArchive(tmp_path / "y.part", {}, FIXED, COLUMNS) as archive:
+        archive.replace_head({"long": "x" * 5000}, FIXED)  # no room
+        archive.replace_head({}, {**FIXED, "places": np.zeros((5, 3))})
+    check(GrownArchive(tmp_path / "y.part").read(), [])
+
+
 def test_an_empty_recording_is_one(tmp_path):
     with GrowingArchive(tmp_path / "x.part", {}, FIXED, COLUMNS):
         pass

@@ -1,0 +1,171 @@
+"""Hands that are measured beside their tracker: when, how the size is taken over, and what is told."""
+
+from __future__ import annotations
+
+import dataclasses
+from concurrent.futures import Future
+from functools import cache
+
+import numpy as np
+import pytest
+
+from gloves.optics.reconstruction import number_runs
+from gloves.takes.take import keypoints_of
+from handsim.errors import ArgumentError, HandSimWarning
+from handsim.hand.shape import NUM_QPOS
+from track import Status, StreamedFrame, TrackedFrame, TrackedHand, live_sizing
+from track.live_sizing import LiveSizing
+from track.settings import TrackerSetup, TrackSettings
+from train import simulate_take
+
+RATE = 120
+
+
+class AtOnce:
+    """Calls what a process would call."""
+
+    def __init__(self, workers):
+        pass
+
+    def submit(self, function, *arguments):
+        done = Future()
+        try:
+            done.set_result(function(*arguments))
+        except ArgumentError as error:
+            done.set_exception(error)
+        return done
+
+    def shutdown(self, *, wait):
+        pass
+
+    end = shutdown
+
+
+@pytest.fixture(autouse=True)
+def _here(monkeypatch):
+    monkeypatch.setattr(live_sizing, "LocalProcesses", AtOnce)
+    monkeypatch.setattr(live_sizing, "_NICE", 0)
+
+
+@cache
+def a_take():
+    return simulate_take("single-hand", num_frames=1300, seed=4, hands=["right"])
+
+
+def frames_of(take, begin=0.0):
+    """The frames of a take, that begins at a time [s]."""
+    seen = np.isfinite(take.points[..., 0])
+    ids = number_runs(seen)
+    for number, (points, there) in enumerate(zip(take.points, seen, strict=True)):
+        time = begin + number / RATE
+        yield StreamedFrame(number, time, points[there], ids[number, there])
+
+
+def test_a_hand_is_measured_twice_and_no_joint_jumps():
+    take, setup = a_take(), TrackerSetup.of(TrackSettings(hands="right"))
+    tracker, sizing = setup.tracker(), LiveSizing(setup)
+    truth, sizes, changes, last = keypoints_of(take.hands, take.qpos)[:, 0], [], [], None
+    for frame in frames_of(take, begin=60.0):
+        tracked = tracker.step(frame.points, frame.ids, frame.time)
+        assert tracked.hands[0].has_pose
+        off = keypoints_of(tracker.hands, tracked.hands[0].qpos[None, None])[0, 0] - truth[frame.number]
+        if sizes and sizes[-1][0] > frame.number - 6:
+            changes.append(np.linalg.norm(off - last, axis=1).max())
+        last = off
+        if sizing.step(frame, tracked, tracker):
+            sizes.append((frame.number, tracker.hands[0].shape.length))
+    numbers, lengths = map(np.array, zip(*sizes, strict=True))
+    assert set(np.diff(numbers)) - {1} and np.sum(np.diff(numbers) > 1) == 1, "two times, a step a frame"
+    assert 0.9 * RATE < numbers[0] < 1.1 * RATE and 9.9 * RATE < numbers[numbers > 2 * RATE][0] < 10.1 * RATE
+    assert max(changes) < 0.005
+    assert abs(lengths[-1] - take.hands[0].shape.length) < 0.006 < abs(0.187 - take.hands[0].shape.length)
+    assert tracker.user.notes.startswith("auto, ") and tracker.user.origin("right") == "measured"
+
+
+def found(length):
+    """What a measurement gives that found a hand of a length [m]."""
+
+    def measure(settings, frames, before):
+        calls.append(len(frames))
+        user = TrackerSetup.of(TrackSettings(hands="right", size="M" if length < 0.19 else "XL")).user
+        user = dataclasses.replace(user, notes="auto, measured")
+        return live_sizing._Measured([user])
+
+    calls = []
+    return measure, calls
+
+
+class FakeTracker:
+    """Notes the sizes that it is given."""
+
+    def __init__(self, user):
+        self.user, self.sizes = user, []
+
+    def resize(self, user, keep):
+        self.user = user
+        self.sizes.append((user, keep))
+
+
+def shown(sizing, tracker, begin, seconds, *, there=True, points=20):
+    """Show a stream of points, in which a hand is tracked or not."""
+    status = Status.TRACKED if there else Status.LOST
+    hand = TrackedHand("right", status, np.zeros(NUM_QPOS), 0.001, np.zeros((19, 3)), np.arange(0))
+    for number in range(round(seconds * RATE)):
+        time = begin + number / RATE
+        frame = StreamedFrame(number, time, np.zeros((points, 3)), np.arange(points))
+        tracked = TrackedFrame(time, (hand,), np.full(points, -1), np.ones(points))
+        sizing.step(frame, tracked, tracker)
+
+
+def test_hands_are_measured_again_after_a_pause_and_another_user_is_taken_over_at_once(monkeypatch):
+    setup = TrackerSetup.of(TrackSettings(hands="right"))
+    sizing, tracker = LiveSizing(setup), FakeTracker(setup.user)
+    measure, calls = found(0.187)
+    monkeypatch.setattr(live_sizing, "_measure", measure)
+    shown(sizing, tracker, 0.0, 5.0, there=False, points=3)
+    assert not calls, "nothing can be measured"
+    shown(sizing, tracker, 5.0, 30.0)
+    assert len(calls) == len(tracker.sizes) == 2, "after one second, and for good after ten"
+    shown(sizing, tracker, 35.0, 0.5, there=False, points=3)
+    shown(sizing, tracker, 35.5, 20.0)
+    assert len(calls) == 2, "half a second is no pause"
+    shown(sizing, tracker, 55.5, 3.0, there=False, points=3)
+    shown(sizing, tracker, 58.5, 5.0)
+    assert len(calls) == 3 and len(tracker.sizes) == 2, "one second shows the same hand"
+    shown(sizing, tracker, 63.5, 10.0)
+    assert len(calls) == 4 and len(tracker.sizes) == 3
+    measure, calls = found(0.205)
+    monkeypatch.setattr(live_sizing, "_measure", measure)
+    shown(sizing, tracker, 73.5, 3.0, there=False, points=3)
+    shown(sizing, tracker, 76.5, 1.5)
+    assert len(calls) == 1 and tracker.user[0].shape.length > 0.19, "another hand"
+
+
+def test_points_that_are_no_hand_are_measured_less_and_less_often(monkeypatch):
+    setup = TrackerSetup.of(TrackSettings(hands="right"))
+    sizing, tracker, calls = LiveSizing(setup), FakeTracker(setup.user), []
+
+    def measure(settings, frames, before):
+        calls.append(len(frames))
+        if len(calls) == 1:
+            raise ArgumentError("the points fit hands at 0.001 of their size")
+        return live_sizing._Measured(told=["the points fit another glove better"])
+
+    monkeypatch.setattr(live_sizing, "_measure", measure)
+    with pytest.warns(HandSimWarning) as told:
+        shown(sizing, tracker, 0.0, 70.0, there=False)
+    assert len(calls) == 4 and not tracker.sizes  # after 1, 10, 20 and 40 s
+    assert {str(one.message) for one in told} == {
+        "the points fit hands at 0.001 of their size",
+        "the points fit another glove better",
+    }
+    assert max(calls) <= 8 * 16
+
+
+def test_hands_of_a_known_size_are_not_measured(monkeypatch):
+    setup = TrackerSetup.of(TrackSettings(hands="right", size="L"))
+    sizing, tracker = LiveSizing(setup), FakeTracker(setup.user)
+    measure, calls = found(0.187)
+    monkeypatch.setattr(live_sizing, "_measure", measure)
+    shown(sizing, tracker, 0.0, 15.0)
+    assert not calls and sizing.is_settled

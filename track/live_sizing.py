@@ -1,0 +1,146 @@
+"""The size of the hands of a live stream, measured beside its tracker in a process of its own.
+
+Tracking begins with hands of the usual size. One second of frames with enough points is measured first, ten
+seconds later. The tracker takes a new size over in small steps, one a frame, so that no joint jumps. After a
+pause the hands may be another person's, and are measured again.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import warnings
+from collections import deque
+from collections.abc import Sequence
+from concurrent.futures import Future
+from concurrent.futures.process import BrokenProcessPool
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from handsim.app.workers import LocalProcesses
+from handsim.callbacks import Closing
+from handsim.errors import HandSimError, HandSimWarning
+from track.frames import StreamedFrame, TrackedFrame
+from track.hand_size import hand_between, sample_frames
+from track.settings import TrackerSetup, TrackSettings
+from track.tracker import Tracker
+from track.user import MEASURED, User
+
+_FIRST: Final = 1.0  # [s] of frames with enough points, after which hands are measured
+_ENOUGH: Final = 10.0  # [s] of such frames, in which hands are measured for good
+_LATER: Final = 2.0  # times these seconds, after which they are measured again where no hand was found
+_LONGEST_STEP: Final = 0.1  # [s] from a frame to the next that counts
+_PAUSE: Final = 1.0  # [s] without a hand, after which hands may be another person's
+_SAME: Final = 0.006  # [m] by which lengths differ that one second shows of the same hands
+_STEP: Final = 0.002  # [m] by which the markers of a hand at rest move in a frame when its size changes
+_FEWEST_STEPS: Final = 4  # in which learned biases of markers are given up
+_NICE: Final = 10  # by which the tracker's process comes before the measuring one
+
+
+class _Measured(NamedTuple):
+    """What some frames tell of the hands in them."""
+
+    users: Sequence[User] = ()
+    """The hands on the way to their measured size, in small steps; none if no hand was found."""
+    told: Sequence[str] = ()
+    """What seems wrong with glove, hands or scale, in words."""
+
+
+class LiveSizing(Closing):
+    """Measures the hands of a stream, and has their tracker take the size over; the end of a block ends it.
+
+    Args:
+        setup: The tracker's hands, which are measured if they are of a usual size, and their labeler.
+    """
+
+    def __init__(self, setup: TrackerSetup) -> None:
+        self._setup, self._frames = setup, list[StreamedFrame]()
+        self._shown, self._due = 0.0, _FIRST  # [s] of frames with enough points: those so far, those needed
+        self._last = self._seen = -np.inf  # [s] of the last such frame, and of the last hand
+        self._is_brief, self._is_done = True, False  # of the last measurement, and of what is measured
+        self._processes: LocalProcesses | None = None
+        self._measuring: Future[_Measured] | None = None
+        self._steps: deque[User] = deque()
+
+    @property
+    def is_settled(self) -> bool:
+        """Whether the tracker has taken the newest size over."""
+        return not self._steps
+
+    def close(self) -> None:
+        """End a measurement that goes on."""
+        if self._processes is not None:
+            self._processes.end()
+
+    def step(self, frame: StreamedFrame, tracked: TrackedFrame, tracker: Tracker) -> bool:
+        """Take a frame that was tracked; returns whether the tracker goes on with another size."""
+        if not self._setup.is_auto:
+            return False
+        is_there = any(hand.has_pose for hand in tracked.hands)
+        if frame.time > self._seen + _PAUSE and (is_there or self._is_done):
+            self._frames.clear()
+            self._shown, self._due, self._is_brief, self._is_done = 0.0, _FIRST, True, False
+        self._seen = frame.time if is_there else self._seen
+        if not self._is_done and len(frame.points) >= self._setup.fewest_points:
+            self._shown += min(frame.time - self._last, _LONGEST_STEP)
+            self._last = frame.time
+            self._frames.append(frame)
+        if self._measuring is not None and self._measuring.done():
+            self._end_measuring(self._measuring, tracker)
+        if self._measuring is None and self._shown >= self._due and not self._is_done:
+            self._begin_measuring(tracker.user)
+        if not self._steps:
+            return False
+        user = self._steps.popleft()
+        tracker.resize(user, keep=len(self._steps) / (len(self._steps) + 1))
+        return True
+
+    def _begin_measuring(self, user: User) -> None:
+        """Measure the hands in the frames so far."""
+        self._is_brief, self._due = self._shown < _ENOUGH, max(_ENOUGH, _LATER * self._shown)
+        self._frames = sample_frames(self._frames)
+        self._processes = LocalProcesses(1)
+        self._measuring = self._processes.submit(_measure, self._setup.settings, self._frames, user)
+        self._processes.shutdown(wait=False)  # after this one
+
+    def _end_measuring(self, measuring: Future[_Measured], tracker: Tracker) -> None:
+        """Take over what was measured."""
+        self._measuring = None
+        try:
+            found = measuring.result()
+        except (HandSimError, BrokenProcessPool) as error:
+            found = _Measured(told=[str(error)])
+        for sentence in found.told:
+            warnings.warn(sentence, HandSimWarning, stacklevel=4)
+        if not found.users:
+            return
+        self._is_done = not self._is_brief
+        before, after = (one[0].shape.length for one in (tracker.user, found.users[-1]))
+        is_same = tracker.user.notes.startswith(MEASURED) and abs(after - before) < _SAME
+        if not (self._is_brief and is_same):
+            self._steps = deque(found.users)
+
+
+def _measure(settings: dict[str, Any], frames: Sequence[StreamedFrame], before: User) -> _Measured:
+    """Measure the hands in some frames, in a process that has nothing else to do."""
+    if hasattr(os, "nice"):
+        os.nice(_NICE)
+    setup = TrackerSetup.of(TrackSettings.from_json(settings))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", HandSimWarning)
+        after = setup.measured(frames, warns=False).user
+    told = [str(one.message) for one in caught if issubclass(one.category, HandSimWarning)]
+    if not after.notes.startswith(MEASURED):
+        return _Measured(told=told)
+    places = [np.concatenate([hand.attachment.points for hand in user]) for user in (before, after)]
+    farthest = float(np.linalg.norm(places[1] - places[0], axis=1).max())
+    count = max(_FEWEST_STEPS, int(np.ceil(farthest / _STEP)))
+    users = [_user_between(before, after, number / count) for number in range(1, count)]
+    return _Measured([*users, after], told)
+
+
+def _user_between(before: User, after: User, share: float) -> User:
+    """The measured user with hands at a share of the way to their size."""
+    hands = tuple(hand_between(*pair, share) for pair in zip(before, after, strict=True))
+    return dataclasses.replace(after, hands=hands)

@@ -1,0 +1,225 @@
+"""Faults of a tracked take that labels do not show: of its glove, and of which hand is which.
+
+A layout does not fit, a glove slips, a marker falls off, or a glove like its own mirror image leaves the side
+of a hand open. Each fault is a span of frames with the marker or the hand and the time in words.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Final, NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+from numpy.typing import NDArray
+
+from gloves.fit import GloveFit
+from gloves.takes.take import TRACKED, Take
+from handsim.hand.shape import BONES, JOINTS, Side
+from handsim.space.transforms import rigid_fit
+from track.kinematics.pose_solver import FEWEST_MARKERS, PoseSolver
+from train.labelers.matching import assign
+
+_FEWEST: Final = 60  # tracked frames of a hand that tell of faults
+_MOST_FRAMES: Final = 2000  # frames of a hand that are looked at
+_FARTHEST: Final = 0.02  # [m] offset of a marker from its place at which it is cut off
+_PART: Final = 60  # frames of a marker before a slip and after it, at least
+# A slip changes a marker's place for good; what flesh and posture do to it, by up to 3 mm, ends.
+_SLIP: Final = 0.0035  # [m] change of a marker's place that is told
+_SLIP_SHARE: Final = 0.55  # share of the variance of its offsets that the change explains
+_SMALL_SLIP: Final = 0.0008  # [m] the same where little else moves it: the pose takes most of a slip
+_SMALL_SHARE: Final = 0.85
+_SLIP_PART: Final = 1.9  # [s] before such a change and after it, at least
+_LEAST_VARIANCE: Final = 1e-8  # [m^2] noise of optical systems
+_OFTEN_MISSING: Final = 0.3  # share of the frames without a marker from which on it is looked for elsewhere
+_ELSEWHERE: Final = 0.028  # [m] from its place
+_MISPLACED: Final = 0.008  # [m] from its place, at least
+_STEADY: Final = 0.006  # [m] radius in which a point that belongs to a bone stays, in the bone's frame
+_OFTEN: Final = 0.5  # share of the frames without the marker in which it is there
+_TRIED: Final = 100  # points without a label that are tried as steady ones
+_LAST_GAP: Final = 1.9  # [s] without a marker at a take's end, and before that, at least
+_LONGER: Final = 3.0  # times its longest gap before; other markers have no longer one
+_SEEN: Final = 0.5  # share of the frames before in which it was seen
+AT_LIMIT: Final = 0.5
+"""Distance of an angle from the end of the joint's range at which the joint may have gone farther [deg]."""
+_OFTEN_AT_LIMIT: Final = 0.4  # share of the frames
+_SIDE_FRAMES: Final = 40  # frames in which a hand is compared with its mirror image
+_FITS: Final = 1.5  # times our RMS distance up to which the mirror image fits as well
+_FITS_WELL: Final = 0.0012  # [m] distance up to which it may be the hand in any case
+
+
+class SuspectSpan(NamedTuple):
+    """Frames that deserve a look."""
+
+    first: int
+    last: int
+    """The last one, which belongs to them."""
+    worst: int
+    """The one to look at."""
+    of: str
+    """The side of a hand, or the name of a label."""
+    why: str
+    """In words."""
+    remedy: str = ""
+    """What to do about a fault of the whole take; empty for a label that is in doubt."""
+    of_labels: bool = True
+    """Whether labels are in doubt in these frames, not the angles alone."""
+
+    @property
+    def words(self) -> str:
+        """Of what they are, and why."""
+        return f"{self.of} {self.why}"
+
+
+class _Hand(NamedTuple):
+    """A tracked hand of a take, in F of its frames."""
+
+    take: Take
+    side: Side
+    worn: GloveFit
+    frames: Int[np.ndarray, "F"]
+    offsets: Float[np.ndarray, "F M 3"]  # of the seen markers from their places, in their bones' frames [m]
+
+    def span(self, first: int, name: str, why: str, remedy: str, *, of_labels: bool = True) -> SuspectSpan:
+        """A fault of a marker, or of the whole hand without a name, from a frame to the end."""
+        of = f"{self.side}:{name}" if name else f"the {self.side} hand"
+        return SuspectSpan(first, self.take.num_frames - 1, first, of, why, remedy, of_labels)
+
+
+def find_faults(take: Take) -> tuple[SuspectSpan, ...]:
+    """The faults of a tracked take, each from the frame where it begins."""
+    found: list[SuspectSpan] = []
+    for number, side in enumerate(take.sides) if take.made_by_tracker else ():
+        frames = np.flatnonzero(take.status[:, number] == TRACKED)
+        if len(frames) < _FEWEST:
+            continue
+        some = frames[:: -(-len(frames) // _MOST_FRAMES)]
+        hand = _Hand(take, side, take.hands[number], some, take.marker_offsets(side, some))
+        for faults in (_unsure_side, _misplaced, _slips, _fallen, _at_limits):
+            found += faults(hand)
+    return tuple({one.of: one for one in reversed(found)}.values())[::-1]
+
+
+def _slips(hand: _Hand) -> Iterator[SuspectSpan]:
+    """The marker whose place changes most clearly at one time and stays changed."""
+    known = np.isfinite(hand.offsets[..., 0])
+    values = np.where(known[..., None], hand.offsets.clip(-_FARTHEST, _FARTHEST), 0.0)
+    before, sums = np.cumsum(known, axis=0), np.cumsum(values, axis=0)
+    total, whole = np.maximum(before[-1], 1), sums[-1]
+    after = before[-1] - before
+    early, late = sums / np.maximum(before, 1)[..., None], (whole - sums) / np.maximum(after, 1)[..., None]
+    steps = np.linalg.norm(late - early, axis=-1)
+    variance = np.square(values).sum(axis=(0, 2)) - np.square(whole).sum(axis=1) / total
+    share = before * after / total * steps**2 / np.maximum(variance, _LEAST_VARIANCE * total)
+    seconds = hand.take.times[hand.frames] - hand.take.times[hand.frames[0]]
+    is_long = np.minimum(seconds, seconds[-1] - seconds)[:, None] >= _SLIP_PART
+    is_clear = (steps > _SLIP) & (share > _SLIP_SHARE)
+    is_small = (steps > _SMALL_SLIP) & (share > _SMALL_SHARE) & is_long
+    share[~(is_clear | is_small) | (np.minimum(before, after) < _PART)] = 0.0
+    when, marker = np.unravel_index(int(share.argmax()), share.shape)
+    if share[when, marker] > 0.0:
+        frame, name = int(hand.frames[when]), hand.worn.layout.names[marker]
+        why = f"slips by {1e3 * steps[when, marker]:.1f} mm or more at {hand.take.times[frame]:.2f} s"
+        remedy = "track the frames before and after apart, each with a calibration of its own"
+        yield hand.span(frame, name, why, remedy, of_labels=False)
+
+
+def _fallen(hand: _Hand) -> Iterator[SuspectSpan]:
+    """Markers that were seen and are not seen any more from one time on, although the hand is."""
+    take = hand.take
+    seen = np.isfinite(take.observed(hand.side)[..., 0])
+    shown = take.is_tracked(hand.side)
+    gaps = [np.diff(np.flatnonzero(seen[:, marker])).max(initial=1) - 1 for marker in range(seen.shape[1])]
+    for name, row, longest in zip(hand.worn.layout.names, seen.T, gaps, strict=True):
+        if not row.any():
+            if shown.sum() >= _LAST_GAP * take.rate:
+                yield hand.span(0, name, "is never seen", "compare the layout with the glove")
+            continue
+        begin = take.num_frames - int(row[::-1].argmax())
+        gap = float(shown[begin:].sum()) / take.rate
+        least = max(_LAST_GAP, _LONGER * longest / take.rate, max(gaps) / take.rate)
+        is_usual = begin >= _LAST_GAP * take.rate and row[:begin][shown[:begin]].mean() >= _SEEN
+        if gap >= least and is_usual:
+            why = f"is not seen after {take.times[begin - 1]:.2f} s, for {gap:.1f} s to the end"
+            yield hand.span(begin, name, why, "look for the marker that fell off", of_labels=False)
+
+
+def _at_limits(hand: _Hand) -> Iterator[SuspectSpan]:
+    """Joints that are at the end of the model's range in many frames, and may have gone farther."""
+    angles = np.rad2deg(hand.take.qpos[hand.frames, hand.take.hand_index(hand.side), 7:])
+    for joint, values in zip(JOINTS, angles.T, strict=True):
+        for limit in (joint.low, joint.high):
+            there = np.abs(values - limit) < AT_LIMIT
+            if there.mean() > _OFTEN_AT_LIMIT:
+                first = int(hand.frames[there.argmax()])
+                share, start = 100 * there.mean(), hand.take.times[first]
+                why = f"is at the model's limit, {limit:g} deg, in {share:.0f} % of frames from {start:.2f} s"
+                remedy = "calibrate the hand, or do not use this angle"
+                yield hand.span(first, joint.name, why, remedy, of_labels=False)
+
+
+def _misplaced(hand: _Hand) -> Iterator[SuspectSpan]:
+    """Markers that are elsewhere on their bone than in the layout: a point without a label moves with it."""
+    take, worn = hand.take, hand.worn
+    missing = np.isnan(hand.offsets[..., 0])
+    bones = worn.model.forward_kinematics(take.qpos[hand.frames, take.hand_index(hand.side)])
+    places = worn.attachment.centers(worn.model, bones)
+    enough = max(_OFTEN_MISSING, _LAST_GAP * take.rate / take.num_frames)
+    for marker in np.flatnonzero(missing.mean(axis=0) > enough):
+        rows = np.flatnonzero(missing[:, marker])
+        poses = bones[rows, worn.attachment.main_bones[marker]]
+        found, owners = list[NDArray[np.float64]](), list[int]()
+        for row, pose in zip(rows, poses, strict=True):
+            part = take.point_list.of(int(hand.frames[row]))
+            free = take.point_list.points[part][take.point_list.labels[part] < 0]
+            off = (free - places[row, marker]) @ pose[:3, :3]
+            off = off[np.linalg.norm(off, axis=1) < _ELSEWHERE]
+            found.append(off)
+            owners += [int(row)] * len(off)
+        every, frames = np.concatenate(found), np.array(owners)
+        tried = every[:: max(1, len(every) // _TRIED)]
+        steady = [np.linalg.norm(every - one, axis=1) < _STEADY for one in tried]
+        if not steady:
+            continue
+        best = max(steady, key=lambda near: len(np.unique(frames[near])))
+        share, far = len(np.unique(frames[best])) / len(rows), np.linalg.norm(np.median(every[best], axis=0))
+        if share > _OFTEN and far > _MISPLACED:
+            first, name = int(hand.frames[rows[0]]), worn.layout.names[marker]
+            why = f"is {1e3 * far:.0f} mm from where the layout has it, from {take.times[first]:.2f} s on"
+            yield hand.span(first, name, why, "correct its place in the layout's file")
+
+
+def _unsure_side(hand: _Hand) -> Iterator[SuspectSpan]:
+    """A hand without a marker on its thumb, that a hand of the other side fits as well in motion."""
+    worn, take = hand.worn, hand.take
+    if any(BONES[bone].digit == 0 for bone in worn.attachment.main_bones):
+        return
+    frames = hand.frames[:: -(-len(hand.frames) // _SIDE_FRAMES)]
+    seen = take.point_list.labeled(take.hand_labels[take.hand_index(hand.side)], frames)
+    seen = seen[np.isfinite(seen[..., 0]).sum(axis=1) >= FEWEST_MARKERS]
+    if not len(seen):
+        return
+    other: Side = "left" if hand.side == "right" else "right"
+    ours = np.median(PoseSolver(worn).solve(seen).rms)
+    mirrored = worn.with_side(other)
+    theirs = min(
+        np.median(PoseSolver(mirrored).solve(seen[:, order]).rms) for order in _exchanges(worn, mirrored)
+    )
+    if theirs < max(_FITS * ours, _FITS_WELL):
+        why = f"may be the {other} one: that fits the points to {1e3 * theirs:.1f} mm, this {1e3 * ours:.1f}"
+        yield hand.span(0, "", why, "put a marker on the thumb, or name the hand (--hands)")
+
+
+def _exchanges(worn: GloveFit, mirrored: GloveFit) -> Iterator[Int[np.ndarray, "M"]]:
+    """Which of our markers each marker of the other hand would be: thumb side exchanged, or back and palm."""
+    ours, theirs = worn.attachment.points, mirrored.attachment.points
+    for turn in (np.eye(3), np.diag([1.0, -1.0, -1.0])):
+        moved = theirs @ turn
+        order = np.arange(len(ours))
+        for _ in range(5):
+            shift = ours.mean(axis=0) - moved.mean(axis=0)
+            costs = np.square(moved[:, None] + shift - ours).sum(axis=2)
+            _, order = assign(costs, np.full(len(ours), 1.0))
+            rotation, translation = rigid_fit(theirs, ours[order])
+            moved = theirs @ rotation.T + translation
+        yield order
