@@ -73,7 +73,7 @@ def all_gestures() -> Float[np.ndarray, "G 20"]:
     return gestures_of("gestures")
 
 
-# Couplings between joints, as of a relaxed hand. Sources (docs/anatomy.md): DIP follows PIP (two thirds on
+# Couplings between joints, as of a relaxed hand. Sources (docs/angles.md): DIP follows PIP (two thirds on
 # average; Lin, Wu and Huang 2000), abduction dies away as the MCP flexes (collateral ligaments tighten), and
 # neighbors share tendons, so that one finger's flexion drags the next.
 LOW: Final = np.deg2rad([joint.low for joint in JOINTS])
