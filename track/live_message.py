@@ -288,9 +288,7 @@ def document_format(
         lambda header: _divided(header_document(header, content), encode, largest),
         lambda message: _divided(frame_document(message, content), encode, largest),
         lambda: [encode({"type": "end", "schema": SCHEMA})],
-        lambda lag, dropped: encode(
-            {"type": "lag", "schema": SCHEMA, "lag": _known(lag), "dropped": dropped}
-        ),
+        lambda lag, count: encode({"type": "lag", "schema": SCHEMA, "lag": _known(lag), "dropped": count}),
         is_text=name == "json",
     )
 
