@@ -112,7 +112,7 @@ class LiveMessage:
     """A tracked frame as it is sent."""
 
     header: LiveHeader
-    """The same object in every message of a stream."""
+    """The same object in every message of a stream, until its hands have another size."""
     number: int
     """The frame's number; those of a stream may have gaps and may start again."""
     time: float
