@@ -33,9 +33,9 @@ def main() -> None:
                 tracked = tracker.step(frame.points, frame.ids, frame.time)
                 sinks.send(frame, tracked)
                 recorder.add(frame, tracked)
-        print(f"{load_take(Path(folder) / 'live.npz').num_frames} frames recorded")
-        counts = source.counts
-        print(f"frames missing: {counts['missing_frames']}, dropped: {counts['dropped_frames']}")
+        counts, recorded = source.counts, load_take(Path(folder) / "live.npz").num_frames
+        print(f"{recorded} of {counts['received_frames']} frames that came were recorded")
+        print(f"{counts['dropped_frames']} were not kept up with, {counts['missing_frames']} never came")
 
 
 if __name__ == "__main__":

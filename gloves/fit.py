@@ -396,6 +396,11 @@ class GloveFit:
     attachment: Attachment
     """The glove's markers on this hand."""
 
+    def __repr__(self) -> str:
+        """The hand's side and measures, and the glove's name."""
+        length, breadth = 1e3 * self.shape.length, 1e3 * self.shape.breadth
+        return f"GloveFit({self.side} hand of {length:.0f} x {breadth:.0f} mm in {self.layout.name})"
+
     @property
     def side(self) -> Side:
         """Which hand this is."""

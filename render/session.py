@@ -134,6 +134,13 @@ class Drawing:
     def __init__(self, subject: Subject, config: RenderConfig) -> None:
         if config.shutter is not None and not subject.is_motion:
             raise ArgumentError("poses without times have no motion to blur; add the array times")
+        for body in subject.take.bodies:
+            if body.shape is None and not len(body.positions):
+                told = (
+                    f"{body.name} has neither a surface nor markers and is not drawn; "
+                    "RigidBody.of gives a body the surface of its object"
+                )
+                warnings.warn(told, HandSimWarning, stacklevel=3)
         self.subject, self.config = subject.upright(config.up), config
         self.take, rng = self.subject.take, SpawnKey.VIEWPOINTS.rng(config.seed)
         # Poses that are no motion are many people's, except before one person's eyes.
@@ -142,11 +149,16 @@ class Drawing:
         self.viewpoints = Viewpoints(config.view, self.take, rng=rng, up=config.up, user=self._user)
         self._studio_of = functools.lru_cache(maxsize=_MOST_STUDIOS)(self._studio_of_person)
 
+    def frames_without_hands(self) -> list[int]:
+        """Numbers of the frames whose hands are all NaN."""
+        present = np.isfinite(self.take.qpos[..., 0]).any(axis=1)
+        return [int(number) for number in np.flatnonzero(~present)]
+
     def chosen_frames(self, frames: Iterable[int] | None = None) -> list[int]:
         """Numbers of the requested frames, checked; without a request those that have a hand."""
         if frames is None:
-            present = np.isfinite(self.take.qpos[..., 0]).any(axis=1)
-            found = [n for n in range(0, self.take.num_frames, self.config.every) if present[n]]
+            absent = set(self.frames_without_hands())
+            found = [n for n in range(0, self.take.num_frames, self.config.every) if n not in absent]
             most = len(found) if self.config.num_frames is None else self.config.num_frames
             return [found[n * len(found) // most] for n in range(most)] if most < len(found) else found
         check_type("frames", frames, Iterable, "numbers of frames")
@@ -344,6 +356,9 @@ def render_take(
     for one in cameras if not all(WRITERS[name].any_lens for name in formats) else ():
         centered_K(one)  # refuses other lenses before a folder is begun
     check_hands_in_view(config.view, drawing.viewpoints, drawing.take)
+    if absent := drawing.frames_without_hands():
+        told = f"frames without a hand are not drawn: {len(absent)} of {drawing.take.num_frames}"
+        warnings.warn(f"{told} (the first: {absent[0]})", HandSimWarning, stacklevel=2)
     shards, views = drawing.shards(), drawing.viewpoints.num_cameras
     make = functools.partial(_render_shard, kept, formats, config)
     record = _settings(drawing, kept) | {"formats": list(formats)}

@@ -348,13 +348,28 @@ def source_of(source: Take | str | Path | PoseFile | ArrayLike, *, seed: int = 0
     return PoseFile(path) if path.suffix.lower() == CSV else path
 
 
+def _holds_poses(path: Path) -> bool:
+    """Whether a file is one of `read_pose_file`, by the names of its arrays."""
+    try:
+        return bool({"qpos", "angles"} & set(_arrays(path)))
+    except HandSimError:
+        return False
+
+
 def load_subject(source: Source, *, seed: int) -> Subject:
     """Read what is drawn."""
     if isinstance(source, Subject):
         return source
     if isinstance(source, PoseFile):
         return _load_poses(source, seed)
-    take = load_take(source)
+    try:
+        take = load_take(source)
+    except HandSimError as error:
+        if not _holds_poses(source):
+            raise
+        raise CaptureError(
+            f"{source}: no take, but poses of your own; give them to --poses, or as a PoseFile"
+        ) from error
     try:
         return Subject(take, source.name)
     except ArgumentError as error:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import re
 from collections import defaultdict
 from pathlib import Path
@@ -19,6 +20,11 @@ LOADERS = {"handsim/cli/main.py", "handsim/_imports.py", "handsim/pages.py"}
 
 def relative(path: Path) -> str:
     return path.relative_to(ROOT).as_posix()
+
+
+@functools.cache
+def nodes_of(path: Path) -> list[ast.AST]:
+    return list(ast.walk(ast.parse(path.read_text("utf-8"))))
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +85,7 @@ def test_modules_are_named_by_strings_in_the_command_table_the_pages_and_the_doo
             continue
         strings = [
             node.value
-            for node in ast.walk(ast.parse(path.read_text("utf-8")))
+            for node in nodes_of(path)
             if isinstance(node, ast.Constant)
             and isinstance(node.value, str)
             and modules.match(node.value)
@@ -99,7 +105,7 @@ def test_one_type_holds_a_model_and_an_attachment():
 
 def classes():
     for path in SOURCES:
-        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+        for node in nodes_of(path):
             if isinstance(node, ast.ClassDef):
                 yield path, node
 
@@ -107,7 +113,7 @@ def classes():
 def test_a_bad_argument_is_never_control_flow():
     """A handler of `ArgumentError` adds words and raises again; it never goes on."""
     for path in SOURCES:
-        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+        for node in nodes_of(path):
             if (
                 isinstance(node, ast.ExceptHandler)
                 and node.type

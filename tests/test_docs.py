@@ -17,6 +17,9 @@ from train.labelers.protocol import LABELERS
 NUMBER = re.compile(r"-?\d+(?:\.\d+)?")
 SLOW = {
     "calibration",
+    "layouts",
+    "own_labelers",
+    "rigs",
     "cluster",
     "live_output",
     "rendering",

@@ -112,7 +112,7 @@ class LiveMessage:
     """A tracked frame as it is sent."""
 
     header: LiveHeader
-    """The same object in every message of a stream."""
+    """The same object in every message of a stream, until its hands have another size."""
     number: int
     """The frame's number; those of a stream may have gaps and may start again."""
     time: float
@@ -288,9 +288,7 @@ def document_format(
         lambda header: _divided(header_document(header, content), encode, largest),
         lambda message: _divided(frame_document(message, content), encode, largest),
         lambda: [encode({"type": "end", "schema": SCHEMA})],
-        lambda lag, dropped: encode(
-            {"type": "lag", "schema": SCHEMA, "lag": _known(lag), "dropped": dropped}
-        ),
+        lambda lag, count: encode({"type": "lag", "schema": SCHEMA, "lag": _known(lag), "dropped": count}),
         is_text=name == "json",
     )
 

@@ -35,7 +35,7 @@ _PAUSE: Final = 1.0  # [s] without a hand, after which hands may be another pers
 _SAME: Final = 0.006  # [m] by which lengths differ that one second shows of the same hands
 _STEP: Final = 0.002  # [m] by which the markers of a hand at rest move in a frame when its size changes
 _FEWEST_STEPS: Final = 4  # in which learned biases of markers are given up
-_NICE: Final = 10  # by which the tracker's process comes before the measuring one
+_NICE: Final = 5  # by which the tracker's process comes before the measuring one
 
 
 class _Measured(NamedTuple):

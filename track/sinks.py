@@ -15,7 +15,7 @@ import threading
 import time
 import warnings
 from collections import deque
-from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, suppress
 from types import SimpleNamespace
 from typing import Any, Final
@@ -47,11 +47,7 @@ from track.live_message import (
 from track.rigid_body import RigidTemplate
 from track.streams import split_address
 
-VALID: Final = (
-    *(f"{scheme}://host:port" for scheme in ("osc", "udp", "ws", "tcp")),
-    "lsl:NAME",
-    "module:name",
-)
+VALID: Final = (*(f"{one}://host:port" for one in ("osc", "udp", "ws", "tcp")), "lsl:NAME", "module:name")
 """What an address may be."""
 GROUP: Final = "handsim.sinks"
 """Entry points of packages that bring sinks."""
@@ -533,7 +529,7 @@ class WebSocketSink:
 
     async def _deliver(self, connection: Any, client: _Client) -> None:
         """Send a client the header, then message after message."""
-        unconfirmed: deque[tuple[float, Awaitable[float]]] = deque()  # when frames were sent, and their pongs
+        unconfirmed: deque[tuple[float, asyncio.Future[float]]] = deque()  # times of frames, and pongs
         told, is_text = -math.inf, self._format.is_text
         with suppress(self._closed_error, OSError):
             await client.woken.wait()
@@ -543,8 +539,9 @@ class WebSocketSink:
                 behind = 0.0
                 while unconfirmed and unconfirmed[0][0] < self._loop.time() - _UNCONFIRMED:
                     sent, pong = unconfirmed.popleft()
-                    await pong
-                    behind = max(behind, self._loop.time() - sent)
+                    if not pong.done():
+                        await pong
+                        behind = max(behind, self._loop.time() - sent)
                 await client.next()
                 laid_out, message = client.take()
                 now = self._loop.time()

@@ -27,9 +27,7 @@ _PART: Final = 60  # frames of a marker before a slip and after it, at least
 # A slip changes a marker's place for good; what flesh and posture do to it, by up to 3 mm, ends.
 _SLIP: Final = 0.0035  # [m] change of a marker's place that is told
 _SLIP_SHARE: Final = 0.55  # share of the variance of its offsets that the change explains
-_SMALL_SLIP: Final = (
-    0.0008  # [m] the same where the change is all that happens: the pose takes most of a slip
-)
+_SMALL_SLIP: Final = 0.0008  # [m] the same where little else moves it: the pose takes most of a slip
 _SMALL_SHARE: Final = 0.85
 _SLIP_PART: Final = 1.9  # [s] before such a change and after it, at least
 _LEAST_VARIANCE: Final = 1e-8  # [m^2] noise of optical systems

@@ -453,8 +453,8 @@ def _spans_section(take: Take, spans: Sequence[SuspectSpan], source: str) -> Sec
         look = f"frame {span.worst}, {worst} s"
         table.append([frames, start, end, span.of, span.why, look, f"{command} --time {worst}"])
     text = (
-        "Spans in which a label is probably wrong or a marker lacks its own, those with the most such frames "
-        "first; the percentage is the least confidence in a point. "
+        "Faults of the take, then spans in which a label is probably wrong or a marker lacks its own, those "
+        "with the most such frames first; the percentage is the least confidence in a point. "
         f"<code>{escape(command)}</code> lists the first of them too; a click leads there, "
         "and a wrong label can be corrected."
     )
@@ -463,7 +463,7 @@ def _spans_section(take: Take, spans: Sequence[SuspectSpan], source: str) -> Sec
     for share in _WANTED if take.made_by_tracker else ():
         looks = vouched.looks(share)
         if looks:
-            text += f" After a look at the first {looks} of them {100 * share:g} % of all frames are right."
+            text += f" After a look at the first {looks}, {100 * share:g} % of all frames should be right."
             break
     return Section("Doubtful frames", text, table=table, notes=[more] if len(spans) > _MOST_SPANS else [])
 

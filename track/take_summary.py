@@ -211,10 +211,9 @@ def vouch(take: Take, spans: Sequence[SuspectSpan] | None = None) -> Vouch:
     doubt = 1.0 - np.nan_to_num(frame_confidence(take), nan=1.0)
     listed, masses = np.zeros(take.num_frames, dtype=np.bool_), list[float]()
     for span in find_suspect_spans(take, most=None) if spans is None else spans:
-        if span.of_labels:
-            part = slice(span.first, span.last + 1)
-            masses.append(float(doubt[part][~listed[part]].sum()))
-            listed[part] = True
+        part = slice(span.first, span.last + 1 if span.of_labels else span.first)
+        masses.append(float(doubt[part][~listed[part]].sum()))
+        listed[part] = True
     few = take.hands[0].layout.num_markers < _VOUCH_MARKERS
     if few or listed.mean() > _VOUCH_LISTED or _unlabeled_share(take) > _VOUCH_UNLABELED:
         return Vouch(float(listed.mean()), 0.0, ())

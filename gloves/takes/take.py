@@ -74,7 +74,7 @@ from handsim.motion_files.motion import (
     write_openxr,
 )
 from handsim.motion_files.scenes import write_glb, write_usd
-from handsim.space.objects import RigidObject, named_object, object_names
+from handsim.space.objects import Part, RigidObject, named_object, object_names
 from handsim.space.transforms import UpAxis, file_axes
 
 
@@ -135,6 +135,7 @@ LOST, COASTING, INITIALIZED, TRACKED = Status
 RATED_FRAMES: Final = 100_000
 """Number of frames of a stream that its rate is measured on."""
 _MAX_LENGTH: Final = 1e9  # [m]
+_VERTICES, _FACES = "body_vertices_{}", "body_faces_{}"  # arrays of the surface of a body, by its number
 _MAX_TIME: Final = 1e12  # [s], and the largest rate [Hz]; clocks of computers count 2e9 s
 _QUATERNION_TOLERANCE: Final = 1e-2  # of the unit length; our own files have 1e-6
 _CHUNK: Final = 4096  # frames whose markers are filled in at once
@@ -155,6 +156,14 @@ class RigidBody:
     marker_names: tuple[str, ...]
     positions: Float[np.ndarray, "Q 3"]
     """Its markers in its own frame [m]."""
+    surface: RigidObject | None = None
+    """Its surface, if it is no object that comes with handsim."""
+
+    @classmethod
+    def of(cls, thing: RigidObject) -> RigidBody:
+        """The body of an object."""
+        shipped = thing.name in object_names() and thing is named_object(thing.name)
+        return cls(thing.name, thing.marker_names, thing.markers, None if shipped else thing)
 
     def __post_init__(self) -> None:
         if self.positions.shape != (len(self.marker_names), 3):
@@ -167,7 +176,9 @@ class RigidBody:
 
     @property
     def shape(self) -> RigidObject | None:
-        """Its surface if it is an object that comes with handsim, else None."""
+        """Its own surface, or that of the object of this name that comes with handsim, or None."""
+        if self.surface is not None:
+            return self.surface
         return named_object(self.name) if self.name in object_names() else None
 
 
@@ -859,7 +870,11 @@ def take_header(
         "layouts": [dataclasses.asdict(hand.layout) for hand in hands],
         "statuses": STATUSES,
         "keypoint_names": KEYPOINT_NAMES,
-        "bodies": [{"name": body.name, "marker_names": list(body.marker_names)} for body in bodies],
+        "bodies": [
+            {"name": body.name, "marker_names": list(body.marker_names)}
+            | ({} if body.surface is None else {"surface": True})
+            for body in bodies
+        ],
         "settings": settings,
     }
 
@@ -873,7 +888,28 @@ def worn_arrays(hands: Sequence[GloveFit], bodies: Sequence[RigidBody]) -> dict[
         parts = [getattr(hand.attachment, field) for hand in hands]
         arrays[column.name] = np.concatenate(parts).astype(column.dtype)
     markers = [np.zeros((0, 3)), *(body.positions for body in bodies)]
-    return arrays | {BODY_MARKERS.name: np.concatenate(markers)}
+    arrays[BODY_MARKERS.name] = np.concatenate(markers)
+    surfaces = {number: body.surface for number, body in enumerate(bodies) if body.surface is not None}
+    for number, thing in surfaces.items():
+        arrays[_VERTICES.format(number)] = thing.vertices
+        arrays[_FACES.format(number)] = thing.faces.astype(np.int64)
+    return arrays
+
+
+def _stored_body(
+    number: int, stored: Mapping[str, Any], positions: NDArray[Any], arrays: Mapping[str, NDArray[Any]]
+) -> RigidBody:
+    """A body of a file's header; `RigidObject` checks the arrays of its surface."""
+    name, marker_names = stored["name"], names_of(stored["marker_names"])
+    if not stored.get("surface", False):
+        return RigidBody(name, marker_names, positions)
+    vertices, faces = (arrays[key.format(number)] for key in (_VERTICES, _FACES))
+    hull = Part("mesh", np.zeros(3), np.eye(4), vertices)
+    upright = np.tile([0.0, 0.0, 1.0], (len(positions), 1))  # a file has no normals under markers
+    thing = RigidObject(
+        name, vertices, faces, (hull,), marker_names, positions, upright, 0.1, np.empty((0, 7))
+    )
+    return RigidBody(name, marker_names, positions, thing)
 
 
 def unpack_take(header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Take:
@@ -881,21 +917,21 @@ def unpack_take(header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Take
     if tuple(header["statuses"]) != STATUSES:
         raise ValueError("other statuses")
     layouts = [stored_layout(layout) for layout in header["layouts"]]
-    names = [(stored["name"], names_of(stored["marker_names"])) for stored in header["bodies"]]
-    counts = [layout.num_markers for layout in layouts], [len(markers) for _, markers in names]
+    named = header["bodies"]
+    counts = [layout.num_markers for layout in layouts], [len(one["marker_names"]) for one in named]
     if POINT_COUNTS.name not in arrays:  # until schema 3 points were tables
         tables = {column.name: arrays[column.name] for column in POINTS}
         listed, header["num_columns"] = PointList.of_tables(**tables).stored()
         arrays.update(listed)
-    sizes = {"T": len(arrays["times"]), "P": len(arrays["ids"]), "H": len(layouts), "B": len(names)}
+    sizes = {"T": len(arrays["times"]), "P": len(arrays["ids"]), "H": len(layouts), "B": len(named)}
     check_stored(arrays, sizes | {"M": sum(counts[0]), "Q": sum(counts[1])})
     hands = []
     for record, layout, span in zip(arrays["hands"], layouts, spans(counts[0]), strict=True):
         parts = (arrays[column.name][span.start : span.stop] for column in ATTACHMENT)
         hands.append(GloveFit(HandModel(unpack_hand(record)), Attachment(layout, *parts)))
     bodies = tuple(
-        RigidBody(*name, arrays[BODY_MARKERS.name][span.start : span.stop])
-        for name, span in zip(names, spans(counts[1]), strict=True)
+        _stored_body(number, one, arrays[BODY_MARKERS.name][span.start : span.stop], arrays)
+        for number, (one, span) in enumerate(zip(named, spans(counts[1]), strict=True))
     )
     counted, entries = arrays[POINT_COUNTS.name], {column.name: arrays[column.name] for column in POINTS}
     if header.get("num_columns") is None:  # a stream
@@ -940,6 +976,8 @@ def _check(take: Take) -> None:
         raise ValueError(f"points of {len(points.counts)} frames, expected {frames}")
     for body in take.bodies:
         _check_range(body.positions, -_MAX_LENGTH, _MAX_LENGTH)
+        if body.surface is not None:
+            _check_range(body.surface.vertices, -_MAX_LENGTH, _MAX_LENGTH)
     for distances in (take.rms, take.body_rms, take.angle_spread, take.keypoint_spread):
         if distances is not None:
             _check_range(distances, 0.0, _MAX_LENGTH)

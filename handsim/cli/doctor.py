@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes.util
-import itertools
 import os
 import re
 import shutil
@@ -114,7 +113,8 @@ def send_pointing_hand(address: str, ended: Callable[[], bool], tell: Callable[[
         content = Content(axes=asked.get("axes", WORLD), up=up, unit=asked.get("unit", "auto"))
         axes, hand = content.program or program_axes("ros", "z"), nominal_fit("dense19", "M", "right")
         sinks.start([hand], [])
-        for number in itertools.count():
+        number = 0
+        while not ended():
             along = number // _POINTING % 3
             pointing, back = axes.turn[along], axes.turn[(along + 1) % 3]
             turn = np.stack([pointing, np.cross(back, pointing), back], axis=1)[None]
@@ -125,13 +125,12 @@ def send_pointing_hand(address: str, ended: Callable[[], bool], tell: Callable[[
                 tip = axes.positions(hand_keypoints(hand.model, qpos)[0, KEYPOINT_NAMES.index("index_tip")])
                 place = " ".join(f"{value:.3f}" for value in tip)
                 tell(f"the index finger points along +{'xyz'[along]}, its tip is at {place} {axes.unit}")
-            if ended():
-                break
             nobody = np.empty((0, 3)), np.empty(0, dtype=np.int64)
             frame = StreamedFrame(number, number / _RATE, *nobody, arrived=time.monotonic())
             shown = TrackedHand("right", Status.TRACKED, qpos[0], np.nan, *nobody)
             sinks.send(frame, TrackedFrame(frame.time, (shown,), nobody[1], np.empty(0)))
             time.sleep(1.0 / _RATE)
+            number += 1
 
 
 def examine() -> list[Finding]:

@@ -133,7 +133,7 @@ def check_near(owner: str, camera: Camera) -> None:
     if distance > _MAX_DISTANCE:
         raise RigError(
             f"{owner} stands {distance:.4g} m from the origin, expected at most {_MAX_DISTANCE:g} m; "
-            "are these millimeters? Positions are in meters"
+            "are these millimeters? Positions and translations are in meters: divide them by 1,000"
         )
 
 

@@ -377,7 +377,7 @@ def _binary_image(data: bytes, at: int) -> tuple[int, str]:
     """The end of a record of an image, with its points, and its line."""
     values = struct.unpack_from("<i7di", data, at)
     end = data.index(b"\0", at + 64)
-    name = data[at + 64 : end].decode("utf-8", "replace")
+    name = " ".join(data[at + 64 : end].decode("utf-8", "replace").split())  # of one line
     (points,) = struct.unpack_from("<Q", data, end + 1)
     return end + 9 + 24 * points, " ".join(map(str, (*values, name)))
 

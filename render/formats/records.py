@@ -88,13 +88,25 @@ def hand_mask(frame: RenderedFrame, hand: int) -> Flags | None:
     return None
 
 
-def run_lengths(mask: Flags) -> list[int]:
-    """COCO's uncompressed run lengths of a mask (H, W): zeros and ones in turn, column by column."""
+def run_lengths(mask: Flags) -> str:
+    """COCO's compressed run lengths of a mask (H, W): zeros and ones in turn, column by column.
+
+    A run is its difference from the last but one, in pieces of five bits, the lowest first; a sixth bit says
+    that more follow, and 48 makes a letter of it.
+    """
     flat = cv2.transpose(mask.view(np.uint8)).ravel()
     changes = np.flatnonzero(flat[1:] != flat[:-1]) + 1
     ends = np.concatenate([[0], changes, [flat.size]])
-    counts: list[int] = np.diff(ends).tolist()
-    return [0, *counts] if flat[0] else counts
+    counts: list[int] = [0] * int(flat[0]) + np.diff(ends).tolist()
+    letters = bytearray()
+    for number, count in enumerate(counts):
+        rest = count - counts[number - 2] if number > 2 else count
+        more = True
+        while more:
+            piece, rest = rest & 31, rest >> 5
+            more = rest != (-1 if piece & 16 else 0)
+            letters.append(48 + piece + 32 * more)
+    return letters.decode("ascii")
 
 
 def by_side(frame: RenderedFrame) -> dict[Side, HandTruth]:

@@ -112,12 +112,13 @@ def cut_off(local: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> C
     """Triangles (in the camera's axes [m]) with those cut off that the plane `NEAR` crosses."""
     faces = np.ascontiguousarray(faces, dtype=np.int64)
     ahead = local[:, 2] >= NEAR
-    fronts = ahead[faces] if not ahead.all() else np.ones((len(faces), 3), dtype=np.bool_)
-    (crossed,) = np.nonzero(fronts.any(axis=1) & ~fronts.all(axis=1))
-    none = np.empty(0, dtype=np.int64)
+    crossed = none = np.empty(0, dtype=np.int64)
+    if not ahead.all():
+        first, second, third = ahead[faces.T]
+        crossed = np.flatnonzero((first | second | third) & ~(first & second & third))
     if not len(crossed):
         return CutOff(local, faces, none, none.reshape(0, 2), np.empty((0, 1)))
-    front = fronts[crossed]
+    front = ahead[faces[crossed]]
     one = front.sum(axis=1) == 1  # one corner is ahead, otherwise two are
     lone = np.where(one, front.argmax(axis=1), front.argmin(axis=1))
     around = faces[crossed[:, None], (lone[:, None] + np.arange(3)) % 3]

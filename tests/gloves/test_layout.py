@@ -259,12 +259,27 @@ def test_pinky_is_another_name_of_the_little_finger(tmp_path: Path) -> None:
 
 DENSE = (Path(gloves.layout.__file__).parent / "layouts" / "dense19.toml").read_text("utf-8")
 
+REMARKED = DENSE.replace("along = 0.32\naround = -40.0\n", "along = 0.32 # a third\naround = -40.0# side\n")
+STALKED = DENSE.replace("across = 0.225", "across = 0.225\nheight_mm = 12 # a stalk")
+ONE_SIDED = DENSE.replace("radius_mm", 'sides = ["left"] # the other hand wears none\nradius_mm')
 
-@pytest.mark.parametrize("text", [DENSE, starter_layout()])
+
+@pytest.mark.parametrize("text", [DENSE, starter_layout(), REMARKED, STALKED, ONE_SIDED])
 def test_a_layout_that_is_as_it_was_keeps_every_byte(text, tmp_path):
     path = tmp_path / "glove.toml"
     path.write_text(text)
     assert moved_text(text, load_layout(path)) == (text, True)
+
+
+def test_changes_keep_what_stands_behind_other_values(tmp_path):
+    layout = load_layout("dense19")
+    first = dataclasses.replace(layout.markers[0], along=0.5)
+    moved, kept = moved_text(REMARKED, dataclasses.replace(layout, markers=(first, *layout.markers[1:])))
+    assert kept and "along = 0.5 # a third\naround = -40.0# side\n" in moved
+    assert moved_text(STALKED, layout) == (DENSE, True), "a stalk that is taken away leaves no line"
+    both, kept = moved_text(ONE_SIDED, layout)
+    (tmp_path / "glove.toml").write_text(both)
+    assert not kept and load_layout(tmp_path / "glove.toml") == layout
 
 
 @settings(max_examples=60, deadline=None)
@@ -292,37 +307,6 @@ def test_a_moved_marker_is_read_where_it_went(tmp_path_factory, index, bone, alo
     assert (read[index].name, read[index].bone) == (marker.name, bone)
     for key in ("along", "around", "across", "height"):
         assert getattr(read[index], key) == pytest.approx(getattr(marker, key), abs=1e-8)
-
-
-def test_remarks_behind_values_stay(tmp_path):
-    text = DENSE.replace("along = 0.32\n", "along = 0.32 # a third\n").replace(
-        "around = -40.0\n", "around = -40.0# side\n"
-    )
-    layout = load_layout("dense19")
-    first = dataclasses.replace(layout.markers[0], along=0.5)
-    moved, kept = moved_text(text, dataclasses.replace(layout, markers=(first, *layout.markers[1:])))
-    assert kept and "along = 0.5 # a third\naround = -40.0# side\n" in moved
-
-
-def test_a_stalk_that_is_taken_away_leaves_no_line(tmp_path):
-    text = DENSE.replace("across = 0.225", "across = 0.225\nheight_mm = 12 # a stalk")
-    path = tmp_path / "glove.toml"
-    path.write_text(text)
-    layout = load_layout(path)
-    assert layout.markers[-1].height == pytest.approx(0.012)
-    assert moved_text(text, layout) == (text, True)
-    assert moved_text(text, load_layout("dense19")) == (DENSE, True)
-
-
-def test_sides_stay(tmp_path):
-    text = DENSE.replace("radius_mm", 'sides = ["left"] # the other hand wears none\nradius_mm')
-    path = tmp_path / "glove.toml"
-    path.write_text(text)
-    assert load_layout(path).sides == ("left",)
-    assert moved_text(text, load_layout(path)) == (text, True)
-    both, kept = moved_text(text, load_layout("dense19"))
-    path.write_text(both)
-    assert not kept and load_layout(path) == load_layout("dense19")
 
 
 def test_a_text_that_cannot_be_changed_line_by_line_is_written_anew(tmp_path):

@@ -195,11 +195,6 @@ def test_a_rolling_shutter_slants_a_moving_bar(exposure):
     assert picture[0].sum() == pytest.approx(20.0 * 3, rel=1e-4)
 
 
-def test_a_global_shutter_without_exposure_is_one_moment():
-    times, weights = shutter_times(0.0, 0.0, 1, 5)
-    assert times.tolist() == [0.0] and (weights == 1.0).all()
-
-
 def test_frames_may_come_one_by_one():
     times, weights = shutter_times(0.01, 0.01, 5, HEIGHT)
     frames = [bar(50.0 + 1000.0 * time) for time in times]

@@ -6,13 +6,15 @@ import numpy as np
 import pytest
 import trimesh
 
-from gloves import attach, load_layout
+from gloves import RigidBody, Take, attach, load_layout, load_take
 from handsim import Camera, HandModel, join_qpos, look_at
+from handsim.errors import HandSimWarning
 from handsim.hand.model import KEYPOINT_DIGITS, hand_keypoints, keypoint_thickness
 from handsim.hand.shape import DIGITS, PALM, bones_of
 from handsim.space.camera import pinhole
+from handsim.space.objects import load_object
 from poses import sample_poses
-from render import Pictures
+from render import Pictures, draw
 from render.frames import FOREARM
 from render.painting.figures import HandFigure, sample_people
 from render.painting.rasterizer import Triangles, join, rasterize
@@ -107,3 +109,40 @@ def test_what_is_in_front_of_a_hand_hides_all_of_it(figure):
     for away, rest in ((depths.min() - 0.001, 0), (depths.max() + 0.2, visible(bare).sum())):
         pictures = rasterize(camera, join([surface, plate(camera, away)]), with_normals=False)
         assert visible(pictures).sum() == rest
+
+
+def test_an_object_of_ones_own_is_drawn_where_embree_finds_it(tmp_path):
+    profile = [(0.0, 0.0), (0.035, 0.0), (0.035, 0.12), (0.012, 0.16), (0.012, 0.2), (0.0, 0.2)]
+    trimesh.creation.revolve(profile, sections=32).export(tmp_path / "bottle.obj")
+    bottle = load_object(tmp_path / "bottle.obj")
+    fit, poses = (
+        attach(load_layout("dense19"), HandModel.named("M")),
+        np.tile([0, 0, 0, 1.0, 0, 0, 0], (1, 1, 1)),
+    )
+    poses[..., :3] = 0.08, 0.12, -0.05
+    qpos = join_qpos(np.zeros((1, 20)))[:, None]
+    take = Take.of_poses([fit], qpos, rate=60.0, bodies=[RigidBody.of(bottle)], body_poses=poses)
+    take.save(tmp_path / "take.npz")
+    for one in (take, load_take(tmp_path / "take.npz")):
+        camera = CAMERA.at(look_at(np.array([0.5, 0.6, 0.3]), np.array([0.08, 0.06, 0.03])))
+        (frame,) = draw(one, camera=camera, background="plain", painter="compiled", depth_sensor=None)
+        mesh = trimesh.Trimesh(bottle.vertices + poses[0, 0, :3], bottle.faces, process=False)
+        rays = camera.rays().reshape(-1, 3)
+        eyes = np.tile(camera.T_world_camera[:3, 3], (len(rays), 1))
+        distance, _ = cast(mesh, eyes, rays @ camera.T_world_camera[:3, :3].T)
+        depth = (distance * rays[:, 2]).reshape(480, 640)
+        theirs, mine = np.isfinite(depth) & (frame.ids != 1), frame.ids == 2
+        assert theirs.sum() > 5000 and (theirs & mine).sum() >= 0.995 * (theirs | mine).sum()
+        assert np.quantile(np.abs(frame.depth - depth)[theirs & mine], 0.99) < 1e-5
+        assert np.median(np.abs(frame.rgb[mine].astype(int) - frame.rgb[0, 0]).max(axis=1)) > 5
+        assert [body.name for body in frame.bodies] == ["bottle.obj"]
+
+
+def test_a_body_that_nothing_is_known_of_is_told(figure):
+    poses = np.tile([0, 0, 0, 1.0, 0, 0, 0], (1, 1, 1))
+    body = RigidBody("bottle.obj", (), np.empty((0, 3)))
+    take = Take.of_poses(
+        [figure.fit], join_qpos(np.zeros((1, 20)))[:, None], rate=60.0, bodies=[body], body_poses=poses
+    )
+    with pytest.warns(HandSimWarning, match="bottle.obj has neither a surface nor markers and is not drawn"):
+        next(draw(take, passes=("ids",)))

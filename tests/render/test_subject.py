@@ -125,18 +125,6 @@ def test_a_table_of_an_exported_take_is_drawn_as_its_poses(tmp_path, qpos):
     np.testing.assert_allclose(right.take.qpos[:, 0], qpos + np.eye(27)[0] * 0.2, atol=1e-8)
 
 
-def test_a_table_is_drawn_by_its_name(tmp_path, qpos, cameras):
-    Take.of_poses([attach("dense19", HandModel.named("M"))], qpos[:, None], rate=1.0).export(
-        tmp_path / "p.csv"
-    )
-    line = ["render", str(tmp_path / "p.csv"), "--cameras", str(cameras), "--format", "png", "--workers", "1"]
-    assert main([*line, "--passes", "depth", "--out", str(tmp_path / "out")]) == 0
-    records = [json.loads(path.read_text()) for path in sorted((tmp_path / "out").rglob("left_*.json"))]
-    assert len(records) == len(qpos)
-    for record, pose in zip(records, qpos, strict=True):
-        np.testing.assert_allclose(record["hands"][0]["qpos"], pose, atol=1e-8)
-
-
 def test_a_table_without_poses_is_told(tmp_path):
     (tmp_path / "table.csv").write_text("frame,time_s,hand,x\n0,0,right,1\n")
     with pytest.raises(HandSimError, match=r"no column 'wrist_x_m'; of a \.csv are read frame, time_s, hand"):
@@ -253,8 +241,19 @@ def test_arguments(tmp_path):
         PoseFile(tmp_path, ("both",))
     with pytest.raises(ArgumentError, match="hands are right right"):
         PoseFile(tmp_path, ("right", "right"))
-    with pytest.raises(ArgumentError, match="leave out the placement"):
-        ViewConfig(cameras="c.toml", views=2)
     path = saved(tmp_path, qpos=BASE, person=[0, 1])
     with pytest.raises(CaptureError, match="leave out --people"):
         load_poses(PoseFile(path, people=3))
+
+
+def test_poses_that_are_given_as_a_take_are_told(tmp_path, qpos):
+    np.savez(tmp_path / "poses.npz", qpos=qpos)
+    with pytest.raises(CaptureError, match="no take, but poses of your own; give them to --poses"):
+        load_subject(source_of(tmp_path / "poses.npz"), seed=0)
+
+
+def test_frames_without_a_hand_are_counted(tmp_path, qpos):
+    lost = qpos[:3].copy()
+    lost[1] = np.nan
+    with pytest.warns(HandSimWarning, match=r"frames without a hand are not drawn: 1 of 3 \(the first: 1\)"):
+        assert render_take(lost, tmp_path / "pictures", "png", passes=("ids",), workers=1) == 2

@@ -10,7 +10,7 @@ import pytest
 from gloves import Take
 from gloves.takes.take import LOST
 from handsim import HandSimWarning, look_at
-from handsim.errors import ArgumentError, RigError
+from handsim.errors import RigError
 from handsim.hand.model import hand_keypoints
 from handsim.space.camera import pinhole
 from handsim.space.transforms import quaternion_matrix
@@ -72,19 +72,6 @@ def test_a_lost_hand_is_aimed_at_where_it_was_between(take):
     assert np.linalg.norm(centers[25] - Framing(take).centers[25]) < 0.1
 
 
-@pytest.mark.parametrize(
-    ("wrong", "said"),
-    [
-        ({"placement": "nowhere"}, "placement"),
-        ({"views": 0}, "views is 0"),
-        ({"distance": (0.8, 0.5)}, "distance"),
-    ],
-)
-def test_what_is_no_view_is_refused(wrong, said):
-    with pytest.raises(ArgumentError, match=said):
-        ViewConfig(**wrong)
-
-
 def test_cameras_must_look_at_the_hands():
     take = subject_of_poses(np.zeros((3, 20)), model="M").take
     eye = np.array([0.0, -0.6, 0.0])
@@ -102,7 +89,7 @@ def test_cameras_must_look_at_the_hands():
         check(blind)
 
 
-FRAMES, STEP = 480, 8
+FRAMES, STEP = 480, 16
 WHOLE, SIDE = 0.95, 0.30  # of pictures with all hands; a hand's longer side, of the height
 APART = ("single-hand", "calibration", "free")  # kinds of takes with hands half a meter from each other
 LEAST = {"rig": 0.2, "orbit": 0.25}  # of those, where cameras cannot stay where both are large

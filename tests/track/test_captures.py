@@ -26,7 +26,7 @@ from track import (
 from track.recorder import TakeRecorder
 from train import evaluate_labeler, load_labeler, simulate_take
 
-FRAMES, RATE = 120, 120.0
+FRAMES, RATE = 60, 120.0
 
 
 def capture_of(frames):

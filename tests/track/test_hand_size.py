@@ -57,7 +57,7 @@ def test_the_search_for_a_length_tries_what_scipys_bounded_search_tries(kinks):
         assert found == expected.x and ours == scipys
 
 
-@pytest.mark.parametrize("length", [0.135, 0.15, 0.175, 0.2, 0.215])
+@pytest.mark.parametrize("length", [0.135, 0.175, 0.215])
 def test_lengths_from_children_to_the_longest_are_found(length):
     shape = shape_from_measures(length, usual_breadth(length))
     found = fit_size(frames_of([shape], seed=1), load_layout("dense19"), ["right"], load_labeler("dense19"))
@@ -164,7 +164,7 @@ def test_measured_hands_are_found_in_most_frames_or_in_some_that_fit_well(share,
     assert _is_found(fit, shown, ("right",), load_labeler("dense19")) is is_found
 
 
-FRAMES = 90
+FRAMES = 60
 
 
 @pytest.fixture(scope="module")

@@ -77,7 +77,8 @@ def test_the_command_tells_of_a_wrong_glove(truth, tmp_path, capsys):
     names = tuple(f"*{column}" for column in range(truth.points.shape[1]))
     write_capture(tmp_path / "take.c3d", Capture(names, truth.points, truth.rate))
     out = str(tmp_path / "take.npz")
-    assert main(["track", str(tmp_path / "take.c3d"), "--glove", "sparse13", "--out", out]) == 0
+    options = ["--glove", "sparse13", "--size", "M", "--out", out]
+    assert main(["track", str(tmp_path / "take.c3d"), *options]) == 0
     told = [line for line in capsys.readouterr().err.splitlines() if "warning" in line]
     assert told and all(line.startswith("handsim track: warning: ") for line in told)
     assert any(" of the points at the hands are not markers of what was tracked" in line for line in told)

@@ -364,7 +364,7 @@ def pack_take(
         ids,
         truth,
         rate=scene.rate,
-        bodies=() if thing is None else (RigidBody(thing.name, thing.marker_names, thing.markers),),
+        bodies=() if thing is None else (RigidBody.of(thing),),
         body_poses=None if held is None else transform_poses(held.motion.T_world_body)[:, None],
         settings=settings,
     )

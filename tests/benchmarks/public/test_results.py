@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import io
 import re
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from benchmarks.public.answers import Answers, BenchmarkError, save_answers
 from benchmarks.public.manifest import label_names
@@ -52,25 +49,6 @@ def test_a_table_gives_the_labels(capture, truth, tmp_path):
     frame, column = np.argwhere(np.isfinite(capture.positions[..., 0]) & (truth.labels < 0))[0]
     path.write_text(f"{excel}\r\n{frame + 1},{capture.names[column]},none\r\n", encoding="utf-8")
     np.testing.assert_array_equal(read_result(path, capture, LABELS).labels, truth.labels)
-
-
-@settings(max_examples=25, deadline=None)
-@given(data=st.data())
-def test_any_table_that_is_written_is_read(data):
-    frames, columns = data.draw(st.integers(1, 4)), data.draw(st.integers(1, 6))
-    points = np.full((frames, columns, 3), 0.1)
-    points[np.array(data.draw(st.lists(st.booleans(), min_size=frames * columns, max_size=frames * columns)))
-           .reshape(frames, columns)] = np.nan  # fmt: skip
-    capture = Capture(tuple(f"P{number}" for number in range(columns)), points, 120.0)
-    labels = np.full((frames, columns), -1)
-    for frame in range(frames):
-        order = data.draw(st.permutations(range(len(LABELS))))
-        there = np.isfinite(points[frame, :, 0])
-        labels[frame, there] = np.array(order[:columns])[there]
-    with io.BytesIO(table(capture, labels).encode()) as file:
-        from benchmarks.public.results import _labels_of_table
-
-        np.testing.assert_array_equal(_labels_of_table(file.getvalue(), capture, LABELS), labels)
 
 
 @pytest.mark.parametrize("ending", [".trc", ".c3d", ".csv"])

@@ -56,12 +56,6 @@ def test_every_ending_is_written_and_tells_what_is_missing(folder, ending, tmp_p
     assert out.stat().st_size > 1000 and [path.name for path in out.parent.iterdir()] == [out.name]
 
 
-def test_truth_of_a_simulated_take_has_its_pen(folder):
-    motion = load_take(folder / "take.truth.npz").poses_alone()
-    assert [body.name for body in motion.bodies] == ["pen"] and motion.bodies[0].shape is not None
-    assert motion.sides == ("right", "left") and np.isfinite(motion.qpos).all()
-
-
 @pytest.mark.parametrize("up", ["y", "z"])
 def test_trc_holds_the_keypoints_with_y_up_and_no_gap(folder, up, tmp_path, capsys):
     out = tmp_path / "joints.trc"

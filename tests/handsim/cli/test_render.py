@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-import dataclasses
-from pathlib import Path
-
 import numpy as np
 import pytest
 import tyro
 
-from handsim import HandSimError
-from handsim.cli import render as command
 from handsim.cli.parsing import registry
 from handsim.cli.render import RenderOptions
-from render import Backgrounds, DepthSensor, RenderConfig, ViewConfig
+from render import DepthSensor, RenderConfig
 from render.painting.figures import sample_people
 from render.skin.look import TONES
 
@@ -24,34 +19,6 @@ def parsed(*words: str) -> RenderConfig:
 
 def test_no_option_gives_the_default_configuration() -> None:
     assert parsed() == RenderConfig()
-
-
-def test_every_option_of_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
-    given = []
-
-    def stub(take, out, formats, config, **rest):
-        given.append((take, out, formats, config, rest["workers"]))
-        return 0
-
-    monkeypatch.setattr(command, "render_take", stub)
-    line = (
-        "take.npz --out pics --format coco png --passes rgb depth --placement rig --camera sr300 "
-        "--rig eight --dress glove --tones dark brown --background room plain "
-        "--vary frame --depth-sensor none --no-color-sensor --motion-blur --painter opengl --every 3 "
-        "--frames-per-shard 5 --seed 7 --workers 1"
-    )
-    tyro.cli(command.render, args=line.split(), registry=registry())
-    take, out, formats, config, workers = given[0]
-    assert (take, out, formats, workers) == (Path("take.npz"), Path("pics"), ("coco", "png"), 1)
-    assert dataclasses.astuple(config.view) == ("rig", "sr300", 1, 1 / 3, None, "eight", None)
-    assert (config.passes, config.dress, config.tones) == (("rgb", "depth"), "glove", (-52.0, 10.0))
-    assert config.background == Backgrounds({"plain": 1, "room": 1})
-    assert (config.vary, config.painter, config.seed) == ("frame", "opengl", 7)
-    assert (config.every, config.frames_per_shard) == (3, 5)
-    assert config.depth_sensor is None and config.color_sensor is None
-    assert config.shutter is not None
-    assert parsed("--views", "2", "--share", "0.4").view == ViewConfig(views=2, share=0.4)
-    assert parsed("--distance", "0.5", "0.6").view == ViewConfig(distance=(0.5, 0.6))
 
 
 @pytest.mark.parametrize(
@@ -88,21 +55,6 @@ def test_photographs_alone_are_the_only_background() -> None:
     config = parsed("--photos", "folder")
     assert config.background.photos == "folder"
     assert [*config.background.shares.values()] == [0.0, 0.0, 0.0, 0.0, 0.0, 1.0]
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (("--tones", "green"), "unknown skin tone 'green'"),
-        (("--depth-sensor", "auto", "d435"), "unknown depth sensor 'auto'"),
-        (("--depth-sensor", "sonar"), "unknown depth sensor 'sonar'"),
-        (("--passes", "heat"), "unknown pass 'heat'"),
-        (("--every", "0"), "every is 0"),
-    ],
-)
-def test_wrong_options_are_told(words: tuple[str, ...], message: str) -> None:
-    with pytest.raises(HandSimError, match=message):
-        parsed(*words)
 
 
 def test_depth_alone_never_looks_for_hardware(monkeypatch: pytest.MonkeyPatch) -> None:

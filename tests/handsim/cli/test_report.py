@@ -21,9 +21,8 @@ def folder(tmp_path_factory):
     return folder
 
 
-@pytest.mark.parametrize("name", ["tracked.npz", "take.truth.npz"])
-def test_a_page_and_its_tables_are_written(folder, name, tmp_path, capsys):
-    out = tmp_path / "new" / "page.html"
+def test_a_page_and_its_tables_are_written(folder, tmp_path, capsys):
+    name, out = "tracked.npz", tmp_path / "new" / "page.html"
     assert main(["report", str(folder / name), "--out", str(out)]) == 0
     said = capsys.readouterr().out
     assert said.startswith(f"{out}: page on {folder / name}; tables in ") and said.count("\n") == 1
@@ -34,4 +33,4 @@ def test_a_page_and_its_tables_are_written(folder, name, tmp_path, capsys):
         assert len(list(csv.DictReader(file))) == 2 * FRAMES
     page = out.read_text(encoding="utf-8")
     assert f"<h1>Take {name}</h1>" in page and "Right hand: joint angles" in page
-    assert ("mean hands of size M" in page) == (name == "tracked.npz")
+    assert "mean hands of size M" in page

@@ -10,7 +10,6 @@ import pytest
 from benchmarks.held_out import held_out_markers
 from gloves import Capture, load_layout, load_take, read_capture, write_capture
 from handsim.cli.main import main
-from train.simulation.scenes import KINDS
 
 FRAMES = 60
 
@@ -64,15 +63,6 @@ def test_the_optics_are_options_of_the_command(tmp_path):
     truth = load_take(out.with_suffix(".truth.npz"))
     assert truth.settings["room"]["optics"]["blob_loss"] == 0.9
     assert truth.markers_present().mean() < 0.8
-
-
-def test_an_unknown_kind_is_a_usage_error(tmp_path, capsys):
-    with pytest.raises(SystemExit) as caught:
-        main(["simulate", "--kind", "hand-foot", "--out", str(tmp_path / "take.c3d")])
-    assert caught.value.code == 2
-    said = capsys.readouterr().err
-    assert all(kind in said for kind in KINDS)
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_take_is_evaluated_with_its_own_gaps_and_ghosts(taken, tmp_path, capsys):

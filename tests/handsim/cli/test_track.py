@@ -444,7 +444,7 @@ def recording(capture, out):
             process.wait()
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_a_recording_while_frames_arrive(number, capture, tmp_path):
     with recording(capture, tmp_path / "live.npz") as (process, there):
         process.send_signal(number)

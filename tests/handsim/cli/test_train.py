@@ -79,23 +79,22 @@ def test_distances_of_matching_are_positive(dataset, tmp_path, capsys, option):
     assert f"{option[6:]} is 0, expected a number above 0" in capsys.readouterr().err
 
 
-PRESET, OPTIMIZER = ["--preset", "han2018"], ["--optimizer", "adamw"]
-
-
-@pytest.mark.parametrize("options", [PRESET + OPTIMIZER, OPTIMIZER + PRESET])
-def test_an_option_beside_a_preset_holds_although_it_is_the_usual_default(config_of, options):
-    config = config_of(*options)
-    assert config.optimizer == "adamw" == TrainSettings().optimizer
-    assert config.learning_rate == 0.6 and config.labeler == "cnn"
-
-
-def test_every_usual_default_holds_when_given(config_of):
-    usual = TrainSettings()
+def test_every_usual_default_holds_when_given_before_or_behind_a_preset(config_of):
+    usual, preset = TrainSettings(), ["--preset", "han2018"]
     options = [
         f"--{name.replace('_', '-')}={getattr(usual, name)}"
-        for name in ("labeler", "samples", "learning_rate", "schedule", "weight_decay", "average")
+        for name in (
+            "labeler",
+            "samples",
+            "learning_rate",
+            "schedule",
+            "weight_decay",
+            "average",
+            "optimizer",
+        )
     ]
-    config = config_of("--preset", "han2018", *options)
+    config = config_of(*preset, *options)
+    assert config == config_of(*options, *preset) and config.optimizer == usual.optimizer
     assert config.samples == usual.samples and config.average == usual.average and config.labeler == "set"
     assert config.jitter == usual_settings(preset="han2018").jitter
 

@@ -91,16 +91,6 @@ def test_touching_hands_are_cut_apart(initializer, states):
     assert right >= 36
 
 
-def test_labels_count_among_the_points_that_were_given_and_no_point_twice(initializer, states):
-    points, _ = shuffled(markers(states, 0), 10, np.random.default_rng(5))
-    found = initializer.initialize(points, (0, 1))
-    taken = np.array([hand.labels >= 0 for hand in found])
-    assert taken.sum(axis=0).max() == 1
-    for hand in found:
-        own = hand.labels[hand.labels >= 0]
-        assert len(hand.labels) == len(points) and len(set(own.tolist())) == len(own)
-
-
 def test_a_hand_needs_nearly_half_of_its_markers(initializer, states):
     cloud = markers(states, 1)[0]
     assert len(initializer.initialize(cloud[::2], (0,))) <= 1

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -49,62 +51,60 @@ def exchanged(points, labels, positions) -> tuple[list[int], np.ndarray]:
     return np.flatnonzero(frame.labels != labels).tolist(), frame.labels
 
 
-@pytest.fixture(scope="module")
-def hand() -> GloveFit:
-    return nominal_fit(load_layout("dense19"), "M", "right")
+@dataclasses.dataclass(frozen=True, repr=False)
+class Motion:
+    """A hand that moves, and its markers."""
+
+    hand: GloveFit
+    qpos: np.ndarray
+    markers: np.ndarray
+
+    def followed(self, frames: int) -> tuple[HandState, Prediction]:
+        """The hand after some frames in which all of its markers were seen, and its prediction."""
+        state = HandState(self.hand)
+        state.initialize(self.qpos[0], self.markers[0], 0.0)
+        for frame in range(1, frames):
+            prediction = state.predict(frame / RATE)
+            estimate = state.fit(self.markers[frame], prediction.qpos, prediction)
+            state.update(estimate, np.ones(state.num_markers, dtype=bool), frame / RATE)
+        return state, state.predict(frames / RATE)
 
 
 @pytest.fixture(scope="module")
-def motion(hand) -> np.ndarray:
-    qpos = sample_motion(hand.model, 2.0, rng=np.random.default_rng(3)).qpos
-    return join_qpos(qpos[:, 7:], position=np.tile([0.1, 0.2, 1.0], (len(qpos), 1)))
-
-
-@pytest.fixture(scope="module")
-def markers(hand, motion) -> np.ndarray:
-    return hand.attachment.centers(hand.model, hand.model.forward_kinematics(motion))
-
-
-def followed(
-    hand: GloveFit, motion: np.ndarray, markers: np.ndarray, frames: int
-) -> tuple[HandState, Prediction]:
-    """A hand that was followed for some frames, all of its markers being seen, and its prediction."""
-    state = HandState(hand)
-    state.initialize(motion[0], markers[0], 0.0)
-    for frame in range(1, frames):
-        prediction = state.predict(frame / RATE)
-        estimate = state.fit(markers[frame], prediction.qpos, prediction)
-        state.update(estimate, np.ones(state.num_markers, dtype=bool), frame / RATE)
-    return state, state.predict(frames / RATE)
+def motion() -> Motion:
+    hand = nominal_fit(load_layout("dense19"), "M", "right")
+    angles = sample_motion(hand.model, 2.0, rng=np.random.default_rng(3)).qpos[:, 7:]
+    qpos = join_qpos(angles, position=np.tile([0.1, 0.2, 1.0], (len(angles), 1)))
+    return Motion(hand, qpos, hand.markers(qpos)[0])
 
 
 @pytest.mark.parametrize("frames", [1, 20, 150])
-def test_right_labels_stay_and_give_the_pose(hand, motion, markers, frames):
-    state, prediction = followed(hand, motion, markers, frames)
+def test_right_labels_stay_and_give_the_pose(motion, frames):
+    state, prediction = motion.followed(frames)
     labels = np.arange(19)
-    labels = gated(state, markers[frames], labels, prediction)
-    labels, estimate = fitted(state, markers[frames], labels, prediction)
+    labels = gated(state, motion.markers[frames], labels, prediction)
+    labels, estimate = fitted(state, motion.markers[frames], labels, prediction)
     np.testing.assert_array_equal(labels, np.arange(19))
     assert estimate.rms < 1e-4
-    np.testing.assert_allclose(estimate.positions, markers[frames], atol=1e-3)
+    np.testing.assert_allclose(estimate.positions, motion.markers[frames], atol=1e-3)
 
 
 @settings(deadline=None, max_examples=40)
 @given(st.integers(0, 18), st.integers(0, 500), st.floats(0.025, 0.2), st.sampled_from([1, 20]))
-def test_a_label_far_from_its_predicted_marker_is_dropped(hand, motion, markers, wrong, seed, off, frames):
-    state, prediction = followed(hand, motion, markers, frames)
+def test_a_label_far_from_its_predicted_marker_is_dropped(motion, wrong, seed, off, frames):
+    state, prediction = motion.followed(frames)
     way = np.random.default_rng(seed).normal(size=3)
-    points, labels = markers[frames].copy(), np.arange(19)
+    points, labels = motion.markers[frames].copy(), np.arange(19)
     points[wrong] += off * way / np.linalg.norm(way)
     labels = gated(state, points, labels, prediction)
     assert np.flatnonzero(labels < 0).tolist() == [wrong]
     assert np.flatnonzero(labels != np.arange(19)).tolist() == [wrong]
 
 
-def test_a_hand_that_is_elsewhere_keeps_its_labels(hand, motion, markers):
+def test_a_hand_that_is_elsewhere_keeps_its_labels(motion):
     """Then the prediction is wrong."""
-    state, prediction = followed(hand, motion, markers, 20)
-    labels, points = np.arange(19), markers[20] + [0.05, 0.0, 0.0]
+    state, prediction = motion.followed(20)
+    labels, points = np.arange(19), motion.markers[20] + [0.05, 0.0, 0.0]
     labels = gated(state, points, labels, prediction)
     np.testing.assert_array_equal(labels, np.arange(19))
     labels, estimate = fitted(state, points, labels, prediction)
@@ -112,19 +112,19 @@ def test_a_hand_that_is_elsewhere_keeps_its_labels(hand, motion, markers):
     np.testing.assert_allclose(estimate.positions, points, atol=1e-3)
 
 
-def test_few_labels_may_be_dropped_at_once(hand, motion, markers):
-    state, prediction = followed(hand, motion, markers, 20)
+def test_few_labels_may_be_dropped_at_once(motion):
+    state, prediction = motion.followed(20)
     for many, gone in ((5, 5), (6, 0)):  # of 19 labels, at most 30 %
-        labels, points = np.arange(19), markers[20].copy()
+        labels, points = np.arange(19), motion.markers[20].copy()
         points[:many] += [0.0, 0.0, 0.06]
         labels = gated(state, points, labels, prediction)
         assert (labels < 0).sum() == gone
 
 
-def test_the_gate_is_as_wide_as_the_whole_hand_is_off(hand, motion, markers):
+def test_the_gate_is_as_wide_as_the_whole_hand_is_off(motion):
     """A hand that speeds up is no reason to drop labels."""
-    state, prediction = followed(hand, motion, markers, 20)
-    points = markers[20] + [0.012, 0.0, 0.0]
+    state, prediction = motion.followed(20)
+    points = motion.markers[20] + [0.012, 0.0, 0.0]
     points[[4, 5, 6]] += [0.02, 0.0, 0.0]  # and a finger with it
     labels = np.arange(19)
     labels = gated(state, points, labels, prediction)
@@ -136,11 +136,9 @@ def test_the_gate_is_as_wide_as_the_whole_hand_is_off(hand, motion, markers):
 
 @pytest.mark.parametrize("moved", [0.0, 0.02])
 @pytest.mark.parametrize("pair", [(3, 6), (6, 9), (9, 12), (5, 8), (0, 1)])
-def test_exchanged_labels_are_exchanged_back_also_while_the_hand_speeds_up(
-    hand, motion, markers, pair, moved
-):
-    _, prediction = followed(hand, motion, markers, 20)
-    points = markers[20] + [0.0, moved, 0.0]
+def test_exchanged_labels_are_exchanged_back_also_while_the_hand_speeds_up(motion, pair, moved):
+    _, prediction = motion.followed(20)
+    points = motion.markers[20] + [0.0, moved, 0.0]
     assigned = np.arange(19)
     assert exchanged(points, assigned, prediction.positions)[0] == []
     near = np.linalg.norm(points[pair[0]] - points[pair[1]]) < EXCHANGE_DISTANCE
@@ -151,10 +149,10 @@ def test_exchanged_labels_are_exchanged_back_also_while_the_hand_speeds_up(
         np.testing.assert_array_equal(labels, np.arange(19))
 
 
-def test_exchanges_need_two_labels(hand, motion, markers):
-    _, prediction = followed(hand, motion, markers, 20)
+def test_exchanges_need_two_labels(motion):
+    _, prediction = motion.followed(20)
     for assigned in (np.full(19, -1), np.where(np.arange(19) == 3, 3, -1)):
-        assert exchanged(markers[20], assigned, prediction.positions)[0] == []
+        assert exchanged(motion.markers[20], assigned, prediction.positions)[0] == []
 
 
 def planted(points: np.ndarray, wrong: int, off: float, seed: int) -> np.ndarray:
@@ -166,54 +164,54 @@ def planted(points: np.ndarray, wrong: int, off: float, seed: int) -> np.ndarray
 
 @settings(deadline=None, max_examples=40)
 @given(st.sampled_from([0, 4, 7, 10, 13, 16, 17, 18]), st.integers(0, 500), st.floats(0.03, 0.1))
-def test_a_planted_wrong_label_is_dropped_and_the_right_ones_stay(hand, motion, markers, wrong, seed, off):
+def test_a_planted_wrong_label_is_dropped_and_the_right_ones_stay(motion, wrong, seed, off):
     """On the palm and at the knuckles, where no bent finger explains it."""
-    state, prediction = followed(hand, motion, markers, 20)
+    state, prediction = motion.followed(20)
     labels = np.arange(19)
-    labels, estimate = fitted(state, planted(markers[20], wrong, off, seed), labels, prediction)
+    labels, estimate = fitted(state, planted(motion.markers[20], wrong, off, seed), labels, prediction)
     assert np.flatnonzero(labels < 0).tolist() == [wrong]
-    np.testing.assert_allclose(estimate.positions, markers[20], atol=0.004)
+    np.testing.assert_allclose(estimate.positions, motion.markers[20], atol=0.004)
 
 
-def test_a_wrong_label_on_a_finger_seldom_drops_others(hand, motion, markers):
+def test_a_wrong_label_on_a_finger_seldom_drops_others(motion):
     """The worst goes first: where a bent finger explains the wrong one, that may be a right one."""
-    state, prediction = followed(hand, motion, markers, 20)
+    state, prediction = motion.followed(20)
     found = []
     for number, wrong in enumerate([*range(1, 16)] * 20):
         labels = np.arange(19)
-        points = planted(markers[20], wrong, (0.03, 0.05, 0.09)[number % 3], number)
+        points = planted(motion.markers[20], wrong, (0.03, 0.05, 0.09)[number % 3], number)
         labels, _ = fitted(state, points, labels, prediction)
         found.append(np.flatnonzero(labels < 0).tolist() == [wrong])
     assert np.mean(found) >= 0.95
 
 
 @pytest.mark.parametrize("pair", [(3, 6), (6, 9), (9, 12), (5, 8), (0, 17)])
-def test_of_two_swapped_labels_both_are_dropped(hand, motion, markers, pair):
-    state, prediction = followed(hand, motion, markers, 20)
+def test_of_two_swapped_labels_both_are_dropped(motion, pair):
+    state, prediction = motion.followed(20)
     labels = np.arange(19)
     labels[list(pair)] = pair[::-1]
-    labels, estimate = fitted(state, markers[20], labels, prediction)
+    labels, estimate = fitted(state, motion.markers[20], labels, prediction)
     assert set(np.flatnonzero(labels < 0)) == set(pair)
-    np.testing.assert_allclose(estimate.positions, markers[20], atol=0.004)
+    np.testing.assert_allclose(estimate.positions, motion.markers[20], atol=0.004)
 
 
-def test_without_labels_the_pose_is_the_predicted_one(hand, motion, markers):
-    state, prediction = followed(hand, motion, markers, 20)
+def test_without_labels_the_pose_is_the_predicted_one(motion):
+    state, prediction = motion.followed(20)
     labels = np.full(19, -1)
-    labels, estimate = fitted(state, markers[20], labels, prediction)
+    labels, estimate = fitted(state, motion.markers[20], labels, prediction)
     assert np.isnan(estimate.rms) and (labels == -1).all()
     np.testing.assert_array_equal(estimate.qpos[:7], prediction.qpos[:7])
     np.testing.assert_allclose(estimate.qpos[7:], prediction.joint_prior.angles, atol=1e-9)
     assert gated(state, np.zeros((0, 3)), np.zeros(0, dtype=int), prediction).shape == (0,)
 
 
-def test_with_a_sure_prediction_most_labels_being_wrong_is_told_by_one_fit(hand, motion, markers):
-    state, prediction = followed(hand, motion, markers, 20)
+def test_with_a_sure_prediction_most_labels_being_wrong_is_told_by_one_fit(motion):
+    state, prediction = motion.followed(20)
     shuffled = np.roll(np.arange(19), 5)
-    frame, estimate = fit_labels(frame_of(markers[20], shuffled), 0, state, prediction, is_sure=True)
+    frame, estimate = fit_labels(frame_of(motion.markers[20], shuffled), 0, state, prediction, is_sure=True)
     assert np.isnan(estimate.rms)
     np.testing.assert_array_equal(frame.labels, shuffled)
-    one_off = planted(markers[20], 6, 0.1, 0)
+    one_off = planted(motion.markers[20], 6, 0.1, 0)
     sure = fit_labels(frame_of(one_off, np.arange(19)), 0, state, prediction, is_sure=True)
     assert sure[0].labels[6] == -1 and sure[1].rms < 0.001
 

@@ -59,15 +59,6 @@ def test_markers_sit_where_the_glove_has_them_and_their_jacobian_is_the_numpy_on
     np.testing.assert_allclose(work.jacobian, true_jacobian(model, glove, angles), atol=1e-13)
 
 
-def test_the_jacobian_of_an_earlier_pose_is_overwritten(posed, rng):
-    model, glove, _, hand, work = posed
-    angles = rng.uniform(*model.skeleton.ranges.T)
-    compute_markers(hand, angles, work)
-    for marker in range(len(hand.bones)):
-        marker_jacobian(hand, marker, work)
-    np.testing.assert_allclose(work.jacobian, true_jacobian(model, glove, angles), atol=1e-13)
-
-
 def test_the_normal_matrix_is_accumulated_completely(posed, rng):
     model, glove, angles, hand, work = posed
     weights = rng.uniform(0.5, 2.0, size=len(glove.points))

@@ -142,21 +142,6 @@ def test_measuring_and_calibration_make_them_narrower_and_noise_wider(rng):
         assert (narrow < middle).all()
 
 
-def test_coupled_joints_without_a_marker_are_known_as_their_neighbor_tells():
-    """Without a marker beyond the middle bone the DIP follows the PIP with the prior's width."""
-    fit, doubt = nominal_fit("dense19", "M", "right"), 0.0005
-    digits = hand_arrays(fit).digits
-    qpos = np.zeros((1, 27))
-    qpos[:, 3] = 1.0
-    unseen = np.zeros((1, 19))
-    tip = fit.layout.names.index("IndexTip") if "IndexTip" in fit.layout.names else None
-    unseen[0, [tip] if tip is not None else np.flatnonzero(digits == 1)[-1:]] = np.inf
-    prior = resting_prior()
-    angles, _ = spreads_of(fit, known_hand(digits, doubt), qpos, unseen, prior.precision)
-    conditional = np.sqrt(1.0 / prior.precision[7, 7])
-    assert conditional * 0.5 < angles[0, 7] < prior.spread[7]
-
-
 SEEDS = st.integers(0, 1000)
 SPANS = st.floats(0.0, 5.0)
 LEAST = np.deg2rad(0.5) ** 2 * np.eye(20)
@@ -234,15 +219,6 @@ def nothing_seen():
     seen = MarkerPrediction(*map(np.empty, shapes))
     seen.information_matrix[:], seen.information_vector[:] = 0.0, 0.0
     return seen
-
-
-@pytest.mark.parametrize("digit", range(5))
-def test_with_nothing_seen_a_digit_has_its_prior(digit):
-    prior = predict_joints(*draw_prior(3), 0.4)
-    mine = slice(4 * digit, 4 * digit + 4)
-    angles, precision = conditioned(prior, nothing_seen(), digit)
-    np.testing.assert_allclose(angles, prior.angles[mine])
-    np.testing.assert_allclose(precision @ prior.covariance[mine, mine], np.eye(4), atol=1e-8)
 
 
 @settings(deadline=None)

@@ -477,22 +477,3 @@ def test_what_is_legitimate_is_read_without_a_word(tmp_path):
             setattr(trc, name, value)
         capture, told = trc.read()
         assert capture.num_frames == FRAMES and told == []
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_a_bad_network_loses_no_frame_that_arrived(seed):
-    """A fifth of the frames is lost, a tenth doubled, and each five are shuffled."""
-    rng, count = np.random.default_rng(seed), 20_000
-    sent = np.concatenate([rng.permutation(np.arange(at, at + 5)) for at in range(0, count, 5)])
-    packets = [
-        (number, number / RATE, slot / RATE)
-        for slot, number in enumerate(sent.tolist())
-        if rng.random() > 0.2
-        for _ in range(1 + (rng.random() < 0.1))
-    ]
-    order, arrived = FrameOrder(), sorted({number for number, _, _ in packets})
-    assert numbers_of(order, packets) == arrived
-    assert order.doubled == len(packets) - len(arrived)
-    assert order.missed == arrived[-1] - arrived[0] + 1 - len(arrived)
-    assert (order.late, order.wild, order.restarts) == (0, 0, 0)
-    assert order.passed - order.reordered > 0 < order.reordered

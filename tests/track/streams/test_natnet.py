@@ -170,20 +170,6 @@ def test_every_cut_is_noticed(sized):
 
 
 @settings(max_examples=300)
-@given(st.binary(max_size=400), st.sampled_from(VERSIONS))
-def test_random_bytes_are_read_or_refused(payload, version):
-    for read in (
-        lambda: parse_frame(payload, version),
-        lambda: parse_server_info(payload),
-        lambda: unpack(payload),
-    ):
-        try:
-            read()
-        except DamagedPacket:
-            pass
-
-
-@settings(max_examples=300)
 @given(st.data(), st.booleans())
 def test_damaged_bytes_are_read_or_refused(data, sized):
     payload = bytearray(

@@ -78,14 +78,6 @@ def test_best_of_ten_spreads_best(rng):
         np.testing.assert_array_equal(view, candidates[np.argmax(spreads)])
 
 
-def test_a_line_is_seen_from_the_side():
-    points = np.zeros((20, 5, 3))
-    points[..., 0] = np.linspace(-0.1, 0.1, 5)
-    views = spread_views(points, everything(points), rng=np.random.default_rng(7))
-    candidates = quaternion_matrix(random_quaternions(10, rng=np.random.default_rng(7)))
-    np.testing.assert_allclose(np.abs(views[:, 2, 0]), np.abs(candidates[:, 2, 0]).min())
-
-
 def test_principal_axes_make_the_covariance_diagonal(hands):
     axes = principal_axes(hands, everything(hands))
     assert_orthogonal(axes)
@@ -246,16 +238,6 @@ def test_every_bright_pixel_is_a_point(seed):
         half = 0.5 / 26 + 1e-6
         assert (np.abs(found) <= [half, half, 1e-4]).all(axis=-1).any(axis=1).all()
         assert len(rows) <= present[index].sum()
-
-
-def test_rows_are_y_columns_are_x_and_depth_is_z():
-    points = np.array([[[0.1, 0.0, 0.0], [-0.1, 0.0, 0.1], [0.0, 0.05, 0.05], [0.0, -0.05, 0.05]]])
-    image = depth_images(points, everything(points), STRAIGHT)[0][0]
-    assert np.isclose(image[26, 46], 0.1)
-    assert np.isclose(image[26, 5], 1.0)
-    assert np.isclose(image[36, 26], 0.55)
-    assert np.isclose(image[15, 26], 0.55)
-    assert np.count_nonzero(image) == 4
 
 
 @pytest.mark.parametrize("order", [[0, 1, 2, 3], [1, 0, 3, 2]])

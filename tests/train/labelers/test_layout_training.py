@@ -67,17 +67,16 @@ def test_batches_hold_layouts_of_one_size_and_their_clouds(small_bank):
 
 
 def test_a_run_that_was_stopped_goes_on_as_if_it_was_not(small_bank, tmp_path):
-    drawn = [LayoutBatches(small_bank, np.random.default_rng(number)).draw() for number in range(4)]
+    drawn = [LayoutBatches(small_bank, np.random.default_rng(number)).draw() for number in range(2)]
     whole, first = LayoutTraining(100, SMALL), LayoutTraining(100, SMALL)
     losses = [whole.step(*batch)[0] for batch in drawn]
-    for batch in drawn[:2]:
-        first.step(*batch)
+    first.step(*drawn[0])
     first.save(tmp_path / "checkpoint.pt")
     torch.manual_seed(9)
     second = LayoutTraining(100, SMALL)
     second.restore(tmp_path / "checkpoint.pt")
-    assert [second.step(*batch)[0] for batch in drawn[2:]] == pytest.approx(losses[2:], rel=1e-5)
-    assert second.done == 4
+    assert second.step(*drawn[1])[0] == pytest.approx(losses[1], rel=1e-5)
+    assert second.done == 2
 
 
 def test_the_loss_falls(small_bank):

@@ -408,11 +408,3 @@ def test_real_people_are_labeled(sig18, corruption, least, rng):
     markers = read_markers([files[number] for number in chosen], labeler.marker_names)
     frames = markers[rng.choice(len(markers), size=min(2000, len(markers)), replace=False)]
     assert evaluate_labeler(labeler, frames, corruption, rng=rng).figures["slot_accuracy"] >= least
-
-
-def test_damaged_weights_are_told(tmp_path):
-    folder = resources.files("train").joinpath("weights")
-    (tmp_path / "labeler.json").write_bytes(folder.joinpath("dense19.json").read_bytes())
-    (tmp_path / "labeler.safetensors").write_bytes(folder.joinpath("dense19.safetensors").read_bytes()[:-100])
-    with pytest.raises(WeightsError, match=r"labeler\.safetensors is damaged or not a labeler's"):
-        load_labeler(tmp_path)

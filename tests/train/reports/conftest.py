@@ -17,6 +17,15 @@ def pages_without_pictures() -> None:
     """Here they have them."""
 
 
+@pytest.fixture
+def without_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pages that are not looked at have a small picture in each place: to draw takes seconds."""
+    for page in ("run_page", "dataset_page", "hand_plot"):
+        monkeypatch.setattr(
+            f"train.reports.{page}.picture", lambda *drawn: "data:image/svg+xml;base64,PHN2Zy8+"
+        )
+
+
 @pytest.fixture(scope="session")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     out = tmp_path_factory.mktemp("sets") / "small"

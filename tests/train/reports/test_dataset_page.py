@@ -64,7 +64,7 @@ def test_nearest_neighbors(rows):
     np.testing.assert_allclose(apart, np.tile(expected, (300, 1)), rtol=1e-6)
 
 
-def test_a_take_with_gaps_is_drawn_beside_the_published_figures(dataset, tmp_path):
+def test_a_take_with_gaps_is_drawn_beside_the_published_figures(dataset, tmp_path, without_pictures):
     present = np.ones((1000, 2), bool)
     present[100:103, 0] = present[200:240, 1] = present[:7, 1] = False
     section = report.gap_section(present, 240.0)
@@ -111,7 +111,7 @@ def test_the_page_shows_the_sets_figures_and_is_the_same_every_time(dataset, tmp
     assert sorted(path.name for path in tmp_path.iterdir()) == ["one.html", "two.html"]
 
 
-def test_a_rig_of_ones_own_is_named_in_a_word(tmp_path):
+def test_a_rig_of_ones_own_is_named_in_a_word(tmp_path, without_pictures):
     rig = CameraRig("garage", load_rig("figure5").cameras[:9])
     made = generate_dataset(tmp_path / "set", num_frames=20, frames_per_hand=20, rig=rig, workers=1)
     text = report.write_dataset_page(tmp_path / "page.html", made).read_text("utf-8")
@@ -119,7 +119,7 @@ def test_a_rig_of_ones_own_is_named_in_a_word(tmp_path):
     assert lead == "20 frames of glove dense19 before the 9 cameras of rig garage, seed 0."
 
 
-def test_generate_leaves_a_report_that_is_no_part_of_the_set(tmp_path, capsys):
+def test_generate_leaves_a_report_that_is_no_part_of_the_set(tmp_path, capsys, without_pictures):
     out = tmp_path / "set"
     command = ["generate", "--num-frames", "1", "--ghosts.stray-rate", "0", "--ghosts.mirror-rate", "0"]
     command += ["--out", str(out), "--workers", "1"]

@@ -61,12 +61,6 @@ def run(dataset, tmp_path_factory):
     return out, train_labeler(dataset, out, SMALL)
 
 
-@pytest.fixture
-def without_pictures(monkeypatch):
-    for page in ("run_page", "hand_plot"):
-        monkeypatch.setattr(f"train.reports.{page}.picture", lambda *drawn: "data:,")
-
-
 def test_what_takes_long_beside_the_samples_is_named(dataset, tmp_path, without_pictures):
     told = []
     train_labeler(dataset, tmp_path / "run", dataclasses.replace(SMALL, samples=256), on_step=told.append)
@@ -174,7 +168,7 @@ def test_looking_at_held_out_frames_leaves_the_training_alone(
         assert torch.equal(values, other["network"][name])
 
 
-def test_checkpoints_without_a_history_go_on(dataset, run, tmp_path):
+def test_checkpoints_without_a_history_go_on(dataset, run, tmp_path, without_pictures):
     path = shutil.copytree(run[0], tmp_path / "run") / CHECKPOINT
     content = torch.load(path, weights_only=True)
     del content["history"]
@@ -221,11 +215,12 @@ def test_any_glove_and_either_network_have_a_page(tmp_path, rng, count):
     assert "<b>" not in text and "<i>" not in text
     assert len([ElementTree.fromstring(picture) for picture in pictures(page)]) == 4
     assert text.count("<td>&lt;b&gt;$") > 0
-    first = page.read_bytes()
-    assert write_run_page(tmp_path, card, history, report).read_bytes() == first
+    if count == FEWEST_MARKERS:
+        first = page.read_bytes()
+        assert write_run_page(tmp_path, card, history, report).read_bytes() == first
 
 
-def test_a_labeler_without_mistakes_has_a_page(tmp_path, rng):
+def test_a_labeler_without_mistakes_has_a_page(tmp_path, rng, without_pictures):
     card, report = made_up(19, rng, perfect=True)
     page = write_run_page(tmp_path, card, History([(256, 0.1, 0.6)], [(256, 0.1, 1.0)]), report)
     assert "No marker was taken for another" in page.read_text("utf-8")
