@@ -379,6 +379,8 @@ _MARGIN: Final = (0.8, 2.2)  # range of the distance between the outermost camer
 _FREE: Final = 0.5  # distance of furniture from the box around hands and cameras [m]
 _TEXTURE: Final = 512  # width and height of a wall's picture [px]
 _TO_WALL: Final = 0.95  # share of the way to a wall at which a room's lamp is
+_STRIP: Final = 2**14  # pixels of a picture that `remap` fills at once; it takes at most 32767 rows
+_SHARP: Final = 0.3  # blur that is not drawn [px]
 _SHORTEST: Final = 1e-6  # least component of a ray, so that it meets a wall along each axis
 
 
@@ -398,18 +400,31 @@ class Surroundings:
 
     rgb: UInt8[np.ndarray, "H W 3"]  # sRGB; 0 where the lens sees nothing
     depth: Float32[np.ndarray, "H W"]  # along the camera's axis [m]; 0 for what is not ahead
-    axes: Int8[np.ndarray, "H W"]  # axis of the world that the surface's normal has
-    signs: Int8[np.ndarray, "H W"]  # whether it points along that axis (1) or against it (-1)
+    walls: Int8[np.ndarray, "H W"]
+    """Where surfaces face: against the world's axis `walls // 2` where odd, else along it."""
 
     def put_behind(self, pictures: Geometry, camera: Camera) -> Geometry:
         """Pictures of hands and objects with depth and normals added behind them."""
-        bare = (pictures.instances == 0) & (self.depth > 0.0)
-        normals = pictures.normals
-        if normals is not None:
-            normals, rotation = normals.copy(), camera.T_world_camera[:3, :3].astype(np.float32)
-            facing = np.concatenate([-rotation, rotation]).take(self.axes + 3 * (self.signs > 0), axis=0)
-            np.copyto(normals, facing, where=bare[..., None])
-        return pictures._replace(depth=np.where(bare, self.depth, pictures.depth), normals=normals)
+        depth, rotation = pictures.depth.copy(), camera.T_world_camera[:3, :3].astype(np.float32)
+        facing = np.stack([rotation, -rotation], axis=1).reshape(6, 3)
+        normals = (
+            np.empty((*depth.shape, 0), np.float32) if pictures.normals is None else pictures.normals.copy()
+        )
+        _put_behind(pictures.instances, self.depth, self.walls, facing, depth, normals)
+        return pictures._replace(depth=depth, normals=None if pictures.normals is None else normals)
+
+
+@kernel
+def _put_behind(
+    instances: Bytes, behind: Floats, walls: NDArray[np.int8], facing: Floats, depth: Floats, normals: Floats
+) -> None:
+    """Write depth (H, W) and normals (H, W, 3 or 0) of the walls where there is no instance."""
+    for row in range(depth.shape[0]):
+        for column in range(depth.shape[1]):
+            if instances[row, column] == 0 and behind[row, column] > 0.0:
+                depth[row, column] = behind[row, column]
+                for axis in range(normals.shape[2]):
+                    normals[row, column, axis] = facing[walls[row, column], axis]
 
 
 def enclose(
@@ -433,18 +448,32 @@ def light_in(
     background: Background, enclosure: Enclosure, directions: Float[np.ndarray, "D 3"]
 ) -> Float[np.ndarray, "D 3"]:
     """Linear light that comes to the middle of the free box from these directions."""
-    met = _meet(background, enclosure, np.mean(enclosure.free, axis=0), directions)
-    return np.asarray(np.clip(met.light, 0.0, 1.0))
+    rays, eye = _sloping(directions.astype(np.float32)), np.mean(enclosure.free, axis=0)
+    if background.kind == "room":
+        return np.asarray(np.clip(_in_room(background, enclosure, eye, rays).light, 0.0, 1.0))
+    return (_at_walls(background, enclosure, eye, rays)[0] / np.float32(255.0)) ** np.float32(_GAMMA)
 
 
-def _meet(background: Background, enclosure: Enclosure, eye: Doubles, rays: NDArray[Any]) -> RoomLight:
-    """What rays (N, 3) from an eye in the world [m] meet in the box."""
-    rays, low, high = _sloping(rays), np.array(enclosure.low), np.array(enclosure.high)
-    if background.kind != "room":
-        return _meet_walls(rays, eye - low, high - low, _wall_pictures(background, enclosure))
+def _in_room(background: Background, enclosure: Enclosure, eye: Doubles, rays: Floats) -> RoomLight:
+    """What rays (N, 3) from an eye in the world [m] meet in a room with furniture."""
+    low = np.array(enclosure.low)
     free, lamp = np.array(enclosure.free) - low, np.array(enclosure.lamp) - low
     rng = np.random.default_rng([background.seed, 1])
-    return cast_room(rays.astype(np.float32, copy=False), eye - low, high - low, free, lamp, rng=rng)
+    return cast_room(rays, eye - low, np.array(enclosure.high) - low, free, lamp, rng=rng)
+
+
+def _at_walls(
+    background: Background, enclosure: Enclosure, eye: Doubles, rays: Floats
+) -> tuple[Bytes, Floats, NDArray[np.int8]]:
+    """Colors (N, 3) in sRGB, distances (N,) [m] and walls (N,) that rays (N, 3) meet in an empty room."""
+    distances, places = np.empty(len(rays), np.float32), np.empty((len(rays), 1, 2), np.float32)
+    walls, low = np.empty(len(rays), np.int8), np.array(enclosure.low)
+    room = (np.array(enclosure.high) - low).astype(np.float32)
+    _find_walls(rays, (eye - low).astype(np.float32), room, distances, walls, places[:, 0])
+    pictures = _wall_pictures(background, enclosure)
+    parts = np.split(places, range(_STRIP, len(rays), _STRIP))
+    colors = [cv2.remap(pictures, part, None, cv2.INTER_LINEAR)[:, 0] for part in parts]
+    return np.concatenate(colors), distances, walls
 
 
 def _corner(point: Doubles) -> Corner:
@@ -469,18 +498,26 @@ def _drawn(
 ) -> Surroundings:
     T_world_camera, (rays, known) = np.frombuffer(pose).reshape(4, 4), _rays(size, focal, lens)
     world = rays @ T_world_camera[:3, :3].T.astype(np.float32)
-    met, shape = _meet(background, enclosure, T_world_camera[:3, 3], world), size[::-1]
-    light = np.clip(met.light, 0.0, 1.0).reshape(*shape, 3)
+    world, eye, shape = _sloping(world), T_world_camera[:3, 3], size[::-1]
+    sigma = background.blur * shape[0]
+    if background.kind == "room":
+        met = _in_room(background, enclosure, eye, world)
+        light = np.clip(met.light, 0.0, 1.0).reshape(*shape, 3)
+        if sigma > _SHARP:
+            light = cv2.GaussianBlur(light, (0, 0), sigma)
+        light = cv2.pow(light, 1.0 / _GAMMA)
+        rgb = np.rint(np.multiply(light, np.float32(255.0), out=light), out=light).astype(np.uint8)
+        distances, flat = met.distances, np.arange(0, 3 * len(world), 3) + met.axes
+        walls = 2 * met.axes + (world.ravel().take(flat) > 0.0)
+    else:
+        colors, distances, walls = _at_walls(background, enclosure, eye, world)
+        rgb = colors.reshape(*shape, 3)
+        if sigma > _SHARP:
+            rgb = cv2.GaussianBlur(rgb, (0, 0), sigma)
+    depth = np.maximum(distances * rays[:, 2], np.float32(0.0)).reshape(shape)
     if not known.all():
-        light *= known[..., None]
-    if background.blur * shape[0] > 0.3:
-        light = cv2.GaussianBlur(light, (0, 0), background.blur * shape[0])
-    light = cv2.pow(light, 1.0 / _GAMMA)
-    rgb = np.rint(np.multiply(light, np.float32(255.0), out=light), out=light).astype(np.uint8)
-    depth = np.where(known, np.maximum(met.distances * rays[:, 2], 0.0).reshape(shape), np.float32(0.0))
-    flat = np.arange(0, 3 * len(world), 3) + met.axes
-    signs = np.where(world.ravel().take(flat) > 0.0, np.int8(-1), np.int8(1)).reshape(shape)
-    return Surroundings(rgb, depth, met.axes.reshape(shape), signs)
+        rgb[~known], depth[~known] = 0, 0.0
+    return Surroundings(rgb, depth, walls.reshape(shape).astype(np.int8, copy=False))
 
 
 @functools.lru_cache(maxsize=4)
@@ -492,59 +529,47 @@ def _rays(size: tuple[int, int], focal: tuple[float, ...], lens: Lens) -> tuple[
 
 
 @functools.lru_cache(maxsize=2)
-def _wall_pictures(background: Background, enclosure: Enclosure) -> Float32[np.ndarray, "R S 3"]:
-    """Linear pictures of the six walls, one below the other; photographs are of one folder."""
+def _wall_pictures(background: Background, enclosure: Enclosure) -> UInt8[np.ndarray, "R S 3"]:
+    """Pictures of the six walls in sRGB, one below the other; photographs are of one folder."""
     walls = [
         dataclasses.replace(background, seed=(background.seed + wall) % 2**31, blur=0.0) for wall in range(6)
     ]
-    if background.photo is None:
-        return np.concatenate([draw_background(wall, (_TEXTURE, _TEXTURE)) for wall in walls])
-    room = np.array(enclosure.high) - np.array(enclosure.low)
     pictures = []
-    for number, (wall, photo) in enumerate(zip(walls, photos_beside(Path(background.photo), 6), strict=True)):
-        sides = np.delete(room, number // 2)  # the wall's width and height
-        width, height = np.ceil(_TEXTURE * sides / sides.max()).astype(int).tolist()
-        picture = draw_background(dataclasses.replace(wall, photo=str(photo)), (width, height))
-        pictures.append(cv2.resize(picture, (_TEXTURE, _TEXTURE), interpolation=cv2.INTER_LINEAR))
-    return np.concatenate(pictures)
-
-
-def _meet_walls(rays: NDArray[Any], eye: Doubles, room: Doubles, pictures: Floats) -> RoomLight:
-    """Where rays (N, 3) from the eye (3,) meet the walls of an empty room (3,), and the pictures there."""
-    distances, axes = np.empty(len(rays), np.float32), np.empty(len(rays), np.int8)
-    places = np.empty((len(rays), 1, 2), np.float32)
-    _find_walls(rays, eye, room, distances, axes, places[:, 0])
-    strip = 2**14  # pictures of `remap` have at most 32767 rows
-    parts = np.split(places, range(strip, len(rays), strip))
-    light = [cv2.remap(pictures, part, None, cv2.INTER_LINEAR)[:, 0] for part in parts]
-    return RoomLight(np.concatenate(light), distances, axes)
+    if background.photo is None:
+        pictures = [draw_background(wall, (_TEXTURE, _TEXTURE)) for wall in walls]
+    else:
+        room = np.array(enclosure.high) - np.array(enclosure.low)
+        for number, (wall, photo) in enumerate(
+            zip(walls, photos_beside(Path(background.photo), 6), strict=True)
+        ):
+            sides = np.delete(room, number // 2)  # the wall's width and height
+            width, height = np.ceil(_TEXTURE * sides / sides.max()).astype(int).tolist()
+            picture = draw_background(dataclasses.replace(wall, photo=str(photo)), (width, height))
+            pictures.append(cv2.resize(picture, (_TEXTURE, _TEXTURE), interpolation=cv2.INTER_LINEAR))
+    light = np.clip(np.concatenate(pictures), 0.0, 1.0) ** np.float32(1.0 / _GAMMA)
+    return np.asarray(np.rint(np.float32(255.0) * light).astype(np.uint8))
 
 
 @kernel
 def _find_walls(
-    rays: NDArray[Any],
-    eye: Doubles,
-    room: Doubles,
-    distances: Floats,
-    axes: NDArray[np.int8],
-    places: Floats,
+    rays: Floats, eye: Floats, room: Floats, distances: Floats, walls: NDArray[np.int8], places: Floats
 ) -> None:
-    """Write distance (N,) [m] and axis (N,) of the wall that each ray meets, and its place in the pictures.
+    """Write distance (N,) [m] and number (N,) of the wall of a room (3,) that each ray meets, and the place.
 
-    A place (N, 2) is a column and a row of the six walls' pictures, one below the other [px].
+    Walls lie at x = 0, x = room, y = 0 and so on. A place (N, 2) is a column and a row of the six walls'
+    pictures, one below the other [px].
     """
-    inner = _TEXTURE - 1.0
+    inner, zero, one = np.float32(_TEXTURE - 1), np.float32(0.0), np.float32(1.0)
     for ray in range(len(rays)):
-        distance, wall = np.inf, 0
+        distance, wall = np.float32(np.inf), 0
         for axis in range(3):
-            far = rays[ray, axis] > 0.0
-            way = ((room[axis] if far else 0.0) - eye[axis]) / rays[ray, axis]
+            far = rays[ray, axis] > zero
+            way = ((room[axis] if far else zero) - eye[axis]) / rays[ray, axis]
             if way < distance:
                 distance, wall = way, 2 * axis + int(far)
-        axis = wall // 2
-        wide, high = (1 if axis == 0 else 0), (1 if axis == 2 else 2)
+        wide, high = (1 if wall < 2 else 0), (1 if wall >= 4 else 2)
         across = (eye[wide] + distance * rays[ray, wide]) / room[wide]
         up = (eye[high] + distance * rays[ray, high]) / room[high]
-        distances[ray], axes[ray] = distance, axis
-        places[ray, 0] = inner * min(max(across, 0.0), 1.0)
-        places[ray, 1] = wall * _TEXTURE + inner * (1.0 - min(max(up, 0.0), 1.0))
+        distances[ray], walls[ray] = distance, wall
+        places[ray, 0] = inner * min(max(across, zero), one)
+        places[ray, 1] = wall * _TEXTURE + inner * (one - min(max(up, zero), one))
