@@ -31,6 +31,7 @@ _FIRST: Final = 1.0  # [s] of frames with enough points, after which hands are m
 _ENOUGH: Final = 10.0  # [s] of such frames, in which hands are measured for good
 _LATER: Final = 2.0  # times these seconds, after which they are measured again where no hand was found
 _LONGEST_STEP: Final = 0.1  # [s] from a frame to the next that counts
+_MOST_FRAMES: Final = 20_000  # that are kept; a stream may go on for hours without a hand
 _PAUSE: Final = 1.0  # [s] without a hand, after which hands may be another person's
 _SAME: Final = 0.006  # [m] by which lengths differ that one second shows of the same hands
 _STEP: Final = 0.002  # [m] by which the markers of a hand at rest move in a frame when its size changes
@@ -86,6 +87,8 @@ class LiveSizing(Closing):
             self._shown += min(frame.time - self._last, _LONGEST_STEP)
             self._last = frame.time
             self._frames.append(frame)
+            if len(self._frames) > _MOST_FRAMES:
+                self._frames = sample_frames(self._frames)
         if self._measuring is not None and self._measuring.done():
             self._end_measuring(self._measuring, tracker)
         if self._measuring is None and self._shown >= self._due and not self._is_done:

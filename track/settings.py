@@ -69,7 +69,7 @@ class TrackSettings(LabelSettings):
     calibrate: bool = False
     """Whether to track twice: hands are calibrated on the first take, as `track.calibrate` does it, and the
     second is made with those that fit better so."""
-    smooth: bool = False
+    smooth: bool = True
     """Whether the poses of a file are solved over all of its time, forward and backward. Those of a stream
     are solved frame by frame."""
     tracker: TrackerConfig = field(default_factory=TrackerConfig)

@@ -3,8 +3,8 @@
 A pose that is fitted to the markers of one frame has their noise: on a short bone a millimeter is ten
 degrees. Here all poses of a hand, from one start of its track to the next, are solved together. A motion goes
 on with its velocity but for unforeseen accelerations, and hinges are near those of the gestures that people
-make, as in the tracker, which sees only the past. The offset of each marker of a hand that is not calibrated
-is its mean over the whole take. So a frame has the same pose wherever in a file it stands.
+make, as in the tracker, which sees only the past and learns offsets of markers on the way. So a frame has the
+same pose wherever in a file it stands.
 """
 
 from __future__ import annotations
@@ -41,8 +41,7 @@ _ACCELERATIONS: Final = np.repeat([10.0, 0.5, 10.0], [NUM_JOINTS, 3, 3])
 """Power of unforeseen accelerations: of hinges [rad^2/s^3], of the wrist [m^2/s^3], [rad^2/s^3]."""
 _GESTURES: Final = 30.0  # [1/s] how often the prior of the hinges counts: errors of markers last that long
 _WINDOW, _MARGIN = 2000, 200  # frames that are solved together, and those more at either end
-_ROUNDS, _LEARNING_ROUNDS = 5, 10  # steps of a fit, and of one in which biases are learned
-_OVERSHOOT: Final = 1.5  # times the step of a bias, of which poses take a part
+_ROUNDS: Final = 5  # steps of a fit
 _LONGEST_STEP: Final = 0.5  # [rad], [m]
 _FIRST_NOISE, _LEAST_NOISE = 0.0015, 0.0001  # [m]
 _OUTLIER: Final = 0.01  # [m] where the loss of a marker levels off (Geman and McClure 1987)
@@ -137,14 +136,13 @@ class _SmoothedHand:
         self._residuals = np.full_like(self._targets, np.nan)  # in the frames of the bones [m]
         self._noise, self._flesh = _FIRST_NOISE, 0.0  # [m]
         self._hand, self._model, self._rate = hand_arrays(worn), spread_model(take, worn), take.rate
-        self._learns = hand_origin(str(take.settings.get("user", "")), worn.side) != "calibrated"
 
     def solve(self, windows: Sequence[_Window]) -> tuple[Float[np.ndarray, "20"], Float[np.ndarray, "20 4"]]:
         """Solve all poses; return the cut-off of each angle [Hz] and its spread by `SOURCES` [deg]."""
-        for number in range(_LEARNING_ROUNDS if self._learns else _ROUNDS):
+        for _ in range(_ROUNDS):
             for window in windows:
                 self._step(window, self._equations(window))
-            self._estimate_noise(learns=self._learns and number > 0)
+            self._estimate_noise()
         cutoffs, parts = [], []
         for window in windows:
             equations = self._equations(window)
@@ -220,8 +218,8 @@ class _SmoothedHand:
         self.qpos[window.kept] = moved[window.inner]
         return np.asarray(turns.swapaxes(1, 2) @ covariances @ turns)
 
-    def _estimate_noise(self, *, learns: bool) -> None:
-        """Noise and flesh of the markers by their residuals; their biases, if these are learned."""
+    def _estimate_noise(self) -> None:
+        """Noise and flesh of the markers by their residuals."""
         residuals = self._residuals
         seen = np.isfinite(residuals[..., 0])
         bias = np.nan_to_num(np.nansum(residuals, axis=0) / np.maximum(seen.sum(axis=0), 1)[:, None])
@@ -230,8 +228,6 @@ class _SmoothedHand:
         self._noise = max(noise, _LEAST_NOISE)
         slow = max(_spread((residuals - bias)[seen]) ** 2 - noise**2, 0.0)
         self._flesh = float(np.sqrt(3.0 * slow)) * freedom_factor(seen.shape[1])
-        if learns:
-            self._hand.positions[:, 0] -= _OVERSHOOT * bias
 
 
 def _spread(values: NDArray[np.float64]) -> float:

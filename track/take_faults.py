@@ -91,6 +91,7 @@ def find_faults(take: Take) -> tuple[SuspectSpan, ...]:
     found: list[SuspectSpan] = []
     for number, side in enumerate(take.sides) if take.made_by_tracker else ():
         frames = np.flatnonzero(take.status[:, number] == TRACKED)
+        frames = frames[frames >= _first_of_size(take)]
         if len(frames) < _FEWEST:
             continue
         some = frames[:: -(-len(frames) // _MOST_FRAMES)]
@@ -98,6 +99,14 @@ def find_faults(take: Take) -> tuple[SuspectSpan, ...]:
         for faults in (_unsure_side, _misplaced, _slips, _fallen, _at_limits):
             found += faults(hand)
     return tuple({one.of: one for one in reversed(found)}.values())[::-1]
+
+
+def _first_of_size(take: Take) -> int:
+    """The frame from which on the poses are of the take's hands, whose size a live tracker measures."""
+    match take.settings.get("sizes"):
+        case [*_, [int(first), *_]]:
+            return first
+    return 0
 
 
 def _slips(hand: _Hand) -> Iterator[SuspectSpan]:

@@ -41,7 +41,7 @@ class TrackerOptions:
         """Options that may name files, which no output must overwrite."""
         return self.shape, self.glove, self.labeler, *self.body
 
-    def settings(self, *, calibrate: bool = False, smooth: bool = False) -> TrackSettings:
+    def settings(self, *, calibrate: bool = False, smooth: bool = True) -> TrackSettings:
         """The settings of `track_capture`."""
         from track.settings import TrackSettings
         from track.user import load_user

@@ -35,7 +35,7 @@ def track(
     send: tuple[str, ...] = (),
     options: Annotated[TrackerOptions, tyro.conf.arg(name="")] = TrackerOptions(),  # noqa: B008 (frozen)
     calibrate: bool = False,
-    smooth: bool = False,
+    smooth: bool = True,
     labeled: Annotated[Path | None, tyro.conf.arg(aliases=["--labelled"])] = None,
 ) -> None:
     """Track hands in a marker capture or a live stream; writes motion, labels and status.

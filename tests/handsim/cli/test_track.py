@@ -539,7 +539,8 @@ def test_hands_are_sent_as_they_are_tracked(capture, tmp_path, capsys, monkeypat
         out, now = tmp_path / "take.npz", [50.0]
         monkeypatch.setattr(captures, "monotonic", lambda: now[0])
         monkeypatch.setattr(captures, "sleep", lambda seconds: now.append(now.pop() + seconds))
-        assert main(["track", str(capture), "--out", str(out), "--size", "M", "--send", address]) == 0
+        sent = ["--size", "M", "--send", address, "--no-smooth"]
+        assert main(["track", str(capture), "--out", str(out), *sent]) == 0
         assert now[0] - 50.0 == pytest.approx((FRAMES - 1) / 120), "it waited until each frame's time"
         one.setblocking(False)
         heard = []
