@@ -169,7 +169,9 @@ class _SmoothedHand:
 
     def rms(self) -> Float[np.ndarray, "T"]:
         """3D RMS distance of the markers from the hand as it was given [m]; NaN without markers."""
-        squares = ((self._worn.markers(self.qpos)[0] - self._targets) ** 2).sum(axis=-1)
+        there = np.isfinite(self.qpos).all(axis=1)
+        squares = np.full(self._targets.shape[:2], np.nan)
+        squares[there] = ((self._worn.markers(self.qpos[there])[0] - self._targets[there]) ** 2).sum(axis=-1)
         seen = np.isfinite(squares)
         count = np.where(seen.any(axis=1), seen.sum(axis=1), np.nan)
         return np.asarray(np.sqrt(squares.sum(axis=1, where=seen) / count))

@@ -19,7 +19,7 @@ FRAMES = 120
 @pytest.fixture(scope="module")
 def tracked() -> Take:
     truth = simulate_take(kind="single-hand", num_frames=FRAMES, seed=1)
-    take = track_capture(truth, hands=truth.hands, labeler="dense19")
+    take = track_capture(truth, hands=truth.hands, labeler="dense19", smooth=False)
     assert (take.labels == truth.labels).mean() > 0.999
     return take
 

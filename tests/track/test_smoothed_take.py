@@ -26,7 +26,7 @@ def truth():
 @pytest.fixture(scope="module")
 def fitted(truth):
     """Tracked frame by frame."""
-    return track_capture(truth.capture())
+    return track_capture(truth.capture(), smooth=False)
 
 
 @pytest.fixture(scope="module")
@@ -86,6 +86,15 @@ def test_a_lost_hand_stays_lost(fitted):
     found = smooth_take(dataclasses.replace(fitted, status=status, qpos=qpos, rms=rms))
     assert np.isnan(found.qpos[:, 0]).all()
     assert set(found.settings["filter"]) == {found.sides[1]}
+
+
+def test_a_hand_that_is_lost_for_some_frames_is_smoothed_in_the_others(fitted):
+    status, qpos, rms = fitted.status.copy(), fitted.qpos.copy(), fitted.rms.copy()
+    status[:30, 0] = status[100:110, 0] = LOST
+    qpos[status == LOST], rms[status == LOST] = np.nan, np.nan
+    found = smooth_take(dataclasses.replace(fitted, status=status, qpos=qpos, rms=rms))
+    np.testing.assert_array_equal(np.isfinite(found.qpos[..., 0]), status != LOST)
+    np.testing.assert_array_equal(np.isfinite(found.rms), np.isfinite(rms))
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 4, 7])

@@ -31,7 +31,7 @@ ELSEWHERE = {
     "generate": "out workers cluster sampler", "train": "out threads", "label": "out threads",
     "export": "out", "evaluate": "json threads", "simulate": "out cluster", "calibrate": "out",
     "track": "out live seconds send labelled", "report": "out", "replay": "host port rate loop",
-    "view": "host port out video live", "body": "out", "doctor": "compile",
+    "view": "host port out video live", "body": "out", "doctor": "compile send",
     "render": "out merge format workers cluster painter frames-per-shard",
 }  # fmt: skip
 """Options that say only where something is or goes, as what, or how quickly."""
@@ -62,7 +62,7 @@ QUICK = [
     ("render", "take.npz --out pics --num-frames 2 --format png --workers 1 --passes depth", "every 9"),
     ("render", "take.npz --out pics --num-frames 2 --format png --workers 1 --passes rgb", "vary frame"),
     ("render", "take.npz --out pics --num-frames 1 --format png --workers 1 --passes depth --placement rig",
-     "rig eight"),
+     "rig eight|no-room-depth"),
     ("render", "--poses poses.npz --out pics --format png --workers 1 --passes depth --frames-per-shard 1",
      "hands left|people 1|glove sparse13|up y"),
 ]  # fmt: skip
@@ -73,7 +73,7 @@ SLOW = [
      "labeler set|knee 0.5|cnn.views random|cnn.reject 0.005|cnn.spread 0.05"),
     ("train", "set --out run2 --samples 32 --batch 16", "preset han2018 --average 0.5"),
     ("track", "capture.c3d --out t.npz",
-     "glove sparse13|size XL|shape user.json|hands right|body pen|labeler run|calibrate"),
+     "glove sparse13|size XL|shape user.json|hands right|body pen|labeler run|calibrate|no-smooth"),
     ("calibrate", "long.c3d --out u.json", "glove sparse13|size XL|hands right|labeler run"),
     ("demo", "--out d --num-frames 200", "seed 3|num-frames 300"),
     ("glove score", "starter6 --out s.html --num-frames 100 --captures 0",
@@ -117,7 +117,7 @@ def test_every_option_has_its_place(name):
     varied |= {option.replace("_", "-") for option, _ in simulated}
     if "photos" not in varied and name == "render":
         varied |= {"photos", "poses"}  # in the situations above
-    named = {one.replace("no-color", "color") for one in varied} | ({"num-frames"} if simulated else set())
+    named = {one.removeprefix("no-") for one in varied} | ({"num-frames"} if simulated else set())
     assert options_of(name) == named | told
     assert not named & told
 

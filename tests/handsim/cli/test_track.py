@@ -115,7 +115,7 @@ def test_a_capture_becomes_a_take_and_is_told_of(capture, tmp_path, capsys):
     assert lines[0] == f"{out}: {FRAMES} frames, 0.5 s at 120 Hz"
     assert lines[1].startswith("right hand: tracked 98.3 %, found 1.7 %, coasting 0.0 %, lost 0.0 %; median")
     assert lines[2].startswith("left hand: ") and " mm, " in lines[2]
-    assert "points are not markers" in lines[3] and lines[4].endswith(" ms per frame")
+    assert any("points are not markers" in line for line in lines) and lines[-1].endswith(" ms per frame")
     take, truth = load_take(out), load_take(capture.with_suffix(".truth.npz"))
     assert take.sides == ("right", "left")
     assert take.settings["capture"] == "take.c3d" and take.settings["user"] == "L"
@@ -127,12 +127,12 @@ def test_a_capture_becomes_a_take_and_is_told_of(capture, tmp_path, capsys):
     seen = columns.positions[:, :19]
     np.testing.assert_allclose(seen, take.observed("right"), atol=1e-6)
     unlabeled = np.isfinite(columns.positions[:, 38:, 0]).sum()
-    assert f"{unlabeled} of " in lines[3]
+    assert any(f"{unlabeled} of " in line for line in lines)
 
 
 def test_corrections_come_back_with_a_new_tracking(capture, tmp_path, capsys):
     out, labeled = tmp_path / "tracked.npz", tmp_path / "labeled.trc"
-    arguments = ["track", str(capture), "--out", str(out), "--size", "L"]
+    arguments = ["track", str(capture), "--out", str(out), "--size", "L", "--no-smooth"]
     assert main(arguments) == 0
     first = load_take(out)
     corrector = Corrector(out, first)
