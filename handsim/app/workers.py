@@ -168,12 +168,12 @@ class LocalProcesses(ProcessPoolExecutor):
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if kind is not None:
-            self.end()
-        self.shutdown(wait=True)
+            self._ours.close()
+        self.shutdown(wait=True, cancel_futures=kind is not None)
         self._ours.close()
 
     def end(self) -> None:
-        """End the processes at once."""
+        """End the processes at once, without waiting for it."""
         self._ours.close()
         self.shutdown(wait=False, cancel_futures=True)
 
