@@ -171,7 +171,7 @@ CASES = {
     "evaluate good.trc --truth tracked.npz": "tracked.npz | tracked take | simulated capture",
     "evaluate good.trc --truth missing.truth.npz": "missing.truth.npz | No such file",
     "evaluate good.trc good.trc --truth good.truth.npz": "2 captures | expected one",
-    "evaluate good.trc --truth good.truth.npz --ghosts 2": "--truth | none of --glove, --labeler, --threads, --occlude",
+    "evaluate good.trc --truth good.truth.npz --ghosts 2": "--truth | none of --glove, --labeler",
     "render newer.npz --out out": "newer.npz | schema 99 | schema 4",
     "render good.trc --out out": "good.trc | .npz | handsim track",
     "render missing.npz --out out": "missing.npz | No such file",

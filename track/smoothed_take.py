@@ -40,6 +40,9 @@ from track.user import hand_origin, read_errors
 _ACCELERATIONS: Final = np.repeat([10.0, 0.5, 10.0], [NUM_JOINTS, 3, 3])
 """Power of unforeseen accelerations: of hinges [rad^2/s^3], of the wrist [m^2/s^3], [rad^2/s^3]."""
 _GESTURES: Final = 30.0  # [1/s] how often the prior of the hinges counts: errors of markers last that long
+_WEAK: Final = np.repeat(
+    [0.0, 1.0], [NUM_JOINTS, 6]
+)  # [1/m^2], [1/rad^2] of a wrist whose hand shows no marker
 _WINDOW, _MARGIN = 2000, 200  # frames that are solved together, and those more at either end
 _ROUNDS: Final = 5  # steps of a fit
 _LONGEST_STEP: Final = 0.5  # [rad], [m]
@@ -193,6 +196,7 @@ class _SmoothedHand:
             self._hand, self._targets[window.frames], qpos, self._weight_noise**-2, _OUTLIER**-2
         )
         normal[:, :NUM_JOINTS, :NUM_JOINTS] += self._share * prior.precision
+        normal += np.diag(_WEAK)
         gradient[:, :NUM_JOINTS] += self._share * (qpos[:, 7:] - prior.angles) @ prior.precision
         return normal, gradient
 

@@ -170,7 +170,7 @@ class User(Sequence[GloveFit]):
             "notes": self.notes,
             "glove": dataclasses.asdict(self.layout),
             "hands": [_to_json(hand) for hand in self.hands],
-            "angle_errors": stored_errors(self),
+            **({"angle_errors": errors} if (errors := stored_errors(self)) else {}),
         }
         try:
             with atomic_write(Path(path)) as temporary:

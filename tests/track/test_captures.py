@@ -279,7 +279,7 @@ Tracker(hands, labeler).warm_up()
 checked_frames(take.capture())  # of a whole capture alone, as the next; a stream has neither
 label_confidence(take)
 before = ready()
-track_capture(take, hands=hands, labeler=labeler)
+track_capture(take, hands=hands, labeler=labeler, smooth=False)  # as a stream is tracked
 for cloud in np.random.default_rng(1).uniform(0.0, 0.1, (20, 19, 3)):
     labeler.label_frames([cloud])
 assert before and ready() == before, ready() - before

@@ -97,6 +97,14 @@ def test_a_hand_that_is_lost_for_some_frames_is_smoothed_in_the_others(fitted):
     np.testing.assert_array_equal(np.isfinite(found.rms), np.isfinite(rms))
 
 
+def test_a_hand_without_any_marker_for_a_while_goes_on(fitted):
+    labels = fitted.labels.copy()
+    labels[60:70] = -1
+    found = smooth_take(dataclasses.replace(fitted, labels=labels))
+    assert np.isfinite(found.qpos).all() and np.isfinite(found.angle_spread).all()
+    assert (found.angle_spread[65] > found.angle_spread[50]).mean() > 0.8
+
+
 @pytest.mark.parametrize("count", [1, 2, 3, 4, 7])
 def test_the_blocks_solve_the_whole_system(count, rng):
     """Against one dense system of all frames."""

@@ -98,11 +98,9 @@ def test_a_take_without_a_hand_is_told(seen):
 
 @pytest.mark.slow
 def test_a_take_is_calibrated_on_itself(seen):
-    first = track_capture(seen, hands=["right"])
-    steps = []
-    second = track_capture(
-        seen, hands=["right"], calibrate=True, progress=lambda *values: steps.append(values)
-    )
+    first = track_capture(seen, hands=["right"], smooth=False)
+    steps, told = [], lambda *values: steps.append(values)
+    second = track_capture(seen, hands=["right"], calibrate=True, smooth=False, progress=told)
     assert angle_error(second, seen) < 0.6 * angle_error(first, seen)
     assert np.nanmedian(second.rms) < 0.8 * np.nanmedian(first.rms)
     assert second.settings["user"].startswith("calibrated on the take itself, ")

@@ -72,8 +72,7 @@ _ENOUGH_RANGE: Final = 0.3  # share of a joint's range that the user should cove
 _LEAST_NOISE, _MOST_NOISE = 0.0001, 0.003  # [m]
 _CHI2_MEDIAN: Final = 2.366  # median of the chi-squared distribution with three degrees of freedom
 _USUAL_SPREAD_COORDINATES: Final = 12.0  # coordinates of markers that the usual spread counts as
-# Frames whose deformation of the flesh is independent: it follows the four angles of a digit.
-_INDEPENDENT_POSES: Final = 4.0
+_INDEPENDENT_POSES: Final = 14.0  # frames whose deformation of the flesh is independent
 
 
 @dataclass(frozen=True, slots=True, eq=False)
