@@ -355,15 +355,17 @@ class FrameView:
 
     def _show_points(self) -> None:
         """Show the points of the frame and the names that are wanted, in one message."""
-        frame = self._frame
-        if frame is None:
-            return
-        kept = (self._ghosts.value | (frame.labels >= 0)) & (self._filled.value | frame.seen)
-        every = frozenset(range(len(self._recording.label_names)))
-        with self._lock, self._server.atomic():
+        # Switches are handled in threads of their own: the last one to draw must have read all of them.
+        with self._lock:
+            frame = self._frame
+            if frame is None:
+                return
+            kept = (self._ghosts.value | (frame.labels >= 0)) & (self._filled.value | frame.seen)
+            every = frozenset(range(len(self._recording.label_names)))
             self._kept = np.flatnonzero(kept)
-            self.balls.show(frame.points[kept], frame.labels[kept], frame.seen[kept])
-            self.balls.name(every if self._names.value else self._clicked)
+            with self._server.atomic():
+                self.balls.show(frame.points[kept], frame.labels[kept], frame.seen[kept])
+                self.balls.name(every if self._names.value else self._clicked)
 
     def _click(self, event: SceneNodePointerEvent[BatchedMeshHandle]) -> None:
         """Show or hide the name of the clicked marker."""
