@@ -36,7 +36,8 @@ _NATURAL: Final = (0.5, np.deg2rad(40.0), 0.0)  # such distance and angles of pe
 _SPREADS: Final = (0.12, np.deg2rad(15.0), np.deg2rad(30.0))
 _UNUSUAL: Final = 0.15  # weight of what is far from these
 
-_SWIVELS: Final = np.deg2rad(np.arange(-100.0, 101.0, 20.0))  # of an elbow, from its lowest place
+_SWIVELS: Final = np.deg2rad(np.arange(-100.0, 101.0, 20.0))
+"""Angles of the elbow about the line from the wrist to the shoulder that are tried [rad]; 0 is the lowest."""
 _SWIVEL: Final = np.deg2rad(50.0)  # their spread
 _SOFTNESS: Final = 0.3  # difference of costs within which elbows are averaged, so that they do not jump
 _OVERREACH: Final = 0.05  # distance by which a person reaches farther without much ado [m]

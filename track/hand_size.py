@@ -328,7 +328,7 @@ def _fit_proportions(seen: Float[np.ndarray, "F M 3"], start: GloveFit) -> SizeF
     estimate, fit, _ = levenberg_marquardt(problem, estimate, 0, _FIT_STEPS, None, _SMALL_GAIN)
     hand = user_hand(start, problem, estimate)
     rms = float(np.median(PoseSolver(hand).solve(seen, estimate.qpos).rms))
-    variance = shared_covariance(problem, estimate, fit)[LENGTH, LENGTH]
+    variance = shared_covariance(problem, estimate, fit)[0][LENGTH, LENGTH]
     return SizeFit(hand, rms, hand.shape.length * float(np.sqrt(variance)))
 
 

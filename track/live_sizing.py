@@ -30,7 +30,7 @@ from track.user import MEASURED, User
 _FIRST: Final = 1.0  # [s] of frames with enough points, after which hands are measured
 _ENOUGH: Final = 10.0  # [s] of such frames, in which hands are measured for good
 _LATER: Final = 2.0  # times these seconds, after which they are measured again where no hand was found
-_LONGEST_STEP: Final = 0.1  # [s] from a frame to the next that counts
+_LONGEST_STEP: Final = 0.1  # [s] between two frames; of a longer gap only this much counts as time with hands
 _MOST_FRAMES: Final = 20_000  # that are kept; a stream may go on for hours without a hand
 _PAUSE: Final = 1.0  # [s] without a hand, after which hands may be another person's
 _SAME: Final = 0.006  # [m] by which lengths differ that one second shows of the same hands

@@ -546,7 +546,7 @@ class WebSocketSink:
                 laid_out, message = client.take()
                 now = self._loop.time()
                 behind = max(behind, now - laid_out)
-                # One who asks counts on one answer; it is never behind.
+                # A client that asks for frames expects one message for each request, and is never behind.
                 if behind > _UNCONFIRMED and now > told + _TELL and not client.only_asked:
                     told = now
                     await connection.send(self._format.lag(behind, client.dropped), text=is_text)

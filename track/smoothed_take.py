@@ -204,7 +204,7 @@ class _SmoothedHand:
         self, window: _Window, equations: tuple[NDArray[np.float64], NDArray[np.float64]]
     ) -> NDArray[np.float64]:
         """Move all poses of a window by a Gauss-Newton step; return the covariances of its unknowns."""
-        # The wrist's place is solved in the world, where its accelerations are.
+        # Steps of the wrist's position are solved in world axes, in which its acceleration is penalized.
         normal, gradient = equations[0].copy(), equations[1].copy()
         qpos = self.qpos[window.frames]
         turns = np.tile(np.eye(NUM_UNKNOWNS), (len(qpos), 1, 1))

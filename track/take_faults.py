@@ -38,7 +38,7 @@ _STEADY: Final = 0.006  # [m] radius in which a point that belongs to a bone sta
 _OFTEN: Final = 0.5  # share of the frames without the marker in which it is there
 _TRIED: Final = 100  # points without a label that are tried as steady ones
 _LAST_GAP: Final = 1.9  # [s] without a marker at a take's end, and before that, at least
-_LONGER: Final = 3.0  # times its longest gap before; other markers have no longer one
+_LONGER: Final = 3.0  # A last gap is told from this many times the longest gap that the marker had before.
 _SEEN: Final = 0.5  # share of the frames before in which it was seen
 AT_LIMIT: Final = 0.5
 """Distance of an angle from the end of the joint's range at which the joint may have gone farther [deg]."""

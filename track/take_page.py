@@ -172,7 +172,7 @@ class MarkerFigures(NamedTuple):
     seen: float
     """Share of all frames in which it has a point."""
     num_gaps: int
-    """How often it is not seen between the hand's first pose and its last."""
+    """Number of gaps of the marker from the hand's first pose to its last."""
     longest_gap: int
     """Frames."""
     median_residual: float

@@ -108,7 +108,7 @@ class GrowingArchive(Closing):
         self.flush_due()
 
     def replace_head(self, header: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Replace the header and the arrays that do not grow; not if they need more room than there is."""
+        """Write a header and arrays of fixed size over the old ones, if they fit into the same room."""
         head = self._packed_head(header, arrays, len(self._head[0]))
         if list(map(len, head)) == list(map(len, self._head)):
             self._head = head

@@ -20,7 +20,7 @@ from handsim.hand.shape import DIGITS, HandShape
 from handsim.space.transforms import axis_angle_matrix, euler_matrix
 
 Convention = Literal["model", "isb"]
-"""How angles are named and counted: as the model's hinges, or as the ISB does."""
+"""Convention of joint angles: `model` has those of the model's hinges, `isb` those of Wu and others 2005."""
 _THUMB: Final = (
     *(f"thumb_metacarpal_{name}" for name in ("palmar_abduction", "radial_abduction", "pronation")),
     "thumb_MCP_flexion",

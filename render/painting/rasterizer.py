@@ -97,7 +97,7 @@ class CutOff(NamedTuple):
     shares: Float[np.ndarray, "M 1"]  # places between them, from 0 to 1
 
     def mixed(self, values: NDArray[Any]) -> NDArray[Any]:
-        """Values of the vertices (V - M, ...), and of those on the plane."""
+        """Values (V, ...) of all vertices after the cut, from values (V - M, ...) of those before it."""
         if not len(self.ends):
             return values
         first, second = values[self.ends[:, 0]], values[self.ends[:, 1]]

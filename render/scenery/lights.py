@@ -163,7 +163,7 @@ def irradiance(picture: Float[np.ndarray, "H W 3"]) -> Float[np.ndarray, "9 3"]:
 
 
 def _projected(light: Doubles) -> Doubles:
-    """The rows of `irradiance` for light (D, 3) from the directions of `_sphere`."""
+    """What `irradiance` returns (9, 3), of light (D, 3) from the directions of `_sphere`."""
     functions = _sphere()[1]
     return np.asarray((_MATT / _SQUARES)[:, None] * (functions.T @ light) * (4.0 * np.pi / len(functions)))
 

@@ -107,7 +107,7 @@ def test_a_hand_without_any_marker_for_a_while_goes_on(fitted):
 
 @pytest.mark.parametrize("count", [1, 2, 3, 4, 7])
 def test_the_blocks_solve_the_whole_system(count, rng):
-    """Against one dense system of all frames."""
+    """Compare the block solver with a dense solution of the equations of all frames."""
     size, precision = 26, rng.uniform(0.5, 2.0, 26)
     root = rng.standard_normal((count, size, size))
     normal, gradient = root @ root.swapaxes(1, 2) + np.eye(size), rng.standard_normal((count, size))

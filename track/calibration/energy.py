@@ -558,19 +558,20 @@ def eliminate_poses(
     return reduced, solved
 
 
-def shared_covariance(problem: Problem, estimate: Estimate, fit: Fit) -> Float[np.ndarray, "S S"]:
-    """Covariance of the shared unknowns, whatever the poses are: the inverse of the reduced system."""
-    reduced, _ = eliminate_poses(problem.normal_equations(estimate, fit), 0.0)
-    return np.linalg.inv(reduced[:, :-1])
+def shared_covariance(
+    problem: Problem, estimate: Estimate, fit: Fit
+) -> tuple[Float[np.ndarray, "S S"], Float[np.ndarray, "F 26 S"]]:
+    """Covariance of the shared unknowns, whatever the poses are, and how poses answer to these unknowns."""
+    reduced, solved = eliminate_poses(problem.normal_equations(estimate, fit), 0.0)
+    return np.linalg.inv(reduced[:, :-1]), solved[..., :-1]
 
 
-def angle_errors(problem: Problem, estimate: Estimate, fit: Fit) -> Float[np.ndarray, "20 2"]:
-    """What a solution leaves open of each joint angle [rad]: by places of markers, and by the shape."""
+def angle_errors(
+    covariance: Float[np.ndarray, "S S"], answers: Float[np.ndarray, "F 26 S"]
+) -> Float[np.ndarray, "20 2"]:
+    """What `shared_covariance` leaves open of each joint angle [rad]: by places of markers, by the shape."""
     # Both are correlated. Their shares of the whole variance are as they would be alone.
-    equations = problem.normal_equations(estimate, fit)
-    reduced, solved = eliminate_poses(equations, 0.0)
-    covariance = np.linalg.inv(reduced[:, :-1])
-    by_angle = solved[:, 6:, :-1]
+    by_angle = answers[:, 6:]
     places, bones, both = (
         np.einsum("fis,st,fit->i", of, covariance[part, part], of, optimize=True)
         for part in (slice(NUM_PARAMETERS, None), slice(NUM_PARAMETERS), slice(None))

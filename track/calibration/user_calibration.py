@@ -222,7 +222,8 @@ def calibrate_hand(
         touching = PoseSolver(right).solve(seen[[frame for frame, _ in touches]])
         before = contact_gaps(right.model, touches, touching.qpos)
     final = PoseSolver(done).solve(seen, rough_track.qpos)
-    position_errors, length_errors = standard_errors(problem, estimate, fit)
+    covariance, answers = shared_covariance(problem, estimate, fit)
+    position_errors, length_errors = standard_errors(problem, estimate, fit, covariance)
     return Calibration(
         hand=done.with_side(start.side),
         start=start,
@@ -231,7 +232,7 @@ def calibrate_hand(
         shifts=np.linalg.norm(fit.design_residuals, axis=1),
         position_errors=position_errors,
         length_errors=length_errors,
-        angle_errors=angle_errors(problem, estimate, fit),
+        angle_errors=angle_errors(covariance, answers),
         touches=_touches(estimate, fit, touches, usable, before, mirror),
         still_joints=still_joints(final.qpos[:, 7:], complete, done.model),
     )
@@ -350,7 +351,7 @@ def repeated_share(qpos: Float[np.ndarray, "T 27"], residuals: Float[np.ndarray,
 
 def learn_spreads(problem: Problem, estimate: Estimate, fit: Fit) -> None:
     """Set the spreads of marker places and heights to what the data tell of this glove (MacKay 1992)."""
-    covariance = shared_covariance(problem, estimate, fit)
+    covariance, _ = shared_covariance(problem, estimate, fit)
     own = [slice(first, first + 3) for first in range(NUM_PARAMETERS, len(covariance), 3)]
     blocks, normals = np.array([covariance[one, one] for one in own]), fit.normals
     across = np.einsum("mi,mij,mj->m", normals, blocks, normals)
@@ -375,12 +376,11 @@ def _learned(
 
 
 def standard_errors(
-    problem: Problem, estimate: Estimate, fit: Fit
+    problem: Problem, estimate: Estimate, fit: Fit, covariance: Float[np.ndarray, "S S"]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Standard errors of marker positions on their bones (M,) and of bone lengths (5, 3) [m]."""
     # Where the wrist is in the palm is a convention: of the palm's markers it is the error among the
     # knuckles.
-    covariance = shared_covariance(problem, estimate, fit)
     weights = skin_weights(estimate.coordinates)
     bones, patch = weights.argmax(axis=1), SkinPatch(estimate.coordinates.faces)
 

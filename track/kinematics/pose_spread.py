@@ -440,7 +440,7 @@ class SpreadModel:
 
 
 def freedom_factor(num_markers: int) -> float:
-    """The noise of markers over their distance from a fitted pose, which takes some of their freedom."""
+    """Ratio of the noise of markers to the RMS distance from a pose that was fitted to them."""
     return float(np.sqrt(num_markers / max(3 * num_markers - NUM_UNKNOWNS, _LEAST_FREEDOM)))
 
 

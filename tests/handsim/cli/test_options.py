@@ -38,7 +38,7 @@ ELSEWHERE = {
 SHOWN = {"view": "rig time up glove size shape hands body labeler", "glove improve": "captures"}
 """Options of what is shown and not written."""
 SEARCHED = {"glove improve": "keep rig minutes seed", "glove score": "labeler"}
-"""Options of a search, whose outcome another value may leave as it is, and one that takes minutes to try."""
+"""Options that are not varied: those of a search may leave its outcome as it is, one takes minutes to try."""
 SMALL = "--batch 32 --network.width 8 --network.gates 2 --network.depth 1"
 QUICK = [
     ("hand", "--out h.xml", "size XL|side left|glove dense19|actuators|shape user.json|take take.npz"),
