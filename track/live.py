@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from time import monotonic
+from time import monotonic, sleep
 from typing import Final, NamedTuple, Protocol
 
 import numpy as np
@@ -29,6 +29,7 @@ from track.streams.live_stream import LiveStream, open_source
 from track.tracker import Tracker
 
 _PACE_PERIOD: Final = 1.0  # [s] between two lines about dropped frames
+_RETRY: Final = 0.5  # [s] between two attempts to reach a server
 _LAGS: Final = 100_000  # newest frames whose lag is kept
 _FOREIGN: Final = "foreign_packets"
 _PACKETS: Final = {"damaged_packets": "damaged", _FOREIGN: "of other senders"}
@@ -91,10 +92,12 @@ def track_live(
     out: Path | None = None,
     seconds: float | None = None,
     on_frame: OnFrame = lambda frame, tracked: None,
+    guide: Callable[[TrackedFrame], str | None] = lambda tracked: "",
 ) -> LiveTake:
     """Track a stream, to `out` if given, until `seconds` are over, the stream ends or a signal comes.
 
-    The first signal writes the take without waiting frames; a second one keeps the recording as it is.
+    What a `guide` asks for is shown after each frame; where that is None, the tracking ends. The first signal
+    writes the take without waiting frames; a second one keeps the recording as it is.
     """
     if out is not None:
         check_unused(growing_path(out))
@@ -137,11 +140,12 @@ def track_live(
                 _start(outputs, tracker)
                 if sizing.is_settled:
                     _note_size(tracker, recorder, status)
+            if (wish := guide(tracked)) is None:
+                break
             dropping = pace.tick(stream.counts)
             if frame.silent or dropping or status.due:
-                unsent = sum(sum(output.counts.values()) for output in outputs)
-                line = _status_line(frame, tracked, stream.counts, unsent, pace)
-                status.show(line, now=frame.silent or dropping)
+                line = _status_line(frame, tracked, stream.counts, outputs, pace)
+                status.show(line if frame.silent else wish or line, now=frame.silent or dropping)
             doubt.tell()
         stream.end(until)
         counts = stream.counts
@@ -171,8 +175,9 @@ def _open_answering(address: str, ended: Callable[[], bool], status: LiveStatus)
     while True:
         try:
             return open_source(address, ended=ended)
-        except NoServerError as error:  # each try takes some seconds
+        except NoServerError as error:
             status.show(f"{error}; it is waited for, Ctrl-C ends it", now=True)
+            sleep(_RETRY)  # some are refused at once
 
 
 def _written(
@@ -275,7 +280,11 @@ def _silence_line(counts: dict[str, int]) -> str:
 
 
 def _status_line(
-    frame: StreamedFrame, tracked: TrackedFrame, counts: dict[str, int], unsent: int, pace: _Pace
+    frame: StreamedFrame,
+    tracked: TrackedFrame,
+    counts: dict[str, int],
+    outputs: Sequence[FrameOutput],
+    pace: _Pace,
 ) -> str:
     """A line on the status of a live stream."""
     if frame.silent:
@@ -290,7 +299,7 @@ def _status_line(
         (counts["missing_frames"], "missing"),
         (counts["dropped_frames"], "dropped"),
         (left_out, "left out"),
-        (unsent, "not sent"),
+        (sum(sum(output.counts.values()) for output in outputs), "not sent"),
     ):
         words += [f"{number} {what}"] if number else []
     return f"frame {frame.number}: {', '.join(words)}; Ctrl-C ends it"

@@ -2,7 +2,7 @@
 
 Tracking begins with hands of the usual size. One second of frames with enough points is measured first, ten
 seconds later. The tracker takes a new size over in small steps, one a frame, so that no joint jumps. After a
-pause the hands may be another person's, and are measured again.
+pause, or where they suddenly fit worse, the hands may be another person's, and are measured again.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
+from gloves.takes.points import Status
 from handsim.app.workers import LocalProcesses
 from handsim.callbacks import Closing
 from handsim.errors import HandSimError, HandSimWarning
@@ -34,6 +35,9 @@ _LONGEST_STEP: Final = 0.1  # [s] between two frames; of a longer gap only this 
 _MOST_FRAMES: Final = 20_000  # that are kept; a stream may go on for hours without a hand
 _PAUSE: Final = 1.0  # [s] without a hand, after which hands may be another person's
 _SAME: Final = 0.006  # [m] by which lengths differ that one second shows of the same hands
+_CALM: Final = 5.0  # [s] with measured hands, after which their usual residual is known
+_RECENT: Final = 1.0  # [s] over which the newest residual is averaged
+_JUMP: Final = 1.5  # times the usual residual, from which on hands may be another person's
 _STEP: Final = 0.002  # [m] by which the markers of a hand at rest move in a frame when its size changes
 _FEWEST_STEPS: Final = 4  # in which learned biases of markers are given up
 _NICE: Final = 5  # by which the tracker's process comes before the measuring one
@@ -60,6 +64,7 @@ class LiveSizing(Closing):
         self._shown, self._due = 0.0, _FIRST  # [s] of frames with enough points: those so far, those needed
         self._last = self._seen = -np.inf  # [s] of the last such frame, and of the last hand
         self._is_brief, self._is_done = True, False  # of the last measurement, and of what is measured
+        self._calm = self._usual = self._newest = 0.0  # [s] with measured hands, and their residuals [m]
         self._processes: LocalProcesses | None = None
         self._measuring: Future[_Measured] | None = None
         self._steps: deque[User] = deque()
@@ -79,7 +84,8 @@ class LiveSizing(Closing):
         if not self._setup.is_auto:
             return False
         is_there = any(hand.has_pose for hand in tracked.hands)
-        if frame.time > self._seen + _PAUSE and (is_there or self._is_done):
+        came = frame.time > self._seen + _PAUSE and (is_there or self._is_done)
+        if came or self._fit_worse(tracked, min(frame.time - self._seen, _LONGEST_STEP)):
             self._frames.clear()
             self._shown, self._due, self._is_brief, self._is_done = 0.0, _FIRST, True, False
         self._seen = frame.time if is_there else self._seen
@@ -98,6 +104,18 @@ class LiveSizing(Closing):
         user = self._steps.popleft()
         tracker.resize(user, keep=len(self._steps) / (len(self._steps) + 1))
         return True
+
+    def _fit_worse(self, tracked: TrackedFrame, span: float) -> bool:
+        """Whether measured hands fit much worse than in the seconds after; `span` [s] is since the last."""
+        rms = [hand.rms for hand in tracked.hands if hand.status is Status.TRACKED]
+        if self._steps or not self._is_done or not rms:
+            return False
+        self._calm += span
+        if self._calm < _CALM:
+            self._usual += (float(np.mean(rms)) - self._usual) * span / self._calm
+            self._newest = self._usual
+        self._newest += (float(np.mean(rms)) - self._newest) * span / _RECENT
+        return self._newest > _JUMP * self._usual
 
     def _begin_measuring(self, user: User) -> None:
         """Measure the hands in the frames so far."""
@@ -118,7 +136,7 @@ class LiveSizing(Closing):
             warnings.warn(sentence, HandSimWarning, stacklevel=4)
         if not found.users:
             return
-        self._is_done = not self._is_brief
+        self._is_done, self._calm, self._usual = not self._is_brief, 0.0, 0.0
         before, after = (one[0].shape.length for one in (tracker.user, found.users[-1]))
         is_same = tracker.user.notes.startswith(MEASURED) and abs(after - before) < _SAME
         if not (self._is_brief and is_same):

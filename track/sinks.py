@@ -70,7 +70,7 @@ _LARGEST_INTEGER: Final = 0x7FFFFFFF  # largest integer of an OSC message
 _HEADER_PERIOD: Final = 1.0  # time after which the header is sent again, for receivers that came late [s]
 _WAITING: Final = 256  # largest number of frames that wait for a client that wants every frame
 _UNCONFIRMED: Final = 0.05  # A client that has not confirmed a frame for this time [s] gets no other one.
-_TELL: Final = 1.0  # least time between two messages on a client's lag [s]
+_TELL: Final = 1.0  # least time between two messages on a client's lag, and between two headers [s]
 _ON_REQUEST: Final = "/newest"  # path of clients that ask for each frame
 _FLUSHED: Final = 0.01  # time between two looks whether clients have read what was left [s]
 _SEND_BUFFER: Final = 1 << 17  # size of the system's buffer for each client [bytes]
@@ -418,7 +418,8 @@ def sample_of(message: LiveMessage) -> np.ndarray:
 class WebSocketSink:
     """Serves messages to any number of WebSocket clients from a thread of its own; port 0 is any free one.
 
-    A client gets the header, then the newest frame as soon as it has taken the one before. It confirms what
+    A client gets the header, once more when hands have another size and something in it is different, and the
+    newest frame as soon as it has taken the one before. It confirms what
     it took by the protocol's pongs, which its library sends. A client of the path /newest gets one frame for
     each message that it sends. With `every` all frames wait for a client, and 256 at most. A slow client
     loses frames, is told how far it is behind, and delays nobody. A loopback address serves pages of this
@@ -435,6 +436,7 @@ class WebSocketSink:
         self.dropped = 0
         """Number of frames that were dropped for slow clients."""
         self._header = b""
+        self._described: LiveHeader | None = None  # in it
         self._clients: dict[_Client, Any] = {}  # and their connections
         self._loop = asyncio.new_event_loop()
         self._ending, self._ready = asyncio.Event(), threading.Event()
@@ -449,8 +451,8 @@ class WebSocketSink:
 
     def send(self, message: LiveMessage) -> None:
         """Hand a message over to the clients."""
-        if not self._header:
-            (self._header,) = self._format.header(message.header)
+        if message.header is not self._described:
+            self._described, (self._header,) = message.header, self._format.header(message.header)
         if self._clients:
             (frame,) = self._format.frame(message)
             self._loop.call_soon_threadsafe(self._spread, frame)
@@ -530,11 +532,12 @@ class WebSocketSink:
     async def _deliver(self, connection: Any, client: _Client) -> None:
         """Send a client the header, then message after message."""
         unconfirmed: deque[tuple[float, asyncio.Future[float]]] = deque()  # times of frames, and pongs
-        told, is_text = -math.inf, self._format.is_text
+        told = described = -math.inf
+        is_text = self._format.is_text
         with suppress(self._closed_error, OSError):
             await client.woken.wait()
-            if self._header:
-                await connection.send(self._header, text=is_text)
+            if header := self._header:
+                await connection.send(header, text=is_text)
             while True:
                 behind = 0.0
                 while unconfirmed and unconfirmed[0][0] < self._loop.time() - _UNCONFIRMED:
@@ -546,6 +549,12 @@ class WebSocketSink:
                 laid_out, message = client.take()
                 now = self._loop.time()
                 behind = max(behind, now - laid_out)
+                is_other = self._header != header and now > described + _TELL
+                if is_other and not self._ending.is_set():
+                    header, described = self._header, now
+                    await connection.send(header, text=is_text)
+                    if client.only_asked:
+                        continue  # this was the answer
                 # A client that asks for frames expects one message for each request, and is never behind.
                 if behind > _UNCONFIRMED and now > told + _TELL and not client.only_asked:
                     told = now

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Final
 
 import numpy as np
 import tyro
 
-from handsim.app.messages import print_line, progress_bar
+from handsim.app.messages import named_steps, print_line, progress_bar
+from handsim.cli.options import TrackerOptions, check_live, check_source, check_take_file
 from handsim.files.outputs import check_outputs
 from handsim.hand.shape import Side
 from track.config import BOTH, Size
@@ -17,16 +18,21 @@ if TYPE_CHECKING:
     from track.calibration.user_calibration import Calibration
 
 
+_LONGEST: Final = 180.0  # [s] of a stream that is recorded
+
+
 def calibrate(
-    capture: Annotated[Path, tyro.conf.Positional],
+    capture: Annotated[Path | None, tyro.conf.Positional] = None,
     *,
     out: Path,
+    live: str | None = None,
+    seconds: float | None = None,
     glove: str = "dense19",
     size: Size = "auto",
     hands: tuple[Side, ...] = BOTH,
     labeler: str | None = None,
 ) -> None:
-    """Fit hands and gloves to a user, from any capture; a minute in which all joints move tells most.
+    """Fit hands and gloves to a user, from a capture or stream; a minute in which all joints move tells most.
 
     The capture is labeled by the tracker. Each hand is solved on two thirds of the time and tried on the
     rest; a hand that is no better there stays as it was.
@@ -34,6 +40,10 @@ def calibrate(
     Args:
         capture: A .trc, .c3d, .csv (Motive, Vicon) or .tsv (Qualisys) file; its names are not used.
         out: The user's file, .json, for handsim track --shape.
+        live: A stream instead of a capture, as of handsim track. What is still to be moved is shown until
+            every joint has covered its range; Ctrl-C ends it before. The recording stays beside OUT, as
+            NAME.calibration.npz.
+        seconds: How long to record a live stream at most [s]; three minutes when not given.
         glove: Marker layout: a shipped name or the path of a .toml file.
         size: The size nearest to the hands; auto measures it in the capture.
         hands: Which hands are in the capture.
@@ -43,7 +53,15 @@ def calibrate(
     from track import captures
     from track.settings import CalibrateSettings
 
+    check_source("capture", capture, live)
+    check_live(live, seconds)
     check_outputs((capture, glove, labeler), [out], ".json")
+    if live is not None:
+        capture = out.with_suffix(".calibration.npz")
+        check_take_file(capture, live=True)
+        options = TrackerOptions(glove, size, hands=hands, labeler=labeler)
+        _record(live, options, capture, _LONGEST if seconds is None else seconds)
+    assert capture is not None  # or the source was refused
     with progress_bar("") as bar:
         settings = CalibrateSettings(glove=glove, hands=hands, size=size, labeler=labeler)
         user = captures.calibrate(capture, settings, progress=bar, on_step=bar.step)
@@ -53,6 +71,18 @@ def calibrate(
     for side in hands:
         told = found.get(side, ["it is not in the capture and was left out"])
         print_line(*(f"{side} hand: {line}" for line in told))
+
+
+def _record(live: str, options: TrackerOptions, out: Path, seconds: float) -> None:
+    """Record a stream until it tells enough."""
+    from track.calibration.user_calibration import MotionGuide
+    from track.live import track_live
+    from track.settings import TrackerSetup
+
+    with named_steps(""):  # a glove may have to be learned
+        setup = TrackerSetup.of(options.settings())
+    recorded = track_live(live, setup, out=out, seconds=seconds, guide=MotionGuide(setup.user.hands))
+    print_line(f"{out}: {recorded.num_frames} frames, {recorded.duration:.1f} s", *recorded.notes)
 
 
 def _report(done: Calibration) -> list[str]:

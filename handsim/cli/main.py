@@ -56,7 +56,7 @@ _HELP: Final = {
     ".onnx.",
     "evaluate": "Measure a labeler on a labeled capture.",
     "simulate": "Simulate a capture of hands, with its truth.",
-    "calibrate": "Fit hands and gloves to a user, from a capture.",
+    "calibrate": "Fit hands and gloves to a user, from a capture or a stream.",
     "track": "Follow hands through a marker capture or a live stream.",
     "report": "Write a page on a take: joint angles, range of motion, gaps, residuals, doubtful frames.",
     "replay": "Play a capture as a NatNet server, to try a live set-up.",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -63,6 +64,18 @@ def check_source(noun: str, file: object, live: str | None) -> None:
         both = f"a {noun}, {file}, and --live {live}"
         given = f"neither a {noun} nor --live" if file is None else both
         raise ArgumentError(f"given {given}, expected a {noun} or --live natnet://host")
+
+
+def check_live(live: str | None, seconds: float | None) -> None:
+    """Refuse --seconds without a stream, and an invalid address."""
+    from track.streams.live_stream import check_address
+
+    if seconds is not None and live is None:
+        raise ArgumentError(f"--seconds is {seconds:g} without --live, expected both or neither")
+    if seconds is not None and not 0.0 < seconds < math.inf:
+        raise ArgumentError(f"--seconds is {seconds:g}, expected a positive number")
+    if live is not None:
+        check_address(live)  # before kernels are compiled, which takes long
 
 
 def check_take_file(out: Path, *, live: bool) -> None:

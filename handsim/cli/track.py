@@ -11,7 +11,7 @@ import numpy as np
 import tyro
 
 from handsim.app.messages import named_steps, print_line, progress_bar
-from handsim.cli.options import TrackerOptions, check_source, check_take_file
+from handsim.cli.options import TrackerOptions, check_live, check_source, check_take_file
 from handsim.errors import ArgumentError, HandSimWarning
 from handsim.files.outputs import check_outputs, written_together
 
@@ -67,7 +67,11 @@ def track(
     from track.sinks import open_sinks
 
     check_source("capture", capture, live)
-    _check_live(live, seconds, calibrate=calibrate)
+    check_live(live, seconds)
+    if calibrate and live is not None:
+        raise ArgumentError(
+            f"given --calibrate and --live {live}, expected a capture, which is tracked twice"
+        )
     check_take_file(out, live=live is not None)
     if labeled is not None:
         check_suffix(labeled, WRITABLE)
@@ -145,19 +149,3 @@ def _print_take(out: Path, take: Take, tracked: LiveTake, milliseconds: float) -
     print_line(*lines, *tracked.notes, *summarize(take), f"{milliseconds:.2f} ms per frame")
     for suspicion in suspicions(take):
         warnings.warn(suspicion, HandSimWarning, stacklevel=3)
-
-
-def _check_live(live: str | None, seconds: float | None, *, calibrate: bool) -> None:
-    """Refuse --seconds without a stream, --calibrate with one, and an invalid address."""
-    from track.streams.live_stream import check_address
-
-    if seconds is not None and live is None:
-        raise ArgumentError(f"--seconds is {seconds:g} without --live, expected both or neither")
-    if calibrate and live is not None:
-        raise ArgumentError(
-            f"given --calibrate and --live {live}, expected a capture, which is tracked twice"
-        )
-    if seconds is not None and not 0.0 < seconds < np.inf:
-        raise ArgumentError(f"--seconds is {seconds:g}, expected a positive number")
-    if live is not None:
-        check_address(live)  # before kernels are compiled, which takes long

@@ -579,6 +579,27 @@ def test_a_client_may_ask_for_the_newest_frame(message):
     sink.close()
 
 
+def test_clients_hear_of_a_new_size(message):
+    sink = open_sink("ws://:0?joints=openxr")
+    larger = dataclasses.replace(message(1).header, radii=((0.02,) * 26,) * len(message(1).header.sides))
+    with connect(f"{url(sink)}/newest") as asking, connect(url(sink)) as client:
+        wait_for(lambda: sink.num_clients == 2)
+        sink.send(message(0))
+        assert [one["type"] for one in received(client, 2)] == ["header", "frame"]
+        assert received(asking, 1)[0]["radii"] != [[0.02] * 26] * len(larger.sides)
+        for number in (1, 2):
+            sink.send(dataclasses.replace(message(number), header=larger))
+        asking.send("")
+        (header,) = received(asking, 1)
+        assert header["type"] == "header" and header["radii"] == [[0.02] * 26] * len(larger.sides)
+        asking.send("")
+        sink.send(dataclasses.replace(message(3), header=larger))
+        assert received(asking, 1)[0]["number"] == 3
+        heard = received(client, 2)
+        assert [one["type"] for one in heard] == ["header", "frame"] and heard[0] == header
+    sink.close()
+
+
 def test_a_tcp_client_gets_the_newest_line_for_each_line(message):
     sink = open_sink("tcp://:0?axes=unreal")
     with socket.create_connection(("127.0.0.1", sink.port)) as client, client.makefile("rwb") as lines:

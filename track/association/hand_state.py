@@ -48,6 +48,7 @@ _BIAS_VARIATION: Final = 0.3  # share of the hand's typical bias by which a bias
 _BIAS_DOUBT_TIME: Final = 0.5  # [s] unseen, after which a marker may be off by the typical bias again
 _AVERAGING_FRAMES: Final = 120.0  # that a bias is averaged over; one second at 120 Hz
 _FORGETTING_FRAMES: Final = 2400.0  # in which a bias that nothing confirms shrinks to a third
+_FORGOTTEN: Final = 1.7e-7  # [m] by which it shrinks in each frame; 0.02 mm in a second at 120 Hz
 _LEARNING_FRAMES: Final = 30.0  # after which the spread of a hand's markers is known
 _BIAS_REUSE_RMS: Final = 0.002  # [m] below which a hand that is initialized again keeps its biases
 _FEWEST_ON_DIGIT, _FEWEST_ON_PALM = 2, 3  # markers of which a fit leaves a residual that tells their spread
@@ -370,14 +371,15 @@ def _learn_bias(
         if not settled[marker] or np.isnan(residuals[marker, 0]):
             continue
         bias_frames[marker] = min(bias_frames[marker] + 1.0, _AVERAGING_FRAMES)
+        # A pose fits what all biases of a hand have in common as well: nothing else brings that back.
+        length = np.sqrt(bias[marker, 0] ** 2 + bias[marker, 1] ** 2 + bias[marker, 2] ** 2)
+        kept = max(1.0 - 1.0 / _FORGETTING_FRAMES - _FORGOTTEN / length, 0.0)
         square = 0.0
         for i in range(3):
             residual[i] = 0.0
             for j in range(3):
                 residual[i] += rotations[marker, j, i] * residuals[marker, j]
-            # A pose fits what all biases of a hand have in common as well: nothing else brings that back.
-            bias[marker, i] *= 1.0 - 1.0 / _FORGETTING_FRAMES
-            bias[marker, i] += residual[i] / bias_frames[marker]
+            bias[marker, i] = kept * bias[marker, i] + residual[i] / bias_frames[marker]
             square += residual[i] ** 2
         if on_part[digits[marker]] >= (_FEWEST_ON_DIGIT if digits[marker] >= 0 else _FEWEST_ON_PALM):
             variance[marker] += (square - variance[marker]) / bias_frames[marker]

@@ -12,6 +12,7 @@ markers' residuals. The spreads were chosen on simulated people (docs/calibratio
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
@@ -20,9 +21,10 @@ from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
 from gloves.fit import Attachment, GloveFit
+from gloves.takes.points import Status
 from handsim.errors import CalibrationError
 from handsim.hand.model import HandModel, build_skeleton
-from handsim.hand.shape import BONES, DIGITS, JOINT_NAMES, NUM_JOINTS, PALM, HandShape
+from handsim.hand.shape import BONES, DIGITS, JOINT_NAMES, NUM_JOINTS, PALM, HandShape, Side
 from handsim.hand.skin import rest_vertices
 from handsim.space.transforms import MIRROR, quaternion_matrix, rigid_fit
 from track.calibration.energy import (
@@ -52,6 +54,7 @@ from track.calibration.hand_parameters import (
     skin_points,
     skin_weights,
 )
+from track.frames import TrackedFrame
 from track.kinematics.pose_solver import PoseFit, PoseSolver
 
 _WIDE_STEPS: Final = 6  # at the first robust scale, which keeps distant markers
@@ -68,6 +71,9 @@ _INITIAL_FRAMES: Final = 800
 _FEWEST_MARKERS_OF_FRAME: Final = 6  # that a frame must have
 _LEAST_MARKER_SHARE: Final = 0.75  # of the markers that a frame must have
 _MOST_RMS_RATIO: Final = 3.0  # times the median RMS, up to which a frame is used
+_LOOK_PERIOD: Final = 1.0 / 30.0  # [s] between two poses in which a guide looks at joints
+_ASK_PERIOD: Final = 1.0  # [s] for which it asks for the same motion
+_LEAST_MOTION: Final = 30.0  # [s] with hands, before which it asks for touches
 _ENOUGH_RANGE: Final = 0.3  # share of a joint's range that the user should cover
 _LEAST_NOISE, _MOST_NOISE = 0.0001, 0.003  # [m]
 _CHI2_MEDIAN: Final = 2.366  # median of the chi-squared distribution with three degrees of freedom
@@ -176,16 +182,65 @@ class Calibration:
         """What to do in a better capture, as sentences; empty when nothing is missing."""
         hidden = self.held_out.hidden if self.held_out is not None else ""
         sentences = [f"let {hidden} be seen most of the time"] if hidden else []
-        for digit in DIGITS:
-            still = [name.removeprefix(f"{digit}_") for name in self.still_joints if name.startswith(digit)]
-            if still:
-                joints = ", ".join(joint.replace("_", " ") for joint in still)
-                sentences.append(f"move the {digit} more: {joints} covered too little of its range")
+        sentences += _motions(self.still_joints)
         touched = {touch.finger for touch in self.significant_touches}
         missing = [finger for finger in DIGITS[1:] if finger not in touched]
         if missing:
             sentences.append(f"touch the thumb to the tip of the {', '.join(missing)} finger and hold still")
         return tuple(sentences)
+
+
+def _motions(still: Sequence[str]) -> Iterator[str]:
+    """What to do with joints that moved too little, a sentence for each digit."""
+    for digit in DIGITS:
+        own = [name.removeprefix(f"{digit}_").replace("_", " ") for name in still if name.startswith(digit)]
+        if own:
+            yield f"move the {digit} more: {', '.join(own)} covered too little of its range"
+
+
+class MotionGuide:
+    """Says what users are still to move in front of the cameras, so that they can be calibrated.
+
+    Args:
+        hands: The hands that are tracked.
+    """
+
+    def __init__(self, hands: Sequence[GloveFit]) -> None:
+        self._hands = {hand.side: hand for hand in hands}
+        self._angles: dict[Side, list[NDArray[np.float64]]] = {side: [] for side in self._hands}
+        self._complete: dict[Side, list[NDArray[np.bool_]]] = {side: [] for side in self._hands}
+        self._looked, self._asked, self._wish = -np.inf, -np.inf, ""  # [s] of the last look and wish
+        self._looks = 0  # at which any hand was tracked
+
+    def __call__(self, tracked: TrackedFrame) -> str | None:
+        """What is still to be done after a frame; None when every joint has covered its range."""
+        if tracked.time >= self._looked + _LOOK_PERIOD:
+            self._looked = tracked.time
+            there = [hand for hand in tracked.hands if hand.status is Status.TRACKED]
+            self._looks += bool(there)
+            for hand in there:
+                seen = hand.markers.copy()
+                seen[hand.filled] = np.nan
+                self._angles[hand.side].append(hand.qpos[7:])
+                self._complete[hand.side].append(
+                    complete_digits(seen[None], self._hands[hand.side].attachment)[0]
+                )
+        if tracked.time >= self._asked + _ASK_PERIOD:
+            self._asked, self._wish = tracked.time, next(self._wishes(), "")
+        if not self._wish and self._looks * _LOOK_PERIOD >= _LEAST_MOTION:
+            return None
+        return self._wish or "touch the thumb to the tip of each finger and hold still"
+
+    def _wishes(self) -> Iterator[str]:
+        """What each hand is still to do."""
+        for side, hand in self._hands.items():
+            if not self._angles[side]:
+                yield f"no {side} hand is tracked yet"
+                continue
+            angles, complete = np.array(self._angles[side]), np.array(self._complete[side])
+            yield from (
+                f"{side} hand: {wish}" for wish in _motions(still_joints(angles, complete, hand.model))
+            )
 
 
 def calibrate_hand(

@@ -35,8 +35,10 @@ class FrameSource(Protocol):
 
     The points of a frame are in [m], times in [s]. It is iterated in a thread of its own, once; waiting for
     the next frame is its own affair, and so is an end: after the last frame the take is written. An exception
-    ends the stream in the same way, and is told. One that delivers frames faster than their times go on is
-    made to wait; of one that keeps their pace the oldest are dropped when they cannot be kept up with.
+    ends the stream in the same way, and is told. A `ConnectionError` or `TimeoutError` as the source is made
+    means that its server is not there yet; the command makes it again. One that delivers frames faster than
+    their times go on is made to wait; of one that keeps their pace the oldest are dropped when they cannot be
+    kept up with.
     """
 
     def __iter__(self) -> Iterator[StreamedFrame]:

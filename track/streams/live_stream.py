@@ -31,10 +31,10 @@ from gloves.captures.text import HIGHEST_RATE
 from handsim._checks import check_type
 from handsim._plugins import is_plugin, list_plugins, make_plugin
 from handsim.callbacks import Closing
-from handsim.errors import ArgumentError
+from handsim.errors import ArgumentError, HandSimError
 from handsim.settings import Limits, Settings
 from track.frames import FARTHEST, LATEST_TIME, StreamedFrame
-from track.streams import split_address
+from track.streams import NoServerError, split_address
 from track.streams.frame_source import LEAVE, ArrivingFrames, FrameSource, SourceStream
 
 VALID: Final = ("natnet://host", "natnet://host:port", "qtm://host", "qtm://host:port", "module:name")
@@ -130,7 +130,12 @@ def open_source(
         host, port, _ = split_address(address, options={}, port=PORT)
         frames = SourceStream(QualisysSource(host, port), address, waits=False)
     else:
-        source = make_plugin(address, group=GROUP, noun="frame source")
+        try:
+            source = make_plugin(address, group=GROUP, noun="frame source")
+        except HandSimError as error:
+            if isinstance(error.__cause__, ConnectionError | TimeoutError):
+                raise NoServerError(str(error)) from error
+            raise
         frames = SourceStream(source, address.partition("?")[0])
     return LiveStream(frames, silence=settings.silence, ended=ended)
 

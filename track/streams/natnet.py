@@ -15,6 +15,7 @@ import struct
 import sys
 import threading
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 from enum import IntEnum
 from pathlib import Path
@@ -275,15 +276,14 @@ def open_stream(url: str) -> PointStream:
         raise CaptureError(f"{url}: cannot be reached ({error.strerror or error})") from error
     try:
         info = _connect(commands, address, url)
-        sockets = [commands] if info.group is None else [commands, _join(info, commands, url)]
+        return PointStream(commands, address, info)
     except BaseException:
         commands.close()
         raise
-    return PointStream(sockets, address, info)
 
 
 class PointStream(ArrivingFrames):
-    """The frames of a server as they arrive, also after a restart of the server.
+    """The frames of a server as they arrive, also after a restart of the server with other settings.
 
     Only packets from the server's address and its two ports count. `poll` reads the socket in the tracker's
     thread: a reading thread would contend with it for the interpreter at every packet. While nobody polls, as
@@ -292,15 +292,17 @@ class PointStream(ArrivingFrames):
 
     without_points = "switch on Labeled Markers and Unlabeled Markers in Motive's streaming pane"
 
-    def __init__(self, sockets: list[socket.socket], address: tuple[str, int], server: ServerInfo) -> None:
+    def __init__(self, commands: socket.socket, address: tuple[str, int], server: ServerInfo) -> None:
         super().__init__()
+        self._sockets, self._address = [commands], address
+        self._joined: ServerInfo | None = None  # whose group is listened to
         self.server = server
         """The server's description of itself."""
         self.damaged = 0
         """Number of damaged packets."""
         self.foreign = 0
         """Number of packets of other senders."""
-        self._sockets, self._address = sockets, address
+        self._listen()
         self._has_lists = False  # whether a list of markers has ever held a point
         self._version = min(server.version, NEWEST)
         self._asked = self._kept_alive = self._heard = time.monotonic()
@@ -324,6 +326,9 @@ class PointStream(ArrivingFrames):
         """Return the frames that have arrived; wait up to `seconds` for one."""
         if self._closed.is_set():
             return []
+        if self._joined != self.server:
+            with self._reading, suppress(CaptureError):  # the next description may be of a group
+                self._listen()
         if seconds > 0.0 and not (self._arrived or self._ending):
             select.select(self._sockets, [], [], seconds)
         with self._reading:
@@ -346,6 +351,15 @@ class PointStream(ArrivingFrames):
         _send(self._sockets[0], pack(Kind.DISCONNECT), self._address)
         for one in self._sockets:
             one.close()
+
+    def _listen(self) -> None:
+        """Listen to the group of the server, which may have another one after a restart."""
+        server = self.server
+        while len(self._sockets) > 1:
+            self._sockets.pop().close()
+        if server.group is not None:
+            self._sockets.append(_join(server, self._sockets[0], f"natnet://{self._address[0]}"))
+        self._joined = server
 
     def _attend(self) -> None:
         """Send keep-alive packets, and empty the socket while the reader is busy."""

@@ -11,8 +11,8 @@ from typing import Any, Final
 import numpy as np
 
 from handsim._plugins import import_extra
-from handsim.errors import CaptureError
 from track.frames import StreamedFrame
+from track.streams import NoServerError
 
 PORT: Final = 22223
 """QTM's port for little-endian clients."""
@@ -84,7 +84,7 @@ class QualisysSource:
         except TimeoutError:
             connection = None
         if connection is None:
-            raise CaptureError(
+            raise NoServerError(
                 f"qtm://{self._host}:{self._port}: no QTM answers, expected one that runs there"
             )
         return connection
@@ -97,7 +97,7 @@ class QualisysSource:
                     return False
             try:
                 self._connection = await self._connect()
-            except CaptureError:
+            except NoServerError:
                 await asyncio.sleep(_RETRY)
                 continue
             self._subscribe()

@@ -403,6 +403,77 @@ def test_seconds_count_from_the_first_frame(tmp_path, monkeypatch):
     assert load_take(out).num_frames == 30, "not from the first silence"
 
 
+REFUSED = LATE.replace(
+    "class Late:",
+    """class Late:
+    tries = []
+
+    def __init__(self):
+        self.tries.append(0)
+        if len(self.tries) < 3:
+            raise ConnectionRefusedError("not yet")
+""",
+)
+
+
+def test_a_source_of_the_user_s_own_that_is_refused_is_tried_again(tmp_path, monkeypatch, capsys):
+    (tmp_path / "refused.py").write_text(REFUSED)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr("track.live._RETRY", 0.01)
+    out = tmp_path / "live.npz"
+    assert main(["track", "--live", "refused:Late", "--size", "M", "--out", str(out)]) == 0
+    assert load_take(out).num_frames == 30
+    assert capsys.readouterr().err.count("not yet") == 2
+
+
+PLAYED = """
+import numpy as np
+from gloves import read_capture
+from track import StreamedFrame
+
+class Played:
+    def __init__(self, file):
+        self.capture = read_capture(file)
+
+    def __iter__(self):
+        for number, points in enumerate(self.capture.positions):
+            seen = np.isfinite(points[:, 0])
+            yield StreamedFrame(number, number / self.capture.rate, points[seen], np.flatnonzero(seen))
+
+    def close(self):
+        pass
+"""
+
+
+@pytest.mark.parametrize("enough", [False, True])
+def test_a_user_is_calibrated_from_a_stream(enough, capture, tmp_path, monkeypatch, capsys):
+    (tmp_path / "played.py").write_text(PLAYED)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr("track.calibration.user_calibration._LOOK_PERIOD", 0.0)
+    monkeypatch.setattr("track.calibration.user_calibration._LEAST_MOTION", -1.0)
+    if enough:
+        monkeypatch.setattr("track.calibration.user_calibration.still_joints", lambda *seen: ())
+    calls = []
+
+    def calibrate(*arguments, **options):
+        calls.append(arguments)
+        return User((nominal_fit(load_layout("dense19"), "L", "right"),))
+
+    monkeypatch.setattr(captures, "calibrate", calibrate)
+    out = tmp_path / "user.json"
+    address = f"played:Played?file={capture}"
+    asked = ["--live", address, "--hands", "right", "--size", "L", "--out", str(out)]
+    assert main(["calibrate", *asked]) == 0
+    ((recorded, settings),) = calls
+    assert recorded == tmp_path / "user.calibration.npz" and settings.size == "L"
+    assert load_take(recorded).num_frames == (2 if enough else FRAMES)
+    assert load_user(out).sides == ("right",)
+    assert ("right hand: move the " in capsys.readouterr().err) is not enough
+    assert main(["calibrate", "--seconds", "9", str(capture), "--out", str(out)]) == 1
+    assert main(["calibrate", "--out", str(out)]) == 1
+    assert "neither a capture nor --live" in capsys.readouterr().err
+
+
 EMPTY = LATE.replace("time.sleep(1.0)", "").replace("np.full((6, 3), 0.1 * number), np.arange(6)", "*NOTHING")
 EMPTY = EMPTY.replace(
     "class Late:",

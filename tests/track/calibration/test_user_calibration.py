@@ -17,8 +17,8 @@ from handsim import HandModel, HandSimError, join_qpos
 from handsim.hand.shape import JOINT_NAMES, SIDES, named_shape
 from handsim.space.transforms import MIRROR
 from poses.motion import WristConfig, wrist_path
-from track import Calibration, HeldOut, User, load_user
-from track.calibration.user_calibration import calibrate_hand
+from track import Calibration, HeldOut, Status, TrackedFrame, TrackedHand, User, load_user
+from track.calibration.user_calibration import MotionGuide, calibrate_hand
 from train.simulation.scenes import CalibrationTakeConfig, calibration_angles
 
 LAYOUT = load_layout("dense19")
@@ -131,6 +131,47 @@ def test_a_finger_that_does_not_move_is_told():
     advice = " / ".join(result.suggestions())
     assert "move the ring more: MCP abduction, MCP flexion, PIP flexion, DIP flexion" in advice
     assert calibrated()["right"][1].length_errors[3, 0] < result.length_errors[3, 0]
+
+
+def test_a_guide_asks_for_what_is_missing_until_every_joint_has_moved():
+    hand, qpos = somebody()
+    guide, said, number = MotionGuide((hand,)), [], 0
+
+    def show(poses, *, hidden=()):
+        nonlocal number
+        filled = np.array(hidden, dtype=np.int64)
+        for pose, markers in zip(poses, markers_of(hand, poses), strict=True):
+            one = TrackedHand("right", Status.TRACKED, pose, 0.001, markers, filled)
+            said.append(guide(TrackedFrame(number / RATE, (one,), np.empty(0), np.empty(0))))
+            number += 1
+
+    lost = TrackedHand(
+        "right", Status.LOST, np.full(27, np.nan), np.nan, np.full((19, 3), np.nan), filled := np.arange(0)
+    )
+    assert guide(TrackedFrame(-2.0, (lost,), filled, filled)) == "no right hand is tracked yet"
+    still = qpos.copy()
+    still[:, 7 + RING] = np.deg2rad([0.0, 20.0, 25.0, 15.0])
+    show(still)
+    assert said[-1] == (
+        "right hand: move the ring more: MCP abduction, MCP flexion, PIP flexion, DIP flexion covered too "
+        "little of its range"
+    )
+    ring = [k for k, name in enumerate(LAYOUT.names) if name.startswith("Ring")]
+    show(qpos, hidden=ring[-1:])
+    assert "move the ring" in said[-1], "its markers were not all seen"
+    show(qpos)
+    assert said[-1] is None and number / RATE > 30.0
+    assert None not in said[: round(30.0 * RATE)]
+
+
+def test_touches_are_asked_for_before_half_a_minute_is_over():
+    hand, qpos = somebody()
+    guide, said = MotionGuide((hand,)), []
+    poses = qpos[np.arange(round(29.0 * RATE)) % len(qpos)]
+    for number, (pose, markers) in enumerate(zip(poses, markers_of(hand, poses), strict=True)):
+        one = TrackedHand("right", Status.TRACKED, pose, 0.001, markers, np.arange(0))
+        said.append(guide(TrackedFrame(number / RATE, (one,), np.empty(0), np.empty(0))))
+    assert said[-1] == "touch the thumb to the tip of each finger and hold still"
 
 
 def test_the_result_can_be_kept_and_drawn(tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import itertools
 import math
@@ -492,6 +493,38 @@ def test_multicast_is_heard_on_loopback():
             with stream:
                 sender.sendto(frame(1, (4, 1)), (group, port))
                 assert [one.number for one in itertools.islice(stream, 2)] == [0, 1]
+
+
+def test_a_server_that_comes_back_with_another_group_and_port_is_heard(monkeypatch):
+    monkeypatch.setattr(natnet, "_KEEP_ALIVE", 0.1)
+    monkeypatch.setattr(natnet, "_ATTENDED", 0.01)
+    with contextlib.ExitStack() as stack:
+        senders = [stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) for _ in range(2)]
+        infos = []
+        for sender, group in zip(senders, ("239.255.42.98", "239.255.42.97"), strict=True):
+            sender.bind((LOOPBACK, 0))
+            sender.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton(LOOPBACK))
+            infos.append(ServerInfo("puppet", (4, 1), sender.getsockname()[1], group))
+        with Puppet(infos[0]) as server:
+            try:
+                stream = stack.enter_context(contextlib.closing(open_stream(server.url)))
+                senders[0].sendto(frame(0, (4, 1)), (infos[0].group, infos[0].data_port))
+            except (CaptureError, OSError):
+                pytest.skip("no multicast on this machine's loopback")
+            assert frames(stream) == [0]
+            for number in (1, 0):  # and back again
+                server._answers = [natnet.pack_server_info(infos[number])]
+                stream._heard = 0.0  # long ago
+                wait_for(lambda number=number: (stream.poll(0.01), stream._joined == infos[number])[1])
+                senders[number].sendto(
+                    frame(5 + number, (4, 1)), (infos[number].group, infos[number].data_port)
+                )
+                assert frames(stream) == [5 + number]
+            server._answers = [natnet.pack_server_info(unicast((4, 1)))]
+            stream._heard = 0.0
+            wait_for(lambda: (stream.poll(0.01), len(stream._sockets) == 1)[1])
+            server.say(frame(9, (4, 1)))
+            assert frames(stream) == [9]
 
 
 def test_servers_that_cannot_be_used_are_told(monkeypatch):

@@ -12,7 +12,7 @@ import pytest
 
 from handsim.errors import CaptureError
 from track import open_source
-from track.streams import LOOPBACK
+from track.streams import LOOPBACK, NoServerError
 from track.streams.qualisys import QualisysSource
 
 ERROR, COMMAND, DATA, NO_MORE_DATA, EVENT = 0, 1, 3, 4, 6
@@ -154,7 +154,7 @@ def test_nobody_there_is_one_sentence():
     with socket.socket() as one:
         one.bind((LOOPBACK, 0))
         port = one.getsockname()[1]
-        with pytest.raises(CaptureError, match=rf"^qtm://127.0.0.1:{port}: no QTM answers, expected one"):
+        with pytest.raises(NoServerError, match=rf"^qtm://127.0.0.1:{port}: no QTM answers, expected one"):
             open_source(f"qtm://{LOOPBACK}:{port}")
 
 
