@@ -110,11 +110,12 @@ class LiveSizing(Closing):
         rms = [hand.rms for hand in tracked.hands if hand.status is Status.TRACKED]
         if self._steps or not self._is_done or not rms:
             return False
+        mean = sum(rms) / len(rms)
         self._calm += span
         if self._calm < _CALM:
-            self._usual += (float(np.mean(rms)) - self._usual) * span / self._calm
+            self._usual += (mean - self._usual) * span / self._calm
             self._newest = self._usual
-        self._newest += (float(np.mean(rms)) - self._newest) * span / _RECENT
+        self._newest += (mean - self._newest) * span / _RECENT
         return self._newest > _JUMP * self._usual
 
     def _begin_measuring(self, user: User) -> None:

@@ -106,10 +106,10 @@ class FakeTracker:
         self.sizes.append((user, keep))
 
 
-def shown(sizing, tracker, begin, seconds, *, there=True, points=20):
+def shown(sizing, tracker, begin, seconds, *, there=True, points=20, rms=0.001):
     """Show a stream of points, in which a hand is tracked or not."""
     status = Status.TRACKED if there else Status.LOST
-    hand = TrackedHand("right", status, np.zeros(NUM_QPOS), 0.001, np.zeros((19, 3)), np.arange(0))
+    hand = TrackedHand("right", status, np.zeros(NUM_QPOS), rms, np.zeros((19, 3)), np.arange(0))
     for number in range(round(seconds * RATE)):
         time = begin + number / RATE
         frame = StreamedFrame(number, time, np.zeros((points, 3)), np.arange(points))
@@ -139,6 +139,25 @@ def test_hands_are_measured_again_after_a_pause_and_another_user_is_taken_over_a
     shown(sizing, tracker, 73.5, 3.0, there=False, points=3)
     shown(sizing, tracker, 76.5, 1.5)
     assert len(calls) == 1 and tracker.user[0].shape.length > 0.19, "another hand"
+
+
+def test_another_user_is_noticed_by_the_residual_without_a_pause(monkeypatch):
+    setup = TrackerSetup.of(TrackSettings(hands="right"))
+    sizing, tracker = LiveSizing(setup), FakeTracker(setup.user)
+    measure, calls = found(0.187)
+    monkeypatch.setattr(live_sizing, "_measure", measure)
+    shown(sizing, tracker, 0.0, 30.0)
+    shown(sizing, tracker, 30.0, 20.0, rms=0.0013)
+    assert len(calls) == 2, "poses differ by so much"
+    shown(sizing, tracker, 50.0, 0.1, rms=0.003)
+    shown(sizing, tracker, 50.1, 5.0)
+    assert len(calls) == 2, "some wrong labels"
+    measure, calls = found(0.205)
+    monkeypatch.setattr(live_sizing, "_measure", measure)
+    shown(sizing, tracker, 55.1, 3.0, rms=0.003)
+    assert len(calls) == 1 and tracker.user[0].shape.length > 0.19
+    shown(sizing, tracker, 58.1, 30.0, rms=0.003)
+    assert len(calls) == 2, "this is the usual residual of this user"
 
 
 def test_points_that_are_no_hand_are_measured_less_and_less_often(monkeypatch):

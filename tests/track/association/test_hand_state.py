@@ -9,7 +9,13 @@ from gloves import load_layout
 from gloves.fit import nominal_fit
 from handsim import join_qpos
 from poses.shapes import resting_angles
-from track.association.hand_state import MOST_AGE_LOG_ODDS, SEEN_ELSEWHERE, STRAY_LIFETIME, HandState
+from track.association.hand_state import (
+    MOST_AGE_LOG_ODDS,
+    SEEN_ELSEWHERE,
+    STRAY_LIFETIME,
+    HandState,
+    _learn_bias,
+)
 
 RATE, KNUCKLE, TIP = 120.0, 4, 6
 
@@ -72,6 +78,30 @@ def test_the_bias_of_a_marker_is_learned_and_its_designed_position_is_known(foll
     designed = HandState(state.hand).solver.marker_positions(estimate.qpos)
     np.testing.assert_allclose(state.unbiased_positions(estimate), designed, atol=1e-6)
     assert state.rms_without_bias(estimate) > 3.0 * estimate.rms
+
+
+def test_a_small_bias_is_forgotten_and_a_large_one_stays(followed):
+    """Of what nothing confirms 0.02 mm go in a second, whatever there is."""
+    off = np.zeros((19, 3))
+    off[KNUCKLE] = 0.0, 0.004, 0.004
+    state = followed(off=off)
+    before = np.linalg.norm(state.biases.bias, axis=1)
+    none, turned = np.zeros((19, 3)), np.tile(np.eye(3), (19, 1, 1))
+    bias, frames = state.biases.bias, np.full(19, 120.0)
+    for _ in range(120):
+        _learn_bias(
+            none,
+            turned,
+            np.ones(19, dtype=bool),
+            state.digits,
+            np.ones(5, dtype=bool),
+            frames,
+            bias,
+            np.ones(19),
+        )
+    gone = before - np.linalg.norm(bias, axis=1)
+    np.testing.assert_allclose(gone, np.minimum(before, 2e-5 + 0.049 * before), atol=2e-6)
+    assert np.isfinite(bias).all()
 
 
 def test_only_settled_labels_teach_a_bias(moving):
