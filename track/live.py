@@ -176,7 +176,7 @@ def _open_answering(address: str, ended: Callable[[], bool], status: LiveStatus)
         try:
             return open_source(address, ended=ended)
         except NoServerError as error:
-            status.show(f"{error}; it is waited for, Ctrl-C ends it", now=True)
+            status.show(f"{error}; it is waited for, Ctrl-C ends it")
             sleep(_RETRY)  # some are refused at once
 
 

@@ -17,7 +17,6 @@ from track.config import BOTH, Size
 if TYPE_CHECKING:
     from track.calibration.user_calibration import Calibration
 
-
 _LONGEST: Final = 180.0  # [s] of a stream that is recorded
 
 

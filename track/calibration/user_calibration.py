@@ -238,9 +238,8 @@ class MotionGuide:
                 yield f"no {side} hand is tracked yet"
                 continue
             angles, complete = np.array(self._angles[side]), np.array(self._complete[side])
-            yield from (
-                f"{side} hand: {wish}" for wish in _motions(still_joints(angles, complete, hand.model))
-            )
+            for wish in _motions(still_joints(angles, complete, hand.model)):
+                yield f"{side} hand: {wish}"
 
 
 def calibrate_hand(
