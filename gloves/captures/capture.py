@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
 from gloves.captures.text import check_rate
-from handsim.errors import ArgumentError, CaptureError, HandSimWarning, choices
+from handsim.errors import ArgumentError, CaptureError, HandSimWarning, choices, errors_of
 from handsim.kernels import kernel, squared_distance
 
 
@@ -113,10 +113,8 @@ def select_hands(capture: Capture, names: Sequence[str]) -> list[Float[np.ndarra
     for prefix in sets:
         mine = [number for number, (other, _) in enumerate(columns) if other == prefix]
         part = Capture(tuple(columns[number][1] for number in mine), capture.positions[:, mine], capture.rate)
-        try:
+        with errors_of(f"columns '{prefix}:...'", CaptureError):
             markers = select_markers(part, names)
-        except CaptureError as error:
-            raise CaptureError(f"columns '{prefix}:...': {error}") from error
         hands.append(markers[np.isfinite(markers[..., 0]).any(axis=1)])
     return hands
 
