@@ -18,8 +18,8 @@ from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
 from gloves.captures.capture import Capture, check_unit
+from gloves.takes.bodies import RigidBody
 from gloves.takes.points import Status
-from gloves.takes.take import RigidBody
 from handsim._checks import check_array, check_type
 from handsim.errors import ArgumentError, CalibrationError, HandSimError, choices, errors_of
 from handsim.files.inputs import check_keys, numbers, quoted, read_toml, tables_of, text_of, written

@@ -31,7 +31,8 @@ from gloves.optics.visibility import (
     free_rays,
     hand_tree,
 )
-from gloves.takes.take import RigidBody, Take
+from gloves.takes.bodies import RigidBody
+from gloves.takes.take import Take
 from handsim.hand.shape import PALM
 from handsim.settings import Limits, Settings
 from handsim.space.rig import CameraRig, check_outside
