@@ -4,19 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from gloves.captures.capture import Capture
 from gloves.captures.formats import write_capture
 from handsim.errors import ArgumentError
-from handsim.hand.model import KEYPOINT_NAMES, hand_keypoints, is_steady
+from handsim.hand.model import KEYPOINT_NAMES, hand_keypoints
 from handsim.motion_files.motion import (
     OPENXR_SUFFIX,
     Motion,
-    PosedBody,
-    PosedHand,
     write_bvh,
     write_joint_csv,
     write_joint_parquet,
@@ -25,17 +23,6 @@ from handsim.motion_files.motion import (
 )
 from handsim.motion_files.scenes import write_glb, write_usd
 from handsim.space.transforms import UpAxis, file_axes
-
-if TYPE_CHECKING:
-    from gloves.takes.take import Take
-
-
-def posed_motion(take: Take, neutral: tuple[float, float] | None = None) -> Motion:
-    """The hands and bodies of a take as the writers of motion files need them; each has a pose somewhere."""
-    zeros = [None if neutral is None else take.mean_pose(side, neutral) for side in take.sides]
-    hands = [PosedHand.of(hand.model, take.qpos[:, n], zeros[n]) for n, hand in enumerate(take.hands)]
-    bodies = [PosedBody.of(one.name, one.shape, take.body_poses[:, n]) for n, one in enumerate(take.bodies)]
-    return Motion(take.rate, take.times, hands, bodies)
 
 
 class MotionFormat(NamedTuple):
@@ -48,12 +35,6 @@ class MotionFormat(NamedTuple):
     """Whether frames are written without times, so that they must come at a steady rate."""
     keeps_axes: bool = False
     """Whether positions stay in the take's axes, whatever points up."""
-
-    def take_of(self, take: Take, rate: float | None) -> Take:
-        """The poses of a take that are written, at a rate if given."""
-        poses = take.poses_alone(rate)
-        steady = not self.steady or is_steady(poses.times, poses.rate)
-        return poses if steady else poses.poses_alone(poses.rate)
 
 
 def motion_format(path: Path) -> MotionFormat:

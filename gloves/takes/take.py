@@ -22,7 +22,7 @@ from gloves.fit import Attachment, GlovedHand, GloveFit
 from gloves.layout import stored_layout
 from gloves.takes.archives import SCHEMA, read_archive, settings_of, write_archive
 from gloves.takes.bodies import RigidBody, body_arrays, stored_body
-from gloves.takes.motion_formats import MOTION_FORMATS, motion_format, posed_motion
+from gloves.takes.motion_formats import MOTION_FORMATS, MotionFormat, motion_format
 from gloves.takes.points import (
     ATTACHMENT,
     FRAMES,
@@ -50,6 +50,7 @@ from handsim.hand.model import (
     between_poses,
     bridge_gaps,
     hand_keypoints,
+    is_steady,
     times_at,
 )
 from handsim.hand.shape import (
@@ -61,6 +62,7 @@ from handsim.hand.shape import (
     pack_hand,
     unpack_hand,
 )
+from handsim.motion_files.motion import Motion, PosedBody, PosedHand
 from handsim.space.transforms import UpAxis
 
 SUFFIX: Final = ".truth.npz"
@@ -676,7 +678,7 @@ class Take:
             raise ArgumentError(
                 f"neutral is {neutral} and the file {path}, expected .csv or .parquet with the ISB's angles"
             )
-        take = form.take_of(self, None if rate is None else float(rate))
+        take = poses_for(form, self, None if rate is None else float(rate))
         form.write(path, posed_motion(take, neutral), up)
 
     def save(self, path: str | Path) -> None:
@@ -700,6 +702,20 @@ class Take:
     def _known(self) -> tuple[Column, ...]:
         """The optional columns of this take."""
         return tuple(column for column in OPTIONAL if getattr(self, column.name) is not None)
+
+
+def poses_for(form: MotionFormat, take: Take, rate: float | None) -> Take:
+    """The poses of a take that a format writes, at a rate if given."""
+    poses = take.poses_alone(rate)
+    return poses.poses_alone(poses.rate) if form.steady and not is_steady(poses.times, poses.rate) else poses
+
+
+def posed_motion(take: Take, neutral: tuple[float, float] | None = None) -> Motion:
+    """The hands and bodies of a take as the writers of motion files need them; each has a pose somewhere."""
+    zeros = [None if neutral is None else take.mean_pose(side, neutral) for side in take.sides]
+    hands = [PosedHand.of(hand.model, take.qpos[:, n], zeros[n]) for n, hand in enumerate(take.hands)]
+    bodies = [PosedBody.of(one.name, one.shape, take.body_poses[:, n]) for n, one in enumerate(take.bodies)]
+    return Motion(take.rate, take.times, hands, bodies)
 
 
 def load_take(path: str | Path) -> Take:

@@ -59,14 +59,14 @@ def _export_take(
     source: Path, out: Path, fps: float | None, up: UpAxis, neutral: tuple[float, float] | None
 ) -> None:
     from gloves.takes.motion_formats import motion_format
-    from gloves.takes.take import load_take
+    from gloves.takes.take import load_take, poses_for
 
     form = motion_format(out)
     check_outputs([source], [out])
     take = load_take(source)
     if not np.isfinite(take.qpos[..., 0]).any():
         raise CaptureError(f"{source}: there is no hand in any frame, expected one to export")
-    motion = form.take_of(take, fps)
+    motion = poses_for(form, take, fps)
     motion.export(out, up=up, neutral=neutral)
     sides = " and ".join(motion.sides)
     things = "".join(f", {body.name}" for body in motion.bodies)

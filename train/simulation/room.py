@@ -1,7 +1,7 @@
 """The simulated capture room: its light sources, the cameras that see them, and the recorded take.
 
 How often cameras drop out and how many reflections flash is fitted to the four test captures of Han et al.
-2018: to Table 3 and to the ghost ratios of Table 4 (docs/room_numbers.md says what was fitted to what).
+2018: to Table 3 and to the ghost ratios of Table 4 (docs/room.md has the fitted numbers).
 """
 
 from __future__ import annotations

@@ -12,7 +12,7 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from gloves.takes.motion_formats import posed_motion
+from gloves.takes.take import posed_motion
 from handsim import HandModel, HandSimWarning, join_qpos
 from handsim.errors import CaptureError
 from handsim.hand.model import KEYPOINT_NAMES, hand_keypoints

@@ -12,7 +12,7 @@ import trimesh
 from scipy.spatial.transform import Rotation, Slerp
 
 from gloves import Take, attach, load_layout
-from gloves.takes.motion_formats import posed_motion
+from gloves.takes.take import posed_motion
 from handsim import HandModel, HandSimError, join_qpos
 from handsim.motion_files.scenes import write_glb, write_usd
 
