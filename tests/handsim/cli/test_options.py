@@ -29,8 +29,8 @@ ELSEWHERE = {
     "demo": "out", "hand": "out mesh", "glove list": "out", "glove check": "out", "glove score": "out",
     "glove improve": "out", "rig import": "out", "rig score": "out json", "rig plan": "out",
     "generate": "out workers cluster sampler", "train": "out threads", "label": "out threads",
-    "export": "out", "evaluate": "json threads", "simulate": "out cluster", "calibrate": "out",
-    "track": "out live seconds send labelled", "report": "out", "replay": "host port rate loop",
+    "export": "out", "evaluate": "json threads", "simulate": "out cluster",
+    "calibrate": "out live seconds", "track": "out live seconds send labelled", "report": "out", "replay": "host port rate loop",
     "view": "host port out video live", "body": "out", "doctor": "compile send",
     "render": "out merge format workers cluster painter frames-per-shard",
 }  # fmt: skip
