@@ -30,9 +30,9 @@ ELSEWHERE = {
     "glove improve": "out", "rig import": "out", "rig score": "out json", "rig plan": "out",
     "generate": "out workers cluster sampler", "train": "out threads", "label": "out threads",
     "export": "out", "evaluate": "json threads", "simulate": "out cluster",
-    "calibrate": "out live seconds", "track": "out live seconds send labelled", "report": "out", "replay": "host port rate loop",
-    "view": "host port out video live", "body": "out", "doctor": "compile send",
-    "render": "out merge format workers cluster painter frames-per-shard",
+    "calibrate": "out live seconds", "track": "out live seconds send labelled", "report": "out",
+    "replay": "host port rate loop", "view": "host port out video live", "body": "out",
+    "doctor": "compile send", "render": "out merge format workers cluster painter frames-per-shard",
 }  # fmt: skip
 """Options that say only where something is or goes, as what, or how quickly."""
 SHOWN = {"view": "rig time up glove size shape hands body labeler", "glove improve": "captures"}
