@@ -73,6 +73,7 @@ _LEAST_NOISE, _MOST_NOISE = 0.0001, 0.003  # [m]
 _CHI2_MEDIAN: Final = 2.366  # median of the chi-squared distribution with three degrees of freedom
 _USUAL_SPREAD_COORDINATES: Final = 12.0  # coordinates of markers that the usual spread counts as
 _INDEPENDENT_POSES: Final = 14.0  # frames whose deformation of the flesh is independent
+_FLESH_REPEATS: Final = 0.7  # added to variances by flesh, which follows the angles alike in all of these
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -223,6 +224,8 @@ def calibrate_hand(
         before = contact_gaps(right.model, touches, touching.qpos)
     final = PoseSolver(done).solve(seen, rough_track.qpos)
     covariance, answers = shared_covariance(problem, estimate, fit)
+    flesh = 1.0 - (problem.robust_scale / (_SCALE_IN_NOISES * problem.noise)) ** 2
+    covariance *= 1.0 + _FLESH_REPEATS * flesh
     position_errors, length_errors = standard_errors(problem, estimate, fit, covariance)
     return Calibration(
         hand=done.with_side(start.side),
@@ -232,7 +235,7 @@ def calibrate_hand(
         shifts=np.linalg.norm(fit.design_residuals, axis=1),
         position_errors=position_errors,
         length_errors=length_errors,
-        angle_errors=angle_errors(covariance, answers),
+        angle_errors=angle_errors(covariance, answers, problem.pose_precision),
         touches=_touches(estimate, fit, touches, usable, before, mirror),
         still_joints=still_joints(final.qpos[:, 7:], complete, done.model),
     )
