@@ -40,9 +40,7 @@ from track.user import hand_origin, read_errors
 _ACCELERATIONS: Final = np.repeat([10.0, 0.5, 10.0], [NUM_JOINTS, 3, 3])
 """Power of unforeseen accelerations: of hinges [rad^2/s^3], of the wrist [m^2/s^3], [rad^2/s^3]."""
 _GESTURES: Final = 30.0  # [1/s] how often the prior of the hinges counts: errors of markers last that long
-_WEAK: Final = np.repeat(
-    [0.0, 1.0], [NUM_JOINTS, 6]
-)  # [1/m^2], [1/rad^2] of a wrist whose hand shows no marker
+_WEAK: Final = np.repeat([0.0, 1.0], [NUM_JOINTS, 6])  # [1/m^2, 1/rad^2] of a wrist that no marker shows
 _WINDOW, _MARGIN = 2000, 200  # frames that are solved together, and those more at either end
 _ROUNDS: Final = 5  # steps of a fit
 _LONGEST_STEP: Final = 0.5  # [rad], [m]
@@ -129,12 +127,10 @@ class _SmoothedHand:
 
     def __init__(self, take: Take, number: int) -> None:
         worn = self._worn = take.hands[number]
-        self.qpos = take.qpos[:, number].copy()
-        """Poses (T, 27), NaN where the hand is lost."""
+        self.qpos = take.qpos[:, number].copy()  # (T, 27), NaN where the hand is lost
+        # Standard deviations of joint angles (T, 20) [rad] and of keypoints (T, 21) [m].
         self.angles = np.full((take.num_frames, NUM_JOINTS), np.nan)
-        """Standard deviations of joint angles (T, 20) [rad]."""
         self.keypoints = np.full((take.num_frames, NUM_KEYPOINTS), np.nan)
-        """Standard deviations of keypoints (T, 21) [m]."""
         self._targets = np.ascontiguousarray(take.observed(worn.side))
         self._unseen = times_unseen(take.times, np.isfinite(self._targets[..., 0]))
         self._residuals = np.full_like(self._targets, np.nan)  # in the frames of the bones [m]

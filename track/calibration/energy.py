@@ -365,12 +365,8 @@ def find_touches(
     touches: list[tuple[int, str]] = []
     for number, finger in enumerate(FINGERS):
         speed = _speed(model, angles, finger, window, rate)
-        good = (
-            (speed < _MOST_TOUCH_SPEED)
-            & (gaps[:, number] < _MOST_TOUCH_GAP)
-            & (gaps.argmin(axis=1) == number)
-        )
-        good &= complete[:, 0] & complete[:, number + 1]
+        good = (speed < _MOST_TOUCH_SPEED) & (gaps[:, number] < _MOST_TOUCH_GAP)
+        good &= (gaps.argmin(axis=1) == number) & complete[:, 0] & complete[:, number + 1]
         shortest = max(2, round(_SHORTEST_HOLD * rate))
         stillest = [
             first + int(speed[first : last + 1].argmin())
@@ -428,8 +424,7 @@ def _nearest_skin_points(model: HandModel, bones: NDArray[np.float64], finger: s
     ends = np.stack([pads[0][first], pads[1][second]])
     direction = (ends[1] - ends[0]) / apart.min()
     radii = model.shape.radii[[0, DIGITS.index(finger)], 2:].mean(axis=1)
-    skin: NDArray[np.float64] = ends + radii[:, None] * np.stack([direction, -direction])
-    return skin
+    return np.asarray(ends + radii[:, None] * np.stack([direction, -direction]))
 
 
 def slide_contacts(
@@ -493,8 +488,7 @@ def _blend_transforms(
 ) -> NDArray[np.float64]:
     """Blended transforms (K, 3, 4) from the rest hand to the world, each for its point and frame."""
     motion = (T_world_bone @ np.linalg.inv(model.rest_transforms))[:, :, :3]
-    blends: NDArray[np.float64] = np.einsum("kl,klij->kij", skin_weights(coordinates), motion)
-    return blends
+    return np.asarray(np.einsum("kl,klij->kij", skin_weights(coordinates), motion))
 
 
 def levenberg_marquardt(

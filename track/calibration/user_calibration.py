@@ -170,8 +170,7 @@ class Calibration:
         if not self.significant_touches:
             return np.full(2, np.nan)
         pairs = np.abs([[touch.gap_before, touch.gap_after] for touch in self.significant_touches])
-        means: NDArray[np.float64] = pairs.mean(axis=0)
-        return means
+        return np.asarray(pairs.mean(axis=0))
 
     def suggestions(self) -> tuple[str, ...]:
         """What to do in a better capture, as sentences; empty when nothing is missing."""
@@ -327,8 +326,7 @@ def informative_frames(track: PoseFit, markers: Float[np.ndarray, "T M 3"]) -> N
     while len(chosen) < min(NUM_FRAMES, len(candidates)):
         distance = np.minimum(distance, ((angles - angles[chosen[-1]]) ** 2).sum(axis=1))
         chosen.append(int(distance.argmax()))
-    picked: NDArray[np.int64] = candidates[np.sort(chosen)]
-    return picked
+    return np.asarray(candidates[np.sort(chosen)])
 
 
 def marker_noise(problem: Problem, fit: Fit) -> float:
@@ -371,11 +369,8 @@ def _learned(
 ) -> float:
     """A spread [m] of offsets from zero, by their squares and posterior variances summed over axes."""
     determined = np.clip(axes - variances / spread**2, 0.0, None).sum()
-    return float(
-        np.sqrt(
-            (squares.sum() + _USUAL_SPREAD_COORDINATES * usual**2) / (determined + _USUAL_SPREAD_COORDINATES)
-        )
-    )
+    total, usual_count = squares.sum() + _USUAL_SPREAD_COORDINATES * usual**2, _USUAL_SPREAD_COORDINATES
+    return float(np.sqrt(total / (determined + usual_count)))
 
 
 def standard_errors(

@@ -437,7 +437,10 @@ class SpreadModel:
         prior = share * resting_prior().precision
         variances, keypoints = pose_spreads(self._hand, prior, doubt, qpos, unseen, smoothed)
         if self._angle_errors is not None:
-            variances[..., [1, 3]] = np.maximum(variances[..., [1, 3]], self._angle_errors**2)
+            unsure, errors = variances[..., [1, 3]], self._angle_errors**2
+            # What is open of a hand moves its keypoints as it moves its angles.
+            keypoints *= max(1.0, np.sqrt(errors.sum() / unsure.mean(axis=0).sum()))
+            variances[..., [1, 3]] = np.maximum(unsure, errors)
         return variances, keypoints
 
 
