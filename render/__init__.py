@@ -15,6 +15,9 @@ if TYPE_CHECKING:
     from render.color_sensor import ShutterConfig as ShutterConfig
     from render.config import RenderConfig as RenderConfig
     from render.depth_sensor import DepthSensor as DepthSensor
+    from render.film.film import annotate_film as annotate_film
+    from render.film.film import register_camera as register_camera
+    from render.film.registration import Registration as Registration
     from render.formats.writer import merge_renderings as merge_renderings
     from render.frames import BodyTruth as BodyTruth
     from render.frames import HandTruth as HandTruth

@@ -10,7 +10,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import cv2
 import numpy as np
@@ -63,6 +63,9 @@ from render.studio import FrameChoices, Moment, Studio
 from render.subject import Model, PoseFile, Source, Subject, load_subject, source_of
 from render.user_body import UserBody
 from render.viewpoints import ViewConfig, Viewpoints, check_hands_in_view
+
+if TYPE_CHECKING:
+    from render.film.film import FilmReader
 
 _MOST_STUDIOS: Final = 32  # largest number of studios that are kept, some 5 MB each
 
@@ -146,7 +149,12 @@ class Drawing:
         # Poses that are no motion are many people's, except before one person's eyes.
         has_user = self.subject.is_motion or config.view.placement == "head"
         self._user = UserBody(self.take) if has_user else None
-        self.viewpoints = Viewpoints(config.view, self.take, rng=rng, up=config.up, user=self._user)
+        film = subject.film
+        self._film = None if film is None else film.open()
+        poses = None if film is None else film.poses
+        self.viewpoints = Viewpoints(
+            config.view, self.take, rng=rng, up=config.up, user=self._user, poses=poses
+        )
         self._studio_of = functools.lru_cache(maxsize=_MOST_STUDIOS)(self._studio_of_person)
 
     def frames_without_hands(self) -> list[int]:
@@ -185,6 +193,7 @@ class Drawing:
         config, cast = self.config, self.subject.cast
         viewpoints = self.viewpoints
         several = viewpoints.num_cameras > 1 or (viewpoints.moves and config.vary == "shard")
+        several &= self._film is None
         around = viewpoints.positions() if several else None
         rng = SpawnKey.SHARD.rng(config.seed, shard, 0)
         if cast is None:  # a take has its own hands, whose looks change with the shard
@@ -232,7 +241,12 @@ class Drawing:
 
     def _open_studio(self, hands: Sequence[GloveFit], rng: np.random.Generator) -> Studio:
         return open_studio(
-            hands, self.config, bodies=self.take.bodies, rng=rng, has_user=self._user is not None
+            hands,
+            self.config,
+            bodies=self.take.bodies,
+            rng=rng,
+            has_user=self._user is not None,
+            film=self._film,
         )
 
 
@@ -243,6 +257,7 @@ def open_studio(
     bodies: Sequence[RigidBody] = (),
     rng: np.random.Generator,
     has_user: bool = False,
+    film: FilmReader | None = None,
 ) -> Studio:
     """A studio of one person with random looks, whose wrists a `UserBody` may bend."""
     people = sample_people(len(hands), config.dress == "glove", tones=config.tones, rng=rng)
@@ -251,7 +266,8 @@ def open_studio(
         people = tuple(dataclasses.replace(one, forearm=straight) for one in people)
     colors = [tuple(rng.uniform(0.05, 0.9, 3).tolist()) for _ in bodies]
     assert config.painter != "auto"
-    return Studio(hands, people, bodies, colors, config.passes, config.painter, room_depth=config.room_depth)
+    room = config.room_depth
+    return Studio(hands, people, bodies, colors, config.passes, config.painter, room_depth=room, film=film)
 
 
 def sample_choices(
@@ -292,7 +308,7 @@ _ON_SHEET: Final = 9  # pictures on a contact sheet
 
 
 def render_take(
-    source: Take | str | Path | PoseFile | ArrayLike,
+    source: Take | str | Path | PoseFile | Subject | ArrayLike,
     out: str | Place,
     formats: str | Sequence[str] = ("webdataset",),
     config: RenderConfig | None = None,
@@ -356,7 +372,8 @@ def render_take(
     for one in cameras if not all(WRITERS[name].any_lens for name in formats) else ():
         centered_K(one)  # refuses other lenses before a folder is begun
     check_hands_in_view(config.view, drawing.viewpoints, drawing.take)
-    if absent := drawing.frames_without_hands():
+    absent = drawing.frames_without_hands()
+    if absent and drawing.subject.film is None:  # frames of a video are left out for reasons that are told
         told = f"frames without a hand are not drawn: {len(absent)} of {drawing.take.num_frames}"
         warnings.warn(f"{told} (the first: {absent[0]})", HandSimWarning, stacklevel=2)
     shards, views = drawing.shards(), drawing.viewpoints.num_cameras

@@ -6,7 +6,7 @@ import dataclasses
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import cv2
 import numpy as np
@@ -45,6 +45,9 @@ from render.scenery.backgrounds import Background, Enclosure, draw_surroundings,
 from render.scenery.lights import Lighting
 from render.skin.look import SkinLook, upper_arms
 from render.user_body import UserBody
+
+if TYPE_CHECKING:
+    from render.film.film import FilmReader
 
 
 def _allowed_parts() -> Flags:
@@ -199,8 +202,10 @@ class Studio:
         painter: Painter = "compiled",
         *,
         room_depth: bool = True,
+        film: FilmReader | None = None,
     ) -> None:
         self.passes, self.painter, self._room_depth = tuple(passes), painter, room_depth
+        self._film = film  # whose pictures take the place of drawn colors
         self._people = tuple(people)
         self._looks = [dataclasses.asdict(look) for look in people]
         first = np.cumsum([0, *(len(fit.attachment.points) for fit in hands)])
@@ -238,7 +243,7 @@ class Studio:
         truth = see(camera, surfaces, with_normals=sensor is not None or "normals" in self.passes)
         rgb = noisy_rgb = noisy_depth = None
         if "rgb" in self.passes:
-            rgb = self._colors_of(camera, drawn, choices)
+            rgb = self._colors_of(camera, drawn, choices) if self._film is None else self._film.picture(frame)
             noisy_rgb = self._exposed(moment, camera, rgb, choices, rng)
         seen = truth
         if choices.enclosure is not None and self._room_depth:
@@ -395,6 +400,8 @@ class Studio:
         )
 
     def _record(self, choices: FrameChoices) -> dict[str, Any]:
+        if self._film is not None:
+            return {"film": self._film.name}
         record = _as_record(dataclasses.replace(choices, seed=0)) | {"seed": choices.seed}
         return {"people": self._looks, "body_colors": self._colors, **record}
 

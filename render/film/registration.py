@@ -106,6 +106,19 @@ class Registration:
         """Index of the camera of a frame of the video."""
         return int(np.searchsorted(self.starts, number, side="right")) - 1
 
+    def camera_of(self, number: int) -> Camera:
+        """The camera of a frame of the video."""
+        return self.cameras[self.span(number)]
+
+    def left_out(self) -> list[str]:
+        """How many frames do not count, and why."""
+        told = sorted(set(self.reasons) - {""})
+        return [f"{self.reasons.count(reason)} frames: {reason}" for reason in told]
+
+    def residual(self) -> float:
+        """Median distance of the found keypoints from the take's in the frames that count [px]."""
+        return float(np.median(np.linalg.norm(self.errors, axis=1))) if len(self.errors) else float("nan")
+
     def doubts(self) -> list[str]:
         """What the hands tell badly, as sentences."""
         found = self.deviations
@@ -116,19 +129,18 @@ class Registration:
                 "the camera and away from it."
             )
         if found["offset"] > 0.003:
-            told.append(
-                f"The clock is known to {1e3 * found['offset']:.1f} ms only: the hands hardly move."
-            )
+            told.append(f"The clock is known to {1e3 * found['offset']:.1f} ms only: the hands hardly move.")
         if found["position"] > 0.004:
             told.append(f"The camera's place is known to {1e3 * found['position']:.1f} mm only.")
         if len(self.cameras) > 1:
             when = ", ".join(f"{self.times[self.numbers >= start][0]:.1f} s" for start in self.starts[1:])
-            told.append(f"The camera was moved at {when}: there are {len(self.cameras)} spans, each with its pose.")
+            told.append(
+                f"The camera was moved at {when}: there are {len(self.cameras)} spans, each with its pose."
+            )
         return told
 
     def record(self) -> dict[str, Any]:
         """The registration as JSON."""
-        left = {reason: self.reasons.count(reason) for reason in sorted(set(self.reasons) - {""})}
         return {
             "cameras": [camera.record() for camera in self.cameras],
             "starts": list(self.starts),
@@ -137,7 +149,7 @@ class Registration:
             "readout": self.readout,
             "deviations": self.deviations,
             "frames": len(self.reasons),
-            "left_out": left,
+            "left_out": self.left_out(),
             "doubts": self.doubts(),
         }
 
@@ -225,7 +237,9 @@ class _Samples(NamedTuple):
 class _Bundle:
     """Clock, lens and poses of a camera, from keypoints in its pictures."""
 
-    def __init__(self, motion: _Motion, found: _Detections, size: tuple[int, int], given: Camera | None) -> None:
+    def __init__(
+        self, motion: _Motion, found: _Detections, size: tuple[int, int], given: Camera | None
+    ) -> None:
         self.motion, self.found, self.size = motion, found, size
         self._given, self._middle = given, float(np.median(found.times))
         if given is not None:  # the pictures of a pinhole camera with this matrix
@@ -366,7 +380,14 @@ class _Bundle:
             return np.concatenate([rows, prior])[:, free]
 
         done = least_squares(
-            residuals, start[free], jacobian, loss="cauchy", x_scale=scale[free], max_nfev=40, xtol=1e-6, ftol=1e-6
+            residuals,
+            start[free],
+            jacobian,
+            loss="cauchy",
+            x_scale=scale[free],
+            max_nfev=40,
+            xtol=1e-6,
+            ftol=1e-6,
         )
         unknowns = start.copy()
         unknowns[free] = done.x
@@ -425,7 +446,9 @@ class _Bundle:
             jacobian[mine] = weight[..., None] * part
         return residuals, jacobian
 
-    def _covariance(self, residuals: Doubles, jacobian: Doubles, priors: Doubles, frames: Integers) -> Doubles:
+    def _covariance(
+        self, residuals: Doubles, jacobian: Doubles, priors: Doubles, frames: Integers
+    ) -> Doubles:
         """Covariance of the unknowns; residuals within a block of time are dependent, those of others not."""
         weights = 1.0 / (1.0 + residuals**2)  # of the robust loss
         rows = jacobian.reshape(-1, jacobian.shape[-1])
@@ -597,9 +620,7 @@ def _affine_residuals(sums: Doubles) -> Doubles:
     return np.where(variance > 1e-9, (sums[18] - explained) / np.maximum(variance, 1e-9), np.inf)
 
 
-def _split(
-    bundle: _Bundle, unknowns: Doubles, starts: list[int], noise: float
-) -> tuple[Doubles, list[int]]:
+def _split(bundle: _Bundle, unknowns: Doubles, starts: list[int], noise: float) -> tuple[Doubles, list[int]]:
     """The unknowns with a span more for each time at which the camera was moved."""
     while len(starts) < _MOST_SPANS:
         matches = bundle.match(unknowns, starts, 0.3 * bundle.size[0])
@@ -619,9 +640,7 @@ def _split(
     return unknowns, starts
 
 
-def _mean_errors(
-    bundle: _Bundle, unknowns: Doubles, starts: Sequence[int], matches: _Matches
-) -> Doubles:
+def _mean_errors(bundle: _Bundle, unknowns: Doubles, starts: Sequence[int], matches: _Matches) -> Doubles:
     """Median difference of the found keypoints from the take's in each frame (F, 2) [px], or NaN."""
     pixels = bundle._pictured(unknowns, bundle.motion.at(bundle.times(unknowns))[0], starts)
     errors = np.full((*matches.index.shape, 2), np.nan)
@@ -630,7 +649,10 @@ def _mean_errors(
         sure = bundle.found.weights[number] > 0.0
         errors[frame, hand] = np.median(bundle.found.pixels[number, sure] - pixels[frame, hand, sure], axis=0)
     there = np.isfinite(errors[..., 0])
-    return np.asarray(np.where(there[..., None], errors, 0.0).sum(axis=1) / np.where(there.any(axis=1), there.sum(axis=1), np.nan)[:, None])
+    return np.asarray(
+        np.where(there[..., None], errors, 0.0).sum(axis=1)
+        / np.where(there.any(axis=1), there.sum(axis=1), np.nan)[:, None]
+    )
 
 
 def _change(shifts: Doubles, starts: Sequence[int], noise: float) -> int | None:
