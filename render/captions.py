@@ -199,10 +199,12 @@ class Skeleton(Protocol):
     """A hand's keypoints in a picture, and which are visible; `HandTruth` is one."""
 
     @property
-    def keypoints(self) -> Float[np.ndarray, "21 2"]: ...  # [px]
+    def keypoints(self) -> Float[np.ndarray, "21 2"]:
+        """[px]."""
 
     @property
-    def visible(self) -> Bool[np.ndarray, "21"]: ...
+    def visible(self) -> Bool[np.ndarray, "21"]:
+        """Which are drawn full."""
 
 
 def draw_keypoints(picture: Picture, hands: Sequence[Skeleton], *, scale: float = 1.0) -> Picture:

@@ -1,4 +1,4 @@
-"""`annotate_film`: an ordinary video of a tracked take, as labeled photographs in every format of `render`."""
+"""`annotate_film`: an ordinary video of a tracked take as labeled photographs, in all formats of `render`."""
 
 from __future__ import annotations
 
@@ -195,8 +195,8 @@ def _given(camera: Camera | str | Path | None, size: tuple[int, int]) -> Camera 
     if len(fitting) != 1:
         sizes = ", ".join(f"{one.name} {one.size[0]} x {one.size[1]}" for one in cameras)
         raise HandSimError(
-            f"the video's pictures have {size[0]} x {size[1]} pixels and the cameras are {sizes}; expected one of "
-            "this size, and no other"
+            f"the video's pictures have {size[0]} x {size[1]} pixels and the cameras are {sizes}; expected "
+            "one of this size, and no other"
         )
     return fitting[0]
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from handsim.pages import Paint, Section, coordinates, html_list, picture, write_sections
+from handsim.pages import Paint, Section, html_list, picture, write_sections
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -18,24 +18,23 @@ _CELLS = 12  # across the picture, in which errors are averaged
 
 
 def write_film_page(path: Path, found: Registration) -> None:
-    """Write the page: camera and clock, residuals over time and over the picture, frames that do not count."""
+    """Write the page: camera and clock, residuals over time and over the picture, frames left out."""
     counted = found.reasons.count("")
     doubts = found.doubts() or ["The hands tell the clock, the lens and the camera's place well."]
-    rows = [("", "value", "standard deviation"), *_figures(found)]
     sections = [
-        Section("Camera and clock", html_list(doubts, "ul"), table=rows),
+        Section("Camera and clock", html_list(doubts, "ul"), table=found.figures()),
         Section(
             "Residuals over time",
-            "Distance of the keypoints that the detector found from the take's, the median of each frame; a line "
-            "for each move of the camera.",
+            "Distance of the keypoints that the detector found from the take's, the median of each frame; a "
+            "line for each move of the camera.",
             [(picture((9.0, 2.6), _over_time, found), "Residuals over time")],
             notes=found.left_out(),
         ),
         Section(
             "Residuals over the picture",
-            "Mean difference of found keypoints from the take's, ten times as long, where there are ten or more. "
-            "A pattern tells of a lens that is not described, hands that were tracked badly, or a detector that "
-            "does not know this glove.",
+            "Mean difference of found keypoints from the take's, ten times as long, where there are ten or "
+            "more. A pattern tells of a lens that is not described, hands that were tracked badly, or a "
+            "detector that does not know this glove.",
             [(picture((6.0, 4.6), _over_picture, found), "Residuals over the picture")],
         ),
     ]
@@ -43,23 +42,6 @@ def write_film_page(path: Path, found: Registration) -> None:
         f"{counted} of {len(found.reasons)} frames count; the median residual is {found.residual():.1f} px."
     )
     write_sections(path, sections, title="A video, registered to a take", lead=lead)
-
-
-def _figures(found: Registration) -> list[tuple[str, str, str]]:
-    known, camera = found.deviations, found.cameras[0]
-    rows = [
-        ("offset of the clock", f"{found.offset:.4f} s", f"{1e3 * known['offset']:.1f} ms"),
-        ("drift of the clock", f"{1e6 * found.drift:.0f} ppm", f"{1e6 * known['drift']:.0f} ppm"),
-        ("readout of the shutter", f"{1e3 * found.readout:.1f} ms", f"{1e3 * known['readout']:.1f} ms"),
-        ("focal length", f"{camera.focal_length:.1f} px", f"{100 * known['focal']:.2f} %"),
-        ("center", f"{coordinates(camera.K[:2, 2])} px", ""),
-        ("lens", f"{camera.lens.kind} {coordinates(camera.lens.coefficients[:2])}", ""),
-    ]
-    turn = f"{np.rad2deg(known['rotation']):.2f} degrees"
-    for number, one in enumerate(found.cameras, 1):
-        place = f"{coordinates(one.T_world_camera[:3, 3])} m"
-        rows.append((f"place of span {number}", place, f"{1e3 * known['position']:.1f} mm, {turn}"))
-    return rows
 
 
 def _over_time(figure: Figure, found: Registration) -> None:

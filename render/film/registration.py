@@ -1,9 +1,9 @@
 """`Registration`: where the camera stood that filmed the hands of a take, its lens and its clock.
 
-The clock comes first: for each shift of it, the pictures of an affine camera are fitted to the keypoints that a
-detector found. Then PnP finds the pose for a few focal lengths, and one bundle over all frames refines clock,
-lens and pose at once. Keypoints of a detector are a little off in the same way in all pictures: their offsets
-in the frames of the bones are unknowns of the bundle, too.
+The clock comes first: for each shift of it, an affine camera is fitted to the keypoints that a detector found.
+Then PnP finds the pose for a few focal lengths, and one bundle over all frames refines clock, lens and pose at
+once. Keypoints of a detector are a little off in the same way in all pictures: their offsets in the frames of
+the bones are unknowns of the bundle, too.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from gloves.takes.take import Take
 from handsim.errors import HandSimError
 from handsim.hand.model import KEYPOINT_BONES
 from handsim.hand.shape import NUM_KEYPOINTS, SIDES
+from handsim.pages import coordinates
 from handsim.space.camera import Camera, brown_lens, camera_matrix
 from handsim.space.transforms import rigid
 from render.frames import Doubles, Flags, Integers
@@ -40,20 +41,29 @@ _CLOCK_KEYPOINTS: Final = (0, 4, 5, 8, 9, 12, 16, 17, 20)
 _FEWEST_FRAMES: Final = 20  # frames with a hand that a camera is registered with
 _FEWEST_KEYPOINTS: Final = 8  # of a hand in a frame, to say whether it fits
 _SURE: Final = 0.25  # least score of a keypoint
-_MOST_BUNDLED: Final = 5000  # keypoints in a bundle
+_MOST_BUNDLED: Final = 5000  # keypoints in a bundle, and in the last one
+_MOST_AT_LAST: Final = 12000
+_ROBUST: Final = 2.0  # [noise] from which on residuals count less
 _GATE: Final = 0.08  # [widths] of keypoints' median distance from their hand's, at first
 _BOUND: Final = 3.0  # of the usual median distance, beyond which a frame does not fit
 _LEAST_BOUND: Final = 0.008  # [widths]
+_WORST: Final = 0.03  # [widths] of the usual median distance
+_LEAST_SHARE: Final = 0.2  # of the frames with hands that must fit
 _MOST_SPANS: Final = 4
-_SHORTEST_SPAN: Final = 10  # frames
+_SHORTEST_SPAN: Final = 45  # frames with hands
 _BLOCK: Final = 0.5  # [s] within which residuals count as dependent
 _DEPENDENT: Final = 16.0  # number of keypoints that tell as much as one whose error is its own
 _MIRROR: Final = np.array([[1.0, 1.0, 1.0], [1.0, -1.0, 1.0]])  # of a right and a left hand's bones
 
+_UNLIKE: Final = (
+    "the hands in the video do not move as those of the take at any shift of the clock; expected a video of "
+    "this take, of a camera that stood still"
+)
+
 # The unknowns, before six of the pose of each span, and the standard deviation that each has beforehand.
 _OFFSET, _DRIFT, _READOUT, _FOCAL, _CENTER, _LENS, _BIAS, _POSES = 0, 1, 2, 3, 4, 6, 8, 8 + 3 * NUM_KEYPOINTS
 _PRIORS: Final = np.concatenate([
-    [np.inf, 1e-4, 0.015, 0.7, 0.005, 0.005, 0.1, 0.1], np.full(3 * NUM_KEYPOINTS, 0.004)
+    [np.inf, 1e-4, 0.015, 0.7, 0.005, 0.005, 0.05, 0.05], np.full(3 * NUM_KEYPOINTS, 0.004)
 ])  # fmt: skip
 
 
@@ -125,8 +135,8 @@ class Registration:
         told = []
         if found["focal"] > 0.01:
             told.append(
-                f"The focal length is known to {100 * found['focal']:.1f} % only: the hands hardly move towards "
-                "the camera and away from it."
+                f"The focal length is known to {100 * found['focal']:.1f} % only: the hands hardly move "
+                "towards the camera and away from it."
             )
         if found["offset"] > 0.003:
             told.append(f"The clock is known to {1e3 * found['offset']:.1f} ms only: the hands hardly move.")
@@ -138,6 +148,24 @@ class Registration:
                 f"The camera was moved at {when}: there are {len(self.cameras)} spans, each with its pose."
             )
         return told
+
+    def figures(self) -> list[tuple[str, str, str]]:
+        """Rows of a table: names, values and standard deviations of clock, lens and places."""
+        known, camera = self.deviations, self.cameras[0]
+        rows = [
+            ("", "value", "standard deviation"),
+            ("offset of the clock", f"{self.offset:.4f} s", f"{1e3 * known['offset']:.1f} ms"),
+            ("drift of the clock", f"{1e6 * self.drift:.0f} ppm", f"{1e6 * known['drift']:.0f} ppm"),
+            ("readout of the shutter", f"{1e3 * self.readout:.1f} ms", f"{1e3 * known['readout']:.1f} ms"),
+            ("focal length", f"{camera.focal_length:.1f} px", f"{100 * known['focal']:.2f} %"),
+            ("center", f"{coordinates(camera.K[:2, 2])} px", ""),
+            ("lens", " ".join([camera.lens.kind, coordinates(camera.lens.coefficients)]), ""),
+        ]
+        turn = f"{np.rad2deg(known['rotation']):.2f} degrees"
+        for number, one in enumerate(self.cameras, 1):
+            place = f"{coordinates(one.T_world_camera[:3, 3])} m"
+            rows.append((f"place of span {number}", place, f"{1e3 * known['position']:.1f} mm, {turn}"))
+        return rows
 
     def record(self) -> dict[str, Any]:
         """The registration as JSON."""
@@ -218,7 +246,7 @@ def _detections(found: Sequence[FoundFrame]) -> _Detections:
 class _Matches(NamedTuple):
     """Which detection shows each hand of the take in each frame, or -1."""
 
-    index: Integers
+    numbers: Integers
     """(F, H)."""
     distances: Doubles
     """(F, H): median distance of its keypoints from the take's [px]."""
@@ -330,8 +358,8 @@ class _Bundle:
 
     def samples(self, matches: _Matches, most: int = _MOST_BUNDLED) -> _Samples:
         """The keypoints of matched hands, evenly thinned out over time to `most`."""
-        frames, hands = np.nonzero(matches.index >= 0)
-        number = matches.index[frames, hands]
+        frames, hands = np.nonzero(matches.numbers >= 0)
+        number = matches.numbers[frames, hands]
         rows, keypoints = np.nonzero(self.found.weights[number] > 0.0)
         total = max(len(rows), 1)
         if total > most:  # whole hands
@@ -384,6 +412,7 @@ class _Bundle:
             start[free],
             jacobian,
             loss="cauchy",
+            f_scale=_ROBUST,
             x_scale=scale[free],
             max_nfev=40,
             xtol=1e-6,
@@ -408,7 +437,7 @@ class _Bundle:
     def _residuals(
         self, unknowns: Doubles, samples: _Samples, spans: Integers, rotations: Doubles | None, noise: float
     ) -> tuple[Doubles, Doubles]:
-        """Differences (N, 2) in units of the noise, and their derivatives (N, 2, U); 0 where there are none."""
+        """Differences (N, 2) in units of the noise, and their derivatives (N, 2, U); 0 without a pose."""
         points, velocities = (one[samples.frames, samples.hands, samples.keypoints]
                               for one in self.motion.at(self.times(unknowns)))  # fmt: skip
         row = samples.pixels[:, 1] / self.size[1] - 0.5
@@ -450,7 +479,7 @@ class _Bundle:
         self, residuals: Doubles, jacobian: Doubles, priors: Doubles, frames: Integers
     ) -> Doubles:
         """Covariance of the unknowns; residuals within a block of time are dependent, those of others not."""
-        weights = 1.0 / (1.0 + residuals**2)  # of the robust loss
+        weights = 1.0 / (1.0 + (residuals / _ROBUST) ** 2)
         rows = jacobian.reshape(-1, jacobian.shape[-1])
         information = (rows * weights.reshape(-1, 1)).T @ rows + np.diag(priors)
         gradients = (jacobian * (weights * residuals)[..., None]).sum(axis=1)
@@ -488,20 +517,19 @@ def register(
     unknowns = _first_guess(bundle)
     starts: list[int] = [0]
     noise = 0.01 * width
-    for gate in (_GATE * width, 0.6 * _GATE * width, None, None):
-        if gate is not None:
-            matches = bundle.match(unknowns, starts, gate)
-        else:
+    for turn, gate in enumerate((_GATE, 0.6 * _GATE, 0.5 * _GATE, 0.5 * _GATE)):
+        if turn >= 2:
             unknowns, starts = _split(bundle, unknowns, starts, noise)
-            matches = bundle.match(unknowns, starts, max(4.0 * noise, 0.5 * _GATE * width))
-        if (matches.index >= 0).sum() < _FEWEST_FRAMES:
-            raise HandSimError(
-                "the hands in the video do not move as those of the take; expected a video of this take, of a "
-                "camera that stood still"
-            )
-        unknowns, _, covariance = bundle.solve(unknowns, bundle.samples(matches), starts, noise)
+        matches = bundle.match(unknowns, starts, max(4.0 * noise, gate * width) if turn >= 2 else gate * width)
+        if (matches.numbers >= 0).sum() < _FEWEST_FRAMES:
+            raise HandSimError(_UNLIKE)
+        most = _MOST_AT_LAST if turn == 3 else _MOST_BUNDLED
+        unknowns, _, covariance = bundle.solve(unknowns, bundle.samples(matches, most), starts, noise)
         noise = max(float(np.nanmedian(bundle.match(unknowns, starts, np.inf).distances)) / 1.177, 0.3)
-    return _registration(bundle, unknowns, starts, covariance, found)
+    registration = _registration(bundle, unknowns, starts, covariance, found)
+    if noise > _WORST * width or registration.reasons.count("") < _LEAST_SHARE * with_hands:
+        raise HandSimError(_UNLIKE)
+    return registration
 
 
 def _first_guess(bundle: _Bundle) -> Doubles:
@@ -513,14 +541,13 @@ def _first_guess(bundle: _Bundle) -> Doubles:
             start = _posed(bundle, samples, offset)
             if start is None:
                 continue
-            unknowns, cost, _ = bundle.solve(start, samples, [0], 0.01 * bundle.size[0], first=True)
-            if best is None or cost < best[0]:
-                best = cost, unknowns
+            unknowns, *_ = bundle.solve(start, samples, [0], 0.01 * bundle.size[0], first=True)
+            gate = _GATE * bundle.size[0]
+            agreeing = float(np.nansum(1.0 - bundle.match(unknowns, [0], gate).distances / gate))
+            if best is None or agreeing > best[0]:
+                best = agreeing, unknowns
     if best is None:
-        raise HandSimError(
-            "the hands in the video do not move as those of the take at any shift of the clock; expected a video "
-            "of this take"
-        )
+        raise HandSimError(_UNLIKE)
     return best[1]
 
 
@@ -564,8 +591,8 @@ def _posed(bundle: _Bundle, samples: _Samples, offset: float) -> Doubles | None:
 def _shifts(bundle: _Bundle, swapped: bool) -> list[float]:
     """The offsets of the clock at which an affine camera explains the pictures best.
 
-    An affine camera maps keypoints x to pixels A x + b. All sums that its fit needs are correlations of the two
-    series, which FFT yields for all shifts at once.
+    An affine camera maps keypoints x to pixels A x + b. All sums that its fit needs are correlations of the
+    two series, which FFT yields for all shifts at once.
     """
     found, motion = bundle.found, bundle.motion
     first, begin = float(motion.times[0]), float(found.times.min())
@@ -643,9 +670,9 @@ def _split(bundle: _Bundle, unknowns: Doubles, starts: list[int], noise: float) 
 def _mean_errors(bundle: _Bundle, unknowns: Doubles, starts: Sequence[int], matches: _Matches) -> Doubles:
     """Median difference of the found keypoints from the take's in each frame (F, 2) [px], or NaN."""
     pixels = bundle._pictured(unknowns, bundle.motion.at(bundle.times(unknowns))[0], starts)
-    errors = np.full((*matches.index.shape, 2), np.nan)
-    for frame, hand in np.argwhere(matches.index >= 0):
-        number = matches.index[frame, hand]
+    errors = np.full((*matches.numbers.shape, 2), np.nan)
+    for frame, hand in np.argwhere(matches.numbers >= 0):
+        number = matches.numbers[frame, hand]
         sure = bundle.found.weights[number] > 0.0
         errors[frame, hand] = np.median(bundle.found.pixels[number, sure] - pixels[frame, hand, sure], axis=0)
     there = np.isfinite(errors[..., 0])
@@ -700,8 +727,8 @@ def _registration(
         else:
             reasons.append(f"keypoints are more than {bound:.1f} px off" if np.nanmax(row) > bound else "")
     fits = np.array([not reason for reason in reasons])
-    frames, hands = np.nonzero((matches.index >= 0) & ~far & fits[:, None])
-    number = matches.index[frames, hands]
+    frames, hands = np.nonzero((matches.numbers >= 0) & ~far & fits[:, None])
+    number = matches.numbers[frames, hands]
     rows, keypoints = np.nonzero(bundle.found.weights[number] > 0.0)
     places = bundle.found.pixels[number[rows], keypoints]
     deviations = np.sqrt(np.maximum(np.diag(covariance), 0.0))
