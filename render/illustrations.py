@@ -15,7 +15,7 @@ from gloves.fit import GloveFit
 from gloves.layout import MarkerLayout
 from gloves.optics.visibility import visible_cameras
 from handsim.errors import ArgumentError, FileError
-from handsim.files.outputs import atomic_write, plain_path, unwritten
+from handsim.files.outputs import atomic_write, plain_path, unwritten, writing
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import BONE_NAMES, SIZES
 from handsim.hand.skin import vertex_normals
@@ -206,19 +206,16 @@ def write_clip(
 
 def write_video(path: Path, pictures: Iterable[Picture], *, rate: float, size: tuple[int, int]) -> None:
     """Write a video of pictures of a width and height [px], whole or not at all."""
-    try:
-        with atomic_write(path) as temporary, plain_path(temporary) as plain:
-            writer = cv2.VideoWriter(str(plain), cv2.VideoWriter.fourcc(*_CODEC), rate, size)
-            try:
-                if not writer.isOpened():
-                    raise FileError(f"{path}: OpenCV cannot write a video of the codec {_CODEC} here")
-                for picture in pictures:
-                    writer.write(cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
-            finally:
-                writer.release()
-            _check_written(plain)
-    except OSError as error:
-        raise FileError(f"{path}: cannot be written: {error.strerror or error}") from error
+    with writing(path, FileError), atomic_write(path) as temporary, plain_path(temporary) as plain:
+        writer = cv2.VideoWriter(str(plain), cv2.VideoWriter.fourcc(*_CODEC), rate, size)
+        try:
+            if not writer.isOpened():
+                raise FileError(f"{path}: OpenCV cannot write a video of the codec {_CODEC} here")
+            for picture in pictures:
+                writer.write(cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
+        finally:
+            writer.release()
+        _check_written(plain)
 
 
 def _check_written(path: Path) -> None:

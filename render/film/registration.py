@@ -432,7 +432,7 @@ class _Bundle:
         frames, rows = np.unique(samples.frames, return_inverse=True)
         rotations = self.motion.rotations(self.times(unknowns)[frames])
         found = rotations[rows, samples.hands, samples.keypoints]
-        return np.nan_to_num(found) * self.motion.mirrors[samples.hands][:, None]
+        return np.asarray(np.nan_to_num(found) * self.motion.mirrors[samples.hands][:, None])
 
     def _residuals(
         self, unknowns: Doubles, samples: _Samples, spans: Integers, rotations: Doubles | None, noise: float
@@ -520,7 +520,9 @@ def register(
     for turn, gate in enumerate((_GATE, 0.6 * _GATE, 0.5 * _GATE, 0.5 * _GATE)):
         if turn >= 2:
             unknowns, starts = _split(bundle, unknowns, starts, noise)
-        matches = bundle.match(unknowns, starts, max(4.0 * noise, gate * width) if turn >= 2 else gate * width)
+        matches = bundle.match(
+            unknowns, starts, max(4.0 * noise, gate * width) if turn >= 2 else gate * width
+        )
         if (matches.numbers >= 0).sum() < _FEWEST_FRAMES:
             raise HandSimError(_UNLIKE)
         most = _MOST_AT_LAST if turn == 3 else _MOST_BUNDLED
