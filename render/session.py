@@ -309,7 +309,7 @@ _ON_SHEET: Final = 9  # pictures on a contact sheet
 
 
 def render_take(
-    source: Take | str | Path | PoseFile | Subject | ArrayLike,
+    source: Take | str | Path | PoseFile | ArrayLike,
     out: str | Place,
     formats: str | Sequence[str] = ("webdataset",),
     config: RenderConfig | None = None,

@@ -279,10 +279,11 @@ def annotate_film(
         np.stack([one.T_world_camera for one in registration.cameras])[spans],
         (first, shown) if straight else None,
     )
-    told = {"film": {"sha256": checksum(film.path), **registration.record()}}
-    subject = dataclasses.replace(subject_of_take(posed), film=pictures, poses=told)
+    record = {"film": {"sha256": checksum(film.path), **registration.record()}}
+    subject = dataclasses.replace(subject_of_take(posed), film=pictures, poses=record)
     config = dataclasses.replace(config, view=ViewConfig(cameras=(shown,)))
-    render_take(subject, out, formats, config, workers=workers, progress=progress)
+    source: Any = subject  # only this module gives a subject
+    render_take(source, out, formats, config, workers=workers, progress=progress)
     folder = Path(out)
     save_json(folder / RECORD, registration.record())
     write_video(folder / VIDEO, _drawn_over(film, taken, registration), rate=film.rate, size=film.size)

@@ -1,9 +1,9 @@
 """`Registration`: where the camera stood that filmed the hands of a take, its lens and its clock.
 
-The clock comes first: for each shift of it, an affine camera is fitted to the keypoints that a detector found.
-Then PnP finds the pose for a few focal lengths, and one bundle over all frames refines clock, lens and pose at
-once. Keypoints of a detector are a little off in the same way in all pictures: their offsets in the frames of
-the bones are unknowns of the bundle, too.
+The clock comes first: for each shift of it, an affine camera is fitted to the keypoints that a detector
+found. Then PnP finds the pose for a few focal lengths, and one bundle over all frames refines clock, lens and
+pose at once. Keypoints of a detector are a little off in the same way in all pictures: their offsets in the
+frames of the bones are unknowns of the bundle, too.
 """
 
 from __future__ import annotations
