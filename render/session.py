@@ -10,7 +10,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import cv2
 import numpy as np
@@ -56,7 +56,7 @@ from render.formats.writer import (
     shard_files,
     whole_shards,
 )
-from render.frames import Doubles, RenderedFrame
+from render.frames import Doubles, FilmReader, RenderedFrame
 from render.painting.figures import sample_people
 from render.scenery.backgrounds import photo_files
 from render.scenery.lights import sample_surroundings
@@ -64,9 +64,6 @@ from render.studio import FrameChoices, Moment, Studio
 from render.subject import Model, PoseFile, Source, Subject, load_subject, source_of
 from render.user_body import UserBody
 from render.viewpoints import ViewConfig, Viewpoints, check_hands_in_view
-
-if TYPE_CHECKING:
-    from render.film.film import FilmReader
 
 _MOST_STUDIOS: Final = 32  # largest number of studios that are kept, some 5 MB each
 

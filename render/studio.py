@@ -6,7 +6,7 @@ import dataclasses
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import cv2
 import numpy as np
@@ -31,6 +31,7 @@ from render.frames import (
     BodyTruth,
     Bytes,
     Doubles,
+    FilmReader,
     Flags,
     Floats,
     Geometry,
@@ -46,9 +47,6 @@ from render.scenery.backgrounds import Background, Enclosure, draw_surroundings,
 from render.scenery.lights import Lighting
 from render.skin.look import SkinLook, upper_arms
 from render.user_body import UserBody
-
-if TYPE_CHECKING:
-    from render.film.film import FilmReader
 
 
 def _allowed_parts() -> Flags:

@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -38,10 +38,7 @@ from handsim.motion_files.motion import read_joint_csv
 from handsim.space.transforms import UpAxis, rotation_quaternions, turned_poses, upright
 from poses.shapes import HIGH, LOW
 from render.config import SpawnKey
-from render.frames import Doubles
-
-if TYPE_CHECKING:
-    from render.film.film import FilmPictures
+from render.frames import Doubles, FilmPictures
 
 KEYS: Final = ("qpos", "angles", "T_world_wrist", "times", "person", "hands", "hand_size")
 CSV: Final = ".csv"

@@ -110,7 +110,7 @@ class Film:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class FilmPictures:
+class _Pictures:
     """The pictures of a video in the place of drawn ones, by the numbers of its frames."""
 
     path: Path
@@ -119,15 +119,15 @@ class FilmPictures:
     straightened: tuple[Camera, Camera] | None = None
     """The camera and a pinhole camera, whose pictures are wanted; None for pictures as they are."""
 
-    def open(self) -> FilmReader:
+    def open(self) -> _Reader:
         """A reader for one process."""
-        return FilmReader(self)
+        return _Reader(self)
 
 
-class FilmReader:
-    """Reads the pictures of `FilmPictures`."""
+class _Reader:
+    """Reads the pictures of `_Pictures`."""
 
-    def __init__(self, pictures: FilmPictures) -> None:
+    def __init__(self, pictures: _Pictures) -> None:
         self._film, self._maps = Film(pictures.path), None
         self.name = pictures.path.name
         if pictures.straightened is not None:
@@ -274,7 +274,7 @@ def annotate_film(
     )
     shown = Camera(first.name, first.size, first.K, first.T_world_camera) if straight else first
     spans = [registration.span(number) for number in range(posed.num_frames)]
-    pictures = FilmPictures(
+    pictures = _Pictures(
         film.path.absolute(),
         np.stack([one.T_world_camera for one in registration.cameras])[spans],
         (first, shown) if straight else None,
