@@ -148,7 +148,9 @@ def _keep_supported(disparity: Floats, needed: Integers, most: int, kept: Flags)
             if not kept[row, column]:
                 continue
             middle, agreed = fixed[row + border, column + border], -1
-            enough = min(needed[row // 3, column // 3], len(_DOTS) ** 2 - 1)  # where all agree, nothing is lost
+            enough = min(
+                needed[row // 3, column // 3], len(_DOTS) ** 2 - 1
+            )  # where all agree, nothing is lost
             for down in _DOTS:
                 for right in _DOTS:
                     agreed += abs(fixed[row + border + down, column + border + right] - middle) <= most

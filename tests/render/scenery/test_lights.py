@@ -119,7 +119,9 @@ def test_an_enclosure_lights_hands_from_where_it_is_bright(rng: np.random.Genera
 def test_backs_have_the_tone_that_is_named_and_palms_are_lighter(tone: str) -> None:
     poses = np.zeros((2, 27))  # one side up, then the other
     poses[[0, 1], [3, 4]] = 1.0
-    camera = pinhole("front", (120, 120), 130.0).at(look_at(np.array([0.4, 0.0, 0.4]), np.array([0.05, 0, 0])))
+    camera = pinhole("front", (120, 120), 130.0).at(
+        look_at(np.array([0.4, 0.0, 0.4]), np.array([0.05, 0, 0]))
+    )
     colors: dict[bool, list[np.ndarray]] = {False: [], True: []}  # by whether the sensor is perfect
     for seed in range(16):
         for frame in draw(poses, camera=camera, tones=TONES[tone], passes=("rgb", "ids"), seed=seed):
