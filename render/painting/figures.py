@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -128,6 +129,8 @@ def sample_people(
     """Hands of one person: both have the same skin and the same sleeves."""
     skin, forearm = sample_skin_look(tones, rng=rng), sample_forearm(rng=rng)
     cloth = sample_glove_look(rng=rng) if glove else None
+    if cloth is not None:
+        forearm = dataclasses.replace(forearm, cuff=cloth.cuff)
     return (Appearance(skin, forearm, cloth),) * count
 
 

@@ -555,7 +555,7 @@ def glove_texture(
     hem = bump(behind - look.cuff + 0.004, 0.0015)
     painted = lab + (look.wear * 2.0 * cloth + 1.2 * knit - 5.0 * hem)[:, None] * [1.0, 0.0, 0.0]
     height = look.wear * 1.2e-4 * cloth + 6e-5 * knit - 4e-4 * hem
-    cloth_share = 1.0 - smooth(behind, look.cuff - 0.004, look.cuff + 0.004)
+    cloth_share = 1.0 - smooth(behind, look.cuff, look.cuff + CUFF)
     cloth_share *= 1.0 - smooth(behind, arm.sleeve, arm.sleeve + CUFF)  # a sleeve lies over the cuff
     cloth_share = cloth_share.reshape(rows, width, 1)
     covered = cloth_share > 0.5
