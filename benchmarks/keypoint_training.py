@@ -26,6 +26,8 @@ from torch.nn import functional
 from handsim import HandModel
 from poses import load_gestures, sample_poses
 from render import RenderConfig, RenderedFrame, ViewConfig
+from render.film.network import Residual, convolution
+from render.film.training import BF16
 from render.session import Drawing
 from render.subject import subject_of_poses
 
@@ -33,7 +35,6 @@ SIZE = 128  # of a crop [px]
 HEAT = 16  # cells of a heat map, each way
 SPREAD = 0.06  # of the heat around a keypoint [share of the side]
 NEAR = 0.2  # of the heat that a keypoint is the mean of, around the peak [share of the side]
-BF16 = any(torch.cpu.get_capabilities().get(name) for name in ("amx_bf16", "avx512_bf16"))  # twice as fast
 VIEW = ViewConfig(placement="anywhere", distance=(0.45, 0.8))
 CONFIG = RenderConfig(passes=("rgb", "ids"), view=VIEW, vary="frame", frames_per_shard=8)
 
@@ -139,25 +140,6 @@ def to_input(images: np.ndarray) -> torch.Tensor:
     tensor = torch.from_numpy(np.ascontiguousarray(images.transpose(0, 3, 1, 2), dtype=np.float32))
     tensor = (tensor - tensor.mean((1, 2, 3), keepdim=True)) / (tensor.std((1, 2, 3), keepdim=True) + 1.0)
     return tensor.to(memory_format=torch.channels_last)
-
-
-class Residual(nn.Module):
-    """Two convolutions beside the way past them (He et al. 2016)."""
-
-    def __init__(self, width: int) -> None:
-        super().__init__()
-        self.layers = nn.Sequential(
-            *convolution(width, width), nn.Conv2d(width, width, 3, 1, 1, bias=False), nn.BatchNorm2d(width)
-        )
-
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """Features in, features out."""
-        return functional.relu(x + self.layers(x))
-
-
-def convolution(inside: int, outside: int, stride: int = 1) -> list[nn.Module]:
-    """A convolution, its normalization and its ReLU."""
-    return [nn.Conv2d(inside, outside, 3, stride, 1, bias=False), nn.BatchNorm2d(outside), nn.ReLU()]
 
 
 class KeypointNetwork(nn.Module):

@@ -89,14 +89,12 @@ def check_number(name: str, value: float, low: float, high: float = np.inf, *, a
         raise ArgumentError(f"{name} is {value:g}, expected {expected}")
 
 
-def check_count(
-    name: str, value: Any, low: int, high: float = np.inf, *, error: type[HandSimError] = ArgumentError
-) -> None:
+def check_count(name: str, value: Any, low: int, high: float = np.inf) -> None:
     """Refuse what is not a whole number from `low` to `high`."""
     check_type(name, value, int, "a whole number")
     if not low <= value <= high:
         least = f"at least {low}" if low else "0 or more"
-        raise error(f"{name} is {value}, expected {least if high == np.inf else f'{low} to {high}'}")
+        raise ArgumentError(f"{name} is {value}, expected {least if high == np.inf else f'{low} to {high}'}")
 
 
 def check_span(name: str, span: tuple[float, float], low: float = 0.0) -> None:

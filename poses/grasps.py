@@ -280,8 +280,7 @@ def place_object(scene: GraspScene, style: HoldStyle, *, rng: np.random.Generato
     point = 1e-3 * np.array(placement["point"], dtype=np.float64)
     point[2] += 1e-3 * rng.uniform(*vary["along"])
     bones = model.forward_kinematics(join_qpos(style.open[None]))[0]
-    pose = np.eye(4)
-    # everything is placed for a right hand, then mirrored
+    # Everything is placed for a right hand, then mirrored.
     if "between" in placement:
         at = np.mean([_landmark(model, bones, mark) for mark in placement["between"]], axis=0) @ mirror
         back = _landmark(model, bones, placement["through"]) @ mirror
@@ -301,9 +300,9 @@ def place_object(scene: GraspScene, style: HoldStyle, *, rng: np.random.Generato
     jitter = vector_quaternions(np.deg2rad(vary["angle"]) * np.clip(rng.standard_normal((1, 3)), -1.5, 1.5))
     rotation = quaternion_matrix(jitter)[0] @ rotation
     at = at + 1e-3 * vary["place"] * np.clip(rng.standard_normal(3), -1.5, 1.5)
-    pose[:3, :3] = mirror @ rotation @ MIRROR if model.shape.side == "left" else rotation
-    pose[:3, 3] = mirror @ (at - rotation @ point)
-    pose = pose @ np.linalg.inv(frame)
+    position = mirror @ (at - rotation @ point)
+    rotation = mirror @ rotation @ MIRROR if model.shape.side == "left" else rotation
+    pose = rigid(rotation, position) @ np.linalg.inv(frame)
     return pose if "between" in placement else _slid_to_palm(scene, style, pose)
 
 
@@ -563,11 +562,9 @@ def sample_held_poses(
 def between(start: Held, end: Held, share: NDArray[np.float64]) -> Held:
     """Poses at shares (B,) of the paths from one start to one end or B ends."""
     angles = start.angles + share[:, None] * (end.angles - start.angles)
-    poses = np.tile(np.eye(4), (len(share), 1, 1))
-    poses[:, :3, 3] = start.poses[:, :3, 3] + share[:, None] * (end.poses - start.poses)[:, :3, 3]
+    positions = start.poses[:, :3, 3] + share[:, None] * (end.poses - start.poses)[:, :3, 3]
     rotations = Rotation.from_rotvec(share[:, None] * rotation_between(start, end)).as_matrix()
-    poses[:, :3, :3] = start.poses[:, :3, :3] @ rotations
-    return Held(angles, poses)
+    return Held(angles, rigid(start.poses[:, :3, :3] @ rotations, positions))
 
 
 def rotation_between(start: Held, end: Held) -> NDArray[np.float64]:

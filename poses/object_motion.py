@@ -14,7 +14,7 @@ from handsim.errors import PoseError
 from handsim.hand.capsules import overlap_between
 from handsim.hand.model import BodyMotion, HandModel, HandMotion, join_qpos
 from handsim.space.objects import RigidObject
-from handsim.space.transforms import axis_angle_matrix, pose_matrices, transform_poses
+from handsim.space.transforms import axis_angle_matrix, pose_matrices, rigid, transform_poses
 from poses.grasps import (
     GraspScene,
     Held,
@@ -158,10 +158,8 @@ def point_pen(
     T_wrist_pen = np.linalg.inv(pose_matrices(motion.qpos[:, :7])) @ body.T_world_body
     # In the path's frame the tip is at the origin, and the pen is rotated so that the wrist is at +x.
     wrist = np.linalg.inv(T_wrist_pen.mean(axis=0))[:3, 3]
-    rotation, shift = np.eye(4), np.eye(4)
-    rotation[:3, :3] = axis_angle_matrix(np.array([0.0, 0.0, 1.0]), -np.arctan2(wrist[[1]], wrist[[0]]))[0]
-    shift[:3, 3] = -pen.markers[0]
-    T_world_pen = path @ (rotation @ shift)
+    turn = axis_angle_matrix(np.array([0.0, 0.0, 1.0]), -np.arctan2(wrist[[1]], wrist[[0]]))[0]
+    T_world_pen = path @ (rigid(turn, np.zeros(3)) @ rigid(np.eye(3), -pen.markers[0]))
     qpos = motion.qpos.copy()
     qpos[:, :7] = transform_poses(T_world_pen @ np.linalg.inv(T_wrist_pen))
     led = HandMotion(qpos, motion.rate), BodyMotion(T_world_pen, motion.rate)
@@ -330,7 +328,4 @@ def _frames(origin: Float[np.ndarray, "T 3"], axis: Float[np.ndarray, "T 3"]) ->
     # The shortest rotation from u to a moves v to v - (v . (u + a)) / (1 + u . a) (u + a) + 2 (v . u) a.
     middle = axis + _UPRIGHT
     x = x - (middle @ x / (1.0 + axis @ _UPRIGHT))[:, None] * middle
-    pose = np.tile(np.eye(4), (len(origin), 1, 1))
-    pose[:, :3, 0], pose[:, :3, 1], pose[:, :3, 2] = x, np.cross(axis, x), axis
-    pose[:, :3, 3] = origin
-    return pose
+    return rigid(np.stack([x, np.cross(axis, x), axis], axis=2), origin)

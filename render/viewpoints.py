@@ -149,13 +149,6 @@ def looking(directions: Doubles) -> Doubles:
     return np.stack([right, np.cross(forward, right), forward], axis=2)
 
 
-def _transforms(positions: Doubles, rotations: Doubles) -> Doubles:
-    """Poses (T, 4, 4) of cameras at positions [m], with these axes."""
-    poses = np.tile(np.eye(4), (len(positions), 1, 1))
-    poses[:, :3, :3], poses[:, :3, 3] = rotations, positions
-    return poses
-
-
 Placement = Literal["still", "orbit", "head", "anywhere", "rig"]
 _MOUNTED: Final = 0.03  # largest distance of a head's camera from the eyes along each axis [m]
 _MOSTLY: Final = 0.92  # share of the frames that a head leans back for
@@ -396,7 +389,7 @@ def _lingering(config: ViewConfig, framing: Framing, turned: Doubles, elevation:
         directions = np.tile(_spherical(azimuth, elevation), (len(frames), 1))
         centers, rotations = framing.centers[frames], looking(directions)
         away = framing.shortest(camera, centers, rotations, frames)[:, None] * directions
-        poses = _transforms(centers + away, rotations)
+        poses = rigid(rotations, centers + away)
         shares.append(np.nanmedian(framing.shares(camera, poses, _CLOSER * config.share, frames)))
     time = np.minimum(np.array(shares) / config.share, 1.0) ** _LINGER
     time = np.maximum(time, _QUICKEST * time.max())
@@ -431,7 +424,7 @@ def _followed(
                 distances = framing.held(np.maximum(shortest, usual))
                 centers = framing.centered(centers, rotations, distances)
             distances = framing.held(np.maximum(framing.shortest(camera, centers, rotations), usual))
-    poses = _transforms(centers + distances[:, None] * directions, rotations)
+    poses = rigid(rotations, centers + distances[:, None] * directions)
     return float(np.median(distances)) / farthest, _Path(camera, poses)
 
 
@@ -444,16 +437,14 @@ def _head(config: ViewConfig, take: Take, framing: Framing, rng: np.random.Gener
     """At the user's eyes, turned to the hands; several cameras stand side by side, as two eyes do."""
     user = UserBody(take) if framing.user is None else framing.user
     camera, eyes = preset(config.camera), user.eyes + rng.uniform(-_MOUNTED, _MOUNTED, 3)
-    _, distances, rotations = _turned_to(eyes, framing.followed())
+    distances, rotations = _turned_to(eyes, framing.followed())
     lacking = np.quantile(framing.shortest(camera, framing.followed(), rotations) - distances, _MOSTLY)
     eyes -= np.clip(lacking, 0.0, _LEAN) * rotations[..., 2].mean(axis=0)
     paths = []
     for number in range(config.views):
         aside = 0.064 * (number - 0.5 * (config.views - 1)) * user.right
-        _, _, rotations = _turned_to(eyes + aside, framing.followed())
-        paths.append(
-            _Path(camera, _transforms(np.broadcast_to(eyes + aside, (len(rotations), 3)), rotations))
-        )
+        _, rotations = _turned_to(eyes + aside, framing.followed())
+        paths.append(_Path(camera, rigid(rotations, eyes + aside)))
     return paths
 
 
@@ -477,7 +468,7 @@ def _anywhere(config: ViewConfig, take: Take, framing: Framing, rng: np.random.G
                 distance = np.maximum(usual / closer[remaining], shortest)
                 smaller = distance / usual
                 if attempt:
-                    poses = _transforms(middles + distance[:, None] * directions, rotations)
+                    poses = rigid(rotations, middles + distance[:, None] * directions)
                     shares = framing.shares(camera, poses, _CLOSER * config.share, remaining)
                     smaller = config.share / np.maximum(shares, 1e-6)
                 bad = np.maximum(np.nan_to_num(smaller, nan=1.0), _ENOUGH)
@@ -495,7 +486,7 @@ def _anywhere(config: ViewConfig, take: Take, framing: Framing, rng: np.random.G
             if not len(remaining):
                 break
         distances = np.where(np.isfinite(distances), distances, 1.0)  # frames without hands
-        paths.append(_Path(camera, _transforms(centers + distances[:, None] * chosen, looking(chosen))))
+        paths.append(_Path(camera, rigid(looking(chosen), centers + distances[:, None] * chosen)))
     return paths
 
 
@@ -518,10 +509,10 @@ def _rig(config: ViewConfig, take: Take, framing: Framing, rng: np.random.Genera
         camera, position, zoom = preset(config.camera), T_world_camera[:3, 3], None
         followed = framing.followed()
         for _ in range(_CENTERINGS):
-            _, distances, rotations = _turned_to(position, followed)
+            distances, rotations = _turned_to(position, followed)
             followed = framing.centered(followed, rotations, distances)
         for centers in (np.broadcast_to(middle, followed.shape), followed):
-            away, distances, rotations = _turned_to(position, centers)
+            distances, rotations = _turned_to(position, centers)
             if camera.lens.kind != "pinhole":
                 break
             share = config.share * rng.uniform(1.0, _CLOSER)
@@ -535,18 +526,18 @@ def _rig(config: ViewConfig, take: Take, framing: Framing, rng: np.random.Genera
             zoom = 1.0 / framing.held(1.0 / np.minimum(wanted, longest)) / lens
         if camera.lens.kind == "pinhole":
             camera = zoomed(camera, lens)
-        paths.append(_Path(camera, _transforms(np.broadcast_to(position, away.shape), rotations), zoom))
+        paths.append(_Path(camera, rigid(rotations, position), zoom))
     return paths
 
 
 _PATHS: Final = {"still": _still, "orbit": _orbit, "head": _head, "anywhere": _anywhere, "rig": _rig}
 
 
-def _turned_to(position: Doubles, centers: Doubles) -> tuple[Doubles, Doubles, Doubles]:
-    """Offsets (T, 3) of a camera from its targets [m], distances (T,) [m], and its axes (T, 3, 3)."""
+def _turned_to(position: Doubles, centers: Doubles) -> tuple[Doubles, Doubles]:
+    """Distances (T,) [m] of a camera from its targets, and its axes (T, 3, 3)."""
     away = position - centers
     distances = np.linalg.norm(away, axis=1)
-    return away, distances, looking(away / distances[:, None])
+    return distances, looking(away / distances[:, None])
 
 
 def zoomed(camera: Camera, zoom: float) -> Camera:

@@ -36,7 +36,7 @@ from handsim.hand.shape import (
 )
 from handsim.hand.skin import HandSurface, build_surface, skin_frames
 from handsim.kernels import pose_bones
-from handsim.space.transforms import MIRROR, euler_matrix
+from handsim.space.transforms import MIRROR, euler_matrix, rigid
 
 if TYPE_CHECKING:
     import mujoco
@@ -66,8 +66,7 @@ class Skeleton:
 
     def rest_transforms(self) -> Float[np.ndarray, "L 4 4"]:
         """`T_wrist_bone` of every bone at zero angles."""
-        transforms = np.tile(np.eye(4), (NUM_BONES, 1, 1))
-        transforms[:, :3, :3], transforms[:, :3, 3] = self.rotations, self.offsets
+        transforms = rigid(self.rotations, self.offsets)
         for first in range(1, 4):  # the bones of all digits that are as far from the palm
             bones = slice(first, None, 3)
             transforms[bones] = transforms[_CHAIN[bones, 0]] @ transforms[bones]

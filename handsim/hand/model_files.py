@@ -31,6 +31,7 @@ from handsim.space.transforms import (
     euler_angles,
     file_axes,
     quaternion_matrix,
+    rigid,
 )
 
 _SMALL_SHARE: Final = 0.01
@@ -239,8 +240,7 @@ def _add_knuckle(joints: ET.Element, model: HandModel, bone: int, starts: Mappin
     side, skeleton = model.shape.side, model.skeleton
     hinges = [index for index, joint in enumerate(JOINTS) if joint.bone == bone]
     names = [f"{side}_{JOINTS[index].name}" for index in hinges]
-    T_parent_bone = np.eye(4)
-    T_parent_bone[:3, :3], T_parent_bone[:3, 3] = skeleton.rotations[bone], skeleton.offsets[bone]
+    T_parent_bone = rigid(skeleton.rotations[bone], skeleton.offsets[bone])
     parent = f"/bodyset/{side}_{BONE_NAMES[BONES[bone].parent]}"
     joint = _add_osim_joint(joints, names[0], parent, f"{side}_{BONE_NAMES[bone]}", T_parent_bone)
     axes = [skeleton.axes[index] for index in hinges]

@@ -26,7 +26,7 @@ from scipy import sparse
 
 from handsim.hand.shape import DIGITS, HAND_DTYPE, NUM_BONES, PALM, pack_hand
 from handsim.kernels import kernel
-from handsim.space.transforms import MIRROR, euler_matrix
+from handsim.space.transforms import MIRROR, euler_matrix, rigid
 
 if TYPE_CHECKING:
     from handsim.hand.shape import HandShape
@@ -259,9 +259,8 @@ class CageHands(NamedTuple):
     @classmethod
     def of(cls, shapes: Sequence[HandShape]) -> Self:
         """The measures of some hands, whatever their sides."""
-        frames = np.tile(np.eye(4), (len(shapes), len(DIGITS), 1, 1))
-        frames[..., :3, :3] = euler_matrix(np.stack([shape.base_angles for shape in shapes]))
-        frames[..., :3, 3] = knuckles = np.stack([shape.knuckles for shape in shapes])
+        knuckles = np.stack([shape.knuckles for shape in shapes])
+        frames = rigid(euler_matrix(np.stack([shape.base_angles for shape in shapes])), knuckles)
         return cls(
             np.array([shape.breadth for shape in shapes]),
             np.array([shape.palm_thickness for shape in shapes]),

@@ -44,6 +44,7 @@ from handsim.space.transforms import (
     euler_angles,
     file_axes,
     pose_matrices,
+    rigid,
     rotation_quaternions,
 )
 
@@ -498,11 +499,10 @@ def _palm_joints(model: HandModel) -> Float[np.ndarray, "6 4 4"]:
     middle = _MIDDLE - 1
     starts = [0.5 * (bases[middle] + knuckles[middle]), np.zeros(3), *bases]
     ways = [knuckles[middle] - bases[middle], bases[middle], *(knuckles - bases)]
-    joints = np.tile(np.eye(4), (len(starts), 1, 1))
-    for joint, start, way in zip(joints, starts, ways, strict=True):
+    joints = []
+    for start, way in zip(starts, ways, strict=True):
         along = way / np.linalg.norm(way)
         back = np.array([0.0, 0.0, 1.0]) - along[2] * along
         back /= np.linalg.norm(back)
-        joint[:3, :3] = np.stack([along, np.cross(back, along), back], axis=1) @ _AXES
-        joint[:3, 3] = start
-    return joints
+        joints.append(rigid(np.stack([along, np.cross(back, along), back], axis=1) @ _AXES, start))
+    return np.array(joints)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from handsim._checks import check_array, check_choice
 from handsim.errors import ArgumentError, ObjectError, shortened
 from handsim.files.inputs import check_regular, package_data
-from handsim.space.transforms import axis_angle_matrix, frame_with_z
+from handsim.space.transforms import axis_angle_matrix, frame_with_z, rigid
 
 PartKind = Literal["sphere", "capsule", "cylinder", "box", "ellipsoid", "mesh"]
 _AROUND: Final = 16  # sides of a capsule
@@ -47,22 +47,14 @@ def _part(kind: PartKind, size: Sequence[float] | NDArray[np.float64], pose: NDA
     return Part(kind, np.asarray(size, dtype=np.float64), pose, np.empty((0, 3)))
 
 
-def _at(position: NDArray[np.float64], rotation: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
-    pose = np.eye(4)
-    pose[:3, 3] = position
-    if rotation is not None:
-        pose[:3, :3] = rotation
-    return pose
-
-
 def _along(start: NDArray[np.float64], end: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
     """Pose whose z axis goes from one point to another, at the middle, and their distance."""
-    return _at((start + end) / 2, frame_with_z(end - start)), float(np.linalg.norm(end - start))
+    return rigid(frame_with_z(end - start), (start + end) / 2), float(np.linalg.norm(end - start))
 
 
 def _sphere(numbers: NDArray[np.float64], trimesh: Any) -> Solid:
     position, radius = 1e-3 * numbers[:3], 1e-3 * numbers[3]
-    pose = _at(position)
+    pose = rigid(np.eye(3), position)
     mesh = trimesh.creation.icosphere(subdivisions=3, radius=radius)
     return [_part("sphere", (radius, 0.0, 0.0), pose)], mesh.apply_transform(pose)
 
@@ -76,13 +68,13 @@ def _capsule(numbers: NDArray[np.float64], trimesh: Any) -> Solid:
 
 
 def _box(numbers: NDArray[np.float64], trimesh: Any) -> Solid:
-    pose = _at(1e-3 * numbers[:3], axis_angle_matrix(np.eye(3)[1], np.deg2rad(numbers[6])))
+    pose = rigid(axis_angle_matrix(np.eye(3)[1], np.deg2rad(numbers[6])), 1e-3 * numbers[:3])
     mesh = trimesh.creation.box(extents=2e-3 * numbers[3:6])
     return [_part("box", 1e-3 * numbers[3:6], pose)], mesh.apply_transform(pose)
 
 
 def _ellipsoid(numbers: NDArray[np.float64], trimesh: Any) -> Solid:
-    pose = _at(1e-3 * numbers[:3], axis_angle_matrix(np.eye(3)[1], np.deg2rad(numbers[6])))
+    pose = rigid(axis_angle_matrix(np.eye(3)[1], np.deg2rad(numbers[6])), 1e-3 * numbers[:3])
     mesh = trimesh.creation.icosphere(subdivisions=2)
     mesh.apply_scale(1e-3 * numbers[3:6])
     return [_part("ellipsoid", 1e-3 * numbers[3:6], pose)], mesh.apply_transform(pose)
@@ -94,7 +86,7 @@ def _cup(numbers: NDArray[np.float64], trimesh: Any) -> Solid:
     inner, floor = radius - wall, high - depth
     profile = [(0, low), (radius, low), (radius, high), (inner, high), (inner, floor), (0, floor)]
     mesh = trimesh.creation.revolve(profile, sections=_CUP_SIDES)
-    pose = _at(np.array([0.0, 0.0, (low + high) / 2]))
+    pose = rigid(np.eye(3), (0.0, 0.0, (low + high) / 2))
     return [_part("cylinder", (radius, (high - low) / 2, 0.0), pose)], mesh
 
 

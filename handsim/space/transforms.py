@@ -127,11 +127,11 @@ def frame_with_z(direction: Float[np.ndarray, "3"]) -> NDArray[np.float64]:
 
 
 def rigid(
-    rotation: Float[np.ndarray, "3 3"], position: Sequence[float] | Float[np.ndarray, "3"]
+    rotation: Float[np.ndarray, "*batch 3 3"], position: Sequence[float] | Float[np.ndarray, "*batch 3"]
 ) -> NDArray[np.float64]:
-    """The transform (4, 4) of a rotation and a position."""
-    transform = np.eye(4)
-    transform[:3, :3], transform[:3, 3] = rotation, position
+    """Transforms (..., 4, 4) of rotations and positions."""
+    transform = np.zeros((*rotation.shape[:-2], 4, 4))
+    transform[..., :3, :3], transform[..., :3, 3], transform[..., 3, 3] = rotation, position, 1.0
     return transform
 
 

@@ -1,8 +1,8 @@
 """`HandDetector`: the hands in a picture, gloved or bare, with boxes, sides and 21 keypoints.
 
 A finder looks at the whole picture and tells centers, sizes and sides; a second network looks at each hand
-twice: upright, then turned so that its fingers point up. Both learned from drawn pictures alone (`render.film.training`). OpenCV
-runs them.
+twice: upright, then turned so that its fingers point up. Both learned from drawn pictures alone
+(`render.film.training`). OpenCV runs them.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from handsim._checks import check_choice, check_type
 from handsim.errors import ArgumentError, WeightsError
-from handsim.files.inputs import read_bytes
+from handsim.files.inputs import read_bytes, sign_model
 from handsim.hand.shape import NUM_KEYPOINTS, SIDES, Side
 
 WEIGHTS: Final = Path(__file__).parent / "weights"
@@ -31,7 +31,7 @@ HEAT_SIZE: Final = 16  # cells of a keypoint's map, each way
 NEAR: Final = 0.2  # reach of the heat around its peak that a keypoint is the mean of [share of the side]
 ROOM: Final = 1.55  # side of the square that is cut out around a hand, over the hand's longer side
 _WRIST, _KNUCKLE = 0, 9  # keypoints: the wrist, and where the middle finger begins
-_MOST_BYTES: Final = 1 << 26  # of a file of weights
+MOST_BYTES: Final = 1 << 26  # of a file of weights
 _MOST_FOUND: Final = 8  # places in a picture at which hands are looked for
 _LEAST_HEAT: Final = 0.2  # of a place at which a hand is looked for
 _LEAST_CONFIDENCE: Final = 0.5
@@ -74,6 +74,9 @@ class HandDetector:
     """
 
     def __init__(self, finder: bytes, keypoints: bytes) -> None:
+        for content in (finder, keypoints):
+            if sign_model(content) != content:  # OpenCV may crash on damaged files
+                raise ValueError("the SHA-256 is another one")
         self._finder, self._keypoints = _network(finder), _network(keypoints)
         cells = FINDER_SIZE // CELL
         found = _run(self._finder, np.zeros((3, FINDER_SIZE, FINDER_SIZE), np.float32), ("cells",))
@@ -91,7 +94,7 @@ class HandDetector:
         """
         folder = WEIGHTS if path is None else Path(path)
         contents = [
-            read_bytes(folder / name, error=WeightsError, most=_MOST_BYTES) for name in (FINDER, KEYPOINTS)
+            read_bytes(folder / name, error=WeightsError, most=MOST_BYTES) for name in (FINDER, KEYPOINTS)
         ]
         try:
             return cls(*contents)
@@ -109,9 +112,9 @@ class HandDetector:
         """
         picture = _checked(image)
         hands: list[FoundHand] = []
-        for center, size, sides in self._places(picture):
-            first = self._look(picture, upright(center, size * ROOM))
-            hand = self._second_look(picture, first, prior=sides)
+        for corners, right in self._places(picture):
+            first = self._look(picture, square_around(corners))
+            hand = self._second_look(picture, first, prior=right)
             if hand.confidence >= _LEAST_CONFIDENCE:
                 hands.append(hand)
         hands.sort(key=lambda hand: -hand.confidence)
@@ -137,7 +140,10 @@ class HandDetector:
         Raises:
             ArgumentError: An argument has another shape, or a box no size.
         """
-        picture, places = _checked(image), np.asarray(boxes, dtype=np.float64).reshape(-1, 4)
+        picture, places = _checked(image), np.asarray(boxes, dtype=np.float64)
+        places = places.reshape(-1, 4) if not places.size else places
+        if places.ndim != 2 or places.shape[1] != 4:
+            raise ArgumentError(f"boxes have the shape {places.shape}, expected (N, 4)")
         if len(places) != len(sides):
             raise ArgumentError(
                 f"there are {len(places)} boxes and {len(sides)} sides, expected one for each"
@@ -147,12 +153,12 @@ class HandDetector:
         found = []
         for box, side in zip(places, sides, strict=True):
             check_choice(side, SIDES, noun="side")
-            first = self._look(picture, upright(box[:2] + 0.5 * box[2:], ROOM * box[2:].max()))
+            first = self._look(picture, square_around(np.array([box[:2], box[:2] + box[2:]])))
             found.append(self._second_look(picture, first, side=side))
         return found
 
-    def _places(self, picture: NDArray[np.uint8]) -> list[tuple[Doubles, float, float]]:
-        """Center (2,) [px], longer side [px] and log-odds of a right hand of places that look like hands."""
+    def _places(self, picture: NDArray[np.uint8]) -> list[tuple[Doubles, float]]:
+        """Corners (2, 2) [px] of squares that look like hands, and log-odds of a right one."""
         scale = FINDER_SIZE / max(picture.shape[:2])
         matrix = np.array([[scale, 0.0, 0.0], [0.0, scale, 0.0]])
         seen = np.round(scale * np.array(picture.shape[:2])).astype(int)
@@ -167,11 +173,12 @@ class HandDetector:
         for row, column in zip(rows[order], columns[order], strict=True):
             right, *aside, size = cells[0, 1:, row, column].astype(np.float64)
             center = CELL * (np.array([column, row]) + 0.5 + aside) / scale
-            places.append((center, CELL * float(np.exp(size)) / scale, float(right)))
+            half = 0.5 * CELL * float(np.exp(size)) / scale
+            places.append((np.array([center - half, center + half]), float(right)))
         return places
 
     def _look(self, picture: NDArray[np.uint8], matrix: Doubles) -> _Look:
-        """Keypoints in the square that a matrix (2, 3) cuts out of the picture."""
+        """What the keypoint network tells of the square that a matrix (2, 3) cuts out of a picture."""
         square = cut(picture, matrix, (CROP_SIZE, CROP_SIZE))
         heat, logits = _run(self._keypoints, normalized(square), ("heat", "logits"))
         keypoints, scores = peaks_of(heat[0])
@@ -183,7 +190,7 @@ class HandDetector:
         self, picture: NDArray[np.uint8], first: _Look, side: Side | None = None, prior: float = 0.0
     ) -> FoundHand:
         """The hand, after a look at where the first look saw it, with its fingers up."""
-        look = self._look(picture, turned(first.keypoints))
+        look = self._look(picture, square_around(first.keypoints, turn=upright(first.keypoints)))
         if side is None:
             side = "right" if prior + first.right + look.right > 0.0 else "left"
         low, high = look.keypoints.min(axis=0), look.keypoints.max(axis=0)
@@ -191,24 +198,25 @@ class HandDetector:
         return FoundHand(side, box, look.presence, look.keypoints, look.presence * look.scores)
 
 
-def upright(center: Doubles, side: float, size: int = CROP_SIZE) -> Doubles:
-    """Matrix (2, 3) from a picture to the square of `size` pixels around a center, both [px] from corners."""
-    scale = size / side
-    return np.array(
-        [[scale, 0.0, 0.5 * size - scale * center[0]], [0.0, scale, 0.5 * size - scale * center[1]]]
-    )
+def square_around(
+    points: Doubles, room: float = ROOM, size: int = CROP_SIZE, turn: Doubles | None = None
+) -> Doubles:
+    """Matrix (2, 3) from a picture, turned, to a square of `size` pixels around the box of points.
+
+    Points (N, 2) and pixels of the square are counted from corners.
+    """
+    turn = np.eye(2) if turn is None else turn
+    moved = points @ turn.T
+    low, high = moved.min(axis=0), moved.max(axis=0)
+    scale = size / (room * max(float((high - low).max()), 1.0))
+    return np.column_stack([scale * turn, 0.5 * size - scale * 0.5 * (low + high)])
 
 
-def turned(keypoints: Doubles, room: float = ROOM, size: int = CROP_SIZE) -> Doubles:
-    """Matrix (2, 3) from a picture to a square around a hand, turned so that its fingers point up."""
+def upright(keypoints: Doubles) -> Doubles:
+    """The turn (2, 2) of a picture after which a hand's middle finger begins above its wrist."""
     x, y = keypoints[_KNUCKLE] - keypoints[_WRIST]
     length = float(np.hypot(x, y))
-    turn = np.array([[-y, x], [-x, -y]]) / length if length > 0.0 else np.eye(2)
-    moved = keypoints @ turn.T
-    low, high = moved.min(axis=0), moved.max(axis=0)
-    matrix = upright(0.5 * (low + high), room * max(float((high - low).max()), 1.0), size)
-    matrix[:, :2] = matrix[:, :2] @ turn
-    return matrix
+    return np.array([[-y, x], [-x, -y]]) / length if length > 0.0 else np.eye(2)
 
 
 def cut(picture: NDArray[np.uint8], matrix: Doubles, size: tuple[int, int]) -> NDArray[np.uint8]:

@@ -2,17 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Final
-
 import torch
 from torch import nn
 from torch.nn import functional
 
 from handsim.hand.shape import NUM_KEYPOINTS
-from render.film.detector import HEAT_SIZE
-
-SPREAD: Final = 0.06  # of the heat around a keypoint [share of the side]
-BF16: Final = any(torch.cpu.get_capabilities().get(name) for name in ("amx_bf16", "avx512_bf16"))
 
 
 def convolution(inside: int, outside: int, stride: int = 1) -> list[nn.Module]:
@@ -81,16 +75,12 @@ class FinderNetwork(nn.Module):
 class KeypointNetwork(nn.Module):
     """Maps of keypoints (B, 21, 16, 16), and log-odds of a hand and of a right one (B, 2)."""
 
-    def __init__(self, widths: tuple[int, int, int, int] = (32, 64, 112, 144)) -> None:
+    def __init__(self, widths: tuple[int, int, int, int] = (32, 64, 96, 128)) -> None:
         super().__init__()
         _, b, _, d = widths
         self.backbone = Backbone(widths)
-        self.head = nn.Sequential(*convolution(2 * b, 96), Residual(96), nn.Conv2d(96, NUM_KEYPOINTS, 1))
+        self.head = nn.Sequential(*convolution(2 * b, 64), Residual(64), nn.Conv2d(64, NUM_KEYPOINTS, 1))
         self.told = nn.Linear(d, 2)
-        at = (torch.arange(HEAT_SIZE) + 0.5) / HEAT_SIZE
-        places = torch.stack(torch.meshgrid(at, at, indexing="xy"), dim=-1).reshape(-1, 2)
-        self.places: torch.Tensor
-        self.register_buffer("places", places, persistent=False)
 
     def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Squares in, maps and log-odds out."""

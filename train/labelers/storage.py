@@ -29,7 +29,7 @@ from handsim import __version__
 from handsim._checks import check_type
 from handsim._plugins import is_plugin, list_plugins
 from handsim.errors import ArgumentError, HandSimError, HandSimWarning, WeightsError, choices
-from handsim.files.inputs import read_bytes
+from handsim.files.inputs import DIGEST, read_bytes, sign_model
 from handsim.files.outputs import atomic_write, plain_path, save_json, written_together
 from train.labelers.cnn_labeler import CNNLabeler, MeanHand
 from train.labelers.matching import matching_constants
@@ -73,7 +73,6 @@ _EXPECTED: Final = (
     "module:name"
 )
 _NAMES: Final = "handsim.marker_names"  # key of the marker names in the file's metadata
-_DIGEST: Final = "handsim.sha256"  # key of the file's SHA-256, taken with 64 zeros in its place
 _CNN: Final = "handsim.cnn"  # key of the settings of the paper's network
 _ONNX_PRIOR: Final = "handsim.pose_prior"  # key of the pose prior: an .npz in base64
 _MATCHING: Final = "handsim.matching"  # key of the constants of the matching, for other programs
@@ -472,17 +471,6 @@ class OnnxLabeler:
         return CNNLabeler(positions, hand, config, self.marker_names).label_batch
 
 
-def sign_model(content: bytes) -> bytes:
-    """The bytes of an ONNX model with a fresh SHA-256 in the place of its old one."""
-    key = _DIGEST.encode() + b"\x12\x40"  # protobuf's tag of the value, and its length
-    if content.count(key) != 1:
-        raise ValueError("the file has no SHA-256")
-    first = content.index(key) + len(key)
-    place = slice(first, first + 64)
-    blank = content[: place.start] + b"0" * 64 + content[place.stop :]
-    return content[: place.start] + hashlib.sha256(blank).hexdigest().encode() + content[place.stop :]
-
-
 def export_onnx(network: nn.Module, marker_names: Sequence[str], path: Path) -> None:
     """Write a trained labeler as an ONNX file for any number of clouds of any size."""
     import torch
@@ -495,7 +483,7 @@ def export_onnx(network: nn.Module, marker_names: Sequence[str], path: Path) -> 
         import onnx.helper
     except ImportError as error:
         raise HandSimError(f"exporting needs onnx; {_HINT}") from error
-    properties = {_NAMES: json.dumps(list(marker_names)), _DIGEST: "0" * 64, "handsim.version": __version__}
+    properties = {_NAMES: json.dumps(list(marker_names)), DIGEST: "0" * 64, "handsim.version": __version__}
     example: tuple[torch.Tensor, ...]
     if isinstance(network, DeepLabelCNN):
         example, inputs, outputs = (torch.zeros(2, 1, 52, 52),), [_IMAGES], ["positions"]

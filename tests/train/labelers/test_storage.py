@@ -22,6 +22,7 @@ from gloves.captures.formats import read_markers
 from handsim import HandModel, HandSimError, HandSimWarning
 from handsim.cli.main import main
 from handsim.errors import ArgumentError, WeightsError
+from handsim.files.inputs import sign_model
 from handsim.hand.shape import DIGITS
 from poses import sample_poses
 from tests.sentences import error_names
@@ -40,7 +41,6 @@ from train.labelers.storage import (
     load_network,
     save_network,
     shipped_labelers,
-    sign_model,
     weights_metadata,
 )
 

@@ -1,0 +1,454 @@
+"""Training of the hand detector on drawn pictures, and on labeled photographs of your own.
+
+    python -m render.film.training OUT [--samples 92160 --seed 0] [--start FOLDER] [--photographs FILE]
+
+OUT gets the weights that `HandDetector.load` reads. The drawn pictures and a checkpoint are kept beside them,
+and the same command goes on where it was stopped.
+"""
+
+from __future__ import annotations
+
+import io
+import sys
+import time
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import cv2
+import numpy as np
+import torch
+from torch import nn
+from torch.nn import functional
+
+from handsim import __version__
+from handsim._checks import check_count
+from handsim.errors import HandSimError, WeightsError
+from handsim.files.inputs import DIGEST, read_bytes, sign_model
+from handsim.files.outputs import atomic_write
+from handsim.hand.shape import NUM_KEYPOINTS
+from render.film.detector import (
+    CELL,
+    CROP_SIZE,
+    FINDER,
+    FINDER_SIZE,
+    HEAT_SIZE,
+    KEYPOINTS,
+    MOST_BYTES,
+    ROOM,
+    WEIGHTS,
+    cut,
+    normalized,
+    square_around,
+    upright,
+)
+from render.film.lessons import SCENES, VIEW_SIZE, Lessons, drawn_lessons, lessons_of, read_scenes
+from render.film.network import FinderNetwork, KeypointNetwork
+from render.frames import Bytes, Doubles, Floats
+
+BATCH: Final = 32
+PHOTOGRAPH_SHARE: Final = 0.5
+"""Share of the samples that are photographs, where there are any."""
+BF16: Final = any(torch.cpu.get_capabilities().get(name) for name in ("amx_bf16", "avx512_bf16"))
+_SAMPLES_A_SCENE: Final = 18  # squares that the keypoint network sees for each drawn picture
+_FINDER_SHARE: Final = 0.25  # samples of the finder over those of the keypoint network
+_SPREAD: Final = 0.06  # of the heat around a keypoint [share of the side]
+_RATE, _ADAPTING_RATE = 2e-3, 6e-4  # largest learning rates: from scratch, and from given weights
+_SAVE_EVERY: Final = 120.0  # time between checkpoints [s]
+_SMALLEST: Final = 14.0  # longer side of a hand that the finder learns [px of what it sees]
+_ASPECTS: Final = (0.75, 0.75, 0.5625, 1.0)  # shorter side of a picture over the longer one
+_FIRST_LOOK: Final = 0.35  # share of the squares that are turned anyhow; in others fingers are about up
+_OPSET: Final = 17
+_HALF: Final = "_half"  # ending of the names of weights of half precision
+
+Network = FinderNetwork | KeypointNetwork
+
+
+class Batch(NamedTuple):
+    """What a network learns from in one step."""
+
+    pictures: torch.Tensor  # (B, 3, S, S)
+    targets: tuple[torch.Tensor, ...]
+
+
+class Course(NamedTuple):
+    """Drawn lessons, and those of photographs."""
+
+    drawn: Lessons
+    own: Lessons | None
+
+    def draw(self, rng: np.random.Generator) -> tuple[Bytes, Floats, Any]:
+        """A picture, its keypoints (H, 21, 2) and sides (H,)."""
+        is_own = self.own is not None and rng.random() < PHOTOGRAPH_SHARE
+        source = self.own if self.own is not None and is_own else self.drawn
+        number = int(rng.integers(len(source.files)))
+        return source.picture(number), source.keypoints[number], source.sides[number]
+
+
+def train_detector(
+    out: str | Path,
+    *,
+    start: str | Path | None = None,
+    photographs: str | Path | None = None,
+    samples: int = 92_160,
+    seed: int = 0,
+) -> Path:
+    """Train a hand detector on drawn pictures; a second call goes on where the first was stopped.
+
+    Args:
+        out: Folder of the weights, of the drawn pictures and of the checkpoint.
+        start: Folder of weights to begin with, or `shipped`; random ones when not given.
+        photographs: File of COCO keypoints [px] of your own photographs (21 a hand, in our order), which are
+            beside it or in a folder `images` there. Half of the samples are then taken from them.
+        samples: Number of squares that the keypoint network learns from; the finder learns from a quarter
+            as many pictures.
+        seed: Seed of pictures, of initial weights and of all random choices.
+
+    Returns:
+        The folder, for `HandDetector.load`.
+
+    Raises:
+        HandSimError: The start or the photographs cannot be read, onnx is missing, or the folder has a
+            checkpoint of another training.
+    """
+    check_count("samples", samples, BATCH, 1_000_000_000)
+    try:
+        import onnx  # noqa: F401  # missed before the work, not after it
+    except ImportError as error:
+        raise HandSimError(
+            "training a detector needs onnx; install it with: pip install 'handsim[onnx]'"
+        ) from error
+    folder = Path(out)
+    begun = None if start is None else WEIGHTS if start == "shipped" else Path(start)
+    torch.manual_seed(seed)
+    networks: dict[str, Network] = {FINDER: FinderNetwork(), KEYPOINTS: KeypointNetwork()}
+    for name, network in networks.items():
+        if begun is not None:
+            _load_folded(network, begun / name)
+    own: tuple[Lessons | None, Lessons | None] = (None, None)
+    if photographs is not None:
+        own = lessons_of(read_scenes(Path(photographs)), rng=np.random.default_rng(seed))
+    shards = max(1, round(samples / _SAMPLES_A_SCENE / SCENES))
+    parts = []
+    for number in range(shards):
+        parts.append(drawn_lessons(number, folder / "pictures", seed=seed))
+        _tell(f"\r{SCENES * (number + 1)} of {SCENES * shards} pictures are drawn")
+    _tell("\n")
+    drawn = [Lessons.joined(part) for part in zip(*parts, strict=True)]
+    record = f"samples {samples}, seed {seed}, start {start}, photographs {photographs}"
+    plan: tuple[tuple[str, Make, Loss, float], ...] = (
+        (FINDER, finder_batch, finder_loss, _FINDER_SHARE),
+        (KEYPOINTS, keypoint_batch, keypoint_loss, 1.0),
+    )
+    for (name, make, loss, share), lessons, given in zip(plan, drawn, own, strict=True):
+        steps = max(1, round(share * samples / BATCH))
+        run = Run(networks[name], Course(lessons, given), make, loss, steps, seed, adapts=begun is not None)
+        run.go(folder / f"{Path(name).stem}.checkpoint", record)
+    for name, network in networks.items():
+        export(network, folder / name)
+    return folder
+
+
+def _tell(text: str) -> None:
+    print(text, end="", file=sys.stderr, flush=True)
+
+
+Make = Callable[[Course, np.random.Generator], Batch]
+Loss = Callable[[Any, tuple[torch.Tensor, ...]], torch.Tensor]
+
+
+class Run:
+    """One network's training."""
+
+    def __init__(
+        self, network: Network, course: Course, make: Make, loss: Loss, steps: int, seed: int, *, adapts: bool
+    ) -> None:
+        self.network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self._course, self._make, self._loss, self._steps, self._seed = course, make, loss, steps, seed
+        rate = _ADAPTING_RATE if adapts else _RATE
+        self._optimizer = torch.optim.AdamW(network.parameters(), lr=rate, weight_decay=0.01, fused=True)
+        self._schedule = torch.optim.lr_scheduler.OneCycleLR(
+            self._optimizer, rate, total_steps=steps + 1, pct_start=0.15
+        )
+        self._adapts, self._done = adapts, 0
+        self.losses: list[float] = []
+
+    def go(self, checkpoint: Path, record: str) -> None:
+        """Train to the end, from the checkpoint where there is one."""
+        self._restore(checkpoint, record)
+        self.network.train()
+        for layer in self.network.modules():
+            if self._adapts and isinstance(layer, nn.BatchNorm2d):
+                layer.eval()  # given weights hold its figures already
+        saved = time.monotonic()
+        while self._done < self._steps:
+            batch = self._make(self._course, np.random.default_rng([self._seed, self._done]))
+            with torch.autocast("cpu", torch.bfloat16, enabled=BF16):
+                found = self.network(batch.pictures)
+            loss = self._loss(found, batch.targets)
+            self._optimizer.zero_grad()
+            loss.backward()  # type: ignore[no-untyped-call]
+            self._optimizer.step()
+            self._schedule.step()
+            self._done += 1
+            self.losses.append(loss.item())
+            if self._done % max(1, self._steps // 20) == 0:
+                mean = float(np.mean(self.losses[-200:]))
+                _tell(f"{checkpoint.stem}: {self._done} of {self._steps} steps, loss {mean:.3f}\n")
+            if time.monotonic() - saved > _SAVE_EVERY or self._done == self._steps:
+                self._save(checkpoint, record)
+                saved = time.monotonic()
+        self.network.eval()
+
+    def _save(self, path: Path, record: str) -> None:
+        content = {"network": self.network.state_dict(), "optimizer": self._optimizer.state_dict()}
+        stored = io.BytesIO()
+        torch.save(content | {"schedule": self._schedule.state_dict(), "record": record}, stored)
+        with atomic_write(path) as temporary:
+            temporary.write_bytes(stored.getbuffer())
+
+    def _restore(self, path: Path, record: str) -> None:
+        if not path.is_file():
+            return
+        try:
+            content = torch.load(path, weights_only=True)
+            told = content["record"]
+            if told == record:
+                self.network.load_state_dict(content["network"])
+                self._optimizer.load_state_dict(content["optimizer"])
+                self._schedule.load_state_dict(content["schedule"])
+                self._done = self._schedule.last_epoch
+        except Exception as error:  # a file can be damaged in more ways than torch names
+            raise WeightsError(f"{path} is damaged; delete it to begin this training again") from error
+        if told != record:
+            raise HandSimError(
+                f"{path} is of another training ({told}), expected {record}; give another folder"
+            )
+
+
+def recolored(picture: Bytes, rng: np.random.Generator) -> Bytes:
+    """A picture in other light, from another camera: colors, contrast, blur, shake, noise, few pixels."""
+    size = picture.shape[1::-1]
+    if rng.random() < 0.25:
+        small = tuple(max(8, int(side * rng.uniform(0.35, 0.9))) for side in size)
+        picture = cv2.resize(cv2.resize(picture, small, interpolation=cv2.INTER_AREA), size)
+    if rng.random() < 0.3:
+        picture = cv2.GaussianBlur(picture, (5, 5), rng.uniform(0.3, 1.5))
+    elif rng.random() < 0.3:
+        picture = cv2.filter2D(picture, -1, _shake(rng))
+    levels = np.linspace(0.0, 1.0, 256)[:, None] ** rng.uniform(0.7, 1.4)
+    levels = levels * rng.uniform(0.82, 1.18, 3) * rng.uniform(0.8, 1.2) + rng.uniform(-0.06, 0.06)
+    table = np.clip(255.0 * levels, 0.0, 255.0).astype(np.uint8)[:, None]
+    picture = cv2.LUT(np.ascontiguousarray(picture), table)
+    if rng.random() < 0.1:
+        picture = cv2.cvtColor(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), cv2.COLOR_GRAY2RGB)
+    if rng.random() < 0.3:
+        noise = rng.standard_normal(picture.shape, dtype=np.float32) * rng.uniform(2.0, 10.0)
+        picture = np.clip(picture + noise, 0.0, 255.0).astype(np.uint8)
+    return np.asarray(picture)
+
+
+def _shake(rng: np.random.Generator) -> Floats:
+    """The kernel of a camera or a hand that moves along a line while the shutter is open."""
+    kernel, angle, half = np.zeros((9, 9), np.float32), rng.uniform(0.0, np.pi), rng.uniform(1.0, 4.0)
+    for at in np.linspace(-half, half, 17):
+        kernel[round(4 + at * np.sin(angle)), round(4 + at * np.cos(angle))] = 1.0
+    return np.asarray(kernel / kernel.sum())
+
+
+def _turn(angle: float) -> Doubles:
+    return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+
+
+def keypoint_batch(course: Course, rng: np.random.Generator, size: int = BATCH) -> Batch:
+    """Squares around hands, and some without one; targets: keypoints [share of the side], presence, side."""
+    pictures, points = [], np.full((size, NUM_KEYPOINTS, 2), np.nan, np.float32)
+    presence, sides = np.zeros(size, np.float32), np.full(size, -1.0, np.float32)
+    for number in range(size):
+        wide, (keypoints,), (side,) = course.draw(rng)
+        labeled = keypoints[np.isfinite(keypoints[:, 0])].astype(np.float64)
+        first_look = rng.random() < _FIRST_LOOK or len(labeled) < len(keypoints)
+        turn = _turn(rng.normal(0.0, 0.3))
+        if not first_look:
+            turn = turn @ upright(keypoints.astype(np.float64))
+        elif rng.random() < 0.5:
+            turn = _turn(rng.uniform(-np.pi, np.pi))
+        middle = np.array([[0.3, 0.3], [0.7, 0.7]]) * wide.shape[0]
+        room = ROOM * rng.uniform(0.78, 1.3)
+        matrix = square_around(labeled if len(labeled) else middle, room, turn=turn)
+        matrix[:, 2] += rng.normal(0.0, 0.06 * CROP_SIZE, 2)
+        image, moved = cut(wide, matrix, (CROP_SIZE, CROP_SIZE)), keypoints @ matrix[:, :2].T + matrix[:, 2]
+        if rng.random() < 0.5:
+            image, moved = image[:, ::-1], [CROP_SIZE, 0.0] + moved * [-1.0, 1.0]
+            side = 1 - side if side >= 0 else side
+        if rng.random() < 0.15:
+            image = _hidden(image, rng)
+        pictures.append(normalized(recolored(np.ascontiguousarray(image), rng)))
+        points[number], sides[number] = moved / CROP_SIZE, side if len(labeled) else -1.0
+        presence[number] = len(labeled) > 0
+    told = (torch.from_numpy(points), torch.from_numpy(presence), torch.from_numpy(sides))
+    return Batch(_stacked(pictures), told)
+
+
+def _hidden(image: Bytes, rng: np.random.Generator) -> Bytes:
+    """A square with a patch of one color before it."""
+    image = np.array(image)
+    left, top = rng.integers(0, CROP_SIZE - 16, 2)
+    width, height = rng.integers(12, 48, 2)
+    image[top : top + height, left : left + width] = rng.integers(0, 256, 3)
+    return image
+
+
+def _stacked(pictures: list[Floats]) -> torch.Tensor:
+    return torch.from_numpy(np.stack(pictures)).contiguous(memory_format=torch.channels_last)
+
+
+def keypoint_loss(
+    found: tuple[torch.Tensor, torch.Tensor], targets: tuple[torch.Tensor, ...]
+) -> torch.Tensor:
+    """How little heat is near the keypoints, how far off its mean is, and errors of presence and side."""
+    heat, told = (one.float() for one in found)
+    points, presence, sides = targets
+    at = (torch.arange(HEAT_SIZE) + 0.5) / HEAT_SIZE
+    places = torch.stack(torch.meshgrid(at, at, indexing="xy"), dim=-1).reshape(-1, 2)
+    counts = ((points > 0.0) & (points < 1.0)).all(dim=2)  # inside and labeled
+    points = torch.where(counts[..., None], points, torch.zeros_like(points))
+    near = torch.exp(-(torch.cdist(points, places.expand(len(points), -1, -1)) ** 2) / (2 * _SPREAD**2))
+    near = near / near.sum(dim=2, keepdim=True).clamp(min=1e-6)
+    flat = heat.flatten(2)
+    mean = flat.softmax(dim=2) @ places
+    each = -(near * flat.log_softmax(dim=2)).sum(dim=2) + 10.0 * (mean - points).abs().mean(dim=2)
+    loss = (each * counts).sum() / counts.sum().clamp(min=1)
+    loss = loss + functional.binary_cross_entropy_with_logits(told[:, 0], presence)
+    wrong = functional.binary_cross_entropy_with_logits(told[:, 1], sides.clamp(min=0.0), reduction="none")
+    known = sides >= 0.0
+    return loss + 0.5 * (wrong * known).sum() / known.sum().clamp(min=1)
+
+
+def finder_batch(course: Course, rng: np.random.Generator, size: int = BATCH) -> Batch:
+    """Pictures, turned, cut and scaled; targets: cells (5, S/8, S/8) as the network's, and their weight."""
+    cells = FINDER_SIZE // CELL
+    pictures, targets = [], np.zeros((size, 6, cells, cells), np.float32)
+    for number in range(size):
+        picture, keypoints, sides = course.draw(rng)
+        long, short = FINDER_SIZE, round(FINDER_SIZE * _ASPECTS[rng.integers(len(_ASPECTS))])
+        width, height = (long, short) if rng.random() < 0.75 else (short, long)
+        scale = FINDER_SIZE / VIEW_SIZE * rng.uniform(0.75, 1.7)
+        turn = scale * _turn(rng.normal(0.0, 0.25))
+        middle = 0.5 * np.array(picture.shape[1::-1]) * rng.uniform(0.6, 1.4, 2)
+        matrix = np.column_stack([turn, 0.5 * np.array([width, height]) - turn @ middle])
+        image, moved = cut(picture, matrix, (width, height)), keypoints @ matrix[:, :2].T + matrix[:, 2]
+        if rng.random() < 0.5:
+            image, moved = image[:, ::-1], [width, 0.0] + moved * [-1.0, 1.0]
+            sides = np.where(sides >= 0, 1 - sides, sides)
+        square = np.zeros((3, FINDER_SIZE, FINDER_SIZE), np.float32)
+        square[:, :height, :width] = normalized(recolored(np.ascontiguousarray(image), rng))
+        pictures.append(square)
+        for points, side in zip(moved, sides, strict=True):
+            labeled = points[np.isfinite(points[:, 0])]
+            if len(labeled):
+                _mark(targets[number], labeled, int(side), (width, height))
+    return Batch(_stacked(pictures), (torch.from_numpy(targets),))
+
+
+def _mark(target: Floats, points: Floats, side: int, size: tuple[int, int]) -> None:
+    """Write a hand into the cells (6, S/8, S/8): heat, side (0.5: unknown), offset, size, weight."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    center, longer = 0.5 * (low + high), float((high - low).max())
+    if longer < _SMALLEST or (center < 0.0).any() or (center >= size).any():
+        return
+    column, row = (int(value // CELL) for value in center)
+    spread = max(0.6, 0.09 * longer / CELL)
+    rows, columns = np.mgrid[: target.shape[1], : target.shape[2]]
+    heat = np.exp(-((rows - row) ** 2 + (columns - column) ** 2) / (2.0 * spread**2))
+    mine = (heat > target[0]) & (heat > 0.5)
+    target[0] = np.maximum(target[0], heat)
+    target[1][mine] = 0.5 if side < 0 else side
+    target[2][mine] = center[0] / CELL - 0.5 - columns[mine]
+    target[3][mine] = center[1] / CELL - 0.5 - rows[mine]
+    target[4][mine] = np.log(longer / CELL)
+    target[5][mine] = heat[mine]
+
+
+def finder_loss(found: torch.Tensor, targets: tuple[torch.Tensor, ...]) -> torch.Tensor:
+    """Focal loss of the centers (Law and Deng 2018), and errors of side, offset and size at them."""
+    cells, target = found.float(), targets[0]
+    heat, truth, weight = cells[:, 0], target[:, 0], target[:, 5]
+    hit = -((1.0 - heat.sigmoid()) ** 2) * functional.logsigmoid(heat)
+    false = -((1.0 - truth) ** 4) * heat.sigmoid() ** 2 * functional.logsigmoid(-heat)
+    count = (truth == 1.0).sum().clamp(min=1)
+    loss = torch.where(truth == 1.0, hit, false).sum() / count
+    side = functional.binary_cross_entropy_with_logits(cells[:, 1], target[:, 1], reduction="none")
+    off = (cells[:, 2:5] - target[:, 2:5]).abs() * torch.tensor([0.3, 0.3, 1.0])[:, None, None]
+    return loss + ((0.5 * side + off.sum(dim=1)) * weight).sum() / weight.sum().clamp(min=1.0)
+
+
+def export(network: Network, path: Path) -> None:
+    """Write a network as an ONNX file with weights of half precision."""
+    import onnx
+    from onnx import TensorProto, helper, numpy_helper
+
+    is_finder = isinstance(network, FinderNetwork)
+    size, outputs = (FINDER_SIZE, ["cells"]) if is_finder else (CROP_SIZE, ["heat", "logits"])
+    stored = io.BytesIO()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the newer exporter needs another package
+        torch.onnx.export(
+            network.eval(),
+            (torch.zeros(1, 3, size, size),),
+            stored,  # type: ignore[arg-type]  # which it accepts
+            input_names=["picture"],
+            output_names=outputs,
+            opset_version=_OPSET,
+            dynamo=False,
+        )
+    model = onnx.load_model_from_string(stored.getvalue())
+    for tensor in model.graph.initializer:
+        values, name = numpy_helper.to_array(tensor), tensor.name
+        if values.dtype == np.float32 and values.ndim > 1:
+            tensor.CopyFrom(numpy_helper.from_array(values.astype(np.float16), f"{name}_half"))
+            model.graph.node.insert(
+                0, helper.make_node("Cast", [f"{name}_half"], [name], to=TensorProto.FLOAT)
+            )
+    helper.set_model_props(model, {"handsim.version": __version__, DIGEST: "0" * 64})
+    onnx.checker.check_model(model, full_check=True)
+    with atomic_write(path) as temporary:
+        temporary.write_bytes(sign_model(model.SerializeToString()))
+
+
+def _load_folded(network: Network, path: Path) -> None:
+    """Read the weights of an exported network, whose normalizations are part of its convolutions."""
+    import onnx
+    from onnx import numpy_helper
+
+    content = read_bytes(path, error=WeightsError, most=MOST_BYTES)
+    try:
+        graph = onnx.load_model_from_string(content).graph
+        arrays = {one.name.removesuffix(_HALF): numpy_helper.to_array(one) for one in graph.initializer}
+        stored = [
+            [torch.tensor(np.float32(arrays[name])) for name in node.input[1:]]
+            for node in graph.node
+            if node.op_type in ("Conv", "Gemm")
+        ]
+        modules: list[Any] = list(network.modules())
+        layers = [n for n, layer in enumerate(modules) if isinstance(layer, nn.Conv2d | nn.Linear)]
+        for (weight, bias), number in zip(stored, layers, strict=True):
+            layer, norm = modules[number], None
+            if layer.bias is None:
+                norm = modules[number + 1]
+                norm.running_var.fill_(1.0 - norm.eps)
+            if layer.weight.shape != weight.shape:
+                raise ValueError(f"weights of the shape {tuple(weight.shape)}")
+            layer.weight.data.copy_(weight)
+            (layer if norm is None else norm).bias.data.copy_(bias)
+    except Exception as error:  # protobuf and onnx name damage in many ways
+        raise WeightsError(
+            f"{path} is damaged or not a hand detector's, expected what train_detector wrote"
+        ) from error
+
+
+if __name__ == "__main__":
+    import tyro
+
+    print(tyro.cli(train_detector, config=(tyro.conf.PositionalRequiredArgs,)))
