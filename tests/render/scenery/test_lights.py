@@ -5,18 +5,14 @@ from __future__ import annotations
 import dataclasses
 import json
 
-import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from handsim.hand.shape import PALM
-from handsim.space.camera import look_at, pinhole
-from render import Backgrounds, draw
+from render import Backgrounds
 from render.scenery.backgrounds import Background, enclose, light_in
 from render.scenery.lights import irradiance, sample_lighting, sample_surroundings, surround
-from render.skin.look import TONES, typology_angle
 
 
 def test_lightings_are_plain_values_and_repeat() -> None:
@@ -112,26 +108,3 @@ def test_an_enclosure_lights_hands_from_where_it_is_bright(rng: np.random.Genera
     light = light_in(background, box, directions)
     assert light.shape == (4000, 3) and 0.0 <= light.min() and light.max() <= 1.0
     assert light[directions @ towards > 0.5].mean() > light[directions @ towards < -0.5].mean()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("tone", TONES)
-def test_backs_have_the_tone_that_is_named_and_palms_are_lighter(tone: str) -> None:
-    poses = np.zeros((2, 27))  # one side up, then the other
-    poses[[0, 1], [3, 4]] = 1.0
-    camera = pinhole("front", (120, 120), 130.0).at(
-        look_at(np.array([0.4, 0.0, 0.4]), np.array([0.05, 0, 0]))
-    )
-    colors: dict[bool, list[np.ndarray]] = {False: [], True: []}  # by whether the sensor is perfect
-    for seed in range(16):
-        for frame in draw(poses, camera=camera, tones=TONES[tone], passes=("rgb", "ids"), seed=seed):
-            palm = frame.ideal.parts == 1 + PALM
-            assert palm.sum() > 300
-            for perfect, picture in ((True, frame.rgb), (False, frame.noisy.rgb)):
-                lab = cv2.cvtColor(picture[palm][None].astype(np.float32) / 255.0, cv2.COLOR_RGB2Lab)
-                colors[perfect].append(np.median(lab[0], axis=0))
-    for found in colors.values():
-        backs, palms = np.reshape(found, (-1, 2, 3)).transpose(1, 0, 2)
-        angle = np.median([typology_angle(lightness, yellow) for lightness, _, yellow in backs])
-        assert abs(angle - np.mean(TONES[tone])) < 8.0
-        assert np.median(palms[:, 0] - backs[:, 0]) > 0.5
