@@ -27,6 +27,7 @@ from handsim import __version__
 from handsim.errors import LayoutError
 from handsim.files.outputs import atomic_write, save_json, written_together
 from handsim.hand.shape import BONE_NAMES, PALM, SIDES
+from handsim.space.objects import MARKER_RADIUS
 from handsim.space.transforms import MIRROR
 from track.glove_improvement import sample_places
 from train.data.batches import Cloud, Corruption, corrupt, stretched
@@ -35,7 +36,6 @@ from train.labelers.networks import LayoutNetwork, LayoutNetworkConfig, distance
 from train.labelers.protocol import torch_threads
 from train.simulation.training_frames import GenerateSettings, sample_frame_scene, sample_hands
 
-_RADIUS: Final = 0.0032  # of the markers [m]
 _POSES_PER_PERSON: Final = 64
 
 
@@ -60,7 +60,7 @@ def sample_skin_bank(num_places: int, num_people: int, *, rng: np.random.Generat
     """Places, and their positions in up to 64 poses of each random person, with one slip of each marker."""
     places = sample_places(num_places, rng=rng)
     gloves = [
-        MarkerLayout("places", places[first : first + MOST_MARKERS], _RADIUS)
+        MarkerLayout("places", places[first : first + MOST_MARKERS], MARKER_RADIUS)
         for first in range(0, len(places), MOST_MARKERS)
     ]
     parts: list[Float16[np.ndarray, "T C 3"]] = []

@@ -32,6 +32,7 @@ from handsim.callbacks import OnStep, no_step
 from handsim.errors import LayoutError
 from handsim.hand.model import HandModel
 from handsim.hand.shape import BONE_NAMES, PALM, SIDES
+from handsim.space.objects import MARKER_RADIUS
 from handsim.space.rig import CameraRig, load_rig
 from track.glove_score import (
     Trial,
@@ -70,7 +71,6 @@ _AROUND: Final = 35.0  # standard deviation of the angle about a finger's bone [
 _MAX_AROUND: Final = 100.0  # greatest such angle [deg]
 _APART: Final = 0.0025  # between two random places [m]
 _MISSED: Final = 500  # draws in a row without a free place
-_RADIUS: Final = 0.0032  # of the markers of random places [m]
 _PADS: Final = float(np.deg2rad(80.0))  # beyond this angle a finger's marker touches what is held
 _GAIN: Final = 0.05  # least gain of a better layout [points]
 _TRIES: Final = 20  # draws of a place
@@ -495,7 +495,7 @@ def sample_places(
         copies = tuple(dataclasses.replace(place, name=str(number)) for number in range(5))
         missed += 1
         try:
-            point = np.asarray(attach_markers(MarkerLayout("place", copies, _RADIUS), model).points[0])
+            point = np.asarray(attach_markers(MarkerLayout("place", copies, MARKER_RADIUS), model).points[0])
         except LayoutError:
             continue  # the place is off the skin
         if all(np.linalg.norm(point - other) > apart for other in points):

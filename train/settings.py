@@ -9,7 +9,7 @@ from typing import Annotated, Any, Final, Literal, get_args
 
 from handsim.errors import ArgumentError
 from handsim.settings import Expected, Limits, Settings
-from train.data.batches import BatchRecipe, Corruption, OwnCorruption, paper_corruption
+from train.data.batches import MAX_CHANGED, BatchRecipe, Corruption, OwnCorruption, paper_corruption
 
 Kind = Literal["set", "cnn"]
 """`set` is the default labeler, `cnn` the paper's (`train.labelers.cnn_network`)."""
@@ -23,7 +23,6 @@ Views = Literal["aligned", "random"]
 for labeling the one of ten on which the cloud spreads best."""
 _KNEE: Final = 0.02
 _MAX_CLOUDS: Final = 1_000_000  # in a batch
-_MAX_CHANGED: Final = 100  # points to add to a cloud or drop from it
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,10 +93,10 @@ class TrainSettings(Settings):
     """Largest half width of the uniform noise on each coordinate [m]; every batch draws its own."""
     rig_share: Annotated[float, Limits(0.0, 1.0)] = 0.5
     """Share of batches that are what the simulated rig sees; the others get the paper's corruption."""
-    occlude: Annotated[int | None, Limits(0, _MAX_CHANGED)] = None
+    occlude: Annotated[int | None, Limits(0, MAX_CHANGED)] = None
     """Most draws of a marker to drop in the paper's corruption; a quarter of the markers when not given, as
     in the paper for its 19 and 13 markers."""
-    ghosts: Annotated[int, Limits(0, _MAX_CHANGED)] = 2
+    ghosts: Annotated[int, Limits(0, MAX_CHANGED)] = 2
     """Most ghosts added in the paper's corruption."""
     corruption: Annotated[
         OwnCorruption | str | None, Expected("a function (markers, *, rng), or its module:name")
@@ -204,9 +203,9 @@ class EvaluateSettings(Settings):
 
     noun = "setting of an evaluation"
 
-    occlude: Annotated[int, Limits(0, _MAX_CHANGED)] = 0
+    occlude: Annotated[int, Limits(0, MAX_CHANGED)] = 0
     """Up to this many draws of a marker to drop, with replacement (the paper: 5 dense, 3 sparse)."""
-    ghosts: Annotated[int, Limits(0, _MAX_CHANGED)] = 0
+    ghosts: Annotated[int, Limits(0, MAX_CHANGED)] = 0
     """Up to this many ghosts, uniform in the frame's box grown by a tenth (the paper: 2)."""
     every: Annotated[int, Limits(1)] = 1
     """Take one frame of this many of captures; 1 takes all."""

@@ -19,11 +19,8 @@ from handsim.errors import ArgumentError
 from handsim.kernels import kernel, squared_distance
 from handsim.settings import Limits, Settings
 from handsim.space.camera import PINHOLE, distort_jacobian
+from handsim.space.objects import MARKER_RADIUS
 from handsim.space.rig import CameraRig
-
-MARKER_RADIUS: Final = 0.0032
-"""Radius of the spheres of Han et al. 2018 (section 3) [m]: of markers on objects, and of strays."""
-
 
 _BLIND: Final = 1e-6  # determinant of a lens's Jacobian below which it makes no blob
 

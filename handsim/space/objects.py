@@ -147,7 +147,8 @@ _SOLIDS: Final[dict[str, Callable[[NDArray[np.float64], Any], Solid]]] = {
 
 
 MARKER_RADIUS: Final = 0.0032
-"""Radius [m] of an object's own markers; their centers lie this far above the surface."""
+"""Radius of the spheres of Han et al. 2018 (section 3) [m]: of strays, and of an object's own markers; their
+centers lie this far above the surface."""
 MESH_SUFFIXES: Final = (".stl", ".obj", ".ply", ".glb")
 _LARGEST: Final = 1.0  # [m]
 _SMALLEST: Final = 0.002

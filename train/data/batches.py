@@ -19,16 +19,17 @@ from handsim.settings import Limits, Settings
 if TYPE_CHECKING:
     from train.data.shards import MappedRows
 
-_MAX_CHANGED: Final = 100  # points to add to a cloud or drop from it
+MAX_CHANGED: Final = 100
+"""Most points to add to a cloud or to drop from it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Corruption(Settings):
     """The paper's corruption, as it is drawn for training and for tests."""
 
-    occlude: Annotated[int, Limits(0, _MAX_CHANGED)] = 5
+    occlude: Annotated[int, Limits(0, MAX_CHANGED)] = 5
     """Most draws of a marker to drop; drawn with replacement, as the paper's occlusion ratio implies."""
-    ghosts: Annotated[int, Limits(0, _MAX_CHANGED)] = 2
+    ghosts: Annotated[int, Limits(0, MAX_CHANGED)] = 2
     """Most ghosts added, uniform in the sample's box grown by `margin`."""
     jitter: Annotated[float, Limits(0.0, 0.1)] = 0.0
     """Half width of the uniform noise on each coordinate [m]."""

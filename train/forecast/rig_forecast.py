@@ -17,10 +17,11 @@ from numpy.typing import NDArray
 from gloves.captures.capture import run_lengths, runs_of
 from gloves.fit import GlovedHand, GloveFit, settle_glove
 from gloves.layout import MarkerLayout
-from gloves.optics.reconstruction import MARKER_RADIUS, OpticsConfig, reconstruct
+from gloves.optics.reconstruction import OpticsConfig, reconstruct
 from gloves.takes.take import Take
 from handsim.errors import CaptureError, PoseError
 from handsim.hand.model import BodyMotion
+from handsim.space.objects import MARKER_RADIUS
 from handsim.space.rig import FEWEST_CAMERAS, ROOM_CENTER, CameraRig
 from handsim.space.transforms import pose_matrices
 from train.simulation.room import (

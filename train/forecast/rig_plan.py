@@ -15,11 +15,11 @@ from jaxtyping import Float, UInt64
 from numpy.typing import NDArray
 
 from gloves.layout import load_layout
-from gloves.optics.reconstruction import MARKER_RADIUS
 from handsim._checks import check_array, check_count
 from handsim.callbacks import OnStep, no_step
 from handsim.errors import ArgumentError
 from handsim.space.camera import Camera, focal_of_angle, look_at, pinhole
+from handsim.space.objects import MARKER_RADIUS
 from handsim.space.rig import (
     FEWEST_CAMERAS,
     HAND_REACH,

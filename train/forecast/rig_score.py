@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from gloves.fit import GlovedHand
 from gloves.layout import load_layout
-from gloves.optics.reconstruction import MARKER_RADIUS
 from gloves.takes.take import Take, load_take
 from handsim.callbacks import OnStep, no_step
 from handsim.pages import (
@@ -31,6 +30,7 @@ from handsim.pages import (
     picture,
     write_sections,
 )
+from handsim.space.objects import MARKER_RADIUS
 from handsim.space.rig import FEWEST_CAMERAS, HAND_REACH, ROOM_CENTER, CameraRig, load_rig
 from train.forecast.rig_forecast import (
     HALF_SIDE,

@@ -15,14 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from gloves.optics.ghosts import StrayConfig, cameras_by_mirror, reflect, sample_strays
-from gloves.optics.reconstruction import (
-    MARKER_RADIUS,
-    OpticsConfig,
-    Reconstruction,
-    number_runs,
-    pack_columns,
-    reconstruct,
-)
+from gloves.optics.reconstruction import OpticsConfig, Reconstruction, number_runs, pack_columns, reconstruct
 from gloves.optics.visibility import (
     MeshTree,
     clear_of_body,
@@ -35,6 +28,7 @@ from gloves.takes.bodies import RigidBody
 from gloves.takes.take import Take
 from handsim.hand.shape import PALM
 from handsim.settings import Limits, Settings
+from handsim.space.objects import MARKER_RADIUS
 from handsim.space.rig import CameraRig, check_outside
 from handsim.space.transforms import transform_poses
 from train.simulation.scenes import SceneMotion, SimulatedKind
