@@ -129,8 +129,8 @@ def _slips(hand: _Hand) -> Iterator[SuspectSpan]:
     seconds = hand.take.times[hand.frames] - hand.take.times[hand.frames[0]]
     is_long = np.minimum(seconds, seconds[-1] - seconds)[:, None] >= _SLIP_PART
     is_clear = (steps > _SLIP) & (share > _SLIP_SHARE)
-    is_small = (steps > _SMALL_SLIP) & (share > _SMALL_SHARE) & is_long
-    share[~(is_clear | is_small)] = 0.0
+    is_small = (steps > _SMALL_SLIP) & (share > _SMALL_SHARE)
+    share *= (is_clear | is_small) & is_long
     if not share.any():
         width = round(_WHILE * len(seconds) / max(seconds[-1], _WHILE))
         there = uniform_filter1d(known[..., None].astype(float), width, axis=0)
