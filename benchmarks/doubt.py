@@ -1,13 +1,14 @@
 """Whether the standard deviations of joint angles and keypoints are true, on simulated people.
 
     OMP_NUM_THREADS=1 python -m benchmarks.doubt [--gloves dense19 sparse13 starter10]
-        [--seeds 0 1 2 3] [--frames 480] [--free 20] [--without-calibration]
+        [--seeds 0 1 2 3] [--frames 480] [--free 20] [--without-calibration] [--files]
 
 Each person makes a twin of one of the paper's four kinds of captures, in turn. It is tracked with hands of
 the nearest size, with hands that are measured in it, and with hands that were calibrated in a capture of
 their own, whose labels are the truth's. Counted are the errors of all poses within one and within two
 standard deviations: of a normal distribution 68 and 95 %. A person's error is the same in all frames, so that
-single joints need many people.
+single joints need many people. --files tracks real-like takes as `handsim track` does, without and with
+--calibrate: gloves have slipped, markers move with the skin, and poses are smoothed.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from gloves import GloveFit, Take
 from gloves.fit import nominal_fit
 from gloves.takes.take import keypoints_of
 from handsim.hand.shape import JOINT_NAMES
-from track import Tracker, User
+from track import Tracker, User, track_capture
 from track.calibration.user_calibration import calibrate_hand
 from track.settings import USUAL_SIZE
 from track.user import MEASURED
@@ -32,6 +33,7 @@ from train.simulation.scenes import KINDS, CalibrationTakeConfig
 from train.simulation.takes import simulate_calibration
 
 EVERY = 4  # frames
+Pose = tuple[np.ndarray, ...]  # found and true qpos, standard deviations of angles and keypoints
 
 
 class Errors(NamedTuple):
@@ -50,7 +52,7 @@ class Errors(NamedTuple):
 def errors_of(take: Take, user: User, glove: str) -> list[Errors]:
     """The errors of a tracked take, hand by hand."""
     tracker = Tracker(user, load_labeler(glove))
-    poses: list[list[tuple[np.ndarray, ...]]] = [[] for _ in user]
+    poses: list[list[Pose]] = [[] for _ in user]
     for number in range(take.num_frames):
         seen = seen_frame(take, number)
         tracked = tracker.step(seen.points, seen.ids, number / take.rate)
@@ -58,14 +60,31 @@ def errors_of(take: Take, user: User, glove: str) -> list[Errors]:
             true = take.qpos[number, index]
             if number % EVERY == 0 and hand.has_pose and np.isfinite(true[0]):
                 poses[index].append((hand.qpos, true, hand.angle_spread, hand.keypoint_spread))
+    return errors_over(poses, user, take)
+
+
+def errors_of_file(truth: Take, found: Take) -> list[Errors]:
+    """The errors of a take that was tracked as a file, hand by hand."""
+    poses: list[list[Pose]] = []
+    for number, side in enumerate(found.sides):
+        there = np.flatnonzero(np.isfinite(found.qpos[:, number, 0]))[::EVERY]
+        columns = (found.qpos[:, number], truth.qpos[:, truth.hand_index(side)])
+        columns += (found.angle_spread[:, number], found.keypoint_spread[:, number])
+        poses.append(list(zip(*(column[there] for column in columns), strict=True)))
+    return errors_over(poses, found.hands, truth)
+
+
+def errors_over(poses: Sequence[Sequence[Pose]], hands: Sequence[GloveFit], truth: Take) -> list[Errors]:
+    """The errors of found and true poses, hand by hand."""
     found = []
     for index, rows in enumerate(poses):
         if not rows:
             continue
         qpos, true, angles, keypoints = map(np.array, zip(*rows, strict=True))
         off = qpos[:, 7:] - true[:, 7:]
-        places = keypoints_of([user[index]], qpos[:, None])[:, 0]
-        places -= keypoints_of([take.hands[index]], true[:, None])[:, 0]
+        places = keypoints_of([hands[index]], qpos[:, None])[:, 0]
+        mine = truth.hands[truth.hand_index(hands[index].side)]
+        places -= keypoints_of([mine], true[:, None])[:, 0]
         found.append(Errors(off / angles, places / keypoints[..., None], np.rad2deg(off), np.rad2deg(angles)))
     return found
 
@@ -105,6 +124,7 @@ def main(
     frames: int = 480,
     free: float = 20.0,
     without_calibration: bool = False,
+    files: bool = False,
     save: str | None = None,
 ) -> None:
     print(describe("numba", "torch"))
@@ -115,6 +135,13 @@ def main(
     table: dict[str, list[Errors]] = {}
     for glove in gloves:
         for seed in seeds:
+            if files:
+                take = simulate_take("real-like", glove=glove, num_frames=frames, seed=seed)
+                ways = {"measured": False} if without_calibration else {"measured": False, "calibrated": True}
+                for name, calibrate in ways.items():
+                    found = track_capture(take.capture(), glove=glove, calibrate=calibrate)
+                    table.setdefault(f"{glove} {name}", []).extend(errors_of_file(take, found))
+                continue
             kind = KINDS[seed % len(KINDS)]
             take = simulate_take(kind=kind, glove=glove, num_frames=frames, seed=seed)
             take = take.without_body()

@@ -69,11 +69,8 @@ def evidence_of(take: Take) -> Evidence:
     count = take.hand_labels[-1].stop
     listed = take.point_list
     chosen = np.flatnonzero(listed.labels < count)
-    frames, points, labels = (
-        listed.frames[chosen],
-        listed.points[chosen],
-        listed.labels[chosen].astype(np.int64),
-    )
+    frames, points = listed.frames[chosen], listed.points[chosen]
+    labels = listed.labels[chosen].astype(np.int64)
     owners = np.repeat(np.arange(len(take.hands)), [len(part) for part in take.hand_labels])
     expected = np.concatenate([take.pose_markers(side) for side in take.sides], axis=1)
     centers = np.stack([expected[:, owners == hand].mean(axis=1) for hand in range(len(take.hands))], axis=1)
@@ -116,8 +113,7 @@ def _usual(residuals: Float[np.ndarray, "T K"]) -> Float[np.ndarray, "K"]:
     usual = np.full(residuals.shape[1], np.nan)
     usual[known] = np.nanmedian(residuals[:, known], axis=0)
     usual[~known] = np.median(usual[known]) if known.any() else _LEAST_RESIDUAL
-    bounded: NDArray[np.float64] = np.maximum(usual, _LEAST_RESIDUAL)
-    return bounded
+    return np.asarray(np.maximum(usual, _LEAST_RESIDUAL))
 
 
 def _lives(
@@ -257,10 +253,8 @@ def _undo_exchanges(
             one, other = source[j], source[m]
             if one < 0 or other < 0:
                 continue
-            kept, also = (
-                point_distance(predicted[one], points[j]),
-                point_distance(predicted[other], points[m]),
-            )
+            kept = point_distance(predicted[one], points[j])
+            also = point_distance(predicted[other], points[m])
             changed = point_distance(predicted[one], points[m]) + point_distance(predicted[other], points[j])
             if min(kept, also) >= exchange and changed < 0.5 * (kept + also):
                 source[j], source[m] = other, one

@@ -40,13 +40,12 @@ from track.user import hand_origin, read_errors
 _ACCELERATIONS: Final = np.repeat([10.0, 0.5, 10.0], [NUM_JOINTS, 3, 3])
 """Power of unforeseen accelerations: of hinges [rad^2/s^3], of the wrist [m^2/s^3], [rad^2/s^3]."""
 _GESTURES: Final = 30.0  # [1/s] how often the prior of the hinges counts: errors of markers last that long
-_WEAK: Final = np.repeat(
-    [0.0, 1.0], [NUM_JOINTS, 6]
-)  # [1/m^2], [1/rad^2] of a wrist whose hand shows no marker
+_WEAK: Final = np.repeat([0.0, 1.0], [NUM_JOINTS, 6])  # [1/m^2, 1/rad^2] of a wrist that no marker shows
 _WINDOW, _MARGIN = 2000, 200  # frames that are solved together, and those more at either end
 _ROUNDS: Final = 5  # steps of a fit
 _LONGEST_STEP: Final = 0.5  # [rad], [m]
 _FIRST_NOISE, _LEAST_NOISE = 0.0015, 0.0001  # [m]
+_FROM_BIAS: Final = 1.4  # error of a marker's place over its mean residual: poses take half of the variance
 _OUTLIER: Final = 0.01  # [m] where the loss of a marker levels off (Geman and McClure 1987)
 # From the order of a step's unknowns (hinges, place and turn of the wrist) to that of MuJoCo and back.
 _TO_MUJOCO: Final = np.r_[NUM_JOINTS:NUM_UNKNOWNS, 0:NUM_JOINTS]
@@ -128,16 +127,14 @@ class _SmoothedHand:
 
     def __init__(self, take: Take, number: int) -> None:
         worn = self._worn = take.hands[number]
-        self.qpos = take.qpos[:, number].copy()
-        """Poses (T, 27), NaN where the hand is lost."""
+        self.qpos = take.qpos[:, number].copy()  # (T, 27), NaN where the hand is lost
+        # Standard deviations of joint angles (T, 20) [rad] and of keypoints (T, 21) [m].
         self.angles = np.full((take.num_frames, NUM_JOINTS), np.nan)
-        """Standard deviations of joint angles (T, 20) [rad]."""
         self.keypoints = np.full((take.num_frames, NUM_KEYPOINTS), np.nan)
-        """Standard deviations of keypoints (T, 21) [m]."""
         self._targets = np.ascontiguousarray(take.observed(worn.side))
         self._unseen = times_unseen(take.times, np.isfinite(self._targets[..., 0]))
         self._residuals = np.full_like(self._targets, np.nan)  # in the frames of the bones [m]
-        self._noise, self._flesh = _FIRST_NOISE, 0.0  # [m]
+        self._noise, self._flesh, self._place = _FIRST_NOISE, 0.0, 0.0  # [m]
         self._hand, self._model, self._rate = hand_arrays(worn), spread_model(take, worn), take.rate
 
     def solve(self, windows: Sequence[_Window]) -> tuple[Float[np.ndarray, "20"], Float[np.ndarray, "20 4"]]:
@@ -160,6 +157,7 @@ class _SmoothedHand:
                 self._unseen[kept],
                 self._weight_noise,
                 self._flesh,
+                self._place,
                 covariances[inner] + same,
                 self._share,
             )
@@ -225,7 +223,7 @@ class _SmoothedHand:
         return np.asarray(turns.swapaxes(1, 2) @ covariances @ turns)
 
     def _estimate_noise(self) -> None:
-        """Noise and flesh of the markers by their residuals."""
+        """Estimate noise, flesh and places of the markers by their residuals."""
         residuals = self._residuals
         seen = np.isfinite(residuals[..., 0])
         bias = np.nan_to_num(np.nansum(residuals, axis=0) / np.maximum(seen.sum(axis=0), 1)[:, None])
@@ -234,6 +232,7 @@ class _SmoothedHand:
         self._noise = max(noise, _LEAST_NOISE)
         slow = max(_spread((residuals - bias)[seen]) ** 2 - noise**2, 0.0)
         self._flesh = float(np.sqrt(3.0 * slow)) * freedom_factor(seen.shape[1])
+        self._place = _FROM_BIAS * _spread(bias[seen.any(axis=0)])
 
 
 def _spread(values: NDArray[np.float64]) -> float:

@@ -29,6 +29,9 @@ _SLIP: Final = 0.0035  # [m] change of a marker's place that is told
 _SLIP_SHARE: Final = 0.55  # share of the variance of its offsets that the change explains
 _SMALL_SLIP: Final = 0.0008  # [m] the same where little else moves it: the pose takes most of a slip
 _SMALL_SHARE: Final = 0.85
+_GLOVE_SLIP: Final = 0.0019  # [m] root of the mean square over markers: a whole glove's, beside much noise
+_GLOVE_SHARE: Final = 0.4  # of the variance of all markers' offsets, averaged over a while
+_WHILE: Final = 0.25  # [s]
 _SLIP_PART: Final = 1.9  # [s] before such a change and after it, at least
 _LEAST_VARIANCE: Final = 1e-8  # [m^2] noise of optical systems
 _OFTEN_MISSING: Final = 0.3  # share of the frames without a marker from which on it is looked for elsewhere
@@ -111,20 +114,31 @@ def _first_of_size(take: Take) -> int:
 
 def _slips(hand: _Hand) -> Iterator[SuspectSpan]:
     """The marker whose place changes most clearly at one time and stays changed."""
+    from scipy.ndimage import uniform_filter1d
+
     known = np.isfinite(hand.offsets[..., 0])
     values = np.where(known[..., None], hand.offsets.clip(-_FARTHEST, _FARTHEST), 0.0)
     before, sums = np.cumsum(known, axis=0), np.cumsum(values, axis=0)
     total, whole = np.maximum(before[-1], 1), sums[-1]
     after = before[-1] - before
     early, late = sums / np.maximum(before, 1)[..., None], (whole - sums) / np.maximum(after, 1)[..., None]
-    steps = np.linalg.norm(late - early, axis=-1)
+    steps = np.where(np.minimum(before, after) < _PART, 0.0, np.linalg.norm(late - early, axis=-1))
     variance = np.square(values).sum(axis=(0, 2)) - np.square(whole).sum(axis=1) / total
-    share = before * after / total * steps**2 / np.maximum(variance, _LEAST_VARIANCE * total)
+    explained = before * after / total * steps**2
+    share = explained / np.maximum(variance, _LEAST_VARIANCE * total)
     seconds = hand.take.times[hand.frames] - hand.take.times[hand.frames[0]]
     is_long = np.minimum(seconds, seconds[-1] - seconds)[:, None] >= _SLIP_PART
     is_clear = (steps > _SLIP) & (share > _SLIP_SHARE)
-    is_small = (steps > _SMALL_SLIP) & (share > _SMALL_SHARE) & is_long
-    share[~(is_clear | is_small) | (np.minimum(before, after) < _PART)] = 0.0
+    is_small = (steps > _SMALL_SLIP) & (share > _SMALL_SHARE)
+    share *= (is_clear | is_small) & is_long
+    if not share.any():
+        width = round(_WHILE * len(seconds) / max(seconds[-1], _WHILE))
+        there = uniform_filter1d(known[..., None].astype(float), width, axis=0)
+        slow = uniform_filter1d(values, width, axis=0) / np.maximum(there, 0.5 / width)
+        slow -= whole / total[:, None]
+        of_glove = explained.sum(axis=1, keepdims=True) / np.square(slow[known]).sum()
+        together = np.sqrt(np.square(steps).mean(axis=1, keepdims=True)) > _GLOVE_SLIP
+        share = of_glove * steps / max(steps.max(), _SLIP) * (together & (of_glove > _GLOVE_SHARE) & is_long)
     when, marker = np.unravel_index(int(share.argmax()), share.shape)
     if share[when, marker] > 0.0:
         frame, name = int(hand.frames[when]), hand.worn.layout.names[marker]

@@ -39,6 +39,7 @@ _RANGE: Final = {"least": 0.0, "5th": 5.0, "median": 50.0, "95th": 95.0, "larges
 _CHUNK: Final = 4096  # frames whose bones are posed at once
 _WANTED: Final = (0.99, 0.999)  # shares of right frames that a person may want
 _MOST_SPANS: Final = 100  # doubtful spans in the page's table; the table beside it has all
+_MDD: Final = 1.96 * float(np.sqrt(2.0))  # minimal detectable difference over standard error
 _BINS: Final = 750  # bins of a long take's curve, which shows the least and the largest value of each
 _STROKES: Final = (Paint.VIOLET, Paint.BLUE, Paint.WARM, Paint.GREEN)
 """Colors of a digit's joints, from the knuckle outwards."""
@@ -335,7 +336,9 @@ def _error_section(title: str, take: Take, hand: HandFigures) -> Section:
     text = (
         "Filter: all poses were solved together, forward and backward in time, without a delay. At the "
         "cut-off an oscillation keeps half of its size. The band [deg] is the root of the sum of the squares "
-        "of its parts, as root of the mean square over all frames. Gluing and bones are alike in all of them."
+        "of its parts, as root of the mean square over all frames. Gluing and bones are alike in all of "
+        "them. MDD: minimal detectable difference of two sessions of a person, 1.96 times the root of two "
+        "times all parts but bones, which stay."
         if filtered
         else "Filter: none, each pose was fitted to the markers of its frame."
     )
@@ -343,9 +346,11 @@ def _error_section(title: str, take: Take, hand: HandFigures) -> Section:
         [BONES[bone].digit for bone in take.hands[take.hand_index(hand.side)].attachment.main_bones]
     )
     gaps = np.array([marker.longest_gap for marker in hand.markers()]) / take.rate
-    table = [["joint", *(("band", *SOURCES, "cut-off [Hz]") if filtered else ()), "longest gap [s]"]]
+    table = [["joint", *(("band", *SOURCES, "MDD", "cut-off [Hz]") if filtered else ()), "longest gap [s]"]]
     for number, joint in enumerate(JOINTS):
-        parts = [np.linalg.norm(budget[number]), *budget[number], cutoffs[number]] if filtered else []
+        own = np.array(budget[number] if filtered else ())
+        mdd = _MDD * np.linalg.norm(own[:-1])
+        parts = [np.linalg.norm(own), *own, mdd, cutoffs[number]] if filtered else []
         longest = float(gaps[digits == number // 4].max(initial=0.0))
         table.append([joint.name.replace("_", " "), *(f"{part:.1f}" for part in parts), f"{longest:.3f}"])
     return Section(title, text, table=table)

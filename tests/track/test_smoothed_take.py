@@ -52,6 +52,20 @@ def test_the_parts_of_the_deviations_sum_up_to_them(smooth):
         assert (np.array(smooth.settings["filter"][side]) > 0.5).all()
 
 
+def test_markers_that_stay_off_their_places_widen_the_part_of_gluing(truth, fitted, rng):
+    told = []
+    for off in (0.0, 0.004):
+        hands = []
+        for hand in truth.hands:
+            points = hand.attachment.points + off * rng.standard_normal(hand.attachment.points.shape)
+            worn = dataclasses.replace(hand.attachment, points=points)
+            hands.append(dataclasses.replace(hand, attachment=worn))
+        settings = {**fitted.settings, "user": "calibrated before"}
+        take = smooth_take(dataclasses.replace(fitted, hands=tuple(hands), settings=settings))
+        told.append(np.mean(list(take.settings["budget"].values()), axis=(0, 1)))
+    assert told[1][1] > 2.0 * told[0][1]
+
+
 def test_a_frame_has_the_same_pose_at_the_start_and_at_the_end(fitted):
     """A hand that turns back in time: the same frames follow in the opposite order."""
     again = np.concatenate([np.arange(240), np.arange(240)[::-1]])

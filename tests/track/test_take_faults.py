@@ -101,6 +101,19 @@ def test_a_glove_that_slips_is_named_with_the_time(truth):
     assert f"at {found[0].first / RATE:.2f} s" in found[0].why
 
 
+@pytest.mark.parametrize("shift", [0.0, 0.008])
+def test_a_slip_is_told_from_noise_by_all_markers_together(truth, rng, shift):
+    (hand, *_), qpos = truth.hands, truth.qpos[:, 0]
+    seen = hand.markers(qpos)[0] + rng.normal(0.0, 0.002, (FRAMES, hand.layout.num_markers, 3))
+    palm = np.flatnonzero(hand.attachment.main_bones == PALM)
+    bones = hand.model.forward_kinematics(qpos)
+    seen[HALF:, palm] += shift * bones[HALF:, PALM, None, :3, 0]
+    take = as_tracked([hand], PoseSolver(hand).solve(seen).qpos[:, None], seen)
+    found = [fault for fault in find_faults(take) if "slips by" in fault.why]
+    assert len(found) == (shift > 0.0)
+    assert all(abs(fault.first - HALF) <= 3 and fault.of.startswith("right:BackHand") for fault in found)
+
+
 @pytest.mark.parametrize("across", [(-0.18, 0.18), (0.18, -0.18)])  # 15 mm
 def test_places_that_are_off_are_named(truth, across):
     designed, off = load_layout("dense19"), dict(zip(("BackHand1", "BackHand3"), across, strict=True))

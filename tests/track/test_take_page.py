@@ -143,6 +143,9 @@ def test_the_page_is_whole_and_leads_to_the_frames_to_look_at(take, report):
     assert not re.search(r"(src|href)=\"(?!data:)", page) and "<script" not in page
     assert "prefers-color-scheme: dark" in page and "@media print" in page
     assert page.count("<img ") == 3 * len(take.hands)
+    budget = take.settings["budget"]["right"][0]
+    cells = [np.linalg.norm(budget), *budget, 2.772 * np.linalg.norm(budget[:3])]
+    assert "".join(f"<td>{cell:.1f}</td>" for cell in cells) in page
 
 
 def test_a_gap_shows_in_the_angles(take):

@@ -57,6 +57,8 @@ CONTACT_SPREAD: Final = 0.0007
 """Standard deviation of a pad's compression around `PAD_COMPRESSION` [m]; (noise / spread)^2 is lambda_2."""
 _LIMIT_SPREAD: Final = np.deg2rad(2.0)  # of an angle beyond its range
 _GESTURES: Final = 4.0  # that a capture counts as, however many frames it has: they are much alike
+# All angles of a capture may differ from the gestures by so many of their standard deviations.
+_OFF_GESTURES: Final = np.repeat([1.0, 0.25], [4, 16])  # thumbs at work are held otherwise
 RELINEARIZE: Final = 0.005  # change of a parameter (log lengths, [rad], [m]) that renews the skin's jacobian
 _DIFFERENCE_STEP: Final = 1e-5  # of finite differences
 PAD_COMPRESSION: Final = 0.001
@@ -146,7 +148,7 @@ class Problem:
         """Markers that are not missing."""
         self.targets = np.where(self.present[..., None], targets, 0.0)
         self.noise, self.robust_scale = noise, robust_scale
-        self._pose_precision = min(1.0, _GESTURES / len(targets)) * resting_prior().precision
+        self.pose_precision = min(1.0, _GESTURES / len(targets)) * resting_prior().precision
         self.position_spread, self.height_spread = POSITION_SPREAD, HEIGHT_SPREAD
         self.precision = shape_precision()
         self._ranges = HandModel(shape).skeleton.ranges
@@ -179,7 +181,7 @@ class Problem:
         cost += ((estimate.coordinates.heights - self.heights) ** 2).sum() / self.height_spread**2
         beyond, off = self._joint_angle_residuals(estimate)
         cost += (beyond**2).sum() / _LIMIT_SPREAD**2
-        cost += ((off @ self._pose_precision) * off).sum()
+        cost += ((off @ self.pose_precision) * off).sum()
         weights = contact_weights(fit.geometry, estimate.contacts.fingers)
         cost += (weights * fit.geometry.gaps**2).sum() / CONTACT_SPREAD**2
         return float(cost)
@@ -282,10 +284,10 @@ class Problem:
         result.shared[first:, first:] += lifts.T @ lifts / self.height_spread**2
         result.shared_gradient[first:] += (higher - self.heights) @ lifts / self.height_spread**2
         beyond, off = self._joint_angle_residuals(estimate)
-        result.pose[:, 6:, 6:] += self._pose_precision
+        result.pose[:, 6:, 6:] += self.pose_precision
         angles = np.arange(6, 26)
         result.pose[:, angles, angles] += (beyond != 0.0) / _LIMIT_SPREAD**2
-        result.pose_gradient[:, 6:] += beyond / _LIMIT_SPREAD**2 + off @ self._pose_precision
+        result.pose_gradient[:, 6:] += beyond / _LIMIT_SPREAD**2 + off @ self.pose_precision
 
     def _gap_jacobians(
         self, estimate: Estimate, fit: Fit, rest: NDArray[np.float64]
@@ -363,12 +365,8 @@ def find_touches(
     touches: list[tuple[int, str]] = []
     for number, finger in enumerate(FINGERS):
         speed = _speed(model, angles, finger, window, rate)
-        good = (
-            (speed < _MOST_TOUCH_SPEED)
-            & (gaps[:, number] < _MOST_TOUCH_GAP)
-            & (gaps.argmin(axis=1) == number)
-        )
-        good &= complete[:, 0] & complete[:, number + 1]
+        good = (speed < _MOST_TOUCH_SPEED) & (gaps[:, number] < _MOST_TOUCH_GAP)
+        good &= (gaps.argmin(axis=1) == number) & complete[:, 0] & complete[:, number + 1]
         shortest = max(2, round(_SHORTEST_HOLD * rate))
         stillest = [
             first + int(speed[first : last + 1].argmin())
@@ -426,8 +424,7 @@ def _nearest_skin_points(model: HandModel, bones: NDArray[np.float64], finger: s
     ends = np.stack([pads[0][first], pads[1][second]])
     direction = (ends[1] - ends[0]) / apart.min()
     radii = model.shape.radii[[0, DIGITS.index(finger)], 2:].mean(axis=1)
-    skin: NDArray[np.float64] = ends + radii[:, None] * np.stack([direction, -direction])
-    return skin
+    return np.asarray(ends + radii[:, None] * np.stack([direction, -direction]))
 
 
 def slide_contacts(
@@ -491,8 +488,7 @@ def _blend_transforms(
 ) -> NDArray[np.float64]:
     """Blended transforms (K, 3, 4) from the rest hand to the world, each for its point and frame."""
     motion = (T_world_bone @ np.linalg.inv(model.rest_transforms))[:, :, :3]
-    blends: NDArray[np.float64] = np.einsum("kl,klij->kij", skin_weights(coordinates), motion)
-    return blends
+    return np.asarray(np.einsum("kl,klij->kij", skin_weights(coordinates), motion))
 
 
 def levenberg_marquardt(
@@ -567,11 +563,16 @@ def shared_covariance(
 
 
 def angle_errors(
-    covariance: Float[np.ndarray, "S S"], answers: Float[np.ndarray, "F 26 S"]
+    covariance: Float[np.ndarray, "S S"],
+    answers: Float[np.ndarray, "F 26 S"],
+    pose_precision: Float[np.ndarray, "20 20"],
 ) -> Float[np.ndarray, "20 2"]:
     """What `shared_covariance` leaves open of each joint angle [rad]: by places of markers, by the shape."""
-    # Both are correlated. Their shares of the whole variance are as they would be alone.
     by_angle = answers[:, 6:]
+    # Where directions of bones are unsure, gestures that the user does not make turn them.
+    turns = covariance @ by_angle.sum(axis=0).T @ pose_precision * _OFF_GESTURES
+    covariance = covariance + turns @ resting_prior().covariance @ turns.T
+    # Both are correlated. Their shares of the whole variance are as they would be alone.
     places, bones, both = (
         np.einsum("fis,st,fit->i", of, covariance[part, part], of, optimize=True)
         for part in (slice(NUM_PARAMETERS, None), slice(NUM_PARAMETERS), slice(None))

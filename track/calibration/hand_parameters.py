@@ -229,10 +229,8 @@ def skin_points(
 def skin_weights(coordinates: SkinCoordinates) -> Float[np.ndarray, "P 16"]:
     """Shares of all bones at these coordinates."""
     mesh = skin_mesh()
-    weights: NDArray[np.float64] = np.einsum(
-        "pc,pcb->pb", coordinates.bary, mesh.weights[mesh.faces[coordinates.faces]]
-    )
-    return weights
+    shares = mesh.weights[mesh.faces[coordinates.faces]]
+    return np.asarray(np.einsum("pc,pcb->pb", coordinates.bary, shares))
 
 
 def attachment_at(layout: MarkerLayout, coordinates: SkinCoordinates, shape: HandShape) -> Attachment:
@@ -249,8 +247,7 @@ def skin_weight_jacobian(coordinates: SkinCoordinates, corners: Corners) -> Floa
     mesh = skin_mesh()
     shares = mesh.weights[mesh.faces[coordinates.faces]]
     jacobian = np.linalg.inv(_point_jacobian(coordinates, corners))[:, :2]
-    change: NDArray[np.float64] = np.einsum("pcb,pci->pbi", shares[:, 1:] - shares[:, :1], jacobian)
-    return change
+    return np.asarray(np.einsum("pcb,pci->pbi", shares[:, 1:] - shares[:, :1], jacobian))
 
 
 def _point_jacobian(coordinates: SkinCoordinates, corners: Corners) -> NDArray[np.float64]:

@@ -73,6 +73,7 @@ _LEAST_NOISE, _MOST_NOISE = 0.0001, 0.003  # [m]
 _CHI2_MEDIAN: Final = 2.366  # median of the chi-squared distribution with three degrees of freedom
 _USUAL_SPREAD_COORDINATES: Final = 12.0  # coordinates of markers that the usual spread counts as
 _INDEPENDENT_POSES: Final = 14.0  # frames whose deformation of the flesh is independent
+_FLESH_REPEATS: Final = 0.7  # added to variances by flesh, which follows the angles alike in all of these
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -169,8 +170,7 @@ class Calibration:
         if not self.significant_touches:
             return np.full(2, np.nan)
         pairs = np.abs([[touch.gap_before, touch.gap_after] for touch in self.significant_touches])
-        means: NDArray[np.float64] = pairs.mean(axis=0)
-        return means
+        return np.asarray(pairs.mean(axis=0))
 
     def suggestions(self) -> tuple[str, ...]:
         """What to do in a better capture, as sentences; empty when nothing is missing."""
@@ -223,6 +223,8 @@ def calibrate_hand(
         before = contact_gaps(right.model, touches, touching.qpos)
     final = PoseSolver(done).solve(seen, rough_track.qpos)
     covariance, answers = shared_covariance(problem, estimate, fit)
+    flesh = 1.0 - (problem.robust_scale / (_SCALE_IN_NOISES * problem.noise)) ** 2
+    covariance *= 1.0 + _FLESH_REPEATS * flesh
     position_errors, length_errors = standard_errors(problem, estimate, fit, covariance)
     return Calibration(
         hand=done.with_side(start.side),
@@ -232,7 +234,7 @@ def calibrate_hand(
         shifts=np.linalg.norm(fit.design_residuals, axis=1),
         position_errors=position_errors,
         length_errors=length_errors,
-        angle_errors=angle_errors(covariance, answers),
+        angle_errors=angle_errors(covariance, answers, problem.pose_precision),
         touches=_touches(estimate, fit, touches, usable, before, mirror),
         still_joints=still_joints(final.qpos[:, 7:], complete, done.model),
     )
@@ -324,8 +326,7 @@ def informative_frames(track: PoseFit, markers: Float[np.ndarray, "T M 3"]) -> N
     while len(chosen) < min(NUM_FRAMES, len(candidates)):
         distance = np.minimum(distance, ((angles - angles[chosen[-1]]) ** 2).sum(axis=1))
         chosen.append(int(distance.argmax()))
-    picked: NDArray[np.int64] = candidates[np.sort(chosen)]
-    return picked
+    return np.asarray(candidates[np.sort(chosen)])
 
 
 def marker_noise(problem: Problem, fit: Fit) -> float:
@@ -368,11 +369,8 @@ def _learned(
 ) -> float:
     """A spread [m] of offsets from zero, by their squares and posterior variances summed over axes."""
     determined = np.clip(axes - variances / spread**2, 0.0, None).sum()
-    return float(
-        np.sqrt(
-            (squares.sum() + _USUAL_SPREAD_COORDINATES * usual**2) / (determined + _USUAL_SPREAD_COORDINATES)
-        )
-    )
+    total, usual_count = squares.sum() + _USUAL_SPREAD_COORDINATES * usual**2, _USUAL_SPREAD_COORDINATES
+    return float(np.sqrt(total / (determined + usual_count)))
 
 
 def standard_errors(

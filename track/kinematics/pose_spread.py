@@ -420,22 +420,27 @@ class SpreadModel:
         unseen: Float[np.ndarray, "T M"],
         noise: float,
         flesh: float = 0.0,
+        place: float = 0.0,
         smoothed: Float[np.ndarray, "S 26 26"] = NOT_SMOOTHED,
         share: float = 1.0,
     ) -> tuple[Float[np.ndarray, "T 20 4"], Float[np.ndarray, "T 21"]]:
         """Variances of angles by `SOURCES` [rad^2], and standard deviations of keypoints [m].
 
-        Of a smoothed hand the covariances of its unknowns by noise and gaps are given, and how often the
-        prior counts in a frame.
+        Of a smoothed hand are given: flesh, how far its markers are from their places in all frames [m], the
+        covariances of its unknowns by noise and gaps, and how often the prior counts in a frame.
         """
         steps = round(noise / _NOISE_STEP)
         if steps not in self._doubts:
             self._doubts[steps] = hand_doubt(self._digits, self._origin, steps * _NOISE_STEP)
-        doubt = self._doubts[steps]._replace(flesh=flesh)
+        doubt = self._doubts[steps]
+        doubt = doubt._replace(flesh=flesh, places=np.maximum(doubt.places, place))
         prior = share * resting_prior().precision
         variances, keypoints = pose_spreads(self._hand, prior, doubt, qpos, unseen, smoothed)
         if self._angle_errors is not None:
-            variances[..., [1, 3]] = self._angle_errors**2
+            unsure, errors = variances[..., [1, 3]], self._angle_errors**2
+            # What is open of a hand moves its keypoints as it moves its angles.
+            keypoints *= max(1.0, np.sqrt(errors.sum() / unsure.mean(axis=0).sum()))
+            variances[..., [1, 3]] = np.maximum(unsure, errors)
         return variances, keypoints
 
 

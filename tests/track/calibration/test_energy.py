@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from copy import copy
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from track.calibration.energy import (
     ContactGeometry,
     Estimate,
     Problem,
+    angle_errors,
     contact_geometry,
     contact_weights,
     eliminate_poses,
@@ -26,6 +28,7 @@ from track.calibration.energy import (
     initialize_contacts,
     levenberg_marquardt,
     marker_rms,
+    shared_covariance,
     slide_contacts,
 )
 from track.calibration.hand_parameters import NUM_PARAMETERS, SkinPatch, nearest_coordinates
@@ -99,6 +102,20 @@ def test_elimination_solves_the_whole_system(problem_and_estimate):
     np.testing.assert_allclose((left + equations.shared_gradient) / scale, 0.0, atol=1e-6)
     rest = np.einsum("fpq,fq->fp", equations.pose, poses) + equations.mixed @ shared + equations.pose_gradient
     np.testing.assert_allclose(rest / np.sqrt(np.einsum("fpp->fp", equations.pose)), 0.0, atol=1e-6)
+
+
+def test_a_thumb_that_gestures_may_turn_is_told_as_unsure(problem_and_estimate):
+    problem, estimate = copy(problem_and_estimate[0]), problem_and_estimate[1]
+    problem.noise = 0.003  # so that the markers tell little
+    covariance, answers = shared_covariance(problem, estimate, problem.fit(estimate))
+    precision = problem.pose_precision
+    without, told = (
+        np.linalg.norm(angle_errors(covariance, answers, one), axis=1) for one in (0 * precision, precision)
+    )
+    assert (told >= without).all()
+    assert told[0] > 1.05 * without[0] > 0.0
+    more = np.linalg.norm(angle_errors(4.0 * covariance, answers, 0 * precision), axis=1)
+    np.testing.assert_allclose(more, 2.0 * without)
 
 
 def test_steps_go_down_and_are_told(problem_and_estimate):
