@@ -275,7 +275,7 @@ class Studio:
         found = np.full((len(self._hands), 3), np.nan)
         poses = {number: moment.hand(number) for number in range(len(self._hands))}
         there = {number: pose for number, pose in poses.items() if pose is not None}
-        forearms = None if user is None else user.forearms(moment.take.qpos[moment.frame])
+        forearms = None if user is None else user.forearms[moment.frame]
         if there:
             lines = (
                 self._hands[number].skin.forearm_line(pose, None if forearms is None else forearms[number])
@@ -357,8 +357,8 @@ class Studio:
         background = choices.background
         whole = paint(camera, drawn, choices.lighting, self.painter)
         if choices.enclosure is not None:
-            behind = draw_surroundings(background, choices.enclosure, camera).rgb.astype(np.float32)
-            return put_before(whole, behind)
+            behind = draw_surroundings(background, choices.enclosure, camera).rgb
+            return put_before(whole, behind, behind)
         (plain, bare), light = _background(background, camera.size), None
         if background.backdrop is not None and camera.lens.kind == "pinhole":
             light = light_behind(camera, drawn, choices.lighting, background.backdrop)

@@ -41,7 +41,7 @@ class Framing:
     def __init__(self, take: Take, user: UserBody | None = None) -> None:
         self.user = user
         straight = -quaternion_matrix(take.qpos[..., 3:7])[..., 0]
-        self.forearms: Doubles = straight if user is None else user.forearms(take.qpos)
+        self.forearms: Doubles = straight if user is None else user.forearms
         """Unit direction (T, H, 3) from each wrist to its elbow; NaN where there is no hand."""
         shape = (take.num_frames, len(take.hands), len(_OUTLINE), 3)
         self.points: Floats = np.full(shape, np.nan, dtype=np.float32)
