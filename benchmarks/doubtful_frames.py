@@ -30,7 +30,7 @@ from gloves.captures.capture import runs_of
 from track import find_suspect_spans, label_capture, track_capture
 from track.label_confidence import evidence_of, label_confidence
 from track.recorder import TakeRecorder
-from track.take_summary import frame_confidence
+from track.take_summary import _VOUCH_LEAST, frame_confidence, vouch
 from train import OpticsOptions, simulate_take
 from train.evaluation import expected_calibration_error
 
@@ -121,6 +121,18 @@ def score(take: Take, truth: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
     return np.array(counts), [*pairs, np.stack([certain[known], right.all(axis=1)[known]])]
 
 
+def vouch_ratio(take: Take, truth: np.ndarray) -> float:
+    """Share of wrong frames among those not listed, over what `vouch` multiplies by its factor."""
+    right = ((take.labels == truth) | ~np.isfinite(take.points[..., 0])).all(axis=1)
+    listed = np.zeros(take.num_frames, dtype=bool)
+    for span in find_suspect_spans(take, None):
+        listed[span.first : span.last + 1 if span.of_labels else span.first] = True
+    doubt = 1.0 - np.nan_to_num(frame_confidence(take), nan=1.0)
+    if listed.all():
+        return 0.0
+    return float((~right[~listed]).mean() / (doubt[~listed].mean() + _VOUCH_LEAST))
+
+
 def row(counts: np.ndarray, pairs: list[np.ndarray]) -> list[float]:
     """`WHAT` of some captures."""
     runs, covered, spans, good, seconds, listed = counts
@@ -162,12 +174,15 @@ def main(
     torch.set_num_threads(1)
     print(describe("numba", "torch"), WHAT, sep="\n")
     table: dict[str, list[tuple[np.ndarray, list[np.ndarray]]]] = {}
+    ratios: list[float] = []
     labeled: list[tuple[np.ndarray, np.ndarray]] = []
     others: list[tuple[np.ndarray, np.ndarray]] = []
     takes = real_takes(real, frames) if real else simulated_takes(gloves, seeds, frames, label)
     for name, take, truth in takes:
         for key in (*name.split(), "all"):
             table.setdefault(key, []).append(score(take, truth))
+        if vouch(take).right > 0.0:
+            ratios.append(vouch_ratio(take, truth))
         if fit:
             evidence = evidence_of(take)
             points = take.point_list
@@ -183,6 +198,10 @@ def main(
         )
         print(f"{key:16s} | " + " | ".join(f"{value:6.1f}" for value in values), flush=True)
         figures[key] = f"{WHAT}; {key}", values
+    if (rank := int(np.ceil(0.95 * (len(ratios) + 1)))) <= len(ratios):
+        factor = float(np.sort(ratios)[rank - 1])
+        figures["vouch"] = "factor of the bound that the next take keeps with 95 % (split conformal)", factor
+        print(f"factor of the bound on wrong frames by {len(ratios)} takes: {factor:.2f}")
     save_figures(save, figures)
     if fit:
         print("_LABELED", fitted(labeled).round(2), "\n_UNLABELED", fitted(others).round(2))

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 _WRITERS: Final = {
     "gloves.takes.take.Take": "track.take_page:write_take_page",
     "train.data.shards.Dataset": "train.reports.dataset_page:write_dataset_page",
+    "render.film.registration.Registration": "render.film.page:write_film_page",
     "track.glove_score.LayoutScore": "track.glove_page:write_glove_page",
     "train.forecast.rig_score.RigScore": "train.forecast.rig_score:write_rig_page",
 }
@@ -93,8 +94,8 @@ def write_page(path: str | Path, thing: Any) -> None:
 
     Args:
         path: The page, an .html file; the tables of a take (.csv) lie beside it.
-        thing: A take, a training set, or what `score_glove` or `score_rig` returned; pages show angles in
-            [deg] and distances in [mm].
+        thing: A take, a training set, or what `register_camera`, `score_glove` or `score_rig` returned; pages
+            show angles in [deg] and distances in [mm].
 
     Raises:
         ArgumentError: It is something else, or the page's name does not end in .html.
@@ -107,7 +108,8 @@ def write_page(path: str | Path, thing: Any) -> None:
     target = next((_WRITERS[kind] for kind in kinds if kind in _WRITERS), None)
     if target is None:
         raise ArgumentError(
-            f"thing is {shown_value(thing)}, expected a Take, a Dataset, or a score of a glove or a rig"
+            f"thing is {shown_value(thing)}, expected a Take, a Dataset, a Registration, or a score of a "
+            "glove or a rig"
         )
     module, _, name = target.partition(":")
     getattr(importlib.import_module(module), name)(Path(path), thing)

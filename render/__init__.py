@@ -18,6 +18,9 @@ if TYPE_CHECKING:
     from render.depth_sensor import DepthSensor as DepthSensor
     from render.film.detector import FoundHand as FoundHand
     from render.film.detector import HandDetector as HandDetector
+    from render.film.film import annotate_film as annotate_film
+    from render.film.film import register_camera as register_camera
+    from render.film.registration import Registration as Registration
     from render.film.training import train_detector as train_detector
     from render.formats.writer import merge_renderings as merge_renderings
     from render.frames import BodyTruth as BodyTruth

@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Final, Literal
+from typing import Final, Literal, Protocol
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Bool, Float, Float32, UInt8
 from scipy.optimize import isotonic_regression
 
 from handsim.errors import HandSimError
@@ -19,7 +19,7 @@ from handsim.hand.shape import BONES, DIGITS
 from handsim.hand.skin import vertex_normals
 from render.formats.png import encode_png
 from render.formats.records import CENTER, as_sensed
-from render.frames import Bytes, Doubles, HandTruth, RenderedFrame
+from render.frames import Bytes, Doubles, RenderedFrame
 from render.painting.figures import Material, linear
 from render.skin.texture import GLOVE_COLOR
 
@@ -195,7 +195,19 @@ def contact_sheet(frames: Sequence[RenderedFrame], *, columns: int = 3, width: i
     return pad(np.concatenate(rows), (_GAP, 0), (_GAP, 0))
 
 
-def draw_keypoints(picture: Picture, hands: Sequence[HandTruth], *, scale: float = 1.0) -> Picture:
+class Skeleton(Protocol):
+    """A hand's keypoints in a picture, and which are visible; `HandTruth` is one."""
+
+    @property
+    def keypoints(self) -> Float[np.ndarray, "21 2"]:
+        """[px]."""
+
+    @property
+    def visible(self) -> Bool[np.ndarray, "21"]:
+        """Which are drawn full."""
+
+
+def draw_keypoints(picture: Picture, hands: Sequence[Skeleton], *, scale: float = 1.0) -> Picture:
     """The picture with the hands' skeletons in it, in the digits' colors."""
     drawn = np.ascontiguousarray(picture).copy()
     colors = np.rint(255 * bone_colors()).astype(int)

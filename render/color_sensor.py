@@ -26,7 +26,7 @@ from render.frames import Bytes, Floats
 
 _ROOTS: Final = 4096  # of light in the same table by its root, which stays in the processor's cache
 _SPREAD: Final = (3, 3)  # [px] that a point of light is spread over
-_GRAY: Final = 0.33  # mean light of pictures that keep the nominal exposure
+_GRAY: Final = 0.25  # mean light of pictures that keep the nominal exposure
 _METERED: Final = (0.25, 4.0)  # range of the ratio of light that is made up for
 _LEVELS: Final = 65536  # of light in the table of the sRGB curve: twenty to its narrowest step
 
@@ -59,7 +59,7 @@ class ExposureConfig:
     """Ranges of exposures; drawn uniformly unless stated."""
 
     stops: tuple[float, float] = (-0.5, 0.4)
-    metering: float = 0.4
+    metering: float = 0.2
     """Share of the difference between a picture's mean light and middle gray that cameras make up for."""
     balance: float = 0.05
     """Standard deviation of the logarithms of the factors of red and blue."""

@@ -148,11 +148,15 @@ def _keep_supported(disparity: Floats, needed: Integers, most: int, kept: Flags)
             if not kept[row, column]:
                 continue
             middle, agreed = fixed[row + border, column + border], -1
+            enough = min(
+                needed[row // 3, column // 3], len(_DOTS) ** 2 - 1
+            )  # where all agree, nothing is lost
             for down in _DOTS:
                 for right in _DOTS:
                     agreed += abs(fixed[row + border + down, column + border + right] - middle) <= most
-            # Where all agree, nothing is lost.
-            kept[row, column] = agreed >= min(needed[row // 3, column // 3], len(_DOTS) ** 2 - 1)
+                if agreed >= enough:
+                    break
+            kept[row, column] = agreed >= enough
 
 
 @kernel

@@ -200,13 +200,18 @@ def write_clip(
     if path.suffix.lower() != SUFFIX:
         raise ArgumentError(f"cannot write a video as '{path}', expected a name that ends in {SUFFIX}")
     view = view_along(np.array(_AHEAD), np.array([0.0, 0.0, 1.0]), shown, _SIZE)
+    pictures = (_draw_frame(ClipFrame(*frame), view, radius) for frame in frames)  # type: ignore[arg-type]
+    write_video(path, pictures, rate=rate, size=_SIZE)
+
+
+def write_video(path: Path, pictures: Iterable[Picture], *, rate: float, size: tuple[int, int]) -> None:
+    """Write a video of pictures of a width and height [px], whole or not at all."""
     with writing(path, FileError), atomic_write(path) as temporary, plain_path(temporary) as plain:
-        writer = cv2.VideoWriter(str(plain), cv2.VideoWriter.fourcc(*_CODEC), rate, _SIZE)
+        writer = cv2.VideoWriter(str(plain), cv2.VideoWriter.fourcc(*_CODEC), rate, size)
         try:
             if not writer.isOpened():
                 raise FileError(f"{path}: OpenCV cannot write a video of the codec {_CODEC} here")
-            for frame in frames:
-                picture = _draw_frame(ClipFrame(*frame), view, radius)  # type: ignore[arg-type]
+            for picture in pictures:
                 writer.write(cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
         finally:
             writer.release()

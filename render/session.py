@@ -56,7 +56,7 @@ from render.formats.writer import (
     shard_files,
     whole_shards,
 )
-from render.frames import Doubles, RenderedFrame
+from render.frames import Doubles, FilmReader, RenderedFrame
 from render.painting.figures import sample_people
 from render.scenery.backgrounds import photo_files
 from render.scenery.lights import sample_surroundings
@@ -147,7 +147,12 @@ class Drawing:
         # Poses that are no motion are many people's, except before one person's eyes.
         has_user = self.subject.is_motion or config.view.placement == "head"
         self._user = UserBody(self.take) if has_user else None
-        self.viewpoints = Viewpoints(config.view, self.take, rng=rng, up=config.up, user=self._user)
+        film = subject.film
+        self._film = None if film is None else film.open()
+        poses = None if film is None else film.poses
+        self.viewpoints = Viewpoints(
+            config.view, self.take, rng=rng, up=config.up, user=self._user, poses=poses
+        )
         self._studio_of = functools.lru_cache(maxsize=_MOST_STUDIOS)(self._studio_of_person)
 
     def frames_without_hands(self) -> list[int]:
@@ -186,6 +191,7 @@ class Drawing:
         config, cast = self.config, self.subject.cast
         viewpoints = self.viewpoints
         several = viewpoints.num_cameras > 1 or (viewpoints.moves and config.vary == "shard")
+        several &= self._film is None
         around = viewpoints.positions() if several else None
         rng = SpawnKey.SHARD.rng(config.seed, shard, 0)
         if cast is None:  # a take has its own hands, whose looks change with the shard
@@ -233,7 +239,12 @@ class Drawing:
 
     def _open_studio(self, hands: Sequence[GloveFit], rng: np.random.Generator) -> Studio:
         return open_studio(
-            hands, self.config, bodies=self.take.bodies, rng=rng, has_user=self._user is not None
+            hands,
+            self.config,
+            bodies=self.take.bodies,
+            rng=rng,
+            has_user=self._user is not None,
+            film=self._film,
         )
 
 
@@ -244,6 +255,7 @@ def open_studio(
     bodies: Sequence[RigidBody] = (),
     rng: np.random.Generator,
     has_user: bool = False,
+    film: FilmReader | None = None,
 ) -> Studio:
     """A studio of one person with random looks, whose wrists a `UserBody` may bend."""
     people = sample_people(len(hands), config.dress == "glove", tones=config.tones, rng=rng)
@@ -252,7 +264,8 @@ def open_studio(
         people = tuple(dataclasses.replace(one, forearm=straight) for one in people)
     colors = [tuple(rng.uniform(0.05, 0.9, 3).tolist()) for _ in bodies]
     assert config.painter != "auto"
-    return Studio(hands, people, bodies, colors, config.passes, config.painter, room_depth=config.room_depth)
+    room = config.room_depth
+    return Studio(hands, people, bodies, colors, config.passes, config.painter, room_depth=room, film=film)
 
 
 def sample_choices(
@@ -357,7 +370,8 @@ def render_take(
     for one in cameras if not all(WRITERS[name].any_lens for name in formats) else ():
         centered_K(one)  # refuses other lenses before a folder is begun
     check_hands_in_view(config.view, drawing.viewpoints, drawing.take)
-    if absent := drawing.frames_without_hands():
+    absent = drawing.frames_without_hands()
+    if absent and drawing.subject.film is None:  # frames of a video are left out for reasons that are told
         told = f"frames without a hand are not drawn: {len(absent)} of {drawing.take.num_frames}"
         warnings.warn(f"{told} (the first: {absent[0]})", HandSimWarning, stacklevel=2)
     shards, views = drawing.shards(), drawing.viewpoints.num_cameras

@@ -31,6 +31,7 @@ from render.frames import (
     BodyTruth,
     Bytes,
     Doubles,
+    FilmReader,
     Flags,
     Floats,
     Geometry,
@@ -200,8 +201,10 @@ class Studio:
         painter: Painter = "compiled",
         *,
         room_depth: bool = True,
+        film: FilmReader | None = None,
     ) -> None:
         self.passes, self.painter, self._room_depth = tuple(passes), painter, room_depth
+        self._film = film  # whose pictures take the place of drawn colors
         self._people = tuple(people)
         self._looks = [dataclasses.asdict(look) for look in people]
         first = np.cumsum([0, *(len(fit.attachment.points) for fit in hands)])
@@ -239,7 +242,7 @@ class Studio:
         truth = see(camera, surfaces, with_normals=sensor is not None or "normals" in self.passes)
         rgb = noisy_rgb = noisy_depth = None
         if "rgb" in self.passes:
-            rgb = self._colors_of(camera, drawn, choices)
+            rgb = self._colors_of(camera, drawn, choices) if self._film is None else self._film.picture(frame)
             noisy_rgb = self._exposed(moment, camera, rgb, choices, rng)
         seen = truth
         if choices.enclosure is not None and self._room_depth:
@@ -275,7 +278,7 @@ class Studio:
         found = np.full((len(self._hands), 3), np.nan)
         poses = {number: moment.hand(number) for number in range(len(self._hands))}
         there = {number: pose for number, pose in poses.items() if pose is not None}
-        forearms = None if user is None else user.forearms(moment.take.qpos[moment.frame])
+        forearms = None if user is None else user.forearms[moment.frame]
         if there:
             lines = (
                 self._hands[number].skin.forearm_line(pose, None if forearms is None else forearms[number])
@@ -357,8 +360,8 @@ class Studio:
         background = choices.background
         whole = paint(camera, drawn, choices.lighting, self.painter)
         if choices.enclosure is not None:
-            behind = draw_surroundings(background, choices.enclosure, camera).rgb.astype(np.float32)
-            return put_before(whole, behind)
+            behind = draw_surroundings(background, choices.enclosure, camera).rgb
+            return put_before(whole, behind, behind)
         (plain, bare), light = _background(background, camera.size), None
         if background.backdrop is not None and camera.lens.kind == "pinhole":
             light = light_behind(camera, drawn, choices.lighting, background.backdrop)
@@ -396,6 +399,8 @@ class Studio:
         )
 
     def _record(self, choices: FrameChoices) -> dict[str, Any]:
+        if self._film is not None:
+            return {"film": self._film.name}
         record = _as_record(dataclasses.replace(choices, seed=0)) | {"seed": choices.seed}
         return {"people": self._looks, "body_colors": self._colors, **record}
 

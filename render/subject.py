@@ -38,7 +38,7 @@ from handsim.motion_files.motion import read_joint_csv
 from handsim.space.transforms import UpAxis, rotation_quaternions, turned_poses, upright
 from poses.shapes import HIGH, LOW
 from render.config import SpawnKey
-from render.frames import Doubles
+from render.frames import Doubles, FilmPictures
 
 KEYS: Final = ("qpos", "angles", "T_world_wrist", "times", "person", "hands", "hand_size")
 CSV: Final = ".csv"
@@ -283,6 +283,7 @@ class Subject:
     cast: Cast | None = None  # people; None if the take's hands are drawn
     is_motion: bool = True  # whether frames follow one another in time
     poses: dict[str, Any] | None = None  # other settings of poses, as JSON; None for a take
+    film: FilmPictures | None = None  # pictures of a video in the place of drawn colors
 
     def __post_init__(self) -> None:
         if not np.isfinite(self.take.qpos[..., 0]).any():
@@ -331,16 +332,18 @@ Source = Path | PoseFile | Subject
 """A subject or its file; every process that draws reads files again."""
 
 
-def source_of(source: Take | str | Path | PoseFile | ArrayLike, *, seed: int = 0, **options: Any) -> Source:
+def source_of(
+    source: Take | str | Path | PoseFile | Subject | ArrayLike, *, seed: int = 0, **options: Any
+) -> Source:
     """The source that a user gave; the options are those of `subject_of_poses`."""
     given = {name: value for name, value in options.items() if value is not None}
-    if not isinstance(source, Take | str | Path | PoseFile):
+    if not isinstance(source, Take | str | Path | PoseFile | Subject):
         return subject_of_poses(source, seed=seed, **given)
     for name in given:
         raise ArgumentError(f"{name} belongs to poses of your own; a take and a file have their own")
     if isinstance(source, Take):
         return subject_of_take(source)
-    if isinstance(source, PoseFile):
+    if isinstance(source, PoseFile | Subject):
         return source
     path = Path(source)
     return PoseFile(path) if path.suffix.lower() == CSV else path

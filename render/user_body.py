@@ -58,6 +58,8 @@ class UserBody:
     """Position of each hand's shoulder (H, 3) [m]."""
     right: Doubles
     """Level unit direction (3,) to the person's right."""
+    forearms: Doubles
+    """Unit directions from wrists to elbows in all frames (T, H, 3); NaN where there is no hand."""
 
     def __init__(self, take: Take) -> None:
         self._lengths = np.array([hand.shape.length for hand in take.hands])
@@ -78,6 +80,7 @@ class UserBody:
             if means[first] < best:
                 best, azimuth = float(means[first]), float(tried[first, 0])
                 self.eyes, self.shoulders, self.right = eyes[first], shoulders[first], right[first]
+        self.forearms = self._forearms(take.qpos)
 
     def _stand(
         self, middle: Doubles, azimuth: Doubles, distance: Doubles, down: Doubles, facing: Doubles
@@ -95,8 +98,8 @@ class UserBody:
     def _palms(self, wrists: Doubles, axes: Doubles) -> Doubles:
         return np.asarray(wrists + 0.5 * self._lengths[:, None] * axes[..., 0])
 
-    def forearms(self, qpos: Float[np.ndarray, "*T H 27"]) -> Float[np.ndarray, "*T H 3"]:
-        """Unit directions from wrists to elbows; NaN where there is no hand."""
+    def _forearms(self, qpos: Float[np.ndarray, "T H 27"]) -> Doubles:
+        """The mean of the elbows that are tried, by what they cost."""
         axes = quaternion_matrix(qpos[..., 3:7])
         ways, costs = self._elbows(qpos[..., :3], axes, self.shoulders, self.eyes)
         weights = np.exp((costs.min(axis=-1, keepdims=True) - costs) / _SOFTNESS)

@@ -41,7 +41,7 @@ class Framing:
     def __init__(self, take: Take, user: UserBody | None = None) -> None:
         self.user = user
         straight = -quaternion_matrix(take.qpos[..., 3:7])[..., 0]
-        self.forearms: Doubles = straight if user is None else user.forearms(take.qpos)
+        self.forearms: Doubles = straight if user is None else user.forearms
         """Unit direction (T, H, 3) from each wrist to its elbow; NaN where there is no hand."""
         shape = (take.num_frames, len(take.hands), len(_OUTLINE), 3)
         self.points: Floats = np.full(shape, np.nan, dtype=np.float32)
@@ -267,15 +267,19 @@ class Viewpoints:
         rng: np.random.Generator,
         up: UpAxis = "z",
         user: UserBody | None = None,
+        poses: Float[np.ndarray, "T 4 4"] | None = None,
     ) -> None:
+        """Place the cameras; `poses` are those of the one camera of its own that moves."""
         framing, own = Framing(take, user), config.cameras
         if own is not None:
             cameras = list(load_cameras(own) if isinstance(own, str) else own)
+            turn = rigid(upright(up), np.zeros(3)) if up != "z" else np.eye(4)
             if up != "z":
-                turn = rigid(upright(up), np.zeros(3))
                 cameras = [one.at(turn @ one.T_world_camera) for one in cameras]
             stay = (take.num_frames, 4, 4)
             self._paths = [_Path(one, np.broadcast_to(one.T_world_camera, stay)) for one in cameras]
+            if poses is not None:
+                self._paths = [_Path(cameras[0], turn @ poses)]
         else:
             paths = _PATHS[config.placement](config, take, framing, rng)
             cameras = [dataclasses.replace(path.camera, name=f"view{n}") for n, path in enumerate(paths)]

@@ -129,14 +129,15 @@ def _slips(hand: _Hand) -> Iterator[SuspectSpan]:
     seconds = hand.take.times[hand.frames] - hand.take.times[hand.frames[0]]
     is_long = np.minimum(seconds, seconds[-1] - seconds)[:, None] >= _SLIP_PART
     is_clear = (steps > _SLIP) & (share > _SLIP_SHARE)
-    is_small = (steps > _SMALL_SLIP) & (share > _SMALL_SHARE) & is_long
-    share[~(is_clear | is_small)] = 0.0
+    is_small = (steps > _SMALL_SLIP) & (share > _SMALL_SHARE)
+    share *= (is_clear | is_small) & is_long
     if not share.any():
-        width = round(_WHILE * len(seconds) / max(seconds[-1], _WHILE))
+        width = max(1, round(_WHILE * len(seconds) / max(seconds[-1], _WHILE)))
         there = uniform_filter1d(known[..., None].astype(float), width, axis=0)
         slow = uniform_filter1d(values, width, axis=0) / np.maximum(there, 0.5 / width)
         slow -= whole / total[:, None]
-        of_glove = explained.sum(axis=1, keepdims=True) / np.square(slow[known]).sum()
+        lasting = max(np.square(slow[known]).sum(), _LEAST_VARIANCE * known.sum(), _LEAST_VARIANCE)
+        of_glove = explained.sum(axis=1, keepdims=True) / lasting
         together = np.sqrt(np.square(steps).mean(axis=1, keepdims=True)) > _GLOVE_SLIP
         share = of_glove * steps / max(steps.max(), _SLIP) * (together & (of_glove > _GLOVE_SHARE) & is_long)
     when, marker = np.unravel_index(int(share.argmax()), share.shape)

@@ -63,6 +63,7 @@ _HELP: Final = {
     "view": "Show a file or a live tracker in the browser.",
     "body": "Write a rigid body's markers as a file, to track it with.",
     "render": "Draw the hands of a take, with the truth of each picture.",
+    "film": "Register an ordinary video to a tracked take; its frames become labeled photographs.",
     "doctor": "Say what is missing on this machine, and how to get it.",
 }
 """Every command with its line of help; `handsim glove list` is `list_glove` in the module `glove`."""

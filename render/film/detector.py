@@ -1,6 +1,6 @@
 """`HandDetector`: the hands in a picture, gloved or bare, with boxes, sides and 21 keypoints.
 
-A finder looks at the whole picture and tells centers, sizes and sides; a second network looks at each hand
+A finder looks at the whole picture and tells centers and sizes of hands; a second network looks at each hand
 twice: upright, then turned so that its fingers point up. Both learned from drawn pictures alone
 (`render.film.training`). OpenCV runs them.
 """
@@ -30,10 +30,10 @@ CROP_SIZE: Final = 128  # of the square that the keypoint network sees [px]
 HEAT_SIZE: Final = 16  # cells of a keypoint's map, each way
 NEAR: Final = 0.2  # reach of the heat around its peak that a keypoint is the mean of [share of the side]
 ROOM: Final = 1.55  # side of the square that is cut out around a hand, over the hand's longer side
-_WRIST, _KNUCKLE = 0, 9  # keypoints: the wrist, and where the middle finger begins
+_WRIST, _INDEX, _KNUCKLE, _LITTLE = 0, 5, 9, 17  # keypoints: the wrist, and where three fingers begin
 MOST_BYTES: Final = 1 << 26  # of a file of weights
 _MOST_FOUND: Final = 8  # places in a picture at which hands are looked for
-_LEAST_HEAT: Final = 0.2  # of a place at which a hand is looked for
+_LEAST_HEAT: Final = 0.25  # of a place at which a hand is looked for
 _LEAST_CONFIDENCE: Final = 0.5
 _SAME: Final = 0.25  # mean distance of the keypoints of one hand that was found twice [longer side]
 
@@ -82,7 +82,7 @@ class HandDetector:
         found = _run(self._finder, np.zeros((3, FINDER_SIZE, FINDER_SIZE), np.float32), ("cells",))
         told = _run(self._keypoints, np.zeros((3, CROP_SIZE, CROP_SIZE), np.float32), ("heat", "logits"))
         shapes = [array.shape for array in (*found, *told)]
-        if shapes != [(1, 5, cells, cells), (1, NUM_KEYPOINTS, HEAT_SIZE, HEAT_SIZE), (1, 2)]:
+        if shapes != [(1, 4, cells, cells), (1, NUM_KEYPOINTS, HEAT_SIZE, HEAT_SIZE), (1, 2)]:
             raise ValueError(f"outputs have the shapes {shapes}")
 
     @classmethod
@@ -112,9 +112,9 @@ class HandDetector:
         """
         picture = _checked(image)
         hands: list[FoundHand] = []
-        for corners, right in self._places(picture):
+        for corners in self._places(picture):
             first = self._look(picture, square_around(corners))
-            hand = self._second_look(picture, first, prior=right)
+            hand = self._second_look(picture, first)
             if hand.confidence >= _LEAST_CONFIDENCE:
                 hands.append(hand)
         hands.sort(key=lambda hand: -hand.confidence)
@@ -157,8 +157,8 @@ class HandDetector:
             found.append(self._second_look(picture, first, side=side))
         return found
 
-    def _places(self, picture: NDArray[np.uint8]) -> list[tuple[Doubles, float]]:
-        """Corners (2, 2) [px] of squares that look like hands, and log-odds of a right one."""
+    def _places(self, picture: NDArray[np.uint8]) -> list[Doubles]:
+        """Corners (2, 2) [px] of squares that look like hands."""
         scale = FINDER_SIZE / max(picture.shape[:2])
         matrix = np.array([[scale, 0.0, 0.0], [0.0, scale, 0.0]])
         seen = np.round(scale * np.array(picture.shape[:2])).astype(int)
@@ -171,10 +171,10 @@ class HandDetector:
         order = np.argsort(-heat[rows, columns])[:_MOST_FOUND]
         places = []
         for row, column in zip(rows[order], columns[order], strict=True):
-            right, *aside, size = cells[0, 1:, row, column].astype(np.float64)
+            *aside, size = cells[0, 1:, row, column].astype(np.float64)
             center = CELL * (np.array([column, row]) + 0.5 + aside) / scale
             half = 0.5 * CELL * float(np.exp(size)) / scale
-            places.append((np.array([center - half, center + half]), float(right)))
+            places.append(np.array([center - half, center + half]))
         return places
 
     def _look(self, picture: NDArray[np.uint8], matrix: Doubles) -> _Look:
@@ -183,16 +183,15 @@ class HandDetector:
         heat, logits = _run(self._keypoints, normalized(square), ("heat", "logits"))
         keypoints, scores = peaks_of(heat[0])
         turn = np.linalg.inv(matrix[:, :2])
-        presence, right = (float(value) for value in logits[0])
+        presence, palm = (float(value) for value in logits[0])
+        right = palm * float(np.sign(palm_spread(keypoints)))
         return _Look((CROP_SIZE * keypoints - matrix[:, 2]) @ turn.T, scores, float(_share(presence)), right)
 
-    def _second_look(
-        self, picture: NDArray[np.uint8], first: _Look, side: Side | None = None, prior: float = 0.0
-    ) -> FoundHand:
+    def _second_look(self, picture: NDArray[np.uint8], first: _Look, side: Side | None = None) -> FoundHand:
         """The hand, after a look at where the first look saw it, with its fingers up."""
         look = self._look(picture, square_around(first.keypoints, turn=upright(first.keypoints)))
         if side is None:
-            side = "right" if prior + first.right + look.right > 0.0 else "left"
+            side = "right" if first.right + look.right > 0.0 else "left"
         low, high = look.keypoints.min(axis=0), look.keypoints.max(axis=0)
         box = np.concatenate([low, high - low])
         return FoundHand(side, box, look.presence, look.keypoints, look.presence * look.scores)
@@ -217,6 +216,15 @@ def upright(keypoints: Doubles) -> Doubles:
     x, y = keypoints[_KNUCKLE] - keypoints[_WRIST]
     length = float(np.hypot(x, y))
     return np.array([[-y, x], [-x, -y]]) / length if length > 0.0 else np.eye(2)
+
+
+def palm_spread(keypoints: Doubles | Floats) -> float:
+    """How far the knuckles are spread [px^2]: positive for a right hand whose palm faces the camera.
+
+    It is negative for its back, and for a left hand the other way round.
+    """
+    index, little = keypoints[[_INDEX, _LITTLE]] - keypoints[_WRIST]
+    return float(index[1] * little[0] - index[0] * little[1])
 
 
 def cut(picture: NDArray[np.uint8], matrix: Doubles, size: tuple[int, int]) -> NDArray[np.uint8]:

@@ -53,16 +53,16 @@ class Backbone(nn.Module):
 
 
 class FinderNetwork(nn.Module):
-    """Cells (B, 5, S/8, S/8) of pictures (B, 3, S, S).
+    """Cells (B, 4, S/8, S/8) of pictures (B, 3, S, S).
 
-    Log-odds of a hand's center in the cell and of a right hand, the center from the cell's middle [cells],
-    and the logarithm of the hand's longer side [cells].
+    Log-odds of a hand's center in the cell, the center from the cell's middle [cells], and the logarithm of
+    the hand's longer side [cells].
     """
 
     def __init__(self) -> None:
         super().__init__()
         self.backbone = Backbone((16, 32, 48, 64))
-        last = nn.Conv2d(48, 5, 1)
+        last = nn.Conv2d(48, 4, 1)
         self.head = nn.Sequential(*convolution(64, 48), last)
         assert last.bias is not None
         nn.init.constant_(last.bias[:1], -4.0)  # most cells have no hand
@@ -73,16 +73,16 @@ class FinderNetwork(nn.Module):
 
 
 class KeypointNetwork(nn.Module):
-    """Maps of keypoints (B, 21, 16, 16), and log-odds of a hand and of a right one (B, 2)."""
+    """Maps of keypoints (B, 21, 16, 16), and log-odds of a hand and of a palm before the camera (B, 2)."""
 
     def __init__(self, widths: tuple[int, int, int, int] = (32, 64, 96, 128)) -> None:
         super().__init__()
         _, b, _, d = widths
         self.backbone = Backbone(widths)
         self.head = nn.Sequential(*convolution(2 * b, 64), Residual(64), nn.Conv2d(64, NUM_KEYPOINTS, 1))
-        self.told = nn.Linear(d, 2)
+        self.told = nn.Sequential(nn.Flatten(), nn.Linear(16 * d, 64), nn.ReLU(), nn.Linear(64, 2))
 
     def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Squares in, maps and log-odds out."""
         features, coarse = self.backbone(x)
-        return self.head(features), self.told(coarse.mean((2, 3)))
+        return self.head(features), self.told(coarse)

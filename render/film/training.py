@@ -1,6 +1,6 @@
 """Training of the hand detector on drawn pictures, and on labeled photographs of your own.
 
-    python -m render.film.training OUT [--samples 92160 --seed 0] [--start FOLDER] [--photographs FILE]
+    python -m render.film.training OUT [--samples 192000 --seed 0] [--start FOLDER] [--photographs FILE]
 
 OUT gets the weights that `HandDetector.load` reads. The drawn pictures and a checkpoint are kept beside them,
 and the same command goes on where it was stopped.
@@ -40,6 +40,7 @@ from render.film.detector import (
     WEIGHTS,
     cut,
     normalized,
+    palm_spread,
     square_around,
     upright,
 )
@@ -91,7 +92,7 @@ def train_detector(
     *,
     start: str | Path | None = None,
     photographs: str | Path | None = None,
-    samples: int = 92_160,
+    samples: int = 192_000,
     seed: int = 0,
 ) -> Path:
     """Train a hand detector on drawn pictures; a second call goes on where the first was stopped.
@@ -262,9 +263,13 @@ def _turn(angle: float) -> Doubles:
 
 
 def keypoint_batch(course: Course, rng: np.random.Generator, size: int = BATCH) -> Batch:
-    """Squares around hands, and some without one; targets: keypoints [share of the side], presence, side."""
+    """Squares around hands, and some without one; targets: keypoints [share of the side], presence, palm.
+
+    The palm faces the camera (1), or does not (0), or that is not known (-1). Mirrored pictures have the same
+    answer, which is learned long before the side.
+    """
     pictures, points = [], np.full((size, NUM_KEYPOINTS, 2), np.nan, np.float32)
-    presence, sides = np.zeros(size, np.float32), np.full(size, -1.0, np.float32)
+    presence, palms = np.zeros(size, np.float32), np.full(size, -1.0, np.float32)
     for number in range(size):
         wide, (keypoints,), (side,) = course.draw(rng)
         labeled = keypoints[np.isfinite(keypoints[:, 0])].astype(np.float64)
@@ -281,13 +286,14 @@ def keypoint_batch(course: Course, rng: np.random.Generator, size: int = BATCH) 
         image, moved = cut(wide, matrix, (CROP_SIZE, CROP_SIZE)), keypoints @ matrix[:, :2].T + matrix[:, 2]
         if rng.random() < 0.5:
             image, moved = image[:, ::-1], [CROP_SIZE, 0.0] + moved * [-1.0, 1.0]
-            side = 1 - side if side >= 0 else side
         if rng.random() < 0.15:
             image = _hidden(image, rng)
         pictures.append(normalized(recolored(np.ascontiguousarray(image), rng)))
-        points[number], sides[number] = moved / CROP_SIZE, side if len(labeled) else -1.0
+        points[number] = moved / CROP_SIZE
+        if side >= 0 and np.isfinite(spread := palm_spread(keypoints)):
+            palms[number] = (spread > 0.0) == (side == 1)
         presence[number] = len(labeled) > 0
-    told = (torch.from_numpy(points), torch.from_numpy(presence), torch.from_numpy(sides))
+    told = (torch.from_numpy(points), torch.from_numpy(presence), torch.from_numpy(palms))
     return Batch(_stacked(pictures), told)
 
 
@@ -307,9 +313,9 @@ def _stacked(pictures: list[Floats]) -> torch.Tensor:
 def keypoint_loss(
     found: tuple[torch.Tensor, torch.Tensor], targets: tuple[torch.Tensor, ...]
 ) -> torch.Tensor:
-    """How little heat is near the keypoints, how far off its mean is, and errors of presence and side."""
+    """How little heat is near the keypoints, how far off its mean is, and errors of presence and palm."""
     heat, told = (one.float() for one in found)
-    points, presence, sides = targets
+    points, presence, palms = targets
     at = (torch.arange(HEAT_SIZE) + 0.5) / HEAT_SIZE
     places = torch.stack(torch.meshgrid(at, at, indexing="xy"), dim=-1).reshape(-1, 2)
     counts = ((points > 0.0) & (points < 1.0)).all(dim=2)  # inside and labeled
@@ -321,17 +327,17 @@ def keypoint_loss(
     each = -(near * flat.log_softmax(dim=2)).sum(dim=2) + 10.0 * (mean - points).abs().mean(dim=2)
     loss = (each * counts).sum() / counts.sum().clamp(min=1)
     loss = loss + functional.binary_cross_entropy_with_logits(told[:, 0], presence)
-    wrong = functional.binary_cross_entropy_with_logits(told[:, 1], sides.clamp(min=0.0), reduction="none")
-    known = sides >= 0.0
-    return loss + 0.5 * (wrong * known).sum() / known.sum().clamp(min=1)
+    wrong = functional.binary_cross_entropy_with_logits(told[:, 1], palms.clamp(min=0.0), reduction="none")
+    known = palms >= 0.0
+    return loss + (wrong * known).sum() / known.sum().clamp(min=1)
 
 
 def finder_batch(course: Course, rng: np.random.Generator, size: int = BATCH) -> Batch:
-    """Pictures, turned, cut and scaled; targets: cells (5, S/8, S/8) as the network's, and their weight."""
+    """Pictures, turned, cut and scaled; targets: cells (4, S/8, S/8) as the network's, and their weight."""
     cells = FINDER_SIZE // CELL
-    pictures, targets = [], np.zeros((size, 6, cells, cells), np.float32)
+    pictures, targets = [], np.zeros((size, 5, cells, cells), np.float32)
     for number in range(size):
-        picture, keypoints, sides = course.draw(rng)
+        picture, keypoints, _ = course.draw(rng)
         long, short = FINDER_SIZE, round(FINDER_SIZE * _ASPECTS[rng.integers(len(_ASPECTS))])
         width, height = (long, short) if rng.random() < 0.75 else (short, long)
         scale = FINDER_SIZE / VIEW_SIZE * rng.uniform(0.75, 1.7)
@@ -341,19 +347,18 @@ def finder_batch(course: Course, rng: np.random.Generator, size: int = BATCH) ->
         image, moved = cut(picture, matrix, (width, height)), keypoints @ matrix[:, :2].T + matrix[:, 2]
         if rng.random() < 0.5:
             image, moved = image[:, ::-1], [width, 0.0] + moved * [-1.0, 1.0]
-            sides = np.where(sides >= 0, 1 - sides, sides)
         square = np.zeros((3, FINDER_SIZE, FINDER_SIZE), np.float32)
         square[:, :height, :width] = normalized(recolored(np.ascontiguousarray(image), rng))
         pictures.append(square)
-        for points, side in zip(moved, sides, strict=True):
+        for points in moved:
             labeled = points[np.isfinite(points[:, 0])]
             if len(labeled):
-                _mark(targets[number], labeled, int(side), (width, height))
+                _mark(targets[number], labeled, (width, height))
     return Batch(_stacked(pictures), (torch.from_numpy(targets),))
 
 
-def _mark(target: Floats, points: Floats, side: int, size: tuple[int, int]) -> None:
-    """Write a hand into the cells (6, S/8, S/8): heat, side (0.5: unknown), offset, size, weight."""
+def _mark(target: Floats, points: Floats, size: tuple[int, int]) -> None:
+    """Write a hand into the cells (5, S/8, S/8): heat, offset, size, weight."""
     low, high = points.min(axis=0), points.max(axis=0)
     center, longer = 0.5 * (low + high), float((high - low).max())
     if longer < _SMALLEST or (center < 0.0).any() or (center >= size).any():
@@ -364,24 +369,22 @@ def _mark(target: Floats, points: Floats, side: int, size: tuple[int, int]) -> N
     heat = np.exp(-((rows - row) ** 2 + (columns - column) ** 2) / (2.0 * spread**2))
     mine = (heat > target[0]) & (heat > 0.5)
     target[0] = np.maximum(target[0], heat)
-    target[1][mine] = 0.5 if side < 0 else side
-    target[2][mine] = center[0] / CELL - 0.5 - columns[mine]
-    target[3][mine] = center[1] / CELL - 0.5 - rows[mine]
-    target[4][mine] = np.log(longer / CELL)
-    target[5][mine] = heat[mine]
+    target[1][mine] = center[0] / CELL - 0.5 - columns[mine]
+    target[2][mine] = center[1] / CELL - 0.5 - rows[mine]
+    target[3][mine] = np.log(longer / CELL)
+    target[4][mine] = heat[mine]
 
 
 def finder_loss(found: torch.Tensor, targets: tuple[torch.Tensor, ...]) -> torch.Tensor:
-    """Focal loss of the centers (Law and Deng 2018), and errors of side, offset and size at them."""
+    """Focal loss of the centers (Law and Deng 2018), and errors of offset and size at them."""
     cells, target = found.float(), targets[0]
-    heat, truth, weight = cells[:, 0], target[:, 0], target[:, 5]
+    heat, truth, weight = cells[:, 0], target[:, 0], target[:, 4]
     hit = -((1.0 - heat.sigmoid()) ** 2) * functional.logsigmoid(heat)
     false = -((1.0 - truth) ** 4) * heat.sigmoid() ** 2 * functional.logsigmoid(-heat)
     count = (truth == 1.0).sum().clamp(min=1)
     loss = torch.where(truth == 1.0, hit, false).sum() / count
-    side = functional.binary_cross_entropy_with_logits(cells[:, 1], target[:, 1], reduction="none")
-    off = (cells[:, 2:5] - target[:, 2:5]).abs() * torch.tensor([0.3, 0.3, 1.0])[:, None, None]
-    return loss + ((0.5 * side + off.sum(dim=1)) * weight).sum() / weight.sum().clamp(min=1.0)
+    off = (cells[:, 1:4] - target[:, 1:4]).abs() * torch.tensor([0.3, 0.3, 1.0])[:, None, None]
+    return loss + (off.sum(dim=1) * weight).sum() / weight.sum().clamp(min=1.0)
 
 
 def export(network: Network, path: Path) -> None:

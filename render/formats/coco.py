@@ -33,6 +33,7 @@ from handsim.hand.shape import DIGITS, NUM_KEYPOINTS, SIDES, Side
 from render.formats.records import (
     CENTER,
     as_sensed,
+    body_records,
     by_side,
     centered_K,
     hand_mask,
@@ -83,6 +84,7 @@ def picture_record(frame: RenderedFrame, file_name: str) -> dict[str, Any]:
         "K": shifted_K(camera).tolist(),
         "lens": {"kind": camera.lens.kind, "coefficients": list(camera.lens.coefficients)},
         "T_world_camera": camera.T_world_camera.tolist(),
+        "bodies": body_records(frame),
         "choices": frame.choices,
     }
     if "person" in frame.choices:

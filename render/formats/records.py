@@ -139,6 +139,11 @@ def shape_record(shape: HandShape) -> dict[str, Any]:
     return {name: _listed(x) if isinstance(x, np.ndarray | np.generic) else x for name, x in fields.items()}
 
 
+def body_records(frame: RenderedFrame) -> list[dict[str, Any]]:
+    """Names and poses in the world of a frame's rigid bodies."""
+    return [{"name": body.name, "T_world_body": body.T_world_body.tolist()} for body in frame.bodies]
+
+
 def rounded(values: NDArray[np.floating], decimals: int) -> Any:
     """Numbers as nested lists, short enough to be read."""
     return np.round(np.asarray(values, dtype=np.float64), decimals).tolist()

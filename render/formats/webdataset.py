@@ -33,6 +33,7 @@ from render.formats.records import (
     CENTER,
     JOINT_ORDERS,
     METERS_PER_UNIT,
+    body_records,
     by_side,
     encode_pictures,
     is_seen,
@@ -141,7 +142,7 @@ def frame_record(frame: RenderedFrame) -> dict[str, Any]:
             }
             for hand in frame.hands
         ],
-        "bodies": [{"name": body.name, "T_world_body": body.T_world_body.tolist()} for body in frame.bodies],
+        "bodies": body_records(frame),
         "markers": markers_record(frame),
         "choices": frame.choices,
     }

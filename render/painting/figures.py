@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -74,6 +75,8 @@ def shade_colors(shade: Float32[np.ndarray, "D"]) -> Float32[np.ndarray, "D 4"]:
 
 
 _BALL_LEVEL: Final = 2
+_BASE: Final = (0.85, 0.4)  # radius of a marker's base on the glove and in the marker [marker radii]
+_BASE_SIDES: Final = 12
 _BODY_BALLS: Final = 0.0032  # [m] radius of the markers of rigid bodies, 6.4 mm in diameter (Han et al. 2018)
 
 
@@ -126,6 +129,8 @@ def sample_people(
     """Hands of one person: both have the same skin and the same sleeves."""
     skin, forearm = sample_skin_look(tones, rng=rng), sample_forearm(rng=rng)
     cloth = sample_glove_look(rng=rng) if glove else None
+    if cloth is not None:
+        forearm = dataclasses.replace(forearm, cuff=cloth.cuff)
     return (Appearance(skin, forearm, cloth),) * count
 
 
@@ -151,7 +156,7 @@ class HandFigure:
         upper_arm: Float[np.ndarray, "3"] | None = None,
         forearm: Float[np.ndarray, "3"] | None = None,
     ) -> list[Drawn]:
-        """Skin, and markers where a glove is worn."""
+        """Skin, and markers on their bases where a glove is worn."""
         skin, first_part = self.skin.posed(qpos, upper_arm, forearm), 1 + PARTS_A_HAND * number
         count = len(skin.faces)
         triangles = Triangles(
@@ -166,8 +171,11 @@ class HandFigure:
         if self.look.glove is not None:
             parts = (first_part + self._marker_bones).astype(np.uint8)
             instances = np.full(len(parts), 1 + number, dtype=np.uint8)
-            radius, markers = self.fit.layout.radius, self.markers(qpos)
+            radius = self.fit.layout.radius
+            (markers,), (normals,) = self.fit.markers(qpos[None])
             drawn.append(_drawn_balls(markers, radius, parts, instances, self._marker_numbers))
+            feet = markers - self.fit.layout.heights[:, None] * normals
+            drawn.append(_drawn_bases(feet, markers, normals, radius, parts, instances, np.zeros_like(parts)))
         return drawn
 
     def markers(self, qpos: Float[np.ndarray, "27"]) -> Float[np.ndarray, "M 3"]:
@@ -208,6 +216,32 @@ class BodyFigure:
             centers, zeros = self._markers @ rotation.T + position, np.zeros(len(self._markers), np.uint8)
             drawn.append(_drawn_balls(centers, _BODY_BALLS, zeros, zeros + np.uint8(instance), zeros))
         return drawn
+
+
+def _drawn_bases(feet: Doubles, tops: Doubles, axes: Doubles, radius: float, *ids: Bytes) -> Drawn:
+    """Cones from the skin into markers of this radius, with a part, an instance and a marker (N,) each."""
+    turns = np.arange(_BASE_SIDES) * (2.0 * np.pi / _BASE_SIDES)
+    aside = np.cross(axes, np.eye(3)[np.abs(axes).argmin(axis=1)])
+    aside /= np.linalg.norm(aside, axis=1, keepdims=True)
+    around = np.cos(turns)[:, None] * aside[:, None] + np.sin(turns)[:, None] * np.cross(axes, aside)[:, None]
+    ends = zip((feet, tops), _BASE, strict=True)
+    vertices = np.stack([end[:, None] + wide * radius * around for end, wide in ends], axis=1)
+    low = np.arange(_BASE_SIDES)
+    high, on = low + _BASE_SIDES, np.roll(low, -1)
+    sides = np.concatenate(
+        [np.stack([low, on, high], axis=1), np.stack([on, on + _BASE_SIDES, high], axis=1)]
+    )
+    faces = (sides + 2 * _BASE_SIDES * np.arange(len(feet))[:, None, None]).reshape(-1, 3)
+    normals = np.repeat(around[:, None], 2, axis=1).reshape(-1, 3)
+    triangles = Triangles(
+        vertices.reshape(-1, 3), faces, normals, *(np.repeat(one, len(sides)) for one in ids)
+    )
+    return Drawn(triangles, np.ones((len(normals), 4), dtype=np.float32), None, _base_material)
+
+
+@functools.cache
+def _base_material() -> Material:
+    return Material(linear((0.16, 0.16, 0.17)), 0.5)
 
 
 def _drawn_balls(centers: Doubles, radius: float, *ids: Bytes) -> Drawn:

@@ -349,7 +349,7 @@ def _widen(local: Doubles, K: Doubles, low: Doubles, high: Doubles) -> None:
 
 def put_before(
     painted: UInt8[np.ndarray, "H W 4"],
-    background: Float32[np.ndarray, "H W 3"],
+    background: Float32[np.ndarray, "H W 3"] | UInt8[np.ndarray, "H W 3"],
     bare: UInt8[np.ndarray, "H W 3"] | None = None,
 ) -> UInt8[np.ndarray, "H W 3"]:
     """A picture of `paint` over a background, whose `whole_levels` may be given."""
@@ -364,7 +364,7 @@ def whole_levels(background: Float32[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, 
 
 
 @kernel
-def _mix(painted: Bytes, background: Floats, mixed: Bytes) -> None:
+def _mix(painted: Bytes, background: Floats | Bytes, mixed: Bytes) -> None:
     """Blend painted colors with coverage (P, 4) over the background (P, 3) that `mixed` holds, in place."""
     for pixel in range(len(mixed)):
         if painted[pixel, 3]:

@@ -29,7 +29,7 @@ from render.scenery.backgrounds import (
 _SIZE: Final = (64, 48)  # size of the picture that gives light [px]
 _DIRECTIONS: Final = 1024  # directions in which the picture's light is sampled
 _SHARE: Final = (0.1, 0.5)  # range of the share of ambient light that has the picture's colors
-_LEVEL: Final = 1.65  # usual light of a white surface before all lamps, 1 for the picture's full white
+_LEVEL: Final = 1.56  # usual light of a white surface before all lamps, 1 for the picture's full white
 _LUMINANCE: Final = np.array([0.2126, 0.7152, 0.0722])
 # Factors of a matt surface on each order, and integrals of the squared functions over the sphere.
 _MATT: Final = np.array([1.0, *[2.0 / 3.0] * 3, *[0.25] * 5])

@@ -144,7 +144,7 @@ def sample_skin_look(tones: Sequence[float] = ALL_TONES, *, rng: np.random.Gener
     lightness = 50.0 + yellowness * float(np.tan(np.deg2rad(angle)))
     # The colors of all people's palms are alike, near the color of light skin on the back of the hand.
     paleness = rng.uniform(0.6, 0.75)
-    palm = max(lightness, (1.0 - paleness) * lightness + paleness * 66.0) + rng.uniform(2.0, 4.0)
+    palm = max(lightness, (1.0 - paleness) * lightness + paleness * 66.0) + rng.uniform(4.5, 6.5)
     polish = rng.uniform(0.75, 1.0) if rng.random() < 0.08 else 0.0
     color = rng.uniform((25.0, 10.0, -15.0), (75.0, 60.0, 30.0))
     strengths = np.exp(np.clip(rng.normal(0.0, 0.3, 5), -0.7, 0.7))
@@ -184,6 +184,7 @@ _GIRTHS: Final = (1.92, 2.1, 2.7, 3.0, 2.85, 3.2, 3.6, 3.8)
 """Girths of the arm at these places [hand breadths]."""
 CUFF: Final = 0.0004
 """Length of the step from an arm to its sleeve, between two rings [m]."""
+_THICK: Final = 0.0012  # thickness of a glove's hem [m]
 _HEM: Final = 0.004  # distance of this step from the next rings, so that shading does not round it [m]
 _SQUARE: Final = 0.8  # power of cosine and sine in an arm's section, which is squarer than an ellipse (1)
 _LONGER: Final = 1.04  # girth of this section over that of the ellipse with the same axes
@@ -215,6 +216,7 @@ class Forearm:
     sleeve: float = 1.0  # start of a sleeve, behind the wrist [m]; beyond `length` for a bare arm
     sleeve_color: tuple[float, float, float] = (0.2, 0.25, 0.35)  # sRGB in [0, 1]
     looseness: float = 1.2  # girth of the sleeve over the arm's in it
+    cuff: float = 0.0  # end of a glove, behind the wrist [m]; 0 for a bare hand
 
 
 def sample_forearm(*, rng: np.random.Generator) -> Forearm:
@@ -256,6 +258,8 @@ def forearm_rings(shape: HandShape, forearm: Forearm, wrist: Doubles, rings: int
     round_section = np.stack([width, depth], axis=-1)[:, None] * np.sign(axes_of) * np.abs(axes_of) ** _SQUARE
     share = smooth(behind, 0.0, _BLEND * shape.length)[:, None, None]
     sections = (1.0 - share) * section + share * round_section
+    thick = np.where(np.abs(behind - forearm.cuff) < 0.5 * CUFF, _THICK, 0.0)[:, None, None]
+    sections *= 1.0 + thick / np.linalg.norm(sections, axis=-1, keepdims=True)
     axes, middles = _course(shape, forearm, behind)
     local = np.concatenate([((1.0 - share) * lean[None, :, None]), sections], axis=-1)
     points: Doubles = center + middles[:, None] + np.einsum("kij,krj->kri", axes, local)
@@ -265,17 +269,24 @@ def forearm_rings(shape: HandShape, forearm: Forearm, wrist: Doubles, rings: int
 def arm_places(forearm: Forearm, rings: int) -> Doubles:
     """Places (rings + 1,) of the wrist's ring and those behind it along the arm [m].
 
-    Rings are denser near the wrist, which bends, and two pairs of them lie at the edge of a sleeve.
+    Rings are denser near the wrist, which bends, and two pairs of them lie at the end of a glove that no
+    sleeve covers, and at the edge of a sleeve.
     """
     places: Doubles = forearm.length * np.linspace(0.0, 1.0, rings + 1) ** 1.7
-    if forearm.sleeve < forearm.length:
-        edge = forearm.sleeve + np.array([-_HEM, 0.0, CUFF, CUFF + _HEM])
-        first = int(np.clip(np.abs(places - forearm.sleeve).argmin() - 1, 1, rings - 4))
-        places[: first + 1] *= edge[0] / places[first]
+    covered = min(forearm.sleeve, forearm.length) - 3.0 * _HEM
+    steps = [forearm.cuff] * (0.0 < forearm.cuff < covered)
+    steps += [forearm.sleeve] * (forearm.sleeve < forearm.length)
+    start = 0
+    for step in steps:
+        edge = step + np.array([-_HEM, 0.0, CUFF, CUFF + _HEM])
+        first = int(np.clip(np.abs(places - step).argmin() - 1, start + 1, rings - 4))
+        before = places[start : first + 1] - places[start]
+        places[start : first + 1] = places[start] + before * ((edge[0] - places[start]) / before[-1])
         last = first + len(edge) - 1
         ends = [edge[-1], max(forearm.length, edge[-1] + _HEM)]
-        places[last:] = np.interp(places[last:], [places[last], forearm.length], ends)
+        places[last:] = np.interp(places[last:], [places[last], places[-1]], ends)
         places[first : last + 1] = edge
+        start = last
     return places
 
 

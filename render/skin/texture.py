@@ -320,6 +320,7 @@ def _tangent_scales() -> tuple[Doubles, Doubles, Doubles]:
 _SHADED: Final = 0.006  # length of skin in the shadow of a sleeve [m]
 _SHADE: Final = 0.4  # share of the lightness that this shadow takes
 _FOLD: Final = 0.002  # height of a sleeve's folds [m]
+_STITCH: Final = 0.0034  # period of a glove's knit [m]
 _CREASE: Final = (-0.012, 0.035)  # distances behind the wrist between which the palm's skin ends [m]
 _VEIN: Final = 0.0017  # half width of a vein [m]
 _UNEVEN: Final = np.float32(0.03)  # unevenness of the palm's end over that of the pigment's edge [m]
@@ -550,10 +551,11 @@ def glove_texture(
     behind = behind_wrist(arm)
     lab = cv2.cvtColor(np.array([[look.color]], dtype=np.float32), cv2.COLOR_RGB2Lab)[0, 0]
     cloth = noise(texels.positions, (0.02, 0.006, 0.0025), rng=rng)
+    knit = np.sin((2.0 * np.pi / _STITCH) * texels.positions).sum(axis=1)
     hem = bump(behind - look.cuff + 0.004, 0.0015)
-    painted = lab + (look.wear * 2.0 * cloth - 5.0 * hem)[:, None] * [1.0, 0.0, 0.0]
-    height = look.wear * 1.2e-4 * cloth - 4e-4 * hem
-    cloth_share = 1.0 - smooth(behind, look.cuff - 0.004, look.cuff + 0.004)
+    painted = lab + (look.wear * 2.0 * cloth + 1.2 * knit - 5.0 * hem)[:, None] * [1.0, 0.0, 0.0]
+    height = look.wear * 1.2e-4 * cloth + 6e-5 * knit - 4e-4 * hem
+    cloth_share = 1.0 - smooth(behind, look.cuff, look.cuff + CUFF)
     cloth_share *= 1.0 - smooth(behind, arm.sleeve, arm.sleeve + CUFF)  # a sleeve lies over the cuff
     cloth_share = cloth_share.reshape(rows, width, 1)
     covered = cloth_share > 0.5

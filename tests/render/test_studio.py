@@ -146,3 +146,21 @@ def test_a_body_that_nothing_is_known_of_is_told(figure):
     )
     with pytest.warns(HandSimWarning, match="bottle.obj has neither a surface nor markers and is not drawn"):
         next(draw(take, passes=("ids",)))
+
+
+def test_markers_stand_on_bases_that_reach_the_cloth():
+    glove = sample_people(1, True, tones=ALL_TONES, rng=np.random.default_rng(0))[0]
+    layout = load_layout("dense19")
+    figure = HandFigure(attach(layout, HandModel.named("M")), glove, first_marker=0)
+    qpos = join_qpos(np.zeros((1, 20)))[0]
+    skin, _, bases = (one.triangles for one in figure.drawn(qpos, 0))
+    markers, ends = figure.markers(qpos), bases.vertices.reshape(len(layout.names), 2, -1, 3)
+    away = np.linalg.norm(ends - markers[:, None, None], axis=-1)
+    assert (away[:, 1] < layout.radius).all() and (away[:, 0] > 0.99 * layout.heights[:, None]).all()
+    middles = ends.mean(axis=2)[:, 0]
+    np.testing.assert_allclose(np.linalg.norm(markers - middles, axis=-1), layout.heights, atol=1e-9)
+    nearest = np.linalg.norm(middles[:, None] - skin.vertices, axis=-1).min(axis=1)
+    assert nearest.max() < 0.004 and not bases.markers.any() and (bases.instances == 1).all()
+    corners = bases.vertices[bases.faces]
+    facing = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert ((facing * bases.normals[bases.faces[:, 0]]).sum(axis=-1) > 0.0).all()

@@ -21,7 +21,7 @@ def rotations(qpos: np.ndarray) -> Rotation:
 
 
 def test_wrists_bend_no_farther_than_wrists_do(take):
-    forearms = UserBody(take).forearms(take.qpos)
+    forearms = UserBody(take).forearms
     np.testing.assert_allclose(np.linalg.norm(forearms, axis=-1), 1.0)
     for number, hand in enumerate(take.hands):
         x, y, z = rotations(take.qpos[:, number]).inv().apply(forearms[:, number]).T
@@ -32,7 +32,7 @@ def test_wrists_bend_no_farther_than_wrists_do(take):
 
 
 def test_elbows_do_not_jump(take):
-    forearms = UserBody(take).forearms(take.qpos)
+    forearms = UserBody(take).forearms
     steps = np.rad2deg(np.arccos(np.clip((forearms[1:] * forearms[:-1]).sum(axis=-1), -1.0, 1.0)))
     assert steps.max() < 10.0
 
@@ -52,7 +52,7 @@ def test_a_hand_that_is_not_there_has_no_arm():
     take = simulate_take(kind="hand-hand", num_frames=60, seed=1)
     take.qpos[:20, 0] = np.nan
     take.qpos[10:30, 1] = np.nan
-    forearms = UserBody(take).forearms(take.qpos)
+    forearms = UserBody(take).forearms
     np.testing.assert_array_equal(np.isnan(forearms[..., 0]), np.isnan(take.qpos[..., 0]))
 
 

@@ -32,12 +32,17 @@ ELSEWHERE = {
     "export": "out", "evaluate": "json threads", "simulate": "out cluster",
     "calibrate": "out live seconds", "track": "out live seconds send labelled", "report": "out",
     "replay": "host port rate loop", "view": "host port out video live", "body": "out",
-    "doctor": "compile send", "render": "out merge format workers cluster painter frames-per-shard",
+    "doctor": "compile send", "film": "out format workers detector frames-per-shard",
+    "render": "out merge format workers cluster painter frames-per-shard",
 }  # fmt: skip
 """Options that say only where something is or goes, as what, or how quickly."""
 SHOWN = {"view": "rig time up glove size shape hands body labeler", "glove improve": "captures"}
 """Options of what is shown and not written."""
-SEARCHED = {"glove improve": "keep rig minutes seed", "glove score": "labeler"}
+SEARCHED = {
+    "film": "camera passes dress every num-frames up",
+    "glove improve": "keep rig minutes seed",
+    "glove score": "labeler",
+}
 """Options that are not varied: those of a search may leave its outcome as it is, one takes minutes to try."""
 SMALL = "--batch 32 --network.width 8 --network.gates 2 --network.depth 1"
 QUICK = [

@@ -79,6 +79,9 @@ def test_records_name_who_is_in_the_picture(frames: list[RenderedFrame], tmp_pat
     content = json.loads((tmp_path / "annotations.json").read_text())
     (image,) = content["images"]
     assert image["person"] == 3
+    (body,) = image["bodies"]
+    assert body["name"] == "pen"
+    np.testing.assert_array_equal(body["T_world_body"], frames[0].bodies[0].T_world_body)
     assert image["choices"] == json.loads(json.dumps(chosen))
     for number, (record, hand) in enumerate(zip(content["annotations"], frames[0].hands, strict=True)):
         assert record["look"] == json.loads(json.dumps(looks[number]))

@@ -9,7 +9,7 @@ import pytest
 
 from handsim import HandSimError
 from render import SkinLook
-from render.skin.look import ALL_TONES, TONES, Forearm, sample_forearm, sample_skin_look
+from render.skin.look import ALL_TONES, CUFF, TONES, Forearm, arm_places, sample_forearm, sample_skin_look
 from render.skin.mesh import skin_atlas
 from render.skin.texture import SkinTexture, skin_texels, skin_texture
 
@@ -115,3 +115,14 @@ def test_impossible_looks_are_told() -> None:
         SkinLook(lightness=120.0)
     with pytest.raises(HandSimError, match="roughness is 2"):
         SkinLook(roughness=2.0)
+
+
+def test_rings_lie_at_the_end_of_a_glove_and_at_the_edge_of_a_sleeve() -> None:
+    for sleeve, cuff, steps in ((0.09, 0.03, (0.03, 0.09)), (0.05, 0.045, (0.05,)), (1.0, 0.06, (0.06,))):
+        places = arm_places(Forearm(length=0.7, sleeve=sleeve, cuff=cuff), 20)
+        assert places[0] == 0.0 and places[-1] == pytest.approx(0.7) and (np.diff(places) > 0.0).all()
+        for step in steps:
+            np.testing.assert_allclose(
+                places[np.abs(places - step).argmin() + np.arange(2)], [step, step + CUFF]
+            )
+        assert (np.diff(places) < 0.001).sum() == len(steps)

@@ -1,0 +1,94 @@
+"""The command `handsim film`."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from handsim.app.messages import print_line, print_table, progress_bar
+from handsim.files.outputs import check_outputs
+from handsim.space.transforms import UpAxis
+from render.frames import PASSES
+
+
+@dataclass(frozen=True, slots=True)
+class FilmOptions:
+    """What is written of a video."""
+
+    passes: tuple[str, ...] = PASSES
+    """Pictures to write: some of rgb, depth, normals, ids; rgb is the video's, the others are drawn."""
+    dress: Literal["skin", "glove"] = "glove"
+    """What the hands in the video wear: the marker glove, or nothing."""
+    every: int = 1
+    """Step between the frames that are written."""
+    num_frames: int | None = None
+    """Number of these frames at most, spread evenly over the video; all when not given."""
+    frames_per_shard: int = 64
+    """Frames that are written together."""
+    up: UpAxis = "z"
+    """The axis of the take that points up; the truth of pictures has z up."""
+
+
+def film(
+    take: Annotated[Path, tyro.conf.Positional],
+    video: Annotated[Path, tyro.conf.Positional],
+    *,
+    out: Path,
+    options: Annotated[FilmOptions, tyro.conf.arg(name="")],
+    camera: Path | None = None,
+    detector: Path | None = None,
+    format: tuple[str, ...] = ("webdataset",),
+    workers: int | None = None,
+) -> None:
+    """Register an ordinary video to a tracked take, and write its frames as labeled photographs.
+
+    Pose, lens and clock of the camera follow from the hands alone; docs/how_to/film.md tells how to film.
+
+    Args:
+        take: A tracked take (.npz) with the hands that the video shows.
+        video: The video (.mp4, .mov, .avi): one shot of a camera that stands still.
+        out: Folder for the pictures, their annotations, film.json, film.mp4 and film.html.
+        options: What to write.
+        camera: File with the lens of this camera, as of handsim rig import; found, too, when not given.
+        detector: Folder of a hand detector of your own; the shipped one when not given.
+        format: File formats: webdataset, coco, yolo, freihand, interhand, exr, png; several go into
+            folders.
+        workers: Processes that write; all cores when not given.
+    """
+    from render.film.detector import HandDetector
+    from render.film.film import PAGE, annotate_film
+
+    check_outputs((take, video, camera, detector), (out,))
+    begin, steps = time.perf_counter(), iter(("finding hands", "writing pictures"))
+    with progress_bar("frames") as bar:
+        last = [float("inf")]
+
+        def show(done: int, total: int) -> None:
+            if done < last[0]:
+                bar.step(next(steps, ""))
+            last[0] = done
+            bar(done, total)
+
+        found = annotate_film(
+            take,
+            video,
+            out,
+            format,
+            camera=camera,
+            detector=HandDetector.load(detector),
+            workers=workers,
+            progress=show,
+            **{name: getattr(options, name) for name in FilmOptions.__dataclass_fields__},
+        )
+    print_table(found.figures(), left=1)
+    print_line(*found.doubts(), *(f"Left out: {told}." for told in found.left_out()))
+    counted, seconds = found.reasons.count(""), time.perf_counter() - begin
+    print_line(
+        f"{out}: {counted} of {len(found.reasons)} frames fit, {found.residual():.1f} px off in the median; "
+        f"{seconds:.0f} s"
+    )
+    print_line(f"{out / PAGE}: residuals over time and picture, camera and clock")

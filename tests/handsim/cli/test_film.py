@@ -1,0 +1,73 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from handsim.cli.main import main
+from render.film.detector import HandDetector
+from render.illustrations import write_video
+from tests.render.film.filmed import SIZE, Filming, moving_take
+
+FILMING = Filming(seed=21, rate=12.0, missing=0.0, swapped=0.0, readout=0.0)
+
+
+class Known:
+    """A detector that finds what is known."""
+
+    def __init__(self, take):
+        self._found = iter(FILMING.found(take))
+
+    def detect(self, image):
+        assert image.shape == (SIZE[1], SIZE[0], 3)
+        return list(next(self._found).hands)
+
+    def refine(self, image, boxes, sides):
+        assert len(boxes) == len(sides)
+        return self.detect(image)
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("film")
+    moving_take().save(folder / "take.npz")
+    count = int(FILMING.seconds * FILMING.rate)
+    gray = (np.full((SIZE[1], SIZE[0], 3), 40 + n, np.uint8) for n in range(count))
+    write_video(folder / "video.mp4", gray, rate=FILMING.rate, size=SIZE)
+    return folder
+
+
+def test_a_video_becomes_photographs(files, tmp_path, monkeypatch, capsys):
+    take = moving_take()
+    monkeypatch.setattr(HandDetector, "load", lambda path=None: Known(take))
+    out = tmp_path / "out"
+    words = ["film", str(files / "take.npz"), str(files / "video.mp4"), "--out", str(out)]
+    assert main([*words, "--format", "coco", "--num-frames", "3", "--workers", "1"]) == 0
+    content = json.loads((out / "annotations.json").read_text("utf-8"))
+    assert len(content["images"]) == 3 and content["annotations"][0]["num_keypoints"] > 0
+    middle = content["images"][1]
+    picture = cv2.imread(str(next(out.rglob(Path(middle["file_name"]).name))))
+    number = int(Path(middle["file_name"]).stem.rsplit("_", 1)[1])
+    assert abs(float(picture.mean()) - (40 + number)) < 4.0
+    record = json.loads((out / "film.json").read_text("utf-8"))
+    assert abs(record["offset"] - FILMING.offset) < 0.01
+    assert (out / "film.mp4").is_file() and "Camera and clock" in (out / "film.html").read_text("utf-8")
+    assert "frames fit" in capsys.readouterr().out
+
+
+def test_mistakes_are_sentences(files, tmp_path, capsys):
+    take, video, out = str(files / "take.npz"), str(files / "video.mp4"), str(tmp_path / "out")
+    (tmp_path / "text.mp4").write_text("no video")
+    (tmp_path / "rig.toml").write_text("")
+    for words, told in (
+        ([take, str(tmp_path / "text.mp4")], "not a video that can be read"),
+        ([take, str(tmp_path / "none.mp4")], "none.mp4"),
+        ([video, video], "video.mp4"),
+        ([take, video, "--camera", str(tmp_path / "rig.toml")], "rig.toml"),
+    ):
+        assert main(["film", *words, "--out", out]) == 1
+        error = capsys.readouterr().err
+        assert told in error and len(error.strip().splitlines()) == 1

@@ -1,0 +1,124 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from gloves.takes.take import Take
+from handsim import Camera, HandSimError, Lens, write_page
+from render.film.registration import Registration, register
+from tests.render.film.filmed import SIZE, Filming, moving_take
+
+
+def errors(found: Camera, true: Camera) -> tuple[float, float, float]:
+    """Degrees, millimeters and percent of the focal length."""
+    turn = Rotation.from_matrix(found.T_world_camera[:3, :3].T @ true.T_world_camera[:3, :3])
+    away = np.linalg.norm(found.T_world_camera[:3, 3] - true.T_world_camera[:3, 3])
+    return np.rad2deg(turn.magnitude()), 1e3 * away, 100.0 * abs(found.focal_length / true.focal_length - 1.0)
+
+
+def clock_error(found: Registration, filming: Filming) -> float:
+    """[ms] in the middle of the video."""
+    return 1e3 * abs(found.offset + found.drift * filming.seconds / 2.0 - filming.offset)
+
+
+CASES = {
+    "plain": (Filming(seed=1), ("right",)),
+    "two hands": (Filming(seed=2, swapped=0.15), ("left", "right")),
+    "sides are always wrong": (Filming(seed=3, swapped=1.0), ("right",)),
+    "many misses": (Filming(seed=4, missing=0.5, outliers=0.2), ("left",)),
+    "a stranger's hand": (Filming(seed=5, stranger=True), ("right",)),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_a_hidden_camera_is_found(case):
+    filming, sides = CASES[case]
+    take = moving_take(sides=sides)
+    found = register(take, filming.found(take), SIZE)
+    turn, away, focal = errors(found.cameras[0], filming.cameras()[0])
+    assert turn < 0.6 and away < 8.0 and focal < 1.5
+    assert clock_error(found, filming) < 3.0
+    assert len(found.cameras) == 1
+    assert found.deviations["focal"] < 0.02 and found.deviations["offset"] < 0.005
+    assert found.reasons.count("") > 0.25 * len(found.reasons)
+
+
+def test_a_push_makes_two_spans():
+    take, filming = moving_take(), Filming(seed=6, bump=6.0)
+    found = register(take, filming.found(take), SIZE)
+    assert len(found.cameras) == 2 and abs(found.starts[1] - 180) <= 3
+    for one, true in zip(found.cameras, filming.cameras(), strict=True):
+        turn, away, _ = errors(one, true)
+        assert turn < 0.8 and away < 12.0
+    assert any("moved at 6.0 s" in told for told in found.doubts())
+
+
+def test_what_is_not_moved_tells_no_clock():
+    take, filming = moving_take(still=True), Filming(seed=7)
+    try:
+        told = " ".join(register(take, filming.found(take), SIZE).doubts())
+    except HandSimError as error:
+        assert "expected a video of this take" in str(error)
+    else:
+        assert "clock is known to" in told and "focal length is known to" in told
+
+
+def test_a_given_lens_is_kept():
+    take, filming = moving_take(), Filming(seed=8)
+    given = filming.cameras()[0]
+    found = register(take, filming.found(take), SIZE, given.at(np.eye(4)))
+    assert found.cameras[0].lens == given.lens and np.array_equal(found.cameras[0].K, given.K)
+    assert errors(found.cameras[0], given)[1] < 4.0
+
+
+def test_a_given_fisheye_sees_the_same():
+    take, filming = moving_take(), Filming(seed=9, readout=0.0)
+    true = filming.cameras()[0]
+    fisheye = Camera("f", SIZE, true.K, true.T_world_camera, Lens("fisheye", (0.02, -0.01, 0.0, 0.0)))
+
+    class Fisheye(Filming):
+        def cameras(self):
+            return fisheye, fisheye
+
+    found = register(take, Fisheye(seed=9, readout=0.0).found(take), SIZE, fisheye)
+    assert errors(found.cameras[0], fisheye)[1] < 4.0
+
+
+def test_frames_that_do_not_fit_are_left_out():
+    take, filming = moving_take(), Filming(seed=10, outliers=0.0, missing=0.0, swapped=0.0)
+    frames = filming.found(take)
+    for n in range(100, 120):  # the tracker took another finger there
+        frames[n].hands[0].keypoints[:] += [40.0, 0.0]
+    frames[150] = frames[150]._replace(hands=[])
+    found = register(take, frames, SIZE)
+    left = {n for n, reason in enumerate(found.reasons) if reason}
+    assert set(range(100, 120)) | {150} <= left and len(left) < 60 and len(found.cameras) == 1
+    assert "off" in found.reasons[105] and found.reasons[150] == "the detector found no hand there"
+
+
+def test_dropped_poses_do_not_count():
+    take, filming = moving_take(), Filming(seed=11)
+    frames, qpos = filming.found(take), take.qpos.copy()
+    qpos[300:420] = np.nan
+    found = register(Take.of_poses(take.hands, qpos, rate=take.rate), frames, SIZE)
+    lost = [found.reasons[n] for n in range(len(frames)) if 5.1 < filming.offset + n / 30.0 < 6.9]
+    assert set(lost) == {"the take has no hand then"}
+    assert errors(found.cameras[0], filming.cameras()[0])[1] < 8.0
+
+
+def test_another_take_is_refused():
+    frames = Filming(seed=12).found(moving_take())
+    with pytest.raises(HandSimError, match=r"do not move as those of the take|hands were found in"):
+        register(moving_take(seed=5, sides=("left",)), frames, SIZE)
+    with pytest.raises(HandSimError, match="hands were found in 0 of 10 frames"):
+        register(moving_take(), [frame._replace(hands=[]) for frame in frames[:10]], SIZE)
+
+
+def test_the_page_tells_the_camera(tmp_path):
+    take = moving_take()
+    found = register(take, Filming(seed=13).found(take), SIZE)
+    write_page(tmp_path / "film.html", found)
+    page = (tmp_path / "film.html").read_text("utf-8")
+    assert f"{found.cameras[0].focal_length:.1f} px" in page and "Residuals over the picture" in page
+    assert found.record()["offset"] == found.offset
