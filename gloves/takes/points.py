@@ -199,6 +199,8 @@ class PointList:
         confidence: Float[np.ndarray, "P"],
     ) -> Self:
         """The points of a stream, which fill the first columns of their frame in the order of arrival."""
+        if counts.sum(dtype=np.int64) != len(ids):  # before anything of that size is allocated
+            raise ValueError("other numbers of points in frames than points")
         order, num_columns = _arrival_order(counts), int(counts.max(initial=0))
         return cls(counts, points, ids, labels, confidence, order, num_columns)
 

@@ -67,6 +67,12 @@ def test_points_of_a_stream_fill_the_first_columns(counts):
         np.testing.assert_array_equal(points.columns[points.of(frame)], np.arange(count))
 
 
+def test_frames_that_count_more_points_than_there_are_cost_no_memory():
+    none = np.empty(0)
+    with pytest.raises(ValueError, match="other numbers of points"):
+        PointList.in_order(np.array([2**31, 2**31]), np.empty((0, 3)), none, none, none)
+
+
 def test_markers_are_found_by_their_labels():
     points = PointList.of_tables(
         np.arange(18.0).reshape(3, 2, 3),
