@@ -20,10 +20,10 @@ from benchmarks.record import describe, run, timed
 from gloves import MarkerLayout, load_layout
 from gloves.captures.formats import read_markers
 from gloves.layout import list_layouts
+from track.glove_improvement import sample_places
 from train import Corruption, Labeler, evaluate_labeler, load_labeler
 from train.data.batches import paper_corruption
 from train.labelers.layout_labeler import LayoutLabeler, fine_tuned_labeler, sample_worn_markers
-from train.labelers.layout_training import sample_places
 from train.labelers.storage import shipped_labelers
 
 CAPTURE_FRAMES = 3000

@@ -46,18 +46,19 @@ def speed_run(folder: Path = FOLDER) -> str:
 
 
 def speed_tables(folder: Path = FOLDER) -> tuple[str, str]:
-    """The rows of speed.json as `benchmarks.speed` keeps them: times, and how many in a second."""
+    """The rows of speed.json: times, and how many in a second. Last in each, and left out, is its unit."""
     figures = json.loads((folder / "speed.json").read_text("utf-8"))["figures"]
     times = [
-        "| what | median [ms] | 99th percentile [ms] | longest [ms] | median in units |",
-        "|---|---|---|---|---|",
+        "| what | median [ms] | 99th percentile [ms] | longest [ms] |",
+        "|---|---|---|---|",
     ]
-    rates = ["| what | in a second | in a unit |", "|---|---|---|"]
+    rates = ["| what | in a second |", "|---|---|"]
     for key, figure in figures.items():
         if key == "unit":
             continue
-        row = f"| {' | '.join([figure['what'].rsplit(': ', 1)[0], *map(_shown, figure['value'])])} |"
-        (times if len(figure["value"]) == 4 else rates).append(row)
+        *shown, _ = figure["value"]
+        row = f"| {' | '.join([figure['what'].rsplit(': ', 1)[0], *map(_shown, shown)])} |"
+        (times if len(shown) == 3 else rates).append(row)
     return "\n".join(times), "\n".join(rates)
 
 

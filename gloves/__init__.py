@@ -24,9 +24,9 @@ if TYPE_CHECKING:
     from gloves.optics.ghosts import GhostConfig as GhostConfig
     from gloves.optics.reconstruction import FrameOptics as FrameOptics
     from gloves.optics.reconstruction import OpticsConfig as OpticsConfig
+    from gloves.takes.bodies import RigidBody as RigidBody
     from gloves.takes.points import PointList as PointList
     from gloves.takes.points import Status as Status
-    from gloves.takes.take import RigidBody as RigidBody
     from gloves.takes.take import Take as Take
     from gloves.takes.take import load_take as load_take
 

@@ -21,9 +21,9 @@ import numpy as np
 from jaxtyping import Float
 
 from handsim._checks import check_choice, check_type
-from handsim.errors import HandSimError, LayoutError, choices
+from handsim.errors import HandSimError, LayoutError, choices, errors_of
 from handsim.files.inputs import check_keys, number_of, quoted, read_toml, tables_of, text_of, written
-from handsim.files.outputs import atomic_write
+from handsim.files.outputs import write_text, writing
 from handsim.hand.shape import BONE_NAMES, BONES, DIGITS, PALM, SIDES, Side
 
 FEWEST_MARKERS: Final = 5
@@ -197,11 +197,8 @@ class MarkerLayout:
         Raises:
             LayoutError: The file cannot be written.
         """
-        try:
-            with atomic_write(path) as temporary:
-                temporary.write_text("\n".join(layout_lines(self)) + "\n", "utf-8")
-        except OSError as error:
-            raise LayoutError(f"{path}: cannot be written: {error.strerror or error}") from error
+        with writing(path, LayoutError):
+            write_text(path, "\n".join(layout_lines(self)) + "\n")
 
 
 @dataclass(frozen=True, slots=True)
@@ -246,10 +243,8 @@ def load_layout(glove: MarkerLayout | str | Path) -> MarkerLayout:
         unknown = choices(str(glove), list_layouts(), noun="glove")
         raise LayoutError(f"{unknown}, or the path of a .toml file")
     table = read_toml(path, error=LayoutError)
-    try:
+    with errors_of(path, LayoutError):
         return parse_layout(table)
-    except HandSimError as error:
-        raise LayoutError(f"{path}: {error}") from error
 
 
 def shipped_layout(name: str) -> ShippedLayout:

@@ -7,7 +7,8 @@ names. The command line prints the message alone and exits with code 1.
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from typing import Final
 
 SENTENCE: Final = 500
@@ -84,3 +85,12 @@ def choices(given: str, valid: Iterable[str], *, noun: str) -> str:
     near = difflib.get_close_matches(given, names, n=1)
     hint = f" (did you mean '{near[0]}'?)" if near else ""
     return f"unknown {noun} '{given}'{hint}; valid names: {', '.join(names)}"
+
+
+@contextmanager
+def errors_of(owner: object, kind: type[HandSimError]) -> Iterator[None]:
+    """Within the block an error of ours becomes one of this kind, whose sentence begins with its owner."""
+    try:
+        yield
+    except HandSimError as error:
+        raise kind(f"{owner}: {error}") from error

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Concatenate, Final, ParamSpec
 
 from handsim._checks import check_type, shown_value
 from handsim.errors import ArgumentError
-from handsim.files.outputs import atomic_write
+from handsim.files.outputs import write_text
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -142,8 +142,7 @@ def write_sections(path: Path, sections: Sequence[Section], *, title: str, lead:
         f'<h1>{escape(title)}</h1>\n<p class="lead">{escape(lead)}</p>\n'
         f"{body}\n</body>\n</html>\n"
     )
-    with atomic_write(path) as temporary:
-        temporary.write_text(page, "utf-8", errors="replace")  # names of files need not be text
+    write_text(path, page)
 
 
 def html_list(sentences: Sequence[str], kind: str = "ol") -> str:

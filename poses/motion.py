@@ -325,11 +325,6 @@ def _scripts() -> dict[str, dict[str, Any]]:
     return scripts
 
 
-def script_names() -> tuple[str, ...]:
-    """Names of all scripts."""
-    return tuple(_scripts())
-
-
 def scripted_motion(
     model: HandModel | HandShape | str,
     script: str,

@@ -68,11 +68,6 @@ def load_gestures() -> dict[str, Float[np.ndarray, "20"]]:
     return {name: angles.copy() for name, angles in _gestures().items()}
 
 
-def all_gestures() -> Float[np.ndarray, "G 20"]:
-    """Joint angles [rad] of the gestures that random poses are blended from: those of library "gestures"."""
-    return gestures_of("gestures")
-
-
 # Couplings between joints, as of a relaxed hand. Sources (docs/angles.md): DIP follows PIP (two thirds on
 # average; Lin, Wu and Huang 2000), abduction dies away as the MCP flexes (collateral ligaments tighten), and
 # neighbors share tendons, so that one finger's flexion drags the next.
@@ -153,7 +148,7 @@ def sample_angles(
 
 
 def _blend_gestures(count: int, rng: np.random.Generator) -> NDArray[np.float64]:
-    library = all_gestures()
+    library = gestures_of("gestures")
     first, second = library[rng.integers(len(library), size=(2, count))]
     progress = rng.uniform(-0.1, 1.1, size=(count, 1)) + 0.12 * rng.standard_normal((count, 5))
     weight = np.repeat(np.clip(progress, 0.0, 1.0), 4, axis=1)

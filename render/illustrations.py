@@ -15,7 +15,7 @@ from gloves.fit import GloveFit
 from gloves.layout import MarkerLayout
 from gloves.optics.visibility import visible_cameras
 from handsim.errors import ArgumentError, FileError
-from handsim.files.outputs import atomic_write, plain_path, unwritten
+from handsim.files.outputs import atomic_write, plain_path, unwritten, writing
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import BONE_NAMES, SIZES
 from handsim.hand.skin import vertex_normals
@@ -200,20 +200,17 @@ def write_clip(
     if path.suffix.lower() != SUFFIX:
         raise ArgumentError(f"cannot write a video as '{path}', expected a name that ends in {SUFFIX}")
     view = view_along(np.array(_AHEAD), np.array([0.0, 0.0, 1.0]), shown, _SIZE)
-    try:
-        with atomic_write(path) as temporary, plain_path(temporary) as plain:
-            writer = cv2.VideoWriter(str(plain), cv2.VideoWriter.fourcc(*_CODEC), rate, _SIZE)
-            try:
-                if not writer.isOpened():
-                    raise FileError(f"{path}: OpenCV cannot write a video of the codec {_CODEC} here")
-                for frame in frames:
-                    picture = _draw_frame(ClipFrame(*frame), view, radius)  # type: ignore[arg-type]
-                    writer.write(cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
-            finally:
-                writer.release()
-            _check_written(plain)
-    except OSError as error:
-        raise FileError(f"{path}: cannot be written: {error.strerror or error}") from error
+    with writing(path, FileError), atomic_write(path) as temporary, plain_path(temporary) as plain:
+        writer = cv2.VideoWriter(str(plain), cv2.VideoWriter.fourcc(*_CODEC), rate, _SIZE)
+        try:
+            if not writer.isOpened():
+                raise FileError(f"{path}: OpenCV cannot write a video of the codec {_CODEC} here")
+            for frame in frames:
+                picture = _draw_frame(ClipFrame(*frame), view, radius)  # type: ignore[arg-type]
+                writer.write(cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
+        finally:
+            writer.release()
+        _check_written(plain)
 
 
 def _check_written(path: Path) -> None:

@@ -18,7 +18,8 @@ from numpy.typing import ArrayLike
 
 from gloves.fit import GloveFit
 from gloves.layout import MarkerLayout
-from gloves.takes.take import RigidBody, Take
+from gloves.takes.bodies import RigidBody
+from gloves.takes.take import Take
 from handsim._checks import check_choice, check_type
 from handsim.app.output import (
     CHECKSUMS,

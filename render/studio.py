@@ -14,7 +14,8 @@ from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
 from gloves.fit import GloveFit
-from gloves.takes.take import RigidBody, Take
+from gloves.takes.bodies import RigidBody
+from gloves.takes.take import Take
 from handsim.errors import HandSimError
 from handsim.hand.model import KEYPOINT_DIGITS, KEYPOINT_NAMES, hand_keypoints
 from handsim.hand.shape import DIGITS, PALM, bones_of

@@ -18,7 +18,7 @@ from gloves.fit import GloveFit, settle_glove
 from gloves.layout import MarkerLayout, load_layout
 from gloves.takes.take import Take, load_take
 from handsim._checks import check_choice, check_count, check_type
-from handsim.errors import ArgumentError, CaptureError, HandSimError, HandSimWarning, choices
+from handsim.errors import ArgumentError, CaptureError, HandSimError, HandSimWarning, choices, errors_of
 from handsim.files.arrays import read_npz
 from handsim.files.inputs import check_regular, checksum
 from handsim.hand.model import HandModel, join_qpos, load_model
@@ -70,10 +70,8 @@ def read_pose_file(path: Path, sides: Sequence[Side] | None = None) -> tuple[Own
         arrays: dict[str, NDArray[Any]] = {"qpos": qpos, "times": table.times}
     else:
         arrays, sides = _arrays(path), tuple(sides or ("right",))
-    try:
+    with errors_of(path, CaptureError):
         poses = _own_poses(arrays, len(sides), _stored_shapes(arrays))
-    except HandSimError as error:
-        raise CaptureError(f"{path}: {error}") from error
     _tell_beyond(str(path), poses.qpos)
     return poses, sides
 
@@ -370,10 +368,8 @@ def load_subject(source: Source, *, seed: int) -> Subject:
         raise CaptureError(
             f"{source}: no take, but poses of your own; give them to --poses, or as a PoseFile"
         ) from error
-    try:
+    with errors_of(source, CaptureError):
         return Subject(take, source.name)
-    except ArgumentError as error:
-        raise CaptureError(f"{source}: {error}") from error
 
 
 def subject_of_take(take: Take) -> Subject:

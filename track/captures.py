@@ -24,7 +24,7 @@ from gloves.takes.corrections import Correction, find_pins, load_corrections, to
 from gloves.takes.points import PointList
 from gloves.takes.take import Take, label_names
 from handsim.callbacks import OnStep, Progress, no_progress, no_step
-from handsim.errors import CalibrationError, CaptureError, HandSimWarning
+from handsim.errors import CalibrationError, CaptureError, HandSimWarning, errors_of
 from handsim.hand.shape import NUM_QPOS, Side
 from track.association.frame_state import change_of_distances
 from track.association.initialization import FEWEST_POINTS, label_alone
@@ -318,8 +318,6 @@ def _checked_corrections(path: Path, source: Capture, setup: TrackerSetup) -> tu
     corrections = load_corrections(path)
     ids = number_runs(np.isfinite(source.positions[..., 0]))
     points = PointList.of_tables(source.positions, ids, np.full_like(ids, -1), np.ones(ids.shape))
-    try:
+    with errors_of(path, CaptureError):
         find_pins(corrections, points, label_names(setup.user, setup.bodies))
-    except CaptureError as error:
-        raise CaptureError(f"{path}: {error}") from error
     return corrections

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Final, NamedTuple, Protocol
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -284,11 +284,3 @@ class TrackedFrame:
         sides = [hand.side for hand in self.hands]
         check_choice(side, sides, noun="hand")
         return self.hands[sides.index(side)]
-
-
-class FrameTracker(Protocol):
-    """Anything that tracks a capture frame by frame."""
-
-    def step(self, points: Float[np.ndarray, "N 3"], ids: Int[np.ndarray, "N"], time: float) -> TrackedFrame:
-        """Track the next frame: points [m], their IDs, and the time [s]."""
-        ...

@@ -46,7 +46,6 @@ from train.data.batches import Corruption, corrupt
 from train.evaluation import LabelCounts
 from train.forecast.settings import ImproveGloveSettings
 from train.labelers.layout_labeler import learned_labeler, mean_features, shipped_network
-from train.labelers.layout_training import sample_places
 from train.labelers.matching import match_probabilities, pair_probabilities
 from train.labelers.protocol import labeling_threads
 from train.simulation.training_frames import GenerateSettings, sample_hands, sample_single_hand
@@ -64,7 +63,14 @@ _CREASE: Final = 0.005  # from a joint, within which the skin folds and stretche
 _TIP: Final = 0.9  # of the last bone: beyond it is the nail's edge
 _ON_BACK: Final = 3  # markers on the palm's bone, from which its pose is known
 _PALM_SURE: Final = float(np.deg2rad(2.0))  # spread of the palm's pose that is enough [rad]
-_PALM_ALONG, _PALM_ACROSS = (-0.1, 0.95), 0.36
+_PALM_ALONG, _PALM_ACROSS = (-0.1, 0.95), 0.36  # places along and across the palm [bone lengths]
+_FINGER_ALONG, _TIP_ALONG = (0.1, 1.05), (0.1, 0.9)  # places along a finger's bone and its last bone
+_PALM_SHARE: Final = 5.0  # places on the palm for each one on a finger's bone
+_AROUND: Final = 35.0  # standard deviation of the angle about a finger's bone [deg]
+_MAX_AROUND: Final = 100.0  # greatest such angle [deg]
+_APART: Final = 0.0025  # between two random places [m]
+_MISSED: Final = 500  # draws in a row without a free place
+_RADIUS: Final = 0.0032  # of the markers of random places [m]
 _PADS: Final = float(np.deg2rad(80.0))  # beyond this angle a finger's marker touches what is held
 _GAIN: Final = 0.05  # least gain of a better layout [points]
 _TRIES: Final = 20  # draws of a place
@@ -465,3 +471,35 @@ class Improvement:
         stem = "".join(word.capitalize() for word in bone.split("_"))
         taken = {place.name for place in self._columns.places}
         return next(name for number in range(1, 100) if (name := f"{stem}{number}") not in taken)
+
+
+def sample_places(
+    num_places: int, *, rng: np.random.Generator, apart: float = _APART
+) -> tuple[MarkerPlace, ...]:
+    """Random places on the back and the sides of the flat hand; fewer if no more fit."""
+    model = HandModel.named("M")
+    share = np.where(np.arange(len(BONE_NAMES)) == PALM, _PALM_SHARE, 1.0)
+    places: list[MarkerPlace] = []
+    points: list[Float[np.ndarray, "3"]] = []
+    missed = 0
+    while len(places) < num_places and missed < _MISSED:
+        bone = int(rng.choice(len(BONE_NAMES), p=share / share.sum()))
+        name = BONE_NAMES[bone]
+        if bone == PALM:
+            along, around = rng.uniform(*_PALM_ALONG), 0.0
+            across = rng.uniform(-_PALM_ACROSS, _PALM_ACROSS)
+        else:
+            along = rng.uniform(*(_TIP_ALONG if name.endswith("distal") else _FINGER_ALONG))
+            around, across = np.clip(_AROUND * rng.standard_normal(), -_MAX_AROUND, _MAX_AROUND), 0.0
+        place = MarkerPlace(f"place{len(places)}", name, along, float(np.deg2rad(around)), across)
+        copies = tuple(dataclasses.replace(place, name=str(number)) for number in range(5))
+        missed += 1
+        try:
+            point = np.asarray(attach_markers(MarkerLayout("place", copies, _RADIUS), model).points[0])
+        except LayoutError:
+            continue  # the place is off the skin
+        if all(np.linalg.norm(point - other) > apart for other in points):
+            places.append(place)
+            points.append(point)
+            missed = 0
+    return tuple(places)

@@ -18,12 +18,12 @@ from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
 from gloves.captures.capture import Capture, check_unit
+from gloves.takes.bodies import RigidBody
 from gloves.takes.points import Status
-from gloves.takes.take import RigidBody
 from handsim._checks import check_array, check_type
-from handsim.errors import ArgumentError, CalibrationError, HandSimError, choices
+from handsim.errors import ArgumentError, CalibrationError, HandSimError, choices, errors_of
 from handsim.files.inputs import check_keys, numbers, quoted, read_toml, tables_of, text_of, written
-from handsim.files.outputs import atomic_write
+from handsim.files.outputs import write_text, writing
 from handsim.hand.shape import SIDES
 from handsim.kernels import move, velocity_of, write_quaternion_matrix
 from handsim.space.objects import RigidObject, named_object, object_names
@@ -348,10 +348,8 @@ def load_body(name_or_path: AnyBody) -> RigidTemplate:
         unknown = choices(str(name_or_path), ours, noun="body")
         raise ArgumentError(f"{unknown}, or the path of a .toml file")
     table = read_toml(path, error=BodyError)
-    try:
+    with errors_of(path, BodyError):
         return _parse_body(table)
-    except HandSimError as error:
-        raise BodyError(f"{path}: {error}") from error
 
 
 def load_bodies(names_or_paths: AnyBody | Iterable[AnyBody]) -> tuple[RigidTemplate, ...]:
@@ -379,11 +377,8 @@ def save_body(path: str | Path, body: RigidTemplate) -> None:
     for name, position in zip(body.marker_names, 1e3 * body.positions, strict=True):
         numbers_mm = ", ".join(written(value) for value in position.tolist())
         lines += ["", "[[marker]]", f"name = {quoted(name)}", f"place_mm = [{numbers_mm}]"]
-    try:
-        with atomic_write(path) as temporary:
-            temporary.write_text("\n".join(lines) + "\n", "utf-8")
-    except OSError as error:
-        raise BodyError(f"{path}: cannot be written: {error.strerror or error}") from error
+    with writing(path, BodyError):
+        write_text(path, "\n".join(lines) + "\n")
 
 
 def _parse_body(table: Mapping[str, object]) -> RigidTemplate:

@@ -18,7 +18,7 @@ from gloves.layout import MarkerLayout, list_layouts, load_layout, stored_layout
 from handsim._checks import check_choice, check_type, shown_value
 from handsim.errors import ArgumentError, FileError, HandSimError
 from handsim.files.inputs import read_bytes
-from handsim.files.outputs import atomic_write
+from handsim.files.outputs import write_text, writing
 from handsim.hand.model import HandModel
 from handsim.hand.shape import NUM_JOINTS, SIDES, HandShape, Side
 from track.calibration.user_calibration import Calibration
@@ -172,12 +172,8 @@ class User(Sequence[GloveFit]):
             "hands": [_to_json(hand) for hand in self.hands],
             **({"angle_errors": errors} if (errors := stored_errors(self)) else {}),
         }
-        try:
-            with atomic_write(Path(path)) as temporary:
-                text = json.dumps(content, indent=1, ensure_ascii=False) + "\n"
-                temporary.write_text(text, "utf-8", errors="replace")  # notes have names of files
-        except OSError as error:
-            raise UserError(f"{path}: cannot be written: {error.strerror or error}") from error
+        with writing(path, UserError):
+            write_text(path, json.dumps(content, indent=1, ensure_ascii=False) + "\n")
 
 
 def hand_origin(notes: str, side: Side) -> HandOrigin:

@@ -12,6 +12,7 @@ from jaxtyping import Float
 from benchmarks.paper.assignment_trackers import HungarianTracker, NearestNeighborTracker
 from benchmarks.paper.paper_tracker import PaperTracker
 from benchmarks.paper.take_evaluation import (
+    FrameTracker,
     TrackingReport,
     evaluate_tracker,
     measured_users,
@@ -23,7 +24,6 @@ from gloves import GloveFit, Take
 from handsim.errors import ArgumentError
 from handsim.space.objects import named_object
 from track import RigidTemplate, Tracker
-from track.frames import FrameTracker
 from train import Labeler
 
 MakeTracker = Callable[[Take, Sequence[GloveFit]], FrameTracker]

@@ -9,15 +9,15 @@ from typing import Annotated, Final, NamedTuple, Self
 
 import numpy as np
 import tyro
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from rich.console import Console
 from rich.table import Table
 
 from benchmarks.held_out import held_out_markers
-from benchmarks.paper.printed import AUGMENTATIONS, TABLE2, TABLE4, TABLE6, TEST_SETS
+from benchmarks.paper.printed import AUGMENTATIONS, TABLE2, TABLE3, TABLE4, TABLE6, TEST_SETS, GapCounts
 from benchmarks.record import Figures, save_figures
 from gloves import Take
-from gloves.captures.capture import count_gaps, run_lengths
+from gloves.captures.capture import run_lengths
 from gloves.captures.formats import find_captures, read_markers
 from handsim import HandSimError
 from handsim.app.messages import progress_bar
@@ -34,7 +34,6 @@ from train import (
 from train.data.batches import paper_corruption
 from train.labelers.storage import shipped_labelers
 from train.settings import Kind, usual_settings
-from train.simulation.room import TWINS
 from train.simulation.scenes import KINDS
 
 # Median and p90 of real finger markers' gaps [frames]; docs/room.md.
@@ -213,7 +212,7 @@ class TakeMeasures(NamedTuple):
     @classmethod
     def of(cls, kind: str, take: Take) -> Self:
         """Those of the twin of one of the paper's captures."""
-        present, paper = take.markers_present(), TWINS[kind].paper
+        present, paper = take.markers_present(), TABLE3[kind]
         ours = count_gaps(present)
         ghosts = int(((take.labels < 0) & np.isfinite(take.points[..., 0])).sum())
         pairs: list[list[float]] = [
@@ -221,11 +220,25 @@ class TakeMeasures(NamedTuple):
             [ours.gaps, paper.gaps],
             [ours.average_length, paper.average_length],
             [ours.average_missing, paper.average_missing],
-            [100 * ghosts / present.size, 100 * TWINS[kind].ghost_ratio],
+            [100 * ghosts / present.size, 100 * TABLE4["ghost_ratio"][TEST_SETS.index(kind)]],
         ]
         share, lengths = 100 * (~present).mean(axis=0), run_lengths(~present)
         quantiles = np.quantile(lengths, [0.5, 0.9, 0.99]) if len(lengths) else np.full(3, np.nan)
         return cls(pairs, [share.mean(), share.min(), share.max(), *quantiles])
+
+
+def count_gaps(present: Bool[np.ndarray, "T M"]) -> GapCounts:
+    """Table 3's figures of a capture with M expected markers."""
+    missing = ~present
+    lacking = np.any(missing, axis=1)
+    lengths = run_lengths(lacking[:, None])
+    gaps = len(lengths)
+    return GapCounts(
+        frames=len(present),
+        gaps=gaps,
+        average_length=float(lengths.mean()) if gaps else float("nan"),
+        average_missing=float(missing.sum() / lacking.sum()) if gaps else float("nan"),
+    )
 
 
 def _table3(measures: Mapping[str, TakeMeasures]) -> Table:

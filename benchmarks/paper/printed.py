@@ -8,9 +8,22 @@ product of Table 7's two shares.
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Final, NamedTuple
 
 from train.simulation.scenes import Kind
+
+
+class GapCounts(NamedTuple):
+    """One row of Table 3."""
+
+    frames: int
+    gaps: int
+    """Stretches of frames in each of which at least one marker is missing."""
+    average_length: float
+    """Average gap length (AGL) [frames]; NaN without gaps."""
+    average_missing: float
+    """Average missing markers (AMF) of the frames that miss any; NaN without gaps."""
+
 
 AUGMENTATIONS: Final = ("Base", "Base+O", "Base+G", "Base+O+G")
 """The networks and the test sets of Table 2."""
@@ -48,13 +61,13 @@ TABLE6: Final = {
 }
 """The sparse layout of 13 markers, by test set."""
 
-FRAMES: Final[dict[Kind, int]] = {
-    "single-hand": 4785,
-    "hand-hand": 3312,
-    "hand-pen": 4511,
-    "hand-controller": 2645,
+TABLE3: Final[dict[str, GapCounts]] = {
+    "single-hand": GapCounts(4785, 44, 2.11, 1.35),
+    "hand-hand": GapCounts(3312, 331, 4.01, 3.30),
+    "hand-pen": GapCounts(4511, 481, 3.39, 2.31),
+    "hand-controller": GapCounts(2645, 382, 2.65, 1.62),
 }
-"""Numbers of frames of the captures; Table 3."""
+"""The captures: frames and gaps."""
 
 HAN: Final = "Han 2018"
 

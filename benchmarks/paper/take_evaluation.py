@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, Protocol
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -17,12 +17,19 @@ from gloves.fit import nominal_fit
 from handsim import HandModel
 from handsim.hand.shape import NUM_QPOS, SIZES
 from track import StreamedFrame, TrackedFrame
-from track.frames import FrameTracker
 from track.hand_size import fit_size, sample_frames
 from train import Labeler
 
 OCCLUSIONS: Final = ((0, 0), (1, 2), (3, 5), (6, 99))
 """Classes of a hand's number of missing markers, from and to, for pose errors."""
+
+
+class FrameTracker(Protocol):
+    """Anything that tracks a capture frame by frame."""
+
+    def step(self, points: Float[np.ndarray, "N 3"], ids: Int[np.ndarray, "N"], time: float) -> TrackedFrame:
+        """Track the next frame: points [m], their IDs, and the time [s]."""
+        ...
 
 
 class SeenFrame(NamedTuple):

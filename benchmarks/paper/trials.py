@@ -9,10 +9,9 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float
 
-from benchmarks.paper.take_evaluation import is_right, is_valid, seen_frame
+from benchmarks.paper.take_evaluation import FrameTracker, is_right, is_valid, seen_frame
 from gloves import Take
 from handsim.errors import ArgumentError
-from track.frames import FrameTracker
 
 _FRAMES_BEFORE: Final = 60  # frames that a tracker sees before all points are hidden
 _FRAMES_HIDDEN: Final = 120  # a second

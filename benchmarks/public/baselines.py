@@ -14,6 +14,7 @@ from jaxtyping import Int
 
 from benchmarks.paper.assignment_trackers import HungarianTracker, NearestNeighborTracker
 from benchmarks.paper.paper_tracker import PaperTracker
+from benchmarks.paper.take_evaluation import FrameTracker
 from benchmarks.public.answers import SIDES, Answers, BenchmarkError, poses_of, save_answers
 from benchmarks.public.difficulties import BENCHMARK, GLOVE
 from benchmarks.public.manifest import Benchmark
@@ -21,7 +22,7 @@ from gloves import Capture, GloveFit
 from handsim.files.outputs import claim
 from handsim.hand.shape import NUM_QPOS
 from track import Tracker, measure_hands
-from track.frames import FrameTracker, capture_frames
+from track.frames import capture_frames
 from train import Labeler, load_labeler
 
 MakeTracker = Callable[[Sequence[GloveFit], Labeler, Int[np.ndarray, "N"]], FrameTracker]

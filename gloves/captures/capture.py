@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
 from gloves.captures.text import check_rate
-from handsim.errors import ArgumentError, CaptureError, HandSimWarning, choices
+from handsim.errors import ArgumentError, CaptureError, HandSimWarning, choices, errors_of
 from handsim.kernels import kernel, squared_distance
 
 
@@ -62,32 +62,6 @@ class Capture:
     def num_frames(self) -> int:
         """Number of frames, T."""
         return len(self.positions)
-
-
-class GapCounts(NamedTuple):
-    """One row of Table 3."""
-
-    frames: int
-    gaps: int
-    """Stretches of frames in each of which at least one marker is missing."""
-    average_length: float
-    """Average gap length (AGL) [frames]; NaN without gaps."""
-    average_missing: float
-    """Average missing markers (AMF) of the frames that miss any; NaN without gaps."""
-
-
-def count_gaps(present: Bool[np.ndarray, "T M"]) -> GapCounts:
-    """Table 3's figures of a capture with M expected markers."""
-    missing = ~present
-    lacking = np.any(missing, axis=1)
-    lengths = run_lengths(lacking[:, None])
-    gaps = len(lengths)
-    return GapCounts(
-        frames=len(present),
-        gaps=gaps,
-        average_length=float(lengths.mean()) if gaps else float("nan"),
-        average_missing=float(missing.sum() / lacking.sum()) if gaps else float("nan"),
-    )
 
 
 def run_lengths(flags: Bool[np.ndarray, "T M"], *, inside: bool = False) -> Int[np.ndarray, "G"]:
@@ -139,10 +113,8 @@ def select_hands(capture: Capture, names: Sequence[str]) -> list[Float[np.ndarra
     for prefix in sets:
         mine = [number for number, (other, _) in enumerate(columns) if other == prefix]
         part = Capture(tuple(columns[number][1] for number in mine), capture.positions[:, mine], capture.rate)
-        try:
+        with errors_of(f"columns '{prefix}:...'", CaptureError):
             markers = select_markers(part, names)
-        except CaptureError as error:
-            raise CaptureError(f"columns '{prefix}:...': {error}") from error
         hands.append(markers[np.isfinite(markers[..., 0]).any(axis=1)])
     return hands
 

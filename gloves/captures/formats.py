@@ -61,9 +61,9 @@ from gloves.captures.text import (
     warn,
 )
 from handsim._checks import check_type
-from handsim.errors import CaptureError, HandSimWarning, choices, shortened
+from handsim.errors import CaptureError, HandSimWarning, choices, errors_of, shortened
 from handsim.files.inputs import read_bytes
-from handsim.files.outputs import as_text, atomic_write
+from handsim.files.outputs import as_text, atomic_write, writing
 
 _BEGIN: Final = b"PathFileType"
 _HEADER_LINES: Final = 5
@@ -626,16 +626,11 @@ def write_capture(path: str | Path, capture: Capture, *, source: str | Path | No
                 f"{path}: marker name {name!r} cannot be written; expected printable characters without "
                 "tabs, line ends or outer blanks"
             )
-    try:
-        with atomic_write(path) as temporary:
-            if path.suffix.lower() in _TEXT_WRITERS:
-                _TEXT_WRITERS[path.suffix.lower()](temporary, capture, title=as_text(path.name))
-            else:
-                write_c3d(temporary, capture, kept)
-    except OSError as error:
-        raise CaptureError(f"{path}: cannot be written: {error.strerror or error}") from error
-    except CaptureError as error:
-        raise CaptureError(f"{path}: {error}") from error
+    with writing(path, CaptureError), errors_of(path, CaptureError), atomic_write(path) as temporary:
+        if path.suffix.lower() in _TEXT_WRITERS:
+            _TEXT_WRITERS[path.suffix.lower()](temporary, capture, title=as_text(path.name))
+        else:
+            write_c3d(temporary, capture, kept)
 
 
 def check_suffix(path: Path, valid: tuple[str, ...]) -> None:

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 
 from gloves.takes.points import PointList
 from gloves.takes.take import Take
-from handsim.errors import CaptureError, HandSimError, choices
+from handsim.errors import CaptureError, HandSimError, choices, errors_of
 from handsim.files.inputs import check_keys, numbers, quoted, read_toml, shown, tables_of, text_of, written
-from handsim.files.outputs import atomic_write
+from handsim.files.outputs import write_text, writing
 
 SUFFIX: Final = ".corrections.toml"
 """How the names of such files end."""
@@ -73,14 +73,10 @@ def corrections_path(take: Path) -> Path:
 def load_corrections(path: Path) -> tuple[Correction, ...]:
     """Read a file of corrections."""
     table = read_toml(path, error=CaptureError)
-    try:
+    with errors_of(path, CaptureError):
         check_keys(table, "the file", ("correction",), optional=("correction",))
         entries = enumerate(tables_of(table, "correction"), start=1)
         return tuple(_parse(entry, f"correction {number}") for number, entry in entries)
-    except CaptureError:
-        raise
-    except HandSimError as error:
-        raise CaptureError(f"{path}: {error}") from error
 
 
 def corrections_of(take: Path) -> tuple[Correction, ...]:
@@ -97,11 +93,8 @@ def save_corrections(path: Path, corrections: Iterable[Correction]) -> None:
         place = ", ".join(written(value) for value in record["place_mm"])
         lines += ["", "[[correction]]", f"frames = {record['frames']}", f"place_mm = [{place}]"]
         lines += [f"label = {quoted(correction.label)}"]
-    try:
-        with atomic_write(path) as temporary:
-            temporary.write_text("\n".join(lines) + "\n", "utf-8")
-    except OSError as error:
-        raise CaptureError(f"{path}: cannot be written: {error.strerror or error}") from error
+    with writing(path, CaptureError):
+        write_text(path, "\n".join(lines) + "\n")
 
 
 def find_pins(corrections: Sequence[Correction], points: PointList, label_names: Sequence[str]) -> Pins:

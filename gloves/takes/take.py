@@ -8,23 +8,23 @@ from __future__ import annotations
 import dataclasses
 import os
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, NamedTuple, Self, get_args
+from typing import Any, Final, Self, get_args
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike, NDArray
 
 from gloves.captures.capture import Capture, labeled_columns
-from gloves.captures.formats import write_capture
 from gloves.fit import Attachment, GlovedHand, GloveFit
 from gloves.layout import stored_layout
-from gloves.takes.archives import SCHEMA, names_of, read_archive, settings_of, write_archive
+from gloves.takes.archives import SCHEMA, read_archive, settings_of, write_archive
+from gloves.takes.bodies import RigidBody, body_arrays, stored_body
+from gloves.takes.motion_formats import MOTION_FORMATS, MotionFormat, motion_format
 from gloves.takes.points import (
     ATTACHMENT,
-    BODY_MARKERS,
     FRAMES,
     KEYPOINTS,
     NUMBERS,
@@ -62,71 +62,9 @@ from handsim.hand.shape import (
     pack_hand,
     unpack_hand,
 )
-from handsim.motion_files.motion import (
-    OPENXR_SUFFIX,
-    Motion,
-    PosedBody,
-    PosedHand,
-    write_bvh,
-    write_joint_csv,
-    write_joint_parquet,
-    write_mot,
-    write_openxr,
-)
-from handsim.motion_files.scenes import write_glb, write_usd
-from handsim.space.objects import Part, RigidObject, named_object, object_names
-from handsim.space.transforms import UpAxis, file_axes
+from handsim.motion_files.motion import Motion, PosedBody, PosedHand
+from handsim.space.transforms import UpAxis
 
-
-class MotionFormat(NamedTuple):
-    """A format of motion."""
-
-    write: Callable[[Path, Motion, UpAxis], None]
-    without_pose: str
-    """How a hand without a pose is written, in words."""
-    steady: bool = False
-    """Whether frames are written without times, so that they must come at a steady rate."""
-    keeps_axes: bool = False
-    """Whether positions stay in the take's axes, whatever points up."""
-
-    def take_of(self, take: Take, rate: float | None) -> Take:
-        """The poses of a take that are written, at a rate if given."""
-        poses = take.poses_alone(rate)
-        steady = not self.steady or is_steady(poses.times, poses.rate)
-        return poses if steady else poses.poses_alone(poses.rate)
-
-
-def motion_format(path: Path) -> MotionFormat:
-    """The format of a file, by the ending of its name."""
-    for ending, form in MOTION_FORMATS.items():
-        if path.name.lower().endswith(ending):
-            return form
-    endings = ", ".join(MOTION_FORMATS)
-    raise ArgumentError(f"cannot write a take as '{path}', expected a name that ends in {endings}")
-
-
-def _write_joint_trc(path: Path, motion: Motion, up: UpAxis) -> None:
-    """Write a .trc file for OpenSim: every keypoint of the hands is a marker, and the y axis points up."""
-    turn, positions, names = file_axes(up), [], []
-    for hand in motion.hands:
-        positions.append(hand_keypoints(hand.model, hand.qpos) @ turn.T)
-        names += [f"{hand.side}_{name}" for name in KEYPOINT_NAMES]
-    write_capture(path, Capture(tuple(names), np.concatenate(positions, axis=1), motion.rate))
-
-
-HELD: Final = "held at its last pose"
-MOTION_FORMATS: Final[dict[str, MotionFormat]] = {
-    ".glb": MotionFormat(write_glb, "hidden (scale 0)"),
-    ".bvh": MotionFormat(write_bvh, HELD, steady=True),
-    ".usda": MotionFormat(write_usd, "invisible"),
-    ".usdc": MotionFormat(write_usd, "invisible"),
-    ".csv": MotionFormat(write_joint_csv, "blank", keeps_axes=True),
-    ".parquet": MotionFormat(write_joint_parquet, "null", keeps_axes=True),
-    ".trc": MotionFormat(_write_joint_trc, HELD, steady=True),
-    ".mot": MotionFormat(write_mot, HELD),
-    OPENXR_SUFFIX: MotionFormat(write_openxr, "null"),
-}
-"""The formats, by the endings of file names."""
 SUFFIX: Final = ".truth.npz"
 """Ending of the name of a simulated take that lies beside its capture."""
 STATUSES: Final = tuple(map(str, Status))
@@ -135,51 +73,12 @@ LOST, COASTING, INITIALIZED, TRACKED = Status
 RATED_FRAMES: Final = 100_000
 """Number of frames of a stream that its rate is measured on."""
 _MAX_LENGTH: Final = 1e9  # [m]
-_VERTICES, _FACES = "body_vertices_{}", "body_faces_{}"  # arrays of the surface of a body, by its number
 _MAX_TIME: Final = 1e12  # [s], and the largest rate [Hz]; clocks of computers count 2e9 s
 _QUATERNION_TOLERANCE: Final = 1e-2  # of the unit length; our own files have 1e-6
 _CHUNK: Final = 4096  # frames whose markers are filled in at once
 _MAX_BIAS_FRAMES: Final = 2000  # frames that marker biases are learned from
 _STILL: Final = 3.0  # [deg], largest standard deviation of an angle of a hand that holds still
 _MIN_BIAS_FRAMES: Final = 30  # frames with a marker from which its bias is learned
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class RigidBody:
-    """A rigid body with markers of its own.
-
-    Raises:
-        ArgumentError: A name is no text, or there is not one position per marker.
-    """
-
-    name: str
-    marker_names: tuple[str, ...]
-    positions: Float[np.ndarray, "Q 3"]
-    """Its markers in its own frame [m]."""
-    surface: RigidObject | None = None
-    """Its surface, if it is no object that comes with handsim."""
-
-    @classmethod
-    def of(cls, thing: RigidObject) -> RigidBody:
-        """The body of an object."""
-        shipped = thing.name in object_names() and thing is named_object(thing.name)
-        return cls(thing.name, thing.marker_names, thing.markers, None if shipped else thing)
-
-    def __post_init__(self) -> None:
-        if self.positions.shape != (len(self.marker_names), 3):
-            expected = f"({len(self.marker_names)}, 3)"
-            raise ArgumentError(
-                f"{self.name}: positions has shape {self.positions.shape}, expected {expected}"
-            )
-        if not all(isinstance(name, str) for name in (self.name, *self.marker_names)):
-            raise ArgumentError(f"{self.name!r}: a name is no text, expected text for body and markers")
-
-    @property
-    def shape(self) -> RigidObject | None:
-        """Its own surface, or that of the object of this name that comes with handsim, or None."""
-        if self.surface is not None:
-            return self.surface
-        return named_object(self.name) if self.name in object_names() else None
 
 
 @dataclass(frozen=True, slots=True, eq=False, init=False)
@@ -779,7 +678,7 @@ class Take:
             raise ArgumentError(
                 f"neutral is {neutral} and the file {path}, expected .csv or .parquet with the ISB's angles"
             )
-        take = form.take_of(self, None if rate is None else float(rate))
+        take = poses_for(form, self, None if rate is None else float(rate))
         form.write(path, posed_motion(take, neutral), up)
 
     def save(self, path: str | Path) -> None:
@@ -803,6 +702,12 @@ class Take:
     def _known(self) -> tuple[Column, ...]:
         """The optional columns of this take."""
         return tuple(column for column in OPTIONAL if getattr(self, column.name) is not None)
+
+
+def poses_for(form: MotionFormat, take: Take, rate: float | None) -> Take:
+    """The poses of a take that a format writes, at a rate if given."""
+    poses = take.poses_alone(rate)
+    return poses.poses_alone(poses.rate) if form.steady and not is_steady(poses.times, poses.rate) else poses
 
 
 def posed_motion(take: Take, neutral: tuple[float, float] | None = None) -> Motion:
@@ -870,11 +775,7 @@ def take_header(
         "layouts": [dataclasses.asdict(hand.layout) for hand in hands],
         "statuses": STATUSES,
         "keypoint_names": KEYPOINT_NAMES,
-        "bodies": [
-            {"name": body.name, "marker_names": list(body.marker_names)}
-            | ({} if body.surface is None else {"surface": True})
-            for body in bodies
-        ],
+        "bodies": [body.record() for body in bodies],
         "settings": settings,
     }
 
@@ -887,29 +788,7 @@ def worn_arrays(hands: Sequence[GloveFit], bodies: Sequence[RigidBody]) -> dict[
         field = column.name.removeprefix("attachment_")
         parts = [getattr(hand.attachment, field) for hand in hands]
         arrays[column.name] = np.concatenate(parts).astype(column.dtype)
-    markers = [np.zeros((0, 3)), *(body.positions for body in bodies)]
-    arrays[BODY_MARKERS.name] = np.concatenate(markers)
-    surfaces = {number: body.surface for number, body in enumerate(bodies) if body.surface is not None}
-    for number, thing in surfaces.items():
-        arrays[_VERTICES.format(number)] = thing.vertices
-        arrays[_FACES.format(number)] = thing.faces.astype(np.int64)
-    return arrays
-
-
-def _stored_body(
-    number: int, stored: Mapping[str, Any], positions: NDArray[Any], arrays: Mapping[str, NDArray[Any]]
-) -> RigidBody:
-    """A body of a file's header; `RigidObject` checks the arrays of its surface."""
-    name, marker_names = stored["name"], names_of(stored["marker_names"])
-    if not stored.get("surface", False):
-        return RigidBody(name, marker_names, positions)
-    vertices, faces = (arrays[key.format(number)] for key in (_VERTICES, _FACES))
-    hull = Part("mesh", np.zeros(3), np.eye(4), vertices)
-    upright = np.tile([0.0, 0.0, 1.0], (len(positions), 1))  # a file has no normals under markers
-    thing = RigidObject(
-        name, vertices, faces, (hull,), marker_names, positions, upright, 0.1, np.empty((0, 7))
-    )
-    return RigidBody(name, marker_names, positions, thing)
+    return arrays | body_arrays(bodies)
 
 
 def unpack_take(header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Take:
@@ -930,7 +809,7 @@ def unpack_take(header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Take
         parts = (arrays[column.name][span.start : span.stop] for column in ATTACHMENT)
         hands.append(GloveFit(HandModel(unpack_hand(record)), Attachment(layout, *parts)))
     bodies = tuple(
-        _stored_body(number, one, arrays[BODY_MARKERS.name][span.start : span.stop], arrays)
+        stored_body(number, one, span, arrays)
         for number, (one, span) in enumerate(zip(named, spans(counts[1]), strict=True))
     )
     counted, entries = arrays[POINT_COUNTS.name], {column.name: arrays[column.name] for column in POINTS}

@@ -58,14 +58,15 @@ def export(
 def _export_take(
     source: Path, out: Path, fps: float | None, up: UpAxis, neutral: tuple[float, float] | None
 ) -> None:
-    from gloves.takes.take import load_take, motion_format
+    from gloves.takes.motion_formats import motion_format
+    from gloves.takes.take import load_take, poses_for
 
     form = motion_format(out)
     check_outputs([source], [out])
     take = load_take(source)
     if not np.isfinite(take.qpos[..., 0]).any():
         raise CaptureError(f"{source}: there is no hand in any frame, expected one to export")
-    motion = form.take_of(take, fps)
+    motion = poses_for(form, take, fps)
     motion.export(out, up=up, neutral=neutral)
     sides = " and ".join(motion.sides)
     things = "".join(f", {body.name}" for body in motion.bodies)
@@ -80,7 +81,7 @@ def _export_take(
 
 def _export_labeler(source: str, out: Path) -> None:
     from gloves.captures.formats import READABLE
-    from gloves.takes.take import MOTION_FORMATS
+    from gloves.takes.motion_formats import MOTION_FORMATS
     from train.labelers.storage import export_onnx, load_network
 
     if Path(source).suffix.lower() in READABLE:

@@ -34,7 +34,7 @@ def generate(
 
     Args:
         out: Folder for the shards, their manifest and report.html; or a folder of an object store, as
-            s3://bucket/prefix, which gets no report (docs/object_stores.md).
+            s3://bucket/prefix, which gets no report (docs/cluster.md).
         settings: What to make.
         workers: Processes; all cores when not given.
         cluster: Where else to make shards: tcp://host:port of a Dask scheduler, its file (.json), or local;

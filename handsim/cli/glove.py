@@ -18,7 +18,7 @@ from gloves.layout import (
     starter_layout,
 )
 from handsim.app.messages import named_steps, print_line, print_table
-from handsim.errors import LayoutError
+from handsim.errors import LayoutError, errors_of
 from handsim.files.outputs import as_text, check_outputs, write_starter
 from handsim.hand.shape import SIZES
 from train.forecast.settings import ImproveGloveSettings, ScoreGloveSettings
@@ -136,10 +136,8 @@ def check_glove(
 def _fitted(layout: MarkerLayout, size: str) -> GloveFit:
     from gloves.fit import nominal_fit
 
-    try:
+    with errors_of(f"on a hand of size {size}", LayoutError):
         return nominal_fit(layout, size, layout.sides[-1])
-    except LayoutError as error:
-        raise LayoutError(f"on a hand of size {size}: {error}") from error
 
 
 def score_glove(

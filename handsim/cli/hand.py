@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from gloves.layout import load_layout
 from handsim.app.messages import print_line
-from handsim.errors import ArgumentError
+from handsim.errors import ArgumentError, errors_of
 from handsim.files.outputs import check_ending, check_outputs, written_together
 from handsim.hand.shape import NUM_JOINTS, NUM_QPOS, Side
 from handsim.space.transforms import UpAxis
@@ -108,10 +108,8 @@ def _chosen_hand(
             raise ArgumentError(f"given --glove {glove} and {named[0]}, expected one of them")
         moving = None if take is None else load_take(take)
         user = load_user(source) if moving is None else User(moving.hands)
-        try:
+        with errors_of(source, ArgumentError):
             fit = user.of_side(side)
-        except ArgumentError as error:
-            raise ArgumentError(f"{source}: {error}") from error
         poses = np.empty((0, NUM_QPOS)) if moving is None else moving.qpos[:, moving.hand_index(fit.side)]
         poses = poses[np.isfinite(poses).all(axis=1)]
         return fit, f"of {source}, {User((fit,))}", poses[0] if len(poses) else None

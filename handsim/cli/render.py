@@ -93,7 +93,7 @@ def render(
     Args:
         take: A tracked take (.npz), the truth of a simulated one (.truth.npz), or a .csv of handsim export.
         out: Folder for the pictures, their annotations and contact_sheet.png; or a folder of an object store,
-            as s3://bucket/prefix (docs/object_stores.md).
+            as s3://bucket/prefix (docs/cluster.md).
         poses: Poses of your own (.npz, or .csv as handsim export writes it) instead of a take;
             docs/rendering.md has the arrays and columns.
         hands: Whose poses an .npz has, in its order: right (when not given), left, or both. A .csv names its

@@ -158,6 +158,21 @@ def _keep(final: Path, older: Path) -> None:
             shutil.copy2(final, older)
 
 
+def write_text(path: str | Path, text: str) -> None:
+    """Write a text file, complete or not at all; what is no text, as names of files may be, is replaced."""
+    with atomic_write(path) as temporary:
+        temporary.write_text(text, "utf-8", errors="replace")
+
+
+@contextmanager
+def writing(path: str | Path, kind: type[HandSimError]) -> Iterator[None]:
+    """Within the block an error of the system becomes one of this kind: a file cannot be written."""
+    try:
+        yield
+    except OSError as error:
+        raise kind(f"{path}: cannot be written: {error.strerror or error}") from error
+
+
 def unwritten(path: Path) -> OSError:
     """The system's error for a file that a library did not write whole, without saying why."""
     try:
@@ -302,8 +317,7 @@ def write_starter(file: Path, text: str, *, error: type[HandSimError]) -> None:
         raise error(f"{file}: expected a file name that ends in .toml")
     if file.exists():
         raise error(f"{file} exists already and is left as it is; name a new file")
-    with atomic_write(file) as temporary:
-        temporary.write_text(text, "utf-8")
+    write_text(file, text)
 
 
 def check_free(folder: Path, needed: int, what: str, remedy: str, *, error: type[HandSimError]) -> None:
@@ -353,8 +367,7 @@ _MOST_SHOWN: Final = 4  # settings that a message lists
 
 def save_json(path: Path, content: dict[str, Any]) -> None:
     """Write a JSON file, whole or not at all."""
-    with atomic_write(path) as temporary:
-        temporary.write_text(json_text(content), encoding="utf-8")
+    write_text(path, json_text(content))
 
 
 def json_text(content: dict[str, Any]) -> str:

@@ -4,7 +4,7 @@ Sixteen bones and twenty joints, four per digit, are with the free joint of the 
 hand of Han et al. 2018, section 4.1. Axes are given for the right hand in the frame of the joint's bone: x
 along the bone, y towards the thumb side, z out of the back (nail) side. Zero angles are the flat hand.
 
-Sources, in docs/anatomy.md with their tables: bone lengths from Buryanov and Kotiuk 2010 (Int. J. Morphol.
+Sources, in docs/poses.md with their tables: bone lengths from Buryanov and Kotiuk 2010 (Int. J. Morphol.
 28:755), hand length and breadth from ANSUR II (2012), finger girths from Greiner 1991 (NATICK/TR-92/011).
 """
 

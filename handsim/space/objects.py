@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from handsim._checks import check_array, check_choice
 from handsim.errors import ArgumentError, ObjectError, shortened
 from handsim.files.inputs import check_regular, package_data
-from handsim.space.transforms import axis_angle_matrix
+from handsim.space.transforms import axis_angle_matrix, frame_with_z
 
 PartKind = Literal["sphere", "capsule", "cylinder", "box", "ellipsoid", "mesh"]
 _AROUND: Final = 16  # sides of a capsule
@@ -57,11 +57,7 @@ def _at(position: NDArray[np.float64], rotation: NDArray[np.float64] | None = No
 
 def _along(start: NDArray[np.float64], end: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
     """Pose whose z axis goes from one point to another, at the middle, and their distance."""
-    z = (end - start) / np.linalg.norm(end - start)
-    x = np.cross(np.eye(3)[np.abs(z).argmin()], z)
-    x /= np.linalg.norm(x)
-    rotation = np.stack([x, np.cross(z, x), z], axis=1)
-    return _at((start + end) / 2, rotation), float(np.linalg.norm(end - start))
+    return _at((start + end) / 2, frame_with_z(end - start)), float(np.linalg.norm(end - start))
 
 
 def _sphere(numbers: NDArray[np.float64], trimesh: Any) -> Solid:

@@ -19,7 +19,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from handsim.errors import HandSimError, HandSimWarning, RigError, choices, shortened
+from handsim.errors import HandSimError, HandSimWarning, RigError, choices, errors_of, shortened
 from handsim.files.inputs import read_bytes, read_toml, words_numbers
 from handsim.space.camera import Camera, Lens, LensKind, brown_lens
 from handsim.space.rig import TOML_MATRIX, camera_names, checked_cameras, nearest_rotation
@@ -117,12 +117,10 @@ def _many(values: Values, sections: Sections) -> list[Camera]:
     cameras = []
     common = {key: value for key, value in values.items() if key in _OF_ALL}
     for name, (given, own) in zip(camera_names(list(sections)), sections.items(), strict=True):
-        try:
+        with errors_of(f"camera '{shortened(given)}'", RigError):
             if "T_world_camera" not in own and (_find(own, _R) is None or _find(own, _T) is None):
                 raise RigError("no R and T, the rotation and translation from the world to the camera")
             cameras.append(_camera(common | own, name, _K, _D, _pose(own)))
-        except HandSimError as error:
-            raise RigError(f"camera '{shortened(given)}': {error}") from error
     return cameras
 
 

@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
 from handsim._checks import check_type
-from handsim.errors import ArgumentError, HandSimError, RigError, choices, shortened
+from handsim.errors import ArgumentError, RigError, choices, errors_of, shortened
 from handsim.files.inputs import (
     check_keys,
     number_list,
@@ -32,7 +32,7 @@ from handsim.files.inputs import (
     tables_of,
     text_of,
 )
-from handsim.files.outputs import as_text, atomic_write
+from handsim.files.outputs import as_text, write_text
 from handsim.settings import Limits
 from handsim.space.camera import (
     Camera,
@@ -78,10 +78,8 @@ class RigFile(NamedTuple):
 def read_rig_file(path: Path) -> RigFile:
     """Read a file of cameras."""
     table = read_toml(path, error=RigError)
-    try:
+    with errors_of(path, RigError):
         return _parse(table, as_text(path.stem))
-    except HandSimError as error:
-        raise RigError(f"{path}: {error}") from error
 
 
 def checked_cameras(path: Path, cameras: Sequence[Camera]) -> tuple[Camera, ...]:
@@ -90,10 +88,8 @@ def checked_cameras(path: Path, cameras: Sequence[Camera]) -> tuple[Camera, ...]
         raise RigError(f"{path}: {len(cameras)} cameras, expected 1 to {_MAX_FILE_CAMERAS}")
     check_names(str(path), cameras)
     for camera in cameras:
-        try:
+        with errors_of(path, RigError):
             check_near(f"camera '{camera.name}'", camera)
-        except RigError as error:
-            raise RigError(f"{path}: {error}") from error
     return tuple(cameras)
 
 
@@ -377,8 +373,7 @@ class CameraRig:
         Raises:
             OSError: The file cannot be written.
         """
-        with atomic_write(path) as temporary:
-            temporary.write_text("\n".join(rig_lines(self.name, self.cameras)) + "\n", encoding="utf-8")
+        write_text(path, "\n".join(rig_lines(self.name, self.cameras)) + "\n")
 
     def digest(self) -> str:
         """Beginning of the SHA-256 of its record to nine decimals: whether a name still means this rig."""
@@ -427,10 +422,8 @@ def load_rig(rig: CameraRig | str | Path | Mapping[str, Any]) -> CameraRig:
         unknown = choices(str(rig), list_rigs(), noun="camera rig")
         raise RigError(f"{unknown}, or the path of a .toml file")
     read = read_rig_file(path)
-    try:
+    with errors_of(path, RigError):
         return CameraRig(read.name, read.cameras)
-    except HandSimError as error:
-        raise RigError(f"{path}: {error}") from error
 
 
 def rig_setting(rig: CameraRig) -> str | dict[str, Any]:

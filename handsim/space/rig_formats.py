@@ -33,7 +33,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from handsim.errors import HandSimError, HandSimWarning, RigError, choices, shortened
+from handsim.errors import HandSimWarning, RigError, choices, errors_of, shortened
 from handsim.files.inputs import read_bytes, read_toml, shown, words_numbers
 from handsim.space.camera import Camera, Lens, brown_lens, camera_matrix
 from handsim.space.opencv_cameras import read_opencv_cameras
@@ -415,11 +415,9 @@ def _colmap_lens(path: Path, line: str) -> tuple[str, Camera]:
         )
     if model in _ONE_FOCAL:
         parameters.insert(0, parameters[0])
-    try:
+    with errors_of(owner, RigError):
         K, lens = camera_matrix(*parameters[:4]), _bent_lens(model, parameters[4:])
         return number, Camera(number, (int(width), int(height)), K, lens=lens)
-    except HandSimError as error:
-        raise RigError(f"{owner}: {error}") from error
 
 
 def _bent_lens(model: str, bent: list[float]) -> Lens:
@@ -537,11 +535,9 @@ def _of_xml(path: Path) -> tuple[LabCamera, ...]:
             f"{path}: its XML begins with <{shortened(root.tag)}>, expected <{'>, <'.join(_READERS)}>: "
             "Vicon's, Qualisys' or Motive's calibration"
         )
-    try:
+    with errors_of(path, RigError):
         tag, read_camera = _READERS[known]
         read = [read_camera(entry, number) for number, entry in enumerate(root.iter(tag), 1)]
-    except HandSimError as error:
-        raise RigError(f"{path}: {error}") from error
     skipped = [one for one in read if isinstance(one, Skipped)]
     if skipped:
         named = ", ".join(f"{shortened(one.name)} {one.why}" for one in skipped[:8])

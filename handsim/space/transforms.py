@@ -118,6 +118,14 @@ def quaternion_matrix(quaternion: Float[np.ndarray, "*batch 4"]) -> NDArray[np.f
     return matrix
 
 
+def frame_with_z(direction: Float[np.ndarray, "3"]) -> NDArray[np.float64]:
+    """Any rotation (3, 3) whose z axis has this direction."""
+    z = direction / np.linalg.norm(direction)
+    x = np.cross(np.eye(3)[np.abs(z).argmin()], z)
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(z, x), z], axis=1)
+
+
 def rigid(
     rotation: Float[np.ndarray, "3 3"], position: Sequence[float] | Float[np.ndarray, "3"]
 ) -> NDArray[np.float64]:

@@ -13,7 +13,7 @@ import trimesh
 from jaxtyping import Float, Float32, Int, UInt8
 
 from gloves.fit import GloveFit
-from gloves.takes.take import RigidBody
+from gloves.takes.bodies import RigidBody
 from handsim.hand.model import keypoint_thickness
 from handsim.hand.skin import vertex_normals
 from render.frames import PARTS_A_HAND, Bytes, Doubles, Integers
@@ -49,11 +49,6 @@ class Material:
 def linear(color: Float[np.ndarray, "*batch 3"] | tuple[float, float, float]) -> Doubles:
     """Linear light of an sRGB color, with the plain 2.2 power that pyrender's shader undoes."""
     return np.asarray(color, dtype=np.float64) ** 2.2
-
-
-def plain_material(color: tuple[float, float, float]) -> Material:
-    """A surface of one color, such as plastic."""
-    return Material(linear(color), 0.5)
 
 
 @functools.cache
@@ -195,7 +190,7 @@ class BodyFigure:
     def __init__(self, body: RigidBody, color: tuple[float, float, float]) -> None:
         self._thing = body.shape
         self._markers = body.positions if self._thing is None else self._thing.markers
-        self._material = functools.cache(functools.partial(plain_material, color))
+        self._material = functools.cache(lambda: Material(linear(color), 0.5))  # such as plastic
         if self._thing is not None:
             self._normals = vertex_normals(self._thing.vertices, self._thing.faces)
 

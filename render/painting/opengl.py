@@ -15,7 +15,7 @@ from jaxtyping import UInt8
 
 from handsim._plugins import EGL_PACKAGES
 from handsim.errors import HandSimError
-from render.frames import Doubles
+from handsim.space.transforms import frame_with_z
 
 if TYPE_CHECKING:
     from handsim.space.camera import Camera
@@ -218,11 +218,3 @@ def _cast_shadows(pyrender: Any, light: Any, extent: float) -> None:
     light._get_shadow_camera = lambda _: pyrender.OrthographicCamera(
         xmag=0.52 * diagonal, ymag=0.52 * diagonal, znear=0.3 * diagonal, zfar=_SHADOW_DEPTH * diagonal
     )
-
-
-def frame_with_z(direction: Doubles) -> Doubles:
-    """Any rotation whose z axis is `direction`."""
-    z = direction / np.linalg.norm(direction)
-    x = np.cross(np.eye(3)[np.abs(z).argmin()], z)
-    x /= np.linalg.norm(x)
-    return np.stack([x, np.cross(z, x), z], axis=1)

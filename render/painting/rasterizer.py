@@ -1,7 +1,7 @@
 """Depth, normals and ids of triangles by a compiled z-buffer, and pictures through lenses.
 
 Every pixel shows the surface behind its center, so that depth, normals and ids belong together and have the
-same bytes on every machine (docs/decisions/pictures.md). A picture through a lens is resampled from pinhole
+same bytes on every machine (docs/decisions.md). A picture through a lens is resampled from pinhole
 pictures of the same position: one for a narrow lens, the faces of a cube for others. Only the part of a
 face that the lens sees is drawn, at the lens's finest resolution.
 """

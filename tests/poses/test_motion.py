@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from handsim import HandModel, HandMotion, join_qpos, sample_shape
 from handsim.errors import ArgumentError, PoseError
+from handsim.files.inputs import package_data
 from handsim.hand.shape import SIDES
 from handsim.space.transforms import quaternion_matrix
 from poses import MotionConfig, sample_motion
@@ -21,7 +22,6 @@ from poses.motion import (
     minimum_jerk,
     motion_through,
     path_to_rest,
-    script_names,
     script_poses,
     scripted_motion,
     wrist_path,
@@ -88,7 +88,7 @@ def _people(count: int, seed: int) -> list[HandModel]:
     return people
 
 
-@pytest.mark.parametrize("script", script_names())
+@pytest.mark.parametrize("script", package_data("poses", "scripts")["scripts"])
 def test_every_frame_of_every_script_is_valid(script):
     for number, model in enumerate([HandModel.named("XS"), HandModel.named("XL"), *_people(3, seed=3)]):
         motion = scripted_motion(model, script, 5.0, rng=np.random.default_rng(number))

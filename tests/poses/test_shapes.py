@@ -19,7 +19,6 @@ from poses.shapes import (
     LIBRARIES,
     LOW,
     MAX_PENETRATION,
-    all_gestures,
     apply_couplings,
     gesture,
     gesture_names,
@@ -37,8 +36,8 @@ _BLENDED = "1a3e09876ee645e750ec62f76644780e15ab045294e70693ae700a934acc667d"
 
 
 def test_random_poses_blend_the_same_gestures_as_ever():
-    assert all_gestures().shape == (53, 20)
-    hundredths = np.rint(100 * np.rad2deg(all_gestures())).astype("<i4")
+    assert gestures_of("gestures").shape == (53, 20)
+    hundredths = np.rint(100 * np.rad2deg(gestures_of("gestures"))).astype("<i4")
     assert hashlib.sha256(hundredths.tobytes()).hexdigest() == _BLENDED
 
 

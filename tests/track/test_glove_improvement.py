@@ -12,7 +12,7 @@ from handsim import HandModel, load_rig
 from handsim.errors import LayoutError
 from handsim.hand.shape import BONE_NAMES
 from track import glove_improvement
-from track.glove_improvement import Improvement
+from track.glove_improvement import Improvement, sample_places
 from track.glove_score import palm_spread
 
 
@@ -104,3 +104,13 @@ def test_wrong_names_and_too_many_to_keep_are_refused():
         search_of(layout, keep=("Tail",))
     with pytest.raises(LayoutError, match="all 6 markers are to be kept"):
         search_of(layout, keep=layout.names).resize(5)
+
+
+def test_the_palm_has_more_places_than_a_finger(rng):
+    bones = [place.bone for place in sample_places(150, rng=rng)]
+    assert bones.count("palm") > 2 * bones.count("index_middle")
+
+
+def test_places_that_do_not_fit_are_left_out() -> None:
+    places = sample_places(60, rng=np.random.default_rng(0), apart=0.03)
+    assert 5 <= len(places) < 60

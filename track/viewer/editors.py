@@ -24,9 +24,9 @@ from gloves.takes.corrections import (
     save_corrections,
 )
 from gloves.takes.take import Take
-from handsim.errors import CaptureError, LayoutError
+from handsim.errors import CaptureError, LayoutError, errors_of
 from handsim.files.inputs import read_bytes
-from handsim.files.outputs import atomic_write
+from handsim.files.outputs import write_text, writing
 from handsim.hand.model import HandModel
 from handsim.hand.shape import NUM_QPOS
 from track.corrected_take import correct_take
@@ -60,10 +60,8 @@ class Corrector:
         records = applied_corrections(take)
         self._stale = any(correction.record() not in records for correction in self.saved)
         if self._stale:
-            try:
+            with errors_of(corrections_path(path), CaptureError):
                 self._make(())
-            except CaptureError as error:
-                raise CaptureError(f"{corrections_path(path)}: {error}") from error
 
     @property
     def unsaved(self) -> bool:
@@ -121,11 +119,8 @@ class Corrector:
             beside, every = corrections_path(self.path), (*self.saved, *self.added)
             save_corrections(beside, every)
             self.saved, self.added, self._stale = corrections_of(self.path), (), True
-            try:
+            with writing(self.path, CaptureError):
                 self.take.save(self.path)
-            except OSError as error:
-                words = error.strerror or error
-                raise CaptureError(f"{self.path}: cannot be written: {words}") from error
             self._base, self._state, self._stale = self.take, _state_of(self.path), False
         return f"saved {self.path} and {beside}"
 
@@ -389,11 +384,8 @@ class LayoutEditor:
         with self._lock:
             given = read_bytes(self._path, error=LayoutError).decode("utf-8", "replace")
             text, kept = moved_text(given, self.fit.layout)
-            try:
-                with atomic_write(self._out) as temporary:
-                    temporary.write_text(text, "utf-8")
-            except OSError as error:
-                raise LayoutError(f"{self._out}: cannot be written: {error.strerror or error}") from error
+            with writing(self._out, LayoutError):
+                write_text(self._out, text)
         self.changed = False
         return f"saved {self._out}" if kept else f"saved {self._out}, without the comments of {self._path}"
 

@@ -15,7 +15,8 @@ from jaxtyping import Bool, Float, Int, UInt8, UInt32
 
 from gloves.captures.capture import Capture
 from gloves.fit import GloveFit
-from gloves.takes.take import STATUSES, RigidBody, Take, label_names
+from gloves.takes.bodies import RigidBody
+from gloves.takes.take import STATUSES, Take, label_names
 from handsim.callbacks import Progress, no_progress
 from handsim.hand.model import HandModel
 from handsim.hand.shape import NUM_QPOS

@@ -31,7 +31,7 @@ from handsim import __version__
 from handsim.app.messages import tell_state, told_share
 from handsim.errors import WeightsError
 from handsim.files.inputs import checksum
-from handsim.files.outputs import atomic_write, save_json, written_together
+from handsim.files.outputs import atomic_write
 from handsim.hand.shape import SIDES
 from handsim.space.rig import CameraRig, load_rig
 from train.data.batches import Cloud, draw_batch
@@ -61,7 +61,7 @@ from train.simulation.training_frames import (
 
 NUM_POSES: Final = 40_000
 """Poses that describe a layout; fewer make a coarser pose prior."""
-WEIGHTS, CARD = "any_layout.safetensors", "any_layout.json"
+WEIGHTS: Final = "any_layout.safetensors"
 SHIPPED: Final = Path(__file__).parents[1] / "weights"
 _NETWORK, _PRIOR, _DISTANCES = "network.", "prior.", "distances"
 _CHUNK: Final = 500  # poses whose features are in memory at once
@@ -158,24 +158,6 @@ def shipped_network() -> LayoutNetwork:
             f"{SHIPPED / WEIGHTS} is missing or damaged; install handsim again ({error})"
         ) from error
     return network
-
-
-def save_layout_network(folder: Path, network: LayoutNetwork, num_clouds: int) -> None:
-    """Write the network in half precision, and its card."""
-    from safetensors.torch import save
-
-    tensors = {name: tensor.half().contiguous() for name, tensor in network.state_dict().items()}
-    card = {
-        "network": dataclasses.asdict(network.config),
-        "clouds": num_clouds,
-        "trained_on": "simulated poses in random layouts",
-        "handsim": __version__,
-        "license": "apache-2.0",
-    }
-    with written_together():
-        with atomic_write(folder / WEIGHTS) as temporary:
-            temporary.write_bytes(save(tensors))
-        save_json(folder / CARD, card)
 
 
 def sample_worn_markers(

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Int
 
 from gloves.layout import MarkerLayout, stored_layout
-from handsim.files.outputs import atomic_write
+from handsim.files.outputs import write_text
 from handsim.pages import NOTHING, Paint, Section, annotate, color_bar, picture, write_sections
 from train.evaluation import (
     BINS,
@@ -326,8 +326,7 @@ def write_model_card(out: Path, card: dict[str, Any]) -> Path:
     path = out / MODEL_CARD
     if path.is_file() and f"license: {UNKNOWN_LICENSE}" not in path.read_text("utf-8", "replace"):
         return path
-    with atomic_write(path) as temporary:
-        temporary.write_text(model_card(card), encoding="utf-8")
+    write_text(path, model_card(card))
     return path
 
 

@@ -1,7 +1,7 @@
 """The simulated capture room: its light sources, the cameras that see them, and the recorded take.
 
 How often cameras drop out and how many reflections flash is fitted to the four test captures of Han et al.
-2018: to Table 3 and to the ghost ratios of Table 4 (docs/room_numbers.md says what was fitted to what).
+2018: to Table 3 and to the ghost ratios of Table 4 (docs/room.md has the fitted numbers).
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ from typing import Annotated, Any, Final, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from gloves.captures.capture import GapCounts
 from gloves.optics.ghosts import StrayConfig, cameras_by_mirror, reflect, sample_strays
 from gloves.optics.reconstruction import (
     MARKER_RADIUS,
@@ -32,7 +31,8 @@ from gloves.optics.visibility import (
     free_rays,
     hand_tree,
 )
-from gloves.takes.take import RigidBody, Take
+from gloves.takes.bodies import RigidBody
+from gloves.takes.take import Take
 from handsim.hand.shape import PALM
 from handsim.settings import Limits, Settings
 from handsim.space.rig import CameraRig, check_outside
@@ -94,38 +94,28 @@ class OpticsOptions(Settings):
         return dataclasses.replace(optics, **given)
 
 
-@dataclass(frozen=True, slots=True)
-class TwinSettings:
-    """One of the paper's captures, and the settings that make its simulated twin like it."""
+class Twin(NamedTuple):
+    """The settings of a simulated capture that make it like one of the paper's."""
 
-    paper: GapCounts
-    """Table 3."""
-    ghost_ratio: float
-    """Ghosts over expected labels; Table 4."""
+    num_frames: int
+    """Frames of the paper's capture; its Table 3."""
     room: RoomConfig
     draw: int
     """Which of many random captures of this kind is the twin: the one nearest to the paper's figures."""
 
-
-def _twin(
-    paper: tuple[int, int, float, float],
-    ghost_ratio: float,
-    strays: float,
-    losses: tuple[float, float, float, int],
-    draw: int,
-) -> TwinSettings:
-    """A twin from its row of Table 3, and from four settings of losses."""
-    names = ("blob_loss", "dropout", "dropout_length", "dropout_cameras")
-    optics = OpticsConfig(min_rays_to_start=2, **dict(zip(names, losses, strict=True)))  # type: ignore[arg-type]
-    room = RoomConfig(optics=optics, strays=StrayConfig(number=strays))
-    return TwinSettings(GapCounts(*paper), ghost_ratio, room, draw)
+    @classmethod
+    def of(cls, num_frames: int, strays: float, losses: tuple[float, float, float, int], draw: int) -> Twin:
+        """A twin from the number of stray reflections and four settings of losses."""
+        names = ("blob_loss", "dropout", "dropout_length", "dropout_cameras")
+        optics = OpticsConfig(min_rays_to_start=2, **dict(zip(names, losses, strict=True)))  # type: ignore[arg-type]
+        return cls(num_frames, RoomConfig(optics=optics, strays=StrayConfig(number=strays)), draw)
 
 
-TWINS: Final[dict[str, TwinSettings]] = {
-    "single-hand": _twin((4785, 44, 2.11, 1.35), 0.0001, 0.0, (0.01, 0.016, 2.2, 6), draw=8),
-    "hand-hand": _twin((3312, 331, 4.01, 3.30), 0.1063, 7.0, (0.002, 0.35, 1.5, 4), draw=8),
-    "hand-pen": _twin((4511, 481, 3.39, 2.31), 0.0755, 3.0, (0.002, 0.17, 1.4, 6), draw=15),
-    "hand-controller": _twin((2645, 382, 2.65, 1.62), 0.0450, 1.7, (0.115, 0.0, 1.0, 1), draw=2),
+TWINS: Final[dict[str, Twin]] = {
+    "single-hand": Twin.of(4785, 0.0, (0.01, 0.016, 2.2, 6), draw=8),
+    "hand-hand": Twin.of(3312, 7.0, (0.002, 0.35, 1.5, 4), draw=8),
+    "hand-pen": Twin.of(4511, 3.0, (0.002, 0.17, 1.4, 6), draw=15),
+    "hand-controller": Twin.of(2645, 1.7, (0.115, 0.0, 1.0, 1), draw=2),
 }
 _SAME_ROOM: Final[dict[str, str]] = {"real-like": "hand-hand", "free": "single-hand"}
 

@@ -166,7 +166,7 @@ def _sample_scene(settings: SimulateSettings, layout: MarkerLayout, rng: np.rand
     if kind == "real-like":
         return sample_real_like_scene(layout, count or NUM_FRAMES, rng=rng)
     if kind in TWINS:
-        scene = sample_scene(cast("Kind", kind), layout, count or TWINS[kind].paper.frames, rng=rng)
+        scene = sample_scene(cast("Kind", kind), layout, count or TWINS[kind].num_frames, rng=rng)
         worn = tuple(hand for hand in scene.hands if hand.side in settings.hands)
         return dataclasses.replace(scene, hands=worn)
     made = CalibrationTakeConfig()

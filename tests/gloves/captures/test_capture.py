@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gloves import Capture, read_capture, write_capture
-from gloves.captures.capture import check_place, count_gaps, run_lengths, unit_fault
+from gloves.captures.capture import check_place, run_lengths, unit_fault
 from gloves.captures.coordinates import zeros_as_missing
 from gloves.captures.formats import READABLE, WRITABLE
 from handsim import HandSimWarning
@@ -121,22 +121,6 @@ def test_every_readable_format_refuses_noise(tmp_path: Path) -> None:
             path.write_bytes(rng.bytes(size))
             with pytest.raises(CaptureError, match=f"(?i)not a .*{suffix[1:]}|damaged"):
                 read_capture(path)
-
-
-def test_gaps_of_a_capture_made_by_hand() -> None:
-    present = np.ones((12, 3), dtype=bool)
-    present[2:4, 0] = False
-    present[3:6, 1] = False  # overlaps: one gap of frames 2 to 5
-    present[11, 2] = False
-    counts = count_gaps(present)
-    assert (counts.frames, counts.gaps) == (12, 2)
-    assert counts.average_length == (4 + 1) / 2
-    assert counts.average_missing == 6 / 5
-    assert sorted(run_lengths(~present)) == [1, 2, 3]
-    never = count_gaps(np.zeros((5, 2), dtype=bool))  # is one gap
-    assert (never.gaps, never.average_length, never.average_missing) == (1, 5.0, 2.0)
-    always = count_gaps(np.ones((5, 2), dtype=bool))
-    assert always.gaps == 0 and np.isnan([always.average_length, always.average_missing]).all()
 
 
 def test_gaps_that_begin_and_end_inside_are_measured():

@@ -17,8 +17,9 @@ from scipy.spatial.transform import Rotation
 from gloves import RigidBody, Take, attach, load_layout, load_take
 from gloves.fit import nominal_fit
 from gloves.takes.archives import SCHEMA
+from gloves.takes.motion_formats import MOTION_FORMATS
 from gloves.takes.points import FRAMES as COLUMNS_OF_FRAMES
-from gloves.takes.take import INITIALIZED, LOST, MOTION_FORMATS, STATUSES, SUFFIX, TRACKED, usual_rate
+from gloves.takes.take import INITIALIZED, LOST, STATUSES, SUFFIX, TRACKED, usual_rate
 from handsim import HandModel, join_qpos, sample_shape
 from handsim.errors import ArgumentError, CaptureError, HandSimWarning
 from handsim.hand.model import KEYPOINT_NAMES, hand_keypoints, is_steady

@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from gloves.takes.take import MOTION_FORMATS
+from gloves.takes.motion_formats import MOTION_FORMATS
 from handsim.cli.main import main
 
 if sys.platform == "win32":

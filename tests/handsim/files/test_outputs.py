@@ -18,7 +18,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gloves import load_layout
-from gloves.takes.take import MOTION_FORMATS
+from gloves.takes.motion_formats import MOTION_FORMATS
 from handsim.cli.main import main
 from handsim.errors import ArgumentError, DatasetError
 from handsim.files.inputs import load_json

@@ -5,9 +5,10 @@ import subprocess
 import numpy as np
 import pytest
 
+from handsim.space.transforms import frame_with_z
 from render import SkinLook
 from render.painting import opengl as gl
-from render.painting.opengl import frame_with_z, is_hardware
+from render.painting.opengl import is_hardware
 from render.scenery.lights import STUDIO, Lamp, Lighting
 from render.skin.texture import skin_texture
 from tests.programs import run_python

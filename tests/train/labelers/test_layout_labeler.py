@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from benchmarks.any_layout_training import save_layout_network
 from gloves import load_layout
 from handsim.errors import WeightsError
 from train import Corruption, evaluate_labeler
@@ -17,7 +18,6 @@ from train.labelers.layout_labeler import (
     is_learned,
     learned_labeler,
     sample_worn_markers,
-    save_layout_network,
     shipped_network,
 )
 from train.labelers.protocol import learned_folder, learned_gloves

@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.paper.labeling_tables import count_gaps
+from benchmarks.paper.printed import TABLE3
 from gloves import Take, load_layout, load_take
-from gloves.captures.capture import count_gaps
 from handsim import HandModel, load_rig
 from handsim.errors import ArgumentError, PoseError
 from handsim.space.objects import named_object
@@ -23,7 +24,6 @@ from tests.rigs import mixed_rig
 from tests.sentences import error_names
 from train import OpticsOptions, SimulateSettings, simulate_take
 from train.simulation import takes
-from train.simulation.room import TWINS
 from train.simulation.scenes import KINDS, RATE
 from train.simulation.takes import WRIST_VOLUME
 
@@ -192,7 +192,7 @@ def test_people_who_cannot_do_it_are_replaced_and_counted(monkeypatch):
 
 def test_the_whole_hand_controller_twin_is_near_table_3():
     take = whole()
-    paper = TWINS["hand-controller"].paper
+    paper = TABLE3["hand-controller"]
     observed = np.concatenate([take.observed(label) for label in take.hand_labels], axis=1)
     ours = count_gaps(np.isfinite(observed[..., 0]))
     assert ours.frames == paper.frames == 2645

@@ -1,6 +1,6 @@
 """Training of the network for any layout, with new random layouts in every batch.
 
-python -m train.labelers.layout_training FOLDER [--steps N]
+python -m benchmarks.any_layout_training FOLDER [--steps N]
 
 A layout is a choice among many places on the skin, whose positions in many poses of many people are sampled
 once. The run writes `any_layout.safetensors` and its card `any_layout.json` into the folder, and continues
@@ -9,7 +9,6 @@ from the checkpoint there. The figures of the shipped weights are in train/weigh
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import io
 import time
@@ -21,26 +20,21 @@ import numpy as np
 import torch
 from jaxtyping import Float, Float16, Int
 
-from gloves.fit import attach_markers, wear
+from benchmarks.record import run
+from gloves.fit import wear
 from gloves.layout import MOST_MARKERS, MarkerLayout, MarkerPlace
+from handsim import __version__
 from handsim.errors import LayoutError
-from handsim.files.outputs import atomic_write
-from handsim.hand.model import HandModel
+from handsim.files.outputs import atomic_write, save_json, written_together
 from handsim.hand.shape import BONE_NAMES, PALM, SIDES
 from handsim.space.transforms import MIRROR
+from track.glove_improvement import sample_places
 from train.data.batches import Cloud, Corruption, corrupt, stretched
-from train.labelers.layout_labeler import layout_step, new_optimizer, save_layout_network
+from train.labelers.layout_labeler import WEIGHTS, layout_step, new_optimizer
 from train.labelers.networks import LayoutNetwork, LayoutNetworkConfig, distance_features
 from train.labelers.protocol import torch_threads
 from train.simulation.training_frames import GenerateSettings, sample_frame_scene, sample_hands
 
-_MAX_MISSED: Final = 500  # draws in a row without a free place
-_MIN_DISTANCE: Final = 0.0025  # between two places of a bank [m]
-_PALM_SHARE: Final = 5.0  # places on the palm for each one on a finger's bone
-_PALM_ALONG, _PALM_ACROSS = (-0.1, 0.95), 0.36  # places along and across the palm [bone lengths]
-_FINGER_ALONG, _TIP_ALONG = (0.1, 1.05), (0.1, 0.9)  # places along a finger's bone and its last bone
-_AROUND: Final = 35.0  # standard deviation of the angle about a finger's bone [deg]
-_MAX_AROUND: Final = 100.0  # greatest such angle [deg]
 _RADIUS: Final = 0.0032  # of the markers [m]
 _POSES_PER_PERSON: Final = 64
 
@@ -75,38 +69,6 @@ def sample_skin_bank(num_places: int, num_people: int, *, rng: np.random.Generat
         if positions is not None:
             parts.append(positions)
     return SkinBank(places, np.concatenate(parts))
-
-
-def sample_places(
-    num_places: int, *, rng: np.random.Generator, apart: float = _MIN_DISTANCE
-) -> tuple[MarkerPlace, ...]:
-    """Random places on the back and the sides of the flat hand; fewer if no more fit."""
-    model = HandModel.named("M")
-    share = np.where(np.arange(len(BONE_NAMES)) == PALM, _PALM_SHARE, 1.0)
-    places: list[MarkerPlace] = []
-    points: list[Float[np.ndarray, "3"]] = []
-    missed = 0
-    while len(places) < num_places and missed < _MAX_MISSED:
-        bone = int(rng.choice(len(BONE_NAMES), p=share / share.sum()))
-        name = BONE_NAMES[bone]
-        if bone == PALM:
-            along, around = rng.uniform(*_PALM_ALONG), 0.0
-            across = rng.uniform(-_PALM_ACROSS, _PALM_ACROSS)
-        else:
-            along = rng.uniform(*(_TIP_ALONG if name.endswith("distal") else _FINGER_ALONG))
-            around, across = np.clip(_AROUND * rng.standard_normal(), -_MAX_AROUND, _MAX_AROUND), 0.0
-        place = MarkerPlace(f"place{len(places)}", name, along, float(np.deg2rad(around)), across)
-        copies = tuple(dataclasses.replace(place, name=str(number)) for number in range(5))
-        missed += 1
-        try:
-            point = np.asarray(attach_markers(MarkerLayout("place", copies, _RADIUS), model).points[0])
-        except LayoutError:
-            continue  # the place is off the skin
-        if all(np.linalg.norm(point - other) > apart for other in points):
-            places.append(place)
-            points.append(point)
-            missed = 0
-    return tuple(places)
 
 
 def _positions(gloves: list[MarkerLayout], rng: np.random.Generator) -> Float16[np.ndarray, "T C 3"] | None:
@@ -237,30 +199,44 @@ class LayoutTraining:
             self.done = int(content["done"])
 
 
-def main() -> None:
-    """Train until the last step."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("out", type=Path)
-    parser.add_argument("--steps", type=int, default=9000, help=f"of {_LAYOUTS * _CLOUDS} clouds")
-    options = parser.parse_args()
-    options.out.mkdir(parents=True, exist_ok=True)
-    training, checkpoint = LayoutTraining(options.steps), options.out / "checkpoint.pt"
+def save_layout_network(folder: Path, network: LayoutNetwork, num_clouds: int) -> None:
+    """Write the network in half precision, and its card."""
+    from safetensors.torch import save
+
+    tensors = {name: tensor.half().contiguous() for name, tensor in network.state_dict().items()}
+    card = {
+        "network": dataclasses.asdict(network.config),
+        "clouds": num_clouds,
+        "trained_on": "simulated poses in random layouts",
+        "handsim": __version__,
+        "license": "apache-2.0",
+    }
+    with written_together():
+        with atomic_write(folder / WEIGHTS) as temporary:
+            temporary.write_bytes(save(tensors))
+        save_json(folder / "any_layout.json", card)
+
+
+def main(out: Path, steps: int = 9000) -> None:
+    """Train until the last step, and write the network into a folder."""
+    out.mkdir(parents=True, exist_ok=True)
+    training, checkpoint = LayoutTraining(steps), out / "checkpoint.pt"
     training.restore(checkpoint)
     bank = sample_skin_bank(PLACES, PEOPLE, rng=np.random.default_rng(11))
     batches = LayoutBatches(bank, np.random.default_rng([11, training.done]))
     figures, began = [], time.monotonic()
     with torch_threads(1):
-        while training.done < options.steps:
+        while training.done < steps:
             figures.append(training.step(*batches.draw()))
             if training.done % _TOLD_EVERY == 0:
                 loss, right = np.mean(figures, axis=0)
                 print(f"{training.done}: loss {loss:.3f}, {100.0 * right:.2f} % right, "
                       f"{time.monotonic() - began:.0f} s", flush=True)  # fmt: skip
                 figures = []
-            if training.done % _SAVED_EVERY == 0 or training.done == options.steps:
+            if training.done % _SAVED_EVERY == 0 or training.done == steps:
                 training.save(checkpoint)
-    save_layout_network(options.out, training.network, training.steps * _LAYOUTS * _CLOUDS)
+    save_layout_network(out, training.network, steps * _LAYOUTS * _CLOUDS)
 
 
 if __name__ == "__main__":
-    main()
+    run(main, __doc__)

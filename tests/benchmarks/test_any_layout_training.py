@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from train.labelers.layout_training import LayoutBatches, LayoutTraining, sample_places, sample_skin_bank
+from benchmarks.any_layout_training import LayoutBatches, LayoutTraining, sample_skin_bank
 from train.labelers.networks import LayoutNetworkConfig
 
 
@@ -34,16 +34,6 @@ def test_mean_distances_are_those_of_the_positions(bank):
     positions = bank.positions.astype(np.float64)
     expected = np.linalg.norm(positions[:, 4] - positions[:, 9], axis=1).mean()
     assert bank.mean_distances(10_000)[4, 9] == pytest.approx(expected, abs=1e-5)
-
-
-def test_the_palm_has_more_places_than_a_finger(rng):
-    bones = [place.bone for place in sample_places(150, rng=rng)]
-    assert bones.count("palm") > 2 * bones.count("index_middle")
-
-
-def test_places_that_do_not_fit_are_left_out() -> None:
-    places = sample_places(60, rng=np.random.default_rng(0), apart=0.03)
-    assert 5 <= len(places) < 60
 
 
 SMALL = LayoutNetworkConfig(width=32, gates=8, first_rounds=1, match_rounds=1)

@@ -1,0 +1,90 @@
+"""The rigid bodies of takes: markers of their own and perhaps a surface, and their form in files."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
+
+from gloves.takes.archives import names_of
+from gloves.takes.points import BODY_MARKERS
+from handsim.errors import ArgumentError
+from handsim.space.objects import Part, RigidObject, named_object, object_names
+
+_VERTICES: Final = "body_vertices_{}"
+_FACES: Final = "body_faces_{}"  # arrays of the surface of a body, by its number
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RigidBody:
+    """A rigid body with markers of its own.
+
+    Raises:
+        ArgumentError: A name is no text, or there is not one position per marker.
+    """
+
+    name: str
+    marker_names: tuple[str, ...]
+    positions: Float[np.ndarray, "Q 3"]
+    """Its markers in its own frame [m]."""
+    surface: RigidObject | None = None
+    """Its surface, if it is no object that comes with handsim."""
+
+    @classmethod
+    def of(cls, thing: RigidObject) -> RigidBody:
+        """The body of an object."""
+        shipped = thing.name in object_names() and thing is named_object(thing.name)
+        return cls(thing.name, thing.marker_names, thing.markers, None if shipped else thing)
+
+    def __post_init__(self) -> None:
+        if self.positions.shape != (len(self.marker_names), 3):
+            expected = f"({len(self.marker_names)}, 3)"
+            raise ArgumentError(
+                f"{self.name}: positions has shape {self.positions.shape}, expected {expected}"
+            )
+        if not all(isinstance(name, str) for name in (self.name, *self.marker_names)):
+            raise ArgumentError(f"{self.name!r}: a name is no text, expected text for body and markers")
+
+    @property
+    def shape(self) -> RigidObject | None:
+        """Its own surface, or that of the object of this name that comes with handsim, or None."""
+        if self.surface is not None:
+            return self.surface
+        return named_object(self.name) if self.name in object_names() else None
+
+    def record(self) -> dict[str, Any]:
+        """The body in the header of a take's file, without its arrays."""
+        named = {"name": self.name, "marker_names": list(self.marker_names)}
+        return named if self.surface is None else named | {"surface": True}
+
+
+def body_arrays(bodies: Sequence[RigidBody]) -> dict[str, NDArray[Any]]:
+    """The arrays of bodies in a take's file: the markers of all, and surfaces."""
+    markers = [np.zeros((0, 3)), *(body.positions for body in bodies)]
+    arrays: dict[str, NDArray[Any]] = {BODY_MARKERS.name: np.concatenate(markers)}
+    for number, body in enumerate(bodies):
+        if body.surface is not None:
+            arrays[_VERTICES.format(number)] = body.surface.vertices
+            arrays[_FACES.format(number)] = body.surface.faces.astype(np.int64)
+    return arrays
+
+
+def stored_body(
+    number: int, stored: Mapping[str, Any], markers: range, arrays: Mapping[str, NDArray[Any]]
+) -> RigidBody:
+    """A body of a file by its record; `RigidObject` checks the arrays of its surface."""
+    name, marker_names = stored["name"], names_of(stored["marker_names"])
+    positions = arrays[BODY_MARKERS.name][markers.start : markers.stop]
+    if not stored.get("surface", False):
+        return RigidBody(name, marker_names, positions)
+    vertices, faces = (arrays[key.format(number)] for key in (_VERTICES, _FACES))
+    hull = Part("mesh", np.zeros(3), np.eye(4), vertices)
+    upright = np.tile([0.0, 0.0, 1.0], (len(positions), 1))  # a file has no normals under markers
+    thing = RigidObject(
+        name, vertices, faces, (hull,), marker_names, positions, upright, 0.1, np.empty((0, 7))
+    )
+    return RigidBody(name, marker_names, positions, thing)

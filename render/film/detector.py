@@ -1,0 +1,282 @@
+"""`HandDetector`: the hands in a picture, gloved or bare, with boxes, sides and 21 keypoints.
+
+A finder looks at the whole picture and tells centers, sizes and sides; a second network looks at each hand
+twice: upright, then turned so that its fingers point up. Both learned from drawn pictures alone (`render.film.training`). OpenCV
+runs them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, NamedTuple, cast
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+from numpy.typing import ArrayLike, NDArray
+
+from handsim._checks import check_choice, check_type
+from handsim.errors import ArgumentError, WeightsError
+from handsim.files.inputs import read_bytes
+from handsim.hand.shape import NUM_KEYPOINTS, SIDES, Side
+
+WEIGHTS: Final = Path(__file__).parent / "weights"
+FINDER, KEYPOINTS = "finder.onnx", "keypoints.onnx"  # files in a folder of weights
+FINDER_SIZE: Final = 256  # of the square that the finder sees [px]
+CELL: Final = 8  # of the finder's map [px]
+CROP_SIZE: Final = 128  # of the square that the keypoint network sees [px]
+HEAT_SIZE: Final = 16  # cells of a keypoint's map, each way
+NEAR: Final = 0.2  # reach of the heat around its peak that a keypoint is the mean of [share of the side]
+ROOM: Final = 1.55  # side of the square that is cut out around a hand, over the hand's longer side
+_WRIST, _KNUCKLE = 0, 9  # keypoints: the wrist, and where the middle finger begins
+_MOST_BYTES: Final = 1 << 26  # of a file of weights
+_MOST_FOUND: Final = 8  # places in a picture at which hands are looked for
+_LEAST_HEAT: Final = 0.2  # of a place at which a hand is looked for
+_LEAST_CONFIDENCE: Final = 0.5
+_SAME: Final = 0.25  # mean distance of the keypoints of one hand that was found twice [longer side]
+
+Doubles = NDArray[np.float64]
+Floats = NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FoundHand:
+    """One hand in a picture."""
+
+    side: Side
+    box: Float[np.ndarray, "4"]
+    """Left, top, width, height [px] of the box around its keypoints."""
+    confidence: float
+    """How sure it is that this is a hand, from 0 to 1."""
+    keypoints: Float[np.ndarray, "21 2"]
+    """[px] from the picture's corner, as in `RenderedFrame`."""
+    scores: Float[np.ndarray, "21"]
+    """How sure each keypoint is, from 0 to 1."""
+
+
+class _Look(NamedTuple):
+    """What the keypoint network tells of one square."""
+
+    keypoints: Doubles  # (21, 2) [px] of the picture
+    scores: Doubles  # (21,)
+    presence: float  # probability of a hand
+    right: float  # log-odds of a right hand
+
+
+class HandDetector:
+    """Finds hands in pictures, on one core.
+
+    Args:
+        finder: ONNX model that `render.film.training` writes: where hands are in a picture.
+        keypoints: The other one: where 21 keypoints are in a hand's square.
+    """
+
+    def __init__(self, finder: bytes, keypoints: bytes) -> None:
+        self._finder, self._keypoints = _network(finder), _network(keypoints)
+        cells = FINDER_SIZE // CELL
+        found = _run(self._finder, np.zeros((3, FINDER_SIZE, FINDER_SIZE), np.float32), ("cells",))
+        told = _run(self._keypoints, np.zeros((3, CROP_SIZE, CROP_SIZE), np.float32), ("heat", "logits"))
+        shapes = [array.shape for array in (*found, *told)]
+        if shapes != [(1, 5, cells, cells), (1, NUM_KEYPOINTS, HEAT_SIZE, HEAT_SIZE), (1, 2)]:
+            raise ValueError(f"outputs have the shapes {shapes}")
+
+    @classmethod
+    def load(cls, path: str | Path | None = None) -> HandDetector:
+        """The detector of a folder that `train_detector` wrote; the shipped one when not given.
+
+        Raises:
+            WeightsError: A file is missing, larger than 64 MiB, or not one of a detector.
+        """
+        folder = WEIGHTS if path is None else Path(path)
+        contents = [
+            read_bytes(folder / name, error=WeightsError, most=_MOST_BYTES) for name in (FINDER, KEYPOINTS)
+        ]
+        try:
+            return cls(*contents)
+        except Exception as error:  # OpenCV's errors of damaged files have no class of their own
+            raise WeightsError(
+                f"{folder}: {FINDER} and {KEYPOINTS} are damaged or not a hand detector's, expected what "
+                "render.train_detector wrote"
+            ) from error
+
+    def detect(self, image: UInt8[np.ndarray, "H W 3"]) -> list[FoundHand]:
+        """All hands in an sRGB picture, the surest first.
+
+        Raises:
+            ArgumentError: The picture is no array of bytes with three channels.
+        """
+        picture = _checked(image)
+        hands: list[FoundHand] = []
+        for center, size, sides in self._places(picture):
+            first = self._look(picture, upright(center, size * ROOM))
+            hand = self._second_look(picture, first, prior=sides)
+            if hand.confidence >= _LEAST_CONFIDENCE:
+                hands.append(hand)
+        hands.sort(key=lambda hand: -hand.confidence)
+        kept: list[FoundHand] = []
+        for hand in hands:
+            if not any(_are_same(hand, other) for other in kept):
+                kept.append(hand)
+        return kept
+
+    def refine(
+        self, image: UInt8[np.ndarray, "H W 3"], boxes: ArrayLike, sides: Sequence[Side]
+    ) -> list[FoundHand]:
+        """The hands in known boxes, one each in their order, without a search of the picture.
+
+        Args:
+            image: sRGB picture.
+            boxes: Left, top, width, height (N, 4) of the box around each hand's keypoints [px].
+            sides: Side of each hand, which is believed.
+
+        Returns:
+            A hand for each box; its `confidence` tells whether there is one.
+
+        Raises:
+            ArgumentError: An argument has another shape, or a box no size.
+        """
+        picture, places = _checked(image), np.asarray(boxes, dtype=np.float64).reshape(-1, 4)
+        if len(places) != len(sides):
+            raise ArgumentError(
+                f"there are {len(places)} boxes and {len(sides)} sides, expected one for each"
+            )
+        if not (np.isfinite(places).all() and (places[:, 2:] > 0.0).all()):
+            raise ArgumentError("a box is not finite or has no size, expected left, top, width, height [px]")
+        found = []
+        for box, side in zip(places, sides, strict=True):
+            check_choice(side, SIDES, noun="side")
+            first = self._look(picture, upright(box[:2] + 0.5 * box[2:], ROOM * box[2:].max()))
+            found.append(self._second_look(picture, first, side=side))
+        return found
+
+    def _places(self, picture: NDArray[np.uint8]) -> list[tuple[Doubles, float, float]]:
+        """Center (2,) [px], longer side [px] and log-odds of a right hand of places that look like hands."""
+        scale = FINDER_SIZE / max(picture.shape[:2])
+        matrix = np.array([[scale, 0.0, 0.0], [0.0, scale, 0.0]])
+        seen = np.round(scale * np.array(picture.shape[:2])).astype(int)
+        square = np.zeros((3, FINDER_SIZE, FINDER_SIZE), np.float32)
+        square[:, : seen[0], : seen[1]] = normalized(cut(picture, matrix, (int(seen[1]), int(seen[0]))))
+        (cells,) = _run(self._finder, square, ("cells",))
+        heat = _share(cells[0, 0])
+        peaks = (heat >= cv2.dilate(heat, np.ones((3, 3), np.uint8))) & (heat > _LEAST_HEAT)
+        rows, columns = np.nonzero(peaks)
+        order = np.argsort(-heat[rows, columns])[:_MOST_FOUND]
+        places = []
+        for row, column in zip(rows[order], columns[order], strict=True):
+            right, *aside, size = cells[0, 1:, row, column].astype(np.float64)
+            center = CELL * (np.array([column, row]) + 0.5 + aside) / scale
+            places.append((center, CELL * float(np.exp(size)) / scale, float(right)))
+        return places
+
+    def _look(self, picture: NDArray[np.uint8], matrix: Doubles) -> _Look:
+        """Keypoints in the square that a matrix (2, 3) cuts out of the picture."""
+        square = cut(picture, matrix, (CROP_SIZE, CROP_SIZE))
+        heat, logits = _run(self._keypoints, normalized(square), ("heat", "logits"))
+        keypoints, scores = peaks_of(heat[0])
+        turn = np.linalg.inv(matrix[:, :2])
+        presence, right = (float(value) for value in logits[0])
+        return _Look((CROP_SIZE * keypoints - matrix[:, 2]) @ turn.T, scores, float(_share(presence)), right)
+
+    def _second_look(
+        self, picture: NDArray[np.uint8], first: _Look, side: Side | None = None, prior: float = 0.0
+    ) -> FoundHand:
+        """The hand, after a look at where the first look saw it, with its fingers up."""
+        look = self._look(picture, turned(first.keypoints))
+        if side is None:
+            side = "right" if prior + first.right + look.right > 0.0 else "left"
+        low, high = look.keypoints.min(axis=0), look.keypoints.max(axis=0)
+        box = np.concatenate([low, high - low])
+        return FoundHand(side, box, look.presence, look.keypoints, look.presence * look.scores)
+
+
+def upright(center: Doubles, side: float, size: int = CROP_SIZE) -> Doubles:
+    """Matrix (2, 3) from a picture to the square of `size` pixels around a center, both [px] from corners."""
+    scale = size / side
+    return np.array(
+        [[scale, 0.0, 0.5 * size - scale * center[0]], [0.0, scale, 0.5 * size - scale * center[1]]]
+    )
+
+
+def turned(keypoints: Doubles, room: float = ROOM, size: int = CROP_SIZE) -> Doubles:
+    """Matrix (2, 3) from a picture to a square around a hand, turned so that its fingers point up."""
+    x, y = keypoints[_KNUCKLE] - keypoints[_WRIST]
+    length = float(np.hypot(x, y))
+    turn = np.array([[-y, x], [-x, -y]]) / length if length > 0.0 else np.eye(2)
+    moved = keypoints @ turn.T
+    low, high = moved.min(axis=0), moved.max(axis=0)
+    matrix = upright(0.5 * (low + high), room * max(float((high - low).max()), 1.0), size)
+    matrix[:, :2] = matrix[:, :2] @ turn
+    return matrix
+
+
+def cut(picture: NDArray[np.uint8], matrix: Doubles, size: tuple[int, int]) -> NDArray[np.uint8]:
+    """What a matrix (2, 3) moves into a picture of a width and height; the border is repeated outside."""
+    turn, shift = matrix[:, :2], matrix[:, 2].copy()
+    corners = (np.array([[0, 0], [size[0], 0], [0, size[1]], size]) - shift) @ np.linalg.inv(turn).T
+    limit = np.array(picture.shape[1::-1])
+    low = np.clip(np.floor(corners.min(axis=0)) - 2, 0, limit - 1).astype(int)
+    high = np.clip(np.ceil(corners.max(axis=0)) + 2, low + 1, limit).astype(int)
+    part, shift = np.ascontiguousarray(picture[low[1] : high[1], low[0] : high[0]]), shift + turn @ low
+    shrink = np.array([1.0, 1.0])
+    if (scale := float(np.sqrt(abs(np.linalg.det(turn))))) < 0.5:  # fine detail would become noise
+        small = np.maximum(np.round((high - low) * scale * 1.5), 1).astype(int)
+        shrink = (high - low) / small
+        part = cv2.resize(part, (int(small[0]), int(small[1])), interpolation=cv2.INTER_AREA)
+    turn = turn * shrink
+    moved = np.column_stack([turn, shift + turn @ [0.5, 0.5] - 0.5])  # OpenCV counts from pixels' centers
+    return np.asarray(cv2.warpAffine(part, moved, size, borderMode=cv2.BORDER_REPLICATE))
+
+
+def normalized(picture: NDArray[np.uint8]) -> Floats:
+    """A picture (H, W, 3) as the networks see it: (3, H, W), of mean 0 and deviation 1."""
+    values = np.ascontiguousarray(picture.transpose(2, 0, 1), dtype=np.float32)
+    return np.asarray((values - values.mean()) / (values.std() + 1.0))
+
+
+def peaks_of(heat: Floats) -> tuple[Doubles, Doubles]:
+    """Keypoints (..., 2) as shares of the side, and shares of the heat near them, of maps (..., S, S).
+
+    A map that is torn between two fingers has its mean between them; the higher peak is one of them.
+    """
+    at = (np.arange(HEAT_SIZE) + 0.5) / HEAT_SIZE
+    places = np.stack(np.meshgrid(at, at, indexing="xy"), axis=-1).reshape(-1, 2)
+    flat = heat.reshape(*heat.shape[:-2], -1).astype(np.float64)
+    share = np.exp(flat - flat.max(axis=-1, keepdims=True))
+    share /= share.sum(axis=-1, keepdims=True)
+    away = np.linalg.norm(places - places[flat.argmax(axis=-1)][..., None, :], axis=-1)
+    near = np.where(away > NEAR, 0.0, share)
+    scores = near.sum(axis=-1)
+    return near @ places / scores[..., None], scores
+
+
+def _share(log_odds: ArrayLike) -> Doubles:
+    """Probabilities of log-odds."""
+    return np.asarray(1.0 / (1.0 + np.exp(-np.clip(log_odds, -50.0, 50.0))))
+
+
+def _checked(image: object) -> NDArray[np.uint8]:
+    check_type("image", image, np.ndarray, "a picture (H, W, 3) of bytes")
+    picture = cast("NDArray[np.uint8]", image)
+    if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] != 3 or not picture.size:
+        raise ArgumentError(
+            f"image is {picture.dtype} of shape {picture.shape}, expected uint8 of shape (H, W, 3), sRGB"
+        )
+    return picture
+
+
+def _are_same(hand: FoundHand, other: FoundHand) -> bool:
+    """Whether one hand was found twice."""
+    away = float(np.linalg.norm(hand.keypoints - other.keypoints, axis=1).mean())
+    return away < _SAME * float(max(hand.box[2:].max(), other.box[2:].max()))
+
+
+def _network(content: bytes) -> Any:
+    return cv2.dnn.readNetFromONNX(np.frombuffer(content, dtype=np.uint8))
+
+
+def _run(network: Any, picture: Floats, outputs: Sequence[str]) -> list[Floats]:
+    """Outputs of a network for one picture (3, H, W)."""
+    network.setInput(picture[None])
+    return [np.asarray(array) for array in network.forward(outputs)]

@@ -1,0 +1,98 @@
+"""The two networks of the hand detector: where hands are in a picture, and where keypoints are in a hand."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import torch
+from torch import nn
+from torch.nn import functional
+
+from handsim.hand.shape import NUM_KEYPOINTS
+from render.film.detector import HEAT_SIZE
+
+SPREAD: Final = 0.06  # of the heat around a keypoint [share of the side]
+BF16: Final = any(torch.cpu.get_capabilities().get(name) for name in ("amx_bf16", "avx512_bf16"))
+
+
+def convolution(inside: int, outside: int, stride: int = 1) -> list[nn.Module]:
+    """A convolution, its normalization and its ReLU."""
+    return [nn.Conv2d(inside, outside, 3, stride, 1, bias=False), nn.BatchNorm2d(outside), nn.ReLU()]
+
+
+class Residual(nn.Module):
+    """Two convolutions beside the way past them (He et al. 2016)."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.layers = nn.Sequential(
+            *convolution(width, width), nn.Conv2d(width, width, 3, 1, 1, bias=False), nn.BatchNorm2d(width)
+        )
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """Features in, features out."""
+        return functional.relu(x + self.layers(x))
+
+
+class Backbone(nn.Module):
+    """Features at an eighth of the picture's size, seen with those at a sixteenth and a thirty-second."""
+
+    def __init__(self, widths: tuple[int, int, int, int]) -> None:
+        super().__init__()
+        a, b, c, d = widths
+        self.fine = nn.Sequential(
+            *(nn.Conv2d(3, a, 8, 4, 2, bias=False), nn.BatchNorm2d(a), nn.ReLU(), Residual(a)),
+            *(*convolution(a, b, 2), Residual(b), Residual(b)),
+        )
+        self.coarse = nn.Sequential(
+            *(*convolution(b, c, 2), Residual(c), Residual(c)),
+            *(*convolution(c, d, 2), Residual(d), Residual(d)),
+        )
+        self.narrow = nn.Conv2d(d, b, 1)
+
+    def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Features of each cell, and the coarsest ones."""
+        fine = self.fine(x)
+        coarse = self.coarse(fine)
+        wide = functional.interpolate(self.narrow(coarse), scale_factor=4.0, mode="bilinear")
+        return torch.cat([fine, wide], dim=1), coarse
+
+
+class FinderNetwork(nn.Module):
+    """Cells (B, 5, S/8, S/8) of pictures (B, 3, S, S).
+
+    Log-odds of a hand's center in the cell and of a right hand, the center from the cell's middle [cells],
+    and the logarithm of the hand's longer side [cells].
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.backbone = Backbone((16, 32, 48, 64))
+        last = nn.Conv2d(48, 5, 1)
+        self.head = nn.Sequential(*convolution(64, 48), last)
+        assert last.bias is not None
+        nn.init.constant_(last.bias[:1], -4.0)  # most cells have no hand
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """Pictures in, cells out."""
+        return torch.as_tensor(self.head(self.backbone(x)[0]))
+
+
+class KeypointNetwork(nn.Module):
+    """Maps of keypoints (B, 21, 16, 16), and log-odds of a hand and of a right one (B, 2)."""
+
+    def __init__(self, widths: tuple[int, int, int, int] = (32, 64, 112, 144)) -> None:
+        super().__init__()
+        _, b, _, d = widths
+        self.backbone = Backbone(widths)
+        self.head = nn.Sequential(*convolution(2 * b, 96), Residual(96), nn.Conv2d(96, NUM_KEYPOINTS, 1))
+        self.told = nn.Linear(d, 2)
+        at = (torch.arange(HEAT_SIZE) + 0.5) / HEAT_SIZE
+        places = torch.stack(torch.meshgrid(at, at, indexing="xy"), dim=-1).reshape(-1, 2)
+        self.places: torch.Tensor
+        self.register_buffer("places", places, persistent=False)
+
+    def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Squares in, maps and log-odds out."""
+        features, coarse = self.backbone(x)
+        return self.head(features), self.told(coarse.mean((2, 3)))
