@@ -34,7 +34,9 @@ def displace_markers(
     steps -= (steps * worn.normals).sum(axis=1, keepdims=True) * worn.normals
     steps *= distance / np.linalg.norm(steps, axis=1, keepdims=True)
     coordinates = project_onto_skin(
-        nearest_coordinates(worn.points, shape), worn.points + steps, build_skin(shape)
+        nearest_coordinates(worn.points, worn.feet, worn.main_bones, shape),
+        worn.points + steps,
+        build_skin(shape),
     )
     heights = worn.layout.heights + rng.normal(scale=lift, size=len(steps))
     return attachment_at(worn.layout, coordinates._replace(heights=heights), shape)

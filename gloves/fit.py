@@ -17,7 +17,7 @@ from gloves.layout import ACROSS_RANGE, ALONG_RANGE, MarkerLayout, MarkerPlace, 
 from gloves.optics.visibility import visible_cameras
 from handsim.errors import ArgumentError, LayoutError
 from handsim.hand.model import HandModel, Site, load_model
-from handsim.hand.shape import BONE_NAMES, BONES, NUM_BONES, NUM_QPOS, PALM, HandShape, Side
+from handsim.hand.shape import BONE_NAMES, DIGIT_OF_BONE, NUM_BONES, NUM_QPOS, PALM, HandShape, Side
 from handsim.hand.skin import vertex_normals
 from handsim.kernels import kernel
 from handsim.space.rig import CameraRig
@@ -27,7 +27,6 @@ _WIDTHS: Final = {"points": 3, "normals": 3, "bone_indices": 4, "bone_weights": 
 _MAX_NUMBER: Final = 100.0  # of positions [m], directions and indices of bones
 _SUM_TOLERANCE: Final = 1e-6
 _NORMAL_TOLERANCE: Final = 1e-3  # of the unit length
-_DIGIT_OF_BONE: Final = np.array([bone.digit for bone in BONES])
 # The digits of the palm's capsules: the fingers' metacarpals, and the wrist for the thumb.
 _PALM_DIGITS: Final = np.array([1, 2, 3, 4, 0, 0])
 # From the wanted place of a marker (1) back to where it was designed (0), and to the middle of its bone (-1).
@@ -80,6 +79,11 @@ class Attachment:
     def main_bones(self) -> Int[np.ndarray, "M"]:
         """The bone that carries most of each marker."""
         return np.asarray(self.bone_indices[np.arange(len(self.points)), self.bone_weights.argmax(axis=1)])
+
+    @property
+    def feet(self) -> Float[np.ndarray, "M 3"]:
+        """The places on the skin under the markers at zero angles, in the wrist frame [m]."""
+        return np.asarray(self.points - self.layout.heights[:, None] * self.normals)
 
     def centers(
         self, model: HandModel, T_world_bone: Float[np.ndarray, "T L 4 4"]
@@ -192,7 +196,7 @@ def _other_digits(
     carriers: NDArray[np.int64],
     model: HandModel,
 ) -> list[str]:
-    """For each marker the nearest bone of the flat hand if it is of another digit, "" otherwise.
+    """For each marker the bone of another digit that carries it or is nearest on the flat hand, "" for none.
 
     A finger's metacarpal counts as the finger's for its own markers, and as the palm's for the palm's; a
     thumb's marker may lie over the index finger's metacarpal and the wrist. What the palm carries more than
@@ -207,20 +211,21 @@ def _other_digits(
     """
     capsules = model.capsules
     axes = capsules.posed(model.rest_transforms[None])[0]
-    digits = _DIGIT_OF_BONE[bones][:, None]
-    own = _DIGIT_OF_BONE[capsules.bones] == digits
+    digits = DIGIT_OF_BONE[bones][:, None]
+    own = DIGIT_OF_BONE[capsules.bones] == digits
     own[:, capsules.bones == PALM] |= (digits == _PALM_DIGITS) | ((digits == 0) & (_PALM_DIGITS == 1))
     distances = _axis_distances(feet, axes)
     nearest = np.where(own, distances, np.inf).min(axis=1)
     rival = np.where(own, np.inf, distances)
     slack = np.where((digits[:, 0] < 0) & (carriers == PALM), np.inf, 0.0)
     inside = np.where(own, np.inf, _axis_distances(points, axes) - capsules.radii)
-    return [
-        BONE_NAMES[capsules.bones[depths.argmin() if depths.min() < 0.0 else others.argmin()]]
-        if others.min() + allowed < own_distance or depths.min() < 0.0
-        else ""
-        for others, own_distance, allowed, depths in zip(rival, nearest, slack, inside, strict=True)
-    ]
+    carried = DIGIT_OF_BONE[carriers]
+    is_carried = (digits[:, 0] >= 0) & (carried >= 0) & (carried != digits[:, 0])
+    is_buried, is_nearer = inside.min(axis=1) < 0.0, rival.min(axis=1) + slack < nearest
+    others = capsules.bones[np.where(is_buried, inside.argmin(axis=1), rival.argmin(axis=1))]
+    others = np.where(is_carried, carriers, others)
+    is_astray = is_carried | is_buried | is_nearer
+    return [BONE_NAMES[other] if wrong else "" for other, wrong in zip(others, is_astray, strict=True)]
 
 
 def _axis_distances(points: NDArray[np.float64], axes: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -16,6 +16,7 @@ from handsim.files.outputs import atomic_write
 from handsim.hand.model import HandModel, build_spec, join_qpos
 from handsim.hand.model_files import hand_osim, hand_urdf
 from handsim.hand.shape import NUM_JOINTS
+from handsim.space.transforms import UpAxis
 
 ENDINGS: Final = (".xml", ".urdf", ".osim", ".glb")
 WITH_MARKERS: Final = (".xml", ".osim")
@@ -30,6 +31,7 @@ def write_hand(
     *,
     actuators: bool = False,
     start: Float[np.ndarray, "27"] | None = None,
+    up: UpAxis = "z",
 ) -> None:
     """Write a hand in the flat pose; meters, radians, kilograms.
 
@@ -39,6 +41,7 @@ def write_hand(
         hand: The hand; markers of its glove become sites of the .xml and markers of the .osim.
         actuators: Position servos in the .xml, whose controls are angles within the joints' ranges.
         start: Pose that the .osim begins in [m, rad]; flat when not given.
+        up: The axis of that pose's world that points up.
 
     Raises:
         ArgumentError: The name ends otherwise, or servos are asked for in a file that has none.
@@ -63,7 +66,7 @@ def write_hand(
             return
         sites = hand.attachment.sites(model) if isinstance(hand, GloveFit) else ()
         if suffix == ".osim":
-            temporary.write_text(hand_osim(model, sites, start), "utf-8")
+            temporary.write_text(hand_osim(model, sites, start, up), "utf-8")
             return
         spec = build_spec(model.skeleton, model.capsules, sites=sites, actuators=actuators)
         import mujoco

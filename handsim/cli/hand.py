@@ -13,6 +13,7 @@ from handsim.app.messages import print_line
 from handsim.errors import ArgumentError, errors_of
 from handsim.files.outputs import check_ending, check_outputs, written_together
 from handsim.hand.shape import NUM_JOINTS, NUM_QPOS, Side
+from handsim.space.transforms import UpAxis
 
 if TYPE_CHECKING:
     from gloves.fit import GloveFit
@@ -30,6 +31,7 @@ def hand(
     mesh: Path | None = None,
     glove: str | None = None,
     actuators: bool = False,
+    up: UpAxis = "z",
 ) -> None:
     """Write a hand as a MuJoCo or OpenSim model, a URDF or a rigged mesh, and its skin as a plain mesh.
 
@@ -45,6 +47,7 @@ def hand(
         glove: Marker layout whose markers become sites of the .xml or markers of the .osim: a shipped name
             or a .toml file. Hands of a file have their own markers.
         actuators: Position servos in the .xml, whose controls are angles within the joints' ranges.
+        up: The axis of the take that points up, for the first pose in an .osim; y for Motive's default.
     """
     from gloves.fit import GloveFit
     from gloves.hand_files import ENDINGS, MESH_ENDINGS, WITH_MARKERS, write_hand, write_skin
@@ -62,11 +65,15 @@ def hand(
             raise ArgumentError(
                 f"given {option} and --out {out}, expected an --out that ends in {wanted} with it"
             )
+    if up != "z" and (take is None or suffix != ".osim"):
+        raise ArgumentError(
+            f"given --up {up} and --out {out}, expected --take and an --out that ends in .osim with it"
+        )
     check_outputs([glove, shape, take], (out, mesh))
     chosen, words, start = _chosen_hand(size, side, shape, take, glove)
     model = chosen.model if isinstance(chosen, GloveFit) else chosen
     with written_together():
-        write_hand(out, chosen, actuators=actuators, start=start)
+        write_hand(out, chosen, actuators=actuators, start=start, up=up)
         if mesh is not None:
             write_skin(mesh, model)
     markers = chosen.layout.num_markers if isinstance(chosen, GloveFit) else 0

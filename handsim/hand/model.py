@@ -21,6 +21,7 @@ from handsim.hand.capsules import Capsules, build_capsules, penetration_depth
 from handsim.hand.shape import (
     BONE_NAMES,
     BONES,
+    DIGIT_OF_BONE,
     DIGITS,
     JOINTS,
     NUM_BONES,
@@ -348,9 +349,8 @@ NUM_VELOCITIES: Final = 6 + NUM_JOINTS
 _FIRST: Final = np.array([n == 0 or JOINTS[n - 1].bone != joint.bone for n, joint in enumerate(JOINTS)])
 _BONE: Final = np.array([joint.bone for joint in JOINTS])
 _PARENT: Final = np.array([BONES[joint.bone].parent for joint in JOINTS])
-_DIGIT: Final = np.array([bone.digit for bone in BONES])
 # A joint moves its own bone and those further out on its digit (J, L).
-_MOVED: Final = (_DIGIT == _DIGIT[_BONE, None]) & (np.arange(NUM_BONES) >= _BONE[:, None])
+_MOVED: Final = (DIGIT_OF_BONE == DIGIT_OF_BONE[_BONE, None]) & (np.arange(NUM_BONES) >= _BONE[:, None])
 
 
 def joint_axes(

@@ -152,12 +152,16 @@ def coordinate_values(qpos: Float[np.ndarray, "T 27"], up: UpAxis) -> NDArray[np
 
 
 def hand_osim(
-    model: HandModel, markers: Sequence[Site] = (), start: Float[np.ndarray, "27"] | None = None
+    model: HandModel,
+    markers: Sequence[Site] = (),
+    start: Float[np.ndarray, "27"] | None = None,
+    up: UpAxis = "z",
 ) -> str:
     """The text of a .osim file: meters, radians, kilograms.
 
-    The hand begins in the pose `start`, flat with the back up when not given. OpenSim's inverse kinematics
-    begins there too, and finds the wrist's angles on the branch of those of a .mot that begins so.
+    The hand begins in the pose `start` of a world whose axis `up` points up, or flat with the back up.
+    OpenSim's inverse kinematics begins there too, and finds the wrist's angles on the branch of those of a
+    .mot that begins so.
     """
     side = model.shape.side
     document = ET.Element("OpenSimDocument", Version=_VERSION)
@@ -172,7 +176,7 @@ def hand_osim(
     for bone in range(len(BONES)):
         _add_body(bodies, model, bone)
     flat = join_qpos(np.zeros((1, NUM_JOINTS)))
-    values = coordinate_values(flat if start is None else start[None], "z")[0]
+    values = coordinate_values(flat if start is None else start[None], up)[0]
     starts = dict(zip(coordinate_names(side), values, strict=True))
     # The palm turns about its own axes and moves along those of the ground, in which it is free.
     names = coordinate_names(side)[:6]

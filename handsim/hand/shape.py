@@ -63,6 +63,8 @@ BONES: Final[tuple[Bone, ...]] = (
 )
 BONE_NAMES: Final[tuple[str, ...]] = tuple(bone.name for bone in BONES)
 NUM_BONES: Final = len(BONES)
+DIGIT_OF_BONE: Final = np.array([bone.digit for bone in BONES])
+"""Digit of each bone, -1 for the palm."""
 
 # Ranges [deg]: active ranges of the AAOS and e-hand tables, MCP extension and PIP flexion as in the wider of
 # the published sets (docs/angles.md lists them side by side). The thumb's first two count from its rest.

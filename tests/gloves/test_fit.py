@@ -238,19 +238,18 @@ def test_slips_leave_lateral_markers_on_the_skin_of_their_digit(rng):
         model = HandModel(sample_shape(EVERYBODY, rng=rng))
         designed = settle_glove(layout, model).attachment
         worn = wear(layout, model, along=0.1, around=np.deg2rad(10), rng=rng)
-        feet = worn.points - layout.heights[:, None] * worn.normals
-        np.testing.assert_array_equal(nearest_digits(feet, model), own)
+        np.testing.assert_array_equal(nearest_digits(worn.feet, model), own)
         assert np.linalg.norm(worn.points - designed.points, axis=1).max() < 0.025
         assert worn.layout.names == layout.names
 
 
 def stray(worn: Attachment, model: HandModel) -> list[str]:
-    """Markers whose nearest bone is of another digit.
+    """Markers whose nearest bone, or the bone that carries their skin, is of another digit.
 
     Metacarpals are the palm's and their finger's; the thumb has the index finger's and the wrist, too. What
     the palm carries is its own.
     """
-    feet, capsules = worn.points - worn.layout.heights[:, None] * worn.normals, model.capsules
+    feet, capsules = worn.feet, model.capsules
     starts, ends = np.moveaxis(capsules.posed(model.rest_transforms[None])[0], 1, 0)
     shares = ((feet[:, None] - starts) * (ends - starts)).sum(-1) / ((ends - starts) ** 2).sum(-1)
     away = feet[:, None] - starts - np.clip(shares, 0.0, 1.0)[..., None] * (ends - starts)
@@ -264,7 +263,9 @@ def stray(worn: Attachment, model: HandModel) -> list[str]:
         own = [BONES[BONE_NAMES.index(marker.bone)].digit in one for one in owners]
         # Where two bones meet, as in a knuckle, both are equally near.
         near = distances[index, own].min() <= distances[index].min() + 1e-9
-        if not near and not (marker.bone == "palm" and worn.main_bones[index] == PALM):
+        digit = BONES[BONE_NAMES.index(marker.bone)].digit
+        carried = digit < 0 or BONES[worn.main_bones[index]].digit in (-1, digit)
+        if not (carried and near) and not (marker.bone == "palm" and worn.main_bones[index] == PALM):
             found.append(marker.name)
     return found
 

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
 from gloves.fit import GloveFit
-from handsim.hand.shape import BONES, DIGITS, NUM_JOINTS
+from handsim.hand.shape import DIGIT_OF_BONE, DIGITS, NUM_JOINTS
 from handsim.kernels import kernel, move, velocity_of
 from track.association.digit_hypotheses import DigitModel, digit_ranges
 from track.association.frame_state import peak_log_odds
@@ -116,7 +116,7 @@ class HandState:
         self.rms = np.nan
         """RMS distance of its markers, biases removed [m]."""
         count = self.num_markers = hand.attachment.layout.num_markers
-        self.digits = np.array([BONES[bone].digit for bone in hand.attachment.main_bones])
+        self.digits = DIGIT_OF_BONE[hand.attachment.main_bones]
         """Digit of each marker (M,), -1 for the palm."""
         self.adapted = self.solver.hand
         """The hand as arrays, its markers shifted by their biases."""
@@ -133,8 +133,7 @@ class HandState:
         self._bias_frames = np.zeros(count)  # that each bias is averaged over
         self._variance = self.variance.copy()  # [m^2] while the biases are certain
         self._typical_bias = 0.0  # [m] RMS over the markers
-        self._last_seen = np.zeros(count)  # [s] of each marker
-        self._last_label = np.full(count, -np.inf)  # [s] of each marker
+        self._last_seen = np.full(count, -np.inf)  # [s] of each marker since the hand was initialized
         self._spread_model = SpreadModel(hand, origin, angle_errors)
         self._usual_square = np.nan  # [m^2] of the RMS distance of the markers, biases included
         self._designed = self.adapted.positions[:, 0].copy()  # [m] without biases
@@ -202,7 +201,7 @@ class HandState:
     def pose_spread(self, time: float) -> Callable[[], Spreads]:
         """What computes the standard deviations of this pose at a time [s], whatever the hand does later."""
         assert self.qpos is not None
-        unseen = np.maximum(time - self._last_label, 0.0)
+        unseen = np.maximum(time - self._last_seen, 0.0)
         return partial(self._spread_model.of_pose, self.qpos.copy(), unseen, np.sqrt(self._usual_square))
 
     @property
@@ -227,8 +226,7 @@ class HandState:
     ) -> HandEstimate:
         """Start from a pose without history; the biases are kept if they still fit."""
         self.velocity[:] = 0.0
-        self._last_seen[:] = time
-        self._last_label[:] = -np.inf
+        self._last_seen[:] = -np.inf  # a marker without a point may be any of those that are there
         self.confirmed[:] = False
         unknown = self._prediction(qpos, resting_prior(), (1.0, 1.0))
         estimate = self.fit(targets, qpos, unknown)
@@ -266,7 +264,7 @@ class HandState:
     def resize(self, hand: GloveFit, origin: HandOrigin, keep: float) -> None:
         """Go on as the same hand of another size, with a share of the biases."""
         self.hand, self.solver, self._spread_model = hand, PoseSolver(hand), SpreadModel(hand, origin)
-        self.digits = np.array([BONES[bone].digit for bone in hand.attachment.main_bones])
+        self.digits = DIGIT_OF_BONE[hand.attachment.main_bones]
         self.adapted = self.solver.hand
         self._designed = self.adapted.positions[:, 0].copy()
         if not keep:
@@ -305,7 +303,7 @@ class HandState:
         self.qpos, self.time, self.positions = estimate.qpos, time, estimate.positions
         self.rms = estimate.rms
         self._joint_covariance = estimate.predicted.joint_covariance
-        _note_markers(estimate.residuals, self.digits, time, self._last_seen, self._last_label, self.velocity)
+        _note_markers(estimate.residuals, self.digits, time, self._last_seen, self.velocity)
         square = self.rms_without_bias(estimate) ** 2
         if np.isnan(self._usual_square):
             self._usual_square = square
@@ -334,14 +332,13 @@ def _note_markers(
     digits: Int[np.ndarray, "M"],
     time: float,
     last_seen: Float[np.ndarray, "M"],
-    last_label: Float[np.ndarray, "M"],
     velocity: Float[np.ndarray, "26"],
 ) -> None:
     """Note when markers with a residual were seen [s], and slow down the hinges of digits that lack one."""
     lacks = np.zeros(len(DIGITS) + 1, dtype=np.bool_)
     for marker in range(len(residuals)):
         if np.isfinite(residuals[marker, 0]):
-            last_seen[marker] = last_label[marker] = time
+            last_seen[marker] = time
         else:
             lacks[digits[marker]] = True
     for hinge in range(NUM_JOINTS):

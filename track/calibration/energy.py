@@ -339,7 +339,8 @@ def first_estimate(
     hand: GloveFit, targets: Float[np.ndarray, "F M 3"], qpos: Float[np.ndarray, "F 27"], **options: float
 ) -> tuple[Problem, Estimate]:
     """The problem of a right hand's labeled markers [m] with its options, and the hand as it is."""
-    worn, coordinates = hand.attachment, nearest_coordinates(hand.attachment.points, hand.shape)
+    worn = hand.attachment
+    coordinates = nearest_coordinates(worn.points, worn.feet, worn.main_bones, hand.shape)
     problem = Problem(hand.shape, coordinates, worn.layout.heights, targets, **options)
     return problem, Estimate(np.zeros(NUM_PARAMETERS), worn.points, coordinates, qpos)
 
@@ -397,14 +398,15 @@ def initialize_contacts(
     model: HandModel, touches: list[tuple[int, str]], T_world_bone: Float[np.ndarray, "K L 4 4"]
 ) -> Contacts:
     """Contacts of touches, their points first where the two last bones come nearest."""
-    points = np.empty((2, len(touches), 3))
+    points, bones = np.empty((2, len(touches), 3)), np.empty((2, len(touches)), dtype=np.int64)
     for number, (_, finger) in enumerate(touches):
-        ends = _nearest_skin_points(model, T_world_bone[number], finger)
+        nearest = _nearest_skin_points(model, T_world_bone[number], finger)
         for part, digit in enumerate(("thumb", finger)):
-            bone = bones_of(digit)[2]
-            local = np.linalg.inv(T_world_bone[number, bone]) @ np.append(ends[part], 1.0)
+            bone = bones[part, number] = bones_of(digit)[2]
+            local = np.linalg.inv(T_world_bone[number, bone]) @ np.append(nearest[part], 1.0)
             points[part, number] = (model.rest_transforms[bone] @ local)[:3]
-    pads = nearest_coordinates(points.reshape(-1, 3), model.shape)
+    ends = points.reshape(-1, 3)
+    pads = nearest_coordinates(ends, ends, bones.ravel(), model.shape)
     pads = pads._replace(heights=np.zeros(len(pads.faces)))
     frames = np.array([frame for frame, _ in touches], dtype=np.int64)
     fingers = np.array([DIGITS.index(finger) for _, finger in touches], dtype=np.int64)

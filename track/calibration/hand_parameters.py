@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from gloves.fit import Attachment
 from gloves.layout import MarkerLayout
 from handsim.hand.model import HandModel, bone_transforms, build_skeleton
-from handsim.hand.shape import ADULTS, DIGITS, NUM_BONES, HandShape, named_shape
+from handsim.hand.shape import ADULTS, DIGIT_OF_BONE, DIGITS, NUM_BONES, HandShape, named_shape
 from handsim.hand.skin import build_surface, catmull_clark, vertex_normals
 
 if TYPE_CHECKING:
@@ -130,6 +130,7 @@ class SkinTopology(NamedTuple):
     faces: Int[np.ndarray, "F 3"]  # triangles, counter-clockwise from outside
     adjacent: Int[np.ndarray, "F 3"]  # the triangle beyond the edge opposite to each corner
     weights: Float[np.ndarray, "V 16"]  # skinning weights of all bones
+    digits: Int[np.ndarray, "F"]  # digit of the bone that carries most of each triangle, -1 for the palm
 
 
 class SkinCoordinates(NamedTuple):
@@ -178,7 +179,9 @@ def skin_mesh() -> SkinTopology:
     faces = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
     weights = np.zeros((len(coarse.vertices), NUM_BONES))
     np.add.at(weights, (np.arange(len(weights))[:, None], coarse.bone_indices), coarse.bone_weights)
-    return SkinTopology(step, faces, _adjacent_faces(faces), step @ weights)
+    weights = step @ weights
+    digits = DIGIT_OF_BONE[weights[faces].sum(axis=1).argmax(axis=1)]
+    return SkinTopology(step, faces, _adjacent_faces(faces), weights, digits)
 
 
 def _adjacent_faces(faces: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -310,11 +313,18 @@ def _cross_edges(
     faces[crossing], bary[crossing] = new, carried / np.maximum(carried.sum(axis=1, keepdims=True), 1e-12)
 
 
-def nearest_coordinates(points: Float[np.ndarray, "P 3"], shape: HandShape) -> SkinCoordinates:
-    """Coordinates of points [m] in the wrist's frame, starting from the nearest of all triangles."""
-    skin = build_skin(shape)
-    middles = skin.points[skin_mesh().faces].mean(axis=1)
-    off = 0.5 * (middles**2).sum(axis=1)[:, None] - middles @ points.T  # half the squares, less the points'
-    faces = off.argmin(axis=0)
-    start = SkinCoordinates(faces, np.full((len(faces), 3), 1 / 3), np.zeros(len(faces)))
+def nearest_coordinates(
+    points: Float[np.ndarray, "P 3"],
+    feet: Float[np.ndarray, "P 3"],
+    bones: Int[np.ndarray, "P"],
+    shape: HandShape,
+) -> SkinCoordinates:
+    """Coordinates of points [m] in the wrist's frame, near their feet on the skin of their bones' digits."""
+    # A marker between two fingers may be nearer to the skin of the other one.
+    skin, mesh = build_skin(shape), skin_mesh()
+    middles = skin.points[mesh.faces].mean(axis=1)
+    off = 0.5 * (middles**2).sum(axis=1)[:, None] - middles @ feet.T  # half the squares, less the feet's
+    faces = np.where(mesh.digits[:, None] == DIGIT_OF_BONE[bones], off, np.inf).argmin(axis=0)
+    heights = np.linalg.norm(points - feet, axis=1)
+    start = SkinCoordinates(faces, np.full((len(faces), 3), 1 / 3), heights)
     return project_onto_skin(start, points, skin)

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from gloves.fit import GloveFit
-from handsim.hand.shape import BONES, NUM_BONES, NUM_JOINTS
+from handsim.hand.shape import DIGIT_OF_BONE, NUM_BONES, NUM_JOINTS
 from handsim.kernels import kernel, multiply_rotations, quaternion_product, rotate_quaternion
 
 NUM_UNKNOWNS: Final = NUM_JOINTS + 6
@@ -82,11 +82,10 @@ def hand_arrays(fit: GloveFit) -> HandArrays:
     bones = np.take_along_axis(attachment.bone_indices, order, axis=1)
     bone_weights = np.take_along_axis(attachment.bone_weights, order, axis=1)
     positions = np.take_along_axis(local, order[..., None], axis=1) * bone_weights[..., None]
-    digits = np.array([bone.digit for bone in BONES])
     hinge_span = np.zeros((len(bones), 2), dtype=np.int64)
     skyline = np.zeros(NUM_UNKNOWNS, dtype=np.int64)
     skyline[:NUM_JOINTS] = np.arange(NUM_JOINTS) // 4 * 4
-    for marker, row in enumerate(np.where(bone_weights > 0.0, digits[bones], -1)):
+    for marker, row in enumerate(np.where(bone_weights > 0.0, DIGIT_OF_BONE[bones], -1)):
         moving = row[row >= 0]
         if len(moving):
             first, last = 4 * moving.min(), 4 * moving.max() + 4
@@ -101,7 +100,7 @@ def hand_arrays(fit: GloveFit) -> HandArrays:
         np.where(bone_weights > 0.0, bones, -1),
         bone_weights,
         np.array(positions, order="C"),
-        digits[bones[:, 0]],
+        DIGIT_OF_BONE[bones[:, 0]],
         hinge_span,
         skyline,
     )

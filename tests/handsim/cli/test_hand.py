@@ -12,7 +12,9 @@ from gloves import GloveFit, Take, attach, load_layout, load_take
 from gloves.fit import attach_markers, wear
 from handsim import HandModel, join_qpos, sample_shape
 from handsim.cli.main import main
+from handsim.hand.model_files import coordinate_names, coordinate_values
 from handsim.hand.shape import JOINT_NAMES
+from handsim.space.transforms import UpAxis
 from track import User, load_user
 
 
@@ -95,6 +97,29 @@ def test_the_only_hand_of_a_take_is_taken(
     assert np.linalg.norm(middle) in (pytest.approx(0.0), pytest.approx(shape.bone_lengths[2, 0]))
     mesh = trimesh.load(tmp_path / "hand.glb", force="mesh", process=False)
     assert len(mesh.vertices) == len(HandModel(shape).surface.vertices)
+
+
+@pytest.mark.parametrize("up", ["y", "z"])
+def test_an_opensim_model_begins_in_the_first_pose_of_a_take_with_any_axis_up(
+    up: UpAxis, files: Path, tmp_path: Path
+) -> None:
+    take, out = files / "one.truth.npz", tmp_path / "hand.osim"
+    assert main(["hand", "--take", str(take), "--out", str(out), "--up", up]) == 0
+    begins = {
+        one.get("name"): float(one.findtext("default_value") or "nan")
+        for one in ET.parse(out).iter("Coordinate")
+    }
+    values = coordinate_values(load_take(take).qpos[:1, 0], up)[0]
+    expected = dict(zip(coordinate_names("left"), values, strict=True))
+    assert begins == pytest.approx(expected, abs=1e-9)
+
+
+def test_an_axis_that_points_up_needs_a_pose_in_an_opensim_model(
+    files: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for given in (["hand.osim"], ["hand.glb", "--take", str(files / "one.truth.npz")]):
+        assert main(["hand", "--up", "y", "--out", str(tmp_path / given[0]), *given[1:]]) == 1
+        assert "expected --take and an --out that ends in .osim" in capsys.readouterr().err
 
 
 def test_servos_go_where_they_are_told(tmp_path: Path, rng: np.random.Generator) -> None:

@@ -65,6 +65,15 @@ def test_a_marker_that_is_missing_is_less_certain_than_its_neighbors(moving):
     assert spread.argmax() == TIP
 
 
+def test_a_marker_without_a_point_at_the_start_may_be_any_point_that_is_there(moving):
+    target = moving.positions.copy()
+    target[TIP] = np.nan
+    moving.initialize(moving.qpos, target, 1.0)
+    moving.predict(1.0)
+    odds = moving.presence_log_odds(np.array([1.0 - STRAY_LIFETIME]))[0]
+    assert odds[KNUCKLE] == SEEN_ELSEWHERE + 1.0 < SEEN_ELSEWHERE + MOST_AGE_LOG_ODDS < odds[TIP]
+
+
 def test_the_bias_of_a_marker_is_learned_and_its_designed_position_is_known(followed):
     off = np.zeros((19, 3))
     off[KNUCKLE] = 0.0, 0.004, 0.004

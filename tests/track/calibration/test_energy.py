@@ -52,7 +52,8 @@ def problem_and_estimate():
     bones = hand.model.forward_kinematics(qpos)
     targets = hand.attachment.centers(hand.model, bones) + rng.normal(scale=0.001, size=(FRAMES, 19, 3))
     targets[3, 5] = np.nan
-    coordinates = nearest_coordinates(hand.attachment.points, hand.model.shape)
+    worn = hand.attachment
+    coordinates = nearest_coordinates(worn.points, worn.feet, worn.main_bones, hand.shape)
     problem = Problem(hand.model.shape, coordinates, 0.0032, targets, noise=0.001, robust_scale=0.01)
     contacts = initialize_contacts(hand.model, touches, bones[:2])
     estimate = Estimate(np.zeros(NUM_PARAMETERS), hand.attachment.points, coordinates, qpos, contacts)

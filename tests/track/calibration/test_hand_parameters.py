@@ -5,12 +5,13 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+import pytest
 
 from benchmarks.people import displace_markers
-from gloves import load_layout
-from gloves.fit import attach_markers
+from gloves import MarkerLayout, MarkerPlace, load_layout
+from gloves.fit import attach_markers, settle_glove
 from handsim import HandModel, sample_shape
-from handsim.hand.shape import named_shape
+from handsim.hand.shape import DIGIT_OF_BONE, DIGITS, named_shape, shape_from_measures
 from track.calibration.hand_parameters import (
     NUM_PARAMETERS,
     SkinPatch,
@@ -74,7 +75,7 @@ def test_neighbors_share_an_edge():
 def test_a_glove_is_found_where_it_sits(rng):
     shape = sample_shape(rng=rng)
     worn = attach_markers(load_layout("dense19"), HandModel(shape))
-    coordinates = nearest_coordinates(worn.points, shape)
+    coordinates = nearest_coordinates(worn.points, worn.feet, worn.main_bones, shape)
     points, normals = points_of(coordinates, shape)
     np.testing.assert_allclose(points, worn.points, atol=1e-9)
     assert (normals * worn.normals).sum(axis=1).min() > 0.99
@@ -83,11 +84,28 @@ def test_a_glove_is_found_where_it_sits(rng):
     np.testing.assert_allclose(dense_weights(again), dense_weights(worn), atol=0.03)
 
 
+@pytest.mark.parametrize("length", [0.175, 0.187, 0.199])
+def test_a_marker_between_two_fingers_is_found_on_its_own(length):
+    turns = np.deg2rad([90.0, -90.0])
+    sides = [(name, part, turn) for name in DIGITS[1:] for part in ("proximal", "middle") for turn in turns]
+    places = [
+        MarkerPlace(f"M{number}", f"{name}_{part}", 0.65, turn)
+        for number, (name, part, turn) in enumerate(sides)
+    ]
+    model = HandModel(shape_from_measures(length, 0.086))
+    worn = settle_glove(MarkerLayout("sides", tuple(places), 0.0032), model).attachment
+    coordinates = nearest_coordinates(worn.points, worn.feet, worn.main_bones, model.shape)
+    again = attachment_at(worn.layout, coordinates, model.shape)
+    np.testing.assert_allclose(again.points, worn.points, atol=1e-6)
+    own = [DIGITS.index(name) for name, _, _ in sides]
+    np.testing.assert_array_equal(DIGIT_OF_BONE[again.main_bones], own)
+
+
 def test_stalks_are_heights_above_the_skin(rng):
     shape, layout = sample_shape(rng=rng), load_layout("dense19")
     stalks = [dataclasses.replace(marker, height=rng.uniform(0.0, 0.012)) for marker in layout.markers]
     worn = attach_markers(dataclasses.replace(layout, markers=tuple(stalks)), HandModel(shape))
-    coordinates = nearest_coordinates(worn.points, shape)
+    coordinates = nearest_coordinates(worn.points, worn.feet, worn.main_bones, shape)
     np.testing.assert_allclose(points_of(coordinates, shape)[0], worn.points, atol=1e-9)
     np.testing.assert_allclose(coordinates.heights, worn.layout.heights, atol=1e-3)
     moved = displace_markers(worn, shape, 0.0, rng=rng)
@@ -98,7 +116,9 @@ def test_slides_end_under_their_points(rng):
     shape = sample_shape(rng=rng)
     worn = attach_markers(load_layout("dense19"), HandModel(shape))
     moved = displace_markers(worn, shape, 0.005, rng=rng)
-    coordinates = project_onto_skin(nearest_coordinates(worn.points, shape), moved.points, build_skin(shape))
+    coordinates = project_onto_skin(
+        nearest_coordinates(worn.points, worn.feet, worn.main_bones, shape), moved.points, build_skin(shape)
+    )
     np.testing.assert_allclose(points_of(coordinates, shape)[0], moved.points, atol=1e-9)
     np.testing.assert_allclose(coordinates.heights, worn.layout.radius, atol=1e-9)
     distance = np.linalg.norm(moved.points - worn.points, axis=1)
@@ -108,14 +128,15 @@ def test_slides_end_under_their_points(rng):
 def test_points_go_with_the_skin():
     small, large = named_shape("XS"), named_shape("XL")
     worn = attach_markers(load_layout("dense19"), HandModel(small))
-    coordinates = nearest_coordinates(worn.points, small)
+    coordinates = nearest_coordinates(worn.points, worn.feet, worn.main_bones, small)
     there = attach_markers(load_layout("dense19"), HandModel(large)).points
     assert np.linalg.norm(points_of(coordinates, large)[0] - there, axis=1).max() < 0.003
 
 
 def test_weights_change_as_their_jacobian_say(rng):
     shape = sample_shape(rng=rng)
-    coordinates = nearest_coordinates(attach_markers(load_layout("dense19"), HandModel(shape)).points, shape)
+    worn = attach_markers(load_layout("dense19"), HandModel(shape))
+    coordinates = nearest_coordinates(worn.points, worn.feet, worn.main_bones, shape)
     jacobian = skin_weight_jacobian(coordinates, build_skin(shape).corners(coordinates.faces))
     points, step = points_of(coordinates, shape)[0], 1e-7
     for axis in np.eye(3):
