@@ -527,7 +527,10 @@ def register(
             raise HandSimError(_UNLIKE)
         most = _MOST_AT_LAST if turn == 3 else _MOST_BUNDLED
         unknowns, _, covariance = bundle.solve(unknowns, bundle.samples(matches, most), starts, noise)
-        noise = max(float(np.nanmedian(bundle.match(unknowns, starts, np.inf).distances)) / 1.177, 0.3)
+        distances = bundle.match(unknowns, starts, np.inf).distances
+        if np.isnan(distances).all():  # the camera looks away from the hands
+            raise HandSimError(_UNLIKE)
+        noise = max(float(np.nanmedian(distances)) / 1.177, 0.3)
     registration = _registration(bundle, unknowns, starts, covariance, found)
     if noise > _WORST * width or registration.reasons.count("") < _LEAST_SHARE * with_hands:
         raise HandSimError(_UNLIKE)

@@ -92,8 +92,10 @@ def test_frames_that_do_not_fit_are_left_out():
         frames[n].hands[0].keypoints[:] += [40.0, 0.0]
     frames[150] = frames[150]._replace(hands=[])
     found = register(take, frames, SIZE)
-    left = {n for n, reason in enumerate(found.reasons) if reason}
-    assert set(range(100, 120)) | {150} <= left and len(left) < 60 and len(found.cameras) == 1
+    assert len(found.cameras) == 1 and all(found.reasons[n] for n in range(100, 120))
+    away = "no hand of the take is in the picture"
+    left = {n for n, reason in enumerate(found.reasons) if reason not in ("", away)}
+    assert left <= set(range(100, 120)) | {150} and len(left) > 12
     assert "off" in found.reasons[105] and found.reasons[150] == "the detector found no hand there"
 
 
