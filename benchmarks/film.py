@@ -9,7 +9,6 @@ share of frames that count, how many of those are off in truth, and the processo
 
 from __future__ import annotations
 
-import dataclasses
 import tempfile
 import time
 from collections.abc import Iterator
@@ -152,7 +151,7 @@ def compared(filmed: Filmed, options: Options) -> dict[str, float]:
     points = posed.keypoints()
     true_times = filmed.offset + (1.0 + filmed.drift) * np.arange(posed.num_frames) / options.rate
     qpos = between_poses(filmed.truth.times, true_times, filmed.truth.qpos, filmed.truth.rate)
-    truth = dataclasses.replace(posed, qpos=qpos).keypoints()
+    truth = Take.of_poses(posed.hands, qpos, rate=posed.rate, times=true_times).keypoints()
     off = []
     for n in range(posed.num_frames):
         camera = filmed.cameras[int(n / options.rate >= filmed.bumped)]

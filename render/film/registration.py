@@ -34,8 +34,11 @@ if TYPE_CHECKING:
 _MAX_GAP: Final = 0.1  # [s] that poses are interpolated over
 _STEP: Final = 1.0 / 30.0  # [s] of the shifts that are tried
 _OVERLAP: Final = 0.5  # least share of the keypoints that a shift must cover, of the most that one covers
-_APART: Final = 0.3  # [s] between two shifts that are tried on
-_SHIFTS: Final = 5  # that are tried on, of each way to tell sides
+_SHIFTS: Final = 60  # at which hands are matched, of each way to tell sides
+_CLOSE, _APART = 0.1, 0.3  # [s] between two of these, and between two of those that are tried on
+_ROUNDS: Final = 5  # of matching
+_MOST_MATCHED: Final = 400  # detections that are matched
+_TRIED: Final = 3  # best matches with which PnP is tried
 _FOCALS: Final = (0.5, 0.65, 0.85, 1.1, 1.45, 1.9, 2.5, 3.3)  # [widths of the picture]
 _CLOCK_KEYPOINTS: Final = (0, 4, 5, 8, 9, 12, 16, 17, 20)
 _FEWEST_FRAMES: Final = 20  # frames with a hand that a camera is registered with
@@ -539,33 +542,67 @@ def register(
 
 def _first_guess(bundle: _Bundle) -> Doubles:
     """Unknowns that explain most of what was found: clock by all shifts, pose by PnP."""
+    tried = [
+        (*_affine_matches(bundle, offset, swapped), offset)
+        for swapped in (False, True)
+        for offset in _shifts(bundle, swapped)
+    ]
     best: tuple[float, Doubles] | None = None
-    for swapped in (False, True):
-        for offset in _shifts(bundle, swapped):
-            samples = _by_sides(bundle, offset, swapped)
-            start = _posed(bundle, samples, offset)
-            if start is None:
-                continue
-            unknowns, *_ = bundle.solve(start, samples, [0], 0.01 * bundle.size[0], first=True)
-            gate = _GATE * bundle.size[0]
-            agreeing = float(np.nansum(1.0 - bundle.match(unknowns, [0], gate).distances / gate))
-            if best is None or agreeing > best[0]:
-                best = agreeing, unknowns
+    offsets: list[float] = []
+    for _, matches, offset in sorted(tried, key=lambda one: one[0]):
+        if len(offsets) == _TRIED:
+            break
+        if any(abs(offset - other) < _APART for other in offsets):
+            continue
+        offsets.append(offset)
+        samples = bundle.samples(matches, 1500)
+        start = _posed(bundle, samples, offset)
+        if start is None:
+            continue
+        unknowns, *_ = bundle.solve(start, samples, [0], 0.01 * bundle.size[0], first=True)
+        gate = _GATE * bundle.size[0]
+        agreeing = float(np.nansum(1.0 - bundle.match(unknowns, [0], gate).distances / gate))
+        if best is None or agreeing > best[0]:
+            best = agreeing, unknowns
     if best is None:
         raise HandSimError(_UNLIKE)
     return best[1]
 
 
-def _by_sides(bundle: _Bundle, offset: float, swapped: bool, most: int = 1500) -> _Samples:
-    """Keypoints of the surest detection of each side, and the hand of this side, or of the other one."""
+def _affine_matches(bundle: _Bundle, offset: float, swapped: bool) -> tuple[float, _Matches]:
+    """How far off an affine camera is that explains what was found at this shift, and its matches.
+
+    It begins with the sides that the detector told, or with the other ones, and then gives each detection to
+    the hand that is nearest in the picture: a detector is often wrong about sides.
+    """
     found, motion = bundle.found, bundle.motion
-    index = np.full((len(found.times), motion.num_hands), -1)
-    order = np.argsort(found.confidence, kind="stable")
-    for hand, side in enumerate(motion.sides):
-        mine = order[found.sides[order] == (1 - side if swapped else side)]
-        index[found.frames[mine], hand] = mine  # the surest comes last
-    there = np.isfinite(motion.at(found.times + offset)[0][..., 0, 0])
-    return bundle.samples(_Matches(np.where(there, index, -1), np.zeros(index.shape)), most)
+    some = np.unique(np.linspace(0, len(found.frames) - 1, _MOST_MATCHED).astype(int))
+    frames, weights = found.frames[some], found.weights[some]
+    points = motion.at(found.times + offset)[0][frames]  # (D, H, 21, 3)
+    there = np.isfinite(points[..., 0, 0])
+    rows = np.concatenate([np.nan_to_num(points), np.ones((*points.shape[:-1], 1))], axis=-1)
+    sides = np.where(swapped, 1 - found.sides[some], found.sides[some])
+    told = there & (motion.sides == sides[:, None])
+    hand, counts = told.argmax(axis=1), told.any(axis=1).astype(float)
+    distances = np.full(there.shape, np.inf)
+    for _ in range(_ROUNDS):
+        if not counts.any():
+            break
+        left = rows[np.arange(len(some)), hand]
+        weighted = left * (weights * counts[:, None])[..., None]
+        normal = np.einsum("nki,nkj->ij", weighted, left) + 1e-6 * np.eye(4)
+        pictured = rows @ np.linalg.solve(normal, np.einsum("nki,nkj->ij", weighted, found.pixels[some]))
+        away = np.linalg.norm(pictured - found.pixels[some, None], axis=-1)
+        away = (away * weights[:, None]).sum(axis=-1) / np.maximum(weights.sum(axis=1), 1e-6)[:, None]
+        distances = np.where(there, away, np.inf)
+        hand = distances.argmin(axis=1)
+        nearest = distances.min(axis=1)
+        counts = 1.0 / (1.0 + (nearest / (2.0 * _GATE * bundle.size[0])) ** 2)
+    numbers = np.full((len(found.times), motion.num_hands), -1)
+    order = np.argsort(-distances.min(axis=1), kind="stable")
+    order = order[np.isfinite(distances.min(axis=1)[order])]
+    numbers[frames[order], hand[order]] = some[order]  # the nearest comes last
+    return -float(counts.sum()), _Matches(numbers, np.zeros(numbers.shape))
 
 
 def _posed(bundle: _Bundle, samples: _Samples, offset: float) -> Doubles | None:
@@ -629,14 +666,14 @@ def _shifts(bundle: _Bundle, swapped: bool) -> list[float]:
     values = irfft(sums, length)
     shifts = np.arange(length)
     shifts = np.where(shifts >= len(ticks), shifts - length, shifts)
-    score = _affine_residuals(values)
+    score = values[0] * np.log(_affine_residuals(values))
     score[values[0] < max(_OVERLAP * values[0].max(), 6.0 * len(_CLOCK_KEYPOINTS))] = np.inf
     offsets: list[float] = []
     for index in np.argsort(score):
         offset = float(first + shifts[index] * _STEP - begin)
         if not np.isfinite(score[index]) or len(offsets) == _SHIFTS:
             break
-        if all(abs(offset - other) >= _APART for other in offsets):
+        if all(abs(offset - other) >= _CLOSE for other in offsets):
             offsets.append(offset)
     return offsets
 
@@ -649,7 +686,7 @@ def _affine_residuals(sums: Doubles) -> Doubles:
     right = np.stack([sums[10:14].T, sums[14:18].T], axis=-1)
     explained = (right * np.linalg.solve(normal, right)).sum(axis=(1, 2))
     variance = sums[18] - (sums[10] ** 2 + sums[14] ** 2) / count
-    return np.where(variance > 1e-9, (sums[18] - explained) / np.maximum(variance, 1e-9), np.inf)
+    return np.asarray(np.clip((sums[18] - explained) / np.maximum(variance, 1e-9), 1e-3, 1.0))
 
 
 def _split(bundle: _Bundle, unknowns: Doubles, starts: list[int], noise: float) -> tuple[Doubles, list[int]]:

@@ -47,6 +47,7 @@ SEARCHED = {
 SMALL = "--batch 32 --network.width 8 --network.gates 2 --network.depth 1"
 QUICK = [
     ("hand", "--out h.xml", "size XL|side left|glove dense19|actuators|shape user.json|take take.npz"),
+    ("hand", "--take take.npz --out h.osim", "up y"),
     ("glove check", "dense19 --out g.png", "size XS"),
     ("rig import", "lab.xcp --out r.toml", "up y"),
     ("export", "take.npz --out x.bvh", "fps 30|up y"),
