@@ -46,7 +46,7 @@ def speed_run(folder: Path = FOLDER) -> str:
 
 
 def speed_tables(folder: Path = FOLDER) -> tuple[str, str]:
-    """The rows of speed.json: times, and how many in a second. Last in each, and left out, is its unit."""
+    """The rows of speed.json, with times or rates. Each row ends with its unit, which is left out here."""
     figures = json.loads((folder / "speed.json").read_text("utf-8"))["figures"]
     times = [
         "| what | median [ms] | 99th percentile [ms] | longest [ms] |",

@@ -81,6 +81,11 @@ class Attachment:
         return np.asarray(self.bone_indices[np.arange(len(self.points)), self.bone_weights.argmax(axis=1)])
 
     @property
+    def digits(self) -> Int[np.ndarray, "M"]:
+        """Digit of the bone that carries most of each marker, -1 for the palm."""
+        return np.asarray(DIGIT_OF_BONE[self.main_bones])
+
+    @property
     def feet(self) -> Float[np.ndarray, "M 3"]:
         """The places on the skin under the markers at zero angles, in the wrist frame [m]."""
         return np.asarray(self.points - self.layout.heights[:, None] * self.normals)

@@ -99,7 +99,7 @@ class UserBody:
         return np.asarray(wrists + 0.5 * self._lengths[:, None] * axes[..., 0])
 
     def _forearms(self, qpos: Float[np.ndarray, "T H 27"]) -> Doubles:
-        """The mean of the elbows that are tried, by what they cost."""
+        """Average the directions to all tried elbows; the less an elbow costs, the more it counts."""
         axes = quaternion_matrix(qpos[..., 3:7])
         ways, costs = self._elbows(qpos[..., :3], axes, self.shoulders, self.eyes)
         weights = np.exp((costs.min(axis=-1, keepdims=True) - costs) / _SOFTNESS)

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
 from gloves.takes.take import LOST, Take
-from handsim.hand.shape import DIGIT_OF_BONE, DIGITS, NUM_JOINTS
+from handsim.hand.shape import DIGITS, NUM_JOINTS
 from handsim.kernels import kernel, point_distance
 from track.kinematics.pose_spread import resting_prior
 
@@ -141,7 +141,7 @@ def _of_hands(
 def _improbable(take: Take, owners: Int[np.ndarray, "K"]) -> Float[np.ndarray, "T K"]:
     """How far from those of resting hands the angles of each marker's digit are; 0 for the palm."""
     prior, n = resting_prior(), NUM_JOINTS // len(DIGITS)
-    digits = np.concatenate([DIGIT_OF_BONE[hand.attachment.main_bones] for hand in take.hands])
+    digits = np.concatenate([hand.attachment.digits for hand in take.hands])
     improbable = np.zeros((take.num_frames, len(digits)))
     for digit in range(len(DIGITS)):
         part = slice(n * digit, n * digit + n)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from gloves.fit import GloveFit
 from gloves.takes.take import TRACKED, Take
-from handsim.hand.shape import BONES, JOINTS, Side
+from handsim.hand.shape import JOINTS, Side
 from handsim.space.transforms import rigid_fit
 from track.kinematics.pose_solver import FEWEST_MARKERS, PoseSolver
 from train.labelers.matching import assign
@@ -216,7 +216,7 @@ def _misplaced(hand: _Hand) -> Iterator[SuspectSpan]:
 def _unsure_side(hand: _Hand) -> Iterator[SuspectSpan]:
     """A hand without a marker on its thumb, that a hand of the other side fits as well in motion."""
     worn, take = hand.worn, hand.take
-    if any(BONES[bone].digit == 0 for bone in worn.attachment.main_bones):
+    if (worn.attachment.digits == 0).any():
         return
     frames = hand.frames[:: -(-len(hand.frames) // _SIDE_FRAMES)]
     seen = take.point_list.labeled(take.hand_labels[take.hand_index(hand.side)], frames)

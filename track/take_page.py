@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float, Int
 from gloves.captures.capture import runs_of
 from gloves.takes.take import COASTING, INITIALIZED, LOST, STATUSES, Take
 from handsim.files.outputs import atomic_write, check_ending, written_together
-from handsim.hand.shape import BONES, DIGIT_OF_BONE, DIGITS, JOINT_NAMES, JOINTS, Side
+from handsim.hand.shape import BONES, DIGITS, JOINT_NAMES, JOINTS, Side
 from handsim.pages import NOTHING, Paint, Section, html_list, picture, write_sections
 from track.config import Size
 from track.kinematics.pose_spread import SOURCES
@@ -342,7 +342,7 @@ def _error_section(title: str, take: Take, hand: HandFigures) -> Section:
         if filtered
         else "Filter: none, each pose was fitted to the markers of its frame."
     )
-    digits = DIGIT_OF_BONE[take.hands[take.hand_index(hand.side)].attachment.main_bones]
+    digits = take.hands[take.hand_index(hand.side)].attachment.digits
     gaps = np.array([marker.longest_gap for marker in hand.markers()]) / take.rate
     table = [["joint", *(("band", *SOURCES, "MDD", "cut-off [Hz]") if filtered else ()), "longest gap [s]"]]
     for number, joint in enumerate(JOINTS):

@@ -24,9 +24,9 @@ from handsim.hand.shape import NUM_KEYPOINTS, SIDES, Side
 
 WEIGHTS: Final = Path(__file__).parent / "weights"
 FINDER, KEYPOINTS = "finder.onnx", "keypoints.onnx"  # files in a folder of weights
-FINDER_SIZE: Final = 256  # of the square that the finder sees [px]
-CELL: Final = 8  # of the finder's map [px]
-CROP_SIZE: Final = 128  # of the square that the keypoint network sees [px]
+FINDER_SIZE: Final = 256  # side of the square picture that the finder takes [px]
+CELL: Final = 8  # side of a cell of the finder's map [px]
+CROP_SIZE: Final = 128  # side of the square picture that the keypoint network takes [px]
 HEAT_SIZE: Final = 16  # cells of a keypoint's map, each way
 NEAR: Final = 0.2  # reach of the heat around its peak that a keypoint is the mean of [share of the side]
 ROOM: Final = 1.55  # side of the square that is cut out around a hand, over the hand's longer side
@@ -219,9 +219,9 @@ def upright(keypoints: Doubles) -> Doubles:
 
 
 def palm_spread(keypoints: Doubles | Floats) -> float:
-    """How far the knuckles are spread [px^2]: positive for a right hand whose palm faces the camera.
+    """Signed area between wrist, index knuckle and little knuckle, times two [px^2].
 
-    It is negative for its back, and for a left hand the other way round.
+    It is positive where the camera sees the palm of a right hand or the back of a left hand, else negative.
     """
     index, little = keypoints[[_INDEX, _LITTLE]] - keypoints[_WRIST]
     return float(index[1] * little[0] - index[0] * little[1])

@@ -292,7 +292,7 @@ def annotate_film(
 
 
 def filmed_take(take: Take, registration: Registration) -> Take:
-    """The take's poses in the frames of the video that fit, by their numbers; NaN in the others.
+    """A take with one frame for each frame of the video; poses are NaN in frames that do not fit.
 
     A hand has the pose of the time at which a rolling shutter reads the rows that it is in.
     """

@@ -10,7 +10,7 @@ from handsim.hand.shape import NUM_KEYPOINTS
 
 
 def convolution(inside: int, outside: int, stride: int = 1) -> list[nn.Module]:
-    """A convolution, its normalization and its ReLU."""
+    """A convolution, followed by a batch normalization and a ReLU."""
     return [nn.Conv2d(inside, outside, 3, stride, 1, bias=False), nn.BatchNorm2d(outside), nn.ReLU()]
 
 

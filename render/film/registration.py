@@ -48,8 +48,8 @@ _MOST_BUNDLED: Final = 5000  # keypoints in a bundle, and in the last one
 _MOST_AT_LAST: Final = 12000
 _ROBUST: Final = 2.0  # [noise] from which on residuals count less
 _GATE: Final = 0.08  # [widths] of keypoints' median distance from their hand's, at first
-_BOUND: Final = 3.0  # of the usual median distance, beyond which a frame does not fit
-_LEAST_BOUND: Final = 0.008  # [widths]
+_BOUND: Final = 3.0  # A frame does not fit beyond this many times the usual median distance.
+_LEAST_BOUND: Final = 0.008  # A frame fits up to this distance in any case [widths of the picture].
 _WORST: Final = 0.03  # [widths] of the usual median distance
 _LEAST_SHARE: Final = 0.2  # of the frames with hands that must fit
 _MOST_SPANS: Final = 4
@@ -153,7 +153,7 @@ class Registration:
         return told
 
     def figures(self) -> list[tuple[str, str, str]]:
-        """Rows of a table: names, values and standard deviations of clock, lens and places."""
+        """A table of clock, lens and camera places: rows of a name, a value and its standard deviation."""
         known, camera = self.deviations, self.cameras[0]
         rows = [
             ("", "value", "standard deviation"),
@@ -606,7 +606,7 @@ def _affine_matches(bundle: _Bundle, offset: float, swapped: bool) -> tuple[floa
 
 
 def _posed(bundle: _Bundle, samples: _Samples, offset: float) -> Doubles | None:
-    """Unknowns with the focal length and pose with which most samples agree; None without any."""
+    """Unknowns that hold the focal length and pose by which most samples are explained, or None."""
     if len(samples.frames) < 6 * _FEWEST_KEYPOINTS:
         return None
     width = bundle.size[0]

@@ -263,7 +263,7 @@ def _turn(angle: float) -> Doubles:
 
 
 def keypoint_batch(course: Course, rng: np.random.Generator, size: int = BATCH) -> Batch:
-    """Squares around hands, and some without one; targets: keypoints [share of the side], presence, palm.
+    """Pictures of single hands, and some of none. Targets: keypoints [share of the side], presence, palm.
 
     The palm faces the camera (1), or does not (0), or that is not known (-1). Mirrored pictures have the same
     answer, which is learned long before the side.

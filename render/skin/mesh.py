@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
 
 from handsim.hand.model import HandModel
-from handsim.hand.shape import BONES, DIGITS, JOINT_NAMES, NUM_BONES, PALM
+from handsim.hand.shape import DIGIT_OF_BONE, DIGITS, JOINT_NAMES, NUM_BONES, PALM
 from handsim.hand.skin import (
     WRIST,
     cage_topology,
@@ -419,13 +419,13 @@ class PosableSkin:
         """Occlusion of the flat hand; of a digit, only by itself and the palm, not by its neighbors."""
         normals = vertex_normals(self.rest, self.faces)
         occluded = self._occluded(self.model.rest_transforms[None], self.rest, normals)
-        capsules, digits = self.model.capsules, np.array([bone.digit for bone in BONES])
+        capsules = self.model.capsules
         segments = capsules.posed(self.model.rest_transforms[None])[0]
-        of_digit = digits[self._bones]
+        of_digit = DIGIT_OF_BONE[self._bones]
         for digit in range(len(DIGITS)):
             share = (self._weights * (of_digit == digit)).sum(axis=1)
             mine = np.flatnonzero(share > 0.0)
-            near = np.isin(digits[capsules.bones], (digit, digits[PALM]))
+            near = np.isin(DIGIT_OF_BONE[capsules.bones], (digit, DIGIT_OF_BONE[PALM]))
             radii = capsules.radii[near] * _FLESH
             own = _occluded_share(self.rest[mine], normals[mine], segments[near], radii)
             occluded[mine] += share[mine].astype(np.float32) * (own - occluded[mine])

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
 from gloves.fit import GloveFit
-from handsim.hand.shape import DIGIT_OF_BONE, DIGITS, NUM_JOINTS
+from handsim.hand.shape import DIGITS, NUM_JOINTS
 from handsim.kernels import kernel, move, velocity_of
 from track.association.digit_hypotheses import DigitModel, digit_ranges
 from track.association.frame_state import peak_log_odds
@@ -116,7 +116,7 @@ class HandState:
         self.rms = np.nan
         """RMS distance of its markers, biases removed [m]."""
         count = self.num_markers = hand.attachment.layout.num_markers
-        self.digits = DIGIT_OF_BONE[hand.attachment.main_bones]
+        self.digits = hand.attachment.digits
         """Digit of each marker (M,), -1 for the palm."""
         self.adapted = self.solver.hand
         """The hand as arrays, its markers shifted by their biases."""
@@ -264,7 +264,7 @@ class HandState:
     def resize(self, hand: GloveFit, origin: HandOrigin, keep: float) -> None:
         """Go on as the same hand of another size, with a share of the biases."""
         self.hand, self.solver, self._spread_model = hand, PoseSolver(hand), SpreadModel(hand, origin)
-        self.digits = DIGIT_OF_BONE[hand.attachment.main_bones]
+        self.digits = hand.attachment.digits
         self.adapted = self.solver.hand
         self._designed = self.adapted.positions[:, 0].copy()
         if not keep:

@@ -57,7 +57,7 @@ CONTACT_SPREAD: Final = 0.0007
 """Standard deviation of a pad's compression around `PAD_COMPRESSION` [m]; (noise / spread)^2 is lambda_2."""
 _LIMIT_SPREAD: Final = np.deg2rad(2.0)  # of an angle beyond its range
 _GESTURES: Final = 4.0  # that a capture counts as, however many frames it has: they are much alike
-# All angles of a capture may differ from the gestures by so many of their standard deviations.
+# A user's mean angles differ from the mean of the gestures by this many standard deviations of the gestures.
 _OFF_GESTURES: Final = np.repeat([1.0, 0.25], [4, 16])  # thumbs at work are held otherwise
 RELINEARIZE: Final = 0.005  # change of a parameter (log lengths, [rad], [m]) that renews the skin's jacobian
 _DIFFERENCE_STEP: Final = 1e-5  # of finite differences

@@ -24,7 +24,7 @@ from gloves.fit import Attachment, GloveFit
 from gloves.takes.points import Status
 from handsim.errors import CalibrationError
 from handsim.hand.model import HandModel, build_skeleton
-from handsim.hand.shape import DIGIT_OF_BONE, DIGITS, JOINT_NAMES, NUM_JOINTS, PALM, HandShape, Side
+from handsim.hand.shape import DIGITS, JOINT_NAMES, NUM_JOINTS, PALM, HandShape, Side
 from handsim.hand.skin import rest_vertices
 from handsim.space.transforms import MIRROR, quaternion_matrix, rigid_fit
 from track.calibration.energy import (
@@ -362,7 +362,7 @@ def usable_frames(markers: Float[np.ndarray, "T M 3"], hand: GloveFit) -> NDArra
 def complete_digits(markers: Float[np.ndarray, "T M 3"], attachment: Attachment) -> Bool[np.ndarray, "T 5"]:
     """Whether all markers of a digit are seen."""
     present = np.isfinite(markers[..., 0])
-    digits = DIGIT_OF_BONE[attachment.main_bones]
+    digits = attachment.digits
     return np.stack([present[:, digits == digit].all(axis=1) for digit in range(len(DIGITS))], axis=1)
 
 
