@@ -26,9 +26,10 @@ from handsim.space.camera import Camera
 from handsim.space.rig_formats import load_cameras
 from render.captions import draw_keypoints
 from render.config import RenderConfig
+from render.film.bundle import FoundFrame
 from render.film.detector import FoundHand, HandDetector
 from render.film.page import write_film_page
-from render.film.registration import FoundFrame, Registration, register
+from render.film.registration import Registration, register
 from render.formats.writer import WRITERS
 from render.frames import Bytes
 from render.illustrations import write_video

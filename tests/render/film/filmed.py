@@ -15,8 +15,8 @@ from handsim.hand.model import between_poses
 from handsim.hand.shape import Side
 from handsim.space.camera import camera_matrix
 from handsim.space.transforms import rigid
+from render.film.bundle import FoundFrame
 from render.film.detector import FoundHand
-from render.film.registration import FoundFrame
 
 SIZE = (640, 480)
 OTHER: dict[Side, Side] = {"left": "right", "right": "left"}

@@ -1,0 +1,355 @@
+"""`Bundle`: clock, lens and poses of a camera, adjusted to the hands that a detector found in its video."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import cv2
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from gloves.takes.take import Take
+from handsim.hand.model import KEYPOINT_BONES
+from handsim.hand.shape import NUM_KEYPOINTS, SIDES
+from handsim.space.camera import Camera, brown_lens, camera_matrix
+from handsim.space.transforms import rigid
+from render.frames import Doubles, Flags, Integers
+
+if TYPE_CHECKING:
+    from render.film.detector import FoundHand
+
+_MAX_GAP: Final = 0.1  # [s] that poses are interpolated over
+FEWEST_KEYPOINTS: Final = 8  # of a hand in a frame, to say whether it fits
+_SURE: Final = 0.25  # least score of a keypoint
+MOST_BUNDLED: Final = 5000  # keypoints in a bundle, and in the last one
+_ROBUST: Final = 2.0  # [noise] from which on residuals count less
+_BLOCK: Final = 0.5  # [s] within which residuals count as dependent
+_DEPENDENT: Final = 16.0  # number of keypoints that tell as much as one whose error is its own
+_MIRROR: Final = np.array([[1.0, 1.0, 1.0], [1.0, -1.0, 1.0]])  # of a right and a left hand's bones
+
+# The unknowns, before six of the pose of each span, and the standard deviation that each has beforehand.
+OFFSET, DRIFT, READOUT, FOCAL, _CENTER, _LENS, _BIAS, POSES = 0, 1, 2, 3, 4, 6, 8, 8 + 3 * NUM_KEYPOINTS
+_PRIORS: Final = np.concatenate([
+    [np.inf, 1e-4, 0.015, 0.7, 0.005, 0.005, 0.05, 0.05], np.full(3 * NUM_KEYPOINTS, 0.004)
+])  # fmt: skip
+
+
+class FoundFrame(NamedTuple):
+    """The hands that a detector found in a frame of a video."""
+
+    number: int
+    time: float
+    """In the video [s]."""
+    hands: Sequence[FoundHand]
+
+
+class Motion:
+    """Keypoints of a take's hands at any time, and how their bones are turned."""
+
+    def __init__(self, take: Take) -> None:
+        self.times, self.num_hands = take.times, len(take.hands)
+        self._points, self._hands, self._qpos = take.keypoints(), take.hands, take.qpos
+        self.sides = np.array([SIDES.index(side) for side in take.sides])
+        self.mirrors = _MIRROR[[0 if side == "right" else 1 for side in take.sides]]
+
+    def at(self, times: Doubles) -> tuple[Doubles, Doubles]:
+        """Keypoints (N, H, 21, 3) [m] and their velocities [m/s]; NaN where the take has none."""
+        before = np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, max(len(self.times) - 2, 0))
+        after = np.minimum(before + 1, len(self.times) - 1)
+        step = self.times[after] - self.times[before]
+        gap = (step > _MAX_GAP) | (times < self.times[0]) | (times > self.times[-1])
+        step = np.where(gap | (step <= 0.0), np.nan, step)[:, None, None, None]
+        first = self._points[before]
+        velocities = (self._points[after] - first) / step
+        return first + velocities * (times - self.times[before])[:, None, None, None], velocities
+
+    def rotations(self, times: Doubles) -> Doubles:
+        """Rotations (N, H, 21, 3, 3) of the keypoints' bones in the frames nearest to some times."""
+        nearest = np.clip(np.searchsorted(self.times, times), 0, len(self.times) - 1)
+        turned = np.full((len(times), self.num_hands, NUM_KEYPOINTS, 3, 3), np.nan)
+        for number, hand in enumerate(self._hands):
+            there = np.isfinite(self._qpos[nearest, number, 0])
+            bones = hand.model.forward_kinematics(self._qpos[nearest[there], number])
+            turned[there, number] = bones[:, list(KEYPOINT_BONES), :3, :3]
+        return turned
+
+
+class Detections(NamedTuple):
+    """All detections of a video: D hands in F frames."""
+
+    times: Doubles
+    """(F,)."""
+    frames: Integers
+    """(D,)."""
+    sides: Integers
+    """(D,), as in `SIDES`."""
+    confidence: Doubles
+    """(D,)."""
+    pixels: Doubles
+    """(D, 21, 2)."""
+    weights: Doubles
+    """(D, 21); 0 for keypoints that are not sure."""
+
+    @classmethod
+    def of(cls, found: Sequence[FoundFrame]) -> Detections:
+        """The detections in the frames of a video."""
+        hands = [(index, hand) for index, frame in enumerate(found) for hand in frame.hands]
+        scores = np.array([hand.scores for _, hand in hands], dtype=np.float64).reshape(-1, NUM_KEYPOINTS)
+        return cls(
+            np.array([frame.time for frame in found]),
+            np.array([index for index, _ in hands], dtype=np.int64),
+            np.array([SIDES.index(hand.side) for _, hand in hands], dtype=np.int64),
+            np.array([hand.confidence for _, hand in hands], dtype=np.float64),
+            np.array([hand.keypoints for _, hand in hands], dtype=np.float64).reshape(-1, NUM_KEYPOINTS, 2),
+            np.where(scores >= _SURE, np.sqrt(np.clip(scores, 0.0, 1.0)), 0.0),
+        )
+
+
+class Matches(NamedTuple):
+    """Which detection shows each hand of the take in each frame, or -1."""
+
+    numbers: Integers
+    """(F, H)."""
+    distances: Doubles
+    """(F, H): median distance of its keypoints from the take's [px]."""
+
+
+class Samples(NamedTuple):
+    """Keypoints that a bundle explains."""
+
+    frames: Integers
+    hands: Integers
+    keypoints: Integers
+    pixels: Doubles
+    weights: Doubles
+
+
+class Bundle:
+    """Clock, lens and poses of a camera, from keypoints in its pictures."""
+
+    def __init__(
+        self, motion: Motion, found: Detections, size: tuple[int, int], given: Camera | None
+    ) -> None:
+        self.motion, self.found, self.size = motion, found, size
+        self.given, self._middle = given, float(np.median(found.times))
+        if given is not None:  # the pictures of a pinhole camera with this matrix
+            rays = given.unproject(found.pixels)
+            pixels = rays[..., :2] / rays[..., 2:] * given.K[[0, 1], [0, 1]] + given.K[:2, 2]
+            seen = np.isfinite(pixels).all(axis=-1) & (rays[..., 2] > 0.0)
+            self.found = found._replace(
+                pixels=np.where(seen[..., None], pixels, 0.0), weights=np.where(seen, found.weights, 0.0)
+            )
+
+    def clock(self, unknowns: Doubles) -> tuple[float, float]:
+        """Offset [s] and drift of the take's time over the video's."""
+        return float(unknowns[OFFSET] - unknowns[DRIFT] * self._middle), float(unknowns[DRIFT])
+
+    def times(self, unknowns: Doubles) -> Doubles:
+        """Times of the frames in the take [s]."""
+        offset, drift = self.clock(unknowns)
+        return offset + (1.0 + drift) * self.found.times
+
+    def matrix(self, unknowns: Doubles) -> Doubles:
+        """K."""
+        if self.given is not None:
+            return self.given.K
+        width, height = self.size
+        focal = width * np.exp(unknowns[FOCAL])
+        center = 0.5 * np.array([width, height]) + width * unknowns[_CENTER : _CENTER + 2]
+        return camera_matrix(focal, focal, *center)
+
+    def free(self, num_spans: int, *, first: bool = False) -> Flags:
+        """The unknowns that are looked for; `first`, before the lens and the bones' offsets."""
+        free = np.ones(POSES + 6 * num_spans, dtype=bool)
+        free[FOCAL:_BIAS] = self.given is None
+        if first:
+            free[[DRIFT, READOUT]] = False
+            free[_CENTER:POSES] = False
+        return free
+
+    def camera(self, unknowns: Doubles, span: int) -> Camera:
+        """The camera of a span."""
+        pose = unknowns[POSES + 6 * span :][:6]
+        rotation = Rotation.from_rotvec(pose[:3]).as_matrix()
+        place = rigid(rotation.T, -rotation.T @ pose[3:])
+        name = "film" if span == 0 else f"film{span + 1}"
+        if self.given is not None:
+            return Camera(name, self.size, self.given.K, place, self.given.lens)
+        k1, k2 = unknowns[_LENS : _LENS + 2]
+        return Camera(name, self.size, self.matrix(unknowns), place, brown_lens(k1, k2, 0.0, 0.0, 0.0))
+
+    def project(self, unknowns: Doubles, points: Doubles, span: int) -> tuple[Doubles, Doubles]:
+        """Pixels (N, 2) of points (N, 3), and their derivatives (N, 2, 15) as OpenCV orders them."""
+        pose = unknowns[POSES + 6 * span :][:6]
+        lens = np.zeros(5)
+        lens[:2] = unknowns[_LENS : _LENS + 2] if self.given is None else 0.0
+        if not len(points):
+            return np.empty((0, 2)), np.empty((0, 2, 15))
+        pixels, jacobian = cv2.projectPoints(
+            np.ascontiguousarray(points)[:, None], pose[:3], pose[3:], self.matrix(unknowns), lens
+        )
+        return pixels[:, 0], jacobian.reshape(-1, 2, 15)
+
+    def match(self, unknowns: Doubles, starts: Sequence[int], gate: float) -> Matches:
+        """The detections nearest to the hands of the take, within a median distance [px]."""
+        found, points = self.found, self.motion.at(self.times(unknowns))[0]
+        pixels = self.pictured(unknowns, points, starts)
+        index = np.full(points.shape[:2], -1)
+        distances = np.full(points.shape[:2], np.inf)
+        for number, frame in enumerate(found.frames):
+            sure = found.weights[number] > 0.0
+            if sure.sum() < FEWEST_KEYPOINTS:
+                continue
+            away = np.linalg.norm(pixels[frame][:, sure] - found.pixels[number, sure], axis=-1)
+            away = np.median(np.where(np.isfinite(away), away, np.inf), axis=1)
+            hand = int(away.argmin())
+            if away[hand] < min(gate, distances[frame, hand]):
+                index[frame, hand], distances[frame, hand] = number, away[hand]
+        return Matches(index, np.where(index >= 0, distances, np.nan))
+
+    def pictured(self, unknowns: Doubles, points: Doubles, starts: Sequence[int]) -> Doubles:
+        """Pixels of keypoints (F, H, 21, 3) by each frame's span; NaN where unknown or behind the camera."""
+        pixels = np.full((*points.shape[:-1], 2), np.nan)
+        spans = np.searchsorted(starts, np.arange(len(points)), side="right") - 1
+        for span in range(len(starts)):
+            pose = unknowns[POSES + 6 * span :][:6]
+            ahead = (points @ Rotation.from_rotvec(pose[:3]).as_matrix()[2] + pose[5]) > 0.05
+            mine = ahead & (spans == span)[:, None, None]
+            pixels[mine] = self.project(unknowns, points[mine], span)[0]
+        return pixels
+
+    def samples(self, matches: Matches, most: int = MOST_BUNDLED) -> Samples:
+        """The keypoints of matched hands, evenly thinned out over time to `most`."""
+        frames, hands = np.nonzero(matches.numbers >= 0)
+        number = matches.numbers[frames, hands]
+        rows, keypoints = np.nonzero(self.found.weights[number] > 0.0)
+        total = max(len(rows), 1)
+        if total > most:  # whole hands
+            kept = np.unique(np.linspace(0, len(frames) - 1, max(1, len(frames) * most // total)).astype(int))
+            chosen = np.isin(rows, kept)
+            rows, keypoints = rows[chosen], keypoints[chosen]
+        return Samples(
+            frames[rows], hands[rows], keypoints,
+            self.found.pixels[number[rows], keypoints], self.found.weights[number[rows], keypoints],
+        )  # fmt: skip
+
+    def solve(
+        self,
+        start: Doubles,
+        samples: Samples,
+        starts: Sequence[int],
+        noise: float,
+        *,
+        first: bool = False,
+    ) -> tuple[Doubles, float, Doubles]:
+        """Unknowns, their cost per keypoint, and their covariance, where keypoints are `noise` [px] off."""
+        spans = np.searchsorted(starts, samples.frames, side="right") - 1
+        free = self.free(len(starts), first=first)
+        rotations = None if first else self._turned(start, samples)
+        priors = np.concatenate([_PRIORS, np.full(len(start) - POSES, np.inf)])
+        center = np.zeros(len(start))
+        center[FOCAL] = 0.1
+        held = free & np.isfinite(priors)
+        weights = np.where(held, np.sqrt(_DEPENDENT) / priors, 0.0)
+        scale = np.where(np.isfinite(priors), priors, 0.1)
+
+        def linearized(part: Doubles) -> tuple[Doubles, Doubles]:
+            unknowns = start.copy()
+            unknowns[free] = part
+            return self._residuals(unknowns, samples, spans, rotations, noise)
+
+        def residuals(part: Doubles) -> Doubles:
+            prior = np.zeros(len(start))
+            prior[free] = part
+            prior = ((prior - center) * weights)[held]
+            return np.concatenate([linearized(part)[0].ravel(), prior])
+
+        def jacobian(part: Doubles) -> Doubles:
+            prior = np.diag(weights)[held]
+            rows = linearized(part)[1].reshape(-1, len(start))
+            return np.concatenate([rows, prior])[:, free]
+
+        done = least_squares(
+            residuals,
+            start[free],
+            jacobian,
+            loss="cauchy",
+            f_scale=_ROBUST,
+            x_scale=scale[free],
+            max_nfev=40,
+            xtol=1e-6,
+            ftol=1e-6,
+        )
+        unknowns = start.copy()
+        unknowns[free] = done.x
+        covariance = np.zeros((len(start), len(start)))
+        if not first:
+            left, rows = linearized(done.x)
+            told = self._covariance(left, rows[..., free], weights[free] ** 2, samples.frames)
+            covariance[np.ix_(free, free)] = told
+        return unknowns, 2.0 * float(done.cost) / max(len(samples.frames), 1), covariance
+
+    def _turned(self, unknowns: Doubles, samples: Samples) -> Doubles:
+        """The sampled keypoints' bones (N, 3, 3), mirrored for left hands."""
+        frames, rows = np.unique(samples.frames, return_inverse=True)
+        rotations = self.motion.rotations(self.times(unknowns)[frames])
+        found = rotations[rows, samples.hands, samples.keypoints]
+        return np.asarray(np.nan_to_num(found) * self.motion.mirrors[samples.hands][:, None])
+
+    def _residuals(
+        self, unknowns: Doubles, samples: Samples, spans: Integers, rotations: Doubles | None, noise: float
+    ) -> tuple[Doubles, Doubles]:
+        """Differences (N, 2) in units of the noise, and their derivatives (N, 2, U); 0 without a pose."""
+        points, velocities = (one[samples.frames, samples.hands, samples.keypoints]
+                              for one in self.motion.at(self.times(unknowns)))  # fmt: skip
+        row = samples.pixels[:, 1] / self.size[1] - 0.5
+        points = points + velocities * (unknowns[READOUT] * row)[:, None]
+        if rotations is not None:
+            bias = unknowns[_BIAS:POSES].reshape(-1, 3)[samples.keypoints]
+            points = points + np.einsum("nij,nj->ni", rotations, bias)
+        residuals = np.zeros((len(points), 2))
+        jacobian = np.zeros((len(points), 2, len(unknowns)))
+        there = np.isfinite(points).all(axis=1)
+        for span in np.unique(spans):
+            mine = np.flatnonzero(there & (spans == span))
+            pixels, derivatives = self.project(unknowns, points[mine], span)
+            first = POSES + 6 * span
+            rotation = Rotation.from_rotvec(unknowns[first : first + 3]).as_matrix()
+            by_point = derivatives[:, :, 3:6] @ rotation
+            by_time = np.einsum("nij,nj->ni", by_point, velocities[mine])
+            # Unequal weights make a plain sum of squares of the residuals.
+            weight = (samples.weights[mine] / noise)[:, None]
+            residuals[mine] = weight * (pixels - samples.pixels[mine])
+            part = np.zeros((len(mine), 2, len(unknowns)))
+            part[:, :, OFFSET] = by_time
+            part[:, :, DRIFT] = by_time * (self.found.times[samples.frames[mine]] - self._middle)[:, None]
+            part[:, :, READOUT] = by_time * row[mine, None]
+            if self.given is None:
+                focal = self.matrix(unknowns)[0, 0]
+                part[:, :, FOCAL] = derivatives[:, :, 6:8].sum(axis=2) * focal
+                part[:, :, _CENTER:_LENS] = derivatives[:, :, 8:10] * self.size[0]
+                part[:, :, _LENS:_BIAS] = derivatives[:, :, 10:12]
+            if rotations is not None:
+                by_bias = by_point @ rotations[mine]
+                columns = _BIAS + 3 * samples.keypoints[mine, None] + np.arange(3)
+                np.put_along_axis(part, np.broadcast_to(columns[:, None], by_bias.shape), by_bias, axis=2)
+            part[:, :, first : first + 6] = derivatives[:, :, :6]
+            jacobian[mine] = weight[..., None] * part
+        return residuals, jacobian
+
+    def _covariance(
+        self, residuals: Doubles, jacobian: Doubles, priors: Doubles, frames: Integers
+    ) -> Doubles:
+        """Covariance of the unknowns; residuals within a block of time are dependent, those of others not."""
+        weights = 1.0 / (1.0 + (residuals / _ROBUST) ** 2)
+        rows = jacobian.reshape(-1, jacobian.shape[-1])
+        information = (rows * weights.reshape(-1, 1)).T @ rows + np.diag(priors)
+        gradients = (jacobian * (weights * residuals)[..., None]).sum(axis=1)
+        blocks = np.floor(self.found.times[frames] / _BLOCK).astype(np.int64)
+        order = np.argsort(blocks, kind="stable")
+        firsts = np.flatnonzero(np.diff(blocks[order], prepend=blocks.min() - 1))
+        gradients = np.add.reduceat(gradients[order], firsts, axis=0)
+        inverse = np.linalg.pinv(information)
+        return np.asarray(inverse @ (gradients.T @ gradients + _DEPENDENT * np.diag(priors)) @ inverse)
