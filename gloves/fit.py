@@ -24,15 +24,15 @@ from handsim.space.rig import CameraRig
 from handsim.space.transforms import MIRROR
 
 _WIDTHS: Final = {"points": 3, "normals": 3, "bone_indices": 4, "bone_weights": 4}
-_MAX_NUMBER: Final = 100.0  # of positions [m], directions and indices of bones
-_SUM_TOLERANCE: Final = 1e-6
-_NORMAL_TOLERANCE: Final = 1e-3  # of the unit length
-# The digits of the palm's capsules: the fingers' metacarpals, and the wrist for the thumb.
+_MAX_NUMBER: Final = 100.0  # Larger positions [m], directions or bone indices are refused.
+_SUM_TOLERANCE: Final = 1e-6  # The bone weights of a marker sum to one within this.
+_NORMAL_TOLERANCE: Final = 1e-3  # Normals have unit length within this.
+# The digit of each palm capsule: a metacarpal counts to its finger, the wrist to the thumb.
 _PALM_DIGITS: Final = np.array([1, 2, 3, 4, 0, 0])
-# From the wanted place of a marker (1) back to where it was designed (0), and to the middle of its bone (-1).
+# Places tried for a marker, in this order: wanted (1), designed (0), middle of its bone's back (-1).
 _WAY_BACK: Final = (1.0, 0.75, 0.5, 0.25, 0.0, -0.125, -0.25, -0.375, -0.5, -0.625, -0.75, -0.875, -1.0)
-_LONGEST_SLIP: Final = 0.025  # [m]
-_SLACK: Final = 1e-9  # of barycentric weights, so that a ray through an edge meets a face
+_LONGEST_SLIP: Final = 0.025  # A random shift moves a marker at most this far [m].
+_SLACK: Final = 1e-9  # Tolerance of barycentric weights, so that a ray through an edge hits a face.
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -107,7 +107,7 @@ class Attachment:
     def _carried(
         self, model: HandModel, T_world_bone: NDArray[np.float64], rest: NDArray[np.float64], last: float
     ) -> NDArray[np.float64]:
-        """Points (`last` 1) or directions (0) at the markers, blended over the bones in one product."""
+        """Move rest points (`last` 1) or directions (`last` 0) with their bones: (T, M, 3) in the world."""
         inverse = np.linalg.inv(model.rest_transforms)
         local = np.einsum("lij,mj->mli", inverse, np.insert(rest, 3, last, axis=1))
         weights = np.zeros(local.shape[:2])
@@ -171,7 +171,7 @@ def _put_on(
     distances[missed] = 0.0
     bary[missed] = 1.0 / 3.0
     corners = surface.faces[faces]
-    # Skin normals of a few vertices, from the faces around them alone.
+    # Compute the skin normals only at the vertices under markers.
     needed = np.zeros(len(surface.vertices), dtype=np.bool_)
     needed[corners] = True
     around = surface.faces[needed[surface.faces].any(axis=1)]
@@ -179,7 +179,7 @@ def _put_on(
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     feet = origins + distances[:, None] * directions
     points = feet + layout.heights[:, None] * normals
-    full = np.zeros((len(corners), len(BONE_NAMES)))  # skin weights between three vertices each
+    full = np.zeros((len(corners), len(BONE_NAMES)))  # skin weights, interpolated over each face's vertices
     for corner in range(3):
         vertex = corners[:, corner]
         shares = bary[:, corner, None] * surface.bone_weights[vertex]
@@ -201,12 +201,12 @@ def _other_digits(
     carriers: NDArray[np.int64],
     model: HandModel,
 ) -> list[str]:
-    """For each marker the bone of another digit that carries it or is nearest on the flat hand, "" for none.
+    """Per marker, the bone of another digit that carries it or is nearest on the flat hand; "" for none.
 
-    A finger's metacarpal counts as the finger's for its own markers, and as the palm's for the palm's; a
-    thumb's marker may lie over the index finger's metacarpal and the wrist. What the palm carries more than
-    any other bone, such as the skin over the thumb's muscle and the knuckles, is the palm's. The end of a
-    stalk may not be inside another digit.
+    A metacarpal counts to its finger for markers of that finger, and to the palm for markers of the palm. A
+    thumb's marker may lie over the index finger's metacarpal and the wrist. Skin that the palm carries more
+    than any other bone, as over the thumb's muscle and the knuckles, counts to the palm. The end of a stalk
+    may not be inside another digit.
 
     Args:
         feet: The places under the markers on the skin (M, 3) [m].
@@ -269,8 +269,8 @@ def wear(
 ) -> Attachment:
     """Put on a glove with random shifts (`vary_layout`).
 
-    A shift is shortened until it carries its marker neither off the skin of its digit nor far over the hand,
-    as from the palm around the thumb's muscle.
+    A shift is shortened until its marker is on the skin of its digit and within `_LONGEST_SLIP` of its
+    designed point.
     """
     wanted, designed = (
         vary_layout(layout, along=along, around=around, rng=rng),
@@ -280,9 +280,9 @@ def wear(
 
 
 def settle_glove(layout: MarkerLayout, model: HandModel) -> GloveFit:
-    """Put a glove on a hand of any proportions: as designed where the skin of each marker's digit reaches.
+    """Put a glove on a hand of any proportions, as designed where that is possible.
 
-    A marker that would lie on another digit of this hand moves towards the middle of its bone's back.
+    A marker that would not lie on its own digit moves towards the middle of its bone's back.
     """
     return GloveFit(model, _settled(layout, layout, model))
 
@@ -293,7 +293,7 @@ def _settled(
     model: HandModel,
     designed: Float[np.ndarray, "M 3"] | None = None,
 ) -> Attachment:
-    """The glove with each marker at its wanted place, or on the way from there to its place in a layout.
+    """The glove with each marker at the first place of `_WAY_BACK` that is on the skin of its digit.
 
     Markers are within `_LONGEST_SLIP` of the `designed` points [m], if these are given.
     """
@@ -350,9 +350,9 @@ def _exits(origins: Any, directions: Any, vertices: Any, faces: Any) -> Any:
             corners[i, f] = corner[i]
             first[i] = vertices[faces[f, 1], i] - corner[i]
             second[i] = vertices[faces[f, 2], i] - corner[i]
-        # A line through a triangle comes nearer to its first corner than the longer edge there.
+        # A line that meets a triangle passes its first corner within the longer of the edges there.
         reach[f] = 1.01 * max(_dot(first, first), _dot(second, second))
-    away = np.empty(len(faces))  # by how much more a line passes the first corner, squared; in one plain loop
+    away = np.empty(len(faces))  # squared distance of the line from each first corner, less `reach`
     for r in range(len(origins)):
         x, y, z = origins[r]
         dx, dy, dz = directions[r]
@@ -370,7 +370,7 @@ def _exits(origins: Any, directions: Any, vertices: Any, faces: Any) -> Any:
                 offset[i] = origins[r, i] - corner[i]
             _cross(directions[r], second, across)
             determinant = _dot(first, across)
-            if determinant >= 0.0:  # on the way in, or along the face
+            if determinant >= 0.0:  # the ray enters the skin here, or runs along the face
                 continue
             _cross(offset, first, turned)
             u, v = _dot(offset, across) / determinant, _dot(turned, directions[r]) / determinant
@@ -528,9 +528,9 @@ def nearest_markers(fit: GloveFit) -> tuple[str, str, float]:
 _STEPS: Final = 12
 _CONVERGED: Final = 1e-5  # [m] distance of a marker from its target
 _STALK_CONVERGED: Final = 2e-4  # [m] distance of a stalk's axis from its target
-_ACCEPTED: Final = 5e-4  # [m] distance at which a marker keeps its bone
-_CURVATURE_RADIUS: Final = 0.006  # of the skin of a finger's tip [m]
-_SPACING: Final = 4e-3  # [m] of the skin's vertices, roughly
+_ACCEPTED: Final = 5e-4  # A marker keeps its bone if it comes this near to its target [m].
+_CURVATURE_RADIUS: Final = 0.006  # radius of curvature of a fingertip's skin [m]
+_SPACING: Final = 4e-3  # rough distance between neighboring skin vertices [m]
 
 
 def place_marker(
@@ -576,7 +576,7 @@ def _place_on(
     height, wanted, start = layout.markers[index].height, center, model.rest_transforms[bone]
     middle = start[:3, 3] + 0.5 * model.skeleton.lengths[bone] * start[:3, 0]
     best, least = layout, math.inf
-    for _ in range(_STEPS):  # the center is one radius off the skin, not along the ray that finds the skin
+    for _ in range(_STEPS):  # the center lies on the skin's normal, not on the ray that finds the skin
         moved = dataclasses.replace(_place(layout.markers[index], bone, model, wanted), height=height)
         markers = (*layout.markers[:index], moved, *layout.markers[index + 1 :])
         candidate = dataclasses.replace(layout, markers=markers)

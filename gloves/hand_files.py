@@ -1,4 +1,4 @@
-"""A hand that does not move, for others: a MuJoCo or OpenSim model, a URDF, a rigged mesh, or its skin."""
+"""Files of a hand in the flat pose: a MuJoCo or OpenSim model, a URDF, a rigged mesh, or its skin."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def write_hand(
         up: The axis of that pose's world that points up.
 
     Raises:
-        ArgumentError: The name ends otherwise, or servos are asked for in a file that has none.
+        ArgumentError: The file has another ending, or servos are asked for in a file other than .xml.
         OSError: The file cannot be written.
     """
     suffix = path.suffix.lower()
@@ -55,7 +55,7 @@ def write_hand(
     if actuators and suffix != ".xml":
         raise ArgumentError(f"cannot write servos to '{path}', expected a name that ends in .xml")
     model = hand.model if isinstance(hand, GloveFit) else hand
-    if suffix == ".glb":  # a take has gloves; the file has none
+    if suffix == ".glb":  # a take needs a glove, which the file does not show
         worn = hand if isinstance(hand, GloveFit) else attach(load_layout(_USUAL_GLOVE), model)
         flat = join_qpos(np.zeros((1, NUM_JOINTS)))
         Take.of_poses([worn], flat[:, None], rate=1.0).export(path)
@@ -71,9 +71,9 @@ def write_hand(
         spec = build_spec(model.skeleton, model.capsules, sites=sites, actuators=actuators)
         import mujoco
 
-        spec.compile()  # fills in what the XML writer asks for
+        spec.compile()  # the XML writer needs a compiled spec
         temporary.write_text(spec.to_xml(), "utf-8")
-        mujoco.MjModel.from_xml_string(temporary.read_text("utf-8"))  # before it takes its name
+        mujoco.MjModel.from_xml_string(temporary.read_text("utf-8"))  # check before the file gets its name
 
 
 def write_skin(path: Path, model: HandModel) -> None:

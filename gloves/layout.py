@@ -179,7 +179,7 @@ class MarkerLayout:
         return self.radius + np.array([marker.height for marker in self.markers])
 
     def check_side(self, side: Side) -> None:
-        """Refuse a hand that the glove does not fit by a `LayoutError`."""
+        """Raise a `LayoutError` if the glove does not fit hands of this side."""
         if side not in self.sides:
             raise LayoutError(
                 f"glove '{self.name}' is for a {self.sides[0]} hand only (its file's `sides`), and a {side} "
@@ -218,16 +218,16 @@ def list_layouts() -> tuple[str, ...]:
 
 
 def load_layout(glove: MarkerLayout | str | Path) -> MarkerLayout:
-    """A shipped layout by its name, or your own by the path of its `.toml` file; a layout as it is.
+    """A shipped layout by its name, or your own by the path of its `.toml` file.
 
     The file has the marker radius in [mm] and angles in [deg]; the layout has them in [m] and [rad].
     `handsim glove new FILE` writes a commented file to begin with.
 
     Args:
-        glove: A layout; `dense19`, `sparse13` or another shipped name; or a path.
+        glove: `dense19`, `sparse13` or another shipped name; a path; or a layout, which is returned as it is.
 
     Raises:
-        ArgumentError: It is none of these.
+        ArgumentError: `glove` has another type.
         LayoutError: No such layout or file, or the file does not describe one; the message names the file.
     """
     if isinstance(glove, MarkerLayout):

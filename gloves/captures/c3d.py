@@ -40,7 +40,7 @@ FLOAT_DTYPES: Final = {_INTEL: "<f4", _DEC: "<u4", _SGI: ">f4"}  # DEC floats ar
 BLOCK: Final = 512
 _CHARACTER, _BYTE, _INTEGER, _FLOAT = -1, 1, 2, 4
 _GROUPS: Final = {"POINT", "ANALOG", "TRIAL"}  # groups that locate the points; damage to others is ignored
-_MAX_BYTES: Final = 1 << 22  # of all values together; damaged records may overlap and state far more
+_MAX_BYTES: Final = 1 << 22  # All values fit into this; damaged records may overlap and state far more.
 _MAX_RECORD: Final = 1 << 17  # bytes; records are chained by 16-bit offsets
 
 
@@ -110,7 +110,7 @@ def _records(data: bytes, at: int, processor: int, tell: Tell) -> Iterator[tuple
     order: Literal["little", "big"] = "big" if processor == _SGI else "little"
     view = memoryview(data)
     points_at = (int.from_bytes(data[16:18], order) - 1) * BLOCK
-    end = points_at if points_at > at else len(data)  # of the section
+    end = points_at if points_at > at else len(data)  # end of the section
     while at + 2 <= len(data):
         name_length = abs(int.from_bytes(data[at : at + 1], "little", signed=True))
         group = int.from_bytes(data[at + 1 : at + 2], "little", signed=True)
@@ -159,7 +159,7 @@ def _text(raw: bytes) -> str:
         return raw.decode("latin-1")
 
 
-MOST_FRAMES: Final = 65535  # of a 16-bit count; longer takes state their length in TRIAL:ACTUAL_END_FIELD
+MOST_FRAMES: Final = 65535  # largest 16-bit count; longer takes state their length in ACTUAL_END_FIELD
 _MAX_PADDING: Final = 2 * BLOCK  # bytes after the last frame
 _SCALE_TOLERANCE: Final = 1e-3  # relative difference of the two scales of a file
 
@@ -279,7 +279,7 @@ def _analog_numbers(
     """Analog numbers per frame, which follow the points of each frame."""
     channels = int(parameters.number("ANALOG", "USED", default=0.0 if header.per_frame == 0 else -1.0))
     stated = header.per_frame
-    if channels < 0 or stated == channels * header.samples:  # negative: not stated
+    if channels < 0 or stated == channels * header.samples:  # ANALOG:USED is absent, or agrees
         return stated
     rates = [parameters.number(group, "RATE", default=0.0) for group in ("ANALOG", "POINT")]
     ratio = round(rates[0] / rates[1]) if rates[1] > 0.0 else 0
@@ -370,8 +370,8 @@ def read_c3d(data: bytes, tell: Tell = warn) -> Capture:
 def write_c3d(path: Path, capture: Capture, source: bytes | None = None) -> None:
     """Write float32 millimeters; a missing point gets residual -1.
 
-    All of a `source` is kept, the bytes of the C3D that the capture was made from, but points and rotations
-    (group ROTATION): analogs, events, first frame, parameters, and the unit, which its force plates have.
+    `source` holds the bytes of the C3D that the capture was read from. All of it but points and rotations
+    (group ROTATION) is kept: analogs, events, first frame, parameters, and the unit, used by force plates.
     The length of a take of more than 65,535 frames stands in TRIAL:ACTUAL_END_FIELD; programs that ignore
     this field, such as ezc3d 1.7, see the first 65,535 frames.
     """
@@ -403,12 +403,12 @@ def _unit(source: bytes) -> str:
 
 
 _OF_POINTS: Final = ("USED", "SCALE", "RATE", "FRAMES", "LONG_FRAMES", "UNITS", "LABELS", "DESCRIPTIONS")
-"""How parameters of the group POINT begin that state what the points are."""
+"""Prefixes of the parameters in group POINT that describe the points."""
 _EVENTS_AT: Final = slice(304, 376)  # bytes of the header with times of events; flags and labels follow
 
 
 def _with_source(written: bytes, num_frames: int, source: bytes) -> bytes:
-    """A written file with all of its source but the points: analogs, events, parameters, first frame."""
+    """The points of a written file with analogs, events, parameters and first frame of its source."""
     parameters = Parameters.parse(source, (source[0] - 1) * BLOCK, _silent)
     header = Header.parse(source, processor := parameters.processor)
     frames, num_points, scale = _read_frames(source, parameters, header, _silent)
@@ -443,7 +443,7 @@ def _with_source(written: bytes, num_frames: int, source: bytes) -> bytes:
 
 
 def _silent(text: str) -> None:
-    """What a source has that is odd was told when it was read."""
+    """Drop a warning: the user got it when the source was read."""
 
 
 def _data_start(group: int, block: int) -> bytes:
@@ -458,7 +458,7 @@ def _record(group: int, name: str, content: bytes) -> bytes:
 
 
 def _merged_records(written: bytes, source: bytes, processor: int) -> tuple[int, bytes]:
-    """Number of the group POINT, and all records of a source; of those that state points the written ones."""
+    """Number of the group POINT, and a source's records; those that describe points are the written ones."""
     merged: list[bytes] = []
     numbers: list[int] = []
     for data, kind in ((source, processor), (written, _INTEL)):
@@ -470,7 +470,7 @@ def _merged_records(written: bytes, source: bytes, processor: int) -> tuple[int,
         for group, name, content in records:
             is_point = groups.get(group) == "POINT"
             of_points = is_point and name.startswith(_OF_POINTS)
-            behind = rotated and groups.get(abs(group)) == "ROTATION"  # their numbers follow the frames
+            behind = rotated and groups.get(abs(group)) == "ROTATION"  # rotations follow the frames: dropped
             if of_points == (data is written) and not behind and not (is_point and name == "DATA_START"):
                 number = numbers[0] if of_points else group
                 try:

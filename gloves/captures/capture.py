@@ -1,6 +1,6 @@
-"""Marker files: trajectories at a frame rate, their gaps, labels, and mistakes of units and places.
+"""Trajectories of a marker file at a frame rate, their gaps and labels, and checks of unit and place.
 
-Gaps are counted as in Table 3 of Han et al. 2018, and per marker. Positions tell of a wrong unit or place.
+Table 3 of Han et al. 2018 counts the gaps that `run_lengths` measures.
 """
 
 from __future__ import annotations
@@ -148,8 +148,8 @@ AT_ORIGIN: Final = "all points are at the origin, (0, 0, 0)"
 """What errors say of clouds for which `all_at_origin` is true."""
 _MIN_SPAN: Final = 0.02  # [m]: smallest median span; a fist with five markers spans three times as much
 _MAX_SPACING: Final = 1.5  # [m]: largest median distance of a point from the nearest other one
-_MIN_POINTS: Final = 5  # from which a cloud shows its unit; fewer points may all be strays
-_MIN_FRAMES: Final = 10  # from which small or wide clouds count; a few frames may show strays alone
+_MIN_POINTS: Final = 5  # A cloud needs this many points to show its unit; fewer may all be strays.
+_MIN_FRAMES: Final = 10  # Small or wide clouds count in this many frames; fewer may show strays alone.
 _SAMPLED: Final = 200  # frames that are looked at, evenly spread
 
 

@@ -1,8 +1,8 @@
-"""What the coordinates in a file are: measured points, or else missing, held, doubled, or no marker's.
+"""Keep the measured points of a file, and drop missing, held and doubled ones and outputs of models.
 
 Programs write more than was measured. Gaps hold zeros or the last position, a marker of two subjects comes
 twice, outputs of models lie between the markers, and unlabeled points get a column for each piece of their
-path. Every format is settled here, once, and a sentence counts what was found.
+path. `settled` cleans a capture of any format, and `findings_sentence` counts what was found.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ _SENTENCES: Final = {
 """The kinds of findings, the keys of `Capture.findings`, in the order in which they are told."""
 _MODELED: Final = re.compile(r".(?:Angle|Force|Moment|Power|Scalar)s?$")
 """Names that Vicon's models give their outputs: RThumbAngles, LWristMoment."""
-_MIN_FRAMES: Final = 10  # from which repetitions count; fewer may agree by chance
-_NEVER_STILL: Final = 2e-5  # [m] in a frame: a marker that moves by more was not at rest in the frame before
-_COARSE: Final = 5e-6  # [m] of a grid on which markers at rest repeat their positions
-_GRID_STEPS: Final = 20.0  # of a grid, by which a marker at rest does not move in a frame
-_GRID_COUNT: Final = 10  # smallest steps of equal size that show a grid
+_MIN_FRAMES: Final = 10  # Repetitions count in this many frames; in fewer they may be chance.
+_NEVER_STILL: Final = 2e-5  # A marker that moves more than this in a frame [m] was not at rest before it.
+_COARSE: Final = 5e-6  # On a grid coarser than this [m], markers at rest repeat their positions.
+_GRID_STEPS: Final = 20.0  # A marker at rest moves by fewer grid steps than this in a frame.
+_GRID_COUNT: Final = 10  # This many smallest steps of equal size show a grid.
 _AT_REST: Final = 0.4  # A marker starts abruptly if its first step is more than this share of the second one.
 
 
@@ -51,7 +51,7 @@ def findings_sentence(findings: Mapping[str, int]) -> str:
 
 
 def settled(capture: Capture) -> Capture:
-    """The measured points of a capture as it was read, and in its findings what the others are."""
+    """The measured points of a capture; its findings count the others, by kind."""
     capture = without_outputs(capture)
     counts = {}
     capture, counts[_ZEROS] = zeros_as_missing(capture)
@@ -62,7 +62,7 @@ def settled(capture: Capture) -> Capture:
         if held.any():
             positions = np.where(held[..., None], np.nan, capture.positions)
             capture = dataclasses.replace(capture, positions=positions)
-    found = Counter(capture.findings) + Counter(counts)  # which leaves zeros out
+    found = Counter(capture.findings) + Counter(counts)  # the sum drops counts of zero
     return dataclasses.replace(capture, findings=dict(found))
 
 
@@ -97,7 +97,7 @@ def without_outputs(capture: Capture, listed: Sequence[str] = ()) -> Capture:
 
 
 def zeros_as_missing(capture: Capture) -> tuple[Capture, int]:
-    """A capture whose points at exactly (0, 0, 0) are missing, and how many they were.
+    """The capture with points at exactly (0, 0, 0) as missing, and their number.
 
     Some programs write zeros for what was not seen. A measured point is never exactly there twice; a capture
     in which nothing moves is left as it is.
@@ -113,13 +113,13 @@ def zeros_as_missing(capture: Capture) -> tuple[Capture, int]:
 
 
 def _once(capture: Capture) -> tuple[Capture, int]:
-    """The capture with one of all points at one place in a frame, and how many the others were.
+    """The capture without points that double another of their frame, and the number of doubles.
 
     Two columns that always agree where both have a point become one, with the points of both.
     """
     positions = capture.positions
     key = positions @ np.array([1.0, np.sqrt(2.0), np.sqrt(3.0)])  # equal for equal points
-    key[(positions == 0.0).all(axis=-1)] = np.nan  # of a capture in which nothing moves
+    key[(positions == 0.0).all(axis=-1)] = np.nan  # zeros that `zeros_as_missing` left are no doubles
     order = np.argsort(key, axis=1, kind="stable")
     ranked = np.take_along_axis(key, order, axis=1)
     frames, ranks = np.nonzero(ranked[:, 1:] == ranked[:, :-1])
@@ -130,7 +130,7 @@ def _once(capture: Capture) -> tuple[Capture, int]:
         return capture, 0
     positions = positions.copy()
     positions[frames, second] = np.nan
-    kept = np.arange(len(capture.names))  # the column that each column's points belong to
+    kept = np.arange(len(capture.names))  # the column that each column is merged into
     pairs, counts = np.unique(np.stack([first, second], axis=1), axis=0, return_counts=True)
     there = np.isfinite(key)
     for (one, other), count in zip(pairs.tolist(), counts.tolist(), strict=True):
@@ -145,7 +145,7 @@ def _once(capture: Capture) -> tuple[Capture, int]:
 
 
 def _held(positions: Float[np.ndarray, "T N 3"]) -> Bool[np.ndarray, "T N"]:
-    """Points of gaps that were filled with the last position, or with the first one before the marker came.
+    """Points that repeat the last position in a gap, or the first one before the marker appeared.
 
     Such a marker stops and starts abruptly. One that rests slows down and speeds up, and does not repeat its
     position to the last digit, unless the capture is simulated or its digits are few.
@@ -172,7 +172,7 @@ def _held(positions: Float[np.ndarray, "T N 3"]) -> Bool[np.ndarray, "T N"]:
     ]
     known = [np.isfinite(steps[at, columns]) for at in (first + 1, last + 2)]
     abruptly = [end > abrupt for end in ends]
-    if grid > _COARSE:  # a marker may rest here, and be stopped abruptly by what it touches
+    if grid > _COARSE:  # a marker at rest repeats its position, and may be stopped abruptly by an object
         held = (known[0] | known[1]) & (abruptly[0] | ~known[0]) & (abruptly[1] | ~known[1])
         held &= last > first + 1
     else:
@@ -182,11 +182,11 @@ def _held(positions: Float[np.ndarray, "T N 3"]) -> Bool[np.ndarray, "T N"]:
         others = np.concatenate([[0], np.cumsum(alive)])
         chosen = held & (others[last] > others[first])
         marks = np.zeros((num_frames + 1, num_columns), dtype=np.int32)
-        # before the marker came, all are held; otherwise the first was measured
+        # a run in the first frames is held throughout; in other runs the first point was measured
         marks[(first + (first > 0))[chosen], columns[chosen]] += 1
         marks[last[chosen] + 1, columns[chosen]] -= 1
         missing = np.cumsum(marks, axis=0)[:-1] > 0
-        alive |= missing[1:].any(axis=1)  # where nothing moves, all are held beside one that is
+        alive |= missing[1:].any(axis=1)  # if one point is held where nothing moves, all others are, too
     return missing
 
 

@@ -116,7 +116,7 @@ def _timed(read: Trajectories, times: StatedTimes, tell: Tell, outputs: int = 0)
 
 
 def _tabs_for_spaces(lines: list[bytes]) -> list[bytes]:
-    """The lines with tabs where spaces part the cells, between which a blank cell cannot be told."""
+    """Put tabs in place of spaces between cells; refuse rows whose blank cells spaces may hide."""
     spaced = [index for index, line in enumerate(lines) if TAB not in line and b" " in line.strip()]
     lines = list(lines)
     for index in spaced:
@@ -385,7 +385,7 @@ def _scales(
 ) -> tuple[int, NDArray[np.int64], NDArray[np.float64]]:
     """Index of the first row of numbers, the trajectories in units of length, and meters per unit of each."""
     cells = header_cells(lines[row], row + 1) if row < len(lines) else []
-    if cells and cells[0]:  # a frame's number
+    if cells and cells[0]:  # a frame number: there is no row of units
         tell("the file states no unit of length, read as millimeters, which Vicon's programs write")
         return row, columns, np.full(len(columns), meters_per("mm"))
     units = np.array([cells[column] if column < len(cells) else "" for column in columns])
@@ -399,7 +399,7 @@ def _scales(
 _BEGINS: Final = (b"NO_OF_FRAMES", b"FILE_VERSION")
 _KEY: Final = re.compile(rb"(?!NULL\t)[A-Z][A-Z0-9_]*(\t|$)")
 _QTM_LEADING: Final = ("frame", "time")
-_MAX_DIGITS: Final = 12  # of a count
+_MAX_DIGITS: Final = 12  # Counts are cut to this many digits.
 
 
 def read_qtm_tsv(data: bytes, tell: Tell = warn) -> Capture:
@@ -513,7 +513,7 @@ _UNREAD: Final = {
     **dict.fromkeys((".mot", ".sto", ".osim"), _OPENSIM),
     **dict.fromkeys((".bvh", ".fbx", ".amc", ".asf", ".htr", ".mvnx", ".glb"), _SKELETON),
 }
-"""What files of other programs are, and what would help, by their endings."""
+"""Descriptions of other programs' files and what to export instead, by ending."""
 _FOREIGN: Final = {
     _BEGIN.lower(): "the content of a TRC; name it .trc",
     MOTIVE_BEGIN.lower(): "the content of Motive's CSV; name it .csv",
@@ -524,7 +524,7 @@ _FOREIGN: Final = {
     b"<": "XML or a page of the web",
     b"{": "JSON",
 }
-"""What files are that begin so."""
+"""Descriptions of files, by the lower-case bytes that they begin with."""
 WRITABLE: Final = (".trc", ".c3d", ".csv")
 
 
@@ -532,7 +532,7 @@ def read_capture(capture: Capture | str | Path) -> Capture:
     """Read a `.trc` or `.c3d` file, a `.csv` of Motive or Vicon, or a `.tsv` of Qualisys.
 
     Args:
-        capture: The file, whose suffix decides the format; a `Capture` is given back.
+        capture: The file, whose suffix decides the format; a `Capture` is returned as it is.
 
     Returns:
         Positions (T, N, 3) in [m], whatever the file's unit, with one trajectory per column, and the rate
@@ -573,7 +573,7 @@ def read_capture(capture: Capture | str | Path) -> Capture:
 
 
 def _content_hint(data: bytes, error: str) -> str:
-    """What a file is that is not what its ending says, behind an error that says so."""
+    """If an error says that the content is of another format: a clause that names that format."""
     begin = data[:_FIRST_BYTES].removeprefix(codecs.BOM_UTF8).lstrip(_BLANKS).lower()
     found = next((text for word, text in _FOREIGN.items() if begin.startswith(word)), None)
     return f"; this is {found}" if found and error.startswith("not a ") else ""
@@ -604,7 +604,7 @@ def write_capture(path: str | Path, capture: Capture, *, source: str | Path | No
     Args:
         path: The file; its suffix decides the format.
         capture: Positions (T, N, 3) [m] at a rate [Hz].
-        source: The file of the points. If both are C3D, all else of it is kept: analogs, events, parameters.
+        source: The file the points came from; of a C3D, another C3D keeps analogs, events and parameters.
 
     Raises:
         ArgumentError: An argument is of another type.

@@ -1,4 +1,4 @@
-"""Trajectories of a wide table, in memory that goes with the number of points.
+"""Trajectories of a wide table, in memory proportional to its number of points.
 
 An optical system gives an unlabeled marker another number whenever it comes back, and its export another
 column. Such columns hold a piece of a path each, thousands a minute, and are packed into a few.
@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
-_FAMILY: Final = 100  # columns whose names differ by a number alone, from which they may be pieces
-_LITTLE: Final = 0.5  # share of the frames in which pieces have points
+_FAMILY: Final = 100  # More columns than this, with names that differ by a number alone, may be pieces.
+_LITTLE: Final = 0.5  # A piece has points in less than this share of the frames.
 
 
 def _pieces_of(names: Sequence[str], present: Float[np.ndarray, "N"]) -> Bool[np.ndarray, "N"]:
@@ -28,15 +28,15 @@ def _pieces_of(names: Sequence[str], present: Float[np.ndarray, "N"]) -> Bool[np
 
 
 def _packed(frames: Int[np.ndarray, "P"], columns: Int[np.ndarray, "P"]) -> tuple[NDArray[np.int64], int]:
-    """A place for each point (P,) among as few columns as possible, and the number of these.
+    """Assign points (P,) to as few columns as possible; returns these columns and their number.
 
-    A piece is an unbroken run of points of a column. A blank frame parts the pieces of a place.
+    A piece is an unbroken run of points of a column. A blank frame separates the pieces in a new column.
     """
     order = np.lexsort((frames, columns))
     frames, columns = frames[order], columns[order]
     begins = np.flatnonzero(np.diff(frames, prepend=-2) * (np.diff(columns, prepend=-1) == 0) != 1)
     ends = np.append(begins[1:], len(frames))
-    free: list[tuple[int, int]] = []  # the frame from which a place is free, and the place
+    free: list[tuple[int, int]] = []  # the frame from which a new column is free, and that column
     number, place = 0, np.empty(len(frames), dtype=np.int64)
     for piece in np.argsort(frames[begins], kind="stable").tolist():
         begin, end = begins[piece], ends[piece]
@@ -56,7 +56,7 @@ class Trajectories(NamedTuple):
 
     names: tuple[str, ...]
     positions: Float[np.ndarray, "T N 3"]
-    """[m], NaN where there is none."""
+    """Positions [m], NaN where there is none."""
     pieces: int = 0
     """Number of the file's columns that held pieces of paths and were packed into fewer."""
 
@@ -68,7 +68,7 @@ def packed_trajectories(
     columns: Int[np.ndarray, "P"],
     points: Float[np.ndarray, "P 3"],
 ) -> Trajectories:
-    """Trajectories of a list of points, those in pieces behind the others."""
+    """Trajectories of a list of points; columns packed from pieces come last."""
     share = np.bincount(columns, minlength=len(names)) / num_frames
     in_pieces = _pieces_of(names, share)
     whole = np.flatnonzero(~in_pieces)

@@ -38,13 +38,13 @@ TAB: Final = b"\t"
 _BLANK: Final = math.nan
 _BLANKS: Final = ("", "NULL")  # Qualisys writes NULL for a missing marker
 _TIME_CODE: Final = re.compile(rb"\d+:[\d:.;]+")
-_DECIMALS: Final = re.compile(rb",0\d")  # no whole number begins with a zero
+_DECIMALS: Final = re.compile(rb",0\d")  # This comma is decimal: no whole number begins with a zero.
 _NUMBERS: Final = re.compile(rb"\d[-+\d.,eE \t]*")
 _SAMPLED_ROWS: Final = 50  # rows that show how a writer formats numbers
 _MANY_NUMBERS: Final = 60  # numbers that show whether a writer drops zeros at the end
 _LEADING: Final = 2  # cells of a row before its positions: frame and time, or frame and sub-frame
 _MOST_BLANKS: Final = 4_000_000  # cells of a table that may be absent from its rows
-_MOST_DENSE: Final = 8_000_000  # cells of a table that is held whole
+_MOST_DENSE: Final = 8_000_000  # A table with more cells than this is read sparsely.
 
 Tell = Callable[[str], None]
 """Called with a sentence about something suspicious in a file that is read nevertheless."""
@@ -159,9 +159,9 @@ class TableColumns(NamedTuple):
     """What the columns of a table are."""
 
     titles: Sequence[str]
-    """Of all columns, in messages."""
+    """Titles of all columns, for messages."""
     names: Sequence[str]
-    """Of the N trajectories."""
+    """Names of the N trajectories."""
     first: Int[np.ndarray, "N"]
     """The first of the three columns of each trajectory."""
     scales: Float[np.ndarray, "N"]
@@ -171,7 +171,7 @@ class TableColumns(NamedTuple):
 
     @classmethod
     def of_triples(cls, leading: Sequence[str], names: Sequence[str], scale: float) -> TableColumns:
-        """The columns of a table with three cells per marker behind those that lead."""
+        """The columns of a table with these leading columns, then three per marker."""
         titles = [*leading, *(f"{name} {axis}" for name in names for axis in "XYZ")]
         first = len(leading) + 3 * np.arange(len(names))
         return cls(titles, names, first, np.full(len(names), scale))
@@ -184,7 +184,7 @@ def parse_table(
 
     A blank or absent cell is NaN, a blank line is not a row. Numbers have decimal points, or commas if no
     number of the table has a point. A row may lack cells at its end, because some writers omit missing
-    markers, or have blank cells too many.
+    markers, or have extra blank cells.
     """
     titles, text_columns = columns.titles, columns.texts
     num_columns = len(titles)
@@ -255,7 +255,7 @@ def _parse_wide(
 
 
 def _check_blank(cells: Sequence[bytes], width: int, expected: int, number: int) -> None:
-    """Refuse cells behind the end of a table."""
+    """Refuse a row with content beyond the last column."""
     if any(cell.strip() for cell in cells):
         raise CaptureError(f"line {number} has {width} cells, expected {expected}")
 
@@ -274,7 +274,7 @@ def _decimal_commas(rows: Iterable[bytes], text_columns: frozenset[int]) -> bool
 
 
 def _check_last_line(rows: list[bytes], number: int, num_columns: int) -> None:
-    """Refuse a last line without a line end that lacks cells, or decimals of its last number."""
+    """Refuse a last line, which has no line end, if it lacks cells or decimals of its last number."""
     *others, last = rows[-1].split(TAB)
     # A separator may end a row, so one blank cell beyond the table counts.
     usual = min(rows[0].count(TAB) + 1, num_columns + 1)
@@ -333,12 +333,12 @@ LOWEST_RATE: Final = 1.0
 HIGHEST_RATE: Final = 5000.0
 """Highest frame rate of an optical system [Hz]."""
 _RATE_TOLERANCE: Final = 0.02  # relative difference of equal rates: 119.88 is called 120, 29.97 is called 30
-_MIN_DECIMALS: Final = 1  # of times; frames are not timed in whole seconds
-_MAX_DECIMALS: Final = 9  # of times
+_MIN_DECIMALS: Final = 1  # Times have at least this many: frames are not timed in whole seconds.
+_MAX_DECIMALS: Final = 9  # Times have at most this many.
 _INTERVAL_TOLERANCE: Final = 0.1  # relative spread of the intervals when no rate is stated
-_JITTER: Final = 0.25  # of a frame: spread of times without a gap
+_JITTER: Final = 0.25  # A time that is late by less than this share of a frame shows no gap.
 _MAX_MISSING: Final = 10  # missing frames for each frame that is present
-_MAX_DIGITS: Final = 12  # of a count
+_MAX_DIGITS: Final = 12  # Counts are cut to this many digits.
 _SHOWN_GAPS: Final = 3  # gaps that a warning lists
 
 

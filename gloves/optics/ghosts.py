@@ -55,7 +55,7 @@ def _over_patch(
             behind = 0.0  # how deep the image lies behind the plane
             for i in range(3):
                 behind += (point[i] - images[t, p, i]) * normal[i]
-            if not behind > 0.0:  # also where there is no image: NaN
+            if not behind > 0.0:  # also skips missing images, whose `behind` is NaN
                 continue
             for i in range(3):
                 marker[i] = images[t, p, i] + 2.0 * behind * normal[i]
@@ -99,11 +99,11 @@ class StrayConfig(Settings):
     number: Annotated[float, Limits(0.0)] = 1.0
     """Mean number of reflecting spots, Poisson distributed."""
     reach: Annotated[float, Limits(0.0)] = 0.12
-    """Radius of the ball around the middle of the carrier in which they lie [m]."""
+    """Spots lie within this distance of the middle of their carrier [m]."""
     shown: Annotated[float, Limits(0.0, above=True)] = 0.4
     """Mean time that a spot reflects [s]."""
     hidden: Annotated[float, Limits(0.0)] = 1.0
-    """Mean time that it does not [s]."""
+    """Mean time between two flashes of a spot [s]."""
     camera_share: Annotated[float, Limits(0.0, 1.0)] = 0.5
     """Share of the cameras that a spot reflects to."""
 
@@ -172,9 +172,9 @@ def sample_ghosts(
     min_cameras: int,
     rng: np.random.Generator,
 ) -> Float[np.ndarray, "T 4 3"]:
-    """Ghosts [m] of every frame, NaN where there is none, near markers [m] behind capsules of these axes [m].
+    """Ghosts [m] of every frame near its markers [m]; NaN where there is none.
 
-    A mirror image is a point if at least `min_cameras` see it.
+    A mirror image counts if at least `min_cameras` see it past the capsules of these axes and radii [m].
     """
     frames = len(markers)
     low, high = markers.min(axis=1), markers.max(axis=1)

@@ -40,7 +40,7 @@ def draw_blobs(
         seen: Which cameras have a free view of each (S, C).
         cameras: `CameraArrays` of C cameras.
         optics: Noise of a source of `MARKER_RADIUS` [px], chance to lose a blob, roundness.
-        rng: The draws go by camera, then source.
+        rng: Random numbers are drawn camera by camera, then source by source.
     """
     loss = optics[1]
     for c in range(len(cameras.lenses)):
@@ -149,8 +149,8 @@ def reconstruct_frames(
         optics: As for `gloves.optics.reconstruction.draw_blobs`.
         gates: Largest residual of a ray [m], sine of the smallest angle, smallest distance of two points [m].
         min_rays: Rays that must meet for a point to go on, and to begin.
-        rays: Where the number of their rays goes (T, S).
-        false_points: Where false intersections go (T, F, 3) [m]; NaN before.
+        rays: Output: the number of rays of each point (T, S).
+        false_points: Output: false intersections (T, F, 3) [m]; all NaN when passed.
     """
     count, num_cameras = seen.shape[1:]
     T_world_camera = cameras.T_world_camera
@@ -172,7 +172,7 @@ def reconstruct_frames(
 
 @kernel
 def _meet(directions: Any, usable: Any, T_world_camera: Any, gates: Any, enough: int, point: Any) -> int:
-    """Write the point (3,) nearest to a source's rays (C, 3), the worst ones dropped; number of rays."""
+    """Write the point (3,) nearest to a source's rays (C, 3) without the worst; return how many are used."""
     used = usable.copy()
     count = 0
     for c in range(len(used)):
@@ -330,7 +330,7 @@ def _new_and_near(point: Any, sources: Any, positions: Any, min_distance: float)
     """Whether a false point lies in the capture volume and away from all other points."""
     near = False
     for s in range(len(sources)):
-        # False where there is none: NaN
+        # A missing point is NaN, and comparisons with NaN are false.
         if squared_distance(positions[s], point) < min_distance * min_distance:
             return False
         near |= squared_distance(sources[s], point) < _FALSE_REACH * _FALSE_REACH
@@ -371,10 +371,10 @@ class FrameOptics(Settings):
     min_angle: Annotated[float, Limits(0.0, 90.0)] = 10.0
     """Two rays alone must cross at this angle at least [deg]."""
     min_distance: Annotated[float, Limits(0.0)] = 0.004
-    """Points nearer to each other than this are one: the one with more rays [m]."""
+    """Of two points nearer to each other than this [m], only the one with more rays is kept."""
 
     def worn(self, radius: float) -> Self:
-        """The same for a glove whose spheres have this radius [m], unless `marker_radius` is given."""
+        """These settings for spheres of this radius [m], unless `marker_radius` is given."""
         return dataclasses.replace(self, marker_radius=self.radius_of(radius))
 
     def radius_of(self, radius: float) -> float:
@@ -397,9 +397,9 @@ class OpticsConfig(FrameOptics):
     dropout: Annotated[float, Limits(0.0, 1.0)] = 0.0002
     """Chance per frame that cameras begin to lose their pictures: a lost packet, or an arm in front."""
     dropout_length: Annotated[float, Limits(1.0)] = 3.0
-    """Mean number of pictures that they lose then."""
+    """Mean number of pictures that a camera loses in a dropout."""
     dropout_cameras: Annotated[int, Limits(0)] = 1
-    """Number of cameras that lose them together, as those on one network switch do."""
+    """Number of cameras that drop out together, as those on one network switch do."""
     min_rays: Annotated[int, Limits(2)] = 2
     """Rays that must meet for a point to exist."""
     min_rays_to_start: Annotated[int, Limits(2)] = 3
@@ -481,8 +481,8 @@ def pack_columns(
 ) -> tuple[Int[np.ndarray, "T S"], int]:
     """Pack many runs into few columns: an unbroken stretch of a column is one run, then a frame is empty.
 
-    Gives the column of every point, -1 where there is none, and their number. Runs that begin together have
-    random columns, which do not reveal sources.
+    Returns the column of every point, -1 where there is none, and the number of columns. Runs that begin
+    together get columns in random order, which does not reveal sources.
     """
     ids = number_runs(present)
     first, source = np.nonzero(present & np.vstack([np.ones_like(present[:1]), ~present[:-1]]))

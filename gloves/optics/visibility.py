@@ -16,7 +16,7 @@ from handsim.kernels import kernel, segment_distance_squared
 from handsim.space.camera import in_picture
 from handsim.space.rig import CameraRig
 
-_PAD: Final = 1e-9  # around every box [m]: more than rounding, and flat boxes are no special case
+_PAD: Final = 1e-9  # margin of every box [m]: exceeds rounding, and gives flat boxes a volume
 
 
 @kernel
@@ -56,7 +56,7 @@ def _meets(start: Any, end: Any, vertices: Any, nodes: Any, boxes: Any) -> bool:
     ix = 1.0 / d[0] if d[0] != 0.0 else 1e300
     iy = 1.0 / d[1] if d[1] != 0.0 else 1e300
     iz = 1.0 / d[2] if d[2] != 0.0 else 1e300
-    # the sides of all boxes that this line meets first
+    # per axis, the index of the box side that the line meets first
     nx, ny, nz = (0 if ix > 0.0 else 3), (1 if iy > 0.0 else 4), (2 if iz > 0.0 else 5)
     node = 0
     while node < len(skip):
@@ -108,7 +108,7 @@ def clear_lines(vertices: Any, lines: Any, nodes: Any, spots: Any, boxes: Any) -
         vertices: The mesh in every frame (T, V, 3) [m], or in one for all.
         lines: Starts (T, P, C or 1, 3) [m], ends (T or 1, C, 3) [m], and which lines are needed (T, P, C).
         nodes: `faces`, `first` and `skip` of the tree.
-        spots: `spots` and `spots_start` of the tree; no spots: the boxes are used as given.
+        spots: `spots` and `spots_start` of the tree; boxes are used as given if `spots` is empty.
         boxes: Low and high corner of each node (N, 6) [m], refitted in every frame.
     """
     starts, ends, needed = lines
@@ -125,7 +125,7 @@ def clear_lines(vertices: Any, lines: Any, nodes: Any, spots: Any, boxes: Any) -
     return clear
 
 
-_LEAF: Final = 4  # triangles of a leaf at most
+_LEAF: Final = 4  # A leaf has at most this many triangles.
 
 
 class MeshTree:
@@ -358,7 +358,7 @@ def _keep_free(
     radii: Float[np.ndarray, "K"],
     free: Bool[np.ndarray, "T M C"],
 ) -> None:
-    """Clear what is set of `free` (T, M, C) where a line meets a capsule; else as for `free_rays`."""
+    """Set `free` (T, M, C) to False where a line meets a capsule; other arguments as in `free_rays`."""
     frames, count = markers.shape[:2]
     capsules = len(radii)
     centers, reach = np.empty((capsules, 3)), np.empty(capsules)
