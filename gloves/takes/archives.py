@@ -63,7 +63,7 @@ def check_unused(path: Path) -> None:
 
 
 class GrowingArchive(Closing):
-    """Writes a new archive at `growing_path`, which grows by `columns` sized for all letters but T and P."""
+    """Writes a new archive that grows by `columns`, in whose shapes only T and P are still letters."""
 
     def __init__(
         self,
@@ -102,7 +102,7 @@ class GrowingArchive(Closing):
             if row.shape != ((num_points,) if column.of_points else ()) + column.entry:
                 raise ValueError(f"{column.name} has shape {row.shape}")
             packed.append(row.tobytes())
-        self._waiting.append(packed)  # at once: an interrupt leaves no half of a frame
+        self._waiting.append(packed)  # in a single step, so that an interrupt leaves no partial frame
         self._points += num_points
         self._due = min(self._due, time.monotonic() + _INTERVAL)
         self.flush_due()
@@ -146,7 +146,7 @@ class GrowingArchive(Closing):
     def _packed_head(
         self, header: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], size: int = 0
     ) -> list[bytes]:
-        """The header, of at least so many bytes, by default with some to spare, and the arrays."""
+        """The header, padded to `size` bytes or else by `_SPARE` bytes, and the arrays."""
         text = {**header, "arrays": list(arrays), "columns": [one._asdict() for one in self._columns[1:]]}
         parts = list[bytes]()
         for array in arrays.values():
@@ -184,7 +184,7 @@ class GrownArchive:
                 raise ValueError("not a recording")
             self.header: dict[str, Any] = json.loads(_take_part(file))
             parts = [_take_part(file) for _ in self.header["arrays"]]
-            known = self.header.pop(_CHECKSUM, None)  # which earlier versions did not write
+            known = self.header.pop(_CHECKSUM, None)  # None in files of earlier versions
             if known not in (None, _head_checksum(self.header, parts)):
                 raise ValueError("a header with another checksum")
             names = map(str, self.header.pop("arrays"))
@@ -201,7 +201,7 @@ class GrownArchive:
         return {**self._arrays, **{column.name: self._joined(column, blocks) for column in self._columns}}
 
     def first(self, name: str, most: int) -> NDArray[Any]:
-        """At least the first `most` entries of a column of frames, or all."""
+        """The first entries of a column of frames: at least `most`, or all if there are fewer."""
         column = next(column for column in self._columns if column.name == name)
         before = np.cumsum([0, *(block.frames for block in self._blocks)])[:-1]
         return self._joined(column, self._blocks[: int((before < most).sum())])
@@ -219,7 +219,7 @@ class GrownArchive:
             yield Member(column.name, np.dtype(column.dtype), shape, partial(self._parts, column, told))
 
     def _scan(self, file: io.BufferedReader, check: bool) -> Iterator[_Block]:
-        """The whole blocks."""
+        """The blocks before the first one that is cut off or damaged."""
         number = 0
         while len(head := file.read(_BLOCK.size)) == _BLOCK.size:
             mark, index, frames, points, checksum = _BLOCK.unpack(head)
@@ -325,7 +325,7 @@ def _column(stored: Mapping[str, Any]) -> Column:
 Content = TypeVar("Content")
 
 SCHEMA: Final = 4
-"""Version of the files of takes. Points were tables until 3; simulated and tracked takes differed until 2."""
+"""Version of the files of takes. Points are tables up to 3; up to 2 simulated and tracked takes differ."""
 _READABLE: Final = (3, SCHEMA)
 _KINDS: Final = ("take", "tracked take")
 """Kinds in headers; trackers wrote the second one before schema 3."""

@@ -32,7 +32,7 @@ class RigidBody:
     positions: Float[np.ndarray, "Q 3"]
     """Its markers in its own frame [m]."""
     surface: RigidObject | None = None
-    """Its surface, if it is no object that comes with handsim."""
+    """The body's own surface; None if it has none, or is an object that comes with handsim."""
 
     @classmethod
     def of(cls, thing: RigidObject) -> RigidBody:

@@ -1,8 +1,7 @@
 """Labels of a tracked take that a person corrected, as a TOML file beside the take.
 
 A correction names a point by its place in the first frame of a span, so that it also fits a new tracking of
-the same capture. From there the point's ID leads through the span; a point without one is followed from
-place to place.
+the same capture. Through the span the point is followed by its ID, or without an ID from position to position.
 """
 
 from __future__ import annotations
@@ -23,14 +22,14 @@ from handsim.files.inputs import check_keys, numbers, quoted, read_toml, shown, 
 from handsim.files.outputs import write_text, writing
 
 SUFFIX: Final = ".corrections.toml"
-"""How the names of such files end."""
+"""Ending of the names of correction files."""
 NO_MARKER: Final = "none"
-"""The label of a point that is no marker; a marker's has a colon in it."""
+"""The label of a point that is no marker; labels of markers contain a colon."""
 FREE: Final = -2
 """The label of a point without a correction."""
 _KEYS: Final = ("frames", "place_mm", "label")
-_SAME_PLACE: Final = 0.002  # [m] between a point and its place in the file; formats round differently
-_LONGEST_STEP: Final = 0.02  # [m] of a point without an ID, from where it is expected in the next frame
+_SAME_PLACE: Final = 0.002  # largest distance of a point from its place in the file [m]; formats round it
+_LONGEST_STEP: Final = 0.02  # largest distance of a point without an ID from its prediction [m]
 _COMMENT: Final = "# Corrected labels; `handsim track` applies them again, `handsim view` adds to them."
 
 
@@ -41,7 +40,7 @@ class Correction:
     first: int
     """The first frame of the span, from 0."""
     last: int
-    """The last frame of the span, which belongs to it."""
+    """The last frame of the span, inclusive."""
     place: tuple[float, float, float]
     """Where the point is in the first frame [m]."""
     label: str
@@ -57,10 +56,10 @@ class Correction:
 
 
 class Pins(NamedTuple):
-    """What corrections say about the points of a take."""
+    """The labels that corrections give to the points of a take."""
 
     labels: Int[np.ndarray, "P"]
-    """Label of each point, -1 for no marker; `FREE` where no correction is about it."""
+    """Corrected label of each point, -1 for no marker; `FREE` for a point without a correction."""
     unfitting: tuple[Correction, ...]
     """Corrections that fit no point."""
 
@@ -98,7 +97,7 @@ def save_corrections(path: Path, corrections: Iterable[Correction]) -> None:
 
 
 def find_pins(corrections: Sequence[Correction], points: PointList, label_names: Sequence[str]) -> Pins:
-    """The points that corrections are about; of two about one point, the later counts."""
+    """Find the points that corrections name; of two corrections of one point the later counts."""
     pinned = np.full(len(points.ids), FREE, dtype=np.int64)
     unfitting = []
     for number, correction in enumerate(corrections, start=1):
@@ -119,8 +118,8 @@ def find_pins(corrections: Sequence[Correction], points: PointList, label_names:
 def follow_point(points: PointList, correction: Correction) -> NDArray[np.int64]:
     """Indices (K,) of a corrected point, one for each frame that holds it; none without a point at its place.
 
-    A point is followed by its ID, across gaps too. A point without an ID is followed to the nearest point to
-    where its last two positions lead, until no point is near.
+    A point is followed by its ID, across gaps too. A point without an ID is followed to the point nearest to
+    its position extrapolated from the last two, until none is within `_LONGEST_STEP`.
     """
     first, last = correction.first, correction.last
     start = _nearest(points, first, np.array(correction.place), _SAME_PLACE)

@@ -1,9 +1,9 @@
 """The arrays of a take: one table of their names, types and shapes, the list of points, and the statuses.
 
 A shape is letters and numbers: T frames, P points of all frames, H hands, B bodies, M markers of all hands, Q
-those of all bodies. An array that begins with T or P grows with each frame while a take is recorded.
+markers of all bodies. An array that begins with T or P grows with each frame while a take is recorded.
 
-The points are one list over all frames, whose size goes with the number of points. A table with a row per
+The points are one list over all frames, so memory is proportional to their number. A table with a row per
 frame is as wide as its fullest frame, so a single crowded frame, as when a camera sees the sun, can make it
 larger than memory.
 """
@@ -200,7 +200,7 @@ class PointList:
     ) -> Self:
         """The points of a stream, which fill the first columns of their frame in the order of arrival."""
         if counts.sum(dtype=np.int64) != len(ids):  # before anything of that size is allocated
-            raise ValueError("other numbers of points in frames than points")
+            raise ValueError("the counts of frames do not sum to the number of points")
         order, num_columns = _arrival_order(counts), int(counts.max(initial=0))
         return cls(counts, points, ids, labels, confidence, order, num_columns)
 

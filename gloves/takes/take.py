@@ -74,7 +74,7 @@ RATED_FRAMES: Final = 100_000
 """Number of frames of a stream that its rate is measured on."""
 _MAX_LENGTH: Final = 1e9  # [m]
 _MAX_TIME: Final = 1e12  # [s], and the largest rate [Hz]; clocks of computers count 2e9 s
-_QUATERNION_TOLERANCE: Final = 1e-2  # of the unit length; our own files have 1e-6
+_QUATERNION_TOLERANCE: Final = 1e-2  # Quaternions have unit length within this; our own within 1e-6.
 _CHUNK: Final = 4096  # frames whose markers are filled in at once
 _MAX_BIAS_FRAMES: Final = 2000  # frames that marker biases are learned from
 _STILL: Final = 3.0  # [deg], largest standard deviation of an angle of a hand that holds still
@@ -458,7 +458,7 @@ class Take:
     def markers(self, side: Side) -> Float[np.ndarray, "T M 3"]:
         """The markers of a hand [m]: seen, or else computed from the pose; NaN where the hand has no pose.
 
-        Gloves slip: a marker that is computed from the pose is shifted by its `marker_bias`.
+        Gloves slip, so the `marker_bias` is subtracted from a marker that is computed from the pose.
         """
         number, markers = self.hand_index(side), self.observed(side)
         there = self.status[:, number] != LOST
@@ -471,7 +471,7 @@ class Take:
     def pose_markers(
         self, side: Side, frames: Int[np.ndarray, "F"] | None = None
     ) -> Float[np.ndarray, "F M 3"]:
-        """A hand's markers computed from its pose [m], shifted by `marker_bias`; NaN without a pose.
+        """A hand's markers computed from its pose [m], less their `marker_bias`; NaN without a pose.
 
         Args:
             side: The hand.
@@ -491,7 +491,7 @@ class Take:
         return markers
 
     def marker_bias(self, side: Side) -> Float[np.ndarray, "M 3"]:
-        """Median offset of each marker of a hand from its place on the glove, in the frame of its bone [m].
+        """Median of `marker_offsets` of each marker of a hand, in the frame of its bone [m].
 
         It is learned from the frames whose pose was fitted to points; 0 where these are few. A tracker
         fits poses to markers with these offsets, so markers computed from its poses need them too.
@@ -508,7 +508,7 @@ class Take:
         return bias
 
     def marker_offsets(self, side: Side, frames: Int[np.ndarray, "F"]) -> Float[np.ndarray, "F M 3"]:
-        """Offset of a hand's markers from where they were seen, in the frames of their bones [m]; or NaN."""
+        """Computed minus observed markers of a hand, in the frames of their bones [m]; NaN if unseen."""
         number = self.hand_index(side)
         worn, qpos = self.hands[number], self.qpos[frames, number]
         seen = self.point_list.labeled(self.hand_labels[number], frames)
@@ -573,7 +573,7 @@ class Take:
     def capture(self) -> Capture:
         """The points without labels, as an optical system exports them: one trajectory per column.
 
-        Frames that a stream lacks are there without points.
+        Frames that a stream lacks are included, without points.
 
         Raises:
             CaptureError: There are no points.
@@ -609,13 +609,13 @@ class Take:
         return self._steady(labeled_columns(frames, rows, names, self.rate))
 
     def _steady(self, capture: Capture) -> Capture:
-        """The capture with frames without points where a stream lacks some: marker files have no times."""
+        """Insert empty frames where a stream lacks some, because marker files have no times."""
         if self.numbers is None:
             return capture
         times_at(self.times, self.rate)  # refuses too many frames
         order = np.arange(self.num_frames)
         places = np.rint((self.times - self.times[0]) * self.rate).astype(np.intp) - order
-        places = np.maximum.accumulate(places) + order  # two late frames have two places
+        places = np.maximum.accumulate(places) + order  # two late frames must not share a place
         positions = np.full((places[-1] + 1, *capture.positions.shape[1:]), np.nan)
         positions[places] = capture.positions
         return dataclasses.replace(capture, positions=positions)

@@ -69,7 +69,7 @@ def test_points_of_a_stream_fill_the_first_columns(counts):
 
 def test_frames_that_count_more_points_than_there_are_cost_no_memory():
     none = np.empty(0)
-    with pytest.raises(ValueError, match="other numbers of points"):
+    with pytest.raises(ValueError, match="do not sum to the number of points"):
         PointList.in_order(np.array([2**31, 2**31]), np.empty((0, 3)), none, none, none)
 
 
