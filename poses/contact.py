@@ -26,7 +26,7 @@ NEAREST: Final = -0.15
 _PRESS: Final = 0.0005  # depth of the contact [m]
 _STEP: Final = 0.15  # step of closing fingers, summed over joints [rad]
 _HALVINGS: Final = 6  # bisections of the first blocked step, at most
-_PRECISION: Final = 0.003  # at which bisection stops, summed over joints [rad]
+_PRECISION: Final = 0.003  # change at which bisection stops, summed over joints [rad]
 
 
 class Digit(NamedTuple):
@@ -120,8 +120,8 @@ def search_contact(
 def _pairs_in_line(moving: Any, moving_radii: Any, still: Any, still_radii: Any, axis: Any) -> Any:
     """Pairs (P, 2) whose bounding spheres meet somewhere along the axis; the others never touch.
 
-    And of each pair (P, 3): the squared distance [m^2] of the spheres' centers, its part along the axis [m],
-    and the sum of the spheres' radii [m].
+    Also returns for each pair (P, 3): the squared distance [m^2] of the spheres' centers, the distance along
+    the axis [m], and the sum of the spheres' radii [m].
     """
     pairs = np.empty((len(moving_radii) * len(still_radii), 2), dtype=np.int64)
     spheres = np.empty((len(pairs), 3))
@@ -181,7 +181,7 @@ def _within_reach(wrist: Any, parts: Any, obstacles: Any, frame: Any, near: Any,
     Args:
         near: Both ends of each obstacle's axis (K, :6) [m], and the squared distances (K, 6:) [m^2] at which
             the axes of the digit's three bones meet it; -1 for a bone that may not meet it.
-        spheres: Centers (:3, K) [m] of bounding spheres, and the same squares (3:6, K) for these.
+        spheres: Centers (:3, K) [m] of bounding spheres, and squared distances (3:6, K) at which these meet.
     """
     knuckle = wrist[1].copy()
     for row in range(3):
@@ -210,7 +210,7 @@ def _blocked(bones: Any, count: int, near: Any, spheres: Any) -> bool:
 
     `near` and `spheres` are those of `_within_reach`; the last row of `spheres` is room for the arithmetic.
     """
-    for i in range(2, -1, -1):  # the outer bones meet most
+    for i in range(2, -1, -1):  # the outer bones hit obstacles most often
         p = (bones[i, 0, 0], bones[i, 0, 1], bones[i, 0, 2])
         q = (bones[i, 1, 0], bones[i, 1, 1], bones[i, 1, 2])
         for n in range(count):
@@ -240,8 +240,8 @@ def pose_digit(wrists: Any, angles: Any, parts: Any) -> Any:
     return posed
 
 
-# Fingers close in two stages, all joints and then those beyond the knuckle: depth [m] to which a finger may
-# press into a hand, and joints of the digit.
+# Fingers close in two stages: all joints, then the two outer ones. Each stage has the depth [m] that a finger
+# may press into a hand, and its joints.
 _STAGES: Final = ((0.0006, slice(0, 4)), (0.0008, slice(2, 4)))
 _ORDER: Final = (1, 2, 3, 4, 0)  # the thumb closes last, over what the fingers hold
 
@@ -253,7 +253,7 @@ def first_contact(
     moving_qpos: Float[np.ndarray, "T 27"],
     axis: Float[np.ndarray, "T 3"],
 ) -> Float[np.ndarray, "T"]:
-    """Distance along `axis` [m] at which a hand from outside touches a still one, or else `NEAREST`.
+    """Distance along `axis` [m] at which an approaching hand touches a still one; `NEAREST` if it never does.
 
     The moving hand backs off along this unit direction; at distance zero it has the given poses.
     """
@@ -357,7 +357,7 @@ APPROACH: Final = (0.4, 0.8)
 VOLUME: Final = 0.2
 """Half side of the cube in which the middle of the wrists travels [m], around 1.1 m above the floor."""
 _TURNING: Final = 8.0  # fastest rotation of one hand relative to the other [rad/s]
-_DISTANCE: Final = (0.25, 0.45)  # of the wrists of separate hands [m]
+_DISTANCE: Final = (0.25, 0.45)  # distance of the wrists while hands rest apart [m]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

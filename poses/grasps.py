@@ -51,8 +51,8 @@ _ARMATURE: Final = 1e-4  # [kg m^2], inertia of tendons and muscles
 _FINGER_TORQUES: Final = (0.20, 0.30, 0.16, 0.06)
 _THUMB_TORQUES: Final = (0.40, 0.40, 0.25, 0.10)
 _FRICTION: Final = (1.2, 0.01, 0.001)  # of a palm on plastic: sliding, twisting (by the pad's size), rolling
-_CONTACT_TIME: Final = (0.005, 1.0)
-_GUIDE_TIME: Final = (0.03, 1.0)  # of the soft constraint that holds the object while fingers close
+_CONTACT_TIME: Final = (0.005, 1.0)  # MuJoCo's solref of contacts: time constant [s], damping ratio
+_GUIDE_TIME: Final = (0.03, 1.0)  # solref of the soft constraint that holds the object while fingers close
 _MAX_DISTANCE: Final = 0.5  # distances of capsules from the object are measured up to this one [m]
 
 
@@ -196,7 +196,7 @@ def _add_object(spec: mujoco.MjSpec, obj: RigidObject) -> None:
 _GAP: Final = 0.0005  # [m] between palm and object before the fingers close
 _SLIDE: Final = 0.15  # an object is raised to the palm from this far below it [m]
 _SLIDE_HALVINGS: Final = 12
-_ANY: Final = "any"  # the entry of objects without one of their own
+_ANY: Final = "any"  # library entry of objects that have none of their own
 _ROUNDS: Final = 12
 _STIFFNESS: Final = 0.006  # [m/rad] weight of joint deviations against residuals of the tips
 _MAX_STEP: Final = 0.2  # [rad]
@@ -381,13 +381,13 @@ def _marks(model: HandModel, angles: NDArray[np.float64]) -> tuple[NDArray[np.fl
 
 
 _MAX_TRIES: Final = 40
-_TRY_SPREADS: Final = np.deg2rad([1.0, 2.0, 3.0, 4.0, 5.0])  # of the angles in the first tries and later ones
+_TRY_SPREADS: Final = np.deg2rad([1.0, 2.0, 3.0, 4.0, 5.0])  # deviation of angles in tries 1, 2, 3, 4, later
 _RAMP: Final = 10  # steps of the motors' targets from open to closed
 _CLOSE, _SETTLE, _SHAKE, _REST = 400, 200, 60, 60  # steps of 2 ms
 _GRAVITY: Final = 9.81
 _TETRAHEDRON: Final = np.array([(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)]) / np.sqrt(3.0)
-_MAX_DRIFT: Final = 0.004  # [m] of the shaken object
-_MAX_ROTATION: Final = np.deg2rad(8.0)  # of the shaken object
+_MAX_DRIFT: Final = 0.004  # largest displacement of the shaken object [m]
+_MAX_ROTATION: Final = np.deg2rad(8.0)  # largest rotation of the shaken object
 _TOUCHING: Final = 0.0005  # [m] largest distance of a contact
 _MAX_SETTLED_DEPTH: Final = MAX_OBJECT_PENETRATION - 1e-5  # [m]
 _MAX_FINAL_SPEED: Final = 0.5  # [rad/s] of the hinges
@@ -434,7 +434,7 @@ def try_hold(scene: GraspScene, style: HoldStyle, *, rng: np.random.Generator) -
     start = place_object(scene, style, rng=rng)
     data = scene.new_data(style.open, start)
     _close(scene, data, style, start)
-    _shake(scene, data)  # so that the object settles
+    _shake(scene, data)  # a first shake lets the object settle
     before = scene.object_pose(data)
     _shake(scene, data)
     pose = scene.object_pose(data)
@@ -509,14 +509,14 @@ def _shake(scene: GraspScene, data: mujoco.MjData) -> None:
 
 _MAX_HELD_DEPTH: Final = MAX_OBJECT_PENETRATION - 1e-6  # [m], with a margin for rounding in the world's frame
 _HALVINGS: Final = 4
-_LIFT_CHANCE: Final = 0.55  # of a free digit
-_TAP_CHANCE: Final = 0.3  # of a pressing digit
-_STILL_CHANCE: Final = 0.3  # of an object that does not move in the hand
-# Largest opening of a lifted digit [rad]: the thumb's four joints; abduction (both ways), MCP, PIP, DIP.
+_LIFT_CHANCE: Final = 0.55  # chance that a free digit lifts off the object
+_TAP_CHANCE: Final = 0.3  # chance that a digit that may tap does
+_STILL_CHANCE: Final = 0.3  # chance that the object does not move in the hand
+# Largest opening of a lifted or tapping thumb (first row) and finger: abduction (both ways), MCP, PIP, DIP.
 _LIFT: Final = np.deg2rad([[14.0, 30.0, 20.0, 25.0], [5.0, 45.0, 45.0, 30.0]])
 _TAP: Final = np.deg2rad([[4.0, 10.0, 6.0, 8.0], [1.0, 14.0, 10.0, 6.0]])
-_TREMBLE: Final = np.deg2rad([0.5, 1.2, 1.8, 1.8])  # of digits that hold
-_WOBBLE: Final = (0.0006, np.deg2rad(1.2))  # of the object in the hand: [m], [rad]
+_TREMBLE: Final = np.deg2rad([0.5, 1.2, 1.8, 1.8])  # standard deviations of joints of digits that hold
+_WOBBLE: Final = (0.0006, np.deg2rad(1.2))  # standard deviations of the object in the hand: [m], [rad]
 
 
 class Held(NamedTuple):

@@ -45,8 +45,8 @@ _AHEAD: Final = [np.ones(NUM_JOINTS, dtype=bool)] + [
     for first in (True, False)
     for digit in range(len(DIGITS))
 ]
-_ROUNDS: Final = 2  # of random durations for each path
-_FANS: Final = (0.0, 0.3, 0.6, 1.0, 1.6)  # spreads of the fingers at first, relative to the gesture "spread"
+_ROUNDS: Final = 2  # Each path is tried with this many random durations.
+_FANS: Final = (0.0, 0.3, 0.6, 1.0, 1.6)  # finger spread at the first stop, relative to "spread"
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,8 +88,8 @@ def straight_path(
     return start + minimum_jerk(frames)[:, None] * (target - start)
 
 
-def held(path: NDArray[np.float64], config: MotionConfig, rng: np.random.Generator) -> NDArray[np.float64]:
-    """The path, and a random rest at its end."""
+def _rested(path: NDArray[np.float64], config: MotionConfig, rng: np.random.Generator) -> NDArray[np.float64]:
+    """The path with a random rest at its end."""
     pause = int(rng.uniform(0.0, config.hold) * config.rate)
     return np.concatenate([path, np.repeat(path[-1:], pause, axis=0)])
 
@@ -98,7 +98,7 @@ def path_to_rest(
     model: HandModel, start: NDArray[np.float64], config: MotionConfig, rng: np.random.Generator
 ) -> NDArray[np.float64]:
     """Valid frames (T, 20) [rad] from a pose to rest: the straight path, or the first valid detour."""
-    # each round draws other durations, and so other frames, of which all may be valid
+    # Each round draws new durations: other frames of the same path may all be valid.
     for stops in chain(*(_via_paths(start, resting_angles(model)) for _ in range(_ROUNDS))):
         path = np.concatenate([straight_path(*pair, config, rng) for pair in pairwise([start, *stops])])
         if is_valid(model, path).all():
@@ -149,7 +149,7 @@ class WristConfig(Settings):
     center: tuple[float, float, float] = ROOM_CENTER
     """Middle of the cube that the wrist moves in [m]."""
     volume: Annotated[float, Limits(0.0)] = 0.3
-    """Half side of that cube [m]."""
+    """Half side of the cube that the wrist moves in [m]."""
     turning: Annotated[float, Limits(0.0)] = 0.5
     """Standard deviation of the rotation about each axis, from fingers ahead and palm down [rad]."""
     times: Annotated[tuple[float, float], Limits(0.0, ascends=True)] = (0.6, 2.0)
@@ -181,7 +181,7 @@ def wrist_path(
 ) -> tuple[Float[np.ndarray, "T 3"], Float[np.ndarray, "T 4"]]:
     """Positions [m] and orientations (wxyz) of a wrist whose palm faces mostly down."""
     shares = [np.zeros(1)]
-    while sum(map(len, shares)) < max(frames, 2):  # interpolation needs two
+    while sum(map(len, shares)) < max(frames, 2):  # Slerp needs two keys
         steps = int(rng.uniform(*config.times) * rate) + 1
         shares.append(len(shares) - 1 + minimum_jerk(steps))
     count = len(shares)
@@ -286,7 +286,7 @@ def angles_through(
             out = path_to_rest(model, poses[number], config, rng)
             back = path_to_rest(model, poses[number + 1], config, rng)[-2::-1]
             paths[number] = np.concatenate([out, back, poses[number + 1 : number + 2]])
-    return np.concatenate([held(path, config, rng) for path in paths])
+    return np.concatenate([_rested(path, config, rng) for path in paths])
 
 
 def _next_path(
@@ -298,13 +298,13 @@ def _next_path(
         for target in sample_valid_angles(model, _POSES_A_DRAW, rng=rng):
             direct = straight_path(start, target, config, rng)
             if is_valid(model, direct).all():
-                return held(direct, config, rng)
+                return _rested(direct, config, rng)
             around = np.concatenate(
                 [straight_path(start, resting, config, rng), straight_path(resting, target, config, rng)]
             )
             if is_valid(model, around).all():
-                return held(around, config, rng)
-    return held(path_to_rest(model, start, config, rng), config, rng)
+                return _rested(around, config, rng)
+    return _rested(path_to_rest(model, start, config, rng), config, rng)
 
 
 def with_wrist(
@@ -367,7 +367,7 @@ def script_poses(model: HandModel, script: str) -> Float[np.ndarray, "K 20"]:
     if "touches" in entry:
         touches = []
         for finger in entry["touches"]:
-            with contextlib.suppress(PoseError):  # other fingers remain
+            with contextlib.suppress(PoseError):  # leave out a finger that this thumb cannot touch
                 touches.append(touching_angles(model, finger))
         poses = np.array(touches).reshape(-1, NUM_JOINTS)
     elif "library" in entry:

@@ -1,4 +1,4 @@
-"""Motion of a hand with an object: it plays with it, points with it, keeps away from the other hand."""
+"""Motion of a hand that holds an object: it plays, points, and keeps clear of the other hand."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from poses.shapes import MAX_PENETRATION
 _VARIANTS: Final = 12  # held poses of one draw
 _MAX_DRAWS: Final = 20
 _HOLDS: Final = 3  # grasps of one style in a motion
-_SHIFT_CHANCE: Final = 0.15  # of a change to another grasp
+_SHIFT_CHANCE: Final = 0.15  # chance to change to another grasp
 _MAX_GAP: Final = 0.003  # [m] between a shifting object and the digits that hold it
 _SLIDING, _ROLLING = 0.15, 4.0  # fastest shift of the object in the hand [m/s], [rad/s]
 _MARGIN: Final = 0.9  # share of the limits of speed and acceleration that paths use
@@ -115,7 +115,7 @@ class _Player:
         return Held(*(np.concatenate([part, np.repeat(part[-1:], pause, axis=0)]) for part in path))
 
     def _keeps_touch(self, held: Held) -> bool:
-        """Whether the holding digits stay near the object at the quarters of the way."""
+        """Whether the holding digits are near the object after 1/4, 1/2 and 3/4 of the path."""
         scene = self.scene
         names = [scene.mj_model.geom(geom).name for geom in scene.hand_geoms]
         for number in len(held.angles) * np.array([1, 2, 3]) // 4:
@@ -210,9 +210,9 @@ PATH: Final = (0.4, 0.9)
 _TILT: Final = 0.6  # standard deviation of the pen's lean from the outward direction, as a tangent
 _UPRIGHT: Final = np.array([0.36, -0.26, 0.9]) / np.linalg.norm([0.36, -0.26, 0.9])
 """Direction of a pen in the right hand of a person at -y, over a palm that faces down."""
-_ARM: Final = np.array([0.8, -0.6, 0.0])  # where the writing arm comes from
+_ARM: Final = np.array([0.8, -0.6, 0.0])  # direction from the pen to the writing arm
 _CONE: Final = 1.2  # largest angle of the pen from upright [rad]
-_MAX_LEAN: Final = 1.0  # from the outward direction, as a tangent
+_MAX_LEAN: Final = 1.0  # largest lean of the pen from the outward direction, as a tangent
 _MIN_FACING: Final = -0.2  # smallest cosine of a target's outward direction and the upright pen
 _STEADY: Final = 0.15  # [s] standard deviation of the smoothing of outward directions
 
@@ -301,7 +301,7 @@ def _draw(outward: Float[np.ndarray, "M 3"], rng: np.random.Generator) -> tuple[
 
 
 def _axes(outward: Float[np.ndarray, "*T 3"], lean: Float[np.ndarray, "*T 3"]) -> Float[np.ndarray, "*T 3"]:
-    """Directions of the pen at targets: off the skin, and never far from upright, smoothly in both."""
+    """Directions of the pen at targets: off the skin, near upright, and smooth in both arguments."""
     axis = outward + lean
     facing = np.einsum("...i,...i->...", axis, outward)[..., None]
     axis = axis + np.clip(0.5 - facing, 0.0, None) * outward

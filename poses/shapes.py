@@ -64,7 +64,7 @@ def gestures_of(library: str) -> Float[np.ndarray, "G 20"]:
 
 
 def load_gestures() -> dict[str, Float[np.ndarray, "20"]]:
-    """Joint angles [rad] of every named gesture of all libraries, in the order of `topology.JOINTS`."""
+    """Joint angles [rad] of every named gesture, in the order of `handsim.hand.shape.JOINTS`."""
     return {name: angles.copy() for name, angles in _gestures().items()}
 
 
@@ -76,9 +76,9 @@ HIGH: Final = np.deg2rad([joint.high for joint in JOINTS])
 
 _TIGHT_FLEXION: Final = np.deg2rad(85.0)  # MCP flexion from which abduction has its smallest range
 _TIGHT_ABDUCTION: Final = 0.25  # share of the abduction range that remains there
-_DIP_SHARE: Final = 2.0 / 3.0  # of the PIP's flexion
+_DIP_SHARE: Final = 2.0 / 3.0  # DIP flexion as a share of the PIP's
 _DIP_BELOW: Final = np.deg2rad(32.0)  # largest deviation of the DIP below its share of the PIP
-_DIP_ABOVE: Final = np.deg2rad(28.0)  # largest deviation of the DIP above it
+_DIP_ABOVE: Final = np.deg2rad(28.0)  # largest deviation of the DIP above its share of the PIP
 # Largest difference of MCP flexion between neighbors [rad]: index-middle, middle-ring, ring-little.
 _MCP_APART: Final = np.deg2rad([85.0, 70.0, 75.0])
 
@@ -106,11 +106,11 @@ def apply_couplings(angles: Float[np.ndarray, "T 20"]) -> Float[np.ndarray, "T 2
 
 _FLEXION_NOISE: Final = np.deg2rad(6.0)
 _ABDUCTION_NOISE: Final = np.deg2rad(2.0)
-_SWAY: Final = np.deg2rad(3.0)  # all fingers to one side
+_SWAY: Final = np.deg2rad(3.0)  # standard deviation of all fingers leaning to one side
 # Chance that neighbors curl independently: index-middle, middle-ring, ring-little.
 _SPLIT: Final = np.array([0.3, 0.2, 0.25])
 _NEIGHBOR_CORRELATION: Final = 0.993
-# Standard deviation of the growth of curl from index to little, in the latent.
+# One standard deviation of a curl that grows from index to little finger, in units of the normals.
 _SLOPE: Final = 0.15 * np.array([-1.5, -0.5, 0.5, 1.5])
 _CURL_DIP_SHARE: Final = 0.68
 _DIP_LAG: Final = np.deg2rad(6.0)
@@ -216,7 +216,7 @@ MAX_PENETRATION: Final = 0.001
 _HALVINGS: Final = 4
 _THUMB: Final = np.array([joint.name.startswith("thumb") for joint in JOINTS])
 _ABDUCTIONS: Final = np.array([joint.name.endswith("abduction") for joint in JOINTS])
-_FAN: Final = np.deg2rad([1.0, 0.2, -0.6, -1.4])
+_FAN: Final = np.deg2rad([1.0, 0.2, -0.6, -1.4])  # one step of fanning at rest, index to little
 
 
 def is_valid(
@@ -298,8 +298,8 @@ SAMPLER: Final = Expected(
 )
 """Description of a sampler in errors on settings."""
 _NOUN: Final = "pose sampler"
-_MAX_ANGLE: Final = 2.0 * np.pi  # [rad] of a joint
-_MAX_WRIST_DISTANCE: Final = 100.0  # [m] from the origin
+_MAX_ANGLE: Final = 2.0 * np.pi  # largest joint angle that a sampler may return [rad]
+_MAX_WRIST_DISTANCE: Final = 100.0  # largest wrist coordinate that a sampler may return [m]
 
 
 class PoseSampler(Protocol):
@@ -366,7 +366,7 @@ def sample_poses(
 
 
 def load_sampler(sampler: PoseSampler | str, *, is_tried: bool = True) -> PoseSampler:
-    """A user's sampler, or the one of a name, behind checks of what it returns; two poses are a trial."""
+    """A sampler, or that of a name, whose output is checked; with `is_tried` two poses are drawn as a trial."""
     if not isinstance(sampler, str):
         names = ", ".join(SAMPLER.names())
         check_callable("sampler", sampler, SAMPLER.words + (f"; valid names: {names}" if names else ""))

@@ -1,4 +1,4 @@
-"""Thumb and finger that touch: solved for one person's hand, with the position of the contact.
+"""Poses in which thumb and finger touch, solved for one person's hand, and where they touch.
 
 A touch is two capsules that meet: those of the thumb's and the finger's last bones, pads facing each other.
 A real hand gives this kind of ground truth without any instrument.
@@ -28,15 +28,15 @@ MAX_OVERLAP: Final = 0.0006
 MIN_FACING: Final = 0.5
 """Smallest cosine between a pad's direction and the direction to the other bone in a solved touch."""
 _PAD: Final = 0.6  # where the pad is, as a share of the last bone's capsule
-# One unit of the sum of squares: meters of overlap, of penetration elsewhere, between the pads; radians.
+# Residuals are divided by these scales [m]: overlap of the last bones, other penetration, pad distance.
 _OVERLAP_SCALE: Final = 5e-5
-_DIG_SCALE: Final = 1e-4
+_PENETRATION_SCALE: Final = 1e-4
 _PAD_SCALE: Final = 3e-2
 _FACING_WEIGHT: Final = 5.0
 _ANGLE_WEIGHTS: Final = 2.0 * np.array([1.0, 1.0, 1.0, 1.0, 2.0, 1.0, 1.0, 1.0])
 _TARGET_FACING: Final = 0.55
 _MOST_ROUNDS: Final = 4
-_STEP: Final = 1e-6  # of the finite differences [rad]
+_STEP: Final = 1e-6  # step of the finite differences [rad]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -99,7 +99,7 @@ def touching_angles(
         starts = check_array("start", start, (NUM_JOINTS,)).reshape(-1, NUM_JOINTS)
     for begin in np.clip(starts, LOW, HIGH):
         angles = begin
-        for _ in range(_MOST_ROUNDS):  # each solution stays near its start, so a far touch takes some rounds
+        for _ in range(_MOST_ROUNDS):  # a solution stays near its start, so a far touch takes several rounds
             angles = _solve(model, finger, angles)
             if is_touching(model, angles[None], finger)[0]:
                 return angles
@@ -167,7 +167,7 @@ def _residuals(
         return np.concatenate(
             [
                 (contact.overlap - 0.5 * MAX_OVERLAP)[:, None] / _OVERLAP_SCALE,
-                np.maximum(0.0, overlaps - 0.7 * MAX_PENETRATION) / _DIG_SCALE,
+                np.maximum(0.0, overlaps - 0.7 * MAX_PENETRATION) / _PENETRATION_SCALE,
                 _FACING_WEIGHT * np.maximum(0.0, _TARGET_FACING - contact.facing),
                 (positions[0] - positions[1]) / _PAD_SCALE,
                 _ANGLE_WEIGHTS * (x - start[moving]),

@@ -1,4 +1,7 @@
-"""Two hands that meet, clasp, clap, rub, point and part: smooth motions, and single poses drawn from them."""
+"""Two hands that meet, clasp, clap, rub, point and part: smooth motions and single poses.
+
+A beat is a key pose of an interaction; motion interpolates between beats, and single poses are beats.
+"""
 
 from __future__ import annotations
 
@@ -66,7 +69,7 @@ class Fingers:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Meeting:
-    """Beats of interactions: poses of the moving hand in the wrist frame of the still one."""
+    """Beats (key poses) of interactions: the moving hand in the wrist frame of the still one."""
 
     still: Fingers
     moving: Fingers
@@ -108,7 +111,7 @@ def draw_variant(name: str, *, rng: np.random.Generator) -> dict[str, Any]:
 
 
 class Sketch(NamedTuple):
-    """The random part of an interaction's beats, before hands give it their size."""
+    """The random part of an interaction's beats, for hands of any size."""
 
     variant: dict[str, Any]  # from `draw_variant`
     still: _FingerSketch
@@ -183,7 +186,7 @@ class _Noise:
     def around(
         self, scale: NDArray[np.float64], wander: float, *, common: float = 1.0
     ) -> NDArray[np.float64]:
-        """Noise (K, n) of scale (n,): `common` times a lasting part plus `wander` times one for each beat."""
+        """Noise (K, n) of scale (n,): `common` times a lasting part plus `wander` times a part per beat."""
         size = (self.count, len(scale))
         lasting = self.rng.standard_normal((1, size[1]) if self.together else size)
         new = self.rng.standard_normal(size)
@@ -306,7 +309,7 @@ def draw_poses(
 
 
 class _Draw(NamedTuple):
-    """Single poses of one interaction, before hands give them their size."""
+    """Single poses of one interaction, for hands of any size."""
 
     left_still: bool
     """Whether the left hand is the still one."""
