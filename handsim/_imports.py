@@ -65,14 +65,14 @@ class ShadowedPackageWarning(UserWarning):
 
 
 def shadowed_siblings(home: str = _HOME) -> dict[str, str]:
-    """Where each sibling leads that does not lie in `home`, the folder that holds `handsim`."""
+    """Locations of siblings that are found elsewhere than in `home`, the folder that holds `handsim`."""
     found = {name: _location(name) for name in SIBLINGS}
     own = {name: os.path.realpath(os.path.join(home, name)) for name in SIBLINGS}
     return {name: place for name, place in found.items() if place and os.path.realpath(place) != own[name]}
 
 
 def warn_if_shadowed() -> None:
-    """Warn once for each sibling that leads elsewhere; nothing is imported."""
+    """Warn once for each sibling that is found elsewhere; nothing is imported."""
     for name, location in shadowed_siblings().items():
         warnings.warn(
             f"handsim needs its own package '{name}', but `import {name}` finds {location}; rename that, "

@@ -126,7 +126,7 @@ def _told(error: Exception) -> str:
 
 
 EGL_PACKAGES: Final = "libegl1 libegl-mesa0 libgl1-mesa-dri libgl1 libopengl0"
-"""What drawing through OpenGL without a screen needs of Debian and Ubuntu, which pip cannot install."""
+"""Packages of Debian and Ubuntu, which pip cannot install, for OpenGL without a screen."""
 
 
 def import_extra(module: str, what: str, extra: str) -> Any:

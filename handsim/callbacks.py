@@ -1,4 +1,4 @@
-"""What long work calls to tell how far it is, and objects that are closed at its end."""
+"""Callbacks that report the progress of long work, and a base of objects that are closed at its end."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ def no_step(name: str) -> None:
 
 
 before_compiling: list[Callable[[], None]] = []
-"""What is called before the next kernel is compiled that the cache lacks: the last one, once."""
+"""Callbacks; the last one is removed and called before a kernel that the cache lacks is compiled."""
 
 
 class Closing:
     """A base of classes with `close`: the end of a `with` block closes them, whatever ended it."""
 
     def close(self) -> None:
-        """Give back what is held; to be overridden."""
+        """Release what the object holds; to be overridden."""
         raise NotImplementedError
 
     def __enter__(self) -> Self:

@@ -59,7 +59,7 @@ def _compiled(function: Callable[P, R], *, inline: bool) -> Any:
 
 
 def _load_or_prepare(load: Callable[..., Any], types: object, target: object) -> Any:
-    """Load a kernel from the cache, after what `before_compiling` holds if it is not there."""
+    """Load a kernel from the cache; while it is missing, call what `before_compiling` holds and try again."""
     found = load(types, target)
     while found is None and before_compiling:
         before_compiling.pop()()
@@ -427,7 +427,7 @@ def pose_digit_axes(wrist: Any, angles: Any, digit: Any, posed: Any, scratch: An
     """
     for joint in range(4):
         scratch[joint, 0], scratch[joint, 1] = np.sin(angles[joint]), np.cos(angles[joint])
-    for row in range(3):  # a row of the frames and of the origins needs no other
+    for row in range(3):  # rows of the frames and of the origins do not depend on each other
         a, b, c, origin = wrist[0][row, 0], wrist[0][row, 1], wrist[0][row, 2], wrist[1][row]
         joint = 0
         for bone in range(3):

@@ -34,12 +34,12 @@ class Limits:
     above: bool = False
     """Whether `low` itself is refused."""
     ascends: bool = False
-    """Whether the numbers of a tuple must not fall."""
+    """Whether the numbers of a tuple must not decrease."""
 
 
 @dataclass(frozen=True, slots=True)
 class Expected:
-    """Words of errors for a field of several types: `Annotated[A | str, Expected("an A, or its name")]`."""
+    """How errors describe a field of several types: `Annotated[A | str, Expected("an A, or its name")]`."""
 
     words: str
     names: Callable[[], Iterable[str]] = tuple
@@ -50,9 +50,9 @@ class Settings:
     """Base of the frozen dataclasses of settings.
 
     Each field is checked by its annotation when an object is made: numbers by their `Limits`, names by their
-    `Literal`, other types by what they are, `Expected` telling errors what to say. A group of settings may be
-    given as a mapping of the fields that differ from its default (a `Mixture` as its shares), a tuple as a
-    list or as its only item, a path as a string.
+    `Literal`, others by their type, which errors describe as `Expected`. A group of settings may be given as
+    a mapping of the fields that differ from its default (a `Mixture` as its shares), a tuple as a list or as
+    its only item, a path as a string.
 
     Raises:
         ArgumentError: A field has another type, is out of range, or is none of the valid names.
@@ -60,7 +60,7 @@ class Settings:
 
     __slots__ = ()
     noun: ClassVar[str] = "setting"
-    """What errors call a field that is unknown."""
+    """The noun for an unknown field in errors."""
 
     def __post_init__(self) -> None:
         hints = _hints(type(self))  # type: ignore[arg-type]  # a class is hashable
@@ -88,9 +88,9 @@ class Settings:
 
     @classmethod
     def from_json(cls, record: Mapping[str, Any]) -> Self:
-        """The settings in a record, which may hold more than them.
+        """The settings in a record, whose other keys are ignored.
 
-        What was given as an object is recorded by its name, and is the thing of that name here.
+        A setting that was given as an object is recorded by its name, which is looked up here.
         """
         known = {field.name for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
         return cls(**{name: value for name, value in record.items() if name in known})
@@ -142,7 +142,7 @@ def _hints(kind: type) -> dict[str, Any]:
 
 
 def _checked(name: str, value: Any, hint: Any, field: dataclasses.Field[Any] | None = None) -> Any:
-    """A value as its annotation has it, or an error."""
+    """A value converted to its annotation, or an error."""
     limits, expected = None, None
     while get_origin(hint) is Annotated:
         hint, *extras = get_args(hint)
@@ -172,7 +172,7 @@ def _checked_object(name: str, value: Any, kind: Any, expected: Expected | None)
             raise ArgumentError(f"{name} is {shown_value(value)}, expected {_words(kind, expected)}")
     elif isinstance(kind, type) and get_origin(kind) is None:
         check_type(name, value, kind, _words(kind, expected), () if expected is None else expected.names())
-    return value  # of a generic type, such as a sequence of several types, `check` of the class refuses some
+    return value  # values of a generic type, such as a sequence of several types, are left to `check`
 
 
 def _checked_union(

@@ -366,7 +366,7 @@ def sample_poses(
 
 
 def load_sampler(sampler: PoseSampler | str, *, is_tried: bool = True) -> PoseSampler:
-    """A sampler, or that of a name, whose output is checked; with `is_tried` two poses are drawn as a trial."""
+    """A sampler, or that of a name, with checks of its output; if `is_tried`, it draws two poses first."""
     if not isinstance(sampler, str):
         names = ", ".join(SAMPLER.names())
         check_callable("sampler", sampler, SAMPLER.words + (f"; valid names: {names}" if names else ""))

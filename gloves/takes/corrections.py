@@ -1,7 +1,7 @@
 """Labels of a tracked take that a person corrected, as a TOML file beside the take.
 
 A correction names a point by its place in the first frame of a span, so that it also fits a new tracking of
-the same capture. Through the span the point is followed by its ID, or without an ID from position to position.
+the same capture. Within the span the point is followed by its ID, or without one from position to position.
 """
 
 from __future__ import annotations

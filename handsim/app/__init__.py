@@ -1,1 +1,1 @@
-"""What commands share: what they say, how they end, and who does their work."""
+"""What commands share: messages, compiled kernels, output folders and workers."""

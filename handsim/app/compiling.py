@@ -2,8 +2,8 @@
 
 data/kernels.json lists the kernels of every command: the types of their arguments, by rows of a table in
 which rows refer to earlier ones, and the time to compile each. `python -m benchmarks.cold_start --record`
-writes it. What the list lacks is compiled when it is called; what it holds in vain costs some time and
-nothing else.
+writes it. A kernel that the list lacks is compiled when it is called; one that is no longer used costs some
+time and nothing else.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ if TYPE_CHECKING:
     from numba.core.registry import CPUDispatcher
 
 LIST: Final = Path(__file__).parents[1] / "data" / "kernels.json"
-_FEW: Final = 4.0  # [s] of compiling that other processes are not worth
+_FEW: Final = 4.0  # Less compiling than this is not worth other processes [s].
 _TOLD: Final = 2.0  # [s] between two lines
 _ENDING: Final = 5.0  # [s] that a process has to end
 _MOST: Final = 8  # processes; more would wait for one another
-_KNOWN: Final = 3.0  # factor of the rank of kernels in a package whose other kernels a process has compiled
-_GARBAGE: Final = 100_000  # new objects that Python's collector waits for: a twentieth of the time is its
+_KNOWN: Final = 3.0  # A process ranks a kernel so much higher if it has compiled others of its package.
+_GARBAGE: Final = 100_000  # new objects before Python collects garbage, which else takes 5 % of the time
 
 
 class ListedKernel(NamedTuple):
@@ -59,7 +59,7 @@ def compile_kernels(command: str | None = None) -> tuple[int, int]:
     """
     listed = {row: one for row, one in enumerate(read_list()) if command in (None, *one.commands.split())}
     missing = missing_kernels(listed)
-    if command is not None:  # what is missing after all of this
+    if command is not None:  # kernels that are missing afterwards are compiled when they are called
         before_compiling.append(functools.partial(tell_state, "compiling what is new, once on this machine"))
     if sum(one.seconds for one in missing.values()) <= (0.0 if command is None else _FEW):
         return 0, len(missing)
@@ -103,7 +103,7 @@ def _type_of(row: str | list[Any], known: list[Any]) -> Any:
 
 
 def type_row(kind: Any, table: list[Any]) -> int:
-    """The row of a type in a table, which gets it if it is not there; for the list's author.
+    """The row of a type in a table, to which it is added if it is missing; used to record the list.
 
     Raises:
         ValueError: The list has no words for the type.
@@ -136,7 +136,7 @@ def _found(place: str) -> Any:
 
 
 def missing_kernels(listed: Mapping[int, ListedKernel]) -> dict[int, ListedKernel]:
-    """Those kernels, by their rows in the list, that the cache lacks."""
+    """The kernels that the cache lacks, by their rows in the list."""
     from numba.core.registry import cpu_target
 
     codegen, known = cpu_target.target_context.codegen(), known_types()
@@ -188,7 +188,7 @@ class _Compilers:
         home = str(Path(__file__).parents[2])
         path = os.pathsep.join(filter(None, (home, os.environ.get("PYTHONPATH"))))
         command = [sys.executable, "-P", "-m", __name__]
-        with one_thread(), without_signals(), contextlib.suppress(OSError):  # if it has no room for more
+        with one_thread(), without_signals(), contextlib.suppress(OSError):  # no memory for another process
             for _ in range(min(usable_cores(), self._count, _MOST)):
                 self._processes.append(
                     subprocess.Popen(
@@ -217,7 +217,7 @@ class _Compilers:
         tell_state(f"compiling {self._count} kernels, once on this machine")
         for thread in threads:
             thread.start()
-        told, first = began, (began, 0.0)  # the first kernel waits until the process is there
+        told, first = began, (began, 0.0)  # speed counts from the first kernel, when processes have started
         while any(thread.is_alive() for thread in threads):
             with self._changed:
                 self._changed.wait(_TOLD / 10.0)
@@ -249,9 +249,9 @@ class _Compilers:
                 return
 
     def _take(self, packages: set[str]) -> int | None:
-        """The next kernel, when what it calls is there; None if no more are left.
+        """The next kernel, once the kernels that it calls are compiled; None if none is left.
 
-        Each process compiles what kernels need of numba itself. So it keeps to few packages if it can.
+        A process also compiles the parts of numba that its kernels use, so it keeps to few packages.
         """
 
         def rank(row: int) -> float:
@@ -279,10 +279,10 @@ class _Compilers:
 
 
 def plain_shape_errors() -> None:
-    """Let kernels say that shapes of a slice and of what it is set to differ, but not which shapes they are.
+    """Let a kernel that sets a slice to another shape raise an error that does not tell the shapes.
 
-    Ours have no such slices, and the words that numba would compile into each kernel with a slice are up to
-    half of its code.
+    Our kernels set no slice to another shape, and numba's error with the shapes is up to half of the code of
+    each kernel with a slice.
     """
     from numba.core.extending import overload
     from numba.np import arrayobj
@@ -307,7 +307,7 @@ def _work(rows: Iterable[str]) -> None:
     listed, known = read_list(), known_types()
     for row in rows:
         one = listed[int(row)]
-        with contextlib.suppress(Exception):  # what is wrong with a kernel is told where it is called
+        with contextlib.suppress(Exception):  # a kernel that cannot be compiled raises where it is called
             _found(one.name).compile(tuple(known[number] for number in one.types))
         print(row.strip(), flush=True)
 

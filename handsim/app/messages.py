@@ -1,4 +1,4 @@
-"""What a command says: lines as they are, warnings as lines, progress bars, and a renewed line of status.
+"""Messages of a command: lines as they are, warnings as lines, progress bars, and a live line of status.
 
 In a batch job's log a progress bar is a line every ten seconds. rich takes long to import, and is imported
 where it is needed.
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 _RENEWED: Final = 0.2  # [s] between two lines on a terminal
 _PRINTED: Final = 10.0  # [s] between two lines elsewhere, as in the log of a batch job
-_WIDTH: Final = 80  # columns of a terminal that does not tell
+_WIDTH: Final = 80  # columns of a terminal whose width is unknown
 
 
 def print_line(*lines: str) -> None:
@@ -137,8 +137,8 @@ def _columns() -> int:
 _COUNTS: Final = re.compile(r"[\d.,]+")
 EVERY: Final = 10.0
 """Time between two lines where there is no terminal [s]."""
-_PERIOD: Final = 600.0  # [s] that speeds and the time left are means over
-_tellers: list[Callable[[str], None]] = []  # of the bars and steps that are shown, the innermost last
+_PERIOD: Final = 600.0  # Speeds and the time left are averages over this time [s].
+_tellers: list[Callable[[str], None]] = []  # show a line in a bar or step; the innermost is last
 
 
 def tell_state(line: str) -> None:
@@ -169,7 +169,7 @@ def told_share(what: str) -> Callable[[int, int], None]:
 
 @contextmanager
 def _telling(tell: Callable[[str], None]) -> Iterator[None]:
-    """Let `tell_state` tell this within the block."""
+    """Within the block `tell_state` passes its lines to `tell`."""
     _tellers.append(tell)
     try:
         yield
@@ -251,7 +251,7 @@ def progress_bar(unit: str) -> Iterator[ProgressBar]:
 
 @contextmanager
 def named_steps(first: str) -> Iterator[Callable[[str], None]]:
-    """Names steps whose length is not known, on standard error: on a terminal the running one, else all.
+    """Show names of steps of unknown length on standard error: the current one on a terminal, else all.
 
     Without a `first` one, only what `tell_state` tells is shown.
     """

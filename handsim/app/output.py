@@ -58,7 +58,7 @@ def load_checksums(path: Path) -> dict[str, str]:
 
 
 def checked_list(path: Path, files: Mapping[str, Path]) -> tuple[dict[str, str], list[str]]:
-    """The checksums of a list, and the names of files that are missing or have others, or of a damaged list.
+    """The checksums of a list, and the names of missing and changed files; a damaged list names itself.
 
     Files are beside the list, unless `files` says where they are.
     """
@@ -108,7 +108,7 @@ class Output:
     """A folder that all jobs write to.
 
     For an object store, each job writes to a temporary folder on its own machine and puts the files into the
-    store. Files made of all jobs are written to `folder`, from what `fetch` brings, and put by `publish`.
+    store. Files on all jobs are made in `folder`, from files that `fetch` copies, and put by `publish`.
     """
 
     place: Place
@@ -195,7 +195,7 @@ class Output:
             return checksum(self.place / name)
 
     def warn_of(self, files: Collection[str], what: str) -> None:
-        """Warn of files that are not as they were written; `what` says so, and what becomes of them."""
+        """Warn of damaged files; `what` ends the sentence: what is wrong, and what becomes of them."""
         if files:
             warnings.warn(f"{self}: {', '.join(sorted(files))} {what}", HandSimWarning, stacklevel=5)
 
@@ -281,7 +281,7 @@ def _put(store: Place, folder: Path, names: Collection[str], last: Sequence[str]
 
 @contextmanager
 def _one_sentence(place: Place, doing: str) -> Iterator[Any]:
-    """The file system of a store, any error of which ends in one sentence: each protocol has its own."""
+    """The file system of a store; any error, of whatever protocol, becomes a `HandSimError`."""
     try:
         yield None if isinstance(place, Path) else place.fs
     except ImportError:

@@ -48,7 +48,7 @@ def usable_cores() -> int:
 def check_workers(workers: int | None) -> int:
     """Number of processes, by default one per core.
 
-    A process that runs a script again while it starts ends here, before it does what its parent does.
+    A worker that runs its parent's script while it starts ends here, before it repeats the parent's work.
     """
     if getattr(multiprocessing.current_process(), "_inheriting", False):
         raise SystemExit(f"a process that starts runs this script again: {_GUARD}")
@@ -79,7 +79,7 @@ def run_jobs(job: Job, todo: Sequence[int], workers: int | Executor | None) -> I
 
 
 def _check_main(job: Job) -> None:
-    """Refuse a job that is defined where workers cannot import it without doing the same as this process."""
+    """Refuse a job that workers can import only by running this process's script again."""
     try:
         needs_main = _MAIN.encode() in pickle.dumps(job)
     except Exception:  # the executor tells what cannot be pickled
@@ -103,7 +103,7 @@ def _is_guarded() -> bool:
 
 @contextmanager
 def _main_left_out() -> Iterator[None]:
-    """Let processes started in the block not run the main script, as they usually do."""
+    """Keep processes started in the block from running the main script, as they usually do."""
     main, sys.modules[_MAIN] = sys.modules[_MAIN], ModuleType(_MAIN)
     try:
         yield
@@ -205,7 +205,7 @@ def one_thread() -> Iterator[None]:
 
 @contextmanager
 def without_signals() -> Iterator[None]:
-    """Let processes started in the block ignore Ctrl-C and hang-ups; this one gets them after it."""
+    """Let processes started in the block ignore Ctrl-C and hang-ups; this process gets them afterwards."""
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 _MOST_MEMBERS: Final = 10_000
 _MOST_DIMENSIONS: Final = 8
 _ALWAYS: Final = 1 << 28  # bytes that any archive may hold
-_LARGEST_RATIO: Final = 20  # of the bytes in memory to those of the file beyond that
+_LARGEST_RATIO: Final = 20  # A larger archive may expand to this many times the size of its file.
 _DAMAGE: Final = (
     AttributeError, EOFError, IndexError, KeyError, OverflowError, RuntimeError, SyntaxError, TypeError,
     tokenize.TokenError, lzma.LZMAError, zipfile.BadZipFile, zlib.error,
@@ -87,11 +87,11 @@ def read_npz(path: Path) -> dict[str, np.ndarray[Any, Any]]:
 
 @contextmanager
 def _damage_named() -> Iterator[None]:
-    """Make a ValueError of what the libraries raise for a damaged archive."""
+    """Turn what the libraries raise for a damaged archive into a ValueError."""
     try:
         yield
     except OSError as error:
-        if error.errno is None:  # of a decompressor
+        if error.errno is None:  # raised by a decompressor
             raise ValueError("damaged") from error
         raise
     except _DAMAGE as error:

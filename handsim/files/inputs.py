@@ -110,7 +110,7 @@ def read_toml(path: Path, *, error: type[HandSimError]) -> dict[str, Any]:
 
 
 def _has_long_integer(value: object) -> bool:
-    """Whether an integer beyond the 64 bits of TOML is in a table, which Python would take."""
+    """Whether a table holds an integer beyond TOML's 64 bits, which Python accepts."""
     if isinstance(value, dict | list):
         return any(map(_has_long_integer, value.values() if isinstance(value, dict) else value))
     return isinstance(value, int) and value.bit_length() > _INTEGER_BITS
@@ -156,7 +156,7 @@ def tables_of(table: Mapping[str, object], key: str) -> list[dict[str, Any]]:
 
 
 def text_of(table: Mapping[str, object], key: str, prefix: str = "", *, default: str | None = None) -> str:
-    """Text of any characters."""
+    """The text under a key of a table."""
     value = table.get(key, default)
     if not isinstance(value, str):
         raise HandSimError(f"{prefix}{key} is {shown(value)}, expected text in quotes")
@@ -166,7 +166,7 @@ def text_of(table: Mapping[str, object], key: str, prefix: str = "", *, default:
 def number_of(
     table: Mapping[str, object], key: str, prefix: str = "", *, default: float | None = None
 ) -> float:
-    """A finite number."""
+    """The finite number under a key of a table."""
     return float(numbers(f"{prefix}{key}", table.get(key, default), (), "a number"))
 
 

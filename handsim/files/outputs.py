@@ -1,6 +1,6 @@
 """Files that are written whole or not at all, alone or together, and checks before the work.
 
-Outputs can be written, none over an input, and disk and memory have room.
+The checks are that outputs can be written, none over an input, and that disk and memory have room.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def as_text(name: str) -> str:
 
 @contextmanager
 def plain_path(path: Path) -> Iterator[Path]:
-    """The path, or where it is not UTF-8 a link to it whose path is: some libraries take no other."""
+    """The path, or a link to it if the path is not UTF-8, which some libraries require."""
     try:
         str(path).encode()
     except UnicodeEncodeError:
@@ -50,7 +50,7 @@ def plain_path(path: Path) -> Iterator[Path]:
 
 
 _OLDER: Final = "-older"  # marks the second name of a file that is being replaced
-_PROBE: Final = 1 << 20  # bytes
+_PROBE: Final = 1 << 20  # bytes that are written to learn why a library's write failed
 
 
 @contextmanager
@@ -87,7 +87,7 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
 
 @contextmanager
 def _errors_name(final: Path, temporary: Path) -> Iterator[None]:
-    """Errors name the file that was asked for, not the temporary one, nor none as those of full disks do."""
+    """Let errors name the final file; else they name the temporary one, or none if the disk is full."""
     try:
         yield
     except OSError as error:
@@ -126,7 +126,7 @@ def _name(files: Mapping[Path, Path]) -> None:
     named: list[Path] = []
     with signals_wait():
         try:
-            if len(files) > 1:  # a single rename is whole in itself
+            if len(files) > 1:  # a single rename is atomic
                 for final in filter(Path.exists, files):
                     older[final] = temporary_beside(final, _OLDER)
                     _keep(final, older[final])
@@ -159,7 +159,7 @@ def _keep(final: Path, older: Path) -> None:
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """Write a text file, complete or not at all; what is no text, as names of files may be, is replaced."""
+    """Write a text file, complete or not at all; what is not UTF-8, as in some file names, is replaced."""
     with atomic_write(path) as temporary:
         temporary.write_text(text, "utf-8", errors="replace")
 
@@ -197,14 +197,14 @@ def temporary_beside(path: Path, mark: str = "") -> Path:
 
 
 def _prefix(path: Path) -> str:
-    """The beginning of temporary names, with a number of this machine, since process numbers are its own."""
+    """The beginning of temporary names, with a hash of this machine, because process IDs differ by machine."""
     return f".{path.stem}.tmp-{zlib.crc32(platform.node().encode()):08x}-"
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Remove every temporary file and folder in a folder and below it that no process writes any more.
+    """Remove every temporary file and folder in a folder and below it.
 
-    Only for a folder that one job owns: what another living process is writing there would be lost.
+    Call it only for a folder that one job owns: what another process is writing there would be lost.
     """
     for leftover in folder.glob("**/.*.tmp-*"):
         _remove(leftover)
@@ -227,7 +227,7 @@ def remove_abandoned(final: Path) -> None:
 
 
 def _is_running(process: int) -> bool:
-    if os.name != "posix":  # there a signal of zero would end the process
+    if os.name != "posix":  # on Windows signal 0 would end the process
         return True
     try:
         os.kill(process, 0)
@@ -376,7 +376,7 @@ def json_text(content: dict[str, Any]) -> str:
 
 
 def _finite(value: Any) -> Any:
-    """The same, with None for what is not finite."""
+    """The value with None in place of NaN and infinity."""
     if isinstance(value, dict):
         return {key: _finite(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):
@@ -397,8 +397,8 @@ def claim(
 ) -> None:
     """Claim a folder by a settings file, or check that its settings are equal; clear what a killed run left.
 
-    The setting `grows`, written like `train.samples`, may be larger than in the file, which then takes the
-    new settings; the old ones' file `result` is removed before. Settings that are `free` may differ.
+    The setting `grows`, written like `train.samples`, may be larger than in the file. Then `result`, made
+    with the old settings, is removed, and the file takes the new ones. Settings that are `free` may differ.
     """
     out, shown = path.parent, shown or str(path.parent)
     if path.is_file():
@@ -417,7 +417,7 @@ def claim(
         remove_leftovers(out)
         if grown and result is not None:
             result.unlink(missing_ok=True)
-        if grown or path.read_text("utf-8") != json_text(stored):  # damaged without another meaning
+        if grown or path.read_text("utf-8") != json_text(stored):  # the text is damaged, its content is not
             save_json(path, settings)
     elif out.exists() and not out.is_dir():
         raise error(f"{out} is a file, expected a folder")

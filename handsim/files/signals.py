@@ -1,4 +1,4 @@
-"""Signals that ask a command to end: put off, as a flag for a loop, or as an exception with what is kept."""
+"""Signals that ask a command to end: delayed, as a flag for a loop, or as an exception."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ ENDING: Final = tuple(
     getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
 )
 """Ctrl-C, the end of a batch job, and a terminal that closes."""
-_AGAIN: Final = 0.05  # [s] after which a signal is sent again whose exception was lost
+_AGAIN: Final = 0.05  # A signal whose exception was lost is sent again after this time [s].
 
 
 class Stopped(KeyboardInterrupt):
@@ -39,20 +39,20 @@ class Stopped(KeyboardInterrupt):
 
 
 class InterruptFlag:
-    """A flag that a signal to end sets; a call tells whether one came."""
+    """A flag that a signal to end sets; a call tells whether it is set."""
 
     def __init__(self) -> None:
         self.number = 0
         """The first signal that came, 0 if none did."""
 
     def __call__(self) -> bool:
-        """Whether one came."""
+        """Whether a signal to end came."""
         return self.number != 0
 
 
 @contextmanager
 def signals_wait() -> Iterator[None]:
-    """Deliver signals to end that come within the block after it."""
+    """Delay signals to end that come within the block until after it."""
     came: list[int] = []
     try:
         with _handled(lambda number, _frame: came.append(number)):
