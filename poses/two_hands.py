@@ -1,7 +1,4 @@
-"""Two hands that meet, clasp, clap, rub, point and part: smooth motions and single poses.
-
-A beat is a key pose of an interaction; motion interpolates between beats, and single poses are beats.
-"""
+"""Two hands that meet, clasp, rub, point and part, in motion and in single poses; a beat is a key pose."""
 
 from __future__ import annotations
 

@@ -2,8 +2,7 @@
 
 data/kernels.json lists the kernels of every command: the types of their arguments, by rows of a table in
 which rows refer to earlier ones, and the time to compile each. `python -m benchmarks.cold_start --record`
-writes it. A kernel that the list lacks is compiled when it is called; one that is no longer used costs some
-time and nothing else.
+writes it. A kernel that the list lacks is compiled when it is called; one out of use only costs time.
 """
 
 from __future__ import annotations

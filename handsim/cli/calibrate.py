@@ -17,7 +17,7 @@ from track.config import BOTH, Size
 if TYPE_CHECKING:
     from track.calibration.user_calibration import Calibration
 
-_LONGEST: Final = 180.0  # [s] of a stream that is recorded
+_LONGEST: Final = 180.0  # longest recording of a stream by default [s]
 
 
 def calibrate(
@@ -31,7 +31,7 @@ def calibrate(
     hands: tuple[Side, ...] = BOTH,
     labeler: str | None = None,
 ) -> None:
-    """Fit hands and gloves to a user, from a capture or stream; a minute in which all joints move tells most.
+    """Fit hands and gloves to a user, from a capture or stream; best is a minute in which all joints move.
 
     The capture is labeled by the tracker. Each hand is solved on two thirds of the time and tried on the
     rest; a hand that is no better there stays as it was.

@@ -17,7 +17,7 @@ def demo(out: Path = Path("demo"), seed: int = 0, num_frames: int = 2000) -> Non
 
     Args:
         out: Folder for index.html and its pictures.
-        seed: Of the generated frames and of everything drawn at random.
+        seed: Seed of the generated frames and of everything drawn at random.
         num_frames: Frames to generate and label.
     """
     check_count("num_frames", num_frames, 1)

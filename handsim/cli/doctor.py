@@ -24,10 +24,10 @@ from handsim._plugins import EGL_PACKAGES
 from handsim.app.workers import usable_cores
 
 _PROBE_SECONDS: Final = 120.0
-_RATE: Final = 60.0  # [Hz] of the hand that points
-_POINTING: Final = 120  # frames for which it points along an axis
-_WRIST: Final = (0.1, 0.2, 0.3)  # its wrist in the receiver's axes [m]
-_BENT: Final = 1.2  # flexion of its other fingers [rad]
+_RATE: Final = 60.0  # frame rate of the pointing hand [Hz]
+_POINTING: Final = 120  # frames for which the hand points along each axis
+_WRIST: Final = (0.1, 0.2, 0.3)  # wrist of the pointing hand in the receiver's axes [m]
+_BENT: Final = 1.2  # flexion of the fingers that do not point [rad]
 # These programs run in processes of their own, because a broken driver kills its process.
 _DRAW: Final = """
 import os

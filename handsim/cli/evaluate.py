@@ -61,7 +61,7 @@ def evaluate(
         report = evaluate_labels(captures[0], truth)
         found = {"truth": str(truth)}
     by_marker = dict(zip(report.marker_names, map(float, report.slot_accuracy_by_marker), strict=True))
-    # JSON has no NaN, which stands where there was nothing to count.
+    # A share of nothing is NaN, which JSON lacks.
     figures = {name: None if math.isnan(value) else value for name, value in report.figures.items()}
     found |= {"frames": report.num_frames, "figures": figures, "numbers": report.numbers}
     found["slot_accuracy_by_marker"] = by_marker

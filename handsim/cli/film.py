@@ -53,7 +53,7 @@ def film(
         video: The video (.mp4, .mov, .avi): one shot of a camera that stands still.
         out: Folder for the pictures, their annotations, film.json, film.mp4 and film.html.
         options: What to write.
-        camera: File with the lens of this camera, as of handsim rig import; found, too, when not given.
+        camera: File with this camera's lens, as of handsim rig import; the lens is fitted when not given.
         detector: Folder of a hand detector of your own; the shipped one when not given.
         format: File formats: webdataset, coco, yolo, freihand, interhand, exr, png; several go into
             folders.

@@ -98,8 +98,8 @@ def render(
             docs/rendering.md has the arrays and columns.
         hands: Whose poses an .npz has, in its order: right (when not given), left, or both. A .csv names its
             hands, and all are drawn when not given.
-        people: Number of people that they are distributed over; one for each shard when not given.
-        glove: Their marker layout with --dress glove: a shipped name or the path of a .toml file; dense19
+        people: Number of people that poses are distributed over; one for each shard when not given.
+        glove: Marker layout of poses with --dress glove: a shipped name or the path of a .toml file; dense19
             when not given.
         merge: Folders of other renderings to be copied into one, with keys and ids of their own.
         options: What to draw.

@@ -92,7 +92,7 @@ def import_rig(
             intrinsics and extrinsics, Pose2Sim's .toml, or the folder of COLMAP's cameras and images.
         out: The rig, a .toml file.
         up: The axis that points up in the calibration; y for Motive and z for the others when not given.
-            The rig's is z.
+            In the rig z points up.
     """
     check_outputs([file], [out], ".toml")
     try:

@@ -37,7 +37,7 @@ def _train(
     from train.reports.run_page import PAGE, held_out_people
 
     del preset  # it is in `settings`
-    if os.environ.get("RANK", os.environ.get("SLURM_PROCID", "0")) != "0":  # the first process tells
+    if os.environ.get("RANK", os.environ.get("SLURM_PROCID", "0")) != "0":  # only the first process prints
         train_labeler(dataset, out, settings, threads=threads)
         return
     with progress_bar("samples") as bar:
@@ -56,7 +56,7 @@ def _with_usual_settings(args: Sequence[str], prog: str) -> Callable[..., None]:
     kinds, presets = (one for one in KINDS if one == labeler), (one for one in PRESETS if one == preset)
     kind = next(kinds, None)
     settings = usual_settings(kind or "set", next(presets, None))
-    if kind == "set":  # of a preset for the paper's network the rest is kept
+    if kind == "set":  # keep the other settings of a preset for the paper's network
         usual = usual_settings(kind)
         settings = dataclasses.replace(settings, labeler=kind, knee=usual.knee, cnn=usual.cnn)
     return functools.partial(_train, settings=settings)

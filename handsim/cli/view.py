@@ -51,7 +51,7 @@ def view(
         live: Stream to track instead of a file: natnet://host, qtm://host or module:name.
         options: Options of a live tracker; --size is also that of the hand that wears a layout.
         video: File for a video of a take, capture or training set (.mp4), which is drawn instead of a page.
-        time: Time of a take, capture or training set that the page opens at [s]; its begin when not given.
+        time: Time of a take, capture or training set that the page opens at [s]; its start when not given.
         up: The axis of a take, capture or stream that points up; y for Motive's default.
     """
     from track.settings import TrackerSetup

@@ -197,7 +197,7 @@ def temporary_beside(path: Path, mark: str = "") -> Path:
 
 
 def _prefix(path: Path) -> str:
-    """The beginning of temporary names, with a hash of this machine, because process IDs differ by machine."""
+    """The beginning of temporary names, with a hash of this machine, since only there IDs are unique."""
     return f".{path.stem}.tmp-{zlib.crc32(platform.node().encode()):08x}-"
 
 

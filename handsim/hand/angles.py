@@ -57,7 +57,7 @@ def isb_angles(
 
 
 def _first_bones(shape: HandShape, angles: Float[np.ndarray, "T 20"]) -> NDArray[np.float64]:
-    """Orientation (T, 5, 3, 3) of the first bone of each digit, as a right hand's: a shape is always one."""
+    """Orientation (T, 5, 3, 3) of each digit's first bone on the right hand that every shape describes."""
     by_digit = angles.reshape(len(angles), len(DIGITS), -1)
     _, y, z = np.eye(3)
     turns = axis_angle_matrix(z, by_digit[..., 0]) @ axis_angle_matrix(y, by_digit[..., 1])

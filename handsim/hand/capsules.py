@@ -29,13 +29,13 @@ class Capsules:
     """Capsules fixed to bones: K segments with a radius each."""
 
     bones: Int[np.ndarray, "K"]
-    """The bone that carries each capsule, an index into `topology.BONES`."""
+    """The bone that carries each capsule, an index into `handsim.hand.shape.BONES`."""
     starts: Float[np.ndarray, "K 3"]
     """One end of each axis in its bone's frame [m]."""
     ends: Float[np.ndarray, "K 3"]
-    """The other end [m]."""
+    """The other end of each axis in its bone's frame [m]."""
     radii: Float[np.ndarray, "K"]
-    """Radius of each one [m]."""
+    """Radius of each capsule [m]."""
 
     def posed(self, T_world_bone: Float[np.ndarray, "T L 4 4"]) -> NDArray[np.float64]:
         """Both ends of every axis in the world (T, K, 2, 3) [m]."""
@@ -156,7 +156,7 @@ def _deepest(
         for pair in range(len(pairs)):
             i, j = pairs[pair, 0], pairs[pair, 1]
             reach = radii[i] + radii[j] - depth[frame]
-            near = sizes[i] + sizes[j] - depth[frame]  # spheres apart by more hold capsules apart by more
+            near = sizes[i] + sizes[j] - depth[frame]  # capsules overlap by no more than their spheres do
             x, y = centers[i, 0] - centers[j, 0], centers[i, 1] - centers[j, 1]
             z = centers[i, 2] - centers[j, 2]
             if reach > 0.0 and x * x + y * y + z * z < near * near:

@@ -68,7 +68,7 @@ class Skeleton:
     def rest_transforms(self) -> Float[np.ndarray, "L 4 4"]:
         """`T_wrist_bone` of every bone at zero angles."""
         transforms = rigid(self.rotations, self.offsets)
-        for first in range(1, 4):  # the bones of all digits that are as far from the palm
+        for first in range(1, 4):  # the first bones of all digits, the second, and the third
             bones = slice(first, None, 3)
             transforms[bones] = transforms[_CHAIN[bones, 0]] @ transforms[bones]
         return transforms
@@ -266,7 +266,7 @@ class HandModel:
 
 
 def load_model(model: HandModel | HandShape | str) -> HandModel:
-    """A hand as it is, of measures, or a right one of size XS, S, M, L or XL; else an `ArgumentError`."""
+    """A model as it is, that of a shape, or a right hand of size XS to XL; else an `ArgumentError`."""
     if isinstance(model, HandModel):
         return model
     if isinstance(model, HandShape):
@@ -284,7 +284,7 @@ def join_qpos(
     """Full qpos of joint angles, with the wrist at the origin by default.
 
     Args:
-        angles: Joint angles [rad], in the order of `topology.JOINTS`.
+        angles: Joint angles [rad], in the order of `handsim.hand.shape.JOINTS`.
         position: Wrist position in the world [m], one per frame or one for all.
         quaternion: Wrist orientation in the world (wxyz), one per frame or one for all.
 
@@ -320,7 +320,7 @@ SKELETON: Final[tuple[tuple[int, int], ...]] = tuple(
     for part in range(4)
 )
 """Pairs of keypoints that a drawing joins by a line."""
-_WRIST_THICKNESS: Final = 1.3  # in thicknesses of the palm
+_WRIST_THICKNESS: Final = 1.3  # thickness of the wrist over that of the palm
 
 
 def hand_keypoints(model: HandModel, qpos: Float[np.ndarray, "T 27"]) -> Float[np.ndarray, "T 21 3"]:
@@ -375,7 +375,7 @@ def skinned_jacobian(
     frames, count = len(T_world_bone), len(points)
     motion = T_world_bone @ np.linalg.inv(model.rest_transforms)
     homogeneous = np.concatenate([points, np.ones((count, 1))], axis=1)
-    carried = np.einsum("tmkij,mj->tmki", motion[:, bone_indices, :3], homogeneous)  # by each bone alone
+    carried = np.einsum("tmkij,mj->tmki", motion[:, bone_indices, :3], homogeneous)  # moved by one bone each
     placed = np.einsum("mk,tmki->tmi", bone_weights, carried)
     jacobian = np.zeros((frames, count, 3, NUM_VELOCITIES))
     jacobian[..., :3] = np.eye(3)
@@ -393,7 +393,7 @@ def skinned_jacobian(
 
 
 _MAX_FRAMES: Final = 1 << 22
-_STEADY: Final = 0.01  # of a frame: largest deviation of times from a steady rate
+_STEADY: Final = 0.01  # largest deviation of times from a steady rate, in frames
 _MAX_GAP: Final = 0.1  # [s] that interpolation bridges
 _MAX_GAP_FRAMES: Final = 2.5  # old frames that interpolation bridges, if that is longer
 
@@ -499,7 +499,7 @@ def between_poses(
 ) -> Float[np.ndarray, "K H W"]:
     """Poses at new times, interpolated between old ones: position, quaternion (wxyz) and angles, if any.
 
-    They are NaN beside a missing old pose, and between old frames more than a tenth of a second apart.
+    They are NaN beside a missing old pose, and between old frames more than 0.1 s and 2.5 frames apart.
     """
     old, new = times - times[0], new - times[0]
     # The old frame before each new time, and the weight of the next one, NaN in a gap.

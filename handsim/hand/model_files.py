@@ -34,7 +34,7 @@ from handsim.space.transforms import (
     rigid,
 )
 
-_SMALL_SHARE: Final = 0.01
+_SMALL_SHARE: Final = 0.01  # share of a bone's mass for the link between its two joints
 _MOST_TORQUE: Final = 2.0  # [N m], about that of a strong finger's first joint
 _MOST_SPEED: Final = 40.0  # [rad/s], above that of the fastest fingers
 _COLOR: Final = "0.85 0.65 0.55 1"
@@ -104,7 +104,7 @@ def _add_capsule(
 def _add_joint(
     root: ET.Element, model: HandModel, joint: int, parent: str, child: str, *, at_rest: bool
 ) -> None:
-    """A hinge; the first of a bone stands at the bone's place at rest, the next one in the same place."""
+    """A hinge; a bone's first hinge has the bone's pose at rest, its second one is in the same place."""
     skeleton, bone = model.skeleton, JOINTS[joint].bone
     place, turn = np.zeros(3), np.zeros(3)
     if at_rest:
@@ -133,9 +133,9 @@ def number_text(value: float) -> str:
 _VERSION: Final = "40000"  # of the document: OpenSim 4.0 and later read it
 _GRAVITY: Final = "0 -9.80665 0"  # OpenSim's world has y up
 _OSIM_COLOR: Final = "0.85 0.65 0.55"
-_FARTHEST: Final = 5.0  # [m] of the wrist from the origin
-_MOST_TURN: Final = 2.0 * np.pi  # [rad] of the wrist
-_PARALLEL: Final = 0.5  # of two axes: the cosine of the angle between them
+_FARTHEST: Final = 5.0  # range of the wrist's positions, both ways [m]
+_MOST_TURN: Final = 2.0 * np.pi  # range of the wrist's rotations, both ways [rad]
+_PARALLEL: Final = 0.5  # Axes with a larger cosine between them are too parallel for one joint.
 
 
 def coordinate_names(side: Side) -> tuple[str, ...]:
@@ -160,8 +160,8 @@ def hand_osim(
     """The text of a .osim file: meters, radians, kilograms.
 
     The hand begins in the pose `start` of a world whose axis `up` points up, or flat with the back up.
-    OpenSim's inverse kinematics begins there too, and finds the wrist's angles on the branch of those of a
-    .mot that begins so.
+    OpenSim's inverse kinematics begins there too, so that the wrist's angles do not differ by full turns from
+    a .mot that begins in this pose.
     """
     side = model.shape.side
     document = ET.Element("OpenSimDocument", Version=_VERSION)
@@ -178,7 +178,7 @@ def hand_osim(
     flat = join_qpos(np.zeros((1, NUM_JOINTS)))
     values = coordinate_values(flat if start is None else start[None], up)[0]
     starts = dict(zip(coordinate_names(side), values, strict=True))
-    # The palm turns about its own axes and moves along those of the ground, in which it is free.
+    # The palm is free: it turns about its own axes and moves along those of the ground.
     names = coordinate_names(side)[:6]
     joint = _add_osim_joint(joints, f"{side}_wrist", "/ground", f"{side}_{BONE_NAMES[PALM]}", np.eye(4))
     axes = [*zip(names[3:], np.eye(3), strict=True), *zip(names[:3], np.eye(3), strict=True)]
@@ -248,7 +248,7 @@ def _add_knuckle(joints: ET.Element, model: HandModel, bone: int, starts: Mappin
     parent = f"/bodyset/{side}_{BONE_NAMES[BONES[bone].parent]}"
     joint = _add_osim_joint(joints, names[0], parent, f"{side}_{BONE_NAMES[bone]}", T_parent_bone)
     axes = [skeleton.axes[index] for index in hinges]
-    # A custom joint takes three axes, all of them different, also where fewer turn.
+    # A custom joint needs three different axes, even if fewer of them turn.
     axes += [axis for axis in np.eye(3) if all(abs(axis @ one) < _PARALLEL for one in axes)][: 3 - len(axes)]
     _add_motion(
         joint,
@@ -278,10 +278,10 @@ def _add_motion(
     starts: Mapping[str, float],
     ranges: Mapping[str, Float[np.ndarray, "2"]] = MappingProxyType({}),
 ) -> None:
-    """Coordinates of a custom joint: three rotations in turn, then three translations; '' is none.
+    """Add the coordinates of a custom joint: three rotations in turn, three translations; '' for none.
 
-    Ranges [rad] are stated and not enforced ('clamped'): OpenSim's inverse kinematics takes another optimizer
-    for bounds, which ends degrees away from angles that lie well within them.
+    Ranges [rad] are stated and not enforced ('clamped'): with bounds OpenSim's inverse kinematics takes
+    another optimizer, which stops degrees away from angles that lie well within them.
     """
     coordinates = ET.SubElement(joint, "coordinates")
     transform = ET.SubElement(joint, "SpatialTransform")

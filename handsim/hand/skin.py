@@ -185,14 +185,14 @@ _DEPTHS: Final = np.array(
 )
 # Position of each palm row along the metacarpals: 0 at the wrist, 1 at the joints.
 _ROW_POSITIONS: Final = np.array([-0.26, -0.05, 0.16, 0.42, 0.70, 0.97])
-_WRIST_COLUMNS: Final = np.array([0.215, 0.075, -0.07, -0.205])  # of the four rays, in hand breadths
+_WRIST_COLUMNS: Final = np.array([0.215, 0.075, -0.07, -0.205])  # y of the rays at the wrist, in breadths
 _EDGES: Final = np.array([[0.15, 0.14, 0.12, 0.13, 0.13, 0.145], [0.15, 0.14, 0.16, 0.17, 0.155, 0.145]])
 
 _CARPUS_RISE: Final = 0.42  # the carpus arches over the line from wrist to knuckles, in palm thicknesses
-_ARCH: Final = np.array([0.0, 0.0, 0.04, 0.08, 0.08, 0.02])  # and the metacarpals' backs over theirs, by row
-# Finger joints rotate nearer to the back than to the pad: how far a section's middle lies below, in radii.
+_ARCH: Final = np.array([0.0, 0.0, 0.04, 0.08, 0.08, 0.02])  # added to the back's height, by row
+# Finger joints lie nearer to the back than to the pad: the middle (y, z) of a section, in radii.
 _PALMWARD: Final = np.array([0.0, -0.14])
-# The web row along the first phalanges; webs slope from the back to the palm, the crotch comes out halfway.
+# Distance of the web row along each first phalanx, in its lengths; webs slope from the back to the palm.
 _WEB_DISTANCES: Final = np.array(
     [
         [0.43, 0.43, 0.31, 0.38, 0.45, 0.43],
@@ -202,8 +202,8 @@ _WEB_DISTANCES: Final = np.array(
     ]
 )
 
-# The palm's vertices around the thumb's metacarpal: where they go along it, in its lengths, sideways and
-# upwards, in its radii, and how much of the way there.
+# Targets of the palm's vertices around the thumb's metacarpal: position along it in its lengths, sideways and
+# upwards in its radii, and the share of the way that each vertex moves to its target.
 _THUMB_BASE_ROWS: Final = np.repeat([CARPUS, THENAR, METACARPUS], [4, 5, 3])
 _THUMB_BASE_COLUMNS: Final = np.array(
     [dorsal(0), *map(palmar, range(3)), dorsal(0), *map(palmar, range(4)), *map(palmar, range(3))]
@@ -240,7 +240,7 @@ _SECTIONS: Final = {
 }
 
 
-_WAISTS: Final = {"before 1": 0.985, "at 1": 1.01, "after 1": 0.985}
+_WAISTS: Final = {"before 1": 0.985, "at 1": 1.01, "after 1": 0.985}  # girths, in those of the shape
 _THUMB, _FINGERS = slice(0, 1), slice(1, len(DIGITS))
 _GROUPS: Final = ((_THUMB, THUMB_RINGS), (_FINGERS, FINGER_RINGS))  # digits with the same rings
 
@@ -280,7 +280,7 @@ class CageHands(NamedTuple):
         return np.concatenate(girths, axis=1)
 
     def cage_parts(self, topology: CageTopology) -> Float[np.ndarray, "3 B K 3"]:
-        """The cage is affine in its scales: vertices in the wrist frame [m] at zero, per width, per depth.
+        """Cage vertices in the wrist frame [m], affine in two scales: at zero, per width, per depth.
 
         Width scales rings and the palm's breadth; depth pushes the last rings out and scales the palm's
         thickness.
@@ -421,7 +421,8 @@ _THENAR: Final = (
     (METACARPUS, palmar(0), 0.4),
     (METACARPUS, palmar(1), 0.25),
 )
-_KNUCKLE_SHARES: Final = {KNUCKLES: (0.35, 0.25), PAST_KNUCKLES: (0.9, 0.7), WEB: (1.0, 0.9)}  # finger, web
+# Share of the fingers' first bones on the palm's rows, on a finger's column and on a web's.
+_KNUCKLE_SHARES: Final = {KNUCKLES: (0.35, 0.25), PAST_KNUCKLES: (0.9, 0.7), WEB: (1.0, 0.9)}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -433,7 +434,7 @@ class HandSurface:
     faces: Int[np.ndarray, "F 3"]
     """Triangles, counter-clockwise from outside."""
     bone_indices: Int[np.ndarray, "V 4"]
-    """Indices in `topology.BONES` of the bones that move each vertex."""
+    """Indices in `handsim.hand.shape.BONES` of the bones that move each vertex."""
     bone_weights: Float[np.ndarray, "V 4"]
     """Their shares: not negative, in descending order, summing to one."""
 
@@ -464,7 +465,7 @@ def _template() -> _Template:
         loops = subdivided_loops(loops, quads, count)
         subdivide = step @ subdivide
         quads, count = next_quads, step.shape[0]
-    children = np.arange(len(quads)).reshape(len(topology.quads), -1)  # a quad's four follow one another
+    children = np.arange(len(quads)).reshape(len(topology.quads), -1)  # quads that came from each cage quad
     tips = np.array([np.unique(quads[children[pair]]) for pair in topology.tips])
     faces = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
     indices, weights = strongest_weights(subdivide @ cage_weights(topology))
@@ -492,7 +493,7 @@ def build_surface(shape: HandShape) -> HandSurface:
 
 @functools.lru_cache(maxsize=4)
 def _right_vertices(measures: bytes) -> Float[np.ndarray, "V 3"]:
-    """`rest_vertices` of the bytes of a `HAND_DTYPE` after the side, which a pair of hands shares."""
+    """`rest_vertices` of the bytes of a `HAND_DTYPE` without the side, cached for both hands of a pair."""
     shape: Any = np.frombuffer(b"\0" + measures, HAND_DTYPE).view(np.recarray)[0]
     vertices: NDArray[np.float64] = rest_vertices([shape])[0]
     return vertices

@@ -169,7 +169,7 @@ def corner_normals(
     at = sparse.csr_array((np.ones(count), (np.arange(count), faces.ravel())), shape=(count, len(vertices)))
     one, other = (at @ at.T).nonzero()  # pairs of corners at one vertex
     near = (units[one // 3] * units[other // 3]).sum(axis=1) > _SMOOTH_EDGE
-    near |= one == other  # a face without an area too
+    near |= one == other  # also on a face without an area
     sums = np.zeros((count, 3))
     np.add.at(sums, one[near], areas[other[near] // 3])
     return _unit(sums).reshape(-1, 3, 3)
@@ -428,8 +428,8 @@ OPENXR_JOINTS: Final[tuple[str, ...]] = (
 )
 """The names of XrHandJointEXT, without XR_HAND_JOINT_ and _EXT, in its order."""
 OPENXR_SUFFIX: Final = ".openxr.json"
-_CARPUS: Final = 0.38
-_MIDDLE: Final = 2  # of the digits
+_CARPUS: Final = 0.38  # share of the way from wrist to knuckle where a finger's metacarpal begins
+_MIDDLE: Final = 2  # the middle finger's number among the digits
 _AXES: Final = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 """OpenXR's axes as columns in a frame with x along the bone and z out of the back."""
 

@@ -85,7 +85,7 @@ class _Scene:
             self._add_thing(thing)
 
     def pack(self) -> bytes:
-        """The whole file, of JSON without its arrays; an `ArgumentError` if a .glb cannot be so large."""
+        """The content of the file; an `ArgumentError` if it is larger than a .glb can be."""
         document: dict[str, Any] = {
             "asset": {"version": "2.0", "generator": f"handsim {__version__}"},
             "scene": 0,
@@ -196,7 +196,7 @@ class _Scene:
         return {"attributes": attributes, "indices": indices, "material": _MATERIALS.index(material)}
 
     def _animate(self, node: int, path: str, values: NDArray[np.float64]) -> None:
-        """A key in every frame, with straight motion between them."""
+        """Add a key in every frame, with linear interpolation between them."""
         if self._seconds is not None:
             self._channel(node, path, self._seconds, values, "LINEAR")
 
@@ -206,7 +206,7 @@ class _Scene:
             return
         frames = changes(present)
         seconds = self._times
-        # Halfway: a reader that asks for a frame's time must not meet the other side of a rounded key.
+        # Halfway between frames, rounding cannot move a key past the time of a frame.
         halfway = 0.5 * (seconds[frames] + seconds[np.maximum(frames - 1, 0)])
         times = self._buffer.add(halfway.astype("<f4"), bounds=True)
         self._channel(node, "scale", times, np.repeat(present[frames, None], 3, axis=1), "STEP")
@@ -233,7 +233,7 @@ class GlbBuffer:
 
     def add(self, array: NDArray[Any], *, target: Target | None = None, bounds: bool = False) -> int:
         """Add an array and return the index of its accessor."""
-        content = np.ascontiguousarray(np.swapaxes(array, 1, 2) if array.ndim == 3 else array)  # by columns
+        content = np.ascontiguousarray(np.swapaxes(array, 1, 2) if array.ndim == 3 else array)  # column-major
         view: dict[str, Any] = {"buffer": 0, "byteOffset": self._size, "byteLength": content.nbytes}
         if target is not None:
             view["target"] = _TARGETS[target]
@@ -253,7 +253,7 @@ class GlbBuffer:
         return len(self._accessors) - 1
 
     def pack(self, document: dict[str, Any]) -> bytes:
-        """The whole file."""
+        """The content of a file: this JSON, with what it needs to find the arrays, and the arrays."""
         arrays = {"buffers": [{"byteLength": self._size}], "bufferViews": self._views}
         text = json.dumps(
             {**document, **arrays, "accessors": self._accessors}, separators=(",", ":"), allow_nan=False
@@ -412,11 +412,11 @@ def _add_mesh(
     mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(faces.astype(np.int32).ravel()))
     mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
     mesh.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(np.stack([points.min(axis=0), points.max(axis=0)])))
-    mesh.CreateDisplayColorAttr([Gf.Vec3f(*material.color)])  # for programs that look at no material
+    mesh.CreateDisplayColorAttr([Gf.Vec3f(*material.color)])  # for programs that ignore materials
     beside, kinds = f"{path.rpartition('/')[0]}/{material.name}", Sdf.ValueTypeNames
     made = UsdShade.Material.Define(stage, beside)
     shader = UsdShade.Shader.Define(stage, f"{beside}/surface")
-    shader.CreateIdAttr("UsdPreviewSurface")  # USD's own
+    shader.CreateIdAttr("UsdPreviewSurface")  # USD's standard shader
     shader.CreateInput("diffuseColor", kinds.Color3f).Set(Gf.Vec3f(*material.color))
     shader.CreateInput("roughness", kinds.Float).Set(material.roughness)
     shader.CreateInput("metallic", kinds.Float).Set(0.0)

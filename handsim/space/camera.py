@@ -27,11 +27,11 @@ _COEFFICIENTS: Final[dict[str, int]] = {"pinhole": 0, "brown": 5, "fisheye": 4}
 PINHOLE: Final = 0
 """The kind of a pinhole in `Lens.row`; a Brown lens is 1."""
 _FISHEYE: Final = 2
-_STEP: Final = 1e-5  # [focal lengths] of the central differences of a Jacobian
-_NODES: Final = 1024  # of the table of first guesses
-_STEPS: Final = 12  # of Newton's method; three are enough away from a fold
+_STEP: Final = 1e-5  # step of a Jacobian's central differences [focal lengths]
+_NODES: Final = 1024  # nodes of the table that Newton's method starts from
+_STEPS: Final = 12  # most steps of Newton's method; three are enough away from a fold
 _CONVERGED: Final = 1e-12  # [focal lengths] largest change of the last step
-_MAX_TANGENT: Final = 1e3  # of rays that a Brown lens without a fold sees: 89.94 degrees
+_MAX_TANGENT: Final = 1e3  # largest tangent of rays that a Brown lens without a fold sees: 89.94 degrees
 
 
 @dataclass(frozen=True, slots=True)
@@ -459,7 +459,7 @@ def points_in_view(
 def in_picture(inner: Any, size: Any, lens: Any, x: float, y: float, z: float) -> bool:
     """Whether a point (x, y, z) [m] in a camera's axes is inside its picture."""
     u, v = x / z, y / z
-    if lens[0] != PINHOLE:  # this call is slow
+    if lens[0] != PINHOLE:  # a pinhole avoids this slow call
         u, v = distort_ray(lens, x, y, z)
     u, v = u * inner[0] + inner[2], v * inner[1] + inner[3]
     inside = (u >= 0.0) & (u < size[0]) & (v >= 0.0) & (v < size[1])  # never so for NaN

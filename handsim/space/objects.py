@@ -48,7 +48,7 @@ def _part(kind: PartKind, size: Sequence[float] | NDArray[np.float64], pose: NDA
 
 
 def _along(start: NDArray[np.float64], end: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
-    """Pose whose z axis goes from one point to another, at the middle, and their distance."""
+    """Pose in the middle of two points, its z axis from one to the other, and their distance."""
     return rigid(frame_with_z(end - start), (start + end) / 2), float(np.linalg.norm(end - start))
 
 
@@ -175,7 +175,7 @@ class RigidObject:
     markers: Float[np.ndarray, "Q 3"]
     """Centers of its own retro-reflective markers [m]; none for most objects."""
     marker_normals: Float[np.ndarray, "Q 3"]
-    """Outward unit normals of the surface under them."""
+    """Outward unit normals of the surface under the markers."""
     mass: float
     """Mass [kg]."""
     shiny: Float[np.ndarray, "S 7"]
@@ -266,7 +266,7 @@ def _read_mesh(path: Path) -> Any:
 
 
 def _close(mesh: Any, path: Path) -> Part:
-    """The convex hull of a mesh whose seams are joined and whose inside is turned in; refuse an open one."""
+    """Join a mesh's seams, make its faces look outwards, and return its convex hull; refuse an open mesh."""
     try:
         mesh.merge_vertices(merge_tex=True, merge_norm=True)  # a closed surface may come with seams
         closed = bool(mesh.is_watertight)

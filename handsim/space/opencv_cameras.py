@@ -26,9 +26,9 @@ from handsim.space.rig import TOML_MATRIX, camera_names, checked_cameras, neares
 from handsim.space.transforms import quaternion_matrix, rigid, vector_quaternions
 
 _MAX_OPENCV_BYTES: Final = 1 << 24
-_MAX_NUMBERS: Final = 16  # of a value; longer lists, such as corners of a board, are ignored
+_MAX_NUMBERS: Final = 16  # Longer lists of numbers, such as corners of a board, are ignored.
 _CENTER: Final = 0.5  # OpenCV measures pixels from the center of the first one, we from the picture's corner
-_MAX_BASELINE: Final = 5.0  # [m]
+_MAX_BASELINE: Final = 5.0  # largest distance of the cameras of a pair [m]
 _ENTRY: Final = re.compile(r"^[\"']?([A-Za-z_][\w ]*?)[\"']?[ \t]*:(?=\s)", re.M)
 _DATA: Final = re.compile(r"\bdata[\"']?[ \t]*:[ \t]*\[([^\[\]]*)\]")
 _DASH: Final = re.compile(r"^[ \t]*-[ \t](?=[ \t]*[-+.\d\[])", re.M)
@@ -74,7 +74,7 @@ _UNREAD: Final = {
     "transform_matrix": f"the JSON of NeRF and nerfstudio, with poses {_FIELD}",
     "img_name": f"the JSON of Gaussian Splatting, with poses {_FIELD}",
 }
-"""What files of other programs are, by a key of theirs."""
+"""Descriptions of other programs' files, by a key that these contain."""
 _OF_ALL: Final = (*_WIDTH, *_HEIGHT, *_SIZE, *_FISHEYE, *_MODEL)
 _OF_ONE: Final = (*_K, *_D, "W", "H", *_OF_ALL, *_R, *_T)
 _SECTION: Final = re.compile(r"^[ \t]+[\"']?(?:" + "|".join(_K) + r")[\"']?[ \t]*:(?=\s)", re.M)

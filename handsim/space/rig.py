@@ -58,11 +58,11 @@ _CAMERA: Final = ("name", *_PICTURE, *_PLACE)
 _DEFAULT_RESOLUTION: Final = 1280  # [px]
 _MAX_FIELD_OF_VIEW: Final = 170.0  # [deg]
 _MAX_FILE_CAMERAS: Final = 256
-_MAX_DISTANCE: Final = 50.0  # [m] from the origin
-_CLOSEST: Final = 1e-3  # [m] from a camera to its target, or to another camera
+_MAX_DISTANCE: Final = 50.0  # largest distance of a camera from the origin [m]
+_CLOSEST: Final = 1e-3  # least distance of a camera from its target or another camera [m]
 _NAME: Final = re.compile(r"[A-Za-z0-9_-]{1,64}")
 NAMELESS: Final = re.compile(r"[^A-Za-z0-9_-]+")
-"""What a camera's name cannot have."""
+"""Characters that a camera's name cannot have."""
 _MAX_NAME: Final = 56  # characters of a name that a number may follow
 _ROTATION_TOLERANCE: Final = 1e-3  # deviation of a rounded matrix from a rotation
 
@@ -124,7 +124,7 @@ def nearest_rotation(owner: str, matrix: Float[np.ndarray, "3 3"]) -> NDArray[np
 
 
 def check_near(owner: str, camera: Camera) -> None:
-    """Refuse a camera beyond 50 m."""
+    """Refuse a camera more than 50 m from the origin."""
     distance = float(np.linalg.norm(camera.T_world_camera[:3, 3]))
     if distance > _MAX_DISTANCE:
         raise RigError(
@@ -196,7 +196,7 @@ def _camera(top: Mapping[str, Any], own: Mapping[str, Any], number: int) -> Came
     K = _matrix(given, size, owner)
     kind = text_of(given, "lens", f"{owner}: ", default="pinhole")
     coefficients = number_list(f"{owner}: coefficients", given.get("coefficients", []))
-    lens = Lens(cast("LensKind", kind), coefficients)  # which refuses unknown kinds
+    lens = Lens(cast("LensKind", kind), coefficients)  # `Lens` refuses unknown kinds
     return Camera(text_of(own, "name", f"{owner}: ", default=f"camera{number}"), size, K, pose, lens)
 
 
@@ -275,9 +275,9 @@ MAX_CAMERAS: Final = 32
 ROOM_CENTER: Final = (0.0, 0.0, 1.1)
 """Middle of the space that hands move in, in front of a seated user [m]."""
 LONGEST_SIDE: Final = 50.0
-"""No volume or room is longer, and no middle of one farther from the origin [m]."""
+"""Largest side of a volume or room, and largest coordinate of its middle [m]."""
 Center = Annotated[tuple[float, float, float], Limits(-LONGEST_SIDE, LONGEST_SIDE)]
-"""The middle of such a space [m]."""
+"""The middle of a volume or room [m]."""
 HAND_REACH: Final = 0.25
 """Longest reach of a hand from its wrist [m], and the least distance of a camera from the wrists' volume."""
 _SHIPPED: Final = Path(__file__).parents[1] / "rigs"
@@ -396,13 +396,13 @@ def load_rig(rig: CameraRig | str | Path | Mapping[str, Any]) -> CameraRig:
 
     Args:
         rig: `figure5` (sixteen cameras, as in the paper), `eight`, `six`, a path, or the record of a rig
-            (`CameraRig.record`); a rig is given back.
+            (`CameraRig.record`); a rig is returned as it is.
 
     Returns:
         The rig, each camera with its pose [m], its intrinsics [px] and its lens.
 
     Raises:
-        ArgumentError: It is nothing of these.
+        ArgumentError: `rig` has another type.
         RigError: No such rig or file, or the file or record does not describe one; the sentence names the
             file.
     """

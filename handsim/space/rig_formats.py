@@ -47,7 +47,7 @@ from handsim.space.rig import (
 )
 from handsim.space.transforms import quaternion_matrix, rigid
 
-_MAX_VALUE: Final = 1e9  # of a number in any unit
+_MAX_VALUE: Final = 1e9  # largest number in a calibration, in any unit
 
 
 class LabCamera(NamedTuple):
@@ -377,7 +377,7 @@ def _binary_image(data: bytes, at: int) -> tuple[int, str]:
     """The end of a record of an image, with its points, and its line."""
     values = struct.unpack_from("<i7di", data, at)
     end = data.index(b"\0", at + 64)
-    name = " ".join(data[at + 64 : end].decode("utf-8", "replace").split())  # of one line
+    name = " ".join(data[at + 64 : end].decode("utf-8", "replace").split())  # fit for a line of text
     (points,) = struct.unpack_from("<Q", data, end + 1)
     return end + 9 + 24 * points, " ".join(map(str, (*values, name)))
 
@@ -507,7 +507,7 @@ def import_cameras(path: str | Path, up: Up | None = None) -> tuple[Camera, ...]
 
 
 def load_lab_cameras(path: str | Path) -> tuple[LabCamera, ...]:
-    """The cameras of a file, by its ending, with their kinds."""
+    """The cameras of a file, by its ending, with what the file states of each: video, y up."""
     path, ending = Path(path), Path(path).suffix.lower()
     if ending == ".toml" and foreign_camera(read_toml(path, error=RigError)) is None:
         return tuple(map(LabCamera, checked_cameras(path, read_rig_file(path).cameras)))

@@ -36,7 +36,7 @@ class ProgramAxes(NamedTuple):
 
     @property
     def scale(self) -> float:
-        """Its units in a meter."""
+        """Number of the program's units in a meter."""
         return 100.0 if self.unit == "cm" else 1.0
 
     def positions(self, positions: Float[np.ndarray, "*batch 3"]) -> NDArray[np.float64]:
@@ -84,7 +84,7 @@ def upright(up: UpAxis) -> Float[np.ndarray, "3 3"]:
 
 
 def turned_poses(poses: Float[np.ndarray, "*batch K"], turn: Float[np.ndarray, "3 3"]) -> NDArray[np.float64]:
-    """Poses in a rotated world: positions and orientations (wxyz), and what follows them; NaN stays."""
+    """Rotate the world of poses: positions and orientations (wxyz) change, later numbers and NaN stay."""
     turned = np.array(poses, dtype=np.float64)
     turned[..., :3], turned[..., 3:7] = poses[..., :3] @ turn.T, poses[..., 3:7] @ _turning(turn).T
     return turned
@@ -141,7 +141,7 @@ def rotation_quaternions(rotations: Float[np.ndarray, "T 3 3"]) -> NDArray[np.fl
 
     quaternions: NDArray[np.float64] = np.empty((len(rotations), 4))
     matrices = np.ascontiguousarray(rotations, dtype=np.float64)
-    if not write_matrix_quaternions(matrices, quaternions):  # to the nearest rotations
+    if not write_matrix_quaternions(matrices, quaternions):  # some are no rotations: take the nearest ones
         from scipy.spatial.transform import Rotation
 
         quaternions = Rotation.from_matrix(matrices).as_quat(scalar_first=True)
