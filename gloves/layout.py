@@ -342,7 +342,7 @@ def moved_text(text: str, layout: MarkerLayout) -> tuple[str, bool]:
         for start, end, marker in reversed(list(zip(starts, ends, layout.markers, strict=True))):
             lines[start + 1 : end] = _moved_table(lines[start + 1 : end], marker)
         changed = "\n".join(lines) + "\n"
-        if _says(changed, layout):
+        if _describes(changed, layout):
             return changed, True
     return "\n".join(layout_lines(layout)) + "\n", False
 
@@ -374,7 +374,7 @@ def _moved_table(lines: list[str], marker: MarkerPlace) -> list[str]:
     return result
 
 
-def _says(text: str, layout: MarkerLayout) -> bool:
+def _describes(text: str, layout: MarkerLayout) -> bool:
     """Whether a text describes this layout, up to the decimals of a file."""
     try:
         read = parse_layout(tomllib.loads(text))

@@ -41,7 +41,7 @@ def load_plugin(name: str, *, group: str, noun: str) -> Any:
     try:
         return found() if inspect.isclass(found) else found
     except Exception as error:
-        raise ArgumentError(f"{noun} '{name}' cannot be loaded: {_told(error)}") from error
+        raise ArgumentError(f"{noun} '{name}' cannot be loaded: {_error_text(error)}") from error
 
 
 def make_plugin(address: str, *, group: str, noun: str) -> Any:
@@ -93,7 +93,7 @@ def _find(name: str, group: str, noun: str) -> Any:
     except AttributeError as error:
         raise ArgumentError(f"{noun} '{name}': {error}") from error
     except Exception as error:
-        raise ArgumentError(f"{noun} '{name}' cannot be loaded: {_told(error)}") from error
+        raise ArgumentError(f"{noun} '{name}' cannot be loaded: {_error_text(error)}") from error
     return found
 
 
@@ -116,10 +116,10 @@ def call_plugin(function: Callable[..., Any], name: str, noun: str, /, *args: An
     except HandSimError:
         raise
     except Exception as error:
-        raise HandSimError(f"{noun} '{name}' failed: {_told(error)}") from error
+        raise HandSimError(f"{noun} '{name}' failed: {_error_text(error)}") from error
 
 
-def _told(error: Exception) -> str:
+def _error_text(error: Exception) -> str:
     """An error and the line that raised it."""
     last = traceback.extract_tb(error.__traceback__)[-1]
     return f"{type(error).__name__}: {error} ({last.filename}, line {last.lineno})"

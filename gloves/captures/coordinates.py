@@ -56,7 +56,7 @@ def settled(capture: Capture) -> Capture:
     counts = {}
     capture, counts[_ZEROS] = zeros_as_missing(capture)
     if capture.num_frames >= _MIN_FRAMES:
-        capture, counts[_DOUBLED] = _once(capture)
+        capture, counts[_DOUBLED] = _without_doubles(capture)
         held = _held(capture.positions)
         counts[_HELD] = int(held.sum())
         if held.any():
@@ -112,7 +112,7 @@ def zeros_as_missing(capture: Capture) -> tuple[Capture, int]:
     return dataclasses.replace(capture, positions=np.where(zero[..., None], np.nan, positions)), count
 
 
-def _once(capture: Capture) -> tuple[Capture, int]:
+def _without_doubles(capture: Capture) -> tuple[Capture, int]:
     """The capture without points that double another of their frame, and the number of doubles.
 
     Two columns that always agree where both have a point become one, with the points of both.

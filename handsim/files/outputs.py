@@ -69,7 +69,7 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
     make_folder_of(final)
     remove_abandoned(final)
     temporary = temporary_beside(final)
-    with _errors_name(final, temporary):
+    with _naming_final(final, temporary):
         mode = _usual_mode(temporary)
         try:
             yield temporary
@@ -77,7 +77,7 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
             _flush(temporary)
             together = _TOGETHER.get()
             if together is None:
-                _name({final: temporary})
+                _rename_all({final: temporary})
             else:
                 together[final] = temporary
         except BaseException:  # also an interrupt must leave nothing behind
@@ -86,7 +86,7 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
 
 
 @contextmanager
-def _errors_name(final: Path, temporary: Path) -> Iterator[None]:
+def _naming_final(final: Path, temporary: Path) -> Iterator[None]:
     """Let errors name the final file; else they name the temporary one, or none if the disk is full."""
     try:
         yield
@@ -113,14 +113,14 @@ def written_together() -> Iterator[None]:
     token = _TOGETHER.set(files)
     try:
         yield
-        _name(files)
+        _rename_all(files)
     finally:
         _TOGETHER.reset(token)
         for temporary in files.values():
             temporary.unlink(missing_ok=True)
 
 
-def _name(files: Mapping[Path, Path]) -> None:
+def _rename_all(files: Mapping[Path, Path]) -> None:
     """Rename all temporary files, or none."""
     older: dict[Path, Path] = {}
     named: list[Path] = []
@@ -131,7 +131,7 @@ def _name(files: Mapping[Path, Path]) -> None:
                     older[final] = temporary_beside(final, _OLDER)
                     _keep(final, older[final])
             for final, temporary in files.items():
-                with _errors_name(final, temporary):
+                with _naming_final(final, temporary):
                     os.replace(temporary, final)
                 named.append(final)
         except BaseException:
@@ -154,7 +154,7 @@ def _keep(final: Path, older: Path) -> None:
     try:
         os.link(final, older)
     except OSError:  # the file system has no hard links
-        with _errors_name(final, older):
+        with _naming_final(final, older):
             shutil.copy2(final, older)
 
 

@@ -233,7 +233,7 @@ def load_object(path: str | Path, *, mass: float = 0.1) -> RigidObject:
         )
     if size < _SMALLEST:
         raise ObjectError(f"{path}: the mesh is {size:.3g} m large, expected at least 2 mm, in meters")
-    hull = _close(mesh, path)
+    hull = _convex_hull(mesh, path)
     return RigidObject(
         name=path.name,
         vertices=np.asarray(mesh.vertices),
@@ -265,7 +265,7 @@ def _read_mesh(path: Path) -> Any:
     return mesh
 
 
-def _close(mesh: Any, path: Path) -> Part:
+def _convex_hull(mesh: Any, path: Path) -> Part:
     """Join a mesh's seams, make its faces look outwards, and return its convex hull; refuse an open mesh."""
     try:
         mesh.merge_vertices(merge_tex=True, merge_norm=True)  # a closed surface may come with seams
