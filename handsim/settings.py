@@ -269,7 +269,7 @@ def _changed(kind: Any, usual: Any, changes: Mapping[str, Any], noun: str) -> An
 
 
 def _words(kind: Any, expected: Expected | None) -> str:
-    """What errors call a type."""
+    """How errors describe a type."""
     if expected is not None:
         return expected.words
     plain = {str: "a string", bool: "True or False", int: "a whole number", float: "a number", Path: "a path"}

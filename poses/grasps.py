@@ -50,7 +50,7 @@ _ARMATURE: Final = 1e-4  # [kg m^2], inertia of tendons and muscles
 # Largest torques [N m] of a finger's abduction, MCP, PIP and DIP, and of the thumb's four hinges.
 _FINGER_TORQUES: Final = (0.20, 0.30, 0.16, 0.06)
 _THUMB_TORQUES: Final = (0.40, 0.40, 0.25, 0.10)
-_FRICTION: Final = (1.2, 0.01, 0.001)  # of a palm on plastic: sliding, twisting (by the pad's size), rolling
+_FRICTION: Final = (1.2, 0.01, 0.001)  # palm on plastic: sliding, twisting (by the pad's size), rolling
 _CONTACT_TIME: Final = (0.005, 1.0)  # MuJoCo's solref of contacts: time constant [s], damping ratio
 _GUIDE_TIME: Final = (0.03, 1.0)  # solref of the soft constraint that holds the object while fingers close
 _MAX_DISTANCE: Final = 0.5  # distances of capsules from the object are measured up to this one [m]
@@ -199,7 +199,7 @@ _SLIDE_HALVINGS: Final = 12
 _ANY: Final = "any"  # library entry of objects that have none of their own
 _ROUNDS: Final = 12
 _STIFFNESS: Final = 0.006  # [m/rad] weight of joint deviations against residuals of the tips
-_MAX_STEP: Final = 0.2  # [rad]
+_MAX_STEP: Final = 0.2  # largest change of an angle in a round [rad]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -157,7 +157,7 @@ class UnitFault(NamedTuple):
     """Clouds in a wrong unit."""
 
     found: str
-    """What is wrong with them as meters."""
+    """What shows, in words, that the clouds are not in meters."""
     guess: str
     """The unit of length that they probably had before they were scaled."""
 

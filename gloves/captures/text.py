@@ -105,7 +105,7 @@ def separator_behind(words: Sequence[bytes], line: bytes) -> bytes | None:
 
 
 def plain_lines(lines: list[bytes], separator: bytes, *, first: int = 1, wider: bool = False) -> list[bytes]:
-    """The same list of lines, now with tabs between their cells and without quotes.
+    """Put tabs between the cells of a list of lines, remove quotes, and return the list.
 
     In a file with tabs, quotes are quotes only if its first cell is quoted. `first` is the number of the
     first line in the file. With `wider`, rows may have more cells than the line above them.

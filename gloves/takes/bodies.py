@@ -30,7 +30,7 @@ class RigidBody:
     name: str
     marker_names: tuple[str, ...]
     positions: Float[np.ndarray, "Q 3"]
-    """Its markers in its own frame [m]."""
+    """Markers in the body's own frame [m]."""
     surface: RigidObject | None = None
     """The body's own surface; None if it has none, or is an object that comes with handsim."""
 

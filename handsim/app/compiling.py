@@ -41,13 +41,13 @@ class ListedKernel(NamedTuple):
     """A kernel on the list."""
 
     name: str
-    """Its place, as module:name."""
+    """Where the kernel is, as module:name."""
     types: list[int]
-    """Types of its arguments, as rows of the table of types."""
+    """Types of the kernel's arguments, as rows of the table of types."""
     seconds: float
-    """Processor time that it took to compile [s]."""
+    """Processor time to compile the kernel [s]."""
     commands: str
-    """Commands that need it, with spaces between them."""
+    """Commands that need the kernel, with spaces between them."""
 
 
 def compile_kernels(command: str | None = None) -> tuple[int, int]:

@@ -220,7 +220,7 @@ def open_output(out: str | Place) -> Iterator[Output]:
         return
     _check_store(place)
     name = Path(tempfile.gettempdir(), f"handsim-{zlib.crc32(str(place).encode()):08x}")
-    remove_abandoned(name)  # of a run that was killed
+    remove_abandoned(name)  # left by a killed run
     here = temporary_beside(name)
     try:
         (here / "output").mkdir(mode=0o700, parents=True)

@@ -21,7 +21,7 @@ from train.simulation.scenes import SimulatedKind
 from train.simulation.takes import WRIST_VOLUME, simulate_take
 from train.simulation.training_frames import GenerateSettings
 
-_TAKE_FRAMES: Final = 1200  # of the continuous take for the report's gaps
+_TAKE_FRAMES: Final = 1200  # length of the take whose gaps the report shows
 
 
 def generate(

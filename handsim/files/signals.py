@@ -34,7 +34,7 @@ class Stopped(KeyboardInterrupt):
 
     @classmethod
     def again(cls, stop: KeyboardInterrupt, kept: str) -> Stopped:
-        """The same signal, with what is kept."""
+        """A `Stopped` by the signal of another one, with this `kept`."""
         return cls(stop.number if isinstance(stop, Stopped) else signal.SIGINT, kept)
 
 

@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     import mujoco
 
 
-_MOVED_BONES: Final = [joint.bone for joint in JOINTS]  # in the order of the bones
+_MOVED_BONES: Final = [joint.bone for joint in JOINTS]  # joints are in the order of their bones
 _CHAIN: Final = np.array([(bone.parent, _MOVED_BONES.count(number)) for number, bone in enumerate(BONES)])
 """Parent of each bone, and the number of its joints."""
 _AXES: Final = np.array([joint.axis for joint in JOINTS])

@@ -130,7 +130,7 @@ def number_text(value: float) -> str:
     return f"{float(value) + 0.0:.12g}"
 
 
-_VERSION: Final = "40000"  # of the document: OpenSim 4.0 and later read it
+_VERSION: Final = "40000"  # document version that OpenSim 4.0 and later read
 _GRAVITY: Final = "0 -9.80665 0"  # OpenSim's world has y up
 _OSIM_COLOR: Final = "0.85 0.65 0.55"
 _FARTHEST: Final = 5.0  # range of the wrist's positions, both ways [m]

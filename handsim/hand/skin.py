@@ -436,7 +436,7 @@ class HandSurface:
     bone_indices: Int[np.ndarray, "V 4"]
     """Indices in `handsim.hand.shape.BONES` of the bones that move each vertex."""
     bone_weights: Float[np.ndarray, "V 4"]
-    """Their shares: not negative, in descending order, summing to one."""
+    """Weights of these bones: not negative, in descending order, summing to one."""
 
 
 class _Template(NamedTuple):

@@ -258,7 +258,7 @@ def _fold_radius(radial: tuple[float, ...], most: float) -> float:
     return min(float(np.sqrt(folds.min())), most) if len(folds) else most
 
 
-_MAX_SIZE: Final = 8192  # [px]
+_MAX_SIZE: Final = 8192  # largest width or height of a picture [px]
 _NEAREST: Final = 1e-6  # [m] least depth of visible points
 
 

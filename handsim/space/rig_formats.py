@@ -55,7 +55,7 @@ class LabCamera(NamedTuple):
 
     camera: Camera
     video: bool = False
-    """Whether it takes pictures and sees no markers."""
+    """Whether the camera takes pictures and sees no markers."""
     y_up: bool = False
     """Whether the file states that y points up in its world."""
 

@@ -32,7 +32,7 @@ class ProgramAxes(NamedTuple):
     quaternion: Float[np.ndarray, "4 4"]
     """Takes a wxyz quaternion of a thing in the world to that in the program."""
     unit: str
-    """Its unit of length, m or cm."""
+    """The program's unit of length, m or cm."""
 
     @property
     def scale(self) -> float:
