@@ -36,7 +36,7 @@ def list_plugins(group: str) -> tuple[str, ...]:
 
 @functools.lru_cache(maxsize=64)
 def load_plugin(name: str, *, group: str, noun: str) -> Any:
-    """What a name stands for, imported now; a class is called without arguments, once."""
+    """Import the object of a name; a class is called without arguments, once."""
     found = _find(name, group, noun)
     try:
         return found() if inspect.isclass(found) else found
@@ -45,7 +45,7 @@ def load_plugin(name: str, *, group: str, noun: str) -> Any:
 
 
 def make_plugin(address: str, *, group: str, noun: str) -> Any:
-    """What a name stands for, called anew with the options that follow it, which are strings.
+    """Import the object of an address and call it with the options there, which are strings.
 
     The address is `module:name` or the name of an entry point, of a class or a function; perhaps followed by
     `?option=value&option=value`.
@@ -56,7 +56,7 @@ def make_plugin(address: str, *, group: str, noun: str) -> Any:
 
 
 def plugin_name(value: Any) -> str:
-    """How a function or an object is called in records and messages: `module:name`, or its name as it is."""
+    """The name of a function or an object in records and messages: `module:name`, or a string as it is."""
     if isinstance(value, str):
         return value
     if isinstance(value, functools.partial):
@@ -70,7 +70,7 @@ def plugin_name(value: Any) -> str:
 
 
 def _find(name: str, group: str, noun: str) -> Any:
-    """What a name stands for, see `load_plugin`."""
+    """Import the object of a name: `module:name`, or an entry point of the group."""
     target = name
     if not is_plugin(name):
         points = {point.name: point.value for point in metadata.entry_points(group=group)}

@@ -333,8 +333,8 @@ LOWEST_RATE: Final = 1.0
 HIGHEST_RATE: Final = 5000.0
 """Highest frame rate of an optical system [Hz]."""
 _RATE_TOLERANCE: Final = 0.02  # relative difference of equal rates: 119.88 is called 120, 29.97 is called 30
-_MIN_DECIMALS: Final = 1  # Times have at least this many: frames are not timed in whole seconds.
-_MAX_DECIMALS: Final = 9  # Times have at most this many.
+_MIN_DECIMALS: Final = 1  # Times have at least this many decimals: no frame is timed in whole seconds.
+_MAX_DECIMALS: Final = 9  # Times have at most this many decimals.
 _INTERVAL_TOLERANCE: Final = 0.1  # relative spread of the intervals when no rate is stated
 _JITTER: Final = 0.25  # A time that is late by less than this share of a frame shows no gap.
 _MAX_MISSING: Final = 10  # missing frames for each frame that is present

@@ -264,7 +264,7 @@ def _join_near(positions: Any, rays: Any, min_distance: float) -> None:
 
 @kernel
 def _spend(point: Any, source: int, directions: Any, usable: Any, T_world_camera: Any, gate: float) -> None:
-    """Mark the rays of a point as used; a camera without a ray of its source gives its nearest ray."""
+    """Mark the rays of a point as used; in a camera without a ray of its source, the nearest ray."""
     for c in range(len(T_world_camera)):
         taken, near = -1, gate * gate
         if usable[source, c]:

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from numba.core.registry import CPUDispatcher
 
 LIST: Final = Path(__file__).parents[1] / "data" / "kernels.json"
-_FEW: Final = 4.0  # Less compiling than this is not worth other processes [s].
+_FEW: Final = 4.0  # Processes are started only if there is more than this to compile [s].
 _TOLD: Final = 2.0  # [s] between two lines
 _ENDING: Final = 5.0  # [s] that a process has to end
 _MOST: Final = 8  # processes; more would wait for one another
@@ -210,7 +210,7 @@ class _Compilers:
                     pipe.close()  # type: ignore[union-attr]
 
     def run(self) -> None:
-        """Compile, and tell how far it is."""
+        """Compile the kernels, and show the progress."""
         began = time.monotonic()
         threads = [threading.Thread(target=self._feed, args=(one,), daemon=True) for one in self._processes]
         tell_state(f"compiling {self._count} kernels, once on this machine")
@@ -271,7 +271,7 @@ class _Compilers:
                     self._now[row] = self._todo.pop(row)
                     packages.add(self._now[row].name.rpartition(".")[0])
                     return row
-                if not self._now:  # kernels that call one another
+                if not self._now:  # the remaining kernels call one another
                     break
                 self._changed.wait()
             return None

@@ -286,7 +286,7 @@ def named_steps(first: str) -> Iterator[Callable[[str], None]]:
 
 @contextmanager
 def _lines(console: Console, task: Task, unit: str, every: float = EVERY) -> Iterator[None]:
-    """Print the state of a task now and then, so that a log shows that it lives."""
+    """Print the state of a task now and then, so that a log shows its progress."""
     ended = threading.Event()
     start = time.monotonic()
 
@@ -295,7 +295,7 @@ def _lines(console: Console, task: Task, unit: str, every: float = EVERY) -> Ite
             line = _line(task, unit, time.monotonic() - start)
             try:
                 console.print(line, soft_wrap=True, markup=False, highlight=False)
-            except (OSError, SystemExit):  # nobody reads it
+            except (OSError, SystemExit):  # the stream was closed
                 return
 
     thread = threading.Thread(target=report, daemon=True)

@@ -250,7 +250,7 @@ class _Job:
                     "folder that all workers share, under the same path"
                 )
             return self.make(self.folder, number)
-        _check_store(self.place)  # before the work
+        _check_store(self.place)  # a missing package must show before the work
         near = self.folder.parent  # removed at the end of the run, if this machine has it
         with tempfile.TemporaryDirectory(prefix="handsim-", dir=near if near.is_dir() else None) as name:
             self.make(Path(name), number)

@@ -60,7 +60,7 @@ def calibrate(
         check_take_file(capture, live=True)
         options = TrackerOptions(glove, size, hands=hands, labeler=labeler)
         _record(live, options, capture, _LONGEST if seconds is None else seconds)
-    assert capture is not None  # or the source was refused
+    assert capture is not None  # `check_source` refused a call with neither source
     with progress_bar("") as bar:
         settings = CalibrateSettings(glove=glove, hands=hands, size=size, labeler=labeler)
         user = captures.calibrate(capture, settings, progress=bar, on_step=bar.step)

@@ -108,7 +108,7 @@ def send_pointing_hand(address: str, ended: Callable[[], bool], tell: Callable[[
 
     bent = [name.startswith(("middle", "ring", "little")) and "flexion" in name for name in JOINT_NAMES]
     with open_sinks(address) as sinks:
-        asked = dict(parse_qsl(urlsplit(address).query))  # it was checked just now
+        asked = dict(parse_qsl(urlsplit(address).query))  # `open_sinks` has checked it
         up: UpAxis = "y" if asked.get("up") == "y" else "z"
         content = Content(axes=asked.get("axes", WORLD), up=up, unit=asked.get("unit", "auto"))
         axes, hand = content.program or program_axes("ros", "z"), nominal_fit("dense19", "M", "right")

@@ -54,7 +54,7 @@ def simulate(
 
 
 def _simulate_into(out: Path, settings: SimulateSettings, number: int) -> int:
-    """Write a capture and its truth; a worker's job, of which there is one."""
+    """Write a capture and its truth; the only job of a worker."""
     take = simulate_take(settings=settings)
     names = tuple(f"{UNLABELED}{column + 1}" for column in range(take.point_list.num_columns))
     with written_together():  # a capture without its truth is no use

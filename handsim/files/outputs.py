@@ -233,7 +233,7 @@ def _is_running(process: int) -> bool:
         os.kill(process, 0)
     except (ProcessLookupError, OverflowError):
         return False
-    except PermissionError:  # another user's
+    except PermissionError:  # the process is another user's
         return True
     return True
 
@@ -261,7 +261,7 @@ _UNITS: Final = ("bytes", "kB", "MB", "GB", "TB", "PB", "EB")
 
 
 def check_outputs(inputs: Iterable[object], outputs: Sequence[Path | None], *endings: str) -> None:
-    """Refuse an output that names an input or another one, in whatever spelling, or has no place.
+    """Refuse an output that is an input or another output, in whatever spelling, or cannot be written.
 
     If `endings` are given, the first output is --out, whose name must have one of them.
     """
@@ -343,7 +343,7 @@ def check_memory(needed: int, what: str, remedy: str) -> None:
 
 
 def available_bytes() -> int:
-    """Memory that is free without swapping [bytes], or all memory where the system does not tell."""
+    """Memory that is free without swapping [bytes]; all memory if the system does not state it."""
     try:
         lines = Path("/proc/meminfo").read_text().splitlines()
     except OSError:

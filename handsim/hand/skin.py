@@ -240,7 +240,7 @@ _SECTIONS: Final = {
 }
 
 
-_WAISTS: Final = {"before 1": 0.985, "at 1": 1.01, "after 1": 0.985}  # girths, in those of the shape
+_WAISTS: Final = {"before 1": 0.985, "at 1": 1.01, "after 1": 0.985}  # girth of a ring over the shape's
 _THUMB, _FINGERS = slice(0, 1), slice(1, len(DIGITS))
 _GROUPS: Final = ((_THUMB, THUMB_RINGS), (_FINGERS, FINGER_RINGS))  # digits with the same rings
 
