@@ -543,7 +543,7 @@ class Take:
         """The hands and bodies that have a pose in some frame, without points, resampled if a rate is given.
 
         Positions and angles are interpolated linearly, rotations along the shortest way. There is no pose
-        between two frames of which one has none, or which are more than a tenth of a second apart.
+        between two frames of which one has none, or which are more than 0.1 s and 2.5 frames apart.
 
         Args:
             rate: Frames per second [Hz].
