@@ -1,4 +1,4 @@
-"""The page of a layout's score: advice, figures, the hand with confusions, and its joints."""
+"""The report page of a layout's score: advice, labels with confusions, markers and joints."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from train.reports.hand_plot import HAND_CAPTION, FlatHand, flat_hand, hand_pict
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_MOST: Final = 15.0  # end of the colors' scale [deg]
+_MOST: Final = 15.0  # end of the color scale [deg]
 _TRIALS: Final = (
     "Short captures of several people, simulated, then labeled and tracked as `handsim label` and "
     "`handsim track` do, the size of the hands measured and nothing calibrated: slots and whole frames that "
     "are right. Joints: root mean square error of all, of uncalibrated hands; the section on joints is about "
     "calibrated ones."
 )
-_PAIRS: Final = 5  # pairs of near markers that are listed
+_PAIRS: Final = 5  # number of listed pairs of close markers
 
 
 def write_glove_page(path: Path, score: LayoutScore) -> None:
@@ -52,7 +52,7 @@ def write_glove_page(path: Path, score: LayoutScore) -> None:
 
 
 def trial_rows(trials: Mapping[str, Trial], layout: MarkerLayout) -> list[list[str]]:
-    """What became of simulated captures of each kind of work, the header first."""
+    """Table of the simulated captures of each kind of work, header first."""
     rows = [
         ["work", "label: slots, frames [%]", "track: slots, frames [%]", "worst marker", "joints [deg]",
          "size off [mm]"]
@@ -121,7 +121,7 @@ def _joints_section(score: LayoutScore) -> Section:
 
 
 def _draw_joints(figure: Figure, hand: FlatHand, degrees: Float[np.ndarray, "20"]) -> None:
-    """Draw a disk at each bone's near end, with the standard deviation of the worst joint there."""
+    """Draw a disk at each bone's proximal end, colored by the worst joint's standard deviation."""
     panel = figure.subplots()
     panel.set_axis_off()
     panel.set_aspect("equal")
