@@ -320,11 +320,11 @@ def _range_section(title: str, hand: HandFigures) -> Section:
         limits = f"{joint.low:g} to {joint.high:g}", percent(share) if share > 0.0 else NOTHING
         table.append([joint.name.replace("_", " "), *cells, *limits, spread])
     text = (
-        f"Over the {int(hand.fitted.sum()):,} frames whose pose was fitted to points, of a joint those in "
-        "which a marker beyond it is seen, if the glove has one: others are predicted. 5th and 95th are "
-        "percentiles, which a single wrong frame does not move. A joint at its limits may bend further than "
-        "its least and largest angle say, which are then the model's. Spread: the median standard deviation "
-        "of the angle, from what is not known of the hand, hidden markers and noise."
+        f"Over the {int(hand.fitted.sum()):,} frames with a fitted pose; for a joint with markers beyond it, "
+        "only over those that show one of them, as other angles are predicted. 5th and 95th are "
+        "percentiles, which a single wrong frame does not change. A joint at its limits may bend further "
+        "than its least and largest angle, which are then the model's limits. Spread: median standard "
+        "deviation of the angle, from unknown proportions of the hand, hidden markers and noise."
     )
     return Section(title, text, table=table)
 
@@ -336,9 +336,9 @@ def _error_section(title: str, take: Take, hand: HandFigures) -> Section:
     text = (
         "Filter: all poses were solved together, forward and backward in time, without a delay. At the "
         "cut-off an oscillation keeps half of its size. The band [deg] is the root of the sum of the squares "
-        "of its parts, as root of the mean square over all frames. Gluing and bones are alike in all of "
-        "them. MDD: minimal detectable difference of two sessions of a person, 1.96 times the root of two "
-        "times all parts but bones, which stay."
+        "of its parts, as root mean square over all frames. Gluing and bones are constant errors. "
+        "MDD: minimal detectable difference of two sessions of a person, 1.96 times the root of two "
+        "times all parts but bones, which stay the same."
         if filtered
         else "Filter: none, each pose was fitted to the markers of its frame."
     )
