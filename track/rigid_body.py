@@ -40,7 +40,7 @@ from track.frames import StreamedFrame, capture_frames
 GATE: Final = 0.003
 """Largest distance of a labeled point from its marker [m]: ten times the noise of a good system."""
 _TIGHT: Final = 0.001  # [m] largest residual of points that determine a pose, and in a search
-_TIGHTEST: Final = 0.0005  # [m] largest residual in a search that matches only three points, by chance
+_TIGHTEST: Final = 0.0005  # [m] largest residual in a search that matches three points, maybe by chance
 _LEAST_WIDTH: Final = 0.005  # [m] least RMS distance of the markers from their best line
 _LEAST_MARKER_DISTANCE: Final = 2.0 * GATE  # [m] Closer markers could exchange labels.
 _LONGEST_COAST: Final = 0.026  # [s] longest prediction (three frames at 120 Hz) without three markers

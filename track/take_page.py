@@ -37,7 +37,7 @@ _TABLES: Final = (".frames.csv", ".joints.csv", ".markers.csv", ".doubts.csv")
 _RANGE: Final = {"least": 0.0, "5th": 5.0, "median": 50.0, "95th": 95.0, "largest": 100.0}
 """Columns of a range of motion, and the percentile of each."""
 _CHUNK: Final = 4096  # frames per call of forward kinematics
-_WANTED: Final = (0.99, 0.999)  # shares of right frames to which looks are counted
+_WANTED: Final = (0.99, 0.999)  # shares of right frames for which the page gives a number of looks
 _MOST_SPANS: Final = 100  # rows of the page's table of doubtful spans
 _MDD: Final = 1.96 * float(np.sqrt(2.0))  # ratio of the minimal detectable difference to the standard error
 _BINS: Final = 750  # bins of a long take's curve, which shows the extremes of each

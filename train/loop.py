@@ -64,7 +64,7 @@ from train.reports.run_page import UNKNOWN_LICENSE, write_model_card, write_run_
 from train.settings import CNNConfig, Kind, TrainSettings, batch_recipe, train_settings
 
 CHECKPOINT: Final = "checkpoint.pt"
-_HELD_OUT: Final = 0.02  # share of people, the last ones, that training never uses
+_HELD_OUT: Final = 0.02  # share of people, from the end, held out from training
 _LEAST_PEOPLE: Final = 20  # held-out people of a set of at least two hundred
 _NUM_EVALUATIONS: Final = 10  # number of evaluations on held-out frames during a run
 _CURVE_FRAMES: Final[dict[Kind, int]] = {"set": 512, "cnn": 160}  # held-out frames of each such evaluation

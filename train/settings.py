@@ -92,7 +92,7 @@ class TrainSettings(Settings):
     jitter: Annotated[float, Limits(0.0, 0.1)] = 0.005
     """Largest half width of the uniform noise on each coordinate [m]; every batch draws its own."""
     rig_share: Annotated[float, Limits(0.0, 1.0)] = 0.5
-    """Share of batches that are what the simulated rig sees; the others get the paper's corruption."""
+    """Share of batches as seen by the simulated rig; the others get the paper's corruption."""
     occlude: Annotated[int | None, Limits(0, MAX_CHANGED)] = None
     """Most draws of a marker to drop in the paper's corruption; a quarter of the markers when not given, as
     in the paper for its 19 and 13 markers."""

@@ -34,7 +34,7 @@ _MOST_DAMPING: Final = 1e8  # share of the diagonal at which steps vanish
 
 
 class HandArrays(NamedTuple):
-    """A hand and its glove as plain arrays: L bones, J = 20 hinges, M markers."""
+    """A hand and its glove as plain arrays: L bones, J = 20 joint angles, M markers."""
 
     offsets: Float[np.ndarray, "L 3"]  # origin of each bone in its parent's frame [m]
     rotations: Float[np.ndarray, "L 3 3"]  # rotation of each bone in its parent's frame, all joints at zero

@@ -41,7 +41,7 @@ NEWEST: Final[Version] = (4, 1)
 """Newest known layout, which servers are asked to send."""
 _SIZED: Final[Version] = (4, 1)
 """First version with section sizes, assets and a finer clock."""
-_LOST: Final = 9e6  # [m] Motive sends lost markers from farther away than this.
+_LOST: Final = 9e6  # [m] Motive places lost markers farther away.
 _OCCLUDED, _SEEN, _FILLED, _UNLABELED = 1, 2, 4, 16  # flags of a marker
 _NAME: Final = 256  # size of a program's name [bytes]
 _BODY: Final = 38  # size of a rigid body: ID, position, orientation, error, flags [bytes]

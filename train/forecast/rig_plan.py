@@ -55,7 +55,7 @@ _WIDE: Final = pinhole("wide", (1280, 1280), focal_of_angle(1280, np.deg2rad(170
 _ERROR_SAMPLES: Final = 1200  # marker-frames for the estimate of the error
 _PEOPLE: Final = 3  # people for each kind of work
 _FRAMES: Final = 900  # frames of each person
-_STRIDE: Final = 12  # every so many frames one is used
+_STRIDE: Final = 12  # One frame in this many is used.
 _TEST_FRAMES: Final = 600  # frames of each person for the forecast; other people than those of the search
 
 
