@@ -387,9 +387,7 @@ def right_shares(truth: Take, take: Take) -> tuple[Float[np.ndarray, "M"], float
     markers = truth.hands[0].layout.num_markers
     names = truth.label_names
     of_hands = [names.index(name) if name in names else -1 for name in take.label_names]
-    others = (
-        len(truth.hands) * markers
-    )  # labels from this number on are of hands that the truth does not have
+    others = len(truth.hands) * markers  # stands for all labels of hands that the truth does not have
     known = np.array([number if 0 <= number < others else others for number in of_hands] + [-1])
     counts, right = LabelCounts(), np.zeros(others)
     for points, true, given in zip(truth.points, truth.labels, take.labels, strict=True):

@@ -41,10 +41,7 @@ from train.labelers.protocol import Labeler, Labeling
 from train.labelers.storage import labeler_at_once
 
 _LENGTHS: Final = (0.187, 0.205, 0.168, 0.150)  # [m] lengths for the first labels, the likeliest first
-_SHORTEST, _LONGEST = (
-    0.125,
-    0.225,
-)  # [m] range of hand lengths: 0.6 of an adult's to beyond ANSUR II's longest
+_SHORTEST, _LONGEST = 0.125, 0.225  # [m] hand lengths: 0.6 of an adult's to beyond ANSUR II's longest
 _BREADTHS: Final = (0.88, 1.12)  # breadth over the usual one of a length: three standard deviations
 _FAR: Final = 0.012  # [m] Hands are labeled again after a larger change of length.
 _PRECISION: Final = 0.001  # [m] precision of length and breadth

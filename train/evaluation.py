@@ -604,9 +604,7 @@ def _labels_of_columns(
 ) -> Int[np.ndarray, "P"]:
     """Convert point labels that number columns of these names to labels of the true take's hands."""
     known = {name: label for label, name in enumerate(actual.label_names[: actual.hand_labels[-1].stop])}
-    options = np.full(
-        (len(actual.hands), len(columns) + 1), -1
-    )  # the last entry is for points without a label
+    options = np.full((len(actual.hands), len(columns) + 1), -1)  # last entry: points without a label
     absent = np.zeros(len(columns) + 1, dtype=np.bool_)  # columns of hands missing in the truth
     for column, name in enumerate(columns):
         side, marker = (part.strip() for part in name.rpartition(":")[::2])

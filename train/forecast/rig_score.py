@@ -71,9 +71,7 @@ _OFF_CENTER: Final = 0.5  # [m] distance of the working point from the default p
 _NARROW_ANGLE: Final = 30.0  # [deg] largest angle between two cameras
 _SMALL_MARKER: Final = 2.0  # [px] diameter of a marker in the picture
 _COVERED: Final = 0.9  # share of the cube in view of two cameras
-_UPSIDE_DOWN: Final = (
-    -0.2
-)  # A camera is upside down if the cosine between its picture's up and the world's is smaller.
+_UPSIDE_DOWN: Final = -0.2  # cosine between its up and the world's, below which a camera is upside down
 
 
 class VolumeMap(NamedTuple):

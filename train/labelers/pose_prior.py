@@ -450,9 +450,7 @@ def _shrunk_covariances(
 
 _MAX_FOURS: Final = 3000
 _POSES: Final = 100  # number of poses of a hand of each size
-_RECOGNIZED: Final = (
-    0.98  # Layouts with a smaller share of recognized complete hands resemble their mirror image.
-)
+_RECOGNIZED: Final = 0.98  # Layouts with fewer recognized complete hands resemble their mirror image.
 _SIZES: Final = ("XS", "S", "M", "L", "XL")
 
 
