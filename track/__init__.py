@@ -1,11 +1,11 @@
 """From unlabeled points to hand motion, online.
 
 `track_capture` tracks the hands of a capture, and `label_capture` labels them frame by frame. A `Tracker`
-takes one frame of points at a time and gives a `TrackedFrame`; `measure_hands` measures whom it follows, and
-`calibrate` fits hands and gloves to them as a `User`. `open_source` opens a live stream, `ReplayServer` plays
-a capture as one, `open_sinks` takes hands to other programs, and a `Recorder` writes the take. `solve_pose`
-is the inverse kinematics alone: poses from labeled markers. `find_suspect_spans` tells of a take,
-`score_glove` and `improve_glove` of a glove that nobody has worn.
+takes one frame of points at a time and returns a `TrackedFrame`; `measure_hands` measures hands for it, and
+`calibrate` fits hands and gloves to their user as a `User`. `open_source` opens a live stream, `ReplayServer`
+plays a capture as one, `open_sinks` sends hands to other programs, and a `Recorder` writes the take.
+`solve_pose` is the inverse kinematics alone: poses from labeled markers. `find_suspect_spans` lists the
+doubtful frames of a take. `score_glove` and `improve_glove` judge and improve a glove by simulation.
 """
 
 from typing import TYPE_CHECKING

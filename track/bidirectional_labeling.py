@@ -1,7 +1,7 @@
-"""Labels of frames that follow from each other: the hands are tracked forward and backward.
+"""Labels of continuous frames: hands are tracked forward and backward, and the better labels kept.
 
-A track that goes wrong at an event is wrong after it in one direction and before it in the other. Where the
-directions differ, the labels of each event are those of the direction whose whole track makes them likelier.
+A tracker that fails at an event is wrong after it when tracking forward, and before it when going backward.
+Where the directions differ, each event takes the labels of the direction in which they are likelier.
 """
 
 from __future__ import annotations
@@ -22,29 +22,29 @@ from track.frames import StreamedFrame, TrackedHand
 from track.label_confidence import label_confidence
 from track.tracker import Tracker
 
-_WORTH: Final = 6.0  # log-odds of a point that lies exactly where its marker is, against a stray
-_SPREAD: Final = 0.003  # [m] of the RMS distance of labeled markers from a pose
-_MOST: Final = 0.5  # share of the points with two labels, whose hands are different
-_LEAST: Final = 1e-4  # probability of a label being right, and of its being wrong, at least
-_AGREED: Final = 5.0  # factor of a label's odds where both directions agree, on simulated captures
+_EXACT_LOG_ODDS: Final = 6.0  # log-odds that a point exactly at a marker is that marker and not a stray
+_RMS_SPREAD: Final = 0.003  # [m] standard deviation of the RMS distance of labeled markers from a pose
+_EXCHANGED_SHARE: Final = 0.5  # Hands are exchanged if more points than this share change hands.
+_LEAST_CONFIDENCE: Final = 1e-4  # Confidences are clipped to between this and one minus this.
+_AGREEMENT_ODDS: Final = 5.0  # factor of a label's odds where both directions agree, on simulated captures
 
 
 class _Track(NamedTuple):
-    """What the tracker made of a capture in one direction."""
+    """Result of tracking a capture in one direction."""
 
     take: Take
     """Labels and poses."""
     evidence: Float[np.ndarray, "T"]
-    """Of all hands together: log-odds of their labeled points, by their distances from the poses."""
+    """Log-odds of the labeled points of all hands, from their distances to the poses."""
 
 
 class _Events(NamedTuple):
-    """The E points to which the directions give different labels."""
+    """The E points whose labels differ between the directions."""
 
     points: Int[np.ndarray, "E"]
-    """Which points of the take these are."""
+    """Indices of these points in the take."""
     numbers: Int[np.ndarray, "E"]
-    """The event that each is of."""
+    """Event number of each point."""
 
 
 def label_both_ways(
@@ -53,7 +53,7 @@ def label_both_ways(
     new_tracker: Callable[[], Tracker],
     on_count: Callable[[int], None],
 ) -> Take:
-    """The take with labels and their confidence; `on_count` is called with the number of frames done."""
+    """Label a take in both directions; `on_count` is called with the number of frames done."""
     count = len(frames)
     order = range(count)
     forward = _track(take, frames, order, new_tracker(), lambda done: on_count(done // 2))
@@ -63,13 +63,13 @@ def label_both_ways(
     events = _events_of(points.frames, one, other)
     is_second[events.points] = _is_likelier(backward.take, forward.take, events)
     is_better = backward.evidence > forward.evidence
-    for run in _exchanges(points, one, other, len(take.hand_labels[0])):  # right and left: the poses tell
+    for run in _exchanges(points, one, other, len(take.hand_labels[0])):  # Which hand is which
         is_better[run] = backward.evidence[run].sum() > forward.evidence[run].sum()
         is_second[points.starts[run.start] : points.starts[run.stop]] = is_better[run.start]
     labels = np.where(is_second, other, one)
     qpos, rms = _poses(forward.take, backward.take, is_better)
     right = label_confidence(_posed(take, labels, qpos, rms))
-    odds = np.where(one == other, _AGREED, 1.0)
+    odds = np.where(one == other, _AGREEMENT_ODDS, 1.0)
     confidence = odds * right / (1.0 - right + odds * right)
     return dataclasses.replace(
         take, point_list=dataclasses.replace(points, labels=labels, confidence=confidence)
@@ -83,7 +83,7 @@ def _track(
     tracker: Tracker,
     on_count: Callable[[int], None],
 ) -> _Track:
-    """The hands tracked through frames in an order."""
+    """Track the hands through frames in the given order."""
     points, num_hands = take.point_list, len(tracker.hands)
     labels, evidence = points.labels.copy(), np.zeros(len(frames))
     qpos, rms = np.zeros((len(frames), num_hands, NUM_QPOS)), np.zeros((len(frames), num_hands))
@@ -105,26 +105,26 @@ def _posed(
     qpos: Float[np.ndarray, "T H 27"],
     rms: Float[np.ndarray, "T H"],
 ) -> Take:
-    """The take with labels and the poses [m, rad] that they were found with, NaN of lost hands."""
+    """The take with labels and the poses [m, rad] that gave them, NaN for lost hands."""
     status = np.where(np.isfinite(qpos[..., 0]), TRACKED, LOST)
     points = dataclasses.replace(take.point_list, labels=labels)
     return dataclasses.replace(take, point_list=points, qpos=qpos, status=status, rms=rms)
 
 
 def _evidence(hand: TrackedHand) -> float:
-    """What speaks for a hand's labels: many points near the pose's markers, where they are designed."""
+    """Log-odds of a hand's labels, from the number and RMS distance of its points."""
     if not np.isfinite(hand.rms):
         return 0.0
-    return (len(hand.markers) - len(hand.filled)) * (_WORTH - 0.5 * (hand.rms / _SPREAD) ** 2)
+    return (len(hand.markers) - len(hand.filled)) * (_EXACT_LOG_ODDS - 0.5 * (hand.rms / _RMS_SPREAD) ** 2)
 
 
 def _events_of(
     frames: Int[np.ndarray, "P"], one: Int[np.ndarray, "P"], other: Int[np.ndarray, "P"]
 ) -> _Events:
-    """The points whose two labels are different, by event.
+    """Group the points whose two labels differ into events.
 
-    Points are of one event if a label is one's in one direction and the other's in the other direction, or if
-    they have the same two labels in one frame and the next.
+    Two points belong to one event if they exchange a label between the directions in a frame, or if they have
+    the same two labels in successive frames.
     """
     points = np.flatnonzero(one != other)
     rows = frames[points]
@@ -147,13 +147,13 @@ def _events_of(
 
 
 def _components(links: Int[np.ndarray, "2 K"], count: int) -> Int[np.ndarray, "N"]:
-    """Numbers of the connected parts of a graph of N nodes; scipy.sparse.csgraph takes longer to load."""
+    """Component number of each of N nodes of a graph; importing scipy.sparse.csgraph takes longer."""
     least, before = np.arange(count), np.full(count, -1)
     while (least != before).any():
         before = least.copy()
         for one, other in (links, links[::-1]):
             np.minimum.at(least, before[one], before[other])
-        least = least[least]  # halves the way to a part's first node
+        least = least[least]  # halves each node's distance to its component's least node
     numbers: NDArray[np.int64] = np.unique(least, return_inverse=True)[1]
     return numbers
 
@@ -161,12 +161,12 @@ def _components(links: Int[np.ndarray, "2 K"], count: int) -> Int[np.ndarray, "N
 def _is_likelier(take: Take, other: Take, events: _Events) -> Bool[np.ndarray, "E"]:
     """For each point, whether a take's labels of its event are likelier than another take's.
 
-    A point without a label tells nothing where the hand is lost that the other take has it on.
+    An unlabeled point counts as no evidence if its take has lost the hand of the other take's label.
     """
     log_odds, markers = [], len(take.hand_labels[0])
     rows = take.point_list.frames[events.points]
     for one, rival in ((take, other), (other, take)):
-        right = np.clip(one.point_list.confidence[events.points], _LEAST, 1.0 - _LEAST)
+        right = np.clip(one.point_list.confidence[events.points], _LEAST_CONFIDENCE, 1.0 - _LEAST_CONFIDENCE)
         hand = rival.point_list.labels[events.points] // markers
         is_silent = (hand >= 0) & (one.point_list.labels[events.points] < 0)
         is_silent &= one.status[rows, hand] == LOST
@@ -184,14 +184,14 @@ def _exchanges(
     exchanged = both & (one // num_markers != other // num_markers)
     count = len(points.counts)
     numbers = [np.bincount(points.frames[which], minlength=count) for which in (exchanged, both)]
-    wrong = numbers[0] > _MOST * numbers[1]
+    wrong = numbers[0] > _EXCHANGED_SHARE * numbers[1]
     yield from (slice(first, last + 1) for first, last in runs_of(wrong))
 
 
 def _poses(
     one: Take, other: Take, is_better: Bool[np.ndarray, "T"]
 ) -> tuple[Float[np.ndarray, "T H 27"], Float[np.ndarray, "T H"]]:
-    """The poses of the better take, and their RMS; the other one's of hands that it has lost."""
+    """Poses and RMS of the better take, or of the other one for hands that the better one has lost."""
     there = [np.isfinite(take.qpos[..., 0]) for take in (one, other)]
     chosen: NDArray[np.bool_] = np.where(is_better[:, None], there[1], there[1] & ~there[0])
     return np.where(chosen[..., None], other.qpos, one.qpos), np.where(chosen, other.rms, one.rms)

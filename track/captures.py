@@ -1,7 +1,7 @@
-"""From a capture to hands: their labels, their motion, or the hands themselves.
+"""Label, track, measure and calibrate the hands of a capture.
 
-All go one way. What is given becomes frames, and hands with their labeler; hands that nobody has measured are
-measured in some of the frames; then all frames are labeled or tracked.
+Each function turns its capture into frames and its settings into hands and a labeler, measures the hands in
+some of the frames if nobody has measured them, and then labels or tracks all frames.
 """
 
 from __future__ import annotations
@@ -44,13 +44,13 @@ from track.tracker import Tracker
 from track.user import AnyGlove, AnyLabeler, User, labeler_of, nominal_user
 
 OnFrame = Callable[[StreamedFrame, TrackedFrame], None]
-_COMPARED: Final = 200  # pairs of frames that tell whether a capture's frames follow from each other
-_CONTINUOUS: Final = 0.005  # [m] change of the distances in a hand from a frame to the next, at most
-_MOST: Final = 0.5  # share of these pairs that change no more
+_COMPARED: Final = 200  # pairs of successive frames compared to see whether frames are continuous
+_CONTINUOUS: Final = 0.005  # [m] A pair is continuous if distances within a hand change less.
+_MOST: Final = 0.5  # Frames are tracked if at least this share of their pairs is continuous.
 
 
 class _Opened(NamedTuple):
-    """A capture, and what tracks it."""
+    """A capture, its frames, and the setup that tracks them."""
 
     source: Capture
     frames: list[StreamedFrame]
@@ -58,7 +58,7 @@ class _Opened(NamedTuple):
 
     @classmethod
     def of(cls, capture: AnyCapture, settings: LabelSettings, *, warns: bool = False) -> _Opened:
-        """The capture of a file, and the hands in it: as they are given, or as they are measured in it."""
+        """Read a capture, and measure its hands unless the settings give them."""
         setup = TrackerSetup.of(settings)
         source = capture_of(capture)
         frames = checked_frames(source)
@@ -140,10 +140,10 @@ def track_capture(
         capture: Points [m], or the path of a marker file or a take; names of markers are not used.
         settings: How to track; as `TrackSettings()` when not given.
         corrections: A file of labels that a person corrected, as `handsim view` saves it beside a take.
-        sinks: Take every frame as it is tracked, from `open_sinks`; the capture is then played at its own
+        sinks: Receives every frame as it is tracked, from `open_sinks`; the capture is then played at its own
             rate.
         progress: Called after each frame with the number of tracked frames and of all frames.
-        on_frame: Called with each frame, its time in [s], and what the tracker made of it.
+        on_frame: Called with each frame and its `TrackedFrame`.
         options: Fields of `TrackSettings` that differ from `settings`, as `glove="dense19"`, `size="M"`,
             `hands="user.json"`, `bodies=["mug"]` or `calibrate=True`.
 
@@ -183,11 +183,11 @@ def calibrate(
     on_step: OnStep = no_step,
     **options: Any,
 ) -> User:
-    """Fit hands and gloves to their user, from any capture; one in which every joint moves tells most.
+    """Fit hands and gloves to their user, from any capture; best from one in which every joint moves.
 
     The capture is labeled by the tracker. If some markers stay unlabeled, it is labeled once more with the
-    calibrated hands. Each hand is solved on two thirds of the time and tried on the rest: where that is no
-    better than the hand before, the hand stays, with a warning. Otherwise it is solved on all frames.
+    calibrated hands. Each hand is solved on two thirds of the frames and tested on the rest. If it does no
+    better there than the hand before, that one is kept, with a warning; else it is solved on all frames.
 
     Args:
         capture: Points [m], or the path of a marker file or a take; names of markers are not used.
@@ -197,11 +197,11 @@ def calibrate(
         options: Fields of `CalibrateSettings` that differ from `settings`, as `glove="dense19"`.
 
     Returns:
-        The hands that are in the capture; its `calibrations` tell of each how it was found: `held_out`,
-        standard errors and `suggestions()` for a better capture. Printed, one is what `notes` keep of it.
+        The hands in the capture. Its `calibrations` hold for each hand the `held_out` comparison, standard
+        errors and `suggestions()` for a better capture; `str()` of a calibration is what `notes` keep.
 
     Raises:
-        CalibrationError: No hand is in the capture, or it tells too little of one.
+        CalibrationError: No hand is in the capture, or a hand is observed too poorly.
         ArgumentError: The capture is not in meters, or arguments do not go together.
         CaptureError: The capture cannot be read, or most of its points are far from any room.
         LayoutError: The glove is unknown, or does not fit a hand.
@@ -244,7 +244,7 @@ def measure_hands(
         hands: Which hands.
 
     Returns:
-        The hands, all of one shape; printed, it is their length and breadth. Where no hand is found that
+        The hands, all of one shape; `str()` gives their length and breadth. If no hand is found that
         shows most of its markers, hands of size M, with a warning.
 
     Raises:
@@ -265,7 +265,7 @@ def record_frames(
     on_frame: OnFrame | None = None,
     progress: Progress = no_progress,
 ) -> TakeRecorder:
-    """Track all frames; sinks take them at the capture's own rate."""
+    """Track all frames; with sinks, at the capture's own rate."""
     recorder = TakeRecorder(tracker)
     if sinks:
         sinks.start(tracker.hands, tracker.bodies)
@@ -283,13 +283,13 @@ def record_frames(
 
 
 def _named(capture: AnyCapture, source: Capture) -> dict[str, Any]:
-    """What a take records of the file of its capture, and of what was found in it."""
+    """Entries of a take's settings: the name of the capture's file, and the reader's findings."""
     name = {"capture": Path(capture).name} if isinstance(capture, str | Path) else {}
     return {**name, **({"findings": dict(source.findings)} if source.findings else {})}
 
 
 def _is_continuous(frames: Sequence[StreamedFrame]) -> bool:
-    """Whether the frames of a capture follow from each other."""
+    """Whether successive frames of a capture mostly show hands that hardly changed."""
     pairs = [
         (one.points, other.points)
         for one, other in pairwise(frames)

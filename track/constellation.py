@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from handsim.kernels import align_rigid, kernel, squared_distance, write_quaternion_matrix
 
 FEWEST: Final = 3
-"""Markers that determine a pose."""
-_NEW_ID_FACTOR: Final = 1.5  # gate of a point with a new ID, over the tight gate
-# Height of a triangle over its longest side, below which it determines no rotation.
+"""A pose needs at least this many markers."""
+_NEW_ID_FACTOR: Final = 1.5  # gate of a point with a new ID, as a multiple of the tight gate
+# A triangle whose height is less than this share of its longest side determines no rotation.
 _LEAST_TRIANGLE_HEIGHT: Final = 0.1
 
 Floats = NDArray[np.float64]
@@ -25,7 +25,7 @@ Ints = NDArray[np.int64]
 
 
 class _Search(NamedTuple):
-    """The arrays of a search, and the best match so far."""
+    """Input arrays of a search, and the best match so far."""
 
     positions: Floats  # markers in the body's frame (Q, 3) [m]
     distances: Floats  # between markers (Q, Q) [m]
@@ -33,9 +33,9 @@ class _Search(NamedTuple):
     apart: Floats  # distances between points (N, N) [m]
     near: NDArray[np.bool_]  # whether a point is near enough to a marker's expected position (Q, N)
     gate: float  # largest residual of a point after the fit [m]
-    assignment: Ints  # the best one (Q,)
+    assignment: Ints  # best assignment so far (Q,)
     pose: Floats  # its pose (7,)
-    score: Floats  # number of its markers, its RMS distance [m], number of markers in the best other one
+    score: Floats  # its number of markers and RMS distance [m]; number of markers of the runner-up
 
 
 @kernel
@@ -50,7 +50,7 @@ def fit_inliers(
     while count > FEWEST and worst > tight * tight:
         marker, clear = _worst_outlier(positions, points, core)
         if count == FEWEST + 1 and not clear:
-            break  # three of four agree in more than one way: all four, if they do within the gate
+            break  # Three of four agree in more than one way: keep all four if they fit within the gate.
         core[marker] = -1
         count, _, worst = _fit_pose(positions, points, core, fitted)
     limit = tight if count == FEWEST else gate
@@ -71,7 +71,7 @@ def fit_inliers(
 
 @kernel
 def _fit_pose(positions: Floats, points: Floats, assignment: Ints, pose: Floats) -> tuple[int, float, float]:
-    """Fit the pose to all assigned points; their number, and sum and largest of their squares [m^2]."""
+    """Fit the pose to all assigned points; return their number, sum and largest of squares [m^2]."""
     target, count = np.full_like(positions, np.nan), 0
     for marker in range(len(positions)):
         if assignment[marker] >= 0:
@@ -90,7 +90,7 @@ def _fit_pose(positions: Floats, points: Floats, assignment: Ints, pose: Floats)
 
 @kernel
 def _worst_outlier(positions: Floats, points: Floats, assignment: Ints) -> tuple[int, bool]:
-    """The marker without which the others fit best, and whether they do ten times better than otherwise."""
+    """The marker without which the others fit best, and whether that is ten times better than any other."""
     outlier, least, second, pose = -1, np.inf, np.inf, np.empty(7)
     for marker in range(len(positions)):
         if assignment[marker] >= 0:
@@ -108,7 +108,7 @@ def _worst_outlier(positions: Floats, points: Floats, assignment: Ints) -> tuple
 def assign_remaining(
     positions: Floats, points: Floats, assignment: Ints, pose: Floats, tight: float, gate: float
 ) -> tuple[int, float]:
-    """Assign to the other markers of a known pose the free points nearby, and fit again, as `fit_inliers`."""
+    """Assign free points near the predicted markers to the markers without a point, and fit again."""
     predicted = transform_markers(positions, pose)
     for marker in range(len(positions)):
         if assignment[marker] < 0:
@@ -118,7 +118,7 @@ def assign_remaining(
 
 @kernel
 def _nearest_free(points: Floats, center: Floats, radius: float, assignment: Ints) -> int:
-    """The nearest point within a radius [m] of a center (3,) that no marker has, -1 if there is none."""
+    """Nearest unassigned point within a radius [m] of a center (3,), or -1."""
     nearest, least = -1, radius * radius
     for point in range(len(points)):
         square = squared_distance(points[point], center)
@@ -138,7 +138,7 @@ def track_by_ids(
     gate: float,
     assignment: Ints,
 ) -> tuple[int, float]:
-    """Assign points by the IDs of the last frame, -1 for none; fit as `fit_inliers`, and assign the rest."""
+    """Assign points by the IDs of the last frame (-1: none), fit as `fit_inliers`, and assign the rest."""
     found = 0
     for marker in range(len(last_ids)):
         assignment[marker] = -1
@@ -157,7 +157,7 @@ def track_by_ids(
 
 @kernel
 def transform_markers(positions: Floats, pose: Floats) -> Floats:
-    """Markers in the world (Q, 3) [m] of those in the body's frame."""
+    """Transform markers from the body's frame to the world (Q, 3) [m]."""
     rotation, moved = np.empty((3, 3)), np.empty_like(positions)
     write_quaternion_matrix(rotation, pose[3], pose[4], pose[5], pose[6])
     for marker in range(len(positions)):
@@ -179,7 +179,7 @@ def search_constellation(
     assignment: Ints,
     pose: Floats,
 ) -> tuple[int, float, int]:
-    """The largest set of points in the markers' constellation, from every triangle that fits."""
+    """Find the largest set of points in the markers' constellation, starting from every matching triangle."""
     apart = np.empty((len(points), len(points)))
     for i in range(len(points)):
         for j in range(len(points)):
@@ -205,7 +205,7 @@ def search_constellation(
 
 @kernel
 def _try_triangles(search: _Search, a: int, b: int, i: int, j: int) -> None:
-    """Try every triangle that fits of a side (markers a and b, points i and j) and a later marker."""
+    """Extend a matched side (markers a and b, points i and j) by every later marker that matches."""
     trial, slack = np.empty_like(search.assignment), 2.0 * search.gate
     apart, distances = search.apart, search.distances
     for c in range(b + 1, len(search.positions)):
@@ -222,8 +222,8 @@ def _try_triangles(search: _Search, a: int, b: int, i: int, j: int) -> None:
 
 @kernel
 def _keep_better(search: _Search, trial: Ints) -> None:
-    """Keep a trial of more markers than the best so far, or as many that fit better, without its outliers."""
-    # One that shares three pairs with the best assignment is not another one.
+    """Keep a trial with more markers than the best, or as many and a better fit, without its outliers."""
+    # A trial that shares three pairs with the best assignment is the same match, not a runner-up.
     pose, score = np.empty(7), search.score
     count, rms = fit_inliers(search.positions, search.points, trial, pose, search.gate, search.gate)
     if count < max(score[0], FEWEST):
@@ -242,7 +242,7 @@ def _keep_better(search: _Search, trial: Ints) -> None:
 def _extend_triangle(
     positions: Floats, points: Floats, slack: float, assignment: Ints, a: int, b: int, c: int
 ) -> int:
-    """Assign to other markers the free points where a triangle predicts them; how many, 0 if it is flat."""
+    """Assign free points where a triangle predicts other markers; return how many, 0 if it is flat."""
     model, seen = np.empty((3, 3)), np.empty((3, 3))
     if not _triangle_axes(positions[a], positions[b], positions[c], model):
         return 0
@@ -259,7 +259,7 @@ def _extend_triangle(
 
 @kernel
 def _triangle_axes(first: Floats, second: Floats, third: Floats, axes: Floats) -> bool:
-    """Write the axes of a triangle as rows: first side, in its plane, normal; False where it is too flat."""
+    """Write a triangle's axes as rows (first side, in-plane, normal); return False if it is too flat."""
     along, across = second - first, third - first
     length = np.sqrt((along**2).sum())
     axes[0] = along / length

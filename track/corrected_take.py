@@ -1,4 +1,4 @@
-"""A tracked take with corrected labels, and poses that are fitted to them again."""
+"""Corrected labels of a tracked take, and poses fitted to them again."""
 
 from __future__ import annotations
 
@@ -18,27 +18,27 @@ from handsim.hand.shape import NUM_JOINTS, NUM_KEYPOINTS
 from track.kinematics.pose_solver import FEWEST_MARKERS, PoseSolver
 from track.smoothed_take import smooth_take, spread_model
 
-_ANGLE_SPREAD: Final = 0.3  # [rad] of hinges that markers leave open, around the tracked ones
-_BAD_RMS: Final = 0.006  # [m] after which a fit from general poses is tried too
+_ANGLE_SPREAD: Final = 0.3  # [rad] prior standard deviation of joint angles around the tracked ones
+_BAD_RMS: Final = 0.006  # [m] A fit that is worse is tried again from general poses.
 
 
 class CorrectedTake(NamedTuple):
-    """What corrections make of a take."""
+    """A take after corrections."""
 
     take: Take
     labels: int
-    """Points, over all frames, whose label a correction gives."""
+    """Number of points, over all frames, whose label a correction gives."""
     frames: int
-    """Frames in which there are such points."""
+    """Number of frames with such points."""
     unfitting: tuple[Correction, ...]
-    """Corrections that fit no point."""
+    """Corrections that match no point."""
 
 
 def correct_take(take: Take, corrections: Sequence[Correction]) -> CorrectedTake:
-    """Give points their right labels, and fit the poses of those frames to them.
+    """Correct the labels of points, and fit the poses of those frames to them.
 
-    A corrected label has a confidence of 1. Where a hand has at least four labeled markers its pose is fitted
-    again; with fewer, and where the hand is lost, its pose stays. Poses of rigid bodies stay.
+    A corrected label has a confidence of 1. A hand with at least four labeled markers is fitted again; with
+    fewer, and where the hand is lost, its pose stays. Poses of rigid bodies stay.
     """
     before = take.point_list
     pins = find_pins(corrections, before, take.label_names)
@@ -66,7 +66,7 @@ def correct_take(take: Take, corrections: Sequence[Correction]) -> CorrectedTake
 
 
 def _spreads(take: Take, points: PointList, qpos: NDArray[np.float64]) -> dict[str, Any]:
-    """Standard deviations of all poses with the labels of these points, by the names of a take's fields."""
+    """Standard deviations of all poses given these labels, by the names of a take's fields."""
     angles = np.full((*qpos.shape[:2], NUM_JOINTS), np.nan)
     keypoints = np.full((*qpos.shape[:2], NUM_KEYPOINTS), np.nan)
     for number, (hand, span) in enumerate(zip(take.hands, take.hand_labels, strict=True)):
@@ -86,7 +86,7 @@ def _spreads(take: Take, points: PointList, qpos: NDArray[np.float64]) -> dict[s
 def _fit_again(
     take: Take, hand: int, frames: NDArray[np.int64], targets: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Poses and RMS [m] of some frames of a hand that has a pose there."""
+    """Fit a hand that is not lost to labeled markers in some frames; poses and RMS [m]."""
     worn, qpos = take.hands[hand], take.qpos[frames, hand]
     enough = np.isfinite(targets[..., 0]).sum(axis=1) >= FEWEST_MARKERS
     rms = np.full(len(frames), np.nan)
@@ -101,27 +101,27 @@ def _fit_again(
 def _solved(
     worn: GloveFit, bias: NDArray[np.float64], targets: NDArray[np.float64], near: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Poses (T, 27) of a hand whose markers are shifted by biases; each starts from the pose near it."""
+    """Fit poses (T, 27) of a hand with biased markers, each starting from a given pose."""
     solver = PoseSolver(worn)
     solver.hand.positions[:, 0] -= bias
     fit = solver.solve(targets, near, prior=(near[:, 7:], _ANGLE_SPREAD))
     qpos, bad = fit.qpos.copy(), np.flatnonzero(fit.rms > _BAD_RMS)
     if len(bad):
-        other = solver.solve(targets[bad])  # a wrong label may have bent the pose too far
+        other = solver.solve(targets[bad])  # A wrong label may have bent the starting pose too far.
         better = other.rms < 0.5 * fit.rms[bad]
         qpos[bad[better]] = other.qpos[better]
     return qpos
 
 
 def _of_hand(labels: Int[np.ndarray, "P"], span: range) -> NDArray[np.int64]:
-    """Labels of one hand, -1 for those of others."""
+    """Labels of one hand, -1 for all others."""
     return np.where((labels >= span.start) & (labels < span.stop), labels, -1)
 
 
 def _records(
     take: Take, corrections: Sequence[Correction], unfitting: Sequence[Correction]
 ) -> list[dict[str, object]]:
-    """The corrections that a take has now, those from before included."""
+    """Records of all corrections of a take, earlier ones included."""
     before = applied_corrections(take)
     now = [correction.record() for correction in corrections if correction not in unfitting]
     return [*(record for record in before if record not in now), *now]

@@ -1,6 +1,6 @@
-"""Frames of points: those of a capture, checked before anything relies on them, and as they are tracked.
+"""Frames of points: read from a capture, validated for the tracker, and tracked.
 
-A bad frame does not stop a stream. What cannot be used is left out, and a note says so.
+A bad frame does not stop a stream. Unusable points are left out, and a note says so.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ from handsim.hand.shape import JOINT_NAMES, NUM_JOINTS, NUM_KEYPOINTS, Side
 from track.config import TrackerConfig
 
 AnyCapture = Capture | Take | str | Path
-"""A capture, or a take, of which only the points are used; or the path of one."""
+"""A capture; a take, of which only the points are used; or the path of one."""
 FARTHEST: Final = 1e3
 """Largest coordinate of a point [m]; no capture volume is larger."""
 LATEST_TIME: Final = 1e11
-"""Beyond it a clock of doubles does not move on by a frame [s]."""
-_USUAL_INTERVAL: Final = 1.0 / 120.0  # [s] until a stream has shown its own; usual for optical systems
-_INTERVAL_SMOOTHING: Final = 0.1  # share of the newest interval in the usual one
-_SHORTEST_INTERVAL: Final = 0.1  # of the usual interval, at least between two frames on the tracker's clock
-_LONGEST_INTERVAL: Final = 2.0  # of the usual interval, which counts in it at most
+"""Largest time stamp [s]: beyond it doubles cannot resolve the time between frames."""
+_USUAL_INTERVAL: Final = 1.0 / 120.0  # [s] assumed until a stream shows its own; usual for optical systems
+_INTERVAL_SMOOTHING: Final = 0.1  # weight of the newest interval in the running mean
+_SHORTEST_INTERVAL: Final = 0.1  # The tracker's clock advances by at least this share of the mean interval.
+_LONGEST_INTERVAL: Final = 2.0  # Longer intervals enter the mean as this multiple of it.
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,21 +43,21 @@ class StreamedFrame:
     """The points of one frame."""
 
     number: int
-    """The server's number of the frame."""
+    """The server's frame number."""
     time: float
     """The server's time [s]."""
     points: Float[np.ndarray, "N 3"]
-    """[m], in the server's axes."""
+    """Positions [m] in the server's axes."""
     ids: Int[np.ndarray, "N"]
     """The server's ID of each point, -1 where it gives none."""
     silent: bool = False
-    """No frame arrived for a while: there are no points, and number and time are those of the last frame."""
+    """Whether no frame has arrived for a while: no points, number and time are those of the last frame."""
     restarted: bool = False
-    """The server's time began anew: it does not continue that of the frame before."""
+    """Whether the server's time began anew and does not continue that of the frame before."""
     arrived: float = math.nan
-    """Monotonic time of its arrival on this machine [s]; NaN where it did not come live."""
+    """Monotonic time of its arrival on this machine [s]; NaN if it is not live."""
     latency: float = math.nan
-    """Time from the middle of its exposure to its sending [s]; NaN where the source does not tell."""
+    """Time from the middle of its exposure to its sending [s]; NaN if the source does not give it."""
 
 
 def capture_of(capture: AnyCapture) -> Capture:
@@ -81,11 +81,11 @@ def read_points(path: str | Path) -> Capture | Take:
 
 
 def capture_frames(capture: Capture) -> Iterator[StreamedFrame]:
-    """The frames of a capture as of a stream: points [m], IDs and times [s].
+    """The frames of a capture as those of a stream: points [m], IDs and times [s].
 
-    Marker files have no IDs. Every format that is read has one column per trajectory, so a column is an ID
-    for as long as it has a point. After a gap it is a new ID, because a column of unlabeled points may
-    continue with another marker. Column names are not used.
+    Marker files have no IDs. Every supported format has one column per trajectory, so a column is an ID until
+    its point disappears. After a gap it is a new ID, because a column of unlabeled points may go on with
+    another marker. Column names are not used.
     """
     present = np.isfinite(capture.positions[..., 0])
     ids = number_runs(present)
@@ -94,7 +94,7 @@ def capture_frames(capture: Capture) -> Iterator[StreamedFrame]:
 
 
 def checked_frames(capture: Capture) -> list[StreamedFrame]:
-    """The frames of a capture, if their points can be hands' markers."""
+    """The frames of a capture, after checking unit and place of its points."""
     frames = list(capture_frames(capture))
     check_unit([frame.points for frame in frames])
     check_place(capture, FARTHEST)
@@ -107,13 +107,13 @@ class IncomingFrame(NamedTuple):
     points: Float[np.ndarray, "P 3"]
     """Points [m], all of them finite."""
     ids: Int[np.ndarray, "P"]
-    """Their IDs; -1 where a point has none of its own."""
+    """Their IDs; -1 where there is none or several points share one."""
     kept: Int[np.ndarray, "P"]
-    """Indices of these points in the frame as it came."""
+    """Indices of these points in the original frame."""
     num_points: int
-    """Points of the frame as it came."""
+    """Number of points in the original frame."""
     stamp: float
-    """Time stamp of the frame as it came [s]."""
+    """Original time stamp of the frame [s]."""
     time: float
     """Time on a clock that only goes forward [s]."""
     notes: tuple[str, ...]
@@ -121,10 +121,10 @@ class IncomingFrame(NamedTuple):
 
 
 class FrameValidator:
-    """Checks the frames of one stream.
+    """Validates the frames of one stream.
 
     Args:
-        silence: Time without a frame that is noted [s].
+        silence: A longer time without a frame is noted [s].
     """
 
     def __init__(self, silence: float = TrackerConfig.silence) -> None:
@@ -136,7 +136,7 @@ class FrameValidator:
     def check_frame(
         self, points: Float[np.ndarray, "N 3"], ids: Int[np.ndarray, "N"] | None, time: float | None
     ) -> IncomingFrame:
-        """Check the next frame; an ID is -1 where there is none, and the stream may have none."""
+        """Validate the next frame; an ID is -1 where there is none, and `ids` may be None."""
         points = _numbers("points", points, np.float64)
         ids = np.full(points.shape[:1], -1) if ids is None else _numbers("ids", ids, np.int64)
         if ids.ndim != 1 or points.shape != (len(ids), 3):
@@ -147,7 +147,7 @@ class FrameValidator:
         stamp = float(time)
         notes = self._tick(stamp)
         with np.errstate(invalid="ignore"):
-            usable = np.abs(points).max(axis=1, initial=0.0) < FARTHEST  # which NaN is not
+            usable = np.abs(points).max(axis=1, initial=0.0) < FARTHEST  # NaN compares as false
         if not usable.all():
             notes.append(f"{np.sum(~usable)} of {len(points)} points are nowhere and left out")
         kept = np.flatnonzero(usable)
@@ -183,7 +183,7 @@ class FrameValidator:
 
 
 def _numbers(name: str, values: ArrayLike, kind: type) -> NDArray[Any]:
-    """An array of a kind of numbers; an `ArgumentError` if the values are none."""
+    """Convert values to an array of numbers; an `ArgumentError` if they are not numbers."""
     try:
         return np.asarray(values, dtype=kind)
     except (TypeError, ValueError, OverflowError) as error:
@@ -207,25 +207,25 @@ class TrackedHand:
     qpos: Float[np.ndarray, "27"]
     """The pose; NaN where the hand is lost."""
     rms: float
-    """3D RMS distance of the labeled markers from the pose's, biases included [m]; NaN without a fit."""
+    """RMS distance of the labeled markers from the pose's, biases included [m]; NaN without a fit."""
     markers: Float[np.ndarray, "M 3"]
-    """The labeled markers [m], and the pose's where they are missing; NaN where the hand is lost."""
+    """The labeled markers [m], those of the pose where one is missing; NaN where the hand is lost."""
     filled: Int[np.ndarray, "F"]
     """Indices of the markers that are filled in from the pose."""
     find_spreads: Callable[[], Spreads] = field(default=_unknown_spreads, repr=False)
-    """Computes the standard deviations: only where they are asked for, since a frame has little time."""
+    """Computes the standard deviations when they are first read, as a frame has little time."""
     velocity: Float[np.ndarray, "26"] = field(default_factory=lambda: np.full(26, np.nan))
     """Velocity of the wrist [m/s], its angular velocity in its own frame and that of each joint [rad/s];
     NaN where the hand is not tracked."""
 
     @property
     def angle_spread(self) -> Float[np.ndarray, "20"]:
-        """Standard deviation of each joint angle [rad]; NaN where the hand is lost or it is not known."""
+        """Standard deviation of each joint angle [rad]; NaN where it is unknown or the hand is lost."""
         return self._spreads[0]
 
     @property
     def keypoint_spread(self) -> Float[np.ndarray, "21"]:
-        """Standard deviation of each keypoint in each direction [m]; NaN as of the angles."""
+        """Standard deviation of each keypoint in each direction [m]; NaN as for the angles."""
         return self._spreads[1]
 
     @cached_property
@@ -270,7 +270,7 @@ class TrackedFrame:
     """Time of the frame [s]."""
     hands: tuple[TrackedHand, ...]
     labels: Int[np.ndarray, "N"]
-    """Marker of each point, counted through the hands in their order, then the bodies; -1 for none."""
+    """Index of each point's marker, counted through all hands in order, then all bodies; -1 for none."""
     confidence: Float[np.ndarray, "N"]
     """Confidence in each label, 0 to 1."""
     bodies: tuple[TrackedBody, ...] = ()

@@ -1,7 +1,7 @@
-"""A search for a better layout near a given one: markers are moved, added and dropped, one at a time.
+"""A search for a better layout near a given one: markers are moved, added and dropped one at a time.
 
-Layouts are compared by labels of the same hands with the same losses (`judge`). At the end the old and the
-new one are tried in captures that the search did not see.
+Layouts are compared by labels of the same hands with the same occlusions (`judge`). At the end the old and
+the new one are tried in captures that the search did not use.
 """
 
 from __future__ import annotations
@@ -52,52 +52,52 @@ from train.labelers.protocol import labeling_threads
 from train.simulation.training_frames import GenerateSettings, sample_hands, sample_single_hand
 
 _PEOPLE, _POSES_EACH = 40, 40
-_JOINT_POSES: Final = 6  # poses of a person from which the joints' spread is taken
+_JOINT_POSES: Final = 6  # poses per person for the spread of the joints
 _TABLES: Final = ("points", "normals", "bone_indices", "bone_weights")
-_CANDIDATES: Final = 10  # places that are tried at once
-_LOCAL: Final = 6  # of them near the marker's own
-_ADDED: Final = 24  # places that are tried for a new marker
+_CANDIDATES: Final = 10  # places tried at once
+_LOCAL: Final = 6  # of these, places near the marker's own
+_ADDED: Final = 24  # tried places of a new marker
 _STEP: Final = (0.15, float(np.deg2rad(20.0)), 0.1)  # standard deviations: along, around, across
-_GRID: Final = (0.05, float(np.deg2rad(15.0)), 0.05)  # of places that a person finds with a ruler
-_CLEAR: Final = 0.006  # between two markers' surfaces on the flat hand [m]
-_CREASE: Final = 0.005  # from a joint, within which the skin folds and stretches [m]
-_TIP: Final = 0.9  # of the last bone: beyond it is the nail's edge
-_ON_BACK: Final = 3  # markers on the palm's bone, from which its pose is known
-_PALM_SURE: Final = float(np.deg2rad(2.0))  # spread of the palm's pose that is enough [rad]
-_PALM_ALONG, _PALM_ACROSS = (-0.1, 0.95), 0.36  # places along and across the palm [bone lengths]
-_FINGER_ALONG, _TIP_ALONG = (0.1, 1.05), (0.1, 0.9)  # places along a finger's bone and its last bone
-_PALM_SHARE: Final = 5.0  # places on the palm for each one on a finger's bone
-_AROUND: Final = 35.0  # standard deviation of the angle about a finger's bone [deg]
-_MAX_AROUND: Final = 100.0  # greatest such angle [deg]
-_APART: Final = 0.0025  # between two random places [m]
-_MISSED: Final = 500  # draws in a row without a free place
-_PADS: Final = float(np.deg2rad(80.0))  # beyond this angle a finger's marker touches what is held
-_GAIN: Final = 0.05  # least gain of a better layout [points]
-_TRIES: Final = 20  # draws of a place
+_GRID: Final = (0.05, float(np.deg2rad(15.0)), 0.05)  # rounding of places: along, around, across
+_CLEAR: Final = 0.006  # [m] least gap between two markers' surfaces on the flat hand
+_CREASE: Final = 0.005  # [m] distance from a joint within which the skin folds and stretches
+_TIP: Final = 0.9  # [bone lengths] limit of places on a last bone; beyond is the nail's edge
+_ON_BACK: Final = 3  # The palm's bone keeps this many markers, which determine its pose.
+_PALM_SURE: Final = float(np.deg2rad(2.0))  # [rad] spread of the palm's pose that suffices
+_PALM_ALONG, _PALM_ACROSS = (-0.1, 0.95), 0.36  # [bone lengths] along and across the palm
+_FINGER_ALONG, _TIP_ALONG = (0.1, 1.05), (0.1, 0.9)  # [bone lengths] along a bone, a last bone
+_PALM_SHARE: Final = 5.0  # random places on the palm for each one on a finger's bone
+_AROUND: Final = 35.0  # [deg] standard deviation about a finger's bone
+_MAX_AROUND: Final = 100.0  # [deg] largest angle about a finger's bone
+_APART: Final = 0.0025  # [m] least distance between two random places
+_MISSED: Final = 500  # draws in a row without a free place, after which sampling ends
+_PADS: Final = float(np.deg2rad(80.0))  # [rad] Beyond this angle a finger's marker touches what is held.
+_GAIN: Final = 0.05  # A better layout costs less by at least this much.
+_TRIES: Final = 20  # attempts to draw a place
 _TESTED: Final = 240  # frames whose labels are counted
-_GHOSTS: Final = 2  # most ghosts in a frame
-_OF_JOINTS: Final = 3.0  # percent of the slots that a degree of the joints counts for
-_FEWER: Final = 3  # markers by which smaller layouts are compared with an improved one
-_SAME_SLOTS: Final = 0.002  # by which the slots of two layouts differ by chance
+_GHOSTS: Final = 2  # largest number of ghosts in a frame
+_OF_JOINTS: Final = 3.0  # cost of one degree of joint spread, in percent of slots
+_FEWER: Final = 3  # Smaller layouts with up to this many markers fewer are compared, too.
+_SAME_SLOTS: Final = 0.002  # difference in share of right slots that may be chance
 
 
 class Worth(NamedTuple):
     """How good a layout is."""
 
     slots: float
-    """Share of slots that are right, as a rig sees them and with ghosts."""
+    """Share of right slots, as a rig sees them and with ghosts."""
     joints: float
     """Root mean square spread of the joints [rad]."""
     by_marker: Float[np.ndarray, "M"]
-    """Share of each marker's slots that are right."""
+    """Share of right slots of each marker."""
 
     @property
     def cost(self) -> float:
-        """What a better layout has less of: wrong slots [%] and, weighted, the spread of the joints [deg]."""
+        """Cost to be minimized: wrong slots [%] and, weighted, the spread of the joints [deg]."""
         return 100.0 * (1.0 - self.slots) + _OF_JOINTS * float(np.rad2deg(self.joints))
 
     def __str__(self) -> str:
-        """Both shares in words."""
+        """Share of right slots and spread of the joints in words."""
         return (
             f"{100.0 * self.slots:.1f} % of the slots right with losses and ghosts, joints to "
             f"{np.rad2deg(self.joints):.1f} deg"
@@ -110,17 +110,17 @@ class ImprovedGlove:
 
     start: MarkerLayout
     layout: MarkerLayout
-    """The better one."""
+    """The improved layout."""
     before: Worth
     after: Worth
     fewer: Sequence[tuple[int, Worth]]
-    """How good it is without its least useful markers: how many are left, and its worth."""
+    """Worth without the least useful markers: number of markers left, and worth."""
     trials: Mapping[str, Mapping[str, Trial]]
-    """What became of captures `before` and `after`, by kind of work; empty where none was tried."""
+    """Results on captures, `before` and `after`, by kind of work; empty if none was tried."""
 
     @property
     def verdict(self) -> str | None:
-        """Whether it did better in captures, in a sentence; None where none was tried."""
+        """One sentence on whether captures went better; None if none was tried."""
         return verdict(self.trials["before"], self.trials["after"]) if self.trials else None
 
 
@@ -135,16 +135,16 @@ def improve_glove(
     """Look for a better layout near a given one, as `handsim glove improve` does.
 
     Args:
-        glove: Marker layout to begin with, or its shipped name or the path of its .toml file.
-        settings: How to search.
+        glove: Marker layout to start from, or its shipped name or the path of its .toml file.
+        settings: Settings of the search.
         name: Name of the new layout.
         on_step: Called with the name of each step.
         options: Fields of `settings`, by name: `keep=("ThumbTip",)`, `minutes=10` [min].
 
     Raises:
         ArgumentError: A setting is unknown or refused.
-        LayoutError, RigError: The glove or the rig is unknown, a marker misses the skin of somebody, or a
-            name to keep is none of the layout's.
+        LayoutError, RigError: The glove or the rig is unknown, a marker is off the skin of a hand, or a name
+            to keep is not in the layout.
     """
     chosen = ImproveGloveSettings.of(settings, options)
     layout, rig = load_layout(glove), load_rig(chosen.rig)
@@ -173,7 +173,7 @@ def improve_glove(
 
 
 def verdict(before: Mapping[str, Trial], after: Mapping[str, Trial]) -> str:
-    """Whether a layout did better in captures than another one, in a sentence."""
+    """One sentence on whether a layout did better in captures than another one."""
     slots, joints = (
         [float(np.mean([measure(one) for one in trials.values()])) for trials in (before, after)]
         for measure in (lambda one: float(one.right.mean()), lambda one: one.joint_error)
@@ -188,18 +188,18 @@ def verdict(before: Mapping[str, Trial], after: Mapping[str, Trial]) -> str:
 
 
 class Columns(NamedTuple):
-    """Places, and where they are on everybody; a layout is some columns in order."""
+    """Places and their positions on all simulated hands; a layout is a sequence of columns."""
 
     places: tuple[MarkerPlace, ...]
     positions: Float[np.ndarray, "T P 3"]
-    """[m], around the mean of the wrist."""
+    """[m], relative to the mean of the wrist."""
     seen: Bool[np.ndarray, "T P"]
-    """By two cameras or more."""
+    """Whether two or more cameras see each place."""
     worn: tuple[dict[str, NDArray[Any]], ...]
-    """The tables of each person's `gloves.fit.Attachment`."""
+    """Tables of each person's `gloves.fit.Attachment`."""
 
     def chosen(self, columns: Sequence[int] | Int[np.ndarray, "Q"]) -> Columns:
-        """Some columns in this order."""
+        """Select columns in this order."""
         rows = np.asarray(columns)
         return Columns(
             tuple(self.places[column] for column in rows),
@@ -209,13 +209,13 @@ class Columns(NamedTuple):
         )
 
     def renamed(self, number: int, name: str) -> Columns:
-        """The same columns, one with another name."""
+        """The same columns with one renamed."""
         places = list(self.places)
         places[number] = dataclasses.replace(places[number], name=name)
         return self._replace(places=tuple(places))
 
     def joined(self, other: Columns) -> Columns:
-        """These columns, then others of the same people."""
+        """Append other columns of the same people."""
         return Columns(
             (*self.places, *other.places),
             np.concatenate([self.positions, other.positions], axis=1),
@@ -228,7 +228,7 @@ class Columns(NamedTuple):
 
 
 class WornPlaces:
-    """Places on the skin of right hands of random people in random poses before a rig."""
+    """Places on the skin of the right hands of random people in random poses, seen by a rig."""
 
     def __init__(
         self, num_people: int, poses_each: int, radius: float, rig: CameraRig, *, rng: np.random.Generator
@@ -243,7 +243,7 @@ class WornPlaces:
             self._people.append((model, qpos, model.forward_kinematics(qpos)))
 
     def put_on(self, places: Sequence[MarkerPlace]) -> Columns:
-        """Put markers on everybody, each slipped a little; refuses a place that misses somebody's skin."""
+        """Attach markers to all hands, each slipped a little; raises a `LayoutError` off a hand's skin."""
         glove, (along, around) = layout_of(places, self._radius), self._slip
         positions, seen, worn = [], [], []
         for model, qpos, bones in self._people:
@@ -259,7 +259,7 @@ class WornPlaces:
         return columns.chosen(range(len(places)))
 
     def joint_spreads(self, columns: Columns) -> Float[np.ndarray, "20"]:
-        """`layout_spreads` of a layout of five places or more [rad]."""
+        """`layout_spreads` of a layout of at least five places [rad]."""
         poses_each = len(self._people[0][1])
         step = max(1, poses_each // _JOINT_POSES)
         parts = []
@@ -271,9 +271,9 @@ class WornPlaces:
 
 
 def judge(people: WornPlaces, layout: Columns, *, seed: int) -> Worth:
-    """Label a layout with the network for any layout, without verification by a pose, and count.
+    """Label a layout with the network for any layout, without verification by a pose, and count errors.
 
-    Layouts that are compared need the same seed, of losses and ghosts.
+    Layouts can be compared only with the same seed of occlusions and ghosts.
     """
     network = shipped_network()
     features = mean_features(layout.positions, network.config)[None]
@@ -281,7 +281,7 @@ def judge(people: WornPlaces, layout: Columns, *, seed: int) -> Worth:
     step = max(1, len(layout.positions) // _TESTED)
     points = layout.positions[::step] - layout.positions[::step].mean(axis=1, keepdims=True)
     observed = np.where(layout.seen[::step, :, None], points, np.nan)
-    half = len(layout.places) // 8  # the rig loses few; half of the paper's recipe on top
+    half = len(layout.places) // 8  # The rig loses few: add half of the paper's occlusions.
     cloud = corrupt(observed, Corruption(occlude=half, ghosts=_GHOSTS), rng=rng)
     with torch.inference_mode(), labeling_threads():
         scores = network(
@@ -301,7 +301,7 @@ def judge(people: WornPlaces, layout: Columns, *, seed: int) -> Worth:
 
 
 class Improvement:
-    """A layout that gets better step by step; markers whose names are to be kept stay where they are."""
+    """A layout that is improved step by step; markers named in `keep` do not move."""
 
     def __init__(
         self, layout: MarkerLayout, rig: CameraRig, keep: Collection[str], *, rng: np.random.Generator
@@ -318,22 +318,22 @@ class Improvement:
         self._seed = int(rng.integers(2**31))
         self._columns = self._people.put_on(layout.markers)
         self.worth = self._judge(self._columns)
-        """How good the layout so far is."""
+        """Worth of the current layout."""
 
     @property
     def layout(self) -> MarkerLayout:
-        """The layout so far."""
+        """The current layout."""
         return dataclasses.replace(self._start, markers=self._columns.places)
 
     def resize(self, num_markers: int) -> None:
-        """Add the best of some places, or drop the least useful marker, until there are so many."""
+        """Add the best of some places, or drop the least useful marker, until the number is right."""
         while len(self._columns.places) < num_markers:
             self._take(self._grown())
         while len(self._columns.places) > num_markers:
             self._take(self._shrunk())
 
     def search(self, seconds: float, told: Callable[[Worth], None]) -> None:
-        """Move markers while time lasts."""
+        """Move one marker at a time until the time is over."""
         places, until = self._columns.places, time.monotonic() + seconds
         free = [number for number, place in enumerate(places) if place.name not in self._keep]
         while free and time.monotonic() < until:
@@ -344,7 +344,7 @@ class Improvement:
             told(self.worth)
 
     def smaller(self, fewest: int) -> list[tuple[int, Worth]]:
-        """How good the layout is without its least useful markers, one after the other; it stays as it is."""
+        """Worth without the least useful markers, dropped one by one; the layout itself is unchanged."""
         kept, found = (self.worth, self._columns), []
         while len(self._columns.places) > fewest:
             self._take(self._shrunk())
@@ -356,7 +356,7 @@ class Improvement:
         return judge(self._people, columns, seed=self._seed)
 
     def _take(self, layouts: Sequence[Columns]) -> None:
-        """Go on with the best of some layouts."""
+        """Continue with the best of some layouts."""
         worth, columns = self._best(layouts)
         if columns is None:
             raise LayoutError("no place for another marker was found, expected a hand with free skin")
@@ -370,7 +370,7 @@ class Improvement:
         return [layout for layout in layouts if self.is_wearable(layout.places)]
 
     def is_wearable(self, places: Sequence[MarkerPlace]) -> bool:
-        """Whether markers may replace those so far: digits keep one, no bone is crowded, the palm known."""
+        """Whether places may replace the current ones: digits kept, bones not crowded, palm determined."""
         now, palm = self._columns.places, BONE_NAMES[PALM]
         bones, before = (Counter(place.bone for place in some) for some in (places, now))
         crowded = any(count > max(1, before[bone]) for bone, count in bones.items() if bone != palm)
@@ -380,33 +380,33 @@ class Improvement:
         return bones[palm] >= min(_ON_BACK, before[palm]) and palm_spread(places, self._model) <= least
 
     def _shrunk(self) -> list[Columns]:
-        """The layout without each of its markers."""
+        """The layout with one marker dropped, for each marker."""
         places = self._columns.places
         free = [number for number, place in enumerate(places) if place.name not in self._keep]
         if not free:
             raise LayoutError(f"all {len(places)} markers are to be kept, expected fewer than are left")
         everything = range(len(places))
         fewer = [self._columns.chosen([one for one in everything if one != number]) for number in free]
-        return self._wearable(fewer) or fewer  # where there are too few for all digits and the palm
+        return self._wearable(fewer) or fewer  # with too few markers no layout is wearable
 
     def _grown(self) -> list[Columns]:
-        """The layout with another marker at some places."""
+        """The layout with a marker added, for some places."""
         count = len(self._columns.places)
         added = self._changed(count, self._anywhere(_ADDED, self._columns.places))
         return self._wearable(added) or added
 
     def _moved(self, number: int) -> list[Columns]:
-        """The layout with one marker at some other places."""
+        """The layout with one marker moved to some other places."""
         places = self._columns.places
         others = places[:number] + places[number + 1 :]
         near = [place for _ in range(_LOCAL) for place in self._near(places[number], others)]
         return self._wearable(self._changed(number, [*near, *self._anywhere(_CANDIDATES - _LOCAL, others)]))
 
     def _changed(self, number: int, places: Sequence[MarkerPlace]) -> list[Columns]:
-        """The layout with each of some places as its marker of this number, which may be a new one."""
+        """The layout with marker `number`, perhaps a new one, at each of some places."""
         try:
             fresh = self._people.put_on(places) if places else None
-        except LayoutError:  # it misses the skin of somebody's hand
+        except LayoutError:  # off the skin of some hand
             fresh = None
         if fresh is None:
             return []
@@ -419,7 +419,7 @@ class Improvement:
         return changed
 
     def _near(self, place: MarkerPlace, others: Sequence[MarkerPlace]) -> Iterator[MarkerPlace]:
-        """A place near another one, if one is found."""
+        """Yield a free place near another one, unless none is found."""
         for _ in range(_TRIES):
             along, around, across = self._rng.standard_normal(3) * _STEP
             palm = place.bone == BONE_NAMES[PALM]
@@ -436,7 +436,7 @@ class Improvement:
                 return
 
     def _on_grid(self, place: MarkerPlace) -> MarkerPlace | None:
-        """The nearest place that a ruler finds, on the back or a side and off the creases; None without."""
+        """The nearest place on the grid; None if it is on a crease, on the inside or off the bone."""
         bone = BONE_NAMES.index(place.bone)
         low, high = _PALM_ALONG
         if bone != PALM:
@@ -450,7 +450,7 @@ class Improvement:
         return dataclasses.replace(place, along=along, around=around, across=across) if fits else None
 
     def _anywhere(self, count: int, others: Sequence[MarkerPlace]) -> list[MarkerPlace]:
-        """Places anywhere on the back and the sides of the hand, clear of the creases and other markers."""
+        """Random places on the back and sides of the hand, away from creases and other markers."""
         found: list[MarkerPlace] = []
         for place in map(self._on_grid, sample_places(_TRIES + 4 * count, rng=self._rng)):
             if place is not None and len(found) < count and self._is_clear(place, others):
@@ -458,7 +458,7 @@ class Improvement:
         return found
 
     def _is_clear(self, place: MarkerPlace, others: Sequence[MarkerPlace]) -> bool:
-        """Whether a place is on the skin and not too near to the other markers of the flat hand."""
+        """Whether a place is on the skin and away from the other markers of the flat hand."""
         try:
             points = attach_markers(layout_of((*others, place), self._start.radius), self._model).points
         except LayoutError:
@@ -467,7 +467,7 @@ class Improvement:
         return bool(apart > 2.0 * self._start.radius + _CLEAR)
 
     def _new_name(self, bone: str) -> str:
-        """A name for a marker on a bone, as IndexMiddle2."""
+        """A new name for a marker on a bone, such as IndexMiddle2."""
         stem = "".join(word.capitalize() for word in bone.split("_"))
         taken = {place.name for place in self._columns.places}
         return next(name for number in range(1, 100) if (name := f"{stem}{number}") not in taken)
@@ -476,7 +476,7 @@ class Improvement:
 def sample_places(
     num_places: int, *, rng: np.random.Generator, apart: float = _APART
 ) -> tuple[MarkerPlace, ...]:
-    """Random places on the back and the sides of the flat hand; fewer if no more fit."""
+    """Random places on the back and sides of the flat hand; fewer if no more fit."""
     model = HandModel.named("M")
     share = np.where(np.arange(len(BONE_NAMES)) == PALM, _PALM_SHARE, 1.0)
     places: list[MarkerPlace] = []

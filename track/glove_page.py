@@ -1,4 +1,4 @@
-"""The page of a layout's score: advice, figures, the hand with confusions, and its joints."""
+"""The report page of a layout's score: advice, labels with confusions, markers and joints."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ from train.reports.hand_plot import HAND_CAPTION, FlatHand, flat_hand, hand_pict
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_MOST: Final = 15.0  # end of the colors' scale [deg]
+_MOST: Final = 15.0  # end of the color scale [deg]
 _TRIALS: Final = (
-    "Short captures of several people, simulated, then labeled and tracked as `handsim label` and "
-    "`handsim track` do, the size of the hands measured and nothing calibrated: slots and whole frames that "
-    "are right. Joints: root mean square error of all, of uncalibrated hands; the section on joints is about "
+    "Shares of right slots and of completely right frames in short simulated captures of several people, "
+    "labeled and tracked as by `handsim label` and `handsim track`, with measured but uncalibrated hands. "
+    "Joints: root mean square error over all joints, of uncalibrated hands; the section on joints is on "
     "calibrated ones."
 )
-_PAIRS: Final = 5  # pairs of near markers that are listed
+_PAIRS: Final = 5  # number of listed pairs of close markers
 
 
 def write_glove_page(path: Path, score: LayoutScore) -> None:
     """Write the page on a layout's score."""
-    layout, nothing = score.layout, "Nothing stands out: no marker is in anybody's way."
+    layout, nothing = score.layout, "No figure is beyond its threshold."
     sections = [
         Section("What to do", html_list(score.advice) if score.advice else nothing),
         *([Section("Captures", _TRIALS, table=trial_rows(score.trials, layout))] if score.trials else []),
@@ -52,7 +52,7 @@ def write_glove_page(path: Path, score: LayoutScore) -> None:
 
 
 def trial_rows(trials: Mapping[str, Trial], layout: MarkerLayout) -> list[list[str]]:
-    """What became of simulated captures of each kind of work, the header first."""
+    """Table of the simulated captures of each kind of work, header first."""
     rows = [
         ["work", "label: slots, frames [%]", "track: slots, frames [%]", "worst marker", "joints [deg]",
          "size off [mm]"]
@@ -72,7 +72,7 @@ def _labels_section(score: LayoutScore) -> Section:
         for title, name in (("slots right", "slot_accuracy"), ("whole frames right", "frame_accuracy"))
     ]
     accuracy, arrows = score.observed.slot_accuracy_by_marker, mistakes(score.observed.confusion)
-    caption = f"{HAND_CAPTION}Arrows lead from what points are to what they are called, wider the more often."
+    caption = f"{HAND_CAPTION}Arrows lead from true to given labels, wider for more points."
     text = f"Left and right are told apart in {percent(score.sides_right)} % of the frames."
     drawn = hand_picture(score.layout, accuracy, arrows)
     return Section("Labels", text, table=table, pictures=[(drawn, caption)])
@@ -89,8 +89,8 @@ def _markers_section(score: LayoutScore) -> Section:
         shares = percent(score.seen[number]), percent(accuracy[number])
         table.append([name, *shares, *taken, f"{lost[number]:.1f}"])
     text = (
-        "Seen: the marker becomes a point. Joints lose: by how much the worst-hit joint is known less well "
-        "without it."
+        "Seen: share of frames in which the marker has a point. Joints lose: largest increase of a joint's "
+        "standard deviation without the marker."
     )
     near = np.triu(score.near)
     order = np.argsort(-near, axis=None, kind="stable")[:_PAIRS]
@@ -112,16 +112,16 @@ def _joints_section(score: LayoutScore) -> Section:
     rows = zip(DIGITS, degrees.reshape(len(DIGITS), -1), strict=True)
     table += [[digit, *(f"{one:.1f}" for one in row)] for digit, row in rows]
     text = (
-        "Standard deviation of each joint's angle, from the information that the markers give the solver "
-        f"frame by frame where they lie within {1e3 * NOISE:g} mm of a calibrated hand's, and from the "
-        "limits of the joints. Tracking knows more: what the hand did before, and what hands usually do."
+        "Standard deviation of each joint angle in single frames, from markers within "
+        f"{1e3 * NOISE:g} mm of a calibrated hand's and from the limits of the joints. Tracking does "
+        "better, by the hand's motion and the prior of joint angles."
     )
     drawn = picture((8.4, 6.4), _draw_joints, flat_hand(score.layout), degrees)
     return Section("Joints", text, table=table, pictures=[(drawn, caption)])
 
 
 def _draw_joints(figure: Figure, hand: FlatHand, degrees: Float[np.ndarray, "20"]) -> None:
-    """Draw a disk at each bone's near end, with the standard deviation of the worst joint there."""
+    """Draw a disk at each bone's proximal end, colored by the worst joint's standard deviation."""
     panel = figure.subplots()
     panel.set_axis_off()
     panel.set_aspect("equal")

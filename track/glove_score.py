@@ -1,7 +1,7 @@
-"""The score of a marker layout before anybody wears it: labels, joints, simulated captures, and advice.
+"""The score of a marker layout from simulation: labels, joints, simulated captures, and advice.
 
-Captures are short: simulated people in the glove, labeled and tracked as users' are. Nothing is calibrated:
-the size of the hands is measured in each capture, as `handsim label` and `handsim track` do.
+Captures are short: simulated people wear the glove, and are labeled and tracked like users. Nothing is
+calibrated: hands are measured in each capture, as `handsim label` and `handsim track` do.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ from train.simulation.takes import simulate_take
 
 METHODS: Final = ("label", "track")
 CAPTURES: Final = 3
-"""Captures of each kind of work; those of one number have the same people and motions for every layout."""
+"""Captures of each kind of work. Equal numbers mean equal people and motions for every layout."""
 FRAMES: Final = 240
 """Frames of a capture: two seconds."""
 WORK: Final[Mapping[str, tuple[SimulatedKind, tuple[Side, ...]]]] = {
@@ -54,54 +54,54 @@ WORK: Final[Mapping[str, tuple[SimulatedKind, tuple[Side, ...]]]] = {
 }
 """What hands do in captures."""
 NOISE: Final = 0.0015
-"""Standard deviation of a marker around a calibrated hand's [m]: optics, and the skin that moves."""
-_TWIN_FRAMES: Final = 600  # of each kind of capture that is simulated
-_NEAR: Final = 0.003  # distance between two markers' surfaces at which gloves and blobs touch [m]
+"""Standard deviation of markers around a calibrated hand [m], from optics and moving skin."""
+_TWIN_FRAMES: Final = 600  # frames of each simulated motion
+_NEAR: Final = 0.003  # [m] gap between two markers' surfaces at which gloves and blobs touch
 _SIDE_FRAMES: Final = 500
 _JOINT_FRAMES: Final = 600
-_FEWEST: Final = 4  # markers of a pose
-_FEWEST_OF_BODY: Final = 3  # markers of a rigid body
-_IN_LINE: Final = 1e-8  # least information of markers that are not in a line [m^2]
+_FEWEST: Final = 4  # A pose needs this many markers.
+_FEWEST_OF_BODY: Final = 3  # A rigid body needs this many markers.
+_IN_LINE: Final = 1e-8  # [m^2] Markers with less information about a rotation are in a line.
 
-# A layout with these figures gets a sentence.
-_UNINFORMED: Final = 0.6  # share of a joint's usual spread
-_UNCERTAIN: Final = np.deg2rad(5.0)  # spread of a joint
-_CONFUSED: Final = 0.02  # share of a marker's points that are taken for another's
+# Figures beyond these thresholds get a sentence of advice.
+_UNINFORMED: Final = 0.6  # ratio of a joint's spread to that of an unseen joint
+_UNCERTAIN: Final = np.deg2rad(5.0)  # [rad] spread of a joint
+_CONFUSED: Final = 0.02  # share of a marker's points that are labeled as another marker
 _HIDDEN: Final = 0.85  # share of frames in which a marker is seen
-_TOUCHING: Final = 0.02  # share of frames
-_WRONG: Final = 0.97  # share of frames in which a marker of a capture is right
-_SIDES: Final = 0.99  # share of frames whose side is right
-_DISPENSABLE: Final = np.deg2rad(0.3)  # largest growth of a joint's spread without a marker
-_MOST_OF_A_KIND: Final = 4  # sentences
+_TOUCHING: Final = 0.02  # share of frames in which two markers touch
+_WRONG: Final = 0.97  # share of frames in which a marker is labeled right in captures
+_SIDES: Final = 0.99  # share of frames in which the side is recognized
+_DISPENSABLE: Final = np.deg2rad(0.3)  # [rad] A marker is dispensable if no joint's spread grows more.
+_MOST_OF_A_KIND: Final = 4  # sentences of one kind
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trial:
-    """What became of the captures of one kind of work."""
+    """Results on the simulated captures of one kind of work."""
 
     slots: dict[str, Float[np.ndarray, "M"]]
-    """Share of the frames in which each marker's slot is right, by method: `label` and `track`."""
+    """Share of the frames in which each marker is labeled right, by method: `label` and `track`."""
     frames: dict[str, float]
     """Share of the frames without any error, by method."""
     joints: Float[np.ndarray, "20"]
-    """Root mean square error of each joint that `track` gives [rad]; NaN if no hand was found."""
+    """Root mean square error of each joint angle from `track` [rad]; NaN if no hand was found."""
     size_error: float
-    """Mean distance of the measured from the true length of the hands [m]."""
+    """Mean absolute error of the measured length of the hands [m]."""
 
     @property
     def right(self) -> Float[np.ndarray, "M"]:
-        """Share of each marker's slots that are right, the mean of both methods."""
+        """Share of each marker's slots that are right, averaged over both methods."""
         share: Float[np.ndarray, "M"] = np.mean([self.slots[name] for name in METHODS], axis=0)
         return share
 
     @property
     def worst(self) -> int:
-        """The marker with most wrong slots."""
+        """The marker with the most wrong slots."""
         return int(self.right.argmin())
 
     @property
     def joint_error(self) -> float:
-        """Root mean square error over the joints [deg]."""
+        """Root mean square error over all joints [deg]."""
         return float(np.rad2deg(np.sqrt(np.mean(self.joints**2))))
 
     def share(self, method: str) -> float:
@@ -111,13 +111,13 @@ class Trial:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LayoutScore:
-    """How well a layout can be labeled, and what it tells of each joint."""
+    """How well a layout can be labeled, and how well it determines each joint."""
 
     layout: MarkerLayout
     observed: LabelingReport
-    """Labels of the frames as the rig sees them, on average over both hands."""
+    """Labels of the frames as the rig sees them, averaged over both hands."""
     clean: LabelingReport
-    """Labels where every marker is seen."""
+    """Labels with every marker seen."""
     corrupted: LabelingReport
     """Labels with the drops and ghosts of the paper's recipe."""
     seen: Float[np.ndarray, "M"]
@@ -125,21 +125,21 @@ class LayoutScore:
     near: Float[np.ndarray, "M M"]
     """Share of the frames in which two markers touch or nearly do."""
     joints: Float[np.ndarray, "20"]
-    """Standard deviation that the markers leave of each joint of a calibrated hand [rad]."""
+    """Standard deviation of each joint of a calibrated hand, given the markers [rad]."""
     joints_without: Float[np.ndarray, "M 20"]
     """The same without each marker [rad]."""
     sides_right: float
-    """Share of the frames in which left and right are told apart by the labeled markers."""
+    """Share of the frames in which left and right are distinguished by the labeled markers."""
     trials: Mapping[str, Trial] = field(default_factory=dict)
-    """What became of simulated captures of each kind of work; empty where none was tried."""
+    """Results on simulated captures by kind of work; empty if none was tried."""
     is_trained: bool = False
     """Whether the labeler was trained on the layout; else it is the network for any layout."""
     seen_by: str = ""
-    """Whose motion was seen by which rig, in words."""
+    """Description of the motion and the rig."""
 
     @property
     def advice(self) -> tuple[str, ...]:
-        """What to move, add or drop, in sentences, the most important first."""
+        """Sentences on what to move, add or drop, the most important first."""
         kinds = (_captures, _confusions, _joints, _hidden, _touching, _sides, _dispensable)
         found: list[_Advice] = []
         for kind in kinds:
@@ -154,21 +154,21 @@ def score_glove(
     on_step: OnStep = no_step,
     **options: Any,
 ) -> LayoutScore:
-    """Score a layout as `handsim glove score` does; nothing is trained.
+    """Score a layout as `handsim glove score` does, with a given labeler or one learned in a minute.
 
     Args:
         glove: Marker layout, or its shipped name or the path of its .toml file.
-        settings: What hands do, before which rig.
+        settings: Motion and rig.
         on_step: Called with the name of each step.
         options: Fields of `settings`, by name: `rig="six"`.
 
     Returns:
-        Shares of labels that are right, standard deviations of joints [rad], what became of the captures, and
-        advice in sentences.
+        Shares of right labels, standard deviations of joints [rad], results on the captures, and advice in
+        sentences.
 
     Raises:
         ArgumentError: A setting is unknown or refused.
-        CaptureError: The take cannot be read, or its hands are never there together.
+        CaptureError: The take cannot be read, or its hands are never tracked together.
         LayoutError, RigError, WeightsError: The glove, the rig or the labeler is unknown.
     """
     chosen = ScoreGloveSettings.of(settings, options)
@@ -190,7 +190,7 @@ def score_glove(
 def _hands(
     settings: ScoreGloveSettings, layout: MarkerLayout, rig: CameraRig, rng: np.random.Generator
 ) -> tuple[list[ObservedHand], str]:
-    """Hands in the motion that was asked for, and its name."""
+    """Hands in the requested motion, and a description of it."""
     motion, frames = settings.motion, settings.num_frames
     if motion == POSES:
         return observe_poses(layout, rig, frames, rng=rng), "random people and poses"
@@ -207,7 +207,7 @@ def _hands(
 def score_layout(
     layout: MarkerLayout, hands: Sequence[ObservedHand], labeler: Labeler, *, rng: np.random.Generator
 ) -> LayoutScore:
-    """Label and count what a rig sees of gloved hands, with a labeler of this layout; no captures."""
+    """Label what a rig sees of gloved hands with a labeler of this layout; without captures."""
     observed = np.concatenate([hand.frames.observed for hand in hands])
     ghosts = np.concatenate([hand.frames.ghosts for hand in hands])
     markers = np.concatenate([hand.frames.markers for hand in hands])
@@ -232,7 +232,7 @@ def score_layout(
 
 
 def _some(hands: Sequence[ObservedHand], count: int) -> list[ObservedHand]:
-    """About so many frames, evenly chosen."""
+    """About `count` frames, evenly spaced."""
     step = max(1, sum(len(hand.qpos) for hand in hands) // count)
     return [
         ObservedHand(hand.fit, hand.qpos[::step], type(hand.frames)(*(part[::step] for part in hand.frames)))
@@ -241,7 +241,7 @@ def _some(hands: Sequence[ObservedHand], count: int) -> list[ObservedHand]:
 
 
 def _sides_right(layout: MarkerLayout, hands: Sequence[ObservedHand], rng: np.random.Generator) -> float:
-    """Share of the frames whose side is recognized from the markers that are seen, by the true labels."""
+    """Share of the frames whose side is recognized from the seen markers with their true labels."""
     classifier, right, count = SideClassifier(layout, rng=rng), 0, 0
     for hand in _some(hands, _SIDE_FRAMES):
         observed, side = hand.frames.observed, hand.fit.side
@@ -253,7 +253,7 @@ def _sides_right(layout: MarkerLayout, hands: Sequence[ObservedHand], rng: np.ra
 
 
 def joint_spreads(hands: Iterable[ObservedHand], *, without: int | None = None) -> Float[np.ndarray, "20"]:
-    """`layout_spreads` of observed hands, perhaps without a marker."""
+    """`layout_spreads` of observed hands, optionally without one marker."""
     parts = []
     for hand in hands:
         seen = np.isfinite(hand.frames.observed[..., 0])
@@ -266,11 +266,11 @@ def joint_spreads(hands: Iterable[ObservedHand], *, without: int | None = None) 
 def layout_spreads(
     poses: Iterable[tuple[GloveFit, Float[np.ndarray, "T 27"], Bool[np.ndarray, "T M"]]],
 ) -> Float[np.ndarray, "20"]:
-    """Standard deviation of each joint's error [rad], its root mean square over the frames.
+    """Standard deviation of each joint's error [rad], as root mean square over the frames.
 
-    It comes from the information of the markers that are seen, of hands in their gloves and poses, and from
-    the limits of the joints, as in the solver; frames with fewer than four markers tell nothing. What hands
-    usually do narrows that further when a hand is tracked.
+    It follows from the information of the seen markers and the limits of the joints, as in the solver. Frames
+    with fewer than four markers give no information. A tracked hand does better, thanks to its motion and the
+    pose prior.
     """
     squares, count = np.zeros(NUM_JOINTS), 0
     limits = np.diag(free_spreads() ** -2.0)
@@ -285,13 +285,13 @@ def layout_spreads(
 
 
 def free_spreads() -> Float[np.ndarray, "20"]:
-    """Standard deviation of each joint where nothing is seen: anywhere in its range [rad]."""
+    """Standard deviation of each joint without any marker: uniform in its range [rad]."""
     ranges = np.deg2rad([joint.high - joint.low for joint in JOINTS])
     return np.asarray(ranges / np.sqrt(12.0))
 
 
 def palm_spread(places: Sequence[MarkerPlace], model: HandModel) -> float:
-    """Standard deviation of the palm's rotation about its least certain axis, by its own markers [rad].
+    """Standard deviation of the palm's rotation about its least certain axis, from its own markers [rad].
 
     Infinite with fewer than three markers on the palm, or three in a line.
     """
@@ -306,7 +306,7 @@ def palm_spread(places: Sequence[MarkerPlace], model: HandModel) -> float:
 
 
 def layout_of(places: Sequence[MarkerPlace], radius: float) -> MarkerLayout:
-    """A layout of any places, numbered, the first repeated where they are fewer than a glove's markers."""
+    """A layout of any places, numbered; the first is repeated up to the least number of a glove's markers."""
     copies = (*places, *[places[0]] * (FEWEST_MARKERS - len(places)))
     named = [dataclasses.replace(place, name=str(number)) for number, place in enumerate(copies)]
     return MarkerLayout("places", tuple(named), radius)
@@ -322,9 +322,9 @@ def try_layout(
     frames: int = FRAMES,
     told: Callable[[str], None] = no_step,
 ) -> dict[str, Trial]:
-    """Label and track simulated captures, from number `first` on, of each kind of work that the glove is for.
+    """Label and track simulated captures, from number `first` + 1 on, of each kind of work the glove allows.
 
-    `told` is called before each capture with what it is.
+    `told` is called with a description before each capture.
     """
     found: dict[str, Trial] = {}
     for name in WORK if count else ():
@@ -376,20 +376,18 @@ def mean_trial(trials: Sequence[Trial]) -> Trial:
 
 
 def _root_mean(squares: Float[np.ndarray, "T 20"]) -> Float[np.ndarray, "20"]:
-    """Root mean of the squares that are known; NaN where none is."""
+    """Root mean square over the known values; NaN where none is known."""
     known = np.isfinite(squares)
     sums: Float[np.ndarray, "20"] = np.where(known, squares, 0.0).sum(axis=0)
     return np.sqrt(sums / np.where(known.any(axis=0), known.sum(axis=0), np.nan))
 
 
 def right_shares(truth: Take, take: Take) -> tuple[Float[np.ndarray, "M"], float]:
-    """Share of the frames in which each marker's slots are right, of hands that are there; and of frames."""
+    """Share of the frames in which each marker of the true hands is right, and share of right frames."""
     markers = truth.hands[0].layout.num_markers
     names = truth.label_names
     of_hands = [names.index(name) if name in names else -1 for name in take.label_names]
-    others = (
-        len(truth.hands) * markers
-    )  # labels from this number on are of hands that the truth does not have
+    others = len(truth.hands) * markers  # stands for all labels of hands that the truth does not have
     known = np.array([number if 0 <= number < others else others for number in of_hands] + [-1])
     counts, right = LabelCounts(), np.zeros(others)
     for points, true, given in zip(truth.points, truth.labels, take.labels, strict=True):
@@ -401,11 +399,11 @@ def right_shares(truth: Take, take: Take) -> tuple[Float[np.ndarray, "M"], float
 
 
 _Advice = tuple[float, str]
-"""The share of points, frames or joints that a sentence is about, and the sentence."""
+"""Weight of a sentence (the share of points, frames or joints that it concerns), and the sentence."""
 
 
 def _captures(score: LayoutScore) -> Iterator[_Advice]:
-    """The worst marker of the captures that were tried."""
+    """Advice on the worst marker of the simulated captures."""
     for work, trial in score.trials.items():
         shares = {method: float(trial.slots[method][trial.worst]) for method in METHODS}
         if min(shares.values()) < _WRONG:
@@ -467,7 +465,7 @@ def _hidden(score: LayoutScore) -> Iterator[_Advice]:
 
 
 def _touching(score: LayoutScore) -> Iterator[_Advice]:
-    """Pairs on one digit; tips of two meet because fingers do, and moving them does not help."""
+    """Advice on touching pairs of one digit; tips of two digits touch whatever the layout."""
     names, digits = score.layout.names, [digit_of(marker) for marker in score.layout.markers]
     for first, second in zip(*np.nonzero(np.triu(score.near) > _TOUCHING), strict=True):
         share = float(score.near[first, second])

@@ -1,9 +1,9 @@
-"""The size and proportions of a user's hands in some frames, and whether hands fit these frames at all.
+"""Size and proportions of a user's hands from some frames, and a check whether hands fit these frames.
 
-Length and breadth of hands of mean proportions are searched first; then the proportions and the positions of
-the markers follow as far as the frames tell. `calibrate` finds the rest from a longer capture. Where hands
-fit badly, those of other gloves, sides and scales are measured in the same frames; the likeliest are named if
-they are clearly likelier.
+Length and breadth of hands of mean proportions are searched first; then proportions and marker positions are
+fitted as far as the frames determine them. `calibrate` fits the rest on a longer capture. Where hands fit
+badly, other gloves, sides and scales are measured in the same frames, and the likeliest of them is suggested
+if it is clearly likelier.
 """
 
 from __future__ import annotations
@@ -40,77 +40,74 @@ from track.user import MEASURED, User, designed_glove
 from train.labelers.protocol import Labeler, Labeling
 from train.labelers.storage import labeler_at_once
 
-_LENGTHS: Final = (0.187, 0.205, 0.168, 0.150)  # [m] hands to find the labels with, the likeliest first
-_SHORTEST, _LONGEST = (
-    0.125,
-    0.225,
-)  # hand lengths that are tried [m]: 0.6 of an adult's to beyond ANSUR II's longest
-_BREADTHS: Final = (0.88, 1.12)  # from the usual breadth of a length; three standard deviations
-_FAR: Final = 0.012  # [m] change of length after which the hands are labeled again
-_PRECISION: Final = 0.001  # [m] of length
-_GOLDEN: Final = 0.5 * (3.0 - math.sqrt(5.0))  # share of an interval at which a search goes on
-_ROUNDING: Final = math.sqrt(2.2e-16)  # below which two arguments in a search are one
-_USUAL_LENGTH, _LENGTH_SPREAD = 0.187, 0.012  # [m] of adults, women and men, ANSUR II
-_BREADTH_SPREAD: Final = 0.04  # from the usual breadth of a length
-_MARKER_SPREAD: Final = 0.002  # [m] per axis of glued markers around their places
-_INDEPENDENT: Final = 4.0  # frames' worth of evidence: what glue and flesh do repeats from frame to frame
-_FRAMES: Final = 8  # of each hand with which length and breadth are searched
-_PROPORTION_FRAMES: Final = 40  # of each hand that its proportions are fitted to
-_MOST_FRAMES: Final = 0.5  # share of the frames in which measured hands must be found
-_SOME_FRAMES: Final = 0.1  # the same of hands that fit well; hands that touch seldom begin a track
-_FITS_WELL: Final = 0.00175  # [m] median RMS distance; where points that are no hand's are found, it is more
-_FEWEST: Final = 3  # fewest frames from which a size is trusted
-_MISSING: Final = 0.2  # largest share of missing markers in a frame that shows a hand
+_LENGTHS: Final = (0.187, 0.205, 0.168, 0.150)  # [m] lengths for the first labels, the likeliest first
+_SHORTEST, _LONGEST = 0.125, 0.225  # [m] hand lengths: 0.6 of an adult's to beyond ANSUR II's longest
+_BREADTHS: Final = (0.88, 1.12)  # breadth over the usual one of a length: three standard deviations
+_FAR: Final = 0.012  # [m] Hands are labeled again after a larger change of length.
+_PRECISION: Final = 0.001  # [m] precision of length and breadth
+_GOLDEN: Final = 0.5 * (3.0 - math.sqrt(5.0))  # golden section: where an interval is divided
+_ROUNDING: Final = math.sqrt(2.2e-16)  # relative rounding error of an argument in the search
+_USUAL_LENGTH, _LENGTH_SPREAD = 0.187, 0.012  # [m] mean and deviation of adults, ANSUR II
+_BREADTH_SPREAD: Final = 0.04  # standard deviation of the breadth over the usual one of a length
+_MARKER_SPREAD: Final = 0.002  # [m] standard deviation of glued markers per axis
+_INDEPENDENT: Final = 4.0  # All frames count as this many: errors of glue and flesh repeat.
+_FRAMES: Final = 8  # frames of each hand in the search of length and breadth
+_PROPORTION_FRAMES: Final = 40  # frames of each hand in the fit of proportions
+_MOST_FRAMES: Final = 0.5  # Measured hands must be found in this share of the frames.
+_SOME_FRAMES: Final = 0.1  # The same for hands that fit well: touching hands are seldom initialized.
+_FITS_WELL: Final = 0.00175  # [m] median RMS distance of hands that fit well; false hands have a larger one
+_FEWEST: Final = 3  # A size needs this many frames.
+_MISSING: Final = 0.2  # A frame shows a hand if at most this share of its markers is missing.
 _FITTED: Final = (Status.TRACKED, Status.INITIALIZED)
-_PATIENCE: Final = 20  # frames with enough points for a hand, but none, after which another size is tried
-_WINDOWS: Final = 8  # parts of a capture that are looked at
-_WINDOW: Final = 16  # frames of each
-_FIT_NOISE: Final = 0.003  # [m] twice that of real gloves: flesh repeats in frames that are much alike
-_SURE: Final = 2.0  # standard deviations within which the length is with 95 %
+_PATIENCE: Final = 20  # frames with enough points but no hand, after which another size is tried
+_WINDOWS: Final = 8  # parts of a capture that are used
+_WINDOW: Final = 16  # frames of each part
+_FIT_NOISE: Final = 0.003  # [m] twice that of real gloves, as errors of flesh repeat in similar frames
+_SURE: Final = 2.0  # standard deviations of a 95 % interval
 _USUAL: Final = TrackerConfig()
-_LENIENT: Final = TrackerConfig(least_evidence=2.0)  # for hands of few markers, before they are measured
+_LENIENT: Final = TrackerConfig(least_evidence=2.0)  # for hands of few markers before they are measured
 _ROBUST_SCALE: Final = 0.015  # [m]
 _FIT_STEPS: Final = 15
-_SMALL_GAIN, _RELINEARIZE = 1e-3, 0.05  # ten times a calibration's: a size has 0.2 mm to spare
-_PART: Final = 30  # frames of each of two parts in which hands are compared
-_LEAST_FRAMES: Final = 10  # frames below which hands are not compared
-_NEAR: Final = 0.04  # [m] from a hand's points, where a point without a label counts against it
-_PENALTY: Final = 3.0  # log-odds of such a point, and of a marker that is not seen
-_FOUND: Final = 0.6  # share of the frames in which hands are found that fit
-_MOST_MISSING, _MOST_NEAR = 0.15, 0.2  # of the markers: missing ones, and points nearby, of hands that fit
-_MOST_HIDDEN: Final = 0.35  # the same for missing markers of a hand whose markers are all seen at times
-_FEW_NEAR: Final = 2.5  # points near a hand that may be ghosts
-_MOST_RMS: Final = 0.004  # [m] median RMS distance of hands that fit
-_LEAST_FOUND: Final = 0.5  # share of the frames in which suggested hands are found, at least
-_BETTER: Final = 1.15  # factor of our log-odds from which on another glove is suggested
+_SMALL_GAIN, _RELINEARIZE = 1e-3, 0.05  # ten times a calibration's: a size may be off by 0.2 mm
+_PART: Final = 30  # Hands are compared in two parts of this many frames.
+_LEAST_FRAMES: Final = 10  # Hands are not compared in fewer frames.
+_NEAR: Final = 0.04  # [m] distance from a hand's markers within which an unlabeled point counts against it
+_PENALTY: Final = 3.0  # log-odds lost for such a point, and for a missing marker
+_FOUND: Final = 0.6  # share of the frames in which a good fit finds hands
+_MOST_MISSING, _MOST_NEAR = 0.15, 0.2  # missing markers and nearby points of a good fit, per marker
+_MOST_HIDDEN: Final = 0.35  # the same for missing markers if every marker is seen at times
+_FEW_NEAR: Final = 2.5  # number of nearby points that may be ghosts
+_MOST_RMS: Final = 0.004  # [m] median RMS distance of a good fit
+_LEAST_FOUND: Final = 0.5  # Suggested hands must be found in at least this share of the frames.
+_BETTER: Final = 1.15  # Suggest another glove only if its log-odds are 1.15 times ours.
 _MUCH_BETTER: Final = 2.0  # the same for another scale
 _UNITS: Final = {"millimeters": 1e-3, "centimeters": 1e-2, "meters": 1.0, "inches": 0.0254, "feet": 0.3048}
 _READ: Final = ("millimeters", "centimeters", "meters")  # units that files state
-_WANDS: Final = (2.0, 0.5)  # scales of a system whose calibration wand had another length than it was told
-_FAR_OFF: Final = 4.0  # times the distance between a glove's neighbors, on a flat hand, which no hand has
-_LEAST_SPACING: Final = 1e-9  # [m] between points, so that nothing is divided by zero
-_MOST_OWN: Final = 16  # gloves of the working folder that are tried
+_WANDS: Final = (2.0, 0.5)  # scales if the calibration wand's length was entered wrongly
+_FAR_OFF: Final = 4.0  # ratio of spacings beyond which points cannot be a hand at this scale
+_LEAST_SPACING: Final = 1e-9  # [m] avoids a division by zero
+_MOST_OWN: Final = 16  # largest number of tried gloves of the working folder
 
 
 class SizeFit(NamedTuple):
-    """Hands as measured."""
+    """Measured hands."""
 
     hand: GloveFit  # the right one; a left hand is its mirror image
     rms: float  # median RMS distance of the markers from this hand [m]
     spread: float  # standard deviation of its length [m]
 
     def __str__(self) -> str:
-        """Length and breadth [mm], and by how much the length may be off, with 95 %."""
+        """Length and breadth, and the 95 % uncertainty of the length [mm]."""
         shape, unsure = self.hand.shape, _SURE * self.spread
         return f"{1e3 * shape.length:.0f} x {1e3 * shape.breadth:.0f} mm, unsure by {1e3 * unsure:.0f} mm"
 
     def hands(self, sides: Sequence[Side]) -> tuple[GloveFit, ...]:
-        """The measured hands of these sides."""
+        """The measured hands of the given sides."""
         return tuple(self.hand.with_side(side) for side in sides)
 
 
 def sample_frames(frames: Sequence[StreamedFrame]) -> list[StreamedFrame]:
-    """Parts of a capture for `fit_size`, of consecutive frames each: beginning, end and six between."""
+    """Parts of a capture for `fit_size`, each of consecutive frames: beginning, end and six between."""
     if len(frames) <= _WINDOWS * _WINDOW:
         return list(frames)
     starts = np.linspace(0, len(frames) - _WINDOW, _WINDOWS).astype(int)
@@ -125,7 +122,7 @@ def fit_size(
     *,
     is_quick: bool = False,
 ) -> SizeFit | None:
-    """The size and proportions of the hands in some frames."""
+    """Measure size and proportions of the hands in some frames; None if no hand is found."""
     for config in (_LENIENT,) if is_quick else (_USUAL, _LENIENT):
         for length in _LENGTHS[:2] if is_quick else _LENGTHS:
             fit = _fit_from(length, frames, layout, sides, labeler, config)
@@ -137,7 +134,7 @@ def fit_size(
 def measured_user(
     frames: Sequence[StreamedFrame], user: User, labeler: Labeler, *, warns: bool = True
 ) -> User:
-    """A user with the hands as measured in some frames; as they are, with a warning, if no hand is found."""
+    """A user with hands measured in some frames; unchanged, with a warning, if no hand is found."""
     size = fit_size(frames, user.layout, user.sides, labeler)
     if size is not None:
         return User(size.hands(user.sides), f"{MEASURED}{size}")
@@ -148,7 +145,7 @@ def measured_user(
 
 
 def hand_between(one: GloveFit, other: GloveFit, share: float) -> GloveFit:
-    """The hand at a share of the way from one size of a hand in its glove to another."""
+    """Interpolate linearly between two sizes of a hand in its glove."""
 
     def mixed(first: Any, last: Any, *names: str) -> dict[str, Any]:
         return {name: (1.0 - share) * getattr(first, name) + share * getattr(last, name) for name in names}
@@ -168,9 +165,9 @@ def _fit_from(
     labeler: Labeler,
     config: TrackerConfig,
 ) -> SizeFit | None:
-    """The hands that are found as hands of a length [m]."""
+    """Measure hands that are first labeled as hands of a given length [m]."""
     markers: list[NDArray[np.float64]] = []
-    for _ in range(2):  # the labels are better with hands of about their own size
+    for _ in range(2):  # Labels improve with hands of about their own size.
         start = _hand(length, usual_breadth(length), layout)
         markers = _label(frames, start, sides, labeler, config) or markers
         if not markers:
@@ -201,12 +198,12 @@ def _are_enough(frame: StreamedFrame, count: int) -> bool:
 
 
 def _is_shown(hand: TrackedHand, count: int) -> bool:
-    """Whether most of the markers of a hand are there."""
+    """Whether a hand is fitted with most of its markers."""
     return hand.status in _FITTED and len(hand.filled) <= _MISSING * count
 
 
 def usual_breadth(length: float) -> float:
-    """The breadth of hands of a length [m]: that of the five sizes, and in proportion beyond them."""
+    """The usual breadth of a hand of some length [m]: interpolated in the five sizes, proportional beyond."""
     lengths, breadths = 1e-3 * np.array(sorted(SIZES.values())).T
     inside = float(np.clip(length, lengths[0], lengths[-1]))
     return float(np.interp(inside, lengths, breadths)) * length / inside
@@ -224,7 +221,7 @@ def _label(
     labeler: Labeler,
     config: TrackerConfig,
 ) -> list[Float[np.ndarray, "F M 3"]]:
-    """Labeled markers [m] of each hand that enough frames show, as a right one's, NaN where missing."""
+    """Labeled markers [m] of each hand shown often enough, mirrored to a right hand, NaN where missing."""
     tracker = Tracker([hand.with_side(side) for side in sides], labeler, config=config)
     count = hand.layout.num_markers
     found: list[list[NDArray[np.float64]]] = [[] for _ in sides]
@@ -246,7 +243,7 @@ def _label(
 
 
 def _spread_out(markers: NDArray[np.float64], most: int) -> NDArray[np.float64]:
-    """So many frames of markers (F, M, 3) at most, evenly spaced."""
+    """At most `most` frames of markers (F, M, 3), evenly spaced."""
     chosen: NDArray[np.float64] = markers[
         np.linspace(0, len(markers) - 1, min(most, len(markers))).astype(int)
     ]
@@ -254,9 +251,9 @@ def _spread_out(markers: NDArray[np.float64], most: int) -> NDArray[np.float64]:
 
 
 class _Search:
-    """The likeliest length and breadth of hands of mean proportions, as which some frames were labeled."""
+    """Search of the likeliest length and breadth of hands of mean proportions, given labeled markers."""
 
-    # Few markers fit hands of many sizes, so that the sizes of people count too.
+    # Few markers fit hands of many sizes, so the distribution of people's sizes counts, too.
 
     def __init__(self, markers: Sequence[Float[np.ndarray, "F M 3"]], start: GloveFit) -> None:
         few = [_spread_out(some, _FRAMES) for some in markers]
@@ -266,11 +263,11 @@ class _Search:
         self._poses = PoseSolver(start).solve(self._markers).qpos
 
     def length(self, breadth: Callable[[float], float], shortest: float, longest: float) -> float:
-        """The likeliest length [m] between two; `breadth` gives the breadth [m] of each."""
+        """The likeliest length [m] in a range; `breadth` maps a length to a breadth [m]."""
         return _least(lambda tried: self._cost(tried, breadth(tried)), shortest, longest)
 
     def measures(self, length: float) -> tuple[float, float]:
-        """Length and breadth [m]."""
+        """The likeliest length and breadth [m]."""
         usual = usual_breadth(length)
         low, high = (factor * usual for factor in _BREADTHS)
         breadth = _least(lambda tried: self._cost(length, tried), low, high)
@@ -285,7 +282,7 @@ class _Search:
 
 
 def _least(function: Callable[[float], float], low: float, high: float) -> float:
-    """The argument between two bounds [m] with the least value of a function: Brent's method (1973)."""
+    """Minimize a function between two bounds by Brent's method (1973)."""
     # SciPy has this search in scipy.optimize, but importing that takes as long as all searches of a capture.
     best = second = third = low + _GOLDEN * (high - low)
     least = second_least = third_least = function(best)
@@ -299,7 +296,7 @@ def _least(function: Callable[[float], float], low: float, high: float) -> float
         p, q = (-p if q > 0.0 else p), abs(q)
         is_far = abs(before) > tolerance
         if is_far and abs(p) < abs(0.5 * q * before) and q * (low - best) < p < q * (high - best):
-            before, step = step, (p + 0.0) / q  # to a parabola's lowest point; zero counts as positive
+            before, step = step, (p + 0.0) / q  # the parabola's minimum; zero counts as positive
             if min(best + step - low, high - best - step) < 2.0 * tolerance:
                 step = math.copysign(tolerance, middle - best)
         else:
@@ -322,7 +319,7 @@ def _least(function: Callable[[float], float], low: float, high: float) -> float
 
 
 def _fit_proportions(seen: Float[np.ndarray, "F M 3"], start: GloveFit) -> SizeFit:
-    """One shape for right hands in some frames, by a calibration without touches."""
+    """Fit one shape to right hands in some frames, by a calibration without touches."""
     options = {"noise": _FIT_NOISE, "robust_scale": _ROBUST_SCALE, "relinearize": _RELINEARIZE}
     problem, estimate = first_estimate(start, seen, PoseSolver(start).solve(seen).qpos, **options)
     estimate, fit, _ = levenberg_marquardt(problem, estimate, 0, _FIT_STEPS, None, _SMALL_GAIN)
@@ -335,12 +332,12 @@ def _fit_proportions(seen: Float[np.ndarray, "F M 3"], start: GloveFit) -> SizeF
 class _Fit(NamedTuple):
     """How well hands fit some frames."""
 
-    log_odds: float = 0.0  # mean over the frames of the hands' log-odds, less penalties
+    log_odds: float = 0.0  # log-odds of the hands less penalties, mean over the frames
     found: dict[Side, int] = {}  # noqa: RUF012
     """Number of frames in which each hand is found."""
-    shown: int = 0  # number of frames in which any hand is found
-    is_good: bool = False  # whether the hands fit well enough not to look for others
-    is_whole: bool = False  # whether each marker is seen at times; if not, the glove may have fewer
+    shown: int = 0  # number of frames in which at least one hand is found
+    is_good: bool = False  # whether the fit is so good that no others are tried
+    is_whole: bool = False  # whether every marker is seen at times; otherwise the glove may have fewer
 
 
 class _Other(NamedTuple):
@@ -348,12 +345,12 @@ class _Other(NamedTuple):
 
     name: str  # name of the glove, or path of its file
     layout: MarkerLayout
-    scale: float  # factor that makes the points ones in meters
+    scale: float  # factor that converts the points to meters
     fit: _Fit
 
 
 class _AtOnce:
-    """`labeler_at_once`, made when it is first asked: bodies alone have no points like a hand's."""
+    """`labeler_at_once`, made at the first use: rigid bodies alone never need it."""
 
     def __init__(self, layout: MarkerLayout) -> None:
         self._layout, self.marker_names = layout, layout.names
@@ -364,7 +361,7 @@ class _AtOnce:
 
 
 def check_scale(frames: Sequence[StreamedFrame], hands: Sequence[GloveFit], labeler: Labeler) -> None:
-    """Refuse points that fit hands at another scale, which distances between neighbors tell."""
+    """Refuse points at a wrong scale, recognized by the distances between neighbors."""
     some = _compared(frames)
     if not some:
         return
@@ -386,8 +383,8 @@ def check_hands(
     *,
     options: Collection[str] = ("--hands", "--glove"),
 ) -> None:
-    """Tell of hands that do not fit, where another side, glove or unit fits clearly better."""
-    # That takes seconds, where something is wrong; gloves of .toml files in the working folder are tried too.
+    """Warn of hands that fit badly if other hands fit clearly better; refuse a wrong unit."""
+    # Takes seconds if the fit is bad. Gloves of .toml files in the working folder are tried, too.
     some = _compared(frames)
     if not some:
         return
@@ -395,7 +392,7 @@ def check_hands(
     if asked.is_good:
         return
     glove = designed_glove(hands[0].layout)
-    others = _others(some, glove, labeler)  # of these a glove of few markers fits anything somehow
+    others = _others(some, glove, labeler)  # A glove of few markers fits anything somehow.
     likely = [other for other in others if other.layout == glove or other.fit.is_good]
     best = max(likely, key=lambda other: other.fit.log_odds)
     fit, factor = best.fit, _BETTER if best.scale == 1.0 else _MUCH_BETTER
@@ -417,7 +414,7 @@ def check_hands(
 
 
 def _compared(frames: Sequence[StreamedFrame]) -> list[StreamedFrame]:
-    """The frames in which hands are compared; none where there are too few to tell anything."""
+    """Frames in which hands are compared; none if there are too few."""
     shown = [frame for frame in frames if len(frame.points) >= FEWEST_POINTS]
     half = max(_PART, len(shown) // (2 * _PART) * _PART)
     some = [*shown[:_PART], *shown[half : half + _PART]]
@@ -425,7 +422,7 @@ def _compared(frames: Sequence[StreamedFrame]) -> list[StreamedFrame]:
 
 
 def _others(frames: Sequence[StreamedFrame], glove: MarkerLayout, labeler: Labeler) -> list[_Other]:
-    """Hands of both sides in the glove that is asked for, in other gloves, and at other scales."""
+    """Fits of both hands in the given glove, in other gloves, and at other scales."""
     others = [_Other(glove.name, glove, 1.0, _measured_fit(frames, glove, labeler))]
     if others[0].fit.is_good:
         return others
@@ -442,13 +439,13 @@ def _others(frames: Sequence[StreamedFrame], glove: MarkerLayout, labeler: Label
 
 
 def _measured_fit(frames: Sequence[StreamedFrame], layout: MarkerLayout, labeler: Labeler) -> _Fit:
-    """How well the hands of a glove fit some frames that they are measured in."""
+    """Measure the hands of a glove in some frames, and rate their fit."""
     size = fit_size(frames, layout, layout.sides, labeler, is_quick=True)
     return _Fit() if size is None else _fit(frames, size.hands(layout.sides), labeler)
 
 
 def _fit(frames: Sequence[StreamedFrame], hands: Sequence[GloveFit], labeler: Labeler) -> _Fit:
-    """How well hands fit some frames."""
+    """Rate the fit of hands to some frames."""
     tracker, markers = Tracker(hands, labeler), hands[0].layout.num_markers
     score = HandInitializer([HandState(hands[0])], labeler).score
     found = {hand.side: 0 for hand in hands}
@@ -478,22 +475,22 @@ def _fit(frames: Sequence[StreamedFrame], hands: Sequence[GloveFit], labeler: La
 
 
 def _gloves() -> list[tuple[str, MarkerLayout]]:
-    """The shipped gloves and those in the working folder, by name or path; those with more markers first."""
+    """Shipped gloves and those of the working folder with their names or paths, most markers first."""
     found = [(name, load_layout(name)) for name in list_layouts()]
     for path in sorted(Path().glob("*.toml"))[:_MOST_OWN]:
-        with contextlib.suppress(HandSimError):  # a file of another kind
+        with contextlib.suppress(HandSimError):  # not a glove
             found.append((str(path), load_layout(path)))
     return sorted(found, key=lambda one: -one[1].num_markers)
 
 
 def _scales() -> list[float]:
-    """Factors that correct a unit of length that was mistaken for another, or a wand's length."""
+    """Factors that correct a mistaken unit of length or wand length."""
     pairs = {_UNITS[true] / _UNITS[read] for read in _READ for true in _UNITS if true != read}
     return [*sorted(pairs), *_WANDS]
 
 
 def _of_scale(times: float) -> str:
-    """The sentence about points that fit hands at so many times their size."""
+    """The message that points fit hands at `times` their size."""
     units = [
         f"in {true}, read as {read}"
         for read in _READ

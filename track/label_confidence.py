@@ -1,8 +1,8 @@
-"""Calibrated confidence in the labels of a whole take: of labels with confidence 0.9, nine of ten are right.
+"""Calibrated confidence in the labels of a whole take: of labels with confidence 0.9, 90 % are right.
 
-Points are followed from frame to frame, by their IDs where these last, so that a label can be compared with
-the others of the point's life. Two logistic models weigh this evidence: one for points with a label, one for
-points without. `python -m benchmarks.doubtful_frames --fit` fits both to simulated captures.
+Points are followed from frame to frame, by their IDs if these persist; the frames of one point are its life.
+Two logistic models weigh the evidence of each life: one for points with a label, one for points without.
+`python -m benchmarks.doubtful_frames --fit` fits both to simulated captures.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ LABELED: Final = (
     "biases of the hand",
     "improbable digit",
 )
-"""Names of the evidence on a point with a label."""
+"""Names of the evidence on a labeled point."""
 UNLABELED: Final = (
     "labels in its life",
     "a free marker within 10 mm",
@@ -38,34 +38,34 @@ UNLABELED: Final = (
     "markers not seen",
     "biases of the hand",
 )
-"""Names of the evidence on a point without a label."""
-_LEAST_RESIDUAL: Final = 0.0003  # [m] least usual residual of a marker: the noise of optical systems
-_FEWEST: Final = 10  # frames from which the usual residual of a marker is estimated, at least
-_LINK: Final = 0.015  # [m] largest motion of a point within its hand between frames, where IDs do not last
+"""Names of the evidence on an unlabeled point."""
+_LEAST_RESIDUAL: Final = 0.0003  # [m] lower bound of a marker's usual residual: the noise of optical systems
+_FEWEST: Final = 10  # frames needed to estimate the usual residual of a marker
+_LINK: Final = 0.015  # [m] largest motion within the hand between frames, without lasting IDs
 _EXCHANGE: Final = 0.005  # [m] smallest jump of points whose IDs were exchanged
 _BESIDE: Final = 0.1  # [m] radius within which points belong to one hand
-_SHORT: Final = 20.0  # frames from which on the length of a life is no evidence
-_FAR: Final = 1.0  # [m] distance of a neighbor that does not exist
-_MOST_OFF: Final = 100.0  # usual residuals, at which the evidence of a residual is cut off
+_SHORT: Final = 20.0  # Lives of at least this many frames count as long.
+_FAR: Final = 1.0  # [m] stands for the distance of a missing neighbor
+_MOST_OFF: Final = 100.0  # upper bound of a residual in the evidence, in usual residuals
 
 
 class Evidence(NamedTuple):
-    """Evidence on P points of a take, in the order of its frames."""
+    """Evidence on P points of a take, in order of its frames."""
 
     points: Int[np.ndarray, "P"]
     """Indices of the points in the take's list."""
     labels: Int[np.ndarray, "P"]
-    """Label of each point, -1 for none."""
+    """Label of each point, -1 if unlabeled."""
     markers: Int[np.ndarray, "P"]
-    """Label of each point, or of the nearest marker without a point."""
+    """Label of each point; of an unlabeled one, the nearest free marker."""
     labeled: Float[np.ndarray, "L 7"]
-    """Evidence on the points with a label, see `LABELED`."""
+    """Evidence on the labeled points, see `LABELED`."""
     unlabeled: Float[np.ndarray, "U 8"]
-    """Evidence on the points without a label, see `UNLABELED`."""
+    """Evidence on the unlabeled points, see `UNLABELED`."""
 
 
 def evidence_of(take: Take) -> Evidence:
-    """Evidence on the labels of a take with poses, without those of rigid bodies."""
+    """Evidence on the labels of a take with poses, except those of rigid bodies."""
     count = take.hand_labels[-1].stop
     listed = take.point_list
     chosen = np.flatnonzero(listed.labels < count)
@@ -108,7 +108,7 @@ def evidence_of(take: Take) -> Evidence:
 
 
 def _usual(residuals: Float[np.ndarray, "T K"]) -> Float[np.ndarray, "K"]:
-    """Usual distance of each marker from its pose [m]."""
+    """Usual residual of each marker [m]: the median, or that of the others if it has too few frames."""
     known = np.isfinite(residuals).sum(axis=0) >= _FEWEST
     usual = np.full(residuals.shape[1], np.nan)
     usual[known] = np.nanmedian(residuals[:, known], axis=0)
@@ -119,7 +119,7 @@ def _usual(residuals: Float[np.ndarray, "T K"]) -> Float[np.ndarray, "K"]:
 def _lives(
     lives: Int[np.ndarray, "P"], labels: Int[np.ndarray, "P"], count: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Frames in the life of each point with its label, with another one, and of the whole life."""
+    """Frames in each point's life: with the point's label, with another label, and in total."""
     pairs = lives * (count + 1) + labels + 1
     _, inverse, counts = np.unique(pairs, return_inverse=True, return_counts=True)
     own, with_label, length = counts[inverse], np.bincount(lives, labels >= 0), np.bincount(lives)
@@ -139,7 +139,7 @@ def _of_hands(
 
 
 def _improbable(take: Take, owners: Int[np.ndarray, "K"]) -> Float[np.ndarray, "T K"]:
-    """How far from those of resting hands the angles of each marker's digit are; 0 for the palm."""
+    """How improbable the angles of each marker's digit are under the resting prior; 0 for the palm."""
     prior, n = resting_prior(), NUM_JOINTS // len(DIGITS)
     digits = np.concatenate([hand.attachment.digits for hand in take.hands])
     improbable = np.zeros((take.num_frames, len(digits)))
@@ -162,10 +162,10 @@ def _surroundings(
     beside: float,
     far: float,
 ) -> tuple[Int[np.ndarray, "U"], Float[np.ndarray, "3 U"]]:
-    """Surroundings of the points without a label.
+    """Surroundings of the unlabeled points.
 
-    These are the nearest marker without a point, its distance and that of the nearest other point [m], and
-    the number of points without a label nearby.
+    Returns the nearest free marker; its distance and that of the nearest other point [m], and the number of
+    unlabeled points nearby.
     """
     count = (labels < 0).sum()
     marker, near = np.zeros(count, dtype=np.int64), np.full((3, count), far)
@@ -202,7 +202,7 @@ def _follow(
     link: float,
     exchange: float,
 ) -> Int[np.ndarray, "P"]:
-    """The life that each point is of: that of its ID, where IDs last, and where two are not exchanged."""
+    """The life of each point, followed by IDs if they persist, else by position; exchanged IDs are undone."""
     lives, number = np.full(len(points), -1), 0
     for frame in range(len(starts) - 1):
         first, last = starts[frame], starts[frame + 1]
@@ -231,7 +231,7 @@ def _follow(
 def _move(
     points: Float[np.ndarray, "N 3"], old: Float[np.ndarray, "H 3"], new: Float[np.ndarray, "H 3"]
 ) -> None:
-    """Move the points near hands as the middles of these move [m]."""
+    """Move points near a hand along with the hand's center [m]."""
     for i in range(len(points)):
         hand = _nearest(old, points[i], 0.2)
         if hand >= 0 and not np.isnan(new[hand, 0]):
@@ -245,7 +245,7 @@ def _undo_exchanges(
     source: Int[np.ndarray, "N"],
     exchange: float,
 ) -> None:
-    """Exchange the sources of two points that both jump, if each is where the other one was predicted."""
+    """Exchange the sources of two points that jump, if each is where the other was predicted."""
     for j in range(len(source)):
         for m in range(j):
             one, other = source[j], source[m]
@@ -270,15 +270,15 @@ def _nearest(points: Float[np.ndarray, "N 3"], place: Float[np.ndarray, "3"], mo
 
 
 _LABELED: Final = (-8.11, 0.72, 3.08, 0.08, 0.68, 1.49, 2.49, 0.78)
-"""Log-odds of a wrong label, and what each entry of `LABELED` adds to them."""
+"""Log-odds of a wrong label: bias, and weight of each entry of `LABELED`."""
 _UNLABELED: Final = (-9.44, 3.91, 3.13, 6.01, -0.76, 3.30, 1.62, 0.76, 1.35)
-"""Log-odds of a marker that has no label, and what each entry of `UNLABELED` adds to them."""
+"""Log-odds that an unlabeled point is a marker: bias, and weight of each entry of `UNLABELED`."""
 
 
 def label_confidence(take: Take, evidence: Evidence | None = None) -> Float[np.ndarray, "P"]:
-    """Probability that each point's label is right; of a point without one, that it is no marker.
+    """Probability that each point's label is right; for an unlabeled point, that it is no marker.
 
-    Confidences of rigid bodies' points stay, and all those of a take without poses.
+    The confidence of rigid bodies' points does not change, nor that of a take without poses.
     """
     confidence = take.point_list.confidence.copy()
     if not np.isfinite(take.qpos).any():

@@ -1,4 +1,4 @@
-"""Tracking of a live stream: hands are tracked, sent on and recorded, and measured beside that."""
+"""Tracking of a live stream: hands are tracked, measured meanwhile, sent on and recorded."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ from track.streams import NoServerError
 from track.streams.live_stream import LiveStream, open_source
 from track.tracker import Tracker
 
-_PACE_PERIOD: Final = 1.0  # [s] between two lines about dropped frames
+_PACE_PERIOD: Final = 1.0  # [s] between two reports on dropped frames
 _RETRY: Final = 0.5  # [s] between two attempts to reach a server
-_LAGS: Final = 100_000  # newest frames whose lag is kept
+_LAGS: Final = 100_000  # number of newest frames whose lag is kept
 _FOREIGN: Final = "foreign_packets"
 _PACKETS: Final = {"damaged_packets": "damaged", _FOREIGN: "of other senders"}
-"""Counts of packets that were left out, in words."""
+"""Words for the counts of ignored packets."""
 _FRAMES: Final = {
     "frames_in_order": "in order",
     "reordered_frames": "put in order",
@@ -41,26 +41,26 @@ _FRAMES: Final = {
     "late_frames": "too late",
     "frames_with_wild_times": "with a wild time",
 }
-"""Counts that add up to all received frames, in words."""
+"""Words for the counts that add up to all received frames."""
 _OF_THEM: Final = {
     "dropped_frames": "of them dropped, as they were not kept up with",
     "frames_after_end": "of them after the end",
 }
-"""Counts of some of these frames, in words."""
+"""Words for the counts of some of these frames."""
 
 
 class FrameOutput(Protocol):
-    """Takes tracked frames as they are made: a `SinkGroup` or a `LiveView`."""
+    """Receives tracked frames as they are made: a `SinkGroup` or a `LiveView`."""
 
     @property
     def counts(self) -> dict[str, int]:
-        """Numbers of dropped frames, by their destination."""
+        """Numbers of dropped frames, by destination."""
 
     def start(self, hands: Sequence[GloveFit], bodies: Sequence[RigidTemplate]) -> None:
-        """Take on the tracker's hands and bodies; again when their size changes."""
+        """Prepare for the tracker's hands and bodies; called again when their size changes."""
 
     def send(self, frame: StreamedFrame, tracked: TrackedFrame) -> None:
-        """Take a frame, without waiting."""
+        """Receive a frame, without waiting."""
 
     def notes(self) -> tuple[str, ...]:
         """Lines to print at the end."""
@@ -70,11 +70,11 @@ class LiveTake(NamedTuple):
     """The result of tracking a stream."""
 
     take: Take | None
-    """The take, only some blocks of a long one; None if nothing was recorded."""
+    """The take; of a long one only some blocks; None if nothing was recorded."""
     num_frames: int
-    """Number of all frames."""
+    """Number of all tracked frames."""
     duration: float
-    """Time of all frames [s], those included that are missing."""
+    """Duration of all frames [s], missing ones included."""
     notes: tuple[str, ...]
     """Lines to print at the end."""
 
@@ -94,10 +94,10 @@ def track_live(
     on_frame: OnFrame = lambda frame, tracked: None,
     guide: Callable[[TrackedFrame], str | None] = lambda tracked: "",
 ) -> LiveTake:
-    """Track a stream, to `out` if given, until `seconds` are over, the stream ends or a signal comes.
+    """Track a stream, into `out` if given, until `seconds` are over, the stream ends or a signal comes.
 
-    What a `guide` asks for is shown after each frame; where that is None, the tracking ends. The first signal
-    writes the take without waiting frames; a second one keeps the recording as it is.
+    After each frame the text of `guide` is shown; if it is None, tracking ends. The first signal writes the
+    take without the waiting frames; a second one keeps the recording as it is.
     """
     if out is not None:
         check_unused(growing_path(out))
@@ -105,8 +105,8 @@ def track_live(
         tracker = setup.tracker()
         tracker.warm_up()
         _start(outputs, tracker)
-        gc.freeze()  # the collector would otherwise stop us for 0.25 s now and then
-    until = math.inf  # [s], the end of the tracking by the monotonic clock
+        gc.freeze()  # A garbage collection would stop tracking for up to 0.25 s.
+    until = math.inf  # [s] end of tracking on the monotonic clock
     interrupted = InterruptFlag()
     with (
         LiveStatus() as status,
@@ -114,7 +114,7 @@ def track_live(
         ExitStack() as stack,
     ):
         doubt = _Doubt(stream, status)
-        stack.enter_context(interrupt_flag(interrupted))  # from here on a signal keeps the frames so far
+        stack.enter_context(interrupt_flag(interrupted))  # From here on a signal keeps the frames so far.
         recorder = None
         if out is not None:
             recorder = stack.enter_context(Recorder(out, tracker, {"capture": address, **setup.settings}))
@@ -158,13 +158,13 @@ def track_live(
 
 
 def _start(outputs: Sequence[FrameOutput], tracker: Tracker) -> None:
-    """Have outputs take on a tracker's hands and bodies."""
+    """Start all outputs with a tracker's hands and bodies."""
     for output in outputs:
         output.start(tracker.hands, tracker.bodies)
 
 
 def _note_size(tracker: Tracker, recorder: Recorder | None, status: LiveStatus) -> None:
-    """Print and record the size that a tracker's hands have from now on."""
+    """Print and record the new size of a tracker's hands."""
     status.say(f"size of the hands: {tracker.user}")
     if recorder is not None:
         recorder.resize()
@@ -177,13 +177,13 @@ def _open_answering(address: str, ended: Callable[[], bool], status: LiveStatus)
             return open_source(address, ended=ended)
         except NoServerError as error:
             status.show(f"{error}; it is waited for, Ctrl-C ends it")
-            sleep(_RETRY)  # some are refused at once
+            sleep(_RETRY)  # a refused connection returns at once
 
 
 def _written(
     recorder: Recorder, out: Path | None, counts: dict[str, int], status: LiveStatus
 ) -> tuple[Take, int, float]:
-    """Write the take of a recording, see `Recorder.finish`; also the time of all its frames [s]."""
+    """Write the take of a recording, see `Recorder.finish`; return its duration [s] as well."""
     status.show(f"writing {out}", now=True)
     kept = f"writing {out}; {recorder.part} is kept until then"
     take, step = recorder.finish(counts, told=lambda: status.show(kept))
@@ -192,7 +192,7 @@ def _written(
 
 @contextmanager
 def _recording_kept(recorder: Recorder) -> Iterator[None]:
-    """Close the recording if an interrupt ends the block, and say where it is kept."""
+    """On an interrupt, close the recording and say where it is kept."""
     try:
         with interrupts_bare():
             yield
@@ -202,13 +202,13 @@ def _recording_kept(recorder: Recorder) -> Iterator[None]:
 
 
 class _Doubt:
-    """Says once what is wrong with the points of a stream."""
+    """Reports a problem with the points of a stream once."""
 
     def __init__(self, stream: LiveStream, status: LiveStatus) -> None:
         self._stream, self._status, self._told = stream, status, False
 
     def tell(self) -> None:
-        """Say it as soon as it is known."""
+        """Report the problem as soon as it is known."""
         if not self._told and (doubt := self._stream.point_doubt):
             self._told = True
             self._status.say(doubt)
@@ -223,17 +223,17 @@ class _Pace:
         self.frames = 0
         """Number of frames."""
         self.words = ""
-        """A summary of the last second."""
+        """Summary of the last second."""
         self._begin, self._received, self._dropped = monotonic(), 0, 0
 
     def add(self, frame: StreamedFrame) -> None:
-        """Add the lag of a frame."""
+        """Record the lag of a frame."""
         if not frame.silent:
             self.lags.append(monotonic() - frame.arrived)
             self.frames += 1
 
     def tick(self, counts: dict[str, int]) -> bool:
-        """Once a second renew the summary; returns whether frames were dropped in that second."""
+        """Renew the summary once a second; return whether frames were dropped in that second."""
         now = monotonic()
         span = now - self._begin
         if span < _PACE_PERIOD:
@@ -249,7 +249,7 @@ class _Pace:
 
 
 def _notes(counts: dict[str, int], step: int, pace: _Pace, interval: float) -> Iterator[str]:
-    """Lines to print on a stream at its end; `interval` is the time from frame to frame [s]."""
+    """Lines to print at the end of a stream; `interval` is the time between frames [s]."""
     told = ", ".join(f"{counts[name]} {what}" for name, what in _FRAMES.items())
     others = ", ".join(f"{counts[name]} {what}" for name, what in _OF_THEM.items() if counts[name])
     others = f" ({others})" if others else ""
@@ -273,7 +273,7 @@ def _notes(counts: dict[str, int], step: int, pace: _Pace, interval: float) -> I
 
 
 def _silence_line(counts: dict[str, int]) -> str:
-    """A line on a stream from which no frame comes."""
+    """Status line of a stream from which no frames come."""
     if foreign := counts.get(_FOREIGN):
         return f"no frames arrive, but {foreign} packets of other senders; is this the right port?"
     return "no frames arrive; is the server playing?"
@@ -286,7 +286,7 @@ def _status_line(
     outputs: Sequence[FrameOutput],
     pace: _Pace,
 ) -> str:
-    """A line on the status of a live stream."""
+    """Status line of a live stream."""
     if frame.silent:
         return _silence_line(counts)
     words = [f"{hand.side} {hand.status}" for hand in tracked.hands]

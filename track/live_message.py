@@ -1,4 +1,4 @@
-"""Outgoing messages on tracked frames, and their documents, which docs/live_output.md describes."""
+"""Messages on tracked frames for other programs, and their documents; see docs/live_output.md."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ from track.frames import StreamedFrame, TrackedFrame, TrackedHand
 from track.rigid_body import RigidTemplate
 
 SCHEMA: Final = 1
-"""Version of what is sent; a receiver that knows it knows every later message of the same version."""
+"""Version of the messages; a receiver of one version understands all later messages of it."""
 FORMATS: Final = ("json", "msgpack")
 WORLD: Final = "world"
 """The axes of the camera system."""
 LARGEST_DATAGRAM: Final = 1400
-"""Size up to which datagrams go through usual networks in one packet [bytes]."""
-_DECIMALS: Final = 6  # micrometers and microradians
-_STEP: Final = 1e-3  # time between the poses whose difference is a velocity [s]
-_POSE: Final = ("side", "status", "wrist", "angles", "positions")  # entries of a hand that stay together
+"""Largest size of a datagram that usual networks carry in one packet [bytes]."""
+_DECIMALS: Final = 6  # resolution of micrometers and microradians
+_STEP: Final = 1e-3  # [s] Velocities are differences of poses this far apart in time.
+_POSE: Final = ("side", "status", "wrist", "angles", "positions")  # entries of a hand that share one part
 _HALF: Final = len(OPENXR_JOINTS) // 2
 
 
@@ -54,14 +54,14 @@ class LiveHeader:
     bodies: tuple[str, ...]
     """The rigid bodies in their order."""
     markers: tuple[str, ...]
-    """What a point's label counts through: `right:ThumbTip`, ..., the hands' markers before the bodies'."""
+    """Marker names that labels index: `right:ThumbTip`, ..., first the hands' markers, then the bodies'."""
     radii: tuple[tuple[float, ...], ...]
     """Radius of each hand at each of OpenXR's joints [m]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LiveHand:
-    """One hand; all numbers are NaN where it has no pose."""
+    """One hand; all numbers are NaN if it has no pose."""
 
     side: Side
     status: Status
@@ -78,9 +78,9 @@ class LiveHand:
     position_spread: Float[np.ndarray, "21"]
     """Standard deviation of each joint position in each direction [m]."""
     angle_velocities: Float[np.ndarray, "20"]
-    """Angular velocity of each joint [rad/s]; NaN where it is not known."""
+    """Angular velocity of each joint [rad/s]; NaN where unknown."""
     find_velocities: Callable[[], Float[np.ndarray, "21 3"]] = field(repr=False)
-    """Computes the velocity of each joint position in the world [m/s]; NaN where it is not known."""
+    """Computes the velocity of each joint position in the world [m/s]; NaN where unknown."""
     find_joints: Callable[[], Float[np.ndarray, "26 7"]] = field(repr=False)
     """Computes positions [m] and wxyz quaternions of OpenXR's joints in the world; for a hand with a pose."""
 
@@ -92,7 +92,7 @@ class LiveHand:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LiveBody:
-    """One rigid body; all numbers are NaN where it is lost."""
+    """One rigid body; all numbers are NaN if it is lost."""
 
     name: str
     status: Status
@@ -112,38 +112,38 @@ class LiveMessage:
     """A tracked frame as it is sent."""
 
     header: LiveHeader
-    """The same object in every message of a stream, until its hands have another size."""
+    """The same object in every message of a stream until the size of its hands changes."""
     number: int
-    """The frame's number; those of a stream may have gaps and may start again."""
+    """Frame number; numbers of a stream may have gaps and may start again."""
     time: float
-    """Time of the frame [s]; never runs back."""
+    """Time of the frame [s]; never goes back."""
     silent: bool
-    """No frame arrives; this message says what has become of the hands until now."""
+    """Whether no frame has arrived for a while; the message then holds the hands' state until now."""
     hands: tuple[LiveHand, ...]
     bodies: tuple[LiveBody, ...]
     points: Float[np.ndarray, "N 3"]
     """All points of the frame [m]."""
     labels: Int[np.ndarray, "N"]
-    """Marker of each point, an index into `header.markers`; -1 for none."""
+    """Index of each point's marker in `header.markers`; -1 for none."""
     lag: float
-    """Time from the frame's arrival on this machine to this message [s]; NaN where it did not come live."""
+    """Time from the frame's arrival on this machine to this message [s]; NaN if it is not live."""
     latency: float
-    """Time from the middle of the frame's exposure to this message [s]; NaN where it is not known."""
+    """Time from the middle of the frame's exposure to this message [s]; NaN where unknown."""
 
 
 class LiveSink(Protocol):
-    """Takes messages somewhere; a class of the user's own for `handsim track --send module:name`.
+    """A destination of messages; also a class of the user's own for `handsim track --send module:name`.
 
     The tracker calls both methods and waits for them, so `send` must not wait itself. A sink that raises is
     closed with a warning, and tracking goes on without it.
     """
 
     def send(self, message: LiveMessage) -> None:
-        """Take a message: positions in [m], angles in [rad]."""
+        """Receive a message: positions in [m], angles in [rad]."""
         ...
 
     def close(self) -> None:
-        """No further message comes."""
+        """Called once, after the last message."""
         ...
 
 
@@ -206,7 +206,7 @@ _Placed = TypeVar("_Placed", LiveHand, LiveBody)
 
 
 def in_axes(message: LiveMessage, axes: ProgramAxes) -> LiveMessage:
-    """A message with positions, orientations and points in a program's axes and unit."""
+    """Convert positions, orientations and points of a message to a program's axes and unit."""
 
     def turned(poses: Float[np.ndarray, "K 7"]) -> NDArray[np.float64]:
         return np.concatenate([axes.positions(poses[:, :3]), axes.quaternions(poses[:, 3:])], axis=1)
@@ -234,18 +234,18 @@ def in_axes(message: LiveMessage, axes: ProgramAxes) -> LiveMessage:
 
 
 class MessageFormat(NamedTuple):
-    """How messages become bytes, or several datagrams each."""
+    """Conversion of messages to bytes, each one or several datagrams."""
 
     header: Callable[[LiveHeader], list[bytes]]
     frame: Callable[[LiveMessage], list[bytes]]
     end: Callable[[], list[bytes]]
     lag: Callable[[float, int], bytes] = lambda lag, dropped: b""
-    """Tells a client how far it is behind [s], and how many frames it has not got."""
+    """Encodes for a client its lag [s] and the number of frames that it missed."""
     is_text: bool = False
 
 
 class Content(NamedTuple):
-    """What messages hold beside what all of them do, and in which axes."""
+    """Optional contents of messages, and their axes."""
 
     points: bool = False
     """All points and their labels."""
@@ -254,15 +254,15 @@ class Content(NamedTuple):
     velocities: bool = False
     """Velocities of joint angles and positions."""
     axes: str = WORLD
-    """The program in whose axes and unit they are, one of `PROGRAMS`, or the world of the camera system."""
+    """Program whose axes and unit are used, one of `PROGRAMS`, or `WORLD`, the axes of the camera system."""
     up: UpAxis = "z"
     """The axis of the camera system that points up."""
     unit: str = "auto"
-    """The unit of length, m or cm; auto is the program's."""
+    """Unit of length, m or cm; auto is the program's."""
 
     @property
     def program(self) -> ProgramAxes | None:
-        """The axes of the program; None for those of the camera system in meters."""
+        """The program's axes; None for those of the camera system in meters."""
         if self.axes == WORLD:
             return program_axes("ros", "z", self.unit) if self.unit == "cm" else None
         return program_axes(self.axes, self.up, self.unit)
@@ -294,7 +294,7 @@ def document_format(
 
 
 def _divided(document: dict[str, Any], encode: Callable[[Any], bytes], largest: float) -> list[bytes]:
-    """A document, or parts that hold the items of its lists between them, see docs/live_output.md."""
+    """Encode a document, in parts with a share of its lists if it is too large; see docs/live_output.md."""
     whole = encode(document)
     if len(whole) <= largest:
         return [whole]
@@ -314,7 +314,7 @@ def _divided(document: dict[str, Any], encode: Callable[[Any], bytes], largest: 
 
 
 def _hand_parts(hands: list[dict[str, Any]]) -> Iterator[dict[str, Any]]:
-    """The poses of hands, then their other entries alone, joints in two halves."""
+    """The poses of hands, then each other entry by itself, OpenXR's joints in two halves."""
     for hand in hands:
         yield {name: hand[name] for name in _POSE}
     for hand in hands:
@@ -342,7 +342,7 @@ def header_document(header: LiveHeader, content: Content = Content()) -> dict[st
 
 
 def frame_document(message: LiveMessage, content: Content = Content()) -> dict[str, Any]:  # noqa: B008
-    """A frame, with null for NaN."""
+    """A frame as a document, with null for NaN."""
     if content.program is not None:
         message = in_axes(message, content.program)
     document = {

@@ -1,8 +1,8 @@
-"""The size of the hands of a live stream, measured beside its tracker in a process of its own.
+"""The size of the hands of a live stream, measured in a separate process while tracking goes on.
 
-Tracking begins with hands of the usual size. One second of frames with enough points is measured first, ten
-seconds later. The tracker takes a new size over in small steps, one a frame, so that no joint jumps. After a
-pause, or where they suddenly fit worse, the hands may be another person's, and are measured again.
+Tracking begins with hands of the usual size. They are measured after one second of frames with enough points,
+and again after ten seconds. The tracker adopts a new size in small steps, one per frame, so that no joint
+jumps. After a pause, or if the fit suddenly worsens, the hands may be another person's: measure again.
 """
 
 from __future__ import annotations
@@ -28,59 +28,59 @@ from track.settings import TrackerSetup, TrackSettings
 from track.tracker import Tracker
 from track.user import MEASURED, User
 
-_FIRST: Final = 1.0  # [s] of frames with enough points, after which hands are measured
-_ENOUGH: Final = 10.0  # [s] of such frames, in which hands are measured for good
-_LATER: Final = 2.0  # times these seconds, after which they are measured again where no hand was found
-_LONGEST_STEP: Final = 0.1  # [s] between two frames; of a longer gap only this much counts as time with hands
-_MOST_FRAMES: Final = 20_000  # that are kept; a stream may go on for hours without a hand
-_PAUSE: Final = 1.0  # [s] without a hand, after which hands may be another person's
-_SAME: Final = 0.006  # [m] by which lengths differ that one second shows of the same hands
-_CALM: Final = 5.0  # [s] after a measurement, over which the usual residual of the measured hands is averaged
-_RECENT: Final = 1.0  # [s] over which the newest residual is averaged
-_JUMP: Final = 1.5  # times the usual residual, from which on hands may be another person's
-_STEP: Final = 0.002  # [m] by which the markers of a hand at rest move in a frame when its size changes
-_FEWEST_STEPS: Final = 4  # in which learned biases of markers are given up
-_NICE: Final = 5  # by which the tracker's process comes before the measuring one
+_FIRST: Final = 1.0  # [s] duration of frames with enough points before the first measurement
+_ENOUGH: Final = 10.0  # [s] the same for the final measurement
+_LATER: Final = 2.0  # If no hand was found, try again after this multiple of that time.
+_LONGEST_STEP: Final = 0.1  # [s] A longer gap between two frames counts as this much time with hands.
+_MOST_FRAMES: Final = 20_000  # largest number of kept frames; a stream may show no hand for hours
+_PAUSE: Final = 1.0  # [s] without a hand, after which the hands may be another person's
+_SAME: Final = 0.006  # [m] Measurements from one second of the same hands differ by less.
+_CALM: Final = 5.0  # [s] time after a measurement over which the usual residual is averaged
+_RECENT: Final = 1.0  # [s] time constant of the newest residual's running mean
+_JUMP: Final = 1.5  # ratio to the usual residual beyond which the hands may be another person's
+_STEP: Final = 0.002  # [m] motion of the markers of a hand at rest per step to a new size
+_FEWEST_STEPS: Final = 4  # Learned marker biases fade out in at least this many steps.
+_NICE: Final = 5  # The measuring process has a lower priority than the tracker's.
 
 
 class _Measured(NamedTuple):
-    """What some frames tell of the hands in them."""
+    """Result of measuring the hands in some frames."""
 
     users: Sequence[User] = ()
-    """The hands on the way to their measured size, in small steps; none if no hand was found."""
+    """Hands in small steps towards their measured size; empty if no hand was found."""
     told: Sequence[str] = ()
-    """What seems wrong with glove, hands or scale, in words."""
+    """Warnings about glove, hands or scale."""
 
 
 class LiveSizing(Closing):
-    """Measures the hands of a stream, and has their tracker take the size over; the end of a block ends it.
+    """Measures the hands of a stream and resizes those of its tracker; usable in a `with` block.
 
     Args:
-        setup: The tracker's hands, which are measured if they are of a usual size, and their labeler.
+        setup: The tracker's hands, measured only if their size is automatic, and their labeler.
     """
 
     def __init__(self, setup: TrackerSetup) -> None:
         self._setup, self._frames = setup, list[StreamedFrame]()
-        self._shown, self._due = 0.0, _FIRST  # [s] of frames with enough points: those so far, those needed
-        self._last = self._seen = -np.inf  # [s] of the last such frame, and of the last hand
-        self._is_brief, self._is_done = True, False  # of the last measurement, and of what is measured
-        self._calm = self._usual = self._newest = 0.0  # [s] with measured hands, and their residuals [m]
+        self._shown, self._due = 0.0, _FIRST  # [s] frames with enough points: so far, needed
+        self._last = self._seen = -np.inf  # [s] times of the last such frame and hand
+        self._is_brief, self._is_done = True, False  # is the last measurement brief, the size final?
+        self._calm = self._usual = self._newest = 0.0  # [s] since measured; [m] residuals
         self._processes: LocalProcesses | None = None
         self._measuring: Future[_Measured] | None = None
         self._steps: deque[User] = deque()
 
     @property
     def is_settled(self) -> bool:
-        """Whether the tracker has taken the newest size over."""
+        """Whether the tracker has adopted the newest size."""
         return not self._steps
 
     def close(self) -> None:
-        """End a measurement that goes on."""
+        """Cancel a running measurement."""
         if self._processes is not None:
             self._processes.end()
 
     def step(self, frame: StreamedFrame, tracked: TrackedFrame, tracker: Tracker) -> bool:
-        """Take a frame that was tracked; returns whether the tracker goes on with another size."""
+        """Process a tracked frame; return whether the tracker's hands were resized."""
         if not self._setup.is_auto:
             return False
         is_there = any(hand.has_pose for hand in tracked.hands)
@@ -106,7 +106,7 @@ class LiveSizing(Closing):
         return True
 
     def _fit_worse(self, tracked: TrackedFrame, span: float) -> bool:
-        """Whether measured hands fit much worse than in the seconds after; `span` [s] is since the last."""
+        """Whether the fit is much worse than just after the measurement; `span` [s] is the time step."""
         rms = [hand.rms for hand in tracked.hands if hand.status is Status.TRACKED]
         if self._steps or not self._is_done or not rms:
             return False
@@ -119,15 +119,15 @@ class LiveSizing(Closing):
         return self._newest > _JUMP * self._usual
 
     def _begin_measuring(self, user: User) -> None:
-        """Measure the hands in the frames so far."""
+        """Start to measure the hands in the frames so far."""
         self._is_brief, self._due = self._shown < _ENOUGH, max(_ENOUGH, _LATER * self._shown)
         self._frames = sample_frames(self._frames)
         self._processes = LocalProcesses(1)
         self._measuring = self._processes.submit(_measure, self._setup.settings, self._frames, user)
-        self._processes.shutdown(wait=False)  # after this one
+        self._processes.shutdown(wait=False)  # ends after this task
 
     def _end_measuring(self, measuring: Future[_Measured], tracker: Tracker) -> None:
-        """Take over what was measured."""
+        """Adopt the result of a measurement."""
         self._measuring = None
         try:
             found = measuring.result()
@@ -145,7 +145,7 @@ class LiveSizing(Closing):
 
 
 def _measure(settings: dict[str, Any], frames: Sequence[StreamedFrame], before: User) -> _Measured:
-    """Measure the hands in some frames, in a process that has nothing else to do."""
+    """Measure the hands in some frames, in a process of low priority."""
     if hasattr(os, "nice"):
         os.nice(_NICE)
     setup = TrackerSetup.of(TrackSettings.from_json(settings))
@@ -163,6 +163,6 @@ def _measure(settings: dict[str, Any], frames: Sequence[StreamedFrame], before: 
 
 
 def _user_between(before: User, after: User, share: float) -> User:
-    """The measured user with hands at a share of the way to their size."""
+    """The measured user with hands interpolated towards their size."""
     hands = tuple(hand_between(*pair, share) for pair in zip(before, after, strict=True))
     return dataclasses.replace(after, hands=hands)

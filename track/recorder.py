@@ -35,12 +35,12 @@ from track.frames import FARTHEST, LATEST_TIME, StreamedFrame, TrackedFrame
 from track.tracker import Tracker
 from track.user import stored_errors
 
-_SUMMARIZED: Final = 20_000  # most frames that are read for a summary
-_ID_BITS: Final = (1 << 31) - 1  # bits of an ID that takes store
+_SUMMARIZED: Final = 20_000  # largest number of frames read for a summary
+_ID_BITS: Final = (1 << 31) - 1  # bits of IDs in takes
 
 
 class TakeRecorder:
-    """Records tracked frames; `take` gives the take so far at any time."""
+    """Records tracked frames in memory; `take` returns the take so far at any time."""
 
     def __init__(self, tracker: Tracker) -> None:
         self._hands = tracker.hands
@@ -54,19 +54,19 @@ class TakeRecorder:
         return len(self._rows)
 
     def add(self, frame: StreamedFrame, tracked: TrackedFrame) -> None:
-        """Record a frame, unless it stands for a silence of the stream."""
+        """Record a frame, unless it only marks a silence of the stream."""
         if not frame.silent:
             self._rows.append(frame_values(frame, tracked))
 
     def take(self, capture: Capture | None = None) -> Take:
-        """The take so far, with columns and rate of the capture, or with the median rate of a stream."""
+        """The take so far, with columns and rate of the capture, or the median rate of a stream."""
         if not self._rows or (capture is None and len(self._rows) < 2):
             raise CaptureError(f"{len(self._rows)} frames came, expected two or more")
         return Take.of_frames(self._rows, self._hands, self._bodies, capture=capture, settings=self._settings)
 
 
 def settings_of(tracker: Tracker) -> dict[str, Any]:
-    """The entries of a take's settings on the tracker that made it, as JSON."""
+    """Settings that a take records of its tracker, as JSON."""
     known: dict[str, Any] = {"user": tracker.user.notes} if tracker.user.notes else {}
     errors = stored_errors(tracker.user)
     known |= {"angle_errors": errors} if errors else {}
@@ -74,7 +74,7 @@ def settings_of(tracker: Tracker) -> dict[str, Any]:
 
 
 def frame_values(frame: StreamedFrame, tracked: TrackedFrame) -> dict[str, NDArray[Any]]:
-    """A frame's rows of the arrays of a take, by name; arrays of points have N rows."""
+    """A frame's row of each array of a take, by name; arrays of points have N rows."""
     hands, bodies = tracked.hands, tracked.bodies
     poses = [np.concatenate([body.translation, body.rotation]) for body in bodies]
     return {
@@ -98,17 +98,17 @@ def frame_values(frame: StreamedFrame, tracked: TrackedFrame) -> dict[str, NDArr
 class Recorder:
     """Records tracked frames on disk in a `with` block, frame by frame with `add`.
 
-    The end of the block writes the take, also when Ctrl-C ends it. After any other exception the recording
-    stays as it is, in `part`.
+    The end of the block writes the take, also if Ctrl-C ended it. After any other exception the recording is
+    kept in `part`.
 
     Args:
-        path: The take's file, .npz; until its end the recording is beside it.
+        path: File of the take, .npz; the recording grows beside it.
         tracker: The tracker, for its hands, bodies and settings.
-        settings: What else made the take, as JSON.
+        settings: Further settings of the take, as JSON.
 
     Raises:
         ArgumentError: The path does not end in .npz.
-        CaptureError: A recording that was cut off is in the way.
+        CaptureError: An unfinished recording exists already.
         OSError: The file cannot be written.
     """
 
@@ -146,9 +146,9 @@ class Recorder:
         return self._times[1] - self._times[0] if self._times else 0.0
 
     def add(self, frame: StreamedFrame, tracked: TrackedFrame) -> None:
-        """Record a frame, unless it stands for a silence of the stream.
+        """Record a frame, unless it only marks a silence of the stream.
 
-        Points that the tracker leaves out, because they are not finite or very far away, are left out here.
+        Points that the tracker ignores, because they are not finite or very far away, are left out.
 
         Raises:
             ArgumentError: Its time is not after that of the frame before; what was recorded is kept.
@@ -179,9 +179,9 @@ class Recorder:
         self._times = (self._times[0] if self._times else frame.time, frame.time)
 
     def resize(self) -> None:
-        """Note that the tracker's hands have another size from here on; the take has hands of the last one.
+        """Note that the tracker's hands change their size now; the finished take has hands of the last size.
 
-        `sizes` in the settings has all of them, with the frames from which on poses are of that size.
+        `sizes` in the settings lists all sizes with their first frames.
         """
         sizes = self._settings.setdefault("sizes", [[0, self._settings.get("user", "")]])
         self._settings["user"] = self._tracker.user.notes
@@ -189,21 +189,21 @@ class Recorder:
         self._archive.replace_head(self._header(None), worn_arrays(self._tracker.hands, self._tracker.bodies))
 
     def close(self) -> None:
-        """Write what still waits, and close the recording without writing the take."""
+        """Write waiting frames, and close the recording without writing the take."""
         self._closed = True
         self._archive.close()
 
     def finish(
         self, stream: Mapping[str, int] | None = None, *, told: Callable[[], None] = lambda: None
     ) -> tuple[Take, int]:
-        """Write the take, read it back, and remove the recording; of fewer than two frames, remove it only.
+        """Write the take, read it back, and remove the recording; with fewer than two frames only remove it.
 
         Args:
-            stream: What became of the stream's frames (`counts` of `open_source`), for the take's settings.
+            stream: Counts of the stream's frames (`counts` of `open_source`), for the take's settings.
             told: Called after every part.
 
         Returns:
-            The take for a summary, and a step: of a long take it holds the frames of every step-th block.
+            The take for a summary, and a step: of a long take only every step-th block is read.
 
         Raises:
             CaptureError: Fewer than two frames came, or the take cannot be written; then the recording is
@@ -222,7 +222,7 @@ class Recorder:
             step = grown.step_for(_SUMMARIZED)
             take = unpack_take(dict(header), grown.read(step))
             finish_archive(grown, self._out, header, told=told)
-        except Exception as error:  # after any error the recording must be kept
+        except Exception as error:  # keep the recording after any error
             reason = (error.strerror if isinstance(error, OSError) else None) or error
             raise CaptureError(
                 f"{self._out}: cannot be written ({reason}); the recording is kept in {self.part}"
@@ -244,5 +244,5 @@ class Recorder:
             self.close()
         else:
             self.finish()
-        if stop is not None and stop is not error:  # compiled code wrapped it
+        if stop is not None and stop is not error:  # compiled code wrapped the interrupt
             raise stop from error

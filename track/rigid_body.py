@@ -1,9 +1,9 @@
-"""Rigid bodies with markers, tracked beside the hands: labels of their points, and their pose.
+"""Rigid bodies with markers, tracked beside the hands: labels of their points, and their poses.
 
-Labels go from frame to frame by ID. A point with a new ID is assigned where the pose predicts a missing
-marker. A lost body is searched among all points by the distances between its markers. A body of more than
-three markers is initialized from four or more, and tracked by three or more; near its last pose three are
-enough.
+Labels continue from frame to frame by ID. A point with a new ID is assigned if it is where the pose predicts
+a missing marker. A lost body is searched among all points by the distances between its markers. A body with
+more than three markers is initialized with four or more, and tracked with three or more; near its last pose
+three suffice for both.
 """
 
 from __future__ import annotations
@@ -39,37 +39,37 @@ from track.frames import StreamedFrame, capture_frames
 
 GATE: Final = 0.003
 """Largest distance of a labeled point from its marker [m]: ten times the noise of a good system."""
-_TIGHT: Final = 0.001  # [m] largest residual of points that determine the pose, and in a search
-_TIGHTEST: Final = 0.0005  # [m] largest residual in a search that finds three points, which may fit by chance
-_LEAST_WIDTH: Final = 0.005  # [m] RMS distance of the markers from their best line, at least
-_LEAST_MARKER_DISTANCE: Final = 2.0 * GATE  # [m]; markers nearer to each other could exchange labels
-_LONGEST_COAST: Final = 0.026  # [s] without three markers (three frames at 120 Hz), before a body is lost
-_VELOCITY_FITS: Final = 5  # consecutive fits from which the velocity is known
+_TIGHT: Final = 0.001  # [m] largest residual of points that determine a pose, and in a search
+_TIGHTEST: Final = 0.0005  # [m] largest residual in a search that matches three points, maybe by chance
+_LEAST_WIDTH: Final = 0.005  # [m] least RMS distance of the markers from their best line
+_LEAST_MARKER_DISTANCE: Final = 2.0 * GATE  # [m] Closer markers could exchange labels.
+_LONGEST_COAST: Final = 0.026  # [s] longest prediction (three frames at 120 Hz) without three markers
+_VELOCITY_FITS: Final = 5  # The velocity is known after this many consecutive fits.
 _VELOCITY_SMOOTHING: Final = 0.4  # weight of the newest velocity; fits to three markers are noisy
-_LONGEST_PREDICTION: Final = 0.25  # [s] without a fit, after which the body may be anywhere
-_FIRST_RADIUS, _MOST_SPEED = 0.005, 1.5  # [m], [m/s]: search radius without a known velocity
-_RADIUS, _MOST_ACCELERATION = 0.002, 30.0  # [m], [m/s^2]: search radius with one
-_CONFIDENT_RADIUS: Final = 0.03  # [m]: search radius within which three markers are accepted at once
-_MOST_CANDIDATE_MOTION: Final = 0.02  # [m] per frame that a candidate may move before it is accepted
-_MOST_SEARCHED_POINTS: Final = 250  # in a search: some 30 ms, which grows with their third power
+_LONGEST_PREDICTION: Final = 0.25  # [s] A body without a fit for longer may be anywhere.
+_FIRST_RADIUS, _MOST_SPEED = 0.005, 1.5  # [m], [m/s]: search radius with unknown velocity
+_RADIUS, _MOST_ACCELERATION = 0.002, 30.0  # [m], [m/s^2]: search radius with known velocity
+_CONFIDENT_RADIUS: Final = 0.03  # [m] largest search radius in which three markers suffice
+_MOST_CANDIDATE_MOTION: Final = 0.02  # [m] largest motion per frame of an unconfirmed candidate
+_MOST_SEARCHED_POINTS: Final = 250  # largest number of points in a search: 30 ms, cubic in it
 SUFFIX: Final = ".toml"
 _EXPECTED: Final = "RigidTemplates, names of handsim's objects, or paths of .toml files"
 _BODY_KEYS: Final = ("name", "description", "marker")
 _MARKER_KEYS: Final = ("name", "place_mm")
 _MOST_LEARNED_MARKERS: Final = 20
-_COUNT_QUANTILE: Final = 0.9  # of the frames' numbers of points: the body's number of markers
-_TEMPLATE_CANDIDATES: Final = 5  # frames that are tried as the first template
+_COUNT_QUANTILE: Final = 0.9  # quantile of the frames' numbers of points that gives the number of markers
+_TEMPLATE_CANDIDATES: Final = 5  # number of frames tried as first template
 _AVERAGING_ROUNDS: Final = 3  # rounds of averaging the markers over all frames
-_LEAST_SEEN_SHARE: Final = 0.5  # least share of the body's frames in which a marker is seen
-_LEAST_LABELED_SHARE: Final = 0.8  # least share of all points that are the body's
+_LEAST_SEEN_SHARE: Final = 0.5  # A marker must be seen in this share of the body's frames.
+_LEAST_LABELED_SHARE: Final = 0.8  # This share of all points must be the body's.
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RigidTemplate(RigidBody):
-    """A rigid body whose markers determine its pose: the markers in its own frame.
+    """A rigid body whose markers, in its own frame, determine its pose.
 
     Raises:
-        ArgumentError: `positions` have another shape, or do not tell the body's pose.
+        ArgumentError: `positions` have another shape, or do not determine the pose.
     """
 
     def __post_init__(self) -> None:
@@ -81,10 +81,10 @@ class RigidTemplate(RigidBody):
 
     @classmethod
     def of(cls, thing: RigidObject) -> RigidTemplate:
-        """The markers of an object.
+        """A template with the markers of an object.
 
         Raises:
-            ArgumentError: They do not make a rigid body; most objects carry too few.
+            ArgumentError: They do not make a trackable rigid body; most objects carry too few.
         """
         return cls(thing.name, thing.marker_names, thing.markers)
 
@@ -95,7 +95,7 @@ class RigidTemplate(RigidBody):
         return distances
 
     def _fault(self) -> str | None:
-        """Why these markers are not a body that can be tracked; None if they are."""
+        """Why these markers cannot be tracked as a rigid body; None if they can."""
         positions, marker_names = self.positions, self.marker_names
         if len(positions) < FEWEST:
             return f"{len(positions)} markers, expected at least {FEWEST}, which determine a pose"
@@ -123,10 +123,10 @@ class RigidTemplate(RigidBody):
 
 
 def _symmetry(positions: NDArray[np.float64], distances: NDArray[np.float64]) -> tuple[int, ...] | None:
-    """Another order of all markers that fits the body after a rotation, if there is one."""
+    """Another order of all markers that fits the body after a rotation; None if there is none."""
     count = len(positions)
     orders: list[tuple[int, ...]] = [()]
-    for marker in range(count):  # orders that keep all distances so far
+    for marker in range(count):  # Keep the orders that preserve all distances so far.
         orders = [
             (*order, to)
             for order in orders
@@ -137,7 +137,7 @@ def _symmetry(positions: NDArray[np.float64], distances: NDArray[np.float64]) ->
     for order in orders:
         if order != tuple(range(count)):
             agree, _ = fit_inliers(positions, positions, np.array(order), np.empty(7), _TIGHT, _TIGHT)
-            if agree == count:  # rotated, not mirrored
+            if agree == count:  # a rotation, not a reflection
                 return order
     return None
 
@@ -147,19 +147,19 @@ class BodyFrame:
     """Status, pose and labels of a body in one frame."""
 
     status: Status
-    """`found` in the first frame after it was lost, `tracked` from then on, `coasting` for a few frames where
-    fewer than three markers are seen and the pose is a prediction, `lost`."""
-    T_world_body: Float[np.ndarray, "4 4"] | None  # the body's frame in the world [m]; None when lost
+    """`found` in the first frame after being lost, then `tracked`; `coasting` for a few frames with fewer
+    than three seen markers and a predicted pose; `lost`."""
+    T_world_body: Float[np.ndarray, "4 4"] | None  # None when lost; translation in [m]
     labels: Int[np.ndarray, "N"]  # index of each point's marker in the template, -1 for all others
-    rms: float  # RMS distance of the labeled points from their markers [m]; NaN without any
+    rms: float  # RMS distance of the labeled points from their markers [m]; NaN without labeled points
 
 
 class _Match(NamedTuple):
-    """Points that are a body's markers."""
+    """Points matched to a body's markers."""
 
-    num_points: int  # 0 where there is no unique match
+    num_points: int  # 0 if there is no unique match
     rms: float  # their RMS distance from the markers [m]
-    pose: NDArray[np.float64]  # of the body (7,)
+    pose: NDArray[np.float64]  # pose of the body (7,)
     assignment: NDArray[np.int64]  # index of each marker's point, -1 for none
 
 
@@ -170,14 +170,14 @@ class BodyTracker:
         self.template = template
         self._positions, self._distances = template.positions, template.distances
         self._reset()
-        for number in range(18):  # loads all kernels before the first frame of a stream
+        for number in range(18):  # Compile or load all kernels before the stream's first frame.
             there = self._positions if number < 17 else self._positions[:0]
             self.step(there, np.arange(len(there)), number / 120.0)
         self._reset()
 
     def step(self, points: Float[np.ndarray, "N 3"], ids: Int[np.ndarray, "N"], time: float) -> BodyFrame:
         """Track the body among the finite points of the next frame."""
-        # Copies, because a kernel is compiled anew for arrays that are read-only or not contiguous.
+        # Copy, because read-only or non-contiguous arrays would compile a kernel anew.
         points, ids = np.array(points, dtype=np.float64, order="C"), np.array(ids, dtype=np.int64)
         elapsed = time - self._time
         if self._status != Status.LOST:
@@ -189,7 +189,7 @@ class BodyTracker:
 
     def _reset(self) -> None:
         self._pose, self._velocity, self._time = np.full(7, np.nan), np.zeros(6), -np.inf  # of the last fit
-        self._most_markers, self._fits = 0, 0  # since initialization: most markers in one fit, number of fits
+        self._most_markers, self._fits = 0, 0  # since initialization: most markers in a fit, fits
         self._lose()
 
     def _lose(self) -> None:
@@ -200,7 +200,7 @@ class BodyTracker:
     def _track(
         self, points: NDArray[np.float64], ids: NDArray[np.int64], time: float, elapsed: float
     ) -> BodyFrame | None:
-        """The body by the IDs of its points, or near its predicted pose."""
+        """Track the body by the IDs of its points, or near its predicted pose; None if that fails."""
         pose, assignment = self._no_match
         count, rms = track_by_ids(
             self._positions, points, ids, self._last_ids, pose, _TIGHT, GATE, assignment
@@ -211,21 +211,21 @@ class BodyTracker:
         if match.num_points < FEWEST:
             return None
         if max(self._most_markers, match.num_points) <= FEWEST < len(self._positions):
-            # Three points may match three markers by chance: a larger match elsewhere is the body.
+            # Three points may match three markers by chance: a larger match elsewhere is right.
             other = self._match(points)
             if other.num_points > FEWEST:
                 return self._accept(Status.INITIALIZED, other, ids, time)
         return self._accept(Status.TRACKED, match, ids, time)
 
     def _coast(self, points: NDArray[np.float64], ids: NDArray[np.int64], elapsed: float) -> BodyFrame | None:
-        """The body at its predicted pose, for `_LONGEST_COAST` seconds at most."""
+        """Predict the body's pose, for at most `_LONGEST_COAST` seconds; None after that."""
         if not 0.0 < elapsed <= _LONGEST_COAST or self._fits < _VELOCITY_FITS:
             return None
         pose = self._predict(elapsed)
         there = (self._last_ids[:, None] == ids) & (ids >= 0)
         assignment, rms = np.where(there.any(axis=1), there.argmax(axis=1) if len(ids) else -1, -1), np.nan
         seen = np.flatnonzero(assignment >= 0)
-        if len(seen):  # one or two points shift the body, if they agree with its pose
+        if len(seen):  # One or two points shift the body if they agree with its pose.
             off = points[assignment[seen]] - transform_markers(self._positions, pose)[seen]
             shift = off.mean(axis=0)
             distances = np.linalg.norm(off - shift, axis=1)
@@ -240,7 +240,7 @@ class BodyTracker:
     def _initialize(
         self, points: NDArray[np.float64], ids: NDArray[np.int64], time: float, elapsed: float
     ) -> BodyFrame:
-        """The body near its predicted pose, or anywhere."""
+        """Search the body near its predicted pose, then anywhere."""
         if 0.0 < elapsed <= _LONGEST_PREDICTION:
             radius = self._search_radius(elapsed)
             match = self._match(points, self._predict(elapsed), radius)
@@ -260,11 +260,11 @@ class BodyTracker:
         return BodyFrame(Status.LOST, None, np.full(len(points), -1), np.nan)
 
     def _predict(self, elapsed: float) -> NDArray[np.float64]:
-        """The pose after some time [s] at constant velocity."""
+        """Predict the pose after some time [s] with constant velocity."""
         return move(self._pose[None], elapsed * self._velocity[None])[0]  # type: ignore[no-any-return]
 
     def _search_radius(self, elapsed: float) -> float:
-        """Largest distance of a marker from its predicted position [m]."""
+        """Largest expected distance of a marker from its predicted position [m]."""
         if self._fits < _VELOCITY_FITS:
             return _FIRST_RADIUS + _MOST_SPEED * elapsed
         return _RADIUS + 0.5 * _MOST_ACCELERATION * elapsed**2
@@ -272,7 +272,7 @@ class BodyTracker:
     def _match(
         self, points: NDArray[np.float64], near: NDArray[np.float64] | None = None, radius: float = np.inf
     ) -> _Match:
-        """The unique match of the markers within a radius of a pose, or anywhere."""
+        """The unique match of the markers, within a radius [m] of a pose or anywhere."""
         pose, assignment = self._no_match
         expected = self._positions if near is None else transform_markers(self._positions, near)
         if len(points) > _MOST_SEARCHED_POINTS:
@@ -289,11 +289,11 @@ class BodyTracker:
 
     @property
     def _no_match(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """A pose and an assignment to be filled."""
+        """Buffers for a pose and an assignment."""
         return np.empty(7), np.full(len(self._positions), -1)
 
     def _accept(self, status: Status, match: _Match, ids: NDArray[np.int64], time: float) -> BodyFrame:
-        """Update pose and velocity by a fit."""
+        """Update pose and velocity from a fit."""
         elapsed = time - self._time
         if status == Status.INITIALIZED:
             self._velocity, self._most_markers, self._fits = np.zeros(6), 0, 0
@@ -306,7 +306,7 @@ class BodyTracker:
         return self._result(match, ids)
 
     def _result(self, match: _Match, ids: NDArray[np.int64]) -> BodyFrame:
-        """The result of a fit; the IDs are kept for the next frame."""
+        """The result of a fit; stores the IDs for the next frame."""
         seen, labels = np.flatnonzero(match.assignment >= 0), np.full(len(ids), -1)
         labels[match.assignment[seen]] = seen
         self._last_ids[:] = -1
@@ -318,10 +318,10 @@ class BodyTracker:
 
 
 def _frames_to_confirm(count: int, markers: int) -> float:
-    """Frames that a match of `count` markers must last before it is accepted without a pose."""
+    """Number of frames in which a match of `count` markers must persist before it is accepted."""
     # Three markers of a larger body are never accepted: markers on the back of a hand keep their distances
-    # for minutes, and in up to one of twenty frames some three markers of two hands match three of an object.
-    # Four match in one of a thousand.
+    # for minutes, and in up to 5 % of the frames some three markers of two hands match three of an object.
+    # Four markers match in 0.1 %.
     if count == FEWEST:
         return 10 if markers == FEWEST else np.inf
     return 2 if count == FEWEST + 1 < markers else 1
@@ -332,11 +332,11 @@ AnyBody = RigidTemplate | str | Path
 
 
 class BodyError(HandSimError):
-    """A body's file that cannot be read or written."""
+    """A body's file cannot be read or written."""
 
 
 def load_body(name_or_path: AnyBody) -> RigidTemplate:
-    """A body as it is, or the markers of handsim's object or `.toml` file of this name."""
+    """Return a body as it is, or load handsim's object or the `.toml` file of this name."""
     check_type("body", name_or_path, (RigidTemplate, str, Path), _EXPECTED)
     if isinstance(name_or_path, RigidTemplate):
         return name_or_path
@@ -353,7 +353,7 @@ def load_body(name_or_path: AnyBody) -> RigidTemplate:
 
 
 def load_bodies(names_or_paths: AnyBody | Iterable[AnyBody]) -> tuple[RigidTemplate, ...]:
-    """Bodies that are tracked together, or one."""
+    """Load one or several bodies with different names."""
     if isinstance(names_or_paths, AnyBody):
         names_or_paths = (names_or_paths,)
     check_type("bodies", names_or_paths, Iterable, _EXPECTED)
@@ -372,7 +372,7 @@ def load_bodies(names_or_paths: AnyBody | Iterable[AnyBody]) -> tuple[RigidTempl
 
 
 def save_body(path: str | Path, body: RigidTemplate) -> None:
-    """Write a body as TOML, numbers to nine decimals; `load_body` gives the same body again."""
+    """Write a body as TOML with nine decimals; `load_body` reads the same body again."""
     lines = [f"name = {quoted(body.name)}"]
     for name, position in zip(body.marker_names, 1e3 * body.positions, strict=True):
         numbers_mm = ", ".join(written(value) for value in position.tolist())
@@ -400,14 +400,14 @@ def _parse_marker(table: Mapping[str, object], number: int) -> tuple[str, list[f
 
 
 def _printable(what: str, name: str) -> str:
-    """A name that marker files can hold."""
+    """Check that marker files can hold a name."""
     if not name or name != name.strip() or not name.isprintable():
         raise ArgumentError(f"{what} {name!r}: expected printable characters without outer blanks")
     return name
 
 
 def learn_body(capture: Capture, name: str) -> RigidTemplate:
-    """The markers of a body from a capture of it; the origin of its frame is the mean of its markers."""
+    """Learn the markers of a body from a capture of it alone; its origin is the mean of its markers."""
     frames = list(capture_frames(capture))
     check_unit([frame.points for frame in frames])
     counts = np.array([len(frame.points) for frame in frames])
@@ -428,7 +428,7 @@ def learn_body(capture: Capture, name: str) -> RigidTemplate:
 def _best_template(
     name: str, frames: Sequence[StreamedFrame], counts: NDArray[np.int64]
 ) -> tuple[RigidTemplate, list[BodyFrame]]:
-    """Of several frames' points the template that labels most points, and its track through all frames."""
+    """The template, among those of several frames, that labels most points, and its track."""
     count = int(np.quantile(counts, _COUNT_QUANTILE, method="lower"))
     if not 3 <= count <= _MOST_LEARNED_MARKERS:
         raise CalibrationError(
@@ -451,7 +451,7 @@ def _best_template(
 
 
 def _template(name: str, positions: NDArray[np.float64]) -> RigidTemplate:
-    """A body of markers at these positions (Q, 3) [m], moved to its own frame."""
+    """A body with markers at these positions (Q, 3) [m], its origin moved to their mean."""
     names = tuple(f"Marker{number + 1}" for number in range(len(positions)))
     try:
         return RigidTemplate(name, names, positions - positions.mean(axis=0))

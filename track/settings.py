@@ -1,4 +1,4 @@
-"""Settings of labeling, tracking and calibration, and the hands, labeler and bodies that they name."""
+"""Settings of labeling, tracking and calibration, and the tracker setup that they describe."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ AnyHands = User | Sequence[GloveFit] | Sequence[Side] | str | Path
 """A user, hands in their gloves, or the path of a user's file; or sides, whose hands are to be measured."""
 USUAL_GLOVE: Final = "dense19"
 USUAL_SIZE: Final = "M"
-"""The size of hands that could not be measured."""
+"""Size of hands that could not be measured."""
 _HANDS: Final = "a User, GloveFits, the path of a user's file, or sides"
-_SHOWN: Final = 0.8  # share of one hand's markers in a frame in which its size can be measured
+_SHOWN: Final = 0.8  # A frame can measure a hand if it has points for this share of its markers.
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,8 +44,8 @@ class LabelSettings(Settings):
     hands: AnyHands | None = None
     """A user, hands in their gloves or the path of a user's file; or sides, those of the glove when None."""
     size: Size = "auto"
-    """Size of hands of which only the sides are given: XS, S, M, L, XL, or auto, which measures it, and the
-    proportions, in the capture."""
+    """Size of hands given by sides alone: XS, S, M, L, XL, or auto, which measures size and proportions in
+    the capture."""
     labeler: AnyLabeler = None
     """A labeler, or what `load_labeler` reads; that of the glove when None."""
 
@@ -67,16 +67,16 @@ class TrackSettings(LabelSettings):
     bodies: Sequence[AnyBody] = ()
     """Rigid bodies beside the hands: templates, names of handsim's objects, or .toml files."""
     calibrate: bool = False
-    """Whether to track twice: hands are calibrated on the first take, as `track.calibrate` does it, and the
-    second is made with those that fit better so."""
+    """Whether to track twice: hands are calibrated on the first take, as `track.calibrate` does, and the
+    second take uses those hands that fit better after it."""
     smooth: bool = True
-    """Whether the poses of a file are solved over all of its time, forward and backward. Those of a stream
-    are solved frame by frame."""
+    """Whether the poses of a file are solved over its whole time, forward and backward. Those of a stream are
+    solved frame by frame."""
     tracker: TrackerConfig = field(default_factory=TrackerConfig)
     """Settings of the tracker itself, distances in [m] and times in [s]."""
 
     def record(self) -> dict[str, Any]:
-        """Itself as JSON: objects by their names, hands in their gloves by their sides."""
+        """The settings as JSON: objects by their names, hands in their gloves by their sides."""
         record, hands, labeler = Settings.record(self), self.hands, self.labeler
         if not isinstance(hands, str | Path):
             record["hands"] = [hand.side if isinstance(hand, GloveFit) else str(hand) for hand in hands]
@@ -87,22 +87,22 @@ class TrackSettings(LabelSettings):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrackerSetup:
-    """Everything that a tracker needs: what settings name, as objects."""
+    """Everything that a tracker needs, as objects."""
 
     user: User
-    """The hands; of the usual size where they are still to be measured."""
+    """The hands; of the usual size until they are measured."""
     is_auto: bool
-    """Whether the hands are measured in the capture or stream."""
+    """Whether the hands are to be measured in the capture or stream."""
     labeler: Labeler
     """Labeler of their glove."""
     bodies: tuple[RigidTemplate, ...]
     config: TrackerConfig
     settings: dict[str, Any]
-    """What makes a take, as JSON."""
+    """Settings that a take records, as JSON."""
 
     @classmethod
     def of(cls, settings: LabelSettings) -> Self:
-        """The setup that settings name."""
+        """Load what the settings name."""
         user, is_auto = _chosen_user(settings)
         tracking = settings if isinstance(settings, TrackSettings) else TrackSettings()
         bodies, config = load_bodies(tracking.bodies), tracking.tracker
@@ -112,18 +112,18 @@ class TrackerSetup:
 
     @property
     def fewest_points(self) -> float:
-        """Points of a frame in which hands can be measured."""
+        """Number of points of a frame from which hands can be measured."""
         return _SHOWN * self.user.layout.num_markers
 
     @property
     def start(self) -> tuple[GloveFit, ...]:
-        """The hands that a calibration begins with; measured ones in the glove as it was designed."""
+        """Hands that a calibration starts from; measured hands have the glove as designed."""
         if not self.is_auto:
             return self.user.hands
         return tuple(settle_glove(hand.layout, hand.model) for hand in self.user)
 
     def measured(self, frames: Sequence[StreamedFrame], *, warns: bool = True) -> TrackerSetup:
-        """The setup with the hands as measured in some frames, if they are to be measured."""
+        """Measure the hands in some frames, if their size is automatic, and check that they fit."""
         check_scale(frames, self.user, self.labeler)
         user, is_named = self.user, self.user.notes in get_args(Size)
         if self.is_auto:
@@ -141,7 +141,7 @@ class TrackerSetup:
 
 
 def _chosen_user(settings: LabelSettings) -> tuple[User, bool]:
-    """The hands that settings name, and whether they are to be measured; see `TrackerSetup.of` for errors."""
+    """The hands that the settings describe, and whether they are to be measured."""
     hands = settings.hands
     layout = None if settings.glove is None else load_layout(settings.glove)
     check_type("hands", hands, (Sequence, Path, type(None)), _HANDS)

@@ -1,6 +1,6 @@
-"""Live output: sinks take tracked frames to other programs as they are made.
+"""Live output: sinks send tracked frames to other programs immediately.
 
-An address names a sink, see `VALID`. Each frame goes to all sinks. A failing sink does not stop the tracker.
+An address selects a sink, see `VALID`. Each frame goes to all sinks. A failing one does not stop the tracker.
 """
 
 from __future__ import annotations
@@ -48,11 +48,11 @@ from track.rigid_body import RigidTemplate
 from track.streams import split_address
 
 VALID: Final = (*(f"{one}://host:port" for one in ("osc", "udp", "ws", "tcp")), "lsl:NAME", "module:name")
-"""What an address may be."""
+"""Valid forms of an address."""
 GROUP: Final = "handsim.sinks"
-"""Entry points of packages that bring sinks."""
+"""Entry points of packages that provide sinks."""
 STATUSES: Final = tuple(reversed(Status))
-"""Values of a status channel of LSL are indices of these."""
+"""A status channel of LSL holds an index into these."""
 _METHODS: Final = (("send", "close"), "the methods send and close of a sink")
 _YES: Final = ("no", "yes")  # valid values of an option
 _AXES: Final = {"axes": (WORLD, *PROGRAMS), "up": ("z", "y"), "unit": ("auto", "m", "cm"), "velocities": _YES}
@@ -65,19 +65,19 @@ _OPTIONS: Final[Mapping[str, Mapping[str, tuple[str, ...]]]] = {
     "ws": {**_DOCUMENTS, "every": _YES},
 }
 _RESERVED: Final = re.compile(r"[^!-~]|[#*,/?\[\]{}]")  # not allowed in a part of an OSC address
-_BUNDLE_HEAD, _BUNDLE_ENTRY = 16, 4  # sizes of what an OSC bundle begins with, and each message in it [bytes]
+_BUNDLE_HEAD, _BUNDLE_ENTRY = 16, 4  # [bytes] overhead of an OSC bundle and of each message in it
 _LARGEST_INTEGER: Final = 0x7FFFFFFF  # largest integer of an OSC message
-_HEADER_PERIOD: Final = 1.0  # time after which the header is sent again, for receivers that came late [s]
-_WAITING: Final = 256  # largest number of frames that wait for a client that wants every frame
-_UNCONFIRMED: Final = 0.05  # A client that has not confirmed a frame for this time [s] gets no other one.
-_TELL: Final = 1.0  # least time between two messages on a client's lag, and between two headers [s]
-_ON_REQUEST: Final = "/newest"  # path of clients that ask for each frame
-_FLUSHED: Final = 0.01  # time between two looks whether clients have read what was left [s]
-_SEND_BUFFER: Final = 1 << 17  # size of the system's buffer for each client [bytes]
-_LARGEST: Final = 1 << 10  # largest size of a client's message, which is ignored [bytes]
-_FLUSH: Final = 1.0  # time for clients to read waiting frames at the end [s]
+_HEADER_PERIOD: Final = 1.0  # [s] The header is repeated after this time for receivers that came late.
+_WAITING: Final = 256  # largest number of frames waiting for a client that wants every frame
+_UNCONFIRMED: Final = 0.05  # [s] A client with a frame unconfirmed for longer gets no other one.
+_TELL: Final = 1.0  # [s] least time between two reports of a client's lag, or two headers
+_ON_REQUEST: Final = "/newest"  # path for clients that request each frame
+_FLUSHED: Final = 0.01  # [s] interval of checks whether clients have read what waits
+_SEND_BUFFER: Final = 1 << 17  # [bytes] size of the system's send buffer for each client
+_LARGEST: Final = 1 << 10  # [bytes] largest message of a client; its content is ignored
+_FLUSH: Final = 1.0  # [s] time for clients to read waiting frames at the end
 _OWN_PAGES: Final = re.compile(r"https?://(localhost|127\.0\.0\.1|\[::1\])(:\d+)?")
-"""Pages of this machine; any other page in its browser is refused."""
+"""Pages from this machine; the sink refuses other pages in its browsers."""
 _XYZ: Final = ("x", "y", "z")
 _POSE: Final = (*[(f"position_{axis}", "meters") for axis in _XYZ], *[(f"rotation_{c}", "") for c in "wxyz"])
 
@@ -89,7 +89,7 @@ class SinkGroup(Closing):
     """Sends frames to sinks; the end of a `with` block closes them.
 
     Args:
-        sinks: The sinks by the addresses that opened them.
+        sinks: The sinks, by the addresses that opened them.
     """
 
     def __init__(self, sinks: Mapping[str, LiveSink]) -> None:
@@ -98,11 +98,11 @@ class SinkGroup(Closing):
         self._sent = 0
 
     def __bool__(self) -> bool:
-        """Whether there are any."""
+        """Whether any sink is open."""
         return bool(self._sinks)
 
     def start(self, hands: Sequence[GloveFit], bodies: Sequence[RigidTemplate]) -> None:
-        """Take on a tracker's hands and bodies; nothing is sent before."""
+        """Set the tracker's hands and bodies; nothing is sent before this call."""
         self._encoder = MessageEncoder(hands, bodies)
 
     def send(self, frame: StreamedFrame, tracked: TrackedFrame) -> None:
@@ -114,17 +114,17 @@ class SinkGroup(Closing):
         for address, sink in list(self._sinks.items()):
             try:
                 sink.send(message)
-            except Exception as error:  # the user's code may raise anything; the recording goes on
+            except Exception as error:  # A user's sink may raise anything; recording goes on.
                 _warn(f"{address} failed and gets no further frame", error)
                 self._close(address)
 
     @property
     def counts(self) -> dict[str, int]:
-        """Frames that each sink has dropped, by its address."""
+        """Number of frames that each sink has dropped, by address."""
         return {address: getattr(sink, "dropped", 0) for address, sink in self._all.items()}
 
     def notes(self) -> tuple[str, ...]:
-        """What to print at the end, one line each."""
+        """Lines to print at the end."""
         sent = [f"{self._sent} frames sent to {', '.join(self._sinks)}"] if self._sinks and self._sent else []
         dropped = [f"{address}: {count} frames dropped" for address, count in self.counts.items() if count]
         told = [f"{at}: {note}" for at, sink in self._all.items() if (note := getattr(sink, "note", ""))]
@@ -138,7 +138,7 @@ class SinkGroup(Closing):
     def _close(self, address: str) -> None:
         try:
             self._sinks.pop(address).close()
-        except Exception as error:  # the user's code may raise anything
+        except Exception as error:  # A user's sink may raise anything.
             _warn(f"{address} could not be closed", error)
 
 
@@ -147,11 +147,11 @@ def _warn(what: str, error: Exception) -> None:
 
 
 def open_sinks(addresses: str | LiveSink | Sequence[str | LiveSink]) -> SinkGroup:
-    """Open a sink for each address, which gets positions in [m] and angles in [rad].
+    """Open a sink for each address; sinks receive positions in [m] and angles in [rad].
 
     Args:
-        addresses: One, or several, each as in `VALID`, with the options of docs/live_output.md. A sink of
-            your own may be given as an object.
+        addresses: One or several, each as in `VALID`, with the options of docs/live_output.md. A sink of your
+            own may be given as an object.
 
     Raises:
         ArgumentError: An address is invalid or is given twice, a package is missing, or a port is taken.
@@ -173,7 +173,7 @@ def open_sinks(addresses: str | LiveSink | Sequence[str | LiveSink]) -> SinkGrou
 
 
 def open_sink(address: str) -> LiveSink:
-    """Open the sink that an address names, see `open_sinks`."""
+    """Open the sink of one address, see `open_sinks`."""
     scheme, _, rest = address.partition(":")
     if scheme in _OPTIONS and rest.startswith("//"):
         serves = scheme in ("ws", "tcp")
@@ -205,29 +205,29 @@ def open_sink(address: str) -> LiveSink:
 
 
 class DatagramSink:
-    """Sends each frame as UDP datagrams, and the header every second; it drops them rather than wait."""
+    """Sends each frame as UDP datagrams, and the header every second; drops datagrams instead of waiting."""
 
     def __init__(self, host: str, port: int, format: MessageFormat) -> None:
         try:
             family, kind, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
             self._socket = socket.socket(family, kind)
-            self._socket.connect(address)  # so that the system tells when nobody listens at a port
+            self._socket.connect(address)  # so that the system reports if nobody listens at the port
         except OSError as error:
             raise ArgumentError(f"host '{host}' cannot be sent to ({error.strerror or error})") from error
         self._socket.setblocking(False)
         self._format, self._due = format, 0.0
         self.dropped = self.refused = self.sent = 0
-        """Numbers of datagrams that were not sent, that came back because nobody listened, and of all."""
+        """Numbers of datagrams: not sent, refused because nobody listened, and all."""
 
     @property
     def note(self) -> str:
-        """Whether somebody listened, as far as that is known."""
+        """Whether anybody listened, as far as UDP reports it."""
         if self.refused:
             return f"nobody listened to {self.refused} of {self.sent} datagrams"
         return "UDP does not tell whether anybody listened"
 
     def send(self, message: LiveMessage) -> None:
-        """Send a frame, after the header if that is due."""
+        """Send a frame, and before it the header if it is due."""
         now = time.monotonic()
         if now >= self._due:
             self._due = now + _HEADER_PERIOD
@@ -235,7 +235,7 @@ class DatagramSink:
         self._put(self._format.frame(message))
 
     def close(self) -> None:
-        """Send the end, and close the socket."""
+        """Send the end message, and close the socket."""
         self._put(self._format.end())
         self._socket.close()
 
@@ -245,15 +245,15 @@ class DatagramSink:
             try:
                 try:
                     self._socket.send(datagram)
-                except ConnectionRefusedError:  # of an earlier one; this one was not sent
+                except ConnectionRefusedError:  # The error is of an earlier datagram; this one was not sent.
                     self.refused += 1
                     self._socket.send(datagram)
-            except OSError:  # the buffer is full, the network is down, or the datagram is too large
+            except OSError:  # full buffer, broken network or too large a datagram
                 self.dropped += 1
 
 
 def osc_format(content: Content = Content()) -> MessageFormat:  # noqa: B008 (immutable)
-    """Messages as bundles of Open Sound Control 1.0; docs/live_output.md lists their addresses."""
+    """Messages as bundles of Open Sound Control 1.0; docs/live_output.md lists the addresses."""
     program = content.program
     messages: Any = import_extra("pythonosc.osc_message_builder", "osc://", "send")
     bundles: Any = import_extra("pythonosc.osc_bundle_builder", "osc://", "send")
@@ -266,7 +266,7 @@ def osc_format(content: Content = Content()) -> MessageFormat:  # noqa: B008 (im
         return message.build()
 
     def divided(contents: Iterable[_Content]) -> list[bytes]:
-        """Bundles that fit into packets, each of which begins with the first message."""
+        """Bundles that fit into packets; each begins with the first message."""
         first, *others = map(built, contents)
         made, room = [], 0
         for message in others or [first]:
@@ -289,7 +289,7 @@ def osc_format(content: Content = Content()) -> MessageFormat:  # noqa: B008 (im
 
 
 def _osc_header(header: LiveHeader) -> Iterator[_Content]:
-    """The messages of a header: names, in the order of the numbers in frames."""
+    """Messages of the header: names in the order of the numbers in frames."""
     yield "/handsim/schema", "i", [SCHEMA]
     yield _strings("/handsim/sides", header.sides)
     yield _strings("/handsim/angles", header.angles)
@@ -298,7 +298,7 @@ def _osc_header(header: LiveHeader) -> Iterator[_Content]:
 
 
 def _osc_frame(message: LiveMessage, content: Content) -> Iterator[_Content]:
-    """The messages of a frame; a hand or body without a pose only has a status."""
+    """Messages of a frame; a hand or body without a pose has only a status."""
     yield "/handsim/frame", "idi", [message.number & _LARGEST_INTEGER, message.time, int(message.silent)]
     for name, seconds in (("lag", message.lag), ("latency", message.latency)):
         if not math.isnan(seconds):
@@ -321,7 +321,7 @@ def _osc_frame(message: LiveMessage, content: Content) -> Iterator[_Content]:
 
 
 def _part(name: str) -> str:
-    """A name as a part of an OSC address."""
+    """Make a name valid as a part of an OSC address."""
     return _RESERVED.sub("_", name)
 
 
@@ -335,7 +335,7 @@ def _strings(address: str, values: Sequence[str]) -> _Content:
 
 
 _Channel = tuple[str, str, str]
-"""Label, unit and kind of one number of a sample of LSL."""
+"""Label, unit and kind of one channel of an LSL stream."""
 
 
 class LabStreamingSink:
@@ -347,7 +347,7 @@ class LabStreamingSink:
         self._outlet: Any = None
 
     def send(self, message: LiveMessage) -> None:
-        """Push a sample; the first one opens the stream, whose channels depend on the hands."""
+        """Push a sample; the first one opens the stream, whose channels depend on the header."""
         if self._outlet is None:
             self._outlet = self._open(message.header)
         self._outlet.push_sample(sample_of(message).tolist())
@@ -364,7 +364,7 @@ class LabStreamingSink:
             len(channels),
             self._lsl.IRREGULAR_RATE,
             self._lsl.cf_double64,
-            f"handsim:{self._name}",  # clients find the stream by this ID after a restart
+            f"handsim:{self._name}",  # Clients find the stream again by this ID.
         )
         description = info.desc()
         description.append_child_value("manufacturer", "handsim")
@@ -395,7 +395,7 @@ def channels_of(header: LiveHeader) -> Iterator[_Channel]:
 
 
 def _pose_channels(status: str, name: str) -> Iterator[_Channel]:
-    """Status, position and orientation, with the kinds of XDF's motion capture such as PositionX."""
+    """Channels of status, position and orientation, with XDF's kinds of motion capture, as PositionX."""
     yield (status, "", "Status")
     for label, unit in _POSE:
         what, _, axis = label.partition("_")
@@ -416,14 +416,14 @@ def sample_of(message: LiveMessage) -> np.ndarray:
 
 
 class WebSocketSink:
-    """Serves messages to any number of WebSocket clients from a thread of its own; port 0 is any free one.
+    """Serves messages to any number of WebSocket clients from its own thread; port 0 selects a free port.
 
-    A client gets the header, once more when hands have another size and something in it is different, and the
-    newest frame as soon as it has taken the one before. It confirms what
-    it took by the protocol's pongs, which its library sends. A client of the path /newest gets one frame for
-    each message that it sends. With `every` all frames wait for a client, and 256 at most. A slow client
-    loses frames, is told how far it is behind, and delays nobody. A loopback address serves pages of this
-    machine and other programs; another address serves everybody.
+    A client receives the header, again when the hands change their size and thus the header, and the newest
+    frame as soon as it has read the one before, which its WebSocket library confirms by a pong. A client
+    of the path /newest gets one frame for each message that it sends. With `every` all frames wait for a
+    client, at most 256. A slow client loses frames, receives its lag, and delays nobody. A sink at a
+    loopback address serves pages of this machine and other programs; one at another address serves
+    everybody.
     """
 
     def __init__(self, host: str, port: int, format: MessageFormat, *, every: bool = False) -> None:
@@ -434,10 +434,10 @@ class WebSocketSink:
         self._origins = [None, _OWN_PAGES] if ipaddress.ip_address(address[0]).is_loopback else None
         self.port: int = address[1]
         self.dropped = 0
-        """Number of frames that were dropped for slow clients."""
+        """Number of frames dropped for slow clients."""
         self._header = b""
-        self._described: LiveHeader | None = None  # in it
-        self._clients: dict[_Client, Any] = {}  # and their connections
+        self._described: LiveHeader | None = None  # the header encoded in `_header`
+        self._clients: dict[_Client, Any] = {}  # clients with their connections
         self._loop = asyncio.new_event_loop()
         self._ending, self._ready = asyncio.Event(), threading.Event()
         self._thread = threading.Thread(target=self._run, name="websocket server", daemon=True)
@@ -446,11 +446,11 @@ class WebSocketSink:
 
     @property
     def num_clients(self) -> int:
-        """Number of clients at this moment."""
+        """Number of connected clients."""
         return len(self._clients)
 
     def send(self, message: LiveMessage) -> None:
-        """Hand a message over to the clients."""
+        """Pass a message on to the clients."""
         if message.header is not self._described:
             self._described, (self._header,) = message.header, self._format.header(message.header)
         if self._clients:
@@ -458,13 +458,13 @@ class WebSocketSink:
             self._loop.call_soon_threadsafe(self._spread, frame)
 
     def close(self) -> None:
-        """Give clients a second to read what waits for them and the end, and disconnect them."""
+        """Give clients a second to read what waits for them and the end message, then disconnect them."""
         if self._thread.is_alive():
             self._loop.call_soon_threadsafe(self._ending.set)
             self._thread.join()
 
     def _spread(self, message: bytes) -> None:
-        """Lay a message out for every client; where there is no room the oldest is dropped."""
+        """Queue a message for every client; a full queue drops its oldest message."""
         for client in self._clients:
             full = len(client.waiting) == client.waiting.maxlen
             self.dropped += full
@@ -480,13 +480,13 @@ class WebSocketSink:
             self._ready.set()
 
     async def _open(self) -> Any:
-        quiet = logging.getLogger("handsim.websocket")  # invalid requests are not the user's mistakes
+        quiet = logging.getLogger("handsim.websocket")  # Invalid requests are not the user's mistakes.
         quiet.setLevel(logging.CRITICAL + 1)
         return await self._serve(
             lambda one: self._talk(one, only_asked=one.request.path == _ON_REQUEST),
             sock=self._socket,
             origins=self._origins,
-            compression=None,  # costs more time than a local network does
+            compression=None,  # takes longer than a local network does
             max_size=_LARGEST,
             close_timeout=_FLUSH,
             logger=quiet,
@@ -510,20 +510,20 @@ class WebSocketSink:
         await server.wait_closed()
 
     async def _wait_while(self, there_is: Callable[[], bool]) -> None:
-        """Wait until something is over, or for a second."""
+        """Wait while a condition holds, at most one second."""
         until = self._loop.time() + _FLUSH
         while there_is() and self._loop.time() < until:
             await asyncio.sleep(_FLUSHED)
 
     async def _talk(self, connection: Any, *, only_asked: bool) -> None:
-        """Send messages to a client until it leaves."""
+        """Send messages to a client until it disconnects."""
         client = _Client(_WAITING if self._every else 1, only_asked=only_asked)
         self._clients[client] = connection
         sending = asyncio.ensure_future(self._deliver(connection, client))
         try:
             with suppress(self._closed_error):
                 while True:
-                    await connection.recv()  # this notices pongs and the end of the connection
+                    await connection.recv()  # also notices pongs and the end of the connection
                     client.ask()
         finally:
             del self._clients[client]
@@ -531,7 +531,7 @@ class WebSocketSink:
 
     async def _deliver(self, connection: Any, client: _Client) -> None:
         """Send a client the header, then message after message."""
-        unconfirmed: deque[tuple[float, asyncio.Future[float]]] = deque()  # times of frames, and pongs
+        unconfirmed: deque[tuple[float, asyncio.Future[float]]] = deque()  # send times and pongs of frames
         told = described = -math.inf
         is_text = self._format.is_text
         with suppress(self._closed_error, OSError):
@@ -554,8 +554,8 @@ class WebSocketSink:
                     header, described = self._header, now
                     await connection.send(header, text=is_text)
                     if client.only_asked:
-                        continue  # this was the answer
-                # A client that asks for frames expects one message for each request, and is never behind.
+                        continue  # The header was the answer to the request.
+                # A client that requests frames expects one message per request, and is never behind.
                 if behind > _UNCONFIRMED and now > told + _TELL and not client.only_asked:
                     told = now
                     await connection.send(self._format.lag(behind, client.dropped), text=is_text)
@@ -576,29 +576,29 @@ class LineSink(WebSocketSink):
             async def send(message: bytes, text: bool) -> None:
                 writer.write(message + b"\n")
                 if self._ending.is_set():
-                    writer.close()  # after what it still holds
+                    writer.close()  # after sending what it still holds
                 await writer.drain()
 
             connection = SimpleNamespace(recv=receive, send=send, transport=writer.transport)
-            with closing(writer), suppress(OSError, ValueError):  # it left, or sent a line that is too long
+            with closing(writer), suppress(OSError, ValueError):  # The client left, or sent too long a line.
                 await self._talk(connection, only_asked=True)
 
         return await asyncio.start_server(talk, sock=self._socket, limit=_LARGEST)
 
 
 class _Client:
-    """What waits for a client of a WebSocket, and what it has asked for."""
+    """Queue and requests of one WebSocket client."""
 
     def __init__(self, most: int, *, only_asked: bool) -> None:
         self.waiting: deque[tuple[float, bytes]] = deque(maxlen=most)
-        """Messages, with the times at which they were laid out [s]."""
+        """Messages with the times at which they were queued [s]."""
         self.woken = asyncio.Event()
         self.dropped = 0
         self.only_asked = only_asked
         self._asks = not only_asked
 
     def ask(self) -> None:
-        """The client asks for a message."""
+        """Note that the client requests a message."""
         self._asks = True
         if self.waiting:
             self.woken.set()
@@ -610,7 +610,7 @@ class _Client:
             await self.woken.wait()
 
     def take(self) -> tuple[float, bytes]:
-        """The oldest message that waits, with its time [s]."""
+        """Remove and return the oldest waiting message with its time [s]."""
         self._asks = not self.only_asked
         return self.waiting.popleft()
 

@@ -1,10 +1,9 @@
-"""A tracked take whose poses are solved over all of its time, forward and backward.
+"""Poses of a tracked take, smoothed over its whole time, forward and backward.
 
-A pose that is fitted to the markers of one frame has their noise: on a short bone a millimeter is ten
-degrees. Here all poses of a hand, from one start of its track to the next, are solved together. A motion goes
-on with its velocity but for unforeseen accelerations, and hinges are near those of the gestures that people
-make, as in the tracker, which sees only the past and learns offsets of markers on the way. So a frame has the
-same pose wherever in a file it stands.
+A pose fitted to the markers of one frame has their noise: on a short bone a millimeter is ten degrees. Here
+all poses of a hand between two initializations are solved together, with white noise as acceleration of all
+unknowns and the tracker's prior of joint angles. The tracker itself knows only the past, and learns marker
+biases meanwhile; smoothed poses do not depend on where in a file their frame is.
 """
 
 from __future__ import annotations
@@ -36,18 +35,18 @@ from track.kinematics.marker_kinematics import (
 from track.kinematics.pose_spread import SpreadModel, freedom_factor, resting_prior
 from track.user import hand_origin, read_errors
 
-# Chosen on simulated real-like hands; the error hardly changes within a factor of ten.
+# Chosen on realistic simulated hands; the error hardly changes within a factor of ten.
 _ACCELERATIONS: Final = np.repeat([10.0, 0.5, 10.0], [NUM_JOINTS, 3, 3])
-"""Power of unforeseen accelerations: of hinges [rad^2/s^3], of the wrist [m^2/s^3], [rad^2/s^3]."""
-_GESTURES: Final = 30.0  # [1/s] how often the prior of the hinges counts: errors of markers last that long
-_WEAK: Final = np.repeat([0.0, 1.0], [NUM_JOINTS, 6])  # [1/m^2, 1/rad^2] of a wrist that no marker shows
-_WINDOW, _MARGIN = 2000, 200  # frames that are solved together, and those more at either end
-_ROUNDS: Final = 5  # steps of a fit
-_LONGEST_STEP: Final = 0.5  # [rad], [m]
-_FIRST_NOISE, _LEAST_NOISE = 0.0015, 0.0001  # [m]
-_FROM_BIAS: Final = 1.4  # error of a marker's place over its mean residual: poses take half of the variance
-_OUTLIER: Final = 0.01  # [m] where the loss of a marker levels off (Geman and McClure 1987)
-# From the order of a step's unknowns (hinges, place and turn of the wrist) to that of MuJoCo and back.
+"""Power spectral density of acceleration: joints [rad^2/s^3], wrist [m^2/s^3], [rad^2/s^3]."""
+_GESTURES: Final = 30.0  # [1/s] how often the prior counts: errors of markers last this long
+_WEAK: Final = np.repeat([0.0, 1.0], [NUM_JOINTS, 6])  # [1/m^2, 1/rad^2] keeps an unseen wrist solvable
+_WINDOW, _MARGIN = 2000, 200  # frames solved together, and additional ones at either end
+_ROUNDS: Final = 5  # Gauss-Newton steps
+_LONGEST_STEP: Final = 0.5  # [rad], [m] bound of each step
+_FIRST_NOISE, _LEAST_NOISE = 0.0015, 0.0001  # [m] standard deviation of markers: first value, lower bound
+_FROM_BIAS: Final = 1.4  # ratio of a marker's place error to its mean residual: poses absorb half of it
+_OUTLIER: Final = 0.01  # [m] scale of the robust loss (Geman and McClure 1987)
+# Permutations between a step's unknowns (joints, wrist position and rotation) and MuJoCo's order.
 _TO_MUJOCO: Final = np.r_[NUM_JOINTS:NUM_UNKNOWNS, 0:NUM_JOINTS]
 _FROM_MUJOCO: Final = np.argsort(_TO_MUJOCO)
 
@@ -57,19 +56,19 @@ class _Window(NamedTuple):
 
     frames: slice
     kept: slice
-    """Those whose poses are kept; the others are near the end of a window, where another one goes on."""
+    """Frames whose poses are kept; those near the ends of a window belong to its neighbors."""
 
     @property
     def inner(self) -> slice:
-        """The kept frames, counted in the window."""
+        """The kept frames, counted from the window's first."""
         first = self.frames.start
         return slice(self.kept.start - first, self.kept.stop - first)
 
 
 def smooth_take(take: Take) -> Take:
-    """The take with the poses of its hands smoothed, and their standard deviations.
+    """Smooth the poses of a take's hands, and compute their standard deviations.
 
-    Labels and statuses stay. Of each hand the settings hold under "filter" the cut-off of each joint angle
+    Labels and statuses stay. The settings get for each hand under "filter" the cut-off of each joint angle
     [Hz], and under "budget" its standard deviation by `SOURCES` [deg].
     """
     qpos, rms = take.qpos.copy(), take.rms.copy()
@@ -95,21 +94,21 @@ def smooth_take(take: Take) -> Take:
 
 
 def spread_model(take: Take, hand: GloveFit) -> SpreadModel:
-    """The standard deviations of a hand of a take, by what its settings tell of its user."""
+    """Model of the standard deviations of a take's hand, given what the settings record of the user."""
     errors = read_errors(take.settings.get("angle_errors", {}))
     origin = hand_origin(str(take.settings.get("user", "")), hand.side)
     return SpreadModel(hand, origin, errors.get(hand.side))
 
 
 def times_unseen(times: Float[np.ndarray, "T"], seen: Bool[np.ndarray, "T M"]) -> Float[np.ndarray, "T M"]:
-    """Time to the nearest frame with each marker [s]; infinite where there is none."""
+    """Time to the nearest frame that shows each marker [s]; infinite if there is none."""
     last = np.maximum.accumulate(np.where(seen, times[:, None], -np.inf), axis=0)
     following = np.minimum.accumulate(np.where(seen, times[:, None], np.inf)[::-1], axis=0)[::-1]
     return np.asarray(np.minimum(times[:, None] - last, following - times[:, None]))
 
 
 def _windows(status: Int[np.ndarray, "T"]) -> list[_Window]:
-    """The windows of a hand; none goes on over a frame in which the hand is initialized."""
+    """The windows of a hand; none spans a frame in which the hand is initialized."""
     windows = []
     for first, last in runs_of(status != LOST):
         begins = first + np.flatnonzero(status[first : last + 1] == INITIALIZED)
@@ -123,7 +122,7 @@ def _windows(status: Int[np.ndarray, "T"]) -> list[_Window]:
 
 
 class _SmoothedHand:
-    """A hand of a take, on the way to smooth poses."""
+    """A hand of a take whose poses are being smoothed."""
 
     def __init__(self, take: Take, number: int) -> None:
         worn = self._worn = take.hands[number]
@@ -149,7 +148,7 @@ class _SmoothedHand:
             covariances = self._step(window, equations)
             kept, inner = window.kept, window.inner
             alone = np.linalg.inv(equations[0])[inner]
-            # What the gestures are off by is alike in frames that follow each other.
+            # Errors of the prior are alike in successive frames.
             by_hinges = self._share * alone[:, :, :NUM_JOINTS]
             same = by_hinges @ resting_prior().precision @ by_hinges.swapaxes(1, 2)
             variances, self.keypoints[kept] = self._model.variances(
@@ -169,7 +168,7 @@ class _SmoothedHand:
         return np.median(np.concatenate(cutoffs), axis=0), budget
 
     def rms(self) -> Float[np.ndarray, "T"]:
-        """3D RMS distance of the markers from the hand as it was given [m]; NaN without markers."""
+        """RMS distance of the markers from those of the smoothed poses [m]; NaN without markers."""
         there = np.isfinite(self.qpos).all(axis=1)
         squares = np.full(self._targets.shape[:2], np.nan)
         squares[there] = ((self._worn.markers(self.qpos[there])[0] - self._targets[there]) ** 2).sum(axis=-1)
@@ -179,16 +178,16 @@ class _SmoothedHand:
 
     @property
     def _share(self) -> float:
-        """How often the prior of the hinges counts in a frame."""
+        """Weight of the prior of joint angles in one frame."""
         return min(1.0, _GESTURES / self._rate)
 
     @property
     def _weight_noise(self) -> float:
-        """Noise and flesh together [m], by which a marker counts."""
+        """Noise and flesh motion together [m], which weight a marker."""
         return float(np.hypot(self._noise, self._flesh))
 
     def _equations(self, window: _Window) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Normal matrices (F, 26, 26) and gradients (F, 26) of frames, each by itself."""
+        """Normal matrices (F, 26, 26) and gradients (F, 26) of single frames."""
         qpos, prior = self.qpos[window.frames], resting_prior()
         normal, gradient, self._residuals[window.frames] = _frame_equations(
             self._hand, self._targets[window.frames], qpos, self._weight_noise**-2, _OUTLIER**-2
@@ -201,8 +200,8 @@ class _SmoothedHand:
     def _step(
         self, window: _Window, equations: tuple[NDArray[np.float64], NDArray[np.float64]]
     ) -> NDArray[np.float64]:
-        """Move all poses of a window by a Gauss-Newton step; return the covariances of its unknowns."""
-        # Steps of the wrist's position are solved in world axes, in which its acceleration is penalized.
+        """Move the poses of a window by a Gauss-Newton step; return the covariances of its unknowns."""
+        # The wrist's position is solved in world axes, in which its acceleration is penalized.
         normal, gradient = equations[0].copy(), equations[1].copy()
         qpos = self.qpos[window.frames]
         turns = np.tile(np.eye(NUM_UNKNOWNS), (len(qpos), 1, 1))
@@ -223,7 +222,7 @@ class _SmoothedHand:
         return np.asarray(turns.swapaxes(1, 2) @ covariances @ turns)
 
     def _estimate_noise(self) -> None:
-        """Estimate noise, flesh and places of the markers by their residuals."""
+        """Estimate noise, flesh motion and place errors of the markers from their residuals."""
         residuals = self._residuals
         seen = np.isfinite(residuals[..., 0])
         bias = np.nan_to_num(np.nansum(residuals, axis=0) / np.maximum(seen.sum(axis=0), 1)[:, None])
@@ -236,7 +235,7 @@ class _SmoothedHand:
 
 
 def _spread(values: NDArray[np.float64]) -> float:
-    """Standard deviation of values around zero [m], without wrong labels."""
+    """Standard deviation of values around zero [m], without outliers."""
     near = values[np.abs(values) < _OUTLIER]
     return float(np.sqrt(np.mean(near**2))) if len(near) else 0.0
 
@@ -249,7 +248,7 @@ def _frame_equations(
     precision: float,
     robust_scale: float,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Normal matrices, gradients and residuals in the frames of the bones, of frames one by one."""
+    """Normal matrices, gradients and residuals (in the bones' frames) of each frame."""
     frames, count = targets.shape[:2]
     normal, gradient = np.zeros((frames, NUM_UNKNOWNS, NUM_UNKNOWNS)), np.zeros((frames, NUM_UNKNOWNS))
     local, work, weights = np.zeros((frames, count, 3)), workspace(count), np.empty(count)
@@ -281,11 +280,11 @@ def _frame_equations(
 def _solve_in_time(
     normal: Float[np.ndarray, "T U U"], gradient: Float[np.ndarray, "T U"], precision: Float[np.ndarray, "U"]
 ) -> tuple[Float[np.ndarray, "T U"], Float[np.ndarray, "T U U"]]:
-    """Solve frames that second differences of a precision connect; with the covariances of each frame."""
-    # Two frames are one block, so that the system is block tridiagonal: forward elimination, then backward.
+    """Solve frames coupled by second differences of a given precision; also return their covariances."""
+    # Pairs of frames form the blocks of a block tridiagonal system: eliminate forward, then substitute.
     count, size = gradient.shape
     pairs = (count + 1) // 2
-    connected = np.zeros((3, 2 * pairs))  # by the distance of two frames, at the first of them
+    connected = np.zeros((3, 2 * pairs))  # coefficient of two frames by their distance, stored at the first
     for distance, values in enumerate(((1.0, 4.0, 1.0), (-2.0, -2.0), (1.0,))):
         for start, value in enumerate(values):
             connected[distance, start : max(count - 2, 0) + start] += value

@@ -1,4 +1,4 @@
-"""Calibration of the hands of a labeled take, and whether it fits frames that it has not seen better."""
+"""Calibration of the hands of a labeled take, and its test on held-out frames."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ from track.kinematics.pose_solver import PoseSolver
 from track.user import AS_MEASURED, MEASURED, User
 
 OnPart = Callable[[str, int, int], None]
-"""Called with the name of a step, such as "frames", what is done of it, and all there is to do in it."""
-_SHOWN: Final = 0.05  # share of the frames in which a hand must be tracked to be calibrated
-_NEAR: Final = 0.015  # [m]: largest residual of a marker on a hand of another size
-_LEFT_OVER: Final = 0.005  # share of the markers that the first round may leave unlabeled
-_BLOCK: Final = 1.0  # [s] of frames that are held out together, since neighbors are much alike
-_BLOCKS: Final = 6  # at least
-_HELD_OUT: Final = 3  # one block of so many is held out
-_MOST_CHECKED: Final = 400  # frames that are held out
-_FEWEST_SEEN: Final = 0.75  # share of the markers of such a frame
-_RARELY: Final = 0.75  # of the frames show a marker whose label the next finger's cannot have
-_NEXT_FINGER: Final = 3  # bones further
-_AS_WELL: Final = 1.2  # times the residual, and times the shift of markers, up to which labels fit as well
+"""Called with the name of a step, such as "frames", and the amounts done and in total."""
+_SHOWN: Final = 0.05  # A hand must be tracked in this share of the frames to be calibrated.
+_NEAR: Final = 0.015  # [m] largest residual of a marker on a hand of another size
+_LEFT_OVER: Final = 0.005  # The first round may leave this share of missing markers unlabeled.
+_BLOCK: Final = 1.0  # [s] duration of frames held out together, since neighbors are much alike
+_BLOCKS: Final = 6  # least number of such blocks
+_HELD_OUT: Final = 3  # one of this many blocks is held out
+_MOST_CHECKED: Final = 400  # largest number of held-out frames
+_FEWEST_SEEN: Final = 0.75  # Held-out frames must show this share of the markers.
+_RARELY: Final = 0.75  # A marker in fewer of the hand's frames may wear the next finger's label.
+_NEXT_FINGER: Final = 3  # difference of bone numbers between neighbor fingers
+_AS_WELL: Final = 1.2  # Labels fit as well up to this factor of residual times marker shifts.
 
 
 def calibrate_take(
@@ -41,9 +41,9 @@ def calibrate_take(
     before: Sequence[GloveFit],
     on_part: OnPart = lambda step, done, total: None,
 ) -> tuple[Calibration, ...]:
-    """Calibrate the hands that are in a take on two thirds of its frames, and try them on the others.
+    """Calibrate the hands in a take on two thirds of its frames, and test them on the others.
 
-    Labels of hands that are tracked count. Each side begins with `start`; the take was labeled with `before`.
+    Only labels of tracked hands count. Each side starts from `start`; the take was labeled with `before`.
     """
     there = [hand for hand in start if hand.side in take.sides]
     shown = [hand for hand in there if _reliable(take, hand.side).mean() > _SHOWN]
@@ -52,7 +52,7 @@ def calibrate_take(
             f"no {' and no '.join(take.sides)} hand was found in the capture; expected half a minute of one"
         )
     worn = {hand.side: hand for hand in before}
-    # Frames that the calibration does not see: every third second, or less of a short take.
+    # Hold out every third second, or a shorter block of a short take.
     block = max(1, min(round(_BLOCK * take.rate), take.num_frames // _BLOCKS))
     out: NDArray[np.bool_] = np.arange(take.num_frames) // block % _HELD_OUT == _HELD_OUT - 1
     done = []
@@ -70,14 +70,14 @@ def calibrate_take(
 def _hidden(
     markers: Float[np.ndarray, "T M 3"], out: Bool[np.ndarray, "T"], one: Calibration, off: float, rate: float
 ) -> str:
-    """A rarely seen marker in whose place the next finger's, calibrated likewise, fits as well.
+    """Name of a rarely seen marker whose place fits the next finger's points as well; empty if none.
 
-    Around a thing held, sparse markers of a finger may have the next finger's labels from the first frame to
-    the last. Other marker places explain that, and held-out frames, labeled alike, confirm them. Right labels
-    fit better, or with places nearer to the design.
+    Around a held object, sparse markers of a finger may have the next finger's labels throughout. Shifted
+    marker places explain such labels, and held-out frames, labeled alike, confirm them. Right labels fit
+    better, or with places nearer to the design.
 
     Args:
-        off: Residual of held-out frames with the labels as they are [m].
+        off: Residual of held-out frames with the original labels [m].
     """
     worn, shown = one.start.attachment, np.isfinite(markers[..., 0])
     rare = shown.mean(axis=0) < _RARELY * shown.any(axis=1).mean()
@@ -105,12 +105,12 @@ def kept_user(
     source: str,
     on_part: OnPart = lambda step, done, total: None,
 ) -> User:
-    """The user with the hands that fit held-out frames better: calibrated on all frames, or as before.
+    """The user with calibrated hands where these fit held-out frames better, and the hands before elsewhere.
 
     Args:
-        done: What `calibrate_take` made of the take.
-        before: The hands that it was labeled with, for each side in `done`.
-        source: Where the frames are from, as "from take.c3d".
+        done: Result of `calibrate_take`.
+        before: Hands that labeled the take, for each side in `done`.
+        source: Origin of the frames, such as "from take.c3d".
     """
     worn, hands, whole, errors = {hand.side: hand for hand in before}, [], [], dict(before.angle_errors)
     notes = [f"calibrated {source}, {before.notes.removeprefix(MEASURED) or before} to begin with"]
@@ -122,7 +122,7 @@ def kept_user(
             one = dataclasses.replace(again, held_out=one.held_out)  # noqa: PLW2901
             errors[side] = one.angle_errors
         elif not before.is_calibrated(side):
-            remark = AS_MEASURED  # by which `is_calibrated` knows it
+            remark = AS_MEASURED  # `is_calibrated` recognizes this remark
         hands.append(one.hand if one.is_better else worn[side])
         notes.append(f"{side} hand: {one}{remark}")
         whole.append(one)
@@ -130,7 +130,7 @@ def kept_user(
 
 
 def leaves_markers(take: Take, done: Sequence[Calibration]) -> bool:
-    """Whether too many missing markers had an unlabeled point nearby."""
+    """Whether too many missing markers have an unlabeled point nearby."""
     from scipy.spatial.distance import cdist
 
     left, total = 0, 0
@@ -147,7 +147,7 @@ def leaves_markers(take: Take, done: Sequence[Calibration]) -> bool:
 
 
 def _tried(markers: Float[np.ndarray, "T M 3"], before: GloveFit, after: GloveFit) -> HeldOut | None:
-    """How well two hands fit held-out markers [m], NaN where missing; None if they tell too little."""
+    """Residuals of two hands on held-out markers [m], NaN where missing; None if no frame shows enough."""
     frames = np.flatnonzero(np.isfinite(markers[..., 0]).mean(axis=1) >= _FEWEST_SEEN)
     if not len(frames):
         return None
@@ -157,7 +157,7 @@ def _tried(markers: Float[np.ndarray, "T M 3"], before: GloveFit, after: GloveFi
 
 
 def _steps(side: Side, on_part: OnPart) -> Progress:
-    """The progress of one hand."""
+    """Progress callback of one hand."""
     return lambda step, rms, gap: on_part(f"steps for the {side} hand", min(step, MOST_STEPS), MOST_STEPS)
 
 
@@ -169,5 +169,5 @@ def _markers(take: Take, side: Side) -> Float[np.ndarray, "T M 3"]:
 
 
 def _reliable(take: Take, side: Side) -> Bool[np.ndarray, "T"]:
-    """Frames whose labels are reliable."""
+    """Whether the labels of each frame are reliable."""
     return np.isin(take.status[:, take.hand_index(side)], (TRACKED, INITIALIZED))

@@ -1,7 +1,7 @@
-"""Faults of a tracked take that labels do not show: of its glove, and of which hand is which.
+"""Faults of a tracked take beyond single labels: in its glove, and in the sides of its hands.
 
-A layout does not fit, a glove slips, a marker falls off, or a glove like its own mirror image leaves the side
-of a hand open. Each fault is a span of frames with the marker or the hand and the time in words.
+The layout may not fit, a glove may slip, a marker may fall off, or a symmetric glove may leave the side of a
+hand open. Each fault is a span of frames with a sentence that names marker or hand, and the time.
 """
 
 from __future__ import annotations
@@ -20,77 +20,77 @@ from handsim.space.transforms import rigid_fit
 from track.kinematics.pose_solver import FEWEST_MARKERS, PoseSolver
 from train.labelers.matching import assign
 
-_FEWEST: Final = 60  # tracked frames of a hand that tell of faults
-_MOST_FRAMES: Final = 2000  # frames of a hand that are looked at
-_FARTHEST: Final = 0.02  # [m] offset of a marker from its place at which it is cut off
-_PART: Final = 60  # frames of a marker before a slip and after it, at least
-# A slip changes a marker's place for good; what flesh and posture do to it, by up to 3 mm, ends.
-_SLIP: Final = 0.0035  # [m] change of a marker's place that is told
-_SLIP_SHARE: Final = 0.55  # share of the variance of its offsets that the change explains
-_SMALL_SLIP: Final = 0.0008  # [m] the same where little else moves it: the pose takes most of a slip
-_SMALL_SHARE: Final = 0.85
-_GLOVE_SLIP: Final = 0.0019  # [m] root of the mean square over markers: a whole glove's, beside much noise
-_GLOVE_SHARE: Final = 0.4  # of the variance of all markers' offsets, averaged over a while
-_WHILE: Final = 0.25  # [s]
-_SLIP_PART: Final = 1.9  # [s] before such a change and after it, at least
+_FEWEST: Final = 60  # Faults are looked for from this many tracked frames of a hand on.
+_MOST_FRAMES: Final = 2000  # largest number of examined frames of a hand
+_FARTHEST: Final = 0.02  # [m] offsets of markers are clipped here
+_PART: Final = 60  # least number of a marker's frames before and after a slip
+# A slip shifts a marker for good; shifts by flesh and posture, of up to 3 mm, are temporary.
+_SLIP: Final = 0.0035  # [m] least reported shift of a marker
+_SLIP_SHARE: Final = 0.55  # least share of the variance of its offsets that the shift explains
+_SMALL_SLIP: Final = 0.0008  # [m] the same for a steady marker: the pose absorbs most of a slip
+_SMALL_SHARE: Final = 0.85  # least explained share for such a small shift
+_GLOVE_SLIP: Final = 0.0019  # [m] RMS shift over the markers if a whole glove slips
+_GLOVE_SHARE: Final = 0.4  # least explained share of the variance of all markers' smoothed offsets
+_WHILE: Final = 0.25  # [s] smoothing time of these offsets
+_SLIP_PART: Final = 1.9  # [s] least time before and after a slip
 _LEAST_VARIANCE: Final = 1e-8  # [m^2] noise of optical systems
-_OFTEN_MISSING: Final = 0.3  # share of the frames without a marker from which on it is looked for elsewhere
-_ELSEWHERE: Final = 0.028  # [m] from its place
-_MISPLACED: Final = 0.008  # [m] from its place, at least
-_STEADY: Final = 0.006  # [m] radius in which a point that belongs to a bone stays, in the bone's frame
-_OFTEN: Final = 0.5  # share of the frames without the marker in which it is there
-_TRIED: Final = 100  # points without a label that are tried as steady ones
-_LAST_GAP: Final = 1.9  # [s] without a marker at a take's end, and before that, at least
-_LONGER: Final = 3.0  # A last gap is told from this many times the longest gap that the marker had before.
-_SEEN: Final = 0.5  # share of the frames before in which it was seen
+_OFTEN_MISSING: Final = 0.3  # A marker missing in this share of the frames is looked for elsewhere.
+_ELSEWHERE: Final = 0.028  # [m] largest distance of a misplaced marker from its place
+_MISPLACED: Final = 0.008  # [m] least reported distance from its place
+_STEADY: Final = 0.006  # [m] radius within which a point fixed to a bone stays in the bone's frame
+_OFTEN: Final = 0.5  # share of the frames without the marker that show such a point
+_TRIED: Final = 100  # number of unlabeled points tried as its center
+_LAST_GAP: Final = 1.9  # [s] least time without a marker at the end, and least time before
+_LONGER: Final = 3.0  # A last gap is reported if it is this many times the longest earlier gap.
+_SEEN: Final = 0.5  # share of the earlier frames in which it was seen
 AT_LIMIT: Final = 0.5
-"""Distance of an angle from the end of the joint's range at which the joint may have gone farther [deg]."""
-_OFTEN_AT_LIMIT: Final = 0.4  # share of the frames
-_SIDE_FRAMES: Final = 40  # frames in which a hand is compared with its mirror image
-_FITS: Final = 1.5  # times our RMS distance up to which the mirror image fits as well
-_FITS_WELL: Final = 0.0012  # [m] distance up to which it may be the hand in any case
+"""Tolerance within which a joint counts as being at its limit [deg]."""
+_OFTEN_AT_LIMIT: Final = 0.4  # share of the frames at the limit
+_SIDE_FRAMES: Final = 40  # number of frames in which a hand is compared with its mirror image
+_FITS: Final = 1.5  # largest ratio of the mirror image's RMS distance to that of the hand
+_FITS_WELL: Final = 0.0012  # [m] the mirror image fits if its RMS distance is below this
 
 
 class SuspectSpan(NamedTuple):
-    """Frames that deserve a look."""
+    """Frames that deserve a look, and the reason."""
 
     first: int
     last: int
-    """The last one, which belongs to them."""
+    """The last frame, inclusive."""
     worst: int
-    """The one to look at."""
+    """The frame to look at first."""
     of: str
     """The side of a hand, or the name of a label."""
     why: str
-    """In words."""
+    """The reason, as a predicate for `of`."""
     remedy: str = ""
-    """What to do about a fault of the whole take; empty for a label that is in doubt."""
+    """Remedy of a fault of the whole take; empty for a doubtful label."""
     of_labels: bool = True
-    """Whether labels are in doubt in these frames, not the angles alone."""
+    """Whether labels are in doubt in these frames, not only angles."""
 
     @property
     def words(self) -> str:
-        """Of what they are, and why."""
+        """The whole sentence: `of` and `why`."""
         return f"{self.of} {self.why}"
 
 
 class _Hand(NamedTuple):
-    """A tracked hand of a take, in F of its frames."""
+    """A tracked hand of a take, in some of its frames (F)."""
 
     take: Take
     side: Side
     worn: GloveFit
     frames: Int[np.ndarray, "F"]
-    offsets: Float[np.ndarray, "F M 3"]  # of the seen markers from their places, in their bones' frames [m]
+    offsets: Float[np.ndarray, "F M 3"]  # [m] of seen markers from their places, in the bones' frames
 
     def span(self, first: int, name: str, why: str, remedy: str, *, of_labels: bool = True) -> SuspectSpan:
-        """A fault of a marker, or of the whole hand without a name, from a frame to the end."""
+        """A fault from frame `first` to the end, of a marker or joint; of the whole hand without `name`."""
         of = f"{self.side}:{name}" if name else f"the {self.side} hand"
         return SuspectSpan(first, self.take.num_frames - 1, first, of, why, remedy, of_labels)
 
 
 def find_faults(take: Take) -> tuple[SuspectSpan, ...]:
-    """The faults of a tracked take, each from the frame where it begins."""
+    """Find the faults of a tracked take, each from the frame in which it begins."""
     found: list[SuspectSpan] = []
     for number, side in enumerate(take.sides) if take.made_by_tracker else ():
         frames = np.flatnonzero(take.status[:, number] == TRACKED)
@@ -105,7 +105,7 @@ def find_faults(take: Take) -> tuple[SuspectSpan, ...]:
 
 
 def _first_of_size(take: Take) -> int:
-    """The frame from which on the poses are of the take's hands, whose size a live tracker measures."""
+    """The first frame with the final size of the hands, which a live tracker measures on the way."""
     match take.settings.get("sizes"):
         case [*_, [int(first), *_]]:
             return first
@@ -113,7 +113,7 @@ def _first_of_size(take: Take) -> int:
 
 
 def _slips(hand: _Hand) -> Iterator[SuspectSpan]:
-    """The marker whose place changes most clearly at one time and stays changed."""
+    """The marker with the clearest lasting shift, if any."""
     from scipy.ndimage import uniform_filter1d
 
     known = np.isfinite(hand.offsets[..., 0])
@@ -149,7 +149,7 @@ def _slips(hand: _Hand) -> Iterator[SuspectSpan]:
 
 
 def _fallen(hand: _Hand) -> Iterator[SuspectSpan]:
-    """Markers that were seen and are not seen any more from one time on, although the hand is."""
+    """Markers that are not seen from some time on, although their hand is."""
     take = hand.take
     seen = np.isfinite(take.observed(hand.side)[..., 0])
     shown = take.is_tracked(hand.side)
@@ -169,7 +169,7 @@ def _fallen(hand: _Hand) -> Iterator[SuspectSpan]:
 
 
 def _at_limits(hand: _Hand) -> Iterator[SuspectSpan]:
-    """Joints that are at the end of the model's range in many frames, and may have gone farther."""
+    """Joints at the limit of the model's range in many frames, which may have gone beyond."""
     angles = np.rad2deg(hand.take.qpos[hand.frames, hand.take.hand_index(hand.side), 7:])
     for joint, values in zip(JOINTS, angles.T, strict=True):
         for limit in (joint.low, joint.high):
@@ -183,7 +183,7 @@ def _at_limits(hand: _Hand) -> Iterator[SuspectSpan]:
 
 
 def _misplaced(hand: _Hand) -> Iterator[SuspectSpan]:
-    """Markers that are elsewhere on their bone than in the layout: a point without a label moves with it."""
+    """Markers misplaced on their bone: an unlabeled point moves with the bone instead."""
     take, worn = hand.take, hand.worn
     missing = np.isnan(hand.offsets[..., 0])
     bones = worn.model.forward_kinematics(take.qpos[hand.frames, take.hand_index(hand.side)])
@@ -214,7 +214,7 @@ def _misplaced(hand: _Hand) -> Iterator[SuspectSpan]:
 
 
 def _unsure_side(hand: _Hand) -> Iterator[SuspectSpan]:
-    """A hand without a marker on its thumb, that a hand of the other side fits as well in motion."""
+    """A hand without thumb marker whose points its mirror image fits as well."""
     worn, take = hand.worn, hand.take
     if (worn.attachment.digits == 0).any():
         return
@@ -235,7 +235,7 @@ def _unsure_side(hand: _Hand) -> Iterator[SuspectSpan]:
 
 
 def _exchanges(worn: GloveFit, mirrored: GloveFit) -> Iterator[Int[np.ndarray, "M"]]:
-    """Which of our markers each marker of the other hand would be: thumb side exchanged, or back and palm."""
+    """Orders in which the other hand's markers may be ours: with thumb side, or back and palm, exchanged."""
     ours, theirs = worn.attachment.points, mirrored.attachment.points
     for turn in (np.eye(3), np.diag([1.0, -1.0, -1.0])):
         moved = theirs @ turn

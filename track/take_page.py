@@ -1,7 +1,7 @@
-"""The page on a take and the tables beside it: what a biomechanics lab looks at before it uses the angles.
+"""The report page on a take and its tables, for checking the angles before they are used.
 
-Angles are in degrees and residuals in millimeters. In the tables (.csv) units stand in the names of columns,
-and an empty cell is a number that does not exist.
+Angles are in degrees and residuals in millimeters. In the tables (.csv) column names contain the units, and
+an empty cell stands for an unknown number.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ if TYPE_CHECKING:
 
 _TABLES: Final = (".frames.csv", ".joints.csv", ".markers.csv", ".doubts.csv")
 _RANGE: Final = {"least": 0.0, "5th": 5.0, "median": 50.0, "95th": 95.0, "largest": 100.0}
-"""Columns of a range of motion, and the percentile in each."""
-_CHUNK: Final = 4096  # frames whose bones are posed at once
-_WANTED: Final = (0.99, 0.999)  # shares of right frames that a person may want
-_MOST_SPANS: Final = 100  # doubtful spans in the page's table; the table beside it has all
-_MDD: Final = 1.96 * float(np.sqrt(2.0))  # minimal detectable difference over standard error
-_BINS: Final = 750  # bins of a long take's curve, which shows the least and the largest value of each
+"""Columns of a range of motion, and the percentile of each."""
+_CHUNK: Final = 4096  # frames per call of forward kinematics
+_WANTED: Final = (0.99, 0.999)  # shares of right frames for which the page gives a number of looks
+_MOST_SPANS: Final = 100  # rows of the page's table of doubtful spans
+_MDD: Final = 1.96 * float(np.sqrt(2.0))  # ratio of the minimal detectable difference to the standard error
+_BINS: Final = 750  # bins of a long take's curve, which shows the extremes of each
 _STROKES: Final = (Paint.VIOLET, Paint.BLUE, Paint.WARM, Paint.GREEN)
-"""Colors of a digit's joints, from the knuckle outwards."""
+"""Colors of a digit's joints, from proximal to distal."""
 _COASTING: Final = "#efd9c9"
 _SHADES: Final = "Gray: the hand is lost and has no pose. Orange: it coasts, its pose is predicted."
 _UNCALIBRATED: Final = (
@@ -56,10 +56,10 @@ _CALIBRATE: Final = (
 
 
 def write_take_page(out: str | Path, take: Take, *, source: str = "take.npz") -> tuple[Path, ...]:
-    """Write the page on a take and its tables beside it, all or none, as `handsim report` does.
+    """Write the page on a take and its tables, all or none, as `handsim report` does.
 
-    The page names the take's file, its source. The page and its tables are returned: frames, joints, markers
-    and doubtful frames.
+    The page shows commands for the take's file `source`. Returns the paths of the page and of its tables:
+    frames, joints, markers and doubtful frames.
     """
     out = Path(out)
     check_ending(out, ".html")
@@ -80,13 +80,13 @@ def write_take_page(out: str | Path, take: Take, *, source: str = "take.npz") ->
 
 
 def table_paths(page: Path) -> tuple[Path, ...]:
-    """The tables beside a page: frames, ranges of motion, markers, frames to look at."""
+    """Paths of a page's tables: frames, ranges of motion, markers, doubtful frames."""
     return tuple(page.with_suffix(ending) for ending in _TABLES)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HandFigures:
-    """What a take tells of one hand over its T frames, with its M markers."""
+    """Figures of one hand over the T frames of a take, with its M markers."""
 
     side: Side
     marker_names: tuple[str, ...]
@@ -95,11 +95,11 @@ class HandFigures:
     angles: Float[np.ndarray, "T 20"]
     """Joint angles in the order of `JOINT_NAMES` [deg]; NaN where the hand is lost."""
     angle_spread: Float[np.ndarray, "T 20"] | None
-    """Standard deviation of each angle [deg]; None where the take does not know them."""
+    """Standard deviation of each angle [deg]; None if the take has none."""
     residuals: Float[np.ndarray, "T M"]
     """Distance of each labeled point from the pose's marker [m]; NaN without a point or a pose."""
     confidence: Float[np.ndarray, "T M"]
-    """Probability of each marker's label; NaN where the marker has no point."""
+    """Confidence in each marker's label; NaN where the marker has no point."""
     beyond: Bool[np.ndarray, "20 M"]
     """Which markers each joint moves."""
 
@@ -110,12 +110,12 @@ class HandFigures:
 
     @property
     def fitted(self) -> Bool[np.ndarray, "T"]:
-        """Frames whose pose was fitted to points, which a coasting hand's is not."""
+        """Frames whose pose was fitted to points, not predicted."""
         return self.status >= INITIALIZED
 
     @property
     def rms(self) -> Float[np.ndarray, "T"]:
-        """3D RMS of the residuals of each frame [m], of a truth too; NaN where there is none."""
+        """RMS of the residuals of each frame [m], also of simulated takes; NaN where there are none."""
         known = np.isfinite(self.residuals)
         total = np.sum(np.square(self.residuals), axis=1, where=known)
         count = np.where(known.any(axis=1), known.sum(axis=1), np.nan)
@@ -123,15 +123,15 @@ class HandFigures:
 
     @property
     def measured(self) -> Bool[np.ndarray, "T 20"]:
-        """Fitted frames in which a joint moves a marker that is seen, or which the glove has no marker for.
+        """Fitted frames in which a joint moves a seen marker, or the glove has no marker beyond the joint.
 
-        In the others its angle is predicted.
+        In all others the angle is predicted.
         """
         told = ~self.beyond.any(axis=1) | (self.seen @ self.beyond.T)
         return np.asarray(self.fitted[:, None] & told)
 
     def joints(self) -> Float[np.ndarray, "20 6"]:
-        """`_RANGE` of each angle over its measured frames, and its median spread [deg]; NaN if unknown."""
+        """`_RANGE` of each angle over its measured frames, and its median standard deviation [deg]."""
         found = np.full((self.angles.shape[1], len(_RANGE) + 1), np.nan)
         for row, angles, measured in zip(found, self.angles.T, self.measured.T, strict=True):
             if measured.any():
@@ -141,7 +141,7 @@ class HandFigures:
         return found
 
     def at_limits(self) -> Float[np.ndarray, "20"]:
-        """Share of the fitted frames in which each joint stands at a limit of the model; NaN without any."""
+        """Share of the fitted frames with each joint at a limit of the model; NaN without such frames."""
         low, high = np.array([(joint.low, joint.high) for joint in JOINTS]).T
         angles = self.angles[self.fitted]
         if not len(angles):
@@ -149,7 +149,7 @@ class HandFigures:
         return np.asarray(((angles < low + AT_LIMIT) | (angles > high - AT_LIMIT)).mean(axis=0))
 
     def markers(self) -> Iterator[MarkerFigures]:
-        """What was seen of each marker, in the order of the glove."""
+        """Figures of each marker, in the glove's order."""
         seen = self.seen
         there = np.flatnonzero(self.status != LOST)
         hidden = np.zeros_like(seen)
@@ -167,25 +167,25 @@ class HandFigures:
 
 
 class MarkerFigures(NamedTuple):
-    """What was seen of a marker; NaN where it was never seen, and without a pose."""
+    """Figures of one marker; NaN if it was never seen or there is no pose."""
 
     name: str
     seen: float
     """Share of all frames in which it has a point."""
     num_gaps: int
-    """Number of gaps of the marker from the hand's first pose to its last."""
+    """Number of gaps between the hand's first and last pose."""
     longest_gap: int
-    """Frames."""
+    """Length of the longest gap [frames]."""
     median_residual: float
-    """Distance from the pose's marker [m]."""
+    """Median distance from the pose's marker [m]."""
     high_residual: float
-    """The 95th percentile [m]."""
+    """95th percentile of that distance [m]."""
     median_confidence: float
     """Median confidence in its labels."""
 
 
 def hand_figures(take: Take) -> tuple[HandFigures, ...]:
-    """The figures of each hand of a take, simulated or tracked, in their order."""
+    """The figures of each hand of a simulated or tracked take."""
     found = []
     for number, (hand, labels) in enumerate(zip(take.hands, take.hand_labels, strict=True)):
         there, bones = take.status[:, number] != LOST, hand.attachment.main_bones
@@ -213,7 +213,7 @@ def hand_figures(take: Take) -> tuple[HandFigures, ...]:
 
 
 def _lead(take: Take) -> str:
-    """What the take is, and how long."""
+    """Capture, glove, hands and length of the take, in a sentence."""
     settings = take.settings
     glove, user = settings.get("glove", take.hands[0].layout.name), str(settings.get("user", ""))
     _, is_measured, size = user.partition(MEASURED)
@@ -241,7 +241,7 @@ def _summary_section(take: Take) -> Section:
 
 
 def _calibration_section(take: Take) -> Section:
-    """Whether the hands are calibrated, and what that means for the angles; HTML."""
+    """Whether the hands are calibrated, and what that means for the angles, as HTML."""
     notes = str(take.settings.get("user", ""))
     if not take.made_by_tracker:
         text = "The hands are those that the take was made with: there is nothing to calibrate."
@@ -290,7 +290,7 @@ def _hand_sections(take: Take, hand: HandFigures) -> list[Section]:
 
 
 def _draw_angles(figure: Figure, times: Float[np.ndarray, "T"], hand: HandFigures) -> None:
-    """One panel for each digit with its four angles and their bands; lost and coasting frames are shaded."""
+    """Draw one panel per digit with its four angles and their bands; shade lost and coasting frames."""
     panels = figure.subplots(len(DIGITS), 1, sharex=True)
     starts, _ = _bins(len(times))
     shape = len(times), len(DIGITS), -1
@@ -320,25 +320,25 @@ def _range_section(title: str, hand: HandFigures) -> Section:
         limits = f"{joint.low:g} to {joint.high:g}", percent(share) if share > 0.0 else NOTHING
         table.append([joint.name.replace("_", " "), *cells, *limits, spread])
     text = (
-        f"Over the {int(hand.fitted.sum()):,} frames whose pose was fitted to points, of a joint those in "
-        "which a marker beyond it is seen, if the glove has one: others are predicted. 5th and 95th are "
-        "percentiles, which a single wrong frame does not move. A joint at its limits may bend further than "
-        "its least and largest angle say, which are then the model's. Spread: the median standard deviation "
-        "of the angle, from what is not known of the hand, hidden markers and noise."
+        f"Over the {int(hand.fitted.sum()):,} frames with a fitted pose; for a joint with markers beyond it, "
+        "only over those that show one of them, as other angles are predicted. 5th and 95th are "
+        "percentiles, which a single wrong frame does not change. A joint at its limits may bend further "
+        "than its least and largest angle, which are then the model's limits. Spread: median standard "
+        "deviation of the angle, from unknown proportions of the hand, hidden markers and noise."
     )
     return Section(title, text, table=table)
 
 
 def _error_section(title: str, take: Take, hand: HandFigures) -> Section:
-    """The parts of the deviation of each angle, its filter, and the longest gap of its digit."""
+    """Table of the error budget and filter cut-off of each angle, and the longest gap of its digit."""
     cutoffs, budget = (take.settings.get(name, {}).get(hand.side) for name in ("filter", "budget"))
     filtered = cutoffs is not None and budget is not None
     text = (
         "Filter: all poses were solved together, forward and backward in time, without a delay. At the "
         "cut-off an oscillation keeps half of its size. The band [deg] is the root of the sum of the squares "
-        "of its parts, as root of the mean square over all frames. Gluing and bones are alike in all of "
-        "them. MDD: minimal detectable difference of two sessions of a person, 1.96 times the root of two "
-        "times all parts but bones, which stay."
+        "of its parts, as root mean square over all frames. Gluing and bones are constant errors. "
+        "MDD: minimal detectable difference of two sessions of a person, 1.96 times the root of two "
+        "times all parts but bones, which stay the same."
         if filtered
         else "Filter: none, each pose was fitted to the markers of its frame."
     )
@@ -376,7 +376,7 @@ def _markers_section(title: str, take: Take, hand: HandFigures) -> Section:
 
 
 def _draw_presence(figure: Figure, times: Float[np.ndarray, "T"], hand: HandFigures) -> None:
-    """A strip for each marker: blue where it was seen, blank where not; of long takes the share seen."""
+    """Draw a strip for each marker: blue where it was seen; in long takes by the share seen."""
     from matplotlib.colors import LinearSegmentedColormap
 
     panel = figure.subplots()
@@ -404,7 +404,7 @@ def _draw_residuals(figure: Figure, times: Float[np.ndarray, "T"], hand: HandFig
 
 
 def _prepare(panel: Axes, times: Float[np.ndarray, "T"], status: Int[np.ndarray, "T"]) -> None:
-    """Grid and limits of a panel, with the frames shaded in which the hand is lost or coasts."""
+    """Set grid and limits of a panel, and shade the frames in which the hand is lost or coasts."""
     panel.grid(axis="y", color=Paint.BAND, linewidth=0.8)
     panel.set_xlim(times[0], _end(times))
     for state, color in ((COASTING, _COASTING), (LOST, Paint.LINE)):
@@ -416,7 +416,7 @@ def _prepare(panel: Axes, times: Float[np.ndarray, "T"], status: Int[np.ndarray,
 def decimated(
     times: Float[np.ndarray, "T"], values: Float[np.ndarray, "T"]
 ) -> tuple[Float[np.ndarray, "K"], Float[np.ndarray, "K"]]:
-    """A curve of at most twice 750 values: the least and the largest of each bin of frames, or NaN."""
+    """Reduce a curve to the least and largest value of each of at most 750 bins of frames; NaN if unknown."""
     starts, ends = _bins(len(times))
     if len(starts) == len(times):
         return times, values
@@ -426,7 +426,7 @@ def decimated(
 
 
 def shaded(times: Float[np.ndarray, "T"], flags: Bool[np.ndarray, "T"]) -> list[tuple[float, float]]:
-    """Begin and length of the spans of frames that are flagged [s], as wide as a bin at least."""
+    """Begin and length of the runs of flagged frames [s], rounded up to whole bins."""
     starts, ends = _bins(len(times))
     edges = np.append(times, _end(times))
     runs = runs_of(np.logical_or.reduceat(flags, starts))
@@ -434,14 +434,14 @@ def shaded(times: Float[np.ndarray, "T"], flags: Bool[np.ndarray, "T"]) -> list[
 
 
 def _bins(num_frames: int) -> tuple[Int[np.ndarray, "K"], Int[np.ndarray, "K"]]:
-    """The first frame of each bin, and the one after its last; a bin for each frame of a short take."""
+    """First frame of each bin, and the frame after its last; one bin per frame of a short take."""
     width = 1 if num_frames <= 2 * _BINS else -(-num_frames // _BINS)
     starts = np.arange(0, num_frames, width)
     return starts, np.append(starts[1:], num_frames)
 
 
 def _end(times: Float[np.ndarray, "T"]) -> float:
-    """When the last frame ends [s]: it lasts as long as the one before."""
+    """End of the last frame [s], which lasts as long as the one before."""
     return float(2.0 * times[-1] - times[-2]) if len(times) > 1 else float(times[-1]) + 1.0
 
 
@@ -475,7 +475,7 @@ _Rows = list[list[object]]
 
 
 def _frame_rows(take: Take, hands: Sequence[HandFigures]) -> _Rows:
-    """One row per frame and hand, below the header."""
+    """One row per frame and hand; header first."""
     header = ["frame", "time_s", "hand", "status", "markers_seen", "residual_rms_mm"]
     header += [f"{joint}_deg" for joint in JOINT_NAMES]
     rows: _Rows = [[*header, *(f"{joint}_spread_deg" for joint in JOINT_NAMES)]]
@@ -492,7 +492,7 @@ def _frame_rows(take: Take, hands: Sequence[HandFigures]) -> _Rows:
 
 
 def _joint_rows(hands: Sequence[HandFigures]) -> _Rows:
-    """The range of motion of each joint, beside the model's."""
+    """Rows of the range of motion of each joint and of the model."""
     columns = [f"{name}_deg" for name in (*_RANGE, "model_low", "model_high", "spread")]
     rows: _Rows = [["hand", "joint", *columns, "at_limits_share"]]
     for hand in hands:
@@ -503,7 +503,7 @@ def _joint_rows(hands: Sequence[HandFigures]) -> _Rows:
 
 
 def _marker_rows(take: Take, hands: Sequence[HandFigures]) -> _Rows:
-    """What was seen of each marker."""
+    """Rows of the figures of each marker."""
     header = ["hand", "marker", "seen_share", "gaps", "longest_gap_frames", "longest_gap_s"]
     rows: _Rows = [[*header, "residual_median_mm", "residual_95th_mm", "confidence_median"]]
     for hand in hands:
@@ -516,7 +516,7 @@ def _marker_rows(take: Take, hands: Sequence[HandFigures]) -> _Rows:
 
 
 def _span_rows(take: Take, spans: Sequence[SuspectSpan]) -> _Rows:
-    """Frames to look at, the worst first; `frame` is the one to go to."""
+    """Rows of doubtful spans, the worst first; `frame` is the one to look at."""
     rows: _Rows = [["first_frame", "last_frame", "start_s", "end_s", "frame", "of", "why"]]
     for span in spans:
         times = [_time(float(take.times[one])) for one in (span.first, span.last)]
@@ -525,10 +525,10 @@ def _span_rows(take: Take, spans: Sequence[SuspectSpan]) -> _Rows:
 
 
 def _number(value: float) -> str:
-    """Six digits; nothing for NaN."""
+    """A number with six digits; empty for NaN."""
     return "" if np.isnan(value) else f"{value:.6g}"
 
 
 def _time(seconds: float) -> str:
-    """Nine digits, which hold a tenth of a millisecond of a day."""
+    """A time with nine digits, which resolve 0.1 ms within a day."""
     return f"{seconds:.9g}"

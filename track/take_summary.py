@@ -1,4 +1,4 @@
-"""Summary of a take, as lines of text, what in it tells of a mistake, and frames that deserve a look."""
+"""Summary of a take in lines of text, signs of mistakes in its setup, and doubtful frames."""
 
 from __future__ import annotations
 
@@ -15,42 +15,42 @@ from track.association.initialization import distances_to_nearest
 from track.label_confidence import Evidence, evidence_of, label_confidence
 from track.take_faults import SuspectSpan, find_faults
 
-_LEAST_SEEN: Final = 0.1  # share of the frames that a hand should have a pose in
-_MOST_FILLED: Final = 0.35  # share of a hand's markers; two hands that hide each other reach 0.31
+_LEAST_SEEN: Final = 0.1  # A hand should have a pose in this share of the frames.
+_MOST_FILLED: Final = 0.35  # share of filled-in markers; two hands that hide each other reach 0.31
 _MOST_RMS: Final = 0.005  # [m]; hands of the nearest size reach 0.004
 _MOST_UNLABELED: Final = 0.25  # share of the points at the hands
-_MANY_FAR: Final = 0.05  # share of the points that are elsewhere, from which on it is told
-_AT_HAND: Final = 0.04  # [m] from the markers of a hand
-_CERTAIN: Final = 0.85  # confidence in every point of a frame that needs no look
-_AROUND: Final = 0.025  # [s] around such a frame, which a span includes: events and errors begin together
-_APART: Final = 0.2  # [s] between two spans that are two
-_MOST_DOUBTS: Final = 12  # rows of a list that is read at a glance
-# Of 37 takes of other people, rigs and noise one had more wrong frames among those not listed than this
-# factor times their mean doubt and a least one: with 95 %, a bound for the next take (split conformal
-# prediction). Few markers, many listed frames or many points without a label leave no useful bound.
+_MANY_FAR: Final = 0.05  # Unlabeled points away from the hands are mentioned from this share on.
+_AT_HAND: Final = 0.04  # [m] distance from a hand's markers within which a point counts as its own
+_CERTAIN: Final = 0.85  # Frames whose points all have at least this confidence need no look.
+_AROUND: Final = 0.025  # [s] added before and after doubtful frames: errors begin with events
+_APART: Final = 0.2  # [s] Spans closer together are joined.
+_MOST_DOUBTS: Final = 12  # rows of a list to be read at a glance
+# Of 37 takes of other people, rigs and noise, one had more wrong frames among those not listed than this
+# factor times the sum of their mean doubt and a minimum: a 95 % bound for the next take (split conformal
+# prediction). With few markers, many listed frames or many unlabeled points there is no useful bound.
 _VOUCH_FACTOR: Final = 2.8
 _VOUCH_LEAST: Final = 0.002
-_VOUCH_LISTED: Final = 0.33  # share of listed frames up to which the others are vouched for
-_VOUCH_MARKERS: Final = 12  # of the glove, at least
-_VOUCH_UNLABELED: Final = 0.1  # share of the points at the hands, at most
+_VOUCH_LISTED: Final = 0.33  # largest share of listed frames
+_VOUCH_MARKERS: Final = 12  # least number of the glove's markers
+_VOUCH_UNLABELED: Final = 0.1  # largest share of unlabeled points at the hands
 
 
 class Vouch(NamedTuple):
     """How many of a take's frames have every label right, with 95 % confidence."""
 
     listed: float
-    """Share of the frames that are listed as doubtful."""
+    """Share of the frames listed as doubtful."""
     right: float
-    """Least share of the others in which every label is right; 0 where nothing is known."""
+    """Lower bound of the share of right frames among the others; 0 if there is none."""
     after: tuple[float, ...]
-    """Expected share of all frames that are right after a look at the first, two first, ... listed spans."""
+    """Expected share of right frames after looking at the first 0, 1, 2, ... listed spans."""
 
     def looks(self, share: float) -> int | None:
-        """How many spans must be looked at, in their order, for a share of right frames, or None."""
+        """Number of spans to look at, in order, for a share of right frames; None if all are too few."""
         return next((count for count, one in enumerate(self.after) if one >= share), None)
 
     def __str__(self) -> str:
-        """One sentence."""
+        """The result as one sentence."""
         if self.right <= 0.0:
             return (
                 f"labels: {100 * self.listed:.1f} % of the frames are listed as doubtful, the rest is unsure"
@@ -62,7 +62,7 @@ class Vouch(NamedTuple):
 
 
 def summarize(take: Take) -> list[str]:
-    """One line per hand, one per body and one for the unlabeled points."""
+    """One line per hand and body, one on confidence, and one on unlabeled points."""
     lines = []
     for number, side in enumerate(take.sides):
         status, rms = take.status[:, number], take.rms[:, number]
@@ -88,12 +88,12 @@ def summarize(take: Take) -> list[str]:
 
 
 def no_points(take: Take) -> str:
-    """What is told of a take without a point."""
+    """The sentence on a take without any point."""
     return f"no point is in any of the {take.num_frames} frames; does the camera system see markers?"
 
 
 def suspicions(take: Take) -> list[str]:
-    """What is probably not as the user meant it, as one sentence each with its remedy."""
+    """Signs of a wrong setup, one sentence each with its remedy."""
     points = take.point_list
     if not len(points.points):
         return [no_points(take)]
@@ -115,13 +115,13 @@ def suspicions(take: Take) -> list[str]:
 
 
 def _unlabeled_share(take: Take) -> float:
-    """Share of the points at the hands, and of those with a label, that have none."""
+    """Share of unlabeled points among those at the hands or with a label."""
     near = _unlabeled_at_hands(take)
     return near / max(1, near + int((take.point_list.labels >= 0).sum()))
 
 
 def _unlabeled_at_hands(take: Take) -> int:
-    """Number of points without a label at the hands; those that are elsewhere tell of no mistake."""
+    """Number of unlabeled points at the hands; those elsewhere are no sign of a mistake."""
     markers = np.concatenate([take.markers(side) for side in take.sides], axis=1)
     points, near = take.point_list.without(take.point_list.labels >= 0), 0
     for frame in np.flatnonzero(points.counts):
@@ -133,12 +133,12 @@ def _unlabeled_at_hands(take: Take) -> int:
 
 
 def _suspicions_of(take: Take, side: Side) -> list[str]:
-    """What tells of a mistake about one hand."""
+    """Signs of a wrong setup of one hand."""
     hand = take.hand_index(side)
     shown = take.status[:, hand] != LOST
     if shown.mean() < _LEAST_SEEN:
         if ((take.status != LOST).mean(axis=0) >= _LEAST_SEEN).any():
-            return []  # one hand is there, the other one is not
+            return []  # the other hand is there
         return [
             f"the {side} hand was seen in {100 * shown.mean():.1f} % of the frames; name the glove worn "
             "(--glove) and the hands (--hands)"
@@ -167,19 +167,19 @@ def _status_shares(status: Int[np.ndarray, "T"]) -> str:
 
 
 def _median_rms(rms: Float[np.ndarray, "T"]) -> list[str]:
-    """One part of a line; none where no pose was fitted, as of a truth."""
+    """A part of a line; empty if no pose was fitted, as in simulated takes."""
     return [f"median RMS {1e3 * np.nanmedian(rms):.2f} mm"] if np.isfinite(rms).any() else []
 
 
 def find_suspect_spans(take: Take, most: int | None = _MOST_DOUBTS) -> tuple[SuspectSpan, ...]:
-    """Faults of the take, then spans in which a label is probably wrong or missing, those with most first.
+    """Faults of the take, then spans with probably wrong or missing labels, the most doubtful first.
 
     Args:
-        take: A tracked take; of a truth there is nothing to doubt.
-        most: The largest number of spans beside the faults; all when None.
+        take: A tracked take; a simulated one has no doubtful spans.
+        most: Largest number of spans besides the faults; all if None.
 
     Returns:
-        Spans `first` to `last` [frames], the `worst` frame of each, and in words of what and why.
+        Spans of frames `first` to `last`, with the `worst` frame, what they concern, and why.
     """
     evidence = evidence_of(take) if np.isfinite(take.qpos).any() and not _is_known(take) else None
     points = take.point_list
@@ -202,11 +202,11 @@ def find_suspect_spans(take: Take, most: int | None = _MOST_DOUBTS) -> tuple[Sus
 
 
 def vouch(take: Take, spans: Sequence[SuspectSpan] | None = None) -> Vouch:
-    """How many frames of a tracked take are right, from the confidences in their labels.
+    """Bound the number of wrong frames of a tracked take by the confidences in its labels.
 
     Args:
         take: The take.
-        spans: All its doubtful spans, if they are known.
+        spans: All its doubtful spans, if already known.
     """
     doubt = 1.0 - np.nan_to_num(frame_confidence(take), nan=1.0)
     listed, masses = np.zeros(take.num_frames, dtype=np.bool_), list[float]()
@@ -223,7 +223,7 @@ def vouch(take: Take, spans: Sequence[SuspectSpan] | None = None) -> Vouch:
 
 
 def _joined(runs: Sequence[tuple[int, int]], apart: float) -> list[tuple[int, int]]:
-    """Runs of frames, those that are less than `apart` frames from each other as one."""
+    """Join runs of frames that are less than `apart` frames from each other."""
     joined: list[tuple[int, int]] = []
     for first, last in runs:
         if joined and first - joined[-1][1] < apart:
@@ -234,7 +234,7 @@ def _joined(runs: Sequence[tuple[int, int]], apart: float) -> list[tuple[int, in
 
 
 def _words(take: Take, frame: int, label: int, marker: int) -> tuple[str, str]:
-    """Of what a doubt is, and why: of a label, of a marker whose point may lack it, or of its hand."""
+    """What a doubt concerns (a label, a marker that may lack it, or its hand), and why."""
     if marker < 0:
         return "a point", "without a label"
     if label >= 0:
@@ -247,19 +247,19 @@ def _words(take: Take, frame: int, label: int, marker: int) -> tuple[str, str]:
 
 
 def frame_confidence(take: Take) -> Float[np.ndarray, "T"]:
-    """The least confidence in a frame's points, with a label or without; NaN in frames without points."""
+    """The least confidence of each frame's points, labeled or not; NaN in frames without points."""
     return _least_in_frames(take, _confidence(take))
 
 
 def _least_in_frames(take: Take, confidence: Float[np.ndarray, "P"]) -> Float[np.ndarray, "T"]:
-    """The least confidence in a frame's points; NaN in frames without points."""
+    """The least confidence of each frame's points; NaN in frames without points."""
     least = np.full(take.num_frames, np.nan)
     np.fmin.at(least, take.point_list.frames, confidence)
     return least
 
 
 def _confidence(take: Take, evidence: Evidence | None = None) -> Float[np.ndarray, "P"]:
-    """The confidence by all of the take; 1 stays, as that of corrected labels and of a truth."""
+    """Confidence from the whole take's evidence; confidences of 1 stay, as those of corrected labels."""
     confidence = take.point_list.confidence
     if _is_known(take):
         return confidence
@@ -267,5 +267,5 @@ def _confidence(take: Take, evidence: Evidence | None = None) -> Float[np.ndarra
 
 
 def _is_known(take: Take) -> bool:
-    """Whether every label is certain, as those of a truth."""
+    """Whether every label is certain, as in a simulated take."""
     return bool((take.point_list.confidence == 1.0).all())

@@ -1,8 +1,8 @@
-"""The online tracker: the points of a frame in, the motion of hands out.
+"""The online tracker: points of a frame in, poses of hands out.
 
-Section 4 of Han et al. 2018 with more history: labels go along with IDs while they fit, new points are
-labeled by the pose that is predicted (`track.association`), and hands without history are initialized with
-the labeler. A frame goes one way, as a `FrameState` that every step replaces by the next.
+Section 4 of Han et al. 2018 with more history: labels are carried over by IDs while they fit, new points are
+labeled by the predicted pose (`track.association`), and hands without history are initialized by the
+labeler. Each step takes a frame's `FrameState` and returns the next one.
 """
 
 from __future__ import annotations
@@ -39,41 +39,41 @@ from track.frames import FrameValidator, IncomingFrame, TrackedBody, TrackedFram
 from track.rigid_body import AnyBody, BodyTracker, load_bodies
 from track.user import AnyLabeler, User, as_user, labeler_of
 
-_EVIDENCE_PER_FRAME: Final = 2.0  # of a label (log-odds), less half its point's squared Mahalanobis distance
-_MOST_EVIDENCE: Final = 12.0  # of a label (log-odds), so that a wrong one can still be lost
-_DOUBT_SHARE: Final = 0.6  # a track with a smaller share of its markers labeled is doubted
-_DOUBT_RMS: Final = 0.003  # [m], biases removed, from which on a track is doubted
-_DOUBT_RADIUS: Final = 0.2  # [m] from the wrist within which points without a label confirm the doubt
-_REPLACEMENT_MARGIN: Final = 20.0  # log-odds by which another pose must be better to replace a doubted track
-_FIRST_WAIT: Final = 0.005  # [s] after a vain attempt to initialize lost hands; less than a frame
-_WAIT_FACTOR: Final = 1.5  # of that time after each vain attempt
-_LONGEST_WAIT: Final = 0.1  # [s]
-_MORE_POINTS: Final = 3  # with which hands are looked for at once
-_HAND_SPACING: Final = 0.5  # [m] between the hands of the warm-up
-_UNSURE_EXTENT: Final = 0.12  # [m] of clouds that no labeler is sure of
+_EVIDENCE_PER_FRAME: Final = 2.0  # log-odds gained by a label per frame, less half its squared distance
+_MOST_EVIDENCE: Final = 12.0  # log-odds bound, so that a wrong label can still be lost
+_DOUBT_SHARE: Final = 0.6  # A track with a smaller share of its markers labeled is doubted.
+_DOUBT_RMS: Final = 0.003  # [m] A track with a larger RMS distance, biases removed, is doubted.
+_DOUBT_RADIUS: Final = 0.2  # [m] distance from the wrist within which unlabeled points confirm the doubt
+_REPLACEMENT_MARGIN: Final = 20.0  # log-odds by which a new pose must be better than a doubted track
+_FIRST_WAIT: Final = 0.005  # [s] to the next attempt after a failed initialization; less than a frame
+_WAIT_FACTOR: Final = 1.5  # factor of that time after each failed attempt
+_LONGEST_WAIT: Final = 0.1  # [s] longest such time
+_MORE_POINTS: Final = 3  # With this many more points the next attempt is made at once.
+_HAND_SPACING: Final = 0.5  # [m] between the hands in the warm-up
+_UNSURE_EXTENT: Final = 0.12  # [m] size of random clouds, whose labels need verification
 
 
 class _Outcome(NamedTuple):
-    """What a frame brought for a hand."""
+    """Result of a frame for one hand."""
 
     status: Status
     rms: float = np.nan
-    """RMS distance of its labeled markers from the pose's, biases included [m]; NaN without a fit."""
+    """RMS distance of the labeled markers from the pose's, biases included [m]; NaN without a fit."""
 
 
 class Tracker:
-    """Tracks the user's hands, and bodies with markers of their own, from frame to frame.
+    """Tracks the user's hands, and rigid bodies with markers, from frame to frame.
 
     Args:
-        hands: The user's hands, each side at most once; a `User`, which knows whether they are calibrated (of
-            others that is assumed), or the path of a user's file.
-        labeler: Labels the markers of the hands' glove; or its name or path for `train.load_labeler`. That of
-            the glove when not given.
+        hands: The user's hands, each side at most once: a `User`; other sequences of hands, which count as
+            calibrated; or the path of a user's file.
+        labeler: Labeler of the glove's markers, or its name or path for `train.load_labeler`; the glove's own
+            if not given.
         bodies: Rigid bodies beside the hands, or names of handsim's objects, or paths of their files.
         config: Settings.
 
     Raises:
-        ArgumentError: An argument is of another type, or two hands are of one side.
+        ArgumentError: An argument has a wrong type, or two hands have the same side.
         UserError: The user's file cannot be read.
         WeightsError: There is no labeler of that name, or it knows other markers.
     """
@@ -109,14 +109,14 @@ class Tracker:
         self._digits = digit_table(self._states, self._numbering)
         self._initializer = HandInitializer(self._states, self.labeler, config)
         self._review = LabelerReview(self.labeler, len(self.hands), config)
-        self._last_attempt, self._attempt_wait = -np.inf, 0.0  # [s] of looking for lost hands
-        self._attempt_points = 0  # that it looked among
-        self._last_sound = np.zeros(len(self.hands))  # [s] when each track was last beyond doubt
+        self._last_attempt, self._attempt_wait = -np.inf, 0.0  # [s] last attempt, wait after it
+        self._attempt_points = 0  # number of free points in that attempt
+        self._last_sound = np.zeros(len(self.hands))  # [s] time at which each track was last not doubted
 
     def warm_up(self) -> None:
-        """Load the kernels and the labeler, for which the first frames of a stream would otherwise wait.
+        """Load all kernels and run the labeler once, so that the first frames of a stream need not wait.
 
-        The state of this tracker stays as it is.
+        The state of this tracker does not change.
         """
         tracker, hands = Tracker(self.user, self.labeler), self.hands
         qpos = np.zeros((len(hands), NUM_QPOS))
@@ -128,16 +128,16 @@ class Tracker:
             for hand in tracker.step(points, ids, 0.01 * number).hands:
                 _ = hand.angle_spread
         unsure = np.random.default_rng(0).uniform(0.0, _UNSURE_EXTENT, (4, len(points) // len(hands), 3))
-        for cloud in unsure:  # labels that a pose has to verify
+        for cloud in unsure:  # random points, whose labels must be verified by a pose
             self.labeler.label_frames([cloud])
 
     def resize(self, user: User, keep: float = 0.0) -> None:
-        """Go on with the same hands of another size; they keep their poses and labels.
+        """Replace the hands by the same hands of another size; they keep poses and labels.
 
         Args:
-            user: The hands, in the order of those before.
-            keep: Share of the learned biases of markers that is kept, from 0 to 1. More than 0 is a step on
-                the way to another size, which takes a tenth of the time.
+            user: The hands, in the same order.
+            keep: Share of the learned marker biases to keep, from 0 to 1. With more than 0 the call is a step
+                towards another size, which takes a tenth of the time.
         """
         self.user, self.hands = user, user.hands
         for state, hand in zip(self._states, self.hands, strict=True):
@@ -152,16 +152,16 @@ class Tracker:
         ids: Int[np.ndarray, "N"] | None = None,
         time: float | None = None,
     ) -> TrackedFrame:
-        """Track the next frame; whatever a stream may bring ends in a status or a note.
+        """Track the next frame; faults of the stream end in a status or a note, not in an error.
 
         Args:
-            points: Points [m]; those without finite coordinates are left out.
-            ids: The system's IDs: a point keeps its own for as long as it is visible; -1 where there is none.
-                Without IDs the tracker links the points of one frame with those of the next itself.
+            points: Points [m]; non-finite ones are left out.
+            ids: IDs of the camera system: a point keeps its ID while it is visible; -1 where it has none.
+                Without IDs the tracker links points from frame to frame itself.
             time: Time of the frame [s].
 
         Raises:
-            ArgumentError: `points` and `ids` do not fit together or are no numbers, or there is no time.
+            ArgumentError: `points` and `ids` do not fit together or are not numbers, or `time` is missing.
         """
         began = perf_counter()
         incoming = self._intake.check_frame(points, ids, time)
@@ -196,7 +196,7 @@ class Tracker:
         )
 
     def _track_bodies(self, incoming: IncomingFrame) -> tuple[tuple[TrackedBody, ...], NDArray[np.int64]]:
-        """Every body, and the labels (P,) of their points."""
+        """Track every body; return also the labels (P,) of their points."""
         labels, bodies = np.full(len(incoming.points), -1), []
         for owner, tracker in enumerate(self._bodies, start=len(self._states)):
             body = tracker.step(incoming.points, incoming.ids, incoming.time)
@@ -209,14 +209,14 @@ class Tracker:
         return tuple(bodies), labels
 
     def _marker_positions(self, predictions: Mapping[int, Prediction]) -> Float[np.ndarray, "K 3"]:
-        """Predicted position of the marker of each label [m], NaN for hands without a pose and for bodies."""
+        """Predicted position of each label's marker [m]; NaN for bodies and for hands without a pose."""
         positions = np.full((len(self._numbering.owners), 3), np.nan)
         for hand, prediction in predictions.items():
             positions[self._numbering.part(hand)] = prediction.positions
         return positions
 
     def _give_up_old_poses(self, frame: FrameState) -> FrameState:
-        """Hands without a pose that can be predicted lose it, and their labels."""
+        """Drop poses too old to be predicted, and the labels of hands without a pose."""
         for hand, state in enumerate(self._states):
             labeled = int((frame.markers(hand) >= 0).sum())
             if labeled < self.config.fewest_labels and self._coasted_out(state, frame.time):
@@ -228,7 +228,7 @@ class Tracker:
     def _fit_kept_labels(
         self, frame: FrameState, predictions: Mapping[int, Prediction]
     ) -> tuple[FrameState, list[HandTrack]]:
-        """The hands that have a pose, fitted to the labels that are consistent with it."""
+        """Fit hands with a pose to the labels that are consistent with it."""
         tracks = []
         for hand, state in enumerate(self._states):
             if state.qpos is not None:
@@ -241,7 +241,7 @@ class Tracker:
     def _review_labels(
         self, fitted: FrameState, frame: FrameState, tracks: Sequence[HandTrack]
     ) -> tuple[FrameState, list[HandTrack]]:
-        """Fit hands with new labels again, and compare their labels with the labeler's."""
+        """Refit hands with new labels, and compare their labels with the labeler's."""
         reviewed = []
         for fit in tracks:
             frame, track = refit_labels(fitted, frame, fit)
@@ -250,13 +250,13 @@ class Tracker:
         return frame, reviewed
 
     def _coasted_out(self, state: HandState, time: float) -> bool:
-        """Whether a pose is too old to be predicted on."""
+        """Whether a pose is too old for further prediction."""
         return time - state.time > self.config.longest_coast
 
     def _update(
         self, frame: FrameState, tracks: Sequence[HandTrack]
     ) -> tuple[FrameState, tuple[_Outcome, ...]]:
-        """Take over the hands' estimates, or reject them; the evidence of their labels is updated."""
+        """Accept or reject the hands' estimates, and update the evidence of their labels."""
         estimates, outcomes = {track.hand: track.estimate for track in tracks}, []
         evidence = frame.evidence.copy()
         for hand, state in enumerate(self._states):
@@ -264,7 +264,7 @@ class Tracker:
             labeled = np.count_nonzero(markers >= 0)
             enough = labeled >= self.config.fewest_labels
             if estimate is not None and enough and estimate.rms <= self.config.most_rms:
-                rms = state.rms_without_bias(estimate)  # by the biases that the pose was fitted with
+                rms = state.rms_without_bias(estimate)  # with the biases used by the fit
                 settled = _weigh_labels(frame.points, markers, estimate.positions, state.variance, evidence)
                 state.update(estimate, settled, frame.time)
                 outcomes.append(_Outcome(Status.TRACKED, rms))
@@ -279,14 +279,14 @@ class Tracker:
     def _initialize_lost(
         self, frame: FrameState, outcomes: tuple[_Outcome, ...]
     ) -> tuple[FrameState, tuple[_Outcome, ...]]:
-        """Initialize hands without a pose with the points that the others leave."""
+        """Initialize hands without a pose from the points left by the others."""
         lost = tuple(
             hand for hand, one in enumerate(outcomes) if one.status in (Status.LOST, Status.COASTING)
         )
         if not lost:
             return frame, outcomes
         free = frame.free_for(lost)
-        # Lost hands are looked for less and less often among the same number of points.
+        # Attempts become rarer while the number of points stays the same.
         is_due = frame.time >= self._last_attempt + self._attempt_wait
         if not is_due and len(free) < self._attempt_points + _MORE_POINTS:
             return frame, outcomes
@@ -302,9 +302,9 @@ class Tracker:
     def _replace_doubted(
         self, frame: FrameState, outcomes: tuple[_Outcome, ...]
     ) -> tuple[FrameState, tuple[_Outcome, ...]]:
-        """Initialize a hand again that lacks most of its labels, or fits badly, with points around it.
+        """Initialize a hand again if it lacks most labels, or fits badly, and has unlabeled points around it.
 
-        A track can hold on to a wrong pose with a few points; it must not stay there.
+        Otherwise a track could hold on to a wrong pose by a few points.
         """
         for hand, state in enumerate(self._states):
             count = int((frame.markers(hand) >= 0).sum())
@@ -334,7 +334,7 @@ class Tracker:
         found: InitializedHand,
         among: NDArray[np.int64],
     ) -> tuple[FrameState, tuple[_Outcome, ...]]:
-        """Start a track from a hand that was initialized among some points."""
+        """Start a track from an initialized hand."""
         state, markers = self._states[found.index], np.full(len(frame.points), -1)
         markers[among] = found.labels
         targets = targets_of(frame.points, markers, state.num_markers)
@@ -353,7 +353,7 @@ def _weigh_labels(
     variance: Float[np.ndarray, "M"],
     evidence: Float[np.ndarray, "P"],
 ) -> Bool[np.ndarray, "M"]:
-    """Update the evidence of a hand's labels; return the markers whose labels were settled before."""
+    """Update the evidence of a hand's labels; return which markers had settled labels before."""
     settled = np.zeros(len(positions), dtype=np.bool_)
     for point in range(len(markers)):
         marker = markers[point]
@@ -368,7 +368,7 @@ def _weigh_labels(
 def _tracked_hand(
     state: HandState, outcome: _Outcome, frame: FrameState, own: NDArray[np.int64]
 ) -> TrackedHand:
-    """The output for a hand: its labeled points where there are some, the pose's markers elsewhere."""
+    """Output for a hand: its labeled points, and the pose's markers where points are missing."""
     count, side = state.num_markers, state.hand.side
     if state.qpos is None:
         no_markers = np.full((count, 3), np.nan)
@@ -377,7 +377,7 @@ def _tracked_hand(
     is_missing = np.isnan(seen[:, 0])
     markers, filled = np.where(is_missing[:, None], state.positions, seen), np.flatnonzero(is_missing)
     spreads = state.pose_spread(frame.time)
-    # A pose that stands still, or has just been found, tells nothing of the hand's velocity.
+    # A predicted or newly initialized pose has no known velocity.
     known = 1.0 if outcome.status is Status.TRACKED else np.nan
     qpos, velocity = state.qpos.copy(), known * state.velocity
     return TrackedHand(side, outcome.status, qpos, outcome.rms, markers, filled, spreads, velocity)

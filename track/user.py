@@ -31,12 +31,12 @@ AnyLabeler = Labeler | str | Path | None
 """A labeler, what `load_labeler` reads, or None for the one of the glove."""
 SCHEMA: Final = 1
 MEASURED: Final = "auto, "
-"""How the notes on hands begin whose size was measured; the size follows."""
+"""Prefix of the notes on measured hands; the size follows."""
 AS_MEASURED: Final = ", as measured"
-"""How the sentence on a hand ends that a calibration left as it was measured."""
-_MOST: Final = 1 << 24  # bytes; a user of two hands has 40,000
+"""Suffix of a calibration's sentence on a hand that stayed as measured."""
+_MOST: Final = 1 << 24  # [bytes] largest file; a user of two hands takes 40,000
 _ARRAYS: Final = {"points": "f8", "normals": "f8", "bone_indices": None, "bone_weights": "f8"}
-"""The stored arrays of an attachment and their types; indices keep theirs, so that fractions are refused."""
+"""Stored arrays of an attachment and their types; None keeps the type, so that fractional indices fail."""
 _DAMAGE: Final = (
     KeyError,
     TypeError,
@@ -49,25 +49,25 @@ _DAMAGE: Final = (
 
 
 class UserError(FileError):
-    """A user's file that cannot be read or written."""
+    """A user's file cannot be read or written."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class User(Sequence[GloveFit]):
-    """A person's hands in their gloves: measured, calibrated or read from a file. It is the sequence of them.
+    """A person's hands in their gloves, as a sequence: measured, calibrated or read from a file.
 
     Raises:
         ArgumentError: There is no hand, two are of one side, or they wear different gloves.
     """
 
     hands: tuple[GloveFit, ...]
-    """One hand or two, all with the same markers; lengths in [m], angles in [rad]."""
+    """One or two hands with the same markers; lengths in [m], angles in [rad]."""
     notes: str = ""
-    """Where they are from, in words."""
+    """Origin of the hands, in words."""
     calibrations: tuple[Calibration, ...] = ()
-    """How `calibrate` found each hand, and how well it fits frames that were held out; not in a file."""
+    """Results of `calibrate` for each hand, with its fit to held-out frames; not stored in files."""
     angle_errors: Mapping[Side, Float[np.ndarray, "20 2"]] = field(default_factory=dict)
-    """What a side's calibration leaves open of each joint angle [rad]: by places of markers, by bones."""
+    """Errors of each joint angle that remain after calibration [rad]: from marker places, from bones."""
 
     def __post_init__(self) -> None:
         expected = "a left hand, a right hand, or one of each in its glove"
@@ -85,24 +85,24 @@ class User(Sequence[GloveFit]):
 
     @property
     def layout(self) -> MarkerLayout:
-        """The glove, of the first hand."""
+        """The glove of the first hand."""
         return self.hands[0].layout
 
     @property
     def sides(self) -> tuple[Side, ...]:
-        """Sides of the hands, in their order."""
+        """Sides of the hands in order."""
         return tuple(hand.side for hand in self.hands)
 
     def origin(self, side: Side) -> HandOrigin:
-        """Where the hand of a side is from: of a named size, measured, or calibrated."""
+        """Origin of the hand of a side: a named size, measured, or calibrated."""
         return hand_origin(self.notes, side)
 
     def is_calibrated(self, side: Side) -> bool:
-        """Whether the hand of a side is the person's, not one of the same size."""
+        """Whether the hand of a side was calibrated to the person."""
         return self.origin(side) == "calibrated"
 
     def __str__(self) -> str:
-        """Length and breadth of the hands [mm], one pair where both are alike."""
+        """Length and breadth of the hands [mm]; one pair if both are alike."""
         sizes = [f"{1e3 * one.shape.length:.0f} x {1e3 * one.shape.breadth:.0f} mm" for one in self.hands]
         return " and ".join(dict.fromkeys(sizes))
 
@@ -111,7 +111,7 @@ class User(Sequence[GloveFit]):
     @overload
     def __getitem__(self, index: slice) -> tuple[GloveFit, ...]: ...
     def __getitem__(self, index: int | slice) -> GloveFit | tuple[GloveFit, ...]:
-        """A hand, or several."""
+        """One hand or several."""
         return self.hands[index]
 
     def __len__(self) -> int:
@@ -130,7 +130,7 @@ class User(Sequence[GloveFit]):
         return dataclasses.replace(self, hands=tuple(known[side] for side in sides))
 
     def of_side(self, side: Side | None = None) -> GloveFit:
-        """The hand of a side; when not given the right hand, or the only one.
+        """The hand of a side; if not given, the right hand or the only one.
 
         Raises:
             ArgumentError: The user has no such hand.
@@ -138,22 +138,22 @@ class User(Sequence[GloveFit]):
         return self.of_sides(["right" if "right" in self.sides else "left"] if side is None else [side])[0]
 
     def export(self, path: str | Path, side: Side | None = None, *, actuators: bool = False) -> None:
-        """Write a hand for other programs, in the flat pose; meters, radians, kilograms.
+        """Write a hand in the flat pose for other programs, in meters, radians and kilograms.
 
         Args:
             path: The file: .xml (MuJoCo, with the markers as sites), .urdf, .osim (OpenSim, with the markers)
                 or .glb (rigged skin, y up).
-            side: Which hand; when not given the right hand, or the only one.
-            actuators: Position servos in the .xml.
+            side: Which hand; if not given, the right hand or the only one.
+            actuators: Whether the .xml gets position servos.
 
         Raises:
-            ArgumentError: The name ends otherwise, or the user has no such hand.
+            ArgumentError: The file's ending is unknown, or the user has no such hand.
             OSError: The file cannot be written.
         """
         write_hand(Path(path), self.of_side(side), actuators=actuators)
 
     def save(self, path: str | Path) -> None:
-        """Write hands and gloves as JSON; `load_user` gives the same numbers again.
+        """Write hands and gloves as JSON; `load_user` reads the same numbers again.
 
         Args:
             path: The file, usually `user.json`.
@@ -177,9 +177,9 @@ class User(Sequence[GloveFit]):
 
 
 def hand_origin(notes: str, side: Side) -> HandOrigin:
-    """Where the hand of a side is from, of a user with these notes.
+    """Origin of the hand of a side, from the notes of its user.
 
-    A hand whose size could not be measured is of a usual one, and one that a calibration left so is measured.
+    Hands that could not be measured have a named size; one that calibration did not improve is measured.
     """
     if notes.removeprefix(MEASURED) in get_args(Size):
         return "named"
@@ -188,12 +188,12 @@ def hand_origin(notes: str, side: Side) -> HandOrigin:
 
 
 def _left_as_measured(notes: str) -> list[str]:
-    """The sentences on hands that a calibration left as they were measured."""
+    """Sentences of the notes on hands that stayed as measured."""
     return [told for told in notes.split("; ") if told.endswith(AS_MEASURED)]
 
 
 def nominal_user(layout: MarkerLayout, size: str, sides: str | Sequence[str]) -> User:
-    """Hands of one of the five sizes in gloves as designed, of one side or both."""
+    """Hands of one of the five sizes in gloves as designed, for one or both sides."""
     sides = (sides,) if isinstance(sides, str) else tuple(map(str, sides))
     if not sides or len(set(sides)) < len(sides) or not set(sides) <= set(SIDES):
         raise ArgumentError(f"hands are '{' '.join(sides)}', expected right, left, or one of each")
@@ -201,7 +201,7 @@ def nominal_user(layout: MarkerLayout, size: str, sides: str | Sequence[str]) ->
 
 
 def as_user(hands: User | Sequence[GloveFit] | str | Path) -> User:
-    """The user of hands, of a user's file, or one that is given."""
+    """Make a user of hands, a user's file, or a user."""
     if isinstance(hands, str | Path):
         user = load_user(hands)
         return dataclasses.replace(user, notes="; ".join([Path(hands).name, *_left_as_measured(user.notes)]))
@@ -218,7 +218,7 @@ def load_user(path: str | Path) -> User:
         path: The file, usually `user.json`; lengths are in [m], angles in [rad].
 
     Returns:
-        The user; `hands` are one hand or two, each in its glove.
+        The user; `hands` holds one or two hands in their gloves.
 
     Raises:
         UserError: The file does not exist, is not a user's file, has another schema, or is damaged.
@@ -245,7 +245,7 @@ def load_user(path: str | Path) -> User:
 
 
 def stored_errors(user: User) -> dict[Side, list[list[float]]]:
-    """The errors that calibrations leave of a user's angles, as JSON."""
+    """Errors of a user's angles after calibration, as JSON."""
     return {
         side: np.round(user.angle_errors[side], 6).tolist()
         for side in user.sides
@@ -254,7 +254,7 @@ def stored_errors(user: User) -> dict[Side, list[list[float]]]:
 
 
 def read_errors(stored: Any) -> dict[Side, Float[np.ndarray, "20 2"]]:
-    """What `stored_errors` stored; a `ValueError` if it is anything else."""
+    """Inverse of `stored_errors`; a `ValueError` if the data are invalid."""
     errors = {side: np.array(stored[side], dtype=np.float64) for side in SIDES if side in stored}
     for values in errors.values():
         if values.shape != (NUM_JOINTS, 2) or not (np.isfinite(values) & (values >= 0.0)).all():
@@ -265,7 +265,7 @@ def read_errors(stored: Any) -> dict[Side, Float[np.ndarray, "20 2"]]:
 def _reason(error: Exception) -> str:
     if isinstance(error, KeyError):
         return f"the key {error} is missing"
-    if isinstance(error, TypeError | AttributeError | OverflowError):  # in the words of Python
+    if isinstance(error, TypeError | AttributeError | OverflowError):  # rather than Python's message
         return "a value is of another kind than handsim calibrate writes"
     return " ".join(str(error).splitlines())
 
@@ -292,12 +292,12 @@ def _from_json(stored: dict[str, Any], layout: MarkerLayout) -> GloveFit:
 
 
 def labeler_of(worn: MarkerLayout, labeler: AnyLabeler) -> Labeler:
-    """A labeler that knows the markers of a glove; see `load_labeler` for errors."""
+    """Load a labeler for the markers of a glove; see `load_labeler` for errors."""
     return load_labeler(worn if hasattr(labeler, "label_frames") else designed_glove(worn), labeler)
 
 
 def designed_glove(worn: MarkerLayout) -> MarkerLayout:
-    """The shipped layout of a glove as it is worn, whose markers may have slipped: labelers know that one."""
+    """The shipped layout of a worn glove, whose markers may have slipped: labelers know the shipped one."""
     if worn.name not in list_layouts():
         return worn
     designed = load_layout(worn.name)

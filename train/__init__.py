@@ -2,7 +2,7 @@
 
 `generate_dataset` writes a training set, `train_labeler` trains a network on it, `load_labeler` reads a
 shipped or trained one, `evaluate_labeler` counts its errors. `simulate_take` simulates a capture with its
-truth. `score_rig` and `plan_rig` tell of cameras before they hang.
+truth. `score_rig` and `plan_rig` forecast what cameras see before they are mounted.
 """
 
 import os

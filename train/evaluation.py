@@ -1,11 +1,11 @@
-"""How right labelers are: known markers are corrupted as in the paper, labeled, and counted.
+"""Accuracy of labelers: known markers are corrupted as in the paper, labeled, and errors are counted.
 
-The figures are those of Han et al. 2018. Slot accuracy: over frames and label slots, a slot is right when it
-holds the right point, or rightly none (Tables 2, 4 and 6 on synthetic data). Point accuracy: over the points
-of the input, ghosts among them. Occlusion (O) and ghost (G) figures take "occluded slot" and "ghost point" as
-the positive class. Macro F1 is over points too: the mean F1 of the markers and of "ghost", the null class, as
-SOMA (Ghorbani and Black 2021) counts it. Calibration compares the confidence of labels with the share of them
-that is right.
+The figures are those of Han et al. 2018. Slot accuracy: share of label slots, over all frames, that hold the
+right point, or rightly none (Tables 2, 4 and 6 on synthetic data). Point accuracy: share of right labels of
+all points, ghosts included. Occlusion (O) and ghost (G) figures take "occluded slot" and "ghost point" as the
+positive class. Macro F1 is computed over points, too: the mean F1 of the markers and of "ghost", the null
+class, as in SOMA (Ghorbani and Black 2021). Calibration compares the confidence of labels with the share of
+right ones.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from train.labelers.storage import load_labeler
 from train.settings import EvaluateSettings
 
 BINS: Final = 15
-"""Equally wide bins of confidence."""
+"""Number of equally wide bins of confidence."""
 LEAST_SURE: Final = 0.02
 """Share of the points that a person might check by hand."""
 
@@ -48,7 +48,7 @@ LEAST_SURE: Final = 0.02
 class LabelCounts:
     """Running counts of right and wrong labels.
 
-    Precision is NaN where nothing was occluded, or no point was a ghost: it could only be zero.
+    Precision is NaN if nothing was occluded, or no point was a ghost: it could only be zero.
     """
 
     frames: int = 0
@@ -67,7 +67,7 @@ class LabelCounts:
     def add(
         self, labels: Int[np.ndarray, "N"], truth: Int[np.ndarray, "N"], num_labels: int
     ) -> Bool[np.ndarray, "M"]:
-        """Count one frame, given its labels and the true ones, -1 for a ghost. Returns the right slots."""
+        """Count one frame with its labels and the true ones, -1 for a ghost; return which slots are right."""
         given, true = _slots(labels, num_labels), _slots(truth, num_labels)
         right: np.ndarray = given == true
         self.frames += 1
@@ -83,7 +83,7 @@ class LabelCounts:
         return right
 
     def figures(self) -> dict[str, float]:
-        """All figures by name: shares in [0, 1], NaN where there was nothing to count."""
+        """All figures by name: shares in [0, 1], NaN if there was nothing to count."""
         counts = self.numbers()
         occluded, occluded_right = counts["occluded"], counts["occluded_right"]
         ghosts, ghosts_right, nan = counts["ghosts"], counts["ghosts_right"], float("nan")
@@ -116,7 +116,7 @@ class LabelCounts:
 
 
 def macro_f1(confusion: Int[np.ndarray, "K K"]) -> float:
-    """Mean F1 of the classes that occur, as true (rows) or given labels; NaN where none does."""
+    """Mean F1 of the classes that occur as true (rows) or given labels; NaN if none does."""
     occurs = confusion.sum(axis=0) + confusion.sum(axis=1)
     there = occurs > 0
     return float((2.0 * confusion.diagonal()[there] / occurs[there]).mean()) if there.any() else float("nan")
@@ -124,17 +124,17 @@ def macro_f1(confusion: Int[np.ndarray, "K K"]) -> float:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reliability:
-    """Points in equally wide bins of confidence; NaN in bins that hold none."""
+    """Points in equally wide bins of confidence; NaN in empty bins."""
 
     confidence: Float[np.ndarray, "15"]
     """Mean confidence."""
     right: Float[np.ndarray, "15"]
-    """Share that is right."""
+    """Share of right labels."""
     count: Int[np.ndarray, "15"]
 
 
 def reliability(confidence: Float[np.ndarray, "N"], right: Bool[np.ndarray, "N"]) -> Reliability:
-    """Share of right labels by confidence; a bin includes its lower edge, the last one also 1."""
+    """Share of right labels by confidence; bins include their lower edges, the last one also 1."""
     index = np.floor(confidence * BINS).astype(np.int64).clip(0, BINS - 1)
     count = np.bincount(index, minlength=BINS)
     sums = [np.bincount(index, weights, minlength=BINS) for weights in (confidence, right)]
@@ -143,7 +143,7 @@ def reliability(confidence: Float[np.ndarray, "N"], right: Bool[np.ndarray, "N"]
 
 
 def expected_calibration_error(confidence: Float[np.ndarray, "N"], right: Bool[np.ndarray, "N"]) -> float:
-    """Mean difference of a bin's confidence and its share of right labels, weighted by points."""
+    """Mean difference between a bin's confidence and its share of right labels, weighted by points."""
     if not len(confidence):
         return float("nan")
     bins = reliability(confidence, right)
@@ -153,14 +153,14 @@ def expected_calibration_error(confidence: Float[np.ndarray, "N"], right: Bool[n
 def error_without(
     confidence: Float[np.ndarray, "N"], right: Bool[np.ndarray, "N"], share: float = LEAST_SURE
 ) -> float:
-    """Share of points labeled wrongly once the share of least confidence is left out; NaN if none is left.
+    """Share of wrong labels without the given share of least confident points; NaN if no point is left.
 
-    Of points with equal confidence that are left out in part, the mean over all choices counts.
+    If points of equal confidence are left out in part, the mean over all choices counts.
     """
     kept = len(confidence) - round(share * len(confidence))
     if not kept:
         return float("nan")
-    least = np.partition(confidence, -kept)[-kept]  # the least confidence that is kept
+    least = np.partition(confidence, -kept)[-kept]  # the least kept confidence
     above, tied = confidence > least, confidence == least
     from_tied = (kept - above.sum()) * (~right[tied]).mean()
     return float(((~right[above]).sum() + from_tied) / kept)
@@ -168,17 +168,17 @@ def error_without(
 
 @dataclass(slots=True)
 class History:
-    """Loss, learning rate and held-out accuracy of a training run, as checkpoints keep them."""
+    """Loss, learning rate and held-out accuracy of a training run, as stored in checkpoints."""
 
     losses: list[tuple[int, float, float]] = field(default_factory=list)
-    """Samples done, mean loss of the steps since the previous entry, learning rate of the last of them."""
+    """Samples done, mean loss of the steps since the previous entry, their last learning rate."""
     accuracies: list[tuple[int, float, float]] = field(default_factory=list)
-    """Samples done, minutes of steps until then, slot accuracy on some held-out frames with the paper's
+    """Samples done, minutes of training until then, slot accuracy on some held-out frames with the paper's
     corruption."""
     minutes: float = 0.0
     """Time of all steps [min]."""
     waiting: float = 0.0
-    """Sum of the losses of the steps since the last entry."""
+    """Sum of losses since the last entry."""
     steps: int = 0
     """Number of steps since the last entry."""
 
@@ -201,7 +201,7 @@ def percent(share: float) -> str:
 
 
 def _slots(labels: Int[np.ndarray, "N"], num_labels: int) -> Int[np.ndarray, "M"]:
-    """Which point each label slot holds, -1 for none."""
+    """Point in each label slot, -1 for none."""
     slots = np.full(num_labels, -1)
     labeled = np.flatnonzero(labels >= 0)
     slots[labels[labeled]] = labeled
@@ -213,7 +213,7 @@ def _share(part: int, whole: int) -> float:
 
 
 def print_figures(columns: dict[str, dict[str, float]], *, title: str) -> None:
-    """Print figures in percent as a table, a column for each set of them."""
+    """Print sets of figures in percent as a table with a column for each set."""
     shares = [
         [name.replace("_", " "), *(percent(one[name]) for one in columns.values())]
         for name in next(iter(columns.values()))
@@ -222,16 +222,16 @@ def print_figures(columns: dict[str, dict[str, float]], *, title: str) -> None:
 
 
 _CHUNK: Final = 4096
-_BOOTSTRAPS: Final = 1000  # draws of people for an interval
+_BOOTSTRAPS: Final = 1000  # draws of people for a confidence interval
 CLEAN: Final = Corruption(occlude=0, ghosts=0)
-"""No corruption but the order of points."""
+"""Only the order of points is changed."""
 SEEN: Final = "as the rig sees them"
-"""Name of the figures of markers and ghosts as a rig saw them."""
+"""Name of the figures for markers and ghosts as seen by a rig."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LabelingReport:
-    """The result of an evaluation."""
+    """Result of an evaluation."""
 
     figures: dict[str, float]
     """Shares in [0, 1]: accuracies, precision and recall of occlusions and ghosts, macro F1, the expected
@@ -243,7 +243,7 @@ class LabelingReport:
     confidences: Float[np.ndarray, "N"]
     """Confidence of each point's label, the points of all frames in order."""
     right: Bool[np.ndarray, "N"]
-    """Whether that label is right."""
+    """Whether each of these labels is right."""
     numbers: dict[str, int] = field(default_factory=dict)
     """Slots, points, occlusions and ghosts counted."""
     right_slots: Bool[np.ndarray, "T M"] = field(default_factory=lambda: np.zeros((0, 0), dtype=np.bool_))
@@ -251,14 +251,14 @@ class LabelingReport:
     marker_names: tuple[str, ...] = ()
     """Names of the M markers; label m is the marker of index m."""
     seconds: Int[np.ndarray, "T"] | None = None
-    """The second of each frame, for labels of a take; frames of one second are alike."""
+    """The second of each frame, for labels of a take, as frames of one second are alike."""
 
     def interval(self, people: Int[np.ndarray, "T"], marker: int | None = None) -> tuple[float, float]:
-        """The 95 % interval of the slot accuracy, by a bootstrap over two or more people, or seconds.
+        """The 95 % interval of the slot accuracy, by a bootstrap over at least two people or seconds.
 
         Args:
-            people: The person, or the second, of each frame, as numbers.
-            marker: The index of the one marker whose slot counts; all when not given.
+            people: Number of the person, or the second, of each frame.
+            marker: Index of a single marker to evaluate; all if not given.
         """
         _, person = np.unique(people, return_inverse=True)
         frames = np.bincount(person)
@@ -271,11 +271,11 @@ class LabelingReport:
 
 
 Frames = tuple[list[Float[np.ndarray, "N 3"]], list[Int[np.ndarray, "N"]]]
-"""Points of some frames [m], and the marker of each; -1 for a ghost."""
+"""Points of some frames [m], and the marker of each, -1 for a ghost."""
 
 
 def evaluate_frames(labeler: Labeler, parts: Iterable[Frames]) -> LabelingReport:
-    """Label points whose truth is known, and count errors."""
+    """Label points with known truth, and count errors."""
     return _count(
         labeler.marker_names,
         (
@@ -291,7 +291,7 @@ def _count(
 ) -> LabelingReport:
     """Count errors in frames of given labels, their confidence, and true labels.
 
-    Labels without a confidence (NaN) are left out of the figures on confidence.
+    Labels with NaN as confidence are left out of the figures on confidence.
     """
     num_labels = len(names)
     counts = LabelCounts(confusion=np.zeros((num_labels + 1, num_labels + 1), dtype=np.int64))
@@ -338,14 +338,14 @@ def evaluate_markers(
 
 
 def paper_report(labeler: Labeler, rows: NDArray[np.void]) -> LabelingReport:
-    """Evaluation of a labeler on these rows with the paper's corruption, the same each time."""
+    """Evaluate a labeler on rows with the paper's corruption, which is the same each time."""
     markers = rows["markers"].astype(np.float64)
     corruption = paper_corruption(markers.shape[1])
     return evaluate_markers(labeler, markers, corruption, rng=np.random.default_rng(0))
 
 
 def rig_report(labeler: Labeler, rows: NDArray[np.void], *, rng: np.random.Generator) -> LabelingReport:
-    """Evaluation of a labeler on the points and ghosts of these rows, as their rig saw them."""
+    """Evaluate a labeler on the points and ghosts of rows as their rig saw them."""
     parts = (rows[first : first + _CHUNK] for first in range(0, len(rows), _CHUNK))
     clouds = (
         corrupt(part["observed"].astype(np.float64), CLEAN, ghosts=part["ghosts"].astype(np.float64), rng=rng)
@@ -355,7 +355,7 @@ def rig_report(labeler: Labeler, rows: NDArray[np.void], *, rng: np.random.Gener
 
 
 def cloud_frames(cloud: Cloud) -> Frames:
-    """The points and labels of clouds without their padding."""
+    """Points and labels of clouds without padding."""
     return (
         [points[here] for points, here in zip(cloud.points, cloud.present, strict=True)],
         [truth[here] for truth, here in zip(cloud.truth, cloud.present, strict=True)],
@@ -363,10 +363,10 @@ def cloud_frames(cloud: Cloud) -> Frames:
 
 
 def _take_frames(take: Take) -> Iterator[Frames]:
-    """The points of every hand of every frame of a take, separated by the truth.
+    """Points of every hand in every frame of a take, separated by the truth.
 
-    A ghost belongs to the hand with the nearest marker, if that is within `GHOST_REACH`. Markers of tracked
-    bodies belong to no hand.
+    A ghost is assigned to the hand with the nearest marker, if within `GHOST_REACH`. Markers of tracked
+    bodies are assigned to no hand.
     """
     labels = take.point_list.labels
     nearest = np.stack([_nearest_marker(take, label) for label in take.hand_labels])
@@ -381,7 +381,7 @@ def _take_frames(take: Take) -> Iterator[Frames]:
 
 
 def _nearest_marker(take: Take, label: range) -> Float[np.ndarray, "P"]:
-    """Distance from every point to the nearest visible marker of one hand [m]; inf where none is visible."""
+    """Distance from every point to the nearest visible marker of one hand [m]; inf if none is visible."""
     markers, points = take.observed(label), take.point_list
     distance = np.full(len(points.labels), np.inf)
     for frame, every in enumerate(markers):
@@ -392,8 +392,8 @@ def _nearest_marker(take: Take, label: range) -> Float[np.ndarray, "P"]:
 
 
 Truth = Float[np.ndarray, "T M 3"] | Dataset | Take | Capture | str | Path
-"""Markers whose labels are known: [m] in the labeler's order, a training set, a take with its truth, a
-labeled capture, the path of one of the three, or a folder of captures."""
+"""True markers: an array [m] in the labeler's order, a training set, a take with its truth, a labeled
+capture, the path of one of the last three, or a folder of captures."""
 
 
 def evaluate_labeler(
@@ -405,29 +405,28 @@ def evaluate_labeler(
     rng: np.random.Generator | None = None,
     **options: Any,
 ) -> LabelingReport:
-    """Corrupt known markers, label them and count errors; takes keep the gaps and ghosts that they have.
+    """Corrupt known markers, label them and count errors; takes keep their own gaps and ghosts.
 
-    Training sets without any corruption are counted as their rig saw them, with its gaps and ghosts.
+    Training sets without corruption are evaluated as their rig saw them, with its gaps and ghosts.
 
     Args:
-        labeler: The labeler to evaluate, its name or path, or a glove whose labeler it is.
+        labeler: Labeler to evaluate, its name or path, or a glove whose labeler is used.
         truth: True markers (T, M, 3) [m] in the labeler's order, NaN where missing; a training set, a labeled
             capture or a take with its truth; the path of one of these or of a folder of captures; or several.
             Each hand is counted by itself.
-        corruption: Occlusion, ghosts and jitter to draw, instead of those of the settings. Or a corruption of
-            your own, as `CloudStream` takes it.
-        settings: How to evaluate; every frame without any corruption when not given.
-        rng: Source of all randomness; one of the settings' seed when not given.
+        corruption: Corruption instead of that of the settings; also one of your own, as for `CloudStream`.
+        settings: Settings of the evaluation; every frame without corruption if not given.
+        rng: Source of all randomness; if not given, from the settings' seed.
         options: Settings of `EvaluateSettings` that differ from `settings`: `occlude=5, ghosts=2, every=10`.
 
     Returns:
-        Figures as shares in [0, 1], by their names, and the counts that they come from. The ghosts of a hand
-        of a take are those within 0.1 [m] of its markers.
+        Figures as shares in [0, 1], by name, and the underlying counts. Ghosts of a hand in a take are those
+        within 0.1 [m] of its markers.
 
     Raises:
         ArgumentError: An argument is of another type, or markers are not in meters.
-        CaptureError: A file cannot be read, its glove has other markers than the labeler knows, takes are
-            given with others or to be corrupted, or there is nothing to count.
+        CaptureError: A file cannot be read, its glove has other markers than the labeler, takes are mixed
+            with others or to be corrupted, or there is nothing to count.
     """
     network, settings = load_labeler(labeler), EvaluateSettings.of(settings, options)
     corruption = Corruption(settings.occlude, settings.ghosts) if corruption is None else corruption
@@ -473,7 +472,7 @@ def _shown(given: Any) -> str:
 
 
 def _simulated_take(given: Take | str | Path) -> Take:
-    """A take with its truth."""
+    """A take with its truth; a `CaptureError` if it is a tracked one."""
     take = given if isinstance(given, Take) else load_take(given)
     if take.made_by_tracker:
         raise CaptureError(f"{_shown(given)}: a tracked take, expected the truth of a simulated capture")
@@ -511,41 +510,41 @@ def _is_set(given: Any) -> bool:
 
 
 def _rows(dataset: Dataset, names: tuple[str, ...]) -> NDArray[np.void]:
-    """The rows of a set whose markers the labeler knows."""
+    """Rows of a set, whose markers must be those of the labeler."""
     _check_markers(f"the set {dataset.path}", dataset.marker_names, names)
     rows: NDArray[np.void] = dataset.rows()
     return rows
 
 
 def _check_markers(owner: str, has: Sequence[str], knows: Sequence[str]) -> None:
-    """Refuse markers that the labeler does not know."""
+    """Refuse markers that are not those of the labeler."""
     if tuple(has) != tuple(knows):
         raise CaptureError(f"{owner} has markers {', '.join(has)}, the labeler knows {', '.join(knows)}")
 
 
-_SAME_POINT: Final = 1e-3  # [m] between the places of a point in two files of a capture
-_SAME_CAPTURE: Final = 0.5  # least share of the points of a labeled capture that its truth has, too
+_SAME_POINT: Final = 1e-3  # [m] distance of a point between two files of a capture
+_SAME_CAPTURE: Final = 0.5  # The truth must have this share of a labeled capture's points.
 
 
 def evaluate_labels(labeled: Take | Capture | str | Path, truth: Take | str | Path) -> LabelingReport:
-    """Count errors in the labels of a capture against the truth of the simulated take that it is of.
+    """Count errors in the labels of a capture against the truth of the simulated take from which it comes.
 
-    Points are matched by frame and place, within 0.001 [m]. Slots are those of all hands of the truth. A
-    point that the capture lacks counts as one without a label; a point that the truth lacks, or that is a
-    rigid body's, as a ghost.
+    Points are matched by frame and position, within 0.001 [m]. Slots are those of all hands of the truth. A
+    point missing in the capture counts as one without a label; a point missing in the truth, or of a rigid
+    body, counts as a ghost.
 
     Args:
         labeled: A labeled capture with columns `ThumbTip` or `right:ThumbTip`, a tracked take, or the path of
-            one. Columns without a side are, in each frame, those of the hand that more of them fit.
+            one. Columns without a side are assigned, in each frame, to the hand with more right labels.
         truth: The take with its truth, or its path.
 
     Returns:
-        Figures as shares in [0, 1], by their names, and the counts that they come from, among them the points
-        that only one of the two has. Marker files have no confidence: figures on it are NaN.
+        Figures as shares in [0, 1], by name, and the underlying counts, with the numbers of points that only
+        one of the two has. Marker files have no confidence, so figures on it are NaN.
 
     Raises:
         ArgumentError: An argument is of another type.
-        CaptureError: A file cannot be read, the two are not of one capture, or a marker has no column or two.
+        CaptureError: A file cannot be read, the two are not of one capture, or a marker has not one column.
     """
     check_type("labeled", labeled, (Take, Capture, str, Path), "a Take or Capture, or the path of one")
     check_type("truth", truth, (Take, str, Path), "a Take, or the path of one")
@@ -589,7 +588,7 @@ def evaluate_labels(labeled: Take | Capture | str | Path, truth: Take | str | Pa
 
 
 def _partners(points: PointList, others: PointList) -> Int[np.ndarray, "P"]:
-    """The index of each point among the others, one to one by frame and place; -1 for none."""
+    """Index of each point's partner among the others, one to one by frame and position; -1 for none."""
     mine, theirs = (np.column_stack([one.points, one.frames]) for one in (points, others))
     distance, nearest = cKDTree(theirs).query(mine, distance_upper_bound=_SAME_POINT)
     order = np.argsort(distance, kind="stable")
@@ -603,12 +602,10 @@ def _partners(points: PointList, others: PointList) -> Int[np.ndarray, "P"]:
 def _labels_of_columns(
     points: PointList, columns: Sequence[str], true: Int[np.ndarray, "P"], actual: Take, what: str
 ) -> Int[np.ndarray, "P"]:
-    """The labels of points, which number columns of these names, as labels of the true take's hands."""
+    """Convert point labels that number columns of these names to labels of the true take's hands."""
     known = {name: label for label, name in enumerate(actual.label_names[: actual.hand_labels[-1].stop])}
-    options = np.full(
-        (len(actual.hands), len(columns) + 1), -1
-    )  # the last entry is for points without a label
-    absent = np.zeros(len(columns) + 1, dtype=np.bool_)  # columns of a hand that the truth lacks
+    options = np.full((len(actual.hands), len(columns) + 1), -1)  # last entry: points without a label
+    absent = np.zeros(len(columns) + 1, dtype=np.bool_)  # columns of hands missing in the truth
     for column, name in enumerate(columns):
         side, marker = (part.strip() for part in name.rpartition(":")[::2])
         absent[column] = side in SIDES and side not in actual.sides
@@ -625,5 +622,5 @@ def _labels_of_columns(
         [np.bincount(points.frames[one == true], minlength=actual.num_frames) for one in choices]
     )
     labels: NDArray[np.int64] = choices[fitting.argmax(axis=0)[points.frames], np.arange(len(true))]
-    # A marker that is given to a hand which is not there is a mistake, whatever its name.
+    # A marker assigned to a hand that is not in the truth is a mistake, whatever its name.
     return np.where(absent[points.labels] & (true >= 0), -1, labels)

@@ -1,4 +1,4 @@
-"""The device of this process, and by Fabric those of other processes that torchrun or srun started."""
+"""Devices of a training run, by Fabric: that of this process, and of others started by torchrun or srun."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ _LOOPBACK: Final = {"linux": "lo", "darwin": "lo0"}
 
 
 def start_fabric(settings: TrainSettings, out: Path) -> Fabric:
-    """Fabric with the device of this process, a GPU if there is one, and the writer of the curves.
+    """Start Fabric with this process's device, a GPU if there is one, and the writer of training curves.
 
-    It waits for the other processes of the run.
+    Waits for the other processes of the run.
     """
     environment, here, nodes = _processes()
     if settings.batch < here * nodes:
@@ -42,10 +42,10 @@ def start_fabric(settings: TrainSettings, out: Path) -> Fabric:
             f"{here} processes were started on this machine, expected 1 to {torch.cuda.device_count()}: one "
             "for each GPU"
         )
-    torch.set_flush_denormal(True)  # features of distances underflow, and denormal numbers make a core slow
-    logging.getLogger("lightning_fabric").setLevel(logging.WARNING)  # its messages do not concern users
+    torch.set_flush_denormal(True)  # Features underflow, and denormal numbers slow a core down.
+    logging.getLogger("lightning_fabric").setLevel(logging.WARNING)  # Its messages do not concern users.
     warnings.filterwarnings("ignore", module="lightning_fabric")
-    if nodes == 1 and sys.platform in _LOOPBACK:  # connections on one machine stay off the network
+    if nodes == 1 and sys.platform in _LOOPBACK:  # Connections within one machine stay off the network.
         os.environ.setdefault("GLOO_SOCKET_IFNAME", _LOOPBACK[sys.platform])
     fabric = Fabric(
         accelerator="cuda" if has_gpu else "cpu",
@@ -62,9 +62,9 @@ def start_fabric(settings: TrainSettings, out: Path) -> Fabric:
 
 
 def _processes() -> tuple[ClusterEnvironment, int, int]:
-    """The environment of this process, the number of processes on each machine, and of machines.
+    """The environment of this process, the number of processes per machine, and of machines.
 
-    A batch script that Slurm runs without srun is one process, whatever the job's number of tasks.
+    A batch script run by Slurm without srun is one process, whatever the job's number of tasks.
     """
     if TorchElasticEnvironment.detect():
         here = int(os.environ["LOCAL_WORLD_SIZE"])
@@ -77,30 +77,30 @@ def _processes() -> tuple[ClusterEnvironment, int, int]:
         raise ArgumentError(
             f"srun started {tasks} tasks on {nodes} nodes, expected as many on each (--ntasks-per-node)"
         )
-    os.environ.setdefault("SLURM_NTASKS_PER_NODE", str(tasks // nodes))  # srun -n alone does not set it
+    os.environ.setdefault("SLURM_NTASKS_PER_NODE", str(tasks // nodes))  # srun -n alone does not set this
     return SLURMEnvironment(auto_requeue=False), tasks // nodes, nodes
 
 
 def _leave() -> None:
-    """End gloo's threads before the interpreter, because one that frees a tensor later aborts the process."""
+    """End gloo's threads before the interpreter; one that frees a tensor later would abort the process."""
     if torch.distributed.is_initialized():
         torch.distributed.destroy_process_group()
 
 
 @contextmanager
 def lost_peers_told() -> Iterator[None]:
-    """Within the block a broken connection is a `HandSimError` that says so."""
+    """Turn a broken connection within the block into a `HandSimError`."""
     try:
         yield
     except RuntimeError as error:
-        # gloo has no class of errors for a lost process.
+        # gloo has no error class for a lost process.
         if not (isinstance(error, torch.distributed.DistError) or "gloo" in str(error)):
             raise
         raise HandSimError("another process of this run ended, and tells why") from error
 
 
 def _takes_bf16(precision: str) -> bool:
-    """Whether to run the forward pass in bf16, which is slow on CPUs without instructions for it."""
+    """Whether the forward pass runs in bf16, which is slow on CPUs without bf16 instructions."""
     if precision != "auto":
         return precision == "bf16"
     if torch.cuda.is_available():

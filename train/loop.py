@@ -1,4 +1,4 @@
-"""Training of a labeler: its steps and checkpoints, and the weights, card and page that a run ends with."""
+"""Training of a labeler: steps and checkpoints, and at the end weights, card and page."""
 
 from __future__ import annotations
 
@@ -64,17 +64,17 @@ from train.reports.run_page import UNKNOWN_LICENSE, write_model_card, write_run_
 from train.settings import CNNConfig, Kind, TrainSettings, batch_recipe, train_settings
 
 CHECKPOINT: Final = "checkpoint.pt"
-_HELD_OUT: Final = 0.02  # share of people, from the end, whom training never sees
-_LEAST_PEOPLE: Final = 20  # held-out people of a set of two hundred or more
-_NUM_EVALUATIONS: Final = 10  # on held-out frames in the course of a run
-_CURVE_FRAMES: Final[dict[Kind, int]] = {"set": 512, "cnn": 160}  # held-out frames of each of them
-_CARD_FRAMES: Final[dict[Kind, int]] = {"set": 8192, "cnn": 1024}  # those of the model card
-_FEWEST_SHOWN, _SAMPLES_A_FRAME = 64, 8  # held-out frames at least; samples of a run for each of them
-_CURVE_POINTS: Final = 200  # entries of the loss curve
-_PRIOR_STRETCH: Final = 0.03  # anisotropy of the prior's hands: real people differ more than simulated ones
-_COST_FRAMES: Final = 400  # held-out frames on which the costs of the paper's network are chosen
-_REJECTS: Final = (0.015, 0.02, 0.03, 0.04, 0.06, 0.08)  # costs of a ghost that are tried [m]
-_SPREADS: Final = (0.002, 0.003, 0.004, 0.006, 0.008, 0.012)  # confidence scales tried after training [m]
+_HELD_OUT: Final = 0.02  # share of people, from the end, held out from training
+_LEAST_PEOPLE: Final = 20  # held-out people of a set of at least two hundred
+_NUM_EVALUATIONS: Final = 10  # number of evaluations on held-out frames during a run
+_CURVE_FRAMES: Final[dict[Kind, int]] = {"set": 512, "cnn": 160}  # held-out frames of each such evaluation
+_CARD_FRAMES: Final[dict[Kind, int]] = {"set": 8192, "cnn": 1024}  # held-out frames of the model card
+_FEWEST_SHOWN, _SAMPLES_A_FRAME = 64, 8  # least held-out frames; samples of a run for each
+_CURVE_POINTS: Final = 200  # number of entries of the loss curve
+_PRIOR_STRETCH: Final = 0.03  # anisotropy of the prior's hands: real people differ more
+_COST_FRAMES: Final = 400  # held-out frames for choosing the costs of the paper's network
+_REJECTS: Final = (0.015, 0.02, 0.03, 0.04, 0.06, 0.08)  # [m] tried costs of a ghost
+_SPREADS: Final = (0.002, 0.003, 0.004, 0.006, 0.008, 0.012)  # [m] confidence scales tried after training
 
 
 class TrainingError(HandSimError):
@@ -94,22 +94,21 @@ def train_labeler(
 ) -> dict[str, Any]:
     """Train a labeler and write weights, card, curves and a page to `out`; continues from a checkpoint there.
 
-    `load_labeler(out)` is the labeler.
+    `load_labeler(out)` reads the labeler.
 
-    A run there may have had fewer samples. The learning rate then goes on as in a run of the new length. It
-    may have had another number of devices. In a process that torchrun or srun started this takes its part in
-    the run of all of them.
+    A run to be continued may have had fewer samples: the learning rate then continues as in a run of the new
+    length. It may also have had another number of devices. In a process started by torchrun or srun this
+    takes part in a run of all processes.
 
     Args:
         dataset: The training set, or its folder.
         out: Folder of the run.
-        settings: How to train; as the shipped labelers when not given.
-        threads: Threads of each process on a CPU. When not given, one for the set labeler and all for the
-            paper's network, but one where there are several processes. Weights differ in their last bits
-            with it.
-        progress: Called after every step with samples done and samples expected.
-        on_step: Called with what is done, such as "pose prior", when it begins; and after every step of
-            training with the loss.
+        settings: Settings of the training; those of the shipped labelers if not given.
+        threads: Threads of each process on a CPU. By default one for the set labeler, and all for the paper's
+            network unless there are several processes. The number affects the last bits of the weights.
+        progress: Called after every step with the numbers of samples done and in total.
+        on_step: Called with the name of each step, such as "pose prior", and with the loss after every
+            training step.
         save_every: Time between checkpoints [s].
         options: Settings of `TrainSettings` that differ from `settings`: `samples=300_000`; `labeler="cnn"`
             alone stands for the settings that the paper's network is trained with.
@@ -119,7 +118,7 @@ def train_labeler(
 
     Raises:
         DatasetError: The set is too small to train on.
-        WeightsError: `out` holds a run of other settings.
+        WeightsError: `out` holds a run with other settings.
         ArgumentError: A setting is refused, or there are fewer GPUs than processes.
         TrainingError: The loss is not finite.
         HandSimError: Another process of the run ended, and tells why.
@@ -136,11 +135,11 @@ def train_labeler(
         alone_on_cpu = fabric.device.type == "cpu" and fabric.world_size == 1
         threads = torch.get_num_threads() if settings.labeler == "cnn" and alone_on_cpu else 1
     with ExitStack() as stack, lost_peers_told(), torch_threads(threads):
-        # The thread that writes curves complains in a process that ends before the writer is closed.
+        # The thread that writes curves complains if its process ends before the writer is closed.
         stack.callback(fabric.logger.finalize, "")
         on_step("training set")
         flag = InterruptFlag()
-        # A process that a signal ends at once would have the others wait for it.
+        # A process ended immediately by a signal would make the others wait for it.
         with nullcontext() if fabric.world_size == 1 else interrupt_flag(flag, again=False):
             run = _prepare(load_dataset(dataset), settings, out, fabric)
             with run.kept():
@@ -150,7 +149,7 @@ def train_labeler(
 
 
 def _prepare(dataset: Dataset, settings: TrainSettings, out: Path, fabric: Fabric) -> _Run:
-    """Claim the folder of the run, or check that the run there is this one, and restore its checkpoint."""
+    """Claim the run's folder, or check that its run has the same settings, and restore the checkpoint."""
     rows, people = dataset.mapped_rows(), dataset.people()
     settings = settings.for_set(len(dataset.marker_names), len(rows))
     held_out = len(rows) - _first_held_out(people)
@@ -164,7 +163,7 @@ def _prepare(dataset: Dataset, settings: TrainSettings, out: Path, fabric: Fabri
             del record["corruption"]
         else:
             check_corruption(settings.corruption, len(dataset.marker_names))
-        # Older runs name their devices.
+        # Older runs record their devices.
         claim(
             out / RUN_SETTINGS, {"train": record, "dataset": dataset.manifest.config}, noun="training run",
             error=WeightsError, grows="train.samples", free=("train.devices",),
@@ -178,9 +177,9 @@ def _prepare(dataset: Dataset, settings: TrainSettings, out: Path, fabric: Fabri
 
 
 def _first_held_out(people: Int[np.ndarray, "T"]) -> int:
-    """The first row of the last people of a set, whom training never sees.
+    """The first row of a set's last people, who are held out from training.
 
-    They are 2 % of the people and no fewer than twenty, but a tenth of a small set's. Of a set of one person
+    They are 2 % of the people, at least twenty, but at most a tenth in a small set. In a set of one person
     the last 2 % of the rows are held out.
     """
     firsts = np.flatnonzero(np.diff(people, prepend=-1))
@@ -199,13 +198,13 @@ class _Run:
     rows: MappedRows
     held_out: MappedRows
     people: Int[np.ndarray, "T"]
-    """The person of each held-out row; empty in a set of one person, who is seen in training."""
+    """Person of each held-out row; empty in a set of one person, who is also trained on."""
     out: Path
 
     def do_steps(self, flag: InterruptFlag, progress: Progress, on_step: OnStep, save_every: float) -> None:
         """Make the remaining steps, and save the state every `save_every` seconds.
 
-        A signal ends the run between two steps; several processes all end after the same step.
+        A signal ends the run between two steps; several processes all end after the same one.
         """
         state, settings, alone = self.state, self.state.settings, self.state.fabric.world_size == 1
         recipe, names = batch_recipe(settings, len(self.manifest.marker_names)), self.manifest.marker_names
@@ -223,8 +222,8 @@ class _Run:
             if state.done >= settings.samples:
                 break
             with interrupt_flag(flag, again=alone):
-                # One generator per step, so that a resumed run makes the same draws; the same one on
-                # each device.
+                # One generator per step, so that a resumed run makes the same draws; all devices use the
+                # same one.
                 rng = np.random.default_rng((settings.seed, state.done, 0))
                 loss = state.step(draw_batch(self.rows, recipe, rng=rng), rng=rng)
             ended = torch.tensor(float(flag()), device=state.fabric.device)
@@ -312,7 +311,7 @@ class _Run:
 
 
 class TrainingState:
-    """The state that a run carries from step to step and a checkpoint keeps."""
+    """State of a run, which is updated in every step and stored in checkpoints."""
 
     def __init__(self, settings: TrainSettings, fabric: Fabric, rows: NDArray[np.void] | MappedRows) -> None:
         self.settings = settings
@@ -333,9 +332,9 @@ class TrainingState:
         self.began = time.monotonic(), 0
 
     def step(self, batch: Batch, *, rng: np.random.Generator) -> float:
-        """Make one gradient step together with the other devices and return the loss before it.
+        """Make one gradient step together with the other devices; return the loss before it.
 
-        Each device learns from its part of the batch; the rng is the same on each.
+        Each device learns from its part of the batch; `rng` is the same on all.
         """
         began = time.perf_counter()
         rate = self.settings.learning_rate * _rate(self.settings, self.done / self.settings.samples)
@@ -379,7 +378,7 @@ class TrainingState:
                     self.mean[name].copy_(tensor)
 
     def evaluate(self, rows: NDArray[np.void], names: tuple[str, ...]) -> None:
-        """Record the slot accuracy of the mean weights on a few held-out rows, the same each time."""
+        """Record the slot accuracy of the mean weights on a few held-out rows, which are always the same."""
         report = paper_report(labeler_of(self.averaged(), names), rows)
         accuracy = report.figures["slot_accuracy"]
         self.history.accuracies.append((self.done, self.history.minutes, accuracy))
@@ -387,13 +386,13 @@ class TrainingState:
 
     def averaged(self) -> nn.Module:
         """The network with the mean weights."""
-        with torch.random.fork_rng(devices=[]):  # initial weights are drawn, and replaced at once
+        with torch.random.fork_rng(devices=[]):  # Initial weights are drawn, and then replaced.
             network = new_network(self.settings.chosen)
         network.load_state_dict({name: tensor.cpu() for name, tensor in self.mean.items()})
         return network.eval()
 
     def save(self, path: Path) -> None:
-        """Write a checkpoint; the first process does."""
+        """Write a checkpoint in the first process."""
         if not self.fabric.is_global_zero:
             return
         content = {
@@ -403,8 +402,8 @@ class TrainingState:
             "done": self.done,
             "history": dataclasses.asdict(self.history),
         }
-        # Through memory: torch puts the temporary name into a file that it opens itself, and does not say
-        # that the disk is full.
+        # Through memory, as torch writes the temporary name into a file that it opens itself, and does not
+        # report a full disk.
         buffer = io.BytesIO()
         torch.save(content, buffer)
         with atomic_write(path) as temporary:
@@ -428,10 +427,10 @@ class TrainingState:
             self.network.load_state_dict(content["network"])
             self.optimizer.load_state_dict(content["optimizer"])
             self.mean, self.done = content["mean"], content["done"]
-            self.history = History(**content.get("history", {}))  # older checkpoints have none
+            self.history = History(**content.get("history", {}))  # Older checkpoints have none.
         except MemoryError:
             raise
-        except Exception as error:  # a file can be damaged in more ways than torch names
+        except Exception as error:  # A file can be damaged in more ways than torch has errors for.
             raise WeightsError(f"{path} is damaged; delete it to begin this run again") from error
         self.began = time.monotonic(), self.done
 
@@ -479,7 +478,7 @@ def _passed(done: int, settings: TrainSettings, parts: int) -> bool:
 def choose_costs(network: DeepLabelCNN, marker_names: tuple[str, ...], rows: NDArray[np.void]) -> CNNConfig:
     """Choose the reject with the best slot accuracy on held-out rows, and the best calibrated spread.
 
-    A reject or spread that was set before stays.
+    A given reject or spread is kept.
     """
     labeler = _Recalling(network, marker_names)
 
@@ -500,7 +499,7 @@ def choose_costs(network: DeepLabelCNN, marker_names: tuple[str, ...], rows: NDA
 
 
 class _Recalling:
-    """A labeler that runs its network once and labels the same frames again at other costs."""
+    """Labeler that runs its network once, and labels the same frames again with other costs."""
 
     def __init__(self, network: DeepLabelCNN, marker_names: tuple[str, ...]) -> None:
         self.marker_names = marker_names

@@ -1,4 +1,4 @@
-"""Settings of the labelers, their training and their evaluation; without torch, so that help is fast."""
+"""Settings of labelers, their training and their evaluation; without torch, so that help is fast."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ EPOCHS: Final = 75
 """Passes of the paper's training through its frames."""
 Views = Literal["aligned", "random"]
 """`aligned` turns every hand like the mean hand; `random` is the paper's policy: any view in training, and
-for labeling the one of ten on which the cloud spreads best."""
+for labeling the one of ten in which the cloud has the largest extent."""
 _KNEE: Final = 0.02
-_MAX_CLOUDS: Final = 1_000_000  # in a batch
+_MAX_CLOUDS: Final = 1_000_000  # clouds in a batch
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,14 +42,14 @@ class SetLabelerConfig(Settings):
     """Largest distance [m] with a basis function of its own; a hand's markers span about this much."""
 
     def check(self) -> None:
-        """Refuse groups of different sizes."""
+        """Refuse gate groups of different sizes."""
         if self.width % self.gates:
             raise ArgumentError(f"gates is {self.gates}, expected a divisor of width, {self.width}")
 
 
 @dataclass(frozen=True, slots=True)
 class CNNConfig(Settings):
-    """How the paper's network sees a cloud, and how labels follow from the positions that it predicts."""
+    """How the paper's network sees a cloud, and how labels follow from its predicted positions."""
 
     num_labels: Annotated[int, Limits(1, 1000)] = field(default=19, metadata={"follows": "the training set"})
     views: Views = "aligned"
@@ -57,7 +57,7 @@ class CNNConfig(Settings):
     """Cost of a point without a label [m]: no point is matched over a larger distance. Chosen on held-out
     simulated frames when not given."""
     spread: Annotated[float | None, Limits(0.0, above=True)] = None
-    """Distance over which a label's weight in the confidence falls by a factor of e [m]; chosen likewise."""
+    """Distance over which a label's weight in the confidence falls by e [m]; chosen likewise."""
 
 
 NetworkConfig = SetLabelerConfig | CNNConfig
@@ -92,7 +92,7 @@ class TrainSettings(Settings):
     jitter: Annotated[float, Limits(0.0, 0.1)] = 0.005
     """Largest half width of the uniform noise on each coordinate [m]; every batch draws its own."""
     rig_share: Annotated[float, Limits(0.0, 1.0)] = 0.5
-    """Share of batches that are what the simulated rig sees; the others get the paper's corruption."""
+    """Share of batches as seen by the simulated rig; the others get the paper's corruption."""
     occlude: Annotated[int | None, Limits(0, MAX_CHANGED)] = None
     """Most draws of a marker to drop in the paper's corruption; a quarter of the markers when not given, as
     in the paper for its 19 and 13 markers."""
@@ -113,11 +113,11 @@ class TrainSettings(Settings):
 
     @property
     def chosen(self) -> NetworkConfig:
-        """The settings of the network of this kind."""
+        """Settings of the network of the chosen kind."""
         return self.cnn if self.labeler == "cnn" else self.network
 
     def check(self) -> None:
-        """Refuse settings of the other kind of network, and the paper's corruption beside one's own."""
+        """Refuse settings of the other kind of network, and the paper's corruption besides a user's own."""
         is_given = {
             "network": self.network != SetLabelerConfig(self.network.num_labels),
             "cnn": self.cnn != CNNConfig(self.cnn.num_labels),
@@ -152,12 +152,12 @@ def batch_recipe(settings: TrainSettings, num_markers: int) -> BatchRecipe:
 
 
 def usual_settings(labeler: Kind = "set", preset: Preset | None = None) -> TrainSettings:
-    """The settings that a labeler of this kind is trained with when no others are given, or of a preset.
+    """Default settings of a kind of labeler, or those of a preset.
 
     `han2018` is section 3.3 of Han et al. 2018: plain SGD from 0.6, batches of 256, 75 epochs, random drops
-    and ghosts, views from anywhere, a smooth L1 loss with its usual knee of one, and points matched over
-    15 mm at most. The paper does not give the jitter; ours is that of its published data (±3 mm). A 16-bit
-    precision on hardware that has it is not the paper's either.
+    and ghosts, views from anywhere, a smooth L1 loss with its usual knee of one, and points matched over at
+    most 15 mm. The paper does not give the jitter; ours is that of its published data (±3 mm). 16-bit
+    precision, on hardware that has it, is not the paper's either.
     """
     if preset == "han2018":
         return TrainSettings(
@@ -191,7 +191,7 @@ def usual_settings(labeler: Kind = "set", preset: Preset | None = None) -> Train
 
 
 def train_settings(settings: TrainSettings | None, options: Mapping[str, Any]) -> TrainSettings:
-    """The settings with those that are given by name; a `labeler` alone stands for its usual settings."""
+    """Override settings by name; `labeler` alone selects its default settings."""
     if settings is None and options.get("labeler") in KINDS:
         settings = usual_settings(options["labeler"])
     return TrainSettings.of(settings, options)
@@ -199,7 +199,7 @@ def train_settings(settings: TrainSettings | None, options: Mapping[str, Any]) -
 
 @dataclass(frozen=True, slots=True)
 class EvaluateSettings(Settings):
-    """Which true frames a labeler is evaluated on, and how they are corrupted."""
+    """Frames on which a labeler is evaluated, and their corruption."""
 
     noun = "setting of an evaluation"
 

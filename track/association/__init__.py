@@ -1,11 +1,11 @@
-"""Data association: which point is which marker of which hand, and hands among points without history.
+"""Data association: which point is which marker of which hand, and initialization without history.
 
-A frame goes through these steps as a `FrameState`, which each replaces by the next:
+A frame passes through these steps as a `FrameState`:
 
-- `frame_state`: the points of a frame, numbers of them that last, and the labels that these carry over.
+- `frame_state`: points of a frame with persistent numbers, and the labels that these carry over.
 - `hand_state`: filter state of one hand: prediction, fit, update, and the learned bias of each marker.
-- `label_consistency`: kept labels: exchanged, gated, tested by the fit, and compared with the labeler's.
-- `label_new_points`: labels for new points: those of a palm, and the best combination of all digits'.
+- `label_consistency`: tests of kept labels: exchanges, gate, fit, and comparison with the labeler's labels.
+- `label_new_points`: labels of new points: of a palm, and the best joint assignment of all digits.
 - `digit_hypotheses`: every assignment of a digit's candidates to its markers, fitted and scored.
-- `initialization`: hands without history, from labeled clouds, and frames labeled by themselves.
+- `initialization`: hands without history, from labeled clouds, and labels of single frames.
 """

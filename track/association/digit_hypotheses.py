@@ -1,10 +1,10 @@
-"""Hypotheses of a digit: every assignment of a few candidate points to its markers is fitted; compiled.
+"""Hypotheses of a digit: every assignment of a few candidate points to its markers, fitted and scored.
 
-With the palm known, a digit has four hinges, and three markers on it leave five of nine coordinates as a
-test. So the points near a digit can be labeled by trying all assignments. The score of a hypothesis is its
-log-odds against all points being strays: from the distances of the points from the fitted markers, from that
-of the hinges from their prior, from the Laplace approximation of the hinges' uncertainty, and from the
-evidence of IDs and of the labeler's reviews.
+With the palm known, a digit has four joint angles, and three markers on it leave five of nine coordinates as
+a test. So the points near a digit can be labeled by trying all assignments. The score of a hypothesis is its
+log-odds against all points being strays. It sums up the distances of the points from the fitted markers, the
+prior of the joint angles, the Laplace approximation of their uncertainty, and the evidence of IDs and of
+the labeler's reviews.
 """
 
 from __future__ import annotations
@@ -31,39 +31,39 @@ from track.kinematics.marker_kinematics import (
 )
 from track.kinematics.pose_spread import JointPrior, MarkerPrediction, digit_prior
 
-IMPOSSIBLE: Final = 1e9  # minus the score of a hypothesis that is excluded
-_ANGLES_PER_HINGE: Final = 5  # angles of each hinge at which distances are taken
-_LENGTH_TOLERANCE: Final = 0.003  # [m] of the distances between two markers of a digit over all poses
-_PRUNING_MARGIN: Final = 7.0  # log-odds behind another hypothesis from which on one is not fitted
-_START_DISTANCE: Final = float(np.deg2rad(5.0))  # two starts are one if no hinge differs by more
-_MOST_FIT_STEPS: Final = 10  # Levenberg-Marquardt steps at most; a digit needs about four
-_SMALL_GAIN: Final = 0.01  # of the cost (half squared standard deviations); no decision hangs on less
-_ROBUST_SQUARE: Final = 20.0  # squared standard deviations of the prior at which its loss levels off
+IMPOSSIBLE: Final = 1e9  # score of an excluded hypothesis, negated
+_ANGLES_PER_HINGE: Final = 5  # grid of each joint angle for the ranges of distances
+_LENGTH_TOLERANCE: Final = 0.003  # [m] tolerance of distances between two markers of a digit
+_PRUNING_MARGIN: Final = 7.0  # A hypothesis with an upper bound this far behind another is not fitted.
+_START_DISTANCE: Final = float(np.deg2rad(5.0))  # Two starts closer than this in every angle are one.
+_MOST_FIT_STEPS: Final = 10  # most Levenberg-Marquardt steps; a digit needs about four
+_SMALL_GAIN: Final = 0.01  # least gain of a step (half squared standard deviations)
+_ROBUST_SQUARE: Final = 20.0  # scale of the prior's robust loss, in squared standard deviations
 
 
 class DigitRanges(NamedTuple):
-    """Range of the distance between two markers of one digit over all poses."""
+    """Range of the distance between two markers of a digit over all poses."""
 
     nearest: Float[np.ndarray, "M M"]  # least distance [m]
     farthest: Float[np.ndarray, "M M"]  # largest distance [m]
 
 
 class DigitModel(NamedTuple):
-    """The model that the candidates of a digit are tested against."""
+    """Model of a hand, against which a digit's candidates are tested."""
 
-    joint_prior: JointPrior  # distribution of the hand's hinges before the frame's markers were used
-    predicted: MarkerPrediction  # the hand as fitted to the labels so far
+    joint_prior: JointPrior  # prior of the hand's joint angles before this frame
+    predicted: MarkerPrediction  # the hand fitted to the labels so far
     variance: Float[np.ndarray, "M"]  # variance of each marker around its position [m^2]
-    peak_log_odds: Float[np.ndarray, "M"]  # of a point exactly at the predicted position of each marker
-    slack: Float[np.ndarray, "M"]  # by which each marker may be off its place on the hand of the ranges [m]
+    peak_log_odds: Float[np.ndarray, "M"]  # log-odds of a point exactly at the predicted marker
+    slack: Float[np.ndarray, "M"]  # possible offset of each marker from its design, beyond `ranges` [m]
     ranges: DigitRanges  # distances between markers of a digit over all poses
 
 
 class DigitHypotheses(NamedTuple):
-    """The best assignment of every set of a digit's points, one row per set: bit n is its n-th candidate."""
+    """The best assignment of every subset of a digit's candidates, one row per subset (bits)."""
 
     scores: Float[np.ndarray, "*D S"]  # log-odds against all points being strays; `-IMPOSSIBLE` if excluded
-    runners_up: Float[np.ndarray, "*D S"]  # the same of the next best assignment of the same points
+    runners_up: Float[np.ndarray, "*D S"]  # score of the second best assignment
     assignments: Int[np.ndarray, "*D S K"]  # candidate of each of the digit's markers, -1 for none
 
 
@@ -80,17 +80,17 @@ class DigitPoints(NamedTuple):
 
 
 def digit_ranges(hand: GloveFit) -> DigitRanges:
-    """The distances of a hand's markers over a grid of its hinges, the same for each digit."""
+    """Ranges of the distances between a hand's markers over a grid of joint angles, equal for all digits."""
     shares = np.indices((_ANGLES_PER_HINGE,) * 4).reshape(4, -1).T / (_ANGLES_PER_HINGE - 1)
     low, high = hand.model.skeleton.ranges.T
     markers, _ = hand.markers(join_qpos(low + np.tile(shares, 5) * (high - low)))
-    x, y, z = np.ascontiguousarray(markers.T)  # poses last, which is six times as fast
+    x, y, z = np.ascontiguousarray(markers.T)  # Poses last is six times as fast.
     squares = (x[:, None] - x) ** 2 + (y[:, None] - y) ** 2 + (z[:, None] - z) ** 2
     return DigitRanges(np.sqrt(squares.min(axis=-1)), np.sqrt(squares.max(axis=-1)))
 
 
 def empty_hypotheses(num_digits: int, num_candidates: int, num_markers: int) -> DigitHypotheses:
-    """`DigitHypotheses` to be filled, for so many candidates and markers of each digit at most."""
+    """Buffers of `DigitHypotheses`, for at most this number of candidates and markers per digit."""
     sets = num_digits, 1 << num_candidates
     return DigitHypotheses(
         np.full(sets, -IMPOSSIBLE), np.full(sets, -IMPOSSIBLE), np.full((*sets, num_markers), -1)
@@ -108,7 +108,7 @@ def evaluate_digit(
     log_odds: Float[np.ndarray, "N M"],
     found: DigitHypotheses,
 ) -> None:
-    """Evaluate all assignments of points to a digit's markers, with the labels' other log-odds."""
+    """Evaluate all assignments of points to a digit's markers; `log_odds` are those apart from the fit."""
     pose, wrist = model.predicted.qpos, np.empty((3, 3))
     write_quaternion_matrix(wrist, pose[3], pose[4], pose[5], pose[6])
     local, label_log_odds = np.zeros((len(candidates), 3)), np.empty((len(candidates), len(markers)))
@@ -128,7 +128,7 @@ def evaluate_digit(
 def _fit_hypotheses(
     own: DigitPoints, model: DigitModel, label_log_odds: Float[np.ndarray, "C K"], found: DigitHypotheses
 ) -> None:
-    """Fit the hypotheses that may still be the best for their points, those with the fewest labels first."""
+    """Fit the hypotheses that may be the best for their points, those with the fewest labels first."""
     scores, runners_up, assignments = found
     count, choices, angles_before = len(own.markers), len(own.points) + 1, model.predicted.qpos[7:]
     work = workspace(len(own.hand.digits))
@@ -171,7 +171,7 @@ def _fit_hypotheses(
 
 @kernel
 def _decode(number: int, choices: int, hypothesis: Int[np.ndarray, "K"]) -> int:
-    """Write the hypothesis of a number, and return the set of points that it uses as bits."""
+    """Write the hypothesis of a number; return the points that it uses as bits."""
     points_used = 0
     for slot in range(len(hypothesis)):
         hypothesis[slot] = number % choices - 1
@@ -185,7 +185,7 @@ def _decode(number: int, choices: int, hypothesis: Int[np.ndarray, "K"]) -> int:
 def _costliest_subset(
     number: int, choices: int, hypothesis: Int[np.ndarray, "K"], costs: Float[np.ndarray, "H"]
 ) -> int:
-    """Number of the costliest hypothesis with one label less; its cost is a lower bound of this one's."""
+    """Number of the costliest hypothesis with one label less, whose cost is a lower bound of this one's."""
     costliest, radix = 0, 1
     for slot in range(len(hypothesis)):
         part = number - (hypothesis[slot] + 1) * radix
@@ -199,7 +199,7 @@ def _costliest_subset(
 def _best_subset_score(
     points_used: int, scores: Float[np.ndarray, "S"], subset_scores: Float[np.ndarray, "S"]
 ) -> float:
-    """Best score so far of any proper subset of a set of points; `subset_scores` keeps it for larger sets."""
+    """Best score so far of a proper subset of some points, stored in `subset_scores` for larger sets."""
     bit = 1
     while bit <= points_used:
         if points_used & bit:
@@ -216,7 +216,7 @@ def _upper_bound(
     label_log_odds: Float[np.ndarray, "C K"],
     hypothesis: Int[np.ndarray, "K"],
 ) -> float:
-    """Score of a hypothesis if every point is at its marker; `-IMPOSSIBLE` if the distances exclude it."""
+    """Score of a hypothesis with every point at its marker; `-IMPOSSIBLE` if the distances exclude it."""
     ranges, slack, total = model.ranges, model.slack, 0.0
     for slot in range(len(own.markers)):
         point, one = hypothesis[slot], own.markers[slot]
@@ -245,10 +245,10 @@ def fit_hypothesis(
     angles: Float[np.ndarray, "4"],
     work: Workspace,
 ) -> tuple[float, float]:
-    """Fit the four hinges of a digit [rad] to a hypothesis; return the cost and the complexity term.
+    """Fit the four joint angles of a digit [rad] to a hypothesis; return cost and complexity.
 
-    The complexity is half the log ratio of the hinges' precision after and before (Laplace's approximation),
-    because a hypothesis that any pose would fit is little evidence. Costs beyond `cutoff` end the fit early.
+    Complexity is half the log ratio of the angles' precision after and before (Laplace's approximation): a
+    hypothesis that any pose fits is weak evidence. A cost beyond `cutoff` ends the fit early.
     """
     trial, factor, step = angles.copy(), np.empty((4, 4)), np.empty(4)
     normal, gradient = np.empty((4, 4)), np.empty(4)
@@ -297,7 +297,7 @@ def _accumulate_digit(
     normal: Float[np.ndarray, "4 4"],
     gradient: Float[np.ndarray, "4"],
 ) -> float:
-    """Cost of a hypothesis at some angles [rad]; its normal matrix and half its gradient are filled."""
+    """Cost of a hypothesis at some angles [rad]; writes the normal matrix and half the gradient."""
     normal[:] = 0.0
     gradient[:] = 0.0
     hand, mean, precision, cost, first = own.hand, own.mean, own.precision, 0.0, 4 * own.digit

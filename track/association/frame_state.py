@@ -1,7 +1,7 @@
-"""The labels of a frame's points, and the state that the steps of the tracker hand from one to the next.
+"""Labels of a frame's points, and the state that the tracker's steps pass on.
 
-A label is one number: the markers of each hand in their layout's order, hand after hand, then those of each
-rigid body. Only `Numbering` knows where a hand begins.
+A label is one number: it counts the markers of each hand in the order of its layout, hand after hand, then
+those of each rigid body. Only `Numbering` knows where a hand begins.
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ from handsim.kernels import kernel
 from handsim.space.transforms import rigid_fit
 from train.labelers.matching import assign
 
-_LASTING_SHARE: Final = 0.5  # of the last frame's IDs must be there again for the stream's IDs to be used
-# Distance of a point from its prediction [m], before hands are aligned and after each alignment.
+_LASTING_SHARE: Final = 0.5  # Use the stream's IDs only if this share of the last frame's IDs persists.
+# [m] gates of distances from the prediction, before hands are aligned and after each alignment
 _DISTANCES: Final = (0.04, 0.025, 0.015)
-_FEWEST_ALIGNED: Final = 5  # points with which a hand is aligned
-_NEIGHBORS: Final = 0.06  # [m] between markers whose distance hardly changes from frame to frame
-_FEWEST_NEIGHBORS: Final = 3  # pairs of these that tell something
-_BESIDE_DISTANCE: Final = 0.06  # [m] from a hand's points within which a point without a label moves with it
+_FEWEST_ALIGNED: Final = 5  # A hand is aligned with at least this many points.
+_NEIGHBORS: Final = 0.06  # [m] Distances between markers closer than this hardly change between frames.
+_FEWEST_NEIGHBORS: Final = 3  # A pair of frames needs this many neighbor pairs before their distances count.
+_BESIDE_DISTANCE: Final = 0.06  # [m] An unlabeled point this close to a hand's points moves with the hand.
 
 
 class Numbering:
-    """The one numbering of the markers of all owners, of which each has some: hands, then bodies."""
+    """The numbering of all markers: those of the hands, then those of the bodies."""
 
     def __init__(self, counts: Sequence[int]) -> None:
         self._first = np.cumsum([0, *counts]).tolist()
@@ -35,28 +35,28 @@ class Numbering:
         """Owner of each label."""
 
     def part(self, owner: int) -> slice:
-        """The labels of an owner."""
+        """Range of the labels of an owner."""
         return slice(self._first[owner], self._first[owner + 1])
 
     def markers(self, owner: int, labels: Int[np.ndarray, "N"]) -> Int[np.ndarray, "N"]:
-        """Marker of an owner that each point is, in the layout's order; -1 where it is none of them."""
+        """Index of each point's marker in an owner's layout; -1 for points that are none of its markers."""
         return _markers(labels, self._first[owner], self._first[owner + 1])
 
     def with_markers(
         self, owner: int, markers: Int[np.ndarray, "N"], labels: Int[np.ndarray, "N"]
     ) -> Int[np.ndarray, "N"]:
-        """Labels in which exactly these points are an owner's markers, -1 for none of them."""
+        """Replace an owner's labels: `markers` holds the new marker of each point, -1 for none."""
         return _with_markers(labels, self._first[owner], self._first[owner + 1], markers)
 
 
 class FrameState(NamedTuple):
-    """P points of a frame and what is known of each so far; no array of it is ever overwritten."""
+    """P points of a frame and what is known of each so far; its arrays are never overwritten."""
 
     points: Float[np.ndarray, "P 3"]  # points in the world [m]
-    ids: Int[np.ndarray, "P"]  # numbers of the points that last from frame to frame
+    ids: Int[np.ndarray, "P"]  # persistent numbers of the points
     labels: Int[np.ndarray, "P"]  # label of each point by `numbering`, -1 for none
     evidence: Float[np.ndarray, "P"]
-    """Evidence for the label of each point that its number has collected over the frames (log-odds)."""
+    """Evidence (log-odds) for each point's label, accumulated over the frames of its number."""
     confidence: Float[np.ndarray, "P"]  # confidence in each label, 0 to 1
     first_seen: Float[np.ndarray, "P"]  # time of the first frame with the point's number [s]
     time: float  # time of the frame [s]
@@ -68,23 +68,23 @@ class FrameState(NamedTuple):
         return self.labels < 0
 
     def markers(self, hand: int) -> Int[np.ndarray, "P"]:
-        """Marker of a hand that each point is, -1 where it is none of them."""
+        """Index of each point's marker on a hand; -1 for points that are none of its markers."""
         return self.numbering.markers(hand, self.labels)
 
     def with_markers(self, hand: int, markers: Int[np.ndarray, "P"]) -> FrameState:
-        """The state in which exactly these points are a hand's markers."""
+        """Replace a hand's labels."""
         return self._replace(labels=self.numbering.with_markers(hand, markers, self.labels))
 
     def with_confidence(
         self, changed: Bool[np.ndarray, "P"], confidence: Float[np.ndarray, "C"]
     ) -> FrameState:
-        """The state in which C labels are new: without evidence so far, and with this confidence (0 to 1)."""
+        """Give C changed labels no evidence, and a confidence from 0 to 1."""
         evidence, all_confidence = self.evidence.copy(), self.confidence.copy()
         evidence[changed], all_confidence[changed] = 0.0, confidence
         return self._replace(evidence=evidence, confidence=all_confidence)
 
     def free_for(self, hands: Sequence[int]) -> Int[np.ndarray, "F"]:
-        """Indices of the points that have no label, or one of these hands."""
+        """Indices of the points without a label or with a label of these hands."""
         free = self.unlabeled
         for hand in hands:
             free |= self.markers(hand) >= 0
@@ -95,7 +95,7 @@ class FrameState(NamedTuple):
 def targets_of(
     points: Float[np.ndarray, "N 3"], markers: Int[np.ndarray, "N"], count: int
 ) -> Float[np.ndarray, "M 3"]:
-    """Labeled points in the order of a layout of so many markers [m], NaN where a marker has no point."""
+    """Labeled points in the order of a layout [m], NaN where a marker has no point."""
     targets = np.full((count, 3), np.nan)
     for point in range(len(markers)):
         if markers[point] >= 0:
@@ -105,7 +105,7 @@ def targets_of(
 
 @kernel
 def _markers(labels: Int[np.ndarray, "N"], first: int, last: int) -> Int[np.ndarray, "N"]:
-    """`Numbering.markers` of the owner of the labels from `first` to before `last`."""
+    """`Numbering.markers`, for labels from `first` to before `last`."""
     markers = np.full(len(labels), -1)
     for point in range(len(labels)):
         if first <= labels[point] < last:
@@ -117,7 +117,7 @@ def _markers(labels: Int[np.ndarray, "N"], first: int, last: int) -> Int[np.ndar
 def _with_markers(
     labels: Int[np.ndarray, "N"], first: int, last: int, markers: Int[np.ndarray, "N"]
 ) -> Int[np.ndarray, "N"]:
-    """`Numbering.with_markers` of the owner of the labels from `first` to before `last`."""
+    """`Numbering.with_markers`, for labels from `first` to before `last`."""
     changed = labels.copy()
     for point in range(len(labels)):
         if markers[point] >= 0:
@@ -128,17 +128,17 @@ def _with_markers(
 
 
 class PointHistory:
-    """What is known of the points of a stream from the frames before: label, evidence and age."""
+    """History of a stream's points by their numbers: label, evidence and age."""
 
-    # Labels do not outlive some silence [s] without a frame; IDs may have changed by then.
+    # Labels are dropped after `silence` seconds without a frame, as IDs may have changed.
 
     def __init__(self, numbering: Numbering, silence: float) -> None:
         self._numbering = numbering
         self._silence = silence
         self._linker = PointLinker(numbering.owners)
-        self._labels: dict[int, int] = {}  # of each number
-        self._evidence: dict[int, float] = {}  # for these labels (log-odds)
-        self._first_seen: dict[int, float] = {}  # [s] of each number
+        self._labels: dict[int, int] = {}  # by point number
+        self._evidence: dict[int, float] = {}  # log-odds of these labels
+        self._first_seen: dict[int, float] = {}  # [s] by point number
         self._last_time = -np.inf  # [s] of the last frame
 
     def carry(
@@ -148,7 +148,7 @@ class PointHistory:
         time: float,
         expected: Float[np.ndarray, "K 3"],
     ) -> FrameState:
-        """The next frame with the labels and the evidence that its points carry over."""
+        """The next frame, with labels and evidence carried over by its points."""
         if time - self._last_time > self._silence:
             self._labels = {}
         self._last_time = time
@@ -162,7 +162,7 @@ class PointHistory:
         return FrameState(points, numbers, labels, evidence, confidence, first_seen, time, self._numbering)
 
     def keep(self, frame: FrameState) -> None:
-        """Keep what the next frame can use of this one."""
+        """Store what the next frame needs of this one."""
         rows = np.flatnonzero(frame.labels >= 0)
         numbers = frame.ids[rows].tolist()
         self._labels = dict(zip(numbers, frame.labels[rows].tolist(), strict=True))
@@ -170,11 +170,11 @@ class PointHistory:
 
 
 class PointLinker:
-    """Numbers the points of a stream."""
+    """Gives the points of a stream persistent numbers."""
 
     def __init__(self, owners: Int[np.ndarray, "K"]) -> None:
         self._owners = owners
-        self._numbers: dict[int, int] = {}  # of the stream's IDs in the last frame
+        self._numbers: dict[int, int] = {}  # from the stream's IDs in the last frame
         self._last = np.zeros(0, dtype=np.int64)  # numbers (Q,) of the last frame's points
         self._points = np.zeros((0, 3))  # those points [m]
         self._next = 0
@@ -186,9 +186,9 @@ class PointLinker:
         labels: Mapping[int, int],
         expected: Float[np.ndarray, "K 3"],
     ) -> Int[np.ndarray, "P"]:
-        """Number the points of the next frame, as the stream does where most of its IDs last."""
-        # Where numbers had labels in the last frame, the IDs of these count: ghosts have short lives. A point
-        # without an ID in a stream that has them gets a new one.
+        """Number the points of the next frame, by the stream's IDs if most of these persist."""
+        # If there were labels, only IDs of labeled points are counted, as ghosts are short-lived. In a stream
+        # with IDs a point without one gets a new number.
         again = [self._numbers.get(number, -1) for number in ids.tolist()]
         known = np.array(again, dtype=np.int64)
         before = labels.keys() if labels else set(self._last.tolist())
@@ -204,7 +204,7 @@ class PointLinker:
     def _link(
         self, points: NDArray[np.float64], labels: Mapping[int, int], expected: NDArray[np.float64]
     ) -> NDArray[np.int64]:
-        """Numbers of the last frame's points for the points of this one, -1 where there is none."""
+        """Match points with those of the last frame by position; their numbers, -1 for new points."""
         predicted, hands = self._points.copy(), np.full(len(self._last), -1)
         for row, number in enumerate(self._last.tolist()):
             label = labels.get(number, -1)
@@ -225,7 +225,7 @@ class PointLinker:
         return found
 
     def _beside(self, hands: NDArray[np.int64]) -> Int[np.ndarray, "Q"]:
-        """The hand that each point of the last frame without one is beside, and moves with; -1 for none."""
+        """The hand that each unlabeled point of the last frame is near, and moves with; -1 for none."""
         beside, loose, held = np.full(len(hands), -1), np.flatnonzero(hands < 0), np.flatnonzero(hands >= 0)
         if len(loose) and len(held):
             distances = np.linalg.norm(self._points[loose, None] - self._points[held], axis=-1)
@@ -237,7 +237,7 @@ class PointLinker:
 def _assign(
     points: NDArray[np.float64], predicted: NDArray[np.float64], distance: float
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Points and predicted points, one to one, within a distance [m]."""
+    """Match points with predicted points within a distance [m]; indices of both."""
     squares = ((points[:, None] - predicted) ** 2).sum(axis=-1)
     _, labels = assign(squares, np.full(len(points), distance**2))
     near = np.flatnonzero(labels >= 0)
@@ -245,9 +245,8 @@ def _assign(
 
 
 def change_of_distances(before: Float[np.ndarray, "O 3"], points: Float[np.ndarray, "P 3"]) -> float:
-    """Median change of the distances of neighboring points [m]; infinite if points cannot be linked."""
-    # About 2 mm where one frame follows from the other, also of fast hands, and 8 mm and more of hands in
-    # poses that have nothing to do with each other.
+    """Median change of the distances between neighbors [m]; infinite if too few points can be matched."""
+    # About 2 mm between successive frames, even of fast hands; 8 mm and more between unrelated poses.
     rows, columns = _assign(points, before, _DISTANCES[0])
     first, second = np.triu_indices(len(rows), 1)
     was = np.linalg.norm(before[columns[first]] - before[columns[second]], axis=-1)
@@ -262,7 +261,7 @@ def match_log_odds(
     covariances: Float[np.ndarray, "K 3 3"],
     stray_density: float,
 ) -> Float[np.ndarray, "P K"]:
-    """Log-odds of each point being a marker rather than a stray; strays have a density [1/m^3]."""
+    """Log-odds that each point is each marker and not a stray, for strays of some density [1/m^3]."""
     innovation = points[:, None] - positions
     precision = np.linalg.inv(covariances)
     square = np.einsum("pki,kij,pkj->pk", innovation, precision, innovation)
@@ -273,7 +272,7 @@ def match_log_odds(
 
 
 def peak_log_odds(variances: Float[np.ndarray, "K"], stray_density: float) -> Float[np.ndarray, "K"]:
-    """Log-odds of a point exactly at the predicted position of a marker of some variance [m^2]."""
+    """Log-odds of a point exactly at the predicted position of a marker, by the marker's variance [m^2]."""
     log_odds: np.ndarray = -1.5 * np.log(variances) - _stray_log_density(stray_density)
     return log_odds
 
@@ -281,7 +280,7 @@ def peak_log_odds(variances: Float[np.ndarray, "K"], stray_density: float) -> Fl
 def match_points(
     log_odds: Float[np.ndarray, "P K"],
 ) -> tuple[Int[np.ndarray, "P"], Float[np.ndarray, "P"]]:
-    """The likeliest assignment of points to markers, either -1 if alone, and the confidence in it, 0 to 1."""
+    """The likeliest one-to-one assignment of points to markers, -1 for none, and its confidence (0 to 1)."""
     _, labels = assign(-log_odds, np.zeros(len(log_odds)))
     if 0 in log_odds.shape:
         return labels, np.ones(len(log_odds))
@@ -295,5 +294,5 @@ def match_points(
 
 
 def _stray_log_density(stray_density: float) -> float:
-    """Log density of strays, less the constant of a normal density."""
+    """Log density of strays, relative to the constant factor of a normal density."""
     return float(np.log(stray_density * (2.0 * np.pi) ** 1.5))

@@ -1,8 +1,8 @@
 """The filter state of one hand: pose, velocity, covariances, and the learned bias of each marker.
 
-A hand model that is not quite the user's hand is off by the same few millimeters at each marker in every
-frame, in the frame of the bone that carries the marker. Once this bias is known, a marker is predicted from
-the pose and its bias, which is nearly as accurate for an uncalibrated hand as for a calibrated one.
+If the model differs from the user's hand, each marker is off by the same few millimeters in every frame, in
+the frame of its bone. Once this bias is known, a marker is predicted from the pose and its bias, for an
+uncalibrated hand nearly as accurately as for a calibrated one.
 """
 
 from __future__ import annotations
@@ -33,33 +33,33 @@ from track.kinematics.pose_spread import (
 )
 
 # Process model.
-_LONGEST_EXTRAPOLATION: Final = 0.05  # [s] for which a motion goes on; later the hand is predicted to stand
-_VELOCITY_SMOOTHING: Final = 0.6  # share of the newest velocity in the smoothed one
-_HIDDEN_DIGIT_DAMPING: Final = 0.7  # factor per frame of the velocity of a digit that lacks markers
-_WRIST_SPREAD: Final = 0.001  # standard deviation of the wrist's place as predicted within a frame [m]
-_WRIST_ACCELERATION: Final = 10.0  # [m/s^2] unforeseen
-_WRIST_ROTATION_SPREAD: Final = float(np.deg2rad(1.5))  # of its predicted orientation in the same frame
-_WRIST_ANGULAR_ACCELERATION: Final = 100.0  # [rad/s^2] unforeseen
-# Measurement model: spread and bias of markers.
-_INITIAL_SPREAD: Final = 1.2  # of the markers of a hand that was just initialized, over the RMS of the fit
-_INITIAL_SPREAD_LEAST, _INITIAL_SPREAD_MOST = 0.0015, 0.006  # [m] bounds of that spread
-_LEAST_MARKER_SPREAD: Final = 0.0005  # [m] of a marker: the noise of one that few cameras see
-_BIAS_VARIATION: Final = 0.3  # share of the hand's typical bias by which a bias changes as the hand moves
-_BIAS_DOUBT_TIME: Final = 0.5  # [s] unseen, after which a marker may be off by the typical bias again
-_AVERAGING_FRAMES: Final = 120.0  # that a bias is averaged over; one second at 120 Hz
-_FORGETTING_FRAMES: Final = 2400.0  # in which a bias that nothing confirms shrinks to a third
-_FORGOTTEN: Final = 1.7e-7  # [m] by which it shrinks in each frame; 0.02 mm in a second at 120 Hz
-_LEARNING_FRAMES: Final = 30.0  # after which the spread of a hand's markers is known
-_BIAS_REUSE_RMS: Final = 0.002  # [m] below which a hand that is initialized again keeps its biases
-_FEWEST_ON_DIGIT, _FEWEST_ON_PALM = 2, 3  # markers of which a fit leaves a residual that tells their spread
-_BIAS_SLACK: Final = 2.5  # standard deviations that count in how far a marker may be off its design
-# When markers come back, and how long strays live.
-_RETURN_TIME: Final = 0.01  # [s] over the time it was hidden is a marker's chance to come back in a frame
-_RETURN_LEAST, _RETURN_MOST = 0.01, 0.65  # bounds of that chance
+_LONGEST_EXTRAPOLATION: Final = 0.05  # [s] longest extrapolated motion; then the hand stands still
+_VELOCITY_SMOOTHING: Final = 0.6  # weight of the newest velocity in the smoothed one
+_HIDDEN_DIGIT_DAMPING: Final = 0.7  # factor per frame of the velocity of a digit with missing markers
+_WRIST_SPREAD: Final = 0.001  # [m] standard deviation of the wrist's predicted position in the same frame
+_WRIST_ACCELERATION: Final = 10.0  # [m/s^2] process noise
+_WRIST_ROTATION_SPREAD: Final = float(np.deg2rad(1.5))  # [rad] the same of its predicted orientation
+_WRIST_ANGULAR_ACCELERATION: Final = 100.0  # [rad/s^2] process noise
+# Measurement model: standard deviations and biases of markers.
+_INITIAL_SPREAD: Final = 1.2  # initial standard deviation of markers over the RMS of the first fit
+_INITIAL_SPREAD_LEAST, _INITIAL_SPREAD_MOST = 0.0015, 0.006  # [m] bounds of it
+_LEAST_MARKER_SPREAD: Final = 0.0005  # [m] lower bound of a marker's noise, as few cameras may see it
+_BIAS_VARIATION: Final = 0.3  # variation of a bias with the pose, as share of the hand's typical bias
+_BIAS_DOUBT_TIME: Final = 0.5  # [s] unseen, after which a marker's bias is unknown again
+_AVERAGING_FRAMES: Final = 120.0  # averaging window of a bias; one second at 120 Hz
+_FORGETTING_FRAMES: Final = 2400.0  # time constant in which an unconfirmed bias decays
+_FORGOTTEN: Final = 1.7e-7  # [m] additional decay per frame; 0.02 mm in a second at 120 Hz
+_LEARNING_FRAMES: Final = 30.0  # number of frames after which the spread of a hand's markers is known
+_BIAS_REUSE_RMS: Final = 0.002  # [m] A hand initialized again with a smaller RMS keeps its biases.
+_FEWEST_ON_DIGIT, _FEWEST_ON_PALM = 2, 3  # markers needed for a variance estimate
+_BIAS_SLACK: Final = 2.5  # standard deviations allowed between a marker and its design
+# Reappearance of markers, and lifetime of strays.
+_RETURN_TIME: Final = 0.01  # [s] over the hidden time: a marker's probability to return in a frame
+_RETURN_LEAST, _RETURN_MOST = 0.01, 0.65  # bounds of that probability
 SEEN_ELSEWHERE: Final = -7.0
-"""Log probability that a point is a marker that had another point while this one was visible."""
-STRAY_LIFETIME: Final = 0.1  # mean time for which a stray point is seen [s]
-MOST_AGE_LOG_ODDS: Final = 3.0  # largest log-odds that a point's age contributes
+"""Log probability that a point is a marker that was seen as another point at the same time."""
+STRAY_LIFETIME: Final = 0.1  # [s] mean lifetime of strays
+MOST_AGE_LOG_ODDS: Final = 3.0  # largest log-odds from a point's age
 
 
 class Prediction(NamedTuple):
@@ -67,36 +67,36 @@ class Prediction(NamedTuple):
 
     qpos: Float[np.ndarray, "27"]  # the predicted pose
     positions: Float[np.ndarray, "M 3"]  # its markers in the world [m]
-    joint_prior: JointPrior  # distribution of the hinges
+    joint_prior: JointPrior  # prior of the joint angles
     wrist_spread: tuple[float, float]  # standard deviations of the wrist's position [m] and orientation [rad]
-    priors: FramePriors  # the same for the solver
+    priors: FramePriors  # the same as priors of the solver
 
 
 class HandEstimate(NamedTuple):
-    """A hand's pose that was fitted to the markers of a frame."""
+    """A hand's pose fitted to the markers of a frame."""
 
     qpos: Float[np.ndarray, "27"]  # the fitted pose
-    rms: float  # 3D RMS distance over the markers that are present [m]
+    rms: float  # RMS distance of the present markers [m]
     residuals: Float[np.ndarray, "M 3"]  # model minus marker [m], NaN where a marker is missing
-    predicted: MarkerPrediction  # markers and hinges at that pose, with covariances
+    predicted: MarkerPrediction  # markers and joint angles of that pose, with covariances
 
     @property
     def positions(self) -> Float[np.ndarray, "M 3"]:
-        """Positions of the pose's markers in the world [m]."""
+        """Positions of the fitted pose's markers in the world [m]."""
         return self.predicted.positions
 
 
 class Biases(NamedTuple):
-    """What is known of the biases of a hand's markers."""
+    """Learned biases of a hand's markers."""
 
     bias: Float[np.ndarray, "M 3"]  # in the frames of the bones [m]
-    frames: Float[np.ndarray, "M"]  # frames that each is averaged over
-    learned_variance: Float[np.ndarray, "M"]  # variance of each marker while its bias is certain [m^2]
+    frames: Float[np.ndarray, "M"]  # number of frames in each average
+    learned_variance: Float[np.ndarray, "M"]  # variance of each marker with a certain bias [m^2]
     variance: Float[np.ndarray, "M"]  # variance of each marker at the last prediction [m^2]
 
 
 class HandState:
-    """Filter state of one of the user's hands, which is from a calibration or not."""
+    """Filter state of one of the user's hands, calibrated or not."""
 
     def __init__(
         self,
@@ -110,38 +110,38 @@ class HandState:
         self.config = config
         self.solver = PoseSolver(hand)
         self.qpos: NDArray[np.float64] | None = None
-        """The pose of the last frame with one; None where the hand is lost."""
+        """Pose of the last frame with one; None if the hand is lost."""
         self.time = 0.0
         """Time of that pose [s]."""
         self.rms = np.nan
-        """RMS distance of its markers, biases removed [m]."""
+        """RMS distance of that pose's markers, biases removed [m]."""
         count = self.num_markers = hand.attachment.layout.num_markers
         self.digits = hand.attachment.digits
         """Digit of each marker (M,), -1 for the palm."""
         self.adapted = self.solver.hand
-        """The hand as arrays, its markers shifted by their biases."""
+        """The hand as arrays, with markers shifted by their biases."""
         self.variance = np.full(count, _INITIAL_SPREAD_MOST**2)
         """Variance (M,) of each marker around its position on the hand [m^2], at the last prediction."""
         self.positions = np.full((count, 3), np.nan)
         """Positions (M, 3) of the pose's markers [m]."""
         self.confirmed = np.zeros(len(DIGITS), dtype=bool)
-        """Digits that have had a settled label since the hand was initialized."""
+        """Digits with a settled label since the hand was initialized."""
         self.velocity = np.zeros(6 + NUM_JOINTS)
         """Velocity in MuJoCo's order, smoothed [m/s, rad/s]."""
         self._joint_covariance = resting_prior().covariance  # [rad^2] of the last estimate
         self._bias = np.zeros((count, 3))  # [m] in the frames of the bones
-        self._bias_frames = np.zeros(count)  # that each bias is averaged over
-        self._variance = self.variance.copy()  # [m^2] while the biases are certain
+        self._bias_frames = np.zeros(count)  # number of frames in each average
+        self._variance = self.variance.copy()  # [m^2] with certain biases
         self._typical_bias = 0.0  # [m] RMS over the markers
         self._last_seen = np.full(count, -np.inf)  # [s] of each marker since the hand was initialized
         self._spread_model = SpreadModel(hand, origin, angle_errors)
-        self._usual_square = np.nan  # [m^2] of the RMS distance of the markers, biases included
+        self._usual_square = np.nan  # [m^2] mean squared RMS distance, biases included
         self._designed = self.adapted.positions[:, 0].copy()  # [m] without biases
         self._ranges = digit_ranges(hand)
         self._now = 0.0  # [s] of the last prediction
 
     def predict(self, time: float) -> Prediction:
-        """The pose at a time [s] if the hand goes on with its velocity; for a hand that has a pose."""
+        """Predict the pose at a time [s] with constant velocity, for a hand that has a pose."""
         assert self.qpos is not None
         self._now = time
         span = time - self.time
@@ -159,14 +159,14 @@ class HandState:
     def _prediction(
         self, qpos: NDArray[np.float64], joint_prior: JointPrior, wrist_spread: tuple[float, float]
     ) -> Prediction:
-        """The prediction of a pose with these uncertainties."""
+        """Make a prediction from a pose with these uncertainties."""
         priors = priors_of_frame(joint_prior.angles, joint_prior.spread, qpos[:7], wrist_spread)
         return Prediction(qpos, self.solver.marker_positions(qpos), joint_prior, wrist_spread, priors)
 
     def fit(
         self, targets: Float[np.ndarray, "M 3"], start: Float[np.ndarray, "27"], prediction: Prediction
     ) -> HandEstimate:
-        """Fit the pose to four labeled markers or more, and what they leave open to the prediction."""
+        """Fit the pose to at least four labeled markers; with fewer it stays the prediction."""
         if np.count_nonzero(np.isfinite(targets[:, 0])) >= FEWEST_MARKERS:
             fit = self.solver.solve_frame(targets, start, prediction.priors)
             qpos, rms, residuals = fit.qpos[0], float(fit.rms[0]), fit.residuals[0]
@@ -185,8 +185,8 @@ class HandState:
         return HandEstimate(predicted.qpos, rms, residuals, predicted)
 
     def digit_models(self, prediction: Prediction, estimate: HandEstimate) -> tuple[DigitModel, DigitModel]:
-        """Models for new points of a digit: of one with settled labels, and of one without."""
-        # The second has the resting prior: the pose that a wrong label gave to a digit must not confirm it.
+        """Models for new points of a digit: one for digits with settled labels, one for others."""
+        # The second uses the resting prior, so that a pose bent by a wrong label cannot confirm it.
         slack = _BIAS_SLACK * np.sqrt(self.variance) + np.sqrt((self._bias**2).sum(axis=1))
         confirmed = DigitModel(
             prediction.joint_prior,
@@ -199,20 +199,20 @@ class HandState:
         return confirmed, confirmed._replace(joint_prior=resting_prior())
 
     def pose_spread(self, time: float) -> Callable[[], Spreads]:
-        """What computes the standard deviations of this pose at a time [s], whatever the hand does later."""
+        """A function that computes the standard deviations of this pose at a time [s], valid later, too."""
         assert self.qpos is not None
         unseen = np.maximum(time - self._last_seen, 0.0)
         return partial(self._spread_model.of_pose, self.qpos.copy(), unseen, np.sqrt(self._usual_square))
 
     @property
     def spread(self) -> float | None:
-        """Standard deviation of the markers in each direction [m]; None while unknown."""
+        """Standard deviation of the markers in each direction [m]; None if not yet known."""
         if np.median(self._bias_frames) < _LEARNING_FRAMES:
             return None
         return max(float(np.sqrt(np.median(self._variance))), self.config.marker_noise)
 
     def presence_log_odds(self, first_seen: Float[np.ndarray, "P"]) -> Float[np.ndarray, "P M"]:
-        """Log-odds of a marker coming back when a point appeared, against a stray as old as the point."""
+        """Log-odds that each marker returned when each point appeared, against a stray of the point's age."""
         gap = first_seen[:, None] - self._last_seen
         log_odds: NDArray[np.float64] = np.log(
             np.clip(_RETURN_TIME / np.maximum(gap, 1e-3), _RETURN_LEAST, _RETURN_MOST)
@@ -224,9 +224,9 @@ class HandState:
     def initialize(
         self, qpos: Float[np.ndarray, "27"], targets: Float[np.ndarray, "M 3"], time: float
     ) -> HandEstimate:
-        """Start from a pose without history; the biases are kept if they still fit."""
+        """Start from a pose without history; biases are kept if they still fit."""
         self.velocity[:] = 0.0
-        self._last_seen[:] = -np.inf  # a marker without a point may be any of those that are there
+        self._last_seen[:] = -np.inf  # A marker may be any of the present points.
         self.confirmed[:] = False
         unknown = self._prediction(qpos, resting_prior(), (1.0, 1.0))
         estimate = self.fit(targets, qpos, unknown)
@@ -240,29 +240,29 @@ class HandState:
         return estimate
 
     def unbiased_positions(self, estimate: HandEstimate) -> Float[np.ndarray, "M 3"]:
-        """Where a pose's markers would be in the world if the glove had no bias [m]."""
+        """Positions of a pose's markers in the world without any bias [m]."""
         offsets: NDArray[np.float64] = np.einsum("mij,mj->mi", estimate.predicted.rotations, self._bias)
         return estimate.positions + offsets
 
     @property
     def biases(self) -> Biases:
-        """A copy of what is known of the markers' biases, for `recall`."""
+        """A copy of the learned biases, for `recall`."""
         known = (self._bias, self._bias_frames, self._variance, self.variance)
         return Biases(*(values.copy() for values in known))
 
     def forget(self, markers: Int[np.ndarray, "K"]) -> None:
-        """Forget the biases of some markers: they are where the glove has them again, give or take."""
+        """Reset the biases of some markers, with the initial uncertainty."""
         self._bias[markers], self._bias_frames[markers] = 0.0, 0.0
         self._variance[markers] = self.variance[markers] = _INITIAL_SPREAD_MOST**2
         self._shift_markers()
 
     def recall(self, biases: Biases) -> None:
-        """Take back what was known of the biases."""
+        """Restore biases that were copied before."""
         self._bias[:], self._bias_frames[:], self._variance[:], self.variance[:] = biases
         self._shift_markers()
 
     def resize(self, hand: GloveFit, origin: HandOrigin, keep: float) -> None:
-        """Go on as the same hand of another size, with a share of the biases."""
+        """Continue with the same hand of another size, and a share of the biases."""
         self.hand, self.solver, self._spread_model = hand, PoseSolver(hand), SpreadModel(hand, origin)
         self.digits = hand.attachment.digits
         self.adapted = self.solver.hand
@@ -275,11 +275,11 @@ class HandState:
         self._shift_markers()
 
     def rms_without_bias(self, estimate: HandEstimate) -> float:
-        """RMS distance of the markers from their positions on the hand as it was given [m]."""
+        """RMS distance of the markers from the hand's own marker positions, biases included [m]."""
         return float(_rms_without_bias(estimate.residuals, estimate.predicted.rotations, self._bias))
 
     def update(self, estimate: HandEstimate, settled: Bool[np.ndarray, "M"], time: float) -> None:
-        """Take over the pose of the next frame, and learn the biases of markers with settled labels."""
+        """Accept the pose of the next frame, and learn biases of markers with settled labels."""
         assert self.qpos is not None
         qpos, span = estimate.qpos, time - self.time
         if span > 0.0:
@@ -299,7 +299,7 @@ class HandState:
         self._shift_markers()
 
     def _store(self, estimate: HandEstimate, time: float) -> None:
-        """Keep an estimate as the state at a time [s]."""
+        """Store an estimate as the state at a time [s]."""
         self.qpos, self.time, self.positions = estimate.qpos, time, estimate.positions
         self.rms = estimate.rms
         self._joint_covariance = estimate.predicted.joint_covariance
@@ -311,7 +311,7 @@ class HandState:
             self._usual_square += (square - self._usual_square) / _AVERAGING_FRAMES
 
     def _shift_markers(self) -> None:
-        """Shift the hand's markers by their learned biases, and update what depends on these."""
+        """Shift the hand's markers by their learned biases, and update the typical bias and the variances."""
         self._typical_bias = _shift_markers(
             self._bias_frames, self._bias, self._designed, self._variance, self.adapted.positions
         )
@@ -322,8 +322,8 @@ class HandTrack(NamedTuple):
 
     hand: int  # index of the hand
     state: HandState  # its filter state
-    prediction: Prediction  # the pose before the frame's markers were used
-    estimate: HandEstimate  # the pose fitted to its labels so far
+    prediction: Prediction  # pose before the frame's markers were used
+    estimate: HandEstimate  # pose fitted to its labels so far
 
 
 @kernel
@@ -334,7 +334,7 @@ def _note_markers(
     last_seen: Float[np.ndarray, "M"],
     velocity: Float[np.ndarray, "26"],
 ) -> None:
-    """Note when markers with a residual were seen [s], and slow down the hinges of digits that lack one."""
+    """Store the time [s] of the seen markers, and slow down the joints of digits that lack one."""
     lacks = np.zeros(len(DIGITS) + 1, dtype=np.bool_)
     for marker in range(len(residuals)):
         if np.isfinite(residuals[marker, 0]):
@@ -356,8 +356,8 @@ def _learn_bias(
     bias: Float[np.ndarray, "M 3"],
     variance: Float[np.ndarray, "M"],
 ) -> None:
-    """Average the residuals [m] of settled markers in the frames of their bones, and their variance [m^2]."""
-    # Any pose fits markers that are not tested by others on their part: their variance stays.
+    """Update biases and variances [m, m^2] of settled markers with their residuals, in the bones' frames."""
+    # A pose fits any marker that is alone on its part: such a marker's variance does not change.
     on_part = np.zeros(len(DIGITS) + 1, dtype=np.int64)
     for marker in range(len(residuals)):
         on_part[digits[marker]] += np.isfinite(residuals[marker, 0])
@@ -368,7 +368,7 @@ def _learn_bias(
         if not settled[marker] or np.isnan(residuals[marker, 0]):
             continue
         bias_frames[marker] = min(bias_frames[marker] + 1.0, _AVERAGING_FRAMES)
-        # A pose fits what all biases of a hand have in common as well: nothing else brings that back.
+        # The pose also absorbs what all biases have in common; only the decay corrects that.
         length = np.sqrt(bias[marker, 0] ** 2 + bias[marker, 1] ** 2 + bias[marker, 2] ** 2)
         kept = max(1.0 - 1.0 / _FORGETTING_FRAMES - _FORGOTTEN / length, 0.0)
         square = 0.0
@@ -390,7 +390,7 @@ def _shift_markers(
     variance: Float[np.ndarray, "M"],
     positions: Float[np.ndarray, "M 4 3"],
 ) -> float:
-    """Shift the hand's markers by their biases; return the typical bias (RMS over the known ones) [m]."""
+    """Shift the hand's markers by their biases; return the typical bias, the RMS of the known ones [m]."""
     square, count = 0.0, 0
     for marker in range(len(bias_frames)):
         for i in range(3):
@@ -407,7 +407,7 @@ def _shift_markers(
 def _rms_without_bias(
     residuals: Float[np.ndarray, "M 3"], rotations: Float[np.ndarray, "M 3 3"], bias: Float[np.ndarray, "M 3"]
 ) -> float:
-    """RMS of the residuals with the biases added back [m]; the arguments are those of `_learn_bias`."""
+    """RMS of the residuals with the biases added back [m]; for the arguments see `_learn_bias`."""
     square, count = 0.0, 0
     for marker in range(len(residuals)):
         if np.isnan(residuals[marker, 0]):

@@ -1,8 +1,8 @@
-"""Track initialization: hands among points without history are labeled, fitted, and checked.
+"""Initialization of tracks: points without history are labeled, fitted and verified as hands.
 
-The labeler knows clouds of one hand. Hands that touch make one cloud of two; it is cut in halves along
-several directions, of which some leave most of a hand whole, and the score of a fitted hand tells which those
-were. Whether a hand is left or right follows from the fit: a mirrored hand does not fit.
+The labeler expects one hand in a cloud. Hands that touch form one cloud, which is cut in halves along several
+directions; some halves contain most of one hand, and the score of the fitted hands shows which. The side of a
+hand follows from the fit: its mirror image fits worse.
 """
 
 from __future__ import annotations
@@ -26,71 +26,71 @@ from track.kinematics.pose_solver import PoseFit, PoseSolver
 from track.kinematics.pose_spread import resting_prior
 from train.labelers.protocol import MAX_POINTS, Labeler
 
-MOST_POINTS: Final = 100  # largest number of points of a group that may be a hand
-_LINK_DISTANCE: Final = 0.085  # [m] between neighboring markers of one hand, or more where its glove needs it
-_LINKED_GESTURES: Final = 0.99  # share of gestures in which all markers of a hand are linked
-_LEAST_LABELED_SHARE: Final = 0.45  # of a hand's markers that must be labeled
-FEWEST_POINTS: Final = 4  # least number of labeled points of a hand; a pose needs as many
+MOST_POINTS: Final = 100  # A larger group of points is no hand.
+_LINK_DISTANCE: Final = 0.085  # [m] least linking distance between neighboring markers of a hand
+_LINKED_GESTURES: Final = 0.99  # share of gestures in which all markers of a hand must be linked
+_LEAST_LABELED_SHARE: Final = 0.45  # least share of a hand's markers with a label
+FEWEST_POINTS: Final = 4  # least number of labeled points of a hand, which a pose needs
 SPARE_POINTS: Final = 6
-"""Points beyond a hand's markers from which on a group may be two hands that touch, at most."""
-_SPARE_SHARE: Final = 0.3  # of the markers of a hand; ghosts beside one of few markers mislead the labeler
-_CUTS: Final = 12  # directions along which a group is cut, even over half a sphere
-_CUTS_OF_SEARCH: Final = 6  # of these, in one search of a capture in motion; the next one has the others
-_STRIDE: Final = 5  # between directions tried one after another, so that a few are even over half a sphere
-_CUTS_AT_FIRST: Final = 3  # tried together; mostly one of them is enough
-_LAST_TURN: Final = _CUTS_OF_SEARCH - _CUTS_AT_FIRST  # number of the call in which a search ends
-_EXCHANGE_DISTANCE: Final = 0.06  # [m] between digits of two hands within which they may be exchanged
-_FITS_AT_A_TIME: Final = 3  # labeled clouds that are fitted at a time, the most confident ones
-# From each starting pose of a first fit: enough to tell a hand from its mirror image.
+"""A group with this many points more than a hand has markers may be two touching hands, at the latest."""
+_SPARE_SHARE: Final = 0.3  # the same as share of a hand's markers: ghosts resemble few markers
+_CUTS: Final = 12  # number of directions of cuts, even over half a sphere
+_CUTS_OF_SEARCH: Final = 6  # directions per search in continuous frames; the next search has the others
+_STRIDE: Final = 5  # step between successive directions, so that any few are spread evenly
+_CUTS_AT_FIRST: Final = 3  # directions tried in the first call; mostly one of them suffices
+_LAST_TURN: Final = _CUTS_OF_SEARCH - _CUTS_AT_FIRST  # turn in which a search ends
+_EXCHANGE_DISTANCE: Final = 0.06  # [m] Digits of two hands closer than this may be exchanged.
+_FITS_AT_A_TIME: Final = 3  # number of labeled clouds fitted at once, the most confident first
+# Steps from each starting pose; enough to distinguish a hand from its mirror image.
 _FIRST_FIT_STEPS: Final = 6
-_REFIT_STEPS: Final = 8  # from a near pose: fits are compared, and the one that is kept is solved again
-_OUTLIER_DISTANCE: Final = 0.01  # [m] of a labeled point from a robust fit, from which on the label is wrong
-# Share of the labels that a robust fit keeps of a hand; a mirrored one loses more.
+_REFIT_STEPS: Final = 8  # from a close pose; the final fit is solved again
+_OUTLIER_DISTANCE: Final = 0.01  # [m] Labels farther from a robust fit are wrong.
+# A robust fit must keep this share of the labels; that of a mirrored hand keeps fewer.
 _LEAST_KEPT_LABELS: Final = 0.75
-_POSE_WEIGHT: Final = 0.25  # log-odds of a pose for each squared deviation beyond the usual
-_MOST_POSE_PENALTY: Final = 20.0  # log-odds, because people do unusual things
-_REFINEMENTS: Final = 2  # rounds of assigning points to the markers of a fitted hand
-_SEARCH_FACTOR: Final = 4.0  # spread of the markers in these rounds over that of the fit
-_SEARCH_LEAST, _SEARCH_MOST = 0.003, 0.012  # [m] bounds of that spread
-_FREE_COORDINATES: Final = 20.0  # degrees of freedom that a pose takes from its points, in effect
-_SPREAD_BEFORE: Final = 0.002  # [m] of markers around a fitted pose, as long as few of them tell
-_SPREAD_BEFORE_COORDINATES: Final = 6.0  # coordinates that this spread counts for
-_MARKERS_OF_EVIDENCE: Final = 10  # whose evidence is asked for: about that of twelve points that are 5 mm off
-_CERTAIN_SCORE: Final = 5.5  # log-odds per marker after which no further cloud is tried
-_HOPELESS_FACTOR: Final = 2.5  # of the RMS distance of the other hand, from which on a hand is mirrored
-_GOOD_RMS: Final = 0.003  # [m] of that hand at most; a wrong label may bend the hand that it should have been
-_HOPELESS_SHARE: Final = 0.8  # of the labels that the other hand keeps
-_KNOWN_SPREAD_ATTEMPTS: Final = 60  # in which a known hand must fit as well as before; 0.5 s at 120 Hz
-_CLOUD_RADIUS: Final = 0.06  # [m] from a hand's points, within which other points may be its markers
-# Share of a capture's frames with a hand, from which on the others hold one too.
+_POSE_WEIGHT: Final = 0.25  # log-odds lost per squared standard deviation beyond the expected sum
+_MOST_POSE_PENALTY: Final = 20.0  # bound of that loss, because people make unusual poses
+_REFINEMENTS: Final = 2  # rounds of matching points with the fitted hand's markers
+_SEARCH_FACTOR: Final = 4.0  # standard deviation of markers in these rounds over that of the fit
+_SEARCH_LEAST, _SEARCH_MOST = 0.003, 0.012  # [m] bounds of it
+_FREE_COORDINATES: Final = 20.0  # effective degrees of freedom of a pose
+_SPREAD_BEFORE: Final = 0.002  # [m] prior standard deviation of markers around a fitted pose
+_SPREAD_BEFORE_COORDINATES: Final = 6.0  # number of coordinates that this prior counts for
+_MARKERS_OF_EVIDENCE: Final = 10  # Evidence is required for at most this many markers.
+_CERTAIN_SCORE: Final = 5.5  # log-odds per marker from which no further cloud is tried
+_HOPELESS_FACTOR: Final = 2.5  # A mirrored hand has an RMS distance this many times the best one's.
+_GOOD_RMS: Final = 0.003  # [m] The best hand must fit this well to reject its mirror image.
+_HOPELESS_SHARE: Final = 0.8  # The best hand must keep this share of the mirrored hand's labels.
+_KNOWN_SPREAD_ATTEMPTS: Final = 60  # attempts in which a known hand must fit as before; 0.5 s at 120 Hz
+_CLOUD_RADIUS: Final = 0.06  # [m] distance from a hand's points within which others may be its markers
+# If this share of the frames shows a hand, all are assumed to do so.
 _USUAL_HAND_SHARE: Final = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class InitializedHand:
-    """A hand that was initialized."""
+    """Result of an initialization."""
 
     index: int  # index of the hand
     fit: PoseFit  # its pose, one frame
-    labels: Int[np.ndarray, "N"]  # marker of each point, -1 for points that are none of this hand's
+    labels: Int[np.ndarray, "N"]  # marker of each point, -1 for points of no marker of this hand
     score: float  # see `HandInitializer.score`
 
 
 @dataclass(slots=True)
 class _Search:
-    """Where a search for some hands among points of more than one stands."""
+    """State of a search for some hands that takes several frames."""
 
-    turn: int = 0  # number of calls before this one
-    best_turn: int = 0  # number of the rotation that gave the best hand so far
-    score: float = -np.inf  # of that hand
+    turn: int = 0  # number of earlier calls
+    best_turn: int = 0  # call with the best hand so far
+    score: float = -np.inf  # score of that hand
 
 
 class HandInitializer:
-    """Initializes hands without any history, by a labeler that does not know left from right."""
+    """Initializes hands without history, by a labeler that does not distinguish left from right."""
 
-    # Unless it looks at a group of points along all directions at once, a call looks along three, and the
-    # next calls, a frame later each, along one more, until a hand is certain or all were tried: no frame
-    # waits for a search.
+    # With `at_once` a call tries all directions of cuts. Otherwise it tries three, and the calls of the next
+    # frames try one more each, until a hand is certain or all directions were tried: no frame waits for a
+    # long search.
 
     def __init__(
         self,
@@ -105,22 +105,22 @@ class HandInitializer:
         self._states = states
         self._labeler = labeler
         self._config = config
-        links = [_link_distance(one.hand) for one in states[:1]]  # the other hand is its mirror image
+        links = [_link_distance(one.hand) for one in states[:1]]  # The other hand is its mirror image.
         self._link_distance = max([_LINK_DISTANCE, *links])
         self._prior = resting_prior()
         self._robust = [PoseSolver(one.hand, outlier_distance=_OUTLIER_DISTANCE) for one in states]
         self._attempts = np.zeros(len(states), dtype=np.int64)
         self._spreads: list[float | None] = [None] * len(states)
-        self._points: NDArray[np.float64] = np.empty((0, 3))  # those of the frame
+        self._points: NDArray[np.float64] = np.empty((0, 3))  # of the current frame
         spread = np.arange(_CUTS) + 0.5
         height, azimuth = 1.0 - spread / _CUTS, np.pi * (1.0 + 5.0**0.5) * spread  # even over half a sphere
         flat = np.sqrt(1.0 - height**2)
         self._directions = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), height], axis=1)
 
     def initialize(self, points: Float[np.ndarray, "N 3"], hands: Sequence[int]) -> list[InitializedHand]:
-        """Look for some of the hands."""
+        """Search for some of the hands."""
         search, self._points = self._searches.pop(tuple(hands), _Search()), points
-        self._spreads = [state.spread for state in self._states]  # medians, which take a fit's time
+        self._spreads = [state.spread for state in self._states]  # medians take as long as a fit
         initialized: list[InitializedHand] = []
         cut = False
         least = min((self._least(index) for index in hands), default=0)
@@ -152,13 +152,13 @@ class HandInitializer:
         return initialized
 
     def is_searching(self, hands: Sequence[int]) -> bool:
-        """Whether the last call for some hands left directions for the next one."""
+        """Whether a search for these hands continues in the next call."""
         return tuple(hands) in self._searches
 
     def _sides_checked(self, hands: list[InitializedHand]) -> list[InitializedHand]:
-        """Two hands as they are, or the other way round where both together fit better so."""
-        # One by one the hand that fits a cloud best may be the wrong one: markers without a thumb's, in a
-        # symmetric pattern, fit both hands nearly alike.
+        """Exchange the sides of two hands if both together fit better so."""
+        # Each cloud alone may fit the wrong hand best: without a marker on the thumb, a symmetric layout fits
+        # both hands almost equally.
         if len(hands) != 2:
             return hands
         one, two = hands
@@ -168,8 +168,8 @@ class HandInitializer:
         return _likelier([self._trim(fit) for fit in first], hands)
 
     def score(self, count: int, rms: float, spread: float | None = None) -> float:
-        """Log-odds of labeled points being a hand against strays, by the markers' `spread` [m] if known."""
-        # Few points fit any pose; what a pose takes from them does not count.
+        """Log-odds of labeled points being a hand and not strays; `spread` [m] of its markers if known."""
+        # Few points fit any pose, so coordinates absorbed by the pose do not count.
         taken = min(_FREE_COORDINATES, 3.0 * count)
         square = count * rms**2
         variance = (square + _SPREAD_BEFORE_COORDINATES * _SPREAD_BEFORE**2) / (
@@ -187,7 +187,7 @@ class HandInitializer:
     def _best(
         self, group: NDArray[np.int64], hands: Sequence[int], cuts: NDArray[np.int64], search: _Search
     ) -> InitializedHand | None:
-        """The first hand of a group that is certain, or the best one after the last of the cuts."""
+        """The first certain hand of a group, or after the last cut the best one."""
         if not len(cuts):
             return self._better(None, group, [group], hands)
         best: InitializedHand | None = None
@@ -206,7 +206,7 @@ class HandInitializer:
         return self._better(best, group, self._clouds(group, cuts, search.best_turn), hands)
 
     def _labeled(self, clouds: Sequence[NDArray[np.int64]]) -> list[NDArray[np.int64]]:
-        """A label for every point by each cloud, the cloud of most confidence in all first."""
+        """Label each cloud; return labels of all points per cloud, the most confident cloud first."""
         labelings = self._labeler.label_frames([self._points[cloud] for cloud in clouds])
         confidence = [float(one.confidence[one.labels >= 0].sum()) for one in labelings]
         labeled = np.full((len(clouds), len(self._points)), -1)
@@ -221,7 +221,7 @@ class HandInitializer:
         clouds: Sequence[NDArray[np.int64]],
         hands: Sequence[int],
     ) -> InitializedHand | None:
-        """The best hand so far, or one of these clouds of a group with a better score."""
+        """The best hand so far, or a hand with a better score from these clouds of a group."""
         for labels in self._labeled(clouds)[:_FITS_AT_A_TIME]:
             fits = [self._fit(index, labels) for index in hands]
             for first in sorted((fit for fit in fits if fit is not None), key=lambda fit: -fit.score):
@@ -235,11 +235,11 @@ class HandInitializer:
         return best
 
     def _is_certain(self, hand: InitializedHand) -> bool:
-        """Whether a hand fits so well that no other cloud need be tried."""
+        """Whether a hand fits so well that no other cloud is tried."""
         return hand.score > _CERTAIN_SCORE * self._states[hand.index].num_markers
 
     def _cuts_of(self, group: NDArray[np.int64], hands: Sequence[int]) -> NDArray[np.int64]:
-        """Directions along which a group is cut if it has points of more than one hand, the longest first."""
+        """Directions in which a group is cut, the longest extent first; none if it may be a single hand."""
         most = max(self._states[index].num_markers for index in hands)
         if len(group) <= most + min(SPARE_POINTS, _SPARE_SHARE * most):
             return np.empty(0, dtype=np.int64)
@@ -250,7 +250,7 @@ class HandInitializer:
     def _clouds(
         self, group: NDArray[np.int64], cuts: NDArray[np.int64], turn: int
     ) -> list[NDArray[np.int64]]:
-        """The clouds of a turn: the whole group and its halves along the first cuts, then one cut a turn."""
+        """Clouds of a turn: the whole group and its halves along three cuts, then those of one more cut."""
         clouds, last = [group] if turn == 0 else [], turn + _CUTS_AT_FIRST
         for cut in cuts[0 if turn == 0 else last - 1 : last]:
             order = group[np.argsort(self._points[group] @ self._directions[cut])]
@@ -258,7 +258,7 @@ class HandInitializer:
         return clouds
 
     def _improve(self, first: InitializedHand, group: NDArray[np.int64]) -> InitializedHand | None:
-        """A hand without labels that do not fit, then fitted to the points of the group that do."""
+        """Remove labels that do not fit, then match and fit all points of the group again."""
         index, state = first.index, self._states[first.index]
         hand = self._trim(first) or self._trim(self._without_outliers(first))
         for _ in range(_REFINEMENTS):
@@ -277,7 +277,7 @@ class HandInitializer:
         return hand
 
     def _divided(self, hands: list[InitializedHand], group: NDArray[np.int64]) -> list[InitializedHand]:
-        """Hands of one group, each labeled once more among the points that the others leave."""
+        """Label each of several hands of a group again, without the points of the others."""
         for number, hand in enumerate(hands if len(hands) > 1 else ()):
             others = [other.labels[group] >= 0 for other in hands if other is not hand]
             again = self._better(hand, group, [group[~np.any(others, axis=0)]], (hand.index,))
@@ -285,8 +285,8 @@ class HandInitializer:
         return hands
 
     def _uncrossed(self, hands: list[InitializedHand]) -> list[InitializedHand]:
-        """Two hands, with the points of a digit exchanged between them where both together fit better so."""
-        # A thumb fits the other hand's palm nearly as well as its own where hands touch.
+        """Exchange the points of a digit between two hands where both together fit better so."""
+        # A thumb fits the palm of a touching hand almost as well as its own.
         if len(hands) != 2:
             return hands
         points, digits = self._points, self._states[hands[0].index].solver.hand.digits
@@ -310,7 +310,7 @@ class HandInitializer:
         return hands
 
     def _trim(self, hand: InitializedHand | None) -> InitializedHand | None:
-        """Drop the worst label while that improves the score; None where it is no hand."""
+        """Drop the worst label while that raises the score; None if the result is not a hand."""
         best: InitializedHand | None = None
         while hand is not None and (best is None or hand.score > best.score):
             best = hand
@@ -328,8 +328,8 @@ class HandInitializer:
         return best if accepted else None
 
     def _without_outliers(self, first: InitializedHand) -> InitializedHand | None:
-        """The hand without labels that a robust fit leaves aside; None where these are many."""
-        # One wrong label can bend a whole first fit.
+        """Drop labels that are outliers of a robust fit; None if these are too many."""
+        # One wrong label can bend a least-squares fit.
         state = self._states[first.index]
         targets = targets_of(self._points, first.labels, state.num_markers)
         fit = self._robust[first.index].solve(targets[None], iterations=_FIRST_FIT_STEPS)
@@ -342,8 +342,8 @@ class HandInitializer:
     def _fit(
         self, index: int, labels: NDArray[np.int64], near: PoseFit | None = None
     ) -> InitializedHand | None:
-        """A hand fitted to labeled points, from a near pose if there is one; None where they are too few."""
-        # An unusual pose costs score, and a hand that was seen lately must fit as well as then.
+        """Fit a hand to labeled points, starting from `near` if given; None if there are too few points."""
+        # Unusual poses lower the score; a hand seen recently must fit as well as before.
         count, state = int((labels >= 0).sum()), self._states[index]
         if count < self._least(index):
             return None
@@ -360,21 +360,21 @@ class HandInitializer:
 def _likelier(
     changed: Sequence[InitializedHand | None], hands: list[InitializedHand]
 ) -> list[InitializedHand]:
-    """Changed hands if all of them are hands and score more together, else the hands as they were."""
+    """The changed hands if all of them exist and have a higher total score; otherwise the hands before."""
     found = [hand for hand in changed if hand is not None]
     better = sum(hand.score for hand in found) > sum(hand.score for hand in hands)
     return found if better and len(found) == len(hands) else hands
 
 
 def _is_mirrored(first: InitializedHand, best: InitializedHand) -> bool:
-    """Whether labels fit another hand so much better that they are not of this one."""
+    """Whether labels fit the hand of the other side so much better that they cannot be of this one."""
     kept = ((first.labels >= 0) & (best.labels == first.labels)).sum()
     much_better = best.fit.rms[0] < _GOOD_RMS and first.fit.rms[0] > _HOPELESS_FACTOR * best.fit.rms[0]
     return bool(much_better and kept >= _HOPELESS_SHARE * (first.labels >= 0).sum())
 
 
 def _link_distance(hand: GloveFit) -> float:
-    """Distance within which the neighboring markers of a hand are, while all are seen [m]."""
+    """Distance that links all neighboring markers of a hand in most gestures [m]."""
     gestures = np.concatenate([gestures_of(library) for library in LIBRARIES])
     markers, _ = hand.markers(join_qpos(gestures))
     return float(np.quantile(longest_links(markers), _LINKED_GESTURES))
@@ -383,7 +383,7 @@ def _link_distance(hand: GloveFit) -> float:
 class FrameLabels(NamedTuple):
     """Labels of a frame's points."""
 
-    labels: Int[np.ndarray, "N"]  # marker of each point, counted through the hands; -1 for none
+    labels: Int[np.ndarray, "N"]  # index of each point's marker, counted through the hands; -1 for none
     confidence: Float[np.ndarray, "N"]  # confidence in each label, 0 to 1
 
 
@@ -393,7 +393,7 @@ def label_alone(
     labeler: Labeler,
     told: Callable[[int], None] = lambda count: None,
 ) -> list[FrameLabels]:
-    """Label every frame by itself; a hand is there where a pose fits."""
+    """Label every frame by itself; a hand is present if a pose fits."""
     finder = HandInitializer([HandState(hand) for hand in hands], labeler, at_once=True)
     found = []
     for points in frames:
@@ -414,7 +414,7 @@ def _clouds(
     found: Sequence[Sequence[InitializedHand]],
     num_markers: int,
 ) -> list[tuple[int, int, Int[np.ndarray, "C"]]]:
-    """The points that the labeler is shown as one hand: number of the frame, the hand, and which points."""
+    """Points given to the labeler as one hand: frame, hand, and indices of the points."""
     most = num_markers + SPARE_POINTS
     full = [bool(hands) for points, hands in zip(frames, found, strict=True) if len(points) >= FEWEST_POINTS]
     sides = [hand.index for hands in found for hand in hands]
@@ -434,10 +434,10 @@ def _clouds(
 
 
 def linked_groups(points: Float[np.ndarray, "N 3"], distance: float) -> list[NDArray[np.int64]]:
-    """Indices of the points that are linked by steps of at most `distance` [m], the largest group first."""
+    """Indices of points linked by steps of at most `distance` [m], the largest group first."""
     near = ((points[:, None] - points) ** 2).sum(axis=-1) <= distance**2
     before, number = np.zeros(0, dtype=np.int64), np.arange(len(points))
-    while not np.array_equal(before, number):  # each point takes the least number of its neighbors
+    while not np.array_equal(before, number):  # Each point takes the least number of its neighbors.
         before, number = number, np.where(near, number, len(points)).min(axis=1, initial=len(points))
     groups = [np.flatnonzero(number == one) for one in dict.fromkeys(number)]
     return sorted(groups, key=len, reverse=True)
@@ -446,13 +446,13 @@ def linked_groups(points: Float[np.ndarray, "N 3"], distance: float) -> list[NDA
 def distances_to_nearest(
     points: Float[np.ndarray, "N 3"], others: Float[np.ndarray, "K 3"]
 ) -> Float[np.ndarray, "N"]:
-    """Distance of each point from the nearest of some others [m], of which there is one at least."""
+    """Distance of each point from the nearest of some others [m], which must not be empty."""
     distances: NDArray[np.float64] = np.linalg.norm(points[:, None] - others, axis=-1).min(axis=1)
     return distances
 
 
 def longest_links(points: Float[np.ndarray, "T N 3"]) -> Float[np.ndarray, "T"]:
-    """The least distance at which the points of each frame are linked to one group [m], by Prim's tree."""
+    """Least distance that links all points of a frame to one group [m], by Prim's algorithm."""
     frames, longest = np.arange(len(points)), np.zeros(len(points))
     added, apart = np.zeros(len(points), dtype=np.int64), np.full(points.shape[:2], np.inf)
     in_tree = np.zeros(points.shape[:2], dtype=np.bool_)

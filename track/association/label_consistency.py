@@ -1,4 +1,4 @@
-"""Tests of labels that go along with IDs: exchanged ones, gating by the predicted pose, then by the fit."""
+"""Tests of labels carried over by IDs: exchange of IDs, gate at the predicted pose, fit, labeler's review."""
 
 from __future__ import annotations
 
@@ -24,36 +24,36 @@ from track.association.initialization import MOST_POINTS
 from track.config import TrackerConfig
 from train.labelers.protocol import Labeler
 
-_GATE: Final = 16.0  # squared Mahalanobis distance of a point that is fitted: four standard deviations
-_PREDICTION_SPREAD: Final = 0.004  # [m] least standard deviation of a predicted marker beside its own spread
-_PREDICTION_FACTOR: Final = 2.0  # the same over what the other markers show in this frame
-_MOST_GATED_SHARE: Final = 0.3  # share of a hand's labels dropped at once; with more the prediction is wrong
-EXCHANGE_DISTANCE: Final = 0.04  # distance of two points within which their IDs may be exchanged [m]
-_EXCHANGE_MARGIN: Final = 8.0  # log-odds from which on two labels are exchanged; systems rarely exchange IDs
-_EXCHANGE_SPREAD: Final = 0.002  # [m] least standard deviation of the offset of two predicted markers
+_GATE: Final = 16.0  # gate of a fitted point, as squared Mahalanobis distance: four standard deviations
+_PREDICTION_SPREAD: Final = 0.004  # [m] least standard deviation of a prediction
+_PREDICTION_FACTOR: Final = 2.0  # standard deviation of a prediction over that of the other markers
+_MOST_GATED_SHARE: Final = 0.3  # With a larger share outside the gate the prediction is wrong.
+EXCHANGE_DISTANCE: Final = 0.04  # [m] IDs of points closer than this may be exchanged.
+_EXCHANGE_MARGIN: Final = 8.0  # least log-odds for an exchange, as systems rarely exchange IDs
+_EXCHANGE_SPREAD: Final = 0.002  # [m] least standard deviation of the offset between two predicted markers
 _EXCHANGE_CONFIDENCE: Final = 0.5
-_FIT_SPREAD: Final = 0.0015  # [m] standard deviation of a fitted marker beside its own spread
-_RESTART_RMS: Final = 0.004  # [m] beyond which a fit is tried again from shapes instead of the prediction
-_RESTART_STEPS: Final = 8  # from each starting pose; the fit goes on from there
+_FIT_SPREAD: Final = 0.0015  # [m] standard deviation of a fitted marker, added to its own
+_RESTART_RMS: Final = 0.004  # [m] A worse fit is tried again from general poses instead of the prediction.
+_RESTART_STEPS: Final = 8  # steps from each of these poses; the best result is fitted further
 _MEDIAN_SQUARE: Final = 2.366  # median of the squared length of a standard normal vector
-# [m] from a missing marker, within which the labeler is shown points without a label.
+# [m] Unlabeled points this close to a missing marker are given to the labeler.
 _CLOUD_RADIUS: Final = 0.06
-# [m] the same of a marker whose digit has no label: it may be bent or straight.
+# [m] the same for a marker of a digit without labels, which may be bent or straight
 _DIGIT_CLOUD_RADIUS: Final = 0.13
-_FIRST_REVIEW_WAIT: Final = 0.01  # [s] from a review that changed something to the next one
-_REVIEW_WAIT_FACTOR: Final = 1.6  # of that time after each review that changed nothing
+_FIRST_REVIEW_WAIT: Final = 0.01  # [s] from a review with changes to the next one
+_REVIEW_WAIT_FACTOR: Final = 1.6  # factor of that time after each review without changes
 _DOUBTED_PRESENCE: Final = -2.0  # log probability of a marker that the track saw elsewhere at the same time
-_REVIEW_MARGIN: Final = 8.0  # log-odds by which the labeler's labels must be likelier than those of the track
-# Share of a point's distance that is left without a bias, to doubt the bias.
+_REVIEW_MARGIN: Final = 8.0  # log-odds by which the labeler's labels must be better than those of the track
+# A bias is doubted if a point is this much closer to the marker without it.
 _DOUBTED_BIAS_SHARE: Final = 0.85
-_MOVED_LABEL_LOG_ODDS: Final = 2.0  # log-odds that a point keeps the label that it has
-_REPEATED_REVIEW_LOG_ODDS: Final = 1.0  # log-odds added by each earlier review with the same labels
-_MOST_ANSWER_LOG_ODDS: Final = 7.0  # that the labeler's confidence in a label contributes
+_MOVED_LABEL_LOG_ODDS: Final = 2.0  # log-odds that a point keeps its label
+_REPEATED_REVIEW_LOG_ODDS: Final = 1.0  # log-odds gained by each earlier review with the same result
+_MOST_ANSWER_LOG_ODDS: Final = 7.0  # bound of the log-odds from the labeler's confidence
 
 
 def exchange_labels(frame: FrameState, positions: Float[np.ndarray, "K 3"]) -> FrameState:
-    """Exchange the labels of two points where that explains both much better, as if IDs were exchanged."""
-    # A motion that the prediction misses moves both points alike and cancels in the comparison.
+    """Exchange the labels of two points if that explains both much better, as if IDs were exchanged."""
+    # An error of the prediction moves both points alike, and cancels in the comparison.
     labels = frame.labels.copy()
     points = _exchange(frame.points, labels, positions)
     if len(points) == 0:
@@ -70,10 +70,10 @@ def _exchange(
     labels: NDArray[np.int64],
     positions: NDArray[np.float64],
 ) -> NDArray[np.int64]:
-    """Kernel of `exchange_labels`: overwrites the labels, returns the points whose label has changed."""
+    """Kernel of `exchange_labels`: changes labels in place, returns the points with changed labels."""
     # The gain of exchanging the labels of points p_i and p_j with predicted markers m_i and m_j,
     # (|p_i-m_i|^2 + |p_j-m_j|^2 - |p_i-m_j|^2 - |p_j-m_i|^2) / (2 s^2), is -(p_i-p_j).(m_i-m_j) / s^2.
-    # The pair that gains most comes first; a point is exchanged once.
+    # Exchange the pair with the largest gain first, and each point only once.
     labeled = np.flatnonzero(labels >= 0)
     changed = np.empty(len(labeled), dtype=np.int64)
     count = 0
@@ -106,8 +106,8 @@ def _exchange(
 
 
 def gate_labels(frame: FrameState, hand: int, state: HandState, prediction: Prediction) -> FrameState:
-    """Drop labels of points outside a gate as wide as the innovations of the hand's other markers."""
-    # Where too many labels are outside, the prediction is wrong, and all labels stay.
+    """Drop labels of points outside a gate as wide as the innovations of the hand's markers."""
+    # If too many labels are outside, the prediction is wrong, and all labels stay.
     markers = frame.markers(hand)
     _gate(frame.points, markers, prediction.positions, state.variance)
     return frame.with_markers(hand, markers)
@@ -120,7 +120,7 @@ def _gate(
     positions: NDArray[np.float64],
     variance: NDArray[np.float64],
 ) -> None:
-    """Kernel of `gate_labels` for one hand; its markers (P,) are overwritten."""
+    """Kernel of `gate_labels` for one hand; changes `markers` (P,) in place."""
     labeled = np.flatnonzero(markers >= 0)
     if len(labeled) == 0:
         return
@@ -136,9 +136,9 @@ def _gate(
 def fit_labels(
     frame: FrameState, hand: int, state: HandState, prediction: Prediction, *, is_sure: bool = False
 ) -> tuple[FrameState, HandEstimate]:
-    """Fit the pose to the labeled points, without labels that are inconsistent, the worst first.
+    """Fit the pose to the labeled points, and drop inconsistent labels, the worst first.
 
-    With a sure prediction nothing else is tried; most labels being far off it, the RMS distance is NaN.
+    If the prediction is sure, no other start is tried; if most labels are far from it, the RMS is NaN.
     """
     points, markers = frame.points, frame.markers(hand)
     start, restarted, dropped = prediction.qpos, False, False
@@ -171,7 +171,7 @@ def _worst_label(
     positions: Float[np.ndarray, "M 3"],
     variance: Float[np.ndarray, "M"],
 ) -> int:
-    """The labeled point that is farthest from its fitted marker, if it is outside the gate; else -1."""
+    """The labeled point farthest from its fitted marker, if it is outside the gate; otherwise -1."""
     worst, most = -1, -1.0
     for point in range(len(markers)):
         marker = markers[point]
@@ -185,7 +185,7 @@ def _worst_label(
 
 
 def refit_labels(before: FrameState, frame: FrameState, track: HandTrack) -> tuple[FrameState, HandTrack]:
-    """Fit the pose of a hand again if its labels have changed."""
+    """Fit the pose of a hand again if its labels changed."""
     if (before.markers(track.hand) == frame.markers(track.hand)).all():
         return frame, track
     frame, estimate = fit_labels(frame, track.hand, track.state, track.prediction)
@@ -193,32 +193,32 @@ def refit_labels(before: FrameState, frame: FrameState, track: HandTrack) -> tup
 
 
 class _Proposal(NamedTuple):
-    """Labels of a hand's points by the labeler, and the pose that fits them."""
+    """The labeler's labels of a hand's points, and the pose fitted to them."""
 
     frame: FrameState  # the frame with these labels
     confidence: Float[np.ndarray, "P"]
-    """The labeler's confidence in each label; NaN for points that it was not shown."""
+    """The labeler's confidence in each label; NaN for points that it did not get."""
     estimate: HandEstimate  # the pose fitted to them
 
 
 class LabelerReview:
-    """Decides when a hand's labels are reviewed, and reviews them."""
+    """Decides when a hand's labels are reviewed by the labeler, and reviews them."""
 
     def __init__(self, labeler: Labeler, num_hands: int, config: TrackerConfig) -> None:
         self._labeler = labeler
         self._config = config
-        self._wait = np.full(num_hands, _FIRST_REVIEW_WAIT)  # [s] from a hand's last review to its next
+        self._wait = np.full(num_hands, _FIRST_REVIEW_WAIT)  # [s] between a hand's reviews
         self._last = np.full(num_hands, -np.inf)  # [s] of each hand's last review
         self._earlier: list[dict[tuple[int, int], int]] = [{} for _ in range(num_hands)]
-        # How many reviews in turn found other labels of points likelier, but not by enough.
-        self._open: list[frozenset[int]] = [frozenset()] * num_hands  # IDs that it was about
+        # counts successive reviews in which the same new labels were better, but not by enough
+        self._open: list[frozenset[int]] = [frozenset()] * num_hands  # IDs near missing markers
 
     def restart(self, index: int, time: float) -> None:
-        """Note that a hand was initialized at a time [s]: its labels are reviewed soon."""
+        """Note that a hand was initialized at a time [s], so that its labels are reviewed soon."""
         self._wait[index], self._last[index] = _FIRST_REVIEW_WAIT, time
 
     def review(self, frame: FrameState, track: HandTrack) -> tuple[FrameState, HandTrack]:
-        """Compare a hand's labels with the labeler's if that is due, and take over the likelier ones."""
+        """If a review is due, compare a hand's labels with the labeler's, and adopt the likelier ones."""
         markers = frame.markers(track.hand)
         near = _near_missing(
             frame.points, frame.labels, markers, track.state.digits, track.estimate.positions
@@ -257,7 +257,7 @@ class LabelerReview:
         named: NDArray[np.int64],
         confidence: NDArray[np.float64],
     ) -> _Proposal | None:
-        """Fit the labeler's labels; None if those of the frame are likelier or the same."""
+        """Fit the labeler's labels; None if the current ones are likelier or equal."""
         named_frame, is_sure = frame.with_markers(track.hand, named), track.estimate.rms < _RESTART_RMS
         proposed, estimate = fit_labels(
             named_frame, track.hand, track.state, track.prediction, is_sure=is_sure
@@ -279,7 +279,7 @@ class LabelerReview:
         return None
 
     def _is_due(self, index: int, frame: FrameState, near: NDArray[np.bool_]) -> bool:
-        """Whether a review is due; the next one is planned then."""
+        """Whether a review is due; if so, the next one is scheduled."""
         points = frozenset(frame.ids[near].tolist())
         new = bool(points - self._open[index])
         if not new and frame.time < self._last[index] + self._wait[index]:
@@ -290,7 +290,7 @@ class LabelerReview:
         return True
 
     def _gain(self, frame: FrameState, track: HandTrack, proposal: _Proposal) -> float:
-        """Log-odds by which proposed labels are likelier than those of the frame."""
+        """Log-odds gained by the proposed labels over the current ones."""
         before, proposed = frame.markers(track.hand), proposal.frame.markers(track.hand)
         gain = self._log_odds(frame, track, proposed, proposal.estimate)
         gain -= self._log_odds(frame, track, before, track.estimate)
@@ -302,14 +302,14 @@ class LabelerReview:
         presence = track.state.presence_log_odds(frame.first_seen[fresh])[
             np.arange(len(fresh)), proposed[fresh]
         ]
-        # That the marker was seen elsewhere is what the review doubts.
+        # The review doubts exactly that the marker was seen elsewhere.
         doubted = presence <= SEEN_ELSEWHERE + MOST_AGE_LOG_ODDS
         return float(gain + presence[~doubted].sum() + _DOUBTED_PRESENCE * doubted.sum())
 
     def _log_odds(
         self, frame: FrameState, track: HandTrack, markers: NDArray[np.int64], estimate: HandEstimate
     ) -> float:
-        """Log-odds of labeled points being the markers of a fitted hand against their being strays."""
+        """Log-odds of labeled points being markers of the fitted hand and not strays."""
         labeled = np.flatnonzero(markers >= 0)
         variance = track.state.variance[markers[labeled]]
         peak = peak_log_odds(variance, self._config.stray_density)
@@ -325,7 +325,7 @@ def _near_missing(
     digits: Int[np.ndarray, "M"],
     positions: Float[np.ndarray, "M 3"],
 ) -> Bool[np.ndarray, "P"]:
-    """Which points without a label may be markers that a hand lacks, by its markers' positions [m]."""
+    """Which unlabeled points may be missing markers of a hand, by their distances from the positions [m]."""
     near, missing = np.zeros(len(points), dtype=np.bool_), np.ones(len(digits), dtype=np.bool_)
     seen = np.zeros(len(DIGITS) + 1, dtype=np.bool_)
     for point in range(len(points)):
@@ -341,8 +341,8 @@ def _near_missing(
 
 
 def _doubted_biases(frame: FrameState, track: HandTrack, named: NDArray[np.int64]) -> Int[np.ndarray, "K"]:
-    """Markers that the hand lacks, for which the labeler names points that have lasted."""
-    # Their biases may be of other points if the markers would be much nearer without them.
+    """Missing markers with a probably wrong bias: the labeler assigns them points that have persisted."""
+    # Such a bias was learned from other points if the point is much closer without it.
     old = frame.time - frame.first_seen >= STRAY_LIFETIME
     rows = np.flatnonzero(old & frame.unlabeled & (named >= 0))
     if not len(rows):

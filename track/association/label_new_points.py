@@ -1,8 +1,8 @@
-"""Labels for new points: first the palms' markers, then those of all digits with candidates, jointly.
+"""Labels for new points: first of the palms' markers, then of all digits with candidates, jointly.
 
-The points within a radius of a digit's markers are its candidates. All assignments of them to its markers
-are tested on the digit (`track.association.digit_hypotheses`). Where digits share candidates, of one hand or
-of two that touch, the best joint assignment is taken. Labels with weak evidence can be reassigned.
+Points within a radius of a digit's markers are its candidates. All assignments of them to its markers are
+tested (`track.association.digit_hypotheses`). Where digits share candidates, within one hand or between two,
+the best joint assignment is chosen. Labels with weak evidence can be reassigned.
 """
 
 from __future__ import annotations
@@ -21,36 +21,36 @@ from track.association.frame_state import FrameState, Numbering, match_log_odds,
 from track.association.hand_state import HandState, HandTrack
 
 MAX_CANDIDATES: Final = 7
-"""Candidates of a digit at most; the number of hypotheses and the bits of a joint assignment grow with it."""
+"""Largest number of candidates of a digit; hypotheses and bits of joint assignments grow with it."""
 SETTLED_EVIDENCE: Final = 4.0
-"""Evidence from which on a label is settled (log-odds); below it the label can be reassigned."""
-_NOWHERE: Final = 1e6  # [m] of the markers of a hand without a pose, which no point is near
-_SEEN_RADIUS: Final = 0.012  # [m] from a marker that has a point, within which others are its candidates
-_MISSING_RADIUS: Final = 0.05  # [m] from a missing marker, within which points are its candidates
+"""Evidence (log-odds) from which a label is settled; weaker labels can be reassigned."""
+_NOWHERE: Final = 1e6  # [m] position for markers of hands without a pose, far from all points
+_SEEN_RADIUS: Final = 0.012  # [m] Points this close to a seen marker are its candidates.
+_MISSING_RADIUS: Final = 0.05  # [m] Points this close to a missing marker are its candidates.
 
 
 class DigitTable(NamedTuple):
-    """The D digits of all hands, counted through the hands, with their labels."""
+    """The D digits of all hands, numbered through the hands, and their labels."""
 
-    digits: Int[np.ndarray, "K"]  # digit of each label, -1 for a palm's
+    digits: Int[np.ndarray, "K"]  # digit of each label, -1 for the palm
     labels: Int[np.ndarray, "D K"]  # labels of each digit, -1 where there are fewer
-    markers: Int[np.ndarray, "D K"]  # the same in the order of the hand's layout
+    markers: Int[np.ndarray, "D K"]  # the same as markers of the hand's layout
 
 
 class MarkerTable(NamedTuple):
-    """The K markers of all hands by their labels, and the label of each of N points."""
+    """The K markers of all hands, indexed by label, and the label of each of N points."""
 
     positions: Float[np.ndarray, "K 3"]  # predicted positions [m]
-    digits: Int[np.ndarray, "K"]  # digit of each marker, counted through the hands; -1 on a palm
+    digits: Int[np.ndarray, "K"]  # digit of each marker, numbered through the hands; -1 for the palm
     assigned: Int[np.ndarray, "N"]  # label of each point, -1 for none
 
 
 class DigitCandidates(NamedTuple):
-    """Candidate points of D digits, those with their labels among them."""
+    """Candidate points of D digits, including their labeled points."""
 
     candidates: Int[np.ndarray, "D 7"]
-    """Points of each digit: first those labeled as its markers, then others, the nearest first."""
-    counts: Int[np.ndarray, "D"]  # how many there are; zero where there is nothing to decide
+    """Points of each digit: those labeled as its markers, then others, the nearest first."""
+    counts: Int[np.ndarray, "D"]  # number of candidates; 0 if there is nothing to decide
 
 
 def digit_table(states: Sequence[HandState], numbering: Numbering) -> DigitTable:
@@ -67,7 +67,7 @@ def digit_table(states: Sequence[HandState], numbering: Numbering) -> DigitTable
 
 
 def label_new_points(frame: FrameState, tracks: Sequence[HandTrack], table: DigitTable) -> FrameState:
-    """Label points without a label, and reassign labels with weak evidence, by the hands that have a pose."""
+    """Label unlabeled points, and reassign weakly supported labels, for hands with a pose."""
     if not tracks:
         return frame
     positions = np.full((len(table.digits), 3), _NOWHERE)
@@ -90,7 +90,7 @@ def label_new_points(frame: FrameState, tracks: Sequence[HandTrack], table: Digi
 
 
 def _label_palm(frame: FrameState, track: HandTrack) -> FrameState:
-    """Match unlabeled points with the missing markers of a palm."""
+    """Match unlabeled points with missing markers of a palm."""
     free = np.flatnonzero(frame.unlabeled)
     markers, missing = frame.markers(track.hand), track.state.digits < 0
     missing[markers[markers >= 0]] = False
@@ -115,7 +115,7 @@ def _evaluate_hand(
     digit_markers: NDArray[np.int64],
     hypotheses: DigitHypotheses,
 ) -> None:
-    """Evaluate the hypotheses of one hand's digits, which are filled."""
+    """Evaluate the hypotheses of one hand's digits, and write them to `hypotheses`."""
     first = track.hand * len(DIGITS)
     open_digits = np.flatnonzero(candidates.counts[first : first + len(DIGITS)]).tolist()
     if not open_digits:
@@ -141,7 +141,7 @@ def _evaluate_hand(
 def find_candidates(
     points: Float[np.ndarray, "N 3"], evidence: Float[np.ndarray, "N"], table: MarkerTable, num_digits: int
 ) -> DigitCandidates:
-    """The candidates of each digit."""
+    """Find the candidates of each digit."""
     found = DigitCandidates(np.full((num_digits, MAX_CANDIDATES), -1), np.zeros(num_digits, dtype=np.int64))
     _find_candidates(points, evidence, table, found)
     return found
@@ -195,7 +195,7 @@ def _find_contested(
     table: MarkerTable,
     missing: Bool[np.ndarray, "K"],
 ) -> Bool[np.ndarray, "N"]:
-    """Points whose label has weak evidence, with a missing marker of another digit nearby."""
+    """Points with a weakly supported label and a missing marker of another digit nearby."""
     contested = np.zeros(len(points), dtype=np.bool_)
     for point in range(len(points)):
         owner = table.assigned[point]
@@ -237,7 +237,7 @@ def assign_jointly(
     assigned: Int[np.ndarray, "N"],
     margins: Float[np.ndarray, "N"],
 ) -> None:
-    """Choose the best hypothesis of each digit together, and the margin of each label over the next best."""
+    """Choose the best joint hypothesis of all digits; write labels and their margins over the next best."""
     pending = candidates.counts > 0
     group = np.empty(len(pending), dtype=np.int64)
     for first in range(len(pending)):
@@ -274,12 +274,12 @@ def _assign_group(
     assigned: Int[np.ndarray, "N"],
     margins: Float[np.ndarray, "N"],
 ) -> None:
-    """`assign_jointly` for a group of digits that share points, directly or through others."""
+    """`assign_jointly` for a group of digits that share points directly or indirectly."""
     most = hypotheses.scores.shape[1]
     rows, counts = np.zeros((len(group), most), dtype=np.int64), np.zeros(len(group), dtype=np.int64)
     scores, sets = np.full((len(group), most), -IMPOSSIBLE), np.zeros((len(group), most), dtype=np.int64)
     bits = np.full(len(assigned), -1)
-    num_bits = 0  # 61 at most for ten digits with seven candidates, as each shares one with another
+    num_bits = 0  # at most 61: ten digits with seven candidates, each sharing one with another
     for index, digit in enumerate(group):
         for point in candidates.candidates[digit, : candidates.counts[digit]]:
             assigned[point], margins[point] = -1, np.inf
@@ -313,7 +313,7 @@ def _assign_group(
 
 @kernel
 def _sort_rows(scores: Float[np.ndarray, "S"], rows: Int[np.ndarray, "S"]) -> int:
-    """Write the rows that are possible to `rows`, the best first, and return how many there are."""
+    """Write the possible rows to `rows`, the best first; return their number."""
     count = 0
     for row in range(len(scores)):
         if scores[row] <= -IMPOSSIBLE:
@@ -335,7 +335,7 @@ def best_combination(
     banned: Int[np.ndarray, "D"],
     best: Int[np.ndarray, "D"],
 ) -> float:
-    """Score of the best choice of one row per digit that shares no point, by branch and bound."""
+    """Choose one row per digit without a shared point, by branch and bound; return the best score."""
     digits = len(scores)
     bound = np.zeros(digits + 1)
     for digit in range(digits - 1, -1, -1):

@@ -1,12 +1,12 @@
 """The energy of a calibration and its Gauss-Newton normal equations.
 
-The energy is that of Han et al. 2018, section 4.5, with the hand's shape as a further unknown. Its unit is
-the variance of the markers' noise:
+The energy is that of Han et al. 2018, section 4.5, with the hand's shape as an additional unknown, in units
+of the variance of the markers' noise:
 
     E = E_data + E_prior(M) + E_contact + prior of hand shapes + prior and limits of joint angles
 
-Contact points slide on the skin after each step. What remains of a contact is its gap along the normal, which
-sliding does not change to first order.
+Contact points slide on the skin after each step. Only the gap along the normal remains in a contact's energy:
+sliding does not change it to first order.
 """
 
 from __future__ import annotations
@@ -50,41 +50,41 @@ from track.kinematics.pose_spread import resting_prior
 ALPHA_NORMAL, ALPHA_ALONG = 2.0, 1.0
 """Weights of E_prior along the normal and in the skin (Han et al. 2018, section 4.5)."""
 POSITION_SPREAD: Final = 0.002
-"""Standard deviation of a marker's slip along the skin [m], to begin with; (noise / spread)^2 is the paper's
+"""Initial standard deviation of a marker's slip along the skin [m]; (noise / spread)^2 is the paper's
 lambda_1."""
-HEIGHT_SPREAD: Final = 0.0005  # the same of a marker center's height around that of the design [m]
+HEIGHT_SPREAD: Final = 0.0005  # [m] the same of its height over the design's
 CONTACT_SPREAD: Final = 0.0007
 """Standard deviation of a pad's compression around `PAD_COMPRESSION` [m]; (noise / spread)^2 is lambda_2."""
-_LIMIT_SPREAD: Final = np.deg2rad(2.0)  # of an angle beyond its range
-_GESTURES: Final = 4.0  # that a capture counts as, however many frames it has: they are much alike
-# A user's mean angles differ from the mean of the gestures by this many standard deviations of the gestures.
-_OFF_GESTURES: Final = np.repeat([1.0, 0.25], [4, 16])  # thumbs at work are held otherwise
-RELINEARIZE: Final = 0.005  # change of a parameter (log lengths, [rad], [m]) that renews the skin's jacobian
+_LIMIT_SPREAD: Final = np.deg2rad(2.0)  # [rad] standard deviation of an angle beyond its range
+_GESTURES: Final = 4.0  # The pose prior counts this many times per capture, as its frames are much alike.
+# Standard deviation of a user's mean angles around the mean of the gestures, in that of the gestures.
+_OFF_GESTURES: Final = np.repeat([1.0, 0.25], [4, 16])  # large for thumbs
+RELINEARIZE: Final = 0.005  # The skin's jacobian is renewed after such a change (log lengths, [rad], [m]).
 _DIFFERENCE_STEP: Final = 1e-5  # of finite differences
 PAD_COMPRESSION: Final = 0.001
 """Compression of each pad in a touch [m]: simulated pads overlap by 1.6 to 2.4 mm together."""
-_MOST_TOUCH_GAP: Final = 0.012  # [m] between the two pads of a touch
-_MOST_TOUCH_SPEED: Final = 0.02  # [m/s] of the finger relative to the thumb
-_SHORTEST_HOLD: Final = 0.06  # [s] that a touch lasts
+_MOST_TOUCH_GAP: Final = 0.012  # [m] largest gap between the pads of a touch
+_MOST_TOUCH_SPEED: Final = 0.02  # [m/s] largest speed of the finger relative to the thumb
+_SHORTEST_HOLD: Final = 0.06  # [s] shortest touch
 _MOST_TOUCHES_PER_FINGER: Final = 10
-_SPEED_WINDOW: Final = 0.025  # [s] before and after a frame, over which speed is measured
-_GAP_SCALE: Final = 0.002  # [m] from its finger's usual gap, at which a touch has a quarter of its weight
-_PAD_DEPTH: Final = 0.006  # [m] below the skin: about the middle of a pad
+_SPEED_WINDOW: Final = 0.025  # [s] before and after a frame, in which speed is measured
+_GAP_SCALE: Final = 0.002  # [m] from its finger's usual gap a touch has a quarter of its weight
+_PAD_DEPTH: Final = 0.006  # [m] depth of a pad's middle below the skin
 _SLIDE_ROUNDS: Final = 3
-_GAP_QUANTILE: Final = 0.35  # of a finger's gaps: the usual one
-_FACING_COSINE: Final = -0.8  # cosine between the normals of pads that face each other
-_MOST_PAD_OFFSET: Final = 0.002  # [m] between the contact points, across their direction
+_GAP_QUANTILE: Final = 0.35  # quantile of a finger's gaps that counts as the usual one
+_FACING_COSINE: Final = -0.8  # Normals of facing pads have a smaller cosine.
+_MOST_PAD_OFFSET: Final = 0.002  # [m] largest offset of the contact points across their direction
 Progress = Callable[[int, float, float], None]
-"""Called after each step: its number, `marker_rms` and `contact_gap` [m] (NaN: no contacts yet)."""
+"""Called after each step with its number, `marker_rms` and `contact_gap` [m] (NaN without contacts)."""
 _FIRST_DAMPING, _LEAST_DAMPING = 1e-3, 1e-8
-_DAMPING_RAISE, _DAMPING_CUT = 10.0, 0.2  # factors of the damping after a failed step and a good one
+_DAMPING_RAISE, _DAMPING_CUT = 10.0, 0.2  # factors after a failed and a good step
 _LEAST_RAISED_DAMPING: Final = 1e-6
 _MOST_DAMPING_TRIALS: Final = 8
-SMALL_GAIN: Final = 1e-4  # share of the energy; a step that gains less is the last one
+SMALL_GAIN: Final = 1e-4  # A step that gains a smaller share of the energy is the last one.
 
 
 class Contacts(NamedTuple):
-    """K contacts of the thumb, each in one frame, with a point on either pad."""
+    """K contacts of the thumb, each in one frame and with a point on either pad."""
 
     frames: Int[np.ndarray, "K"]
     fingers: Int[np.ndarray, "K"]  # indices into `topology.DIGITS`
@@ -99,11 +99,11 @@ _NO_CONTACTS: Final = Contacts(np.empty(0, dtype=np.int64), np.empty(0, dtype=np
 class Estimate:
     """All unknowns of a calibration at one iteration."""
 
-    parameters: Float[np.ndarray, "53"]  # hand shape, see `hand_parameters`
+    parameters: Float[np.ndarray, "53"]  # parameters of the shape, see `hand_parameters`
     points: Float[np.ndarray, "M 3"]  # marker centers on the rest hand, in the wrist's frame [m]
-    coordinates: SkinCoordinates  # the same points in coordinates of its skin
+    coordinates: SkinCoordinates  # skin coordinates of these points
     qpos: Float[np.ndarray, "F 27"]
-    contacts: Contacts = _NO_CONTACTS  # their frames count in `qpos`
+    contacts: Contacts = _NO_CONTACTS  # with indices into `qpos` as frames
 
 
 class Fit(NamedTuple):
@@ -114,12 +114,12 @@ class Fit(NamedTuple):
     residuals: Float[np.ndarray, "F M 3"]  # model minus marker [m], zero where a marker is missing
     design_residuals: Float[np.ndarray, "M 3"]  # marker minus its designed position, in the wrist's frame [m]
     normals: Float[np.ndarray, "M 3"]  # unit normals of the rest skin under the markers
-    geometry: ContactGeometry  # how the pads of the contacts lie to each other
+    geometry: ContactGeometry  # relation of the contacts' pads
     cost: float
 
 
 class NormalEquations(NamedTuple):
-    """Gauss-Newton matrix and gradient in blocks: the poses of each frame, and the S shared unknowns."""
+    """Gauss-Newton matrix and gradient in blocks: poses of each frame, and S shared unknowns."""
 
     pose: Float[np.ndarray, "F 26 26"]
     mixed: Float[np.ndarray, "F 26 S"]
@@ -129,23 +129,23 @@ class NormalEquations(NamedTuple):
 
 
 class Problem:
-    """The data of a calibration; once a hand nearly fits, `robust_scale` and the markers' spreads change."""
+    """Data of a calibration; `robust_scale` and the spreads of marker places are adapted on the way."""
 
     def __init__(
         self,
-        shape: HandShape,  # right hand that the parameters start from
-        design: SkinCoordinates,  # of the markers by the glove's design
-        heights: Float[np.ndarray, "M"],  # of the marker centers above the skin, as designed [m]
-        targets: Float[np.ndarray, "F M 3"],  # labeled markers of the chosen frames [m]; NaN where missing
+        shape: HandShape,  # right hand at which all parameters are zero
+        design: SkinCoordinates,  # designed markers
+        heights: Float[np.ndarray, "M"],  # designed heights of marker centers above the skin [m]
+        targets: Float[np.ndarray, "F M 3"],  # labeled markers in F frames [m]; NaN where missing
         *,
-        noise: float,  # standard deviation of a marker's coordinates [m]
-        robust_scale: float,  # where a residual costs half of a quadratic loss [m] (Geman and McClure 1987)
+        noise: float,  # standard deviation of marker coordinates [m]
+        robust_scale: float,  # [m] scale of the robust loss, which halves a square there (Geman, McClure)
         relinearize: float = RELINEARIZE,
     ) -> None:
         self._relinearize = relinearize
         self.shape, self.design, self.heights = shape, design, heights
         self.present: Bool[np.ndarray, "F M"] = np.isfinite(targets).all(axis=2)
-        """Markers that are not missing."""
+        """Whether each marker is present."""
         self.targets = np.where(self.present[..., None], targets, 0.0)
         self.noise, self.robust_scale = noise, robust_scale
         self.pose_precision = min(1.0, _GESTURES / len(targets)) * resting_prior().precision
@@ -187,25 +187,25 @@ class Problem:
         return float(cost)
 
     def _position_precision(self, fit: Fit) -> NDArray[np.float64]:
-        """E_prior's precision matrix of each marker (M, 3, 3) [1/m^2]."""
+        """Precision matrix of E_prior for each marker (M, 3, 3) [1/m^2]."""
         normal = fit.normals[:, :, None] * fit.normals[:, None]
         precision: NDArray[np.float64] = ALPHA_ALONG * np.eye(3) + (ALPHA_NORMAL - ALPHA_ALONG) * normal
         return precision / self.position_spread**2
 
     def _joint_angle_residuals(self, estimate: Estimate) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Joint angles (F, 20) [rad] beyond their limits, and from the mean of gestures."""
+        """Joint angles (F, 20) [rad] beyond their limits, and relative to the mean of the gestures."""
         angles = estimate.qpos[:, 7:]
         low, high = self._ranges.T
         beyond = np.maximum(angles - high, 0.0) + np.minimum(angles - low, 0.0)
         return beyond, angles - resting_prior().angles
 
     def normal_equations(self, estimate: Estimate, fit: Fit) -> NormalEquations:
-        """Gauss-Newton's equations; the shared unknowns are the parameters, then three per marker [m]."""
+        """Gauss-Newton equations; shared unknowns are the parameters, then three per marker [m]."""
         count, frames = len(estimate.points), len(estimate.qpos)
         skin = fit.model.surface.vertices
         patch = SkinPatch(self._all_coordinates(estimate).faces)
         corners, rest = patch.corners(skin).part(0, count), self._rest_jacobian(estimate, patch, skin)
-        # A frame has a row for each coordinate of a marker, and the last one for the gap of its contact.
+        # A frame has one row per marker coordinate, and a last row for the gap of its contact.
         by_pose = np.zeros((frames, 3 * count + 1, NUM_VELOCITIES))
         by_shared = np.zeros((frames, 3 * count + 1, NUM_PARAMETERS + 3 * count))
         residuals, precision = np.zeros((2, frames, 3 * count + 1))
@@ -244,9 +244,9 @@ class Problem:
     def _rest_jacobian(
         self, estimate: Estimate, patch: SkinPatch, skin: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Derivative of points at fixed skin coordinates on the rest hand by the parameters (P, 3, 53)."""
-        # The skin's derivative is renewed when a parameter has changed: by 0.005 or more changes the result
-        # by less than a micrometer, while four times as much is noticeable.
+        """Derivatives of points at fixed skin coordinates of the rest hand by the parameters (P, 3, 53)."""
+        # The skin's derivative is renewed when a parameter has changed by 0.005. This affects the result by
+        # less than a micrometer; four times as much would be noticeable.
         if (
             self._surface_jacobian is None
             or np.abs(estimate.parameters - self._linearized_at).max() > self._relinearize
@@ -262,7 +262,7 @@ class Problem:
         return np.stack(columns, axis=-1)
 
     def _all_coordinates(self, estimate: Estimate) -> SkinCoordinates:
-        """Skin coordinates of the markers, of their design, and of compressed pads at the contacts."""
+        """Skin coordinates of the markers, of their design, and of the compressed pads at the contacts."""
         pads = estimate.contacts.pads
         pads = pads._replace(heights=np.full(len(pads.faces), -PAD_COMPRESSION))
         parts = zip(estimate.coordinates, self.design, pads, strict=True)
@@ -271,7 +271,7 @@ class Problem:
     def _add_priors(
         self, estimate: Estimate, fit: Fit, design_jacobian: NDArray[np.float64], result: NormalEquations
     ) -> None:
-        """Add the priors; `design_jacobian` (M, 3, 53): marker minus design, at fixed skin coordinates."""
+        """Add the priors; `design_jacobian` (M, 3, 53) is of marker minus design at fixed coordinates."""
         first, count = NUM_PARAMETERS, len(estimate.points)
         by_marker = np.eye(3 * count).reshape(count, 3, -1)
         result.shared[:first, :first] += self.precision
@@ -292,7 +292,7 @@ class Problem:
     def _gap_jacobians(
         self, estimate: Estimate, fit: Fit, rest: NDArray[np.float64]
     ) -> list[NDArray[np.float64]]:
-        """Jacobians of the gaps by poses (K, 26) and parameters (K, 53), given those of points at rest."""
+        """Jacobians of the gaps by poses (K, 26) and parameters (K, 53); `rest` is that of rest points."""
         frames, count = estimate.contacts.frames, len(estimate.contacts.frames)
         rows, pads = np.arange(count), self._all_coordinates(estimate).part(-2 * count, None)
         points, _ = skin_points(pads, SkinPatch(pads.faces).corners(fit.model.surface.vertices))
@@ -311,7 +311,7 @@ class Problem:
         weights: NDArray[np.float64],
         rest: NDArray[np.float64],
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Jacobians of skinned points by poses, parameters and rest points, and the points by each bone."""
+        """Jacobians of skinned points by poses, parameters and rest points; points moved by each bone."""
         bones, qpos = fit.bones[frames], estimate.qpos[frames]
         by_point, by_bone = skinning_terms(fit.model, bones, points, weights)
         all_bones = np.tile(np.arange(NUM_BONES), (len(points), 1))
@@ -322,7 +322,7 @@ class Problem:
     def apply_step(
         self, estimate: Estimate, pose_step: Float[np.ndarray, "F 26"], shared_step: Float[np.ndarray, "S"]
     ) -> Estimate:
-        """The estimate after a step, with new coordinates of its markers on the new hand's skin."""
+        """Apply a step, and update the markers' coordinates on the new hand's skin."""
         parameters = estimate.parameters + shared_step[:NUM_PARAMETERS]
         shape = shape_at(self.shape, parameters)
         skin = build_skin(shape)
@@ -338,7 +338,7 @@ class Problem:
 def first_estimate(
     hand: GloveFit, targets: Float[np.ndarray, "F M 3"], qpos: Float[np.ndarray, "F 27"], **options: float
 ) -> tuple[Problem, Estimate]:
-    """The problem of a right hand's labeled markers [m] with its options, and the hand as it is."""
+    """The problem of a right hand's labeled markers [m] with its options, and the hand as first estimate."""
     worn = hand.attachment
     coordinates = nearest_coordinates(worn.points, worn.feet, worn.main_bones, hand.shape)
     problem = Problem(hand.shape, coordinates, worn.layout.heights, targets, **options)
@@ -346,11 +346,11 @@ def first_estimate(
 
 
 class ContactGeometry(NamedTuple):
-    """How the pads of K contacts lie to each other in the world."""
+    """Relation of the pads of K contacts in the world."""
 
     directions: Float[np.ndarray, "K 3"]  # unit vectors from thumb to finger
-    gaps: Float[np.ndarray, "K"]  # distance of the compressed pads [m]; negative where they press harder
-    facing: Bool[np.ndarray, "K"]  # whether the points are on the last bones and face each other
+    gaps: Float[np.ndarray, "K"]  # distance of the compressed pads [m]; negative if they press harder
+    facing: Bool[np.ndarray, "K"]  # whether both points are on last bones and face each other
 
 
 def find_touches(
@@ -359,7 +359,7 @@ def find_touches(
     complete: Bool[np.ndarray, "T 5"],
     rate: float,
 ) -> list[tuple[int, str]]:
-    """Frames and fingers of possible touches."""
+    """Find frames and fingers of possible touches."""
     by_finger = [thumb_contact(model, angles, finger) for finger in FINGERS]
     gaps = np.stack([-contact.overlap for contact in by_finger], axis=1)
     window = max(1, round(_SPEED_WINDOW * rate))
@@ -382,7 +382,7 @@ def find_touches(
 def _speed(
     model: HandModel, angles: NDArray[np.float64], finger: str, window: int, rate: float
 ) -> NDArray[np.float64]:
-    """Speed of the finger's tip in the frame of the thumb's last bone (T,) [m/s]."""
+    """Speed (T,) of the finger's tip relative to the thumb's last bone [m/s]."""
     bones = model.forward_kinematics(join_qpos(angles))
     thumb, other = bones_of("thumb")[2], bones_of(finger)[2]
     tip = bones[:, other, :3, 3] + model.skeleton.lengths[other] * bones[:, other, :3, 0]
@@ -397,7 +397,7 @@ def _speed(
 def initialize_contacts(
     model: HandModel, touches: list[tuple[int, str]], T_world_bone: Float[np.ndarray, "K L 4 4"]
 ) -> Contacts:
-    """Contacts of touches, their points first where the two last bones come nearest."""
+    """Contacts of touches, with points where the two last bones are nearest."""
     points, bones = np.empty((2, len(touches), 3)), np.empty((2, len(touches)), dtype=np.int64)
     for number, (_, finger) in enumerate(touches):
         nearest = _nearest_skin_points(model, T_world_bone[number], finger)
@@ -414,7 +414,7 @@ def initialize_contacts(
 
 
 def _nearest_skin_points(model: HandModel, bones: NDArray[np.float64], finger: str) -> NDArray[np.float64]:
-    """Points (2, 3) [m] on the skins of the two last bones, each nearest to the other bone."""
+    """Points (2, 3) [m] on the skins of the two last bones, each where the other bone is nearest."""
     pads = []
     for digit in ("thumb", finger):
         bone = bones_of(digit)[2]
@@ -432,9 +432,9 @@ def _nearest_skin_points(model: HandModel, bones: NDArray[np.float64], finger: s
 def slide_contacts(
     contacts: Contacts, model: HandModel, T_world_bone: Float[np.ndarray, "K L 4 4"]
 ) -> Contacts:
-    """Slide the contact points on the skin to where thumb and finger come nearest."""
+    """Slide the contact points on the skin to where thumb and finger are nearest."""
     # Each moves to where its skin is nearest to a target inside the other pad. A target on the other skin
-    # would fail where the skins overlap.
+    # would fail if the skins overlap.
     skin, count = build_skin(model.shape), len(contacts.frames)
     sides = [contacts.pads.part(0, count), contacts.pads.part(count, None)]
     for _ in range(_SLIDE_ROUNDS):
@@ -453,7 +453,7 @@ def slide_contacts(
 def contact_geometry(
     contacts: Contacts, corners: Corners, model: HandModel, T_world_bone: NDArray[np.float64]
 ) -> ContactGeometry:
-    """How the pads lie to each other."""
+    """Directions and gaps of contacts, and whether their pads face each other."""
     rest, rest_normals = skin_points(contacts.pads, corners)
     blend = _blend_transforms(contacts.pads, model, np.concatenate([T_world_bone, T_world_bone]))
     points = (np.einsum("kij,kj->ki", blend[:, :, :3], rest) + blend[:, :, 3]).reshape(2, -1, 3)
@@ -464,7 +464,7 @@ def contact_geometry(
     along = (offset * direction).sum(axis=1)
     across = np.linalg.norm(offset - along[:, None] * direction, axis=1)
     normals /= np.linalg.norm(normals, axis=2, keepdims=True)
-    # Both points are on last bones, and have not slid away.
+    # Both points must be on last bones, and must not have slid away.
     last = np.array([bones_of(digit)[2] for digit in DIGITS])
     bones = np.append(np.full(len(offset), last[0]), last[contacts.fingers])
     on_tips = (skin_weights(contacts.pads)[np.arange(len(bones)), bones] > 0.5).reshape(2, -1).all(axis=0)
@@ -474,9 +474,8 @@ def contact_geometry(
 
 
 def contact_weights(geometry: ContactGeometry, fingers: Int[np.ndarray, "K"]) -> Float[np.ndarray, "K"]:
-    """Weight of each contact, 0 to 1: small where its gap is unlike the others of its finger."""
-    # Geman and McClure's weights (1987), around a lower quantile: a touch is the nearest that the thumb
-    # comes.
+    """Weight of each contact from 0 to 1, small if its gap differs from the others of its finger."""
+    # Geman and McClure's weights (1987) around a low quantile, as in a touch the gap is smallest.
     weights = np.zeros(len(geometry.gaps))
     for finger in np.unique(fingers[geometry.facing]):
         mine = (fingers == finger) & geometry.facing
@@ -488,7 +487,7 @@ def contact_weights(geometry: ContactGeometry, fingers: Int[np.ndarray, "K"]) ->
 def _blend_transforms(
     coordinates: SkinCoordinates, model: HandModel, T_world_bone: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Blended transforms (K, 3, 4) from the rest hand to the world, each for its point and frame."""
+    """Blended transforms (K, 3, 4) from the rest hand to the world, for each point in its frame."""
     motion = (T_world_bone @ np.linalg.inv(model.rest_transforms))[:, :, :3]
     return np.asarray(np.einsum("kl,klij->kij", skin_weights(coordinates), motion))
 
@@ -501,7 +500,7 @@ def levenberg_marquardt(
     progress: Progress | None,
     small_gain: float = SMALL_GAIN,
 ) -> tuple[Estimate, Fit, int]:
-    """Minimize until a step gains less than a share, or step `most`; with the last step's number."""
+    """Minimize until a step gains too small a share, or step `most`; return the last step's number, too."""
     fit, damping = problem.fit(estimate), _FIRST_DAMPING
     while steps < most:
         before, equations = fit.cost, problem.normal_equations(estimate, fit)
@@ -522,13 +521,13 @@ def levenberg_marquardt(
 
 
 def marker_rms(problem: Problem, fit: Fit) -> float:
-    """Median over frames of the markers' RMS distance [m]; wrong labels hardly change it."""
+    """Median over frames of the markers' RMS distance [m], which wrong labels hardly change."""
     squares = (fit.residuals**2).sum(axis=(1, 2)) / problem.present.sum(axis=1)
     return float(np.sqrt(np.median(squares)))
 
 
 def contact_gap(estimate: Estimate, fit: Fit) -> float:
-    """Weighted RMS gap of the contacts [m], NaN without any."""
+    """Weighted RMS gap of the contacts [m]; NaN without contacts."""
     if not len(estimate.contacts.frames):
         return float("nan")
     weights = contact_weights(fit.geometry, estimate.contacts.fingers)
@@ -536,7 +535,7 @@ def contact_gap(estimate: Estimate, fit: Fit) -> float:
 
 
 def user_hand(right: GloveFit, problem: Problem, estimate: Estimate) -> GloveFit:
-    """The right hand of an estimate in its glove."""
+    """The estimated right hand in its glove."""
     shape = shape_at(problem.shape, estimate.parameters)
     return GloveFit(HandModel(shape), attachment_at(right.attachment.layout, estimate.coordinates, shape))
 
@@ -544,7 +543,7 @@ def user_hand(right: GloveFit, problem: Problem, estimate: Estimate) -> GloveFit
 def eliminate_poses(
     equations: NormalEquations, damping: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The damped poses' Schur complement (S, S + 1), gradient last, and their solution (F, 26, S + 1)."""
+    """Schur complement of the damped poses (S, S + 1), gradient last, and their solution (F, 26, S + 1)."""
     pose = equations.pose.copy()
     diagonal = np.arange(pose.shape[1])
     pose[:, diagonal, diagonal] *= 1.0 + damping
@@ -559,7 +558,7 @@ def eliminate_poses(
 def shared_covariance(
     problem: Problem, estimate: Estimate, fit: Fit
 ) -> tuple[Float[np.ndarray, "S S"], Float[np.ndarray, "F 26 S"]]:
-    """Covariance of the shared unknowns, whatever the poses are, and how poses answer to these unknowns."""
+    """Covariance of the shared unknowns, marginalized over poses, and derivative of poses by them."""
     reduced, solved = eliminate_poses(problem.normal_equations(estimate, fit), 0.0)
     return np.linalg.inv(reduced[:, :-1]), solved[..., :-1]
 
@@ -569,12 +568,12 @@ def angle_errors(
     answers: Float[np.ndarray, "F 26 S"],
     pose_precision: Float[np.ndarray, "20 20"],
 ) -> Float[np.ndarray, "20 2"]:
-    """What `shared_covariance` leaves open of each joint angle [rad]: by places of markers, by the shape."""
+    """Remaining errors of each joint angle [rad], from marker places and from the shape."""
     by_angle = answers[:, 6:]
-    # Where directions of bones are unsure, gestures that the user does not make turn them.
+    # Where directions of bones are uncertain, gestures that the user does not make turn them.
     turns = covariance @ by_angle.sum(axis=0).T @ pose_precision * _OFF_GESTURES
     covariance = covariance + turns @ resting_prior().covariance @ turns.T
-    # Both are correlated. Their shares of the whole variance are as they would be alone.
+    # Both are correlated; the total variance is divided in the ratio of their separate variances.
     places, bones, both = (
         np.einsum("fis,st,fit->i", of, covariance[part, part], of, optimize=True)
         for part in (slice(NUM_PARAMETERS, None), slice(NUM_PARAMETERS), slice(None))
@@ -587,7 +586,7 @@ def angle_errors(
 def _damped_step(
     equations: NormalEquations, damping: float
 ) -> tuple[Float[np.ndarray, "F 26"], Float[np.ndarray, "S"]]:
-    """The step of the poses (F, 26) and that of the shared unknowns (S,)."""
+    """Steps of the poses (F, 26) and of the shared unknowns (S,)."""
     reduced, solved = eliminate_poses(equations, damping)
     system = reduced[:, :-1] + np.diag(damping * equations.shared.diagonal())
     shared = -np.linalg.solve(system, reduced[:, -1])
@@ -595,7 +594,7 @@ def _damped_step(
 
 
 def _with_slid_contacts(problem: Problem, estimate: Estimate, fit: Fit) -> tuple[Estimate, Fit]:
-    """The estimate after its contact points have slid on the skin, and its fit."""
+    """Slide the contact points of an estimate, and fit it again."""
     if not len(estimate.contacts.frames):
         return estimate, fit
     contacts = slide_contacts(estimate.contacts, fit.model, fit.bones[estimate.contacts.frames])

@@ -1,7 +1,7 @@
-"""A hand's shape as 53 parameters around an initial shape, and coordinates on the skin of such hands.
+"""A hand's shape as 53 parameters around an initial shape, and coordinates on the skin of hands.
 
-All shapes are of right hands. Length and breadth scale the whole hand; bone lengths, knuckles, directions of
-the digits, girths and the palm's thickness vary in addition, as in `handsim.hand.shape.sample_shape`.
+All shapes are of right hands. Length and breadth scale the whole hand. In addition bone lengths, knuckles,
+directions of digits, girths and palm thickness vary, as in `handsim.hand.shape.sample_shape`.
 """
 
 from __future__ import annotations
@@ -31,19 +31,19 @@ DIRECTIONS: Final = slice(32, 47)  # base angles [rad], three per digit
 GIRTHS: Final = slice(47, 52)  # log factors, one per digit
 THICKNESS: Final = 52  # log factor
 NUM_PARAMETERS: Final = 53
-# Standard deviations. The nearest of five sizes may be a size off and more; length and breadth are correlated
-# (ANSUR II). Real knuckles are assumed to vary twice as much as the simulated population's.
+# Standard deviations. The nearest of the five sizes may be wrong by more than a size; length and breadth are
+# correlated (ANSUR II). Real knuckles are assumed to vary twice as much as in the simulated population.
 _SIZE_SPREAD: Final = 0.09
 _SIZE_CORRELATION: Final = 0.6
 _KNUCKLE_SPREAD: Final = 2.0 * ADULTS.knuckle_spread
-_DIFFERENCE_STEP: Final = 1e-5  # of finite differences
+_DIFFERENCE_STEP: Final = 1e-5  # step of finite differences
 _MOST_PROJECTION_STEPS: Final = 40
 _OUTSIDE_COORDINATE: Final = -1e-9  # barycentric coordinate below which a point is outside its triangle
-_PROJECTION_TOLERANCE: Final = 1e-8  # [m] from the target, at which a projection ends
+_PROJECTION_TOLERANCE: Final = 1e-8  # [m] A projection ends closer to its target than this.
 
 
 def shape_at(start: HandShape, parameters: Float[np.ndarray, "53"]) -> HandShape:
-    """The shape of these parameters; zeros give `start`."""
+    """The shape at these parameters; zeros give `start`."""
     along, across = np.exp(parameters[LENGTH]), np.exp(parameters[BREADTH])
     return dataclasses.replace(
         start,
@@ -58,7 +58,7 @@ def shape_at(start: HandShape, parameters: Float[np.ndarray, "53"]) -> HandShape
 
 
 def shape_precision() -> Float[np.ndarray, "53 53"]:
-    """Information matrix of the prior: inverse covariance of the parameters among people."""
+    """Precision matrix of the prior: inverse covariance of the parameters among people."""
     covariance = np.zeros((NUM_PARAMETERS, NUM_PARAMETERS))
     covariance[:2, :2] = _SIZE_SPREAD**2 * np.array([[1.0, _SIZE_CORRELATION], [_SIZE_CORRELATION, 1.0]])
     a_digit = np.kron(np.eye(len(DIGITS)), np.ones((3, 3)))
@@ -78,10 +78,10 @@ def shape_jacobian(
     function: Callable[[list[HandShape]], Float[np.ndarray, "B *shape"]],
     count: int = NUM_PARAMETERS,
 ) -> Float[np.ndarray, "*shape 53"]:
-    """Derivative of a function of the shape by the parameters, by finite differences."""
-    nudged = parameters + _DIFFERENCE_STEP * np.eye(1 + count, NUM_PARAMETERS, -1)  # the first as it is
+    """Derivative of a function of the shape by its first `count` parameters, by finite differences."""
+    nudged = parameters + _DIFFERENCE_STEP * np.eye(1 + count, NUM_PARAMETERS, -1)  # first row unchanged
     values = function([shape_at(start, one) for one in nudged])
-    jacobian = np.zeros((NUM_PARAMETERS, *values.shape[1:]))  # each parameter's derivatives together
+    jacobian = np.zeros((NUM_PARAMETERS, *values.shape[1:]))  # derivatives by one parameter are contiguous
     jacobian[:count] = (values[1:] - values[0]) / _DIFFERENCE_STEP
     return np.moveaxis(jacobian, 0, -1)
 
@@ -93,7 +93,7 @@ def skinned_shape_jacobian(
     points: Float[np.ndarray, "M 3"],
     weights: Float[np.ndarray, "M 16"],
 ) -> Float[np.ndarray, "T M 3 53"]:
-    """Derivative of skinned points by the parameters, rest points [m] and poses held fixed."""
+    """Derivative of skinned points by the parameters, for fixed rest points [m] and poses."""
     homogeneous = np.pad(points, ((0, 0), (0, 1)), constant_values=1.0)
 
     def skinned(shapes: list[HandShape]) -> NDArray[np.float64]:
@@ -115,7 +115,7 @@ def skinning_terms(
     points: Float[np.ndarray, "M 3"],
     weights: Float[np.ndarray, "M 16"],
 ) -> tuple[Float[np.ndarray, "T M 3 3"], Float[np.ndarray, "T M L 3"]]:
-    """Blended rotations of skinned points, and the position that each bone alone would give them [m]."""
+    """Blended rotations of skinned points, and the points as moved by each single bone [m]."""
     motion = (T_world_bone @ np.linalg.inv(model.rest_transforms))[:, :, :3]
     rotations = np.einsum("ml,tlij->tmij", weights, motion[..., :3], optimize=True)
     by_bone = np.einsum("tlij,mj->tmli", motion[..., :3], points, optimize=True)
@@ -124,13 +124,13 @@ def skinning_terms(
 
 
 class SkinTopology(NamedTuple):
-    """Topology and weights, the same for the skins of all hands."""
+    """Topology and skinning weights of the skin, equal for all hands."""
 
-    subdivide: sparse.csr_array  # matrix (V, coarse V) from the vertices of `handsim.hand.skin` to these
+    subdivide: sparse.csr_array  # maps coarse vertices of `handsim.hand.skin` to these (V, coarse V)
     faces: Int[np.ndarray, "F 3"]  # triangles, counter-clockwise from outside
-    adjacent: Int[np.ndarray, "F 3"]  # the triangle beyond the edge opposite to each corner
+    adjacent: Int[np.ndarray, "F 3"]  # triangle across the edge opposite to each corner
     weights: Float[np.ndarray, "V 16"]  # skinning weights of all bones
-    digits: Int[np.ndarray, "F"]  # digit of the bone that carries most of each triangle, -1 for the palm
+    digits: Int[np.ndarray, "F"]  # digit of each triangle's main bone, -1 for the palm
 
 
 class SkinCoordinates(NamedTuple):
@@ -141,7 +141,7 @@ class SkinCoordinates(NamedTuple):
     heights: Float[np.ndarray, "P"]  # above the skin, along the normal [m]
 
     def part(self, first: int, last: int | None) -> SkinCoordinates:
-        """Those of some of the points."""
+        """Coordinates of a range of points."""
         return SkinCoordinates(*(values[first:last] for values in self))
 
 
@@ -152,7 +152,7 @@ class Corners(NamedTuple):
     normals: Float[np.ndarray, "P 3 3"]  # unit vertex normals
 
     def part(self, first: int, last: int | None) -> Corners:
-        """Those of some of the triangles."""
+        """Corners of a range of triangles."""
         return Corners(self.points[first:last], self.normals[first:last])
 
 
@@ -170,7 +170,7 @@ class Skin(NamedTuple):
 
 @cache
 def skin_mesh() -> SkinTopology:
-    """Triangles and weights of the skin, subdivided once (cached)."""
+    """Triangles and weights of the skin, subdivided once; cached."""
     coarse = build_surface(named_shape("M"))
     half = len(coarse.faces) // 2
     step, quads = catmull_clark(
@@ -189,7 +189,7 @@ def _adjacent_faces(faces: NDArray[np.int64]) -> NDArray[np.int64]:
     ends = np.stack([np.roll(faces, -1, axis=1), np.roll(faces, -2, axis=1)], axis=-1).reshape(-1, 2)
     order = np.argsort(ends.min(axis=1) * (int(faces.max()) + 1) + ends.max(axis=1)).reshape(-1, 2)
     neighbors = np.empty(len(ends), dtype=np.int64)
-    neighbors[order] = order[:, ::-1] // 3  # each edge is one of two triangles
+    neighbors[order] = order[:, ::-1] // 3  # Every edge belongs to two triangles.
     return neighbors.reshape(faces.shape)
 
 
@@ -198,7 +198,7 @@ class SkinPatch:
 
     def __init__(self, faces: Int[np.ndarray, "P"]) -> None:
         mesh = skin_mesh()
-        needed = np.isin(mesh.faces, mesh.faces[faces]).any(axis=1)  # the triangles around a vertex
+        needed = np.isin(mesh.faces, mesh.faces[faces]).any(axis=1)  # all triangles around their vertices
         vertices, local = np.unique(mesh.faces[needed], return_inverse=True)
         rows = mesh.subdivide[vertices]
         self._nearby = np.unique(rows.indices)
@@ -207,13 +207,13 @@ class SkinPatch:
         self._corners = np.searchsorted(vertices, mesh.faces[faces])
 
     def corners(self, vertices: Float[np.ndarray, "C 3"]) -> Corners:
-        """Corners of the triangles."""
+        """Corners of the triangles on a skin with these coarse vertices."""
         points = self._rows @ vertices[self._nearby]
         return Corners(points[self._corners], vertex_normals(points, self._faces)[self._corners])
 
 
 def build_skin(shape: HandShape) -> Skin:
-    """The subdivided skin of a right hand of this shape."""
+    """The subdivided skin of a right hand."""
     mesh = skin_mesh()
     points = mesh.subdivide @ build_surface(shape).vertices
     return Skin(points, vertex_normals(points, mesh.faces))
@@ -230,14 +230,14 @@ def skin_points(
 
 
 def skin_weights(coordinates: SkinCoordinates) -> Float[np.ndarray, "P 16"]:
-    """Shares of all bones at these coordinates."""
+    """Skinning weights of all bones at these coordinates."""
     mesh = skin_mesh()
     shares = mesh.weights[mesh.faces[coordinates.faces]]
     return np.asarray(np.einsum("pc,pcb->pb", coordinates.bary, shares))
 
 
 def attachment_at(layout: MarkerLayout, coordinates: SkinCoordinates, shape: HandShape) -> Attachment:
-    """A glove with markers at these coordinates of a right hand, each on the four bones of largest weight."""
+    """A glove with markers at skin coordinates of a right hand, each on its four bones of largest weight."""
     points, normals = skin_points(coordinates, build_skin(shape).corners(coordinates.faces))
     weights = skin_weights(coordinates)
     bones = np.argsort(-weights, axis=1, kind="stable")[:, :4]
@@ -246,7 +246,7 @@ def attachment_at(layout: MarkerLayout, coordinates: SkinCoordinates, shape: Han
 
 
 def skin_weight_jacobian(coordinates: SkinCoordinates, corners: Corners) -> Float[np.ndarray, "P 16 3"]:
-    """Derivative of the skinning weights by the point's position in the wrist's frame [1/m]."""
+    """Derivative of the skinning weights by a point's position in the wrist's frame [1/m]."""
     mesh = skin_mesh()
     shares = mesh.weights[mesh.faces[coordinates.faces]]
     jacobian = np.linalg.inv(_point_jacobian(coordinates, corners))[:, :2]
@@ -254,7 +254,7 @@ def skin_weight_jacobian(coordinates: SkinCoordinates, corners: Corners) -> Floa
 
 
 def _point_jacobian(coordinates: SkinCoordinates, corners: Corners) -> NDArray[np.float64]:
-    """Derivatives (P, 3, 3) of each point by second and third barycentric coordinate and height [m]."""
+    """Derivatives (P, 3, 3) of each point [m] by two barycentric coordinates (the last two) and height."""
     blended = np.einsum("pc,pci->pi", coordinates.bary, corners.normals)
     length = np.linalg.norm(blended, axis=1)[:, None]
     normal = blended / length
@@ -271,7 +271,7 @@ def _point_jacobian(coordinates: SkinCoordinates, corners: Corners) -> NDArray[n
 def project_onto_skin(
     coordinates: SkinCoordinates, targets: Float[np.ndarray, "P 3"], skin: Skin
 ) -> SkinCoordinates:
-    """Coordinates of points [m], by Newton steps that walk from triangle to adjacent triangle."""
+    """Coordinates of points [m], by Newton steps that walk between adjacent triangles."""
     # Where the skin folds and the walk does not converge, the foot point stays on the last edge.
     mesh = skin_mesh()
     faces, bary, heights = (values.copy() for values in coordinates)
@@ -285,7 +285,7 @@ def project_onto_skin(
         heights[active] = here.heights + step[:, 2]
         lowest = moved.argmin(axis=1)
         out = moved[np.arange(len(active)), lowest] < _OUTSIDE_COORDINATE
-        # What left its triangle is clipped to its border.
+        # A foot point outside its triangle is clipped to the border.
         inside = np.clip(moved, 0.0, None)
         edge: NDArray[np.float64] = inside / inside.sum(axis=1, keepdims=True)
         bary[active] = np.where(out[:, None], np.where(np.isfinite(edge), edge, here.bary), moved)
@@ -304,7 +304,7 @@ def _cross_edges(
     crossing: NDArray[np.int64],
     corner: NDArray[np.int64],
 ) -> None:
-    """Move the points `crossing` over the edges opposite to `corner`; `faces` and `bary` are written."""
+    """Move the points `crossing` over the edges opposite to `corner`; changes `faces` and `bary`."""
     old = faces[crossing]
     new = mesh.adjacent[old, corner]
     same = mesh.faces[new][:, :, None] == mesh.faces[old][:, None, :]
@@ -319,11 +319,11 @@ def nearest_coordinates(
     bones: Int[np.ndarray, "P"],
     shape: HandShape,
 ) -> SkinCoordinates:
-    """Coordinates of points [m] in the wrist's frame, near their feet on the skin of their bones' digits."""
-    # A marker between two fingers may be nearer to the skin of the other one.
+    """Skin coordinates of points [m] in the wrist's frame, near `feet` on the digits of their bones."""
+    # The skin of a neighboring finger may be nearer to a marker between two fingers.
     skin, mesh = build_skin(shape), skin_mesh()
     middles = skin.points[mesh.faces].mean(axis=1)
-    off = 0.5 * (middles**2).sum(axis=1)[:, None] - middles @ feet.T  # half the squares, less the feet's
+    off = 0.5 * (middles**2).sum(axis=1)[:, None] - middles @ feet.T  # half the squared distances, shifted
     faces = np.where(mesh.digits[:, None] == DIGIT_OF_BONE[bones], off, np.inf).argmin(axis=0)
     heights = np.linalg.norm(points - feet, axis=1)
     start = SkinCoordinates(faces, np.full((len(faces), 3), 1 / 3), heights)

@@ -1,12 +1,12 @@
 """User calibration: marker positions, hand shape and contacts from a minute of labeled markers.
 
 After Han et al. 2018, section 4.5: poses of some frames, marker positions on the rest hand and contact points
-are solved together. In addition to the paper the hand's shape is solved, touches are detected instead of
+are solved together. Beyond the paper the hand's shape is solved, too, touches are detected instead of
 annotated, and the result has standard errors and suggestions for a better capture.
 
-The paper gives no values for its lambdas. Here they result from standard deviations: lambda_1 is
-(noise / POSITION_SPREAD)^2 and lambda_2 is (noise / CONTACT_SPREAD)^2, where the noise is that of the
-markers' residuals. The spreads were chosen on simulated people (docs/calibration.md).
+The paper gives no values of its lambdas. Here they follow from standard deviations: lambda_1 is
+(noise / POSITION_SPREAD)^2 and lambda_2 is (noise / CONTACT_SPREAD)^2, with the noise of the markers'
+residuals. The standard deviations were chosen on simulated people (docs/calibration.md).
 """
 
 from __future__ import annotations
@@ -57,29 +57,29 @@ from track.calibration.hand_parameters import (
 from track.frames import TrackedFrame
 from track.kinematics.pose_solver import PoseFit, PoseSolver
 
-_WIDE_STEPS: Final = 6  # at the first robust scale, which keeps distant markers
-_STEPS_WITHOUT_CONTACTS: Final = 10  # steps, as in the paper
-MOST_STEPS: Final = 30  # steps in all, at most
-_SPREAD_ROUNDS: Final = 4  # in which the spreads of marker places are learned
+_WIDE_STEPS: Final = 6  # steps with the first robust scale, which includes distant markers
+_STEPS_WITHOUT_CONTACTS: Final = 10  # last step without contacts, as in the paper
+MOST_STEPS: Final = 30  # largest number of steps
+_SPREAD_ROUNDS: Final = 4  # rounds of learning the spreads of marker places
 _FIRST_NOISE, _FIRST_SCALE = 0.001, 0.03  # [m]
-_SCALE_IN_NOISES: Final = 8.0  # robust scale over the noise
-_BETTER_SHARE: Final = 0.98  # of the distance before; what is not better than that stays as it was
-_SIGNIFICANT_TOUCH: Final = 0.25  # weight above which a touch is significant
-NUM_FRAMES: Final = 240  # frames that a calibration is solved on
-FEWEST_FRAMES: Final = 100  # usable frames without which a capture is refused
+_SCALE_IN_NOISES: Final = 8.0  # robust scale, as multiple of the noise
+_BETTER_SHARE: Final = 0.98  # A better hand reduces the residual to less than this share.
+_SIGNIFICANT_TOUCH: Final = 0.25  # A touch with a larger weight is significant.
+NUM_FRAMES: Final = 240  # number of frames that a calibration uses
+FEWEST_FRAMES: Final = 100  # A capture needs this many usable frames.
 _INITIAL_FRAMES: Final = 800
-_FEWEST_MARKERS_OF_FRAME: Final = 6  # that a frame must have
-_LEAST_MARKER_SHARE: Final = 0.75  # of the markers that a frame must have
-_MOST_RMS_RATIO: Final = 3.0  # times the median RMS, up to which a frame is used
-_LOOK_PERIOD: Final = 1.0 / 30.0  # [s] between two poses in which a guide looks at joints
-_ASK_PERIOD: Final = 1.0  # [s] for which it asks for the same motion
-_LEAST_MOTION: Final = 30.0  # [s] with hands, before which it asks for touches
-_ENOUGH_RANGE: Final = 0.3  # share of a joint's range that the user should cover
+_FEWEST_MARKERS_OF_FRAME: Final = 6  # A usable frame has this many markers.
+_LEAST_MARKER_SHARE: Final = 0.75  # A usable frame has this share of the markers.
+_MOST_RMS_RATIO: Final = 3.0  # A used frame has an RMS of at most this multiple of the median.
+_LOOK_PERIOD: Final = 1.0 / 30.0  # [s] between two poses that a guide examines
+_ASK_PERIOD: Final = 1.0  # [s] least time between two requests of a guide
+_LEAST_MOTION: Final = 30.0  # [s] of hands before a guide asks for touches
+_ENOUGH_RANGE: Final = 0.3  # share of its range that each joint should cover
 _LEAST_NOISE, _MOST_NOISE = 0.0001, 0.003  # [m]
 _CHI2_MEDIAN: Final = 2.366  # median of the chi-squared distribution with three degrees of freedom
-_USUAL_SPREAD_COORDINATES: Final = 12.0  # coordinates of markers that the usual spread counts as
-_INDEPENDENT_POSES: Final = 14.0  # frames whose deformation of the flesh is independent
-_FLESH_REPEATS: Final = 0.7  # added to variances by flesh, which follows the angles alike in all of these
+_USUAL_SPREAD_COORDINATES: Final = 12.0  # coordinates of markers that the usual spread counts for
+_INDEPENDENT_POSES: Final = 14.0  # number of frames with independent deformation of the flesh
+_FLESH_REPEATS: Final = 0.7  # variance added by flesh, whose motion is alike in similar poses
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -87,33 +87,33 @@ class Touch:
     """A contact of the thumb with a fingertip, detected in the data."""
 
     frame: int
-    """Its number in the capture."""
+    """Number of the frame in the capture."""
     finger: str
     gap_before: float
-    """Gap between the compressed pads of the hand that the calibration began with [m]."""
+    """Gap between the compressed pads on the first hand [m]."""
     gap_after: float
-    """The same on the calibrated hand [m]."""
+    """Gap on the calibrated hand [m]."""
     weight: float
-    """Its weight in the energy, 0 to 1."""
+    """Weight of the touch in the energy, 0 to 1."""
     points: Float[np.ndarray, "2 3"]
     """Contact points of thumb and finger on the calibrated rest hand, in the wrist's frame [m]."""
 
 
 class HeldOut(NamedTuple):
-    """How well hands fit frames of the capture that a calibration did not see."""
+    """How well hands fit held-out frames, which the calibration did not use."""
 
     before: float
-    """Median over frames of the markers' RMS distance from the fitted hand without calibration [m]."""
+    """Median over frames of the markers' RMS distance from the hand before calibration [m]."""
     after: float
-    """The same with calibration [m]."""
+    """The same with the calibrated hand [m]."""
     num_frames: int
     """Number of frames."""
     hidden: str = ""
-    """A rarely seen marker whose place the next finger's may have; empty where there is none."""
+    """A rarely seen marker whose label may belong to the next finger's marker; empty if there is none."""
 
     @property
     def is_better(self) -> bool:
-        """Whether the calibrated hand fits better, by more than chance and with labels that are certain."""
+        """Whether the calibrated hand fits better by more than chance, and no label is doubtful."""
         return not self.hidden and self.after < _BETTER_SHARE * self.before
 
 
@@ -123,37 +123,37 @@ class Calibration:
 
     hand: GloveFit
     start: GloveFit
-    """What the calibration began with."""
+    """The hand before calibration."""
     rms_before: float
-    """Median over frames of the markers' RMS distance from the tracked hand [m]."""
+    """Median over frames of the markers' RMS distance from the hand before [m]."""
     rms_after: float
     """The same with the calibrated hand [m]."""
     shifts: Float[np.ndarray, "M"]
-    """Distance of each marker from its position by the glove's design on this hand [m]."""
+    """Distance of each marker from its designed position on this hand [m]."""
     position_errors: Float[np.ndarray, "M"]
-    """Standard error of each marker's position on its bone, or among the knuckles on the palm [m]."""
+    """Standard error of each marker's position on its bone; on the palm relative to the knuckles [m]."""
     length_errors: Float[np.ndarray, "5 3"]
     """Standard error of each bone's length [m]."""
     angle_errors: Float[np.ndarray, "20 2"]
-    """Standard deviation of each joint angle [rad]: by the places of markers, and by the bones."""
+    """Standard deviation of each joint angle [rad] from errors of marker places and of bones."""
     touches: tuple[Touch, ...]
     still_joints: tuple[str, ...]
     """Joints that moved too little to determine the bones on either side."""
     held_out: HeldOut | None = None
-    """How it does on frames that it was not solved on; None if that was not measured."""
+    """Residuals on held-out frames; None if they were not tested."""
 
     @property
     def is_better(self) -> bool:
-        """Whether it was tried on held-out frames, and fits them better than the hand before."""
+        """Whether it was tested on held-out frames, and fits them better than the hand before."""
         return self.held_out is not None and self.held_out.is_better
 
     @property
     def place_error(self) -> float:
-        """What the capture leaves open of the markers' places, root of the mean square over markers [m]."""
+        """Standard error of the markers' places, as root mean square over markers [m]."""
         return float(np.sqrt((self.position_errors**2).mean()))
 
     def __str__(self) -> str:
-        """The markers on held-out frames and their places, in a line [mm]."""
+        """Residuals on held-out frames and error of marker places, in a line [mm]."""
         if self.held_out is None:
             return "too few frames to try a calibration on, so that it stays as it was"
         before, after, frames, hidden = self.held_out
@@ -172,14 +172,14 @@ class Calibration:
         return tuple(touch for touch in self.touches if touch.weight > _SIGNIFICANT_TOUCH)
 
     def gaps(self) -> Float[np.ndarray, "2"]:
-        """Mean distance from touching [m], before and after, of the significant touches; NaN without any."""
+        """Mean absolute gap [m] before and after, of the significant touches; NaN without any."""
         if not self.significant_touches:
             return np.full(2, np.nan)
         pairs = np.abs([[touch.gap_before, touch.gap_after] for touch in self.significant_touches])
         return np.asarray(pairs.mean(axis=0))
 
     def suggestions(self) -> tuple[str, ...]:
-        """What to do in a better capture, as sentences; empty when nothing is missing."""
+        """Sentences on what to do in a better capture; empty if nothing is missing."""
         hidden = self.held_out.hidden if self.held_out is not None else ""
         sentences = [f"let {hidden} be seen most of the time"] if hidden else []
         sentences += _motions(self.still_joints)
@@ -191,7 +191,7 @@ class Calibration:
 
 
 def _motions(still: Sequence[str]) -> Iterator[str]:
-    """What to do with joints that moved too little, a sentence for each digit."""
+    """Sentences on joints that moved too little, one per digit."""
     for digit in DIGITS:
         own = [name.removeprefix(f"{digit}_").replace("_", " ") for name in still if name.startswith(digit)]
         if own:
@@ -199,21 +199,21 @@ def _motions(still: Sequence[str]) -> Iterator[str]:
 
 
 class MotionGuide:
-    """Says what users are still to move in front of the cameras, so that they can be calibrated.
+    """Tells users in front of the cameras what to move for a good calibration.
 
     Args:
-        hands: The hands that are tracked.
+        hands: The tracked hands.
     """
 
     def __init__(self, hands: Sequence[GloveFit]) -> None:
         self._hands = {hand.side: hand for hand in hands}
         self._angles: dict[Side, list[NDArray[np.float64]]] = {side: [] for side in self._hands}
         self._complete: dict[Side, list[NDArray[np.bool_]]] = {side: [] for side in self._hands}
-        self._looked, self._asked, self._wish = -np.inf, -np.inf, ""  # [s] of the last look and wish
-        self._looks = 0  # at which any hand was tracked
+        self._looked, self._asked, self._wish = -np.inf, -np.inf, ""  # [s] of last pose, request
+        self._looks = 0  # number of examined poses with a tracked hand
 
     def __call__(self, tracked: TrackedFrame) -> str | None:
-        """What is still to be done after a frame; None when every joint has covered its range."""
+        """The request after a frame; None when every joint has covered its range."""
         if tracked.time >= self._looked + _LOOK_PERIOD:
             self._looked = tracked.time
             there = [hand for hand in tracked.hands if hand.status is Status.TRACKED]
@@ -232,7 +232,7 @@ class MotionGuide:
         return self._wish or "touch the thumb to the tip of each finger and hold still"
 
     def _wishes(self) -> Iterator[str]:
-        """What each hand is still to do."""
+        """Requests for each hand."""
         for side, hand in self._hands.items():
             if not self._angles[side]:
                 yield f"no {side} hand is tracked yet"
@@ -249,17 +249,17 @@ def calibrate_hand(
     *,
     progress: Progress | None = None,
 ) -> Calibration:
-    """Fit a hand and its glove to one user's labeled markers."""
+    """Fit a hand and its glove to labeled markers of one user."""
     mirror = MIRROR if start.side == "left" else np.eye(3)
     markers, right = np.asarray(markers, dtype=np.float64) @ mirror, start.with_side("right")
     usable = usable_frames(markers, start)
     seen, complete = markers[usable], complete_digits(markers[usable], right.attachment)
-    # Poses of frames spread over the capture, on the hand that the calibration begins with.
+    # Solve poses of frames spread over the capture, with the first hand.
     some = seen[:: max(1, len(usable) // _INITIAL_FRAMES)]
     track = PoseSolver(right).solve(some)
     chosen, scales = informative_frames(track, some), {"noise": _FIRST_NOISE, "robust_scale": _FIRST_SCALE}
     problem, estimate = first_estimate(right, some[chosen], track.qpos[chosen], **scales)
-    # Distant markers lose their weight only when the hand nearly fits.
+    # Distant markers are down-weighted only after the hand nearly fits.
     estimate, fit, steps = levenberg_marquardt(problem, estimate, 0, _WIDE_STEPS, progress)
     problem.robust_scale = _SCALE_IN_NOISES * marker_noise(problem, fit)
     estimate, fit, steps = levenberg_marquardt(problem, estimate, steps, _STEPS_WITHOUT_CONTACTS, progress)
@@ -302,13 +302,13 @@ def _with_touches(
     track: PoseFit,
     touches: list[tuple[int, str]],
 ) -> tuple[Problem, Estimate]:
-    """The problem with the frames of the touches, at the noise of the first fit."""
-    # The other frames are selected again: on a hand that nearly fits, a wrong label gives a large RMS.
+    """The problem with the frames of the touches, and the noise of the first fit."""
+    # The other frames are selected again: wrong labels are recognized on a hand that nearly fits.
     noise = marker_noise(problem, fit)
     chosen = informative_frames(track, markers)
     touching = np.array([frame for frame, _ in touches], dtype=np.int64)
     frames = np.concatenate([chosen, touching])
-    # Flesh moves alike in similar poses: many frames tell no more about it than a few.
+    # Flesh moves alike in similar poses, so many frames tell no more about it than a few.
     flesh = repeated_share(track.qpos, track.residuals) * noise**2
     larger = Problem(
         problem.shape,
@@ -347,7 +347,7 @@ def _touches(
 
 
 def usable_frames(markers: Float[np.ndarray, "T M 3"], hand: GloveFit) -> NDArray[np.int64]:
-    """Numbers of the frames with enough markers for a pose."""
+    """Indices of the frames with enough markers for a pose."""
     count = markers.shape[1]
     needed = min(count, max(_FEWEST_MARKERS_OF_FRAME, round(_LEAST_MARKER_SHARE * count)))
     usable = np.flatnonzero(np.isfinite(markers[..., 0]).sum(axis=1) >= needed)
@@ -360,14 +360,14 @@ def usable_frames(markers: Float[np.ndarray, "T M 3"], hand: GloveFit) -> NDArra
 
 
 def complete_digits(markers: Float[np.ndarray, "T M 3"], attachment: Attachment) -> Bool[np.ndarray, "T 5"]:
-    """Whether all markers of a digit are seen."""
+    """Whether all markers of each digit are seen."""
     present = np.isfinite(markers[..., 0])
     digits = attachment.digits
     return np.stack([present[:, digits == digit].all(axis=1) for digit in range(len(DIGITS))], axis=1)
 
 
 def informative_frames(track: PoseFit, markers: Float[np.ndarray, "T M 3"]) -> NDArray[np.int64]:
-    """Indices into a track of well fitted frames, poses as different and complete as possible."""
+    """Indices of well-fitted frames with poses as different, and as complete, as possible."""
     missing = np.isnan(markers[..., 0]).sum(axis=1)
     well_fitted = track.rms <= _MOST_RMS_RATIO * np.median(track.rms)
     for allowed in range(markers.shape[1]):
@@ -384,7 +384,7 @@ def informative_frames(track: PoseFit, markers: Float[np.ndarray, "T M 3"]) -> N
 
 
 def marker_noise(problem: Problem, fit: Fit) -> float:
-    """Standard deviation of a marker's coordinates [m] by the median residual and its degrees of freedom."""
+    """Standard deviation of marker coordinates [m], from the median residual and the degrees of freedom."""
     squares = (fit.residuals**2).sum(axis=2)[problem.present]
     freedom = 3 * len(squares) - 26 * len(fit.residuals) - NUM_PARAMETERS - 3 * fit.residuals.shape[1]
     remaining = max(freedom, 1) / (3 * len(squares))
@@ -392,9 +392,9 @@ def marker_noise(problem: Problem, fit: Fit) -> float:
 
 
 def repeated_share(qpos: Float[np.ndarray, "T 27"], residuals: Float[np.ndarray, "T M 3"]) -> float:
-    """Share of the residuals' variance that repeats in a similar pose: flesh that moves with the joints."""
-    # The share is the correlation of residuals, in the wrist's frame, between each frame and the frame whose
-    # joint angles are nearest. Noise that is independent from frame to frame gives zero.
+    """Share of the residuals' variance that repeats in similar poses, as flesh moves with the joints."""
+    # This is the correlation of residuals, in the wrist's frame, between each frame and the frame with the
+    # nearest joint angles. Independent noise gives zero.
     from scipy.spatial import cKDTree
 
     local = np.einsum("tji,tmj->tmi", quaternion_matrix(qpos[:, 3:7]), residuals)
@@ -405,7 +405,7 @@ def repeated_share(qpos: Float[np.ndarray, "T 27"], residuals: Float[np.ndarray,
 
 
 def learn_spreads(problem: Problem, estimate: Estimate, fit: Fit) -> None:
-    """Set the spreads of marker places and heights to what the data tell of this glove (MacKay 1992)."""
+    """Estimate the spreads of marker places and heights of this glove (evidence procedure, MacKay 1992)."""
     covariance, _ = shared_covariance(problem, estimate, fit)
     own = [slice(first, first + 3) for first in range(NUM_PARAMETERS, len(covariance), 3)]
     blocks, normals = np.array([covariance[one, one] for one in own]), fit.normals
@@ -421,7 +421,7 @@ def learn_spreads(problem: Problem, estimate: Estimate, fit: Fit) -> None:
 def _learned(
     squares: NDArray[np.float64], variances: NDArray[np.float64], axes: int, spread: float, usual: float
 ) -> float:
-    """A spread [m] of offsets from zero, by their squares and posterior variances summed over axes."""
+    """Estimate a spread [m] of offsets, given their squares and posterior variances, summed over axes."""
     determined = np.clip(axes - variances / spread**2, 0.0, None).sum()
     total, usual_count = squares.sum() + _USUAL_SPREAD_COORDINATES * usual**2, _USUAL_SPREAD_COORDINATES
     return float(np.sqrt(total / (determined + usual_count)))
@@ -431,8 +431,8 @@ def standard_errors(
     problem: Problem, estimate: Estimate, fit: Fit, covariance: Float[np.ndarray, "S S"]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Standard errors of marker positions on their bones (M,) and of bone lengths (5, 3) [m]."""
-    # Where the wrist is in the palm is a convention: of the palm's markers it is the error among the
-    # knuckles.
+    # The place of the wrist in the palm is a convention, so errors of the palm's markers are relative to
+    # the knuckles.
     weights = skin_weights(estimate.coordinates)
     bones, patch = weights.argmax(axis=1), SkinPatch(estimate.coordinates.faces)
 
@@ -462,7 +462,7 @@ def standard_errors(
 def contact_gaps(
     model: HandModel, touches: list[tuple[int, str]], qpos: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Gaps between thumb and finger (K,) [m] of touches on a right hand, in the poses (K, 27) of each."""
+    """Gaps between thumb and finger (K,) [m] in touches of a right hand, given the pose (K, 27) of each."""
     bones = model.forward_kinematics(qpos)
     contacts = initialize_contacts(model, touches, bones)
     corners = SkinPatch(contacts.pads.faces).corners(model.surface.vertices)

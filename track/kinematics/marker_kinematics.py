@@ -2,10 +2,10 @@
 
 The energy E_IK is that of Han et al. 2018, section 4.3, with joint limits, a prior and a robust loss.
 
-All kernels work in the wrist's frame: the target markers are transformed into it, so a fit does not depend on
-where the hand is. The 26 unknowns of a step are the 20 hinge angles [rad], then the translation of the wrist
-[m] and its rotation vector [rad], both along the wrist's own axes. The hinges come first because the Cholesky
-factor of the normal matrix then keeps its zeros between digits.
+All kernels work in the wrist's frame: targets are transformed into it, so a fit does not depend on the hand's
+place. The 26 unknowns of a step are the 20 joint angles [rad], then the translation [m] and the rotation
+vector [rad] of the wrist along its own axes. Joint angles come first, so that the Cholesky factor of the
+normal matrix keeps its zeros between digits.
 """
 
 from __future__ import annotations
@@ -20,32 +20,32 @@ from handsim.hand.shape import DIGIT_OF_BONE, NUM_BONES, NUM_JOINTS
 from handsim.kernels import kernel, multiply_rotations, quaternion_product, rotate_quaternion
 
 NUM_UNKNOWNS: Final = NUM_JOINTS + 6
-"""Unknowns of a step: 20 hinges, 3 translations and 3 rotations of the wrist."""
+"""Unknowns of a step: 20 joint angles, 3 translations and 3 rotations of the wrist."""
 MARKER_NOISE: Final = 0.001
-"""Standard deviation of a marker [m]: the scale of all costs; optical systems and gloves reach about this."""
+"""Standard deviation of a marker [m], the unit of all costs; about what optical systems and gloves reach."""
 _TRANSLATION: Final = NUM_JOINTS  # index of the first unknown of the wrist's translation
 _ROTATION: Final = NUM_JOINTS + 3  # index of the first unknown of its rotation
 _MARKER_PRECISION: Final = MARKER_NOISE**-2  # [1/m^2]
 LIMIT_PRECISION: Final = np.deg2rad(2.0) ** -2
-"""Precision of a hinge beyond its range [1/rad^2]: a soft limit."""
+"""Precision of a joint angle beyond its range [1/rad^2]: a soft limit."""
 _FIRST_DAMPING: Final = 1e-4  # share of the diagonal; small, because most starts are near the minimum
 _LEAST_DAMPING: Final = 1e-10  # share of the diagonal; keeps the factor positive
-_MOST_DAMPING: Final = 1e8  # share of the diagonal; steps are nothing from there on
+_MOST_DAMPING: Final = 1e8  # share of the diagonal at which steps vanish
 
 
 class HandArrays(NamedTuple):
-    """A hand and its glove as plain arrays: L bones, J = 20 hinges, M markers."""
+    """A hand and its glove as plain arrays: L bones, J = 20 joint angles, M markers."""
 
     offsets: Float[np.ndarray, "L 3"]  # origin of each bone in its parent's frame [m]
-    rotations: Float[np.ndarray, "L 3 3"]  # rotation of each bone in its parent's frame, all hinges at zero
-    axes: Float[np.ndarray, "J 3"]  # unit axis of each hinge in the frame of its bone
-    ranges: Float[np.ndarray, "J 2"]  # lower and upper limit of each hinge [rad]
+    rotations: Float[np.ndarray, "L 3 3"]  # rotation of each bone in its parent's frame, all joints at zero
+    axes: Float[np.ndarray, "J 3"]  # unit axis of each joint in the frame of its bone
+    ranges: Float[np.ndarray, "J 2"]  # lower and upper limit of each joint [rad]
     bones: Int[np.ndarray, "M 4"]  # bones that carry each marker, largest weight first; -1 for none
     bone_weights: Float[np.ndarray, "M 4"]  # skinning weight of each of these bones; they sum to one
     positions: Float[np.ndarray, "M 4 3"]  # each marker in the frames of its bones [m], times the weight
     digits: Int[np.ndarray, "M"]  # digit of the bone with the largest weight; -1 for the palm
-    hinge_span: Int[np.ndarray, "M 2"]  # first hinge that may move each marker, and the one after the last
-    skyline: Int[np.ndarray, "26"]  # first column of each row of the normal matrix that can be nonzero
+    hinge_span: Int[np.ndarray, "M 2"]  # first joint that may move each marker, and the one after the last
+    skyline: Int[np.ndarray, "26"]  # first nonzero column of each row of the normal matrix
 
 
 class Workspace(NamedTuple):
@@ -53,24 +53,24 @@ class Workspace(NamedTuple):
 
     rotations: Float[np.ndarray, "L 3 3"]  # rotation of each bone
     origins: Float[np.ndarray, "L 3"]  # origin of each bone [m]
-    axes: Float[np.ndarray, "J 3"]  # unit axis of each hinge
-    bone_terms: Float[np.ndarray, "M 4 3"]  # each bone's term of the weighted sum that is a marker [m]
+    axes: Float[np.ndarray, "J 3"]  # unit axis of each joint
+    bone_terms: Float[np.ndarray, "M 4 3"]  # each bone's term of the weighted sum that gives a marker [m]
     markers: Float[np.ndarray, "M 3"]  # position of each marker [m]
-    residuals: Float[np.ndarray, "M 3"]  # model minus target marker [m]; NaN where that is missing
+    residuals: Float[np.ndarray, "M 3"]  # model minus target marker [m]; NaN where the target is missing
     jacobian: Float[np.ndarray, "M 3 26"]  # derivatives of the markers by the unknowns [m/rad, m/m]
     normal: Float[np.ndarray, "26 26"]  # upper triangle; zero between digits that share no marker
     gradient: Float[np.ndarray, "26"]  # half the gradient of the cost
-    factor: Float[np.ndarray, "26 26"]  # room for a factor of the normal matrix
+    factor: Float[np.ndarray, "26 26"]  # buffer for a factor of the normal matrix
     step: Float[np.ndarray, "26"]  # step of the unknowns [rad, m]
 
 
 class PoseEnergy(NamedTuple):
-    """What a pose is fitted to: markers, and a prior."""
+    """Energy of a pose: marker targets and a prior."""
 
     target: Float[np.ndarray, "M 3"]  # markers in the world [m]; NaN where missing
-    prior_mean: Float[np.ndarray, "27"]  # mean of the prior, a pose
-    precision: Float[np.ndarray, "26"]  # its precision by unknowns [1/rad^2, 1/m^2, 1/rad^2]; zero for none
-    robust_scale: float  # inverse square distance where the robust loss levels off [1/m^2]; zero for none
+    prior_mean: Float[np.ndarray, "27"]  # mean of the prior, as a pose
+    precision: Float[np.ndarray, "26"]  # precision of each unknown [1/rad^2, 1/m^2, 1/rad^2], or zero
+    robust_scale: float  # inverse square scale of the robust loss [1/m^2]; zero for least squares
 
 
 def hand_arrays(fit: GloveFit) -> HandArrays:
@@ -108,7 +108,7 @@ def hand_arrays(fit: GloveFit) -> HandArrays:
 
 @kernel
 def workspace(num_markers: int) -> Workspace:
-    """A `Workspace` for a hand with some number of markers; what never changes in it is filled in."""
+    """Allocate a `Workspace` for a number of markers, with all constant entries."""
     rotations, jacobian = np.zeros((NUM_BONES, 3, 3)), np.zeros((num_markers, 3, NUM_UNKNOWNS))
     for i in range(3):
         rotations[0, i, i] = 1.0
@@ -130,7 +130,7 @@ def workspace(num_markers: int) -> Workspace:
 
 @kernel
 def compute_markers(hand: HandArrays, angles: Float[np.ndarray, "20"], work: Workspace) -> None:
-    """Forward kinematics of all bones, hinge axes and markers in the wrist's frame, which are filled."""
+    """Forward kinematics: write all bones, joint axes and markers in the wrist's frame."""
     for digit in range(NUM_JOINTS // 4):
         compute_digit(hand, digit, angles[4 * digit : 4 * digit + 4], work)
     for marker in range(len(hand.bones)):
@@ -139,7 +139,7 @@ def compute_markers(hand: HandArrays, angles: Float[np.ndarray, "20"], work: Wor
 
 @kernel
 def compute_digit(hand: HandArrays, digit: int, angles: Float[np.ndarray, "4"], work: Workspace) -> None:
-    """Fill the bones and hinge axes of one digit (0 is the thumb) in the wrist's frame."""
+    """Write the bones and joint axes of one digit (0 is the thumb) in the wrist's frame."""
     for link in range(3):
         bone = 1 + 3 * digit + link
         parent = bone - 1 if link > 0 else 0
@@ -156,7 +156,7 @@ def compute_digit(hand: HandArrays, digit: int, angles: Float[np.ndarray, "4"], 
 
 @kernel
 def compute_marker(hand: HandArrays, marker: int, work: Workspace) -> None:
-    """Fill the position and the bones' terms of one marker [m]; its bones must be computed."""
+    """Write the position and the bones' terms of one marker [m]; its bones must be computed."""
     work.markers[marker] = 0.0
     for slot in range(4):
         bone = hand.bones[marker, slot]
@@ -174,7 +174,7 @@ def compute_marker(hand: HandArrays, marker: int, work: Workspace) -> None:
 def _rotate_bone(
     own: Float[np.ndarray, "3 3"], axis: Float[np.ndarray, "3"], angle: float, outside: Float[np.ndarray, "3"]
 ) -> None:
-    """Rotate a bone about its own unit axis (Rodrigues); `outside` gets the axis in the wrist's frame."""
+    """Rotate a bone about its own unit axis (Rodrigues); writes the axis seen from the wrist to `outside`."""
     sine, cosine = np.sin(angle), np.cos(angle)
     x, y, z = axis[0], axis[1], axis[2]
     for i in range(3):
@@ -189,11 +189,11 @@ def _rotate_bone(
 
 @kernel
 def marker_jacobian(hand: HandArrays, marker: int, work: Workspace) -> None:
-    """Fill the derivatives of one marker by all unknowns; its bones and the marker must be computed."""
+    """Write the derivatives of one marker by all unknowns; its bones and the marker must be computed."""
     jacobian = work.jacobian[marker]
     for digit in range(hand.hinge_span[marker, 0] // 4, hand.hinge_span[marker, 1] // 4):
         x, y, z, share = 0.0, 0.0, 0.0, 0.0
-        for link in range(2, -1, -1):  # a hinge moves what is attached to its own bone and to those beyond
+        for link in range(2, -1, -1):  # A joint moves its own bone and all bones beyond.
             bone = 1 + 3 * digit + link
             for slot in range(4):
                 if hand.bones[marker, slot] == bone:
@@ -217,7 +217,7 @@ def marker_jacobian(hand: HandArrays, marker: int, work: Workspace) -> None:
 
 @kernel
 def accumulate_normal_equations(hand: HandArrays, weights: Float[np.ndarray, "M"], work: Workspace) -> None:
-    """Normal matrix and half gradient of the sum of the markers' weighted squared residuals."""
+    """Write normal matrix and half gradient of the markers' weighted squared residuals."""
     normal, gradient = work.normal, work.gradient
     normal[:] = 0.0
     gradient[:] = 0.0
@@ -246,7 +246,7 @@ def accumulate_normal_equations(hand: HandArrays, weights: Float[np.ndarray, "M"
 def marker_residuals(
     hand: HandArrays, target: Float[np.ndarray, "M 3"], qpos: Float[np.ndarray, "27"], work: Workspace
 ) -> None:
-    """Fill markers and residuals of a pose in the wrist's frame; targets [m] are in the world."""
+    """Write markers and residuals of a pose in the wrist's frame; targets [m] are in the world."""
     compute_markers(hand, qpos[7:], work)
     w, x, y, z = qpos[3], qpos[4], qpos[5], qpos[6]
     for marker in range(len(target)):
@@ -268,7 +268,7 @@ def levenberg_marquardt(
     small_gain: float,
     work: Workspace,
 ) -> tuple[float, int]:
-    """Bring a pose to a minimum of its cost."""
+    """Minimize the cost of a pose in place; return the cost and the number of steps."""
     trial, weights = qpos.copy(), np.zeros(len(energy.target))
     cost = _cost(hand, energy, qpos, work)
     _linearize(hand, energy, qpos, weights, work)
@@ -297,7 +297,7 @@ def levenberg_marquardt(
 
 @kernel
 def _cost(hand: HandArrays, energy: PoseEnergy, qpos: Float[np.ndarray, "27"], work: Workspace) -> float:
-    """Cost of a pose (squared standard deviations); fills `work` as `marker_residuals` does."""
+    """Cost of a pose (squared standard deviations); writes to `work` as `marker_residuals` does."""
     marker_residuals(hand, energy.target, qpos, work)
     cost, precision = 0.0, energy.precision
     for marker in range(len(energy.target)):
@@ -325,7 +325,7 @@ def _linearize(
     weights: Float[np.ndarray, "M"],
     work: Workspace,
 ) -> None:
-    """Normal matrix and half gradient where `marker_residuals` was last called; `weights` is a buffer."""
+    """Write normal matrix and half gradient at the pose of the last `marker_residuals`."""
     precision = energy.precision
     for marker in range(len(weights)):
         residual = work.residuals[marker]
@@ -350,7 +350,7 @@ def _linearize(
 
 @kernel
 def _solve(skyline: Int[np.ndarray, "26"], damping: float, work: Workspace) -> float:
-    """Solve the damped equations by a skyline Cholesky factor; the expected gain, negative for none."""
+    """Solve the damped equations by a skyline Cholesky factor; return the expected gain, or -1."""
     factor, step, gain = work.factor, work.step, 0.0
     for row in range(NUM_UNKNOWNS):
         start, own = skyline[row], factor[row]
@@ -381,7 +381,7 @@ def _solve(skyline: Int[np.ndarray, "26"], damping: float, work: Workspace) -> f
 def move_wrist(
     qpos: Float[np.ndarray, "27"], step: Float[np.ndarray, "26"], moved: Float[np.ndarray, "27"]
 ) -> None:
-    """Write the wrist of a pose after a step, which is along the wrist's own axes, to another pose."""
+    """Write the wrist of a pose after a step along the wrist's own axes to `moved`."""
     w, x, y, z = qpos[3], qpos[4], qpos[5], qpos[6]
     a, b, c = step[NUM_JOINTS], step[NUM_JOINTS + 1], step[NUM_JOINTS + 2]
     i, j, k = y * c - z * b, z * a - x * c, x * b - y * a
@@ -395,8 +395,8 @@ def move_wrist(
 def wrist_offsets(
     before: Float[np.ndarray, "27"], now: Float[np.ndarray, "27"], step: Float[np.ndarray, "26"]
 ) -> None:
-    """Fill the step of the wrist from one pose to another, along its axes in the second."""
-    # The rotation is to first order: twice the vector part of the quaternion.
+    """Write the wrist's step from one pose to another, along its axes in the second."""
+    # First order in the rotation: twice the vector part of the quaternion.
     w, x, y, z = now[3], now[4], now[5], now[6]
     a, b, c = now[0] - before[0], now[1] - before[1], now[2] - before[2]
     i, j, k = b * z - c * y, c * x - a * z, a * y - b * x
@@ -410,8 +410,8 @@ def wrist_offsets(
 
 @kernel
 def invert_positive(matrix: Float[np.ndarray, "N N"]) -> None:
-    """Overwrite a symmetric positive-definite matrix, given by its lower triangle, by its inverse."""
-    # A call of LAPACK costs more than the inverse of so small a matrix.
+    """Invert a symmetric positive-definite matrix in place, given its lower triangle."""
+    # A LAPACK call takes longer than the inversion of such a small matrix.
     count = len(matrix)
     for row in range(count):
         for column in range(row + 1):
@@ -440,7 +440,7 @@ def invert_positive(matrix: Float[np.ndarray, "N N"]) -> None:
 def eliminate(
     matrix: Float[np.ndarray, "N N"], right_side: Float[np.ndarray, "N"], first: int, last: int
 ) -> None:
-    """Eliminate unknowns `first` to before `last` of a positive-definite system; the rest stays symmetric."""
+    """Eliminate unknowns `first` to `last` - 1 of a positive-definite system; the rest stays symmetric."""
     for pivot in range(first, last):
         scale = 1.0 / matrix[pivot, pivot]
         for row in range(pivot + 1, len(matrix)):
@@ -453,7 +453,7 @@ def eliminate(
 
 @kernel
 def solve_positive(matrix: Float[np.ndarray, "N N"], right_side: Float[np.ndarray, "N"]) -> None:
-    """Solve a symmetric positive-definite system; both are overwritten, the right side by the solution."""
+    """Solve a symmetric positive-definite system in place: `right_side` becomes the solution."""
     count = len(matrix)
     eliminate(matrix, right_side, 0, count)
     for row in range(count - 1, -1, -1):

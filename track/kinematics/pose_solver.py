@@ -1,8 +1,8 @@
 """Inverse kinematics from labeled markers: the paper's E_IK (Han et al. 2018, section 4.3) for one hand.
 
 Frames are solved one by one, each from its own start; a missing marker is NaN. Two terms determine what the
-markers leave open: a soft limit of each hinge's range, and a prior on digits that lack a marker or have fewer
-than three: weakly towards the resting angles, and towards predicted angles where these are given.
+markers do not: soft limits of the joints' ranges, and a prior on digits with a missing marker or fewer than
+three. The prior is weak around the resting angles, or that of predicted angles if given.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ from track.kinematics.marker_kinematics import (
     workspace,
 )
 
-FEWEST_MARKERS: Final = 4  # least number of markers of a frame for a pose to be solved
+FEWEST_MARKERS: Final = 4  # A pose needs this many markers in a frame.
 FEWEST_ON_PART: Final = 3
-"""Markers that determine a digit's hinges, also when it is straight, or a palm's pose."""
+"""This many markers determine a digit's joint angles, even if it is straight, or a palm's pose."""
 RESTING: Final = np.tile(np.deg2rad([0.0, 25.0, 35.0, 20.0]), 5)  # joint angles of a relaxed hand [rad]
-# Six ways to hold a digit [deg], in the order of its hinges: relaxed, straight, half closed, bent in the
-# knuckle alone, bent in all others, closed; for the thumb relaxed, away from the palm, beside the index
-# finger, opposed, opposed and bent, across the palm.
+# Six shapes of a digit [deg], in the order of its joints: relaxed, straight, half closed, bent in the knuckle
+# only, bent in all other joints, closed; for the thumb: relaxed, away from the palm, beside the index finger,
+# opposed, opposed and bent, across the palm.
 _FINGER: Final = (
     (0, 25, 35, 20),
     (0, 0, 5, 5),
@@ -56,33 +56,33 @@ _THUMB: Final = (
     (20, 25, 45, 60),
     (-20, 35, 50, 40),
 )
-# Of choosing digits and aligning again; the choice no longer changes after these.
+# Rounds of choosing digits and aligning, after which the choice no longer changes.
 _ALIGNMENT_ROUNDS: Final = 3
-_LEAST_SHAPE_SPREAD: Final = 0.005  # [m] spread of a marker that is the same in all shapes: bounds its weight
-_ROBUST_SCALES: Final = (1 / 64, 1 / 8, 1.0)  # factors of the robust scale, so that a start may be far off
-_STEPS_AT_WIDE_SCALES: Final = 8  # at most at each widened scale
-_REST_PRECISION: Final = float(np.deg2rad(90.0)) ** -2  # [1/rad^2] of a hinge around its resting angle: weak
-_COMPLETE_DIGIT: Final = 1e-4  # factor of that precision for a digit that has all its markers
-_RMS_OF_LAST_START: Final = 0.0005  # [m] limits and prior included, below which no further start is tried
-_MOST_STEPS: Final = 30  # from each start
-_CONVERGED: Final = (1e-6 / MARKER_NOISE) ** 2  # of the cost: one marker nearer by a micron
-_ACCURATE: Final = (3e-5 / MARKER_NOISE) ** 2  # of the cost, in real time: all markers nearer by 30 um
+_LEAST_SHAPE_SPREAD: Final = 0.005  # [m] least standard deviation of a marker over the shapes
+_ROBUST_SCALES: Final = (1 / 64, 1 / 8, 1.0)  # factors of the robust scale, wide first for poor starts
+_STEPS_AT_WIDE_SCALES: Final = 8  # most steps at each wide scale
+_REST_PRECISION: Final = float(np.deg2rad(90.0)) ** -2  # [1/rad^2] weak prior around resting angles
+_COMPLETE_DIGIT: Final = 1e-4  # factor of that precision for digits with all markers
+_RMS_OF_LAST_START: Final = 0.0005  # [m] A start with a smaller RMS, limits and prior included, is the last.
+_MOST_STEPS: Final = 30  # largest number of steps from each start
+_CONVERGED: Final = (1e-6 / MARKER_NOISE) ** 2  # gain in cost: one marker 1 um closer
+_ACCURATE: Final = (3e-5 / MARKER_NOISE) ** 2  # gain in cost, in real time: all markers 30 um closer
 
 
 class _StartingShapes(NamedTuple):
-    """K hand shapes with the wrist at the origin, and the positions of their markers."""
+    """K starting shapes of a hand, with their markers."""
 
-    angles: Float[np.ndarray, "K 20"]  # hinge angles [rad]
+    angles: Float[np.ndarray, "K 20"]  # joint angles [rad]
     markers: Float[np.ndarray, "K M 3"]  # markers in the wrist's frame [m]
-    weights: Float[np.ndarray, "M"]  # of each marker in aligning whole hands [1/m^2]: small if shapes differ
+    weights: Float[np.ndarray, "M"]  # weights to align whole hands [1/m^2]: small if shapes differ
 
 
 class FramePriors(NamedTuple):
-    """What is known of the poses of frames before their markers are used."""
+    """Priors of poses before the markers of their frames are used."""
 
-    angles: Float[np.ndarray, "P 20"]  # mean of the hinges [rad], one row per frame or none
+    angles: Float[np.ndarray, "P 20"]  # mean joint angles [rad], one row per frame, or no row
     precision: Float[np.ndarray, "P 20"]  # their precision [1/rad^2]
-    wrist: Float[np.ndarray, "9"]  # position [m] and orientation of the wrist, then the precisions of both
+    wrist: Float[np.ndarray, "9"]  # position [m] and orientation of the wrist, then both precisions
 
 
 _NO_ROWS: Final = np.empty((0, NUM_JOINTS))
@@ -95,34 +95,34 @@ def priors_of_frame(
     wrist: Float[np.ndarray, "7"],
     wrist_spread: tuple[float, float],
 ) -> FramePriors:
-    """What is known of one frame's pose: hinges and wrist with their standard deviations [m, rad]."""
+    """Priors of one frame's joint angles and wrist, from means and standard deviations [m, rad]."""
     wrist_prior = np.concatenate([wrist, np.array(wrist_spread) ** -2.0])
     return FramePriors(angles[None], spread[None] ** -2.0, wrist_prior)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseFit:
-    """Poses and how well they fit."""
+    """Poses and their residuals."""
 
     qpos: Float[np.ndarray, "T 27"]
     """The poses."""
     rms: Float[np.ndarray, "T"]
-    """3D RMS distance over the markers that are present [m]."""
+    """RMS distance of the present markers [m]."""
     residuals: Float[np.ndarray, "T M 3"]
     """Model minus marker [m], NaN where a marker is missing."""
     iterations: Int[np.ndarray, "T"]
-    """Steps tried, over all starts of a frame."""
+    """Number of tried steps, over all starts of a frame."""
 
 
 class PoseSolver:
-    """Solves poses of one hand in one glove; precomputes what does not depend on the frame."""
+    """Solves poses of one hand in one glove; precomputes all that is equal for all frames."""
 
-    # The outlier distance [m] is the scale of a robust loss (Geman and McClure 1987), so that a wrong label
+    # `outlier_distance` [m] is the scale of a robust loss (Geman and McClure 1987), so that a wrong label
     # does not bend the hand; it needs a good start. Without it a fit is plain least squares.
 
     def __init__(self, fit: GloveFit, *, outlier_distance: float | None = None) -> None:
         self.hand: HandArrays = hand_arrays(fit)
-        """The hand and its glove; a change of its marker positions takes effect in the next solution."""
+        """The hand and its glove; changed marker positions take effect in the next solution."""
         angles = np.deg2rad([[*thumb, *finger * 4] for thumb, finger in zip(_THUMB, _FINGER, strict=True)])
         markers = fit.markers(join_qpos(angles))[0]
         weights = 1.0 / (_LEAST_SHAPE_SPREAD**2 + markers.var(axis=0).sum(axis=1))
@@ -141,9 +141,9 @@ class PoseSolver:
         prior: tuple[Float[np.ndarray, "T 20"], float] | None = None,
         iterations: int = _MOST_STEPS,
     ) -> PoseFit:
-        """Solve the poses of frames with four markers or more, each by itself; see `solve_pose`."""
-        # The prior is that of digits that lack a marker or have under three: mean angles, their spread [rad].
-        # Copies, because a kernel is compiled anew for arrays that are read-only or not contiguous.
+        """Solve poses of frames with at least four markers, each by itself; see `solve_pose`."""
+        # The prior is for digits with a missing marker or fewer than three: mean angles, deviation [rad].
+        # Copies are made because a kernel is compiled anew for read-only or non-contiguous arrays.
         targets = np.array(targets, dtype=np.float64, order="C")
         targets[~np.isfinite(targets).all(axis=-1)] = np.nan
         starts = np.array(np.empty((0, NUM_QPOS)) if initial is None else initial, np.float64, order="C")
@@ -157,7 +157,7 @@ class PoseSolver:
     def solve_frame(
         self, target: Float[np.ndarray, "M 3"], start: Float[np.ndarray, "27"], prior: FramePriors
     ) -> PoseFit:
-        """`solve` for one frame from a near start in real time; a marker [m] is complete or NaN."""
+        """Solve one frame in real time from a close start; a marker [m] is complete or NaN."""
         steps = self._robust_scale, _MOST_STEPS, _ACCURATE
         return PoseFit(
             *_fit_frames(self.hand, self._shapes, self.on_part, target[None], start[None], prior, *steps)
@@ -175,13 +175,13 @@ def solve_pose(
     initial: Float[np.ndarray, "T 27"] | None = None,
     iterations: int | None = None,
 ) -> PoseFit:
-    """Poses of a hand whose markers are nearest to labeled ones, each frame by itself.
+    """Poses of a hand with the least distances to labeled markers, each frame by itself.
 
     Args:
         fit: The hand in its glove.
         targets: Labeled markers in the glove's order [m]; NaN where missing.
-        initial: Poses to start from [m, rad]; a few general ones when not given.
-        iterations: Steps at most from each start.
+        initial: Poses to start from [m, rad]; several general poses if not given.
+        iterations: Largest number of steps from each start.
 
     Returns:
         Poses (T, 27) [m, rad], RMS distances (T,) [m] and residuals (T, M, 3) [m].
@@ -222,7 +222,7 @@ def _fit_frames(
     iterations: int,
     small_gain: float,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
-    """Solve frames one by one; the result has the fields of a `PoseFit`."""
+    """Solve frames one by one; returns the fields of a `PoseFit`."""
     frames, count = targets.shape[:2]
     qpos, residuals = np.empty((frames, NUM_QPOS)), np.empty((frames, count, 3))
     rms, steps = np.zeros(frames), np.zeros(frames, dtype=np.int64)
@@ -267,7 +267,7 @@ def _set_prior(
     mean: Float[np.ndarray, "27"],
     precision: Float[np.ndarray, "26"],
 ) -> int:
-    """Fill the prior of a frame, see `PoseEnergy`; return how many markers it has, each complete or NaN."""
+    """Write the prior of a frame, see `PoseEnergy`; return its number of markers, each complete or NaN."""
     seen = np.zeros(len(on_part), dtype=np.int64)
     for marker in range(len(target)):
         if not np.isnan(target[marker, 0]):
@@ -296,7 +296,7 @@ def _write_residuals(
     work: Workspace,
     residuals: Float[np.ndarray, "M 3"],
 ) -> float:
-    """Fill the residuals in the world [m], NaN where a marker is missing, and return their RMS [m]."""
+    """Write the residuals in the world [m], NaN where a marker is missing; return their RMS [m]."""
     marker_residuals(hand, target, pose, work)
     w, x, y, z = pose[3:7]
     total, present = 0.0, 0
@@ -328,7 +328,7 @@ def _world_markers(hand: HandArrays, pose: Float[np.ndarray, "27"]) -> Float[np.
 def _initial_poses(
     shapes: _StartingShapes, digits: Int[np.ndarray, "M"], target: Float[np.ndarray, "M 3"]
 ) -> Float[np.ndarray, "S 27"]:
-    """Poses to start a frame from (K + 1, 27): digits of the nearest shapes, then shapes, best first."""
+    """Starting poses of a frame (K + 1, 27): one of the nearest digits, then all shapes, nearest first."""
     count = len(shapes.angles)
     aligned, poses, squares = np.empty((count, NUM_QPOS)), np.empty((count + 1, NUM_QPOS)), np.empty(count)
     for number in range(count):
@@ -356,7 +356,7 @@ def _choose_digits(
     pose: Float[np.ndarray, "27"],
     markers: Float[np.ndarray, "M 3"],
 ) -> None:
-    """Take each digit from the shape whose markers are nearest, the wrist held."""
+    """Take each digit from the shape with the nearest markers, with the wrist fixed."""
     rotation = np.empty((3, 3))
     write_quaternion_matrix(rotation, pose[3], pose[4], pose[5], pose[6])
     squares = np.zeros((5, len(shapes.angles)))

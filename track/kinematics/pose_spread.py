@@ -1,16 +1,16 @@
-"""What markers and priors leave open of a pose: covariances of hinges, predicted markers and keypoints.
+"""Uncertainty of poses: covariances of joint angles, predicted markers and keypoints.
 
-- Before its markers are used, a hand has a prior: a normal distribution of all 20 hinges together. They
-  follow an Ornstein-Uhlenbeck process whose resting distribution is that of the gestures people make: a hinge
-  that no marker shows for a while returns to it, in its mean and in its spread. Neighboring fingers bend
-  together, so the covariance carries information from visible digits to hidden ones.
-- The neighbors of a missing marker may determine its position nearly, or leave it free along the arc of one
-  hinge. The normal matrix of the fit together with the prior of the hinges gives its covariance.
-- Standard deviations of joint angles and keypoints come from a model that is linear and normal around the
-  pose. Each marker is seen with noise, and tells less the longer it is hidden. The hand differs from its
-  user's in the same way in every frame, so that no number of frames averages it out: in its size, in the
-  places of its markers, in where its digits begin and point, in the lengths of its bones. Flesh moves markers
-  slowly, so that frames beside each other do not average it out either.
+- Before its markers are used, a hand has a prior: a joint normal distribution of all 20 joint angles. They
+  follow an Ornstein-Uhlenbeck process whose stationary distribution is that of people's gestures: an unseen
+  joint returns to it, in mean and covariance. Neighboring fingers bend together, so the covariance carries
+  information from visible digits to hidden ones.
+- The neighbors of a missing marker may determine its position well, or leave it free along the arc of one
+  joint. Its covariance follows from the normal matrix of the fit and the prior of the joint angles.
+- Standard deviations of joint angles and keypoints come from a linear normal model around the pose. Each
+  marker is seen with noise, and tells less the longer it is hidden. The hand model differs from the user's
+  hand in the same way in every frame, so that averaging does not help: in its size, marker places, origins
+  and directions of digits, and bone lengths. Flesh moves markers slowly, so that averaging over successive
+  frames does not help, either.
 """
 
 from __future__ import annotations
@@ -42,43 +42,43 @@ from track.kinematics.marker_kinematics import (
 )
 from track.kinematics.pose_solver import FEWEST_ON_PART
 
-# So short that a digit with one marker that was bent as few digits are finds its way back.
-_JOINT_MEMORY: Final = 0.3  # [s] time constant of the process of the hinges
-_JOINT_SPREAD: Final = float(np.deg2rad(0.5))  # least standard deviation of a predicted hinge
-_GESTURE_MARGIN: Final = float(np.deg2rad(6.0))  # added to the gestures' spread, for poses that none shows
-_ARC: Final = 0.04  # [m] usual radius of the arcs that markers move on: the length of a finger's bones
-_LEAST_INFORMATION: Final = 1e-9  # share of a marker's precision on the diagonal, so that it has an inverse
-_DRIFT: Final = 0.014  # [m/sqrt(s)] of a hidden marker
-_ANYWHERE: Final = 0.01  # [1/m^2, 1/rad^2] precision of the wrist before any marker is seen
-_LEAST_NOISE: Final = 0.0001  # [m] of a marker that many cameras see
-_NOISE_STEP: Final = 1e-5  # [m] to which noise is rounded
-# A calibrated hand, chosen on the same people; what markers tell is better the less noise they have.
+# Short, so that a digit with one marker recovers from a wrong, unusual pose.
+_JOINT_MEMORY: Final = 0.3  # [s] time constant of the process of joint angles
+_JOINT_SPREAD: Final = float(np.deg2rad(0.5))  # [rad] least standard deviation of a predicted angle
+_GESTURE_MARGIN: Final = float(np.deg2rad(6.0))  # [rad] added to that of the gestures, for other poses
+_ARC: Final = 0.04  # [m] usual radius of the arcs of markers: the length of a finger's bones
+_LEAST_INFORMATION: Final = 1e-9  # share of a marker's precision, added for an inverse
+_DRIFT: Final = 0.014  # [m/sqrt(s)] random walk of a hidden marker
+_ANYWHERE: Final = 0.01  # [1/m^2, 1/rad^2] prior precision of the wrist
+_LEAST_NOISE: Final = 0.0001  # [m] lower bound of a marker's noise
+_NOISE_STEP: Final = 1e-5  # [m] rounding of the noise
+# Standard deviations of a calibrated hand, chosen as `_MEASURED` is; they grow with the markers' noise.
 _FEW: Final = 1.4  # uncertainty factor of a digit with fewer than three markers
-_CALIBRATED_SIZE: Final = 3.0  # [1/m] times the noise
-_CALIBRATED_PLACE: Final = 0.15  # times the noise
-_CALIBRATED_PALM: Final = 0.45  # times the noise
-_CALIBRATED_KNUCKLE: Final = 0.15  # times the noise
-_CALIBRATED_TURNS: Final = (0.5, 0.8, 1.5)  # [deg]; abduction hardly tells where a digit points
-_CALIBRATED_THUMB: Final = 1.6  # times the fingers' directions
-_CALIBRATED_BONES: Final = (3.5, 3.0)  # [1/m] times the noise
-_CALIBRATED_WRIST: Final = 0.0007  # [m]
-_CALIBRATED_JOINTS: Final = (0.00016, 0.00045)  # [m], tips last
-_SINGLE: Final = (7.0, 3.0)  # times these, of a digit with one marker
-_LEAST_FREEDOM: Final = 3  # coordinates of markers beyond those that a pose needs
+_CALIBRATED_SIZE: Final = 3.0  # [1/m] of relative size, times the noise
+_CALIBRATED_PLACE: Final = 0.15  # of marker places, times the noise
+_CALIBRATED_PALM: Final = 0.45  # of the palm's marker places, times the noise
+_CALIBRATED_KNUCKLE: Final = 0.15  # of knuckles, times the noise
+_CALIBRATED_TURNS: Final = (0.5, 0.8, 1.5)  # [deg] directions; abduction hardly shows a digit's
+_CALIBRATED_THUMB: Final = 1.6  # factor of the thumb's directions over the fingers'
+_CALIBRATED_BONES: Final = (3.5, 3.0)  # [1/m] of log lengths, times the noise
+_CALIBRATED_WRIST: Final = 0.0007  # [m] wrist in the palm
+_CALIBRATED_JOINTS: Final = (0.00016, 0.00045)  # [m] joints, tips
+_SINGLE: Final = (7.0, 3.0)  # factors of these for a digit with one marker
+_LEAST_FREEDOM: Final = 3  # least number of marker coordinates beyond those that a pose needs
 SOURCES: Final = ("noise and gaps", "gluing", "flesh", "bones")
-"""What makes an angle uncertain: markers that are noisy or not seen, the places where they were glued on,
-their motion over the bones, and the sizes and directions of these."""
-_OWN: Final = 10  # numbers of a digit that are not known: knuckle, direction, bones (3 each), all its bones
-_NUMBERS: Final = 5 * _OWN + 1  # numbers of a hand that are not known: those of its digits, and its size
+"""Sources of an angle's uncertainty: noisy or unseen markers, their glued places, their motion over the
+bones, and sizes and directions of the bones."""
+_OWN: Final = 10  # unknown numbers of a digit: knuckle, direction, bones (3 each), all its bones
+_NUMBERS: Final = 5 * _OWN + 1  # unknown numbers of a hand: those of its digits, and its size
 NOT_SMOOTHED: Final = np.empty((0, NUM_UNKNOWNS, NUM_UNKNOWNS))
-"""Covariances of poses that were fitted frame by frame."""
-# Unknowns by which a digit's keypoints respond to each number: its own hinges, and the wrist.
+"""No covariances: the poses were fitted frame by frame."""
+# Unknowns by which a digit's keypoints respond to each number: its own joint angles, and the wrist.
 _OWN_UNKNOWNS: Final = np.ones((NUM_UNKNOWNS, _NUMBERS))
 _OWN_UNKNOWNS[:NUM_JOINTS, :-1] = np.kron(np.eye(5), np.ones((4, _OWN)))
 
 
 class JointPrior(NamedTuple):
-    """A normal distribution of the hinges."""
+    """Normal distribution of the joint angles."""
 
     angles: Float[np.ndarray, "20"]  # mean [rad]
     covariance: Float[np.ndarray, "20 20"]  # covariance [rad^2]
@@ -86,52 +86,52 @@ class JointPrior(NamedTuple):
 
     @property
     def spread(self) -> Float[np.ndarray, "20"]:
-        """Standard deviation of each hinge [rad]."""
+        """Standard deviation of each joint angle [rad]."""
         return np.sqrt(np.diag(self.covariance))
 
 
 class MarkerPrediction(NamedTuple):
-    """Positions of the markers and angles of the hinges at a fitted pose, with their covariances."""
+    """Markers and joint angles of a fitted pose, with covariances."""
 
-    qpos: Float[np.ndarray, "27"]  # the pose; digits that lack markers at the optimum of markers and prior
+    qpos: Float[np.ndarray, "27"]  # the pose; digits with missing markers at the optimum of markers and prior
     positions: Float[np.ndarray, "M 3"]  # markers in the world [m]
-    covariances: Float[np.ndarray, "M 3 3"]  # of each marker in the world [m^2]: the pose's and its own
-    rotations: Float[np.ndarray, "M 3 3"]  # in the world, of each marker's bone with the largest weight
-    joint_covariance: Float[np.ndarray, "20 20"]  # covariance of the hinges [rad^2]
-    information_matrix: Float[np.ndarray, "20 20"]  # of the markers alone on hinges, the palm held [1/rad^2]
+    covariances: Float[np.ndarray, "M 3 3"]  # of each marker in the world [m^2]: from the pose, and its own
+    rotations: Float[np.ndarray, "M 3 3"]  # rotation in the world of each marker's main bone
+    joint_covariance: Float[np.ndarray, "20 20"]  # covariance of the joint angles [rad^2]
+    information_matrix: Float[np.ndarray, "20 20"]  # of the markers alone on angles, palm fixed [1/rad^2]
     information_vector: Float[np.ndarray, "20"]  # the matrix times the angles by the markers alone [1/rad]
 
 
 class HandDoubt(NamedTuple):
-    """How far a hand in its glove may be from its user's: standard deviations."""
+    """Standard deviations of the difference between a hand model and its user's hand."""
 
-    noise: float  # of a marker around its place on the hand, from frame to frame [m]
-    size: float  # of the size of the whole hand, its logarithm
-    places: Float[np.ndarray, "M"]  # of each marker's place on its bone, in each direction [m]
-    knuckles: Float[np.ndarray, "5"]  # of where each digit begins on the palm, in each direction [m]
-    directions: Float[np.ndarray, "5 3"]  # of the way each digit points, about the axes of the palm [rad]
-    bones: Float[np.ndarray, "5 2"]  # of the length of each bone of a digit, and of all together, logarithms
-    wrist: float  # of where the wrist is in the palm, which no marker shows, in each direction [m]
-    joints: Float[np.ndarray, "5 2"]  # of a digit's joints and tip, beyond what markers show, each way [m]
-    flesh: float = 0.0  # of a marker around its place, alike in frames that follow each other [m]
+    noise: float  # marker around its place, independent in each frame [m]
+    size: float  # log size of the whole hand
+    places: Float[np.ndarray, "M"]  # each marker's place on its bone, in each direction [m]
+    knuckles: Float[np.ndarray, "5"]  # origin of each digit on the palm, in each direction [m]
+    directions: Float[np.ndarray, "5 3"]  # direction of each digit, about the axes of the palm [rad]
+    bones: Float[np.ndarray, "5 2"]  # log lengths of each bone of a digit, and of all of them together
+    wrist: float  # place of the wrist in the palm, which no marker shows, in each direction [m]
+    joints: Float[np.ndarray, "5 2"]  # joints and tip of a digit, beyond what markers show, each way [m]
+    flesh: float = 0.0  # marker around its place, alike in successive frames [m]
 
 
 class _Proportions(NamedTuple):
-    """How far a hand that is not calibrated is from its user's: standard deviations."""
+    """Standard deviations of the difference between an uncalibrated hand model and its user's hand."""
 
-    size: float  # logarithm
-    place: float  # of a marker [m]
-    knuckle: float  # [m]
-    turn: float  # of a finger's direction [deg]
-    thumb: float  # times the fingers' directions
-    bones: tuple[float, float]  # logarithms, of each bone and of all of a digit
+    size: float  # log size
+    place: float  # marker place [m]
+    knuckle: float  # knuckle position [m]
+    turn: float  # direction of a finger [deg]
+    thumb: float  # factor for the thumb's direction
+    bones: tuple[float, float]  # log lengths: each bone, all of a digit
 
 
-# Chosen on simulated people that benchmarks.doubt does not try. What the fit of the proportions makes up for
-# is not here: less than people differ by.
+# Chosen on simulated people that benchmarks.doubt does not use. Smaller than differences between people, as
+# the fit of proportions makes up for part of them.
 _MEASURED: Final = _Proportions(0.001, 0.0014, 0.0003, 1.8, 4.0, (0.01, 0.02))
-# Of the nearest of five sizes: what people differ by, and half a step between sizes. Places are off by what
-# slips, and by what girths of digits and lengths of bones that are not the user's move.
+# Nearest of five sizes: differences between people, and half a step between sizes. Marker places include
+# slips, and shifts by wrong girths and bone lengths.
 _NAMED: Final = _Proportions(
     0.02, 0.003, ADULTS.knuckle_spread, ADULTS.angle_spread, 3.0, (ADULTS.bone_spread, ADULTS.digit_spread)
 )
@@ -148,7 +148,7 @@ def resting_prior() -> JointPrior:
 def predict_joints(
     angles: Float[np.ndarray, "20"], covariance: Float[np.ndarray, "20 20"], span: float
 ) -> JointPrior:
-    """Prior of the hinges `span` seconds after they were estimated, near these predicted angles [rad]."""
+    """Prior of the joint angles `span` seconds after an estimate, around predicted angles [rad]."""
     kept = float(np.exp(-max(span, 0.0) / _JOINT_MEMORY))
     return _relax(angles, covariance, resting_prior(), kept)
 
@@ -157,7 +157,7 @@ def predict_joints(
 def _relax(
     angles: Float[np.ndarray, "20"], covariance: Float[np.ndarray, "20 20"], resting: JointPrior, kept: float
 ) -> JointPrior:
-    """The prior of hinges of which this share is kept, and the rest is that of resting hands."""
+    """Mix joint angles with the resting prior, keeping the share `kept` of their deviation from it."""
     count, share = len(angles), kept**2
     mean, spread, precision = np.empty(count), np.empty((count, count)), np.empty((count, count))
     for row in range(count):
@@ -179,11 +179,11 @@ def digit_prior(
     angles: Float[np.ndarray, "4"],
     precision: Float[np.ndarray, "4 4"],
 ) -> None:
-    """Fill mean and precision of one digit's hinges, given the information of the others' markers."""
+    """Write mean and precision of one digit's joint angles, given the information of the other digits."""
     count = len(prior.angles)
     order, system, right_side = np.empty(count, dtype=np.int64), np.empty((count, count)), np.zeros(count)
     index = 0
-    for hinge in range(count):  # the digit's own hinges last, so that the others are eliminated from them
+    for hinge in range(count):  # The digit's own joints come last, so that the others are eliminated.
         own = hinge // 4 == digit
         order[count - 4 + hinge % 4 if own else index] = hinge
         index += not own
@@ -276,7 +276,7 @@ def _marker_covariance(
     work: Workspace,
     covariance: Float[np.ndarray, "3 3"],
 ) -> None:
-    """Fill the covariance of a marker in the world [m^2]: that of the unknowns, and its own variance."""
+    """Write the covariance of a marker in the world [m^2], from that of the unknowns and its own variance."""
     first, last = hand.hinge_span[marker, 0], hand.hinge_span[marker, 1]
     count = last - first + 6
     jacobian, in_world = work.jacobian[marker], np.zeros((3, count))
@@ -298,8 +298,8 @@ def _marker_covariance(
             covariance[i, 0] += in_world[i, one] * x
             covariance[i, 1] += in_world[i, one] * y
             covariance[i, 2] += in_world[i, one] * z
-    # A marker moves on an arc, not on its tangent: a variance along the tangent means a deviation
-    # across it, by the square over twice the radius.
+    # A marker moves on an arc, not on its tangent: motion along the tangent implies a deviation across
+    # it, the square over twice the radius.
     bend = (covariance[0, 0] + covariance[1, 1] + covariance[2, 2]) / (2.0 * _ARC)
     for i in range(3):
         covariance[i, i] += variance + bend**2
@@ -314,7 +314,7 @@ def _complete_digits(
     work: Workspace,
     qpos: Float[np.ndarray, "27"],
 ) -> bool:
-    """Move hinges of digits that lack markers to the optimum of prior and markers, the others held."""
+    """Move joints of digits with missing markers to the optimum of prior and markers, others fixed."""
     weak = np.zeros(NUM_JOINTS, dtype=np.int64)
     count = 0
     for hinge in range(NUM_JOINTS):
@@ -343,16 +343,16 @@ def _complete_digits(
 
 
 def known_hand(digits: Int[np.ndarray, "M"], noise: float) -> HandDoubt:
-    """Doubt of a hand of which everything is known, whose markers are seen with a noise [m]."""
+    """`HandDoubt` of a perfectly known hand whose markers have some noise [m]."""
     count = len(DIGITS)
     pairs, turns = np.zeros((count, 2)), np.zeros((count, 3))
     return HandDoubt(noise, 0.0, np.zeros(len(digits)), np.zeros(count), turns, pairs, 0.0, pairs)
 
 
 def hand_doubt(digits: Int[np.ndarray, "M"], origin: HandOrigin, noise: float) -> HandDoubt:
-    """Doubt of a user's hand by where it is from: people and gloves differ as simulated ones do."""
-    # A calibrated hand is as near to its user's as the noise of its markers [m] lets it be; a digit with a
-    # single marker remains half as doubtful as on a measured hand.
+    """`HandDoubt` of a user's hand by its origin, for people and gloves like the simulated ones."""
+    # A calibrated hand is as accurate as the noise of its markers [m] allows; a digit with one marker remains
+    # half as uncertain as on a measured hand.
     known, count = _NAMED if origin == "named" else _MEASURED, len(DIGITS)
     turns = np.full((count, 3), np.deg2rad(known.turn))
     turns[0] *= known.thumb
@@ -372,7 +372,7 @@ def hand_doubt(digits: Int[np.ndarray, "M"], origin: HandOrigin, noise: float) -
     single, few = counts < 2, np.where(counts < FEWEST_ON_PART, _FEW, 1.0)
     places = np.where(single, 0.6 * known.place, _CALIBRATED_PLACE * noise * few)
     lengths, turns = np.outer(few, _CALIBRATED_BONES) * noise, np.outer(few, np.deg2rad(_CALIBRATED_TURNS))
-    turns[0] *= _CALIBRATED_THUMB * few[0]  # few markers tell even less of where a thumb points
+    turns[0] *= _CALIBRATED_THUMB * few[0]  # Few markers determine a thumb's direction even less.
     return HandDoubt(
         noise,
         _CALIBRATED_SIZE * noise,
@@ -386,9 +386,9 @@ def hand_doubt(digits: Int[np.ndarray, "M"], origin: HandOrigin, noise: float) -
 
 
 class SpreadModel:
-    """Standard deviations of the poses of one hand, which depend on where the hand is from.
+    """Standard deviations of the poses of one hand, which depend on the hand's origin.
 
-    `angle_errors` are what the solution of the hand leaves open of each angle, see `energy.angle_errors`.
+    `angle_errors` are those that remain after a calibration, see `energy.angle_errors`.
     """
 
     def __init__(
@@ -408,7 +408,7 @@ class SpreadModel:
     def spreads(
         self, qpos: Float[np.ndarray, "T 27"], unseen: Float[np.ndarray, "T M"], rms: float
     ) -> tuple[Float[np.ndarray, "T 20"], Float[np.ndarray, "T 21"]]:
-        """Standard deviations of angles [rad] and keypoints [m]; markers are unseen for [s] or for ever."""
+        """Standard deviations of angles [rad] and keypoints [m]; `unseen` is in [s], infinite for never."""
         digits = self._digits
         noise = max(rms * freedom_factor(len(digits)), _LEAST_NOISE) if rms > 0.0 else MARKER_NOISE
         variances, keypoints = self.variances(qpos, unseen, noise)
@@ -426,8 +426,8 @@ class SpreadModel:
     ) -> tuple[Float[np.ndarray, "T 20 4"], Float[np.ndarray, "T 21"]]:
         """Variances of angles by `SOURCES` [rad^2], and standard deviations of keypoints [m].
 
-        Of a smoothed hand are given: flesh, how far its markers are from their places in all frames [m], the
-        covariances of its unknowns by noise and gaps, and how often the prior counts in a frame.
+        For smoothed poses are given: flesh motion and RMS error of marker places [m], the covariances of the
+        unknowns from noise and gaps, and the weight of the prior in one frame.
         """
         steps = round(noise / _NOISE_STEP)
         if steps not in self._doubts:
@@ -438,22 +438,22 @@ class SpreadModel:
         variances, keypoints = pose_spreads(self._hand, prior, doubt, qpos, unseen, smoothed)
         if self._angle_errors is not None:
             unsure, errors = variances[..., [1, 3]], self._angle_errors**2
-            # What is open of a hand moves its keypoints as it moves its angles.
+            # Errors of the hand move its keypoints as they move its angles.
             keypoints *= max(1.0, np.sqrt(errors.sum() / unsure.mean(axis=0).sum()))
             variances[..., [1, 3]] = np.maximum(unsure, errors)
         return variances, keypoints
 
 
 def freedom_factor(num_markers: int) -> float:
-    """Ratio of the noise of markers to the RMS distance from a pose that was fitted to them."""
+    """Ratio of the noise of marker coordinates to the RMS distance from a fitted pose."""
     return float(np.sqrt(num_markers / max(3 * num_markers - NUM_UNKNOWNS, _LEAST_FREEDOM)))
 
 
 def with_keypoints(fit: GloveFit) -> HandArrays:
-    """The arrays of a hand whose keypoints follow its markers, each on the bone that ends there."""
+    """Arrays of a hand with its keypoints as further markers, each on the bone that ends there."""
     hand, count = hand_arrays(fit), NUM_KEYPOINTS
     digits = np.repeat(np.arange(len(DIGITS)), 4)
-    ends = 1 + 3 * digits + np.tile([0, 0, 1, 2], len(DIGITS))  # a knuckle is where the first bone begins
+    ends = 1 + 3 * digits + np.tile([0, 0, 1, 2], len(DIGITS))  # A knuckle is where the first bone begins.
     bones, weights, positions = np.full((count, 4), -1), np.zeros((count, 4)), np.zeros((count, 4, 3))
     bones[0, 0], bones[1:, 0], weights[:, 0] = PALM, ends, 1.0
     positions[1:, 0, 0] = fit.model.skeleton.lengths[ends] * np.tile([0.0, 1.0, 1.0, 1.0], len(DIGITS))
@@ -477,10 +477,10 @@ def pose_spreads(
     unseen: Float[np.ndarray, "T M"],
     smoothed: Float[np.ndarray, "S 26 26"],
 ) -> tuple[Float[np.ndarray, "T 20 4"], Float[np.ndarray, "T 21"]]:
-    """Variances of joint angles by `SOURCES` [rad^2], standard deviations of keypoints [m] `with_keypoints`.
+    """Variances of joint angles by `SOURCES` [rad^2] and standard deviations of keypoints [m].
 
-    A marker off its place moves the fit as noise does. The hand's numbers move markers, through them the fit,
-    and the keypoints also by themselves.
+    `hand` is from `with_keypoints`. A marker off its place moves the fit as noise does. The hand's unknown
+    numbers move markers, through them the fit, and keypoints also directly.
     """
     angles, keypoints = np.empty((len(qpos), NUM_JOINTS, 4)), np.empty((len(qpos), NUM_KEYPOINTS))
     count, work, weights = unseen.shape[1], workspace(len(hand.digits)), np.zeros(len(hand.digits))
@@ -531,7 +531,7 @@ def _write_variances(
     off: Float[np.ndarray, "R 26"],
     variances: Float[np.ndarray, "20 4"],
 ) -> None:
-    """Fill the variances of angles [rad^2]; `off` is what a meter moves, then what the doubt does."""
+    """Write the variances of angles [rad^2]; scales `off` from derivatives [rad/m] to deviations [rad]."""
     variances[:] = 0.0
     for hinge in range(NUM_JOINTS):
         variances[hinge, 0], variances[hinge, 3] = noise[hinge, hinge], bones[hinge, hinge]
@@ -548,8 +548,8 @@ def _write_variances(
 def _move_points(
     hand: HandArrays, doubt: HandDoubt, work: Workspace, moved: Float[np.ndarray, "P 3 51"]
 ) -> None:
-    """Fill how points move by a hand's numbers, in their standard deviations [m]."""
-    # Ten of each digit: where it begins, turns about three axes, lengths of bones and of all; then the size.
+    """Write the motion of points by one standard deviation of each unknown number of the hand [m]."""
+    # Ten numbers per digit: origin, turns about three axes, lengths of bones and of all; then the size.
     lever = np.empty(3)
     for point in range(len(moved)):
         for i in range(3):
@@ -559,7 +559,7 @@ def _move_points(
             shift[:], lever[:] = 0.0, 0.0
             for link in range(2, -1, -1):
                 bone = 1 + 3 * digit + link
-                reach = share * hand.offsets[bone + 1, 0] if link < 2 else 0.0  # along the bone [m]
+                reach = share * hand.offsets[bone + 1, 0] if link < 2 else 0.0  # distance along the bone [m]
                 for slot in range(4):
                     if hand.bones[point, slot] == bone:
                         share += hand.bone_weights[point, slot]

@@ -1,4 +1,4 @@
-"""Live streams of points: their addresses `scheme://host:port?option=value`, and the settings of a replay."""
+"""Live streams of points: addresses `scheme://host:port?option=value`, and the settings of a replay."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ class ReplaySettings(Settings):
     rate: Annotated[float | None, Limits(0.0, above=True)] = None
     """Frames per second [Hz]; the capture's own when not given."""
     host: str = LOOPBACK
-    """Address of this machine to listen at; other machines do not reach the default."""
+    """Address of this machine to listen at; the default cannot be reached from other machines."""
     port: Annotated[int, Limits(0, 65535)] = 0
     """UDP port to listen at; 0 takes a free one."""
 
 
 class NetworkAddress(NamedTuple):
-    """The parts of an address."""
+    """Parts of an address."""
 
     host: str
-    """This machine's loopback address where none was named."""
+    """Host; this machine's loopback address if none is named."""
     port: int
     options: Mapping[str, str]
 
@@ -45,12 +45,12 @@ class NetworkAddress(NamedTuple):
 def split_address(
     address: str, *, options: Mapping[str, Sequence[str]], port: int | None = None, any_port: bool = False
 ) -> NetworkAddress:
-    """Take `scheme://host:port?option=value` apart.
+    """Split `scheme://host:port?option=value` into its parts.
 
     Args:
-        options: The valid values of each option, the usual one first.
-        port: The usual port; an address must have one where there is none.
-        any_port: Whether port 0 stands for any free one.
+        options: The valid values of each option, the default first.
+        port: The default port; if None, the address must name one.
+        any_port: Whether port 0 is allowed, for any free port.
     """
     scheme = address.partition("://")[0]
     try:

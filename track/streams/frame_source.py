@@ -1,4 +1,4 @@
-"""Sources of frames: the user's own protocol, and the threads and queues that read them."""
+"""Sources of frames: the protocol for users' own sources, and the threads and queues that read them."""
 
 from __future__ import annotations
 
@@ -21,24 +21,24 @@ from track.frames import LATEST_TIME, StreamedFrame
 LEAVE: Final = 1.0
 """Time for a source to end after `close` [s]."""
 _MOST_WAITING: Final = 1 << 14  # largest number of frames that wait for a reader
-_WAITING: Final = 256  # waiting frames after which a source that is not live is made to wait
+_WAITING: Final = 256  # A source that is not live has to wait when this many frames wait.
 _PACE_FRAMES: Final = 64  # newest frames that show the pace of a source
-_FEWEST_PACE: Final = 5  # number of frames from which on the pace is known
+_FEWEST_PACE: Final = 5  # The pace is known from this many frames on.
 _SAME_PACE: Final = 1.0  # longest step in time within one pace [s]
-_FASTER: Final = 1.5  # a source that is so many times as fast as its frames' times is not live
-_SHORT: Final = 0.01  # time by which any source may be ahead [s]
+_FASTER: Final = 1.5  # A source whose frames come this many times faster than their time stamps is not live.
+_SHORT: Final = 0.01  # [s] Any source may be ahead by this.
 _MOST_ID: Final = 1 << 31  # IDs of takes are smaller
 
 
 class FrameSource(Protocol):
-    """Delivers the frames of a system of the user's own, for `handsim track --live module:name`.
+    """A user's own source of frames, for `handsim track --live module:name`.
 
-    The points of a frame are in [m], times in [s]. It is iterated in a thread of its own, once; waiting for
-    the next frame is its own affair, and so is an end: after the last frame the take is written. An exception
-    ends the stream in the same way, and is told. A `ConnectionError` or `TimeoutError` as the source is made
-    means that its server is not there yet; the command makes it again. One that delivers frames faster than
-    their times go on is made to wait; of one that keeps their pace the oldest are dropped when they cannot be
-    kept up with.
+    Points of a frame are in [m], times in [s]. A source is iterated once, in its own thread, which may wait
+    for the next frame. After its last frame the take is written; an exception ends the stream in the same
+    way, and is reported. A `ConnectionError` or `TimeoutError` in the constructor means that the server is
+    not there yet; the command then tries again. A source that delivers frames faster than their time stamps
+    has to wait; from one at the pace of its time stamps, the oldest frames are dropped when tracking is
+    slower.
     """
 
     def __iter__(self) -> Iterator[StreamedFrame]:
@@ -46,28 +46,28 @@ class FrameSource(Protocol):
         ...
 
     def close(self) -> None:
-        """No further frame is wanted; called once, from another thread, while a frame may be waited for."""
+        """End the source. Called once, from another thread, possibly while a frame is awaited."""
         ...
 
 
 class ArrivingFrames(ABC):
-    """Frames as they arrive, in any order; the oldest are left out when too many wait."""
+    """Frames as they arrive, in any order; when too many wait, the oldest are dropped."""
 
     is_live = True
-    """Whether frames come at their own pace, however slow their reader is."""
+    """Whether frames come at their own pace, however slow the reader is."""
     error: Exception | None = None
     """Why no further frame comes, if the source failed."""
     without_points = "does the camera system see markers?"
-    """What to do when frames come and no point is in any of them."""
+    """Hint for frames without any point."""
 
     def __init__(self) -> None:
         self.lost = 0
-        """Number of frames that were left out."""
+        """Number of dropped frames."""
         self._arrived: deque[StreamedFrame] = deque(maxlen=_MOST_WAITING)
 
     @property
     def counts(self) -> dict[str, int]:
-        """Numbers of packets that were left out, by name."""
+        """Numbers of ignored packets, by name."""
         return {}
 
     @property
@@ -81,14 +81,14 @@ class ArrivingFrames(ABC):
 
     @abstractmethod
     def end(self) -> None:
-        """Take no frame that arrives from now on."""
+        """Ignore all frames that arrive from now on."""
 
     @abstractmethod
     def close(self) -> None:
-        """End the source; no frame is wanted any more."""
+        """End the source, and drop waiting frames."""
 
     def _add(self, frame: StreamedFrame) -> None:
-        self.lost += len(self._arrived) == _MOST_WAITING  # then the oldest one goes
+        self.lost += len(self._arrived) == _MOST_WAITING  # drops the oldest frame
         self._arrived.append(frame)
 
     def _take_all(self) -> list[StreamedFrame]:
@@ -97,10 +97,10 @@ class ArrivingFrames(ABC):
 
 
 class SourceStream(ArrivingFrames):
-    """The checked frames of a source, which is iterated in a thread of its own.
+    """Validated frames of a source, which is iterated in its own thread.
 
-    With `waits`, a source that is faster than the times of its frames is made to wait. A source may say what
-    to do when no points come, in an attribute `without_points`.
+    With `waits`, a source that is faster than the time stamps of its frames has to wait. A source may have an
+    attribute `without_points` with a hint for frames without points.
     """
 
     def __init__(self, source: FrameSource, name: str, *, waits: bool = True) -> None:
@@ -134,18 +134,18 @@ class SourceStream(ArrivingFrames):
         self._ended = True
         try:
             self._source.close()
-        except Exception as error:  # the user's code may raise anything; earlier frames are kept
+        except Exception as error:  # A user's source may raise anything; earlier frames are kept.
             warnings.warn(
                 f"{self._name}: close failed ({type(error).__name__}: {error})", HandSimWarning, stacklevel=3
             )
 
     def close(self) -> None:
-        """Close the source."""
+        """Close the source, and end the thread."""
         self.end()
         with self._changed:
             self._closed = True
             self._changed.notify_all()
-        self._thread.join(LEAVE)  # a source that does not end now ends with the process
+        self._thread.join(LEAVE)  # A source that does not return now ends with the process.
 
     def _read(self) -> None:
         """Take frames from the source until it ends or is closed."""
@@ -153,8 +153,8 @@ class SourceStream(ArrivingFrames):
             for frame in self._source:
                 if self._ended or not self._put(_checked(frame)):
                     break
-        except Exception as error:  # the user's code may raise anything
-            if not self._ended:  # a source that is closed while it waits may fail
+        except Exception as error:  # A user's source may raise anything.
+            if not self._ended:  # A source closed while it waits may fail.
                 self.error = CaptureError(
                     f"{self._name}: the stream failed ({type(error).__name__}: {error})"
                 )
@@ -164,7 +164,7 @@ class SourceStream(ArrivingFrames):
             self._changed.notify_all()
 
     def _put(self, frame: StreamedFrame) -> bool:
-        """Queue a frame for the reader; returns whether the reader still listens."""
+        """Queue a frame for the reader; return whether the reader is still there."""
         with self._changed:
             while len(self._arrived) >= _WAITING and not self.is_live and not self._closed:
                 self._changed.wait()
@@ -183,7 +183,7 @@ class SourceStream(ArrivingFrames):
 
 
 def _checked(frame: StreamedFrame) -> StreamedFrame:
-    """A frame with arrays of the right types and without missing points; `ArgumentError` if it is invalid."""
+    """Validate a frame: arrays of the right types, and points without missing ones."""
     if not isinstance(frame, StreamedFrame):
         raise ArgumentError(f"a {type(frame).__name__} came, expected a track.StreamedFrame")
     points, ids = np.asarray(frame.points, dtype=np.float64), np.asarray(frame.ids, dtype=np.int64)

@@ -1,16 +1,15 @@
-"""Live streams as a tracker takes them: in order, on a clock that never goes back, without old frames.
+"""Live streams for a tracker: in order, on a clock that never goes back, without outdated frames.
 
-Each frame that arrives is passed on once, in order, or counted. A frame that continues the stream is passed
-on at once. Behind a gap in the numbers frames are held until the gap is closed, eight frames are held, or
-30 ms have passed (five intervals of a slower stream; 0.1 s if frames were out of order in the last ten
-seconds).
+Each arriving frame is passed on once, in order, or counted. A frame that continues the stream is passed on at
+once. After a gap in the numbers frames are held until the gap is closed, eight frames are held, or 30 ms
+have passed (five intervals of a slower stream; 0.1 s if frames were out of order in the last ten seconds).
 
 A frame continues the stream if its steps in time and number agree, and its time is at most sixteen frames
-ahead of its arrival. Any other frame is a jump, which is believed only when five frames in a row fit
-together, as those of a recording or server that starts again. Fewer such frames are wild, and left out.
+ahead of its arrival. Any other frame is a jump. A jump is accepted only when five successive frames fit
+together, as after a restart of a recording or server. Frames of shorter jumps are wild, and are dropped.
 
-When the stream's time begins anew, it continues here. Frames that the reader is too slow for are dropped and
-counted, oldest first.
+When the stream's time restarts, the clock here continues. If the reader is too slow, the oldest frames are
+dropped and counted.
 """
 
 from __future__ import annotations
@@ -38,39 +37,39 @@ from track.streams import NoServerError, split_address
 from track.streams.frame_source import LEAVE, ArrivingFrames, FrameSource, SourceStream
 
 VALID: Final = ("natnet://host", "natnet://host:port", "qtm://host", "qtm://host:port", "module:name")
-"""What an address may be."""
+"""Valid forms of an address."""
 GROUP: Final = "handsim.frame_sources"
-"""Entry points of packages that bring frame sources."""
+"""Entry points of packages that provide frame sources."""
 MOST_LAG: Final = 0.03
-"""Longest time that a frame waits for a reader that was held up [s]."""
-_EMPTY: Final = 2.0  # time of frames without any point after which that is told [s]
-_MANY_FAR: Final = 0.5  # share of points out of range above which the unit is questioned
-_SILENCE: Final = 2.0  # time without a frame after which a silent frame comes [s]
-_LEAST_LAG: Final = 0.01  # longest time that a frame waits for a slow reader [s]
-_TOO_SLOW: Final = 0.1  # a reader is slow if frames have waited for it so long without a break [s]
-_FORGIVEN: Final = 2.0  # largest lag that is forgiven [s]
-_CATCHING_UP: Final = 1.0  # rate at which a forgiven lag has to shrink [s/s]
-_LOOP_GAP: Final = 0.01  # time between the last frame of a recording and the first one of its repetition [s]
-_STOP: Final = 0.1  # longest wait before `ended` is asked again [s]
-_WINDOW: Final = 8  # most frames that are held behind a gap
-_REACH: Final = 16  # frames by which a frame's time may be ahead of its arrival
-_LASTING: Final = 5  # frames in a row that make a jump believed
-_WAIT: Final = 0.03  # time for which a frame is held behind a gap [s]
-_WAIT_FRAMES: Final = 5  # frame intervals for which a frame is held if they take longer than `_WAIT`
-_LONGEST_WAIT: Final = 0.1  # longest time for which a frame is held, and the time in a disordered stream [s]
-_REMEMBERED: Final = 10.0  # time for which a stream counts as disordered [s]
-_OLD: Final = 1.0  # a frame older than the last by more is of a recording that starts again [s]
-_BURST: Final = 0.5  # time after the last frame in which late frames of a recording may arrive [s]
-_GOES_ON: Final = 1.0  # longest jump in time within the same recording [s]
-_FIRST_SLACK: Final = 0.05  # tolerance of a frame's time while the interval is unknown [s]
-_FIRST_WAIT: Final = 0.1  # time for which the first frame is held [s]
-_SLACK: Final = 0.001  # tolerance of time stamps, added to half an interval [s]
+"""Longest time that a frame waits for a reader that was briefly busy [s]."""
+_EMPTY: Final = 2.0  # [s] Frames without any point are reported after this time.
+_MANY_FAR: Final = 0.5  # The unit is questioned if a larger share of points is out of range.
+_SILENCE: Final = 2.0  # [s] A silent frame is produced after this time without a frame.
+_LEAST_LAG: Final = 0.01  # [s] longest time that a frame waits for a reader that is always too slow
+_TOO_SLOW: Final = 0.1  # [s] A reader is too slow if frames have waited without a break for this time.
+_FORGIVEN: Final = 2.0  # [s] longest lag that is forgiven
+_CATCHING_UP: Final = 1.0  # [s/s] rate at which a forgiven lag must shrink
+_LOOP_GAP: Final = 0.01  # [s] between the last frame of a recording and its first one when repeated
+_STOP: Final = 0.1  # [s] longest interval between calls of `ended`
+_WINDOW: Final = 8  # largest number of frames held behind a gap
+_REACH: Final = 16  # largest lead of a frame's time over its arrival [frames]
+_LASTING: Final = 5  # A jump is accepted after this many successive frames.
+_WAIT: Final = 0.03  # [s] longest time that a frame is held behind a gap
+_WAIT_FRAMES: Final = 5  # the same in frame intervals, for slower streams
+_LONGEST_WAIT: Final = 0.1  # [s] the same for any stream; used for disordered ones
+_REMEMBERED: Final = 10.0  # [s] A stream counts as disordered for this time.
+_OLD: Final = 1.0  # [s] A frame older than the last by more is from a restarted recording.
+_BURST: Final = 0.5  # [s] Late frames of a recording may arrive for this time after the last.
+_GOES_ON: Final = 1.0  # [s] longest jump in time within one recording
+_FIRST_SLACK: Final = 0.05  # [s] tolerance of a frame's time before the interval is known
+_FIRST_WAIT: Final = 0.1  # [s] time that the first frame is held
+_SLACK: Final = 0.001  # [s] tolerance of time stamps, added to half an interval
 _DRIFT: Final = 0.01  # largest relative difference between two clocks' rates
 _SMOOTHING: Final = 0.1  # weight of the newest interval in the mean
-_MOST_CHANGE: Final = 2.0  # largest ratio of a counted interval to the mean
-_MOST_JUMPING: Final = 4 * _WINDOW  # most frames of jumps that are held
-_RECENT: Final = 256  # number of newest frames among which doubled ones are found
-_STRIDES: Final = 16  # frames whose numbers show the server's step
+_MOST_CHANGE: Final = 2.0  # Intervals enter the mean with at most this ratio to it.
+_MOST_JUMPING: Final = 4 * _WINDOW  # largest number of held frames of jumps
+_RECENT: Final = 256  # number of newest frames searched for duplicates
+_STRIDES: Final = 16  # number of frames that determine the server's step
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,11 +77,11 @@ class StreamSettings(Settings):
     """How a live stream is read: keyword arguments of `open_source`."""
 
     silence: Annotated[float, Limits(0.0, above=True)] = _SILENCE
-    """Time without a frame after which the stream yields a silent frame [s]."""
+    """A silent frame is produced after this time without a frame [s]."""
 
 
 def check_address(address: str) -> str:
-    """The scheme of an address; an `ArgumentError` unless it is one of a stream. No server is asked."""
+    """Scheme of a stream's address, checked without asking a server."""
     check_type("address", address, str, f"one of {', '.join(VALID)}")
     scheme, _, rest = address.rpartition("://")
     name = rest.partition("?")[0]
@@ -98,17 +97,17 @@ def open_source(
     ended: Callable[[], bool] = lambda: False,
     **options: Any,
 ) -> LiveStream:
-    """Open a live stream, the frames of which are iterated in a `with` block.
+    """Open a live stream; its frames are iterated in a `with` block.
 
-    A frame has `points` (N, 3) [m], `ids` (N,) and a `time` [s] that never goes back, as `Tracker.step` takes
-    them. Frames that are not kept up with are dropped, oldest first, see `LiveStream`.
+    A frame has `points` (N, 3) [m], `ids` (N,) and a `time` [s] that never goes back, as for `Tracker.step`.
+    If the reader is too slow, the oldest frames are dropped, see `LiveStream`.
 
     Args:
-        address: As in `VALID`; `module:name?option=value` gives options to a source of the user's own, which
-            may also be given as an object.
-        settings: How to read it; as `StreamSettings()` when not given.
-        ended: The stream ends when this is true; it is asked before each frame, and several times a second
-            while none comes.
+        address: One of `VALID`. `module:name?option=value` passes options to a user's own source, which can
+            also be given as an object.
+        settings: Settings of the stream; `StreamSettings()` when not given.
+        ended: The stream ends when this returns True; it is called before each frame, and several times a
+            second while none comes.
         options: Fields of `StreamSettings` that differ from `settings`.
 
     Raises:
@@ -141,19 +140,19 @@ def open_source(
 
 
 class LiveStream(Closing, Iterator[StreamedFrame]):
-    """Frames of a live stream as a tracker takes them; the end of a `with` block or `close` ends it.
+    """Frames of a live stream for a tracker; a `with` block or `close` ends it.
 
-    They are in order, and their time never goes back: when the stream's time begins anew, as in a recording
-    that starts again, it continues. During a silence frames without points come, at the time that has passed.
-    Points 1000 m or more from the origin are left out and counted. A frame that has waited for `MOST_LAG`
-    while newer ones came is dropped and counted; where the reader is too slow, so that frames wait all the
-    time, a third of that.
+    Frames are in order, and their time never goes back: when the stream's time restarts, as in a repeated
+    recording, the time here continues. During a silence frames without points come, with the current time.
+    Points 1000 m or more from the origin are dropped and counted. A frame that has waited for `MOST_LAG`
+    while newer ones came is dropped and counted; if the reader is too slow all the time, so that frames
+    always wait, this limit is a third.
 
     Args:
-        frames: The frames as they arrive.
-        silence: Time without a frame after which the stream yields a silent frame [s].
-        ended: The stream ends when this is true, after what has arrived; it is asked before each frame, and
-            several times a second while none comes.
+        frames: Frames as they arrive.
+        silence: A silent frame is produced after this time without a frame [s].
+        ended: The stream ends when this returns True, after all that has arrived; it is called before each
+            frame, and several times a second while none comes.
     """
 
     def __init__(
@@ -166,26 +165,26 @@ class LiveStream(Closing, Iterator[StreamedFrame]):
         self.order = FrameOrder()
         """Puts the frames in order."""
         self.dropped = 0
-        """Number of frames that were not kept up with."""
+        """Number of frames dropped because the reader was too slow."""
         self.points = self.far_points = 0
-        """Numbers of points that came, and of those that were out of range."""
+        """Numbers of all points, and of those out of range."""
         self.forgiven_until = -math.inf
-        """When a lag is no longer forgiven, by the monotonic clock [s]."""
+        """Monotonic time until which a lag is forgiven [s]."""
         self._frames, self._silence, self._ended = frames, silence, ended
-        self._ahead = 0.0  # [s] of this time over the stream's
+        self._ahead = 0.0  # [s] of this clock over the stream's
         self._last: StreamedFrame | None = None  # on this clock
-        self._began = math.inf  # [s], when the first frame was passed on
+        self._began = math.inf  # [s] when the first frame was passed on
         self._ready: deque[tuple[StreamedFrame, float]] = deque()  # in order, with times of arrival [s]
-        self._kept_up = time.monotonic()  # [s], when the reader last waited for a frame
-        self._end_at = math.inf  # [s], when the stream was ended from here
+        self._kept_up = time.monotonic()  # [s] when the reader last waited
+        self._end_at = math.inf  # [s] when `end` was called
         self._over = self._closed = self._failed = False
 
     @property
     def counts(self) -> dict[str, int]:
-        """What became of the frames so far, by name.
+        """Counts of the frames so far, by name.
 
-        All that were received were in order, reordered, doubled, late or with wild times, or wait; those that
-        were dropped were in order or reordered.
+        Received frames are in order, reordered, doubled, late, with wild times, or waiting; dropped frames
+        are among those in order or reordered.
         """
         order, lost = self.order, self._frames.lost
         return {
@@ -205,7 +204,7 @@ class LiveStream(Closing, Iterator[StreamedFrame]):
 
     @property
     def point_doubt(self) -> str:
-        """A sentence where the points of the stream are none or too far away; an empty one else."""
+        """A sentence if the stream has no points or too distant ones; otherwise empty."""
         if not self.points and time.monotonic() > self._began + _EMPTY:
             return f"frames arrive, but no point was in any of them; {self._frames.without_points}"
         if self.far_points <= _MANY_FAR * self.points:
@@ -216,10 +215,10 @@ class LiveStream(Closing, Iterator[StreamedFrame]):
         )
 
     def __next__(self) -> StreamedFrame:
-        """Wait for the next frame; after each period of silence a silent frame.
+        """Wait for the next frame; return a silent frame after each period of silence.
 
         Raises:
-            CaptureError: A source of the user's own failed.
+            CaptureError: A user's own source failed.
         """
         quiet = time.monotonic() + self._silence
         self._line_up(0.0)
@@ -242,9 +241,9 @@ class LiveStream(Closing, Iterator[StreamedFrame]):
         raise StopIteration
 
     def forgive(self) -> None:
-        """Drop nothing for the time that the reader needed until now, if it catches up.
+        """Drop no frame because of the time that the reader has needed so far, if it catches up.
 
-        The lag may be what it is, two seconds at most, less a second for every second from now on.
+        The current lag, at most two seconds, is forgiven, less one second for each second from now on.
         """
         self._line_up(0.0)
         now = time.monotonic()
@@ -252,7 +251,7 @@ class LiveStream(Closing, Iterator[StreamedFrame]):
         self.forgiven_until = now + min(now - oldest, _FORGIVEN) / _CATCHING_UP
 
     def end(self, at: float = math.inf) -> None:
-        """End the stream after what has arrived; `at` is the monotonic time of its end, if before now [s]."""
+        """End the stream after what has arrived, or earlier at a monotonic time `at` [s]."""
         ended = self._end_at < math.inf
         self._end_at = min(self._end_at, at, time.monotonic())
         if not ended:
@@ -291,7 +290,7 @@ class LiveStream(Closing, Iterator[StreamedFrame]):
                 self._ready[0] = (dataclasses.replace(frame, restarted=True), waits_since)
 
     def _continue(self, frame: StreamedFrame) -> StreamedFrame:
-        """A frame on this clock, with only the points in range."""
+        """Put a frame onto this clock, and drop points out of range."""
         now, last = frame.time + self._ahead, self._last
         if last is not None and (now <= last.time or frame.restarted):
             begin = last.time + max(_LOOP_GAP, frame.arrived - last.arrived)
@@ -307,7 +306,7 @@ class LiveStream(Closing, Iterator[StreamedFrame]):
         return self._last
 
     def _silent(self) -> StreamedFrame:
-        """A frame that stands for a silence."""
+        """A frame that stands for a silence, with the current time."""
         now, last = time.monotonic(), self._last
         number, shown = (last.number, last.time + now - last.arrived) if last is not None else (0, 0.0)
         return StreamedFrame(
@@ -316,11 +315,11 @@ class LiveStream(Closing, Iterator[StreamedFrame]):
 
 
 class FrameOrder:
-    """Passes frames on in order, and counts the others.
+    """Passes frames on in order, and counts all others.
 
-    Frames are `received`, and then `passed` on (some of them `reordered`), `doubled`, too `late`, or `wild`:
-    with a time or number that the stream did not follow. `missed` frames never arrived, by the numbers of the
-    others; `restarts` are those of the stream's time.
+    Each `received` frame is `passed` (perhaps `reordered`), `doubled`, too `late`, or `wild`: with a time or
+    number that the stream did not follow. `missed` counts frames that never arrived, by the numbers of
+    others; `restarts` counts those of the stream's time.
     """
 
     def __init__(self) -> None:
@@ -328,21 +327,21 @@ class FrameOrder:
         self.late = self.wild = self.missed = self.restarts = 0
         self._last: StreamedFrame | None = None
         self._first: StreamedFrame | None = None  # since the time began
-        self._held: list[StreamedFrame] = []  # behind a gap, ordered by time
-        self._jumping: dict[StreamedFrame, int] = {}  # in order of arrival, with `passed` at that moment
-        self._in_a_row = 0  # jumping frames
+        self._held: list[StreamedFrame] = []  # frames behind a gap, ordered by time
+        self._jumping: dict[StreamedFrame, int] = {}  # frames of jumps by arrival, with `passed`
+        self._in_a_row = 0  # number of successive frames of a jump
         self._recent: dict[tuple[int, float], float] = {}  # arrival by number and time
         self._strides: deque[int] = deque(maxlen=_STRIDES)
         self._interval: float | None = None  # [s] per frame number
-        self._disordered = -math.inf  # [s], when a frame came out of order
+        self._disordered = -math.inf  # [s] when a frame was last out of order
 
     @property
     def interval(self) -> float:
-        """Time from frame to frame [s]; NaN while it is not known."""
+        """Time between frames [s]; NaN while unknown."""
         return math.nan if self._interval is None else self._interval * self._stride
 
     def missing_at_end(self, end: float) -> int:
-        """Number of frames that could have been sent between the last one and `end` [s]; 0 for one or two."""
+        """Number of frames that could have been sent from the last one to `end` [s]; 0 if below three."""
         if self._last is None or self._interval is None:
             return 0
         missing = math.floor((end - self._last.arrived) / self.interval)
@@ -350,7 +349,7 @@ class FrameOrder:
 
     @property
     def deadline(self) -> float:
-        """Time at which `expire` is to be called [s]; infinite while no frame is held."""
+        """Time at which `expire` must be called [s]; infinite while no frame is held."""
         if self._held:
             return min(frame.arrived for frame in self._held) + self._wait
         if self._last is None and self._jumping:
@@ -358,7 +357,7 @@ class FrameOrder:
         return math.inf
 
     def add(self, frame: StreamedFrame) -> Iterator[StreamedFrame]:
-        """Take on a frame that arrived; returns the frames to pass on now."""
+        """Add an arrived frame; yield the frames to pass on now."""
         self.received += 1
         last = self._last
         if not abs(frame.time) < LATEST_TIME:
@@ -371,7 +370,7 @@ class FrameOrder:
         elif last is not None and self._is_late(last, frame):
             self.late += 1
             if self._first is not None and frame.time > self._first.time:
-                self.missed -= self.missed > 0  # it was counted when later frames were passed on
+                self.missed -= self.missed > 0  # it was counted as missing before
             self._remember(frame)
             self._disordered = frame.arrived
         elif last is not None and self._is_next(last, frame):
@@ -382,7 +381,7 @@ class FrameOrder:
             yield from self._doubt(frame)
 
     def expire(self, now: float) -> Iterator[StreamedFrame]:
-        """The held frames that have waited long enough for the missing ones."""
+        """Yield held frames that have waited long enough for missing ones."""
         if not self.deadline <= now:
             return
         if self._last is None:
@@ -393,7 +392,7 @@ class FrameOrder:
         yield from self._release()
 
     def end(self) -> Iterator[StreamedFrame]:
-        """All frames that are held, without those of a short jump."""
+        """Yield all held frames, without those of an unconfirmed jump."""
         if self._last is None and self._jumping:
             yield from self._begin(max(map(self._group_of, self._jumping), key=len))
         yield from self._release(every=True)
@@ -401,7 +400,7 @@ class FrameOrder:
 
     @property
     def _wait(self) -> float:
-        """Time for which a frame is held behind a gap [s]."""
+        """Time for which frames are held behind a gap [s]."""
         newest = max(frame.arrived for frame in self._held)
         if newest - self._disordered < _REMEMBERED or self._interval is None:
             return _LONGEST_WAIT
@@ -409,31 +408,31 @@ class FrameOrder:
 
     @property
     def _stride(self) -> int:
-        """Step of the numbers from frame to frame; some servers send only every other frame."""
+        """Step of the frame numbers; some servers send only every other frame."""
         return max(1, min(self._strides)) if len(self._strides) == _STRIDES else 1
 
     def _hold(self, frame: StreamedFrame) -> None:
-        """Add a frame to those that are held."""
+        """Insert a frame into the held ones."""
         if self._held and frame.time < self._held[-1].time:
             self.reordered += 1
             self._disordered = frame.arrived
         bisect.insort(self._held, frame, key=lambda one: one.time)
 
     def _release(self, *, every: bool = False) -> Iterator[StreamedFrame]:
-        """Pass on held frames while none is missing before them or too many are held, or `every` one."""
+        """Pass held frames on, up to the next gap unless too many are held; all with `every`."""
         while self._held and (every or len(self._held) > _WINDOW or not self._is_behind_gap()):
             yield self._pass(self._held.pop(0))
 
     def _is_behind_gap(self) -> bool:
-        """Whether a frame is missing before the first one that is held."""
+        """Whether a frame is missing before the first held one."""
         last = self._last
         if last is None or not self._missing(last, self._held[0]):
             return False
-        # If a later frame has the expected number, the first one's number is wrong, and nothing is missing.
+        # If a later frame has the expected number, the first one's number is wrong: nothing is missing.
         return all(one.number - last.number > place for place, one in enumerate(self._held, start=1))
 
     def _pass(self, frame: StreamedFrame) -> StreamedFrame:
-        """Count a frame that is passed on, and learn the interval from it."""
+        """Count a frame that is passed on, and update the interval."""
         last, self._last = self._last, frame
         self.passed += 1
         self._remember(frame)
@@ -450,7 +449,7 @@ class FrameOrder:
         return frame
 
     def _doubt(self, frame: StreamedFrame) -> Iterator[StreamedFrame]:
-        """Hold a frame that jumps, or pass its group on if the jump has lasted."""
+        """Hold a frame that jumps, or accept the jump if it has lasted."""
         self._jumping[frame] = self.passed
         group = self._group_of(frame)
         self._in_a_row = min(self._in_a_row + 1, len(group))
@@ -460,7 +459,7 @@ class FrameOrder:
             self._leave_out_jumping(1)
 
     def _settle(self, last: StreamedFrame, frame: StreamedFrame) -> None:
-        """Hold the jumping frames that the next frame of the stream confirms; leave out old ones."""
+        """Hold frames of jumps that the stream's next frame confirms; drop old ones."""
         self._in_a_row = 0
         right = [
             one for one in self._jumping if last.time < one.time < frame.time and self._continues(one, frame)
@@ -471,19 +470,19 @@ class FrameOrder:
         self._leave_out_jumping(sum(self.passed - passed > _WINDOW for passed in self._jumping.values()))
 
     def _leave_out_jumping(self, count: int) -> None:
-        """Drop the `count` oldest frames whose time or number jumped, and count them in `wild`."""
+        """Drop the `count` oldest frames of jumps, and count them as `wild`."""
         self.wild += count
         for one in list(self._jumping)[:count]:
             del self._jumping[one]
 
     def _group_of(self, frame: StreamedFrame) -> list[StreamedFrame]:
-        """The jumping frames of the same recording as one of them, in order of arrival."""
+        """Frames of jumps in the same recording as one of them, in order of arrival."""
         group = [one for one in self._jumping if one is frame or self._fit(one, frame)]
         ordered = _increasing(sorted(group, key=lambda one: one.time))
         return [one for one in group if one in ordered]
 
     def _begin(self, group: list[StreamedFrame], *, restarted: bool | None = None) -> Iterator[StreamedFrame]:
-        """Continue the stream with frames that jumped, of the same recording or of another one."""
+        """Continue the stream with frames of an accepted jump, in the same or another recording."""
         for one in group:
             self._jumping.pop(one, None)
         self._leave_out_jumping(len(self._jumping))
@@ -507,7 +506,7 @@ class FrameOrder:
         yield from self._release()
 
     def _is_again(self, new: StreamedFrame) -> bool:
-        """Whether a frame came before."""
+        """Whether the same frame came before."""
         key = new.number, new.time
         came = [one.arrived for one in (*self._held, *self._jumping) if (one.number, one.time) == key]
         came.append(self._recent.get(key, -math.inf))
@@ -524,17 +523,17 @@ class FrameOrder:
         return -_OLD < new.time - last.time <= 0.0 and new.arrived - last.arrived < _BURST
 
     def _is_next(self, last: StreamedFrame, new: StreamedFrame) -> bool:
-        """Whether a frame follows the last one, or fits to those that are held behind a gap."""
+        """Whether a frame follows the last one, or fits the frames held behind a gap."""
         if new.time <= last.time:
             return False
         return self._continues(last, new) or bool(self._held and self._fit(self._held[-1], new))
 
     def _continues(self, last: StreamedFrame, new: StreamedFrame) -> bool:
-        """Whether a frame follows another: its steps in time and number agree and are short enough."""
+        """Whether a frame follows another one: its steps in time and number agree and are short."""
         return new.time - last.time <= self._reach(new.arrived - last.arrived) and self._agrees(last, new)
 
     def _fit(self, one: StreamedFrame, other: StreamedFrame) -> bool:
-        """Whether two frames in any order may be of the same recording."""
+        """Whether two frames, in any order, may be of the same recording."""
         first, second = sorted((one, other), key=lambda frame: frame.time)
         span, steps = second.time - first.time, second.number - first.number
         if not 0.0 < span <= self._reach(abs(one.arrived - other.arrived)):
@@ -548,7 +547,7 @@ class FrameOrder:
         return waited + ahead
 
     def _agrees(self, last: StreamedFrame, new: StreamedFrame) -> bool:
-        """Whether the steps in time and number agree, or the step in time and that in arrival."""
+        """Whether the steps in time and number agree, or those in time and arrival."""
         span, waited = new.time - last.time, new.arrived - last.arrived
         steps = new.number - last.number
         if self._interval is None:
@@ -557,7 +556,7 @@ class FrameOrder:
         return 0.0 < span <= longest and 0 <= steps <= 1.5 * (span + _SLACK) / self._interval + 1.0
 
     def _goes_on(self, new: StreamedFrame) -> bool:
-        """Whether a lasting jump continues the recording, as far as the time since its start allows."""
+        """Whether an accepted jump continues the recording, judged by the time since its start."""
         last, first = self._last, self._first
         if last is None or first is None:
             return True
@@ -567,7 +566,7 @@ class FrameOrder:
         return 0.0 < new.time - last.time <= _GOES_ON or self._agrees(last, new)
 
     def _missing(self, last: StreamedFrame, new: StreamedFrame) -> int:
-        """Number of frames missing between two, as far as their times agree with their numbers."""
+        """Number of frames missing between two, by their numbers if these agree with their times."""
         steps = new.number - last.number
         if self._interval is not None:
             steps = min(steps, round(1.5 * (new.time - last.time) / self._interval))
@@ -575,7 +574,7 @@ class FrameOrder:
 
 
 def _increasing(ordered: list[StreamedFrame]) -> list[StreamedFrame]:
-    """The longest chain of frames, ordered by time, whose numbers do not decrease."""
+    """Longest subsequence of frames, ordered by time, whose numbers do not decrease."""
     longest: list[list[StreamedFrame]] = []
     for frame in ordered:
         before = [chain for chain in longest if chain[-1].number <= frame.number]
@@ -584,7 +583,7 @@ def _increasing(ordered: list[StreamedFrame]) -> list[StreamedFrame]:
 
 
 def _usual_interval(ordered: list[StreamedFrame]) -> float | None:
-    """Median time per frame number [s]; None where the numbers do not increase."""
+    """Median time per frame number [s]; None if the numbers do not increase."""
     intervals = [
         (second.time - first.time) / (second.number - first.number)
         for first, second in pairwise(ordered)

@@ -1,8 +1,8 @@
 """NatNet, the protocol in which OptiTrack servers (Motive) stream markers: packets, a client and a server.
 
-Packets of versions 3.0 to 4.1 are little-endian: kind and payload size (two uint16), then the payload. Of a
-frame only the lists of markers are read, and as long as these are empty, because Motive can switch off
-both, the points of marker sets and assets. Every count is checked against the remaining bytes before use.
+Packets of versions 3.0 to 4.1 are little-endian: kind and payload size (two uint16), then the payload. Only a
+frame's lists of markers are read; while both are empty, as Motive can switch them off, the points of marker
+sets and assets are read instead. Every count is checked against the remaining bytes before use.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ from track.streams import COMMAND_PORT, NoServerError, ReplaySettings, split_add
 from track.streams.frame_source import ArrivingFrames
 
 Version = tuple[int, int]
-LARGEST: Final = 65507  # bytes of a UDP datagram
+LARGEST: Final = 65507  # largest UDP datagram [bytes]
 OLDEST: Final[Version] = (3, 0)
 NEWEST: Final[Version] = (4, 1)
-"""The newest known layout, which servers are asked for."""
+"""Newest known layout, which servers are asked to send."""
 _SIZED: Final[Version] = (4, 1)
-"""The first version with sizes of sections, assets and a finer clock."""
-_LOST: Final = 9e6  # [m]: Motive sends lost markers farther away than this
+"""First version with section sizes, assets and a finer clock."""
+_LOST: Final = 9e6  # [m] Motive places lost markers farther away.
 _OCCLUDED, _SEEN, _FILLED, _UNLABELED = 1, 2, 4, 16  # flags of a marker
 _NAME: Final = 256  # size of a program's name [bytes]
 _BODY: Final = 38  # size of a rigid body: ID, position, orientation, error, flags [bytes]
@@ -56,23 +56,23 @@ _MARKER: Final = np.dtype(
 _PATIENCE: Final = 3.0  # longest wait for a server [s]
 _RETRY: Final = 0.5  # time between requests to a server that does not answer [s]
 _KEEP_ALIVE: Final = 2.0  # time between keep-alive packets [s]
-_ATTENDED: Final = 0.1  # time without a read after which the thread empties the socket [s]
+_ATTENDED: Final = 0.1  # [s] Without a read for this time the thread empties the socket.
 _BUFFER: Final = 1 << 22  # size of the socket's receive buffer [bytes]
 _STAMPS: Final = 35 if sys.platform == "linux" else None  # SO_TIMESTAMPNS, which Python does not name
 _STAMP: Final = struct.Struct("@ll")  # seconds and nanoseconds
-_TICKS: Final = 1_000_000  # of our clock in a second
-_LONGEST_LATENCY: Final = 10.0  # after a longer one the server's times are of another clock [s]
-_LONGEST_STAY: Final = 60.0  # after a longer stay in the socket the clock was set [s]
+_TICKS: Final = 1_000_000  # ticks of our clock in a second
+_LONGEST_LATENCY: Final = 10.0  # [s] With a longer latency the server's times are of another clock.
+_LONGEST_STAY: Final = 60.0  # [s] After a longer time in the socket our clock was set.
 VERSIONS: Final[tuple[Version, ...]] = ((3, 0), (3, 1), (4, 0), (4, 1))
-_MOST_POINTS: Final = 1500  # points that fit into a datagram
+_MOST_POINTS: Final = 1500  # largest number of points that fit into a datagram
 _MOST_CLIENTS: Final = 8
-_CLIENT_TIMEOUT: Final = 10.0  # time without a packet after which a client is gone [s]
-_WAIT: Final = 0.05  # longest time that the server waits for a client's packet [s]
+_CLIENT_TIMEOUT: Final = 10.0  # [s] A client without a packet for this time is gone.
+_WAIT: Final = 0.05  # [s] longest wait of the server for a client's packet
 _NUMBERS: Final = 1 << 31  # frame numbers and IDs wrap around here
 
 
 class Kind(IntEnum):
-    """The used kinds of packets."""
+    """Kinds of packets in use."""
 
     CONNECT = 0
     SERVER_INFO = 1
@@ -82,7 +82,7 @@ class Kind(IntEnum):
 
 
 class DamagedPacket(ValueError):
-    """Bytes that are not a packet of the expected kind and version."""
+    """Bytes are not a packet of the expected kind and version."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,12 +100,12 @@ class ServerInfo:
 
 
 def pack(kind: Kind, payload: bytes = b"") -> bytes:
-    """A packet of a kind."""
+    """Make a packet."""
     return struct.pack("<HH", kind, len(payload)) + payload
 
 
 def unpack(packet: bytes) -> tuple[int, bytes]:
-    """Kind and payload of a packet."""
+    """Split a packet into kind and payload."""
     if len(packet) < 4:
         raise DamagedPacket("no header")
     kind, size = struct.unpack_from("<HH", packet)
@@ -123,7 +123,7 @@ def pack_connect() -> bytes:
 
 
 def pack_server_info(info: ServerInfo) -> bytes:
-    """A server's description of itself."""
+    """Packet of a server's description of itself."""
     group = bytes(int(part) for part in info.group.split(".")) if info.group else bytes(4)
     name = info.application.encode()[: _NAME - 1].ljust(_NAME, b"\0")
     versions = bytes((1, 0, 0, 0, *info.version, 0, 0))
@@ -175,7 +175,7 @@ def parse_frame(
     reader, extra, size = _Reader(payload), 4 if version >= _SIZED else 0, _MARKER.itemsize
     number = reader.integer()
     in_sets, in_assets = b"", b""
-    for _ in range(reader.count(5, extra)):  # marker sets: names, and markers once more
+    for _ in range(reader.count(5, extra)):  # marker sets: names, and markers again
         reader.skip_text()
         in_sets += reader.items(12)
     older = np.frombuffer(reader.items(12, extra), dtype="<f4").reshape(-1, 3)
@@ -194,14 +194,14 @@ def parse_frame(
             for _ in range(reader.count(4)):
                 reader.items(4)
     reader.take(8)  # time code
-    time, exposed, _, sent = struct.unpack("<d3Q", reader.take(32))  # in ticks: exposed, received, sent
+    time, exposed, _, sent = struct.unpack("<d3Q", reader.take(32))  # ticks: exposed, received, sent
     reader.take(2 * extra + 2)  # another clock, flags
     if reader.integer() != 0 or reader.left > 4 or not np.isfinite(time):
         raise DamagedPacket("no end where it should be")
     if assets:
         markers = np.frombuffer(in_assets, dtype=_MARKER)
         older = np.frombuffer(in_sets, dtype="<f4").reshape(-1, 3)
-        older = older[older.any(axis=1)]  # zeros stand for a marker that is not seen
+        older = older[older.any(axis=1)]  # A marker that is not seen has zeros.
     points, ids = _seen(markers, older)
     latency = (sent - exposed) / clock if clock and exposed else np.nan
     known = 0.0 <= latency < _LONGEST_LATENCY
@@ -211,7 +211,7 @@ def parse_frame(
 def _seen(
     markers: NDArray[np.void], older: NDArray[np.float32]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Points (N, 3) [m] and IDs (N,), without repetitions: both lists and two assets may hold one point."""
+    """Points (N, 3) [m] and IDs (N,), each point once although both lists and two assets may contain it."""
     filled_in = (markers["flags"] & _OCCLUDED != 0) | (markers["flags"] & (_SEEN | _FILLED) == _FILLED)
     points = np.concatenate([markers["position"], older])
     ids = np.concatenate([markers["id"], np.full(len(older), -1)]).astype(np.int64)
@@ -225,7 +225,7 @@ def _seen(
 
 
 class _Reader:
-    """Reads values from bytes; `DamagedPacket` beyond their end."""
+    """Reads values from bytes; raises a `DamagedPacket` beyond their end."""
 
     def __init__(self, content: bytes) -> None:
         self._content, self._at = content, 0
@@ -270,7 +270,7 @@ def open_stream(url: str) -> PointStream:
         server = socket.getaddrinfo(host, port, socket.AF_INET, socket.SOCK_DGRAM)[0][4]
         address = (str(server[0]), port)
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-            probe.connect(address)  # sends nothing, but chooses the network card that leads to the server
+            probe.connect(address)  # sends nothing, but selects the network card towards the server
             commands = _bind(probe.getsockname()[0], 0)
     except OSError as error:
         raise CaptureError(f"{url}: cannot be reached ({error.strerror or error})") from error
@@ -283,11 +283,11 @@ def open_stream(url: str) -> PointStream:
 
 
 class PointStream(ArrivingFrames):
-    """The frames of a server as they arrive, also after a restart of the server with other settings.
+    """Frames of a server as they arrive, even after the server restarts with other settings.
 
-    Only packets from the server's address and its two ports count. `poll` reads the socket in the tracker's
-    thread: a reading thread would contend with it for the interpreter at every packet. While nobody polls, as
-    when hands are measured, a thread empties the socket before it overflows.
+    Only packets from the server's address and its two ports are read. `poll` reads in the tracker's thread,
+    because a reading thread would compete for the interpreter at every packet. While nobody polls, as during
+    a measurement of hands, a thread empties the socket before it overflows.
     """
 
     without_points = "switch on Labeled Markers and Unlabeled Markers in Motive's streaming pane"
@@ -295,7 +295,7 @@ class PointStream(ArrivingFrames):
     def __init__(self, commands: socket.socket, address: tuple[str, int], server: ServerInfo) -> None:
         super().__init__()
         self._sockets, self._address = [commands], address
-        self._joined: ServerInfo | None = None  # whose group is listened to
+        self._joined: ServerInfo | None = None  # whose group was joined
         self.server = server
         """The server's description of itself."""
         self.damaged = 0
@@ -314,7 +314,7 @@ class PointStream(ArrivingFrames):
 
     @property
     def counts(self) -> dict[str, int]:
-        """Numbers of packets that were left out, as a take records them."""
+        """Numbers of ignored packets, as a take records them."""
         return {"damaged_packets": self.damaged, "foreign_packets": self.foreign}
 
     @property
@@ -327,7 +327,7 @@ class PointStream(ArrivingFrames):
         if self._closed.is_set():
             return []
         if self._joined != self.server:
-            with self._reading, suppress(CaptureError):  # the next description may be of a group
+            with self._reading, suppress(CaptureError):  # The next description may have a valid group.
                 self._listen()
         if seconds > 0.0 and not (self._arrived or self._ending):
             select.select(self._sockets, [], [], seconds)
@@ -337,7 +337,7 @@ class PointStream(ArrivingFrames):
             return self._take_all()
 
     def end(self) -> None:
-        """Take no frame that arrives from now on."""
+        """Ignore all frames that arrive from now on."""
         with self._reading:
             self._drain()
             self._ending = True
@@ -353,7 +353,7 @@ class PointStream(ArrivingFrames):
             one.close()
 
     def _listen(self) -> None:
-        """Listen to the group of the server, which may have another one after a restart."""
+        """Join the multicast group of the server, which may change after a restart."""
         server = self.server
         while len(self._sockets) > 1:
             self._sockets.pop().close()
@@ -367,7 +367,7 @@ class PointStream(ArrivingFrames):
             now = time.monotonic()
             if now >= self._kept_alive + _KEEP_ALIVE:
                 _send(self._sockets[0], pack(Kind.KEEP_ALIVE), self._address)
-                if now >= self._heard + _KEEP_ALIVE:  # a restarted server does not know this client
+                if now >= self._heard + _KEEP_ALIVE:  # A restarted server does not know this client.
                     _send(self._sockets[0], pack_connect(), self._address)
                 self._kept_alive = now
             if time.monotonic() > self._asked + _ATTENDED:
@@ -375,7 +375,7 @@ class PointStream(ArrivingFrames):
                     self._drain()
 
     def _drain(self) -> None:
-        """Take the packets that have arrived until now out of the sockets."""
+        """Read all packets that have arrived by now."""
         begin = time.monotonic()
         for one in () if self._ending or self._closed.is_set() else self._sockets:
             while (received := _receive(one)) is not None:
@@ -386,7 +386,7 @@ class PointStream(ArrivingFrames):
                     break
 
     def _parse(self, packet: bytes, sender: tuple[str, int], arrived: float) -> StreamedFrame | None:
-        """The frame of a packet, if it holds one."""
+        """The frame of a packet; None if it has none."""
         if sender[0] != self._address[0] or sender[1] not in (self._address[1], self.server.data_port):
             self.foreign += 1
             return None
@@ -400,7 +400,7 @@ class PointStream(ArrivingFrames):
             clock = self.server.clock
             try:
                 frame = parse_frame(payload, self._version, arrived, clock=clock)
-            except DamagedPacket:  # some servers send another version than they announce
+            except DamagedPacket:  # Some servers announce another version than they send.
                 other: Version = OLDEST if self._version == NEWEST else NEWEST
                 frame = parse_frame(payload, other, arrived, clock=clock)
                 self._version = other
@@ -418,7 +418,7 @@ def _bind(address: str, port: int) -> socket.socket:
     one = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
         one.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)
-        if port:  # other programs on this machine may listen to the same multicast
+        if port:  # Other programs on this machine may listen to the same group.
             one.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         if _STAMPS is not None:
             one.setsockopt(socket.SOL_SOCKET, _STAMPS, 1)
@@ -431,7 +431,7 @@ def _bind(address: str, port: int) -> socket.socket:
 
 
 def _connect(commands: socket.socket, server: tuple[str, int], url: str) -> ServerInfo:
-    """Send requests until the server describes itself."""
+    """Request the server's description until it answers."""
     for _ in range(round(_PATIENCE / _RETRY)):
         _send(commands, pack_connect(), server)
         until = time.monotonic() + _RETRY
@@ -458,7 +458,7 @@ def _connect(commands: socket.socket, server: tuple[str, int], url: str) -> Serv
 
 
 def _join(info: ServerInfo, commands: socket.socket, url: str) -> socket.socket:
-    """Listen to the group that the server multicasts to."""
+    """Join the group to which the server multicasts."""
     group, local = str(info.group), commands.getsockname()[0]
     if not ipaddress.ip_address(group).is_multicast:
         raise CaptureError(
@@ -478,7 +478,7 @@ def _send(one: socket.socket, packet: bytes, address: tuple[str, int]) -> None:
     try:
         one.sendto(packet, address)
     except OSError:
-        pass  # the network is down or a buffer is full, and the packet is lost as any other may be
+        pass  # no network or a full buffer: the packet is lost, as any other may be
 
 
 class _Received(NamedTuple):
@@ -489,7 +489,7 @@ class _Received(NamedTuple):
 
 
 def _receive(one: socket.socket) -> _Received | None:
-    """The next packet in a socket; None if there is none."""
+    """Next packet in a socket; None if there is none."""
     try:
         if _STAMPS is None:
             packet, (host, port) = one.recvfrom(LARGEST)
@@ -523,14 +523,14 @@ class PointFrames(Protocol):
 
 
 class ReplayServer(Closing):
-    """Streams frames at their rate over NatNet while there is a client, and waits without one.
+    """Streams frames at their rate over NatNet while a client is connected, and waits otherwise.
 
     The end of a `with` block or `close` ends it.
 
     Args:
-        source: A capture, whose names are not sent and in which an ID lasts until its marker is lost; a take,
-            of which only points and IDs are sent; or the path of one.
-        settings: How to play it; as `ReplaySettings()` when not given.
+        source: A capture, whose names are not sent and whose IDs last until the marker is lost; a take, of
+            which only points and IDs are sent; or the path of either.
+        settings: Settings of the replay; `ReplaySettings()` when not given.
         version: NatNet version of the packets.
         options: Fields of `ReplaySettings` that differ from `settings`, as `loop=True` or `rate=120.0`.
 
@@ -586,9 +586,9 @@ class ReplayServer(Closing):
             ) from error
         self._socket.setblocking(False)
         self._port: int = self._socket.getsockname()[1]
-        self._clients: dict[tuple[str, int], float] = {}  # times of their last packets [s]
+        self._clients: dict[tuple[str, int], float] = {}  # time of each client's last packet [s]
         self.sent = 0
-        """Number of frames that were sent so far."""
+        """Number of frames sent so far."""
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._serve, name="natnet replay", daemon=True)
         self._thread.start()
@@ -600,17 +600,17 @@ class ReplayServer(Closing):
 
     @property
     def num_clients(self) -> int:
-        """Number of clients at this moment."""
+        """Number of connected clients."""
         return len(self._clients)
 
     @property
     def num_frames(self) -> int:
-        """Number of frames of a round."""
+        """Number of frames of the capture."""
         return len(self._points)
 
     @property
     def finished(self) -> bool:
-        """Whether the last frame was sent; never in a loop."""
+        """Whether the last frame was sent; never with `loop`."""
         return not self._loop and self.sent >= len(self._points)
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""Frames from Qualisys Track Manager (QTM) over its real-time protocol, by the package qtm-rt."""
+"""Frames from Qualisys Track Manager (QTM) over its real-time protocol, with the package qtm-rt."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ _PATIENCE: Final = 3.0  # longest wait for an answer [s]
 _RETRY: Final = 1.0  # time between attempts to reach a QTM that went away [s]
 _COMPONENTS: Final = ["3d", "3dnolabels"]
 _STARTS: Final = ("EventConnected", "EventCaptureStarted", "EventRTfromFileStarted")
-_FIRST_ID: Final = 1 << 16  # first ID of unidentified markers; identified ones have smaller IDs
+_FIRST_ID: Final = 1 << 16  # first ID of unidentified markers; smaller ones are identified
 _IDS: Final = 1 << 30
-_LOST, _CLOSED = "lost", "closed"  # queued after the last frame of a connection, and of the source
+_LOST, _CLOSED = "lost", "closed"  # queued after the last frame of a connection, or of the source
 
 
 class QualisysSource:
-    """A `FrameSource` of QTM's real-time 3D points, which reconnects when QTM was away.
+    """A `FrameSource` of QTM's real-time 3D points, which reconnects after QTM was away.
 
     The ID of an identified marker is its index in QTM's list; other markers have QTM's IDs plus 65536.
     """
@@ -50,7 +50,7 @@ class QualisysSource:
             raise
 
     def __iter__(self) -> Iterator[StreamedFrame]:
-        """The frames in the order of their times, until `close`."""
+        """Yield the frames in the order of their times, until `close`."""
         self._subscribe()
         again = False
         while (arrived := self._loop.run_until_complete(self._arrived.get())) != _CLOSED:
@@ -90,7 +90,7 @@ class QualisysSource:
         return connection
 
     async def _reconnect(self) -> bool:
-        """Connect as soon as QTM is there again; returns False if `close` was called before."""
+        """Connect again as soon as QTM is back; return False if `close` was called before."""
         while True:
             while not self._arrived.empty():  # a failed attempt queues "lost", too
                 if self._arrived.get_nowait() == _CLOSED:
@@ -104,7 +104,7 @@ class QualisysSource:
             return True
 
     def _react(self, event: Any) -> None:
-        """Ask for the frames of the next measurement: a subscription ends with its measurement."""
+        """Subscribe to the next measurement, as a subscription ends with its measurement."""
         if event.name in _STARTS:
             self._subscribe()
 
@@ -115,7 +115,7 @@ class QualisysSource:
         try:
             await self._connection.stream_frames(components=_COMPONENTS, on_packet=self._take)
         except (TimeoutError, self._qtm.QRTCommandException):
-            pass  # no measurement runs; an event announces the next one
+            pass  # No measurement is running; an event announces the next one.
 
     def _take(self, packet: Any) -> None:
         self._arrived.put_nowait(frame_of(packet))

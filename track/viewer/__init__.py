@@ -1,4 +1,4 @@
-"""The web server of the viewer, which listens on this machine's own address and opens no public tunnel."""
+"""Web server of the viewer, which listens on this machine's own address and opens no public tunnel."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _PORTS: Final = range(8080, 8100)  # tried in this order when --port is not give
 
 @contextmanager
 def opened_server(host: str, port: int | None, title: str) -> Iterator[ViserServer]:
-    """Run a web server in the block; port None is the first free one from 8080 on, 0 any free one."""
+    """Run a web server in the block; port None selects the first free port from 8080 on, 0 any free one."""
     try:
         import viser
     except ImportError as error:
@@ -35,7 +35,7 @@ def opened_server(host: str, port: int | None, title: str) -> Iterator[ViserServ
         raise HandSimError(f"the viewer needs the package viser; {hint}") from error
 
     class Server(viser.ViserServer):
-        """A server that never opens viser's public tunnel, which any page could ask for."""
+        """A server that never opens viser's public tunnel, which any page could request."""
 
         def request_share_url(self, verbose: bool = True) -> str | None:
             return None
@@ -59,16 +59,16 @@ def address_of(server: ViserServer) -> str:
 
 
 def is_own_page(origin: str | None, asked: str | None, host: str) -> bool:
-    """Whether a connection with the headers Origin and Host (`asked`) comes from our page or from no browser.
+    """Whether a connection with these Origin and Host (`asked`) headers is from our page or no browser.
 
-    Any page may connect to this machine, and browsers send its origin along; other programs send none.
+    Any page may connect to this machine; browsers send the page's origin, other programs send none.
     """
     if origin is None:
         return True
     parts = urlsplit(origin)
     if asked is None or parts.netloc.lower() != asked.lower():
         return False
-    # A foreign page's own name for our address (DNS rebinding) is in both headers, but is no loopback name.
+    # With DNS rebinding both headers hold a foreign page's own name for us, which is no loopback name.
     return not _is_loopback(host) or _is_loopback(parts.hostname or "")
 
 
@@ -81,7 +81,7 @@ def _is_loopback(host: str) -> bool:
 
 @contextmanager
 def _guarded(host: str) -> Iterator[None]:
-    """Make websockets servers that start in the block refuse other pages; viser has no option for it."""
+    """Make websockets servers started in the block refuse other pages, for which viser has no option."""
     import websockets.asyncio.server as websockets_server
     from websockets.asyncio.server import ServerConnection
     from websockets.http11 import Request, Response
@@ -111,7 +111,7 @@ def _guarded(host: str) -> Iterator[None]:
 
 
 def _free_port(host: str, port: int | None) -> int:
-    """The port to listen at; viser itself would silently take another one than the given."""
+    """The port to listen at; viser itself would silently replace a given one that is taken."""
     if port is not None and not 0 <= port <= 65535:
         raise ArgumentError(f"--port is {port}, expected 0 to 65535")
     reason = ""

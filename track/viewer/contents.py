@@ -1,4 +1,4 @@
-"""Pages for everything that can be viewed: the kind of a file or folder is found by its content."""
+"""Pages for everything that can be viewed; the kind of a file or folder is recognized by its content."""
 
 from __future__ import annotations
 
@@ -40,8 +40,8 @@ ACCEPTED: Final = (
     f"({', '.join(READABLE)}), a tracked take or a simulated take's truth (.npz), or a user's file (.json)"
 )
 """The kinds of files that can be viewed."""
-_ROUNDED: Final = 0.01  # time by which --time may lie outside of a recording [s]
-_LOOKED_AT: Final = 30  # number of frames whose points decide where the first look goes
+_ROUNDED: Final = 0.01  # [s] --time may be outside of a recording by this
+_LOOKED_AT: Final = 30  # number of frames that determine the first look
 
 Run = Callable[[Callable[[], bool]], None]
 """Serves a page until the given function returns True."""
@@ -51,13 +51,13 @@ _BEFORE_COLOR: Final = (150, 150, 150)
 
 
 class Content(NamedTuple):
-    """The content of a file, ready to be shown."""
+    """Content of a file, ready to be shown."""
 
     kind: str
     show: Callable[[ViserServer], Run]
-    """Puts the content into a page; returns the function that serves the page."""
+    """Adds the content to a page; returns the function that serves the page."""
     recording: Recording | None = None
-    """Frames, of what changes over time."""
+    """Frames of content that changes over time."""
 
 
 def open_content(
@@ -69,7 +69,7 @@ def open_content(
     time: float | None = None,
     up: UpAxis = "z",
 ) -> Content:
-    """Read a file, folder or shipped layout or rig; parameters are those of `handsim view`."""
+    """Read a file, folder, or shipped layout or rig; the parameters are those of `handsim view`."""
     path, given, keys = Path(name), cast("str | Path", name), set[str]()
     suffix = path.suffix.lower()
     if not path.exists() and name in (*list_layouts(), *list_rigs()):
@@ -104,7 +104,7 @@ def open_content(
 
 
 def _moving(path: Path, name: str, rig: CameraRig | None, time: float | None, up: UpAxis) -> Content:
-    """The frames of a file or folder, with the corrector of a tracked take."""
+    """Frames of a file or folder, and a corrector for a tracked take."""
     recording: Recording
     corrector: Corrector | None = None
     if path.is_dir():
@@ -165,7 +165,7 @@ def show_recording(
     first: int = 0,
     up: UpAxis = "z",
 ) -> Run:
-    """Put a recording into a page, opened at the frame `first`; returns the function that serves the page."""
+    """Add a recording to a page, opened at frame `first`; return the function that serves the page."""
 
     def show(index: int) -> None:
         frame = recording.frame(index)
@@ -201,7 +201,7 @@ def show_recording(
 
 
 def first_look(recording: Recording) -> np.ndarray:
-    """Points [m] for the first look: wrists and labeled points, or all points, of some frames."""
+    """Points [m] for the first look: wrists and labeled points of some frames, or else all their points."""
     indices = np.unique(np.linspace(0, recording.num_frames - 1, _LOOKED_AT).astype(int))
     frames = [recording.frame(int(index)) for index in indices]
     wrists = [frame.qpos[:, :3] for frame in frames]
@@ -213,7 +213,7 @@ def first_look(recording: Recording) -> np.ndarray:
 
 
 def _still(_shown: object = None) -> Run:
-    """Serve a page that only reacts; the page's handlers live as long as `_shown`."""
+    """Serve a page that only reacts; `_shown` is kept alive with its handlers."""
 
     def run(ended: Callable[[], bool]) -> None:
         while not ended():
@@ -223,7 +223,7 @@ def _still(_shown: object = None) -> Run:
 
 
 def _show_user(server: ViserServer, hands: Sequence[GloveFit]) -> Run:
-    """Show a user's hands, flat, side by side; lines lead from the designed markers to the real ones."""
+    """Show a user's flat hands side by side; lines lead from designed to calibrated markers."""
     for node, words in (("/after", "calibrated hands"), ("/before", "hands of the nearest size")):
         switch(server, words, server.scene.add_frame(node, show_axes=False))
     corners = []

@@ -1,4 +1,4 @@
-"""Editors in the page: a person corrects labels of a take or moves markers of a layout, and saves them."""
+"""Editors in the page: a person corrects labels of a take, or moves markers of a layout, and saves."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ _GIZMO: Final = 0.03  # size of the handle that moves a marker [m]
 
 
 class Corrector:
-    """A take that is open for corrections, with those in the file beside it."""
+    """A take that is open for corrections, with those of the file beside it."""
 
     def __init__(self, path: Path, take: Take) -> None:
         self.path, self._base, self._lock = path, take, threading.Lock()
@@ -53,9 +53,9 @@ class Corrector:
         """The take with all corrections."""
         self.saved: tuple[Correction, ...] = corrections_of(path)
         self.added: tuple[Correction, ...] = ()
-        """Corrections that are not saved."""
+        """Corrections that are not saved yet."""
         self.unfitting: tuple[Correction, ...] = ()
-        """Saved corrections that fit no point."""
+        """Saved corrections that match no point."""
         self._state = _state_of(path)
         records = applied_corrections(take)
         self._stale = any(correction.record() not in records for correction in self.saved)
@@ -69,7 +69,7 @@ class Corrector:
         return bool(self.added) or self._stale
 
     def span_of(self, frame: int, column: int) -> tuple[int, int]:
-        """The first and last frame in which a point has its ID and label without a gap."""
+        """First and last frame around a frame in which its point keeps ID and label without a gap."""
         take, points = self.take, self.take.point_list
         point = points.at(frame, column)
         if points.ids[point] < 0:
@@ -82,7 +82,7 @@ class Corrector:
         return first, last
 
     def add(self, frame: int, column: int, span: tuple[int, int], label: str) -> Correction:
-        """Give a point its right label, a marker's name or `NO_MARKER`, in the frames of a span."""
+        """Correct a point's label, to a marker's name or `NO_MARKER`, in the frames of a span."""
         with self._lock:
             points, (first, last) = self.take.point_list, sorted(span)
             point, start = points.at(frame, column), frame
@@ -103,7 +103,7 @@ class Corrector:
         return correction
 
     def undo(self) -> None:
-        """Take the last unsaved correction back."""
+        """Remove the last unsaved correction."""
         with self._lock:
             if self.added:
                 self._make(self.added[:-1])
@@ -125,7 +125,7 @@ class Corrector:
         return f"saved {self.path} and {beside}"
 
     def _make(self, added: Sequence[Correction]) -> None:
-        """Make the take with the saved and these corrections; `CaptureError` if they contradict."""
+        """Apply the saved and these corrections; a `CaptureError` if they contradict each other."""
         every = (*self.saved, *added)
         corrected = correct_take(self._base, every)
         self.added, self.unfitting = tuple(added), corrected.unfitting
@@ -139,7 +139,7 @@ def label_of(take: Take, frame: int, column: int) -> str:
 
 
 def _state_of(path: Path) -> tuple[int, int] | None:
-    """Time and size of a file, to see whether it was changed; None if it is gone."""
+    """Time and size of a file, to notice changes; None if it is gone."""
     try:
         found = path.stat()
     except OSError:
@@ -148,7 +148,7 @@ def _state_of(path: Path) -> tuple[int, int] | None:
 
 
 class LabelEditor:
-    """The folder of the panel in which labels are corrected, and a halo around the chosen point."""
+    """Panel folder in which labels are corrected, and a halo around the chosen point."""
 
     def __init__(
         self,
@@ -183,7 +183,7 @@ class LabelEditor:
             self.state.content = "That marker was not seen: it has no point whose label could be wrong."
 
     def choose(self, frame: int, column: int) -> None:
-        """Choose a point by its column in a frame, and the span of its label."""
+        """Choose a point by its column in a frame, and the span in which it has its label."""
         points = self._corrector.take.point_list
         self.chosen = (frame, column)
         _set(self.span, self._corrector.span_of(frame, column))
@@ -252,7 +252,7 @@ class LabelEditor:
         self.state.content = "taken back"
 
     def _renew(self) -> None:
-        """Show the take with the corrector's present corrections."""
+        """Show the take with the current corrections."""
         self._recording.replace(self._corrector.take)
         self._list()
         self._changed()
@@ -305,12 +305,12 @@ class LabelEditor:
 
 
 def _set(handle: Any, value: object) -> None:
-    """Set the value of a GUI element, which viser's handles do through `__setattr__`."""
+    """Set the value of a GUI element, whose viser handle hides its setter from type checkers."""
     handle.value = value
 
 
 class LayoutEditor:
-    """The markers of a layout file on one hand; they can be moved and saved to `out`."""
+    """Markers of a layout file on one hand, which can be moved and saved to `out`."""
 
     def __init__(
         self, server: ViserServer, path: Path, layout: MarkerLayout, model: HandModel, out: Path
@@ -321,7 +321,7 @@ class LayoutEditor:
         self.fit: GloveFit = attach(layout, model)
         """The hand in the glove with all changes."""
         self.changed = False
-        """Whether a marker was moved since the layout was read or saved."""
+        """Whether a marker was moved since the last reading or saving."""
         self._chosen: int | None = None
         qpos = np.zeros(NUM_QPOS)
         qpos[2], qpos[3] = _HEIGHT, 1.0
@@ -367,7 +367,7 @@ class LayoutEditor:
             self._describe_chosen()
 
     def move(self, index: int, point: np.ndarray) -> None:
-        """Move a marker to the skin near a point of the page [m], if there is skin."""
+        """Move a marker to the skin near a point of the page [m], if there is any."""
         with self._lock:
             try:
                 layout = place_marker(self.fit.layout, index, self.fit.model, point - self.shift)
@@ -397,10 +397,10 @@ class LayoutEditor:
     def _drag(self, event: Any) -> None:
         chosen = self._chosen
         if chosen is None or (event.phase != "end" and self._lock.locked()):
-            return  # the step before is still being computed
+            return  # The previous step is still being computed.
         self.move(chosen, np.array(self.gizmo.position))
         if event.phase == "end":
-            self.choose(chosen)  # this moves the gizmo onto the marker
+            self.choose(chosen)  # moves the gizmo onto the marker
 
     def _show(self) -> None:
         count = self.fit.layout.num_markers

@@ -1,4 +1,4 @@
-"""Recordings for the viewer: frames of hands, points and bodies, one at a time or as a video."""
+"""Recordings for the viewer: frames of hands, points and bodies, shown singly or as a video."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ from track.take_summary import find_suspect_spans, frame_confidence
 from train.data.shards import Dataset
 
 GHOST_COLOR: Final = (128, 128, 128)
-"""Color of points without a label."""
+"""Color of unlabeled points."""
 _NO_NAME: Final = re.compile(r"(?:.*:)?\s*(?:\*|_?unlabell?ed|uname)", re.I)
 """Names that optical systems give to unnamed trajectories."""
-_ROWS_PER_SECOND: Final = 4.0  # rows of a training set that are played per second [Hz]
-_MOST_LIVE_POINTS: Final = 400  # points of a live frame that are shown
+_ROWS_PER_SECOND: Final = 4.0  # [Hz] played rows of a training set
+_MOST_LIVE_POINTS: Final = 400  # largest number of shown points of a live frame
 _VIDEO_RATE: Final = 30.0  # highest rate of a video [Hz]
 
 
@@ -45,7 +45,7 @@ class ShownFrame:
     time: float
     """[s]"""
     words: tuple[str, ...] = ()
-    """Lines on the state of the frame."""
+    """Lines about the frame."""
     hands: tuple[HandModel, ...] = ()
     qpos: Float[np.ndarray, "H 27"] = field(default_factory=lambda: np.empty((0, 27)))
     """Poses [m, rad]; NaN for a hand without a pose."""
@@ -54,7 +54,7 @@ class ShownFrame:
     labels: Int[np.ndarray, "N"] = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     """Indices of `Recording.label_names`, -1 for a ghost."""
     seen: Bool[np.ndarray, "N"] = field(default_factory=lambda: np.empty(0, dtype=np.bool_))
-    """Which points were seen; the others are computed from a pose."""
+    """Which points were seen; others are computed from a pose."""
     bodies: Float[np.ndarray, "B 7"] = field(default_factory=lambda: np.empty((0, 7)))
     """Position [m] and orientation (wxyz) of each body; NaN if lost."""
     rays: Float[np.ndarray, "R 2 3"] = field(default_factory=lambda: np.empty((0, 2, 3)))
@@ -91,7 +91,7 @@ class Recording(ABC):
 
 
 class TakeRecording(Recording):
-    """A take with the given cameras, or with those in its settings."""
+    """A take with the given cameras, or those in its settings."""
 
     def __init__(self, take: Take, rig: CameraRig | None = None) -> None:
         self._models = tuple(hand.model for hand in take.hands)
@@ -102,7 +102,7 @@ class TakeRecording(Recording):
         self.replace(take)
 
     def replace(self, take: Take) -> None:
-        """Show the same frames with other labels and poses."""
+        """Replace labels and poses of the same frames."""
         self._take, self.curves, self.suspects = take, _curves(take), find_suspect_spans(take)
         self._filled = np.concatenate([take.filled(side) for side in take.sides], axis=1)
         self._markers = np.concatenate([take.markers(side) for side in take.sides], axis=1)
@@ -136,13 +136,13 @@ class TakeRecording(Recording):
 
 
 def _words_of(name: str, status: object, rms: float, filled: int = 0) -> str:
-    """A line on the state of a hand or a body."""
+    """Line on the state of a hand or a body."""
     rms_words = f", RMS {1e3 * rms:.2f} mm" if np.isfinite(rms) else ""
     return f"**{name}** {status}{rms_words}" + (f", {filled} filled in" if filled else "")
 
 
 def _curves(take: Take) -> dict[str, Float[np.ndarray, "T"]]:
-    """RMS of each hand, and doubt; empty if no pose was fitted, as in a simulation's truth."""
+    """RMS of each hand and doubt over time; empty if no pose was fitted, as in a simulated take."""
     if not np.isfinite(take.rms).any():
         return {}
     curves = {f"{side} RMS [mm]": 1e3 * take.rms[:, hand] for hand, side in enumerate(take.sides)}
@@ -150,12 +150,12 @@ def _curves(take: Take) -> dict[str, Float[np.ndarray, "T"]]:
 
 
 def rig_of_settings(rig: object) -> CameraRig | None:
-    """The rig that settings hold or name as a shipped one; else None, also for a path."""
+    """The rig stored in settings, or the shipped rig that they name; None for a path."""
     return load_rig(rig) if isinstance(rig, dict) or rig in list_rigs() else None
 
 
 class LiveRecording(Recording):
-    """The newest frame of a running tracker."""
+    """Newest frame of a running tracker."""
 
     def __init__(
         self, hands: Sequence[GloveFit], bodies: Sequence[RigidTemplate], rig: CameraRig | None
@@ -171,7 +171,7 @@ class LiveRecording(Recording):
         return ShownFrame(0.0)
 
     def frame_of(self, frame: StreamedFrame, tracked: TrackedFrame) -> ShownFrame:
-        """Make a frame of what the tracker took and gave."""
+        """Make a frame from the tracker's input and output."""
         filled = [hand.markers[hand.filled] for hand in tracked.hands]
         labels = [offset + hand.filled for offset, hand in zip(self._offsets, tracked.hands, strict=False)]
         bodies = [np.concatenate([body.translation, body.rotation]) for body in tracked.bodies]
@@ -191,7 +191,7 @@ class LiveRecording(Recording):
 
 
 class CaptureRecording(Recording):
-    """A marker file: named trajectories in color, the others gray."""
+    """A marker file: named trajectories in color, others gray."""
 
     has_hands = has_filled = False
 
@@ -217,7 +217,7 @@ class CaptureRecording(Recording):
 
 
 class DatasetRecording(Recording):
-    """The rows of a training set, with the given cameras or with those in its settings."""
+    """Rows of a training set, with the given cameras or those in its settings."""
 
     def __init__(self, dataset: Dataset, rig: CameraRig | None = None) -> None:
         self._dataset = dataset
@@ -251,7 +251,7 @@ class DatasetRecording(Recording):
         )
 
     def _hand(self, shard: int, number: int) -> HandModel:
-        """The hand of a row, kept for the next row, which mostly shares it."""
+        """The hand of a row, cached because the next row mostly has the same one."""
         if self._model is None or self._model[0] != (shard, number):
             self._model = ((shard, number), HandModel(self._dataset.hands(shard)[number]))
         return self._model[1]
@@ -265,7 +265,7 @@ class DatasetRecording(Recording):
 
 
 def label_colors(names: Sequence[str]) -> UInt8[np.ndarray, "K 3"]:
-    """A color for each label, equal for both hands, and the color of unlabeled points at the end."""
+    """A color for each label, equal for both hands, with the color of unlabeled points last."""
     bare = [name.rsplit(":", 1)[-1] for name in names]
     order = {name: number for number, name in enumerate(dict.fromkeys(bare))}
     colors = distinct_colors(len(order))  # in the order of the glove, so that digits differ
@@ -283,9 +283,9 @@ def write_video(
     write_clip: Callable[..., None],
     progress: Progress = no_progress,
 ) -> int:
-    """Write a recording as a video (.mp4) in its own time; returns the number of pictures.
+    """Write a recording as a video (.mp4) in real time; return the number of pictures.
 
-    The view holds the points `shown` [m]; `write_clip` of `render.illustrations` draws and encodes.
+    The view contains the points `shown` [m]; `write_clip` of `render.illustrations` draws and encodes.
     """
     rate, frames = chosen_frames(recording.times)
     turn = upright(up)
@@ -305,7 +305,7 @@ def write_video(
 
 
 def chosen_frames(times: Float[np.ndarray, "T"]) -> tuple[float, list[int]]:
-    """The rate of a video [Hz], and the frame of each picture: the last one up to the picture's time."""
+    """Rate of a video [Hz], and the frame of each picture: the last one until the picture's time."""
     if len(times) < 2:
         return _VIDEO_RATE, [0]
     rate = min(_VIDEO_RATE, 1.0 / float(np.median(np.diff(times))))

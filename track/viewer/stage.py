@@ -33,13 +33,13 @@ if TYPE_CHECKING:
 
 _FROM: Final = np.array([0.62, -0.62, 0.48])  # direction from the target of the first look to the eye
 _NEAREST: Final = 0.22  # smallest distance between the eye and its target [m]
-_HALF_SIDE: Final = 0.3  # half side of the cube that wrists move in, as in training sets [m]
-_SPACING: Final = 0.2  # distance between grid points whose cameras are counted [m]
+_HALF_SIDE: Final = 0.3  # [m] half side of the cube in which wrists move in training sets
+_SPACING: Final = 0.2  # [m] spacing of grid points at which cameras are counted
 _MOST_POINTS: Final = 40_000  # largest number of grid points
 _FRUSTUM: Final = 0.12  # size of a camera's frustum [m]
 _FEW_CAMERAS_COLOR, _ALL_CAMERAS_COLOR = np.array([214, 96, 60]), np.array([40, 120, 180])
 _SKIN_COLORS: Final[dict[Side, tuple[int, int, int]]] = {"right": (214, 170, 140), "left": (150, 172, 200)}
-_FILLED: Final = 0.45  # relative size of a marker that was not seen
+_FILLED: Final = 0.45  # relative size of an unseen marker
 _BODY_COLOR: Final = (120, 124, 132)
 _RAY_COLOR: Final = (235, 170, 60)
 
@@ -51,8 +51,8 @@ def set_stage(
     ground: float | None = None,
     up: UpAxis = "z",
 ) -> None:
-    """Set light, ground and a first look at points [m], with the ground at a height or below them."""
-    turn = upright(up).T  # of the stage, to the axes of the points
+    """Set light, ground and a first look at points [m]; the ground is at a height or below the points."""
+    turn = upright(up).T  # from the axes of the stage to those of the points
     there = points[np.isfinite(points).all(axis=1)] @ turn
     low, high = np.percentile(there, [2, 98], axis=0) if len(there) else np.tile([[-0.1], [0.1]], 3)
     middle, size = (low + high) / 2, float(np.linalg.norm(high - low))
@@ -60,7 +60,7 @@ def set_stage(
     cell = 0.01 if size < 0.5 else 0.1
     scene = server.scene
     scene.set_up_direction(turn[:, 2])
-    # The light is soft, so that labels keep their colors.
+    # Soft light preserves the colors of labels.
     scene.configure_default_lights(enabled=False)
     scene.configure_environment_map("studio", environment_intensity=0.12)
     scene.add_light_hemisphere(
@@ -75,7 +75,7 @@ def set_stage(
         height=200 * cell,
         cell_size=cell,
         section_size=10 * cell,
-        cell_color=(180, 180, 180),  # on white as on black
+        cell_color=(180, 180, 180),  # visible on white and on black
         section_color=(140, 140, 140),
         cell_thickness=0.6,
         section_thickness=1.0,
@@ -92,7 +92,7 @@ def set_stage(
 
 
 def show_rig(server: ViserServer, rig: CameraRig) -> None:
-    """Show the cameras as frusta with their numbers."""
+    """Show cameras as frusta with their numbers."""
     quaternions = rotation_quaternions(rig.T_world_camera[:, :3, :3])
     for number, (camera, quaternion) in enumerate(zip(rig.cameras, quaternions, strict=True), 1):
         width, height = camera.angles
@@ -112,7 +112,7 @@ def show_rig(server: ViserServer, rig: CameraRig) -> None:
 
 
 def show_volume(server: ViserServer, rig: CameraRig) -> None:
-    """Show the cube that wrists move in, and dots colored by the number of cameras that see them."""
+    """Show the cube in which wrists move, and dots colored by the number of cameras that see them."""
     side = 2 * _HALF_SIDE
     server.scene.add_box("/volume", (40, 120, 60), (side, side, side), wireframe=True, position=ROOM_CENTER)
     places, counts = camera_counts(rig)
@@ -127,7 +127,7 @@ def show_volume(server: ViserServer, rig: CameraRig) -> None:
 
 
 def camera_counts(rig: CameraRig) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Grid points (N, 3) [m] that two or more cameras see, and the number of these cameras (N,)."""
+    """Grid points (N, 3) [m] seen by at least two cameras, and their numbers of cameras (N,)."""
     low, high = rig.positions.min(axis=0), rig.positions.max(axis=0)
     low[2] = min(0.0, low[2])
     spacing = max(_SPACING, float((np.prod(high - low + _SPACING) / _MOST_POINTS) ** (1 / 3)))
@@ -146,7 +146,7 @@ def switch(server: ViserServer, words: str, node: SceneNodeHandle, *, visible: b
 class HandSkin:
     """The skin of one hand, by default in the color of its side.
 
-    The mesh moves with the wrist, and its bones in the mesh: moving a whole hand takes two small messages.
+    The mesh moves with the wrist, and bones move within it: moving a whole hand takes two small messages.
     """
 
     def __init__(
@@ -182,7 +182,7 @@ class HandSkin:
         weights = np.zeros((len(surface.vertices), len(model.rest_transforms)))
         np.add.at(
             weights, (np.arange(len(weights))[:, None], surface.bone_indices), surface.bone_weights
-        )  # at most four bones move a vertex, which is also the page's limit
+        )  # At most four bones move a vertex, which is viser's limit, too.
         positions, quaternions = _poses(model.rest_transforms)
         return self._server.scene.add_mesh_skinned(
             self._name,
@@ -202,13 +202,13 @@ def _poses(transforms: Float[np.ndarray, "L 4 4"]) -> tuple[NDArray[np.float64],
 
 
 class PointBalls:
-    """Up to `most` balls with a radius [m], all in one message a frame."""
+    """Up to `most` balls with a radius [m], updated in one message per frame."""
 
     def __init__(
         self, server: ViserServer, name: str, label_names: tuple[str, ...], *, most: int, radius: float
     ) -> None:
         self._server, self._name, self._names = server, name, label_names
-        self._palette = label_colors(label_names)  # label -1 takes the last row
+        self._palette = label_colors(label_names)  # Label -1 selects the last row.
         self._texts: dict[int, LabelHandle] = {}
         self._chosen: frozenset[int] = frozenset()
         ball = trimesh.creation.icosphere(subdivisions=2, radius=radius)
@@ -230,7 +230,7 @@ class PointBalls:
     def show(
         self, points: Float[np.ndarray, "N 3"], labels: Int[np.ndarray, "N"], seen: Bool[np.ndarray, "N"]
     ) -> None:
-        """Show points [m]; those that were not seen are small."""
+        """Show points [m]; unseen ones are small."""
         count = min(len(points), self._most)
         self._points, self._labels = points[:count], labels[:count]
         positions, colors = self.balls.batched_positions.copy(), self.balls.batched_colors.copy()
@@ -243,7 +243,7 @@ class PointBalls:
         self._show_names()
 
     def name(self, labels: frozenset[int]) -> None:
-        """Show the names of these labels beside their points, and no others."""
+        """Show the names of these labels beside their points, and hide all others."""
         self._chosen = labels
         self._show_names()
 
@@ -272,7 +272,7 @@ class PointBalls:
 
 
 class FrameView:
-    """The scene of a recording, with switches for its parts."""
+    """Scene of a recording, with switches for its parts."""
 
     def __init__(self, server: ViserServer, recording: Recording) -> None:
         self._server, self._recording = server, recording
@@ -299,7 +299,7 @@ class FrameView:
         self.on_pick: Callable[[int], None] = lambda index: None
         """Called with the index of a clicked point of the frame."""
         self._frame: ShownFrame | None = None
-        self._lock = threading.RLock()  # viser handles switches in other threads
+        self._lock = threading.RLock()  # viser runs switches in other threads
         self._add_switches(recording)
         if recording.rig is not None:
             show_rig(server, recording.rig)
@@ -342,7 +342,7 @@ class FrameView:
         server.gui.add_command("Center the hands", hotkey="C").on_trigger(self._look)
 
     def _look(self, event: Any) -> None:
-        """Move the eye of the requesting page, without turning it, so that the hands are in the middle."""
+        """Move the eye of the requesting page, without turning it, so that the hands are in the center."""
         frame, client = self._frame, event.client
         if frame is None or client is None:
             return
@@ -354,8 +354,8 @@ class FrameView:
             camera.position = camera.position + points.mean(axis=0) - camera.look_at
 
     def _show_points(self) -> None:
-        """Show the points of the frame and the names that are wanted, in one message."""
-        # Switches are handled in threads of their own: the last one to draw must have read all of them.
+        """Show the points of the frame and the requested names, in one message."""
+        # Switches run in their own threads, so the last one to draw must read all of them.
         with self._lock:
             frame = self._frame
             if frame is None:

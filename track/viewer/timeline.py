@@ -1,4 +1,4 @@
-"""Time in the page: a recording is played, with texts and plots, or a live tracker is shown."""
+"""Time in the page: playing of a recording, with texts and plots, or a live tracker."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ if TYPE_CHECKING:
     from handsim.space.rig import CameraRig
 
 PICTURES: Final = 60.0
-"""Most pictures per second while playing [Hz]."""
+"""Highest rate of shown frames [Hz]."""
 _SPEEDS: Final = {"0.1 x": 0.1, "0.25 x": 0.25, "0.5 x": 0.5, "1 x": 1.0, "2 x": 2.0, "4 x": 4.0}
-_SLIDER_PERIOD: Final = 0.1  # time between two moves of the slider while playing [s]
-_IDLE: Final = 0.2  # longest wait before `ended` is asked again [s]
-_TEXT_PERIOD: Final = 0.1  # time between two texts while playing [s]
-_LIVE_TEXT_PERIOD: Final = 0.2  # time between two texts of a live view [s]
+_SLIDER_PERIOD: Final = 0.1  # [s] least time between moves of the slider while playing
+_IDLE: Final = 0.2  # [s] longest interval between calls of `ended`
+_TEXT_PERIOD: Final = 0.1  # [s] least time between texts while playing
+_LIVE_TEXT_PERIOD: Final = 0.2  # [s] least time between texts of a live view
 _COLUMNS: Final = 600  # largest number of points in a plotted curve
 _STROKES: Final = ("#b8572b", "#3f7396", "#5b8c5a", "#7a5ba0")
 
@@ -38,7 +38,7 @@ Key = Literal["space", "arrowleft", "arrowright", "home", "end", "pageup", "page
 
 
 class Timeline:
-    """Chooses frames; `run` calls `show` with their indices, all other methods only request one."""
+    """Selects frames: `run` calls `show` with their indices, all other methods only request a frame."""
 
     def __init__(
         self, server: ViserServer, times: Float[np.ndarray, "T"], show: Callable[[int], None]
@@ -46,9 +46,9 @@ class Timeline:
         self._times, self._show = times, show
         self._wake = threading.Event()
         self.index, self.playing = 0, False
-        """The frame that was requested last, and whether the recording is being played."""
+        """The last requested frame, and whether the recording is playing."""
         self._shown = -1
-        self._anchor = (0.0, 0.0)  # clock and time of the recording when playing began [s]
+        self._anchor = (0.0, 0.0)  # clock and time of the recording at the start of playing [s]
         self._slider_due = 0.0
         last = max(len(times) - 1, 1)
         gui = server.gui
@@ -81,7 +81,7 @@ class Timeline:
                 self.go_to(self._slider.value)
 
     def go_to(self, index: int) -> None:
-        """Request a frame; indices beyond the ends mean the first or last frame."""
+        """Request a frame; indices beyond the ends select the first or last frame."""
         self.index = int(np.clip(index, 0, len(self._times) - 1))
         self._set_anchor()
         self._wake.set()
@@ -92,15 +92,15 @@ class Timeline:
         self.go_to(index)
 
     def step(self, frames: int) -> None:
-        """Stop playing and go some frames on, or back."""
+        """Stop playing, and go some frames forward or back."""
         self.jump(self.index + frames)
 
     def toggle(self) -> None:
-        """Play, or stop playing."""
+        """Start or stop playing."""
         self.play(not self.playing)
 
     def play(self, playing: bool) -> None:
-        """Play, or stop playing; after the end the recording begins anew."""
+        """Start or stop playing; after its end the recording starts again."""
         if playing != self.playing:
             self._button.label = "Pause" if playing else "Play"
         self.playing = playing and len(self._times) > 1
@@ -120,12 +120,12 @@ class Timeline:
             self._wake.clear()
 
     def refresh(self) -> None:
-        """Request the same frame again, because its content has changed."""
+        """Request the same frame again after its content changed."""
         self._shown = -1
         self._wake.set()
 
     def update(self) -> None:
-        """Show the requested frame, unless it is shown."""
+        """Show the requested frame, unless it is shown already."""
         index = self.index
         if index == self._shown:
             return
@@ -139,7 +139,7 @@ class Timeline:
     def _advance(self) -> None:
         clock, begin = self._anchor
         now = begin + (time.perf_counter() - clock) * _SPEEDS[self._speed.value]
-        if now >= 2.0 * self._times[-1] - self._times[-2]:  # the last frame is shown for one interval
+        if now >= 2.0 * self._times[-1] - self._times[-2]:  # The last frame is shown for one interval.
             self.index = 0
             self._set_anchor()
             return
@@ -150,7 +150,7 @@ class Timeline:
 
 
 class StatusPanel:
-    """Text of the shown frame, plots, and buttons that lead to doubtful frames."""
+    """Text on the shown frame, plots, and buttons that lead to doubtful frames."""
 
     def __init__(self, server: ViserServer, recording: Recording) -> None:
         self._server, self._recording, self._due = server, recording, 0.0
@@ -161,14 +161,14 @@ class StatusPanel:
         self._plots: list[tuple[GuiUplotHandle, list[str]]] = []
 
     def add_doubts(self, go_to: Callable[[int], None]) -> None:
-        """Add buttons that call `go_to` with a doubtful frame, if there are such frames."""
+        """Add buttons that call `go_to` with a doubtful frame, if there are any."""
         self._go_to = go_to
         if self._recording.suspects:
             self._rows = self._server.gui.add_folder("Doubtful frames")
             self._add_rows()
 
     def add_plots(self) -> None:
-        """Add a plot of the curves with a unit and one of those without, if there are such curves."""
+        """Add one plot of the curves with a unit and one of the others, if there are any."""
         gui, recording = self._server.gui, self._recording
         if not recording.curves or recording.num_frames < 2:
             return
@@ -185,7 +185,7 @@ class StatusPanel:
                 self._plots.append((plot, names))
 
     def renew(self) -> None:
-        """Renew buttons and plots of a recording that was changed."""
+        """Renew buttons and plots after the recording changed."""
         for row in self._buttons:
             row.remove()
         self._add_rows()
@@ -207,7 +207,7 @@ class StatusPanel:
                 self._go_to(frame)
 
     def show(self, index: int, frame: ShownFrame, *, hurried: bool) -> None:
-        """Show the state of a frame; if `hurried`, at most ten times a second."""
+        """Show the state of a frame; with `hurried`, at most ten times a second."""
         now = time.perf_counter()
         if hurried and now < self._due:
             return
@@ -217,20 +217,20 @@ class StatusPanel:
 
 
 def _columns(recording: Recording, names: list[str]) -> tuple[np.ndarray, ...]:
-    """Thinned times, and the thinned values of some curves."""
+    """Decimated times, and the decimated values of some curves."""
     columns = [thinned(recording.times, recording.curves[name]) for name in names]
     return (columns[0][0], *(values for _, values in columns))
 
 
 def thinned(times: NDArray[np.float64], values: NDArray[np.float64]) -> tuple[np.ndarray, np.ndarray]:
-    """Times and largest values of the columns of a plot, from a curve (T,) that may hold NaN."""
+    """Reduce a curve (T,), which may hold NaN, to the columns of a plot: their times and largest values."""
     step = -(-len(times) // _COLUMNS)
     starts = np.arange(0, len(times), step)
     return times[starts], np.fmax.reduceat(values, starts)
 
 
 class LiveView(Closing):
-    """A `FrameOutput` that shows a tracker's newest frame, from a thread of its own."""
+    """A `FrameOutput` that shows a tracker's newest frame, from its own thread."""
 
     def __init__(self, server: ViserServer, rig: CameraRig | None = None, up: UpAxis = "z") -> None:
         self._server, self._rig, self._up = server, rig, up
@@ -242,11 +242,11 @@ class LiveView(Closing):
 
     @property
     def counts(self) -> dict[str, int]:
-        """Empty: frames that are not shown do not count as dropped."""
+        """Empty, as frames that are not shown do not count as dropped."""
         return {}
 
     def start(self, hands: Sequence[GloveFit], bodies: Sequence[RigidTemplate]) -> None:
-        """Take on a tracker's hands and bodies; again when their size changes."""
+        """Set the tracker's hands and bodies; called again when their size changes."""
         self._recording = LiveRecording(hands, bodies, self._rig)
         if self._thread is not None:
             return
@@ -256,14 +256,14 @@ class LiveView(Closing):
         self._thread.start()
 
     def send(self, frame: StreamedFrame, tracked: TrackedFrame) -> None:
-        """Replace the newest frame, in microseconds."""
+        """Replace the newest frame, within microseconds."""
         if not frame.silent:
             self.frames += 1
             self._newest = (frame, tracked)
             self._came.set()
 
     def notes(self) -> tuple[str, ...]:
-        """How many frames were shown."""
+        """A line with the number of shown frames."""
         return (f"{self.frames} frames tracked, {self.pictures} of them shown",)
 
     def close(self) -> None:

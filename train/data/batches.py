@@ -1,4 +1,4 @@
-"""Batches for training: random rows, stretched and corrupted anew each time by us or by a user's function."""
+"""Batches for training: random rows, stretched and corrupted anew by the paper's or a user's corruption."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ if TYPE_CHECKING:
     from train.data.shards import MappedRows
 
 MAX_CHANGED: Final = 100
-"""Most points to add to a cloud or to drop from it."""
+"""Largest number of points to add to a cloud or to drop from it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Corruption(Settings):
-    """The paper's corruption, as it is drawn for training and for tests."""
+    """The paper's corruption, for training and for tests."""
 
     occlude: Annotated[int, Limits(0, MAX_CHANGED)] = 5
-    """Most draws of a marker to drop; drawn with replacement, as the paper's occlusion ratio implies."""
+    """Largest number of draws of a marker to drop, with replacement, as the paper's ratio implies."""
     ghosts: Annotated[int, Limits(0, MAX_CHANGED)] = 2
-    """Most ghosts added, uniform in the sample's box grown by `margin`."""
+    """Largest number of added ghosts, uniform in the sample's box grown by `margin`."""
     jitter: Annotated[float, Limits(0.0, 0.1)] = 0.0
     """Half width of the uniform noise on each coordinate [m]."""
     margin: Annotated[float, Limits(0.0, 10.0)] = 0.1
-    """Growth of the box [share of its sides]."""
+    """Growth of the box, as share of its sides."""
 
 
 class Cloud(NamedTuple):
@@ -55,16 +55,16 @@ def corrupt(
     ghosts: Float[np.ndarray, "B G 3"] | None = None,
     rng: np.random.Generator,
 ) -> Cloud:
-    """Corrupted, shuffled clouds (B, N) of clean markers (B, M).
+    """Corrupt and shuffle clean markers (B, M) to clouds (B, N).
 
     Args:
         markers: Marker positions (B, M, 3) [m]; NaN where a marker is missing already.
-        corruption: How much is drawn at random on top.
+        corruption: Additional random corruption.
         ghosts: Ghosts that the rig sees (B, G, 3) [m], NaN where there is none.
         rng: Source of all randomness.
 
     Returns:
-        Points (B, N, 3) [m], which of them are there (B, N), and the marker of each (B, N), -1 for a ghost.
+        Points (B, N, 3) [m], which of them are present (B, N), and the marker of each (B, N), -1 for a ghost.
 
     Raises:
         ArgumentError: An argument is of another type or shape.
@@ -114,7 +114,7 @@ def shuffled(
 def _draw_ghosts(
     positions: NDArray[np.float64], known: NDArray[np.bool_], corruption: Corruption, rng: np.random.Generator
 ) -> NDArray[np.float64]:
-    """Zero to `ghosts` points uniform in each cloud's box [m], NaN for those that are not drawn."""
+    """Zero to `ghosts` points, uniform in each cloud's box [m]; NaN for points that are not drawn."""
     batch, most = len(positions), corruption.ghosts
     low = np.where(known[..., None], positions, np.inf).min(1)
     high = np.where(known[..., None], positions, -np.inf).max(1)
@@ -127,14 +127,14 @@ def _draw_ghosts(
 
 
 CORRUPTIONS: Final = "handsim.corruptions"
-"""Group of entry points of corruptions."""
+"""Group of entry points for corruptions."""
 _NOUN: Final = "corruption"
-_MAX_COORDINATE: Final = 10.0  # of a point, from the middle of the markers [m]
-_MAX_POINTS: Final = 512  # points of a cloud
+_MAX_COORDINATE: Final = 10.0  # [m] largest coordinate of a point relative to the markers' center
+_MAX_POINTS: Final = 512  # largest number of points in a cloud
 
 
 class OwnCorruption(Protocol):
-    """Makes clouds as cameras might see them; any function with this signature is one."""
+    """A user's own corruption: any function with this signature."""
 
     def __call__(
         self, markers: Float[np.ndarray, "B M 3"], *, rng: np.random.Generator
@@ -142,7 +142,7 @@ class OwnCorruption(Protocol):
         """Corrupt a batch.
 
         Args:
-            markers: All markers of right hands [m], around each hand's middle; left ones are mirrored.
+            markers: All markers of right hands [m], relative to each hand's center; left hands are mirrored.
             rng: Source of all randomness.
 
         Returns:
@@ -156,7 +156,7 @@ def draw_cloud(
     *,
     rng: np.random.Generator,
 ) -> Cloud:
-    """Shuffled clouds (B, N) of clean markers [m] by our corruption or a user's."""
+    """Shuffled clouds (B, N) of clean markers [m], by the paper's or a user's corruption."""
     if isinstance(corruption, Corruption):
         return corrupt(markers, corruption, rng=rng)
     if isinstance(corruption, str):
@@ -179,7 +179,7 @@ def draw_cloud(
 
 
 def check_corruption(corruption: OwnCorruption | str, num_markers: int) -> None:
-    """Load a corruption and try it on two clouds."""
+    """Load a corruption and test it on two clouds."""
     rng = np.random.default_rng(0)
     draw_cloud(corruption, rng.uniform(-0.1, 0.1, (2, num_markers, 3)), rng=rng)
 
@@ -187,7 +187,7 @@ def check_corruption(corruption: OwnCorruption | str, num_markers: int) -> None:
 def _check(
     owner: str, points: NDArray[np.float64], labels: NDArray[np.generic], batch: int, count: int
 ) -> None:
-    """Refuse what a user's corruption returned for `count` markers of a batch, unless it is valid."""
+    """Refuse an invalid result of a user's corruption for `count` markers."""
     if points.ndim != 3 or points.shape[0] != batch or points.shape[2] != 3 or points.shape[1] > _MAX_POINTS:
         raise ArgumentError(
             f"{owner} returns points of shape {points.shape}, expected ({batch}, N, 3) with N up to "
@@ -216,7 +216,7 @@ def _check(
 
 
 class Weights(NamedTuple):
-    """Factors of the losses of a part of a batch, so that their mean over all parts is the batch's loss."""
+    """Factors for the losses of a part of a batch, so that their mean over all parts is the batch's loss."""
 
     points: float = 1.0
     """Factor of a mean over points."""
@@ -225,11 +225,11 @@ class Weights(NamedTuple):
 
 
 WHOLE: Final = Weights()
-"""The factors for the whole batch."""
+"""Factors for the whole batch."""
 
 
 class Batch(NamedTuple):
-    """Clouds and the markers behind them."""
+    """Clouds and their true markers."""
 
     cloud: Cloud
     markers: Float[np.ndarray, "B M 3"]
@@ -239,7 +239,7 @@ class Batch(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """The clouds of a batch from which one of several processes learns: every `count`-th from `first` on."""
+    """The clouds of a batch for one of several processes: every `count`-th, starting from `first`."""
 
     first: int = 0
     count: int = 1
@@ -264,12 +264,12 @@ def paper_corruption(num_markers: int) -> Corruption:
 
 @dataclass(frozen=True, slots=True)
 class BatchRecipe:
-    """How a batch is drawn."""
+    """Parameters of the drawing of batches."""
 
     batch: int
     """Number of clouds."""
     corruption: Corruption | OwnCorruption | str
-    """Corruption of clean markers, or a user's function or its name."""
+    """Corruption of clean markers: the paper's, a user's function, or its name."""
     jitter: float = 0.0
     """Largest half width of the uniform noise on each coordinate [m]; every batch draws its own."""
     rig_share: float = 0.0
@@ -323,7 +323,7 @@ def _stretches(count: int, anisotropy: float, rng: np.random.Generator) -> NDArr
 
 
 def _mirrors(hand: NDArray[np.uint32]) -> NDArray[np.float64]:
-    """Matrices (B, 3, 3) that mirror left hands; a person's hands are stored in the order of `SIDES`."""
+    """Matrices (B, 3, 3) that mirror left hands; hands of a person are stored in the order of `SIDES`."""
     mirrors = np.tile(np.eye(3), (len(hand), 1, 1))
     mirrors[hand % len(SIDES) == SIDES.index("left"), 0, 0] = -1.0
     return mirrors

@@ -1,4 +1,4 @@
-"""Batches of labeled clouds without end, out of a training set, for networks of your own."""
+"""Endless batches of labeled clouds from a training set, for users' own networks."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ from train.data.shards import Dataset, load_dataset
 
 
 class CloudStream(IterableDataset[tuple[Tensor, Tensor, Tensor]]):
-    """Clouds of points of one hand, each corrupted anew, in batches without end.
+    """Clouds of points of one hand, each corrupted anew, in endless batches.
 
-    An item is a batch: points (B, N, 3) [m], float32, around the middle of the hand's markers, 0 in padding;
-    which of them are there (B, N), bool; and the marker of each (B, N), int64, -1 for a ghost. Left hands
-    are mirrored to right ones. N is the fullest cloud's.
+    An item is a batch: points (B, N, 3) [m], float32, relative to the center of the hand's markers, 0 in
+    padding; which of them are present (B, N), bool; and the marker of each (B, N), int64, -1 for a ghost.
+    Left hands are mirrored to right ones. N is that of the fullest cloud.
 
-    For `torch.utils.data.DataLoader(stream, batch_size=None, num_workers=...)`. Batch number n depends on the
-    set, the settings, the seed and n alone, and workers share the numbers: the sequence is the same with any
+    For `torch.utils.data.DataLoader(stream, batch_size=None, num_workers=...)`. Batch number n depends only
+    on the set, the settings, the seed and n, and workers share the numbers: the sequence is the same for any
     number of workers. Each pass begins at batch `start` again.
 
     Args:
         dataset: The training set, or its folder.
-        corruption: What is done to clean markers: a `Corruption`, or one of your own: a function
+        corruption: Corruption of clean markers: a `Corruption`, or a function of your own
             `(markers, *, rng) -> (points, labels)`, its `module:name` or its entry point.
-        batch: Clouds in a batch, B.
+        batch: Number of clouds in a batch, B.
         seed: Seed of all randomness.
-        rig_share: Share of batches, 0 to 1, that are what the set's simulated cameras see instead; our
-            labelers learn from half of each.
+        rig_share: Share of batches, 0 to 1, seen by the set's simulated cameras instead; the shipped labelers
+            learn from half of each.
         anisotropy: Log standard deviation of the stretch of each hand along three random directions.
         start: Number of the first batch.
 
@@ -71,7 +71,7 @@ class CloudStream(IterableDataset[tuple[Tensor, Tensor, Tensor]]):
             yield self.batch(number)
 
     def batch(self, number: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Points (B, N, 3) [m], presence (B, N) and labels (B, N) of the batch of a number."""
+        """Points (B, N, 3) [m], presence (B, N) and labels (B, N) of a batch."""
         rng = np.random.default_rng((self.seed, number))
         cloud = draw_batch(self.dataset.mapped_rows(), self.recipe, rng=rng).cloud
         return (

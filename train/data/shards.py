@@ -1,8 +1,8 @@
-"""Training sets on disk: `.npy` shards of rows and hands, and a manifest that names and checks them.
+"""Training sets on disk: `.npy` shards of rows and hands, and a manifest that lists and checks them.
 
-A row is clean: the pose of the hand and what the rig sees of it. Jitter, drops and a shuffled order are drawn
-when training (`train.data.batches`). Rows stay in their files (`MappedRows`): the operating
-system keeps one copy for all processes.
+A row is clean: the pose of the hand and what the rig sees of it. Jitter, drops and a shuffled order are added
+during training (`train.data.batches`). Rows stay in their files (`MappedRows`), so that the operating system
+keeps one copy for all processes.
 """
 
 from __future__ import annotations
@@ -35,15 +35,15 @@ from handsim.settings import Limits, Settings
 SCHEMA: Final = 2
 MANIFEST: Final = "manifest.json"
 CONFIG: Final = "config.json"
-_MAX_NAME_BYTES: Final = 100  # of a file's name; file systems take 255
+_MAX_NAME_BYTES: Final = 100  # bytes of a file name; file systems allow 255
 
 
 def row_dtype(num_markers: int) -> np.dtype[np.void]:
-    """The record of one frame of one hand.
+    """Record type of one frame of one hand.
 
-    `qpos` (position [m], quaternion wxyz, 20 joint angles [rad]), `hand` (its index in the shard's hands),
-    true `markers` (M, 3) [m], `cameras` with a free view of each marker (bits), positions `observed` by the
-    optical system (M, 3) [m] (NaN where it loses the marker), `ghosts` (4, 3) [m] (NaN where there is none).
+    `qpos` (position [m], quaternion wxyz, 20 joint angles [rad]), `hand` (index into the shard's hands), true
+    `markers` (M, 3) [m], `cameras` with a free view of each marker (bits), positions `observed` by the
+    optical system (M, 3) [m] (NaN for lost markers), and `ghosts` (4, 3) [m] (NaN for absent ones).
     """
     return np.dtype(
         [
@@ -58,9 +58,9 @@ def row_dtype(num_markers: int) -> np.dtype[np.void]:
 
 
 def worn_dtype(num_markers: int) -> np.dtype[np.void]:
-    """The record of one hand: a `HAND_DTYPE`, and the `places` (M, 3) of its glove's markers as worn.
+    """Record type of one hand: a `HAND_DTYPE`, and the `places` (M, 3) of its glove's markers as worn.
 
-    A place is `along`, `around` [rad] and `across` of a `MarkerPlace`; NaN for a hand that is in no row.
+    A place is `along`, `around` [rad] and `across` of a `MarkerPlace`; NaN for a hand without rows.
     """
     return np.dtype([*HAND_DTYPE.descr, ("places", "<f8", (num_markers, 3))])
 
@@ -75,16 +75,16 @@ class Manifest(Settings):
     marker_names: tuple[str, ...]
     num_frames: Annotated[int, Limits(1)]
     min_cameras: Annotated[int, Limits(1)]
-    """Cameras that must see a marker before it exists."""
+    """Number of cameras that must see a marker."""
     files: dict[str, str]
     """SHA-256 of every file, by name."""
     redrawn: dict[str, int] | None = None
-    """Number of people and scenes that were drawn again, by reason; None in old sets, which did not count."""
+    """Numbers of redrawn people and scenes, by reason; None in old sets, which did not count them."""
     units: str = "metres, radians, world frame"
     schema: int = SCHEMA
 
     def check(self) -> None:
-        """Refuse wrong types, equal marker names, and files of other folders."""
+        """Refuse wrong types, repeated marker names, and files in other folders."""
         if not isinstance(self.config, dict):
             raise ArgumentError("config is not a table")
         if not 0 < len(set(self.marker_names)) == len(self.marker_names):
@@ -139,7 +139,7 @@ def array_bytes(dtype: np.dtype[np.void], count: int) -> int:
 
 
 def save_array(path: Path, array: NDArray[Any]) -> None:
-    """Write an `.npy` file, complete or not at all."""
+    """Write an `.npy` file completely or not at all."""
     # numpy.save reports a full disk as "8192 requested and 6690 written", without its errno.
     with atomic_write(path) as temporary, temporary.open("wb") as file:
         np.lib.format.write_array_header_1_0(file, np.lib.format.header_data_from_array_1_0(array))
@@ -147,7 +147,7 @@ def save_array(path: Path, array: NDArray[Any]) -> None:
 
 
 def load_manifest(path: Path) -> Manifest:
-    """The manifest of a finished training set, whose other files are not checked."""
+    """Manifest of a finished training set; its other files are not checked."""
     file = path / MANIFEST
     if not file.is_file():
         hint = "is unfinished; run handsim generate again" if (path / CONFIG).is_file() else "holds none"
@@ -173,11 +173,11 @@ class Dataset:
     `cameras` that see each marker, positions `observed` (M, 3) [m] and `ghosts` (4, 3) [m].
 
     Args:
-        path: The folder that `handsim generate` wrote: `.npy` shards and a `manifest.json`. A folder of an
+        path: The folder written by `handsim generate`: `.npy` shards and a `manifest.json`. A folder of an
             object store, as s3://bucket/prefix, is copied for as long as the set is open.
 
     Raises:
-        DatasetError: Not a training set, unfinished, of another schema, or damaged (the file is named).
+        DatasetError: The folder is no training set, unfinished, of another schema, or damaged.
     """
 
     def __init__(self, path: str | Place) -> None:
@@ -204,7 +204,7 @@ class Dataset:
             )
 
     def _copied(self, place: UPath) -> Path:
-        """A copy of the files of an object store, removed together with the `Dataset`."""
+        """Copy the files of an object store; the copy is removed with the `Dataset`."""
         self._copy = tempfile.TemporaryDirectory(prefix="handsim-set-")
         folder = Path(self._copy.name)
         for name in (MANIFEST, CONFIG):
@@ -233,10 +233,10 @@ class Dataset:
 
     @property
     def layout(self) -> MarkerLayout:
-        """The glove of its hands.
+        """Glove of the set's hands.
 
         Raises:
-            DatasetError: The manifest holds none.
+            DatasetError: The manifest has no layout.
         """
         try:
             return stored_layout(self.manifest.config["layout"])
@@ -253,11 +253,11 @@ class Dataset:
         return np.concatenate(self.shards)
 
     def mapped_rows(self) -> MappedRows:
-        """All T rows in order, left where they are; processes that read them share one copy."""
+        """All T rows in order, left in their files; processes that read them share one copy."""
         return MappedRows(self.shards)
 
     def people(self) -> Int[np.ndarray, "T"]:
-        """The person of each row, numbered from 0 through the set; a person's rows follow each other."""
+        """Person of each row, numbered from 0 through the set; rows of a person are contiguous."""
         parts, known = [], 0
         for number, shard in enumerate(self.shards):
             parts.append(known + shard["hand"].astype(np.int64) // len(SIDES))
@@ -265,16 +265,16 @@ class Dataset:
         return np.concatenate(parts)
 
     def hands(self, shard: int) -> list[HandShape]:
-        """The hands of a shard; the `hand` of its rows is an index into them."""
+        """Hands of a shard; `hand` of its rows is an index into them."""
         return [unpack_hand(record) for record in self._hand_records(shard)]
 
     def gloves(self, shard: int) -> list[MarkerLayout | None]:
-        """The glove of each hand of a shard as it was worn, slips and all; None for a hand that is in no row.
+        """Glove of each hand of a shard as worn, with all slips; None for a hand without rows.
 
-        `attach(glove, hand)` puts it on; the markers of rows are those of their hand's glove.
+        `attach(glove, hand)` puts it on; the rows' markers are those of their hand's glove.
 
         Raises:
-            DatasetError: The set is of a version that did not keep them.
+            DatasetError: The set was written by a version that did not store them.
         """
         records = self._hand_records(shard)
         if "places" not in (records.dtype.names or ()):
@@ -289,13 +289,13 @@ class Dataset:
         ]  # fmt: skip
 
     def _hand_records(self, shard: int) -> NDArray[np.void]:
-        """The memory-mapped hands of a shard; those of old sets have no places of markers."""
+        """Memory-mapped hands of a shard; those of old sets have no places of markers."""
         worn = worn_dtype(len(self.manifest.marker_names))
         return _load_records(self.path / hands_name(shard), worn, HAND_DTYPE)
 
 
 def load_dataset(dataset: Dataset | str | Place) -> Dataset:
-    """A training set that is given as an object or by its folder."""
+    """Open a training set, given as an object or by its folder."""
     if isinstance(dataset, Dataset):
         return dataset
     check_type("dataset", dataset, (str, Path, UPath), "a Dataset or the folder of one")
@@ -303,7 +303,7 @@ def load_dataset(dataset: Dataset | str | Place) -> Dataset:
 
 
 def _load_records(file: Path, *dtypes: np.dtype[np.void]) -> NDArray[np.void]:
-    """Memory-mapped records of one of these types; a `DatasetError` if the file holds something else."""
+    """Memory-map records of one of these types; a `DatasetError` if the file holds other data."""
     try:
         with file.open("rb") as content:
             check_npy_header(content, file.stat().st_size)
@@ -316,12 +316,12 @@ def _load_records(file: Path, *dtypes: np.dtype[np.void]) -> NDArray[np.void]:
 
 
 class MappedRows:
-    """Rows of several arrays one after the other, none of which is copied before it is asked for.
+    """Rows of several arrays in sequence, copied only when requested.
 
     Args:
-        shards: The arrays, memory-mapped or not, of one type of records (`train.data.shards.row_dtype`).
-        start: First row of the span that this is.
-        stop: The row after its last one; all rows when not given.
+        shards: The arrays, memory-mapped or not, with one record type (`train.data.shards.row_dtype`).
+        start: First row of this span.
+        stop: Row after the last one; all rows if not given.
     """
 
     def __init__(
@@ -335,11 +335,11 @@ class MappedRows:
         return self._stop - self._start
 
     def span(self, start: int, stop: int) -> MappedRows:
-        """The rows from `start` to before `stop`, left where they are."""
+        """The rows from `start` to before `stop`, left in their files."""
         return MappedRows(self._shards, start=self._start + start, stop=self._start + stop)
 
     def __getitem__(self, wanted: str | Int[np.ndarray, "B"]) -> Shaped[np.ndarray, "B *rest"]:
-        """A copy of the rows of these numbers (0 or more), or of a field of all rows."""
+        """A copy of the rows with these numbers (0 or more), or of one field of all rows."""
         if isinstance(wanted, str):
             return np.concatenate([part[wanted] for part in self._parts()])
         numbers = np.asarray(wanted) + self._start

@@ -1,7 +1,7 @@
-"""Forecasts of what a rig captures of hands at work, which are simulated or those of a take.
+"""Forecasts of what a rig captures of simulated hands at work, or of those of a take.
 
-Captures are forecast in the rooms of simulated takes; the error of points is a covariance, from the noise of
-blobs in the pictures. Gloves are scored on the single frames of `observe_poses` and `observe_motion`.
+Captures are forecast in the rooms of simulated takes. Errors of points are covariances that follow from the
+noise of blobs in the pictures. Gloves are scored on single frames of `observe_poses` and `observe_motion`.
 """
 
 from __future__ import annotations
@@ -52,15 +52,15 @@ from train.simulation.training_frames import (
 )
 
 HALF_SIDE: Final = 0.3
-"""Half side of the cube that hands work in by default [m]."""
+"""Half side of the default cube in which hands work [m]."""
 OPTICS: Final = OpticsConfig()
-"""Noise of blobs and size of visible spots, the same in every room."""
+"""Noise of blobs and size of visible spots, equal in all rooms."""
 _REAL_LIKE: Final = "real-like"
 _MAX_PEOPLE: Final = 10
-_MIN_FRAMES: Final = 12  # frames in a row of a take that is used
-_ROUND_TRIP: Final = (11.0, 14.0, 9.0)  # time through the volume and back along each axis [s]
+_MIN_FRAMES: Final = 12  # least number of successive frames that are used of a take
+_ROUND_TRIP: Final = (11.0, 14.0, 9.0)  # [s] time to walk through the volume and back along each axis
 _POSES_PER_PERSON: Final = 60
-_ERROR_SAMPLES: Final = 4000  # marker-frames of a scene from which the error is estimated
+_ERROR_SAMPLES: Final = 4000  # marker-frames of a scene for the estimate of the error
 
 
 def sample_work(
@@ -74,7 +74,7 @@ def sample_work(
 ) -> dict[str, list[SceneMotion]]:
     """Scenes of several people by kind of work: real-like, and as in the paper's captures.
 
-    Hands work around the center of a volume [m]; people walk through a volume that is longer than they reach.
+    Hands work around the center of a volume [m]; people walk through a volume larger than their reach.
     """
     work: dict[str, list[SceneMotion]] = {}
     for kind in (_REAL_LIKE, *KINDS):
@@ -87,7 +87,7 @@ def sample_work(
 
 
 def _work_scene(kind: str, layout: MarkerLayout, num_frames: int, rng: np.random.Generator) -> SceneMotion:
-    """A scene of the first random person who can do this work."""
+    """A scene of a random person who can do this work."""
     if kind != _REAL_LIKE:
         return sample_scene(cast("Kind", kind), layout, num_frames, rng=rng)
     reason: PoseError | None = None
@@ -102,14 +102,14 @@ def _work_scene(kind: str, layout: MarkerLayout, num_frames: int, rng: np.random
 def _walk(
     seconds: float, frames: int, sides: Float[np.ndarray, "3"], rng: np.random.Generator
 ) -> NDArray[np.float64]:
-    """Offsets (T, 3) [m] to and fro through the parts of a volume beyond the reach from its middle."""
+    """Offsets (T, 3) [m] of walking to and fro through the parts of a volume beyond reach from its center."""
     reach = np.maximum(0.0, np.asarray(sides) / 2 - HALF_SIDE)
     turns = seconds * np.linspace(0.0, 1.0, frames)[:, None] / _ROUND_TRIP + rng.random(3)
     return np.asarray(reach * (4.0 * np.abs(turns % 1.0 - 0.5) - 1.0))
 
 
 def work_of_take(take: Take, layout: MarkerLayout | None, num_frames: int) -> dict[str, list[SceneMotion]]:
-    """Scenes of the first frames of a take in which every hand has a pose, perhaps in another glove."""
+    """Scenes of a take's first frames in which every hand has a pose, optionally with another glove."""
     fits = [hand if layout is None else settle_glove(layout, hand.model) for hand in take.hands]
     whole = np.isfinite(take.qpos).all(axis=(1, 2))
     scenes, left = [], num_frames
@@ -146,7 +146,7 @@ class ObservedHand(NamedTuple):
 def observe_poses(
     layout: MarkerLayout, rig: CameraRig, num_frames: int, *, rng: np.random.Generator
 ) -> list[ObservedHand]:
-    """Random people's hands in the poses and scenes of training sets, in at least `num_frames` frames."""
+    """Random people's hands in poses and scenes as in training sets, in at least `num_frames` frames."""
     config, observed, done = GenerateSettings(), [], 0
     slip, roll = config.slip_along, np.deg2rad(config.slip_around)
     while done < num_frames:
@@ -162,7 +162,7 @@ def observe_poses(
 def observe_motion(
     take: Take, layout: MarkerLayout, rig: CameraRig, num_frames: int, *, rng: np.random.Generator
 ) -> list[ObservedHand]:
-    """The hands of a take in another glove, in up to `num_frames` frames, moved to the middle of the rig."""
+    """Hands of a take with another glove, in up to `num_frames` frames, moved to the center of the rig."""
     posed = np.flatnonzero(np.isfinite(take.qpos).all(axis=(1, 2)))
     if not len(posed):
         raise CaptureError("there is no frame in which every hand of the take has a pose, expected one")
@@ -178,9 +178,9 @@ def observe_motion(
 def _observe(
     scene: FrameScene, fits: tuple[GloveFit, ...], rig: CameraRig, rng: np.random.Generator
 ) -> Iterator[ObservedHand]:
-    """What the rig captures of each hand of unrelated frames."""
+    """What the rig captures of each hand in unrelated frames."""
     config = GenerateSettings()
-    # In single frames two rays are enough for a point, as for one that exists already in a capture.
+    # In single frames two rays suffice for a point, as for a continued point in a capture.
     optics = OpticsConfig(min_rays_to_start=config.min_cameras)
     frames = observe_scene(scene, fits, rig, optics, config.ghosts, rng=rng)
     for fit, qpos, seen in zip(fits, scene.qpos, frames, strict=True):
@@ -188,7 +188,7 @@ def _observe(
 
 
 class LitScene(NamedTuple):
-    """A scene, and its light sources as the cameras of a rig see them."""
+    """A scene, and its light sources as seen by the cameras of a rig."""
 
     scene: SceneMotion
     sources: LightSources
@@ -197,7 +197,7 @@ class LitScene(NamedTuple):
 
     @property
     def num_markers(self) -> int:
-        """Number of the hands' markers, which are the first of the sources."""
+        """Number of the hands' markers, which come first among the sources."""
         return sum(hand.fit.layout.num_markers for hand in self.scene.hands)
 
     @property
@@ -206,7 +206,7 @@ class LitScene(NamedTuple):
         return self.sources.visible[:, : self.num_markers]
 
     def without(self, camera: int) -> LitScene:
-        """The same scene without a camera."""
+        """The same scene without one camera."""
         visible = np.delete(self.sources.visible, camera, axis=2)
         return self._replace(sources=self.sources._replace(visible=visible))
 
@@ -214,7 +214,7 @@ class LitScene(NamedTuple):
 def light(
     scenes: Sequence[SceneMotion], rig: CameraRig, room: RoomConfig, *, rng: np.random.Generator
 ) -> list[LitScene]:
-    """Cast all lines of sight of a room; an `ArgumentError` if a camera stands in the hands."""
+    """Cast all lines of sight in a room; an `ArgumentError` if a camera is inside a hand."""
     return [
         LitScene(scene, sample_light_sources(SceneSight(scene, rig), room, rng=rng), room.optics)
         for scene in scenes
@@ -224,7 +224,7 @@ def light(
 def light_work(
     work: Mapping[str, Sequence[SceneMotion]], rig: CameraRig, *, rng: np.random.Generator
 ) -> dict[str, list[LitScene]]:
-    """Cast the lines of sight for scenes by kind of work, each in the default room of its kind."""
+    """Cast the lines of sight of scenes by kind of work, each in the default room of its kind."""
     lit: dict[str, list[LitScene]] = {}
     for kind, scenes in work.items():
         lit[kind] = []
@@ -237,49 +237,49 @@ def light_work(
 
 
 class ErrorEllipsoid(NamedTuple):
-    """The average error of triangulated points."""
+    """Mean error of triangulated points."""
 
     axes: Float[np.ndarray, "3"]
-    """Standard deviations along the directions, the longest first [m]; NaN without points."""
+    """Standard deviations along `directions`, the largest first [m]; NaN without points."""
     directions: Float[np.ndarray, "3 3"]
-    """Unit vectors in the world, one in each row."""
+    """Unit vectors in the world, as rows."""
     mean: float
-    """Root mean square of the distance from the truth, averaged over the points [m]."""
+    """Root mean square distance from the truth, averaged over the points [m]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Forecast:
-    """A forecast of a capture; shares are of marker-frames: every marker in every frame."""
+    """Forecast of a capture. Shares are of marker-frames: every marker in every frame."""
 
     marker_frames: int
     seen_by_two: float
-    """Share that two cameras or more see."""
+    """Share seen by at least two cameras."""
     seen_by_three: float
     missing: float
     """Share without a point."""
     gaps: float
-    """Gaps of a marker [1/min]."""
+    """Gaps per marker [1/min]."""
     gap_median: float
-    """Length of a gap [s]; NaN without gaps."""
+    """Median length of a gap [s]; NaN without gaps."""
     gap_p95: float
     ghosts: float
-    """Points per frame that are no marker."""
+    """Points per frame that are not markers."""
     error: ErrorEllipsoid
 
 
 class CameraLoss(NamedTuple):
-    """The contribution of one camera."""
+    """Contribution of one camera."""
 
     seen: float
     """Share of the marker-frames that it sees."""
     needed: float
-    """Share of the marker-frames that it sees and fewer than two others see."""
+    """Share of the marker-frames that it and fewer than two others see."""
     without: Forecast | None
-    """The forecast without it; None for a rig of two cameras."""
+    """Forecast without it; None for a rig of two cameras."""
 
 
 def forecast(lit: Sequence[LitScene], rig: CameraRig, *, seed: int = 0) -> Forecast:
-    """The forecast of scenes before a rig, whose noise and losses come from a seed."""
+    """Forecast of scenes seen by a rig, with noise and losses from a seed."""
     rng = np.random.default_rng(seed)
     counts, gaps, spreads = zip(*(_count(one, rig, rng) for one in lit), strict=True)
     frames, scene_frames, minutes, two, three, missing, ghosts = map(sum, zip(*counts, strict=True))
@@ -301,10 +301,10 @@ def forecast(lit: Sequence[LitScene], rig: CameraRig, *, seed: int = 0) -> Forec
 def _count(
     one: LitScene, rig: CameraRig, rng: np.random.Generator
 ) -> tuple[tuple[int, int, float, int, int, int, int], Float[np.ndarray, "G"], Float[np.ndarray, "N 3 3"]]:
-    """Counts of a scene, the lengths of its gaps [s], and covariances of some points [m^2].
+    """Counts of a scene, lengths of its gaps [s], and covariances of some points [m^2].
 
-    The counts are of marker-frames, frames and minutes of markers, marker-frames that two cameras see, that
-    three see and that have no point, and ghosts.
+    The counts are: marker-frames; frames; minutes of markers; marker-frames seen by two cameras, seen by
+    three, and without a point; ghosts.
     """
     sources, optics, markers, rate = one.sources, one.optics, one.num_markers, one.scene.rate
     found = reconstruct(
@@ -335,7 +335,7 @@ def _count(
 
 
 def camera_losses(lit: Sequence[LitScene], rig: CameraRig, *, seed: int = 0) -> list[CameraLoss]:
-    """The contribution of each camera: forecasts of the same scenes without it."""
+    """Contribution of each camera, from forecasts of the same scenes without it."""
     seen = np.concatenate([one.seen.reshape(-1, len(rig.positions)) for one in lit])
     views, losses = seen.sum(axis=1), []
     for camera in range(len(rig.positions)):
@@ -353,7 +353,7 @@ def covariances(
     rig: CameraRig,
     noise: Float[np.ndarray, "N"],
 ) -> Float[np.ndarray, "N 3 3"]:
-    """Covariance of each point [m^2] triangulated from equally weighted rays of two cameras or more.
+    """Covariance of each point [m^2], triangulated from equally weighted rays of at least two cameras.
 
     `noise` is the standard deviation of each point's blob per axis [px].
     """
@@ -364,7 +364,7 @@ def covariances(
         directions = rays / distances[:, None]
         across = (np.eye(3) - directions[:, :, None] * directions[:, None]) * seen[:, number, None, None]
         total += across
-        # Motion of the ray, at the point's depth and across the ray, by one pixel to the right and down.
+        # Motion of the ray at the point's depth, across the ray, per pixel to the right and down.
         local = camera.local(points)
         tangents = np.linalg.inv(camera.lens.jacobian(local)) / camera.focal_lengths
         shift = across @ camera.T_world_camera[:3, :2] @ tangents * (local[:, 2] * noise)[:, None, None]
@@ -374,7 +374,7 @@ def covariances(
 
 
 def ellipsoid(spread: Float[np.ndarray, "N 3 3"]) -> ErrorEllipsoid:
-    """The ellipsoid of the mean of covariances [m^2]."""
+    """Ellipsoid of the mean covariance [m^2]."""
     if not len(spread):
         return ErrorEllipsoid(np.full(3, np.nan), np.eye(3), float("nan"))
     values, vectors = np.linalg.eigh(spread.mean(axis=0))

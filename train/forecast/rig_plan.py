@@ -1,7 +1,7 @@
-"""The search for a camera rig: places for cameras, what they would see of hands at work, and the best ones.
+"""Search for a camera rig: candidate places, what they would see of hands at work, and the best ones.
 
 Cameras are chosen one after the other, then exchanged while that helps. Each candidate has bits of the
-marker-frames that it sees, and the information that it gives on the points.
+marker-frames that it sees, and its information on the points.
 """
 
 from __future__ import annotations
@@ -33,40 +33,40 @@ from train.forecast.settings import Mount, PlanRigSettings
 from train.simulation.room import SceneSight, marker_radii
 from train.simulation.scenes import SceneMotion
 
-_MAX_PLACES: Final = 400  # the step between places grows with the room
-_STEPS: Final = (0.3, 0.4, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0)  # steps between places [m]
-_CLEARANCE: Final = 0.1  # distance of a lens from wall, ceiling or beam [m]
-_MIN_HEIGHT: Final = 0.5  # least height of cameras on walls and posts [m]
+_MAX_PLACES: Final = 400  # The step between places grows with the room to stay below this number.
+_STEPS: Final = (0.3, 0.4, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0)  # [m] tried steps between places
+_CLEARANCE: Final = 0.1  # [m] distance of a lens from a wall, ceiling or beam
+_MIN_HEIGHT: Final = 0.5  # [m] least height of cameras on walls and posts
 _TRIPOD_HEIGHTS: Final = (0.9, 1.4, 1.9)  # [m]
-_LARGE_SIDE: Final = 1.0  # side of a volume above which cameras may also look beside its middle [m]
-_ASIDE: Final = 0.3  # distance of these targets from the middle, as a share of the side
+_LARGE_SIDE: Final = 1.0  # [m] Along longer sides of a volume cameras may also look beside its center.
+_ASIDE: Final = 0.3  # offset of these targets from the center, as share of the side
 
 _WEIGHTS: Final = (0.02, 0.4, 0.6, 0.05)
-"""Values of the shares of marker-frames that one, two, three and four cameras see. A point begins with three
-rays and continues with two, so that both count; one camera matters while there is no other, and a fourth
-makes up for a lost picture."""
+"""Values of the shares of marker-frames seen by one, two, three and four cameras. A point begins with three
+rays and continues with two, so both count. One camera matters only until there is a second, and a fourth
+compensates for a lost picture."""
 _ERROR_COST: Final = 0.15  # cost of a millimeter of mean error
-_MAX_ERROR: Final = 1.5  # error of points that no two cameras see, or only along nearly one line [mm]
-_MIN_DISTANCE: Final = 0.3  # between two cameras [m]
-_MIN_GAIN: Final = 1e-5  # of an exchange
+_MAX_ERROR: Final = 1.5  # [mm] error of points seen by fewer than two cameras, or only along nearly one line
+_MIN_DISTANCE: Final = 0.3  # [m] least distance between two cameras
+_MIN_GAIN: Final = 1e-5  # least gain of an exchange
 _MAX_EXCHANGES: Final = 200
 _WIDE: Final = pinhole("wide", (1280, 1280), focal_of_angle(1280, np.deg2rad(170.0)))
-"""A camera that has hands in view wherever it is aimed."""
-_ERROR_SAMPLES: Final = 1200  # marker-frames from which the error is estimated
+"""Camera that has hands in view wherever it is aimed."""
+_ERROR_SAMPLES: Final = 1200  # marker-frames for the estimate of the error
 _PEOPLE: Final = 3  # people for each kind of work
 _FRAMES: Final = 900  # frames of each person
-_STRIDE: Final = 12  # one frame of this many is used
-_TEST_FRAMES: Final = 600  # frames of each person for the forecast, who are not those of the search
+_STRIDE: Final = 12  # One frame in this many is used.
+_TEST_FRAMES: Final = 600  # frames of each person for the forecast; other people than those of the search
 
 
 class RigPlan(NamedTuple):
-    """A rig, and the forecast of it."""
+    """A planned rig and its forecast."""
 
     rig: CameraRig
     targets: Float[np.ndarray, "C 3"]
-    """What each camera looks at [m]; of cameras that were kept a point one meter ahead."""
+    """Point at which each camera looks [m]; for kept cameras a point one meter ahead."""
     before: Forecast | None
-    """The forecast of the cameras that were kept alone."""
+    """Forecast of the kept cameras alone."""
     after: Forecast
 
 
@@ -83,18 +83,18 @@ def plan_rig(
     """Look for the best places of cameras, as `handsim rig plan` does.
 
     Args:
-        cameras: Cameras of the rig, with those that are kept.
+        cameras: Number of cameras of the rig, including kept ones.
         room: Width along x, depth along y and height of the room or truss (3,) [m]; it stands on the floor,
-            its middle below that of the volume.
-        settings: Where hands work, and what cameras can hang on.
-        camera: What every new camera is, but for its pose; when not given, the first of those that are kept,
-            or one of the settings' size and field of view.
+            with its center below that of the volume.
+        settings: Where hands work, and what cameras can be mounted on.
+        camera: Model of every new camera except for its pose; if not given, the first kept camera, or one of
+            the settings' size and field of view.
         name: Name of the rig.
         on_step: Called with the name of each step.
         options: Fields of `settings`, by name.
 
     Raises:
-        ArgumentError: A setting or number is refused, or there is no room for so many cameras.
+        ArgumentError: A setting or number is refused, or there is no place for so many cameras.
         LayoutError, RigError: The glove or the rig is unknown.
     """
     chosen = PlanRigSettings.of(settings, options)
@@ -173,7 +173,7 @@ def _on_walls(room: NDArray[np.float64], step: float) -> NDArray[np.float64]:
 
 
 def _on_truss(room: NDArray[np.float64], step: float) -> NDArray[np.float64]:
-    """Positions (N, 3) on the beams along the top of all four sides and on the posts below their ends [m]."""
+    """Positions (N, 3) on the beams along all four upper edges, and on the posts below their ends [m]."""
     width, depth = room[:2] / 2
     beams = _product(_outline(width, depth, step), np.array([room[2] - _CLEARANCE]))
     corners = np.array([[x, y] for x in (-width, width) for y in (-depth, depth)])
@@ -192,7 +192,7 @@ _ON: Final = {"walls": _on_walls, "truss": _on_truss, "tripods": _on_tripods}
 
 
 def _outline(width: float, depth: float, step: float) -> NDArray[np.float64]:
-    """Points (N, 2) on a rectangle with these half sides, about a step apart [m]."""
+    """Points (N, 2) on a rectangle with these half sides, about one step apart [m]."""
     along, across = _line(-width, width, step), _line(-depth, depth, step)
     sides = [np.stack([along, np.full(len(along), end)], axis=1) for end in (-depth, depth)]
     sides += [np.stack([np.full(len(across), end), across], axis=1) for end in (-width, width)]
@@ -200,12 +200,12 @@ def _outline(width: float, depth: float, step: float) -> NDArray[np.float64]:
 
 
 def _line(low: float, high: float, step: float) -> NDArray[np.float64]:
-    """Evenly spaced numbers from end to end, about a step apart."""
+    """Evenly spaced numbers from end to end, about one step apart."""
     return np.linspace(low, high, max(1, round((high - low) / step)) + 1)
 
 
 def _product(floor: NDArray[np.float64], heights: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Points (N, 3): each point (N, 2) at each height [m]."""
+    """Points (N, 3) [m]: each floor point (N, 2) at each height."""
     above = np.repeat(floor, len(heights), axis=0)
     return np.column_stack([above, np.tile(heights, len(floor))])
 
@@ -215,22 +215,22 @@ def _lengths(sides: NDArray[np.float64]) -> str:
 
 
 class CandidateViews(NamedTuple):
-    """Marker-frames as K candidate cameras see them."""
+    """Marker-frames as seen by K candidate cameras."""
 
     positions: Float[np.ndarray, "K 3"]
     """Positions of the candidates [m]."""
     bits: UInt64[np.ndarray, "K W"]
-    """Visible marker-frames of each candidate, 64 in a word."""
+    """Visible marker-frames of each candidate, 64 per word."""
     num_marker_frames: int
     information: Float[np.ndarray, "6 K S"]
     """Information on S of the marker-frames from each candidate [1/mm^2]: xx, xy, xz, yy, yz, zz; 0 where it
-    does not see."""
+    sees nothing."""
 
 
 def view_candidates(
     scenes: Sequence[SceneMotion], candidates: Sequence[Camera], *, rng: np.random.Generator
 ) -> CandidateViews:
-    """Cast the lines of sight from every marker to every candidate, once for each position."""
+    """Cast the lines of sight from every marker to every candidate, once per position."""
     positions = np.stack([one.T_world_camera[:3, 3] for one in candidates])
     apart, which = np.unique(positions.round(6), axis=0, return_inverse=True)
     seen, points, noise = [], [], []
@@ -253,12 +253,12 @@ def view_candidates(
 def _free_views(
     scene: SceneMotion, positions: NDArray[np.float64], rng: np.random.Generator
 ) -> tuple[NDArray[np.bool_], NDArray[np.float64], NDArray[np.float64]]:
-    """The hands' marker-frames: positions that see them (N, P), their centers (N, 3) and radii (N,) [m]."""
+    """Marker-frames of the hands: which positions see them (N, P), centers (N, 3) and radii (N,) [m]."""
     count = sum(hand.fit.layout.num_markers for hand in scene.hands)
     parts = []
     for begin in range(0, len(positions), MAX_CAMERAS):
         few = positions[begin : begin + MAX_CAMERAS]
-        # A rig has at least two cameras: a single one gets a companion, whose view is cut off again.
+        # A rig needs two cameras: a single one gets a companion, whose view is dropped.
         some = few if len(few) >= FEWEST_CAMERAS else np.concatenate([few, few + np.array([0.0, 0.0, 1.0])])
         middle = scene.hands[0].qpos[:, :3].mean(axis=0)
         cameras = [
@@ -276,7 +276,7 @@ def _free_views(
 def _information(
     points: NDArray[np.float64], positions: NDArray[np.float64], noise: NDArray[np.float64]
 ) -> NDArray[np.float32]:
-    """Information (6, K, S) [1/mm^2] of rays whose directions have noise [rad]."""
+    """Information (6, K, S) [1/mm^2] of rays with noisy directions [rad]."""
     rays = points - positions[:, None]
     distances = np.linalg.norm(rays, axis=-1)
     x, y, z = np.moveaxis(rays / distances[..., None], -1, 0)
@@ -286,7 +286,7 @@ def _information(
 
 
 class Planning:
-    """Cameras chosen among candidates, after those that are kept."""
+    """Cameras chosen among candidates, in addition to kept ones."""
 
     def __init__(self, views: CandidateViews, kept: Sequence[int] = ()) -> None:
         self._views, self._kept = views, tuple(kept)
@@ -294,14 +294,14 @@ class Planning:
         """Indices of the candidates chosen so far."""
 
     def value_of(self, chosen: Sequence[int]) -> float:
-        """The value of some cameras together."""
+        """Value of a set of cameras."""
         seen = [int(np.bitwise_count(plane).sum()) for plane in self._planes(chosen)]
         shares = np.array(seen) / self._views.num_marker_frames
         error = _mean_error(self._views.information[:, list(chosen)].sum(axis=1)[:, None])
         return float(shares @ _WEIGHTS - _ERROR_COST * error[0])
 
     def grow(self, num_cameras: int) -> None:
-        """Add the best candidate until there are `num_cameras`."""
+        """Add the best candidates up to `num_cameras`."""
         while len(self.chosen) < num_cameras:
             values = self._values_with(self.chosen)
             if not np.isfinite(values.max()):
@@ -328,7 +328,7 @@ class Planning:
             number = number + 1 if number + 1 < len(self.chosen) else len(self._kept)
 
     def _values_with(self, chosen: Sequence[int]) -> NDArray[np.float64]:
-        """The values (K,) of the chosen cameras with each candidate; -inf if it is too near to another."""
+        """Values (K,) of the chosen cameras plus each candidate; -inf if it is too close to another."""
         views = self._views
         planes = self._planes(chosen)
         values = np.zeros(len(views.bits))
@@ -346,7 +346,7 @@ class Planning:
         return values
 
     def _planes(self, chosen: Sequence[int]) -> list[NDArray[np.uint64]]:
-        """Bits of the marker-frames that one, two, ... or more of the chosen cameras see."""
+        """Bits of the marker-frames seen by at least one, two, ... of the chosen cameras."""
         planes = [np.zeros_like(self._views.bits[0]) for _ in _WEIGHTS]
         for camera in chosen:
             for level in range(len(_WEIGHTS) - 1, 0, -1):
@@ -358,7 +358,7 @@ class Planning:
 def _mean_error(information: Float[np.ndarray, "6 K S"]) -> NDArray[np.float64]:
     """Root mean square error of points (K,) [mm], averaged over the points."""
     a, b, c, d, e, f = information
-    # The trace of the inverse of [[a, b, c], [b, d, e], [c, e, f]].
+    # trace of the inverse of [[a, b, c], [b, d, e], [c, e, f]]
     minors = (d * f - e * e) + (a * f - c * c) + (a * d - b * b)
     determinant = a * (d * f - e * e) - b * (b * f - c * e) + c * (b * e - c * d)
     known = determinant > 1e-6 * np.maximum(a + d + f, 1e-12) ** 3

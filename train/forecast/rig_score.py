@@ -1,6 +1,6 @@
-"""The score of a camera rig before it records: forecasts of hands at work, what is suspicious, and its page.
+"""Score of a camera rig before it records: forecasts of hands at work, suspicious geometry, and its page.
 
-A map shows what the rig sees of hands that are set at each point of a grid in the volume.
+A map shows what the rig sees of hands placed at each point of a grid in the volume.
 """
 
 from __future__ import annotations
@@ -52,70 +52,68 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 GRID: Final = 5
-"""Points of the map along each side of the volume."""
+"""Number of points of the map along each side of the volume."""
 _GLOVE: Final = "dense19"
-_PEOPLE: Final = 2  # of each kind of work
-_HANDS: Final = 12  # hands at every point of the map
-_LONGEST_ERROR: Final = 0.01  # of errors that are averaged [m]: two rays that hardly cross make no point
+_PEOPLE: Final = 2  # people for each kind of work
+_HANDS: Final = 12  # number of hands placed at every point of the map
+_LONGEST_ERROR: Final = 0.01  # [m] larger errors are not averaged: two almost parallel rays make no point
 
-# A rig with these figures gets a sentence.
+# Figures beyond these thresholds get a sentence of advice.
 _MANY_MISSING: Final = 0.05  # share of marker-frames without a point
 _POOR_CORNER: Final = 0.7  # share of markers seen by two at the worst point of the volume, over the best
-_RARELY_NEEDED: Final = 0.005  # share of marker-frames that need a camera
-_RISE: Final = 1.1  # factor by which missing marker-frames may rise when a camera goes
-_LONG_AXIS_RATIO: Final = 2.0  # longest axis of the error over the shortest
-_LEAST_LONG_AXIS: Final = 0.0005  # longest axis of the error [m]
-_MANY_GHOSTS: Final = 0.2  # ghosts in a frame
-_CLOSE_CAMERAS: Final = 0.10  # distance between two cameras that see the same [m]
-_OFF_CENTER: Final = 0.5  # distance of the working point from where simulated hands are [m]
-_NARROW_ANGLE: Final = 30.0  # largest angle between two cameras [deg]
-_SMALL_MARKER: Final = 2.0  # diameter of a marker in the picture [px]
+_RARELY_NEEDED: Final = 0.005  # share of marker-frames for which a camera is needed
+_RISE: Final = 1.1  # factor by which missing marker-frames may rise without a camera
+_LONG_AXIS_RATIO: Final = 2.0  # ratio of the error's longest axis to its shortest
+_LEAST_LONG_AXIS: Final = 0.0005  # [m] longest axis of the error
+_MANY_GHOSTS: Final = 0.2  # ghosts per frame
+_CLOSE_CAMERAS: Final = 0.10  # [m] distance between two cameras with nearly the same view
+_OFF_CENTER: Final = 0.5  # [m] distance of the working point from the default position of simulated hands
+_NARROW_ANGLE: Final = 30.0  # [deg] largest angle between two cameras
+_SMALL_MARKER: Final = 2.0  # [px] diameter of a marker in the picture
 _COVERED: Final = 0.9  # share of the cube in view of two cameras
-_UPSIDE_DOWN: Final = (
-    -0.2
-)  # cosine of the picture's up and the world's up, below which a camera is upside down
+_UPSIDE_DOWN: Final = -0.2  # cosine between its up and the world's, below which a camera is upside down
 
 
 class VolumeMap(NamedTuple):
-    """G points of a volume and what becomes of a hand there."""
+    """Forecast for a hand at each of G points of a volume."""
 
     points: Float[np.ndarray, "G 3"]
-    """Where the wrist is [m]."""
+    """Positions of the wrist [m]."""
     seen_by_two: Float[np.ndarray, "G"]
-    """Share of a hand's markers that two cameras or more see."""
+    """Share of a hand's markers seen by at least two cameras."""
     seen_by_three: Float[np.ndarray, "G"]
     error: Float[np.ndarray, "G"]
-    """Root mean square distance of points from the truth [m]; NaN where no marker has a point."""
+    """Root mean square distance of points from the truth [m]; NaN if no marker has a point."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RigScore:
-    """What a rig makes of hands at work."""
+    """Forecasts for a rig, and its faults."""
 
     rig: CameraRig
     whole: Forecast
-    """The forecast of all work together: shares of the marker-frames, gaps [s], error of points [m]."""
+    """Forecast of all work: shares of the marker-frames, gaps [s], error of points [m]."""
     kinds: dict[str, Forecast]
-    """The forecast of each kind of work."""
+    """Forecast of each kind of work."""
     losses: list[CameraLoss]
-    """What each camera is worth."""
+    """Contribution of each camera."""
     volume: VolumeMap
     faults: list[str]
-    """What is suspicious about the rig itself."""
+    """Suspicious properties of the rig's geometry."""
     work: str
-    """Whose hands did what, in words."""
+    """Whose hands work, in words."""
     seed: int
 
     @property
     def advice(self) -> list[str]:
-        """What to do with the rig, in sentences; what is most wrong comes first."""
+        """Sentences on what to do with the rig, the worst problem first."""
         suspicious = [f"Suspicious: {fault}." for fault in self.faults]
         if self.whole.missing >= 1.0:
             return [*suspicious, "No point is seen: hands work where no two cameras look."]
         return [*suspicious, *_sentences(self)]
 
     def record(self) -> dict[str, Any]:
-        """All figures as JSON, in meters and seconds; what does not exist is null."""
+        """All figures as JSON, in meters and seconds; unknown ones are null."""
         return {
             "work": self.work,
             "seed": self.seed,
@@ -140,11 +138,11 @@ def score_rig(
     on_step: OnStep = no_step,
     **options: Any,
 ) -> RigScore:
-    """Score a rig as `handsim rig score` does; nothing is recorded.
+    """Score a rig as `handsim rig score` does, without any recording.
 
     Args:
         rig: The cameras, or the name or path of a rig.
-        settings: What hands do before it.
+        settings: Work of the hands.
         on_step: Called with the name of each step.
         options: Fields of `settings`, by name: `volume=(1, 1, 0.8)` [m].
 
@@ -153,8 +151,8 @@ def score_rig(
         sentences.
 
     Raises:
-        ArgumentError: A setting is unknown or refused, or a camera stands in the hands.
-        CaptureError: The take cannot be read, or its hands are never there together.
+        ArgumentError: A setting is unknown or refused, or a camera is inside the hands.
+        CaptureError: The take cannot be read, or its hands are never tracked together.
         LayoutError, RigError: The glove or the rig is unknown.
     """
     cameras, chosen = load_rig(rig), ScoreRigSettings.of(settings, options)
@@ -185,7 +183,7 @@ def score_work(
     told: str,
     seed: int = 0,
 ) -> RigScore:
-    """The score for scenes of each kind of work, told in words, and for a volume that is mapped [m]."""
+    """Score for scenes of each kind of work, described by `told`, and for a volume that is mapped [m]."""
     rng = np.random.default_rng(seed)
     lit = light_work(work, rig, rng=rng)
     everything = [one for scenes in lit.values() for one in scenes]
@@ -209,7 +207,7 @@ def map_volume(
     *,
     rng: np.random.Generator,
 ) -> VolumeMap:
-    """Set hands of scenes, in poses of theirs, at each point of a grid in a volume [m]."""
+    """Place hands of scenes, in poses of theirs, at each point of a grid in a volume [m]."""
     points = cube_points(center, sides, GRID)
     two, three, errors = [], [], []
     for _ in range(_HANDS):
@@ -252,7 +250,7 @@ def _figures(one: Forecast) -> dict[str, Any]:
 
 
 def _numbers(value: Any) -> Any:
-    """Numbers and lists of them; what is not a number is None."""
+    """Numbers and lists of numbers as JSON; non-finite ones as None."""
     array = np.asarray(value)
     if array.ndim:
         return [_numbers(part) for part in array]
@@ -260,7 +258,7 @@ def _numbers(value: Any) -> Any:
 
 
 def _sentences(score: RigScore) -> Iterator[str]:
-    """What the figures of a rig suggest, the worst problem first."""
+    """Sentences on the figures of a rig, the worst problem first."""
     whole, (axes, directions, _) = score.whole, score.whole.error
     if whole.missing > _MANY_MISSING:
         worst_kind = max(score.kinds, key=lambda kind: score.kinds[kind].missing)
@@ -294,7 +292,7 @@ def _sentences(score: RigScore) -> Iterator[str]:
 
 
 def _camera_sentences(score: RigScore) -> Iterator[str]:
-    """Which camera matters most, and which cameras can go."""
+    """Sentences on the camera that matters most, and on dispensable cameras."""
     if len(score.losses) == FEWEST_CAMERAS:
         yield "Without either camera there are no points at all: a third would forgive a loss."
         return
@@ -323,13 +321,13 @@ def _camera_sentences(score: RigScore) -> Iterator[str]:
 
 
 def faults(rig: CameraRig) -> list[str]:
-    """What is suspicious about the geometry of a rig, in sentences."""
+    """Sentences on suspicious geometry of a rig."""
     point = working_point(rig)
     return [*_axes_faults(rig, point), *_place_faults(rig, point)]
 
 
 def working_point(rig: CameraRig) -> NDArray[np.float64]:
-    """The point (3,) nearest to all optical axes [m]; `ROOM_CENTER` where they are parallel."""
+    """Point (3,) nearest to all optical axes [m]; `ROOM_CENTER` if they are parallel."""
     axes = rig.T_world_camera[:, :3, 2]
     across = np.eye(3) - axes[:, :, None] * axes[:, None]
     total = across.sum(axis=0)
@@ -339,7 +337,7 @@ def working_point(rig: CameraRig) -> NDArray[np.float64]:
 
 
 def _axes_faults(rig: CameraRig, point: NDArray[np.float64]) -> Iterator[str]:
-    """Cameras that look the wrong way."""
+    """Cameras that look in a wrong direction."""
     rays = point - rig.positions
     ahead = np.einsum("ci,ci->c", rays, rig.T_world_camera[:, :3, 2])
     if (ahead < 0.0).sum() > len(ahead) / 2:
@@ -355,7 +353,7 @@ def _axes_faults(rig: CameraRig, point: NDArray[np.float64]) -> Iterator[str]:
 
 
 def _place_faults(rig: CameraRig, point: NDArray[np.float64]) -> Iterator[str]:
-    """Cameras in the wrong places, and what they do not cover around the point where they look."""
+    """Cameras in wrong places, and parts around their common point of view that are not covered."""
     positions = rig.positions
     for number in np.flatnonzero(positions[:, 2] < 0.0) + 1:
         yield f"camera {number} is {-positions[number - 1, 2]:.2f} m below the floor, expected z up"
@@ -399,7 +397,7 @@ def _place_faults(rig: CameraRig, point: NDArray[np.float64]) -> Iterator[str]:
 
 
 def pixels_of_a_marker(rig: CameraRig, point: Float[np.ndarray, "3"]) -> NDArray[np.float64]:
-    """Diameter (C,) of the paper's marker at a point [m] in each picture [px]."""
+    """Diameter (C,) of the paper's marker at a point [m] in each camera's picture [px]."""
     distances = np.linalg.norm(point - rig.positions, axis=1)
     focals = np.array([one.focal_length for one in rig.cameras])
     return np.asarray(2 * MARKER_RADIUS * focals / np.maximum(distances, 1e-9))
@@ -420,9 +418,9 @@ COLUMNS_TOLD: Final = (
     "meet by chance, in mirror images, and of reflections. Losses and reflections are those of `handsim "
     "simulate` with the same kind of work. Error: root mean square distance from the true center."
 )
-"""What the columns of both tables are."""
+"""Explanation of both tables' columns."""
 _VIEWS: Final = (("from above", 0, 1), ("from the front", 0, 2))
-_ARROW: Final = 0.3  # length of a camera's direction [m]
+_ARROW: Final = 0.3  # [m] length of the line that shows a camera's direction
 
 
 def write_rig_page(path: Path, score: RigScore) -> None:
@@ -456,13 +454,13 @@ def write_rig_page(path: Path, score: RigScore) -> None:
 
 
 def work_table(score: RigScore) -> list[list[str]]:
-    """Figures of each kind of work and of all, the header first."""
+    """Figures of each kind of work and of all work, header first."""
     rows = [[kind, *_cells(one)] for kind, one in score.kinds.items()] if len(score.kinds) > 1 else []
     return [["work", *_COLUMNS], *rows, ["all", *_cells(score.whole)]]
 
 
 def camera_table(score: RigScore) -> list[list[str]]:
-    """What is left without each camera, the header first."""
+    """Figures without each camera, header first."""
     rows = []
     for number, one in enumerate(score.losses, 1):
         left = [NOTHING] * len(_COLUMNS) if one.without is None else _cells(one.without)
@@ -471,7 +469,7 @@ def camera_table(score: RigScore) -> list[list[str]]:
 
 
 def volume_table(volume: VolumeMap) -> list[list[str]]:
-    """What is seen in the volume, the header first."""
+    """Figures of the volume, header first."""
     rows = [["a hand's markers", "mean", "worst", "at [m]"]]
     for title, shares in (("two", volume.seen_by_two), ("three", volume.seen_by_three)):
         least, place = f"{100 * shares.min():.1f}", coordinates(volume.points[shares.argmin()])
@@ -502,7 +500,7 @@ def _number(value: float, decimals: int) -> str:
 
 
 def _draw_losses(figure: Figure, losses: list[CameraLoss], missing: float) -> None:
-    """Draw what share of marker-frames is missing without each camera, beside what is missing with all."""
+    """Draw the share of missing marker-frames without each camera, and with all."""
     panel = figure.subplots()
     numbers = np.arange(1, len(losses) + 1)
     without = [100.0 if one.without is None else 100 * one.without.missing for one in losses]

@@ -1,4 +1,4 @@
-"""The settings of forecasts: how gloves and rigs are scored, and how better ones are sought."""
+"""Settings of forecasts: scoring of gloves and rigs, and the search for better ones."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ _Seed = Annotated[int, Limits(0)]
 
 @dataclass(frozen=True, slots=True)
 class ScoreRigSettings(Settings):
-    """What hands do before a rig that is scored: options of `handsim rig score`, arguments of `score_rig`."""
+    """What hands do in front of a rig: options of `handsim rig score`, arguments of `score_rig`."""
 
     volume: _Sides = (0.6, 0.6, 0.6)
-    """Sides of the space that hands work in [m]."""
+    """Sides of the space in which hands work [m]."""
     center: Center | None = None
-    """Its middle [m]; (0, 0, 1.1) when not given, or where the hands of the take are."""
+    """Center of that space [m]; (0, 0, 1.1) when not given, or the center of the take's hands."""
     take: Annotated[Take | str | Path | None, Expected("a Take, or the path of one")] = None
     """A take (.npz) of `handsim track` or `handsim simulate`, whose hands work where they are; simulated
     people when not given."""
@@ -50,26 +50,26 @@ class PlanRigSettings(Settings):
     """What a rig is planned for: options of `handsim rig plan`, arguments of `plan_rig`."""
 
     mounts: tuple[Mount, ...] = MOUNTS
-    """What cameras can hang on: walls, a truss along the room's edges (four beams above and four posts),
+    """What cameras can be mounted on: walls, a truss along the room's edges (four beams above, four posts),
     tripods."""
     volume: _Sides = (0.6, 0.6, 0.6)
-    """Sides of the space that hands work in [m]."""
+    """Sides of the space in which hands work [m]."""
     center: Center = ROOM_CENTER
-    """Its middle [m]."""
+    """Center of that space [m]."""
     keep: _Rig | None = None
     """A rig whose cameras stay where they are, a .toml file or a shipped name; the new ones are like its
     first."""
     size: Annotated[tuple[int, int], Limits(1)] = (1280, 1280)
     """Width and height of the new cameras' pictures [px]."""
     field_of_view: Annotated[float, Limits(1.0, 170.0)] = 60.0
-    """Full opening across the shorter side of these [deg]."""
+    """Full angle across the shorter side of the new cameras' pictures [deg]."""
     glove: _Layout = "dense19"
     """Marker layout: a shipped name or the path of a .toml file."""
     seed: _Seed = 0
     """Seed of people and motion."""
 
     def check(self) -> None:
-        """Refuse a plan without a mount, and a picture of new cameras that are like a rig's first."""
+        """Refuse a plan without mounts, or with a picture size although new cameras copy a kept one."""
         if self.keep is not None and (self.size, self.field_of_view) != ((1280, 1280), 60.0):
             raise ArgumentError(
                 f"given keep {self.keep}, and size or field of view, expected none of them: new cameras are "
@@ -91,7 +91,7 @@ class ScoreGloveSettings(Settings):
     """What hands do: poses (random people and poses), twins (simulated motion of one hand and of two) or a
     take (.npz) of `handsim track` or `handsim simulate`."""
     num_frames: Annotated[int, Limits(100)] = 1500
-    """Frames of hands, of a take those of each hand."""
+    """Frames of hands; of a take, frames of each hand."""
     labeler: Annotated[Labeler | str | Path | None, Expected("a Labeler, or the path of one")] = None
     """Folder of a labeler trained on the layout, or an exported .onnx file; the network for any layout when
     not given."""
@@ -101,7 +101,7 @@ class ScoreGloveSettings(Settings):
     """Seed of people, poses and cameras' losses; captures have their own."""
 
     def check(self) -> None:
-        """Refuse a motion that is no take."""
+        """Refuse a motion that is not a take."""
         motion = self.motion
         if not isinstance(motion, Take) and motion not in (POSES, TWINS) and Path(motion).suffix != ".npz":
             raise ArgumentError(f"motion is '{motion}', expected {POSES}, {TWINS} or a take (.npz)")
@@ -109,7 +109,7 @@ class ScoreGloveSettings(Settings):
 
 @dataclass(frozen=True, slots=True)
 class ImproveGloveSettings(Settings):
-    """How a better layout is sought: options of `handsim glove improve`, arguments of `improve_glove`."""
+    """How a better layout is searched: options of `handsim glove improve`, arguments of `improve_glove`."""
 
     markers: Annotated[int | None, Limits(FEWEST_MARKERS, MOST_MARKERS)] = None
     """Number of markers of the new layout; as many as before when not given."""
@@ -118,8 +118,8 @@ class ImproveGloveSettings(Settings):
     rig: _Rig = "figure5"
     """Camera rig: a shipped name or the path of a .toml file."""
     minutes: Annotated[float, Limits(0.0)] = 3.0
-    """How long to move markers [min]."""
+    """Time for moving markers [min]."""
     captures: Annotated[int, Limits(0)] = 3
     """Captures of each kind of work on which both layouts are tried at the end; 0 for none."""
     seed: _Seed = 0
-    """Seed of people, poses and tries."""
+    """Seed of people, poses and tried places."""

@@ -1,15 +1,15 @@
-"""The paper's network as a labeler without torch: the views and images of clouds, and the labels.
+"""The paper's network as a labeler without torch: views and images of clouds, and their labels.
 
-A view is an orthogonal matrix from the cloud's frame into the camera's; one with determinant -1 shows a left
+A view is an orthogonal matrix from the cloud's frame into the camera's; with determinant -1 it shows a left
 hand as a right one. Views are random as in the paper, or aligned: they turn every hand like the mean hand of
-its layout, so that the network does not have to learn all orientations. Training aligns views by the true
-markers; labeling begins with the cloud's principal axes and aligns the next view by the predicted markers.
+its layout, so that the network need not learn all orientations. Training aligns views by the true markers;
+labeling starts with the cloud's principal axes, and aligns the next view by the predicted markers.
 
-Images are 52x52 depth images (Han et al. 2018, section 3.1): an orthographic camera whose axis passes through
-the cloud's mean, zoomed so that every point stays clear of a 10 % margin; the depth of a point is the
-brightness of its one pixel. A view frame has x to the right, y down and z away from the camera, all three in
-the same unit: half an image width. The images stretch depth to a fixed range; network outputs do not, so that
-distances in them are to scale.
+Images are 52x52 depth images (Han et al. 2018, section 3.1): an orthographic camera looks along an axis
+through the cloud's mean, zoomed so that every point stays clear of a 10 % margin; each point is one pixel
+with its depth as brightness. A view frame has x to the right, y down and z away from the camera, all in one
+unit: half an image width. Images stretch depth to a fixed range; network outputs do not, so that distances in
+them are to scale.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ SIGNS: Final = np.array(list(product((1.0, -1.0), repeat=3)))
 """Signs (8, 3) of the principal axes: four rotations for each side of the body."""
 MIRROR_IMAGE: Final = np.array([-1.0, 1.0, 1.0])
 """Signs of the camera's axes in a mirrored view."""
-_CANDIDATES: Final = 10  # views from which the best one is chosen (Han et al., section 3.1)
+_CANDIDATES: Final = 10  # views of which the best is chosen (Han et al., section 3.1)
 _MOMENTS: Final = tuple(
     powers for order in (3, 5) for powers in combinations_with_replacement(range(3), order)
 )
 NUM_MOMENTS: Final = len(_MOMENTS)
-_ALIGNED_SHARE: Final = 0.6  # share of aligned views in training; the others are along principal axes
-_TURN_SPREAD: Final = np.radians(12.0)  # standard deviation of an aligned view's angle from the truth [rad]
-_ROUNDS: Final = 10  # rounds in which hands are averaged and aligned with their average
+_ALIGNED_SHARE: Final = 0.6  # share of aligned views in training; others are along principal axes
+_TURN_SPREAD: Final = np.radians(12.0)  # [rad] standard deviation of an aligned view's angle
+_ROUNDS: Final = 10  # rounds of averaging hands and aligning them with the average
 _REGULARIZATION: Final = 1e-4  # added to the variances of moments, which have no unit
 
 
@@ -48,9 +48,9 @@ class MeanHand:
     """The mean right hand of a layout, and the distribution of its clouds' moments."""
 
     markers: Float[np.ndarray, "M 3"]
-    """Mean positions of the aligned markers [m], principal axes along x, y and z."""
+    """Mean positions of the aligned markers [m], with principal axes along x, y and z."""
     moments: Float[np.ndarray, "K"]
-    """Mean third and fifth moments of clouds along their principal axes, with the right signs."""
+    """Mean third and fifth moments of clouds along principal axes with the right signs."""
     precision: Float[np.ndarray, "K K"]
     """Inverse of their covariance."""
 
@@ -61,7 +61,7 @@ class MeanHand:
         points: Float[np.ndarray, "B N 3"],
         present: Bool[np.ndarray, "B N"],
     ) -> MeanHand:
-        """The mean hand of a training set, from markers of right hands [m] and their clouds."""
+        """Mean hand of a training set, from markers of right hands [m] and their clouds."""
         mean = markers[0]
         for _ in range(_ROUNDS):
             rotations, _ = rigid_fit(markers, mean)
@@ -75,7 +75,7 @@ class MeanHand:
         return cls(mean, seen.mean(axis=0), np.linalg.inv(covariance))
 
     def align(self, markers: Float[np.ndarray, "B M 3"], side: Float[np.ndarray, "B"]) -> NDArray[np.float64]:
-        """Views (B, 3, 3) that align markers [m] with the mean hand; where `side` is -1, mirrored ones."""
+        """Views (B, 3, 3) that align markers [m] with the mean hand; mirrored where `side` is -1."""
         mirrors = np.ones((len(markers), 1, 3))
         mirrors[:, 0, 0] = side
         rotations, _ = rigid_fit(markers * mirrors, self.markers)
@@ -84,9 +84,9 @@ class MeanHand:
     def first_views(
         self, points: Float[np.ndarray, "B N 3"], present: Bool[np.ndarray, "B N"]
     ) -> NDArray[np.float64]:
-        """Views (B, 8, 3, 3) along the principal axes of clouds [m], the likeliest signs of the axes first.
+        """Views (B, 8, 3, 3) along the principal axes of clouds [m], the likeliest signs first.
 
-        Moments of odd order change sign with the axes; the mean hand has a normal distribution of them.
+        Odd moments change their sign with the axes; for the right signs they have a normal distribution.
         """
         views = SIGNS[:, :, None] * principal_axes(points, present)[:, None]
         offsets = _moments(points, present, views) - self.moments
@@ -103,7 +103,7 @@ class MeanHand:
         rng: np.random.Generator,
     ) -> NDArray[np.float64]:
         """Random views (B, 3, 3) of right hands [m], along principal axes or nearly aligned."""
-        from scipy.spatial.transform import Rotation  # not loaded by labeling
+        from scipy.spatial.transform import Rotation  # not needed for labeling
 
         aligned = self.align(markers, np.ones(len(markers)))
         axes = _nearest_axes(points, present, aligned)
@@ -117,7 +117,7 @@ class MeanHand:
 def principal_axes(
     points: Float[np.ndarray, "B N 3"], present: Bool[np.ndarray, "B N"]
 ) -> NDArray[np.float64]:
-    """Orthogonal matrices (B, 3, 3) whose rows are the principal axes of clouds, the longest first."""
+    """Orthogonal matrices (B, 3, 3) with the principal axes of clouds as rows, the longest first."""
     offsets, _ = centered(points, present)
     _, axes = np.linalg.eigh(offsets.swapaxes(1, 2) @ offsets)
     return axes[:, :, ::-1].swapaxes(1, 2)
@@ -131,10 +131,10 @@ def random_views(count: int, *, rng: np.random.Generator) -> NDArray[np.float64]
 def spread_views(
     points: Float[np.ndarray, "B N 3"], present: Bool[np.ndarray, "B N"], *, rng: np.random.Generator
 ) -> NDArray[np.float64]:
-    """Rotations (B, 3, 3) to the one of ten views in which each cloud spreads best (section 3.1).
+    """Rotations (B, 3, 3) to the one of ten views in which each cloud has the largest extent (section 3.1).
 
-    The ten are the same for all clouds. A cloud spreads best where the smaller eigenvalue of its projection's
-    covariance is largest; the larger eigenvalue decides between equals.
+    The ten views are equal for all clouds. The extent is the smaller eigenvalue of the projection's
+    covariance; the larger one decides between equals.
     """
     candidates = random_views(_CANDIDATES, rng=rng)  # (V, 3, 3)
     offsets, _ = centered(points, present)
@@ -150,7 +150,7 @@ def spread_views(
 def centered(
     points: Float[np.ndarray, "B N 3"], present: Bool[np.ndarray, "B N"]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Offsets (B, N, 3) of points from the mean of their cloud, 0 for padding, and the means (B, 3)."""
+    """Offsets (B, N, 3) of points from the mean of their cloud, 0 in padding, and the means (B, 3)."""
     known = np.where(present[..., None], points, 0.0)
     means = known.sum(axis=1) / np.maximum(present.sum(axis=1), 1)[:, None]
     return np.where(present[..., None], known - means[:, None], 0.0), means
@@ -159,7 +159,7 @@ def centered(
 def _moments(
     points: NDArray[np.float64], present: NDArray[np.bool_], views: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Third and fifth moments (B, V, K) of clouds (B, N, 3) in views (B, V, 3, 3), for a spread of one."""
+    """Third and fifth moments (B, V, K) of clouds (B, N, 3) in views (B, V, 3, 3), for unit variance."""
     seen = centered(points, present)[0][:, None] @ views.swapaxes(2, 3)  # (B, V, N, 3)
     count = np.maximum(present.sum(axis=1), 1)[:, None]
     spread = np.sqrt((seen * seen).sum(axis=(2, 3)) / count)
@@ -171,7 +171,7 @@ def _moments(
 def _nearest_axes(
     points: NDArray[np.float64], present: NDArray[np.bool_], aligned: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Rotations (B, 3, 3) to the principal axes, with the signs nearest to the aligned views."""
+    """Rotations (B, 3, 3) to the principal axes, with the signs closest to the aligned views."""
     axes = principal_axes(points, present)
     axes = axes * np.linalg.det(axes)[:, None, None]
     rotations = SIGNS[SIGNS.prod(axis=1) > 0]
@@ -182,13 +182,13 @@ def _nearest_axes(
 IMAGE_SIZE = 52
 """Width and height of a depth image [pixel]."""
 MARGIN = 0.1
-"""Empty border on each of the four sides [share of the image]."""
+"""Empty border on each side, as share of the image."""
 NEAREST, FARTHEST = 0.1, 1.0
-"""Brightness of the nearest and of the farthest point; 0 is background."""
+"""Brightness of the nearest and farthest point; 0 is background."""
 SMALLEST_EXTENT = 0.01
-"""Least extent from the mean that the zoom assumes [m]; a single point has none."""
+"""Least extent from the mean assumed by the zoom [m]; a single point has no extent."""
 FLAT = 1e-6
-"""Depth ranges below this are rounding [m]; their points get the middle brightness."""
+"""Smaller depth ranges are rounding errors [m]; their points get the middle brightness."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -202,9 +202,9 @@ class ViewFrames:
     scales: Float[np.ndarray, "B"]
     """View units per meter [1/m], the same for x, y and z."""
     nearest: Float[np.ndarray, "B"]
-    """Depth of each cloud's nearest point, of brightness 0.1, from the mean along the camera's axis [m]."""
+    """Depth of each cloud's nearest point, of brightness 0.1, relative to the mean [m]."""
     depth_ranges: Float[np.ndarray, "B"]
-    """Depth between brightness 0.1 and 1.0 [m]; 0 where all points are equally deep."""
+    """Depth between brightness 0.1 and 1.0 [m]; 0 if all points have the same depth."""
 
     def normalize(self, positions: Float[np.ndarray, "B N 3"]) -> NDArray[np.float64]:
         """Positions (B, N, 3) in the input's frame [m] as view units; NaN stays NaN."""
@@ -243,7 +243,7 @@ def depth_images(
 def _view_frames(
     points: NDArray[np.float64], present: NDArray[np.bool_], rotations: NDArray[np.float64]
 ) -> ViewFrames:
-    """Pick a camera for each of B clouds that has all points of the cloud in its image."""
+    """Choose a camera for each of B clouds that has all points in its image."""
     offsets, centers = centered(points, present)
     rotated = offsets @ rotations.swapaxes(1, 2)
     extent = np.abs(rotated[..., :2]).max(axis=(1, 2), initial=SMALLEST_EXTENT)
@@ -261,24 +261,24 @@ def _view_frames(
     )
 
 
-_SEARCH_REJECT: Final = 0.04  # default cost of a point without a label [m]
-_SPREAD: Final = 0.005  # default spread of the confidence [m]
-_ACCEPTED_DISTANCE: Final = 0.01  # a view with a smaller mean distance of labeled points is accepted [m]
-_ACCEPTED_GHOSTS: Final = 2  # an accepted view has at most so many points without a label
-_TOGETHER: Final = (1, 2)  # numbers of first views that are tried at once, before all others
-_TURNS: Final = 2  # times that each first view is aligned by the predictions
-_IMAGES: Final = 128  # images that go through the network at once
+_SEARCH_REJECT: Final = 0.04  # [m] default cost of a point without a label
+_SPREAD: Final = 0.005  # [m] default scale of the confidence
+_ACCEPTED_DISTANCE: Final = 0.01  # [m] A view with a smaller mean distance of labeled points is accepted.
+_ACCEPTED_GHOSTS: Final = 2  # largest number of unlabeled points in an accepted view
+_TOGETHER: Final = (1, 2)  # numbers of first views tried together, before all others
+_TURNS: Final = 2  # number of times that each first view is aligned by the predictions
+_IMAGES: Final = 128  # largest number of images in one call of the network
 
 
 class _View(NamedTuple):
-    """The fit of the markers predicted from one view to a cloud."""
+    """Fit of the markers predicted from one view to a cloud."""
 
     distances: Float[np.ndarray, "N M"]
     """Distances of the points from the predicted markers [m]."""
     cost: float
     """Mean cost of a point in equation 1 [m]."""
     accepted: bool
-    """Whether the fit is so good that no further view is tried."""
+    """Whether the fit is so good that no other view is tried."""
 
 
 _NONE: Final = _View(np.zeros((0, 0)), np.inf, False)
@@ -287,7 +287,7 @@ _NONE: Final = _View(np.zeros((0, 0)), np.inf, False)
 class CNNLabeler:
     """The paper's network, which maps images (B, 1, 52, 52) to positions (B, M, 3) in view units.
 
-    Equation 1 then matches points, and its cost decides between views. The network knows right hands only;
+    Equation 1 then matches points, and its cost selects the view. The network knows only right hands;
     mirrored views show left hands as right ones.
     """
 
@@ -310,7 +310,7 @@ class CNNLabeler:
         return label_in_batches(frames, self.label_batch)
 
     def label_batch(self, clouds: list[NDArray[np.float64]]) -> list[Labeling]:
-        """Label the points [m] of a few frames together."""
+        """Label the points [m] of several frames together."""
         return [label_by_distance(one, self._reject, self._spread) for one in self.distances(clouds)]
 
     def distances(self, clouds: list[NDArray[np.float64]]) -> list[Float[np.ndarray, "N M"]]:
@@ -319,7 +319,7 @@ class CNNLabeler:
         points = padded.astype(np.float64)
         if self._aligned:
             views = self._hand.first_views(points, present)
-        else:  # a fixed seed gives the same clouds the same labels every time
+        else:  # A fixed seed gives equal clouds equal labels.
             shown = spread_views(points, present, rng=np.random.default_rng(0))
             views = np.stack([shown, MIRROR_IMAGE[:, None] * shown], axis=1)
         best = [_NONE] * len(clouds)
@@ -341,7 +341,7 @@ class CNNLabeler:
         present: Bool[np.ndarray, "B N"],
         views: Float[np.ndarray, "B 3 3"],
     ) -> NDArray[np.float64]:
-        """Predicted markers (B, M, 3) [m] in the frame of the points, with these views first."""
+        """Predicted markers (B, M, 3) [m] in the frame of the points, starting from these views."""
         predicted = self._predict_once(points, present, views)
         if self._aligned:
             sides = np.sign(np.linalg.det(views))
@@ -365,7 +365,7 @@ class CNNLabeler:
 
 
 def _compare(points: NDArray[np.float64], markers: NDArray[np.float64]) -> _View:
-    """How well predicted markers (M, 3) [m] fit points (N, 3) [m]."""
+    """Compare predicted markers (M, 3) [m] with points (N, 3) [m]."""
     distances = np.linalg.norm(points[:, None] - markers, axis=-1)
     labels = match_distances(distances, _SEARCH_REJECT)
     labeled = labels >= 0
@@ -376,9 +376,9 @@ def _compare(points: NDArray[np.float64], markers: NDArray[np.float64]) -> _View
 
 
 def label_by_distance(distances: Float[np.ndarray, "N M"], reject: float, spread: float) -> Labeling:
-    """Labels of equation 1 by distances from predicted markers [m], with ghosts at the cost `reject` [m].
+    """Labels of equation 1 from distances to predicted markers [m]; a ghost costs `reject` [m].
 
-    A confidence is the label's share of weights that fall by a factor of e over `spread` [m].
+    The confidence is the label's share of all weights, which fall by a factor of e over `spread` [m].
     """
     labels = match_distances(distances, reject)
     rejects = np.full((len(distances), 1), reject)

@@ -5,10 +5,10 @@ The outputs are positions in the image's view frame (`train.labelers.cnn_labeler
 layout's marker order; labels come from matching them with the points (equation 1).
 
 On a CPU the first filters are computed only where an image differs from its background. A depth image has
-points in about 20 of its 2,704 pixels. Convolutions without padding keep the others uniform, so that the
+points in about 20 of its 2,704 pixels. Convolutions without padding keep the rest uniform, so that the
 features of a layer are one background and the pixels that differ from it: 7 % of the first layer, 18 % of the
-second, 55 % of the third. The results, with batch statistics, are those of the dense layers at a third of
-the multiplications.
+second, 55 % of the third. The results, batch statistics included, equal those of dense layers, with a third
+of the multiplications.
 """
 
 from __future__ import annotations
@@ -28,20 +28,20 @@ from train.data.batches import Batch, Part
 from train.labelers.cnn_labeler import NUM_MOMENTS, MeanHand, depth_images, random_views
 from train.settings import CNNConfig, TrainSettings
 
-_TAPS = 9  # of a 3x3 filter
+_TAPS = 9  # weights of a 3x3 filter
 
 
 class SparseFeatures(NamedTuple):
     """Features of a batch of images with a uniform background."""
 
     pixels: Int32[np.ndarray, "B S S"]
-    """Row of each pixel in `values`, -1 where it is background."""
+    """Row of each pixel in `values`, -1 for background."""
     values: Float[Tensor, "P C"]
     """Features of the other pixels minus the background's."""
     background: Float[Tensor, "C"]
 
     def dense(self) -> Float[Tensor, "B C S S"]:
-        """All pixels, in the memory format channels last."""
+        """All pixels, with channels last in memory."""
         batch, size, _ = self.pixels.shape
         rows = torch.from_numpy(np.flatnonzero(self.pixels.ravel() >= 0))
         everywhere = self.background.expand(batch * size * size, -1)
@@ -87,7 +87,7 @@ def _convolve(features: SparseFeatures, layer: nn.Conv2d) -> SparseFeatures:
 
 
 class _Convolution(torch.autograd.Function):
-    """Multiply each input by the nine taps, then sum the products that reach each output."""
+    """Multiply each input by the nine taps, then sum the products for each output."""
 
     @staticmethod
     def forward(
@@ -120,7 +120,7 @@ def _normalize(features: SparseFeatures, layer: nn.BatchNorm2d) -> SparseFeature
     assert layer.running_mean is not None and layer.running_var is not None
     if layer.training:
         total = pixels.size
-        offset = values.sum(0) / total  # of the mean from the background
+        offset = values.sum(0) / total  # mean relative to the background
         rest = (total - len(values)) / total
         variance = (values - offset).square().sum(0) / total + rest * offset.square()
         with torch.no_grad():
@@ -131,7 +131,7 @@ def _normalize(features: SparseFeatures, layer: nn.BatchNorm2d) -> SparseFeature
     else:
         offset, variance = layer.running_mean - background, layer.running_var
     scale = layer.weight * torch.rsqrt(variance + layer.eps)
-    # Batch statistics cancel the background, but several devices expect a gradient of 0 rather than none.
+    # Batch statistics cancel the background, but several devices expect a zero gradient, not none.
     shift = layer.bias - offset * scale + 0.0 * background
     return SparseFeatures(pixels, values * scale, shift)
 
@@ -148,12 +148,12 @@ def _pool(features: SparseFeatures) -> SparseFeatures:
 def _connect(
     pixels: NDArray[np.int32], count: int
 ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]:
-    """Which of P inputs (B, S, S), -1 for background, of a 3x3 convolution reach which outputs.
+    """Connect P inputs (B, S, S), -1 for background, of a 3x3 convolution with its outputs.
 
     Returns:
         Rows of the outputs (B, S - 2, S - 2), -1 for background; the products (row x 9 + tap) that each of
-        the Q outputs sums (Q, 9), P x 9 for a product with the background; and the output that each product
-        reaches (P, 9), Q where it is outside of the image.
+        the Q outputs sums (Q, 9), P x 9 for a product with the background; and the output to which each
+        product contributes (P, 9), Q outside of the image.
     """
     batch, size = len(pixels), pixels.shape[1] - 2
     reached = np.full((batch, size, size), -1, np.int32)
@@ -180,7 +180,7 @@ def _connect(
 
 @kernel
 def _pair(pixels: NDArray[np.int32], count: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Which of P inputs (B, S, S), -1 for background, a 2x2 pooling joins.
+    """Connect P inputs (B, S, S), -1 for background, of a 2x2 pooling with its outputs.
 
     Returns:
         Rows of the outputs (B, S / 2, S / 2), -1 for background, and the inputs (Q, 4) of each of the Q
@@ -203,7 +203,7 @@ def _pair(pixels: NDArray[np.int32], count: int) -> tuple[NDArray[np.int32], NDA
     return reached, sources[:outputs]
 
 
-_NUM_SPARSE: Final = 10  # layers up to the third filter, after which much of an image is still uniform
+_NUM_SPARSE: Final = 10  # layers up to the third filter, after which sparsity no longer helps
 
 
 class DeepLabelCNN(nn.Module):
@@ -278,7 +278,7 @@ def cnn_loss(
     rng: np.random.Generator,
     part: Part,
 ) -> Tensor:
-    """Loss of a part of one batch, each cloud in its own random view (section 3.1 of the paper)."""
+    """Loss of a part of a batch, with a random view for each cloud (section 3.1 of the paper)."""
     points, present = batch.cloud.points, batch.cloud.present
     if config.cnn.views == "aligned":
         hand = network.mean_hand.get()  # type: ignore[operator, union-attr]

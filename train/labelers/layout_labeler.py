@@ -1,8 +1,8 @@
-"""A labeler for any layout, without a training set: one network that takes the layout as an input.
+"""A labeler for any layout without a training set: one network that takes the layout as an input.
 
-Some seconds of simulation describe a layout: they give the distribution of the distance between every two
-markers over people and poses, and the pose prior (`train.labelers.pose_prior`). Some minutes of training make
-the labeler better. The user's cache folder keeps it under a digest of the layout, the cameras, the shipped
+A layout is described by some seconds of simulation: the distribution of the distance between every two
+markers over people and poses, and the pose prior (`train.labelers.pose_prior`). Some minutes of training
+improve the labeler. The user's cache folder stores it under a digest of the layout, the cameras, the shipped
 weights and the version.
 """
 
@@ -60,17 +60,17 @@ from train.simulation.training_frames import (
 )
 
 NUM_POSES: Final = 40_000
-"""Poses that describe a layout; fewer make a coarser pose prior."""
+"""Poses that describe a layout; fewer give a coarser pose prior."""
 WEIGHTS: Final = "any_layout.safetensors"
 SHIPPED: Final = Path(__file__).parents[1] / "weights"
 _NETWORK, _PRIOR, _DISTANCES = "network.", "prior.", "distances"
-_CHUNK: Final = 500  # poses whose features are in memory at once
-_MANY_MARKERS: Final = 24  # beyond which poses and clouds become fewer, as work goes with the square
+_CHUNK: Final = 500  # number of poses whose features are in memory together
+_MANY_MARKERS: Final = 24  # Larger layouts use fewer poses and clouds, as work is quadratic.
 _POSES_PER_PERSON: Final = 100
 
 
 class LayoutLabeler:
-    """Labels a glove by the network for any layout and the glove's `mean_features`."""
+    """Labels a glove with the network for any layout and the glove's `mean_features`."""
 
     def __init__(
         self,
@@ -84,7 +84,7 @@ class LayoutLabeler:
 
     @classmethod
     def at_once(cls, layout: MarkerLayout, *, num_poses: int = NUM_POSES, seed: int = 0) -> Self:
-        """The shipped network for a layout that a few seconds of simulation describe."""
+        """The shipped network for a layout described by a few seconds of simulation."""
         rng = np.random.default_rng(seed)
         markers = sample_worn_markers(layout, num_poses, rng=rng)
         network, prior = shipped_network(), learn_pose_prior(markers, rng=rng)
@@ -139,7 +139,7 @@ def mean_features(markers: Float[np.ndarray, "T M 3"], config: LayoutNetworkConf
 
 
 def _share_of_work(num_markers: int) -> float:
-    """Share of poses and clouds that a layout is learned from, so that large ones take two minutes too."""
+    """Share of poses and clouds used for a layout, so that large ones take two minutes, too."""
     return min(1.0, (_MANY_MARKERS / num_markers) ** 2)
 
 
@@ -163,7 +163,7 @@ def shipped_network() -> LayoutNetwork:
 def sample_worn_markers(
     layout: MarkerLayout, num_frames: int, *, rng: np.random.Generator
 ) -> Float[np.ndarray, "T M 3"]:
-    """Markers [m] of right hands in valid poses, with another person and glove fit every hundred frames."""
+    """Markers [m] of right hands in valid poses, with a new person and glove fit every hundred frames."""
     config = GenerateSettings()
     slip, roll = config.slip_along, np.deg2rad(config.slip_around)
     parts, show = [], told_share(f"learning glove '{layout.name}', once: its poses")
@@ -178,19 +178,19 @@ def sample_worn_markers(
 
 
 MAX_KEPT: Final = 32
-"""Labelers in the cache; one takes about four megabytes."""
+"""Number of labelers in the cache; one takes about four megabytes."""
 NUM_CLOUDS: Final = 15_000
 _BATCH, _LEAST_BATCH = 64, 16  # clouds of a step
-_PEAK_RATE, _WARM_UP = 2e-3, 20  # learning rate; steps until it is reached
+_PEAK_RATE, _WARM_UP = 2e-3, 20  # learning rate; number of steps until it is reached
 
 
 def is_learned(layout: MarkerLayout, rig: CameraRig | str = "figure5") -> bool:
-    """Whether the cache holds a labeler of a glove."""
+    """Whether the cache has a labeler of a glove."""
     return _file_of(layout, rig).exists()
 
 
 def learned_labeler(layout: MarkerLayout, rig: CameraRig | str = "figure5") -> LayoutLabeler:
-    """The labeler of a glove: learned in some minutes the first time, and read from the cache later."""
+    """The labeler of a glove: learned in some minutes the first time, later read from the cache."""
     file = _file_of(layout, rig)
     found = _read(file, layout)
     if found is not None:
@@ -199,7 +199,7 @@ def learned_labeler(layout: MarkerLayout, rig: CameraRig | str = "figure5") -> L
     try:
         _write(file, learned)
     except OSError:
-        return learned  # a cache that cannot be written costs time only
+        return learned  # Without a cache the labeler is learned again next time.
     return _read(file, layout) or learned
 
 
@@ -256,9 +256,9 @@ def fine_tuned_labeler(
     num_clouds: int = NUM_CLOUDS,
     seed: int = 0,
 ) -> LayoutLabeler:
-    """A labeler for any layout after training on clouds of one layout, as a rig sees them.
+    """Train the labeler for any layout on clouds of one layout, as seen by a rig.
 
-    Layouts of more than 24 markers are learned from fewer clouds, in the square of their number.
+    Layouts with more than 24 markers use fewer clouds, inversely to the square of their number.
     """
     rng = np.random.default_rng(seed)
     share = _share_of_work(layout.num_markers)
@@ -298,7 +298,7 @@ def layout_step(
     cloud: Cloud,
     layouts: Float[Tensor, "G M M K"],
 ) -> tuple[float, Float[Tensor, "B N M+1"]]:
-    """Make a gradient step at a share of the peak rate, and return the loss and point scores before it."""
+    """Make a gradient step at a share of the peak rate; return the loss and point scores before it."""
     for group in optimizer.param_groups:
         group["lr"] = float(_PEAK_RATE * rate)
     points, present = torch.from_numpy(cloud.points.astype(np.float32)), torch.from_numpy(cloud.present)

@@ -1,8 +1,8 @@
-"""From scores or distances to labels: one point per label, one label per point, with a reject option.
+"""From scores or distances to labels: one point per label, one label per point, or neither.
 
-A network judges each point by itself, so that the likeliest labeling may be no hand: an occluded marker's
-label may go to its neighbor, or a chain of labels may be shifted by one. Therefore labelings near the
-likeliest one compete by the network's scores and a prior of hands.
+A network scores each point by itself, so that the likeliest labeling may not be a hand: an occluded marker's
+label may go to its neighbor, or a chain of labels may be shifted by one. Therefore labelings close to the
+likeliest one are compared by the network's scores and a prior of hands.
 """
 
 from __future__ import annotations
@@ -31,19 +31,19 @@ from train.labelers.pose_prior import (
 )
 
 GHOST = -1
-"""Label of a point that is not a marker."""
+"""Label of a point that is no marker."""
 _SCORE_WEIGHT: Final = 0.65
-"""Weight of each of the two scores: 0.5 if they held the same information, 1 if they were independent."""
+"""Weight of each of the two scores: 0.5 if they had the same information, 1 if they were independent."""
 _SINKHORN_ROUNDS: Final = 20
-_MIN_PROBABILITY: Final = 1e-30  # its logarithm is still a number
+_MIN_PROBABILITY: Final = 1e-30  # its logarithm is finite
 SINKHORN: Final = {
     "score_weight": _SCORE_WEIGHT,
     "sinkhorn_rounds": _SINKHORN_ROUNDS,
     "least_probability": _MIN_PROBABILITY,
 }
-"""Constants of `pair_probabilities`, for programs that repeat it."""
+"""Constants of `pair_probabilities`, for other programs."""
 IMPOSSIBLE: Final = 1e6
-"""Cost of a pair that is excluded."""
+"""Cost of an excluded pair."""
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
@@ -51,9 +51,9 @@ IntArray = NDArray[np.int64]
 def pair_probabilities(
     point_scores: Float[np.ndarray, "N M+1"], label_scores: Float[np.ndarray, "M N+1"]
 ) -> Float[np.ndarray, "N+1 M+1"]:
-    """Probability of each label for each point when no two points may share one; rows of points sum to 1.
+    """Probability of each label for each point if no two points share one; rows of points sum to 1.
 
-    The last column is a ghost, the last row an occluded label.
+    The last column stands for a ghost, the last row for an occluded label.
     """
     return balance(
         point_scores.astype(np.float64), label_scores.astype(np.float64), _SCORE_WEIGHT, _SINKHORN_ROUNDS
@@ -61,21 +61,21 @@ def pair_probabilities(
 
 
 def match_probabilities(probabilities: Float[np.ndarray, "N+1 M+1"]) -> Int[np.ndarray, "N"]:
-    """The one-to-one labeling with the greatest product of probabilities; `GHOST` where a point has none."""
+    """The one-to-one labeling with the largest product of probabilities; `GHOST` for points without label."""
     return assign(*assignment_costs(probabilities))[1]
 
 
 def match_distances(distances: Float[np.ndarray, "N M"], reject: float) -> Int[np.ndarray, "N"]:
-    """One-to-one labeling with the least total distance from predicted markers [m], the paper's equation 1.
+    """One-to-one labeling with the least total distance to predicted markers [m], the paper's equation 1.
 
-    A point is a `GHOST` at the cost of `reject` [m], an option that the paper's results imply.
+    A point is a `GHOST` at the cost `reject` [m], an option implied by the paper's results.
     """
     return assign(distances.astype(np.float64), np.full(len(distances), reject))[1]
 
 
 @kernel
 def assignment_costs(probabilities: Float[np.ndarray, "N+1 M+1"]) -> tuple[FloatArray, FloatArray]:
-    """Costs of pairs of a point and a label (N, M), against the label's occlusion, and of ghosts (N,)."""
+    """Costs of pairs of point and label (N, M), relative to the label's occlusion, and of ghosts (N,)."""
     count, num_labels = len(probabilities) - 1, probabilities.shape[1] - 1
     costs, reject = np.empty((count, num_labels)), np.empty(count)
     for i in range(count):
@@ -108,10 +108,10 @@ def assign(costs: Float[np.ndarray, "N M"], reject: Float[np.ndarray, "N"]) -> t
             if owner[column] >= 0:
                 row_dual[owner[column]] += length - shortest[column]
             column_dual[column] -= length - shortest[column]
-        if end < 0:  # a point gives its label up and is a ghost
+        if end < 0:  # a point loses its label and becomes a ghost
             end = labels[rejected]
             labels[rejected] = GHOST
-        while end >= 0:  # each point on the path passes its label on
+        while end >= 0:  # Each point on the path passes its label on.
             row = before[end]
             owner[end] = row
             end, labels[row] = labels[row], end
@@ -134,11 +134,11 @@ def _shortest_path(
     reached: Bool[np.ndarray, "M"],
     columns: Int[np.ndarray, "M"],
 ) -> tuple[float, int, int, int]:
-    """The shortest path by reduced costs from a point to a free label, or to a point that may be a ghost.
+    """Shortest path by reduced costs from a point to a free label, or to a point that becomes a ghost.
 
-    Returns its length, the number of reached labels, the free label or -1, and the point that is a ghost
-    then. The last four arrays are overwritten: length to each label, the point before it, whether it was
-    reached, and the reached labels in their order.
+    Returns its length, the number of reached labels, the free label or -1, and then the point that becomes a
+    ghost. The last four arrays are overwritten: length to each label, the point before it, whether it was
+    reached, and the reached labels in order.
     """
     shortest[:] = np.inf
     reached[:] = False
@@ -174,7 +174,7 @@ def balance(
 ) -> NDArray[np.float64]:
     """Sinkhorn's iteration on the weighted sum of log-probabilities by point (N, M + 1) and label (M, N + 1).
 
-    Returns probabilities (N + 1, M + 1), the last column "a ghost", the last row "occluded".
+    Returns probabilities (N + 1, M + 1); the last column stands for a ghost, the last row for occlusion.
     """
     count, num_labels = len(point_scores), len(label_scores)
     plan = np.zeros((count + 1, num_labels + 1))
@@ -204,22 +204,22 @@ def balance(
     return plan
 
 
-_SURE: Final = 0.95  # pairs with this probability are final
-_MAX_UNSURE: Final = 8  # the least sure pairs of a labeling, each of which is tried without
-_ROUNDS: Final = 3  # pairs that a labeling is tried without
-_WIDTH: Final = 3  # best labelings of a round, from which the next round starts
+_SURE: Final = 0.95  # Pairs of a higher probability are final.
+_MAX_UNSURE: Final = 8  # number of least certain pairs of a labeling that are excluded in turn
+_ROUNDS: Final = 3  # largest number of pairs excluded from a labeling
+_WIDTH: Final = 3  # number of best labelings with which the next round starts
 _MAX_LABELINGS: Final = 1 + _MAX_UNSURE * (1 + (_ROUNDS - 1) * _WIDTH)
-_MAX_EXTRA_COST: Final = 14.0  # of a labeling above the cost of the likeliest one [nats, twice]
-_PRIOR_WEIGHT: Final = 2.0  # of the prior's density against the scores, chosen on held-out simulated frames
+_MAX_EXTRA_COST: Final = 14.0  # [nats, for points plus labels] above the cost of the likeliest labeling
+_PRIOR_WEIGHT: Final = 2.0  # weight of the prior's log-density, chosen on held-out simulated frames
 _GHOST: Final = 4.0  # log-density of a ghost, uniform around the hand [1/m^3]
-_NEAR_COMPONENTS: Final = 40  # components of the prior that are tried for all labelings of a cloud
-_TEMPERATURE: Final = 0.25  # of the odds between labelings, for the confidence
-_MIN_LABELED: Final = 4  # labeled points of a hand
-_MIN_DENSITY: Final = 2.5  # log-density of a hand per coordinate; true labels of real hands have 2.8 to 4.2
+_NEAR_COMPONENTS: Final = 40  # number of the prior's components that are considered for a cloud
+_TEMPERATURE: Final = 0.25  # temperature of the odds between labelings, for the confidence
+_MIN_LABELED: Final = 4  # least number of labeled points of a hand
+_MIN_DENSITY: Final = 2.5  # least log-density of a hand per coordinate; true labels have 2.8 to 4.2
 
 
 def matching_constants() -> dict[str, float]:
-    """Constants of `match_scores`, for programs that repeat it, such as that of docs/how_to/onnx.md."""
+    """Constants of `match_scores`, for other programs such as that of docs/how_to/onnx.md."""
     return {
         **SINKHORN,
         "impossible": IMPOSSIBLE,
@@ -279,15 +279,15 @@ def _verify(
     probabilities: Float[np.ndarray, "N+1 M+1"],
     prior: PriorTables,
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """The best labeling (N,) near the likeliest one, and the probability (N,) of each label."""
+    """The best labeling (N,) close to the likeliest one, and the probability (N,) of each label."""
     costs, reject = assignment_costs(probabilities)
     least, labels = assign(costs, reject)
     near, mirrored = _near_components(points, labels, prior)
     near_table = means_by_marker(prior.means, near)
     found = np.empty((_MAX_LABELINGS, len(points)), dtype=np.int64)
     scores, densities = np.empty(_MAX_LABELINGS), np.empty(_MAX_LABELINGS)
-    taken = np.full((_MAX_LABELINGS, _ROUNDS), -1)  # points whose pairs a labeling excludes
-    columns = np.full((_MAX_LABELINGS, _ROUNDS), -1)  # labels of these pairs
+    taken = np.full((_MAX_LABELINGS, _ROUNDS), -1)  # points of excluded pairs
+    columns = np.full((_MAX_LABELINGS, _ROUNDS), -1)  # labels of excluded pairs
     rank = prior.directions.shape[3]
     kept = _Factors(
         np.empty((_MAX_LABELINGS, len(prior.means[0])), dtype=np.bool_),
@@ -331,9 +331,9 @@ def _log_density_of_near(
     prior: PriorTables,
     kept: _Factors,
 ) -> float:
-    """Log-density of centered, labeled points [m] by the nearest of some components, their means in `table`.
+    """Log-density of centered, labeled points [m] under the nearest of some components, with means `table`.
 
-    Cholesky factors are kept for other labelings.
+    Stores Cholesky factors for other labelings.
     """
     marked = np.zeros(kept.sets.shape[1], dtype=np.bool_)
     marked[labels] = True
@@ -364,7 +364,7 @@ def _near_components(
     labels: Int[np.ndarray, "N"],
     prior: PriorTables,
 ) -> tuple[NDArray[np.int64], bool]:
-    """The components (C,) nearest to labeled points of the likelier side, and whether that is the left."""
+    """Components (C,) nearest to labeled points of the likelier side, and whether that is the left one."""
     known = np.flatnonzero(labels >= 0)
     known_labels = labels[known]
     best, near, left = -np.inf, np.empty(0, dtype=np.int64), False
@@ -384,7 +384,7 @@ def _near_components(
 def _least_sure(
     probabilities: Float[np.ndarray, "N+1 M+1"], labels: Int[np.ndarray, "N"]
 ) -> NDArray[np.int64]:
-    """The points of a labeling with the least sure labels, in this order."""
+    """Points of a labeling with uncertain labels, the least certain first."""
     confidence = np.empty(len(labels))
     for point in range(len(labels)):
         confidence[point] = probabilities[point, labels[point]]
@@ -400,7 +400,7 @@ def _assign_without(
     labels: Int[np.ndarray, "3"],
     count: int,
 ) -> tuple[float, NDArray[np.int64]]:
-    """The labeling of least cost that excludes some pairs of a point and a label, -1 for a ghost."""
+    """Labeling of least cost without some pairs of point and label, -1 for a ghost."""
     rest, without = costs.copy(), reject.copy()
     for number in range(count):
         if labels[number] >= 0:
@@ -412,7 +412,7 @@ def _assign_without(
 
 @kernel
 def _index_of(row: NDArray[np.generic], rows: NDArray[np.generic], count: int) -> int:
-    """Index of a row (W,) among the first rows of a table (R, W); -1 if it is not there."""
+    """Index of a row (W,) among the first `count` rows of a table (R, W); -1 if it is not there."""
     for number in range(count):
         same = True
         for column in range(len(row)):
@@ -433,8 +433,8 @@ def _elected(
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """The best labeling (N,), and the confidence (N,) of each of its labels.
 
-    The confidence is the network's own where all labelings agree; else its geometric mean with the odds of
-    the labelings that agree. The network alone decides if the best labeling is no hand.
+    If all labelings agree, the confidence is the network's own; otherwise it is its geometric mean with the
+    odds of the agreeing labelings. The network alone decides if the best labeling is not a hand.
     """
     best, count = int(np.argmax(scores)), len(found)
     if densities[best] < _MIN_DENSITY:

@@ -1,16 +1,16 @@
-"""The networks of the labelers in torch: how each is built and trained, and how it becomes a labeler.
+"""Networks of the labelers in torch: how each is built and trained, and how it becomes a labeler.
 
-The default network exchanges gated messages between points, from the distances between them alone, so
-rotating, moving or mirroring the cloud changes nothing: one network labels left and right hands. Messages are
-weighted by sigmoid gates of distance and of both ends (no softmax over points, unlike self-attention), so
-they add up evidence and can count neighbors. Two outputs are trained together: the label, or ghost, of each
-point; and the point, or none, of each label.
+The default network exchanges gated messages between points, based only on their distances, so that rotating,
+moving or mirroring the cloud changes nothing: one network labels left and right hands. Messages are weighted
+by sigmoid gates of distance and of both ends (no softmax over points, unlike self-attention), so they add up
+evidence and can count neighbors. Two outputs are trained together: the label, or ghost, of each point; and
+the point, or none, of each label.
 
-The network for any layout describes points and markers by such messages, from the distances between the
-points of a cloud and from the distributions of the distance between two markers over many people and poses.
-It then compares points and markers in rounds. Each round uses the matches of the last one: it compares the
-distances from a point to other matched points with those from a marker (a mean-field step of graph matching).
-So a layout that was never trained on is labeled from its distances alone.
+The network for any layout describes points and markers by such messages, based on distances between the
+points of a cloud and on distributions of the distance between two markers over many people and poses. It then
+compares points and markers in rounds. Each round uses the matches of the last one: it compares distances from
+a point to other matched points with those from a marker (a mean-field step of graph matching). So a layout
+that was never trained on is labeled by its distances alone.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class SetLabeler(nn.Module):
         super().__init__()
         self.config = config
         self.prior: PosePrior | None = None
-        """Prior of hands that verifies labelings, learned after training."""
+        """Prior of hands that verifies labelings; learned after training."""
         width, bumps = config.width, config.num_distances
         self.register_buffer("centers", torch.linspace(0.0, config.reach, bumps), persistent=False)
         self.embed = nn.Sequential(nn.Linear(bumps + 1, width), nn.SiLU(), nn.Linear(width, width))
@@ -67,7 +67,7 @@ class SetLabeler(nn.Module):
         )
 
     def forward(self, points: Float[Tensor, "B N 3"], present: Bool[Tensor, "B N"]) -> LabelScores:
-        """Score clouds [m], padded where not `present`."""
+        """Score clouds [m], which are padded where not `present`."""
         batch, count, _ = points.shape
         distances = (points[:, :, None] - points[:, None]).square().sum(-1).add(1e-12).sqrt()  # (B, N, N)
         spacing = self.config.reach / (self.config.num_distances - 1)
@@ -91,15 +91,15 @@ class SetLabeler(nn.Module):
         )
 
     def numpy_weights(self) -> dict[str, np.ndarray]:
-        """The weights by name, in the network's own memory."""
+        """Weights by name, without a copy."""
         return {name: value.detach().numpy() for name, value in self.state_dict().items()}
 
 
 class PairedScores(nn.Module):
-    """A network with two more outputs, for exported files, as `train.labelers.matching` has them.
+    """A network with two additional outputs of `train.labelers.matching`, for exported files.
 
-    They are the probabilities of pairs of a point and a label, ghosts last (B, N, M+1), and the costs of
-    pairs and of points as ghosts (B, N, M+N).
+    They are the probabilities of pairs of point and label, ghosts last (B, N, M+1), and the costs of pairs
+    and of points as ghosts (B, N, M+N).
     """
 
     def __init__(self, network: nn.Module) -> None:
@@ -139,7 +139,7 @@ class MessageRound(nn.Module):
         self.ends = nn.Linear(width, 2 * gates)
         self.distance_gate = nn.Linear(bumps, gates)
         self.mix = nn.Linear(width, width)
-        # The weights on disk name these modules.
+        # The weights on disk use this name.
         self.think = nn.Sequential(
             nn.LayerNorm(width), nn.Linear(width, 2 * width), nn.SiLU(), nn.Linear(2 * width, width)
         )
@@ -154,7 +154,7 @@ class MessageRound(nn.Module):
         batch, count, width = features.shape
         normed = self.norm(features)
         receiver, sender = self.ends(normed).transpose(1, 2).chunk(2, dim=1)  # (B, G, N) each
-        # Gates come before points, because bmm expects the large arrays of pairs in this layout.
+        # Gates precede points, because bmm expects the large arrays of pairs in this order.
         near = torch.bmm(self.distance_gate.weight.expand(batch, -1, -1), bumps).view(batch, -1, count, count)
         biased = receiver + self.distance_gate.bias[:, None]
         gate = torch.sigmoid(near + biased[..., None] + sender[:, :, None])  # (B, G, N, N)
@@ -179,10 +179,10 @@ def labeling_loss(scores: LabelScores, truth: Tensor, present: Tensor, *, weight
     return weights.points * point_loss + weights.clouds * label_loss
 
 
-_USUAL_POINTS: Final = 20.0  # number of points that a cloud's is divided by
-_MIN_SHARE: Final = 1e-3  # added to the shares of poses, so that they have logarithms
-_EARLY_WEIGHT: Final = 0.3  # weight of the loss of each comparison before the last
-_IMPOSSIBLE: Final = -1e4  # score of a point that is padding
+_USUAL_POINTS: Final = 20.0  # divisor of the number of points in a cloud
+_MIN_SHARE: Final = 1e-3  # added to shares of poses, so that logarithms are finite
+_EARLY_WEIGHT: Final = 0.3  # weight of the loss of all comparisons but the last
+_IMPOSSIBLE: Final = -1e4  # score of padding
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,7 +198,7 @@ class LayoutNetworkConfig:
     match_rounds: int = 4
     """Rounds between comparisons."""
     heads: int = 2
-    """Ways in which a distance counts for two pairs of a point and a marker."""
+    """Number of ways to weight the agreement of distances."""
     num_distances: int = 24
     """Gaussian basis functions that encode a distance."""
     reach: float = 0.24
@@ -237,8 +237,8 @@ class LayoutNetwork(nn.Module):
     ) -> list[LabelScores]:
         """Scores after each comparison, the best last.
 
-        Clouds of one layout [m] follow each other; G, the number of layouts, divides their number. A layout
-        is the mean of `distance_features` over its poses.
+        Clouds [m] of one layout are contiguous; G, the number of layouts, divides their number. A layout is
+        the mean of `distance_features` over its poses.
         """
         graphs = _Graphs.of(points, present, layouts, self.config)
         there = graphs.there
@@ -271,7 +271,7 @@ class LayoutNetwork(nn.Module):
 
 
 class _Graphs(NamedTuple):
-    """Distances of clouds and layouts in the layouts that the network needs."""
+    """Distances of clouds and layouts in the memory orders that the network needs."""
 
     near: Float[Tensor, "B N N K"]
     flat_near: Float[Tensor, "B K N*N"]
@@ -302,16 +302,16 @@ class _Graphs(NamedTuple):
 
 
 class _Matches(NamedTuple):
-    """The result of one comparison of points and markers."""
+    """Result of one comparison of points and markers."""
 
     scores: Float[Tensor, "B N M"]
     log: LabelScores
     soft: Float[Tensor, "B N M"]
     """Geometric mean of both probabilities of a pair."""
     points_sure: Float[Tensor, "B N 2"]
-    """Probability that a point is a ghost, and of its likeliest marker."""
+    """Probability that a point is a ghost, and that of its likeliest marker."""
     markers_sure: Float[Tensor, "B M 2"]
-    """Probability that a marker is occluded, and of its likeliest point."""
+    """Probability that a marker is occluded, and that of its likeliest point."""
 
 
 class Comparison(nn.Module):
@@ -330,7 +330,7 @@ class Comparison(nn.Module):
         present: Bool[Tensor, "B N"],
         evidence: Float[Tensor, "B N M"] | None,
     ) -> _Matches:
-        """The matches by features and, after the first comparison, further evidence."""
+        """Matches from features and, after the first comparison, further evidence."""
         left = self.of_points(self.norm_points(of_points))
         right = self.of_markers(self.norm_markers(of_markers))
         scores = left @ right.transpose(1, 2) / math.sqrt(left.shape[-1])
@@ -356,7 +356,7 @@ class MatchExchange(nn.Module):
         self.agreement = nn.Linear(2 * bumps, bumps * heads)
         nn.init.zeros_(self.agreement.bias)
         nn.init.normal_(self.agreement.weight, std=0.01)
-        with torch.no_grad():  # begin with the log-likelihood of a distance
+        with torch.no_grad():  # Start with the log-likelihood of a distance.
             for head in range(heads):
                 rows = slice(head * bumps, (head + 1) * bumps)
                 self.agreement.weight[rows, bumps:] += torch.eye(bumps) * (0.3 if head else 1.0)
@@ -379,13 +379,11 @@ class MatchExchange(nn.Module):
         return points, markers, self._agreement(soft, graphs) + self.kept * matches.scores
 
     def _agreement(self, soft: Float[Tensor, "B N M"], graphs: _Graphs) -> Float[Tensor, "B N M"]:
-        """How well the distances from a point to matched points fit those from a marker."""
+        """Agreement of the distances from a point to matched points with those from a marker."""
         batch, count, num_markers = soft.shape
         groups, heads = len(graphs.pairs), len(self.weights)
         bumps = graphs.pairs.shape[-1] // 2
-        seen = (graphs.shares @ soft).view(
-            batch, bumps, count, num_markers
-        )  # which markers are at which distance
+        seen = (graphs.shares @ soft).view(batch, bumps, count, num_markers)  # markers at each distance
         seen = seen.permute(0, 2, 1, 3).reshape(groups, -1, bumps * num_markers)
         other = (1.0 - torch.eye(num_markers))[None, :, :, None]
         fits = (self.agreement(graphs.pairs) * other).view(groups, num_markers, num_markers, heads, bumps)
@@ -400,7 +398,7 @@ def _embedding(bumps: int, width: int) -> nn.Sequential:
 
 
 def layout_loss(found: list[LabelScores], truth: Tensor, present: Tensor) -> Tensor:
-    """Loss of all comparisons, see `train.labelers.networks.labeling_loss`."""
+    """Loss of all comparisons, see `labeling_loss`."""
     losses = torch.stack([labeling_loss(scores, truth, present) for scores in found])
     return losses[-1] + _EARLY_WEIGHT * losses[:-1].sum()
 
@@ -437,7 +435,7 @@ def batch_loss(
 ) -> torch.Tensor:
     """Loss of a part of a batch, a scalar; its mean over all parts is the loss of the batch.
 
-    Random draws are for the whole batch, so that a cloud does not depend on the number of parts.
+    Random draws are made for the whole batch, so that a cloud does not depend on the number of parts.
     """
     if config.labeler == "cnn":
         return cnn_loss(network, batch, device, config, rng=rng, part=part)
@@ -468,12 +466,12 @@ def labeler_of(network: nn.Module, marker_names: tuple[str, ...]) -> Labeler:
 
 
 def batch_device() -> torch.device:
-    """The device on which batches are labeled."""
+    """Device on which batches are labeled."""
     return torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
 
 class BatchNetwork:
-    """A trained network for batches; the first batch copies it to the GPU, if there is one."""
+    """A trained network for batches; the first call copies it to the GPU, if there is one."""
 
     def __init__(self, network: nn.Module) -> None:
         self._network = network
@@ -482,7 +480,7 @@ class BatchNetwork:
     def __call__(self, *inputs: torch.Tensor) -> Any:
         """Outputs of the network, on its device, for inputs on the CPU.
 
-        TF32 is off, so that labels differ from the CPU's in near ties only.
+        TF32 is off, so that labels differ from the CPU's only in near ties.
         """
         if self._placed is None:
             device, here = batch_device(), next(self._network.parameters()).device

@@ -1,9 +1,9 @@
-"""How likely labeled points are as a hand, in any position and orientation, and which side it is of.
+"""Density of labeled points as a hand, in any position and orientation, and recognition of its side.
 
-The prior is a mixture. Each component is a mean hand with the directions in which markers move together
-around it (probabilistic principal components, Tipping and Bishop 1999), learned from a cluster of frames.
-Missing markers are left out of mean and covariance, which is exact for a normal distribution. Points are
-aligned with each mean hand first.
+The prior is a mixture. Each component is a mean hand with the directions in which its markers move together
+(probabilistic principal components, Tipping and Bishop 1999), learned from a cluster of frames. Missing
+markers are left out of mean and covariance, which is exact for a normal distribution. Points are first
+aligned with each mean hand.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from handsim.hand.shape import Side
 from handsim.kernels import horn_matrix, kernel, write_quaternion_matrix
 
 NEAREST: Final = 4
-"""Number of components in a density: those whose mean hands are nearest to the points."""
-_MIN_POINTS: Final = 4  # fewer points fit any hand
+"""Number of components in a density: those with the mean hands nearest to the points."""
+_MIN_POINTS: Final = 4  # Fewer points fit any hand.
 _MAX_NEWTON_STEPS: Final = 60
-_ROUGH, _EXACT = 1e-9, 1e-14  # tolerance of the largest root, relative to the bound above it
+_ROUGH, _EXACT = 1e-9, 1e-14  # tolerances of the largest root, relative to its upper bound
 _MAX_COMPONENTS, _MAX_DIRECTIONS = 10_000, 100
 FloatArray = NDArray[np.float64]
 
@@ -41,7 +41,7 @@ class PosePrior:
     directions: Float32[np.ndarray, "K M 3 R"]
     """Principal directions of each component; their lengths are standard deviations [m]."""
     spreads: Float32[np.ndarray, "K"]
-    """Standard deviation of each coordinate beside these directions [m]."""
+    """Standard deviation of each coordinate apart from these directions [m]."""
     log_weights: Float32[np.ndarray, "K"]
     """Logarithm of each component's share."""
 
@@ -61,13 +61,13 @@ class PosePrior:
 
     @property
     def num_markers(self) -> int:
-        """Markers of the layout."""
+        """Number of markers of the layout."""
         return int(self.means.shape[1])
 
     def log_density(
         self, points: Float[np.ndarray, "N 3"], labels: Int[np.ndarray, "N"], *, mirrored: bool
     ) -> float:
-        """Log-density of labeled points [m], of a left hand where `mirrored`; -inf for fewer than four."""
+        """Log-density of labeled points [m], of a left hand if `mirrored`; -inf for fewer than four."""
         if len(points) < _MIN_POINTS:
             return -np.inf
         cloud, tables = seen_as_right(points, mirrored), tables_of(self)
@@ -75,7 +75,7 @@ class PosePrior:
         return float(log_density(cloud, labels, nearest, tables))
 
     def tensors(self) -> dict[str, NDArray[np.generic]]:
-        """The tables by name, for a file, the directions in half precision."""
+        """The tables by name, for a file, with directions in half precision."""
         tables = {field.name: getattr(self, field.name) for field in fields(self)}
         return tables | {"directions": self.directions.astype(np.float16)}
 
@@ -107,7 +107,7 @@ def tables_of(prior: PosePrior) -> PriorTables:
 
 @kernel
 def seen_as_right(points: Float[np.ndarray, "N 3"], mirrored: bool) -> FloatArray:
-    """Centered points (N, 3) [m], mirrored to a right hand's if need be."""
+    """Center points (N, 3) [m], and mirror those of a left hand."""
     centered = points.copy()
     for axis in range(3):
         centered[:, axis] -= points[:, axis].mean()
@@ -118,7 +118,7 @@ def seen_as_right(points: Float[np.ndarray, "N 3"], mirrored: bool) -> FloatArra
 
 @kernel
 def means_by_marker(means: Float32[np.ndarray, "K M 3"], chosen: Int[np.ndarray, "C"]) -> FloatArray:
-    """Mean hands (M, 3, C) of some components [m], contiguous along the components."""
+    """Mean hands (M, 3, C) of some components [m], contiguous along components."""
     table = np.empty((means.shape[1], 3, len(chosen)))
     for number in range(len(chosen)):
         for marker in range(means.shape[1]):
@@ -131,7 +131,7 @@ def means_by_marker(means: Float32[np.ndarray, "K M 3"], chosen: Int[np.ndarray,
 def procrustes_errors(
     cloud: Float[np.ndarray, "N 3"], labels: Int[np.ndarray, "N"], table: Float[np.ndarray, "M 3 C"]
 ) -> FloatArray:
-    """Squared distances (C,) of centered points from mean hands that are aligned with them [m^2]."""
+    """Squared distances (C,) of centered points from mean hands aligned with them [m^2]."""
     return errors_of_products(*products_with_means(cloud, labels, table), False)
 
 
@@ -139,7 +139,7 @@ def procrustes_errors(
 def products_with_means(
     cloud: Float[np.ndarray, "N 3"], labels: Int[np.ndarray, "N"], table: Float[np.ndarray, "M 3 C"]
 ) -> tuple[FloatArray, FloatArray]:
-    """Sums of outer products (9, C) of points and markers of mean hands, and of squares (C,) [m^2]."""
+    """Sums of outer products (9, C) of points and mean hands' markers, and of squares (C,) [m^2]."""
     count, size = table.shape[2], 0.0
     product, center, squares = np.zeros((9, count)), np.zeros((3, count)), np.zeros(count)
     for number in range(len(cloud)):
@@ -173,10 +173,10 @@ def errors_of_products(
 
 @kernel
 def _largest_root(product: Float[np.ndarray, "9"], mirrored: bool, above: float, tolerance: float) -> float:
-    """Largest eigenvalue of Horn's matrix of a sum of outer products, from a bound above it (Theobald 2005).
+    """Largest eigenvalue of Horn's matrix of a sum of outer products, from an upper bound (Theobald 2005).
 
-    Its characteristic polynomial is x^4 + c2 x^2 + c1 x + c0. For a mirrored cloud, whose first coordinates
-    have the other sign, only the sign of c1 changes.
+    Its characteristic polynomial is x^4 + c2 x^2 + c1 x + c0. For a mirrored cloud, with the first
+    coordinates negated, only the sign of c1 changes.
     """
     a, b, c, d, e, f, g, h, i = product
     xx, yy, zz = a * a + d * d + g * g, b * b + e * e + h * h, c * c + f * f + i * i
@@ -207,7 +207,7 @@ def log_density(
     chosen: Int[np.ndarray, "C"],
     prior: PriorTables,
 ) -> float:
-    """Log-density of centered, labeled points [m] by some components."""
+    """Log-density of centered, labeled points [m] under some components."""
     total = -np.inf
     for component in chosen:
         spread, directions = float(prior.spreads[component]), prior.directions[component]
@@ -223,7 +223,7 @@ def log_density(
 def factor_of(
     labels: Int[np.ndarray, "N"], directions: Float32[np.ndarray, "M 3 R"], spread: float
 ) -> FloatArray:
-    """Lower Cholesky factor (R, R) of D^T D + spread^2 I, D being the directions of some markers [m]."""
+    """Lower Cholesky factor (R, R) of D^T D + spread^2 I, where D holds some markers' directions [m]."""
     rank = directions.shape[2]
     rows = np.empty((3 * len(labels), rank))
     for number in range(len(labels)):
@@ -240,7 +240,7 @@ def factor_of(
 def residual_of(
     cloud: Float[np.ndarray, "N 3"], labels: Int[np.ndarray, "N"], mean: Float32[np.ndarray, "M 3"]
 ) -> FloatArray:
-    """Residuals (N, 3) [m] of centered points, once they are aligned with a mean hand."""
+    """Residuals (N, 3) [m] of centered points after alignment with a mean hand."""
     center, product, bound = np.zeros(3), np.zeros((3, 3)), 0.0
     for number in range(len(cloud)):
         for axis in range(3):
@@ -268,7 +268,7 @@ def _largest_eigenvector(k: Float[np.ndarray, "4 4"], root: float) -> FloatArray
     """Unit eigenvector (4,) of the largest eigenvalue of Horn's matrix.
 
     The adjugate of k - root is a multiple of the outer product of the eigenvector with itself; its row with
-    the greatest diagonal element is the most exact one.
+    the largest diagonal element is the most accurate.
     """
     shifted = k.copy()
     for axis in range(4):
@@ -282,7 +282,7 @@ def _largest_eigenvector(k: Float[np.ndarray, "4 4"], root: float) -> FloatArray
     for axis in range(4):
         vector[axis] = _cofactor(shifted, best, axis)
     length = np.sqrt((vector * vector).sum())
-    if not length > 0.0:  # two equal eigenvalues: any mixture of their eigenvectors will do
+    if not length > 0.0:  # two equal eigenvalues: any combination of their eigenvectors
         vector, length = np.linalg.eigh(k)[1][:, 3], 1.0
     unit: FloatArray = vector / length
     return unit
@@ -309,10 +309,10 @@ def log_normal(
     lower: Float[np.ndarray, "R R"],
     spread: float,
 ) -> float:
-    """Log-density of residuals [m] whose covariance is D D^T + spread^2 I, D being rows of directions.
+    """Log-density of residuals [m] with covariance D D^T + spread^2 I, where D holds rows of directions.
 
-    The matrix of the directions (R, R), of which `lower` is the Cholesky factor, stands for that of the
-    residuals (Woodbury's identity).
+    By Woodbury's identity the matrix of directions (R, R), with Cholesky factor `lower`, replaces that of the
+    residuals.
     """
     count, rank = 3 * len(labels), directions.shape[2]
     along, distance = np.zeros(rank), 0.0
@@ -336,20 +336,20 @@ def log_normal(
 
 _MAX_LEARNED_COMPONENTS: Final = 400
 _FRAMES_PER_COMPONENT: Final = 400
-_MIN_COMPONENTS: Final = 12  # a prior with fewer components knows less than the network
-_MIN_MEMBERS: Final = 20  # frames of a component
+_MIN_COMPONENTS: Final = 12  # With fewer components a prior knows less than the network.
+_MIN_MEMBERS: Final = 20  # least number of frames of a component
 _DIRECTIONS: Final = 24  # about the degrees of freedom of a hand
-_NOISE: Final = 0.0012  # noise of a marker's coordinate in a capture, from optics and skin [m]
-_NEIGHBOR_FRAMES: Final = 100.0  # frames that the neighbors' covariance counts as
+_NOISE: Final = 0.0012  # [m] noise of a marker's coordinate in a capture, from optics and skin
+_NEIGHBOR_FRAMES: Final = 100.0  # weight of the neighbors' covariance, in frames
 _NEIGHBORS: Final = 8
-_ITERATIONS: Final = 4  # of each clustering and alignment
+_ITERATIONS: Final = 4  # iterations of each clustering and alignment
 _RIGID: Final = 6  # degrees of freedom that the alignment removes
-_CHUNK: Final = 8192  # frames that are compared with the centers at once
+_CHUNK: Final = 8192  # number of frames compared with the centers at once
 _MAX_FRAMES: Final = 200_000
 
 
 def learn_pose_prior(markers: Float[np.ndarray, "T M 3"], *, rng: np.random.Generator) -> PosePrior | None:
-    """The prior of right hands in frames with every marker [m]; None for too few frames or markers."""
+    """Learn the prior of right hands from complete frames [m]; None for too few frames or markers."""
     markers = markers[np.isfinite(markers).all(axis=(1, 2))]
     if len(markers) > _MAX_FRAMES:
         markers = markers[np.sort(rng.permutation(len(markers))[:_MAX_FRAMES])]
@@ -375,7 +375,7 @@ def learn_pose_prior(markers: Float[np.ndarray, "T M 3"], *, rng: np.random.Gene
 def align_all(
     hands: Float[np.ndarray, "T M 3"], target: Float[np.ndarray, "M 3"]
 ) -> Float[np.ndarray, "T M 3"]:
-    """Hands aligned with a target by least squares (Kabsch 1976) [m]."""
+    """Align hands with a target by least squares (Kabsch 1976) [m]."""
     centered = hands - hands.mean(axis=1, keepdims=True)
     center = target.mean(axis=0)
     left, _, right = np.linalg.svd(centered.swapaxes(1, 2) @ (target - center))
@@ -387,7 +387,7 @@ def align_all(
 def _clusters(
     markers: Float[np.ndarray, "T M 3"], count: int, rng: np.random.Generator
 ) -> Int[np.ndarray, "T"]:
-    """The cluster of each frame, by k-means of the hands aligned with their mean."""
+    """Cluster of each frame, by k-means of the hands aligned with their mean."""
     mean = markers[0]
     for _ in range(_ITERATIONS):
         mean = align_all(markers, mean).mean(axis=0)
@@ -404,7 +404,7 @@ def _clusters(
 
 
 def _nearest(flat: Float[np.ndarray, "T D"], centers: Float[np.ndarray, "K D"]) -> Int[np.ndarray, "T"]:
-    """The nearest center of each row."""
+    """Index of the nearest center of each row."""
     offsets = (centers**2).sum(axis=1)
     parts = [
         (offsets - 2.0 * flat[first : first + _CHUNK] @ centers.T).argmin(axis=1)
@@ -436,7 +436,7 @@ def _moments(
 def _shrunk_covariances(
     means: Float[np.ndarray, "K M 3"], scatters: Float[np.ndarray, "K D D"], sizes: Int[np.ndarray, "K"]
 ) -> Float[np.ndarray, "K D D"]:
-    """Covariances of the clusters, each shrunk toward its neighbors', because its own frames are few."""
+    """Covariances of the clusters, each shrunk toward its neighbors', because it has few frames."""
     flat = means.reshape(len(means), -1)
     covariances = np.empty_like(scatters)
     for cluster, mean in enumerate(flat):
@@ -449,17 +449,15 @@ def _shrunk_covariances(
 
 
 _MAX_FOURS: Final = 3000
-_POSES: Final = 100  # of a hand of each size
-_RECOGNIZED: Final = (
-    0.98  # share of complete hands whose side is right if a layout is unlike its mirror image
-)
+_POSES: Final = 100  # number of poses of a hand of each size
+_RECOGNIZED: Final = 0.98  # Layouts with fewer recognized complete hands resemble their mirror image.
 _SIZES: Final = ("XS", "S", "M", "L", "XL")
 
 
 class SideClassifier:
     """Classifies the labeled hands of a layout as left or right, one frame at a time.
 
-    Four labeled points span a tetrahedron, and a mirror inverts its orientation. Some groups of four have the
+    Four labeled points span a tetrahedron, whose orientation a mirror inverts. Some groups of four have the
     same orientation in almost every pose (thumb, knuckles and wrist), others do not. Poses of simulated right
     hands measure this; each group votes with the log-odds of its orientation.
     """
@@ -475,22 +473,22 @@ class SideClassifier:
         self._num_markers = layout.num_markers
 
     def classify(self, points: Float[np.ndarray, "N 3"], labels: Int[np.ndarray, "N"]) -> tuple[Side, float]:
-        """The side of one hand [m], and how clear the vote is, 0 to 1; 0 for fewer than four markers."""
+        """Side of one hand [m], and clarity of the vote from 0 to 1; 0 for fewer than four markers."""
         markers = np.full((self._num_markers, 3), np.nan)
         markers[labels[labels >= 0]] = points[labels >= 0]
         vote, most = _vote(markers, self._fours, self._votes)
         return ("left" if vote < 0.0 else "right"), abs(vote) / most if most else 0.0
 
     def recognized(self, hands: Float[np.ndarray, "T M 3"], side: Side) -> Bool[np.ndarray, "T"]:
-        """Whether each hand of a side is classified right by its true labels; NaN for missing markers."""
+        """Whether the side of each hand is recognized with true labels; NaN for missing markers."""
         labels = np.arange(self._num_markers)
         return np.array([self.classify(hand, labels)[0] == side for hand in hands], dtype=np.bool_)
 
 
 def is_mirror_like(layout: MarkerLayout) -> bool:
-    """Whether a layout is nearly its own mirror image, so that true labels do not always tell the side."""
+    """Whether a layout is nearly its own mirror image, so that true labels do not always show the side."""
     if any(one.bone.startswith("thumb") for one in layout.markers):
-        return False  # a thumb always shows the side
+        return False  # A thumb always shows the side.
     rng = np.random.default_rng(0)
     classifier = SideClassifier(layout, rng=rng)
     return bool(classifier.recognized(_right_hands(layout, "M", rng), "right").mean() < _RECOGNIZED)
@@ -512,7 +510,7 @@ def _right_hands(layout: MarkerLayout, size: str, rng: np.random.Generator) -> N
 def _mean_orientation(
     hands: Float[np.ndarray, "T M 3"], fours: Int[np.ndarray, "F 4"]
 ) -> NDArray[np.float64]:
-    """Mean over hands of the sign of the volume of each group of four (F,); markers in [m]."""
+    """Mean over hands of the sign of each group's volume (F,); markers in [m]."""
     mean = np.zeros(len(fours))
     for hand in range(len(hands)):
         for number in range(len(fours)):
@@ -525,7 +523,7 @@ def _mean_orientation(
 def _vote(
     markers: Float[np.ndarray, "M 3"], fours: Int[np.ndarray, "F 4"], votes: Float[np.ndarray, "F"]
 ) -> tuple[float, float]:
-    """The sum of the votes of all groups of four, and the greatest sum that they could have."""
+    """Sum of the votes of all groups of four, and its largest possible value."""
     vote, most = 0.0, 0.0
     for number in range(len(fours)):
         volume = _volume(markers, fours[number])

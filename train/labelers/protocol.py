@@ -1,6 +1,6 @@
-"""The interface of every labeler: points of a frame in, a label and a confidence per point out; no torch.
+"""The interface of every labeler, without torch: from points of a frame to labels and confidences.
 
-`OwnLabeler` is one that a user wrote, behind checks.
+`OwnLabeler` wraps a user's labeler with checks.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from train.labelers.matching import match_scores
 from train.labelers.pose_prior import PosePrior
 
 LABELERS: Final = "handsim.labelers"
-"""Group of entry points of labelers."""
+"""Group of entry points for labelers."""
 LEARNED: Final = ".safetensors"
-"""How the files in `learned_folder` end."""
+"""Ending of the files in `learned_folder`."""
 _NOUN: Final = "labeler"
 MAX_POINTS: Final = 512
 MOST_THREADS: Final = 1024
@@ -40,17 +40,17 @@ class Labeling:
     """Labels of one frame's points."""
 
     labels: Int[np.ndarray, "N"]
-    """Index of each point's marker in the layout, -1 for a ghost; no marker twice."""
+    """Index of each point's marker in the layout, -1 for a ghost; no index occurs twice."""
     confidence: Float[np.ndarray, "N"]
     """Confidence of each label, a probability from 0 to 1."""
 
 
 class Labeler(Protocol):
-    """Labels the points of a frame, each frame on its own."""
+    """Labels the points of frames, each frame by itself."""
 
     @property
     def marker_names(self) -> tuple[str, ...]:
-        """The markers that it knows, in label order."""
+        """Markers of the labeler, in label order."""
         ...
 
     def label_frames(self, frames: Sequence[Float[np.ndarray, "N 3"]]) -> list[Labeling]:
@@ -63,7 +63,7 @@ class Labeler(Protocol):
 
 
 def checked_names(names: object) -> tuple[str, ...]:
-    """Marker names from a file; a ValueError if they are not different strings."""
+    """Validate marker names from a file; a ValueError unless they are distinct strings."""
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise ValueError("marker_names is not a list of names")
     if len(set(names)) < len(names) or not names:
@@ -75,7 +75,7 @@ def label_in_batches(
     frames: Sequence[Float[np.ndarray, "N 3"]],
     label: Callable[[list[NDArray[np.float64]]], list[Labeling]],
 ) -> list[Labeling]:
-    """Check frames, and label them in batches of similar size, so that padding stays small."""
+    """Validate frames, and label them in batches of similar size, so that padding stays small."""
     clouds = check_clouds(frames)
     order = sorted(range(len(clouds)), key=lambda number: len(clouds[number]))
     results = [Labeling(np.zeros(0, dtype=np.int64), np.zeros(0)) for _ in clouds]
@@ -89,7 +89,7 @@ def label_in_batches(
 
 
 def check_clouds(frames: Sequence[Float[np.ndarray, "N 3"]]) -> list[NDArray[np.float64]]:
-    """The points of every frame [m], after the checks that `Labeler.label_frames` names."""
+    """The points of every frame [m], validated as `Labeler.label_frames` describes."""
     clouds = [np.asarray(points, dtype=np.float64) for points in frames]
     for frame, cloud in enumerate(clouds):
         if cloud.ndim != 2 or cloud.shape[1] != 3:
@@ -105,19 +105,19 @@ def check_clouds(frames: Sequence[Float[np.ndarray, "N 3"]]) -> list[NDArray[np.
 def pad_clouds(
     clouds: Sequence[NDArray[np.float64]],
 ) -> tuple[Float32[np.ndarray, "B N 3"], Bool[np.ndarray, "B N"]]:
-    """Clouds [m] around their means, padded to one length, and which points are no padding."""
+    """Clouds [m] relative to their means, padded to one length, and which points are not padding."""
     longest = max(len(cloud) for cloud in clouds)
     points = np.zeros((len(clouds), longest, 3), dtype=np.float32)
     present = np.zeros((len(clouds), longest), dtype=bool)
     for row, cloud in enumerate(clouds):
         if len(cloud):
-            points[row, : len(cloud)] = cloud - cloud.mean(axis=0)  # before float32 rounds off far positions
+            points[row, : len(cloud)] = cloud - cloud.mean(axis=0)  # before rounding to float32
         present[row, : len(cloud)] = True
     return points, present
 
 
 def check_output(numbers: Float[np.ndarray, "..."]) -> None:
-    """Raise a `WeightsError` for NaN in the output of a network, whose weights are damaged then."""
+    """Raise a `WeightsError` for NaN in a network's output, which means damaged weights."""
     if np.isnan(numbers).any():
         raise WeightsError(
             "the labeler's network gives numbers that are NaN, expected weights that are whole"
@@ -143,12 +143,12 @@ def label_by_scores(
 
 
 def learned_folder() -> Path:
-    """The folder of the labelers of learned gloves; `XDG_CACHE_HOME` moves it."""
+    """Folder of the labelers of learned gloves; `XDG_CACHE_HOME` moves it."""
     return Path(platformdirs.user_cache_dir("handsim", appauthor=False)) / "gloves"
 
 
 def learned_gloves() -> tuple[Path, ...]:
-    """The files of learned gloves, the most recently used first."""
+    """Files of learned gloves, the most recently used first."""
     files = learned_folder().glob(f"*{LEARNED}")
     return tuple(sorted(files, key=lambda file: file.stat().st_mtime, reverse=True))
 
@@ -161,17 +161,17 @@ def label_on(threads: int) -> None:
 
 @contextmanager
 def labeling_threads() -> Iterator[None]:
-    """Within the block torch uses the number of threads set for labelers."""
+    """Use the number of threads set for labelers in torch, within the block."""
     with torch_threads(_threads.get()):
         yield
 
 
 @contextmanager
 def torch_threads(count: int) -> Iterator[None]:
-    """Within the block torch and labelers use this many threads.
+    """Use this many threads in torch and labelers, within the block.
 
-    With torch's default, one a core, a small network is many times slower on a busy machine, because its
-    threads wait for one another in every operation.
+    With torch's default of one thread per core, a small network is many times slower on a busy machine,
+    because its threads wait for one another in every operation.
     """
     import torch
 
@@ -185,7 +185,7 @@ def torch_threads(count: int) -> Iterator[None]:
 
 
 class OwnLabeler:
-    """A user's `Labeler`, given as an object or by its name, whose results are checked."""
+    """A user's `Labeler`, given as an object or by name, with validated results."""
 
     def __init__(self, labeler: Labeler | str) -> None:
         name = plugin_name(labeler)
@@ -210,7 +210,7 @@ class OwnLabeler:
         return [self._checked(one, len(cloud)) for one, cloud in zip(returned, clouds, strict=True)]
 
     def _checked(self, labeling: Any, count: int) -> Labeling:
-        """A labeling of `count` points, if it is a valid one."""
+        """Validate a labeling of `count` points."""
         owner = f"{_NOUN} '{self._name}'"
         try:
             labels, confidence = np.asarray(labeling.labels), np.asarray(labeling.confidence, np.float64)

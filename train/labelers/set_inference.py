@@ -1,6 +1,6 @@
-"""The trained set labeler for one cloud at a time, compiled and without torch.
+"""The trained set labeler for single clouds, compiled and without torch.
 
-With so few points torch spends its time on calls. The order of operations is that of
+With so few points torch spends most time on calls. Operations have the order of
 `train.labelers.networks`.
 """
 
@@ -23,12 +23,12 @@ Floats = NDArray[np.float32]
 Weights = Mapping[str, Floats]
 """Weights of the network by their names in `train.labelers.networks`."""
 
-_EPSILON: Final = np.float32(1e-5)  # of torch's LayerNorm
+_EPSILON: Final = np.float32(1e-5)  # that of torch's LayerNorm
 _NEAREST: Final = np.float32(1e-12)  # [m^2] added to squared distances
 _COUNT: Final = np.float32(20.0)  # divisor of sums over the points of a cloud
 _MESSAGES: Final = np.float32(5.0)  # divisor of sums over the senders of messages
-# exp(x) = 2^n exp(r) with r = x - n log(2), and exp(r) as a polynomial: exact to two units of the last place.
-_LIMIT: Final = np.float32(80.0)  # beyond it the logistic function is 0 or 1 in single precision
+# exp(x) = 2^n exp(r) with r = x - n log(2), and exp(r) a polynomial: accurate to two units in the last place.
+_LIMIT: Final = np.float32(80.0)  # Beyond it the logistic function is 0 or 1 in single precision.
 _LOG2E: Final = np.float32(1.4426950408889634)
 _LN2_HIGH, _LN2_LOW = np.float32(0.693359375), np.float32(-2.12194440e-4)
 _HALF, _ONE, _ZERO = np.float32(0.5), np.float32(1.0), np.float32(0.0)
@@ -38,7 +38,7 @@ _P2, _P1 = np.float32(4.1665795894e-2), np.float32(1.6666665459e-1)
 
 
 class TrainedSetLabeler:
-    """The set labeler with copied weights and a prior of hands."""
+    """The set labeler with its own copy of weights and a prior of hands."""
 
     def __init__(
         self,
@@ -72,7 +72,7 @@ class _Norm(NamedTuple):
 
 
 class _Linear(NamedTuple):
-    """Linear layers of D rounds, their weights transposed."""
+    """Linear layers of D rounds, with transposed weights."""
 
     weight: Float32[np.ndarray, "D I O"]
     bias: Float32[np.ndarray, "D O"]
@@ -92,7 +92,7 @@ class _Rounds(NamedTuple):
 
 
 class _Ends(NamedTuple):
-    """The layers before and after the rounds; D is 1."""
+    """Layers before and after the rounds, with D = 1."""
 
     embed: _Linear
     embed_again: _Linear
@@ -103,7 +103,7 @@ class _Ends(NamedTuple):
 
 
 class CloudScorer:
-    """Scores single clouds by weights with the names and shapes of `weight_shapes`."""
+    """Scores single clouds with weights whose names and shapes are `weight_shapes`."""
 
     def __init__(self, config: SetLabelerConfig, weights: Weights) -> None:
         self._sharpness = np.float32(-0.5 * ((config.num_distances - 1) / config.reach) ** 2)
@@ -173,14 +173,14 @@ def weight_shapes(config: SetLabelerConfig) -> dict[str, tuple[int, ...]]:
 
 
 def _centers(config: SetLabelerConfig) -> Float32[np.ndarray, "K"]:
-    """Centers of the distance bumps [m], computed like torch's linspace: the second half from its end."""
+    """Centers of the distance bumps [m], computed like torch's linspace: the second half from the end."""
     reach, count = np.float32(config.reach), config.num_distances
     steps = np.arange(count) * np.float64(reach / np.float32(count - 1))
     return np.where(np.arange(count) < count // 2, steps, reach - steps[::-1]).astype(np.float32)
 
 
 def _linear(weights: Weights, parts: list[str], name: str) -> _Linear:
-    """A linear layer of this name in each of some parts of the network."""
+    """The linear layer of this name in several parts of the network."""
     return _Linear(
         np.stack([np.ascontiguousarray(weights[f"{part}{name}.weight"].T) for part in parts]),
         np.stack([weights[f"{part}{name}.bias"] for part in parts]),
@@ -188,7 +188,7 @@ def _linear(weights: Weights, parts: list[str], name: str) -> _Linear:
 
 
 def _norm(weights: Weights, parts: list[str], name: str) -> _Norm:
-    """A layer norm of this name in each of some parts of the network."""
+    """The layer norm of this name in several parts of the network."""
     weight, bias = (
         np.stack([weights[f"{part}{name}.{kind}"] for part in parts]) for kind in ("weight", "bias")
     )
@@ -248,7 +248,7 @@ def _bumps(
     bits: Int32[np.ndarray, "B"],
     scale: Float32[np.ndarray, "B"],
 ) -> Floats:
-    """Gaussian bumps (K, N * N) of the distances between points around each center, 0 to 1."""
+    """Gaussian bumps (K, N * N) of the distances between points around each center, from 0 to 1."""
     count = len(points)
     near = np.empty((count, 3), dtype=np.float32)
     for axis in range(3):
@@ -284,7 +284,7 @@ def _exchange(
     normed = _layer_norm(features, rounds.norm, one)
     ends = _dense(normed, rounds.ends, one)  # receivers, then senders
     gate = np.dot(rounds.distance_gate[one], bumps)
-    for g in range(num_gates):  # bumps are symmetric, so that receivers may be contiguous
+    for g in range(num_gates):  # As bumps are symmetric, receivers may be contiguous.
         for j in range(count):
             for i in range(count):
                 gate[g, j * count + i] += ends[i, g] + ends[j, num_gates + g]
@@ -334,9 +334,9 @@ def _layer_norm(values: Float32[np.ndarray, "N W"], norm: _Norm, one: int) -> Fl
 def _split_exp(
     values: Float32[np.ndarray, "L"], bits: Int32[np.ndarray, "B"], scale: Float32[np.ndarray, "B"]
 ) -> None:
-    """The exponential of values as a product: values in place, and a power of two in `scale`.
+    """Exponential of values as a product: one factor in place, and a power of two in `scale`.
 
-    `scale` and `bits` are the same memory; values beyond 80 are cut off.
+    `scale` and `bits` share memory; values beyond 80 are clipped.
     """
     for index in range(len(values)):
         x = values[index]
@@ -353,7 +353,7 @@ def _split_exp(
 def _sigmoid(
     values: Float32[np.ndarray, "L"], bits: Int32[np.ndarray, "B"], scale: Float32[np.ndarray, "B"]
 ) -> None:
-    """The logistic function in place."""
+    """Logistic function in place."""
     for index in range(len(values)):
         values[index] = -values[index]
     _split_exp(values, bits, scale)
@@ -374,7 +374,7 @@ def _silu(
 
 @kernel
 def _log_softmax(values: Float32[np.ndarray, "R C"]) -> None:
-    """The logarithm of the softmax along the last axis, in place."""
+    """Logarithm of the softmax along the last axis, in place."""
     for row in range(len(values)):
         most = values[row].max()
         total = _ZERO

@@ -1,8 +1,8 @@
-"""Labelers by their names and files: of a glove, for any layout, trained, exported, or your own object.
+"""Labelers by their names and files: of a glove, for any layout, trained, exported, or a user's object.
 
-A trained labeler is a safetensors file of weights and a model card in JSON, or one ONNX file, which
-onnxruntime runs without torch. The metadata of the weights repeat parts of the card for people who find the
-file alone; handsim reads the card only.
+A trained labeler is a safetensors file of weights and a model card in JSON, or a single ONNX file, which
+onnxruntime runs without torch. Metadata of the weights repeat parts of the card for people who find only that
+file; handsim reads only the card.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ ANY_LAYOUT: Final = "any-layout"
 """Name of the labeler that needs no training."""
 WEIGHTS: Final = "labeler.safetensors"
 CARD: Final = "labeler.json"
-_ANY_LAYOUT: Final = "any_layout"  # stem of the weights of the network for any layout
+_ANY_LAYOUT: Final = "any_layout"  # file stem of the weights of the network for any layout
 _PRIOR: Final = "pose_prior."  # prefix of the names of the prior's tensors
 _METADATA: Final = "__metadata__"  # key in the header of a safetensors file
 _LENGTH_BYTES: Final = 8  # bytes that hold the header's length
@@ -64,10 +64,10 @@ _MAX_CARD_BYTES: Final = 1 << 24
 _CONFIGS: Final[dict[Kind, type[NetworkConfig]]] = {"set": SetLabelerConfig, "cnn": CNNConfig}
 _SHIPPED: Final = Path(__file__).parents[1] / "weights"
 GLOVE: Final = "glove.toml"
-"""The file of a run that holds its marker layout."""
+"""File with the marker layout of a run."""
 RUN_SETTINGS: Final = "train.json"
-"""The file in which a run keeps its settings from the beginning."""
-_FEW_POSES: Final = 6000  # poses that describe a layout to the labeler without a minute of learning
+"""File with the settings of a run, written at its beginning."""
+_FEW_POSES: Final = 6000  # poses that describe a layout to a labeler that skips learning
 _EXPECTED: Final = (
     "a MarkerLayout, the name or path of one, a Labeler, the folder of a trained one, an .onnx file, or "
     "module:name"
@@ -75,7 +75,7 @@ _EXPECTED: Final = (
 _NAMES: Final = "handsim.marker_names"  # key of the marker names in the file's metadata
 _CNN: Final = "handsim.cnn"  # key of the settings of the paper's network
 _ONNX_PRIOR: Final = "handsim.pose_prior"  # key of the pose prior: an .npz in base64
-_MATCHING: Final = "handsim.matching"  # key of the constants of the matching, for other programs
+_MATCHING: Final = "handsim.matching"  # key of the constants of matching, for other programs
 _IMAGES: Final = "images"  # input of the paper's network
 _INPUTS: Final = "points", "present"
 _OUTPUTS: Final = "point_scores", "label_scores"
@@ -101,7 +101,7 @@ _MEANINGS: Final = {
     "positions": "Predicted position of each marker in the view: x right, y down, z away; 1 is half an "
     "image's width.",
 }
-"""Descriptions of inputs and outputs, stored in the file's metadata under `handsim.` and their names."""
+"""Descriptions of inputs and outputs, stored in the file's metadata as `handsim.` and name."""
 _HINT: Final = "install it with: pip install 'handsim[onnx]'"
 
 
@@ -110,16 +110,15 @@ def load_labeler(
 ) -> Labeler:
     """The labeler of a glove, or a labeler by its name, path or object.
 
-    A glove without a labeler of its own gets the one for any layout, which learns the layout in a minute,
-    and in two if it has more than 24 markers.
-    Only shipped labelers, folders and the one for any layout need torch.
+    A glove without a trained labeler gets the one for any layout, which learns the layout in a minute, or in
+    two with more than 24 markers. Only shipped labelers, folders and the one for any layout need torch.
 
     Args:
-        glove: A marker layout, or its name or path, whose labeler is wanted. Or, where `labeler` is not
-            given, a labeler: a folder that `handsim train` wrote, an .onnx file, `module:name` of a `Labeler`
-            or of a class of them, an entry point of the group `handsim.labelers`, or a `Labeler`.
-        labeler: A labeler like these, or `any-layout`, to be used with this glove; it is checked against the
-            glove's markers.
+        glove: A marker layout, or its name or path, whose labeler is returned. Without `labeler` also a
+            labeler: a folder written by `handsim train`, an .onnx file, `module:name` of a `Labeler` or of a
+            class of them, an entry point of the group `handsim.labelers`, or a `Labeler`.
+        labeler: A labeler as above, or `any-layout`, to be used with this glove; its markers must be the
+            glove's.
 
     Returns:
         A labeler; `label_frames` gives labels (N,) and confidences (N,) of points (N, 3) [m].
@@ -130,7 +129,7 @@ def load_labeler(
         WeightsError: The labeler is unknown, damaged, or knows other markers.
 
     Warns:
-        HandSimWarning: No labeler was trained on the glove, so that it is the one for any layout; or such a
+        HandSimWarning: The glove has no trained labeler, so that the one for any layout is used; or such a
             glove is nearly its own mirror image.
     """
     if labeler is None and not _is_glove(glove):
@@ -153,7 +152,7 @@ def load_labeler(
 
 @functools.lru_cache(maxsize=32)
 def labeler_at_once(layout: MarkerLayout) -> Labeler:
-    """A labeler of a glove without a minute of learning; it is good enough to recognize the glove."""
+    """A labeler of a glove without any learning; it is good enough to recognize the glove."""
     shipped = _shipped_labeler(layout)
     if shipped is not None:
         return shipped
@@ -174,7 +173,7 @@ def _is_glove(given: Any) -> bool:
 
 
 def _resolved(labeler: Any) -> Labeler:
-    """A labeler that is given as an object, or by its name or path."""
+    """Load a labeler given as an object, by name or by path."""
     if labeler == ANY_LAYOUT:
         raise ArgumentError(
             f"labeler '{ANY_LAYOUT}' needs a glove, expected load_labeler(GLOVE, '{ANY_LAYOUT}') with a "
@@ -199,7 +198,7 @@ def _shipped_labeler(layout: MarkerLayout) -> Labeler | None:
 
 
 def _any_layout_labeler(layout: MarkerLayout, glove: MarkerLayout | str | Path) -> Labeler:
-    """The labeler for any layout, after a warning that the glove has none of its own."""
+    """The labeler for any layout, with a warning that the glove has no trained one."""
     from train.labelers.layout_labeler import is_learned, learned_labeler  # torch
     from train.labelers.pose_prior import is_mirror_like  # kernels
 
@@ -226,7 +225,7 @@ def _any_layout_labeler(layout: MarkerLayout, glove: MarkerLayout | str | Path) 
 
 
 def shipped_labelers() -> tuple[str, ...]:
-    """Names of the gloves whose trained labelers are shipped."""
+    """Names of the gloves with shipped trained labelers."""
     return tuple(sorted(path.stem for path in _SHIPPED.glob("*.safetensors") if path.stem != _ANY_LAYOUT))
 
 
@@ -237,7 +236,7 @@ def load_network(name_or_path: str | Path) -> tuple[nn.Module, dict[str, Any]]:
 
 
 def _files(name: str) -> tuple[Path, Path]:
-    """Paths of the weights and the card of a shipped labeler or of a folder."""
+    """Paths of weights and card, of a shipped labeler or in a folder."""
     if name in shipped_labelers():
         return _SHIPPED / f"{name}.safetensors", _SHIPPED / f"{name}.json"
     weights, card = Path(name) / WEIGHTS, Path(name) / CARD
@@ -256,12 +255,12 @@ def _files(name: str) -> tuple[Path, Path]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Stored:
-    """The contents of the two files of a labeler."""
+    """Contents of a labeler's two files."""
 
     config: NetworkConfig
     card: dict[str, Any]
     weights: dict[str, NDArray[Any]]
-    """The network's weights by name."""
+    """Weights of the network by name."""
     prior: PosePrior | None
 
     def labeler(self) -> Labeler:
@@ -287,7 +286,7 @@ class _Stored:
 
 
 def _read(weights: Path, card: Path) -> _Stored:
-    """Read and check weights and card."""
+    """Read and validate weights and card."""
     from safetensors import SafetensorError
     from safetensors.numpy import load_file
 
@@ -333,7 +332,7 @@ def _read(weights: Path, card: Path) -> _Stored:
 
 
 def _digest(card: dict[str, Any], weights: bytes) -> str:
-    """SHA-256 of all that decides labels: the markers, the network and its weights."""
+    """SHA-256 of all that determines labels: markers, network and weights."""
     described = json.dumps([card["marker_names"], card.get("labeler"), card["network"]])
     return hashlib.sha256(described.encode() + weights).hexdigest()
 
@@ -365,12 +364,12 @@ def save_network(folder: Path, network: nn.Module, card: dict[str, Any]) -> None
     content = _with_metadata(save(tensors), weights_metadata(card))
     with written_together():
         with atomic_write(folder / WEIGHTS) as temporary:
-            temporary.write_bytes(content)  # the writer of safetensors does not report a full disk
+            temporary.write_bytes(content)  # safetensors' own writer does not report a full disk
         save_json(folder / CARD, card | {"sha256": _digest(card, content)})
 
 
 def weights_metadata(card: dict[str, Any]) -> dict[str, str]:
-    """Metadata of the weights: the parts of the card that describe them, as text."""
+    """Metadata of the weights: those parts of the card that describe them, as text."""
     known = {
         "format": "pt",
         "library_name": "handsim",
@@ -391,12 +390,12 @@ def _with_metadata(content: bytes, metadata: dict[str, str]) -> bytes:
     tensors = json.loads(content[_LENGTH_BYTES:end])
     tensors.pop(_METADATA, None)
     header = json.dumps({_METADATA: metadata, **tensors}, separators=(",", ":"), ensure_ascii=False).encode()
-    header += b" " * (-len(header) % _LENGTH_BYTES)  # tensors begin at multiples of eight bytes
+    header += b" " * (-len(header) % _LENGTH_BYTES)  # Tensors must begin at a multiple of eight bytes.
     return len(header).to_bytes(_LENGTH_BYTES, "little") + header + content[end:]
 
 
 class OnnxLabeler:
-    """A labeler of either kind from an ONNX file, on one thread, as `handsim export` wrote it."""
+    """A labeler of either kind from an ONNX file written by `handsim export`, on one thread."""
 
     def __init__(self, path: Path) -> None:
         try:
@@ -406,14 +405,14 @@ class OnnxLabeler:
         if not path.is_file():
             raise WeightsError(f"{path} is missing, expected an .onnx file that handsim export wrote")
         options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = options.inter_op_num_threads = 1  # a frame is too small to share
+        options.intra_op_num_threads = options.inter_op_num_threads = 1  # A frame is too small for more.
         options.log_severity_level = 4
         options.add_session_config_entry("session.set_denormal_as_zero", "1")  # distance bumps underflow
         try:
             content = path.read_bytes()
             if sign_model(content) != content:  # onnxruntime crashes on some damaged files
                 raise ValueError("the SHA-256 is another one")
-            # Without its fallback, which prints on standard output.
+            # Without the fallback, which prints on standard output.
             self._session = onnxruntime.InferenceSession(
                 content, options, providers=["CPUExecutionProvider"], enable_fallback=0
             )
@@ -424,17 +423,17 @@ class OnnxLabeler:
             self.prior = None
             if _ONNX_PRIOR in metadata:
                 stored = io.BytesIO(base64.b64decode(metadata[_ONNX_PRIOR], validate=True))
-                with np.load(stored) as tables:  # unpickles nothing
+                with np.load(stored) as tables:  # never unpickles
                     self.prior = PosePrior.of_tensors(dict(tables))
             self._label = self._label_by_images(metadata[_CNN]) if _CNN in metadata else self._label_by_scores
             self._try(_IMAGES if _CNN in metadata else _INPUTS[0])
-        except Exception as error:  # onnxruntime's errors have no common class of their own
+        except Exception as error:  # onnxruntime's errors have no common class.
             raise WeightsError(
                 f"{path} is damaged or not a labeler's: expected what handsim export wrote"
             ) from error
 
     def _try(self, given: str) -> None:
-        """Raise a ValueError unless the outputs are finite and have the shapes of a labeler's."""
+        """Raise a ValueError unless the outputs are finite and have a labeler's shapes."""
         count = len(self.marker_names)
         if given == _IMAGES:
             found = self._session.run(None, {_IMAGES: np.zeros((1, 1, 52, 52), np.float32)})[:1]
@@ -459,7 +458,7 @@ class OnnxLabeler:
         return label_by_scores(clouds, by_point, by_label, self.prior)
 
     def _label_by_images(self, settings: str) -> Callable[[list[NDArray[np.float64]]], list[Labeling]]:
-        """What labels a batch with the paper's network, given its settings in JSON."""
+        """A function that labels a batch with the paper's network, given its settings in JSON."""
         content = json.loads(settings)
         hand = MeanHand(*(np.array(content["mean_hand"][field.name]) for field in fields(MeanHand)))
         config = CNNConfig(**content["config"])
@@ -505,7 +504,7 @@ def export_onnx(network: nn.Module, marker_names: Sequence[str], path: Path) -> 
             axes |= {name: {0: "frames", 1: "points"} for name in _PAIRED}
             axes[_PAIRED[1]][2] = "markers_and_points"
     with atomic_write(path) as temporary, plain_path(temporary) as plain, warnings.catch_warnings():
-        # The newer exporter needs another package and fixes the sizes of expanded arrays.
+        # The newer exporter needs another package, and fixes the sizes of expanded arrays.
         warnings.simplefilter("ignore")
         torch.onnx.export(
             network.eval(),

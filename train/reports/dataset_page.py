@@ -25,19 +25,19 @@ if TYPE_CHECKING:
 
 REPORT: Final = "report.html"
 MAX_ROWS: Final = 50_000
-"""Rows read for the plots; larger sets are sampled evenly."""
+"""Number of rows read for the plots; larger sets are sampled evenly."""
 _ANGLE_BINS: Final = 40
-_CHUNK: Final = 1024  # rows whose marker pairs are in memory at once
+_CHUNK: Final = 1024  # number of rows whose marker pairs are in memory together
 _LOW: Final = np.array([joint.low for joint in JOINTS])
 _HIGH: Final = np.array([joint.high for joint in JOINTS])
-_PUBLISHED_MEDIAN: Final = (3, 4)  # median gap of real finger markers [frames]: lowest and highest take
-_PUBLISHED_P90: Final = (24, 43)  # the same, 90th percentile
+_PUBLISHED_MEDIAN: Final = (3, 4)  # [frames] median gap of real finger markers: lowest and highest take
+_PUBLISHED_P90: Final = (24, 43)  # [frames] the same for the 90th percentile
 
 
 def write_dataset_page(
     path: Path, dataset: Dataset, *, present: Bool[np.ndarray, "T M"] | None = None, rate: float = 120.0
 ) -> Path:
-    """Write the page on a training set, with gaps of markers that are `present` in a take at a rate [Hz]."""
+    """Write the page on a training set, with gaps of `present` markers in a take of some rate [Hz]."""
     rows, manifest = sample_rows(dataset), dataset.manifest
     rig = load_rig(manifest.config["rig"])
     sections = [
@@ -61,14 +61,14 @@ def write_dataset_page(
 
 
 def sample_rows(dataset: Dataset, most: int = MAX_ROWS) -> Shaped[np.ndarray, "T"]:
-    """At most `most` rows, evenly spaced over all shards, in order."""
+    """At most `most` rows in order, evenly spaced over all shards."""
     rows = dataset.mapped_rows()
     count = min(most, len(rows))
     return rows[np.arange(count) * len(rows) // count]
 
 
 def _figures_section(dataset: Dataset, rows: Shaped[np.ndarray, "T"]) -> Section:
-    """A table of figures on the whole set."""
+    """Table of figures on the whole set."""
     manifest = dataset.manifest
     files = [dataset.path / hands_name(shard) for shard in range(len(dataset.shards))]
     hands = np.concatenate([np.load(file, allow_pickle=False)["length"] for file in files])
@@ -124,7 +124,7 @@ def _draw_angles(
     for number, joint in enumerate(JOINTS):
         digit, row = divmod(number, 4)
         panel: Axes = panels[row, digit]
-        if digit > 1:  # the thumb has axes of its own; axes are linked before anything is drawn
+        if digit > 1:  # The thumb has its own axes; axes must be linked before drawing.
             panel.sharex(panels[row, 1])
             panel.sharey(panels[row, 1])
         density = 100.0 * shares[number] / np.diff(edges[number])
@@ -182,7 +182,7 @@ def _draw_visibility(
     seen_by: Float[np.ndarray, "M C+1"],
     min_cameras: int,
 ) -> None:
-    """Draw the share of frames that lose each marker, and beside it the number of cameras in free view."""
+    """Draw the share of frames that lose each marker, and its number of cameras with a free view."""
     rows = np.arange(len(names))
     left, right = figure.subplots(1, 2, sharey=True, width_ratios=(1.0, 1.5))
     left.barh(rows, 100.0 * lost, color=Paint.BLUE, height=0.62)
@@ -225,7 +225,7 @@ def _ghosts_section(rows: Shaped[np.ndarray, "T"]) -> Section:
 
 
 def ghost_counts(rows: Shaped[np.ndarray, "T"]) -> Int[np.ndarray, "G+1"]:
-    """Frames with 0, 1, ... ghosts."""
+    """Number of frames with 0, 1, ... ghosts."""
     here = np.isfinite(rows["ghosts"][..., 0])
     return np.bincount(here.sum(axis=1), minlength=here.shape[1] + 1)
 
@@ -262,7 +262,7 @@ def _draw_ghosts(figure: Figure, counts: Int[np.ndarray, "G+1"], distances: Floa
 
 
 def _slips_section(dataset: Dataset) -> Section:
-    """Where slips of the glove put each marker."""
+    """Positions of each marker with slips of the glove."""
     config = dataset.manifest.config
     names = ("population", "slip_along", "slip_around")
     given = {name: value for name, value in config.items() if name in names}
@@ -280,7 +280,7 @@ def _slips_section(dataset: Dataset) -> Section:
 
 
 def _neighbors_section(rows: Shaped[np.ndarray, "T"], diameter: float) -> Section:
-    """Distances between neighboring markers with a diameter [m]."""
+    """Distances between neighboring markers of some diameter [m]."""
     distances = neighbor_distances(rows)
     closer = 100.0 * (distances.min(axis=1) < diameter).mean()
     caption = (
@@ -293,7 +293,7 @@ def _neighbors_section(rows: Shaped[np.ndarray, "T"], diameter: float) -> Sectio
 
 
 def neighbor_distances(rows: Shaped[np.ndarray, "T"]) -> Float[np.ndarray, "T M"]:
-    """Distance from every marker to the nearest other one, center to center [m]."""
+    """Distance from every marker to the nearest other one, between centers [m]."""
     parts = []
     for first in range(0, len(rows), _CHUNK):
         markers = rows["markers"][first : first + _CHUNK]
@@ -304,7 +304,7 @@ def neighbor_distances(rows: Shaped[np.ndarray, "T"]) -> Float[np.ndarray, "T M"
 
 
 def _draw_neighbors(figure: Figure, distances: Float[np.ndarray, "T M"], diameter: float) -> None:
-    """Draw the distances of each marker's nearest neighbor, and of each frame's nearest pair [m]."""
+    """Draw the distances of each marker's nearest neighbor, and of each frame's closest pair [m]."""
     panel = figure.subplots()
     nearest, bins = distances.min(axis=1), _bins(distances)
     panel.stairs(*_histogram(distances.ravel(), bins), fill=True, color=Paint.PALE)
@@ -324,7 +324,7 @@ def _draw_neighbors(figure: Figure, distances: Float[np.ndarray, "T M"], diamete
 
 
 def _bins(distances: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "B"]:
-    """Edges [mm] of at most 80 whole-millimeter bins from 0 to the 99.9th percentile."""
+    """Edges [mm] of at most 80 bins, of whole millimeters, from 0 to the 99.9th percentile."""
     longest = 1e3 * float(np.percentile(distances, 99.9)) if distances.size else 1.0
     width = max(1.0, np.ceil(longest / 80.0))
     return np.arange(0.0, longest + width, width)
@@ -333,7 +333,7 @@ def _bins(distances: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "B"]:
 def _histogram(
     distances: Float[np.ndarray, "N"], bins: Float[np.ndarray, "B"]
 ) -> tuple[Float[np.ndarray, "B-1"], Float[np.ndarray, "B"]]:
-    """Percent of the distances [m] per millimeter in each bin, and the bins [mm]."""
+    """Percentage of the distances [m] per millimeter in each bin, and the bins [mm]."""
     counts, _ = np.histogram(1e3 * distances, bins)
     return 100.0 * counts / (max(1, len(distances)) * np.diff(bins)), bins
 
@@ -348,7 +348,7 @@ def _mark(panel: Axes, value: float, text: str, color: str) -> None:
 
 
 def gap_section(present: Bool[np.ndarray, "T M"], rate: float) -> Section:
-    """Lengths of the gaps in a continuous take, beside published figures of real finger markers."""
+    """Lengths of gaps in a continuous take, and published ones of real finger markers."""
     lengths = run_lengths(~present, inside=True)
     frames, markers = present.shape
     text = (
@@ -366,7 +366,7 @@ def gap_section(present: Bool[np.ndarray, "T M"], rate: float) -> Section:
 
 
 def _draw_gaps(figure: Figure, lengths: Int[np.ndarray, "G"], rate: float) -> None:
-    """Draw the share of gaps up to each length [frames], beside the published median and p90."""
+    """Draw the share of gaps up to each length [frames], and the published median and 90th percentile."""
     panel = figure.subplots()
     ordered = np.sort(lengths)
     longest = int(max(ordered[-1], 1.3 * _PUBLISHED_P90[1]))

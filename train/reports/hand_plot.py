@@ -1,4 +1,4 @@
-"""Pictures of a glove on the resting hand: markers colored by accuracy, arrows between confused ones."""
+"""Pictures of a glove on the resting hand: markers colored by accuracy, arrows between confused markers."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ HAND_CAPTION: Final = (
     "A right hand of size M at rest, from the back; rings are markers that look to the palm's side. "
 )
 MAX_LETTERS: Final = 20
-"""Longest marker name that is drawn in full."""
+"""Longest marker name drawn in full."""
 _SLIPS_SIZE: Final = (10.8, 6.6)  # [inch]
 _MAX_ARROWS: Final = 12
-_MARGIN: Final = 34.0  # around the hand [points]
-_BEND: Final = 0.22  # of the arrows, so that the two between a pair of markers lie side by side
-_BAR: Final = (0.90, 0.2, 0.016, 0.6)  # place of the color bar, as shares of the picture
-_FONT_SIZE: Final = 7.5  # of names [points]
-_DOT_RADIUS: Final = 4.2  # of a marker's dot [points]
-_DISTANCES: Final = (7.0, 11.0, 16.0, 23.0, 32.0, 43.0, 56.0, 72.0, 92.0)  # from dot to name [points]
+_MARGIN: Final = 34.0  # [points] around the hand
+_BEND: Final = 0.22  # curvature of the arrows, so that two between a pair of markers lie side by side
+_BAR: Final = (0.90, 0.2, 0.016, 0.6)  # position of the color bar, as shares of the picture
+_FONT_SIZE: Final = 7.5  # [points] of names
+_DOT_RADIUS: Final = 4.2  # [points] of a marker's dot
+_DISTANCES: Final = (7.0, 11.0, 16.0, 23.0, 32.0, 43.0, 56.0, 72.0, 92.0)  # [points] from dot to name
 
 
 class FlatHand(NamedTuple):
@@ -60,7 +60,7 @@ class FlatHand(NamedTuple):
 
 
 def flat_hand(layout: MarkerLayout) -> FlatHand:
-    """The drawing of a glove on the hand of size M at rest."""
+    """Drawing of a glove on the hand of size M at rest."""
     model = HandModel.named("M")
     attachment = attach_markers(layout, model)
     starts = model.rest_transforms[:, :3, 3]
@@ -77,14 +77,14 @@ def flat_hand(layout: MarkerLayout) -> FlatHand:
 
 
 def _projected(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Positions (..., 3) in the wrist's frame as seen from the back of a right hand (..., 2) [m]."""
+    """Project positions (..., 3) in the wrist's frame to the view of a right hand's back (..., 2) [m]."""
     return np.stack([-points[..., 1], points[..., 0]], axis=-1)
 
 
 def _outlines(
     vertices: Float[np.ndarray, "V 2"], faces: Int[np.ndarray, "F 3"]
 ) -> list[Float[np.ndarray, "N 2"]]:
-    """Outlines of the faces that are turned to the viewer; those of holes run in the opposite direction."""
+    """Outlines of the faces turned to the viewer; those of holes have the opposite direction."""
     first, second, third = (vertices[faces[:, corner]] for corner in range(3))
     one, other = second - first, third - first
     seen = faces[one[:, 0] * other[:, 1] - one[:, 1] * other[:, 0] > 0.0]
@@ -129,7 +129,7 @@ def mistakes(confusion: Int[np.ndarray, "M+1 M+1"], most: int = _MAX_ARROWS) -> 
 
 
 def hand_picture(layout: MarkerLayout, accuracy: Float[np.ndarray, "M"], arrows: list[Mistake]) -> str:
-    """A picture of the hand with each marker's slot accuracy, and arrows for mistakes."""
+    """Picture of the hand with each marker's slot accuracy, and arrows for mistakes."""
     return picture(HAND_SIZE, _draw_hand, flat_hand(layout), layout.names, accuracy, arrows)
 
 
@@ -144,7 +144,7 @@ def _draw_hand(
     # Constrained layout would move things after the names are placed.
     figure.set_layout_engine("none")
     panel: Axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
-    width, height = 72.0 * figure.get_figwidth(), 72.0 * figure.get_figheight()  # one unit is one point
+    width, height = 72.0 * figure.get_figwidth(), 72.0 * figure.get_figheight()  # One unit is one point.
     panel.set(xlim=(0.0, width), ylim=(0.0, height))
     panel.set_axis_off()
     everything = np.concatenate([*hand.outlines, hand.markers])
@@ -168,7 +168,7 @@ def _draw_hand(
 
 
 def slips_picture(layout: MarkerLayout, slips: Sequence[GloveFit]) -> str:
-    """A picture of the hand of size M from the back and the palm's side, with the markers of gloves on it."""
+    """Picture of the hand of size M from the back and the palm's side, with markers of many gloves."""
     points = np.stack([fit.attachment.points for fit in slips])
     below = np.stack([fit.attachment.normals[:, 2] < 0.0 for fit in slips])
     return picture(_SLIPS_SIZE, _draw_slips, flat_hand(layout), layout.names, _projected(points), below)
@@ -181,7 +181,7 @@ def _draw_slips(
     dots: Float[np.ndarray, "P M 2"],
     below: NDArray[np.bool_],
 ) -> None:
-    """Draw the markers of many gloves [m], one color a marker; those `below` (P, M) on the right."""
+    """Draw the markers of many gloves [m], one color per marker; those `below` (P, M) on the right."""
     figure.set_layout_engine("none")  # as in _draw_hand
     panel: Axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     width, height = 72.0 * figure.get_figwidth(), 72.0 * figure.get_figheight()
@@ -209,12 +209,12 @@ def _draw_slips(
 
 
 def short(name: str) -> str:
-    """A marker's name, cut to the room that there is."""
+    """Shorten a marker's name to the available room."""
     return name if len(name) <= MAX_LETTERS else name[: MAX_LETTERS - 1] + "…"
 
 
 def _draw_name(panel: Axes, name: str, dot: NDArray[np.float64], center: NDArray[np.float64]) -> None:
-    """Draw a name, with a line to its dot if that is not beside it."""
+    """Draw a name, with a line to its dot unless that is close."""
     panel.annotate(
         name, (center[0], center[1]), fontsize=_FONT_SIZE, color=Paint.INK, ha="center", va="center_baseline",
         zorder=6, parse_math=False,
@@ -242,7 +242,7 @@ def _draw_arrows(panel: Axes, dots: NDArray[np.float64], arrows: list[Mistake]) 
 
 
 def arrow_curve(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Points (15, 2) along an arrow that is bent like matplotlib's arc3 [points]."""
+    """Points (15, 2) along an arrow curved like matplotlib's arc3 [points]."""
     aside = _BEND * (second - first)[::-1] * (1.0, -1.0)
     middle = (first + second) / 2.0 + aside
     along = np.linspace(0.1, 0.9, 15)[:, None]
@@ -255,7 +255,7 @@ def place_names(
     curves: Sequence[Float[np.ndarray, "K 2"]],
     size: tuple[float, float],
 ) -> Float[np.ndarray, "M 2"]:
-    """Centers of the names, placed one by one where each overlaps least with the rest [points]."""
+    """Centers of the names, placed one by one where they overlap least with the rest [points]."""
     extents = np.array([name_extent(name) for name in names])
     taken = np.concatenate([dots, *curves])
     half_sizes = np.concatenate(
@@ -282,7 +282,7 @@ def place_names(
 
 
 def name_extent(name: str) -> tuple[float, float]:
-    """Width and height of a name as it is drawn [points]."""
+    """Width and height of a drawn name [points]."""
     from matplotlib.font_manager import FontProperties
     from matplotlib.textpath import TextToPath
 

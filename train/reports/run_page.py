@@ -33,42 +33,42 @@ if TYPE_CHECKING:
 PAGE: Final = "report.html"
 MODEL_CARD: Final = "README.md"
 UNKNOWN_LICENSE: Final = "unknown"
-"""License in the card of weights whose owner has named none, in the word that hubs of models know."""
+"""License in the card of weights whose owner has named none, as hubs of models call it."""
 _IN_WORDS: Final = {SEEN: SEEN, "clean": "where every marker is seen"}
 _KINDS: Final = {"set": "Set labeler", "cnn": "The paper's network"}
-_MIN_SHARE: Final = 0.01  # lower end of the confusions' scale [%]
-_MAX_WRITTEN: Final = 30  # number of classes up to which a cell has room for a number
+_MIN_SHARE: Final = 0.01  # [%] lower end of the confusions' color scale
+_MAX_WRITTEN: Final = 30  # largest number of classes for which cells have room for numbers
 
 
 def write_run_page(out: Path, card: dict[str, Any], history: History, report: LabelingReport) -> Path:
-    """Write the page of a run and return its path; the report is of frames with the paper's corruption."""
+    """Write the page of a run and return its path; the report is on frames with the paper's corruption."""
     layout = stored_layout(card["dataset"]["layout"])
     caption = (
-        "Mean loss since the point before; slot accuracy on the same few held-out frames each time, with the "
+        "Mean loss since the previous point; slot accuracy on the same held-out frames each time, with the "
         "paper's recipe and the running mean of the weights; learning rate."
     )
     curves = picture((9.6, 5.6), draw_curves, history)
     size = confusion_size(layout.num_markers + 1)
     confusion = picture(size, draw_confusion, layout.names, report.confusion)
     wrong = int((~report.right).sum())
-    mistaken = f"{wrong:,} of {report.right.size:,} points were called something else than they are."
+    mistaken = f"{wrong:,} of {report.right.size:,} points have a wrong label."
     shares = (
-        "A row holds the points of one marker, the last one ghosts; a column, what they were called. A row's "
-        "shares add up to 100 %. The colors' scale is logarithmic; blank cells are mistakes never made."
+        "Rows are true labels, columns given labels; the last row and column are ghosts. The shares of a row "
+        "add up to 100 %. The color scale is logarithmic; blank cells are mistakes that never happened."
     )
     bins = reliability(report.confidences, report.right)
     drawn = picture((6.4, 6.0), draw_reliability, bins, report.figures["calibration_error"])
-    sure = "Whether the confidence that comes with every label can be taken at its word."
+    sure = "How well the confidence of labels agrees with the share of right labels."
     binned = (
-        "Points in fifteen bins of confidence: how many of each bin are right, and how many there are. On "
-        "the gray line they would be right as often as the labeler says; orange is what they miss it by."
+        "Points in fifteen bins of confidence: the share of right labels, and the number of points. On the "
+        "gray line confidence and share are equal; orange lines are the differences."
     )
     sections = [
         _figures_section(card, report),
         Section("The run", "The course of training.", pictures=[(curves, caption)]),
-        Section("What is taken for what", mistaken, pictures=[(confusion, shares)]),
+        Section("Confusions", mistaken, pictures=[(confusion, shares)]),
         _hand_section(layout, report),
-        Section("How sure to believe it", sure, pictures=[(drawn, binned)]),
+        Section("Confidence", sure, pictures=[(drawn, binned)]),
     ]
     path = out / PAGE
     write_sections(path, sections, title=f"Labeler {out.resolve().name}", lead=_lead(card, layout))
@@ -76,7 +76,7 @@ def write_run_page(out: Path, card: dict[str, Any], history: History, report: La
 
 
 def _lead(card: dict[str, Any], layout: MarkerLayout) -> str:
-    """The run's settings and its two main figures, in words."""
+    """Settings of the run and its main figures, in words."""
     train = card["train"]
     shown = [
         f"{percent(column['slot_accuracy'])} %{_interval(card, name)} of the slots are right "
@@ -95,7 +95,7 @@ def _lead(card: dict[str, Any], layout: MarkerLayout) -> str:
 
 
 def held_out_people(card: dict[str, Any]) -> str:
-    """Whose frames the figures of a card are of, in words."""
+    """Description of the frames behind the figures of a card."""
     count = card.get("held_out_people")
     if count is None:
         return "held-out frames"
@@ -105,13 +105,13 @@ def held_out_people(card: dict[str, Any]) -> str:
 
 
 def _interval(card: dict[str, Any], name: str) -> str:
-    """The interval of a column's slot accuracy over people in brackets, if there is one."""
+    """Interval of a column's slot accuracy over people, in brackets, if there is one."""
     interval = card.get("held_out_intervals", {}).get(name)
     return "" if interval is None else f" ({percent(interval[0])} to {percent(interval[1])})"
 
 
 def _figures_section(card: dict[str, Any], report: LabelingReport) -> Section:
-    """A table of all figures."""
+    """Table of all figures."""
     columns = card["held_out_simulated"]
     (recipe,) = set(columns) - {SEEN, "clean"}
     table = [["figure [%]", *columns]]
@@ -131,7 +131,7 @@ def _figures_section(card: dict[str, Any], report: LabelingReport) -> Section:
 
 
 def draw_curves(figure: Figure, history: History) -> None:
-    """Draw loss, held-out accuracy if there is any, and learning rate over the samples."""
+    """Draw loss, held-out accuracy if known, and learning rate over the samples."""
     from matplotlib.ticker import LogFormatter
 
     done, losses, rates = np.array(history.losses, dtype=np.float64).reshape(-1, 3).T
@@ -163,18 +163,18 @@ def draw_curves(figure: Figure, history: History) -> None:
 
 
 def confusion_size(num_classes: int) -> tuple[float, float]:
-    """Width and height [inch] of a confusion matrix in which every name can be read."""
+    """Width and height [inch] of a confusion matrix with readable names."""
     side = 1.6 + num_classes * float(np.clip(8.4 / num_classes, 0.15, 0.36))
     return side + 0.9, side
 
 
 def draw_confusion(figure: Figure, names: Sequence[str], confusion: Int[np.ndarray, "M+1 M+1"]) -> None:
-    """Draw the shares of each row's points: mistakes in color, the diagonal in figures."""
+    """Draw the shares of each row's points: mistakes in color, the diagonal as numbers."""
     from matplotlib.colors import LogNorm
 
     classes = [*map(short, names), "ghost"]
     places = np.arange(len(classes))
-    with np.errstate(invalid="ignore"):  # rows without points are NaN
+    with np.errstate(invalid="ignore"):  # Rows without points are NaN.
         shares = 100.0 * confusion / confusion.sum(axis=1, keepdims=True)
     wrong = np.where(np.eye(len(classes), dtype=np.bool_) | (shares == 0.0), np.nan, shares)
     # From the decade below the rarest mistake to the most frequent one.
@@ -199,8 +199,8 @@ def draw_confusion(figure: Figure, names: Sequence[str], confusion: Int[np.ndarr
     panel.set_aspect("equal")
     panel.tick_params(length=0)
     panel.spines[:].set_visible(False)
-    panel.set_xlabel("called")
-    panel.set_ylabel("is")
+    panel.set_xlabel("given label")
+    panel.set_ylabel("true label")
     bar = color_bar(
         figure, shades, "share of the row's points [%]", ax=panel, pad=0.02, aspect=40, shrink=0.8
     )
@@ -213,8 +213,8 @@ def _hand_section(layout: MarkerLayout, report: LabelingReport) -> Section:
     drawn = hand_picture(layout, report.slot_accuracy_by_marker, arrows)
     told, table = "No marker was taken for another.", []
     if arrows:
-        told = f"Arrows lead from what points are to what they were called: the {len(arrows)} most frequent "
-        told += "pairs, wider the more often."
+        told = f"Arrows lead from true to given labels: the {len(arrows)} most frequent "
+        told += "confusions, wider for more points."
         table = [["marker", "taken for", "points", "of its points [%]"]]
     for arrow in arrows:
         pair = names[arrow.truth], names[arrow.called]
@@ -309,7 +309,7 @@ In Python, `train.load_labeler(folder).label_frames([points])`. The folder needs
 ## Limits
 
 - One hand in one frame; it does not tell left from right.
-- Markers of this layout only; moved by more than a centimeter they want a labeler of their own.
+- Markers of this layout only; if moved by more than a centimeter they need a labeler of their own.
 - Computed in float32. In bfloat16, which some runtimes choose by themselves, labels change.
 """
 _CARD_IN_WORDS: Final = {SEEN: SEEN, "clean": "where every marker is seen"}
@@ -331,7 +331,7 @@ def write_model_card(out: Path, card: dict[str, Any]) -> Path:
 
 
 def model_card(card: dict[str, Any]) -> str:
-    """The README's text for hubs of models: YAML, data, figures, use and limits."""
+    """Text of the README for hubs of models: YAML, data, figures, use and limits."""
     dataset, columns = card["dataset"], card["held_out_simulated"]
     figures = [f"| | {' | '.join(columns)} |", f"|---|{'---|' * len(columns)}"]
     figures += [

@@ -1,4 +1,4 @@
-"""The generation of training sets: in shards on all cores, resumable, reproducible to the byte."""
+"""Generation of training sets: in shards on all cores, resumable, and reproducible to the byte."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ from train.data.shards import (
 from train.simulation.training_frames import FrameSource, GenerateSettings, sample_hands, simulate_frames
 
 ROWS_PER_SHARD: Final = 8192
-_SMALL_BYTES: Final = 50_000_000  # size of sets for which free space is not checked
+_SMALL_BYTES: Final = 50_000_000  # [bytes] Free space is not checked for smaller sets.
 
 
 def generate_dataset(
@@ -67,26 +67,26 @@ def generate_dataset(
     progress: Progress = no_progress,
     **options: Any,
 ) -> Dataset:
-    """Make a training set, finish a stopped one, or let one grow.
+    """Generate a training set, continue a stopped one, or extend one.
 
-    The same settings give the same bytes, with any number of workers.
+    The same settings give the same bytes for any number of workers.
 
     Args:
-        out: Folder to make it in, or a folder of an object store, as s3://bucket/prefix. A set there may have
-            fewer frames and must have the same settings else.
-        settings: What to make; the usual set when not given.
-        workers: Processes, all cores when not given, or an executor; one process for a sampler that no other
-            can import, such as a lambda.
-        progress: Called after every shard with frames done and frames expected.
-        options: Settings by name: `glove="sparse13"`, `num_frames=2000`, `scenes={"alone": 1.0}`, and so on.
+        out: Folder of the set, also in an object store, as s3://bucket/prefix. An existing set there may have
+            fewer frames, but must have the same other settings.
+        settings: Settings of the set; the defaults when not given.
+        workers: Number of processes, all cores when not given, or an executor; one process for a sampler that
+            other processes cannot import, such as a lambda.
+        progress: Called after every shard with the numbers of frames done and in total.
+        options: Settings by name: `glove="sparse13"`, `num_frames=2000`, `scenes={"alone": 1.0}`, ...
 
     Returns:
         The set: `rows()` are its frames, positions in [m] and angles in [rad].
 
     Raises:
-        ArgumentError: A setting is unknown or out of range, the rig stands in the hands' way, or no hand of
-            the population can rest.
-        DatasetError: `out` holds a set of other settings, its disk is too small, or a worker died.
+        ArgumentError: A setting is unknown or out of range, a camera of the rig is inside the hands' volume,
+            or no hand of the population can rest.
+        DatasetError: `out` holds a set with other settings, its disk is too small, or a worker died.
         LayoutError, RigError: The glove or rig is unknown, or the glove does not fit.
     """
     make_dataset(GenerateSettings.of(settings, options), out, workers=workers, progress=progress)
@@ -100,7 +100,7 @@ def make_dataset(
     workers: int | Executor | None = None,
     progress: Progress = no_progress,
 ) -> Manifest:
-    """Make a training set like `generate_dataset`, without reading it, and return its manifest."""
+    """Generate a training set like `generate_dataset`, without reading it; return its manifest."""
     place, workers = place_of(out), _allowed_workers(workers, settings.sampler)
     source = _resolved(settings)
     if isinstance(place, Path):
@@ -120,7 +120,7 @@ def make_dataset(
 
 
 def _resolved(settings: GenerateSettings) -> FrameSource:
-    """The settings with the glove, rig and sampler that they name, checked against each other."""
+    """Load the glove, rig and sampler named by the settings, and check them against each other."""
     layout, rig = load_layout(settings.glove), load_rig(settings.rig)
     check_outside_volume(rig, np.array(settings.center), settings.volume)
     if settings.min_cameras > len(rig.positions):
@@ -134,14 +134,14 @@ def _resolved(settings: GenerateSettings) -> FrameSource:
 
 
 def _allowed_workers(workers: int | Executor | None, sampler: PoseSampler | str | None) -> int | Executor:
-    """The workers, but one process for a sampler that others cannot import, with a warning if need be."""
+    """The workers; one process, with a warning if needed, for a sampler that others cannot import."""
     allowed = workers if isinstance(workers, Executor) else check_workers(workers)
     if allowed == 1 or sampler is None or isinstance(sampler, str):
         return allowed
     try:
         pickle.dumps(sampler)
         alone = getattr(sampler, "__module__", "") == "__main__" and main_script() is None
-    except Exception:  # a user's object may raise anything
+    except Exception:  # A user's object may raise anything.
         alone = True
     if alone and workers is not None:
         what = f"sampler {plugin_name(sampler)} cannot be imported by other processes"
@@ -151,12 +151,12 @@ def _allowed_workers(workers: int | Executor | None, sampler: PoseSampler | str 
 
 
 def _record(source: FrameSource) -> dict[str, Any]:
-    """Everything that decides the bytes of a set, as JSON."""
+    """Everything that determines the bytes of a set, as JSON."""
     settings, layout, rig, _ = source
     record = dataclasses.replace(settings, optics=settings.optics.worn(layout.radius)).record()
     if settings.sampler is None:
         del record["sampler"]
-    if settings.center == ROOM_CENTER:  # sets of versions without this setting go on
+    if settings.center == ROOM_CENTER:  # continues sets of versions without this setting
         del record["center"]
     if not settings.flesh:
         del record["flesh"]
@@ -168,7 +168,7 @@ def _record(source: FrameSource) -> dict[str, Any]:
 
 
 def _recorded_files(output: Output, own: Mapping[str, Mapping[str, str]]) -> dict[str, str]:
-    """Checksums of files of finished shards: those of the shards' own lists, or else the manifest's."""
+    """Checksums of files of finished shards: from the shards' own lists, or else from the manifest."""
     try:
         recorded = load_manifest(output.folder).files
     except DatasetError:  # unfinished, damaged, or of another version
@@ -179,7 +179,7 @@ def _recorded_files(output: Output, own: Mapping[str, Mapping[str, str]]) -> dic
 
 
 def _shard_records(output: Output) -> dict[str, dict[str, str]]:
-    """Checksums of each shard's files, by the name of the file that lists them; a damaged list is empty."""
+    """Checksums of each shard's files, by the name of the list's file; a damaged list is empty."""
     output.fetch(CHECKSUMS)
     records = {path.name: load_checksums(path) for path in output.folder.glob(CHECKSUMS)}
     return {
@@ -188,7 +188,7 @@ def _shard_records(output: Output) -> dict[str, dict[str, str]]:
 
 
 def _whole_files(output: Output) -> dict[str, str]:
-    """Checksums of the files of undamaged shards; files that are not as they were made are told."""
+    """Checksums of the files of undamaged shards; warns of files that changed since they were written."""
     if not output.is_here and MANIFEST in output.sizes():
         (output.folder / MANIFEST).write_bytes((output.place / MANIFEST).read_bytes())
     own, there = _shard_records(output), output.sizes()
@@ -202,7 +202,7 @@ def _whole_files(output: Output) -> dict[str, str]:
 
 
 def _number(name: str) -> int:
-    """The number of a shard in the name of one of its files; -1 for other names."""
+    """Number of a shard from the name of one of its files; -1 for other names."""
     number = Path(name).stem.rpartition("-")[2]
     return int(number) if number.isdecimal() else -1
 
@@ -234,7 +234,7 @@ def _make_shards(
 
 
 def _complete(source: FrameSource, output: Output, whole: dict[str, str]) -> Manifest:
-    """Write the manifest of a set with all its shards."""
+    """Write the manifest of a set with all shards."""
     shards = _shards(source.settings.num_frames)
     output.fetch("redrawn-*.json")
     recorded = whole | _recorded_files(output, _shard_records(output))
@@ -277,14 +277,14 @@ def _shard_size(num_frames: int, shard: int) -> int:
 
 
 def _is_finished(source: FrameSource, there: dict[str, int], shard: int) -> bool:
-    """Whether a shard has all its rows; the last shard of a set that grows does not."""
+    """Whether a shard has all its rows; the last shard of a set to be extended has not."""
     size = _shard_size(source.settings.num_frames, shard)
     expected = array_bytes(row_dtype(source.layout.num_markers), size)
     return hands_name(shard) in there and there.get(rows_name(shard)) == expected
 
 
 def make_shard(source: FrameSource, out: Path, shard: int) -> int:
-    """Write one shard's hands, counts of redraws and rows, which depend on its number and the seed alone."""
+    """Write one shard's hands, counts of redraws and rows, which depend only on its number and the seed."""
     settings = source.settings
     rng = np.random.default_rng(np.random.SeedSequence(settings.seed, spawn_key=(shard,)))
     rows = np.zeros(_shard_size(settings.num_frames, shard), dtype=row_dtype(source.layout.num_markers))

@@ -1,7 +1,7 @@
-"""The simulated capture room: its light sources, the cameras that see them, and the recorded take.
+"""The simulated capture room: light sources, the cameras that see them, and the recorded take.
 
-How often cameras drop out and how many reflections flash is fitted to the four test captures of Han et al.
-2018: to Table 3 and to the ghost ratios of Table 4 (docs/room.md has the fitted numbers).
+The frequencies of camera dropouts and reflections are fitted to the four test captures of Han et al. 2018: to
+Table 3 and to the ghost ratios of Table 4 (docs/room.md has the numbers).
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ from handsim.space.transforms import transform_poses
 from train.simulation.scenes import SceneMotion, SimulatedKind
 
 SKIN_CHUNK: Final = 16
-"""Frames whose skins are posed at once, few enough for the processor's cache."""
-_CHUNK: Final = 256  # frames whose lines of sight are in memory at once
-_MIN_BODY_MARKERS: Final = 3  # markers without which an object cannot be tracked as a rigid body
+"""Number of frames whose skins are posed together, few enough for the processor's cache."""
+_CHUNK: Final = 256  # number of frames whose lines of sight are in memory together
+_MIN_BODY_MARKERS: Final = 3  # An object needs this many markers to be tracked as a rigid body.
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,60 +46,60 @@ class RoomConfig(Settings):
     optics: OpticsConfig = field(default_factory=OpticsConfig)
     """Noise, losses and triangulation of the optical system."""
     strays: StrayConfig = field(default_factory=StrayConfig)
-    """Stray reflections carried by every hand and by the object."""
+    """Stray reflections on every hand and on the object."""
     reflectance: Annotated[float, Limits(0.0, 1.0)] = 0.5
-    """Share of the mirror images in shiny patches that are bright enough."""
+    """Share of the mirror images in shiny patches that are bright enough to be seen."""
 
 
 @dataclass(frozen=True, slots=True)
 class OpticsOptions(Settings):
-    """The fields of `OpticsConfig`; those that are not given are the ones fitted to the kind of capture."""
+    """The fields of `OpticsConfig`; the default of each is fitted to the kind of capture."""
 
     noise: float | None = None
     """Standard deviation of a blob's center per axis [px], for a sphere of 3.2 mm radius."""
     marker_radius: float | None = None
     """Radius of the glove's spheres [m]; the layout's when not given."""
     roundness: float | None = None
-    """Share of the sum of their radii within which two blobs that touch count as one marker."""
+    """Two touching blobs count as one marker within this share of the sum of their radii."""
     max_residual: float | None = None
     """Largest distance of a ray from its point [m]."""
     min_angle: float | None = None
-    """Two rays alone must cross at this angle at least [deg]."""
+    """Smallest angle between two rays that alone make a point [deg]."""
     min_distance: float | None = None
-    """Points nearer to each other than this are one [m]."""
+    """Closer points are merged [m]."""
     partial: float | None = None
-    """Share of a marker's radius within which its visible spot lies, another one for each camera."""
+    """Visible spots lie within this share of a marker's radius, randomly for each camera."""
     blob_loss: float | None = None
-    """Chance that a camera misses a blob it should see."""
+    """Probability that a camera misses a blob."""
     dropout: float | None = None
-    """Chance per frame that cameras begin to lose their pictures."""
+    """Probability per frame that cameras begin to lose their pictures."""
     dropout_length: float | None = None
-    """Mean number of pictures that they lose then."""
+    """Mean number of pictures lost in a row."""
     dropout_cameras: int | None = None
-    """Number of cameras that lose them together."""
+    """Number of cameras that lose pictures together."""
     min_rays: int | None = None
-    """Rays that must meet for a point to exist."""
+    """Number of rays that must meet for a point."""
     min_rays_to_start: int | None = None
-    """Rays that must meet for a point that did not exist in the frame before."""
+    """Number of rays that must meet for a point that was not there in the frame before."""
 
     def applied(self, optics: OpticsConfig) -> OpticsConfig:
-        """An optical system with these options in the place of its own, if they are in range."""
+        """Replace settings of an optical system by these options, and validate them."""
         given = {name: value for name, value in dataclasses.asdict(self).items() if value is not None}
         return dataclasses.replace(optics, **given)
 
 
 class Twin(NamedTuple):
-    """The settings of a simulated capture that make it like one of the paper's."""
+    """Settings of a simulated capture that make it similar to one of the paper's."""
 
     num_frames: int
-    """Frames of the paper's capture; its Table 3."""
+    """Number of frames of the paper's capture (Table 3)."""
     room: RoomConfig
     draw: int
-    """Which of many random captures of this kind is the twin: the one nearest to the paper's figures."""
+    """Number of the random capture of this kind that is nearest to the paper's figures."""
 
     @classmethod
     def of(cls, num_frames: int, strays: float, losses: tuple[float, float, float, int], draw: int) -> Twin:
-        """A twin from the number of stray reflections and four settings of losses."""
+        """A twin, from its number of stray reflections and four settings of losses."""
         names = ("blob_loss", "dropout", "dropout_length", "dropout_cameras")
         optics = OpticsConfig(min_rays_to_start=2, **dict(zip(names, losses, strict=True)))  # type: ignore[arg-type]
         return cls(num_frames, RoomConfig(optics=optics, strays=StrayConfig(number=strays)), draw)
@@ -115,7 +115,7 @@ _SAME_ROOM: Final[dict[str, str]] = {"real-like": "hand-hand", "free": "single-h
 
 
 def usual_room(kind: SimulatedKind) -> RoomConfig:
-    """The room of the paper's capture of this kind, or of the most similar one."""
+    """The room of the paper's capture of this kind, or of the most similar kind."""
     return RoomConfig() if kind == "calibration" else TWINS[_SAME_ROOM.get(kind, kind)].room
 
 
@@ -129,7 +129,7 @@ class SceneSight:
 
     @cached_property
     def markers(self) -> tuple[Float[np.ndarray, "T P 3"], Float[np.ndarray, "T P 3"]]:
-        """Centers [m] and outward unit directions of the hands' markers and then of the object's."""
+        """Centers [m] and outward unit directions of the hands' markers, then of the object's."""
         parts = [
             hand.fit.attachment.markers(hand.fit.model, bones)
             for hand, bones in zip(self.scene.hands, self.T_world_bone, strict=True)
@@ -161,14 +161,14 @@ class SceneSight:
         return [(MeshTree(held.rigid_object.vertices, held.rigid_object.faces), held.motion.T_world_body)]
 
     def free_of_hands(self, points: Float[np.ndarray, "T S 3"]) -> Bool[np.ndarray, "T S C"]:
-        """Which cameras see points [m] that no capsule of a hand hides."""
+        """Which cameras see points [m] that are not hidden by a hand's capsules."""
         free = self.rig.in_view(points) & free_rays(points, self.rig.positions, *self.capsules)
         return np.asarray(free)
 
     def visible_markers(
         self, radii: Float[np.ndarray, "P"], *, rng: np.random.Generator
     ) -> Bool[np.ndarray, "T P C"]:
-        """Which cameras see each marker, or rather a random spot within a radius [m] of its center."""
+        """Which cameras see a random spot of each marker, within a radius [m] of its center."""
         markers, normals = self.markers
         seen = np.empty((*markers.shape[:2], len(self.rig.positions)), dtype=bool)
         for first in range(0, self.scene.num_frames, _CHUNK):
@@ -184,7 +184,7 @@ class SceneSight:
     def clear_lines(
         self, frames: slice, starts: Float[np.ndarray, "t P C 3"], candidates: Bool[np.ndarray, "t P C"]
     ) -> Bool[np.ndarray, "t P C"]:
-        """Which candidate lines from the starts [m] to the cameras meet no skin and no object."""
+        """Which candidate lines from the starts [m] to the cameras meet neither skin nor object."""
         clear = candidates
         for hand in self.scene.hands:
             vertices = hand.fit.model.skin(hand.qpos[frames])
@@ -197,7 +197,7 @@ class SceneSight:
 def _random_offsets(
     shape: tuple[int, int, int], radii: Float[np.ndarray, "P"], rng: np.random.Generator
 ) -> Float[np.ndarray, "*shape 3"]:
-    """Random offsets in balls; `radii` are those of the sources along the second axis [m]."""
+    """Random offsets in balls; `radii` [m] belong to the sources along the second axis."""
     offsets = rng.standard_normal((*shape, 3), dtype=np.float32)
     length = np.sqrt(np.einsum("...i,...i->...", offsets, offsets))
     scale = radii.astype(np.float32)[:, None] * np.cbrt(rng.random(shape, dtype=np.float32))
@@ -212,15 +212,15 @@ class LightSources(NamedTuple):
     positions: Float[np.ndarray, "T S 3"]
     """Centers in the world [m]."""
     visible: Bool[np.ndarray, "T S C"]
-    """Cameras with a free view."""
+    """Which cameras have a free view."""
     labels: Int[np.ndarray, "S"]
-    """Marker of each source; -1 for a source that is not a marker."""
+    """Marker of each source; -1 if it is not a marker."""
     radii: Float[np.ndarray, "S"]
     """Radii of the sources [m]."""
 
 
 def sample_light_sources(sight: SceneSight, config: RoomConfig, *, rng: np.random.Generator) -> LightSources:
-    """The light sources of a scene, and the cameras that see them."""
+    """Light sources of a scene, and the cameras that see them."""
     markers, _ = sight.markers
     check_outside(sight.rig, markers)
     labels = np.arange(markers.shape[1])
@@ -249,7 +249,7 @@ def _without_label(positions: Float[np.ndarray, "T S 3"], visible: Bool[np.ndarr
 
 
 def marker_radii(scene: SceneMotion, optics: OpticsConfig) -> Float[np.ndarray, "P"]:
-    """Radii of the hands' markers and then of the object's [m]; the optics may set those of the gloves."""
+    """Radii of the hands' markers, then of the object's [m]; the optics may override those of the gloves."""
     layouts = [hand.fit.layout for hand in scene.hands]
     radii = [np.full(layout.num_markers, optics.radius_of(layout.radius)) for layout in layouts]
     if scene.moving_object is not None:
@@ -306,7 +306,7 @@ def record_take(
     *,
     rng: np.random.Generator,
 ) -> Take:
-    """The take that an optical system records of a scene, with its truth and these settings."""
+    """Record a scene with an optical system, as a take with its truth and these settings."""
     sources = sample_light_sources(SceneSight(scene, rig), config, rng=rng)
     return pack_take(scene, sources, rig, config, settings, rng=rng)
 
@@ -327,7 +327,7 @@ def pack_take(
     )
     false_labels = label_false_points(found, sources.positions, sources.labels, optics.max_residual)
     labels = np.hstack([np.tile(sources.labels, (scene.num_frames, 1)), false_labels])
-    order = rng.permutation(labels.shape[1])  # IDs and columns must not identify markers
+    order = rng.permutation(labels.shape[1])  # IDs and columns must not reveal markers.
     positions = np.concatenate([found.positions, found.false_points], axis=1)[:, order]
     labels = labels[:, order]
     present = np.isfinite(positions).all(axis=-1)
@@ -362,7 +362,7 @@ def label_false_points(
 ) -> Int[np.ndarray, "T F"]:
     """Labels of false points: the nearest marker without another point, or -1 beyond `max_distance` [m].
 
-    People who label a capture also take such a point for the marker.
+    People who label a capture also assign such a point to the marker.
     """
     false_labels = np.full(found.false_points.shape[:2], -1)
     markers = np.flatnonzero(labels >= 0)
@@ -375,7 +375,7 @@ def label_false_points(
             false_labels[frame, point] = labels[missing[marker]]
             distance[point], distance[:, marker] = np.inf, np.inf
     runs = number_runs(np.isfinite(found.false_points[..., 0]))
-    for run in np.unique(runs[false_labels >= 0]):  # an ID keeps its label
+    for run in np.unique(runs[false_labels >= 0]):  # An ID keeps its label.
         if len(np.unique(false_labels[runs == run])) > 1:
             false_labels[runs == run] = -1
     return false_labels

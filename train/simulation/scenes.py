@@ -1,4 +1,4 @@
-"""Scenes in motion: people in gloves, the objects that they hold, and the motions of each kind of capture."""
+"""Scenes in motion: people in gloves, objects that they hold, and motions of each kind of capture."""
 
 from __future__ import annotations
 
@@ -41,16 +41,16 @@ KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
 SimulatedKind = Literal[
     "single-hand", "hand-hand", "hand-pen", "hand-controller", "real-like", "calibration", "free"
 ]
-"""These, hands like real ones, the exercises that a user is calibrated by, and hands that move freely."""
+"""The paper's kinds, realistic hands, the exercises for a user's calibration, and freely moving hands."""
 SIMULATED_KINDS: Final[tuple[SimulatedKind, ...]] = get_args(SimulatedKind)
 RATE: Final = 120.0
 """Frames per second of simulated takes [Hz]."""
 
-_HAND_OFFSET: Final = 0.22  # distance of a hand that touches nothing from the middle of the room [m]
-_VOLUME: Final = 0.1  # half side of the cube around the wrist of such a hand [m]
-_RETREAT_DIRECTION: Final = np.array([1.0, 0.0, 0.0])  # in which the right hand makes room for the left
+_HAND_OFFSET: Final = 0.22  # [m] distance of a hand that touches nothing from the center of the room
+_VOLUME: Final = 0.1  # [m] half side of the cube around the wrist of such a hand
+_RETREAT_DIRECTION: Final = np.array([1.0, 0.0, 0.0])  # in which the right hand avoids the left
 _PAUSE_BETWEEN_CONTACTS: Final = (2.0, 4.0)  # [s]
-_WRIST_ROTATION: Final = 0.5  # standard deviation about each axis [rad]
+_WRIST_ROTATION: Final = 0.5  # [rad] standard deviation about each axis
 _FREE_SCRIPT, _RESTING_SCRIPT = "piano", "typing"
 
 
@@ -64,16 +64,16 @@ class MovingObject:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SceneMotion:
-    """Everything that moves in a take; all motions have one length."""
+    """Everything that moves in a take; all motions have the same length."""
 
     hands: tuple[GlovedHand, ...]
     moving_object: MovingObject | None = None
     rate: float = RATE
     """Frames per second [Hz]."""
     skin: tuple[Float[np.ndarray, "T M 3"], ...] = ()
-    """Displacement of each hand's markers by its skin, in the world [m]; none when empty."""
+    """Displacement of each hand's markers by its skin, in the world [m]; empty for none."""
     others: Float[np.ndarray, "T Q 3"] | None = None
-    """Markers that belong to no hand and to no tracked object [m]."""
+    """Markers that belong to no hand and no tracked object [m]."""
 
     @property
     def num_frames(self) -> int:
@@ -90,7 +90,7 @@ class SceneMotion:
         return SceneMotion(hands, held, self.rate)
 
     def moved(self, offsets: Float[np.ndarray, "*T 3"]) -> SceneMotion:
-        """The scene moved by one offset, or by one for each frame [m]; without markers of others."""
+        """The scene moved by one offset [m], or by one per frame; without markers of others."""
         hands = []
         for hand in self.hands:
             qpos = hand.qpos.copy()
@@ -107,7 +107,7 @@ class SceneMotion:
 def sample_scene_motion(
     kind: Kind, fits: Sequence[GloveFit], num_frames: int, *, rng: np.random.Generator
 ) -> SceneMotion:
-    """Random motion of a right and a left hand, and of the object in the right hand if there is one."""
+    """Random motion of a right and a left hand, and of the object in the right hand, if any."""
     right, left = fits
     if kind == "hand-hand":
         both = sample_two_hand_motion(
@@ -136,7 +136,7 @@ def sample_scene_motion(
 def _free_hand(
     model: HandModel, script: str, offset: float, num_frames: int, rng: np.random.Generator
 ) -> HandMotion:
-    """Motion of a hand in the air, palm mostly down, at `offset` from the middle of the room [m]."""
+    """Motion of a hand in the air, palm mostly down, at `offset` from the center of the room [m]."""
     qpos = scripted_motion(model, script, num_frames / RATE, rng=rng).qpos[:num_frames].copy()
     config = WristConfig(center=(offset, 0.0, 1.1), volume=_VOLUME, turning=_WRIST_ROTATION)
     qpos[:, :3], qpos[:, 3:7] = wrist_path(num_frames, RATE, config, rng=rng)
@@ -152,20 +152,20 @@ def _gloved(
 
 # A calibration capture.
 _MAX_DRAWS: Final = 20
-_STARTS: Final = ("pinch_pad", "pinch_tip")  # gestures from which touches start
-_JITTER: Final = np.deg2rad(8.0)  # standard deviation of the starts' joint angles [rad]
+_STARTS: Final = ("pinch_pad", "pinch_tip")  # gestures before touches
+_JITTER: Final = np.deg2rad(8.0)  # [rad] standard deviation of these gestures' joint angles
 _TOUCHING: Final = MotionConfig(durations=(0.4, 0.8), hold=0.8)
 _FREE: Final = MotionConfig(durations=(0.3, 0.9), hold=0.2)
 
 
 @dataclass(frozen=True, slots=True)
 class CalibrationTakeConfig(Settings):
-    """The exercises of a calibration capture, and the cameras that record it."""
+    """Exercises of a calibration capture, and the cameras that record it."""
 
     free: Annotated[float, Limits(0.0, above=True)] = 40.0
-    """Free motion [s]."""
+    """Duration of free motion [s]."""
     rounds: Annotated[int, Limits(0)] = 3
-    """How often the thumb goes to each of the other fingertips in turn."""
+    """Number of rounds in which the thumb touches each of the other fingertips."""
     rig: CameraRig | str = "figure5"
     """Camera rig: a shipped name, the path of a .toml file, or the rig itself."""
     turning: Annotated[float, Limits(0.0)] = 0.7
@@ -175,7 +175,7 @@ class CalibrationTakeConfig(Settings):
 def sample_calibration_scene(
     hands: tuple[GloveFit, ...], config: CalibrationTakeConfig, *, rng: np.random.Generator
 ) -> SceneMotion:
-    """The motion of one hand or both in a calibration capture."""
+    """Motion of one or both hands in a calibration capture."""
     if not 1 <= len(hands) <= len(SIDES):
         raise ArgumentError(f"{len(hands)} hands, expected one or two")
     angles = [calibration_angles(fit.model, config, rng=rng) for fit in hands]
@@ -202,7 +202,7 @@ def calibration_angles(
 
 
 def _free_motion(model: HandModel, seconds: float, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Joint angles (T, 20) of free motion that begins at a pose which touches can move to [rad]."""
+    """Joint angles (T, 20) [rad] of free motion from a pose that can be reached from touches."""
     for _ in range(_MAX_DRAWS):
         free = sample_motion(model, seconds, _FREE, rng=rng).qpos[: count_frames(seconds, _FREE), 7:]
         if can_be_left(model, free[:1]).all():
@@ -211,7 +211,7 @@ def _free_motion(model: HandModel, seconds: float, rng: np.random.Generator) -> 
 
 
 def _touch_fingers(model: HandModel, rng: np.random.Generator) -> list[NDArray[np.float64]]:
-    """Poses (20,) [rad] of the thumb at each fingertip within its reach, each from another random start."""
+    """Poses (20,) [rad] in which the thumb touches each reachable fingertip, from random starts."""
     poses = []
     for finger in FINGERS:
         pinch = gesture(f"{_STARTS[rng.integers(len(_STARTS))]}_{finger}")
@@ -219,19 +219,19 @@ def _touch_fingers(model: HandModel, rng: np.random.Generator) -> list[NDArray[n
         try:
             touch = touching_angles(model, finger, start)
         except PoseError:
-            continue  # calibration does not need every finger in every round
+            continue  # Calibration does not need every finger in every round.
         if can_be_left(model, touch[None]).all():
             poses.append(touch)
     return poses
 
 
-# Hands like real ones. The figures are those of the published captures of Han et al. 2018 (docs/room.md): no
-# pose of our hand model comes closer to the markers than 1.5 mm per axis, similar poses share three tenths of
-# that variance, and half of the captures are about twice as fast as simulated hands.
+# Realistic hands, after the published captures of Han et al. 2018 (docs/room.md): no pose of our hand model
+# comes closer to the markers than 1.5 mm per axis, similar poses share three tenths of that variance, and
+# half of the captures are about twice as fast as simulated hands.
 NUM_FRAMES: Final = 3000
 """Default number of frames of real-like and free takes."""
 SPEED: Final = 2
-"""Speed of these hands as a multiple of the speed in the other takes."""
+"""Speed of realistic hands relative to the other takes."""
 _SLIP_ALONG, _SLIP_AROUND = 0.1, np.deg2rad(10.0)  # slip of a glove [bone lengths, rad], as in training sets
 
 
@@ -246,16 +246,16 @@ def sample_real_like_scene(layout: MarkerLayout, num_frames: int, *, rng: np.ran
 # Markers of others move rigidly with an arm, a thing or a person.
 MAX_OTHERS: Final = 60
 """Largest number of markers of others."""
-_STRAIGHT: Final = 0.6  # weight of the hand's direction in the forearm's
-_SHOULDER: Final = (0.45, 0.18, 0.25)  # [m] behind the hands, to the side and above them
+_STRAIGHT: Final = 0.6  # weight of the hand's direction in that of the forearm
+_SHOULDER: Final = (0.45, 0.18, 0.25)  # [m] behind the hands, beside and above them
 _WRIST: Final = ((0.03, 0.028, 0.02), (0.035, -0.028, 0.02))  # [m] behind the wrist, across, above
 _ELBOW: Final = (0.26, 0.03, 0.02)
 _FOREARM: Final = ((0.12, 0.0, 0.03), (0.2, -0.03, 0.02))
 _THING: Final = ((0.10, 0.0, -0.06), (0.14, 0.03, -0.09), (0.17, -0.02, -0.07), (0.21, 0.01, -0.12))  # [m]
 _HEAD: Final = ((0.09, 0.0, 0.25), (-0.09, 0.0, 0.25), (0.0, 0.08, 0.27), (0.0, -0.08, 0.2))  # [m]
 _BACK: Final = ((-0.12, 0.05, -0.1), (-0.12, -0.05, -0.25))
-_PERSON: Final = 1.2  # distance of the other person [m]
-_SWAY: Final = 0.03  # half side of the cube that a swaying body stays in [m]
+_PERSON: Final = 1.2  # [m] distance of the other person
+_SWAY: Final = 0.03  # [m] half side of the cube in which a swaying body stays
 _BODY_SIZE: Final = (0.3, 0.3, 0.7)  # [m] half sides of the box of the other person's markers
 
 
@@ -307,6 +307,6 @@ def _arm(
 def _path(
     scene: SceneMotion, center: Float[np.ndarray, "3"], volume: float, rng: np.random.Generator
 ) -> Float[np.ndarray, "T 3"]:
-    """Slow motion in a cube of half side `volume` around a place [m]."""
+    """Slow motion in a cube of half side `volume` around a center [m]."""
     config = WristConfig(center=tuple(center), volume=volume, turning=0.0)
     return wrist_path(scene.num_frames, scene.rate, config, rng=rng)[0]

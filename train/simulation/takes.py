@@ -1,6 +1,6 @@
 """Simulated takes of hands, such as twins of the four test captures of Han et al. 2018 (section 5, Table 3).
 
-A take flows one way: people in gloves, their motion, what cameras see of it, the optical system, the take.
+A take is made in steps: people in gloves, their motion, the cameras' views, the optical system, the take.
 """
 
 from __future__ import annotations
@@ -37,24 +37,24 @@ from train.simulation.scenes import (
 from train.simulation.training_frames import AnyLayout, AnyRig, sample_adult_hands, wear_gloves
 
 WRIST_VOLUME: Final = 0.5
-"""Half side of the cube that wrists stay in [m]; no camera may stand there."""
+"""Half side of the cube in which wrists stay [m]; no camera may be there."""
 BOTH: Final[tuple[Side, Side]] = ("right", "left")
 APART: Final = ("single-hand", "calibration", "free")
-"""Kinds of capture in which a hand may be alone."""
+"""Kinds of capture that one hand alone can do."""
 _MAX_PEOPLE: Final = 10
 _SLIP_ALONG, _SLIP_AROUND = 0.05, np.deg2rad(5.0)  # slip of a glove [bone lengths, rad]
 
 
 @dataclass(frozen=True, slots=True)
 class SimulateSettings(Settings):
-    """Everything that decides the bytes of a simulated take; takes have 120 frames per second [Hz]."""
+    """Everything that determines the bytes of a simulated take, which has 120 frames per second [Hz]."""
 
     noun: ClassVar[str] = "setting of a simulated take"
     kind: SimulatedKind = "single-hand"
     """What the hands do: single-hand, hand-hand, hand-pen or hand-controller, as in the paper's captures;
-    real-like; calibration, what a user does to be calibrated by; or free."""
+    real-like; calibration, the exercises for a user's calibration; or free."""
     num_frames: Annotated[int, Limits(1)] | None = None
-    """Frames; when not given the paper's number for this kind, 3000 for real-like and free, and for
+    """Number of frames; when not given the paper's number for this kind, 3000 for real-like and free, and for
     calibration touches and 40 s of free motion."""
     glove: AnyLayout = "dense19"
     """Marker layout: a shipped name or the path of a .toml file."""
@@ -63,18 +63,18 @@ class SimulateSettings(Settings):
     seed: Annotated[int, Limits(0)] = 0
     """Seed of people, motion and losses."""
     center: Center = ROOM_CENTER
-    """Middle of the space that hands move in, in the rig's room [m]."""
+    """Center of the space in which hands move, in the rig's room [m]."""
     optics: OpticsOptions = field(default_factory=OpticsOptions)
-    """The optical system, where it differs from the one fitted to this kind of capture."""
+    """Settings of the optical system that differ from those fitted to this kind of capture."""
     hands: tuple[Side, ...] = BOTH
     """Hands to simulate: right, left, or both, which meet or hold an object together in the kinds hand-hand,
-    hand-pen, hand-controller and real-like. Of a glove for one hand that hand alone."""
+    hand-pen, hand-controller and real-like. A glove for one hand simulates that hand alone."""
     others: Annotated[int, Limits(0, MAX_OTHERS)] = 0
-    """Markers that are not the hands', up to 60, with label -1. Those nearest to the hands come first: on the
-    wearer's arms, a thing in a hand, the wearer's head and back, and a person beside."""
+    """Number of markers that are not the hands', up to 60, with label -1. The nearest come first: on the
+    wearer's arms, a thing in a hand, the wearer's head and back, and a person nearby."""
 
     def check(self) -> None:
-        """Refuse hands that cannot do this alone, and optics out of range."""
+        """Refuse one hand where two are needed, and optics out of range."""
         if set(self.hands) != set(BOTH) and (self.kind not in APART or len(self.hands) != 1):
             raise ArgumentError(
                 f"hands are {' '.join(self.hands) or 'none'}, expected right and left, or one of them for "
@@ -86,11 +86,11 @@ class SimulateSettings(Settings):
 def simulate_take(
     kind: SimulatedKind | None = None, settings: SimulateSettings | None = None, **options: Any
 ) -> Take:
-    """A simulated capture of one hand or two with its truth: points (T, N, 3) [m], labels, IDs and motion.
+    """Simulate a capture of one or two hands with its truth: points (T, N, 3) [m], labels, IDs and motion.
 
     Args:
         kind: What the hands do, one of the kinds of `SimulateSettings`.
-        settings: The settings; the usual ones when not given.
+        settings: The settings; the defaults when not given.
         options: Settings by name, such as `glove="sparse13"`, `num_frames=600`, `seed=3` or
             `optics={"blob_loss": 0.1}`.
 
@@ -98,10 +98,10 @@ def simulate_take(
         A take at 120 [Hz]; the same settings give the same take.
 
     Raises:
-        LayoutError: The glove is unknown, does not fit, or is for one hand and the other is simulated too.
+        LayoutError: The glove is unknown, does not fit, or is for one hand while the other is simulated, too.
         RigError: The rig is unknown or damaged.
-        ArgumentError: A setting is unknown or out of range, or a camera stands in the hands' way.
-        PoseError: None of the people drawn can do what this kind of capture asks for.
+        ArgumentError: A setting is unknown or out of range, or a camera is inside the hands' volume.
+        PoseError: None of the random people can do what this kind of capture needs.
     """
     given = SimulateSettings.of(settings, options if kind is None else {"kind": kind, **options})
     rig, layout = load_rig(given.rig), load_layout(given.glove)
@@ -131,7 +131,7 @@ def simulate_take(
 def simulate_calibration(
     hands: tuple[GloveFit, ...], config: CalibrationTakeConfig | None = None, *, rng: np.random.Generator
 ) -> Take:
-    """A calibration capture of certain hands in their gloves, one or both."""
+    """A calibration capture of one or both of the given hands in their gloves."""
     config = config or CalibrationTakeConfig()
     scene = sample_calibration_scene(hands, config, rng=rng)
     rig = load_rig(config.rig)
@@ -142,12 +142,12 @@ def simulate_calibration(
 def sample_scene(
     kind: Kind, layout: MarkerLayout, num_frames: int, *, rng: np.random.Generator
 ) -> SceneMotion:
-    """A random person in gloves, in the motion of a kind of capture, at `RATE` frames per second."""
+    """A random person in gloves, with the motion of a kind of capture, at `RATE` frames per second."""
     return _by_somebody(kind, layout, lambda fits: sample_scene_motion(kind, fits, num_frames, rng=rng), rng)
 
 
 def _worn_hands(settings: SimulateSettings, layout: MarkerLayout) -> tuple[Side, ...]:
-    """The simulated hands; a `LayoutError` if the glove is not for them."""
+    """The hands to simulate; a `LayoutError` if the glove is not for them."""
     if len(layout.sides) == 1 and set(settings.hands) == set(BOTH):
         if settings.kind not in APART:
             raise LayoutError(
@@ -161,7 +161,7 @@ def _worn_hands(settings: SimulateSettings, layout: MarkerLayout) -> tuple[Side,
 
 
 def _sample_scene(settings: SimulateSettings, layout: MarkerLayout, rng: np.random.Generator) -> SceneMotion:
-    """The scene of a take with these settings, without markers of others."""
+    """Scene of a take with these settings, without markers of others."""
     kind, count = settings.kind, settings.num_frames
     if kind == "real-like":
         return sample_real_like_scene(layout, count or NUM_FRAMES, rng=rng)
@@ -190,7 +190,7 @@ def _by_somebody(
     act: Callable[[Sequence[GloveFit]], SceneMotion],
     rng: np.random.Generator,
 ) -> SceneMotion:
-    """The scene of the first random person who can do this kind of capture."""
+    """Scene of the first random person who can do this kind of capture."""
     reason: PoseError | None = None
     for _ in range(_MAX_PEOPLE):
         models = sample_adult_hands(rng=rng)

@@ -1,4 +1,4 @@
-"""Training frames: one person's gloved hands in random poses, as a rig and its optical system see them."""
+"""Training frames: a person's gloved hands in random poses, seen by a rig and its optical system."""
 
 from __future__ import annotations
 
@@ -32,18 +32,18 @@ from poses.two_hands import sample_two_hand_poses
 
 NO_REST: Final = "person: fingers overlap at rest"
 """Reason to draw another person."""
-# Fitted to the published captures of Han et al. 2018, as the speed of real-like takes (docs/room.md).
+# Fitted to the published captures of Han et al. 2018, like the speed of real-like takes (docs/room.md).
 NOISE: Final = 0.00125
 """Standard deviation of the markers' independent noise per axis [m]."""
 FLESH: Final = 0.0008
-"""RMS displacement per axis that repeats with the angles of the marker's digit [m]."""
+"""RMS displacement per axis that depends on the angles of the marker's digit [m]."""
 _MAX_PEOPLE: Final = 1000
-_SHOWN_PEOPLE: Final = 100  # whose slips are drawn
+_SHOWN_PEOPLE: Final = 100  # number of people whose slips are drawn
 NO_TOUCH: Final = "two hands: no valid pose, one hand instead"
 """Reason to replace a scene of two hands by one of a single hand."""
 NO_GRASP: Final = "held object: not grasped, empty hand instead"
 """Reason to replace a scene with an object by one of an empty hand."""
-_MAX_LOST_CAMERAS: Final = 6  # cameras that lose their pictures together
+_MAX_LOST_CAMERAS: Final = 6  # largest number of cameras that lose pictures together
 AnyLayout = Annotated[
     MarkerLayout | str | Path, Expected("a MarkerLayout, or the name or path of one", list_layouts)
 ]
@@ -52,7 +52,7 @@ AnyRig = Annotated[CameraRig | str | Path, Expected("a CameraRig, or the name or
 
 @dataclass(frozen=True, slots=True)
 class SceneMix(Mixture):
-    """How often a person's hands are alone, together or hold something; the shares are normalized."""
+    """How often a person's hands are alone, together or hold something; shares are normalized."""
 
     alone: float = 0.6
     together: float = 0.25
@@ -63,10 +63,10 @@ class SceneMix(Mixture):
 
 @dataclass(frozen=True, slots=True)
 class GenerateSettings(Settings):
-    """Everything that decides the bytes of a training set: people, poses, scenes, cameras and losses.
+    """Everything that determines the bytes of a training set: people, poses, scenes, cameras and losses.
 
-    A group of settings may be given as a mapping of those that differ from its default, such as
-    `ghosts={"stray_rate": 0.0}`; the shares of `poses` and `scenes` as a mapping of those that are not 0:
+    A group of settings may be given as a mapping with those that differ from the default, such as
+    `ghosts={"stray_rate": 0.0}`; the shares of `poses` and `scenes` as a mapping with the nonzero ones:
     `scenes={"alone": 1.0}`.
     """
 
@@ -74,41 +74,41 @@ class GenerateSettings(Settings):
     glove: AnyLayout = "dense19"
     """Marker layout: a shipped name or the path of a .toml file."""
     num_frames: Annotated[int, Limits(1)] = 170_330
-    """Frames; the default is the paper's number."""
+    """Number of frames; the default is the paper's."""
     seed: Annotated[int, Limits(0)] = 0
     rig: AnyRig = "figure5"
     """Camera rig: a shipped name or the path of a .toml file."""
     min_cameras: Annotated[int, Limits(1)] = 2
-    """Cameras that must see a marker before it exists."""
+    """Number of cameras that must see a marker."""
     frames_per_hand: Annotated[int, Limits(1)] = 128
-    """Poses of one hand before the next person puts on the glove."""
+    """Poses of one person before the next one puts on the glove."""
     slip_along: Annotated[float, Limits(0.0, 1.0)] = 0.1
-    """Standard deviation of the markers' slip along the bones [bone lengths]."""
+    """Standard deviation of the markers' slip along bones [bone lengths]."""
     slip_around: Annotated[float, Limits(0.0, 90.0)] = 10.0
-    """The same around the bones [deg]."""
+    """Standard deviation of the markers' slip around bones [deg]."""
     center: Center = ROOM_CENTER
-    """Middle of the cube that wrists move in, in the rig's room [m]."""
+    """Center of the cube in which wrists move, in the rig's room [m]."""
     volume: Annotated[float, Limits(0.0, 10.0)] = 0.3
     """Half side of that cube [m]."""
     population: Population = field(default_factory=lambda: Population(children=0.2))
     poses: PoseMix = field(default_factory=PoseMix)
     sampler: Annotated[PoseSampler | str, SAMPLER] | None = None
-    """A pose sampler of your own for hands that are alone, instead of that mix: module:name, or the name of
-    an entry point. Whole poses (T, 27) say where the hands are; joint angles (T, 20) [rad], and wrists left
-    at the origin, are put anywhere."""
+    """A pose sampler of your own for hands that are alone, instead of `poses`: module:name, or the name of an
+    entry point. Whole poses (T, 27) place the hands; joint angles (T, 20) [rad], and wrists that are all at
+    the origin, are placed at random."""
     scenes: SceneMix = field(default_factory=SceneMix)
     flesh: bool = False
     """Whether markers move with the skin, as in real-like takes of `simulate`: by 0.8 mm per axis that depend
-    on the digit's angles, and 1.25 mm of noise."""
+    on the digit's angles, and by 1.25 mm of noise."""
     ghosts: GhostConfig = field(default_factory=GhostConfig)
     optics: FrameOptics = field(default_factory=FrameOptics)
     blob_loss: Annotated[tuple[float, float], Limits(0.0, 1.0, ascends=True)] = (0.0, 0.15)
-    """Least and greatest chance that a camera misses a blob; every person draws another."""
+    """Range of the probability that a camera misses a blob, drawn for every person."""
     dropout: Annotated[tuple[float, float], Limits(0.0, 1.0, ascends=True)] = (0.0, 0.4)
-    """Least and greatest chance per frame that some cameras lose their pictures."""
+    """Range of the probability per frame that some cameras lose their pictures, drawn for every person."""
 
     def check(self) -> None:
-        """Refuse optics over time, whose chances are drawn for each person here."""
+        """Refuse optics over time, as their losses are drawn for each person."""
         if isinstance(self.optics, OpticsConfig):
             raise ArgumentError(
                 "optics is an OpticsConfig, expected FrameOptics; each person draws the losses of blobs and "
@@ -117,7 +117,7 @@ class GenerateSettings(Settings):
 
 
 class FrameSource(NamedTuple):
-    """The settings of training frames, and the objects that they name."""
+    """Settings of training frames, and the objects that they name."""
 
     settings: GenerateSettings
     layout: MarkerLayout
@@ -135,22 +135,22 @@ class FrameScene(NamedTuple):
 
 
 class HandFrames(NamedTuple):
-    """The markers of one hand of a scene, as they are and as a rig and its optical system capture them."""
+    """Markers of one hand of a scene: true ones, and as captured by a rig and its optical system."""
 
     markers: Float[np.ndarray, "T M 3"]
     """True centers [m]."""
     cameras: Int[np.ndarray, "T M"]
-    """Cameras with a free view, a bit each."""
+    """Cameras with a free view, as bits."""
     observed: Float[np.ndarray, "T M 3"]
     """Captured positions [m], NaN for lost markers."""
     ghosts: Float[np.ndarray, "T 4 3"]
-    """Ghosts near the hand [m], NaN where there is none."""
+    """Ghosts near the hand [m]; NaN where there is none."""
 
 
 def sample_hands(
     population: Population, *, redrawn: Counter[str] | None = None, rng: np.random.Generator
 ) -> tuple[HandModel, ...]:
-    """A random person's left and right hand, whose fingers do not overlap at rest.
+    """Left and right hand of a random person, whose fingers do not overlap at rest.
 
     Redraws are counted in `redrawn`, by reason.
     """
@@ -184,7 +184,7 @@ def wear_gloves(
     around: float,
     rng: np.random.Generator,
 ) -> tuple[GloveFit, ...]:
-    """The same glove on each hand, with random slips along [bone lengths] and around [rad] the bones."""
+    """Put the same glove on each hand, with random slips along [bone lengths] and around [rad] bones."""
     return tuple(
         GloveFit(model, wear(layout, model, along=along, around=around, rng=rng)) for model in models
     )
@@ -193,7 +193,7 @@ def wear_gloves(
 def slipped_gloves(
     layout: MarkerLayout, model: HandModel, settings: GenerateSettings, *, rng: np.random.Generator
 ) -> tuple[GloveFit, ...]:
-    """The gloves of a hundred people with the slips of a training set, their places put on one hand."""
+    """Gloves of a hundred people, with slips as in a training set, whose places are put on one hand."""
     people = [sample_shape(settings.population, side=model.shape.side, rng=rng) for _ in range(_SHOWN_PEOPLE)]
     along, around = settings.slip_along, np.deg2rad(settings.slip_around)
     worn = (wear_gloves(layout, [HandModel(one)], along=along, around=around, rng=rng) for one in people)
@@ -201,7 +201,7 @@ def slipped_gloves(
 
 
 def move_skin(hand: GlovedHand, *, rng: np.random.Generator) -> Float[np.ndarray, "T M 3"]:
-    """Displacement of a hand's markers in the world [m]: one part depends on the pose, the other is noise."""
+    """Displacement of a hand's markers in the world [m]: a part that depends on the pose, and noise."""
     turns, layout = quaternion_matrix(hand.qpos[:, 3:7]), hand.layout
     moved = NOISE * rng.standard_normal((len(hand.qpos), layout.num_markers, 3))
     for marker, bone in enumerate(hand.fit.attachment.main_bones):
@@ -221,16 +221,16 @@ def simulate_frames(
     redrawn: Counter[str] | None = None,
     rng: np.random.Generator,
 ) -> tuple[GloveFit, ...]:
-    """Fill rows with random poses of one person's gloved hands, as rig and optical system capture them.
+    """Fill rows with random poses of a person's gloved hands, as captured by a rig and its optical system.
 
-    Of a scene with two hands, the first half of the rows is the right hand's. Impossible scenes are counted
-    in `redrawn`, by reason. Returns the hands with their gloves as worn.
+    In a scene of two hands, the first half of the rows is the right hand's. Impossible scenes are counted in
+    `redrawn`, by reason. Returns the hands with their gloves as worn.
     """
     settings, layout, rig, sampler = source
     scene = sample_frame_scene(models, len(block), settings, sampler=sampler, redrawn=redrawn, rng=rng)
     around = np.deg2rad(settings.slip_around)
     fits = wear_gloves(layout, scene.hands, along=settings.slip_along, around=around, rng=rng)
-    optics = OpticsConfig(  # every person has another optical system
+    optics = OpticsConfig(  # Every person has another optical system.
         **dataclasses.asdict(settings.optics),
         blob_loss=rng.uniform(*settings.blob_loss),
         dropout=rng.uniform(*settings.dropout),
@@ -260,9 +260,9 @@ def sample_frame_scene(
     redrawn: Counter[str] | None = None,
     rng: np.random.Generator,
 ) -> FrameScene:
-    """A random scene of a person's left and right hand for `num_rows` rows, which two hands share.
+    """A random scene of a person's left and right hand, with `num_rows` rows shared by the hands.
 
-    A scene that these hands cannot do is replaced by one of a single hand, and counted in `redrawn`.
+    A scene that the hands cannot do is replaced by one of a single hand, and counted in `redrawn`.
     """
     shares = settings.scenes.shares
     kind = int(rng.choice(len(shares), p=shares))
@@ -292,7 +292,7 @@ def sample_single_hand(
 ) -> FrameScene:
     """Poses of one hand in any orientation and anywhere in the volume.
 
-    A sampler of whole poses also places the wrists, unless it leaves all of them at the origin.
+    A sampler of whole poses also places the wrists, unless all of them are at the origin.
     """
     position = settings.center + rng.uniform(-settings.volume, settings.volume, size=(num_frames, 3))
     if sampler is None:
@@ -331,7 +331,7 @@ def observe_scene(
     flesh: bool = False,
     rng: np.random.Generator,
 ) -> tuple[HandFrames, ...]:
-    """The markers of every hand as a rig captures them; hands, as capsules, and the object hide markers.
+    """Markers of every hand as captured by a rig; hands, as capsules, and the object hide markers.
 
     With `flesh`, markers move with the skin.
     """
@@ -362,7 +362,7 @@ def observe_scene(
 
 
 def _near(points: Float[np.ndarray, "T P 3"], centers: Float[np.ndarray, "T M 3"]) -> Bool[np.ndarray, "T P"]:
-    """Which points, of which most are NaN, are within `GHOST_REACH` of a marker center of their frame."""
+    """Which points, most of them NaN, are within `GHOST_REACH` of a marker center of their frame."""
     near: NDArray[np.bool_] = np.isfinite(points[..., 0])
     distance = np.linalg.norm(points[near][:, None] - centers[near.nonzero()[0]], axis=-1)
     near[near] = distance.min(axis=1) < GHOST_REACH
@@ -371,6 +371,6 @@ def _near(points: Float[np.ndarray, "T P 3"], centers: Float[np.ndarray, "T M 3"
 
 @cache
 def _mesh_tree(name: str) -> MeshTree:
-    """The search tree of a named object's mesh."""
+    """Search tree of a named object's mesh."""
     rigid_object = named_object(name)
     return MeshTree(rigid_object.vertices, rigid_object.faces)
