@@ -21,22 +21,33 @@ from handsim.errors import CaptureError
 
 OUTPUTS: Final = "model_outputs"
 UNMARKED: Final = "marked_as_missing"
+LEFT_OUT: Final = "left_out_by_mark"
 PIECES: Final = "columns_of_pieces"
 _ZEROS: Final = "zeros"
+_STAND_INS: Final = "stand_ins"
 _DOUBLED: Final = "doubled"
 _HELD: Final = "held"
 _SENTENCES: Final = {
     OUTPUTS: "{} columns are outputs of models, such as angles and forces, and are left out",
     UNMARKED: "all points are marked as missing (residual -1), and the {} with coordinates are read",
+    LEFT_OUT: "{} points have coordinates and are marked as missing (residual -1), and are left out",
     PIECES: "{} columns hold pieces of unlabeled paths and are read as a few columns",
     _ZEROS: "{} points at exactly (0, 0, 0) are read as missing; if they are points, move the origin",
-    _DOUBLED: "{} points are exactly where another is, as a marker of two subjects is, and are left out",
+    _STAND_INS: "{} points have one number in all three coordinates, such as (-1, -1, -1) for none, and are "
+    "read as missing",
+    _DOUBLED: "{} points are where another is, as a marker of two subjects is, and are left out",
     _HELD: "{} points repeat their position while others move, as in gaps filled with the last one, and are "
     "read as missing",
 }
 """The kinds of findings, the keys of `Capture.findings`, in the order in which they are told."""
-_MODELED: Final = re.compile(r".(?:Angle|Force|Moment|Power|Scalar)s?$")
-"""Names that Vicon's models give their outputs: RThumbAngles, LWristMoment."""
+_MODELED: Final = re.compile(
+    r".(?:Angle|Force|Moment|Power|Scalar)s?$|[_. -](?:angle|force|moment|power|scalar)s?$|"
+    r"[_. -](?:ANGLE|FORCE|MOMENT|POWER|SCALAR)S?$"
+)
+"""Names that models give their outputs: RThumbAngles, LWristMoment, R_WRIST_ANGLE."""
+_SAME_PLACE: Final = 5e-4  # [m]: the smallest markers, which cannot be in each other, are 1.5 mm wide
+_SAME_SHARE: Final = 5e-3  # of the width of all points, where the unit of a file is wrong
+_NEIGHBORS: Final = 8  # points along a line, among which the ones at one place are looked for
 _MIN_FRAMES: Final = 10  # from which repetitions count; fewer may agree by chance
 _NEVER_STILL: Final = 2e-5  # [m] in a frame: a marker that moves by more was not at rest in the frame before
 _COARSE: Final = 5e-6  # [m] of a grid on which markers at rest repeat their positions
@@ -54,7 +65,7 @@ def settled(capture: Capture) -> Capture:
     """The measured points of a capture as it was read, and in its findings what the others are."""
     capture = without_outputs(capture)
     counts = {}
-    capture, counts[_ZEROS] = zeros_as_missing(capture)
+    capture, counts[_ZEROS], counts[_STAND_INS] = _without_stand_ins(capture)
     if capture.num_frames >= _MIN_FRAMES:
         capture, counts[_DOUBLED] = _once(capture)
         held = _held(capture.positions)
@@ -96,20 +107,24 @@ def without_outputs(capture: Capture, listed: Sequence[str] = ()) -> Capture:
     )
 
 
-def zeros_as_missing(capture: Capture) -> tuple[Capture, int]:
-    """A capture whose points at exactly (0, 0, 0) are missing, and how many they were.
+def _without_stand_ins(capture: Capture) -> tuple[Capture, int, int]:
+    """A capture without points that stand for none; how many were at (0, 0, 0), and how many elsewhere.
 
-    Some programs write zeros for what was not seen. A measured point is never exactly there twice; a capture
-    in which nothing moves is left as it is.
+    Some programs write zeros for what was not seen, or -1 or 9999 three times. A measured point never has one
+    number in all coordinates twice; a capture in which nothing moves is left as it is.
     """
     positions = capture.positions
-    zero = (positions == 0.0).all(axis=-1)
-    count = int(zero.sum())
-    there = np.isfinite(positions[..., 0]) & ~zero
+    equal = (positions == positions[..., :1]).all(axis=-1)
+    values, counts = np.unique(positions[equal, 0], return_counts=True)
+    repeats = (counts > 1) & ((values == 0.0) | (capture.num_frames >= _MIN_FRAMES))
+    stands = equal & np.isin(positions[..., 0], values[repeats])
+    there = np.isfinite(positions[..., 0]) & ~stands
     tracks = (positions[there[:, column], column] for column in range(positions.shape[1]))
-    if count < 2 or not any((track != track[:1]).any() for track in tracks):  # nothing moves
-        return capture, 0
-    return dataclasses.replace(capture, positions=np.where(zero[..., None], np.nan, positions)), count
+    if not stands.any() or not any((track != track[:1]).any() for track in tracks):  # nothing moves
+        return capture, 0, 0
+    zeros = int((stands & (positions[..., 0] == 0.0)).sum())
+    missing = np.where(stands[..., None], np.nan, positions)
+    return dataclasses.replace(capture, positions=missing), zeros, int(stands.sum()) - zeros
 
 
 def _once(capture: Capture) -> tuple[Capture, int]:
@@ -118,21 +133,27 @@ def _once(capture: Capture) -> tuple[Capture, int]:
     Two columns that always agree where both have a point become one, with the points of both.
     """
     positions = capture.positions
-    key = positions @ np.array([1.0, np.sqrt(2.0), np.sqrt(3.0)])  # equal for equal points
-    key[(positions == 0.0).all(axis=-1)] = np.nan  # of a capture in which nothing moves
+    there = np.isfinite(positions[..., 0]) & (positions != 0.0).any(axis=-1)  # zeros: nothing moves
+    key = np.where(there, positions @ np.array([0.48, 0.6, 0.64]), np.nan)  # no farther apart than the points
     order = np.argsort(key, axis=1, kind="stable")
     ranked = np.take_along_axis(key, order, axis=1)
-    frames, ranks = np.nonzero(ranked[:, 1:] == ranked[:, :-1])
-    first, second = order[frames, ranks], order[frames, ranks + 1]
-    equal = (positions[frames, first] == positions[frames, second]).all(axis=-1)
-    frames, first, second = frames[equal], first[equal], second[equal]
+    if not there.any():
+        return capture, 0
+    near = min(_SAME_PLACE, _SAME_SHARE * float(np.ptp(positions[there], axis=0).max(initial=0.0)))
+    found = []
+    for lag in range(1, min(_NEIGHBORS, len(capture.names) - 1) + 1):
+        frames, ranks = np.nonzero(ranked[:, lag:] - ranked[:, :-lag] <= near)
+        pair = np.sort(np.stack([order[frames, ranks], order[frames, ranks + lag]]), axis=0)
+        apart = np.linalg.norm(positions[frames, pair[0]] - positions[frames, pair[1]], axis=-1)
+        found.append(np.stack([frames, *pair])[:, apart <= near])
+    frames, first, second = np.concatenate(found, axis=1) if found else np.empty((3, 0), dtype=np.int64)
     if not len(frames):
         return capture, 0
     positions = positions.copy()
     positions[frames, second] = np.nan
+    doubled = int((there & np.isnan(positions[..., 0])).sum())
     kept = np.arange(len(capture.names))  # the column that each column's points belong to
     pairs, counts = np.unique(np.stack([first, second], axis=1), axis=0, return_counts=True)
-    there = np.isfinite(key)
     for (one, other), count in zip(pairs.tolist(), counts.tolist(), strict=True):
         if count >= _MIN_FRAMES and count == int((there[:, one] & there[:, other]).sum()):
             kept[kept == kept[other]] = kept[one]
@@ -141,7 +162,7 @@ def _once(capture: Capture) -> tuple[Capture, int]:
         positions[moved, kept[column]] = positions[moved, column]
     left = np.unique(kept)
     names = tuple(capture.names[column] for column in left.tolist())
-    return dataclasses.replace(capture, names=names, positions=positions[:, left]), len(frames)
+    return dataclasses.replace(capture, names=names, positions=positions[:, left]), doubled
 
 
 def _held(positions: Float[np.ndarray, "T N 3"]) -> Bool[np.ndarray, "T N"]:
