@@ -358,9 +358,9 @@ def read_c3d(data: bytes, tell: Tell = warn) -> Capture:
     missing = points[..., 3] < 0.0
     positions = points[..., :3] * meters_per(units or "mm")
     located = np.isfinite(positions).all(axis=-1) & (positions != 0.0).any(axis=-1)
-    left_out, read = int((located & missing).sum()), int((located & ~missing).sum())
-    findings = {LEFT_OUT: left_out if left_out > read else 0}
-    if left_out and not read:
+    left_out = int((located & missing).sum())
+    findings = {LEFT_OUT: left_out}
+    if left_out and not (located & ~missing).any():
         missing, findings = ~located, {UNMARKED: left_out}
     positions[missing] = np.nan
     timed = timed_positions(positions, StatedTimes(repr(rate), "POINT:RATE"), tell)

@@ -45,7 +45,7 @@ _MODELED: Final = re.compile(
     r"[_. -](?:ANGLE|FORCE|MOMENT|POWER|SCALAR)S?$"
 )
 """Names that models give their outputs: RThumbAngles, LWristMoment, R_WRIST_ANGLE."""
-_SAME_PLACE: Final = 5e-4  # [m]: the smallest markers, which cannot be in each other, are 1.5 mm wide
+_SAME_PLACE: Final = 1e-3  # [m]: the smallest markers, which cannot be in each other, are 1.5 mm wide
 _SAME_SHARE: Final = 5e-3  # of the width of all points, where the unit of a file is wrong
 _NEIGHBORS: Final = 8  # points along a line, among which the ones at one place are looked for
 _MIN_FRAMES: Final = 10  # from which repetitions count; fewer may agree by chance

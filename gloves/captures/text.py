@@ -37,7 +37,20 @@ MOST_CELLS: Final = 400_000
 """Largest number of cells in a row: twice as many as the largest C3D would need."""
 TAB: Final = b"\t"
 _BLANK: Final = math.nan
-_BLANKS: Final = ("", "null", "none", "na", "n/a", "#n/a", "<na>", "-", "--", "1.#qnan", "-1.#ind", "nan(ind)")
+_BLANKS: Final = (
+    "",
+    "null",
+    "none",
+    "na",
+    "n/a",
+    "#n/a",
+    "<na>",
+    "-",
+    "--",
+    "1.#qnan",
+    "-1.#ind",
+    "nan(ind)",
+)
 """What programs write for no number, in small letters; Qualisys writes NULL."""
 _SEPARATOR: Final = re.compile(rb'^"?sep=.?"?\n', re.I)  # Excel's first line
 _TIME_CODE: Final = re.compile(rb"\d+:[\d:.;]+")
@@ -112,7 +125,8 @@ def plain_lines(lines: list[bytes], separator: bytes, *, first: int = 1, wider: 
     """The same list of lines, now with tabs between their cells and without quotes.
 
     In a file with tabs, quotes are quotes only if its first cell is quoted, and nowhere in a line with an odd
-    number of them, such as a note of inches. `first` is the number of the first line in the file. With `wider`, rows may have more cells than the line above them.
+    number of them, such as a note of inches. `first` is the number of the first line in the file. With
+    `wider`, rows may have more cells than the line above them.
     """
     if separator == TAB and not lines[0].startswith(b'"'):
         return lines
