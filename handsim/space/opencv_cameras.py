@@ -375,14 +375,23 @@ def _yaml_tables(text: str) -> tuple[Values, Sections]:
     values: Values = {}
     sections: Sections = {}
     for name, body in _yaml_bodies(text):
-        below = textwrap.dedent(body.strip("\n"))
+        below = {name: body}
         if _SECTION.search(body):
-            sections[name] = _yaml_tables(below)[0]
-        elif not (inner := dict(_yaml_bodies(below))) or "data" in inner:
-            values[name] = _yaml_value(inner.get("data", body))
+            below, values_of = _yaml_below(body), sections.setdefault(name, {})
         else:
-            values |= {f"{name}_{key}": _yaml_value(value) for key, value in inner.items()}
+            values_of = values
+        for key, value in below.items():
+            inner = _yaml_below(value)
+            if not inner or "data" in inner:
+                values_of[key] = _yaml_value(inner.get("data", value))
+            else:
+                values_of |= {f"{key}_{word}": _yaml_value(one) for word, one in inner.items()}
     return values, sections
+
+
+def _yaml_below(body: str) -> dict[str, str]:
+    """The entries that are indented below a key."""
+    return dict(_yaml_bodies(textwrap.dedent(body.strip("\n"))))
 
 
 def _yaml_bodies(text: str) -> Iterator[tuple[str, str]]:
