@@ -37,20 +37,7 @@ MOST_CELLS: Final = 400_000
 """Largest number of cells in a row: twice as many as the largest C3D would need."""
 TAB: Final = b"\t"
 _BLANK: Final = math.nan
-_BLANKS: Final = (
-    "",
-    "null",
-    "none",
-    "na",
-    "n/a",
-    "#n/a",
-    "<na>",
-    "-",
-    "--",
-    "1.#qnan",
-    "-1.#ind",
-    "nan(ind)",
-)
+_BLANKS: Final = ("", *"null none na n/a #n/a <na> - -- 1.#qnan -1.#ind nan(ind)".split())
 """What programs write for no number, in small letters; Qualisys writes NULL."""
 _SEPARATOR: Final = re.compile(rb'^"?sep=.?"?\n', re.I)  # Excel's first line
 _TIME_CODE: Final = re.compile(rb"\d+:[\d:.;]+")

@@ -120,12 +120,8 @@ def _many(values: Values, sections: Sections) -> list[Camera]:
     if len(sections) > _MAX_CAMERAS:
         raise RigError(f"{len(sections)} cameras, expected at most {_MAX_CAMERAS}")
     cameras = []
-    sizes = set(map(_plain, (*_WIDTH, *_HEIGHT, *_SIZE)))
-    common = {
-        key: value
-        for key, value in values.items()
-        if (plain := _plain(key)) in sizes or _FISHEYE.fullmatch(plain) or _MODEL.fullmatch(plain)
-    }
+    alone = {key for names in (_K, _D, _R, _T) if (key := _find(values, names)) is not None}
+    common = {key: value for key, value in values.items() if key not in alone}
     for name, (given, own) in zip(camera_names(list(sections)), sections.items(), strict=True):
         with errors_of(f"camera '{shortened(given)}'", RigError):
             if "T_world_camera" not in own and (_find(own, _R) is None or _find(own, _T) is None):
