@@ -498,7 +498,8 @@ def import_cameras(path: str | Path, up: Up | None = None) -> tuple[Camera, ...]
     axis = up or ("y" if all(one.y_up for one in seeing) else "z")
     turn = _Y_TO_Z if axis == "y" else np.eye(4)
     cameras = tuple(one.camera.at(turn @ one.camera.T_world_camera) for one in seeing)
-    guessed = not (seeing[0].y_up and axis == "y")  # a lab may turn its cameras on their sides
+    # a lab may turn its cameras on their sides, and a camera alone is often without a pose
+    guessed = len(seeing) > 1 and not (seeing[0].y_up and axis == "y")
     if guessed and -np.mean([one.T_world_camera[2, 1] for one in cameras]) < _MIN_UPRIGHT:
         _warn(
             f"{path}: with {axis} up, the tops of its cameras' pictures do not point up on average; is "
