@@ -27,6 +27,7 @@ _ZEROS: Final = "zeros"
 _STAND_INS: Final = "stand_ins"
 _DOUBLED: Final = "doubled"
 _HELD: Final = "held"
+_STRAIGHT: Final = "interpolated"
 _SENTENCES: Final = {
     OUTPUTS: "{} columns are outputs of models, such as angles and forces, and are left out",
     UNMARKED: "all points are marked as missing (residual -1), and the {} with coordinates are read",
@@ -38,6 +39,7 @@ _SENTENCES: Final = {
     _DOUBLED: "{} points are where another is, as a marker of two subjects is, and are left out",
     _HELD: "{} points repeat their position while others move, as in gaps filled with the last one, and are "
     "read as missing",
+    _STRAIGHT: "{} points move by equal steps, as in gaps that were interpolated, and are read as missing",
 }
 """The kinds of findings, the keys of `Capture.findings`, in the order in which they are told."""
 _MODELED: Final = re.compile(
@@ -50,6 +52,8 @@ _SAME_SHARE: Final = 5e-3  # of the width of all points, where the unit of a fil
 _NEIGHBORS: Final = 8  # points along a line, among which the ones at one place are looked for
 _MIN_FRAMES: Final = 10  # from which repetitions count; fewer may agree by chance
 _NEVER_STILL: Final = 2e-5  # [m] in a frame: a marker that moves by more was not at rest in the frame before
+_NO_BEND: Final = 3e-7  # [m]: difference of equal steps, rounded
+_FINE: Final = 1e-7  # [m] of a grid on which measured steps are never equal
 _COARSE: Final = 5e-6  # [m] of a grid on which markers at rest repeat their positions
 _GRID_STEPS: Final = 20.0  # of a grid, by which a marker at rest does not move in a frame
 _GRID_COUNT: Final = 10  # smallest steps of equal size that show a grid
@@ -68,13 +72,14 @@ def settled(capture: Capture) -> Capture:
     capture, counts[_ZEROS], counts[_STAND_INS] = _without_stand_ins(capture)
     if capture.num_frames >= _MIN_FRAMES:
         capture, counts[_DOUBLED] = _once(capture)
-        held = _held(capture.positions)
-        counts[_HELD] = int(held.sum())
-        if held.any():
-            positions = np.where(held[..., None], np.nan, capture.positions)
-            capture = dataclasses.replace(capture, positions=positions)
-    found = Counter(capture.findings) + Counter(counts)  # which leaves zeros out
-    return dataclasses.replace(capture, findings=dict(found))
+        for kind, found in ((_HELD, _held), (_STRAIGHT, _interpolated)):
+            filled = found(capture.positions)
+            counts[kind] = int(filled.sum())
+            if filled.any():
+                positions = np.where(filled[..., None], np.nan, capture.positions)
+                capture = dataclasses.replace(capture, positions=positions)
+    told = Counter(capture.findings) + Counter(counts)  # which leaves zeros out
+    return dataclasses.replace(capture, findings=dict(told))
 
 
 def without_outputs(capture: Capture, listed: Sequence[str] = ()) -> Capture:
@@ -208,6 +213,26 @@ def _held(positions: Float[np.ndarray, "T N 3"]) -> Bool[np.ndarray, "T N"]:
         marks[last[chosen] + 1, columns[chosen]] -= 1
         missing = np.cumsum(marks, axis=0)[:-1] > 0
         alive |= missing[1:].any(axis=1)  # where nothing moves, all are held beside one that is
+    return missing
+
+
+def _interpolated(positions: Float[np.ndarray, "T N 3"]) -> Bool[np.ndarray, "T N"]:
+    """Points of gaps of three frames or more that were filled along a line, by equal steps.
+
+    Measured steps are never equal, but rounded ones are, and those of simulated motion without noise.
+    """
+    missing = np.zeros(positions.shape[:2], dtype=np.bool_)
+    moves = np.diff(positions, axis=0)
+    if _grid(moves) > _FINE:
+        return missing
+    # differences of the second to the fourth order, NaN beside a gap; only those of noise grow with the order
+    bend, third, fourth = (np.linalg.norm(np.diff(moves, order, axis=0), axis=-1) for order in (1, 2, 3))
+    measured = bend[2:] > _NO_BEND
+    noisy = (measured & (fourth > third[1:])).sum(axis=0) > (measured & (fourth <= third[1:])).sum(axis=0)
+    straight = noisy & (bend < _NO_BEND) & (np.linalg.norm(moves[1:], axis=-1) > _NEVER_STILL)
+    three = straight[2:] & straight[1:-1] & straight[:-2]
+    for begin in range(3):
+        missing[1 + begin : len(three) + 1 + begin] |= three
     return missing
 
 

@@ -77,6 +77,30 @@ def test_gaps_that_hold_the_last_position_are_missing(moving, rng, tmp_path, suf
     np.testing.assert_array_equal(np.isnan(read.positions[..., 0]), hidden)
 
 
+@pytest.mark.parametrize("suffix", WRITABLE)
+def test_gaps_that_were_interpolated_are_missing(moving, rng, tmp_path, suffix):
+    hidden = gaps(rng)
+    positions, frames = moving.positions.copy(), np.arange(FRAMES)
+    for column in range(MARKERS):
+        seen = np.flatnonzero(~hidden[:, column])
+        for axis in range(3):
+            positions[:, column, axis] = np.interp(frames, seen, positions[seen, column, axis])
+    write_capture(tmp_path / f"take{suffix}", with_positions(moving, positions))
+    with pytest.warns(HandSimWarning, match=r"points move by equal steps"):
+        read = read_capture(tmp_path / f"take{suffix}")
+    missing = np.isnan(read.positions[..., 0])
+    assert not (missing & ~hidden).any() and missing.sum() > 0.8 * hidden.sum()  # of one or two frames: left
+
+
+def test_what_is_simulated_without_noise_stays(moving):
+    """It moves along a line, as a whole or beside a finger."""
+    seconds = np.arange(FRAMES)[:, None, None] / 120.0
+    positions = moving.positions[:1] + seconds * np.array([0.2, 0.1, 0.0])
+    untouched(with_positions(moving, positions))
+    positions[60:, :4] += 0.02 * (1.0 - np.cos(3.0 * seconds[:60]))
+    untouched(with_positions(moving, positions))
+
+
 def test_a_marker_that_was_not_there_at_first_is_missing(moving):
     hidden = np.zeros((FRAMES, MARKERS), dtype=bool)
     hidden[:30, 2] = True
