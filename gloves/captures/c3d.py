@@ -25,7 +25,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from gloves.captures.capture import Capture
-from gloves.captures.coordinates import UNMARKED, without_outputs
+from gloves.captures.coordinates import LEFT_OUT, UNMARKED, without_outputs
 from gloves.captures.text import StatedTimes, Tell, check_same_rate, meters_per, timed_positions, warn
 from handsim.errors import CaptureError, shortened
 from handsim.files.outputs import plain_path, unwritten
@@ -339,7 +339,7 @@ def _num_frames(
 
 
 _MOST_LABEL_BYTES: Final = 255
-_OUTPUTS: Final = ("ANGLES", "MOMENTS", "FORCES", "POWERS", "SCALARS", "REACTIONS")
+_OUTPUTS: Final = ("ANGLES", "MOMENTS", "FORCES", "POWERS", "SCALARS", "REACTIONS", "MODELED_MARKERS")
 """Parameters of the group POINT that name columns which are no markers."""
 
 
@@ -358,12 +358,13 @@ def read_c3d(data: bytes, tell: Tell = warn) -> Capture:
     missing = points[..., 3] < 0.0
     positions = points[..., :3] * meters_per(units or "mm")
     located = np.isfinite(positions).all(axis=-1) & (positions != 0.0).any(axis=-1)
-    unmarked = 0
-    if located.any() and not (located & ~missing).any():
-        missing, unmarked = ~located, int(located.sum())
+    left_out = int((located & missing).sum())
+    findings = {LEFT_OUT: left_out}
+    if left_out and not (located & ~missing).any():
+        missing, findings = ~located, {UNMARKED: left_out}
     positions[missing] = np.nan
     timed = timed_positions(positions, StatedTimes(repr(rate), "POINT:RATE"), tell)
-    capture = Capture(_labels(parameters, points.shape[1]), *timed, findings={UNMARKED: unmarked})
+    capture = Capture(_labels(parameters, points.shape[1]), *timed, findings=findings)
     return without_outputs(capture, [name for group in _OUTPUTS for name in _list(parameters, group)])
 
 

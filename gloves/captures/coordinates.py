@@ -21,27 +21,42 @@ from handsim.errors import CaptureError
 
 OUTPUTS: Final = "model_outputs"
 UNMARKED: Final = "marked_as_missing"
+LEFT_OUT: Final = "left_out_by_mark"
 PIECES: Final = "columns_of_pieces"
 _ZEROS: Final = "zeros"
+_STAND_INS: Final = "stand_ins"
 _DOUBLED: Final = "doubled"
 _HELD: Final = "held"
+_STRAIGHT: Final = "interpolated"
 _SENTENCES: Final = {
     OUTPUTS: "{} columns are outputs of models, such as angles and forces, and are left out",
     UNMARKED: "all points are marked as missing (residual -1), and the {} with coordinates are read",
+    LEFT_OUT: "{} points have coordinates and are marked as missing (residual -1), and are left out",
     PIECES: "{} columns hold pieces of unlabeled paths and are read as a few columns",
     _ZEROS: "{} points at exactly (0, 0, 0) are read as missing; if they are points, move the origin",
-    _DOUBLED: "{} points are exactly where another is, as a marker of two subjects is, and are left out",
+    _STAND_INS: "{} points have one number in all three coordinates, such as (-1, -1, -1) for none, and are "
+    "read as missing",
+    _DOUBLED: "{} points are where another is, as a marker of two subjects is, and are left out",
     _HELD: "{} points repeat their position while others move, as in gaps filled with the last one, and are "
     "read as missing",
+    _STRAIGHT: "{} points move by equal steps, as in gaps that were interpolated, and are read as missing",
 }
 """The kinds of findings, the keys of `Capture.findings`, in the order in which they are told."""
-_MODELED: Final = re.compile(r".(?:Angle|Force|Moment|Power|Scalar)s?$")
-"""Names that Vicon's models give their outputs: RThumbAngles, LWristMoment."""
-_MIN_FRAMES: Final = 10  # Repetitions count in this many frames; in fewer they may be chance.
-_NEVER_STILL: Final = 2e-5  # A marker that moves more than this in a frame [m] was not at rest before it.
-_COARSE: Final = 5e-6  # On a grid coarser than this [m], markers at rest repeat their positions.
-_GRID_STEPS: Final = 20.0  # A marker at rest moves by fewer grid steps than this in a frame.
-_GRID_COUNT: Final = 10  # This many smallest steps of equal size show a grid.
+_MODELED: Final = re.compile(
+    r".(?:Angle|Force|Moment|Power|Scalar)s?$|[_. -](?:angle|force|moment|power|scalar)s?$|"
+    r"[_. -](?:ANGLE|FORCE|MOMENT|POWER|SCALAR)S?$"
+)
+"""Names that models give their outputs: RThumbAngles, LWristMoment, R_WRIST_ANGLE."""
+_SAME_PLACE: Final = 1e-3  # [m]: the smallest markers, which cannot be in each other, are 1.5 mm wide
+_SAME_SHARE: Final = 5e-3  # of the width of all points, where the unit of a file is wrong
+_NEIGHBORS: Final = 8  # points along a line, among which the ones at one place are looked for
+_MIN_FRAMES: Final = 10  # from which repetitions count; fewer may agree by chance
+_NEVER_STILL: Final = 2e-5  # [m] in a frame: a marker that moves by more was not at rest in the frame before
+_NO_BEND: Final = 3e-7  # [m]: difference of equal steps, rounded
+_FINE: Final = 1e-7  # [m] of a grid on which measured steps are never equal
+_COARSE: Final = 5e-6  # [m] of a grid on which markers at rest repeat their positions
+_GRID_STEPS: Final = 20.0  # of a grid, by which a marker at rest does not move in a frame
+_GRID_COUNT: Final = 10  # smallest steps of equal size that show a grid
 _AT_REST: Final = 0.4  # A marker starts abruptly if its first step is more than this share of the second one.
 
 
@@ -54,16 +69,17 @@ def settled(capture: Capture) -> Capture:
     """The measured points of a capture; its findings count the others, by kind."""
     capture = without_outputs(capture)
     counts = {}
-    capture, counts[_ZEROS] = zeros_as_missing(capture)
+    capture, counts[_ZEROS], counts[_STAND_INS] = _without_stand_ins(capture)
     if capture.num_frames >= _MIN_FRAMES:
-        capture, counts[_DOUBLED] = _without_doubles(capture)
-        held = _held(capture.positions)
-        counts[_HELD] = int(held.sum())
-        if held.any():
-            positions = np.where(held[..., None], np.nan, capture.positions)
-            capture = dataclasses.replace(capture, positions=positions)
-    found = Counter(capture.findings) + Counter(counts)  # the sum drops counts of zero
-    return dataclasses.replace(capture, findings=dict(found))
+        capture, counts[_DOUBLED] = _once(capture)
+        for kind, found in ((_HELD, _held), (_STRAIGHT, _interpolated)):
+            filled = found(capture.positions)
+            counts[kind] = int(filled.sum())
+            if filled.any():
+                positions = np.where(filled[..., None], np.nan, capture.positions)
+                capture = dataclasses.replace(capture, positions=positions)
+    told = Counter(capture.findings) + Counter(counts)  # which leaves zeros out
+    return dataclasses.replace(capture, findings=dict(told))
 
 
 def without_outputs(capture: Capture, listed: Sequence[str] = ()) -> Capture:
@@ -96,20 +112,24 @@ def without_outputs(capture: Capture, listed: Sequence[str] = ()) -> Capture:
     )
 
 
-def zeros_as_missing(capture: Capture) -> tuple[Capture, int]:
-    """The capture with points at exactly (0, 0, 0) as missing, and their number.
+def _without_stand_ins(capture: Capture) -> tuple[Capture, int, int]:
+    """A capture without points that stand for none; how many were at (0, 0, 0), and how many elsewhere.
 
-    Some programs write zeros for what was not seen. A measured point is never exactly there twice; a capture
-    in which nothing moves is left as it is.
+    Some programs write zeros for what was not seen, or -1 or 9999 three times. A measured point never has one
+    number in all coordinates twice; a capture in which nothing moves is left as it is.
     """
     positions = capture.positions
-    zero = (positions == 0.0).all(axis=-1)
-    count = int(zero.sum())
-    there = np.isfinite(positions[..., 0]) & ~zero
+    equal = (positions == positions[..., :1]).all(axis=-1)
+    values, counts = np.unique(positions[equal, 0], return_counts=True)
+    repeats = (counts > 1) & ((values == 0.0) | (capture.num_frames >= _MIN_FRAMES))
+    stands = equal & np.isin(positions[..., 0], values[repeats])
+    there = np.isfinite(positions[..., 0]) & ~stands
     tracks = (positions[there[:, column], column] for column in range(positions.shape[1]))
-    if count < 2 or not any((track != track[:1]).any() for track in tracks):  # nothing moves
-        return capture, 0
-    return dataclasses.replace(capture, positions=np.where(zero[..., None], np.nan, positions)), count
+    if not stands.any() or not any((track != track[:1]).any() for track in tracks):  # nothing moves
+        return capture, 0, 0
+    zeros = int((stands & (positions[..., 0] == 0.0)).sum())
+    missing = np.where(stands[..., None], np.nan, positions)
+    return dataclasses.replace(capture, positions=missing), zeros, int(stands.sum()) - zeros
 
 
 def _without_doubles(capture: Capture) -> tuple[Capture, int]:
@@ -118,21 +138,27 @@ def _without_doubles(capture: Capture) -> tuple[Capture, int]:
     Two columns that always agree where both have a point become one, with the points of both.
     """
     positions = capture.positions
-    key = positions @ np.array([1.0, np.sqrt(2.0), np.sqrt(3.0)])  # equal for equal points
-    key[(positions == 0.0).all(axis=-1)] = np.nan  # zeros that `zeros_as_missing` left are no doubles
+    there = np.isfinite(positions[..., 0]) & (positions != 0.0).any(axis=-1)  # zeros: nothing moves
+    key = np.where(there, positions @ np.array([0.48, 0.6, 0.64]), np.nan)  # no farther apart than the points
     order = np.argsort(key, axis=1, kind="stable")
     ranked = np.take_along_axis(key, order, axis=1)
-    frames, ranks = np.nonzero(ranked[:, 1:] == ranked[:, :-1])
-    first, second = order[frames, ranks], order[frames, ranks + 1]
-    equal = (positions[frames, first] == positions[frames, second]).all(axis=-1)
-    frames, first, second = frames[equal], first[equal], second[equal]
+    if not there.any():
+        return capture, 0
+    near = min(_SAME_PLACE, _SAME_SHARE * float(np.ptp(positions[there], axis=0).max(initial=0.0)))
+    found = []
+    for lag in range(1, min(_NEIGHBORS, len(capture.names) - 1) + 1):
+        frames, ranks = np.nonzero(ranked[:, lag:] - ranked[:, :-lag] <= near)
+        pair = np.sort(np.stack([order[frames, ranks], order[frames, ranks + lag]]), axis=0)
+        apart = np.linalg.norm(positions[frames, pair[0]] - positions[frames, pair[1]], axis=-1)
+        found.append(np.stack([frames, *pair])[:, apart <= near])
+    frames, first, second = np.concatenate(found, axis=1) if found else np.empty((3, 0), dtype=np.int64)
     if not len(frames):
         return capture, 0
     positions = positions.copy()
     positions[frames, second] = np.nan
-    kept = np.arange(len(capture.names))  # the column that each column is merged into
+    doubled = int((there & np.isnan(positions[..., 0])).sum())
+    kept = np.arange(len(capture.names))  # the column that each column's points belong to
     pairs, counts = np.unique(np.stack([first, second], axis=1), axis=0, return_counts=True)
-    there = np.isfinite(key)
     for (one, other), count in zip(pairs.tolist(), counts.tolist(), strict=True):
         if count >= _MIN_FRAMES and count == int((there[:, one] & there[:, other]).sum()):
             kept[kept == kept[other]] = kept[one]
@@ -141,7 +167,7 @@ def _without_doubles(capture: Capture) -> tuple[Capture, int]:
         positions[moved, kept[column]] = positions[moved, column]
     left = np.unique(kept)
     names = tuple(capture.names[column] for column in left.tolist())
-    return dataclasses.replace(capture, names=names, positions=positions[:, left]), len(frames)
+    return dataclasses.replace(capture, names=names, positions=positions[:, left]), doubled
 
 
 def _held(positions: Float[np.ndarray, "T N 3"]) -> Bool[np.ndarray, "T N"]:
@@ -187,6 +213,26 @@ def _held(positions: Float[np.ndarray, "T N 3"]) -> Bool[np.ndarray, "T N"]:
         marks[last[chosen] + 1, columns[chosen]] -= 1
         missing = np.cumsum(marks, axis=0)[:-1] > 0
         alive |= missing[1:].any(axis=1)  # if one point is held where nothing moves, all others are, too
+    return missing
+
+
+def _interpolated(positions: Float[np.ndarray, "T N 3"]) -> Bool[np.ndarray, "T N"]:
+    """Points of gaps of three frames or more that were filled along a line, by equal steps.
+
+    Measured steps are never equal, but rounded ones are, and those of simulated motion without noise.
+    """
+    missing = np.zeros(positions.shape[:2], dtype=np.bool_)
+    moves = np.diff(positions, axis=0)
+    if _grid(moves) > _FINE:
+        return missing
+    # differences of the second to the fourth order, NaN beside a gap; only those of noise grow with the order
+    bend, third, fourth = (np.linalg.norm(np.diff(moves, order, axis=0), axis=-1) for order in (1, 2, 3))
+    measured = bend[2:] > _NO_BEND
+    noisy = (measured & (fourth > third[1:])).sum(axis=0) > (measured & (fourth <= third[1:])).sum(axis=0)
+    straight = noisy & (bend < _NO_BEND) & (np.linalg.norm(moves[1:], axis=-1) > _NEVER_STILL)
+    three = straight[2:] & straight[1:-1] & straight[:-2]
+    for begin in range(3):
+        missing[1 + begin : len(three) + 1 + begin] |= three
     return missing
 
 

@@ -75,7 +75,7 @@ _KEYS: Final = "DataRate CameraRate NumFrames NumMarkers Units OrigDataRate Orig
 def read_trc(data: bytes, tell: Tell = warn) -> Capture:
     """Read the bytes of a TRC file."""
     lines, ended = split_lines(data)
-    if not lines[0].lstrip(b' \t"').startswith(_BEGIN):
+    if not lines[0].lstrip(b' \t"').lower().startswith(_BEGIN.lower()):
         raise CaptureError("not a TRC file: line 1 does not begin with 'PathFileType'")
     lines = plain_lines(lines, separator_behind([_BEGIN], lines[0]) or TAB, wider=True)
     lines = _tabs_for_spaces(lines)
@@ -122,9 +122,7 @@ def _tabs_for_spaces(lines: list[bytes]) -> list[bytes]:
     for index in spaced:
         lines[index] = TAB.join(lines[index].split())
     rows = [index for index in spaced if index >= _HEADER_LINES]
-    if not rows:
-        return lines
-    if not any(b"nan" in lines[index].lower() for index in rows):
+    if rows and not any(b"nan" in lines[index].lower() for index in rows):
         widths = [lines[index].count(TAB) + 1 for index in rows]
         other = next((row for row, width in enumerate(widths) if width != widths[0]), None)
         if other is not None:

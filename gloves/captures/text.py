@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from gloves.captures.pieces import Trajectories, packed_trajectories
 from handsim.errors import CaptureError, HandSimWarning, shortened
+from handsim.files.inputs import text_encoding
 
 METERS: Final = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 _WORDS: Final = {
@@ -36,7 +37,9 @@ MOST_CELLS: Final = 400_000
 """Largest number of cells in a row: twice as many as the largest C3D would need."""
 TAB: Final = b"\t"
 _BLANK: Final = math.nan
-_BLANKS: Final = ("", "NULL")  # Qualisys writes NULL for a missing marker
+_BLANKS: Final = ("", *"null none na n/a #n/a <na> - -- 1.#qnan -1.#ind nan(ind)".split())
+"""What programs write for no number, in small letters; Qualisys writes NULL."""
+_SEPARATOR: Final = re.compile(rb'^"?sep=.?"?\n', re.I)  # Excel's first line
 _TIME_CODE: Final = re.compile(rb"\d+:[\d:.;]+")
 _DECIMALS: Final = re.compile(rb",0\d")  # This comma is decimal: no whole number begins with a zero.
 _NUMBERS: Final = re.compile(rb"\d[-+\d.,eE \t]*")
@@ -57,7 +60,7 @@ def warn(text: str) -> None:
 
 def meters_per(unit: str) -> float:
     """Meters per unit of length; the unit may be upper-case, cut off ("Mete") or in the singular."""
-    word = unit.strip(" .\t\0").lower()
+    word = unit.strip(" .\t\0()[]").lower()
     scale = METERS.get(word)
     if scale is None and len(word) >= _MIN_WORD:
         scale = next((scale for name, scale in _WORDS.items() if name.startswith(word)), None)
@@ -85,14 +88,15 @@ def check_width(num_cells: int, number: int) -> None:
 def cell_number(text: str) -> float:
     """The number in a cell, which may have a decimal comma; NaN for a blank cell."""
     text = text.strip()
-    return _BLANK if text in _BLANKS else float(text.replace(",", "."))
+    return _BLANK if text.lower() in _BLANKS else float(text.replace(",", "."))
 
 
 def split_lines(data: bytes) -> tuple[list[bytes], bool]:
     """Lines of a file in UTF-8, and whether the last one has a line end."""
-    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-        data = data.decode("utf-16", "replace").encode()
+    if (encoding := text_encoding(data)) != "utf-8-sig":
+        data = data.decode(encoding, "replace").encode()
     data = data.removeprefix(codecs.BOM_UTF8).replace(b"\r\n", b"\n").replace(b"\r", b"\n")
+    data = _SEPARATOR.sub(b"", data)
     lines = data.split(b"\n")
     ended = not lines[-1].strip(b" ")
     return (lines[:-1] if ended and len(lines) > 1 else lines), ended
@@ -100,15 +104,16 @@ def split_lines(data: bytes) -> tuple[list[bytes], bool]:
 
 def separator_behind(words: Sequence[bytes], line: bytes) -> bytes | None:
     """The tab, comma or semicolon after one of the words, quoted or not, at the beginning of a line."""
-    begin = re.match(rb'\s*("?)(?:' + b"|".join(words) + rb")\1 *([\t,;])", line)
+    begin = re.match(rb'\s*("?)(?:' + b"|".join(words) + rb")\1 *([\t,;])", line, re.I)
     return None if begin is None else begin[2]
 
 
 def plain_lines(lines: list[bytes], separator: bytes, *, first: int = 1, wider: bool = False) -> list[bytes]:
     """Put tabs between the cells of a list of lines, remove quotes, and return the list.
 
-    In a file with tabs, quotes are quotes only if its first cell is quoted. `first` is the number of the
-    first line in the file. With `wider`, rows may have more cells than the line above them.
+    In a file with tabs, quotes are quotes only if its first cell is quoted, and nowhere in a line with an odd
+    number of them, such as a note of inches. `first` is the number of the first line in the file. With
+    `wider`, rows may have more cells than the line above them.
     """
     if separator == TAB and not lines[0].startswith(b'"'):
         return lines
@@ -116,7 +121,7 @@ def plain_lines(lines: list[bytes], separator: bytes, *, first: int = 1, wider: 
         _check_decimals(lines, first, wider)
     for index, line in enumerate(lines):  # in place: large files would be held twice
         number = first + index
-        if b'"' not in line:
+        if line.count(b'"') % 2 or b'"' not in line:
             lines[index] = line.replace(TAB, b" ").replace(separator, TAB)
             continue
         check_width(line.count(separator) + 1, number)
@@ -320,7 +325,7 @@ def _cell_value(cell: bytes, number: int, titles: Sequence[str], column: int) ->
     """The number of a cell that may hold blanks."""
     text = cell.decode("utf-8", "replace").strip()
     try:
-        return _BLANK if text in _BLANKS else float(text)
+        return _BLANK if text.lower() in _BLANKS else float(text)
     except ValueError:
         mixed = "," in text and "." not in text and text.count(",") == 1
         raise CaptureError(

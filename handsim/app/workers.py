@@ -36,7 +36,7 @@ _THREADS: Final = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 _MAX_PENDING: Final = 1000  # jobs that an executor holds: enough for hundreds of workers
 _AGAIN: Final = "run the same command again to go on"
 _GUARD: Final = 'put the call under `if __name__ == "__main__":`, or give workers=1'
-_GUARDED: Final = re.compile(r"__name__\s*==\s*[\"']__main__|__main__[\"']\s*==\s*__name__")
+_GUARDED: Final = re.compile(r"^if\b.*\b__name__\b", re.M)
 _MAIN: Final = "__main__"
 
 
@@ -69,36 +69,32 @@ def run_jobs(job: Job, todo: Sequence[int], workers: int | Executor | None) -> I
         return
     count = check_workers(workers)
     here = len(todo) if count == 1 or len(todo) == 2 else 1
-    if todo[here:]:
-        _check_main(job)
+    needs_main = bool(todo[here:]) and _needs_main(job)
     for number in todo[:here]:
         yield job(number)
     if todo[here:]:
-        with LocalProcesses(min(count, len(todo) - here)) as processes:
+        with LocalProcesses(min(count, len(todo) - here), needs_main) as processes:
             yield from _share_out(job, todo[here:], processes)
 
 
-def _check_main(job: Job) -> None:
-    """Refuse a job that workers can import only by running this process's script again."""
+def _needs_main(job: Job) -> bool:
+    """Whether workers have to run the main script for a job; refused where they would do the same as it."""
     try:
-        needs_main = _MAIN.encode() in pickle.dumps(job)
+        if _MAIN.encode() not in pickle.dumps(job):
+            return False
     except Exception:  # the executor tells what cannot be pickled
-        return
-    if needs_main and not _is_guarded():
-        defined = f"{script} defines" if (script := main_script()) else "this session, not a module, defines"
+        return False
+    script = main_script()
+    if script is None or not _GUARDED.search(script.read_text(encoding="utf-8", errors="replace")):
+        defined = f"{script} defines" if script else "this session, not a module, defines"
         raise ArgumentError(f"{defined} what the workers use: {_GUARD}")
+    return True
 
 
 def main_script() -> Path | None:
     """The file that Python runs; None in a notebook, at a prompt, or where it reads standard input."""
     script = Path(getattr(sys.modules[_MAIN], "__file__", None) or "")
     return script if script.is_file() else None
-
-
-def _is_guarded() -> bool:
-    """Whether workers can run the main script again without its calls."""
-    script = main_script()
-    return script is not None and bool(_GUARDED.search(script.read_text(encoding="utf-8", errors="replace")))
 
 
 @contextmanager
@@ -150,17 +146,18 @@ class LocalProcesses(ProcessPoolExecutor):
     """Processes of this machine, spawned when they are needed, with one thread each unless the user chose.
 
     They end with the block, at once if it raises, and with this process, however it ends. They ignore Ctrl-C
-    and hang-ups.
+    and hang-ups, and do not run the main script, unless they need what it defines.
     """
 
-    def __init__(self, workers: int) -> None:
+    def __init__(self, workers: int, needs_main: bool = False) -> None:
+        self._needs_main = needs_main
         context = multiprocessing.get_context("spawn")
         theirs, self._ours = context.Pipe(duplex=False)
         super().__init__(workers, mp_context=context, initializer=_end_with, initargs=(theirs,))
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         """Have a process call `fn(*args, **kwargs)`."""
-        main_module = contextlib.nullcontext() if _is_guarded() else _main_left_out()
+        main_module = contextlib.nullcontext() if self._needs_main else _main_left_out()
         with one_thread(), without_signals(), main_module:  # submit starts a process if none is idle
             return super().submit(fn, *args, **kwargs)
 

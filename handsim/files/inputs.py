@@ -5,6 +5,7 @@ A wrong value raises a `HandSimError` that names the key; the caller, which know
 
 from __future__ import annotations
 
+import codecs
 import functools
 import hashlib
 import json
@@ -67,6 +68,13 @@ def read_bytes(path: Path, *, error: type[HandSimError], most: int | None = None
         raise error(f"{path}: cannot be read: {cause.strerror or cause}") from cause
 
 
+def text_encoding(data: bytes) -> str:
+    """The encoding of a text: UTF-8, or UTF-16 as programs of Windows write it, with or without its mark."""
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return "utf-16"
+    return {0: "utf-16-be", 1: "utf-16-le"}.get(data[:2].find(b"\0"), "utf-8-sig")
+
+
 def checksum(path: Path | UPath) -> str:
     """SHA-256 of a file."""
     with path.open("rb") as file:
@@ -91,7 +99,7 @@ def read_toml(path: Path, *, error: type[HandSimError]) -> dict[str, Any]:
     """The tables of a TOML file."""
     data = read_bytes(path, error=error, most=_MOST_TOML)
     try:
-        text = data.decode("utf-8-sig")  # editors of Windows begin a file with a byte order mark
+        text = data.decode(text_encoding(data))
         deep = _DOTTED.search(text)
         if deep is not None:
             raise tomllib.TOMLDecodeError(f"the key {shortened(deep[0])!r} has too many parts")

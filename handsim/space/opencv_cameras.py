@@ -20,43 +20,43 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handsim.errors import HandSimError, HandSimWarning, RigError, choices, errors_of, shortened
-from handsim.files.inputs import read_bytes, read_toml, words_numbers
+from handsim.files.inputs import read_bytes, read_toml, text_encoding, words_numbers
 from handsim.space.camera import Camera, Lens, LensKind, brown_lens
-from handsim.space.rig import TOML_MATRIX, camera_names, checked_cameras, nearest_rotation
+from handsim.space.rig import TOML_MATRIX, camera_names, checked_cameras, foreign_cameras, nearest_rotation
 from handsim.space.transforms import quaternion_matrix, rigid, vector_quaternions
 
 _MAX_OPENCV_BYTES: Final = 1 << 24
 _MAX_NUMBERS: Final = 16  # Longer lists of numbers, such as corners of a board, are ignored.
 _CENTER: Final = 0.5  # OpenCV measures pixels from the center of the first one, we from the picture's corner
-_MAX_BASELINE: Final = 5.0  # largest distance of the cameras of a pair [m]
-_ENTRY: Final = re.compile(r"^[\"']?([A-Za-z_][\w ]*?)[\"']?[ \t]*:(?=\s)", re.M)
+_MAX_BASELINE: Final = 5.0  # [m]
+_ENTRY: Final = re.compile(r"^[\"']?([A-Za-z_][\w .-]*?)[\"']?[ \t]*:(?=\s)", re.M)
 _DATA: Final = re.compile(r"\bdata[\"']?[ \t]*:[ \t]*\[([^\[\]]*)\]")
 _DASH: Final = re.compile(r"^[ \t]*-[ \t](?=[ \t]*[-+.\d\[])", re.M)
 _LIST: Final = re.compile(r"[\[\],\s]+")
 _K: Final = ("camera_matrix", "cameraMatrix", "K", "mtx", "M")
-_D: Final = (
-    "distortion_coefficients", "distortion_coeffs", "dist_coeffs", "distCoeffs", "distCoef", "D", "dist",
-    "distortions",
-)  # fmt: skip
-_WIDTH: Final = ("image_width", "imageWidth", "img_width", "width")
-_HEIGHT: Final = ("image_height", "imageHeight", "img_height", "height")
-_SIZE: Final = ("image_size", "imageSize", "img_size", "size", "resolution")
-_FISHEYE: Final = ("fisheye_model", "fisheye")
-_MODEL: Final = (
-    "distortion_model", "distortionModel", "distortion_type", "distortion", "lens_model", "lensModel",
-    "lens_type", "camera_model", "cameraModel", "projection_model", "projection", "model_type",
-)  # fmt: skip
-"""Keys of the name of a lens."""
-_LOOSE_MODEL: Final = ("model", "camera_type", "lens", "type")
+_D: Final = ("distortion_coefficients", "dist_coeffs", "distCoef", "D", "dist", "distortions")
+_WIDTH: Final = ("image_width", "img_width", "width")
+_HEIGHT: Final = ("image_height", "img_height", "height")
+_SIZE: Final = ("image_size", "img_size", "size", "resolution")
+_BROWN: Final = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+_FISHEYE: Final = re.compile(r"(is|use)?fisheye(model|lens)?")
+_MODEL: Final = re.compile(
+    r"(distortion|lens|projection|calibration)(model|type|name)|distortion|projection|cameramodel|modeltype"
+)
+"""Keys of the name of a lens, without signs and capital letters."""
+_LOOSE_MODEL: Final = re.compile(r"model|modelname|cameratype|lens|type")
 """Keys of the name of a lens, or of the camera's maker."""
+_WORDS: Final = {"true": True, "yes": True, "on": True, "false": False, "no": False, "off": False}
+_NOTHING: Final = ("[]", "", "~", "null", "None")
 _LENSES: Final[dict[str, LensKind]] = {
     **dict.fromkeys(("none", "pinhole", "perspective"), "pinhole"),
-    **dict.fromkeys(("plumb_bob", "radtan", "radial_tangential", "brown", "brown_conrady"), "brown"),
-    **dict.fromkeys(("opencv", "standard", "rational_polynomial"), "brown"),
-    **dict.fromkeys(("equidistant", "equi", "fisheye", "opencv_fisheye", "cv2_fisheye"), "fisheye"),
-    **dict.fromkeys(("kannala_brandt", "kannala_brandt8", "kb", "kb4", "kb8", "pinhole_equi"), "fisheye"),
+    **dict.fromkeys(("plumbbob", "radtan", "radialtangential", "brown", "brownconrady"), "brown"),
+    **dict.fromkeys(("opencv", "standard", "rational", "rationalpolynomial"), "brown"),
+    **dict.fromkeys(
+        ("equidistant", "equi", "fisheye", "opencvfisheye", "cvfisheye", "kannalabrandt", "kb"), "fisheye"
+    ),
 }
-"""Names of lenses. A pinhole camera may have coefficients of Brown's lens."""
+"""Names of lenses in small letters. A pinhole camera may have coefficients of Brown's lens."""
 _SHOWN_LENSES: Final = (
     "pinhole", "plumb_bob", "radtan", "rational_polynomial", "equidistant", "fisheye", "kannala_brandt",
 )  # fmt: skip
@@ -70,14 +70,19 @@ _PAIRS: Final = {"intrinsics": "extrinsics", "intri": "extri"}
 """Files that belong together: of OpenCV's stereo sample, and of EasyMocap."""
 _OTHERS: Final = _PAIRS | {second: first for first, second in _PAIRS.items()}
 _FIELD: Final = "in units of their own; give the COLMAP reconstruction in meters that they were made of"
+_ANEW: Final = "write its numbers as OpenCV's camera_matrix and distortion_coefficients"
 _UNREAD: Final = {
     "transform_matrix": f"the JSON of NeRF and nerfstudio, with poses {_FIELD}",
     "img_name": f"the JSON of Gaussian Splatting, with poses {_FIELD}",
+    "cam0": f"a chain of Kalibr; {_ANEW}, with R and T of each camera",
+    "ppx": f"a RealSense's intrinsics; {_ANEW}",
+    "projection_parameters": f"a camera of VINS; {_ANEW}",
+    "Camera.fx": f"a settings file of ORB-SLAM; {_ANEW}",
+    "Camera1.fx": f"a settings file of ORB-SLAM; {_ANEW}",
 }
-"""Descriptions of other programs' files, by a key that these contain."""
-_OF_ALL: Final = (*_WIDTH, *_HEIGHT, *_SIZE, *_FISHEYE, *_MODEL)
-_OF_ONE: Final = (*_K, *_D, "W", "H", *_OF_ALL, *_R, *_T)
+"""What files of other programs are, by a key of theirs."""
 _SECTION: Final = re.compile(r"^[ \t]+[\"']?(?:" + "|".join(_K) + r")[\"']?[ \t]*:(?=\s)", re.M)
+_KEY: Final = r"(?:^|[{{,])[ \t\n]{{0,99}}[\"']?{}[\"']?[ \t]*:"
 _MAX_CAMERAS: Final = 256
 
 Values = dict[str, tuple[float, ...] | str]
@@ -115,7 +120,8 @@ def _many(values: Values, sections: Sections) -> list[Camera]:
     if len(sections) > _MAX_CAMERAS:
         raise RigError(f"{len(sections)} cameras, expected at most {_MAX_CAMERAS}")
     cameras = []
-    common = {key: value for key, value in values.items() if key in _OF_ALL}
+    alone = {key for names in (_K, _D, _R, _T) if (key := _find(values, names)) is not None}
+    common = {key: value for key, value in values.items() if key not in alone}
     for name, (given, own) in zip(camera_names(list(sections)), sections.items(), strict=True):
         with errors_of(f"camera '{shortened(given)}'", RigError):
             if "T_world_camera" not in own and (_find(own, _R) is None or _find(own, _T) is None):
@@ -143,7 +149,7 @@ def _numbered_sections(values: Values) -> Sections:
         if base is None:
             continue
         ending = key[len(base) :]
-        own = {one: values[one + ending] for one in _OF_ONE if one + ending in values}
+        own = {one.removesuffix(ending): value for one, value in values.items() if one.endswith(ending)}
         for short, name in (("W", _WIDTH[0]), ("H", _HEIGHT[0])):
             if short in own:
                 own[name] = own.pop(short)
@@ -191,9 +197,21 @@ def _from_corner(K: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _lens(values: Values, names: tuple[str, ...]) -> Lens:
-    found = _find(values, names) or ("distortion" if isinstance(values.get("distortion"), tuple) else None)
+    found, plain = _find(values, names), {key: _plain(key) for key in values}
+    if found is None and names is _D:
+        lists = (key for key, value in values.items() if isinstance(value, tuple) and len(value) > 3)
+        found = next((key for key in lists if plain[key].startswith("dist")), None)
     given = () if found is None else _value_numbers(values, found, None)
-    if "fisheye" in _lens_kinds(values, any(given)):
+    single = {
+        re.sub(r"^dist[a-z]*?(?=[kp]\d)", "", plain[key]): key
+        for key, value in values.items()
+        if found is None and names is _D and len(value) == 1 and not isinstance(value, str)
+    }
+    kinds = _lens_kinds(values, any(given) or "k1" in single)
+    if "k1" in single:
+        found, order = "k1", ("k1", "k2", "k3", "k4") if "fisheye" in kinds else _BROWN
+        given = tuple(_value_numbers(values, single[key], (1,))[0] if key in single else 0.0 for key in order)
+    if "fisheye" in kinds:
         if len(given) < 4 or any(given[4:]):
             raise RigError(f"a fisheye lens with {len(given)} coefficients, expected 4")
         return Lens("fisheye", given[:4])
@@ -208,26 +226,36 @@ def _lens(values: Values, names: tuple[str, ...]) -> Lens:
     return brown_lens(*(*given, *[0.0] * 5)[:5])
 
 
+def _plain(key: str) -> str:
+    """A key without signs and capital letters."""
+    return re.sub("[^a-z0-9]", "", key.lower())
+
+
 def _lens_kinds(values: Values, bent: bool) -> set[LensKind]:
     """The kinds of lens that the values name; names that are not known are refused."""
     kinds: set[LensKind] = set()
-    known = {name.replace("_", ""): kind for name, kind in _LENSES.items()}
-    for key in (*_MODEL, *_LOOSE_MODEL):
-        if not isinstance(values.get(key), str):
+    for key, value in values.items():
+        plain = _plain(key)
+        is_flag, is_model = _FISHEYE.fullmatch(plain), _FISHEYE.fullmatch(plain) or _MODEL.fullmatch(plain)
+        if not (is_model or _LOOSE_MODEL.fullmatch(plain)) or (len(value) > 1 and not isinstance(value, str)):
             continue
-        text = str(values[key]).partition("\n")[0].partition("#")[0].strip("\"' \t")
-        name = re.sub(r"[^a-z0-9]", "", text.lower())
-        if name in known:
-            kinds.add(known[name])
+        text = value if isinstance(value, str) else f"{value[0]:g}"
+        text = text.partition("\n")[0].partition("#")[0].strip("\"' \t")
+        is_on = _WORDS.get(text.lower(), bool(value[0]) if value and not isinstance(value, str) else None)
+        words = re.findall("[a-z]+", text.lower())
+        name = "".join(words).removeprefix("distortion")
+        if is_flag and is_on is not None:
+            kinds |= {"fisheye"} if is_on else set()
+        elif name in _LENSES:
+            kinds.add(_LENSES[name])
+        elif words and all(word in _LENSES for word in words):
+            kinds.update(_LENSES[word] for word in words)
         elif name.endswith("brownconrady") and not bent:  # RealSense's variants
             kinds.add("pinhole")
-        elif name and (key in _MODEL or name in _OTHER_LENSES):
+        elif not is_model and re.search("fisheye|equidistant|kannalabrandt", name):
+            kinds.add("fisheye")
+        elif text not in _NOTHING and (is_model or name in _OTHER_LENSES):
             raise RigError(f"{key}: {choices(text, _SHOWN_LENSES, noun='lens')}")
-    flag = _find(values, _FISHEYE)
-    if flag is not None:
-        words = {"true": (1.0,), "yes": (1.0,), "false": (0.0,), "no": (0.0,)}
-        on = words.get(str(values[flag]).lower()) or _value_numbers(values, flag, (1,))
-        return {"fisheye"} if any(on) else kinds
     if len(kinds - {"pinhole"}) > 1:
         raise RigError("the lens is named both as Brown's and as a fisheye, expected one of them")
     return kinds
@@ -294,13 +322,16 @@ def _numbered(names: tuple[str, ...], number: int) -> tuple[str, ...]:
 
 
 def _find(values: Mapping[str, object], names: tuple[str, ...]) -> str | None:
-    return next((name for name in names if name in values), None)
+    """The key of a name; if it is no single letter, signs and capital letters do not count."""
+    plain = {word for word in map(_plain, names) if len(word) > 2}
+    exact = next((name for name in names if name in values), None)
+    return exact or next((key for key in values if _plain(key) in plain), None)
 
 
 def _value_numbers(values: Values, key: str, shape: tuple[int, ...] | None) -> tuple[float, ...]:
     if key not in values:
         raise RigError(f"no '{key}'")
-    given = values[key]
+    given = () if values[key] in _NOTHING else values[key]
     if isinstance(given, str) or not np.isfinite(given).all():
         raise RigError(f"{key} is no list of at most {_MAX_NUMBERS} finite numbers")
     if shape is not None and len(given) != np.prod(shape):
@@ -311,28 +342,25 @@ def _value_numbers(values: Values, key: str, shape: tuple[int, ...] | None) -> t
 
 def _read(path: Path) -> tuple[Values, Sections]:
     if path.suffix.lower() == ".toml":
-        tables = {name: one for name, one in read_toml(path, error=RigError).items() if isinstance(one, dict)}
-        for one in tables.values():
-            one["K"] = one.pop(TOML_MATRIX, None)
-        return {}, dict(_json_sections({name: one for name, one in tables.items() if one["K"]}))
+        tables = foreign_cameras(read_toml(path, error=RigError))
+        return {}, dict(_json_sections({name: one | {"K": one[TOML_MATRIX]} for name, one in tables.items()}))
     data = read_bytes(path, error=RigError, most=_MAX_OPENCV_BYTES)
     try:
-        text = data.decode("utf-8-sig")
+        text = data.decode(text_encoding(data))
     except UnicodeDecodeError as error:
         raise RigError(f"{path}: not a calibration: it is not UTF-8 text") from error
     if text.lstrip().startswith("<"):
         raise RigError(f"{path}: this is XML, expected OpenCV's YAML or JSON")
-    if not text.lstrip().startswith(("{", "[")):
-        return _yaml_tables(text)
-    try:
-        content = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise RigError(f"{path}: not a calibration: it is no JSON") from error
-    if isinstance(content, list):
-        content = {"cameras": content}
-    values = {str(key): _json_value(value) for key, value in content.items()}
-    sections = dict(_json_sections(content))
-    known = next((what for key, what in _UNREAD.items() if f'"{key}"' in text), None)
+    if text.lstrip().startswith(("{", "[")):
+        try:
+            content = json.loads(text)
+        except (ValueError, RecursionError) as error:
+            raise RigError(f"{path}: not a calibration: it is no JSON") from error
+        content = {"cameras": content} if isinstance(content, list) else content
+        values, sections = _json_values(content), dict(_json_sections(content))
+    else:
+        values, sections = _yaml_tables(text)
+    known = next((what for key, what in _UNREAD.items() if re.search(_KEY.format(key), text, re.M)), None)
     if known is not None and not sections and _find(values, _K) is None:
         raise RigError(f"{path}: this is {known}")
     return values, sections
@@ -343,12 +371,23 @@ def _yaml_tables(text: str) -> tuple[Values, Sections]:
     values: Values = {}
     sections: Sections = {}
     for name, body in _yaml_bodies(text):
+        below = {name: body}
         if _SECTION.search(body):
-            inner = _yaml_bodies(textwrap.dedent(body.strip("\n")))
-            sections[name] = {key: _yaml_value(value) for key, value in inner}
+            below, values_of = _yaml_below(body), sections.setdefault(name, {})
         else:
-            values[name] = _yaml_value(body)
+            values_of = values
+        for key, value in below.items():
+            inner = _yaml_below(value)
+            if not inner or "data" in inner:
+                values_of[key] = _yaml_value(inner.get("data", value))
+            else:
+                values_of |= {f"{key}_{word}": _yaml_value(one) for word, one in inner.items()}
     return values, sections
+
+
+def _yaml_below(body: str) -> dict[str, str]:
+    """The entries that are indented below a key."""
+    return dict(_yaml_bodies(textwrap.dedent(body.strip("\n"))))
 
 
 def _yaml_bodies(text: str) -> Iterator[tuple[str, str]]:
@@ -385,7 +424,16 @@ def _json_sections(content: Mapping[str, object]) -> Iterator[tuple[str, Values]
         named = list(cameras.items()) if isinstance(cameras, dict) else []
     for name, one in named[: _MAX_CAMERAS + 1]:
         if isinstance(one, dict) and _find(one, _K) is not None:
-            yield name, {str(key): _json_value(value) for key, value in one.items()}
+            yield name, _json_values(one)
+
+
+def _json_values(table: Mapping[str, object]) -> Values:
+    """The values of a table, and those of tables in it with both keys: "distortion_model"."""
+    values: Values = {}
+    for key, value in table.items():
+        inner = value if isinstance(value, dict) and "data" not in value else {"": value}
+        values |= {f"{key}_{below}" if below else str(key): _json_value(one) for below, one in inner.items()}
+    return values
 
 
 def _json_value(value: object) -> tuple[float, ...] | str:

@@ -165,14 +165,15 @@ TOML_MATRIX: Final = "matrix"
 """The key of a camera's K in the TOML files of Pose2Sim and anipose."""
 
 
-def foreign_camera(table: Mapping[str, Any]) -> str | None:
-    """The name of a camera's table in a TOML file of Pose2Sim or anipose, None in any other file."""
-    return next((key for key, one in table.items() if isinstance(one, dict) and TOML_MATRIX in one), None)
+def foreign_cameras(table: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """The cameras in a TOML file of Pose2Sim, anipose or Caliscope by name; none in any other file."""
+    inner = table.get("cameras")
+    named = {**table, **(inner if isinstance(inner, dict) else {})}
+    return {key: one for key, one in named.items() if isinstance(one, dict) and TOML_MATRIX in one}
 
 
 def _parse(table: Mapping[str, Any], stem: str) -> RigFile:
-    foreign = foreign_camera(table)
-    if foreign is not None:
+    for foreign in foreign_cameras(table):
         raise RigError(
             f"[{shortened(foreign)}] with a {TOML_MATRIX} is a camera of Pose2Sim or anipose, expected "
             "[[camera]]; handsim rig import makes a rig of such a file"

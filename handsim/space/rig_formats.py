@@ -18,7 +18,6 @@ COLMAP's reconstructions are `cameras` with the lenses and `images` with the pos
 
 from __future__ import annotations
 
-import codecs
 import dataclasses
 import re
 import struct
@@ -34,14 +33,14 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from handsim.errors import HandSimWarning, RigError, choices, errors_of, shortened
-from handsim.files.inputs import read_bytes, read_toml, shown, words_numbers
+from handsim.files.inputs import read_bytes, read_toml, shown, text_encoding, words_numbers
 from handsim.space.camera import Camera, Lens, brown_lens, camera_matrix
 from handsim.space.opencv_cameras import read_opencv_cameras
 from handsim.space.rig import (
     NAMELESS,
     camera_names,
     checked_cameras,
-    foreign_camera,
+    foreign_cameras,
     nearest_rotation,
     read_rig_file,
 )
@@ -140,14 +139,10 @@ def read_xml(path: Path) -> ET.Element:
 
 def _decoded(path: Path, data: bytes) -> str:
     """The text without its XML declaration, in which some programs state a wrong encoding."""
-    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-        encoding = "utf-16"
-    else:
-        encoding = {b"<\0": "utf-16-le", b"\0<": "utf-16-be"}.get(data[:2], "utf-8-sig")
     try:
-        text = data.decode(encoding)
+        text = data.decode(text_encoding(data))
     except UnicodeDecodeError as error:
-        if encoding != "utf-8-sig" or not re.match(rb"\s*<\?xml[^>]*(8859-1|1252)", data[:200], re.I):
+        if not re.match(rb"\s*<\?xml[^>]*(8859-1|1252)", data[:200], re.I):
             raise RigError(f"{path}: not a calibration: it is no XML text") from error
         text = data.decode("latin-1")
     return _DECLARATION.sub("", text, count=1)
@@ -329,7 +324,7 @@ _MODELS: Final = {
 """Known camera models, and their numbers of parameters."""
 _BINARY_MODELS: Final = (
     "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV",
-    "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE",
+    "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE",
 )  # fmt: skip
 _ONE_FOCAL: Final = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 
@@ -338,7 +333,13 @@ def read_colmap_cameras(path: Path) -> tuple[Camera, ...]:
     """A camera for each image of a reconstruction in meters, with the name of the image."""
     folder = path if path.is_dir() else path.parent
     cameras, images = folder / CAMERAS, folder / IMAGES
-    if cameras.with_suffix(".bin").is_file() and not cameras.is_file():
+    is_binary = cameras.with_suffix(".bin").is_file()
+    if not (is_binary or cameras.is_file()):
+        raise RigError(
+            f"{folder}: no {CAMERAS} and no {cameras.stem}.bin; give the folder in which COLMAP wrote them, "
+            "such as sparse/0"
+        )
+    if is_binary and not cameras.is_file():
         cameras, images = cameras.with_suffix(".bin"), images.with_suffix(".bin")
         lines = [_binary_lines(cameras, _binary_lens), _binary_lines(images, _binary_image)]
     else:
@@ -368,7 +369,7 @@ def _binary_lens(data: bytes, at: int) -> tuple[int, str]:
     """The end of a record of a camera, and its line."""
     number, model, width, height = struct.unpack_from("<iiQQ", data, at)
     name = _BINARY_MODELS[model] if model >= 0 else ""
-    count = {**_MODELS, "FOV": 5, "THIN_PRISM_FISHEYE": 12}[name]
+    count = {**_MODELS, "FOV": 5, "THIN_PRISM_FISHEYE": 12, "RAD_TAN_THIN_PRISM_FISHEYE": 16}[name]
     parameters = struct.unpack_from(f"<{count}d", data, at + 24)
     return at + 24 + 8 * count, " ".join(map(str, (number, name, width, height, *parameters)))
 
@@ -497,7 +498,8 @@ def import_cameras(path: str | Path, up: Up | None = None) -> tuple[Camera, ...]
     axis = up or ("y" if all(one.y_up for one in seeing) else "z")
     turn = _Y_TO_Z if axis == "y" else np.eye(4)
     cameras = tuple(one.camera.at(turn @ one.camera.T_world_camera) for one in seeing)
-    guessed = not (seeing[0].y_up and axis == "y")  # a lab may turn its cameras on their sides
+    # a lab may turn its cameras on their sides, and a camera alone is often without a pose
+    guessed = len(seeing) > 1 and not (seeing[0].y_up and axis == "y")
     if guessed and -np.mean([one.T_world_camera[2, 1] for one in cameras]) < _MIN_UPRIGHT:
         _warn(
             f"{path}: with {axis} up, the tops of its cameras' pictures do not point up on average; is "
@@ -509,7 +511,7 @@ def import_cameras(path: str | Path, up: Up | None = None) -> tuple[Camera, ...]
 def load_lab_cameras(path: str | Path) -> tuple[LabCamera, ...]:
     """The cameras of a file, by its ending, with what the file states of each: video, y up."""
     path, ending = Path(path), Path(path).suffix.lower()
-    if ending == ".toml" and foreign_camera(read_toml(path, error=RigError)) is None:
+    if ending == ".toml" and not foreign_cameras(read_toml(path, error=RigError)):
         return tuple(map(LabCamera, checked_cameras(path, read_rig_file(path).cameras)))
     if ending in (*_OPENCV, ".toml"):
         return tuple(map(LabCamera, read_opencv_cameras(path)))
@@ -533,7 +535,7 @@ def _of_xml(path: Path) -> tuple[LabCamera, ...]:
     if known is None:
         raise RigError(
             f"{path}: its XML begins with <{shortened(root.tag)}>, expected <{'>, <'.join(_READERS)}>: "
-            "Vicon's, Qualisys' or Motive's calibration"
+            "Vicon's, Qualisys' or Motive's calibration; OpenCV's is read as .yml"
         )
     with errors_of(path, RigError):
         tag, read_camera = _READERS[known]

@@ -142,10 +142,16 @@ def camera_files(folder: Path) -> list[Path]:
         "k: [500, 0, 320, 0, 500, 240, 0, 0, 1]\nr: [1, 0, 0, 0, 1, 0, 0, 0, 1]\n"
         "p: [500, 0, 320, 0, 0, 500, 240, 0, 0, 0, 1, 0]\n---\n"
     )
+    nested = {"CameraMatrix": [[500, 0, 320], [0, 500, 240], [0, 0, 1]], "image_size": [640, 480]}
+    nested["distortion"] = {"model": "plumb_bob", "k1": 0.1, "k2": 0.0}
+    (folder / "nested.json").write_text(json.dumps(nested), "utf-16")
     (folder / "cameras.txt").write_text("# cameras\n1 OPENCV 640 480 500 501 320 240 0.1 0.01 0 0\n")
     (folder / "images.txt").write_text("1 1 0 0 0 0.1 0.2 0.3 1 one.jpg\n\n2 0 1 0 0 0 0 1 1 two.jpg\n\n")
-    names = ("desk.toml", "stereo.yml", "stereo.json", "cameras.txt", "images.txt", "calib.toml", "info.yaml")
-    return [*(folder / name for name in names), binary / "cameras.bin", binary / "images.bin"]
+    names = (
+        "desk.toml", "stereo.yml", "stereo.json", "cameras.txt", "images.txt", "calib.toml", "info.yaml",
+        "nested.json", "0/cameras.bin", "0/images.bin",
+    )  # fmt: skip
+    return [folder / name for name in names]
 
 
 def calibrations(folder: Path) -> list[Path]:

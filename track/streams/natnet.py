@@ -168,10 +168,12 @@ def parse_frame(
     version: Version,
     arrived: float = np.nan,
     *,
-    assets: bool = False,
     clock: int = _TICKS,
 ) -> StreamedFrame:
-    """Read the observed markers of a frame, or of its `assets`, without what the server filled in."""
+    """Read the observed markers of a frame, without what the server filled in.
+
+    Those of marker sets and assets count if no labeled marker is in the list of markers.
+    """
     reader, extra, size = _Reader(payload), 4 if version >= _SIZED else 0, _MARKER.itemsize
     number = reader.integer()
     in_sets, in_assets = b"", b""
@@ -198,10 +200,10 @@ def parse_frame(
     reader.take(2 * extra + 2)  # another clock, flags
     if reader.integer() != 0 or reader.left > 4 or not np.isfinite(time):
         raise DamagedPacket("no end where it should be")
-    if assets:
-        markers = np.frombuffer(in_assets, dtype=_MARKER)
-        older = np.frombuffer(in_sets, dtype="<f4").reshape(-1, 3)
-        older = older[older.any(axis=1)]  # A marker that is not seen has zeros.
+    if (markers["flags"] & _UNLABELED != 0).all():
+        markers = np.concatenate([markers, np.frombuffer(in_assets, dtype=_MARKER)])
+        sets = np.frombuffer(in_sets, dtype="<f4").reshape(-1, 3)
+        older = np.concatenate([older, sets[sets.any(axis=1)]])  # zeros stand for a marker that is not seen
     points, ids = _seen(markers, older)
     latency = (sent - exposed) / clock if clock and exposed else np.nan
     known = 0.0 <= latency < _LONGEST_LATENCY
@@ -303,7 +305,6 @@ class PointStream(ArrivingFrames):
         self.foreign = 0
         """Number of packets of other senders."""
         self._listen()
-        self._has_lists = False  # whether a list of markers has ever held a point
         self._version = min(server.version, NEWEST)
         self._asked = self._kept_alive = self._heard = time.monotonic()
         self._reading = threading.Lock()
@@ -404,9 +405,6 @@ class PointStream(ArrivingFrames):
                 other: Version = OLDEST if self._version == NEWEST else NEWEST
                 frame = parse_frame(payload, other, arrived, clock=clock)
                 self._version = other
-            self._has_lists |= len(frame.points) > 0
-            if not self._has_lists:
-                frame = parse_frame(payload, self._version, arrived, assets=True, clock=clock)
         except DamagedPacket:
             self.damaged += 1
             return None

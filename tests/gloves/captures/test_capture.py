@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from gloves import Capture, read_capture, write_capture
 from gloves.captures.capture import check_place, run_lengths, unit_fault
-from gloves.captures.coordinates import zeros_as_missing
+from gloves.captures.coordinates import settled
 from gloves.captures.formats import READABLE, WRITABLE
 from handsim import HandSimWarning
 from handsim.errors import CaptureError
@@ -207,10 +207,10 @@ def motive(positions: np.ndarray) -> str:
 def test_a_single_zero_and_what_stands_still_stay(hand):
     positions = hand.positions.copy()
     positions[3, 4] = 0.0
-    assert zeros_as_missing(Capture(NAMES_PLAUSIBILITY, positions, 120.0))[1] == 0
+    assert not settled(Capture(NAMES_PLAUSIBILITY, positions, 120.0)).findings
     still = np.zeros((5, 3, 3))
     still[:, 1] = 1.0
-    assert zeros_as_missing(Capture(NAMES_PLAUSIBILITY[:3], still, 120.0))[1] == 0
+    assert not settled(Capture(NAMES_PLAUSIBILITY[:3], still, 120.0)).findings
 
 
 def test_nothing_is_told_of_a_good_capture(hand, tmp_path):

@@ -77,6 +77,30 @@ def test_gaps_that_hold_the_last_position_are_missing(moving, rng, tmp_path, suf
     np.testing.assert_array_equal(np.isnan(read.positions[..., 0]), hidden)
 
 
+@pytest.mark.parametrize("suffix", WRITABLE)
+def test_gaps_that_were_interpolated_are_missing(moving, rng, tmp_path, suffix):
+    hidden = gaps(rng)
+    positions, frames = moving.positions.copy(), np.arange(FRAMES)
+    for column in range(MARKERS):
+        seen = np.flatnonzero(~hidden[:, column])
+        for axis in range(3):
+            positions[:, column, axis] = np.interp(frames, seen, positions[seen, column, axis])
+    write_capture(tmp_path / f"take{suffix}", with_positions(moving, positions))
+    with pytest.warns(HandSimWarning, match=r"points move by equal steps"):
+        read = read_capture(tmp_path / f"take{suffix}")
+    missing = np.isnan(read.positions[..., 0])
+    assert not (missing & ~hidden).any() and missing.sum() > 0.8 * hidden.sum()  # of one or two frames: left
+
+
+def test_what_is_simulated_without_noise_stays(moving):
+    """It moves along a line, as a whole or beside a finger."""
+    seconds = np.arange(FRAMES)[:, None, None] / 120.0
+    positions = moving.positions[:1] + seconds * np.array([0.2, 0.1, 0.0])
+    untouched(with_positions(moving, positions))
+    positions[60:, :4] += 0.02 * (1.0 - np.cos(3.0 * seconds[:60]))
+    untouched(with_positions(moving, positions))
+
+
 def test_a_marker_that_was_not_there_at_first_is_missing(moving):
     hidden = np.zeros((FRAMES, MARKERS), dtype=bool)
     hidden[:30, 2] = True
@@ -121,20 +145,34 @@ def test_gaps_are_found_among_few_digits(moving):
 
 
 @pytest.mark.parametrize("suffix", WRITABLE)
-@pytest.mark.parametrize("share", [1.0, 0.5])
-def test_markers_of_two_subjects_are_one(moving, rng, tmp_path, suffix, share):
+@pytest.mark.parametrize(("share", "apart"), [(1.0, 0.0), (0.5, 0.0), (1.0, 1e-4), (2.0, 1e-4)])
+def test_markers_of_two_subjects_are_one(moving, rng, tmp_path, suffix, share, apart):
+    """Also of three, and where the two differ a little."""
     positions = np.where(gaps(rng)[..., None], np.nan, moving.positions)
-    again = round(share * MARKERS)
-    names = [f"A:{name}" for name in moving.names] + [f"B:{name}" for name in moving.names[:again]]
-    twice = np.concatenate([positions, positions[:, :again]], axis=1)
+    again = np.arange(round(share * MARKERS)) % MARKERS
+    names = [f"A:{name}" for name in moving.names] + [f"B:{moving.names[n]}" for n in again]
+    others = positions[:, again] + rng.uniform(-apart, apart, size=(FRAMES, len(again), 3))
+    twice = np.concatenate([positions, others], axis=1)
     path = tmp_path / f"take{suffix}"
     write_capture(path, Capture(tuple(names), twice, 120.0))
-    with pytest.warns(HandSimWarning, match="exactly where another is"):
+    with pytest.warns(HandSimWarning, match="where another is"):
         read = read_capture(path)
     assert read.names == tuple(names[:MARKERS])
-    assert read.findings == {"doubled": np.isfinite(positions[:, :again, 0]).sum()}
+    assert read.findings == {"doubled": np.isfinite(positions[:, again, 0]).sum()}
     np.testing.assert_allclose(read.positions, positions, atol=1e-6)
     assert select_markers(read, moving.names).shape == positions.shape
+
+
+@pytest.mark.parametrize("number", [9999.0, -1.0, -9999.99, 1e6])
+@pytest.mark.parametrize("suffix", WRITABLE)
+def test_numbers_that_stand_for_none_are_missing(moving, rng, tmp_path, suffix, number):
+    hidden = gaps(rng)
+    path = tmp_path / f"take{suffix}"
+    positions = np.where(hidden[..., None], number * 1e-3, moving.positions)
+    write_capture(path, with_positions(moving, positions))
+    with pytest.warns(HandSimWarning, match=rf"{hidden.sum()} points have one number in all three"):
+        read = read_capture(path)
+    np.testing.assert_array_equal(np.isnan(read.positions[..., 0]), hidden)
 
 
 def test_two_columns_of_a_marker_have_the_points_of_both(moving):
@@ -175,7 +213,7 @@ def with_outputs(path: Path, moving: Capture, groups: dict[str, list[str]], labe
 def test_outputs_of_models_are_no_markers(moving, tmp_path, prefixes):
     names = {
         "ANGLES": ["RWristOne"], "ANGLES2": ["RWristTwo"], "MOMENTS": ["M"], "FORCES": ["F"], "POWERS": ["P"],
-        "SCALARS": ["Spread"], "REACTIONS": ["R"],
+        "SCALARS": ["Spread"], "MODELED_MARKERS": ["WristCenter"],
     }  # fmt: skip
     listed, shown = prefixes
     labels = [shown + name for group in names.values() for name in group]
@@ -188,7 +226,7 @@ def test_outputs_of_models_are_no_markers(moving, tmp_path, prefixes):
 
 
 def test_outputs_show_by_their_names_and_units(moving, tmp_path):
-    with_outputs(tmp_path / "bare.c3d", moving, {}, ["Anna:RThumbAngles", "LWristMoment", "RPower"])
+    with_outputs(tmp_path / "bare.c3d", moving, {}, ["Anna:RThumbAngles", "LWristMoment", "R_WRIST_ANGLE"])
     assert settled(read_c3d((tmp_path / "bare.c3d").read_bytes())).names == moving.names
     text = nexus(names=("a", "b", "c")).replace("mm,mm,mm,mm,mm,mm,mm", "mm,mm,mm,deg,deg,deg,mm")
     (tmp_path / "nexus.csv").write_text(text)
@@ -209,7 +247,9 @@ def test_a_c3d_that_marks_all_points_as_missing_is_read() -> None:
     holes[0, 1] = 0.0
     read = read_c3d(c3d(holes, missing=everywhere))
     assert np.isnan(read.positions[0, 1]).all() and np.isfinite(read.positions[:, 0]).all()
-    assert np.isnan(read_c3d(c3d(missing=everywhere[1:])).positions).any(axis=-1).sum() == 3
+    read = read_c3d(c3d(missing=everywhere[1:]))
+    assert np.isnan(read.positions).any(axis=-1).sum() == 3
+    assert "3 points have coordinates and are marked as missing" in findings_sentence(read.findings)
 
 
 def test_one_sentence_tells_everything(moving, rng, tmp_path):

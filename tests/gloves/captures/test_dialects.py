@@ -43,6 +43,21 @@ SAME = {
     "a quoted line break and commas": (".csv", noted(notes='"left, tight\n\nright, loose"'), MOTIVE),
     "a line break": (".csv", noted(notes="left tight\nright loose"), MOTIVE),
     "a line break of Windows": (".csv", noted(notes='"left\r\nright"').replace("\n", "\r\n"), MOTIVE),
+    "an open quote": (".csv", noted(notes='"left glove, 5'), MOTIVE),
+    "inches": (".csv", noted(notes='5" ball'), MOTIVE),
+    "Excel's first line": (".csv", "sep=,\n" + MOTIVE, MOTIVE),
+    "UTF-16 without a mark": (".trc", TRC.encode("utf-16-le"), TRC),
+    "small letters": (".trc", TRC.replace("PathFileType", "pathfiletype"), TRC),
+    "a unit in brackets": (".trc", TRC.replace("mm", "(mm)"), TRC),
+    "a row of nan": (".trc", TRC.replace(ROWS[0], "nan\n" + ROWS[0]), TRC),
+    **{
+        f"{word} for none": (
+            ".trc",
+            TRC.replace("1.25\t-0.05\t3.00", f"{word}\t{word}\t{word}"),
+            TRC.replace("1.25\t-0.05\t3.00", "\t\t"),
+        )
+        for word in ("N/A", "#N/A", "null", "None", "--", "<NA>", "1.#QNAN", "NaN")
+    },
     "notes like a key": (".csv", noted(notes="Length Units"), MOTIVE),
     "semicolons and a semicolon": (".csv", noted(notes="a;b").replace(",", ";"), MOTIVE),
     "keys in small letters": (".csv", MOTIVE.replace(KEYS, KEYS.replace("Frame Rate", "frame rate")), MOTIVE),

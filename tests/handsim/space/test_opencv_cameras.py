@@ -86,8 +86,10 @@ def is_the_fisheye(camera):
     np.testing.assert_allclose(camera.project(POINTS), expected + 0.5, atol=1e-6)
 
 
-@pytest.mark.parametrize("key", ["distortion_model", "camera_model", "lens_model", "model"])
-@pytest.mark.parametrize("name", ["equidistant", "Equidistant", "KANNALA-BRANDT", "Fisheye", "kb4  # four"])
+@pytest.mark.parametrize(
+    "key", ["distortion_model", "DistortionModel", "camera_model", "projection-type", "model"]
+)
+@pytest.mark.parametrize("name", ["Equidistant", "KANNALA-BRANDT4", "fisheye (equidistant)", "kb4  # four"])
 def test_other_names_of_a_fisheye(tmp_path, key, name):
     is_the_fisheye(load_cameras(calibrated(tmp_path / "fish.yml", f"{key}: {name}\n"))[0])
 
@@ -96,6 +98,10 @@ def test_other_names_of_a_fisheye(tmp_path, key, name):
     ("lines", "kind"),
     [
         ("fisheye: true\n", "fisheye"),
+        ("is_fisheye: Yes\n", "fisheye"),
+        ("distortion:\n  model: equidistant\n", "fisheye"),
+        ("lens: fisheye of 180 degrees\n", "fisheye"),
+        ("distortion_model: null\n", "brown"),
         ("camera_model: pinhole\ndistortion_model: equidistant\n", "fisheye"),
         ("fisheye: false\n", "brown"),
         ("distortion_model: PLUMB_BOB\n", "brown"),
@@ -121,6 +127,53 @@ def test_unknown_lenses_are_refused(tmp_path, key, name):
     path = calibrated(tmp_path / "other.yml", f"{key}: {name}\n")
     with pytest.raises(RigError, match=f"{key}: unknown lens '{name}'.* valid names: .*fisheye"):
         load_cameras(path)
+
+
+@pytest.mark.parametrize("name", ["thin_prism_fisheye", "omni-radtan", "5", "unknown"])
+def test_lenses_that_are_partly_known_are_refused(tmp_path, name):
+    with pytest.raises(RigError, match=f"distortion_model: unknown lens '{name}'"):
+        load_cameras(calibrated(tmp_path / "other.yml", f"distortion_model: {name}\n"))
+
+
+@pytest.mark.parametrize(
+    "coefficients",
+    [
+        {"distortion_parameters": FISH.tolist()},
+        {"DistCoeffs": FISH.tolist()},
+        {"distortion": {"coefficients": FISH.tolist()}},
+        dict(zip(("k1", "k2", "p1", "p2"), FISH, strict=True)),
+        {"distortion": dict(zip(("k1", "k2", "p1", "p2"), FISH, strict=True))},
+    ],
+)
+def test_coefficients_are_never_left_out(tmp_path, coefficients):
+    """By whatever key they are there."""
+    values = {"CameraMatrix": K.tolist(), "ImageWidth": 640, "ImageHeight": 480, **coefficients}
+    (tmp_path / "c.json").write_text(json.dumps(values), "utf-16")
+    (camera,) = load_cameras(tmp_path / "c.json")
+    assert (camera.size, camera.lens.kind) == ((640, 480), "brown")
+    np.testing.assert_allclose(camera.lens.coefficients, [*FISH, 0.0])
+
+
+@pytest.mark.parametrize("none", ["[]", "", "null"])
+def test_no_coefficients(tmp_path, none):
+    lines = f"K: {K.ravel().tolist()}\nD: {none}\nwidth: 640\nheight: 480\n"
+    (tmp_path / "c.yaml").write_text(lines)
+    assert load_cameras(tmp_path / "c.yaml")[0].lens.kind == "pinhole"
+
+
+@pytest.mark.parametrize(
+    ("text", "program"),
+    [
+        ("cam0:\n  camera_model: omni\n  intrinsics: [1.6, 420, 421, 640, 400]\n", "Kalibr"),
+        ("model_type: MEI\nprojection_parameters:\n   gamma1: 1.0\n", "VINS"),
+        ('Camera.type: "KannalaBrandt8"\nCamera1.fx: 420.0\n', "ORB-SLAM"),
+        ('{"width": 1280, "ppx": 640.0, "model": "kannala_brandt4"}', "RealSense"),
+    ],
+)
+def test_calibrations_of_other_programs_are_named(tmp_path, text, program):
+    (tmp_path / "c.yaml").write_text(text)
+    with pytest.raises(RigError, match=f"this is a.* {program}.* OpenCV's camera_matrix"):
+        load_cameras(tmp_path / "c.yaml")
 
 
 def test_a_lens_of_two_kinds_is_refused(tmp_path):
@@ -158,6 +211,9 @@ def test_the_calibration_of_pose2sim(tmp_path):
     np.testing.assert_allclose(brown.project(POINTS), projected(R, T, K, D.ravel()[:4]), atol=1e-6)
     with pytest.raises(RigError, match=r"\[a\] .* Pose2Sim or anipose, .* handsim rig import"):
         load_rig(path)
+    nested = tmp_path / "camera_array.toml"
+    nested.write_text(path.read_text().replace("[a]", "[cameras.0]").replace("[b]", "[cameras.1]"))
+    assert [camera.name for camera in load_cameras(nested)] == ["0", "1"]
     path.write_text(path.read_text().replace(str(shift[0]), "1e5"))
     with pytest.raises(RigError, match="are these millimeters"):
         load_cameras(path)

@@ -123,8 +123,9 @@ def test_every_section_is_stepped_over(sized):
 
 
 @pytest.mark.parametrize("sized", [False, True])
-def test_points_of_marker_sets_and_assets_count_where_they_are_asked_for(sized):
-    payload = full_frame([(5, 0.1, 0.2, 0.3, 2)], [(0.1, 0.2, 0.3)], sized=sized)
+@pytest.mark.parametrize("labeled", [False, True])
+def test_points_of_marker_sets_and_assets_count_where_labeled_markers_are_off(sized, labeled):
+    payload = full_frame([(5, 0.1, 0.2, 0.3, 2 if labeled else 18)], [(0.5, 0.5, 0.5)], sized=sized)
     twice = np.array([9.0, 9.0, 9.0], dtype="<f4").tobytes() * 2
     other = np.array([[1.0, 2.0, 3.0], [0.0, 0.0, 0.0]], dtype="<f4").tobytes()  # zeros: not seen
     payload = payload.replace(
@@ -132,9 +133,10 @@ def test_points_of_marker_sets_and_assets_count_where_they_are_asked_for(sized):
     )
     payload = payload.replace(b"all\0" + struct.pack("<i", 0), b"")
     payload = payload[:4] + struct.pack("<i", 1) + payload[8:]
-    frame = parse_frame(payload, (4, 1) if sized else (4, 0), assets=True)
-    np.testing.assert_array_equal(frame.points, [[1.0, 2.0, 3.0]])  # the asset's marker is filled in
-    np.testing.assert_array_equal(frame.ids, [-1])
+    frame = parse_frame(payload, (4, 1) if sized else (4, 0))
+    in_lists, in_sets = [(0.1, 0.2, 0.3), (0.5, 0.5, 0.5)], [(1.0, 2.0, 3.0)]  # the asset's is filled in
+    np.testing.assert_array_equal(frame.points, np.float32(in_lists + ([] if labeled else in_sets)))
+    np.testing.assert_array_equal(frame.ids, [5, -1] if labeled else [5, -1, -1])
 
 
 @pytest.mark.parametrize("sized", [False, True])
@@ -318,7 +320,7 @@ def say_frames(puppet: Puppet, version: tuple[int, int], frames: list[np.ndarray
 
 
 @pytest.mark.parametrize("version", VERSIONS)
-def test_points_of_marker_sets_are_used_until_a_list_has_one(version, monkeypatch):
+def test_points_of_marker_sets_are_used_beside_unlabeled_ones(version, monkeypatch):
     monkeypatch.setattr("track.streams.live_stream._EMPTY", -1.0)
     points = np.array([[0.25, 0.5, 0.75], [0.0, 0.0, 0.0], [0.5, 0.5, 1.0]])
     with Puppet(unicast(version)) as puppet, opened(puppet.url) as stream:
@@ -327,7 +329,7 @@ def test_points_of_marker_sets_are_used_until_a_list_has_one(version, monkeypatc
         assert not len(next(stream).points) and len(next(stream).points) == 2 and not stream.point_doubt
         puppet.say(frame(3, version))
         puppet.say(bare(4, version, points))
-        assert len(next(stream).points) == 1 and not len(next(stream).points)
+        assert len(next(stream).points) == 1 and len(next(stream).points) == 2
 
 
 @pytest.mark.parametrize("version", VERSIONS)
