@@ -47,16 +47,16 @@ _MODELED: Final = re.compile(
     r"[_. -](?:ANGLE|FORCE|MOMENT|POWER|SCALAR)S?$"
 )
 """Names that models give their outputs: RThumbAngles, LWristMoment, R_WRIST_ANGLE."""
-_SAME_PLACE: Final = 1e-3  # [m]: the smallest markers, which cannot be in each other, are 1.5 mm wide
-_SAME_SHARE: Final = 5e-3  # of the width of all points, where the unit of a file is wrong
-_NEIGHBORS: Final = 8  # points along a line, among which the ones at one place are looked for
-_MIN_FRAMES: Final = 10  # from which repetitions count; fewer may agree by chance
-_NEVER_STILL: Final = 2e-5  # [m] in a frame: a marker that moves by more was not at rest in the frame before
-_NO_BEND: Final = 3e-7  # [m]: difference of equal steps, rounded
-_FINE: Final = 1e-7  # [m] of a grid on which measured steps are never equal
-_COARSE: Final = 5e-6  # [m] of a grid on which markers at rest repeat their positions
-_GRID_STEPS: Final = 20.0  # of a grid, by which a marker at rest does not move in a frame
-_GRID_COUNT: Final = 10  # smallest steps of equal size that show a grid
+_SAME_PLACE: Final = 1e-3  # Markers this near [m] are one: the smallest markers are 1.5 mm wide.
+_SAME_SHARE: Final = 5e-3  # The same as a share of the extent of all points, for files with a wrong unit.
+_NEIGHBORS: Final = 8  # A point is compared with this many points that follow it along a line.
+_MIN_FRAMES: Final = 10  # Repetitions count in this many frames; in fewer they may be chance.
+_NEVER_STILL: Final = 2e-5  # A marker that moves more than this in a frame [m] was not at rest before it.
+_NO_BEND: Final = 3e-7  # Steps that differ by less than this [m] are equal up to rounding.
+_FINE: Final = 1e-7  # On a grid finer than this [m], measured steps are never equal.
+_COARSE: Final = 5e-6  # On a grid coarser than this [m], markers at rest repeat their positions.
+_GRID_STEPS: Final = 20.0  # A marker at rest moves by fewer grid steps than this in a frame.
+_GRID_COUNT: Final = 10  # This many smallest steps of equal size show a grid.
 _AT_REST: Final = 0.4  # A marker starts abruptly if its first step is more than this share of the second one.
 
 
@@ -71,14 +71,14 @@ def settled(capture: Capture) -> Capture:
     counts = {}
     capture, counts[_ZEROS], counts[_STAND_INS] = _without_stand_ins(capture)
     if capture.num_frames >= _MIN_FRAMES:
-        capture, counts[_DOUBLED] = _once(capture)
+        capture, counts[_DOUBLED] = _without_doubles(capture)
         for kind, found in ((_HELD, _held), (_STRAIGHT, _interpolated)):
             filled = found(capture.positions)
             counts[kind] = int(filled.sum())
             if filled.any():
                 positions = np.where(filled[..., None], np.nan, capture.positions)
                 capture = dataclasses.replace(capture, positions=positions)
-    told = Counter(capture.findings) + Counter(counts)  # which leaves zeros out
+    told = Counter(capture.findings) + Counter(counts)  # the sum drops counts of zero
     return dataclasses.replace(capture, findings=dict(told))
 
 

@@ -28,7 +28,7 @@ from handsim.space.transforms import quaternion_matrix, rigid, vector_quaternion
 _MAX_OPENCV_BYTES: Final = 1 << 24
 _MAX_NUMBERS: Final = 16  # Longer lists of numbers, such as corners of a board, are ignored.
 _CENTER: Final = 0.5  # OpenCV measures pixels from the center of the first one, we from the picture's corner
-_MAX_BASELINE: Final = 5.0  # [m]
+_MAX_BASELINE: Final = 5.0  # largest distance of the cameras of a pair [m]
 _ENTRY: Final = re.compile(r"^[\"']?([A-Za-z_][\w .-]*?)[\"']?[ \t]*:(?=\s)", re.M)
 _DATA: Final = re.compile(r"\bdata[\"']?[ \t]*:[ \t]*\[([^\[\]]*)\]")
 _DASH: Final = re.compile(r"^[ \t]*-[ \t](?=[ \t]*[-+.\d\[])", re.M)
@@ -80,7 +80,7 @@ _UNREAD: Final = {
     "Camera.fx": f"a settings file of ORB-SLAM; {_ANEW}",
     "Camera1.fx": f"a settings file of ORB-SLAM; {_ANEW}",
 }
-"""What files of other programs are, by a key of theirs."""
+"""Descriptions of other programs' files, by a key that these contain."""
 _SECTION: Final = re.compile(r"^[ \t]+[\"']?(?:" + "|".join(_K) + r")[\"']?[ \t]*:(?=\s)", re.M)
 _KEY: Final = r"(?:^|[{{,])[ \t\n]{{0,99}}[\"']?{}[\"']?[ \t]*:"
 _MAX_CAMERAS: Final = 256

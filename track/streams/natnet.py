@@ -203,7 +203,7 @@ def parse_frame(
     if (markers["flags"] & _UNLABELED != 0).all():
         markers = np.concatenate([markers, np.frombuffer(in_assets, dtype=_MARKER)])
         sets = np.frombuffer(in_sets, dtype="<f4").reshape(-1, 3)
-        older = np.concatenate([older, sets[sets.any(axis=1)]])  # zeros stand for a marker that is not seen
+        older = np.concatenate([older, sets[sets.any(axis=1)]])  # A marker that is not seen has zeros.
     points, ids = _seen(markers, older)
     latency = (sent - exposed) / clock if clock and exposed else np.nan
     known = 0.0 <= latency < _LONGEST_LATENCY
