@@ -27,7 +27,7 @@ _ROBUST: Final = 2.0  # [noise] from which on residuals count less
 _BLOCK: Final = 0.5  # [s] within which residuals count as dependent
 _NOTHING: Final = 1e-2  # information on unknowns beforehand: a deviation of 10 s, m or rad
 _REGION: Final = 0.0004  # [m] standard deviation of how much thicker a region of the hand is
-_DEPENDENT: Final = 16.0  # samples of a detector's keypoints, see `Samples.dependent`
+_DEPENDENT: Final = 16.0  # number of samples that tell as much as one whose error is its own
 
 # The unknowns, before six of the pose of each span, and the standard deviation that each has beforehand. The
 # last is how much thicker than the tracked hands the filmed ones are [m]: cloth, or a measured hand's error.
@@ -119,8 +119,6 @@ class Samples(NamedTuple):
     """(N, 3): the way in which a thicker hand moves the point."""
     regions: Integers
     """(N,): part of the hand, all of which may be thicker than is known."""
-    dependent: float
-    """Number of samples that tell as much as one whose error is its own."""
     points_at: Callable[[Doubles], tuple[Doubles, Doubles]]
     """Points (N, 3) [m] and their velocities, at the times (F,) of the frames in the take."""
 
@@ -242,8 +240,7 @@ class Bundle:
         nothing = np.zeros((len(rows), 3))
         return Samples(
             frames, self.found.pixels[number[rows], keypoints], np.tile(np.eye(2), (len(rows), 1, 1)),
-            self.found.weights[number[rows], keypoints], nothing, np.zeros(len(rows), np.int64), _DEPENDENT,
-            points_at,
+            self.found.weights[number[rows], keypoints], nothing, np.zeros(len(rows), np.int64), points_at,
         )  # fmt: skip
 
     def solve(
@@ -262,13 +259,17 @@ class Bundle:
         center = np.zeros(len(start))
         center[FOCAL] = 0.1
         held = free & np.isfinite(priors)
-        weights = np.where(held, np.sqrt(samples.dependent) / priors, 0.0)
+        weights = np.where(held, np.sqrt(_DEPENDENT) / priors, 0.0)
         scale = np.where(np.isfinite(priors), priors, 0.1)
+
+        far = self.residuals(start, samples, spans, noise)[0]
+        inlying = None if first or not samples.outward.any() else 1.0 / np.sqrt(1.0 + (far / _ROBUST) ** 2)
 
         def linearized(part: Doubles) -> tuple[Doubles, Doubles]:
             unknowns = start.copy()
             unknowns[free] = part
-            return self.residuals(unknowns, samples, spans, noise)
+            found = self.residuals(unknowns, samples, spans, noise)
+            return found if inlying is None else _without_regions(*found, inlying, samples.regions)
 
         def residuals(part: Doubles) -> Doubles:
             prior = np.zeros(len(start))
@@ -281,11 +282,19 @@ class Bundle:
             rows = linearized(part)[1].reshape(-1, len(start))
             return np.concatenate([rows, prior])[:, free]
 
+        def loss(squares: Doubles) -> Doubles:
+            """Cauchy's, but for what is known beforehand, which no residual may outweigh."""
+            beyond = 1.0 + squares
+            rho = np.stack([np.log(beyond), 1.0 / beyond, -1.0 / beyond**2])
+            known = slice(len(squares) - int(held.sum()), None)
+            rho[:, known] = np.stack([squares, np.ones(len(squares)), np.zeros(len(squares))])[:, known]
+            return rho
+
         done = least_squares(
             residuals,
             start[free],
             jacobian,
-            loss="cauchy",
+            loss=loss,
             f_scale=_ROBUST,
             x_scale=scale[free],
             max_nfev=40,
@@ -340,23 +349,38 @@ class Bundle:
     def _covariance(
         self, residuals: Doubles, jacobian: Doubles, priors: Doubles, samples: Samples
     ) -> Doubles:
-        """Covariance of the unknowns.
-
-        Residuals within a block of time are dependent, those of others not. And all of a region of the hand
-        may be thicker throughout (the considered parameters of Schmidt 1966).
-        """
+        """Covariance of the unknowns; residuals within a block of time are dependent, those of others not."""
         weights = 1.0 / (1.0 + (residuals / _ROBUST) ** 2)
         rows = jacobian.reshape(-1, jacobian.shape[-1])
         information = (rows * weights.reshape(-1, 1)).T @ rows + np.diag(priors)
-        thicker = jacobian[:, :, THICKER]
-        scatter = samples.dependent * np.diag(priors)
+        gradients = (jacobian * (weights * residuals)[..., None]).sum(axis=1)
         blocks = np.floor(self.found.times[samples.frames] / _BLOCK).astype(np.int64)
-        for values, groups, size in ((residuals, blocks, 1.0), (thicker, samples.regions, _REGION)):
-            gradients = (jacobian * (weights * values)[..., None]).sum(axis=1)
-            order = np.argsort(groups, kind="stable")
-            firsts = np.flatnonzero(np.diff(groups[order], prepend=groups.min() - 1))
-            sums = size * np.add.reduceat(gradients[order], firsts, axis=0)
-            scatter = scatter + sums.T @ sums
+        sums = _sums(gradients, blocks)[0]
         nothing = _NOTHING * np.eye(len(priors))  # or what is not told at all would have no deviation
         inverse = np.linalg.inv(information + nothing)
-        return np.asarray(inverse @ (scatter + nothing) @ inverse)
+        scatter = sums.T @ sums + _DEPENDENT * np.diag(priors) + nothing
+        return np.asarray(inverse @ scatter @ inverse)
+
+
+def _sums(values: Doubles, groups: Integers) -> tuple[Doubles, Integers]:
+    """Sums (G, ...) of the values (N, ...) of each group, and the row (N,) of each value's sum."""
+    _, rows = np.unique(groups, return_inverse=True)
+    order = np.argsort(rows, kind="stable")
+    return np.add.reduceat(values[order], np.flatnonzero(np.diff(rows[order], prepend=-1)), axis=0), rows
+
+
+def _without_regions(
+    residuals: Doubles, jacobian: Doubles, inlying: Doubles, regions: Integers
+) -> tuple[Doubles, Doubles]:
+    """Residuals (N, 1) and derivatives, weighted, without what regions that are thicker have in common.
+
+    Their covariance is that of independent ones again, if thicknesses have the deviation `_REGION`.
+    """
+    residuals, jacobian = residuals * inlying, jacobian * inlying[..., None]
+    thicker = _REGION * jacobian[..., THICKER]
+    rows = np.concatenate([residuals[..., None], jacobian], axis=2)
+    size, group = _sums(thicker[:, 0] ** 2, regions)
+    kept = (1.0 - 1.0 / np.sqrt(1.0 + size)) / np.maximum(size, 1e-9)
+    common = kept[:, None] * _sums(thicker * rows[:, 0], regions)[0]
+    rows = rows - (thicker * common[group])[:, None]
+    return rows[..., 0], rows[..., 1:]

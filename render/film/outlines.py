@@ -8,12 +8,13 @@ and Reid 2012, Int. J. Comput. Vis. 98:335; Stoiber et al. 2022, Int. J. Comput.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import cv2
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
+from gloves.fit import GloveFit
 from gloves.takes.take import Take
 from handsim.hand.model import between_poses
 from handsim.space.camera import Camera
@@ -30,7 +31,6 @@ _STEP: Final = 0.004  # [s] before and after, of velocities
 _LEVELS: Final = 5  # bits of a color's channels
 _SMOOTH: Final = 1.0  # [levels] of counts of colors
 _SUREST: Final = 3.0  # largest log-odds of a color
-_ALIKE: Final = 200.0  # edges that tell as much as one whose error is its own: a hand is wrong in all
 _DEPENDENT: Final = 0.5  # share of the log-odds of neighboring pixels that counts
 _CONTRAST: Final = 0.6  # least mean log-odds on both sides of an edge
 _BESIDE: Final = 5  # [px] of each side that this mean is over
@@ -40,7 +40,8 @@ _LINEAR: Final = (np.linspace(0.0, 1.0, 256, dtype=np.float32) ** 2.2)[:, None]
 _FEWEST_PIXELS: Final = 30  # of a region whose colors are counted
 _AROUND: Final = 14  # [px] beyond the reach, of the colors around a hand
 _BLUR: Final = 0.3  # [px] least deviation of an edge
-_ARM: Final = 6.0  # [px] least distance of the outline from the forearm, where the wrist bends
+_ARM: Final = 0.02  # [m] least distance of the outline from the forearm, where the wrist bends
+_BALL: Final = 0.004  # [m] least distance from the markers of a glove, which may be worn
 _EDGE: Final = 3.0  # [px] least distance from the edge of the picture
 _OTHER: Final = 4.0  # [px] least distance from other hands and things
 
@@ -71,7 +72,8 @@ class Edges(NamedTuple):
 
     def thinned(self, most: int) -> Edges:
         """This many at most, evenly."""
-        return Edges(*(values[:: 1 + len(values) // most] for values in self))
+        kept: list[Any] = [values[:: 1 + len(values) // most] for values in self]
+        return Edges(*kept)
 
     def samples(self, bundle: Bundle) -> Samples:
         """The edges for a bundle."""
@@ -86,7 +88,7 @@ class Edges(NamedTuple):
             return self.points + self.velocities * late, self.velocities
 
         return Samples(
-            self.frames, pixels, normals[:, None], self.weights / length, self.outward, self.regions, _ALIKE,
+            self.frames, pixels, normals[:, None], self.weights / length, self.outward, self.regions,
             points_at,
         )  # fmt: skip
 
@@ -96,7 +98,8 @@ class Outlines:
 
     def __init__(self, take: Take, size: tuple[int, int]) -> None:
         self._take, self._scale = take, min(1.0, _WIDEST / max(size))
-        self._size = tuple(max(1, round(self._scale * side)) for side in size)
+        width, height = (max(1, round(self._scale * side)) for side in size)
+        self._size = width, height
         self._skins = [PosableSkin(hand.model, bony=0.5) for hand in take.hands]
         self._bodies = [BodyFigure(body, (0.5, 0.5, 0.5)) for body in take.bodies]
         self._seen = np.zeros((len(take.hands), 1 << 3 * _LEVELS))  # counts of the hands' colors
@@ -135,22 +138,23 @@ class Outlines:
         tried, radius = np.zeros(moments.shape, dtype=np.int64), max(3, round(reach * self._size[0]))
         least, parts = np.full(moments.shape, np.nan), []
         for frame, picture in looks:
-            there = np.flatnonzero(np.isfinite(qpos[frame, :, :, 0]).all(axis=1))
-            if not len(there):
+            there = np.flatnonzero(np.isfinite(qpos[frame, :, :, 0]).all(axis=1)).tolist()
+            if not there:
                 continue
             camera = cameras[spans[frame]]
             drawn = [self._hand(hand, qpos[frame, hand, 0]) for hand in there]
             drawn += self._things(bodies[frame])
             truth = see(camera, drawn, with_normals=False)
             for hand in there:
-                outline = _outline(truth, hand, camera)
+                outline = _outline(truth, hand, camera, take.hands[hand], qpos[frame, hand, 0])
                 if outline is None:
                     continue
                 tried[frame, hand] = len(outline.pixels)
                 chosen, offsets, spreads, least[frame, hand] = self._across(
                     picture, truth, hand, outline, radius
                 )
-                outline = _Outline(*(values[chosen] for values in outline))
+                kept: list[Any] = [values[chosen] for values in outline]
+                outline = _Outline(*kept)
                 count = len(offsets)
                 velocities, regions = self._moved(hand, qpos[frame, hand], outline)
                 parts.append(Edges(
@@ -218,7 +222,7 @@ class Outlines:
         if deep.sum() < _FEWEST_PIXELS or around.sum() < _FEWEST_PIXELS:
             return np.empty(0, np.int64), np.empty(0), np.empty(0), np.nan
         self._seen[hand] += np.bincount(colors[deep], minlength=self._seen.shape[1])
-        beside = np.bincount(colors[around], minlength=self._seen.shape[1])
+        beside = np.bincount(colors[around], minlength=self._seen.shape[1]).astype(np.float64)
         odds = np.log(_shares(self._seen[hand]) / _shares(beside)).clip(-_SUREST, _SUREST)
         table = odds.astype(np.float32)[colors]
         within = mine & (inside > 1.5)
@@ -258,8 +262,8 @@ class _Outline(NamedTuple):
     bones: Integers
 
 
-def _outline(truth: Geometry, hand: int, camera: Camera) -> _Outline | None:
-    """Points of a drawn hand's outline, without its wrist and what is beside other things."""
+def _outline(truth: Geometry, hand: int, camera: Camera, fit: GloveFit, qpos: Doubles) -> _Outline | None:
+    """Points of a drawn hand's outline, without its wrist and what is beside markers and other things."""
     mine = truth.instances == 1 + hand
     left, top, width, height = cv2.boundingRect(mine.view(np.uint8))
     if width < 8 or height < 8:
@@ -268,11 +272,12 @@ def _outline(truth: Geometry, hand: int, camera: Camera) -> _Outline | None:
     high = np.minimum([left + width + 8, top + height + 8], camera.size)
     part = (slice(low[1], high[1]), slice(low[0], high[0]))
     mine, instances = np.ascontiguousarray(mine[part]), truth.instances[part]
+    scale = camera.focal_length / float(truth.depth[part][mine].mean())  # [px/m]
     arm = truth.parts[part] == 1 + PARTS_A_HAND * hand + FOREARM
     other = ~mine & (instances > 0)
     nearby = cv2.dilate((instances == 0).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     rim = mine & nearby & ~arm
-    for away, flags in ((_ARM, arm), (_OTHER, other)):
+    for away, flags in ((_ARM * scale, arm), (_OTHER, other)):
         if flags.any():
             rim &= cv2.distanceTransform((~flags).astype(np.uint8), cv2.DIST_L2, 3) > away
     soft = cv2.GaussianBlur(mine.astype(np.float32), (0, 0), 1.0)
@@ -292,6 +297,8 @@ def _outline(truth: Geometry, hand: int, camera: Camera) -> _Outline | None:
     rays /= rays[..., 2:]
     good = (size > 0.1) & ((pixels > _EDGE) & (pixels < np.array(camera.size) - _EDGE)).all(axis=1)
     good &= np.isfinite(rays).all(axis=(0, 2))
+    balls = pixels[:, None] - camera.project(fit.markers(qpos[None])[0][0])
+    good &= (np.linalg.norm(balls, axis=2) > (fit.layout.radius + _BALL) * scale).all(axis=1)
     if good.sum() < 10:
         return None
     pixels, normals, rows, columns, rays = (

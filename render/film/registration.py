@@ -56,7 +56,7 @@ _BESIDE: Final = -0.7  # mean log-odds of the colors of a bone that is not where
 _MOST_LOOKED: Final = 150  # frames whose outlines are looked for
 _REACHES: Final = (0.04, 0.02, 0.01, 0.01)  # [widths] within which an edge is looked for, one after the other
 _FIRST_NOISE: Final = 2.0  # [px] of edges
-_MOST_EDGES: Final = 3000  # in a bundle
+_MOST_EDGES: Final = 12000  # in a bundle
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -250,15 +250,10 @@ def _outlined(
         unknowns, _, covariance = bundle.solve(unknowns, samples, starts, noise, first=turn == 0)
         left = bundle.residuals(unknowns, samples, spans, 1.0)[0]
         noise = max(0.3, float(np.median(np.abs(left))) / 0.6745)
-        if DEBUG is not None:
-            DEBUG(turn, bundle, unknowns, starts, edges, noise, covariance)
     every = ((n, outlines.shrunk(one[2])) for n, one in enumerate(pictures()))
     edges, tried, least = outlines.edges(bundle, unknowns, starts, every, _REACHES[1])
     fit = _keypoint_fit(bundle, unknowns, starts)
     return unknowns, covariance, fit if edges is None else _outline_fit(bundle, edges, tried, least, fit)
-
-
-DEBUG = None
 
 
 def _split(bundle: Bundle, unknowns: Doubles, starts: list[int], noise: float) -> tuple[Doubles, list[int]]:
@@ -348,26 +343,27 @@ def _keypoint_fit(bundle: Bundle, unknowns: Doubles, starts: Sequence[int]) -> _
     number = matches.numbers[frames, hands]
     rows, keypoints = np.nonzero(bundle.found.weights[number] > 0.0)
     places = bundle.found.pixels[number[rows], keypoints]
-    usual = np.nanmax(np.where(np.isnan(distances).all(axis=1)[:, None], np.inf, distances), axis=1)
+    lost = np.asarray(np.isnan(distances).all(axis=1))
+    usual = np.nanmax(np.where(lost[:, None], np.inf, distances), axis=1)
     errors = places - pixels[frames[rows], hands[rows], keypoints]
     return _Fit(np.where(np.isinf(usual), np.nan, usual), reasons, places, errors)
 
 
 def _outline_fit(bundle: Bundle, edges: Edges, tried: Integers, least: Doubles, fit: _Fit) -> _Fit:
     """How well frames fit by their outlines, or by their keypoints where hardly an outline is seen."""
-    index, shape = edges.frames * tried.shape[1] + edges.hands, tried.shape
-    seen = np.bincount(index, minlength=tried.size).reshape(shape)
-    order = np.lexsort((np.abs(edges.offsets), index))
-    first = np.cumsum(seen).reshape(shape) - seen
-    away = np.append(np.abs(edges.offsets)[order], np.nan)
-    told = seen >= np.maximum(_FEWEST_EDGES, _SEEN * tried)
-    middle, most = (
-        np.where(told, away[np.minimum(first + (share * seen).astype(int), len(away) - 1)], np.nan)
-        for share in (0.5, _WITHIN)
-    )
-    bound = max(_BOUND * float(np.nanmedian(most)), 0.5 * _LEAST_BOUND * bundle.size[0])
+    index = edges.frames * tried.shape[1] + edges.hands
+    away = np.abs(edges.offsets)[np.argsort(index, kind="stable")]
+    seen = np.bincount(index, minlength=tried.size)
+    told = (seen >= np.maximum(_FEWEST_EDGES, _SEEN * tried.ravel())).reshape(tried.shape)
+    middle, most = np.full((2, *tried.shape), np.nan)
+    parts = np.split(away, np.cumsum(seen)[:-1])
+    for frame, hand in np.argwhere(told):
+        part = parts[frame * tried.shape[1] + hand]
+        middle[frame, hand], most[frame, hand] = np.quantile(part, (0.5, _WITHIN))
+    usual = float(np.nanmedian(most)) if told.any() else 0.0
+    bound = max(_BOUND * usual, 0.5 * _LEAST_BOUND * bundle.size[0])
     reasons = list(fit.reasons)
-    beside = (np.nan_to_num(least) < _BESIDE).any(axis=1)
+    beside = np.asarray((np.nan_to_num(least) < _BESIDE).any(axis=1))
     for frame in np.flatnonzero(told.any(axis=1) | beside):
         if (most[frame] > bound).any():
             reasons[frame] = f"the hand's outline is more than {bound:.1f} px off"
@@ -376,9 +372,10 @@ def _outline_fit(bundle: Bundle, edges: Edges, tried: Integers, least: Doubles, 
         elif told[frame, tried[frame] > 0].all():
             reasons[frame] = ""
     kept = np.array([not reason for reason in reasons])[edges.frames]
-    usual = np.nanmax(np.where(told.any(axis=1)[:, None], middle, np.inf), axis=1)
+    seen_at_all = np.asarray(told.any(axis=1))
+    distances = np.nanmax(np.where(seen_at_all[:, None], middle, np.inf), axis=1)
     errors = edges.offsets[kept, None] * edges.normals[kept]
-    return _Fit(np.where(np.isinf(usual), np.nan, usual), reasons, edges.pixels[kept], errors)
+    return _Fit(np.where(np.isinf(distances), np.nan, distances), reasons, edges.pixels[kept], errors)
 
 
 def _registration(

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import torch
 
-from handsim import HandSimError
 from handsim.errors import ArgumentError, WeightsError
 from handsim.hand.shape import SIDES
 from render import HandDetector, train_detector
