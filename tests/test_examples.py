@@ -11,7 +11,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 
 
-SLOW = ("05", "06", "07", "11", "14")
+SLOW = ("05", "06", "07", "11", "14", "15")
 
 
 @pytest.mark.parametrize(

@@ -1,8 +1,8 @@
-"""`Bundle`: clock, lens and poses of a camera, adjusted to the hands that a detector found in its video."""
+"""`Bundle`: clock, lens and poses of a camera, adjusted to keypoints and outlines of hands in its video."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import cv2
@@ -11,7 +11,6 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from gloves.takes.take import Take
-from handsim.hand.model import KEYPOINT_BONES
 from handsim.hand.shape import NUM_KEYPOINTS, SIDES
 from handsim.space.camera import Camera, brown_lens, camera_matrix
 from handsim.space.transforms import rigid
@@ -26,14 +25,14 @@ _SURE: Final = 0.25  # least score of a keypoint
 MOST_BUNDLED: Final = 5000  # keypoints in a bundle, and in the last one
 _ROBUST: Final = 2.0  # [noise] from which on residuals count less
 _BLOCK: Final = 0.5  # [s] within which residuals count as dependent
-_DEPENDENT: Final = 16.0  # number of keypoints that tell as much as one whose error is its own
-_MIRROR: Final = np.array([[1.0, 1.0, 1.0], [1.0, -1.0, 1.0]])  # of a right and a left hand's bones
+_NOTHING: Final = 1e-2  # information on unknowns beforehand: a deviation of 10 s, m or rad
+_REGION: Final = 0.0004  # [m] standard deviation of how much thicker a region of the hand is
+_DEPENDENT: Final = 16.0  # number of samples that tell as much as one whose error is its own
 
-# The unknowns, before six of the pose of each span, and the standard deviation that each has beforehand.
-OFFSET, DRIFT, READOUT, FOCAL, _CENTER, _LENS, _BIAS, POSES = 0, 1, 2, 3, 4, 6, 8, 8 + 3 * NUM_KEYPOINTS
-_PRIORS: Final = np.concatenate([
-    [np.inf, 1e-4, 0.015, 0.7, 0.005, 0.005, 0.05, 0.05], np.full(3 * NUM_KEYPOINTS, 0.004)
-])  # fmt: skip
+# The unknowns, before six of the pose of each span, and the standard deviation that each has beforehand. The
+# last is how much thicker than the tracked hands the filmed ones are [m]: cloth, or a measured hand's error.
+OFFSET, DRIFT, READOUT, FOCAL, _CENTER, _LENS, THICKER, POSES = 0, 1, 2, 3, 4, 6, 8, 9
+_PRIORS: Final = np.array([np.inf, 1e-4, 0.015, 0.7, 0.005, 0.005, 0.05, 0.05, 0.0007])
 
 
 class FoundFrame(NamedTuple):
@@ -46,13 +45,12 @@ class FoundFrame(NamedTuple):
 
 
 class Motion:
-    """Keypoints of a take's hands at any time, and how their bones are turned."""
+    """Keypoints of a take's hands at any time."""
 
     def __init__(self, take: Take) -> None:
         self.times, self.num_hands = take.times, len(take.hands)
-        self._points, self._hands, self._qpos = take.keypoints(), take.hands, take.qpos
+        self._points = take.keypoints()
         self.sides = np.array([SIDES.index(side) for side in take.sides])
-        self.mirrors = _MIRROR[[0 if side == "right" else 1 for side in take.sides]]
 
     def at(self, times: Doubles) -> tuple[Doubles, Doubles]:
         """Keypoints (N, H, 21, 3) [m] and their velocities [m/s]; NaN where the take has none."""
@@ -64,16 +62,6 @@ class Motion:
         first = self._points[before]
         velocities = (self._points[after] - first) / step
         return first + velocities * (times - self.times[before])[:, None, None, None], velocities
-
-    def rotations(self, times: Doubles) -> Doubles:
-        """Rotations (N, H, 21, 3, 3) of the keypoints' bones in the frames nearest to some times."""
-        nearest = np.clip(np.searchsorted(self.times, times), 0, len(self.times) - 1)
-        turned = np.full((len(times), self.num_hands, NUM_KEYPOINTS, 3, 3), np.nan)
-        for number, hand in enumerate(self._hands):
-            there = np.isfinite(self._qpos[nearest, number, 0])
-            bones = hand.model.forward_kinematics(self._qpos[nearest[there], number])
-            turned[there, number] = bones[:, list(KEYPOINT_BONES), :3, :3]
-        return turned
 
 
 class Detections(NamedTuple):
@@ -117,13 +105,22 @@ class Matches(NamedTuple):
 
 
 class Samples(NamedTuple):
-    """Keypoints that a bundle explains."""
+    """Points of hands, and lines in pictures on which they are: two for a keypoint, one for an outline."""
 
     frames: Integers
-    hands: Integers
-    keypoints: Integers
+    """(N,)."""
     pixels: Doubles
+    """(N, 2): a point of all its lines."""
+    normals: Doubles
+    """(N, K, 2): unit normals of the lines."""
     weights: Doubles
+    """(N,)."""
+    outward: Doubles
+    """(N, 3): the way in which a thicker hand moves the point."""
+    regions: Integers
+    """(N,): part of the hand, all of which may be thicker than is known."""
+    points_at: Callable[[Doubles], tuple[Doubles, Doubles]]
+    """Points (N, 3) [m] and their velocities, at the times (F,) of the frames in the take."""
 
 
 class Bundle:
@@ -134,13 +131,17 @@ class Bundle:
     ) -> None:
         self.motion, self.found, self.size = motion, found, size
         self.given, self._middle = given, float(np.median(found.times))
-        if given is not None:  # the pictures of a pinhole camera with this matrix
-            rays = given.unproject(found.pixels)
-            pixels = rays[..., :2] / rays[..., 2:] * given.K[[0, 1], [0, 1]] + given.K[:2, 2]
-            seen = np.isfinite(pixels).all(axis=-1) & (rays[..., 2] > 0.0)
-            self.found = found._replace(
-                pixels=np.where(seen[..., None], pixels, 0.0), weights=np.where(seen, found.weights, 0.0)
-            )
+        pixels, seen = self.flat(found.pixels)
+        self.found = found._replace(pixels=pixels, weights=np.where(seen, found.weights, 0.0))
+
+    def flat(self, pixels: Doubles) -> tuple[Doubles, Flags]:
+        """Pixels (..., 2) as a pinhole camera with the given one's matrix has them, and which it has."""
+        if self.given is None:
+            return pixels, np.ones(pixels.shape[:-1], dtype=bool)
+        rays = self.given.unproject(pixels)
+        found = rays[..., :2] / rays[..., 2:] * self.given.K[[0, 1], [0, 1]] + self.given.K[:2, 2]
+        seen = np.isfinite(found).all(axis=-1) & (rays[..., 2] > 0.0)
+        return np.where(seen[..., None], found, 0.0), seen
 
     def clock(self, unknowns: Doubles) -> tuple[float, float]:
         """Offset [s] and drift of the take's time over the video's."""
@@ -161,9 +162,9 @@ class Bundle:
         return camera_matrix(focal, focal, *center)
 
     def free(self, num_spans: int, *, first: bool = False) -> Flags:
-        """The unknowns that are looked for; `first`, before the lens and the bones' offsets."""
+        """The unknowns that are looked for; `first`, before the lens and the thickness."""
         free = np.ones(POSES + 6 * num_spans, dtype=bool)
-        free[FOCAL:_BIAS] = self.given is None
+        free[FOCAL:THICKER] = self.given is None
         if first:
             free[[DRIFT, READOUT]] = False
             free[_CENTER:POSES] = False
@@ -230,9 +231,16 @@ class Bundle:
             kept = np.unique(np.linspace(0, len(frames) - 1, max(1, len(frames) * most // total)).astype(int))
             chosen = np.isin(rows, kept)
             rows, keypoints = rows[chosen], keypoints[chosen]
+        frames, hands = frames[rows], hands[rows]
+
+        def points_at(times: Doubles) -> tuple[Doubles, Doubles]:
+            points, velocities = (one[frames, hands, keypoints] for one in self.motion.at(times))
+            return points, velocities
+
+        nothing = np.zeros((len(rows), 3))
         return Samples(
-            frames[rows], hands[rows], keypoints,
-            self.found.pixels[number[rows], keypoints], self.found.weights[number[rows], keypoints],
+            frames, self.found.pixels[number[rows], keypoints], np.tile(np.eye(2), (len(rows), 1, 1)),
+            self.found.weights[number[rows], keypoints], nothing, np.zeros(len(rows), np.int64), points_at,
         )  # fmt: skip
 
     def solve(
@@ -244,10 +252,9 @@ class Bundle:
         *,
         first: bool = False,
     ) -> tuple[Doubles, float, Doubles]:
-        """Unknowns, their cost per keypoint, and their covariance, where keypoints are `noise` [px] off."""
+        """Unknowns, their cost per sample, and their covariance, where weight 1 is `noise` [px] off."""
         spans = np.searchsorted(starts, samples.frames, side="right") - 1
         free = self.free(len(starts), first=first)
-        rotations = None if first else self._turned(start, samples)
         priors = np.concatenate([_PRIORS, np.full(len(start) - POSES, np.inf)])
         center = np.zeros(len(start))
         center[FOCAL] = 0.1
@@ -255,10 +262,14 @@ class Bundle:
         weights = np.where(held, np.sqrt(_DEPENDENT) / priors, 0.0)
         scale = np.where(np.isfinite(priors), priors, 0.1)
 
+        far = self.residuals(start, samples, spans, noise)[0]
+        inlying = None if first or not samples.outward.any() else 1.0 / np.sqrt(1.0 + (far / _ROBUST) ** 2)
+
         def linearized(part: Doubles) -> tuple[Doubles, Doubles]:
             unknowns = start.copy()
             unknowns[free] = part
-            return self._residuals(unknowns, samples, spans, rotations, noise)
+            found = self.residuals(unknowns, samples, spans, noise)
+            return found if inlying is None else _without_regions(*found, inlying, samples.regions)
 
         def residuals(part: Doubles) -> Doubles:
             prior = np.zeros(len(start))
@@ -271,11 +282,19 @@ class Bundle:
             rows = linearized(part)[1].reshape(-1, len(start))
             return np.concatenate([rows, prior])[:, free]
 
+        def loss(squares: Doubles) -> Doubles:
+            """Cauchy's, but for what is known beforehand, which no residual may outweigh."""
+            beyond = 1.0 + squares
+            rho = np.stack([np.log(beyond), 1.0 / beyond, -1.0 / beyond**2])
+            known = slice(len(squares) - int(held.sum()), None)
+            rho[:, known] = np.stack([squares, np.ones(len(squares)), np.zeros(len(squares))])[:, known]
+            return rho
+
         done = least_squares(
             residuals,
             start[free],
             jacobian,
-            loss="cauchy",
+            loss=loss,
             f_scale=_ROBUST,
             x_scale=scale[free],
             max_nfev=40,
@@ -287,30 +306,21 @@ class Bundle:
         covariance = np.zeros((len(start), len(start)))
         if not first:
             left, rows = linearized(done.x)
-            told = self._covariance(left, rows[..., free], weights[free] ** 2, samples.frames)
+            told = self._covariance(left, rows, weights**2, samples)[np.ix_(free, free)]
             covariance[np.ix_(free, free)] = told
         return unknowns, 2.0 * float(done.cost) / max(len(samples.frames), 1), covariance
 
-    def _turned(self, unknowns: Doubles, samples: Samples) -> Doubles:
-        """The sampled keypoints' bones (N, 3, 3), mirrored for left hands."""
-        frames, rows = np.unique(samples.frames, return_inverse=True)
-        rotations = self.motion.rotations(self.times(unknowns)[frames])
-        found = rotations[rows, samples.hands, samples.keypoints]
-        return np.asarray(np.nan_to_num(found) * self.motion.mirrors[samples.hands][:, None])
-
-    def _residuals(
-        self, unknowns: Doubles, samples: Samples, spans: Integers, rotations: Doubles | None, noise: float
+    def residuals(
+        self, unknowns: Doubles, samples: Samples, spans: Integers, noise: float
     ) -> tuple[Doubles, Doubles]:
-        """Differences (N, 2) in units of the noise, and their derivatives (N, 2, U); 0 without a pose."""
-        points, velocities = (one[samples.frames, samples.hands, samples.keypoints]
-                              for one in self.motion.at(self.times(unknowns)))  # fmt: skip
+        """Distances (N, K) in units of the noise, and their derivatives (N, K, U); 0 without a pose."""
+        points, velocities = samples.points_at(self.times(unknowns))
         row = samples.pixels[:, 1] / self.size[1] - 0.5
-        points = points + velocities * (unknowns[READOUT] * row)[:, None]
-        if rotations is not None:
-            bias = unknowns[_BIAS:POSES].reshape(-1, 3)[samples.keypoints]
-            points = points + np.einsum("nij,nj->ni", rotations, bias)
-        residuals = np.zeros((len(points), 2))
-        jacobian = np.zeros((len(points), 2, len(unknowns)))
+        points = (
+            points + velocities * (unknowns[READOUT] * row)[:, None] + unknowns[THICKER] * samples.outward
+        )
+        residuals = np.zeros(samples.normals.shape[:2])
+        jacobian = np.zeros((*residuals.shape, len(unknowns)))
         there = np.isfinite(points).all(axis=1)
         for span in np.unique(spans):
             mine = np.flatnonzero(there & (spans == span))
@@ -319,9 +329,6 @@ class Bundle:
             rotation = Rotation.from_rotvec(unknowns[first : first + 3]).as_matrix()
             by_point = derivatives[:, :, 3:6] @ rotation
             by_time = np.einsum("nij,nj->ni", by_point, velocities[mine])
-            # Unequal weights make a plain sum of squares of the residuals.
-            weight = (samples.weights[mine] / noise)[:, None]
-            residuals[mine] = weight * (pixels - samples.pixels[mine])
             part = np.zeros((len(mine), 2, len(unknowns)))
             part[:, :, OFFSET] = by_time
             part[:, :, DRIFT] = by_time * (self.found.times[samples.frames[mine]] - self._middle)[:, None]
@@ -330,26 +337,50 @@ class Bundle:
                 focal = self.matrix(unknowns)[0, 0]
                 part[:, :, FOCAL] = derivatives[:, :, 6:8].sum(axis=2) * focal
                 part[:, :, _CENTER:_LENS] = derivatives[:, :, 8:10] * self.size[0]
-                part[:, :, _LENS:_BIAS] = derivatives[:, :, 10:12]
-            if rotations is not None:
-                by_bias = by_point @ rotations[mine]
-                columns = _BIAS + 3 * samples.keypoints[mine, None] + np.arange(3)
-                np.put_along_axis(part, np.broadcast_to(columns[:, None], by_bias.shape), by_bias, axis=2)
+                part[:, :, _LENS:THICKER] = derivatives[:, :, 10:12]
+            part[:, :, THICKER] = np.einsum("nij,nj->ni", by_point, samples.outward[mine])
             part[:, :, first : first + 6] = derivatives[:, :, :6]
-            jacobian[mine] = weight[..., None] * part
+            # Unequal weights make a plain sum of squares of the residuals.
+            lines = samples.normals[mine] * (samples.weights[mine] / noise)[:, None, None]
+            residuals[mine] = np.einsum("nki,ni->nk", lines, pixels - samples.pixels[mine])
+            jacobian[mine] = lines @ part
         return residuals, jacobian
 
     def _covariance(
-        self, residuals: Doubles, jacobian: Doubles, priors: Doubles, frames: Integers
+        self, residuals: Doubles, jacobian: Doubles, priors: Doubles, samples: Samples
     ) -> Doubles:
         """Covariance of the unknowns; residuals within a block of time are dependent, those of others not."""
         weights = 1.0 / (1.0 + (residuals / _ROBUST) ** 2)
         rows = jacobian.reshape(-1, jacobian.shape[-1])
         information = (rows * weights.reshape(-1, 1)).T @ rows + np.diag(priors)
         gradients = (jacobian * (weights * residuals)[..., None]).sum(axis=1)
-        blocks = np.floor(self.found.times[frames] / _BLOCK).astype(np.int64)
-        order = np.argsort(blocks, kind="stable")
-        firsts = np.flatnonzero(np.diff(blocks[order], prepend=blocks.min() - 1))
-        gradients = np.add.reduceat(gradients[order], firsts, axis=0)
-        inverse = np.linalg.pinv(information)
-        return np.asarray(inverse @ (gradients.T @ gradients + _DEPENDENT * np.diag(priors)) @ inverse)
+        blocks = np.floor(self.found.times[samples.frames] / _BLOCK).astype(np.int64)
+        sums = _sums(gradients, blocks)[0]
+        nothing = _NOTHING * np.eye(len(priors))  # or what is not told at all would have no deviation
+        inverse = np.linalg.inv(information + nothing)
+        scatter = sums.T @ sums + _DEPENDENT * np.diag(priors) + nothing
+        return np.asarray(inverse @ scatter @ inverse)
+
+
+def _sums(values: Doubles, groups: Integers) -> tuple[Doubles, Integers]:
+    """Sums (G, ...) of the values (N, ...) of each group, and the row (N,) of each value's sum."""
+    _, rows = np.unique(groups, return_inverse=True)
+    order = np.argsort(rows, kind="stable")
+    return np.add.reduceat(values[order], np.flatnonzero(np.diff(rows[order], prepend=-1)), axis=0), rows
+
+
+def _without_regions(
+    residuals: Doubles, jacobian: Doubles, inlying: Doubles, regions: Integers
+) -> tuple[Doubles, Doubles]:
+    """Residuals (N, 1) and derivatives, weighted, without what regions that are thicker have in common.
+
+    Their covariance is that of independent ones again, if thicknesses have the deviation `_REGION`.
+    """
+    residuals, jacobian = residuals * inlying, jacobian * inlying[..., None]
+    thicker = _REGION * jacobian[..., THICKER]
+    rows = np.concatenate([residuals[..., None], jacobian], axis=2)
+    size, group = _sums(thicker[:, 0] ** 2, regions)
+    kept = (1.0 - 1.0 / np.sqrt(1.0 + size)) / np.maximum(size, 1e-9)
+    common = kept[:, None] * _sums(thicker * rows[:, 0], regions)[0]
+    rows = rows - (thicker * common[group])[:, None]
+    return rows[..., 0], rows[..., 1:]

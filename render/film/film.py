@@ -173,9 +173,8 @@ def register_camera(
     """
     taken, film = _taken(take), Film(video)
     given = _given(camera, film.size)
-    return register(
-        taken, find_hands(film, detector or HandDetector.load(), step, progress), film.size, given
-    )
+    found = find_hands(film, detector or HandDetector.load(), step, progress)
+    return register(taken, found, film.size, given, lambda: film.frames(step))
 
 
 def _taken(take: Take | str | Path) -> Take:

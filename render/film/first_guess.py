@@ -102,8 +102,7 @@ def _posed(bundle: Bundle, samples: Samples, offset: float) -> Doubles | None:
     if len(samples.frames) < 6 * FEWEST_KEYPOINTS:
         return None
     width = bundle.size[0]
-    points = bundle.motion.at(bundle.found.times + offset)[0]
-    points = np.ascontiguousarray(points[samples.frames, samples.hands, samples.keypoints])
+    points = np.ascontiguousarray(samples.points_at(bundle.found.times + offset)[0])
     best, most = None, 0
     for focal in _FOCALS if bundle.given is None else (1.0,):
         unknowns = np.zeros(POSES + 6)

@@ -6,7 +6,7 @@ import itertools
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import cv2
 import numpy as np
@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from handsim.errors import DatasetError
-from handsim.files.arrays import read_npz
-from handsim.files.outputs import atomic_write, plain_path
+from handsim.files.outputs import plain_path
 from handsim.hand.model import HandModel
 from handsim.hand.shape import NUM_KEYPOINTS, NUM_QPOS, SIDES
 from poses import sample_poses
@@ -162,27 +161,3 @@ def read_scenes(file: Path) -> Iterator[Scene]:
         picture = np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), dtype=np.uint8)
         sides = np.array([hand.side for hand in labeled], dtype=np.int8)
         yield Scene(picture, np.stack([hand.keypoints for hand in labeled]), sides)
-
-
-def drawn_lessons(number: int, folder: Path, *, seed: int) -> tuple[Lessons, Lessons]:
-    """The lessons of `draw_scenes`, drawn or from the folder."""
-    path = folder / f"drawn-{seed}-{number:05d}.npz"
-    if not path.exists():
-        drawn = lessons_of(draw_scenes(number, seed=seed), rng=np.random.default_rng([seed, number, 1]))
-        arrays: dict[str, Any] = {}
-        for name, part in zip(("views", "squares"), drawn, strict=True):
-            arrays |= {f"{name}_{key}": getattr(part, key) for key in ("keypoints", "sides")}
-            arrays[f"{name}_lengths"] = np.array([len(file) for file in part.files])
-            arrays[f"{name}_files"] = np.concatenate(part.files)
-        with atomic_write(path) as temporary, temporary.open("wb") as file:
-            np.savez(file, **arrays)
-    stored = read_npz(path)
-    views, squares = (
-        Lessons(
-            np.split(stored[f"{name}_files"], np.cumsum(stored[f"{name}_lengths"])[:-1]),
-            stored[f"{name}_keypoints"],
-            stored[f"{name}_sides"],
-        )
-        for name in ("views", "squares")
-    )
-    return views, squares

@@ -25,16 +25,15 @@ def write_film_page(path: Path, found: Registration) -> None:
         Section("Camera and clock", html_list(doubts, "ul"), table=found.figures()),
         Section(
             "Residuals over time",
-            "Distance of the keypoints that the detector found from the take's, the median of each frame; a "
-            "line for each move of the camera.",
+            "Distance of the hands' outlines in the picture from the take's, or of keypoints where outlines "
+            "are not seen, the median of each frame; a line for each move of the camera.",
             [(picture((9.0, 2.6), _over_time, found), "Residuals over time")],
             notes=found.left_out(),
         ),
         Section(
             "Residuals over the picture",
-            "Mean difference of found keypoints from the take's, ten times as long, where there are ten or "
-            "more. A pattern tells of a lens that is not described, hands that were tracked badly, or a "
-            "detector that does not know this glove.",
+            "Mean difference of found points from the take's, ten times as long, where there are ten. "
+            "A pattern tells of a lens that is not described, or of hands that were tracked badly.",
             [(picture((6.0, 4.6), _over_picture, found), "Residuals over the picture")],
         ),
     ]

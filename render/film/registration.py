@@ -2,15 +2,15 @@
 
 The clock comes first: for each shift of it, an affine camera is fitted to the keypoints that a detector
 found. Then PnP finds the pose for a few focal lengths, and one bundle over all frames refines clock, lens and
-pose at once. Keypoints of a detector are a little off in the same way in all pictures: their offsets in the
-frames of the bones are unknowns of the bundle, too.
+pose at once. Keypoints of a detector are several pixels off. The outlines of the hands are seen within half a
+pixel, and the last bundles are of these.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -35,7 +35,8 @@ from render.film.bundle import (
     Motion,
 )
 from render.film.first_guess import GATE, UNLIKE, first_guess
-from render.frames import Doubles
+from render.film.outlines import Edges, Outlines
+from render.frames import Bytes, Doubles, Integers
 
 _FEWEST_FRAMES: Final = 20  # frames with a hand that a camera is registered with
 _MOST_AT_LAST: Final = 12000
@@ -45,6 +46,17 @@ _WORST: Final = 0.03  # [widths] of the usual median distance
 _LEAST_SHARE: Final = 0.2  # of the frames with hands that must fit
 _MOST_SPANS: Final = 4
 _SHORTEST_SPAN: Final = 45  # frames with hands
+_NO_HAND: Final = "the take has no hand then"
+_OUTSIDE: Final = "no hand of the take is in the picture"
+_NOT_FOUND: Final = "the detector found no hand there"
+_FEWEST_EDGES: Final = 15  # of a hand's outline, to say whether it fits
+_SEEN: Final = 0.4  # share of the outline that must be seen for that
+_WITHIN: Final = 0.8  # share of the edges that the bound holds for
+_BESIDE: Final = -0.7  # mean log-odds of the colors of a bone that is not where it should be
+_MOST_LOOKED: Final = 150  # frames whose outlines are looked for
+_REACHES: Final = (0.04, 0.02, 0.01, 0.01)  # [widths] within which an edge is looked for, one after the other
+_FIRST_NOISE: Final = 2.0  # [px] of edges
+_MOST_EDGES: Final = 12000  # in a bundle
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,11 +83,11 @@ class Registration:
     times: Float[np.ndarray, "F"]
     """Their times in the video [s]."""
     distances: Float[np.ndarray, "F"]
-    """Median distance of the found keypoints from the take's [px]; NaN where none were found."""
+    """Median distance of the found outlines, or keypoints, from the take's [px]; NaN where none are found."""
     reasons: tuple[str, ...]
     """Why each frame does not count; empty where it does."""
     places: Float[np.ndarray, "N 2"]
-    """Found keypoints [px] in the frames that fit."""
+    """Found points of outlines, or keypoints, [px] in the frames that fit."""
     errors: Float[np.ndarray, "N 2"]
     """Their differences from the take's [px]."""
 
@@ -97,7 +109,7 @@ class Registration:
         return [f"{self.reasons.count(reason)} frames: {reason}" for reason in told]
 
     def residual(self) -> float:
-        """Median distance of the found keypoints from the take's in the frames that count [px]."""
+        """Median distance of the found points from the take's in the frames that count [px]."""
         return float(np.median(np.linalg.norm(self.errors, axis=1))) if len(self.errors) else float("nan")
 
     def doubts(self) -> list[str]:
@@ -153,8 +165,16 @@ class Registration:
         }
 
 
+Pictures = Callable[[], Iterable[tuple[int, float, Bytes]]]
+"""Yields the number, the time and the picture of each frame in which hands were looked for."""
+
+
 def register(
-    take: Take, found: Sequence[FoundFrame], size: tuple[int, int], given: Camera | None = None
+    take: Take,
+    found: Sequence[FoundFrame],
+    size: tuple[int, int],
+    given: Camera | None = None,
+    pictures: Pictures | None = None,
 ) -> Registration:
     """The registration of a video of this size [px] in which a detector found hands.
 
@@ -163,6 +183,8 @@ def register(
         found: What was found in frames of the video, in their order.
         size: Width and height of the video [px].
         given: A camera with the lens of the video's, wherever it stands; the lens is found, too, when None.
+        pictures: The frames again, for the outlines of the hands; without them, keypoints alone tell the
+            camera, which are much coarser.
 
     Raises:
         HandSimError: Too few hands were found, or they do not move as those of the take do.
@@ -193,10 +215,45 @@ def register(
         if np.isnan(distances).all():  # the camera looks away from the hands
             raise HandSimError(UNLIKE)
         noise = max(float(np.nanmedian(distances)) / 1.177, 0.3)
-    registration = _registration(bundle, unknowns, starts, covariance, found)
-    if noise > _WORST * width or registration.reasons.count("") < _LEAST_SHARE * with_hands:
+    outlined = None if pictures is None else _outlined(bundle, take, unknowns, starts, pictures)
+    if outlined is not None:
+        unknowns, covariance, fit = outlined
+    elif noise > _WORST * width:
         raise HandSimError(UNLIKE)
-    return registration
+    else:
+        fit = _keypoint_fit(bundle, unknowns, starts)
+    if fit.reasons.count("") < _LEAST_SHARE * with_hands:
+        raise HandSimError(UNLIKE)
+    return _registration(bundle, unknowns, starts, covariance, found, fit)
+
+
+def _outlined(
+    bundle: Bundle,
+    take: Take,
+    unknowns: Doubles,
+    starts: list[int],
+    pictures: Pictures,
+) -> tuple[Doubles, Doubles, _Fit] | None:
+    """Unknowns, covariance and fit by the outlines of the hands; None where they are not seen."""
+    outlines, width, noise = Outlines(take, bundle.size), bundle.size[0], _FIRST_NOISE
+    shown = np.flatnonzero((bundle.match(unknowns, starts, GATE * width).numbers >= 0).any(axis=1))
+    if not len(shown):
+        return None
+    chosen = set(shown[np.linspace(0, len(shown) - 1, _MOST_LOOKED).astype(int)].tolist())
+    looks = [(n, outlines.shrunk(one[2])) for n, one in enumerate(pictures()) if n in chosen]
+    for turn, reach in enumerate(_REACHES):
+        edges, *_ = outlines.edges(bundle, unknowns, starts, looks, reach)
+        if edges is None or len(edges.frames) < _FEWEST_EDGES * _FEWEST_FRAMES:
+            return None
+        samples = edges.thinned(_MOST_EDGES).samples(bundle)
+        spans = np.searchsorted(starts, samples.frames, side="right") - 1
+        unknowns, _, covariance = bundle.solve(unknowns, samples, starts, noise, first=turn == 0)
+        left = bundle.residuals(unknowns, samples, spans, 1.0)[0]
+        noise = max(0.3, float(np.median(np.abs(left))) / 0.6745)
+    every = ((n, outlines.shrunk(one[2])) for n, one in enumerate(pictures()))
+    edges, tried, least = outlines.edges(bundle, unknowns, starts, every, _REACHES[1])
+    fit = _keypoint_fit(bundle, unknowns, starts)
+    return unknowns, covariance, fit if edges is None else _outline_fit(bundle, edges, tried, least, fit)
 
 
 def _split(bundle: Bundle, unknowns: Doubles, starts: list[int], noise: float) -> tuple[Doubles, list[int]]:
@@ -252,14 +309,17 @@ def _change(shifts: Doubles, starts: Sequence[int], noise: float) -> int | None:
     return best
 
 
-def _registration(
-    bundle: Bundle,
-    unknowns: Doubles,
-    starts: Sequence[int],
-    covariance: Doubles,
-    found: Sequence[FoundFrame],
-) -> Registration:
-    """The registration of solved unknowns, with the frames that fit."""
+class _Fit(NamedTuple):
+    """How well frames fit: as in `Registration`."""
+
+    distances: Doubles
+    reasons: list[str]
+    places: Doubles
+    errors: Doubles
+
+
+def _keypoint_fit(bundle: Bundle, unknowns: Doubles, starts: Sequence[int]) -> _Fit:
+    """How well frames fit by their keypoints."""
     matches = bundle.match(unknowns, starts, np.inf)
     points = bundle.motion.at(bundle.times(unknowns))[0]
     pixels = bundle.pictured(unknowns, points, starts)
@@ -271,11 +331,11 @@ def _registration(
     reasons = []
     for frame, row in enumerate(distances):
         if not tracked[frame].any():
-            reasons.append("the take has no hand then")
+            reasons.append(_NO_HAND)
         elif not (tracked[frame] & inside[frame]).any():
-            reasons.append("no hand of the take is in the picture")
+            reasons.append(_OUTSIDE)
         elif np.isnan(row).all():
-            reasons.append("the detector found no hand there")
+            reasons.append(_NOT_FOUND)
         else:
             reasons.append(f"keypoints are more than {bound:.1f} px off" if np.nanmax(row) > bound else "")
     fits = np.array([not reason for reason in reasons])
@@ -283,11 +343,53 @@ def _registration(
     number = matches.numbers[frames, hands]
     rows, keypoints = np.nonzero(bundle.found.weights[number] > 0.0)
     places = bundle.found.pixels[number[rows], keypoints]
+    lost = np.asarray(np.isnan(distances).all(axis=1))
+    usual = np.nanmax(np.where(lost[:, None], np.inf, distances), axis=1)
+    errors = places - pixels[frames[rows], hands[rows], keypoints]
+    return _Fit(np.where(np.isinf(usual), np.nan, usual), reasons, places, errors)
+
+
+def _outline_fit(bundle: Bundle, edges: Edges, tried: Integers, least: Doubles, fit: _Fit) -> _Fit:
+    """How well frames fit by their outlines, or by their keypoints where hardly an outline is seen."""
+    index = edges.frames * tried.shape[1] + edges.hands
+    away = np.abs(edges.offsets)[np.argsort(index, kind="stable")]
+    seen = np.bincount(index, minlength=tried.size)
+    told = (seen >= np.maximum(_FEWEST_EDGES, _SEEN * tried.ravel())).reshape(tried.shape)
+    middle, most = np.full((2, *tried.shape), np.nan)
+    parts = np.split(away, np.cumsum(seen)[:-1])
+    for frame, hand in np.argwhere(told):
+        part = parts[frame * tried.shape[1] + hand]
+        middle[frame, hand], most[frame, hand] = np.quantile(part, (0.5, _WITHIN))
+    usual = float(np.nanmedian(most)) if told.any() else 0.0
+    bound = max(_BOUND * usual, 0.5 * _LEAST_BOUND * bundle.size[0])
+    reasons = list(fit.reasons)
+    beside = np.asarray((np.nan_to_num(least) < _BESIDE).any(axis=1))
+    for frame in np.flatnonzero(told.any(axis=1) | beside):
+        if (most[frame] > bound).any():
+            reasons[frame] = f"the hand's outline is more than {bound:.1f} px off"
+        elif beside[frame]:
+            reasons[frame] = "the picture has other colors where a finger should be"
+        elif told[frame, tried[frame] > 0].all():
+            reasons[frame] = ""
+    kept = np.array([not reason for reason in reasons])[edges.frames]
+    seen_at_all = np.asarray(told.any(axis=1))
+    distances = np.nanmax(np.where(seen_at_all[:, None], middle, np.inf), axis=1)
+    errors = edges.offsets[kept, None] * edges.normals[kept]
+    return _Fit(np.where(np.isinf(distances), np.nan, distances), reasons, edges.pixels[kept], errors)
+
+
+def _registration(
+    bundle: Bundle,
+    unknowns: Doubles,
+    starts: Sequence[int],
+    covariance: Doubles,
+    found: Sequence[FoundFrame],
+    fit: _Fit,
+) -> Registration:
+    """The registration of solved unknowns."""
     deviations = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     offset, drift = bundle.clock(unknowns)
     pose = slice(POSES, POSES + 6)
-    with np.errstate(all="ignore"):
-        usual = np.array([np.nanmax(row) if np.isfinite(row).any() else np.nan for row in distances])
     return Registration(
         cameras=tuple(bundle.camera(unknowns, span) for span in range(len(starts))),
         starts=tuple(0 if start == 0 else found[start].number for start in starts),
@@ -304,10 +406,10 @@ def _registration(
         },
         numbers=np.array([frame.number for frame in found]),
         times=bundle.found.times,
-        distances=usual,
-        reasons=tuple(reasons),
-        places=places,
-        errors=places - pixels[frames[rows], hands[rows], keypoints],
+        distances=fit.distances,
+        reasons=tuple(fit.reasons),
+        places=fit.places,
+        errors=fit.errors,
     )
 
 

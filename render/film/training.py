@@ -2,15 +2,13 @@
 
     python -m render.film.training OUT [--samples 192000 --seed 0] [--start FOLDER] [--photographs FILE]
 
-OUT gets the weights that `HandDetector.load` reads. The drawn pictures and a checkpoint are kept beside them,
-and the same command goes on where it was stopped.
+OUT gets the weights that `HandDetector.load` reads.
 """
 
 from __future__ import annotations
 
 import io
 import sys
-import time
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -44,7 +42,7 @@ from render.film.detector import (
     square_around,
     upright,
 )
-from render.film.lessons import SCENES, VIEW_SIZE, Lessons, drawn_lessons, lessons_of, read_scenes
+from render.film.lessons import SCENES, VIEW_SIZE, Lessons, draw_scenes, lessons_of, read_scenes
 from render.film.network import FinderNetwork, KeypointNetwork
 from render.frames import Bytes, Doubles, Floats
 
@@ -56,7 +54,6 @@ _SAMPLES_A_SCENE: Final = 18  # squares that the keypoint network sees for each 
 _FINDER_SHARE: Final = 0.25  # samples of the finder over those of the keypoint network
 _SPREAD: Final = 0.06  # of the heat around a keypoint [share of the side]
 _RATE, _ADAPTING_RATE = 2e-3, 6e-4  # largest learning rates: from scratch, and from given weights
-_SAVE_EVERY: Final = 120.0  # time between checkpoints [s]
 _SMALLEST: Final = 14.0  # longer side of a hand that the finder learns [px of what it sees]
 _ASPECTS: Final = (0.75, 0.75, 0.5625, 1.0)  # shorter side of a picture over the longer one
 _FIRST_LOOK: Final = 0.35  # share of the squares that are turned anyhow; in others fingers are about up
@@ -95,10 +92,10 @@ def train_detector(
     samples: int = 192_000,
     seed: int = 0,
 ) -> Path:
-    """Train a hand detector on drawn pictures; a second call goes on where the first was stopped.
+    """Train a hand detector on drawn pictures.
 
     Args:
-        out: Folder of the weights, of the drawn pictures and of the checkpoint.
+        out: Folder of the weights.
         start: Folder of weights to begin with, or `shipped`; random ones when not given.
         photographs: File of COCO keypoints [px] of your own photographs (21 a hand, in our order), which are
             beside it or in a folder `images` there. Half of the samples are then taken from them.
@@ -110,8 +107,7 @@ def train_detector(
         The folder, for `HandDetector.load`.
 
     Raises:
-        HandSimError: The start or the photographs cannot be read, onnx is missing, or the folder has a
-            checkpoint of another training.
+        HandSimError: The start or the photographs cannot be read, or onnx is missing.
     """
     check_count("samples", samples, BATCH, 1_000_000_000)
     try:
@@ -133,11 +129,11 @@ def train_detector(
     shards = max(1, round(samples / _SAMPLES_A_SCENE / SCENES))
     parts = []
     for number in range(shards):
-        parts.append(drawn_lessons(number, folder / "pictures", seed=seed))
+        rng = np.random.default_rng([seed, number, 1])
+        parts.append(lessons_of(draw_scenes(number, seed=seed), rng=rng))
         _tell(f"\r{SCENES * (number + 1)} of {SCENES * shards} pictures are drawn")
     _tell("\n")
     drawn = [Lessons.joined(part) for part in zip(*parts, strict=True)]
-    record = f"samples {samples}, seed {seed}, start {start}, photographs {photographs}"
     plan: tuple[tuple[str, Make, Loss, float], ...] = (
         (FINDER, finder_batch, finder_loss, _FINDER_SHARE),
         (KEYPOINTS, keypoint_batch, keypoint_loss, 1.0),
@@ -145,7 +141,7 @@ def train_detector(
     for (name, make, loss, share), lessons, given in zip(plan, drawn, own, strict=True):
         steps = max(1, round(share * samples / BATCH))
         run = Run(networks[name], Course(lessons, given), make, loss, steps, seed, adapts=begun is not None)
-        run.go(folder / f"{Path(name).stem}.checkpoint", record)
+        run.go(Path(name).stem)
     for name, network in networks.items():
         export(network, folder / name)
     return folder
@@ -172,19 +168,17 @@ class Run:
         self._schedule = torch.optim.lr_scheduler.OneCycleLR(
             self._optimizer, rate, total_steps=steps + 1, pct_start=0.15
         )
-        self._adapts, self._done = adapts, 0
+        self._adapts = adapts
         self.losses: list[float] = []
 
-    def go(self, checkpoint: Path, record: str) -> None:
-        """Train to the end, from the checkpoint where there is one."""
-        self._restore(checkpoint, record)
+    def go(self, name: str) -> None:
+        """Train to the end."""
         self.network.train()
         for layer in self.network.modules():
             if self._adapts and isinstance(layer, nn.BatchNorm2d):
                 layer.eval()  # given weights hold its figures already
-        saved = time.monotonic()
-        while self._done < self._steps:
-            batch = self._make(self._course, np.random.default_rng([self._seed, self._done]))
+        for step in range(self._steps):
+            batch = self._make(self._course, np.random.default_rng([self._seed, step]))
             with torch.autocast("cpu", torch.bfloat16, enabled=BF16):
                 found = self.network(batch.pictures)
             loss = self._loss(found, batch.targets)
@@ -192,40 +186,11 @@ class Run:
             loss.backward()  # type: ignore[no-untyped-call]
             self._optimizer.step()
             self._schedule.step()
-            self._done += 1
             self.losses.append(loss.item())
-            if self._done % max(1, self._steps // 20) == 0:
+            if (step + 1) % max(1, self._steps // 20) == 0:
                 mean = float(np.mean(self.losses[-200:]))
-                _tell(f"{checkpoint.stem}: {self._done} of {self._steps} steps, loss {mean:.3f}\n")
-            if time.monotonic() - saved > _SAVE_EVERY or self._done == self._steps:
-                self._save(checkpoint, record)
-                saved = time.monotonic()
+                _tell(f"{name}: {step + 1} of {self._steps} steps, loss {mean:.3f}\n")
         self.network.eval()
-
-    def _save(self, path: Path, record: str) -> None:
-        content = {"network": self.network.state_dict(), "optimizer": self._optimizer.state_dict()}
-        stored = io.BytesIO()
-        torch.save(content | {"schedule": self._schedule.state_dict(), "record": record}, stored)
-        with atomic_write(path) as temporary:
-            temporary.write_bytes(stored.getbuffer())
-
-    def _restore(self, path: Path, record: str) -> None:
-        if not path.is_file():
-            return
-        try:
-            content = torch.load(path, weights_only=True)
-            told = content["record"]
-            if told == record:
-                self.network.load_state_dict(content["network"])
-                self._optimizer.load_state_dict(content["optimizer"])
-                self._schedule.load_state_dict(content["schedule"])
-                self._done = self._schedule.last_epoch
-        except Exception as error:  # a file can be damaged in more ways than torch names
-            raise WeightsError(f"{path} is damaged; delete it to begin this training again") from error
-        if told != record:
-            raise HandSimError(
-                f"{path} is of another training ({told}), expected {record}; give another folder"
-            )
 
 
 def recolored(picture: Bytes, rng: np.random.Generator) -> Bytes:

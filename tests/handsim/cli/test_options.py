@@ -19,7 +19,9 @@ from handsim.cli.main import _HELP, _target, load, main
 from handsim.cli.parsing import PresetCommand, _with_hints, registry
 from handsim.space.camera import pinhole
 from handsim.space.rig import CameraRig
+from render.illustrations import write_video
 from tests.handsim.space.known_rig import XCP
+from tests.render.film.filmed import SIZE, Filming, moving_take
 from tests.train.simulation.test_options import GENERATE, SIMULATE
 from track.settings import nominal_user
 from train import generate_dataset, simulate_take
@@ -39,11 +41,10 @@ ELSEWHERE = {
 SHOWN = {"view": "rig time up glove size shape hands body labeler", "glove improve": "captures"}
 """Options of what is shown and not written."""
 SEARCHED = {
-    "film": "camera passes dress every num-frames up",
     "glove improve": "keep rig minutes seed",
     "glove score": "labeler",
 }
-"""Options that are not varied: those of a search may leave its outcome as it is, one takes minutes to try."""
+"""Options that are not varied: those of a search may leave its outcome as it is."""
 SMALL = "--batch 32 --network.width 8 --network.gates 2 --network.depth 1"
 QUICK = [
     ("hand", "--out h.xml", "size XL|side left|glove dense19|actuators|shape user.json|take take.npz"),
@@ -82,6 +83,8 @@ SLOW = [
      "glove sparse13|size XL|shape user.json|hands right|body pen|labeler run|calibrate|no-smooth"),
     ("calibrate", "long.c3d --out u.json", "glove sparse13|size XL|hands right|labeler run"),
     ("demo", "--out d --num-frames 200", "seed 3|num-frames 300"),
+    ("film", "moving.npz video.mp4 --out f --format png --num-frames 2 --workers 1",
+     "camera lens.toml|passes rgb depth|dress skin|every 2|num-frames 3|up y"),
     ("glove score", "starter6 --out s.html --num-frames 100 --captures 0",
      "rig six|motion twins|num-frames 140|captures 1|seed 3"),
     ("glove improve", "starter6 --out i.toml --minutes 0.02 --captures 0",
@@ -160,6 +163,12 @@ def files(tmp_path_factory) -> Path:
 
 def written(command: str, line: str, files: Path, folder: Path) -> dict[str, object]:
     """What a command writes, run in a folder of copies of the files."""
+    if command == "film" and not (files / "video.mp4").exists():
+        filming, take = Filming(seed=21, seconds=8.0, rate=8.0, readout=0.0), moving_take()
+        take.save(files / "moving.npz")
+        pictures = filming.pictures(take, "skin")
+        write_video(files / "video.mp4", iter(pictures), rate=filming.rate, size=SIZE)
+        CameraRig("lens", (filming.cameras()[0],)).save(files / "lens.toml")
     shutil.copytree(files, folder)
     before = set(folder.rglob("*"))
     with pytest.MonkeyPatch.context() as patch:

@@ -15,6 +15,7 @@ from handsim.hand.model import between_poses
 from handsim.hand.shape import Side
 from handsim.space.camera import camera_matrix
 from handsim.space.transforms import rigid
+from render import RenderConfig, draw
 from render.film.bundle import FoundFrame
 from render.film.detector import FoundHand
 
@@ -95,6 +96,18 @@ class Filming:
                 hands.append(found_hand("right", camera.project(strange[number, 0])))
             frames.append(FoundFrame(number, float(time), hands))
         return frames
+
+    def pictures(self, take: Take, dress: str = "glove") -> list[np.ndarray]:
+        """What the camera sees."""
+        times = np.arange(int(self.seconds * self.rate)) / self.rate
+        qpos = between_poses(take.times, self.offset + times, take.qpos, take.rate)
+        config = RenderConfig(passes=("rgb",), dress=dress, painter="compiled", seed=self.seed, vary="shard")
+        shown, drawn = Take.of_poses(take.hands, qpos, rate=self.rate, times=times), []
+        for camera, chosen in zip(self.cameras(), (times < self.bump, times >= self.bump), strict=True):
+            some = np.flatnonzero(chosen)
+            frames = draw(shown, camera=camera, frames=some, config=config)
+            drawn += [frame.rgb if frame.noisy.rgb is None else frame.noisy.rgb for frame in frames]
+        return drawn
 
     def _points(self, take: Take, times: np.ndarray) -> np.ndarray:
         qpos = between_poses(take.times, self.offset + times, take.qpos, take.rate)

@@ -44,6 +44,28 @@ def test_a_hidden_camera_is_found(case):
     assert found.reasons.count("") > 0.25 * len(found.reasons)
 
 
+@pytest.mark.parametrize("dress", ["glove", "skin"])
+def test_outlines_tell_the_camera_within_its_bounds(dress):
+    """Keypoints are 10 px off, and the take has a finger bent wrongly for a second."""
+    filming = Filming(seed=31, seconds=9.0, rate=8.0, noise=10.0, readout=0.0)
+    take = moving_take()
+    frames, pictures = filming.found(take), filming.pictures(take, dress)
+    qpos = take.qpos.copy()
+    qpos[(take.times > 6.0) & (take.times < 7.0), 0, 12:16] += 0.9
+    wrong = Take.of_poses(take.hands, qpos, rate=take.rate)
+    looks = [(frame.number, frame.time, picture) for frame, picture in zip(frames, pictures, strict=True)]
+    found = register(wrong, frames, SIZE, pictures=lambda: looks)
+    turn, away, focal = errors(found.cameras[0], filming.cameras()[0])
+    assert turn < 0.2 and away < 3.0 and focal < 0.6
+    assert clock_error(found, filming) < 1.5 and found.residual() < 1.0
+    bent = [6.1 < filming.offset + frame.time < 6.9 for frame in frames]
+    assert all(reason for reason, is_bent in zip(found.reasons, bent, strict=True) if is_bent)
+    assert (
+        np.mean([not reason for reason, is_bent in zip(found.reasons, bent, strict=True) if not is_bent])
+        > 0.7
+    )
+
+
 def test_a_push_makes_two_spans():
     take, filming = moving_take(), Filming(seed=6, bump=6.0)
     found = register(take, filming.found(take), SIZE)

@@ -1,0 +1,60 @@
+"""Teach the hand detector your gloves, with a video of a tracked take.
+
+    python examples/15_teach_the_detector_your_gloves.py [TAKE VIDEO SAMPLES]     # 20,000 samples, say
+
+It learns from the first half of the video, beside drawn pictures; the second half tells what that brought.
+"""
+
+import json
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from handsim import look_at
+from handsim.hand.shape import SIDES
+from handsim.space.camera import pinhole
+from render import HandDetector, annotate_film, draw, train_detector
+from render.film.lessons import read_scenes
+from render.illustrations import write_video
+from train import simulate_take
+
+
+def short_video(folder: Path) -> tuple[Path, Path]:  # by a camera that nobody knows
+    take = simulate_take(num_frames=960, seed=5)
+    middle = np.nanmedian(take.keypoints().reshape(-1, 3), axis=0)
+    camera = pinhole("phone", (640, 480), 600.0).at(look_at(middle + np.array([0.7, -0.3, 0.5]), middle))
+    frames = draw(take, camera=camera, frames=range(0, 960, 12), dress="glove", passes=("rgb",), vary="shard")
+    write_video(folder / "video.mp4", (frame.rgb for frame in frames), rate=10.0, size=camera.size)
+    take.save(folder / "take.npz")
+    return folder / "take.npz", folder / "video.mp4"
+
+
+def share_found(detector: HandDetector, file: Path) -> float:
+    """Share of the keypoints that are found within a tenth of their hand's box [%]."""
+    near = []
+    for picture, keypoints, sides in read_scenes(file):
+        low, high = np.nanmin(keypoints, axis=1), np.nanmax(keypoints, axis=1)
+        hands = detector.refine(picture, np.hstack([low, high - low]), [SIDES[n] for n in sides])
+        away = np.linalg.norm([hand.keypoints for hand in hands] - keypoints, axis=2)
+        near += (away < 0.1 * (high - low).max(axis=1, keepdims=True)).ravel().tolist()
+    return 100.0 * float(np.mean(near))
+
+
+with tempfile.TemporaryDirectory() as temporary:
+    folder = Path(temporary)
+    take, video = map(Path, sys.argv[1:3]) if sys.argv[1:] else short_video(folder)
+    photographs = folder / "photographs"
+    found = annotate_film(take, video, photographs, "coco", passes=("rgb",), workers=1)
+    print(f"{found.residual():.1f} px off; {found.left_out()}")
+    content, files = json.loads((photographs / "annotations.json").read_text("utf-8")), []
+    middle = content["images"][len(content["images"]) // 2]["id"]
+    for late in (False, True):
+        half = [one for one in content["annotations"] if (one["image_id"] >= middle) == late]
+        files.append(photographs / f"half{late}.json")
+        files[-1].write_text(json.dumps(content | {"annotations": half}))
+    samples = int(sys.argv[3]) if sys.argv[1:] else 64
+    taught = train_detector(folder / "taught", start="shipped", photographs=files[0], samples=samples)
+    shares = (share_found(HandDetector.load(one), files[1]) for one in (None, taught))
+    print("keypoints found before and after: {:.1f} % {:.1f} %".format(*shares))
