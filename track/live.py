@@ -113,7 +113,6 @@ def track_live(
         _open_answering(address, lambda: interrupted() or monotonic() >= until, status) as stream,
         ExitStack() as stack,
     ):
-        doubt = _Doubt(stream, status)
         stack.enter_context(interrupt_flag(interrupted))  # from here on a signal keeps the frames so far
         recorder = None
         if out is not None:
@@ -123,7 +122,7 @@ def track_live(
         sizing = stack.enter_context(LiveSizing(setup))
         status.show("waiting for the first frame")
         stream.forgive()
-        pace = _Pace()
+        pace, doubt = _Pace(), ""
         for frame in stream:
             if seconds is not None and not frame.silent:
                 until = min(until, frame.arrived + seconds)
@@ -146,7 +145,8 @@ def track_live(
             if frame.silent or dropping or status.due:
                 line = _status_line(frame, tracked, stream.counts, outputs, pace)
                 status.show(line if frame.silent else wish or line, now=frame.silent or dropping)
-            doubt.tell()
+            if not doubt and (doubt := stream.point_doubt):
+                status.say(doubt)
         stream.end(until)
         counts = stream.counts
         take, step, duration = (None, 1, 0.0) if recorder is None else _written(recorder, out, counts, status)
@@ -199,19 +199,6 @@ def _recording_kept(recorder: Recorder) -> Iterator[None]:
     except KeyboardInterrupt as stop:
         recorder.close()
         raise Stopped.again(stop, f"the recording is kept in {recorder.part}") from stop
-
-
-class _Doubt:
-    """Says once what is wrong with the points of a stream."""
-
-    def __init__(self, stream: LiveStream, status: LiveStatus) -> None:
-        self._stream, self._status, self._told = stream, status, False
-
-    def tell(self) -> None:
-        """Say it as soon as it is known."""
-        if not self._told and (doubt := self._stream.point_doubt):
-            self._told = True
-            self._status.say(doubt)
 
 
 class _Pace:
