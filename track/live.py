@@ -128,7 +128,7 @@ def track_live(
                 until = min(until, frame.arrived + seconds)
             if interrupted() or frame.arrived > until:
                 break
-            tracked = tracker.step(frame.points, frame.ids, frame.time)
+            tracked = sizing.eased(tracker.step(frame.points, frame.ids, frame.time), tracker)
             for output in outputs:
                 output.send(frame, tracked)
             pace.add(frame)
