@@ -259,13 +259,6 @@ def _notes(counts: dict[str, int], step: int, pace: _Pace, interval: float) -> I
         yield f"the following figures are of one half second in {step}"
 
 
-def _silence_line(counts: dict[str, int]) -> str:
-    """A line on a stream from which no frame comes."""
-    if foreign := counts.get(_FOREIGN):
-        return f"no frames arrive, but {foreign} packets of other senders; is this the right port?"
-    return "no frames arrive; is the server playing?"
-
-
 def _status_line(
     frame: StreamedFrame,
     tracked: TrackedFrame,
@@ -275,7 +268,8 @@ def _status_line(
 ) -> str:
     """A line on the status of a live stream."""
     if frame.silent:
-        return _silence_line(counts)
+        foreign = f", but {counts.get(_FOREIGN)} packets of other senders; is this the right port?"
+        return f"no frames arrive{foreign if counts.get(_FOREIGN) else '; is the server playing?'}"
     words = [f"{hand.side} {hand.status}" for hand in tracked.hands]
     words += [f"{body.name} {body.status}" for body in tracked.bodies]
     rms = [hand.rms for hand in tracked.hands if np.isfinite(hand.rms)]

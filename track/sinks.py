@@ -484,7 +484,7 @@ class WebSocketSink:
         quiet = logging.getLogger("handsim.websocket")  # invalid requests are not the user's mistakes
         quiet.setLevel(logging.CRITICAL + 1)
         return await self._serve(
-            lambda one: self._talk(one, only_asked=_path_of(one.request) == _ON_REQUEST),
+            lambda one: self._talk(one, only_asked=one.request.path == _ON_REQUEST),
             sock=self._socket,
             origins=self._origins,
             process_request=_refuse_other_paths,
@@ -566,15 +566,11 @@ class WebSocketSink:
                     unconfirmed.append((self._loop.time(), await connection.ping()))
 
 
-def _path_of(request: Any) -> str:
-    """The path that a client asks for, without a slash at its end."""
-    return str(request.path.partition("?")[0].rstrip("/"))
-
-
 def _refuse_other_paths(connection: Any, request: Any) -> Any:
     """Refuse a misspelled /newest: its client expects to ask, and would get a stream."""
-    is_known = _path_of(request) in ("", _ON_REQUEST)
-    return None if is_known else connection.respond(HTTPStatus.NOT_FOUND, f"expected / or {_ON_REQUEST}\n")
+    request.path = request.path.partition("?")[0].rstrip("/")
+    known = request.path in ("", _ON_REQUEST)
+    return None if known else connection.respond(HTTPStatus.NOT_FOUND, f"expected / or {_ON_REQUEST}\n")
 
 
 class LineSink(WebSocketSink):
