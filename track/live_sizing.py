@@ -88,11 +88,10 @@ class LiveSizing(Closing):
         """The frame to show: a new size may find a hand in another pose, to which it goes in small steps."""
         before, self._shown_last = self._shown_last, tracked
         if self._is_easing and before is not None:
-            pairs = zip(before.hands, tracked.hands, tracker.hands, strict=True)
             span = tracked.time - before.time
+            pairs = zip(before.hands, tracked.hands, tracker.hands, strict=True)
             hands = tuple(_eased(last, hand, span, fit.model) for last, hand, fit in pairs)
-            is_eased = any(one is not hand for one, hand in zip(hands, tracked.hands, strict=True))
-            self._is_easing = is_eased or not self.is_settled
+            self._is_easing = hands != tracked.hands or not self.is_settled
             self._shown_last = dataclasses.replace(tracked, hands=hands)
         return self._shown_last
 
