@@ -113,7 +113,6 @@ def track_live(
         _open_answering(address, lambda: interrupted() or monotonic() >= until, status) as stream,
         ExitStack() as stack,
     ):
-        doubt = _Doubt(stream, status)
         stack.enter_context(interrupt_flag(interrupted))  # From here on a signal keeps the frames so far.
         recorder = None
         if out is not None:
@@ -123,13 +122,13 @@ def track_live(
         sizing = stack.enter_context(LiveSizing(setup))
         status.show("waiting for the first frame")
         stream.forgive()
-        pace = _Pace()
+        pace, doubt = _Pace(), ""
         for frame in stream:
             if seconds is not None and not frame.silent:
                 until = min(until, frame.arrived + seconds)
             if interrupted() or frame.arrived > until:
                 break
-            tracked = tracker.step(frame.points, frame.ids, frame.time)
+            tracked = sizing.eased(tracker.step(frame.points, frame.ids, frame.time), tracker)
             for output in outputs:
                 output.send(frame, tracked)
             pace.add(frame)
@@ -146,7 +145,8 @@ def track_live(
             if frame.silent or dropping or status.due:
                 line = _status_line(frame, tracked, stream.counts, outputs, pace)
                 status.show(line if frame.silent else wish or line, now=frame.silent or dropping)
-            doubt.tell()
+            if not doubt and (doubt := stream.point_doubt):
+                status.say(doubt)
         stream.end(until)
         counts = stream.counts
         take, step, duration = (None, 1, 0.0) if recorder is None else _written(recorder, out, counts, status)
@@ -199,19 +199,6 @@ def _recording_kept(recorder: Recorder) -> Iterator[None]:
     except KeyboardInterrupt as stop:
         recorder.close()
         raise Stopped.again(stop, f"the recording is kept in {recorder.part}") from stop
-
-
-class _Doubt:
-    """Reports a problem with the points of a stream once."""
-
-    def __init__(self, stream: LiveStream, status: LiveStatus) -> None:
-        self._stream, self._status, self._told = stream, status, False
-
-    def tell(self) -> None:
-        """Report the problem as soon as it is known."""
-        if not self._told and (doubt := self._stream.point_doubt):
-            self._told = True
-            self._status.say(doubt)
 
 
 class _Pace:
@@ -272,13 +259,6 @@ def _notes(counts: dict[str, int], step: int, pace: _Pace, interval: float) -> I
         yield f"the following figures are of one half second in {step}"
 
 
-def _silence_line(counts: dict[str, int]) -> str:
-    """Status line of a stream from which no frames come."""
-    if foreign := counts.get(_FOREIGN):
-        return f"no frames arrive, but {foreign} packets of other senders; is this the right port?"
-    return "no frames arrive; is the server playing?"
-
-
 def _status_line(
     frame: StreamedFrame,
     tracked: TrackedFrame,
@@ -288,7 +268,8 @@ def _status_line(
 ) -> str:
     """Status line of a live stream."""
     if frame.silent:
-        return _silence_line(counts)
+        foreign = f", but {counts.get(_FOREIGN)} packets of other senders; is this the right port?"
+        return f"no frames arrive{foreign if counts.get(_FOREIGN) else '; is the server playing?'}"
     words = [f"{hand.side} {hand.status}" for hand in tracked.hands]
     words += [f"{body.name} {body.status}" for body in tracked.bodies]
     rms = [hand.rms for hand in tracked.hands if np.isfinite(hand.rms)]

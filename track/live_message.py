@@ -39,6 +39,7 @@ _DECIMALS: Final = 6  # resolution of micrometers and microradians
 _STEP: Final = 1e-3  # [s] Velocities are differences of poses this far apart in time.
 _POSE: Final = ("side", "status", "wrist", "angles", "positions")  # entries of a hand that share one part
 _HALF: Final = len(OPENXR_JOINTS) // 2
+_HINT: Final = "a client of the path /newest gets the newest frame for each message that it sends"
 
 
 @dataclass(frozen=True, slots=True)
@@ -288,7 +289,9 @@ def document_format(
         lambda header: _divided(header_document(header, content), encode, largest),
         lambda message: _divided(frame_document(message, content), encode, largest),
         lambda: [encode({"type": "end", "schema": SCHEMA})],
-        lambda lag, count: encode({"type": "lag", "schema": SCHEMA, "lag": _known(lag), "dropped": count}),
+        lambda lag, count: encode(
+            {"type": "lag", "schema": SCHEMA, "lag": _known(lag), "dropped": count, "hint": _HINT}
+        ),
         is_text=name == "json",
     )
 

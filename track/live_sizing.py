@@ -22,7 +22,9 @@ from gloves.takes.points import Status
 from handsim.app.workers import LocalProcesses
 from handsim.callbacks import Closing
 from handsim.errors import HandSimError, HandSimWarning
-from track.frames import StreamedFrame, TrackedFrame
+from handsim.hand.model import HandModel, hand_keypoints
+from handsim.kernels import move, velocity_of
+from track.frames import StreamedFrame, TrackedFrame, TrackedHand
 from track.hand_size import hand_between, sample_frames
 from track.settings import TrackerSetup, TrackSettings
 from track.tracker import Tracker
@@ -40,6 +42,7 @@ _RECENT: Final = 1.0  # [s] time constant of the newest residual's running mean
 _JUMP: Final = 1.5  # ratio to the usual residual beyond which the hands may be another person's
 _STEP: Final = 0.002  # [m] motion of the markers of a hand at rest per step to a new size
 _FEWEST_STEPS: Final = 4  # Learned marker biases fade out in at least this many steps.
+_EASE: Final = 0.0025  # [m] by which a keypoint leaves its motion in a frame while a size is taken over
 _NICE: Final = 5  # The measuring process has a lower priority than the tracker's.
 
 
@@ -68,6 +71,8 @@ class LiveSizing(Closing):
         self._processes: LocalProcesses | None = None
         self._measuring: Future[_Measured] | None = None
         self._steps: deque[User] = deque()
+        self._shown_last: TrackedFrame | None = None
+        self._is_easing = False
 
     @property
     def is_settled(self) -> bool:
@@ -78,6 +83,17 @@ class LiveSizing(Closing):
         """Cancel a running measurement."""
         if self._processes is not None:
             self._processes.end()
+
+    def eased(self, tracked: TrackedFrame, tracker: Tracker) -> TrackedFrame:
+        """The frame to show: a new size may find a hand in another pose, to which it goes in small steps."""
+        before, self._shown_last = self._shown_last, tracked
+        if self._is_easing and before is not None:
+            span = tracked.time - before.time
+            pairs = zip(before.hands, tracked.hands, tracker.hands, strict=True)
+            hands = tuple(_eased(last, hand, span, fit.model) for last, hand, fit in pairs)
+            self._is_easing = hands != tracked.hands or not self.is_settled
+            self._shown_last = dataclasses.replace(tracked, hands=hands)
+        return self._shown_last
 
     def step(self, frame: StreamedFrame, tracked: TrackedFrame, tracker: Tracker) -> bool:
         """Process a tracked frame; return whether the tracker's hands were resized."""
@@ -101,7 +117,7 @@ class LiveSizing(Closing):
             self._begin_measuring(tracker.user)
         if not self._steps:
             return False
-        user = self._steps.popleft()
+        user, self._is_easing = self._steps.popleft(), True
         tracker.resize(user, keep=len(self._steps) / (len(self._steps) + 1))
         return True
 
@@ -166,3 +182,16 @@ def _user_between(before: User, after: User, share: float) -> User:
     """The measured user with hands interpolated towards their size."""
     hands = tuple(hand_between(*pair, share) for pair in zip(before, after, strict=True))
     return dataclasses.replace(after, hands=hands)
+
+
+def _eased(before: TrackedHand, hand: TrackedHand, span: float, model: HandModel) -> TrackedHand:
+    """A hand's pose, or one on the way to it from that which was shown `span` seconds before."""
+    if not before.has_pose or hand.status not in (Status.TRACKED, Status.COASTING):
+        return hand
+    due = move(before.qpos[None], span * np.nan_to_num(before.velocity)[None])[0]
+    ways = np.diff(hand_keypoints(model, np.stack([due, hand.qpos])), axis=0)
+    share = _EASE / max(float(np.linalg.norm(ways, axis=-1).max()), _EASE)
+    if share == 1.0:
+        return hand
+    qpos = move(due[None], share * velocity_of(due, hand.qpos, 1.0)[None])[0]
+    return dataclasses.replace(hand, qpos=qpos, velocity=before.velocity)

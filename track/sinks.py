@@ -17,6 +17,7 @@ import warnings
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, suppress
+from http import HTTPStatus
 from types import SimpleNamespace
 from typing import Any, Final
 
@@ -486,6 +487,7 @@ class WebSocketSink:
             lambda one: self._talk(one, only_asked=one.request.path == _ON_REQUEST),
             sock=self._socket,
             origins=self._origins,
+            process_request=_refuse_other_paths,
             compression=None,  # takes longer than a local network does
             max_size=_LARGEST,
             close_timeout=_FLUSH,
@@ -562,6 +564,13 @@ class WebSocketSink:
                 await connection.send(message, text=is_text)
                 if not (self._every or client.only_asked):
                     unconfirmed.append((self._loop.time(), await connection.ping()))
+
+
+def _refuse_other_paths(connection: Any, request: Any) -> Any:
+    """Refuse a misspelled /newest: its client expects to ask, and would get a stream."""
+    request.path = request.path.partition("?")[0].rstrip("/")
+    known = request.path in ("", _ON_REQUEST)
+    return None if known else connection.respond(HTTPStatus.NOT_FOUND, f"expected / or {_ON_REQUEST}\n")
 
 
 class LineSink(WebSocketSink):

@@ -12,6 +12,7 @@ import pytest
 from gloves.optics.reconstruction import number_runs
 from gloves.takes.take import keypoints_of
 from handsim.errors import ArgumentError, HandSimWarning
+from handsim.hand.model import join_qpos
 from handsim.hand.shape import NUM_QPOS
 from track import Status, StreamedFrame, TrackedFrame, TrackedHand, live_sizing
 from track.live_sizing import LiveSizing
@@ -66,7 +67,7 @@ def test_a_hand_is_measured_twice_and_no_joint_jumps():
     tracker, sizing = setup.tracker(), LiveSizing(setup)
     truth, sizes, changes, last = keypoints_of(take.hands, take.qpos)[:, 0], [], [], None
     for frame in frames_of(take, begin=60.0):
-        tracked = tracker.step(frame.points, frame.ids, frame.time)
+        tracked = sizing.eased(tracker.step(frame.points, frame.ids, frame.time), tracker)
         assert tracked.hands[0].has_pose
         off = keypoints_of(tracker.hands, tracked.hands[0].qpos[None, None])[0, 0] - truth[frame.number]
         if sizes and sizes[-1][0] > frame.number - 6:
@@ -99,7 +100,7 @@ class FakeTracker:
     """Notes the sizes that it is given."""
 
     def __init__(self, user):
-        self.user, self.sizes = user, []
+        self.user, self.hands, self.sizes = user, user.hands, []
 
     def resize(self, user, keep):
         self.user = user
@@ -139,6 +140,30 @@ def test_hands_are_measured_again_after_a_pause_and_another_user_is_taken_over_a
     shown(sizing, tracker, 73.5, 3.0, there=False, points=3)
     shown(sizing, tracker, 76.5, 1.5)
     assert len(calls) == 1 and tracker.user[0].shape.length > 0.19, "another hand"
+
+
+def test_a_hand_that_jumps_while_a_size_is_taken_over_is_shown_on_its_way(monkeypatch):
+    """The wrist moves at 0.5 m/s; from the take-over on the pose is 20 mm and 0.2 rad away from it."""
+    setup = TrackerSetup.of(TrackSettings(hands="right"))
+    sizing, tracker = LiveSizing(setup), FakeTracker(setup.user)
+    monkeypatch.setattr(live_sizing, "_measure", found(0.187)[0])
+    velocity, nobody = np.zeros(26), np.zeros((20, 3))
+    velocity[0] = 0.5
+    places, jumped = [], None
+    for number in range(round(1.3 * RATE)):
+        time, far = number / RATE, 0.0 if jumped is None else 1.0
+        qpos = join_qpos(np.full((1, 20), 0.2 * far), position=np.array([0.5 * time, 0.02 * far, 0.0]))[0]
+        hand = TrackedHand("right", Status.TRACKED, qpos, 0.001, nobody, np.arange(0), velocity=velocity)
+        tracked = TrackedFrame(time, (hand,), np.full(20, -1), np.ones(20))
+        shown = sizing.eased(tracked, tracker)
+        places.append(keypoints_of(tracker.hands, shown.hands[0].qpos[None, None])[0, 0])
+        if sizing.step(StreamedFrame(number, time, nobody, np.arange(20)), tracked, tracker):
+            jumped = number
+    moved = np.diff(places, axis=0) - [0.5 / RATE, 0.0, 0.0]
+    largest = np.linalg.norm(moved, axis=-1).max(axis=1)
+    assert jumped is not None and 0.0024 < largest.max() < 0.0026
+    assert (largest[:jumped] < 1e-9).all() and (largest[jumped + 30 :] < 1e-9).all(), "it arrives"
+    assert shown is tracked and abs(places[-1][0, 1] - 0.02) < 1e-9
 
 
 def test_another_user_is_noticed_by_the_residual_without_a_pause(monkeypatch):

@@ -7,6 +7,7 @@ import dataclasses
 import json
 import logging
 import os
+import re
 import socket
 import subprocess
 import sys
@@ -66,6 +67,7 @@ NO_ADDRESSES = ("", "osc", "http://localhost:80", "wss://localhost:1", "lsl:", "
         ("osc://localhost:0", "expected a port from 1 to 65535"),
         ("ws://localhost:99999", "expected ws://host:port"),
         ("udp://localhost:9000/path", "expected udp://host:port"),
+        ("ws://localhost:9000/newest", "expected ws://host:port without '/newest'"),
         ("udp://user@localhost:9000", "expected udp://host:port"),
         ("udp://localhost:9000?format", "expected udp://host:port"),
         ("ws://:1?format=xml", "unknown format 'xml'; valid names: json, msgpack"),
@@ -560,13 +562,15 @@ def test_a_client_that_does_not_read_gets_no_old_frames_but_the_end(message, mon
     frames = [one for one in others if one["type"] == "frame"]
     lags = [one for one in others if one["type"] == "lag"]
     assert all(one["lag"] > 0.05 and one["dropped"] > 0 for one in lags) and len(lags) >= 1
+    assert "/newest" in lags[0]["hint"]
     assert (header["type"], end["type"]) == ("header", "end")
     assert len(frames) + sink.dropped == sent
 
 
-def test_a_client_may_ask_for_the_newest_frame(message):
+@pytest.mark.parametrize("path", ["/newest", "/newest/", "/newest?who=robot"])
+def test_a_client_may_ask_for_the_newest_frame(path, message):
     sink = open_sink("ws://:0")
-    with connect(f"{url(sink)}/newest") as client:
+    with connect(url(sink) + path) as client:
         wait_for(lambda: sink.num_clients == 1)
         sink.send(message(0))
         assert received(client, 1)[0]["type"] == "header"
@@ -577,6 +581,35 @@ def test_a_client_may_ask_for_the_newest_frame(message):
             client.send("")
             assert received(client, 1)[0]["number"] == last
     sink.close()
+
+
+def test_the_client_of_the_page_runs_as_it_stands_until_the_end(message, capsys):
+    page = (Path(__file__).parents[2] / "docs" / "live_output.md").read_text()
+    (code,) = re.findall(r"^import json\nfrom websockets.*?(?=^```)", page, re.DOTALL | re.MULTILINE)
+    sink = open_sink("ws://:0")
+    client = threading.Thread(target=exec, args=(code.replace("8765", str(sink.port)), {}))
+    client.start()
+    wait_for(lambda: sink.num_clients == 1)
+    for _ in range(20):
+        sink.send(message())
+        time.sleep(0.01)
+    sink.close()
+    client.join(LONG)
+    assert not client.is_alive()
+    lines, at = capsys.readouterr().out.splitlines(), message().header.positions.index("index_tip")
+    assert len(lines) > 2
+    for line, hand in zip(lines, message().hands, strict=False):
+        side, _, tip = line.partition(" ")
+        assert side == hand.side
+        np.testing.assert_allclose(json.loads(tip), hand.positions[at], atol=1e-6)
+
+
+def test_a_misspelled_path_is_refused(sink):
+    connect(f"{url(sink)}/").close()
+    for path in ("/Newest", "/latest", "/newest/frame"):
+        with pytest.raises(InvalidStatus, match="404") as refused:
+            connect(url(sink) + path)
+        assert refused.value.response.body == b"expected / or /newest\n"
 
 
 def test_clients_hear_of_a_new_size(message):

@@ -61,6 +61,7 @@ def split_address(
         number = None
     if number is None or parts.path not in ("", "/") or parts.fragment or parts.username is not None:
         suffix = "" if port is None else f" or {scheme}://host"
+        suffix += f" without '{parts.path}'" if number is not None and parts.path else ""
         raise ArgumentError(f"'{address}' is not an address, expected {scheme}://host:port{suffix}")
     if number == 0 and not any_port:
         raise ArgumentError(f"'{address}' is not an address, expected a port from 1 to 65535")

@@ -473,10 +473,8 @@ def _join(info: ServerInfo, commands: socket.socket, url: str) -> socket.socket:
 
 
 def _send(one: socket.socket, packet: bytes, address: tuple[str, int]) -> None:
-    try:
+    with suppress(OSError):  # the network is down or a buffer is full: the packet is lost as any other may be
         one.sendto(packet, address)
-    except OSError:
-        pass  # no network or a full buffer: the packet is lost, as any other may be
 
 
 class _Received(NamedTuple):
