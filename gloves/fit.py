@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -138,6 +139,12 @@ def attach_markers(layout: MarkerLayout, model: HandModel) -> Attachment:
     return worn
 
 
+@functools.lru_cache(maxsize=64)
+def check_layout(layout: MarkerLayout) -> None:
+    """Refuse a layout that a hand of size M cannot wear, see `attach_markers`."""
+    attach_markers(layout, HandModel.named("M"))
+
+
 def _refusal(marker: MarkerPlace, other: str) -> str:
     """The error message for a marker whose place has no skin, or skin of another digit."""
     place = f"along {marker.along:g}, "
@@ -271,7 +278,11 @@ def wear(
 
     A shift is shortened until it carries its marker neither off the skin of its digit nor far over the hand,
     as from the palm around the thumb's muscle.
+
+    Raises:
+        LayoutError: A hand of size M cannot wear the glove.
     """
+    check_layout(layout)
     wanted, designed = (
         vary_layout(layout, along=along, around=around, rng=rng),
         _settled(layout, layout, model),
