@@ -13,16 +13,16 @@ from pathlib import Path
 
 import torch
 
-from benchmarks.paper.labeling_tables import measure_augmentations
 from benchmarks.record import Figures, describe, report, run
-from gloves.captures.formats import find_captures, read_markers
-from train import LabelingReport, load_labeler
+from train import LabelingReport, evaluate_labeler, load_labeler
+from train.data.batches import paper_corruption
 
 COLUMNS = (
     "slot, point, frame accuracy, occlusion and ghost precision / recall, macro F1, calibration error, "
     "error without the least sure"
 )
-NAMES = ("clean", "drops", "ghosts", "both")
+TESTS = {"clean": (0, 0), "drops": (1, 0), "ghosts": (0, 1), "both": (1, 1)}
+"""Whether markers are dropped and ghosts added."""
 
 
 def figures_of(report: LabelingReport, markers: tuple[str, ...], title: str) -> Figures:
@@ -35,7 +35,12 @@ def figures_of(report: LabelingReport, markers: tuple[str, ...], title: str) -> 
     ]
     worst = report.slot_accuracy_by_marker.argmin()
     slots = 100 * report.slot_accuracy_by_marker[worst]
+    between = {name: [100 * end for end in ends] for name, ends in report.intervals().items()}
     return {
+        "intervals": (
+            f"95 % intervals over {report.num_groups} {report.grouped_by}: slot, point, frame accuracy [%]",
+            list(between.values()),
+        ),
         "row": (f"{report.num_frames:,} frames, {title}: {COLUMNS} [%]", row),
         "worst_marker": ("the marker that is labeled worst, slots right [%]", [markers[worst], slots]),
     }
@@ -47,12 +52,13 @@ def main(
     torch.set_num_threads(1)
     print(describe("torch"))
     network = load_labeler(glove, labeler)
-    markers = read_markers(find_captures([data]), network.marker_names)[::every]
+    paper = paper_corruption(len(network.marker_names))
     print(f"[%]: {COLUMNS}")
-    reports = measure_augmentations(network, markers, seed=0)
-    for name, (test, found) in zip(NAMES, reports.items(), strict=True):
-        figures = figures_of(found, network.marker_names, f"{glove}, {test}")
-        report(save and f"{save}_{name}", figures)
+    for name, (dropped, added) in TESTS.items():
+        occlude, ghosts = dropped * paper.occlude, added * paper.ghosts
+        found = evaluate_labeler(network, data, occlude=occlude, ghosts=ghosts, every=every)
+        title = f"{glove}, occlude {occlude}, ghosts {ghosts}"
+        report(save and f"{save}_{name}", figures_of(found, network.marker_names, title))
 
 
 if __name__ == "__main__":

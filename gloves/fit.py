@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -29,8 +30,13 @@ _SUM_TOLERANCE: Final = 1e-6  # The bone weights of a marker sum to one within t
 _NORMAL_TOLERANCE: Final = 1e-3  # Normals have unit length within this.
 # The digit of each palm capsule: a metacarpal counts to its finger, the wrist to the thumb.
 _PALM_DIGITS: Final = np.array([1, 2, 3, 4, 0, 0])
-# Places tried for a marker, in this order: wanted (1), designed (0), middle of its bone's back (-1).
-_WAY_BACK: Final = (1.0, 0.75, 0.5, 0.25, 0.0, -0.125, -0.25, -0.375, -0.5, -0.625, -0.75, -0.875, -1.0)
+# From the wanted place of a marker (1) back to where it was designed (0), to the middle of its bone's back (-1),
+# and to the near end of that (-2), where fingers that overlap at zero angles have skin of their own.
+_WAY_BACK: Final = (
+    *(1.0, 0.75, 0.5, 0.25, 0.0, -0.125, -0.25, -0.375, -0.5, -0.625, -0.75, -0.875, -1.0),
+    *(-1.25, -1.5, -1.75, -2.0),
+)
+_NEAR_END: Final = 0.1  # along the bone
 _LONGEST_SLIP: Final = 0.025  # A random shift moves a marker at most this far [m].
 _SLACK: Final = 1e-9  # Tolerance of barycentric weights, so that a ray through an edge hits a face.
 
@@ -136,6 +142,12 @@ def attach_markers(layout: MarkerLayout, model: HandModel) -> Attachment:
     if missed:
         raise LayoutError(_refusal(layout.markers[missed[0]], others[missed[0]]))
     return worn
+
+
+@functools.lru_cache(maxsize=64)
+def check_layout(layout: MarkerLayout) -> None:
+    """Refuse a layout that a hand of size M cannot wear, see `attach_markers`."""
+    attach_markers(layout, HandModel.named("M"))
 
 
 def _refusal(marker: MarkerPlace, other: str) -> str:
@@ -271,7 +283,11 @@ def wear(
 
     A shift is shortened until its marker is on the skin of its digit and within `_LONGEST_SLIP` of its
     designed point.
+
+    Raises:
+        LayoutError: A hand of size M cannot wear the glove.
     """
+    check_layout(layout)
     wanted, designed = (
         vary_layout(layout, along=along, around=around, rng=rng),
         _settled(layout, layout, model),
@@ -282,7 +298,8 @@ def wear(
 def settle_glove(layout: MarkerLayout, model: HandModel) -> GloveFit:
     """Put a glove on a hand of any proportions, as designed where that is possible.
 
-    A marker that would not lie on its own digit moves towards the middle of its bone's back.
+    A marker that would lie on another digit of this hand moves towards the middle of its bone's back, and on
+    to its near end.
     """
     return GloveFit(model, _settled(layout, layout, model))
 
@@ -311,9 +328,12 @@ def _settled(
 
 
 def _on_the_way(designed: MarkerPlace, wanted: MarkerPlace, share: float) -> MarkerPlace:
-    """A place between the wanted one (1), the designed one (0), and the middle of the bone's back (-1)."""
+    """A place of `_WAY_BACK` between the wanted one, the designed one, and the near end of the bone's back."""
     if share == 1.0:
         return wanted
+    if share < -1.0:
+        along = 0.5 + (0.5 - _NEAR_END) * (share + 1.0)
+        return dataclasses.replace(designed, along=along, around=0.0, across=0.0)
     end = wanted if share >= 0.0 else dataclasses.replace(designed, along=0.5, around=0.0, across=0.0)
     values = {
         key: getattr(designed, key) + abs(share) * (getattr(end, key) - getattr(designed, key))

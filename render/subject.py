@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike, NDArray
 
-from gloves.fit import GloveFit, settle_glove
+from gloves.fit import GloveFit, check_layout, settle_glove
 from gloves.layout import MarkerLayout, load_layout
 from gloves.takes.take import Take, load_take
 from handsim._checks import check_choice, check_count, check_type
@@ -445,6 +445,7 @@ def _posed(
     record: dict[str, Any],
 ) -> Subject:
     """The subject of poses on these hands in gloves."""
+    check_layout(layout)
     hands = tuple(settle_glove(layout, HandModel(model.shape.with_side("right"))) for model in models)
     hands = tuple(fit.with_side(model.shape.side) for fit, model in zip(hands, models, strict=True))
     times = _SECOND * np.arange(len(poses.qpos)) if poses.times is None else poses.times

@@ -13,7 +13,7 @@ from gloves.layout import MarkerLayout
 from handsim.hand.shape import DIGITS, JOINTS
 from handsim.pages import NOTHING, Paint, Section, color_bar, color_scale, html_list, picture, write_sections
 from track.glove_score import METHODS, NOISE, LayoutScore, Trial
-from train.evaluation import percent
+from train.evaluation import percent, percent_between
 from train.reports.hand_plot import HAND_CAPTION, FlatHand, flat_hand, hand_picture, mistakes
 
 if TYPE_CHECKING:
@@ -68,12 +68,14 @@ def _labels_section(score: LayoutScore) -> Section:
     columns = (score.observed, score.corrupted, score.clean)
     table = [["labels [%]", "as the rig sees them", "the paper's drops and ghosts", "every marker seen"]]
     table += [
-        [title, *(percent(report.figures[name]) for report in columns)]
+        [title, *(percent_between(report.figures[name], report.interval(name)) for report in columns)]
         for title, name in (("slots right", "slot_accuracy"), ("whole frames right", "frame_accuracy"))
     ]
     accuracy, arrows = score.observed.slot_accuracy_by_marker, mistakes(score.observed.confusion)
     caption = f"{HAND_CAPTION}Arrows lead from true to given labels, wider for more points."
-    text = f"Left and right are told apart in {percent(score.sides_right)} % of the frames."
+    people = score.observed.num_groups
+    over = f" Intervals of 95 % are over {people} people." if people > 1 else ""
+    text = f"Left and right are told apart in {percent(score.sides_right)} % of the frames.{over}"
     drawn = hand_picture(score.layout, accuracy, arrows)
     return Section("Labels", text, table=table, pictures=[(drawn, caption)])
 

@@ -218,11 +218,22 @@ def score_layout(
     apart = np.linalg.norm(markers[:, :, None] - markers[:, None], axis=-1)
     near: Float[np.ndarray, "M M"] = (apart < 2.0 * layout.radius + _NEAR).mean(axis=0)
     np.fill_diagonal(near, 0.0)
+    # People differ in length; both hands of one are alike.
+    _, person = np.unique([hand.fit.shape.length for hand in hands], return_inverse=True)
+    people = np.repeat(person, [len(hand.qpos) for hand in hands])
+    seen, clean, corrupted = (
+        dataclasses.replace(report, groups=people)
+        for report in (
+            evaluate_frames(labeler, [cloud_frames(cloud)]),
+            evaluate_labeler(labeler, markers - center, nothing, rng=rng),
+            evaluate_labeler(labeler, markers - center, recipe, rng=rng),
+        )
+    )
     return LayoutScore(
         layout,
-        evaluate_frames(labeler, [cloud_frames(cloud)]),
-        evaluate_labeler(labeler, markers - center, nothing, rng=rng),
-        evaluate_labeler(labeler, markers - center, recipe, rng=rng),
+        seen,
+        clean,
+        corrupted,
         np.isfinite(observed[..., 0]).mean(axis=0),
         near,
         joint_spreads(some),

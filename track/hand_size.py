@@ -21,7 +21,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from gloves.captures.capture import spacing
-from gloves.fit import GloveFit, settle_glove
+from gloves.fit import GloveFit, check_layout, settle_glove
 from gloves.layout import MarkerLayout, list_layouts, load_layout
 from gloves.takes.points import Status
 from handsim.errors import ArgumentError, HandSimError, HandSimWarning
@@ -478,7 +478,8 @@ def _gloves() -> list[tuple[str, MarkerLayout]]:
     """Shipped gloves and those of the working folder with their names or paths, most markers first."""
     found = [(name, load_layout(name)) for name in list_layouts()]
     for path in sorted(Path().glob("*.toml"))[:_MOST_OWN]:
-        with contextlib.suppress(HandSimError):  # not a glove
+        with contextlib.suppress(HandSimError):  # a file of another kind, or a glove that no hand wears
+            check_layout(load_layout(path))
             found.append((str(path), load_layout(path)))
     return sorted(found, key=lambda one: -one[1].num_markers)
 

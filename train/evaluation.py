@@ -11,7 +11,7 @@ right ones.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import chain
 from pathlib import Path
@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from gloves.captures.capture import Capture, select_hands
-from gloves.captures.formats import find_captures, read_capture, read_markers
+from gloves.captures.formats import find_captures, read_capture, read_hands
 from gloves.layout import MarkerLayout
 from gloves.optics.ghosts import GHOST_REACH
 from gloves.takes.points import PointList
@@ -212,10 +212,22 @@ def _share(part: int, whole: int) -> float:
     return part / whole if whole else float("nan")
 
 
-def print_figures(columns: dict[str, dict[str, float]], *, title: str) -> None:
-    """Print sets of figures in percent as a table with a column for each set."""
+Intervals = Mapping[str, Sequence[float]]
+"""Lower and upper end by the name of a share."""
+
+
+def print_figures(
+    columns: dict[str, dict[str, float]], intervals: Mapping[str, Intervals] = {}, *, title: str
+) -> None:
+    """Print figures in percent as a table, a column for each set of them, with the intervals of each set."""
     shares = [
-        [name.replace("_", " "), *(percent(one[name]) for one in columns.values())]
+        [
+            name.replace("_", " "),
+            *(
+                percent_between(one[name], intervals.get(column, {}).get(name))
+                for column, one in columns.items()
+            ),
+        ]
         for name in next(iter(columns.values()))
     ]
     print_table([["figure", *(f"{name} [%]" for name in columns)], *shares], title=title)
@@ -223,6 +235,8 @@ def print_figures(columns: dict[str, dict[str, float]], *, title: str) -> None:
 
 _CHUNK: Final = 4096
 _BOOTSTRAPS: Final = 1000  # draws of people for a confidence interval
+ACCURACIES: Final = ("slot_accuracy", "point_accuracy", "frame_accuracy")
+"""The figures that have intervals."""
 CLEAN: Final = Corruption(occlude=0, ghosts=0)
 """Only the order of points is changed."""
 SEEN: Final = "as the rig sees them"
@@ -250,24 +264,53 @@ class LabelingReport:
     """Whether each slot of each frame is right."""
     marker_names: tuple[str, ...] = ()
     """Names of the M markers; label m is the marker of index m."""
-    seconds: Int[np.ndarray, "T"] | None = None
-    """The second of each frame, for labels of a take, as frames of one second are alike."""
+    num_points: Int[np.ndarray, "T"] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    """Number of points of each frame."""
+    groups: Int[np.ndarray, "T"] | None = None
+    """A number for the person of each frame; where people are unknown, for its capture or its second."""
+    grouped_by: str = "people"
+    """What these numbers are of: people, captures or seconds."""
 
-    def interval(self, people: Int[np.ndarray, "T"], marker: int | None = None) -> tuple[float, float]:
-        """The 95 % interval of the slot accuracy, by a bootstrap over at least two people or seconds.
+    @property
+    def num_groups(self) -> int:
+        """Number of people, captures or seconds."""
+        return 0 if self.groups is None else len(np.unique(self.groups))
+
+    def interval(
+        self, figure: str = "slot_accuracy", marker: int | None = None
+    ) -> tuple[float, float] | None:
+        """The 95 % interval of a share, by a bootstrap over groups of frames; None of fewer than two.
 
         Args:
-            people: Number of the person, or the second, of each frame.
-            marker: Index of a single marker to evaluate; all if not given.
+            figure: One of `ACCURACIES`.
+            marker: The index of the one marker whose slots count; all when not given.
         """
-        _, person = np.unique(people, return_inverse=True)
-        frames = np.bincount(person)
-        counted = self.right_slots if marker is None else self.right_slots[:, [marker]]
-        right = np.bincount(person, weights=counted.mean(axis=1))
-        drawn = np.random.default_rng(0).integers(len(frames), size=(_BOOTSTRAPS, len(frames)))
-        shares = right[drawn].sum(axis=1) / frames[drawn].sum(axis=1)
+        if self.groups is None or self.num_groups < 2:
+            return None
+        _, group = np.unique(self.groups, return_inverse=True)
+        frames = np.arange(len(group))
+        rights = np.bincount(np.repeat(frames, self.num_points), self.right, len(group))
+        slots = self.right_slots if marker is None else self.right_slots[:, [marker]]
+        right, count = {
+            "slot_accuracy": (slots.sum(axis=1), np.full(len(group), slots.shape[1])),
+            "point_accuracy": (rights, self.num_points),
+            "frame_accuracy": (slots.all(axis=1) & (rights == self.num_points), np.ones(len(group))),
+        }[figure]
+        sums = np.stack([np.bincount(group, one) for one in (right, count)])
+        drawn = np.random.default_rng(0).integers(self.num_groups, size=(_BOOTSTRAPS, self.num_groups))
+        shares = np.divide(*sums[:, drawn].sum(axis=2))
         low, high = np.quantile(shares, (0.025, 0.975))
         return float(low), float(high)
+
+    def intervals(self) -> dict[str, tuple[float, float]]:
+        """The intervals of all accuracies; empty with fewer than two people, captures or seconds."""
+        found = {name: self.interval(name) for name in ACCURACIES}
+        return {name: one for name, one in found.items() if one is not None}
+
+
+def percent_between(share: float, interval: Sequence[float] | None) -> str:
+    """A share in percent, and its interval in brackets if there is one."""
+    return percent(share) + ("" if interval is None else f" ({' to '.join(map(percent, interval))})")
 
 
 Frames = tuple[list[Float[np.ndarray, "N 3"]], list[Int[np.ndarray, "N"]]]
@@ -310,6 +353,7 @@ def _count(
         "error_without_least_sure": error_without(confidence[known], is_right[known]),
     }
     slots = np.array(right_slots, dtype=np.bool_).reshape(-1, num_labels)
+    num_points = np.array([len(one) for one in right[1:]], dtype=np.int64)
     by_marker = slots.sum(axis=0) / max(1, counts.frames)
     return LabelingReport(
         figures,
@@ -321,6 +365,7 @@ def _count(
         counts.numbers(),
         slots,
         names,
+        num_points,
     )
 
 
@@ -452,12 +497,21 @@ def evaluate_labeler(
         for hand in (hand for take in simulated for hand in take.hands):
             _check_markers("the take's glove", hand.layout.names, network.marker_names)
         report = evaluate_frames(network, chain.from_iterable(map(_take_frames, simulated)))
-    elif corruption == CLEAN and all(map(_is_set, given)):
-        rows = [_rows(load_dataset(one), network.marker_names)[:: settings.every] for one in given]
-        report = rig_report(network, np.concatenate(rows), rng=rng)
+        seconds = [np.tile(take.times.astype(np.int64), len(take.hands)) for take in simulated]
+        report = _grouped(report, seconds, "seconds")
+    elif all(map(_is_set, given)):
+        sets = [load_dataset(one) for one in given]
+        rows = np.concatenate([_rows(one, network.marker_names) for one in sets])[:: settings.every]
+        if corruption == CLEAN:
+            report = rig_report(network, rows, rng=rng)
+        else:
+            report = evaluate_markers(network, rows["markers"].astype(np.float64), corruption, rng=rng)
+        report = _grouped(report, [one.people() for one in sets], "people", settings.every)
     else:
-        markers = _markers(given, network.marker_names)[:: settings.every]
+        parts = _markers(given, network.marker_names)
+        markers = np.concatenate([one for one, _ in parts])[:: settings.every]
         report = evaluate_markers(network, markers, corruption, rng=rng)
+        report = _grouped(report, [seconds for _, seconds in parts], "seconds", settings.every)
     if not report.confusion[:-1].any() and not all(isinstance(one, np.ndarray) for one in given):
         raise CaptureError(
             f"nothing to count: no frame holds any of {', '.join(network.marker_names)}, expected labeled "
@@ -479,9 +533,11 @@ def _simulated_take(given: Take | str | Path) -> Take:
     return take
 
 
-def _markers(truth: Sequence[Any], names: tuple[str, ...]) -> Float[np.ndarray, "T M 3"]:
-    """True markers of all captures, sets and arrays [m], in the labeler's order."""
-    parts = []
+def _markers(
+    truth: Sequence[Any], names: tuple[str, ...]
+) -> list[tuple[Float[np.ndarray, "T M 3"], Int[np.ndarray, "T"] | None]]:
+    """True markers of captures, sets and arrays [m], in the labeler's order, and seconds of captures."""
+    parts: list[tuple[NDArray[np.float64], NDArray[np.int64] | None]] = []
     for one in truth:
         if isinstance(one, np.ndarray):
             count = len(names)
@@ -489,18 +545,40 @@ def _markers(truth: Sequence[Any], names: tuple[str, ...]) -> Float[np.ndarray, 
                 raise ArgumentError(
                     f"markers are {one.dtype} of shape {one.shape}, expected (T, {count}, 3) numbers [m]"
                 )
-            parts.append(one.astype(np.float64))
+            parts.append((one.astype(np.float64), None))
         elif isinstance(one, Capture):
-            parts += select_hands(one, names)
+            parts.append(_of_hands(select_hands(one, names), one.rate))
         elif _is_set(one):
-            parts.append(_rows(load_dataset(one), names)["markers"].astype(np.float64))
+            parts.append((_rows(load_dataset(one), names)["markers"].astype(np.float64), None))
         else:
             expected = "markers (T, M, 3) [m], a Dataset, Capture or Take, or the path of one"
             check_type("truth", one, (str, Path), expected)
-            parts.append(read_markers(find_captures([Path(one)]), names))
+            parts += [_of_hands(*read_hands(file, names)) for file in find_captures([Path(one)])]
     if not parts:
         raise CaptureError("no capture was given, expected labeled captures, folders, training sets or takes")
-    return np.concatenate(parts)
+    return parts
+
+
+def _of_hands(
+    hands: Sequence[Float[np.ndarray, "T M 3"]], rate: float
+) -> tuple[Float[np.ndarray, "T M 3"], Int[np.ndarray, "T"]]:
+    """The markers of a capture's hands [m], and the second that each frame is of."""
+    seconds = [(np.arange(len(hand)) / rate).astype(np.int64) for hand in hands]
+    return np.concatenate(hands), np.concatenate(seconds)
+
+
+def _grouped(
+    report: LabelingReport, parts: Sequence[Int[np.ndarray, "T"] | None], grouped_by: str, every: int = 1
+) -> LabelingReport:
+    """The report with the person, capture or second of each of its frames, if they are known of all parts."""
+    known = [part for part in parts if part is not None]
+    if len(known) < len(parts):
+        return report
+    if grouped_by == "seconds" and len(known) > 1:
+        known, grouped_by = [np.zeros_like(part) for part in known], "captures"
+    firsts = np.cumsum([0, *(part.max(initial=-1) + 1 for part in known)])
+    numbers = np.concatenate([first + part for first, part in zip(firsts[:-1], known, strict=True)])
+    return dataclasses.replace(report, groups=numbers[::every], grouped_by=grouped_by)
 
 
 def _is_set(given: Any) -> bool:
@@ -584,7 +662,7 @@ def evaluate_labels(labeled: Take | Capture | str | Path, truth: Take | str | Pa
     report = _count(names, zip(*by_frame, strict=True))
     report.numbers["points_of_truth_alone"] = count - int((~alone).sum())
     report.numbers["points_of_capture_alone"] = int(alone.sum())
-    return dataclasses.replace(report, seconds=actual.times.astype(np.int64))
+    return dataclasses.replace(report, groups=actual.times.astype(np.int64), grouped_by="seconds")
 
 
 def _partners(points: PointList, others: PointList) -> Int[np.ndarray, "P"]:

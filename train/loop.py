@@ -286,15 +286,16 @@ class _Run:
         settings, names = self.state.settings, self.manifest.marker_names
         labeler, paper = labeler_of(network, names), paper_corruption(len(names))
         rows, people = self.held_out[shown], self.people[shown] if len(self.people) else self.people
-        report = paper_report(labeler, rows)
+        corrupted = f"occlude {paper.occlude}, ghosts {paper.ghosts}"
         reports = {
             SEEN: rig_report(labeler, rows, rng=np.random.default_rng(0)),
-            f"occlude {paper.occlude}, ghosts {paper.ghosts}": report,
+            corrupted: paper_report(labeler, rows),
             "clean": evaluate_markers(
                 labeler, rows["markers"].astype(np.float64), CLEAN, rng=np.random.default_rng(0)
             ),
         }
-        count = len(np.unique(people))
+        if len(people):
+            reports = {name: dataclasses.replace(one, groups=people) for name, one in reports.items()}
         card = {
             "marker_names": list(names),
             "trained_on": "simulated frames only",
@@ -303,11 +304,11 @@ class _Run:
             "dataset": self.manifest.config,
             "train": settings.record() | {"devices": self.state.fabric.world_size},
             "held_out_simulated": {name: one.figures for name, one in reports.items()},
-            "held_out_people": count,
-            "held_out_intervals": {name: one.interval(people) for name, one in reports.items() if count > 1},
+            "held_out_people": reports[SEEN].num_groups,
+            "held_out_intervals": {name: one.intervals() for name, one in reports.items()},
             "curve": self.state.history.accuracies,
         }
-        return card, report
+        return card, reports[corrupted]
 
 
 class TrainingState:

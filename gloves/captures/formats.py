@@ -652,15 +652,20 @@ def find_captures(paths: Sequence[Path]) -> list[Path]:
     return files
 
 
+def read_hands(file: Path, names: Sequence[str]) -> tuple[list[Float[np.ndarray, "T M 3"]], float]:
+    """The named markers of each hand in a labeled capture [m], and its rate [Hz].
+
+    Frames in which all markers of a hand are missing are left out.
+    """
+    try:
+        capture = read_capture(file)
+        hands = select_hands(capture, names)
+    except CaptureError as error:
+        text = str(error)
+        raise CaptureError(text if text.startswith(str(file)) else f"{file}: {text}") from error
+    return [hand[np.isfinite(hand).any(axis=(1, 2))] for hand in hands], capture.rate
+
+
 def read_markers(files: Sequence[Path], names: Sequence[str]) -> Float[np.ndarray, "T M 3"]:
     """The named markers of each hand in labeled captures [m], without frames in which all are missing."""
-    hands = []
-    for file in files:
-        try:
-            hands += select_hands(read_capture(file), names)
-        except CaptureError as error:
-            text = str(error)
-            raise CaptureError(text if text.startswith(str(file)) else f"{file}: {text}") from error
-    markers = np.concatenate(hands)
-    shown: Float[np.ndarray, "T M 3"] = markers[np.isfinite(markers).any(axis=(1, 2))]
-    return shown
+    return np.concatenate([hand for file in files for hand in read_hands(file, names)[0]])

@@ -68,7 +68,11 @@ def evaluate(
     hard = f", occlude {settings.occlude}, ghosts {settings.ghosts}"
     hard = hard if settings.occlude or settings.ghosts else ""
     what = "hands in frames" if truth is None else "frames"
-    print_figures({"share": report.figures}, title=f"{report.num_frames} {what}{hard}")
+    if report.num_groups > 1:
+        hard += f"; 95 % intervals over {report.num_groups} {report.grouped_by}"
+    intervals = report.intervals()
+    found["intervals"] = intervals
+    print_figures({"share": report.figures}, {"share": intervals}, title=f"{report.num_frames} {what}{hard}")
     if truth is not None:
         found |= _against_truth(report)
     if json is not None:
@@ -81,13 +85,11 @@ def _against_truth(report: LabelingReport) -> dict[str, Any]:
     """Print the share of right slots of all markers and of each, and return their intervals."""
     from train.evaluation import percent
 
-    rows, seconds = [["marker", "slots right [%]", "95 % interval"]], report.seconds
+    rows = [["marker", "slots right [%]", "95 % interval"]]
     intervals: dict[str, tuple[float, float] | None] = {}
     shares = [report.figures["slot_accuracy"], *report.slot_accuracy_by_marker]
     for index, name in enumerate(("all", *report.marker_names)):
-        interval = None
-        if seconds is not None and seconds[0] != seconds[-1]:  # two or more seconds
-            interval = report.interval(seconds, index - 1 if index else None)
+        interval = report.interval(marker=index - 1 if index else None)
         between = "-" if interval is None else " to ".join(map(percent, interval))
         rows.append([name, percent(float(shares[index])), between])
         intervals[name] = interval

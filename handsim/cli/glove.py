@@ -159,7 +159,7 @@ def score_glove(
     check_outputs([glove, settings.rig, settings.motion], [page], ".html")
     from track import glove_score
     from track.glove_page import trial_rows, write_glove_page
-    from train.evaluation import percent
+    from train.evaluation import percent, percent_between
 
     with named_steps("getting ready") as step:
         score = glove_score.score_glove(glove, settings, on_step=step)
@@ -168,7 +168,8 @@ def score_glove(
         ("with the paper's drops and ghosts", score.corrupted),
         ("where every marker is seen", score.clean),
     ):
-        print_line(f"{percent(report.figures['slot_accuracy'])} % of the slots right {title}")
+        share = percent_between(report.figures["slot_accuracy"], report.interval())
+        print_line(f"{share} % of the slots right {title}")
     sides = f"{percent(score.sides_right)} % of the hands told left from right"
     print_line(f"{percent(score.seen.mean())} % of the markers seen; {sides}")
     joints = np.rad2deg(score.joints)

@@ -208,6 +208,8 @@ def test_a_place_in_the_web_between_fingers_is_refused_with_the_bone_it_would_be
     for size in ("XS", "M", "XL"):
         with pytest.raises(LayoutError, match=rf"marker '0' on {bone} .* would lie on \w*{other}"):
             attach(layout, size)
+    with pytest.raises(LayoutError, match="would lie on"):
+        wear(layout, HandModel.named("XL"), along=0.1, around=0.1, rng=np.random.default_rng(0))
     attach(worn_by(MarkerPlace("R1", bone, 0.7, np.deg2rad(around))), "M")
 
 

@@ -245,7 +245,7 @@ def test_the_truth_as_a_capture_has_no_error(take):
         report = evaluate_labels(sides, take)
         assert report.figures["slot_accuracy"] == report.figures["point_accuracy"] == 1.0
         assert np.isnan(report.figures["calibration_error"])
-        assert report.interval(report.seconds) == (1.0, 1.0)
+        assert report.interval() == (1.0, 1.0) and report.grouped_by == "seconds"
     assert report.marker_names == take.label_names[: len(report.marker_names)]
 
 
@@ -259,9 +259,10 @@ def test_exchanged_labels_are_counted_by_marker_with_an_interval(take):
     assert set(wrong) == {"right:ThumbTip", "right:IndexTip"}
     assert all(0.3 < share <= 0.5 for share in wrong.values())  # a frame that lacks both is right
     thumb = report.marker_names.index("right:ThumbTip")
-    low, high = report.interval(report.seconds, thumb)
+    low, high = report.interval(marker=thumb)
     assert low < report.slot_accuracy_by_marker[thumb] < high
-    assert report.interval(report.seconds)[0] < report.figures["slot_accuracy"] < 1.0
+    for name, (low, high) in report.intervals().items():
+        assert low < report.figures[name] < min(high, 1.0)
 
 
 def test_columns_without_sides_fit_the_hand_that_is_there(take):

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from gloves.fit import GloveFit
 from handsim.hand.model import join_qpos
 from handsim.hand.shape import DIGITS, NUM_JOINTS
+from handsim.space.transforms import rigid_fit
 from poses.shapes import LIBRARIES, gestures_of
 from track.association.frame_state import match_log_odds, match_points, peak_log_odds, targets_of
 from track.association.hand_state import HandState
@@ -56,6 +57,9 @@ _FREE_COORDINATES: Final = 20.0  # effective degrees of freedom of a pose
 _SPREAD_BEFORE: Final = 0.002  # [m] prior standard deviation of markers around a fitted pose
 _SPREAD_BEFORE_COORDINATES: Final = 6.0  # number of coordinates that this prior counts for
 _MARKERS_OF_EVIDENCE: Final = 10  # Evidence is required for at most this many markers.
+_LEAST_REPEATED: Final = 0.5  # share of that evidence, from which on a hand counts that repeats itself
+_REPETITION: Final = 5.0  # log-odds of a hand that was found in an earlier call, too
+_SAME_RMS: Final = 0.008  # [m] between the markers of one hand in two calls, after a rigid motion
 _CERTAIN_SCORE: Final = 5.5  # log-odds per marker from which no further cloud is tried
 _HOPELESS_FACTOR: Final = 2.5  # A mirrored hand has an RMS distance this many times the best one's.
 _GOOD_RMS: Final = 0.003  # [m] The best hand must fit this well to reject its mirror image.
@@ -85,12 +89,19 @@ class _Search:
     score: float = -np.inf  # score of that hand
 
 
+class _Repeated(NamedTuple):
+    """A hand that lacked evidence."""
+
+    markers: Float[np.ndarray, "M 3"]  # its labeled points [m], NaN for markers without one
+    evidence: float = 0.0  # log-odds of the calls before in which it was found, too
+
+
 class HandInitializer:
     """Initializes hands without history, by a labeler that does not distinguish left from right."""
 
     # With `at_once` a call tries all directions of cuts. Otherwise it tries three, and the calls of the next
     # frames try one more each, until a hand is certain or all directions were tried: no frame waits for a
-    # long search.
+    # waits for a search. A hand that shows few markers is initialized once some calls agree on it.
 
     def __init__(
         self,
@@ -102,6 +113,8 @@ class HandInitializer:
     ) -> None:
         self._at_once, self._first_cut = at_once, 0
         self._searches: dict[tuple[int, ...], _Search] = {}
+        self._repeated: dict[int, _Repeated] = {}
+        self._least_repeated = 1.0 if at_once else _LEAST_REPEATED
         self._states = states
         self._labeler = labeler
         self._config = config
@@ -134,7 +147,7 @@ class HandInitializer:
                 cuts = self._cuts_of(rest, missing)
                 cut |= len(cuts) > 0
                 hand = self._best(rest, missing, cuts, search)
-                if hand is None:
+                if hand is None or not self._is_evident(hand):
                     break
                 here.append(hand)
                 rest = rest[hand.labels[rest] < 0]
@@ -154,6 +167,24 @@ class HandInitializer:
     def is_searching(self, hands: Sequence[int]) -> bool:
         """Whether a search for these hands continues in the next call."""
         return tuple(hands) in self._searches
+
+    def _needed(self, index: int) -> float:
+        """Log-odds from which on a hand is initialized."""
+        return self._config.least_evidence * min(_MARKERS_OF_EVIDENCE, self._states[index].num_markers)
+
+    def _is_evident(self, hand: InitializedHand) -> bool:
+        """Whether a hand has enough evidence, by itself or with earlier calls that found the same."""
+        markers = targets_of(self._points, hand.labels, self._states[hand.index].num_markers)
+        before = self._repeated.pop(hand.index, _Repeated(np.full_like(markers, np.nan)))
+        now = _Repeated(markers, before.evidence + _REPETITION if _is_same(before.markers, markers) else 0.0)
+        if hand.score + now.evidence >= self._needed(hand.index):
+            return True
+        # A hand that was found more often outlasts another one in between.
+        outlasts = now.evidence == 0.0 < before.evidence
+        self._repeated[hand.index] = (
+            before._replace(evidence=before.evidence - _REPETITION) if outlasts else now
+        )
+        return False
 
     def _sides_checked(self, hands: list[InitializedHand]) -> list[InitializedHand]:
         """Exchange the sides of two hands if both together fit better so."""
@@ -189,10 +220,11 @@ class HandInitializer:
     ) -> InitializedHand | None:
         """The first certain hand of a group, or after the last cut the best one."""
         if not len(cuts):
-            return self._better(None, group, [group], hands)
+            return self._better(None, group, [group], hands, self._least_repeated)
         best: InitializedHand | None = None
         for turn in range(len(cuts) - _CUTS_AT_FIRST + 1) if self._at_once else [search.turn]:
-            best = self._better(best, group, self._clouds(group, cuts, turn), hands)
+            clouds = self._clouds(group, cuts, turn)
+            best = self._better(best, group, clouds, hands, self._least_repeated)
             if best is not None and self._is_certain(best):
                 return best
         if self._at_once:
@@ -203,7 +235,8 @@ class HandInitializer:
             return None
         if search.best_turn == search.turn:
             return best
-        return self._better(best, group, self._clouds(group, cuts, search.best_turn), hands)
+        clouds = self._clouds(group, cuts, search.best_turn)
+        return self._better(best, group, clouds, hands, self._least_repeated)
 
     def _labeled(self, clouds: Sequence[NDArray[np.int64]]) -> list[NDArray[np.int64]]:
         """Label each cloud; return labels of all points per cloud, the most confident cloud first."""
@@ -220,14 +253,18 @@ class HandInitializer:
         group: NDArray[np.int64],
         clouds: Sequence[NDArray[np.int64]],
         hands: Sequence[int],
+        share: float = 1.0,
     ) -> InitializedHand | None:
-        """The best hand so far, or a hand with a better score from these clouds of a group."""
+        """The best hand so far, or one of these clouds of a group with a better score.
+
+        Hands with at least this share of the evidence that is asked for count.
+        """
         for labels in self._labeled(clouds)[:_FITS_AT_A_TIME]:
             fits = [self._fit(index, labels) for index in hands]
             for first in sorted((fit for fit in fits if fit is not None), key=lambda fit: -fit.score):
                 if best is not None and _is_mirrored(first, best):
                     continue
-                hand = self._improve(first, group)
+                hand = self._improve(first, group, share)
                 if hand is not None and (best is None or hand.score > best.score):
                     best = hand
             if best is not None and self._is_certain(best):
@@ -257,10 +294,12 @@ class HandInitializer:
             clouds += [order[: len(group) // 2], order[len(group) // 2 :]]
         return clouds
 
-    def _improve(self, first: InitializedHand, group: NDArray[np.int64]) -> InitializedHand | None:
+    def _improve(
+        self, first: InitializedHand, group: NDArray[np.int64], share: float
+    ) -> InitializedHand | None:
         """Remove labels that do not fit, then match and fit all points of the group again."""
         index, state = first.index, self._states[first.index]
-        hand = self._trim(first) or self._trim(self._without_outliers(first))
+        hand = self._trim(first) or self._trim(self._without_outliers(first)) or self._trim(first, share)
         for _ in range(_REFINEMENTS):
             if hand is None:
                 return None
@@ -273,7 +312,7 @@ class HandInitializer:
             labels[group], _ = match_points(log_odds)
             if (labels == hand.labels).all():
                 break
-            hand = self._trim(self._fit(index, labels, hand.fit))
+            hand = self._trim(self._fit(index, labels, hand.fit), share)
         return hand
 
     def _divided(self, hands: list[InitializedHand], group: NDArray[np.int64]) -> list[InitializedHand]:
@@ -309,8 +348,11 @@ class HandInitializer:
             hands = _likelier(changed, hands)
         return hands
 
-    def _trim(self, hand: InitializedHand | None) -> InitializedHand | None:
-        """Drop the worst label while that raises the score; None if the result is not a hand."""
+    def _trim(self, hand: InitializedHand | None, share: float = 1.0) -> InitializedHand | None:
+        """Drop the worst label while that improves the score; None where it is no hand.
+
+        A hand has at least this share of the evidence that is asked for.
+        """
         best: InitializedHand | None = None
         while hand is not None and (best is None or hand.score > best.score):
             best = hand
@@ -322,8 +364,7 @@ class HandInitializer:
         accepted = (
             best is not None
             and best.fit.rms[0] <= self._config.most_rms
-            and best.score
-            >= self._config.least_evidence * min(_MARKERS_OF_EVIDENCE, self._states[best.index].num_markers)
+            and best.score >= share * self._needed(best.index)
         )
         return best if accepted else None
 
@@ -364,6 +405,16 @@ def _likelier(
     found = [hand for hand in changed if hand is not None]
     better = sum(hand.score for hand in found) > sum(hand.score for hand in hands)
     return found if better and len(found) == len(hands) else hands
+
+
+def _is_same(before: Float[np.ndarray, "M 3"], markers: Float[np.ndarray, "M 3"]) -> bool:
+    """Whether markers [m] of two calls, NaN where missing, are those of one hand."""
+    both = np.isfinite(before[:, 0]) & np.isfinite(markers[:, 0])
+    if both.sum() < FEWEST_POINTS:
+        return False
+    rotation, shift = rigid_fit(before[both], markers[both])
+    off = before[both] @ rotation.T + shift - markers[both]
+    return bool((off**2).sum(axis=1).mean() < _SAME_RMS**2)
 
 
 def _is_mirrored(first: InitializedHand, best: InitializedHand) -> bool:

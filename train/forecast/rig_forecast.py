@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
 from gloves.captures.capture import run_lengths, runs_of
-from gloves.fit import GlovedHand, GloveFit, settle_glove
+from gloves.fit import GlovedHand, GloveFit, check_layout, settle_glove
 from gloves.layout import MarkerLayout
 from gloves.optics.reconstruction import OpticsConfig, reconstruct
 from gloves.takes.take import Take
@@ -110,6 +110,8 @@ def _walk(
 
 def work_of_take(take: Take, layout: MarkerLayout | None, num_frames: int) -> dict[str, list[SceneMotion]]:
     """Scenes of a take's first frames in which every hand has a pose, optionally with another glove."""
+    if layout is not None:
+        check_layout(layout)
     fits = [hand if layout is None else settle_glove(layout, hand.model) for hand in take.hands]
     whole = np.isfinite(take.qpos).all(axis=(1, 2))
     scenes, left = [], num_frames

@@ -21,6 +21,7 @@ from train.evaluation import (
     LabelingReport,
     Reliability,
     percent,
+    percent_between,
     reliability,
 )
 from train.labelers.storage import GLOVE
@@ -79,7 +80,7 @@ def _lead(card: dict[str, Any], layout: MarkerLayout) -> str:
     """Settings of the run and its main figures, in words."""
     train = card["train"]
     shown = [
-        f"{percent(column['slot_accuracy'])} %{_interval(card, name)} of the slots are right "
+        f"{_shown(card, name, 'slot_accuracy')} % of the slots are right "
         f"{_IN_WORDS.get(name, f'with the paper recipe ({name})')}"
         for name, column in card["held_out_simulated"].items()
     ]
@@ -104,10 +105,10 @@ def held_out_people(card: dict[str, Any]) -> str:
     return f"frames of {count} {'person' if count == 1 else 'people'} whom training did not see"
 
 
-def _interval(card: dict[str, Any], name: str) -> str:
-    """Interval of a column's slot accuracy over people, in brackets, if there is one."""
-    interval = card.get("held_out_intervals", {}).get(name)
-    return "" if interval is None else f" ({percent(interval[0])} to {percent(interval[1])})"
+def _shown(card: dict[str, Any], column: str, name: str) -> str:
+    """A figure of a column in percent, with its interval over people if there is one."""
+    interval = card.get("held_out_intervals", {}).get(column, {}).get(name)
+    return percent_between(card["held_out_simulated"][column][name], interval)
 
 
 def _figures_section(card: dict[str, Any], report: LabelingReport) -> Section:
@@ -116,7 +117,7 @@ def _figures_section(card: dict[str, Any], report: LabelingReport) -> Section:
     (recipe,) = set(columns) - {SEEN, "clean"}
     table = [["figure [%]", *columns]]
     table += [
-        [name.replace("_", " "), *(percent(column[name]) for column in columns.values())]
+        [name.replace("_", " "), *(_shown(card, column, name) for column in columns)]
         for name in columns[recipe]
     ]
     text = (
@@ -335,12 +336,7 @@ def model_card(card: dict[str, Any]) -> str:
     dataset, columns = card["dataset"], card["held_out_simulated"]
     figures = [f"| | {' | '.join(columns)} |", f"|---|{'---|' * len(columns)}"]
     figures += [
-        f"| {words} | "
-        + " | ".join(
-            percent(column[name]) + (_interval(card, recipe) if name == "slot_accuracy" else "")
-            for recipe, column in columns.items()
-        )
-        + " |"
+        f"| {words} | {' | '.join(_shown(card, column, name) for column in columns)} |"
         for name, words in _CARD_FIGURES.items()
     ]
     return _CARD.format(

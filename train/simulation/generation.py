@@ -14,7 +14,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from gloves.fit import attach_markers
+from gloves.fit import check_layout
 from gloves.layout import load_layout
 from handsim._plugins import plugin_name
 from handsim.app.output import (
@@ -34,7 +34,6 @@ from handsim.errors import DatasetError, HandSimWarning
 from handsim.files.inputs import load_json
 from handsim.files.outputs import check_free, json_text, save_json
 from handsim.files.signals import Stopped, interrupts_bare
-from handsim.hand.model import HandModel
 from handsim.hand.shape import SIDES, pack_hand
 from handsim.space.rig import ROOM_CENTER, check_outside_volume, load_rig, rig_setting
 from poses.shapes import PoseSampler, load_sampler
@@ -127,7 +126,7 @@ def _resolved(settings: GenerateSettings) -> FrameSource:
         raise DatasetError(
             f"min_cameras is {settings.min_cameras}, but rig '{rig.name}' has {len(rig.positions)}"
         )
-    attach_markers(layout, HandModel.named("M"))
+    check_layout(layout)
     return FrameSource(
         settings, layout, rig, None if settings.sampler is None else load_sampler(settings.sampler)
     )

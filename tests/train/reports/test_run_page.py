@@ -106,8 +106,12 @@ def test_a_set_is_evaluated_as_its_rig_saw_it(dataset):
     assert seen.numbers["ghosts"] == ghosts > 0
     clean = evaluate_labeler("dense19", rows["markers"].astype(np.float64))
     assert clean.figures["slot_accuracy"] > seen.figures["slot_accuracy"] > 0.8
-    low, high = seen.interval(dataset.people())
-    assert low < seen.figures["slot_accuracy"] < high
+    assert (seen.grouped_by, seen.num_groups) == ("people", len(np.unique(dataset.people())))
+    for name, (low, high) in seen.intervals().items():
+        assert low < seen.figures[name] < high
+    hard = evaluate_labeler("dense19", dataset, occlude=5, ghosts=2, every=2)
+    assert hard.num_groups == seen.num_groups and hard.interval() is not None
+    assert clean.interval() is None
 
 
 def test_a_run_has_a_model_card_of_what_was_trained(run):
