@@ -15,7 +15,7 @@ from gloves.captures.formats import READABLE, read_capture
 from gloves.fit import GloveFit, nominal_fit
 from gloves.layout import list_layouts, load_layout
 from gloves.takes.archives import is_growing
-from gloves.takes.corrections import corrections_path, told
+from gloves.takes.corrections import corrections_path, unfitting_sentences
 from gloves.takes.take import load_take
 from handsim.errors import ArgumentError, FileError, HandSimWarning
 from handsim.files.inputs import read_toml
@@ -115,7 +115,7 @@ def _moving(path: Path, name: str, rig: CameraRig | None, time: float | None, up
         take = load_take(path)
         if take.made_by_tracker and not is_growing(path):
             corrector = Corrector(path, take)
-            for sentence in told(corrections_path(path), corrector.unfitting):
+            for sentence in unfitting_sentences(corrections_path(path), corrector.unfitting):
                 warnings.warn(sentence, HandSimWarning, stacklevel=2)
         recording = TakeRecording(corrector.take if corrector else take, rig)
     else:
