@@ -26,7 +26,7 @@ from handsim.space.rig import CameraRig, list_rigs, load_rig
 from handsim.space.transforms import UpAxis
 from track.settings import USUAL_SIZE
 from track.user import load_user
-from track.viewer.editors import Corrector, LabelEditor, LayoutEditor, edited_path
+from track.viewer.editors import HEIGHT, Corrector, LabelEditor, LayoutEditor, edited_path
 from track.viewer.recordings import CaptureRecording, DatasetRecording, Recording, TakeRecording
 from track.viewer.stage import FrameView, HandSkin, PointBalls, set_stage, show_rig, show_volume, switch
 from track.viewer.timeline import StatusPanel, Timeline
@@ -46,7 +46,6 @@ _LOOKED_AT: Final = 30  # number of frames that determine the first look
 Run = Callable[[Callable[[], bool]], None]
 """Serves a page until the given function returns True."""
 _SPACING: Final = 0.14  # distance between the centers of two hands [m]
-_HEIGHT: Final = 0.06  # height of a flat hand above the ground [m]
 _BEFORE_COLOR: Final = (150, 150, 150)
 
 
@@ -230,7 +229,7 @@ def _show_user(server: ViserServer, hands: Sequence[GloveFit]) -> Run:
     for number, hand in enumerate(hands):
         nominal = [nominal_fit(hand.layout, size, hand.side) for size in SIZES]
         before = min(nominal, key=lambda fit: abs(fit.shape.length - hand.shape.length))
-        shift = np.array([0.0, _SPACING * (number - (len(hands) - 1) / 2), _HEIGHT])
+        shift = np.array([0.0, _SPACING * (number - (len(hands) - 1) / 2), HEIGHT])
         _add_hand(server, f"/after/{hand.side}", hand, shift)
         _add_hand(server, f"/before/{hand.side}", before, shift, _BEFORE_COLOR, 0.35, 0.5)
         points = np.stack([before.attachment.points, hand.attachment.points], axis=1)
