@@ -19,7 +19,7 @@ from gloves.optics.visibility import visible_cameras
 from handsim.errors import ArgumentError, LayoutError
 from handsim.hand.model import HandModel, Site, load_model
 from handsim.hand.shape import BONE_NAMES, DIGIT_OF_BONE, NUM_BONES, NUM_QPOS, PALM, HandShape, Side
-from handsim.hand.skin import vertex_normals
+from handsim.hand.skin import all_weights, strongest_weights, vertex_normals
 from handsim.kernels import kernel
 from handsim.space.rig import CameraRig
 from handsim.space.transforms import MIRROR
@@ -116,8 +116,7 @@ class Attachment:
         """Move rest points (`last` 1) or directions (`last` 0) with their bones: (T, M, 3) in the world."""
         inverse = np.linalg.inv(model.rest_transforms)
         local = np.einsum("lij,mj->mli", inverse, np.insert(rest, 3, last, axis=1))
-        weights = np.zeros(local.shape[:2])
-        np.add.at(weights, (np.arange(len(rest))[:, None], self.bone_indices), self.bone_weights)
+        weights = all_weights(self.bone_indices, self.bone_weights)
         bones = np.swapaxes(T_world_bone[..., :3, :], -1, -2).reshape(len(T_world_bone), -1, 3)
         return np.asarray((weights[..., None] * local).reshape(len(rest), -1) @ bones)
 
@@ -196,9 +195,7 @@ def _put_on(
         vertex = corners[:, corner]
         shares = bary[:, corner, None] * surface.bone_weights[vertex]
         np.add.at(full, (np.arange(len(corners))[:, None], surface.bone_indices[vertex]), shares)
-    indices = np.argsort(-full, axis=1, kind="stable")[:, :4]
-    weights = np.clip(np.take_along_axis(full, indices, axis=1), 0.0, None)
-    weights /= weights.sum(axis=1, keepdims=True)
+    indices, weights = strongest_weights(full)
     bones = np.array([BONE_NAMES.index(marker.bone) for marker in markers])
     others = _other_digits(feet, points, bones, indices[:, 0], model)
     others = ["" if gone else other for gone, other in zip(missed, others, strict=True)]

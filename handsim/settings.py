@@ -100,6 +100,11 @@ class Settings:
         fields = dataclasses.fields(self)  # type: ignore[arg-type]
         return {field.name: _json_of(getattr(self, field.name)) for field in fields}
 
+    def changed(self, *names: str) -> list[str]:
+        """Those of some fields whose values are not their defaults."""
+        defaults = {field.name: field.default for field in dataclasses.fields(self)}  # type: ignore[arg-type]
+        return [name for name in names if getattr(self, name) != defaults[name]]
+
 
 class Mixture(Settings):
     """Base of shares of kinds, which are normalized; a share that a mapping does not name is 0."""

@@ -212,8 +212,7 @@ class ViewConfig(Settings):
 
     def check(self) -> None:
         """Refuse options that would do nothing beside your own cameras or with this placement."""
-        defaults = {field.name: field.default for field in dataclasses.fields(self)}
-        given = [name for name in _PLACING if getattr(self, name) != defaults[name]]
+        given = self.changed(*_PLACING)
         if self.cameras is not None and given:
             raise ArgumentError(
                 f"the cameras are those of {self.own_cameras}; leave out the placement, the camera, the "
@@ -230,7 +229,7 @@ class ViewConfig(Settings):
             )
         if self.cameras == ():
             raise ArgumentError("cameras is empty, expected at least one camera")
-        if self.placement != "rig" and self.rig != "six":
+        if self.placement != "rig" and self.changed("rig"):
             raise ArgumentError(
                 f"the rig is '{self.rig}' and the placement '{self.placement}', expected the placement rig"
             )

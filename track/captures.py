@@ -20,14 +20,14 @@ import numpy as np
 from gloves.captures.capture import Capture
 from gloves.layout import load_layout
 from gloves.optics.reconstruction import number_runs
-from gloves.takes.corrections import Correction, find_pins, load_corrections, told
+from gloves.takes.corrections import Correction, find_pins, load_corrections, unfitting_sentences
 from gloves.takes.points import PointList
 from gloves.takes.take import Take, label_names
 from handsim.callbacks import OnStep, Progress, no_progress, no_step
 from handsim.errors import CalibrationError, CaptureError, HandSimWarning, errors_of
 from handsim.hand.shape import NUM_QPOS, Side
 from track.association.frame_state import change_of_distances
-from track.association.initialization import FEWEST_POINTS, label_alone
+from track.association.initialization import label_alone
 from track.bidirectional_labeling import label_both_ways
 from track.config import BOTH
 from track.corrected_take import correct_take
@@ -170,7 +170,7 @@ def track_capture(
     if corrections is None:
         return smooth_take(take) if chosen.smooth else take
     corrected = correct_take(take, pins)
-    for sentence in told(Path(corrections), corrected.unfitting):
+    for sentence in unfitting_sentences(Path(corrections), corrected.unfitting):
         warnings.warn(sentence, HandSimWarning, stacklevel=2)
     return corrected.take
 
@@ -293,7 +293,7 @@ def _is_continuous(frames: Sequence[StreamedFrame]) -> bool:
     pairs = [
         (one.points, other.points)
         for one, other in pairwise(frames)
-        if min(len(one.points), len(other.points)) >= FEWEST_POINTS
+        if min(len(one.points), len(other.points)) >= FEWEST_MARKERS
     ]
     chosen = np.unique(np.linspace(0, len(pairs) - 1, min(_COMPARED, len(pairs))).astype(int))
     changes = [change_of_distances(*pairs[number]) for number in chosen]

@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
@@ -399,8 +399,9 @@ class Improvement:
         """The layout with one marker moved to some other places."""
         places = self._columns.places
         others = places[:number] + places[number + 1 :]
-        near = [place for _ in range(_LOCAL) for place in self._near(places[number], others)]
-        return self._wearable(self._changed(number, [*near, *self._anywhere(_CANDIDATES - _LOCAL, others)]))
+        near = (self._near(places[number], others) for _ in range(_LOCAL))
+        found = [place for place in near if place is not None]
+        return self._wearable(self._changed(number, found + self._anywhere(_CANDIDATES - _LOCAL, others)))
 
     def _changed(self, number: int, places: Sequence[MarkerPlace]) -> list[Columns]:
         """The layout with marker `number`, perhaps a new one, at each of some places."""
@@ -418,8 +419,8 @@ class Improvement:
             changed.append(columns.renamed(number, now[number].name if stays else self._new_name(place.bone)))
         return changed
 
-    def _near(self, place: MarkerPlace, others: Sequence[MarkerPlace]) -> Iterator[MarkerPlace]:
-        """Yield a free place near another one, unless none is found."""
+    def _near(self, place: MarkerPlace, others: Sequence[MarkerPlace]) -> MarkerPlace | None:
+        """A free place near another one, or None."""
         for _ in range(_TRIES):
             along, around, across = self._rng.standard_normal(3) * _STEP
             palm = place.bone == BONE_NAMES[PALM]
@@ -432,8 +433,8 @@ class Improvement:
                 )
             )
             if moved is not None and self._is_clear(moved, others):
-                yield moved
-                return
+                return moved
+        return None
 
     def _on_grid(self, place: MarkerPlace) -> MarkerPlace | None:
         """The nearest place on the grid; None if it is on a crease, on the inside or off the bone."""

@@ -29,12 +29,12 @@ from handsim.hand.model import HandModel
 from handsim.hand.shape import SIZES, HandShape, Side, shape_from_measures
 from handsim.space.transforms import MIRROR
 from track.association.hand_state import HandState
-from track.association.initialization import FEWEST_POINTS, HandInitializer, distances_to_nearest
+from track.association.initialization import HandInitializer, distances_to_nearest
 from track.calibration.energy import first_estimate, levenberg_marquardt, shared_covariance, user_hand
 from track.calibration.hand_parameters import LENGTH
 from track.config import TrackerConfig
 from track.frames import StreamedFrame, TrackedHand
-from track.kinematics.pose_solver import PoseSolver
+from track.kinematics.pose_solver import FEWEST_MARKERS, PoseSolver
 from track.tracker import Tracker
 from track.user import MEASURED, User, designed_glove
 from train.labelers.protocol import Labeler, Labeling
@@ -415,7 +415,7 @@ def check_hands(
 
 def _compared(frames: Sequence[StreamedFrame]) -> list[StreamedFrame]:
     """Frames in which hands are compared; none if there are too few."""
-    shown = [frame for frame in frames if len(frame.points) >= FEWEST_POINTS]
+    shown = [frame for frame in frames if len(frame.points) >= FEWEST_MARKERS]
     half = max(_PART, len(shown) // (2 * _PART) * _PART)
     some = [*shown[:_PART], *shown[half : half + _PART]]
     return some if len(some) >= _LEAST_FRAMES else []

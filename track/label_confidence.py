@@ -18,27 +18,6 @@ from handsim.hand.shape import DIGITS, NUM_JOINTS
 from handsim.kernels import kernel, point_distance
 from track.kinematics.pose_spread import resting_prior
 
-LABELED: Final = (
-    "other labels in its life",
-    "frames without a label in its life",
-    "residual",
-    "residual in a short life",
-    "markers not seen",
-    "biases of the hand",
-    "improbable digit",
-)
-"""Names of the evidence on a labeled point."""
-UNLABELED: Final = (
-    "labels in its life",
-    "a free marker within 10 mm",
-    "a free marker within 30 mm",
-    "a free marker within 30 mm in a short life",
-    "a point within 30 mm",
-    "points beside it and a lost hand",
-    "markers not seen",
-    "biases of the hand",
-)
-"""Names of the evidence on an unlabeled point."""
 _LEAST_RESIDUAL: Final = 0.0003  # [m] lower bound of a marker's usual residual: the noise of optical systems
 _FEWEST: Final = 10  # frames needed to estimate the usual residual of a marker
 _LINK: Final = 0.015  # [m] largest motion within the hand between frames, without lasting IDs
@@ -59,9 +38,9 @@ class Evidence(NamedTuple):
     markers: Int[np.ndarray, "P"]
     """Label of each point; of an unlabeled one, the nearest free marker."""
     labeled: Float[np.ndarray, "L 7"]
-    """Evidence on the labeled points, see `LABELED`."""
+    """Evidence on the labeled points, in the order of `evidence_of`."""
     unlabeled: Float[np.ndarray, "U 8"]
-    """Evidence on the unlabeled points, see `UNLABELED`."""
+    """Evidence on the unlabeled points."""
 
 
 def evidence_of(take: Take) -> Evidence:
@@ -87,21 +66,21 @@ def evidence_of(take: Take) -> Evidence:
     off = np.fmax(residuals[frame, label] / _usual(residuals)[label], 1.0)
     off = np.minimum(np.nan_to_num(off, nan=3.0), _MOST_OFF)
     labeled = [
-        of_life[which],
-        np.log1p((length - own - others) / own)[which],
-        off - 1.0,
-        np.log(off) * short[which],
+        of_life[which],  # other labels in its life
+        np.log1p((length - own - others) / own)[which],  # frames without a label in its life
+        off - 1.0,  # residual
+        np.log(off) * short[which],  # residual in a short life
         *of_hand[which].T,
         _improbable(take, owners)[frame, label],
     ]
     is_lost = (take.status == LOST).any(axis=1)[frames[free]]
     unlabeled = [
-        of_life[free],
-        np.exp(-near[0] / 0.01),
-        np.exp(-near[0] / 0.03),
-        np.exp(-near[0] / 0.03) * short[free],
-        np.exp(-near[1] / 0.03),
-        np.log1p(near[2]) * is_lost,
+        of_life[free],  # labels in its life
+        np.exp(-near[0] / 0.01),  # a free marker within 10 mm
+        np.exp(-near[0] / 0.03),  # a free marker within 30 mm
+        np.exp(-near[0] / 0.03) * short[free],  # the same in a short life
+        np.exp(-near[1] / 0.03),  # a point within 30 mm
+        np.log1p(near[2]) * is_lost,  # points beside it and a lost hand
         *of_hand[free].T,
     ]
     return Evidence(chosen, labels, markers, np.stack(labeled, axis=1), np.stack(unlabeled, axis=1))
@@ -270,9 +249,9 @@ def _nearest(points: Float[np.ndarray, "N 3"], place: Float[np.ndarray, "3"], mo
 
 
 _LABELED: Final = (-8.11, 0.72, 3.08, 0.08, 0.68, 1.49, 2.49, 0.78)
-"""Log-odds of a wrong label: bias, and weight of each entry of `LABELED`."""
+"""Log-odds of a wrong label: bias, and weight of each piece of evidence."""
 _UNLABELED: Final = (-9.44, 3.91, 3.13, 6.01, -0.76, 3.30, 1.62, 0.76, 1.35)
-"""Log-odds that an unlabeled point is a marker: bias, and weight of each entry of `UNLABELED`."""
+"""Log-odds that an unlabeled point is a marker: bias, and weight of each piece of evidence."""
 
 
 def label_confidence(take: Take, evidence: Evidence | None = None) -> Float[np.ndarray, "P"]:

@@ -21,7 +21,6 @@ EPOCHS: Final = 75
 Views = Literal["aligned", "random"]
 """`aligned` turns every hand like the mean hand; `random` is the paper's policy: any view in training, and
 for labeling the one of ten in which the cloud has the largest extent."""
-_KNEE: Final = 0.02
 _MAX_CLOUDS: Final = 1_000_000  # clouds in a batch
 
 
@@ -104,7 +103,7 @@ class TrainSettings(Settings):
     """A corruption of your own instead of the paper's: module:name, or the name of an entry point."""
     anisotropy: Annotated[float, Limits(0.0, 1.0)] = 0.06
     """Log standard deviation of the stretch of each hand along three random directions."""
-    knee: Annotated[float, Limits(0.0, above=True)] = _KNEE
+    knee: Annotated[float, Limits(0.0, above=True)] = 0.02
     """Distance at which the loss of the paper's network turns from quadratic to linear [half an image's
     width]."""
     seed: Annotated[int, Limits(0)] = 0
@@ -121,7 +120,7 @@ class TrainSettings(Settings):
         is_given = {
             "network": self.network != SetLabelerConfig(self.network.num_labels),
             "cnn": self.cnn != CNNConfig(self.cnn.num_labels),
-            "knee": self.knee != _KNEE,
+            "knee": self.changed("knee"),
         }
         of_others = ("network",) if self.labeler == "cnn" else ("cnn", "knee")
         given = [name for name in of_others if is_given[name]]
@@ -130,7 +129,7 @@ class TrainSettings(Settings):
             raise ArgumentError(
                 f"given {' and '.join(given)} with the labeler {self.labeler}, expected the labeler {kind}"
             )
-        if self.corruption is not None and (self.occlude, self.ghosts) != (None, 2):
+        if self.corruption is not None and self.changed("occlude", "ghosts"):
             raise ArgumentError("given occlude or ghosts beside a corruption, expected one of them")
 
     def for_set(self, num_markers: int, num_frames: int) -> TrainSettings:

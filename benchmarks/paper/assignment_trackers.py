@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from benchmarks.paper.plain_hand import MOST_RMS, PlainHand, label_by_proximity
+from benchmarks.paper.plain_hand import MOST_RMS, PlainHand, label_by_proximity, labels_by_id
 from gloves import GloveFit, Status
 from handsim.errors import ArgumentError
 from handsim.kernels import move, velocity_of
@@ -112,11 +112,7 @@ class NearestNeighborTracker(InitializedTracker):
             self._last_positions[:] = self._marker_positions([hand.qpos for hand in self._hands])
             self._last_time[:] = time
         self._remember(points, labels, time)
-        self._labels = {
-            point: label
-            for point, label in zip(known, labels.tolist(), strict=True)
-            if min(point, label) >= 0
-        }
+        self._labels = labels_by_id(known, labels)
         self._last_ids = set(known) - {-1}
         return TrackedFrame(time, tuple(hands), labels, np.ones(len(points)))
 

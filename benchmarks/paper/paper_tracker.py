@@ -29,7 +29,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
-from benchmarks.paper.plain_hand import MOST_RMS, PlainHand, label_by_proximity
+from benchmarks.paper.plain_hand import MOST_RMS, PlainHand, label_by_proximity, labels_by_id
 from gloves import GloveFit, Status
 from track import TrackedFrame, TrackedHand
 from train import Labeler
@@ -81,11 +81,7 @@ class PaperTracker:
             if hand.qpos is not None:
                 hands[number] = self._track(number, points, labels, by_proximity)
         self._initialize(lost, points, labels, hands)
-        self._labels = {
-            point: label
-            for point, label in zip(known, labels.tolist(), strict=True)
-            if min(point, label) >= 0
-        }
+        self._labels = labels_by_id(known, labels)
         self._last_ids = set(known) - {-1}
         return TrackedFrame(time, tuple(hands), labels, np.ones(len(points)))
 

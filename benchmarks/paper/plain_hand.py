@@ -20,6 +20,12 @@ FEWEST: Final = 4
 """Labeled points that a pose needs; the paper gives no number, our solver needs this one."""
 
 
+def labels_by_id(ids: Sequence[int], labels: Int[np.ndarray, "N"]) -> dict[int, int]:
+    """Label of each ID; points without an ID or a label are left out."""
+    pairs = zip(ids, labels.tolist(), strict=True)
+    return {point: label for point, label in pairs if min(point, label) >= 0}
+
+
 class PlainHand:
     """A hand tracked without any state but its last pose.
 

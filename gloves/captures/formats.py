@@ -67,7 +67,6 @@ from handsim.files.outputs import as_text, atomic_write, writing
 
 _BEGIN: Final = b"PathFileType"
 _HEADER_LINES: Final = 5
-_LEADING: Final = 2  # frame number and time
 _NO_MARKERS: Final = "no markers: line 4 should read 'Frame#', 'Time', then the marker names"
 _KEYS: Final = "DataRate CameraRate NumFrames NumMarkers Units OrigDataRate OrigDataStartFrame OrigNumFrames"
 
@@ -164,10 +163,10 @@ def _write_rows(file: TextIO, capture: Capture, row_format: str, *, first: int) 
 
 def _marker_names(titles: list[str], num_axes: int) -> tuple[str, ...]:
     """Names of line 4, one in three cells; a blank name becomes '*n'. There may be none."""
-    lower = [title.lower() for title in titles[: 2 * _LEADING]]
+    lower = [title.lower() for title in titles[: 2 * LEADING]]
     if not lower[0].startswith("frame"):
         raise CaptureError(_NO_MARKERS)
-    cells = titles[lower.index("time") + 1 if "time" in lower else _LEADING :]
+    cells = titles[lower.index("time") + 1 if "time" in lower else LEADING :]
     while cells and not cells[-1]:
         cells.pop()
     if not any(cell for index, cell in enumerate(cells) if index % 3):
@@ -182,7 +181,7 @@ def _marker_names(titles: list[str], num_axes: int) -> tuple[str, ...]:
 
 def _unnamed(rows: list[bytes], num_named: int) -> tuple[str, ...]:
     """Names '*n' for trajectories that line 4 does not name, as Cortex writes them at the ends of rows."""
-    expected = _LEADING + 3 * num_named
+    expected = LEADING + 3 * num_named
     widths = [row.rstrip(b" \t").count(TAB) + 1 for row in rows]
     width = max(widths, default=0)
     extra = max(0, width - expected)
@@ -397,7 +396,6 @@ def _scales(
 _BEGINS: Final = (b"NO_OF_FRAMES", b"FILE_VERSION")
 _KEY: Final = re.compile(rb"(?!NULL\t)[A-Z][A-Z0-9_]*(\t|$)")
 _QTM_LEADING: Final = ("frame", "time")
-_MAX_DIGITS: Final = 12  # Counts are cut to this many digits.
 
 
 def read_qtm_tsv(data: bytes, tell: Tell = warn) -> Capture:
@@ -449,7 +447,7 @@ def _names(stated: dict[str, list[str]]) -> tuple[str, ...]:
     while names and not names[-1]:
         names = names[:-1]
     text = _first(stated, "NO_OF_MARKERS")
-    count = int(text[:_MAX_DIGITS]) if text.isdecimal() else len(names)
+    count = int(text[:MAX_DIGITS]) if text.isdecimal() else len(names)
     if count < len(names) or count > MOST_CELLS // 3:
         raise CaptureError(f"MARKER_NAMES holds {len(names)} names, and NO_OF_MARKERS states {count}")
     if not count:

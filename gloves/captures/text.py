@@ -45,7 +45,7 @@ _DECIMALS: Final = re.compile(rb",0\d")  # This comma is decimal: no whole numbe
 _NUMBERS: Final = re.compile(rb"\d[-+\d.,eE \t]*")
 _SAMPLED_ROWS: Final = 50  # rows that show how a writer formats numbers
 _MANY_NUMBERS: Final = 60  # numbers that show whether a writer drops zeros at the end
-_LEADING: Final = 2  # cells of a row before its positions: frame and time, or frame and sub-frame
+LEADING: Final = 2  # cells of a row before its positions: frame and time, or frame and sub-frame
 _MOST_BLANKS: Final = 4_000_000  # cells of a table that may be absent from its rows
 _MOST_DENSE: Final = 8_000_000  # A table with more cells than this is read sparsely.
 
@@ -140,7 +140,7 @@ def _check_decimals(lines: list[bytes], first: int, wider: bool) -> None:
     for index, line in enumerate(lines):
         numbers = _TIME_CODE.sub(b"", line)
         # a row of numbers without quotes
-        if numbers.count(b",") > _LEADING and _NUMBERS.fullmatch(numbers) is not None:
+        if numbers.count(b",") > LEADING and _NUMBERS.fullmatch(numbers) is not None:
             if b"." in numbers:
                 return
             rows.append(index)
@@ -218,7 +218,7 @@ def parse_table(
                 cells[column] = b""
         table[row, : len(cells)] = _parse_cells(cells, index + 1, titles, range(len(cells)))
     triples = table[:, columns.first[:, None] + np.arange(3)] * columns.scales[:, None]
-    return table[:, :_LEADING], Trajectories(tuple(columns.names), triples)
+    return table[:, :LEADING], Trajectories(tuple(columns.names), triples)
 
 
 def _parse_wide(
@@ -241,8 +241,8 @@ def _parse_wide(
     frames = np.repeat(np.arange(len(rows)), [len(filled) for filled, _ in found])
     cells_at = np.concatenate([filled for filled, _ in found])
     values = np.concatenate([values for _, values in found])
-    leading = np.full((len(rows), _LEADING), np.nan)
-    leads = cells_at < _LEADING
+    leading = np.full((len(rows), LEADING), np.nan)
+    leads = cells_at < LEADING
     leading[frames[leads], cells_at[leads]] = values[leads]
 
     num_names = len(columns.names)
@@ -288,8 +288,8 @@ def _check_last_line(rows: list[bytes], number: int, num_columns: int) -> None:
         raise CaptureError(
             f"truncated: line {number}, the last, has {got} of {expected} cells and no line end"
         )
-    cells = [cell for row in rows[:-1][:_SAMPLED_ROWS] for cell in row.split(TAB)[_LEADING:]]
-    numbers = [cell.strip() for cell in (*cells, *others[_LEADING:]) if cell.strip()]
+    cells = [cell for row in rows[:-1][:_SAMPLED_ROWS] for cell in row.split(TAB)[LEADING:]]
+    numbers = [cell.strip() for cell in (*cells, *others[LEADING:]) if cell.strip()]
     decimals = {len(cell.partition(b".")[2]) for cell in numbers}
     # numbers of a writer that drops zeros at the end may agree in length by chance
     fixed = any(cell.endswith(b"0") for cell in numbers) or len(numbers) >= _MANY_NUMBERS
@@ -343,7 +343,7 @@ _MAX_DECIMALS: Final = 9  # Times have at most this many decimals.
 _INTERVAL_TOLERANCE: Final = 0.1  # relative spread of the intervals when no rate is stated
 _JITTER: Final = 0.25  # A time that is late by less than this share of a frame shows no gap.
 _MAX_MISSING: Final = 10  # missing frames for each frame that is present
-_MAX_DIGITS: Final = 12  # Counts are cut to this many digits.
+MAX_DIGITS: Final = 12  # Counts are cut to this many digits.
 _SHOWN_GAPS: Final = 3  # gaps that a warning lists
 
 
@@ -422,7 +422,7 @@ def timed_positions(
             "correct the numbers or the times, or cut the capture there"
         )
     if stated.count.strip().isdecimal():
-        count = int(stated.count.strip()[:_MAX_DIGITS])
+        count = int(stated.count.strip()[:MAX_DIGITS])
         if count > num_frames and stated.count_is_reliable:
             raise CaptureError(
                 f"truncated: {stated.count_name} is {count}, and {num_frames} frames are there; export the "

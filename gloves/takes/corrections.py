@@ -199,7 +199,7 @@ def _parse(table: Mapping[str, object], owner: str) -> Correction:
     return Correction(first, last, (float(x), float(y), float(z)), text_of(table, "label", f"{owner}: "))
 
 
-def told(path: Path, corrections: Iterable[Correction]) -> Iterator[str]:
+def unfitting_sentences(path: Path, corrections: Iterable[Correction]) -> Iterator[str]:
     """A sentence for each correction that fits no point."""
     for correction in corrections:
         yield (

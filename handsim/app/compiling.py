@@ -68,9 +68,9 @@ def compile_kernels(command: str | None = None) -> tuple[int, int]:
     return len(missing) - rest, rest
 
 
-def read_list(path: Path = LIST) -> list[ListedKernel]:
+def read_list() -> list[ListedKernel]:
     """All kernels on the list."""
-    return [ListedKernel(*row) for row in json.loads(path.read_text(encoding="utf-8"))["kernels"]]
+    return [ListedKernel(*row) for row in json.loads(LIST.read_text(encoding="utf-8"))["kernels"]]
 
 
 @functools.cache

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from rich.text import Text
 
 _RENEWED: Final = 0.2  # [s] between two lines on a terminal
-_PRINTED: Final = 10.0  # [s] between two lines elsewhere, as in the log of a batch job
+EVERY: Final = 10.0  # [s] between two lines elsewhere, as in the log of a batch job
 _WIDTH: Final = 80  # columns of a terminal whose width is unknown
 
 
@@ -101,7 +101,7 @@ class LiveStatus(Closing):
         """Show a line if it is time for one, or `now`."""
         if not (now or self.due):
             return
-        self._due = time.monotonic() + (_RENEWED if self._terminal else _PRINTED)
+        self._due = time.monotonic() + (_RENEWED if self._terminal else EVERY)
         if self._terminal:
             self._write(f"\r{line[: _columns() - 1]}\x1b[K")
             self._shown = True
@@ -135,8 +135,6 @@ def _columns() -> int:
 
 
 _COUNTS: Final = re.compile(r"[\d.,]+")
-EVERY: Final = 10.0
-"""Time between two lines where there is no terminal [s]."""
 _PERIOD: Final = 600.0  # Speeds and the time left are averages over this time [s].
 _tellers: list[Callable[[str], None]] = []  # show a line in a bar or step; the innermost is last
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import tyro
@@ -20,7 +20,7 @@ from gloves.layout import (
 from handsim.app.messages import named_steps, print_line, print_table
 from handsim.errors import LayoutError, errors_of
 from handsim.files.outputs import as_text, check_outputs, write_starter
-from handsim.hand.shape import SIZES
+from handsim.hand.shape import SIZES, Size
 from train.forecast.settings import ImproveGloveSettings, ScoreGloveSettings
 
 if TYPE_CHECKING:
@@ -93,7 +93,7 @@ def new_glove(file: Annotated[Path, tyro.conf.Positional]) -> None:
 def check_glove(
     glove: Annotated[str, tyro.conf.Positional],
     out: Path | None = None,
-    size: Literal["XS", "S", "M", "L", "XL"] = "M",
+    size: Size = "M",
 ) -> None:
     """Check a layout on hands of all five sizes, and draw it from all sides with its slips on 100 people.
 

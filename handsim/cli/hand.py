@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
@@ -12,14 +12,12 @@ from gloves.layout import load_layout
 from handsim.app.messages import print_line
 from handsim.errors import ArgumentError, errors_of
 from handsim.files.outputs import check_ending, check_outputs, written_together
-from handsim.hand.shape import NUM_JOINTS, NUM_QPOS, Side
+from handsim.hand.shape import NUM_JOINTS, NUM_QPOS, Side, Size
 from handsim.space.transforms import UpAxis
 
 if TYPE_CHECKING:
     from gloves.fit import GloveFit
     from handsim.hand.model import HandModel
-
-Size = Literal["XS", "S", "M", "L", "XL"]
 
 
 def hand(

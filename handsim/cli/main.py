@@ -29,7 +29,7 @@ Table = Mapping[str, tuple[Any, str]]
 """For each command "module:function", or a table of its sub-commands, and a line of help."""
 _HELP: Final = {
     "demo": "Run the whole chain on a built-in example; ends with a page of pictures.",
-    "hand": "Write a hand as a MuJoCo model, a URDF or a rigged mesh.",
+    "hand": "Write a hand as a MuJoCo or OpenSim model, a URDF or a rigged mesh.",
     "glove": "List, show, start and check marker layouts; score and improve one before it is worn.",
     "glove list": "List the marker layouts that come with handsim: markers, labeler and source of each.",
     "glove show": "Show a layout's markers.",

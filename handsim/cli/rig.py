@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Final
 
 import numpy as np
 import tyro
@@ -21,6 +21,7 @@ from handsim.files.outputs import (
 from handsim.pages import coordinates
 from handsim.space.rig import CameraRig, list_rigs, load_rig, rig_description
 from handsim.space.rig_formats import import_cameras
+from handsim.space.transforms import UpAxis
 from train.forecast.settings import PlanRigSettings, ScoreRigSettings
 
 if TYPE_CHECKING:
@@ -82,9 +83,7 @@ def _suspicions(rig: CameraRig) -> list[str]:
     return [f"Suspicious: {sentence}." for sentence in faults(rig)]
 
 
-def import_rig(
-    file: Annotated[Path, tyro.conf.Positional], out: Path, up: Literal["y", "z"] | None = None
-) -> None:
+def import_rig(file: Annotated[Path, tyro.conf.Positional], out: Path, up: UpAxis | None = None) -> None:
     """Write a rig's file of the calibration of a camera system: all its cameras, pictures and lenses.
 
     Args:

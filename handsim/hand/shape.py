@@ -23,6 +23,7 @@ from handsim.errors import ArgumentError
 from handsim.settings import Limits, Settings
 
 Side = Literal["left", "right"]
+Size = Literal["XS", "S", "M", "L", "XL"]
 SIDES: Final[tuple[Side, Side]] = ("left", "right")
 DIGITS: Final = ("thumb", "index", "middle", "ring", "little")
 

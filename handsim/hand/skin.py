@@ -85,7 +85,7 @@ def subdivided_loops(
     return results
 
 
-WRIST_END, WRIST, CARPUS, THENAR, METACARPUS, KNUCKLES, PAST_KNUCKLES, WEB = range(8)
+WRIST, CARPUS, THENAR, METACARPUS, KNUCKLES, PAST_KNUCKLES, WEB = range(1, 8)
 NUM_ROWS: Final = 8
 AROUND: Final = 18
 # Rings of a finger past the web, and of the thumb; the last two form the tip.
@@ -112,20 +112,15 @@ class CageTopology:
         return int(self.quads.max()) + 1
 
 
-def dorsal(column: int) -> int:
-    """Index of a back column in a palm row."""
-    return column
-
-
 def palmar(column: int) -> int:
-    """Index of a palm column in a palm row."""
+    """Index of a palm column in a palm row; that of a back column is its number."""
     return AROUND - 1 - column
 
 
 def finger_slots(finger: int) -> list[int]:
     """Indices in a palm row of the six vertices around a finger (0 to 3), in a ring's order."""
     columns = range(2 * finger, 2 * finger + 3)
-    return [dorsal(column) for column in columns] + [palmar(column) for column in reversed(columns)]
+    return [*columns, *map(palmar, reversed(columns))]
 
 
 def cage_topology() -> CageTopology:
@@ -136,7 +131,7 @@ def cage_topology() -> CageTopology:
         count = len(THUMB_RINGS if digit == 0 else FINGER_RINGS)
         rings.append(first + np.arange(count * 6).reshape(count, 6))
         first += count * 6
-    back, front, three = dorsal(0), palmar(0), (CARPUS, THENAR, METACARPUS)
+    front, three = palmar(0), (CARPUS, THENAR, METACARPUS)
     hole = {(row, front) for row in three[:2]}
     quads = [
         [palm[row, index], palm[row, next_index], palm[row + 1, next_index], palm[row + 1, index]]
@@ -146,11 +141,11 @@ def cage_topology() -> CageTopology:
         if (row, index) not in hole
     ]
     quads += [
-        [palm[0, dorsal(c)], palm[0, palmar(c)], palm[0, palmar(c + 1)], palm[0, dorsal(c + 1)]]
+        [palm[0, c], palm[0, palmar(c)], palm[0, palmar(c + 1)], palm[0, c + 1]]
         for c in range(AROUND // 2 - 1)
     ]
     a, b, c = (palm[row] for row in three)
-    bases = [np.array([a[front], a[back], b[back], c[back], c[front], b[front]])]
+    bases = [np.array([a[front], a[0], b[0], c[0], c[front], b[front]])]
     bases += [palm[WEB, finger_slots(finger)] for finger in range(4)]
     tips = []
     for base, digit_rings in zip(bases, rings, strict=True):
@@ -206,7 +201,7 @@ _WEB_DISTANCES: Final = np.array(
 # upwards in its radii, and the share of the way that each vertex moves to its target.
 _THUMB_BASE_ROWS: Final = np.repeat([CARPUS, THENAR, METACARPUS], [4, 5, 3])
 _THUMB_BASE_COLUMNS: Final = np.array(
-    [dorsal(0), *map(palmar, range(3)), dorsal(0), *map(palmar, range(4)), *map(palmar, range(3))]
+    [0, *map(palmar, range(3)), 0, *map(palmar, range(4)), *map(palmar, range(3))]
 )
 _THUMB_BASE: Final = np.array(
     [
@@ -408,16 +403,16 @@ _FIRST_RING, _FIRST_PALM = 1.2, 1.1  # scales that suit the mean hand
 _FINGER_RINGS: Final = ((1, 0.0), (1, 0.5), (1, 1.0), (2, 0.0), (2, 1.0), (2, 1.0), (2, 1.0))
 # Share of the thumb's metacarpal on the palm's rows around it: (row, index, share).
 _THENAR: Final = (
-    (CARPUS, dorsal(0), 0.25),
+    (CARPUS, 0, 0.25),
     (CARPUS, palmar(0), 0.35),
     (CARPUS, palmar(1), 0.15),
-    (THENAR, dorsal(0), 0.5),
-    (THENAR, dorsal(1), 0.05),
+    (THENAR, 0, 0.5),
+    (THENAR, 1, 0.05),
     (THENAR, palmar(0), 0.8),
     (THENAR, palmar(1), 0.6),
     (THENAR, palmar(2), 0.3),
     (THENAR, palmar(3), 0.05),
-    (METACARPUS, dorsal(0), 0.15),
+    (METACARPUS, 0, 0.15),
     (METACARPUS, palmar(0), 0.4),
     (METACARPUS, palmar(1), 0.25),
 )
@@ -471,7 +466,7 @@ def _template() -> _Template:
     indices, weights = strongest_weights(subdivide @ cage_weights(topology))
     for array in (faces, indices, weights):
         array.setflags(write=False)
-    back_and_palm = topology.palm[METACARPUS][[dorsal(3), palmar(3)]]
+    back_and_palm = topology.palm[METACARPUS][[3, palmar(3)]]
     looked_at = (np.array(loops[:-1]), loops[-1], tips, back_and_palm)
     rows = np.unique(np.concatenate([part.ravel() for part in looked_at]))
     parts = [np.searchsorted(rows, part) for part in looked_at]
@@ -581,7 +576,7 @@ def cage_weights(topology: CageTopology) -> Float[np.ndarray, "K 16"]:
             beside = (column // 2,) if column % 2 else (column // 2 - 1, column // 2)
             fingers = [finger for finger in beside if 0 <= finger < 4]
             share = on_finger if column % 2 or len(fingers) == 1 else on_web
-            for index in (dorsal(column), palmar(column)):
+            for index in (column, palmar(column)):
                 weights[topology.palm[row, index], [4 + 3 * f for f in fingers]] = share / len(fingers)
     for row, index, share in _THENAR:
         weights[topology.palm[row, index], 1] = share
@@ -601,8 +596,17 @@ def strongest_weights(
 ) -> tuple[Int[np.ndarray, "V 4"], Float[np.ndarray, "V 4"]]:
     """The four largest shares of each vertex in descending order, scaled to sum to one, and their bones."""
     indices = np.argsort(-weights, axis=1, kind="stable")[:, :4]
-    shares = np.take_along_axis(weights, indices, axis=1)
+    shares = np.clip(np.take_along_axis(weights, indices, axis=1), 0.0, None)
     return indices, shares / shares.sum(axis=1, keepdims=True)
+
+
+def all_weights(
+    indices: Int[np.ndarray, "V 4"], shares: Float[np.ndarray, "V 4"]
+) -> Float[np.ndarray, "V 16"]:
+    """Shares of all bones, from those of four."""
+    weights = np.zeros((len(indices), NUM_BONES))
+    np.add.at(weights, (np.arange(len(indices))[:, None], indices), shares)
+    return weights
 
 
 def skin_frames(

@@ -281,6 +281,7 @@ Center = Annotated[tuple[float, float, float], Limits(-LONGEST_SIDE, LONGEST_SID
 """The middle of a volume or room [m]."""
 HAND_REACH: Final = 0.25
 """Longest reach of a hand from its wrist [m], and the least distance of a camera from the wrists' volume."""
+_CLEARANCE: Final = 0.05  # [m] least distance of a camera from a hand
 _SHIPPED: Final = Path(__file__).parents[1] / "rigs"
 
 
@@ -432,18 +433,16 @@ def rig_setting(rig: CameraRig) -> str | dict[str, Any]:
     return rig.name if rig.name in list_rigs() and rig == load_rig(rig.name) else rig.record()
 
 
-def check_outside(
-    rig: CameraRig, points: Float[np.ndarray, "*batch 3"], *, clearance: float = 0.05, what: str = "hand"
-) -> None:
-    """Refuse a rig with a camera inside or near an object or a hand (`what`, in messages)."""
+def check_outside(rig: CameraRig, points: Float[np.ndarray, "*batch 3"]) -> None:
+    """Refuse a rig with a camera inside or near a hand, of which these are points [m]."""
     flat = np.asarray(points, dtype=np.float64).reshape(-1, 3)
     flat = flat[~np.isnan(flat).any(axis=1)]
     for number, position in enumerate(rig.positions, 1):
         nearest = np.sqrt(((flat - position) ** 2).sum(axis=1).min(initial=np.inf))
-        if nearest < clearance:
+        if nearest < _CLEARANCE:
             raise ArgumentError(
-                f"camera {number} of rig '{rig.name}' is {nearest:.2g} m from the {what}, "
-                f"expected at least {clearance:g} m"
+                f"camera {number} of rig '{rig.name}' is {nearest:.2g} m from the hand, "
+                f"expected at least {_CLEARANCE:g} m"
             )
 
 

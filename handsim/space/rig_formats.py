@@ -25,7 +25,7 @@ import warnings
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Final, Literal, NamedTuple
+from typing import Final, NamedTuple
 from xml.parsers import expat
 
 import numpy as np
@@ -44,7 +44,7 @@ from handsim.space.rig import (
     nearest_rotation,
     read_rig_file,
 )
-from handsim.space.transforms import quaternion_matrix, rigid
+from handsim.space.transforms import UpAxis, quaternion_matrix, rigid, upright
 
 _MAX_VALUE: Final = 1e9  # largest number in a calibration, in any unit
 
@@ -464,9 +464,6 @@ def _numbers(owner: str, words: list[str]) -> list[float]:
     return values
 
 
-Up = Literal["y", "z"]
-_Y_TO_Z: Final = np.array([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]])
-"""Rotation about x from a world with y up to one with z up."""
 _MIN_UPRIGHT: Final = 0.3  # mean component of the cameras' upward axes along the axis that points up
 _OPENCV: Final = (".yml", ".yaml", ".json")
 _XML: Final = (".xcp", ".xml", ".txt", ".mcal")
@@ -488,15 +485,15 @@ def load_cameras(path: str | Path) -> tuple[Camera, ...]:
     return tuple(one.camera for one in load_lab_cameras(path))
 
 
-def import_cameras(path: str | Path, up: Up | None = None) -> tuple[Camera, ...]:
+def import_cameras(path: str | Path, up: UpAxis | None = None) -> tuple[Camera, ...]:
     """The cameras of a calibration that see markers, in a world with z up."""
     found = load_lab_cameras(path)
     seeing = [one for one in found if not one.video] or list(found)
     if len(seeing) < len(found):
         named = ", ".join(one.camera.name for one in found if one.video)
         _warn(f"{path}: video cameras see no markers and are left out: {named}")
-    axis = up or ("y" if all(one.y_up for one in seeing) else "z")
-    turn = _Y_TO_Z if axis == "y" else np.eye(4)
+    axis: UpAxis = up or ("y" if all(one.y_up for one in seeing) else "z")
+    turn = rigid(upright(axis), np.zeros(3))
     cameras = tuple(one.camera.at(turn @ one.camera.T_world_camera) for one in seeing)
     # a lab may turn its cameras on their sides, and a camera alone is often without a pose
     guessed = len(seeing) > 1 and not (seeing[0].y_up and axis == "y")

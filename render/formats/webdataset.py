@@ -26,7 +26,8 @@ from jaxtyping import Float
 
 from handsim.errors import HandSimError
 from handsim.hand.model import KEYPOINT_DIGITS, HandModel, hand_keypoints, join_qpos
-from handsim.hand.shape import JOINTS, NUM_BONES, NUM_JOINTS, HandShape
+from handsim.hand.shape import JOINTS, NUM_JOINTS, HandShape
+from handsim.hand.skin import all_weights
 from handsim.space.camera import Camera
 from handsim.space.transforms import quaternion_matrix, rigid
 from render.formats.records import (
@@ -171,9 +172,7 @@ def umetrack_hand(shape: HandShape) -> dict[str, Any]:
     axes = np.einsum("jab,jb->ja", rest[:, :3, :3], model.skeleton.axes)
     numbers, surface = np.arange(NUM_JOINTS), model.surface
     step, next_digit = numbers % _JOINTS_PER_DIGIT, numbers + _JOINTS_PER_DIGIT
-    weights = np.zeros((len(surface.vertices), _ROOT_FRAMES + NUM_BONES))
-    rows = np.arange(len(weights))[:, None]
-    np.add.at(weights, (rows, surface.bone_indices + _ROOT_FRAMES), surface.bone_weights)
+    weights = np.pad(all_weights(surface.bone_indices, surface.bone_weights), ((0, 0), (_ROOT_FRAMES, 0)))
     landmarks = to_order(hand_keypoints(model, join_qpos(np.zeros((1, NUM_JOINTS))))[0], "umetrack")
     return {
         "joint_rotation_axes": rounded(axes @ _UMETRACK_FROM_OURS.T, 8),

@@ -26,6 +26,7 @@ from handsim.hand.model import HandModel
 from handsim.hand.shape import DIGIT_OF_BONE, DIGITS, JOINT_NAMES, NUM_BONES, PALM
 from handsim.hand.skin import (
     WRIST,
+    all_weights,
     cage_topology,
     catmull_clark,
     skin_frames,
@@ -443,8 +444,8 @@ def face_parts() -> UInt8[np.ndarray, "F"]:
     """Bone of each triangle of `DrawnSkin.faces`: the one with the largest weight in it, or `FOREARM`."""
     atlas, surface = skin_atlas(), HandModel.named("M").surface  # all hands have the same weights
     shares = np.zeros((atlas.num_vertices, NUM_BONES + 1))
-    rows = np.arange(atlas.num_hand)[:, None]
-    shares[rows, surface.bone_indices[atlas.used]] = surface.bone_weights[atlas.used]
+    hand = all_weights(surface.bone_indices, surface.bone_weights)
+    shares[: atlas.num_hand, :NUM_BONES] = hand[atlas.used]
     shares[atlas.num_hand :, FOREARM] = 1e3  # a triangle with one vertex of the forearm is the forearm's
     parts: Bytes = shares[atlas.faces].sum(axis=1).argmax(axis=1).astype(np.uint8)
     parts.setflags(write=False)

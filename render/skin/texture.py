@@ -20,7 +20,7 @@ from scipy import ndimage
 
 from handsim.hand.model import HandModel
 from handsim.hand.shape import DIGITS, NUM_BONES, named_shape
-from handsim.hand.skin import vertex_normals
+from handsim.hand.skin import all_weights, vertex_normals
 from handsim.kernels import kernel
 from render.fields import along_segment, bump, noise, smooth
 from render.frames import Bytes, Doubles, Floats, Integers
@@ -70,9 +70,8 @@ def skin_texels() -> Texels:
     mesh = PosableSkin(model, REFERENCE)
     normals = vertex_normals(mesh.rest, mesh.faces)
     weights = np.zeros((atlas.num_vertices, NUM_BONES))
-    surface = model.surface
-    rows = np.arange(atlas.num_hand)[:, None]
-    weights[rows, surface.bone_indices[atlas.used]] = surface.bone_weights[atlas.used]
+    hand = all_weights(model.surface.bone_indices, model.surface.bone_weights)
+    weights[: atlas.num_hand] = hand[atlas.used]
     weights[atlas.num_hand :, 0] = 1.0
     dorsal = np.einsum("vi,vi->v", normals, weights @ model.rest_transforms[:, :3, 2])
     values = np.concatenate([mesh.rest, normals, dorsal[:, None], weights], axis=1)

@@ -23,7 +23,7 @@ from poses.shapes import LIBRARIES, gestures_of
 from track.association.frame_state import match_log_odds, match_points, peak_log_odds, targets_of
 from track.association.hand_state import HandState
 from track.config import TrackerConfig
-from track.kinematics.pose_solver import PoseFit, PoseSolver
+from track.kinematics.pose_solver import FEWEST_MARKERS, PoseFit, PoseSolver
 from track.kinematics.pose_spread import resting_prior
 from train.labelers.protocol import MAX_POINTS, Labeler
 
@@ -31,7 +31,6 @@ MOST_POINTS: Final = 100  # A larger group of points is no hand.
 _LINK_DISTANCE: Final = 0.085  # [m] least linking distance between neighboring markers of a hand
 _LINKED_GESTURES: Final = 0.99  # share of gestures in which all markers of a hand must be linked
 _LEAST_LABELED_SHARE: Final = 0.45  # least share of a hand's markers with a label
-FEWEST_POINTS: Final = 4  # least number of labeled points of a hand, which a pose needs
 SPARE_POINTS: Final = 6
 """A group with this many points more than a hand has markers may be two touching hands, at the latest."""
 _SPARE_SHARE: Final = 0.3  # the same as share of a hand's markers: ghosts resemble few markers
@@ -65,7 +64,7 @@ _HOPELESS_FACTOR: Final = 2.5  # A mirrored hand has an RMS distance this many t
 _GOOD_RMS: Final = 0.003  # [m] The best hand must fit this well to reject its mirror image.
 _HOPELESS_SHARE: Final = 0.8  # The best hand must keep this share of the mirrored hand's labels.
 _KNOWN_SPREAD_ATTEMPTS: Final = 60  # attempts in which a known hand must fit as before; 0.5 s at 120 Hz
-_CLOUD_RADIUS: Final = 0.06  # [m] distance from a hand's points within which others may be its markers
+CLOUD_RADIUS: Final = 0.06  # [m] distance from a hand's points within which others may be its markers
 # If this share of the frames shows a hand, all are assumed to do so.
 _USUAL_HAND_SHARE: Final = 0.5
 
@@ -213,7 +212,7 @@ class HandInitializer:
     def _least(self, index: int) -> int:
         """Least number of labeled points of a hand."""
         share = _LEAST_LABELED_SHARE * self._states[index].num_markers
-        return max(FEWEST_POINTS, int(np.ceil(share)))
+        return max(FEWEST_MARKERS, int(np.ceil(share)))
 
     def _best(
         self, group: NDArray[np.int64], hands: Sequence[int], cuts: NDArray[np.int64], search: _Search
@@ -467,17 +466,17 @@ def _clouds(
 ) -> list[tuple[int, int, Int[np.ndarray, "C"]]]:
     """Points given to the labeler as one hand: frame, hand, and indices of the points."""
     most = num_markers + SPARE_POINTS
-    full = [bool(hands) for points, hands in zip(frames, found, strict=True) if len(points) >= FEWEST_POINTS]
+    full = [bool(hands) for points, hands in zip(frames, found, strict=True) if len(points) >= FEWEST_MARKERS]
     sides = [hand.index for hands in found for hand in hands]
     usual = np.bincount(sides).argmax() if sides and np.mean(full) >= _USUAL_HAND_SHARE else None
     clouds = []
     for number, (points, hands) in enumerate(zip(frames, found, strict=True)):
-        small = FEWEST_POINTS <= len(points) <= most
+        small = FEWEST_MARKERS <= len(points) <= most
         if small and len(hands) < 2 and (hands or usual is not None):
             clouds.append((number, hands[0].index if hands else int(usual), np.arange(len(points))))  # type: ignore[arg-type]
             continue
         for hand in hands:
-            near = distances_to_nearest(points, points[hand.labels >= 0]) < _CLOUD_RADIUS
+            near = distances_to_nearest(points, points[hand.labels >= 0]) < CLOUD_RADIUS
             for other in hands:
                 near &= (other.labels < 0) | (other is hand)
             clouds.append((number, hand.index, np.flatnonzero(near)[:MAX_POINTS]))

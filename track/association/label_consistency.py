@@ -20,7 +20,7 @@ from track.association.hand_state import (
     HandTrack,
     Prediction,
 )
-from track.association.initialization import MOST_POINTS
+from track.association.initialization import CLOUD_RADIUS, MOST_POINTS
 from track.config import TrackerConfig
 from train.labelers.protocol import Labeler
 
@@ -36,9 +36,7 @@ _FIT_SPREAD: Final = 0.0015  # [m] standard deviation of a fitted marker, added 
 _RESTART_RMS: Final = 0.004  # [m] A worse fit is tried again from general poses instead of the prediction.
 _RESTART_STEPS: Final = 8  # steps from each of these poses; the best result is fitted further
 _MEDIAN_SQUARE: Final = 2.366  # median of the squared length of a standard normal vector
-# [m] Unlabeled points this close to a missing marker are given to the labeler.
-_CLOUD_RADIUS: Final = 0.06
-# [m] the same for a marker of a digit without labels, which may be bent or straight
+# [m] as `CLOUD_RADIUS`, around a missing marker of a digit without labels, which may be bent or straight
 _DIGIT_CLOUD_RADIUS: Final = 0.13
 _FIRST_REVIEW_WAIT: Final = 0.01  # [s] from a review with changes to the next one
 _REVIEW_WAIT_FACTOR: Final = 1.6  # factor of that time after each review without changes
@@ -335,7 +333,7 @@ def _near_missing(
     for point in range(len(points)):
         for marker in range(len(digits)):
             if labels[point] < 0 and missing[marker]:
-                radius = _CLOUD_RADIUS if seen[digits[marker]] else _DIGIT_CLOUD_RADIUS
+                radius = CLOUD_RADIUS if seen[digits[marker]] else _DIGIT_CLOUD_RADIUS
                 near[point] |= point_distance(points[point], positions[marker]) < radius
     return near
 

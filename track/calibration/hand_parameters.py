@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from gloves.fit import Attachment
 from gloves.layout import MarkerLayout
 from handsim.hand.model import HandModel, bone_transforms, build_skeleton
-from handsim.hand.shape import ADULTS, DIGIT_OF_BONE, DIGITS, NUM_BONES, HandShape, named_shape
-from handsim.hand.skin import build_surface, catmull_clark, vertex_normals
+from handsim.hand.shape import ADULTS, DIGIT_OF_BONE, DIGITS, HandShape, named_shape
+from handsim.hand.skin import all_weights, build_surface, catmull_clark, strongest_weights, vertex_normals
 
 if TYPE_CHECKING:
     from scipy import sparse
@@ -177,9 +177,7 @@ def skin_mesh() -> SkinTopology:
         np.column_stack([coarse.faces[:half], coarse.faces[half:, 2]]), len(coarse.vertices)
     )
     faces = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
-    weights = np.zeros((len(coarse.vertices), NUM_BONES))
-    np.add.at(weights, (np.arange(len(weights))[:, None], coarse.bone_indices), coarse.bone_weights)
-    weights = step @ weights
+    weights = step @ all_weights(coarse.bone_indices, coarse.bone_weights)
     digits = DIGIT_OF_BONE[weights[faces].sum(axis=1).argmax(axis=1)]
     return SkinTopology(step, faces, _adjacent_faces(faces), weights, digits)
 
@@ -239,10 +237,7 @@ def skin_weights(coordinates: SkinCoordinates) -> Float[np.ndarray, "P 16"]:
 def attachment_at(layout: MarkerLayout, coordinates: SkinCoordinates, shape: HandShape) -> Attachment:
     """A glove with markers at skin coordinates of a right hand, each on its four bones of largest weight."""
     points, normals = skin_points(coordinates, build_skin(shape).corners(coordinates.faces))
-    weights = skin_weights(coordinates)
-    bones = np.argsort(-weights, axis=1, kind="stable")[:, :4]
-    shares = np.clip(np.take_along_axis(weights, bones, axis=1), 0.0, None)
-    return Attachment(layout, points, normals, bones, shares / shares.sum(axis=1, keepdims=True))
+    return Attachment(layout, points, normals, *strongest_weights(skin_weights(coordinates)))
 
 
 def skin_weight_jacobian(coordinates: SkinCoordinates, corners: Corners) -> Float[np.ndarray, "P 16 3"]:

@@ -15,7 +15,7 @@ from gloves.captures.formats import READABLE, read_capture
 from gloves.fit import GloveFit, nominal_fit
 from gloves.layout import list_layouts, load_layout
 from gloves.takes.archives import is_growing
-from gloves.takes.corrections import corrections_path, told
+from gloves.takes.corrections import corrections_path, unfitting_sentences
 from gloves.takes.take import load_take
 from handsim.errors import ArgumentError, FileError, HandSimWarning
 from handsim.files.inputs import read_toml
@@ -26,7 +26,7 @@ from handsim.space.rig import CameraRig, list_rigs, load_rig
 from handsim.space.transforms import UpAxis
 from track.settings import USUAL_SIZE
 from track.user import load_user
-from track.viewer.editors import Corrector, LabelEditor, LayoutEditor, edited_path
+from track.viewer.editors import HEIGHT, Corrector, LabelEditor, LayoutEditor, edited_path
 from track.viewer.recordings import CaptureRecording, DatasetRecording, Recording, TakeRecording
 from track.viewer.stage import FrameView, HandSkin, PointBalls, set_stage, show_rig, show_volume, switch
 from track.viewer.timeline import StatusPanel, Timeline
@@ -46,7 +46,6 @@ _LOOKED_AT: Final = 30  # number of frames that determine the first look
 Run = Callable[[Callable[[], bool]], None]
 """Serves a page until the given function returns True."""
 _SPACING: Final = 0.14  # distance between the centers of two hands [m]
-_HEIGHT: Final = 0.06  # height of a flat hand above the ground [m]
 _BEFORE_COLOR: Final = (150, 150, 150)
 
 
@@ -115,7 +114,7 @@ def _moving(path: Path, name: str, rig: CameraRig | None, time: float | None, up
         take = load_take(path)
         if take.made_by_tracker and not is_growing(path):
             corrector = Corrector(path, take)
-            for sentence in told(corrections_path(path), corrector.unfitting):
+            for sentence in unfitting_sentences(corrections_path(path), corrector.unfitting):
                 warnings.warn(sentence, HandSimWarning, stacklevel=2)
         recording = TakeRecording(corrector.take if corrector else take, rig)
     else:
@@ -230,7 +229,7 @@ def _show_user(server: ViserServer, hands: Sequence[GloveFit]) -> Run:
     for number, hand in enumerate(hands):
         nominal = [nominal_fit(hand.layout, size, hand.side) for size in SIZES]
         before = min(nominal, key=lambda fit: abs(fit.shape.length - hand.shape.length))
-        shift = np.array([0.0, _SPACING * (number - (len(hands) - 1) / 2), _HEIGHT])
+        shift = np.array([0.0, _SPACING * (number - (len(hands) - 1) / 2), HEIGHT])
         _add_hand(server, f"/after/{hand.side}", hand, shift)
         _add_hand(server, f"/before/{hand.side}", before, shift, _BEFORE_COLOR, 0.35, 0.5)
         points = np.stack([before.attachment.points, hand.attachment.points], axis=1)

@@ -40,7 +40,7 @@ _NOTHING: Final = "choose"
 _HALO: Final = 2.5  # radius of the halo around the chosen point, in radii of a marker
 _HALO_COLOR: Final = (255, 190, 0)
 _LISTED: Final = 12  # largest number of corrections in the list
-_HEIGHT: Final = 0.06  # height of the wrist above the ground [m]
+HEIGHT: Final = 0.06  # height of the wrist above the ground [m]
 _GIZMO: Final = 0.03  # size of the handle that moves a marker [m]
 
 
@@ -58,15 +58,9 @@ class Corrector:
         """Saved corrections that match no point."""
         self._state = _state_of(path)
         records = applied_corrections(take)
-        self._stale = any(correction.record() not in records for correction in self.saved)
-        if self._stale:
+        if any(correction.record() not in records for correction in self.saved):
             with errors_of(corrections_path(path), CaptureError):
                 self._make(())
-
-    @property
-    def unsaved(self) -> bool:
-        """Whether the take with all corrections differs from its file."""
-        return bool(self.added) or self._stale
 
     def span_of(self, frame: int, column: int) -> tuple[int, int]:
         """First and last frame around a frame in which its point keeps ID and label without a gap."""
@@ -118,10 +112,10 @@ class Corrector:
                 )
             beside, every = corrections_path(self.path), (*self.saved, *self.added)
             save_corrections(beside, every)
-            self.saved, self.added, self._stale = corrections_of(self.path), (), True
+            self.saved, self.added = corrections_of(self.path), ()
             with writing(self.path, CaptureError):
                 self.take.save(self.path)
-            self._base, self._state, self._stale = self.take, _state_of(self.path), False
+            self._base, self._state = self.take, _state_of(self.path)
         return f"saved {self.path} and {beside}"
 
     def _make(self, added: Sequence[Correction]) -> None:
@@ -316,15 +310,13 @@ class LayoutEditor:
         self, server: ViserServer, path: Path, layout: MarkerLayout, model: HandModel, out: Path
     ) -> None:
         self._path, self._out, self._lock = path, out, threading.Lock()
-        self.shift = np.array([0.0, 0.0, _HEIGHT])
+        self.shift = np.array([0.0, 0.0, HEIGHT])
         """Wrist position in the page [m]."""
         self.fit: GloveFit = attach(layout, model)
         """The hand in the glove with all changes."""
-        self.changed = False
-        """Whether a marker was moved since the last reading or saving."""
         self._chosen: int | None = None
         qpos = np.zeros(NUM_QPOS)
-        qpos[2], qpos[3] = _HEIGHT, 1.0
+        qpos[2], qpos[3] = HEIGHT, 1.0
         self.skin = HandSkin(server, "/hand")
         self.skin.show(model, qpos)
         count = layout.num_markers
@@ -375,7 +367,6 @@ class LayoutEditor:
                 self.state.content = str(error)
                 return
             self.fit = attach(layout, self.fit.model)
-            self.changed = True
             self._show()
             self._describe_chosen()
 
@@ -386,7 +377,6 @@ class LayoutEditor:
             text, kept = moved_text(given, self.fit.layout)
             with writing(self._out, LayoutError):
                 write_text(self._out, text)
-        self.changed = False
         return f"saved {self._out}" if kept else f"saved {self._out}, without the comments of {self._path}"
 
     def _click(self, event: SceneNodePointerEvent[Any]) -> None:

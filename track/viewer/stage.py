@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from handsim.hand.model import HandModel
 from handsim.hand.shape import NUM_QPOS
+from handsim.hand.skin import all_weights
 from handsim.space.rig import ROOM_CENTER, CameraRig
 from handsim.space.transforms import UpAxis, rotation_quaternions, upright
 from track.viewer.recordings import Recording, ShownFrame, label_colors
@@ -179,10 +180,6 @@ class HandSkin:
 
     def _send(self, model: HandModel) -> MeshSkinnedHandle:
         surface = model.surface
-        weights = np.zeros((len(surface.vertices), len(model.rest_transforms)))
-        np.add.at(
-            weights, (np.arange(len(weights))[:, None], surface.bone_indices), surface.bone_weights
-        )  # At most four bones move a vertex, which is viser's limit, too.
         positions, quaternions = _poses(model.rest_transforms)
         return self._server.scene.add_mesh_skinned(
             self._name,
@@ -190,7 +187,7 @@ class HandSkin:
             surface.faces,
             bone_wxyzs=quaternions,
             bone_positions=positions,
-            skin_weights=weights,
+            skin_weights=all_weights(surface.bone_indices, surface.bone_weights),
             color=self._color or _SKIN_COLORS[model.shape.side],
             opacity=self._opacity,
         )

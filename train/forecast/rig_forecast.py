@@ -19,7 +19,7 @@ from gloves.fit import GlovedHand, GloveFit, check_layout, settle_glove
 from gloves.layout import MarkerLayout
 from gloves.optics.reconstruction import OpticsConfig, reconstruct
 from gloves.takes.take import Take
-from handsim.errors import CaptureError, PoseError
+from handsim.errors import CaptureError
 from handsim.hand.model import BodyMotion
 from handsim.space.objects import MARKER_RADIUS
 from handsim.space.rig import FEWEST_CAMERAS, ROOM_CENTER, CameraRig
@@ -40,7 +40,7 @@ from train.simulation.scenes import (
     SceneMotion,
     sample_real_like_scene,
 )
-from train.simulation.takes import sample_scene
+from train.simulation.takes import by_somebody, sample_scene
 from train.simulation.training_frames import (
     FrameScene,
     GenerateSettings,
@@ -56,7 +56,6 @@ HALF_SIDE: Final = 0.3
 OPTICS: Final = OpticsConfig()
 """Noise of blobs and size of visible spots, equal in all rooms."""
 _REAL_LIKE: Final = "real-like"
-_MAX_PEOPLE: Final = 10
 _MIN_FRAMES: Final = 12  # least number of successive frames that are used of a take
 _ROUND_TRIP: Final = (11.0, 14.0, 9.0)  # [s] time to walk through the volume and back along each axis
 _POSES_PER_PERSON: Final = 60
@@ -90,13 +89,7 @@ def _work_scene(kind: str, layout: MarkerLayout, num_frames: int, rng: np.random
     """A scene of a random person who can do this work."""
     if kind != _REAL_LIKE:
         return sample_scene(cast("Kind", kind), layout, num_frames, rng=rng)
-    reason: PoseError | None = None
-    for _ in range(_MAX_PEOPLE):
-        try:
-            return sample_real_like_scene(layout, num_frames, rng=rng)
-        except PoseError as error:
-            reason = error
-    raise PoseError(f"none of {_MAX_PEOPLE} people can do '{_REAL_LIKE}'; the last: {reason}") from reason
+    return by_somebody(_REAL_LIKE, lambda: sample_real_like_scene(layout, num_frames, rng=rng))
 
 
 def _walk(

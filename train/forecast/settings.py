@@ -70,7 +70,7 @@ class PlanRigSettings(Settings):
 
     def check(self) -> None:
         """Refuse a plan without mounts, or with a picture size although new cameras copy a kept one."""
-        if self.keep is not None and (self.size, self.field_of_view) != ((1280, 1280), 60.0):
+        if self.keep is not None and self.changed("size", "field_of_view"):
             raise ArgumentError(
                 f"given keep {self.keep}, and size or field of view, expected none of them: new cameras are "
                 "like the first one that is kept"

@@ -58,7 +58,7 @@ class SetLabeler(nn.Module):
         """Prior of hands that verifies labelings; learned after training."""
         width, bumps = config.width, config.num_distances
         self.register_buffer("centers", torch.linspace(0.0, config.reach, bumps), persistent=False)
-        self.embed = nn.Sequential(nn.Linear(bumps + 1, width), nn.SiLU(), nn.Linear(width, width))
+        self.embed = _embedding(bumps, width)
         self.rounds = nn.ModuleList(MessageRound(width, config.gates, bumps) for _ in range(config.depth))
         self.norm = nn.LayerNorm(width)
         self.to_scores = nn.Linear(width, config.num_labels + 1)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from gloves.layout import MarkerLayout
 from handsim.errors import WeightsError
-from handsim.hand.shape import Side
+from handsim.hand.shape import SIZES, Side
 from handsim.kernels import horn_matrix, kernel, write_quaternion_matrix
 
 NEAREST: Final = 4
@@ -451,7 +451,6 @@ def _shrunk_covariances(
 _MAX_FOURS: Final = 3000
 _POSES: Final = 100  # number of poses of a hand of each size
 _RECOGNIZED: Final = 0.98  # Layouts with fewer recognized complete hands resemble their mirror image.
-_SIZES: Final = ("XS", "S", "M", "L", "XL")
 
 
 class SideClassifier:
@@ -466,7 +465,7 @@ class SideClassifier:
         fours = np.array(list(combinations(range(layout.num_markers), 4)))
         if len(fours) > _MAX_FOURS:
             fours = fours[rng.choice(len(fours), size=_MAX_FOURS, replace=False)]
-        markers = np.concatenate([_right_hands(layout, size, rng) for size in _SIZES])
+        markers = np.concatenate([_right_hands(layout, size, rng) for size in SIZES])
         mean = _mean_orientation(markers, fours)
         self._fours: NDArray[np.int64] = fours
         self._votes: NDArray[np.float64] = np.arctanh(mean.clip(-0.999, 0.999))

@@ -141,16 +141,8 @@ def _draw_hand(
     arrows: list[Mistake],
 ) -> None:
     """Draw hand, markers, arrows, names and color bar."""
-    # Constrained layout would move things after the names are placed.
-    figure.set_layout_engine("none")
-    panel: Axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
-    width, height = 72.0 * figure.get_figwidth(), 72.0 * figure.get_figheight()  # One unit is one point.
-    panel.set(xlim=(0.0, width), ylim=(0.0, height))
-    panel.set_axis_off()
-    everything = np.concatenate([*hand.outlines, hand.markers])
-    low, size = everything.min(axis=0), np.ptp(everything, axis=0)
-    scale = float(((np.array([0.86 * width, height]) - 2.0 * _MARGIN) / size).min())
-    shift = np.array([0.46 * width, 0.5 * height]) - scale * (low + size / 2.0)
+    panel, (width, height), middle, scale = _canvas(figure, hand, hand.markers, 0.86)
+    shift = np.array([0.46 * width, 0.5 * height]) - scale * middle
     hand.draw(panel, scale=scale, shift=shift, bone_width=3.0)
     dots = scale * hand.markers + shift
     _draw_arrows(panel, dots, arrows)
@@ -165,6 +157,22 @@ def _draw_hand(
     for name, dot, center in zip(labels, dots, centers, strict=True):
         _draw_name(panel, name, dot, center)
     color_bar(figure, colors, "slots right [%]", cax=figure.add_axes(_BAR))
+
+
+def _canvas(
+    figure: Figure, hand: FlatHand, dots: Float[np.ndarray, "K 2"], share: float
+) -> tuple[Axes, tuple[float, float], Float[np.ndarray, "2"], float]:
+    """A panel in points, its size, the middle of hand and dots [m], and the scale that fits a share of it."""
+    # Constrained layout would move things after the names are placed.
+    figure.set_layout_engine("none")
+    panel: Axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+    width, height = 72.0 * figure.get_figwidth(), 72.0 * figure.get_figheight()
+    panel.set(xlim=(0.0, width), ylim=(0.0, height))
+    panel.set_axis_off()
+    everything = np.concatenate([*hand.outlines, dots])
+    low, size = everything.min(axis=0), np.ptp(everything, axis=0)
+    scale = float(((np.array([share * width, height]) - 2.0 * _MARGIN) / size).min())
+    return panel, (width, height), low + size / 2.0, scale
 
 
 def slips_picture(layout: MarkerLayout, slips: Sequence[GloveFit]) -> str:
@@ -182,18 +190,11 @@ def _draw_slips(
     below: NDArray[np.bool_],
 ) -> None:
     """Draw the markers of many gloves [m], one color per marker; those `below` (P, M) on the right."""
-    figure.set_layout_engine("none")  # as in _draw_hand
-    panel: Axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
-    width, height = 72.0 * figure.get_figwidth(), 72.0 * figure.get_figheight()
-    panel.set(xlim=(0.0, width), ylim=(0.0, height))
-    panel.set_axis_off()
-    everything = np.concatenate([*hand.outlines, dots.reshape(-1, 2)])
-    low, size = everything.min(axis=0), np.ptp(everything, axis=0)
-    scale = float(((np.array([0.5 * width, height]) - 2.0 * _MARGIN) / size).min())
+    panel, (width, height), middle, scale = _canvas(figure, hand, dots.reshape(-1, 2), 0.5)
     colors, middles, shown = distinct_colors(len(names)), [], []
     for center, flip, there in ((0.25, 1.0, ~below), (0.75, -1.0, below)):
         turn = np.array([flip, 1.0])
-        shift = np.array([center * width, 0.5 * height]) - scale * turn * (low + size / 2.0)
+        shift = np.array([center * width, 0.5 * height]) - scale * turn * middle
         seen = hand._replace(outlines=[turn * loop for loop in hand.outlines], bones=turn * hand.bones)
         seen.draw(panel, scale=scale, shift=shift, bone_width=2.0)
         for marker, color in enumerate(colors):

@@ -313,7 +313,6 @@ In Python, `train.load_labeler(folder).label_frames([points])`. The folder needs
 - Markers of this layout only; if moved by more than a centimeter they need a labeler of their own.
 - Computed in float32. In bfloat16, which some runtimes choose by themselves, labels change.
 """
-_CARD_IN_WORDS: Final = {SEEN: SEEN, "clean": "where every marker is seen"}
 _CARD_KINDS: Final = {"set": "A set labeler", "cnn": "The network of Han et al. 2018"}
 _CARD_FIGURES: Final = {
     "slot_accuracy": "labels and gaps that are right",

@@ -143,7 +143,9 @@ def sample_scene(
     kind: Kind, layout: MarkerLayout, num_frames: int, *, rng: np.random.Generator
 ) -> SceneMotion:
     """A random person in gloves, with the motion of a kind of capture, at `RATE` frames per second."""
-    return _by_somebody(kind, layout, lambda fits: sample_scene_motion(kind, fits, num_frames, rng=rng), rng)
+    return by_somebody(
+        kind, lambda: sample_scene_motion(kind, _worn_gloves(layout, rng), num_frames, rng=rng)
+    )
 
 
 def _worn_hands(settings: SimulateSettings, layout: MarkerLayout) -> tuple[Side, ...]:
@@ -175,28 +177,27 @@ def _sample_scene(settings: SimulateSettings, layout: MarkerLayout, rng: np.rand
     if count is not None:
         made = dataclasses.replace(made, free=(count + 1) / RATE)
 
-    def exercise(fits: Sequence[GloveFit]) -> SceneMotion:
-        worn = tuple(fit for fit in fits if fit.side in settings.hands)
+    def exercise() -> SceneMotion:
+        worn = tuple(fit for fit in _worn_gloves(layout, rng) if fit.side in settings.hands)
         scene = sample_calibration_scene(worn, made, rng=rng)
         hands = tuple(GlovedHand(hand.fit, hand.qpos[:count]) for hand in scene.hands)
         return dataclasses.replace(scene, hands=hands)
 
-    return _by_somebody(kind, layout, exercise, rng)
+    return by_somebody(kind, exercise)
 
 
-def _by_somebody(
-    kind: SimulatedKind,
-    layout: MarkerLayout,
-    act: Callable[[Sequence[GloveFit]], SceneMotion],
-    rng: np.random.Generator,
-) -> SceneMotion:
-    """Scene of the first random person who can do this kind of capture."""
+def _worn_gloves(layout: MarkerLayout, rng: np.random.Generator) -> Sequence[GloveFit]:
+    """A random adult's hands in gloves."""
+    models = sample_adult_hands(rng=rng)
+    return wear_gloves(layout, models, along=_SLIP_ALONG, around=_SLIP_AROUND, rng=rng)
+
+
+def by_somebody(kind: SimulatedKind, act: Callable[[], SceneMotion]) -> SceneMotion:
+    """Scene of the first person who can do this kind of capture; `act` draws one and raises if not."""
     reason: PoseError | None = None
     for _ in range(_MAX_PEOPLE):
-        models = sample_adult_hands(rng=rng)
-        fits = wear_gloves(layout, models, along=_SLIP_ALONG, around=_SLIP_AROUND, rng=rng)
         try:
-            return act(fits)
+            return act()
         except PoseError as error:
             reason = error
     raise PoseError(f"none of {_MAX_PEOPLE} people can do '{kind}'; the last: {reason}") from reason

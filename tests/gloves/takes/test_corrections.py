@@ -20,7 +20,7 @@ from gloves.takes.corrections import (
     load_corrections,
     pin_labels,
     save_corrections,
-    told,
+    unfitting_sentences,
 )
 from handsim.errors import CaptureError
 from tests.sentences import error_names
@@ -113,7 +113,7 @@ def test_what_no_longer_fits_is_told(points, tmp_path):
     moved = Correction(7, 9, (5.0, 5.0, 5.0), NAMES[0])
     pins = find_pins([moved], listed(points, ids), NAMES)
     assert (pins.labels == FREE).all() and pins.unfitting == (moved,)
-    (sentence,) = told(tmp_path / "a.corrections.toml", pins.unfitting)
+    (sentence,) = unfitting_sentences(tmp_path / "a.corrections.toml", pins.unfitting)
     assert "the correction to right:ThumbTip in frames 7 to 9 no longer fits" in sentence
 
 
