@@ -42,7 +42,9 @@ _RECENT: Final = 1.0  # [s] time constant of the newest residual's running mean
 _JUMP: Final = 1.5  # ratio to the usual residual beyond which the hands may be another person's
 _STEP: Final = 0.002  # [m] motion of the markers of a hand at rest per step to a new size
 _FEWEST_STEPS: Final = 4  # Learned marker biases fade out in at least this many steps.
-_EASE: Final = 0.0025  # [m] by which a keypoint leaves its motion in a frame while a size is taken over
+_EASE: Final = (
+    0.0025  # [m] A keypoint leaves its motion by at most this per frame while a size is taken over.
+)
 _NICE: Final = 5  # The measuring process has a lower priority than the tracker's.
 
 
