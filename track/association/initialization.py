@@ -56,9 +56,9 @@ _FREE_COORDINATES: Final = 20.0  # effective degrees of freedom of a pose
 _SPREAD_BEFORE: Final = 0.002  # [m] prior standard deviation of markers around a fitted pose
 _SPREAD_BEFORE_COORDINATES: Final = 6.0  # number of coordinates that this prior counts for
 _MARKERS_OF_EVIDENCE: Final = 10  # Evidence is required for at most this many markers.
-_LEAST_REPEATED: Final = 0.5  # share of that evidence, from which on a hand counts that repeats itself
-_REPETITION: Final = 5.0  # log-odds of a hand that was found in an earlier call, too
-_SAME_RMS: Final = 0.008  # [m] between the markers of one hand in two calls, after a rigid motion
+_LEAST_REPEATED: Final = 0.5  # A hand with this share of that evidence waits for other calls to confirm it.
+_REPETITION: Final = 5.0  # log-odds that each earlier call with the same hand adds
+_SAME_RMS: Final = 0.008  # [m] Markers of one hand in two calls differ by less, up to a rigid motion.
 _CERTAIN_SCORE: Final = 5.5  # log-odds per marker from which no further cloud is tried
 _HOPELESS_FACTOR: Final = 2.5  # A mirrored hand has an RMS distance this many times the best one's.
 _GOOD_RMS: Final = 0.003  # [m] The best hand must fit this well to reject its mirror image.
@@ -89,10 +89,10 @@ class _Search:
 
 
 class _Repeated(NamedTuple):
-    """A hand that lacked evidence."""
+    """A hand that had too little evidence by itself."""
 
-    markers: Float[np.ndarray, "M 3"]  # its labeled points [m], NaN for markers without one
-    evidence: float = 0.0  # log-odds of the calls before in which it was found, too
+    markers: Float[np.ndarray, "M 3"]  # its labeled points [m], NaN for markers without a point
+    evidence: float = 0.0  # log-odds that earlier calls with the same hand add
 
 
 class HandInitializer:
@@ -100,7 +100,7 @@ class HandInitializer:
 
     # With `at_once` a call tries all directions of cuts. Otherwise it tries three, and the calls of the next
     # frames try one more each, until a hand is certain or all directions were tried: no frame waits for a
-    # waits for a search. A hand that shows few markers is initialized once some calls agree on it.
+    # long search. A hand that shows few markers is initialized once several calls agree on it.
 
     def __init__(
         self,
@@ -254,7 +254,7 @@ class HandInitializer:
         hands: Sequence[int],
         share: float = 1.0,
     ) -> InitializedHand | None:
-        """The best hand so far, or one of these clouds of a group with a better score.
+        """The best hand so far, or a hand with a better score from these clouds of a group.
 
         Hands with at least this share of the evidence that is asked for count.
         """
@@ -348,7 +348,7 @@ class HandInitializer:
         return hands
 
     def _trim(self, hand: InitializedHand | None, share: float = 1.0) -> InitializedHand | None:
-        """Drop the worst label while that improves the score; None where it is no hand.
+        """Drop the worst label while that raises the score; None if the result is not a hand.
 
         A hand has at least this share of the evidence that is asked for.
         """
@@ -409,7 +409,7 @@ def _likelier(
 def _is_same(before: Float[np.ndarray, "M 3"], markers: Float[np.ndarray, "M 3"]) -> bool:
     """Whether markers [m] of two calls, NaN where missing, are those of one hand."""
     both = np.isfinite(before[:, 0]) & np.isfinite(markers[:, 0])
-    if both.sum() < FEWEST_POINTS:
+    if both.sum() < FEWEST_MARKERS:
         return False
     rotation, shift = rigid_fit(before[both], markers[both])
     off = before[both] @ rotation.T + shift - markers[both]
