@@ -65,10 +65,11 @@ def capture_of(capture: AnyCapture) -> Capture:
     if isinstance(capture, str | Path):
         capture = read_points(capture)
     if not isinstance(capture, Capture | Take):
-        names = ", ".join((*READABLE, ".npz"))
+        endings = ", ".join((*READABLE, ".npz"))
+        made = "; Capture(names, positions, rate) makes one of positions (T, N, 3) in meters"
         raise ArgumentError(
-            f"capture is {shown_value(capture)}, expected a Capture, a Take, or the path of a file; valid "
-            f"names: {names}"
+            f"capture is {shown_value(capture)}, expected a Capture, a Take, or the path of a file "
+            f"({endings}){made if isinstance(capture, np.ndarray) else ''}"
         )
     return capture if isinstance(capture, Capture) else capture.capture()
 

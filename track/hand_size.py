@@ -407,7 +407,7 @@ def check_hands(
         named += f" in glove '{best.name}'"
         remedy.append(f"--glove {best.name}")
     if remedy:
-        shares = f"{fit.shown} of {len(some)} frames, what is asked for {asked.shown}"
+        shares = f"in {fit.shown} of {len(some)} frames instead of {asked.shown}"
         known = [one for one in remedy if one.split()[0] in options]
         how = f"; name it ({' '.join(known)})" if known else ""
         warnings.warn(f"the points fit {named} better ({shares}){how}", HandSimWarning, stacklevel=3)

@@ -53,7 +53,8 @@ class Vouch(NamedTuple):
         """The result as one sentence."""
         if self.right <= 0.0:
             return (
-                f"labels: {100 * self.listed:.1f} % of the frames are listed as doubtful, the rest is unsure"
+                f"labels: {100 * self.listed:.1f} % of the frames are listed as doubtful; how many of the "
+                "others are right is not known"
             )
         return (
             f"labels: of the {100 * (1.0 - self.listed):.1f} % of frames that are not listed as doubtful at "

@@ -147,6 +147,7 @@ MAX_SPAN: Final = 30.0
 AT_ORIGIN: Final = "all points are at the origin, (0, 0, 0)"
 """What errors say of clouds for which `all_at_origin` is true."""
 _MIN_SPAN: Final = 0.02  # [m]: smallest median span; a fist with five markers spans three times as much
+_MIN_CENTIMETERS: Final = 0.002  # [m]: smallest span of hands in centimeters that were read as millimeters
 _MAX_SPACING: Final = 1.5  # [m]: largest median distance of a point from the nearest other one
 _MIN_POINTS: Final = 5  # A cloud needs this many points to show its unit; fewer may all be strays.
 _MIN_FRAMES: Final = 10  # Small or wide clouds count in this many frames; fewer may show strays alone.
@@ -189,7 +190,8 @@ def unit_fault(clouds: Sequence[Float[np.ndarray, "N 3"]], *, only_wide: bool = 
         return None
     span = float(np.median(spans))
     if span < _MIN_SPAN:
-        return UnitFault(f"the points of a frame span {1e3 * span:.2g} mm", "meters")
+        unit = "meters" if span < _MIN_CENTIMETERS else "centimeters"
+        return UnitFault(f"the points of a frame span {1e3 * span:.2g} mm", unit)
     apart = float(np.median([spacing(cloud) for cloud in shown]))
     if apart > _MAX_SPACING:
         return UnitFault(f"the points of a frame are {apart:.2g} m apart", "centimeters")

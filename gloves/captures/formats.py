@@ -503,7 +503,7 @@ _UNREAD: Final = {
     ".tak": "a take of Motive, a closed format; export CSV or C3D with unlabeled markers from Motive",
     ".qtm": "a file of Qualisys' own; export C3D, or TSV of 3D data, from QTM",
     ".mat": "a file of MATLAB; export C3D, or TSV of 3D data, from the program that wrote it",
-    ".npz": "an archive of NumPy; if it is a take, load_take reads it and handsim export writes its points",
+    ".npz": "an archive of NumPy; if it is a take, load_take reads it, and its capture() has the points",
     **dict.fromkeys((".x1d", ".x2d", ".v", ".vsk", ".enf", ".system"), _VICON),
     **dict.fromkeys((".trb", ".cap"), _CORTEX),
     **dict.fromkeys((".mot", ".sto", ".osim"), _OPENSIM),

@@ -16,6 +16,7 @@ import re
 import warnings
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from numbers import Real
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -23,6 +24,7 @@ from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
 from gloves.captures.pieces import Trajectories, packed_trajectories
+from handsim._checks import shown_value
 from handsim.errors import CaptureError, HandSimWarning, shortened
 from handsim.files.inputs import text_encoding
 
@@ -369,9 +371,10 @@ class StatedTimes:
 
 def check_rate(rate: float, name: str = "the rate") -> None:
     """Raise a `CaptureError` unless a frame rate [Hz] is that of an optical system."""
-    if not LOWEST_RATE <= rate <= HIGHEST_RATE:
+    if not isinstance(rate, Real) or not LOWEST_RATE <= rate <= HIGHEST_RATE:
+        given = f"{rate:g} Hz" if isinstance(rate, Real) else shown_value(rate)
         raise CaptureError(
-            f"{name} is {rate:g} Hz, expected {LOWEST_RATE:g} to {HIGHEST_RATE:g} frames per second"
+            f"{name} is {given}, expected {LOWEST_RATE:g} to {HIGHEST_RATE:g} frames per second"
         )
 
 

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from gloves.takes.points import POINT_COUNTS, Column
 from handsim.callbacks import Closing
-from handsim.errors import CaptureError, HandSimError, HandSimWarning, shortened
+from handsim.errors import ArgumentError, CaptureError, HandSimError, HandSimWarning, shortened
 from handsim.files.arrays import Member, check_npy_header, check_npz, read_npz, write_npz
 from handsim.files.inputs import check_regular
 from handsim.files.outputs import atomic_write, make_folder_of
@@ -365,6 +365,8 @@ def read_archive(
         )
     try:
         return unpack(header, arrays)
+    except ArgumentError as error:
+        raise CaptureError(f"{_damaged(path)}: {error}") from error
     except _DAMAGE as error:
         raise CaptureError(_damaged(path)) from error
 

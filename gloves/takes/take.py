@@ -385,6 +385,8 @@ class Take:
     def mean_pose(self, side: Side, between: tuple[float, float]) -> Float[np.ndarray, "20"]:
         """The mean joint angles of a hand between two times [rad]; warns if it moves there."""
         first, last = between
+        if not first < last:
+            raise ArgumentError(f"neutral is {first:g} to {last:g} s, expected the earlier time first")
         there = self.is_tracked(side) & (self.times >= first) & (self.times <= last)
         if not there.any():
             raise ArgumentError(
@@ -637,7 +639,8 @@ class Take:
         Raises:
             ArgumentError: The take does not have these frames.
         """
-        if not 0 <= first < last <= self.num_frames:
+        whole = isinstance(first, int | np.integer) and isinstance(last, int | np.integer)
+        if not whole or not 0 <= first < last <= self.num_frames:
             raise ArgumentError(f"frames {first} to {last}, expected a part of 0 to {self.num_frames}")
         parts = {column.name: getattr(self, column.name)[first:last] for column in (*FRAMES, *self._known())}
         return dataclasses.replace(self, **parts, point_list=self.point_list.cut(first, last))
@@ -687,11 +690,12 @@ class Take:
         The file also holds `keypoints`, for programs that have no model of the hand.
 
         Raises:
-            ArgumentError: The name does not end in .npz.
+            ArgumentError: The name does not end in .npz, or an array was changed to what no take has.
             OSError: The file cannot be written.
         """
         check_type("path", path, (str, os.PathLike), "the path of a .npz file")
         check_ending(Path(path), ".npz", option="path")
+        dataclasses.replace(self)  # checks its arrays, which may have been changed
         points, num_columns = self.point_list.stored()
         arrays = {column.name: getattr(self, column.name) for column in (*FRAMES, *self._known())} | points
         arrays |= {KEYPOINTS.name: self.keypoints(), **worn_arrays(self.hands, self.bodies)}

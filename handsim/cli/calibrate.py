@@ -65,7 +65,8 @@ def calibrate(
         settings = CalibrateSettings(glove=glove, hands=hands, size=size, labeler=labeler)
         user = captures.calibrate(capture, settings, progress=bar, on_step=bar.step)
     user.save(out)
-    print_line(f"{out}: {len(user)} hands in glove {glove}")
+    sides = " and ".join(hand.side for hand in user)
+    print_line(f"{out}: {sides} hand in glove {glove}")
     found = {one.hand.side: _report(one) for one in user.calibrations}
     for side in hands:
         told = found.get(side, ["it is not in the capture and was left out"])

@@ -77,8 +77,9 @@ def evaluate(
         found |= _against_truth(report)
     if json is not None:
         save_json(json, found)
-    worst = sorted(by_marker, key=by_marker.__getitem__)[:3]
-    print_line("worst markers: " + ", ".join(f"{name} {100 * by_marker[name]:.2f} %" for name in worst))
+    worst = [name for name in sorted(by_marker, key=by_marker.__getitem__)[:3] if by_marker[name] < 1.0]
+    if worst:
+        print_line("worst markers: " + ", ".join(f"{name} {100 * by_marker[name]:.2f} %" for name in worst))
 
 
 def _against_truth(report: LabelingReport) -> dict[str, Any]:

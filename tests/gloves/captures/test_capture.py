@@ -149,6 +149,7 @@ def scaled(capture: Capture, scale: float) -> Capture:
     ("scale", "sentence"),
     [
         (1e-3, r"the points of a frame span 0\.1\d mm; correct that unit, probably to meters"),
+        (1e-1, r"the points of a frame span 1\d mm; correct that unit, probably to centimeters"),
         (1e3, r"the points of a frame span 1\d\d m; correct that unit, probably to millimeters"),
         (1e2, r"the points of a frame are \d\.\d m apart; correct that unit, probably to centimeters"),
     ],

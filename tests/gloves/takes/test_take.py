@@ -580,3 +580,10 @@ def test_other_endings_are_refused_with_the_valid_ones(moving, tmp_path):
         moving.export(tmp_path / "hands.fbx")
     assert all(ending in str(caught.value) for ending in MOTION_FORMATS)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_take_whose_arrays_were_changed_is_not_saved(take, tmp_path):
+    take.qpos[0, 0, 3:7] = 0.0
+    with pytest.raises(ArgumentError, match="not a take: "):
+        take.save(tmp_path / "changed.npz")
+    assert not list(tmp_path.iterdir())
