@@ -1,4 +1,4 @@
-"""Poses in which thumb and finger touch, solved for one person's hand.
+"""Poses in which thumb and finger touch, solved for one person's hand, and where they touch.
 
 A touch is two capsules that meet: those of the thumb's and the finger's last bones, pads facing each other.
 A real hand gives this kind of ground truth without any instrument.
@@ -41,12 +41,16 @@ _STEP: Final = 1e-6  # step of the finite differences [rad]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ThumbContact:
-    """How the last bones of thumb and one finger meet in each frame."""
+    """Relative position of the last bones of thumb and one finger in each frame."""
 
     finger: str
     """Which finger."""
     overlap: Float[np.ndarray, "T"]
     """How deep the two capsules overlap [m]; negative: the gap between them."""
+    thumb_point: Float[np.ndarray, "T 3"]
+    """The thumb's point nearest to the finger, in the frame of the thumb's last bone [m]."""
+    finger_point: Float[np.ndarray, "T 3"]
+    """The finger's point nearest to the thumb, in the frame of the finger's last bone [m]."""
     facing: Float[np.ndarray, "T 2"]
     """Cosine between pad direction and direction to the other bone, for thumb and finger; 1: pad to pad."""
 
@@ -54,7 +58,7 @@ class ThumbContact:
 def thumb_contact(
     model: HandModel | HandShape | str, angles: Float[np.ndarray, "T 20"], finger: str
 ) -> ThumbContact:
-    """Overlap and facing of thumb and finger ("index", "middle", "ring" or "little"), touching or not."""
+    """The nearest points of thumb and finger ("index", "middle", "ring" or "little"), touching or not."""
     model = load_model(model)
     check_choice(finger, FINGERS, noun="finger")
     return _contact(model.capsules, model.forward_kinematics(join_qpos(angles)), finger)
@@ -68,8 +72,13 @@ def _contact(capsules: Capsules, frames: NDArray[np.float64], finger: str) -> Th
     direction = ends[:, 1] - ends[:, 0]
     distance = np.linalg.norm(direction, axis=1)
     direction /= distance[:, None]
-    thumb, other = ((frames[:, bone, :3, 2] * direction).sum(axis=1) for bone in bones)
-    return ThumbContact(finger, radii.sum() - distance, np.stack([-thumb, other], axis=1))
+    points, facing = [], []
+    for number, sign in enumerate((1.0, -1.0)):
+        frame = frames[:, bones[number]]
+        surface = ends[:, number] + sign * radii[number] * direction - frame[:, :3, 3]
+        points.append(np.einsum("tji,tj->ti", frame[:, :3, :3], surface))
+        facing.append(-sign * (frame[:, :3, 2] * direction).sum(axis=1))
+    return ThumbContact(finger, radii.sum() - distance, points[0], points[1], np.stack(facing, axis=1))
 
 
 def touching_angles(

@@ -33,6 +33,7 @@ from track.config import BOTH
 from track.corrected_take import correct_take
 from track.frames import AnyCapture, StreamedFrame, TrackedFrame, capture_of, checked_frames
 from track.hand_size import measured_user, sample_frames
+from track.kinematics.pose_solver import FEWEST_MARKERS
 from track.label_confidence import label_confidence
 from track.recorder import TakeRecorder
 from track.settings import USUAL_SIZE, CalibrateSettings, LabelSettings, TrackerSetup, TrackSettings

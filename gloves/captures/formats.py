@@ -44,6 +44,8 @@ from gloves.captures.capture import (
 from gloves.captures.coordinates import OUTPUTS, PIECES, findings_sentence, settled
 from gloves.captures.pieces import Trajectories
 from gloves.captures.text import (
+    LEADING,
+    MAX_DIGITS,
     MOST_CELLS,
     TAB,
     StatedTimes,

@@ -12,23 +12,24 @@ from hypothesis import strategies as st
 
 from handsim import HandModel, join_qpos, sample_shape
 from handsim.errors import ArgumentError, PoseError
-from handsim.hand.shape import SIDES, SIZES
+from handsim.hand.shape import DIGITS, SIDES, SIZES
 from poses.shapes import HIGH, LOW, MAX_PENETRATION, is_valid, resting_angles
 from poses.touch import FINGERS, MAX_OVERLAP, MIN_FACING, is_touching, thumb_contact, touching_angles
 from tests.sentences import error_names
 
 
-def _measured(model: HandModel, angles: np.ndarray, finger: str) -> float:
-    """Distance [m] of the two last bones' capsules, by MuJoCo."""
+def _measured(model: HandModel, angles: np.ndarray, finger: str) -> tuple[float, np.ndarray]:
+    """Distance [m] of the two last bones' capsules and the two nearest points (2, 3), by MuJoCo."""
     data = mujoco.MjData(model.mj_model)
     data.qpos[:] = join_qpos(angles[None])[0]
     mujoco.mj_forward(model.mj_model, data)
     geoms = [model.mj_model.geom(f"{digit}_distal_1").id for digit in ("thumb", finger)]
-    return mujoco.mj_geomDistance(model.mj_model, data, *geoms, 1.0, None)
+    line = np.zeros(6)
+    return mujoco.mj_geomDistance(model.mj_model, data, *geoms, 1.0, line), line.reshape(2, 3)
 
 
 def _check_touch(model: HandModel, angles: np.ndarray, finger: str) -> None:
-    distance = _measured(model, angles, finger)
+    distance, _ = _measured(model, angles, finger)
     assert -MAX_OVERLAP <= distance <= 0.0
     assert abs(distance + MAX_OVERLAP / 2) <= 0.0003
     contact = thumb_contact(model, angles[None], finger)
@@ -72,14 +73,29 @@ def test_nearly_everybody_touches_with_nearly_every_finger():
 
 @given(seed=st.integers(0, 10_000), finger=st.sampled_from(FINGERS))
 @settings(max_examples=25, deadline=None)
-def test_overlap_is_minus_the_distance_that_mujoco_finds(seed, finger):
+def test_the_nearest_points_are_those_that_mujoco_finds(seed, finger):
     rng = np.random.default_rng(seed)
     model = HandModel.named("M", side=SIDES[seed % 2])
     angles = rng.uniform(LOW, HIGH)
-    distance = _measured(model, angles, finger)
+    distance, points = _measured(model, angles, finger)
     contact = thumb_contact(model, angles[None], finger)
     assert contact.overlap[0] == pytest.approx(-distance, abs=1e-6)
-    assert contact.finger == finger
+    frames = model.forward_kinematics(join_qpos(angles[None]))[0]
+    bones = (3, 3 * DIGITS.index(finger) + 3)
+    for bone, local, point in zip(bones, (contact.thumb_point, contact.finger_point), points, strict=True):
+        ours = frames[bone, :3, :3] @ local[0] + frames[bone, :3, 3]
+        if distance > 1e-4:  # MuJoCo gives the middle of an overlap for both
+            np.testing.assert_allclose(ours, point, atol=1e-5)
+
+
+def test_the_place_of_a_contact_is_on_both_pads():
+    model = HandModel.named("L")
+    for finger in FINGERS:
+        contact = thumb_contact(model, touching_angles(model, finger)[None], finger)
+        for point in (contact.thumb_point[0], contact.finger_point[0]):
+            assert point[2] < 0.0  # the palm's side of the bone
+            assert point[0] > 0.005  # not at its knuckle
+        assert contact.finger == finger
 
 
 def test_both_sides_touch_alike():
