@@ -23,9 +23,11 @@ from numpy.typing import NDArray
 from gloves.captures.capture import runs_of
 from gloves.fit import GloveFit
 from handsim.hand.model import NUM_VELOCITIES, HandModel, join_qpos, skinned_jacobian
-from handsim.hand.shape import DIGITS, NUM_BONES, HandShape, bones_of
+from handsim.hand.shape import BONES, DIGITS, NUM_BONES, HandShape, bones_of
 from handsim.hand.skin import rest_vertices
 from handsim.kernels import move
+from handsim.space.transforms import quaternion_matrix
+from poses.shapes import LIBRARIES, gestures_of
 from poses.touch import FINGERS, thumb_contact
 from track.calibration.hand_parameters import (
     NUM_PARAMETERS,
@@ -59,6 +61,8 @@ _LIMIT_SPREAD: Final = np.deg2rad(2.0)  # of an angle beyond its range
 _GESTURES: Final = 4.0  # that a capture counts as, however many frames it has: they are much alike
 # A user's mean angles differ from the mean of the gestures by this many standard deviations of the gestures.
 _OFF_GESTURES: Final = np.repeat([1.0, 0.25], [4, 16])  # thumbs at work are held otherwise
+_MOST_GESTURES: Final = 80  # in which errors of angles are computed
+_LEAST_MOTION: Final = np.deg2rad(1.0)  # of a digit that flesh follows
 RELINEARIZE: Final = 0.005  # change of a parameter (log lengths, [rad], [m]) that renews the skin's jacobian
 _DIFFERENCE_STEP: Final = 1e-5  # of finite differences
 PAD_COMPRESSION: Final = 0.001
@@ -150,6 +154,8 @@ class Problem:
         self.noise, self.robust_scale = noise, robust_scale
         self.pose_precision = min(1.0, _GESTURES / len(targets)) * resting_prior().precision
         self.position_spread, self.height_spread = POSITION_SPREAD, HEIGHT_SPREAD
+        self.data_noise = noise
+        """Standard deviation of a marker's coordinates [m] without the flesh, for which `noise` is larger."""
         self.precision = shape_precision()
         self._ranges = HandModel(shape).skeleton.ranges
         self._surface_jacobian: NDArray[np.float64] | None = None
@@ -199,8 +205,13 @@ class Problem:
         beyond = np.maximum(angles - high, 0.0) + np.minimum(angles - low, 0.0)
         return beyond, angles - resting_prior().angles
 
-    def normal_equations(self, estimate: Estimate, fit: Fit) -> NormalEquations:
-        """Gauss-Newton's equations; the shared unknowns are the parameters, then three per marker [m]."""
+    def weighted_jacobians(
+        self, estimate: Estimate, fit: Fit
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Jacobians by poses and by shared unknowns and residuals, each times the root of its weight.
+
+        The last array is the jacobian of markers minus designs by the parameters (M, 3, 53).
+        """
         count, frames = len(estimate.points), len(estimate.qpos)
         skin = fit.model.surface.vertices
         patch = SkinPatch(self._all_coordinates(estimate).faces)
@@ -229,7 +240,12 @@ class Problem:
             residuals[at] = fit.geometry.gaps
             precision[at] = contact_weights(fit.geometry, estimate.contacts.fingers) / CONTACT_SPREAD**2
         root = np.sqrt(precision)[..., None]
-        by_pose, by_shared, residuals = root * by_pose, root * by_shared, root[..., 0] * residuals
+        moved = rest[:count] - rest[count : 2 * count]
+        return root * by_pose, root * by_shared, root[..., 0] * residuals, moved
+
+    def normal_equations(self, estimate: Estimate, fit: Fit) -> NormalEquations:
+        """Gauss-Newton's equations; the shared unknowns are the parameters, then three per marker [m]."""
+        by_pose, by_shared, residuals, moved = self.weighted_jacobians(estimate, fit)
         transposed, flat = by_pose.swapaxes(1, 2), by_shared.reshape(-1, by_shared.shape[2])
         result = NormalEquations(
             transposed @ by_pose,
@@ -238,7 +254,7 @@ class Problem:
             (transposed @ residuals[..., None])[..., 0],
             residuals.ravel() @ flat,
         )
-        self._add_priors(estimate, fit, rest[:count] - rest[count : 2 * count], result)
+        self._add_priors(estimate, fit, moved, result)
         return result
 
     def _rest_jacobian(
@@ -564,17 +580,77 @@ def shared_covariance(
     return np.linalg.inv(reduced[:, :-1]), solved[..., :-1]
 
 
+def error_covariance(
+    problem: Problem, estimate: Estimate, fit: Fit
+) -> tuple[Float[np.ndarray, "S S"], Float[np.ndarray, "F 26 S"]]:
+    """Covariance of the errors of the shared unknowns, and how poses answer to these unknowns.
+
+    Unlike noise, flesh that follows the angles of its digit is not averaged out by many frames, nor are the
+    gestures of a user that differ from people's.
+    """
+    by_pose, by_shared, residuals, _ = problem.weighted_jacobians(estimate, fit)
+    equations = problem.normal_equations(estimate, fit)
+    reduced, solved = eliminate_poses(equations, 0.0)
+    inverse, answers = np.linalg.inv(reduced[:, :-1]), solved[..., :-1]
+    flat = by_shared.reshape(-1, len(reduced))
+    share = (problem.data_noise / problem.noise) ** 2
+    errors = share * reduced[:, :-1] + (1.0 - share) * (equations.shared - flat.T @ flat)
+    turns = answers[:, 6:].sum(axis=0).T @ problem.pose_precision * _OFF_GESTURES
+    errors += turns @ resting_prior().covariance @ turns.T
+    # Of flesh of a size, the fit leaves a part in the residuals; by that the size is estimated.
+    patterns = _flesh_patterns(problem, estimate)
+    bases = np.stack([np.linalg.qr(one.reshape(-1, one.shape[2]))[0] for one in patterns])
+    bases, forces, left = bases.reshape(patterns.shape), [], 0.0
+    for marker, moved in enumerate(patterns):
+        rows = slice(3 * marker, 3 * marker + 3)
+        poses = by_pose[:, rows].swapaxes(1, 2) @ moved
+        force = np.tensordot(by_shared[:, rows], moved, ((0, 1), (0, 1)))
+        forces.append(force - np.tensordot(answers, poses, ((0, 1), (0, 1))))
+        shared = inverse @ forces[-1]
+        rest = by_pose @ (answers @ shared - np.linalg.solve(equations.pose, poses)) - by_shared @ shared
+        rest[:, rows] += moved
+        by_marker = rest[:, :-1].reshape(len(rest), len(patterns), 3, -1)
+        left += np.square(np.einsum("mfkb,fmkc->mbc", bases, by_marker, optimize=True)).sum()
+    seen = residuals[:, :-1].reshape(len(residuals), -1, 3)
+    found = np.square(np.einsum("mfkb,fmk->mb", bases, seen, optimize=True)).sum()
+    flesh = max(found - share * bases[:, 0, 0].size, 0.0) / left
+    across = np.concatenate(forces, axis=1)
+    return inverse @ (errors + flesh * across @ across.T) @ inverse, answers
+
+
+def _flesh_patterns(problem: Problem, estimate: Estimate) -> Float[np.ndarray, "M F 3 12"]:
+    """Ways in which flesh moves each marker, in the wrist's frame, with the angles of its digit.
+
+    They are in units of the noise, each with a mean square of a quarter over the frames. Flesh on the palm
+    follows the flexions of the MCPs.
+    """
+    patterns, turned = [], quaternion_matrix(estimate.qpos[:, 3:7]) / problem.noise
+    for marker, bone in enumerate(skin_weights(estimate.coordinates).argmax(axis=1)):
+        digit = BONES[bone].digit
+        angles = estimate.qpos[:, 12::4] if digit < 0 else estimate.qpos[:, 7 + 4 * digit : 11 + 4 * digit]
+        off = problem.present[:, marker, None] * (angles - angles.mean(axis=0))
+        off /= max(float(np.sqrt((off**2).sum(axis=1).mean())), _LEAST_MOTION)
+        patterns.append(np.einsum("fki,fj->fkij", turned, off).reshape(len(off), 3, -1))
+    return np.stack(patterns)
+
+
+def gesture_answers(problem: Problem, estimate: Estimate) -> Float[np.ndarray, "F 26 S"]:
+    """How poses answer to the shared unknowns in the gestures that people make, whatever the capture has."""
+    gestures = np.concatenate([gestures_of(library) for library in LIBRARIES])
+    qpos = join_qpos(gestures[:: -(-len(gestures) // _MOST_GESTURES)])
+    at = dataclasses.replace(estimate, qpos=qpos, contacts=_NO_CONTACTS)
+    targets = np.zeros((len(qpos), *estimate.points.shape))
+    scales = {"noise": problem.noise, "robust_scale": np.inf}
+    seen = Problem(problem.shape, problem.design, problem.heights, targets, **scales)
+    return shared_covariance(seen, at, seen.fit(at))[1]
+
+
 def angle_errors(
-    covariance: Float[np.ndarray, "S S"],
-    answers: Float[np.ndarray, "F 26 S"],
-    pose_precision: Float[np.ndarray, "20 20"],
+    covariance: Float[np.ndarray, "S S"], answers: Float[np.ndarray, "F 26 S"]
 ) -> Float[np.ndarray, "20 2"]:
-    """What `shared_covariance` leaves open of each joint angle [rad]: by places of markers, by the shape."""
-    by_angle = answers[:, 6:]
-    # Where directions of bones are unsure, gestures that the user does not make turn them.
-    turns = covariance @ by_angle.sum(axis=0).T @ pose_precision * _OFF_GESTURES
-    covariance = covariance + turns @ resting_prior().covariance @ turns.T
+    """What is open of each joint angle [rad]: by places of markers, by the shape."""
     # Both are correlated. Their shares of the whole variance are as they would be alone.
+    by_angle = answers[:, 6:]
     places, bones, both = (
         np.einsum("fis,st,fit->i", of, covariance[part, part], of, optimize=True)
         for part in (slice(NUM_PARAMETERS, None), slice(NUM_PARAMETERS), slice(None))

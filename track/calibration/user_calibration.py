@@ -37,8 +37,10 @@ from track.calibration.energy import (
     angle_errors,
     contact_geometry,
     contact_weights,
+    error_covariance,
     find_touches,
     first_estimate,
+    gesture_answers,
     initialize_contacts,
     levenberg_marquardt,
     shared_covariance,
@@ -79,7 +81,6 @@ _LEAST_NOISE, _MOST_NOISE = 0.0001, 0.003  # [m]
 _CHI2_MEDIAN: Final = 2.366  # median of the chi-squared distribution with three degrees of freedom
 _USUAL_SPREAD_COORDINATES: Final = 12.0  # coordinates of markers that the usual spread counts as
 _INDEPENDENT_POSES: Final = 14.0  # frames whose deformation of the flesh is independent
-_FLESH_REPEATS: Final = 0.7  # added to variances by flesh, which follows the angles alike in all of these
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -276,9 +277,7 @@ def calibrate_hand(
         touching = PoseSolver(right).solve(seen[[frame for frame, _ in touches]])
         before = contact_gaps(right.model, touches, touching.qpos)
     final = PoseSolver(done).solve(seen, rough_track.qpos)
-    covariance, answers = shared_covariance(problem, estimate, fit)
-    flesh = 1.0 - (problem.robust_scale / (_SCALE_IN_NOISES * problem.noise)) ** 2
-    covariance *= 1.0 + _FLESH_REPEATS * flesh
+    covariance, answers = error_covariance(problem, estimate, fit)
     position_errors, length_errors = standard_errors(problem, estimate, fit, covariance)
     return Calibration(
         hand=done.with_side(start.side),
@@ -288,7 +287,9 @@ def calibrate_hand(
         shifts=np.linalg.norm(fit.design_residuals, axis=1),
         position_errors=position_errors,
         length_errors=length_errors,
-        angle_errors=angle_errors(covariance, answers, problem.pose_precision),
+        angle_errors=np.maximum(
+            *(angle_errors(covariance, one) for one in (answers, gesture_answers(problem, estimate)))
+        ),
         touches=_touches(estimate, fit, touches, usable, before, mirror),
         still_joints=still_joints(final.qpos[:, 7:], complete, done.model),
     )
@@ -318,6 +319,7 @@ def _with_touches(
         noise=float(np.sqrt(noise**2 + flesh * max(len(frames) / _INDEPENDENT_POSES - 1.0, 0.0))),
         robust_scale=_SCALE_IN_NOISES * noise,
     )
+    larger.data_noise = noise
     estimate = dataclasses.replace(estimate, qpos=track.qpos[frames])
     if not touches:
         return larger, estimate
