@@ -171,7 +171,7 @@ def _fit_from(
     """The hands that are found as hands of a length [m]."""
     markers: list[NDArray[np.float64]] = []
     for _ in range(2):  # the labels are better with hands of about their own size
-        start = _hand(length, usual_breadth(length), layout)
+        start = mean_hand(length, usual_breadth(length), layout)
         markers = _label(frames, start, sides, labeler, config) or markers
         if not markers:
             return None
@@ -179,7 +179,7 @@ def _fit_from(
         length = search.length(usual_breadth, _SHORTEST, _LONGEST)
         if abs(length - before) <= _FAR:
             break
-    return _fit_proportions(np.concatenate(markers), _hand(*search.measures(length), layout))
+    return _fit_proportions(np.concatenate(markers), mean_hand(*search.measures(length), layout))
 
 
 def _is_found(fit: SizeFit, frames: Sequence[StreamedFrame], sides: Sequence[Side], labeler: Labeler) -> bool:
@@ -212,7 +212,7 @@ def usual_breadth(length: float) -> float:
     return float(np.interp(inside, lengths, breadths)) * length / inside
 
 
-def _hand(length: float, breadth: float, layout: MarkerLayout) -> GloveFit:
+def mean_hand(length: float, breadth: float, layout: MarkerLayout) -> GloveFit:
     """A right hand of mean proportions in a glove as designed; length and breadth in [m]."""
     return settle_glove(layout, HandModel(shape_from_measures(length, breadth, side="right")))
 
@@ -277,7 +277,7 @@ class _Search:
         return self.length(lambda tried: breadth, 0.95 * length, 1.05 * length), breadth
 
     def _cost(self, length: float, breadth: float) -> float:
-        solver = PoseSolver(_hand(length, breadth, self._layout))
+        solver = PoseSolver(mean_hand(length, breadth, self._layout))
         beyond = (length - _USUAL_LENGTH) / _LENGTH_SPREAD
         broad = (breadth / usual_breadth(length) - 1.0) / _BREADTH_SPREAD
         square = float(np.median(solver.solve(self._markers, self._poses).rms)) ** 2

@@ -14,7 +14,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from gloves.captures.capture import runs_of
 from gloves.fit import GloveFit
 from handsim.hand.model import NUM_VELOCITIES, HandModel, join_qpos, skinned_jacobian
-from handsim.hand.shape import BONES, DIGITS, NUM_BONES, HandShape, bones_of
+from handsim.hand.shape import BONES, DIGITS, NUM_BONES, NUM_JOINTS, HandShape, bones_of
 from handsim.hand.skin import rest_vertices
 from handsim.kernels import move
 from handsim.space.transforms import quaternion_matrix
@@ -61,6 +61,8 @@ _LIMIT_SPREAD: Final = np.deg2rad(2.0)  # of an angle beyond its range
 _GESTURES: Final = 4.0  # that a capture counts as, however many frames it has: they are much alike
 # A user's mean angles differ from the mean of the gestures by this many standard deviations of the gestures.
 _OFF_GESTURES: Final = np.repeat([1.0, 0.25], [4, 16])  # thumbs at work are held otherwise
+GESTURES_OF_USER: Final = np.repeat([1.0, _GESTURES], [4, 16])
+"""Gestures that a user's capture counts as, by joint angle."""
 _MOST_GESTURES: Final = 80  # in which errors of angles are computed
 _LEAST_MOTION: Final = np.deg2rad(1.0)  # of a digit that flesh follows
 RELINEARIZE: Final = 0.005  # change of a parameter (log lengths, [rad], [m]) that renews the skin's jacobian
@@ -145,6 +147,7 @@ class Problem:
         noise: float,  # standard deviation of a marker's coordinates [m]
         robust_scale: float,  # where a residual costs half of a quadratic loss [m] (Geman and McClure 1987)
         relinearize: float = RELINEARIZE,
+        gestures: Float[np.ndarray, "20"] | float = _GESTURES,  # that the capture counts as
     ) -> None:
         self._relinearize = relinearize
         self.shape, self.design, self.heights = shape, design, heights
@@ -152,7 +155,8 @@ class Problem:
         """Markers that are not missing."""
         self.targets = np.where(self.present[..., None], targets, 0.0)
         self.noise, self.robust_scale = noise, robust_scale
-        self.pose_precision = min(1.0, _GESTURES / len(targets)) * resting_prior().precision
+        roots = np.sqrt(np.minimum(1.0, gestures / np.full(NUM_JOINTS, len(targets))))
+        self.pose_precision = np.outer(roots, roots) * resting_prior().precision
         self.position_spread, self.height_spread = POSITION_SPREAD, HEIGHT_SPREAD
         self.data_noise = noise
         """Standard deviation of a marker's coordinates [m] without the flesh, for which `noise` is larger."""
@@ -352,7 +356,7 @@ class Problem:
 
 
 def first_estimate(
-    hand: GloveFit, targets: Float[np.ndarray, "F M 3"], qpos: Float[np.ndarray, "F 27"], **options: float
+    hand: GloveFit, targets: Float[np.ndarray, "F M 3"], qpos: Float[np.ndarray, "F 27"], **options: Any
 ) -> tuple[Problem, Estimate]:
     """The problem of a right hand's labeled markers [m] with its options, and the hand as it is."""
     worn = hand.attachment
