@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import math
 import warnings
 from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
@@ -48,8 +47,6 @@ _SHORTEST, _LONGEST = (
 _BREADTHS: Final = (0.88, 1.12)  # from the usual breadth of a length; three standard deviations
 _FAR: Final = 0.012  # [m] change of length after which the hands are labeled again
 _PRECISION: Final = 0.001  # [m] of length
-_GOLDEN: Final = 0.5 * (3.0 - math.sqrt(5.0))  # share of an interval at which a search goes on
-_ROUNDING: Final = math.sqrt(2.2e-16)  # below which two arguments in a search are one
 _USUAL_LENGTH, _LENGTH_SPREAD = 0.187, 0.012  # [m] of adults, women and men, ANSUR II
 _BREADTH_SPREAD: Final = 0.04  # from the usual breadth of a length
 _MARKER_SPREAD: Final = 0.002  # [m] per axis of glued markers around their places
@@ -285,40 +282,11 @@ class _Search:
 
 
 def _least(function: Callable[[float], float], low: float, high: float) -> float:
-    """The argument between two bounds [m] with the least value of a function: Brent's method (1973)."""
-    # SciPy has this search in scipy.optimize, but importing that takes as long as all searches of a capture.
-    best = second = third = low + _GOLDEN * (high - low)
-    least = second_least = third_least = function(best)
-    step = before = 0.0
-    while True:
-        middle, tolerance = 0.5 * (low + high), _ROUNDING * best + _PRECISION / 3.0
-        if abs(best - middle) <= 2.0 * tolerance - 0.5 * (high - low):
-            return best
-        r, q = (best - second) * (least - third_least), (best - third) * (least - second_least)
-        p, q = (best - third) * q - (best - second) * r, 2.0 * (q - r)
-        p, q = (-p if q > 0.0 else p), abs(q)
-        is_far = abs(before) > tolerance
-        if is_far and abs(p) < abs(0.5 * q * before) and q * (low - best) < p < q * (high - best):
-            before, step = step, (p + 0.0) / q  # to a parabola's lowest point; zero counts as positive
-            if min(best + step - low, high - best - step) < 2.0 * tolerance:
-                step = math.copysign(tolerance, middle - best)
-        else:
-            before = (low if best >= middle else high) - best
-            step = _GOLDEN * before
-        tried = best + math.copysign(max(abs(step), tolerance), step)
-        value = function(tried)
-        if value <= least:
-            low, high = (best, high) if tried >= best else (low, best)
-            third, third_least = second, second_least
-            second, second_least = best, least
-            best, least = tried, value
-            continue
-        low, high = (tried, high) if tried < best else (low, tried)
-        if value <= second_least or second == best:
-            third, third_least = second, second_least
-            second, second_least = tried, value
-        elif value <= third_least or third in (best, second):
-            third, third_least = tried, value
+    """The argument between two bounds [m] with the least value of a function."""
+    from scipy.optimize import minimize_scalar
+
+    options = {"xatol": _PRECISION}
+    return float(minimize_scalar(function, bounds=(low, high), method="bounded", options=options).x)
 
 
 def _fit_proportions(seen: Float[np.ndarray, "F M 3"], start: GloveFit) -> SizeFit:

@@ -80,8 +80,8 @@ _SLIDE_ROUNDS: Final = 3
 _GAP_QUANTILE: Final = 0.35  # of a finger's gaps: the usual one
 _FACING_COSINE: Final = -0.8  # cosine between the normals of pads that face each other
 _MOST_PAD_OFFSET: Final = 0.002  # [m] between the contact points, across their direction
-Progress = Callable[[int, float, float], None]
-"""Called after each step: its number, `marker_rms` and `contact_gap` [m] (NaN: no contacts yet)."""
+Progress = Callable[[int], None]
+"""Called after each step with its number."""
 _FIRST_DAMPING, _LEAST_DAMPING = 1e-3, 1e-8
 _DAMPING_RAISE, _DAMPING_CUT = 10.0, 0.2  # factors of the damping after a failed step and a good one
 _LEAST_RAISED_DAMPING: Final = 1e-6
@@ -535,24 +535,10 @@ def levenberg_marquardt(
             damping = max(_DAMPING_RAISE * damping, _LEAST_RAISED_DAMPING)
         steps += 1
         if progress is not None:
-            progress(steps, marker_rms(problem, fit), contact_gap(estimate, fit))
+            progress(steps)
         if abs(before - fit.cost) < small_gain * before:
             break
     return estimate, fit, steps
-
-
-def marker_rms(problem: Problem, fit: Fit) -> float:
-    """Median over frames of the markers' RMS distance [m]; wrong labels hardly change it."""
-    squares = (fit.residuals**2).sum(axis=(1, 2)) / problem.present.sum(axis=1)
-    return float(np.sqrt(np.median(squares)))
-
-
-def contact_gap(estimate: Estimate, fit: Fit) -> float:
-    """Weighted RMS gap of the contacts [m], NaN without any."""
-    if not len(estimate.contacts.frames):
-        return float("nan")
-    weights = contact_weights(fit.geometry, estimate.contacts.fingers)
-    return float(np.sqrt((weights * fit.geometry.gaps**2).sum() / max(weights.sum(), 1e-12)))
 
 
 def user_hand(right: GloveFit, problem: Problem, estimate: Estimate) -> GloveFit:
