@@ -209,6 +209,11 @@ class Problem:
         beyond = np.maximum(angles - high, 0.0) + np.minimum(angles - low, 0.0)
         return beyond, angles - resting_prior().angles
 
+    def roots(self, fit: Fit) -> Float[np.ndarray, "F M"]:
+        """Roots of the markers' weights [1/m]."""
+        squares = (fit.residuals**2).sum(axis=2)
+        return np.asarray(self.present / (1.0 + squares / self.robust_scale**2) / self.noise)
+
     def weighted_jacobians(
         self, estimate: Estimate, fit: Fit
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
@@ -234,9 +239,7 @@ class Problem:
         by_marker = by_shared[:, :-1, NUM_PARAMETERS:].reshape(frames, count, 3, count, 3)
         by_marker[:, np.arange(count), :, np.arange(count)] = by_point.swapaxes(0, 1)
         residuals[:, :-1] = fit.residuals.reshape(frames, -1)
-        squares = (fit.residuals**2).sum(axis=2)
-        weights = self.present / (1.0 + squares / self.robust_scale**2) ** 2 / self.noise**2
-        precision[:, :-1] = np.repeat(weights, 3, axis=1)
+        precision[:, :-1] = np.repeat(self.roots(fit) ** 2, 3, axis=1)
         if len(estimate.contacts.frames):
             at = estimate.contacts.frames, -1
             gaps = self._gap_jacobians(estimate, fit, rest[2 * count :])
@@ -588,7 +591,7 @@ def error_covariance(
     turns = answers[:, 6:].sum(axis=0).T @ problem.pose_precision * _OFF_GESTURES
     errors += turns @ resting_prior().covariance @ turns.T
     # Of flesh of a size, the fit leaves a part in the residuals; by that the size is estimated.
-    patterns = _flesh_patterns(problem, estimate)
+    patterns = _flesh_patterns(problem, estimate, fit)
     bases = np.stack([np.linalg.qr(one.reshape(-1, one.shape[2]))[0] for one in patterns])
     bases, forces, left = bases.reshape(patterns.shape), [], 0.0
     for marker, moved in enumerate(patterns):
@@ -603,23 +606,25 @@ def error_covariance(
         left += np.square(np.einsum("mfkb,fmkc->mbc", bases, by_marker, optimize=True)).sum()
     seen = residuals[:, :-1].reshape(len(residuals), -1, 3)
     found = np.square(np.einsum("mfkb,fmk->mb", bases, seen, optimize=True)).sum()
-    flesh = max(found - share * bases[:, 0, 0].size, 0.0) / left
+    of_noise = share * bases[:, 0, 0].size * (1.0 - (by_pose[:, 0].size + len(reduced)) / seen.size)
+    flesh = max(found - of_noise, 0.0) / left
     across = np.concatenate(forces, axis=1)
     return inverse @ (errors + flesh * across @ across.T) @ inverse, answers
 
 
-def _flesh_patterns(problem: Problem, estimate: Estimate) -> Float[np.ndarray, "M F 3 12"]:
+def _flesh_patterns(problem: Problem, estimate: Estimate, fit: Fit) -> Float[np.ndarray, "M F 3 12"]:
     """Ways in which flesh moves each marker, in the wrist's frame, with the angles of its digit.
 
-    They are in units of the noise, each with a mean square of a quarter over the frames. Flesh on the palm
-    follows the flexions of the MCPs.
+    They are weighted as residuals are, each with a mean square of a quarter over the frames before. Flesh on
+    the palm follows the flexions of the MCPs.
     """
-    patterns, turned = [], quaternion_matrix(estimate.qpos[:, 3:7]) / problem.noise
+    patterns, turned = [], quaternion_matrix(estimate.qpos[:, 3:7])
+    roots = problem.roots(fit)
     for marker, bone in enumerate(skin_weights(estimate.coordinates).argmax(axis=1)):
         digit = BONES[bone].digit
         angles = estimate.qpos[:, 12::4] if digit < 0 else estimate.qpos[:, 7 + 4 * digit : 11 + 4 * digit]
         off = problem.present[:, marker, None] * (angles - angles.mean(axis=0))
-        off /= max(float(np.sqrt((off**2).sum(axis=1).mean())), _LEAST_MOTION)
+        off *= roots[:, marker, None] / max(float(np.sqrt((off**2).sum(axis=1).mean())), _LEAST_MOTION)
         patterns.append(np.einsum("fki,fj->fkij", turned, off).reshape(len(off), 3, -1))
     return np.stack(patterns)
 
