@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import math
 import warnings
 from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
@@ -45,8 +44,6 @@ _SHORTEST, _LONGEST = 0.125, 0.225  # [m] hand lengths: 0.6 of an adult's to bey
 _BREADTHS: Final = (0.88, 1.12)  # breadth over the usual one of a length: three standard deviations
 _FAR: Final = 0.012  # [m] Hands are labeled again after a larger change of length.
 _PRECISION: Final = 0.001  # [m] precision of length and breadth
-_GOLDEN: Final = 0.5 * (3.0 - math.sqrt(5.0))  # golden section: where an interval is divided
-_ROUNDING: Final = math.sqrt(2.2e-16)  # relative rounding error of an argument in the search
 _USUAL_LENGTH, _LENGTH_SPREAD = 0.187, 0.012  # [m] mean and deviation of adults, ANSUR II
 _BREADTH_SPREAD: Final = 0.04  # standard deviation of the breadth over the usual one of a length
 _MARKER_SPREAD: Final = 0.002  # [m] standard deviation of glued markers per axis
@@ -168,7 +165,7 @@ def _fit_from(
     """Measure hands that are first labeled as hands of a given length [m]."""
     markers: list[NDArray[np.float64]] = []
     for _ in range(2):  # Labels improve with hands of about their own size.
-        start = _hand(length, usual_breadth(length), layout)
+        start = mean_hand(length, usual_breadth(length), layout)
         markers = _label(frames, start, sides, labeler, config) or markers
         if not markers:
             return None
@@ -176,7 +173,7 @@ def _fit_from(
         length = search.length(usual_breadth, _SHORTEST, _LONGEST)
         if abs(length - before) <= _FAR:
             break
-    return _fit_proportions(np.concatenate(markers), _hand(*search.measures(length), layout))
+    return _fit_proportions(np.concatenate(markers), mean_hand(*search.measures(length), layout))
 
 
 def _is_found(fit: SizeFit, frames: Sequence[StreamedFrame], sides: Sequence[Side], labeler: Labeler) -> bool:
@@ -209,7 +206,7 @@ def usual_breadth(length: float) -> float:
     return float(np.interp(inside, lengths, breadths)) * length / inside
 
 
-def _hand(length: float, breadth: float, layout: MarkerLayout) -> GloveFit:
+def mean_hand(length: float, breadth: float, layout: MarkerLayout) -> GloveFit:
     """A right hand of mean proportions in a glove as designed; length and breadth in [m]."""
     return settle_glove(layout, HandModel(shape_from_measures(length, breadth, side="right")))
 
@@ -274,7 +271,7 @@ class _Search:
         return self.length(lambda tried: breadth, 0.95 * length, 1.05 * length), breadth
 
     def _cost(self, length: float, breadth: float) -> float:
-        solver = PoseSolver(_hand(length, breadth, self._layout))
+        solver = PoseSolver(mean_hand(length, breadth, self._layout))
         beyond = (length - _USUAL_LENGTH) / _LENGTH_SPREAD
         broad = (breadth / usual_breadth(length) - 1.0) / _BREADTH_SPREAD
         square = float(np.median(solver.solve(self._markers, self._poses).rms)) ** 2
@@ -282,40 +279,11 @@ class _Search:
 
 
 def _least(function: Callable[[float], float], low: float, high: float) -> float:
-    """Minimize a function between two bounds by Brent's method (1973)."""
-    # SciPy has this search in scipy.optimize, but importing that takes as long as all searches of a capture.
-    best = second = third = low + _GOLDEN * (high - low)
-    least = second_least = third_least = function(best)
-    step = before = 0.0
-    while True:
-        middle, tolerance = 0.5 * (low + high), _ROUNDING * best + _PRECISION / 3.0
-        if abs(best - middle) <= 2.0 * tolerance - 0.5 * (high - low):
-            return best
-        r, q = (best - second) * (least - third_least), (best - third) * (least - second_least)
-        p, q = (best - third) * q - (best - second) * r, 2.0 * (q - r)
-        p, q = (-p if q > 0.0 else p), abs(q)
-        is_far = abs(before) > tolerance
-        if is_far and abs(p) < abs(0.5 * q * before) and q * (low - best) < p < q * (high - best):
-            before, step = step, (p + 0.0) / q  # the parabola's minimum; zero counts as positive
-            if min(best + step - low, high - best - step) < 2.0 * tolerance:
-                step = math.copysign(tolerance, middle - best)
-        else:
-            before = (low if best >= middle else high) - best
-            step = _GOLDEN * before
-        tried = best + math.copysign(max(abs(step), tolerance), step)
-        value = function(tried)
-        if value <= least:
-            low, high = (best, high) if tried >= best else (low, best)
-            third, third_least = second, second_least
-            second, second_least = best, least
-            best, least = tried, value
-            continue
-        low, high = (tried, high) if tried < best else (low, tried)
-        if value <= second_least or second == best:
-            third, third_least = second, second_least
-            second, second_least = tried, value
-        elif value <= third_least or third in (best, second):
-            third, third_least = tried, value
+    """The argument between two bounds [m] with the least value of a function."""
+    from scipy.optimize import minimize_scalar
+
+    options = {"xatol": _PRECISION}
+    return float(minimize_scalar(function, bounds=(low, high), method="bounded", options=options).x)
 
 
 def _fit_proportions(seen: Float[np.ndarray, "F M 3"], start: GloveFit) -> SizeFit:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Final, Self, get_args
 
-from gloves.fit import GloveFit, settle_glove
+from gloves.fit import GloveFit
 from gloves.layout import list_layouts, load_layout
 from handsim._checks import check_type, shown_value
 from handsim.errors import ArgumentError
@@ -16,7 +16,7 @@ from handsim.hand.shape import SIDES, Side
 from handsim.settings import Expected, Settings
 from track.config import BOTH, Size, TrackerConfig
 from track.frames import StreamedFrame
-from track.hand_size import check_hands, check_scale, measured_user
+from track.hand_size import check_hands, check_scale, mean_hand, measured_user
 from track.rigid_body import AnyBody, RigidTemplate, load_bodies
 from track.tracker import Tracker
 from track.user import AnyGlove, AnyLabeler, User, as_user, labeler_of, nominal_user
@@ -117,10 +117,16 @@ class TrackerSetup:
 
     @property
     def start(self) -> tuple[GloveFit, ...]:
-        """Hands that a calibration starts from; measured hands have the glove as designed."""
+        """The hands that a calibration begins with, of measured ones those of mean proportions.
+
+        Their proportions are of the same motion, so that what people are like would count twice.
+        """
         if not self.is_auto:
             return self.user.hands
-        return tuple(settle_glove(hand.layout, hand.model) for hand in self.user)
+        shapes = ((hand.shape.length, hand.shape.breadth, hand.layout) for hand in self.user)
+        return tuple(
+            mean_hand(*shape).with_side(side) for shape, side in zip(shapes, self.user.sides, strict=True)
+        )
 
     def measured(self, frames: Sequence[StreamedFrame], *, warns: bool = True) -> TrackerSetup:
         """Measure the hands in some frames, if their size is automatic, and check that they fit."""

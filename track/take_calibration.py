@@ -158,7 +158,7 @@ def _tried(markers: Float[np.ndarray, "T M 3"], before: GloveFit, after: GloveFi
 
 def _steps(side: Side, on_part: OnPart) -> Progress:
     """Progress callback of one hand."""
-    return lambda step, rms, gap: on_part(f"steps for the {side} hand", min(step, MOST_STEPS), MOST_STEPS)
+    return lambda step: on_part(f"steps for the {side} hand", min(step, MOST_STEPS), MOST_STEPS)
 
 
 def _markers(take: Take, side: Side) -> Float[np.ndarray, "T M 3"]:

@@ -214,10 +214,8 @@ def _misplaced(hand: _Hand) -> Iterator[SuspectSpan]:
 
 
 def _unsure_side(hand: _Hand) -> Iterator[SuspectSpan]:
-    """A hand without thumb marker whose points its mirror image fits as well."""
+    """A hand in a glove like its mirror image, that a hand of the other side fits as well in motion."""
     worn, take = hand.worn, hand.take
-    if (worn.attachment.digits == 0).any():
-        return
     frames = hand.frames[:: -(-len(hand.frames) // _SIDE_FRAMES)]
     seen = take.point_list.labeled(take.hand_labels[take.hand_index(hand.side)], frames)
     seen = seen[np.isfinite(seen[..., 0]).sum(axis=1) >= FEWEST_MARKERS]
@@ -231,7 +229,7 @@ def _unsure_side(hand: _Hand) -> Iterator[SuspectSpan]:
     )
     if theirs < max(_FITS * ours, _FITS_WELL):
         why = f"may be the {other} one: that fits the points to {1e3 * theirs:.1f} mm, this {1e3 * ours:.1f}"
-        yield hand.span(0, "", why, "put a marker on the thumb, or name the hand (--hands)")
+        yield hand.span(0, "", why, "make the glove less like its mirror image, or name the hand (--hands)")
 
 
 def _exchanges(worn: GloveFit, mirrored: GloveFit) -> Iterator[Int[np.ndarray, "M"]]:

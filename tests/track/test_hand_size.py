@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import warnings
 
 import numpy as np
 import pytest
-from scipy.optimize import minimize_scalar
 
 from gloves import MarkerLayout, MarkerPlace, attach, load_layout
 from handsim import HandModel, HandSimWarning, join_qpos, sample_shape
@@ -39,22 +37,6 @@ def frames_of(shapes, *, seed: int, noise: float = 0.0015, seconds: float = 1.0)
     points += noise * rng.standard_normal(points.shape)
     order = rng.permutation(points.shape[1])
     return [StreamedFrame(t, t / RATE, cloud[order], order) for t, cloud in enumerate(points)]
-
-
-@pytest.mark.parametrize("kinks", [0.0, 0.002])
-def test_the_search_for_a_length_tries_what_scipys_bounded_search_tries(kinks):
-    rng = np.random.default_rng(0)
-    for least, low, width in rng.uniform([0.1, 0.1, 0.005], [0.25, 0.15, 0.1], (50, 3)):
-        ours, scipys = [], []
-
-        def cost(length, calls, least=least):
-            calls.append(float(length))
-            return (length - least) ** 2 + kinks * np.floor(300.0 * length)
-
-        found = hand_size._least(functools.partial(cost, calls=ours), low, low + width)
-        bounds, options = (low, low + width), {"xatol": hand_size._PRECISION}
-        expected = minimize_scalar(cost, bounds=bounds, args=(scipys,), method="bounded", options=options)
-        assert found == expected.x and ours == scipys
 
 
 @pytest.mark.parametrize("length", [0.135, 0.175, 0.215])

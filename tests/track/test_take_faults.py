@@ -149,13 +149,14 @@ def test_a_joint_at_its_limit_is_named(tracked):
     assert fault.of == "right:ring_MCP_flexion" and fault.first == HALF and not fault.of_labels
 
 
-@pytest.fixture(scope="module")
-def mirror_like() -> Take:
-    """A right hand in a glove without a thumb marker that is like its own mirror image, as if tracked."""
-    places = [
-        MarkerPlace(f"{digit}Tip", f"{digit}_distal", along=0.7, around=0.0)
-        for digit in ("index", "middle", "ring", "little")
-    ]
+FINGERTIPS = ("index_distal", "middle_distal", "ring_distal", "little_distal")
+WITH_THUMB = ("thumb_distal", "little_distal", "index_proximal", "ring_proximal", "middle_distal")
+
+
+@pytest.fixture(scope="module", params=[FINGERTIPS, WITH_THUMB])
+def mirror_like(request) -> Take:
+    """A right hand in a glove that is like its own mirror image, as if tracked."""
+    places = [MarkerPlace(bone, bone, along=0.7, around=0.0) for bone in request.param]
     back = ((0.3, 0.2), (0.3, -0.2), (0.7, 0.2), (0.7, -0.2))
     places += [
         MarkerPlace(f"Back{n}", "palm", along=x, around=0.0, across=y) for n, (x, y) in enumerate(back)

@@ -14,7 +14,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -23,9 +23,11 @@ from numpy.typing import NDArray
 from gloves.captures.capture import runs_of
 from gloves.fit import GloveFit
 from handsim.hand.model import NUM_VELOCITIES, HandModel, join_qpos, skinned_jacobian
-from handsim.hand.shape import DIGITS, NUM_BONES, HandShape, bones_of
+from handsim.hand.shape import BONES, DIGITS, NUM_BONES, NUM_JOINTS, HandShape, bones_of
 from handsim.hand.skin import rest_vertices
 from handsim.kernels import move
+from handsim.space.transforms import quaternion_matrix
+from poses.shapes import LIBRARIES, gestures_of
 from poses.touch import FINGERS, thumb_contact
 from track.calibration.hand_parameters import (
     NUM_PARAMETERS,
@@ -59,6 +61,10 @@ _LIMIT_SPREAD: Final = np.deg2rad(2.0)  # [rad] standard deviation of an angle b
 _GESTURES: Final = 4.0  # The pose prior counts this many times per capture, as its frames are much alike.
 # Standard deviation of a user's mean angles around the mean of the gestures, in that of the gestures.
 _OFF_GESTURES: Final = np.repeat([1.0, 0.25], [4, 16])  # large for thumbs
+GESTURES_OF_USER: Final = np.repeat([1.0, _GESTURES], [4, 16])
+"""Gestures that a user's capture counts as, by joint angle."""
+_MOST_GESTURES: Final = 80  # in which errors of angles are computed
+_LEAST_MOTION: Final = np.deg2rad(1.0)  # of a digit that flesh follows
 RELINEARIZE: Final = 0.005  # The skin's jacobian is renewed after such a change (log lengths, [rad], [m]).
 _DIFFERENCE_STEP: Final = 1e-5  # of finite differences
 PAD_COMPRESSION: Final = 0.001
@@ -74,8 +80,8 @@ _SLIDE_ROUNDS: Final = 3
 _GAP_QUANTILE: Final = 0.35  # quantile of a finger's gaps that counts as the usual one
 _FACING_COSINE: Final = -0.8  # Normals of facing pads have a smaller cosine.
 _MOST_PAD_OFFSET: Final = 0.002  # [m] largest offset of the contact points across their direction
-Progress = Callable[[int, float, float], None]
-"""Called after each step with its number, `marker_rms` and `contact_gap` [m] (NaN without contacts)."""
+Progress = Callable[[int], None]
+"""Called after each step with its number."""
 _FIRST_DAMPING, _LEAST_DAMPING = 1e-3, 1e-8
 _DAMPING_RAISE, _DAMPING_CUT = 10.0, 0.2  # factors after a failed and a good step
 _LEAST_RAISED_DAMPING: Final = 1e-6
@@ -141,6 +147,7 @@ class Problem:
         noise: float,  # standard deviation of marker coordinates [m]
         robust_scale: float,  # [m] scale of the robust loss, which halves a square there (Geman, McClure)
         relinearize: float = RELINEARIZE,
+        gestures: Float[np.ndarray, "20"] | float = _GESTURES,  # that the capture counts as
     ) -> None:
         self._relinearize = relinearize
         self.shape, self.design, self.heights = shape, design, heights
@@ -148,8 +155,11 @@ class Problem:
         """Whether each marker is present."""
         self.targets = np.where(self.present[..., None], targets, 0.0)
         self.noise, self.robust_scale = noise, robust_scale
-        self.pose_precision = min(1.0, _GESTURES / len(targets)) * resting_prior().precision
+        roots = np.sqrt(np.minimum(1.0, gestures / np.full(NUM_JOINTS, len(targets))))
+        self.pose_precision = np.outer(roots, roots) * resting_prior().precision
         self.position_spread, self.height_spread = POSITION_SPREAD, HEIGHT_SPREAD
+        self.data_noise = noise
+        """Standard deviation of a marker's coordinates [m] without the flesh, for which `noise` is larger."""
         self.precision = shape_precision()
         self._ranges = HandModel(shape).skeleton.ranges
         self._surface_jacobian: NDArray[np.float64] | None = None
@@ -199,8 +209,18 @@ class Problem:
         beyond = np.maximum(angles - high, 0.0) + np.minimum(angles - low, 0.0)
         return beyond, angles - resting_prior().angles
 
-    def normal_equations(self, estimate: Estimate, fit: Fit) -> NormalEquations:
-        """Gauss-Newton equations; shared unknowns are the parameters, then three per marker [m]."""
+    def roots(self, fit: Fit) -> Float[np.ndarray, "F M"]:
+        """Roots of the markers' weights [1/m]."""
+        squares = (fit.residuals**2).sum(axis=2)
+        return np.asarray(self.present / (1.0 + squares / self.robust_scale**2) / self.noise)
+
+    def weighted_jacobians(
+        self, estimate: Estimate, fit: Fit
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Jacobians by poses and by shared unknowns and residuals, each times the root of its weight.
+
+        The last array is the jacobian of markers minus designs by the parameters (M, 3, 53).
+        """
         count, frames = len(estimate.points), len(estimate.qpos)
         skin = fit.model.surface.vertices
         patch = SkinPatch(self._all_coordinates(estimate).faces)
@@ -219,9 +239,7 @@ class Problem:
         by_marker = by_shared[:, :-1, NUM_PARAMETERS:].reshape(frames, count, 3, count, 3)
         by_marker[:, np.arange(count), :, np.arange(count)] = by_point.swapaxes(0, 1)
         residuals[:, :-1] = fit.residuals.reshape(frames, -1)
-        squares = (fit.residuals**2).sum(axis=2)
-        weights = self.present / (1.0 + squares / self.robust_scale**2) ** 2 / self.noise**2
-        precision[:, :-1] = np.repeat(weights, 3, axis=1)
+        precision[:, :-1] = np.repeat(self.roots(fit) ** 2, 3, axis=1)
         if len(estimate.contacts.frames):
             at = estimate.contacts.frames, -1
             gaps = self._gap_jacobians(estimate, fit, rest[2 * count :])
@@ -229,7 +247,12 @@ class Problem:
             residuals[at] = fit.geometry.gaps
             precision[at] = contact_weights(fit.geometry, estimate.contacts.fingers) / CONTACT_SPREAD**2
         root = np.sqrt(precision)[..., None]
-        by_pose, by_shared, residuals = root * by_pose, root * by_shared, root[..., 0] * residuals
+        moved = rest[:count] - rest[count : 2 * count]
+        return root * by_pose, root * by_shared, root[..., 0] * residuals, moved
+
+    def normal_equations(self, estimate: Estimate, fit: Fit) -> NormalEquations:
+        """Gauss-Newton's equations; the shared unknowns are the parameters, then three per marker [m]."""
+        by_pose, by_shared, residuals, moved = self.weighted_jacobians(estimate, fit)
         transposed, flat = by_pose.swapaxes(1, 2), by_shared.reshape(-1, by_shared.shape[2])
         result = NormalEquations(
             transposed @ by_pose,
@@ -238,7 +261,7 @@ class Problem:
             (transposed @ residuals[..., None])[..., 0],
             residuals.ravel() @ flat,
         )
-        self._add_priors(estimate, fit, rest[:count] - rest[count : 2 * count], result)
+        self._add_priors(estimate, fit, moved, result)
         return result
 
     def _rest_jacobian(
@@ -336,7 +359,7 @@ class Problem:
 
 
 def first_estimate(
-    hand: GloveFit, targets: Float[np.ndarray, "F M 3"], qpos: Float[np.ndarray, "F 27"], **options: float
+    hand: GloveFit, targets: Float[np.ndarray, "F M 3"], qpos: Float[np.ndarray, "F 27"], **options: Any
 ) -> tuple[Problem, Estimate]:
     """The problem of a right hand's labeled markers [m] with its options, and the hand as first estimate."""
     worn = hand.attachment
@@ -514,24 +537,10 @@ def levenberg_marquardt(
             damping = max(_DAMPING_RAISE * damping, _LEAST_RAISED_DAMPING)
         steps += 1
         if progress is not None:
-            progress(steps, marker_rms(problem, fit), contact_gap(estimate, fit))
+            progress(steps)
         if abs(before - fit.cost) < small_gain * before:
             break
     return estimate, fit, steps
-
-
-def marker_rms(problem: Problem, fit: Fit) -> float:
-    """Median over frames of the markers' RMS distance [m], which wrong labels hardly change."""
-    squares = (fit.residuals**2).sum(axis=(1, 2)) / problem.present.sum(axis=1)
-    return float(np.sqrt(np.median(squares)))
-
-
-def contact_gap(estimate: Estimate, fit: Fit) -> float:
-    """Weighted RMS gap of the contacts [m]; NaN without contacts."""
-    if not len(estimate.contacts.frames):
-        return float("nan")
-    weights = contact_weights(fit.geometry, estimate.contacts.fingers)
-    return float(np.sqrt((weights * fit.geometry.gaps**2).sum() / max(weights.sum(), 1e-12)))
 
 
 def user_hand(right: GloveFit, problem: Problem, estimate: Estimate) -> GloveFit:
@@ -563,17 +572,79 @@ def shared_covariance(
     return np.linalg.inv(reduced[:, :-1]), solved[..., :-1]
 
 
+def error_covariance(
+    problem: Problem, estimate: Estimate, fit: Fit
+) -> tuple[Float[np.ndarray, "S S"], Float[np.ndarray, "F 26 S"]]:
+    """Covariance of the errors of the shared unknowns, and how poses answer to these unknowns.
+
+    Unlike noise, flesh that follows the angles of its digit is not averaged out by many frames, nor are the
+    gestures of a user that differ from people's.
+    """
+    by_pose, by_shared, residuals, _ = problem.weighted_jacobians(estimate, fit)
+    equations = problem.normal_equations(estimate, fit)
+    reduced, solved = eliminate_poses(equations, 0.0)
+    inverse, answers = np.linalg.inv(reduced[:, :-1]), solved[..., :-1]
+    flat = by_shared.reshape(-1, len(reduced))
+    share = (problem.data_noise / problem.noise) ** 2
+    errors = share * reduced[:, :-1] + (1.0 - share) * (equations.shared - flat.T @ flat)
+    turns = answers[:, 6:].sum(axis=0).T @ problem.pose_precision * _OFF_GESTURES
+    errors += turns @ resting_prior().covariance @ turns.T
+    # Of flesh of a size, the fit leaves a part in the residuals; by that the size is estimated.
+    patterns = _flesh_patterns(problem, estimate, fit)
+    bases = np.stack([np.linalg.qr(one.reshape(-1, one.shape[2]))[0] for one in patterns])
+    bases, forces, left = bases.reshape(patterns.shape), [], 0.0
+    for marker, moved in enumerate(patterns):
+        rows = slice(3 * marker, 3 * marker + 3)
+        poses = by_pose[:, rows].swapaxes(1, 2) @ moved
+        force = np.tensordot(by_shared[:, rows], moved, ((0, 1), (0, 1)))
+        forces.append(force - np.tensordot(answers, poses, ((0, 1), (0, 1))))
+        shared = inverse @ forces[-1]
+        rest = by_pose @ (answers @ shared - np.linalg.solve(equations.pose, poses)) - by_shared @ shared
+        rest[:, rows] += moved
+        by_marker = rest[:, :-1].reshape(len(rest), len(patterns), 3, -1)
+        left += np.square(np.einsum("mfkb,fmkc->mbc", bases, by_marker, optimize=True)).sum()
+    seen = residuals[:, :-1].reshape(len(residuals), -1, 3)
+    found = np.square(np.einsum("mfkb,fmk->mb", bases, seen, optimize=True)).sum()
+    of_noise = share * bases[:, 0, 0].size * (1.0 - (by_pose[:, 0].size + len(reduced)) / seen.size)
+    flesh = max(found - of_noise, 0.0) / left
+    across = np.concatenate(forces, axis=1)
+    return inverse @ (errors + flesh * across @ across.T) @ inverse, answers
+
+
+def _flesh_patterns(problem: Problem, estimate: Estimate, fit: Fit) -> Float[np.ndarray, "M F 3 12"]:
+    """Ways in which flesh moves each marker, in the wrist's frame, with the angles of its digit.
+
+    They are weighted as residuals are, each with a mean square of a quarter over the frames before. Flesh on
+    the palm follows the flexions of the MCPs.
+    """
+    patterns, turned = [], quaternion_matrix(estimate.qpos[:, 3:7])
+    roots = problem.roots(fit)
+    for marker, bone in enumerate(skin_weights(estimate.coordinates).argmax(axis=1)):
+        digit = BONES[bone].digit
+        angles = estimate.qpos[:, 12::4] if digit < 0 else estimate.qpos[:, 7 + 4 * digit : 11 + 4 * digit]
+        off = problem.present[:, marker, None] * (angles - angles.mean(axis=0))
+        off *= roots[:, marker, None] / max(float(np.sqrt((off**2).sum(axis=1).mean())), _LEAST_MOTION)
+        patterns.append(np.einsum("fki,fj->fkij", turned, off).reshape(len(off), 3, -1))
+    return np.stack(patterns)
+
+
+def gesture_answers(problem: Problem, estimate: Estimate) -> Float[np.ndarray, "F 26 S"]:
+    """How poses answer to the shared unknowns in the gestures that people make, whatever the capture has."""
+    gestures = np.concatenate([gestures_of(library) for library in LIBRARIES])
+    qpos = join_qpos(gestures[:: -(-len(gestures) // _MOST_GESTURES)])
+    at = dataclasses.replace(estimate, qpos=qpos, contacts=_NO_CONTACTS)
+    targets = np.zeros((len(qpos), *estimate.points.shape))
+    scales = {"noise": problem.noise, "robust_scale": np.inf}
+    seen = Problem(problem.shape, problem.design, problem.heights, targets, **scales)
+    return shared_covariance(seen, at, seen.fit(at))[1]
+
+
 def angle_errors(
-    covariance: Float[np.ndarray, "S S"],
-    answers: Float[np.ndarray, "F 26 S"],
-    pose_precision: Float[np.ndarray, "20 20"],
+    covariance: Float[np.ndarray, "S S"], answers: Float[np.ndarray, "F 26 S"]
 ) -> Float[np.ndarray, "20 2"]:
-    """Remaining errors of each joint angle [rad], from marker places and from the shape."""
-    by_angle = answers[:, 6:]
-    # Where directions of bones are uncertain, gestures that the user does not make turn them.
-    turns = covariance @ by_angle.sum(axis=0).T @ pose_precision * _OFF_GESTURES
-    covariance = covariance + turns @ resting_prior().covariance @ turns.T
+    """What is open of each joint angle [rad]: by places of markers, by the shape."""
     # Both are correlated; the total variance is divided in the ratio of their separate variances.
+    by_angle = answers[:, 6:]
     places, bones, both = (
         np.einsum("fis,st,fit->i", of, covariance[part, part], of, optimize=True)
         for part in (slice(NUM_PARAMETERS, None), slice(NUM_PARAMETERS), slice(None))

@@ -28,6 +28,7 @@ from handsim.hand.shape import DIGITS, JOINT_NAMES, NUM_JOINTS, PALM, HandShape,
 from handsim.hand.skin import rest_vertices
 from handsim.space.transforms import MIRROR, quaternion_matrix, rigid_fit
 from track.calibration.energy import (
+    GESTURES_OF_USER,
     HEIGHT_SPREAD,
     POSITION_SPREAD,
     Estimate,
@@ -37,8 +38,10 @@ from track.calibration.energy import (
     angle_errors,
     contact_geometry,
     contact_weights,
+    error_covariance,
     find_touches,
     first_estimate,
+    gesture_answers,
     initialize_contacts,
     levenberg_marquardt,
     shared_covariance,
@@ -79,7 +82,6 @@ _LEAST_NOISE, _MOST_NOISE = 0.0001, 0.003  # [m]
 _CHI2_MEDIAN: Final = 2.366  # median of the chi-squared distribution with three degrees of freedom
 _USUAL_SPREAD_COORDINATES: Final = 12.0  # coordinates of markers that the usual spread counts for
 _INDEPENDENT_POSES: Final = 14.0  # number of frames with independent deformation of the flesh
-_FLESH_REPEATS: Final = 0.7  # variance added by flesh, whose motion is alike in similar poses
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -258,7 +260,9 @@ def calibrate_hand(
     some = seen[:: max(1, len(usable) // _INITIAL_FRAMES)]
     track = PoseSolver(right).solve(some)
     chosen, scales = informative_frames(track, some), {"noise": _FIRST_NOISE, "robust_scale": _FIRST_SCALE}
-    problem, estimate = first_estimate(right, some[chosen], track.qpos[chosen], **scales)
+    problem, estimate = first_estimate(
+        right, some[chosen], track.qpos[chosen], gestures=GESTURES_OF_USER, **scales
+    )
     # Distant markers are down-weighted only after the hand nearly fits.
     estimate, fit, steps = levenberg_marquardt(problem, estimate, 0, _WIDE_STEPS, progress)
     problem.robust_scale = _SCALE_IN_NOISES * marker_noise(problem, fit)
@@ -276,9 +280,7 @@ def calibrate_hand(
         touching = PoseSolver(right).solve(seen[[frame for frame, _ in touches]])
         before = contact_gaps(right.model, touches, touching.qpos)
     final = PoseSolver(done).solve(seen, rough_track.qpos)
-    covariance, answers = shared_covariance(problem, estimate, fit)
-    flesh = 1.0 - (problem.robust_scale / (_SCALE_IN_NOISES * problem.noise)) ** 2
-    covariance *= 1.0 + _FLESH_REPEATS * flesh
+    covariance, answers = error_covariance(problem, estimate, fit)
     position_errors, length_errors = standard_errors(problem, estimate, fit, covariance)
     return Calibration(
         hand=done.with_side(start.side),
@@ -288,7 +290,9 @@ def calibrate_hand(
         shifts=np.linalg.norm(fit.design_residuals, axis=1),
         position_errors=position_errors,
         length_errors=length_errors,
-        angle_errors=angle_errors(covariance, answers, problem.pose_precision),
+        angle_errors=np.maximum(
+            *(angle_errors(covariance, one) for one in (answers, gesture_answers(problem, estimate)))
+        ),
         touches=_touches(estimate, fit, touches, usable, before, mirror),
         still_joints=still_joints(final.qpos[:, 7:], complete, done.model),
     )
@@ -317,7 +321,9 @@ def _with_touches(
         markers[frames],
         noise=float(np.sqrt(noise**2 + flesh * max(len(frames) / _INDEPENDENT_POSES - 1.0, 0.0))),
         robust_scale=_SCALE_IN_NOISES * noise,
+        gestures=GESTURES_OF_USER,
     )
+    larger.data_noise = noise
     estimate = dataclasses.replace(estimate, qpos=track.qpos[frames])
     if not touches:
         return larger, estimate
