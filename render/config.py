@@ -84,6 +84,8 @@ class RenderConfig(Settings):
     """What paints colors: our own compiled code, opengl, or auto: opengl where there is hardware for it."""
     shutter: ShutterConfig | None = None
     """Motion blur and rolling shutters, which take a drawing per sub-frame; None: pictures of an instant."""
+    frames: Annotated[tuple[int, ...] | None, Limits(0)] = None
+    """Numbers of the frames that are drawn; all frames with a hand when not given."""
     every: Annotated[int, Limits(1)] = 1
     """Step between the frames that are drawn."""
     num_frames: Annotated[int | None, Limits(1)] = None

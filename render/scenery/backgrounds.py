@@ -32,7 +32,11 @@ from render.fields import normal_numbers
 from render.frames import Bytes, Doubles, Flags, Floats, Geometry
 from render.scenery.rooms import RoomLight, cast_room, draw_room, paint_tints
 
-PHOTO_SUFFIXES: Final = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
+MAP_SUFFIXES: Final = (".hdr", ".exr")
+"""Files of environment maps: the light of all directions, longitudes across and latitudes down, z up."""
+PHOTO_SUFFIXES: Final = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff", *MAP_SUFFIXES)
+LUMINANCE: Final = np.array([0.2126, 0.7152, 0.0722])
+_MAP_LIGHT: Final = 0.5  # mean luminance of a map, 1 for a white surface in full light
 _TRIES: Final = 50  # unreadable files in turn after which a folder counts as one without photographs
 _MOST_PIXELS: Final = 100_000_000  # largest number of pixels of a photograph
 
@@ -46,7 +50,8 @@ def photo_files(folder: Path) -> tuple[tuple[Path, ...], tuple[Path, ...]]:
     good, broken = list[Path](), list[Path]()
     for file in files:
         with plain_path(file) as plain:
-            (good if cv2.haveImageReader(str(plain)) else broken).append(file)
+            readable = file.suffix.lower() in MAP_SUFFIXES or cv2.haveImageReader(str(plain))
+            (good if readable else broken).append(file)
     if not good:
         raise _no_photo(folder)
     return tuple(good), tuple(broken)
@@ -56,9 +61,55 @@ def pick_photo(folder: Path, rng: np.random.Generator) -> Path:
     """A random photograph that can be read whole."""
     files, _ = photo_files(folder)
     for index in rng.permutation(len(files))[:_TRIES]:
-        if _read(files[index]) is not None:
+        is_map = files[index].suffix.lower() in MAP_SUFFIXES
+        if (environment_map if is_map else _read)(files[index]) is not None:
             return Path(files[index])
     raise _no_photo(folder)
+
+
+@functools.lru_cache(maxsize=4)
+def environment_map(file: Path) -> Float32[np.ndarray, "H W 3"] | None:
+    """Linear light of an environment map, its mean luminance `_MAP_LIGHT`; None if it cannot be read."""
+    import OpenEXR
+
+    try:
+        with plain_path(file) as plain:
+            if file.suffix.lower() == ".exr":
+                with OpenEXR.File(str(plain)) as opened:
+                    found = opened.channels()
+                    light = found["RGBA" if "RGBA" in found else "RGB"].pixels[..., :3]
+            else:
+                content = np.fromfile(plain, np.uint8)
+                light = cv2.imdecode(content, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)[..., ::-1]
+        light = np.nan_to_num(np.maximum(light, 0.0).astype(np.float32), posinf=0.0)
+        share = np.sin(np.pi * (np.arange(len(light)) + 0.5) / len(light))
+        mean = np.average(light.mean(axis=1), axis=0, weights=share) @ LUMINANCE
+        return np.asarray(light * np.float32(_MAP_LIGHT / mean)) if mean > 0.0 else None
+    except (OSError, RuntimeError, KeyError, TypeError, cv2.error):
+        return None
+
+
+def _in_map(background: Background, rays: Floats, *, coarse: bool = False) -> RoomLight:
+    """Light of an environment map, or of a small copy of it, along rays (N, 3); a map has no depth."""
+    whole = environment_map(Path(str(background.photo)))
+    if whole is None:
+        raise HandSimError(f"{background.photo}: not a readable environment map")
+    if coarse:  # so that small lamps are not missed
+        whole = cv2.resize(whole, (64, 32), interpolation=cv2.INTER_AREA)
+    x, y, z = (rays / np.linalg.norm(rays, axis=1, keepdims=True)).T
+    turn = np.random.default_rng(background.seed).random()
+    across = (turn - np.arctan2(y, x) / (2.0 * np.pi)) % 1.0
+    places = np.stack([across, np.arccos(np.clip(z, -1.0, 1.0)) / np.pi], axis=1)
+    light, nothing = _looked_up(whole, places * whole.shape[1::-1] - 0.5), np.zeros(len(rays), np.float32)
+    return RoomLight(light, nothing, nothing.astype(np.int8))
+
+
+def _looked_up(picture: NDArray[Any], places: NDArray[Any]) -> NDArray[Any]:
+    """Colors (N, C) at columns and rows (N, 2) of a picture, whose sides are joined."""
+    parts = np.array_split(places.astype(np.float32)[:, None], range(_STRIP, len(places), _STRIP))
+    return np.concatenate(
+        [cv2.remap(picture, part, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)[:, 0] for part in parts]
+    )
 
 
 def photos_beside(file: Path, count: int) -> list[Path]:
@@ -193,7 +244,7 @@ class Backgrounds:
         if not isinstance(given, Mapping):
             return cls(given)  # type: ignore[arg-type]  # names are made shares
         shares = {kind: share for kind, share in given.items() if kind != "photos"}
-        return cls(shares, given.get("photos"))
+        return cls(given.get("shares", shares), given.get("photos"))  # records hold shares as one mapping
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,6 +258,11 @@ class Background:
     blur: float = 0.0  # standard deviation of its blur, in picture heights
     photo: str | None = None  # the photograph's file
     backdrop: Backdrop | None = None  # plane that catches shadows; None for a far background
+
+    @property
+    def is_map(self) -> bool:
+        """Whether it is an environment map, which lights the hands, too."""
+        return self.photo is not None and Path(self.photo).suffix.lower() in MAP_SUFFIXES
 
 
 def sample_background(config: Backgrounds, *, rng: np.random.Generator) -> Background:
@@ -449,6 +505,8 @@ def light_in(
 ) -> Float[np.ndarray, "D 3"]:
     """Linear light that comes to the middle of the free box from these directions."""
     rays, eye = _sloping(directions.astype(np.float32)), np.mean(enclosure.free, axis=0)
+    if background.is_map:
+        return _in_map(background, rays, coarse=True).light
     if background.kind == "room":
         return np.asarray(np.clip(_in_room(background, enclosure, eye, rays).light, 0.0, 1.0))
     return (_at_walls(background, enclosure, eye, rays)[0] / np.float32(255.0)) ** np.float32(_GAMMA)
@@ -466,14 +524,11 @@ def _at_walls(
     background: Background, enclosure: Enclosure, eye: Doubles, rays: Floats
 ) -> tuple[Bytes, Floats, NDArray[np.int8]]:
     """Colors (N, 3) in sRGB, distances (N,) [m] and walls (N,) that rays (N, 3) meet in an empty room."""
-    distances, places = np.empty(len(rays), np.float32), np.empty((len(rays), 1, 2), np.float32)
+    distances, places = np.empty(len(rays), np.float32), np.empty((len(rays), 2), np.float32)
     walls, low = np.empty(len(rays), np.int8), np.array(enclosure.low)
     room = (np.array(enclosure.high) - low).astype(np.float32)
-    _find_walls(rays, (eye - low).astype(np.float32), room, distances, walls, places[:, 0])
-    pictures = _wall_pictures(background, enclosure)
-    parts = np.split(places, range(_STRIP, len(rays), _STRIP))
-    colors = [cv2.remap(pictures, part, None, cv2.INTER_LINEAR)[:, 0] for part in parts]
-    return np.concatenate(colors), distances, walls
+    _find_walls(rays, (eye - low).astype(np.float32), room, distances, walls, places)
+    return _looked_up(_wall_pictures(background, enclosure), places), distances, walls
 
 
 def _corner(point: Doubles) -> Corner:
@@ -500,8 +555,9 @@ def _drawn(
     world = rays @ T_world_camera[:3, :3].T.astype(np.float32)
     world, eye, shape = _sloping(world), T_world_camera[:3, 3], size[::-1]
     sigma = background.blur * shape[0]
-    if background.kind == "room":
-        met = _in_room(background, enclosure, eye, world)
+    if background.kind == "room" or background.is_map:
+        is_map = background.is_map
+        met = _in_map(background, world) if is_map else _in_room(background, enclosure, eye, world)
         light = np.clip(met.light, 0.0, 1.0).reshape(*shape, 3)
         if sigma > _SHARP:
             light = cv2.GaussianBlur(light, (0, 0), sigma)
