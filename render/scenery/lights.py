@@ -30,7 +30,7 @@ from render.scenery.backgrounds import (
 _SIZE: Final = (64, 48)  # size of the picture that gives light [px]
 _DIRECTIONS: Final = 1024  # directions in which the picture's light is sampled
 _SHARE: Final = (0.1, 0.5)  # range of the share of ambient light that has the picture's colors
-_LEVEL: Final = 1.56  # usual light of a white surface before all lamps, 1 for the picture's full white
+_LEVEL: Final = 1.44  # usual light of a white surface before all lamps, 1 for the picture's full white
 _BRIGHT: Final = 3.0  # luminance beyond which light of a map is a lamp's, over the mean
 # Factors of a matt surface on each order, and integrals of the squared functions over the sphere.
 _MATT: Final = np.array([1.0, *[2.0 / 3.0] * 3, *[0.25] * 5])
@@ -83,9 +83,9 @@ def sample_lighting(*, rng: np.random.Generator) -> Lighting:
     exposure = _LEVEL * float(np.exp(np.clip(rng.normal(0.0, 0.18), -0.4, 0.4)))
     warmth = rng.normal(0.0, 0.06)  # lamps are warm or cold, and white balances keep some of it
     # These shares give an open palm the standard deviation of lightness that photographs have, 3.6.
-    key_share, ambient_share = rng.uniform(0.52, 0.86), rng.uniform(0.09, 0.19)
+    key_share, ambient_share = rng.uniform(0.5, 0.8), rng.uniform(0.09, 0.19)
     # The key light comes from above more often than from below, and seldom from behind the hand.
-    key = np.array([rng.normal(0.0, 0.75), rng.normal(-0.65, 0.5), rng.normal(-0.9, 0.45)])
+    key = np.array([rng.normal(0.0, 0.6), rng.normal(-0.6, 0.45), rng.normal(-1.05, 0.3)])
     fill = np.array([-np.sign(key[0]) * rng.uniform(0.4, 1.2), rng.normal(-0.2, 0.4), rng.uniform(-1.1, 0.1)])
     directions = (
         key,

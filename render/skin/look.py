@@ -143,8 +143,8 @@ def sample_skin_look(tones: Sequence[float] = ALL_TONES, *, rng: np.random.Gener
     redness = float(np.interp(angle, _ANGLES, _REDNESS)) + float(np.clip(rng.normal(0.0, 1.0), -2.0, 2.0))
     lightness = 50.0 + yellowness * float(np.tan(np.deg2rad(angle)))
     # The colors of all people's palms are alike, near the color of light skin on the back of the hand.
-    paleness = rng.uniform(0.6, 0.75)
-    palm = max(lightness, (1.0 - paleness) * lightness + paleness * 66.0) + rng.uniform(4.5, 6.5)
+    paleness = rng.uniform(0.52, 0.68)
+    palm = max(lightness, (1.0 - paleness) * lightness + paleness * 66.0) + rng.uniform(6.5, 8.0)
     polish = rng.uniform(0.75, 1.0) if rng.random() < 0.08 else 0.0
     color = rng.uniform((25.0, 10.0, -15.0), (75.0, 60.0, 30.0))
     strengths = np.exp(np.clip(rng.normal(0.0, 0.3, 5), -0.7, 0.7))

@@ -84,7 +84,7 @@ def test_a_picture_is_drawn_again_from_its_record(tmp_path):
     _, again = draw(tmp_path / "take.npz", config=saved, record=record)
     kept = cv2.imread(str(next((out / "images").rglob("view1_000009.png"))))
     np.testing.assert_array_equal(again.noisy.rgb, kept[..., ::-1])
-    with pytest.raises(ArgumentError, match="expected frames or a record"):
+    with pytest.raises(ArgumentError, match="expected frames or a picture's record"):
         draw(tmp_path / "take.npz", record={"number": 9})
 
 
