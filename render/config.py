@@ -99,7 +99,8 @@ class RenderConfig(Settings):
     truth of pictures has z up."""
 
     def __post_init__(self) -> None:
-        named: dict[str, Any] = {"background": Backgrounds.of(self.background)}
+        given, named = self.background, dict[str, Any]()
+        named["background"] = given if isinstance(given, Backgrounds) else Backgrounds(given)
         check_type("tones", self.tones, (str, tuple, list), "names of skin tones", map(hyphened, TONES))
         tones = (self.tones,) if isinstance(self.tones, str) else tuple(self.tones)
         if any(isinstance(tone, str) for tone in tones):

@@ -160,6 +160,9 @@ class Drawing:
         self._user = UserBody(self.take) if has_user else None
         film = subject.film
         self._film = None if film is None else film.open()
+        self._open_studio = functools.partial(
+            open_studio, config=config, bodies=self.take.bodies, has_user=has_user, film=self._film
+        )
         poses = None if film is None else film.poses
         self.viewpoints = Viewpoints(
             config.view, self.take, rng=rng, up=config.up, user=self._user, poses=poses
@@ -174,8 +177,8 @@ class Drawing:
     def chosen_frames(self, frames: Iterable[int] | None = None) -> list[int]:
         """Numbers of the requested frames, checked; without a request those that have a hand."""
         if frames is None:
-            absent, every = set(self.frames_without_hands()), range(self.take.num_frames)
-            given = every if self.config.frames is None else self.chosen_frames(self.config.frames)
+            absent, chosen = set(self.frames_without_hands()), self.config.frames
+            given = range(self.take.num_frames) if chosen is None else self.chosen_frames(chosen)
             found = [n for n in given[:: self.config.every] if n not in absent]
             most = len(found) if self.config.num_frames is None else self.config.num_frames
             return [found[n * len(found) // most] for n in range(most)] if most < len(found) else found
@@ -207,7 +210,7 @@ class Drawing:
         around = viewpoints.positions() if enclosed and self._film is None else None
         rng = SpawnKey.SHARD.rng(config.seed, shard, 0)
         if cast is None:  # a take has its own hands, whose looks change with the shard
-            studio = self._open_studio(self.take.hands, rng)
+            studio = self._open_studio(self.take.hands, rng=rng)
         kept: dict[int, FrameChoices] = {}
         for place, frame in numbered:
             person = shard if cast is None else cast.person_in(frame, shard)
@@ -247,17 +250,7 @@ class Drawing:
         cast = self.subject.cast
         assert cast is not None
         hands = cast.hands(person, self.take.hands)
-        return self._open_studio(hands, cast.rng(person))
-
-    def _open_studio(self, hands: Sequence[GloveFit], rng: np.random.Generator) -> Studio:
-        return open_studio(
-            hands,
-            self.config,
-            bodies=self.take.bodies,
-            rng=rng,
-            has_user=self._user is not None,
-            film=self._film,
-        )
+        return self._open_studio(hands, rng=cast.rng(person))
 
 
 def open_studio(
@@ -551,12 +544,9 @@ def _finished(output: Output, formats: Sequence[str]) -> frozenset[int]:
 
 def _is_complete(output: Output) -> bool:
     """Whether the files of all shards together are there as they were written."""
-    sheet, path = output.folder / SHEET, output.folder / _MERGED
     if not output.is_here:
         return SHEET in output.sizes()
-    if not path.exists() and not any(output.folder.glob(CHECKSUMS)):  # of an earlier version
-        return sheet.is_file()
-    record, changed = checked_list(path, {})
+    record, changed = checked_list(output.folder / _MERGED, {})
     output.warn_of(changed, "are damaged (other checksums), and are written again")
     return bool(record) and not changed
 

@@ -11,7 +11,7 @@ import dataclasses
 import functools
 import itertools
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Int8, UInt8
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import Image, ImageOps
 
 from handsim._checks import check_choice
 from handsim.errors import HandSimError, choices
@@ -73,19 +73,19 @@ def environment_map(file: Path) -> Float32[np.ndarray, "H W 3"] | None:
     import OpenEXR
 
     try:
-        with plain_path(file) as plain:
-            if file.suffix.lower() == ".exr":
-                with OpenEXR.File(str(plain)) as opened:
-                    found = opened.channels()
-                    light = found["RGBA" if "RGBA" in found else "RGB"].pixels[..., :3]
-            else:
-                content = np.fromfile(plain, np.uint8)
-                light = cv2.imdecode(content, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)[..., ::-1]
+        if file.suffix.lower() == ".hdr":
+            content = np.fromfile(file, np.uint8)
+            light = cv2.imdecode(content, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)[..., ::-1]
+        else:
+            with plain_path(file) as plain, OpenEXR.File(str(plain)) as opened:
+                light = next(one.pixels for name, one in opened.channels().items() if name[:3] == "RGB")[
+                    ..., :3
+                ]
         light = np.nan_to_num(np.maximum(light, 0.0).astype(np.float32), posinf=0.0)
         share = np.sin(np.pi * (np.arange(len(light)) + 0.5) / len(light))
         mean = np.average(light.mean(axis=1), axis=0, weights=share) @ LUMINANCE
         return np.asarray(light * np.float32(_MAP_LIGHT / mean)) if mean > 0.0 else None
-    except (OSError, RuntimeError, KeyError, TypeError, cv2.error):
+    except (OSError, RuntimeError, StopIteration, TypeError, cv2.error):
         return None
 
 
@@ -127,28 +127,14 @@ def _no_photo(folder: Path) -> HandSimError:
 
 
 def _read(file: Path) -> Bytes | None:
+    """A photograph upright (H, W, 3); None for what is none, or is larger than `_MOST_PIXELS`."""
     try:
         check_regular(file, error=HandSimError)
-        if _num_pixels(file) > _MOST_PIXELS:
-            return None
-        data = np.fromfile(file, dtype=np.uint8)
-        picture = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
-    except (OSError, cv2.error, HandSimError):
+        with warnings.catch_warnings(action="ignore"), Image.open(file) as picture:
+            fits = picture.width * picture.height <= _MOST_PIXELS
+            return np.asarray(ImageOps.exif_transpose(picture).convert("RGB")) if fits else None
+    except Exception:  # files are damaged in many ways
         return None
-    return None if picture is None else np.asarray(picture)
-
-
-def _num_pixels(file: Path) -> int:
-    """Number of pixels in a file's header, checked because OpenCV allocates them before it reads any."""
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # warnings of decompression bombs
-            with Image.open(file) as picture:
-                pixels = int(picture.width * picture.height)
-                picture.verify()
-                return pixels
-    except Exception as error:  # headers are damaged in many ways
-        raise HandSimError(f"{file}: not a readable photograph") from error
 
 
 def draw_photo(file: Path, size: tuple[int, int], rng: np.random.Generator) -> Floats:
@@ -160,7 +146,7 @@ def draw_photo(file: Path, size: tuple[int, int], rng: np.random.Generator) -> F
     scale = min(width / size[0], height / size[1]) * rng.uniform(0.5, 1.0)
     part = np.maximum(np.array(size) * scale, 1.0).astype(int)
     left, top = (int(rng.integers(0, room + 1)) for room in np.array([width, height]) - part)
-    cut = photo[top : top + part[1], left : left + part[0], ::-1]
+    cut = photo[top : top + part[1], left : left + part[0]]
     method = cv2.INTER_AREA if part[0] > size[0] else cv2.INTER_LINEAR
     scaled = cv2.resize(np.ascontiguousarray(cut), size, interpolation=method)
     return np.asarray((scaled.astype(np.float32) / 255.0) ** _GAMMA)
@@ -216,14 +202,16 @@ class Backgrounds:
     """
 
     shares: Mapping[str, float] = field(default_factory=lambda: dict(_USUAL_SHARES), hash=False)
-    """Share of each kind of `KINDS`, of any sum; a kind that is not named has none. A name, or several, have
-    equal shares."""
+    """Share of each kind of `KINDS`, of any sum, and beside them maybe `photos`; a kind that is not named has
+    none. A name, or several, have equal shares."""
     photos: str | None = None
     """Folder of photographs, its subfolders included."""
 
     def __post_init__(self) -> None:
         given = (self.shares,) if isinstance(self.shares, str) else self.shares
-        shares = dict(given) if isinstance(given, Mapping) else dict.fromkeys(given, 1.0)
+        shares: dict[str, Any] = dict(given) if isinstance(given, Mapping) else dict.fromkeys(given, 1.0)
+        object.__setattr__(self, "photos", shares.pop("photos", self.photos))
+        shares = shares.get("shares", shares)  # as records have them
         for kind in shares:
             check_choice(kind, KINDS, noun="background")
         every = {kind: float(shares.get(kind, 0.0)) for kind in KINDS}
@@ -235,16 +223,6 @@ class Backgrounds:
             raise HandSimError(f"photos is {self.photos}, expected a share of the background photo with it")
         object.__setattr__(self, "shares", every)
         object.__setattr__(self, "photos", None if self.photos is None else str(self.photos))
-
-    @classmethod
-    def of(cls, given: Backgrounds | Mapping[str, Any] | str | Sequence[str]) -> Backgrounds:
-        """The backgrounds that a user names: kinds, or shares by kind and beside them the folder `photos`."""
-        if isinstance(given, Backgrounds):
-            return given
-        if not isinstance(given, Mapping):
-            return cls(given)  # type: ignore[arg-type]  # names are made shares
-        shares = {kind: share for kind, share in given.items() if kind != "photos"}
-        return cls(given.get("shares", shares), given.get("photos"))  # records hold shares as one mapping
 
 
 @dataclass(frozen=True, slots=True)

@@ -44,5 +44,7 @@ def test_backs_have_the_tone_that_is_named_and_palms_are_lighter(tone: str) -> N
         assert min(len(backs), len(palms)) >= 10
         angle = np.median([typology_angle(lightness, yellowness) for lightness, _, yellowness in backs])
         off = angle - np.mean(TONES[tone])
-        assert abs(off) < 8.0, f"{name}: the median typology angle is {off:.1f} degrees off the class's middle"
+        assert abs(off) < 8.0, (
+            f"{name}: the median typology angle is {off:.1f} degrees off the class's middle"
+        )
         assert np.median(palms[:, 0]) > np.median(backs[:, 0]) + 0.5, name
