@@ -75,17 +75,16 @@ def environment_map(file: Path) -> Float32[np.ndarray, "H W 3"] | None:
     try:
         if file.suffix.lower() == ".hdr":
             content = np.fromfile(file, np.uint8)
-            light = cv2.imdecode(content, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)[..., ::-1]
+            light = np.asarray(cv2.imdecode(content, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH))[..., ::-1]
         else:
             with plain_path(file) as plain, OpenEXR.File(str(plain)) as opened:
-                light = next(one.pixels for name, one in opened.channels().items() if name[:3] == "RGB")[
-                    ..., :3
-                ]
+                colors = (one.pixels for name, one in opened.channels().items() if name[:3] == "RGB")
+                light = next(colors)[..., :3]
         light = np.nan_to_num(np.maximum(light, 0.0).astype(np.float32), posinf=0.0)
         share = np.sin(np.pi * (np.arange(len(light)) + 0.5) / len(light))
         mean = np.average(light.mean(axis=1), axis=0, weights=share) @ LUMINANCE
         return np.asarray(light * np.float32(_MAP_LIGHT / mean)) if mean > 0.0 else None
-    except (OSError, RuntimeError, StopIteration, TypeError, cv2.error):
+    except (OSError, RuntimeError, StopIteration, IndexError, TypeError, cv2.error):
         return None
 
 

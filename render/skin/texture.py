@@ -377,10 +377,10 @@ def _painted(
     _add(lab, look.veins * veins, (-1.6, -1.6, -2.2))
     blotches = noise(texels.positions, (0.05, 0.018, 0.007, 0.003), rng=rng)
     _add(lab, look.blotches * blotches, (1.0, -0.6, 0.2))
-    weight = 0.65 + 0.4 * noise(texels.positions, (0.014, 0.005), rng=rng)
+    weight = 0.8 + 0.4 * noise(texels.positions, (0.014, 0.005), rng=rng)
     lines = np.clip(line_depth(rng) * np.clip(weight, 0.1, 1.2), 0.0, 1.0)
     # Pigment collects in the lines; their darkness depends on the contrast that the skin allows.
-    _add(lab, look.creases * lines, (-8.5, 4.0, 0.5))
+    _add(lab, look.creases * lines, (-9.5, 4.0, 0.5))
     height = look.relief * relief() - 0.0004 * look.creases * lines + 0.00008 * look.veins * veins
     grain = noise(texels.positions, _GRAIN_SIZES, rng=rng)
     grain *= smooth(texels.positions[:, 0].astype(np.float32), *_GRAINED)  # it would be streaks on the arm
@@ -493,11 +493,11 @@ def _paint_nails(paint: _Paint, look: SkinLook) -> None:
         color += np.float32(look.polish) * (np.array(look.polish_color, dtype=np.float32) - color)
         lab = paint.lab[mine]
         lab += plate[:, None] * (color - lab)
-        _add(lab, look.creases * fold, (-5.0, 4.0, 0.0))
+        _add(lab, look.creases * fold, (-7.0, 4.0, 0.0))
         paint.lab[mine] = lab
         paint.roughness[mine] += plate * (np.float32(0.28) - paint.roughness[mine])
         paint.height[mine] *= 1.0 - plate
-        paint.height[mine] += 0.0002 * plate - 0.00025 * fold
+        paint.height[mine] += 0.00025 * plate - 0.0003 * fold
 
 
 def _sleeve(paint: _Paint, forearm: Forearm, rng: np.random.Generator) -> None:
