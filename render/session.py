@@ -115,9 +115,7 @@ def draw(
     check_type("record", record, Mapping, "a picture's record, as formats of files have it")
     number, choices = record.get("number", record.get("frame")), record.get("choices", {})
     if frames is not None or number is None or not {"shard", "place"} <= set(choices):
-        raise ArgumentError(
-            "expected frames or a picture's record, with the shard and place among its choices"
-        )
+        raise ArgumentError("expected frames or a picture's record, with shard and place in its choices")
     return drawing.frames(choices["shard"], [(choices["place"], *drawing.chosen_frames([number]))])
 
 

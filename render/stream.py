@@ -337,9 +337,9 @@ class PictureStream(IterableDataset[dict[str, torch.Tensor]]):
             if sitting.studio.is_clear(reaching, [camera]):
                 break
         skin = sitting.studio.skin
-        bends, T_world_camera = camera.lens.kind != "pinhole", camera.T_world_camera
-        around = np.stack([T_world_camera[:3, 3], points.mean(axis=0)]) if bends else None
-        chosen = sample_choices(self.config, T_world_camera[:3, :3], camera.size, around, rng=rng)
+        eye = camera.T_world_camera[:3, 3]
+        around = None if camera.lens.kind == "pinhole" else np.stack([eye, points.mean(axis=0)])
+        chosen = sample_choices(self.config, camera.T_world_camera[:3, :3], camera.size, around, rng=rng)
         fresh = dataclasses.replace(chosen, seed=int(rng.integers(2**31)))
         frame = sitting.studio.photograph(reaching, camera, fresh, recorded=False)
         truth = dict(zip(there, frame.hands, strict=True))

@@ -21,6 +21,9 @@ _FLOORS: Final = (0.25, 0.4, 0.35)  # probabilities of tiles, boards and no patt
 _FLOOR: Final = 4  # number of the floor among the six sides
 _CONTRAST: Final = (0.15, 0.7)  # contrast of a pattern over that of any two paints
 _COLORED: Final = 0.4  # share of paints with a strong color
+_QUARTERS: Final = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))  # four rays of a pixel
+_CROSS: Final = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
+_STEP: Final = 0.04  # least difference of the root of light around a pixel that makes an edge
 _FRAME: Final = 0.06  # width of the frame of a picture or window, as a share of its sides
 
 
@@ -56,11 +59,21 @@ class _Boxes(NamedTuple):
 def draw_room(size: tuple[int, int], seed: int) -> Float32[np.ndarray, "H W 3"]:
     """A random room from a random position, in linear light."""
     (width, height), scene = size, _scene(seed)
+
+    def seen(across: Floats, down: Floats) -> Floats:
+        """Light (N, 3) at columns and rows (N,) of the picture [px]."""
+        rays = np.empty((len(across), 3), dtype=np.float32)
+        _aim(across, down, 0.5 * width, 0.5 * height, scene.focal * height, scene.axes, rays)
+        return _cast_all(
+            rays, scene.eye, scene.room, scene.walls, scene.boxes, scene.lamp, scene.strength
+        ).light
+
     down, across = np.mgrid[:height, :width].reshape(2, -1).astype(np.float32) + np.float32(0.5)
-    rays = np.empty((len(across), 3), dtype=np.float32)
-    _aim(across, down, 0.5 * width, 0.5 * height, scene.focal * height, scene.axes, rays)
-    met = _cast_all(rays, scene.eye, scene.room, scene.walls, scene.boxes, scene.lamp, scene.strength)
-    picture = met.light.reshape(height, width, 3)
+    picture = seen(across, down).reshape(height, width, 3)
+    roots = cv2.sqrt(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY))
+    edges = cv2.morphologyEx(roots, cv2.MORPH_GRADIENT, _CROSS).ravel() > _STEP
+    parts = [seen(across[edges] + x, down[edges] + y) for x, y in _QUARTERS]
+    picture.reshape(-1, 3)[edges] = np.mean(parts, axis=0)
     grain = normal_numbers((height, width, 1), rng=np.random.default_rng([seed, 1]))
     picture *= np.float32(1.0) + np.float32(0.05) * grain
     return np.asarray(cv2.GaussianBlur(picture, (0, 0), 0.9))  # because rays have no width, but pixels do

@@ -136,8 +136,8 @@ def test_impossible_configs_are_told() -> None:
 def test_edges_of_rooms_are_smooth() -> None:
     """Nearly as the mean over sixteen rays has them."""
     for seed in (1, 2):
-        coarse, fine = (draw_room((320 * k, 240 * k), seed) for k in (1, 4))
-        mean = fine.reshape(240, 4, 320, 4, 3).mean(axis=(1, 3))
+        coarse, fine = (draw_room((80 * k, 60 * k), seed) for k in (1, 4))
+        mean = fine.reshape(60, 4, 80, 4, 3).mean(axis=(1, 3))
         off = np.abs(cv2.GaussianBlur(mean, (0, 0), 0.9) - coarse)
         assert np.quantile(off, 0.99) < 0.06
 
