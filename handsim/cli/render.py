@@ -63,7 +63,7 @@ class RenderOptions(RenderConfig):
             **given
             | {
                 "tones": self.tones or ALL_TONES,
-                "background": Backgrounds(kinds, self.photos) if kinds else Backgrounds(),
+                "background": Backgrounds(kinds | {"photos": self.photos}) if kinds else Backgrounds(),
                 "depth_sensor": "auto" if names == ("auto",) else DepthSensor(names) if names else None,
                 "color_sensor": ExposureConfig() if self.color_sensor else None,
                 "shutter": ShutterConfig() if self.shutter else None,
