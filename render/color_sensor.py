@@ -59,7 +59,7 @@ class ExposureConfig:
     """Ranges of exposures; drawn uniformly unless stated."""
 
     stops: tuple[float, float] = (-0.5, 0.4)
-    metering: float = 0.2
+    metering: float = 0.12
     """Share of the difference between a picture's mean light and middle gray that cameras make up for."""
     balance: float = 0.05
     """Standard deviation of the logarithms of the factors of red and blue."""

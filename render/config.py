@@ -84,6 +84,8 @@ class RenderConfig(Settings):
     """What paints colors: our own compiled code, opengl, or auto: opengl where there is hardware for it."""
     shutter: ShutterConfig | None = None
     """Motion blur and rolling shutters, which take a drawing per sub-frame; None: pictures of an instant."""
+    frames: Annotated[tuple[int, ...] | None, Limits(0)] = None
+    """Numbers of the frames that are drawn; all frames with a hand when not given."""
     every: Annotated[int, Limits(1)] = 1
     """Step between the frames that are drawn."""
     num_frames: Annotated[int | None, Limits(1)] = None
@@ -97,7 +99,8 @@ class RenderConfig(Settings):
     truth of pictures has z up."""
 
     def __post_init__(self) -> None:
-        named: dict[str, Any] = {"background": Backgrounds.of(self.background)}
+        given, named = self.background, dict[str, Any]()
+        named["background"] = given if isinstance(given, Backgrounds) else Backgrounds(given)
         check_type("tones", self.tones, (str, tuple, list), "names of skin tones", map(hyphened, TONES))
         tones = (self.tones,) if isinstance(self.tones, str) else tuple(self.tones)
         if any(isinstance(tone, str) for tone in tones):

@@ -78,6 +78,7 @@ def draw(
     model: Model | tuple[Model, Model] | None = None,
     camera: Cameras | None = None,
     frames: Iterable[int] | None = None,
+    record: Mapping[str, Any] | None = None,
     config: RenderConfig | None = None,
     **settings: Any,
 ) -> Iterator[RenderedFrame]:
@@ -92,7 +93,9 @@ def draw(
         model: The hand of your own poses, or both in the poses' order; drawn people when not given.
         camera: Camera of your own, fixed in the world and used as it is, or several; or the name of a preset.
             Without it, viewpoints are drawn as `RenderConfig.view` says.
-        frames: Numbers of the frames; all that have a hand, every `RenderConfig.every`, when not given.
+        frames: Numbers of the frames; those that `RenderConfig` chooses when not given.
+        record: A picture's record in files, whose frame is drawn again as it was, with the configuration that
+            `RenderConfig.from_json` reads from their render.json.
         config: What to draw.
         settings: Settings of `RenderConfig` that differ from `config`, as `seed=1` or `background="room"`.
 
@@ -107,7 +110,13 @@ def draw(
     subject = load_subject(source_of(source, model=model, seed=config.seed), seed=config.seed)
     drawing = Drawing(subject, config)
     check_hands_in_view(config.view, drawing.viewpoints, drawing.take)
-    return drawing.frames(0, ((n, n) for n in drawing.chosen_frames(frames)))
+    if record is None:
+        return drawing.frames(0, ((n, n) for n in drawing.chosen_frames(frames)))
+    check_type("record", record, Mapping, "a picture's record, as formats of files have it")
+    number, choices = record.get("number", record.get("frame")), record.get("choices", {})
+    if frames is not None or number is None or not {"shard", "place"} <= set(choices):
+        raise ArgumentError("expected frames or a picture's record, with shard and place in its choices")
+    return drawing.frames(choices["shard"], [(choices["place"], *drawing.chosen_frames([number]))])
 
 
 def configured(
@@ -149,6 +158,9 @@ class Drawing:
         self._user = UserBody(self.take) if has_user else None
         film = subject.film
         self._film = None if film is None else film.open()
+        self._open_studio = functools.partial(
+            open_studio, config=config, bodies=self.take.bodies, has_user=has_user, film=self._film
+        )
         poses = None if film is None else film.poses
         self.viewpoints = Viewpoints(
             config.view, self.take, rng=rng, up=config.up, user=self._user, poses=poses
@@ -163,8 +175,9 @@ class Drawing:
     def chosen_frames(self, frames: Iterable[int] | None = None) -> list[int]:
         """Numbers of the requested frames, checked; without a request those that have a hand."""
         if frames is None:
-            absent = set(self.frames_without_hands())
-            found = [n for n in range(0, self.take.num_frames, self.config.every) if n not in absent]
+            absent, chosen = set(self.frames_without_hands()), self.config.frames
+            given = range(self.take.num_frames) if chosen is None else self.chosen_frames(chosen)
+            found = [n for n in given[:: self.config.every] if n not in absent]
             most = len(found) if self.config.num_frames is None else self.config.num_frames
             return [found[n * len(found) // most] for n in range(most)] if most < len(found) else found
         check_type("frames", frames, Iterable, "numbers of frames")
@@ -190,12 +203,12 @@ class Drawing:
         """Pictures of frames by all cameras; the frames are given with their places in the shard."""
         config, cast = self.config, self.subject.cast
         viewpoints = self.viewpoints
-        several = viewpoints.num_cameras > 1 or (viewpoints.moves and config.vary == "shard")
-        several &= self._film is None
-        around = viewpoints.positions() if several else None
+        enclosed = viewpoints.num_cameras > 1 or (viewpoints.moves and config.vary == "shard")
+        enclosed |= viewpoints.cameras(0)[0].lens.kind != "pinhole"  # which bends what is behind the hands
+        around = viewpoints.positions() if enclosed and self._film is None else None
         rng = SpawnKey.SHARD.rng(config.seed, shard, 0)
         if cast is None:  # a take has its own hands, whose looks change with the shard
-            studio = self._open_studio(self.take.hands, rng)
+            studio = self._open_studio(self.take.hands, rng=rng)
         kept: dict[int, FrameChoices] = {}
         for place, frame in numbered:
             person = shard if cast is None else cast.person_in(frame, shard)
@@ -210,7 +223,7 @@ class Drawing:
                     scene = sample_choices(config, viewpoints.viewer, viewpoints.size, around, rng=rng)
                     kept[person] = self._held(scene)
                 chosen = kept[person]
-            cameras = viewpoints.cameras(frame)
+            cameras, placed = viewpoints.cameras(frame), {"shard": shard, "place": place}
             moment = Moment(self.take, frame, None if cast is None else cast.person)
             moment = studio.reaching(moment, cameras, self._user)
             if leave_out is not None and not studio.is_clear(moment, cameras):
@@ -219,7 +232,7 @@ class Drawing:
             for camera in cameras:
                 fresh = dataclasses.replace(chosen, seed=int(own.integers(2**31)))
                 drawn = studio.photograph(moment, camera, fresh)
-                yield dataclasses.replace(drawn, choices={"person": person, **drawn.choices})
+                yield dataclasses.replace(drawn, choices={"person": person, **placed, **drawn.choices})
 
     def _held(self, scene: FrameChoices) -> FrameChoices:
         """The choices with a backdrop that stays where it is, behind the hands of all frames."""
@@ -235,17 +248,7 @@ class Drawing:
         cast = self.subject.cast
         assert cast is not None
         hands = cast.hands(person, self.take.hands)
-        return self._open_studio(hands, cast.rng(person))
-
-    def _open_studio(self, hands: Sequence[GloveFit], rng: np.random.Generator) -> Studio:
-        return open_studio(
-            hands,
-            self.config,
-            bodies=self.take.bodies,
-            rng=rng,
-            has_user=self._user is not None,
-            film=self._film,
-        )
+        return self._open_studio(hands, rng=cast.rng(person))
 
 
 def open_studio(
@@ -478,7 +481,7 @@ def _settings(drawing: Drawing, source: Source) -> dict[str, Any]:
     """What decides the pictures, as JSON: digests of files, and of the names and sizes of photographs."""
     subject = drawing.subject
     name = f"{subject.name}, sha256:{checksum(source)}" if isinstance(source, Path) else subject.name
-    settings: dict[str, Any] = {"take": name, "frames": subject.take.num_frames}
+    settings: dict[str, Any] = {"take": name, "take_frames": subject.take.num_frames}
     settings |= dataclasses.asdict(drawing.config)
     if drawing.config.background.shares["photo"] > 0.0:
         files, broken = photo_files(Path(str(drawing.config.background.photos)))
@@ -489,8 +492,6 @@ def _settings(drawing: Drawing, source: Source) -> dict[str, Any]:
         listed = "\n".join(f"{file} {file.stat().st_size}" for file in files)
         names = listed.encode("utf-8", "surrogateescape")  # names of files need not be valid text
         settings["photos"] = f"sha256:{hashlib.sha256(names).hexdigest()}"
-    if drawing.config.up == "z":  # as in records of earlier versions
-        del settings["up"]
     if drawing.config.view.cameras is None:
         del settings["view"]["cameras"]
     else:
@@ -541,12 +542,9 @@ def _finished(output: Output, formats: Sequence[str]) -> frozenset[int]:
 
 def _is_complete(output: Output) -> bool:
     """Whether the files of all shards together are there as they were written."""
-    sheet, path = output.folder / SHEET, output.folder / _MERGED
     if not output.is_here:
         return SHEET in output.sizes()
-    if not path.exists() and not any(output.folder.glob(CHECKSUMS)):  # of an earlier version
-        return sheet.is_file()
-    record, changed = checked_list(path, {})
+    record, changed = checked_list(output.folder / _MERGED, {})
     output.warn_of(changed, "are damaged (other checksums), and are written again")
     return bool(record) and not changed
 

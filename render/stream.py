@@ -337,7 +337,9 @@ class PictureStream(IterableDataset[dict[str, torch.Tensor]]):
             if sitting.studio.is_clear(reaching, [camera]):
                 break
         skin = sitting.studio.skin
-        chosen = sample_choices(self.config, camera.T_world_camera[:3, :3], camera.size, rng=rng)
+        eye = camera.T_world_camera[:3, 3]
+        around = None if camera.lens.kind == "pinhole" else np.stack([eye, points.mean(axis=0)])
+        chosen = sample_choices(self.config, camera.T_world_camera[:3, :3], camera.size, around, rng=rng)
         fresh = dataclasses.replace(chosen, seed=int(rng.integers(2**31)))
         frame = sitting.studio.photograph(reaching, camera, fresh, recorded=False)
         truth = dict(zip(there, frame.hands, strict=True))

@@ -164,7 +164,8 @@ def _settings(info: StructTypeInfo) -> StructConstructorSpec | None:
             default = one.default
         elif one.default_factory is not dataclasses.MISSING:
             default = one.default_factory()
-        kind = _hinted(hints[one.name], aliases=["--frames"] if one.name == "num_frames" else None)
+        is_count = one.name == "num_frames" and "frames" not in hints
+        kind = _hinted(hints[one.name], aliases=["--frames"] if is_count else None)
         fields.append(StructFieldSpec(one.name, kind, default, told.get(one.name)))
     return StructConstructorSpec(instantiate=info.type, fields=tuple(fields))
 

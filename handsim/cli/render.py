@@ -63,7 +63,7 @@ class RenderOptions(RenderConfig):
             **given
             | {
                 "tones": self.tones or ALL_TONES,
-                "background": Backgrounds.of(kinds | {"photos": self.photos}) if kinds else Backgrounds(),
+                "background": Backgrounds(kinds | {"photos": self.photos}) if kinds else Backgrounds(),
                 "depth_sensor": "auto" if names == ("auto",) else DepthSensor(names) if names else None,
                 "color_sensor": ExposureConfig() if self.color_sensor else None,
                 "shutter": ShutterConfig() if self.shutter else None,
@@ -128,10 +128,7 @@ def render(
         (take, poses, cast("str | None", options.view.cameras)), (place if isinstance(place, Path) else None,)
     )
     config, start, counts = options.config(), time.perf_counter(), []
-    with (
-        progress_bar("images") as bar,
-        chosen_workers(cluster, workers, bar.say) as chosen,
-    ):
+    with progress_bar("images") as bar, chosen_workers(cluster, workers, bar.say) as chosen:
 
         def show(done: int, total: int) -> None:
             counts.append((done, total))

@@ -114,11 +114,7 @@ class Site(NamedTuple):
 
 
 def build_spec(
-    skeleton: Skeleton,
-    capsules: Capsules,
-    *,
-    sites: tuple[Site, ...] = (),
-    actuators: bool = False,
+    skeleton: Skeleton, capsules: Capsules, *, sites: tuple[Site, ...] = (), actuators: bool = False
 ) -> mujoco.MjSpec:
     """Editable MuJoCo specification of a hand.
 

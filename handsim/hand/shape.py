@@ -110,13 +110,7 @@ REFERENCE_BREADTH: Final = 0.0883
 
 # Moving bones [mm]: proximal, middle, distal with its soft tip; for the thumb metacarpal, proximal, distal.
 _BONE_LENGTHS: Final = np.array(
-    [
-        [46.2, 31.6, 27.3],
-        [39.8, 22.4, 19.7],
-        [44.6, 26.3, 21.4],
-        [41.4, 25.7, 21.3],
-        [32.7, 18.1, 19.7],
-    ]
+    [[46.2, 31.6, 27.3], [39.8, 22.4, 19.7], [44.6, 26.3, 21.4], [41.4, 25.7, 21.3], [32.7, 18.1, 19.7]]
 )
 # Where each digit begins [mm], in the wrist frame: thumb CMC joint, then the four MCP joints. x follows the
 # metacarpal and carpus lengths, y spreads over the breadth, z is the transverse arch.

@@ -47,14 +47,7 @@ from render.formats.records import (
     to_order,
     without_colors,
 )
-from render.formats.shards import (
-    _LABELS,
-    FolderWriter,
-    _write,
-    json_list,
-    one_sentence,
-    save_text,
-)
+from render.formats.shards import _LABELS, FolderWriter, _write, json_list, one_sentence, save_text
 from render.frames import HandTruth, RenderedFrame
 from render.skin.look import tone_name, typology_angle
 

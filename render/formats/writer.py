@@ -197,12 +197,12 @@ def merge_renderings(folders: Sequence[str | Path], out: str | Path) -> int:
     if not count:
         raise HandSimError(f"{', '.join(map(str, parts))}: no finished shards of the format {formats[0]}")
     for name in formats:
-        _merge_format(name, parts, shards, [one["frames"] for one in settings], formats, out)
+        _merge_format(name, parts, shards, [one["take_frames"] for one in settings], formats, out)
         open_writer(name, format_folder(out, formats, name)).finish()
     for number in range(count):
         save_checksums(out / checksums_name(number), shard_files(out, formats, number))
-    frames = sum(one["frames"] for one in settings)
-    save_json(out / CONFIG, {"formats": formats, "frames": frames, "merged": settings})
+    frames = sum(one["take_frames"] for one in settings)
+    save_json(out / CONFIG, {"formats": formats, "take_frames": frames, "merged": settings})
     return count
 
 
@@ -210,7 +210,8 @@ def _settings(folder: Path) -> dict[str, Any]:
     if not (folder / CONFIG).is_file():
         raise HandSimError(f"{folder} holds no {CONFIG}, expected a folder that handsim render wrote")
     settings = load_json(folder / CONFIG)
-    formats, frames = settings.get("formats"), settings.get("frames")
+    frames = settings.setdefault("take_frames", settings.get("frames"))  # its name in earlier versions
+    formats = settings.get("formats")
     good = isinstance(formats, list) and formats and all(isinstance(name, str) for name in formats)
     if not good or not isinstance(frames, int) or not 0 < frames < 1 << 40:
         raise DatasetError(f"{folder / CONFIG} is damaged: formats or frames are missing")

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import ctypes
 import functools
 import os
 import subprocess
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -23,8 +23,7 @@ if TYPE_CHECKING:
     from render.scenery.lights import Lighting
 
 _BROKEN_PYRENDER = "0.1.45"  # cannot draw beside NumPy 2 on Python 3.12 and later
-_EGL_EXTENSIONS: Final = 0x3055
-_MOST_DEVICES: Final = 32
+_DEVICES: Final = ("dri/renderD*", "nvidia[0-9]*", "dxg")  # files of Mesa's, NVIDIA's and WSL's devices
 _SECONDS: Final = 60.0  # a first start of pyrender from a slow disk takes some seconds
 _SOFTWARE: Final = ("llvmpipe", "softpipe", "swrast", "software", "swiftshader")
 _NAME_OF_RENDERER: Final = (
@@ -88,9 +87,8 @@ def _no_driver(error: Exception) -> HandSimError:
 def opengl_has_hardware() -> bool:
     """Whether `render.painting.opengl` would draw on hardware; False where anything fails.
 
-    A list of EGL's devices rules out most machines without hardware within milliseconds. Where there is such
-    a device, another process starts OpenGL and reports its renderer, so that a broken driver cannot end this
-    process.
+    Where there is a graphics device, another process starts OpenGL and reports its renderer, so that a broken
+    driver cannot end this process.
     """
     try:
         return _some_hardware_device() and is_hardware(_renderer_name())
@@ -105,23 +103,9 @@ def is_hardware(renderer: str) -> bool:
 
 
 def _some_hardware_device() -> bool:
-    """Whether EGL lists a device that is not Mesa's software rasterizer."""
-    if os.environ.get("PYOPENGL_PLATFORM", "egl") != "egl":
-        return True  # the user's own platform: only its renderer can tell
-    egl = ctypes.CDLL("libEGL.so.1")
-    egl.eglGetProcAddress.restype = ctypes.c_void_p
-    egl.eglGetProcAddress.argtypes = [ctypes.c_char_p]
-    list_devices = ctypes.CFUNCTYPE(
-        ctypes.c_uint, ctypes.c_int, ctypes.POINTER(ctypes.c_void_p), ctypes.POINTER(ctypes.c_int)
-    )(egl.eglGetProcAddress(b"eglQueryDevicesEXT"))
-    device_string = ctypes.CFUNCTYPE(ctypes.c_char_p, ctypes.c_void_p, ctypes.c_int)(
-        egl.eglGetProcAddress(b"eglQueryDeviceStringEXT")
-    )
-    devices, count = (ctypes.c_void_p * _MOST_DEVICES)(), ctypes.c_int(0)
-    if not list_devices(_MOST_DEVICES, devices, ctypes.byref(count)):
-        return False
-    extensions = (device_string(device, _EGL_EXTENSIONS) or b"" for device in devices[: count.value])
-    return any(b"EGL_MESA_device_software" not in names.split() for names in extensions)
+    """Whether Linux lists a graphics device, or the user asks for another platform than EGL."""
+    asked = os.environ.get("PYOPENGL_PLATFORM", "egl") != "egl"
+    return asked or any(path for pattern in _DEVICES for path in Path("/dev").glob(pattern))
 
 
 def _renderer_name() -> str:

@@ -11,7 +11,7 @@ import dataclasses
 import functools
 import itertools
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Int8, UInt8
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import Image, ImageOps
 
 from handsim._checks import check_choice
 from handsim.errors import HandSimError, choices
@@ -32,7 +32,11 @@ from render.fields import normal_numbers
 from render.frames import Bytes, Doubles, Flags, Floats, Geometry
 from render.scenery.rooms import RoomLight, cast_room, draw_room, paint_tints
 
-PHOTO_SUFFIXES: Final = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
+MAP_SUFFIXES: Final = (".hdr", ".exr")
+"""Files of environment maps: the light of all directions, longitudes across and latitudes down, z up."""
+PHOTO_SUFFIXES: Final = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff", *MAP_SUFFIXES)
+LUMINANCE: Final = np.array([0.2126, 0.7152, 0.0722])
+_MAP_LIGHT: Final = 0.5  # mean luminance of a map, 1 for a white surface in full light
 _TRIES: Final = 50  # unreadable files in turn after which a folder counts as one without photographs
 _MOST_PIXELS: Final = 100_000_000  # largest number of pixels of a photograph
 
@@ -46,7 +50,8 @@ def photo_files(folder: Path) -> tuple[tuple[Path, ...], tuple[Path, ...]]:
     good, broken = list[Path](), list[Path]()
     for file in files:
         with plain_path(file) as plain:
-            (good if cv2.haveImageReader(str(plain)) else broken).append(file)
+            readable = file.suffix.lower() in MAP_SUFFIXES or cv2.haveImageReader(str(plain))
+            (good if readable else broken).append(file)
     if not good:
         raise _no_photo(folder)
     return tuple(good), tuple(broken)
@@ -56,9 +61,54 @@ def pick_photo(folder: Path, rng: np.random.Generator) -> Path:
     """A random photograph that can be read whole."""
     files, _ = photo_files(folder)
     for index in rng.permutation(len(files))[:_TRIES]:
-        if _read(files[index]) is not None:
+        is_map = files[index].suffix.lower() in MAP_SUFFIXES
+        if (environment_map if is_map else _read)(files[index]) is not None:
             return Path(files[index])
     raise _no_photo(folder)
+
+
+@functools.lru_cache(maxsize=4)
+def environment_map(file: Path) -> Float32[np.ndarray, "H W 3"] | None:
+    """Linear light of an environment map, its mean luminance `_MAP_LIGHT`; None if it cannot be read."""
+    import OpenEXR
+
+    try:
+        if file.suffix.lower() == ".hdr":
+            content = np.fromfile(file, np.uint8)
+            light = np.asarray(cv2.imdecode(content, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH))[..., ::-1]
+        else:
+            with plain_path(file) as plain, OpenEXR.File(str(plain)) as opened:
+                colors = (one.pixels for name, one in opened.channels().items() if name[:3] == "RGB")
+                light = next(colors)[..., :3]
+        light = np.nan_to_num(np.maximum(light, 0.0).astype(np.float32), posinf=0.0)
+        share = np.sin(np.pi * (np.arange(len(light)) + 0.5) / len(light))
+        mean = np.average(light.mean(axis=1), axis=0, weights=share) @ LUMINANCE
+        return np.asarray(light * np.float32(_MAP_LIGHT / mean)) if mean > 0.0 else None
+    except (OSError, RuntimeError, StopIteration, IndexError, TypeError, cv2.error):
+        return None
+
+
+def _in_map(background: Background, rays: Floats, *, coarse: bool = False) -> RoomLight:
+    """Light of an environment map, or of a small copy of it, along rays (N, 3); a map has no depth."""
+    whole = environment_map(Path(str(background.photo)))
+    if whole is None:
+        raise HandSimError(f"{background.photo}: not a readable environment map")
+    if coarse:  # so that small lamps are not missed
+        whole = cv2.resize(whole, (64, 32), interpolation=cv2.INTER_AREA)
+    x, y, z = (rays / np.linalg.norm(rays, axis=1, keepdims=True)).T
+    turn = np.random.default_rng(background.seed).random()
+    across = (turn - np.arctan2(y, x) / (2.0 * np.pi)) % 1.0
+    places = np.stack([across, np.arccos(np.clip(z, -1.0, 1.0)) / np.pi], axis=1)
+    light, nothing = _looked_up(whole, places * whole.shape[1::-1] - 0.5), np.zeros(len(rays), np.float32)
+    return RoomLight(light, nothing, nothing.astype(np.int8))
+
+
+def _looked_up(picture: NDArray[Any], places: NDArray[Any]) -> NDArray[Any]:
+    """Colors (N, C) at columns and rows (N, 2) of a picture, whose sides are joined."""
+    parts = np.array_split(places.astype(np.float32)[:, None], range(_STRIP, len(places), _STRIP))
+    return np.concatenate(
+        [cv2.remap(picture, part, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)[:, 0] for part in parts]
+    )
 
 
 def photos_beside(file: Path, count: int) -> list[Path]:
@@ -76,28 +126,14 @@ def _no_photo(folder: Path) -> HandSimError:
 
 
 def _read(file: Path) -> Bytes | None:
+    """A photograph upright (H, W, 3); None for what is none, or is larger than `_MOST_PIXELS`."""
     try:
         check_regular(file, error=HandSimError)
-        if _num_pixels(file) > _MOST_PIXELS:
-            return None
-        data = np.fromfile(file, dtype=np.uint8)
-        picture = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
-    except (OSError, cv2.error, HandSimError):
+        with warnings.catch_warnings(action="ignore"), Image.open(file) as picture:
+            fits = picture.width * picture.height <= _MOST_PIXELS
+            return np.asarray(ImageOps.exif_transpose(picture).convert("RGB")) if fits else None
+    except Exception:  # files are damaged in many ways
         return None
-    return None if picture is None else np.asarray(picture)
-
-
-def _num_pixels(file: Path) -> int:
-    """Number of pixels in a file's header, checked because OpenCV allocates them before it reads any."""
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # warnings of decompression bombs
-            with Image.open(file) as picture:
-                pixels = int(picture.width * picture.height)
-                picture.verify()
-                return pixels
-    except Exception as error:  # headers are damaged in many ways
-        raise HandSimError(f"{file}: not a readable photograph") from error
 
 
 def draw_photo(file: Path, size: tuple[int, int], rng: np.random.Generator) -> Floats:
@@ -109,7 +145,7 @@ def draw_photo(file: Path, size: tuple[int, int], rng: np.random.Generator) -> F
     scale = min(width / size[0], height / size[1]) * rng.uniform(0.5, 1.0)
     part = np.maximum(np.array(size) * scale, 1.0).astype(int)
     left, top = (int(rng.integers(0, room + 1)) for room in np.array([width, height]) - part)
-    cut = photo[top : top + part[1], left : left + part[0], ::-1]
+    cut = photo[top : top + part[1], left : left + part[0]]
     method = cv2.INTER_AREA if part[0] > size[0] else cv2.INTER_LINEAR
     scaled = cv2.resize(np.ascontiguousarray(cut), size, interpolation=method)
     return np.asarray((scaled.astype(np.float32) / 255.0) ** _GAMMA)
@@ -165,14 +201,16 @@ class Backgrounds:
     """
 
     shares: Mapping[str, float] = field(default_factory=lambda: dict(_USUAL_SHARES), hash=False)
-    """Share of each kind of `KINDS`, of any sum; a kind that is not named has none. A name, or several, have
-    equal shares."""
+    """Share of each kind of `KINDS`, of any sum, and beside them maybe `photos`; a kind that is not named has
+    none. A name, or several, have equal shares."""
     photos: str | None = None
     """Folder of photographs, its subfolders included."""
 
     def __post_init__(self) -> None:
         given = (self.shares,) if isinstance(self.shares, str) else self.shares
-        shares = dict(given) if isinstance(given, Mapping) else dict.fromkeys(given, 1.0)
+        shares: dict[str, Any] = dict(given) if isinstance(given, Mapping) else dict.fromkeys(given, 1.0)
+        object.__setattr__(self, "photos", shares.pop("photos", self.photos))
+        shares = shares.get("shares", shares)  # as records have them
         for kind in shares:
             check_choice(kind, KINDS, noun="background")
         every = {kind: float(shares.get(kind, 0.0)) for kind in KINDS}
@@ -184,16 +222,6 @@ class Backgrounds:
             raise HandSimError(f"photos is {self.photos}, expected a share of the background photo with it")
         object.__setattr__(self, "shares", every)
         object.__setattr__(self, "photos", None if self.photos is None else str(self.photos))
-
-    @classmethod
-    def of(cls, given: Backgrounds | Mapping[str, Any] | str | Sequence[str]) -> Backgrounds:
-        """The backgrounds that a user names: kinds, or shares by kind and beside them the folder `photos`."""
-        if isinstance(given, Backgrounds):
-            return given
-        if not isinstance(given, Mapping):
-            return cls(given)  # type: ignore[arg-type]  # names are made shares
-        shares = {kind: share for kind, share in given.items() if kind != "photos"}
-        return cls(shares, given.get("photos"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,6 +235,11 @@ class Background:
     blur: float = 0.0  # standard deviation of its blur, in picture heights
     photo: str | None = None  # the photograph's file
     backdrop: Backdrop | None = None  # plane that catches shadows; None for a far background
+
+    @property
+    def is_map(self) -> bool:
+        """Whether it is an environment map, which lights the hands, too."""
+        return self.photo is not None and Path(self.photo).suffix.lower() in MAP_SUFFIXES
 
 
 def sample_background(config: Backgrounds, *, rng: np.random.Generator) -> Background:
@@ -449,6 +482,8 @@ def light_in(
 ) -> Float[np.ndarray, "D 3"]:
     """Linear light that comes to the middle of the free box from these directions."""
     rays, eye = _sloping(directions.astype(np.float32)), np.mean(enclosure.free, axis=0)
+    if background.is_map:
+        return _in_map(background, rays, coarse=True).light
     if background.kind == "room":
         return np.asarray(np.clip(_in_room(background, enclosure, eye, rays).light, 0.0, 1.0))
     return (_at_walls(background, enclosure, eye, rays)[0] / np.float32(255.0)) ** np.float32(_GAMMA)
@@ -466,14 +501,11 @@ def _at_walls(
     background: Background, enclosure: Enclosure, eye: Doubles, rays: Floats
 ) -> tuple[Bytes, Floats, NDArray[np.int8]]:
     """Colors (N, 3) in sRGB, distances (N,) [m] and walls (N,) that rays (N, 3) meet in an empty room."""
-    distances, places = np.empty(len(rays), np.float32), np.empty((len(rays), 1, 2), np.float32)
+    distances, places = np.empty(len(rays), np.float32), np.empty((len(rays), 2), np.float32)
     walls, low = np.empty(len(rays), np.int8), np.array(enclosure.low)
     room = (np.array(enclosure.high) - low).astype(np.float32)
-    _find_walls(rays, (eye - low).astype(np.float32), room, distances, walls, places[:, 0])
-    pictures = _wall_pictures(background, enclosure)
-    parts = np.split(places, range(_STRIP, len(rays), _STRIP))
-    colors = [cv2.remap(pictures, part, None, cv2.INTER_LINEAR)[:, 0] for part in parts]
-    return np.concatenate(colors), distances, walls
+    _find_walls(rays, (eye - low).astype(np.float32), room, distances, walls, places)
+    return _looked_up(_wall_pictures(background, enclosure), places), distances, walls
 
 
 def _corner(point: Doubles) -> Corner:
@@ -500,8 +532,9 @@ def _drawn(
     world = rays @ T_world_camera[:3, :3].T.astype(np.float32)
     world, eye, shape = _sloping(world), T_world_camera[:3, 3], size[::-1]
     sigma = background.blur * shape[0]
-    if background.kind == "room":
-        met = _in_room(background, enclosure, eye, world)
+    if background.kind == "room" or background.is_map:
+        is_map = background.is_map
+        met = _in_map(background, world) if is_map else _in_room(background, enclosure, eye, world)
         light = np.clip(met.light, 0.0, 1.0).reshape(*shape, 3)
         if sigma > _SHARP:
             light = cv2.GaussianBlur(light, (0, 0), sigma)

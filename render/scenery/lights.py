@@ -17,6 +17,7 @@ from jaxtyping import Float
 
 from render.frames import Doubles, Integers
 from render.scenery.backgrounds import (
+    LUMINANCE,
     Background,
     Backgrounds,
     Enclosure,
@@ -29,8 +30,8 @@ from render.scenery.backgrounds import (
 _SIZE: Final = (64, 48)  # size of the picture that gives light [px]
 _DIRECTIONS: Final = 1024  # directions in which the picture's light is sampled
 _SHARE: Final = (0.1, 0.5)  # range of the share of ambient light that has the picture's colors
-_LEVEL: Final = 1.56  # usual light of a white surface before all lamps, 1 for the picture's full white
-_LUMINANCE: Final = np.array([0.2126, 0.7152, 0.0722])
+_LEVEL: Final = 1.44  # usual light of a white surface before all lamps, 1 for the picture's full white
+_BRIGHT: Final = 3.0  # luminance beyond which light of a map is a lamp's, over the mean
 # Factors of a matt surface on each order, and integrals of the squared functions over the sphere.
 _MATT: Final = np.array([1.0, *[2.0 / 3.0] * 3, *[0.25] * 5])
 _SQUARES: Final = np.pi * np.array([4.0, *[4.0 / 3.0] * 3, *[4.0 / 15.0] * 3, 16.0 / 15.0, 16.0 / 5.0])
@@ -82,9 +83,9 @@ def sample_lighting(*, rng: np.random.Generator) -> Lighting:
     exposure = _LEVEL * float(np.exp(np.clip(rng.normal(0.0, 0.18), -0.4, 0.4)))
     warmth = rng.normal(0.0, 0.06)  # lamps are warm or cold, and white balances keep some of it
     # These shares give an open palm the standard deviation of lightness that photographs have, 3.6.
-    key_share, ambient_share = rng.uniform(0.52, 0.86), rng.uniform(0.09, 0.19)
+    key_share, ambient_share = rng.uniform(0.5, 0.8), rng.uniform(0.09, 0.19)
     # The key light comes from above more often than from below, and seldom from behind the hand.
-    key = np.array([rng.normal(0.0, 0.75), rng.normal(-0.65, 0.5), rng.normal(-0.9, 0.45)])
+    key = np.array([rng.normal(0.0, 0.6), rng.normal(-0.6, 0.45), rng.normal(-1.05, 0.3)])
     fill = np.array([-np.sign(key[0]) * rng.uniform(0.4, 1.2), rng.normal(-0.2, 0.4), rng.uniform(-1.1, 0.1)])
     directions = (
         key,
@@ -136,6 +137,9 @@ def sample_surroundings(
     """
     background, lighting = sample_background(config, rng=rng), sample_lighting(rng=rng).turned(viewer)
     share = float(rng.uniform(*_SHARE))
+    if background.is_map:
+        enclosure = enclose(np.zeros((1, 3)) if around is None else around, background.seed, viewer[:, 2])
+        return background, _light_of_map(light_in(background, enclosure, _sphere()[0])), enclosure
     if around is None:
         picture = cv2.resize(kept_background(background, size), _SIZE, interpolation=cv2.INTER_AREA)
         return background, surround(lighting, turned_irradiance(irradiance(picture), viewer), share), None
@@ -144,10 +148,21 @@ def sample_surroundings(
     return background, surround(lighting, _projected(light), share), enclosure
 
 
+def _light_of_map(light: Doubles) -> Lighting:
+    """A lamp where light (D, 3) from the directions of `_sphere` is strongest; the rest is ambient."""
+    luminance = np.maximum(light @ LUMINANCE, 1e-6)
+    beyond = light * np.maximum(1.0 - _BRIGHT * luminance.mean() / luminance, 0.0)[:, None]
+    lamp = 4.0 / len(light) * beyond.sum(axis=0) + 1e-6  # what a white surface that faces it reflects
+    rows = _projected(light - beyond)
+    towards = (beyond @ LUMINANCE) @ _sphere()[0] + [0.0, 0.0, 1e-6]
+    key = Lamp(_triple(towards), float(lamp.mean()), _triple(lamp / lamp.mean()))
+    return Lighting((key,), _triple(rows[0]), tuple(map(_triple, rows)))
+
+
 def surround(lighting: Lighting, rows: Float[np.ndarray, "9 3"], share: float) -> Lighting:
     """Give a share of the ambient light the colors of an irradiance; its luminance stays."""
     ambient = np.array(lighting.ambient)
-    rows = rows * share * (ambient @ _LUMINANCE) / max(float(rows[0] @ _LUMINANCE), 1e-4)
+    rows = rows * share * (ambient @ LUMINANCE) / max(float(rows[0] @ LUMINANCE), 1e-4)
     rows[0] += (1.0 - share) * ambient
     table = tuple(map(_triple, rows))
     return dataclasses.replace(lighting, ambient=table[0], surroundings=table)

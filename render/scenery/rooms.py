@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from handsim.kernels import kernel
 from render.fields import normal_numbers
-from render.frames import Doubles, Flags, Floats, Integers
+from render.frames import Doubles, Floats, Integers
 
 _FURNITURE: Final = (4, 14)  # range of the number of boxes
 _PLAIN, _STRIPES, _TILES, _BOARDS = 3, 0, 1, 2  # patterns of walls
@@ -22,8 +22,8 @@ _FLOOR: Final = 4  # number of the floor among the six sides
 _CONTRAST: Final = (0.15, 0.7)  # contrast of a pattern over that of any two paints
 _COLORED: Final = 0.4  # share of paints with a strong color
 _QUARTERS: Final = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))  # four rays of a pixel
-_STEP: Final = 0.04  # least difference of the root of light between neighbors that makes an edge
-_WEIGHTS: Final = np.array([0.2, 0.6, 0.2], dtype=np.float32)  # weights of red, green and blue in this light
+_CROSS: Final = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
+_STEP: Final = 0.04  # least difference of the root of light around a pixel that makes an edge
 _FRAME: Final = 0.06  # width of the frame of a picture or window, as a share of its sides
 
 
@@ -58,24 +58,25 @@ class _Boxes(NamedTuple):
 
 def draw_room(size: tuple[int, int], seed: int) -> Float32[np.ndarray, "H W 3"]:
     """A random room from a random position, in linear light."""
-    width, height = size
-    scene = _scene(seed)
+    (width, height), scene = size, _scene(seed)
+
+    def seen(across: Floats, down: Floats) -> Floats:
+        """Light (N, 3) at columns and rows (N,) of the picture [px]."""
+        rays = np.empty((len(across), 3), dtype=np.float32)
+        _aim(across, down, 0.5 * width, 0.5 * height, scene.focal * height, scene.axes, rays)
+        return _cast_all(
+            rays, scene.eye, scene.room, scene.walls, scene.boxes, scene.lamp, scene.strength
+        ).light
+
     down, across = np.mgrid[:height, :width].reshape(2, -1).astype(np.float32) + np.float32(0.5)
-    picture = _seen(scene, size, across, down).reshape(height, width, 3)
-    (edges,) = np.nonzero(_edges(picture))
-    parts = [_seen(scene, size, across[edges] + x, down[edges] + y) for x, y in _QUARTERS]
+    picture = seen(across, down).reshape(height, width, 3)
+    roots = cv2.sqrt(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY))
+    edges = cv2.morphologyEx(roots, cv2.MORPH_GRADIENT, _CROSS).ravel() > _STEP
+    parts = [seen(across[edges] + x, down[edges] + y) for x, y in _QUARTERS]
     picture.reshape(-1, 3)[edges] = np.mean(parts, axis=0)
     grain = normal_numbers((height, width, 1), rng=np.random.default_rng([seed, 1]))
     picture *= np.float32(1.0) + np.float32(0.05) * grain
     return np.asarray(cv2.GaussianBlur(picture, (0, 0), 0.9))  # because rays have no width, but pixels do
-
-
-def _seen(scene: _Scene, size: tuple[int, int], across: Floats, down: Floats) -> Floats:
-    """Light (N, 3) at columns and rows (N,) of a picture [px]."""
-    width, height = size
-    rays = np.empty((len(across), 3), dtype=np.float32)
-    _aim(across, down, 0.5 * width, 0.5 * height, scene.focal * height, scene.axes, rays)
-    return _cast_all(rays, scene.eye, scene.room, scene.walls, scene.boxes, scene.lamp, scene.strength).light
 
 
 @kernel
@@ -92,19 +93,6 @@ def _aim(
         for axis in range(3):
             way = (x * axes[0, axis] + y * axes[1, axis] + axes[2, axis]) / length
             rays[n, axis] = way if abs(way) > 1e-6 else 1e-6
-
-
-def _edges(picture: Floats) -> Flags:
-    """Pixels (H W,) on both sides of edges."""
-    roots = np.sqrt(picture @ _WEIGHTS)
-    edges = np.zeros(roots.shape, dtype=bool)
-    right = np.abs(np.diff(roots, axis=1)) > _STEP
-    below = np.abs(np.diff(roots, axis=0)) > _STEP
-    edges[:, 1:] |= right
-    edges[:, :-1] |= right
-    edges[1:] |= below
-    edges[:-1] |= below
-    return edges.ravel()
 
 
 class _Scene(NamedTuple):

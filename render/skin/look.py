@@ -143,8 +143,8 @@ def sample_skin_look(tones: Sequence[float] = ALL_TONES, *, rng: np.random.Gener
     redness = float(np.interp(angle, _ANGLES, _REDNESS)) + float(np.clip(rng.normal(0.0, 1.0), -2.0, 2.0))
     lightness = 50.0 + yellowness * float(np.tan(np.deg2rad(angle)))
     # The colors of all people's palms are alike, near the color of light skin on the back of the hand.
-    paleness = rng.uniform(0.6, 0.75)
-    palm = max(lightness, (1.0 - paleness) * lightness + paleness * 66.0) + rng.uniform(4.5, 6.5)
+    paleness = rng.uniform(0.52, 0.68)
+    palm = max(lightness, (1.0 - paleness) * lightness + paleness * 66.0) + rng.uniform(6.5, 8.0)
     polish = rng.uniform(0.75, 1.0) if rng.random() < 0.08 else 0.0
     color = rng.uniform((25.0, 10.0, -15.0), (75.0, 60.0, 30.0))
     strengths = np.exp(np.clip(rng.normal(0.0, 0.3, 5), -0.7, 0.7))
@@ -169,13 +169,11 @@ def sample_skin_look(tones: Sequence[float] = ALL_TONES, *, rng: np.random.Gener
 
 def _draw_angle(tones: Sequence[float], rng: np.random.Generator) -> float:
     """A typology angle [deg], uniform over all ranges."""
-    lows, widths = np.array(tones[::2]), np.diff(tones)[::2]
-    along = rng.uniform(0.0, widths.sum())
-    for low, width in zip(lows[:-1], widths[:-1], strict=True):
-        if along < width:
-            return float(low + along)
-        along -= width
-    return float(lows[-1] + along)
+    widths = np.diff(tones)[::2]
+    ends = np.cumsum(widths)
+    along = rng.uniform(0.0, ends[-1])
+    number = int(np.searchsorted(ends[:-1], along, side="right"))
+    return float(tones[::2][number] + along - (ends - widths)[number])
 
 
 _PLACES: Final = (0.0, 0.28, 0.62, 1.0, 1.42, 1.9, 2.6, 6.0)
@@ -341,22 +339,17 @@ def upper_arms(
     body = forearms.mean(axis=0) * [1.0, 1.0, 0.0] + _DOWN
     body -= (body @ axis) * axis
     body /= max(float(np.linalg.norm(body)), 1e-6)
-    found = []
-    if shoulders is not None:
+    if shoulders is None:
+        flat = forearms - (forearms @ axis)[:, None] * axis
+        level = np.linalg.norm(flat, axis=1, keepdims=True)
+        back = np.minimum(flat @ body, 0.0)[:, None] / np.maximum(level, 1e-6) ** 2
+        ways = flat + (1.0 - level) * (body - back * np.minimum(5.0 * level, 1.0) * flat)
+        ways[np.linalg.norm(ways, axis=1) < 1e-3] = cameras[0].T_world_camera[:3, 1]
+    else:
         ways = shoulders - elbows
-        ways /= np.linalg.norm(ways, axis=1, keepdims=True)
-        return np.array(
-            [_out_of_pictures(*one, axis, cameras) for one in zip(elbows, forearms, ways, strict=True)]
-        )
-    for elbow, forearm in zip(elbows, forearms, strict=True):
-        flat = forearm - (forearm @ axis) * axis
-        level = float(np.linalg.norm(flat))
-        back = min(0.0, float(body @ flat)) / max(level, 1e-6) ** 2 * min(1.0, 5.0 * level)
-        way = flat + (1.0 - level) * (body - back * flat)
-        if np.linalg.norm(way) < 1e-3:
-            way = cameras[0].T_world_camera[:3, 1]
-        found.append(_out_of_pictures(elbow, forearm, way / np.linalg.norm(way), axis, cameras))
-    return np.array(found)
+    ways = ways / np.linalg.norm(ways, axis=1, keepdims=True)
+    arms = zip(elbows, forearms, ways, strict=True)
+    return np.array([_out_of_pictures(*one, axis, cameras) for one in arms])
 
 
 def _out_of_pictures(

@@ -325,6 +325,7 @@ _VEIN: Final = 0.0017  # half width of a vein [m]
 _UNEVEN: Final = np.float32(0.03)  # unevenness of the palm's end over that of the pigment's edge [m]
 _GRAIN: Final = 4.5e-5  # height of the relief that breaks gloss [m]: furrows are 20 to 100 um deep
 _GRAIN_SIZES: Final = (0.0032, 0.0016, 0.0009)  # lengths of its waves [m]
+_GRAINED: Final = (-0.035, 0.005)  # places along the wrist between which it fades in [m]
 _MATT_GRAIN: Final = np.float32(0.05)  # additional roughness of its ridges, which are drier than furrows
 _INNER_ARM: Final = 0.8  # pigment of the inner forearm; that of the back of the hand is 1
 
@@ -365,7 +366,7 @@ def _painted(
     behind = smooth(edge * _UNEVEN - texels.positions[:, 0].astype(np.float32), *_CREASE)
     pigment = np.maximum(pigment, np.float32(_INNER_ARM) * behind)
     # The palm of a dark hand is not redder or yellower than other palms: chroma depends on the pigment.
-    bare = np.array([look.palm_lightness, 15.0, 16.0])
+    bare = np.array([look.palm_lightness, 13.0, 16.5])
     whole = np.array([look.lightness, look.redness, look.yellowness])
     lab = bare.astype(np.float32) + pigment[:, None] * (whole - bare).astype(np.float32)
     blood, knuckles = _blood()
@@ -375,12 +376,13 @@ def _painted(
     _add(lab, look.veins * veins, (-1.6, -1.6, -2.2))
     blotches = noise(texels.positions, (0.05, 0.018, 0.007, 0.003), rng=rng)
     _add(lab, look.blotches * blotches, (1.0, -0.6, 0.2))
-    weight = 0.8 + 0.3 * noise(texels.positions, (0.014, 0.005), rng=rng)
-    lines = np.clip(line_depth(rng) * np.clip(weight, 0.2, 1.2), 0.0, 1.0)
+    weight = 0.8 + 0.4 * noise(texels.positions, (0.014, 0.005), rng=rng)
+    lines = np.clip(line_depth(rng) * np.clip(weight, 0.1, 1.2), 0.0, 1.0)
     # Pigment collects in the lines; their darkness depends on the contrast that the skin allows.
     _add(lab, look.creases * lines, (-9.5, 4.0, 0.5))
     height = look.relief * relief() - 0.0004 * look.creases * lines + 0.00008 * look.veins * veins
     grain = noise(texels.positions, _GRAIN_SIZES, rng=rng)
+    grain *= smooth(texels.positions[:, 0].astype(np.float32), *_GRAINED)  # it would be streaks on the arm
     height += look.relief * _GRAIN * grain
     rough = np.minimum(look.roughness + 0.1 * (1.0 - texels.back), 1.0).astype(np.float32)
     rough += _MATT_GRAIN * np.clip(grain, -1.5, 1.5)
@@ -483,8 +485,8 @@ def _nails() -> tuple[tuple[Integers, Floats, Floats, Floats], ...]:
 
 def _paint_nails(paint: _Paint, look: SkinLook) -> None:
     """Paint nails: plates pinker and smoother than the skin, pale moons, whiter free edges, dark folds."""
-    bed = np.array([look.lightness, look.redness, look.yellowness]) * [0.6, 0.5, 0.6]
-    bed += np.array([68.0, 12.0, 13.0]) * [0.4, 0.5, 0.4]  # beds hold little pigment, as palms do
+    bed = np.array([look.lightness, look.redness, look.yellowness]) * [0.7, 0.5, 0.6]
+    bed += np.array([68.0, 12.0, 13.0]) * [0.3, 0.5, 0.4]  # beds hold little pigment, as palms do
     for mine, plate, fold, moon in _nails():
         color = (bed + look.nail).astype(np.float32) + moon
         color += np.float32(look.polish) * (np.array(look.polish_color, dtype=np.float32) - color)
@@ -494,7 +496,7 @@ def _paint_nails(paint: _Paint, look: SkinLook) -> None:
         paint.lab[mine] = lab
         paint.roughness[mine] += plate * (np.float32(0.28) - paint.roughness[mine])
         paint.height[mine] *= 1.0 - plate
-        paint.height[mine] += 0.00025 * plate - 0.00035 * fold
+        paint.height[mine] += 0.00025 * plate - 0.0003 * fold
 
 
 def _sleeve(paint: _Paint, forearm: Forearm, rng: np.random.Generator) -> None:

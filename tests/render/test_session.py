@@ -69,6 +69,23 @@ def test_frames_are_spread_over_the_poses():
     qpos[0, 3] = np.nan  # no hand is there
     numbers = [frame.number for frame in draw(qpos, model=MODEL, camera=ABOVE, config=BARE, num_frames=3)]
     assert numbers == [1, 4, 7]
+    config = dataclasses.replace(BARE, frames=(0, 8, 2, 4), every=2)
+    assert [frame.number for frame in draw(qpos, model=MODEL, camera=ABOVE, config=config)] == [2]
+
+
+def test_a_picture_is_drawn_again_from_its_record(tmp_path):
+    """In the middle of a shard, of one of two cameras, with a light and a background of its own."""
+    simulate_take(kind="hand-pen", num_frames=12).save(tmp_path / "take.npz")
+    config = RenderConfig(view=ViewConfig(views=2), tones="tan", vary="frame", frames_per_shard=2, seed=3)
+    out = tmp_path / "pictures"
+    assert render_take(tmp_path / "take.npz", out, "png", config, frames=(0, 3, 6, 9), workers=1) == 8
+    record = json.loads(next(out.rglob("view1_000009.json")).read_text())
+    saved = RenderConfig.from_json(json.loads((out / "render.json").read_text()))
+    _, again = draw(tmp_path / "take.npz", config=saved, record=record)
+    kept = cv2.imread(str(next((out / "images").rglob("view1_000009.png"))))
+    np.testing.assert_array_equal(again.noisy.rgb, kept[..., ::-1])
+    with pytest.raises(ArgumentError, match="expected frames or a picture's record"):
+        draw(tmp_path / "take.npz", record={"number": 9})
 
 
 def test_settings_are_given_by_name_and_mixtures_whole(qpos):

@@ -64,8 +64,8 @@ QUICK = [
      "network.width 16|network.gates 4|network.depth 2|network.num-distances 8|network.reach 0.1"),
     ("render", "take.npz --out pics --num-frames 1 --format png --workers 1 --camera vga",
      "passes rgb|dress glove|tones dark|background plain|depth-sensor kinect1|no-color-sensor|motion-blur|"
-     "num-frames 2|seed 4|placement orbit|camera sr300|views 2|share 0.6|distance 0.9 1.0|cameras own.toml|"
-     "background photo --photos photos"),
+     "num-frames 2|frames 4|seed 4|placement orbit|camera sr300|views 2|share 0.6|distance 0.9 1.0|"
+     "cameras own.toml|background photo --photos photos"),
     ("render", "take.npz --out pics --num-frames 2 --format png --workers 1 --passes depth", "every 9"),
     ("render", "take.npz --out pics --num-frames 2 --format png --workers 1 --passes rgb", "vary frame"),
     ("render", "take.npz --out pics --num-frames 1 --format png --workers 1 --passes depth --placement rig",
@@ -111,7 +111,8 @@ def options_of(name: str) -> set[str]:
     with pytest.warns(DeprecationWarning):
         parser = tyro.extras.get_parser(_with_hints(command), registry=registry())
     names = {one.option_strings[0] for one in parser._actions if one.option_strings} - {"-h"}
-    return {"num-frames" if name == "--frames" else name[2:] for name in names}
+    also = "--frames" in names and "--num-frames" not in names
+    return {"num-frames" if name == "--frames" and also else name[2:] for name in names}
 
 
 COMMANDS = [name for name in _HELP if isinstance(_target(name), str)]

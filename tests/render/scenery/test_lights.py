@@ -5,13 +5,17 @@ from __future__ import annotations
 import dataclasses
 import json
 
+import cv2
 import numpy as np
+import OpenEXR
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from handsim import HandSimError, look_at
+from handsim.space.camera import preset
 from render import Backgrounds
-from render.scenery.backgrounds import Background, enclose, light_in
+from render.scenery.backgrounds import Background, draw_surroundings, enclose, light_in
 from render.scenery.lights import irradiance, sample_lighting, sample_surroundings, surround
 
 
@@ -108,3 +112,34 @@ def test_an_enclosure_lights_hands_from_where_it_is_bright(rng: np.random.Genera
     light = light_in(background, box, directions)
     assert light.shape == (4000, 3) and 0.0 <= light.min() and light.max() <= 1.0
     assert light[directions @ towards > 0.5].mean() > light[directions @ towards < -0.5].mean()
+
+
+@pytest.mark.parametrize("name", ["sky.hdr", "sky.exr"])
+def test_an_environment_map_lights_hands_from_where_its_sun_stands(name: str, tmp_path) -> None:
+    light = np.full((64, 128, 3), 0.2, np.float32)
+    light[:32] = (0.2, 0.4, 0.9)
+    light[20:24, 40:44] = (300.0, 250.0, 200.0)
+    if name.endswith("exr"):
+        header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+        OpenEXR.File(header, {"RGB": light}).write(str(tmp_path / name))
+    else:
+        assert cv2.imwrite(str(tmp_path / name), light[..., ::-1])
+    maps = Backgrounds({"photo": 1}, str(tmp_path))
+    background, lighting, box = sample_surroundings(maps, np.eye(3), rng=np.random.default_rng(5))
+    assert background.is_map and box is not None and len(lighting.lamps) == 1
+    way, color = np.array(lighting.lamps[0].direction), lighting.lamps[0].color
+    elevation = np.arcsin(way[2] / np.linalg.norm(way))
+    assert elevation == pytest.approx(np.pi * (0.5 - 22 / 64), abs=0.05) and color[0] > color[2]
+    up, down = sent_back(np.array(lighting.surroundings), np.array([[0.0, 0, 1], [0, 0, -1]]))
+    assert up[2] > 2.0 * up[0] and down[2] < 1.8 * down[0], "the sky is blue, the ground is gray"
+    place = np.array([0.3, 0.2, 1.0])
+    seen = draw_surroundings(background, box, preset("vga").at(look_at(place, place + way)))
+    assert seen.rgb[235:245, 315:325].min() > 200 > seen.rgb[:20].mean(), "the sun is in the middle"
+    assert not seen.depth.any()
+
+
+def test_a_damaged_environment_map_is_told(tmp_path) -> None:
+    for name in ("sky.hdr", "sky.exr"):
+        (tmp_path / name).write_bytes(b"#?RADIANCE or not")
+    with pytest.raises(HandSimError, match="no photograph that can be read"):
+        sample_surroundings(Backgrounds({"photo": 1}, str(tmp_path)), np.eye(3), rng=np.random.default_rng(5))
