@@ -129,6 +129,8 @@ def shot(options: Options, number: int, folder: Path) -> Filmed:
 
     if not path.exists():
         write_video(path, pictures(), rate=options.rate, size=SIZE)
+    if options.second:  # whose hand takes the place of the other one
+        truth = Take.of_poses(truth.hands[:1], truth.qpos[:, :1], rate=truth.rate)
     taken = with_dropout(truth, options.dropout, rng) if options.dropout else truth
     return Filmed(path, taken, truth, cameras, bumped, offset, drift)
 

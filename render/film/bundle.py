@@ -25,6 +25,7 @@ _SURE: Final = 0.25  # least score of a keypoint
 MOST_BUNDLED: Final = 5000  # keypoints in a bundle, and in the last one
 _ROBUST: Final = 2.0  # [noise] from which on residuals count less
 _BLOCK: Final = 0.5  # [s] within which residuals count as dependent
+_SHARED: Final = 2.0  # Outlines are wrong in common ways, too: in drawn videos deviations were half as large.
 _NOTHING: Final = 1e-2  # information on unknowns beforehand: a deviation of 10 s, m or rad
 _REGION: Final = 0.0004  # [m] standard deviation of how much thicker a region of the hand is
 _DEPENDENT: Final = 16.0  # number of samples that tell as much as one whose error is its own
@@ -359,7 +360,8 @@ class Bundle:
         nothing = _NOTHING * np.eye(len(priors))  # or what is not told at all would have no deviation
         inverse = np.linalg.inv(information + nothing)
         scatter = sums.T @ sums + _DEPENDENT * np.diag(priors) + nothing
-        return np.asarray(inverse @ scatter @ inverse)
+        shared = _SHARED if samples.outward.any() else 1.0
+        return np.asarray(shared**2 * (inverse @ scatter @ inverse))
 
 
 def _sums(values: Doubles, groups: Integers) -> tuple[Doubles, Integers]:

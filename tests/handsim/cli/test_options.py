@@ -165,11 +165,13 @@ def files(tmp_path_factory) -> Path:
 def written(command: str, line: str, files: Path, folder: Path) -> dict[str, object]:
     """What a command writes, run in a folder of copies of the files."""
     if command == "film" and not (files / "video.mp4").exists():
-        filming, take = Filming(seed=21, seconds=8.0, rate=8.0, readout=0.0), moving_take()
+        filming, take = Filming(seed=21, seconds=8.0, rate=12.0, readout=0.0), moving_take()
         take.save(files / "moving.npz")
         pictures = filming.pictures(take, "skin")
         write_video(files / "video.mp4", iter(pictures), rate=filming.rate, size=SIZE)
-        CameraRig("lens", (filming.cameras()[0],)).save(files / "lens.toml")
+        camera, pushed = filming.cameras()
+        smaller = dataclasses.replace(pushed, name="smaller", size=(320, 240))
+        CameraRig("lens", (camera, smaller)).save(files / "lens.toml")
     shutil.copytree(files, folder)
     before = set(folder.rglob("*"))
     with pytest.MonkeyPatch.context() as patch:
