@@ -119,10 +119,11 @@ def plain_lines(lines: list[bytes], separator: bytes, *, first: int = 1, wider: 
         return lines
     if separator == b",":
         _check_decimals(lines, first, wider)
+    table = bytes.maketrans(TAB + separator, b" " + TAB)
     for index, line in enumerate(lines):  # in place: large files would be held twice
         number = first + index
         if line.count(b'"') % 2 or b'"' not in line:
-            lines[index] = line.replace(TAB, b" ").replace(separator, TAB)
+            lines[index] = line.translate(table)
             continue
         check_width(line.count(separator) + 1, number)
         try:
