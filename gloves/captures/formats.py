@@ -223,6 +223,7 @@ def read_motive_csv(data: bytes, tell: Tell = warn) -> Capture:
         raise CaptureError("the header is cut: no whole row begins with 'Frame'")
     # a comma or a line break in the take's name or notes moves the keys behind them
     keyed = [index for index, row in enumerate(rows[:end]) for cell in row if cell.lower() in _MOTIVE_KEYS]
+    keyed = keyed or [0]
     stated = {
         _MOTIVE_KEYS[key.lower()]: value
         for row in rows[: keyed[-1] + 1]

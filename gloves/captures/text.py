@@ -113,18 +113,19 @@ def separator_behind(words: Sequence[bytes], line: bytes) -> bytes | None:
 def plain_lines(lines: list[bytes], separator: bytes, *, first: int = 1, wider: bool = False) -> list[bytes]:
     """Put tabs between the cells of a list of lines, remove quotes, and return the list.
 
-    In a file with tabs, quotes are quotes only if its first cell is quoted, and nowhere in a line with an odd
-    number of them, such as a note of inches. `first` is the number of the first line in the file. With
-    `wider`, rows may have more cells than the line above them.
+    In a file with tabs, quotes are quotes only if its first cell is quoted. Among an odd number of them, such
+    as in a note of inches, they are so only in a line that begins with one. `first` is the number of the
+    first line in the file. With `wider`, rows may have more cells than the line above them.
     """
     if separator == TAB and not lines[0].startswith(b'"'):
         return lines
     if separator == b",":
         _check_decimals(lines, first, wider)
+    table = bytes.maketrans(TAB + separator, b" " + TAB)
     for index, line in enumerate(lines):  # in place: large files would be held twice
         number = first + index
-        if line.count(b'"') % 2 or b'"' not in line:
-            lines[index] = line.replace(TAB, b" ").replace(separator, TAB)
+        if b'"' not in line or (line.count(b'"') % 2 and not line.lstrip().startswith(b'"')):
+            lines[index] = line.translate(table)
             continue
         check_width(line.count(separator) + 1, number)
         try:

@@ -1,8 +1,8 @@
 """NatNet, the protocol in which OptiTrack servers (Motive) stream markers: packets, a client and a server.
 
 Packets of versions 3.0 to 4.1 are little-endian: kind and payload size (two uint16), then the payload. Only a
-frame's lists of markers are read; while both are empty, as Motive can switch them off, the points of marker
-sets and assets are read instead. Every count is checked against the remaining bytes before use.
+frame only the lists of markers are read, and the points of marker sets and assets if no labeled marker is in
+a list, because Motive can switch these off. Every count is checked against the remaining bytes before use.
 """
 
 from __future__ import annotations
