@@ -30,8 +30,8 @@ _SUM_TOLERANCE: Final = 1e-6
 _NORMAL_TOLERANCE: Final = 1e-3  # of the unit length
 # The digits of the palm's capsules: the fingers' metacarpals, and the wrist for the thumb.
 _PALM_DIGITS: Final = np.array([1, 2, 3, 4, 0, 0])
-# From the wanted place of a marker (1) back to where it was designed (0), to the middle of its bone's back (-1),
-# and to the near end of that (-2), where fingers that overlap at zero angles have skin of their own.
+# From the wanted place of a marker (1) back to where it was designed (0), to the middle of its bone's back
+# (-1), and to the near end (-2), where fingers that overlap at zero angles have skin of their own.
 _WAY_BACK: Final = (
     *(1.0, 0.75, 0.5, 0.25, 0.0, -0.125, -0.25, -0.375, -0.5, -0.625, -0.75, -0.875, -1.0),
     *(-1.25, -1.5, -1.75, -2.0),
@@ -328,7 +328,7 @@ def _settled(
 
 
 def _on_the_way(designed: MarkerPlace, wanted: MarkerPlace, share: float) -> MarkerPlace:
-    """A place of `_WAY_BACK` between the wanted one, the designed one, and the near end of the bone's back."""
+    """A place of `_WAY_BACK` between the wanted one and the near end of the bone's back."""
     if share == 1.0:
         return wanted
     if share < -1.0:
