@@ -30,8 +30,8 @@ _SUM_TOLERANCE: Final = 1e-6  # The bone weights of a marker sum to one within t
 _NORMAL_TOLERANCE: Final = 1e-3  # Normals have unit length within this.
 # The digit of each palm capsule: a metacarpal counts to its finger, the wrist to the thumb.
 _PALM_DIGITS: Final = np.array([1, 2, 3, 4, 0, 0])
-# Places tried for a marker, in this order: wanted (1), designed (0), middle of its bone's back (-1), and near
-# end of that back (-2), where fingers that overlap in the flat hand have skin of their own.
+# From the wanted place of a marker (1) back to where it was designed (0), to the middle of its bone's back
+# (-1), and to the near end (-2), where fingers that overlap at zero angles have skin of their own.
 _WAY_BACK: Final = (
     *(1.0, 0.75, 0.5, 0.25, 0.0, -0.125, -0.25, -0.375, -0.5, -0.625, -0.75, -0.875, -1.0),
     *(-1.25, -1.5, -1.75, -2.0),
@@ -325,7 +325,7 @@ def _settled(
 
 
 def _on_the_way(designed: MarkerPlace, wanted: MarkerPlace, share: float) -> MarkerPlace:
-    """The place of a share of `_WAY_BACK`, from the wanted place to the near end of the bone's back."""
+    """A place of `_WAY_BACK` between the wanted one and the near end of the bone's back."""
     if share == 1.0:
         return wanted
     if share < -1.0:

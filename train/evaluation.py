@@ -212,21 +212,14 @@ def _share(part: int, whole: int) -> float:
     return part / whole if whole else float("nan")
 
 
-Intervals = Mapping[str, Sequence[float]]
-"""Lower and upper end by the name of a share."""
-
-
 def print_figures(
-    columns: dict[str, dict[str, float]], intervals: Mapping[str, Intervals] = {}, *, title: str
+    columns: dict[str, dict[str, float]], intervals: Mapping[str, Sequence[float]] = {}, *, title: str
 ) -> None:
-    """Print figures in percent as a table, a column for each set of them, with the intervals of each set."""
+    """Print figures in percent as a table, a column for each set of them, with intervals."""
     shares = [
         [
             name.replace("_", " "),
-            *(
-                percent_between(one[name], intervals.get(column, {}).get(name))
-                for column, one in columns.items()
-            ),
+            *(percent_between(one[name], intervals.get(name)) for one in columns.values()),
         ]
         for name in next(iter(columns.values()))
     ]

@@ -68,11 +68,10 @@ def evaluate(
     hard = f", occlude {settings.occlude}, ghosts {settings.ghosts}"
     hard = hard if settings.occlude or settings.ghosts else ""
     what = "hands in frames" if truth is None else "frames"
-    if report.num_groups > 1:
-        hard += f"; 95 % intervals over {report.num_groups} {report.grouped_by}"
-    intervals = report.intervals()
-    found["intervals"] = intervals
-    print_figures({"share": report.figures}, {"share": intervals}, title=f"{report.num_frames} {what}{hard}")
+    found["intervals"] = intervals = report.intervals()
+    print_figures({"share": report.figures}, intervals, title=f"{report.num_frames} {what}{hard}")
+    if intervals:
+        print_line(f"in brackets: 95 % intervals over {report.num_groups} {report.grouped_by}")
     if truth is not None:
         found |= _against_truth(report)
     if json is not None:

@@ -32,7 +32,7 @@ def _train(
         preset: A published recipe, which replaces the defaults; options given beside it hold.
         threads: Threads on a CPU; when not given, one for the set labeler and all for the paper's network.
     """
-    from train.evaluation import print_figures
+    from train.evaluation import percent, print_figures
     from train.loop import train_labeler
     from train.reports.run_page import PAGE, held_out_people
 
@@ -43,8 +43,13 @@ def _train(
     with progress_bar("samples") as bar:
         card = train_labeler(dataset, out, settings, threads=threads, progress=bar, on_step=bar.step)
     title = held_out_people(card)
-    title += ", with 95 % intervals over people" if any(card["held_out_intervals"].values()) else ""
-    print_figures(card["held_out_simulated"], card["held_out_intervals"], title=title[0].upper() + title[1:])
+    print_figures(card["held_out_simulated"], title=title[0].upper() + title[1:])
+    for name, between in card["held_out_intervals"].items():
+        ends = [
+            f"{figure.partition('_')[0]} {' to '.join(map(percent, one))}" for figure, one in between.items()
+        ]
+        if ends:
+            print_line(f"{name}, 95 % over people: accuracy by {', '.join(ends)} %")
     print_line(f"weights and model card in {out}")
     print_line(f"report in {out / PAGE}")
 

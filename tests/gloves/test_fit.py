@@ -273,7 +273,7 @@ def stray(worn: Attachment, model: HandModel) -> list[str]:
 
 
 @pytest.mark.parametrize(
-    ("num_places", "num_people"), [(120, 8), pytest.param(800, 80, marks=pytest.mark.slow)]
+    ("num_places", "num_people"), [(120, 8), pytest.param(2000, 200, marks=pytest.mark.slow)]
 )
 def test_any_place_is_refused_or_stays_on_its_digit_and_slips_a_little(num_places, num_people):
     rng, places = np.random.default_rng(0), []

@@ -113,10 +113,10 @@ class HandInitializer:
         self._at_once, self._first_cut = at_once, 0
         self._searches: dict[tuple[int, ...], _Search] = {}
         self._repeated: dict[int, _Repeated] = {}
-        self._least_repeated = 1.0 if at_once else _LEAST_REPEATED
         self._states = states
         self._labeler = labeler
         self._config = config
+        self._least_shares = [1.0 if at_once else self._least_share(index) for index in range(len(states))]
         links = [_link_distance(one.hand) for one in states[:1]]  # The other hand is its mirror image.
         self._link_distance = max([_LINK_DISTANCE, *links])
         self._prior = resting_prior()
@@ -171,8 +171,16 @@ class HandInitializer:
         """Log-odds from which on a hand is initialized."""
         return self._config.least_evidence * min(_MARKERS_OF_EVIDENCE, self._states[index].num_markers)
 
+    def _least_share(self, index: int) -> float:
+        """Share of that evidence from which on repetitions count; 1 where half of the markers have it."""
+        is_enough = self.score(self._least(index), self._config.marker_noise) >= self._needed(index)
+        return 1.0 if is_enough else _LEAST_REPEATED
+
     def _is_evident(self, hand: InitializedHand) -> bool:
         """Whether a hand has enough evidence, by itself or with earlier calls that found the same."""
+        if hand.score >= self._needed(hand.index):
+            self._repeated.pop(hand.index, None)
+            return True
         markers = targets_of(self._points, hand.labels, self._states[hand.index].num_markers)
         before = self._repeated.pop(hand.index, _Repeated(np.full_like(markers, np.nan)))
         now = _Repeated(markers, before.evidence + _REPETITION if _is_same(before.markers, markers) else 0.0)
@@ -219,11 +227,11 @@ class HandInitializer:
     ) -> InitializedHand | None:
         """The first certain hand of a group, or after the last cut the best one."""
         if not len(cuts):
-            return self._better(None, group, [group], hands, self._least_repeated)
+            return self._better(None, group, [group], hands, may_repeat=True)
         best: InitializedHand | None = None
         for turn in range(len(cuts) - _CUTS_AT_FIRST + 1) if self._at_once else [search.turn]:
             clouds = self._clouds(group, cuts, turn)
-            best = self._better(best, group, clouds, hands, self._least_repeated)
+            best = self._better(best, group, clouds, hands, may_repeat=True)
             if best is not None and self._is_certain(best):
                 return best
         if self._at_once:
@@ -235,7 +243,7 @@ class HandInitializer:
         if search.best_turn == search.turn:
             return best
         clouds = self._clouds(group, cuts, search.best_turn)
-        return self._better(best, group, clouds, hands, self._least_repeated)
+        return self._better(best, group, clouds, hands, may_repeat=True)
 
     def _labeled(self, clouds: Sequence[NDArray[np.int64]]) -> list[NDArray[np.int64]]:
         """Label each cloud; return labels of all points per cloud, the most confident cloud first."""
@@ -252,17 +260,18 @@ class HandInitializer:
         group: NDArray[np.int64],
         clouds: Sequence[NDArray[np.int64]],
         hands: Sequence[int],
-        share: float = 1.0,
+        may_repeat: bool = False,
     ) -> InitializedHand | None:
         """The best hand so far, or a hand with a better score from these clouds of a group.
 
-        Hands with at least this share of the evidence that is asked for count.
+        A hand that lacks evidence counts if it may repeat itself.
         """
         for labels in self._labeled(clouds)[:_FITS_AT_A_TIME]:
             fits = [self._fit(index, labels) for index in hands]
             for first in sorted((fit for fit in fits if fit is not None), key=lambda fit: -fit.score):
                 if best is not None and _is_mirrored(first, best):
                     continue
+                share = self._least_shares[first.index] if may_repeat else 1.0
                 hand = self._improve(first, group, share)
                 if hand is not None and (best is None or hand.score > best.score):
                     best = hand
@@ -298,7 +307,9 @@ class HandInitializer:
     ) -> InitializedHand | None:
         """Remove labels that do not fit, then match and fit all points of the group again."""
         index, state = first.index, self._states[first.index]
-        hand = self._trim(first) or self._trim(self._without_outliers(first)) or self._trim(first, share)
+        hand = self._trim(first) or self._trim(self._without_outliers(first))
+        if hand is None and share < 1.0:
+            hand = self._trim(first, share)
         for _ in range(_REFINEMENTS):
             if hand is None:
                 return None

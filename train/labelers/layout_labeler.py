@@ -15,6 +15,7 @@ import hashlib
 import json
 import math
 import os
+import warnings
 from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
@@ -29,7 +30,7 @@ from torch import Tensor
 from gloves.layout import MarkerLayout
 from handsim import __version__
 from handsim.app.messages import tell_state, told_share
-from handsim.errors import WeightsError
+from handsim.errors import HandSimWarning, WeightsError
 from handsim.files.inputs import checksum
 from handsim.files.outputs import atomic_write
 from handsim.hand.shape import SIDES
@@ -198,8 +199,10 @@ def learned_labeler(layout: MarkerLayout, rig: CameraRig | str = "figure5") -> L
     learned = fine_tuned_labeler(layout, rig)
     try:
         _write(file, learned)
-    except OSError:
-        return learned  # Without a cache the labeler is learned again next time.
+    except OSError as error:
+        kept = f"the labeler of glove '{layout.name}' cannot be kept in {file.parent} ({error.strerror})"
+        warnings.warn(f"{kept}; set XDG_CACHE_HOME to a folder of yours", HandSimWarning, stacklevel=2)
+        return learned
     return _read(file, layout) or learned
 
 

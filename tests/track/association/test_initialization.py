@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 from scipy.cluster.hierarchy import fclusterdata
@@ -23,7 +25,9 @@ from track.association.initialization import (
     linked_groups,
     longest_links,
 )
+from track.kinematics.pose_spread import resting_prior
 from train import load_labeler
+from train.labelers.protocol import Labeling
 
 SIDES: tuple[Side, Side] = ("right", "left")
 
@@ -102,6 +106,31 @@ def test_points_at_random_are_no_hand(initializer):
     rng = np.random.default_rng(0)
     assert initializer.initialize(rng.uniform(0.0, 0.2, (24, 3)), (0, 1)) == []
     assert initializer.initialize(rng.uniform(0.0, 0.2, (MOST_POINTS + 1, 3)), (0, 1)) == []
+
+
+class _Known:
+    """A labeler that knows the markers at some points."""
+
+    def __init__(self, points: np.ndarray, labels: np.ndarray, names: tuple[str, ...]) -> None:
+        self._points, self._labels, self.marker_names = points, labels, names
+
+    def label_frames(self, frames: Sequence[np.ndarray]) -> list[Labeling]:
+        nearest = [cdist(points, self._points).argmin(axis=1) for points in frames]
+        return [Labeling(self._labels[one], np.ones(len(one))) for one in nearest]
+
+
+def test_a_hand_that_shows_few_markers_is_found_once_calls_agree(rng):
+    state = HandState(nominal_fit(load_layout("starter10"), "M", "right"))
+    angles = resting_prior().angles
+    worn = state.solver.marker_positions(join_qpos(angles[None])[0])
+    shown = np.array([0, 1, 2, 3, 4, 6, 8])
+    initializer = HandInitializer([state], _Known(worn[shown], shown, state.hand.layout.names))
+    calls = [initializer.initialize(worn[shown] + 3e-4 * rng.standard_normal((7, 3)), (0,)) for _ in range(9)]
+    assert not calls[0] and any(calls[1:])
+    (hand,) = next(one for one in calls if one)
+    np.testing.assert_array_equal(hand.labels, shown)
+    for _ in range(30):  # points that are elsewhere each time agree with none before
+        assert not initializer.initialize(rng.uniform(0.0, 0.15, (7, 3)), (0,))
 
 
 def test_scores_grow_with_points_and_fall_with_their_distance(initializer):

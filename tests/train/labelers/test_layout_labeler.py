@@ -9,7 +9,8 @@ import pytest
 
 from benchmarks.any_layout_training import save_layout_network
 from gloves import load_layout
-from handsim.errors import WeightsError
+from handsim.cli.doctor import check_learned_gloves
+from handsim.errors import HandSimWarning, WeightsError
 from train import Corruption, evaluate_labeler
 from train.labelers import layout_labeler
 from train.labelers.layout_labeler import (
@@ -127,10 +128,14 @@ def test_the_least_recently_used_go(quickly_learned, monkeypatch):
     assert not is_learned(load_layout("starter6")) and is_learned(load_layout("tips8"))
 
 
-def test_a_cache_that_cannot_be_written_costs_no_labels(quickly_learned, monkeypatch, tmp_path):
+def test_a_cache_that_cannot_be_written_costs_no_labels_and_is_told(quickly_learned, monkeypatch, tmp_path):
+    assert not check_learned_gloves().remedy
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
-    assert learned_labeler(load_layout("starter6")).label_frames([CLOUD])[0].labels.shape == (8,)
+    with pytest.warns(HandSimWarning, match=r"glove 'starter6' cannot be kept in .*file.*XDG_CACHE_HOME"):
+        learned = learned_labeler(load_layout("starter6"))
+    assert learned.label_frames([CLOUD])[0].labels.shape == (8,)
+    assert "XDG_CACHE_HOME" in check_learned_gloves().remedy
 
 
 @pytest.mark.slow
