@@ -19,16 +19,16 @@ from render.frames import Doubles, Flags, Integers
 if TYPE_CHECKING:
     from render.film.detector import FoundHand
 
-_MAX_GAP: Final = 0.1  # [s] that poses are interpolated over
-FEWEST_KEYPOINTS: Final = 8  # of a hand in a frame, to say whether it fits
-_SURE: Final = 0.25  # least score of a keypoint
-MOST_BUNDLED: Final = 5000  # keypoints in a bundle, and in the last one
-_ROBUST: Final = 2.0  # [noise] from which on residuals count less
-_BLOCK: Final = 0.5  # [s] within which residuals count as dependent
-_SHARED: Final = 2.0  # Outlines are wrong in common ways, too: in drawn videos deviations were half as large.
-_NOTHING: Final = 1e-2  # information on unknowns beforehand: a deviation of 10 s, m or rad
+_MAX_GAP: Final = 0.1  # [s] Poses are interpolated over gaps up to this length.
+FEWEST_KEYPOINTS: Final = 8  # A hand in a frame is judged by this many keypoints.
+_SURE: Final = 0.25  # Keypoints with a lower score are not used.
+MOST_BUNDLED: Final = 5000  # largest number of keypoints in a bundle
+_ROBUST: Final = 2.0  # Residuals beyond this many standard deviations count less.
+_BLOCK: Final = 0.5  # [s] Residuals within this time count as dependent.
+_SHARED: Final = 2.0  # Errors of outlines have common causes: in drawn videos they were twice the deviations.
+_NOTHING: Final = 1e-2  # prior information on free unknowns: a deviation of 10 s, m or rad
 _REGION: Final = 0.0004  # [m] standard deviation of how much thicker a region of the hand is
-_DEPENDENT: Final = 16.0  # number of samples that tell as much as one whose error is its own
+_DEPENDENT: Final = 16.0  # This many samples count as one with an independent error.
 
 # The unknowns, before six of the pose of each span, and the standard deviation that each has beforehand. The
 # last is how much thicker than the tracked hands the filmed ones are [m]: cloth, or a measured hand's error.

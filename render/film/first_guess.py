@@ -16,16 +16,16 @@ from handsim.errors import HandSimError
 from render.film.bundle import FEWEST_KEYPOINTS, FOCAL, OFFSET, POSES, Bundle, Matches, Samples
 from render.frames import Doubles
 
-_STEP: Final = 1.0 / 30.0  # [s] of the shifts that are tried
-_OVERLAP: Final = 0.5  # least share of the keypoints that a shift must cover, of the most that one covers
-_SHIFTS: Final = 60  # at which hands are matched, of each way to tell sides
-_CLOSE, _APART = 0.1, 0.3  # [s] between two of these, and between two of those that are tried on
-_ROUNDS: Final = 5  # of matching
-_MOST_MATCHED: Final = 400  # detections that are matched
-_TRIED: Final = 3  # best matches with which PnP is tried
-_FOCALS: Final = (0.5, 0.65, 0.85, 1.1, 1.45, 1.9, 2.5, 3.3)  # [widths of the picture]
+_STEP: Final = 1.0 / 30.0  # [s] step between the shifts of the clock
+_OVERLAP: Final = 0.5  # A shift must cover this share of the most keypoints that any shift covers.
+_SHIFTS: Final = 60  # number of shifts at which hands are matched, with sides as told and exchanged
+_CLOSE, _APART = 0.1, 0.3  # [s] least distance of two such shifts, and of two for which PnP is tried
+_ROUNDS: Final = 5  # rounds of matching
+_MOST_MATCHED: Final = 400  # largest number of detections that are matched
+_TRIED: Final = 3  # number of best matches for which PnP is tried
+_FOCALS: Final = (0.5, 0.65, 0.85, 1.1, 1.45, 1.9, 2.5, 3.3)  # [widths] focal lengths that PnP is tried with
 _CLOCK_KEYPOINTS: Final = (0, 4, 5, 8, 9, 12, 16, 17, 20)
-GATE: Final = 0.08  # [widths] of keypoints' median distance from their hand's, at first
+GATE: Final = 0.08  # [widths] A detection farther than this from a hand, in the median, is not its.
 UNLIKE: Final = (
     "the hands in the video do not move as those of the take at any shift of the clock; expected a video of "
     "this take, of a camera that stood still"

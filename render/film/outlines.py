@@ -25,25 +25,25 @@ from render.painting.figures import BodyFigure
 from render.painting.rasterizer import Triangles, see
 from render.skin.mesh import PosableSkin
 
-_WIDEST: Final = 800  # wider pictures are shrunk for this [px]
-_MOST_POINTS: Final = 80  # of the outline of a hand in a picture
-_STEP: Final = 0.004  # [s] before and after, of velocities
-_LEVELS: Final = 5  # bits of a color's channels
-_SMOOTH: Final = 1.0  # [levels] of counts of colors
-_SUREST: Final = 3.0  # largest log-odds of a color
-_DEPENDENT: Final = 0.5  # share of the log-odds of neighboring pixels that counts
-_CONTRAST: Final = 0.6  # least mean log-odds on both sides of an edge
-_BESIDE: Final = 5  # [px] of each side that this mean is over
-_FLAT: Final = 3  # of these, at the ends, that have the colors of the sides
-_NOISIEST: Final = 0.25  # largest deviation of these colors, over the difference of both sides
+_WIDEST: Final = 800  # [px] Wider pictures are shrunk to this width.
+_MOST_POINTS: Final = 80  # largest number of outline points of a hand in a picture
+_STEP: Final = 0.004  # [s] step of the central differences that give velocities
+_LEVELS: Final = 5  # bits of each color channel in the histograms
+_SMOOTH: Final = 1.0  # [levels] standard deviation of the histograms' smoothing
+_SUREST: Final = 3.0  # largest log-odds that one color gives
+_DEPENDENT: Final = 0.5  # Neighboring pixels are alike: this share of their log-odds counts.
+_CONTRAST: Final = 0.6  # An edge has at least these mean log-odds on both sides.
+_BESIDE: Final = 5  # [px] width of each side for this mean
+_FLAT: Final = 3  # number of pixels at each end that show the colors of the two sides
+_NOISIEST: Final = 0.25  # largest deviation of those colors, over the difference of the two sides
 _LINEAR: Final = (np.linspace(0.0, 1.0, 256, dtype=np.float32) ** 2.2)[:, None]
-_FEWEST_PIXELS: Final = 30  # of a region whose colors are counted
-_AROUND: Final = 14  # [px] beyond the reach, of the colors around a hand
-_BLUR: Final = 0.3  # [px] least deviation of an edge
-_ARM: Final = 0.02  # [m] least distance of the outline from the forearm, where the wrist bends
-_BALL: Final = 0.004  # [m] least distance from the markers of a glove, which may be worn
-_EDGE: Final = 3.0  # [px] least distance from the edge of the picture
-_OTHER: Final = 4.0  # [px] least distance from other hands and things
+_FEWEST_PIXELS: Final = 30  # Colors of a region are counted if it has this many pixels.
+_AROUND: Final = 14  # [px] width of the ring around the reach whose colors are the background's
+_BLUR: Final = 0.3  # [px] least standard deviation of an edge
+_ARM: Final = 0.02  # [m] The outline this near to the forearm is left out, because the wrist bends there.
+_BALL: Final = 0.004  # [m] The outline this near to a marker is left out, because the glove may carry it.
+_EDGE: Final = 3.0  # [px] The outline this near to the edge of the picture is left out.
+_OTHER: Final = 4.0  # [px] The outline this near to another hand or thing is left out.
 
 
 class Edges(NamedTuple):

@@ -38,25 +38,25 @@ from render.film.first_guess import GATE, UNLIKE, first_guess
 from render.film.outlines import Edges, Outlines
 from render.frames import Bytes, Doubles, Integers
 
-_FEWEST_FRAMES: Final = 20  # frames with a hand that a camera is registered with
-_MOST_AT_LAST: Final = 12000
+_FEWEST_FRAMES: Final = 20  # A camera is registered from this many frames with a hand.
+_MOST_AT_LAST: Final = 12000  # largest number of keypoints in the last bundle
 _BOUND: Final = 3.0  # A frame does not fit beyond this many times the usual median distance.
 _LEAST_BOUND: Final = 0.008  # A frame fits up to this distance in any case [widths of the picture].
-_WORST: Final = 0.03  # [widths] of the usual median distance
-_LEAST_SHARE: Final = 0.2  # of the frames with hands that must fit
-_MOST_SPANS: Final = 4
-_SHORTEST_SPAN: Final = 45  # frames with hands
+_WORST: Final = 0.03  # [widths] A video whose usual median distance is larger does not show the take.
+_LEAST_SHARE: Final = 0.2  # This share of the frames with hands must fit.
+_MOST_SPANS: Final = 4  # largest number of times between which a camera was moved
+_SHORTEST_SPAN: Final = 45  # number of frames with hands in each of them
 _NO_HAND: Final = "the take has no hand then"
 _OUTSIDE: Final = "no hand of the take is in the picture"
 _NOT_FOUND: Final = "the detector found no hand there"
-_FEWEST_EDGES: Final = 15  # of a hand's outline, to say whether it fits
-_SEEN: Final = 0.4  # share of the outline that must be seen for that
-_WITHIN: Final = 0.8  # share of the edges that the bound holds for
-_BESIDE: Final = -0.7  # mean log-odds of the colors of a bone that is not where it should be
-_MOST_LOOKED: Final = 150  # frames whose outlines are looked for
-_REACHES: Final = (0.04, 0.02, 0.01, 0.01)  # [widths] within which an edge is looked for, one after the other
-_FIRST_NOISE: Final = 2.0  # [px] of edges
-_MOST_EDGES: Final = 12000  # in a bundle
+_FEWEST_EDGES: Final = 15  # A hand's outline is judged by this many edges.
+_SEEN: Final = 0.4  # A hand's outline is judged if this share of it is seen.
+_WITHIN: Final = 0.8  # The bound must hold for this share of the edges.
+_BESIDE: Final = -0.7  # A bone with lower mean log-odds of its colors is not where the take says.
+_MOST_LOOKED: Final = 150  # largest number of frames whose outlines are used
+_REACHES: Final = (0.04, 0.02, 0.01, 0.01)  # [widths] search ranges for edges, one for each round
+_FIRST_NOISE: Final = 2.0  # [px] standard deviation of edges in the first round
+_MOST_EDGES: Final = 12000  # largest number of edges in a bundle
 
 
 @dataclass(frozen=True, slots=True, eq=False)
