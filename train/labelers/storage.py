@@ -197,6 +197,9 @@ def _shipped_labeler(layout: MarkerLayout) -> Labeler | None:
     return next((_read(*_files(name)).labeler() for name in found), None)
 
 
+_QUICKLY_LEARNED: Final = 20  # markers; gloves with more are learned in minutes
+
+
 def _any_layout_labeler(layout: MarkerLayout, glove: MarkerLayout | str | Path) -> Labeler:
     """The labeler for any layout, with a warning that the glove has no trained one."""
     from train.labelers.layout_labeler import is_learned, learned_labeler  # torch
@@ -204,8 +207,11 @@ def _any_layout_labeler(layout: MarkerLayout, glove: MarkerLayout | str | Path) 
 
     own = isinstance(glove, MarkerLayout) and layout not in map(load_layout, list_layouts())
     name = layout.name if isinstance(glove, MarkerLayout) else str(glove)
+    minutes = "a minute" if layout.num_markers <= _QUICKLY_LEARNED else "three minutes"
     how = (
-        "has learned it before" if is_learned(layout) else "learns it now, once, in a minute of an idle core"
+        "has learned it before"
+        if is_learned(layout)
+        else f"learns it now, once, in {minutes} of an idle core"
     )
     warnings.warn(
         f"no labeler was trained on glove '{name}', so that the one for any layout labels it, which {how}; a "
