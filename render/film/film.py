@@ -76,9 +76,11 @@ class Film:
     def _open(self) -> None:
         level = cv2.utils.logging.getLogLevel()
         cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # The error below says enough.
-        with plain_path(self.path) as plain:
-            self._reader = cv2.VideoCapture(str(plain), cv2.CAP_FFMPEG)
-        cv2.utils.logging.setLogLevel(level)
+        try:
+            with plain_path(self.path) as plain:
+                self._reader = cv2.VideoCapture(str(plain), cv2.CAP_FFMPEG)
+        finally:
+            cv2.utils.logging.setLogLevel(level)
         if not self._reader.isOpened():
             raise CaptureError(
                 f"{self.path}: not a video that can be read, expected an .mp4, .mov or .avi file"
