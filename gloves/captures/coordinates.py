@@ -128,14 +128,13 @@ def _without_stand_ins(capture: Capture) -> tuple[Capture, int, int]:
     frames, columns = np.nonzero(np.linalg.norm(np.diff(positions, axis=0), axis=-1) > _JUMP)
     aims = np.unique(np.stack([keys[frames + 1, columns], frames]), axis=1)
     aims, counts = np.unique(aims[0], return_counts=True)
-    stands = np.isin(keys, aims[counts >= _MIN_FRAMES]) | (
-        equal & np.isin(positions[..., 0], values[repeats])
-    )
+    equal &= np.isin(positions[..., 0], values[repeats])
+    stands = equal | np.isin(keys, aims[counts >= _MIN_FRAMES])
     there = np.isfinite(positions[..., 0]) & ~stands
     tracks = (positions[there[:, column], column] for column in range(positions.shape[1]))
     if not stands.any() or not any((track != track[:1]).any() for track in tracks):  # nothing moves
         return capture, 0, 0
-    zeros = int((stands & equal & (positions[..., 0] == 0.0)).sum())
+    zeros = int((equal & (positions[..., 0] == 0.0)).sum())
     missing = np.where(stands[..., None], np.nan, positions)
     return dataclasses.replace(capture, positions=missing), zeros, int(stands.sum()) - zeros
 
