@@ -16,9 +16,9 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.people import read_markers
 from benchmarks.record import describe, run, timed
 from gloves import MarkerLayout, load_layout
-from gloves.captures.formats import read_markers
 from gloves.layout import list_layouts
 from track.glove_improvement import sample_places
 from train import Corruption, Labeler, evaluate_labeler, load_labeler

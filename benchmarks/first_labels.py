@@ -18,9 +18,10 @@ import numpy as np
 from benchmarks.held_out import held_out_markers
 from benchmarks.paper.labeling_tables import measure_augmentations
 from benchmarks.paper.printed import AUGMENTATIONS, TABLE2
+from benchmarks.people import read_markers
 from benchmarks.record import describe, report, run
 from gloves import load_layout
-from gloves.captures.formats import find_captures, read_markers
+from gloves.captures.formats import find_captures
 from train import Dataset, GenerateSettings, TrainSettings
 from train.data.batches import draw_batch
 from train.fabric import start_fabric

@@ -20,9 +20,9 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.paper.hand_errors import hand_errors
+from benchmarks.people import read_markers
 from benchmarks.record import describe, run
 from gloves import Capture, GloveFit, Take, load_layout
-from gloves.captures.formats import read_markers
 from handsim import HandSimWarning
 from handsim.hand.shape import Side
 from track import calibrate, measure_hands, track_capture

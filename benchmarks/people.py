@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from gloves.captures.formats import read_markers
+from gloves.captures.formats import read_hands
 from gloves.fit import Attachment
 from handsim.hand.shape import HandShape
 from track.calibration.hand_parameters import (
@@ -15,6 +16,11 @@ from track.calibration.hand_parameters import (
     nearest_coordinates,
     project_onto_skin,
 )
+
+
+def read_markers(files: Sequence[Path], names: Sequence[str]) -> np.ndarray:
+    """Named markers (T, M, 3) [m] of each hand in labeled captures, without frames that lack them all."""
+    return np.concatenate([hand for file in files for hand in read_hands(file, names)[0]])
 
 
 def right_hands(captures: Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:

@@ -14,12 +14,21 @@ import numpy as np
 
 from benchmarks.record import describe, report, run
 from gloves import Take
+from handsim.hand.capsules import overlap_between
+from handsim.hand.model import HandModel
 from handsim.space.objects import named_object
 from handsim.space.transforms import pose_matrices
 from poses.grasps import object_penetration
-from poses.two_hands import two_hands_penetration
 from train import simulate_take
 from train.simulation.scenes import KINDS
+
+
+def two_hands_penetration(
+    right: HandModel, left: HandModel, right_qpos: np.ndarray, left_qpos: np.ndarray
+) -> np.ndarray:
+    """Deepest overlap (T,) of any capsule of one hand with any of the other [m]; 0 where hands are apart."""
+    bones = right.forward_kinematics(right_qpos), left.forward_kinematics(left_qpos)
+    return np.maximum(overlap_between(right.capsules, bones[0], left.capsules, bones[1]), 0.0)
 
 
 def overlaps(take: Take) -> tuple[float, float, float]:

@@ -13,7 +13,6 @@ from scipy.spatial.transform import Rotation
 
 from handsim.errors import PoseError
 from handsim.files.inputs import package_data
-from handsim.hand.capsules import overlap_between
 from handsim.hand.model import HandModel, HandMotion, join_qpos
 from handsim.hand.shape import DIGITS, bones_of
 from handsim.space.rig import ROOM_CENTER
@@ -410,17 +409,6 @@ _TRAVEL_TIME: Final = (0.8, 2.5)  # between two positions of the pair [s]
 _ROTATION: Final = 0.5  # standard deviation of the rotation between two positions [rad]
 _MAX_DRAWS: Final = 60
 _MAX_PATHS: Final = 10
-
-
-def two_hands_penetration(
-    right: HandModel,
-    left: HandModel,
-    right_qpos: Float[np.ndarray, "T 27"],
-    left_qpos: Float[np.ndarray, "T 27"],
-) -> Float[np.ndarray, "T"]:
-    """Deepest overlap of any capsule of one hand with any of the other [m]; 0 where they do not touch."""
-    bones = right.forward_kinematics(right_qpos), left.forward_kinematics(left_qpos)
-    return np.asarray(np.maximum(overlap_between(right.capsules, bones[0], left.capsules, bones[1]), 0.0))
 
 
 def sample_two_hand_motion(

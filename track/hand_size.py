@@ -377,8 +377,8 @@ def check_hands(
     if remedy:
         shares = f"in {fit.shown} of {len(some)} frames instead of {asked.shown}"
         known = [one for one in remedy if one.split()[0] in options]
-        how = f"; name it ({' '.join(known)})" if known else ""
-        warnings.warn(f"the points fit {named} better ({shares}){how}", HandSimWarning, stacklevel=3)
+        how = f"name it ({' '.join(known)})" if known else "calibrate these, or leave out the hands given"
+        warnings.warn(f"the points fit {named} better ({shares}); {how}", HandSimWarning, stacklevel=3)
 
 
 def _compared(frames: Sequence[StreamedFrame]) -> list[StreamedFrame]:

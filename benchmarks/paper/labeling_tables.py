@@ -15,10 +15,11 @@ from rich.table import Table
 
 from benchmarks.held_out import held_out_markers
 from benchmarks.paper.printed import AUGMENTATIONS, TABLE2, TABLE3, TABLE4, TABLE6, TEST_SETS, GapCounts
+from benchmarks.people import read_markers
 from benchmarks.record import Figures, save_figures
 from gloves import Take
 from gloves.captures.capture import run_lengths
-from gloves.captures.formats import find_captures, read_markers
+from gloves.captures.formats import find_captures
 from handsim import HandSimError
 from handsim.app.messages import progress_bar
 from train import (

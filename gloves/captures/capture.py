@@ -64,20 +64,22 @@ class Capture:
         return len(self.positions)
 
 
+def column_runs(flags: Bool[np.ndarray, "T M"]) -> Int[np.ndarray, "3 G"]:
+    """The column, the first and the last frame of each unbroken stretch of True, column by column."""
+    steps = np.diff(np.pad(flags.T.astype(np.int8), ((0, 0), (1, 1))), axis=1)
+    return np.stack([*np.nonzero(steps == 1), np.nonzero(steps == -1)[1] - 1])
+
+
 def run_lengths(flags: Bool[np.ndarray, "T M"], *, inside: bool = False) -> Int[np.ndarray, "G"]:
     """Lengths of all unbroken stretches of True, column by column [frames]."""
-    padded = np.zeros((len(flags) + 2, flags.shape[1]), dtype=np.int8)
-    padded[1:-1] = flags
-    steps = np.diff(padded, axis=0).T
-    begins, ends = np.nonzero(steps == 1)[1], np.nonzero(steps == -1)[1]
-    lengths: np.ndarray = ends - begins
-    return lengths[(begins > 0) & (ends < len(flags))] if inside else lengths
+    _, first, last = column_runs(flags)
+    lengths: np.ndarray = last - first + 1
+    return lengths[(first > 0) & (last < len(flags) - 1)] if inside else lengths
 
 
 def runs_of(flags: Bool[np.ndarray, "T"]) -> list[tuple[int, int]]:
     """The first and the last frame of each unbroken stretch of True."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
-    return [(int(first), int(end) - 1) for first, end in edges.reshape(-1, 2)]
+    return [(first, last) for _, first, last in column_runs(flags[:, None]).T.tolist()]
 
 
 UNLABELED: Final = "Unlabeled"

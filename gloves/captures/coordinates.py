@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 from jaxtyping import Bool, Float
 
-from gloves.captures.capture import Capture
+from gloves.captures.capture import Capture, column_runs
 from handsim.errors import CaptureError
 
 OUTPUTS: Final = "model_outputs"
@@ -34,8 +34,8 @@ _SENTENCES: Final = {
     LEFT_OUT: "{} points have coordinates and are marked as missing (residual -1), and are left out",
     PIECES: "{} columns hold pieces of unlabeled paths and are read as a few columns",
     _ZEROS: "{} points at exactly (0, 0, 0) are read as missing; if they are points, move the origin",
-    _STAND_INS: "{} points have one number in all three coordinates, such as (-1, -1, -1) for none, and are "
-    "read as missing",
+    _STAND_INS: "{} points stand for none, at one place such as (-1, -1, -1) or (0, 0, -1), and are read as "
+    "missing",
     _DOUBLED: "{} points are where another is, as a marker of two subjects is, and are left out",
     _HELD: "{} points repeat their position while others move, as in gaps filled with the last one, and are "
     "read as missing",
@@ -49,6 +49,7 @@ _MODELED: Final = re.compile(
 """Names that models give their outputs: RThumbAngles, LWristMoment, R_WRIST_ANGLE."""
 _SAME_PLACE: Final = 1e-3  # Markers this near [m] are one: the smallest markers are 1.5 mm wide.
 _SAME_SHARE: Final = 5e-3  # The same as a share of the extent of all points, for files with a wrong unit.
+_JUMP: Final = 0.02  # Points that move farther than this in a frame [m] never meet to the last digit.
 _NEIGHBORS: Final = 8  # A point is compared with this many points that follow it along a line.
 _MIN_FRAMES: Final = 10  # Repetitions count in this many frames; in fewer they may be chance.
 _NEVER_STILL: Final = 2e-5  # A marker that moves more than this in a frame [m] was not at rest before it.
@@ -115,19 +116,25 @@ def without_outputs(capture: Capture, listed: Sequence[str] = ()) -> Capture:
 def _without_stand_ins(capture: Capture) -> tuple[Capture, int, int]:
     """A capture without points that stand for none; how many were at (0, 0, 0), and how many elsewhere.
 
-    Some programs write zeros for what was not seen, or -1 or 9999 three times. A measured point never has one
-    number in all coordinates twice; a capture in which nothing moves is left as it is.
+    Some programs write zeros for what was not seen, -1 or 9999 three times, or (0, 0, -1). A measured point
+    never has one number in all coordinates twice, and markers do not jump to one place again and again; a
+    capture in which nothing moves is left as it is.
     """
     positions = capture.positions
     equal = (positions == positions[..., :1]).all(axis=-1)
     values, counts = np.unique(positions[equal, 0], return_counts=True)
     repeats = (counts > 1) & ((values == 0.0) | (capture.num_frames >= _MIN_FRAMES))
-    stands = equal & np.isin(positions[..., 0], values[repeats])
+    keys = (positions * [1.0, np.pi, np.e]).sum(axis=-1)  # different positions have different ones
+    frames, columns = np.nonzero(np.linalg.norm(np.diff(positions, axis=0), axis=-1) > _JUMP)
+    aims = np.unique(np.stack([keys[frames + 1, columns], frames]), axis=1)
+    aims, counts = np.unique(aims[0], return_counts=True)
+    equal &= np.isin(positions[..., 0], values[repeats])
+    stands = equal | np.isin(keys, aims[counts >= _MIN_FRAMES])
     there = np.isfinite(positions[..., 0]) & ~stands
     tracks = (positions[there[:, column], column] for column in range(positions.shape[1]))
     if not stands.any() or not any((track != track[:1]).any() for track in tracks):  # nothing moves
         return capture, 0, 0
-    zeros = int((stands & (positions[..., 0] == 0.0)).sum())
+    zeros = int((equal & (positions[..., 0] == 0.0)).sum())
     missing = np.where(stands[..., None], np.nan, positions)
     return dataclasses.replace(capture, positions=missing), zeros, int(stands.sum()) - zeros
 
@@ -186,11 +193,8 @@ def _held(positions: Float[np.ndarray, "T N 3"]) -> Bool[np.ndarray, "T N"]:
     grid = _grid(moves)
     abrupt = max(_NEVER_STILL, _GRID_STEPS * grid)
 
-    flags = np.zeros((num_columns, num_frames + 1), dtype=np.int8)
-    flags[:, 1:-1] = repeated.T
-    edges = np.diff(flags, axis=1)
-    columns, first = np.nonzero(edges == 1)  # the first and the last frame of each run of equal positions
-    last = np.nonzero(edges == -1)[1]
+    columns, first, last = column_runs(repeated)
+    last += 1  # the last frame of a run of equal positions
     ends = [
         np.where(step > _AT_REST * np.nan_to_num(steps[beyond, columns]), step, 0.0)
         for at, beyond in ((first + 1, first), (last + 2, last + 3))

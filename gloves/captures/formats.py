@@ -24,7 +24,7 @@ import csv
 import itertools
 import re
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final, TextIO
 
@@ -98,21 +98,24 @@ def read_trc(data: bytes, tell: Tell = warn) -> Capture:
 
     columns = TableColumns.of_triples(("frame number", "time"), names, scale)
     leading, read = parse_table(lines, columns, start=_HEADER_LINES, ended=ended)
-    times = StatedTimes(
-        stated.get("datarate", ""),
-        "DataRate",
-        numbers=leading[:, 0],
-        times=leading[:, 1],
-        count=stated.get("numframes", ""),
-        count_name="NumFrames",
-        count_is_reliable=False,
-    )
-    return _timed(read, times, tell)
+    stated |= {key: stated.get(key.lower(), "") for key in ("DataRate", "NumFrames")}
+    return _timed(read, leading, stated, ("DataRate", "NumFrames"), tell, count_is_reliable=False)
 
 
-def _timed(read: Trajectories, times: StatedTimes, tell: Tell, outputs: int = 0) -> Capture:
-    """The capture of trajectories at the stated times."""
-    timed = timed_positions(read.positions, times, tell)
+def _timed(
+    read: Trajectories,
+    leading: Float[np.ndarray, "T 2"],
+    stated: Mapping[str, str],
+    keys: tuple[str, str],
+    tell: Tell,
+    *,
+    count_is_reliable: bool = True,
+    outputs: int = 0,
+) -> Capture:
+    """The capture of trajectories with the numbers and times of its rows, and the keys of rate and count."""
+    (rate, count), (numbers, times) = keys, leading.T
+    values = stated.get(rate, ""), rate, numbers, times, stated.get(count, ""), count, count_is_reliable
+    timed = timed_positions(read.positions, StatedTimes(*values), tell)
     return Capture(read.names, *timed, findings={PIECES: read.pieces, OUTPUTS: outputs})
 
 
@@ -202,9 +205,11 @@ _MOST_HEADER_LINES: Final = 20
 MOTIVE_BEGIN: Final = b"Format Version"
 _COUNT: Final = "Total Exported Frames"
 _LENGTH: Final = "Length Units"
+_SPACE: Final = "Coordinate Space"
 _RATES: Final = ("Export Frame Rate", "Capture Frame Rate")
 _MOTIVE_KEYS: Final = {
-    key.lower(): key for key in ("Format Version", "Take Name", "Take Notes", *_RATES, _COUNT, _LENGTH)
+    key.lower(): key
+    for key in ("Format Version", "Take Name", "Take Notes", *_RATES, _COUNT, _LENGTH, _SPACE)
 }
 _AXES: Final = ["X", "Y", "Z"]
 _TYPES: Final = {"Marker", "Rigid Body", "Rigid Body Marker", "Bone", "Bone Marker"}
@@ -234,6 +239,8 @@ def read_motive_csv(data: bytes, tell: Tell = warn) -> Capture:
     if not stated.get(_LENGTH):
         tell("line 1 states no Length Units, read as meters, which Motive writes unless told otherwise")
     scale = meters_per(stated.get(_LENGTH) or "Meters")
+    if stated.get(_SPACE) == "Local":
+        tell("Coordinate Space is Local: markers stand still in their bodies; export world coordinates")
     axes = rows[end]
     header = [row for row in rows[keyed[-1] + 1 : end] if any(row)]
     # files without labels begin with the types, behind two blank cells
@@ -252,15 +259,9 @@ def read_motive_csv(data: bytes, tell: Tell = warn) -> Capture:
         texts=frozenset(index for index, axis in enumerate(axes) if axis.lower() == "timecode"),
     )
     leading, read = parse_table(lines, table, start=end + 1, ended=ended)
-    times = StatedTimes(
-        stated.get(rate_key, ""),
-        rate_key,
-        numbers=leading[:, 0],
-        times=leading[:, 1] if axes[1].lower().startswith("time (") or axes[1].lower() == "time" else None,
-        count=stated.get(_COUNT, ""),
-        count_name=_COUNT,
-    )
-    return _timed(read, times, tell)
+    if not re.match(r"time( \(|$)", axes[1], re.I):
+        leading[:, 1] = np.nan
+    return _timed(read, leading, stated, (rate_key, _COUNT), tell)
 
 
 def write_motive_csv(path: Path, capture: Capture, *, title: str) -> None:
@@ -376,8 +377,9 @@ def read_vicon_csv(data: bytes, tell: Tell = warn) -> Capture:
         scales=scales,
     )
     leading, read = parse_table(lines[:end], table, start=start, ended=ended or end < len(lines))
-    times = StatedTimes(rates[0], "the rate of the trajectories", numbers=leading[:, 0])
-    return _timed(read, times, tell, outputs=num_columns - len(columns))
+    leading[:, 1] = np.nan  # sub-frames are no times
+    key = "the rate of the trajectories"
+    return _timed(read, leading, {key: rates[0]}, (key, ""), tell, outputs=num_columns - len(columns))
 
 
 def _scales(
@@ -418,38 +420,25 @@ def read_qtm_tsv(data: bytes, tell: Tell = warn) -> Capture:
         for number, line in enumerate(lines[:start], 1)
         for cells in [header_cells(line, number)]
     }
-    included = _first(stated, "DATA_INCLUDED") or "3D"
+    firsts = {key: next(iter(values), "") for key, values in stated.items()}
+    included = firsts.get("DATA_INCLUDED") or "3D"
     if included != "3D":
         raise CaptureError(f"DATA_INCLUDED is '{shortened(included)}', expected '3D'; export the 3D data")
     if "MARKER_NAMES" not in stated:
         raise CaptureError("the header states no MARKER_NAMES")
-    names = _names(stated)
+    names = _names(stated["MARKER_NAMES"], firsts.get("NO_OF_MARKERS", ""))
     start, num_leading = _begin_of_rows(lines, start, 3 * len(names))
 
     columns = TableColumns.of_triples(_QTM_LEADING[:num_leading], names, meters_per("mm"))
     leading, read = parse_table(lines, columns, start=start, ended=ended)
-    times = StatedTimes(
-        _first(stated, "FREQUENCY"),
-        "FREQUENCY",
-        numbers=leading[:, 0] if num_leading > 0 else None,
-        times=leading[:, 1] if num_leading > 1 else None,
-        count=_first(stated, "NO_OF_FRAMES"),
-        count_name="NO_OF_FRAMES",
-    )
-    return _timed(read, times, tell)
+    leading[:, num_leading:] = np.nan
+    return _timed(read, leading, firsts, ("FREQUENCY", "NO_OF_FRAMES"), tell)
 
 
-def _first(stated: dict[str, list[str]], key: str) -> str:
-    """The first value of a key, or a blank."""
-    return next(iter(stated.get(key, ())), "")
-
-
-def _names(stated: dict[str, list[str]]) -> tuple[str, ...]:
-    """The names of all markers; a missing name becomes '*n'."""
-    names = stated["MARKER_NAMES"]
+def _names(names: list[str], text: str) -> tuple[str, ...]:
+    """The names of all markers, of which a text states the number; a missing name becomes '*n'."""
     while names and not names[-1]:
         names = names[:-1]
-    text = _first(stated, "NO_OF_MARKERS")
     count = int(text[:MAX_DIGITS]) if text.isdecimal() else len(names)
     if count < len(names) or count > MOST_CELLS // 3:
         raise CaptureError(f"MARKER_NAMES holds {len(names)} names, and NO_OF_MARKERS states {count}")
@@ -490,7 +479,7 @@ def _read_csv(data: bytes, tell: Tell) -> Capture:
         return read_vicon_csv(data, tell)
     raise CaptureError(
         "not a CSV of markers: expected Motive's, whose line 1 begins with 'Format Version', or Vicon's, "
-        "where a line reads 'Trajectories'"
+        "where a line reads 'Trajectories'; other tables become a gloves.Capture of an array"
     )
 
 
@@ -505,6 +494,8 @@ _OPENSIM: Final = "angles or forces of OpenSim and no markers; give the TRC that
 _UNREAD: Final = {
     ".tak": "a take of Motive, a closed format; export CSV or C3D with unlabeled markers from Motive",
     ".qtm": "a file of Qualisys' own; export C3D, or TSV of 3D data, from QTM",
+    ".json": "JSON, which is no format of markers; export C3D or TSV of 3D data",
+    **dict.fromkeys((".gz", ".zip", ".7z", ".rar"), "compressed; unpack it"),
     ".mat": "a file of MATLAB; export C3D, or TSV of 3D data, from the program that wrote it",
     ".npz": "an archive of NumPy; if it is a take, load_take reads it, and its capture() has the points",
     **dict.fromkeys((".x1d", ".x2d", ".v", ".vsk", ".enf", ".system"), _VICON),
@@ -518,6 +509,10 @@ _FOREIGN: Final = {
     MOTIVE_BEGIN.lower(): "the content of Motive's CSV; name it .csv",
     **{word.lower(): "the content of a TSV of Qualisys; name it .tsv" for word in _BEGINS},
     b"comment,this file was exported from": "a CSV of Tracking Tools; export its take from Motive",
+    b"objects": "a CSV of Vicon Tracker with bodies and no markers",
+    b"%time,": "a topic of ROS",
+    b"timestamp\tframenumber": "a text of D-Flow; export C3D or TRC from where it was captured",
+    b"version https://git-lfs": "a pointer of Git LFS to the file; git lfs pull brings it",
     b"scorer,": "a CSV of DeepLabCut with points of pictures; triangulate them and write a TRC",
     b"pk\3\4": "a workbook of Excel or another archive; save it as text",
     b"<": "XML or a page of the web",
@@ -644,7 +639,7 @@ def find_captures(paths: Sequence[Path]) -> list[Path]:
     for path in paths:
         inside = [path]
         if path.is_dir():
-            inside = sorted(file for file in path.rglob("*") if file.suffix.lower() in READABLE)
+            inside = sorted(file for file in path.rglob("[!.]*") if file.suffix.lower() in READABLE)
         if not inside:
             raise CaptureError(f"{path} holds no capture; expected files {', '.join(READABLE)}")
         files += inside
@@ -658,15 +653,7 @@ def read_hands(file: Path, names: Sequence[str]) -> tuple[list[Float[np.ndarray,
 
     Frames in which all markers of a hand are missing are left out.
     """
-    try:
-        capture = read_capture(file)
+    capture = read_capture(file)
+    with errors_of(file, CaptureError):
         hands = select_hands(capture, names)
-    except CaptureError as error:
-        text = str(error)
-        raise CaptureError(text if text.startswith(str(file)) else f"{file}: {text}") from error
     return [hand[np.isfinite(hand).any(axis=(1, 2))] for hand in hands], capture.rate
-
-
-def read_markers(files: Sequence[Path], names: Sequence[str]) -> Float[np.ndarray, "T M 3"]:
-    """The named markers of each hand in labeled captures [m], without frames in which all are missing."""
-    return np.concatenate([hand for file in files for hand in read_hands(file, names)[0]])

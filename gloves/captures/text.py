@@ -9,6 +9,7 @@ without points, with a warning. Values that contradict each other are refused by
 
 from __future__ import annotations
 
+import bisect
 import codecs
 import csv
 import math
@@ -41,7 +42,11 @@ TAB: Final = b"\t"
 _BLANK: Final = math.nan
 _BLANKS: Final = ("", *"null none na n/a #n/a <na> - -- 1.#qnan -1.#ind nan(ind)".split())
 """What programs write for no number, in small letters; Qualisys writes NULL."""
-_SEPARATOR: Final = re.compile(rb'^"?sep=.?"?\n', re.I)  # Excel's first line
+_MISWRITTEN: Final = {  # forms of cells that are no numbers, and why
+    r"[^.,]*,[^.,]*": ", since others have decimal points",
+    r"\d+[-. ]+[A-Z]\w\w\.?|[A-Z]\w\w[- ]\d+": ", but a date that a spreadsheet made of one; export it again",
+}
+_SEPARATOR: Final = re.compile(rb'"?sep=.?"?', re.I)  # Excel's first line
 _TIME_CODE: Final = re.compile(rb"\d+:[\d:.;]+")
 _DECIMALS: Final = re.compile(rb",0\d")  # This comma is decimal: no whole number begins with a zero.
 _NUMBERS: Final = re.compile(rb"\d[-+\d.,eE \t]*")
@@ -97,9 +102,12 @@ def split_lines(data: bytes) -> tuple[list[bytes], bool]:
     """Lines of a file in UTF-8, and whether the last one has a line end."""
     if (encoding := text_encoding(data)) != "utf-8-sig":
         data = data.decode(encoding, "replace").encode()
-    data = data.removeprefix(codecs.BOM_UTF8).replace(b"\r\n", b"\n").replace(b"\r", b"\n")
-    data = _SEPARATOR.sub(b"", data)
+    data = data.removeprefix(codecs.BOM_UTF8)
+    if b"\r" in data:
+        data = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     lines = data.split(b"\n")
+    if len(lines) > 1 and _SEPARATOR.fullmatch(lines[0]):
+        del lines[0]
     ended = not lines[-1].strip(b" ")
     return (lines[:-1] if ended and len(lines) > 1 else lines), ended
 
@@ -228,19 +236,18 @@ def _parse_wide(
     rows: list[bytes], columns: TableColumns, numbers: Sequence[int]
 ) -> tuple[Float[np.ndarray, "T 2"], Trajectories]:
     """`parse_table` of a table that is too large for an array, most of whose cells are blank."""
-    num_columns, texts = len(columns.titles), np.array(sorted(columns.texts), dtype=np.int64)
-    found = []
+    num_columns, found = len(columns.titles), []
     for row, number in zip(rows, numbers, strict=True):
-        ends = np.append(np.flatnonzero(np.frombuffer(row, dtype=np.uint8) == TAB[0]), len(row))
-        begins = np.append(0, ends[:-1] + 1)
-        filled = np.flatnonzero(ends > begins)
-        filled = filled[~np.isin(filled, texts)]
-        spans = zip(begins[filled].tolist(), ends[filled].tolist(), strict=True)
-        cells = [row[begin:end] for begin, end in spans]
-        inside = int(np.searchsorted(filled, num_columns))
-        _check_blank(cells[inside:], len(ends), num_columns, number)
-        filled = filled[:inside]
-        found.append((filled, _parse_cells(cells[:inside], number, columns.titles, filled.tolist())))
+        blank = np.frombuffer(TAB + row + TAB, dtype=np.uint8) == TAB[0]
+        begins, ends = np.flatnonzero(blank[1:] != blank[:-1]).reshape(-1, 2).T
+        filled = (ends + np.cumsum(begins - ends)).tolist()  # the number of tabs before each cell
+        spans = zip(filled, begins.tolist(), ends.tolist(), strict=True)
+        cells = [b"" if column in columns.texts else row[begin:end] for column, begin, end in spans]
+        inside = bisect.bisect_left(filled, num_columns)
+        if inside < len(filled):
+            _check_blank(cells[inside:], row.count(TAB) + 1, num_columns, number)
+            del filled[inside:], cells[inside:]
+        found.append((filled, _parse_cells(cells, number, columns.titles, filled)))
     frames = np.repeat(np.arange(len(rows)), [len(filled) for filled, _ in found])
     cells_at = np.concatenate([filled for filled, _ in found])
     values = np.concatenate([values for _, values in found])
@@ -313,28 +320,25 @@ def _parse_cells(
     """The numbers of a row, NaN for a blank; an error names the cell that is not a finite number."""
     try:
         values = np.array([float(cell) if cell else _BLANK for cell in cells])
+        if not np.isinf(values).any():
+            return values
     except ValueError:
-        values = np.array([_cell_value(cell, number, titles, columns[n]) for n, cell in enumerate(cells)])
-    if np.isinf(values).any():
-        column = columns[int(np.isinf(values).argmax())]
-        raise CaptureError(
-            f"line {number}, column {column + 1} ({titles[column]}): infinite, expected a "
-            "finite number or a blank cell"
-        )
-    return values
+        pass
+    return np.array([_cell_value(cell, number, titles, columns[n]) for n, cell in enumerate(cells)])
 
 
 def _cell_value(cell: bytes, number: int, titles: Sequence[str], column: int) -> float:
     """The number of a cell that may hold blanks."""
     text = cell.decode("utf-8", "replace").strip()
     try:
-        return _BLANK if text.lower() in _BLANKS else float(text)
+        value = _BLANK if text.lower() in _BLANKS else float(text)
+        fault = "infinite, expected a finite number or a blank cell" if math.isinf(value) else ""
     except ValueError:
-        mixed = "," in text and "." not in text and text.count(",") == 1
-        raise CaptureError(
-            f"line {number}, column {column + 1} ({titles[column]}): '{shortened(text)}' is not a "
-            f"number{', since others have decimal points' if mixed else ''}"
-        ) from None
+        reason = next((why for form, why in _MISWRITTEN.items() if re.fullmatch(form, text)), "")
+        fault = f"'{shortened(text)}' is not a number{reason}"
+    if fault:
+        raise CaptureError(f"line {number}, column {column + 1} ({titles[column]}): {fault}")
+    return value
 
 
 LOWEST_RATE: Final = 1.0

@@ -11,7 +11,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Self, get_args
+from typing import Any, Final, NoReturn, Self, get_args
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -40,7 +40,7 @@ from gloves.takes.points import (
     spans,
 )
 from handsim._checks import check_choice, check_type
-from handsim.errors import ArgumentError, HandSimWarning
+from handsim.errors import ArgumentError, HandSimWarning, choices
 from handsim.files.outputs import check_ending
 from handsim.hand.angles import ISB_NAMES, Convention, isb_angles
 from handsim.hand.model import (
@@ -79,6 +79,13 @@ _CHUNK: Final = 4096  # frames whose markers are filled in at once
 _MAX_BIAS_FRAMES: Final = 2000  # frames that marker biases are learned from
 _STILL: Final = 3.0  # [deg], largest standard deviation of an angle of a hand that holds still
 _MIN_BIAS_FRAMES: Final = 30  # frames with a marker from which its bias is learned
+
+
+class _Angles(dict[str, Float[np.ndarray, "T"]]):
+    """Values of angles by their names; an unknown name is an error in one sentence."""
+
+    def __missing__(self, name: str) -> NoReturn:
+        raise ArgumentError(choices(name, self, noun="angle"))
 
 
 @dataclass(frozen=True, slots=True, eq=False, init=False)
@@ -379,8 +386,8 @@ class Take:
         zero = None if neutral is None else self.mean_pose(side, neutral)
         if convention == "isb":
             shape = self.hands[self.hand_index(side)].model.shape
-            return dict(zip(ISB_NAMES, isb_angles(shape, angles, zero).T, strict=True))
-        return dict(zip(JOINT_NAMES, (angles if zero is None else angles - zero).T, strict=True))
+            return _Angles(zip(ISB_NAMES, isb_angles(shape, angles, zero).T, strict=True))
+        return _Angles(zip(JOINT_NAMES, (angles if zero is None else angles - zero).T, strict=True))
 
     def mean_pose(self, side: Side, between: tuple[float, float]) -> Float[np.ndarray, "20"]:
         """The mean joint angles of a hand between two times [rad]; warns if it moves there."""
@@ -406,7 +413,7 @@ class Take:
         spread = self.angle_spread
         if spread is None:
             spread = np.full((*self.status.shape, NUM_JOINTS), np.nan, dtype=np.float32)
-        return dict(zip(JOINT_NAMES, spread[:, self.hand_index(side)].T, strict=True))
+        return _Angles(zip(JOINT_NAMES, spread[:, self.hand_index(side)].T, strict=True))
 
     def is_tracked(self, side: Side) -> Bool[np.ndarray, "T"]:
         """Frames in which a hand's pose follows from the points; in the others it coasts or is lost."""

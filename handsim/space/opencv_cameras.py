@@ -28,6 +28,8 @@ from handsim.space.transforms import quaternion_matrix, rigid, vector_quaternion
 _MAX_OPENCV_BYTES: Final = 1 << 24
 _MAX_NUMBERS: Final = 16  # Longer lists of numbers, such as corners of a board, are ignored.
 _CENTER: Final = 0.5  # OpenCV measures pixels from the center of the first one, we from the picture's corner
+_LEAST_FOCAL: Final = 0.02  # of the width; in shares of the picture's size a focal length is about 1
+_MAX_TURN: Final = 6.4  # longest rotation vector [rad]; longer ones are angles in degrees
 _MAX_BASELINE: Final = 5.0  # largest distance of the cameras of a pair [m]
 _ENTRY: Final = re.compile(r"^[\"']?([A-Za-z_][\w .-]*?)[\"']?[ \t]*:(?=\s)", re.M)
 _DATA: Final = re.compile(r"\bdata[\"']?[ \t]*:[ \t]*\[([^\[\]]*)\]")
@@ -161,8 +163,14 @@ def _numbered_sections(values: Values) -> Sections:
 def _camera(
     values: Values, name: str, K: tuple[str, ...], D: tuple[str, ...], pose: NDArray[np.float64]
 ) -> Camera:
-    matrix = _matrix(values, K, (3, 3))
-    return Camera(name, _size(values), _from_corner(matrix), pose, _lens(values, D))
+    matrix, size = _matrix(values, K, (3, 3)), _size(values)
+    off, other = (np.abs(2.0 * matrix[:2, 2] / sides - 1.0).max() for sides in (size, size[::-1]))
+    if matrix[0, 0] < _LEAST_FOCAL * size[0] or (off > 0.3 and other < 0.1):
+        raise RigError(
+            f"K has the focal length {matrix[0, 0]:.4g} and center {matrix[0, 2]:.4g}, {matrix[1, 2]:.4g} "
+            f"for pictures of {size[0]} x {size[1]}; expected pixels, and the width before the height"
+        )
+    return Camera(name, size, _from_corner(matrix), pose, _lens(values, D))
 
 
 def _stereo(values: Values) -> list[Camera]:
@@ -291,11 +299,12 @@ def _own_pose(values: Values) -> NDArray[np.float64]:
 def _rotation(values: Values, key: str) -> NDArray[np.float64]:
     """The rotation of a matrix or of a rotation vector [rad]."""
     given = np.array(_value_numbers(values, key, None))
-    if given.size == 3:
+    if given.size == 3 and np.linalg.norm(given) < _MAX_TURN:
         turned: NDArray[np.float64] = quaternion_matrix(vector_quaternions(given[None])[0])
         return turned
     if given.size != 9:
-        raise RigError(f"{key} has {given.size} numbers, expected a rotation: 9 of a matrix or 3 of a vector")
+        shown = shortened(str(given.tolist()))
+        raise RigError(f"{key} is {shown}, expected a rotation: 9 numbers of a matrix or 3 of a vector [rad]")
     return nearest_rotation(key, given.reshape(3, 3))
 
 

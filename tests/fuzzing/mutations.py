@@ -10,6 +10,7 @@ import json
 import re
 import zipfile
 from collections.abc import Callable
+from functools import lru_cache
 from typing import Any, Final
 
 import numpy as np
@@ -71,8 +72,8 @@ def mutate_take(data: bytes, rng: np.random.Generator) -> bytes:
     kind = rng.random()
     if kind < 0.3:
         return mutate_archive(data, rng)
-    with np.load(io.BytesIO(data)) as stored:
-        arrays = dict(stored)
+    stored = _stored_arrays(data)
+    arrays = {name: array for name, (array, _) in stored.items()}
     for _ in range(int(rng.integers(1, 4))):
         name = sorted(arrays)[int(rng.integers(len(arrays)))]
         if rng.random() < 0.4 and "header" in arrays:
@@ -84,10 +85,22 @@ def mutate_take(data: bytes, rng: np.random.Generator) -> bytes:
     out = io.BytesIO()
     with zipfile.ZipFile(out, "w", method) as archive:
         for name, array in arrays.items():
-            buffer = io.BytesIO()
-            np.save(buffer, array)
-            archive.writestr(f"{name}.npy", buffer.getvalue())
+            known, content = stored[name]
+            archive.writestr(f"{name}.npy", content if array is known else _npy(array))
     return out.getvalue() if kind < 0.8 else mutate(out.getvalue(), rng)
+
+
+@lru_cache(maxsize=8)
+def _stored_arrays(data: bytes) -> dict[str, tuple[np.ndarray[Any, Any], bytes]]:
+    """The arrays of a valid file, which is damaged again and again, and the content of their members."""
+    with np.load(io.BytesIO(data)) as stored:
+        return {name: (array, _npy(array)) for name, array in stored.items()}
+
+
+def _npy(array: np.ndarray[Any, Any]) -> bytes:
+    buffer = io.BytesIO()
+    np.save(buffer, array)
+    return buffer.getvalue()
 
 
 def mutate_checkpoint(data: bytes, rng: np.random.Generator) -> bytes:

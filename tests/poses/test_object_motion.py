@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from benchmarks.validity import two_hands_penetration
 from gloves import load_layout
 from gloves.fit import attach_markers
 from handsim import HandModel, HandMotion, RigidObject, join_qpos, sample_shape
@@ -44,7 +45,6 @@ from poses.object_motion import (
     sample_object_motion,
 )
 from poses.shapes import MAX_PENETRATION, is_valid, resting_angles
-from poses.two_hands import two_hands_penetration
 from tests.meshes import winding
 
 FACETS = 0.0008  # a mesh of few triangles lies inside the round part it stands for [m]

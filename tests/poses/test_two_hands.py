@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from benchmarks.validity import two_hands_penetration
 from handsim import HandModel, join_qpos, sample_shape
 from handsim.files.inputs import package_data
 from handsim.hand.capsules import overlap_between
@@ -25,7 +26,7 @@ from poses.contact import (
     smooth_below,
 )
 from poses.shapes import gesture_names, is_valid, resting_angles
-from poses.two_hands import INTERACTIONS, sample_two_hand_motion, sample_two_hand_poses, two_hands_penetration
+from poses.two_hands import INTERACTIONS, sample_two_hand_motion, sample_two_hand_poses
 
 DEEPEST = 0.001
 TOUCHING = 0.001

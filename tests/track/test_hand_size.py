@@ -168,6 +168,14 @@ def test_the_other_side_is_named(capture):
         track_capture(capture, hands="left")
 
 
+def test_hands_of_a_user_who_is_not_there_are_to_be_left_out(capture):
+    user = dataclasses.replace(nominal_user(load_layout("dense19"), "M", "left"), notes="calibrated")
+    with pytest.warns(
+        HandSimWarning, match="a right hand better .*; calibrate these, or leave out the hands"
+    ):
+        track_capture(capture, hands=user)
+
+
 def test_the_glove_that_is_worn_is_named(capture):
     with pytest.warns(HandSimWarning, match=r"a right hand in glove 'dense19' better .*--glove dense19"):
         label_capture(capture, glove="sparse13")

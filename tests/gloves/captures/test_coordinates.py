@@ -163,14 +163,14 @@ def test_markers_of_two_subjects_are_one(moving, rng, tmp_path, suffix, share, a
     assert select_markers(read, moving.names).shape == positions.shape
 
 
-@pytest.mark.parametrize("number", [9999.0, -1.0, -9999.99, 1e6])
+@pytest.mark.parametrize("numbers", [9999.0, -1.0, -9999.99, 1e6, (0.0, 0.0, -1.0), (0.0, -9999.0, 0.0)])
 @pytest.mark.parametrize("suffix", WRITABLE)
-def test_numbers_that_stand_for_none_are_missing(moving, rng, tmp_path, suffix, number):
+def test_numbers_that_stand_for_none_are_missing(moving, rng, tmp_path, suffix, numbers):
     hidden = gaps(rng)
     path = tmp_path / f"take{suffix}"
-    positions = np.where(hidden[..., None], number * 1e-3, moving.positions)
+    positions = np.where(hidden[..., None], 1e-3 * np.array(numbers), moving.positions)
     write_capture(path, with_positions(moving, positions))
-    with pytest.warns(HandSimWarning, match=rf"{hidden.sum()} points have one number in all three"):
+    with pytest.warns(HandSimWarning, match=rf"{hidden.sum()} points stand for none"):
         read = read_capture(path)
     np.testing.assert_array_equal(np.isnan(read.positions[..., 0]), hidden)
 

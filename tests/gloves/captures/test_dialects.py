@@ -82,6 +82,14 @@ def test_the_same_values(tmp_path, dialect):
     np.testing.assert_array_equal(capture.positions, expected.positions)
 
 
+def test_local_coordinates_are_told(tmp_path):
+    """Motive can export markers in the axes of their rigid bodies, where they stand still."""
+    keys = KEYS.replace("Coordinate Space,Global", "Coordinate Space,Local")
+    capture, told = read(tmp_path / "take.csv", MOTIVE.replace(KEYS, keys))
+    assert capture.num_frames and len(told) == 1
+    assert_names(told[0], "Coordinate Space is Local | export world coordinates")
+
+
 def test_blanks_between_spaces(tmp_path):
     """A blank cell is written as nan; rows may lack cells at their end, and a blank line may be nan."""
     rows = SPACED.split("\n")
@@ -130,6 +138,25 @@ REFUSED = {
     "a TRC by another ending": (".csv", TRC, "not a CSV of markers | the content of a TRC; name it .trc"),
     "Motive's by another ending": (".tsv", MOTIVE, "Motive's CSV; name it .csv"),
     "DeepLabCut": (".csv", "scorer,a,a,a\nbodyparts,x,x,x\n", "DeepLabCut | write a TRC"),
+    "bodies of Vicon Tracker": (".csv", "Objects\n100\n,,A\nFrame,Sub Frame,RX\n", "Vicon Tracker | bodies"),
+    "ROS": (".csv", "%time,field.header.seq\n", "a topic of ROS | gloves.Capture of an array"),
+    "D-Flow": (".tsv", "TimeStamp\tFrameNumber\tA.PosX\n", "D-Flow | C3D or TRC"),
+    **{
+        f"a pointer in place of a {suffix}": (
+            suffix,
+            "version https://git-lfs.github.com/spec/v1\n",
+            "git lfs pull",
+        )
+        for suffix in (".c3d", ".csv", ".trc")
+    },
+    "JSON": (".json", "{}", "no format of markers | C3D or TSV"),
+    "compressed": (".gz", b"\x1f\x8b", "compressed; unpack it"),
+    "a date of a spreadsheet": (
+        ".trc",
+        TRC.replace("1.25", "25. Jan", 1),
+        "'25. Jan' | a date | spreadsheet",
+    ),
+    "a date in English": (".csv", MOTIVE.replace("1.010000", "25-Jan", 1), "'25-Jan' | a date | spreadsheet"),
     "a workbook": (".csv", b"PK\3\4" + bytes(40), "workbook of Excel | save it as text"),
 }
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from gloves import Capture, read_capture, write_capture
-from gloves.captures.formats import read_markers, read_motive_csv, read_qtm_tsv, read_trc, read_vicon_csv
+from gloves.captures.formats import read_hands, read_motive_csv, read_qtm_tsv, read_trc, read_vicon_csv
 from handsim.errors import CaptureError
 from tests.sentences import error_names
 
@@ -613,7 +613,7 @@ def two_hands(rng):
 def test_two_hands_are_counted_each_by_itself(tmp_path, two_hands):
     columns = [f"{side}:{name}" for side in ("right", "left") for name in MARKERS]
     write_capture(tmp_path / "two.trc", Capture((*columns, "Unlabeled1"), two_hands, 120.0))
-    markers = read_markers([tmp_path / "two.trc"], MARKERS)
+    markers = np.concatenate(read_hands(tmp_path / "two.trc", MARKERS)[0])
     expected = np.concatenate([two_hands[[0, 1, 3], :3], two_hands[:, 3:6]])
     np.testing.assert_allclose(markers, expected, atol=1e-6)
 
@@ -622,4 +622,4 @@ def test_a_hand_that_lacks_a_marker_is_named(tmp_path, two_hands):
     columns = [f"{side}:{name}" for side in ("right", "left") for name in MARKERS]
     write_capture(tmp_path / "two.trc", Capture(tuple(columns[:5]), two_hands[:, :5], 120.0))
     with pytest.raises(CaptureError, match=r"two\.trc: columns 'left:\.\.\.': .*PinkyTip"):
-        read_markers([tmp_path / "two.trc"], MARKERS)
+        read_hands(tmp_path / "two.trc", MARKERS)

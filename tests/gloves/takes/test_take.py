@@ -264,6 +264,12 @@ def test_angles_have_names_and_frames_a_status(take):
     assert not take.made_by_tracker
     with pytest.raises(ArgumentError, match="unknown hand 'middle'"):
         take.angles("middle")
+    for named in (angles, known, take.angles("right", convention="isb")):
+        with pytest.raises(
+            ArgumentError, match=r"unknown angle 'index_PIP_flex' \(did you mean 'index_PIP_flexion'"
+        ):
+            named["index_PIP_flex"]
+        assert named.get("index_PIP_flex") is None
 
 
 def test_angles_may_be_the_isbs_and_begin_at_a_neutral_pose(take):

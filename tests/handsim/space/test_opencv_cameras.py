@@ -241,6 +241,18 @@ def test_a_calibration_without_opencvs_header(tmp_path):
         ({"distortion_coefficients": np.full((1, 8), 0.1)}, "after the fifth are not 0"),
         ({"R": np.diag([1.0, 1.0, -1.0]), "T": T}, "R is not a rotation"),
         ({"R": R}, "no 'T'"),
+        (
+            {"R": np.array([[90.0, 0.0, 45.0]]), "T": T},
+            r"R is \[90.0, 0.0, 45.0\], .*3 of a vector \[rad\]",
+        ),
+        (
+            {"camera_matrix": np.array([[0.9, 0, 0.5], [0, 1.2, 0.5], [0, 0, 1]])},
+            "focal length 0.9 .*expected pixels",
+        ),
+        (
+            {"camera_matrix": np.array([[500, 0, 240], [0, 500, 320], [0, 0, 1]])},
+            "center 240, 320 for pictures of 640 x 480; .* the width before the height",
+        ),
         ({"R": R, "T": 1e5 * T}, "are these millimeters"),
         ({"M1": K, "M2": K, "R": R, "T": 1e3 * T}, "the cameras are 120.5 m apart"),
         ({"camera_matrix": np.array([[np.nan, 0, 1], [0, 2, 1], [0, 0, 1]])}, "camera_matrix is no list"),

@@ -17,8 +17,8 @@ import pytest
 import torch
 from safetensors.numpy import load_file, save_file
 
+from benchmarks.people import read_markers
 from gloves import Capture, MarkerLayout, MarkerPlace, attach, load_layout, read_capture, write_capture
-from gloves.captures.formats import read_markers
 from handsim import HandModel, HandSimError, HandSimWarning
 from handsim.cli.main import main
 from handsim.errors import ArgumentError, WeightsError

@@ -11,6 +11,7 @@ import pytest
 
 from benchmarks.paper.labeling_tables import count_gaps
 from benchmarks.paper.printed import TABLE3
+from benchmarks.validity import two_hands_penetration
 from gloves import Take, load_layout, load_take
 from handsim import HandModel, load_rig
 from handsim.errors import ArgumentError, PoseError
@@ -19,7 +20,6 @@ from handsim.space.rig import ROOM_CENTER, CameraRig
 from handsim.space.transforms import pose_matrices, quaternion_matrix, rigid
 from poses.grasps import object_penetration
 from poses.shapes import HIGH, LOW
-from poses.two_hands import two_hands_penetration
 from tests.rigs import mixed_rig
 from tests.sentences import error_names
 from train import OpticsOptions, SimulateSettings, simulate_take
