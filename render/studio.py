@@ -24,6 +24,7 @@ from handsim.space.camera import Camera
 from handsim.space.transforms import pose_matrices
 from render.color_sensor import Exposure, Shutter, combine, expose, linear_of, shutter_times
 from render.depth_sensor import DepthNoise, TimeOfFlight, apply_depth_noise, reflectance_of
+from render.film.video import FilmReader
 from render.frames import (
     FOREARM,
     PARTS_A_HAND,
@@ -31,7 +32,6 @@ from render.frames import (
     BodyTruth,
     Bytes,
     Doubles,
-    FilmReader,
     Flags,
     Floats,
     Geometry,

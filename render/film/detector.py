@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from numpy.typing import ArrayLike, NDArray
 
-from handsim._checks import check_choice, check_type
+from handsim._checks import check_array, check_choice, check_type
 from handsim.errors import ArgumentError, WeightsError
 from handsim.files.inputs import read_bytes, sign_model
 from handsim.hand.shape import NUM_KEYPOINTS, SIDES, Side
@@ -140,16 +140,14 @@ class HandDetector:
         Raises:
             ArgumentError: An argument has another shape, or a box no size.
         """
-        picture, places = _checked(image), np.asarray(boxes, dtype=np.float64)
-        places = places.reshape(-1, 4) if not places.size else places
-        if places.ndim != 2 or places.shape[1] != 4:
-            raise ArgumentError(f"boxes have the shape {places.shape}, expected (N, 4)")
+        picture = _checked(image)
+        places = check_array("boxes", boxes, (4,)).reshape(-1, 4) if np.size(boxes) else np.empty((0, 4))
         if len(places) != len(sides):
             raise ArgumentError(
                 f"there are {len(places)} boxes and {len(sides)} sides, expected one for each"
             )
-        if not (np.isfinite(places).all() and (places[:, 2:] > 0.0).all()):
-            raise ArgumentError("a box is not finite or has no size, expected left, top, width, height [px]")
+        if not (places[:, 2:] > 0.0).all():
+            raise ArgumentError("a box has no size, expected left, top, width, height [px]")
         found = []
         for box, side in zip(places, sides, strict=True):
             check_choice(side, SIDES, noun="side")
