@@ -50,7 +50,7 @@ class Motion:
     """Keypoints of a take's hands at any time."""
 
     def __init__(self, take: Take) -> None:
-        self.times, self.num_hands = take.times, len(take.hands)
+        self.times = take.times
         self._points = take.keypoints()
         self.sides = np.array([SIDES.index(side) for side in take.sides])
 
@@ -73,7 +73,6 @@ class Detections(NamedTuple):
     looked: Integers  # (F,): the nearest frame in which hands were looked for
     frames: Integers  # (D,)
     sides: Integers  # (D,), as in `SIDES`
-    confidence: Doubles  # (D,)
     pixels: Doubles  # (D, 21, 2)
     weights: Doubles  # (D, 21): 0 for keypoints that are not sure
 
@@ -89,7 +88,6 @@ class Detections(NamedTuple):
             looked[between],
             np.array([index for index, _ in hands], dtype=np.int64),
             np.array([SIDES.index(hand.side) for _, hand in hands], dtype=np.int64),
-            np.array([hand.confidence for _, hand in hands], dtype=np.float64),
             np.array([hand.keypoints for _, hand in hands], dtype=np.float64).reshape(-1, NUM_KEYPOINTS, 2),
             np.where(scores >= _SURE, np.sqrt(np.clip(scores, 0.0, 1.0)), 0.0),
         )
@@ -142,10 +140,8 @@ class Bundle:
         pixels, seen = self.flat(found.pixels)
         weights = np.where(seen, found.weights, 0.0)
         told = (weights > 0.0).sum(axis=1) >= FEWEST_KEYPOINTS
-        self.found = found._replace(
-            frames=found.frames[told], sides=found.sides[told], confidence=found.confidence[told],
-            pixels=pixels[told], weights=weights[told],
-        )  # fmt: skip
+        frames, sides = found.frames[told], found.sides[told]
+        self.found = found._replace(frames=frames, sides=sides, pixels=pixels[told], weights=weights[told])
 
     def flat(self, pixels: Doubles) -> tuple[Doubles, Flags]:
         """Pixels (..., 2) as a pinhole camera with the given one's matrix has them, and which it has."""
@@ -214,10 +210,10 @@ class Bundle:
         matches.errors[at] = errors[order, hand[order]]
         return matches
 
-    def samples(self, matches: Matches, most: int = _MOST_BUNDLED) -> Samples:
-        """The keypoints of matched hands, thinned out to about this many."""
+    def samples(self, matches: Matches) -> Samples:
+        """The keypoints of matched hands, thinned out to `_MOST_BUNDLED` about."""
         frames, hands, keypoints = np.nonzero(np.isfinite(matches.errors[..., 0]))
-        kept = matches.numbers[frames, hands] % (1 + len(frames) // most) == 0
+        kept = matches.numbers[frames, hands] % (1 + len(frames) // _MOST_BUNDLED) == 0
         frames, hands, keypoints = (np.repeat(one[kept], 2) for one in (frames, hands, keypoints))
         number, count = matches.numbers[frames, hands], len(frames)
 

@@ -117,7 +117,7 @@ def find_hands(film: Film, detector: HandDetector, progress: Progress) -> list[F
         else:
             boxes, sides = np.array([hand.box for hand in known]), [hand.side for hand in known]
             known = [hand for hand in detector.refine(picture, boxes, sides) if hand.confidence >= _SURE]
-        known = [hand for hand in known if np.isfinite(hand.box).all() and hand.box[2:].min() >= _SMALLEST]
+        known = [hand for hand in known if hand.box[2:].min() >= _SMALLEST]
         found.append(FoundFrame(time, known))
     if not found:
         raise CaptureError(f"{film.path}: no frame can be read, expected a video")

@@ -134,8 +134,6 @@ class Outlines:
 
     def shrunk(self, picture: Bytes) -> Bytes:
         """A picture as it is looked at."""
-        if self._scale == 1.0:
-            return picture
         return np.asarray(cv2.resize(picture, self._size, interpolation=cv2.INTER_AREA))
 
     def edges(

@@ -324,8 +324,8 @@ def _outline_fit(bundle: Bundle, edges: Edges, seen: Seen, fit: _Fit) -> _Fit:
 def _registration(bundle: Bundle, state: State, covariance: Doubles, fit: _Fit) -> Registration:
     """The registration of a solved state."""
     deviations = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    offset, drift = bundle.clock(state)
-    pose = slice(POSES, POSES + 6)
+    told = {"offset": OFFSET, "drift": DRIFT, "readout": READOUT, "focal": FOCAL}
+    (offset, drift), pose = bundle.clock(state), slice(POSES, POSES + 6)
     rotation, derivatives = cv2.Rodrigues(state.pose(0)[:3])
     by_turn = derivatives.reshape(3, 3, 3).transpose(0, 2, 1) @ state.pose(0)[3:]
     by_pose = np.column_stack([by_turn.T, rotation.T])  # derivatives of the camera's place, negated
@@ -336,11 +336,8 @@ def _registration(bundle: Bundle, state: State, covariance: Doubles, fit: _Fit) 
         offset=offset,
         drift=drift,
         readout=float(state.values[READOUT]),
-        deviations={
-            "offset": float(deviations[OFFSET]),
-            "drift": float(deviations[DRIFT]),
-            "readout": float(deviations[READOUT]),
-            "focal": float(deviations[FOCAL]),
+        deviations={name: float(deviations[number]) for name, number in told.items()}
+        | {
             "position": float(np.sqrt(max(place, 0.0))),
             "rotation": float(np.linalg.norm(deviations[POSES : POSES + 3])),
         },
