@@ -16,7 +16,7 @@ from gloves.takes.take import Take
 from handsim.hand.shape import NUM_KEYPOINTS, SIDES
 from handsim.space.camera import Camera, Lens, brown_lens, camera_matrix
 from handsim.space.transforms import rigid
-from render.frames import Doubles, Flags, Integers
+from render.frames import Doubles, Integers
 
 if TYPE_CHECKING:
     from render.film.detector import FoundHand
@@ -137,20 +137,15 @@ class Bundle:
     ) -> None:
         self.motion, self.size, self.given = motion, size, given
         self._middle = float(np.median(found.times))
-        pixels, seen = self.flat(found.pixels)
-        weights = np.where(seen, found.weights, 0.0)
+        pixels, weights = found.pixels, found.weights
+        if given is not None:  # They are as a pinhole camera with its matrix has them.
+            rays = given.unproject(pixels)
+            pixels = rays[..., :2] / rays[..., 2:] * given.K[[0, 1], [0, 1]] + given.K[:2, 2]
+            weights = np.where(np.isfinite(pixels).all(axis=-1) & (rays[..., 2] > 0.0), weights, 0.0)
+            pixels = np.where(weights[..., None] > 0.0, pixels, 0.0)
         told = (weights > 0.0).sum(axis=1) >= FEWEST_KEYPOINTS
         frames, sides = found.frames[told], found.sides[told]
         self.found = found._replace(frames=frames, sides=sides, pixels=pixels[told], weights=weights[told])
-
-    def flat(self, pixels: Doubles) -> tuple[Doubles, Flags]:
-        """Pixels (..., 2) as a pinhole camera with the given one's matrix has them, and which it has."""
-        if self.given is None:
-            return pixels, np.ones(pixels.shape[:-1], dtype=bool)
-        rays = self.given.unproject(pixels)
-        found = rays[..., :2] / rays[..., 2:] * self.given.K[[0, 1], [0, 1]] + self.given.K[:2, 2]
-        seen = np.isfinite(found).all(axis=-1) & (rays[..., 2] > 0.0)
-        return np.where(seen[..., None], found, 0.0), seen
 
     def clock(self, state: State) -> tuple[float, float]:
         """Offset [s] and drift of the take's time over the video's."""
@@ -169,19 +164,17 @@ class Bundle:
         focal = self.size[0] * np.exp(values[FOCAL])
         return camera_matrix(focal, focal, *(0.5 * np.array(self.size) + self.size[0] * values[_CENTER]))
 
-    def camera(self, state: State, span: int, *, flat: bool = False) -> Camera:
-        """The camera of a span, with the given lens, or `flat` without it."""
-        pose = state.pose(span)
-        rotation = Rotation.from_rotvec(pose[:3]).as_matrix()
-        lens = brown_lens(*state.values[_LENS], 0.0, 0.0, 0.0)
+    def cameras(self, state: State, *, flat: bool = False) -> list[Camera]:
+        """The cameras of all spans, with the given lens, or `flat` without it."""
+        lens, cameras = brown_lens(*state.values[_LENS], 0.0, 0.0, 0.0), []
         if self.given is not None:
             lens = Lens() if flat else self.given.lens
-        name, place = f"film{span + 1}" if span else "film", rigid(rotation.T, -rotation.T @ pose[3:])
-        return Camera(name, self.size, self.matrix(state.values), place, lens)
-
-    def cameras(self, state: State, *, flat: bool = False) -> list[Camera]:
-        """The cameras of all spans."""
-        return [self.camera(state, span, flat=flat) for span in range(len(state.starts))]
+        for span in range(len(state.starts)):
+            pose, name = state.pose(span), f"film{span + 1}" if span else "film"
+            rotation = Rotation.from_rotvec(pose[:3]).as_matrix()
+            place = rigid(rotation.T, -rotation.T @ pose[3:])
+            cameras.append(Camera(name, self.size, self.matrix(state.values), place, lens))
+        return cameras
 
     def pictured(self, state: State) -> Doubles:
         """Pixels (F, H, 21, 2) of the take's keypoints in each frame; NaN where there are none."""

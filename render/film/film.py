@@ -187,15 +187,16 @@ def annotate_film(
     return registration
 
 
-def filmed_take(take: Take, registration: Registration) -> Take:
-    """A take with one frame for each frame of the video; poses are NaN in frames that do not fit.
+def filmed_take(take: Take, registration: Registration, *, every: bool = False) -> Take:
+    """A take with one frame for each frame of the video; poses of those that do not fit are NaN, unless `every`.
 
     A hand has the pose of the time at which a rolling shutter reads the rows that it is in.
     """
     times = registration.take_times(registration.times)
     cameras = [registration.camera_of(number) for number in range(len(times))]
     qpos = poses_at(take, shutter_times(take, times, cameras, registration.readout))
-    qpos[[bool(reason) for reason in registration.reasons]] = np.nan
+    if not every:
+        qpos[[bool(reason) for reason in registration.reasons]] = np.nan
     return Take.of_poses(
         take.hands,
         qpos,
@@ -216,8 +217,7 @@ class _Skeleton(NamedTuple):
 
 def _drawn_over(film: Film, take: Take, registration: Registration) -> Iterator[Bytes]:
     """The frames of a video with the skeletons of the take's hands, hollow where the frame does not count."""
-    everywhere = dataclasses.replace(registration, reasons=("",) * len(registration.reasons))
-    whole = filmed_take(take, everywhere).keypoints()
+    whole = filmed_take(take, registration, every=True).keypoints()
     for number, (_, picture) in zip(range(len(whole)), film.frames(), strict=False):
         fits = np.full(NUM_KEYPOINTS, not registration.reasons[number])
         camera = registration.camera_of(number)

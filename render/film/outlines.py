@@ -126,8 +126,7 @@ class Outlines:
 
     def __init__(self, take: Take, size: tuple[int, int]) -> None:
         self._take, self._scale = take, min(1.0, _WIDEST / max(size))
-        width, height = (max(1, round(self._scale * side)) for side in size)
-        self._size = width, height
+        self._size = round(self._scale * size[0]), max(1, round(self._scale * size[1]))
         self._skins = [PosableSkin(hand.model, bony=0.5) for hand in take.hands]
         self._bodies = [BodyFigure(body, (0.5, 0.5, 0.5)) for body in take.bodies]
         self._seen = np.zeros((len(take.hands), 1 << 3 * _LEVELS))  # counts of the hands' colors

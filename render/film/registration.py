@@ -108,22 +108,18 @@ class Registration:
     def doubts(self) -> list[str]:
         """What the hands tell badly, as sentences."""
         found = self.deviations
-        told = []
-        if found["focal"] > 0.01:
-            told.append(
-                f"The focal length is known to {100 * found['focal']:.1f} % only: the hands hardly move "
-                "towards the camera and away from it."
-            )
-        if found["offset"] > 0.003:
-            told.append(f"The clock is known to {1e3 * found['offset']:.1f} ms only: the hands hardly move.")
-        if found["position"] > 0.004:
-            told.append(f"The camera's place is known to {1e3 * found['position']:.1f} mm only.")
-        if len(self.cameras) > 1:
-            when = ", ".join(f"{self.times[start]:.1f} s" for start in self.starts[1:])
-            told.append(
-                f"The camera was moved at {when}: there are {len(self.cameras)} spans, each with its pose."
-            )
-        return told
+        when = ", ".join(f"{self.times[start]:.1f} s" for start in self.starts[1:])
+        told = {
+            f"The focal length is known to {100 * found['focal']:.1f} % only: the hands hardly move towards "
+            "the camera and away from it.": found["focal"] > 0.01,
+            f"The clock is known to {1e3 * found['offset']:.1f} ms only: the hands hardly move.":
+                found["offset"] > 0.003,
+            f"The camera's place is known to {1e3 * found['position']:.1f} mm only.":
+                found["position"] > 0.004,
+            f"The camera was moved at {when}: there are {len(self.cameras)} spans, each with its pose.":
+                len(self.cameras) > 1,
+        }  # fmt: skip
+        return [sentence for sentence, holds in told.items() if holds]
 
     def figures(self) -> list[tuple[str, str, str]]:
         """A table of clock, lens and camera places: rows of a name, a value and its standard deviation."""
@@ -183,11 +179,11 @@ def register(
         HandSimError: Too few hands were found, or they do not move as those of the take do.
     """
     bundle, width = Bundle(Motion(take), Detections.of(found), size, given), size[0]
-    with_hands = len(np.unique(bundle.found.frames))
+    with_hands, looked = (len(np.unique(one)) for one in (bundle.found.frames, bundle.found.looked))
     if with_hands < _FEWEST_FRAMES:
         raise HandSimError(
-            f"hands were found in {with_hands} of {len(found)} frames of the video, expected "
-            f"{_FEWEST_FRAMES} at least"
+            f"hands were found in {with_hands} of {looked} frames of the video, expected {_FEWEST_FRAMES} at "
+            "least"
         )
     state, noise = first_guess(bundle), 0.25 * GATE * width
     for turn in range(_ROUNDS):

@@ -24,7 +24,7 @@ from torch.nn import functional
 
 from handsim import __version__
 from handsim._checks import check_count
-from handsim.errors import HandSimError
+from handsim._plugins import import_extra
 from handsim.files.inputs import DIGEST, sign_model
 from handsim.files.outputs import atomic_write
 from handsim.hand.shape import NUM_KEYPOINTS
@@ -108,12 +108,7 @@ def train_detector(
         HandSimError: The start or the photographs cannot be read, or onnx is missing.
     """
     check_count("samples", samples, BATCH, 1_000_000_000)
-    try:
-        import onnx  # noqa: F401  # missed before the work, not after it
-    except ImportError as error:
-        raise HandSimError(
-            "training a detector needs onnx; install it with: pip install 'handsim[onnx]'"
-        ) from error
+    import_extra("onnx", "training a detector", "onnx")  # missed before the work, not after it
     torch.manual_seed(seed)
     networks: dict[str, Network] = {FINDER: FinderNetwork(), KEYPOINTS: KeypointNetwork()}
     if start is not None:
@@ -220,15 +215,15 @@ def _turn(angle: float) -> Doubles:
     return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
 
 
-def keypoint_batch(course: Course, rng: np.random.Generator, size: int = BATCH) -> Batch:
+def keypoint_batch(course: Course, rng: np.random.Generator) -> Batch:
     """Pictures of single hands, and some of none. Targets: keypoints [share of the side], presence, palm.
 
     The palm faces the camera (1), or does not (0), or that is not known (-1). Mirrored pictures have the same
     answer, which is learned long before the side.
     """
-    pictures, points = [], np.full((size, NUM_KEYPOINTS, 2), np.nan, np.float32)
-    presence, palms = np.zeros(size, np.float32), np.full(size, -1.0, np.float32)
-    for number in range(size):
+    pictures, points = [], np.full((BATCH, NUM_KEYPOINTS, 2), np.nan, np.float32)
+    presence, palms = np.zeros(BATCH, np.float32), np.full(BATCH, -1.0, np.float32)
+    for number in range(BATCH):
         lesson = course.draw(rng)
         wide, is_hand = lesson.picture(), len(lesson.sides) > 0
         keypoints = lesson.keypoints[0] if is_hand else np.full((NUM_KEYPOINTS, 2), np.nan)
@@ -246,8 +241,10 @@ def keypoint_batch(course: Course, rng: np.random.Generator, size: int = BATCH) 
         image, moved = cut(wide, matrix, (CROP_SIZE, CROP_SIZE)), keypoints @ matrix[:, :2].T + matrix[:, 2]
         if rng.random() < 0.5:
             image, moved = image[:, ::-1], [CROP_SIZE, 0.0] + moved * [-1.0, 1.0]
-        if rng.random() < 0.15:
-            image = _hidden(image, rng)
+        if rng.random() < 0.15:  # A patch of one color is before the hand.
+            (left, top), (width, height) = rng.integers(0, CROP_SIZE - 16, 2), rng.integers(12, 48, 2)
+            image = np.array(image)
+            image[top : top + height, left : left + width] = rng.integers(0, 256, 3)
         pictures.append(normalized(recolored(np.ascontiguousarray(image), rng)))
         points[number] = moved / CROP_SIZE
         if is_hand and lesson.sides[0] >= 0 and np.isfinite(spread := palm_spread(keypoints)):
@@ -255,15 +252,6 @@ def keypoint_batch(course: Course, rng: np.random.Generator, size: int = BATCH) 
         presence[number] = is_hand
     told = (torch.from_numpy(points), torch.from_numpy(presence), torch.from_numpy(palms))
     return _stacked(pictures), told
-
-
-def _hidden(image: Bytes, rng: np.random.Generator) -> Bytes:
-    """A square with a patch of one color before it."""
-    image = np.array(image)
-    left, top = rng.integers(0, CROP_SIZE - 16, 2)
-    width, height = rng.integers(12, 48, 2)
-    image[top : top + height, left : left + width] = rng.integers(0, 256, 3)
-    return image
 
 
 def _stacked(pictures: list[Floats]) -> torch.Tensor:
@@ -290,11 +278,11 @@ def keypoint_loss(found: tuple[torch.Tensor, torch.Tensor], targets: Targets) ->
     return loss + (wrong * known).sum() / known.sum().clamp(min=1)
 
 
-def finder_batch(course: Course, rng: np.random.Generator, size: int = BATCH) -> Batch:
+def finder_batch(course: Course, rng: np.random.Generator) -> Batch:
     """Pictures, turned, cut and scaled; targets: cells (4, S/8, S/8) as the network's, and their weight."""
     cells = FINDER_SIZE // CELL
-    pictures, targets = [], np.zeros((size, 5, cells, cells), np.float32)
-    for number in range(size):
+    pictures, targets = [], np.zeros((BATCH, 5, cells, cells), np.float32)
+    for number in range(BATCH):
         lesson = course.draw(rng)
         picture = lesson.picture()
         long, short = FINDER_SIZE, round(FINDER_SIZE * _ASPECTS[rng.integers(len(_ASPECTS))])

@@ -24,13 +24,13 @@ _USUAL_RATE: Final = 30.0  # [Hz] of a video that does not tell its own
 
 
 class Film:
-    """A video file, read frame by frame.
+    """A video file, read frame by frame, as it is or without the lens of its camera.
 
     Raises:
         CaptureError: The file is missing, or no video that OpenCV reads.
     """
 
-    def __init__(self, path: str | Path) -> None:
+    def __init__(self, path: str | Path, lens_of: Camera | None = None) -> None:
         check_type("video", path, (str, os.PathLike), "the path of a video")
         self.path = Path(path)
         check_regular(self.path, error=CaptureError)
@@ -45,6 +45,7 @@ class Film:
         self.num_frames = int(max(count, 0))
         """As the file tells it, which may be wrong."""
         Camera("film", self.size, np.diag([1.0, 1.0, 1.0]))  # refuses pictures that are too large
+        self._maps = None if lens_of is None else straightening(lens_of)
 
     def _open(self) -> None:
         level = cv2.utils.logging.getLogLevel()
@@ -78,7 +79,16 @@ class Film:
         if not done or picture.shape[1::-1] != self.size:
             raise CaptureError(f"{self.path}: a frame is damaged, or of another size than {self.size}")
         time = 1e-3 * float(self._reader.get(cv2.CAP_PROP_POS_MSEC))
+        if self._maps is not None:
+            picture = cv2.remap(picture, self._maps, None, cv2.INTER_LINEAR)
         return time, np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB))
+
+    def picture(self, number: int) -> Bytes:
+        """The picture (sRGB) of a frame that the video has."""
+        frame = self.frame(number)
+        if frame is None:
+            raise CaptureError(f"{self.path}: frame {number} cannot be read; was the file changed?")
+        return frame[1]
 
 
 def straightening(camera: Camera) -> Floats:
@@ -99,24 +109,5 @@ class FilmPictures:
     path: Path
     poses: Float[np.ndarray, "T 4 4"]
     """Pose of the camera in each frame [m]."""
-    straightened: Camera | None = None
+    lens_of: Camera | None = None
     """The camera whose pictures are wanted without its lens; None for pictures as they are."""
-
-
-class FilmReader:
-    """Reads the pictures of `FilmPictures`, in one process."""
-
-    def __init__(self, pictures: FilmPictures) -> None:
-        self._film, self._maps = Film(pictures.path), None
-        self.name = pictures.path.name
-        if pictures.straightened is not None:
-            self._maps = straightening(pictures.straightened)
-
-    def picture(self, number: int) -> Bytes:
-        """The picture (sRGB) of a frame."""
-        frame = self._film.frame(number)
-        if frame is None:
-            raise CaptureError(f"{self.name}: frame {number} cannot be read; was the file changed?")
-        if self._maps is None:
-            return frame[1]
-        return np.asarray(cv2.remap(frame[1], self._maps, None, cv2.INTER_LINEAR))
