@@ -188,7 +188,7 @@ def annotate_film(
 
 
 def filmed_take(take: Take, registration: Registration, *, every: bool = False) -> Take:
-    """A take with one frame for each frame of the video; poses of those that do not fit are NaN, unless `every`.
+    """A take with a frame for each of the video; poses of those that do not fit are NaN, unless `every`.
 
     A hand has the pose of the time at which a rolling shutter reads the rows that it is in.
     """
