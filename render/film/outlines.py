@@ -66,7 +66,7 @@ class Edges(NamedTuple):
 
     def samples(self, most: int) -> Samples:
         """The edges for a bundle, this many at most, evenly."""
-        one = Edges(*(values[:: 1 + len(self.frames) // most] for values in self))
+        one = Edges._make(values[:: 1 + len(self.frames) // most] for values in self)
 
         def points_at(times: Doubles) -> tuple[Doubles, Doubles]:
             late = (times[one.frames] - one.times)[:, None]
@@ -79,7 +79,7 @@ class Seen(NamedTuple):
     """How well the outlines of hands are seen in frames; NaN where there is no hand."""
 
     tried: Doubles  # (F, H): number of points at which an edge was looked for
-    count: Doubles  # (F, H): number of edges
+    found: Doubles  # (F, H): number of edges
     middle: Doubles  # (F, H): median distance of the edges from the drawn outline [px]
     most: Doubles  # (F, H): distance within which the share `_WITHIN` of them is [px]
     odds: Doubles  # (F, H): least mean log-odds of a bone's colors
@@ -159,7 +159,7 @@ class Outlines:
                     continue
                 chosen, offsets, spreads, odds = self._across(look, hand, outline, radius)
                 tried, away = len(outline.pixels), offsets / self._scale
-                outline = _Outline(*(values[chosen] for values in outline))
+                outline = _Outline._make(values[chosen] for values in outline)
                 middle, most = np.quantile(np.abs(away), (0.5, _WITHIN)) if len(away) else (np.nan, np.nan)
                 seen[:, frame, hand] = tried, len(away), middle, most, odds
                 places = look.corner + outline.pixels + offsets[:, None] * outline.normals
@@ -172,9 +172,9 @@ class Outlines:
                 ))  # fmt: skip
         if not parts:
             return None, Seen(*seen)
-        found = Edges(*(np.concatenate(values) for values in zip(*parts, strict=True)))
+        found = Edges._make(np.concatenate(values) for values in zip(*parts, strict=True))
         kept = np.isfinite(found.weights)  # others are beyond what the lens sees
-        return Edges(*(values[kept] for values in found)), Seen(*seen)
+        return Edges._make(values[kept] for values in found), Seen(*seen)
 
     def _shrunk_camera(self, camera: Camera) -> Camera:
         K = np.diag([self._scale, self._scale, 1.0]) @ camera.K
@@ -315,7 +315,7 @@ def _outline(look: _Look, hand: int, fit: GloveFit, qpos: Doubles) -> _Outline |
     outward = (beside - rays) / np.linalg.norm(beside - rays, axis=1, keepdims=True)
     points = rays * truth.depth[rows, columns, None].astype(np.float64) @ rotation.T + place
     bones = truth.parts[rows, columns].astype(np.int64) - 1 - PARTS_A_HAND * hand
-    return _Outline(*(one[good] for one in (pixels, normals, points, outward @ rotation.T, bones)))
+    return _Outline._make(one[good] for one in (pixels, normals, points, outward @ rotation.T, bones))
 
 
 def _shares(counts: Doubles) -> Doubles:

@@ -301,7 +301,7 @@ def _keypoint_fit(bundle: Bundle, state: State) -> _Fit:
 
 def _outline_fit(bundle: Bundle, edges: Edges, seen: Seen, fit: _Fit) -> _Fit:
     """How well frames fit by their outlines, or by their keypoints where hardly an outline is seen."""
-    told = seen.count >= np.maximum(_FEWEST_EDGES, _SEEN * seen.tried)
+    told = seen.found >= np.maximum(_FEWEST_EDGES, _SEEN * seen.tried)
     middle, most = (np.where(told, one, np.nan) for one in (seen.middle, seen.most))
     usual = float(np.nanmedian(most)) if told.any() else 0.0
     bound = max(_BOUND * usual, 0.5 * _LEAST_BOUND * bundle.size[0])

@@ -378,7 +378,9 @@ def _load_folded(network: Network, path: Path) -> None:
         for node in graph.node
         if node.op_type in ("Conv", "Gemm")
     )
-    layers = [one for one in network.modules() if isinstance(one, nn.Conv2d | nn.Linear | nn.BatchNorm2d)]
+    layers: list[Any] = [
+        one for one in network.modules() if isinstance(one, nn.Conv2d | nn.Linear | nn.BatchNorm2d)
+    ]
     for layer, norm in itertools.zip_longest(layers, layers[1:]):
         if isinstance(layer, nn.BatchNorm2d):
             continue
