@@ -36,7 +36,6 @@ _DEPENDENT: Final = 16.0  # This many samples count as one with an independent e
 # last is how much thicker than the tracked hands the filmed ones are [m]: cloth, or a measured hand's error.
 OFFSET, DRIFT, READOUT, FOCAL, _CENTER, _LENS, THICKER, POSES = 0, 1, 2, 3, slice(4, 6), slice(6, 8), 8, 9
 _PRIORS: Final = np.array([np.inf, 1e-4, 0.015, 0.7, 0.005, 0.005, 0.05, 0.05, 0.0007])
-_USUAL_FOCAL: Final = 0.1  # logarithm of the focal length [widths]
 
 
 class FoundFrame(NamedTuple):
@@ -233,8 +232,6 @@ class Bundle:
             free[[DRIFT, READOUT]] = free[_CENTER] = free[_LENS] = free[THICKER] = False
         priors = np.concatenate([_PRIORS, np.full(size - POSES, np.inf)])
         held = np.sqrt(_DEPENDENT) * np.diag(1.0 / priors)
-        usual = np.zeros(size)
-        usual[FOCAL] = _USUAL_FOCAL
         far = self.rows(state, samples, noise)[:, :1]
         robust = 1.0 / np.sqrt(1.0 + (far / _ROBUST) ** 2)
 
@@ -246,7 +243,7 @@ class Bundle:
         @functools.lru_cache(maxsize=1)  # SciPy asks for residuals and derivatives one after the other
         def rows(part: bytes) -> Doubles:
             now = widened(np.frombuffer(part))
-            known = np.column_stack([held @ (now.values - usual), held])
+            known = np.column_stack([held @ now.values, held])
             own = _without_regions(robust * self.rows(now, samples, noise), samples.regions)
             return np.concatenate([own, known])
 

@@ -388,9 +388,7 @@ def _load_folded(network: Network, path: Path) -> None:
         layer.weight.data.copy_(weight)
         if isinstance(norm, nn.BatchNorm2d):
             norm.running_var.fill_(1.0 - norm.eps)
-            norm.bias.data.copy_(bias)
-        else:
-            layer.bias.data.copy_(bias)
+        (layer if layer.bias is not None else norm).bias.data.copy_(bias)
 
 
 if __name__ == "__main__":
