@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Final, NamedTuple, Protocol
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
@@ -56,26 +56,6 @@ class Geometry(NamedTuple):
     parts: UInt8[np.ndarray, "H W"]
     instances: UInt8[np.ndarray, "H W"]
     markers: UInt8[np.ndarray, "H W"]
-
-
-class FilmReader(Protocol):
-    """Reads the pictures of a video."""
-
-    name: str
-
-    def picture(self, number: int) -> Bytes:
-        """The picture (H, W, 3) of a frame, sRGB."""
-
-
-class FilmPictures(Protocol):
-    """The pictures of a video in the place of drawn colors, by the numbers of its frames."""
-
-    @property
-    def poses(self) -> Float[np.ndarray, "T 4 4"]:
-        """Pose of the camera in each frame [m]."""
-
-    def open(self) -> FilmReader:
-        """A reader for one process."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

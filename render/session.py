@@ -44,6 +44,7 @@ from render.captions import contact_sheet, write_png
 from render.color_sensor import sample_exposure, sample_shutter
 from render.config import RenderConfig, SpawnKey
 from render.depth_sensor import sample_depth_noise
+from render.film.video import Film
 from render.formats.records import centered_K, without_colors
 from render.formats.shards import INDEX
 from render.formats.webdataset import TAR
@@ -56,7 +57,7 @@ from render.formats.writer import (
     shard_files,
     whole_shards,
 )
-from render.frames import Doubles, FilmReader, RenderedFrame
+from render.frames import Doubles, RenderedFrame
 from render.painting.figures import sample_people
 from render.scenery.backgrounds import photo_files
 from render.scenery.lights import sample_surroundings
@@ -157,7 +158,7 @@ class Drawing:
         has_user = self.subject.is_motion or config.view.placement == "head"
         self._user = UserBody(self.take) if has_user else None
         film = subject.film
-        self._film = None if film is None else film.open()
+        self._film = None if film is None else Film(film.path, film.lens_of)
         self._open_studio = functools.partial(
             open_studio, config=config, bodies=self.take.bodies, has_user=has_user, film=self._film
         )
@@ -258,7 +259,7 @@ def open_studio(
     bodies: Sequence[RigidBody] = (),
     rng: np.random.Generator,
     has_user: bool = False,
-    film: FilmReader | None = None,
+    film: Film | None = None,
 ) -> Studio:
     """A studio of one person with random looks, whose wrists a `UserBody` may bend."""
     people = sample_people(len(hands), config.dress == "glove", tones=config.tones, rng=rng)

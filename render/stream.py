@@ -88,6 +88,15 @@ def _hand(path: Path, name: str, label: dict[str, Any]) -> LabeledHand:
     )
 
 
+def read_photograph(path: Path) -> NDArray[np.uint8]:
+    """A photograph (H, W, 3), sRGB."""
+    with plain_path(path) as plain:
+        bgr = cv2.imread(str(plain), cv2.IMREAD_COLOR)
+    if bgr is None:
+        raise DatasetError(f"{path}: not a readable photograph")
+    return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+
+
 def cut_out(
     hand: LabeledHand, size: int, share: float, *, rng: np.random.Generator
 ) -> dict[str, NDArray[np.generic]]:
@@ -95,10 +104,7 @@ def cut_out(
 
     The photograph's border is repeated outside of it. Keypoints and box are in pixels of the square.
     """
-    with plain_path(hand.file) as plain:
-        photograph = cv2.imread(str(plain), cv2.IMREAD_COLOR)
-    if photograph is None:
-        raise DatasetError(f"{hand.file}: not a readable photograph")
+    photograph = read_photograph(hand.file)
     low, high = np.nanmin(hand.keypoints, axis=0), np.nanmax(hand.keypoints, axis=0)
     side = max(float((high - low).max()), 1.0) / share
     corner = 0.5 * (low + high - side) + _FREE * rng.uniform(-0.5, 0.5, 2) * (side - (high - low))
@@ -109,7 +115,7 @@ def cut_out(
         photograph = cv2.GaussianBlur(photograph, (0, 0), 0.4 / scale)
     square = cv2.warpAffine(photograph, matrix, (size, size), borderMode=cv2.BORDER_REPLICATE)
     return {
-        "rgb": np.moveaxis(cv2.cvtColor(square, cv2.COLOR_BGR2RGB), 2, 0),
+        "rgb": np.moveaxis(square, 2, 0),
         "keypoints": (hand.keypoints - corner) * scale,
         "visible": hand.visible,
         "box": np.array([*(low - corner), *(high - low)]) * scale,

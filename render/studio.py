@@ -24,6 +24,7 @@ from handsim.space.camera import Camera
 from handsim.space.transforms import pose_matrices
 from render.color_sensor import Exposure, Shutter, combine, expose, linear_of, shutter_times
 from render.depth_sensor import DepthNoise, TimeOfFlight, apply_depth_noise, reflectance_of
+from render.film.video import Film
 from render.frames import (
     FOREARM,
     PARTS_A_HAND,
@@ -31,7 +32,6 @@ from render.frames import (
     BodyTruth,
     Bytes,
     Doubles,
-    FilmReader,
     Flags,
     Floats,
     Geometry,
@@ -201,7 +201,7 @@ class Studio:
         painter: Painter = "compiled",
         *,
         room_depth: bool = True,
-        film: FilmReader | None = None,
+        film: Film | None = None,
     ) -> None:
         self.passes, self.painter, self._room_depth = tuple(passes), painter, room_depth
         self._film = film  # whose pictures take the place of drawn colors
@@ -400,7 +400,7 @@ class Studio:
 
     def _record(self, choices: FrameChoices) -> dict[str, Any]:
         if self._film is not None:
-            return {"film": self._film.name}
+            return {"film": self._film.path.name}
         record = _as_record(dataclasses.replace(choices, seed=0)) | {"seed": choices.seed}
         return {"people": self._looks, "body_colors": self._colors, **record}
 

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from numpy.typing import ArrayLike, NDArray
 
-from handsim._checks import check_choice, check_type
+from handsim._checks import check_array, check_choice, check_type
 from handsim.errors import ArgumentError, WeightsError
 from handsim.files.inputs import read_bytes, sign_model
 from handsim.hand.shape import NUM_KEYPOINTS, SIDES, Side
@@ -35,7 +35,7 @@ MOST_BYTES: Final = 1 << 26  # of a file of weights
 _MOST_FOUND: Final = 8  # places in a picture at which hands are looked for
 _LEAST_HEAT: Final = 0.25  # of a place at which a hand is looked for
 _LEAST_CONFIDENCE: Final = 0.5
-_SAME: Final = 0.25  # mean distance of the keypoints of one hand that was found twice [longer side]
+_SAME: Final = 0.6  # Boxes whose intersection is a larger share of their union are of one hand.
 
 Doubles = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -111,18 +111,10 @@ class HandDetector:
             ArgumentError: The picture is no array of bytes with three channels.
         """
         picture = _checked(image)
-        hands: list[FoundHand] = []
-        for corners in self._places(picture):
-            first = self._look(picture, square_around(corners))
-            hand = self._second_look(picture, first)
-            if hand.confidence >= _LEAST_CONFIDENCE:
-                hands.append(hand)
-        hands.sort(key=lambda hand: -hand.confidence)
-        kept: list[FoundHand] = []
-        for hand in hands:
-            if not any(_are_same(hand, other) for other in kept):
-                kept.append(hand)
-        return kept
+        squares = [square_around(corners) for corners in self._places(picture)]
+        hands = [self._second_look(picture, self._look(picture, square)) for square in squares]
+        boxes, sure = [hand.box.tolist() for hand in hands], [hand.confidence for hand in hands]
+        return [hands[number] for number in cv2.dnn.NMSBoxes(boxes, sure, _LEAST_CONFIDENCE, _SAME)]
 
     def refine(
         self, image: UInt8[np.ndarray, "H W 3"], boxes: ArrayLike, sides: Sequence[Side]
@@ -140,16 +132,14 @@ class HandDetector:
         Raises:
             ArgumentError: An argument has another shape, or a box no size.
         """
-        picture, places = _checked(image), np.asarray(boxes, dtype=np.float64)
-        places = places.reshape(-1, 4) if not places.size else places
-        if places.ndim != 2 or places.shape[1] != 4:
-            raise ArgumentError(f"boxes have the shape {places.shape}, expected (N, 4)")
+        picture = _checked(image)
+        places = check_array("boxes", boxes, (4,)).reshape(-1, 4) if np.size(boxes) else np.empty((0, 4))
         if len(places) != len(sides):
             raise ArgumentError(
                 f"there are {len(places)} boxes and {len(sides)} sides, expected one for each"
             )
-        if not (np.isfinite(places).all() and (places[:, 2:] > 0.0).all()):
-            raise ArgumentError("a box is not finite or has no size, expected left, top, width, height [px]")
+        if not (places[:, 2:] > 0.0).all():
+            raise ArgumentError("a box has no size, expected left, top, width, height [px]")
         found = []
         for box, side in zip(places, sides, strict=True):
             check_choice(side, SIDES, noun="side")
@@ -280,12 +270,6 @@ def _checked(image: object) -> NDArray[np.uint8]:
             f"image is {picture.dtype} of shape {picture.shape}, expected uint8 of shape (H, W, 3), sRGB"
         )
     return picture
-
-
-def _are_same(hand: FoundHand, other: FoundHand) -> bool:
-    """Whether one hand was found twice."""
-    away = float(np.linalg.norm(hand.keypoints - other.keypoints, axis=1).mean())
-    return away < _SAME * float(max(hand.box[2:].max(), other.box[2:].max()))
 
 
 def _network(content: bytes) -> Any:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -13,15 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from handsim.errors import DatasetError
-from handsim.files.outputs import plain_path
 from handsim.hand.model import HandModel
 from handsim.hand.shape import NUM_KEYPOINTS, NUM_QPOS, SIDES
 from poses import sample_poses
 from render.config import RenderConfig
 from render.film.detector import cut, square_around
 from render.frames import Bytes, Doubles
-from render.stream import PictureStream, load_labeled_hands
+from render.stream import PictureStream, load_labeled_hands, read_photograph
 
 VIEW_SIZE: Final = 320  # longer side of a stored picture [px]
 WIDE: Final = 192  # of a stored square around a hand [px]: it can be turned and shifted
@@ -33,7 +30,6 @@ _SITTING: Final = 16  # pictures of a person
 _FEWEST_SEEN: Final = 4  # keypoints of a hand that must be seen
 _EMPTY: Final = 0.35  # share of the scenes of which a square without a hand is kept
 _QUALITY: Final = 88  # of JPEG files
-MOST_HANDS: Final = 4  # hands of a photograph that are learned from
 
 
 class Scene(NamedTuple):
@@ -44,63 +40,47 @@ class Scene(NamedTuple):
     sides: NDArray[np.int8]  # (N,) 0 left, 1 right, -1 unknown
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Lessons:
-    """Pictures and the hands in them."""
+class Lesson(NamedTuple):
+    """A scene as it is kept."""
 
-    files: list[Bytes]  # JPEG
-    keypoints: NDArray[np.float32]  # (N, H, 21, 2) [px]; NaN where there is no hand, or no label
-    sides: NDArray[np.int8]  # (N, H) 0 left, 1 right, -1 unknown
-
-    @classmethod
-    def of(cls, scenes: Sequence[Scene], most: int) -> Lessons:
-        """Scenes, and this many hands of each at most."""
-        keypoints = np.full((len(scenes), most, NUM_KEYPOINTS, 2), np.nan, np.float32)
-        files, sides = [], np.full((len(scenes), most), -1, np.int8)
-        for number, scene in enumerate(scenes):
-            bgr = cv2.cvtColor(scene.picture, cv2.COLOR_RGB2BGR)
-            files.append(cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1])
-            count = min(most, len(scene.sides))
-            keypoints[number, :count], sides[number, :count] = scene.keypoints[:count], scene.sides[:count]
-        return cls(files, keypoints, sides)
+    file: Bytes  # JPEG
+    keypoints: Doubles  # as in `Scene`
+    sides: NDArray[np.int8]
 
     @classmethod
-    def joined(cls, parts: Iterable[Lessons]) -> Lessons:
-        """Several, one after the other."""
-        every = list(parts)
-        files = [file for part in every for file in part.files]
-        keypoints = np.concatenate([part.keypoints for part in every])
-        return cls(files, keypoints, np.concatenate([part.sides for part in every]))
+    def of(cls, scene: Scene) -> Lesson:
+        """A scene, compressed."""
+        bgr = cv2.cvtColor(scene.picture, cv2.COLOR_RGB2BGR)
+        file = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1]
+        return cls(np.asarray(file, dtype=np.uint8), scene.keypoints, scene.sides)
 
-    def picture(self, number: int) -> Bytes:
-        """A picture (H, W, 3), sRGB."""
-        bgr = cv2.imdecode(self.files[number], cv2.IMREAD_COLOR)
+    def picture(self) -> Bytes:
+        """The picture (H, W, 3), sRGB."""
+        bgr = cv2.imdecode(self.file, cv2.IMREAD_COLOR)
         return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 
 
-def lessons_of(scenes: Iterable[Scene], *, rng: np.random.Generator) -> tuple[Lessons, Lessons]:
+def lessons_of(scenes: Iterable[Scene], *, rng: np.random.Generator) -> tuple[list[Lesson], list[Lesson]]:
     """Whole pictures for the finder, and squares with and without a hand for the keypoint network."""
-    parts = []
+    views, squares = [], []
     for scene in scenes:
         height, width = scene.picture.shape[:2]
         scale = VIEW_SIZE / max(height, width)
         small = cut(scene.picture, scale * np.eye(2, 3), (round(scale * width), round(scale * height)))
-        places = [points[np.isfinite(points[:, 0])] for points in scene.keypoints]
-        squares = [_square(scene, points, [number]) for number, points in enumerate(places)]
+        views.append(Lesson.of(Scene(small, scale * scene.keypoints, scene.sides)))
+        for number, points in enumerate(scene.keypoints):
+            squares.append(_square(scene, points[np.isfinite(points[:, 0])], [number]))
         empty = _empty_place(scene, rng)
         if empty is not None and rng.random() < _EMPTY:
             squares.append(_square(scene, empty, []))
-        view = Scene(small, scale * scene.keypoints, scene.sides)
-        parts.append((Lessons.of([view], MOST_HANDS), Lessons.of(squares, 1)))
-    views, squared = (Lessons.joined(part) for part in zip(*parts, strict=True))
-    return views, squared
+    return views, squares
 
 
-def _square(scene: Scene, points: Doubles, hands: list[int]) -> Scene:
+def _square(scene: Scene, points: Doubles, hands: list[int]) -> Lesson:
     """The square around points, with these hands."""
     matrix = square_around(points, WIDE_ROOM, WIDE)
     keypoints = scene.keypoints[hands] @ matrix[:, :2].T + matrix[:, 2]
-    return Scene(cut(scene.picture, matrix, (WIDE, WIDE)), keypoints, scene.sides[hands])
+    return Lesson.of(Scene(cut(scene.picture, matrix, (WIDE, WIDE)), keypoints, scene.sides[hands]))
 
 
 def _empty_place(scene: Scene, rng: np.random.Generator) -> Doubles | None:
@@ -153,11 +133,6 @@ def read_scenes(file: Path) -> Iterator[Scene]:
     """Your own photographs with the hands of a file of COCO keypoints."""
     hands = sorted(load_labeled_hands(file), key=lambda hand: hand.file)
     for path, group in itertools.groupby(hands, key=lambda hand: hand.file):
-        with plain_path(path) as plain:
-            bgr = cv2.imread(str(plain), cv2.IMREAD_COLOR)
-        if bgr is None:
-            raise DatasetError(f"{path}: not a readable photograph")
         labeled = list(group)
-        picture = np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), dtype=np.uint8)
         sides = np.array([hand.side for hand in labeled], dtype=np.int8)
-        yield Scene(picture, np.stack([hand.keypoints for hand in labeled]), sides)
+        yield Scene(read_photograph(path), np.stack([hand.keypoints for hand in labeled]), sides)

@@ -75,12 +75,11 @@ class FinderNetwork(nn.Module):
 class KeypointNetwork(nn.Module):
     """Maps of keypoints (B, 21, 16, 16), and log-odds of a hand and of a palm before the camera (B, 2)."""
 
-    def __init__(self, widths: tuple[int, int, int, int] = (32, 64, 96, 128)) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        _, b, _, d = widths
-        self.backbone = Backbone(widths)
-        self.head = nn.Sequential(*convolution(2 * b, 64), Residual(64), nn.Conv2d(64, NUM_KEYPOINTS, 1))
-        self.told = nn.Sequential(nn.Flatten(), nn.Linear(16 * d, 64), nn.ReLU(), nn.Linear(64, 2))
+        self.backbone = Backbone((32, 64, 96, 128))
+        self.head = nn.Sequential(*convolution(128, 64), Residual(64), nn.Conv2d(64, NUM_KEYPOINTS, 1))
+        self.told = nn.Sequential(nn.Flatten(), nn.Linear(16 * 128, 64), nn.ReLU(), nn.Linear(64, 2))
 
     def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Squares in, maps and log-odds out."""

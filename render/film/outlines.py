@@ -7,8 +7,9 @@ and Reid 2012, Int. J. Comput. Vis. 98:335; Stoiber et al. 2022, Int. J. Comput.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterable, Sequence
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import cv2
 import numpy as np
@@ -19,11 +20,12 @@ from gloves.takes.take import Take
 from handsim.hand.model import between_poses
 from handsim.space.camera import Camera
 from handsim.space.transforms import pose_matrices
-from render.film.bundle import READOUT, Bundle, Samples
+from render.film.bundle import READOUT, Bundle, Samples, State
+from render.film.video import straight, straightening
 from render.frames import FOREARM, PARTS_A_HAND, Bytes, Doubles, Flags, Floats, Geometry, Integers
 from render.painting.figures import BodyFigure
 from render.painting.rasterizer import Triangles, see
-from render.skin.mesh import PosableSkin
+from render.skin.mesh import PosableSkin, face_parts, skin_atlas
 
 _WIDEST: Final = 800  # [px] Wider pictures are shrunk to this width.
 _MOST_POINTS: Final = 80  # largest number of outline points of a hand in a picture
@@ -37,219 +39,76 @@ _BESIDE: Final = 5  # [px] width of each side for this mean
 _FLAT: Final = 3  # number of pixels at each end that show the colors of the two sides
 _NOISIEST: Final = 0.25  # largest deviation of those colors, over the difference of the two sides
 _LINEAR: Final = (np.linspace(0.0, 1.0, 256, dtype=np.float32) ** 2.2)[:, None]
+_FEWEST_POINTS: Final = 10  # An outline has this many points.
 _FEWEST_PIXELS: Final = 30  # Colors of a region are counted if it has this many pixels.
 _AROUND: Final = 14  # [px] width of the ring around the reach whose colors are the background's
 _BLUR: Final = 0.3  # [px] least standard deviation of an edge
 _ARM: Final = 0.02  # [m] The outline this near to the forearm is left out, because the wrist bends there.
 _BALL: Final = 0.004  # [m] The outline this near to a marker is left out, because the glove may carry it.
 _EDGE: Final = 3.0  # [px] The outline this near to the edge of the picture is left out.
+_WITHIN: Final = 0.8  # share of the edges whose largest distance is told
 _OTHER: Final = 4.0  # [px] The outline this near to another hand or thing is left out.
 
 
 class Edges(NamedTuple):
     """Points of outlines, and where in the pictures they are seen."""
 
-    frames: Integers
-    hands: Integers
-    pixels: Doubles
-    """(N, 2): where each edge is."""
-    normals: Doubles
-    """(N, 2): unit normals of the edges, out of the hand."""
-    weights: Doubles
-    """(N,): one over the standard deviation [1/px]."""
-    points: Doubles
-    """(N, 3): on the drawn hand [m]."""
-    velocities: Doubles
-    """(N, 3) [m/s]."""
-    outward: Doubles
-    """(N, 3): unit normals of the hand's surface."""
-    regions: Integers
-    """(N,): one of four sides of one bone of one hand."""
-    times: Doubles
-    """(N,): of the take, at which the points are there [s]."""
-    offsets: Doubles
-    """(N,): distance of the edge from the drawn outline [px]."""
+    frames: Integers  # (N,)
+    pixels: Doubles  # (N, 2): where each edge is, as a bundle counts them
+    normals: Doubles  # (N, 2): unit normals of the edges, out of the hand
+    weights: Doubles  # (N,): one over the standard deviation [1/px]
+    points: Doubles  # (N, 3): on the drawn hand [m]
+    velocities: Doubles  # (N, 3) [m/s]
+    outward: Doubles  # (N, 3): unit normals of the hand's surface
+    regions: Integers  # (N,): one of four sides of one bone of one hand
+    times: Doubles  # (N,): of the take, at which the points are there [s]
+    offsets: Doubles  # (N,): distance of the edge from the drawn outline [px]
 
-    def thinned(self, most: int) -> Edges:
-        """This many at most, evenly."""
-        kept: list[Any] = [values[:: 1 + len(values) // most] for values in self]
-        return Edges(*kept)
-
-    def samples(self, bundle: Bundle) -> Samples:
-        """The edges for a bundle."""
-        aside = self.pixels + self.normals[:, ::-1] * [-1.0, 1.0]
-        pixels, beside = (bundle.flat(one)[0] for one in (self.pixels, aside))
-        along = beside - pixels
-        length = np.linalg.norm(along, axis=1)
-        normals = along[:, ::-1] * [1.0, -1.0] / length[:, None]
+    def samples(self, most: int) -> Samples:
+        """The edges for a bundle, this many at most, evenly."""
+        one = Edges._make(values[:: 1 + len(self.frames) // most] for values in self)
 
         def points_at(times: Doubles) -> tuple[Doubles, Doubles]:
-            late = (times[self.frames] - self.times)[:, None]
-            return self.points + self.velocities * late, self.velocities
+            late = (times[one.frames] - one.times)[:, None]
+            return one.points + one.velocities * late, one.velocities
 
-        return Samples(
-            self.frames, pixels, normals[:, None], self.weights / length, self.outward, self.regions,
-            points_at,
-        )  # fmt: skip
+        return Samples(one.frames, one.pixels, one.normals, one.weights, one.outward, one.regions, points_at)
 
 
-class Outlines:
-    """Finds the edges of a take's hands in pictures of a video of this size."""
+class Seen(NamedTuple):
+    """How well the outlines of hands are seen in frames; NaN where there is no hand."""
 
-    def __init__(self, take: Take, size: tuple[int, int]) -> None:
-        self._take, self._scale = take, min(1.0, _WIDEST / max(size))
-        width, height = (max(1, round(self._scale * side)) for side in size)
-        self._size = width, height
-        self._skins = [PosableSkin(hand.model, bony=0.5) for hand in take.hands]
-        self._bodies = [BodyFigure(body, (0.5, 0.5, 0.5)) for body in take.bodies]
-        self._seen = np.zeros((len(take.hands), 1 << 3 * _LEVELS))  # counts of the hands' colors
+    tried: Doubles  # (F, H): number of points at which an edge was looked for
+    found: Doubles  # (F, H): number of edges
+    middle: Doubles  # (F, H): median distance of the edges from the drawn outline [px]
+    most: Doubles  # (F, H): distance within which the share `_WITHIN` of them is [px]
+    odds: Doubles  # (F, H): least mean log-odds of a bone's colors
 
-    def shrunk(self, picture: Bytes) -> Bytes:
-        """A picture as it is looked at."""
-        if self._scale == 1.0:
-            return picture
-        return np.asarray(cv2.resize(picture, self._size, interpolation=cv2.INTER_AREA))
 
-    def edges(
-        self,
-        bundle: Bundle,
-        unknowns: Doubles,
-        starts: Sequence[int],
-        looks: Iterable[tuple[int, Bytes]],
-        reach: float,
-    ) -> tuple[Edges | None, Integers, Doubles]:
-        """The edges within `reach` [widths] in numbered frames.
+def poses_at(take: Take, moments: Doubles) -> Doubles:
+    """Poses (F, H, 27) of each hand at its own times (F, H) [s]; NaN before and after the take."""
+    poses = np.empty((*moments.shape, take.qpos.shape[2]))
+    for hand, times in enumerate(moments.T):
+        poses[:, [hand]] = between_poses(take.times, times, take.qpos[:, [hand]], take.rate)
+    poses[(moments < take.times[0]) | (moments > take.times[-1])] = np.nan
+    return poses
 
-        Returns:
-            Edges, numbers (F, H) of points that were tried, and the least mean log-odds of a bone's colors.
-        """
-        take, times = self._take, bundle.times(unknowns)
-        spans = np.searchsorted(starts, np.arange(len(times)), side="right") - 1
-        cameras = [bundle.camera(unknowns, span) for span in range(len(starts))]
-        moments = times[:, None] + unknowns[READOUT] * self._late(cameras, spans, times)  # (F, H)
-        cameras = [self._shrunk_camera(camera) for camera in cameras]
-        poses = [
-            [between_poses(take.times, one + shift, take.qpos[:, [hand]], take.rate)[:, 0]
-             for shift in (0.0, -_STEP, _STEP)]
-            for hand, one in enumerate(moments.T)
-        ]  # fmt: skip
-        qpos = np.moveaxis(np.array(poses), 2, 0)  # (F, H, 3, 27)
-        bodies = between_poses(take.times, times, take.body_poses, take.rate)
-        tried, radius = np.zeros(moments.shape, dtype=np.int64), max(3, round(reach * self._size[0]))
-        least, parts = np.full(moments.shape, np.nan), []
-        for frame, picture in looks:
-            there = np.flatnonzero(np.isfinite(qpos[frame, :, :, 0]).all(axis=1)).tolist()
-            if not there:
-                continue
-            camera = cameras[spans[frame]]
-            drawn = [self._hand(hand, qpos[frame, hand, 0]) for hand in there]
-            drawn += self._things(bodies[frame])
-            truth = see(camera, drawn, with_normals=False)
-            for hand in there:
-                outline = _outline(truth, hand, camera, take.hands[hand], qpos[frame, hand, 0])
-                if outline is None:
-                    continue
-                tried[frame, hand] = len(outline.pixels)
-                chosen, offsets, spreads, least[frame, hand] = self._across(
-                    picture, truth, hand, outline, radius
-                )
-                kept: list[Any] = [values[chosen] for values in outline]
-                outline = _Outline(*kept)
-                count = len(offsets)
-                velocities, regions = self._moved(hand, qpos[frame, hand], outline)
-                parts.append(Edges(
-                    np.full(count, frame), np.full(count, hand),
-                    (outline.pixels + offsets[:, None] * outline.normals) / self._scale, outline.normals,
-                    self._scale / spreads, outline.points, velocities, outline.outward,
-                    regions, np.full(count, moments[frame, hand]), offsets / self._scale,
-                ))  # fmt: skip
-        found = Edges(*(np.concatenate(values) for values in zip(*parts, strict=True))) if parts else None
-        return found, tried, least
 
-    def _late(self, cameras: list[Camera], spans: Integers, times: Doubles) -> Doubles:
-        """Rows of the hands' wrists (F, H), from -0.5 to 0.5 of the picture's height."""
-        take = self._take
-        wrists = between_poses(take.times, times, take.qpos, take.rate)[..., :3]
-        rows = np.array([cameras[span].project(one)[:, 1] for span, one in zip(spans, wrists, strict=True)])
-        return np.clip(np.nan_to_num(rows / cameras[0].size[1] - 0.5), -0.5, 0.5)
+def shutter_times(take: Take, times: Doubles, cameras: Sequence[Camera], readout: float) -> Doubles:
+    """Times (F, H) at which a rolling shutter reads the hands' rows, from those of the middle rows [s]."""
+    wrists = between_poses(take.times, times, take.qpos, take.rate)[..., :3]
+    rows = np.array([camera.project(one)[:, 1] for camera, one in zip(cameras, wrists, strict=True)])
+    late = np.clip(np.nan_to_num(rows / cameras[0].size[1] - 0.5), -0.5, 0.5)
+    return np.asarray(times[:, None] + readout * late)
 
-    def _shrunk_camera(self, camera: Camera) -> Camera:
-        K = np.diag([self._scale, self._scale, 1.0]) @ camera.K
-        return Camera(camera.name, self._size, K, camera.T_world_camera, camera.lens)
 
-    def _hand(self, hand: int, qpos: Doubles) -> Triangles:
-        """A drawn hand."""
-        skin = self._skins[hand].posed(qpos)
-        count = len(skin.faces)
-        return Triangles(
-            skin.vertices, skin.faces, skin.normals, (1 + PARTS_A_HAND * hand + skin.parts).astype(np.uint8),
-            np.full(count, 1 + hand, np.uint8), np.zeros(count, np.uint8),
-        )  # fmt: skip
+class _Look(NamedTuple):
+    """The part of a picture around the hands, as a pinhole camera sees it."""
 
-    def _things(self, poses: Doubles) -> list[Triangles]:
-        """The rigid bodies that the frame has."""
-        found = []
-        for number, T_world_body in enumerate(pose_matrices(poses)):
-            if np.isfinite(T_world_body).all():
-                instance = 1 + len(self._skins) + number
-                found += [one.triangles for one in self._bodies[number].drawn(T_world_body, instance)]
-        return found
-
-    def _moved(self, hand: int, qpos: Doubles, outline: _Outline) -> tuple[Doubles, Integers]:
-        """Velocities (N, 3) [m/s] of points, from poses (3, 27) now, before and after; and their regions."""
-        bones = self._take.hands[hand].model.forward_kinematics(qpos)[:, outline.bones]  # (3, N, 4, 4)
-        now, step = bones[0], (bones[2] - bones[1]) / (2.0 * _STEP)
-        local = np.einsum("nji,nj->ni", now[:, :3, :3], outline.points - now[:, :3, 3])
-        velocities = np.einsum("nij,nj->ni", step[:, :3, :3], local) + step[:, :3, 3]
-        sides = np.einsum("nji,nj->ni", now[:, :3, 1:3], outline.outward) > 0.0
-        return velocities, 4 * (FOREARM * hand + outline.bones) + sides @ [1, 2]
-
-    def _across(
-        self, picture: Bytes, truth: Geometry, hand: int, found: _Outline, reach: int
-    ) -> tuple[Integers, Doubles, Doubles, float]:
-        """Points of an outline with an edge, its distance, its deviation [px]; and the least log-odds."""
-        room = 2 * reach + _AROUND
-        low = np.maximum(np.floor(found.pixels.min(axis=0)).astype(int) - room, 0)
-        high = np.minimum(np.ceil(found.pixels.max(axis=0)).astype(int) + room, picture.shape[1::-1])
-        part = (slice(low[1], high[1]), slice(low[0], high[0]))
-        mine, free = truth.instances[part] == 1 + hand, truth.instances[part] == 0
-        levels = (picture[part] >> (8 - _LEVELS)).astype(np.int64)
-        colors = (levels[..., 0] << 2 * _LEVELS) | (levels[..., 1] << _LEVELS) | levels[..., 2]
-        inside = cv2.distanceTransform(mine.view(np.uint8), cv2.DIST_L2, 3)
-        outside = cv2.distanceTransform((~mine).view(np.uint8), cv2.DIST_L2, 3)
-        deep = inside > min(0.7 * reach, 0.5 * float(inside.max()))
-        around = free & (outside > min(0.7 * reach, 6.0)) & (outside < reach + _AROUND)
-        if deep.sum() < _FEWEST_PIXELS or around.sum() < _FEWEST_PIXELS:
-            return np.empty(0, np.int64), np.empty(0), np.empty(0), np.nan
-        self._seen[hand] += np.bincount(colors[deep], minlength=self._seen.shape[1])
-        beside = np.bincount(colors[around], minlength=self._seen.shape[1]).astype(np.float64)
-        odds = np.log(_shares(self._seen[hand]) / _shares(beside)).clip(-_SUREST, _SUREST)
-        table = odds.astype(np.float32)[colors]
-        within = mine & (inside > 1.5)
-        bones = truth.parts[part][within].astype(np.int64) - 1 - PARTS_A_HAND * hand
-        count = np.bincount(bones, minlength=PARTS_A_HAND)[:FOREARM]
-        total = np.bincount(bones, table[within], minlength=PARTS_A_HAND)[:FOREARM]
-        least = float((total / np.maximum(count, 1))[count >= _FEWEST_PIXELS].min(initial=_SUREST))
-        steps = np.arange(-reach, reach + 1)
-        places = (found.pixels - low)[:, None] + steps[:, None] * found.normals[:, None] - 0.5
-        at = places.astype(np.float32)
-        across = cv2.remap(table, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
-        in_me, in_free = (
-            cv2.remap(flags.view(np.uint8), at, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT) > 0
-            for flags in (mine, free)
-        )
-        chosen, offsets = _edge(across, in_me, in_free, reach)
-        if not len(chosen):
-            return chosen, offsets, offsets, least
-        normals = found.normals[chosen]
-        light = cv2.LUT(np.ascontiguousarray(picture[part]), _LINEAR)
-        at = (found.pixels[chosen] - low + offsets[:, None] * normals)[:, None] - 0.5
-        at = at + np.arange(-_BESIDE, _BESIDE + 1)[:, None] * normals[:, None]
-        colors = cv2.remap(
-            light, at.astype(np.float32), None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-        )
-        sharp, beyond, spreads = _sharpened(colors.reshape(*at.shape[:2], 3))
-        return chosen[sharp], (offsets + beyond)[sharp], spreads[sharp], least
+    corner: Integers  # (2,): of the part [px]
+    view: Camera
+    colors: Bytes
+    truth: Geometry  # what is drawn there
 
 
 class _Outline(NamedTuple):
@@ -262,58 +121,201 @@ class _Outline(NamedTuple):
     bones: Integers
 
 
-def _outline(truth: Geometry, hand: int, camera: Camera, fit: GloveFit, qpos: Doubles) -> _Outline | None:
+class Outlines:
+    """Finds the edges of a take's hands in pictures of a video of this size."""
+
+    def __init__(self, take: Take, size: tuple[int, int]) -> None:
+        self._take, self._scale = take, min(1.0, _WIDEST / max(size))
+        self._size = round(self._scale * size[0]), max(1, round(self._scale * size[1]))
+        self._skins = [PosableSkin(hand.model, bony=0.5) for hand in take.hands]
+        self._bodies = [BodyFigure(body, (0.5, 0.5, 0.5)) for body in take.bodies]
+        self._seen = np.zeros((len(take.hands), 1 << 3 * _LEVELS))  # counts of the hands' colors
+
+    def shrunk(self, picture: Bytes) -> Bytes:
+        """A picture as it is looked at."""
+        return np.asarray(cv2.resize(picture, self._size, interpolation=cv2.INTER_AREA))
+
+    def edges(
+        self, bundle: Bundle, state: State, looks: Iterable[tuple[int, Bytes]], reach: float
+    ) -> tuple[Edges | None, Seen]:
+        """The edges within `reach` [widths] in numbered frames, if any, and how well they are seen."""
+        take, times, cameras = self._take, bundle.times(state), bundle.cameras(state)
+        spans = state.spans(np.arange(len(times)))
+        moments = shutter_times(take, times, [cameras[span] for span in spans], state.values[READOUT])
+        qpos = np.stack([poses_at(take, moments + late) for late in (0.0, -_STEP, _STEP)], axis=2)
+        bodies = between_poses(take.times, times, take.body_poses, take.rate)
+        views = [self._shrunk_camera(camera) for camera in cameras]
+        maps, radius = straightening(views[0]), max(3, round(reach * self._size[0]))
+        seen, parts = np.full((5, *moments.shape), np.nan), []
+        for frame, picture in looks:
+            there = np.flatnonzero(np.isfinite(qpos[frame, :, :, 0]).all(axis=1)).tolist()
+            drawn, room = [self._hand(hand, qpos[frame, hand, 0]) for hand in there], 2 * radius + _AROUND
+            look = self._look(picture, maps, straight(views[spans[frame]]), drawn, bodies[frame], room)
+            if look is None:
+                continue
+            for hand in there:
+                outline = _outline(look, hand, take.hands[hand], qpos[frame, hand, 0])
+                if outline is None:
+                    continue
+                chosen, offsets, spreads, odds = self._across(look, hand, outline, radius)
+                tried, away = len(outline.pixels), offsets / self._scale
+                outline = _Outline._make(values[chosen] for values in outline)
+                middle, most = np.quantile(np.abs(away), (0.5, _WITHIN)) if len(away) else (np.nan, np.nan)
+                seen[:, frame, hand] = tried, len(away), middle, most, odds
+                places = look.corner + outline.pixels + offsets[:, None] * outline.normals
+                pixels, normals, length = self._pictured(bundle, views[0], places, outline.normals)
+                velocities, regions = self._moved(hand, qpos[frame, hand], outline)
+                parts.append(Edges(
+                    np.full(len(away), frame), pixels, normals, self._scale / spreads / length,
+                    outline.points, velocities, outline.outward, regions,
+                    np.full(len(away), moments[frame, hand]), away,
+                ))  # fmt: skip
+        if not parts:
+            return None, Seen(*seen)
+        found = Edges._make(np.concatenate(values) for values in zip(*parts, strict=True))
+        kept = np.isfinite(found.weights)  # others are beyond what the lens sees
+        return Edges._make(values[kept] for values in found), Seen(*seen)
+
+    def _shrunk_camera(self, camera: Camera) -> Camera:
+        K = np.diag([self._scale, self._scale, 1.0]) @ camera.K
+        return dataclasses.replace(camera, size=self._size, K=K)
+
+    def _look(
+        self, picture: Bytes, maps: Floats, view: Camera, drawn: list[Triangles], bodies: Doubles, room: int
+    ) -> _Look | None:
+        """The part of a picture with drawn hands and room around them; None if they are elsewhere."""
+        vertices = [one.vertices[: skin_atlas().num_hand] for one in drawn]  # without forearms
+        pixels = view.project(np.concatenate([np.empty((0, 3)), *vertices]))
+        ends = [np.fmin.reduce(pixels, initial=np.inf) - room, np.fmax.reduce(pixels, initial=-np.inf) + room]
+        (left, top), (right, bottom) = np.clip(ends, 0, self._size).astype(int).tolist()
+        if min(right - left, bottom - top) < 8:
+            return None
+        for number, T_world_body in enumerate(pose_matrices(bodies)):
+            if np.isfinite(T_world_body).all():
+                instance = 1 + len(self._skins) + number
+                drawn += [one.triangles for one in self._bodies[number].drawn(T_world_body, instance)]
+        colors = cv2.remap(picture, maps[top:bottom, left:right], None, cv2.INTER_LINEAR)
+        part = view.part(left, top, right - left, bottom - top)
+        return _Look(np.array([left, top]), part, np.asarray(colors), see(part, drawn, with_normals=False))
+
+    def _hand(self, hand: int, qpos: Doubles) -> Triangles:
+        """A drawn hand, without normals."""
+        skin = self._skins[hand]
+        vertices, count = skin.surface(qpos), len(skin.faces)
+        ids = (1 + PARTS_A_HAND * hand + face_parts(), np.full(count, 1 + hand), np.zeros(count))
+        return Triangles(vertices, skin.faces, vertices, *(one.astype(np.uint8) for one in ids))
+
+    def _pictured(
+        self, bundle: Bundle, camera: Camera, pixels: Doubles, normals: Doubles
+    ) -> tuple[Doubles, Doubles, Doubles]:
+        """Pixels (N, 2) and unit normals of straightened edges as a bundle counts them, and their scale."""
+        points = np.stack([pixels, pixels + normals[:, ::-1] * [-1.0, 1.0]])
+        if bundle.given is None:
+            bent = camera.at(np.eye(4))
+            points = bent.project(straight(bent).unproject(points))
+        along = points[1] - points[0]
+        length = np.linalg.norm(along, axis=1)
+        return points[0] / self._scale, along[:, ::-1] * [1.0, -1.0] / length[:, None], length
+
+    def _moved(self, hand: int, qpos: Doubles, outline: _Outline) -> tuple[Doubles, Integers]:
+        """Velocities (N, 3) [m/s] of points, from poses (3, 27) now, before and after; and their regions."""
+        bones = self._take.hands[hand].model.forward_kinematics(qpos)[:, outline.bones]  # (3, N, 4, 4)
+        now, step = bones[0], (bones[2] - bones[1]) / (2.0 * _STEP)
+        local = np.einsum("nji,nj->ni", now[:, :3, :3], outline.points - now[:, :3, 3])
+        velocities = np.einsum("nij,nj->ni", step[:, :3, :3], local) + step[:, :3, 3]
+        sides = np.einsum("nji,nj->ni", now[:, :3, 1:3], outline.outward) > 0.0
+        return velocities, 4 * (FOREARM * hand + outline.bones) + sides @ [1, 2]
+
+    def _across(
+        self, look: _Look, hand: int, found: _Outline, reach: int
+    ) -> tuple[Integers, Doubles, Doubles, float]:
+        """Points of an outline with an edge, its distance, its deviation [px]; and the least log-odds."""
+        mine, free = look.truth.instances == 1 + hand, look.truth.instances == 0
+        inside = cv2.distanceTransform(mine.view(np.uint8), cv2.DIST_L2, 3)
+        table = self._odds(look, hand, inside, reach)
+        if table is None:
+            return np.empty(0, np.int64), np.empty(0), np.empty(0), np.nan
+        within = mine & (inside > 1.5)
+        bones = look.truth.parts[within].astype(np.int64) - 1 - PARTS_A_HAND * hand
+        count = np.bincount(bones, minlength=PARTS_A_HAND)[:FOREARM]
+        total = np.bincount(bones, table[within], minlength=PARTS_A_HAND)[:FOREARM]
+        least = float((total / np.maximum(count, 1))[count >= _FEWEST_PIXELS].min(initial=_SUREST))
+        places = _along(found.pixels, found.normals, reach)
+        across = cv2.remap(table, places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+        in_me, in_free = (
+            cv2.remap(one.view(np.uint8), places, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT) > 0
+            for one in (mine, free)
+        )
+        chosen, offsets = _edge(across, in_me, in_free, reach)
+        if not len(chosen):
+            return chosen, offsets, offsets, least
+        normals = found.normals[chosen]
+        places = _along(found.pixels[chosen] + offsets[:, None] * normals, normals, _BESIDE)
+        light = cv2.remap(
+            cv2.LUT(look.colors, _LINEAR), places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        )
+        sharp, beyond, spreads = _sharpened(light)
+        return chosen[sharp], (offsets + beyond)[sharp], spreads[sharp], least
+
+    def _odds(self, look: _Look, hand: int, inside: Floats, reach: int) -> Floats | None:
+        """Log-odds (h, w) that colors are the hand's and not those around it; None for a tiny hand."""
+        levels = (look.colors >> (8 - _LEVELS)).astype(np.int64)
+        colors = (levels[..., 0] << 2 * _LEVELS) | (levels[..., 1] << _LEVELS) | levels[..., 2]
+        outside = cv2.distanceTransform((inside == 0.0).view(np.uint8), cv2.DIST_L2, 3)
+        deep = inside > min(0.7 * reach, 0.5 * float(inside.max()))
+        around = (outside > min(0.7 * reach, 6.0)) & (outside < reach + _AROUND)
+        around &= look.truth.instances == 0
+        if deep.sum() < _FEWEST_PIXELS or around.sum() < _FEWEST_PIXELS:
+            return None
+        self._seen[hand] += np.bincount(colors[deep], minlength=self._seen.shape[1])
+        beside = np.bincount(colors[around], minlength=self._seen.shape[1]).astype(np.float64)
+        odds = np.log(_shares(self._seen[hand]) / _shares(beside)).clip(-_SUREST, _SUREST)
+        return np.asarray(odds.astype(np.float32)[colors])
+
+
+def _along(pixels: Doubles, normals: Doubles, reach: int) -> Floats:
+    """Pixels (N, 2 R + 1, 2), as OpenCV counts, along normals."""
+    steps = np.arange(-reach, reach + 1)[:, None] * normals[:, None]
+    return np.asarray(pixels[:, None] + steps - 0.5, dtype=np.float32)
+
+
+def _outline(look: _Look, hand: int, fit: GloveFit, qpos: Doubles) -> _Outline | None:
     """Points of a drawn hand's outline, without its wrist and what is beside markers and other things."""
-    mine = truth.instances == 1 + hand
-    left, top, width, height = cv2.boundingRect(mine.view(np.uint8))
-    if width < 8 or height < 8:
-        return None
-    low = np.maximum([left - 8, top - 8], 0)
-    high = np.minimum([left + width + 8, top + height + 8], camera.size)
-    part = (slice(low[1], high[1]), slice(low[0], high[0]))
-    mine, instances = np.ascontiguousarray(mine[part]), truth.instances[part]
-    scale = camera.focal_length / float(truth.depth[part][mine].mean())  # [px/m]
-    arm = truth.parts[part] == 1 + PARTS_A_HAND * hand + FOREARM
-    other = ~mine & (instances > 0)
-    nearby = cv2.dilate((instances == 0).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    truth, camera = look.truth, look.view
+    mine, free = truth.instances == 1 + hand, truth.instances == 0
+    arm = truth.parts == 1 + PARTS_A_HAND * hand + FOREARM
+    nearby = cv2.dilate(free.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     rim = mine & nearby & ~arm
-    for away, flags in ((_ARM * scale, arm), (_OTHER, other)):
+    if rim.sum() < _FEWEST_POINTS:
+        return None
+    scale = camera.focal_length / float(truth.depth[mine].mean())  # [px/m]
+    for away, flags in ((_ARM * scale, arm), (_OTHER, ~mine & ~free)):
         if flags.any():
             rim &= cv2.distanceTransform((~flags).astype(np.uint8), cv2.DIST_L2, 3) > away
-    soft = cv2.GaussianBlur(mine.astype(np.float32), (0, 0), 1.0)
-    gx, gy = (cv2.Sobel(soft, cv2.CV_32F, *order, ksize=3) / 8.0 for order in ((1, 0), (0, 1)))
     rows, columns = np.nonzero(rim)
-    if len(rows) < 10:
-        return None
-    if len(rows) > _MOST_POINTS:
-        some = np.linspace(0, len(rows) - 1, _MOST_POINTS).astype(int)
-        rows, columns = rows[some], columns[some]
-    gradient = np.stack([gx[rows, columns], gy[rows, columns]], axis=1).astype(np.float64)
+    some = np.unique(np.linspace(0, len(rows) - 1, min(len(rows), _MOST_POINTS)).astype(int))
+    rows, columns = rows[some], columns[some]
+    soft = cv2.GaussianBlur(mine.astype(np.float32), (0, 0), 1.0)
+    gradient = np.stack(
+        [cv2.Sobel(soft, cv2.CV_64F, *order, ksize=3)[rows, columns] / 8.0 for order in ((1, 0), (0, 1))],
+        axis=1,
+    )
     size = np.maximum(np.linalg.norm(gradient, axis=1), 1e-9)
     normals = -gradient / size[:, None]
     beyond = np.clip((soft[rows, columns] - 0.5) / size, -1.0, 1.0)
-    pixels = low + np.stack([columns, rows], axis=1) + 0.5 + beyond[:, None] * normals
-    rays = camera.unproject(np.stack([pixels, pixels + normals]))
-    rays /= rays[..., 2:]
-    good = (size > 0.1) & ((pixels > _EDGE) & (pixels < np.array(camera.size) - _EDGE)).all(axis=1)
-    good &= np.isfinite(rays).all(axis=(0, 2))
+    pixels = np.stack([columns, rows], axis=1) + 0.5 + beyond[:, None] * normals
     balls = pixels[:, None] - camera.project(fit.markers(qpos[None])[0][0])
-    good &= (np.linalg.norm(balls, axis=2) > (fit.layout.radius + _BALL) * scale).all(axis=1)
-    if good.sum() < 10:
+    good = (np.linalg.norm(balls, axis=2) > (fit.layout.radius + _BALL) * scale).all(axis=1) & (size > 0.1)
+    good &= ((pixels > _EDGE) & (pixels < np.array(camera.size) - _EDGE)).all(axis=1)
+    if good.sum() < _FEWEST_POINTS:
         return None
-    pixels, normals, rows, columns, rays = (
-        pixels[good],
-        normals[good],
-        rows[good],
-        columns[good],
-        rays[:, good],
-    )
     rotation, place = camera.T_world_camera[:3, :3], camera.T_world_camera[:3, 3]
-    depth = truth.depth[part][rows, columns].astype(np.float64)
-    outward = (rays[1] - rays[0]) / np.linalg.norm(rays[1] - rays[0], axis=1, keepdims=True)
-    bones = truth.parts[part][rows, columns].astype(np.int64) - 1 - PARTS_A_HAND * hand
-    points = (rays[0] * depth[:, None]) @ rotation.T + place
-    return _Outline(pixels, normals, points, outward @ rotation.T, bones)
+    rays, beside = (camera.unproject(one) for one in (pixels, pixels + normals))
+    rays, beside = rays / rays[:, 2:], beside / beside[:, 2:]
+    outward = (beside - rays) / np.linalg.norm(beside - rays, axis=1, keepdims=True)
+    points = rays * truth.depth[rows, columns, None].astype(np.float64) @ rotation.T + place
+    bones = truth.parts[rows, columns].astype(np.int64) - 1 - PARTS_A_HAND * hand
+    return _Outline._make(one[good] for one in (pixels, normals, points, outward @ rotation.T, bones))
 
 
 def _shares(counts: Doubles) -> Doubles:

@@ -49,7 +49,7 @@ def _over_time(figure: Figure, found: Registration) -> None:
     for kept, color, name in ((fits, Paint.BLUE, "counts"), (~fits, Paint.WARM, "does not")):
         panel.plot(found.times[kept], found.distances[kept], ".", ms=2.5, color=color, label=name)
     for start in found.starts[1:]:
-        panel.axvline(float(found.times[np.searchsorted(found.numbers, start)]), color=Paint.INK, lw=1.0)
+        panel.axvline(float(found.times[start]), color=Paint.INK, lw=1.0)
     panel.set(xlabel="time in the video [s]", ylabel="residual [px]", ylim=(0.0, None))
     panel.legend(frameon=False, ncols=2)
 

@@ -7,10 +7,12 @@ OUT gets the weights that `HandDetector.load` reads.
 
 from __future__ import annotations
 
+import functools
 import io
+import itertools
 import sys
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -22,8 +24,8 @@ from torch.nn import functional
 
 from handsim import __version__
 from handsim._checks import check_count
-from handsim.errors import HandSimError, WeightsError
-from handsim.files.inputs import DIGEST, read_bytes, sign_model
+from handsim._plugins import import_extra
+from handsim.files.inputs import DIGEST, sign_model
 from handsim.files.outputs import atomic_write
 from handsim.hand.shape import NUM_KEYPOINTS
 from render.film.detector import (
@@ -33,16 +35,16 @@ from render.film.detector import (
     FINDER_SIZE,
     HEAT_SIZE,
     KEYPOINTS,
-    MOST_BYTES,
     ROOM,
     WEIGHTS,
+    HandDetector,
     cut,
     normalized,
     palm_spread,
     square_around,
     upright,
 )
-from render.film.lessons import SCENES, VIEW_SIZE, Lessons, draw_scenes, lessons_of, read_scenes
+from render.film.lessons import SCENES, VIEW_SIZE, Lesson, draw_scenes, lessons_of, read_scenes
 from render.film.network import FinderNetwork, KeypointNetwork
 from render.frames import Bytes, Doubles, Floats
 
@@ -63,25 +65,21 @@ _HALF: Final = "_half"  # ending of the names of weights of half precision
 Network = FinderNetwork | KeypointNetwork
 
 
-class Batch(NamedTuple):
-    """What a network learns from in one step."""
-
-    pictures: torch.Tensor  # (B, 3, S, S)
-    targets: tuple[torch.Tensor, ...]
+Targets = tuple[torch.Tensor, ...]
+Batch = tuple[torch.Tensor, Targets]
+"""Pictures (B, 3, S, S) and what is learned of them in one step."""
 
 
 class Course(NamedTuple):
     """Drawn lessons, and those of photographs."""
 
-    drawn: Lessons
-    own: Lessons | None
+    drawn: Sequence[Lesson]
+    own: Sequence[Lesson] = ()
 
-    def draw(self, rng: np.random.Generator) -> tuple[Bytes, Floats, Any]:
-        """A picture, its keypoints (H, 21, 2) and sides (H,)."""
-        is_own = self.own is not None and rng.random() < PHOTOGRAPH_SHARE
-        source = self.own if self.own is not None and is_own else self.drawn
-        number = int(rng.integers(len(source.files)))
-        return source.picture(number), source.keypoints[number], source.sides[number]
+    def draw(self, rng: np.random.Generator) -> Lesson:
+        """One of the lessons."""
+        source = self.own if self.own and rng.random() < PHOTOGRAPH_SHARE else self.drawn
+        return source[int(rng.integers(len(source)))]
 
 
 def train_detector(
@@ -110,87 +108,77 @@ def train_detector(
         HandSimError: The start or the photographs cannot be read, or onnx is missing.
     """
     check_count("samples", samples, BATCH, 1_000_000_000)
-    try:
-        import onnx  # noqa: F401  # missed before the work, not after it
-    except ImportError as error:
-        raise HandSimError(
-            "training a detector needs onnx; install it with: pip install 'handsim[onnx]'"
-        ) from error
-    folder = Path(out)
-    begun = None if start is None else WEIGHTS if start == "shipped" else Path(start)
+    import_extra("onnx", "training a detector", "onnx")  # missed before the work, not after it
     torch.manual_seed(seed)
     networks: dict[str, Network] = {FINDER: FinderNetwork(), KEYPOINTS: KeypointNetwork()}
-    for name, network in networks.items():
-        if begun is not None:
+    if start is not None:
+        begun = WEIGHTS if start == "shipped" else Path(start)
+        HandDetector.load(begun)  # refuses damaged weights
+        for name, network in networks.items():
             _load_folded(network, begun / name)
-    own: tuple[Lessons | None, Lessons | None] = (None, None)
+    own: tuple[list[Lesson], list[Lesson]] = ([], [])
     if photographs is not None:
         own = lessons_of(read_scenes(Path(photographs)), rng=np.random.default_rng(seed))
-    shards = max(1, round(samples / _SAMPLES_A_SCENE / SCENES))
-    parts = []
+    views, squares = _drawn(max(1, round(samples / _SAMPLES_A_SCENE / SCENES)), seed)
+    rate, steps = _RATE if start is None else _ADAPTING_RATE, max(1, round(samples / BATCH))
+    make = functools.partial(finder_batch, Course(views, own[0]))
+    fit(networks[FINDER], make, finder_loss, max(1, round(_FINDER_SHARE * steps)), seed, rate)
+    make = functools.partial(keypoint_batch, Course(squares, own[1]))
+    fit(networks[KEYPOINTS], make, keypoint_loss, steps, seed, rate)
+    for name, network in networks.items():
+        export(network, Path(out) / name)
+    return Path(out)
+
+
+def _drawn(shards: int, seed: int) -> tuple[list[Lesson], list[Lesson]]:
+    """Drawn lessons for the finder and for the keypoint network."""
+    views: list[Lesson] = []
+    squares: list[Lesson] = []
     for number in range(shards):
         rng = np.random.default_rng([seed, number, 1])
-        parts.append(lessons_of(draw_scenes(number, seed=seed), rng=rng))
+        whole, cut_out = lessons_of(draw_scenes(number, seed=seed), rng=rng)
+        views += whole
+        squares += cut_out
         _tell(f"\r{SCENES * (number + 1)} of {SCENES * shards} pictures are drawn")
     _tell("\n")
-    drawn = [Lessons.joined(part) for part in zip(*parts, strict=True)]
-    plan: tuple[tuple[str, Make, Loss, float], ...] = (
-        (FINDER, finder_batch, finder_loss, _FINDER_SHARE),
-        (KEYPOINTS, keypoint_batch, keypoint_loss, 1.0),
-    )
-    for (name, make, loss, share), lessons, given in zip(plan, drawn, own, strict=True):
-        steps = max(1, round(share * samples / BATCH))
-        run = Run(networks[name], Course(lessons, given), make, loss, steps, seed, adapts=begun is not None)
-        run.go(Path(name).stem)
-    for name, network in networks.items():
-        export(network, folder / name)
-    return folder
+    return views, squares
 
 
 def _tell(text: str) -> None:
     print(text, end="", file=sys.stderr, flush=True)
 
 
-Make = Callable[[Course, np.random.Generator], Batch]
-Loss = Callable[[Any, tuple[torch.Tensor, ...]], torch.Tensor]
-
-
-class Run:
-    """One network's training."""
-
-    def __init__(
-        self, network: Network, course: Course, make: Make, loss: Loss, steps: int, seed: int, *, adapts: bool
-    ) -> None:
-        self.network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        self._course, self._make, self._loss, self._steps, self._seed = course, make, loss, steps, seed
-        rate = _ADAPTING_RATE if adapts else _RATE
-        self._optimizer = torch.optim.AdamW(network.parameters(), lr=rate, weight_decay=0.01, fused=True)
-        self._schedule = torch.optim.lr_scheduler.OneCycleLR(
-            self._optimizer, rate, total_steps=steps + 1, pct_start=0.15
-        )
-        self._adapts = adapts
-        self.losses: list[float] = []
-
-    def go(self, name: str) -> None:
-        """Train to the end."""
-        self.network.train()
-        for layer in self.network.modules():
-            if self._adapts and isinstance(layer, nn.BatchNorm2d):
-                layer.eval()  # given weights hold its figures already
-        for step in range(self._steps):
-            batch = self._make(self._course, np.random.default_rng([self._seed, step]))
-            with torch.autocast("cpu", torch.bfloat16, enabled=BF16):
-                found = self.network(batch.pictures)
-            loss = self._loss(found, batch.targets)
-            self._optimizer.zero_grad()
-            loss.backward()  # type: ignore[no-untyped-call]
-            self._optimizer.step()
-            self._schedule.step()
-            self.losses.append(loss.item())
-            if (step + 1) % max(1, self._steps // 20) == 0:
-                mean = float(np.mean(self.losses[-200:]))
-                _tell(f"{name}: {step + 1} of {self._steps} steps, loss {mean:.3f}\n")
-        self.network.eval()
+def fit(
+    network: Network,
+    make: Callable[[np.random.Generator], Batch],
+    loss: Callable[[Any, Targets], torch.Tensor],
+    steps: int,
+    seed: int,
+    rate: float = _RATE,
+) -> list[float]:
+    """Train a network with batches that are made; the losses of all steps."""
+    network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    optimizer = torch.optim.AdamW(network.parameters(), lr=rate, weight_decay=0.01, fused=True)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, rate, total_steps=steps + 1, pct_start=0.15)
+    network.train()
+    for layer in network.modules():
+        if rate == _ADAPTING_RATE and isinstance(layer, nn.BatchNorm2d):
+            layer.eval()  # given weights hold its figures already
+    losses: list[float] = []
+    for step in range(steps):
+        pictures, targets = make(np.random.default_rng([seed, step]))
+        with torch.autocast("cpu", torch.bfloat16, enabled=BF16):
+            found = network(pictures)
+        value = loss(found, targets)
+        optimizer.zero_grad()
+        value.backward()  # type: ignore[no-untyped-call]
+        optimizer.step()
+        schedule.step()
+        losses.append(value.item())
+        if (step + 1) % max(1, steps // 20) == 0:
+            _tell(f"{step + 1} of {steps} steps, loss {np.mean(losses[-200:]):.3f}\n")
+    network.eval()
+    return losses
 
 
 def recolored(picture: Bytes, rng: np.random.Generator) -> Bytes:
@@ -227,21 +215,23 @@ def _turn(angle: float) -> Doubles:
     return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
 
 
-def keypoint_batch(course: Course, rng: np.random.Generator, size: int = BATCH) -> Batch:
+def keypoint_batch(course: Course, rng: np.random.Generator) -> Batch:
     """Pictures of single hands, and some of none. Targets: keypoints [share of the side], presence, palm.
 
     The palm faces the camera (1), or does not (0), or that is not known (-1). Mirrored pictures have the same
     answer, which is learned long before the side.
     """
-    pictures, points = [], np.full((size, NUM_KEYPOINTS, 2), np.nan, np.float32)
-    presence, palms = np.zeros(size, np.float32), np.full(size, -1.0, np.float32)
-    for number in range(size):
-        wide, (keypoints,), (side,) = course.draw(rng)
-        labeled = keypoints[np.isfinite(keypoints[:, 0])].astype(np.float64)
+    pictures, points = [], np.full((BATCH, NUM_KEYPOINTS, 2), np.nan, np.float32)
+    presence, palms = np.zeros(BATCH, np.float32), np.full(BATCH, -1.0, np.float32)
+    for number in range(BATCH):
+        lesson = course.draw(rng)
+        wide, is_hand = lesson.picture(), len(lesson.sides) > 0
+        keypoints = lesson.keypoints[0] if is_hand else np.full((NUM_KEYPOINTS, 2), np.nan)
+        labeled = keypoints[np.isfinite(keypoints[:, 0])]
         first_look = rng.random() < _FIRST_LOOK or len(labeled) < len(keypoints)
         turn = _turn(rng.normal(0.0, 0.3))
         if not first_look:
-            turn = turn @ upright(keypoints.astype(np.float64))
+            turn = turn @ upright(keypoints)
         elif rng.random() < 0.5:
             turn = _turn(rng.uniform(-np.pi, np.pi))
         middle = np.array([[0.3, 0.3], [0.7, 0.7]]) * wide.shape[0]
@@ -251,33 +241,24 @@ def keypoint_batch(course: Course, rng: np.random.Generator, size: int = BATCH) 
         image, moved = cut(wide, matrix, (CROP_SIZE, CROP_SIZE)), keypoints @ matrix[:, :2].T + matrix[:, 2]
         if rng.random() < 0.5:
             image, moved = image[:, ::-1], [CROP_SIZE, 0.0] + moved * [-1.0, 1.0]
-        if rng.random() < 0.15:
-            image = _hidden(image, rng)
+        if rng.random() < 0.15:  # A patch of one color is before the hand.
+            (left, top), (width, height) = rng.integers(0, CROP_SIZE - 16, 2), rng.integers(12, 48, 2)
+            image = np.array(image)
+            image[top : top + height, left : left + width] = rng.integers(0, 256, 3)
         pictures.append(normalized(recolored(np.ascontiguousarray(image), rng)))
         points[number] = moved / CROP_SIZE
-        if side >= 0 and np.isfinite(spread := palm_spread(keypoints)):
-            palms[number] = (spread > 0.0) == (side == 1)
-        presence[number] = len(labeled) > 0
+        if is_hand and lesson.sides[0] >= 0 and np.isfinite(spread := palm_spread(keypoints)):
+            palms[number] = (spread > 0.0) == (lesson.sides[0] == 1)
+        presence[number] = is_hand
     told = (torch.from_numpy(points), torch.from_numpy(presence), torch.from_numpy(palms))
-    return Batch(_stacked(pictures), told)
-
-
-def _hidden(image: Bytes, rng: np.random.Generator) -> Bytes:
-    """A square with a patch of one color before it."""
-    image = np.array(image)
-    left, top = rng.integers(0, CROP_SIZE - 16, 2)
-    width, height = rng.integers(12, 48, 2)
-    image[top : top + height, left : left + width] = rng.integers(0, 256, 3)
-    return image
+    return _stacked(pictures), told
 
 
 def _stacked(pictures: list[Floats]) -> torch.Tensor:
     return torch.from_numpy(np.stack(pictures)).contiguous(memory_format=torch.channels_last)
 
 
-def keypoint_loss(
-    found: tuple[torch.Tensor, torch.Tensor], targets: tuple[torch.Tensor, ...]
-) -> torch.Tensor:
+def keypoint_loss(found: tuple[torch.Tensor, torch.Tensor], targets: Targets) -> torch.Tensor:
     """How little heat is near the keypoints, how far off its mean is, and errors of presence and palm."""
     heat, told = (one.float() for one in found)
     points, presence, palms = targets
@@ -297,19 +278,20 @@ def keypoint_loss(
     return loss + (wrong * known).sum() / known.sum().clamp(min=1)
 
 
-def finder_batch(course: Course, rng: np.random.Generator, size: int = BATCH) -> Batch:
+def finder_batch(course: Course, rng: np.random.Generator) -> Batch:
     """Pictures, turned, cut and scaled; targets: cells (4, S/8, S/8) as the network's, and their weight."""
     cells = FINDER_SIZE // CELL
-    pictures, targets = [], np.zeros((size, 5, cells, cells), np.float32)
-    for number in range(size):
-        picture, keypoints, _ = course.draw(rng)
+    pictures, targets = [], np.zeros((BATCH, 5, cells, cells), np.float32)
+    for number in range(BATCH):
+        lesson = course.draw(rng)
+        picture = lesson.picture()
         long, short = FINDER_SIZE, round(FINDER_SIZE * _ASPECTS[rng.integers(len(_ASPECTS))])
         width, height = (long, short) if rng.random() < 0.75 else (short, long)
         scale = FINDER_SIZE / VIEW_SIZE * rng.uniform(0.75, 1.7)
         turn = scale * _turn(rng.normal(0.0, 0.25))
         middle = 0.5 * np.array(picture.shape[1::-1]) * rng.uniform(0.6, 1.4, 2)
         matrix = np.column_stack([turn, 0.5 * np.array([width, height]) - turn @ middle])
-        image, moved = cut(picture, matrix, (width, height)), keypoints @ matrix[:, :2].T + matrix[:, 2]
+        image, moved = cut(picture, matrix, (width, height)), lesson.keypoints @ turn.T + matrix[:, 2]
         if rng.random() < 0.5:
             image, moved = image[:, ::-1], [width, 0.0] + moved * [-1.0, 1.0]
         square = np.zeros((3, FINDER_SIZE, FINDER_SIZE), np.float32)
@@ -319,10 +301,10 @@ def finder_batch(course: Course, rng: np.random.Generator, size: int = BATCH) ->
             labeled = points[np.isfinite(points[:, 0])]
             if len(labeled):
                 _mark(targets[number], labeled, (width, height))
-    return Batch(_stacked(pictures), (torch.from_numpy(targets),))
+    return _stacked(pictures), (torch.from_numpy(targets),)
 
 
-def _mark(target: Floats, points: Floats, size: tuple[int, int]) -> None:
+def _mark(target: Floats, points: Doubles, size: tuple[int, int]) -> None:
     """Write a hand into the cells (5, S/8, S/8): heat, offset, size, weight."""
     low, high = points.min(axis=0), points.max(axis=0)
     center, longer = 0.5 * (low + high), float((high - low).max())
@@ -340,7 +322,7 @@ def _mark(target: Floats, points: Floats, size: tuple[int, int]) -> None:
     target[4][mine] = heat[mine]
 
 
-def finder_loss(found: torch.Tensor, targets: tuple[torch.Tensor, ...]) -> torch.Tensor:
+def finder_loss(found: torch.Tensor, targets: Targets) -> torch.Tensor:
     """Focal loss of the centers (Law and Deng 2018), and errors of offset and size at them."""
     cells, target = found.float(), targets[0]
     heat, truth, weight = cells[:, 0], target[:, 0], target[:, 4]
@@ -375,10 +357,9 @@ def export(network: Network, path: Path) -> None:
     for tensor in model.graph.initializer:
         values, name = numpy_helper.to_array(tensor), tensor.name
         if values.dtype == np.float32 and values.ndim > 1:
-            tensor.CopyFrom(numpy_helper.from_array(values.astype(np.float16), f"{name}_half"))
-            model.graph.node.insert(
-                0, helper.make_node("Cast", [f"{name}_half"], [name], to=TensorProto.FLOAT)
-            )
+            tensor.CopyFrom(numpy_helper.from_array(values.astype(np.float16), name + _HALF))
+            cast = helper.make_node("Cast", [name + _HALF], [name], to=TensorProto.FLOAT)
+            model.graph.node.insert(0, cast)
     helper.set_model_props(model, {"handsim.version": __version__, DIGEST: "0" * 64})
     onnx.checker.check_model(model, full_check=True)
     with atomic_write(path) as temporary:
@@ -390,30 +371,24 @@ def _load_folded(network: Network, path: Path) -> None:
     import onnx
     from onnx import numpy_helper
 
-    content = read_bytes(path, error=WeightsError, most=MOST_BYTES)
-    try:
-        graph = onnx.load_model_from_string(content).graph
-        arrays = {one.name.removesuffix(_HALF): numpy_helper.to_array(one) for one in graph.initializer}
-        stored = [
-            [torch.tensor(np.float32(arrays[name])) for name in node.input[1:]]
-            for node in graph.node
-            if node.op_type in ("Conv", "Gemm")
-        ]
-        modules: list[Any] = list(network.modules())
-        layers = [n for n, layer in enumerate(modules) if isinstance(layer, nn.Conv2d | nn.Linear)]
-        for (weight, bias), number in zip(stored, layers, strict=True):
-            layer, norm = modules[number], None
-            if layer.bias is None:
-                norm = modules[number + 1]
-                norm.running_var.fill_(1.0 - norm.eps)
-            if layer.weight.shape != weight.shape:
-                raise ValueError(f"weights of the shape {tuple(weight.shape)}")
-            layer.weight.data.copy_(weight)
-            (layer if norm is None else norm).bias.data.copy_(bias)
-    except Exception as error:  # protobuf and onnx name damage in many ways
-        raise WeightsError(
-            f"{path} is damaged or not a hand detector's, expected what train_detector wrote"
-        ) from error
+    graph = onnx.load_model(path).graph
+    arrays = {one.name.removesuffix(_HALF): numpy_helper.to_array(one) for one in graph.initializer}
+    stored = (
+        [torch.tensor(np.float32(arrays[name])) for name in node.input[1:]]
+        for node in graph.node
+        if node.op_type in ("Conv", "Gemm")
+    )
+    layers: list[Any] = [
+        one for one in network.modules() if isinstance(one, nn.Conv2d | nn.Linear | nn.BatchNorm2d)
+    ]
+    for layer, norm in itertools.zip_longest(layers, layers[1:]):
+        if isinstance(layer, nn.BatchNorm2d):
+            continue
+        weight, bias = next(stored)
+        layer.weight.data.copy_(weight)
+        if isinstance(norm, nn.BatchNorm2d):
+            norm.running_var.fill_(1.0 - norm.eps)
+        (layer if layer.bias is not None else norm).bias.data.copy_(bias)
 
 
 if __name__ == "__main__":

@@ -410,6 +410,11 @@ class PosableSkin:
             self._coarse_faces,
         )
 
+    def surface(self, qpos: Doubles) -> Doubles:
+        """Vertices (U, 3) of `faces` in one pose [m], with a straight arm."""
+        transforms = self.model.forward_kinematics(qpos[None])
+        return self.merged(transforms, self._flexion.shaped(self.rest, qpos[7:]))
+
     def merged(self, transforms: Doubles, rest: Doubles | None = None) -> Doubles:
         """Vertices (U, 3), of `rest` or given, in a pose of the bones' transforms (1, L, 4, 4) [m]."""
         still = self.rest if rest is None else rest

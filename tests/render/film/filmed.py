@@ -94,7 +94,7 @@ class Filming:
                     hands.append(found_hand(told, pixels))
             if self.stranger:
                 hands.append(found_hand("right", camera.project(strange[number, 0])))
-            frames.append(FoundFrame(number, float(time), hands))
+            frames.append(FoundFrame(float(time), hands))
         return frames
 
     def pictures(self, take: Take, dress: str = "glove") -> list[np.ndarray]:

@@ -53,8 +53,7 @@ def test_outlines_tell_the_camera_within_its_bounds(dress):
     qpos = take.qpos.copy()
     qpos[(take.times > 6.0) & (take.times < 7.0), 0, 12:16] += 0.9
     wrong = Take.of_poses(take.hands, qpos, rate=take.rate)
-    looks = [(frame.number, frame.time, picture) for frame, picture in zip(frames, pictures, strict=True)]
-    found = register(wrong, frames, SIZE, pictures=lambda: looks)
+    found = register(wrong, frames, SIZE, pictures=lambda: pictures)
     turn, away, focal = errors(found.cameras[0], filming.cameras()[0])
     assert turn < 0.2 and away < 3.0 and focal < 0.6
     assert clock_error(found, filming) < 1.5 and found.residual() < 1.0
