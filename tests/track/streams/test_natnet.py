@@ -533,7 +533,7 @@ def test_servers_that_cannot_be_used_are_told(monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(natnet, "_PATIENCE", 0.2)
         patch.setattr(natnet, "_RETRY", 0.1)
-        with Puppet() as server, pytest.raises(CaptureError, match="no NatNet server answers; in Motive"):
+        with Puppet() as server, pytest.raises(CaptureError, match="no NatNet server answers at port"):
             opened(server.url)
         with (
             Puppet(b"", b"nonsense", natnet.pack(Kind.SERVER_INFO)) as server,
