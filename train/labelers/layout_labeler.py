@@ -132,11 +132,13 @@ def mean_features(markers: Float[np.ndarray, "T M 3"], config: LayoutNetworkConf
     share = _share_of_work(markers.shape[1])
     markers, chunk = markers[:: math.ceil(1.0 / share)], int(_CHUNK * share)
     centered = torch.from_numpy((markers - markers.mean(axis=1, keepdims=True)).astype(np.float32))
-    sums = [
-        distance_features(centered[first : first + chunk], config).sum(0)
-        for first in range(0, len(centered), chunk)
-    ]
-    return torch.stack(sums).sum(0) / len(markers)
+    parts = centered.split(chunk)
+    # In a list, sums would lie between large freed tensors and keep their memory from being used again.
+    sums = centered.new_empty(len(parts), *2 * markers.shape[1:2], config.num_distances)
+    with torch_threads(1):
+        for total, part in zip(sums, parts, strict=True):
+            torch.sum(distance_features(part, config), 0, out=total)
+    return sums.sum(0) / len(markers)
 
 
 def _share_of_work(num_markers: int) -> float:

@@ -350,15 +350,15 @@ _MAX_FRAMES: Final = 200_000
 
 def learn_pose_prior(markers: Float[np.ndarray, "T M 3"], *, rng: np.random.Generator) -> PosePrior | None:
     """Learn the prior of right hands from complete frames [m]; None for too few frames or markers."""
-    markers = markers[np.isfinite(markers).all(axis=(1, 2))]
+    markers = markers[np.isfinite(markers).all(axis=(1, 2))].astype(np.float64, copy=False)
     if len(markers) > _MAX_FRAMES:
         markers = markers[np.sort(rng.permutation(len(markers))[:_MAX_FRAMES])]
     count = min(_MAX_LEARNED_COMPONENTS, len(markers) // _FRAMES_PER_COMPONENT)
     rank = min(_DIRECTIONS, 3 * markers.shape[1] - _RIGID - 1)
     if count < _MIN_COMPONENTS or rank < 1:
         return None
-    members = _clusters(markers.astype(np.float64), count, rng)
-    means, scatters, sizes = _moments(markers.astype(np.float64), members, count)
+    members = _clusters(markers, count, rng)
+    means, scatters, sizes = _moments(markers, members, count)
     covariances = _shrunk_covariances(means, scatters, sizes)
     values, vectors = np.linalg.eigh(covariances)  # in ascending order
     spreads = np.sqrt(values[:, _RIGID:-rank].mean(axis=1) + _NOISE**2)

@@ -110,8 +110,8 @@ def load_labeler(
 ) -> Labeler:
     """The labeler of a glove, or a labeler by its name, path or object.
 
-    A glove without a trained labeler gets the one for any layout, which learns the layout in a minute, or in
-    two with more than 24 markers. Only shipped labelers, folders and the one for any layout need torch.
+    A glove without a trained labeler gets the one for any layout, which learns the layout in one to two
+    minutes. Only shipped labelers, folders and the one for any layout need torch.
 
     Args:
         glove: A marker layout, or its name or path, whose labeler is returned. Without `labeler` also a
@@ -197,9 +197,6 @@ def _shipped_labeler(layout: MarkerLayout) -> Labeler | None:
     return next((_read(*_files(name)).labeler() for name in found), None)
 
 
-_QUICKLY_LEARNED: Final = 20  # markers; gloves with more are learned in minutes
-
-
 def _any_layout_labeler(layout: MarkerLayout, glove: MarkerLayout | str | Path) -> Labeler:
     """The labeler for any layout, with a warning that the glove has no trained one."""
     from train.labelers.layout_labeler import is_learned, learned_labeler  # torch
@@ -207,11 +204,10 @@ def _any_layout_labeler(layout: MarkerLayout, glove: MarkerLayout | str | Path) 
 
     own = isinstance(glove, MarkerLayout) and layout not in map(load_layout, list_layouts())
     name = layout.name if isinstance(glove, MarkerLayout) else str(glove)
-    minutes = "a minute" if layout.num_markers <= _QUICKLY_LEARNED else "three minutes"
     how = (
         "has learned it before"
         if is_learned(layout)
-        else f"learns it now, once, in {minutes} of an idle core"
+        else "learns it now, once, in one to two minutes of an idle core"
     )
     warnings.warn(
         f"no labeler was trained on glove '{name}', so that the one for any layout labels it, which {how}; a "
