@@ -157,7 +157,8 @@ def _fallen(hand: _Hand) -> Iterator[SuspectSpan]:
     for name, row, longest in zip(hand.worn.layout.names, seen.T, gaps, strict=True):
         if not row.any():
             if shown.sum() >= _LAST_GAP * take.rate:
-                yield hand.span(0, name, "is never seen", "compare the layout with the glove")
+                remedy = "compare the layout with the glove"
+                yield hand.span(0, name, "is never seen", remedy, of_labels=False)
             continue
         begin = take.num_frames - int(row[::-1].argmax())
         gap = float(shown[begin:].sum()) / take.rate
@@ -172,8 +173,8 @@ def _at_limits(hand: _Hand) -> Iterator[SuspectSpan]:
     """Joints at the limit of the model's range in many frames, which may have gone beyond."""
     angles = np.rad2deg(hand.take.qpos[hand.frames, hand.take.hand_index(hand.side), 7:])
     for joint, values in zip(JOINTS, angles.T, strict=True):
-        for limit in (joint.low, joint.high):
-            there = np.abs(values - limit) < AT_LIMIT
+        low, high = values < joint.low + AT_LIMIT, values > joint.high - AT_LIMIT
+        for limit, there in ((joint.low, low), (joint.high, high)):
             if there.mean() > _OFTEN_AT_LIMIT:
                 first = int(hand.frames[there.argmax()])
                 share, start = 100 * there.mean(), hand.take.times[first]

@@ -57,7 +57,13 @@ def without_marker(take: Take, marker: int, first: int) -> Take:
 @pytest.mark.parametrize("glove", ["dense19", "sparse13"])
 def test_no_fault_is_named_in_a_take_without_one(glove, seed):
     truth = at_rate(simulate_take("hand-hand", glove=glove, num_frames=2 * FRAMES, seed=seed).without_body())
-    assert find_faults(track_capture(truth, glove=glove)) == ()
+    take = track_capture(truth, glove=glove)
+    faults = find_faults(take)
+    assert all("at the model's limit" in fault.why for fault in faults)
+    for side, joint in (fault.of.split(":") for fault in faults):  # The angle is indeed off.
+        column, own = 7 + take.joint_names.index(joint), take.hand_index(side)
+        off = take.qpos[:, own, column] - truth.qpos[:, truth.hand_index(side), column]
+        assert np.median(np.abs(off)) > np.deg2rad(5.0)
 
 
 def test_a_truth_has_no_faults(truth):
@@ -80,6 +86,12 @@ def test_a_marker_that_falls_off_is_named(truth, tracked, first):
     assert not figures.measured[first:, dip].any() and figures.measured[:first, dip].all()
     assert figures.joints()[dip, 4] == pytest.approx(figures.angles[:first, dip].max())
     assert figures.measured[:, pip].sum() >= figures.measured[:, dip].sum()
+
+
+def test_labels_are_vouched_for_without_a_marker_that_is_never_seen(tracked):
+    take = without_marker(tracked, 6, 0)
+    assert [fault.why for fault in find_faults(take)] == ["is never seen"]
+    assert vouch(take).listed < 0.1
 
 
 def test_a_short_gap_at_the_end_is_no_fault(tracked):
@@ -139,10 +151,11 @@ def test_places_that_are_off_are_named(truth, across):
     assert summarize(take)[-2].startswith("labels: ")
 
 
-def test_a_joint_at_its_limit_is_named(tracked):
+@pytest.mark.parametrize("beyond", [0.0, 2.0])
+def test_a_joint_at_its_limit_is_named(tracked, beyond):
     qpos = tracked.qpos.copy()
     joint = tracked.joint_names.index("ring_MCP_flexion")
-    qpos[HALF:, 0, 7 + joint] = np.deg2rad(JOINTS[joint].low)
+    qpos[HALF:, 0, 7 + joint] = np.deg2rad(JOINTS[joint].low - beyond)
     take = dataclasses.replace(tracked, qpos=qpos)
     assert hand_figures(take)[0].joints()[joint, -1] >= 0.49
     (fault,) = (one for one in find_faults(take) if "limit" in one.why)
