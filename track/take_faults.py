@@ -31,6 +31,8 @@ _SMALL_SLIP: Final = 0.0008  # [m] the same for a steady marker: the pose absorb
 _SMALL_SHARE: Final = 0.85  # least explained share for such a small shift
 _GLOVE_SLIP: Final = 0.0019  # [m] RMS shift over the markers if a whole glove slips
 _GLOVE_SHARE: Final = 0.4  # least explained share of the variance of all markers' smoothed offsets
+_SMALL_GLOVE_SLIP: Final = 0.00075  # [m] the same where markers are steady, as in a calibrated hand
+_SMALL_GLOVE_SHARE: Final = 0.5  # least explained share for such a small shift
 _WHILE: Final = 0.25  # [s] smoothing time of these offsets
 _SLIP_PART: Final = 1.9  # [s] least time before and after a slip
 _LEAST_VARIANCE: Final = 1e-8  # [m^2] noise of optical systems
@@ -138,8 +140,10 @@ def _slips(hand: _Hand) -> Iterator[SuspectSpan]:
         slow -= whole / total[:, None]
         lasting = max(np.square(slow[known]).sum(), _LEAST_VARIANCE * known.sum(), _LEAST_VARIANCE)
         of_glove = explained.sum(axis=1, keepdims=True) / lasting
-        together = np.sqrt(np.square(steps).mean(axis=1, keepdims=True)) > _GLOVE_SLIP
-        share = of_glove * steps / max(steps.max(), _SLIP) * (together & (of_glove > _GLOVE_SHARE) & is_long)
+        together = np.sqrt(np.square(steps).mean(axis=1, keepdims=True))
+        is_clear = (together > _GLOVE_SLIP) & (of_glove > _GLOVE_SHARE)
+        is_small = (together > _SMALL_GLOVE_SLIP) & (of_glove > _SMALL_GLOVE_SHARE)
+        share = of_glove * steps / max(steps.max(), _SLIP) * ((is_clear | is_small) & is_long)
     when, marker = np.unravel_index(int(share.argmax()), share.shape)
     if share[when, marker] > 0.0:
         frame, name = int(hand.frames[when]), hand.worn.layout.names[marker]

@@ -98,13 +98,13 @@ def test_a_short_gap_at_the_end_is_no_fault(tracked):
     assert find_faults(without_marker(tracked, 6, FRAMES - 60)) == ()
 
 
-def test_a_glove_that_slips_is_named_with_the_time(truth):
+@pytest.mark.parametrize("part", ["palm", "whole"])
+def test_a_glove_that_slips_is_named_with_the_time(truth, part):
     points, hand = truth.points.copy(), truth.hands[0]
-    bones = hand.model.forward_kinematics(truth.qpos[:, 0])
-    palm = np.flatnonzero(hand.attachment.main_bones == PALM)
+    bones, own = hand.model.forward_kinematics(truth.qpos[:, 0]), hand.attachment.main_bones
     for frame in range(HALF, FRAMES):
-        for marker in palm:
-            points[frame, columns_of(truth, frame, marker)] += 0.008 * bones[frame, PALM, :3, 0]
+        for marker in np.flatnonzero(own == PALM) if part == "palm" else range(len(own)):
+            points[frame, columns_of(truth, frame, marker)] += 0.008 * bones[frame, own[marker], :3, 0]
     slipped = dataclasses.replace(truth, points=points)
     take = track_capture(slipped, hands=truth.hands, labeler="dense19")
     found = [fault for fault in find_faults(take) if fault.why.startswith("slips by ")]
