@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from gloves import MarkerLayout, MarkerPlace, Take, load_layout
+from gloves import GloveFit, MarkerLayout, MarkerPlace, Take, load_layout
 from handsim.hand.shape import JOINTS, PALM
 from track import find_suspect_spans, track_capture
 from track.kinematics.pose_solver import PoseSolver
@@ -124,6 +124,19 @@ def test_a_slip_is_told_from_noise_by_all_markers_together(truth, rng, shift):
     found = [fault for fault in find_faults(take) if "slips by" in fault.why]
     assert len(found) == (shift > 0.0)
     assert all(abs(fault.first - HALF) <= 3 and fault.of.startswith("right:BackHand") for fault in found)
+
+
+def test_a_slip_is_told_of_a_hand_that_was_calibrated_on_both_parts(truth, rng):
+    (hand, *_), qpos = truth.hands, truth.qpos[:, 0]
+    worn, own = hand.attachment, hand.attachment.main_bones
+    half = 0.0025 * hand.model.rest_transforms[own, :3, 0]
+    between = GloveFit(hand.model, dataclasses.replace(worn, points=worn.points + half))
+    shift = 0.005 * hand.model.forward_kinematics(qpos)[:, :, :3, 0][:, own]
+    shift[:HALF] = 0.0
+    seen = hand.markers(qpos)[0] + shift + rng.normal(0.0, 0.0005, shift.shape)
+    take = as_tracked([between], PoseSolver(between).solve(seen).qpos[:, None], seen)
+    (fault,) = (one for one in find_faults(take) if "slips by" in one.why)
+    assert abs(fault.first - HALF) <= 3
 
 
 @pytest.mark.parametrize("across", [(-0.18, 0.18), (0.18, -0.18)])  # 15 mm
