@@ -31,6 +31,8 @@ _SMALL_SLIP: Final = 0.0008  # [m] the same for a steady marker: the pose absorb
 _SMALL_SHARE: Final = 0.85  # least explained share for such a small shift
 _GLOVE_SLIP: Final = 0.0019  # [m] RMS shift over the markers if a whole glove slips
 _GLOVE_SHARE: Final = 0.4  # least explained share of the variance of all markers' smoothed offsets
+_SMALL_GLOVE_SLIP: Final = 0.00075  # [m] the same where markers are steady, as in a calibrated hand
+_SMALL_GLOVE_SHARE: Final = 0.5  # least explained share for such a small shift
 _WHILE: Final = 0.25  # [s] smoothing time of these offsets
 _SLIP_PART: Final = 1.9  # [s] least time before and after a slip
 _LEAST_VARIANCE: Final = 1e-8  # [m^2] noise of optical systems
@@ -138,8 +140,10 @@ def _slips(hand: _Hand) -> Iterator[SuspectSpan]:
         slow -= whole / total[:, None]
         lasting = max(np.square(slow[known]).sum(), _LEAST_VARIANCE * known.sum(), _LEAST_VARIANCE)
         of_glove = explained.sum(axis=1, keepdims=True) / lasting
-        together = np.sqrt(np.square(steps).mean(axis=1, keepdims=True)) > _GLOVE_SLIP
-        share = of_glove * steps / max(steps.max(), _SLIP) * (together & (of_glove > _GLOVE_SHARE) & is_long)
+        together = np.sqrt(np.square(steps).mean(axis=1, keepdims=True))
+        is_clear = (together > _GLOVE_SLIP) & (of_glove > _GLOVE_SHARE)
+        is_small = (together > _SMALL_GLOVE_SLIP) & (of_glove > _SMALL_GLOVE_SHARE)
+        share = of_glove * steps / max(steps.max(), _SLIP) * ((is_clear | is_small) & is_long)
     when, marker = np.unravel_index(int(share.argmax()), share.shape)
     if share[when, marker] > 0.0:
         frame, name = int(hand.frames[when]), hand.worn.layout.names[marker]
@@ -157,7 +161,8 @@ def _fallen(hand: _Hand) -> Iterator[SuspectSpan]:
     for name, row, longest in zip(hand.worn.layout.names, seen.T, gaps, strict=True):
         if not row.any():
             if shown.sum() >= _LAST_GAP * take.rate:
-                yield hand.span(0, name, "is never seen", "compare the layout with the glove")
+                remedy = "compare the layout with the glove"
+                yield hand.span(0, name, "is never seen", remedy, of_labels=False)
             continue
         begin = take.num_frames - int(row[::-1].argmax())
         gap = float(shown[begin:].sum()) / take.rate
@@ -172,8 +177,8 @@ def _at_limits(hand: _Hand) -> Iterator[SuspectSpan]:
     """Joints at the limit of the model's range in many frames, which may have gone beyond."""
     angles = np.rad2deg(hand.take.qpos[hand.frames, hand.take.hand_index(hand.side), 7:])
     for joint, values in zip(JOINTS, angles.T, strict=True):
-        for limit in (joint.low, joint.high):
-            there = np.abs(values - limit) < AT_LIMIT
+        low, high = values < joint.low + AT_LIMIT, values > joint.high - AT_LIMIT
+        for limit, there in ((joint.low, low), (joint.high, high)):
             if there.mean() > _OFTEN_AT_LIMIT:
                 first = int(hand.frames[there.argmax()])
                 share, start = 100 * there.mean(), hand.take.times[first]

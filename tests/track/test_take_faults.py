@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from gloves import MarkerLayout, MarkerPlace, Take, load_layout
+from gloves import GloveFit, MarkerLayout, MarkerPlace, Take, load_layout
 from handsim.hand.shape import JOINTS, PALM
 from track import find_suspect_spans, track_capture
 from track.kinematics.pose_solver import PoseSolver
@@ -57,7 +57,13 @@ def without_marker(take: Take, marker: int, first: int) -> Take:
 @pytest.mark.parametrize("glove", ["dense19", "sparse13"])
 def test_no_fault_is_named_in_a_take_without_one(glove, seed):
     truth = at_rate(simulate_take("hand-hand", glove=glove, num_frames=2 * FRAMES, seed=seed).without_body())
-    assert find_faults(track_capture(truth, glove=glove)) == ()
+    take = track_capture(truth, glove=glove)
+    faults = find_faults(take)
+    assert all("at the model's limit" in fault.why for fault in faults)
+    for side, joint in (fault.of.split(":") for fault in faults):  # The angle is indeed off.
+        column, own = 7 + take.joint_names.index(joint), take.hand_index(side)
+        off = take.qpos[:, own, column] - truth.qpos[:, truth.hand_index(side), column]
+        assert np.median(np.abs(off)) > np.deg2rad(5.0)
 
 
 def test_a_truth_has_no_faults(truth):
@@ -82,17 +88,23 @@ def test_a_marker_that_falls_off_is_named(truth, tracked, first):
     assert figures.measured[:, pip].sum() >= figures.measured[:, dip].sum()
 
 
+def test_labels_are_vouched_for_without_a_marker_that_is_never_seen(tracked):
+    take = without_marker(tracked, 6, 0)
+    assert [fault.why for fault in find_faults(take)] == ["is never seen"]
+    assert vouch(take).listed < 0.1
+
+
 def test_a_short_gap_at_the_end_is_no_fault(tracked):
     assert find_faults(without_marker(tracked, 6, FRAMES - 60)) == ()
 
 
-def test_a_glove_that_slips_is_named_with_the_time(truth):
+@pytest.mark.parametrize("part", ["palm", "whole"])
+def test_a_glove_that_slips_is_named_with_the_time(truth, part):
     points, hand = truth.points.copy(), truth.hands[0]
-    bones = hand.model.forward_kinematics(truth.qpos[:, 0])
-    palm = np.flatnonzero(hand.attachment.main_bones == PALM)
+    bones, own = hand.model.forward_kinematics(truth.qpos[:, 0]), hand.attachment.main_bones
     for frame in range(HALF, FRAMES):
-        for marker in palm:
-            points[frame, columns_of(truth, frame, marker)] += 0.008 * bones[frame, PALM, :3, 0]
+        for marker in np.flatnonzero(own == PALM) if part == "palm" else range(len(own)):
+            points[frame, columns_of(truth, frame, marker)] += 0.008 * bones[frame, own[marker], :3, 0]
     slipped = dataclasses.replace(truth, points=points)
     take = track_capture(slipped, hands=truth.hands, labeler="dense19")
     found = [fault for fault in find_faults(take) if fault.why.startswith("slips by ")]
@@ -112,6 +124,19 @@ def test_a_slip_is_told_from_noise_by_all_markers_together(truth, rng, shift):
     found = [fault for fault in find_faults(take) if "slips by" in fault.why]
     assert len(found) == (shift > 0.0)
     assert all(abs(fault.first - HALF) <= 3 and fault.of.startswith("right:BackHand") for fault in found)
+
+
+def test_a_slip_is_told_of_a_hand_that_was_calibrated_on_both_parts(truth, rng):
+    (hand, *_), qpos = truth.hands, truth.qpos[:, 0]
+    worn, own = hand.attachment, hand.attachment.main_bones
+    half = 0.0025 * hand.model.rest_transforms[own, :3, 0]
+    between = GloveFit(hand.model, dataclasses.replace(worn, points=worn.points + half))
+    shift = 0.005 * hand.model.forward_kinematics(qpos)[:, :, :3, 0][:, own]
+    shift[:HALF] = 0.0
+    seen = hand.markers(qpos)[0] + shift + rng.normal(0.0, 0.0005, shift.shape)
+    take = as_tracked([between], PoseSolver(between).solve(seen).qpos[:, None], seen)
+    (fault,) = (one for one in find_faults(take) if "slips by" in one.why)
+    assert abs(fault.first - HALF) <= 3
 
 
 @pytest.mark.parametrize("across", [(-0.18, 0.18), (0.18, -0.18)])  # 15 mm
@@ -139,10 +164,11 @@ def test_places_that_are_off_are_named(truth, across):
     assert summarize(take)[-2].startswith("labels: ")
 
 
-def test_a_joint_at_its_limit_is_named(tracked):
+@pytest.mark.parametrize("beyond", [0.0, 2.0])
+def test_a_joint_at_its_limit_is_named(tracked, beyond):
     qpos = tracked.qpos.copy()
     joint = tracked.joint_names.index("ring_MCP_flexion")
-    qpos[HALF:, 0, 7 + joint] = np.deg2rad(JOINTS[joint].low)
+    qpos[HALF:, 0, 7 + joint] = np.deg2rad(JOINTS[joint].low - beyond)
     take = dataclasses.replace(tracked, qpos=qpos)
     assert hand_figures(take)[0].joints()[joint, -1] >= 0.49
     (fault,) = (one for one in find_faults(take) if "limit" in one.why)

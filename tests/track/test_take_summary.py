@@ -111,13 +111,13 @@ def test_doubtful_frames_are_listed_by_the_stored_confidence_where_there_are_no_
     confidence[11, columns[0]], confidence[34, columns[0]] = 0.55, 0.9
     take = dataclasses.replace(
         tracked,
-        rate=40.0,  # a frame around, and spans of less than ten frames from each other are one
+        rate=200.0,  # spans of less than ten frames from each other are one
         status=np.full(tracked.status.shape, LOST, dtype=np.int8),
         qpos=np.full(tracked.qpos.shape, np.nan),
         confidence=confidence,
     )
     doubts = find_suspect_spans(take)
-    assert [doubt[:3] for doubt in doubts] == [(3, 12, 5), (27, 29, 28)], "more of the first is wrong"
+    assert [doubt[:3] for doubt in doubts] == [(4, 11, 5), (28, 28, 28)], "more of the first is wrong"
     assert doubts[0].words == f"{take.label_names[take.labels[5, columns[1]]]} labeled, 30 %"
     assert find_suspect_spans(take, most=1) == doubts[:1]
     assert frame_confidence(take)[[5, 28, 34, 35]].tolist() == [0.3, 0.1, 0.9, 0.99]

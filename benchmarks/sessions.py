@@ -1,0 +1,154 @@
+"""Whether two sessions of a person differ as much as the report's minimal detectable differences say.
+
+python -m benchmarks.sessions [--glove dense19] [--users 30] [--seconds 4] [--calibrate] [--store FOLDER]
+
+Each simulated user makes one motion of the right hand in two sessions. For each session every marker is glued
+on anew, up to 6 mm off along either direction of the skin, and moves with the flesh by 0.5 to 2 mm (RMS, a
+figure per session, by linear functions of the digit's angles). Sessions are tracked as `handsim track` does,
+with measured hands or --calibrate. --store keeps each session in a folder, so that a stopped run continues.
+
+Errors within the 95 % interval are those of at most 1.96 standard deviations. The found MDD is 1.96 times the
+root mean square, over users and frames, of the difference of an angle between the sessions; the forecast one
+is that of the report, from the standard deviations' parts but bones.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import warnings
+from pathlib import Path
+
+import numpy as np
+from scipy.stats import spearmanr
+
+from benchmarks.record import describe, report, run
+from gloves import GloveFit, load_layout
+from gloves.fit import GlovedHand, nominal_fit
+from handsim import HandSimWarning, load_rig
+from handsim.hand.shape import BONES, EVERYBODY, JOINT_NAMES, NUM_JOINTS
+from handsim.space.transforms import quaternion_matrix
+from track import track_capture
+from train.simulation.room import RoomConfig, record_take
+from train.simulation.scenes import CalibrationTakeConfig, sample_calibration_scene
+from train.simulation.training_frames import sample_hands, wear_gloves
+
+GLUED, FLESH = 0.006, (0.0005, 0.002)  # [m]
+Session = dict[str, np.ndarray]
+
+
+def glued(fit: GloveFit, rng: np.random.Generator) -> GloveFit:
+    """The hand with each marker shifted along the skin."""
+    worn = fit.attachment
+    shifts = rng.uniform(-GLUED, GLUED, worn.points.shape)
+    shifts -= (shifts * worn.normals).sum(axis=1, keepdims=True) * worn.normals
+    return GloveFit(fit.model, dataclasses.replace(worn, points=worn.points + shifts))
+
+
+def flesh(hand: GlovedHand, rng: np.random.Generator) -> np.ndarray:
+    """Displacement of the markers in the world (T, M, 3) [m]."""
+    turns, size = quaternion_matrix(hand.qpos[:, 3:7]), rng.uniform(*FLESH) / np.sqrt(3.0)
+    moved = np.zeros((len(turns), hand.layout.num_markers, 3))
+    for marker, bone in enumerate(hand.fit.attachment.main_bones):
+        digit = BONES[bone].digit
+        angles = hand.qpos[:, 7 + 4 * digit : 11 + 4 * digit] if digit >= 0 else hand.qpos[:, 12::4]
+        way = (angles - angles.mean(axis=0)) @ rng.standard_normal((4, 3))
+        way *= size / max(np.sqrt((way**2).mean()), 1e-9)
+        moved[:, marker] = np.einsum("tij,tj->ti", turns, way)
+    return moved
+
+
+def sessions_of(user: int, glove: str, seconds: float, calibrate: bool) -> list[Session]:
+    """True and found angles, standard deviations (T, 20) and their parts (20, 4) of both sessions [deg]."""
+    rng = np.random.default_rng((user, 56))
+    layout = load_layout(glove)
+    model = next(one for one in sample_hands(EVERYBODY, rng=rng) if one.shape.side == "right")
+    (worn,) = wear_gloves(layout, [model], along=0.0, around=0.0, rng=rng)
+    config = CalibrationTakeConfig(free=seconds, rounds=0)
+    scene = sample_calibration_scene((worn,), config, rng=rng)
+    made: list[Session] = []
+    for _ in range(2):
+        hand = GlovedHand(glued(worn, rng), scene.hands[0].qpos)
+        moving = dataclasses.replace(scene, hands=(hand,), skin=(flesh(hand, rng),))
+        take = record_take(moving, load_rig("figure5"), RoomConfig(), {}, rng=rng)
+        found = track_capture(take.capture(), glove=layout, hands="right", calibrate=calibrate)
+        assert found.angle_spread is not None
+        made.append(
+            {
+                "true": np.rad2deg(take.qpos[:, 0, 7:]),
+                "found": np.rad2deg(found.qpos[:, 0, 7:]),
+                "spread": np.rad2deg(found.angle_spread[:, 0]),
+                "budget": np.array(found.settings["budget"].get("right", np.full((NUM_JOINTS, 4), np.nan))),
+            }
+        )
+    return made
+
+
+def kept_sessions(
+    folder: Path | None, user: int, glove: str, seconds: float, calibrate: bool
+) -> list[Session]:
+    """The same from a folder where they are there, else kept in it."""
+    if folder is None:
+        return sessions_of(user, glove, seconds, calibrate)
+    path = folder / f"{glove}_{seconds:g}_{'calibrated' if calibrate else 'measured'}_{user}.npz"
+    if not path.exists():
+        made = sessions_of(user, glove, seconds, calibrate)
+        folder.mkdir(parents=True, exist_ok=True)
+        names = made[0]
+        np.savez_compressed(path, **{name: np.stack([one[name] for one in made]) for name in names})
+    with np.load(path) as stored:
+        return [{name: stored[name][number] for name in stored.files} for number in range(2)]
+
+
+def main(
+    glove: str = "dense19",
+    users: int = 30,
+    seconds: float = 4.0,
+    calibrate: bool = False,
+    store: Path | None = None,
+    save: str | None = None,
+) -> None:
+    warnings.simplefilter("ignore", HandSimWarning)
+    print(describe("numba"))
+    pairs = [kept_sessions(store, user, glove, seconds, calibrate) for user in range(users)]
+    every = [one for pair in pairs for one in pair]
+    off = np.concatenate([one["found"] - one["true"] for one in every])
+    spread = np.concatenate([one["spread"] for one in every])
+    seen = np.isfinite(off[:, 0])
+    within = 100.0 * (np.abs(off[seen]) <= 1.96 * spread[seen]).mean(axis=0)
+    changes = np.concatenate([first["found"] - second["found"] for first, second in pairs])
+    found = 1.96 * np.sqrt(np.nanmean(changes**2, axis=0))
+    parts = np.array([one["budget"] for one in every])[..., :-1]
+    forecast = 1.96 * np.sqrt(2.0) * np.sqrt(np.nanmean((parts**2).sum(axis=2), axis=0))
+    ratio = forecast / found
+    digits = nominal_fit(glove, "M", "right").attachment.digits
+    told = np.isin(np.arange(NUM_JOINTS) // 4, digits)  # joints of digits with a marker
+    print("joint | within the 95 % interval [%] | RMSE [deg] | MDD forecast, found [deg] | ratio")
+    rms = np.sqrt(np.nanmean(off**2, axis=0))
+    for row in zip(JOINT_NAMES, within, rms, forecast, found, ratio, strict=True):
+        print("{:28s} | {:5.1f} | {:5.2f} | {:5.2f} {:5.2f} | {:4.2f}".format(*row))
+    figures = {
+        "users": ("users with two sessions", users),
+        "lost": ("frames without a pose [%]", 100.0 * (1.0 - seen.mean())),
+        "within": (
+            "errors within the 95 % interval [%]: all, least and largest of a joint",
+            [within[told].mean(), within[told].min(), within[told].max()],
+        ),
+        "joints": ("joints with 93 to 97 %", int(((within[told] >= 93.0) & (within[told] <= 97.0)).sum())),
+        "ratio": (
+            "forecast MDD over the found one: median, least and largest of a joint",
+            [np.median(ratio[told]), ratio[told].min(), ratio[told].max()],
+        ),
+        "close": (
+            "joints with a ratio of 0.8 to 1.25",
+            int(((ratio[told] >= 0.8) & (ratio[told] <= 1.25)).sum()),
+        ),
+        "rank": (
+            "rank correlation of both over the joints",
+            spearmanr(forecast[told], found[told]).statistic,
+        ),
+    }
+    report(save, figures)
+
+
+if __name__ == "__main__":
+    run(main, __doc__)
