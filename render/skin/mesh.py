@@ -154,17 +154,8 @@ def _assemble(used: Integers, tiles: Integers, wrist: Integers) -> Atlas:
     uv.append(np.stack(np.broadcast_arrays(u[None, :], v[:, None]), axis=-1).reshape(-1, 2))
     uv.append(np.array([[0.5, v[-1]]]))
     table, corner_faces = np.concatenate(corners), np.concatenate(faces)
-    atlas = Atlas(
-        used,
-        wrist,
-        table[corner_faces],
-        table,
-        corner_faces,
-        np.concatenate(coarse),
-        np.concatenate(uv).astype(np.float32),
-        tiles,
-        (width, height),
-    )
+    faces_of = table[corner_faces], table, corner_faces, np.concatenate(coarse)
+    atlas = Atlas(used, wrist, *faces_of, np.concatenate(uv).astype(np.float32), tiles, (width, height))
     for array in atlas[:-1]:
         array.setflags(write=False)
     return atlas
@@ -319,30 +310,28 @@ class _Skin(NamedTuple):
 
 def _finger(skin: _Skin, number: int, digit: str, wide: float) -> Iterator[_Hill]:
     """Hills of a finger's knuckles, its tendon, its shaft, its neck, and the pad that bending pushes out."""
-    first = 1 + 3 * number
-    bent = f"{digit}_MCP_flexion"
-    yield _Hill(bent, 5.0, 75.0, skin.knob(first, 0.0046 * wide, 0.0068, 0.0054, at=(-0.001, 0.0)))
-    for aside in (-0.0036, 0.0036):  # a phalanx ends in two heads
-        heads = skin.knob(first + 1, 0.0010, 0.0050, 0.0048, at=(-0.001, aside))
-        yield _Hill(f"{digit}_PIP_flexion", 5.0, 95.0, heads)
-    yield _Hill(f"{digit}_DIP_flexion", 5.0, 75.0, skin.knob(first + 2, 0.0012, 0.0042, 0.0050))
+    first, size, bent = 1 + 3 * number, skin.scale, f"{digit}_MCP_flexion"
+    middle = 0.5 * float(np.linalg.norm(skin.frames[first + 1, :3, 3] - skin.frames[first, :3, 3])) / size
+    for bone, joint, start, full, height, long, broad, at in (
+        (first, "MCP", 5.0, 75.0, 0.0046 * wide, 0.0068, 0.0054, (-0.001, 0.0)),
+        (first, "MCP", 10.0, 85.0, -0.0018 * wide, 0.0095, 0.0075, (middle, 0.0)),  # shaft
+        (first, "MCP", 10.0, 85.0, -0.0014 * wide, 0.0090, 0.0085, (-0.021, 0.0)),  # neck
+        (first + 1, "PIP", 5.0, 95.0, 0.0010, 0.0050, 0.0048, (-0.001, -0.0036)),  # a phalanx has two heads
+        (first + 1, "PIP", 5.0, 95.0, 0.0010, 0.0050, 0.0048, (-0.001, 0.0036)),
+        (first + 2, "DIP", 5.0, 75.0, 0.0012, 0.0042, 0.0050, (0.0, 0.0)),
+    ):
+        yield _Hill(f"{digit}_{joint}_flexion", start, full, skin.knob(bone, height, long, broad, at=at))
     knuckle = skin.frames[first, :2, 3]
     root = np.array([0.1, 0.35]) * knuckle  # tendons meet at the wrist
     along, aside = along_segment(skin.points[:, :2], root, knuckle)
     ridge = 0.0014 * smooth(along, 0.15, 0.75) * bump(aside, 0.0030) * smooth(skin.normals[:, 2], 0.2, 0.7)
-    yield _Hill(bent, 15.0, -22.0, skin.scale * ridge)
-    place, facing = skin.local(first)
-    middle = 0.5 * np.linalg.norm(skin.frames[first + 1, :3, 3] - skin.frames[first, :3, 3])
-    shaft = skin.knob(first, -0.0018 * wide, 0.0095, 0.0075, at=(float(middle) / skin.scale, 0.0))
-    yield _Hill(bent, 10.0, 85.0, shaft)
-    neck = skin.knob(first, -0.0014 * wide, 0.0090, 0.0085, at=(-0.021, 0.0))
-    yield _Hill(bent, 10.0, 85.0, neck)
+    yield _Hill(bent, 15.0, -22.0, size * ridge)
     for bone, joint, full in ((first, "PIP", 100.0), (first + 1, "DIP", 70.0)):
         place, facing = skin.local(bone)
         end = np.linalg.norm(skin.frames[bone + 1, :3, 3] - skin.frames[bone, :3, 3])
         pads = 0.0018 * bump(place[:, 0] - 0.5 * end, 0.009) - 0.0016 * bump(place[:, 0] - end, 0.0022)
         pads *= bump(place[:, 1], 0.007) * smooth(-facing, 0.1, 0.7) * (place[:, 2] < 0.004)
-        yield _Hill(f"{digit}_{joint}_flexion", 20.0, full, skin.scale * pads)
+        yield _Hill(f"{digit}_{joint}_flexion", 20.0, full, size * pads)
 
 
 _FLESH: Final = 1.2  # radius of the flesh around a capsule over the capsule's radius

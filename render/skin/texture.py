@@ -89,9 +89,8 @@ def skin_texels() -> Texels:
         digits.append(DigitTexels(mine, local[:, 0], angle, share[mine], joints))
     # The thumb's back faces sideways, but the part of it on the hand's back does not have the palm's skin.
     facing = np.maximum(dorsal, normals[:, 2])
-    return Texels(
-        positions, normals, dorsal, smooth(facing, -0.25, 0.35), facing, weights[:, 0], tuple(digits)
-    )
+    back, palm = smooth(facing, -0.25, 0.35), weights[:, 0]
+    return Texels(positions, normals, dorsal, back, facing, palm, tuple(digits))
 
 
 def _spread(values: Doubles) -> Doubles:
@@ -183,13 +182,13 @@ class _DigitLines(NamedTuple):
     """The K texels of a digit that lines are drawn on."""
 
     texels: Integers
+    joints: Doubles  # distances of its other joints [m]
     along: Floats  # distance from its first joint [m]
     sine: Floats  # sine of three times the angle about it
     cosine: Floats  # cosine of three times the angle about it
     arch: Floats  # offset of curved wrinkles [m]
     pad: Floats  # factor on the strength of creases, on the palm's side
     back: Floats  # factor on the strength of wrinkles, on the back
-    joints: Doubles  # distances of its other joints [m]
 
 
 @functools.cache
@@ -198,18 +197,9 @@ def _digit_lines() -> tuple[_DigitLines, ...]:
     for digit in texels.digits:
         back = texels.back[digit.texels]
         on_back = back * digit.share * smooth(np.cos(digit.angle), -0.1, 0.6)
-        lines.append(
-            _DigitLines(
-                digit.texels,
-                along=digit.along.astype(np.float32),
-                sine=np.sin(3.0 * digit.angle).astype(np.float32),
-                cosine=np.cos(3.0 * digit.angle).astype(np.float32),
-                arch=(0.0015 * np.cos(digit.angle)).astype(np.float32),
-                pad=((1.0 - back) * digit.share).astype(np.float32),
-                back=on_back.astype(np.float32),
-                joints=digit.joints,
-            )
-        )
+        waves = np.sin(3.0 * digit.angle), np.cos(3.0 * digit.angle), 0.0015 * np.cos(digit.angle)
+        parts = (digit.along, *waves, (1.0 - back) * digit.share, on_back)
+        lines.append(_DigitLines(digit.texels, digit.joints, *(one.astype(np.float32) for one in parts)))
     return tuple(lines)
 
 
