@@ -159,6 +159,8 @@ def test_a_written_map_has_the_light_of_its_room(tmp_path) -> None:
     assert rise == pytest.approx(expected, abs=0.1), "pictures turn maps about the vertical alone"
     with pytest.raises(HandSimError, match=r"expected a file name that ends in \.hdr"):
         write_environment_map(tmp_path / "room.png")
+    with pytest.raises(HandSimError, match="seed is -1, expected 0 or more"):
+        write_environment_map(tmp_path / "room.hdr", seed=-1)
 
 
 def test_a_damaged_environment_map_is_told(tmp_path) -> None:
