@@ -187,7 +187,7 @@ _HEM: Final = 0.004  # distance of this step from the next rings, so that shadin
 _SQUARE: Final = 0.8  # power of cosine and sine in an arm's section, which is squarer than an ellipse (1)
 _LONGER: Final = 1.04  # girth of this section over that of the ellipse with the same axes
 _BLEND: Final = 0.22  # length of the blend from the hand's section to the arm's [hand lengths]
-BEND: Final = 0.20
+BEND: Final = 0.32
 """Length of the bend of the wrist [hand lengths]."""
 ELBOW: Final = _PLACES[4]
 """Place of the elbow behind the wrist [hand lengths]."""
