@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from render.frames import Pictures as Pictures
     from render.frames import RenderedFrame as RenderedFrame
     from render.scenery.backgrounds import Backgrounds as Backgrounds
+    from render.scenery.lights import write_environment_map as write_environment_map
     from render.session import draw as draw
     from render.session import render_take as render_take
     from render.skin.look import SkinLook as SkinLook

@@ -29,12 +29,8 @@ SEEN_COLOR: Final = (0.13, 0.72, 0.33)
 HIDDEN_COLOR: Final = (0.89, 0.2, 0.2)
 UNLABELED_COLOR: Final = (0.5, 0.52, 0.56)
 _DIGIT_COLORS: Final = (
-    (0.85, 0.33, 0.1),
-    (0.93, 0.66, 0.08),
-    (0.15, 0.62, 0.35),
-    (0.1, 0.47, 0.82),
-    (0.56, 0.27, 0.68),
-)
+    (0.85, 0.33, 0.1), (0.93, 0.66, 0.08), (0.15, 0.62, 0.35), (0.1, 0.47, 0.82), (0.56, 0.27, 0.68)
+)  # fmt: skip
 _PALM_COLOR: Final = (0.32, 0.36, 0.42)
 _BASE: Final = {"skin": (0.86, 0.66, 0.56), "glove": GLOVE_COLOR}
 _ROUGHNESS: Final = {"skin": 0.62, "glove": 0.85}
@@ -89,10 +85,8 @@ def side_by_side(pictures: Sequence[Picture], *, gap: int = 0) -> Picture:
     height = max(picture.shape[0] for picture in pictures)
     parts = []
     for number, picture in enumerate(pictures):
-        above = (height - picture.shape[0]) // 2
-        below = height - picture.shape[0] - above
-        before = gap if number else 0
-        parts.append(pad(picture, (above, below), (before, 0)))
+        spare = height - picture.shape[0]
+        parts.append(pad(picture, (spare // 2, spare - spare // 2), (gap if number else 0, 0)))
     return np.concatenate(parts, axis=1)
 
 
@@ -100,8 +94,7 @@ def titled(picture: Picture, title: str) -> Picture:
     """The picture with a line of text above it, in its middle."""
     band = round(_TEXT_HEIGHT * 2.2)
     result = pad(picture, (band, 0), (0, 0))
-    width = text_width(title)
-    origin = ((picture.shape[1] - width) // 2, band - _PADDING // 2)
+    origin = ((picture.shape[1] - text_width(title)) // 2, band - _PADDING // 2)
     _write(result, title, origin, _INK)
     return result
 
@@ -187,7 +180,8 @@ def contact_sheet(frames: Sequence[RenderedFrame], *, columns: int = 3, width: i
     cells = [_cell(frame, width) for frame in frames]
     height = max(cell.shape[0] for cell in cells)
     across = max(cell.shape[1] for cell in cells)
-    cells = [_padded(cell, height, across) for cell in cells]
+    spare = [(height - cell.shape[0] + _GAP, across - cell.shape[1] + _GAP) for cell in cells]
+    cells = [pad(cell, (0, rows), (0, right)) for cell, (rows, right) in zip(cells, spare, strict=True)]
     blank = np.broadcast_to(np.array(_PAPER, dtype=np.uint8), cells[0].shape)
     columns = min(columns, len(cells))
     cells += [blank] * (math.ceil(len(cells) / columns) * columns - len(cells))
@@ -217,9 +211,8 @@ def draw_keypoints(picture: Picture, hands: Sequence[Skeleton], *, scale: float 
     for hand in hands:
         near = (np.abs(np.nan_to_num(hand.keypoints)) < 1e5).all(axis=1)
         known = np.isfinite(hand.keypoints).all(axis=1) & near
-        pixels = (
-            np.rint(unit * (scale * np.nan_to_num(hand.keypoints) - CENTER)).astype(int).clip(-(2**24), 2**24)
-        )
+        sixteenths = np.rint(unit * (scale * np.nan_to_num(hand.keypoints) - CENTER))
+        pixels = sixteenths.astype(int).clip(-(2**24), 2**24)
         for start, end in SKELETON:
             if known[start] and known[end]:
                 cv2.line(drawn, pixels[start].tolist(), pixels[end].tolist(), inks[end], 1, **style)
@@ -261,8 +254,3 @@ def _scaled(picture: Picture, scale: float) -> Picture:
         return picture
     size = [max(1, round(scale * length)) for length in picture.shape[1::-1]]
     return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA))
-
-
-def _padded(picture: Picture, height: int, width: int) -> Picture:
-    rows, columns = height - picture.shape[0], width - picture.shape[1]
-    return pad(picture, (0, rows + _GAP), (0, columns + _GAP))

@@ -288,26 +288,17 @@ def draw_sizes() -> Picture:
     """The five sizes from the back, at one scale."""
     models = {size: HandModel.named(size) for size in SIZES}
     spread = join_qpos(gesture("spread")[None])[0]
-    return draw_row(
-        [
-            (f"{size}: {1e3 * model.shape.length:.0f} x {1e3 * model.shape.breadth:.0f} mm", model, spread)
-            for size, model in models.items()
-        ]
-    )
+    lengths = [(1e3 * model.shape.length, 1e3 * model.shape.breadth) for model in models.values()]
+    captions = [f"{size}: {a:.0f} x {b:.0f} mm" for size, (a, b) in zip(models, lengths, strict=True)]
+    return draw_row([(caption, one, spread) for caption, one in zip(captions, models.values(), strict=True)])
 
 
 def draw_gloves(fits: Sequence[GloveFit]) -> Picture:
     """Gloves (one at least) on flat hands from the back, with name and number of markers, in rows."""
     spread = join_qpos(gesture("spread")[None])[0]
     cells = [(f"{fit.layout.name}: {fit.layout.num_markers}", fit, spread) for fit in fits]
-    rows = [
-        draw_row(
-            cells[start : start + _COLUMNS],
-            covering="glove",
-            width=_WIDTH * min(_COLUMNS, len(cells) - start) // _COLUMNS,
-        )
-        for start in range(0, len(cells), _COLUMNS)
-    ]
+    groups = [cells[start : start + _COLUMNS] for start in range(0, len(cells), _COLUMNS)]
+    rows = [draw_row(one, covering="glove", width=_WIDTH * len(one) // _COLUMNS) for one in groups]
     return np.concatenate([pad(row, (0, 0), (0, _WIDTH - row.shape[1])) for row in rows])
 
 
@@ -343,11 +334,8 @@ def draw_glove(
             view = _side_view(hand, side, np.concatenate([markers, dots]), _SLIPS_HEIGHT)
             picture = draw_things(view, bare)
             shown = unoccluded(view, bare, dots, slack=slack)
-            for pixel, color in zip(
-                np.rint(view.project(dots[shown])).astype(int),
-                np.tile(colors, (len(slips), 1))[shown],
-                strict=True,
-            ):
+            pixels, inks = np.rint(view.project(dots[shown])), np.tile(colors, (len(slips), 1))[shown]
+            for pixel, color in zip(pixels.astype(int), inks, strict=True):
                 cv2.circle(picture, pixel.tolist(), 2, byte_color(tuple(color)), -1, cv2.LINE_AA)
             picture = titled(picture, f"slips of {len(slips)} people")
             spare = pictures[-1].shape[1] - picture.shape[1]
@@ -421,9 +409,8 @@ def draw_labels(
         cv2.circle(colored, (x, y), 9, byte_color(HIDDEN_COLOR), 2, cv2.LINE_AA)
     named = with_names(colored, pixels, [names[label] for label in labels], palette[labels])
     margin = (named.shape[0] - size[1]) // 2
-    return side_by_side(
-        [titled(pad(gray, (margin, margin), (0, 0)), "as it comes"), titled(named, "labeled")], gap=20
-    )
+    gray = titled(pad(gray, (margin, margin), (0, 0)), "as it comes")
+    return side_by_side([gray, titled(named, "labeled")], gap=20)
 
 
 def marker_colors(layout: MarkerLayout) -> Float[np.ndarray, "M 3"]:

@@ -353,18 +353,11 @@ class PictureStream(IterableDataset[dict[str, torch.Tensor]]):
         merged = {name: np.stack([hand[name] for hand in hands]) for name in hands[0]}
         if len(hands) == 1:
             merged = {name: array[0] for name, array in merged.items()}
-        return _tensors(
-            _picture_arrays(frame)
-            | merged
-            | {
-                "K": camera.K,
-                "T_world_camera": camera.T_world_camera,
-                "person": np.array(sitting.person),
-                "tone": np.array(np.nan if skin is None else skin.typology_angle),
-                "drawn": np.array(True),
-                "number": np.array(number),
-            }
-        )
+        tone = np.nan if skin is None else skin.typology_angle
+        about = {"person": sitting.person, "tone": tone, "drawn": True, "number": number}
+        placed = {"K": camera.K, "T_world_camera": camera.T_world_camera}
+        scalars = {name: np.array(value) for name, value in about.items()}
+        return _tensors(_picture_arrays(frame) | merged | placed | scalars)
 
 
 def _as_photographs(picture: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
@@ -401,16 +394,8 @@ def _rows(poses: ArrayLike) -> Doubles:
 def _picture_arrays(frame: RenderedFrame) -> dict[str, NDArray[np.generic]]:
     """The pictures of a frame, colors and normals with their channels first."""
     ideal, noisy = frame.ideal, frame.noisy
-    arrays = {
-        "rgb": ideal.rgb,
-        "noisy_rgb": noisy.rgb,
-        "depth": ideal.depth,
-        "noisy_depth": noisy.depth,
-        "normals": ideal.normals,
-        "ids": ideal.instances,
-        "parts": ideal.parts,
-        "markers": ideal.markers,
-    }
+    arrays = {name: getattr(ideal, name) for name in ("rgb", "depth", "normals", "parts", "markers")}
+    arrays |= {"noisy_rgb": noisy.rgb, "noisy_depth": noisy.depth, "ids": ideal.instances}
     return {
         name: np.moveaxis(array, 2, 0) if array.ndim == 3 else array
         for name, array in arrays.items()

@@ -9,15 +9,20 @@ from __future__ import annotations
 import dataclasses
 import functools
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Final
 
 import cv2
 import numpy as np
 from jaxtyping import Float
 
+from handsim._checks import check_count, check_type
+from handsim.errors import HandSimError
+from handsim.files.outputs import atomic_write
 from render.frames import Doubles, Integers
 from render.scenery.backgrounds import (
     LUMINANCE,
+    MAP_SUFFIXES,
     Background,
     Backgrounds,
     Enclosure,
@@ -31,6 +36,9 @@ _SIZE: Final = (64, 48)  # size of the picture that gives light [px]
 _DIRECTIONS: Final = 1024  # directions in which the picture's light is sampled
 _SHARE: Final = (0.1, 0.5)  # range of the share of ambient light that has the picture's colors
 _LEVEL: Final = 1.44  # usual light of a white surface before all lamps, 1 for the picture's full white
+_MAP_SIZE: Final = (1024, 512)  # size of a written map [px]
+_LOBE: Final = 300.0  # sharpness of a lamp in it, a spot with a standard deviation of 3.3 degrees
+_AHEAD: Final = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # axes of who looks along y
 _BRIGHT: Final = 3.0  # luminance beyond which light of a map is a lamp's, over the mean
 # Factors of a matt surface on each order, and integrals of the squared functions over the sphere.
 _MATT: Final = np.array([1.0, *[2.0 / 3.0] * 3, *[0.25] * 5])
@@ -87,21 +95,12 @@ def sample_lighting(*, rng: np.random.Generator) -> Lighting:
     # The key light comes from above more often than from below, and seldom from behind the hand.
     key = np.array([rng.normal(0.0, 0.6), rng.normal(-0.6, 0.45), rng.normal(-1.05, 0.3)])
     fill = np.array([-np.sign(key[0]) * rng.uniform(0.4, 1.2), rng.normal(-0.2, 0.4), rng.uniform(-1.1, 0.1)])
-    directions = (
-        key,
-        fill,
-        np.array([rng.normal(0.0, 0.3), -1.0, rng.normal(0.1, 0.4)]),
-        np.array([rng.normal(0.0, 0.3), 1.0, rng.normal(-0.2, 0.3)]),
-    )
+    sky = np.array([rng.normal(0.0, 0.3), -1.0, rng.normal(0.1, 0.4)])
+    ground = np.array([rng.normal(0.0, 0.3), 1.0, rng.normal(-0.2, 0.3)])
     rest = 1.15 - key_share - ambient_share
-    shares = (
-        key_share,
-        rest * rng.uniform(0.4, 0.9),
-        rest * rng.uniform(0.2, 0.7),
-        rest * rng.uniform(0.05, 0.4),
-    )
+    shares = key_share, *(rest * rng.uniform((0.4, 0.2, 0.05), (0.9, 0.7, 0.4)))
     lamps = []
-    for number, (direction, share) in enumerate(zip(directions, shares, strict=True)):
+    for number, (direction, share) in enumerate(zip((key, fill, sky, ground), shares, strict=True)):
         own = rng.normal(0.0, 0.03 if number == 0 else 0.08)
         lamps.append(Lamp(_triple(direction), float(exposure * share), _tint(warmth + own, rng)))
     # Lamps in rooms are wide and their shadows faint: part of the key light comes without any.
@@ -146,6 +145,35 @@ def sample_surroundings(
     enclosure = enclose(around, background.seed, np.array(lighting.lamps[0].direction))
     light = light_in(background, enclosure, _sphere()[0])
     return background, surround(lighting, _projected(light), share), enclosure
+
+
+def write_environment_map(file: str | Path, *, seed: int = 0) -> None:
+    """Write the light in a random room as an environment map (.hdr): its walls and furniture, and its lamps.
+
+    Pictures take it from their folder of photographs, and other programs as the light of their world, z up.
+    Lamps have the strength that hands in such a room see, and walls the light that pictures show.
+
+    Raises:
+        HandSimError: The file's name ends otherwise, or the seed is negative.
+    """
+    check_type("file", file, (str, Path), "a path")
+    check_count("seed", seed, 0)
+    if Path(file).suffix.lower() != MAP_SUFFIXES[0]:
+        raise HandSimError(f"{file}: expected a file name that ends in {MAP_SUFFIXES[0]}")
+    rng, here = np.random.default_rng(seed), np.zeros((1, 3))
+    background, lighting, room = sample_surroundings(Backgrounds({"room": 1.0}), _AHEAD, around=here, rng=rng)
+    assert room is not None
+    (width, height), sides = _MAP_SIZE, [np.pi * (np.arange(side) + 0.5) / side for side in _MAP_SIZE]
+    azimuth, polar = np.pi - 2.0 * sides[0], sides[1][:, None]
+    ways = np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)
+    rays = np.stack(np.broadcast_arrays(*ways), axis=-1).reshape(-1, 3)
+    light = light_in(background, room, rays)
+    for lamp in lighting.lamps:
+        beside = rays @ np.array(lamp.direction) / np.linalg.norm(lamp.direction) - 1.0
+        light = light + 0.5 * _LOBE * lamp.strength * np.exp(_LOBE * beside)[:, None] * lamp.color
+    written = light.reshape(height, width, 3)[..., ::-1].astype(np.float32)
+    with atomic_write(file) as temporary:
+        temporary.write_bytes(cv2.imencode(MAP_SUFFIXES[0], written)[1].tobytes())
 
 
 def _light_of_map(light: Doubles) -> Lighting:

@@ -187,7 +187,7 @@ _HEM: Final = 0.004  # distance of this step from the next rings, so that shadin
 _SQUARE: Final = 0.8  # power of cosine and sine in an arm's section, which is squarer than an ellipse (1)
 _LONGER: Final = 1.04  # girth of this section over that of the ellipse with the same axes
 _BLEND: Final = 0.22  # length of the blend from the hand's section to the arm's [hand lengths]
-BEND: Final = 0.20
+BEND: Final = 0.32
 """Length of the bend of the wrist [hand lengths]."""
 ELBOW: Final = _PLACES[4]
 """Place of the elbow behind the wrist [hand lengths]."""
@@ -227,15 +227,8 @@ def sample_forearm(*, rng: np.random.Generator) -> Forearm:
     girth = float(np.exp(np.clip(rng.normal(0.0, 0.06), -0.15, 0.15)))
     sleeve = rng.uniform(0.035, 0.12) if rng.random() < 1 / 3 else 1.0
     red, green, blue = np.clip(rng.uniform(0.05, 0.85) + rng.normal(0.0, 0.08, 3), 0.02, 0.95)
-    return Forearm(
-        float(length),
-        float(flexion),
-        float(deviation),
-        girth,
-        float(sleeve),
-        (float(red), float(green), float(blue)),
-        float(rng.uniform(1.1, 1.45)),
-    )
+    color, loose = (float(red), float(green), float(blue)), float(rng.uniform(1.1, 1.45))
+    return Forearm(float(length), float(flexion), float(deviation), girth, float(sleeve), color, loose)
 
 
 def forearm_rings(shape: HandShape, forearm: Forearm, wrist: Doubles, rings: int) -> Doubles:

@@ -21,9 +21,10 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
+from scipy import sparse
 
 from handsim.hand.model import HandModel
-from handsim.hand.shape import DIGIT_OF_BONE, DIGITS, JOINT_NAMES, NUM_BONES, PALM
+from handsim.hand.shape import BONES, DIGIT_OF_BONE, DIGITS, JOINT_NAMES, JOINTS, NUM_BONES, NUM_JOINTS, PALM
 from handsim.hand.skin import (
     WRIST,
     all_weights,
@@ -153,17 +154,8 @@ def _assemble(used: Integers, tiles: Integers, wrist: Integers) -> Atlas:
     uv.append(np.stack(np.broadcast_arrays(u[None, :], v[:, None]), axis=-1).reshape(-1, 2))
     uv.append(np.array([[0.5, v[-1]]]))
     table, corner_faces = np.concatenate(corners), np.concatenate(faces)
-    atlas = Atlas(
-        used,
-        wrist,
-        table[corner_faces],
-        table,
-        corner_faces,
-        np.concatenate(coarse),
-        np.concatenate(uv).astype(np.float32),
-        tiles,
-        (width, height),
-    )
+    faces_of = table[corner_faces], table, corner_faces, np.concatenate(coarse)
+    atlas = Atlas(used, wrist, *faces_of, np.concatenate(uv).astype(np.float32), tiles, (width, height))
     for array in atlas[:-1]:
         array.setflags(write=False)
     return atlas
@@ -180,6 +172,7 @@ def _squares(nodes: Integers) -> Integers:
 _REFERENCE: Final = 0.0118  # radius of the finger at its knuckle that the lengths below are made for [m]
 _THUMB_RADIUS: Final = 0.018  # distance from the thumb's axis within which the skin is the thumb's [m]
 _FINGERS: Final = ("index", "middle", "ring", "little")
+_LEAST_SHARE: Final = 0.04  # of two bones in a vertex between them that counts as bent
 
 
 class _Hill(NamedTuple):
@@ -192,7 +185,7 @@ class _Hill(NamedTuple):
 
 
 class Flexion:
-    """The hills that the joints of one hand raise on its skin."""
+    """What the joints of one hand do to its skin: they raise hills, and bent ones keep their thickness."""
 
     def __init__(self, model: HandModel, rest: Doubles, normals: Doubles, bony: float) -> None:
         hills = list(_hills(model, rest, normals))
@@ -204,6 +197,7 @@ class Flexion:
         heights = bony * np.stack([hill.heights for hill in hills], axis=1)
         self._rows = np.flatnonzero(np.abs(heights).max(axis=1) > 1e-6)
         self._heights, self._normals = heights[self._rows], normals[self._rows]
+        self._bends = _bends(model, rest) if bony else None
 
     def shaped(self, rest: Doubles, angles: Doubles) -> Doubles:
         """Vertices (U, 3) at rest with the hills of joint angles (20,) [m, rad]."""
@@ -211,7 +205,32 @@ class Flexion:
         share = smooth(angle, self._start, self._full)
         shaped: Doubles = rest.copy()
         shaped[self._rows] += (self._heights @ share)[:, None] * self._normals
+        if self._bends is not None:
+            sums, offsets, shares, joints = self._bends
+            lengths = np.sqrt(1.0 - shares * (1.0 - np.cos(angles))[joints])
+            shaped += sums @ (offsets * (1.0 / lengths - 1.0)[:, None])
         return shaped
+
+
+def _bends(model: HandModel, rest: Doubles) -> tuple[sparse.csr_array, Doubles, Doubles, Integers]:
+    """Offsets (K, 3) of vertices from a hinge that bends the skin there, their shares (K,) and joints (K,).
+
+    Blending shrinks an offset to the root of 1 - share (1 - cosine of the angle). A matrix (U, K) adds what
+    belongs to a vertex.
+    """
+    atlas, surface, frames = skin_atlas(), model.surface, model.rest_transforms
+    weights = all_weights(surface.bone_indices, surface.bone_weights)[atlas.used]
+    joint_of = {joint.bone: number for number, joint in enumerate(JOINTS)}  # a bone's last joint flexes it
+    parts = []
+    for bone in range(2, NUM_BONES):  # the thumb's first joint lies deep in the flesh
+        shares = 2.0 * weights[:, bone] * weights[:, BONES[bone].parent]
+        rows = np.flatnonzero(shares > _LEAST_SHARE)
+        axes = frames[bone, :3, :3]
+        offsets = (rest[rows] - frames[bone, :3, 3]) @ axes * [1.0, 0.0, 1.0] @ axes.T
+        parts.append((rows, offsets, shares[rows], np.full(len(rows), joint_of[bone])))
+    rows, offsets, shares, joints = (np.concatenate(part) for part in zip(*parts, strict=True))
+    sums = sparse.csr_array((np.ones(len(rows)), (rows, np.arange(len(rows)))), (len(rest), len(rows)))
+    return sums, offsets, shares, joints
 
 
 def _hills(model: HandModel, rest: Doubles, normals: Doubles) -> Iterator[_Hill]:
@@ -229,9 +248,9 @@ def _hills(model: HandModel, rest: Doubles, normals: Doubles) -> Iterator[_Hill]
         here = 0.5 * (frames[first, :2, 3] + frames[second, :2, 3])
         parted = here + 0.45 * (0.5 * (frames[first + 1, :2, 3] + frames[second + 1, :2, 3]) - here)
         along, aside = along_segment(skin.points[:, :2], here, parted)
-        hollow = -0.0042 * bump(aside, scale * 0.0048) * smooth(skin.normals[:, 2], 0.0, 0.6)
+        hollow = -0.0050 * bump(aside, scale * 0.0048) * smooth(skin.normals[:, 2], 0.0, 0.6)
         hollow *= 1.0 - 0.4 * along
-        yield _Hill(f"{_FINGERS[number]}_MCP_flexion", 10.0, 85.0, scale * hollow)
+        yield _Hill(f"{_FINGERS[number]}_MCP_flexion", 10.0, 75.0, scale * hollow)
     # The thumb's knuckles, its waist and pad, and the muscle between it and the index when they close.
     yield _Hill("thumb_MCP_flexion", 0.0, 55.0, skin.knob(2, 0.0022, 0.0070, 0.0068))
     yield _Hill("thumb_IP_flexion", 5.0, 70.0, skin.knob(3, 0.0020, 0.0060, 0.0065))
@@ -291,27 +310,32 @@ class _Skin(NamedTuple):
 
 def _finger(skin: _Skin, number: int, digit: str, wide: float) -> Iterator[_Hill]:
     """Hills of a finger's knuckles, its tendon, its shaft, its neck, and the pad that bending pushes out."""
-    first = 1 + 3 * number
-    bent = f"{digit}_MCP_flexion"
-    yield _Hill(bent, 5.0, 85.0, skin.knob(first, 0.0042 * wide, 0.0075, 0.0062, at=(-0.001, 0.0)))
-    yield _Hill(f"{digit}_PIP_flexion", 5.0, 95.0, skin.knob(first + 1, 0.0019, 0.0058, 0.0056))
-    yield _Hill(f"{digit}_DIP_flexion", 5.0, 75.0, skin.knob(first + 2, 0.0012, 0.0042, 0.0050))
+    first, size, bent = 1 + 3 * number, skin.scale, f"{digit}_MCP_flexion"
+    middle = 0.5 * float(np.linalg.norm(skin.frames[first + 1, :3, 3] - skin.frames[first, :3, 3])) / size
+    for bone, joint, start, full, height, long, broad, at in (
+        (first, "MCP", 5.0, 75.0, 0.0046 * wide, 0.0068, 0.0054, (-0.001, 0.0)),
+        (first, "MCP", 10.0, 85.0, -0.0018 * wide, 0.0095, 0.0075, (middle, 0.0)),  # shaft
+        (first, "MCP", 10.0, 85.0, -0.0014 * wide, 0.0090, 0.0085, (-0.021, 0.0)),  # neck
+        (first + 1, "PIP", 5.0, 95.0, 0.0010, 0.0050, 0.0048, (-0.001, -0.0036)),  # a phalanx has two heads
+        (first + 1, "PIP", 5.0, 95.0, 0.0010, 0.0050, 0.0048, (-0.001, 0.0036)),
+        (first + 2, "DIP", 5.0, 75.0, 0.0012, 0.0042, 0.0050, (0.0, 0.0)),
+    ):
+        yield _Hill(f"{digit}_{joint}_flexion", start, full, skin.knob(bone, height, long, broad, at=at))
     knuckle = skin.frames[first, :2, 3]
     root = np.array([0.1, 0.35]) * knuckle  # tendons meet at the wrist
     along, aside = along_segment(skin.points[:, :2], root, knuckle)
     ridge = 0.0014 * smooth(along, 0.15, 0.75) * bump(aside, 0.0030) * smooth(skin.normals[:, 2], 0.2, 0.7)
-    yield _Hill(bent, 15.0, -22.0, skin.scale * ridge)
-    place, facing = skin.local(first)
-    middle = 0.5 * np.linalg.norm(skin.frames[first + 1, :3, 3] - skin.frames[first, :3, 3])
-    shaft = skin.knob(first, -0.0018 * wide, 0.0095, 0.0075, at=(float(middle) / skin.scale, 0.0))
-    yield _Hill(bent, 10.0, 85.0, shaft)
-    neck = skin.knob(first, -0.0014 * wide, 0.0090, 0.0085, at=(-0.021, 0.0))
-    yield _Hill(bent, 10.0, 85.0, neck)
-    pad = 0.0018 * bump(place[:, 0] - middle, 0.009) * bump(place[:, 1], 0.007) * smooth(-facing, 0.1, 0.7)
-    yield _Hill(f"{digit}_PIP_flexion", 20.0, 100.0, skin.scale * pad * (place[:, 2] < 0.004))
+    yield _Hill(bent, 15.0, -22.0, size * ridge)
+    for bone, joint, full in ((first, "PIP", 100.0), (first + 1, "DIP", 70.0)):
+        place, facing = skin.local(bone)
+        end = np.linalg.norm(skin.frames[bone + 1, :3, 3] - skin.frames[bone, :3, 3])
+        pads = 0.0018 * bump(place[:, 0] - 0.5 * end, 0.009) - 0.0016 * bump(place[:, 0] - end, 0.0022)
+        pads *= bump(place[:, 1], 0.007) * smooth(-facing, 0.1, 0.7) * (place[:, 2] < 0.004)
+        yield _Hill(f"{digit}_{joint}_flexion", 20.0, full, size * pads)
 
 
 _FLESH: Final = 1.2  # radius of the flesh around a capsule over the capsule's radius
+_PALE: Final = 35.0  # logarithm of the light of skin that bones stretch, over how far they raise it [1/m]
 _DARKEST: Final = 0.12  # share of the ambient light that the deepest folds receive
 
 
@@ -355,7 +379,9 @@ class PosableSkin:
             np.ascontiguousarray(faces[:, ::-1] if mirrored else faces)
             for faces in (atlas.corner_faces, atlas.coarse_faces)
         )
-        self._flexion = Flexion(model, self.rest, vertex_normals(self.rest, self.faces), bony)
+        self._normals: Doubles = vertex_normals(self.rest, self.faces)
+        self._flexion = Flexion(model, self.rest, self._normals, bony)
+        self._straight = self._flexion.shaped(self.rest, np.zeros(NUM_JOINTS))
         self._rest_occluded = self._rest_occlusion()
         middles = self._rings(self.rest).mean(axis=1)
         ahead = middles[-1] - middles[-2]
@@ -388,6 +414,7 @@ class PosableSkin:
         atlas = skin_atlas()
         transforms = self.model.forward_kinematics(qpos[None])
         shaped = self._flexion.shaped(self.rest, qpos[7:])
+        raised = np.einsum("vi,vi->v", shaped - self._straight, self._normals)
         if upper_arm is not None:
             rings, rotation = self._rings(shaped), quaternion_matrix(qpos[3:7])
             if forearm is not None:
@@ -399,6 +426,7 @@ class PosableSkin:
         normals = vertex_normals(points, self.faces)
         occluded = self._occluded(transforms, points, normals)
         shade = np.clip(1.0 - np.maximum(occluded - self._rest_occluded, 0.0), _DARKEST, 1.0)
+        shade *= np.exp(_PALE * raised)
         corners = atlas.corners
         return DrawnSkin(
             points.astype(np.float32).take(corners, axis=0),

@@ -89,9 +89,8 @@ def skin_texels() -> Texels:
         digits.append(DigitTexels(mine, local[:, 0], angle, share[mine], joints))
     # The thumb's back faces sideways, but the part of it on the hand's back does not have the palm's skin.
     facing = np.maximum(dorsal, normals[:, 2])
-    return Texels(
-        positions, normals, dorsal, smooth(facing, -0.25, 0.35), facing, weights[:, 0], tuple(digits)
-    )
+    back, palm = smooth(facing, -0.25, 0.35), weights[:, 0]
+    return Texels(positions, normals, dorsal, back, facing, palm, tuple(digits))
 
 
 def _spread(values: Doubles) -> Doubles:
@@ -135,7 +134,7 @@ def line_depth(rng: np.random.Generator) -> Floats:
     near, palm_lines, wrist_lines = _lines_of_all()
     depth = wrist_lines.copy()
     for line in palm_lines:
-        depth[near] = np.maximum(depth[near], np.float32(rng.uniform(1.0, 1.5)) * line)
+        depth[near] = np.maximum(depth[near], np.float32(rng.uniform(0.7, 1.05)) * line)
     for number, digit in enumerate(_digit_lines()):
         joints = digit.joints
         phase = rng.uniform(0.0, 6.0)
@@ -183,13 +182,13 @@ class _DigitLines(NamedTuple):
     """The K texels of a digit that lines are drawn on."""
 
     texels: Integers
+    joints: Doubles  # distances of its other joints [m]
     along: Floats  # distance from its first joint [m]
     sine: Floats  # sine of three times the angle about it
     cosine: Floats  # cosine of three times the angle about it
     arch: Floats  # offset of curved wrinkles [m]
     pad: Floats  # factor on the strength of creases, on the palm's side
     back: Floats  # factor on the strength of wrinkles, on the back
-    joints: Doubles  # distances of its other joints [m]
 
 
 @functools.cache
@@ -198,18 +197,9 @@ def _digit_lines() -> tuple[_DigitLines, ...]:
     for digit in texels.digits:
         back = texels.back[digit.texels]
         on_back = back * digit.share * smooth(np.cos(digit.angle), -0.1, 0.6)
-        lines.append(
-            _DigitLines(
-                digit.texels,
-                along=digit.along.astype(np.float32),
-                sine=np.sin(3.0 * digit.angle).astype(np.float32),
-                cosine=np.cos(3.0 * digit.angle).astype(np.float32),
-                arch=(0.0015 * np.cos(digit.angle)).astype(np.float32),
-                pad=((1.0 - back) * digit.share).astype(np.float32),
-                back=on_back.astype(np.float32),
-                joints=digit.joints,
-            )
-        )
+        waves = np.sin(3.0 * digit.angle), np.cos(3.0 * digit.angle), 0.0015 * np.cos(digit.angle)
+        parts = (digit.along, *waves, (1.0 - back) * digit.share, on_back)
+        lines.append(_DigitLines(digit.texels, digit.joints, *(one.astype(np.float32) for one in parts)))
     return tuple(lines)
 
 
@@ -379,8 +369,8 @@ def _painted(
     weight = 0.8 + 0.4 * noise(texels.positions, (0.014, 0.005), rng=rng)
     lines = np.clip(line_depth(rng) * np.clip(weight, 0.1, 1.2), 0.0, 1.0)
     # Pigment collects in the lines; their darkness depends on the contrast that the skin allows.
-    _add(lab, look.creases * lines, (-9.5, 4.0, 0.5))
-    height = look.relief * relief() - 0.0004 * look.creases * lines + 0.00008 * look.veins * veins
+    _add(lab, look.creases * lines, (-8.5, 4.5, 0.5))
+    height = look.relief * relief() - 0.0003 * look.creases * lines + 0.00008 * look.veins * veins
     grain = noise(texels.positions, _GRAIN_SIZES, rng=rng)
     grain *= smooth(texels.positions[:, 0].astype(np.float32), *_GRAINED)  # it would be streaks on the arm
     height += look.relief * _GRAIN * grain
@@ -473,8 +463,8 @@ def _nails() -> tuple[tuple[Integers, Floats, Floats, Floats], ...]:
         b = digit.angle / wide
         where = np.abs(b) < 1.6
         shape = (np.abs(a) ** 3.2 + np.abs(b) ** 3.2) ** (1 / 3.2)
-        plate = (1.0 - smooth(shape, 0.93, 1.03)) * where
-        fold = bump(shape - 1.06, 0.085) * where * (a < 0.75)
+        plate = (1.0 - smooth(shape, 0.88, 1.04)) * where
+        fold = bump(shape - 1.07, 0.10) * where * smooth(-a, -0.7, 0.5)  # the tip has none
         moon = (bump(a + 1.0, 0.42) * bump(b, 0.55))[:, None] * [4.0, -4.0, -1.0]
         moon += smooth(a, 0.72, 0.86)[:, None] * [8.0, -7.0, 1.0]
         near = np.flatnonzero((plate > 0.0) | (fold > 1e-4))
@@ -492,11 +482,11 @@ def _paint_nails(paint: _Paint, look: SkinLook) -> None:
         color += np.float32(look.polish) * (np.array(look.polish_color, dtype=np.float32) - color)
         lab = paint.lab[mine]
         lab += plate[:, None] * (color - lab)
-        _add(lab, look.creases * fold, (-7.0, 4.0, 0.0))
+        _add(lab, look.creases * fold, (-4.5, 3.0, 0.0))
         paint.lab[mine] = lab
         paint.roughness[mine] += plate * (np.float32(0.28) - paint.roughness[mine])
         paint.height[mine] *= 1.0 - plate
-        paint.height[mine] += 0.00025 * plate - 0.0003 * fold
+        paint.height[mine] += 0.00016 * plate - 0.0002 * fold
 
 
 def _sleeve(paint: _Paint, forearm: Forearm, rng: np.random.Generator) -> None:

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from handsim import HandSimError, look_at
 from handsim.space.camera import preset
-from render import Backgrounds
+from render import Backgrounds, write_environment_map
 from render.scenery.backgrounds import Background, draw_surroundings, enclose, light_in
 from render.scenery.lights import irradiance, sample_lighting, sample_surroundings, surround
 
@@ -136,6 +136,31 @@ def test_an_environment_map_lights_hands_from_where_its_sun_stands(name: str, tm
     seen = draw_surroundings(background, box, preset("vga").at(look_at(place, place + way)))
     assert seen.rgb[235:245, 315:325].min() > 200 > seen.rgb[:20].mean(), "the sun is in the middle"
     assert not seen.depth.any()
+
+
+def test_a_written_map_has_the_light_of_its_room(tmp_path) -> None:
+    write_environment_map(tmp_path / "room.hdr", seed=3)
+    written = cv2.imread(str(tmp_path / "room.hdr"), cv2.IMREAD_ANYDEPTH | cv2.IMREAD_COLOR)[..., ::-1]
+    assert written.shape == (512, 1024, 3) and written.min() >= 0.0
+    viewer, rng = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]), np.random.default_rng(3)
+    room, lighting, box = sample_surroundings(Backgrounds("room"), viewer, around=np.zeros((1, 3)), rng=rng)
+    assert box is not None
+    walls = light_in(room, box, around(20_000, np.random.default_rng(0))).mean(axis=0)
+    lamps = sum(0.25 * lamp.strength * np.array(lamp.color) for lamp in lighting.lamps)
+    areas = np.sin(np.pi * (np.arange(512) + 0.5) / 512)
+    seen = np.average(written.mean(axis=1), axis=0, weights=areas)
+    np.testing.assert_allclose(seen, walls + lamps, rtol=0.03)
+    maps = Backgrounds({"photo": 1}, str(tmp_path))
+    again = sample_surroundings(maps, np.eye(3), rng=rng)[1].lamps[0]
+    wanted = sum(
+        lamp.strength * np.array(lamp.direction) / np.linalg.norm(lamp.direction) for lamp in lighting.lamps
+    )
+    rise, expected = (way[2] / np.linalg.norm(way) for way in (np.array(again.direction), wanted))
+    assert rise == pytest.approx(expected, abs=0.1), "pictures turn maps about the vertical alone"
+    with pytest.raises(HandSimError, match=r"expected a file name that ends in \.hdr"):
+        write_environment_map(tmp_path / "room.png")
+    with pytest.raises(HandSimError, match="seed is -1, expected 0 or more"):
+        write_environment_map(tmp_path / "room.hdr", seed=-1)
 
 
 def test_a_damaged_environment_map_is_told(tmp_path) -> None:
