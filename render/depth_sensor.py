@@ -41,6 +41,9 @@ class StructuredLight:
     """What disparities are rounded to [px]; 0: not at all."""
     disparity_noise: float = 0.125 / 6
     """Standard deviation before rounding [px]."""
+    window: int = 9
+    """Width of the window that is matched [px]: windows that overlap have noise in common. Kinect's is by
+    Konolige and Mihelich (ROS, kinect_calibration), a D435's by Keselman et al. (CVPR workshops 2017)."""
     shift: float = 0.5
     """Standard deviation of where a pixel's depth is taken, each way [px]; rounded to whole pixels."""
     support: float = 0.6
@@ -73,12 +76,23 @@ def _measure_disparity(
     if noise.shadow:
         keep_lit(ideal, kept)
     shifts = random_words((2, height, width) if noise.shift > 0.0 else (2, 0, 0), rng=rng)
-    words = random_words((height, width) if noise.disparity_noise > 0.0 else (0, 0), rng=rng)
+    blobs = _blobs((height, width), noise.window, noise.disparity_noise, rng=rng)
     measured = np.zeros_like(depth)
-    table, least = np.float32(noise.disparity_noise) * quantiles(), np.float32(0.5 * scale / noise.farthest)
-    step = np.float32(noise.step)
-    _match(ideal, kept, shifts, _whole_shifts(noise.shift), words, table, step, least, scale, measured)
+    step, least = np.float32(noise.step), np.float32(0.5 * scale / noise.farthest)
+    _match(ideal, kept, shifts, _whole_shifts(noise.shift), blobs, step, least, scale, measured)
     return measured
+
+
+def _blobs(shape: tuple[int, int], window: int, sigma: float, *, rng: np.random.Generator) -> Floats:
+    """Normal noise (H, W), each pixel the scaled sum of independent numbers in a window [px] around it.
+
+    Two pixels that are k apart along an axis have a correlation of 1 - k / window.
+    """
+    numbers = normal_numbers((shape[0] + window - 1, shape[1] + window - 1), rng=rng)
+    sums = cv2.boxFilter(numbers, -1, (window, window), normalize=False)
+    half = window // 2
+    mine = sums[half : half + shape[0], half : half + shape[1]]
+    return np.multiply(mine, np.float32(sigma / window), dtype=np.float32)
 
 
 @kernel
@@ -165,7 +179,6 @@ def _match(
     kept: Flags,
     shifts: NDArray[np.uint16],
     offsets: NDArray[np.int32],
-    words: NDArray[np.uint16],
     noise: Floats,
     step: np.float32,
     least: np.float32,
@@ -175,8 +188,8 @@ def _match(
     """Write the depth [m] of the pixels that are kept.
 
     Each takes its disparity from some whole pixels away, so that no value is made up between near and far;
-    then come noise and rounding. Random words pick offsets (65536,) [px] and noise (65536,) [px]; those of
-    shape 0 pick none. Less than the `least` disparity is nothing.
+    then come noise (H, W) [px] and rounding. Random words pick offsets (65536,) [px]; those of shape 0 pick
+    none. Less than the `least` disparity is nothing.
     """
     height, width = disparity.shape
     for row in range(height):
@@ -187,9 +200,7 @@ def _match(
             if shifts.shape[1]:
                 i = min(max(row + offsets[shifts[0, row, column]], 0), height - 1)
                 j = min(max(column + offsets[shifts[1, row, column]], 0), width - 1)
-            value = disparity[i, j]
-            if len(words):
-                value += noise[words[row, column]]
+            value = disparity[i, j] + noise[row, column]
             if step > 0.0:
                 value = np.rint(value / step) * step
             if value > least:
@@ -216,6 +227,9 @@ class TimeOfFlight:
     """Standard deviation c0 + c1 z + c2 z^2 of a white wall that faces, depth z in meters [m]."""
     angle_sigma: float = 0.1e-3
     """What is added at an angle a, times z^1.5 (a / (pi/2 - a))^2 [m]."""
+    window: int = 3
+    """Width of the square of pixels whose light the depth of one is of [px]: the filter of Kinect v2's phases
+    in libfreenect2 has nearly even weights in 3 x 3 pixels."""
     offset: float = 0.0
     """Added to every depth [m]."""
     edge: float = 0.03
@@ -249,7 +263,7 @@ def _measure_flight(
             sigma += depth * np.sqrt(depth) * _angle_terms(noise.angle_sigma).take(bands, mode="clip")
         # Shot noise goes with the root of the light.
         sigma *= np.sqrt(np.float32(_WALL) / np.maximum(reflectance, np.float32(0.02)))
-        measured += sigma * normal_numbers(depth.shape, rng=rng)
+        measured += sigma * _blobs(depth.shape, noise.window, 1.0, rng=rng)
     measured += np.float32(noise.offset)
     if noise.step > 0.0:
         measured = np.rint(measured * np.float32(1.0 / noise.step)) / np.float32(1.0 / noise.step)
@@ -316,6 +330,7 @@ DEPTH_NOISES: Final[dict[str, DepthNoise]] = {
         baseline=0.05,
         step=1.0 / 32.0,
         disparity_noise=0.08,
+        window=7,
         agreement=2.0,
         nearest=0.2,
         farthest=10.0,
