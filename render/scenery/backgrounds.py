@@ -484,7 +484,8 @@ def surroundings_of_picture(background: Background, camera: Camera, level: float
     one, walls = (
         cv2.resize(rows, camera.size, interpolation=cv2.INTER_NEAREST) for rows in (nearness, room.walls)
     )
-    depth = 1.0 / np.where(np.abs(smooth - one) < _ONE_SURFACE * one, smooth, one)
+    np.copyto(smooth, one, where=cv2.absdiff(smooth, one) > _ONE_SURFACE * one)
+    depth = np.reciprocal(smooth, out=smooth)
     own = camera_matrix(room.focal * height, room.focal * height, 0.5 * width, 0.5 * height)
     return Surroundings(depth, walls, _both_ways(np.linalg.solve(own, camera.K).T @ room.rotation))
 
@@ -498,8 +499,9 @@ def _put_behind(
         for column in range(depth.shape[1]):
             if instances[row, column] == 0 and behind[row, column] > 0.0:
                 depth[row, column] = behind[row, column]
-                for axis in range(normals.shape[2]):
-                    normals[row, column, axis] = facing[walls[row, column], axis]
+                if normals.shape[2]:
+                    for axis in range(3):
+                        normals[row, column, axis] = facing[walls[row, column], axis]
 
 
 def enclose(

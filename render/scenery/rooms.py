@@ -86,8 +86,8 @@ def draw_room(size: tuple[int, int], seed: int) -> RoomPicture:
     picture.reshape(-1, 3)[edges] = np.mean(parts, axis=0)
     grain = normal_numbers((height, width, 1), rng=np.random.default_rng([seed, 1]))
     picture *= np.float32(1.0) + np.float32(0.05) * grain
-    aside = np.hypot(across - 0.5 * width, down - 0.5 * height) / (scene.focal * height)
-    depth = (met.distances / np.sqrt(aside**2 + 1.0)).astype(np.float32)
+    aside = ((across - 0.5 * width) ** 2 + (down - 0.5 * height) ** 2) / (scene.focal * height) ** 2
+    depth = met.distances / np.sqrt(aside + 1.0)
     light = cv2.GaussianBlur(picture, (0, 0), 0.9)  # because rays have no width, but pixels do
     shape = height, width
     return RoomPicture(light, depth.reshape(shape), met.walls.reshape(shape), scene.focal, scene.axes)
