@@ -238,8 +238,8 @@ class Drawing:
     def _held(self, scene: FrameChoices) -> FrameChoices:
         """The choices with a backdrop that stays where it is, behind the hands of all frames."""
         backdrop = scene.background.backdrop
-        level = self.viewpoints.nearest(backdrop.normal) - backdrop.gap
-        held = dataclasses.replace(backdrop, level=level)
+        level, arms = (self.viewpoints.nearest(backdrop.normal, arms=arms) for arms in (False, True))
+        held = dataclasses.replace(backdrop, level=level - backdrop.gap, arms=arms)
         return dataclasses.replace(scene, background=dataclasses.replace(scene.background, backdrop=held))
 
     def _studio_of_person(self, person: int) -> Studio:

@@ -122,9 +122,7 @@ def by_side(frame: RenderedFrame) -> dict[Side, HandTruth]:
 
 def without_colors(name: str) -> HandSimError:
     """The error for a format that needs color pictures."""
-    return HandSimError(
-        f"the format {name} needs color pictures; add rgb to the passes, or write webdataset, exr or png"
-    )
+    return HandSimError(f"the format {name} needs color pictures; add rgb to the passes")
 
 
 def rigid_record(transform: Doubles) -> dict[str, list[float]]:

@@ -114,12 +114,13 @@ def lit_share(to_map: Doubles, nearest: Floats, bias: float, x: float, y: float,
 
 
 def level_behind(backdrop: Backdrop, camera: Camera, drawn: Sequence[Drawn]) -> float:
-    """Position of a backdrop along its normal in the camera's axes [m]."""
+    """Position along its normal in the camera's axes [m] that depth has a backdrop at: behind arms, too."""
     nearest, normal = np.inf, backdrop.normal
     if backdrop.level is None and drawn:
         points = camera.local(np.concatenate([one.triangles.vertices for one in drawn]))
         nearest = _nearest_seen(points, normal, camera.K, np.array(camera.size, np.float64))[0]
-    return backdrop.behind(nearest if np.isfinite(nearest) else -1.0)
+    level = backdrop.behind(nearest if np.isfinite(nearest) else -1.0)
+    return level if backdrop.arms is None else min(level, backdrop.arms)
 
 
 def light_behind(
@@ -245,10 +246,7 @@ POSITION, NORMAL, TINT, COLOR, ROUGH, TANGENT, BUMP, VIEW, FACING = 0, 3, 6, 9, 
 
 @kernel
 def display(light: Floats, tint: Floats, table: Floats) -> None:
-    """Turn linear light (N,) of this tint (N,) into display values in [0, 1]; `table` is `TO_DISPLAY`.
-
-    With an empty table highlights stay beyond 1.
-    """
+    """Turn linear light (N,) of this tint (N,) into display values, by `TO_DISPLAY` up to 1, or by none."""
     if len(table) == 0:
         for n in range(len(light)):
             value = tint[n] * light[n]

@@ -178,6 +178,8 @@ class Backdrop:
     level: float | None = None
     """Position along its normal in the camera's axes [m]; None: the gap is from the hands of each picture."""
     shadows: bool = True  # whether it catches the hands' shadows, or is too far away for them
+    arms: float | None = None
+    """Level behind the arms of all frames, which depth has where it is the lower one [m]."""
 
     def behind(self, nearest: float) -> float:
         """Its level; `nearest` is the hands' least position along the normal [m]."""
@@ -289,7 +291,8 @@ def _coarse(background: Background, size: tuple[int, int]) -> Floats:
     """The picture of `draw_background`, at half its size if that is as good."""
     rng = np.random.default_rng(background.seed)
     first, second = (np.array(color, dtype=np.float32) for color in background.colors)
-    drawn_size = _halved(size) if background.kind in _OUT_OF_FOCUS else size
+    halved = (max(2, size[0] // 2), max(2, size[1] // 2))
+    drawn_size = halved if background.kind in _OUT_OF_FOCUS else size
     width, height = drawn_size
     if background.kind == "plain":
         picture = np.broadcast_to(first, (height, width, 3)).copy()
@@ -308,10 +311,6 @@ def _coarse(background: Background, size: tuple[int, int]) -> Floats:
     if background.blur * height > 0.3:
         picture = cv2.GaussianBlur(picture, (0, 0), background.blur * height)
     return np.asarray(np.clip(picture, 0.0, 1.0, dtype=np.float32))
-
-
-def _halved(size: tuple[int, int]) -> tuple[int, int]:
-    return max(2, size[0] // 2), max(2, size[1] // 2)
 
 
 def _color(rng: np.random.Generator) -> tuple[float, float, float]:
@@ -478,7 +477,7 @@ def surroundings_of_picture(background: Background, camera: Camera, level: float
         along = way[0] * across + (way[1] * down + way[2])[:, None]
         depth = np.divide(np.float32(level), along, out=np.zeros_like(along), where=along < 0.0)
         return Surroundings(depth, np.zeros(along.shape, np.int8), normal[None].astype(np.float32))
-    room = draw_room(_halved(camera.size), background.seed)
+    room = draw_room((max(2, width // 2), max(2, height // 2)), background.seed)
     nearness = 1.0 / (max(1.0, -level / float(room.depth.min())) * room.depth)
     smooth = cv2.resize(nearness, camera.size, interpolation=cv2.INTER_LINEAR)  # is exact for planes
     one, walls = (
@@ -560,10 +559,7 @@ def _corner(point: Doubles) -> Corner:
 def draw_surroundings(
     background: Background, enclosure: Enclosure, camera: Camera, *, bright: bool = False
 ) -> Surroundings:
-    """The box as a camera in it sees it, through any lens; cached for cameras that stand still.
-
-    The bright picture of a room or map does not end at white.
-    """
+    """The box as a camera in it sees it, through any lens; cached for cameras that stand still."""
     focal, pose = tuple(camera.K.ravel().tolist()), camera.T_world_camera.tobytes()
     return _drawn(background, enclosure, camera.size, focal, camera.lens, pose, bright)
 
