@@ -32,7 +32,7 @@ from handsim.errors import PoseError
 from handsim.hand.shape import SIDES, Side
 from handsim.space.camera import preset
 from poses.shapes import gesture, make_valid
-from render import Backgrounds, ExposureConfig, RenderedFrame
+from render import Backgrounds, ExposureConfig, RenderConfig, RenderedFrame
 from render.color_sensor import sample_exposure
 from render.formats.writer import open_writer
 from render.painting.figures import sample_people
@@ -139,7 +139,8 @@ def photograph(
     qpos = case.qpos[None] if shown else np.full((1, len(case.qpos)), np.nan)
     hand = attach(load_layout("dense19"), case.model)
     people = sample_people(1, False, tones=TONES[case.tone], rng=rng)
-    studio = Studio([hand], people, passes=("rgb", "ids", "depth"))
+    config = RenderConfig(passes=("rgb", "ids", "depth"), painter="compiled")
+    studio = Studio([hand], people, config)
     moment = Moment(Take.of_poses([hand], qpos[:, None], rate=60.0), 0)
     if shown:
         moment = studio.reaching(moment, [case.camera])

@@ -180,7 +180,8 @@ def accuracy(frames: int) -> Figures:
 
 def bare_studio(take: Take) -> Studio:
     rng = np.random.default_rng(0)
-    return Studio(take.hands, sample_people(len(take.hands), False, tones=ALL_TONES, rng=rng))
+    people = sample_people(len(take.hands), False, tones=ALL_TONES, rng=rng)
+    return Studio(take.hands, people, PLAIN)
 
 
 def main(

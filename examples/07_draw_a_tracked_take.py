@@ -24,7 +24,7 @@ def compare(frame: RenderedFrame, truth: RenderedFrame) -> None:
     camera: Camera = frame.camera
     for hand, true in zip(frame.hands, truth.hands, strict=True):
         off = np.linalg.norm(hand.keypoints - camera.project(true.keypoints_world), axis=1)[hand.visible]
-        shown = frame.depth[frame.depth > 0]
+        shown = frame.depth[frame.ids > 0]
         print(
             f"{frame.key}, {hand.shape.side}: {hand.visible.sum()} of 21 keypoints visible, "
             f"{np.mean(off):.1f} px off, hands at {1e3 * np.median(shown):.0f} mm"
@@ -36,7 +36,11 @@ def main() -> None:
     tracked = track_capture(truth.capture(), glove="dense19")  # nobody was calibrated
     tone = SkinLook(lightness=45.0).typology_angle  # [deg]; people with skin about as dark as this
     config = RenderConfig(
-        view=ViewConfig("orbit"), passes=("rgb", "depth"), tones=(tone - 5.0, tone + 5.0), every=40, seed=1
+        view=ViewConfig("orbit"),
+        passes=("rgb", "depth", "ids"),
+        tones=(tone - 5.0, tone + 5.0),
+        every=40,
+        seed=1,
     )
     drawn, true = draw(tracked, config=config), draw(truth, config=config)  # every 40th frame
     for pair in zip(drawn, true, strict=True):

@@ -230,10 +230,9 @@ def colored_depth(depth: Float32[np.ndarray, "H W"]) -> Picture:
     picture[:] = _PAPER
     if present.any():
         near, far = depth[present].min(), depth[present].max()
-        share = (far - depth) / max(far - near, 1e-9)
-        levels = np.rint(255 * np.clip(share, 0.0, 1.0)).astype(np.uint8)
-        colors = cv2.applyColorMap(levels, cv2.COLORMAP_TURBO)[..., ::-1]
-        picture[present] = colors[present]
+        share = (far / depth[present] - 1.0) / max(far / near - 1.0, 1e-9)  # rooms are far behind hands
+        levels = np.rint(255 * np.clip(share, 0.0, 1.0)).astype(np.uint8)[:, None]
+        picture[present] = cv2.applyColorMap(levels, cv2.COLORMAP_TURBO)[:, 0, ::-1]
     return picture
 
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import cv2
 import numpy as np
@@ -24,6 +24,8 @@ from handsim.kernels import kernel
 from render.fields import quantiles, random_words
 from render.frames import Bytes, Floats
 
+GAMMA: Final = 2.2
+"""Exponent that makes linear light of the painters' display values."""
 _ROOTS: Final = 4096  # of light in the same table by its root, which stays in the processor's cache
 _SPREAD: Final = (3, 3)  # [px] that a point of light is spread over
 _GRAY: Final = 0.25  # mean light of pictures that keep the nominal exposure
@@ -95,6 +97,13 @@ def sample_exposure(config: ExposureConfig, *, rng: np.random.Generator) -> Expo
 def linear_of(rgb: UInt8[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "H W 3"]:
     """Light of sRGB colors, 1 for white. What was clipped at white stays there."""
     return np.asarray(cv2.LUT(rgb, _decoded()))
+
+
+def light_of(levels: NDArray[Any]) -> NDArray[Any]:
+    """Light of sRGB levels (...,), 1 for 255; beyond, where sRGB ends, that of the painters."""
+    value = levels / 255.0
+    light = np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
+    return np.where(value > 1.0, value**GAMMA, light)
 
 
 def expose(
@@ -179,8 +188,7 @@ def _expose(
 @functools.cache
 def _decoded() -> Floats:
     """Light of the 256 sRGB values (IEC 61966-2-1)."""
-    value = np.arange(256) / 255.0
-    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4).astype(np.float32)
+    return light_of(np.arange(256)).astype(np.float32)
 
 
 @functools.cache

@@ -76,8 +76,10 @@ class RenderConfig(Settings):
     """Sensor that adds noise to depth, or its name; auto: one whose range fits the placement, see
     `NEAR_SENSOR`; None: perfect depth alone."""
     room_depth: bool = True
-    """Whether depth and normals have the room behind hands and objects, where there is one: with several
-    cameras, or one that moves before one background."""
+    """Whether depth and normals have the room or the wall behind hands and objects, which environment maps
+    lack. Without it, depth is 0 there, and a mask."""
+    openxr: bool = False
+    """Whether COCO's annotations have the 26 joints of OpenXR, too, with their poses."""
     color_sensor: ExposureConfig | None = field(default_factory=ExposureConfig)
     """Exposure and noise of colors; None: perfect colors alone."""
     painter: PainterChoice = "auto"

@@ -26,7 +26,7 @@ from render.fields import normal_numbers, quantiles, random_words
 from render.frames import Flags, Floats, Integers
 
 _DOTS: Final = (-3, 0, 3)  # one pixel in nine is a dot, so that a window of 9 x 9 holds these
-_FIXED: Final = 32.0  # disparities are compared in 1/32 px, which fit sixteen bits up to 1023 px
+_BYTES: Final = np.arange(256)
 _SHADOW_SLACK: Final = 2.0  # [px] of disparity that a surface may differ from itself
 
 
@@ -41,6 +41,9 @@ class StructuredLight:
     """What disparities are rounded to [px]; 0: not at all."""
     disparity_noise: float = 0.125 / 6
     """Standard deviation before rounding [px]."""
+    window: int = 9
+    """Width of the window that is matched [px]: windows that overlap have noise in common. Kinect's is by
+    Konolige and Mihelich (ROS, kinect_calibration), a D435's by Keselman et al. (CVPR workshops 2017)."""
     shift: float = 0.5
     """Standard deviation of where a pixel's depth is taken, each way [px]; rounded to whole pixels."""
     support: float = 0.6
@@ -69,16 +72,30 @@ def _measure_disparity(
     if noise.support > 0.0:
         coarse = normal_numbers(((height + 2) // 3, (width + 2) // 3), rng=rng)
         needed = np.ceil((len(_DOTS) ** 2 - 1) * (noise.support + noise.wavering * coarse))
-        _keep_supported(ideal, needed.astype(np.int64), int(noise.agreement * _FIXED), kept)
+        border = _DOTS[-1]
+        around = cv2.copyMakeBorder(ideal, border, border, border, border, cv2.BORDER_REPLICATE)
+        _keep_supported(around, needed.astype(np.int64), np.float32(noise.agreement), kept)
     if noise.shadow:
         keep_lit(ideal, kept)
-    shifts = random_words((2, height, width) if noise.shift > 0.0 else (2, 0, 0), rng=rng)
-    words = random_words((height, width) if noise.disparity_noise > 0.0 else (0, 0), rng=rng)
+    shifts = random_words((height, width) if noise.shift > 0.0 else (0, 0), rng=rng)
+    blobs = _blobs((height, width), noise.window, noise.disparity_noise, rng=rng)
     measured = np.zeros_like(depth)
-    table, least = np.float32(noise.disparity_noise) * quantiles(), np.float32(0.5 * scale / noise.farthest)
-    step = np.float32(noise.step)
-    _match(ideal, kept, shifts, _whole_shifts(noise.shift), words, table, step, least, scale, measured)
+    step, least = np.float32(noise.step), np.float32(0.5 * scale / noise.farthest)
+    _match(ideal, kept, shifts, _whole_shifts(noise.shift), blobs, step, least, scale, measured)
     return measured
+
+
+def _blobs(shape: tuple[int, int], window: int, sigma: float, *, rng: np.random.Generator) -> Floats:
+    """Noise (H, W), each pixel the sum of random bytes in a window [px] around it: as good as normal.
+
+    Two pixels that are k apart along a row or column have a correlation of 1 - k / window.
+    """
+    (rows, columns), half = (side + window for side in shape), window // 2
+    numbers = random_words((rows, (columns + 1) // 2), rng=rng).view(np.uint8)
+    sums = cv2.boxFilter(numbers, cv2.CV_32F, (window, window), normalize=False)
+    sums -= np.float32(window**2 * _BYTES.mean())
+    sums *= np.float32(sigma / (window * _BYTES.std()))
+    return np.asarray(sums[half : half + shape[0], half : half + shape[1]])
 
 
 @kernel
@@ -109,54 +126,44 @@ def keep_lit(disparity: Floats, kept: Flags) -> None:
     one of its columns, the nearest one is visible to it.
     """
     height, width = disparity.shape
-    most = np.float32(np.ceil(max(disparity.max(), np.float32(0.0))) + 1.0)
-    first = np.empty(width + int(most) + 2, np.float32)
+    most = np.float32(np.ceil(max(disparity.max(), np.float32(0.0))) + 1.5)  # cells are rounded
+    first, cells = np.empty(width + int(most) + 2, np.float32), np.empty(width, np.int32)
     for row in range(height):
         first[:] = 0.0
+        near = disparity[row]
         for column in range(width):
-            near = disparity[row, column]
-            if near > 0.0:
-                cell = 1 + int(np.rint(np.float32(column) - near + most))
-                first[cell] = max(first[cell], near)
+            cells[column] = np.int32(np.float32(column) - near[column] + most)
+        for column in range(width):
+            if near[column] > 0.0:
+                first[1 + cells[column]] = max(first[1 + cells[column]], near[column])
         for column in range(width):
             if kept[row, column]:  # neighbors close what rounding left open
-                cell = 1 + int(np.rint(np.float32(column) - disparity[row, column] + most))
+                cell = 1 + cells[column]
                 nearest = max(first[cell - 1], first[cell], first[cell + 1])
-                kept[row, column] = nearest <= disparity[row, column] + np.float32(_SHADOW_SLACK)
+                kept[row, column] = nearest <= near[column] + np.float32(_SHADOW_SLACK)
 
 
 @kernel
-def _keep_supported(disparity: Floats, needed: Integers, most: int, kept: Flags) -> None:
+def _keep_supported(around: Floats, needed: Integers, most: np.float32, kept: Flags) -> None:
     """Clear those of `kept` (H, W) with fewer dots in the window that agree with its middle than are needed.
 
-    `needed` is alike in patches of 3 x 3 pixels, and `most` the largest difference in 1/32 px.
+    Disparities (H + 6, W + 6) go on beyond the picture, so that no window ends at its edge. `needed` is alike
+    in patches of 3 x 3 pixels, and `most` the largest difference [px].
     """
-    height, width = disparity.shape
-    border = _DOTS[-1]  # around the picture, so that no window ends at its edge
-    fixed = np.empty((height + 2 * border, width + 2 * border), np.int16)
-    for row in range(height):
-        inner = fixed[row + border, border : border + width]
-        for column in range(width):
-            inner[column] = int(min(disparity[row, column] * np.float32(_FIXED), np.float32(32767.0)))
-        fixed[row + border, :border] = inner[0]
-        fixed[row + border, border + width :] = inner[width - 1]
-    for row in range(border):
-        fixed[row] = fixed[border]
-        fixed[height + border + row] = fixed[height + border - 1]
-    for row in range(height):
-        for column in range(width):
-            if not kept[row, column]:
-                continue
-            middle, agreed = fixed[row + border, column + border], -1
-            enough = min(
-                needed[row // 3, column // 3], len(_DOTS) ** 2 - 1
-            )  # where all agree, nothing is lost
-            for down in _DOTS:
-                for right in _DOTS:
-                    agreed += abs(fixed[row + border + down, column + border + right] - middle) <= most
-                if agreed >= enough:
-                    break
-            kept[row, column] = agreed >= enough
+    height, width = kept.shape
+    border, agreed = _DOTS[-1], np.empty(width, np.float32)
+    zero, one = np.float32(0.0), np.float32(1.0)
+    for row in range(border, border + height):
+        middle = around[row, border:]
+        agreed[:] = -one  # for the middle itself
+        for down in _DOTS:
+            for right in _DOTS:
+                other = around[row + down, border + right :]
+                for n in range(width):
+                    agreed[n] += one if abs(other[n] - middle[n]) <= most else zero
+        for n in range(width):  # where all agree, nothing is lost
+            enough = min(needed[(row - border) // 3, n // 3], len(_DOTS) ** 2 - 1)
+            kept[row - border, n] &= agreed[n] >= enough
 
 
 @kernel
@@ -165,7 +172,6 @@ def _match(
     kept: Flags,
     shifts: NDArray[np.uint16],
     offsets: NDArray[np.int32],
-    words: NDArray[np.uint16],
     noise: Floats,
     step: np.float32,
     least: np.float32,
@@ -175,7 +181,7 @@ def _match(
     """Write the depth [m] of the pixels that are kept.
 
     Each takes its disparity from some whole pixels away, so that no value is made up between near and far;
-    then come noise and rounding. Random words pick offsets (65536,) [px] and noise (65536,) [px]; those of
+    then come noise (H, W) [px] and rounding. Both bytes of random words pick offsets (256,) [px]; those of
     shape 0 pick none. Less than the `least` disparity is nothing.
     """
     height, width = disparity.shape
@@ -184,12 +190,10 @@ def _match(
             if not kept[row, column]:
                 continue
             i, j = row, column
-            if shifts.shape[1]:
-                i = min(max(row + offsets[shifts[0, row, column]], 0), height - 1)
-                j = min(max(column + offsets[shifts[1, row, column]], 0), width - 1)
-            value = disparity[i, j]
-            if len(words):
-                value += noise[words[row, column]]
+            if len(shifts):
+                i = min(max(row + offsets[shifts[row, column] >> 8], 0), height - 1)
+                j = min(max(column + offsets[shifts[row, column] & 255], 0), width - 1)
+            value = disparity[i, j] + noise[row, column]
             if step > 0.0:
                 value = np.rint(value / step) * step
             if value > least:
@@ -198,7 +202,7 @@ def _match(
 
 @functools.lru_cache(maxsize=16)
 def _whole_shifts(deviation: float) -> NDArray[np.int32]:
-    return np.rint(deviation * quantiles()).astype(np.int32)
+    return np.rint(deviation * quantiles()[128::256]).astype(np.int32)
 
 
 _WALL: Final = 0.8  # reflectance of the white walls that noise was published for
@@ -216,6 +220,9 @@ class TimeOfFlight:
     """Standard deviation c0 + c1 z + c2 z^2 of a white wall that faces, depth z in meters [m]."""
     angle_sigma: float = 0.1e-3
     """What is added at an angle a, times z^1.5 (a / (pi/2 - a))^2 [m]."""
+    window: int = 3
+    """Width of the square of pixels whose light the depth of one is of [px]: the filter of Kinect v2's phases
+    in libfreenect2 has nearly even weights in 3 x 3 pixels."""
     offset: float = 0.0
     """Added to every depth [m]."""
     edge: float = 0.03
@@ -249,7 +256,7 @@ def _measure_flight(
             sigma += depth * np.sqrt(depth) * _angle_terms(noise.angle_sigma).take(bands, mode="clip")
         # Shot noise goes with the root of the light.
         sigma *= np.sqrt(np.float32(_WALL) / np.maximum(reflectance, np.float32(0.02)))
-        measured += sigma * normal_numbers(depth.shape, rng=rng)
+        measured += sigma * _blobs(depth.shape, noise.window, 1.0, rng=rng)
     measured += np.float32(noise.offset)
     if noise.step > 0.0:
         measured = np.rint(measured * np.float32(1.0 / noise.step)) / np.float32(1.0 / noise.step)
@@ -316,6 +323,7 @@ DEPTH_NOISES: Final[dict[str, DepthNoise]] = {
         baseline=0.05,
         step=1.0 / 32.0,
         disparity_noise=0.08,
+        window=7,
         agreement=2.0,
         nearest=0.2,
         farthest=10.0,
@@ -413,17 +421,13 @@ def _facing(normals: Floats, camera: Camera) -> Floats:
 def _facing_pinhole(normals: Floats, fx: float, fy: float, cx: float, cy: float) -> Any:
     """Cosines (H, W) between normals and the rays that come back to a pinhole; 0 without a surface."""
     height, width = normals.shape[:2]
-    cosines = np.zeros((height, width), np.float32)
-    across = (np.arange(width) + 0.5 - cx) / fx
+    cosines, zero, one = np.empty((height, width), np.float32), np.float32(0.0), np.float32(1.0)
+    across = ((np.arange(width) + 0.5 - cx) / fx).astype(np.float32)
     for row in range(height):
-        y = (row + 0.5 - cy) / fy
-        for column in range(width):
-            nx, ny, nz = normals[row, column, 0], normals[row, column, 1], normals[row, column, 2]
-            if nx != 0.0 or ny != 0.0 or nz != 0.0:
-                x = across[column]
-                along = -(x * nx + y * ny + nz)
-                if along > 0.0:
-                    cosines[row, column] = along / np.sqrt(x * x + y * y + 1.0)
+        y, into, of = np.float32((row + 0.5 - cy) / fy), cosines[row], normals[row]
+        for n in range(width):
+            along = -(across[n] * of[n, 0] + y * of[n, 1] + of[n, 2])
+            into[n] = (along if along > zero else zero) / np.sqrt(across[n] * across[n] + (y * y + one))
     return cosines
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int, UInt8
+from jaxtyping import Bool, Float, Float16, Float32, Int, UInt8
 from numpy.typing import NDArray
 
 from handsim.hand.shape import NUM_BONES, HandShape
@@ -33,6 +33,8 @@ class Pictures:
 
     rgb: UInt8[np.ndarray, "H W 3"] | None = None
     """sRGB."""
+    light: Float16[np.ndarray, "H W 3"] | None = None
+    """Linear light of the colors before they end at white, which is 1; in pictures for EXR files."""
     depth: Float32[np.ndarray, "H W"] | None = None
     """Distance along the camera's axis at each pixel's center [m]; 0 where there is nothing."""
     normals: Float32[np.ndarray, "H W 3"] | None = None
@@ -78,6 +80,12 @@ class HandTruth:
     """Left, top, width, height [px] of the visible hand without its forearm; NaN where none is visible."""
     vertices: Float32[np.ndarray, "V 3"]
     """`HandModel.skin` in the world [m]; on pictures of bare hands joints shape it further."""
+    openxr: Float[np.ndarray, "J 4 4"] = field(default_factory=lambda: np.empty((0, 4, 4)))
+    """Poses in the world [m] of OpenXR's 26 joints; none unless `RenderConfig.openxr` asks for them."""
+    openxr_visible: Bool[np.ndarray, "J"] = field(default_factory=lambda: np.empty(0, dtype=bool))
+    """Whether they are visible, as of keypoints; those in the palm are on its pixels."""
+    tracking: Mapping[str, Any] | None = None
+    """Status, RMS [m] and standard deviations ([rad], [m]) of a tracked pose; None for others."""
     marker_names: tuple[str, ...] = ()
     markers: Float[np.ndarray, "M 3"] = field(default_factory=lambda: np.empty((0, 3)))
     """Centers of the glove's markers as the pose has them, in the world [m]."""

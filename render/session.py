@@ -142,10 +142,11 @@ def configured(
 class Drawing:
     """A subject and its cameras; draws any of its frames."""
 
-    def __init__(self, subject: Subject, config: RenderConfig) -> None:
+    def __init__(self, subject: Subject, config: RenderConfig, *, light: bool = False) -> None:
         if config.shutter is not None and not subject.is_motion:
             raise ArgumentError("poses without times have no motion to blur; add the array times")
-        for body in subject.take.bodies:
+        bodies = subject.take.bodies
+        for body in bodies:
             if body.shape is None and not len(body.positions):
                 told = (
                     f"{body.name} has neither a surface nor markers and is not drawn; "
@@ -160,7 +161,7 @@ class Drawing:
         film = subject.film
         self._film = None if film is None else Film(film.path, film.lens_of)
         self._open_studio = functools.partial(
-            open_studio, config=config, bodies=self.take.bodies, has_user=has_user, film=self._film
+            open_studio, config=config, bodies=bodies, has_user=has_user, film=self._film, light=light
         )
         poses = None if film is None else film.poses
         self.viewpoints = Viewpoints(
@@ -238,10 +239,8 @@ class Drawing:
     def _held(self, scene: FrameChoices) -> FrameChoices:
         """The choices with a backdrop that stays where it is, behind the hands of all frames."""
         backdrop = scene.background.backdrop
-        if backdrop is None:
-            return scene
-        level = self.viewpoints.nearest(backdrop.normal) - backdrop.gap
-        held = dataclasses.replace(backdrop, level=level)
+        level, arms = (self.viewpoints.nearest(backdrop.normal, arms=arms) for arms in (False, True))
+        held = dataclasses.replace(backdrop, level=level - backdrop.gap, arms=arms)
         return dataclasses.replace(scene, background=dataclasses.replace(scene.background, backdrop=held))
 
     def _studio_of_person(self, person: int) -> Studio:
@@ -260,6 +259,7 @@ def open_studio(
     rng: np.random.Generator,
     has_user: bool = False,
     film: Film | None = None,
+    light: bool = False,
 ) -> Studio:
     """A studio of one person with random looks, whose wrists a `UserBody` may bend."""
     people = sample_people(len(hands), config.dress == "glove", tones=config.tones, rng=rng)
@@ -267,9 +267,7 @@ def open_studio(
         straight = dataclasses.replace(people[0].forearm, flexion=0.0, deviation=0.0)
         people = tuple(dataclasses.replace(one, forearm=straight) for one in people)
     colors = [tuple(rng.uniform(0.05, 0.9, 3).tolist()) for _ in bodies]
-    assert config.painter != "auto"
-    room = config.room_depth
-    return Studio(hands, people, bodies, colors, config.passes, config.painter, room_depth=room, film=film)
+    return Studio(hands, people, config, bodies, colors, light=light, film=film)
 
 
 def sample_choices(
@@ -551,18 +549,18 @@ def _is_complete(output: Output) -> bool:
 
 
 @functools.lru_cache(maxsize=1)
-def _opened(source: Source, config: RenderConfig) -> Drawing:
+def _opened(source: Source, config: RenderConfig, light: bool) -> Drawing:
     """The drawing of a source; cached, because a worker draws many of its shards."""
     cv2.setNumThreads(1)  # there is one process per core
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", HandSimWarning)  # the main process has warned already
-        return Drawing(load_subject(source, seed=config.seed), config)
+        return Drawing(load_subject(source, seed=config.seed), config, light=light)
 
 
 def _render_shard(
     source: Source, formats: tuple[str, ...], config: RenderConfig, out: Path, shard: int
 ) -> int:
-    drawing = _opened(source, config)
+    drawing = _opened(source, config, "exr" in formats)
     lost: list[int] = []
 
     def leave_out(frame: int) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -15,20 +15,21 @@ from numpy.typing import NDArray
 
 from gloves.fit import GloveFit
 from gloves.takes.bodies import RigidBody
-from gloves.takes.take import Take
+from gloves.takes.take import STATUSES, Take
 from handsim.errors import HandSimError
 from handsim.hand.model import KEYPOINT_DIGITS, KEYPOINT_NAMES, hand_keypoints
 from handsim.hand.shape import DIGITS, PALM, bones_of
 from handsim.kernels import kernel
+from handsim.motion_files.motion import joint_poses
 from handsim.space.camera import Camera
 from handsim.space.transforms import pose_matrices
-from render.color_sensor import Exposure, Shutter, combine, expose, linear_of, shutter_times
+from render.color_sensor import GAMMA, Exposure, Shutter, combine, expose, light_of, linear_of, shutter_times
+from render.config import RenderConfig
 from render.depth_sensor import DepthNoise, TimeOfFlight, apply_depth_noise, reflectance_of
 from render.film.video import Film
 from render.frames import (
     FOREARM,
     PARTS_A_HAND,
-    PASSES,
     BodyTruth,
     Bytes,
     Doubles,
@@ -36,14 +37,23 @@ from render.frames import (
     Floats,
     Geometry,
     HandTruth,
+    Integers,
     Pictures,
     RenderedFrame,
 )
 from render.painting.figures import Appearance, BodyFigure, Drawn, HandFigure
-from render.painting.painter import Painter, paint, put_before, whole_levels
+from render.painting.painter import paint, put_before, whole_levels
 from render.painting.rasterizer import NEAR, see
-from render.painting.shading import GAMMA, light_behind
-from render.scenery.backgrounds import Background, Enclosure, draw_surroundings, enlarged, kept_background
+from render.painting.shading import level_behind, light_behind
+from render.scenery.backgrounds import (
+    Background,
+    Enclosure,
+    Surroundings,
+    draw_surroundings,
+    enlarged,
+    kept_background,
+    surroundings_of_picture,
+)
 from render.scenery.lights import Lighting
 from render.skin.look import SkinLook, upper_arms
 from render.user_body import UserBody
@@ -59,6 +69,9 @@ def _allowed_parts() -> Flags:
 
 
 _ALLOWED: Final = _allowed_parts()
+_PALM_JOINTS: Final = {0: (0, 0), **{first: (0, first) for first in range(5, 21, 4)}}
+_OPENXR: Final = np.array([n for keypoint in range(21) for n in _PALM_JOINTS.get(keypoint, (keypoint,))])
+"""Keypoint at each of `OPENXR_JOINTS`; the wrist for those in the palm."""
 
 
 def hand_truth(
@@ -67,40 +80,50 @@ def hand_truth(
     number: int,
     camera: Camera,
     pictures: Geometry,
+    tracking: Mapping[str, Any] | None = None,
     *,
     recorded: bool = True,
+    openxr: bool = False,
 ) -> HandTruth:
     """Ground truth of a hand, by its number among those in the picture; vertices only where `recorded`."""
     model = figure.fit.model
     keypoints = hand_keypoints(model, qpos[None])[0]
-    pixels = camera.project(keypoints)
+    poses = joint_poses(model, qpos[None])[0] if openxr else np.empty((0, 4, 4))
+    points = np.concatenate([keypoints, poses[:, :3, 3]])
+    pixels = camera.project(points)
+    rules = np.append(np.arange(len(keypoints)), _OPENXR[: len(poses)])
+    visible = _visible(points, rules, figure.thickness[rules], number, camera, pictures)
     worn = figure.look.glove is not None
     return HandTruth(
         shape=model.shape,
         qpos=qpos,
-        keypoints=pixels,
+        keypoints=pixels[: len(keypoints)],
         keypoints_world=keypoints,
-        visible=_visible(keypoints, pixels, figure.thickness, number, camera, pictures),
+        visible=visible[: len(keypoints)],
         box=_box(pictures.parts, number),
         vertices=model.skin(qpos[None])[0].astype(np.float32) if recorded else np.empty((0, 3), np.float32),
+        openxr=poses,
+        openxr_visible=visible[len(keypoints) :],
+        tracking=tracking,
         marker_names=figure.fit.layout.names if worn else (),
         markers=figure.markers(qpos) if worn else np.empty((0, 3)),
     )
 
 
 def _visible(
-    keypoints: Doubles, pixels: Doubles, thickness: Doubles, number: int, camera: Camera, pictures: Geometry
+    points: Doubles, rules: Integers, thickness: Doubles, number: int, camera: Camera, pictures: Geometry
 ) -> Flags:
-    """Keypoints (21,) whose pixel shows their own finger, or the palm for those at its edge.
+    """Points (K,) whose pixel shows the finger of a keypoint, or the palm for those at its edge.
 
-    A visible keypoint is no deeper under the surface at its pixel than the finger is thick.
+    A visible point is no deeper under the surface at its pixel than the finger is thick.
     """
+    pixels = camera.project(points)
     inside = np.all((pixels >= 0.0) & (pixels < camera.size), axis=1)
     columns, rows = np.where(inside[:, None], pixels, 0.0).astype(np.int64).T
     bones = pictures.parts[rows, columns].astype(np.int64) - 1 - PARTS_A_HAND * number
     own = inside & (pictures.instances[rows, columns] == 1 + number) & (bones >= 0) & (bones < PARTS_A_HAND)
-    own &= _ALLOWED[np.arange(len(keypoints)), np.where(own, bones, 0)]
-    local = camera.local(keypoints)
+    own &= _ALLOWED[rules, np.where(own, bones, 0)]
+    local = camera.local(points)
     ahead = local[:, 2] > 0.0
     slant = np.linalg.norm(local, axis=1) / np.where(ahead, local[:, 2], np.inf)
     under = slant * (local[:, 2] - pictures.depth[rows, columns])
@@ -116,9 +139,6 @@ def _box(parts: Bytes, number: int) -> Doubles:
     return np.array([left, top, width, height], np.float64) if width else np.full(4, np.nan)
 
 
-_WINDOW: Final = 8  # pixels around a surface that change what a depth sensor measures on it, at most
-
-
 @dataclass(frozen=True, slots=True)
 class FrameChoices:
     """Random choices of one picture, apart from people and camera."""
@@ -130,7 +150,7 @@ class FrameChoices:
     depth_noise: DepthNoise | None  # None for a perfect depth sensor
     seed: int  # seed of the sensors' noise
     enclosure: Enclosure | None = None
-    """Box whose walls show the background to several cameras; None for a background without depth."""
+    """Box whose walls show the background to several cameras; None for the picture of one camera."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -195,16 +215,18 @@ class Studio:
         self,
         hands: Sequence[GloveFit],
         people: Sequence[Appearance],
+        config: RenderConfig,
         bodies: Sequence[RigidBody] = (),
         body_colors: Sequence[tuple[float, float, float]] = (),
-        passes: Sequence[str] = PASSES,
-        painter: Painter = "compiled",
         *,
-        room_depth: bool = True,
+        light: bool = False,
         film: Film | None = None,
     ) -> None:
-        self.passes, self.painter, self._room_depth = tuple(passes), painter, room_depth
+        """The configuration is resolved; `light` asks for that of colors, which our own painter has."""
+        assert config.painter != "auto"
+        self._config, self._passes, self._painter = config, set(config.passes), config.painter
         self._film = film  # whose pictures take the place of drawn colors
+        self._light = light and film is None and config.painter == "compiled"
         self._people = tuple(people)
         self._looks = [dataclasses.asdict(look) for look in people]
         first = np.cumsum([0, *(len(fit.attachment.points) for fit in hands)])
@@ -237,21 +259,27 @@ class Studio:
                 f"expected {2e3 * NEAR:.0f} mm or more; place it elsewhere"
             )
         present = [number for number in range(len(self._hands)) if moment.hand(number) is not None]
-        sensor = choices.depth_noise if "depth" in self.passes else None
+        sensor = choices.depth_noise if "depth" in self._passes else None
         surfaces = [one.triangles for one in drawn]
-        truth = see(camera, surfaces, with_normals=sensor is not None or "normals" in self.passes)
-        rgb = noisy_rgb = noisy_depth = None
-        if "rgb" in self.passes:
+        truth = see(camera, surfaces, with_normals=sensor is not None or "normals" in self._passes)
+        rgb = light = noisy_rgb = noisy_depth = None
+        if "rgb" in self._passes:
             rgb = self._colors_of(camera, drawn, choices) if self._film is None else self._film.picture(frame)
             noisy_rgb = self._exposed(moment, camera, rgb, choices, rng)
-        seen = truth
-        if choices.enclosure is not None and self._room_depth:
-            seen = draw_surroundings(choices.background, choices.enclosure, camera).put_behind(truth, camera)
+            if self._light:
+                most = np.where(rgb < 255, rgb + 1.0, np.inf)  # a pixel's parts end at white first
+                levels = np.clip(self._colors_of(camera, drawn, choices, bright=True), rgb - 1.0, most)
+                light = light_of(levels).astype(np.float16)
+        if self._config.room_depth and self._film is None and {"depth", "normals"} & self._passes:
+            _walls(camera, drawn, choices).put_behind(truth)
         if sensor is not None:
-            noisy_depth = self._noisy_depth(seen, rgb, present, camera, sensor, rng)
+            noisy_depth = self._noisy_depth(truth, rgb, present, camera, sensor, rng)
+        asked = {"recorded": recorded, "openxr": self._config.openxr}
         hands = tuple(
-            hand_truth(self._hands[number], take.qpos[frame, number], index, camera, truth, recorded=recorded)
-            for index, number in enumerate(present)
+            hand_truth(
+                self._hands[n], take.qpos[frame, n], index, camera, truth, _tracking(take, frame, n), **asked
+            )
+            for index, n in enumerate(present)
         )
         bodies = tuple(
             BodyTruth(body.name, T_world_body)
@@ -265,7 +293,7 @@ class Studio:
             camera=camera,
             hands=hands,
             bodies=bodies,
-            ideal=self._requested(seen, rgb),
+            ideal=self._requested(truth, rgb, light),
             noisy=Pictures(rgb=noisy_rgb, depth=noisy_depth),
             points=take.point_list.points[seen_points],
             labels=take.point_list.labels[seen_points],
@@ -326,44 +354,29 @@ class Studio:
         sensor: DepthNoise,
         rng: np.random.Generator,
     ) -> Floats:
-        """Depth that the sensor measures, computed for the part of the picture with surfaces."""
+        """Depth that the sensor measures."""
         assert truth.normals is not None
-        noisy = np.zeros_like(truth.depth)
-        left, top, width, height = cv2.boundingRect((truth.depth > 0.0).view(np.uint8))
-        if width == 0:
-            return noisy
-        right, bottom = (
-            min(end + _WINDOW, side)
-            for end, side in zip((left + width, top + height), camera.size, strict=True)
-        )
-        left, top = max(0, left - _WINDOW), max(0, top - _WINDOW)
-        part = np.s_[top:bottom, left:right]
         light = None
         if isinstance(sensor, TimeOfFlight):
-            shape = bottom - top, right - left
-            light = np.ones(shape, np.float32) if rgb is None else reflectance_of(rgb[part])
+            light = np.ones(truth.depth.shape, np.float32) if rgb is None else reflectance_of(rgb)
             for index, number in enumerate(present):
                 if self._people[number].glove is None:
-                    light[truth.instances[part] == index + 1] = self._people[number].skin.infrared
-        noisy[part] = apply_depth_noise(
-            truth.depth[part],
-            truth.normals[part],
-            sensor,
-            camera=camera.part(left, top, right - left, bottom - top),
-            reflectance=light,
-            rng=rng,
+                    light[truth.instances == index + 1] = self._people[number].skin.infrared
+        return apply_depth_noise(
+            truth.depth, truth.normals, sensor, camera=camera, reflectance=light, rng=rng
         )
-        return noisy
 
-    def _colors_of(self, camera: Camera, drawn: Sequence[Drawn], choices: FrameChoices) -> Bytes:
-        """The perfect color picture."""
+    def _colors_of(
+        self, camera: Camera, drawn: Sequence[Drawn], choices: FrameChoices, *, bright: bool = False
+    ) -> NDArray[Any]:
+        """The perfect color picture as bytes, or bright: as levels that do not end at 255."""
         background = choices.background
-        whole = paint(camera, drawn, choices.lighting, self.painter)
+        whole = paint(camera, drawn, choices.lighting, "bright" if bright else self._painter)
         if choices.enclosure is not None:
-            behind = draw_surroundings(background, choices.enclosure, camera).rgb
+            behind = draw_surroundings(background, choices.enclosure, camera, bright=bright).rgb
             return put_before(whole, behind, behind)
         (plain, bare), light = _background(background, camera.size), None
-        if background.backdrop is not None and camera.lens.kind == "pinhole":
+        if background.backdrop.shadows and camera.lens.kind == "pinhole":
             light = light_behind(camera, drawn, choices.lighting, background.backdrop)
         if light is None:
             return put_before(whole, plain, bare)
@@ -386,17 +399,11 @@ class Studio:
             light = combine(moments, weights)
         return expose(light, choices.exposure or Exposure(), rng=rng)
 
-    def _requested(self, truth: Geometry, rgb: Bytes | None) -> Pictures:
+    def _requested(self, truth: Geometry, rgb: Bytes | None, light: NDArray[Any] | None) -> Pictures:
         """The pictures of the requested passes."""
-        ids = "ids" in self.passes
-        return Pictures(
-            rgb,
-            truth.depth if "depth" in self.passes else None,
-            truth.normals if "normals" in self.passes else None,
-            truth.parts if ids else None,
-            truth.instances if ids else None,
-            truth.markers if ids else None,
-        )
+        kinds = {"depth": ("depth",), "normals": ("normals",), "ids": ("parts", "instances", "markers")}
+        names = [name for kind in kinds if kind in self._passes for name in kinds[kind]]
+        return Pictures(rgb, light, **{name: getattr(truth, name) for name in names})
 
     def _record(self, choices: FrameChoices) -> dict[str, Any]:
         if self._film is not None:
@@ -419,6 +426,23 @@ def _distance(vertices: NDArray[Any], x: float, y: float, z: float) -> float:
         dx, dy, dz = vertices[vertex, 0] - x, vertices[vertex, 1] - y, vertices[vertex, 2] - z
         least = min(least, dx * dx + dy * dy + dz * dz)
     return float(np.sqrt(least))
+
+
+def _tracking(take: Take, frame: int, number: int) -> dict[str, Any] | None:
+    """How sure a tracked pose is; None for poses that are true or a user's own."""
+    spreads = {"angle_spread": take.angle_spread, "keypoint_spread": take.keypoint_spread}
+    known = {name: spread[frame, number] for name, spread in spreads.items() if spread is not None}
+    if not known and np.isnan(take.rms[:, number]).all():
+        return None
+    return {"status": STATUSES[take.status[frame, number]], "rms": float(take.rms[frame, number]), **known}
+
+
+def _walls(camera: Camera, drawn: Sequence[Drawn], choices: FrameChoices) -> Surroundings:
+    """What is behind the hands and bodies."""
+    background = choices.background
+    if choices.enclosure is not None:
+        return draw_surroundings(background, choices.enclosure, camera)
+    return surroundings_of_picture(background, camera, level_behind(background.backdrop, camera, drawn))
 
 
 @functools.lru_cache(maxsize=2)

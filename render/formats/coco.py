@@ -30,6 +30,8 @@ from handsim import __version__
 from handsim.errors import DatasetError
 from handsim.hand.model import KEYPOINT_NAMES, SKELETON
 from handsim.hand.shape import DIGITS, NUM_KEYPOINTS, SIDES, Side
+from handsim.motion_files.motion import OPENXR_JOINTS
+from handsim.space.transforms import rotation_quaternions
 from render.formats.records import (
     CENTER,
     as_sensed,
@@ -48,7 +50,7 @@ from render.formats.records import (
     without_colors,
 )
 from render.formats.shards import _LABELS, FolderWriter, _write, json_list, one_sentence, save_text
-from render.frames import HandTruth, RenderedFrame
+from render.frames import Doubles, Flags, HandTruth, RenderedFrame
 from render.skin.look import tone_name, typology_angle
 
 INFO: Final[dict[str, Any]] = {  # without a date, so that the same frames give the same bytes
@@ -61,6 +63,7 @@ CATEGORY: Final[dict[str, Any]] = {
     "supercategory": "hand",
     "keypoints": list(KEYPOINT_NAMES),
     "skeleton": [[start + 1, end + 1] for start, end in SKELETON],  # COCO counts keypoints from one
+    "openxr_joints": OPENXR_JOINTS,
 }
 
 
@@ -99,12 +102,11 @@ def numbered(records: Iterable[dict[str, Any]]) -> Iterator[tuple[dict[str, Any]
 
 def _hand_record(frame: RenderedFrame, number: int, hand: HandTruth) -> dict[str, Any]:
     """COCO's annotation of a hand, without ids."""
-    flags, mask = keypoint_flags(hand, frame.camera.size), hand_mask(frame, number)
-    pixels = rounded(np.where(flags[:, None] > 0, hand.keypoints - CENTER, 0.0), 5)
+    keypoints, mask = _triples(hand.keypoints, hand.visible, frame.camera.size), hand_mask(frame, number)
     record = {
         "category_id": CATEGORY["id"],
-        "keypoints": [x for uv, flag in zip(pixels, flags.tolist(), strict=True) for x in (*uv, flag)],
-        "num_keypoints": int((flags > 0).sum()),
+        "keypoints": keypoints,
+        "num_keypoints": sum(flag > 0 for flag in keypoints[2::3]),
         "bbox": rounded(hand.box, 3),
         "area": float(hand.box[2] * hand.box[3]) if mask is None else int(mask.sum()),
         "iscrowd": 0,
@@ -113,6 +115,14 @@ def _hand_record(frame: RenderedFrame, number: int, hand: HandTruth) -> dict[str
         "qpos": hand.qpos.tolist(),
         "shape": shape_record(hand.shape),
     }
+    if len(hand.openxr):
+        joints = np.linalg.inv(frame.camera.T_world_camera) @ hand.openxr
+        turns = np.roll(rotation_quaternions(joints[:, :3, :3]), -1, axis=1)
+        pixels = frame.camera.project(hand.openxr[:, :3, 3])
+        record["openxr_keypoints"] = _triples(pixels, hand.openxr_visible, frame.camera.size)
+        record["openxr_poses"] = rounded(np.concatenate([joints[:, :3, 3], turns], axis=1), 9)
+    if hand.tracking:
+        record["tracking"] = hand.tracking
     looks = frame.choices.get("people", ())
     if number < len(looks):
         angle = typology_angle(looks[number]["skin"]["lightness"], looks[number]["skin"]["yellowness"])
@@ -123,13 +133,20 @@ def _hand_record(frame: RenderedFrame, number: int, hand: HandTruth) -> dict[str
     return record
 
 
+def _triples(pixels: Doubles, visible: Flags, size: tuple[int, int]) -> list[Any]:
+    """COCO's list u, v, flag, u, ... of keypoints (K, 2)."""
+    flags = keypoint_flags(pixels, visible, size)
+    known = rounded(np.where(flags[:, None] > 0, pixels - CENTER, 0.0), 5)
+    return [x for uv, flag in zip(known, flags.tolist(), strict=True) for x in (*uv, flag)]
+
+
 def label_lines(frame: RenderedFrame) -> str:
     """YOLO's text of a picture: one line per visible hand, none where there is no hand."""
     size, lines = np.array(frame.camera.size), []
     for hand in filter(is_seen, frame.hands):
         corner, extent = hand.box[:2], hand.box[2:]
         box = np.concatenate([(corner + 0.5 * extent) / size, extent / size]).tolist()
-        flags = keypoint_flags(hand, frame.camera.size)
+        flags = keypoint_flags(hand.keypoints, hand.visible, frame.camera.size)
         points = np.where(flags[:, None] > 0, hand.keypoints / size, 0.0).tolist()
         rows = (f"{x:.6f} {y:.6f} {flag}" for (x, y), flag in zip(points, flags.tolist(), strict=True))
         lines.append(" ".join(["0", *(f"{value:.6f}" for value in box), *rows]) + "\n")

@@ -70,10 +70,10 @@ def is_seen(hand: HandTruth) -> bool:
     return bool(np.isfinite(hand.box).all())
 
 
-def keypoint_flags(hand: HandTruth, size: tuple[int, int]) -> Integers:
-    """COCO's flags (21,) of keypoints in a picture of this size [px]: 0 outside, 1 hidden, 2 visible."""
-    inside = np.all((hand.keypoints >= 0.0) & (hand.keypoints < size), axis=1)  # False for NaN
-    return np.where(inside, np.where(hand.visible, 2, 1), 0)
+def keypoint_flags(pixels: Doubles, visible: Flags, size: tuple[int, int]) -> Integers:
+    """COCO's flags (K,) of keypoints in a picture of this size [px]: 0 outside, 1 hidden, 2 visible."""
+    inside = np.all((pixels >= 0.0) & (pixels < size), axis=1)  # False for NaN
+    return np.where(inside, np.where(visible, 2, 1), 0)
 
 
 def hand_mask(frame: RenderedFrame, hand: int) -> Flags | None:
@@ -300,8 +300,8 @@ def write_exr(path: str | Path, frame: RenderedFrame) -> None:
 def _channels(pictures: Pictures) -> dict[str, NDArray[Any]]:
     channels: dict[str, NDArray[Any]] = {}
     if pictures.rgb is not None:
-        light = linear_of(pictures.rgb).astype(np.float16)
-        channels |= {name: light[..., index] for index, name in enumerate(_RGB)}
+        light = linear_of(pictures.rgb) if pictures.light is None else pictures.light
+        channels |= {name: light[..., index].astype(np.float16) for index, name in enumerate(_RGB)}
     if pictures.depth is not None:
         channels["Z"] = pictures.depth.astype(np.float32)
     if pictures.normals is not None:

@@ -32,7 +32,6 @@ from render.painting.shading import (
     TINT,
     TO_DISPLAY,
     TO_LINEAR,
-    ShadowMap,
     display,
     shade,
     shadow_map,
@@ -58,8 +57,8 @@ class _Mesh(NamedTuple):
 
 
 def paint_compiled(
-    cameras: Sequence[Camera], drawn: Sequence[Drawn], lighting: Lighting
-) -> list[UInt8[np.ndarray, "H W 4"]]:
+    cameras: Sequence[Camera], drawn: Sequence[Drawn], lighting: Lighting, *, bright: bool = False
+) -> list[NDArray[Any]]:
     """Colors and coverage, as `paint` has them, by our own code; machines differ by rounding alone.
 
     The cameras have one shadow map, so that shadows go on from one face of a lens to the next.
@@ -84,24 +83,21 @@ def paint_compiled(
         turned[:, :3] = lamps[:, :3] @ rotation
         ambient = turned_irradiance(around, rotation.T)
         own = shadows._replace(to_map=shadows.to_map @ camera.T_world_camera)
-        pictures.append(_painted(camera.size, meshes, turned, ambient, own))
+        width, height = camera.size
+        surfaces = [(mesh.corners, mesh.faces) for mesh in meshes]
+        nearness, first = nearest_faces(surfaces, (2 * width, 2 * height), farthest=0.0)
+        covered = _covered(first)
+        sums = np.zeros((len(covered), 4), dtype=np.float32)  # sums over the four samples of a pixel
+        table = TO_DISPLAY[:0] if bright else TO_DISPLAY
+        for mesh in meshes:
+            _add_surface(nearness, first, covered, *mesh, TO_LINEAR, turned, ambient, *own, table, sums)
+        painted = np.zeros((height * width, 4), dtype=np.float32 if bright else np.uint8)
+        if bright:
+            painted[covered] = np.float32(63.75) * sums
+        else:
+            _write_means(sums, covered, painted)
+        pictures.append(painted.reshape(height, width, 4))
     return pictures
-
-
-def _painted(
-    size: tuple[int, int], meshes: Sequence[_Mesh], lamps: Doubles, around: Doubles, shadows: ShadowMap
-) -> Bytes:
-    """The picture of one camera, whose axes the light is in."""
-    width, height = size
-    surfaces = [(mesh.corners, mesh.faces) for mesh in meshes]
-    nearness, first = nearest_faces(surfaces, (2 * width, 2 * height), farthest=0.0)
-    covered = _covered(first)
-    sums = np.zeros((len(covered), 4), dtype=np.float32)  # sums over the four samples of a pixel
-    for mesh in meshes:
-        _add_surface(nearness, first, covered, *mesh, TO_LINEAR, lamps, around, *shadows, TO_DISPLAY, sums)
-    painted = np.zeros((height, width, 4), dtype=np.uint8)
-    _write_means(sums, covered, painted.reshape(-1, 4))
-    return painted
 
 
 @kernel
@@ -290,23 +286,27 @@ def _write_spot(
             spots[COLOR + i, spot] = np.float32(finish[i] if i < 3 else max(finish[i], ROUGHEST))
 
 
-Painter = Literal["compiled", "opengl"]
+Painter = Literal["compiled", "bright", "opengl"]
 PainterChoice = Literal["auto", "compiled", "opengl"]
 _WHITE: Final = np.float32(255.0)
 _STEP: Final = 64  # windows' sizes are multiples of it, because OpenGL reallocates buffers for new sizes [px]
 
 
-def choose_painter() -> Painter:
+def choose_painter() -> PainterChoice:
     """OpenGL where it draws on hardware, and our own painter elsewhere."""
     return "opengl" if opengl_has_hardware() else "compiled"
 
 
 def paint(
     camera: Camera, drawn: Sequence[Drawn], lighting: Lighting, painter: Painter = "compiled"
-) -> UInt8[np.ndarray, "H W 4"]:
-    """Colors over black (sRGB), and as fourth channel the covered share of each pixel, through any lens."""
+) -> NDArray[Any]:
+    """Colors over black (sRGB), and as fourth channel the covered share of each pixel, through any lens.
+
+    Bytes (H, W, 4); what the painter "bright" returns are numbers, and do not end at 255.
+    """
+    bright = painter == "bright"
     faces, parts, inner = faces_for(camera), [], []
-    pictures = [np.zeros((*face.size[::-1], 4), dtype=np.uint8) for face in faces]
+    pictures = [np.zeros((*face.size[::-1], 4), np.float32 if bright else np.uint8) for face in faces]
     for face, picture in zip(faces, pictures, strict=True):
         left, top, right, bottom = _window(face, drawn)
         if left < right and top < bottom:
@@ -315,7 +315,7 @@ def paint(
     if painter == "opengl":
         painted = [paint_opengl(one, drawn, lighting) for one in inner]
     else:
-        painted = paint_compiled(inner, drawn, lighting) if inner else []
+        painted = paint_compiled(inner, drawn, lighting, bright=bright) if inner else []
     for part, colors in zip(parts, painted, strict=True):
         part[:] = colors
     return np.asarray(warp(camera, pictures, cv2.INTER_LINEAR))
@@ -348,11 +348,11 @@ def _widen(local: Doubles, K: Doubles, low: Doubles, high: Doubles) -> None:
 
 
 def put_before(
-    painted: UInt8[np.ndarray, "H W 4"],
-    background: Float32[np.ndarray, "H W 3"] | UInt8[np.ndarray, "H W 3"],
-    bare: UInt8[np.ndarray, "H W 3"] | None = None,
-) -> UInt8[np.ndarray, "H W 3"]:
-    """A picture of `paint` over a background, whose `whole_levels` may be given."""
+    painted: NDArray[Any], background: NDArray[Any], bare: UInt8[np.ndarray, "H W 3"] | None = None
+) -> NDArray[Any]:
+    """A picture of `paint` over a background (H, W, 3), whose `whole_levels` may be given."""
+    if painted.dtype == np.float32:  # it is a bright one
+        return np.asarray(painted[..., :3] + (1.0 - np.rint(painted[..., 3:]) / 255.0) * background)
     mixed = whole_levels(background) if bare is None else bare.copy()
     _mix(painted.reshape(-1, 4), background.reshape(-1, 3), mixed.reshape(-1, 3))
     return mixed

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from handsim.kernels import kernel
 from handsim.space.camera import Camera
 from handsim.space.transforms import cross
+from render.color_sensor import GAMMA
 from render.frames import Doubles, Flags, Floats
 from render.painting.figures import Drawn
 from render.painting.rasterizer import NEAR, cut_off, nearest_faces, project
@@ -112,6 +113,16 @@ def lit_share(to_map: Doubles, nearest: Floats, bias: float, x: float, y: float,
     return lit / 9.0
 
 
+def level_behind(backdrop: Backdrop, camera: Camera, drawn: Sequence[Drawn]) -> float:
+    """Position along its normal in the camera's axes [m] that depth has a backdrop at: behind arms, too."""
+    nearest, normal = np.inf, backdrop.normal
+    if backdrop.level is None and drawn:
+        points = camera.local(np.concatenate([one.triangles.vertices for one in drawn]))
+        nearest = _nearest_seen(points, normal, camera.K, np.array(camera.size, np.float64))[0]
+    level = backdrop.behind(nearest if np.isfinite(nearest) else -1.0)
+    return level if backdrop.arms is None else min(level, backdrop.arms)
+
+
 def light_behind(
     camera: Camera, drawn: Sequence[Drawn], lighting: Lighting, backdrop: Backdrop
 ) -> Float32[np.ndarray, "H W"] | None:
@@ -127,10 +138,9 @@ def light_behind(
     points = camera.local(np.concatenate([surface.vertices for surface in surfaces]))
     starts = np.cumsum([0, *(len(surface.vertices) for surface in surfaces)])
     faces = np.concatenate([one.casting + start for one, start in zip(drawn, starts, strict=False)])
-    size = np.array(camera.size, dtype=np.float64)
+    nearest, seen = _nearest_seen(points, normal, camera.K, np.array(camera.size, np.float64))
     fallen, distance = np.full_like(points, np.nan), np.zeros(2)
-    level = np.nan if backdrop.level is None else backdrop.level
-    _fall(points, normal, towards, backdrop.gap, level, camera.K, size, fallen, distance)
+    _fall(points, seen, normal, towards, backdrop.behind(nearest), fallen, distance)
     if distance[1] == 0.0:
         return None
     width, height = (-(-side // _COARSE) for side in camera.size)
@@ -154,24 +164,8 @@ def light_behind(
 
 
 @kernel
-def _fall(
-    points: Doubles,
-    normal: Doubles,
-    towards: Doubles,
-    gap: float,
-    level: float,
-    K: Doubles,
-    size: Doubles,
-    fallen: Doubles,
-    distance: Doubles,
-) -> None:
-    """Write where the shadows of points (V, 3) fall on a backdrop, in the camera's axes [m].
-
-    The backdrop's normal looks towards the camera. It has this level along the normal; where that is NaN, the
-    gap separates it from the nearest point in the picture. Points behind it have no shadow, and their rows
-    are not written. `distance` (2,) gets the points' mean distance from the backdrop and its mean depth
-    behind them, or zeros if no point is in the picture.
-    """
+def _nearest_seen(points: Doubles, normal: Doubles, K: Doubles, size: Doubles) -> Any:
+    """Least position along a normal of the points (V, 3) in or near the picture, and which are there (V,)."""
     seen = np.zeros(len(points), dtype=np.bool_)
     nearest = np.inf
     for number in range(len(points)):
@@ -182,8 +176,25 @@ def _fall(
             if -_MARGIN < across < 1.0 + _MARGIN and -_MARGIN < down < 1.0 + _MARGIN:
                 seen[number] = True
                 nearest = min(nearest, x * normal[0] + y * normal[1] + z * normal[2])
-    if np.isnan(level):
-        level = nearest - gap
+    return nearest, seen
+
+
+@kernel
+def _fall(
+    points: Doubles,
+    seen: Flags,
+    normal: Doubles,
+    towards: Doubles,
+    level: float,
+    fallen: Doubles,
+    distance: Doubles,
+) -> None:
+    """Write where the shadows of points (V, 3) fall on a backdrop, in the camera's axes [m].
+
+    The backdrop's normal looks towards the camera, and it has this level along the normal. Points behind it
+    have no shadow, and their rows are not written. `distance` (2,) gets the mean distance of the points that
+    are seen from the backdrop and its mean depth behind them, or zeros if none is.
+    """
     steep = normal[0] * towards[0] + normal[1] * towards[1] + normal[2] * towards[2]
     count = 0
     for number in range(len(points)):
@@ -200,7 +211,6 @@ def _fall(
         distance /= count
 
 
-GAMMA: Final = 2.2
 _FACING: Final = np.float32(0.04)  # specular reflectance of dielectrics at normal incidence
 _LIFT: Final = 1.7  # shadow look-ups start this many biases of the map off a slanted surface
 _UNDER: Final = 0.012  # depth in the skin that scattered light passes at a scatter of 1 [m]
@@ -236,7 +246,12 @@ POSITION, NORMAL, TINT, COLOR, ROUGH, TANGENT, BUMP, VIEW, FACING = 0, 3, 6, 9, 
 
 @kernel
 def display(light: Floats, tint: Floats, table: Floats) -> None:
-    """Turn linear light (N,) of this tint (N,) into display values in [0, 1]; `table` is `TO_DISPLAY`."""
+    """Turn linear light (N,) of this tint (N,) into display values, by `TO_DISPLAY` up to 1, or by none."""
+    if len(table) == 0:
+        for n in range(len(light)):
+            value = tint[n] * light[n]
+            light[n] = (value if value > _ZERO else _ZERO) ** np.float32(1.0 / GAMMA)
+        return
     for n in range(len(light)):
         value = tint[n] * light[n]
         value = value if value > _ZERO else _ZERO

@@ -27,7 +27,8 @@ from handsim.errors import HandSimError, choices
 from handsim.files.inputs import check_regular
 from handsim.files.outputs import plain_path
 from handsim.kernels import kernel
-from handsim.space.camera import Camera, Lens
+from handsim.space.camera import Camera, Lens, camera_matrix
+from render.color_sensor import GAMMA
 from render.fields import normal_numbers
 from render.frames import Bytes, Doubles, Flags, Floats, Geometry
 from render.scenery.rooms import RoomLight, cast_room, draw_room, paint_tints
@@ -148,12 +149,13 @@ def draw_photo(file: Path, size: tuple[int, int], rng: np.random.Generator) -> F
     cut = photo[top : top + part[1], left : left + part[0]]
     method = cv2.INTER_AREA if part[0] > size[0] else cv2.INTER_LINEAR
     scaled = cv2.resize(np.ascontiguousarray(cut), size, interpolation=method)
-    return np.asarray((scaled.astype(np.float32) / 255.0) ** _GAMMA)
+    return np.asarray((scaled.astype(np.float32) / 255.0) ** GAMMA)
 
 
 SHARE: Final = 0.6
 """Share of the plain backgrounds that catch shadows; the others are too far away."""
 _GAPS: Final = (0.02, 0.35)  # range of a backdrop's distance from the hands [m]
+_FAR: Final = 8.0  # distance of a backdrop without shadows over that of one with them
 _STEEPEST: Final = 0.35  # largest slope of a backdrop against the picture's plane
 _SOFTNESS: Final = (0.03, 0.25)  # range of shadows' softness, from that of a bare bulb to a window's
 BackgroundKind = Literal["plain", "gradient", "noise", "clutter", "room", "photo"]
@@ -161,7 +163,6 @@ KINDS: Final[tuple[BackgroundKind, ...]] = ("plain", "gradient", "noise", "clutt
 _USUAL_SHARES: Final = {"plain": 0.1, "gradient": 0.1, "noise": 0.15, "clutter": 0.15, "room": 0.5}
 _CLOSE: Final = ("plain", "gradient", "noise", "clutter")  # kinds that may be a wall or a table
 _OUT_OF_FOCUS: Final = ("gradient", "noise", "clutter", "room")  # kinds drawn at half the resolution
-_GAMMA: Final = 2.2
 _GRAINS: Final = (6.0, 60.0)  # range of the number of grains along the height of a picture
 _GRAIN_CONTRAST: Final = (0.1, 0.5)  # contrast of grain over that of any two colors
 _SIDE: Final = np.float32(0.6)  # light on an object's side over that on its top
@@ -169,13 +170,20 @@ _SIDE: Final = np.float32(0.6)  # light on an object's side over that on its top
 
 @dataclass(frozen=True, slots=True)
 class Backdrop:
-    """A plane behind the hands that catches their shadows."""
+    """A plane behind the hands: a wall or a table."""
 
     gap: float  # distance from the nearest point of the hands [m]
     recedes: tuple[float, float] = (0.0, 0.0)  # slopes to the right and downwards
     softness: float = 0.1  # tangent of half the angle under which it sees the lamp
     level: float | None = None
     """Position along its normal in the camera's axes [m]; None: the gap is from the hands of each picture."""
+    shadows: bool = True  # whether it catches the hands' shadows, or is too far away for them
+    arms: float | None = None
+    """Level behind the arms of all frames, which depth has where it is the lower one [m]."""
+
+    def behind(self, nearest: float) -> float:
+        """Its level; `nearest` is the hands' least position along the normal [m]."""
+        return nearest - self.gap if self.level is None else self.level
 
     @property
     def normal(self) -> Float[np.ndarray, "3"]:
@@ -183,12 +191,16 @@ class Backdrop:
         return np.asarray(np.array([*self.recedes, -1.0]) / np.linalg.norm([*self.recedes, 1.0]))
 
 
-def sample_backdrop(*, rng: np.random.Generator) -> Backdrop | None:
-    """A random backdrop, or none."""
+_WALL: Final = Backdrop(0.4, shadows=False)
+
+
+def sample_backdrop(*, rng: np.random.Generator) -> Backdrop:
+    """A random backdrop."""
     gap = float(np.exp(rng.uniform(*np.log(_GAPS))))
     right, down = rng.uniform(-_STEEPEST, _STEEPEST, 2)
     softness = float(np.exp(rng.uniform(*np.log(_SOFTNESS))))
-    return Backdrop(gap, (float(right), float(down)), softness) if rng.random() < SHARE else None
+    shadows = bool(rng.random() < SHARE)
+    return Backdrop(gap * (1.0 if shadows else _FAR), (float(right), float(down)), softness, shadows=shadows)
 
 
 @dataclass(frozen=True, slots=True)
@@ -234,7 +246,8 @@ class Background:
     seed: int
     blur: float = 0.0  # standard deviation of its blur, in picture heights
     photo: str | None = None  # the photograph's file
-    backdrop: Backdrop | None = None  # plane that catches shadows; None for a far background
+    backdrop: Backdrop = _WALL
+    """Where it is behind the hands of one camera; nothing in a room is nearer."""
 
     @property
     def is_map(self) -> bool:
@@ -249,7 +262,7 @@ def sample_background(config: Backgrounds, *, rng: np.random.Generator) -> Backg
     first, second = _color(rng), _color(rng)
     blur = float(rng.uniform(0.0, 0.01)) if kind in ("room", "clutter", "photo") else 0.0
     photo = str(pick_photo(Path(str(config.photos)), rng)) if kind == "photo" else None
-    backdrop = sample_backdrop(rng=rng) if kind in _CLOSE else None
+    backdrop = sample_backdrop(rng=rng) if kind in _CLOSE else _WALL
     return Background(kind, (first, second), int(rng.integers(2**31)), blur, photo, backdrop)
 
 
@@ -290,7 +303,7 @@ def _coarse(background: Background, size: tuple[int, int]) -> Floats:
     elif background.kind == "clutter":
         picture = _clutter(first, second, drawn_size, rng)
     elif background.kind == "room":
-        picture = draw_room(drawn_size, background.seed)
+        picture = draw_room(drawn_size, background.seed).light
     elif background.kind == "photo":
         picture = draw_photo(Path(str(background.photo)), size, rng)
     else:
@@ -302,7 +315,7 @@ def _coarse(background: Background, size: tuple[int, int]) -> Floats:
 
 def _color(rng: np.random.Generator) -> tuple[float, float, float]:
     """Linear color of a wall or a cloth: more often gray than strong."""
-    gray = rng.uniform(0.12, 0.95) ** _GAMMA
+    gray = rng.uniform(0.12, 0.95) ** GAMMA
     red, green, blue = np.clip(gray * np.exp(paint_tints(rng, 1)[0]), 0.003, 0.95)
     return float(red), float(green), float(blue)
 
@@ -414,6 +427,7 @@ _TEXTURE: Final = 512  # width and height of a wall's picture [px]
 _TO_WALL: Final = 0.95  # share of the way to a wall at which a room's lamp is
 _STRIP: Final = 2**14  # pixels of a picture that `remap` fills at once; it takes at most 32767 rows
 _SHARP: Final = 0.3  # blur that is not drawn [px]
+_ONE_SURFACE: Final = 0.03  # share by which nearness inside a pixel of a coarse picture may differ
 _SHORTEST: Final = 1e-6  # least component of a ray, so that it meets a wall along each axis
 
 
@@ -431,20 +445,48 @@ class Enclosure:
 class Surroundings:
     """The picture, depth and normals that one camera has behind hands and objects."""
 
-    rgb: UInt8[np.ndarray, "H W 3"]  # sRGB; 0 where the lens sees nothing
     depth: Float32[np.ndarray, "H W"]  # along the camera's axis [m]; 0 for what is not ahead
-    walls: Int8[np.ndarray, "H W"]
-    """Where surfaces face: against the world's axis `walls // 2` where odd, else along it."""
+    walls: Int8[np.ndarray, "H W"]  # number of each pixel's normal
+    facing: Float32[np.ndarray, "N 3"]  # these unit normals in the camera's axes
+    rgb: NDArray[Any] = field(default_factory=lambda: np.empty((0, 0, 3), np.uint8))
+    """sRGB (H, W, 3) as bytes, or bright: as levels that do not end at 255; 0 where the lens sees nothing."""
 
-    def put_behind(self, pictures: Geometry, camera: Camera) -> Geometry:
-        """Pictures of hands and objects with depth and normals added behind them."""
-        depth, rotation = pictures.depth.copy(), camera.T_world_camera[:3, :3].astype(np.float32)
-        facing = np.stack([rotation, -rotation], axis=1).reshape(6, 3)
-        normals = (
-            np.empty((*depth.shape, 0), np.float32) if pictures.normals is None else pictures.normals.copy()
-        )
-        _put_behind(pictures.instances, self.depth, self.walls, facing, depth, normals)
-        return pictures._replace(depth=depth, normals=None if pictures.normals is None else normals)
+    def put_behind(self, pictures: Geometry) -> None:
+        """Write depth and normals where pictures of hands and objects have none."""
+        none = np.empty((*pictures.depth.shape, 0), np.float32)
+        normals = none if pictures.normals is None else pictures.normals
+        _put_behind(pictures.instances, self.depth, self.walls, self.facing, pictures.depth, normals)
+
+
+def _both_ways(axes: NDArray[Any]) -> Floats:
+    """Unit normals (6, 3) along and against each column of a matrix (3, 3)."""
+    unit = (axes / np.linalg.norm(axes, axis=0)).T
+    return np.stack([unit, -unit], axis=1).reshape(6, 3).astype(np.float32)
+
+
+def surroundings_of_picture(background: Background, camera: Camera, level: float) -> Surroundings:
+    """The wall, or the room, that a background's picture shows to a pinhole camera.
+
+    The wall has this level along the backdrop's normal [m]; nothing in a room is nearer. A room's picture has
+    a camera of its own: to another one the room is larger, and maybe sheared.
+    """
+    (width, height), normal = camera.size, background.backdrop.normal
+    if background.kind != "room":
+        way = (normal @ np.linalg.inv(camera.K)).astype(np.float32)
+        across, down = (np.arange(side, dtype=np.float32) + np.float32(0.5) for side in camera.size)
+        along = way[0] * across + (way[1] * down + way[2])[:, None]
+        depth = np.divide(np.float32(level), along, out=np.zeros_like(along), where=along < 0.0)
+        return Surroundings(depth, np.zeros(along.shape, np.int8), normal[None].astype(np.float32))
+    room = draw_room((max(2, width // 2), max(2, height // 2)), background.seed)
+    nearness = 1.0 / (max(1.0, -level / float(room.depth.min())) * room.depth)
+    smooth = cv2.resize(nearness, camera.size, interpolation=cv2.INTER_LINEAR)  # is exact for planes
+    one, walls = (
+        cv2.resize(rows, camera.size, interpolation=cv2.INTER_NEAREST) for rows in (nearness, room.walls)
+    )
+    np.copyto(smooth, one, where=cv2.absdiff(smooth, one) > _ONE_SURFACE * one)
+    depth = np.reciprocal(smooth, out=smooth)
+    own = camera_matrix(room.focal * height, room.focal * height, 0.5 * width, 0.5 * height)
+    return Surroundings(depth, walls, _both_ways(np.linalg.solve(own, camera.K).T @ room.rotation))
 
 
 @kernel
@@ -456,8 +498,9 @@ def _put_behind(
         for column in range(depth.shape[1]):
             if instances[row, column] == 0 and behind[row, column] > 0.0:
                 depth[row, column] = behind[row, column]
-                for axis in range(normals.shape[2]):
-                    normals[row, column, axis] = facing[walls[row, column], axis]
+                if normals.shape[2]:
+                    for axis in range(3):
+                        normals[row, column, axis] = facing[walls[row, column], axis]
 
 
 def enclose(
@@ -486,7 +529,7 @@ def light_in(
         return _in_map(background, rays, coarse=True).light
     if background.kind == "room":
         return np.asarray(np.clip(_in_room(background, enclosure, eye, rays).light, 0.0, 1.0))
-    return (_at_walls(background, enclosure, eye, rays)[0] / np.float32(255.0)) ** np.float32(_GAMMA)
+    return (_at_walls(background, enclosure, eye, rays)[0] / np.float32(255.0)) ** np.float32(GAMMA)
 
 
 def _in_room(background: Background, enclosure: Enclosure, eye: Doubles, rays: Floats) -> RoomLight:
@@ -513,10 +556,12 @@ def _corner(point: Doubles) -> Corner:
     return x, y, z
 
 
-def draw_surroundings(background: Background, enclosure: Enclosure, camera: Camera) -> Surroundings:
+def draw_surroundings(
+    background: Background, enclosure: Enclosure, camera: Camera, *, bright: bool = False
+) -> Surroundings:
     """The box as a camera in it sees it, through any lens; cached for cameras that stand still."""
     focal, pose = tuple(camera.K.ravel().tolist()), camera.T_world_camera.tobytes()
-    return _drawn(background, enclosure, camera.size, focal, camera.lens, pose)
+    return _drawn(background, enclosure, camera.size, focal, camera.lens, pose, bright)
 
 
 @functools.lru_cache(maxsize=16)
@@ -527,6 +572,7 @@ def _drawn(
     focal: tuple[float, ...],
     lens: Lens,
     pose: bytes,
+    bright: bool,
 ) -> Surroundings:
     T_world_camera, (rays, known) = np.frombuffer(pose).reshape(4, 4), _rays(size, focal, lens)
     world = rays @ T_world_camera[:3, :3].T.astype(np.float32)
@@ -535,13 +581,13 @@ def _drawn(
     if background.kind == "room" or background.is_map:
         is_map = background.is_map
         met = _in_map(background, world) if is_map else _in_room(background, enclosure, eye, world)
-        light = np.clip(met.light, 0.0, 1.0).reshape(*shape, 3)
+        light = np.clip(met.light, 0.0, np.inf if bright else 1.0).reshape(*shape, 3)
         if sigma > _SHARP:
             light = cv2.GaussianBlur(light, (0, 0), sigma)
-        light = cv2.pow(light, 1.0 / _GAMMA)
-        rgb = np.rint(np.multiply(light, np.float32(255.0), out=light), out=light).astype(np.uint8)
-        distances, flat = met.distances, np.arange(0, 3 * len(world), 3) + met.axes
-        walls = 2 * met.axes + (world.ravel().take(flat) > 0.0)
+        light = cv2.pow(light, 1.0 / GAMMA)
+        rgb = np.multiply(light, np.float32(255.0), out=light)
+        rgb = rgb if bright else np.rint(light, out=light).astype(np.uint8)
+        distances, walls = met.distances, met.walls
     else:
         colors, distances, walls = _at_walls(background, enclosure, eye, world)
         rgb = colors.reshape(*shape, 3)
@@ -550,7 +596,7 @@ def _drawn(
     depth = np.maximum(distances * rays[:, 2], np.float32(0.0)).reshape(shape)
     if not known.all():
         rgb[~known], depth[~known] = 0, 0.0
-    return Surroundings(rgb, depth, walls.reshape(shape).astype(np.int8, copy=False))
+    return Surroundings(depth, walls.reshape(shape), _both_ways(T_world_camera[:3, :3].T), rgb)
 
 
 @functools.lru_cache(maxsize=4)
@@ -579,7 +625,7 @@ def _wall_pictures(background: Background, enclosure: Enclosure) -> UInt8[np.nda
             width, height = np.ceil(_TEXTURE * sides / sides.max()).astype(int).tolist()
             picture = draw_background(dataclasses.replace(wall, photo=str(photo)), (width, height))
             pictures.append(cv2.resize(picture, (_TEXTURE, _TEXTURE), interpolation=cv2.INTER_LINEAR))
-    light = np.clip(np.concatenate(pictures), 0.0, 1.0) ** np.float32(1.0 / _GAMMA)
+    light = np.clip(np.concatenate(pictures), 0.0, 1.0) ** np.float32(1.0 / GAMMA)
     return np.asarray(np.rint(np.float32(255.0) * light).astype(np.uint8))
 
 

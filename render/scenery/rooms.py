@@ -40,11 +40,21 @@ class _Walls(NamedTuple):
 
 
 class RoomLight(NamedTuple):
-    """Light, distance and normal of the surfaces in a room that N rays meet."""
+    """Light, distance and side of the surfaces in a room that N rays meet."""
 
     light: Float32[np.ndarray, "N 3"]  # linear light
     distances: Float32[np.ndarray, "N"]  # distance [m]
-    axes: Int8[np.ndarray, "N"]  # axis of the surface's normal, which faces the ray
+    walls: Int8[np.ndarray, "N"]  # twice the axis of the surface's normal, plus one for rays along it
+
+
+class RoomPicture(NamedTuple):
+    """A picture of a room, and the surfaces behind the centers of its pixels."""
+
+    light: Float32[np.ndarray, "H W 3"]  # linear light
+    depth: Float32[np.ndarray, "H W"]  # along the axis of the picture's own camera [m]
+    walls: Int8[np.ndarray, "H W"]  # as of `RoomLight`
+    focal: float  # focal length [picture heights]; the axis meets the middle of the picture
+    rotation: Doubles  # the room's axes as columns in the camera's (3, 3)
 
 
 class _Boxes(NamedTuple):
@@ -56,27 +66,31 @@ class _Boxes(NamedTuple):
     shades: Doubles  # brightness of the faces along x, y and z (B, 3)
 
 
-def draw_room(size: tuple[int, int], seed: int) -> Float32[np.ndarray, "H W 3"]:
-    """A random room from a random position, in linear light."""
+@functools.lru_cache(maxsize=2)  # its light and its depth are asked for one after the other
+def draw_room(size: tuple[int, int], seed: int) -> RoomPicture:
+    """A random room from a random position."""
     (width, height), scene = size, _scene(seed)
 
-    def seen(across: Floats, down: Floats) -> Floats:
-        """Light (N, 3) at columns and rows (N,) of the picture [px]."""
+    def seen(across: Floats, down: Floats) -> RoomLight:
+        """What is at columns and rows (N,) of the picture [px]."""
         rays = np.empty((len(across), 3), dtype=np.float32)
         _aim(across, down, 0.5 * width, 0.5 * height, scene.focal * height, scene.axes, rays)
-        return _cast_all(
-            rays, scene.eye, scene.room, scene.walls, scene.boxes, scene.lamp, scene.strength
-        ).light
+        return _cast_all(rays, scene.eye, scene.room, scene.walls, scene.boxes, scene.lamp, scene.strength)
 
     down, across = np.mgrid[:height, :width].reshape(2, -1).astype(np.float32) + np.float32(0.5)
-    picture = seen(across, down).reshape(height, width, 3)
+    met = seen(across, down)
+    picture = met.light.reshape(height, width, 3).copy()
     roots = cv2.sqrt(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY))
     edges = cv2.morphologyEx(roots, cv2.MORPH_GRADIENT, _CROSS).ravel() > _STEP
-    parts = [seen(across[edges] + x, down[edges] + y) for x, y in _QUARTERS]
+    parts = [seen(across[edges] + x, down[edges] + y).light for x, y in _QUARTERS]
     picture.reshape(-1, 3)[edges] = np.mean(parts, axis=0)
     grain = normal_numbers((height, width, 1), rng=np.random.default_rng([seed, 1]))
     picture *= np.float32(1.0) + np.float32(0.05) * grain
-    return np.asarray(cv2.GaussianBlur(picture, (0, 0), 0.9))  # because rays have no width, but pixels do
+    aside = ((across - 0.5 * width) ** 2 + (down - 0.5 * height) ** 2) / (scene.focal * height) ** 2
+    depth = met.distances / np.sqrt(aside + 1.0)
+    light = cv2.GaussianBlur(picture, (0, 0), 0.9)  # because rays have no width, but pixels do
+    shape = height, width
+    return RoomPicture(light, depth.reshape(shape), met.walls.reshape(shape), scene.focal, scene.axes)
 
 
 @kernel
@@ -201,9 +215,9 @@ def _cast(
     strength: float,
     picture: Floats,
     distances: Floats,
-    axes: NDArray[np.int8],
+    walls: NDArray[np.int8],
 ) -> None:
-    """Write the light (N, 3) along each ray, its distance (N,) [m], and the normal's axis (N,) there."""
+    """Write the light (N, 3) along each ray, its distance (N,) [m], and the wall (N,), see `RoomLight`."""
     position, color, inverse = np.empty(3), np.empty(3), np.empty(3)
     offsets = corners - eye
     cones = _cones(offsets)
@@ -216,7 +230,7 @@ def _cast(
             if way < distance:
                 distance, wall = way, 2 * axis + int(far)
         box, side, distance = _nearest_box(rays[ray], inverse, offsets, cones, distance)
-        distances[ray], axes[ray] = distance, side if box >= 0 else wall // 2
+        distances[ray], walls[ray] = distance, 2 * side + (rays[ray, side] > 0.0) if box >= 0 else wall
         light = 0.35
         for axis in range(3):
             position[axis] = eye[axis] + distance * rays[ray, axis]

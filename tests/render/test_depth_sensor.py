@@ -74,6 +74,25 @@ def test_normal_numbers_are_normal():
     assert abs(np.corrcoef(numbers[:-1], numbers[1:])[0, 1]) < 0.01
 
 
+@pytest.mark.parametrize(("name", "window"), list(zip(SENSORS, (9, 7, 3, 3), strict=True)))
+def test_noise_comes_in_blobs_as_wide_as_what_pixels_share(name, window):
+    """Correlation at 1, 3 and 10 pixels, and the stated deviation, before rounding and shifts."""
+    noise = dataclasses.replace(DEPTH_NOISES[name], step=0.0)
+    if isinstance(noise, StructuredLight):
+        noise = dataclasses.replace(noise, shift=0.0)
+    depth, _ = facing(1.0)
+    fields = [noisy(depth, None, noise, seed) - depth for seed in range(8)]
+    power = np.mean([(field**2).mean() for field in fields])
+    for apart in (1, 3, 10):
+        wanted = max(0.0, 1.0 - apart / window)
+        across = np.mean([(field[:, apart:] * field[:, :-apart]).mean() for field in fields])
+        down = np.mean([(field[apart:] * field[:-apart]).mean() for field in fields])
+        assert (across / power, down / power) == (pytest.approx(wanted, abs=0.04),) * 2
+    if isinstance(noise, StructuredLight):
+        disparities = 300.0 * noise.baseline / (depth + np.stack(fields))
+        assert disparities.std() == pytest.approx(noise.disparity_noise, rel=0.05)
+
+
 @pytest.mark.parametrize("name", SENSORS)
 def test_the_same_seed_gives_the_same_depth(name):
     depth, normals = slanted(1.0, 0.6)

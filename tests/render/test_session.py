@@ -14,8 +14,9 @@ from handsim import Camera, HandModel, HandSimError, join_qpos, look_at
 from handsim.cli.main import main
 from handsim.errors import ArgumentError
 from handsim.hand.model import hand_keypoints
+from handsim.motion_files.motion import OPENXR_JOINTS, joint_poses
 from handsim.space.camera import pinhole, preset
-from handsim.space.transforms import rigid, turned_poses
+from handsim.space.transforms import quaternion_matrix, rigid, turned_poses
 from poses import sample_poses
 from render import Backgrounds, DepthSensor, RenderConfig, ViewConfig, draw, render_take
 from render.scenery.backgrounds import photo_files
@@ -26,7 +27,7 @@ from render.subject import subject_of_take
 from render.user_body import UserBody
 from render.viewpoints import Placement, Viewpoints
 from tests.programs import run_python
-from tests.render.formats.reading import depth_of
+from tests.render.formats.reading import depth_of, exr_content
 from train import simulate_take
 
 K = np.array([[300.0, 0, 160], [0, 300, 120], [0, 0, 1]])
@@ -257,10 +258,74 @@ def check_markers(frame):
         assert np.linalg.norm(np.array([columns.mean(), rows.mean()]) + 0.5 - middle) < 8.0
 
 
-def test_one_camera_has_nothing_behind_the_hands(path):
-    for frame in drawn(path, dataclasses.replace(PLAIN, view=ViewConfig())):
+@pytest.mark.parametrize("kind", ["plain", "noise", "clutter", "room"])
+def test_one_camera_has_one_place_behind_the_hands(path, kind):
+    config = dataclasses.replace(PLAIN, view=ViewConfig(), background=kind)
+    first, second = drawn(path, config)
+    for frame in (first, second):
+        shown = frame.ideal.instances > 0
+        assert (frame.ideal.depth > 0.0).all() and "enclosure" not in frame.choices
+        np.testing.assert_allclose(np.linalg.norm(frame.ideal.normals, axis=-1), 1.0, atol=1e-5)
+        assert frame.ideal.depth[shown].max() < frame.ideal.depth[~shown].max()
+    bare = (first.ids == 0) & (second.ids == 0)
+    np.testing.assert_array_equal(first.depth[bare], second.depth[bare], err_msg="it stays where it is")
+    for frame in drawn(path, dataclasses.replace(config, room_depth=False)):
         np.testing.assert_array_equal(frame.ideal.instances > 0, frame.ideal.depth > 0.0)
-        assert "enclosure" not in frame.choices
+
+
+@pytest.mark.parametrize("views", [1, 2])
+def test_exr_files_have_the_light_that_ends_at_white_in_png_files(path, tmp_path, views):
+    view = ViewConfig(camera="sr300", views=views)
+    config = dataclasses.replace(PLAIN, view=view, every=24, dress="glove", painter="compiled", seed=1)
+    render_take(path, tmp_path, ("exr", "png"), config, workers=1)
+    highest = 0.0
+    for file in sorted((tmp_path / "exr").rglob("*.exr")):
+        _, channels = exr_content(file)
+        light = np.stack([channels[name] for name in "RGB"], axis=-1).astype(np.float64)
+        png = cv2.imread(str(next((tmp_path / "png" / "images").rglob(f"{file.stem}.png"))))[..., ::-1]
+        ended = np.minimum(light, 1.0)
+        levels = 255.0 * np.where(ended <= 0.0031308, 12.92 * ended, 1.055 * ended ** (1 / 2.4) - 0.055)
+        assert np.abs(np.rint(levels) - png).max() <= 1.0
+        assert (png[light > 1.01] == 255).all() and len(np.unique(light)) > 5000, "not of 256 levels"
+        highest = max(highest, light.max())
+    assert highest > 1.2, "markers shine"
+
+
+def test_annotations_have_openxr_joints_and_the_doubt_of_tracked_poses(tmp_path):
+    take = simulate_take(kind="hand-hand", num_frames=2, seed=1)
+    spreads = [np.random.default_rng(0).uniform(0.0, 0.1, (2, 2, count)) for count in (20, 21)]
+    config = dataclasses.replace(PLAIN, view=ViewConfig(), every=1, openxr=True)
+    tracked = dataclasses.replace(
+        take, rms=np.full((2, 2), 4e-4), angle_spread=spreads[0], keypoint_spread=spreads[1]
+    )
+    render_take(tracked, tmp_path / "tracked", "coco", config, workers=1)
+    content = json.loads((tmp_path / "tracked" / "annotations.json").read_text())
+    images = {image["id"]: image for image in content["images"]}
+    assert tuple(content["categories"][0]["openxr_joints"]) == OPENXR_JOINTS
+    same = [n for n, name in enumerate(OPENXR_JOINTS) if name != "PALM" and "METACARPAL" not in name[5:]]
+    same.insert(1, OPENXR_JOINTS.index("THUMB_METACARPAL"))
+    assert len(same) == 21 and len(content["annotations"]) == 4
+    for record in content["annotations"]:
+        image = images[record["image_id"]]
+        number = take.sides.index(record["side"])
+        T_world_camera = np.array(image["T_world_camera"])
+        world = joint_poses(take.hands[number].model, take.qpos[image["frame"], number][None])[0]
+        local, found = np.linalg.inv(T_world_camera) @ world, np.array(record["openxr_poses"])
+        np.testing.assert_allclose(found[:, :3], local[:, :3, 3], atol=1e-8)
+        turned = quaternion_matrix(np.roll(found[:, 3:], 1, axis=1))
+        np.testing.assert_allclose(turned, local[:, :3, :3], atol=1e-6)
+        joints, keypoints = (np.reshape(record[name], (-1, 3)) for name in ("openxr_keypoints", "keypoints"))
+        np.testing.assert_allclose(joints[same], keypoints, atol=1e-4)
+        uvw = found[:, :3] @ np.array(image["K"]).T
+        inside = joints[:, 2] > 0
+        np.testing.assert_allclose((uvw[:, :2] / uvw[:, 2:])[inside], joints[inside, :2], atol=1e-3)
+        doubt = record["tracking"]
+        assert doubt["status"] == "tracked" and doubt["rms"] == 4e-4
+        for name, spread in zip(("angle_spread", "keypoint_spread"), spreads, strict=True):
+            np.testing.assert_allclose(doubt[name], spread[image["frame"], number], rtol=1e-6)
+    render_take(take, tmp_path / "true", "coco", dataclasses.replace(config, openxr=False), workers=1)
+    for record in json.loads((tmp_path / "true" / "annotations.json").read_text())["annotations"]:
+        assert not {"tracking", "openxr_poses", "openxr_keypoints"} & set(record)
 
 
 def test_sensors_and_lenses(path):
@@ -335,7 +400,8 @@ def test_files_have_the_pictures_that_are_drawn_in_memory(path, tmp_path):
         written = cv2.imread(str(file))
         np.testing.assert_array_equal(written[..., ::-1], frame.rgb)
         (file,) = (tmp_path / "out").glob(f"depth/shard-*/{frame.key}.png")
-        np.testing.assert_allclose(depth_of(file.read_bytes()), frame.depth, atol=1e-4)
+        held = np.where(frame.depth < 6.5535, frame.depth, 0.0)
+        np.testing.assert_allclose(depth_of(file.read_bytes()), held, atol=1e-4)
 
 
 def test_pictures_that_lack_a_hand_are_told(path, tmp_path):

@@ -68,7 +68,10 @@ def test_colors_and_sensors():
     one = taken(1, config=config, crop=64, side="left")[0]
     assert one["rgb"].shape == one["noisy_rgb"].shape == one["normals"].shape == (3, 64, 64)
     assert one["rgb"].dtype == torch.uint8 and (one["rgb"] != one["noisy_rgb"]).any()
-    hand = one["depth"] > 0
+    assert (one["depth"] > 0).all(), "there is a wall or a room behind the hand"
+    bare = RenderConfig(passes=("rgb", "depth", "ids"), room_depth=False)
+    hand = taken(1, config=bare, crop=64, side="left")[0]["depth"] > 0
+    assert 0 < hand.sum() < hand.numel()
     assert (one["noisy_depth"][hand] > 0).float().mean() > 0.5, "hands are not too near for the sensor"
     assert one["side"] == 0
 

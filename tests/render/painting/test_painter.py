@@ -17,6 +17,7 @@ from handsim import Camera, HandModel, Lens, join_qpos, look_at
 from handsim.hand.shape import SIDES, Side
 from handsim.space.camera import pinhole
 from poses.shapes import gesture
+from render.color_sensor import light_of
 from render.painting.figures import Drawn, HandFigure, Material, sample_people
 from render.painting.painter import Painter, paint, put_before
 from render.painting.rasterizer import rasterize
@@ -51,6 +52,17 @@ def test_a_wall_that_faces_the_lamp_sends_back_its_color_and_a_glint() -> None:
     assert np.abs(shown[:3] - 255.0 * light ** (1 / 2.2)).max() <= 1.5
     behind = paint(CAMERA, [wall], Lighting((Lamp((0.0, 0.0, 1.0), 1.0),), DARK))[36, 48]
     assert behind.tolist() == [0, 0, 0, 255]
+
+
+def test_bright_pictures_do_not_end_at_white() -> None:
+    wall = thing(trimesh.creation.box((8.0, 8.0, 0.1)).apply_translation([0, 0, 2.0]), plain(), smooth=False)
+    for strength in (1.0, 4.0, 8.0):
+        lighting = Lighting((Lamp((0.0, 0.0, -1.0), strength),), DARK)
+        whole, bright = paint(CAMERA, [wall], lighting), paint(CAMERA, [wall], lighting, "bright")
+        assert np.abs(np.minimum(bright, 255.0) - whole).max() <= 0.75
+        wanted = strength * (0.5 * 0.96 * 0.96 + 0.04 / 4)
+        if wanted > 1.0:
+            assert light_of(bright[36, 48, :3]) == pytest.approx([wanted] * 3, rel=5e-3)
 
 
 def test_edges_cover_pixels_in_part_as_much_as_the_surface_does() -> None:

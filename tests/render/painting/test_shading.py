@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 import trimesh
@@ -10,7 +12,16 @@ from scipy.ndimage import binary_dilation
 from handsim.space.camera import pinhole
 from render.painting import shading
 from render.painting.figures import Drawn
-from render.painting.shading import BUMP, COLOR, ROUGH, SPOT, TO_DISPLAY, TO_LINEAR, light_behind
+from render.painting.shading import (
+    BUMP,
+    COLOR,
+    ROUGH,
+    SPOT,
+    TO_DISPLAY,
+    TO_LINEAR,
+    level_behind,
+    light_behind,
+)
 from render.scenery.backgrounds import SHARE, Backdrop, sample_backdrop
 from render.scenery.lights import Lamp, Lighting
 from tests.render.scenes import plain, thing
@@ -122,8 +133,18 @@ def test_without_hands_or_lamps_there_is_none() -> None:
 
 def test_backdrops_come_as_often_as_they_should(rng: np.random.Generator) -> None:
     drawn = [sample_backdrop(rng=rng) for _ in range(500)]
-    assert sum(one is not None for one in drawn) / 500 == pytest.approx(SHARE, abs=0.08)
-    assert all(0.0 < one.gap < 0.5 for one in drawn if one is not None)
+    assert np.mean([one.shadows for one in drawn]) == pytest.approx(SHARE, abs=0.08)
+    assert all(0.0 < one.gap < (0.5 if one.shadows else 5.0) for one in drawn)
+
+
+def test_a_backdrop_is_behind_what_is_in_the_picture() -> None:
+    _, drawn = ball()
+    _, beside = ball((9.0, 0.0, 1.0))
+    wall = Backdrop(0.1, (0.3, -0.2))
+    nearest = float((CAMERA.local(drawn.triangles.vertices) @ wall.normal).min())
+    assert level_behind(wall, CAMERA, [drawn, beside]) == pytest.approx(nearest - 0.1)
+    assert level_behind(dataclasses.replace(wall, level=-2.0), CAMERA, [drawn]) == -2.0
+    assert level_behind(wall, CAMERA, [beside]) == level_behind(wall, CAMERA, []) == -1.1
 
 
 def test_shadows_are_the_mean_over_the_texels_around_a_point(rng: np.random.Generator) -> None:

@@ -14,13 +14,16 @@ from render import Backgrounds, RenderConfig, RenderedFrame, ViewConfig, draw
 from render.frames import Geometry
 from render.scenery.backgrounds import (
     KINDS,
+    Backdrop,
     Background,
     Enclosure,
     draw_background,
     draw_surroundings,
     enclose,
+    kept_background,
     photos_beside,
     sample_background,
+    surroundings_of_picture,
 )
 from render.scenery.rooms import draw_room
 from train import simulate_take
@@ -136,7 +139,7 @@ def test_impossible_configs_are_told() -> None:
 def test_edges_of_rooms_are_smooth() -> None:
     """Nearly as the mean over sixteen rays has them."""
     for seed in (1, 2):
-        coarse, fine = (draw_room((80 * k, 60 * k), seed) for k in (1, 4))
+        coarse, fine = (draw_room((80 * k, 60 * k), seed).light for k in (1, 4))
         mean = fine.reshape(60, 4, 80, 4, 3).mean(axis=(1, 3))
         off = np.abs(cv2.GaussianBlur(mean, (0, 0), 0.9) - coarse)
         assert np.quantile(off, 0.99) < 0.06
@@ -203,11 +206,45 @@ def test_an_empty_box_is_where_it_says() -> None:
     height, width = seen.depth.shape
     empty = np.zeros((height, width), dtype=np.uint8)
     bare = np.zeros((height, width, 3), dtype=np.float32)
-    filled = seen.put_behind(Geometry(empty.astype(np.float32), bare, empty, empty, empty), camera)
+    filled = Geometry(empty.astype(np.float32), bare, empty, empty, empty)
+    seen.put_behind(filled)
     assert filled.normals is not None and filled.depth is not None
     np.testing.assert_array_equal(filled.depth, seen.depth)
     np.testing.assert_allclose(np.linalg.norm(filled.normals, axis=-1), 1.0, atol=1e-6)
     assert ((filled.normals * rays).sum(axis=-1) < 0.0).all(), "surfaces face the camera"
+
+
+def test_a_wall_is_the_plane_that_catches_shadows() -> None:
+    camera, wall = preset("d435"), Backdrop(0.1, (0.3, -0.2))
+    one = dataclasses.replace(background("noise"), backdrop=wall)
+    seen = surroundings_of_picture(one, camera, -0.7)
+    rays = camera.rays()
+    points = rays / rays[..., 2:] * seen.depth[..., None]
+    assert (seen.depth > 0.3).all() and seen.rgb.size == 0
+    np.testing.assert_allclose(points @ wall.normal, -0.7, atol=1e-5)
+    np.testing.assert_allclose(seen.facing[seen.walls], np.broadcast_to(wall.normal, points.shape), atol=1e-6)
+
+
+@pytest.mark.parametrize("size", [(640, 480), (321, 243)])
+def test_a_room_of_one_camera_is_made_of_planes(size: tuple[int, int]) -> None:
+    """Also for a camera of another angle of view, off its axis: the normals are those of the depth."""
+    K = np.array([[700.0, 0.0, 0.3 * size[0]], [0.0, 700.0, 0.6 * size[1]], [0.0, 0.0, 1.0]])
+    camera = Camera("own", size, K)
+    rays = camera.rays() / camera.rays()[..., 2:]
+    for seed in range(5):
+        seen = surroundings_of_picture(background("room", seed), camera, -1.6)
+        assert seen.depth.min() == pytest.approx(1.6, rel=0.03) or seen.depth.min() > 1.6
+        points, normals = rays * seen.depth[..., None], seen.facing[seen.walls]
+        assert ((normals * rays).sum(axis=-1) < 0.0).mean() > 0.995, "surfaces face the camera"
+        across, down = points[1:-1, 2:] - points[1:-1, :-2], points[2:, 1:-1] - points[:-2, 1:-1]
+        found = np.cross(down, across)
+        found /= np.linalg.norm(found, axis=-1, keepdims=True)
+        cosines = (found * normals[1:-1, 1:-1]).sum(axis=-1)
+        assert (cosines > 0.999).mean() > 0.9, "but for edges"
+        light = kept_background(background("room", seed), size)
+        assert light.shape[0] == size[1] // 2
+        edges = np.abs(np.diff(np.log(seen.depth), axis=1)) > 0.2
+        assert edges.mean() < 0.02
 
 
 def test_furniture_keeps_away_from_hands_and_cameras() -> None:
