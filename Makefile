@@ -15,7 +15,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-slow lint format fuzz fuzz-coverage tables results chaos truth docs clean drawing
+.PHONY: help demo test test-slow lint format fuzz fuzz-coverage tables results truth docs clean drawing
 
 help:  ## list the targets (this)
 	@echo "usage: make TARGET [PYTHON=python3.12]"
@@ -57,9 +57,6 @@ tables: $(DEVELOPER)  ## print the paper's tables beside ours, half an hour; ONL
 
 results: $(DEVELOPER)  ## write docs/results.md from the figures in benchmarks/figures
 	$(BIN)/python -m benchmarks.results
-
-chaos: $(DEVELOPER)  ## kill every long command at random moments and run it again; KILLS=20
-	$(BIN)/python -m benchmarks.chaos --kills $(or $(KILLS),20)
 
 truth: $(DEVELOPER)  ## the tracker on real hands in motion: DATA=path of Mocap_SIG18_Data
 	@test -d "$(DATA)" || { echo "make truth needs DATA, the path of a folder of Mocap_SIG18_Data"; exit 1; }
