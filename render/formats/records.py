@@ -79,13 +79,9 @@ def keypoint_flags(hand: HandTruth, size: tuple[int, int]) -> Integers:
 def hand_mask(frame: RenderedFrame, hand: int) -> Flags | None:
     """Mask (H, W) of one hand with its markers, without its forearm; None without an id picture."""
     parts, instances = frame.ideal.parts, frame.ideal.instances
-    first = 1 + PARTS_A_HAND * hand
-    if instances is not None:
-        mask: Flags = instances == hand + 1
-        return mask if parts is None else mask & (parts != first + FOREARM)
-    if parts is not None:
-        return (parts >= first) & (parts < first + FOREARM)
-    return None
+    if parts is None or instances is None:
+        return None
+    return (instances == 1 + hand) & (parts != 1 + PARTS_A_HAND * hand + FOREARM)
 
 
 def run_lengths(mask: Flags) -> str:
@@ -225,11 +221,9 @@ def _depth_steps(depth: Floats) -> Any:
 
 def encode_ids(pictures: Pictures) -> bytes | None:
     """Parts, instances and markers as red, green and blue of one PNG; None for pictures without ids."""
-    layers = (pictures.parts, pictures.instances, pictures.markers)
-    known = [layer for layer in layers if layer is not None]
-    if not known:
+    if pictures.parts is None or pictures.instances is None or pictures.markers is None:
         return None
-    return encode_png(cv2.merge([np.zeros_like(known[0]) if layer is None else layer for layer in layers]))
+    return encode_png(cv2.merge([pictures.parts, pictures.instances, pictures.markers]))
 
 
 def encode_normals(normals: Float32[np.ndarray, "H W 3"]) -> bytes:
