@@ -116,7 +116,7 @@ def _box(parts: Bytes, number: int) -> Doubles:
     return np.array([left, top, width, height], np.float64) if width else np.full(4, np.nan)
 
 
-_WINDOW: Final = 8  # pixels around a surface that change what a depth sensor measures on it, at most
+_WINDOW: Final = 8  # border around surfaces whose pixels change what a depth sensor measures [px]
 
 
 @dataclass(frozen=True, slots=True)
@@ -274,7 +274,7 @@ class Studio:
         )
 
     def reaching(self, moment: Moment, cameras: Sequence[Camera], user: UserBody | None = None) -> Moment:
-        """The moment with the user's arms, or others, that leave the pictures of these cameras."""
+        """The moment with upper arms, the user's or others, that leave the pictures of these cameras."""
         found = np.full((len(self._hands), 3), np.nan)
         poses = {number: moment.hand(number) for number in range(len(self._hands))}
         there = {number: pose for number, pose in poses.items() if pose is not None}

@@ -87,8 +87,8 @@ def hand_mask(frame: RenderedFrame, hand: int) -> Flags | None:
 def run_lengths(mask: Flags) -> str:
     """COCO's compressed run lengths of a mask (H, W): zeros and ones in turn, column by column.
 
-    A run is its difference from the last but one, in pieces of five bits, the lowest first; a sixth bit says
-    that more follow, and 48 makes a letter of it.
+    A length is stored as its difference from the length two runs before, in groups of five bits, the lowest
+    first. A sixth bit says that more groups follow, and 48 is added to make each group a letter.
     """
     flat = cv2.transpose(mask.view(np.uint8)).ravel()
     changes = np.flatnonzero(flat[1:] != flat[:-1]) + 1
@@ -141,7 +141,7 @@ def body_records(frame: RenderedFrame) -> list[dict[str, Any]]:
 
 
 def rounded(values: NDArray[np.floating], decimals: int) -> Any:
-    """Numbers as nested lists, short enough to be read."""
+    """Numbers as nested lists, rounded to some decimals."""
     return np.round(np.asarray(values, dtype=np.float64), decimals).tolist()
 
 
@@ -227,7 +227,7 @@ def encode_ids(pictures: Pictures) -> bytes | None:
 
 
 def encode_normals(normals: Float32[np.ndarray, "H W 3"]) -> bytes:
-    """Unit normals as 8-bit PNG: x, y, z are (red, green, blue - 128) / 127; black is nothing."""
+    """Unit normals as 8-bit PNG: x, y, z are (red, green, blue - 128) / 127; black without a surface."""
     return encode_png(_normal_levels(np.ascontiguousarray(normals)))
 
 
