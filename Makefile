@@ -15,7 +15,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-slow lint format fuzz fuzz-coverage tables results truth docs clean drawing
+.PHONY: help demo test test-slow lint format fuzz fuzz-coverage tables results chaos truth docs clean drawing
 
 help:  ## list the targets (this)
 	@echo "usage: make TARGET [PYTHON=python3.12]"
@@ -47,6 +47,9 @@ fuzz: $(DEVELOPER)  ## damaged files for every reader: CASES=20000 of each, TARG
 fuzz-coverage: $(DEVELOPER)  ## the same by coverage: MOST=600 seconds of each, TARGET=c3d for one; installs atheris
 	$(BIN)/pip install --quiet --constraint constraints.txt atheris
 	$(BIN)/python -m tests.fuzzing.coverage --seconds $(or $(MOST),600) $(if $(TARGET),--target $(TARGET))
+
+chaos: $(DEVELOPER)  ## kill every long command at random moments and run it again; KILLS=20
+	$(BIN)/python -m tests.chaos --kills $(or $(KILLS),20)
 
 docs: $(DEVELOPER)  ## the guide, the commands and the API reference, into build/docs
 	$(BIN)/sphinx-build -W --keep-going -q -j 2 docs build/docs

@@ -1,0 +1,219 @@
+"""Kill every long command at random moments, run it again, and compare.
+
+    python -m tests.chaos [generate train ...] [--kills 20 --seed 0]
+
+Each command runs once undisturbed. Then it is killed by SIGTERM, SIGKILL and SIGINT in turn, at a random
+moment, and run again to its end. The table counts what must be zero: reruns whose files differ, processes
+that outlive the command, temporary files after the rerun, and files that stay in /dev/shm. Ctrl-C goes to
+the whole group of processes, as from a terminal; the other signals go to the command alone. The last column
+is the longest time from SIGTERM or SIGINT to the end. Exit code 1 when a count is not zero.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, get_args
+
+import tyro
+
+SIGNALS = (signal.SIGTERM, signal.SIGKILL, signal.SIGINT)
+ROOT = Path(__file__).resolve().parents[1]
+PATIENCE = 2.0  # seconds in which processes and files of a killed command must be gone
+ALONE = ("--scenes.together", "0", "--scenes.holding", "0")
+NETWORK = ("--network.width", "8", "--network.gates", "2", "--network.depth", "1", "--batch", "32")
+
+
+@dataclass(frozen=True)
+class Case:
+    """A command; WORK stands for the folder with its inputs, OUT for what it writes."""
+
+    args: tuple[str, ...]
+    files: str = "**/*"
+    """Those of its files that depend on nothing but the settings."""
+
+
+CASES = {
+    "generate": Case(
+        ("generate", "--num-frames", "900", *ALONE, "--workers", "2", "--out", "OUT"), "*.[nj]*"
+    ),
+    "train": Case(
+        ("train", "WORK/set", "--out", "OUT", "--samples", "20000", *NETWORK, "--threads", "1"),
+        "*.safetensors",
+    ),
+    "render": Case(
+        (
+            *("render", "WORK/take.truth.npz", "--every", "4", "--frames-per-shard", "4", "--camera", "vga"),
+            *("--workers", "2", "--out", "OUT"),
+        )
+    ),
+    "simulate": Case(("simulate", "--num-frames", "240", "--out", "OUT/take.c3d")),
+    "track": Case(("track", "WORK/take.c3d", "--out", "OUT/tracked.npz")),
+    "calibrate": Case(("calibrate", "WORK/long.c3d", "--hands", "right", "--out", "OUT/user.json")),
+    "label": Case(("label", "WORK/take.c3d", "--out", "OUT/labeled.c3d")),
+    "cnn": Case(
+        (
+            *("train", "WORK/set", "--out", "OUT", "--labeler", "cnn", "--samples", "640", "--batch", "32"),
+            *("--threads", "1"),
+        ),
+        "*.safetensors",
+    ),
+    "improve": Case(("glove", "improve", "sparse13", "--minutes", "0", "--out", "OUT/better.toml")),
+    "plan": Case(("rig", "plan", "--cameras", "3", "--room", "3", "3", "2.5", "--out", "OUT/rig.toml")),
+}
+
+
+Command = Literal[
+    "generate", "train", "render", "simulate", "track", "calibrate", "label", "cnn", "improve", "plan"
+]
+ALL: tuple[Command, ...] = get_args(Command)
+
+
+@dataclass
+class Counts:
+    """What must be zero for a command, and how fast it ended."""
+
+    kills: int = 0
+    differing: int = 0
+    orphans: int = 0
+    temporary: int = 0
+    segments: int = 0
+    slowest: float = 0.0
+
+    def failed(self) -> bool:
+        """Whether a count is not zero."""
+        return bool(self.differing or self.orphans or self.temporary or self.segments)
+
+
+def main(commands: tyro.conf.Positional[tuple[Command, ...]] = ALL, kills: int = 20, seed: int = 0) -> None:
+    print(
+        f"{'command':12s}{'kills':>7s}{'differ':>8s}{'orphans':>9s}{'temporary':>11s}{'shm':>5s}{'slowest':>9s}"
+    )
+    failed = False
+    with tempfile.TemporaryDirectory(prefix="chaos-") as folder:
+        work = Path(folder)
+        prepare(work)
+        for name in commands:
+            counts = torment(name, work, kills, random.Random(f"{seed} {name}"))
+            failed |= counts.failed()
+            print(
+                f"{name:12s}{counts.kills:7d}{counts.differing:8d}{counts.orphans:9d}{counts.temporary:11d}"
+                f"{counts.segments:5d}{counts.slowest:7.1f} s",
+                flush=True,
+            )
+    raise SystemExit(int(failed))
+
+
+def prepare(work: Path) -> None:
+    """Make what the commands read."""
+    finish(("generate", "--num-frames", "900", *ALONE, "--out", f"{work}/set"))
+    finish(("simulate", "--num-frames", "120", "--out", f"{work}/take.c3d"))
+    finish(("simulate", "--kind", "hand-hand", "--num-frames", "900", "--out", f"{work}/long.c3d"))
+
+
+def torment(name: str, work: Path, kills: int, rng: random.Random) -> Counts:
+    """Run a command undisturbed, then kill it and run it again many times."""
+    case, counts = CASES[name], Counts()
+    whole, out = work / f"{name}-whole", work / f"{name}-out"
+    start = time.monotonic()
+    finish(arguments(case, work, whole))
+    length = time.monotonic() - start
+    expected = contents(whole, case.files)
+    for number in range(kills):
+        shutil.rmtree(out, ignore_errors=True)
+        shared = set(os.listdir("/dev/shm"))
+        args = arguments(case, work, out)
+        counts.slowest = max(
+            counts.slowest, kill(args, rng.uniform(0.0, length), SIGNALS[number % 3], counts)
+        )
+        counts.segments += len(set(os.listdir("/dev/shm")) - shared)
+        finish(args)
+        counts.kills += 1
+        counts.differing += contents(out, case.files) != expected
+        counts.temporary += len(list(out.glob("**/.*tmp*")))
+    return counts
+
+
+def kill(args: tuple[str, ...], after: float, number: signal.Signals, counts: Counts) -> float:
+    """Kill a command after some seconds; count what outlives it, and return how long it took to end."""
+    process = subprocess.Popen(program(args), start_new_session=True, stderr=subprocess.DEVNULL, **QUIET)
+    try:
+        process.wait(after)
+    except subprocess.TimeoutExpired:
+        if number == signal.SIGINT:
+            os.killpg(process.pid, number)
+        else:
+            process.send_signal(number)
+    start = time.monotonic()
+    process.wait()
+    took = time.monotonic() - start
+    while (left := members(process.pid)) and time.monotonic() < start + took + PATIENCE:
+        time.sleep(0.02)
+    counts.orphans += len(left)
+    for orphan in left:
+        os.kill(orphan, signal.SIGKILL)
+    return 0.0 if number == signal.SIGKILL else took
+
+
+def members(session: int) -> list[int]:
+    """Living processes of a session."""
+    found = []
+    for entry in Path("/proc").iterdir():
+        try:
+            state, _, _, of = (entry / "stat").read_text().rpartition(")")[2].split()[:4]
+        except (OSError, ValueError):
+            continue
+        if entry.name.isdecimal() and int(of) == session and state not in "ZX":
+            found.append(int(entry.name))
+    return found
+
+
+QUIET = {"stdout": subprocess.DEVNULL, "stdin": subprocess.DEVNULL, "cwd": ROOT}
+
+
+def finish(args: tuple[str, ...]) -> None:
+    """Run a command to its end."""
+    result = subprocess.run(program(args), stderr=subprocess.PIPE, text=True, check=False, **QUIET)
+    if result.returncode:
+        raise SystemExit(f"{' '.join(args)} ended with {result.returncode}: {result.stderr}")
+
+
+def program(args: tuple[str, ...]) -> list[str]:
+    """The command with small shards, so that there are several."""
+    return [sys.executable, "-m", "tests.chaos", "--run", *args]
+
+
+def arguments(case: Case, work: Path, out: Path) -> tuple[str, ...]:
+    out.parent.mkdir(exist_ok=True)
+    return tuple(word.replace("WORK", str(work)).replace("OUT", str(out)) for word in case.args)
+
+
+def contents(folder: Path, files: str) -> dict[str, str]:
+    """SHA-256 of the files below a folder."""
+    return {
+        str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(folder.glob(files))
+        if path.is_file()
+    }
+
+
+if sys.argv[1:2] == ["--run"]:  # also in worker processes, which read this file first
+    from train.simulation import generation
+
+    generation.ROWS_PER_SHARD = 150
+
+if __name__ == "__main__":
+    if sys.argv[1:2] == ["--run"]:
+        from handsim.cli.main import main as handsim_main
+
+        sys.exit(handsim_main(sys.argv[2:]))
+    tyro.cli(main, description=__doc__, config=(tyro.conf.PositionalRequiredArgs,))
