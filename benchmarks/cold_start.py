@@ -16,7 +16,7 @@ import tempfile
 from pathlib import Path
 from typing import Any, Final
 
-from benchmarks.record import describe
+from benchmarks.record import describe, run
 from handsim.app.compiling import LIST
 
 # In the order of the recording; a later command may read what an earlier one wrote.
@@ -110,4 +110,4 @@ def main(folder: Path) -> None:
 
 if __name__ == "__main__":
     with tempfile.TemporaryDirectory() as temporary:
-        main(Path(temporary))
+        run(lambda: main(Path(temporary)), __doc__)

@@ -81,7 +81,8 @@ def hand_mask(frame: RenderedFrame, hand: int) -> Flags | None:
     parts, instances = frame.ideal.parts, frame.ideal.instances
     if parts is None or instances is None:
         return None
-    return (instances == 1 + hand) & (parts != 1 + PARTS_A_HAND * hand + FOREARM)
+    mask: Flags = (instances == 1 + hand) & (parts != 1 + PARTS_A_HAND * hand + FOREARM)
+    return mask
 
 
 def run_lengths(mask: Flags) -> str:
