@@ -48,6 +48,9 @@ fuzz-coverage: $(DEVELOPER)  ## the same by coverage: MOST=600 seconds of each, 
 	$(BIN)/pip install --quiet --constraint constraints.txt atheris
 	$(BIN)/python -m tests.fuzzing.coverage --seconds $(or $(MOST),600) $(if $(TARGET),--target $(TARGET))
 
+chaos: $(DEVELOPER)  ## kill every long command at random moments and run it again; KILLS=20
+	$(BIN)/python -m tests.chaos --kills $(or $(KILLS),20)
+
 docs: $(DEVELOPER)  ## the guide, the commands and the API reference, into build/docs
 	$(BIN)/sphinx-build -W --keep-going -q -j 2 docs build/docs
 
@@ -57,9 +60,6 @@ tables: $(DEVELOPER)  ## print the paper's tables beside ours, half an hour; ONL
 
 results: $(DEVELOPER)  ## write docs/results.md from the figures in benchmarks/figures
 	$(BIN)/python -m benchmarks.results
-
-chaos: $(DEVELOPER)  ## kill every long command at random moments and run it again; KILLS=20
-	$(BIN)/python -m benchmarks.chaos --kills $(or $(KILLS),20)
 
 truth: $(DEVELOPER)  ## the tracker on real hands in motion: DATA=path of Mocap_SIG18_Data
 	@test -d "$(DATA)" || { echo "make truth needs DATA, the path of a folder of Mocap_SIG18_Data"; exit 1; }

@@ -3,18 +3,17 @@
 python -m benchmarks.any_layout_training FOLDER [--steps N]
 
 A layout is a choice among many places on the skin, whose positions in many poses of many people are sampled
-once. The run writes `any_layout.safetensors` and its card `any_layout.json` into the folder, and continues
-from the checkpoint there. The figures of the shipped weights are in train/weights/README.md.
+once. The run writes `any_layout.safetensors` and its card `any_layout.json` into the folder. The figures of
+the shipped weights are in train/weights/README.md.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import io
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import torch
@@ -102,7 +101,7 @@ _HIDDEN_RADIUS: Final = 0.05  # largest radius in which they are lost [m]
 _MIN_SEEN: Final = 4  # markers of a cloud that are never lost so
 _CONFIG: Final = LayoutNetworkConfig()
 _FEATURE_POSES: Final = 3000
-_SAVED_EVERY, _TOLD_EVERY = 500, 100  # steps
+_TOLD_EVERY: Final = 100  # steps
 
 
 class LayoutBatches:
@@ -182,22 +181,6 @@ class LayoutTraining:
         right = (scores.argmax(-1) == torch.from_numpy(cloud.truth))[markers].float().mean()
         return loss, float(right)
 
-    def save(self, path: Path) -> None:
-        """Write a checkpoint."""
-        buffer = io.BytesIO()
-        states = {"network": self.network.state_dict(), "optimizer": self.optimizer.state_dict()}
-        torch.save(states | {"done": self.done}, buffer)
-        with atomic_write(path) as temporary:
-            temporary.write_bytes(buffer.getbuffer())
-
-    def restore(self, path: Path) -> None:
-        """Go on from a checkpoint, if there is one."""
-        if path.is_file():
-            content: dict[str, Any] = torch.load(path, weights_only=True)
-            self.network.load_state_dict(content["network"])
-            self.optimizer.load_state_dict(content["optimizer"])
-            self.done = int(content["done"])
-
 
 def save_layout_network(folder: Path, network: LayoutNetwork, num_clouds: int) -> None:
     """Write the network in half precision, and its card."""
@@ -220,10 +203,9 @@ def save_layout_network(folder: Path, network: LayoutNetwork, num_clouds: int) -
 def main(out: Path, steps: int = 9000) -> None:
     """Train until the last step, and write the network into a folder."""
     out.mkdir(parents=True, exist_ok=True)
-    training, checkpoint = LayoutTraining(steps), out / "checkpoint.pt"
-    training.restore(checkpoint)
+    training = LayoutTraining(steps)
     bank = sample_skin_bank(PLACES, PEOPLE, rng=np.random.default_rng(11))
-    batches = LayoutBatches(bank, np.random.default_rng([11, training.done]))
+    batches = LayoutBatches(bank, np.random.default_rng([11, 0]))
     figures, began = [], time.monotonic()
     with torch_threads(1):
         while training.done < steps:
@@ -233,8 +215,6 @@ def main(out: Path, steps: int = 9000) -> None:
                 print(f"{training.done}: loss {loss:.3f}, {100.0 * right:.2f} % right, "
                       f"{time.monotonic() - began:.0f} s", flush=True)  # fmt: skip
                 figures = []
-            if training.done % _SAVED_EVERY == 0 or training.done == steps:
-                training.save(checkpoint)
     save_layout_network(out, training.network, steps * _LAYOUTS * _CLOUDS)
 
 

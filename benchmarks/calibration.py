@@ -1,16 +1,13 @@
 """How near a calibration comes to the truth, on simulated users.
 
     python -m benchmarks.calibration [--users 6 --seed 0 --layout dense19 --free 40 --rounds 3]
-        [--picture FILE.png] [--captures FOLDER]
+        [--captures FOLDER]
 
 Each user is one hand, right and left in turn: a size's mean hand made 8 % larger or smaller, with the
 individual spreads of `handsim.hand.shape.sample_shape`, in a glove whose markers sit 5 mm from where they
-belong,
-along the skin, and 0.3 mm above or below it. It makes a capture of touches and free motion before the 16
-cameras of "figure5"; labels are the truth's. The calibration begins with the size's mean hand and the glove
-as designed. Another capture of the same user holds the touches that the gaps are told for: of all frames in
-which the true flesh of thumb and finger meets, how far the flesh of the tracked hand is from touching, apart
-or dug in, and how far the distance of its skins is from that of the true hand's.
+belong, along the skin, and 0.3 mm above or below it. It makes a capture of touches and free motion before
+the 16 cameras of "figure5"; labels are the truth's. The calibration begins with the size's mean hand and the
+glove as designed.
 
 The same capture is calibrated twice more: with 1 % of labels wrong, neighbors having exchanged names for
 a while; and with flesh that moves every marker by 0.5 mm RMS as its digit bends.
@@ -27,17 +24,15 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.calibration_picture import save_picture
 from benchmarks.paper.hand_errors import hand_errors
 from benchmarks.people import displace_markers, right_hands
 from benchmarks.record import Figures, describe, run, save_figures
-from gloves import GloveFit, MarkerLayout, Take, load_layout
+from gloves import GloveFit, MarkerLayout, load_layout
 from gloves.fit import attach_markers, nominal_fit
-from handsim import HandModel, HandShape, join_qpos, sample_shape
+from handsim import HandModel, HandShape, sample_shape
 from handsim.hand.shape import BONES, SIDES, SIZES, shape_from_measures
 from handsim.space.transforms import quaternion_matrix
-from poses.touch import FINGERS, is_touching, thumb_contact
-from track.calibration.user_calibration import calibrate_hand, contact_gaps
+from track.calibration.user_calibration import calibrate_hand
 from track.kinematics.pose_solver import PoseSolver
 from train.simulation.scenes import CalibrationTakeConfig
 from train.simulation.takes import simulate_calibration
@@ -99,54 +94,24 @@ def move_flesh(markers: np.ndarray, qpos: np.ndarray, true: GloveFit, rng: np.ra
     return moved
 
 
-def held_out_gaps(hand: GloveFit, true: GloveFit, take: Take) -> np.ndarray:
-    """Means over each finger's touches (4, 2) [m]: flesh from touching, skins from the true ones."""
-    markers, qpos = take.observed(true.side), take.qpos[:, 0]
-    gaps = np.full((len(FINGERS), 2), np.nan)
-    for number, finger in enumerate(FINGERS):
-        touching = is_touching(true.model, qpos[:, 7:], finger)
-        enough = np.isfinite(markers[..., 0]).sum(axis=1) >= markers.shape[1] - 3
-        frames = np.flatnonzero(touching & enough)[::EVERY]
-        if len(frames):
-            tracked = PoseSolver(hand).solve(markers[frames]).qpos
-            flesh = thumb_contact(hand.model, tracked[:, 7:], finger).overlap
-            off = skin_gaps(hand.model, tracked, finger) - skin_gaps(true.model, qpos[frames], finger)
-            gaps[number] = np.abs(flesh).mean(), np.abs(off).mean()
-    return gaps
-
-
-def skin_gaps(model: HandModel, qpos: np.ndarray, finger: str) -> np.ndarray:
-    """Distance [m] of the skins of thumb and finger; angles alone decide, so right hands will do."""
-    model = HandModel(model.shape.with_side("right"))
-    return contact_gaps(model, [(frame, finger) for frame in range(len(qpos))], join_qpos(qpos[:, 7:]))
-
-
-def tell(name: str, hand: GloveFit, true: GloveFit, held_out: Take) -> list[float]:
+def tell(name: str, hand: GloveFit, true: GloveFit) -> list[float]:
     """Print how far a hand is from the truth; returns what is averaged over users."""
-    errors, gaps = hand_errors(hand, true), 1e3 * held_out_gaps(hand, true, held_out)
+    errors = hand_errors(hand, true)
     off, lengths = 1e3 * errors.positions, 100.0 * np.abs(errors.lengths)
     tips = 100.0 * np.abs(errors.tips)
-    flesh = " ".join(f"{gap:.2f}" for gap in gaps[:, 0])
     print(f"  {name}: places {off.mean():.2f} mm (worst {off.max():.2f}; palm's in the wrist's frame: "
           f"{1e3 * errors.wrist_positions.mean():.2f}), bones {lengths.mean():.2f} % "
-          f"(worst {lengths.max():.1f}), tips {tips.mean():.1f} %, touches off by {flesh} mm, "
-          f"skins by {np.nanmean(gaps[:, 1]):.2f}")  # fmt: skip
+          f"(worst {lengths.max():.1f}), tips {tips.mean():.1f} %")  # fmt: skip
     return [off.mean(), off.max(), 1e3 * errors.wrist_positions.mean(), lengths.mean(), lengths.max(),
-            tips.mean(), *np.nanmean(gaps, axis=0), np.nanmax(gaps[:, 0])]  # fmt: skip
+            tips.mean()]  # fmt: skip
 
 
 def run_user(
-    rng: np.random.Generator,
-    number: int,
-    layout: MarkerLayout,
-    made: CalibrationTakeConfig,
-    picture: Path | None,
+    rng: np.random.Generator, number: int, layout: MarkerLayout, made: CalibrationTakeConfig
 ) -> dict[str, list[float]]:
     """Simulate a user, calibrate in every way, print; what is averaged over users, by the way."""
     true, start = draw_user(number, layout, rng)
-    worn = (true,)
-    take = simulate_calibration(worn, made, rng=rng)
-    held_out = simulate_calibration(worn, CalibrationTakeConfig(free=3.0, rounds=4), rng=rng)
+    take = simulate_calibration((true,), made, rng=rng)
     markers = take.observed(true.side)
     ways = {
         "after": (markers, start),
@@ -154,19 +119,17 @@ def run_user(
         "flesh": (move_flesh(markers, take.qpos[:, 0], true, rng), start),
     }
     print(f"user {number}, {true.side}: {take.num_frames} frames")
-    rows = {"before": tell("before", start, true, held_out)}
+    rows = {"before": tell("before", start, true)}
     for name, (seen, begin) in ways.items():
         began = time.perf_counter()
         result = calibrate_hand(seen, begin, take.rate)
         took = time.perf_counter() - began
         within = (1e3 * hand_errors(result.hand, true).wrist_positions < 2e3 * result.position_errors).mean()
-        rows[name] = tell(name, result.hand, true, held_out)
+        rows[name] = tell(name, result.hand, true)
         print(f"    {took:.1f} s, markers off by {1e3 * result.rms_before:.2f} mm, then "
               f"{1e3 * result.rms_after:.2f}; {len(result.touches)} touches found; {within:.0%} of places "
               f"within two standard errors; {' / '.join(result.suggestions()) or 'no advice'}",
               flush=True)  # fmt: skip
-        if picture and number == 0 and name == "after":
-            save_picture(picture, result)
     return rows
 
 
@@ -192,28 +155,23 @@ def main(
     layout: str = "dense19",
     free: float = 40.0,
     rounds: int = 3,
-    picture: Path | None = None,
     captures: Path | None = None,
     save: str | None = None,
 ) -> None:
     print(describe("scipy", "numba"))
     glove, made = load_layout(layout), CalibrationTakeConfig(free=free, rounds=rounds)
-    told = [
-        run_user(np.random.default_rng((seed, number)), number, glove, made, picture)
-        for number in range(users)
-    ]
+    told = [run_user(np.random.default_rng((seed, number)), number, glove, made) for number in range(users)]
     figures: Figures = {}
     for name in told[0]:
         mean, worst = (by([user[name] for user in told], axis=0) for by in (np.mean, np.max))
         print(f"{name}: places {mean[0]:.2f} mm (worst {worst[1]:.2f}; in the wrist's frame {mean[2]:.2f}), "
-              f"bones {mean[3]:.2f} % (worst {worst[4]:.1f}), tips {mean[5]:.1f} %, touches off by "
-              f"{mean[6]:.2f} mm (worst finger {worst[8]:.2f}), skins by {mean[7]:.2f} mm")  # fmt: skip
+              f"bones {mean[3]:.2f} % (worst {worst[4]:.1f}), tips {mean[5]:.1f} %")  # fmt: skip
         key = {"1 % wrong labels": "wrong_labels"}.get(name, name)
         what = (
             f"{users} simulated users, mean and worst: marker positions [mm] | bones between joints [%] "
-            f"| last bones to their tips [%] | held-out touches [mm]: {name}"
+            f"| last bones to their tips [%]: {name}"
         )
-        figures[key] = what, [[mean[0], worst[1]], [mean[3], worst[4]], mean[5], [mean[6], worst[8]]]
+        figures[key] = what, [[mean[0], worst[1]], [mean[3], worst[4]], mean[5]]
         if name == "after":
             figures["wrist_frame"] = "marker positions in the wrist's frame, mean [mm]", mean[2]
     if captures:

@@ -1,7 +1,7 @@
 """Whether the standard deviations of joint angles and keypoints are true, on simulated people.
 
     OMP_NUM_THREADS=1 python -m benchmarks.doubt [--gloves dense19 sparse13 starter10]
-        [--seeds 0 1 2 3] [--frames 480] [--free 20] [--without-calibration] [--files]
+        [--seeds 0 1 2 3] [--frames 480] [--free 20] [--files]
 
 Each person makes a twin of one of the paper's four kinds of captures, in turn. It is tracked with hands of
 the nearest size, with hands that are measured in it, and with hands that were calibrated in a capture of
@@ -123,7 +123,6 @@ def main(
     seeds: tuple[int, ...] = (0, 1, 2, 3),
     frames: int = 480,
     free: float = 20.0,
-    without_calibration: bool = False,
     files: bool = False,
     save: str | None = None,
 ) -> None:
@@ -137,8 +136,7 @@ def main(
         for seed in seeds:
             if files:
                 take = simulate_take("real-like", glove=glove, num_frames=frames, seed=seed)
-                ways = {"measured": False} if without_calibration else {"measured": False, "calibrated": True}
-                for name, calibrate in ways.items():
+                for name, calibrate in {"measured": False, "calibrated": True}.items():
                     found = track_capture(take.capture(), glove=glove, calibrate=calibrate)
                     table.setdefault(f"{glove} {name}", []).extend(errors_of_file(take, found))
                 continue
@@ -148,9 +146,8 @@ def main(
             users = {
                 "named": User(tuple(nominal_users(take)), USUAL_SIZE),  # the notes of hands of a size
                 "measured": User(tuple(measured_users(take, load_labeler(glove))), f"{MEASURED}twin"),
+                "calibrated": calibrated_hands(take, glove, seed, free),
             }
-            if not without_calibration:
-                users["calibrated"] = calibrated_hands(take, glove, seed, free)
             for name, user in users.items():
                 table.setdefault(f"{glove} {name}", []).extend(errors_of(take, user, glove))
     figures: Figures = {}

@@ -34,12 +34,13 @@ OWNED = 0.003  # [m] from a marker without a point
 STANDING = 0.5  # share that stands still
 
 
-def with_drum(take: Take, first: int, *, rng: np.random.Generator) -> Take:
-    """The same take with ghosts around the hands from a frame on."""
-    markers = np.concatenate([_places(take, number) for number in range(len(take.hands))], axis=1)
+def with_drum(take: Take, *, rng: np.random.Generator) -> Take:
+    """The same take with ghosts around the hands."""
+    hands = enumerate(take.hands)
+    markers = np.concatenate([hand.markers(take.qpos[:, number])[0] for number, hand in hands], axis=1)
     ghosts = np.full((take.num_frames, 2 * NUMBER, 3), np.nan)
     for place in range(NUMBER):  # two columns each: an unbroken stretch of a column is one ghost
-        frame, turn = first, 0
+        frame = turn = 0
         while frame < take.num_frames:
             life = _life(take, markers, frame, rng)
             ghosts[frame : frame + len(life), 2 * place + turn] = life
@@ -58,11 +59,6 @@ def with_drum(take: Take, first: int, *, rng: np.random.Generator) -> Take:
         labels=np.concatenate([take.labels, owned], axis=1)[:, order],
         confidence=np.where(np.isfinite(points[..., 0]), 1.0, np.nan),
     )
-
-
-def _places(take: Take, number: int) -> np.ndarray:
-    """Where the markers of a hand truly are (T, M, 3) [m]."""
-    return take.hands[number].markers(take.qpos[:, number])[0]
 
 
 def _life(take: Take, markers: np.ndarray, frame: int, rng: np.random.Generator) -> np.ndarray:

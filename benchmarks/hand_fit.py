@@ -5,8 +5,7 @@
 CAPTURES is a folder of labeled dense19 captures, one sub-folder a person (right hands, *_right.trc). Shape
 (bone lengths, knuckles, directions of digits) and marker places are fitted together with the poses of some
 frames by Gauss-Newton with the poses eliminated; then other frames are fitted with shape and places held.
-Priors keep the shape near the mean hand. Residuals are listed by marker, joints by how often they leave their
-range.
+Priors keep the shape near the mean hand.
 """
 
 from __future__ import annotations

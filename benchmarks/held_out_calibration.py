@@ -1,13 +1,12 @@
 """Whether a calibration keeps what it says: held-out against fresh frames, places told against true ones.
 
     python -m benchmarks.held_out_calibration [--gloves dense19 dfki13 starter10]
-        [--motions calibration hand-controller] [--people 2] [--seconds 30] [--no-angles] [--captures DATA]
+        [--motions calibration hand-controller] [--people 2] [--seconds 30] [--captures DATA]
 
 Simulated people in gloves that slipped as `handsim simulate` has it; labels are those of the tracker. Rich
 motion is "calibration" (touches) or "free", poor motion "hand-controller", which leaves most joints where
 they are. `track.calibrate` has the first seconds of a capture; the fresh ones are 20 s of the same motion
-after them. Angles are those of `handsim track` on the first seconds, without and with --calibrate, and of
-the true hands, below which no calibration gets.
+after them.
 
 DATA is a folder of Mocap_SIG18_Data: each person's capture1 calibrates, capture2 is fresh (right hands).
 """
@@ -24,17 +23,13 @@ from benchmarks.people import read_markers
 from benchmarks.record import describe, run
 from gloves import Capture, GloveFit, Take, load_layout
 from handsim import HandSimWarning
-from handsim.hand.shape import Side
-from track import calibrate, measure_hands, track_capture
+from track import calibrate, measure_hands
 from track.kinematics.pose_solver import PoseSolver
 from train import simulate_take
 from train.simulation.scenes import SimulatedKind
 
 FRESH, RATE = 20.0, 120.0  # [s], [Hz]
-NAMES = (
-    "held out before", "after", "fresh before", "after", "places told", "true",
-    "angles before", "after", "of the true hand",
-)  # fmt: skip
+NAMES = ("held out before", "after", "fresh before", "after", "places told", "true")
 
 
 def fit_error(hand: GloveFit, markers: np.ndarray) -> float:
@@ -43,19 +38,12 @@ def fit_error(hand: GloveFit, markers: np.ndarray) -> float:
     return 1e3 * float(np.median(PoseSolver(hand).solve(seen[:: max(1, len(seen) // 300)]).rms))
 
 
-def angle_error(take: Take, truth: Take, side: Side) -> float:
-    """RMS over frames and joints [deg]."""
-    found, true = (one.qpos[:, one.hand_index(side), 7:] for one in (take, truth))
-    return float(np.rad2deg(np.sqrt(np.nanmean((found - true) ** 2))))
-
-
-def run_capture(truth: Take, seconds: float, angles: bool) -> list[list[float]]:
+def run_capture(truth: Take, seconds: float) -> list[list[float]]:
     """The figures of `NAMES` for each hand of a simulated capture; NaN for places of hands that stay."""
     count = round(seconds * RATE)
     seen, layout = truth.cut(0, count), load_layout(truth.hands[0].layout.name)  # as designed, not as worn
     before = measure_hands(seen, layout, hands=truth.sides)
     user = calibrate(seen, glove=layout, hands=truth.sides)
-    takes = [track_capture(seen, hands=hands) for hands in (before, user, truth.hands) if angles]
     rows = []
     for done, worn in zip(user.calibrations, user, strict=True):
         side = worn.side
@@ -70,7 +58,6 @@ def run_capture(truth: Take, seconds: float, angles: bool) -> list[list[float]]:
                 1e3 * done.place_error if done.is_better else np.nan,
                 1e3 * float(np.sqrt((hand_errors(worn, true).positions ** 2).mean())),
             ]
-            + [angle_error(take, seen, side) for take in takes]
         )
     return rows
 
@@ -115,12 +102,11 @@ def main(
     motions: tuple[SimulatedKind, ...] = ("calibration", "hand-controller"),
     people: int = 2,
     seconds: float = 30.0,
-    angles: bool = True,
     captures: Path | None = None,
 ) -> None:
     warnings.simplefilter("ignore", HandSimWarning)
     print(describe("scipy", "numba"))
-    print("[mm], [deg] | " + " | ".join(NAMES))
+    print("[mm] | " + " | ".join(NAMES))
     if captures:
         for person in sorted(captures.glob("User*")):
             tell(person.name, np.array(run_person(person)))
@@ -130,7 +116,7 @@ def main(
             rows = []
             for person in range(people):
                 truth = simulate_take(motion, glove=glove, num_frames=count, seed=100 + person)
-                for row in run_capture(truth, seconds, angles):
+                for row in run_capture(truth, seconds):
                     tell(f"{glove}, {motion}, person {person}", np.array(row))
                     rows.append(row)
             tell(f"{glove}, {motion}, mean", np.nanmean(rows, axis=0))

@@ -17,19 +17,16 @@ moved to where MediaPipe has them, by shares that were measured on drawn hands. 
 a hundred labeled photographs of some people to the training, a quarter of the samples; those of other people
 are left to be tried on.
 
-OUT keeps crops and networks, and a run goes on with those of the same numbers and seed. `--page` draws fifty
-photographs, evenly taken from those tried on, with the keypoints that a variant finds.
+OUT keeps crops and networks, and a run goes on with those of the same numbers and seed.
 """
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
-import cv2
 import numpy as np
 import torch
 import trimesh
@@ -51,13 +48,6 @@ SKINS: Final = (
     (220, 175, 148),
     (236, 200, 180),
 )
-LIMBS: Final = (
-    (0, 1, 2, 3, 4),
-    (0, 5, 6, 7, 8),
-    (0, 9, 10, 11, 12),
-    (0, 13, 14, 15, 16),
-    (0, 17, 18, 19, 20),
-)
 
 
 @dataclass(frozen=True)
@@ -72,7 +62,6 @@ class Options:
     samples: int = 240000
     seed: int = 0
     photographs: int = 0
-    page: Path | None = None
     save: str | None = None
 
 
@@ -114,7 +103,7 @@ VARIANTS: Final[dict[str, Callable[[int, int], Any]]] = {
 
 def pictures_of(variant: str, count: int, seed: int, out: Path) -> Any:
     """Crops of a variant, drawn or from the folder."""
-    path = out / f"{variant.replace(' ', '_')}-{count}-{seed}.npz"
+    path = out / f"{variant}-{count}-{seed}.npz"
     if not path.exists():
         cut = VARIANTS[variant](count, seed)
         with atomic_write(path) as temporary:
@@ -134,7 +123,7 @@ def network_of(variant: str, labeled: Any, options: Options) -> torch.nn.Module:
     trained_from = f"{options.pictures}-{options.samples}-{options.seed}"
     if labeled is not None:
         trained_from += f"-{options.photographs}_photographs"
-    path = options.out / f"{variant.replace(' ', '_')}-{trained_from}.pt"
+    path = options.out / f"{variant}-{trained_from}.pt"
     network = training.KeypointNetwork()
     if not path.exists():
         cut = pictures_of(variant, options.pictures, LEARNED, options.out)
@@ -143,24 +132,6 @@ def network_of(variant: str, labeled: Any, options: Options) -> torch.nn.Module:
             torch.save(trained.state_dict(), temporary)
     network.load_state_dict(torch.load(path, weights_only=True))
     return network.eval().to(memory_format=torch.channels_last)
-
-
-def page(network: torch.nn.Module, photos: Any, path: Path, count: int = 50) -> None:
-    """Photographs, evenly taken from all, with the keypoints found in them."""
-    chosen = np.linspace(0, len(photos.crops) - 1, count).round().astype(int)
-    tiles = []
-    for image, points in zip(photos.crops[chosen], training.find(network, photos.crops[chosen]), strict=True):
-        tile = np.ascontiguousarray(image)
-        for number, limb in enumerate(LIMBS):
-            color = tuple(
-                int(c) for c in cv2.applyColorMap(np.uint8([[50 * number]]), cv2.COLORMAP_RAINBOW)[0, 0]
-            )
-            cv2.polylines(
-                tile, [np.round(8 * points[list(limb)]).astype(np.int32)], False, color, 1, cv2.LINE_AA, 3
-            )
-        tiles.append(tile)
-    rows = [np.hstack(tiles[first : first + 10]) for first in range(0, count, 10)]
-    cv2.imwrite(str(path), np.vstack(rows)[..., ::-1])
 
 
 def main(options: Annotated[Options, tyro.conf.arg(name="")]) -> None:
@@ -188,19 +159,13 @@ def main(options: Annotated[Options, tyro.conf.arg(name="")]) -> None:
         result[variant] = found = found | {"moved": 100 * training.pck(moved, photos)}
         shares = "  ".join(f"{name} {share:5.1f}" for name, share in found.items())
         print(f"{variant:15s} {shares}", flush=True)
-        key, sets_of = (
-            variant.replace(" ", "_"),
-            "learned from | other drawn hands | photographs | moved",
-        )
-        figures[key] = (f"trained on {variant}, PCK@0.1 [%]: {sets_of}", list(found.values()))
+        sets_of = "learned from | other drawn hands | photographs | moved"
+        figures[variant] = (f"trained on {variant}, PCK@0.1 [%]: {sets_of}", list(found.values()))
         if "ours" in result and variant != "ours":
             ratio = (100 - found["photographs"]) / (100 - result["ours"]["photographs"])
             print(f"misses on photographs, {variant} over ours: {ratio:.2f}", flush=True)
-            figures[f"{key}_ratio"] = (f"misses on photographs, {variant} over ours", ratio)
-        if options.page is not None:
-            page(network, photos, options.page.with_stem(f"{options.page.stem}_{variant.replace(' ', '_')}"))
+            figures[f"{variant}_ratio"] = (f"misses on photographs, {variant} over ours", ratio)
     save_figures(options.save, figures)
-    (options.out / "result.json").write_text(json.dumps(result, indent=1))
 
 
 if __name__ == "__main__":

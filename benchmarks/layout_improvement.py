@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.layout_forecast import chosen_layouts, stored, trial_figures
+from benchmarks.layout_captures import chosen_layouts, stored, trial_figures
 from benchmarks.record import Figures, describe, run, save_figures
 from gloves import MarkerLayout, MarkerPlace, load_layout
 from handsim.cli.main import main as handsim
@@ -21,7 +21,7 @@ from handsim.hand.shape import BONE_NAMES, DIGITS, bones_of
 from track.glove_score import METHODS
 from train.labelers.layout_labeler import learned_labeler
 
-HARD = ("tips8", "symmetric8", "sides11", "palmar12")  # of the layouts whose score is compared with captures
+HARD = ("tips8", "symmetric8", "sides11", "palmar12")  # of `chosen_layouts`
 FIRST, FRAMES = 80, 600  # of the fresh captures
 WHAT = "slots right of label, of track [%], joints' error [deg]; means of nine captures"
 

@@ -5,12 +5,11 @@ the tracker reads. On the way 5 % of the packets are dropped, as many doubled, o
 corrupted; others bring junk, wild times and frames of another sender. The server restarts now and then, on
 its port; another one on another port is not heard. Then the command itself is killed.
 
-python -m benchmarks.live_stream [soak kill] [--seconds 3600] [--no-hands]
+python -m benchmarks.live_stream [soak kill] [--seconds 3600]
 """
 
 from __future__ import annotations
 
-import dataclasses
 import os
 import signal
 import socket
@@ -168,24 +167,20 @@ def _socket(port: int = 0) -> socket.socket:
 def main(
     parts: tyro.conf.Positional[tuple[Literal["soak", "kill"], ...]] = ("soak", "kill"),
     seconds: float = 3600.0,
-    hands: bool = True,
 ) -> None:
     pace = np.inf
     print(describe("numba", "torch"))
     take = simulate_take(kind="hand-hand", num_frames=1200)
     with tempfile.TemporaryDirectory() as folder:
         if "soak" in parts:
-            pace = soak(take, round(seconds * RATE), hands, Path(folder))
+            pace = soak(take, round(seconds * RATE), Path(folder))
         if "kill" in parts:
             kill(take, min(1.0, 0.4 * pace) * RATE, Path(folder))  # a busy machine needs a slower stream
 
 
-def soak(take: Take, frames: int, hands: bool, folder: Path) -> float:
+def soak(take: Take, frames: int, folder: Path) -> float:
     """Track and record a stream on a bad network; returns how many times faster than its own pace."""
     tracker = Tracker(true_users(take), load_labeler("dense19"))
-    if not hands:
-        apart = 10.0 * np.arange(take.points.shape[1])[:, None]
-        take = dataclasses.replace(take, points=take.points + apart)
     server, out = BadServer(take, frames), folder / "soak.npz"
     server.start()
     start, memory, first = time.perf_counter(), [], 0

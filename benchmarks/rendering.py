@@ -1,6 +1,6 @@
 """Accuracy of drawn depth and ids against embree; and the pictures that `benchmarks.speed` times.
 
-    python -m benchmarks.rendering accuracy [--frames 200]
+    python -m benchmarks.rendering [--frames 200]
 
 What is timed are 640 x 480 pictures of two hands from a simulated take: depth alone; colors, depth, ids and
 keypoints; the same painted by OpenGL, and written as WebDataset. Beside them the loop that a user would write
@@ -16,12 +16,11 @@ import os
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Final, Literal
+from typing import Final
 
 import mujoco
 import numpy as np
 import trimesh
-import tyro
 from torch.utils.data import DataLoader
 
 from benchmarks.record import Figures, describe, report, run, timed
@@ -184,12 +183,7 @@ def bare_studio(take: Take) -> Studio:
     return Studio(take.hands, people, PLAIN)
 
 
-def main(
-    section: tyro.conf.Positional[Literal["accuracy"]] = "accuracy",
-    *,
-    frames: int = 200,
-    save: str | None = None,
-) -> None:
+def main(frames: int = 200, save: str | None = None) -> None:
     print(describe())
     report(save, accuracy(frames))
 

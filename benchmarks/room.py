@@ -2,69 +2,49 @@
 
     python -m benchmarks.room [--frames 2048 --repeats 5]
 
-Two hands, also with a pen or a controller, in one process and in two side by side, each on one core. Each
-figure is the median of the repeats, each with people and motions of its own; the compiled code is warm.
+Two hands, also with a pen or a controller, in two processes side by side, each on one core. Each figure is
+the median of the repeats, each with people and motions of its own; the compiled code is warm.
 """
 
 from __future__ import annotations
 
 import multiprocessing
-import time
 from typing import Any
 
 import numpy as np
 
-from benchmarks.record import Figures, describe, report, run
+from benchmarks.record import Figures, describe, report, run, timed
 from train import simulate_take
 
 KINDS = ("hand-pen", "hand-controller", "hand-hand")
 
 
 def worker(kind: str, frames: int, seeds: list[int], barrier: Any, queue: Any) -> None:
-    """Wall and processor time [s] of captures that begin together with those of the other processes."""
+    """Time [s] of captures that begin together with those of the other process."""
     simulate_take(kind=kind, num_frames=256, seed=99)  # compiled code is loaded, trees are built
     for seed in seeds:
         barrier.wait()
-        start, busy = time.perf_counter(), time.process_time()
-        simulate_take(kind=kind, num_frames=frames, seed=seed)
-        queue.put((seed, time.perf_counter() - start, time.process_time() - busy))
+        queue.put((seed, timed(lambda: simulate_take(kind=kind, num_frames=frames, seed=seed))))  # noqa: B023
 
 
-def side_by_side(kind: str, processes: int, frames: int, repeats: int) -> tuple[float, float]:
-    """Frames a second of all processes together, and processor time a frame [us]; medians."""
+def side_by_side(kind: str, frames: int, repeats: int) -> float:
+    """Frames a second of two processes together, the median of the repeats."""
     context = multiprocessing.get_context("spawn")
-    barrier, queue = context.Barrier(processes), context.Queue()
-    jobs = [
-        context.Process(
-            target=worker, args=(kind, frames, [10 * r + p for r in range(repeats)], barrier, queue)
-        )
-        for p in range(processes)
-    ]
-    for job in jobs:
-        job.start()
-    results = [queue.get(timeout=600) for _ in range(processes * repeats)]
-    for job in jobs:
-        job.join()
-    slowest = [max(wall for seed, wall, _ in results if seed // 10 == r) for r in range(repeats)]
-    busy = [cpu / frames for *_, cpu in results]
-    return processes * frames / float(np.median(slowest)), 1e6 * float(np.median(busy))
+    barrier, queue = context.Barrier(2), context.Queue()
+    for p in range(2):
+        seeds = [10 * r + p for r in range(repeats)]
+        context.Process(target=worker, args=(kind, frames, seeds, barrier, queue)).start()
+    results = [queue.get(timeout=600) for _ in range(2 * repeats)]
+    slowest = [max(wall for seed, wall in results if seed // 10 == r) for r in range(repeats)]
+    return 2 * frames / float(np.median(slowest))
 
 
 def main(frames: int = 2048, repeats: int = 5, save: str | None = None) -> None:
     print(describe("mujoco", "numba", "scipy"))
-    print(f"\nwhole captures of {frames} frames, people and motions included, medians of {repeats}")
     figures: Figures = {}
     for kind in KINDS:
-        rates = []
-        for processes in (1, 2):
-            rate, busy = side_by_side(kind, processes, frames, repeats)
-            rates.append((rate, busy))
-            print(
-                f"  {kind:16s} {processes} process(es): {rate:6,.0f} frames/s on the clock, {busy:5.0f} us "
-                "of processor time a frame"
-            )
-        what = f"{kind}: frames/s of one process | processor time [us] | frames/s of two processes together"
-        figures[kind.split("-")[1]] = (what, [*rates[0], rates[1][0]])
+        what = f"{kind}: frames/s of two processes together"
+        figures[kind.split("-")[1]] = what, side_by_side(kind, frames, repeats)
     report(save, figures)
 
 

@@ -1,4 +1,4 @@
-"""How right lines of sight past the skin are, what capsules miss, and what each rig sees.
+"""How right lines of sight past the skin are, and what each rig sees.
 
     python -m benchmarks.sight [--poses 500 --seed 0]
 
@@ -16,12 +16,7 @@ import trimesh
 from benchmarks.record import Figures, describe, report, run
 from gloves import load_layout
 from gloves.fit import attach_markers
-from gloves.optics.visibility import (
-    MAX_FACING,
-    clear_of_mesh,
-    hand_tree,
-    visible_cameras,
-)
+from gloves.optics.visibility import MAX_FACING, clear_of_mesh, hand_tree
 from handsim import CameraRig, HandModel, join_qpos, load_rig, sample_shape
 from handsim.hand.shape import Side
 from handsim.space.rig import list_rigs
@@ -36,11 +31,9 @@ class Scene(NamedTuple):
     """One gloved hand in random poses."""
 
     model: HandModel
-    qpos: np.ndarray
     skin: np.ndarray
     markers: np.ndarray
     normals: np.ndarray
-    segments: np.ndarray
 
 
 def make_scene(model: HandModel, poses: int, center: np.ndarray, rng: np.random.Generator) -> Scene:
@@ -51,7 +44,7 @@ def make_scene(model: HandModel, poses: int, center: np.ndarray, rng: np.random.
     )
     bones = model.forward_kinematics(qpos)
     markers, normals = attach_markers(load_layout("dense19"), model).markers(model, bones)
-    return Scene(model, qpos, model.skin(qpos), markers, normals, model.capsules.posed(bones))
+    return Scene(model, model.skin(qpos), markers, normals)
 
 
 def in_view_and_facing(markers: np.ndarray, normals: np.ndarray, rig: CameraRig) -> np.ndarray:
@@ -72,34 +65,17 @@ def embree_clear(scene: Scene, cameras: np.ndarray, wanted: np.ndarray) -> np.nd
 
 def agreement(poses: int, rng: np.random.Generator) -> Figures:
     rig, sides = load_rig("figure5"), ("right", "left")
-    embree, skin, capsules, asked = [], [], [], []
+    count = alike = 0
     for number in range(poses // POSES_A_HAND):
         side: Side = sides[number % 2]  # type: ignore[assignment]
         scene = make_scene(HandModel(sample_shape(side=side, rng=rng)), POSES_A_HAND, CENTER, rng)
         everything = np.ones((*scene.markers.shape[:2], len(rig.positions)), dtype=bool)
         clear = clear_of_mesh(hand_tree(), scene.skin, scene.markers, rig.positions, everything)
-        reference = embree_clear(scene, rig.positions, everything)
-        wanted = in_view_and_facing(scene.markers, scene.normals, rig)
-        radii = scene.model.capsules.radii
-        embree.append(reference)
-        skin.append(clear)
-        asked.append(wanted)
-        capsules.append(visible_cameras(scene.markers, scene.normals, rig, scene.segments, radii))
-    oracle, ours, facing, flesh = (np.concatenate(each) for each in (embree, skin, asked, capsules))
-    both, loose = (ours & facing).sum(-1) >= 2, flesh.sum(-1) >= 2
-    seen, alike = ours & facing, oracle == ours
-    markers = both == ((oracle & facing).sum(-1) >= 2)
+        alike += int((clear == embree_clear(scene, rig.positions, everything)).sum())
+        count += clear.size
     return {
-        "all": ("lines of sight past the skin, facing or not", ours.size),
-        "lines": ("lines of sight that agree with embree", int(alike.sum())),
-        "facing": ("of those in view and facing [%]", 100 * alike[facing].mean()),
-        "markers": ("markers that are seen by two cameras, or not, as embree says [%]", 100 * markers.mean()),
-        "false_clear": (
-            "lines in view and facing that capsules see and the skin hides [%]",
-            100 * (flesh & ~seen)[facing].mean(),
-        ),
-        "false_hidden": ("the reverse [%]", 100 * (seen & ~flesh)[facing].mean()),
-        "missing": ("markers missing, capsules and skin [%]", [100 * (~loose).mean(), 100 * (~both).mean()]),
+        "all": ("lines of sight past the skin, facing or not", count),
+        "lines": ("lines of sight that agree with embree", alike),
     }
 
 

@@ -1,16 +1,14 @@
-"""The tracker on the twins: calibrated as users are, among ghosts, from nothing, for an hour.
+"""The tracker on the twins: calibrated as users are, among ghosts, from nothing.
 
-    OMP_NUM_THREADS=1 python -m benchmarks.tracking [calibrated drums starts memory]
-        [--kinds hand-hand ... --seeds 0 1 --frames N --starts 200 --recoveries 100 --hour 432000]
+    OMP_NUM_THREADS=1 python -m benchmarks.tracking [calibrated drums starts]
+        [--kinds hand-hand ... --seeds 0 1 --frames N --starts 200 --recoveries 100]
 
 calibrated: the people of a twin make a calibration capture in their gloves, simulated like the twin; `handsim
     calibrate` measures their size, has the tracker label the capture, and writes their hands. With these the
-    twin is tracked, beside the true hands and hands of the size measured in the twin.
-drums: the twins with twenty ghosts a frame near the hands (`drum_takes`), from the beginning and from second
-    one, and without.
+    twin is tracked.
+drums: the twins with twenty ghosts a frame near the hands (`drum_takes`), and without.
 starts: a tracker begins at a random frame, or has a second of darkness behind it; how many frames pass until
     every point and pose of a frame is right. "Within 3" is the third frame at the latest.
-memory: a take forwards and backwards, again and again with new IDs, 432000 frames being an hour of motion.
 
 All sections when none is named. Twins have the paper's number of frames unless told otherwise; the points of
 a rigid body with markers of its own are left out, as in the paper's tables. What counts as right and valid is
@@ -34,11 +32,10 @@ from benchmarks.paper.take_evaluation import (
     evaluate_tracker,
     measured_users,
     nominal_users,
-    seen_frame,
     true_users,
 )
 from benchmarks.paper.trials import initialization_times, recovery_times
-from benchmarks.record import Figures, describe, resident_memory, run, save_figures
+from benchmarks.record import Figures, describe, run, save_figures
 from gloves import GloveFit, Take
 from track import Tracker, calibrate
 from train import Labeler, load_labeler, simulate_take
@@ -47,8 +44,7 @@ from train.simulation.takes import simulate_calibration
 
 TRIALS = {"start": (initialization_times, 3), "recovery": (recovery_times, 5)}
 """What is tried, and the frames within which all should be right."""
-Section = Literal["calibrated", "drums", "starts", "memory"]
-EVERY = 36000  # frames between two looks at the memory: five minutes
+Section = Literal["calibrated", "drums", "starts"]
 HANDS = {
     "true": true_users,
     "uncalibrated": lambda take: measured_users(take, labeler()),
@@ -104,13 +100,11 @@ def calibrated(takes: dict[str, Take], seed: int, free: float) -> Figures:
     head("calibrated as users are")
     reports = []
     for name, take in takes.items():
-        for number, (users, hands) in enumerate(HANDS.items()):
-            tell(f"{name if number == 0 else ''} {users}", follow(take, hands(take)))
         began = time.perf_counter()
         found = calibrated_users(take, seed, free)
         took = time.perf_counter() - began
         reports.append(follow(take, found))
-        tell(" calibrated", reports[-1])
+        tell(name, reports[-1])
         for one, true in zip(found, true_users(take), strict=True):
             errors = hand_errors(one, true)
             print(
@@ -132,27 +126,14 @@ def calibrated(takes: dict[str, Take], seed: int, free: float) -> Figures:
 
 def drums(takes: dict[str, Take], seed: int) -> Figures:
     head("twenty ghosts a frame near the hands")
-    lost: dict[tuple[str, str], list[float]] = {}
     right: dict[str, list[float]] = {}
     for name, take in takes.items():
-        begins = {"ghosts": 0, "ghosts from 1 s": int(take.rate)}
-        noisy = {
-            when: with_drum(take, begin, rng=np.random.default_rng(seed)) for when, begin in begins.items()
-        }
+        noisy = with_drum(take, rng=np.random.default_rng(seed))
         for users, hands in HANDS.items():
-            clean = follow(take, hands(take))
-            tell(f"{name} {users}", clean)
-            right.setdefault(f"{users}_without", []).append(100 * clean.right.mean())
-            for when, one in noisy.items():
+            for when, one in {"without": take, "ghosts": noisy}.items():
                 report = follow(one, hands(take))
-                tell(f"  {when}", report)
-                key = f"{users}_{'ghosts' if when == 'ghosts' else 'later'}"
-                right.setdefault(key, []).append(100 * report.right.mean())
-                lost.setdefault((users, when), []).append(100 * (report.right.mean() - clean.right.mean()))
-                medians = [1e3 * run.figures()["seconds_p50"] for run in (clean, report)]
-                print(f"    {lost[users, when][-1]:+.2f} points; {medians[0]:.1f} -> {medians[1]:.1f} ms")
-    for (users, when), points in lost.items():
-        print(f"  {users}, {when}: {np.mean(points):+.2f} points on average over {len(points)} takes")
+                tell(f"{name} {users}, {when}", report)
+                right.setdefault(f"{users}_{when}", []).append(100 * report.right.mean())
     return {key: (f"hands and ghosts {key}: {right_of(takes)}", shares) for key, shares in right.items()}
 
 
@@ -191,36 +172,8 @@ def tell_waits(name: str, waits: np.ndarray, within: int) -> None:
     )
 
 
-def memory(takes: dict[str, Take], hour: int) -> Figures:
-    sizes = []
-    name, take = next(iter(takes.items()))
-    print(f"\nresident memory, {name} forwards and backwards")
-    tracker, lap, right = Tracker(true_users(take), labeler()), int(take.ids.max()) + 1, 0
-    there_and_back = [*range(take.num_frames), *range(take.num_frames - 2, 0, -1)]
-    began = time.perf_counter()
-    for number in range(hour):
-        laps, place = divmod(number, len(there_and_back))
-        seen = seen_frame(take, there_and_back[place])
-        tracked = tracker.step(seen.points, seen.ids + laps * lap, number / take.rate)
-        right += np.array_equal(tracked.labels, seen.labels)
-        if (number + 1) % min(EVERY, max(1, hour // 12)) == 0:
-            size = 1e-6 * resident_memory()
-            sizes.append(size)
-            print(
-                f"  {(number + 1) / take.rate / 60:5.1f} min: {size:7.1f} MB, "
-                f"{100 * right / (number + 1):.2f} % right, "
-                f"{1e3 * (time.perf_counter() - began) / (number + 1):.2f} ms a frame",
-                flush=True,
-            )
-    resident = "resident memory [MB] at the"
-    return {
-        "five_minutes": (f"{resident} first look, of five minutes", sizes[0]),
-        "hour": (f"{resident} last look, of an hour", sizes[-1]),
-    }
-
-
 def main(
-    sections: tyro.conf.Positional[tuple[Section, ...]] = ("calibrated", "drums", "starts", "memory"),
+    sections: tyro.conf.Positional[tuple[Section, ...]] = ("calibrated", "drums", "starts"),
     *,
     kinds: tuple[SimulatedKind, ...] = KINDS,
     seeds: tuple[int, ...] = (0, 1),
@@ -228,7 +181,6 @@ def main(
     free: float = 40.0,
     starts_tried: Annotated[int, tyro.conf.arg(name="starts")] = 200,
     recoveries: int = 100,
-    hour: int = 432000,
     save: str | None = None,
 ) -> None:
     print(describe("numba", "scipy", "torch"))
@@ -239,7 +191,6 @@ def main(
         "calibrated": lambda: calibrated(takes, seeds[0], free),
         "drums": lambda: drums(takes, seeds[0]),
         "starts": lambda: starts(takes, seeds[0], {"start": starts_tried, "recovery": recoveries}),
-        "memory": lambda: memory(takes, hour),
     }
     figures: Figures = {}
     for section in sections:

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
-from handsim._checks import check_array, check_choice, check_number, check_rng, check_type
+from handsim._checks import check_choice, check_number, check_rng, check_type
 from handsim.errors import ArgumentError, PoseError, choices
 from handsim.files.inputs import package_data
 from handsim.hand.model import HandModel, HandMotion, join_qpos, load_model
@@ -25,7 +25,6 @@ from handsim.space.transforms import random_quaternions
 from poses.shapes import (
     HIGH,
     LOW,
-    MAX_PENETRATION,
     gesture,
     gestures_of,
     is_valid,
@@ -240,28 +239,6 @@ def sample_motion(
         parts.append(part)
         count += len(part)
     return with_wrist(np.concatenate(parts)[:frames], config, rng=rng)
-
-
-def motion_through(
-    model: HandModel | HandShape | str,
-    poses: Float[np.ndarray, "K 20"],
-    config: MotionConfig | None = None,
-    *,
-    rng: np.random.Generator,
-) -> HandMotion:
-    """Smooth motion of one hand from each valid pose [rad] to the next, with a rest at each later one."""
-    model, config = load_model(model), config or MotionConfig()
-    poses = check_array("poses", poses, (None, NUM_JOINTS))
-    if poses.ndim != 2 or len(poses) < 2:
-        raise ArgumentError(f"poses has shape {poses.shape}, expected at least two poses, (K, {NUM_JOINTS})")
-    valid = is_valid(model, poses)
-    if not valid.all():
-        raise ArgumentError(
-            f"pose {valid.argmin()} of {len(poses)} is not valid on this hand: out of range or deeper than "
-            f"{1e3 * MAX_PENETRATION:g} mm in itself, expected what poses.shapes.make_valid returns"
-        )
-    angles = np.concatenate([poses[:1], angles_through(model, poses, config, rng=rng)])
-    return with_wrist(angles, config, rng=rng)
 
 
 def count_frames(duration: float, config: MotionConfig) -> int:

@@ -37,7 +37,7 @@ _ROUGHNESS: Final = {"skin": 0.62, "glove": 0.85}
 
 
 def bone_colors() -> Float[np.ndarray, "L 3"]:
-    """One color (sRGB) per digit, and one for the palm, in the order of `topology.BONES`."""
+    """One color (sRGB) per digit, and one for the palm, in the order of `handsim.hand.shape.BONES`."""
     colors = [_PALM_COLOR if bone.digit < 0 else _DIGIT_COLORS[bone.digit] for bone in BONES]
     return np.array(colors)
 
@@ -69,7 +69,7 @@ _INK: Final = (38, 42, 50)
 _PAPER: Final = tuple(round(255 * level) for level in BACKGROUND)
 _TEXT_HEIGHT: Final = 24  # [pixels], of names and titles
 _LINE_STEP: Final = 1.35
-_PADDING: Final = 16  # [pixels]
+_PADDING: Final = 16  # between a picture and its texts [pixels]
 
 
 def write_png(path: str | Path, picture: Picture) -> None:
@@ -168,12 +168,12 @@ def _write(picture: Picture, text: str, origin: tuple[int, int], ink: tuple[int,
     cv2.putText(picture, text, origin, _FONT, _TEXT_HEIGHT / 32.0, ink, 2, cv2.LINE_AA)
 
 
-_GAP: Final = 6  # [px]
-_FRACTION_BITS: Final = 4  # OpenCV draws between pixels in sixteenths
+_GAP: Final = 6  # between the pictures of a sheet [px]
+_FRACTION_BITS: Final = 4  # OpenCV gets positions in sixteenths of a pixel
 
 
 def contact_sheet(frames: Sequence[RenderedFrame], *, columns: int = 3, width: int = 320) -> Picture:
-    """Some frames in rows of `columns`, at most so wide each [px]; hidden keypoints are hollow.
+    """Frames in rows of `columns`, each at most `width` wide [px]; hidden keypoints are drawn hollow.
 
     A frame without colors shows its depth alone.
     """
@@ -194,11 +194,11 @@ class Skeleton(Protocol):
 
     @property
     def keypoints(self) -> Float[np.ndarray, "21 2"]:
-        """[px]."""
+        """Positions in the picture [px]."""
 
     @property
     def visible(self) -> Bool[np.ndarray, "21"]:
-        """Which are drawn full."""
+        """Which keypoints are drawn as filled circles."""
 
 
 def draw_keypoints(picture: Picture, hands: Sequence[Skeleton], *, scale: float = 1.0) -> Picture:

@@ -33,12 +33,12 @@ class SpawnKey(enum.IntEnum):
 
     VIEWPOINTS = 1
     SHARD = 2
-    """Then the number of the shard, and of one of its frames."""
+    """The number of the shard follows, and that of one of its frames."""
     PEOPLE_OF_FRAMES = 3
     PERSON = 4
-    """Then the number of the person, and 0 for the hand or 1 for the skin."""
+    """The number of the person follows, and 0 for the hand or 1 for the skin."""
     STREAM = 5
-    """Then the kind and the number of what a stream draws."""
+    """The kind and the number of what a stream draws follow."""
 
     def rng(self, seed: int, *numbers: int) -> np.random.Generator:
         """The generator of the child with these further numbers."""

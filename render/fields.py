@@ -40,7 +40,7 @@ def normal_numbers(shape: tuple[int, ...], *, rng: np.random.Generator) -> Float
 
 
 _KNOTS: Final = 32
-"""Of noise, each way; a power of two. It repeats after as many blots, which nobody sees on a hand."""
+"""Knots of noise along each axis, a power of two; the noise repeats after them, unnoticed on a hand."""
 
 
 def noise(positions: Doubles, sizes: tuple[float, ...], *, rng: np.random.Generator) -> Floats:
@@ -74,13 +74,13 @@ def _add_octave(positions: Doubles, start: Doubles, scale: float, knots: Floats,
 
 
 def smooth(values: NDArray[Any], low: float | NDArray[Any], high: float | NDArray[Any]) -> NDArray[Any]:
-    """0 below `low`, 1 above `high`, smooth between."""
+    """A step from 0 below `low` to 1 above `high`, smooth between them."""
     share = np.clip((values - low) / (high - low), 0.0, 1.0)
     return np.asarray(share * share * (3.0 - 2.0 * share))
 
 
 def along_segment(points: Doubles, start: Doubles, end: Doubles) -> tuple[Doubles, Doubles]:
-    """How far along a segment in a plane points (N, 2) are, 0 to 1, and how far from it."""
+    """Positions of points (N, 2) along a segment in a plane, from 0 to 1, and their distances from it."""
     way = end - start
     along = np.clip((points - start) @ way / (way @ way), 0.0, 1.0)
     return along, np.linalg.norm(points - start - along[:, None] * way, axis=1)

@@ -22,9 +22,9 @@ Flags = NDArray[np.bool_]
 PASSES: Final = ("rgb", "depth", "normals", "ids")
 """Kinds of pictures that can be asked for."""
 FOREARM: Final = NUM_BONES
-"""Number of the forearm among a hand's parts, after those of its bones (`topology.BONES`)."""
+"""Number of the forearm among a hand's parts, after those of its bones (`handsim.hand.shape.BONES`)."""
 PARTS_A_HAND: Final = 32
-"""Part numbers per hand: a pixel of bone b of hand h has part 1 + b + 32 h; 0 is not a hand."""
+"""Part numbers per hand: a pixel of bone b of hand h has part 1 + b + 32 h; 0 is no hand."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -246,7 +246,7 @@ SIDES_OF_HAND: Final[Mapping[str, tuple[float, float, float]]] = {
     "little finger side": (0.0, 1.0, -0.25),
 }
 _GAP: Final = 0.025  # between hands in a row [m]
-_WIDTH, _COLUMNS = 2000, 4  # of a picture of rows [px]; gloves in a row
+_WIDTH, _COLUMNS = 2000, 4  # width of a picture of rows [px]; number of gloves in a row
 _HEIGHT: Final = 900  # of a glove from one side [px]
 _SLIPS_HEIGHT: Final = 600  # of the slips of a glove from one side [px]
 _CAMERA_SIZE: Final = (1100, 900)  # [px], without names

@@ -155,7 +155,7 @@ class Drawing:
                 warnings.warn(told, HandSimWarning, stacklevel=3)
         self.subject, self.config = subject.upright(config.up), config
         self.take, rng = self.subject.take, SpawnKey.VIEWPOINTS.rng(config.seed)
-        # Poses that are no motion are many people's, except before one person's eyes.
+        # Poses that are no motion may be of many people, but cameras at the eyes need one person.
         has_user = self.subject.is_motion or config.view.placement == "head"
         self._user = UserBody(self.take) if has_user else None
         film = subject.film
@@ -297,8 +297,8 @@ def sample_choices(
 
 
 SHEET: Final = "contact_sheet.png"
-_MERGED: Final = "checksums.json"  # of what all shards together make
-_RENAMES: Final = "freihand"
+_MERGED: Final = "checksums.json"  # checksums of the files that all shards make together
+_RENAMES: Final = "freihand"  # format that renames its pictures at the end
 _LEFT_OUT: Final = "left_out-{}.json"
 _CUT_OFF: Final = "cut_off-{}.json"
 _DRAWN: Final = ".drawn-{}"  # file of a shard in progress, which has one byte for each of its pictures
@@ -413,7 +413,7 @@ def _draw_shards(
     workers: int | Executor,
     progress: Progress,
 ) -> bool:
-    """Draw the missing shards; whether there were any. `counts` are the numbers of pictures of all shards."""
+    """Draw the missing shards and return whether there were any; `counts` are all shards' pictures."""
     output.fetch(INDEX, names_of=[f"*{TAR}"])
     done, total = _finished(output, formats), sum(counts)
     count = sum(counts[number] for number in done if number < len(counts))
@@ -533,7 +533,7 @@ def _check_space(out: Path, drawn: int, left: int) -> None:
 
 
 def _finished(output: Output, formats: Sequence[str]) -> frozenset[int]:
-    """The shards that need not be drawn; damaged files are told. Stores themselves check what they keep."""
+    """The shards that need not be drawn; warns of damaged files. Object stores check their own."""
     done, changed = whole_shards(output.folder, formats)
     output.warn_of(changed, "are damaged (other checksums), and are drawn again")
     return done

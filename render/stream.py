@@ -143,9 +143,9 @@ class _Sitting(NamedTuple):
 class PictureStream(IterableDataset[dict[str, torch.Tensor]]):
     """Random pictures of hands with their truth, without end.
 
-    Picture k depends on the seed and k alone. A few people take turns, each for a while: `people` of them are
-    about at a time, picture k shows number k modulo `people`, and each is replaced by somebody new after
-    `sitting` pictures. Light, background, viewpoint and sensors change with every picture.
+    Picture k depends on the seed and k alone. `people` people take turns: picture k shows number k modulo
+    `people`, and each of them is replaced by somebody new after `sitting` pictures. Light, background,
+    viewpoint and sensors change with every picture.
 
     It yields dicts of tensors, which the default collate of a `DataLoader` stacks:
 
@@ -189,7 +189,7 @@ class PictureStream(IterableDataset[dict[str, torch.Tensor]]):
         crop: Size of the picture in pixels [px]: a square around the hand, cut out of what the camera sees by
             a camera of its own, without resampling. The whole picture when not given.
         fill: Least and greatest share of the picture's shorter side that the hand's keypoints span.
-        people: Number of people who are about at a time.
+        people: Number of people who take turns.
         sitting: Pictures of one person.
         glove: Marker layout on the hands, where the config dresses them in gloves.
         batch: Number of pictures in a row that one worker draws. The batches of a `DataLoader` of this batch
@@ -238,7 +238,7 @@ class PictureStream(IterableDataset[dict[str, torch.Tensor]]):
         check_span("fill", fill, 0.05)
         check_number("the greater share of fill", fill[1], 0.05, 1.0)
         config = configured(config, None, {} if seed is None else {"seed": seed})
-        if config.depth_sensor == "auto" and "depth" in config.passes:  # of a stream it measures near hands
+        if config.depth_sensor == "auto" and "depth" in config.passes:  # its cameras are near the hands
             config = dataclasses.replace(config, depth_sensor=DepthSensor((NEAR_SENSOR,)))
         self.config = config.resolved()
         self.seed = self.config.seed

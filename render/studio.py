@@ -302,7 +302,7 @@ class Studio:
         )
 
     def reaching(self, moment: Moment, cameras: Sequence[Camera], user: UserBody | None = None) -> Moment:
-        """The moment with the user's arms, or others, that leave the pictures of these cameras."""
+        """The moment with upper arms, the user's or others, that leave the pictures of these cameras."""
         found = np.full((len(self._hands), 3), np.nan)
         poses = {number: moment.hand(number) for number in range(len(self._hands))}
         there = {number: pose for number, pose in poses.items() if pose is not None}

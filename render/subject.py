@@ -266,7 +266,7 @@ class Cast:
         return SpawnKey.PERSON.rng(self.seed, person, 1)
 
     def hands(self, person: int, worn: Sequence[GloveFit]) -> tuple[GloveFit, ...]:
-        """A person's hands in the gloves of others."""
+        """A person's hands in gloves of the layouts that are worn."""
         if self.shapes is not None:
             shape = self.shapes[person if len(self.shapes) > 1 else 0]
         else:

@@ -17,9 +17,9 @@ from handsim.space.transforms import quaternion_matrix
 from render.frames import Doubles
 from render.skin.look import ELBOW
 
-_HAND: Final = 0.108
-_UPPER_ARM: Final = 0.186 / _HAND  # [hand lengths], as all of these
-_SHOULDER: Final = 0.129 / _HAND  # from the neck's axis
+_HAND: Final = 0.108  # length of a hand, as a share of the stature
+_UPPER_ARM: Final = 0.186 / _HAND  # in hand lengths, as the next two
+_SHOULDER: Final = 0.129 / _HAND  # distance of a shoulder from the neck's axis
 _EYES: Final = (0.5, 0.118 / _HAND)  # before and above the shoulders; a head that looks down leans forward
 _WRIST: Final = np.deg2rad([[76.0, 75.0], [36.0, 22.0]])
 """Largest flexion and extension, ulnar and radial deviation of a wrist [rad], a little less than the means of
@@ -31,22 +31,22 @@ _COARSE: Final = (np.deg2rad(np.arange(0.0, 360.0, 20.0)), [0.5, 0.65], np.deg2r
 angles of that line below the horizon and from where the chest points [rad]."""
 _TURNS: Final = np.deg2rad([-25.0, 0.0, 25.0])
 _FINE: Final = (np.deg2rad([-13.0, 0.0, 13.0]), [0.4, 0.5, 0.6, 0.7], np.deg2rad([15.0, 35.0, 55.0]), _TURNS)
-"""The same around the best azimuth."""
-_NATURAL: Final = (0.5, np.deg2rad(40.0), 0.0)  # such distance and angles of people at work
-_SPREADS: Final = (0.12, np.deg2rad(15.0), np.deg2rad(30.0))
-_UNUSUAL: Final = 0.15  # weight of what is far from these
+"""Places that are tried next, around the best azimuth, as in `_COARSE`."""
+_NATURAL: Final = (0.5, np.deg2rad(40.0), 0.0)  # distance and angles of people at work, as in `_COARSE`
+_SPREADS: Final = (0.12, np.deg2rad(15.0), np.deg2rad(30.0))  # spreads of these
+_UNUSUAL: Final = 0.15  # weight of the cost of other distances and angles
 
 _SWIVELS: Final = np.deg2rad(np.arange(-100.0, 101.0, 20.0))
 """Angles of the elbow about the line from the wrist to the shoulder that are tried [rad]; 0 is the lowest."""
-_SWIVEL: Final = np.deg2rad(50.0)  # their spread
+_SWIVEL: Final = np.deg2rad(50.0)  # spread of these angles
 _SOFTNESS: Final = 0.3  # difference of costs within which elbows are averaged, so that they do not jump
-_OVERREACH: Final = 0.05  # distance by which a person reaches farther without much ado [m]
+_OVERREACH: Final = 0.05  # distance beyond an arm's length whose cost is 1 [m]
 _HIDING: Final = (0.12, 0.04)  # distance of a forearm from a line of sight that it hides, and its spread [m]
 _NEAR: Final = (0.36, 0.06)  # distance of an arm before the eyes that takes up the view, and its spread [m]
 _RISE: Final = 0.1  # spread of the tangent by which elbows are seen above the middle of the view
-_VIEW: Final = np.cos(np.deg2rad(40.0))
+_VIEW: Final = np.cos(np.deg2rad(40.0))  # cosine of half the angle of the view that arms take up
 _ALONG: Final = np.linspace(0.25, 1.0, 4)  # places between wrist and elbow that are looked at
-_WORST: Final = 12.0  # cost of an arm, beyond which another is no worse
+_WORST: Final = 12.0  # largest cost of an arm that counts
 
 
 class UserBody:
@@ -85,7 +85,7 @@ class UserBody:
     def _stand(
         self, middle: Doubles, azimuth: Doubles, distance: Doubles, down: Doubles, facing: Doubles
     ) -> tuple[Doubles, Doubles, Doubles]:
-        """Eyes (K, 3), shoulders (K, H, 3) and right (K, 3) of people who look at a point from there."""
+        """Eyes (K, 3), shoulders (K, H, 3) and right (K, 3) of people who look at a point from these."""
         flat, length = np.cos(down), float(self._lengths.mean())
         sight = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), -np.sin(down)], axis=1)
         ahead = np.stack([np.cos(azimuth + facing), np.sin(azimuth + facing), 0.0 * facing], axis=1)
@@ -162,7 +162,7 @@ def _middle(points: Doubles) -> Doubles:
 
 
 def _bent_wrists(ways: Doubles, axes: Doubles, mirrors: Doubles) -> tuple[Doubles, Doubles]:
-    """Directions of forearms, turned as far as wrists cannot bend, and the bends over the largest ones."""
+    """Directions of forearms, turned to where wrists can bend, and the bends over the largest possible."""
     local = np.einsum("...ij,...i->...j", axes, ways)
     flexion = np.arctan2(-local[..., 2], -local[..., 0])
     radial = np.arcsin(np.clip(mirrors * local[..., 1], -1.0, 1.0))

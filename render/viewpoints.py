@@ -85,7 +85,7 @@ class Framing:
         return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
     def shares(self, camera: Camera, poses: Doubles, most: float, frames: Integers | None = None) -> Doubles:
-        """Share (F,) of the picture's height that hands' longer sides have, at most `most`, their mean.
+        """Mean share (F,) of the picture's height that the hands' longer sides have, each at most `most`.
 
         Where two hands overlap, it is less by the covered share of the smaller one's box.
         """
@@ -154,13 +154,13 @@ def looking(directions: Doubles) -> Doubles:
 
 Placement = Literal["still", "orbit", "head", "anywhere", "rig"]
 _MOUNTED: Final = 0.03  # largest distance of a head's camera from the eyes along each axis [m]
-_MOSTLY: Final = 0.92  # share of the frames that a head leans back for
-_LEAN: Final = 0.3  # distance by which a head leans back for hands that are far apart [m]
+_MOSTLY: Final = 0.92  # share of the frames in which a head that leans back sees all hands
+_LEAN: Final = 0.3  # largest distance by which a head leans back [m]
 _ORBIT_PERIOD: Final = 12.0  # time of one revolution of a camera in orbit [s]
 _LOWEST, _HIGHEST = np.deg2rad(-20.0), np.deg2rad(75.0)  # elevation of cameras that stand anywhere
 _TRIES: Final = 60  # random directions that are tried for one camera
 _CLOSER: Final = 1.35  # largest ratio between a hand's share and `ViewConfig.share`
-_ENOUGH: Final = 1.05  # ratio between the share and that of hands up to which no other place is tried
+_ENOUGH: Final = 1.05  # ratio of the wanted share to the hands' up to which no other place is tried
 _SKIN_CLEARANCE: Final = 0.08  # least depth of a keypoint before a camera around hands [m]
 _FREE: Final = 0.8  # share of the room around hands in a picture that they are shifted within
 _ROUNDS: Final = 8  # iterations that fit the hands into a picture
@@ -169,10 +169,10 @@ _PLACES: Final = 16  # places, or orbits, that are tried for hands that are far 
 _AZIMUTHS: Final = 36  # azimuths of an orbit whose views are compared
 _SAMPLES: Final = 48  # frames in which they are compared
 _CENTERINGS: Final = 2  # times that a camera is turned to the middle of what it sees
-_LINGER: Final = 20.0  # exponent: how fast an orbit skips views with small hands
+_LINGER: Final = 20.0  # exponent of the hands' share in the time that an orbit spends on a view
 _QUICKEST: Final = 0.02  # shortest time at an azimuth of an orbit, as a share of the longest
-_ASIDE: Final = np.deg2rad(90.0)  # largest further angle from the front
-_HIDDEN: Final = 10.0  # penalty of a view from behind an arm; that of a view from twice as far is 1
+_ASIDE: Final = np.deg2rad(90.0)  # largest angle that is added to the usual one from the front
+_HIDDEN: Final = 10.0  # penalty of a view from behind an arm, in multiples of the wanted distance
 _ARM: Final = 0.5  # length of a forearm that views keep clear of [m]
 _ARM_DISTANCE: Final = 0.2  # least distance between its axis and a camera [m]
 _ARM_CLEARANCE: Final = np.deg2rad(35.0)  # least angle between a view and a forearm
@@ -271,7 +271,7 @@ class Viewpoints:
         user: UserBody | None = None,
         poses: Float[np.ndarray, "T 4 4"] | None = None,
     ) -> None:
-        """Place the cameras; `poses` are those of the one camera of its own that moves."""
+        """Place the cameras; `poses` move the first of the user's own cameras."""
         framing, own = Framing(take, user), config.cameras
         if own is not None:
             cameras = list(load_cameras(own) if isinstance(own, str) else own)
@@ -414,7 +414,7 @@ def _followed(
 ) -> tuple[float, _Path]:
     """A camera in these directions (T, 3) that shows all hands and moves as little as it can.
 
-    The first value is the median ratio of its distance and that of the share.
+    The first value is its median distance over the one at which the hands have the wanted share.
     """
     camera, rotations = preset(config.camera), looking(directions)
     kept = np.broadcast_to(framing.middle(), directions.shape)

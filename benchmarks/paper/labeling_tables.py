@@ -34,7 +34,7 @@ from train import (
 )
 from train.data.batches import paper_corruption
 from train.labelers.storage import shipped_labelers
-from train.settings import Kind, usual_settings
+from train.settings import usual_settings
 from train.simulation.scenes import KINDS
 
 # Median and p90 of real finger markers' gaps [frames]; docs/room.md.
@@ -65,19 +65,17 @@ def table2(
     data: Annotated[Path, tyro.conf.Positional],
     out: Path,
     *,
-    kinds: tuple[Kind, ...] = ("set",),
     samples: int = 300_000,
     num_frames: int = 5000,
     captures: tuple[Path, ...] = (),
     seed: int = 0,
     save: str | None = None,
 ) -> None:
-    """Train with and without random drops and ghosts, and test each network with and without them.
+    """Train the set labeler with and without random drops and ghosts, and test each network with and without.
 
     Args:
         data: Training set that handsim generate wrote.
         out: Folder for the runs; the same command continues where it was stopped.
-        kinds: Networks to train: set, cnn or both.
         samples: Clouds that each network is trained on (the paper: 12.8 million).
         num_frames: Test frames of people and poses that are not in the training set.
         captures: Labeled captures or folders of them, for a second table.
@@ -90,31 +88,24 @@ def table2(
     if captures:
         files = find_captures(captures)
         tests[f"{len(files)} captures"] = read_markers(files, names)
-    for kind in kinds:
-        runs = {name: out / f"{kind}-{name}" for name in AUGMENTATIONS}
-        for name, run in runs.items():
-            _train_augmentation(dataset, kind, name, run, samples, seed)
-        for title, markers in tests.items():
-            nets = {
-                name: measure_augmentations(load_labeler(glove, run), markers, seed=seed)
-                for name, run in runs.items()
-            }
-            Console().print(print_table2(nets, title=f"Table 2, {kind}: {title}, ours (the paper's) [%]"))
-            save_figures(save, _table2_figures(nets, f"Table 2, {kind}, {title}"))
+    runs = {name: out / f"set-{name}" for name in AUGMENTATIONS}
+    for name, run in runs.items():
+        _train_augmentation(dataset, name, run, samples, seed)
+    for title, markers in tests.items():
+        nets = {
+            name: measure_augmentations(load_labeler(glove, run), markers, seed=seed)
+            for name, run in runs.items()
+        }
+        Console().print(print_table2(nets, title=f"Table 2, set: {title}, ours (the paper's) [%]"))
+        save_figures(save, _table2_figures(nets, f"Table 2, set, {title}"))
 
 
-def _train_augmentation(dataset: Dataset, kind: Kind, name: str, run: Path, samples: int, seed: int) -> None:
+def _train_augmentation(dataset: Dataset, name: str, run: Path, samples: int, seed: int) -> None:
     drawn = augmentations(len(dataset.marker_names))[name]
-    usual = dataclasses.replace(usual_settings(kind), samples=samples, seed=seed, rig_share=0.0)
+    usual = dataclasses.replace(usual_settings("set"), samples=samples, seed=seed, rig_share=0.0)
     config = dataclasses.replace(usual, occlude=drawn.occlude, ghosts=drawn.ghosts)
     with progress_bar("samples") as bar:
-        train_labeler(
-            dataset,
-            run,
-            config,
-            progress=bar,
-            on_step=lambda step: bar.step(f"{kind} {name}, {step}"),
-        )
+        train_labeler(dataset, run, config, progress=bar, on_step=lambda step: bar.step(f"{name}, {step}"))
 
 
 def table3(glove: str = "dense19", seed: int = 0, save: str | None = None) -> None:
@@ -140,8 +131,6 @@ class TestConfig:
     """Shipped names, folders of trained labelers, or exported .onnx files; the layout's when not given."""
     num_frames: int = 5000
     """Test frames of people and poses that are in no training set, with the paper's recipe."""
-    captures: tuple[Path, ...] = ()
-    """Labeled captures or folders of them, for another column with the paper's recipe."""
     seed: int = 0
     """Seed of the test frames, the takes and the recipe; 0 gives the twins."""
     save: str | None = None
@@ -186,9 +175,6 @@ def _print_tests(table: str, glove: str, paper: Mapping[str, tuple[float, ...]],
     }
     stills = {"synthetic": held_out_markers(glove, config.num_frames, seed=config.seed)}
     takes = _simulate(glove, config.seed)
-    if config.captures:
-        names = next(iter(found.values())).marker_names
-        stills["captures"] = read_markers(find_captures(config.captures), names)
     for name, labeler in found.items():
         reports = measure_tests(labeler, stills, takes, seed=config.seed)
         Console().print(print_tests(reports, paper, title=f"{table}, {name}: ours (the paper's)"))

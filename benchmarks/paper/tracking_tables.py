@@ -61,7 +61,7 @@ _Config = Annotated[TableConfig, tyro.conf.arg(name="")]
 
 
 def table5(config: _Config) -> None:
-    """Trackers on the twins of the paper's captures: frames all of whose labels are right; errors and time.
+    """Trackers on the twins of the paper's captures: frames all of whose labels are right; errors.
 
     Args:
         config: Settings of the measurement.
@@ -70,7 +70,7 @@ def table5(config: _Config) -> None:
     with_body = _measure_with_body(takes[_WITH_BODY], config)
     console = Console()
     console.print(print_table5([*measured, *with_body], with_paper=config.glove == _PAPERS_GLOVE))
-    console.print(*print_errors(measured), print_trials(measured), print_times(measured), sep="\n")
+    console.print(*print_errors(measured), print_trials(measured), sep="\n")
     save_figures(config.save, table5_figures(measured) | body_figures(with_body))
 
 
@@ -153,14 +153,11 @@ def table5_figures(measured: Sequence[Measurement]) -> Figures:
             _mean_errors([one.report.by_occlusion()[bound] for one in row])
             for bound in row[0].report.by_occlusion()
         ]
-        times = np.concatenate([one.report.seconds for one in row])
         kept[f"right_{key}"] = f"frames all of whose labels are right [%], {_captures(row)}: {who}", right
         kept[f"errors_{key}"] = (
             f"mean errors of joints [mm], angles [deg], by markers missing: none, 1-2, 3-5, 6 or more: {who}",
             [[1e3 * joint, np.rad2deg(angle)] for joint, angle in errors],
         )
-        took = 1e3 * np.quantile(times, [0.5, 0.99])
-        kept[f"time_{key}"] = f"time of a frame, median and p99 [ms]: {who}", took
         if row[0].method == PAPERS_LOOP and row[0].users == "calibrated" and len(row[0].recovery):
             waits = [np.concatenate([one.initialization for one in row])]
             waits.append(np.concatenate([one.recovery for one in row]))
@@ -275,15 +272,6 @@ def print_errors(measured: Sequence[Measurement]) -> tuple[Table, Table]:
         joints.add_row(*head, *(_length(joint) for joint, _ in errors))
         angles.add_row(*head, *(_angle(angle) for _, angle in errors))
     return joints, angles
-
-
-def print_times(measured: Sequence[Measurement]) -> Table:
-    """Time per frame [ms], over all captures."""
-    table = _table("Time per frame on this machine [ms]", ("median", "p99"))
-    for head, row in _rows(measured):
-        seconds = np.concatenate([one.report.seconds for one in row])
-        table.add_row(*head, *(f"{1e3 * np.quantile(seconds, q):.2f}" for q in (0.5, 0.99)))
-    return table
 
 
 def print_trials(measured: Sequence[Measurement]) -> Table:

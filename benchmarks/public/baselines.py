@@ -31,7 +31,6 @@ TrackerName = Literal["handsim", "paper", "hungarian", "nearest"]
 Users = Literal["uncalibrated", "calibrated"]
 ABOUT: Final = "about.json"
 """What results were made with."""
-_USUAL_SIZE: Final = "M"
 _SEED: Final = 0  # of the paper's loop, which pairs hands and clusters at random
 _TRACKERS: Final[dict[TrackerName, MakeTracker]] = {
     "handsim": lambda users, labeler, first: Tracker(users, labeler),

@@ -30,7 +30,7 @@ from gloves import Capture, load_take, read_capture
 from gloves.captures.capture import UNLABELED
 from gloves.captures.formats import MOTIVE_BEGIN
 from handsim import HandSimError
-from handsim.errors import choices
+from handsim.errors import choices, shortened
 from handsim.files.inputs import check_regular, read_bytes
 
 SUFFIXES: Final = (".npz", ".csv", ".trc", ".c3d")
@@ -215,5 +215,4 @@ def _check_frames(frames: int, capture: Capture) -> None:
 
 
 def _shown(text: str) -> str:
-    printable = "".join(sign if sign.isprintable() else "?" for sign in text)
-    return printable if len(printable) <= _MOST_SHOWN else f"{printable[:_MOST_SHOWN]}..."
+    return shortened("".join(sign if sign.isprintable() else "?" for sign in text), _MOST_SHOWN)

@@ -5,13 +5,13 @@ files. Beyond COCO's fields an image has its camera (`K` for such pixels, the le
 and every random choice; an annotation has its side, its keypoints in the camera's axes [m], its pose, its
 shape and its skin.
 
-A line of YOLO's is the class, the box (center and size) and 21 x (x, y, flag), as shares of the picture's
+A YOLO label is the class, the box (center and size) and 21 x (x, y, flag), as shares of the picture's
 width and height from its corner. There is one class, because ultralytics mirrors pictures while it trains,
 which makes a right hand a left one.
 
 InterHand2.6M has millimeters and 42 joints: 21 of the right hand and 21 of the left, tip first and wrist
 last. Projections count pixels from the first one's center, boxes from the picture's corner. A dataset is
-one capture, "0". Its cameras are called by numerals, because its loader takes `int` of them, and have one
+one capture, "0". Its cameras are called by numerals, because its loader calls `int` on them, and have one
 pose each, so that a camera that moves becomes many. Each picture has our name of its camera beside the
 numeral.
 """

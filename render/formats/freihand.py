@@ -53,7 +53,7 @@ def hand_entries(frame: RenderedFrame) -> list[tuple[int, dict[str, Any]]]:
     for number, hand in enumerate(frame.hands):
         if not is_seen(hand):
             continue
-        # The bone that FreiHAND measures hands by: the middle finger's first.
+        # FreiHAND measures hands by the first bone of the middle finger.
         scale = float(np.linalg.norm(hand.keypoints_world[10] - hand.keypoints_world[9]))
         entry: dict[str, Any] = {
             "K": K,
@@ -183,7 +183,7 @@ def _pictures(frame: RenderedFrame, hand: int) -> dict[str, bytes]:
         raise without_colors("freihand")
     files = {"rgb": encode_jpeg(sensed.rgb)}
     mask = hand_mask(frame, hand)
-    if mask is not None:  # JPEG, because FreiHAND's readers ask for it; its best keeps black and white apart
+    if mask is not None:  # FreiHAND's readers expect JPEG, whose best quality keeps black and white apart
         files["mask"] = encode_jpeg(255 * mask.astype(np.uint8), quality=100)
     if sensed.depth is not None:
         files["depth"] = encode_depth(sensed.depth)

@@ -1,8 +1,8 @@
-"""PNG files by our own compiled encoder, several times as fast as the libraries' and without their choices.
+"""A compiled encoder of PNG files, several times as fast as those of libraries.
 
 A row is stored as its differences from the row above. Single bytes and runs of equal bytes then share one
-Huffman code, which is made for each picture. All of this is arithmetic of whole numbers: a picture has the
-same bytes on every machine, while libraries of compression adapt to the processor.
+Huffman code, which is made for each picture. The encoder computes with whole numbers alone, so that a picture
+has the same bytes on every machine; libraries choose how they compress by the processor.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ _SIGNATURE: Final = b"\x89PNG\r\n\x1a\n"
 _ZLIB: Final = b"\x78\x01"
 _GRAY, _COLORS = 0, 2  # PNG's types of color
 _UP: Final = 2  # PNG's filter that subtracts the row above
-# DEFLATE's alphabet: bytes, the end of a block, and lengths of runs, whose last one is a code of its own.
+# DEFLATE's symbols are bytes, the end of a block, and lengths of runs; the longest run has its own symbol.
 _END, _LONGEST_SYMBOL, _SYMBOLS = 256, 285, 286
-_SHORTEST, _LONGEST = 3, 258  # of runs
+_SHORTEST, _LONGEST = 3, 258  # lengths of runs [bytes]
 _ADLER: Final = 65521  # largest prime below 2^16
-_MOST_BITS: Final = 15  # of a code
+_MOST_BITS: Final = 15  # length of the longest code [bits]
 _TOKENS: Final = _END + _LONGEST + 1  # bytes, the end, and 256 + length for runs
 _HEADER_WORDS: Final = 48  # room for the code's lengths and the last word
 
@@ -41,7 +41,7 @@ def encode_png(
     rows = np.ascontiguousarray(content).view(np.uint8).reshape(height, -1)
     size = height * (1 + rows.shape[1])
     words = np.empty(size // 8 + 1, np.uint64)
-    words[-1] = 0  # it may have bytes behind the last one
+    words[-1] = 0  # the last word may reach beyond the data
     data = words.view(np.uint8)[:size]
     _subtract_above(rows, data.reshape(height, -1))
     tokens = np.empty(len(data) + 1, np.uint16)
@@ -65,7 +65,7 @@ def _chunk(name: bytes, content: bytes) -> bytes:
 
 @kernel
 def _subtract_above(rows: Bytes, filtered: Bytes) -> None:
-    """Write rows (H, N) as differences from those above, each behind its filter's number (H, 1 + N)."""
+    """Write the differences of rows (H, N) from those above, each after its filter's number (H, 1 + N)."""
     filtered[:, 0] = _UP
     filtered[0, 1:] = rows[0]
     for row in range(1, len(rows)):
@@ -78,7 +78,7 @@ def _subtract_above(rows: Bytes, filtered: Bytes) -> None:
 def _tokenize(data: Bytes, words: NDArray[np.uint64], tokens: NDArray[np.uint16], counts: Integers) -> Any:
     """Turn bytes into counted tokens for compression; return how many there are and Adler's checksum.
 
-    `words` are the same bytes, eight in each, behind which zeros follow.
+    `words` hold the same bytes, eight in each, followed by zeros.
     """
     count = place = 0
     total, weighted = np.int64(1), np.int64(0)  # Adler's sums; 63 bits hold those of 250 million bytes
@@ -150,7 +150,7 @@ def _code_lengths(counts: Integers) -> Any:
     depths = np.zeros(2 * leaves - 1, np.int64)
     depths[0] = _MOST_BITS + 1
     while depths[:leaves].max() > _MOST_BITS:
-        leaf, inner = 0, leaves  # the lightest of either kind without a parent
+        leaf, inner = 0, leaves  # the lightest leaf and inner node without a parent
         for node in range(leaves, 2 * leaves - 1):
             weights[node] = 0
             for _ in range(2):
@@ -187,7 +187,7 @@ def _codes(lengths: Integers) -> Any:
             if token < _END + _SHORTEST:
                 continue
             symbol, bits, value = _run_symbol(token - _END)
-            distance = 1  # one zero: the only distance, one byte
+            distance = 1  # a single zero bit stands for the only distance, one byte
         codes[token] = symbol_codes[symbol] | (value << lengths[symbol])
         sizes[token] = lengths[symbol] + bits + distance
     return codes, sizes
@@ -201,7 +201,7 @@ def _write_block(
 
     `codes` have their lengths in the upper half.
     """
-    # It is the last block, of type 2. Lengths of codes are numbers of four bits, which are codes in turn.
+    # The block is the last one, of type 2. The lengths of the codes are themselves codes, of four bits each.
     header = np.zeros((24 + _SYMBOLS + 1, 2), np.uint64)
     header[0], header[1], header[2], header[4] = (1, 1), (2, 2), (_SYMBOLS - 257, 5), (15, 4)
     header[3, 1] = 5
@@ -232,7 +232,7 @@ def _put(
     place: int,
     block: NDArray[np.uint32],
 ) -> Any:
-    """Add some bits to those that are held; whole words are written, without a branch."""
+    """Append bits to those that are held back, and write a word when it is full, without a branch."""
     held |= value << count
     count += bits
     block[place] = np.uint32(held)

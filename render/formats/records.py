@@ -79,20 +79,17 @@ def keypoint_flags(pixels: Doubles, visible: Flags, size: tuple[int, int]) -> In
 def hand_mask(frame: RenderedFrame, hand: int) -> Flags | None:
     """Mask (H, W) of one hand with its markers, without its forearm; None without an id picture."""
     parts, instances = frame.ideal.parts, frame.ideal.instances
-    first = 1 + PARTS_A_HAND * hand
-    if instances is not None:
-        mask: Flags = instances == hand + 1
-        return mask if parts is None else mask & (parts != first + FOREARM)
-    if parts is not None:
-        return (parts >= first) & (parts < first + FOREARM)
-    return None
+    if parts is None or instances is None:
+        return None
+    mask: Flags = (instances == 1 + hand) & (parts != 1 + PARTS_A_HAND * hand + FOREARM)
+    return mask
 
 
 def run_lengths(mask: Flags) -> str:
     """COCO's compressed run lengths of a mask (H, W): zeros and ones in turn, column by column.
 
-    A run is its difference from the last but one, in pieces of five bits, the lowest first; a sixth bit says
-    that more follow, and 48 makes a letter of it.
+    A length is stored as its difference from the length two runs before, in groups of five bits, the lowest
+    first. A sixth bit says that more groups follow, and 48 is added to make each group a letter.
     """
     flat = cv2.transpose(mask.view(np.uint8)).ravel()
     changes = np.flatnonzero(flat[1:] != flat[:-1]) + 1
@@ -145,7 +142,7 @@ def body_records(frame: RenderedFrame) -> list[dict[str, Any]]:
 
 
 def rounded(values: NDArray[np.floating], decimals: int) -> Any:
-    """Numbers as nested lists, short enough to be read."""
+    """Numbers as nested lists, rounded to some decimals."""
     return np.round(np.asarray(values, dtype=np.float64), decimals).tolist()
 
 
@@ -225,15 +222,13 @@ def _depth_steps(depth: Floats) -> Any:
 
 def encode_ids(pictures: Pictures) -> bytes | None:
     """Parts, instances and markers as red, green and blue of one PNG; None for pictures without ids."""
-    layers = (pictures.parts, pictures.instances, pictures.markers)
-    known = [layer for layer in layers if layer is not None]
-    if not known:
+    if pictures.parts is None or pictures.instances is None or pictures.markers is None:
         return None
-    return encode_png(cv2.merge([np.zeros_like(known[0]) if layer is None else layer for layer in layers]))
+    return encode_png(cv2.merge([pictures.parts, pictures.instances, pictures.markers]))
 
 
 def encode_normals(normals: Float32[np.ndarray, "H W 3"]) -> bytes:
-    """Unit normals as 8-bit PNG: x, y, z are (red, green, blue - 128) / 127; black is nothing."""
+    """Unit normals as 8-bit PNG: x, y, z are (red, green, blue - 128) / 127; black without a surface."""
     return encode_png(_normal_levels(np.ascontiguousarray(normals)))
 
 

@@ -40,7 +40,7 @@ def shards_in(folder: Path, *, suffix: str = "") -> frozenset[int]:
 
 @contextmanager
 def one_sentence(folder: Path, doing: str) -> Iterator[None]:
-    """Tell trouble with the disk in one sentence."""
+    """Raise errors of the disk in the block as one sentence."""
     try:
         yield
     except OSError as error:
@@ -78,9 +78,9 @@ def clear_leftovers(path: Path) -> None:
 
 @contextmanager
 def new_tar(path: Path) -> Iterator[Callable[[str, bytes], None]]:
-    """What adds files by name to a tar file, which takes its own name when the block ends well.
+    """Yield a function that adds files to a tar, which gets its name when the block ends without an error.
 
-    Its bytes depend on its content alone: no times, no owners.
+    The tar's bytes depend on its content alone, because it stores no times and no owners.
     """
     clear_leftovers(path)
     with atomic_write(path) as temporary, tarfile.open(temporary, "w", format=tarfile.USTAR_FORMAT) as tar:
@@ -165,9 +165,9 @@ class FolderWriter:
 
     @contextmanager
     def new_shard(self, shard: int) -> Iterator[Path]:
-        """A temporary folder that becomes a shard when the block ends well; those in it go beside it.
+        """Yield a temporary folder that becomes a shard when the block ends without an error.
 
-        Photographs take their names last: a shard that is there is whole.
+        Its folders of depth, ids and so on move first, so that a shard with photographs is complete.
         """
         with new_folder(self.pictures / shard_name(shard)) as temporary:
             yield temporary
@@ -179,7 +179,7 @@ class FolderWriter:
                     (temporary / kind).replace(place)
 
     def beside(self, shard: int) -> dict[str, Path]:
-        """Where a shard's depth, ids and so on are, if there are any."""
+        """The folders of a shard's depth, ids and so on by kind, whether they exist or not."""
         return {kind: self.folder / kind / self.part / shard_name(shard) for kind in BESIDE}
 
     def finish(self) -> list[Path]:

@@ -48,9 +48,9 @@ from render.formats.shards import new_tar, one_sentence, shard_name, shards_in
 from render.frames import Doubles, HandTruth, RenderedFrame
 
 HAND_SHAPES: Final = "__hand_shapes.json__"
-"""File of a clip with the hand model; webdataset passes over such names."""
+"""File of a clip with the hand model; webdataset skips names of this form."""
 _MODELS: Final = {"pinhole": "PinholePlane", "brown": "OpenCV", "fisheye": "OculusVisionFishEye"}
-# Our wrist frame seen from UmeTrack's.
+# Rotation from our wrist frame to UmeTrack's.
 _UMETRACK_FROM_OURS: Final = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 _JOINTS_PER_DIGIT: Final = 4
 _ROOT_FRAMES: Final = 1  # a root that moves with the wrist comes before our bones

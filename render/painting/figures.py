@@ -43,8 +43,8 @@ class Material:
     """Light that travels under the surface, for red, green and blue: cosine beyond grazing at which lamps
     still light it."""
     texels: UInt8[np.ndarray, "H W 8"] | None = None
-    """Factors on the above, the top row first: sRGB, roughness (255 for 1), normals over the surface's own
-    (0 for -1, 255 for 1) in the axes along u and normal x that, and nothing."""
+    """Factors on color (sRGB) and roughness (255 for 1), the relief's normal (0 for -1, 255 for 1) along u,
+    along normal x u and along the normal, and an unused byte; the top row comes first."""
 
 
 def linear(color: Float[np.ndarray, "*batch 3"] | tuple[float, float, float]) -> Doubles:
@@ -83,7 +83,7 @@ _BODY_BALLS: Final = 0.0032  # [m] radius of the markers of rigid bodies, 6.4 mm
 def sphere_surface(
     centers: Float[np.ndarray, "N 3"], radius: float, *, level: int
 ) -> tuple[Doubles, Doubles, Integers]:
-    """Vertices [m], normals and faces of balls, one after the other; all have as many of each."""
+    """Vertices [m], normals and faces of balls, one after the other; each ball has the same number."""
     ball = _unit_ball(level)
     count, each = len(centers), len(ball.vertices)
     vertices = (centers[:, None] + radius * ball.vertices).reshape(-1, 3)

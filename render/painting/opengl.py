@@ -123,10 +123,10 @@ def _renderer_name() -> str:
 
 OPENGL_FROM_OPENCV: Final = np.diag([1.0, -1.0, -1.0, 1.0])
 """Turns a camera's axes: OpenCV's x right, y down, z ahead into OpenGL's x right, y up, z back."""
-_NEAR, _FAR = 0.01, 30.0  # [m]
+_NEAR, _FAR = 0.01, 30.0  # least and largest depth that is drawn [m]
 _GL_LINEAR: Final = 0x2601
 _DISTANCE: Final = 300.0  # [m], so far that a lamp's rays are as good as parallel
-_SHADOW_DEPTH: Final = 60.0  # [scene diagonals]
+_SHADOW_DEPTH: Final = 60.0  # depth of the camera that sees the shadows [scene diagonals]
 
 
 def paint_opengl(camera: Camera, drawn: Sequence[Drawn], lighting: Lighting) -> UInt8[np.ndarray, "H W 4"]:
@@ -196,7 +196,7 @@ def add_lights(pyrender: Any, scene: Any, lighting: Lighting) -> None:
 
 
 def _cast_shadows(pyrender: Any, light: Any, extent: float) -> None:
-    # pyrender's shadow bias is a fixed share of this camera's depth, too little for skin; depth adds bias.
+    # pyrender's shadow bias is a fixed share of this camera's depth: a large depth makes it enough for skin.
     # Its light stands one scene diagonal away from the middle, so half a diagonal takes in everything.
     diagonal = max(extent, 1e-3)  # an empty scene has none
     light._get_shadow_camera = lambda _: pyrender.OrthographicCamera(

@@ -38,7 +38,7 @@ from render.painting.shading import (
 )
 from render.scenery.lights import Lighting, turned_irradiance
 
-_SMOOTH: Final = 0.006  # share of the depth by which samples of one surface in a pixel differ
+_SMOOTH: Final = 0.006  # largest difference of depth in a pixel of one surface, as a share of the depth
 _SHADED_AROUND: Final = 0.1  # border whose vertices may have faces in the picture, as a share of its size
 _BLOCK: Final = 1000  # points shaded at a time: they fit into the cache, and rows are no power of two apart
 
@@ -153,11 +153,11 @@ def _covered(first: NDArray[np.int32]) -> Any:
         for column in range(width):
             both = (upper[2 * column] & upper[2 * column + 1]) & (lower[2 * column] & lower[2 * column + 1])
             covered[count] = row * width + column
-            count += both >= 0  # all bits of -1 are set, so that only four of them are negative together
+            count += both >= 0  # all bits of -1 are set, so that `both` is -1 only where all four are
     return covered[:count]
 
 
-# Arrays are arguments of their own: numba counts references to those in a tuple, which costs too much.
+# Each array is an argument, because numba counts references to the arrays of a tuple, which takes long.
 @kernel
 def _add_surface(
     nearness: Floats,
@@ -190,7 +190,7 @@ def _add_surface(
     spot = row = start = 0
     for place in range(len(covered) + 1):
         if spot > _BLOCK - 4 or place == len(covered):
-            # A copy takes time; a full block has a few points of before, or zeros, behind the last one.
+            # A full block is not copied; its last columns hold points of an earlier block, or zeros.
             spots = block if spot > _BLOCK - 4 else np.ascontiguousarray(block[:, :spot])
             light = shade(spots, texels, finish, to_linear, lamps, ambient, to_map, nearest, bias)
             for k in range(3):
@@ -252,7 +252,7 @@ def _write_spot(
 ) -> None:
     """Write a surface point of the face (a, b, c): its vertices' rows, interpolated with perspective.
 
-    It is behind column x and row y of the picture at twice its size [px].
+    The point is seen at column x and row y of a picture of twice the size [px].
     """
     ax, ay = corners[a, 0], corners[a, 1]
     bx, by = corners[b, 0] - ax, corners[b, 1] - ay

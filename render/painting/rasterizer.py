@@ -25,7 +25,7 @@ from render.frames import Bytes, Doubles, Flags, Floats, Geometry, Integers
 
 NEAR: Final = 0.01
 """Distance of the plane before the camera at which triangles are cut off [m]."""
-_ROUNDING: Final = 1e-12  # of barycentric coordinates, so that no pixel on a common side falls between faces
+_ROUNDING: Final = 1e-12  # of barycentric coordinates, so that a pixel on a common side belongs to a face
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,7 +68,7 @@ def join(surfaces: Sequence[Triangles]) -> Triangles:
 
 
 def rasterize(camera: Camera, surface: Triangles, *, with_normals: bool = True) -> Geometry:
-    """Depth, normals, parts, instances and markers as a pinhole camera sees them; `cameras.warp` has others.
+    """Depth, normals and ids as a pinhole camera sees them; `see` draws through other lenses.
 
     The surface is closed; the backs of its faces are not drawn.
     """
@@ -88,11 +88,11 @@ def rasterize(camera: Camera, surface: Triangles, *, with_normals: bool = True) 
 
 
 class CutOff(NamedTuple):
-    """Triangles whose parts before the plane `NEAR` are further triangles behind the others."""
+    """Triangles, followed by the visible pieces of those that the plane `NEAR` crosses."""
 
     local: Float[np.ndarray, "V 3"]  # vertices in the camera's axes, those on the plane last [m]
     faces: Int[np.ndarray, "F 3"]
-    owners: Int[np.ndarray, "N"]  # triangle that each further one is a part of
+    owners: Int[np.ndarray, "N"]  # the triangle that each piece is a part of
     ends: Int[np.ndarray, "M 2"]  # vertices between which those on the plane lie
     shares: Float[np.ndarray, "M 1"]  # places between them, from 0 to 1
 
@@ -104,12 +104,12 @@ class CutOff(NamedTuple):
         return np.concatenate([values, (first + self.shares * (second - first)).astype(values.dtype)])
 
     def owned(self, values: NDArray[Any]) -> NDArray[Any]:
-        """Values of the triangles (F - N, ...), and of the further ones."""
+        """Values of the triangles (F - N, ...), followed by those of the pieces."""
         return np.concatenate([values, values[self.owners]]) if len(self.owners) else values
 
 
 def cut_off(local: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> CutOff:
-    """Triangles (in the camera's axes [m]) with those cut off that the plane `NEAR` crosses."""
+    """Cut the triangles (in the camera's axes [m]) that the plane `NEAR` crosses."""
     faces = np.ascontiguousarray(faces, dtype=np.int64)
     ahead = local[:, 2] >= NEAR
     crossed = none = np.empty(0, dtype=np.int64)
@@ -281,9 +281,9 @@ def _interpolate(
                 picture[row, column, i] *= scale
 
 
-_MARGIN: Final = 2  # [px] around what is looked up
-_WIDEST: Final = 1.4  # tangent up to which one flat picture suffices: 54 degrees
-_ONE_SURFACE: Final = 0.01  # share of the depth by which neighboring pixels of one surface differ
+_MARGIN: Final = 2  # border of a face around the pixels that are looked up in it [px]
+_WIDEST: Final = 1.4  # largest tangent of an angle from the axis in one flat picture: 54 degrees
+_ONE_SURFACE: Final = 0.01  # largest difference of depth between neighbors of one surface, as a share of it
 # Axes of the cube's faces in the camera's axes, as columns: ahead, right, left, down, up, back.
 _FACE_AXES: Final = (
     ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
@@ -331,7 +331,7 @@ def faces_for(camera: Camera) -> list[Camera]:
 def warp(camera: Camera, pictures: Sequence[NDArray[Any]], flag: int = cv2.INTER_NEAREST) -> NDArray[Any]:
     """The picture through the lens, from one for each of `faces_for`; 0 where it sees nothing.
 
-    The flag is OpenCV's way of interpolation.
+    `flag` is one of OpenCV's methods of interpolation.
     """
     if camera.lens.kind == "pinhole":
         return pictures[0]
@@ -447,7 +447,7 @@ def _face(rays: Doubles, mine: Flags, rotation: Doubles) -> _Face | None:
 
 def _finest(local: Doubles, mine: Flags) -> float:
     """Focal length [px] at which no step between the lens's pixels is less than a pixel of the face."""
-    near = local[..., 2] > 0.2  # a face's own pixels are, and their neighbors
+    near = local[..., 2] > 0.2  # holds for a face's own pixels and their neighbors
     flat = np.full_like(local[..., :2], np.nan)
     flat[near] = local[near][:, :2] / local[near][:, 2:]
     finest = 1.0

@@ -1,7 +1,8 @@
 """Shading of surface points by texture, lamps and shadows, with glTF 2.0's microfacet model.
 
-Lambert's diffuse light under Schlick's Fresnel term, GGX with Smith's occlusion in Schlick's form (Khronos
-glTF 2.0 specification, appendix B), as in pyrender's shader, so that both painters agree.
+Diffuse light is Lambert's under Schlick's Fresnel term. Specular light is GGX with Smith's occlusion in
+Schlick's form (Khronos glTF 2.0 specification, appendix B). pyrender's shader computes the same, so that both
+painters agree.
 
 Points are columns of a table with a row for each number, so that loops over points are compiled into vector
 instructions: a loop writes one row and reads few, or the compiler cannot tell that rows do not overlap.
@@ -37,7 +38,7 @@ _SHADED: Final = 0.9  # share of a lamp's light that a shadow takes; the rest is
 
 
 class ShadowMap(NamedTuple):
-    """How near to a far lamp its first surface is."""
+    """How near the first surface on each ray of a far lamp is to it."""
 
     to_map: Float[np.ndarray, "3 4"]
     """Maps positions [m] to columns and rows [texels] and nearness to the lamp [m]."""
@@ -91,7 +92,7 @@ def _onto_map(points: Floats, rotation: Doubles, seen: Flags) -> Any:
 
 @kernel
 def lit_share(to_map: Doubles, nearest: Floats, bias: float, x: float, y: float, z: float) -> float:
-    """Visible share of the lamp at (x, y, z) [m]: the mean over 3 x 3 texels of a `ShadowMap`'s fields."""
+    """Share of the lamp seen from (x, y, z) [m], a mean over 3 x 3 texels of a `ShadowMap`'s fields."""
     across = to_map[0, 0] * x + to_map[0, 1] * y + to_map[0, 2] * z + to_map[0, 3] - 0.5
     down = to_map[1, 0] * x + to_map[1, 1] * y + to_map[1, 2] * z + to_map[1, 3] - 0.5
     near = to_map[2, 0] * x + to_map[2, 1] * y + to_map[2, 2] * z + to_map[2, 3] + bias
@@ -126,7 +127,7 @@ def level_behind(backdrop: Backdrop, camera: Camera, drawn: Sequence[Drawn]) -> 
 def light_behind(
     camera: Camera, drawn: Sequence[Drawn], lighting: Lighting, backdrop: Backdrop
 ) -> Float32[np.ndarray, "H W"] | None:
-    """Share of its light that a backdrop keeps beside the first lamp's shadows; None without shadows."""
+    """Light on a backdrop with the first lamp's shadows over that without them; None without shadows."""
     if not drawn or not lighting.lamps:
         return None
     normal = backdrop.normal
@@ -212,8 +213,8 @@ def _fall(
 
 
 _FACING: Final = np.float32(0.04)  # specular reflectance of dielectrics at normal incidence
-_LIFT: Final = 1.7  # shadow look-ups start this many biases of the map off a slanted surface
-_UNDER: Final = 0.012  # depth in the skin that scattered light passes at a scatter of 1 [m]
+_LIFT: Final = 1.7  # distance from a slanted surface at which shadows are looked up [biases]
+_UNDER: Final = 0.012  # thickness of skin that light passes at a scatter of 1 [m]
 _PI: Final = np.float32(np.pi)
 _ZERO: Final = np.float32(0.0)
 _ONE: Final = np.float32(1.0)
@@ -236,17 +237,17 @@ TO_DISPLAY: Final = (np.minimum(np.arange(_LEVELS + 1) / (_LEVELS - 1), 1.0) ** 
 """Display values in [0, 1] by the square root of linear light, where the curve is nearly straight."""
 
 SPOT: Final = 23
-"""Number of rows of a table of surface points, a column a point.
+"""Number of rows of a table of surface points, which has a column for each point.
 
-Position [m] (3) and normal (3) in the camera's axes; tint (3); linear color (3); roughness; the way in which
-u grows (3) and the texture's normal (3), both without a meaning where there is no texture; and what `shade`
-finds: unit vector to the camera (3) and its cosine with the normal."""
+Position [m] (3) and normal (3) in the camera's axes; tint (3); linear color (3); roughness; the direction
+in which u grows (3) and the texture's normal (3), both unused without a texture; and what `shade` computes:
+the unit vector to the camera (3) and its cosine with the normal."""
 POSITION, NORMAL, TINT, COLOR, ROUGH, TANGENT, BUMP, VIEW, FACING = 0, 3, 6, 9, 12, 13, 16, 19, 22
 
 
 @kernel
 def display(light: Floats, tint: Floats, table: Floats) -> None:
-    """Turn linear light (N,) of this tint (N,) into display values, by `TO_DISPLAY` up to 1, or by none."""
+    """Replace linear light (N,), times a tint (N,), by display values, by `TO_DISPLAY` up to 1, or by none."""
     if len(table) == 0:
         for n in range(len(light)):
             value = tint[n] * light[n]
@@ -302,7 +303,7 @@ def _read_texels(spots: Floats, texels: NDArray[np.uint32], finish: Doubles, tab
 def _mix_bytes(
     near: NDArray[np.uint32], bits: np.uint32, right: Floats, below: Floats, mixed: Floats
 ) -> None:
-    """Write the means (N,) of one byte of four texels (4, N), left and right of above and below."""
+    """Interpolate a byte of four texels (4, N): the left and right ones above, then those below."""
     a, b, c, d = near[0], near[1], near[2], near[3]
     low = np.uint32(255)
     for n in range(len(mixed)):
@@ -333,7 +334,7 @@ def shade(
         finish: Linear color (3), roughness, glow, scatter (3); see `Material`.
         table: `TO_LINEAR`.
         lamps: Rows (L, 9): unit vector to the lamp, its light with shadows, and its light without.
-        ambient: Ambient light by the normal (9, 3); see `surroundings.irradiance`.
+        ambient: Ambient light by the normal (9, 3); see `lights.irradiance`.
         to_map: `ShadowMap.to_map` (3, 4) of the first lamp.
         nearest: `ShadowMap.nearest` (3, N, N) of the first lamp [m].
         bias: `ShadowMap.bias` of the first lamp [m].
@@ -519,6 +520,6 @@ def _add_lamp(
     """
     diffuse = (_ONE - _FACING) / (_PI * (_ONE + scatter))
     for n in range(len(light)):
-        wrapped = cosine[n] + scatter  # around the edge of the light
+        wrapped = cosine[n] + scatter  # light reaches around the edge of the lit side
         wrapped = (wrapped if wrapped > _ZERO else _ZERO) * (_ONE - fresnel[n]) * diffuse
         light[n] += (wrapped * color[n] + mirrored[n]) * (lit[n] * hard + soft)

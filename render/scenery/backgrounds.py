@@ -161,7 +161,7 @@ _SOFTNESS: Final = (0.03, 0.25)  # range of shadows' softness, from that of a ba
 BackgroundKind = Literal["plain", "gradient", "noise", "clutter", "room", "photo"]
 KINDS: Final[tuple[BackgroundKind, ...]] = ("plain", "gradient", "noise", "clutter", "room", "photo")
 _USUAL_SHARES: Final = {"plain": 0.1, "gradient": 0.1, "noise": 0.15, "clutter": 0.15, "room": 0.5}
-_CLOSE: Final = ("plain", "gradient", "noise", "clutter")  # kinds that may be a wall or a table
+_CLOSE: Final = ("plain", "gradient", "noise", "clutter")  # kinds that may be as near as a wall or a table
 _OUT_OF_FOCUS: Final = ("gradient", "noise", "clutter", "room")  # kinds drawn at half the resolution
 _GRAINS: Final = (6.0, 60.0)  # range of the number of grains along the height of a picture
 _GRAIN_CONTRAST: Final = (0.1, 0.5)  # contrast of grain over that of any two colors
@@ -174,7 +174,7 @@ class Backdrop:
 
     gap: float  # distance from the nearest point of the hands [m]
     recedes: tuple[float, float] = (0.0, 0.0)  # slopes to the right and downwards
-    softness: float = 0.1  # tangent of half the angle under which it sees the lamp
+    softness: float = 0.1  # tangent of half the angle that the lamp takes up, seen from it
     level: float | None = None
     """Position along its normal in the camera's axes [m]; None: the gap is from the hands of each picture."""
     shadows: bool = True  # whether it catches the hands' shadows, or is too far away for them
@@ -288,7 +288,7 @@ def kept_background(background: Background, size: tuple[int, int]) -> Float32[np
 
 
 def _coarse(background: Background, size: tuple[int, int]) -> Floats:
-    """The picture of `draw_background`, at half its size if that is as good."""
+    """The picture of `draw_background`, at half its size for kinds that are out of focus."""
     rng = np.random.default_rng(background.seed)
     first, second = (np.array(color, dtype=np.float32) for color in background.colors)
     halved = (max(2, size[0] // 2), max(2, size[1] // 2))
@@ -409,7 +409,7 @@ def _paint_object(picture: Floats, outline: NDArray[Any], color: Floats, *, shad
 
 @kernel
 def _lay_over(part: Floats, covered: Bytes, shadow: Bytes, color: Floats) -> None:
-    """Lay a linear color over a part (h, w, 3) of a picture; 255 covers it, or takes half its light."""
+    """Lay a linear color over a part (h, w, 3); 255 covers a pixel, and in `shadow` halves its light."""
     for row in range(part.shape[0]):
         for column in range(part.shape[1]):
             if covered[row, column] or shadow[row, column]:
@@ -516,7 +516,7 @@ def enclose(
 
 
 def _sloping(rays: NDArray[Any]) -> NDArray[Any]:
-    """Rays (..., 3) that meet a wall along each axis."""
+    """Rays (..., 3) without zeros, so that each meets a wall along each axis."""
     return np.where(np.abs(rays) < _SHORTEST, np.asarray(_SHORTEST, rays.dtype), rays)
 
 
@@ -601,7 +601,7 @@ def _drawn(
 
 @functools.lru_cache(maxsize=4)
 def _rays(size: tuple[int, int], focal: tuple[float, ...], lens: Lens) -> tuple[Floats, Flags]:
-    """Rays (H W, 3) in a camera's axes, any where the lens sees nothing, and where (H, W) it sees."""
+    """Rays (H W, 3) in a camera's axes, and where (H, W) the lens sees; elsewhere rays are arbitrary."""
     rays = Camera("rays", size, np.reshape(focal, (3, 3)), lens=lens).rays()
     known = np.isfinite(rays).all(axis=-1)
     return np.where(known[..., None], rays, 1.0).reshape(-1, 3).astype(np.float32), known

@@ -39,8 +39,8 @@ _LEVEL: Final = 1.44  # usual light of a white surface before all lamps, 1 for t
 _MAP_SIZE: Final = (1024, 512)  # size of a written map [px]
 _LOBE: Final = 300.0  # sharpness of a lamp in it, a spot with a standard deviation of 3.3 degrees
 _AHEAD: Final = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # axes of who looks along y
-_BRIGHT: Final = 3.0  # luminance beyond which light of a map is a lamp's, over the mean
-# Factors of a matt surface on each order, and integrals of the squared functions over the sphere.
+_BRIGHT: Final = 3.0  # ratio to the mean luminance from which on light of a map is a lamp's
+# For each function of `_sphere`, how much of it a matt surface keeps, and the integral of its square.
 _MATT: Final = np.array([1.0, *[2.0 / 3.0] * 3, *[0.25] * 5])
 _SQUARES: Final = np.pi * np.array([4.0, *[4.0 / 3.0] * 3, *[4.0 / 15.0] * 3, 16.0 / 15.0, 16.0 / 5.0])
 
@@ -87,7 +87,7 @@ STUDIO: Final = Lighting(
 
 def sample_lighting(*, rng: np.random.Generator) -> Lighting:
     """Random light: a key lamp from in front or above, fill, sky and ground, each with its color."""
-    # The back of a hand sends back the light of its own color in the median of views.
+    # At this level the back of a hand has the brightness of its own color in the median of views.
     exposure = _LEVEL * float(np.exp(np.clip(rng.normal(0.0, 0.18), -0.4, 0.4)))
     warmth = rng.normal(0.0, 0.06)  # lamps are warm or cold, and white balances keep some of it
     # These shares give an open palm the standard deviation of lightness that photographs have, 3.6.
@@ -177,7 +177,7 @@ def write_environment_map(file: str | Path, *, seed: int = 0) -> None:
 
 
 def _light_of_map(light: Doubles) -> Lighting:
-    """A lamp where light (D, 3) from the directions of `_sphere` is strongest; the rest is ambient."""
+    """A lamp where the light (D, 3) from the directions of `_sphere` is strongest, and ambient light."""
     luminance = np.maximum(light @ LUMINANCE, 1e-6)
     beyond = light * np.maximum(1.0 - _BRIGHT * luminance.mean() / luminance, 0.0)[:, None]
     lamp = 4.0 / len(light) * beyond.sum(axis=0) + 1e-6  # what a white surface that faces it reflects
@@ -212,7 +212,7 @@ def _projected(light: Doubles) -> Doubles:
 
 
 def turned_irradiance(rows: Float[np.ndarray, "N 3"], rotation: Float[np.ndarray, "3 3"]) -> Doubles:
-    """Rows of `irradiance`, or of none of its rows, by the normal in axes that the rotation turns to."""
+    """Rows of `irradiance`, or no rows, for normals in the axes that the rotation turns to."""
     if not len(rows):
         return rows
     square = np.empty((3, 3, 3))  # the quadratic part as a symmetric matrix for each color

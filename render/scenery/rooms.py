@@ -196,7 +196,7 @@ def _place_boxes(room: Doubles, eye: Doubles, rng: np.random.Generator) -> _Boxe
     )
 
 
-# Arrays are arguments of their own: numba counts references to those in a tuple, which costs too much.
+# Each array is an argument, because numba counts references to the arrays of a tuple, which takes long.
 @kernel
 def _cast(
     rays: Floats,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import torch
 
 from benchmarks.any_layout_training import LayoutBatches, LayoutTraining, sample_skin_bank
 from train.labelers.networks import LayoutNetworkConfig
@@ -54,19 +53,6 @@ def test_batches_hold_layouts_of_one_size_and_their_clouds(small_bank):
         assert cloud.truth.max() < count
         assert (cloud.present & (cloud.truth >= 0)).sum(axis=1).min() >= 3
         assert layouts.max() <= 1.01 and layouts.min() >= 0.0
-
-
-def test_a_run_that_was_stopped_goes_on_as_if_it_was_not(small_bank, tmp_path):
-    drawn = [LayoutBatches(small_bank, np.random.default_rng(number)).draw() for number in range(2)]
-    whole, first = LayoutTraining(100, SMALL), LayoutTraining(100, SMALL)
-    losses = [whole.step(*batch)[0] for batch in drawn]
-    first.step(*drawn[0])
-    first.save(tmp_path / "checkpoint.pt")
-    torch.manual_seed(9)
-    second = LayoutTraining(100, SMALL)
-    second.restore(tmp_path / "checkpoint.pt")
-    assert second.step(*drawn[1])[0] == pytest.approx(losses[1], rel=1e-5)
-    assert second.done == 2
 
 
 def test_the_loss_falls(small_bank):

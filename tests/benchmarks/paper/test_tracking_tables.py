@@ -81,12 +81,11 @@ def test_table_5_has_a_row_a_tracker_and_kind_of_hands(capsys, quick, measured):
     kept = {name: value for name, (_, value) in table5_figures(measured[1]).items()}
     for method, key in zip(METHODS, ("", "loop_", "nearest_", "hungarian_"), strict=True):
         for users, who in (("calibrated", "true"), ("uncalibrated", "size")):
-            shares, joints, angles, waits, times = tables[method, users]
+            shares, joints, angles, waits = tables[method, users]
             assert shares == [f"{share:.2f}" for share in kept[f"right_{key}{who}"]]
             errors = kept[f"errors_{key}{who}"]
             assert joints == ["" if np.isnan(joint) else f"{joint:.2f}" for joint, _ in errors]
             assert angles == ["" if np.isnan(angle) else f"{angle:.2f}" for _, angle in errors]
-            assert times == [f"{time:.2f}" for time in kept[f"time_{key}{who}"]]
             assert waits == [""] * 6 and "loop_starts" not in kept, "the captures are too short for trials"
     assert kept["right_true"][0] == 100.0
     assert kept["errors_true"][0][0] < 0.5 < kept["errors_size"][0][0]

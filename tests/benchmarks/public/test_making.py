@@ -106,7 +106,7 @@ def test_what_captures_share_can_be_read(benchmark):
         np.testing.assert_allclose(ours.T_world_camera, shipped.T_world_camera, atol=1e-9)
         assert ours == shipped
     card = (benchmark.folder / "README.md").read_text()
-    assert card.startswith("---\nlicense: cc-by-4.0\n") and "120 frames at 120 Hz" in card
+    assert card.startswith("# handsim-benchmark-1, ") and "120 frames at 120 Hz" in card
     assert "Attribution 4.0 International" in (benchmark.folder / "LICENSE.txt").read_text()
     table = [line.split(",") for line in (captures / "captures.csv").read_text().splitlines()]
     for row, one in zip(table[1:], benchmark.captures, strict=True):

@@ -1,6 +1,6 @@
 """Kill every long command at random moments, run it again, and compare.
 
-    python -m benchmarks.chaos [generate train ...] [--kills 20 --seed 0]
+    python -m tests.chaos [generate train ...] [--kills 20 --seed 0]
 
 Each command runs once undisturbed. Then it is killed by SIGTERM, SIGKILL and SIGINT in turn, at a random
 moment, and run again to its end. The table counts what must be zero: reruns whose files differ, processes
@@ -26,10 +26,17 @@ from typing import Literal, get_args
 
 import tyro
 
-from benchmarks.record import run
-
 SIGNALS = (signal.SIGTERM, signal.SIGKILL, signal.SIGINT)
 ROOT = Path(__file__).resolve().parents[1]
+COMMAND = "import sys; from handsim.cli.main import main; sys.exit(main())"
+# Python runs this as the command and its workers start, so that a small set has several shards. Processes
+# that libraries start while they are imported must not import them again.
+SMALL_SHARDS = f"""
+import sys
+if any(word.startswith(({COMMAND!r}, "from multiprocessing.")) for word in sys.orig_argv):
+    from train.simulation import generation
+    generation.ROWS_PER_SHARD = 150
+"""
 PATIENCE = 2.0  # seconds in which processes and files of a killed command must be gone
 ALONE = ("--scenes.together", "0", "--scenes.holding", "0")
 NETWORK = ("--network.width", "8", "--network.gates", "2", "--network.depth", "1", "--batch", "32")
@@ -103,6 +110,8 @@ def main(commands: tyro.conf.Positional[tuple[Command, ...]] = ALL, kills: int =
     failed = False
     with tempfile.TemporaryDirectory(prefix="chaos-") as folder:
         work = Path(folder)
+        (work / "sitecustomize.py").write_text(SMALL_SHARDS)
+        os.environ["PYTHONPATH"] = os.pathsep.join([folder, os.environ.get("PYTHONPATH", str(ROOT))])
         prepare(work)
         for name in commands:
             counts = torment(name, work, kills, random.Random(f"{seed} {name}"))
@@ -190,8 +199,8 @@ def finish(args: tuple[str, ...]) -> None:
 
 
 def program(args: tuple[str, ...]) -> list[str]:
-    """The command with small shards, so that there are several."""
-    return [sys.executable, "-m", "benchmarks.chaos", "--run", *args]
+    """The command as Python runs it."""
+    return [sys.executable, "-c", COMMAND, *args]
 
 
 def arguments(case: Case, work: Path, out: Path) -> tuple[str, ...]:
@@ -208,14 +217,5 @@ def contents(folder: Path, files: str) -> dict[str, str]:
     }
 
 
-if sys.argv[1:2] == ["--run"]:  # also in worker processes, which read this file first
-    from train.simulation import generation
-
-    generation.ROWS_PER_SHARD = 150
-
 if __name__ == "__main__":
-    if sys.argv[1:2] == ["--run"]:
-        from handsim.cli.main import main as handsim_main
-
-        sys.exit(handsim_main(sys.argv[2:]))
-    run(main, __doc__)
+    tyro.cli(main, description=__doc__, config=(tyro.conf.PositionalRequiredArgs,))
