@@ -247,7 +247,7 @@ POSITION, NORMAL, TINT, COLOR, ROUGH, TANGENT, BUMP, VIEW, FACING = 0, 3, 6, 9, 
 
 @kernel
 def display(light: Floats, tint: Floats, table: Floats) -> None:
-    """Replace linear light (N,), times a tint (N,), by display values, by `TO_DISPLAY` up to 1, or by none."""
+    """Replace linear light (N,), times a tint (N,), by display values: `TO_DISPLAY` up to 1, or unbounded."""
     if len(table) == 0:
         for n in range(len(light)):
             value = tint[n] * light[n]
