@@ -245,7 +245,7 @@ CASES = {
     "export tracked.npz --out hands.fbx": ".glb, .bvh, .usda, .usdc, .csv, .parquet",
     "export tracked.npz --out hands.onnx": "cannot write a take",
     "export dense19 --out hands.glb": ".onnx | takes | .npz | .glb",
-    "export user.json --out hand.xml": "user.json has no motion | handsim hand --shape",
+    "export nobody.json --out hand.xml": "nobody.json | cannot be read",
     "export missing.npz --out hands.glb": "missing.npz | cannot be read",
     "export tracked.npz --out tracked.npz": "a name that ends in",
     "export tracked.npz --out x.glb --fps 0": "the rate is 0 Hz | positive",

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from gloves.fit import Attachment, GloveFit, nominal_fit
+from gloves.hand_files import write_hand
 from gloves.layout import MarkerLayout, list_layouts, load_layout, stored_layout
 from handsim._checks import check_choice, check_type, shown_value
 from handsim.errors import ArgumentError, FileError, HandSimError
@@ -135,6 +136,21 @@ class User(Sequence[GloveFit]):
             ArgumentError: The user has no such hand.
         """
         return self.of_sides(["right" if "right" in self.sides else "left"] if side is None else [side])[0]
+
+    def export(self, path: str | Path, side: Side | None = None, *, actuators: bool = False) -> None:
+        """Write a hand in the flat pose for other programs, in meters, radians and kilograms.
+
+        Args:
+            path: The file: .xml (MuJoCo, with the markers as sites), .urdf, .osim (OpenSim, with the markers)
+                or .glb (rigged skin, y up).
+            side: Which hand; if not given, the right hand or the only one.
+            actuators: Whether the .xml gets position servos.
+
+        Raises:
+            ArgumentError: The file's ending is unknown, or the user has no such hand.
+            OSError: The file cannot be written.
+        """
+        write_hand(Path(path), self.of_side(side), actuators=actuators)
 
     def save(self, path: str | Path) -> None:
         """Write hands and gloves as JSON; `load_user` reads the same numbers again.

@@ -21,14 +21,15 @@ def export(
     up: UpAxis = "z",
     neutral: tuple[float, float] | None = None,
 ) -> None:
-    """Write the motion of a take, or a trained labeler, for other programs.
+    """Write the motion of a take, a user's hand, or a trained labeler, for other programs.
 
     Args:
-        source: A take (.npz, of `handsim track` or the .truth.npz of `handsim simulate`); or a labeler, by
-            the name of a glove with a shipped one or the folder of a trained one.
+        source: A take (.npz, of `handsim track` or the .truth.npz of `handsim simulate`); a user's file
+            (.json); or a labeler, by the name of a glove with a shipped one or the folder of a trained one.
         out: The file. Of a take .glb (skinned and animated), .bvh, .usda or .usdc, .csv or .parquet (joint
             angles and positions), .trc (joint positions), .mot (joint angles for OpenSim) or .openxr.json;
-            of a labeler .onnx, which labels without torch.
+            of a user .xml (MuJoCo), .urdf, .osim (OpenSim) or .glb; of a labeler .onnx, which labels without
+            torch.
         fps: Frames per second of the file, such as 30 or 60 for a game; those of the take when not given.
         up: The axis of the take that points up; y for captures of Motive's default. Files have y up, but
             .usda, .usdc, .csv and .parquet have the take's axes.
@@ -36,6 +37,7 @@ def export(
             of the ISB in a .csv or .parquet are to be zero.
     """
     from gloves.takes.archives import GROWING_SUFFIX
+    from track.user import load_user
 
     if source.lower().endswith((".npz", f".npz{GROWING_SUFFIX}")):
         _export_take(Path(source), out, fps, up, neutral)
@@ -44,7 +46,13 @@ def export(
         given = f"--neutral {neutral[0]:g} {neutral[1]:g}" if neutral else f"--up {up}"
         given = f"--fps {fps:g}" if fps is not None else given
         raise ArgumentError(f"given {given} and {source}, expected a take with it, whose motion is written")
-    _export_labeler(source, out)
+    if source.lower().endswith(".json"):
+        check_outputs([source], [out])
+        user = load_user(source)
+        user.export(out)
+        print_line(f"{out}: {user.of_side().side} hand of {source}; handsim hand --shape has more options")
+    else:
+        _export_labeler(source, out)
 
 
 def _export_take(
@@ -78,8 +86,6 @@ def _export_labeler(source: str, out: Path) -> None:
 
     if Path(source).suffix.lower() in READABLE:
         raise ArgumentError(f"{source} is a capture without poses; handsim track makes a take of it")
-    if Path(source).suffix.lower() == ".json":
-        raise ArgumentError(f"{source} has no motion, expected a take; handsim hand --shape writes its hands")
     if Path(source).suffix.lower() == ".toml":
         raise ArgumentError(
             f"{source} is a glove, expected the folder of a labeler that handsim train wrote for it"

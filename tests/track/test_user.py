@@ -8,12 +8,14 @@ import json
 import operator
 import os
 
+import mujoco
 import numpy as np
 import pytest
 
 from gloves import GloveFit, load_layout
 from gloves.fit import nominal_fit
 from handsim import HandModel, HandSimError, sample_shape
+from handsim.cli.main import main
 from handsim.errors import ArgumentError
 from handsim.hand.shape import SIDES
 from tests.sentences import error_names
@@ -76,6 +78,18 @@ def test_what_cannot_be_saved_is_told(hands, tmp_path):
     with pytest.raises(UserError, match="cannot be written"):
         User(hands).save(tmp_path)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_user_s_hand_leaves_with_its_markers(hands, tmp_path, capsys):
+    user = User(hands)
+    user.save(tmp_path / "user.json")
+    user.export(tmp_path / "left.xml", "left")
+    assert main(["export", str(tmp_path / "user.json"), "--out", str(tmp_path / "hand.xml")]) == 0
+    assert capsys.readouterr().out.startswith(f"{tmp_path / 'hand.xml'}: right hand of")
+    for name, hand in (("left.xml", hands[0]), ("hand.xml", hands[1])):
+        assert mujoco.MjModel.from_xml_path(str(tmp_path / name)).nsite == hand.layout.num_markers
+    with pytest.raises(ArgumentError, match=r"expected a name that ends in \.xml, \.urdf, \.osim, \.glb"):
+        user.export(tmp_path / "hand.stl")
 
 
 @pytest.mark.parametrize(

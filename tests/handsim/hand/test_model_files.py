@@ -14,7 +14,6 @@ from scipy.spatial.transform import Rotation
 from gloves import Take, attach, read_capture
 from gloves.hand_files import write_hand
 from handsim import HandModel, join_qpos, sample_shape
-from handsim.errors import ArgumentError
 from handsim.hand.model import KEYPOINT_NAMES, hand_keypoints
 from handsim.hand.model_files import coordinate_names, coordinate_values, hand_osim, hand_urdf
 from handsim.hand.shape import BONE_NAMES, JOINT_NAMES
@@ -223,11 +222,6 @@ def test_inverse_kinematics_by_the_osim_alone_finds_our_angles(fit, qpos, tmp_pa
         start = expected + np.deg2rad(10.0) * np.sin(np.arange(len(names)))
         found = least_squares(residuals, start, x_scale="jac").x
         np.testing.assert_allclose(np.rad2deg(found - expected)[3:], 0.0, atol=0.5)
-
-
-def test_a_hand_is_not_written_as_another_kind_of_file(fit, tmp_path):
-    with pytest.raises(ArgumentError, match=r"expected a name that ends in \.xml, \.urdf, \.osim, \.glb"):
-        write_hand(tmp_path / "hand.stl", fit)
 
 
 def test_opensim_has_bodies_and_markers_where_mujoco_has_them(fit, qpos, tmp_path):
