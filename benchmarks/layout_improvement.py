@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.layout_captures import chosen_layouts, stored, trial_figures
+from benchmarks.layout_forecast import chosen_layouts, stored, trial_figures
 from benchmarks.record import Figures, describe, run, save_figures
 from gloves import MarkerLayout, MarkerPlace, load_layout
 from handsim.cli.main import main as handsim

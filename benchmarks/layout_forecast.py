@@ -1,10 +1,10 @@
-"""Captures in layouts of few markers and in hard ones: slots that are labeled right, by `label` and `track`.
+"""What `handsim glove score` says of layouts, beside captures that are labeled and tracked afterwards.
 
 Twelve layouts of 6 to 30 markers: symmetric, sparse, on the palm's side, without thumb, in clusters, and
-shipped ones. One hand alone, two apart, and two that touch are simulated, and tracked uncalibrated. Layouts
-that are finished stay in the folder; run again to continue.
+shipped ones. Forecast and outcome have other people and motions. Layouts that are finished stay in the
+folder; run again to continue.
 
-python -m benchmarks.layout_captures FOLDER
+python -m benchmarks.layout_forecast FOLDER
 """
 
 from __future__ import annotations
@@ -16,11 +16,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.stats import spearmanr
 
 from benchmarks.record import describe, run
 from gloves import MarkerLayout, MarkerPlace, load_layout
 from handsim.hand.shape import BONE_NAMES, DIGITS, bones_of
-from track.glove_score import CAPTURES, METHODS, mean_trial, try_layout
+from track.glove_score import CAPTURES, FRAMES, METHODS, WORK, mean_trial, try_layout
 from train import Labeler
 from train.labelers.layout_labeler import learned_labeler
 
@@ -29,21 +30,32 @@ Figures = dict[str, Any]
 
 def main(folder: Path) -> None:
     print(describe("torch", "numpy"))
+    told, found, listed = [], [], 0
     for layout in chosen_layouts():
         path = folder / layout.name
         path.mkdir(parents=True, exist_ok=True)
         labeler = learned_labeler(layout)
-        found = stored(path / "found.json", lambda: trial_figures(layout, labeler, 50, 600, 4))  # noqa: B023
-        for work, one in found.items():
-            rows = zip(METHODS, one["share"].values(), one["worst"].values(), strict=True)
-            shares = ", ".join(
-                f"{method} {100 * mean:.2f} / {100 * least:.2f}" for method, mean, least in rows
+        told.append(stored(path / "told.json", lambda: trial_figures(layout, labeler, 0, FRAMES)))  # noqa: B023
+        found.append(stored(path / "found.json", lambda: trial_figures(layout, labeler, 50, 600, 4)))  # noqa: B023
+        for work, shares in told[-1].items():
+            pairs = ", ".join(
+                f"{method} {100 * share:.2f} / {100 * found[-1][work]['share'][method]:.2f}"
+                for method, share in shares["share"].items()
             )
+            least = ", ".join(f"{100 * one:.2f}" for one in found[-1][work]["worst"].values())
+            joints = f"{shares['joints']:.1f} / {found[-1][work]['joints']:.1f} deg"
             print(
-                f"{layout.name}, {work}: mean / worst {shares}; joints {one['joints']:.1f} deg, size off "
-                f"{one['size']:.1f} mm",
+                f"{layout.name}, {work}: forecast / outcome {pairs}; worst {least}; joints {joints}, size "
+                f"off {found[-1][work]['size']:.1f} mm",
                 flush=True,
             )
+        worst = int(np.argmin(told[-1]["two touching"]["right"]))
+        listed += worst in np.argsort(found[-1]["two touching"]["right"])[:3]
+    for work in WORK:
+        for method in METHODS:
+            pairs = [[one[work]["share"][method] for one in rows] for rows in (told, found)]
+            print(f"{work}, {method}: rank correlation {spearmanr(*pairs).statistic:.3f}")
+    print(f"worst marker of touching hands among the worst three: {listed} of {len(told)}")
 
 
 def trial_figures(
@@ -61,6 +73,7 @@ def trial_figures(
         figures[work] = {
             "share": {method: mean.share(method) for method in METHODS},
             "worst": {method: min(row.share(method) for row in rows) for method in METHODS},
+            "right": mean.right.tolist(),
             "joints": float(np.rad2deg(np.sqrt(np.nanmean(mean.joints**2)))),
             "size": 1e3 * mean.size_error,
         }
