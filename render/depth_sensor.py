@@ -42,8 +42,8 @@ class StructuredLight:
     disparity_noise: float = 0.125 / 6
     """Standard deviation before rounding [px]."""
     window: int = 9
-    """Width of the window that is matched [px]: windows that overlap have noise in common. Kinect's is by
-    Konolige and Mihelich (ROS, kinect_calibration), a D435's by Keselman et al. (CVPR workshops 2017)."""
+    """Width of the window that is matched [px]: windows that overlap have noise in common. 9 is BlenSor's
+    for a Kinect (Gschwandtner et al., ISVC 2011), 7 Keselman et al.'s (CVPR workshops 2017) for a D435."""
     shift: float = 0.5
     """Standard deviation of where a pixel's depth is taken, each way [px]; rounded to whole pixels."""
     support: float = 0.6

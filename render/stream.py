@@ -152,7 +152,7 @@ class PictureStream(IterableDataset[dict[str, torch.Tensor]]):
     | key | shape and type | what |
     |---|---|---|
     | `rgb`, `noisy_rgb` | (3, H, W) uint8 | sRGB: perfect, and from the simulated sensor |
-    | `depth`, `noisy_depth` | (H, W) float32 | along the camera's axis [m], 0: nothing |
+    | `depth`, `noisy_depth` | (H, W) float32 | along the camera's axis [m], walls included; 0: nothing |
     | `normals` | (3, H, W) float32 | in the camera's axes, 0: nothing |
     | `ids`, `parts`, `markers` | (H, W) uint8 | hand or body, bone, marker; see `RenderedFrame` |
     | `keypoints` | (21, 2) float32 | [px] from the picture's corner, in the picture or not |

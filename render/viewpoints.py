@@ -30,8 +30,8 @@ from render.user_body import UserBody
 _OUTLINE: Final = (0, 2, 4, 5, 6, 8, 10, 12, 14, 16, 17, 18, 20)  # keypoints that span a hand's outline
 _CHUNK: Final = 2048  # frames whose keypoints are computed at once
 _SKIN: Final = 0.012  # thickness of the skin around keypoints [m]
-_ARM: Final = 0.07  # thickness of a sleeve around the middle of an arm [m]
-_ALONG_ARM: Final = np.linspace(0.0, 0.4, 9)  # distances from the wrist [m]
+_SLEEVE: Final = 0.1  # thickness of sleeves and upper arms around the line of a forearm [m]
+_ALONG_ARM: Final = np.linspace(0.0, 0.6, 13)  # distances from the wrist, beyond the elbow, too [m]
 _BESIDE: Final = 0.15  # border beside a picture that arms are seen in, as a share of its size
 _BORDER: Final = 0.04  # border of a picture that hands keep free, as a share of half its width or height
 _NEAREST_KEYPOINT: Final = 0.15  # least depth of a keypoint before a camera [m]
@@ -307,13 +307,12 @@ class Viewpoints:
 
     def nearest(self, normal: Float[np.ndarray, "3"], *, arms: bool = False) -> float:
         """Least position along a direction in the first camera's axes of all frames' hands, or arms [m]."""
-        points, camera = self._framing.points, self.cameras(0)[0]
-        if arms:
-            points = points[:, :, :1] + self._framing.forearms[:, :, None] * _ALONG_ARM[:, None]
-        points = points.reshape(-1, 3)
+        hands, camera = self._framing.points, self.cameras(0)[0]
+        along = hands[:, :, :1] + self._framing.forearms[:, :, None] * _ALONG_ARM[:, None]
+        points = (along if arms else hands).reshape(-1, 3)
         seen = (np.abs(camera.project(points) / camera.size - 0.5) < 0.5 + _BESIDE).all(axis=1) | (not arms)
         places = camera.local(points[seen]) @ normal
-        return float(np.nanmin(places, initial=0.0)) - (_ARM if arms else _SKIN)
+        return float(np.nanmin(places, initial=0.0)) - (_SLEEVE if arms else _SKIN)
 
     def positions(self) -> Float[np.ndarray, "P 3"]:
         """Positions of the cameras and of the hands' centers in all frames [m]."""

@@ -118,7 +118,8 @@ def level_behind(backdrop: Backdrop, camera: Camera, drawn: Sequence[Drawn]) -> 
     """Position along its normal in the camera's axes [m] that depth has a backdrop at: behind arms, too."""
     nearest, normal = np.inf, backdrop.normal
     if backdrop.level is None and drawn:
-        points = camera.local(np.concatenate([one.triangles.vertices for one in drawn]))
+        some = 1 if backdrop.shadows else 8  # far walls need not be exact
+        points = camera.local(np.concatenate([one.triangles.vertices[::some] for one in drawn]))
         nearest = _nearest_seen(points, normal, camera.K, np.array(camera.size, np.float64))[0]
     level = backdrop.behind(nearest if np.isfinite(nearest) else -1.0)
     return level if backdrop.arms is None else min(level, backdrop.arms)

@@ -267,7 +267,7 @@ def _cones(offsets: Doubles) -> Any:
     return cones
 
 
-@kernel
+@kernel(inline=True)
 def _nearest_box(ray: Floats, inverse: Doubles, offsets: Doubles, cones: Doubles, distance: float) -> Any:
     """The first box along a ray within a distance, the axis of its face, and its distance; -1 for none."""
     nearest, face = -1, 0
@@ -285,7 +285,7 @@ def _nearest_box(ray: Floats, inverse: Doubles, offsets: Doubles, cones: Doubles
     return nearest, face, distance
 
 
-@kernel
+@kernel(inline=True)
 def _wall_color(
     position: Doubles,
     wall: int,

@@ -266,7 +266,11 @@ def test_one_camera_has_one_place_behind_the_hands(path, kind):
         shown = frame.ideal.instances > 0
         assert (frame.ideal.depth > 0.0).all() and "enclosure" not in frame.choices
         np.testing.assert_allclose(np.linalg.norm(frame.ideal.normals, axis=-1), 1.0, atol=1e-5)
-        assert frame.ideal.depth[shown].max() < frame.ideal.depth[~shown].max()
+        if kind != "room":
+            rays, normal = frame.camera.rays(), frame.ideal.normals[~shown][0]
+            along = (rays / rays[..., 2:] * frame.ideal.depth[..., None]) @ normal
+            assert np.ptp(along[~shown]) < 1e-4, "it is flat"
+            assert (along[shown] > along[~shown].mean()).mean() > 0.999, "and behind hands and arms"
     bare = (first.ids == 0) & (second.ids == 0)
     np.testing.assert_array_equal(first.depth[bare], second.depth[bare], err_msg="it stays where it is")
     for frame in drawn(path, dataclasses.replace(config, room_depth=False)):

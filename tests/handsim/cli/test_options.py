@@ -70,6 +70,7 @@ QUICK = [
     ("render", "take.npz --out pics --num-frames 2 --format png --workers 1 --passes rgb", "vary frame"),
     ("render", "take.npz --out pics --num-frames 1 --format png --workers 1 --passes depth --placement rig",
      "rig eight|no-room-depth"),
+    ("render", "take.npz --out pics --num-frames 1 --format coco --workers 1 --passes rgb", "openxr"),
     ("render", "--poses poses.npz --out pics --format png --workers 1 --passes depth --frames-per-shard 1",
      "hands left|people 1|glove sparse13|up y"),
 ]  # fmt: skip
