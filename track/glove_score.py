@@ -7,6 +7,7 @@ calibrated: hands are measured in each capture, as `handsim label` and `handsim 
 from __future__ import annotations
 
 import dataclasses
+import math
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -68,6 +69,8 @@ _UNINFORMED: Final = 0.6  # ratio of a joint's spread to that of an unseen joint
 _UNCERTAIN: Final = np.deg2rad(5.0)  # [rad] spread of a joint
 _CONFUSED: Final = 0.02  # share of a marker's points that are labeled as another marker
 _HIDDEN: Final = 0.85  # share of frames in which a marker is seen
+_AT_ONCE: Final = 0.75  # With a smaller share of its markers a hand is seldom found at once.
+_FEW: Final = 0.1  # share of frames that show fewer
 _TOUCHING: Final = 0.02  # share of frames in which two markers touch
 _WRONG: Final = 0.97  # share of frames in which a marker is labeled right in captures
 _SIDES: Final = 0.99  # share of frames in which the side is recognized
@@ -122,6 +125,8 @@ class LayoutScore:
     """Labels with the drops and ghosts of the paper's recipe."""
     seen: Float[np.ndarray, "M"]
     """Share of the frames in which each marker is seen by two cameras and becomes a point."""
+    few_seen: float
+    """Share of the frames in which fewer than three quarters of the markers are seen."""
     near: Float[np.ndarray, "M M"]
     """Share of the frames in which two markers touch or nearly do."""
     joints: Float[np.ndarray, "20"]
@@ -229,17 +234,13 @@ def score_layout(
             evaluate_labeler(labeler, markers - center, recipe, rng=rng),
         )
     )
+    is_seen = np.isfinite(observed[..., 0])
+    without = np.array([joint_spreads(some, without=marker) for marker in range(layout.num_markers)])
     return LayoutScore(
-        layout,
-        seen,
-        clean,
-        corrupted,
-        np.isfinite(observed[..., 0]).mean(axis=0),
-        near,
-        joint_spreads(some),
-        np.array([joint_spreads(some, without=marker) for marker in range(layout.num_markers)]),
+        layout, seen, clean, corrupted, is_seen.mean(axis=0),
+        float((is_seen.mean(axis=1) < _AT_ONCE).mean()), near, joint_spreads(some), without,
         _sides_right(layout, hands, rng),
-    )
+    )  # fmt: skip
 
 
 def _some(hands: Sequence[ObservedHand], count: int) -> list[ObservedHand]:
@@ -466,6 +467,14 @@ def _joints(score: LayoutScore) -> Iterator[_Advice]:
 
 
 def _hidden(score: LayoutScore) -> Iterator[_Advice]:
+    """Advice on hands that show few markers, and on each marker that is seldom seen."""
+    if score.few_seen > _FEW:
+        count = score.layout.num_markers
+        yield (
+            score.few_seen,
+            f"Add markers, on the back of the hand first: in {100 * score.few_seen:.0f} % of the frames "
+            f"fewer than {math.ceil(_AT_ONCE * count)} of {count} are seen, too few to find a hand at once.",
+        )
     for name, seen in zip(score.layout.names, score.seen, strict=True):
         if seen < _HIDDEN:
             yield (

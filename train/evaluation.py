@@ -349,17 +349,9 @@ def _count(
     num_points = np.array([len(one) for one in right[1:]], dtype=np.int64)
     by_marker = slots.sum(axis=0) / max(1, counts.frames)
     return LabelingReport(
-        figures,
-        by_marker,
-        counts.frames,
-        counts.confusion,
-        confidence,
-        is_right,
-        counts.numbers(),
-        slots,
-        names,
-        num_points,
-    )
+        figures, by_marker, counts.frames, counts.confusion, confidence, is_right, counts.numbers(), slots,
+        names, num_points,
+    )  # fmt: skip
 
 
 def evaluate_markers(

@@ -208,10 +208,7 @@ class _Run:
         """
         state, settings, alone = self.state, self.state.settings, self.state.fabric.world_size == 1
         recipe, names = batch_recipe(settings, len(self.manifest.marker_names)), self.manifest.marker_names
-        shown, saved = (
-            self.held_out[self._shown(_CURVE_FRAMES[settings.labeler])],
-            time.monotonic(),
-        )
+        shown, saved = self.held_out[self._shown(_CURVE_FRAMES[settings.labeler])], time.monotonic()
         evaluated = state.history.accuracies[-1][0] if state.history.accuracies else 0
         while True:
             if state.done > evaluated and _passed(state.done, settings, _NUM_EVALUATIONS):

@@ -35,6 +35,7 @@ def test_seen_and_near_are_counted(tips, tips_hands, tips_score):
     observed = np.concatenate([hand.frames.observed for hand in tips_hands])
     markers = np.concatenate([hand.frames.markers for hand in tips_hands])
     np.testing.assert_allclose(tips_score.seen, np.isfinite(observed).all(axis=2).mean(axis=0))
+    assert 0.0 < tips_score.few_seen == (np.isfinite(observed).all(axis=2).sum(axis=1) < 6).mean()
     first, second = tips.names.index("MiddleTip"), tips.names.index("RingTip")
     apart = np.linalg.norm(markers[:, first] - markers[:, second], axis=1)
     expected = (apart < 2 * tips.radius + 0.003).mean()
@@ -87,6 +88,7 @@ def good(tips, tips_score):
         tips_score,
         observed=report,
         seen=np.ones(count),
+        few_seen=0.0,
         near=np.zeros((count, count)),
         joints=np.full(20, 0.05),
         joints_without=np.full((count, 20), 0.2),
@@ -147,6 +149,12 @@ def test_hidden_touching_and_symmetric_markers_are_told(good):
     assert sentences[0].startswith(f"Move {good.layout.names[3]} towards the back") and "40 %" in sentences[0]
     assert sentences[1].startswith("Make the back of the hand less symmetric") and "30 %" in sentences[1]
     assert sentences[2].startswith(f"Move {good.layout.names[5]} and {good.layout.names[6]} apart")
+
+
+def test_more_markers_are_asked_for_where_few_are_seen(good):
+    (sentence,) = dataclasses.replace(good, few_seen=0.25).advice
+    assert sentence.startswith("Add markers, on the back of the hand first: in 25 % of the frames")
+    assert "fewer than 6 of 8 are seen" in sentence
 
 
 def test_a_marker_that_tells_nothing_can_be_dropped(good):

@@ -132,7 +132,7 @@ def mean_features(markers: Float[np.ndarray, "T M 3"], config: LayoutNetworkConf
     share = _share_of_work(markers.shape[1])
     markers, chunk = markers[:: math.ceil(1.0 / share)], int(_CHUNK * share)
     centered = torch.from_numpy((markers - markers.mean(axis=1, keepdims=True)).astype(np.float32))
-    parts = centered.split(chunk)
+    parts = torch.split(centered, chunk)
     # In a list, sums would lie between large freed tensors and keep their memory from being used again.
     sums = centered.new_empty(len(parts), *2 * markers.shape[1:2], config.num_distances)
     with torch_threads(1):

@@ -110,8 +110,8 @@ def load_labeler(
 ) -> Labeler:
     """The labeler of a glove, or a labeler by its name, path or object.
 
-    A glove without a trained labeler gets the one for any layout, which learns the layout in one to two
-    minutes. Only shipped labelers, folders and the one for any layout need torch.
+    A glove without a trained labeler gets the one for any layout, which learns the layout in about a
+    minute. Only shipped labelers, folders and the one for any layout need torch.
 
     Args:
         glove: A marker layout, or its name or path, whose labeler is returned. Without `labeler` also a
@@ -207,7 +207,7 @@ def _any_layout_labeler(layout: MarkerLayout, glove: MarkerLayout | str | Path) 
     how = (
         "has learned it before"
         if is_learned(layout)
-        else "learns it now, once, in one to two minutes of an idle core"
+        else "learns it now, once, in about a minute of an idle core"
     )
     warnings.warn(
         f"no labeler was trained on glove '{name}', so that the one for any layout labels it, which {how}; a "

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import subprocess
+import sys
 
 import numpy as np
 import pytest
+import torch
 
 from benchmarks.any_layout_training import save_layout_network
 from gloves import load_layout
@@ -18,9 +21,12 @@ from train.labelers.layout_labeler import (
     fine_tuned_labeler,
     is_learned,
     learned_labeler,
+    mean_features,
     sample_worn_markers,
     shipped_network,
 )
+from train.labelers.networks import LayoutNetworkConfig as Config
+from train.labelers.networks import distance_features
 from train.labelers.protocol import learned_folder, learned_gloves
 
 
@@ -34,6 +40,33 @@ def test_a_glove_of_no_training_is_labeled(labeler, corruption, least):
     markers = sample_worn_markers(load_layout("starter15"), 300, rng=np.random.default_rng(5))
     report = evaluate_labeler(labeler, markers, corruption, rng=np.random.default_rng(6))
     assert report.figures["slot_accuracy"] > least
+
+
+def test_features_are_means_over_all_poses():
+    markers, config = (
+        sample_worn_markers(load_layout("starter6"), 1200, rng=np.random.default_rng(3)),
+        Config(),
+    )
+    points = torch.from_numpy(markers - markers.mean(axis=1, keepdims=True)).float()
+    expected = distance_features(points, config).double().mean(0)
+    np.testing.assert_allclose(mean_features(markers, config), expected, atol=1e-5)
+
+
+@pytest.mark.slow
+def test_features_of_a_large_glove_keep_little_memory():
+    """Peak memory grew with the number of poses when small sums lay between large freed tensors."""
+    program = """
+import resource
+import numpy as np
+from train.labelers.layout_labeler import mean_features
+from train.labelers.networks import LayoutNetworkConfig
+markers = np.random.default_rng(0).normal(0.0, 0.05, (40_000, 60, 3))
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+mean_features(markers, LayoutNetworkConfig())
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
+"""
+    told = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert int(told.stdout) < 600_000  # kilobytes
 
 
 def test_labels_follow_the_order_of_the_layout(labeler):
