@@ -380,9 +380,9 @@ def _load_folded(network: Network, path: Path) -> None:
             continue
         weight, bias = next(stored)
         layer.weight.data.copy_(weight)
-        if isinstance(norm, nn.BatchNorm2d):
+        if layer.bias is None:
             norm.running_var.fill_(1.0 - norm.eps)
-        (layer if layer.bias is not None else norm).bias.data.copy_(bias)
+        (norm if layer.bias is None else layer).bias.data.copy_(bias)
 
 
 if __name__ == "__main__":
