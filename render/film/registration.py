@@ -43,6 +43,7 @@ _ROUNDS: Final = 3  # rounds of matching keypoints
 _BOUND: Final = 3.0  # A frame does not fit beyond this many times the usual median distance.
 _LEAST_BOUND: Final = 0.008  # A frame fits up to this distance in any case [widths of the picture].
 _WORST: Final = 0.03  # [widths] A video whose usual median distance is larger does not show the take.
+_UNKNOWN: Final = 0.05  # [m] A camera whose place has a larger deviation is not known.
 _LEAST_SHARE: Final = 0.2  # This share of the frames with hands must fit.
 _MOST_SPANS: Final = 4  # largest number of times between which a camera was moved
 _MOVES: Final = 3  # number of times that the beginning of a span is moved
@@ -199,7 +200,12 @@ def register(
         fit = _keypoint_fit(bundle, state)
     if fit.reasons.count("") < _LEAST_SHARE * np.isin(bundle.found.looked, bundle.found.frames).sum():
         raise HandSimError(UNLIKE)
-    return _registration(bundle, state, covariance, fit)
+    told = _registration(bundle, state, covariance, fit)
+    if (unknown := told.deviations["position"]) > _UNKNOWN:
+        raise HandSimError(
+            f"the hands tell the camera's place to {1e3 * unknown:.0f} mm only; expected a longer video"
+        )
+    return told
 
 
 def _outlined(
