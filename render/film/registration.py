@@ -203,7 +203,8 @@ def register(
     told = _registration(bundle, state, covariance, fit)
     if (unknown := told.deviations["position"]) > _UNKNOWN:
         raise HandSimError(
-            f"the hands tell the camera's place to {1e3 * unknown:.0f} mm only; expected a longer video"
+            f"the hands tell the camera's place to {1e3 * unknown:.0f} mm only; expected hands that move in "
+            "all directions, and a longer video"
         )
     return told
 
