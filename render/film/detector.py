@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 from numpy.typing import ArrayLike, NDArray
+from scipy.special import expit
 
 from handsim._checks import check_array, check_choice, check_type
 from handsim.errors import ArgumentError, WeightsError
@@ -155,7 +156,7 @@ class HandDetector:
         square = np.zeros((3, FINDER_SIZE, FINDER_SIZE), np.float32)
         square[:, : seen[0], : seen[1]] = normalized(cut(picture, matrix, (int(seen[1]), int(seen[0]))))
         (cells,) = _run(self._finder, square, ("cells",))
-        heat = _share(cells[0, 0])
+        heat = expit(cells[0, 0])
         peaks = (heat >= cv2.dilate(heat, np.ones((3, 3), np.uint8))) & (heat > _LEAST_HEAT)
         rows, columns = np.nonzero(peaks)
         order = np.argsort(-heat[rows, columns])[:_MOST_FOUND]
@@ -175,7 +176,7 @@ class HandDetector:
         turn = np.linalg.inv(matrix[:, :2])
         presence, palm = (float(value) for value in logits[0])
         right = palm * float(np.sign(palm_spread(keypoints)))
-        return _Look((CROP_SIZE * keypoints - matrix[:, 2]) @ turn.T, scores, float(_share(presence)), right)
+        return _Look((CROP_SIZE * keypoints - matrix[:, 2]) @ turn.T, scores, float(expit(presence)), right)
 
     def _second_look(self, picture: NDArray[np.uint8], first: _Look, side: Side | None = None) -> FoundHand:
         """The hand, after a look at where the first look saw it, with its fingers up."""
@@ -255,11 +256,6 @@ def peaks_of(heat: Floats) -> tuple[Doubles, Doubles]:
     near = np.where(away > NEAR, 0.0, share)
     scores = near.sum(axis=-1)
     return near @ places / scores[..., None], scores
-
-
-def _share(log_odds: ArrayLike) -> Doubles:
-    """Probabilities of log-odds."""
-    return np.asarray(1.0 / (1.0 + np.exp(-np.clip(log_odds, -50.0, 50.0))))
 
 
 def _checked(image: object) -> NDArray[np.uint8]:

@@ -192,7 +192,7 @@ def filmed_take(take: Take, registration: Registration, *, every: bool = False) 
 
     A hand has the pose of the time at which a rolling shutter reads the rows that it is in.
     """
-    times = registration.take_times(registration.times)
+    times = registration.offset + (1.0 + registration.drift) * registration.times
     cameras = [registration.camera_of(number) for number in range(len(times))]
     qpos = poses_at(take, shutter_times(take, times, cameras, registration.readout))
     if not every:

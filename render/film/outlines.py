@@ -309,13 +309,14 @@ def _outline(look: _Look, hand: int, fit: GloveFit, qpos: Doubles) -> _Outline |
     good &= ((pixels > _EDGE) & (pixels < np.array(camera.size) - _EDGE)).all(axis=1)
     if good.sum() < _FEWEST_POINTS:
         return None
+    pixels, normals, rows, columns = (one[good] for one in (pixels, normals, rows, columns))
     rotation, place = camera.T_world_camera[:3, :3], camera.T_world_camera[:3, 3]
     rays, beside = (camera.unproject(one) for one in (pixels, pixels + normals))
     rays, beside = rays / rays[:, 2:], beside / beside[:, 2:]
     outward = (beside - rays) / np.linalg.norm(beside - rays, axis=1, keepdims=True)
     points = rays * truth.depth[rows, columns, None].astype(np.float64) @ rotation.T + place
     bones = truth.parts[rows, columns].astype(np.int64) - 1 - PARTS_A_HAND * hand
-    return _Outline._make(one[good] for one in (pixels, normals, points, outward @ rotation.T, bones))
+    return _Outline(pixels, normals, points, outward @ rotation.T, bones)
 
 
 def _shares(counts: Doubles) -> Doubles:

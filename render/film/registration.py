@@ -43,8 +43,10 @@ _ROUNDS: Final = 3  # rounds of matching keypoints
 _BOUND: Final = 3.0  # A frame does not fit beyond this many times the usual median distance.
 _LEAST_BOUND: Final = 0.008  # A frame fits up to this distance in any case [widths of the picture].
 _WORST: Final = 0.03  # [widths] A video whose usual median distance is larger does not show the take.
+_UNKNOWN: Final = 0.05  # [m] A camera whose place has a larger deviation is not known.
 _LEAST_SHARE: Final = 0.2  # This share of the frames with hands must fit.
 _MOST_SPANS: Final = 4  # largest number of times between which a camera was moved
+_MOVES: Final = 3  # number of times that the beginning of a span is moved
 _SHORTEST_SPAN: Final = 20  # number of frames with found hands in each of them
 _NO_HAND: Final = "the take has no hand then"
 _OUTSIDE: Final = "no hand of the take is in the picture"
@@ -87,10 +89,6 @@ class Registration:
     """Found points of outlines, or keypoints, [px] in the frames that fit."""
     errors: Float[np.ndarray, "N 2"]
     """Their differences from the take's [px]."""
-
-    def take_times(self, times: Float[np.ndarray, "K"]) -> Float[np.ndarray, "K"]:
-        """Times in the take [s] of times in the video [s]."""
-        return self.offset + (1.0 + self.drift) * times
 
     def camera_of(self, number: int) -> Camera:
         """The camera of a frame of the video."""
@@ -154,16 +152,12 @@ class Registration:
         }
 
 
-Pictures = Callable[[], Iterable[Bytes]]
-"""Yields the picture of each frame of a video."""
-
-
 def register(
     take: Take,
     found: Sequence[FoundFrame],
     size: tuple[int, int],
     given: Camera | None = None,
-    pictures: Pictures | None = None,
+    pictures: Callable[[], Iterable[Bytes]] | None = None,
 ) -> Registration:
     """The registration of a video of this size [px] in which a detector found hands.
 
@@ -206,11 +200,17 @@ def register(
         fit = _keypoint_fit(bundle, state)
     if fit.reasons.count("") < _LEAST_SHARE * np.isin(bundle.found.looked, bundle.found.frames).sum():
         raise HandSimError(UNLIKE)
-    return _registration(bundle, state, covariance, fit)
+    told = _registration(bundle, state, covariance, fit)
+    if (unknown := told.deviations["position"]) > _UNKNOWN:
+        raise HandSimError(
+            f"the hands tell the camera's place to {1e3 * unknown:.0f} mm only; expected hands that move in "
+            "all directions, and a longer video"
+        )
+    return told
 
 
 def _outlined(
-    bundle: Bundle, take: Take, state: State, pictures: Pictures
+    bundle: Bundle, take: Take, state: State, pictures: Callable[[], Iterable[Bytes]]
 ) -> tuple[State, Doubles, _Fit] | None:
     """State, covariance and fit by the outlines of the hands; None where they are not seen."""
     outlines, noise = Outlines(take, bundle.size), _FIRST_NOISE
@@ -241,13 +241,24 @@ def _split(bundle: Bundle, state: State, noise: float) -> State:
             break
         span, samples = int(np.searchsorted(state.starts, change)), bundle.samples(matches)
         values = np.insert(state.values, POSES + 6 * span, state.pose(span - 1))
-        split = State(values, (*state.starts[:span], change, *state.starts[span:]))
         before = bundle.solve(state, samples, noise, first=True)[1]
-        split, cost, _ = bundle.solve(split, samples, noise, first=True)
+        for _ in range(_MOVES):
+            split = State(values, (*state.starts[:span], change, *state.starts[span:]))
+            split, cost, _ = bundle.solve(split, samples, noise, first=True)
+            values, change = split.values, _better_change(bundle, split, span)
         if cost > 0.95 * before:
             break
         state = split
     return state
+
+
+def _better_change(bundle: Bundle, state: State, span: int) -> int:
+    """The first frame of a span, after which its camera explains what is found better than the one before."""
+    alone = (State(np.append(state.values[:POSES], state.pose(number))) for number in (span - 1, span))
+    early, late = (np.fmin.reduce(bundle.match(one, np.inf).distances, axis=1) for one in alone)
+    first, last = (*state.starts, len(early))[span - 1 : span + 2 : 2]
+    votes = np.sign(np.nan_to_num(early - late))[first:last]
+    return first + int(np.clip(np.cumsum(votes).argmin() + 1, 1, last - first - 1))
 
 
 def _change(matches: Matches, starts: Sequence[int], noise: float) -> int | None:

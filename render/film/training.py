@@ -132,16 +132,14 @@ def train_detector(
 
 def _drawn(shards: int, seed: int) -> tuple[list[Lesson], list[Lesson]]:
     """Drawn lessons for the finder and for the keypoint network."""
-    views: list[Lesson] = []
-    squares: list[Lesson] = []
+    drawn: tuple[list[Lesson], list[Lesson]] = ([], [])
     for number in range(shards):
-        rng = np.random.default_rng([seed, number, 1])
-        whole, cut_out = lessons_of(draw_scenes(number, seed=seed), rng=rng)
-        views += whole
-        squares += cut_out
+        parts = lessons_of(draw_scenes(number, seed=seed), rng=np.random.default_rng([seed, number, 1]))
+        for kept, part in zip(drawn, parts, strict=True):
+            kept.extend(part)
         _tell(f"\r{SCENES * (number + 1)} of {SCENES * shards} pictures are drawn")
     _tell("\n")
-    return views, squares
+    return drawn
 
 
 def _tell(text: str) -> None:
@@ -168,7 +166,7 @@ def fit(
     for step in range(steps):
         pictures, targets = make(np.random.default_rng([seed, step]))
         with torch.autocast("cpu", torch.bfloat16, enabled=BF16):
-            found = network(pictures)
+            found = network(pictures.contiguous(memory_format=torch.channels_last))
         value = loss(found, targets)
         optimizer.zero_grad()
         value.backward()  # type: ignore[no-untyped-call]
@@ -251,11 +249,7 @@ def keypoint_batch(course: Course, rng: np.random.Generator) -> Batch:
             palms[number] = (spread > 0.0) == (lesson.sides[0] == 1)
         presence[number] = is_hand
     told = (torch.from_numpy(points), torch.from_numpy(presence), torch.from_numpy(palms))
-    return _stacked(pictures), told
-
-
-def _stacked(pictures: list[Floats]) -> torch.Tensor:
-    return torch.from_numpy(np.stack(pictures)).contiguous(memory_format=torch.channels_last)
+    return torch.from_numpy(np.stack(pictures)), told
 
 
 def keypoint_loss(found: tuple[torch.Tensor, torch.Tensor], targets: Targets) -> torch.Tensor:
@@ -301,7 +295,7 @@ def finder_batch(course: Course, rng: np.random.Generator) -> Batch:
             labeled = points[np.isfinite(points[:, 0])]
             if len(labeled):
                 _mark(targets[number], labeled, (width, height))
-    return _stacked(pictures), (torch.from_numpy(targets),)
+    return torch.from_numpy(np.stack(pictures)), (torch.from_numpy(targets),)
 
 
 def _mark(target: Floats, points: Doubles, size: tuple[int, int]) -> None:
@@ -386,9 +380,9 @@ def _load_folded(network: Network, path: Path) -> None:
             continue
         weight, bias = next(stored)
         layer.weight.data.copy_(weight)
-        if isinstance(norm, nn.BatchNorm2d):
+        if layer.bias is None:
             norm.running_var.fill_(1.0 - norm.eps)
-        (layer if layer.bias is not None else norm).bias.data.copy_(bias)
+        (norm if layer.bias is None else layer).bias.data.copy_(bias)
 
 
 if __name__ == "__main__":

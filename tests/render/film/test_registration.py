@@ -80,7 +80,7 @@ def test_what_is_not_moved_tells_no_clock():
     try:
         told = " ".join(register(take, filming.found(take), SIZE).doubts())
     except HandSimError as error:
-        assert "expected a video of this take" in str(error)
+        assert "expected hands that move in all directions" in str(error)
     else:
         assert "clock is known to" in told and "focal length is known to" in told
 
