@@ -1,7 +1,7 @@
 """Whether the list of doubtful frames is right, the confidence in labels, and the bound on wrong frames.
 
 python -m benchmarks.doubtful_frames [--gloves dense19 sparse13] [--seeds 300 301] [--label] [--unseen]
-    [--real DATA] [--store FOLDER] [--fit]
+    [--real DATA] [--store FOLDER] [--takes 66] [--fit]
 
 A person's capture of each kind is tracked (--label: labeled) without calibration. By turns of the seed there
 are foreign markers; many gaps, and markers that exchange trajectories; gaps and foreign markers; noise.
@@ -10,7 +10,8 @@ twenty foreign markers, gloves that no labeler was trained for, and with --real 
 motion, see `real_motion`. A run of errors is consecutive frames, gaps of 5 bridged, in which a marker lacks
 its label, has another one, or a point that is none has it; where half of a hand is wrong, it is the hand's.
 
---store keeps every tracked take and its true labels in a folder, so that a run that was stopped continues.
+--store keeps every tracked take and its true labels in a folder, so that a run that was stopped continues;
+--takes ends after that many of them.
 --fit prints the coefficients of `track.label_confidence`, fitted to the captures.
 """
 
@@ -271,6 +272,7 @@ def main(
     unseen: bool = False,
     real: Path | None = None,
     store: Path | None = None,
+    takes: int | None = None,
     fit: bool = False,
     save: str | None = None,
 ) -> None:
@@ -280,7 +282,8 @@ def main(
     vouched: list[Vouched] = []
     labeled: list[tuple[np.ndarray, np.ndarray]] = []
     others: list[tuple[np.ndarray, np.ndarray]] = []
-    for case in unseen_cases(frames, real) if unseen or real else usual_cases(gloves, seeds, frames, label):
+    cases = unseen_cases(frames, real) if unseen or real else usual_cases(gloves, seeds, frames, label)
+    for case in cases[:takes]:
         take, truth = case.kept(store)
         for key in (*case.name.split(), "all"):
             table.setdefault(key, []).append(score(take, truth))

@@ -23,7 +23,7 @@ _MANY_FAR: Final = 0.05  # Unlabeled points away from the hands are mentioned fr
 _AT_HAND: Final = 0.04  # [m] distance from a hand's markers within which a point counts as its own
 # Frames whose points all have at least this confidence need no look. Longer joints, and frames around the
 # doubtful ones, list three times as many right frames, and cover hardly more errors.
-_CERTAIN: Final = 0.9
+_CERTAIN: Final = 0.87
 _APART: Final = 0.05  # [s] Spans closer together are joined.
 _MOST_DOUBTS: Final = 12  # rows of a list to be read at a glance
 # Of 37 takes of other people, rigs and noise, one had more wrong frames among those not listed than this
