@@ -175,15 +175,18 @@ def listed_frames(take: Take, spans: Sequence[SuspectSpan]) -> np.ndarray:
     return listed
 
 
-def score(take: Take, truth: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Runs, those covered, spans, those with an error, seconds and seconds listed; pairs for calibration."""
-    spans = [span for span in find_suspect_spans(take, None) if span.of_labels]
+def score(
+    take: Take, truth: np.ndarray, suspect: Sequence[SuspectSpan]
+) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Runs, those covered, spans, those with an error, seconds, frames, those listed; pairs of confidence."""
+    spans = [span for span in suspect if span.of_labels]
     runs, listed = error_runs(take, truth), listed_frames(take, spans)
     there = np.isfinite(take.points[..., 0])
     right = (take.labels == truth) | ~there
     covered = sum(listed[first : last + 1].any() for first, last in runs)
     good = sum(not right[span.first : span.last + 1].all() for span in spans)
-    counts = [len(runs), covered, len(spans), good, take.num_frames / take.rate, listed.sum() / take.rate]
+    frames = take.num_frames
+    counts = [len(runs), covered, len(spans), good, frames / take.rate, frames, listed.sum()]
     parts = [there & (take.labels >= 0), there & (take.labels < 0)]
     pairs = [np.stack([take.confidence[part], right[part]]) for part in parts]
     certain = frame_confidence(take)
@@ -206,9 +209,8 @@ class Vouched(NamedTuple):
     """Share of wrong frames among those not listed, over what `vouch` multiplies by its factor."""
 
     @classmethod
-    def of(cls, take: Take, truth: np.ndarray) -> Vouched:
+    def of(cls, take: Take, truth: np.ndarray, spans: Sequence[SuspectSpan]) -> Vouched:
         """Compare a take with its true labels."""
-        spans = find_suspect_spans(take, None)
         right = ((take.labels == truth) | ~np.isfinite(take.points[..., 0])).all(axis=1)
         rest = ~listed_frames(take, spans)
         doubt = 1.0 - np.nan_to_num(frame_confidence(take), nan=1.0)
@@ -237,10 +239,10 @@ def tell_vouched(takes: Sequence[Vouched]) -> Figures:
 
 def row(counts: np.ndarray, pairs: list[np.ndarray]) -> list[float]:
     """`WHAT` of some captures."""
-    runs, covered, spans, good, seconds, listed = counts
+    runs, covered, spans, good, seconds, frames, listed = counts
     shares = [100.0 * covered / max(runs, 1), 100.0 * good / max(spans, 1)]
     errors = [100.0 * expected_calibration_error(one[0], one[1] > 0.5) for one in pairs]
-    return [*shares, 60.0 * spans / seconds, 100.0 * listed / seconds, *errors]
+    return [*shares, 60.0 * spans / seconds, 100.0 * listed / frames, *errors]
 
 
 def fitted(
@@ -285,9 +287,11 @@ def main(
     cases = unseen_cases(frames, real) if unseen or real else usual_cases(gloves, seeds, frames, label)
     for case in cases[:takes]:
         take, truth = case.kept(store)
+        spans = find_suspect_spans(take, None)
+        scored = score(take, truth, spans)
         for key in (*case.name.split(), "all"):
-            table.setdefault(key, []).append(score(take, truth))
-        vouched.append(Vouched.of(take, truth))
+            table.setdefault(key, []).append(scored)
+        vouched.append(Vouched.of(take, truth, spans))
         if fit:
             evidence = evidence_of(take)
             points = take.point_list
