@@ -1,7 +1,7 @@
 """Whether the list of doubtful frames is right, the confidence in labels, and the bound on wrong frames.
 
 python -m benchmarks.doubtful_frames [--gloves dense19 sparse13] [--seeds 300 301] [--label] [--unseen]
-    [--real DATA] [--store FOLDER] [--fit]
+    [--real DATA] [--store FOLDER] [--takes 66] [--fit]
 
 A person's capture of each kind is tracked (--label: labeled) without calibration. By turns of the seed there
 are foreign markers; many gaps, and markers that exchange trajectories; gaps and foreign markers; noise.
@@ -10,7 +10,8 @@ twenty foreign markers, gloves that no labeler was trained for, and with --real 
 motion, see `real_motion`. A run of errors is consecutive frames, gaps of 5 bridged, in which a marker lacks
 its label, has another one, or a point that is none has it; where half of a hand is wrong, it is the hand's.
 
---store keeps every tracked take and its true labels in a folder, so that a run that was stopped continues.
+--store keeps every tracked take and its true labels in a folder, so that a run that was stopped continues;
+--takes ends after that many of them.
 --fit prints the coefficients of `track.label_confidence`, fitted to the captures.
 """
 
@@ -174,15 +175,18 @@ def listed_frames(take: Take, spans: Sequence[SuspectSpan]) -> np.ndarray:
     return listed
 
 
-def score(take: Take, truth: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Runs, those covered, spans, those with an error, seconds and seconds listed; pairs for calibration."""
-    spans = [span for span in find_suspect_spans(take, None) if span.of_labels]
+def score(
+    take: Take, truth: np.ndarray, suspect: Sequence[SuspectSpan]
+) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Runs, those covered, spans, those with an error, seconds, frames, those listed; pairs of confidence."""
+    spans = [span for span in suspect if span.of_labels]
     runs, listed = error_runs(take, truth), listed_frames(take, spans)
     there = np.isfinite(take.points[..., 0])
     right = (take.labels == truth) | ~there
     covered = sum(listed[first : last + 1].any() for first, last in runs)
     good = sum(not right[span.first : span.last + 1].all() for span in spans)
-    counts = [len(runs), covered, len(spans), good, take.num_frames / take.rate, listed.sum() / take.rate]
+    frames = take.num_frames
+    counts = [len(runs), covered, len(spans), good, frames / take.rate, frames, listed.sum()]
     parts = [there & (take.labels >= 0), there & (take.labels < 0)]
     pairs = [np.stack([take.confidence[part], right[part]]) for part in parts]
     certain = frame_confidence(take)
@@ -205,9 +209,8 @@ class Vouched(NamedTuple):
     """Share of wrong frames among those not listed, over what `vouch` multiplies by its factor."""
 
     @classmethod
-    def of(cls, take: Take, truth: np.ndarray) -> Vouched:
+    def of(cls, take: Take, truth: np.ndarray, spans: Sequence[SuspectSpan]) -> Vouched:
         """Compare a take with its true labels."""
-        spans = find_suspect_spans(take, None)
         right = ((take.labels == truth) | ~np.isfinite(take.points[..., 0])).all(axis=1)
         rest = ~listed_frames(take, spans)
         doubt = 1.0 - np.nan_to_num(frame_confidence(take), nan=1.0)
@@ -236,10 +239,10 @@ def tell_vouched(takes: Sequence[Vouched]) -> Figures:
 
 def row(counts: np.ndarray, pairs: list[np.ndarray]) -> list[float]:
     """`WHAT` of some captures."""
-    runs, covered, spans, good, seconds, listed = counts
+    runs, covered, spans, good, seconds, frames, listed = counts
     shares = [100.0 * covered / max(runs, 1), 100.0 * good / max(spans, 1)]
     errors = [100.0 * expected_calibration_error(one[0], one[1] > 0.5) for one in pairs]
-    return [*shares, 60.0 * spans / seconds, 100.0 * listed / seconds, *errors]
+    return [*shares, 60.0 * spans / seconds, 100.0 * listed / frames, *errors]
 
 
 def fitted(
@@ -271,6 +274,7 @@ def main(
     unseen: bool = False,
     real: Path | None = None,
     store: Path | None = None,
+    takes: int | None = None,
     fit: bool = False,
     save: str | None = None,
 ) -> None:
@@ -280,11 +284,14 @@ def main(
     vouched: list[Vouched] = []
     labeled: list[tuple[np.ndarray, np.ndarray]] = []
     others: list[tuple[np.ndarray, np.ndarray]] = []
-    for case in unseen_cases(frames, real) if unseen or real else usual_cases(gloves, seeds, frames, label):
+    cases = unseen_cases(frames, real) if unseen or real else usual_cases(gloves, seeds, frames, label)
+    for case in cases[:takes]:
         take, truth = case.kept(store)
+        spans = find_suspect_spans(take, None)
+        scored = score(take, truth, spans)
         for key in (*case.name.split(), "all"):
-            table.setdefault(key, []).append(score(take, truth))
-        vouched.append(Vouched.of(take, truth))
+            table.setdefault(key, []).append(scored)
+        vouched.append(Vouched.of(take, truth, spans))
         if fit:
             evidence = evidence_of(take)
             points = take.point_list

@@ -338,7 +338,7 @@ def _error_section(title: str, take: Take, hand: HandFigures) -> Section:
         "cut-off an oscillation keeps half of its size. The band [deg] is the root of the sum of the squares "
         "of its parts, as root mean square over all frames. Gluing and bones are constant errors. "
         "MDD: minimal detectable difference of two sessions of a person, 1.96 times the root of two "
-        "times all parts but bones, which stay. Of hands that are not calibrated it is an upper bound."
+        "times all parts but bones, which stay. Of hands that are not calibrated it is mostly too large."
         if filtered
         else "Filter: none, each pose was fitted to the markers of its frame."
     )
