@@ -450,8 +450,8 @@ def _connect(commands: socket.socket, server: tuple[str, int], url: str) -> Serv
                 raise CaptureError(f"{url}: the server speaks NatNet {major}.{minor}, expected 3.0 or newer")
             return info
     raise NoServerError(
-        f"{url}: no NatNet server answers at port {server[1]}; in Motive, switch streaming on and choose the "
-        "network that this machine is in; its command port may be another one, natnet://host:port"
+        f"{url}: no NatNet server answers at port {server[1]}; in Motive, switch streaming on, choose the "
+        "network that this machine is in, and compare the command port"
     )
 
 
