@@ -493,7 +493,6 @@ _OPENSIM: Final = "angles or forces of OpenSim and no markers; give the TRC that
 _UNREAD: Final = {
     ".tak": "a take of Motive, a closed format; export CSV or C3D with unlabeled markers from Motive",
     ".qtm": "a file of Qualisys' own; export C3D, or TSV of 3D data, from QTM",
-    ".json": "JSON, which is no format of markers; export C3D or TSV of 3D data",
     **dict.fromkeys((".gz", ".zip", ".7z", ".rar"), "compressed; unpack it"),
     ".mat": "a file of MATLAB; export C3D, or TSV of 3D data, from the program that wrote it",
     ".npz": "an archive of NumPy; if it is a take, load_take reads it, and its capture() has the points",

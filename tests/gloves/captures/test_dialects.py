@@ -150,7 +150,6 @@ REFUSED = {
         )
         for suffix in (".c3d", ".csv", ".trc")
     },
-    "JSON": (".json", "{}", "no format of markers | C3D or TSV"),
     "compressed": (".gz", b"\x1f\x8b", "compressed; unpack it"),
     "a date of a spreadsheet": (
         ".trc",
