@@ -130,8 +130,8 @@ def _without_stand_ins(capture: Capture) -> tuple[Capture, int, int]:
     aims = np.unique(np.stack([keys[frames + 1, columns], frames]), axis=1)
     aims, counts = np.unique(aims[0], return_counts=True)
     equal &= np.isin(positions[..., 0], values[repeats])
-    aims = [aim for aim in aims[counts > 2] if not (near == aim).any()]
-    stands = equal | (np.isin(keys, aims) & (capture.num_frames >= _MIN_FRAMES))
+    places = [aim for aim in aims[counts > 2] if not (near == aim).any()]
+    stands = equal | (np.isin(keys, places) & (capture.num_frames >= _MIN_FRAMES))
     there = np.isfinite(positions[..., 0]) & ~stands
     tracks = (positions[there[:, column], column] for column in range(positions.shape[1]))
     if not stands.any() or not any((track != track[:1]).any() for track in tracks):  # nothing moves
