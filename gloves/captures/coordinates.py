@@ -34,8 +34,7 @@ _SENTENCES: Final = {
     LEFT_OUT: "{} points have coordinates and are marked as missing (residual -1), and are left out",
     PIECES: "{} columns hold pieces of unlabeled paths and are read as a few columns",
     _ZEROS: "{} points at exactly (0, 0, 0) are read as missing; if they are points, move the origin",
-    _STAND_INS: "{} points stand for none, at one place such as (-1, -1, -1) or (0, 0, -1), and are read as "
-    "missing",
+    _STAND_INS: "{} points stand for none, as (-1, -1, -1) or (0, 0, -1) do, and are read as missing",
     _DOUBLED: "{} points are where another is, as a marker of two subjects is, and are left out",
     _HELD: "{} points repeat their position while others move, as in gaps filled with the last one, and are "
     "read as missing",
@@ -49,7 +48,7 @@ _MODELED: Final = re.compile(
 """Names that models give their outputs: RThumbAngles, LWristMoment, R_WRIST_ANGLE."""
 _SAME_PLACE: Final = 1e-3  # Markers this near [m] are one: the smallest markers are 1.5 mm wide.
 _SAME_SHARE: Final = 5e-3  # The same as a share of the extent of all points, for files with a wrong unit.
-_JUMP: Final = 0.02  # Points that move farther than this in a frame [m] never meet to the last digit.
+_JUMP: Final = 0.02  # Points that move farther than this in a frame [m] jump; three jumps show a stand-in.
 _NEIGHBORS: Final = 8  # A point is compared with this many points that follow it along a line.
 _MIN_FRAMES: Final = 10  # Repetitions count in this many frames; in fewer they may be chance.
 _NEVER_STILL: Final = 2e-5  # A marker that moves more than this in a frame [m] was not at rest before it.
@@ -117,19 +116,22 @@ def _without_stand_ins(capture: Capture) -> tuple[Capture, int, int]:
     """A capture without points that stand for none; how many were at (0, 0, 0), and how many elsewhere.
 
     Some programs write zeros for what was not seen, -1 or 9999 three times, or (0, 0, -1). A measured point
-    never has one number in all coordinates twice, and markers do not jump to one place again and again; a
-    capture in which nothing moves is left as it is.
+    never has one number in all coordinates twice, and markers do not jump again and again to one place that
+    none moves to; a capture in which nothing moves is left as it is.
     """
     positions = capture.positions
     equal = (positions == positions[..., :1]).all(axis=-1)
     values, counts = np.unique(positions[equal, 0], return_counts=True)
     repeats = (counts > 1) & ((values == 0.0) | (capture.num_frames >= _MIN_FRAMES))
     keys = (positions * [1.0, np.pi, np.e]).sum(axis=-1)  # different positions have different ones
-    frames, columns = np.nonzero(np.linalg.norm(np.diff(positions, axis=0), axis=-1) > _JUMP)
+    steps = np.linalg.norm(np.diff(positions, axis=0), axis=-1)
+    near = keys[1:][(steps > 0.0) & (steps <= _JUMP)]
+    frames, columns = np.nonzero(steps > _JUMP)
     aims = np.unique(np.stack([keys[frames + 1, columns], frames]), axis=1)
     aims, counts = np.unique(aims[0], return_counts=True)
     equal &= np.isin(positions[..., 0], values[repeats])
-    stands = equal | np.isin(keys, aims[counts >= _MIN_FRAMES])
+    places = [aim for aim in aims[counts > 2] if not (near == aim).any()]
+    stands = equal | (np.isin(keys, places) & (capture.num_frames >= _MIN_FRAMES))
     there = np.isfinite(positions[..., 0]) & ~stands
     tracks = (positions[there[:, column], column] for column in range(positions.shape[1]))
     if not stands.any() or not any((track != track[:1]).any() for track in tracks):  # nothing moves

@@ -204,12 +204,11 @@ def _unnamed(rows: list[bytes], num_named: int) -> tuple[str, ...]:
 _MOST_HEADER_LINES: Final = 20
 MOTIVE_BEGIN: Final = b"Format Version"
 _COUNT: Final = "Total Exported Frames"
-_LENGTH: Final = "Length Units"
+_UNIT: Final = "Length Units"
 _SPACE: Final = "Coordinate Space"
 _RATES: Final = ("Export Frame Rate", "Capture Frame Rate")
 _MOTIVE_KEYS: Final = {
-    key.lower(): key
-    for key in ("Format Version", "Take Name", "Take Notes", *_RATES, _COUNT, _LENGTH, _SPACE)
+    key.lower(): key for key in ("Format Version", "Take Name", "Take Notes", *_RATES, _COUNT, _UNIT, _SPACE)
 }
 _AXES: Final = ["X", "Y", "Z"]
 _TYPES: Final = {"Marker", "Rigid Body", "Rigid Body Marker", "Bone", "Bone Marker"}
@@ -236,9 +235,9 @@ def read_motive_csv(data: bytes, tell: Tell = warn) -> Capture:
         if key.lower() in _MOTIVE_KEYS
     }
     rate_key = next((key for key in _RATES if stated.get(key)), _RATES[-1])
-    if not stated.get(_LENGTH):
+    if not stated.get(_UNIT):
         tell("line 1 states no Length Units, read as meters, which Motive writes unless told otherwise")
-    scale = meters_per(stated.get(_LENGTH) or "Meters")
+    scale = meters_per(stated.get(_UNIT) or "Meters")
     if stated.get(_SPACE) == "Local":
         tell("Coordinate Space is Local: markers stand still in their bodies; export world coordinates")
     axes = rows[end]
@@ -494,7 +493,6 @@ _OPENSIM: Final = "angles or forces of OpenSim and no markers; give the TRC that
 _UNREAD: Final = {
     ".tak": "a take of Motive, a closed format; export CSV or C3D with unlabeled markers from Motive",
     ".qtm": "a file of Qualisys' own; export C3D, or TSV of 3D data, from QTM",
-    ".json": "JSON, which is no format of markers; export C3D or TSV of 3D data",
     **dict.fromkeys((".gz", ".zip", ".7z", ".rar"), "compressed; unpack it"),
     ".mat": "a file of MATLAB; export C3D, or TSV of 3D data, from the program that wrote it",
     ".npz": "an archive of NumPy; if it is a take, load_take reads it, and its capture() has the points",

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import bisect
 import codecs
+import contextlib
 import csv
 import math
 import re
@@ -318,18 +319,16 @@ def _parse_cells(
     cells: list[bytes], number: int, titles: Sequence[str], columns: Sequence[int]
 ) -> NDArray[np.float64]:
     """The numbers of a row, NaN for a blank; an error names the cell that is not a finite number."""
-    try:
+    with contextlib.suppress(ValueError):
         values = np.array([float(cell) if cell else _BLANK for cell in cells])
         if not np.isinf(values).any():
             return values
-    except ValueError:
-        pass
     return np.array([_cell_value(cell, number, titles, columns[n]) for n, cell in enumerate(cells)])
 
 
 def _cell_value(cell: bytes, number: int, titles: Sequence[str], column: int) -> float:
     """The number of a cell that may hold blanks."""
-    text = cell.decode("utf-8", "replace").strip()
+    text = cell.decode("utf-8", "replace").strip().replace("\u2212", "-")  # a typographic minus
     try:
         value = _BLANK if text.lower() in _BLANKS else float(text)
         fault = "infinite, expected a finite number or a blank cell" if math.isinf(value) else ""

@@ -175,6 +175,25 @@ def test_numbers_that_stand_for_none_are_missing(moving, rng, tmp_path, suffix, 
     np.testing.assert_array_equal(np.isnan(read.positions[..., 0]), hidden)
 
 
+@pytest.mark.parametrize("count", [2, 3])
+def test_a_place_that_markers_jump_to_thrice_stands_for_none(moving, count):
+    positions = moving.positions.copy()
+    for column in range(count):
+        positions[20 + 9 * column : 40 + 9 * column, column] = 0.0, 0.0, -1e-3
+    read = settled(with_positions(moving, positions))
+    assert read.findings.get("stand_ins", 0) == (20 * count if count == 3 else 0)
+
+
+def test_markers_that_are_exchanged_at_rest_stay(moving):
+    """With few digits exchanged markers jump to where the other one was in other frames."""
+    positions = np.repeat(moving.positions[:1], FRAMES, axis=0)
+    positions += 1e-4 * np.random.default_rng(2).integers(-1, 2, size=positions.shape)
+    positions[:60, 8:] = moving.positions[:60, 8:]
+    positions[::7, [0, 1]] = positions[::7, [1, 0]]
+    read = settled(with_positions(moving, np.round(positions / 1e-4) * 1e-4))
+    assert "stand_ins" not in read.findings
+
+
 def test_two_columns_of_a_marker_have_the_points_of_both(moving):
     first, second = moving.positions[:, :1].copy(), moving.positions[:, :1].copy()
     first[:40], second[80:] = np.nan, np.nan

@@ -47,6 +47,7 @@ SAME = {
     "inches": (".csv", noted(notes='5" ball'), MOTIVE),
     "Excel's first line": (".csv", "sep=,\n" + MOTIVE, MOTIVE),
     "UTF-16 without a mark": (".trc", TRC.encode("utf-16-le"), TRC),
+    "a typographic minus": (".trc", TRC.replace("-", "\u2212"), TRC),
     "small letters": (".trc", TRC.replace("PathFileType", "pathfiletype"), TRC),
     "a unit in brackets": (".trc", TRC.replace("mm", "(mm)"), TRC),
     "a row of nan": (".trc", TRC.replace(ROWS[0], "nan\n" + ROWS[0]), TRC),
@@ -149,7 +150,6 @@ REFUSED = {
         )
         for suffix in (".c3d", ".csv", ".trc")
     },
-    "JSON": (".json", "{}", "no format of markers | C3D or TSV"),
     "compressed": (".gz", b"\x1f\x8b", "compressed; unpack it"),
     "a date of a spreadsheet": (
         ".trc",
