@@ -1,22 +1,26 @@
-"""Write the list of kernels that commands compile ahead, after a kernel's arguments or callers changed.
+"""What the first run of each command costs, while the cache of kernels is empty, and the list of kernels.
 
-The commands run without the list and with one cache that is empty at first. The list is written anew, with
-the time that each kernel takes to compile, and the dearest kernels are printed.
+The clock runs from the start of a command to its end, and processor time is that of all its processes.
+With --record the commands run without the list and with one cache, the dearest kernels are printed, and the
+list is written anew: after a change to a kernel's arguments or to what calls it.
 
-python -m benchmarks.cold_start
+python -m benchmarks.cold_start [--only label track ...] [--record]
 """
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
+import resource
 import subprocess
 import sys
 import tempfile
+import time
 from pathlib import Path
 from typing import Any, Final
 
-from benchmarks.record import describe, run
+from benchmarks.record import describe
 from handsim.app.compiling import LIST
 
 # In the order of the recording; a later command may read what an earlier one wrote.
@@ -30,6 +34,7 @@ COMMANDS: Final = {
     "evaluate": "evaluate hand.truth.npz",
     "calibrate": "calibrate hand.c3d --size M --out user.json",
 }
+RUN: Final = "import sys; from handsim.cli.main import main; sys.exit(main())"
 RECORD: Final = """
 import gc, json, sys, time
 
@@ -80,14 +85,27 @@ sys.exit(code)
 """
 
 
-def main(folder: Path) -> None:
+def measure(names: list[str], folder: Path) -> None:
+    """Print what each command costs with an empty cache of its own."""
+    print(f"{'command':12}{'wall [s]':>9}{'processor [s]':>15}{'kernels':>9}")
+    for name in ["simulate", *(name for name in names if name != "simulate")]:
+        environment = {**os.environ, "NUMBA_CACHE_DIR": str(folder / f"cache-{name}")}
+        before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+        command = [sys.executable, "-c", RUN, *COMMANDS[name].split()]
+        subprocess.run(command, cwd=folder, env=environment, stdout=subprocess.DEVNULL, check=True)
+        after, wall = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter() - began
+        busy = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+        kernels = len(list((folder / f"cache-{name}").rglob("*.nbc")))
+        print(f"{name:12}{wall:9.1f}{busy:15.1f}{kernels:9}", flush=True)
+
+
+def record(names: list[str], folder: Path) -> None:
     """Write the list, and print its dearest kernels."""
-    print(describe("numba"))
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(folder / "cache")}
     table: list[Any] = []
     seconds: dict[str, float] = {}
     users: dict[str, set[str]] = {}
-    for name in COMMANDS:
+    for name in names:
         command = [sys.executable, "-c", RECORD, "recorded.json", *COMMANDS[name].split()]
         given = json.dumps(table) + "\n"
         subprocess.run(command, cwd=folder, env=environment, input=given, text=True, check=True)
@@ -108,6 +126,18 @@ def main(folder: Path) -> None:
         print(f"{took:7.2f} s  {place}  ({commands})")
 
 
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--only", nargs="+", choices=COMMANDS, default=list(COMMANDS))
+    parser.add_argument("--record", action="store_true")
+    options = parser.parse_args()
+    print(describe("numba"))
+    with tempfile.TemporaryDirectory() as folder:
+        if options.record:
+            record(options.only, Path(folder))
+        else:
+            measure(options.only, Path(folder))
+
+
 if __name__ == "__main__":
-    with tempfile.TemporaryDirectory() as temporary:
-        run(lambda: main(Path(temporary)), __doc__)
+    main()

@@ -48,7 +48,7 @@ def no_leftovers():
 
 
 def test_nearly_everything_on_the_list_is_there():
-    """`python -m benchmarks.cold_start` writes it anew; few that are gone cost next to nothing."""
+    """`python -m benchmarks.cold_start --record` writes it anew; few that are gone cost next to nothing."""
     known, listed, gone = known_types(), read_list(), 0.0
     for one in listed:
         try:
