@@ -8,8 +8,8 @@ four pinches, palms together, middle fingertips together, each hand turned about
 again. Sixteen cameras see the markers; the tracker's frames are encoded as `--send
 "ws://...?joints=openxr&axes=openxr"` does it, and read back as a client reads them. The limits are those of
 the page, of its checker's README and of the constants in the checker's source at the end of 2026, where they
-are called provisional. This script shares
-no code with that checker, and a pass here is not one there: a take for it is recorded through a headset.
+are called provisional. This script shares no code with that checker, and a pass here is not one there: a take
+for it is recorded through a headset.
 """
 
 from __future__ import annotations
