@@ -34,7 +34,7 @@ class Pictures:
     rgb: UInt8[np.ndarray, "H W 3"] | None = None
     """sRGB."""
     light: Float16[np.ndarray, "H W 3"] | None = None
-    """Linear light of the colors before they end at white, which is 1; in pictures for EXR files."""
+    """Linear light of the colors, 1 for white, with highlights beyond; only where EXR files are written."""
     depth: Float32[np.ndarray, "H W"] | None = None
     """Distance along the camera's axis at each pixel's center [m]; 0 where there is nothing."""
     normals: Float32[np.ndarray, "H W 3"] | None = None

@@ -267,7 +267,7 @@ class Studio:
             rgb = self._colors_of(camera, drawn, choices) if self._film is None else self._film.picture(frame)
             noisy_rgb = self._exposed(moment, camera, rgb, choices, rng)
             if self._light:
-                most = np.where(rgb < 255, rgb + 1.0, np.inf)  # a pixel's parts end at white first
+                most = np.where(rgb < 255, rgb + 1.0, np.inf)  # parts of a pixel are cut at white one by one
                 levels = np.clip(self._colors_of(camera, drawn, choices, bright=True), rgb - 1.0, most)
                 light = light_of(levels).astype(np.float16)
         if self._config.room_depth and self._film is None and {"depth", "normals"} & self._passes:

@@ -203,7 +203,7 @@ class Bundle:
         return matches
 
     def samples(self, matches: Matches) -> Samples:
-        """The keypoints of matched hands, thinned out to `_MOST_BUNDLED` about."""
+        """The keypoints of matched hands, thinned out to about `_MOST_BUNDLED`."""
         frames, hands, keypoints = np.nonzero(np.isfinite(matches.errors[..., 0]))
         kept = matches.numbers[frames, hands] % (1 + len(frames) // _MOST_BUNDLED) == 0
         frames, hands, keypoints = (np.repeat(one[kept], 2) for one in (frames, hands, keypoints))

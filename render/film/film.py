@@ -64,7 +64,7 @@ def register_camera(
         camera: A camera with the lens of the video's, or a file of it; its pose does not count. The focal
             length, the center and two coefficients are found, too, when not given.
         detector: Finds the hands in the pictures; the shipped one when not given.
-        progress: Called with the numbers of frames in which hands were looked for, and of all.
+        progress: Called with the numbers of frames that were read, and of all.
 
     Returns:
         Pose [m], lens [px] and clock [s], with standard deviations, and what fits where.
@@ -150,8 +150,8 @@ def annotate_film(
         detector: As in `register_camera`.
         workers: As in `render_take`.
         progress: Called with numbers of done and of all frames, first of finding hands, then of writing.
-        settings: Settings of `RenderConfig` that a film has: passes, dress (a glove when not given), every,
-            num_frames, frames_per_shard, seed and up.
+        settings: Settings of `RenderConfig` that a film has: passes, openxr, dress (a glove when not given),
+            frames, every, num_frames, frames_per_shard, seed and up.
 
     Returns:
         The registration: pose [m], lens [px], clock [s], and which frames fit.

@@ -6,6 +6,7 @@ the pose for a few focal lengths.
 
 from __future__ import annotations
 
+import itertools
 from typing import Final, NamedTuple
 
 import cv2
@@ -33,16 +34,17 @@ def first_guess(bundle: Bundle) -> State:
     """Unknowns that explain most of what was found: clock by all shifts, pose by PnP."""
     gate, best, most = GATE * bundle.size[0], None, 0.0
     taken, filmed = bundle.motion.times, bundle.found.times
-    shifts = np.arange(taken[0] - filmed[-1], taken[-1] - filmed[0], _STEP)
-    fits = [_affine_fit(bundle, shift, swapped) for swapped in (False, True) for shift in shifts.tolist()]
+    shifts = np.arange(taken[0] - filmed[-1], taken[-1] - filmed[0], _STEP).tolist()
     tried: list[float] = []
-    for fit in sorted(fits, key=lambda fit: -fit.agreeing):
+    # The best fits are computed again, because those of all shifts together would fill the memory.
+    clocks = itertools.product((False, True), shifts)
+    for swapped, shift in sorted(clocks, key=lambda clock: -_affine_fit(bundle, *clock).agreeing):
         if len(tried) == _TRIED:
             break
-        if any(abs(fit.offset - other) < _APART for other in tried):
+        if any(abs(shift - other) < _APART for other in tried):
             continue
-        tried.append(fit.offset)
-        start = _posed(bundle, fit)
+        tried.append(shift)
+        start = _posed(bundle, _affine_fit(bundle, swapped, shift))
         if start is None:
             continue
         samples = bundle.samples(bundle.match(start, gate))
@@ -65,7 +67,7 @@ class _AffineFit(NamedTuple):
     agreeing: float  # number of detections that are explained
 
 
-def _affine_fit(bundle: Bundle, offset: float, swapped: bool) -> _AffineFit:
+def _affine_fit(bundle: Bundle, swapped: bool, offset: float) -> _AffineFit:
     """The affine camera that explains most of what was found at a shift.
 
     It begins with the sides that the detector told, or with the other ones, and then gives each detection to

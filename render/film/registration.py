@@ -176,8 +176,8 @@ def register(
     with_hands, looked = (len(np.unique(one)) for one in (bundle.found.frames, bundle.found.looked))
     if with_hands < _FEWEST_FRAMES:
         raise HandSimError(
-            f"hands were found in {with_hands} of {looked} frames of the video, expected {_FEWEST_FRAMES} at "
-            "least"
+            f"hands were found in {with_hands} of the {looked} frames that were searched, expected "
+            f"{_FEWEST_FRAMES} at least"
         )
     state, noise = first_guess(bundle), 0.25 * GATE * width
     for turn in range(_ROUNDS):

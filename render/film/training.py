@@ -154,7 +154,7 @@ def fit(
     seed: int,
     rate: float = _RATE,
 ) -> list[float]:
-    """Train a network with batches that are made; the losses of all steps."""
+    """Train a network on the batches that `make` draws; return the losses of all steps."""
     network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     optimizer = torch.optim.AdamW(network.parameters(), lr=rate, weight_decay=0.01, fused=True)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, rate, total_steps=steps + 1, pct_start=0.15)

@@ -302,7 +302,7 @@ def paint(
 ) -> NDArray[Any]:
     """Colors over black (sRGB), and as fourth channel the covered share of each pixel, through any lens.
 
-    Bytes (H, W, 4); what the painter "bright" returns are numbers, and do not end at 255.
+    The picture (H, W, 4) has bytes; that of the painter "bright" has floats, which may exceed 255.
     """
     bright = painter == "bright"
     faces, parts, inner = faces_for(camera), [], []

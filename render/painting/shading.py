@@ -115,7 +115,7 @@ def lit_share(to_map: Doubles, nearest: Floats, bias: float, x: float, y: float,
 
 
 def level_behind(backdrop: Backdrop, camera: Camera, drawn: Sequence[Drawn]) -> float:
-    """Position along its normal in the camera's axes [m] that depth has a backdrop at: behind arms, too."""
+    """Level along its normal in the camera's axes [m] at which depth shows a backdrop: behind arms, too."""
     nearest, normal = np.inf, backdrop.normal
     if backdrop.level is None and drawn:
         some = 1 if backdrop.shadows else 8  # far walls need not be exact

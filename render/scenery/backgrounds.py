@@ -179,7 +179,7 @@ class Backdrop:
     """Position along its normal in the camera's axes [m]; None: the gap is from the hands of each picture."""
     shadows: bool = True  # whether it catches the hands' shadows, or is too far away for them
     arms: float | None = None
-    """Level behind the arms of all frames, which depth has where it is the lower one [m]."""
+    """Level behind the arms of all frames [m]; depth shows the backdrop at the lower of both levels."""
 
     def behind(self, nearest: float) -> float:
         """Its level; `nearest` is the hands' least position along the normal [m]."""

@@ -17,8 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from handsim._checks import check_count, check_type
-from handsim.errors import HandSimError
-from handsim.files.outputs import atomic_write
+from handsim.files.outputs import atomic_write, check_ending
 from render.frames import Doubles, Integers
 from render.scenery.backgrounds import (
     LUMINANCE,
@@ -154,12 +153,11 @@ def write_environment_map(file: str | Path, *, seed: int = 0) -> None:
     Lamps have the strength that hands in such a room see, and walls the light that pictures show.
 
     Raises:
-        HandSimError: The file's name ends otherwise, or the seed is negative.
+        ArgumentError: The file's name does not end in .hdr, or the seed is negative.
     """
     check_type("file", file, (str, Path), "a path")
     check_count("seed", seed, 0)
-    if Path(file).suffix.lower() != MAP_SUFFIXES[0]:
-        raise HandSimError(f"{file}: expected a file name that ends in {MAP_SUFFIXES[0]}")
+    check_ending(Path(file), MAP_SUFFIXES[0], option="file")
     rng, here = np.random.default_rng(seed), np.zeros((1, 3))
     background, lighting, room = sample_surroundings(Backgrounds({"room": 1.0}), _AHEAD, around=here, rng=rng)
     assert room is not None

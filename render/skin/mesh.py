@@ -172,7 +172,7 @@ def _squares(nodes: Integers) -> Integers:
 _REFERENCE: Final = 0.0118  # radius of the finger at its knuckle that the lengths below are made for [m]
 _THUMB_RADIUS: Final = 0.018  # distance from the thumb's axis within which the skin is the thumb's [m]
 _FINGERS: Final = ("index", "middle", "ring", "little")
-_LEAST_SHARE: Final = 0.04  # of two bones in a vertex between them that counts as bent
+_LEAST_SHARE: Final = 0.04  # Vertices bend where twice the product of two bones' weights is larger.
 
 
 class _Hill(NamedTuple):
@@ -348,9 +348,9 @@ class DrawnSkin:
     normals: Float32[np.ndarray, "D 3"]  # outward unit normals
     uv: Float32[np.ndarray, "D 2"]  # texture coordinates, the origin at the bottom left
     shade: Float32[np.ndarray, "D"]
-    """Share of the ambient light that the hand itself does not block, 0 to 1."""
+    """Factor on the ambient light: the share that the hand leaves, more where bones stretch the skin."""
     faces: Int[np.ndarray, "F 3"]  # triangles, counter-clockwise from outside
-    parts: UInt8[np.ndarray, "F"]  # bone of each triangle, an index of `topology.BONES` or `FOREARM`
+    parts: UInt8[np.ndarray, "F"]  # bone of each triangle, an index of `shape.BONES` or `FOREARM`
     coarse_faces: Int[np.ndarray, "G 3"]
     """Fewer triangles of the same vertices, nearly the same surface."""
 

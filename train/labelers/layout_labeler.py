@@ -142,7 +142,7 @@ def mean_features(markers: Float[np.ndarray, "T M 3"], config: LayoutNetworkConf
 
 
 def _share_of_work(num_markers: int) -> float:
-    """Share of poses and clouds used for a layout, so that large ones take two minutes, too."""
+    """Share of poses and clouds used for a layout, so that large ones take about a minute, too."""
     return min(1.0, (_MANY_MARKERS / num_markers) ** 2)
 
 

@@ -134,7 +134,7 @@ def test_another_take_is_refused():
     frames = Filming(seed=12).found(moving_take())
     with pytest.raises(HandSimError, match=r"do not move as those of the take|hands were found in"):
         register(moving_take(seed=5, sides=("left",)), frames, SIZE)
-    with pytest.raises(HandSimError, match="hands were found in 0 of 10 frames"):
+    with pytest.raises(HandSimError, match="hands were found in 0 of the 10 frames"):
         register(moving_take(), [frame._replace(hands=[]) for frame in frames[:10]], SIZE)
 
 
