@@ -232,7 +232,7 @@ class Backgrounds:
         if every["photo"] > 0.0 and self.photos is None:
             raise HandSimError("backgrounds of photographs need `photos`, the folder they lie in (--photos)")
         if every["photo"] == 0.0 and self.photos is not None:
-            raise HandSimError(f"photos is {self.photos}, expected the background photo with it (--background photo)")
+            raise HandSimError(f"photos is {self.photos}, expected the background photo (--background photo)")
         object.__setattr__(self, "shares", every)
         object.__setattr__(self, "photos", None if self.photos is None else str(self.photos))
 

@@ -121,7 +121,7 @@ def test_folders_without_photographs_are_told(photos: Path, tmp_path: Path) -> N
     with pytest.raises(HandSimError, match="no such folder"):
         sample_background(only("photo", photos=str(tmp_path / "none")), rng=np.random.default_rng(0))
     (tmp_path / "room.hdr").touch()
-    with pytest.raises(HandSimError, match="room.hdr: a file, expected a folder of photographs"):
+    with pytest.raises(HandSimError, match=r"room\.hdr: a file, expected a folder of photographs"):
         sample_background(only("photo", photos=str(tmp_path / "room.hdr")), rng=np.random.default_rng(0))
 
 
