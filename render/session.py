@@ -522,6 +522,8 @@ def _check_formats(formats: Sequence[str], config: RenderConfig) -> None:
         check_choice(name, FORMATS, noun="format", error=HandSimError)
         if WRITERS[name].needs_colors and "rgb" not in config.passes:
             raise without_colors(name)
+    if config.openxr and not {"coco", "yolo"} & set(formats):
+        raise HandSimError(f"formats are {', '.join(formats)}, expected coco or yolo for openxr's joints")
     if not formats or len(set(formats)) < len(formats):
         raise HandSimError(f"formats are {', '.join(formats) or 'none'}, expected at least one, each once")
 

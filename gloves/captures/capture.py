@@ -30,7 +30,7 @@ class Capture:
 
     names: tuple[str, ...]
     """One name per trajectory, never empty; it need not name a marker ("*12", "Unlabeled 2379")."""
-    positions: Float[np.ndarray, "T N 3"]
+    positions: Float[np.ndarray, "T N 3"] = field(repr=False)
     """Positions [m] in the file's axes; NaN, always in all three coordinates, where a marker was not seen."""
     rate: float
     """Frames per second [Hz]."""

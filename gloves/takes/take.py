@@ -168,6 +168,7 @@ class Take:
         for name, value in (*by_frame.items(), *others.items()):
             object.__setattr__(self, name, value)
         try:
+            object.__setattr__(self, "rate", float(rate))  # whole numbers and NumPy's are rates, too
             if given or point_list is None:  # all tables, or some that replace those of the list
                 point_list = PointList.of_tables(**(point_list.tables if point_list else {}) | given)
             object.__setattr__(self, "point_list", point_list)
@@ -852,8 +853,8 @@ def _check(take: Take) -> None:
         raise ValueError(
             f"{frames} frames of the hands {take.sides}, expected at least one frame and one hand per side"
         )
-    if not 0.0 < take.rate < np.inf or not np.isfinite(take.times).all() or (np.diff(take.times) <= 0).any():
-        raise ValueError("the rate is not positive, or times do not increase")
+    if not np.isfinite(take.times).all() or (np.diff(take.times) <= 0).any():
+        raise ValueError("times do not increase")
     for status, poses in ((take.status, take.qpos), (take.body_status, take.body_poses)):
         is_lost = (status == LOST)[..., None]
         if not _within(status, 0, len(STATUSES) - 1) or (np.isnan(poses) != is_lost).any():
@@ -872,7 +873,7 @@ def _check(take: Take) -> None:
         if distances is not None:
             _check_range(distances, 0.0, _MAX_LENGTH)
     _check_range(take.times, -_MAX_TIME, _MAX_TIME)
-    _check_range(np.array(take.rate), 1.0 / _MAX_TIME, _MAX_TIME)
+    _check_range(np.nan_to_num(take.rate), 1.0 / _MAX_TIME, _MAX_TIME)
     if not _within(points.points, -_MAX_LENGTH, _MAX_LENGTH):
         raise ValueError(f"a position is not from {-_MAX_LENGTH:g} to {_MAX_LENGTH:g}")
     _check_range(points.confidence, 0.0, 1.0)

@@ -63,7 +63,7 @@ def film(
     from render.film.film import PAGE, annotate_film
 
     check_outputs((take, video, camera, detector), (out,))
-    begin, steps = time.perf_counter(), iter(("finding hands", "writing pictures"))
+    begin, steps = time.perf_counter(), iter(("finding hands and camera", "writing pictures"))
     with progress_bar("frames") as bar:
         last = [float("inf")]
 

@@ -176,9 +176,8 @@ def annotate_film(
     poses = np.stack([registration.camera_of(n).T_world_camera for n in range(posed.num_frames)])
     pictures = FilmPictures(film.path.absolute(), poses, None if shown.lens == first.lens else first)
     record = {"film": {"sha256": checksum(film.path), **registration.record()}}
-    subject = dataclasses.replace(subject_of_take(posed), film=pictures, poses=record)
     config = dataclasses.replace(config, view=ViewConfig(cameras=(shown,)))
-    source: Any = subject  # only this module gives a subject
+    source: Any = dataclasses.replace(subject_of_take(posed), film=pictures, poses=record)  # not public
     render_take(source, out, formats, config, workers=workers, progress=progress)
     folder = Path(out)
     save_json(folder / RECORD, registration.record())
@@ -197,15 +196,11 @@ def filmed_take(take: Take, registration: Registration, *, every: bool = False) 
     qpos = poses_at(take, shutter_times(take, times, cameras, registration.readout))
     if not every:
         qpos[[bool(reason) for reason in registration.reasons]] = np.nan
+    bodies = between_poses(take.times, times, take.body_poses, take.rate)
     return Take.of_poses(
-        take.hands,
-        qpos,
-        rate=take.rate,
-        times=times,
-        bodies=take.bodies,
-        body_poses=between_poses(take.times, times, take.body_poses, take.rate),
+        take.hands, qpos, rate=take.rate, times=times, bodies=take.bodies, body_poses=bodies,
         settings=take.settings,
-    )
+    )  # fmt: skip
 
 
 class _Skeleton(NamedTuple):

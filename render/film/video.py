@@ -48,17 +48,17 @@ class Film:
         self._maps = None if lens_of is None else straightening(lens_of)
 
     def _open(self) -> None:
+        os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # Quiet: the error below says enough.
         level = cv2.utils.logging.getLogLevel()
-        cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # The error below says enough.
+        cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
         try:
             with plain_path(self.path) as plain:
                 self._reader, self._next = cv2.VideoCapture(str(plain), cv2.CAP_FFMPEG), 0
         finally:
             cv2.utils.logging.setLogLevel(level)
         if not self._reader.isOpened():
-            raise CaptureError(
-                f"{self.path}: not a video that can be read, expected an .mp4, .mov or .avi file"
-            )
+            why = "not a video that can be read, expected an .mp4, .mov or .avi file"
+            raise CaptureError(f"{self.path}: {why if self.path.exists() else 'no such file'}")
 
     def frames(self) -> Iterator[tuple[float, Bytes]]:
         """Time [s] and picture (sRGB) of every frame."""

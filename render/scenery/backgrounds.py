@@ -46,7 +46,8 @@ _MOST_PIXELS: Final = 100_000_000  # largest number of pixels of a photograph
 def photo_files(folder: Path) -> tuple[tuple[Path, ...], tuple[Path, ...]]:
     """Files of photographs in a folder and its subfolders: those that begin like pictures, and the others."""
     if not folder.is_dir():
-        raise HandSimError(f"{folder}: no such folder of photographs")
+        what = "a file, expected a" if folder.exists() else "no such"
+        raise HandSimError(f"{folder}: {what} folder of photographs")
     files = sorted(file for file in folder.rglob("*") if file.suffix.lower() in PHOTO_SUFFIXES)
     good, broken = list[Path](), list[Path]()
     for file in files:
@@ -229,9 +230,9 @@ class Backgrounds:
         if min(every.values()) < 0.0 or not sum(every.values()) > 0.0:
             raise HandSimError(f"shares of backgrounds are {shares}, expected none negative and one positive")
         if every["photo"] > 0.0 and self.photos is None:
-            raise HandSimError("backgrounds of photographs need `photos`, the folder they lie in")
+            raise HandSimError("backgrounds of photographs need `photos`, the folder they lie in (--photos)")
         if every["photo"] == 0.0 and self.photos is not None:
-            raise HandSimError(f"photos is {self.photos}, expected a share of the background photo with it")
+            raise HandSimError(f"photos is {self.photos}, expected the background photo (--background photo)")
         object.__setattr__(self, "shares", every)
         object.__setattr__(self, "photos", None if self.photos is None else str(self.photos))
 

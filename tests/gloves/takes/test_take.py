@@ -159,6 +159,16 @@ def test_poses_alone_are_a_take(take, rng):
         Take.of_poses(take.hands, qpos, rate=30.0)
 
 
+@pytest.mark.parametrize("rate", [30, np.int64(30), np.float32(30.0)])
+def test_rates_may_be_whole_numbers_and_numpys(take, rng, tmp_path, rate):
+    mine = Take.of_poses(take.hands[:1], join_qpos(rng.random((4, 20)))[:, None], rate=rate)
+    mine.save(tmp_path / "mine.npz")
+    assert load_take(tmp_path / "mine.npz").rate == 30.0
+    for wrong in (0.0, -1.0, 1e-15, np.nan, np.inf):
+        with pytest.raises(ArgumentError, match="number is not from 1e-12"):
+            dataclasses.replace(mine, rate=wrong)
+
+
 def test_labels_count_through_hands_and_bodies(take):
     names = take.label_names
     assert (names[0], names[MARKERS], names[-1]) == ("left:ThumbCMC", "right:ThumbCMC", "pen:Pen3")

@@ -68,7 +68,7 @@ def test_mistakes_are_sentences(files, tmp_path, capsys):
     (tmp_path / "rig.toml").write_text("")
     for words, told in (
         ([take, str(tmp_path / "text.mp4")], "not a video that can be read"),
-        ([take, str(tmp_path / "none.mp4")], "none.mp4"),
+        ([take, str(tmp_path / "none.mp4")], "none.mp4: no such file"),
         ([video, video], "video.mp4"),
         ([take, video, "--camera", str(tmp_path / "rig.toml")], "rig.toml"),
     ):

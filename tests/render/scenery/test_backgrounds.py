@@ -120,6 +120,9 @@ def test_folders_without_photographs_are_told(photos: Path, tmp_path: Path) -> N
         sample_background(only("photo", photos=str(photos)), rng=np.random.default_rng(0))
     with pytest.raises(HandSimError, match="no such folder"):
         sample_background(only("photo", photos=str(tmp_path / "none")), rng=np.random.default_rng(0))
+    (tmp_path / "room.hdr").touch()
+    with pytest.raises(HandSimError, match=r"room\.hdr: a file, expected a folder of photographs"):
+        sample_background(only("photo", photos=str(tmp_path / "room.hdr")), rng=np.random.default_rng(0))
 
 
 def test_impossible_configs_are_told() -> None:
