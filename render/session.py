@@ -44,7 +44,6 @@ from render.captions import contact_sheet, write_png
 from render.color_sensor import sample_exposure, sample_shutter
 from render.config import RenderConfig, SpawnKey
 from render.depth_sensor import sample_depth_noise
-from render.film.video import Film
 from render.formats.records import centered_K, without_colors
 from render.formats.shards import INDEX
 from render.formats.webdataset import TAR
@@ -64,6 +63,7 @@ from render.scenery.lights import sample_surroundings
 from render.studio import FrameChoices, Moment, Studio
 from render.subject import Model, PoseFile, Source, Subject, load_subject, source_of
 from render.user_body import UserBody
+from render.video import Film
 from render.viewpoints import ViewConfig, Viewpoints, check_hands_in_view
 
 _MOST_STUDIOS: Final = 32  # largest number of studios that are kept, some 5 MB each

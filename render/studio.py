@@ -26,7 +26,6 @@ from handsim.space.transforms import pose_matrices
 from render.color_sensor import GAMMA, Exposure, Shutter, combine, expose, light_of, linear_of, shutter_times
 from render.config import RenderConfig
 from render.depth_sensor import DepthNoise, TimeOfFlight, apply_depth_noise, reflectance_of
-from render.film.video import Film
 from render.frames import (
     FOREARM,
     PARTS_A_HAND,
@@ -57,6 +56,7 @@ from render.scenery.backgrounds import (
 from render.scenery.lights import Lighting
 from render.skin.look import SkinLook, upper_arms
 from render.user_body import UserBody
+from render.video import Film
 
 
 def _allowed_parts() -> Flags:

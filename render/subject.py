@@ -38,8 +38,8 @@ from handsim.motion_files.motion import read_joint_csv
 from handsim.space.transforms import UpAxis, rotation_quaternions, turned_poses, upright
 from poses.shapes import HIGH, LOW
 from render.config import SpawnKey
-from render.film.video import FilmPictures
 from render.frames import Doubles
+from render.video import FilmPictures
 
 KEYS: Final = ("qpos", "angles", "T_world_wrist", "times", "person", "hands", "hand_size")
 CSV: Final = ".csv"

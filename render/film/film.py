@@ -29,12 +29,12 @@ from render.film.detector import FoundHand, HandDetector
 from render.film.outlines import poses_at, shutter_times
 from render.film.page import write_film_page
 from render.film.registration import Registration, register
-from render.film.video import Film, FilmPictures, straight
 from render.formats.writer import WRITERS
 from render.frames import Bytes
 from render.illustrations import write_video
 from render.session import render_take
 from render.subject import subject_of_take
+from render.video import Film, FilmPictures, straight
 from render.viewpoints import ViewConfig
 
 RECORD, VIDEO, PAGE = "film.json", "film.mp4", "film.html"

@@ -21,11 +21,11 @@ from handsim.hand.model import between_poses
 from handsim.space.camera import Camera
 from handsim.space.transforms import pose_matrices
 from render.film.bundle import READOUT, Bundle, Samples, State
-from render.film.video import straight, straightening
 from render.frames import FOREARM, PARTS_A_HAND, Bytes, Doubles, Flags, Floats, Geometry, Integers
 from render.painting.figures import BodyFigure
 from render.painting.rasterizer import Triangles, see
 from render.skin.mesh import PosableSkin, face_parts, skin_atlas
+from render.video import straight, straightening
 
 _WIDEST: Final = 800  # [px] Wider pictures are shrunk to this width.
 _MOST_POINTS: Final = 80  # largest number of outline points of a hand in a picture
