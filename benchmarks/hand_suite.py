@@ -83,7 +83,7 @@ class Hand:
     places: np.ndarray
     """Positions (T, 26, 3) [m]; NaN without a pose."""
     turns: np.ndarray
-    """Quaternions (T, 26, 4), wxyz."""
+    """Orientations of the 26 joints as quaternions (T, 26, 4) in the order w, x, y, z."""
     times: np.ndarray
     steps: dict[str, slice]
 
@@ -516,7 +516,7 @@ def fist_over_flat(hand: Hand) -> float:
 
 
 def pinch(hand: Hand) -> dict[str, np.ndarray]:
-    """Distance of each fingertip from the thumb's [m]."""
+    """Distances (T,) of each finger's tip from the thumb's tip [m]."""
     return {finger: np.linalg.norm(hand.tip(finger) - hand.tip("thumb"), axis=1) for finger in FINGERS}
 
 

@@ -86,7 +86,7 @@ def sessions_of(user: int, glove: str, seconds: float, calibrate: bool) -> list[
 def kept_sessions(
     folder: Path | None, user: int, glove: str, seconds: float, calibrate: bool
 ) -> list[Session]:
-    """The same from a folder where they are there, else kept in it."""
+    """The sessions of a user, read from the folder if it has them, otherwise made and kept there."""
     if folder is None:
         return sessions_of(user, glove, seconds, calibrate)
     path = folder / f"{glove}_{seconds:g}_{'calibrated' if calibrate else 'measured'}_{user}.npz"

@@ -76,8 +76,8 @@ class RenderConfig(Settings):
     """Sensor that adds noise to depth, or its name; auto: one whose range fits the placement, see
     `NEAR_SENSOR`; None: perfect depth alone."""
     room_depth: bool = True
-    """Whether depth and normals show the room or the wall behind hands and objects, which environment maps
-    do not have. Otherwise both are 0 there."""
+    """Whether depth and normals show the room or the wall behind hands and objects. Otherwise both are 0
+    there, as they are before an environment map, which has no depth."""
     openxr: bool = False
     """Whether COCO's annotations have the 26 joints of OpenXR, too, with their poses."""
     color_sensor: ExposureConfig | None = field(default_factory=ExposureConfig)

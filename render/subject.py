@@ -266,7 +266,7 @@ class Cast:
         return SpawnKey.PERSON.rng(self.seed, person, 1)
 
     def hands(self, person: int, worn: Sequence[GloveFit]) -> tuple[GloveFit, ...]:
-        """A person's hands in gloves of the layouts that are worn."""
+        """A person's hands, each in a glove of the same layout as the hand of `worn` that it replaces."""
         if self.shapes is not None:
             shape = self.shapes[person if len(self.shapes) > 1 else 0]
         else:

@@ -21,6 +21,7 @@ from handsim.space.camera import Camera, Lens
 from render.frames import Bytes, Floats
 
 _USUAL_RATE: Final = 30.0  # [Hz] of a video that does not tell its own
+_MOST_FRAMES: Final = 1 << 20
 
 
 class Film:
@@ -42,7 +43,7 @@ class Film:
         )  # fmt: skip
         self.size = int(width), int(height)
         self.rate = rate if 0.0 < rate < 1e4 else _USUAL_RATE
-        self.num_frames = int(max(count, 0))
+        self.num_frames = int(min(max(count, 0), _MOST_FRAMES))
         """As the file tells it, which may be wrong."""
         Camera("film", self.size, np.diag([1.0, 1.0, 1.0]))  # refuses pictures that are too large
         self._maps = None if lens_of is None else straightening(lens_of)
@@ -62,10 +63,12 @@ class Film:
 
     def frames(self) -> Iterator[tuple[float, Bytes]]:
         """Time [s] and picture (sRGB) of every frame."""
-        number = 0
-        while frame := self.frame(number):
+        for number in range(_MOST_FRAMES):
+            frame = self.frame(number)
+            if frame is None:
+                return
             yield frame
-            number += 1
+        raise CaptureError(f"{self.path}: more than {_MOST_FRAMES} frames, expected a shorter video")
 
     def frame(self, number: int) -> tuple[float, Bytes] | None:
         """Time [s] and picture (sRGB) of a frame, None after the last one; reading forward is fast."""

@@ -30,7 +30,7 @@ from render.user_body import UserBody
 _OUTLINE: Final = (0, 2, 4, 5, 6, 8, 10, 12, 14, 16, 17, 18, 20)  # keypoints that span a hand's outline
 _CHUNK: Final = 2048  # frames whose keypoints are computed at once
 _SKIN: Final = 0.012  # thickness of the skin around keypoints [m]
-_SLEEVE: Final = 0.1  # thickness of sleeves and upper arms around the line of a forearm [m]
+_SLEEVE: Final = 0.1  # distance from a forearm's axis to the outside of a sleeve or an upper arm [m]
 _ALONG_ARM: Final = np.linspace(0.0, 0.6, 13)  # distances from the wrist, beyond the elbow, too [m]
 _BESIDE: Final = 0.15  # border beside a picture that arms are seen in, as a share of its size
 _BORDER: Final = 0.04  # border of a picture that hands keep free, as a share of half its width or height

@@ -467,7 +467,7 @@ def _joints(score: LayoutScore) -> Iterator[_Advice]:
 
 
 def _hidden(score: LayoutScore) -> Iterator[_Advice]:
-    """Advice on hands that show few markers, and on each marker that is seldom seen."""
+    """Advice where frames show too few of a hand's markers, and on each marker that is seldom seen."""
     if score.few_seen > _FEW:
         count = score.layout.num_markers
         yield (

@@ -21,8 +21,8 @@ _MOST_RMS: Final = 0.005  # [m]; hands of the nearest size reach 0.004
 _MOST_UNLABELED: Final = 0.25  # share of the points at the hands
 _MANY_FAR: Final = 0.05  # Unlabeled points away from the hands are mentioned from this share on.
 _AT_HAND: Final = 0.04  # [m] distance from a hand's markers within which a point counts as its own
-# Frames whose points all have at least this confidence need no look. To join spans that are farther apart, or
-# to add the frames around them, lists three times as many right frames, and covers hardly more errors.
+# Frames whose points all have at least this confidence need no look. Joining spans that are farther apart, or
+# adding the frames around them, would list three times as many right frames and hardly cover more errors.
 _CERTAIN: Final = 0.87
 _APART: Final = 0.05  # [s] Spans closer together are joined.
 _MOST_DOUBTS: Final = 12  # rows of a list to be read at a glance

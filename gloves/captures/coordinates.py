@@ -130,7 +130,7 @@ def _without_stand_ins(capture: Capture) -> tuple[Capture, int, int]:
     aims = np.unique(np.stack([keys[frames + 1, columns], frames]), axis=1)
     aims, counts = np.unique(aims[0], return_counts=True)
     equal &= np.isin(positions[..., 0], values[repeats])
-    places = [aim for aim in aims[counts > 2] if not (near == aim).any()]
+    places = aims[(counts > 2) & ~np.isin(aims, near)]
     stands = equal | (np.isin(keys, places) & (capture.num_frames >= _MIN_FRAMES))
     there = np.isfinite(positions[..., 0]) & ~stands
     tracks = (positions[there[:, column], column] for column in range(positions.shape[1]))

@@ -39,7 +39,7 @@ from render.viewpoints import ViewConfig
 
 RECORD, VIDEO, PAGE = "film.json", "film.mp4", "film.html"
 """Files beside the pictures: the registration, the video with the hands drawn over it, and the page."""
-_LOOKS: Final = 10.0  # [Hz] Hands are looked for this often, as what they do in between is known.
+_LOOKS: Final = 10.0  # [Hz] how often the detector runs; the take has the motion between two runs
 _SEARCH: Final = 5  # every so many looks the whole picture is searched
 _SURE: Final = 0.5  # least confidence of a hand that is followed
 _SMALLEST: Final = 8.0  # [px] of the box of a hand that is followed

@@ -112,7 +112,7 @@ class _Look(NamedTuple):
 
 
 class _Outline(NamedTuple):
-    """Points of a hand's outline against the background."""
+    """Points on the line where a drawn hand ends and the background begins."""
 
     pixels: Doubles
     normals: Doubles

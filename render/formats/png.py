@@ -22,7 +22,7 @@ _SIGNATURE: Final = b"\x89PNG\r\n\x1a\n"
 _ZLIB: Final = b"\x78\x01"
 _GRAY, _COLORS = 0, 2  # PNG's types of color
 _UP: Final = 2  # PNG's filter that subtracts the row above
-# DEFLATE's symbols are bytes, the end of a block, and lengths of runs; the longest run has its own symbol.
+# A symbol of DEFLATE is a byte, the end of a block, or the length of a run; 285 is the longest run alone.
 _END, _LONGEST_SYMBOL, _SYMBOLS = 256, 285, 286
 _SHORTEST, _LONGEST = 3, 258  # lengths of runs [bytes]
 _ADLER: Final = 65521  # largest prime below 2^16

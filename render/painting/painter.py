@@ -157,7 +157,7 @@ def _covered(first: NDArray[np.int32]) -> Any:
     return covered[:count]
 
 
-# Each array is an argument, because numba counts references to the arrays of a tuple, which takes long.
+# Arrays are separate arguments: numba counts references to each array of a tuple, which costs time per call.
 @kernel
 def _add_surface(
     nearness: Floats,

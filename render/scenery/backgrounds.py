@@ -175,7 +175,7 @@ class Backdrop:
 
     gap: float  # distance from the nearest point of the hands [m]
     recedes: tuple[float, float] = (0.0, 0.0)  # slopes to the right and downwards
-    softness: float = 0.1  # tangent of half the angle that the lamp takes up, seen from it
+    softness: float = 0.1  # tangent of half the angle under which the plane sees the lamp
     level: float | None = None
     """Position along its normal in the camera's axes [m]; None: the gap is from the hands of each picture."""
     shadows: bool = True  # whether it catches the hands' shadows, or is too far away for them

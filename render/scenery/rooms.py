@@ -68,7 +68,7 @@ class _Boxes(NamedTuple):
 
 @functools.lru_cache(maxsize=2)  # its light and its depth are asked for one after the other
 def draw_room(size: tuple[int, int], seed: int) -> RoomPicture:
-    """A random room from a random position."""
+    """Draw a random room as a camera at a random position in it sees it."""
     (width, height), scene = size, _scene(seed)
 
     def seen(across: Floats, down: Floats) -> RoomLight:
@@ -196,7 +196,7 @@ def _place_boxes(room: Doubles, eye: Doubles, rng: np.random.Generator) -> _Boxe
     )
 
 
-# Each array is an argument, because numba counts references to the arrays of a tuple, which takes long.
+# Arrays are separate arguments: numba counts references to each array of a tuple, which costs time per call.
 @kernel
 def _cast(
     rays: Floats,
