@@ -1,6 +1,6 @@
 """What drawn pictures teach: a keypoint network that has seen only them, tried on photographs.
 
-    python -m benchmarks.keypoint_network OUT --photos FOLDER --reference FILE [--variants ours plain ...]
+    python -m benchmarks.keypoint_network OUT PHOTOS REFERENCE [--variants ours plain ...]
         [--pictures 12000 --samples 240000 --seed 0 --photographs 100]
 
 Trains the network of `keypoint_training.py` once for each variant of the pictures, from
