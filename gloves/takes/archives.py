@@ -374,6 +374,8 @@ def read_archive(
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Header and arrays of an archive."""
     check_regular(path, error=CaptureError)
+    if path.is_dir():
+        raise CaptureError(f"{path}: this is a folder, expected a take (.npz)")
     if not path.exists() and growing_path(path).exists():
         raise CaptureError(
             f"{path}: no such file, but {growing_path(path)} is a recording that was cut off or is still "

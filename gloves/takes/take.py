@@ -164,6 +164,9 @@ class Take:
                         angle_spread=angle_spread, keypoint_spread=keypoint_spread)  # fmt: skip
         tables = dict(points=points, ids=ids, labels=labels, confidence=confidence)
         given = {name: table for name, table in tables.items() if table is not None}
+        check_type("hands", hands, Sequence, "a list of GloveFits")
+        for hand in hands:
+            check_type("a hand", hand, GloveFit, "a GloveFit, as attach and nominal_fit return it")
         others = dict(rate=rate, hands=tuple(hands), bodies=tuple(bodies), settings=settings)
         for name, value in (*by_frame.items(), *others.items()):
             object.__setattr__(self, name, value)
@@ -248,7 +251,7 @@ class Take:
         return cls(
             rate=rate,
             times=np.arange(len(qpos)) / rate,
-            hands=tuple(hands),
+            hands=hands,
             qpos=qpos,
             status=_status_of(qpos),
             rms=np.full(qpos.shape[:2], np.nan),
@@ -256,7 +259,7 @@ class Take:
             ids=ids,
             labels=labels,
             confidence=np.where(np.isfinite(points[..., 0]), 1.0, np.nan),
-            bodies=tuple(bodies),
+            bodies=bodies,
             body_poses=poses,
             body_status=_status_of(poses),
             body_rms=np.full(poses.shape[:2], np.nan),
