@@ -219,7 +219,7 @@ class Recorder:
             grown = GrownArchive(self.part, check=False)
             first = (grown.first(name, RATED_FRAMES) for name in ("times", NUMBERS.name))
             header = self._header(usual_rate(*first))
-            step = grown.step_for(_SUMMARIZED)
+            step = max(1, -(-grown.num_frames // _SUMMARIZED))
             take = unpack_take(dict(header), grown.read(step))
             finish_archive(grown, self._out, header, told=told)
         except Exception as error:  # keep the recording after any error

@@ -206,10 +206,6 @@ class GrownArchive:
         before = np.cumsum([0, *(block.frames for block in self._blocks)])[:-1]
         return self._joined(column, self._blocks[: int((before < most).sum())])
 
-    def step_for(self, most: int) -> int:
-        """The `step` with which `read` returns about `most` frames."""
-        return max(1, -(-self.num_frames // most))
-
     def members(self, told: Callable[[], None]) -> Iterator[Member]:
         """Every array, read block by block, with a call of `told` after each block."""
         yield from (Member.of(name, array) for name, array in self._arrays.items())

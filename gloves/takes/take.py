@@ -278,16 +278,10 @@ class Take:
         body_poses: Float[np.ndarray, "T B 7"] | None = None,
         settings: Mapping[str, Any] | None = None,
     ) -> Self:
-        """A take of poses alone, without points.
+        """A take of poses alone, without points; arguments are those of `of_truth`, and `times`.
 
         Args:
-            hands: The hands with their gloves as worn.
-            qpos: Their poses; NaN where a hand has none.
-            rate: Frames per second [Hz].
             times: Time of each frame [s]; at the steady rate from 0 when not given.
-            bodies: Rigid bodies.
-            body_poses: Their positions [m] and orientations (wxyz).
-            settings: What made it, as JSON.
 
         Raises:
             ArgumentError: The arrays do not fit together, or hold what they cannot.
