@@ -8,6 +8,7 @@ the right length.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, Final
@@ -15,7 +16,6 @@ from typing import Any, Final
 import numpy as np
 
 from handsim.errors import DatasetError, HandSimError
-from handsim.files.inputs import load_json
 from render.formats.records import (
     as_sensed,
     centered_K,
@@ -129,8 +129,11 @@ class FreihandWriter:
         path = self.parts / _NUMBERS
         if not path.is_file():
             return {}
-        numbers = load_json(path)
-        if not all(map(_is_pair, numbers.values())):
+        try:
+            numbers = json.loads(path.read_text(encoding="utf-8"))
+        except ValueError as error:
+            raise DatasetError(f"{path}: damaged: it holds no JSON; render into another folder") from error
+        if not isinstance(numbers, dict) or not all(map(_is_pair, numbers.values())):
             raise DatasetError(f"{path}: damaged: it holds no numbers; render into another folder")
         after = 0
         for shard, (first, count) in sorted(numbers.items(), key=lambda entry: entry[1]):
