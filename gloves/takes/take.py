@@ -278,10 +278,9 @@ class Take:
         body_poses: Float[np.ndarray, "T B 7"] | None = None,
         settings: Mapping[str, Any] | None = None,
     ) -> Self:
-        """A take of poses alone, without points; arguments are those of `of_truth`, and `times`.
+        """A take of poses alone, without points.
 
-        Args:
-            times: Time of each frame [s]; at the steady rate from 0 when not given.
+        The arguments are those of `of_truth`; without `times` [s] frames follow from 0 at the steady rate.
 
         Raises:
             ArgumentError: The arrays do not fit together, or hold what they cannot.
