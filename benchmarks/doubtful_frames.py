@@ -35,7 +35,7 @@ from gloves import Take, load_take
 from gloves.captures.capture import runs_of
 from track import find_suspect_spans, label_capture, track_capture
 from track.label_confidence import evidence_of, label_confidence
-from track.recorder import TakeRecorder
+from track.recorder import frame_values, take_of_rows
 from track.smoothed_take import smooth_take
 from track.take_faults import SuspectSpan
 from track.take_summary import _VOUCH_LEAST, frame_confidence, vouch
@@ -117,10 +117,9 @@ def unseen_cases(frames: int, real: Path | None) -> list[Case]:
     def tracked(folder: Path, condition: str) -> tuple[Take, np.ndarray]:
         scene = make_scene(folder, condition, seed=1, frames=frames)
         stream, tracker = tracker_of(scene)
-        recorder, there = TakeRecorder(tracker), np.isfinite(scene.points[..., 0])
-        for frame in stream:
-            recorder.add(frame, tracker.step(frame.points, frame.ids, frame.time))
-        take = recorder.take(scene.capture())
+        there = np.isfinite(scene.points[..., 0])
+        rows = [frame_values(one, tracker.step(one.points, one.ids, one.time)) for one in stream]
+        take = take_of_rows(rows, tracker, scene.capture())
         sure = dataclasses.replace(take.point_list, confidence=label_confidence(take))
         take = smooth_take(dataclasses.replace(take, point_list=sure))
         return take, np.where(there, true_labels(scene), -1)

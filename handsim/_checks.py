@@ -95,10 +95,3 @@ def check_count(name: str, value: Any, low: int, high: float = np.inf) -> None:
     if not low <= value <= high:
         least = f"at least {low}" if low else "0 or more"
         raise ArgumentError(f"{name} is {value}, expected {least if high == np.inf else f'{low} to {high}'}")
-
-
-def check_span(name: str, span: tuple[float, float], low: float = 0.0) -> None:
-    """Refuse a pair of numbers unless the first is at least `low` and the second, finite, no smaller."""
-    check_type(name, span, (tuple, list), "two numbers")
-    if len(span) != 2 or not low <= span[0] <= span[1] < np.inf:
-        raise ArgumentError(f"{name} is {span}, expected two numbers from {low:g} upwards, the smaller first")

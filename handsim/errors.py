@@ -31,6 +31,13 @@ class HandSimError(Exception):
         return shortened(super().__str__(), SENTENCE)
 
 
+DAMAGE: Final = (
+    HandSimError, ValueError, LookupError, TypeError, AttributeError, OverflowError, RuntimeError,
+    SyntaxError,
+)  # fmt: skip
+"""Exceptions that reading the content of a damaged file may raise."""
+
+
 class HandSimWarning(UserWarning):
     """Something in the data that is probably not what the user meant; the work goes on."""
 

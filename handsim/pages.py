@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Concatenate, Final, ParamSpec
 
 from handsim._checks import check_type, shown_value
 from handsim.errors import ArgumentError
-from handsim.files.outputs import write_text
+from handsim.files.outputs import check_ending, write_text
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -102,8 +102,7 @@ def write_page(path: str | Path, thing: Any) -> None:
         OSError: A file cannot be written.
     """
     check_type("path", path, (str, os.PathLike), "the path of an .html file")
-    if Path(path).suffix.lower() != ".html":
-        raise ArgumentError(f"path is {path}, expected a file name that ends in .html")
+    check_ending(Path(path), ".html", option="path")
     kinds = (f"{kind.__module__}.{kind.__qualname__}" for kind in type(thing).__mro__)
     target = next((_WRITERS[kind] for kind in kinds if kind in _WRITERS), None)
     if target is None:

@@ -96,11 +96,11 @@ def sample_exposure(config: ExposureConfig, *, rng: np.random.Generator) -> Expo
 
 def linear_of(rgb: UInt8[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "H W 3"]:
     """Light of sRGB colors, 1 for white. What was clipped at white stays there."""
-    return np.asarray(cv2.LUT(rgb, _decoded()))
+    return np.asarray(cv2.LUT(rgb, light_of(np.arange(256)).astype(np.float32)))
 
 
 def light_of(levels: NDArray[Any]) -> NDArray[Any]:
-    """Light of sRGB levels (...,), 1 for 255; beyond, where sRGB ends, that of the painters."""
+    """Light of sRGB levels (...,), IEC 61966-2-1, 1 for 255; beyond, that of the painters."""
     value = levels / 255.0
     light = np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
     return np.where(value > 1.0, value**GAMMA, light)
@@ -183,12 +183,6 @@ def _expose(
             level[n] = int(np.sqrt(value if value < one else one) * top + half)
         for n in range(width):
             rgb[row, n] = curve[level[n]]
-
-
-@functools.cache
-def _decoded() -> Floats:
-    """Light of the 256 sRGB values (IEC 61966-2-1)."""
-    return light_of(np.arange(256)).astype(np.float32)
 
 
 @functools.cache

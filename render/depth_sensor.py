@@ -78,10 +78,11 @@ def _measure_disparity(
     if noise.shadow:
         keep_lit(ideal, kept)
     shifts = random_words((height, width) if noise.shift > 0.0 else (0, 0), rng=rng)
+    offsets = np.rint(noise.shift * quantiles()[128::256]).astype(np.int32)
     blobs = _blobs((height, width), noise.window, noise.disparity_noise, rng=rng)
     measured = np.zeros_like(depth)
     step, least = np.float32(noise.step), np.float32(0.5 * scale / noise.farthest)
-    _match(ideal, kept, shifts, _whole_shifts(noise.shift), blobs, step, least, scale, measured)
+    _match(ideal, kept, shifts, offsets, blobs, step, least, scale, measured)
     return measured
 
 
@@ -198,11 +199,6 @@ def _match(
                 value = np.rint(value / step) * step
             if value > least:
                 depth[row, column] = scale / max(value, np.float32(1e-6))
-
-
-@functools.lru_cache(maxsize=16)
-def _whole_shifts(deviation: float) -> NDArray[np.int32]:
-    return np.rint(deviation * quantiles()[128::256]).astype(np.int32)
 
 
 _WALL: Final = 0.8  # reflectance of the white walls that noise was published for
@@ -440,9 +436,5 @@ def _back(size: tuple[int, int], middle: tuple[float, float, float, float], lens
 
 def reflectance_of(rgb: UInt8[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "H W"]:
     """Infrared reflectance of surfaces, estimated from their brightness in sRGB."""
-    return np.asarray(cv2.LUT(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), _luminance()))
-
-
-@functools.cache
-def _luminance() -> Floats:
-    return ((np.arange(256) / 255.0) ** 2.2).astype(np.float32)
+    luminance = ((_BYTES / 255.0) ** 2.2).astype(np.float32)
+    return np.asarray(cv2.LUT(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), luminance))

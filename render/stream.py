@@ -16,7 +16,7 @@ from torch.utils.data import IterableDataset, get_worker_info
 
 from gloves.layout import MarkerLayout
 from gloves.takes.take import Take
-from handsim._checks import check_choice, check_number, check_span, check_type, shown_value
+from handsim._checks import check_choice, check_number, check_type, shown_value
 from handsim.errors import ArgumentError, DatasetError, PoseError
 from handsim.files.inputs import load_json
 from handsim.files.outputs import plain_path
@@ -235,8 +235,9 @@ class PictureStream(IterableDataset[dict[str, torch.Tensor]]):
         for name, count in counts.items():
             check_type(name, count, (int, np.integer), "a whole number")
             check_number(name, count, 0 if name == "start" else 1)
-        check_span("fill", fill, 0.05)
-        check_number("the greater share of fill", fill[1], 0.05, 1.0)
+        check_type("fill", fill, (tuple, list), "two numbers")
+        if len(fill) != 2 or not 0.05 <= fill[0] <= fill[1] <= 1.0:
+            raise ArgumentError(f"fill is {fill}, expected two numbers from 0.05 to 1, the smaller first")
         config = configured(config, None, {} if seed is None else {"seed": seed})
         if config.depth_sensor == "auto" and "depth" in config.passes:  # its cameras are near the hands
             config = dataclasses.replace(config, depth_sensor=DepthSensor((NEAR_SENSOR,)))

@@ -50,9 +50,7 @@ if TYPE_CHECKING:
     from track.streams import ReplaySettings as ReplaySettings
     from track.streams.frame_source import FrameSource as FrameSource
     from track.streams.live_stream import LiveStream as LiveStream
-    from track.streams.live_stream import StreamSettings as StreamSettings
     from track.streams.live_stream import open_source as open_source
-    from track.streams.natnet import PointFrames as PointFrames
     from track.streams.natnet import ReplayServer as ReplayServer
     from track.take_faults import SuspectSpan as SuspectSpan
     from track.take_summary import find_suspect_spans as find_suspect_spans

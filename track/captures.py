@@ -35,7 +35,7 @@ from track.frames import AnyCapture, StreamedFrame, TrackedFrame, capture_of, ch
 from track.hand_size import measured_user, sample_frames
 from track.kinematics.pose_solver import FEWEST_MARKERS
 from track.label_confidence import label_confidence
-from track.recorder import TakeRecorder
+from track.recorder import frame_values, take_of_rows
 from track.settings import USUAL_SIZE, CalibrateSettings, LabelSettings, TrackerSetup, TrackSettings
 from track.sinks import SinkGroup
 from track.smoothed_take import smooth_take
@@ -163,8 +163,8 @@ def track_capture(
     source, frames, setup = _Opened.of(capture, chosen, warns=True)
     pins = () if corrections is None else _checked_corrections(Path(corrections), source, setup)
     if chosen.calibrate:
-        setup = _calibrated(record_frames(frames, setup.tracker(), progress=progress).take(source), setup)
-    take = record_frames(frames, setup.tracker(), sinks, on_frame, progress).take(source)
+        setup = _calibrated(tracked_take(source, frames, setup.tracker(), progress=progress), setup)
+    take = tracked_take(source, frames, setup.tracker(), sinks, on_frame, progress)
     points = dataclasses.replace(take.point_list, confidence=label_confidence(take))
     record = {**take.settings, **_named(capture, source), **setup.settings}
     take = dataclasses.replace(take, point_list=points, settings=record)
@@ -215,11 +215,11 @@ def calibrate(
 
     source, frames, setup = _Opened.of(capture, CalibrateSettings.of(settings, options))
     on_label = partial(on_part, "frames")
-    take = record_frames(frames, setup.tracker(), progress=on_label).take(source)
+    take = tracked_take(source, frames, setup.tracker(), progress=on_label)
     done = calibrate_take(take, setup.start, setup.user, on_part)
     if leaves_markers(take, done):
         tracker = Tracker([one.hand for one in done], setup.labeler)
-        take = record_frames(frames, tracker, progress=on_label).take(source)
+        take = tracked_take(source, frames, tracker, progress=on_label)
         done = calibrate_take(take, setup.start, setup.user, on_part)
     name = _named(capture, source).get("capture", "a capture")
     found = kept_user(take, done, setup.user, f"from {name}", on_part)
@@ -259,15 +259,16 @@ def measure_hands(
     return measured_user(sample_frames(frames), user, labeler_of(user.layout, labeler))
 
 
-def record_frames(
+def tracked_take(
+    source: Capture,
     frames: Sequence[StreamedFrame],
     tracker: Tracker,
     sinks: SinkGroup | None = None,
     on_frame: OnFrame | None = None,
     progress: Progress = no_progress,
-) -> TakeRecorder:
-    """Track all frames; with sinks, at the capture's own rate."""
-    recorder = TakeRecorder(tracker)
+) -> Take:
+    """Track all frames of a capture; with sinks, at its own rate."""
+    rows = []
     if sinks:
         sinks.start(tracker.hands, tracker.bodies)
     began = monotonic()
@@ -278,9 +279,9 @@ def record_frames(
             sinks.send(frame, tracked)
         if on_frame is not None:
             on_frame(frame, tracked)
-        recorder.add(frame, tracked)
-        progress(recorder.num_frames, len(frames))
-    return recorder
+        rows.append(frame_values(frame, tracked))
+        progress(len(rows), len(frames))
+    return take_of_rows(rows, tracker, source)
 
 
 def _named(capture: AnyCapture, source: Capture) -> dict[str, Any]:

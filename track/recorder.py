@@ -7,7 +7,7 @@ lacks at most the last half second if the process dies. `finish` turns it into `
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType, TracebackType
 from typing import Any, Final, Self
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from gloves.captures.capture import Capture
 from gloves.takes.archives import GrowingArchive, GrownArchive, finish_archive, growing_path
-from gloves.takes.points import FRAMES, KEYPOINTS, NUMBERS, OPTIONAL, POINTS
+from gloves.takes.points import FRAMES, KEYPOINTS, NUMBERS, OPTIONAL, POINTS, SPREADS, PointList
 from gloves.takes.take import (
     RATED_FRAMES,
     Take,
@@ -29,7 +29,7 @@ from gloves.takes.take import (
 )
 from handsim._checks import check_type
 from handsim.errors import ArgumentError, CaptureError
-from handsim.files.outputs import remove_abandoned
+from handsim.files.outputs import check_ending, remove_abandoned
 from handsim.files.signals import interrupt_behind
 from track.frames import FARTHEST, LATEST_TIME, StreamedFrame, TrackedFrame
 from track.tracker import Tracker
@@ -39,30 +39,21 @@ _SUMMARIZED: Final = 20_000  # largest number of frames read for a summary
 _ID_BITS: Final = (1 << 31) - 1  # bits of IDs in takes
 
 
-class TakeRecorder:
-    """Records tracked frames in memory; `take` returns the take so far at any time."""
-
-    def __init__(self, tracker: Tracker) -> None:
-        self._hands = tracker.hands
-        self._settings = settings_of(tracker)
-        self._bodies = tracker.bodies
-        self._rows: list[dict[str, NDArray[Any]]] = []
-
-    @property
-    def num_frames(self) -> int:
-        """Number of recorded frames."""
-        return len(self._rows)
-
-    def add(self, frame: StreamedFrame, tracked: TrackedFrame) -> None:
-        """Record a frame, unless it only marks a silence of the stream."""
-        if not frame.silent:
-            self._rows.append(frame_values(frame, tracked))
-
-    def take(self, capture: Capture | None = None) -> Take:
-        """The take so far, with columns and rate of the capture, or the median rate of a stream."""
-        if not self._rows or (capture is None and len(self._rows) < 2):
-            raise CaptureError(f"{len(self._rows)} frames came, expected two or more")
-        return Take.of_frames(self._rows, self._hands, self._bodies, capture=capture, settings=self._settings)
+def take_of_rows(rows: Sequence[Mapping[str, NDArray[Any]]], tracker: Tracker, capture: Capture) -> Take:
+    """The take of a capture from `frame_values` of its frames, with the capture's columns and rate."""
+    arrays = {column.name: np.array([row[column.name] for row in rows]) for column in (*FRAMES, *SPREADS)}
+    entries = {column.name: np.concatenate([row[column.name] for row in rows]) for column in POINTS}
+    present = np.isfinite(capture.positions[..., 0])
+    return Take(
+        rate=capture.rate,
+        hands=tracker.hands,
+        bodies=tracker.bodies,
+        settings=settings_of(tracker),
+        point_list=PointList(
+            present.sum(axis=1), **entries, columns=np.nonzero(present)[1], num_columns=present.shape[1]
+        ),
+        **arrays,
+    )
 
 
 def settings_of(tracker: Tracker) -> dict[str, Any]:
@@ -118,8 +109,7 @@ class Recorder:
         check_type("path", path, (str, Path), "the path of a take's file, .npz")
         check_type("tracker", tracker, Tracker, "the Tracker whose frames are recorded")
         out = Path(path)
-        if out.suffix.lower() != ".npz":
-            raise ArgumentError(f"path is {path}, expected a file name that ends in .npz")
+        check_ending(out, ".npz", option="path")
         remove_abandoned(out)  # left by a run that was killed in `finish`
         self.part = growing_path(out)
         """The file of the recording."""
@@ -219,7 +209,7 @@ class Recorder:
             grown = GrownArchive(self.part, check=False)
             first = (grown.first(name, RATED_FRAMES) for name in ("times", NUMBERS.name))
             header = self._header(usual_rate(*first))
-            step = grown.step_for(_SUMMARIZED)
+            step = max(1, -(-grown.num_frames // _SUMMARIZED))
             take = unpack_take(dict(header), grown.read(step))
             finish_archive(grown, self._out, header, told=told)
         except Exception as error:  # keep the recording after any error

@@ -16,7 +16,7 @@ from gloves.fit import Attachment, GloveFit, nominal_fit
 from gloves.hand_files import write_hand
 from gloves.layout import MarkerLayout, list_layouts, load_layout, stored_layout
 from handsim._checks import check_choice, check_type, shown_value
-from handsim.errors import ArgumentError, FileError, HandSimError
+from handsim.errors import DAMAGE, ArgumentError, FileError
 from handsim.files.inputs import read_bytes
 from handsim.files.outputs import write_text, writing
 from handsim.hand.model import HandModel
@@ -37,15 +37,6 @@ AS_MEASURED: Final = ", as measured"
 _MOST: Final = 1 << 24  # [bytes] largest file; a user of two hands takes 40,000
 _ARRAYS: Final = {"points": "f8", "normals": "f8", "bone_indices": None, "bone_weights": "f8"}
 """Stored arrays of an attachment and their types; None keeps the type, so that fractional indices fail."""
-_DAMAGE: Final = (
-    KeyError,
-    TypeError,
-    ValueError,
-    AttributeError,
-    OverflowError,
-    RecursionError,
-    HandSimError,
-)
 
 
 class UserError(FileError):
@@ -240,7 +231,7 @@ def load_user(path: str | Path) -> User:
             str(content.get("notes", "")),
             angle_errors=read_errors(content.get("angle_errors", {})),
         )
-    except _DAMAGE as error:
+    except DAMAGE as error:
         raise UserError(f"{path}: a damaged user's file: {_reason(error)}") from error
 
 

@@ -1,11 +1,7 @@
 """Accuracy of labelers: known markers are corrupted as in the paper, labeled, and errors are counted.
 
-The figures are those of Han et al. 2018. Slot accuracy: share of label slots, over all frames, that hold the
-right point, or rightly none (Tables 2, 4 and 6 on synthetic data). Point accuracy: share of right labels of
-all points, ghosts included. Occlusion (O) and ghost (G) figures take "occluded slot" and "ghost point" as the
-positive class. Macro F1 is computed over points, too: the mean F1 of the markers and of "ghost", the null
-class, as in SOMA (Ghorbani and Black 2021). Calibration compares the confidence of labels with the share of
-right ones.
+docs/results.md defines the figures, which are those of Han et al. 2018. Macro F1 is the mean F1, over points,
+of the markers and of "ghost", the null class, as in SOMA (Ghorbani and Black 2021).
 """
 
 from __future__ import annotations

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from gloves.takes.points import POINT_COUNTS, Column
 from handsim.callbacks import Closing
-from handsim.errors import ArgumentError, CaptureError, HandSimError, HandSimWarning, shortened
+from handsim.errors import DAMAGE, ArgumentError, CaptureError, HandSimWarning, shortened
 from handsim.files.arrays import Member, check_npy_header, check_npz, read_npz, write_npz
 from handsim.files.inputs import check_regular
 from handsim.files.outputs import atomic_write, make_folder_of
@@ -206,10 +206,6 @@ class GrownArchive:
         before = np.cumsum([0, *(block.frames for block in self._blocks)])[:-1]
         return self._joined(column, self._blocks[: int((before < most).sum())])
 
-    def step_for(self, most: int) -> int:
-        """The `step` with which `read` returns about `most` frames."""
-        return max(1, -(-self.num_frames // most))
-
     def members(self, told: Callable[[], None]) -> Iterator[Member]:
         """Every array, read block by block, with a call of `told` after each block."""
         yield from (Member.of(name, array) for name, array in self._arrays.items())
@@ -329,11 +325,6 @@ SCHEMA: Final = 4
 _READABLE: Final = (3, SCHEMA)
 _KINDS: Final = ("take", "tracked take")
 """Kinds in headers; trackers wrote the second one before schema 3."""
-_DAMAGE: Final = (
-    HandSimError, ValueError, KeyError, TypeError, AttributeError, IndexError, OverflowError, RuntimeError,
-    SyntaxError,
-)  # fmt: skip
-"""Exceptions that reading a damaged file may raise."""
 
 
 class CutOffWarning(HandSimWarning):
@@ -367,13 +358,15 @@ def read_archive(
         return unpack(header, arrays)
     except ArgumentError as error:
         raise CaptureError(f"{_damaged(path)}: {error}") from error
-    except _DAMAGE as error:
+    except DAMAGE as error:
         raise CaptureError(_damaged(path)) from error
 
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Header and arrays of an archive."""
     check_regular(path, error=CaptureError)
+    if path.is_dir():
+        raise CaptureError(f"{path}: this is a folder, expected a take (.npz)")
     if not path.exists() and growing_path(path).exists():
         raise CaptureError(
             f"{path}: no such file, but {growing_path(path)} is a recording that was cut off or is still "
@@ -394,7 +387,7 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
                 raise ValueError("the header is not a table")
     except OSError as error:
         raise CaptureError(f"{path}: cannot be read: {error.strerror or error}") from error
-    except _DAMAGE as error:
+    except DAMAGE as error:
         raise CaptureError(_damaged(path)) from error
     if grown is None:
         return header, arrays

@@ -93,8 +93,8 @@ class Take:
     """Hands in motion and labeled points: T frames, H hands, N columns of points, B rigid bodies.
 
     Labels number the markers of all hands, in the order of `hands`, then those of the bodies. The label -1
-    marks a ghost (a point of no marker), or no point at all. `of_truth`, `of_poses` and `of_frames` build
-    takes from fewer arrays.
+    marks a ghost (a point of no marker), or no point at all. `of_truth` and `of_poses` build takes from fewer
+    arrays.
 
     The points are kept in `point_list`. `points`, `ids`, `labels` and `confidence` are tables of them, built
     on first use; these tables may be given instead of the list, or to replace some of its entries
@@ -164,6 +164,9 @@ class Take:
                         angle_spread=angle_spread, keypoint_spread=keypoint_spread)  # fmt: skip
         tables = dict(points=points, ids=ids, labels=labels, confidence=confidence)
         given = {name: table for name, table in tables.items() if table is not None}
+        check_type("hands", hands, Sequence, "a list of GloveFits")
+        for hand in hands:
+            check_type("a hand", hand, GloveFit, "a GloveFit, as attach and nominal_fit return it")
         others = dict(rate=rate, hands=tuple(hands), bodies=tuple(bodies), settings=settings)
         for name, value in (*by_frame.items(), *others.items()):
             object.__setattr__(self, name, value)
@@ -248,7 +251,7 @@ class Take:
         return cls(
             rate=rate,
             times=np.arange(len(qpos)) / rate,
-            hands=tuple(hands),
+            hands=hands,
             qpos=qpos,
             status=_status_of(qpos),
             rms=np.full(qpos.shape[:2], np.nan),
@@ -256,7 +259,7 @@ class Take:
             ids=ids,
             labels=labels,
             confidence=np.where(np.isfinite(points[..., 0]), 1.0, np.nan),
-            bodies=tuple(bodies),
+            bodies=bodies,
             body_poses=poses,
             body_status=_status_of(poses),
             body_rms=np.full(poses.shape[:2], np.nan),
@@ -277,14 +280,7 @@ class Take:
     ) -> Self:
         """A take of poses alone, without points.
 
-        Args:
-            hands: The hands with their gloves as worn.
-            qpos: Their poses; NaN where a hand has none.
-            rate: Frames per second [Hz].
-            times: Time of each frame [s]; at the steady rate from 0 when not given.
-            bodies: Rigid bodies.
-            body_poses: Their positions [m] and orientations (wxyz).
-            settings: What made it, as JSON.
+        The arguments are those of `of_truth`; without `times` [s] frames follow from 0 at the steady rate.
 
         Raises:
             ArgumentError: The arrays do not fit together, or hold what they cannot.
@@ -295,50 +291,6 @@ class Take:
             settings=settings,
         )  # fmt: skip
         return take if times is None else dataclasses.replace(take, times=times)
-
-    @classmethod
-    def of_frames(
-        cls,
-        frames: Sequence[Mapping[str, NDArray[Any]]],
-        hands: Sequence[GloveFit],
-        bodies: Sequence[RigidBody],
-        *,
-        capture: Capture | None,
-        settings: Mapping[str, Any],
-    ) -> Self:
-        """A take of frames that were tracked one by one.
-
-        Args:
-            frames: The entries of each frame in a take's arrays, by name (`FRAMES`, `POINTS` and `numbers` of
-                `gloves.takes.points`).
-            hands: The hands.
-            bodies: The rigid bodies.
-            capture: The capture of these frames, whose columns and rate are kept; None for a stream, which
-                gets its median rate.
-            settings: What made it, as JSON.
-
-        Raises:
-            ArgumentError: The arrays do not fit together, or hold what they cannot.
-        """
-        names = [column.name for column in (*FRAMES, *OPTIONAL) if column.name in frames[0]]
-        arrays = {name: np.array([frame[name] for frame in frames]) for name in names}
-        entries = {column.name: np.concatenate([frame[column.name] for frame in frames]) for column in POINTS}
-        counts = np.array([len(frame["points"]) for frame in frames])
-        if capture is None:
-            point_list = PointList.in_order(counts, **entries)
-        else:
-            arrays.pop(NUMBERS.name)
-            present = np.isfinite(capture.positions[: len(frames), :, 0])
-            columns = np.nonzero(present)[1]
-            point_list = PointList(counts, **entries, columns=columns, num_columns=present.shape[1])
-        return cls(
-            rate=usual_rate(arrays["times"], arrays[NUMBERS.name]) if capture is None else capture.rate,
-            hands=hands,
-            bodies=bodies,
-            settings=dict(settings),
-            point_list=point_list,
-            **arrays,
-        )
 
     @property
     def num_frames(self) -> int:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -61,9 +60,7 @@ def evaluate(
         report = evaluate_labels(captures[0], truth)
         found = {"truth": str(truth)}
     by_marker = dict(zip(report.marker_names, map(float, report.slot_accuracy_by_marker), strict=True))
-    # A share of nothing is NaN, which JSON lacks.
-    figures = {name: None if math.isnan(value) else value for name, value in report.figures.items()}
-    found |= {"frames": report.num_frames, "figures": figures, "numbers": report.numbers}
+    found |= {"frames": report.num_frames, "figures": report.figures, "numbers": report.numbers}
     found["slot_accuracy_by_marker"] = by_marker
     hard = f", occlude {settings.occlude}, ghosts {settings.ghosts}"
     hard = hard if settings.occlude or settings.ghosts else ""

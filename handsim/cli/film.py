@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Final, Literal
 
 import tyro
 
@@ -13,6 +13,8 @@ from handsim.app.messages import print_line, print_table, progress_bar
 from handsim.files.outputs import check_outputs
 from handsim.space.transforms import UpAxis
 from render.frames import PASSES
+
+_STEPS: Final = ("finding hands", "fitting the camera", "writing pictures", "writing film.mp4 and film.html")
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,12 +65,12 @@ def film(
     from render.film.film import PAGE, annotate_film
 
     check_outputs((take, video, camera, detector), (out,))
-    begin, steps = time.perf_counter(), iter(("finding hands and camera", "writing pictures"))
+    begin, steps = time.perf_counter(), iter(_STEPS)
     with progress_bar("frames") as bar:
         last = [float("inf")]
 
         def show(done: int, total: int) -> None:
-            if done < last[0]:
+            if done < last[0] or done == total:
                 bar.step(next(steps, ""))
             last[0] = done
             bar(done, total)

@@ -161,7 +161,7 @@ def score_glove(
     from track.glove_page import trial_rows, write_glove_page
     from train.evaluation import percent, percent_between
 
-    with named_steps("getting ready") as step:
+    with named_steps("") as step:
         score = glove_score.score_glove(glove, settings, on_step=step)
     for title, report in (
         ("as the rig sees them", score.observed),
@@ -203,7 +203,7 @@ def improve_glove(
     from track import glove_improvement
     from track.glove_page import trial_rows
 
-    with named_steps("getting ready") as step:
+    with named_steps("") as step:
         improved = glove_improvement.improve_glove(glove, settings, name=as_text(out.stem), on_step=step)
     layout, found = improved.start, improved.layout
     found.save(out)

@@ -102,7 +102,7 @@ def main(args: Sequence[str] | None = None) -> int:
 
 def run(commands: Table, args: Sequence[str]) -> int:
     """Run a command of a table and return its exit code."""
-    program = f"handsim {args[0]}" if args and args[0] in commands else "handsim"
+    _, program, _ = _chosen(commands, args)
     _prepare_streams()
     # One core solves our small systems faster than several, and each worker has one core.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -133,6 +133,15 @@ def load(target: str | Table) -> Any:
         return {name: load(inner) for name, (inner, _) in target.items()}
     module, _, attribute = target.partition(":")
     return getattr(importlib.import_module(module), attribute)
+
+
+def _chosen(commands: Table, args: Sequence[str]) -> tuple[tuple[Any, str], str, Sequence[str]]:
+    """The entry of the command that the first arguments name, the program's name and the other arguments."""
+    entry: tuple[Any, str] = (commands, "")
+    prog = "handsim"
+    while isinstance(entry[0], Mapping) and args and args[0] in entry[0]:
+        entry, prog, args = entry[0][args[0]], f"{prog} {args[0]}", args[1:]
+    return entry, prog, args
 
 
 def _prepare_streams() -> None:
@@ -226,9 +235,7 @@ def _dispatch(commands: Table, args: Sequence[str]) -> int:
     elif name in commands:
         from handsim.cli.parsing import outline, run_command
 
-        (target, help_line), prog, args = commands[name], f"handsim {name}", args[1:]
-        if isinstance(target, Mapping) and args and args[0] in target:
-            (target, help_line), prog, args = target[args[0]], f"{prog} {args[0]}", args[1:]
+        (target, help_line), prog, args = _chosen(commands, args)
         command = load(target) if isinstance(target, str) else outline(target)
         with _compiled_ahead("-".join(prog.split()[1:])):
             result = run_command(command, prog=prog, help_line=help_line, args=args)

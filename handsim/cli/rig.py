@@ -131,7 +131,7 @@ def score_rig(
     check_outputs([rig, settings.take, settings.glove], [page, json])
     from train.forecast import rig_score
 
-    with named_steps("getting ready") as step:
+    with named_steps("") as step:
         score = rig_score.score_rig(cameras, settings, on_step=step)
     for header, *rows in (rig_score.work_table(score), rig_score.camera_table(score)):
         print_table([[header[0].replace(" ", "\n"), *header[1:]], *rows])
@@ -164,7 +164,7 @@ def plan_rig(
     check_outputs([settings.keep, settings.glove], [out], ".toml")
     from train.forecast import rig_plan
 
-    with named_steps("getting ready") as step:
+    with named_steps("") as step:
         planned = rig_plan.plan_rig(cameras, room, settings, name=as_text(out.stem), on_step=step)
     rows = [["camera", "position [m]", "looks at [m]"]]
     for number, places in enumerate(zip(planned.rig.positions, planned.targets, strict=True), 1):

@@ -20,6 +20,8 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import Any, Final, cast
 
+import numpy as np
+
 from handsim._checks import check_type
 from handsim.errors import ArgumentError, HandSimError, shortened
 from handsim.files.inputs import load_json
@@ -371,16 +373,18 @@ def save_json(path: Path, content: dict[str, Any]) -> None:
 
 
 def json_text(content: dict[str, Any]) -> str:
-    """The text of a JSON file; JSON knows no NaN and no infinity, which become null."""
-    return json.dumps(_finite(content), indent=1, allow_nan=False) + "\n"
+    """The text of a JSON file."""
+    return json.dumps(plain_json(content), indent=1, allow_nan=False) + "\n"
 
 
-def _finite(value: Any) -> Any:
-    """The value with None in place of NaN and infinity."""
-    if isinstance(value, dict):
-        return {key: _finite(entry) for key, entry in value.items()}
+def plain_json(value: Any) -> Any:
+    """A value as JSON can hold it: lists in place of arrays, None in place of NaN and infinity."""
+    if isinstance(value, Mapping):
+        return {key: plain_json(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):
-        return [_finite(entry) for entry in value]
+        return [plain_json(entry) for entry in value]
+    if isinstance(value, np.ndarray | np.generic):
+        return plain_json(value.tolist())
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 

@@ -1,19 +1,8 @@
-"""Readers of the camera calibration files of Vicon, Qualisys, Motive and COLMAP.
+"""Readers of the camera calibration files of Vicon, Qualisys, Motive and COLMAP, whose axes docs/rigs.md has.
 
-Vicon Nexus, Shogun, Tracker and Blade keep an `.xcp` beside a capture. A `KeyFrame` has the position [mm] and
-the rotation from the world to the camera, a quaternion xyzw. The camera's axes are x right, y down, z ahead.
-Radial coefficients undistort points: a point at r pixels from the principal point belongs at
-r (1 + k1 r^2 + k2 r^4 + k3 r^6).
-
-QTM exports Qualisys' calibration as XML or text, and its real-time server sends it. `transform` has the
-position [mm] and a matrix whose rows are the camera's axes in the world: x right, y up, z backward.
-`intrinsic` is in 64ths of a pixel of the sensor, v down; its distortion is OpenCV's.
-
-OptiTrack Motive's `.mcal`, of Motive 3.2 and newer, is in UTF-16. `Extrinsic` has the position [m] and, row
-by row, the matrix whose columns are the camera's axes in the world: x right, y up, z backward. Motive's world
-has y up. The lens of `IntrinsicStandardCameraModel` is OpenCV's; the one of `Intrinsic` is Motive's own.
-
-COLMAP's reconstructions are `cameras` with the lenses and `images` with the poses, as `.txt` or `.bin`.
+Vicon's radial coefficients undistort points: a point at r pixels from the principal point belongs at
+r (1 + k1 r^2 + k2 r^4 + k3 r^6). Qualisys' lens is OpenCV's, v down, in 64ths of a pixel of the sensor. The
+lens of Motive's `IntrinsicStandardCameraModel` is OpenCV's; the one of its `Intrinsic` is Motive's own.
 """
 
 from __future__ import annotations

@@ -1,19 +1,10 @@
-"""COCO keypoints (`annotations.json`), YOLO's labels beside them, and InterHand2.6M's files.
+"""COCO keypoints (`annotations.json`), YOLO's labels beside them, and InterHand2.6M's files: docs/formats.md.
 
-COCO's keypoints count pixels from the first one's center, boxes from the picture's corner, as in COCO's own
-files. Beyond COCO's fields an image has its camera (`K` for such pixels, the lens, the pose), who is in it
-and every random choice; an annotation has its side, its keypoints in the camera's axes [m], its pose, its
-shape and its skin.
+COCO's keypoints and InterHand2.6M's projections count pixels from the first one's center, boxes from the
+picture's corner. YOLO's shares of a picture count from its corner.
 
-A YOLO label is the class, the box (center and size) and 21 x (x, y, flag), as shares of the picture's
-width and height from its corner. There is one class, because ultralytics mirrors pictures while it trains,
-which makes a right hand a left one.
-
-InterHand2.6M has millimeters and 42 joints: 21 of the right hand and 21 of the left, tip first and wrist
-last. Projections count pixels from the first one's center, boxes from the picture's corner. A dataset is
-one capture, "0". Its cameras are called by numerals, because its loader calls `int` on them, and have one
-pose each, so that a camera that moves becomes many. Each picture has our name of its camera beside the
-numeral.
+A dataset of InterHand2.6M is one capture, "0". Its cameras are called by numerals, because its loader calls
+`int` on them, and have one pose each, so that a camera that moves becomes many.
 """
 
 from __future__ import annotations

@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import math
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -19,7 +17,7 @@ from jaxtyping import Float, Float32, UInt8
 from numpy.typing import NDArray
 
 from handsim.errors import HandSimError
-from handsim.files.outputs import atomic_write, plain_path, unwritten
+from handsim.files.outputs import atomic_write, plain_json, plain_path, unwritten
 from handsim.hand.shape import NUM_KEYPOINTS, HandShape, Side
 from handsim.kernels import kernel
 from handsim.space.camera import Camera
@@ -151,25 +149,13 @@ def to_json(content: Any) -> str:
     try:
         return json.dumps(content, default=_listed, allow_nan=False, separators=(",", ":"))
     except (TypeError, ValueError):  # NaN, or a type that only the slow way knows
-        return json.dumps(_plain(content), allow_nan=False, separators=(",", ":"))
+        return json.dumps(plain_json(content), allow_nan=False, separators=(",", ":"))
 
 
 def _listed(content: Any) -> Any:
     if isinstance(content, np.ndarray | np.generic):
         return content.tolist()
     raise TypeError
-
-
-def _plain(content: Any) -> Any:
-    if isinstance(content, Mapping):
-        return {str(key): _plain(value) for key, value in content.items()}
-    if isinstance(content, (list, tuple)):
-        return [_plain(value) for value in content]
-    if isinstance(content, np.ndarray | np.generic):
-        return _plain(content.tolist())
-    if isinstance(content, float) and not math.isfinite(content):
-        return None
-    return content
 
 
 _DIGITS: Final = tuple(tuple(range(first, first + 4)) for first in range(1, NUM_KEYPOINTS, 4))

@@ -1,16 +1,8 @@
-"""Clips in webdataset tars as UmeTrack and HOT3D have them, and the ground truth of a frame in ours.
-
-A clip's sample is one time, seen by one or more cameras ("streams"). What their tools read counts pixels
-from the first one's center, boxes from the picture's corner. `frame_record`, for formats of our own, counts
-all from the corner.
+"""Clips in webdataset tars as UmeTrack and HOT3D have them, and the ground truth of a frame: docs/formats.md.
 
 Our hand as a UmeTrack hand model: UmeTrack describes left hands and mirrors them in its x axis for right
 ones; ours are mirrored in y. Its wrist frame is therefore ours rotated by 90 degrees about z. Like ours it
 has four joint angles per digit and equal angles for mirrored poses, so that our angles are its angles.
-
-A crop's camera is a square pinhole camera at the place of the stream's camera. It looks at the middle of
-one hand's keypoints, with room around them. The tools warp the stream's picture to it, which takes the lens
-out.
 """
 
 from __future__ import annotations

@@ -23,7 +23,7 @@ from track import (
     open_source,
     track_capture,
 )
-from track.recorder import TakeRecorder
+from track.recorder import Recorder
 from train import evaluate_labeler, load_labeler, simulate_take
 
 FRAMES, RATE = 60, 120.0
@@ -207,9 +207,9 @@ def test_empty_frames_and_frames_without_hands_are_lost_not_wrong(user, labeler,
     assert (label_capture(empty).labels == -1).all()
 
 
-def test_a_live_stream_gives_the_capture_s_take(truth, tracked, user, labeler):
+def test_a_live_stream_gives_the_capture_s_take(truth, tracked, user, labeler, tmp_path):
     tracker = Tracker(user, labeler)
-    recorder = TakeRecorder(tracker)
+    recorder = Recorder(tmp_path / "take.npz", tracker)
     with ReplayServer(truth) as server, open_source(server.url, silence=0.4) as stream:
         stream.forgiven_until = math.inf  # nothing is dropped, however busy the machine
         for frame in stream:
@@ -218,7 +218,7 @@ def test_a_live_stream_gives_the_capture_s_take(truth, tracked, user, labeler):
             if frame.silent:
                 break
     assert [hand.status for hand in one.hands] == [Status.LOST] * 2, "nothing came for too long to go on"
-    take = recorder.take()
+    take, _ = recorder.finish({})
     assert take.num_frames == TRACKED_FRAMES, "a silence is no frame"
     assert take.rate == pytest.approx(truth.rate, rel=1e-3)
     assert take.points.shape[1] == np.isfinite(truth.points[..., 0]).sum(axis=1).max()

@@ -17,8 +17,9 @@ from hypothesis import strategies as st
 
 from gloves import RigidBody, Status, Take, load_layout, load_take
 from gloves.fit import nominal_fit
+from gloves.takes import points
 from gloves.takes.archives import CutOffWarning
-from gloves.takes.take import LOST, STATUSES, TRACKED
+from gloves.takes.take import LOST, STATUSES, TRACKED, usual_rate
 from handsim import join_qpos
 from handsim.errors import ArgumentError, CaptureError
 from handsim.space.objects import named_object
@@ -36,7 +37,7 @@ from track import (
 )
 from track import recorder as module
 from track.frames import capture_frames
-from track.recorder import TakeRecorder
+from track.recorder import frame_values
 from train import load_labeler, simulate_take
 
 FRAMES = 24
@@ -65,10 +66,20 @@ def recorded(folder, *, frames: int = FRAMES) -> Recorder:
 
 def in_memory() -> Take:
     tracker, pairs = tracked()
-    recorder = TakeRecorder(tracker)
-    for frame, one in pairs:
-        recorder.add(frame, one)
-    return recorder.take()
+    rows = [frame_values(*pair) for pair in pairs]
+    arrays = {
+        column.name: np.array([row[column.name] for row in rows])
+        for column in (*points.FRAMES, *points.OPTIONAL)
+    }
+    entries = {column.name: np.concatenate([row[column.name] for row in rows]) for column in points.POINTS}
+    return Take(
+        rate=usual_rate(arrays["times"], arrays["numbers"]),
+        hands=tracker.hands,
+        bodies=tracker.bodies,
+        settings={},
+        point_list=points.PointList.in_order(np.array([len(row["points"]) for row in rows]), **entries),
+        **arrays,
+    )
 
 
 def assert_equal(one: Take, other: Take) -> None:

@@ -1,15 +1,9 @@
 """Live streams for a tracker: in order, on a clock that never goes back, without outdated frames.
 
-Each arriving frame is passed on once, in order, or counted. A frame that continues the stream is passed on at
-once. After a gap in the numbers frames are held until the gap is closed, eight frames are held, or 30 ms
-have passed (five intervals of a slower stream; 0.1 s if frames were out of order in the last ten seconds).
-
-A frame continues the stream if its steps in time and number agree, and its time is at most sixteen frames
-ahead of its arrival. Any other frame is a jump. A jump is accepted only when five successive frames fit
-together, as after a restart of a recording or server. Frames of shorter jumps are wild, and are dropped.
-
-When the stream's time restarts, the clock here continues. If the reader is too slow, the oldest frames are
-dropped and counted.
+Each arriving frame is passed on once, in order, or counted; docs/tracking_commands.md says how long frames
+wait behind a gap. A frame continues the stream if its steps in time and number agree, and its time is at most
+sixteen frames ahead of its arrival. Any other frame is a jump. A jump is accepted only when five successive
+frames fit together, as after a restart of a recording or server. Frames of shorter jumps are dropped as wild.
 """
 
 from __future__ import annotations
@@ -20,18 +14,16 @@ import math
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
 from itertools import pairwise
-from typing import Annotated, Any, Final
+from typing import Final
 
 import numpy as np
 
 from gloves.captures.text import HIGHEST_RATE
-from handsim._checks import check_type
+from handsim._checks import check_number, check_type
 from handsim._plugins import is_plugin, list_plugins, make_plugin
 from handsim.callbacks import Closing
 from handsim.errors import ArgumentError, HandSimError
-from handsim.settings import Limits, Settings
 from track.frames import FARTHEST, LATEST_TIME, StreamedFrame
 from track.streams import NoServerError, split_address
 from track.streams.frame_source import LEAVE, ArrivingFrames, FrameSource, SourceStream
@@ -72,14 +64,6 @@ _RECENT: Final = 256  # number of newest frames searched for duplicates
 _STRIDES: Final = 16  # number of frames that determine the server's step
 
 
-@dataclass(frozen=True, slots=True)
-class StreamSettings(Settings):
-    """How a live stream is read: keyword arguments of `open_source`."""
-
-    silence: Annotated[float, Limits(0.0, above=True)] = _SILENCE
-    """A silent frame is produced after this time without a frame [s]."""
-
-
 def check_address(address: str) -> str:
     """Scheme of a stream's address, checked without asking a server."""
     check_type("address", address, str, f"one of {', '.join(VALID)}")
@@ -92,10 +76,9 @@ def check_address(address: str) -> str:
 
 def open_source(
     address: str | FrameSource,
-    settings: StreamSettings | None = None,
     *,
+    silence: float = _SILENCE,
     ended: Callable[[], bool] = lambda: False,
-    **options: Any,
 ) -> LiveStream:
     """Open a live stream; its frames are iterated in a `with` block.
 
@@ -105,16 +88,15 @@ def open_source(
     Args:
         address: One of `VALID`. `module:name?option=value` passes options to a user's own source, which can
             also be given as an object.
-        settings: Settings of the stream; `StreamSettings()` when not given.
+        silence: A silent frame is produced after this time without a frame [s].
         ended: The stream ends when this returns True; it is called before each frame, and several times a
             second while none comes.
-        options: Fields of `StreamSettings` that differ from `settings`.
 
     Raises:
-        ArgumentError: The address is invalid, or there is no such source.
+        ArgumentError: The address or the time is invalid, or there is no such source.
         CaptureError: No server answers.
     """
-    settings = StreamSettings.of(settings, options)
+    check_number("silence", silence, 0.0, above=True)
     frames: ArrivingFrames
     if not isinstance(address, str):
         check_type("address", address, Iterable, f"one of {', '.join(VALID)}, or a frame source")
@@ -136,7 +118,7 @@ def open_source(
                 raise NoServerError(str(error)) from error
             raise
         frames = SourceStream(source, address.partition("?")[0])
-    return LiveStream(frames, silence=settings.silence, ended=ended)
+    return LiveStream(frames, silence=silence, ended=ended)
 
 
 class LiveStream(Closing, Iterator[StreamedFrame]):

@@ -19,14 +19,14 @@ from contextlib import suppress
 from dataclasses import dataclass
 from enum import IntEnum
 from pathlib import Path
-from typing import Any, Final, NamedTuple, Protocol
+from typing import Any, Final, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
 from gloves.captures.capture import Capture
 from gloves.optics.reconstruction import number_runs
+from gloves.takes.take import Take
 from handsim._checks import check_type
 from handsim.callbacks import Closing
 from handsim.errors import ArgumentError, CaptureError, choices
@@ -502,22 +502,6 @@ def _receive(one: socket.socket) -> _Received | None:
     return _Received(packet, (host, port), arrived)
 
 
-class PointFrames(Protocol):
-    """Points of frames with IDs, such as a take's."""
-
-    @property
-    def points(self) -> Float[np.ndarray, "T N 3"]:
-        """Points of all frames [m]; NaN for a missing point."""
-
-    @property
-    def ids(self) -> Int[np.ndarray, "T N"]:
-        """ID of each point, -1 where it has none."""
-
-    @property
-    def rate(self) -> float:
-        """Frames per second [Hz]."""
-
-
 class ReplayServer(Closing):
     """Streams frames at their rate over NatNet while a client is connected, and waits otherwise.
 
@@ -538,7 +522,7 @@ class ReplayServer(Closing):
 
     def __init__(
         self,
-        source: Capture | PointFrames | str | Path,
+        source: Capture | Take | str | Path,
         settings: ReplaySettings | None = None,
         *,
         version: Version = NEWEST,

@@ -19,6 +19,7 @@ from gloves.fit import GlovedHand
 from gloves.layout import load_layout
 from gloves.takes.take import Take, load_take
 from handsim.callbacks import OnStep, no_step
+from handsim.files.outputs import plain_json
 from handsim.pages import (
     NOTHING,
     Paint,
@@ -126,7 +127,7 @@ class RigScore:
                 | ({} if one.without is None else _figures(one.without))
                 for one in self.losses
             ],
-            "volume": {name: _numbers(values) for name, values in self.volume._asdict().items()},
+            "volume": plain_json(self.volume._asdict()),
             "suspicious": self.faults,
         }
 
@@ -244,17 +245,9 @@ def cube_points(
 
 def _figures(one: Forecast) -> dict[str, Any]:
     axes, directions, mean = one.error
-    figures = {field.name: getattr(one, field.name) for field in dataclasses.fields(one)}
+    figures: dict[str, Any] = {field.name: getattr(one, field.name) for field in dataclasses.fields(one)}
     figures |= {"error": mean, "error_axes": axes, "error_directions": directions}
-    return {name: _numbers(value) for name, value in figures.items()}
-
-
-def _numbers(value: Any) -> Any:
-    """Numbers and lists of numbers as JSON; non-finite ones as None."""
-    array = np.asarray(value)
-    if array.ndim:
-        return [_numbers(part) for part in array]
-    return array.item() if np.isfinite(array) else None
+    return {name: plain_json(value) for name, value in figures.items()}
 
 
 def _sentences(score: RigScore) -> Iterator[str]:

@@ -1,9 +1,8 @@
 """The paper's network as a labeler without torch: views and images of clouds, and their labels.
 
 A view is an orthogonal matrix from the cloud's frame into the camera's; with determinant -1 it shows a left
-hand as a right one. Views are random as in the paper, or aligned: they turn every hand like the mean hand of
-its layout, so that the network need not learn all orientations. Training aligns views by the true markers;
-labeling starts with the cloud's principal axes, and aligns the next view by the predicted markers.
+hand as a right one. Views are random as in the paper, or aligned with the mean hand
+(docs/own_labelers.md), so that the network need not learn all orientations.
 
 Images are 52x52 depth images (Han et al. 2018, section 3.1): an orthographic camera looks along an axis
 through the cloud's mean, zoomed so that every point stays clear of a 10 % margin; each point is one pixel

@@ -1,10 +1,7 @@
 """Networks of the labelers in torch: how each is built and trained, and how it becomes a labeler.
 
-The default network exchanges gated messages between points, based only on their distances, so that rotating,
-moving or mirroring the cloud changes nothing: one network labels left and right hands. Messages are weighted
-by sigmoid gates of distance and of both ends (no softmax over points, unlike self-attention), so they add up
-evidence and can count neighbors. Two outputs are trained together: the label, or ghost, of each point; and
-the point, or none, of each label.
+docs/labeling.md describes the default network. Its messages between points are weighted by sigmoid gates, not
+by a softmax over points as in self-attention, so they add up evidence and can count neighbors.
 
 The network for any layout describes points and markers by such messages, based on distances between the
 points of a cloud and on distributions of the distance between two markers over many people and poses. It then

@@ -32,6 +32,7 @@ _NOUN: Final = "labeler"
 MAX_POINTS: Final = 512
 MOST_THREADS: Final = 1024
 _BATCH: Final = 256
+_PAIRS: Final = 1 << 18  # pairs of points in a batch, which take the memory of large clouds
 _threads: ContextVar[int] = ContextVar("threads of labelers", default=1)
 
 
@@ -77,14 +78,13 @@ def label_in_batches(
 ) -> list[Labeling]:
     """Validate frames, and label them in batches of similar size, so that padding stays small."""
     clouds = check_clouds(frames)
-    order = sorted(range(len(clouds)), key=lambda number: len(clouds[number]))
+    order = sorted(range(len(clouds)), key=lambda number: -len(clouds[number]))
     results = [Labeling(np.zeros(0, dtype=np.int64), np.zeros(0)) for _ in clouds]
-    for first in range(0, len(order), _BATCH):
-        chosen = order[first : first + _BATCH]
-        if len(clouds[chosen[-1]]):
-            labelings = label([clouds[number] for number in chosen])
-            for number, labeling in zip(chosen, labelings, strict=True):
-                results[number] = labeling
+    while order and (longest := len(clouds[order[0]])):
+        size = min(_BATCH, max(1, _PAIRS // longest**2))
+        chosen, order = order[:size], order[size:]
+        for number, labeling in zip(chosen, label([clouds[number] for number in chosen]), strict=True):
+            results[number] = labeling
     return results
 
 

@@ -28,7 +28,7 @@ from gloves.layout import MarkerLayout, list_layouts, load_layout
 from handsim import __version__
 from handsim._checks import check_type
 from handsim._plugins import is_plugin, list_plugins
-from handsim.errors import ArgumentError, HandSimError, HandSimWarning, WeightsError, choices
+from handsim.errors import DAMAGE, ArgumentError, HandSimError, HandSimWarning, WeightsError, choices
 from handsim.files.inputs import DIGEST, read_bytes, sign_model
 from handsim.files.outputs import atomic_write, plain_path, save_json, written_together
 from train.labelers.cnn_labeler import CNNLabeler, MeanHand
@@ -321,10 +321,7 @@ def _read(weights: Path, card: Path) -> _Stored:
             )
     except WeightsError:
         raise
-    except (
-        HandSimError, SafetensorError, OSError, ValueError, LookupError, TypeError, AttributeError,
-        RuntimeError, OverflowError,
-    ) as error:  # fmt: skip
+    except (*DAMAGE, SafetensorError, OSError) as error:
         reason = (str(error) or type(error).__name__).splitlines()[0]
         raise WeightsError(f"{weights} is damaged or not a labeler's: {reason}") from error
     for name, tensor in tensors.items():

@@ -157,6 +157,15 @@ def test_poses_alone_are_a_take(take, rng):
         Take.of_poses(take.hands[:1], qpos, rate=0.0)
     with pytest.raises(ArgumentError, match=r"qpos has shape \(4, 1, 27\), expected \(4, 2, 27\)"):
         Take.of_poses(take.hands, qpos, rate=30.0)
+    with pytest.raises(ArgumentError, match="hands is a GloveFit, expected a list of GloveFits"):
+        Take.of_poses(take.hands[0], qpos, rate=30.0)
+    with pytest.raises(ArgumentError, match="a hand is a HandModel, expected a GloveFit"):
+        Take.of_poses([take.hands[0].model], qpos, rate=30.0)
+
+
+def test_a_folder_is_no_take(tmp_path):
+    with pytest.raises(CaptureError, match=r"this is a folder, expected a take \(.npz\)"):
+        load_take(tmp_path)
 
 
 @pytest.mark.parametrize("rate", [30, np.int64(30), np.float32(30.0)])

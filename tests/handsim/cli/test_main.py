@@ -134,6 +134,11 @@ def test_what_a_user_can_set_right_is_told_in_one_line(error, code, line, invoke
     assert err.count("\n") == 1
 
 
+def test_errors_name_the_whole_command(capsys):
+    assert main(["rig", "check", "nothing"]) == 1
+    assert capsys.readouterr().err.startswith("handsim rig check: ")
+
+
 def test_our_own_mistakes_are_one_line_and_a_log(invoke, capsys):
     assert invoke(lambda: 1 // 0) == 1
     said = capsys.readouterr().err

@@ -9,6 +9,7 @@ import torch
 from handsim.errors import ArgumentError
 from train import CNNConfig, SetLabelerConfig
 from train.labelers.networks import labeler_of, new_network
+from train.labelers.protocol import Labeling, label_in_batches
 from train.labelers.storage import OnnxLabeler, export_onnx
 
 NAMES = tuple(f"marker{number}" for number in range(19))
@@ -92,3 +93,16 @@ def test_millimeters_are_told_and_strays_are_not(labeler, rng):
         labeler.label_frames([1000.0 * hand for hand in hands])
     stray = np.concatenate([hands[0], [[200.0, 0.0, 0.0]]])
     check(labeler.label_frames([stray, *hands[1:]])[0], 20)
+
+
+def test_batches_of_large_clouds_are_small(rng):
+    sizes = []
+
+    def label(clouds):
+        sizes.append([len(cloud) for cloud in clouds])
+        return [Labeling(np.full(len(cloud), -1), np.ones(len(cloud))) for cloud in clouds]
+
+    frames = [rng.random((count, 3)) for count in (*[20] * 300, *[512] * 2, 0)]
+    found = label_in_batches(frames, label)
+    assert [len(one.labels) for one in found] == [len(frame) for frame in frames]
+    assert sizes == [[512], [512], [20] * 256, [20] * 44 + [0]], "as many pairs of points, not of frames"
