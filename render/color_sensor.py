@@ -129,7 +129,8 @@ def expose(
     rgb = rgb.reshape(linear.shape)
     if exposure.jpeg_quality is None:
         return rgb
-    done, file = cv2.imencode(".jpg", rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, exposure.jpeg_quality])
+    bgr = cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)
+    done, file = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, exposure.jpeg_quality])
     assert done
     return np.asarray(cv2.cvtColor(cv2.imdecode(file, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB))
 

@@ -69,20 +69,20 @@ def _measure_disparity(
     ideal, kept = np.zeros_like(depth), np.zeros(depth.shape, np.bool_)
     nearest, farthest = np.float32(noise.nearest), np.float32(noise.farthest)
     _write_ideal(depth, cosines, scale, nearest, farthest, float(np.cos(noise.steepest)), ideal, kept)
+    offsets = np.rint(noise.shift * quantiles()[128::256]).astype(np.int64)
+    beyond = max(_DOTS[-1], int(np.abs(offsets).max()))
+    around = cv2.copyMakeBorder(ideal, beyond, beyond, beyond, beyond, cv2.BORDER_REPLICATE)
     if noise.support > 0.0:
         coarse = normal_numbers(((height + 2) // 3, (width + 2) // 3), rng=rng)
         needed = np.ceil((len(_DOTS) ** 2 - 1) * (noise.support + noise.wavering * coarse))
-        border = _DOTS[-1]
-        around = cv2.copyMakeBorder(ideal, border, border, border, border, cv2.BORDER_REPLICATE)
-        _keep_supported(around, needed.astype(np.int64), np.float32(noise.agreement), kept)
+        _keep_supported(around, needed.repeat(3, axis=1), np.float32(noise.agreement), kept)
     if noise.shadow:
         keep_lit(ideal, kept)
     shifts = random_words((height, width) if noise.shift > 0.0 else (0, 0), rng=rng)
-    offsets = np.rint(noise.shift * quantiles()[128::256]).astype(np.int32)
     blobs = _blobs((height, width), noise.window, noise.disparity_noise, rng=rng)
-    measured = np.zeros_like(depth)
+    measured = np.empty_like(depth)
     step, least = np.float32(noise.step), np.float32(0.5 * scale / noise.farthest)
-    _match(ideal, kept, shifts, offsets, blobs, step, least, scale, measured)
+    _match(around, kept, shifts, offsets, blobs, step, least, scale, measured)
     return measured
 
 
@@ -128,77 +128,81 @@ def keep_lit(disparity: Floats, kept: Flags) -> None:
     """
     height, width = disparity.shape
     most = np.float32(np.ceil(max(disparity.max(), np.float32(0.0))) + 1.5)  # cells are rounded
-    first, cells = np.empty(width + int(most) + 2, np.float32), np.empty(width, np.int32)
+    first, cells = np.zeros(width + int(most) + 2, np.float32), np.empty(width, np.int32)
+    around = np.zeros_like(first)
     for row in range(height):
         first[:] = 0.0
         near = disparity[row]
         for column in range(width):
-            cells[column] = np.int32(np.float32(column) - near[column] + most)
+            cells[column] = 1 + np.int32(np.float32(column) - near[column] + most)
         for column in range(width):
-            if near[column] > 0.0:
-                first[1 + cells[column]] = max(first[1 + cells[column]], near[column])
+            cell = np.uint64(cells[column])  # saves a test for negative indices
+            first[cell] = max(first[cell], near[column])
+        for n in range(1, len(first) - 1):  # neighbors close what rounding left open
+            around[n] = max(first[n - 1], first[n], first[n + 1])
         for column in range(width):
-            if kept[row, column]:  # neighbors close what rounding left open
-                cell = 1 + cells[column]
-                nearest = max(first[cell - 1], first[cell], first[cell + 1])
-                kept[row, column] = nearest <= near[column] + np.float32(_SHADOW_SLACK)
+            kept[row, column] &= around[np.uint64(cells[column])] <= near[column] + np.float32(_SHADOW_SLACK)
 
 
 @kernel
-def _keep_supported(around: Floats, needed: Integers, most: np.float32, kept: Flags) -> None:
+def _keep_supported(around: Floats, needed: Floats, most: np.float32, kept: Flags) -> None:
     """Clear those of `kept` (H, W) with fewer dots in the window that agree with its middle than are needed.
 
-    Disparities (H + 6, W + 6) go on beyond the picture, so that no window ends at its edge. `needed` is alike
-    in patches of 3 x 3 pixels, and `most` the largest difference [px].
+    Disparities go on beyond the picture, so that no window ends at its edge. `needed` has a row for three of
+    the picture's, and `most` is the largest difference [px].
     """
     height, width = kept.shape
-    border, agreed = _DOTS[-1], np.empty(width, np.float32)
-    zero, one = np.float32(0.0), np.float32(1.0)
+    border, agreed = (len(around) - height) // 2, np.empty(width, np.float32)
+    zero, one, all_others = np.float32(0.0), np.float32(1.0), np.float32(len(_DOTS) ** 2 - 1)
     for row in range(border, border + height):
         middle = around[row, border:]
-        agreed[:] = -one  # for the middle itself
+        agreed[:] = zero
         for down in _DOTS:
             for right in _DOTS:
+                if down == right == 0:
+                    continue
                 other = around[row + down, border + right :]
                 for n in range(width):
                     agreed[n] += one if abs(other[n] - middle[n]) <= most else zero
+        least = needed[(row - border) // 3]
         for n in range(width):  # where all agree, nothing is lost
-            enough = min(needed[(row - border) // 3, n // 3], len(_DOTS) ** 2 - 1)
-            kept[row - border, n] &= agreed[n] >= enough
+            kept[row - border, n] &= agreed[n] >= min(least[n], all_others)
 
 
 @kernel
 def _match(
-    disparity: Floats,
+    around: Floats,
     kept: Flags,
     shifts: NDArray[np.uint16],
-    offsets: NDArray[np.int32],
+    offsets: Integers,
     noise: Floats,
     step: np.float32,
     least: np.float32,
     scale: np.float32,
     depth: Floats,
 ) -> None:
-    """Write the depth [m] of the pixels that are kept.
+    """Write the depth [m] of the pixels that are kept, and 0 elsewhere.
 
     Each takes its disparity from some whole pixels away, so that no value is made up between near and far;
-    then come noise (H, W) [px] and rounding. Both bytes of random words pick offsets (256,) [px]; those of
-    shape 0 pick none. Less than the `least` disparity is nothing.
+    then come noise (H, W) [px] and rounding. Both bytes of random words pick offsets (256,) [px], as far as
+    disparities go on beyond the picture; no words pick none. Less than the `least` disparity is nothing.
     """
-    height, width = disparity.shape
+    height, width = kept.shape
+    values, tiny, zero = np.empty(width, np.float32), np.float32(1e-6), np.float32(0.0)
+    flat, stride = around.reshape(-1), around.shape[1]
+    border, down = (stride - width) // 2, stride * offsets
     for row in range(height):
+        start = (row + border) * stride + border
+        values[:] = flat[start : start + width]
+        for column in range(width if len(shifts) else 0):
+            word = np.uint64(shifts[row, column])
+            place = start + column + down[word >> np.uint64(8)] + offsets[word & np.uint64(255)]
+            values[column] = flat[np.uint64(place)]  # saves a test for negative indices
         for column in range(width):
-            if not kept[row, column]:
-                continue
-            i, j = row, column
-            if len(shifts):
-                i = min(max(row + offsets[shifts[row, column] >> 8], 0), height - 1)
-                j = min(max(column + offsets[shifts[row, column] & 255], 0), width - 1)
-            value = disparity[i, j] + noise[row, column]
-            if step > 0.0:
-                value = np.rint(value / step) * step
-            if value > least:
-                depth[row, column] = scale / max(value, np.float32(1e-6))
+            value = values[column] + noise[row, column]
+            value = np.rint(value / step) * step if step > zero else value
+            far = scale / (value if value > tiny else tiny)
+            depth[row, column] = far if kept[row, column] and value > least else zero
 
 
 _WALL: Final = 0.8  # reflectance of the white walls that noise was published for

@@ -117,7 +117,7 @@ def cut_out(
     return {
         "rgb": np.moveaxis(square, 2, 0),
         "keypoints": (hand.keypoints - corner) * scale,
-        "visible": hand.visible,
+        "visible": hand.visible.copy(),
         "box": np.array([*(low - corner), *(high - low)]) * scale,
         "side": np.array(hand.side, dtype=np.int64),
     }
@@ -418,8 +418,8 @@ def _hand_arrays(hand: HandTruth | None, camera: Camera, shape: HandShape) -> di
 
 
 def _tensors(arrays: dict[str, NDArray[np.generic]]) -> dict[str, torch.Tensor]:
-    """Arrays as tensors, float64 as float32."""
+    """Arrays that nobody else keeps as tensors, float64 as float32."""
     return {
-        name: torch.from_numpy(np.array(array, dtype=np.float32 if array.dtype == np.float64 else None))
+        name: torch.from_numpy(np.asarray(array, dtype=np.float32 if array.dtype == np.float64 else None))
         for name, array in arrays.items()
     }

@@ -41,7 +41,7 @@ from render.frames import (
     RenderedFrame,
 )
 from render.painting.figures import Appearance, BodyFigure, Drawn, HandFigure
-from render.painting.painter import paint, put_before, whole_levels
+from render.painting.painter import paint, put_before
 from render.painting.rasterizer import NEAR, see
 from render.painting.shading import level_behind, light_behind
 from render.scenery.backgrounds import (
@@ -374,15 +374,14 @@ class Studio:
         whole = paint(camera, drawn, choices.lighting, "bright" if bright else self._painter)
         if choices.enclosure is not None:
             behind = draw_surroundings(background, choices.enclosure, camera, bright=bright).rgb
-            return put_before(whole, behind, behind)
-        (plain, bare), light = _background(background, camera.size), None
+            return put_before(whole, behind)
+        plain, light = _background(background, camera.size), None
         if background.backdrop.shadows and camera.lens.kind == "pinhole":
             light = light_behind(camera, drawn, choices.lighting, background.backdrop)
-        if light is None:
-            return put_before(whole, plain, bare)
-        return put_before(
-            whole, np.asarray(cv2.multiply(plain, cv2.merge([cv2.pow(light, 1.0 / GAMMA)] * 3)))
-        )
+        if light is not None:
+            shade = cv2.cvtColor(cv2.pow(light, 1.0 / GAMMA), cv2.COLOR_GRAY2RGB)
+            plain = np.asarray(cv2.multiply(plain, shade, dst=shade))
+        return put_before(whole, plain)
 
     def _exposed(
         self, moment: Moment, camera: Camera, rgb: Bytes, choices: FrameChoices, rng: np.random.Generator
@@ -446,11 +445,10 @@ def _walls(camera: Camera, drawn: Sequence[Drawn], choices: FrameChoices) -> Sur
 
 
 @functools.lru_cache(maxsize=2)
-def _background(background: Background, size: tuple[int, int]) -> tuple[Floats, Bytes]:
-    """A background (H, W, 3) in sRGB, from 0 to 255, and as bytes."""
+def _background(background: Background, size: tuple[int, int]) -> Floats:
+    """A background (H, W, 3) in sRGB, from 0 to 255."""
     display = cv2.pow(kept_background(background, size), 1.0 / GAMMA)
-    whole = enlarged(np.multiply(display, np.float32(255.0), out=display), size)
-    return whole, whole_levels(whole)
+    return enlarged(np.multiply(display, np.float32(255.0), out=display), size)
 
 
 @functools.lru_cache(maxsize=64)

@@ -54,7 +54,6 @@ CATEGORY: Final[dict[str, Any]] = {
     "supercategory": "hand",
     "keypoints": list(KEYPOINT_NAMES),
     "skeleton": [[start + 1, end + 1] for start, end in SKELETON],  # COCO counts keypoints from one
-    "openxr_joints": OPENXR_JOINTS,
 }
 
 
@@ -113,7 +112,7 @@ def _hand_record(frame: RenderedFrame, number: int, hand: HandTruth) -> dict[str
         record["openxr_keypoints"] = _triples(pixels, hand.openxr_visible, frame.camera.size)
         record["openxr_poses"] = rounded(np.concatenate([joints[:, :3, 3], turns], axis=1), 9)
     if hand.tracking:
-        record["tracking"] = hand.tracking
+        record["tracking"] = {k: x if k == "status" else rounded(x, 6) for k, x in hand.tracking.items()}
     looks = frame.choices.get("people", ())
     if number < len(looks):
         angle = typology_angle(looks[number]["skin"]["lightness"], looks[number]["skin"]["yellowness"])
@@ -194,13 +193,15 @@ class YoloWriter(CocoWriter):
 
 def _coco_file(records: Iterable[dict[str, Any]], category: dict[str, Any], folder: Path) -> Iterator[str]:
     """Pieces of a COCO file; annotations wait in a file of the folder, so that memory need not hold them."""
-    yield f'{{"info":{to_json(INFO)},\n"licenses":[],\n"categories":{to_json([category])},\n"images":'
+    yield f'{{"info":{to_json(INFO)},\n"licenses":[],\n"images":'
+    fields = set[str]()  # of all annotations
     with tempfile.TemporaryFile("w+", dir=folder, encoding="utf-8") as waiting:
 
         def images() -> Iterator[dict[str, Any]]:
             separator = "\n"
             for image, hands in numbered(records):
                 for hand in hands:
+                    fields.update(hand)
                     waiting.write(separator + to_json(hand))
                     separator = ",\n"
                 yield image
@@ -209,7 +210,8 @@ def _coco_file(records: Iterable[dict[str, Any]], category: dict[str, Any], fold
         yield ',\n"annotations":['
         waiting.seek(0)
         yield from waiting
-    yield "\n]}\n"
+    known = {"openxr_joints": OPENXR_JOINTS} if "openxr_poses" in fields else {}
+    yield f'\n],\n"categories":{to_json([category | known])}}}\n'
 
 
 SPLIT: Final = "train"

@@ -12,7 +12,6 @@ from typing import Any, Final, Literal, NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, UInt8
 from numpy.typing import NDArray
 
 from handsim.kernels import kernel
@@ -288,7 +287,6 @@ def _write_spot(
 
 Painter = Literal["compiled", "bright", "opengl"]
 PainterChoice = Literal["auto", "compiled", "opengl"]
-_WHITE: Final = np.float32(255.0)
 _STEP: Final = 64  # windows' sizes are multiples of it, because OpenGL reallocates buffers for new sizes [px]
 
 
@@ -347,20 +345,13 @@ def _widen(local: Doubles, K: Doubles, low: Doubles, high: Doubles) -> None:
             low[axis], high[axis] = min(low[axis], place), max(high[axis], place)
 
 
-def put_before(
-    painted: NDArray[Any], background: NDArray[Any], bare: UInt8[np.ndarray, "H W 3"] | None = None
-) -> NDArray[Any]:
-    """A picture of `paint` over a background (H, W, 3), whose `whole_levels` may be given."""
+def put_before(painted: NDArray[Any], background: NDArray[Any]) -> NDArray[Any]:
+    """A picture of `paint` over a background (H, W, 3) of levels from 0 to 255."""
     if painted.dtype == np.float32:  # it is a bright one
         return np.asarray(painted[..., :3] + (1.0 - np.rint(painted[..., 3:]) / 255.0) * background)
-    mixed = whole_levels(background) if bare is None else bare.copy()
+    mixed = background.astype(np.uint8)
     _mix(painted.reshape(-1, 4), background.reshape(-1, 3), mixed.reshape(-1, 3))
     return mixed
-
-
-def whole_levels(background: Float32[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:
-    """A background as bytes."""
-    return np.asarray(np.minimum(background, _WHITE).astype(np.uint8))
 
 
 @kernel

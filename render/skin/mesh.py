@@ -309,7 +309,7 @@ class _Skin(NamedTuple):
 
 
 def _finger(skin: _Skin, number: int, digit: str, wide: float) -> Iterator[_Hill]:
-    """Hills of a finger's knuckles, its tendon, its shaft, its neck, and the pad that bending pushes out."""
+    """Hills of a finger's knuckles, tendon, shaft, neck and sides, and the pads that bending pushes out."""
     first, size, bent = 1 + 3 * number, skin.scale, f"{digit}_MCP_flexion"
     middle = 0.5 * float(np.linalg.norm(skin.frames[first + 1, :3, 3] - skin.frames[first, :3, 3])) / size
     for bone, joint, start, full, height, long, broad, at in (
@@ -326,6 +326,9 @@ def _finger(skin: _Skin, number: int, digit: str, wide: float) -> Iterator[_Hill
     along, aside = along_segment(skin.points[:, :2], root, knuckle)
     ridge = 0.0014 * smooth(along, 0.15, 0.75) * bump(aside, 0.0030) * smooth(skin.normals[:, 2], 0.2, 0.7)
     yield _Hill(bent, 15.0, -22.0, size * ridge)
+    place, aside = skin.local(first)[0] / size, np.abs(skin.normals @ skin.frames[first, :3, 1])
+    flesh = 0.0016 * wide * bump(place[:, 0] - 1.2 * middle, 0.9 * middle) * bump(place[:, 1], 0.0105)
+    yield _Hill(bent, 20.0, 80.0, size * flesh * smooth(aside, 0.2, 0.8))  # neighbors touch in a fist
     for bone, joint, full in ((first, "PIP", 100.0), (first + 1, "DIP", 70.0)):
         place, facing = skin.local(bone)
         end = np.linalg.norm(skin.frames[bone + 1, :3, 3] - skin.frames[bone, :3, 3])

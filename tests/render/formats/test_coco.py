@@ -45,7 +45,8 @@ def test_the_file_holds_what_was_in_the_pictures(folder: Path, frames: list[Rend
     assert [hand["side"] for hand in content["annotations"]] == ["right", "left", "right"]
     (category,) = content["categories"]
     assert category["keypoints"] == list(KEYPOINT_NAMES) and [1, 2] in category["skeleton"]
-    assert list(content) == ["info", "licenses", "categories", "images", "annotations"]
+    assert "openxr_joints" not in category
+    assert list(content) == ["info", "licenses", "images", "annotations", "categories"]
     assert "handsim" in content["info"]["description"] and content["licenses"] == []
     for image, frame in zip(content["images"], frames, strict=True):
         picture = cv2.imread(str(folder / "images" / image["file_name"]))

@@ -210,6 +210,16 @@ def test_a_bent_finger_has_a_knuckle(side: Side, digit: str, bone: int) -> None:
     assert np.abs(rise[far & ~palm]).max() < 0.0025
 
 
+def test_fingers_of_a_fist_are_wider_so_that_they_touch() -> None:
+    mesh, rise = rises("right", middle_MCP_flexion=80.0)
+    frame = mesh.model.rest_transforms[7]
+    place = (mesh.rest - frame[:3, 3]) @ frame[:3, :3]
+    shaft = (np.abs(place[:, 1]) < 0.0112) & (np.abs(place[:, 0] - 0.025) < 0.008) & (place[:, 2] < 0.0)
+    across = vertex_normals(mesh.rest, mesh.faces) @ frame[:3, 1]
+    for sides in (shaft & (across > 0.9), shaft & (across < -0.9)):
+        assert sides.sum() > 5 and (rise[sides] > 0.0004).all() and (rise[sides] < 0.001).all()
+
+
 @pytest.mark.parametrize("digit", ["thumb", "middle"])
 def test_a_bent_joint_keeps_its_thickness(model: HandModel, digit: str) -> None:
     joint, bone = {"thumb": ("thumb_IP_flexion", 3), "middle": ("middle_PIP_flexion", 8)}[digit]
