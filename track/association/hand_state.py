@@ -46,6 +46,7 @@ _INITIAL_SPREAD_LEAST, _INITIAL_SPREAD_MOST = 0.0015, 0.006  # [m] bounds of it
 _LEAST_MARKER_SPREAD: Final = 0.0005  # [m] lower bound of a marker's noise, as few cameras may see it
 _BIAS_VARIATION: Final = 0.3  # variation of a bias with the pose, as share of the hand's typical bias
 _BIAS_DOUBT_TIME: Final = 0.5  # [s] unseen, after which a marker's bias is unknown again
+_LEFT_OUT_SPREAD: Final = 0.004  # [m] least doubt of a marker that the first fit left out, as if slipped
 _AVERAGING_FRAMES: Final = 120.0  # averaging window of a bias; one second at 120 Hz
 _FORGETTING_FRAMES: Final = 2400.0  # time constant in which an unconfirmed bias decays
 _FORGOTTEN: Final = 1.7e-7  # [m] additional decay per frame; 0.02 mm in a second at 120 Hz
@@ -134,6 +135,7 @@ class HandState:
         self._variance = self.variance.copy()  # [m^2] with certain biases
         self._typical_bias = 0.0  # [m] RMS over the markers
         self._last_seen = np.full(count, -np.inf)  # [s] of each marker since the hand was initialized
+        self._left_out = np.zeros(count, dtype=bool)  # markers without a point when it was initialized
         self._spread_model = SpreadModel(hand, origin, angle_errors)
         self._usual_square = np.nan  # [m^2] mean squared RMS distance, biases included
         self._designed = self.adapted.positions[:, 0].copy()  # [m] without biases
@@ -146,6 +148,8 @@ class HandState:
         self._now = time
         span = time - self.time
         doubt = self._typical_bias * np.minimum((time - self._last_seen) / _BIAS_DOUBT_TIME, 1.0)
+        # The RMS of the first fit tells nothing of markers that it left out, perhaps as they do not fit.
+        doubt[self._left_out & (self._bias_frames == 0.0)] = max(self._typical_bias, _LEFT_OUT_SPREAD)
         self.variance = self._variance + doubt**2
         moved: NDArray[np.float64] = move(
             self.qpos[None], min(span, _LONGEST_EXTRAPOLATION) * self.velocity[None]
@@ -236,6 +240,7 @@ class HandState:
             estimate = self.fit(targets, qpos, unknown)
             spread = _INITIAL_SPREAD * estimate.rms
             self._variance[:] = np.clip(spread, _INITIAL_SPREAD_LEAST, _INITIAL_SPREAD_MOST) ** 2
+        self._left_out = np.isnan(targets[:, 0])
         self._store(estimate, time)
         return estimate
 
@@ -313,7 +318,12 @@ class HandState:
     def _shift_markers(self) -> None:
         """Shift the hand's markers by their learned biases, and update the typical bias and the variances."""
         self._typical_bias = _shift_markers(
-            self._bias_frames, self._bias, self._designed, self._variance, self.adapted.positions
+            self._bias_frames,
+            self._left_out,
+            self._bias,
+            self._designed,
+            self._variance,
+            self.adapted.positions,
         )
 
 
@@ -385,6 +395,7 @@ def _learn_bias(
 @kernel
 def _shift_markers(
     bias_frames: Float[np.ndarray, "M"],
+    left_out: Bool[np.ndarray, "M"],
     bias: Float[np.ndarray, "M 3"],
     designed: Float[np.ndarray, "M 3"],
     variance: Float[np.ndarray, "M"],
@@ -393,10 +404,11 @@ def _shift_markers(
     """Shift the hand's markers by their biases; return the typical bias, the RMS of the known ones [m]."""
     square, count = 0.0, 0
     for marker in range(len(bias_frames)):
+        is_known = bias_frames[marker] > 0.0 and not left_out[marker]  # One that slipped is not typical.
         for i in range(3):
             positions[marker, 0, i] = designed[marker, i] - bias[marker, i]
-            square += bias[marker, i] ** 2 if bias_frames[marker] > 0.0 else 0.0
-        count += bias_frames[marker] > 0.0
+            square += bias[marker, i] ** 2 if is_known else 0.0
+        count += is_known
     square /= max(count, 1)
     for marker in range(len(bias_frames)):
         variance[marker] = max(variance[marker], _LEAST_MARKER_SPREAD**2 + _BIAS_VARIATION**2 * square)

@@ -74,6 +74,22 @@ def test_a_marker_without_a_point_at_the_start_may_be_any_point_that_is_there(mo
     assert odds[KNUCKLE] == SEEN_ELSEWHERE + 1.0 < SEEN_ELSEWHERE + MOST_AGE_LOG_ODDS < odds[TIP]
 
 
+def test_a_marker_that_the_first_fit_left_out_may_be_far_off_and_the_others_stay_certain():
+    user = nominal_fit(load_layout("dense19"), "M", "right")
+    state, others = HandState(user), np.delete(np.arange(19), KNUCKLE)
+    qpos = join_qpos(resting_angles(user.model)[None])[0]
+    seen = state.solver.marker_positions(qpos)
+    state.initialize(qpos, np.where(np.arange(19)[:, None] == KNUCKLE, np.nan, seen), 0.0)
+    state.predict(1 / RATE)
+    assert state.variance[KNUCKLE] >= 0.004**2 > 4 * state.variance[others].max()
+    seen[KNUCKLE, 1] += 0.008
+    for frame in range(1, 40):
+        prediction = state.predict(frame / RATE)
+        state.update(state.fit(seen, qpos, prediction), np.ones(19, dtype=bool), frame / RATE)
+    state.predict(1.0)
+    assert state.variance.max() < 0.0015**2
+
+
 def test_the_bias_of_a_marker_is_learned_and_its_designed_position_is_known(followed):
     off = np.zeros((19, 3))
     off[KNUCKLE] = 0.0, 0.004, 0.004
