@@ -21,12 +21,12 @@ _MOST_RMS: Final = 0.005  # [m]; hands of the nearest size reach 0.004
 _MOST_UNLABELED: Final = 0.25  # share of the points at the hands
 _MANY_FAR: Final = 0.05  # Unlabeled points away from the hands are mentioned from this share on.
 _AT_HAND: Final = 0.04  # [m] distance from a hand's markers within which a point counts as its own
-# Frames whose points all have at least this confidence need no look. Joining spans that are farther apart, or
-# adding the frames around them, would list three times as many right frames and hardly cover more errors.
-_CERTAIN: Final = 0.87
+# Frames whose points all have at least this confidence need no look. A limit of 0.87 would list a third more
+# frames and hardly cover more errors; one of 0.7, or leaving out short spans, would miss more of them.
+_CERTAIN: Final = 0.8
 _APART: Final = 0.05  # [s] Spans closer together are joined.
 _MOST_DOUBTS: Final = 12  # rows of a list to be read at a glance
-# Of 59 takes of other people, rigs, gloves and noise, two had more wrong frames among those not listed than
+# Of 44 takes of other people, rigs, gloves and noise, two had more wrong frames among those not listed than
 # this factor times the sum of their mean doubt and a minimum: a 95 % bound for the next take (split conformal
 # prediction). With few markers, many listed frames or many unlabeled points there is no useful bound.
 _VOUCH_FACTOR: Final = 2.8
