@@ -95,17 +95,17 @@ def test_they_are_what_other_bones_directions_and_places_make_of_the_solver(rng)
 
 def test_they_are_what_markers_that_slip_along_the_skin_make_of_the_solver(rng):
     """Markers of one hand are shifted in all poses alike, and its poses solved again."""
-    fit = nominal_fit("dense19", "M", "right")
+    fit = nominal_fit("starter30", "M", "right")
     digits, qpos, solver = hand_arrays(fit).digits, sample_poses(fit.model, 1, rng=rng), PoseSolver(fit)
-    usual, off, along, worn = known_hand(digits, 0.0002), [], [0.0006, 0.0], fit.attachment
-    angles, _ = spreads_of(fit, usual._replace(places=np.tile(along, (19, 1))), qpos, np.zeros((1, 19)))
+    usual, off, along, worn = known_hand(digits, 0.00001), [], [0.0004, 0.0], fit.attachment
+    angles, _ = spreads_of(fit, usual._replace(places=np.tile(along, (30, 1))), qpos, np.zeros((1, 30)))
     for _ in range(150):
-        shifts = along[0] * rng.standard_normal((19, 3))
+        shifts = along[0] * rng.standard_normal((30, 3))
         shifts -= (shifts * worn.normals).sum(axis=1, keepdims=True) * worn.normals
         moved = GloveFit(fit.model, dataclasses.replace(worn, points=worn.points + shifts))
         off.append((solver.solve(moved.markers(qpos)[0], qpos).qpos - qpos)[0, 7:])
     ratios = np.sqrt(np.square(off).mean(axis=0)) / angles[0]
-    assert 0.85 < np.median(ratios) < 1.15
+    np.testing.assert_allclose(ratios, 1.0, atol=0.25)
 
 
 @settings(deadline=None, max_examples=30)
