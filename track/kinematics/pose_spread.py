@@ -134,7 +134,7 @@ _MEASURED: Final = _Proportions(0.001, (0.0014, 0.0005), 0.0003, 1.8, 4.0, (0.01
 # slips, and shifts by wrong girths and bone lengths.
 _NAMED: Final = _Proportions(
     0.02,
-    (0.003, 0.001),
+    (0.003, 0.003),
     ADULTS.knuckle_spread,
     ADULTS.angle_spread,
     3.0,
