@@ -133,8 +133,9 @@ class _SmoothedHand:
         self._targets = np.ascontiguousarray(take.observed(worn.side))
         self._unseen = times_unseen(take.times, np.isfinite(self._targets[..., 0]))
         self._residuals = np.full_like(self._targets, np.nan)  # in the frames of the bones [m]
-        self._noise, self._flesh, self._place = _FIRST_NOISE, 0.0, 0.0  # [m]
         self._hand, self._model, self._rate = hand_arrays(worn), spread_model(take, worn), take.rate
+        self._noise, self._flesh = _FIRST_NOISE, 0.0  # [m]
+        self._places = np.zeros((len(self._hand.digits), 2))  # RMS error along the skin, off it [m]
 
     def solve(self, windows: Sequence[_Window]) -> tuple[Float[np.ndarray, "20"], Float[np.ndarray, "20 4"]]:
         """Solve all poses; return the cut-off of each angle [Hz] and its spread by `SOURCES` [deg]."""
@@ -156,7 +157,7 @@ class _SmoothedHand:
                 self._unseen[kept],
                 self._weight_noise,
                 self._flesh,
-                self._place,
+                self._places,
                 covariances[inner] + same,
                 self._share,
             )
@@ -231,7 +232,11 @@ class _SmoothedHand:
         self._noise = max(noise, _LEAST_NOISE)
         slow = max(_spread((residuals - bias)[seen]) ** 2 - noise**2, 0.0)
         self._flesh = float(np.sqrt(3.0 * slow)) * freedom_factor(seen.shape[1])
-        self._place = _FROM_BIAS * _spread(bias[seen.any(axis=0)])
+        lifts = (bias * self._hand.normals).sum(axis=1)
+        slips = np.sqrt(np.maximum((bias**2).sum(axis=1) - lifts**2, 0.0) / 2.0)
+        for part in (self._hand.digits < 0, self._hand.digits >= 0):
+            shown = part & seen.any(axis=0)
+            self._places[part] = [_FROM_BIAS * _spread(of[shown]) for of in (slips, lifts)]
 
 
 def _spread(values: NDArray[np.float64]) -> float:

@@ -59,10 +59,8 @@ CONTACT_SPREAD: Final = 0.0007
 """Standard deviation of a pad's compression around `PAD_COMPRESSION` [m]; (noise / spread)^2 is lambda_2."""
 _LIMIT_SPREAD: Final = np.deg2rad(2.0)  # [rad] standard deviation of an angle beyond its range
 _GESTURES: Final = 4.0  # The pose prior counts this many times per capture, as its frames are much alike.
-# Standard deviation of a user's mean angles around the mean of the gestures, in that of the gestures.
-_OFF_GESTURES: Final = np.repeat([1.0, 0.25], [4, 16])  # large for thumbs
 GESTURES_OF_USER: Final = np.repeat([1.0, _GESTURES], [4, 16])
-"""Gestures that a user's capture counts as, by joint angle."""
+"""Gestures that a user's capture counts as, by joint angle: its mean is that of so many."""
 _MOST_GESTURES: Final = 80  # in which errors of angles are computed
 _LEAST_MOTION: Final = np.deg2rad(1.0)  # of a digit that flesh follows
 RELINEARIZE: Final = 0.005  # The skin's jacobian is renewed after such a change (log lengths, [rad], [m]).
@@ -587,7 +585,7 @@ def error_covariance(
     flat = by_shared.reshape(-1, len(reduced))
     share = (problem.data_noise / problem.noise) ** 2
     errors = share * reduced[:, :-1] + (1.0 - share) * (equations.shared - flat.T @ flat)
-    turns = answers[:, 6:].sum(axis=0).T @ problem.pose_precision * _OFF_GESTURES
+    turns = answers[:, 6:].sum(axis=0).T @ problem.pose_precision / np.sqrt(GESTURES_OF_USER)
     errors += turns @ resting_prior().covariance @ turns.T
     # Of flesh of a size, the fit leaves a part in the residuals; by that the size is estimated.
     patterns = _flesh_patterns(problem, estimate, fit)

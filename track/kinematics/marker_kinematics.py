@@ -43,6 +43,7 @@ class HandArrays(NamedTuple):
     bones: Int[np.ndarray, "M 4"]  # bones that carry each marker, largest weight first; -1 for none
     bone_weights: Float[np.ndarray, "M 4"]  # skinning weight of each of these bones; they sum to one
     positions: Float[np.ndarray, "M 4 3"]  # each marker in the frames of its bones [m], times the weight
+    normals: Float[np.ndarray, "M 3"]  # unit direction off the skin, in the frame of the first bone
     digits: Int[np.ndarray, "M"]  # digit of the bone with the largest weight; -1 for the palm
     hinge_span: Int[np.ndarray, "M 2"]  # first joint that may move each marker, and the one after the last
     skyline: Int[np.ndarray, "26"]  # first nonzero column of each row of the normal matrix
@@ -82,6 +83,7 @@ def hand_arrays(fit: GloveFit) -> HandArrays:
     bones = np.take_along_axis(attachment.bone_indices, order, axis=1)
     bone_weights = np.take_along_axis(attachment.bone_weights, order, axis=1)
     positions = np.take_along_axis(local, order[..., None], axis=1) * bone_weights[..., None]
+    normals = np.einsum("mji,mj->mi", model.rest_transforms[bones[:, 0], :3, :3], attachment.normals)
     hinge_span = np.zeros((len(bones), 2), dtype=np.int64)
     skyline = np.zeros(NUM_UNKNOWNS, dtype=np.int64)
     skyline[:NUM_JOINTS] = np.arange(NUM_JOINTS) // 4 * 4
@@ -100,6 +102,7 @@ def hand_arrays(fit: GloveFit) -> HandArrays:
         np.where(bone_weights > 0.0, bones, -1),
         bone_weights,
         np.array(positions, order="C"),
+        normals,
         DIGIT_OF_BONE[bones[:, 0]],
         hinge_span,
         skyline,

@@ -107,7 +107,7 @@ class HandDoubt(NamedTuple):
 
     noise: float  # marker around its place, independent in each frame [m]
     size: float  # log size of the whole hand
-    places: Float[np.ndarray, "M"]  # each marker's place on its bone, in each direction [m]
+    places: Float[np.ndarray, "M 2"]  # each marker on its bone: in each direction of the skin, and off it [m]
     knuckles: Float[np.ndarray, "5"]  # origin of each digit on the palm, in each direction [m]
     directions: Float[np.ndarray, "5 3"]  # direction of each digit, about the axes of the palm [rad]
     bones: Float[np.ndarray, "5 2"]  # log lengths of each bone of a digit, and of all of them together
@@ -120,7 +120,7 @@ class _Proportions(NamedTuple):
     """Standard deviations of the difference between an uncalibrated hand model and its user's hand."""
 
     size: float  # log size
-    place: float  # marker place [m]
+    place: tuple[float, float]  # marker place along the skin, off it [m]
     knuckle: float  # knuckle position [m]
     turn: float  # direction of a finger [deg]
     thumb: float  # factor for the thumb's direction
@@ -129,11 +129,16 @@ class _Proportions(NamedTuple):
 
 # Chosen on simulated people that benchmarks.doubt does not use. Smaller than differences between people, as
 # the fit of proportions makes up for part of them.
-_MEASURED: Final = _Proportions(0.001, 0.0014, 0.0003, 1.8, 4.0, (0.01, 0.02))
+_MEASURED: Final = _Proportions(0.001, (0.0014, 0.0005), 0.0003, 1.8, 4.0, (0.01, 0.02))
 # Nearest of five sizes: differences between people, and half a step between sizes. Marker places include
 # slips, and shifts by wrong girths and bone lengths.
 _NAMED: Final = _Proportions(
-    0.02, 0.003, ADULTS.knuckle_spread, ADULTS.angle_spread, 3.0, (ADULTS.bone_spread, ADULTS.digit_spread)
+    0.02,
+    (0.003, 0.003),
+    ADULTS.knuckle_spread,
+    ADULTS.angle_spread,
+    3.0,
+    (ADULTS.bone_spread, ADULTS.digit_spread),
 )
 
 
@@ -346,7 +351,7 @@ def known_hand(digits: Int[np.ndarray, "M"], noise: float) -> HandDoubt:
     """`HandDoubt` of a perfectly known hand whose markers have some noise [m]."""
     count = len(DIGITS)
     pairs, turns = np.zeros((count, 2)), np.zeros((count, 3))
-    return HandDoubt(noise, 0.0, np.zeros(len(digits)), np.zeros(count), turns, pairs, 0.0, pairs)
+    return HandDoubt(noise, 0.0, np.zeros((len(digits), 2)), np.zeros(count), turns, pairs, 0.0, pairs)
 
 
 def hand_doubt(digits: Int[np.ndarray, "M"], origin: HandOrigin, noise: float) -> HandDoubt:
@@ -359,7 +364,7 @@ def hand_doubt(digits: Int[np.ndarray, "M"], origin: HandOrigin, noise: float) -
     before = HandDoubt(
         MARKER_NOISE,
         known.size,
-        np.full(len(digits), known.place),
+        np.tile(known.place, (len(digits), 1)),
         np.full(count, known.knuckle),
         turns,
         np.tile(known.bones, (count, 1)),
@@ -370,13 +375,13 @@ def hand_doubt(digits: Int[np.ndarray, "M"], origin: HandOrigin, noise: float) -
         return before
     counts = np.bincount(digits[digits >= 0], minlength=count)
     single, few = counts < 2, np.where(counts < FEWEST_ON_PART, _FEW, 1.0)
-    places = np.where(single, 0.6 * known.place, _CALIBRATED_PLACE * noise * few)
+    places = np.where(single[:, None], 0.6 * np.array(known.place), _CALIBRATED_PLACE * noise * few[:, None])
     lengths, turns = np.outer(few, _CALIBRATED_BONES) * noise, np.outer(few, np.deg2rad(_CALIBRATED_TURNS))
     turns[0] *= _CALIBRATED_THUMB * few[0]  # Few markers determine a thumb's direction even less.
     return HandDoubt(
         noise,
         _CALIBRATED_SIZE * noise,
-        np.where(digits < 0, _CALIBRATED_PALM * noise, places[np.maximum(digits, 0)]),
+        np.where(digits[:, None] < 0, _CALIBRATED_PALM * noise, places[np.maximum(digits, 0)]),
         np.where(single, 0.5 * before.knuckles, _CALIBRATED_KNUCKLE * noise * few),
         np.where(single[:, None], 0.5 * before.directions, turns),
         np.where(single[:, None], 0.5 * before.bones, lengths),
@@ -420,20 +425,20 @@ class SpreadModel:
         unseen: Float[np.ndarray, "T M"],
         noise: float,
         flesh: float = 0.0,
-        place: float = 0.0,
+        places: Float[np.ndarray, "M 2"] | float = 0.0,
         smoothed: Float[np.ndarray, "S 26 26"] = NOT_SMOOTHED,
         share: float = 1.0,
     ) -> tuple[Float[np.ndarray, "T 20 4"], Float[np.ndarray, "T 21"]]:
         """Variances of angles by `SOURCES` [rad^2], and standard deviations of keypoints [m].
 
-        For smoothed poses are given: flesh motion and RMS error of marker places [m], the covariances of the
-        unknowns from noise and gaps, and the weight of the prior in one frame.
+        For smoothed poses are given: flesh motion and RMS errors of marker places, along the skin and off it
+        [m], the covariances of the unknowns from noise and gaps, and the weight of the prior in one frame.
         """
         steps = round(noise / _NOISE_STEP)
         if steps not in self._doubts:
             self._doubts[steps] = hand_doubt(self._digits, self._origin, steps * _NOISE_STEP)
         doubt = self._doubts[steps]
-        doubt = doubt._replace(flesh=flesh, places=np.maximum(doubt.places, place))
+        doubt = doubt._replace(flesh=flesh, places=np.maximum(doubt.places, places))
         prior = share * resting_prior().precision
         variances, keypoints = pose_spreads(self._hand, prior, doubt, qpos, unseen, smoothed)
         if self._angle_errors is not None:
@@ -506,7 +511,7 @@ def pose_spreads(
         forces = weighted.T @ numbers[: 3 * count]
         off, answers = weighted @ posterior, posterior @ forces
         covariance, noise = answers @ answers.T, smoothed[frame] if len(smoothed) > 0 else posterior
-        _write_variances(doubt, noise, covariance, off, angles[frame])
+        _write_variances(hand, doubt, work, noise, covariance, off, angles[frame])
         covariance += noise + off.T @ off
         spread = jacobian[3 * count :] @ covariance
         response = jacobian[3 * count :] @ (posterior @ (_OWN_UNKNOWNS * forces))
@@ -525,23 +530,34 @@ def pose_spreads(
 
 @kernel
 def _write_variances(
+    hand: HandArrays,
     doubt: HandDoubt,
+    work: Workspace,
     noise: Float[np.ndarray, "26 26"],
     bones: Float[np.ndarray, "26 26"],
     off: Float[np.ndarray, "R 26"],
     variances: Float[np.ndarray, "20 4"],
 ) -> None:
     """Write the variances of angles [rad^2]; scales `off` from derivatives [rad/m] to deviations [rad]."""
+    # A marker slips along the skin and keeps its height, by which it tells most of a bone's flexion.
     variances[:] = 0.0
     for hinge in range(NUM_JOINTS):
         variances[hinge, 0], variances[hinge, 3] = noise[hinge, hinge], bones[hinge, hinge]
-    for row in range(len(off)):
-        place, flesh = doubt.places[row // 3] ** 2, doubt.flesh**2
-        for hinge in range(NUM_JOINTS):
-            square = off[row, hinge] ** 2
-            variances[hinge, 1] += place * square
-            variances[hinge, 2] += flesh * square
-        off[row] *= np.sqrt(place + flesh)
+    flesh = doubt.flesh**2
+    for marker in range(len(off) // 3):
+        normal = work.rotations[hand.bones[marker, 0]] @ hand.normals[marker]
+        along, above = doubt.places[marker, 0] ** 2, doubt.places[marker, 1] ** 2
+        rows, wide, high = off[3 * marker : 3 * marker + 3], np.sqrt(along + flesh), np.sqrt(above + flesh)
+        for unknown in range(NUM_UNKNOWNS):
+            square, lift = 0.0, 0.0
+            for i in range(3):
+                square += rows[i, unknown] ** 2
+                lift += normal[i] * rows[i, unknown]
+            if unknown < NUM_JOINTS:
+                variances[unknown, 1] += along * (square - lift**2) + above * lift**2
+                variances[unknown, 2] += flesh * square
+            for i in range(3):
+                rows[i, unknown] = wide * rows[i, unknown] + (high - wide) * lift * normal[i]
 
 
 @kernel

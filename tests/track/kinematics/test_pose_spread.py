@@ -65,7 +65,7 @@ def test_they_are_what_other_bones_directions_and_places_make_of_the_solver(rng)
     qpos, solver = sample_poses(fit.model, 1, rng=rng), PoseSolver(fit)
     usual = known_hand(digits, 0.0002)
     doubt = usual._replace(
-        places=np.full(30, 0.0004),
+        places=np.full((30, 2), 0.0004),
         knuckles=np.full(5, 0.0004),
         directions=np.full((5, 3), np.deg2rad(0.8)),
         bones=np.tile([0.01, 0.01], (5, 1)),
@@ -91,6 +91,21 @@ def test_they_are_what_other_bones_directions_and_places_make_of_the_solver(rng)
     assert (ratios > 0.5).all() and (ratios < 2.0).all()
     ratios = np.sqrt(np.square(places).mean(axis=(0, 2))) / keypoints[0]
     assert 0.75 < np.median(ratios) < 1.3
+
+
+def test_they_are_what_markers_that_slip_along_the_skin_make_of_the_solver(rng):
+    """Markers of one hand are shifted in all poses alike, and its poses solved again."""
+    fit = nominal_fit("starter30", "M", "right")
+    digits, qpos, solver = hand_arrays(fit).digits, sample_poses(fit.model, 1, rng=rng), PoseSolver(fit)
+    usual, off, along, worn = known_hand(digits, 0.00001), [], [0.0004, 0.0], fit.attachment
+    angles, _ = spreads_of(fit, usual._replace(places=np.tile(along, (30, 1))), qpos, np.zeros((1, 30)))
+    for _ in range(150):
+        shifts = along[0] * rng.standard_normal((30, 3))
+        shifts -= (shifts * worn.normals).sum(axis=1, keepdims=True) * worn.normals
+        moved = GloveFit(fit.model, dataclasses.replace(worn, points=worn.points + shifts))
+        off.append((solver.solve(moved.markers(qpos)[0], qpos).qpos - qpos)[0, 7:])
+    ratios = np.sqrt(np.square(off).mean(axis=0)) / angles[0]
+    np.testing.assert_allclose(ratios, 1.0, atol=0.25)
 
 
 @settings(deadline=None, max_examples=30)
