@@ -117,9 +117,8 @@ def train_detector(
         HandDetector.load(begun)  # refuses damaged weights
         for name, network in networks.items():
             _load_folded(network, begun / name)
-    rng, own = np.random.default_rng(seed), ([], [])
-    if photographs is not None:
-        own = lessons_of(read_scenes(Path(photographs)), rng=rng)
+    rng = np.random.default_rng(seed)
+    own = lessons_of([] if photographs is None else read_scenes(Path(photographs)), rng=rng)
     drawn = lessons_of(_drawn(max(1, round(samples / _SAMPLES_A_SCENE / SCENES)), seed), rng=rng)
     # Photographs are repeated until half of the samples are taken from them.
     views, squares = (
@@ -312,8 +311,9 @@ def _shake(rng: np.random.Generator) -> Floats:
     """The kernel of a camera or a hand that moves along a line while the shutter is open."""
     kernel, angle = np.zeros((9, 9), np.float32), rng.uniform(0.0, np.pi)
     away = rng.uniform(1.0, 4.0) * np.array([np.cos(angle), np.sin(angle)])
-    cv2.line(kernel, *(np.rint(end).astype(int).tolist() for end in (4.0 - away, 4.0 + away)), 1.0)
-    return kernel / kernel.sum()
+    start, end = np.rint([4.0 - away, 4.0 + away]).astype(int).tolist()
+    cv2.line(kernel, start, end, (1.0,))
+    return np.asarray(kernel / kernel.sum())
 
 
 def _turn(rng: np.random.Generator, deviation: float, scale: float = 1.0) -> Doubles:
@@ -331,7 +331,7 @@ def keypoint_batch(lessons: Sequence[Lesson], rng: np.random.Generator) -> Batch
     pictures, points = [], np.full((BATCH, NUM_KEYPOINTS, 2), np.nan, np.float32)
     presence, palms = np.zeros(BATCH, np.float32), np.full(BATCH, -1.0, np.float32)
     for number in range(BATCH):
-        lesson = lessons[rng.integers(len(lessons))]
+        lesson = lessons[int(rng.integers(len(lessons)))]
         wide, is_hand = lesson.picture(), len(lesson.sides) > 0
         keypoints = lesson.keypoints[0] if is_hand else np.full((NUM_KEYPOINTS, 2), np.nan)
         labeled = keypoints[np.isfinite(keypoints[:, 0])]
@@ -381,7 +381,7 @@ def finder_batch(lessons: Sequence[Lesson], rng: np.random.Generator) -> Batch:
     cells = FINDER_SIZE // CELL
     pictures, targets = [], np.zeros((BATCH, 5, cells, cells), np.float32)
     for target in targets:
-        lesson = lessons[rng.integers(len(lessons))]
+        lesson = lessons[int(rng.integers(len(lessons)))]
         picture = lesson.picture()
         long, short = FINDER_SIZE, round(FINDER_SIZE * rng.choice(_ASPECTS))
         width, height = (long, short) if rng.random() < 0.75 else (short, long)
