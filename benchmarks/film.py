@@ -43,6 +43,7 @@ class Options:
     rate: float = 30.0
     hands: Literal[1, 2] = 1
     dress: Literal["skin", "glove", "both"] = "both"
+    glove: str = "dense19"
     shutter: bool = True
     dropout: float = 0.0
     second: bool = False
@@ -94,7 +95,7 @@ def shot(options: Options, number: int, folder: Path) -> Filmed:
     rng = np.random.default_rng([options.seed, number])
     kind = "hand-hand" if options.hands == 2 else "single-hand"
     seed, frames = 1000 * options.seed + number, int(120 * (options.seconds + 4))
-    truth = simulate_take(kind=kind, num_frames=frames, seed=seed)
+    truth = simulate_take(kind=kind, glove=options.glove, num_frames=frames, seed=seed)
     camera = hidden_camera(truth.keypoints().reshape(-1, 3), rng)
     turn = Rotation.from_rotvec(np.deg2rad(rng.normal(0.0, 2.0, 3))).as_matrix()
     cameras = (camera, camera.at(camera.T_world_camera @ rigid(turn, rng.normal(0.0, 0.01, 3))))

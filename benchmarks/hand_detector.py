@@ -24,7 +24,7 @@ from benchmarks.record import Figures, describe, run, save_figures
 from handsim.hand.shape import SIDES
 from render import HandDetector
 from render.film.detector import CROP_SIZE, ROOM, FoundHand
-from render.film.lessons import Scene, draw_scenes
+from render.film.training import Scene, draw_scenes
 
 KINDS = {0: "bare", 1: "gloved", 2: "two bare", 5: "two gloved"}  # by the number of a shard, modulo six
 NEAR = 0.35  # distance of the middles of one hand's boxes [longer side]

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import functools
+import dataclasses
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-import cv2
 import numpy as np
 from scipy.optimize import least_squares
-from scipy.sparse import csr_array
 from scipy.spatial.transform import Rotation
 
 from gloves.takes.take import Take
 from handsim.hand.shape import NUM_KEYPOINTS, SIDES
-from handsim.space.camera import Camera, Lens, brown_lens, camera_matrix
+from handsim.space.camera import Camera, brown_lens, camera_matrix
 from handsim.space.transforms import rigid
 from render.frames import Doubles, Integers
 
@@ -26,10 +24,7 @@ FEWEST_KEYPOINTS: Final = 8  # A hand in a frame is judged by this many keypoint
 _SURE: Final = 0.25  # Keypoints with a lower score are not used.
 _MOST_BUNDLED: Final = 5000  # largest number of keypoints in a bundle
 _ROBUST: Final = 2.0  # Residuals beyond this many standard deviations count less.
-_BLOCK: Final = 0.5  # [s] Residuals within this time count as dependent.
-_SHARED: Final = 2.0  # Errors of outlines have common causes: in drawn videos they were twice the deviations.
-_NOTHING: Final = 1e-2  # prior information on free unknowns: a deviation of 10 s, m or rad
-_REGION: Final = 0.0004  # [m] standard deviation of how much thicker a region of the hand is
+_NOTHING: Final = 1e-2  # prior information on free unknowns
 _DEPENDENT: Final = 16.0  # This many samples count as one with an independent error.
 
 # The unknowns, before six of the pose of each span, and the standard deviation that each has beforehand. The
@@ -42,7 +37,7 @@ class FoundFrame(NamedTuple):
     """A frame of a video, and the hands that a detector found in it."""
 
     time: float  # in the video [s]
-    hands: Sequence[FoundHand] | None  # None where it did not look
+    hands: Sequence[FoundHand] | None  # None where the detector did not look
 
 
 class Motion:
@@ -53,16 +48,18 @@ class Motion:
         self._points = take.keypoints()
         self.sides = np.array([SIDES.index(side) for side in take.sides])
 
-    def at(self, times: Doubles) -> tuple[Doubles, Doubles]:
-        """Keypoints (N, H, 21, 3) [m] and their velocities [m/s]; NaN where the take has none."""
-        before = np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, max(len(self.times) - 2, 0))
-        after = np.minimum(before + 1, len(self.times) - 1)
-        step = self.times[after] - self.times[before]
-        gap = (step > _MAX_GAP) | (times < self.times[0]) | (times > self.times[-1])
-        step = np.where(gap | (step <= 0.0), np.nan, step)[:, None, None, None]
-        first = self._points[before]
-        velocities = (self._points[after] - first) / step
-        return first + velocities * (times - self.times[before])[:, None, None, None], velocities
+    def at(self, times: Doubles, *which: Integers) -> Doubles:
+        """Keypoints (N, H, 21, 3) [m]; NaN where the take has none.
+
+        With numbers (N,) of hands, or of hands and keypoints, they are only those: (N, 21, 3) or (N, 3).
+        """
+        last = len(self.times) - 1
+        index = np.interp(times, self.times, np.arange(last + 1), np.nan, np.nan)
+        before = np.nan_to_num(index).astype(np.int64)
+        after = np.minimum(before + 1, last)
+        share = np.where(self.times[after] - self.times[before] > _MAX_GAP, np.nan, index - before)
+        first, second = self._points[before, *which], self._points[after, *which]
+        return np.asarray(first + share.reshape(-1, *(first.ndim - 1) * [1]) * (second - first))
 
 
 class Detections(NamedTuple):
@@ -103,7 +100,7 @@ class State(NamedTuple):
         return np.searchsorted(self.starts, frames, side="right") - 1
 
     def pose(self, span: int) -> Doubles:
-        """Rotation vector and translation (6,) from the world to the camera in a span."""
+        """The camera's rotation vector and place (6,) in a span."""
         return self.values[POSES + 6 * span :][:6]
 
 
@@ -120,12 +117,10 @@ class Samples(NamedTuple):
 
     frames: Integers  # (N,)
     pixels: Doubles  # (N, 2): a point of the line
-    normals: Doubles  # (N, 2): unit normal of the line
-    weights: Doubles  # (N,)
+    normals: Doubles  # (N, 2): normal of the line, as long as its weight
     outward: Doubles  # (N, 3): the way in which a thicker hand moves the point
-    regions: Integers  # (N,): part of the hand, all of which may be thicker than is known
-    points_at: Callable[[Doubles], tuple[Doubles, Doubles]]
-    """Points (N, 3) [m] and their velocities, at the times (F,) of the frames in the take."""
+    points_at: Callable[[Doubles], Doubles]
+    """Points (N, 3) [m] at their times (N,) in the take."""
 
 
 class Bundle:
@@ -136,15 +131,9 @@ class Bundle:
     ) -> None:
         self.motion, self.size, self.given = motion, size, given
         self._middle = float(np.median(found.times))
-        pixels, weights = found.pixels, found.weights
-        if given is not None:  # They are as a pinhole camera with its matrix has them.
-            rays = given.unproject(pixels)
-            pixels = rays[..., :2] / rays[..., 2:] * given.K[[0, 1], [0, 1]] + given.K[:2, 2]
-            weights = np.where(np.isfinite(pixels).all(axis=-1) & (rays[..., 2] > 0.0), weights, 0.0)
-            pixels = np.where(weights[..., None] > 0.0, pixels, 0.0)
-        told = (weights > 0.0).sum(axis=1) >= FEWEST_KEYPOINTS
-        frames, sides = found.frames[told], found.sides[told]
-        self.found = found._replace(frames=frames, sides=sides, pixels=pixels[told], weights=weights[told])
+        told = (found.weights > 0.0).sum(axis=1) >= FEWEST_KEYPOINTS
+        hands = {name: getattr(found, name)[told] for name in ("frames", "sides", "pixels", "weights")}
+        self.found = found._replace(**hands)
 
     def clock(self, state: State) -> tuple[float, float]:
         """Offset [s] and drift of the take's time over the video's."""
@@ -156,32 +145,31 @@ class Bundle:
         offset, drift = self.clock(state)
         return offset + (1.0 + drift) * self.found.times
 
-    def matrix(self, values: Doubles) -> Doubles:
-        """K."""
-        if self.given is not None:
-            return self.given.K
-        focal = self.size[0] * np.exp(values[FOCAL])
-        return camera_matrix(focal, focal, *(0.5 * np.array(self.size) + self.size[0] * values[_CENTER]))
-
-    def cameras(self, state: State, *, flat: bool = False) -> list[Camera]:
-        """The cameras of all spans, with the given lens, or `flat` without it."""
-        lens, cameras = brown_lens(*state.values[_LENS], 0.0, 0.0, 0.0), []
-        if self.given is not None:
-            lens = Lens() if flat else self.given.lens
+    def cameras(self, state: State) -> list[Camera]:
+        """The cameras of all spans."""
+        camera, cameras = self.given, []
+        if camera is None:
+            focal = self.size[0] * np.exp(state.values[FOCAL])
+            center = 0.5 * np.array(self.size) + self.size[0] * state.values[_CENTER]
+            lens = brown_lens(*state.values[_LENS], 0.0, 0.0, 0.0)
+            camera = Camera("film", self.size, camera_matrix(focal, focal, *center), lens=lens)
         for span in range(len(state.starts)):
             pose, name = state.pose(span), f"film{span + 1}" if span else "film"
-            rotation = Rotation.from_rotvec(pose[:3]).as_matrix()
-            place = rigid(rotation.T, -rotation.T @ pose[3:])
-            cameras.append(Camera(name, self.size, self.matrix(state.values), place, lens))
+            place = rigid(Rotation.from_rotvec(pose[:3]).as_matrix(), pose[3:])
+            cameras.append(dataclasses.replace(camera, name=name, T_world_camera=place))
         return cameras
+
+    def projected(self, state: State, frames: Integers, points: Doubles) -> Doubles:
+        """Pixels (N, ..., 2) of points (N, ..., 3) [m] in frames (N,); NaN where there are none."""
+        pixels, spans = np.empty((*points.shape[:-1], 2)), state.spans(frames)
+        for span, camera in enumerate(self.cameras(state)):
+            pixels[spans == span] = camera.project(points[spans == span])
+        return pixels
 
     def pictured(self, state: State) -> Doubles:
         """Pixels (F, H, 21, 2) of the take's keypoints in each frame; NaN where there are none."""
-        points = self.motion.at(self.times(state))[0]
-        pixels, spans = np.empty((*points.shape[:-1], 2)), state.spans(np.arange(len(points)))
-        for span, camera in enumerate(self.cameras(state, flat=True)):
-            pixels[spans == span] = camera.project(points[spans == span])
-        return pixels
+        times = self.times(state)
+        return self.projected(state, np.arange(len(times)), self.motion.at(times))
 
     def match(self, state: State, gate: float) -> Matches:
         """The detections nearest to the hands of the take, within a median distance [px]."""
@@ -207,15 +195,11 @@ class Bundle:
         frames, hands, keypoints = np.nonzero(np.isfinite(matches.errors[..., 0]))
         kept = matches.numbers[frames, hands] % (1 + len(frames) // _MOST_BUNDLED) == 0
         frames, hands, keypoints = (np.repeat(one[kept], 2) for one in (frames, hands, keypoints))
-        number, count = matches.numbers[frames, hands], len(frames)
-
-        def points_at(times: Doubles) -> tuple[Doubles, Doubles]:
-            points, velocities = (one[frames, hands, keypoints] for one in self.motion.at(times))
-            return points, velocities
-
+        which = matches.numbers[frames, hands], keypoints
+        normals = np.tile(np.eye(2), (len(frames) // 2, 1)) * self.found.weights[which][:, None]
         return Samples(
-            frames, self.found.pixels[number, keypoints], np.tile(np.eye(2), (count // 2, 1)),
-            self.found.weights[number, keypoints], np.zeros((count, 3)), np.zeros(count, np.int64), points_at,
+            frames, self.found.pixels[which], normals, np.zeros((len(frames), 3)),
+            lambda times: self.motion.at(times, hands, keypoints),
         )  # fmt: skip
 
     def solve(
@@ -231,78 +215,33 @@ class Bundle:
         if first:
             free[[DRIFT, READOUT]] = free[_CENTER] = free[_LENS] = free[THICKER] = False
         priors = np.concatenate([_PRIORS, np.full(size - POSES, np.inf)])
-        held = np.sqrt(_DEPENDENT) * np.diag(1.0 / priors)
-        far = self.rows(state, samples, noise)[:, :1]
-        robust = 1.0 / np.sqrt(1.0 + (far / _ROBUST) ** 2)
+        robust = 1.0 / np.sqrt(1.0 + (self.residuals(state, samples, noise) / _ROBUST) ** 2)
 
         def widened(part: Doubles) -> State:
             values = state.values.copy()
             values[free] = part
             return state._replace(values=values)
 
-        @functools.lru_cache(maxsize=1)  # SciPy asks for residuals and derivatives one after the other
-        def rows(part: bytes) -> Doubles:
-            now = widened(np.frombuffer(part))
-            known = np.column_stack([held @ now.values, held])
-            own = _without_regions(robust * self.rows(now, samples, noise), samples.regions)
-            return np.concatenate([own, known])
+        def rows(part: Doubles) -> Doubles:
+            now = widened(part)
+            known = np.sqrt(_DEPENDENT) * now.values / priors
+            return np.concatenate([robust * self.residuals(now, samples, noise), known])
 
         done = least_squares(
-            lambda part: rows(part.tobytes())[:, 0],
-            state.values[free],
-            lambda part: rows(part.tobytes())[:, 1:][:, free],
-            x_scale=np.where(np.isfinite(priors), priors, 0.1)[free],
+            rows, state.values[free], x_scale=np.where(np.isfinite(priors), priors, 0.1)[free],
             max_nfev=40, xtol=1e-6, ftol=1e-6,
         )  # fmt: skip
-        residuals, jacobian = done.fun[:count], done.jac[:count]
-        # Residuals within a block of time are dependent, those of others are not.
-        blocks = np.floor(self.found.times[samples.frames] / _BLOCK).astype(np.int64)
-        sums = csr_array((residuals, (blocks, np.arange(count)))) @ jacobian
-        nothing = _NOTHING * np.eye(len(done.x))  # or what is not told at all would have no deviation
-        inverse = np.linalg.inv(done.jac.T @ done.jac + nothing)
-        scatter = sums.T @ sums + _DEPENDENT * done.jac[count:].T @ done.jac[count:] + nothing
         covariance = np.zeros((size, size))
-        covariance[np.ix_(free, free)] = inverse @ scatter @ inverse
-        if samples.outward.any():
-            covariance *= _SHARED**2
+        # What is not told at all has a deviation of 40 s, m or rad.
+        inverse = np.linalg.inv(done.jac.T @ done.jac + _NOTHING * np.eye(len(done.x)))
+        covariance[np.ix_(free, free)] = _DEPENDENT * inverse
         return widened(done.x), 2.0 * float(done.cost) / max(count, 1), covariance
 
-    def rows(self, state: State, samples: Samples, noise: float) -> Doubles:
-        """Distances from the lines, in units of the noise, and derivatives (N, 1 + U); 0 without a pose."""
-        values, (points, velocities) = state.values, samples.points_at(self.times(state))
-        late = samples.pixels[:, 1] / self.size[1] - 0.5
-        points = points + velocities * (values[READOUT] * late)[:, None] + values[THICKER] * samples.outward
-        there, spans = np.isfinite(points).all(axis=1), state.spans(samples.frames)
-        rows, matrix, lens = np.zeros((len(points), 1 + len(values))), self.matrix(values), np.zeros(5)
-        lens[:2] = values[_LENS] if self.given is None else 0.0
-        for span in np.unique(spans[there]):
-            mine = np.flatnonzero(there & (spans == span))
-            pose, first = state.pose(span), POSES + 6 * span
-            pixels, jacobian = cv2.projectPoints(points[mine, None], pose[:3], pose[3:], matrix, lens)
-            lines = samples.normals[mine] * (samples.weights[mine] / noise)[:, None]
-            # OpenCV's order: rotation, translation, focal lengths, center and lens.
-            across = np.einsum("ni,nij->nj", lines, jacobian.reshape(len(mine), 2, -1))
-            by_point = across[:, 3:6] @ Rotation.from_rotvec(pose[:3]).as_matrix()
-            by_time = (by_point * velocities[mine]).sum(axis=1)
-            own = np.zeros((len(mine), len(values)))
-            own[:, OFFSET], own[:, READOUT] = by_time, by_time * late[mine]
-            own[:, DRIFT] = by_time * (self.found.times[samples.frames[mine]] - self._middle)
-            own[:, THICKER] = (by_point * samples.outward[mine]).sum(axis=1)
-            if self.given is None:
-                own[:, FOCAL] = across[:, 6:8].sum(axis=1) * matrix[0, 0]
-                own[:, _CENTER], own[:, _LENS] = across[:, 8:10] * self.size[0], across[:, 10:12]
-            own[:, first : first + 6] = across[:, :6]
-            rows[mine, 0] = ((pixels[:, 0] - samples.pixels[mine]) * lines).sum(axis=1)
-            rows[mine, 1:] = own
-        return rows
-
-
-def _without_regions(rows: Doubles, regions: Integers) -> Doubles:
-    """Residuals and derivatives (N, 1 + U) without what regions that are thicker have in common.
-
-    Their covariance is that of independent ones again, if thicknesses have the deviation `_REGION`.
-    """
-    groups = csr_array((_REGION * rows[:, 1 + THICKER], (regions, np.arange(len(rows)))))
-    size = groups.power(2).sum(axis=1)
-    kept = (1.0 - 1.0 / np.sqrt(1.0 + size)) / np.maximum(size, 1e-9)
-    return np.asarray(rows - groups.T @ (kept[:, None] * (groups @ rows)))
+    def residuals(self, state: State, samples: Samples, noise: float) -> Doubles:
+        """Distances (N,) from the lines, in units of the noise; 0 without a pose."""
+        late = state.values[READOUT] * (samples.pixels[:, 1] / self.size[1] - 0.5)
+        points = samples.points_at(self.times(state)[samples.frames] + late)
+        pixels = self.projected(state, samples.frames, points + state.values[THICKER] * samples.outward)
+        away = ((pixels - samples.pixels) * samples.normals).sum(axis=1) / noise
+        away = np.nan_to_num(away, nan=self.size[0] / noise)  # behind the camera
+        return np.where(np.isfinite(points[:, 0]), away, 0.0)

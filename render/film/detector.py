@@ -15,13 +15,14 @@ from typing import Any, Final, NamedTuple, cast
 import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.special import expit
 
 from handsim._checks import check_array, check_choice, check_type
 from handsim.errors import ArgumentError, WeightsError
 from handsim.files.inputs import read_bytes, sign_model
 from handsim.hand.shape import NUM_KEYPOINTS, SIDES, Side
+from render.frames import Bytes, Doubles, Floats
 
 WEIGHTS: Final = Path(__file__).parent / "weights"
 FINDER, KEYPOINTS = "finder.onnx", "keypoints.onnx"  # files in a folder of weights
@@ -37,9 +38,6 @@ _MOST_FOUND: Final = 8  # places in a picture at which hands are looked for
 _LEAST_HEAT: Final = 0.25  # of a place at which a hand is looked for
 _LEAST_CONFIDENCE: Final = 0.5
 _SAME: Final = 0.6  # Boxes whose intersection is a larger share of their union are of one hand.
-
-Doubles = NDArray[np.float64]
-Floats = NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -148,7 +146,7 @@ class HandDetector:
             found.append(self._second_look(picture, first, side=side))
         return found
 
-    def _places(self, picture: NDArray[np.uint8]) -> list[Doubles]:
+    def _places(self, picture: Bytes) -> list[Doubles]:
         """Corners (2, 2) [px] of squares that look like hands."""
         scale = FINDER_SIZE / max(picture.shape[:2])
         matrix = np.array([[scale, 0.0, 0.0], [0.0, scale, 0.0]])
@@ -168,7 +166,7 @@ class HandDetector:
             places.append(np.array([center - half, center + half]))
         return places
 
-    def _look(self, picture: NDArray[np.uint8], matrix: Doubles) -> _Look:
+    def _look(self, picture: Bytes, matrix: Doubles) -> _Look:
         """What the keypoint network tells of the square that a matrix (2, 3) cuts out of a picture."""
         square = cut(picture, matrix, (CROP_SIZE, CROP_SIZE))
         heat, logits = _run(self._keypoints, normalized(square), ("heat", "logits"))
@@ -178,7 +176,7 @@ class HandDetector:
         right = palm * float(np.sign(palm_spread(keypoints)))
         return _Look((CROP_SIZE * keypoints - matrix[:, 2]) @ turn.T, scores, float(expit(presence)), right)
 
-    def _second_look(self, picture: NDArray[np.uint8], first: _Look, side: Side | None = None) -> FoundHand:
+    def _second_look(self, picture: Bytes, first: _Look, side: Side | None = None) -> FoundHand:
         """The hand, after a look at where the first look saw it, with its fingers up."""
         look = self._look(picture, square_around(first.keypoints, turn=upright(first.keypoints)))
         if side is None:
@@ -218,7 +216,7 @@ def palm_spread(keypoints: Doubles | Floats) -> float:
     return float(index[1] * little[0] - index[0] * little[1])
 
 
-def cut(picture: NDArray[np.uint8], matrix: Doubles, size: tuple[int, int]) -> NDArray[np.uint8]:
+def cut(picture: Bytes, matrix: Doubles, size: tuple[int, int]) -> Bytes:
     """What a matrix (2, 3) moves into a picture of a width and height; the border is repeated outside."""
     turn, shift = matrix[:, :2], matrix[:, 2].copy()
     corners = (np.array([[0, 0], [size[0], 0], [0, size[1]], size]) - shift) @ np.linalg.inv(turn).T
@@ -236,7 +234,7 @@ def cut(picture: NDArray[np.uint8], matrix: Doubles, size: tuple[int, int]) -> N
     return np.asarray(cv2.warpAffine(part, moved, size, borderMode=cv2.BORDER_REPLICATE))
 
 
-def normalized(picture: NDArray[np.uint8]) -> Floats:
+def normalized(picture: Bytes) -> Floats:
     """A picture (H, W, 3) as the networks see it: (3, H, W), of mean 0 and deviation 1."""
     values = np.ascontiguousarray(picture.transpose(2, 0, 1), dtype=np.float32)
     return np.asarray((values - values.mean()) / (values.std() + 1.0))
@@ -258,9 +256,9 @@ def peaks_of(heat: Floats) -> tuple[Doubles, Doubles]:
     return near @ places / scores[..., None], scores
 
 
-def _checked(image: object) -> NDArray[np.uint8]:
+def _checked(image: object) -> Bytes:
     check_type("image", image, np.ndarray, "a picture (H, W, 3) of bytes")
-    picture = cast("NDArray[np.uint8]", image)
+    picture = cast("Bytes", image)
     if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] != 3 or not picture.size:
         raise ArgumentError(
             f"image is {picture.dtype} of shape {picture.shape}, expected uint8 of shape (H, W, 3), sRGB"

@@ -25,7 +25,7 @@ from handsim.space.rig_formats import load_cameras
 from render.captions import draw_keypoints
 from render.config import RenderConfig
 from render.film.bundle import FoundFrame
-from render.film.detector import FoundHand, HandDetector
+from render.film.detector import HandDetector
 from render.film.outlines import poses_at, shutter_times
 from render.film.page import write_film_page
 from render.film.registration import Registration, register
@@ -40,9 +40,6 @@ from render.viewpoints import ViewConfig
 RECORD, VIDEO, PAGE = "film.json", "film.mp4", "film.html"
 """Files beside the pictures: the registration, the video with the hands drawn over it, and the page."""
 _LOOKS: Final = 10.0  # [Hz] how often the detector runs; the take has the motion between two runs
-_SEARCH: Final = 5  # every so many looks the whole picture is searched
-_SURE: Final = 0.5  # least confidence of a hand that is followed
-_SMALLEST: Final = 8.0  # [px] of the box of a hand that is followed
 _FILMED: Final = RenderConfig(dress="glove", depth_sensor=None, color_sensor=None, painter="compiled")
 _NOT_FILMED: Final = ("view", "tones", "background", "vary", "depth_sensor", "room_depth", "color_sensor",
                       "painter", "shutter")  # fmt: skip
@@ -103,22 +100,12 @@ def _given(camera: Camera | str | Path | None, size: tuple[int, int]) -> Camera 
 
 
 def find_hands(film: Film, detector: HandDetector, progress: Progress) -> list[FoundFrame]:
-    """The hands in some frames of a video: searched now and then, followed in between."""
+    """The frames of a video, some of them with the hands in them."""
     found: list[FoundFrame] = []
-    known: list[FoundHand] = []
     step = max(1, round(film.rate / _LOOKS))
     for number, (time, picture) in enumerate(film.frames()):
         progress(number + 1, max(film.num_frames, number + 1))
-        if number % step:
-            found.append(FoundFrame(time, None))
-            continue
-        if number % (_SEARCH * step) == 0 or not known:
-            known = detector.detect(picture)
-        else:
-            boxes, sides = np.array([hand.box for hand in known]), [hand.side for hand in known]
-            known = [hand for hand in detector.refine(picture, boxes, sides) if hand.confidence >= _SURE]
-        known = [hand for hand in known if hand.box[2:].min() >= _SMALLEST]
-        found.append(FoundFrame(time, known))
+        found.append(FoundFrame(time, None if number % step else detector.detect(picture)))
     if not found:
         raise CaptureError(f"{film.path}: no frame can be read, expected a video")
     return found

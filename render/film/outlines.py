@@ -30,7 +30,7 @@ from render.video import straight, straightening
 _WIDEST: Final = 800  # [px] Wider pictures are shrunk to this width.
 _MOST_POINTS: Final = 80  # largest number of outline points of a hand in a picture
 _STEP: Final = 0.004  # [s] step of the central differences that give velocities
-_LEVELS: Final = 5  # bits of each color channel in the histograms
+_LEVELS: Final = 32  # of each color channel in the histograms
 _SMOOTH: Final = 1.0  # [levels] standard deviation of the histograms' smoothing
 _SUREST: Final = 3.0  # largest log-odds that one color gives
 _DEPENDENT: Final = 0.5  # Neighboring pixels are alike: this share of their log-odds counts.
@@ -42,7 +42,6 @@ _LINEAR: Final = (np.linspace(0.0, 1.0, 256, dtype=np.float32) ** 2.2)[:, None]
 _FEWEST_POINTS: Final = 10  # An outline has this many points.
 _FEWEST_PIXELS: Final = 30  # Colors of a region are counted if it has this many pixels.
 _AROUND: Final = 14  # [px] width of the ring around the reach whose colors are the background's
-_BLUR: Final = 0.3  # [px] least standard deviation of an edge
 _ARM: Final = 0.02  # [m] The outline this near to the forearm is left out, because the wrist bends there.
 _BALL: Final = 0.004  # [m] The outline this near to a marker is left out, because the glove may carry it.
 _EDGE: Final = 3.0  # [px] The outline this near to the edge of the picture is left out.
@@ -56,23 +55,19 @@ class Edges(NamedTuple):
     frames: Integers  # (N,)
     pixels: Doubles  # (N, 2): where each edge is, as a bundle counts them
     normals: Doubles  # (N, 2): unit normals of the edges, out of the hand
-    weights: Doubles  # (N,): one over the standard deviation [1/px]
     points: Doubles  # (N, 3): on the drawn hand [m]
     velocities: Doubles  # (N, 3) [m/s]
     outward: Doubles  # (N, 3): unit normals of the hand's surface
-    regions: Integers  # (N,): one of four sides of one bone of one hand
     times: Doubles  # (N,): of the take, at which the points are there [s]
     offsets: Doubles  # (N,): distance of the edge from the drawn outline [px]
 
-    def samples(self, most: int) -> Samples:
-        """The edges for a bundle, this many at most, evenly."""
-        one = Edges._make(values[:: 1 + len(self.frames) // most] for values in self)
+    def samples(self) -> Samples:
+        """The edges for a bundle."""
 
-        def points_at(times: Doubles) -> tuple[Doubles, Doubles]:
-            late = (times[one.frames] - one.times)[:, None]
-            return one.points + one.velocities * late, one.velocities
+        def points_at(times: Doubles) -> Doubles:
+            return self.points + self.velocities * (times - self.times)[:, None]
 
-        return Samples(one.frames, one.pixels, one.normals, one.weights, one.outward, one.regions, points_at)
+        return Samples(self.frames, self.pixels, self.normals, self.outward, points_at)
 
 
 class Seen(NamedTuple):
@@ -129,7 +124,7 @@ class Outlines:
         self._size = round(self._scale * size[0]), max(1, round(self._scale * size[1]))
         self._skins = [PosableSkin(hand.model, bony=0.5) for hand in take.hands]
         self._bodies = [BodyFigure(body, (0.5, 0.5, 0.5)) for body in take.bodies]
-        self._seen = np.zeros((len(take.hands), 1 << 3 * _LEVELS))  # counts of the hands' colors
+        self._seen = np.zeros((len(take.hands), *3 * [_LEVELS]), np.float32)  # counts of the hands' colors
 
     def shrunk(self, picture: Bytes) -> Bytes:
         """A picture as it is looked at."""
@@ -157,23 +152,22 @@ class Outlines:
                 outline = _outline(look, hand, take.hands[hand], qpos[frame, hand, 0])
                 if outline is None:
                     continue
-                chosen, offsets, spreads, odds = self._across(look, hand, outline, radius)
+                chosen, offsets, odds = self._across(look, hand, outline, radius)
                 tried, away = len(outline.pixels), offsets / self._scale
                 outline = _Outline._make(values[chosen] for values in outline)
                 middle, most = np.quantile(np.abs(away), (0.5, _WITHIN)) if len(away) else (np.nan, np.nan)
                 seen[:, frame, hand] = tried, len(away), middle, most, odds
                 places = look.corner + outline.pixels + offsets[:, None] * outline.normals
-                pixels, normals, length = self._pictured(bundle, views[0], places, outline.normals)
-                velocities, regions = self._moved(hand, qpos[frame, hand], outline)
+                pixels, normals = self._pictured(views[0], places, outline.normals)
+                velocities = self._moved(hand, qpos[frame, hand], outline)
                 parts.append(Edges(
-                    np.full(len(away), frame), pixels, normals, self._scale / spreads / length,
-                    outline.points, velocities, outline.outward, regions,
+                    np.full(len(away), frame), pixels, normals, outline.points, velocities, outline.outward,
                     np.full(len(away), moments[frame, hand]), away,
                 ))  # fmt: skip
         if not parts:
             return None, Seen(*seen)
         found = Edges._make(np.concatenate(values) for values in zip(*parts, strict=True))
-        kept = np.isfinite(found.weights)  # others are beyond what the lens sees
+        kept = np.isfinite(found.normals[:, 0])  # others are beyond what the lens sees
         return Edges._make(values[kept] for values in found), Seen(*seen)
 
     def _shrunk_camera(self, camera: Camera) -> Camera:
@@ -205,72 +199,69 @@ class Outlines:
         ids = (1 + PARTS_A_HAND * hand + face_parts(), np.full(count, 1 + hand), np.zeros(count))
         return Triangles(vertices, skin.faces, vertices, *(one.astype(np.uint8) for one in ids))
 
-    def _pictured(
-        self, bundle: Bundle, camera: Camera, pixels: Doubles, normals: Doubles
-    ) -> tuple[Doubles, Doubles, Doubles]:
-        """Pixels (N, 2) and unit normals of straightened edges as a bundle counts them, and their scale."""
-        points = np.stack([pixels, pixels + normals[:, ::-1] * [-1.0, 1.0]])
-        if bundle.given is None:
-            bent = camera.at(np.eye(4))
-            points = bent.project(straight(bent).unproject(points))
+    def _pictured(self, camera: Camera, pixels: Doubles, normals: Doubles) -> tuple[Doubles, Doubles]:
+        """Pixels (N, 2) and unit normals of straightened edges, in the video's pictures."""
+        bent = camera.at(np.eye(4))
+        rays = straight(bent).unproject(np.stack([pixels, pixels + normals[:, ::-1] * [-1.0, 1.0]]))
+        points = bent.project(rays)
         along = points[1] - points[0]
-        length = np.linalg.norm(along, axis=1)
-        return points[0] / self._scale, along[:, ::-1] * [1.0, -1.0] / length[:, None], length
+        return points[0] / self._scale, _unit(along[:, ::-1] * [1.0, -1.0])
 
-    def _moved(self, hand: int, qpos: Doubles, outline: _Outline) -> tuple[Doubles, Integers]:
-        """Velocities (N, 3) [m/s] of points, from poses (3, 27) now, before and after; and their regions."""
+    def _moved(self, hand: int, qpos: Doubles, outline: _Outline) -> Doubles:
+        """Velocities (N, 3) [m/s] of points, from poses (3, 27) now, before and after."""
         bones = self._take.hands[hand].model.forward_kinematics(qpos)[:, outline.bones]  # (3, N, 4, 4)
         now, step = bones[0], (bones[2] - bones[1]) / (2.0 * _STEP)
         local = np.einsum("nji,nj->ni", now[:, :3, :3], outline.points - now[:, :3, 3])
-        velocities = np.einsum("nij,nj->ni", step[:, :3, :3], local) + step[:, :3, 3]
-        sides = np.einsum("nji,nj->ni", now[:, :3, 1:3], outline.outward) > 0.0
-        return velocities, 4 * (FOREARM * hand + outline.bones) + sides @ [1, 2]
+        return np.asarray(np.einsum("nij,nj->ni", step[:, :3, :3], local) + step[:, :3, 3])
 
-    def _across(
-        self, look: _Look, hand: int, found: _Outline, reach: int
-    ) -> tuple[Integers, Doubles, Doubles, float]:
-        """Points of an outline with an edge, its distance, its deviation [px]; and the least log-odds."""
+    def _across(self, look: _Look, hand: int, found: _Outline, reach: int) -> tuple[Integers, Doubles, float]:
+        """Points of an outline with an edge, its distance from them [px]; and the least log-odds."""
         mine, free = look.truth.instances == 1 + hand, look.truth.instances == 0
         inside = cv2.distanceTransform(mine.view(np.uint8), cv2.DIST_L2, 3)
         table = self._odds(look, hand, inside, reach)
         if table is None:
-            return np.empty(0, np.int64), np.empty(0), np.empty(0), np.nan
+            return np.empty(0, np.int64), np.empty(0), np.nan
         within = mine & (inside > 1.5)
         bones = look.truth.parts[within].astype(np.int64) - 1 - PARTS_A_HAND * hand
         count = np.bincount(bones, minlength=PARTS_A_HAND)[:FOREARM]
         total = np.bincount(bones, table[within], minlength=PARTS_A_HAND)[:FOREARM]
         least = float((total / np.maximum(count, 1))[count >= _FEWEST_PIXELS].min(initial=_SUREST))
         places = _along(found.pixels, found.normals, reach)
-        across = cv2.remap(table, places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
-        in_me, in_free = (
-            cv2.remap(one.view(np.uint8), places, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT) > 0
-            for one in (mine, free)
+        across, in_me, in_free = (
+            cv2.remap(one, places, None, how, borderMode=cv2.BORDER_CONSTANT)
+            for one, how in (
+                (table, cv2.INTER_LINEAR),
+                (mine.view(np.uint8), cv2.INTER_NEAREST),
+                (free.view(np.uint8), cv2.INTER_NEAREST),
+            )
         )
-        chosen, offsets = _edge(across, in_me, in_free, reach)
+        chosen, offsets = _edge(across, in_me > 0, in_free > 0, reach)
         if not len(chosen):
-            return chosen, offsets, offsets, least
+            return chosen, offsets, least
         normals = found.normals[chosen]
         places = _along(found.pixels[chosen] + offsets[:, None] * normals, normals, _BESIDE)
         light = cv2.remap(
             cv2.LUT(look.colors, _LINEAR), places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
         )
-        sharp, beyond, spreads = _sharpened(light)
-        return chosen[sharp], (offsets + beyond)[sharp], spreads[sharp], least
+        sharp, beyond = _sharpened(light)
+        return chosen[sharp], (offsets + beyond)[sharp], least
 
     def _odds(self, look: _Look, hand: int, inside: Floats, reach: int) -> Floats | None:
         """Log-odds (h, w) that colors are the hand's and not those around it; None for a tiny hand."""
-        levels = (look.colors >> (8 - _LEVELS)).astype(np.int64)
-        colors = (levels[..., 0] << 2 * _LEVELS) | (levels[..., 1] << _LEVELS) | levels[..., 2]
         outside = cv2.distanceTransform((inside == 0.0).view(np.uint8), cv2.DIST_L2, 3)
         deep = inside > min(0.7 * reach, 0.5 * float(inside.max()))
         around = (outside > min(0.7 * reach, 6.0)) & (outside < reach + _AROUND)
         around &= look.truth.instances == 0
         if deep.sum() < _FEWEST_PIXELS or around.sum() < _FEWEST_PIXELS:
             return None
-        self._seen[hand] += np.bincount(colors[deep], minlength=self._seen.shape[1])
-        beside = np.bincount(colors[around], minlength=self._seen.shape[1]).astype(np.float64)
+        here, beside = (
+            cv2.calcHist([look.colors], [0, 1, 2], mask.view(np.uint8), 3 * [_LEVELS], 3 * [0, 256])
+            for mask in (deep, around)
+        )
+        self._seen[hand] += here
         odds = np.log(_shares(self._seen[hand]) / _shares(beside)).clip(-_SUREST, _SUREST)
-        return np.asarray(odds.astype(np.float32)[colors])
+        red, green, blue = cv2.split(look.colors // (256 // _LEVELS))
+        return np.asarray(odds[red, green, blue])
 
 
 def _along(pixels: Doubles, normals: Doubles, reach: int) -> Floats:
@@ -313,19 +304,20 @@ def _outline(look: _Look, hand: int, fit: GloveFit, qpos: Doubles) -> _Outline |
     rotation, place = camera.T_world_camera[:3, :3], camera.T_world_camera[:3, 3]
     rays, beside = (camera.unproject(one) for one in (pixels, pixels + normals))
     rays, beside = rays / rays[:, 2:], beside / beside[:, 2:]
-    outward = (beside - rays) / np.linalg.norm(beside - rays, axis=1, keepdims=True)
     points = rays * truth.depth[rows, columns, None].astype(np.float64) @ rotation.T + place
     bones = truth.parts[rows, columns].astype(np.int64) - 1 - PARTS_A_HAND * hand
-    return _Outline(pixels, normals, points, outward @ rotation.T, bones)
+    return _Outline(pixels, normals, points, _unit(beside - rays) @ rotation.T, bones)
 
 
-def _shares(counts: Doubles) -> Doubles:
+def _unit(vectors: Doubles) -> Doubles:
+    """Vectors (N, ...) of length 1."""
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
+
+
+def _shares(counts: Floats) -> Floats:
     """Shares of colors, smoothed, of their counts."""
-    side = 1 << _LEVELS
-    smooth = gaussian_filter(
-        counts.reshape(side, side, side).astype(np.float32), _SMOOTH, mode="nearest"
-    ).ravel()
-    return np.asarray(smooth / smooth.sum() + 3e-5)
+    smooth = gaussian_filter(counts, _SMOOTH, mode="nearest")
+    return np.asarray(smooth / smooth.sum() + np.float32(3e-5))
 
 
 def _edge(odds: Floats, in_me: Flags, in_free: Flags, reach: int) -> tuple[Integers, Doubles]:
@@ -337,32 +329,27 @@ def _edge(odds: Floats, in_me: Flags, in_free: Flags, reach: int) -> tuple[Integ
     at = np.arange(-reach, reach) + 0.5  # an edge is half a pixel beyond the last pixel of the hand
     score = 2.0 * _DEPENDENT * sums[:, :-1] - 0.5 * (at / (0.7 * reach)) ** 2
     score = np.where(valid[:, :-1] & valid[:, 1:], score, -np.inf)
-    share = np.exp(score - score.max(axis=1, keepdims=True))
-    share /= share.sum(axis=1, keepdims=True)
-    mean = share @ at
-    spread = np.sqrt(np.maximum(share @ at**2 - mean**2, 0.0))
     padded = np.pad(sums, ((0, 0), (1, 0)))
     best, rows = score.argmax(axis=1) + 1, np.arange(len(odds))
     first, last = np.maximum(best - _BESIDE, 0), np.minimum(best + _BESIDE, odds.shape[1])
     good = padded[rows, best] - padded[rows, first] > _CONTRAST * _BESIDE
     good &= padded[rows, best] - padded[rows, last] > _CONTRAST * _BESIDE
-    good &= (np.abs(mean) < reach - 1.0) & (spread < 0.4 + 0.15 * reach)
-    return np.flatnonzero(good), mean[good]
+    offsets = at[best - 1]
+    good &= np.abs(offsets) < reach - 1.0
+    return np.flatnonzero(good), offsets[good]
 
 
-def _sharpened(colors: Floats) -> tuple[Flags, Doubles, Doubles]:
-    """Edges of linear colors (N, 2 B + 1, 3), outwards: which are sharp, how far from the middle, deviations.
+def _sharpened(colors: Floats) -> tuple[Flags, Doubles]:
+    """Which edges of linear colors (N, 2 B + 1, 3), outwards, are sharp, and how far from the middle [px].
 
     An edge is where its pixels' light is shared between the colors on both sides.
     """
-    ends = colors[:, :_FLAT], colors[:, -_FLAT:]
-    inner, outer = (one.mean(axis=1, keepdims=True) for one in ends)
+    inner, outer = (one.mean(axis=1, keepdims=True) for one in (colors[:, :_FLAT], colors[:, -_FLAT:]))
     step = outer - inner
     size = np.maximum((step**2).sum(axis=2), 1e-9)
     share = ((colors - inner) * step).sum(axis=2) / size
     flat = np.concatenate([share[:, :_FLAT], share[:, -_FLAT:] - 1.0], axis=1)
-    noise = np.sqrt((flat**2).mean(axis=1))
     inside = 1.0 - share[:, _FLAT:-_FLAT].clip(-0.2, 1.2)
     beyond = inside.sum(axis=1) - 0.5 * inside.shape[1]
-    sharp = (noise < _NOISIEST) & (np.abs(beyond) < 0.4 * inside.shape[1])
-    return sharp, beyond.astype(np.float64), np.hypot(2.0 * noise, _BLUR).astype(np.float64)
+    sharp = (np.sqrt((flat**2).mean(axis=1)) < _NOISIEST) & (np.abs(beyond) < 0.4 * inside.shape[1])
+    return sharp, beyond.astype(np.float64)

@@ -15,6 +15,7 @@ from typing import Any, Final, NamedTuple
 import cv2
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 from gloves.takes.take import Take
 from handsim.errors import HandSimError
@@ -30,13 +31,13 @@ from render.film.bundle import (
     Bundle,
     Detections,
     FoundFrame,
-    Matches,
     Motion,
+    Samples,
     State,
 )
-from render.film.first_guess import GATE, UNLIKE, first_guess
 from render.film.outlines import Edges, Outlines, Seen
 from render.frames import Bytes, Doubles
+from render.video import straight
 
 _FEWEST_FRAMES: Final = 20  # A camera is registered from this many frames with a hand.
 _ROUNDS: Final = 3  # rounds of matching keypoints
@@ -45,9 +46,10 @@ _LEAST_BOUND: Final = 0.008  # A frame fits up to this distance in any case [wid
 _WORST: Final = 0.03  # [widths] A video whose usual median distance is larger does not show the take.
 _UNKNOWN: Final = 0.05  # [m] A camera whose place has a larger deviation is not known.
 _LEAST_SHARE: Final = 0.2  # This share of the frames with hands must fit.
-_MOST_SPANS: Final = 4  # largest number of times between which a camera was moved
-_MOVES: Final = 3  # number of times that the beginning of a span is moved
-_SHORTEST_SPAN: Final = 20  # number of frames with found hands in each of them
+_MOST_SPANS: Final = 4  # largest number of spans in each of which the camera stands still
+_MOVES: Final = 4  # number of times that the beginning of a new span is looked for
+_LOWER: Final = 0.9  # A span is cut in two if the cost is then less than this share of what it was.
+_SHORTEST_SPAN: Final = 20  # A span has this many frames at least.
 _NO_HAND: Final = "the take has no hand then"
 _OUTSIDE: Final = "no hand of the take is in the picture"
 _NOT_FOUND: Final = "the detector found no hand there"
@@ -57,7 +59,18 @@ _BESIDE: Final = -0.7  # A bone with lower mean log-odds of its colors is not wh
 _MOST_LOOKED: Final = 150  # largest number of frames whose outlines are used
 _REACHES: Final = (0.04, 0.02, 0.01, 0.01)  # [widths] search ranges for edges, one for each round
 _FIRST_NOISE: Final = 2.0  # [px] standard deviation of edges in the first round
-_MOST_EDGES: Final = 12000  # largest number of edges in a bundle
+_STEP: Final = 1.0 / 15.0  # [s] step between the shifts of the clock
+_GUESSES: Final = 4  # rounds of matching in the first guess
+_MOST_MATCHED: Final = 64  # largest number of detections that are matched
+_NOWHERE: Final = 1e3  # [m] where hands are that the take does not have
+_TRIED: Final = 3  # number of best shifts for which PnP is tried
+_APART: Final = 0.3  # [s] least distance of two shifts for which PnP is tried
+_FOCALS: Final = (0.5, 0.65, 0.85, 1.1, 1.45, 1.9, 2.5, 3.3)  # [widths] focal lengths that PnP is tried with
+_GATE: Final = 0.08  # [widths] A detection is not of a hand whose keypoints are farther off in the median.
+_UNLIKE: Final = (
+    "the hands in the video do not move as those of the take at any shift of the clock; expected a video of "
+    "this take, of a camera that stood still"
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -141,11 +154,7 @@ class Registration:
         """The registration as JSON."""
         return {
             "cameras": [camera.record() for camera in self.cameras],
-            "starts": list(self.starts),
-            "offset": self.offset,
-            "drift": self.drift,
-            "readout": self.readout,
-            "deviations": self.deviations,
+            **{name: getattr(self, name) for name in ("starts", "offset", "drift", "readout", "deviations")},
             "frames": len(self.reasons),
             "left_out": self.left_out(),
             "doubts": self.doubts(),
@@ -179,34 +188,123 @@ def register(
             f"hands were found in {with_hands} of the {looked} frames that were searched, expected "
             f"{_FEWEST_FRAMES} at least"
         )
-    state, noise = first_guess(bundle), 0.25 * GATE * width
+    state, noise = _first_guess(bundle), 0.25 * _GATE * width
     for turn in range(_ROUNDS):
         if turn > 0:
             state = _split(bundle, state, noise)
-        matches = bundle.match(state, max(4.0 * noise, 0.5 * GATE * width))
+        matches = bundle.match(state, max(4.0 * noise, 0.5 * _GATE * width))
         if (matches.numbers >= 0).sum() < _FEWEST_FRAMES:
-            raise HandSimError(UNLIKE)
+            raise HandSimError(_UNLIKE)
         state, _, covariance = bundle.solve(state, bundle.samples(matches), noise)
         distances = bundle.match(state, np.inf).distances
         if np.isnan(distances).all():  # the camera looks away from the hands
-            raise HandSimError(UNLIKE)
+            raise HandSimError(_UNLIKE)
         noise = max(float(np.nanmedian(distances)) / 1.177, 0.3)
     outlined = None if pictures is None else _outlined(bundle, take, state, pictures)
     if outlined is not None:
         state, covariance, fit = outlined
     elif noise > _WORST * width:
-        raise HandSimError(UNLIKE)
+        raise HandSimError(_UNLIKE)
     else:
         fit = _keypoint_fit(bundle, state)
     if fit.reasons.count("") < _LEAST_SHARE * np.isin(bundle.found.looked, bundle.found.frames).sum():
-        raise HandSimError(UNLIKE)
-    told = _registration(bundle, state, covariance, fit)
-    if (unknown := told.deviations["position"]) > _UNKNOWN:
+        raise HandSimError(_UNLIKE)
+    (offset, drift), deviations = bundle.clock(state), np.sqrt(np.diag(covariance))
+    unknowns = {"offset": OFFSET, "drift": DRIFT, "readout": READOUT, "focal": FOCAL}
+    known = {name: float(deviations[number]) for name, number in unknowns.items()}
+    pose = deviations[POSES : POSES + 6].reshape(2, 3)
+    known["rotation"], known["position"] = np.linalg.norm(pose, axis=1).tolist()
+    if known["position"] > _UNKNOWN:
         raise HandSimError(
-            f"the hands tell the camera's place to {1e3 * unknown:.0f} mm only; expected hands that move in "
-            "all directions, and a longer video"
+            f"the hands tell the camera's place to {1e3 * known['position']:.0f} mm only; expected hands "
+            "that move in all directions, and a longer video"
         )
-    return told
+    return Registration(
+        tuple(bundle.cameras(state)), state.starts, offset, drift, float(state.values[READOUT]), known,
+        bundle.found.times, fit.distances, tuple(fit.reasons), fit.places, fit.errors,
+    )  # fmt: skip
+
+
+def _first_guess(bundle: Bundle) -> State:
+    """Unknowns that explain most of what was found: clock by all shifts, pose by PnP."""
+    gate, best, most = _GATE * bundle.size[0], None, 0.0
+    taken, filmed = bundle.motion.times, bundle.found.times
+    shifts = np.arange(taken[0] - filmed[-1], taken[-1] - filmed[0], _STEP)
+    tried: list[float] = []
+    # The best fits are computed again, because those of all shifts together would fill the memory.
+    for shift in sorted(shifts.tolist(), key=lambda shift: -_affine_fit(bundle, shift)[0]):
+        if len(tried) == _TRIED:
+            break
+        if any(abs(shift - other) < _APART for other in tried):
+            continue
+        tried.append(shift)
+        start = _posed(bundle, shift, *_affine_fit(bundle, shift)[1:])
+        if start is None:
+            continue
+        samples = bundle.samples(bundle.match(start, gate))
+        state, *_ = bundle.solve(start, samples, 0.01 * bundle.size[0], first=True)
+        agreeing = float(np.nansum(1.0 - bundle.match(state, gate).distances / gate))
+        if agreeing > most:
+            best, most = state, agreeing
+    if best is None:
+        raise HandSimError(_UNLIKE)
+    return best
+
+
+def _affine_fit(bundle: Bundle, offset: float) -> tuple[float, Doubles, Doubles]:
+    """How many detections an affine camera explains at a shift, and their keypoints (N, 3) [m], (N, 2) [px].
+
+    It begins with the sides that the detector told, where the take has them, and then gives each detection to
+    the hand that is nearest in the picture: a detector is often wrong about sides.
+    """
+    found, motion = bundle.found, bundle.motion
+    some = np.unique(np.linspace(0, len(found.frames) - 1, _MOST_MATCHED).astype(int))
+    pixels, weights = found.pixels[some], found.weights[some]
+    times = found.times[found.frames[some]] + offset
+    points = np.nan_to_num(motion.at(times), nan=_NOWHERE)  # (N, H, 21, 3)
+    there = points[..., 0, 0] != _NOWHERE
+    rows = np.concatenate([points, np.ones((*points.shape[:-1], 1))], axis=-1)
+    told = there & (motion.sides == found.sides[some, None])
+    hand, each = np.where(told.any(axis=1), told.argmax(axis=1), there.argmax(axis=1)), np.arange(len(some))
+    counts = there[each, hand].astype(float)
+    for _ in range(_GUESSES):
+        mine = rows[each, hand]
+        weighted = mine * (weights * counts[:, None])[..., None]
+        normal = np.einsum("nki,nkj->ij", weighted, mine) + 1e-6 * np.eye(4)
+        affine = np.linalg.solve(normal, np.einsum("nki,nkj->ij", weighted, pixels))
+        away = np.linalg.norm(rows @ affine - pixels[:, None], axis=-1)
+        away = (away * weights[:, None]).sum(axis=-1) / weights.sum(axis=1)[:, None]
+        distances = np.where(there, away, np.inf)
+        hand = distances.argmin(axis=1)
+        counts = 1.0 / (1.0 + (distances.min(axis=1) / (2.0 * _GATE * bundle.size[0])) ** 2)
+    sure = (weights > 0.0) & there[each, hand, None]
+    return float(counts.sum()), points[each, hand][sure], pixels[sure]
+
+
+def _posed(bundle: Bundle, offset: float, points: Doubles, pixels: Doubles) -> State | None:
+    """The focal length and pose by which most keypoints are explained, or None."""
+    if bundle.given is not None:  # as a pinhole camera with its matrix sees them
+        pixels = straight(bundle.given).at(np.eye(4)).project(bundle.given.unproject(pixels))
+        seen = np.isfinite(pixels[:, 0])
+        points, pixels = points[seen], pixels[seen]
+    if len(points) < 6 * FEWEST_KEYPOINTS:
+        return None
+    best, most = None, 0
+    for focal in _FOCALS if bundle.given is None else (1.0,):
+        values = np.zeros(POSES + 6)
+        values[OFFSET], values[FOCAL] = offset, np.log(focal)
+        try:
+            done, turn, shift, inliers = cv2.solvePnPRansac(
+                points, pixels, bundle.cameras(State(values))[0].K, None, iterationsCount=300,
+                reprojectionError=0.025 * bundle.size[0], flags=cv2.SOLVEPNP_EPNP,
+            )  # fmt: skip
+        except cv2.error:  # points of a degenerate draw
+            continue
+        if done and inliers is not None and len(inliers) > most:
+            rotation = Rotation.from_rotvec(-turn.ravel())
+            values[POSES:] = np.concatenate([rotation.as_rotvec(), -rotation.apply(shift.ravel())])
+            best, most = State(values), len(inliers)
+    return best
 
 
 def _outlined(
@@ -214,7 +312,7 @@ def _outlined(
 ) -> tuple[State, Doubles, _Fit] | None:
     """State, covariance and fit by the outlines of the hands; None where they are not seen."""
     outlines, noise = Outlines(take, bundle.size), _FIRST_NOISE
-    shown = np.flatnonzero((bundle.match(state, GATE * bundle.size[0]).numbers >= 0).any(axis=1))
+    shown = np.flatnonzero((bundle.match(state, _GATE * bundle.size[0]).numbers >= 0).any(axis=1))
     if not len(shown):
         return None
     chosen = set(shown[np.linspace(0, len(shown) - 1, _MOST_LOOKED).astype(int)].tolist())
@@ -223,9 +321,9 @@ def _outlined(
         edges, _ = outlines.edges(bundle, state, looks, reach)
         if edges is None or len(edges.frames) < _FEWEST_EDGES * _FEWEST_FRAMES:
             return None
-        samples = edges.samples(_MOST_EDGES)
+        samples = edges.samples()
         state, _, covariance = bundle.solve(state, samples, noise, first=turn == 0)
-        noise = max(0.3, float(np.median(np.abs(bundle.rows(state, samples, 1.0)[:, 0]))) / 0.6745)
+        noise = max(0.3, float(np.median(np.abs(bundle.residuals(state, samples, 1.0)))) / 0.6745)
     every = ((n, outlines.shrunk(picture)) for n, picture in enumerate(pictures()))
     edges, seen = outlines.edges(bundle, state, every, _REACHES[1])
     fit = _keypoint_fit(bundle, state)
@@ -235,49 +333,35 @@ def _outlined(
 def _split(bundle: Bundle, state: State, noise: float) -> State:
     """The state with a span more for each time at which the camera was moved."""
     while len(state.starts) < _MOST_SPANS:
-        matches = bundle.match(state, 0.3 * bundle.size[0])
-        change = _change(matches, state.starts, noise)
-        if change is None:
-            break
-        span, samples = int(np.searchsorted(state.starts, change)), bundle.samples(matches)
-        values = np.insert(state.values, POSES + 6 * span, state.pose(span - 1))
+        samples = bundle.samples(bundle.match(state, 0.3 * bundle.size[0]))
         before = bundle.solve(state, samples, noise, first=True)[1]
-        for _ in range(_MOVES):
-            split = State(values, (*state.starts[:span], change, *state.starts[span:]))
-            split, cost, _ = bundle.solve(split, samples, noise, first=True)
-            values, change = split.values, _better_change(bundle, split, span)
-        if cost > 0.95 * before:
+        cuts = [_cut(bundle, state, span, samples, noise) for span in range(len(state.starts))]
+        cost, split = min(cuts, key=lambda cut: cut[0])
+        if cost > _LOWER * before:
             break
         state = split
     return state
 
 
-def _better_change(bundle: Bundle, state: State, span: int) -> int:
-    """The first frame of a span, after which its camera explains what is found better than the one before."""
-    alone = (State(np.append(state.values[:POSES], state.pose(number))) for number in (span - 1, span))
+def _cut(bundle: Bundle, state: State, span: int, samples: Samples, noise: float) -> tuple[float, State]:
+    """The cost of a state with one span in two, and that state; it begins with a cut in the middle."""
+    first, last = (*state.starts, len(bundle.found.times))[span : span + 2]
+    if last - first < 2 * _SHORTEST_SPAN:
+        return np.inf, state
+    values, change = np.insert(state.values, POSES + 6 * span, state.pose(span)), (first + last) // 2
+    for _ in range(_MOVES):
+        split = State(values, (*state.starts[: span + 1], change, *state.starts[span + 1 :]))
+        split, cost, _ = bundle.solve(split, samples, noise, first=True)
+        values, change = split.values, _better_change(bundle, split, span, first, last)
+    return cost, split
+
+
+def _better_change(bundle: Bundle, state: State, span: int, first: int, last: int) -> int:
+    """The frame from which on the camera of the next span explains what is found better than a span's."""
+    alone = (State(np.append(state.values[:POSES], state.pose(number))) for number in (span, span + 1))
     early, late = (np.fmin.reduce(bundle.match(one, np.inf).distances, axis=1) for one in alone)
-    first, last = (*state.starts, len(early))[span - 1 : span + 2 : 2]
     votes = np.sign(np.nan_to_num(early - late))[first:last]
-    return first + int(np.clip(np.cumsum(votes).argmin() + 1, 1, last - first - 1))
-
-
-def _change(matches: Matches, starts: Sequence[int], noise: float) -> int | None:
-    """The frame at which a span is best cut in two, by the median errors of its frames; None if nowhere."""
-    best, gain = None, 0.0
-    shown = np.flatnonzero((matches.numbers >= 0).any(axis=1))
-    shifts = np.nanmedian(matches.errors[shown].reshape(len(shown), -1, 2), axis=1)
-    for first, last in zip(starts, [*starts[1:], len(matches.numbers)], strict=True):
-        mine = (shown >= first) & (shown < last)
-        values = shifts[mine]
-        whole = np.abs(values - np.median(values, axis=0)).sum() if len(values) else 0.0
-        for cut in range(_SHORTEST_SPAN, len(values) - _SHORTEST_SPAN + 1):
-            parts = values[:cut], values[cut:]
-            middles = [np.median(part, axis=0) for part in parts]
-            left = sum(np.abs(part - middle).sum() for part, middle in zip(parts, middles, strict=True))
-            step = np.abs(middles[0] - middles[1]).max()
-            if whole - left > max(gain, 0.1 * whole) and step > noise:
-                best, gain = int(shown[mine][cut]), whole - left
-    return best
+    return int(np.clip(first + np.cumsum(votes).argmin() + 1, first + _SHORTEST_SPAN, last - _SHORTEST_SPAN))
 
 
 class _Fit(NamedTuple):
@@ -326,31 +410,3 @@ def _outline_fit(bundle: Bundle, edges: Edges, seen: Seen, fit: _Fit) -> _Fit:
     kept = (reasons == "")[edges.frames]
     errors = edges.offsets[kept, None] * edges.normals[kept]
     return _Fit(np.fmax.reduce(middle, axis=1), reasons.tolist(), edges.pixels[kept], errors)
-
-
-def _registration(bundle: Bundle, state: State, covariance: Doubles, fit: _Fit) -> Registration:
-    """The registration of a solved state."""
-    deviations = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    told = {"offset": OFFSET, "drift": DRIFT, "readout": READOUT, "focal": FOCAL}
-    (offset, drift), pose = bundle.clock(state), slice(POSES, POSES + 6)
-    rotation, derivatives = cv2.Rodrigues(state.pose(0)[:3])
-    by_turn = derivatives.reshape(3, 3, 3).transpose(0, 2, 1) @ state.pose(0)[3:]
-    by_pose = np.column_stack([by_turn.T, rotation.T])  # derivatives of the camera's place, negated
-    place = np.trace(by_pose @ covariance[pose, pose] @ by_pose.T)
-    return Registration(
-        cameras=tuple(bundle.cameras(state)),
-        starts=state.starts,
-        offset=offset,
-        drift=drift,
-        readout=float(state.values[READOUT]),
-        deviations={name: float(deviations[number]) for name, number in told.items()}
-        | {
-            "position": float(np.sqrt(max(place, 0.0))),
-            "rotation": float(np.linalg.norm(deviations[POSES : POSES + 3])),
-        },
-        times=bundle.found.times,
-        distances=fit.distances,
-        reasons=tuple(fit.reasons),
-        places=fit.places,
-        errors=fit.errors,
-    )

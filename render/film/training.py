@@ -12,13 +12,15 @@ import io
 import itertools
 import sys
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import cv2
 import numpy as np
 import torch
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 from torch import nn
 from torch.nn import functional
 
@@ -27,7 +29,10 @@ from handsim._checks import check_count
 from handsim._plugins import import_extra
 from handsim.files.inputs import DIGEST, sign_model
 from handsim.files.outputs import atomic_write
-from handsim.hand.shape import NUM_KEYPOINTS
+from handsim.hand.model import HandModel
+from handsim.hand.shape import NUM_KEYPOINTS, NUM_QPOS, SIDES
+from poses import sample_poses
+from render.config import RenderConfig
 from render.film.detector import (
     CELL,
     CROP_SIZE,
@@ -44,13 +49,11 @@ from render.film.detector import (
     square_around,
     upright,
 )
-from render.film.lessons import SCENES, VIEW_SIZE, Lesson, draw_scenes, lessons_of, read_scenes
 from render.film.network import FinderNetwork, KeypointNetwork
 from render.frames import Bytes, Doubles, Floats
+from render.stream import PictureStream, load_labeled_hands, read_photograph
 
 BATCH: Final = 32
-PHOTOGRAPH_SHARE: Final = 0.5
-"""Share of the samples that are photographs, where there are any."""
 BF16: Final = any(torch.cpu.get_capabilities().get(name) for name in ("amx_bf16", "avx512_bf16"))
 _SAMPLES_A_SCENE: Final = 18  # squares that the keypoint network sees for each drawn picture
 _FINDER_SHARE: Final = 0.25  # samples of the finder over those of the keypoint network
@@ -61,6 +64,16 @@ _ASPECTS: Final = (0.75, 0.75, 0.5625, 1.0)  # shorter side of a picture over th
 _FIRST_LOOK: Final = 0.35  # share of the squares that are turned anyhow; in others fingers are about up
 _OPSET: Final = 17
 _HALF: Final = "_half"  # ending of the names of weights of half precision
+VIEW_SIZE: Final = 320  # longer side of a stored picture [px]
+WIDE: Final = 192  # of a stored square around a hand [px]: it can be turned and shifted
+WIDE_ROOM: Final = 2.4  # side of that square over the hand's longer side
+SCENES: Final = 128  # pictures that are drawn together
+_GLOVES: Final = ("dense19", "starter15", "sparse13", "starter30", "tips8", "dfki13", "starter10")
+_CAMERAS: Final = ("vga", "vga_wide", "vga", "sr300", "kinect2", "d435")
+_SITTING: Final = 16  # pictures of each person
+_FEWEST_SEEN: Final = 4  # keypoints of a hand that must be seen
+_EMPTY: Final = 0.35  # share of the scenes of which a square without a hand is kept
+_QUALITY: Final = 88  # of JPEG files
 
 Network = FinderNetwork | KeypointNetwork
 
@@ -68,18 +81,6 @@ Network = FinderNetwork | KeypointNetwork
 Targets = tuple[torch.Tensor, ...]
 Batch = tuple[torch.Tensor, Targets]
 """Pictures (B, 3, S, S) and what is learned of them in one step."""
-
-
-class Course(NamedTuple):
-    """Drawn lessons, and those of photographs."""
-
-    drawn: Sequence[Lesson]
-    own: Sequence[Lesson] = ()
-
-    def draw(self, rng: np.random.Generator) -> Lesson:
-        """One of the lessons."""
-        source = self.own if self.own and rng.random() < PHOTOGRAPH_SHARE else self.drawn
-        return source[int(rng.integers(len(source)))]
 
 
 def train_detector(
@@ -116,34 +117,139 @@ def train_detector(
         HandDetector.load(begun)  # refuses damaged weights
         for name, network in networks.items():
             _load_folded(network, begun / name)
-    own: tuple[list[Lesson], list[Lesson]] = ([], [])
-    if photographs is not None:
-        own = lessons_of(read_scenes(Path(photographs)), rng=np.random.default_rng(seed))
-    views, squares = _drawn(max(1, round(samples / _SAMPLES_A_SCENE / SCENES)), seed)
+    rng = np.random.default_rng(seed)
+    own = lessons_of([] if photographs is None else read_scenes(Path(photographs)), rng=rng)
+    drawn = lessons_of(_drawn(max(1, round(samples / _SAMPLES_A_SCENE / SCENES)), seed), rng=rng)
+    # Photographs are repeated until half of the samples are taken from them.
+    views, squares = (
+        some + max(1, len(some) // max(1, len(others))) * others
+        for some, others in zip(drawn, own, strict=True)
+    )
     rate, steps = _RATE if start is None else _ADAPTING_RATE, max(1, round(samples / BATCH))
-    make = functools.partial(finder_batch, Course(views, own[0]))
+    make = functools.partial(finder_batch, views)
     fit(networks[FINDER], make, finder_loss, max(1, round(_FINDER_SHARE * steps)), seed, rate)
-    make = functools.partial(keypoint_batch, Course(squares, own[1]))
-    fit(networks[KEYPOINTS], make, keypoint_loss, steps, seed, rate)
+    fit(networks[KEYPOINTS], functools.partial(keypoint_batch, squares), keypoint_loss, steps, seed, rate)
     for name, network in networks.items():
         export(network, Path(out) / name)
     return Path(out)
 
 
-def _drawn(shards: int, seed: int) -> tuple[list[Lesson], list[Lesson]]:
-    """Drawn lessons for the finder and for the keypoint network."""
-    drawn: tuple[list[Lesson], list[Lesson]] = ([], [])
+def _drawn(shards: int, seed: int) -> Iterator[Scene]:
+    """Drawn pictures, whose number is told."""
     for number in range(shards):
-        parts = lessons_of(draw_scenes(number, seed=seed), rng=np.random.default_rng([seed, number, 1]))
-        for kept, part in zip(drawn, parts, strict=True):
-            kept.extend(part)
+        yield from draw_scenes(number, seed=seed)
         _tell(f"\r{SCENES * (number + 1)} of {SCENES * shards} pictures are drawn")
     _tell("\n")
-    return drawn
 
 
 def _tell(text: str) -> None:
     print(text, end="", file=sys.stderr, flush=True)
+
+
+class Scene(NamedTuple):
+    """A picture of hands."""
+
+    picture: Bytes  # (H, W, 3) sRGB
+    keypoints: Doubles  # (N, 21, 2) [px]; NaN for those without a label
+    sides: NDArray[np.int8]  # (N,) 0 left, 1 right, -1 unknown
+
+
+class Lesson(NamedTuple):
+    """A scene as it is kept."""
+
+    file: Bytes  # JPEG
+    keypoints: Doubles  # as in `Scene`
+    sides: NDArray[np.int8]
+
+    @classmethod
+    def of(cls, scene: Scene) -> Lesson:
+        """A scene, compressed."""
+        bgr = cv2.cvtColor(scene.picture, cv2.COLOR_RGB2BGR)
+        file = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1]
+        return cls(np.asarray(file, dtype=np.uint8), scene.keypoints, scene.sides)
+
+    def picture(self) -> Bytes:
+        """The picture (H, W, 3), sRGB."""
+        bgr = cv2.imdecode(self.file, cv2.IMREAD_COLOR)
+        return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+
+
+def lessons_of(scenes: Iterable[Scene], *, rng: np.random.Generator) -> tuple[list[Lesson], list[Lesson]]:
+    """Whole pictures for the finder, and squares with and without a hand for the keypoint network."""
+    views, squares = [], []
+    for scene in scenes:
+        height, width = scene.picture.shape[:2]
+        scale = VIEW_SIZE / max(height, width)
+        small = cut(scene.picture, scale * np.eye(2, 3), (round(scale * width), round(scale * height)))
+        views.append(Lesson.of(Scene(small, scale * scene.keypoints, scene.sides)))
+        for number, points in enumerate(scene.keypoints):
+            squares.append(_square(scene, points[np.isfinite(points[:, 0])], [number]))
+        empty = _empty_place(scene, rng)
+        if empty is not None and rng.random() < _EMPTY:
+            squares.append(_square(scene, empty, []))
+    return views, squares
+
+
+def _square(scene: Scene, points: Doubles, hands: list[int]) -> Lesson:
+    """The square around points, with these hands."""
+    matrix = square_around(points, WIDE_ROOM, WIDE)
+    keypoints = scene.keypoints[hands] @ matrix[:, :2].T + matrix[:, 2]
+    return Lesson.of(Scene(cut(scene.picture, matrix, (WIDE, WIDE)), keypoints, scene.sides[hands]))
+
+
+def _empty_place(scene: Scene, rng: np.random.Generator) -> Doubles | None:
+    """Corners (2, 2) of a square [px] whose middle is not in a hand; None where there is no room."""
+    limit = np.array(scene.picture.shape[1::-1])
+    for _ in range(10):
+        center, side = rng.uniform(0.0, limit), limit.min() * rng.uniform(0.1, 0.6)
+        low, high = np.nanmin(scene.keypoints, axis=1), np.nanmax(scene.keypoints, axis=1)
+        room = np.maximum(0.25 * side, 0.25 * (high - low).max(axis=1, keepdims=True))
+        if not ((center > low - room) & (center < high + room)).all(axis=1).any():
+            return np.array([center - 0.5 * side, center + 0.5 * side])
+    return None
+
+
+def draw_scenes(number: int, *, seed: int) -> Iterator[Scene]:
+    """Some drawn pictures of one or two hands, in gloves or bare, seen by one kind of camera."""
+    rng = np.random.default_rng([seed, number])
+    config = RenderConfig(passes=("rgb", "ids"), dress="glove" if number % 2 else "skin")
+    stream = PictureStream(
+        poses=_two_hands(SCENES, rng) if number % 3 == 2 else None,
+        config=config,
+        camera=_CAMERAS[rng.integers(len(_CAMERAS))],
+        fill=(0.45, 1.0) if number % 3 == 2 else (0.12, 0.85),
+        people=SCENES // _SITTING,
+        sitting=_SITTING,
+        glove=_GLOVES[rng.integers(len(_GLOVES))],
+        seed=int(rng.integers(2**31)),
+    )
+    for one in itertools.islice(stream, SCENES):
+        keypoints, visible = one["keypoints"].numpy(), one["visible"].numpy()
+        keypoints = keypoints.astype(np.float64).reshape(-1, NUM_KEYPOINTS, 2)
+        seen = visible.reshape(-1, NUM_KEYPOINTS).sum(axis=1) >= _FEWEST_SEEN
+        picture = np.ascontiguousarray(one.get("noisy_rgb", one["rgb"]).numpy().transpose(1, 2, 0))
+        yield Scene(picture, keypoints[seen], one["side"].numpy().astype(np.int8).reshape(-1)[seen])
+
+
+def _two_hands(count: int, rng: np.random.Generator) -> Doubles:
+    """Poses (T, 2, 27) of right and left hands that are turned anyhow, near one another."""
+    poses = np.empty((count, 2, NUM_QPOS))
+    for number, side in enumerate(SIDES[::-1]):
+        poses[:, number] = sample_poses(HandModel.named("M", side=side), count, rng=rng)
+        poses[:, number, 3:7] = Rotation.random(count, rng=rng).as_quat()[:, [3, 0, 1, 2]]
+    away = rng.normal(size=(count, 3))
+    away *= rng.uniform(0.14, 0.45, (count, 1)) / np.linalg.norm(away, axis=1, keepdims=True)
+    poses[:, 0, :3], poses[:, 1, :3] = 0.0, away
+    return poses
+
+
+def read_scenes(file: Path) -> Iterator[Scene]:
+    """Your own photographs with the hands of a file of COCO keypoints."""
+    hands = sorted(load_labeled_hands(file), key=lambda hand: hand.file)
+    for path, group in itertools.groupby(hands, key=lambda hand: hand.file):
+        labeled = list(group)
+        sides = np.array([hand.side for hand in labeled], dtype=np.int8)
+        yield Scene(read_photograph(path), np.stack([hand.keypoints for hand in labeled]), sides)
 
 
 def fit(
@@ -192,7 +298,7 @@ def recolored(picture: Bytes, rng: np.random.Generator) -> Bytes:
     levels = np.linspace(0.0, 1.0, 256)[:, None] ** rng.uniform(0.7, 1.4)
     levels = levels * rng.uniform(0.82, 1.18, 3) * rng.uniform(0.8, 1.2) + rng.uniform(-0.06, 0.06)
     table = np.clip(255.0 * levels, 0.0, 255.0).astype(np.uint8)[:, None]
-    picture = cv2.LUT(np.ascontiguousarray(picture), table)
+    picture = cv2.LUT(picture, table)
     if rng.random() < 0.1:
         picture = cv2.cvtColor(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), cv2.COLOR_GRAY2RGB)
     if rng.random() < 0.3:
@@ -203,17 +309,20 @@ def recolored(picture: Bytes, rng: np.random.Generator) -> Bytes:
 
 def _shake(rng: np.random.Generator) -> Floats:
     """The kernel of a camera or a hand that moves along a line while the shutter is open."""
-    kernel, angle, half = np.zeros((9, 9), np.float32), rng.uniform(0.0, np.pi), rng.uniform(1.0, 4.0)
-    for at in np.linspace(-half, half, 17):
-        kernel[round(4 + at * np.sin(angle)), round(4 + at * np.cos(angle))] = 1.0
+    kernel, angle = np.zeros((9, 9), np.float32), rng.uniform(0.0, np.pi)
+    away = rng.uniform(1.0, 4.0) * np.array([np.cos(angle), np.sin(angle)])
+    start, end = np.rint([4.0 - away, 4.0 + away]).astype(int).tolist()
+    cv2.line(kernel, start, end, (1.0,))
     return np.asarray(kernel / kernel.sum())
 
 
-def _turn(angle: float) -> Doubles:
-    return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+def _turn(rng: np.random.Generator, deviation: float, scale: float = 1.0) -> Doubles:
+    """A matrix (2, 2) that turns by an angle of this deviation [deg], and mirrors every other time."""
+    turn = cv2.getRotationMatrix2D((0, 0), rng.normal(0.0, deviation), scale)[:, :2]
+    return np.asarray(turn * [rng.choice((-1.0, 1.0)), 1.0])
 
 
-def keypoint_batch(course: Course, rng: np.random.Generator) -> Batch:
+def keypoint_batch(lessons: Sequence[Lesson], rng: np.random.Generator) -> Batch:
     """Pictures of single hands, and some of none. Targets: keypoints [share of the side], presence, palm.
 
     The palm faces the camera (1), or does not (0), or that is not known (-1). Mirrored pictures have the same
@@ -222,29 +331,24 @@ def keypoint_batch(course: Course, rng: np.random.Generator) -> Batch:
     pictures, points = [], np.full((BATCH, NUM_KEYPOINTS, 2), np.nan, np.float32)
     presence, palms = np.zeros(BATCH, np.float32), np.full(BATCH, -1.0, np.float32)
     for number in range(BATCH):
-        lesson = course.draw(rng)
+        lesson = lessons[int(rng.integers(len(lessons)))]
         wide, is_hand = lesson.picture(), len(lesson.sides) > 0
         keypoints = lesson.keypoints[0] if is_hand else np.full((NUM_KEYPOINTS, 2), np.nan)
         labeled = keypoints[np.isfinite(keypoints[:, 0])]
         first_look = rng.random() < _FIRST_LOOK or len(labeled) < len(keypoints)
-        turn = _turn(rng.normal(0.0, 0.3))
+        turn = _turn(rng, 1e3 if first_look and rng.random() < 0.5 else 17.0)
         if not first_look:
             turn = turn @ upright(keypoints)
-        elif rng.random() < 0.5:
-            turn = _turn(rng.uniform(-np.pi, np.pi))
         middle = np.array([[0.3, 0.3], [0.7, 0.7]]) * wide.shape[0]
         room = ROOM * rng.uniform(0.78, 1.3)
         matrix = square_around(labeled if len(labeled) else middle, room, turn=turn)
         matrix[:, 2] += rng.normal(0.0, 0.06 * CROP_SIZE, 2)
-        image, moved = cut(wide, matrix, (CROP_SIZE, CROP_SIZE)), keypoints @ matrix[:, :2].T + matrix[:, 2]
-        if rng.random() < 0.5:
-            image, moved = image[:, ::-1], [CROP_SIZE, 0.0] + moved * [-1.0, 1.0]
+        image = cut(wide, matrix, (CROP_SIZE, CROP_SIZE))
         if rng.random() < 0.15:  # A patch of one color is before the hand.
             (left, top), (width, height) = rng.integers(0, CROP_SIZE - 16, 2), rng.integers(12, 48, 2)
-            image = np.array(image)
             image[top : top + height, left : left + width] = rng.integers(0, 256, 3)
-        pictures.append(normalized(recolored(np.ascontiguousarray(image), rng)))
-        points[number] = moved / CROP_SIZE
+        pictures.append(normalized(recolored(image, rng)))
+        points[number] = (keypoints @ matrix[:, :2].T + matrix[:, 2]) / CROP_SIZE
         if is_hand and lesson.sides[0] >= 0 and np.isfinite(spread := palm_spread(keypoints)):
             palms[number] = (spread > 0.0) == (lesson.sides[0] == 1)
         presence[number] = is_hand
@@ -272,29 +376,26 @@ def keypoint_loss(found: tuple[torch.Tensor, torch.Tensor], targets: Targets) ->
     return loss + (wrong * known).sum() / known.sum().clamp(min=1)
 
 
-def finder_batch(course: Course, rng: np.random.Generator) -> Batch:
+def finder_batch(lessons: Sequence[Lesson], rng: np.random.Generator) -> Batch:
     """Pictures, turned, cut and scaled; targets: cells (4, S/8, S/8) as the network's, and their weight."""
     cells = FINDER_SIZE // CELL
     pictures, targets = [], np.zeros((BATCH, 5, cells, cells), np.float32)
-    for number in range(BATCH):
-        lesson = course.draw(rng)
+    for target in targets:
+        lesson = lessons[int(rng.integers(len(lessons)))]
         picture = lesson.picture()
-        long, short = FINDER_SIZE, round(FINDER_SIZE * _ASPECTS[rng.integers(len(_ASPECTS))])
+        long, short = FINDER_SIZE, round(FINDER_SIZE * rng.choice(_ASPECTS))
         width, height = (long, short) if rng.random() < 0.75 else (short, long)
-        scale = FINDER_SIZE / VIEW_SIZE * rng.uniform(0.75, 1.7)
-        turn = scale * _turn(rng.normal(0.0, 0.25))
+        turn = _turn(rng, 14.0, FINDER_SIZE / VIEW_SIZE * rng.uniform(0.75, 1.7))
         middle = 0.5 * np.array(picture.shape[1::-1]) * rng.uniform(0.6, 1.4, 2)
-        matrix = np.column_stack([turn, 0.5 * np.array([width, height]) - turn @ middle])
-        image, moved = cut(picture, matrix, (width, height)), lesson.keypoints @ turn.T + matrix[:, 2]
-        if rng.random() < 0.5:
-            image, moved = image[:, ::-1], [width, 0.0] + moved * [-1.0, 1.0]
+        shift = 0.5 * np.array([width, height]) - turn @ middle
         square = np.zeros((3, FINDER_SIZE, FINDER_SIZE), np.float32)
-        square[:, :height, :width] = normalized(recolored(np.ascontiguousarray(image), rng))
+        image = cut(picture, np.column_stack([turn, shift]), (width, height))
+        square[:, :height, :width] = normalized(recolored(image, rng))
         pictures.append(square)
-        for points in moved:
+        for points in lesson.keypoints:
             labeled = points[np.isfinite(points[:, 0])]
             if len(labeled):
-                _mark(targets[number], labeled, (width, height))
+                _mark(target, labeled @ turn.T + shift, (width, height))
     return torch.from_numpy(np.stack(pictures)), (torch.from_numpy(targets),)
 
 

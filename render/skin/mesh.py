@@ -42,12 +42,12 @@ from render.skin.look import BEND, ELBOW, ELBOW_BEND, REACH, Forearm, bent_rings
 
 TILE: Final = 16
 """Texels along a tile's side."""
-COLUMNS: Final = 20
+COLUMNS: Final = 20  # tiles in a row of the texture
 ARM_ROWS: Final = 48
 """Texels along the forearm."""
 RINGS: Final = 20
 """Rings of the forearm beyond the wrist's."""
-_LEVELS: Final = 2
+_LEVELS: Final = 2  # number of times that the cage is subdivided
 _SIDE: Final = 2**_LEVELS  # faces of the skin along a tile
 
 

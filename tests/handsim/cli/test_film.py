@@ -25,10 +25,6 @@ class Known:
         assert image.shape == (SIZE[1], SIZE[0], 3)
         return list(next(self._found).hands)
 
-    def refine(self, image, boxes, sides):
-        assert len(boxes) == len(sides)
-        return self.detect(image)
-
 
 @pytest.fixture(scope="module")
 def pictures() -> list[np.ndarray]:

@@ -28,8 +28,8 @@ from render.film.detector import (
     square_around,
     upright,
 )
-from render.film.lessons import SCENES, Scene, draw_scenes, lessons_of
 from render.film.network import FinderNetwork, KeypointNetwork
+from render.film.training import SCENES, Scene, draw_scenes, lessons_of
 from tests.sentences import error_names
 
 BARE, GLOVED, TWO_GLOVED = 0, 1, 5  # numbers of shards
@@ -214,7 +214,7 @@ def test_training_lowers_its_loss(lessons, kind):
         "finder": (FinderNetwork(), training.finder_batch, training.finder_loss, learned[0]),
         "keypoints": (KeypointNetwork(), training.keypoint_batch, training.keypoint_loss, learned[1]),
     }[kind]
-    losses = training.fit(network, functools.partial(make, training.Course(given)), loss, 24, 0)
+    losses = training.fit(network, functools.partial(make, given), loss, 24, 0)
     assert np.mean(losses[-6:]) < 0.8 * np.mean(losses[:3])
 
 
