@@ -185,6 +185,10 @@ class ProgressBar:
         """Show what is done; this is a `handsim.callbacks.Progress`."""
         self._bar.update(self._task, completed=done, total=total, description=self._step)
 
+    def advance(self, count: int = 1) -> None:
+        """Show that more is done."""
+        self._bar.update(self._task, advance=count, description=self._step)
+
     def step(self, name: str) -> None:
         """Show the name of what is being done; this is a `handsim.callbacks.OnStep`."""
         self._step = name
