@@ -225,7 +225,7 @@ def test_gloves_with_few_markers_far_apart_are_tracked(seed):
 
 
 @pytest.mark.parametrize("name", ["BackHand1", "RingPIP"])
-def test_a_marker_glued_on_8_mm_from_its_place_is_labeled_from_the_next_frames_on(name):
+def test_a_marker_glued_on_8_mm_from_its_place_is_labeled_within_a_fifth_of_a_second(name):
     """All others fit within some tenths of a millimeter, so that the first fit leaves it out."""
     take = simulate_take(kind="single-hand", num_frames=30, glove="sparse13", hands=("right",)).without_body()
     (user,) = true_users(take)
@@ -239,7 +239,7 @@ def test_a_marker_glued_on_8_mm_from_its_place_is_labeled_from_the_next_frames_o
         labels = tracker.step(fed.points, fed.ids, fed.time).labels
         assert np.isin(labels, [-1, *fed.labels]).all() and set(fed.labels) - set(labels) <= {marker}
         missed.append(marker in fed.labels and marker not in labels)
-    assert missed[0] and np.sum(missed) < 6
+    assert missed[0] and not any(missed[24:])
 
 
 def test_a_labeler_may_be_named_or_left_to_the_glove(take, users):

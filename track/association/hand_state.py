@@ -47,6 +47,7 @@ _LEAST_MARKER_SPREAD: Final = 0.0005  # [m] lower bound of a marker's noise, as 
 _BIAS_VARIATION: Final = 0.3  # variation of a bias with the pose, as share of the hand's typical bias
 _BIAS_DOUBT_TIME: Final = 0.5  # [s] unseen, after which a marker's bias is unknown again
 _LEFT_OUT_SPREAD: Final = 0.004  # [m] least doubt of a marker that the first fit left out, as if slipped
+_LEFT_OUT_TIME: Final = 0.2  # [s] after the start, in which this doubt grows: a start may be wrong
 _AVERAGING_FRAMES: Final = 120.0  # averaging window of a bias; one second at 120 Hz
 _FORGETTING_FRAMES: Final = 2400.0  # time constant in which an unconfirmed bias decays
 _FORGOTTEN: Final = 1.7e-7  # [m] additional decay per frame; 0.02 mm in a second at 120 Hz
@@ -135,7 +136,8 @@ class HandState:
         self._variance = self.variance.copy()  # [m^2] with certain biases
         self._typical_bias = 0.0  # [m] RMS over the markers
         self._last_seen = np.full(count, -np.inf)  # [s] of each marker since the hand was initialized
-        self._left_out = np.zeros(count, dtype=bool)  # markers without a point when it was initialized
+        self._started = 0.0  # [s] when it was initialized
+        self._left_out = np.zeros(count, dtype=bool)  # markers without a point then
         self._spread_model = SpreadModel(hand, origin, angle_errors)
         self._usual_square = np.nan  # [m^2] mean squared RMS distance, biases included
         self._designed = self.adapted.positions[:, 0].copy()  # [m] without biases
@@ -149,7 +151,8 @@ class HandState:
         span = time - self.time
         doubt = self._typical_bias * np.minimum((time - self._last_seen) / _BIAS_DOUBT_TIME, 1.0)
         # The RMS of the first fit tells nothing of markers that it left out, perhaps as they do not fit.
-        doubt[self._left_out & (self._bias_frames == 0.0)] = max(self._typical_bias, _LEFT_OUT_SPREAD)
+        slip = _LEFT_OUT_SPREAD * min((time - self._started) / _LEFT_OUT_TIME, 1.0)
+        doubt[self._left_out & (self._bias_frames == 0.0)] = max(self._typical_bias, slip)
         self.variance = self._variance + doubt**2
         moved: NDArray[np.float64] = move(
             self.qpos[None], min(span, _LONGEST_EXTRAPOLATION) * self.velocity[None]
@@ -240,7 +243,7 @@ class HandState:
             estimate = self.fit(targets, qpos, unknown)
             spread = _INITIAL_SPREAD * estimate.rms
             self._variance[:] = np.clip(spread, _INITIAL_SPREAD_LEAST, _INITIAL_SPREAD_MOST) ** 2
-        self._left_out = np.isnan(targets[:, 0])
+        self._started, self._left_out = time, np.isnan(targets[:, 0])
         self._store(estimate, time)
         return estimate
 

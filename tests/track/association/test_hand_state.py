@@ -81,6 +81,8 @@ def test_a_marker_that_the_first_fit_left_out_may_be_far_off_and_the_others_stay
     seen = state.solver.marker_positions(qpos)
     state.initialize(qpos, np.where(np.arange(19)[:, None] == KNUCKLE, np.nan, seen), 0.0)
     state.predict(1 / RATE)
+    assert state.variance[KNUCKLE] < 0.0016**2  # The start may be wrong, and is about to be reviewed.
+    state.predict(0.2)
     assert state.variance[KNUCKLE] >= 0.004**2 > 4 * state.variance[others].max()
     seen[KNUCKLE, 1] += 0.008
     for frame in range(1, 40):
