@@ -65,14 +65,13 @@ def film(
     from render.film.film import PAGE, annotate_film
 
     check_outputs((take, video, camera, detector), (out,))
-    begin, steps = time.perf_counter(), iter(_STEPS)
+    begin, part, last = time.perf_counter(), -1, float("inf")
     with progress_bar("frames") as bar:
-        last = [float("inf")]
 
-        def show(done: int, total: int) -> None:
-            if done < last[0] or done == total:
-                bar.step(next(steps, ""))
-            last[0] = done
+        def show(done: int, total: int) -> None:  # a video may have fewer or more frames than it tells
+            nonlocal part, last
+            part, last = part + (done <= last), done
+            bar.step(_STEPS[min(2 * part + (done == total), 3)])
             bar(done, total)
 
         found = annotate_film(
