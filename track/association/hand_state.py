@@ -136,8 +136,8 @@ class HandState:
         self._variance = self.variance.copy()  # [m^2] with certain biases
         self._typical_bias = 0.0  # [m] RMS over the markers
         self._last_seen = np.full(count, -np.inf)  # [s] of each marker since the hand was initialized
-        self._started = 0.0  # [s] when it was initialized
-        self._left_out = np.zeros(count, dtype=bool)  # markers without a point then
+        self._started = 0.0  # [s] when the hand was initialized
+        self._left_out = np.zeros(count, dtype=bool)  # markers without a point in the first fit
         self._spread_model = SpreadModel(hand, origin, angle_errors)
         self._usual_square = np.nan  # [m^2] mean squared RMS distance, biases included
         self._designed = self.adapted.positions[:, 0].copy()  # [m] without biases
@@ -243,7 +243,8 @@ class HandState:
             estimate = self.fit(targets, qpos, unknown)
             spread = _INITIAL_SPREAD * estimate.rms
             self._variance[:] = np.clip(spread, _INITIAL_SPREAD_LEAST, _INITIAL_SPREAD_MOST) ** 2
-        self._started, self._left_out = time, np.isnan(targets[:, 0])
+            self._left_out = np.isnan(targets[:, 0])
+        self._started = time
         self._store(estimate, time)
         return estimate
 
