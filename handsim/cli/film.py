@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Final, Literal
+from typing import Annotated, Literal
 
 import tyro
 
@@ -13,8 +13,6 @@ from handsim.app.messages import print_line, print_table, progress_bar
 from handsim.files.outputs import check_outputs
 from handsim.space.transforms import UpAxis
 from render.frames import PASSES
-
-_STEPS: Final = ("finding hands", "fitting the camera", "writing pictures", "writing film.mp4 and film.html")
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,15 +63,8 @@ def film(
     from render.film.film import PAGE, annotate_film
 
     check_outputs((take, video, camera, detector), (out,))
-    begin, part, last = time.perf_counter(), -1, float("inf")
+    begin = time.perf_counter()
     with progress_bar("frames") as bar:
-
-        def show(done: int, total: int) -> None:  # a video may have fewer or more frames than it tells
-            nonlocal part, last
-            part, last = part + (done <= last), done
-            bar.step(_STEPS[min(2 * part + (done == total), 3)])
-            bar(done, total)
-
         found = annotate_film(
             take,
             video,
@@ -82,7 +73,8 @@ def film(
             camera=camera,
             detector=HandDetector.load(detector),
             workers=workers,
-            progress=show,
+            progress=bar,
+            on_step=bar.step,
             **{name: getattr(options, name) for name in FilmOptions.__dataclass_fields__},
         )
     print_table(found.figures(), left=1)

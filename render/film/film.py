@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 
 from gloves.takes.take import Take, load_take
 from handsim._checks import check_type
-from handsim.callbacks import Progress, no_progress
+from handsim.callbacks import OnStep, Progress, no_progress, no_step
 from handsim.errors import ArgumentError, CaptureError, HandSimError
 from handsim.files.inputs import checksum
 from handsim.files.outputs import save_json
@@ -52,6 +52,7 @@ def register_camera(
     camera: Camera | str | Path | None = None,
     detector: HandDetector | None = None,
     progress: Progress = no_progress,
+    on_step: OnStep = no_step,
 ) -> Registration:
     """Find the pose, the lens and the clock of the camera that filmed a take, from its hands alone.
 
@@ -62,6 +63,7 @@ def register_camera(
             length, the center and two coefficients are found, too, when not given.
         detector: Finds the hands in the pictures; the shipped one when not given.
         progress: Called with the numbers of frames that were read, and of all.
+        on_step: Called with the name of each step.
 
     Returns:
         Pose [m], lens [px] and clock [s], with standard deviations, and what fits where.
@@ -71,7 +73,9 @@ def register_camera(
     """
     taken, film = _taken(take), Film(video)
     given = _given(camera, film.size)
+    on_step("finding hands")
     found = find_hands(film, detector or HandDetector.load(), progress)
+    on_step("fitting the camera")
     return register(taken, found, film.size, given, lambda: (picture for _, picture in film.frames()))
 
 
@@ -121,6 +125,7 @@ def annotate_film(
     detector: HandDetector | None = None,
     workers: int | Executor | None = None,
     progress: Progress = no_progress,
+    on_step: OnStep = no_step,
     **settings: Any,
 ) -> Registration:
     """Register a video to a take, and write its frames as photographs with the truth of the take's hands.
@@ -137,6 +142,7 @@ def annotate_film(
         detector: As in `register_camera`.
         workers: As in `render_take`.
         progress: Called with numbers of done and of all frames, first of finding hands, then of writing.
+        on_step: As in `register_camera`.
         settings: Settings of `RenderConfig` that a film has: passes, openxr, dress (a glove when not given),
             frames, every, num_frames, frames_per_shard, seed and up.
 
@@ -151,7 +157,9 @@ def annotate_film(
             raise ArgumentError(f"{name} is a setting of drawn pictures, which a video has not")
     config = RenderConfig.of(_FILMED, settings)
     taken, film = _taken(take), Film(video)
-    registration = register_camera(taken, video, camera=camera, detector=detector, progress=progress)
+    registration = register_camera(
+        taken, video, camera=camera, detector=detector, progress=progress, on_step=on_step
+    )
     posed = filmed_take(taken, registration)
     if not np.isfinite(posed.qpos[..., 0]).any():
         told = "; ".join(registration.left_out())
@@ -165,7 +173,9 @@ def annotate_film(
     record = {"film": {"sha256": checksum(film.path), **registration.record()}}
     config = dataclasses.replace(config, view=ViewConfig(cameras=(shown,)))
     source: Any = dataclasses.replace(subject_of_take(posed), film=pictures, poses=record)  # not public
+    on_step("writing pictures")
     render_take(source, out, formats, config, workers=workers, progress=progress)
+    on_step(f"writing {VIDEO} and {PAGE}")
     folder = Path(out)
     save_json(folder / RECORD, registration.record())
     write_video(folder / VIDEO, _drawn_over(film, taken, registration), rate=film.rate, size=film.size)

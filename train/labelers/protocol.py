@@ -32,7 +32,7 @@ _NOUN: Final = "labeler"
 MAX_POINTS: Final = 512
 MOST_THREADS: Final = 1024
 _BATCH: Final = 256
-_PAIRS: Final = 1 << 18  # pairs of points in a batch, which take the memory of large clouds
+_PAIRS: Final = 1 << 18  # largest number of pairs of points in a batch; memory grows with it
 _threads: ContextVar[int] = ContextVar("threads of labelers", default=1)
 
 
@@ -80,9 +80,10 @@ def label_in_batches(
     clouds = check_clouds(frames)
     order = sorted(range(len(clouds)), key=lambda number: -len(clouds[number]))
     results = [Labeling(np.zeros(0, dtype=np.int64), np.zeros(0)) for _ in clouds]
-    while order and (longest := len(clouds[order[0]])):
-        size = min(_BATCH, max(1, _PAIRS // longest**2))
-        chosen, order = order[:size], order[size:]
+    first = 0
+    while first < len(order) and (longest := len(clouds[order[first]])):
+        chosen = order[first : first + min(_BATCH, max(1, _PAIRS // longest**2))]
+        first += len(chosen)
         for number, labeling in zip(chosen, label([clouds[number] for number in chosen]), strict=True):
             results[number] = labeling
     return results
