@@ -181,7 +181,7 @@ def _match(
     scale: np.float32,
     depth: Floats,
 ) -> None:
-    """Write the depth [m] of the pixels that are kept, and 0 elsewhere.
+    """Write the measured depth [m] of the pixels that are kept, and 0 for all others.
 
     Each takes its disparity from some whole pixels away, so that no value is made up between near and far;
     then come noise (H, W) [px] and rounding. Both bytes of random words pick offsets (256,) [px], as far as

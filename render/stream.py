@@ -418,7 +418,7 @@ def _hand_arrays(hand: HandTruth | None, camera: Camera, shape: HandShape) -> di
 
 
 def _tensors(arrays: dict[str, NDArray[np.generic]]) -> dict[str, torch.Tensor]:
-    """Arrays that nobody else keeps as tensors, float64 as float32."""
+    """Tensors that share the memory of their arrays; float64 becomes float32, which is a copy."""
     return {
         name: torch.from_numpy(np.asarray(array, dtype=np.float32 if array.dtype == np.float64 else None))
         for name, array in arrays.items()

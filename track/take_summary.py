@@ -22,7 +22,7 @@ _MOST_UNLABELED: Final = 0.25  # share of the points at the hands
 _MANY_FAR: Final = 0.05  # Unlabeled points away from the hands are mentioned from this share on.
 _AT_HAND: Final = 0.04  # [m] distance from a hand's markers within which a point counts as its own
 # Frames whose points all have at least this confidence need no look. A limit of 0.87 would list a third more
-# frames and hardly cover more errors; one of 0.7, or leaving out short spans, would miss more of them.
+# frames and hardly cover more errors. A limit of 0.7, or leaving out short spans, would miss more errors.
 _CERTAIN: Final = 0.8
 _APART: Final = 0.05  # [s] Spans closer together are joined.
 _MOST_DOUBTS: Final = 12  # rows of a list to be read at a glance

@@ -167,7 +167,7 @@ class Bundle:
         return pixels
 
     def pictured(self, state: State) -> Doubles:
-        """Pixels (F, H, 21, 2) of the take's keypoints in each frame; NaN where there are none."""
+        """Where the camera sees the take's keypoints in each frame (F, H, 21, 2) [px]; NaN without a hand."""
         times = self.times(state)
         return self.projected(state, np.arange(len(times)), self.motion.at(times))
 
@@ -205,9 +205,10 @@ class Bundle:
     def solve(
         self, state: State, samples: Samples, noise: float, *, first: bool = False
     ) -> tuple[State, float, Doubles]:
-        """The state, its cost per sample, and its covariance, where weight 1 is `noise` [px] off.
+        """Adjust a state to samples; return it with its cost per sample and its covariance.
 
-        What is far off at the start counts less. Lens and thickness are not looked for at `first`.
+        Samples of weight 1 have the standard deviation `noise` [px]. Samples that are far off in the given
+        state count less. With `first`, the lens and the thickness of the hands stay as they are.
         """
         size, count = len(state.values), len(samples.frames)
         free = np.ones(size, dtype=bool)
@@ -232,13 +233,13 @@ class Bundle:
             max_nfev=40, xtol=1e-6, ftol=1e-6,
         )  # fmt: skip
         covariance = np.zeros((size, size))
-        # What is not told at all has a deviation of 40 s, m or rad.
+        # An unknown without any information gets a standard deviation of 40 s, m or rad.
         inverse = np.linalg.inv(done.jac.T @ done.jac + _NOTHING * np.eye(len(done.x)))
         covariance[np.ix_(free, free)] = _DEPENDENT * inverse
         return widened(done.x), 2.0 * float(done.cost) / max(count, 1), covariance
 
     def residuals(self, state: State, samples: Samples, noise: float) -> Doubles:
-        """Distances (N,) from the lines, in units of the noise; 0 without a pose."""
+        """Distances (N,) from the lines, over the noise; 0 where the take has no pose."""
         late = state.values[READOUT] * (samples.pixels[:, 1] / self.size[1] - 0.5)
         points = samples.points_at(self.times(state)[samples.frames] + late)
         pixels = self.projected(state, samples.frames, points + state.values[THICKER] * samples.outward)

@@ -208,7 +208,10 @@ class Outlines:
         return points[0] / self._scale, _unit(along[:, ::-1] * [1.0, -1.0])
 
     def _moved(self, hand: int, qpos: Doubles, outline: _Outline) -> Doubles:
-        """Velocities (N, 3) [m/s] of points, from poses (3, 27) now, before and after."""
+        """Velocities (N, 3) [m/s] of an outline's points by central differences.
+
+        The hand's poses (3, 27) are those of the moment, of `_STEP` before it, and of `_STEP` after it.
+        """
         bones = self._take.hands[hand].model.forward_kinematics(qpos)[:, outline.bones]  # (3, N, 4, 4)
         now, step = bones[0], (bones[2] - bones[1]) / (2.0 * _STEP)
         local = np.einsum("nji,nj->ni", now[:, :3, :3], outline.points - now[:, :3, 3])

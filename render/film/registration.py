@@ -49,7 +49,7 @@ _LEAST_SHARE: Final = 0.2  # This share of the frames with hands must fit.
 _MOST_SPANS: Final = 4  # largest number of spans in each of which the camera stands still
 _MOVES: Final = 4  # number of times that the beginning of a new span is looked for
 _LOWER: Final = 0.9  # A span is cut in two if the cost is then less than this share of what it was.
-_SHORTEST_SPAN: Final = 20  # A span has this many frames at least.
+_SHORTEST_SPAN: Final = 20  # smallest number of frames in a span
 _NO_HAND: Final = "the take has no hand then"
 _OUTSIDE: Final = "no hand of the take is in the picture"
 _NOT_FOUND: Final = "the detector found no hand there"
@@ -65,7 +65,7 @@ _MOST_MATCHED: Final = 64  # largest number of detections that are matched
 _NOWHERE: Final = 1e3  # [m] where hands are that the take does not have
 _TRIED: Final = 3  # number of best shifts for which PnP is tried
 _APART: Final = 0.3  # [s] least distance of two shifts for which PnP is tried
-_FOCALS: Final = (0.5, 0.65, 0.85, 1.1, 1.45, 1.9, 2.5, 3.3)  # [widths] focal lengths that PnP is tried with
+_FOCALS: Final = (0.5, 0.65, 0.85, 1.1, 1.45, 1.9, 2.5, 3.3)  # focal lengths for which PnP is tried [widths]
 _GATE: Final = 0.08  # [widths] A detection is not of a hand whose keypoints are farther off in the median.
 _UNLIKE: Final = (
     "the hands in the video do not move as those of the take at any shift of the clock; expected a video of "
@@ -357,7 +357,7 @@ def _cut(bundle: Bundle, state: State, span: int, samples: Samples, noise: float
 
 
 def _better_change(bundle: Bundle, state: State, span: int, first: int, last: int) -> int:
-    """The frame from which on the camera of the next span explains what is found better than a span's."""
+    """The first frame in which the camera of the next span fits better than the camera of this span."""
     alone = (State(np.append(state.values[:POSES], state.pose(number))) for number in (span, span + 1))
     early, late = (np.fmin.reduce(bundle.match(one, np.inf).distances, axis=1) for one in alone)
     votes = np.sign(np.nan_to_num(early - late))[first:last]

@@ -72,7 +72,7 @@ _GLOVES: Final = ("dense19", "starter15", "sparse13", "starter30", "tips8", "dfk
 _CAMERAS: Final = ("vga", "vga_wide", "vga", "sr300", "kinect2", "d435")
 _SITTING: Final = 16  # pictures of each person
 _FEWEST_SEEN: Final = 4  # keypoints of a hand that must be seen
-_EMPTY: Final = 0.35  # share of the scenes of which a square without a hand is kept
+_EMPTY: Final = 0.35  # share of the scenes that also give a square without a hand
 _QUALITY: Final = 88  # of JPEG files
 
 Network = FinderNetwork | KeypointNetwork
@@ -169,7 +169,7 @@ class Lesson(NamedTuple):
         return cls(np.asarray(file, dtype=np.uint8), scene.keypoints, scene.sides)
 
     def picture(self) -> Bytes:
-        """The picture (H, W, 3), sRGB."""
+        """The decoded picture (H, W, 3) in sRGB."""
         bgr = cv2.imdecode(self.file, cv2.IMREAD_COLOR)
         return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 
@@ -317,7 +317,7 @@ def _shake(rng: np.random.Generator) -> Floats:
 
 
 def _turn(rng: np.random.Generator, deviation: float, scale: float = 1.0) -> Doubles:
-    """A matrix (2, 2) that turns by an angle of this deviation [deg], and mirrors every other time."""
+    """A random matrix (2, 2): a rotation of this standard deviation [deg], a scale, and often a mirror."""
     turn = cv2.getRotationMatrix2D((0, 0), rng.normal(0.0, deviation), scale)[:, :2]
     return np.asarray(turn * [rng.choice((-1.0, 1.0)), 1.0])
 

@@ -46,8 +46,8 @@ _INITIAL_SPREAD_LEAST, _INITIAL_SPREAD_MOST = 0.0015, 0.006  # [m] bounds of it
 _LEAST_MARKER_SPREAD: Final = 0.0005  # [m] lower bound of a marker's noise, as few cameras may see it
 _BIAS_VARIATION: Final = 0.3  # variation of a bias with the pose, as share of the hand's typical bias
 _BIAS_DOUBT_TIME: Final = 0.5  # [s] unseen, after which a marker's bias is unknown again
-_LEFT_OUT_SPREAD: Final = 0.004  # [m] least doubt of a marker that the first fit left out, as if slipped
-_LEFT_OUT_TIME: Final = 0.2  # [s] after the start, in which this doubt grows: a start may be wrong
+_LEFT_OUT_SPREAD: Final = 0.004  # [m] doubt of a marker that the first fit left out: it may have slipped
+_LEFT_OUT_TIME: Final = 0.2  # [s] The doubt grows so long: wrong starts are corrected sooner.
 _AVERAGING_FRAMES: Final = 120.0  # averaging window of a bias; one second at 120 Hz
 _FORGETTING_FRAMES: Final = 2400.0  # time constant in which an unconfirmed bias decays
 _FORGOTTEN: Final = 1.7e-7  # [m] additional decay per frame; 0.02 mm in a second at 120 Hz
@@ -150,7 +150,7 @@ class HandState:
         self._now = time
         span = time - self.time
         doubt = self._typical_bias * np.minimum((time - self._last_seen) / _BIAS_DOUBT_TIME, 1.0)
-        # The RMS of the first fit tells nothing of markers that it left out, perhaps as they do not fit.
+        # The first fit may leave a marker out because it slipped, so that the RMS does not bound its error.
         slip = _LEFT_OUT_SPREAD * min((time - self._started) / _LEFT_OUT_TIME, 1.0)
         doubt[self._left_out & (self._bias_frames == 0.0)] = max(self._typical_bias, slip)
         self.variance = self._variance + doubt**2
@@ -408,7 +408,7 @@ def _shift_markers(
     """Shift the hand's markers by their biases; return the typical bias, the RMS of the known ones [m]."""
     square, count = 0.0, 0
     for marker in range(len(bias_frames)):
-        is_known = bias_frames[marker] > 0.0 and not left_out[marker]  # One that slipped is not typical.
+        is_known = bias_frames[marker] > 0.0 and not left_out[marker]  # Slips are not typical.
         for i in range(3):
             positions[marker, 0, i] = designed[marker, i] - bias[marker, i]
             square += bias[marker, i] ** 2 if is_known else 0.0

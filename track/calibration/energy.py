@@ -60,7 +60,7 @@ CONTACT_SPREAD: Final = 0.0007
 _LIMIT_SPREAD: Final = np.deg2rad(2.0)  # [rad] standard deviation of an angle beyond its range
 _GESTURES: Final = 4.0  # The pose prior counts this many times per capture, as its frames are much alike.
 GESTURES_OF_USER: Final = np.repeat([1.0, _GESTURES], [4, 16])
-"""Gestures that a user's capture counts as, by joint angle: its mean is that of so many."""
+"""Number of gestures, by joint angle, whose mean varies from person to person like the mean of a capture."""
 _MOST_GESTURES: Final = 80  # in which errors of angles are computed
 _LEAST_MOTION: Final = np.deg2rad(1.0)  # of a digit that flesh follows
 RELINEARIZE: Final = 0.005  # The skin's jacobian is renewed after such a change (log lengths, [rad], [m]).

@@ -107,7 +107,9 @@ class HandDoubt(NamedTuple):
 
     noise: float  # marker around its place, independent in each frame [m]
     size: float  # log size of the whole hand
-    places: Float[np.ndarray, "M 2"]  # each marker on its bone: in each direction of the skin, and off it [m]
+    places: Float[
+        np.ndarray, "M 2"
+    ]  # of each marker on its bone: along the skin (each direction), off it [m]
     knuckles: Float[np.ndarray, "5"]  # origin of each digit on the palm, in each direction [m]
     directions: Float[np.ndarray, "5 3"]  # direction of each digit, about the axes of the palm [rad]
     bones: Float[np.ndarray, "5 2"]  # log lengths of each bone of a digit, and of all of them together
@@ -539,7 +541,7 @@ def _write_variances(
     variances: Float[np.ndarray, "20 4"],
 ) -> None:
     """Write the variances of angles [rad^2]; scales `off` from derivatives [rad/m] to deviations [rad]."""
-    # A marker slips along the skin and keeps its height, by which it tells most of a bone's flexion.
+    # A slipped marker keeps its height over the bone, and the height tells most of the bone's flexion.
     variances[:] = 0.0
     for hinge in range(NUM_JOINTS):
         variances[hinge, 0], variances[hinge, 3] = noise[hinge, hinge], bones[hinge, hinge]
