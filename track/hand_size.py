@@ -119,12 +119,24 @@ def fit_size(
     *,
     is_quick: bool = False,
 ) -> SizeFit | None:
-    """Measure size and proportions of the hands in some frames; None if no hand is found."""
+    """Measure size and proportions of the hands in some frames; None if no hand is found.
+
+    A child's hand of few markers, some of which get wrong labels, may pass for an adult's: hands that leave
+    points beside them without a label are compared with those that another first length leads to.
+    """
+    some = [] if is_quick else _compared(frames)
     for config in (_LENIENT,) if is_quick else (_USUAL, _LENIENT):
+        rated: list[tuple[float, SizeFit]] = []
         for length in _LENGTHS[:2] if is_quick else _LENGTHS:
             fit = _fit_from(length, frames, layout, sides, labeler, config)
-            if fit is not None and (config is _USUAL or _is_found(fit, frames, sides, labeler)):
+            if fit is None or not (config is _USUAL or _is_found(fit, frames, sides, labeler)):
+                continue
+            match = _fit(some, fit.hands(sides), labeler) if some else _Fit(is_good=True)
+            if match.is_good:
                 return fit
+            rated.append((match.log_odds, fit))
+        if rated:
+            return max(rated, key=lambda one: one[0])[1]
     return None
 
 

@@ -100,6 +100,14 @@ def test_parts_of_a_long_capture_are_consecutive_and_reach_its_end():
 
 
 @pytest.mark.slow
+def test_hands_of_a_child_are_not_measured_as_an_adults_with_wrong_labels():
+    take = simulate_take("real-like", glove="sparse13", num_frames=480, seed=65).without_body()
+    assert take.hands[0].shape.length == pytest.approx(0.145, abs=0.001)
+    (right, _) = measure_hands(take.capture(), glove="sparse13")
+    assert right.shape.length == pytest.approx(take.hands[0].shape.length, abs=0.006)
+
+
+@pytest.mark.slow
 def test_hands_of_few_markers_are_measured_though_no_usual_hand_fits_them():
     """A long, narrow hand that touches another one, in a slipped glove with ten markers."""
     tips = [MarkerPlace(digit, f"{digit}_distal", 0.7, 0.0) for digit in DIGITS]
