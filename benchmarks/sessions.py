@@ -9,7 +9,7 @@ with measured hands or --calibrate. --store keeps each session in a folder, so t
 
 Errors within the 95 % interval are those of at most 1.96 standard deviations. The found MDD is 1.96 times the
 root mean square, over users and frames, of the difference of an angle between the sessions; the forecast one
-is that of the report, from the standard deviations' parts but bones.
+is that of the report, from the parts of the standard deviations that change between sessions.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from handsim import HandSimWarning, load_rig
 from handsim.hand.shape import BONES, EVERYBODY, JOINT_NAMES, NUM_JOINTS
 from handsim.space.transforms import quaternion_matrix
 from track import track_capture
+from track.kinematics.pose_spread import detectable_difference
 from train.simulation.room import RoomConfig, record_take
 from train.simulation.scenes import CalibrationTakeConfig, sample_calibration_scene
 from train.simulation.training_frames import sample_hands, wear_gloves
@@ -117,8 +118,8 @@ def main(
     within = 100.0 * (np.abs(off[seen]) <= 1.96 * spread[seen]).mean(axis=0)
     changes = np.concatenate([first["found"] - second["found"] for first, second in pairs])
     found = 1.96 * np.sqrt(np.nanmean(changes**2, axis=0))
-    parts = np.array([one["budget"] for one in every])[..., :-1]
-    forecast = 1.96 * np.sqrt(2.0) * np.sqrt(np.nanmean((parts**2).sum(axis=2), axis=0))
+    budget = np.sqrt(np.nanmean(np.array([one["budget"] for one in every]) ** 2, axis=0))
+    forecast = detectable_difference(budget, "calibrated" if calibrate else "measured")
     ratio = forecast / found
     digits = nominal_fit(glove, "M", "right").attachment.digits
     told = np.isin(np.arange(NUM_JOINTS) // 4, digits)  # joints of digits with a marker

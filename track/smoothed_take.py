@@ -162,7 +162,9 @@ class _SmoothedHand:
                 self._share,
             )
             self.angles[kept] = np.sqrt(variances.sum(axis=-1))
-            parts.append(variances)
+            pulled = same.diagonal(axis1=1, axis2=2)[:, :NUM_JOINTS]
+            # How far the prior pulls an angle stays the same, as the person does.
+            parts.append(variances + pulled[..., None] * [-1.0, 0.0, 0.0, 1.0])
             spreads = alone[:, range(NUM_JOINTS), range(NUM_JOINTS)]
             cutoffs.append((_ACCELERATIONS[:NUM_JOINTS] * self._rate / spreads) ** 0.25 / (2.0 * np.pi))
         budget = np.rad2deg(np.sqrt(np.concatenate(parts).mean(axis=0)))

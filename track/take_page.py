@@ -23,10 +23,10 @@ from handsim.files.outputs import atomic_write, check_ending, written_together
 from handsim.hand.shape import BONES, DIGITS, JOINT_NAMES, JOINTS, Side
 from handsim.pages import NOTHING, Paint, Section, html_list, picture, write_sections
 from track.config import Size
-from track.kinematics.pose_spread import SOURCES
+from track.kinematics.pose_spread import SOURCES, detectable_difference
 from track.take_faults import AT_LIMIT, SuspectSpan
 from track.take_summary import find_suspect_spans, summarize, suspicions, vouch
-from track.user import MEASURED
+from track.user import MEASURED, hand_origin
 from train.evaluation import percent
 
 if TYPE_CHECKING:
@@ -39,7 +39,6 @@ _RANGE: Final = {"least": 0.0, "5th": 5.0, "median": 50.0, "95th": 95.0, "larges
 _CHUNK: Final = 4096  # frames per call of forward kinematics
 _WANTED: Final = (0.99, 0.999)  # shares of right frames for which the page gives a number of looks
 _MOST_SPANS: Final = 100  # rows of the page's table of doubtful spans
-_MDD: Final = 1.96 * float(np.sqrt(2.0))  # ratio of the minimal detectable difference to the standard error
 _BINS: Final = 750  # bins of a long take's curve, which shows the extremes of each
 _STROKES: Final = (Paint.VIOLET, Paint.BLUE, Paint.WARM, Paint.GREEN)
 """Colors of a digit's joints, from proximal to distal."""
@@ -333,12 +332,15 @@ def _error_section(title: str, take: Take, hand: HandFigures) -> Section:
     """Table of the error budget and filter cut-off of each angle, and the longest gap of its digit."""
     cutoffs, budget = (take.settings.get(name, {}).get(hand.side) for name in ("filter", "budget"))
     filtered = cutoffs is not None and budget is not None
+    origin = hand_origin(str(take.settings.get("user", "")), hand.side)
     text = (
         "Filter: all poses were solved together, forward and backward in time, without a delay. At the "
         "cut-off an oscillation keeps half of its size. The band [deg] is the root of the sum of the squares "
-        "of its parts, as root mean square over all frames. Gluing and bones are constant errors. "
+        "of its parts, as root mean square over all frames. Gluing is a constant error, and so is what "
+        "stays of the person: sizes and directions of bones, and gestures unlike other people's. "
         "MDD: minimal detectable difference of two sessions of a person, 1.96 times the root of two "
-        "times all parts but bones, which stay. Of hands that are not calibrated it is mostly too large."
+        "times what changes between sessions: of calibrated hands all parts but the person's, of other "
+        "hands about four fifths of these."
         if filtered
         else "Filter: none, each pose was fitted to the markers of its frame."
     )
@@ -347,7 +349,7 @@ def _error_section(title: str, take: Take, hand: HandFigures) -> Section:
     table = [["joint", *(("band", *SOURCES, "MDD", "cut-off [Hz]") if filtered else ()), "longest gap [s]"]]
     for number, joint in enumerate(JOINTS):
         own = np.array(budget[number] if filtered else ())
-        mdd = _MDD * np.linalg.norm(own[:-1])
+        mdd = float(detectable_difference(own, origin)) if filtered else 0.0
         parts = [np.linalg.norm(own), *own, mdd, cutoffs[number]] if filtered else []
         longest = float(gaps[digits == number // 4].max(initial=0.0))
         table.append([joint.name.replace("_", " "), *(f"{part:.1f}" for part in parts), f"{longest:.3f}"])

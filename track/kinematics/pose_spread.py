@@ -65,9 +65,12 @@ _CALIBRATED_WRIST: Final = 0.0007  # [m] wrist in the palm
 _CALIBRATED_JOINTS: Final = (0.00016, 0.00045)  # [m] joints, tips
 _SINGLE: Final = (7.0, 3.0)  # factors of these for a digit with one marker
 _LEAST_FREEDOM: Final = 3  # least number of marker coordinates beyond those that a pose needs
-SOURCES: Final = ("noise and gaps", "gluing", "flesh", "bones")
+SOURCES: Final = ("noise and gaps", "gluing", "flesh", "person")
 """Sources of an angle's uncertainty: noisy or unseen markers, their glued places, their motion over the
-bones, and sizes and directions of the bones."""
+bones, and what stays of a person: sizes and directions of bones, gestures unlike other people's."""
+# Share of the gluing and flesh of measured hands that differs between sessions, as found in two sessions
+# of each of 29 simulated people (benchmarks/sessions.py). The rest is what their shape moves markers by.
+_CHANGING: Final = 0.82
 _OWN: Final = 10  # unknown numbers of a digit: knuckle, direction, bones (3 each), all its bones
 _NUMBERS: Final = 5 * _OWN + 1  # unknown numbers of a hand: those of its digits, and its size
 NOT_SMOOTHED: Final = np.empty((0, NUM_UNKNOWNS, NUM_UNKNOWNS))
@@ -449,6 +452,17 @@ class SpreadModel:
             keypoints *= max(1.0, np.sqrt(errors.sum() / unsure.mean(axis=0).sum()))
             variances[..., [1, 3]] = np.maximum(unsure, errors)
         return variances, keypoints
+
+
+def detectable_difference(
+    budget: Float[np.ndarray, "*J 4"], origin: HandOrigin
+) -> Float[np.ndarray, "*J"]:
+    """Minimal detectable difference of angles in two sessions of a person, from their deviations by `SOURCES`.
+
+    It is 1.96 times the root of two times all parts but the person's, in the unit of the deviations.
+    """
+    changing = 1.0 if origin == "calibrated" else _CHANGING
+    return np.asarray(1.96 * np.sqrt(2.0) * changing * np.linalg.norm(budget[..., :-1], axis=-1))
 
 
 def freedom_factor(num_markers: int) -> float:
