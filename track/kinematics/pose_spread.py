@@ -454,10 +454,8 @@ class SpreadModel:
         return variances, keypoints
 
 
-def detectable_difference(
-    budget: Float[np.ndarray, "*J 4"], origin: HandOrigin
-) -> Float[np.ndarray, "*J"]:
-    """Minimal detectable difference of angles in two sessions of a person, from their deviations by `SOURCES`.
+def detectable_difference(budget: Float[np.ndarray, "*J 4"], origin: HandOrigin) -> Float[np.ndarray, "*J"]:
+    """Minimal detectable difference of angles in two sessions of a person, given deviations by `SOURCES`.
 
     It is 1.96 times the root of two times all parts but the person's, in the unit of the deviations.
     """
