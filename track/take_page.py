@@ -45,9 +45,7 @@ _STROKES: Final = (Paint.VIOLET, Paint.BLUE, Paint.WARM, Paint.GREEN)
 """Colors of a digit's joints, from proximal to distal."""
 _COASTING: Final = "#efd9c9"
 _SHADES: Final = "Gray: the hand is lost and has no pose. Orange: it coasts, its pose is predicted."
-_UNCALIBRATED: Final = (
-    "The bands say how far off each joint angle may be; with a calibrated hand they are narrower. "
-)
+_BANDS: Final = "the bands say how far off each joint angle may be, and are narrower with a calibrated hand. "
 _CALIBRATE: Final = (
     "A capture of half a minute in which every joint moves and the thumb touches each fingertip tells more: "
     "<code>handsim calibrate minute.c3d --out user.json</code>, then <code>handsim track ... --shape "
@@ -214,15 +212,14 @@ def hand_figures(take: Take) -> tuple[HandFigures, ...]:
 
 def _lead(take: Take) -> str:
     """Capture, glove, hands and length of the take, in a sentence."""
-    settings = take.settings
-    glove, user = settings.get("glove", take.hands[0].layout.name), str(settings.get("user", ""))
-    _, is_measured, size = user.partition(MEASURED)
-    if is_measured:
-        user = f"size measured in the capture, {size}"
-    elif user in get_args(Size):
-        user = f"size {user}"
+    settings, user = take.settings, str(take.settings.get("user", ""))
     parts = [f"capture {settings['capture']}"] if "capture" in settings else []
-    parts += [f"glove {glove}", f"hands {' and '.join(take.sides)}", *([user] if user else [])]
+    parts.append(f"glove {settings.get('glove', take.hands[0].layout.name)}")
+    parts.append(f"hands {' and '.join(take.sides)}")
+    if user.startswith(MEASURED):
+        parts.append(f"size measured in the capture, {user.removeprefix(MEASURED)}")
+    elif user in get_args(Size):
+        parts.append(f"size {user}")
     end = f"{take.num_frames:,} frames, {take.duration:.1f} s at {take.rate:.4g} Hz."
     first = ", ".join(parts)
     return f"{first[0].upper()}{first[1:]}; {end}"
@@ -245,18 +242,15 @@ def _calibration_section(take: Take) -> Section:
     notes = str(take.settings.get("user", ""))
     if not take.made_by_tracker:
         text = "The hands are those that the take was made with: there is nothing to calibrate."
-    elif notes.startswith(MEASURED):
-        text = "The hands are not calibrated: their size and proportions were measured in the capture. "
-        text += _UNCALIBRATED + _CALIBRATE
-    elif notes in get_args(Size):
-        text = "The hands are not calibrated: "
-        text += f"they are the mean hands of size {notes}, in a glove as designed. "
-        text += _UNCALIBRATED + _CALIBRATE
+    elif notes.startswith(MEASURED) or notes in get_args(Size):
+        named = f"the mean hands of size {notes}, in a glove as designed"
+        known = "measured in the capture" if notes.startswith(MEASURED) else named
+        text = f"The hands are not calibrated but {known}: {_BANDS}{_CALIBRATE}"
     elif notes:
-        text = f"The hands are a user's ({escape(notes)}), as calibrated or given."
+        text = f"The hands are a user's, as calibrated or given: {escape(notes)}."
     else:
         text = "The hands were given, and the take does not say whether they are calibrated. "
-        text += "If they are not: " + _UNCALIBRATED[0].lower() + _UNCALIBRATED[1:]
+        text += f"If they are not, {_BANDS}"
     return Section("Calibration", text)
 
 

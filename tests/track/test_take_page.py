@@ -166,11 +166,12 @@ def test_whose_hands_they_are(take, tmp_path, monkeypatch):
     monkeypatch.setattr("track.take_page.picture", lambda *drawn, **options: "data:,")
     for user, words in {
         "S": "mean hands of size S, in a glove as designed",
-        "user.json": "a user&#x27;s (user.json), as calibrated or given",
+        "user.json": "a user&#x27;s, as calibrated or given: user.json.",
         "": "the take does not say whether they are calibrated",
     }.items():
         page, _ = written(tmp_path, dataclasses.replace(take, settings={**take.settings, "user": user}))
         assert words.replace("user&#x27;s", "user's") in page
+        assert user != "user.json" or page.count(user) == 1, "the notes on a user are told once"
         assert ("handsim calibrate" in page) == (user == "S")
 
 
