@@ -28,7 +28,7 @@ from handsim import HandSimWarning, load_rig
 from handsim.hand.shape import BONES, EVERYBODY, JOINT_NAMES, NUM_JOINTS
 from handsim.space.transforms import quaternion_matrix
 from track import track_capture
-from track.kinematics.pose_spread import detectable_difference
+from track.kinematics.pose_spread import DETECTABLE, measurement_error
 from train.simulation.room import RoomConfig, record_take
 from train.simulation.scenes import CalibrationTakeConfig, sample_calibration_scene
 from train.simulation.training_frames import sample_hands, wear_gloves
@@ -119,7 +119,7 @@ def main(
     changes = np.concatenate([first["found"] - second["found"] for first, second in pairs])
     found = 1.96 * np.sqrt(np.nanmean(changes**2, axis=0))
     budget = np.sqrt(np.nanmean(np.array([one["budget"] for one in every]) ** 2, axis=0))
-    forecast = detectable_difference(budget, "calibrated" if calibrate else "measured")
+    forecast = DETECTABLE * measurement_error(budget, "calibrated" if calibrate else "measured")
     ratio = forecast / found
     digits = nominal_fit(glove, "M", "right").attachment.digits
     told = np.isin(np.arange(NUM_JOINTS) // 4, digits)  # joints of digits with a marker

@@ -387,7 +387,8 @@ def check_hands(
         named += f" in glove '{best.name}'"
         remedy.append(f"--glove {best.name}")
     if remedy:
-        shares = f"in {fit.shown} of {len(some)} frames instead of {asked.shown}"
+        fewer = f" instead of {asked.shown}" if asked.shown < fit.shown else ""
+        shares = f"in {fit.shown} of {len(some)} frames{fewer}"
         known = [one for one in remedy if one.split()[0] in options]
         how = f"name it ({' '.join(known)})" if known else "calibrate these, or leave out the hands given"
         warnings.warn(f"the points fit {named} better ({shares}); {how}", HandSimWarning, stacklevel=3)

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import csv
 import shlex
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, NamedTuple, get_args
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, get_args
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -23,7 +23,7 @@ from handsim.files.outputs import atomic_write, check_ending, written_together
 from handsim.hand.shape import BONES, DIGITS, JOINT_NAMES, JOINTS, Side
 from handsim.pages import NOTHING, Paint, Section, html_list, picture, write_sections
 from track.config import Size
-from track.kinematics.pose_spread import SOURCES, detectable_difference
+from track.kinematics.pose_spread import CHANGING, DETECTABLE, SOURCES, measurement_error
 from track.take_faults import AT_LIMIT, SuspectSpan
 from track.take_summary import find_suspect_spans, summarize, suspicions, vouch
 from track.user import MEASURED, hand_origin
@@ -44,9 +44,7 @@ _STROKES: Final = (Paint.VIOLET, Paint.BLUE, Paint.WARM, Paint.GREEN)
 """Colors of a digit's joints, from proximal to distal."""
 _COASTING: Final = "#efd9c9"
 _SHADES: Final = "Gray: the hand is lost and has no pose. Orange: it coasts, its pose is predicted."
-_UNCALIBRATED: Final = (
-    "The bands say how far off each joint angle may be; with a calibrated hand they are narrower. "
-)
+_BANDS: Final = "the bands say how far off each joint angle may be, and are narrower with a calibrated hand. "
 _CALIBRATE: Final = (
     "A capture of half a minute in which every joint moves and the thumb touches each fingertip tells more: "
     "<code>handsim calibrate minute.c3d --out user.json</code>, then <code>handsim track ... --shape "
@@ -69,7 +67,8 @@ def write_take_page(out: str | Path, take: Take, *, source: str = "take.npz") ->
         *(section for hand in hands for section in _hand_sections(take, hand)),
         _spans_section(take, spans, source),
     ]
-    tables = _frame_rows(take, hands), _joint_rows(hands), _marker_rows(take, hands), _span_rows(take, spans)
+    tables = [rows(take, hands) for rows in (_frame_rows, _joint_rows, _marker_rows)]
+    tables.append(_span_rows(take, spans))
     with written_together():
         write_sections(out, sections, title=f"Take {Path(source).name}", lead=_lead(take))
         for path, rows in zip(paths, tables, strict=True):
@@ -129,34 +128,33 @@ class HandFigures:
         told = ~self.beyond.any(axis=1) | (self.seen @ self.beyond.T)
         return np.asarray(self.fitted[:, None] & told)
 
-    def joints(self) -> Float[np.ndarray, "20 6"]:
-        """`_RANGE` of each angle over its measured frames, and its median standard deviation [deg]."""
-        found = np.full((self.angles.shape[1], len(_RANGE) + 1), np.nan)
-        for row, angles, measured in zip(found, self.angles.T, self.measured.T, strict=True):
-            if measured.any():
-                row[:-1] = np.percentile(angles[measured], list(_RANGE.values()))
-        if self.angle_spread is not None and self.fitted.any():
-            found[:, -1] = np.median(self.angle_spread[self.fitted], axis=0)
-        return found
+    def gaps(self, seen: Bool[np.ndarray, "T K"]) -> list[list[int]]:
+        """Lengths of the gaps of each column, from the hand's first pose to its last [frames]."""
+        there = np.flatnonzero(self.status != LOST)
+        hidden = ~seen[there[0] : there[-1] + 1] if len(there) else seen[:0]
+        return [[last - first + 1 for first, last in runs_of(column)] for column in hidden.T]
 
-    def at_limits(self) -> Float[np.ndarray, "20"]:
-        """Share of the fitted frames with each joint at a limit of the model; NaN without such frames."""
-        low, high = np.array([(joint.low, joint.high) for joint in JOINTS]).T
-        angles = self.angles[self.fitted]
-        if not len(angles):
-            return np.full(len(JOINTS), np.nan)
-        return np.asarray(((angles < low + AT_LIMIT) | (angles > high - AT_LIMIT)).mean(axis=0))
+    def joints(self) -> Float[np.ndarray, "20 9"]:
+        """Each angle's `_RANGE` where measured, median SD [deg], shares at a limit, measured, longest gap."""
+        found, measured = np.full((len(JOINTS), len(_RANGE) + 4), np.nan), self.measured
+        for row, angles, told in zip(found, self.angles.T, measured.T, strict=True):
+            if told.any():
+                row[: len(_RANGE)] = np.percentile(angles[told], list(_RANGE.values()))
+        if self.fitted.any():
+            if self.angle_spread is not None:
+                found[:, -4] = np.median(self.angle_spread[self.fitted], axis=0)
+            low, high = np.array([(joint.low, joint.high) for joint in JOINTS]).T
+            angles = self.angles[self.fitted]
+            found[:, -3] = ((angles < low + AT_LIMIT) | (angles > high - AT_LIMIT)).mean(axis=0)
+        found[:, -2] = measured.mean(axis=0)
+        found[:, -1] = [max(gaps, default=0) for gaps in self.gaps(measured)]
+        return found
 
     def markers(self) -> Iterator[MarkerFigures]:
         """Figures of each marker, in the glove's order."""
         seen = self.seen
-        there = np.flatnonzero(self.status != LOST)
-        hidden = np.zeros_like(seen)
-        if len(there):
-            hidden[there[0] : there[-1] + 1] = ~seen[there[0] : there[-1] + 1]
-        for marker, name in enumerate(self.marker_names):
+        for marker, (name, gaps) in enumerate(zip(self.marker_names, self.gaps(seen), strict=True)):
             frames = np.flatnonzero(seen[:, marker])
-            gaps = [last - first + 1 for first, last in runs_of(hidden[:, marker])]
             residuals = self.residuals[:, marker]
             known = residuals[np.isfinite(residuals)]
             median, high = np.percentile(known, (50.0, 95.0)).tolist() if len(known) else (np.nan, np.nan)
@@ -213,15 +211,14 @@ def hand_figures(take: Take) -> tuple[HandFigures, ...]:
 
 def _lead(take: Take) -> str:
     """Capture, glove, hands and length of the take, in a sentence."""
-    settings = take.settings
-    glove, user = settings.get("glove", take.hands[0].layout.name), str(settings.get("user", ""))
-    _, is_measured, size = user.partition(MEASURED)
-    if is_measured:
-        user = f"size measured in the capture, {size}"
-    elif user in get_args(Size):
-        user = f"size {user}"
+    settings, user = take.settings, str(take.settings.get("user", ""))
     parts = [f"capture {settings['capture']}"] if "capture" in settings else []
-    parts += [f"glove {glove}", f"hands {' and '.join(take.sides)}", *([user] if user else [])]
+    parts.append(f"glove {settings.get('glove', take.hands[0].layout.name)}")
+    parts.append(f"hands {' and '.join(take.sides)}")
+    if user.startswith(MEASURED):
+        parts.append(f"size measured in the capture, {user.removeprefix(MEASURED)}")
+    elif user in get_args(Size):
+        parts.append(f"size {user}")
     end = f"{take.num_frames:,} frames, {take.duration:.1f} s at {take.rate:.4g} Hz."
     first = ", ".join(parts)
     return f"{first[0].upper()}{first[1:]}; {end}"
@@ -244,18 +241,15 @@ def _calibration_section(take: Take) -> Section:
     notes = str(take.settings.get("user", ""))
     if not take.made_by_tracker:
         text = "The hands are those that the take was made with: there is nothing to calibrate."
-    elif notes.startswith(MEASURED):
-        text = "The hands are not calibrated: their size and proportions were measured in the capture. "
-        text += _UNCALIBRATED + _CALIBRATE
-    elif notes in get_args(Size):
-        text = "The hands are not calibrated: "
-        text += f"they are the mean hands of size {notes}, in a glove as designed. "
-        text += _UNCALIBRATED + _CALIBRATE
+    elif notes.startswith(MEASURED) or notes in get_args(Size):
+        named = f"the mean hands of size {notes}, in a glove as designed"
+        known = "measured in the capture" if notes.startswith(MEASURED) else named
+        text = f"The hands are not calibrated but {known}: {_BANDS}{_CALIBRATE}"
     elif notes:
-        text = f"The hands are a user's ({escape(notes)}), as calibrated or given."
+        text = f"The hands are a user's, as calibrated or given: {escape(notes)}."
     else:
         text = "The hands were given, and the take does not say whether they are calibrated. "
-        text += "If they are not: " + _UNCALIBRATED[0].lower() + _UNCALIBRATED[1:]
+        text += f"If they are not, {_BANDS}"
     return Section("Calibration", text)
 
 
@@ -269,7 +263,7 @@ def _hand_sections(take: Take, hand: HandFigures) -> list[Section]:
         "metacarpal, which is relative to the hand, away from the palm."
     )
     if hand.angle_spread is not None:
-        angles += " The band is one standard deviation to either side."
+        angles += " The band is one standard deviation (SD) to either side."
     curves = picture((9.6, 9.6), _draw_angles, take.times, hand)
     rms = hand.rms[np.isfinite(hand.rms)]
     residuals, drawn = "None of its markers has a point.", []
@@ -281,8 +275,8 @@ def _hand_sections(take: Take, hand: HandFigures) -> list[Section]:
         drawn = [(picture((9.6, 2.2), _draw_residuals, take.times, hand), _SHADES)]
     return [
         Section(f"{side} hand: joint angles", angles, pictures=[(curves, _SHADES)]),
-        _range_section(f"{side} hand: range of motion", hand),
-        _error_section(f"{side} hand: errors of angles", take, hand),
+        _range_section(f"{side} hand: range of motion", take, hand),
+        _error_section(f"{side} hand: errors of angles", take.settings, hand),
         _markers_section(f"{side} hand: markers", take, hand),
         Section(f"{side} hand: residuals", residuals, pictures=drawn),
     ]
@@ -312,47 +306,46 @@ def _draw_angles(figure: Figure, times: Float[np.ndarray, "T"], hand: HandFigure
     figure.align_ylabels()
 
 
-def _range_section(title: str, hand: HandFigures) -> Section:
-    table = [["joint [deg]", *_RANGE, "range of the model", "at its limits [%]", "usual spread"]]
-    for joint, row, share in zip(JOINTS, hand.joints(), hand.at_limits().tolist(), strict=True):
-        *cells, spread = (NOTHING if np.isnan(value) else f"{value:.1f}" for value in row)
-        limits = f"{joint.low:g} to {joint.high:g}", percent(share) if share > 0.0 else NOTHING
-        table.append([joint.name.replace("_", " "), *cells, *limits, spread])
+def _range_section(title: str, take: Take, hand: HandFigures) -> Section:
+    table = [["joint [deg]", *_RANGE, "median SD", "model's range", "at its limits [%]", "measured [%]"]]
+    table[0].append("longest gap [s]")
+    for joint, (*first, limits, measured, gap) in zip(JOINTS, hand.joints().tolist(), strict=True):
+        cells = [NOTHING if np.isnan(one) else f"{one:.1f}" for one in first]
+        cells += [f"{joint.low:g} to {joint.high:g}", percent(limits) if limits > 0.0 else NOTHING]
+        cells += [percent(measured), f"{gap / take.rate:.3f}" if gap else NOTHING]
+        table.append([joint.name.replace("_", " "), *cells])
     text = (
-        f"Over the {int(hand.fitted.sum()):,} frames with a fitted pose; for a joint with markers beyond it, "
-        "only over those that show one of them, as other angles are predicted. 5th and 95th are "
-        "percentiles, which a single wrong frame does not change. A joint at its limits may bend further "
-        "than its least and largest angle, which are then the model's limits. Spread: median standard "
-        "deviation of the angle, from unknown proportions of the hand, hidden markers and noise."
+        "An angle is measured in a frame whose pose was fitted while a marker beyond the joint was seen, if "
+        f"the glove has one, and predicted in all others. {int(hand.fitted.sum()):,} frames have a fitted "
+        "pose. The range is that of the measured frames; 5th and 95th are percentiles, which a single wrong "
+        "frame does not change. SD: standard deviation of the angle. A gap is a run of frames in which it is "
+        "not measured, from the hand's first pose to its last. At the limits of the model, which are soft by "
+        "a few degrees, a joint may bend further than the table says."
     )
     return Section(title, text, table=table)
 
 
-def _error_section(title: str, take: Take, hand: HandFigures) -> Section:
-    """Table of the error budget and filter cut-off of each angle, and the longest gap of its digit."""
-    cutoffs, budget = (take.settings.get(name, {}).get(hand.side) for name in ("filter", "budget"))
-    filtered = cutoffs is not None and budget is not None
-    origin = hand_origin(str(take.settings.get("user", "")), hand.side)
+def _error_section(title: str, settings: Mapping[str, Any], hand: HandFigures) -> Section:
+    """The standard deviation of each angle by its sources, and the cut-off of its filter."""
+    cutoffs, budget = (settings.get(name, {}).get(hand.side) for name in ("filter", "budget"))
+    if cutoffs is None or budget is None:
+        return Section(title, "Filter: none, each pose was fitted to the markers of its frame.")
     text = (
-        "Filter: all poses were solved together, forward and backward in time, without a delay. At the "
-        "cut-off an oscillation keeps half of its size. The band [deg] is the root of the sum of the squares "
-        "of its parts, as root mean square over all frames. Gluing is a constant error, and so is what "
-        "stays of the person: sizes and directions of bones, and gestures unlike other people's. "
-        "MDD: minimal detectable difference of two sessions of a person, 1.96 times the root of two "
-        "times what changes between sessions: of calibrated hands all parts but the person's, of other "
-        "hands about four fifths of these."
-        if filtered
-        else "Filter: none, each pose was fitted to the markers of its frame."
+        "Filter: all poses were solved together, forward and backward in time, without a delay. It acts as a "
+        "Butterworth filter of second order that runs forward and backward: at the cut-off an oscillation "
+        "keeps half of its size. SD [deg]: standard deviation of the angle, the root of the sum of the "
+        "squares of its four parts, each as root mean square over all frames. Gluing is a constant error, and "
+        "so is what stays of the person: sizes and directions of bones, and gestures unlike other people's. "
+        "SEM: standard error of measurement between sessions of a person, all parts but the person's; of "
+        f"hands that are not calibrated {CHANGING:g} times that. MDD: minimal detectable difference of two "
+        "sessions, 1.96 times the root of two times the SEM."
     )
-    digits = take.hands[take.hand_index(hand.side)].attachment.digits
-    gaps = np.array([marker.longest_gap for marker in hand.markers()]) / take.rate
-    table = [["joint", *(("band", *SOURCES, "MDD", "cut-off [Hz]") if filtered else ()), "longest gap [s]"]]
-    for number, joint in enumerate(JOINTS):
-        own = np.array(budget[number] if filtered else ())
-        mdd = float(detectable_difference(own, origin)) if filtered else 0.0
-        parts = [np.linalg.norm(own), *own, mdd, cutoffs[number]] if filtered else []
-        longest = float(gaps[digits == number // 4].max(initial=0.0))
-        table.append([joint.name.replace("_", " "), *(f"{part:.1f}" for part in parts), f"{longest:.3f}"])
+    origin = hand_origin(str(settings.get("user", "")), hand.side)
+    errors = measurement_error(np.array(budget), origin)
+    table = [["joint", "SD", *SOURCES, "SEM", "MDD", "cut-off [Hz]"]]
+    for joint, own, error, cutoff in zip(JOINTS, budget, errors, cutoffs, strict=True):
+        cells = np.linalg.norm(own), *own, error, DETECTABLE * error, cutoff
+        table.append([joint.name.replace("_", " "), *(f"{cell:.1f}" for cell in cells)])
     return Section(title, text, table=table)
 
 
@@ -457,19 +450,23 @@ def _spans_section(take: Take, spans: Sequence[SuspectSpan], source: str) -> Sec
         start, end, worst = (f"{take.times[one]:.3f}" for one in (span.first, span.last, span.worst))
         look = f"frame {span.worst}, {worst} s"
         table.append([frames, start, end, span.of, span.why, look, f"{command} --time {worst}"])
+    vouched = vouch(take, spans)
     text = (
-        "Faults of the take, then spans in which a label is probably wrong or a marker lacks its own, those "
+        f"{len(spans):,} rows; {100 * vouched.listed:.1f} % of the frames have doubtful labels. Faults of "
+        "the take come first, then spans in which a label is probably wrong or a marker lacks its own, those "
         "with the most such frames first; the percentage is the least confidence in a point. "
         f"<code>{escape(command)}</code> lists the first of them too; a click leads there, "
         "and a wrong label can be corrected."
     )
     more = f"These are the first {_MOST_SPANS} of {len(spans):,}; the table beside the page has all."
-    vouched = vouch(take, spans)
     for share in _WANTED if take.made_by_tracker else ():
         looks = vouched.looks(share)
         if looks:
             text += f" After a look at the first {looks}, {100 * share:g} % of all frames should be right."
             break
+    else:
+        if vouched.after:
+            text += f" After a look at all, {100 * vouched.after[-1]:.1f} % or more should be right."
     return Section("Doubtful frames", text, table=table, notes=[more] if len(spans) > _MOST_SPANS else [])
 
 
@@ -493,14 +490,14 @@ def _frame_rows(take: Take, hands: Sequence[HandFigures]) -> _Rows:
     return rows
 
 
-def _joint_rows(hands: Sequence[HandFigures]) -> _Rows:
+def _joint_rows(take: Take, hands: Sequence[HandFigures]) -> _Rows:
     """Rows of the range of motion of each joint and of the model."""
     columns = [f"{name}_deg" for name in (*_RANGE, "model_low", "model_high", "spread")]
-    rows: _Rows = [["hand", "joint", *columns, "at_limits_share"]]
+    rows: _Rows = [["hand", "joint", *columns, "at_limits_share", "measured_share", "longest_gap_s"]]
     for hand in hands:
-        shares = hand.at_limits().tolist()
-        for joint, (*row, spread), share in zip(JOINTS, hand.joints().tolist(), shares, strict=True):
-            rows.append([hand.side, joint.name, *map(_number, (*row, joint.low, joint.high, spread, share))])
+        for joint, (*row, spread, limits, measured, gap) in zip(JOINTS, hand.joints().tolist(), strict=True):
+            cells = *row, joint.low, joint.high, spread, limits, measured, gap / take.rate
+            rows.append([hand.side, joint.name, *map(_number, cells)])
     return rows
 
 

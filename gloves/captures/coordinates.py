@@ -35,7 +35,7 @@ _SENTENCES: Final = {
     PIECES: "{} columns hold pieces of unlabeled paths and are read as a few columns",
     _ZEROS: "{} points at exactly (0, 0, 0) are read as missing; if they are points, move the origin",
     _STAND_INS: "{} points stand for none, as (-1, -1, -1) or (0, 0, -1) do, and are read as missing",
-    _DOUBLED: "{} points are where another is, as a marker of two subjects is, and are left out",
+    _DOUBLED: "{} points repeat another within 1 mm, as a marker of two subjects does, and are left out",
     _HELD: "{} points repeat their position while others move, as in gaps filled with the last one, and are "
     "read as missing",
     _STRAIGHT: "{} points move by equal steps, as in gaps that were interpolated, and are read as missing",

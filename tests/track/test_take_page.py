@@ -92,8 +92,15 @@ def test_the_range_of_motion_is_that_of_the_fitted_poses(take, report):
         low, high = expected["model_low"] + 0.5, expected["model_high"] - 0.5
         shares = ((degrees < low) | (degrees > high)).mean(axis=0)
         np.testing.assert_allclose(numbers(rows, "at_limits_share"), shares, rtol=1e-5)
+        tip = take.hands[number].layout.names.index("IndexTip")
+        seen = np.isfinite(take.observed(side)[:, tip, 0]) & (take.status[:, number] > COASTING)
+        (dip,) = (row for row in rows if row["joint"] == "index_DIP_flexion")
+        assert float(dip["measured_share"]) == pytest.approx(seen.mean(), rel=1e-5)
+        longest = max(map(len, re.findall("0+", "".join("01"[int(one)] for one in seen))), default=0)
+        assert float(dip["longest_gap_s"]) == pytest.approx(longest / take.rate, rel=1e-5)
     assert f"<td>{np.rad2deg(take.qpos[fitted, 0, 10].max()):.1f}</td>" in page
-    assert "Over the 50 frames" in page and "<td>-25 to 95</td>" in page
+    assert numbers(joints, "longest_gap_s")[:20].min() == pytest.approx(10 / take.rate, rel=1e-5)
+    assert "50 frames have a fitted" in page and "<td>-25 to 95</td>" in page
 
 
 def test_markers_have_their_gaps_and_residuals(take, report):
@@ -135,6 +142,8 @@ def test_the_page_is_whole_and_leads_to_the_frames_to_look_at(take, report):
         f"<td>frame {doubt['frame']}, {worst:.3f} s</td><td>handsim view &#x27;my take.npz&#x27; --time "
         in page
     )
+    assert "1 rows; 13.3 % of the frames have doubtful labels." in page
+    assert "After a look at the first 1, 99" in page
     assert "Capture &lt;b&gt;.c3d, glove dense19, hands right and left" in page
     assert "size measured in the capture, 180 x 80 mm; 60 frames, 0.5 s at 120 Hz" in page
     assert "are not calibrated" in page and "handsim calibrate minute.c3d" in page
@@ -142,7 +151,8 @@ def test_the_page_is_whole_and_leads_to_the_frames_to_look_at(take, report):
     assert "prefers-color-scheme: dark" in page and "@media print" in page
     assert page.count("<img ") == 3 * len(take.hands)
     budget = take.settings["budget"]["right"][0]
-    cells = [np.linalg.norm(budget), *budget, 2.772 * np.linalg.norm(budget[:3])]
+    error = np.linalg.norm(budget[:3])
+    cells = [np.linalg.norm(budget), *budget, error, 2.772 * error]
     assert "".join(f"<td>{cell:.1f}</td>" for cell in cells) in page
 
 
@@ -156,11 +166,12 @@ def test_whose_hands_they_are(take, tmp_path, monkeypatch):
     monkeypatch.setattr("track.take_page.picture", lambda *drawn, **options: "data:,")
     for user, words in {
         "S": "mean hands of size S, in a glove as designed",
-        "user.json": "a user&#x27;s (user.json), as calibrated or given",
+        "user.json": "a user&#x27;s, as calibrated or given: user.json.",
         "": "the take does not say whether they are calibrated",
     }.items():
         page, _ = written(tmp_path, dataclasses.replace(take, settings={**take.settings, "user": user}))
         assert words.replace("user&#x27;s", "user's") in page
+        assert user != "user.json" or page.count(user) == 1, "the notes on a user are told once"
         assert ("handsim calibrate" in page) == (user == "S")
 
 

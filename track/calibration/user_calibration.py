@@ -158,8 +158,8 @@ class Calibration:
         if self.held_out is None:
             return "too few frames to try a calibration on, so that it stays as it was"
         before, after, frames, hidden = self.held_out
-        line = f"markers {1e3 * before:.2f} mm off before, {1e3 * after:.2f} mm calibrated"
-        line += f" on {frames} frames held out"
+        line = f"markers {1e3 * before:.2f} mm off before and {1e3 * after:.2f} mm after calibration, "
+        line += f"on {frames} frames held out"
         if hidden:
             line += f", but {hidden} is rarely seen, and the next finger's fits in its place as well"
             return f"{line}, so that it stays as it was"

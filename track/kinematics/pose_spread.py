@@ -68,9 +68,11 @@ _LEAST_FREEDOM: Final = 3  # least number of marker coordinates beyond those tha
 SOURCES: Final = ("noise and gaps", "gluing", "flesh", "person")
 """Sources of an angle's uncertainty: noisy or unseen markers, their glued places, their motion over the
 bones, and what stays of a person: sizes and directions of bones, gestures unlike other people's."""
-# Share of the gluing and flesh of measured hands that differs between sessions, as found in two sessions
-# of each of 29 simulated people (benchmarks/sessions.py). The rest is what their shape moves markers by.
-_CHANGING: Final = 0.82
+CHANGING: Final = 0.82
+"""Share of the errors of measured hands that differs between sessions, as found in two sessions of each of 29
+simulated people (benchmarks/sessions.py). The rest is what their shape moves markers by, always alike."""
+DETECTABLE: Final = 1.96 * float(np.sqrt(2.0))
+"""Ratio of the minimal detectable difference of two sessions to the standard error of measurement."""
 _OWN: Final = 10  # unknown numbers of a digit: knuckle, direction, bones (3 each), all its bones
 _NUMBERS: Final = 5 * _OWN + 1  # unknown numbers of a hand: those of its digits, and its size
 NOT_SMOOTHED: Final = np.empty((0, NUM_UNKNOWNS, NUM_UNKNOWNS))
@@ -454,13 +456,10 @@ class SpreadModel:
         return variances, keypoints
 
 
-def detectable_difference(budget: Float[np.ndarray, "*J 4"], origin: HandOrigin) -> Float[np.ndarray, "*J"]:
-    """Minimal detectable difference of angles in two sessions of a person, given deviations by `SOURCES`.
-
-    It is 1.96 times the root of two times all parts but the person's, in the unit of the deviations.
-    """
-    changing = 1.0 if origin == "calibrated" else _CHANGING
-    return np.asarray(1.96 * np.sqrt(2.0) * changing * np.linalg.norm(budget[..., :-1], axis=-1))
+def measurement_error(budget: Float[np.ndarray, "*J 4"], origin: HandOrigin) -> Float[np.ndarray, "*J"]:
+    """Standard error of measurement between sessions of a person, in the unit of deviations by `SOURCES`."""
+    changing = 1.0 if origin == "calibrated" else CHANGING
+    return np.asarray(changing * np.linalg.norm(budget[..., :-1], axis=-1))
 
 
 def freedom_factor(num_markers: int) -> float:

@@ -155,7 +155,7 @@ def test_markers_of_two_subjects_are_one(moving, rng, tmp_path, suffix, share, a
     twice = np.concatenate([positions, others], axis=1)
     path = tmp_path / f"take{suffix}"
     write_capture(path, Capture(tuple(names), twice, 120.0))
-    with pytest.warns(HandSimWarning, match="where another is"):
+    with pytest.warns(HandSimWarning, match="repeat another within 1 mm"):
         read = read_capture(path)
     assert read.names == tuple(names[:MARKERS])
     assert read.findings == {"doubled": np.isfinite(positions[:, again, 0]).sum()}

@@ -197,7 +197,8 @@ def test_what_is_told_is_of_held_out_frames():
     assert not result.is_better and "it stays as it was" in str(result)
     better = dataclasses.replace(result, held_out=HeldOut(0.004, 0.0002, 80))
     places = f"their places known to {1e3 * better.place_error:.1f} mm"
-    assert str(better) == f"markers 4.00 mm off before, 0.20 mm calibrated on 80 frames held out, {places}"
+    off = "markers 4.00 mm off before and 0.20 mm after calibration, on 80 frames held out"
+    assert str(better) == f"{off}, {places}"
     alike = dataclasses.replace(result, held_out=HeldOut(0.004, 0.00395, 80))
     assert not alike.is_better and "no better, so that it stays as it was" in str(alike)
 
