@@ -98,7 +98,7 @@ def main(args: Sequence[str] | None = None) -> int:
         SystemExit: After a command's help (code 0) or a mistake in its options (code 2).
     """
     args = sys.argv[1:] if args is None else args
-    return run(COMMANDS, [*args[1:], "--help"] if args[:1] == ["help"] else args)
+    return run(COMMANDS, [*args[1:], "--help"] if args and args[0] == "help" else args)
 
 
 def run(commands: Table, args: Sequence[str]) -> int:
