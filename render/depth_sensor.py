@@ -31,20 +31,20 @@ _SHADOW_SLACK: Final = 2.0  # [px] of disparity that a surface may differ from i
 
 
 @dataclass(frozen=True, slots=True)
-class StructuredLight:
+class StructuredLight(Settings):
     """Noise of a disparity sensor; see `docs/sensors.md` for the sources of the numbers."""
 
     sensor: str = "kinect1"
-    baseline: float = 0.075
+    baseline: Annotated[float, Limits(0.0, above=True)] = 0.075
     """From the camera to the projector or second camera, to its right [m]."""
-    step: float = 0.125
+    step: Annotated[float, Limits(0.0)] = 0.125
     """What disparities are rounded to [px]; 0: not at all."""
-    disparity_noise: float = 0.125 / 6
+    disparity_noise: Annotated[float, Limits(0.0)] = 0.125 / 6
     """Standard deviation before rounding [px]."""
-    window: int = 9
+    window: Annotated[int, Limits(1)] = 9
     """Width of the window that is matched [px]: windows that overlap have noise in common. 9 is BlenSor's
     for a Kinect (Gschwandtner et al., ISVC 2011), 7 Keselman et al.'s (CVPR workshops 2017) for a D435."""
-    shift: float = 0.5
+    shift: Annotated[float, Limits(0.0, 10.0)] = 0.5
     """Standard deviation of where a pixel's depth is taken, each way [px]; rounded to whole pixels."""
     support: float = 0.6
     """Share of a window's other dots that must agree with its middle, give or take `wavering`."""
@@ -212,7 +212,7 @@ _NOTHING: Final = np.float32(1e6)
 
 
 @dataclass(frozen=True, slots=True)
-class TimeOfFlight:
+class TimeOfFlight(Settings):
     """Noise of a time-of-flight sensor; see `docs/sensors.md` for the sources of the numbers."""
 
     sensor: str = "kinect2"
@@ -220,7 +220,7 @@ class TimeOfFlight:
     """Standard deviation c0 + c1 z + c2 z^2 of a white wall that faces, depth z in meters [m]."""
     angle_sigma: float = 0.1e-3
     """What is added at an angle a, times z^1.5 (a / (pi/2 - a))^2 [m]."""
-    window: int = 3
+    window: Annotated[int, Limits(1)] = 3
     """Width of the square of pixels whose light the depth of one is of [px]: the filter of Kinect v2's phases
     in libfreenect2 has nearly even weights in 3 x 3 pixels."""
     offset: float = 0.0

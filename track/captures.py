@@ -40,7 +40,7 @@ from track.settings import USUAL_SIZE, CalibrateSettings, LabelSettings, Tracker
 from track.sinks import SinkGroup
 from track.smoothed_take import smooth_take
 from track.take_calibration import calibrate_take, kept_user, leaves_markers
-from track.take_summary import no_points
+from track.take_summary import misfits, no_points
 from track.tracker import Tracker
 from track.user import AnyGlove, AnyLabeler, User, labeler_of, nominal_user
 
@@ -207,6 +207,9 @@ def calibrate(
         CaptureError: The capture cannot be read, or most of its points are far from any room.
         LayoutError: The glove is unknown, or does not fit a hand.
         WeightsError: The labeler is unknown, or knows other markers.
+
+    Warns:
+        HandSimWarning: The points do not fit the hands or the glove, or a hand is kept as it was.
     """
 
     def on_part(what: str, done: int, total: int) -> None:
@@ -221,6 +224,8 @@ def calibrate(
         tracker = Tracker([one.hand for one in done], setup.labeler)
         take = tracked_take(source, frames, tracker, progress=on_label)
         done = calibrate_take(take, setup.start, setup.user, on_part)
+    for sentence in misfits(take):
+        warnings.warn(sentence, HandSimWarning, stacklevel=2)
     name = _named(capture, source).get("capture", "a capture")
     found = kept_user(take, done, setup.user, f"from {name}", on_part)
     for one in found.calibrations:

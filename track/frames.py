@@ -51,7 +51,7 @@ class StreamedFrame:
     ids: Int[np.ndarray, "N"]
     """The server's ID of each point, -1 where it gives none."""
     silent: bool = False
-    """Whether no frame has arrived for a while: no points, number and time are those of the last frame."""
+    """Whether no frame has arrived for a while: no points, the last frame's number, and the current time."""
     restarted: bool = False
     """Whether the server's time began anew and does not continue that of the frame before."""
     arrived: float = math.nan

@@ -106,7 +106,9 @@ class TrackerSetup:
         user, is_auto = _chosen_user(settings)
         tracking = settings if isinstance(settings, TrackSettings) else TrackSettings()
         bodies, config = load_bodies(tracking.bodies), tracking.tracker
-        labeler, record = labeler_of(user.layout, settings.labeler), settings.record()
+        # Hands may have slipped in their glove: where it is named, too, its labeler is that of the design.
+        glove = user.layout if settings.glove is None else load_layout(settings.glove)
+        labeler, record = labeler_of(glove, settings.labeler), settings.record()
         record |= {"glove": record["glove"] or user.layout.name, "user": user.notes or str(user)}
         return cls(user, is_auto, labeler, bodies, config, record)
 

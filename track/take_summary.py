@@ -105,8 +105,12 @@ def suspicions(take: Take) -> list[str]:
     fault = unit_fault(clouds, only_wide=True)
     if fault is not None:
         return [f"{fault.found}, expected meters; set the unit of the stream to meters{fault.hint}"]
+    return misfits(take) + [f"{fault.words}; {fault.remedy}" for fault in find_faults(take)]
+
+
+def misfits(take: Take) -> list[str]:
+    """Signs that the hands or the glove tracked are not those of the capture."""
     found = [sentence for side in take.sides for sentence in _suspicions_of(take, side)]
-    found += [f"{fault.words}; {fault.remedy}" for fault in find_faults(take)]
     share = _unlabeled_share(take)
     if share > _MOST_UNLABELED:
         found.append(

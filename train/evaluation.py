@@ -480,7 +480,7 @@ def evaluate_labeler(
         report = evaluate_frames(network, chain.from_iterable(map(_take_frames, simulated)))
         seconds = [np.tile(take.times.astype(np.int64), len(take.hands)) for take in simulated]
         report = _grouped(report, seconds, "seconds")
-    elif all(map(_is_set, given)):
+    elif given and all(map(_is_set, given)):
         sets = [load_dataset(one) for one in given]
         rows = np.concatenate([_rows(one, network.marker_names) for one in sets])[:: settings.every]
         if corruption == CLEAN:

@@ -626,7 +626,9 @@ def write_capture(path: str | Path, capture: Capture, *, source: str | Path | No
 
 
 def check_suffix(path: Path, valid: tuple[str, ...]) -> None:
-    """Refuse a path without one of the valid suffixes."""
+    """Refuse a folder, and a path without one of the valid suffixes."""
+    if path.is_dir():
+        raise CaptureError(f"{path}: this is a folder, expected a file ({', '.join(valid)})")
     if path.suffix.lower() not in valid:
         raise CaptureError(f"{path}: {choices(path.suffix, valid, noun='file type')}")
 
@@ -641,8 +643,6 @@ def find_captures(paths: Sequence[Path]) -> list[Path]:
         if not inside:
             raise CaptureError(f"{path} holds no capture; expected files {', '.join(READABLE)}")
         files += inside
-    if not files:
-        raise CaptureError("no capture was given; expected files or folders")
     return files
 
 

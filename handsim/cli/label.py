@@ -73,7 +73,7 @@ def _files(captures: tuple[Path, ...], out: Path) -> dict[Path, Path]:
     if len(captures) == 1 and not captures[0].is_dir() and not out.is_dir():
         check_suffix(out, WRITABLE)
         return {captures[0]: out}
-    if out.suffix.lower() in WRITABLE and not out.is_dir():
+    if captures and out.suffix.lower() in WRITABLE and not out.is_dir():
         raise ArgumentError(f"--out is {out} for several captures, expected a folder")
     files = {}
     for given in captures:

@@ -92,12 +92,13 @@ _SYSTEM_SENTENCES: Final = {
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Run `handsim ARGS` (those of the process by default) and return its exit code.
+    """Run `handsim ARGS` (those of the process by default) and return its exit code; `help X` is `X --help`.
 
     Raises:
         SystemExit: After a command's help (code 0) or a mistake in its options (code 2).
     """
-    return run(COMMANDS, sys.argv[1:] if args is None else args)
+    args = sys.argv[1:] if args is None else args
+    return run(COMMANDS, [*args[1:], "--help"] if args and args[0] == "help" else args)
 
 
 def run(commands: Table, args: Sequence[str]) -> int:

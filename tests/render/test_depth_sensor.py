@@ -152,6 +152,21 @@ def test_shifts_stay_on_one_side_or_the_other():
     assert not wrong[:, :156].any() and not wrong[:, 165:].any()
 
 
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"shift": np.nan}, "shift is nan, expected a number from 0 to 10"),
+        ({"shift": np.inf}, "shift is inf, expected a number from 0 to 10"),
+        ({"shift": -0.5}, "shift is -0.5, expected a number from 0 to 10"),
+        ({"shift": "wide"}, "shift is 'wide', expected a number"),
+        ({"window": 0}, "window is 0, expected at least 1"),
+    ],
+)
+def test_numbers_of_a_sensor_of_ones_own_are_checked(given, said):
+    with pytest.raises(ArgumentError, match=said):
+        StructuredLight(**given)
+
+
 def hidden_by(disparity):
     lit = np.ones(disparity.shape, np.bool_)
     keep_lit(disparity, lit)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
+import warnings
 
 import pytest
 
@@ -11,6 +13,7 @@ from gloves.fit import nominal_fit
 from handsim.errors import ArgumentError
 from track import TrackerConfig, TrackSettings
 from track.config import BOTH
+from track.settings import TrackerSetup
 
 
 def test_settings_come_back_from_json():
@@ -27,6 +30,14 @@ def test_objects_are_recorded_by_name():
     hands = [nominal_fit(layout, "M", "right")]
     record = TrackSettings(glove=layout, hands=hands).record()
     assert (record["glove"], record["hands"], record["labeler"]) == ("dense19", ["right"], None)
+
+
+def test_hands_in_a_named_glove_get_the_labeler_of_its_design():
+    worn = dataclasses.replace(load_layout("dense19"), name="worn")
+    settings = TrackSettings(glove="dense19", hands=[nominal_fit(worn, "M", "right")])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # of a labeler that is learned anew
+        assert TrackerSetup.of(settings).user.layout is worn
 
 
 def test_fields_that_are_named_differ_from_the_settings():

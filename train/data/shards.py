@@ -150,7 +150,8 @@ def load_manifest(path: Path) -> Manifest:
     """Manifest of a finished training set; its other files are not checked."""
     file = path / MANIFEST
     if not file.is_file():
-        hint = "is unfinished; run handsim generate again" if (path / CONFIG).is_file() else "holds none"
+        again = "is unfinished; run handsim generate again"
+        hint = again if (path / CONFIG).is_file() else "holds none; handsim generate makes one"
         raise DatasetError(f"expected a training set with a {MANIFEST}, but {path} {hint}")
     content = load_json(file)
     if content.get("schema") != SCHEMA:

@@ -15,6 +15,7 @@ import hashlib
 import json
 import math
 import os
+import tomllib
 import warnings
 from collections.abc import Mapping, Sequence
 from functools import cache
@@ -27,7 +28,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gloves.layout import MarkerLayout
+from gloves.layout import MarkerLayout, layout_lines, parse_layout
 from handsim import __version__
 from handsim.app.messages import tell_state, told_share
 from handsim.errors import HandSimWarning, WeightsError
@@ -210,9 +211,10 @@ def learned_labeler(layout: MarkerLayout, rig: CameraRig | str = "figure5") -> L
 
 @functools.lru_cache(maxsize=MAX_KEPT)
 def _digest(layout: MarkerLayout, rig: CameraRig | str) -> str:
-    """Digest of everything that a labeler depends on."""
+    """Digest of everything that a labeler depends on; of the layout as its file has it."""
+    saved = parse_layout(tomllib.loads("\n".join(layout_lines(layout))))
     dependencies = {
-        "layout": dataclasses.asdict(layout),
+        "layout": dataclasses.asdict(saved),
         "rig": load_rig(rig).record(),
         "weights": checksum(SHIPPED / WEIGHTS),
         "version": __version__,

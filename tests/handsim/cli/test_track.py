@@ -91,6 +91,15 @@ def test_a_user_is_calibrated_from_unlabeled_points(user, capsys):
     assert "right hand: tracked" in said
 
 
+@pytest.mark.slow
+def test_a_user_who_is_calibrated_in_a_wrong_glove_is_told(user, tmp_path, capsys):
+    folder, _ = user
+    asked = [str(folder / "user.c3d"), "--glove", "sparse13", "--out", str(tmp_path / "user.json")]
+    assert main(["calibrate", *asked, "--hands", "right", "--size", "L"]) == 0
+    said = capsys.readouterr().err
+    assert " of the points at the hands are not markers of what was tracked; name the glove worn" in said
+
+
 def test_users_that_do_not_fit_are_told(right_user, capture, tmp_path, capsys):
     shape, out = str(right_user), str(tmp_path / "out.npz")
     for arguments, words in (

@@ -129,13 +129,16 @@ def never(*_args, **_options):
     raise AssertionError("it was learned again")
 
 
-def test_a_glove_is_learned_once(quickly_learned, monkeypatch):
-    layout = load_layout("starter6")
+def test_a_glove_is_learned_once(quickly_learned, tmp_path, monkeypatch):
+    shipped = load_layout("starter6")
+    third = dataclasses.replace(shipped.markers[0], along=1 / 3)  # more decimals than a file has
+    layout = dataclasses.replace(shipped, markers=(third, *shipped.markers[1:]))
+    layout.save(tmp_path / "third.toml")
     assert not is_learned(layout)
     first = learned_labeler(layout)
     assert is_learned(layout) and len(learned_gloves()) == 1
     monkeypatch.setattr(layout_labeler, "fine_tuned_labeler", never)
-    again = learned_labeler(layout)
+    again = learned_labeler(load_layout(tmp_path / "third.toml"))
     for one, other in zip(first.label_frames([CLOUD]), again.label_frames([CLOUD]), strict=True):
         np.testing.assert_array_equal(one.labels, other.labels)
         np.testing.assert_array_equal(one.confidence, other.confidence)
