@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Final, Literal, Protocol
+from typing import Final, Literal
 
 import cv2
 import numpy as np
@@ -189,36 +189,32 @@ def contact_sheet(frames: Sequence[RenderedFrame], *, columns: int = 3, width: i
     return pad(np.concatenate(rows), (_GAP, 0), (_GAP, 0))
 
 
-class Skeleton(Protocol):
-    """A hand's keypoints in a picture, and which are visible; `HandTruth` is one."""
+def draw_keypoints(
+    picture: Picture,
+    hands: Iterable[tuple[Float[np.ndarray, "21 2"], Bool[np.ndarray, "21"]]],
+    *,
+    scale: float = 1.0,
+) -> Picture:
+    """The picture with the hands' skeletons in it, in the digits' colors.
 
-    @property
-    def keypoints(self) -> Float[np.ndarray, "21 2"]:
-        """Positions in the picture [px]."""
-
-    @property
-    def visible(self) -> Bool[np.ndarray, "21"]:
-        """Which keypoints are drawn as filled circles."""
-
-
-def draw_keypoints(picture: Picture, hands: Sequence[Skeleton], *, scale: float = 1.0) -> Picture:
-    """The picture with the hands' skeletons in it, in the digits' colors."""
+    Of each hand keypoints [px] are given, and which of them are visible; others are drawn hollow.
+    """
     drawn = np.ascontiguousarray(picture).copy()
     colors = np.rint(255 * bone_colors()).astype(int)
     inks = [tuple(colors[0 if digit < 0 else 1 + 3 * digit].tolist()) for digit in KEYPOINT_DIGITS]
     unit = 2**_FRACTION_BITS
     style = {"lineType": cv2.LINE_AA, "shift": _FRACTION_BITS}
-    for hand in hands:
-        near = (np.abs(np.nan_to_num(hand.keypoints)) < 1e5).all(axis=1)
-        known = np.isfinite(hand.keypoints).all(axis=1) & near
-        sixteenths = np.rint(unit * (scale * np.nan_to_num(hand.keypoints) - CENTER))
+    for keypoints, visible in hands:
+        near = (np.abs(np.nan_to_num(keypoints)) < 1e5).all(axis=1)
+        known = np.isfinite(keypoints).all(axis=1) & near
+        sixteenths = np.rint(unit * (scale * np.nan_to_num(keypoints) - CENTER))
         pixels = sixteenths.astype(int).clip(-(2**24), 2**24)
         for start, end in SKELETON:
             if known[start] and known[end]:
                 cv2.line(drawn, pixels[start].tolist(), pixels[end].tolist(), inks[end], 1, **style)
         for keypoint, pixel in enumerate(pixels.tolist()):
             if known[keypoint]:
-                thickness = -1 if hand.visible[keypoint] else 1
+                thickness = -1 if visible[keypoint] else 1
                 cv2.circle(drawn, pixel, 3 * unit, inks[keypoint], thickness, **style)
     return drawn
 
@@ -239,12 +235,12 @@ def colored_depth(depth: Float32[np.ndarray, "H W"]) -> Picture:
 def _cell(frame: RenderedFrame, width: int) -> Picture:
     sensed = as_sensed(frame)
     scale = min(1.0, width / frame.camera.size[0])
-    parts = []
+    parts, hands = [], [(hand.keypoints, hand.visible) for hand in frame.hands]
     if sensed.rgb is not None:
-        parts.append(draw_keypoints(_scaled(sensed.rgb, scale), frame.hands, scale=scale))
+        parts.append(draw_keypoints(_scaled(sensed.rgb, scale), hands, scale=scale))
     if sensed.depth is not None:
         depth = _scaled(colored_depth(sensed.depth), scale)
-        parts.append(depth if parts else draw_keypoints(depth, frame.hands, scale=scale))
+        parts.append(depth if parts else draw_keypoints(depth, hands, scale=scale))
     return side_by_side(parts)
 
 

@@ -493,10 +493,9 @@ def sample_places(
             along = rng.uniform(*(_TIP_ALONG if name.endswith("distal") else _FINGER_ALONG))
             around, across = np.clip(_AROUND * rng.standard_normal(), -_MAX_AROUND, _MAX_AROUND), 0.0
         place = MarkerPlace(f"place{len(places)}", name, along, float(np.deg2rad(around)), across)
-        copies = tuple(dataclasses.replace(place, name=str(number)) for number in range(5))
         missed += 1
         try:
-            point = np.asarray(attach_markers(MarkerLayout("place", copies, MARKER_RADIUS), model).points[0])
+            point = np.asarray(attach_markers(layout_of([place], MARKER_RADIUS), model).points[0])
         except LayoutError:
             continue  # the place is off the skin
         if all(np.linalg.norm(point - other) > apart for other in points):

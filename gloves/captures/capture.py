@@ -12,11 +12,9 @@ from typing import Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from numpy.typing import NDArray
 
 from gloves.captures.text import check_rate
 from handsim.errors import ArgumentError, CaptureError, HandSimWarning, choices, errors_of
-from handsim.kernels import kernel, squared_distance
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -172,7 +170,10 @@ class UnitFault(NamedTuple):
 
 def spacing(cloud: Float[np.ndarray, "N 3"]) -> float:
     """Median distance of a point from its nearest neighbor [m], of two points or more."""
-    return float(np.median(np.sqrt(_nearest_squared(np.ascontiguousarray(cloud, dtype=np.float64)))))
+    from scipy.spatial import cKDTree
+
+    distances, _ = cKDTree(cloud).query(cloud, k=2)  # the nearest is the point itself
+    return float(np.median(distances[:, 1]))
 
 
 def unit_fault(clouds: Sequence[Float[np.ndarray, "N 3"]], *, only_wide: bool = False) -> UnitFault | None:
@@ -198,18 +199,6 @@ def unit_fault(clouds: Sequence[Float[np.ndarray, "N 3"]], *, only_wide: bool = 
     if apart > _MAX_SPACING:
         return UnitFault(f"the points of a frame are {apart:.2g} m apart", "centimeters")
     return None
-
-
-@kernel
-def _nearest_squared(cloud: Float[np.ndarray, "N 3"]) -> NDArray[np.float64]:
-    """Squared distance (N,) of each point from the nearest other one [m^2]."""
-    nearest = np.full(len(cloud), np.inf)
-    for i in range(len(cloud)):
-        for j in range(i):
-            squared = squared_distance(cloud[i], cloud[j])
-            nearest[i] = min(nearest[i], squared)
-            nearest[j] = min(nearest[j], squared)
-    return nearest
 
 
 def all_at_origin(clouds: Sequence[Float[np.ndarray, "N 3"]]) -> bool:

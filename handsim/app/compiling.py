@@ -12,17 +12,16 @@ import functools
 import gc
 import importlib
 import json
-import os
-import subprocess
-import sys
-import threading
 import time
-from collections.abc import Iterable, Mapping
+import warnings
+from collections.abc import Mapping
+from concurrent.futures import FIRST_COMPLETED, Future, wait
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from handsim.app.messages import tell_state
-from handsim.app.workers import one_thread, usable_cores, without_signals
+from handsim.app.workers import LocalProcesses, usable_cores
 from handsim.callbacks import before_compiling
 
 if TYPE_CHECKING:
@@ -31,7 +30,6 @@ if TYPE_CHECKING:
 LIST: Final = Path(__file__).parents[1] / "data" / "kernels.json"
 _FEW: Final = 4.0  # Processes are started only if there is more than this to compile [s].
 _TOLD: Final = 2.0  # [s] between two lines
-_ENDING: Final = 5.0  # [s] that a process has to end
 _MOST: Final = 8  # processes; more would wait for one another
 _KNOWN: Final = 3.0  # A process ranks a kernel so much higher if it has compiled others of its package.
 _GARBAGE: Final = 100_000  # new objects before Python collects garbage, which else takes 5 % of the time
@@ -49,6 +47,11 @@ class ListedKernel(NamedTuple):
     commands: str
     """Commands that need the kernel, with spaces between them."""
 
+    @property
+    def package(self) -> str:
+        """The package of the kernel's module."""
+        return self.name.rpartition(".")[0]
+
 
 def compile_kernels(command: str | None = None) -> tuple[int, int]:
     """Compile the kernels of a command, by default those of all, that the cache lacks.
@@ -62,8 +65,7 @@ def compile_kernels(command: str | None = None) -> tuple[int, int]:
         before_compiling.append(functools.partial(tell_state, "compiling what is new, once on this machine"))
     if sum(one.seconds for one in missing.values()) <= (0.0 if command is None else _FEW):
         return 0, len(missing)
-    with _Compilers(missing) as compilers:
-        compilers.run()
+    _compile_all(missing)
     rest = len(missing_kernels(missing))
     return len(missing) - rest, rest
 
@@ -168,113 +170,76 @@ def needed_kernels(kernel: CPUDispatcher) -> set[str]:
     return names
 
 
-class _Compilers:
-    """Processes that compile kernels, each after those that it calls; they end with the block."""
+class _Queue:
+    """Kernels to compile, each after those that it calls."""
 
     def __init__(self, listed: Mapping[int, ListedKernel]) -> None:
-        self._todo, self._now, self._done = dict(listed), dict[int, ListedKernel](), 0.0
-        self._total, self._count = sum(one.seconds for one in listed.values()), len(listed)
+        self.waiting, self.running = dict(listed), dict[int, ListedKernel]()
         self._needs = {one.name: needed_kernels(_found(one.name)) for one in listed.values()}
         # Kernels that others wait for come first: those with the most to compile along one line of calls.
         self._rank: dict[str, float] = {}
         for one in sorted(listed.values(), key=lambda one: -len(self._needs[one.name])):
             after = (self._rank[name] for name in self._rank if one.name in self._needs[name])
             self._rank[one.name] = max(self._rank.get(one.name, 0.0), one.seconds + max(after, default=0.0))
-        self._changed = threading.Condition()
-        self._processes: list[subprocess.Popen[str]] = []
 
-    def __enter__(self) -> _Compilers:
-        home = str(Path(__file__).parents[2])
-        path = os.pathsep.join(filter(None, (home, os.environ.get("PYTHONPATH"))))
-        command = [sys.executable, "-P", "-m", __name__]
-        with one_thread(), without_signals(), contextlib.suppress(OSError):  # no memory for another process
-            for _ in range(min(usable_cores(), self._count, _MOST)):
-                self._processes.append(
-                    subprocess.Popen(
-                        command,
-                        stdin=subprocess.PIPE,
-                        stdout=subprocess.PIPE,
-                        stderr=subprocess.DEVNULL,
-                        text=True,
-                        env={**os.environ, "PYTHONPATH": path},
-                    )
-                )
-        return self
+    def take(self, known: set[str]) -> int | None:
+        """The row of the next kernel for a process, None if all wait for others.
 
-    def __exit__(self, *_: object) -> None:
-        for process in self._processes:
-            process.kill()
-            process.wait(_ENDING)
-            for pipe in (process.stdin, process.stdout):
-                with contextlib.suppress(OSError):
-                    pipe.close()  # type: ignore[union-attr]
+        A process also compiles the parts of numba that its kernels use, so it keeps to few packages:
+        those that are `known` to it, where that of its new kernel is added.
+        """
+        busy = {one.name for one in self.running.values()}
+        waited_for = busy | {one.name for one in self.waiting.values()}
+        ranks = {
+            row: self._rank[one.name] * (_KNOWN if one.package in known else 1.0)
+            for row, one in self.waiting.items()
+            if one.name not in busy and not self._needs[one.name] & waited_for - {one.name}
+        }
+        if not ranks:
+            return None
+        row = max(ranks, key=lambda row: ranks[row])
+        self.running[row] = self.waiting.pop(row)
+        known.add(self.running[row].package)
+        return row
 
-    def run(self) -> None:
-        """Compile the kernels, and show the progress."""
-        began = time.monotonic()
-        threads = [threading.Thread(target=self._feed, args=(one,), daemon=True) for one in self._processes]
-        tell_state(f"compiling {self._count} kernels, once on this machine")
-        for thread in threads:
-            thread.start()
-        told, first = began, (began, 0.0)  # speed counts from the first kernel, when processes have started
-        while any(thread.is_alive() for thread in threads):
-            with self._changed:
-                self._changed.wait(_TOLD / 10.0)
-                done = self._count - len(self._todo) - len(self._now)
+
+def _compile_all(listed: Mapping[int, ListedKernel]) -> None:
+    """Compile kernels in processes that end afterwards, and show the progress."""
+    what = f"compiling {len(listed)} kernels, once on this machine"
+    queue, total, done = _Queue(listed), sum(one.seconds for one in listed.values()), 0.0
+    told, first = time.monotonic(), (0.0, 0.0)  # speed counts from the first kernel, when processes run
+    tell_state(what)
+    with ExitStack() as stack:
+        processes = [LocalProcesses(1) for _ in range(min(usable_cores(), len(listed), _MOST))]
+        for one in processes:
+            stack.callback(one.end)
+        known = {one: set[str]() for one in processes}
+        jobs: dict[Future[None], tuple[LocalProcesses, int]] = {}
+        while True:
+            for process in processes[:]:
+                if (row := queue.take(known[process])) is not None:
+                    processes.remove(process)
+                    try:
+                        jobs[process.submit(_compile_row, row)] = process, row
+                    except OSError:  # no memory for another process
+                        del queue.running[row]
+            if not jobs:  # the remaining kernels call one another, or all processes died
+                break
+            for job in wait(jobs, _TOLD, FIRST_COMPLETED).done:
+                process, row = jobs.pop(job)
+                done += queue.running.pop(row).seconds
+                if job.exception() is None:  # else the process died
+                    processes.append(process)
             now = time.monotonic()
-            if not first[1]:
-                first = now, self._done
+            if done and not first[0]:
+                first = now, done
             if now >= told + _TOLD:
                 told = now
-                speed = (self._done - first[1]) / (now - first[0]) if now > first[0] else 0.0
-                rest = f", about {(self._total - self._done) / speed:.0f} s left" if speed else ""
-                tell_state(f"compiling {self._count} kernels, once on this machine: {done} done{rest}")
-        tell_state("")
-
-    def _feed(self, process: subprocess.Popen[str]) -> None:
-        """Hand kernels to a process until none is left or it dies."""
-        assert process.stdin is not None and process.stdout is not None
-        packages: set[str] = set()
-        while (row := self._take(packages)) is not None:
-            alive = False
-            with contextlib.suppress(OSError, ValueError):
-                process.stdin.write(f"{row}\n")
-                process.stdin.flush()
-                alive = process.stdout.readline() != ""
-            with self._changed:
-                self._done += self._now.pop(row).seconds
-                self._changed.notify_all()
-            if not alive:
-                return
-
-    def _take(self, packages: set[str]) -> int | None:
-        """The next kernel, once the kernels that it calls are compiled; None if none is left.
-
-        A process also compiles the parts of numba that its kernels use, so it keeps to few packages.
-        """
-
-        def rank(row: int) -> float:
-            name = self._todo[row].name
-            return self._rank[name] * (_KNOWN if name.rpartition(".")[0] in packages else 1.0)
-
-        with self._changed:
-            while self._todo:
-                busy = {one.name for one in self._now.values()}
-                waited_for = busy | {one.name for one in self._todo.values()}
-                ready = [
-                    row
-                    for row, one in self._todo.items()
-                    if one.name not in busy and not self._needs[one.name] & waited_for - {one.name}
-                ]
-                if ready:
-                    row = max(ready, key=rank)
-                    self._now[row] = self._todo.pop(row)
-                    packages.add(self._now[row].name.rpartition(".")[0])
-                    return row
-                if not self._now:  # the remaining kernels call one another
-                    break
-                self._changed.wait()
-            return None
+                speed = (done - first[1]) / (now - first[0]) if now > first[0] else 0.0
+                rest = f", about {(total - done) / speed:.0f} s left" if speed else ""
+                count = len(listed) - len(queue.waiting) - len(queue.running)
+                tell_state(f"{what}: {count} done{rest}")
+    tell_state("")
 
 
 def plain_shape_errors() -> None:
@@ -299,17 +264,18 @@ def plain_shape_errors() -> None:
     arrayobj.raise_with_shape_context = complain
 
 
-def _work(rows: Iterable[str]) -> None:
-    """Compile kernels by their rows in the list, and print each row when its kernel is in the cache."""
+@functools.cache
+def _prepared() -> tuple[list[ListedKernel], list[Any]]:
+    """The list and its types, in a process that compiles kernels and does nothing else."""
     gc.set_threshold(_GARBAGE)
+    warnings.simplefilter("ignore")
     plain_shape_errors()
-    listed, known = read_list(), known_types()
-    for row in rows:
-        one = listed[int(row)]
-        with contextlib.suppress(Exception):  # a kernel that cannot be compiled raises where it is called
-            _found(one.name).compile(tuple(known[number] for number in one.types))
-        print(row.strip(), flush=True)
+    return read_list(), known_types()
 
 
-if __name__ == "__main__":
-    _work(sys.stdin)
+def _compile_row(row: int) -> None:
+    """Compile the kernel of a row in the list, if that can be done."""
+    listed, known = _prepared()
+    one = listed[row]
+    with contextlib.suppress(Exception):  # a kernel that cannot be compiled raises where it is called
+        _found(one.name).compile(tuple(known[number] for number in one.types))

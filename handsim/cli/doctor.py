@@ -279,18 +279,15 @@ def _finish(process: subprocess.Popen[str]) -> tuple[int, str]:
 
 
 def _print_report(findings: Sequence[Finding]) -> None:
-    from rich.console import Console
-    from rich.table import Table
     from rich.text import Text
 
-    table = Table("", "what", "found", "expected", box=None, pad_edge=False)
+    from handsim.app.messages import print_line, print_table
+
+    rows: list[list[str | Text]] = [["", "what", "found", "expected"]]
     for finding in findings:
-        mark = "[green]ok" if not finding.remedy else "[red]missing" if finding.needed else "[yellow]low"
-        table.add_row(mark, Text(finding.what), Text(finding.found), Text(finding.expected))
-    console = Console()
-    console.print(table)
-    troubles = [finding for finding in findings if finding.remedy]
-    for finding in troubles:
-        console.print(Text(f"{finding.what}: {finding.remedy}."), soft_wrap=True)
-    if not troubles:
-        console.print("Nothing is missing.")
+        bad = Text("missing", "red") if finding.needed else Text("low", "yellow")
+        mark = bad if finding.remedy else Text("ok", "green")
+        rows.append([mark, finding.what, finding.found, finding.expected])
+    print_table(rows, left=4, wraps=True)
+    troubles = [f"{finding.what}: {finding.remedy}." for finding in findings if finding.remedy]
+    print_line(*(troubles or ["Nothing is missing."]))

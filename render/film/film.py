@@ -7,10 +7,9 @@ import os
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
-from jaxtyping import Bool, Float
 
 from gloves.takes.take import Take, load_take
 from handsim._checks import check_type
@@ -200,13 +199,6 @@ def filmed_take(take: Take, registration: Registration, *, every: bool = False) 
     )  # fmt: skip
 
 
-class _Skeleton(NamedTuple):
-    """A hand that `draw_keypoints` draws."""
-
-    keypoints: Float[np.ndarray, "21 2"]
-    visible: Bool[np.ndarray, "21"]
-
-
 def _drawn_over(film: Film, take: Take, registration: Registration) -> Iterator[Bytes]:
     """The frames of a video with the skeletons of the take's hands, hollow where the frame does not count."""
     whole = filmed_take(take, registration, every=True).keypoints()
@@ -214,4 +206,4 @@ def _drawn_over(film: Film, take: Take, registration: Registration) -> Iterator[
         fits = np.full(NUM_KEYPOINTS, not registration.reasons[number])
         camera = registration.camera_of(number)
         there = [hand for hand in whole[number] if np.isfinite(hand[0, 0])]
-        yield draw_keypoints(picture, [_Skeleton(camera.project(hand), fits) for hand in there])
+        yield draw_keypoints(picture, [(camera.project(hand), fits) for hand in there])

@@ -49,27 +49,6 @@ _WITHIN: Final = 0.8  # share of the edges whose largest distance is told
 _OTHER: Final = 4.0  # [px] The outline this near to another hand or thing is left out.
 
 
-class Edges(NamedTuple):
-    """Points of outlines, and where in the pictures they are seen."""
-
-    frames: Integers  # (N,)
-    pixels: Doubles  # (N, 2): where each edge is, as a bundle counts them
-    normals: Doubles  # (N, 2): unit normals of the edges, out of the hand
-    points: Doubles  # (N, 3): on the drawn hand [m]
-    velocities: Doubles  # (N, 3) [m/s]
-    outward: Doubles  # (N, 3): unit normals of the hand's surface
-    times: Doubles  # (N,): of the take, at which the points are there [s]
-    offsets: Doubles  # (N,): distance of the edge from the drawn outline [px]
-
-    def samples(self) -> Samples:
-        """The edges for a bundle."""
-
-        def points_at(times: Doubles) -> Doubles:
-            return self.points + self.velocities * (times - self.times)[:, None]
-
-        return Samples(self.frames, self.pixels, self.normals, self.outward, points_at)
-
-
 class Seen(NamedTuple):
     """How well the outlines of hands are seen in frames; NaN where there is no hand."""
 
@@ -132,8 +111,11 @@ class Outlines:
 
     def edges(
         self, bundle: Bundle, state: State, looks: Iterable[tuple[int, Bytes]], reach: float
-    ) -> tuple[Edges | None, Seen]:
-        """The edges within `reach` [widths] in numbered frames, if any, and how well they are seen."""
+    ) -> tuple[Samples | None, Doubles, Seen]:
+        """Edges within `reach` [widths] in numbered frames, and how well they are seen.
+
+        None stands for no outline. Edges have unit normals, and distances (N,) from the drawn outlines [px].
+        """
         take, times, cameras = self._take, bundle.times(state), bundle.cameras(state)
         spans = state.spans(np.arange(len(times)))
         moments = shutter_times(take, times, [cameras[span] for span in spans], state.values[READOUT])
@@ -160,15 +142,19 @@ class Outlines:
                 places = look.corner + outline.pixels + offsets[:, None] * outline.normals
                 pixels, normals = self._pictured(views[0], places, outline.normals)
                 velocities = self._moved(hand, qpos[frame, hand], outline)
-                parts.append(Edges(
-                    np.full(len(away), frame), pixels, normals, outline.points, velocities, outline.outward,
-                    np.full(len(away), moments[frame, hand]), away,
-                ))  # fmt: skip
+                kept = np.isfinite(normals[:, 0])  # others are beyond what the lens sees
+                here, then = np.full(len(away), frame), np.full(len(away), moments[frame, hand])
+                found = here, pixels, normals, outline.outward, away, outline.points, velocities, then
+                parts.append([values[kept] for values in found])
         if not parts:
-            return None, Seen(*seen)
-        found = Edges._make(np.concatenate(values) for values in zip(*parts, strict=True))
-        kept = np.isfinite(found.normals[:, 0])  # others are beyond what the lens sees
-        return Edges._make(values[kept] for values in found), Seen(*seen)
+            return None, np.empty(0), Seen(*seen)
+        frames, pixels, normals, outward, offsets, points, velocities, then = map(
+            np.concatenate, zip(*parts, strict=True)
+        )
+        edges = Samples(
+            frames, pixels, normals, outward, lambda times: points + velocities * (times - then)[:, None]
+        )
+        return edges, offsets, Seen(*seen)
 
     def _shrunk_camera(self, camera: Camera) -> Camera:
         K = np.diag([self._scale, self._scale, 1.0]) @ camera.K

@@ -35,7 +35,7 @@ from render.film.bundle import (
     Samples,
     State,
 )
-from render.film.outlines import Edges, Outlines, Seen
+from render.film.outlines import Outlines, Seen
 from render.frames import Bytes, Doubles
 from render.video import straight
 
@@ -318,16 +318,15 @@ def _outlined(
     chosen = set(shown[np.linspace(0, len(shown) - 1, _MOST_LOOKED).astype(int)].tolist())
     looks = [(n, outlines.shrunk(picture)) for n, picture in enumerate(pictures()) if n in chosen]
     for turn, reach in enumerate(_REACHES):
-        edges, _ = outlines.edges(bundle, state, looks, reach)
-        if edges is None or len(edges.frames) < _FEWEST_EDGES * _FEWEST_FRAMES:
+        samples, *_ = outlines.edges(bundle, state, looks, reach)
+        if samples is None or len(samples.frames) < _FEWEST_EDGES * _FEWEST_FRAMES:
             return None
-        samples = edges.samples()
         state, _, covariance = bundle.solve(state, samples, noise, first=turn == 0)
         noise = max(0.3, float(np.median(np.abs(bundle.residuals(state, samples, 1.0)))) / 0.6745)
     every = ((n, outlines.shrunk(picture)) for n, picture in enumerate(pictures()))
-    edges, seen = outlines.edges(bundle, state, every, _REACHES[1])
+    edges, offsets, seen = outlines.edges(bundle, state, every, _REACHES[1])
     fit = _keypoint_fit(bundle, state)
-    return state, covariance, fit if edges is None else _outline_fit(bundle, edges, seen, fit)
+    return state, covariance, fit if edges is None else _outline_fit(bundle, edges, offsets, seen, fit)
 
 
 def _split(bundle: Bundle, state: State, noise: float) -> State:
@@ -394,7 +393,7 @@ def _keypoint_fit(bundle: Bundle, state: State) -> _Fit:
     return _Fit(distances, reasons.tolist(), pixels[frames, hands, keypoints] + errors, errors)
 
 
-def _outline_fit(bundle: Bundle, edges: Edges, seen: Seen, fit: _Fit) -> _Fit:
+def _outline_fit(bundle: Bundle, edges: Samples, offsets: Doubles, seen: Seen, fit: _Fit) -> _Fit:
     """How well frames fit by their outlines, or by their keypoints where hardly an outline is seen."""
     told = seen.found >= np.maximum(_FEWEST_EDGES, _SEEN * seen.tried)
     middle, most = (np.where(told, one, np.nan) for one in (seen.middle, seen.most))
@@ -408,5 +407,5 @@ def _outline_fit(bundle: Bundle, edges: Edges, seen: Seen, fit: _Fit) -> _Fit:
     }
     reasons = np.select(list(cases.values()), list(cases), fit.reasons)
     kept = (reasons == "")[edges.frames]
-    errors = edges.offsets[kept, None] * edges.normals[kept]
+    errors = offsets[kept, None] * edges.normals[kept]
     return _Fit(np.fmax.reduce(middle, axis=1), reasons.tolist(), edges.pixels[kept], errors)

@@ -79,16 +79,14 @@ def test_the_sheet_has_a_place_for_every_frame(make_frame) -> None:
 def test_keypoints_are_where_they_are(make_frame) -> None:
     frame = make_frame()
     black = np.zeros((72, 96, 3), np.uint8)
-    hand = dataclasses.replace(frame.hands[0], keypoints=np.full((21, 2), np.nan))
-    assert not draw_keypoints(black, [hand]).any()
+    visible = frame.hands[0].visible
+    assert not draw_keypoints(black, [(np.full((21, 2), np.nan), visible)]).any()
     pixels = np.full((21, 2), np.nan)
     pixels[8] = (30.5, 20.5)
-    drawn = draw_keypoints(black, [dataclasses.replace(hand, keypoints=pixels, visible=np.ones(21, bool))])
+    drawn = draw_keypoints(black, [(pixels, np.ones(21, bool))])
     rows, columns = np.nonzero(drawn.any(axis=-1))
     assert (rows.mean(), columns.mean()) == pytest.approx((20.0, 30.0), abs=0.05)
-    twice = draw_keypoints(
-        np.zeros((144, 192, 3), np.uint8), [dataclasses.replace(hand, keypoints=pixels)], scale=2
-    )
+    twice = draw_keypoints(np.zeros((144, 192, 3), np.uint8), [(pixels, visible)], scale=2)
     rows, columns = np.nonzero(twice.any(axis=-1))
     assert (rows.mean(), columns.mean()) == pytest.approx((40.5, 60.5), abs=0.3)
     assert not black.any()

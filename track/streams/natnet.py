@@ -1,6 +1,6 @@
 """NatNet, the protocol in which OptiTrack servers (Motive) stream markers: packets, a client and a server.
 
-Packets of versions 3.0 to 4.1 are little-endian: kind and payload size (two uint16), then the payload. Only a
+Packets of versions 3.0 to 4.1 are little-endian: kind and payload size (two uint16), then the payload. Of a
 frame only the lists of markers are read, and the points of marker sets and assets if no labeled marker is in
 a list, because Motive can switch these off. Every count is checked against the remaining bytes before use.
 """
