@@ -266,8 +266,8 @@ _LABELED: Final = (-8.11, 0.72, 3.08, 0.08, 0.68, 1.49, 2.49, 0.78)
 _UNLABELED: Final = (-9.44, 3.91, 3.13, 6.01, -0.76, 3.30, 1.62, 0.76, 1.35, 2.0)
 """Log-odds that an unlabeled point is a marker: bias, and weight of each piece of evidence.
 
-Markers that are hardly ever seen are rare in the captures. The last weight is therefore not fitted: from 1.7 on
-it lists a fingertip that is seen in nine of 600 frames, 24 mm from where the pose has it.
+The last weight is not fitted, as markers that are hardly ever seen are rare in the captures: from 1.7 on it
+lists a fingertip that is seen in nine of 600 frames, 24 mm from where the pose has it.
 """
 
 
