@@ -88,6 +88,23 @@ def test_a_foreign_marker_without_a_label_is_sure(tracked):
     assert (confidence_of(dataclasses.replace(tracked, **columns))[:, -1] > 0.9).all()
 
 
+def test_points_that_come_and_go_at_one_offset_from_a_marker_that_is_not_seen(tracked):
+    marker, hand = tracked.label_names.index("right:IndexTip"), tracked.hands[0]
+    bones = hand.model.forward_kinematics(tracked.qpos[:, 0])[:, hand.attachment.main_bones[marker], :3, :3]
+    shifted = tracked.pose_markers("right")[:, marker] + bones @ (0.0, 0.0, 0.012)
+
+    def confidence(frames: list[int]) -> np.ndarray:
+        points, labels, known = tracked.points.copy(), tracked.labels.copy(), tracked.confidence.copy()
+        rows, columns = np.nonzero(labels == marker)
+        points[rows, columns], labels[rows, columns] = shifted[rows], -1
+        hidden = ~np.isin(rows, frames)
+        points[rows[hidden], columns[hidden]] = known[rows[hidden], columns[hidden]] = np.nan
+        found = confidence_of(dataclasses.replace(tracked, points=points, labels=labels, confidence=known))
+        return found[rows[~hidden], columns[~hidden]]
+
+    assert confidence([50]) > 0.9 and (confidence(list(range(5, 115, 12))) < 0.8).all()
+
+
 def test_a_take_without_poses_keeps_its_confidence(tracked):
     blank = np.full(tracked.qpos.shape, np.nan)
     take = dataclasses.replace(tracked, qpos=blank, status=np.full(tracked.status.shape, LOST))
