@@ -250,6 +250,5 @@ def _drawn_balls(centers: Doubles, radius: float, *ids: Bytes) -> Drawn:
     vertices, normals, faces = sphere_surface(centers, radius, level=_BALL_LEVEL)
     each = len(faces) // len(centers)
     triangles = Triangles(vertices, faces, normals, *(np.repeat(one, each) for one in ids))
-    colors = np.ones((len(vertices), 4), dtype=np.float32)
-    colors[:, :3] = linear(MARKER_COLOR)
+    colors = np.tile(np.array([*linear(MARKER_COLOR), 1.0], np.float32), (len(vertices), 1))
     return Drawn(triangles, colors, None, ball_material)
