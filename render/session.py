@@ -77,6 +77,7 @@ def draw(
     source: Take | str | Path | ArrayLike,
     *,
     model: Model | tuple[Model, Model] | None = None,
+    glove: MarkerLayout | str | None = None,
     camera: Cameras | None = None,
     frames: Iterable[int] | None = None,
     record: Mapping[str, Any] | None = None,
@@ -92,6 +93,7 @@ def draw(
             (T, 20) with the wrist at the origin, or poses of two hands (T, 2, 27) [m, rad]. NaN is a hand
             that is not there.
         model: The hand of your own poses, or both in the poses' order; drawn people when not given.
+        glove: Marker layout on the hands of your poses, where they wear gloves; dense19 when not given.
         camera: Camera of your own, fixed in the world and used as it is, or several; or the name of a preset.
             Without it, viewpoints are drawn as `RenderConfig.view` says.
         frames: Numbers of the frames; those that `RenderConfig` chooses when not given.
@@ -108,8 +110,8 @@ def draw(
         HandSimError: The source or the settings cannot be drawn, or a camera stands in a hand or an object.
     """
     config = configured(config, camera, settings).resolved()
-    subject = load_subject(source_of(source, model=model, seed=config.seed), seed=config.seed)
-    drawing = Drawing(subject, config)
+    kept = source_of(source, model=model, glove=glove, seed=config.seed)
+    drawing = Drawing(load_subject(kept, seed=config.seed), config)
     check_hands_in_view(config.view, drawing.viewpoints, drawing.take)
     if record is None:
         return drawing.frames(0, ((n, n) for n in drawing.chosen_frames(frames)))

@@ -106,7 +106,7 @@ def hand_truth(
         openxr_visible=visible[len(keypoints) :],
         tracking=tracking,
         marker_names=figure.fit.layout.names if worn else (),
-        markers=figure.markers(qpos) if worn else np.empty((0, 3)),
+        markers=figure.fit.markers(qpos[None])[0][0] if worn else np.empty((0, 3)),
     )
 
 

@@ -77,6 +77,7 @@ def shade_colors(shade: Float32[np.ndarray, "D"]) -> Float32[np.ndarray, "D 4"]:
 _BALL_LEVEL: Final = 2
 _BASE: Final = (0.85, 0.4)  # radius of a marker's base on the glove and in the marker [marker radii]
 _BASE_SIDES: Final = 12
+_EDGE: Final = np.deg2rad(60.0)  # angle between faces of an object from which their edge is drawn sharp
 _BODY_BALLS: Final = 0.0032  # [m] radius of the markers of rigid bodies, 6.4 mm in diameter (Han et al. 2018)
 
 
@@ -178,10 +179,6 @@ class HandFigure:
             drawn.append(_drawn_bases(feet, markers, normals, radius, parts, instances, np.zeros_like(parts)))
         return drawn
 
-    def markers(self, qpos: Float[np.ndarray, "27"]) -> Float[np.ndarray, "M 3"]:
-        """Centers of the glove's markers in the world [m]."""
-        return np.asarray(self.fit.markers(qpos[None])[0][0])
-
     def _material(self) -> Material:
         if self._painted is None:
             look, side = self.look, self.fit.side
@@ -200,18 +197,22 @@ class BodyFigure:
         self._markers = body.positions if self._thing is None else self._thing.markers
         self._material = functools.cache(lambda: Material(linear(color), 0.5))  # such as plastic
         if self._thing is not None:
-            self._normals = vertex_normals(self._thing.vertices, self._thing.faces)
+            vertices, faces = self._thing.vertices, self._thing.faces
+            solid = trimesh.Trimesh(vertices, faces, process=False)
+            smooth = solid.face_adjacency[solid.face_adjacency_angles < _EDGE]
+            patches = np.repeat(trimesh.graph.connected_component_labels(smooth, node_count=len(faces)), 3)
+            corners, rows = np.unique(np.stack([faces.ravel(), patches]), axis=1, return_inverse=True)
+            self._vertices, self._faces = vertices[corners[0]], rows.reshape(-1, 3)
+            self._normals = vertex_normals(self._vertices, self._faces)
 
     def drawn(self, T_world_body: Float[np.ndarray, "4 4"], instance: int) -> list[Drawn]:
         """Its surface, where that is known, and its markers."""
         rotation, position, drawn = T_world_body[:3, :3], T_world_body[:3, 3], []
-        thing = self._thing
-        if thing is not None:
-            ids = [np.full(len(thing.faces), number, dtype=np.uint8) for number in (0, instance, 0)]
-            vertices = thing.vertices @ rotation.T + position
-            triangles = Triangles(vertices, thing.faces, self._normals @ rotation.T, *ids)
-            white = np.ones((len(vertices), 4), dtype=np.float32)
-            drawn.append(Drawn(triangles, white, None, self._material))
+        if self._thing is not None:
+            ids = [np.full(len(self._faces), number, dtype=np.uint8) for number in (0, instance, 0)]
+            vertices = self._vertices @ rotation.T + position
+            triangles = Triangles(vertices, self._faces, self._normals @ rotation.T, *ids)
+            drawn.append(Drawn(triangles, np.ones((len(vertices), 4), np.float32), None, self._material))
         if len(self._markers):
             centers, zeros = self._markers @ rotation.T + position, np.zeros(len(self._markers), np.uint8)
             drawn.append(_drawn_balls(centers, _BODY_BALLS, zeros, zeros + np.uint8(instance), zeros))
@@ -249,6 +250,5 @@ def _drawn_balls(centers: Doubles, radius: float, *ids: Bytes) -> Drawn:
     vertices, normals, faces = sphere_surface(centers, radius, level=_BALL_LEVEL)
     each = len(faces) // len(centers)
     triangles = Triangles(vertices, faces, normals, *(np.repeat(one, each) for one in ids))
-    colors = np.ones((len(vertices), 4), dtype=np.float32)
-    colors[:, :3] = linear(MARKER_COLOR)
+    colors = np.tile(np.array([*linear(MARKER_COLOR), 1.0], np.float32), (len(vertices), 1))
     return Drawn(triangles, colors, None, ball_material)

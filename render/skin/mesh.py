@@ -248,8 +248,7 @@ def _hills(model: HandModel, rest: Doubles, normals: Doubles) -> Iterator[_Hill]
         here = 0.5 * (frames[first, :2, 3] + frames[second, :2, 3])
         parted = here + 0.45 * (0.5 * (frames[first + 1, :2, 3] + frames[second + 1, :2, 3]) - here)
         along, aside = along_segment(skin.points[:, :2], here, parted)
-        hollow = -0.0050 * bump(aside, scale * 0.0048) * smooth(skin.normals[:, 2], 0.0, 0.6)
-        hollow *= 1.0 - 0.4 * along
+        hollow = (0.0012 * along - 0.003) * bump(aside, scale * 0.0055) * smooth(skin.normals[:, 2], 0.0, 0.6)
         yield _Hill(f"{_FINGERS[number]}_MCP_flexion", 10.0, 75.0, scale * hollow)
     # The thumb's knuckles, its waist and pad, and the muscle between it and the index when they close.
     yield _Hill("thumb_MCP_flexion", 0.0, 55.0, skin.knob(2, 0.0022, 0.0070, 0.0068))
@@ -309,12 +308,11 @@ class _Skin(NamedTuple):
 
 
 def _finger(skin: _Skin, number: int, digit: str, wide: float) -> Iterator[_Hill]:
-    """Hills of a finger's knuckles, tendon, shaft, neck and sides, and the pads that bending pushes out."""
+    """Hills of a finger's knuckles, tendon, neck and sides, and the pads that bending pushes out."""
     first, size, bent = 1 + 3 * number, skin.scale, f"{digit}_MCP_flexion"
     middle = 0.5 * float(np.linalg.norm(skin.frames[first + 1, :3, 3] - skin.frames[first, :3, 3])) / size
     for bone, joint, start, full, height, long, broad, at in (
-        (first, "MCP", 5.0, 75.0, 0.0046 * wide, 0.0068, 0.0054, (-0.001, 0.0)),
-        (first, "MCP", 10.0, 85.0, -0.0018 * wide, 0.0095, 0.0075, (middle, 0.0)),  # shaft
+        (first, "MCP", 5.0, 75.0, 0.0018 * wide, 0.0090, 0.0075, (-0.001, 0.0)),
         (first, "MCP", 10.0, 85.0, -0.0014 * wide, 0.0090, 0.0085, (-0.021, 0.0)),  # neck
         (first + 1, "PIP", 5.0, 95.0, 0.0010, 0.0050, 0.0048, (-0.001, -0.0036)),  # a phalanx has two heads
         (first + 1, "PIP", 5.0, 95.0, 0.0010, 0.0050, 0.0048, (-0.001, 0.0036)),

@@ -12,11 +12,11 @@ from handsim.errors import HandSimWarning
 from handsim.hand.model import KEYPOINT_DIGITS, hand_keypoints, keypoint_thickness
 from handsim.hand.shape import DIGITS, PALM, bones_of
 from handsim.space.camera import pinhole
-from handsim.space.objects import load_object
+from handsim.space.objects import load_object, named_object
 from poses import sample_poses
 from render import Pictures, draw
 from render.frames import FOREARM
-from render.painting.figures import HandFigure, sample_people
+from render.painting.figures import BodyFigure, HandFigure, sample_people
 from render.painting.rasterizer import Triangles, join, rasterize
 from render.skin.look import ALL_TONES
 from render.studio import hand_truth
@@ -138,6 +138,20 @@ def test_an_object_of_ones_own_is_drawn_where_embree_finds_it(tmp_path):
         assert [body.name for body in frame.bodies] == ["bottle.obj"]
 
 
+def test_edges_of_an_object_are_sharp_and_round_sides_are_smooth():
+    for name, most in (("box", 1e-6), ("ball", 6.0), ("mug", 35.0)):
+        thing = named_object(name)
+        (surface, *_) = BodyFigure(RigidBody.of(thing), (0.5, 0.5, 0.5)).drawn(np.eye(4), 1)
+        triangles = surface.triangles
+        corners = triangles.vertices[triangles.faces]
+        np.testing.assert_array_equal(corners, thing.vertices[thing.faces])
+        faces = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        faces /= np.linalg.norm(faces, axis=1, keepdims=True)
+        cosines = np.einsum("fki,fi->fk", triangles.normals[triangles.faces], faces)
+        assert np.rad2deg(np.arccos(np.clip(cosines, -1.0, 1.0))).max() <= most
+        assert (len(triangles.vertices) == len(thing.vertices)) == (name == "ball")
+
+
 def test_a_body_that_nothing_is_known_of_is_told(figure):
     poses = np.tile([0, 0, 0, 1.0, 0, 0, 0], (1, 1, 1))
     body = RigidBody("bottle.obj", (), np.empty((0, 3)))
@@ -154,7 +168,7 @@ def test_markers_stand_on_bases_that_reach_the_cloth():
     figure = HandFigure(attach(layout, HandModel.named("M")), glove, first_marker=0)
     qpos = join_qpos(np.zeros((1, 20)))[0]
     skin, _, bases = (one.triangles for one in figure.drawn(qpos, 0))
-    markers, ends = figure.markers(qpos), bases.vertices.reshape(len(layout.names), 2, -1, 3)
+    markers, ends = figure.fit.markers(qpos[None])[0][0], bases.vertices.reshape(len(layout.names), 2, -1, 3)
     away = np.linalg.norm(ends - markers[:, None, None], axis=-1)
     assert (away[:, 1] < layout.radius).all() and (away[:, 0] > 0.99 * layout.heights[:, None]).all()
     middles = ends.mean(axis=2)[:, 0]

@@ -203,7 +203,7 @@ def test_no_bones_are_the_models_own_skin() -> None:
 def test_a_bent_finger_has_a_knuckle(side: Side, digit: str, bone: int) -> None:
     mesh, rise = rises(side, **{f"{digit}_MCP_flexion": 80.0})
     top = mesh.rest[rise.argmax()] - mesh.model.rest_transforms[bone][:3, 3]
-    assert 0.0025 < rise.max() < 0.007
+    assert 0.0025 < rise.max() < 0.005  # more, and knuckles of a fist look like teeth
     assert np.linalg.norm(top[:2]) < 0.006 and top[2] > 0.006  # over the joint, on the back
     far = np.linalg.norm(mesh.rest - mesh.rest[rise.argmax()], axis=1) > 0.03
     palm = vertex_normals(mesh.rest, mesh.faces)[:, 2] < -0.3
