@@ -13,7 +13,6 @@ from typing import Final, NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.ndimage import gaussian_filter
 
 from gloves.fit import GloveFit
@@ -90,7 +89,7 @@ def poses_at(take: Take, moments: Doubles) -> Doubles:
     return poses
 
 
-def shutter_times(take: Take, times: Doubles, cameras: Sequence[Camera], readout: ArrayLike) -> Doubles:
+def shutter_times(take: Take, times: Doubles, cameras: Sequence[Camera], readout: Doubles) -> Doubles:
     """Times (F, H) at which a rolling shutter reads the hands, from those of the pictures' middles [s]."""
     wrists = between_poses(take.times, times, take.qpos, take.rate)[..., :3]
     pixels = np.array([camera.project(one) for camera, one in zip(cameras, wrists, strict=True)])

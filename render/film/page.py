@@ -29,9 +29,7 @@ def write_film_page(path: Path, found: Registration) -> None:
             notes=found.left_out(),
         ),
     ]
-    lead = (
-        f"{counted} of {len(found.reasons)} frames count; the median residual is {found.residual():.1f} px."
-    )
+    lead = f"{counted} of {len(found.reasons)} frames count, {found.residual():.1f} px off in the median."
     write_sections(path, sections, title="A video, registered to a take", lead=lead)
 
 

@@ -35,7 +35,7 @@ from render.film.bundle import (
     Samples,
     State,
 )
-from render.film.outlines import Edges, Outlines, Seen
+from render.film.outlines import Outlines, Seen
 from render.frames import Bytes, Doubles
 from render.video import straight
 
@@ -53,7 +53,6 @@ _LOWER: Final = 0.9  # A span is cut in two if the cost is then less than this s
 _SHORTEST_SPAN: Final = 20  # smallest number of frames in a span
 _NO_HAND: Final = "the take has no hand then"
 _OUTSIDE: Final = "no hand of the take is in the picture"
-_NOT_FOUND: Final = "the detector found no hand there"
 _FEWEST_EDGES: Final = 15  # A hand's outline is judged by this many edges.
 _SEEN: Final = 0.4  # A hand's outline is judged if this share of it is seen.
 _BESIDE: Final = -0.7  # A bone with lower mean log-odds of its colors is not where the take says.
@@ -98,8 +97,6 @@ class Registration:
     """Median distance of the found outlines, or keypoints, from the take's [px]; NaN where none are found."""
     reasons: tuple[str, ...]
     """Why each frame does not count; empty where it does."""
-    errors: Float[np.ndarray, "N"]
-    """Distances of found points of outlines, or keypoints, from the take's in the frames that fit [px]."""
 
     def camera_of(self, number: int) -> Camera:
         """The camera of a frame of the video."""
@@ -111,8 +108,9 @@ class Registration:
         return [f"{self.reasons.count(reason)} frames: {reason}" for reason in told]
 
     def residual(self) -> float:
-        """Median distance of the found points from the take's in the frames that count [px]."""
-        return float(np.median(self.errors)) if len(self.errors) else float("nan")
+        """Median of the distances in the frames that count [px]."""
+        away = [one for one, reason in zip(self.distances, self.reasons, strict=True) if not reason]
+        return float(np.median(away)) if away else float("nan")
 
     def doubts(self) -> list[str]:
         """What the hands tell badly, as sentences."""
@@ -207,8 +205,8 @@ def register(
     if fit.reasons.count("") < _LEAST_SHARE * np.isin(bundle.found.looked, bundle.found.frames).sum():
         raise HandSimError(_UNLIKE)
     (offset, drift), deviations = bundle.clock(state), np.sqrt(np.diag(covariance))
-    unknowns = {"offset": OFFSET, "drift": DRIFT, "readout": READOUT, "focal": FOCAL}
-    known = {name: float(np.max(deviations[number])) for name, number in unknowns.items()}
+    unknowns: dict[str, int | slice] = {"offset": OFFSET, "drift": DRIFT, "readout": READOUT, "focal": FOCAL}
+    known = {name: float(np.max(deviations[numbers])) for name, numbers in unknowns.items()}
     pose = deviations[POSES : POSES + 6].reshape(2, 3)
     known["rotation"], known["position"] = np.linalg.norm(pose, axis=1).tolist()
     if known["position"] > _UNKNOWN:
@@ -219,7 +217,7 @@ def register(
     across, down = state.values[READOUT].tolist()
     return Registration(
         tuple(bundle.cameras(state)), state.starts, offset, drift, (across, down), known, bundle.found.times,
-        fit.distances, tuple(fit.reasons), fit.errors,
+        fit.distances, tuple(fit.reasons),
     )  # fmt: skip
 
 
@@ -340,9 +338,8 @@ def _outlined(
         state, _, covariance = bundle.solve(state, samples, noise, first=turn == 0)
         noise = max(0.3, float(np.median(np.abs(bundle.residuals(state, samples, 1.0)))) / 0.6745)
     every = ((n, outlines.shrunk(picture)) for n, picture in enumerate(pictures()))
-    edges, seen = outlines.edges(bundle, state, every, _REACHES[1])
-    fit = _keypoint_fit(bundle, state)
-    return state, covariance, fit if edges is None else _outline_fit(bundle, edges, seen, fit)
+    _, seen = outlines.edges(bundle, state, every, _REACHES[1])
+    return state, covariance, _outline_fit(bundle, seen, _keypoint_fit(bundle, state))
 
 
 def _split(bundle: Bundle, state: State, noise: float) -> State:
@@ -384,7 +381,6 @@ class _Fit(NamedTuple):
 
     distances: Doubles
     reasons: list[str]
-    errors: Doubles
 
 
 def _keypoint_fit(bundle: Bundle, state: State) -> _Fit:
@@ -398,16 +394,13 @@ def _keypoint_fit(bundle: Bundle, state: State) -> _Fit:
     cases = {
         _NO_HAND: ~tracked,
         _OUTSIDE: ~inside.any(axis=1),
-        _NOT_FOUND: np.isnan(distances),
+        "the detector found no hand there": np.isnan(distances),
         f"keypoints are more than {bound:.1f} px off": distances > bound,
     }
-    reasons = np.select(list(cases.values()), list(cases), "")
-    fits = np.isfinite(matches.errors) & (reasons == "")[:, None, None, None]
-    errors = np.linalg.norm(matches.errors[fits].reshape(-1, 2), axis=1)
-    return _Fit(distances, reasons.tolist(), errors)
+    return _Fit(distances, np.select(list(cases.values()), list(cases), "").tolist())
 
 
-def _outline_fit(bundle: Bundle, edges: Edges, seen: Seen, fit: _Fit) -> _Fit:
+def _outline_fit(bundle: Bundle, seen: Seen, fit: _Fit) -> _Fit:
     """How well frames fit by their outlines, or by their keypoints where hardly an outline is seen."""
     told = seen.found >= np.maximum(_FEWEST_EDGES, _SEEN * seen.tried)
     middle, most = (np.where(told, one, np.nan) for one in (seen.middle, seen.most))
@@ -420,5 +413,5 @@ def _outline_fit(bundle: Bundle, edges: Edges, seen: Seen, fit: _Fit) -> _Fit:
         "": whole,
     }
     reasons = np.select(list(cases.values()), list(cases), fit.reasons)
-    errors = np.abs(edges.offsets[(reasons == "")[edges.frames]])
-    return _Fit(np.fmax.reduce(middle, axis=1), reasons.tolist(), errors)
+    distances = np.where(told.any(axis=1), np.fmax.reduce(middle, axis=1), fit.distances)
+    return _Fit(distances, reasons.tolist())
