@@ -141,7 +141,7 @@ def train_detector(
         after = _mean_loss(network, judged, loss)
         if judged:
             _tell(f"{name}: loss {before:.3f} of photographs that are held out, then {after:.3f}\n")
-        if before < after:
+        if not after <= before:  # or no number
             network.load_state_dict(given)
         export(network, Path(out) / name)
     return Path(out)
