@@ -109,8 +109,7 @@ class Registration:
 
     def residual(self) -> float:
         """Median of the distances in the frames that count [px]."""
-        away = [one for one, reason in zip(self.distances, self.reasons, strict=True) if not reason]
-        return float(np.median(away)) if away else float("nan")
+        return float(np.median(self.distances[np.array(self.reasons) == ""]))
 
     def doubts(self) -> list[str]:
         """What the hands tell badly, as sentences."""
@@ -196,8 +195,7 @@ def register(
     if outlined := [one for one in tried if one is not None]:
         away = np.array([fit.distances for *_, fit in outlined])
         away = np.nan_to_num(away[:, np.isfinite(away).any(axis=0)], nan=width).clip(max=_LEAST_BOUND * width)
-        best = int((away.sum(axis=1) * _LIKELY ** np.arange(len(away))).argmin())
-        state, covariance, fit = outlined[best]
+        state, covariance, fit = outlined[int((away.sum(axis=1) * _LIKELY ** np.arange(len(away))).argmin())]
     elif noise > _WORST * width:
         raise HandSimError(_UNLIKE)
     else:
