@@ -3,7 +3,7 @@
     python examples/15_teach_the_detector_your_gloves.py [TAKE VIDEO SAMPLES]     # 20,000 samples, say
 
 It learns from the first half of the video, beside drawn pictures; the second half tells what that brought.
-Without arguments it shows the steps on a drawn video, with 64 samples, too few: the detector gets worse.
+Without arguments it shows the steps on a drawn video, with 64 samples, too few to learn anything.
 """
 
 import json

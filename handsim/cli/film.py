@@ -84,4 +84,4 @@ def film(
         f"{out}: {counted} of {len(found.reasons)} frames fit, {found.residual():.1f} px off in the median; "
         f"{seconds:.0f} s"
     )
-    print_line(f"{out / PAGE}: residuals over time and picture, camera and clock")
+    print_line(f"{out / PAGE}: residuals over time, camera and clock")

@@ -27,10 +27,11 @@ _ROBUST: Final = 2.0  # Residuals beyond this many standard deviations count les
 _NOTHING: Final = 1e-2  # prior information on free unknowns
 _DEPENDENT: Final = 16.0  # This many samples count as one with an independent error.
 
-# The unknowns, before six of the pose of each span, and the standard deviation that each has beforehand. The
-# last is how much thicker than the tracked hands the filmed ones are [m]: cloth, or a measured hand's error.
-OFFSET, DRIFT, READOUT, FOCAL, _CENTER, _LENS, THICKER, POSES = 0, 1, 2, 3, slice(4, 6), slice(6, 8), 8, 9
-_PRIORS: Final = np.array([np.inf, 1e-4, 0.015, 0.7, 0.005, 0.005, 0.05, 0.05, 0.0007])
+# The unknowns, before six of the pose of each span, and the standard deviation that each has beforehand.
+# THICKER is how much thicker than tracked hands the filmed ones are [m]: cloth, or a measured hand's error.
+OFFSET, DRIFT, FOCAL, THICKER, POSES = 0, 1, 2, 7, 10
+_CENTER, _LENS, READOUT = slice(3, 5), slice(5, 7), slice(8, 10)
+_PRIORS: Final = np.array([np.inf, 1e-4, 0.7, 0.005, 0.005, 0.05, 0.05, 0.0007, 0.015, 0.015])
 
 
 class FoundFrame(NamedTuple):
@@ -214,7 +215,7 @@ class Bundle:
         free = np.ones(size, dtype=bool)
         free[FOCAL:THICKER] = self.given is None
         if first:
-            free[[DRIFT, READOUT]] = free[_CENTER] = free[_LENS] = free[THICKER] = False
+            free[DRIFT] = free[_CENTER] = free[_LENS] = free[THICKER] = free[READOUT] = False
         priors = np.concatenate([_PRIORS, np.full(size - POSES, np.inf)])
         robust = 1.0 / np.sqrt(1.0 + (self.residuals(state, samples, noise) / _ROBUST) ** 2)
 
@@ -240,7 +241,7 @@ class Bundle:
 
     def residuals(self, state: State, samples: Samples, noise: float) -> Doubles:
         """Distances (N,) from the lines, over the noise; 0 where the take has no pose."""
-        late = state.values[READOUT] * (samples.pixels[:, 1] / self.size[1] - 0.5)
+        late = (samples.pixels / self.size - 0.5) @ state.values[READOUT]
         points = samples.points_at(self.times(state)[samples.frames] + late)
         pixels = self.projected(state, samples.frames, points + state.values[THICKER] * samples.outward)
         away = ((pixels - samples.pixels) * samples.normals).sum(axis=1) / noise

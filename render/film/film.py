@@ -189,7 +189,7 @@ def filmed_take(take: Take, registration: Registration, *, every: bool = False) 
     """
     times = registration.offset + (1.0 + registration.drift) * registration.times
     cameras = [registration.camera_of(number) for number in range(len(times))]
-    qpos = poses_at(take, shutter_times(take, times, cameras, registration.readout))
+    qpos = poses_at(take, shutter_times(take, times, cameras, np.array(registration.readout)))
     if not every:
         qpos[[bool(reason) for reason in registration.reasons]] = np.nan
     bodies = between_poses(take.times, times, take.body_poses, take.rate)

@@ -68,12 +68,12 @@ def poses_at(take: Take, moments: Doubles) -> Doubles:
     return poses
 
 
-def shutter_times(take: Take, times: Doubles, cameras: Sequence[Camera], readout: float) -> Doubles:
-    """Times (F, H) at which a rolling shutter reads the hands' rows, from those of the middle rows [s]."""
+def shutter_times(take: Take, times: Doubles, cameras: Sequence[Camera], readout: Doubles) -> Doubles:
+    """Times (F, H) at which a rolling shutter reads the hands, from those of the pictures' middles [s]."""
     wrists = between_poses(take.times, times, take.qpos, take.rate)[..., :3]
-    rows = np.array([camera.project(one)[:, 1] for camera, one in zip(cameras, wrists, strict=True)])
-    late = np.clip(np.nan_to_num(rows / cameras[0].size[1] - 0.5), -0.5, 0.5)
-    return np.asarray(times[:, None] + readout * late)
+    pixels = np.array([camera.project(one) for camera, one in zip(cameras, wrists, strict=True)])
+    late = np.clip(np.nan_to_num(pixels / cameras[0].size - 0.5), -0.5, 0.5)
+    return np.asarray(times[:, None] + late @ readout)
 
 
 class _Look(NamedTuple):
@@ -121,7 +121,8 @@ class Outlines:
         moments = shutter_times(take, times, [cameras[span] for span in spans], state.values[READOUT])
         qpos = np.stack([poses_at(take, moments + late) for late in (0.0, -_STEP, _STEP)], axis=2)
         bodies = between_poses(take.times, times, take.body_poses, take.rate)
-        views = [self._shrunk_camera(camera) for camera in cameras]
+        matrix = np.diag([self._scale, self._scale, 1.0])
+        views = [dataclasses.replace(one, size=self._size, K=matrix @ one.K) for one in cameras]
         maps, radius = straightening(views[0]), max(3, round(reach * self._size[0]))
         seen, parts = np.full((5, *moments.shape), np.nan), []
         for frame, picture in looks:
@@ -155,10 +156,6 @@ class Outlines:
             frames, pixels, normals, outward, lambda times: points + velocities * (times - then)[:, None]
         )
         return edges, offsets, Seen(*seen)
-
-    def _shrunk_camera(self, camera: Camera) -> Camera:
-        K = np.diag([self._scale, self._scale, 1.0]) @ camera.K
-        return dataclasses.replace(camera, size=self._size, K=K)
 
     def _look(
         self, picture: Bytes, maps: Floats, view: Camera, drawn: list[Triangles], bodies: Doubles, room: int

@@ -14,11 +14,9 @@ if TYPE_CHECKING:
 
     from render.film.registration import Registration
 
-_CELLS = 12  # across the picture, in which errors are averaged
-
 
 def write_film_page(path: Path, found: Registration) -> None:
-    """Write the page: camera and clock, residuals over time and over the picture, frames left out."""
+    """Write the page: camera and clock, residuals over time, frames left out."""
     counted = found.reasons.count("")
     doubts = found.doubts() or ["The hands tell the clock, the lens and the camera's place well."]
     sections = [
@@ -30,16 +28,8 @@ def write_film_page(path: Path, found: Registration) -> None:
             [(picture((9.0, 2.6), _over_time, found), "Residuals over time")],
             notes=found.left_out(),
         ),
-        Section(
-            "Residuals over the picture",
-            "Mean difference of found points from the take's, ten times as long, where there are ten. "
-            "A pattern tells of a lens that is not described, or of hands that were tracked badly.",
-            [(picture((6.0, 4.6), _over_picture, found), "Residuals over the picture")],
-        ),
     ]
-    lead = (
-        f"{counted} of {len(found.reasons)} frames count; the median residual is {found.residual():.1f} px."
-    )
+    lead = f"{counted} of {len(found.reasons)} frames count, {found.residual():.1f} px off in the median."
     write_sections(path, sections, title="A video, registered to a take", lead=lead)
 
 
@@ -52,14 +42,3 @@ def _over_time(figure: Figure, found: Registration) -> None:
         panel.axvline(float(found.times[start]), color=Paint.INK, lw=1.0)
     panel.set(xlabel="time in the video [s]", ylabel="residual [px]", ylim=(0.0, None))
     panel.legend(frameon=False, ncols=2)
-
-
-def _over_picture(figure: Figure, found: Registration) -> None:
-    panel, (width, height) = figure.subplots(), found.cameras[0].size
-    side = width / _CELLS
-    cells, index = np.unique(np.floor(found.places / side), axis=0, return_inverse=True)
-    count = np.bincount(index)
-    mean = np.stack([np.bincount(index, found.errors[:, axis]) / count for axis in (0, 1)], axis=-1)
-    at, mean = (side * (cells + 0.5))[count >= 10], 10.0 * mean[count >= 10]
-    panel.quiver(*at.T, *mean.T, angles="xy", scale_units="xy", scale=1.0, color=Paint.BLUE, width=0.004)
-    panel.set(xlim=(0, width), ylim=(height, 0), aspect="equal", xlabel="[px]", ylabel="[px]")

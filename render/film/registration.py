@@ -48,11 +48,11 @@ _UNKNOWN: Final = 0.05  # [m] A camera whose place has a larger deviation is not
 _LEAST_SHARE: Final = 0.2  # This share of the frames with hands must fit.
 _MOST_SPANS: Final = 4  # largest number of spans in each of which the camera stands still
 _MOVES: Final = 4  # number of times that the beginning of a new span is looked for
+_LIKELY: Final = 1.3  # A camera stood still if its frames are then at most this many times as bad.
 _LOWER: Final = 0.9  # A span is cut in two if the cost is then less than this share of what it was.
 _SHORTEST_SPAN: Final = 20  # smallest number of frames in a span
 _NO_HAND: Final = "the take has no hand then"
 _OUTSIDE: Final = "no hand of the take is in the picture"
-_NOT_FOUND: Final = "the detector found no hand there"
 _FEWEST_EDGES: Final = 15  # A hand's outline is judged by this many edges.
 _SEEN: Final = 0.4  # A hand's outline is judged if this share of it is seen.
 _BESIDE: Final = -0.7  # A bone with lower mean log-odds of its colors is not where the take says.
@@ -69,7 +69,7 @@ _FOCALS: Final = (0.5, 0.65, 0.85, 1.1, 1.45, 1.9, 2.5, 3.3)  # focal lengths fo
 _GATE: Final = 0.08  # [widths] A detection is not of a hand whose keypoints are farther off in the median.
 _UNLIKE: Final = (
     "the hands in the video do not move as those of the take at any shift of the clock; expected a video of "
-    "this take, of a camera that stood still"
+    "this take, cut to its time, of a camera that stood still"
 )
 
 
@@ -77,8 +77,7 @@ _UNLIKE: Final = (
 class Registration:
     """The camera of a video, its clock, and how well each frame fits.
 
-    The time of the take is `offset + (1 + drift) time` of the video; the middle row counts, and rows are read
-    from top to bottom in `readout` seconds.
+    The time of the take is `offset + (1 + drift) time` of the video in the middle of the picture.
     """
 
     cameras: tuple[Camera, ...]
@@ -88,8 +87,8 @@ class Registration:
     offset: float
     """[s]."""
     drift: float
-    readout: float
-    """[s]."""
+    readout: tuple[float, float]
+    """How much later the right edge is read than the left one, and the lower edge than the upper one [s]."""
     deviations: dict[str, float]
     """Standard deviations: offset and readout [s], drift, focal [share], position [m], rotation [rad]."""
     times: Float[np.ndarray, "F"]
@@ -98,10 +97,6 @@ class Registration:
     """Median distance of the found outlines, or keypoints, from the take's [px]; NaN where none are found."""
     reasons: tuple[str, ...]
     """Why each frame does not count; empty where it does."""
-    places: Float[np.ndarray, "N 2"]
-    """Found points of outlines, or keypoints, [px] in the frames that fit."""
-    errors: Float[np.ndarray, "N 2"]
-    """Their differences from the take's [px]."""
 
     def camera_of(self, number: int) -> Camera:
         """The camera of a frame of the video."""
@@ -113,14 +108,17 @@ class Registration:
         return [f"{self.reasons.count(reason)} frames: {reason}" for reason in told]
 
     def residual(self) -> float:
-        """Median distance of the found points from the take's in the frames that count [px]."""
-        return float(np.median(np.linalg.norm(self.errors, axis=1))) if len(self.errors) else float("nan")
+        """Median of the distances in the frames that count [px]."""
+        return float(np.median(self.distances[np.array(self.reasons) == ""]))
 
     def doubts(self) -> list[str]:
         """What the hands tell badly, as sentences."""
         found = self.deviations
         when = ", ".join(f"{self.times[start]:.1f} s" for start in self.starts[1:])
+        seen = sum(reason not in (_NO_HAND, _OUTSIDE) for reason in self.reasons)
         told = {
+            f"Only {self.reasons.count('')} of {seen} frames with a hand fit: look at the skeletons.":
+                self.reasons.count("") < 0.5 * seen,
             f"The focal length is known to {100 * found['focal']:.1f} % only: the hands hardly move towards "
             "the camera and away from it.": found["focal"] > 0.01,
             f"The clock is known to {1e3 * found['offset']:.1f} ms only: the hands hardly move.":
@@ -135,11 +133,12 @@ class Registration:
     def figures(self) -> list[tuple[str, str, str]]:
         """A table of clock, lens and camera places: rows of a name, a value and its standard deviation."""
         known, camera = self.deviations, self.cameras[0]
+        readout = " ".join(f"{1e3 * one:.1f}" for one in self.readout)
         rows = [
             ("", "value", "standard deviation"),
             ("offset of the clock", f"{self.offset:.4f} s", f"{1e3 * known['offset']:.1f} ms"),
             ("drift of the clock", f"{1e6 * self.drift:.0f} ppm", f"{1e6 * known['drift']:.0f} ppm"),
-            ("readout of the shutter", f"{1e3 * self.readout:.1f} ms", f"{1e3 * known['readout']:.1f} ms"),
+            ("readout, across and down", f"{readout} ms", f"{1e3 * known['readout']:.1f} ms"),
             ("focal length", f"{camera.focal_length:.1f} px", f"{100 * known['focal']:.2f} %"),
             ("center", f"{coordinates(camera.K[:2, 2])} px", ""),
             ("lens", " ".join([camera.lens.kind, coordinates(camera.lens.coefficients)]), ""),
@@ -186,23 +185,17 @@ def register(
     if with_hands < _FEWEST_FRAMES:
         raise HandSimError(
             f"hands were found in {with_hands} of the {looked} frames that were searched, expected "
-            f"{_FEWEST_FRAMES} at least"
+            f"{_FEWEST_FRAMES} at least: hands that fill a third of the picture's height, for some seconds"
         )
-    state, noise = _first_guess(bundle), 0.25 * _GATE * width
-    for turn in range(_ROUNDS):
-        if turn > 0:
-            state = _split(bundle, state, noise)
-        matches = bundle.match(state, max(4.0 * noise, 0.5 * _GATE * width))
-        if (matches.numbers >= 0).sum() < _FEWEST_FRAMES:
-            raise HandSimError(_UNLIKE)
-        state, _, covariance = bundle.solve(state, bundle.samples(matches), noise)
-        distances = bundle.match(state, np.inf).distances
-        if np.isnan(distances).all():  # the camera looks away from the hands
-            raise HandSimError(_UNLIKE)
-        noise = max(float(np.nanmedian(distances)) / 1.177, 0.3)
-    outlined = None if pictures is None else _outlined(bundle, take, state, pictures)
-    if outlined is not None:
-        state, covariance, fit = outlined
+    start = _first_guess(bundle)
+    state, covariance, noise = _adjusted(bundle, start, splits=True)
+    # Errors of the detector may look like a push, those of outlines do not.
+    still = [_adjusted(bundle, start, splits=False)[0]] if pictures and len(state.starts) > 1 else []
+    tried = [_outlined(bundle, take, one, pictures) for one in (*still, state)] if pictures else []
+    if outlined := [one for one in tried if one is not None]:
+        away = np.array([fit.distances for *_, fit in outlined])
+        away = np.nan_to_num(away[:, np.isfinite(away).any(axis=0)], nan=width).clip(max=_LEAST_BOUND * width)
+        state, covariance, fit = outlined[int((away.sum(axis=1) * _LIKELY ** np.arange(len(away))).argmin())]
     elif noise > _WORST * width:
         raise HandSimError(_UNLIKE)
     else:
@@ -210,8 +203,8 @@ def register(
     if fit.reasons.count("") < _LEAST_SHARE * np.isin(bundle.found.looked, bundle.found.frames).sum():
         raise HandSimError(_UNLIKE)
     (offset, drift), deviations = bundle.clock(state), np.sqrt(np.diag(covariance))
-    unknowns = {"offset": OFFSET, "drift": DRIFT, "readout": READOUT, "focal": FOCAL}
-    known = {name: float(deviations[number]) for name, number in unknowns.items()}
+    unknowns: dict[str, int | slice] = {"offset": OFFSET, "drift": DRIFT, "readout": READOUT, "focal": FOCAL}
+    known = {name: float(np.max(deviations[numbers])) for name, numbers in unknowns.items()}
     pose = deviations[POSES : POSES + 6].reshape(2, 3)
     known["rotation"], known["position"] = np.linalg.norm(pose, axis=1).tolist()
     if known["position"] > _UNKNOWN:
@@ -219,10 +212,28 @@ def register(
             f"the hands tell the camera's place to {1e3 * known['position']:.0f} mm only; expected hands "
             "that move in all directions, and a longer video"
         )
+    across, down = state.values[READOUT].tolist()
     return Registration(
-        tuple(bundle.cameras(state)), state.starts, offset, drift, float(state.values[READOUT]), known,
-        bundle.found.times, fit.distances, tuple(fit.reasons), fit.places, fit.errors,
+        tuple(bundle.cameras(state)), state.starts, offset, drift, (across, down), known, bundle.found.times,
+        fit.distances, tuple(fit.reasons),
     )  # fmt: skip
+
+
+def _adjusted(bundle: Bundle, state: State, *, splits: bool) -> tuple[State, Doubles, float]:
+    """The state after some rounds of matching keypoints, its covariance, and their noise [px]."""
+    noise = 0.25 * _GATE * bundle.size[0]
+    for turn in range(_ROUNDS):
+        if turn > 0 and splits:
+            state = _split(bundle, state, noise)
+        matches = bundle.match(state, max(4.0 * noise, 0.5 * _GATE * bundle.size[0]))
+        if (matches.numbers >= 0).sum() < _FEWEST_FRAMES:
+            raise HandSimError(_UNLIKE)
+        state, _, covariance = bundle.solve(state, bundle.samples(matches), noise)
+        distances = bundle.match(state, np.inf).distances
+        if np.isnan(distances).all():  # the camera looks away from the hands
+            raise HandSimError(_UNLIKE)
+        noise = max(float(np.nanmedian(distances)) / 1.177, 0.3)
+    return state, covariance, noise
 
 
 def _first_guess(bundle: Bundle) -> State:
@@ -324,9 +335,8 @@ def _outlined(
         state, _, covariance = bundle.solve(state, samples, noise, first=turn == 0)
         noise = max(0.3, float(np.median(np.abs(bundle.residuals(state, samples, 1.0)))) / 0.6745)
     every = ((n, outlines.shrunk(picture)) for n, picture in enumerate(pictures()))
-    edges, offsets, seen = outlines.edges(bundle, state, every, _REACHES[1])
-    fit = _keypoint_fit(bundle, state)
-    return state, covariance, fit if edges is None else _outline_fit(bundle, edges, offsets, seen, fit)
+    _, _, seen = outlines.edges(bundle, state, every, _REACHES[1])
+    return state, covariance, _outline_fit(bundle, seen, _keypoint_fit(bundle, state))
 
 
 def _split(bundle: Bundle, state: State, noise: float) -> State:
@@ -368,8 +378,6 @@ class _Fit(NamedTuple):
 
     distances: Doubles
     reasons: list[str]
-    places: Doubles
-    errors: Doubles
 
 
 def _keypoint_fit(bundle: Bundle, state: State) -> _Fit:
@@ -383,17 +391,13 @@ def _keypoint_fit(bundle: Bundle, state: State) -> _Fit:
     cases = {
         _NO_HAND: ~tracked,
         _OUTSIDE: ~inside.any(axis=1),
-        _NOT_FOUND: np.isnan(distances),
+        "the detector found no hand there": np.isnan(distances),
         f"keypoints are more than {bound:.1f} px off": distances > bound,
     }
-    reasons = np.select(list(cases.values()), list(cases), "")
-    fits = np.isfinite(matches.errors) & (reasons == "")[:, None, None, None]
-    errors = matches.errors[fits].reshape(-1, 2)
-    frames, hands, keypoints = np.nonzero(fits[..., 0])
-    return _Fit(distances, reasons.tolist(), pixels[frames, hands, keypoints] + errors, errors)
+    return _Fit(distances, np.select(list(cases.values()), list(cases), "").tolist())
 
 
-def _outline_fit(bundle: Bundle, edges: Samples, offsets: Doubles, seen: Seen, fit: _Fit) -> _Fit:
+def _outline_fit(bundle: Bundle, seen: Seen, fit: _Fit) -> _Fit:
     """How well frames fit by their outlines, or by their keypoints where hardly an outline is seen."""
     told = seen.found >= np.maximum(_FEWEST_EDGES, _SEEN * seen.tried)
     middle, most = (np.where(told, one, np.nan) for one in (seen.middle, seen.most))
@@ -406,6 +410,5 @@ def _outline_fit(bundle: Bundle, edges: Samples, offsets: Doubles, seen: Seen, f
         "": whole,
     }
     reasons = np.select(list(cases.values()), list(cases), fit.reasons)
-    kept = (reasons == "")[edges.frames]
-    errors = offsets[kept, None] * edges.normals[kept]
-    return _Fit(np.fmax.reduce(middle, axis=1), reasons.tolist(), edges.pixels[kept], errors)
+    distances = np.where(told.any(axis=1), np.fmax.reduce(middle, axis=1), fit.distances)
+    return _Fit(distances, reasons.tolist())

@@ -59,6 +59,8 @@ _SAMPLES_A_SCENE: Final = 18  # squares that the keypoint network sees for each 
 _FINDER_SHARE: Final = 0.25  # samples of the finder over those of the keypoint network
 _SPREAD: Final = 0.06  # of the heat around a keypoint [share of the side]
 _RATE, _ADAPTING_RATE = 2e-3, 6e-4  # largest learning rates: from scratch, and from given weights
+_LEARNED: Final = 0.8  # share of the photographs that are learned from; others tell whether that did good
+_JUDGED: Final = 4  # batches of these others
 _SMALLEST: Final = 14.0  # longer side of a hand that the finder learns [px of what it sees]
 _ASPECTS: Final = (0.75, 0.75, 0.5625, 1.0)  # shorter side of a picture over the longer one
 _FIRST_LOOK: Final = 0.35  # share of the squares that are turned anyhow; in others fingers are about up
@@ -76,9 +78,8 @@ _EMPTY: Final = 0.35  # share of the scenes that also give a square without a ha
 _QUALITY: Final = 88  # of JPEG files
 
 Network = FinderNetwork | KeypointNetwork
-
-
 Targets = tuple[torch.Tensor, ...]
+Loss = Callable[[Any, Targets], torch.Tensor]
 Batch = tuple[torch.Tensor, Targets]
 """Pictures (B, 3, S, S) and what is learned of them in one step."""
 
@@ -97,7 +98,8 @@ def train_detector(
         out: Folder of the weights.
         start: Folder of weights to begin with, or `shipped`; random ones when not given.
         photographs: File of COCO keypoints [px] of your own photographs (21 a hand, in our order), which are
-            beside it or in a folder `images` there. Half of the samples are then taken from them.
+            beside it or in a folder `images` there. Half of the samples are then taken from them. The last
+            fifth by name is held out; a network that did better there before is left as it was.
         samples: Number of squares that the keypoint network learns from; the finder learns from a quarter
             as many pictures.
         seed: Seed of pictures, of initial weights and of all random choices.
@@ -118,7 +120,8 @@ def train_detector(
         for name, network in networks.items():
             _load_folded(network, begun / name)
     rng = np.random.default_rng(seed)
-    own = lessons_of([] if photographs is None else read_scenes(Path(photographs)), rng=rng)
+    mine = lessons_of([] if photographs is None else read_scenes(Path(photographs)), rng=rng)
+    own, held = zip(*((some[: (end := int(_LEARNED * len(some)))], some[end:]) for some in mine), strict=True)
     drawn = lessons_of(_drawn(max(1, round(samples / _SAMPLES_A_SCENE / SCENES)), seed), rng=rng)
     # Photographs are repeated until half of the samples are taken from them.
     views, squares = (
@@ -126,10 +129,20 @@ def train_detector(
         for some, others in zip(drawn, own, strict=True)
     )
     rate, steps = _RATE if start is None else _ADAPTING_RATE, max(1, round(samples / BATCH))
-    make = functools.partial(finder_batch, views)
-    fit(networks[FINDER], make, finder_loss, max(1, round(_FINDER_SHARE * steps)), seed, rate)
-    fit(networks[KEYPOINTS], functools.partial(keypoint_batch, squares), keypoint_loss, steps, seed, rate)
-    for name, network in networks.items():
+    kinds = (
+        (FINDER, finder_batch, finder_loss, max(1, round(_FINDER_SHARE * steps)), views, held[0]),
+        (KEYPOINTS, keypoint_batch, keypoint_loss, steps, squares, held[1]),
+    )
+    for name, batch, loss, count, lessons, unseen in kinds:
+        network, judged = networks[name], [batch(unseen, one) for one in rng.spawn(_JUDGED) if unseen]
+        given = {key: value.clone() for key, value in network.state_dict().items()}
+        before = _mean_loss(network, judged, loss)
+        fit(network, functools.partial(batch, lessons), loss, count, seed, rate)
+        after = _mean_loss(network, judged, loss)
+        if judged:
+            _tell(f"{name}: loss {before:.3f} of photographs that are held out, then {after:.3f}\n")
+        if not after <= before:  # or no number
+            network.load_state_dict(given)
         export(network, Path(out) / name)
     return Path(out)
 
@@ -255,7 +268,7 @@ def read_scenes(file: Path) -> Iterator[Scene]:
 def fit(
     network: Network,
     make: Callable[[np.random.Generator], Batch],
-    loss: Callable[[Any, Targets], torch.Tensor],
+    loss: Loss,
     steps: int,
     seed: int,
     rate: float = _RATE,
@@ -283,6 +296,13 @@ def fit(
             _tell(f"{step + 1} of {steps} steps, loss {np.mean(losses[-200:]):.3f}\n")
     network.eval()
     return losses
+
+
+def _mean_loss(network: Network, batches: Sequence[Batch], loss: Loss) -> float:
+    """The loss of some batches without training."""
+    network.eval()
+    with torch.no_grad():
+        return sum(loss(network(pictures), targets).item() for pictures, targets in batches) / _JUDGED
 
 
 def recolored(picture: Bytes, rng: np.random.Generator) -> Bytes:

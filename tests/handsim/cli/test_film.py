@@ -12,7 +12,7 @@ from render.film.detector import HandDetector
 from render.illustrations import write_video
 from tests.render.film.filmed import SIZE, Filming, moving_take
 
-FILMING = Filming(seed=21, seconds=8.0, rate=8.0, missing=0.0, swapped=0.0, readout=0.0)
+FILMING = Filming(seed=21, seconds=8.0, rate=8.0, missing=0.0, swapped=0.0, readout=(0.0, 0.0))
 
 
 class Known:

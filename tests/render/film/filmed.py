@@ -56,7 +56,7 @@ class Filming:
     outliers: float = 0.05
     missing: float = 0.1
     swapped: float = 0.05
-    readout: float = 0.015  # [s]
+    readout: tuple[float, float] = (0.0, 0.015)  # [s] across and down
     offset: float = 2.345  # [s]
     bump: float = np.inf  # [s]
     stranger: bool = False
@@ -84,7 +84,7 @@ class Filming:
             for hand, side in enumerate(take.sides):
                 velocity = (points[1e-3][number, hand] - points[0.0][number, hand]) / 1e-3
                 pixels = camera.project(points[0.0][number, hand])
-                late = self.readout * (pixels[:, 1] / SIZE[1] - 0.5)
+                late = (pixels / SIZE - 0.5) @ self.readout
                 pixels = camera.project(points[0.0][number, hand] + velocity * late[:, None])
                 pixels = pixels + rng.normal(0.0, self.noise, pixels.shape)
                 if rng.random() < self.outliers:

@@ -261,7 +261,9 @@ def test_training_starts_from_given_weights(tmp_path):
         train_detector(tmp_path / "out", start=tmp_path / "nowhere", samples=64)
 
 
-def test_photographs_are_learned_from(few, tmp_path, monkeypatch):
+@pytest.fixture
+def photographs(few, tmp_path):
+    """A file of these lessons as photographs, some keypoints of which have no label."""
     images, annotations = [], []
     for number, scene in enumerate(few):
         cv2.imwrite(str(tmp_path / f"{number}.png"), scene.picture[..., ::-1])
@@ -271,16 +273,29 @@ def test_photographs_are_learned_from(few, tmp_path, monkeypatch):
         annotations.append({"image_id": number, "keypoints": rows.ravel().tolist(), "side": "right"})
     file = tmp_path / "photographs.json"
     file.write_text(json.dumps({"images": images, "annotations": annotations}))
+    return file
+
+
+def test_photographs_are_learned_from(photographs, tmp_path, monkeypatch):
     seen = []
     loss = training.keypoint_loss
     monkeypatch.setattr(
-        training, "keypoint_loss", lambda found, targets: (seen.append(targets), loss(found, targets))[1]
-    )
-    folder = train_detector(tmp_path / "out", start="shipped", photographs=file, samples=64)
+        training, "keypoint_loss",
+        lambda found, targets: (torch.is_grad_enabled() and seen.append(targets), loss(found, targets))[1],
+    )  # fmt: skip
+    folder = train_detector(tmp_path / "out", start="shipped", photographs=photographs, samples=64)
     labeled = torch.cat([~targets[0].isnan().any(dim=2) for targets in seen])
     lacking = labeled[:, 0] & ~labeled[:, 6]
     assert 0.2 < lacking.float().mean() < 0.8
     HandDetector.load(folder)
+
+
+def test_training_that_does_harm_leaves_the_detector_as_it_was(photographs, few, tmp_path, monkeypatch):
+    monkeypatch.setattr(training, "_ADAPTING_RATE", 1.0)
+    folder = train_detector(tmp_path / "out", start="shipped", photographs=photographs, samples=64)
+    detectors, picture = (HandDetector.load(), HandDetector.load(folder)), few[0].picture
+    one, other = (each.refine(picture, [[100, 80, 90, 90]], ["right"])[0] for each in detectors)
+    np.testing.assert_allclose(one.keypoints, other.keypoints, atol=0.1)
 
 
 def test_a_shard_has_its_scenes():
