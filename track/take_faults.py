@@ -93,7 +93,7 @@ class _Hand(NamedTuple):
         frames = self.frames[:: -(-len(self.frames) // _FITTED_FRAMES)]
         labels = self.take.hand_labels[self.take.hand_index(self.side)]
         seen = self.take.point_list.labeled(labels, frames)
-        return seen[np.isfinite(seen[..., 0]).sum(axis=1) >= FEWEST_MARKERS]
+        return np.asarray(seen[np.isfinite(seen[..., 0]).sum(axis=1) >= FEWEST_MARKERS])
 
     def span(self, first: int, name: str, why: str, remedy: str, *, of_labels: bool = True) -> SuspectSpan:
         """A fault from frame `first` to the end, of a marker or joint; of the whole hand without `name`."""
