@@ -29,7 +29,14 @@ from handsim.hand.shape import SIZES, HandShape, Side, shape_from_measures
 from handsim.space.transforms import MIRROR
 from track.association.hand_state import HandState
 from track.association.initialization import HandInitializer, distances_to_nearest
-from track.calibration.energy import first_estimate, levenberg_marquardt, shared_covariance, user_hand
+from track.calibration.energy import (
+    Estimate,
+    Problem,
+    first_estimate,
+    levenberg_marquardt,
+    shared_covariance,
+    user_hand,
+)
 from track.calibration.hand_parameters import LENGTH
 from track.config import TrackerConfig
 from track.frames import StreamedFrame, TrackedHand
@@ -64,6 +71,7 @@ _SURE: Final = 2.0  # standard deviations of a 95 % interval
 _USUAL: Final = TrackerConfig()
 _LENIENT: Final = TrackerConfig(least_evidence=2.0)  # for hands of few markers before they are measured
 _ROBUST_SCALE: Final = 0.015  # [m]
+_GLUED: Final = 0.0045  # [m] spread per axis of the markers of a glove that may not be as its layout says
 _FIT_STEPS: Final = 15
 _SMALL_GAIN, _RELINEARIZE = 1e-3, 0.05  # ten times a calibration's: a size may be off by 0.2 mm
 _PART: Final = 30  # Hands are compared in two parts of this many frames.
@@ -300,13 +308,37 @@ def _least(function: Callable[[float], float], low: float, high: float) -> float
 
 def _fit_proportions(seen: Float[np.ndarray, "F M 3"], start: GloveFit) -> SizeFit:
     """Fit one shape to right hands in some frames, by a calibration without touches."""
-    options = {"noise": _FIT_NOISE, "robust_scale": _ROBUST_SCALE, "relinearize": _RELINEARIZE}
-    problem, estimate = first_estimate(start, seen, PoseSolver(start).solve(seen).qpos, **options)
+    problem, estimate = _first_proportions(seen, start)
     estimate, fit, _ = levenberg_marquardt(problem, estimate, 0, _FIT_STEPS, None, _SMALL_GAIN)
     hand = user_hand(start, problem, estimate)
     rms = float(np.median(PoseSolver(hand).solve(seen, estimate.qpos).rms))
     variance = shared_covariance(problem, estimate, fit)[0][LENGTH, LENGTH]
     return SizeFit(hand, rms, hand.shape.length * float(np.sqrt(variance)))
+
+
+def _first_proportions(seen: Float[np.ndarray, "F M 3"], start: GloveFit) -> tuple[Problem, Estimate]:
+    """The problem of one shape of right hands in some frames, and the start as first estimate."""
+    options = {"noise": _FIT_NOISE, "robust_scale": _ROBUST_SCALE, "relinearize": _RELINEARIZE}
+    return first_estimate(start, seen, PoseSolver(start).solve(seen).qpos, **options)
+
+
+def glued_offsets(seen: Float[np.ndarray, "F M 3"], worn: GloveFit) -> Float[np.ndarray, "M"]:
+    """Distances of a hand's markers from the places of their layout [m], fitted with the hand's proportions.
+
+    Args:
+        seen: Markers in some frames [m], NaN where missing.
+        worn: A hand of the right size; its own proportions and places may have adapted to a wrong layout.
+    """
+    shape = worn.model.shape
+    start = mean_hand(shape.length, shape.breadth, worn.layout)
+    problem, estimate = _first_proportions(seen @ (MIRROR if worn.side == "left" else np.eye(3)), start)
+    problem.position_spread, off = _GLUED, np.zeros(len(problem.heights))
+    # The second prior is as wide as the first offsets, so that a wrong place no longer bends the hand.
+    for _ in range(2):
+        problem.place_weights = (_GLUED / np.maximum(off, _GLUED)) ** 2
+        estimate, fit, _ = levenberg_marquardt(problem, estimate, 0, _FIT_STEPS, None, _SMALL_GAIN)
+        off = np.linalg.norm(fit.design_residuals, axis=1)
+    return off
 
 
 class _Fit(NamedTuple):

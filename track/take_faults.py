@@ -7,6 +7,7 @@ hand open. Each fault is a span of frames with a sentence that names marker or h
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import lru_cache
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -17,6 +18,7 @@ from gloves.fit import GloveFit
 from gloves.takes.take import TRACKED, Take
 from handsim.hand.shape import JOINTS, Side
 from handsim.space.transforms import rigid_fit
+from track.hand_size import glued_offsets
 from track.kinematics.pose_solver import FEWEST_MARKERS, PoseSolver
 from train.labelers.matching import assign
 
@@ -42,13 +44,14 @@ _MISPLACED: Final = 0.008  # [m] least reported distance from its place
 _STEADY: Final = 0.006  # [m] radius within which a point fixed to a bone stays in the bone's frame
 _OFTEN: Final = 0.5  # share of the frames without the marker that show such a point
 _TRIED: Final = 100  # number of unlabeled points tried as its center
+_OFF_DESIGN: Final = 0.012  # [m] least reported distance of a fitted place from the layout's
 _LAST_GAP: Final = 1.9  # [s] least time without a marker at the end, and least time before
 _LONGER: Final = 3.0  # A last gap is reported if it is this many times the longest earlier gap.
 _SEEN: Final = 0.5  # share of the earlier frames in which it was seen
 AT_LIMIT: Final = 0.5
 """Tolerance within which a joint counts as being at its limit [deg]."""
 _OFTEN_AT_LIMIT: Final = 0.4  # share of the frames at the limit
-_SIDE_FRAMES: Final = 40  # number of frames in which a hand is compared with its mirror image
+_FITTED_FRAMES: Final = 40  # number of frames in which the layout, and the mirror image of a hand, are fitted
 _FITS: Final = 1.5  # largest ratio of the mirror image's RMS distance to that of the hand
 _FITS_WELL: Final = 0.0012  # [m] the mirror image fits if its RMS distance is below this
 
@@ -85,12 +88,25 @@ class _Hand(NamedTuple):
     frames: Int[np.ndarray, "F"]
     offsets: Float[np.ndarray, "F M 3"]  # [m] of seen markers from their places, in the bones' frames
 
+    def seen(self) -> Float[np.ndarray, "S M 3"]:
+        """The markers [m] in some frames that show enough of them for a pose."""
+        frames = self.frames[:: -(-len(self.frames) // _FITTED_FRAMES)]
+        labels = self.take.hand_labels[self.take.hand_index(self.side)]
+        seen = self.take.point_list.labeled(labels, frames)
+        return np.asarray(seen[np.isfinite(seen[..., 0]).sum(axis=1) >= FEWEST_MARKERS])
+
     def span(self, first: int, name: str, why: str, remedy: str, *, of_labels: bool = True) -> SuspectSpan:
         """A fault from frame `first` to the end, of a marker or joint; of the whole hand without `name`."""
         of = f"{self.side}:{name}" if name else f"the {self.side} hand"
         return SuspectSpan(first, self.take.num_frames - 1, first, of, why, remedy, of_labels)
 
+    def off_place(self, name: str, off: float, first: int) -> SuspectSpan:
+        """The fault of a marker that is `off` [m] from its place in the layout."""
+        why = f"is {1e3 * off:.0f} mm from where the layout has it, from {self.take.times[first]:.2f} s on"
+        return self.span(first, name, why, "correct its place in the layout's file")
 
+
+@lru_cache(maxsize=1)  # A summary, its warnings and a report of a take ask one after the other.
 def find_faults(take: Take) -> tuple[SuspectSpan, ...]:
     """Find the faults of a tracked take, each from the frame in which it begins."""
     found: list[SuspectSpan] = []
@@ -101,7 +117,7 @@ def find_faults(take: Take) -> tuple[SuspectSpan, ...]:
             continue
         some = frames[:: -(-len(frames) // _MOST_FRAMES)]
         hand = _Hand(take, side, take.hands[number], some, take.marker_offsets(side, some))
-        for faults in (_unsure_side, _misplaced, _slips, _fallen, _at_limits):
+        for faults in (_unsure_side, _misplaced, _off_design, _slips, _fallen, _at_limits):
             found += faults(hand)
     return tuple({one.of: one for one in reversed(found)}.values())[::-1]
 
@@ -213,17 +229,21 @@ def _misplaced(hand: _Hand) -> Iterator[SuspectSpan]:
         best = max(steady, key=lambda near: len(np.unique(frames[near])))
         share, far = len(np.unique(frames[best])) / len(rows), np.linalg.norm(np.median(every[best], axis=0))
         if share > _OFTEN and far > _MISPLACED:
-            first, name = int(hand.frames[rows[0]]), worn.layout.names[marker]
-            why = f"is {1e3 * far:.0f} mm from where the layout has it, from {take.times[first]:.2f} s on"
-            yield hand.span(first, name, why, "correct its place in the layout's file")
+            yield hand.off_place(worn.layout.names[marker], float(far), int(hand.frames[rows[0]]))
+
+
+def _off_design(hand: _Hand) -> Iterator[SuspectSpan]:
+    """Markers that are glued far from the layout's places, as their motion with the joints shows."""
+    first, seen = int(hand.frames[0]), hand.seen()
+    offsets = glued_offsets(seen, hand.worn) if len(seen) else np.zeros(len(hand.worn.layout.names))
+    for name, off in zip(hand.worn.layout.names, offsets, strict=True):
+        if off > _OFF_DESIGN:
+            yield hand.off_place(name, off, first)
 
 
 def _unsure_side(hand: _Hand) -> Iterator[SuspectSpan]:
     """A hand in a glove like its mirror image, that a hand of the other side fits as well in motion."""
-    worn, take = hand.worn, hand.take
-    frames = hand.frames[:: -(-len(hand.frames) // _SIDE_FRAMES)]
-    seen = take.point_list.labeled(take.hand_labels[take.hand_index(hand.side)], frames)
-    seen = seen[np.isfinite(seen[..., 0]).sum(axis=1) >= FEWEST_MARKERS]
+    worn, seen = hand.worn, hand.seen()
     if not len(seen):
         return
     other: Side = "left" if hand.side == "right" else "right"

@@ -155,6 +155,8 @@ class Problem:
         roots = np.sqrt(np.minimum(1.0, _GESTURES_OF_USER / max(1, len(targets))))
         self.pose_precision = np.outer(roots, roots) * resting_prior().precision
         self.position_spread, self.height_spread = POSITION_SPREAD, HEIGHT_SPREAD
+        self.place_weights = np.ones(len(heights))
+        """Weights (M,) of the prior of each marker's place."""
         self.data_noise = noise
         """Standard deviation of a marker's coordinates [m] without the flesh, for which `noise` is larger."""
         self.precision = shape_precision()
@@ -197,7 +199,7 @@ class Problem:
         """Precision matrix of E_prior for each marker (M, 3, 3) [1/m^2]."""
         normal = fit.normals[:, :, None] * fit.normals[:, None]
         precision: NDArray[np.float64] = ALPHA_ALONG * np.eye(3) + (ALPHA_NORMAL - ALPHA_ALONG) * normal
-        return precision / self.position_spread**2
+        return precision * self.place_weights[:, None, None] / self.position_spread**2
 
     def _joint_angle_residuals(self, estimate: Estimate) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Joint angles (F, 20) [rad] beyond their limits, and relative to the mean of the gestures."""
