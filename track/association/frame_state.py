@@ -59,6 +59,7 @@ class FrameState(NamedTuple):
     """Evidence (log-odds) for each point's label, accumulated over the frames of its number."""
     confidence: Float[np.ndarray, "P"]  # confidence in each label, 0 to 1
     first_seen: Float[np.ndarray, "P"]  # time of the first frame with the point's number [s]
+    free_since: Float[np.ndarray, "P"]  # time of the first of the last frames that gave it no label [s]
     time: float  # time of the frame [s]
     numbering: Numbering  # what labels mean
 
@@ -139,6 +140,7 @@ class PointHistory:
         self._labels: dict[int, int] = {}  # by point number
         self._evidence: dict[int, float] = {}  # log-odds of these labels
         self._first_seen: dict[int, float] = {}  # [s] by point number
+        self._free_since: dict[int, float] = {}  # [s] by number of the points without a label
         self._last_time = -np.inf  # [s] of the last frame
 
     def carry(
@@ -159,7 +161,10 @@ class PointHistory:
         evidence = np.array([self._evidence[n] if n in self._labels else 0.0 for n in known])
         confidence = 1.0 / (1.0 + np.exp(-evidence - 1.0))
         first_seen = np.array(list(self._first_seen.values()))
-        return FrameState(points, numbers, labels, evidence, confidence, first_seen, time, self._numbering)
+        free_since = np.array([self._free_since.get(number, time) for number in known])
+        return FrameState(
+            points, numbers, labels, evidence, confidence, first_seen, free_since, time, self._numbering
+        )
 
     def keep(self, frame: FrameState) -> None:
         """Store what the next frame needs of this one."""
@@ -167,6 +172,8 @@ class PointHistory:
         numbers = frame.ids[rows].tolist()
         self._labels = dict(zip(numbers, frame.labels[rows].tolist(), strict=True))
         self._evidence = dict(zip(numbers, frame.evidence[rows].tolist(), strict=True))
+        free = frame.unlabeled
+        self._free_since = dict(zip(frame.ids[free].tolist(), frame.free_since[free].tolist(), strict=True))
 
 
 class PointLinker:

@@ -60,6 +60,8 @@ _RETURN_TIME: Final = 0.01  # [s] over the hidden time: a marker's probability t
 _RETURN_LEAST, _RETURN_MOST = 0.01, 0.65  # bounds of that probability
 SEEN_ELSEWHERE: Final = -7.0
 """Log probability that a point is a marker that was seen as another point at the same time."""
+_BESIDE_TIME: Final = 0.01  # [s] A marker seen so long beside a point takes a log-odds from it once hidden.
+_MOST_BESIDE: Final = 18.0  # largest such loss, regained as by age; the labeler's answer does not outweigh it
 STRAY_LIFETIME: Final = 0.1  # [s] mean lifetime of strays
 MOST_AGE_LOG_ODDS: Final = 3.0  # largest log-odds from a point's age
 
@@ -218,15 +220,26 @@ class HandState:
             return None
         return max(float(np.sqrt(np.median(self._variance))), self.config.marker_noise)
 
-    def presence_log_odds(self, first_seen: Float[np.ndarray, "P"]) -> Float[np.ndarray, "P M"]:
-        """Log-odds that each marker returned when each point appeared, against a stray of the point's age."""
+    def presence_log_odds(
+        self,
+        first_seen: Float[np.ndarray, "P"],
+        free_since: Float[np.ndarray, "P"],
+        markers: Int[np.ndarray, "P"],
+    ) -> Float[np.ndarray, "P M"]:
+        """Log-odds that each marker returned when each point appeared, against a stray of the point's age.
+
+        Where no point has a marker now, those that were without a label while it was seen are likely foreign.
+        """
         gap = first_seen[:, None] - self._last_seen
         log_odds: NDArray[np.float64] = np.log(
             np.clip(_RETURN_TIME / np.maximum(gap, 1e-3), _RETURN_LEAST, _RETURN_MOST)
         )
         log_odds[gap < 0.0] = SEEN_ELSEWHERE
         age = np.maximum(self._now - first_seen, 0.0)[:, None]
-        return log_odds + np.minimum(age / STRAY_LIFETIME, MOST_AGE_LOG_ODDS)
+        beside = np.minimum((self._last_seen - free_since[:, None]) / _BESIDE_TIME, _MOST_BESIDE)
+        beside[:, markers[markers >= 0]] = 0.0
+        beside -= (self._now - self._last_seen) / STRAY_LIFETIME
+        return log_odds + np.minimum(age / STRAY_LIFETIME, MOST_AGE_LOG_ODDS) - np.maximum(beside, 0.0)
 
     def initialize(
         self, qpos: Float[np.ndarray, "27"], targets: Float[np.ndarray, "M 3"], time: float
