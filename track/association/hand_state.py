@@ -230,16 +230,10 @@ class HandState:
 
         Where no point has a marker now, those that were without a label while it was seen are likely foreign.
         """
-        gap = first_seen[:, None] - self._last_seen
-        log_odds: NDArray[np.float64] = np.log(
-            np.clip(_RETURN_TIME / np.maximum(gap, 1e-3), _RETURN_LEAST, _RETURN_MOST)
+        log_odds: NDArray[np.float64] = _presence_log_odds(
+            first_seen, free_since, markers, self._last_seen, self._now
         )
-        log_odds[gap < 0.0] = SEEN_ELSEWHERE
-        age = np.maximum(self._now - first_seen, 0.0)[:, None]
-        beside = np.minimum((self._last_seen - free_since[:, None]) / _BESIDE_TIME, _MOST_BESIDE)
-        beside[:, markers[markers >= 0]] = 0.0
-        beside -= (self._now - self._last_seen) / STRAY_LIFETIME
-        return log_odds + np.minimum(age / STRAY_LIFETIME, MOST_AGE_LOG_ODDS) - np.maximum(beside, 0.0)
+        return log_odds
 
     def initialize(
         self, qpos: Float[np.ndarray, "27"], targets: Float[np.ndarray, "M 3"], time: float
@@ -351,6 +345,33 @@ class HandTrack(NamedTuple):
     state: HandState  # its filter state
     prediction: Prediction  # pose before the frame's markers were used
     estimate: HandEstimate  # pose fitted to its labels so far
+
+
+@kernel
+def _presence_log_odds(
+    first_seen: Float[np.ndarray, "P"],
+    free_since: Float[np.ndarray, "P"],
+    markers: Int[np.ndarray, "P"],
+    last_seen: Float[np.ndarray, "M"],
+    now: float,
+) -> Float[np.ndarray, "P M"]:
+    """Kernel of `HandState.presence_log_odds` at a time [s]; `last_seen` is the time of each marker [s]."""
+    log_odds = np.empty((len(first_seen), len(last_seen)))
+    missing = np.ones(len(last_seen), dtype=np.bool_)
+    for marker in markers:
+        if marker >= 0:
+            missing[marker] = False
+    for point in range(len(first_seen)):
+        age = min(max(now - first_seen[point], 0.0) / STRAY_LIFETIME, MOST_AGE_LOG_ODDS)
+        for marker in range(len(last_seen)):
+            gap, beside = first_seen[point] - last_seen[marker], 0.0
+            share = min(max(_RETURN_TIME / max(gap, 1e-3), _RETURN_LEAST), _RETURN_MOST)
+            if missing[marker] and last_seen[marker] > free_since[point]:
+                beside = min((last_seen[marker] - free_since[point]) / _BESIDE_TIME, _MOST_BESIDE)
+                beside -= (now - last_seen[marker]) / STRAY_LIFETIME
+            log_odds[point, marker] = SEEN_ELSEWHERE if gap < 0.0 else np.log(share)
+            log_odds[point, marker] += age - max(beside, 0.0)
+    return log_odds
 
 
 @kernel

@@ -205,3 +205,12 @@ def test_a_marker_comes_back_soon_or_hardly_and_never_while_it_is_seen_elsewhere
     age = (0.5 - 30 / RATE - 1e-3) / STRAY_LIFETIME
     soon = log_odds[1] - age
     assert soon[KNUCKLE] == pytest.approx(np.log(0.65)) and log_odds[2, TIP] < soon[TIP]
+
+
+def test_a_point_that_was_beside_a_seen_marker_is_hardly_that_marker_while_it_is_hidden(moving):
+    moving.predict(0.5)  # the markers were last seen at 0.25 s
+    hidden, held = (
+        moving.presence_log_odds(np.zeros(1), np.zeros(1), np.array([marker]))[0] for marker in (-1, KNUCKLE)
+    )
+    assert held[KNUCKLE] == SEEN_ELSEWHERE + MOST_AGE_LOG_ODDS > hidden[KNUCKLE] + 15.0
+    assert held[TIP] == hidden[TIP]
