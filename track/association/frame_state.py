@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
-from handsim.kernels import kernel
+from handsim.kernels import kernel, squared_distance
 from handsim.space.transforms import rigid_fit
 from train.labelers.matching import assign
 
@@ -23,6 +23,7 @@ _DISTANCES: Final = (0.04, 0.025, 0.015)
 _FEWEST_ALIGNED: Final = 5  # A hand is aligned with at least this many points.
 _NEIGHBORS: Final = 0.06  # [m] Distances between markers closer than this hardly change between frames.
 _FEWEST_NEIGHBORS: Final = 3  # A pair of frames needs this many neighbor pairs before their distances count.
+_SAME_PLACE: Final = 0.01  # [m] A point without a label that moves farther in a frame may be another one.
 _BESIDE_DISTANCE: Final = 0.06  # [m] An unlabeled point this close to a hand's points moves with the hand.
 
 
@@ -140,7 +141,8 @@ class PointHistory:
         self._labels: dict[int, int] = {}  # by point number
         self._evidence: dict[int, float] = {}  # log-odds of these labels
         self._first_seen: dict[int, float] = {}  # [s] by point number
-        self._free_since: dict[int, float] = {}  # [s] by number of the points without a label
+        self._free: dict[int, tuple[float, NDArray[np.float64]]] = {}
+        # by number of the points without a label: since when [s], and the last place [m]
         self._last_time = -np.inf  # [s] of the last frame
 
     def carry(
@@ -161,7 +163,11 @@ class PointHistory:
         evidence = np.array([self._evidence[n] if n in self._labels else 0.0 for n in known])
         confidence = 1.0 / (1.0 + np.exp(-evidence - 1.0))
         first_seen = np.array(list(self._first_seen.values()))
-        free_since = np.array([self._free_since.get(number, time) for number in known])
+        free_since = np.full(len(known), time)
+        for row, number in enumerate(known):
+            since, place = self._free.get(number, (time, points[row]))
+            if squared_distance(points[row], place) < _SAME_PLACE**2:  # IDs may have been exchanged.
+                free_since[row] = since
         return FrameState(
             points, numbers, labels, evidence, confidence, first_seen, free_since, time, self._numbering
         )
@@ -172,8 +178,10 @@ class PointHistory:
         numbers = frame.ids[rows].tolist()
         self._labels = dict(zip(numbers, frame.labels[rows].tolist(), strict=True))
         self._evidence = dict(zip(numbers, frame.evidence[rows].tolist(), strict=True))
-        free = frame.unlabeled
-        self._free_since = dict(zip(frame.ids[free].tolist(), frame.free_since[free].tolist(), strict=True))
+        self._free = {
+            int(frame.ids[row]): (frame.free_since[row], frame.points[row])
+            for row in np.flatnonzero(frame.unlabeled)
+        }
 
 
 class PointLinker:
