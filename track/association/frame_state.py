@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
-from handsim.kernels import kernel, squared_distance
+from handsim.kernels import kernel
 from handsim.space.transforms import rigid_fit
 from train.labelers.matching import assign
 
@@ -164,10 +164,11 @@ class PointHistory:
         confidence = 1.0 / (1.0 + np.exp(-evidence - 1.0))
         first_seen = np.array(list(self._first_seen.values()))
         free_since = np.full(len(known), time)
-        for row, number in enumerate(known):
-            since, place = self._free.get(number, (time, points[row]))
-            if squared_distance(points[row], place) < _SAME_PLACE**2:  # IDs may have been exchanged.
-                free_since[row] = since
+        rows = [row for row, number in enumerate(known) if number in self._free]
+        if rows:  # IDs may have been exchanged.
+            since, places = zip(*(self._free[known[row]] for row in rows), strict=True)
+            near = ((points[rows] - np.array(places)) ** 2).sum(axis=1) < _SAME_PLACE**2
+            free_since[rows] = np.where(near, since, time)
         return FrameState(
             points, numbers, labels, evidence, confidence, first_seen, free_since, time, self._numbering
         )
@@ -178,10 +179,9 @@ class PointHistory:
         numbers = frame.ids[rows].tolist()
         self._labels = dict(zip(numbers, frame.labels[rows].tolist(), strict=True))
         self._evidence = dict(zip(numbers, frame.evidence[rows].tolist(), strict=True))
-        self._free = {
-            int(frame.ids[row]): (frame.free_since[row], frame.points[row])
-            for row in np.flatnonzero(frame.unlabeled)
-        }
+        free = frame.unlabeled
+        known = zip(frame.free_since[free].tolist(), frame.points[free], strict=True)
+        self._free = dict(zip(frame.ids[free].tolist(), known, strict=True))
 
 
 class PointLinker:
