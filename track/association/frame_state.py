@@ -23,6 +23,7 @@ _DISTANCES: Final = (0.04, 0.025, 0.015)
 _FEWEST_ALIGNED: Final = 5  # A hand is aligned with at least this many points.
 _NEIGHBORS: Final = 0.06  # [m] Distances between markers closer than this hardly change between frames.
 _FEWEST_NEIGHBORS: Final = 3  # A pair of frames needs this many neighbor pairs before their distances count.
+_SAME_PLACE: Final = 0.01  # [m] A point without a label that moves farther in a frame may be another one.
 _BESIDE_DISTANCE: Final = 0.06  # [m] An unlabeled point this close to a hand's points moves with the hand.
 
 
@@ -59,6 +60,7 @@ class FrameState(NamedTuple):
     """Evidence (log-odds) for each point's label, accumulated over the frames of its number."""
     confidence: Float[np.ndarray, "P"]  # confidence in each label, 0 to 1
     first_seen: Float[np.ndarray, "P"]  # time of the first frame with the point's number [s]
+    free_since: Float[np.ndarray, "P"]  # time of the first of the last frames that gave it no label [s]
     time: float  # time of the frame [s]
     numbering: Numbering  # what labels mean
 
@@ -139,6 +141,8 @@ class PointHistory:
         self._labels: dict[int, int] = {}  # by point number
         self._evidence: dict[int, float] = {}  # log-odds of these labels
         self._first_seen: dict[int, float] = {}  # [s] by point number
+        self._free: dict[int, tuple[float, NDArray[np.float64]]] = {}
+        # by number of the points without a label: since when [s], and the last place [m]
         self._last_time = -np.inf  # [s] of the last frame
 
     def carry(
@@ -159,7 +163,15 @@ class PointHistory:
         evidence = np.array([self._evidence[n] if n in self._labels else 0.0 for n in known])
         confidence = 1.0 / (1.0 + np.exp(-evidence - 1.0))
         first_seen = np.array(list(self._first_seen.values()))
-        return FrameState(points, numbers, labels, evidence, confidence, first_seen, time, self._numbering)
+        free_since = np.full(len(known), time)
+        rows = [row for row, number in enumerate(known) if number in self._free]
+        if rows:  # IDs may have been exchanged.
+            since, places = zip(*(self._free[known[row]] for row in rows), strict=True)
+            near = ((points[rows] - np.array(places)) ** 2).sum(axis=1) < _SAME_PLACE**2
+            free_since[rows] = np.where(near, since, time)
+        return FrameState(
+            points, numbers, labels, evidence, confidence, first_seen, free_since, time, self._numbering
+        )
 
     def keep(self, frame: FrameState) -> None:
         """Store what the next frame needs of this one."""
@@ -167,6 +179,9 @@ class PointHistory:
         numbers = frame.ids[rows].tolist()
         self._labels = dict(zip(numbers, frame.labels[rows].tolist(), strict=True))
         self._evidence = dict(zip(numbers, frame.evidence[rows].tolist(), strict=True))
+        free = frame.unlabeled
+        known = zip(frame.free_since[free].tolist(), frame.points[free], strict=True)
+        self._free = dict(zip(frame.ids[free].tolist(), known, strict=True))
 
 
 class PointLinker:

@@ -60,6 +60,8 @@ _RETURN_TIME: Final = 0.01  # [s] over the hidden time: a marker's probability t
 _RETURN_LEAST, _RETURN_MOST = 0.01, 0.65  # bounds of that probability
 SEEN_ELSEWHERE: Final = -7.0
 """Log probability that a point is a marker that was seen as another point at the same time."""
+_BESIDE_TIME: Final = 0.01  # [s] A marker seen so long beside a point takes a log-odds from it once hidden.
+_MOST_BESIDE: Final = 18.0  # largest such loss, regained as by age; the labeler's answer does not outweigh it
 STRAY_LIFETIME: Final = 0.1  # [s] mean lifetime of strays
 MOST_AGE_LOG_ODDS: Final = 3.0  # largest log-odds from a point's age
 
@@ -218,15 +220,20 @@ class HandState:
             return None
         return max(float(np.sqrt(np.median(self._variance))), self.config.marker_noise)
 
-    def presence_log_odds(self, first_seen: Float[np.ndarray, "P"]) -> Float[np.ndarray, "P M"]:
-        """Log-odds that each marker returned when each point appeared, against a stray of the point's age."""
-        gap = first_seen[:, None] - self._last_seen
-        log_odds: NDArray[np.float64] = np.log(
-            np.clip(_RETURN_TIME / np.maximum(gap, 1e-3), _RETURN_LEAST, _RETURN_MOST)
+    def presence_log_odds(
+        self,
+        first_seen: Float[np.ndarray, "P"],
+        free_since: Float[np.ndarray, "P"],
+        markers: Int[np.ndarray, "P"],
+    ) -> Float[np.ndarray, "P M"]:
+        """Log-odds that each marker returned when each point appeared, against a stray of the point's age.
+
+        Where no point has a marker now, those that were without a label while it was seen are likely foreign.
+        """
+        log_odds: NDArray[np.float64] = _presence_log_odds(
+            first_seen, free_since, markers, self._last_seen, self._now
         )
-        log_odds[gap < 0.0] = SEEN_ELSEWHERE
-        age = np.maximum(self._now - first_seen, 0.0)[:, None]
-        return log_odds + np.minimum(age / STRAY_LIFETIME, MOST_AGE_LOG_ODDS)
+        return log_odds
 
     def initialize(
         self, qpos: Float[np.ndarray, "27"], targets: Float[np.ndarray, "M 3"], time: float
@@ -338,6 +345,33 @@ class HandTrack(NamedTuple):
     state: HandState  # its filter state
     prediction: Prediction  # pose before the frame's markers were used
     estimate: HandEstimate  # pose fitted to its labels so far
+
+
+@kernel
+def _presence_log_odds(
+    first_seen: Float[np.ndarray, "P"],
+    free_since: Float[np.ndarray, "P"],
+    markers: Int[np.ndarray, "P"],
+    last_seen: Float[np.ndarray, "M"],
+    now: float,
+) -> Float[np.ndarray, "P M"]:
+    """Kernel of `HandState.presence_log_odds` at a time [s]; `last_seen` is the time of each marker [s]."""
+    log_odds = np.empty((len(first_seen), len(last_seen)))
+    missing = np.ones(len(last_seen), dtype=np.bool_)
+    for marker in markers:
+        if marker >= 0:
+            missing[marker] = False
+    for point in range(len(first_seen)):
+        age = min(max(now - first_seen[point], 0.0) / STRAY_LIFETIME, MOST_AGE_LOG_ODDS)
+        for marker in range(len(last_seen)):
+            gap, beside = first_seen[point] - last_seen[marker], 0.0
+            share = min(max(_RETURN_TIME / max(gap, 1e-3), _RETURN_LEAST), _RETURN_MOST)
+            if missing[marker] and last_seen[marker] > free_since[point]:
+                beside = min((last_seen[marker] - free_since[point]) / _BESIDE_TIME, _MOST_BESIDE)
+                beside -= (now - last_seen[marker]) / STRAY_LIFETIME
+            log_odds[point, marker] = SEEN_ELSEWHERE if gap < 0.0 else np.log(share)
+            log_odds[point, marker] += age - max(beside, 0.0)
+    return log_odds
 
 
 @kernel

@@ -297,11 +297,10 @@ class LabelerReview:
         gain += np.minimum(np.log(sure / (1.0 - sure)), _MOST_ANSWER_LOG_ODDS).sum()
         fresh = named[before[named] < 0]
         gain -= _MOVED_LABEL_LOG_ODDS * (len(named) - len(fresh))
-        presence = track.state.presence_log_odds(frame.first_seen[fresh])[
-            np.arange(len(fresh)), proposed[fresh]
-        ]
-        # The review doubts exactly that the marker was seen elsewhere.
-        doubted = presence <= SEEN_ELSEWHERE + MOST_AGE_LOG_ODDS
+        presence = track.state.presence_log_odds(frame.first_seen, frame.free_since, before)
+        presence = presence[fresh, proposed[fresh]]
+        # The review doubts exactly that the marker was seen elsewhere, unless the point was long beside it.
+        doubted = (presence >= SEEN_ELSEWHERE) & (presence <= SEEN_ELSEWHERE + MOST_AGE_LOG_ODDS)
         return float(gain + presence[~doubted].sum() + _DOUBTED_PRESENCE * doubted.sum())
 
     def _log_odds(

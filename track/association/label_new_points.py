@@ -101,7 +101,7 @@ def _label_palm(frame: FrameState, track: HandTrack) -> FrameState:
     log_odds = match_log_odds(
         frame.points[free], expected.positions[palm], expected.covariances[palm], density
     )
-    log_odds += track.state.presence_log_odds(frame.first_seen[free])[:, palm]
+    log_odds += track.state.presence_log_odds(frame.first_seen, frame.free_since, markers)[np.ix_(free, palm)]
     matched, confidence = match_points(log_odds)
     chosen = free[matched >= 0]
     markers[chosen] = palm[matched[matched >= 0]]
@@ -121,7 +121,8 @@ def _evaluate_hand(
     if not open_digits:
         return
     state, markers = track.state, frame.markers(track.hand)
-    log_odds, labeled = state.presence_log_odds(frame.first_seen), np.flatnonzero(markers >= 0)
+    log_odds = state.presence_log_odds(frame.first_seen, frame.free_since, markers)
+    labeled = np.flatnonzero(markers >= 0)
     log_odds[labeled, markers[labeled]] = frame.evidence[labeled]
     confirmed, unconfirmed = state.digit_models(track.prediction, track.estimate)
     for digit in open_digits:

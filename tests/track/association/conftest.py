@@ -45,10 +45,13 @@ def followed() -> Followed:
 def frame_of() -> Callable[..., FrameState]:
     """Makes a frame of points whose labels have some evidence."""
 
-    def make(points, labels, time, *, hands=1, evidence=0.0, first_seen=0.0, ids=None) -> FrameState:
+    def make(
+        points, labels, time, *, hands=1, evidence=0.0, first_seen=0.0, free_since=None, ids=None
+    ) -> FrameState:
         count = len(points)
         numbers = np.arange(count) if ids is None else ids
         evidences, seen = np.full(count, evidence), np.full(count, first_seen)
+        free = np.full(count, time if free_since is None else free_since)
         return FrameState(
             points,
             numbers,
@@ -56,6 +59,7 @@ def frame_of() -> Callable[..., FrameState]:
             evidences,
             np.ones(count),
             seen,
+            free,
             time,
             Numbering([19] * hands),
         )

@@ -105,6 +105,7 @@ def test_labels_go_along_with_ids_and_do_not_outlive_a_silence():
     np.testing.assert_array_equal(second.labels, [2, 1, 5, 0, -1, 3])
     np.testing.assert_array_equal(second.evidence, [5, 4, 3, 2, 0, 0])
     np.testing.assert_array_equal(second.first_seen, np.zeros(6))
+    np.testing.assert_array_equal(second.free_since, [0.01, 0.01, 0.01, 0.01, 0.0, 0.01])
     history.keep(second)
     late = history.carry(points, ids, 0.27, nowhere)
     assert (late.labels == -1).all() and (late.evidence == 0.0).all()

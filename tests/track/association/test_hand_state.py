@@ -70,7 +70,7 @@ def test_a_marker_without_a_point_at_the_start_may_be_any_point_that_is_there(mo
     target[TIP] = np.nan
     moving.initialize(moving.qpos, target, 1.0)
     moving.predict(1.0)
-    odds = moving.presence_log_odds(np.array([1.0 - STRAY_LIFETIME]))[0]
+    odds = moving.presence_log_odds(np.array([1.0 - STRAY_LIFETIME]), np.ones(1), np.array([-1]))[0]
     assert odds[KNUCKLE] == SEEN_ELSEWHERE + 1.0 < SEEN_ELSEWHERE + MOST_AGE_LOG_ODDS < odds[TIP]
 
 
@@ -196,7 +196,8 @@ def test_a_marker_comes_back_soon_or_hardly_and_never_while_it_is_seen_elsewhere
     target[TIP] = np.nan
     moving.update(moving.fit(target, prediction.qpos, prediction), np.ones(19, dtype=bool), 30 / RATE)
     moving.predict(0.5)
-    log_odds = moving.presence_log_odds(np.array([0.1, 30 / RATE + 1e-3, 0.5]))
+    unlabeled, now = np.full(3, -1), np.full(3, 0.5)
+    log_odds = moving.presence_log_odds(np.array([0.1, 30 / RATE + 1e-3, 0.5]), now, unlabeled)
     assert log_odds[0, TIP] == pytest.approx(
         SEEN_ELSEWHERE + MOST_AGE_LOG_ODDS
     )  # it was seen after the point
@@ -204,3 +205,12 @@ def test_a_marker_comes_back_soon_or_hardly_and_never_while_it_is_seen_elsewhere
     age = (0.5 - 30 / RATE - 1e-3) / STRAY_LIFETIME
     soon = log_odds[1] - age
     assert soon[KNUCKLE] == pytest.approx(np.log(0.65)) and log_odds[2, TIP] < soon[TIP]
+
+
+def test_a_point_that_was_beside_a_seen_marker_is_hardly_that_marker_while_it_is_hidden(moving):
+    moving.predict(0.5)  # the markers were last seen at 0.25 s
+    hidden, held = (
+        moving.presence_log_odds(np.zeros(1), np.zeros(1), np.array([marker]))[0] for marker in (-1, KNUCKLE)
+    )
+    assert held[KNUCKLE] == SEEN_ELSEWHERE + MOST_AGE_LOG_ODDS > hidden[KNUCKLE] + 15.0
+    assert held[TIP] == hidden[TIP]

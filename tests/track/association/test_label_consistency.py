@@ -32,7 +32,7 @@ RATE = 120.0
 def frame_of(points: np.ndarray, labels: np.ndarray) -> FrameState:
     count = len(points)
     ones, numbers = np.ones(count), np.arange(count)
-    return FrameState(points, numbers, labels, 4.0 * ones, ones, 0.0 * ones, 0.0, Numbering([19]))
+    return FrameState(points, numbers, labels, 4.0 * ones, ones, 0.0 * ones, 0.0 * ones, 0.0, Numbering([19]))
 
 
 def gated(state, points, labels, prediction) -> np.ndarray:
@@ -259,6 +259,16 @@ def test_a_marker_that_waits_gets_its_label_and_a_ghost_does_not(state, frame_of
     ghost[TIP] += [0.0, 0.0, 0.03]
     again = LabelerReview(CountingLabeler(), 1, TrackerConfig())
     assert reviewed(again, state, frame_of(ghost, labels, 0.5, first_seen=0.5)) is None
+
+
+def test_a_point_that_was_long_beside_a_marker_does_not_replace_it(state, frame_of):
+    points = state.solver.marker_positions(state.qpos)
+    labels = np.arange(19)
+    labels[TIP] = -1
+    for free_since, replaces in ((0.45, True), (0.2, False)):
+        review = LabelerReview(CountingLabeler(), 1, TrackerConfig())
+        after = reviewed(review, state, frame_of(points, labels, 0.5, free_since=free_since))
+        assert (after is not None) == replaces
 
 
 def test_reviews_become_rarer_until_a_new_point_comes(state, frame_of):
