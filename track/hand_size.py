@@ -46,7 +46,7 @@ from track.user import MEASURED, User, designed_glove
 from train.labelers.protocol import Labeler, Labeling
 from train.labelers.storage import labeler_at_once
 
-_LENGTHS: Final = (0.187, 0.205, 0.168, 0.150)  # [m] lengths for the first labels, the likeliest first
+_LENGTHS: Final = (0.187, 0.205, 0.168, 0.150, 0.125)  # [m] lengths for the first labels, the likeliest first
 _SHORTEST, _LONGEST = 0.125, 0.225  # [m] hand lengths: 0.6 of an adult's to beyond ANSUR II's longest
 _BREADTHS: Final = (0.88, 1.12)  # breadth over the usual one of a length: three standard deviations
 _FAR: Final = 0.012  # [m] Hands are labeled again after a larger change of length.
@@ -129,18 +129,20 @@ def fit_size(
 ) -> SizeFit | None:
     """Measure size and proportions of the hands in some frames; None if no hand is found.
 
-    A child's hand of few markers, some of which get wrong labels, may pass for an adult's: hands that leave
-    points beside them without a label are compared with those that another first length leads to.
+    A child's hand, some markers of which get no label or a wrong one, may pass for a larger hand. So a hand
+    beside which points have no label, or of which a marker is never seen, is compared with smaller ones.
     """
     some = [] if is_quick else _compared(frames)
     for config in (_LENIENT,) if is_quick else (_USUAL, _LENIENT):
         rated: list[tuple[float, SizeFit]] = []
         for length in _LENGTHS[:2] if is_quick else _LENGTHS:
+            if any(length > fit.hand.shape.length for _, fit in rated):
+                continue
             fit = _fit_from(length, frames, layout, sides, labeler, config)
             if fit is None or not (config is _USUAL or _is_found(fit, frames, sides, labeler)):
                 continue
-            match = _fit(some, fit.hands(sides), labeler) if some else _Fit(is_good=True)
-            if match.is_good:
+            match = _fit(some, fit.hands(sides), labeler) if some else _Fit(is_good=True, is_whole=True)
+            if match.is_good and match.is_whole:
                 return fit
             rated.append((match.log_odds, fit))
         if rated:
