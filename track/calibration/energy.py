@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from gloves.captures.capture import runs_of
 from gloves.fit import GloveFit
 from handsim.hand.model import NUM_VELOCITIES, HandModel, join_qpos, skinned_jacobian
-from handsim.hand.shape import BONES, DIGITS, NUM_BONES, HandShape, bones_of
+from handsim.hand.shape import BONES, DIGITS, NUM_BONES, NUM_JOINTS, HandShape, bones_of
 from handsim.hand.skin import rest_vertices
 from handsim.kernels import move
 from handsim.space.transforms import quaternion_matrix
@@ -58,9 +58,9 @@ HEIGHT_SPREAD: Final = 0.0005  # [m] the same of its height over the design's
 CONTACT_SPREAD: Final = 0.0007
 """Standard deviation of a pad's compression around `PAD_COMPRESSION` [m]; (noise / spread)^2 is lambda_2."""
 _LIMIT_SPREAD: Final = np.deg2rad(2.0)  # [rad] standard deviation of an angle beyond its range
-# The pose prior counts as often as this per capture, as its frames are much alike: the thumb's angles once,
-# the fingers' four times. The mean of so many gestures varies from person to person like that of a capture.
-_GESTURES_OF_USER: Final = np.repeat([1.0, 4.0], [4, 16])
+_GESTURES: Final = 4.0  # The pose prior counts this many times per capture, as its frames are much alike.
+GESTURES_OF_USER: Final = np.repeat([1.0, _GESTURES], [4, 16])
+"""Number of gestures, by joint angle, whose mean varies from person to person like the mean of a capture."""
 _MOST_GESTURES: Final = 80  # in which errors of angles are computed
 _LEAST_MOTION: Final = np.deg2rad(1.0)  # of a digit that flesh follows
 RELINEARIZE: Final = 0.005  # The skin's jacobian is renewed after such a change (log lengths, [rad], [m]).
@@ -145,6 +145,7 @@ class Problem:
         noise: float,  # standard deviation of marker coordinates [m]
         robust_scale: float,  # [m] scale of the robust loss, which halves a square there (Geman, McClure)
         relinearize: float = RELINEARIZE,
+        gestures: Float[np.ndarray, "20"] | float = _GESTURES,  # that the capture counts as
     ) -> None:
         self._relinearize = relinearize
         self.shape, self.design, self.heights = shape, design, heights
@@ -152,7 +153,7 @@ class Problem:
         """Whether each marker is present."""
         self.targets = np.where(self.present[..., None], targets, 0.0)
         self.noise, self.robust_scale = noise, robust_scale
-        roots = np.sqrt(np.minimum(1.0, _GESTURES_OF_USER / max(1, len(targets))))
+        roots = np.sqrt(np.minimum(1.0, gestures / np.full(NUM_JOINTS, len(targets))))
         self.pose_precision = np.outer(roots, roots) * resting_prior().precision
         self.position_spread, self.height_spread = POSITION_SPREAD, HEIGHT_SPREAD
         self.place_weights = np.ones(len(heights))
@@ -586,7 +587,7 @@ def error_covariance(
     flat = by_shared.reshape(-1, len(reduced))
     share = (problem.data_noise / problem.noise) ** 2
     errors = share * reduced[:, :-1] + (1.0 - share) * (equations.shared - flat.T @ flat)
-    turns = answers[:, 6:].sum(axis=0).T @ problem.pose_precision / np.sqrt(_GESTURES_OF_USER)
+    turns = answers[:, 6:].sum(axis=0).T @ problem.pose_precision / np.sqrt(GESTURES_OF_USER)
     errors += turns @ resting_prior().covariance @ turns.T
     # Of flesh of a size, the fit leaves a part in the residuals; by that the size is estimated.
     patterns = _flesh_patterns(problem, estimate, fit)

@@ -28,6 +28,7 @@ from handsim.hand.shape import DIGITS, JOINT_NAMES, NUM_JOINTS, PALM, HandShape,
 from handsim.hand.skin import rest_vertices
 from handsim.space.transforms import MIRROR, quaternion_matrix, rigid_fit
 from track.calibration.energy import (
+    GESTURES_OF_USER,
     HEIGHT_SPREAD,
     POSITION_SPREAD,
     Estimate,
@@ -259,7 +260,9 @@ def calibrate_hand(
     some = seen[:: max(1, len(usable) // _INITIAL_FRAMES)]
     track = PoseSolver(right).solve(some)
     chosen, scales = informative_frames(track, some), {"noise": _FIRST_NOISE, "robust_scale": _FIRST_SCALE}
-    problem, estimate = first_estimate(right, some[chosen], track.qpos[chosen], **scales)
+    problem, estimate = first_estimate(
+        right, some[chosen], track.qpos[chosen], gestures=GESTURES_OF_USER, **scales
+    )
     # Distant markers are down-weighted only after the hand nearly fits.
     estimate, fit, steps = levenberg_marquardt(problem, estimate, 0, _WIDE_STEPS, progress)
     problem.robust_scale = _SCALE_IN_NOISES * marker_noise(problem, fit)
@@ -318,6 +321,7 @@ def _with_touches(
         markers[frames],
         noise=float(np.sqrt(noise**2 + flesh * max(len(frames) / _INDEPENDENT_POSES - 1.0, 0.0))),
         robust_scale=_SCALE_IN_NOISES * noise,
+        gestures=GESTURES_OF_USER,
     )
     larger.data_noise = noise
     estimate = dataclasses.replace(estimate, qpos=track.qpos[frames])

@@ -69,8 +69,8 @@ SOURCES: Final = ("noise and gaps", "gluing", "flesh", "person")
 """Sources of an angle's uncertainty: noisy or unseen markers, their glued places, their motion over the
 bones, and what stays of a person: sizes and directions of bones, gestures unlike other people's."""
 CHANGING: Final = 0.82
-"""Share of the errors of measured hands that differs between sessions, as found in two sessions of each of 29
-simulated people (benchmarks/sessions.py). The rest is what their shape moves markers by, always alike."""
+"""Share of the errors of hands that are not calibrated that differs between sessions, as found for measured
+hands in two sessions of each of 29 simulated people (benchmarks/sessions.py). Their shape does the rest."""
 DETECTABLE: Final = 1.96 * float(np.sqrt(2.0))
 """Ratio of the minimal detectable difference of two sessions to the standard error of measurement."""
 _OWN: Final = 10  # unknown numbers of a digit: knuckle, direction, bones (3 each), all its bones
@@ -460,7 +460,6 @@ def measurement_error(budget: Float[np.ndarray, "*J 4"], origin: HandOrigin) -> 
     """Standard error of measurement between sessions of a person, in the unit of deviations by `SOURCES`."""
     changing = 1.0 if origin == "calibrated" else CHANGING
     return np.asarray(changing * np.linalg.norm(budget[..., :-1], axis=-1))
-
 
 def freedom_factor(num_markers: int) -> float:
     """Ratio of the noise of marker coordinates to the RMS distance from a fitted pose."""
