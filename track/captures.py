@@ -224,7 +224,7 @@ def calibrate(
         tracker = Tracker([one.hand for one in done], setup.labeler)
         take = tracked_take(source, frames, tracker, progress=on_label)
         done = calibrate_take(take, setup.start, setup.user, on_part)
-    for sentence in misfits(take):
+    for sentence in misfits(take, calibrates=True):
         warnings.warn(sentence, HandSimWarning, stacklevel=2)
     name = _named(capture, source).get("capture", "a capture")
     found = kept_user(take, done, setup.user, f"from {name}", on_part)

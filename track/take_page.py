@@ -37,14 +37,14 @@ _TABLES: Final = (".frames.csv", ".joints.csv", ".markers.csv", ".doubts.csv")
 _RANGE: Final = {"least": 0.0, "5th": 5.0, "median": 50.0, "95th": 95.0, "largest": 100.0}
 """Columns of a range of motion, and the percentile of each."""
 _CHUNK: Final = 4096  # frames per call of forward kinematics
-_WANTED: Final = (0.99, 0.999)  # shares of right frames for which the page gives a number of looks
+_WANTED: Final = 0.99  # share of right frames for which the page gives a number of looks
 _MOST_SPANS: Final = 100  # rows of the page's table of doubtful spans
 _BINS: Final = 750  # bins of a long take's curve, which shows the extremes of each
 _STROKES: Final = (Paint.VIOLET, Paint.BLUE, Paint.WARM, Paint.GREEN)
 """Colors of a digit's joints, from proximal to distal."""
 _COASTING: Final = "#efd9c9"
 _SHADES: Final = "Gray: the hand is lost and has no pose. Orange: it coasts, its pose is predicted."
-_BANDS: Final = "the bands say how far off each joint angle may be, and are narrower with a calibrated hand. "
+_BANDS: Final = "The bands say how far off each joint angle may be; with a calibrated hand they are narrower."
 _CALIBRATE: Final = (
     "A capture of half a minute in which every joint moves and the thumb touches each fingertip tells more: "
     "<code>handsim calibrate minute.c3d --out user.json</code>, then <code>handsim track ... --shape "
@@ -244,12 +244,12 @@ def _calibration_section(take: Take) -> Section:
     elif notes.startswith(MEASURED) or notes in get_args(Size):
         named = f"the mean hands of size {notes}, in a glove as designed"
         known = "measured in the capture" if notes.startswith(MEASURED) else named
-        text = f"The hands are not calibrated but {known}: {_BANDS}{_CALIBRATE}"
+        text = f"The hands are not calibrated but {known}. {_BANDS} {_CALIBRATE}"
     elif notes:
         text = f"The hands are a user's, as calibrated or given: {escape(notes)}."
     else:
         text = "The hands were given, and the take does not say whether they are calibrated. "
-        text += f"If they are not, {_BANDS}"
+        text += _BANDS
     return Section("Calibration", text)
 
 
@@ -459,14 +459,10 @@ def _spans_section(take: Take, spans: Sequence[SuspectSpan], source: str) -> Sec
         "and a wrong label can be corrected."
     )
     more = f"These are the first {_MOST_SPANS} of {len(spans):,}; the table beside the page has all."
-    for share in _WANTED if take.made_by_tracker else ():
-        looks = vouched.looks(share)
-        if looks:
-            text += f" After a look at the first {looks}, {100 * share:g} % of all frames should be right."
-            break
-    else:
-        if vouched.after:
-            text += f" After a look at all, {100 * vouched.after[-1]:.1f} % or more should be right."
+    if take.made_by_tracker and (looks := vouched.looks(_WANTED)):
+        text += f" After a look at the first {looks}, {100 * _WANTED:g} % of all frames should be right."
+    elif take.made_by_tracker and vouched.after:
+        text += f" After a look at all, {100 * vouched.after[-1]:.1f} % or more should be right."
     return Section("Doubtful frames", text, table=table, notes=[more] if len(spans) > _MOST_SPANS else [])
 
 

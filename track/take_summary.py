@@ -108,14 +108,15 @@ def suspicions(take: Take) -> list[str]:
     return misfits(take) + [f"{fault.words}; {fault.remedy}" for fault in find_faults(take)]
 
 
-def misfits(take: Take) -> list[str]:
-    """Signs that the hands or the glove tracked are not those of the capture."""
-    found = [sentence for side in take.sides for sentence in _suspicions_of(take, side)]
+def misfits(take: Take, *, calibrates: bool = False) -> list[str]:
+    """Signs that the hands or the glove tracked, to calibrate them or not, are not those of the capture."""
+    found = [sentence for side in take.sides for sentence in _suspicions_of(take, side, calibrates)]
     share = _unlabeled_share(take)
     if share > _MOST_UNLABELED:
         found.append(
             f"{100 * share:.1f} % of the points at the hands are not markers of what was tracked; name the "
-            "glove worn (--glove), the hands (--hands) and the rigid bodies (--body) that are in the capture"
+            f"glove worn (--glove){'' if calibrates else ', rigid bodies (--body)'} and the hands (--hands) "
+            "that are in the capture"
         )
     return found
 
@@ -138,7 +139,7 @@ def _unlabeled_at_hands(take: Take) -> int:
     return near
 
 
-def _suspicions_of(take: Take, side: Side) -> list[str]:
+def _suspicions_of(take: Take, side: Side, calibrates: bool) -> list[str]:
     """Signs of a wrong setup of one hand."""
     hand = take.hand_index(side)
     shown = take.status[:, hand] != LOST
@@ -156,7 +157,7 @@ def _suspicions_of(take: Take, side: Side) -> list[str]:
             f"{100 * filled:.1f} % of the {side} hand's markers were not seen and are filled in from its "
             "pose; name the glove worn (--glove) and the hands that are in the capture (--hands)"
         )
-    if rms > _MOST_RMS:
+    if rms > _MOST_RMS and not calibrates:
         found.append(
             f"the {side} hand's markers are {1e3 * rms:.1f} mm off its pose; name the glove worn (--glove), "
             "try another --size, or calibrate the hands (handsim calibrate, then --shape)"

@@ -15,7 +15,7 @@ import json
 import time
 import warnings
 from collections.abc import Mapping
-from concurrent.futures import FIRST_COMPLETED, Future, wait
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, wait
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
@@ -221,8 +221,8 @@ def _compile_all(listed: Mapping[int, ListedKernel]) -> None:
                     processes.remove(process)
                     try:
                         jobs[process.submit(_compile_row, row)] = process, row
-                    except OSError:  # no memory for another process
-                        del queue.running[row]
+                    except (OSError, BrokenExecutor):  # no memory for another process, or it died
+                        queue.waiting[row] = queue.running.pop(row)
             if not jobs:  # the remaining kernels call one another, or all processes died
                 break
             for job in wait(jobs, _TOLD, FIRST_COMPLETED).done:

@@ -196,7 +196,7 @@ def body_fixed_angles(rotations: Float[np.ndarray, "T 3 3"]) -> NDArray[np.float
 
 
 def random_quaternions(count: int, *, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Uniform random rotations as wxyz quaternions (count, 4), as uniform if read as xyzw."""
+    """Uniform random rotations as wxyz quaternions (count, 4); read as xyzw they are uniform, too."""
     raw: NDArray[np.float64] = rng.standard_normal((count, 4))
     raw /= np.linalg.norm(raw, axis=1, keepdims=True)
     return raw

@@ -8,6 +8,7 @@ pixel, and the last bundles are of these.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
@@ -190,7 +191,10 @@ def register(
     start = _first_guess(bundle)
     state, covariance, noise = _adjusted(bundle, start, splits=True)
     # Errors of the detector may look like a push, those of outlines do not.
-    still = [_adjusted(bundle, start, splits=False)[0]] if pictures and len(state.starts) > 1 else []
+    still = []
+    if pictures and len(state.starts) > 1:
+        with contextlib.suppress(HandSimError):  # no camera that stood still fits
+            still.append(_adjusted(bundle, start, splits=False)[0])
     tried = [_outlined(bundle, take, one, pictures) for one in (*still, state)] if pictures else []
     if outlined := [one for one in tried if one is not None]:
         away = np.array([fit.distances for *_, fit in outlined])

@@ -10,6 +10,7 @@ from __future__ import annotations
 import functools
 import io
 import itertools
+import math
 import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -98,8 +99,8 @@ def train_detector(
         out: Folder of the weights.
         start: Folder of weights to begin with, or `shipped`; random ones when not given.
         photographs: File of COCO keypoints [px] of your own photographs (21 a hand, in our order), which are
-            beside it or in a folder `images` there. Half of the samples are then taken from them. The last
-            fifth by name is held out; a network that did better there before is left as it was.
+            beside it or in a folder `images` there. Half of the samples are then taken from them. About
+            the last fifth by name is held out; a network that did better there before is left as it was.
         samples: Number of squares that the keypoint network learns from; the finder learns from a quarter
             as many pictures.
         seed: Seed of pictures, of initial weights and of all random choices.
@@ -121,7 +122,8 @@ def train_detector(
             _load_folded(network, begun / name)
     rng = np.random.default_rng(seed)
     mine = lessons_of([] if photographs is None else read_scenes(Path(photographs)), rng=rng)
-    own, held = zip(*((some[: (end := int(_LEARNED * len(some)))], some[end:]) for some in mine), strict=True)
+    ends = [math.ceil(_LEARNED * len(some)) for some in mine]
+    own, held = zip(*((some[:end], some[end:]) for some, end in zip(mine, ends, strict=True)), strict=True)
     drawn = lessons_of(_drawn(max(1, round(samples / _SAMPLES_A_SCENE / SCENES)), seed), rng=rng)
     # Photographs are repeated until half of the samples are taken from them.
     views, squares = (
@@ -141,7 +143,7 @@ def train_detector(
         after = _mean_loss(network, judged, loss)
         if judged:
             _tell(f"{name}: loss {before:.3f} of photographs that are held out, then {after:.3f}\n")
-        if not after <= before:  # or no number
+        if not after <= before or not all(one.isfinite().all() for one in network.state_dict().values()):
             network.load_state_dict(given)
         export(network, Path(out) / name)
     return Path(out)

@@ -60,7 +60,7 @@ class FrameState(NamedTuple):
     """Evidence (log-odds) for each point's label, accumulated over the frames of its number."""
     confidence: Float[np.ndarray, "P"]  # confidence in each label, 0 to 1
     first_seen: Float[np.ndarray, "P"]  # time of the first frame with the point's number [s]
-    free_since: Float[np.ndarray, "P"]  # time of the first of the last frames that gave it no label [s]
+    free_since: Float[np.ndarray, "P"]  # since when it has no label; now if it has one [s]
     time: float  # time of the frame [s]
     numbering: Numbering  # what labels mean
 
@@ -141,8 +141,8 @@ class PointHistory:
         self._labels: dict[int, int] = {}  # by point number
         self._evidence: dict[int, float] = {}  # log-odds of these labels
         self._first_seen: dict[int, float] = {}  # [s] by point number
+        # By number of each point without a label: since when it has none [s], and its last place [m].
         self._free: dict[int, tuple[float, NDArray[np.float64]]] = {}
-        # by number of the points without a label: since when [s], and the last place [m]
         self._last_time = -np.inf  # [s] of the last frame
 
     def carry(

@@ -60,8 +60,9 @@ _RETURN_TIME: Final = 0.01  # [s] over the hidden time: a marker's probability t
 _RETURN_LEAST, _RETURN_MOST = 0.01, 0.65  # bounds of that probability
 SEEN_ELSEWHERE: Final = -7.0
 """Log probability that a point is a marker that was seen as another point at the same time."""
-_BESIDE_TIME: Final = 0.01  # [s] A marker seen so long beside a point takes a log-odds from it once hidden.
-_MOST_BESIDE: Final = 18.0  # largest such loss, regained as by age; the labeler's answer does not outweigh it
+# While a point has no label though a marker is seen, each time of this length [s] costs it a log-odds of 1
+# for that marker. The largest loss exceeds a labeler's answer, and shrinks while the marker is hidden.
+_BESIDE_TIME, _MOST_BESIDE = 0.01, 18.0
 STRAY_LIFETIME: Final = 0.1  # [s] mean lifetime of strays
 MOST_AGE_LOG_ODDS: Final = 3.0  # largest log-odds from a point's age
 

@@ -461,6 +461,7 @@ def measurement_error(budget: Float[np.ndarray, "*J 4"], origin: HandOrigin) -> 
     changing = 1.0 if origin == "calibrated" else CHANGING
     return np.asarray(changing * np.linalg.norm(budget[..., :-1], axis=-1))
 
+
 def freedom_factor(num_markers: int) -> float:
     """Ratio of the noise of marker coordinates to the RMS distance from a fitted pose."""
     return float(np.sqrt(num_markers / max(3 * num_markers - NUM_UNKNOWNS, _LEAST_FREEDOM)))

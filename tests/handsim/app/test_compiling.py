@@ -111,7 +111,7 @@ def test_ctrl_c_ends_the_processes(tmp_path):
     process.send_signal(signal.SIGINT)
     process.communicate(timeout=20)
     assert process.returncode != 0
-    with pytest.raises(ProcessLookupError):  # nobody of them is left, multiprocessing's tracker soon
+    with pytest.raises(ProcessLookupError):  # All end; multiprocessing's tracker does a moment later.
         for _ in range(100):
             os.killpg(process.pid, 0)
             time.sleep(0.1)
