@@ -219,7 +219,7 @@ def load_user(path: str | Path) -> User:
     try:
         content = json.loads(read_bytes(path, error=UserError, most=_MOST))
     except (ValueError, RecursionError) as error:
-        raise UserError(f"{path}: no JSON text, expected a user of handsim calibrate (.json)") from error
+        raise UserError(f"{path}: not a user's file of handsim calibrate (.json): no JSON text") from error
     if not isinstance(content, dict) or "schema" not in content:
         raise UserError(f"{path}: not a user's file: it has no schema number")
     if content["schema"] != SCHEMA:
