@@ -156,7 +156,7 @@ class Problem:
         roots = np.sqrt(np.minimum(1.0, gestures / np.full(NUM_JOINTS, len(targets))))
         self.pose_precision = np.outer(roots, roots) * resting_prior().precision
         self.position_spread, self.height_spread = POSITION_SPREAD, HEIGHT_SPREAD
-        self.place_weights = np.ones(len(heights))
+        self.place_weights = np.ones(targets.shape[1])
         """Weights (M,) of the prior of each marker's place."""
         self.data_noise = noise
         """Standard deviation of a marker's coordinates [m] without the flesh, for which `noise` is larger."""
