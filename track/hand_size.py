@@ -46,7 +46,7 @@ from track.user import MEASURED, User, designed_glove
 from train.labelers.protocol import Labeler, Labeling
 from train.labelers.storage import labeler_at_once
 
-_LENGTHS: Final = (0.187, 0.205, 0.168, 0.150, 0.125)  # [m] lengths for the first labels, the likeliest first
+_LENGTHS: Final = (0.187, 0.205, 0.168, 0.150, 0.125)  # [m] tried for the first labels, the likeliest first
 _SHORTEST, _LONGEST = 0.125, 0.225  # [m] hand lengths: 0.6 of an adult's to beyond ANSUR II's longest
 _BREADTHS: Final = (0.88, 1.12)  # breadth over the usual one of a length: three standard deviations
 _FAR: Final = 0.012  # [m] Hands are labeled again after a larger change of length.
@@ -141,7 +141,9 @@ def fit_size(
             fit = _fit_from(length, frames, layout, sides, labeler, config)
             if fit is None or not (config is _USUAL or _is_found(fit, frames, sides, labeler)):
                 continue
-            match = _fit(some, fit.hands(sides), labeler) if some else _Fit(is_good=True, is_whole=True)
+            if not some:
+                return fit
+            match = _fit(some, fit.hands(sides), labeler)
             if match.is_good and match.is_whole:
                 return fit
             rated.append((match.log_odds, fit))

@@ -106,7 +106,7 @@ class TrackerSetup:
         user, is_auto = _chosen_user(settings)
         tracking = settings if isinstance(settings, TrackSettings) else TrackSettings()
         bodies, config = load_bodies(tracking.bodies), tracking.tracker
-        # Hands may have slipped in their glove: where it is named, too, its labeler is that of the design.
+        # The layout of given hands may have slipped, and then has no labeler. That of a named glove has one.
         glove = user.layout if settings.glove is None else load_layout(settings.glove)
         labeler, record = labeler_of(glove, settings.labeler), settings.record()
         record |= {"glove": record["glove"] or user.layout.name, "user": user.notes or str(user)}

@@ -87,13 +87,7 @@ class _Hand(NamedTuple):
     worn: GloveFit
     frames: Int[np.ndarray, "F"]
     offsets: Float[np.ndarray, "F M 3"]  # [m] of seen markers from their places, in the bones' frames
-
-    def seen(self) -> Float[np.ndarray, "S M 3"]:
-        """The markers [m] in some frames that show enough of them for a pose."""
-        frames = self.frames[:: -(-len(self.frames) // _FITTED_FRAMES)]
-        labels = self.take.hand_labels[self.take.hand_index(self.side)]
-        seen = self.take.point_list.labeled(labels, frames)
-        return np.asarray(seen[np.isfinite(seen[..., 0]).sum(axis=1) >= FEWEST_MARKERS])
+    seen: Float[np.ndarray, "S M 3"]  # markers [m] in some frames that show enough of them for a pose
 
     def span(self, first: int, name: str, why: str, remedy: str, *, of_labels: bool = True) -> SuspectSpan:
         """A fault from frame `first` to the end, of a marker or joint; of the whole hand without `name`."""
@@ -116,7 +110,9 @@ def find_faults(take: Take) -> tuple[SuspectSpan, ...]:
         if len(frames) < _FEWEST:
             continue
         some = frames[:: -(-len(frames) // _MOST_FRAMES)]
-        hand = _Hand(take, side, take.hands[number], some, take.marker_offsets(side, some))
+        seen = take.point_list.labeled(take.hand_labels[number], some[:: -(-len(some) // _FITTED_FRAMES)])
+        enough = np.isfinite(seen[..., 0]).sum(axis=1) >= FEWEST_MARKERS
+        hand = _Hand(take, side, take.hands[number], some, take.marker_offsets(side, some), seen[enough])
         for faults in (_unsure_side, _misplaced, _off_design, _slips, _fallen, _at_limits):
             found += faults(hand)
     return tuple({one.of: one for one in reversed(found)}.values())[::-1]
@@ -233,17 +229,17 @@ def _misplaced(hand: _Hand) -> Iterator[SuspectSpan]:
 
 
 def _off_design(hand: _Hand) -> Iterator[SuspectSpan]:
-    """Markers that are glued far from the layout's places, as their motion with the joints shows."""
-    first, seen = int(hand.frames[0]), hand.seen()
-    offsets = glued_offsets(seen, hand.worn) if len(seen) else np.zeros(len(hand.worn.layout.names))
-    for name, off in zip(hand.worn.layout.names, offsets, strict=True):
+    """Markers whose places on the moving hand are far from those in the layout."""
+    if not len(hand.seen):
+        return
+    for name, off in zip(hand.worn.layout.names, glued_offsets(hand.seen, hand.worn), strict=True):
         if off > _OFF_DESIGN:
-            yield hand.off_place(name, off, first)
+            yield hand.off_place(name, off, int(hand.frames[0]))
 
 
 def _unsure_side(hand: _Hand) -> Iterator[SuspectSpan]:
     """A hand in a glove like its mirror image, that a hand of the other side fits as well in motion."""
-    worn, seen = hand.worn, hand.seen()
+    worn, seen = hand.worn, hand.seen
     if not len(seen):
         return
     other: Side = "left" if hand.side == "right" else "right"

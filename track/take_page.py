@@ -307,8 +307,8 @@ def _draw_angles(figure: Figure, times: Float[np.ndarray, "T"], hand: HandFigure
 
 
 def _range_section(title: str, take: Take, hand: HandFigures) -> Section:
-    table = [["joint [deg]", *_RANGE, "median SD", "model's range", "at its limits [%]", "measured [%]"]]
-    table[0].append("longest gap [s]")
+    shares = "at its limits [%]", "measured [%]"
+    table = [["joint [deg]", *_RANGE, "median SD", "model's range", *shares, "longest gap [s]"]]
     for joint, (*first, limits, measured, gap) in zip(JOINTS, hand.joints().tolist(), strict=True):
         cells = [NOTHING if np.isnan(one) else f"{one:.1f}" for one in first]
         cells += [f"{joint.low:g} to {joint.high:g}", percent(limits) if limits > 0.0 else NOTHING]

@@ -109,7 +109,7 @@ def suspicions(take: Take) -> list[str]:
 
 
 def misfits(take: Take, *, calibrates: bool = False) -> list[str]:
-    """Signs that the hands or the glove tracked, to calibrate them or not, are not those of the capture."""
+    """Find signs that the tracked hands or their glove are not those of the capture."""
     found = [sentence for side in take.sides for sentence in _suspicions_of(take, side, calibrates)]
     share = _unlabeled_share(take)
     if share > _MOST_UNLABELED:

@@ -266,7 +266,7 @@ def plain_shape_errors() -> None:
 
 @functools.cache
 def _prepared() -> tuple[list[ListedKernel], list[Any]]:
-    """The list and its types, in a process that compiles kernels and does nothing else."""
+    """Prepare a process that only compiles kernels; return the list of kernels, and the types it names."""
     gc.set_threshold(_GARBAGE)
     warnings.simplefilter("ignore")
     plain_shape_errors()

@@ -69,7 +69,7 @@ def poses_at(take: Take, moments: Doubles) -> Doubles:
 
 
 def shutter_times(take: Take, times: Doubles, cameras: Sequence[Camera], readout: Doubles) -> Doubles:
-    """Times (F, H) at which a rolling shutter reads the hands, from those of the pictures' middles [s]."""
+    """Times (F, H) [s] at which a rolling shutter reads each hand, given that of each picture's middle."""
     wrists = between_poses(take.times, times, take.qpos, take.rate)[..., :3]
     pixels = np.array([camera.project(one) for camera, one in zip(cameras, wrists, strict=True)])
     late = np.clip(np.nan_to_num(pixels / cameras[0].size - 0.5), -0.5, 0.5)

@@ -66,7 +66,7 @@ _MOST_MATCHED: Final = 64  # largest number of detections that are matched
 _NOWHERE: Final = 1e3  # [m] where hands are that the take does not have
 _TRIED: Final = 3  # number of best shifts for which PnP is tried
 _APART: Final = 0.3  # [s] least distance of two shifts for which PnP is tried
-_FOCALS: Final = (0.5, 0.65, 0.85, 1.1, 1.45, 1.9, 2.5, 3.3)  # focal lengths for which PnP is tried [widths]
+_FOCALS: Final = (0.5, 0.65, 0.85, 1.1, 1.45, 1.9, 2.5, 3.3)  # [picture widths] tried by PnP
 _GATE: Final = 0.08  # [widths] A detection is not of a hand whose keypoints are farther off in the median.
 _UNLIKE: Final = (
     "the hands in the video do not move as those of the take at any shift of the clock; expected a video of "
@@ -196,7 +196,7 @@ def register(
         with contextlib.suppress(HandSimError):  # no camera that stood still fits
             still.append(_adjusted(bundle, start, splits=False)[0])
     tried = [_outlined(bundle, take, one, pictures) for one in (*still, state)] if pictures else []
-    if outlined := [one for one in tried if one is not None]:
+    if outlined := [one for one in tried if one is not None]:  # of a camera that stood still first
         away = np.array([fit.distances for *_, fit in outlined])
         away = np.nan_to_num(away[:, np.isfinite(away).any(axis=0)], nan=width).clip(max=_LEAST_BOUND * width)
         state, covariance, fit = outlined[int((away.sum(axis=1) * _LIKELY ** np.arange(len(away))).argmin())]

@@ -141,7 +141,7 @@ class PointHistory:
         self._labels: dict[int, int] = {}  # by point number
         self._evidence: dict[int, float] = {}  # log-odds of these labels
         self._first_seen: dict[int, float] = {}  # [s] by point number
-        # By number of each point without a label: since when it has none [s], and its last place [m].
+        # Points without a label, by number: the time since which each has none [s], and its place [m].
         self._free: dict[int, tuple[float, NDArray[np.float64]]] = {}
         self._last_time = -np.inf  # [s] of the last frame
 

@@ -227,9 +227,10 @@ class HandState:
         free_since: Float[np.ndarray, "P"],
         markers: Int[np.ndarray, "P"],
     ) -> Float[np.ndarray, "P M"]:
-        """Log-odds that each marker returned when each point appeared, against a stray of the point's age.
+        """Log-odds that a point is a marker, which returned when the point appeared, and not a stray.
 
-        Where no point has a marker now, those that were without a label while it was seen are likely foreign.
+        A point that had no label while the marker was seen is likely foreign. This counts only for markers
+        that no point has now.
         """
         log_odds: NDArray[np.float64] = _presence_log_odds(
             first_seen, free_since, markers, self._last_seen, self._now

@@ -69,8 +69,8 @@ SOURCES: Final = ("noise and gaps", "gluing", "flesh", "person")
 """Sources of an angle's uncertainty: noisy or unseen markers, their glued places, their motion over the
 bones, and what stays of a person: sizes and directions of bones, gestures unlike other people's."""
 CHANGING: Final = 0.82
-"""Share of the errors of hands that are not calibrated that differs between sessions, as found for measured
-hands in two sessions of each of 29 simulated people (benchmarks/sessions.py). Their shape does the rest."""
+"""Part of an uncalibrated hand's error that changes between sessions of a person. The rest comes from its
+wrong shape, which stays. Found for two sessions of each of 29 simulated people (benchmarks/sessions.py)."""
 DETECTABLE: Final = 1.96 * float(np.sqrt(2.0))
 """Ratio of the minimal detectable difference of two sessions to the standard error of measurement."""
 _OWN: Final = 10  # unknown numbers of a digit: knuckle, direction, bones (3 each), all its bones
