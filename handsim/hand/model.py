@@ -478,8 +478,7 @@ def times_at(times: Float[np.ndarray, "T"], rate: float) -> Float[np.ndarray, "K
     last = (times[-1] - times[0]) * rate + _STEADY
     if last >= _MAX_FRAMES:
         raise ArgumentError(f"{last:.3g} frames at {rate:g} Hz, expected at most {_MAX_FRAMES}")
-    at: NDArray[np.float64] = times[0] + np.arange(int(last) + 1) / rate
-    return at
+    return np.asarray(times[0] + np.arange(int(last) + 1) / rate)
 
 
 def between_poses(

@@ -133,8 +133,9 @@ class FreihandWriter:
             numbers = json.loads(path.read_text(encoding="utf-8"))
         except ValueError as error:
             raise DatasetError(f"{path}: damaged: it holds no JSON; render into another folder") from error
-        pairs = numbers.values() if isinstance(numbers, dict) else [None]
-        if not all(isinstance(one, list) and [*map(type, one)] == [int, int] for one in pairs):
+        if not isinstance(numbers, dict) or not all(
+            isinstance(one, list) and [*map(type, one)] == [int, int] for one in numbers.values()
+        ):
             raise DatasetError(f"{path}: damaged: it holds no numbers; render into another folder")
         after = 0
         for shard, (first, count) in sorted(numbers.items(), key=lambda entry: entry[1]):

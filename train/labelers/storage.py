@@ -459,8 +459,7 @@ class OnnxLabeler:
         config = CNNConfig(**content["config"])
 
         def positions(images: NDArray[np.float32]) -> NDArray[np.float32]:
-            predicted: NDArray[np.float32] = self._session.run(None, {_IMAGES: images})[0]
-            return predicted
+            return np.asarray(self._session.run(None, {_IMAGES: images})[0])
 
         return CNNLabeler(positions, hand, config, self.marker_names).label_batch
 
