@@ -167,10 +167,8 @@ def _put_on(
 ) -> tuple[Attachment, list[int], list[str]]:
     """The layout's glove with its markers at these places of a hand, and the markers that miss their digit.
 
-    Returns:
-        The glove, the indices of markers that miss the skin of their digit, and for every marker the bone
-        of another digit that it would lie on, "" for none. The points of markers that meet no skin mean
-        nothing.
+    These are indices, and for every marker the bone of another digit that it would lie on, "" for none. The
+    points of markers that meet no skin mean nothing.
     """
     surface = model.surface
     rays = np.array([_ray(marker, model) for marker in markers])
@@ -216,12 +214,8 @@ def _other_digits(
     thumb's marker may lie over the index finger's metacarpal and the wrist. Skin that the palm carries more
     than any other bone, as over the thumb's muscle and the knuckles, counts to the palm. The end of a stalk
     may not be inside another digit.
-
-    Args:
-        feet: The places under the markers on the skin (M, 3) [m].
-        points: The markers' centers (M, 3) [m].
-        bones: The bone of each marker (M,).
-        carriers: The bone that carries most of the skin there (M,).
+    `feet` are the places under the markers' centers `points` on the skin (M, 3) [m], `carriers` the bones
+    that carry most of the skin there, `bones` those of the markers (M,).
     """
     capsules = model.capsules
     axes = capsules.posed(model.rest_transforms[None])[0]

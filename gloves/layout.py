@@ -15,7 +15,7 @@ import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
 import numpy as np
 from jaxtyping import Float
@@ -25,6 +25,7 @@ from handsim.errors import HandSimError, LayoutError, choices, errors_of
 from handsim.files.inputs import check_keys, number_of, quoted, read_toml, tables_of, text_of, written
 from handsim.files.outputs import write_text, writing
 from handsim.hand.shape import BONE_NAMES, BONES, DIGITS, PALM, SIDES, Side
+from handsim.settings import Expected
 
 FEWEST_MARKERS: Final = 5
 MOST_MARKERS: Final = 60
@@ -215,6 +216,12 @@ class ShippedLayout:
 def list_layouts() -> tuple[str, ...]:
     """Names of the layouts that come with the package."""
     return tuple(sorted(path.stem for path in _SHIPPED.glob("*.toml")))
+
+
+AnyLayout = Annotated[
+    MarkerLayout | str | Path, Expected("a MarkerLayout, or the name or path of one", list_layouts)
+]
+"""What `load_layout` takes, as a setting."""
 
 
 def load_layout(glove: MarkerLayout | str | Path) -> MarkerLayout:

@@ -205,8 +205,7 @@ def draw_keypoints(
     unit = 2**_FRACTION_BITS
     style = {"lineType": cv2.LINE_AA, "shift": _FRACTION_BITS}
     for keypoints, visible in hands:
-        near = (np.abs(np.nan_to_num(keypoints)) < 1e5).all(axis=1)
-        known = np.isfinite(keypoints).all(axis=1) & near
+        known = (np.abs(keypoints) < 1e5).all(axis=1)  # False for NaN
         sixteenths = np.rint(unit * (scale * np.nan_to_num(keypoints) - CENTER))
         pixels = sixteenths.astype(int).clip(-(2**24), 2**24)
         for start, end in SKELETON:

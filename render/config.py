@@ -114,17 +114,13 @@ class RenderConfig(Settings):
         Settings.__post_init__(self)
 
     def check(self) -> None:
-        """Refuse names of passes that are unknown, and ranges of tones that fall."""
+        """Refuse unknown passes, ranges of tones that fall, and settings of pictures that are not drawn."""
         check_tones(self.tones)
         for name in self.passes:
             check_choice(name, PASSES, noun="pass")
         if not self.passes:
             raise ArgumentError(f"passes are none, expected some of {', '.join(PASSES)}")
-        self._check_used()
-
-    def _check_used(self) -> None:
-        """Refuse settings of pictures that are not drawn."""
-        unused = {
+        used = {
             "rgb": {
                 "tones": self.tones != ALL_TONES,
                 "background": self.background != Backgrounds(),
@@ -134,7 +130,7 @@ class RenderConfig(Settings):
             },
             "depth": {"depth_sensor": self.depth_sensor not in ("auto", None)},
         }
-        for name, fields in unused.items():
+        for name, fields in used.items():
             given = [field for field, is_given in fields.items() if is_given and name not in self.passes]
             if given:
                 passes = ", ".join(self.passes)

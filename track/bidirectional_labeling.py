@@ -154,8 +154,7 @@ def _components(links: Int[np.ndarray, "2 K"], count: int) -> Int[np.ndarray, "N
         for one, other in (links, links[::-1]):
             np.minimum.at(least, before[one], before[other])
         least = least[least]  # halves each node's distance to its component's least node
-    numbers: NDArray[np.int64] = np.unique(least, return_inverse=True)[1]
-    return numbers
+    return np.asarray(np.unique(least, return_inverse=True)[1])
 
 
 def _is_likelier(take: Take, other: Take, events: _Events) -> Bool[np.ndarray, "E"]:
@@ -172,8 +171,7 @@ def _is_likelier(take: Take, other: Take, events: _Events) -> Bool[np.ndarray, "
         is_silent &= one.status[rows, hand] == LOST
         log_odds.append(np.where(is_silent, 0.0, np.log(right / (1.0 - right))))
     gain = np.bincount(events.numbers, log_odds[0] - log_odds[1])
-    likelier: Bool[np.ndarray, "E"] = gain[events.numbers] > 0.0
-    return likelier
+    return np.asarray(gain[events.numbers] > 0.0)
 
 
 def _exchanges(

@@ -13,7 +13,7 @@ from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from time import monotonic, sleep
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 
@@ -50,22 +50,6 @@ _CONTINUOUS: Final = 0.005  # [m] A pair is continuous if distances within a han
 _MOST: Final = 0.5  # Frames are tracked if at least this share of their pairs is continuous.
 
 
-class _Opened(NamedTuple):
-    """A capture, its frames, and the setup that tracks them."""
-
-    source: Capture
-    frames: list[StreamedFrame]
-    setup: TrackerSetup
-
-    @classmethod
-    def of(cls, capture: AnyCapture, settings: LabelSettings, *, warns: bool = False) -> _Opened:
-        """Read a capture, and measure its hands unless the settings give them."""
-        setup = TrackerSetup.of(settings)
-        source = capture_of(capture)
-        frames = checked_frames(source)
-        return cls(source, frames, setup.measured(sample_frames(frames), warns=warns))
-
-
 def label_capture(
     capture: AnyCapture,
     settings: LabelSettings | None = None,
@@ -97,7 +81,7 @@ def label_capture(
     Warns:
         HandSimWarning: There is no hand in any frame, or another hand or glove fits clearly better.
     """
-    source, frames, setup = _Opened.of(capture, LabelSettings.of(settings, options))
+    source, frames, setup = _opened(capture, LabelSettings.of(settings, options))
     present, glove = np.isfinite(source.positions[..., 0]), setup.settings["glove"]
     take = Take.of_truth(
         setup.user.hands,
@@ -160,7 +144,7 @@ def track_capture(
         WeightsError: The labeler is unknown, or knows other markers.
     """
     chosen = TrackSettings.of(settings, options)
-    source, frames, setup = _Opened.of(capture, chosen, warns=True)
+    source, frames, setup = _opened(capture, chosen, warns=True)
     pins = () if corrections is None else _checked_corrections(Path(corrections), source, setup)
     if chosen.calibrate:
         setup = _calibrated(tracked_take(source, frames, setup.tracker(), progress=progress), setup)
@@ -216,7 +200,7 @@ def calibrate(
         on_step(what)
         progress(done, total)
 
-    source, frames, setup = _Opened.of(capture, CalibrateSettings.of(settings, options))
+    source, frames, setup = _opened(capture, CalibrateSettings.of(settings, options))
     on_label = partial(on_part, "frames")
     take = tracked_take(source, frames, setup.tracker(), progress=on_label)
     done = calibrate_take(take, setup.start, setup.user, on_part)
@@ -287,6 +271,16 @@ def tracked_take(
         rows.append(frame_values(frame, tracked))
         progress(len(rows), len(frames))
     return take_of_rows(rows, tracker, source)
+
+
+def _opened(
+    capture: AnyCapture, settings: LabelSettings, *, warns: bool = False
+) -> tuple[Capture, list[StreamedFrame], TrackerSetup]:
+    """A capture, its frames and the setup that tracks them, with measured hands unless settings give them."""
+    setup = TrackerSetup.of(settings)
+    source = capture_of(capture)
+    frames = checked_frames(source)
+    return source, frames, setup.measured(sample_frames(frames), warns=warns)
 
 
 def _named(capture: AnyCapture, source: Capture) -> dict[str, Any]:

@@ -26,10 +26,6 @@ class CorrectedTake(NamedTuple):
     """A take after corrections."""
 
     take: Take
-    labels: int
-    """Number of points, over all frames, whose label a correction gives."""
-    frames: int
-    """Number of frames with such points."""
     unfitting: tuple[Correction, ...]
     """Corrections that match no point."""
 
@@ -62,7 +58,7 @@ def correct_take(take: Take, corrections: Sequence[Correction]) -> CorrectedTake
         corrected = smooth_take(corrected)
     else:
         corrected = dataclasses.replace(corrected, **_spreads(take, points, qpos))
-    return CorrectedTake(corrected, int(about.sum()), len(np.unique(before.frames[about])), pins.unfitting)
+    return CorrectedTake(corrected, pins.unfitting)
 
 
 def _spreads(take: Take, points: PointList, qpos: NDArray[np.float64]) -> dict[str, Any]:

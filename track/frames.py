@@ -122,11 +122,7 @@ class IncomingFrame(NamedTuple):
 
 
 class FrameValidator:
-    """Validates the frames of one stream.
-
-    Args:
-        silence: A longer time without a frame is noted [s].
-    """
+    """Validates the frames of one stream; a longer `silence` without a frame is noted [s]."""
 
     def __init__(self, silence: float = TrackerConfig.silence) -> None:
         self._silence = silence

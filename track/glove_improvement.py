@@ -160,12 +160,8 @@ def improve_glove(
 
     def trials_of(when: str, tried: MarkerLayout) -> dict[str, Trial]:
         on_step(f"learning the layout {when}, about a minute")
-        labeler = learned_labeler(tried, rig)
-
-        def tell(words: str) -> None:
-            on_step(f"trying captures {when}: {words}")
-
-        return try_layout(tried, rig, labeler, count=chosen.captures, told=tell)
+        labeler, told = learned_labeler(tried, rig), lambda words: on_step(f"trying captures {when}: {words}")
+        return try_layout(tried, rig, labeler, count=chosen.captures, told=told)
 
     pairs = (("before", layout), ("after", found)) if chosen.captures else ()
     trials = {when: trials_of(when, tried) for when, tried in pairs}

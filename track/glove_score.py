@@ -94,8 +94,7 @@ class Trial:
     @property
     def right(self) -> Float[np.ndarray, "M"]:
         """Share of each marker's slots that are right, averaged over both methods."""
-        share: Float[np.ndarray, "M"] = np.mean([self.slots[name] for name in METHODS], axis=0)
-        return share
+        return np.asarray(np.mean([self.slots[name] for name in METHODS], axis=0))
 
     @property
     def worst(self) -> int:

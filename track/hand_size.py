@@ -329,9 +329,7 @@ def _first_proportions(seen: Float[np.ndarray, "F M 3"], start: GloveFit) -> tup
 def glued_offsets(seen: Float[np.ndarray, "F M 3"], worn: GloveFit) -> Float[np.ndarray, "M"]:
     """Distances of a hand's markers from the places of their layout [m], fitted with the hand's proportions.
 
-    Args:
-        seen: Markers in some frames [m], NaN where missing.
-        worn: A hand of the right size; its own proportions and places may have adapted to a wrong layout.
+    `worn` has the right size; its own proportions and places may have adapted to a wrong layout.
     """
     shape = worn.model.shape
     start = mean_hand(shape.length, shape.breadth, worn.layout)

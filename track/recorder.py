@@ -10,7 +10,7 @@ import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType, TracebackType
-from typing import Any, Final, Self
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +28,7 @@ from gloves.takes.take import (
     worn_arrays,
 )
 from handsim._checks import check_type
+from handsim.callbacks import Closing
 from handsim.errors import ArgumentError, CaptureError
 from handsim.files.outputs import check_ending, remove_abandoned
 from handsim.files.signals import interrupt_behind
@@ -86,7 +87,7 @@ def frame_values(frame: StreamedFrame, tracked: TrackedFrame) -> dict[str, NDArr
     }
 
 
-class Recorder:
+class Recorder(Closing):
     """Records tracked frames on disk in a `with` block, frame by frame with `add`.
 
     The end of the block writes the take, also if Ctrl-C ended it. After any other exception the recording is
@@ -222,9 +223,6 @@ class Recorder:
 
     def _header(self, rate: float | None) -> dict[str, Any]:
         return take_header(self._tracker.hands, self._tracker.bodies, rate, self._settings)
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None

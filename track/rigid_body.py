@@ -91,8 +91,7 @@ class RigidTemplate(RigidBody):
     @property
     def distances(self) -> Float[np.ndarray, "Q Q"]:
         """Distances between markers [m]."""
-        distances: NDArray[np.float64] = np.linalg.norm(self.positions[:, None] - self.positions, axis=2)
-        return distances
+        return np.asarray(np.linalg.norm(self.positions[:, None] - self.positions, axis=2))
 
     def _fault(self) -> str | None:
         """Why these markers cannot be tracked as a rigid body; None if they can."""
@@ -480,5 +479,4 @@ def _median_positions(
             seen[number, one.labels[labeled]] = (frame.points[labeled] - translation) @ rotation
     present = np.isfinite(seen[..., 0])
     kept = present.sum(axis=0) >= _LEAST_SEEN_SHARE * present.any(axis=1).sum()
-    median: NDArray[np.float64] = np.nanmedian(seen[:, kept], axis=0)
-    return median
+    return np.asarray(np.nanmedian(seen[:, kept], axis=0))

@@ -74,10 +74,8 @@ def _hidden(
 
     Around a held object, sparse markers of a finger may have the next finger's labels throughout. Shifted
     marker places explain such labels, and held-out frames, labeled alike, confirm them. Right labels fit
-    better, or with places nearer to the design.
-
-    Args:
-        off: Residual of held-out frames with the original labels [m].
+    better, or with places nearer to the design. `off` is the residual of held-out frames with the original
+    labels [m].
     """
     worn, shown = one.start.attachment, np.isfinite(markers[..., 0])
     rare = shown.mean(axis=0) < _RARELY * shown.any(axis=1).mean()
@@ -107,10 +105,8 @@ def kept_user(
 ) -> User:
     """The user with calibrated hands where these fit held-out frames better, and the hands before elsewhere.
 
-    Args:
-        done: Result of `calibrate_take`.
-        before: Hands that labeled the take, for each side in `done`.
-        source: Origin of the frames, such as "from take.c3d".
+    `done` comes from `calibrate_take`, `before` are the hands that labeled the take, and `source` tells where
+    the frames are from, such as "from take.c3d".
     """
     worn, hands, whole, errors = {hand.side: hand for hand in before}, [], [], dict(before.angle_errors)
     notes = [f"calibrated {source}, {before.notes.removeprefix(MEASURED) or before} to begin with"]

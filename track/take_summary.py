@@ -206,12 +206,7 @@ def find_suspect_spans(take: Take, most: int | None = _MOST_DOUBTS) -> tuple[Sus
 
 
 def vouch(take: Take, spans: Sequence[SuspectSpan] | None = None) -> Vouch:
-    """Bound the number of wrong frames of a tracked take by the confidences in its labels.
-
-    Args:
-        take: The take.
-        spans: All its doubtful spans, if already known.
-    """
+    """Bound the wrong frames of a take by the confidences in its labels, and by its doubtful spans."""
     doubt = 1.0 - np.nan_to_num(frame_confidence(take), nan=1.0)
     listed, masses = np.zeros(take.num_frames, dtype=np.bool_), list[float]()
     for span in find_suspect_spans(take, most=None) if spans is None else spans:

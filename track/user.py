@@ -262,9 +262,8 @@ def _reason(error: Exception) -> str:
 
 
 def _to_json(hand: GloveFit) -> dict[str, Any]:
-    shape = hand.model.shape
-    named = {field.name: getattr(shape, field.name) for field in dataclasses.fields(shape)}
-    values = {name: np.asarray(value).tolist() for name, value in named.items()}
+    shape = dataclasses.asdict(hand.model.shape)
+    values = {name: np.asarray(value).tolist() for name, value in shape.items()}
     markers = {name: np.asarray(getattr(hand.attachment, name)).tolist() for name in _ARRAYS}
     return {"shape": values, "markers": markers}
 

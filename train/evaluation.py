@@ -571,8 +571,7 @@ def _is_set(given: Any) -> bool:
 def _rows(dataset: Dataset, names: tuple[str, ...]) -> NDArray[np.void]:
     """Rows of a set, whose markers must be those of the labeler."""
     _check_markers(f"the set {dataset.path}", dataset.marker_names, names)
-    rows: NDArray[np.void] = dataset.rows()
-    return rows
+    return np.asarray(dataset.rows())
 
 
 def _check_markers(owner: str, has: Sequence[str], knows: Sequence[str]) -> None:

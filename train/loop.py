@@ -484,11 +484,10 @@ def choose_costs(network: DeepLabelCNN, marker_names: tuple[str, ...], rows: NDA
         labeler.reject, labeler.spread = reject, spread
         return paper_report(labeler, rows)
 
-    def accuracy(reject: float) -> float:
-        return report(reject, _SPREADS[0]).figures["slot_accuracy"]
-
     config = network.config
-    reject = config.reject or max(_REJECTS, key=accuracy)
+    reject = config.reject or max(
+        _REJECTS, key=lambda tried: report(tried, _SPREADS[0]).figures["slot_accuracy"]
+    )
     spread = config.spread or min(
         _SPREADS, key=lambda tried: report(reject, tried).figures["calibration_error"]
     )

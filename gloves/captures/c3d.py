@@ -218,8 +218,7 @@ def read_points(
     points = frames[:, : 4 * num_points].reshape(-1, num_points, 4)
     if scale < 0.0:
         return to_native(points, parameters.processor)
-    scaled: NDArray[np.float64] = points * np.array([scale, scale, scale, 1.0])
-    return scaled
+    return np.asarray(points * np.array([scale, scale, scale, 1.0]))
 
 
 def _read_frames(

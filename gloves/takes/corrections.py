@@ -128,8 +128,7 @@ def follow_point(points: PointList, correction: Correction) -> NDArray[np.int64]
     number = points.ids[start]
     if number >= 0:
         begin, end = points.starts[first], points.starts[last + 1]
-        own: NDArray[np.int64] = begin + np.flatnonzero(points.ids[begin:end] == number)
-        return own
+        return np.asarray(begin + np.flatnonzero(points.ids[begin:end] == number))
     found, step = [start], np.zeros(3)
     for frame in range(first + 1, last + 1):
         place = points.points[found[-1]]
@@ -167,9 +166,7 @@ def pin_labels(points: PointList, pinned: Int[np.ndarray, "P"]) -> NDArray[np.in
 def applied_corrections(take: Take) -> tuple[dict[str, Any], ...]:
     """The records of the corrections that a take was saved with."""
     records = take.settings.get("corrections", ())
-    return (
-        tuple(record for record in records if isinstance(record, dict)) if isinstance(records, list) else ()
-    )
+    return tuple(one for one in records if isinstance(one, dict)) if isinstance(records, list) else ()
 
 
 def _label_of(correction: Correction, number: int, frames: int, names: Sequence[str]) -> int:

@@ -314,5 +314,4 @@ def _arrival_order(counts: Int[np.ndarray, "T"]) -> NDArray[np.int64]:
     """The columns of points that fill the first columns of each frame."""
     counts = counts.astype(np.int64)
     ends = np.cumsum(counts)
-    order: NDArray[np.int64] = np.arange(counts.sum()) - np.repeat(ends - counts, counts)
-    return order
+    return np.asarray(np.arange(counts.sum()) - np.repeat(ends - counts, counts))

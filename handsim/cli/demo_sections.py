@@ -127,12 +127,11 @@ def _generate_and_label(
     work: Path, labeler: Labeler, seed: int, num_frames: int, report: Callable[[str], None]
 ) -> tuple[Dataset, Section]:
     """Generate a small training set and label it, as seen and corrupted; returns it and a table."""
-
-    def tell(done: int, total: int) -> None:
-        report(f"generating frames: {done} of {total}")
-
     start = time.perf_counter()
-    dataset = generate_dataset(work / "dataset", glove=GLOVE, num_frames=num_frames, seed=seed, progress=tell)
+    dataset = generate_dataset(
+        work / "dataset", glove=GLOVE, num_frames=num_frames, seed=seed,
+        progress=lambda done, total: report(f"generating frames: {done} of {total}"),
+    )  # fmt: skip
     seconds = time.perf_counter() - start
     columns = {}
     for title, corruption in ((SEEN, CLEAN), ("occluded", _PAPER)):

@@ -203,12 +203,12 @@ def _prefix(path: Path) -> str:
     return f".{path.stem}.tmp-{zlib.crc32(platform.node().encode()):08x}-"
 
 
-def remove_leftovers(folder: Path) -> None:
-    """Remove every temporary file and folder in a folder and below it.
+def remove_leftovers(folder: Path, names: str = "**/.*.tmp-*") -> None:
+    """Remove temporary files and folders from a folder: those of these names, or all in it and below it.
 
-    Call it only for a folder that one job owns: what another process is writing there would be lost.
+    Call it only for what one job owns: what another process is writing there would be lost.
     """
-    for leftover in folder.glob("**/.*.tmp-*"):
+    for leftover in folder.glob(names):
         _remove(leftover)
 
 

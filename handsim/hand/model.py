@@ -26,7 +26,6 @@ from handsim.hand.shape import (
     JOINTS,
     NUM_BONES,
     NUM_JOINTS,
-    NUM_KEYPOINTS,
     NUM_QPOS,
     PALM,
     SIZES,
@@ -43,8 +42,8 @@ if TYPE_CHECKING:
     import mujoco
 
 
-_MOVED_BONES: Final = [joint.bone for joint in JOINTS]  # joints are in the order of their bones
-_CHAIN: Final = np.array([(bone.parent, _MOVED_BONES.count(number)) for number, bone in enumerate(BONES)])
+_BONE: Final = np.array([joint.bone for joint in JOINTS])  # joints are in the order of their bones
+_CHAIN: Final = np.array([(bone.parent, (_BONE == number).sum()) for number, bone in enumerate(BONES)])
 """Parent of each bone, and the number of its joints."""
 _AXES: Final = np.array([joint.axis for joint in JOINTS])
 _RANGES: Final = np.deg2rad([(joint.low, joint.high) for joint in JOINTS])
@@ -257,8 +256,7 @@ class HandModel:
         Raises:
             ArgumentError: `qpos` is not (T, 27) or not finite.
         """
-        values = check_array("qpos", qpos, (None, NUM_QPOS))
-        return penetration_depth(self.capsules, bone_transforms(self.skeleton, values))
+        return penetration_depth(self.capsules, self.forward_kinematics(qpos))
 
 
 def load_model(model: HandModel | HandShape | str) -> HandModel:
@@ -321,14 +319,9 @@ _WRIST_THICKNESS: Final = 1.3  # thickness of the wrist over that of the palm
 
 def hand_keypoints(model: HandModel, qpos: Float[np.ndarray, "T 27"]) -> Float[np.ndarray, "T 21 3"]:
     """Keypoints in the world [m]."""
-    transforms = model.forward_kinematics(qpos)
-    points: NDArray[np.float64] = np.empty((len(transforms), NUM_KEYPOINTS, 3))
-    points[:, 0] = transforms[:, PALM, :3, 3]
-    for number, digit in enumerate(DIGITS):
-        bones = bones_of(digit)
-        points[:, 4 * number + 1 : 4 * number + 4] = transforms[:, list(bones)][..., :3, 3]
-        last = transforms[:, bones[-1]]
-        points[:, 4 * number + 4] = last[:, :3, 3] + model.skeleton.lengths[bones[-1]] * last[:, :3, 0]
+    transforms, tips = model.forward_kinematics(qpos), list(KEYPOINT_BONES[4::4])
+    points = np.ascontiguousarray(transforms[:, list(KEYPOINT_BONES)][..., :3, 3])
+    points[:, 4::4] += model.skeleton.lengths[tips, None] * transforms[:, tips][..., :3, 0]
     return points
 
 
@@ -342,9 +335,8 @@ NUM_VELOCITIES: Final = 6 + NUM_JOINTS
 
 
 # The first joint of a bone rotates about an axis of the parent, the second about one of the bone.
-_FIRST: Final = np.array([n == 0 or JOINTS[n - 1].bone != joint.bone for n, joint in enumerate(JOINTS)])
-_BONE: Final = np.array([joint.bone for joint in JOINTS])
-_PARENT: Final = np.array([BONES[joint.bone].parent for joint in JOINTS])
+_FIRST: Final = np.diff(_BONE, prepend=-1) != 0
+_PARENT: Final = _CHAIN[_BONE, 0]
 # A joint moves its own bone and those further out on its digit (J, L).
 _MOVED: Final = (DIGIT_OF_BONE == DIGIT_OF_BONE[_BONE, None]) & (np.arange(NUM_BONES) >= _BONE[:, None])
 
@@ -486,8 +478,7 @@ def times_at(times: Float[np.ndarray, "T"], rate: float) -> Float[np.ndarray, "K
     last = (times[-1] - times[0]) * rate + _STEADY
     if last >= _MAX_FRAMES:
         raise ArgumentError(f"{last:.3g} frames at {rate:g} Hz, expected at most {_MAX_FRAMES}")
-    at: NDArray[np.float64] = times[0] + np.arange(int(last) + 1) / rate
-    return at
+    return np.asarray(times[0] + np.arange(int(last) + 1) / rate)
 
 
 def between_poses(

@@ -337,8 +337,7 @@ class CageHands(NamedTuple):
         local = np.concatenate([along[..., None], offsets], axis=-1)
         frames = self.frames[:, None, digits]
         flat = local.reshape(*local.shape[:3], -1, 3) @ frames[..., :3, :3].swapaxes(-1, -2)
-        points: NDArray[np.float64] = (flat + frames[..., None, :3, 3]).reshape(local.shape)
-        return points
+        return np.asarray((flat + frames[..., None, :3, 3]).reshape(local.shape))
 
     def _palm(self, wide: NDArray[np.float64], deep: NDArray[np.float64]) -> NDArray[np.float64]:
         """The palm's rows (B, 3, 8, 18, 3) at three scales of breadth and thickness [m]."""
@@ -490,8 +489,7 @@ def build_surface(shape: HandShape) -> HandSurface:
 def _right_vertices(measures: bytes) -> Float[np.ndarray, "V 3"]:
     """`rest_vertices` of the bytes of a `HAND_DTYPE` without the side, cached for both hands of a pair."""
     shape: Any = np.frombuffer(b"\0" + measures, HAND_DTYPE).view(np.recarray)[0]
-    vertices: NDArray[np.float64] = rest_vertices([shape])[0]
-    return vertices
+    return np.asarray(rest_vertices([shape])[0])
 
 
 def rest_vertices(shapes: Sequence[HandShape]) -> Float[np.ndarray, "B V 3"]:
@@ -531,8 +529,7 @@ def _fitted_cages(hands: CageHands, template: _Template) -> np.ndarray:
         across = np.ptp(points[:, template.knuckle_loop, 1], axis=1)
         sideways[:, :palm] *= (hands.breadth / across)[:, None]
         upwards[:, :palm] *= -hands.palm_thickness[:, None] / np.diff(points[:, template.back_and_palm, 2])
-    fitted: np.ndarray = still + sideways[..., None] * wide + upwards[..., None] * deep
-    return fitted
+    return np.asarray(still + sideways[..., None] * wide + upwards[..., None] * deep)
 
 
 def vertex_normals(
@@ -618,8 +615,7 @@ def skin_frames(
 ) -> Float[np.ndarray, "T V 3"]:
     """Points attached at rest, carried by the bones."""
     motion = np.ascontiguousarray((transforms @ np.linalg.inv(rest_transforms))[..., :3, :])
-    skinned: NDArray[np.float64] = _skin(points, bone_indices, bone_weights, motion)
-    return skinned
+    return np.asarray(_skin(points, bone_indices, bone_weights, motion))
 
 
 @kernel

@@ -31,7 +31,8 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 from scipy import sparse
 
-from handsim.errors import CaptureError, HandSimError, choices
+from handsim._plugins import import_extra
+from handsim.errors import CaptureError, choices
 from handsim.files.inputs import read_bytes
 from handsim.files.outputs import as_text, atomic_write
 from handsim.hand.angles import ISB_NAMES, isb_angles
@@ -281,11 +282,7 @@ def write_joint_csv(path: Path, motion: Motion, up: UpAxis = "z") -> None:
 
 def write_joint_parquet(path: Path, motion: Motion, up: UpAxis = "z") -> None:
     """Write the table as Apache Parquet, in the take's axes whatever `up` is."""
-    try:
-        import pyarrow
-        from pyarrow import parquet
-    except ImportError as error:
-        raise HandSimError(".parquet needs pyarrow; run `pip install 'handsim[parquet]'`") from error
+    pyarrow, parquet = (import_extra(name, ".parquet", "parquet") for name in ("pyarrow", "pyarrow.parquet"))
     hands = motion.hands
     count = len(hands)
     titles = _titles(motion)

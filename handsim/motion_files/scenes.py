@@ -25,7 +25,8 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from handsim import __version__
-from handsim.errors import ArgumentError, HandSimError
+from handsim._plugins import import_extra
+from handsim.errors import ArgumentError
 from handsim.files.outputs import atomic_write, plain_path, unwritten
 from handsim.hand.model import HandModel, hand_keypoints
 from handsim.hand.shape import BONE_NAMES, BONES, NUM_BONES, PALM, Side
@@ -271,10 +272,7 @@ _AROUND: Final = 0.03  # thickness of skin around keypoints in a hand's extent [
 
 def write_usd(path: Path, motion: Motion, up: UpAxis = "z") -> None:
     """Write hands and things."""
-    try:
-        from pxr import Tf, Usd, UsdGeom
-    except ImportError as error:
-        raise HandSimError(f"{path.suffix} needs usd-core; run `pip install 'handsim[usd]'`") from error
+    Tf, Usd, UsdGeom = (import_extra(f"pxr.{one}", path.suffix, "usd") for one in ("Tf", "Usd", "UsdGeom"))
     stage = Usd.Stage.CreateInMemory()
     UsdGeom.SetStageUpAxis(stage, up.upper())
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)

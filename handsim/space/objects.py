@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from handsim._checks import check_array, check_choice
 from handsim.errors import ArgumentError, ObjectError, shortened
 from handsim.files.inputs import check_regular, package_data
-from handsim.space.transforms import axis_angle_matrix, frame_with_z, rigid
+from handsim.space.transforms import axis_angle_matrix, frame_with_z, rigid, unit
 
 PartKind = Literal["sphere", "capsule", "cylinder", "box", "ellipsoid", "mesh"]
 _AROUND: Final = 16  # sides of a capsule
@@ -282,10 +282,6 @@ def _convex_hull(mesh: Any, path: Path) -> Part:
     return Part("mesh", np.zeros(3), np.eye(4), np.asarray(hull.vertices))
 
 
-def _unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
-
-
 def _library() -> dict[str, Any]:
     library: dict[str, Any] = package_data("handsim", "objects")["objects"]
     return library
@@ -304,10 +300,10 @@ def _build(name: str) -> RigidObject:
         surfaces.append(surface)
     mesh = trimesh.util.concatenate(surfaces)
     rows = np.array(list(entry["markers"].values()), dtype=np.float64).reshape(-1, 6)
-    normals = _unit(rows[:, 3:])
+    normals = unit(rows[:, 3:])
     shiny = np.array(entry["shiny"], dtype=np.float64).reshape(-1, 7)
     shiny[:, :3] *= 1e-3
-    shiny[:, 3:6] = _unit(shiny[:, 3:6])
+    shiny[:, 3:6] = unit(shiny[:, 3:6])
     shiny[:, 6] *= 1e-3
     return RigidObject(
         name=name,

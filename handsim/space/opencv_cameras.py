@@ -300,8 +300,7 @@ def _rotation(values: Values, key: str) -> NDArray[np.float64]:
     """The rotation of a matrix or of a rotation vector [rad]."""
     given = np.array(_value_numbers(values, key, None))
     if given.size == 3 and np.linalg.norm(given) < _MAX_TURN:
-        turned: NDArray[np.float64] = quaternion_matrix(vector_quaternions(given[None])[0])
-        return turned
+        return np.asarray(quaternion_matrix(vector_quaternions(given[None])[0]))
     if given.size != 9:
         shown = shortened(str(given.tolist()))
         raise RigError(f"{key} is {shown}, expected a rotation: 9 numbers of a matrix or 3 of a vector [rad]")

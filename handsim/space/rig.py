@@ -33,7 +33,7 @@ from handsim.files.inputs import (
     text_of,
 )
 from handsim.files.outputs import as_text, write_text
-from handsim.settings import Limits
+from handsim.settings import Expected, Limits
 from handsim.space.camera import (
     Camera,
     CameraArrays,
@@ -386,6 +386,10 @@ class CameraRig:
 def list_rigs() -> tuple[str, ...]:
     """Names of the rigs that come with the package."""
     return tuple(sorted(path.stem for path in _SHIPPED.glob("*.toml")))
+
+
+AnyRig = Annotated[CameraRig | str | Path, Expected("a CameraRig, or the name or path of one", list_rigs)]
+"""What `load_rig` takes, as a setting."""
 
 
 def rig_description(name: str) -> str:

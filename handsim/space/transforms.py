@@ -95,14 +95,18 @@ def axis_angle_matrix(axis: Float[np.ndarray, "3"], angle: NDArray[np.float64]) 
     x, y, z = axis
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     sine, cosine = np.sin(angle)[..., None, None], np.cos(angle)[..., None, None]
-    rotation: NDArray[np.float64] = np.eye(3) + sine * cross + (1.0 - cosine) * (cross @ cross)
-    return rotation
+    return np.asarray(np.eye(3) + sine * cross + (1.0 - cosine) * (cross @ cross))
 
 
 def cross(first: Float[np.ndarray, "3"], second: Float[np.ndarray, "3"]) -> NDArray[np.float64]:
     """The vector product (3,) of two vectors; numpy's function for arrays takes twenty times as long."""
     (x, y, z), (u, v, w) = first.tolist(), second.tolist()
     return np.array([y * w - z * v, z * u - x * w, x * v - y * u])
+
+
+def unit(vectors: Float[np.ndarray, "*batch K"]) -> NDArray[np.float64]:
+    """Vectors of length 1."""
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
 
 
 def quaternion_matrix(quaternion: Float[np.ndarray, "*batch 4"]) -> NDArray[np.float64]:
@@ -167,8 +171,7 @@ def vector_quaternions(vectors: Float[np.ndarray, "T 3"]) -> NDArray[np.float64]
     """Unit wxyz quaternions (T, 4) of rotation vectors [rad]."""
     from scipy.spatial.transform import Rotation
 
-    quaternions: NDArray[np.float64] = Rotation.from_rotvec(vectors).as_quat(scalar_first=True)
-    return quaternions
+    return np.asarray(Rotation.from_rotvec(vectors).as_quat(scalar_first=True))
 
 
 def euler_matrix(angles: Float[np.ndarray, "*batch 3"]) -> NDArray[np.float64]:

@@ -19,7 +19,7 @@ from gloves.fit import GloveFit
 from gloves.takes.take import Take
 from handsim.hand.model import between_poses
 from handsim.space.camera import Camera
-from handsim.space.transforms import pose_matrices
+from handsim.space.transforms import pose_matrices, unit
 from render.film.bundle import READOUT, Bundle, Samples, State
 from render.frames import FOREARM, PARTS_A_HAND, Bytes, Doubles, Flags, Floats, Geometry, Integers
 from render.painting.figures import BodyFigure
@@ -111,10 +111,10 @@ class Outlines:
 
     def edges(
         self, bundle: Bundle, state: State, looks: Iterable[tuple[int, Bytes]], reach: float
-    ) -> tuple[Samples | None, Doubles, Seen]:
-        """Edges within `reach` [widths] in numbered frames, and how well they are seen.
+    ) -> tuple[Samples | None, Seen]:
+        """Edges with unit normals within `reach` [widths] in numbered frames, and how well they are seen.
 
-        None stands for no outline. Edges have unit normals, and distances (N,) from the drawn outlines [px].
+        None stands for no outline.
         """
         take, times, cameras = self._take, bundle.times(state), bundle.cameras(state)
         spans = state.spans(np.arange(len(times)))
@@ -145,17 +145,17 @@ class Outlines:
                 velocities = self._moved(hand, qpos[frame, hand], outline)
                 kept = np.isfinite(normals[:, 0])  # others are beyond what the lens sees
                 here, then = np.full(len(away), frame), np.full(len(away), moments[frame, hand])
-                found = here, pixels, normals, outline.outward, away, outline.points, velocities, then
+                found = here, pixels, normals, outline.outward, outline.points, velocities, then
                 parts.append([values[kept] for values in found])
         if not parts:
-            return None, np.empty(0), Seen(*seen)
-        frames, pixels, normals, outward, offsets, points, velocities, then = map(
+            return None, Seen(*seen)
+        frames, pixels, normals, outward, points, velocities, then = map(
             np.concatenate, zip(*parts, strict=True)
         )
         edges = Samples(
             frames, pixels, normals, outward, lambda times: points + velocities * (times - then)[:, None]
         )
-        return edges, offsets, Seen(*seen)
+        return edges, Seen(*seen)
 
     def _look(
         self, picture: Bytes, maps: Floats, view: Camera, drawn: list[Triangles], bodies: Doubles, room: int
@@ -188,7 +188,7 @@ class Outlines:
         rays = straight(bent).unproject(np.stack([pixels, pixels + normals[:, ::-1] * [-1.0, 1.0]]))
         points = bent.project(rays)
         along = points[1] - points[0]
-        return points[0] / self._scale, _unit(along[:, ::-1] * [1.0, -1.0])
+        return points[0] / self._scale, unit(along[:, ::-1] * [1.0, -1.0])
 
     def _moved(self, hand: int, qpos: Doubles, outline: _Outline) -> Doubles:
         """Velocities (N, 3) [m/s] of an outline's points by central differences.
@@ -292,12 +292,7 @@ def _outline(look: _Look, hand: int, fit: GloveFit, qpos: Doubles) -> _Outline |
     rays, beside = rays / rays[:, 2:], beside / beside[:, 2:]
     points = rays * truth.depth[rows, columns, None].astype(np.float64) @ rotation.T + place
     bones = truth.parts[rows, columns].astype(np.int64) - 1 - PARTS_A_HAND * hand
-    return _Outline(pixels, normals, points, _unit(beside - rays) @ rotation.T, bones)
-
-
-def _unit(vectors: Doubles) -> Doubles:
-    """Vectors (N, ...) of length 1."""
-    return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
+    return _Outline(pixels, normals, points, unit(beside - rays) @ rotation.T, bones)
 
 
 def _shares(counts: Floats) -> Floats:

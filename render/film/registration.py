@@ -170,16 +170,8 @@ def register(
 ) -> Registration:
     """The registration of a video of this size [px] in which a detector found hands.
 
-    Args:
-        take: The take that was filmed.
-        found: What was found in the frames of the video.
-        size: Width and height of the video [px].
-        given: A camera with the lens of the video's, wherever it stands; the lens is found, too, when None.
-        pictures: The frames, for the outlines of the hands; without them, keypoints alone tell the camera,
-            which are much coarser.
-
-    Raises:
-        HandSimError: Too few hands were found, or they do not move as those of the take do.
+    A `given` camera has the lens of the video's. Without `pictures`, the frames, for the outlines of the
+    hands, keypoints alone tell the camera, which are much coarser.
     """
     bundle, width = Bundle(Motion(take), Detections.of(found), size, given), size[0]
     with_hands, looked = (len(np.unique(one)) for one in (bundle.found.frames, bundle.found.looked))
@@ -333,13 +325,13 @@ def _outlined(
     chosen = set(shown[np.linspace(0, len(shown) - 1, _MOST_LOOKED).astype(int)].tolist())
     looks = [(n, outlines.shrunk(picture)) for n, picture in enumerate(pictures()) if n in chosen]
     for turn, reach in enumerate(_REACHES):
-        samples, *_ = outlines.edges(bundle, state, looks, reach)
+        samples, _ = outlines.edges(bundle, state, looks, reach)
         if samples is None or len(samples.frames) < _FEWEST_EDGES * _FEWEST_FRAMES:
             return None
         state, _, covariance = bundle.solve(state, samples, noise, first=turn == 0)
         noise = max(0.3, float(np.median(np.abs(bundle.residuals(state, samples, 1.0)))) / 0.6745)
     every = ((n, outlines.shrunk(picture)) for n, picture in enumerate(pictures()))
-    _, _, seen = outlines.edges(bundle, state, every, _REACHES[1])
+    _, seen = outlines.edges(bundle, state, every, _REACHES[1])
     return state, covariance, _outline_fit(bundle, seen, _keypoint_fit(bundle, state))
 
 

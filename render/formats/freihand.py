@@ -133,7 +133,9 @@ class FreihandWriter:
             numbers = json.loads(path.read_text(encoding="utf-8"))
         except ValueError as error:
             raise DatasetError(f"{path}: damaged: it holds no JSON; render into another folder") from error
-        if not isinstance(numbers, dict) or not all(map(_is_pair, numbers.values())):
+        if not isinstance(numbers, dict) or not all(
+            isinstance(one, list) and [*map(type, one)] == [int, int] for one in numbers.values()
+        ):
             raise DatasetError(f"{path}: damaged: it holds no numbers; render into another folder")
         after = 0
         for shard, (first, count) in sorted(numbers.items(), key=lambda entry: entry[1]):
@@ -171,10 +173,6 @@ class FreihandWriter:
             for index in range(count):
                 source = self.parts / shard_name(shard) / kind / f"{index:08d}{suffix}"
                 yield source, self.folder / SET / kind / f"{first + index:08d}{suffix}"
-
-
-def _is_pair(value: Any) -> bool:
-    return isinstance(value, list) and len(value) == 2 and all(isinstance(number, int) for number in value)
 
 
 def _pictures(frame: RenderedFrame, hand: int) -> dict[str, bytes]:

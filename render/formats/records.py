@@ -79,8 +79,7 @@ def hand_mask(frame: RenderedFrame, hand: int) -> Flags | None:
     parts, instances = frame.ideal.parts, frame.ideal.instances
     if parts is None or instances is None:
         return None
-    mask: Flags = (instances == 1 + hand) & (parts != 1 + PARTS_A_HAND * hand + FOREARM)
-    return mask
+    return np.asarray((instances == 1 + hand) & (parts != 1 + PARTS_A_HAND * hand + FOREARM))
 
 
 def run_lengths(mask: Flags) -> str:

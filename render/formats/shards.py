@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from handsim.errors import DatasetError, HandSimError
-from handsim.files.outputs import atomic_write, temporary_beside
+from handsim.files.outputs import atomic_write, remove_leftovers, temporary_beside
 from render.formats.records import encode_pictures, to_json
 from render.frames import RenderedFrame
 
@@ -55,7 +55,7 @@ def one_sentence(folder: Path, doing: str) -> Iterator[None]:
 def new_folder(path: Path) -> Iterator[Path]:
     """A temporary folder beside `path` that replaces it when the block ends without an error."""
     temporary = temporary_beside(path)
-    clear_leftovers(path)
+    remove_leftovers(path.parent, f".{path.stem}.tmp-*")
     temporary.mkdir(parents=True)
     try:
         yield temporary
@@ -67,22 +67,13 @@ def new_folder(path: Path) -> Iterator[Path]:
         raise
 
 
-def clear_leftovers(path: Path) -> None:
-    """Remove what killed writers of a shard's folder or file left beside it."""
-    for leftover in path.parent.glob(f".{path.stem}.tmp-*"):
-        if leftover.is_dir():
-            shutil.rmtree(leftover, ignore_errors=True)
-        else:
-            leftover.unlink(missing_ok=True)
-
-
 @contextmanager
 def new_tar(path: Path) -> Iterator[Callable[[str, bytes], None]]:
     """Yield a function that adds files to a tar, which gets its name when the block ends without an error.
 
     The tar's bytes depend on its content alone, because it stores no times and no owners.
     """
-    clear_leftovers(path)
+    remove_leftovers(path.parent, f".{path.stem}.tmp-*")
     with atomic_write(path) as temporary, tarfile.open(temporary, "w", format=tarfile.USTAR_FORMAT) as tar:
 
         def add(name: str, content: bytes) -> None:
@@ -148,7 +139,7 @@ class FolderWriter:
         return shards_in(self.pictures)
 
     def files(self, shard: int) -> dict[str, Path]:
-        """The files of a shard by their names in the folder."""
+        """The files of a complete shard by their names in the folder, which stay when files move."""
         places = (self.pictures / shard_name(shard), *self.beside(shard).values())
         paths = (path for place in places if place.is_dir() for path in place.iterdir() if path.is_file())
         return {path.relative_to(self.folder).as_posix(): path for path in paths}
@@ -183,7 +174,7 @@ class FolderWriter:
         return {kind: self.folder / kind / self.part / shard_name(shard) for kind in BESIDE}
 
     def finish(self) -> list[Path]:
-        """Nothing to merge, unless a format overrides this."""
+        """Merge all complete shards into the files that the format requires, if any; may be called again."""
         return []
 
     def _add(self, folder: Path, frame: RenderedFrame, name: str) -> dict[str, Any]:

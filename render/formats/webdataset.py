@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from handsim.errors import HandSimError
-from handsim.hand.model import KEYPOINT_DIGITS, HandModel, hand_keypoints, join_qpos
+from handsim.hand.model import KEYPOINT_BONES, HandModel, hand_keypoints, join_qpos
 from handsim.hand.shape import JOINTS, NUM_JOINTS, HandShape
 from handsim.hand.skin import all_weights
 from handsim.space.camera import Camera
@@ -175,18 +175,12 @@ def umetrack_hand(shape: HandShape) -> dict[str, Any]:
         "joint_next_sibling": np.where((step == 0) & (next_digit < NUM_JOINTS), next_digit, -1).tolist(),
         "landmark_rest_positions": rounded(1e3 * landmarks @ _UMETRACK_FROM_OURS.T, 5),
         "landmark_rest_bone_weights": [[1.0]] * len(landmarks),
-        "landmark_rest_bone_indices": [[_ROOT_FRAMES + _bone(joint)] for joint in JOINT_ORDERS["umetrack"]],
+        "landmark_rest_bone_indices": [[_ROOT_FRAMES + KEYPOINT_BONES[n]] for n in JOINT_ORDERS["umetrack"]],
         "mesh_vertices": rounded(1e3 * surface.vertices @ _UMETRACK_FROM_OURS.T, 4),
         "mesh_triangles": surface.faces.tolist(),
         "dense_bone_weights": rounded(weights, 6),
         "joint_limits": rounded(model.skeleton.ranges, 6),
     }
-
-
-def _bone(keypoint: int) -> int:
-    """The bone that begins at a keypoint, or ends at it, for a tip."""
-    digit = KEYPOINT_DIGITS[keypoint]
-    return 0 if digit < 0 else 1 + 3 * digit + min((keypoint - 1) % 4, 2)
 
 
 _STREAM: Final = re.compile(r"[A-Za-z0-9_-]+")

@@ -11,9 +11,9 @@ import json
 import re
 import shutil
 import tarfile
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final, NamedTuple, Protocol
+from typing import Any, Final, NamedTuple
 
 from handsim._checks import check_choice, check_type
 from handsim.app.output import CHECKSUMS, checked_list, checksums_name, save_checksums
@@ -63,20 +63,8 @@ class ExrWriter(PngWriter):
         return {}
 
 
-class FrameWriter(Protocol):
-    """A writer of one format, as `open_writer` returns it."""
-
-    def done(self) -> frozenset[int]:
-        """Numbers of the shards that are complete."""
-
-    def files(self, shard: int) -> dict[str, Path]:
-        """The files of a shard that is complete by their names in the folder, which stay when files move."""
-
-    def write(self, shard: int, frames: Iterable[RenderedFrame]) -> None:
-        """Write a shard, or write it anew."""
-
-    def finish(self) -> list[Path]:
-        """Merge all complete shards into the files that the format requires; may be called again."""
+FrameWriter = FolderWriter | FreihandWriter | WebdatasetWriter
+"""A writer of one format, as `open_writer` returns it."""
 
 
 class Format(NamedTuple):

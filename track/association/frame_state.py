@@ -288,8 +288,7 @@ def match_log_odds(
 
 def peak_log_odds(variances: Float[np.ndarray, "K"], stray_density: float) -> Float[np.ndarray, "K"]:
     """Log-odds of a point exactly at the predicted position of a marker, by the marker's variance [m^2]."""
-    log_odds: np.ndarray = -1.5 * np.log(variances) - _stray_log_density(stray_density)
-    return log_odds
+    return np.asarray(-1.5 * np.log(variances) - _stray_log_density(stray_density))
 
 
 def match_points(

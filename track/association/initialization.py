@@ -508,8 +508,7 @@ def distances_to_nearest(
     points: Float[np.ndarray, "N 3"], others: Float[np.ndarray, "K 3"]
 ) -> Float[np.ndarray, "N"]:
     """Distance of each point from the nearest of some others [m], which must not be empty."""
-    distances: NDArray[np.float64] = np.linalg.norm(points[:, None] - others, axis=-1).min(axis=1)
-    return distances
+    return np.asarray(np.linalg.norm(points[:, None] - others, axis=-1).min(axis=1))
 
 
 def longest_links(points: Float[np.ndarray, "T N 3"]) -> Float[np.ndarray, "T"]:

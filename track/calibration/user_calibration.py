@@ -201,11 +201,7 @@ def _motions(still: Sequence[str]) -> Iterator[str]:
 
 
 class MotionGuide:
-    """Tells users in front of the cameras what to move for a good calibration.
-
-    Args:
-        hands: The tracked hands.
-    """
+    """Tells users in front of the cameras what to move for a good calibration of the tracked hands."""
 
     def __init__(self, hands: Sequence[GloveFit]) -> None:
         self._hands = {hand.side: hand for hand in hands}

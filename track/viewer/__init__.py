@@ -12,7 +12,8 @@ from http import HTTPStatus
 from typing import TYPE_CHECKING, Any, Final
 from urllib.parse import urlsplit
 
-from handsim.errors import ArgumentError, HandSimError
+from handsim._plugins import import_extra
+from handsim.errors import ArgumentError
 
 if TYPE_CHECKING:
     from viser import ViserServer
@@ -28,11 +29,8 @@ _PORTS: Final = range(8080, 8100)  # tried in this order when --port is not give
 @contextmanager
 def opened_server(host: str, port: int | None, title: str) -> Iterator[ViserServer]:
     """Run a web server in the block; port None selects the first free port from 8080 on, 0 any free one."""
-    try:
-        import viser
-    except ImportError as error:
-        hint = "install it with: pip install 'handsim[view]'"
-        raise HandSimError(f"the viewer needs the package viser; {hint}") from error
+    import_extra("viser", "the viewer", "view")
+    import viser
 
     class Server(viser.ViserServer):
         """A server that never opens viser's public tunnel, which any page could request."""

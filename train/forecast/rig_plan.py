@@ -363,5 +363,4 @@ def _mean_error(information: Float[np.ndarray, "6 K S"]) -> NDArray[np.float64]:
     determinant = a * (d * f - e * e) - b * (b * f - c * e) + c * (b * e - c * d)
     known = determinant > 1e-6 * np.maximum(a + d + f, 1e-12) ** 3
     squared = np.where(known, minors, _MAX_ERROR**2) / np.where(known, determinant, 1.0)
-    mean: NDArray[np.float64] = np.sqrt(np.clip(squared, 0.0, _MAX_ERROR**2)).mean(axis=-1, dtype=np.float64)
-    return mean
+    return np.asarray(np.sqrt(np.clip(squared, 0.0, _MAX_ERROR**2)).mean(axis=-1, dtype=np.float64))

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Final, Literal, get_args
 
-from gloves.layout import FEWEST_MARKERS, MOST_MARKERS, MarkerLayout, list_layouts
+from gloves.layout import FEWEST_MARKERS, MOST_MARKERS, AnyLayout
 from gloves.takes.take import Take
 from handsim.errors import ArgumentError
 from handsim.settings import Expected, Limits, Settings
-from handsim.space.rig import LONGEST_SIDE, ROOM_CENTER, CameraRig, Center, list_rigs
+from handsim.space.rig import LONGEST_SIDE, ROOM_CENTER, AnyRig, Center
 from train.labelers.protocol import Labeler
 
 Mount = Literal["walls", "truss", "tripods"]
@@ -18,10 +18,6 @@ MOUNTS: Final[tuple[Mount, ...]] = get_args(Mount)
 POSES: Final = "poses"
 TWINS: Final = "twins"
 _Sides = Annotated[tuple[float, float, float], Limits(0.0, LONGEST_SIDE, above=True)]
-_Rig = Annotated[CameraRig | str | Path, Expected("a CameraRig, or the name or path of one", list_rigs)]
-_Layout = Annotated[
-    MarkerLayout | str | Path, Expected("a MarkerLayout, or the name or path of one", list_layouts)
-]
 _Seed = Annotated[int, Limits(0)]
 
 
@@ -36,7 +32,7 @@ class ScoreRigSettings(Settings):
     take: Annotated[Take | str | Path | None, Expected("a Take, or the path of one")] = None
     """A take (.npz) of `handsim track` or `handsim simulate`, whose hands work where they are; simulated
     people when not given."""
-    glove: _Layout | None = None
+    glove: AnyLayout | None = None
     """Marker layout: a shipped name or the path of a .toml file; dense19 or that of the take when not
     given."""
     num_frames: Annotated[int, Limits(60)] = 900
@@ -56,14 +52,14 @@ class PlanRigSettings(Settings):
     """Sides of the space in which hands work [m]."""
     center: Center = ROOM_CENTER
     """Center of that space [m]."""
-    keep: _Rig | None = None
+    keep: AnyRig | None = None
     """A rig whose cameras stay where they are, a .toml file or a shipped name; the new ones are like its
     first."""
     size: Annotated[tuple[int, int], Limits(1)] = (1280, 1280)
     """Width and height of the new cameras' pictures [px]."""
     field_of_view: Annotated[float, Limits(1.0, 170.0)] = 60.0
     """Full angle across the shorter side of the new cameras' pictures [deg]."""
-    glove: _Layout = "dense19"
+    glove: AnyLayout = "dense19"
     """Marker layout: a shipped name or the path of a .toml file."""
     seed: _Seed = 0
     """Seed of people and motion."""
@@ -83,7 +79,7 @@ class PlanRigSettings(Settings):
 class ScoreGloveSettings(Settings):
     """How a layout is scored: options of `handsim glove score`, arguments of `score_glove`."""
 
-    rig: _Rig = "figure5"
+    rig: AnyRig = "figure5"
     """Camera rig: a shipped name or the path of a .toml file."""
     motion: Annotated[Take | str | Path, Expected("a Take, or the path of one", lambda: (POSES, TWINS))] = (
         POSES
@@ -115,7 +111,7 @@ class ImproveGloveSettings(Settings):
     """Number of markers of the new layout; as many as before when not given."""
     keep: tuple[str, ...] = ()
     """Names of markers that stay where they are."""
-    rig: _Rig = "figure5"
+    rig: AnyRig = "figure5"
     """Camera rig: a shipped name or the path of a .toml file."""
     minutes: Annotated[float, Limits(0.0)] = 3.0
     """Time for moving markers [min]."""

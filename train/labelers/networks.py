@@ -448,8 +448,7 @@ def cnn_labeler(network: DeepLabelCNN, marker_names: tuple[str, ...]) -> CNNLabe
 
     @torch.inference_mode()
     def positions(images: NDArray[np.float32]) -> NDArray[np.float32]:
-        predicted: NDArray[np.float32] = batches(torch.from_numpy(images)).cpu().numpy()
-        return predicted
+        return np.asarray(batches(torch.from_numpy(images)).cpu().numpy())
 
     return CNNLabeler(positions, network.mean_hand.get(), network.config, marker_names)
 

@@ -380,8 +380,7 @@ def align_all(
     center = target.mean(axis=0)
     left, _, right = np.linalg.svd(centered.swapaxes(1, 2) @ (target - center))
     left[:, :, 2] *= np.linalg.det(left @ right)[:, None]
-    aligned: NDArray[np.float64] = centered @ (left @ right) + center
-    return aligned
+    return np.asarray(centered @ (left @ right) + center)
 
 
 def _clusters(

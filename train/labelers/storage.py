@@ -27,8 +27,8 @@ from numpy.typing import NDArray
 from gloves.layout import MarkerLayout, list_layouts, load_layout
 from handsim import __version__
 from handsim._checks import check_type
-from handsim._plugins import is_plugin, list_plugins
-from handsim.errors import DAMAGE, ArgumentError, HandSimError, HandSimWarning, WeightsError, choices
+from handsim._plugins import import_extra, is_plugin, list_plugins
+from handsim.errors import DAMAGE, ArgumentError, HandSimWarning, WeightsError, choices
 from handsim.files.inputs import DIGEST, read_bytes, sign_model
 from handsim.files.outputs import atomic_write, plain_path, save_json, written_together
 from train.labelers.cnn_labeler import CNNLabeler, MeanHand
@@ -102,7 +102,6 @@ _MEANINGS: Final = {
     "image's width.",
 }
 """Descriptions of inputs and outputs, stored in the file's metadata as `handsim.` and name."""
-_HINT: Final = "install it with: pip install 'handsim[onnx]'"
 
 
 def load_labeler(
@@ -397,10 +396,7 @@ class OnnxLabeler:
     """A labeler of either kind from an ONNX file written by `handsim export`, on one thread."""
 
     def __init__(self, path: Path) -> None:
-        try:
-            import onnxruntime
-        except ImportError as error:
-            raise HandSimError(f"an .onnx labeler needs onnxruntime; {_HINT}") from error
+        onnxruntime = import_extra("onnxruntime", "an .onnx labeler", "onnx")
         if not path.is_file():
             raise WeightsError(f"{path} is missing, expected an .onnx file that handsim export wrote")
         options = onnxruntime.SessionOptions()
@@ -463,8 +459,7 @@ class OnnxLabeler:
         config = CNNConfig(**content["config"])
 
         def positions(images: NDArray[np.float32]) -> NDArray[np.float32]:
-            predicted: NDArray[np.float32] = self._session.run(None, {_IMAGES: images})[0]
-            return predicted
+            return np.asarray(self._session.run(None, {_IMAGES: images})[0])
 
         return CNNLabeler(positions, hand, config, self.marker_names).label_batch
 
@@ -476,11 +471,7 @@ def export_onnx(network: nn.Module, marker_names: Sequence[str], path: Path) -> 
     from train.labelers.cnn_network import DeepLabelCNN
     from train.labelers.networks import PairedScores
 
-    try:
-        import onnx
-        import onnx.helper
-    except ImportError as error:
-        raise HandSimError(f"exporting needs onnx; {_HINT}") from error
+    onnx = import_extra("onnx", "exporting", "onnx")
     properties = {_NAMES: json.dumps(list(marker_names)), DIGEST: "0" * 64, "handsim.version": __version__}
     example: tuple[torch.Tensor, ...]
     if isinstance(network, DeepLabelCNN):

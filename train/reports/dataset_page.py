@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
-from numpy.typing import NDArray
 
 from gloves.captures.capture import run_lengths
 from handsim.hand.model import HandModel
@@ -234,8 +233,7 @@ def ghost_distances(rows: Shaped[np.ndarray, "T"]) -> Float[np.ndarray, "N"]:
     """Distance from every ghost to the nearest marker of its frame, seen or not [m]."""
     frame, ghost = np.nonzero(np.isfinite(rows["ghosts"][..., 0]))
     away = rows["markers"][frame].astype(np.float64) - rows["ghosts"][frame, ghost][:, None]
-    distances: NDArray[np.float64] = np.linalg.norm(away, axis=-1).min(axis=1)
-    return distances
+    return np.asarray(np.linalg.norm(away, axis=-1).min(axis=1))
 
 
 def _draw_ghosts(figure: Figure, counts: Int[np.ndarray, "G+1"], distances: Float[np.ndarray, "N"]) -> None:

@@ -13,12 +13,12 @@ from typing import Annotated, Any, ClassVar, Final, cast
 import numpy as np
 
 from gloves.fit import GlovedHand, GloveFit
-from gloves.layout import MarkerLayout, load_layout
+from gloves.layout import AnyLayout, MarkerLayout, load_layout
 from gloves.takes.take import Take
 from handsim.errors import ArgumentError, LayoutError, PoseError
 from handsim.hand.shape import Side
 from handsim.settings import Limits, Settings
-from handsim.space.rig import ROOM_CENTER, Center, check_outside_volume, load_rig, rig_setting
+from handsim.space.rig import ROOM_CENTER, AnyRig, Center, check_outside_volume, load_rig, rig_setting
 from train.simulation.room import TWINS, OpticsOptions, RoomConfig, record_take, usual_room
 from train.simulation.scenes import (
     MAX_OTHERS,
@@ -34,7 +34,7 @@ from train.simulation.scenes import (
     sample_real_like_scene,
     sample_scene_motion,
 )
-from train.simulation.training_frames import AnyLayout, AnyRig, sample_adult_hands, wear_gloves
+from train.simulation.training_frames import sample_adult_hands, wear_gloves
 
 WRIST_VOLUME: Final = 0.5
 """Half side of the cube in which wrists stay [m]; no camera may be there."""

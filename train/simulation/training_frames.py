@@ -7,7 +7,6 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cache
-from pathlib import Path
 from typing import Annotated, ClassVar, Final, NamedTuple
 
 import numpy as np
@@ -15,16 +14,16 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
 from gloves.fit import GlovedHand, GloveFit, settle_glove, wear
-from gloves.layout import MarkerLayout, list_layouts
+from gloves.layout import AnyLayout, MarkerLayout
 from gloves.optics.ghosts import GHOST_REACH, GhostConfig, keep_some, sample_ghosts
 from gloves.optics.reconstruction import FrameOptics, OpticsConfig, reconstruct
 from gloves.optics.visibility import MeshTree, clear_of_body, pack_cameras, visible_cameras
 from handsim.errors import ArgumentError, PoseError
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import ADULTS, BONES, NUM_JOINTS, NUM_QPOS, SIDES, Population, sample_shape
-from handsim.settings import Expected, Limits, Mixture, Settings
+from handsim.settings import Limits, Mixture, Settings
 from handsim.space.objects import RigidObject, named_object, object_names
-from handsim.space.rig import ROOM_CENTER, CameraRig, Center, list_rigs
+from handsim.space.rig import ROOM_CENTER, AnyRig, CameraRig, Center
 from handsim.space.transforms import pose_matrices, quaternion_matrix, random_quaternions
 from poses.grasps import sample_held_poses, settle_hold
 from poses.shapes import SAMPLER, PoseMix, PoseSampler, make_valid, resting_angles, sample_valid_angles
@@ -44,10 +43,6 @@ NO_TOUCH: Final = "two hands: no valid pose, one hand instead"
 NO_GRASP: Final = "held object: not grasped, empty hand instead"
 """Reason to replace a scene with an object by one of an empty hand."""
 _MAX_LOST_CAMERAS: Final = 6  # largest number of cameras that lose pictures together
-AnyLayout = Annotated[
-    MarkerLayout | str | Path, Expected("a MarkerLayout, or the name or path of one", list_layouts)
-]
-AnyRig = Annotated[CameraRig | str | Path, Expected("a CameraRig, or the name or path of one", list_rigs)]
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import builtins
 import json
 import struct
+import sys
 
 import numpy as np
 import pytest
@@ -280,14 +280,7 @@ def test_meshes_have_materials_and_skeletons_the_names_of_their_hands(stage, mot
 
 
 def test_without_usd_core_the_extra_is_named(motion, tmp_path, monkeypatch):
-    real = builtins.__import__
-
-    def missing(name, *args, **kwargs):
-        if name == "pxr":
-            raise ImportError(name)
-        return real(name, *args, **kwargs)
-
-    monkeypatch.setattr(builtins, "__import__", missing)
-    with pytest.raises(HandSimError, match=r"\.usdc needs usd-core; run `pip install 'handsim\[usd\]'`"):
+    monkeypatch.setitem(sys.modules, "pxr.Tf", None)
+    with pytest.raises(HandSimError, match=r"\.usdc needs the package pxr, .*`pip install 'handsim\[usd\]'`"):
         write_usd(tmp_path / "hands.usdc", posed_motion(motion))
     assert list(tmp_path.iterdir()) == []

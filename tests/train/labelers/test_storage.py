@@ -261,7 +261,7 @@ def test_the_papers_network_labels_alike_in_both_runtimes(tmp_path, rng):
 @pytest.mark.parametrize("missing", ["onnx", "onnxruntime"])
 def test_what_is_not_installed_is_told(exported, tmp_path, monkeypatch, missing):
     monkeypatch.setitem(sys.modules, missing, None)
-    with error_names(HandSimError, f"needs {missing}; install it with: pip install 'handsim[onnx]'"):
+    with error_names(HandSimError, f"needs the package {missing}, | run `pip install 'handsim[onnx]'`"):
         if missing == "onnx":
             export_onnx(new_network(SetLabelerConfig()), ("a",) * 19, tmp_path / "x.onnx")
         else:
