@@ -32,12 +32,13 @@ from track.association.initialization import HandInitializer, distances_to_neare
 from track.calibration.energy import (
     Estimate,
     Problem,
+    eliminate_poses,
     first_estimate,
     levenberg_marquardt,
     shared_covariance,
     user_hand,
 )
-from track.calibration.hand_parameters import LENGTH
+from track.calibration.hand_parameters import LENGTH, NUM_PARAMETERS
 from track.config import TrackerConfig
 from track.frames import StreamedFrame, TrackedHand
 from track.kinematics.pose_solver import FEWEST_MARKERS, PoseSolver
@@ -72,7 +73,8 @@ _USUAL: Final = TrackerConfig()
 _LENIENT: Final = TrackerConfig(least_evidence=2.0)  # for hands of few markers before they are measured
 _ROBUST_SCALE: Final = 0.015  # [m]
 _GLUED: Final = 0.0045  # [m] spread per axis of the markers of a glove that may not be as its layout says
-_FIT_STEPS: Final = 15
+_FIT_STEPS, _FEW_STEPS = 15, 2
+_LEAST_PRECISION: Final = 1.0  # [1/m^2] avoids a division by zero
 _SMALL_GAIN, _RELINEARIZE = 1e-3, 0.05  # ten times a calibration's: a size may be off by 0.2 mm
 _PART: Final = 30  # Hands are compared in two parts of this many frames.
 _LEAST_FRAMES: Final = 10  # Hands are not compared in fewer frames.
@@ -341,6 +343,35 @@ def glued_offsets(seen: Float[np.ndarray, "F M 3"], worn: GloveFit) -> Float[np.
         estimate, fit, _ = levenberg_marquardt(problem, estimate, 0, _FIT_STEPS, None, _SMALL_GAIN)
         off = np.linalg.norm(fit.design_residuals, axis=1)
     return off
+
+
+def glove_shifts(
+    seen: Float[np.ndarray, "F M 3"], worn: GloveFit
+) -> tuple[Float[np.ndarray, "F"], Float[np.ndarray, "F"]]:
+    """How far a whole glove is along the bones from each frame on [m], and the same in standard deviations.
+
+    Poses, proportions and places are fitted along with each shift, to first order: wrist and fingers follow a
+    glove that slips, but not where joints turn.
+
+    Args:
+        seen: Markers in some frames [m], NaN where missing.
+        worn: The hand as tracked.
+    """
+    right = worn.with_side("right")
+    problem, estimate = _first_proportions(seen @ (MIRROR if worn.side == "left" else np.eye(3)), right)
+    estimate, fit, _ = levenberg_marquardt(problem, estimate, 0, _FEW_STEPS, None, _SMALL_GAIN)
+    _, by_shared, residuals, _ = jacobians = problem.weighted_jacobians(estimate, fit)
+    equations = problem.normal_equations(estimate, fit, jacobians)
+    reduced, solved = eliminate_poses(equations, 0.0)
+    along = right.model.rest_transforms[right.attachment.main_bones, :3, 0]
+    way = np.concatenate([np.zeros(NUM_PARAMETERS), along.ravel()])
+    of_frames = np.einsum("fr,frs->fs", by_shared @ way, np.dstack([by_shared, residuals]))
+    of_frames -= np.einsum("fp,fps->fs", equations.mixed @ way, solved)
+    late = of_frames[::-1].cumsum(axis=0)[::-1]
+    left = late[:, :-1] @ np.linalg.inv(reduced[:, :-1])  # what the shared unknowns take of each shift
+    precision = np.maximum(late[:, :-1] @ way - (left * late[:, :-1]).sum(axis=1), _LEAST_PRECISION)
+    shifts = (left @ reduced[:, -1] - late[:, -1]) / precision
+    return shifts, shifts * np.sqrt(precision)
 
 
 class _Fit(NamedTuple):

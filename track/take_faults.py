@@ -11,14 +11,14 @@ from functools import lru_cache
 from typing import Final, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
 from gloves.fit import GloveFit
 from gloves.takes.take import TRACKED, Take
 from handsim.hand.shape import JOINTS, Side
 from handsim.space.transforms import rigid_fit
-from track.hand_size import glued_offsets
+from track.hand_size import glove_shifts, glued_offsets
 from track.kinematics.pose_solver import FEWEST_MARKERS, PoseSolver
 from train.labelers.matching import assign
 
@@ -31,11 +31,8 @@ _SLIP: Final = 0.0035  # [m] least reported shift of a marker
 _SLIP_SHARE: Final = 0.55  # least share of the variance of its offsets that the shift explains
 _SMALL_SLIP: Final = 0.0008  # [m] the same for a steady marker: the pose absorbs most of a slip
 _SMALL_SHARE: Final = 0.85  # least explained share for such a small shift
-_GLOVE_SLIP: Final = 0.0019  # [m] RMS shift over the markers if a whole glove slips
-_GLOVE_SHARE: Final = 0.4  # least explained share of the variance of all markers' smoothed offsets
-_SMALL_GLOVE_SLIP: Final = 0.00075  # [m] the same where markers are steady, as in a calibrated hand
-_SMALL_GLOVE_SHARE: Final = 0.5  # least explained share for such a small shift
-_WHILE: Final = 0.25  # [s] smoothing time of these offsets
+_GLOVE_SLIP: Final = 0.0025  # [m] least reported shift of a whole glove
+_SURE: Final = 2.75  # the same in standard deviations
 _SLIP_PART: Final = 1.9  # [s] least time before and after a slip
 _LEAST_VARIANCE: Final = 1e-8  # [m^2] noise of optical systems
 _OFTEN_MISSING: Final = 0.3  # A marker missing in this share of the frames is looked for elsewhere.
@@ -51,7 +48,8 @@ _SEEN: Final = 0.5  # share of the earlier frames in which it was seen
 AT_LIMIT: Final = 0.5
 """Tolerance within which a joint counts as being at its limit [deg]."""
 _OFTEN_AT_LIMIT: Final = 0.4  # share of the frames at the limit
-_FITTED_FRAMES: Final = 40  # number of frames in which the layout, and the mirror image of a hand, are fitted
+_FITTED_FRAMES: Final = 120  # number of frames in which a slip of the glove is fitted
+_FEWER: Final = 3  # The layout, and the mirror image of a hand, are fitted in every third of them.
 _FITS: Final = 1.5  # largest ratio of the mirror image's RMS distance to that of the hand
 _FITS_WELL: Final = 0.0012  # [m] the mirror image fits if its RMS distance is below this
 
@@ -87,7 +85,8 @@ class _Hand(NamedTuple):
     worn: GloveFit
     frames: Int[np.ndarray, "F"]
     offsets: Float[np.ndarray, "F M 3"]  # [m] of seen markers from their places, in the bones' frames
-    seen: Float[np.ndarray, "S M 3"]  # markers [m] in some frames that show enough of them for a pose
+    some: Int[np.ndarray, "S"]  # those of these frames that show enough markers for a pose, at most 120
+    seen: Float[np.ndarray, "S M 3"]  # markers in these [m]
 
     def span(self, first: int, name: str, why: str, remedy: str, *, of_labels: bool = True) -> SuspectSpan:
         """A fault from frame `first` to the end, of a marker or joint; of the whole hand without `name`."""
@@ -109,10 +108,12 @@ def find_faults(take: Take) -> tuple[SuspectSpan, ...]:
         frames = frames[frames >= _first_of_size(take)]
         if len(frames) < _FEWEST:
             continue
-        some = frames[:: -(-len(frames) // _MOST_FRAMES)]
-        seen = take.point_list.labeled(take.hand_labels[number], some[:: -(-len(some) // _FITTED_FRAMES)])
+        frames = frames[:: -(-len(frames) // _MOST_FRAMES)]
+        some = frames[:: -(-len(frames) // _FITTED_FRAMES)]
+        seen = take.point_list.labeled(take.hand_labels[number], some)
         enough = np.isfinite(seen[..., 0]).sum(axis=1) >= FEWEST_MARKERS
-        hand = _Hand(take, side, take.hands[number], some, take.marker_offsets(side, some), seen[enough])
+        offsets = take.marker_offsets(side, frames)
+        hand = _Hand(take, side, take.hands[number], frames, offsets, some[enough], seen[enough])
         for faults in (_unsure_side, _misplaced, _off_design, _slips, _fallen, _at_limits):
             found += faults(hand)
     return tuple({one.of: one for one in reversed(found)}.values())[::-1]
@@ -127,9 +128,7 @@ def _first_of_size(take: Take) -> int:
 
 
 def _slips(hand: _Hand) -> Iterator[SuspectSpan]:
-    """The marker with the clearest lasting shift, if any."""
-    from scipy.ndimage import uniform_filter1d
-
+    """The marker with the clearest lasting shift, if any, or the whole glove."""
     known = np.isfinite(hand.offsets[..., 0])
     values = np.where(known[..., None], hand.offsets.clip(-_FARTHEST, _FARTHEST), 0.0)
     before, sums = np.cumsum(known, axis=0), np.cumsum(values, axis=0)
@@ -140,28 +139,27 @@ def _slips(hand: _Hand) -> Iterator[SuspectSpan]:
     variance = np.square(values).sum(axis=(0, 2)) - np.square(whole).sum(axis=1) / total
     explained = before * after / total * steps**2
     share = explained / np.maximum(variance, _LEAST_VARIANCE * total)
-    seconds = hand.take.times[hand.frames] - hand.take.times[hand.frames[0]]
-    is_long = np.minimum(seconds, seconds[-1] - seconds)[:, None] >= _SLIP_PART
-    is_clear = (steps > _SLIP) & (share > _SLIP_SHARE)
-    is_small = (steps > _SMALL_SLIP) & (share > _SMALL_SHARE)
-    share *= (is_clear | is_small) & is_long
-    if not share.any():
-        width = max(1, round(_WHILE * len(seconds) / max(seconds[-1], _WHILE)))
-        there = uniform_filter1d(known[..., None].astype(float), width, axis=0)
-        slow = uniform_filter1d(values, width, axis=0) / np.maximum(there, 0.5 / width)
-        slow -= whole / total[:, None]
-        lasting = max(np.square(slow[known]).sum(), _LEAST_VARIANCE * known.sum(), _LEAST_VARIANCE)
-        of_glove = explained.sum(axis=1, keepdims=True) / lasting
-        together = np.sqrt(np.square(steps).mean(axis=1, keepdims=True))
-        is_clear = (together > _GLOVE_SLIP) & (of_glove > _GLOVE_SHARE)
-        is_small = (together > _SMALL_GLOVE_SLIP) & (of_glove > _SMALL_GLOVE_SHARE)
-        share = of_glove * steps / max(steps.max(), _SLIP) * ((is_clear | is_small) & is_long)
+    share *= ((steps > _SLIP) & (share > _SLIP_SHARE)) | ((steps > _SMALL_SLIP) & (share > _SMALL_SHARE))
+    share *= _is_amid(hand.take.times[hand.frames])[:, None]
     when, marker = np.unravel_index(int(share.argmax()), share.shape)
+    remedy = "track the frames before and after apart, each with a calibration of its own"
     if share[when, marker] > 0.0:
         frame, name = int(hand.frames[when]), hand.worn.layout.names[marker]
         why = f"slips by {1e3 * steps[when, marker]:.1f} mm or more at {hand.take.times[frame]:.2f} s"
-        remedy = "track the frames before and after apart, each with a calibration of its own"
         yield hand.span(frame, name, why, remedy, of_labels=False)
+    elif (amid := _is_amid(hand.take.times[hand.some])).any():
+        shifts, sure = glove_shifts(hand.seen, hand.worn)
+        at = int(np.where(amid, np.abs(sure), 0.0).argmax())
+        if abs(sure[at]) > _SURE and abs(shifts[at]) > _GLOVE_SLIP:
+            frame = int(hand.some[at])
+            why = f"is in a glove that slips by {1e3 * abs(shifts[at]):.1f} mm or more"
+            why += f" at about {hand.take.times[frame]:.1f} s"
+            yield hand.span(frame, "", why, remedy, of_labels=False)
+
+
+def _is_amid(times: Float[np.ndarray, "F"]) -> Bool[np.ndarray, "F"]:
+    """Whether each time [s] is long enough after the first and before the last for a slip."""
+    return np.asarray(np.minimum(times - times[:1], times[-1:] - times) >= _SLIP_PART)
 
 
 def _fallen(hand: _Hand) -> Iterator[SuspectSpan]:
@@ -232,14 +230,14 @@ def _off_design(hand: _Hand) -> Iterator[SuspectSpan]:
     """Markers whose places on the moving hand are far from those in the layout."""
     if not len(hand.seen):
         return
-    for name, off in zip(hand.worn.layout.names, glued_offsets(hand.seen, hand.worn), strict=True):
+    for name, off in zip(hand.worn.layout.names, glued_offsets(hand.seen[::_FEWER], hand.worn), strict=True):
         if off > _OFF_DESIGN:
             yield hand.off_place(name, off, int(hand.frames[0]))
 
 
 def _unsure_side(hand: _Hand) -> Iterator[SuspectSpan]:
     """A hand in a glove like its mirror image, that a hand of the other side fits as well in motion."""
-    worn, seen = hand.worn, hand.seen
+    worn, seen = hand.worn, hand.seen[::_FEWER]
     if not len(seen):
         return
     other: Side = "left" if hand.side == "right" else "right"

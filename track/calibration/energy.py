@@ -132,6 +132,9 @@ class NormalEquations(NamedTuple):
     shared_gradient: Float[np.ndarray, "S"]
 
 
+WeightedJacobians = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
+
+
 class Problem:
     """Data of a calibration; `robust_scale` and the spreads of marker places are adapted on the way."""
 
@@ -214,9 +217,7 @@ class Problem:
         squares = (fit.residuals**2).sum(axis=2)
         return np.asarray(self.present / (1.0 + squares / self.robust_scale**2) / self.noise)
 
-    def weighted_jacobians(
-        self, estimate: Estimate, fit: Fit
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    def weighted_jacobians(self, estimate: Estimate, fit: Fit) -> WeightedJacobians:
         """Jacobians by poses and by shared unknowns and residuals, each times the root of its weight.
 
         The last array is the jacobian of markers minus designs by the parameters (M, 3, 53).
@@ -250,9 +251,14 @@ class Problem:
         moved = rest[:count] - rest[count : 2 * count]
         return root * by_pose, root * by_shared, root[..., 0] * residuals, moved
 
-    def normal_equations(self, estimate: Estimate, fit: Fit) -> NormalEquations:
-        """Gauss-Newton's equations; the shared unknowns are the parameters, then three per marker [m]."""
-        by_pose, by_shared, residuals, moved = self.weighted_jacobians(estimate, fit)
+    def normal_equations(
+        self, estimate: Estimate, fit: Fit, jacobians: WeightedJacobians | None = None
+    ) -> NormalEquations:
+        """Gauss-Newton's equations; the shared unknowns are the parameters, then three per marker [m].
+
+        The weighted jacobians are computed unless they are given.
+        """
+        by_pose, by_shared, residuals, moved = jacobians or self.weighted_jacobians(estimate, fit)
         transposed, flat = by_pose.swapaxes(1, 2), by_shared.reshape(-1, by_shared.shape[2])
         result = NormalEquations(
             transposed @ by_pose,
@@ -580,8 +586,8 @@ def error_covariance(
     Unlike noise, flesh that follows the angles of its digit is not averaged out by many frames, nor are the
     gestures of a user that differ from people's.
     """
-    by_pose, by_shared, residuals, _ = problem.weighted_jacobians(estimate, fit)
-    equations = problem.normal_equations(estimate, fit)
+    by_pose, by_shared, residuals, _ = jacobians = problem.weighted_jacobians(estimate, fit)
+    equations = problem.normal_equations(estimate, fit, jacobians)
     reduced, solved = eliminate_poses(equations, 0.0)
     inverse, answers = np.linalg.inv(reduced[:, :-1]), solved[..., :-1]
     flat = by_shared.reshape(-1, len(reduced))
