@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from gloves.fit import GloveFit
 from gloves.takes.take import TRACKED, Take
-from handsim.hand.shape import JOINTS, Side
+from handsim.hand.shape import JOINTS, PALM, Side
 from handsim.space.transforms import rigid_fit
 from track.hand_size import glove_shifts, glued_offsets
 from track.kinematics.pose_solver import FEWEST_MARKERS, PoseSolver
@@ -227,12 +227,16 @@ def _misplaced(hand: _Hand) -> Iterator[SuspectSpan]:
 
 
 def _off_design(hand: _Hand) -> Iterator[SuspectSpan]:
-    """Markers whose places on the moving hand are far from those in the layout."""
-    if not len(hand.seen):
+    """Markers on the palm whose places on the moving hand are far from those in the layout.
+
+    On digits the length of a bone explains the same offsets where joints hardly turn.
+    """
+    on_palm = np.flatnonzero(hand.worn.attachment.main_bones == PALM)
+    if not len(hand.seen) or not len(on_palm):
         return
-    for name, off in zip(hand.worn.layout.names, glued_offsets(hand.seen[::_FEWER], hand.worn), strict=True):
-        if off > _OFF_DESIGN:
-            yield hand.off_place(name, off, int(hand.frames[0]))
+    off = glued_offsets(hand.seen[::_FEWER], hand.worn)
+    for marker in on_palm[off[on_palm] > _OFF_DESIGN]:
+        yield hand.off_place(hand.worn.layout.names[marker], float(off[marker]), int(hand.frames[0]))
 
 
 def _unsure_side(hand: _Hand) -> Iterator[SuspectSpan]:
