@@ -336,7 +336,7 @@ def test_a_point_that_lasts_is_a_marker_whose_bias_is_another_in_this_gesture(ag
     """The bias was learned well, in other frames."""
     state = followed()
     points, labels = state.solver.marker_positions(state.qpos), np.arange(19)
-    points[KNUCKLE] += 0.0, 0.004, 0.004
+    points[KNUCKLE] += 0.0, 0.006, 0.006
     labels[KNUCKLE] = -1
     frame = frame_of(points, labels, 1.0, first_seen=1.0 - age)
     found = reviewed(LabelerReview(CountingLabeler(), 1, TrackerConfig()), state, frame)
