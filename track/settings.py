@@ -62,8 +62,6 @@ class TrackSettings(LabelSettings):
     """How hands are tracked: keyword arguments of `track_capture`, recorded in the `settings` of a take."""
 
     noun: ClassVar[str] = "setting of tracking"
-    hands: AnyHands = BOTH
-    """A user, hands in their gloves or the path of a user's file; or sides."""
     bodies: Sequence[AnyBody] = ()
     """Rigid bodies beside the hands: templates, names of handsim's objects, or .toml files."""
     calibrate: bool = False
@@ -78,7 +76,7 @@ class TrackSettings(LabelSettings):
     def record(self) -> dict[str, Any]:
         """The settings as JSON: objects by their names, hands in their gloves by their sides."""
         record, hands, labeler = Settings.record(self), self.hands, self.labeler
-        if not isinstance(hands, str | Path):
+        if not isinstance(hands, str | Path | None):
             record["hands"] = [hand.side if isinstance(hand, GloveFit) else str(hand) for hand in hands]
         if hasattr(labeler, "label_frames"):
             record["labeler"] = str(getattr(labeler, "name", type(labeler).__name__))
@@ -110,6 +108,7 @@ class TrackerSetup:
         glove = user.layout if settings.glove is None else load_layout(settings.glove)
         labeler, record = labeler_of(glove, settings.labeler), settings.record()
         record |= {"glove": record["glove"] or user.layout.name, "user": user.notes or str(user)}
+        record["hands"] = record["hands"] or list(user.sides)
         return cls(user, is_auto, labeler, bodies, config, record)
 
     @property

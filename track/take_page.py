@@ -327,8 +327,8 @@ def _range_section(title: str, take: Take, hand: HandFigures) -> Section:
 
 def _error_section(title: str, settings: Mapping[str, Any], hand: HandFigures) -> Section:
     """The standard deviation of each angle by its sources, and the cut-off of its filter."""
-    cutoffs, budget = (settings.get(name, {}).get(hand.side) for name in ("filter", "budget"))
-    if cutoffs is None or budget is None:
+    errors = _joint_errors(settings, hand)
+    if np.isnan(errors).all():
         return Section(title, "Filter: none, each pose was fitted to the markers of its frame.")
     text = (
         "Filter: all poses were solved together, forward and backward in time, without a delay. It acts as a "
@@ -340,13 +340,19 @@ def _error_section(title: str, settings: Mapping[str, Any], hand: HandFigures) -
         f"hands that are not calibrated {CHANGING:g} times that. MDD: minimal detectable difference of two "
         "sessions, 1.96 times the root of two times the SEM."
     )
-    origin = hand_origin(str(settings.get("user", "")), hand.side)
-    errors = measurement_error(np.array(budget), origin)
     table = [["joint", "SD", *SOURCES, "SEM", "MDD", "cut-off [Hz]"]]
-    for joint, own, error, cutoff in zip(JOINTS, budget, errors, cutoffs, strict=True):
-        cells = np.linalg.norm(own), *own, error, DETECTABLE * error, cutoff
+    for joint, cells in zip(JOINTS, errors.tolist(), strict=True):
         table.append([joint.name.replace("_", " "), *(f"{cell:.1f}" for cell in cells)])
     return Section(title, text, table=table)
+
+
+def _joint_errors(settings: Mapping[str, Any], hand: HandFigures) -> Float[np.ndarray, "20 E"]:
+    """Each angle's SD, its `SOURCES`, SEM, MDD [deg] and cut-off [Hz]; NaN of takes that are not smoothed."""
+    cutoffs, budget = (settings.get(name, {}).get(hand.side) for name in ("filter", "budget"))
+    if cutoffs is None or budget is None:
+        return np.full((len(JOINTS), len(SOURCES) + 4), np.nan)
+    error = measurement_error(np.array(budget), hand_origin(str(settings.get("user", "")), hand.side))
+    return np.column_stack([np.linalg.norm(budget, axis=1), budget, error, DETECTABLE * error, cutoffs])
 
 
 def _markers_section(title: str, take: Take, hand: HandFigures) -> Section:
@@ -487,12 +493,15 @@ def _frame_rows(take: Take, hands: Sequence[HandFigures]) -> _Rows:
 
 
 def _joint_rows(take: Take, hands: Sequence[HandFigures]) -> _Rows:
-    """Rows of the range of motion of each joint and of the model."""
+    """Rows of the range of motion of each joint and of the model, and of its errors between sessions."""
     columns = [f"{name}_deg" for name in (*_RANGE, "model_low", "model_high", "spread")]
-    rows: _Rows = [["hand", "joint", *columns, "at_limits_share", "measured_share", "longest_gap_s"]]
+    columns += ["at_limits_share", "measured_share", "longest_gap_s", "sem_deg", "mdd_deg", "cutoff_hz"]
+    rows: _Rows = [["hand", "joint", *columns]]
     for hand in hands:
-        for joint, (*row, spread, limits, measured, gap) in zip(JOINTS, hand.joints().tolist(), strict=True):
-            cells = *row, joint.low, joint.high, spread, limits, measured, gap / take.rate
+        errors = _joint_errors(take.settings, hand)[:, -3:].tolist()
+        for joint, figures, error in zip(JOINTS, hand.joints().tolist(), errors, strict=True):
+            *row, spread, limits, measured, gap = figures
+            cells = *row, joint.low, joint.high, spread, limits, measured, gap / take.rate, *error
             rows.append([hand.side, joint.name, *map(_number, cells)])
     return rows
 

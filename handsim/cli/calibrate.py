@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Annotated, Final
 import numpy as np
 import tyro
 
+from gloves.layout import load_layout
 from handsim.app.messages import named_steps, print_line, progress_bar
 from handsim.cli.options import TrackerOptions, check_live, check_source, check_take_file
 from handsim.files.outputs import check_outputs
 from handsim.hand.shape import Side
-from track.config import BOTH, Size
+from track.config import Size
 
 if TYPE_CHECKING:
     from track.calibration.user_calibration import Calibration
@@ -28,7 +29,7 @@ def calibrate(
     seconds: float | None = None,
     glove: str = "dense19",
     size: Size = "auto",
-    hands: tuple[Side, ...] = BOTH,
+    hands: tuple[Side, ...] | None = None,
     labeler: str | None = None,
 ) -> None:
     """Fit hands and gloves to a user, from a capture or stream; best is a minute in which all joints move.
@@ -45,7 +46,7 @@ def calibrate(
         seconds: How long to record a live stream at most [s]; three minutes when not given.
         glove: Marker layout: a shipped name or the path of a .toml file.
         size: The size nearest to the hands; auto measures it in the capture.
-        hands: Which hands are in the capture.
+        hands: Which hands are in the capture; all that the glove is made for when not given.
         labeler: Folder of a trained labeler, an exported .onnx file, or module:name; the shipped one when
             not given.
     """
@@ -68,7 +69,7 @@ def calibrate(
     sides = " and ".join(hand.side for hand in user)
     print_line(f"{out}: {sides} hand in glove {glove}")
     found = {one.hand.side: _report(one) for one in user.calibrations}
-    for side in hands:
+    for side in hands or load_layout(glove).sides[::-1]:
         told = found.get(side, ["it is not in the capture and was left out"])
         print_line(*(f"{side} hand: {line}" for line in told))
 

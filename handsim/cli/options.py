@@ -12,7 +12,7 @@ import tyro
 
 from handsim.errors import ArgumentError
 from handsim.hand.shape import Side
-from track.config import BOTH, Size
+from track.config import Size
 
 if TYPE_CHECKING:
     from track.settings import AnyHands, TrackSettings
@@ -31,7 +31,7 @@ class TrackerOptions:
     shape: Path | None = None
     """The user's file from handsim calibrate: hands and gloves."""
     hands: tuple[Side, ...] | None = None
-    """Which hands to track; both, or those of --shape, when not given."""
+    """Which hands to track; those of --shape, or all that the glove is made for, when not given."""
     body: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """A rigid body to track beside the hands, once per body: a .toml file, see handsim body, or one of
     handsim's own objects."""
@@ -49,7 +49,7 @@ class TrackerOptions:
 
         if self.shape is not None and self.size is not None:
             raise ArgumentError(f"given --size {self.size} and --shape {self.shape}, expected one of them")
-        hands: AnyHands = self.shape or self.hands or BOTH
+        hands: AnyHands | None = self.shape or self.hands
         if self.shape is not None and self.hands is not None:
             hands = dataclasses.replace(load_user(self.shape).of_sides(self.hands), notes=self.shape.name)
         size = self.size or "auto"

@@ -15,7 +15,7 @@ def report(take: Annotated[Path, tyro.conf.Positional], out: Path) -> None:
     """Write a page on a take: joint angles, range of motion, gaps, residuals, doubtful frames.
 
     Beside it are its tables: OUT with the ending .frames.csv has a row per frame and hand, .joints.csv the
-    ranges of motion, .markers.csv what was seen of each marker, .doubts.csv the doubtful frames.
+    ranges of motion and errors, .markers.csv what was seen of each marker, .doubts.csv the doubtful frames.
 
     Args:
         take: A take (.npz, of handsim track or the .truth.npz of handsim simulate).

@@ -116,7 +116,7 @@ def _track_file(
     with progress_bar("frames") as bar:
 
         def show(done: int, total: int) -> None:
-            bar.step("calibrating" if settings.calibrate and done == total else "")
+            bar.step("" if done < total else "calibrating" if settings.calibrate else "smoothing")
             bar(done, total)
 
         take = track_capture(

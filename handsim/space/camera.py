@@ -49,6 +49,7 @@ class Lens:
 
     def __post_init__(self) -> None:
         check_choice(self.kind, _COEFFICIENTS, noun="lens")
+        object.__setattr__(self, "coefficients", tuple(self.coefficients))
         expected = _COEFFICIENTS[self.kind]
         if len(self.coefficients) != expected or not np.isfinite(self.coefficients).all():
             raise ArgumentError(
@@ -281,8 +282,11 @@ class Camera:
     T_world_camera: Float[np.ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))
     """Pose in the world [m]."""
     lens: Lens = field(default_factory=Lens)
+    """A lens, or its fields as `record` has them."""
 
     def __post_init__(self) -> None:
+        if isinstance(self.lens, Mapping):
+            object.__setattr__(self, "lens", Lens(**self.lens))
         object.__setattr__(self, "K", check_array("K", self.K, (3, 3)))
         object.__setattr__(self, "T_world_camera", check_array("T_world_camera", self.T_world_camera, (4, 4)))
         sides = np.asarray(self.size)
@@ -367,7 +371,7 @@ class Camera:
         return self.unproject(np.stack([columns, rows], axis=-1))
 
     def record(self) -> dict[str, Any]:
-        """The camera as a JSON record."""
+        """The camera as a JSON record, of which `Camera(**record)` is the camera again."""
         return {
             "name": self.name,
             "size": list(self.size),
@@ -415,12 +419,6 @@ def look_at(position: ArrayLike, target: ArrayLike) -> Float[np.ndarray, "4 4"]:
 def focal_of_angle(length: float, angle: float) -> float:
     """The focal length [px] at which `length` pixels span an angle [rad]."""
     return float(length / 2 / np.tan(angle / 2))
-
-
-def camera_from_record(record: Mapping[str, Any]) -> Camera:
-    """The camera of a record of `Camera.record`."""
-    lens = Lens(record["lens"]["kind"], tuple(record["lens"]["coefficients"]))
-    return Camera(record["name"], record["size"], record["K"], record["T_world_camera"], lens)
 
 
 class CameraArrays(NamedTuple):

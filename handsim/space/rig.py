@@ -40,7 +40,6 @@ from handsim.space.camera import (
     Lens,
     LensKind,
     camera_arrays,
-    camera_from_record,
     camera_matrix,
     focal_of_angle,
     look_at,
@@ -418,7 +417,7 @@ def load_rig(rig: CameraRig | str | Path | Mapping[str, Any]) -> CameraRig:
     check_type("rig", rig, (str, Path, Mapping), expected, list_rigs())
     if isinstance(rig, Mapping):
         try:
-            return CameraRig(rig["name"], [camera_from_record(one) for one in rig["cameras"]])
+            return CameraRig(rig["name"], [Camera(**one) for one in rig["cameras"]])
         except (KeyError, TypeError) as error:
             raise RigError(
                 f"a damaged record of a rig ({error!r}), expected what CameraRig.record() gives"

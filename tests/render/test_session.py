@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from gloves import load_take
-from handsim import Camera, HandModel, HandSimError, join_qpos, look_at
+from handsim import Camera, HandModel, HandSimError, Lens, join_qpos, look_at
 from handsim.cli.main import main
 from handsim.errors import ArgumentError
 from handsim.hand.model import hand_keypoints
@@ -87,6 +87,12 @@ def test_a_picture_is_drawn_again_from_its_record(tmp_path):
     np.testing.assert_array_equal(again.noisy.rgb, kept[..., ::-1])
     with pytest.raises(ArgumentError, match="expected frames or a picture's record"):
         draw(tmp_path / "take.npz", record={"number": 9})
+
+
+def test_own_cameras_come_back_from_the_settings_of_pictures():
+    bent = dataclasses.replace(ABOVE, lens=Lens("brown", (0.08, -0.05, 0.001, -0.0005, 0.0)))
+    settings = json.loads(json.dumps({"view": {"cameras": [ABOVE.record(), bent.record()]}}))
+    assert RenderConfig.from_json(settings).view.cameras == (ABOVE, bent)
 
 
 def test_settings_are_given_by_name_and_mixtures_whole(qpos):

@@ -12,7 +12,6 @@ from gloves import load_layout
 from gloves.fit import nominal_fit
 from handsim.errors import ArgumentError
 from track import TrackerConfig, TrackSettings
-from track.config import BOTH
 from track.settings import TrackerSetup
 
 
@@ -40,10 +39,18 @@ def test_hands_in_a_named_glove_get_the_labeler_of_its_design():
         assert TrackerSetup.of(settings).user.layout is worn
 
 
+def test_hands_that_are_not_named_are_those_of_the_glove():
+    glove = load_layout("dense19")
+    for sides in (("right",), ("left", "right")):
+        worn = dataclasses.replace(glove, sides=sides)
+        setup = TrackerSetup.of(TrackSettings(glove=worn, labeler="dense19"))
+        assert setup.user.sides == sides[::-1] and setup.settings["hands"] == list(sides[::-1])
+
+
 def test_fields_that_are_named_differ_from_the_settings():
     settings = TrackSettings(size="L", glove="dense19")
     assert TrackSettings.of(settings, {"size": "S"}).record() == {**settings.record(), "size": "S"}
-    assert TrackSettings.of(None, {}).hands == BOTH
+    assert TrackSettings.of(None, {}).hands is None
     with pytest.raises(ArgumentError, match=r"unknown setting of tracking 'glvoe' .* valid names: glove"):
         TrackSettings.of(None, {"glvoe": "dense19"})
     with pytest.raises(ArgumentError, match="settings is 'dense19', expected a TrackSettings"):
