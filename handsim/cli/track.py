@@ -113,10 +113,11 @@ def _track_file(
     from track.live import LiveTake
 
     corrections = corrections_path(out)
+    after = "calibrating" if settings.calibrate else "smoothing" if settings.smooth else ""
     with progress_bar("frames") as bar:
 
         def show(done: int, total: int) -> None:
-            bar.step("" if done < total else "calibrating" if settings.calibrate else "smoothing")
+            bar.step(after if done == total else "")
             bar(done, total)
 
         take = track_capture(
