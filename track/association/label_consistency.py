@@ -42,8 +42,8 @@ _FIRST_REVIEW_WAIT: Final = 0.01  # [s] from a review with changes to the next o
 _REVIEW_WAIT_FACTOR: Final = 1.6  # factor of that time after each review without changes
 _DOUBTED_PRESENCE: Final = -2.0  # log probability of a marker that the track saw elsewhere at the same time
 _REVIEW_MARGIN: Final = 8.0  # log-odds by which the labeler's labels must be better than those of the track
-# A bias is doubted if a point is this much closer to the marker without it, or the labeler is this sure.
-_DOUBTED_BIAS_SHARE, _SURE_ANSWER = 0.85, 0.95
+# A bias is doubted if a point is this much closer to the marker without it.
+_DOUBTED_BIAS_SHARE: Final = 0.85
 _MOVED_LABEL_LOG_ODDS: Final = 2.0  # log-odds that a point keeps its label
 _REPEATED_REVIEW_LOG_ODDS: Final = 1.0  # log-odds gained by each earlier review with the same result
 _MOST_ANSWER_LOG_ODDS: Final = 7.0  # bound of the log-odds from the labeler's confidence
@@ -233,13 +233,11 @@ class LabelerReview:
             return frame, track
         proposal = self._compare(frame, track, named, confidence)
         if proposal is None:
-            # A ghost may spoil the labeler's answer, and a bias may be of another point or another gesture.
-            added = _with_persistent(frame, track, named, confidence)
-            doubted = added[added != markers]
+            doubted = _doubted_biases(frame, track, named)
             if len(doubted):
                 biases = track.state.biases
                 track.state.forget(doubted)
-                proposal = self._compare(frame, track, added, confidence, _FIT_SPREAD)
+                proposal = self._compare(frame, track, named, confidence)
                 if proposal is None:
                     track.state.recall(biases)
         if proposal is None:
@@ -256,12 +254,8 @@ class LabelerReview:
         track: HandTrack,
         named: NDArray[np.int64],
         confidence: NDArray[np.float64],
-        spread: float = 0.0,
     ) -> _Proposal | None:
-        """Fit the labeler's labels; None if the current ones are likelier or equal.
-
-        All markers count as having this standard deviation [m] more: a bias changes with the gesture.
-        """
+        """Fit the labeler's labels; None if the current ones are likelier or equal."""
         named_frame, is_sure = frame.with_markers(track.hand, named), track.estimate.rms < _RESTART_RMS
         proposed, estimate = fit_labels(
             named_frame, track.hand, track.state, track.prediction, is_sure=is_sure
@@ -270,7 +264,7 @@ class LabelerReview:
         if (after == before).all() or np.isnan(estimate.rms):
             return None
         proposal = _Proposal(proposed, confidence, estimate)
-        gain = self._gain(frame, track, proposal, spread)
+        gain = self._gain(frame, track, proposal)
         changes = {
             (int(frame.ids[row]), int(after[row])) for row in np.flatnonzero((after != before) & (after >= 0))
         }
@@ -293,11 +287,11 @@ class LabelerReview:
         self._wait[index] = _FIRST_REVIEW_WAIT if new else longer
         return True
 
-    def _gain(self, frame: FrameState, track: HandTrack, proposal: _Proposal, spread: float) -> float:
+    def _gain(self, frame: FrameState, track: HandTrack, proposal: _Proposal) -> float:
         """Log-odds gained by the proposed labels over the current ones."""
         before, proposed = frame.markers(track.hand), proposal.frame.markers(track.hand)
-        gain = self._log_odds(frame, track, proposed, proposal.estimate, spread)
-        gain -= self._log_odds(frame, track, before, track.estimate, spread)
+        gain = self._log_odds(frame, track, proposed, proposal.estimate)
+        gain -= self._log_odds(frame, track, before, track.estimate)
         named = np.flatnonzero((proposed != before) & (proposed >= 0))
         sure = np.clip(proposal.confidence[named], 0.5, 1.0 - 1e-6)
         gain += np.minimum(np.log(sure / (1.0 - sure)), _MOST_ANSWER_LOG_ODDS).sum()
@@ -310,16 +304,11 @@ class LabelerReview:
         return float(gain + presence[~doubted].sum() + _DOUBTED_PRESENCE * doubted.sum())
 
     def _log_odds(
-        self,
-        frame: FrameState,
-        track: HandTrack,
-        markers: NDArray[np.int64],
-        estimate: HandEstimate,
-        spread: float,
+        self, frame: FrameState, track: HandTrack, markers: NDArray[np.int64], estimate: HandEstimate
     ) -> float:
         """Log-odds of labeled points being markers of the fitted hand and not strays."""
         labeled = np.flatnonzero(markers >= 0)
-        variance = track.state.variance[markers[labeled]] + spread**2
+        variance = track.state.variance[markers[labeled]]
         peak = peak_log_odds(variance, self._config.stray_density)
         squares = ((frame.points[labeled] - estimate.positions[markers[labeled]]) ** 2).sum(axis=1)
         return float((peak - 0.5 * squares / variance).sum())
@@ -348,16 +337,15 @@ def _near_missing(
     return near
 
 
-def _with_persistent(
-    frame: FrameState, track: HandTrack, named: NDArray[np.int64], confidence: NDArray[np.float64]
-) -> Int[np.ndarray, "P"]:
-    """The labels, and the labeler's for persistent points that are missing markers with a doubted bias."""
-    markers = frame.markers(track.hand)
+def _doubted_biases(frame: FrameState, track: HandTrack, named: NDArray[np.int64]) -> Int[np.ndarray, "K"]:
+    """Missing markers with a probably wrong bias: the labeler assigns them points that have persisted."""
+    # Such a bias was learned from other points if the point is much closer without it.
     old = frame.time - frame.first_seen >= STRAY_LIFETIME
-    rows = np.flatnonzero(old & frame.unlabeled & (named >= 0) & ~np.isin(named, markers))
-    points, missing = frame.points[rows], named[rows]
-    without = np.linalg.norm(points - track.state.unbiased_positions(track.estimate)[missing], axis=1)
-    with_bias = np.linalg.norm(points - track.estimate.positions[missing], axis=1)
-    rows = rows[(without < _DOUBTED_BIAS_SHARE * with_bias) | (confidence[rows] >= _SURE_ANSWER)]
-    markers[rows] = named[rows]
-    return markers
+    rows = np.flatnonzero(old & frame.unlabeled & (named >= 0))
+    if not len(rows):
+        return rows
+    points, markers = frame.points[rows], named[rows]
+    without = np.linalg.norm(points - track.state.unbiased_positions(track.estimate)[markers], axis=1)
+    with_bias = np.linalg.norm(points - track.estimate.positions[markers], axis=1)
+    doubted = markers[without < _DOUBTED_BIAS_SHARE * with_bias]
+    return np.setdiff1d(doubted, frame.markers(track.hand))

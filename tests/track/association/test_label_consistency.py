@@ -329,18 +329,3 @@ def test_a_bias_that_was_learned_from_a_ghost_yields_to_a_point_that_lasts(age, 
         assert found is None
     else:
         np.testing.assert_array_equal(found[0].labels, np.arange(19))
-
-
-@pytest.mark.parametrize("age", [0.0, 0.4])
-def test_a_point_that_lasts_is_a_marker_whose_bias_is_another_in_this_gesture(age, followed, frame_of):
-    """The bias was learned well, in other frames."""
-    state = followed()
-    points, labels = state.solver.marker_positions(state.qpos), np.arange(19)
-    points[KNUCKLE] += 0.0, 0.006, 0.006
-    labels[KNUCKLE] = -1
-    frame = frame_of(points, labels, 1.0, first_seen=1.0 - age)
-    found = reviewed(LabelerReview(CountingLabeler(), 1, TrackerConfig()), state, frame)
-    if age == 0.0:
-        assert found is None
-    else:
-        np.testing.assert_array_equal(found[0].labels, np.arange(19))
