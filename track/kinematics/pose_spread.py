@@ -68,9 +68,10 @@ _LEAST_FREEDOM: Final = 3  # least number of marker coordinates beyond those tha
 SOURCES: Final = ("noise and gaps", "gluing", "flesh", "person")
 """Sources of an angle's uncertainty: noisy or unseen markers, their glued places, their motion over the
 bones, and what stays of a person: sizes and directions of bones, gestures unlike other people's."""
-CHANGING: Final = 0.82
-"""Part of an uncalibrated hand's error that changes between sessions of a person. The rest comes from its
-wrong shape, which stays. Found for two sessions of each of 29 simulated people (benchmarks/sessions.py)."""
+CHANGING: Final = 0.82, 0.82, 0.82, 0.28
+"""Shares of these parts of an uncalibrated hand's error that change between sessions of a person. The rest
+comes from its wrong shape, which stays, and from people's usual gestures, towards which a hand is drawn
+nearly alike. Found for two sessions of each of 53 simulated people (benchmarks/sessions.py)."""
 DETECTABLE: Final = 1.96 * float(np.sqrt(2.0))
 """Ratio of the minimal detectable difference of two sessions to the standard error of measurement."""
 _OWN: Final = 10  # unknown numbers of a digit: knuckle, direction, bones (3 each), all its bones
@@ -458,8 +459,8 @@ class SpreadModel:
 
 def measurement_error(budget: Float[np.ndarray, "*J 4"], origin: HandOrigin) -> Float[np.ndarray, "*J"]:
     """Standard error of measurement between sessions of a person, in the unit of deviations by `SOURCES`."""
-    changing = 1.0 if origin == "calibrated" else CHANGING
-    return np.asarray(changing * np.linalg.norm(budget[..., :-1], axis=-1))
+    changing = (1.0, 1.0, 1.0, 0.0) if origin == "calibrated" else CHANGING
+    return np.asarray(np.linalg.norm(budget * np.array(changing), axis=-1))
 
 
 def freedom_factor(num_markers: int) -> float:
