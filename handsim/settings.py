@@ -270,6 +270,7 @@ def _changed(kind: Any, usual: Any, changes: Mapping[str, Any], noun: str) -> An
     known = [field.name for field in dataclasses.fields(kind) if field.init]
     for name in changes:
         check_choice(name, known, noun=noun)
+    changes = {name: tuple(value) if isinstance(value, list) else value for name, value in changes.items()}
     return kind(**changes) if usual is None else dataclasses.replace(usual, **changes)
 
 

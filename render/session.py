@@ -40,6 +40,7 @@ from handsim.files.outputs import check_free, save_json
 from handsim.files.signals import Stopped, interrupts_bare
 from handsim.space.camera import Camera
 from handsim.space.rig import CameraRig, check_names
+from handsim.space.rig_formats import load_cameras
 from render.captions import contact_sheet, write_png
 from render.color_sensor import sample_exposure, sample_shutter
 from render.config import RenderConfig, SpawnKey
@@ -496,7 +497,9 @@ def _settings(drawing: Drawing, source: Source) -> dict[str, Any]:
     if drawing.config.view.cameras is None:
         del settings["view"]["cameras"]
     else:
-        settings["view"]["cameras"] = [camera.record() for camera in drawing.viewpoints.cameras(0)]
+        own = drawing.config.view.cameras  # as given: `up` turns them when they are drawn again, too
+        cameras = load_cameras(own) if isinstance(own, str) else own
+        settings["view"]["cameras"] = [camera.record() for camera in cameras]
     return settings if subject.poses is None else settings | {"poses": subject.poses}
 
 

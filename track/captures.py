@@ -29,7 +29,6 @@ from handsim.hand.shape import NUM_QPOS, Side
 from track.association.frame_state import change_of_distances
 from track.association.initialization import label_alone
 from track.bidirectional_labeling import label_both_ways
-from track.config import BOTH
 from track.corrected_take import correct_take
 from track.frames import AnyCapture, StreamedFrame, TrackedFrame, capture_of, checked_frames
 from track.hand_size import measured_user, sample_frames
@@ -223,7 +222,7 @@ def measure_hands(
     glove: AnyGlove = "dense19",
     *,
     labeler: AnyLabeler = None,
-    hands: Side | Sequence[Side] = BOTH,
+    hands: Side | Sequence[Side] | None = None,
 ) -> User:
     """The hands of a capture with their size and proportions measured; a `Tracker` takes them.
 
@@ -231,7 +230,7 @@ def measure_hands(
         capture: Points [m], or the path of a marker file or a take; names of markers are not used.
         glove: Marker layout, or its shipped name or the path of its .toml file.
         labeler: A labeler, or what `load_labeler` reads; that of the glove when not given.
-        hands: Which hands.
+        hands: Which hands; all that the glove is made for when not given.
 
     Returns:
         The hands, all of one shape; `str()` gives their length and breadth. If no hand is found that
@@ -243,7 +242,8 @@ def measure_hands(
         LayoutError: The glove is unknown, or does not fit a hand.
         WeightsError: The labeler is unknown, or knows other markers.
     """
-    user = nominal_user(load_layout(glove), USUAL_SIZE, hands)
+    layout = load_layout(glove)
+    user = nominal_user(layout, USUAL_SIZE, layout.sides[::-1] if hands is None else hands)
     frames = checked_frames(capture_of(capture))
     return measured_user(sample_frames(frames), user, labeler_of(user.layout, labeler))
 

@@ -152,9 +152,9 @@ def _slips(hand: _Hand) -> Iterator[SuspectSpan]:
         at = int(np.where(amid, np.abs(sure), 0.0).argmax())
         if abs(sure[at]) > _SURE and abs(shifts[at]) > _GLOVE_SLIP:
             frame = int(hand.some[at])
-            why = f"is in a glove that slips by {1e3 * abs(shifts[at]):.1f} mm or more"
-            why += f" at about {hand.take.times[frame]:.1f} s"
-            yield hand.span(frame, "", why, remedy, of_labels=False)
+            why = f"slips by {1e3 * abs(shifts[at]):.1f} mm or more at about {hand.take.times[frame]:.1f} s"
+            fault = hand.span(frame, "", why, remedy, of_labels=False)
+            yield fault._replace(of=f"the {hand.side} glove")
 
 
 def _is_amid(times: Float[np.ndarray, "F"]) -> Bool[np.ndarray, "F"]:

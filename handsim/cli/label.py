@@ -35,7 +35,7 @@ def label(
             Unlabeled2, ... For several captures or a folder of them a folder, whose files have the captures'
             names; those of .tsv files end in .c3d.
         glove: Marker layout: a shipped name or the path of a .toml file.
-        hands: Which hands are in the captures; both when not given.
+        hands: Which hands are in the captures; all that the glove is made for when not given.
         labeler: Folder of a trained labeler, an exported .onnx file, or module:name; the shipped one when
             not given.
         threads: Threads of the labeler; more than one helps a large network on an idle machine.

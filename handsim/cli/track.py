@@ -113,11 +113,11 @@ def _track_file(
     from track.live import LiveTake
 
     corrections = corrections_path(out)
-    after = "calibrating" if settings.calibrate else "smoothing" if settings.smooth else ""
+    after = iter([*["calibrating"] * settings.calibrate, *["smoothing"] * settings.smooth])
     with progress_bar("frames") as bar:
 
         def show(done: int, total: int) -> None:
-            bar.step(after if done == total else "")
+            bar.step(next(after, "") if done == total else "")
             bar(done, total)
 
         take = track_capture(

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike, NDArray
 
-from handsim._checks import check_array, check_choice
+from handsim._checks import check_array, check_choice, check_type
 from handsim.errors import ArgumentError
 from handsim.kernels import kernel
 from handsim.space.transforms import rigid
@@ -49,6 +49,7 @@ class Lens:
 
     def __post_init__(self) -> None:
         check_choice(self.kind, _COEFFICIENTS, noun="lens")
+        check_type("coefficients", self.coefficients, (Sequence, np.ndarray), "a sequence of numbers")
         object.__setattr__(self, "coefficients", tuple(self.coefficients))
         expected = _COEFFICIENTS[self.kind]
         if len(self.coefficients) != expected or not np.isfinite(self.coefficients).all():
@@ -286,7 +287,11 @@ class Camera:
 
     def __post_init__(self) -> None:
         if isinstance(self.lens, Mapping):
+            if set(self.lens) != {"kind", "coefficients"}:
+                given = ", ".join(map(str, self.lens)) or "none"
+                raise ArgumentError(f"a lens with the fields {given}, expected kind, coefficients")
             object.__setattr__(self, "lens", Lens(**self.lens))
+        check_type("lens", self.lens, Lens, "a Lens, or its fields")
         object.__setattr__(self, "K", check_array("K", self.K, (3, 3)))
         object.__setattr__(self, "T_world_camera", check_array("T_world_camera", self.T_world_camera, (4, 4)))
         sides = np.asarray(self.size)

@@ -417,7 +417,8 @@ def load_rig(rig: CameraRig | str | Path | Mapping[str, Any]) -> CameraRig:
     check_type("rig", rig, (str, Path, Mapping), expected, list_rigs())
     if isinstance(rig, Mapping):
         try:
-            return CameraRig(rig["name"], [Camera(**one) for one in rig["cameras"]])
+            fields = ("name", "size", "K", "T_world_camera", "lens")
+            return CameraRig(rig["name"], [Camera(*(one[name] for name in fields)) for one in rig["cameras"]])
         except (KeyError, TypeError) as error:
             raise RigError(
                 f"a damaged record of a rig ({error!r}), expected what CameraRig.record() gives"

@@ -161,7 +161,11 @@ def test_a_take_with_y_up_is_drawn_as_the_same_one_with_z_up(camera, tmp_path):
     for one, other in pairs:
         assert (one.ids != other.ids).mean() < 1e-3 and one.ids.any()
         np.testing.assert_allclose(one.hands[0].keypoints_world, other.hands[0].keypoints_world, atol=1e-6)
+    config = config if own is None else dataclasses.replace(config, view=ViewConfig(cameras=(own,)))
     render_take(lying, tmp_path / "y", "png", config, frames_per_shard=6, num_frames=1, up="y", workers=1)
+    saved = RenderConfig.from_json(json.loads((tmp_path / "y" / "render.json").read_text()))
+    frames = (next(draw(lying, config=one, up="y", frames=(0,))) for one in (config, saved))
+    np.testing.assert_array_equal(*(frame.ids for frame in frames))
     with pytest.raises(HandSimError, match=r"begun with other settings .*up"):
         render_take(lying, tmp_path / "y", "png", config, frames_per_shard=6, num_frames=1, workers=1)
 

@@ -123,7 +123,7 @@ def test_a_slip_is_told_from_noise_by_all_markers_together(truth, rng, shift):
     take = as_tracked([hand], PoseSolver(hand).solve(seen).qpos[:, None], seen)
     found = [fault for fault in find_faults(take) if "slips by" in fault.why]
     assert len(found) == (shift > 0.0)
-    assert all(abs(fault.first - HALF) <= 3 and fault.of == "the right hand" for fault in found)
+    assert all(abs(fault.first - HALF) <= 3 and fault.of == "the right glove" for fault in found)
 
 
 def test_a_slip_is_told_of_a_hand_that_was_calibrated_on_both_parts(truth, rng):
@@ -151,7 +151,7 @@ def test_a_slip_of_the_whole_glove_is_told_on_moving_skin(shift):
     seen = seen[np.isfinite(seen[..., 0]).sum(axis=1) >= FEWEST_MARKERS]
     take = as_tracked([between], PoseSolver(between).solve(seen).qpos[:, None], seen)
     found = [fault for fault in find_faults(take) if "slips by" in fault.why]
-    assert [fault.of for fault in found] == ["the right hand"] * (shift > 0.0)
+    assert [fault.of for fault in found] == ["the right glove"] * (shift > 0.0)
     assert all(abs(fault.first - half) <= RATE / 2 for fault in found)
 
 
