@@ -221,7 +221,7 @@ def list_layouts() -> tuple[str, ...]:
 AnyLayout = Annotated[
     MarkerLayout | str | Path, Expected("a MarkerLayout, or the name or path of one", list_layouts)
 ]
-"""What `load_layout` takes, as a setting."""
+"""Type of a setting that is a marker layout, or the name or path of one."""
 
 
 def load_layout(glove: MarkerLayout | str | Path) -> MarkerLayout:

@@ -242,8 +242,7 @@ def measure_hands(
         LayoutError: The glove is unknown, or does not fit a hand.
         WeightsError: The labeler is unknown, or knows other markers.
     """
-    layout = load_layout(glove)
-    user = nominal_user(layout, USUAL_SIZE, layout.sides[::-1] if hands is None else hands)
+    user = nominal_user(load_layout(glove), USUAL_SIZE, hands)
     frames = checked_frames(capture_of(capture))
     return measured_user(sample_frames(frames), user, labeler_of(user.layout, labeler))
 

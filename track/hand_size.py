@@ -74,7 +74,7 @@ _LENIENT: Final = TrackerConfig(least_evidence=2.0)  # for hands of few markers 
 _ROBUST_SCALE: Final = 0.015  # [m]
 _GLUED: Final = 0.0045  # [m] spread per axis of the markers of a glove that may not be as its layout says
 _FIT_STEPS, _FEW_STEPS = 15, 2
-_LEAST_PRECISION: Final = 1.0  # [1/m^2] avoids a division by zero
+_LEAST_PRECISION: Final = 1.0  # [1/m^2] smallest precision of a shift, so that none is divided by zero
 _SMALL_GAIN, _RELINEARIZE = 1e-3, 0.05  # ten times a calibration's: a size may be off by 0.2 mm
 _PART: Final = 30  # Hands are compared in two parts of this many frames.
 _LEAST_FRAMES: Final = 10  # Hands are not compared in fewer frames.

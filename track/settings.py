@@ -14,7 +14,7 @@ from handsim._checks import check_type, shown_value
 from handsim.errors import ArgumentError
 from handsim.hand.shape import SIDES, Side
 from handsim.settings import Expected, Settings
-from track.config import BOTH, Size, TrackerConfig
+from track.config import Size, TrackerConfig
 from track.frames import StreamedFrame
 from track.hand_size import check_hands, check_scale, mean_hand, measured_user
 from track.rigid_body import AnyBody, RigidTemplate, load_bodies
@@ -169,5 +169,4 @@ def _chosen_user(settings: LabelSettings) -> tuple[User, bool]:
             )
         return user, False
     glove, is_auto = layout or load_layout(USUAL_GLOVE), settings.size == "auto"
-    sides = [side for side in BOTH if side in glove.sides] if hands is None else hands
-    return nominal_user(glove, USUAL_SIZE if is_auto else settings.size, sides), is_auto  # type: ignore[arg-type]
+    return nominal_user(glove, USUAL_SIZE if is_auto else settings.size, hands), is_auto  # type: ignore[arg-type]

@@ -31,8 +31,8 @@ _SLIP: Final = 0.0035  # [m] least reported shift of a marker
 _SLIP_SHARE: Final = 0.55  # least share of the variance of its offsets that the shift explains
 _SMALL_SLIP: Final = 0.0008  # [m] the same for a steady marker: the pose absorbs most of a slip
 _SMALL_SHARE: Final = 0.85  # least explained share for such a small shift
-_GLOVE_SLIP: Final = 0.0025  # [m] least reported shift of a whole glove
-_SURE: Final = 2.75  # the same in standard deviations
+_GLOVE_SLIP: Final = 0.0025  # [m] smallest slip of a whole glove that is reported
+_SURE: Final = 2.75  # smallest such slip in standard deviations
 _SLIP_PART: Final = 1.9  # [s] least time before and after a slip
 _LEAST_VARIANCE: Final = 1e-8  # [m^2] noise of optical systems
 _OFTEN_MISSING: Final = 0.3  # A marker missing in this share of the frames is looked for elsewhere.
@@ -128,7 +128,7 @@ def _first_of_size(take: Take) -> int:
 
 
 def _slips(hand: _Hand) -> Iterator[SuspectSpan]:
-    """The marker with the clearest lasting shift, if any, or the whole glove."""
+    """The slip of the marker with the clearest lasting shift, or that of the whole glove if there is none."""
     known = np.isfinite(hand.offsets[..., 0])
     values = np.where(known[..., None], hand.offsets.clip(-_FARTHEST, _FARTHEST), 0.0)
     before, sums = np.cumsum(known, axis=0), np.cumsum(values, axis=0)

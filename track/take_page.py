@@ -493,7 +493,7 @@ def _frame_rows(take: Take, hands: Sequence[HandFigures]) -> _Rows:
 
 
 def _joint_rows(take: Take, hands: Sequence[HandFigures]) -> _Rows:
-    """Rows of the range of motion of each joint and of the model, and of its errors between sessions."""
+    """Rows of the table of joints: range of motion, range of the model, errors between sessions."""
     columns = [f"{name}_deg" for name in (*_RANGE, "model_low", "model_high", "spread")]
     columns += ["at_limits_share", "measured_share", "longest_gap_s", "sem_deg", "mdd_deg", "cutoff_hz"]
     rows: _Rows = [["hand", "joint", *columns]]

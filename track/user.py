@@ -183,8 +183,9 @@ def _left_as_measured(notes: str) -> list[str]:
     return [told for told in notes.split("; ") if told.endswith(AS_MEASURED)]
 
 
-def nominal_user(layout: MarkerLayout, size: str, sides: str | Sequence[str]) -> User:
-    """Hands of one of the five sizes in gloves as designed, for one or both sides."""
+def nominal_user(layout: MarkerLayout, size: str, sides: str | Sequence[str] | None) -> User:
+    """Hands of one of the five sizes in gloves as designed: of these sides, or of all that the glove has."""
+    sides = layout.sides[::-1] if sides is None else sides  # the right hand comes first
     sides = (sides,) if isinstance(sides, str) else tuple(map(str, sides))
     if not sides or len(set(sides)) < len(sides) or not set(sides) <= set(SIDES):
         raise ArgumentError(f"hands are '{' '.join(sides)}', expected right, left, or one of each")

@@ -204,7 +204,7 @@ def _prefix(path: Path) -> str:
 
 
 def remove_leftovers(folder: Path, names: str = "**/.*.tmp-*") -> None:
-    """Remove temporary files and folders from a folder: those of these names, or all in it and below it.
+    """Remove the temporary files and folders that match a pattern; by default all in a folder and below it.
 
     Call it only for what one job owns: what another process is writing there would be lost.
     """

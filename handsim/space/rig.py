@@ -388,7 +388,7 @@ def list_rigs() -> tuple[str, ...]:
 
 
 AnyRig = Annotated[CameraRig | str | Path, Expected("a CameraRig, or the name or path of one", list_rigs)]
-"""What `load_rig` takes, as a setting."""
+"""Type of a setting that is a camera rig, or the name or path of one."""
 
 
 def rig_description(name: str) -> str:

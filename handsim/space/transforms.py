@@ -111,9 +111,9 @@ def unit(vectors: Float[np.ndarray, "*batch K"]) -> NDArray[np.float64]:
 
 def quaternion_matrix(quaternion: Float[np.ndarray, "*batch 4"]) -> NDArray[np.float64]:
     """Rotation matrices (..., 3, 3) of wxyz quaternions, which are normalized first."""
-    unit = quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True)
-    w, x, y, z = unit if unit.ndim == 1 else np.moveaxis(unit, -1, 0)  # numbers are quicker than arrays
-    matrix = np.empty((*unit.shape[:-1], 3, 3))
+    turn = unit(quaternion)
+    w, x, y, z = turn if turn.ndim == 1 else np.moveaxis(turn, -1, 0)  # numbers are quicker than arrays
+    matrix = np.empty((*turn.shape[:-1], 3, 3))
     matrix[..., 0, 0], matrix[..., 0, 1] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z)
     matrix[..., 0, 2], matrix[..., 1, 0] = 2 * (x * z + w * y), 2 * (x * y + w * z)
     matrix[..., 1, 1], matrix[..., 1, 2] = 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)

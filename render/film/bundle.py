@@ -28,8 +28,8 @@ _NOTHING: Final = 1e-2  # prior information on free unknowns
 _DEPENDENT: Final = 16.0  # This many samples count as one with an independent error.
 
 # Places of the unknowns in a state's values. From POSES on, each span has six numbers for its camera's pose.
-# _PRIORS holds the standard deviation of each unknown before any picture is seen. THICKER is how much thicker
-# the filmed hands are than the tracked ones [m]: cloth, or the error of a measured hand.
+# _PRIORS holds the standard deviation of each unknown before any picture is seen. THICKER says how much
+# thicker the filmed hands are than the tracked ones [m], because of cloth or an error of a measured hand.
 OFFSET, DRIFT, FOCAL, THICKER, POSES = 0, 1, 2, 7, 10
 _CENTER, _LENS, READOUT = slice(3, 5), slice(5, 7), slice(8, 10)
 _PRIORS: Final = np.array([np.inf, 1e-4, 0.7, 0.005, 0.005, 0.05, 0.05, 0.0007, 0.015, 0.015])

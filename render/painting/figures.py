@@ -77,7 +77,7 @@ def shade_colors(shade: Float32[np.ndarray, "D"]) -> Float32[np.ndarray, "D 4"]:
 _BALL_LEVEL: Final = 2
 _BASE: Final = (0.85, 0.4)  # radius of a marker's base on the glove and in the marker [marker radii]
 _BASE_SIDES: Final = 12
-_EDGE: Final = np.deg2rad(60.0)  # [rad] Faces of an object that meet at a larger angle have a sharp edge.
+_EDGE: Final = np.deg2rad(60.0)  # [rad] An edge is drawn sharp where two faces meet at a larger angle.
 _BODY_BALLS: Final = 0.0032  # [m] radius of the markers of rigid bodies, 6.4 mm in diameter (Han et al. 2018)
 
 

@@ -201,7 +201,7 @@ def _motions(still: Sequence[str]) -> Iterator[str]:
 
 
 class MotionGuide:
-    """Tells users in front of the cameras what to move for a good calibration of the tracked hands."""
+    """Tells users which joints of the tracked hands to move, so that a calibration finds them all."""
 
     def __init__(self, hands: Sequence[GloveFit]) -> None:
         self._hands = {hand.side: hand for hand in hands}
