@@ -32,7 +32,7 @@ from track.kinematics.marker_kinematics import (
     marker_residuals,
     workspace,
 )
-from track.kinematics.pose_spread import SpreadModel, freedom_factor, resting_prior
+from track.kinematics.pose_spread import SpreadModel, resting_prior
 from track.user import hand_origin, read_errors
 
 # Chosen on realistic simulated hands; the error hardly changes within a factor of ten.
@@ -42,6 +42,8 @@ _GESTURES: Final = 30.0  # [1/s] how often the prior counts: errors of markers l
 _WEAK: Final = np.repeat([0.0, 1.0], [NUM_JOINTS, 6])  # [1/m^2, 1/rad^2] keeps an unseen wrist solvable
 _WINDOW, _MARGIN = 2000, 200  # frames solved together, and additional ones at either end
 _ROUNDS: Final = 5  # Gauss-Newton steps
+_COUNTED: Final = 8  # One frame of so many tells how many numbers of the markers the poses follow.
+_LEAST_FREEDOM: Final = 0.1  # least share of the markers' numbers that poses do not follow
 _LONGEST_STEP: Final = 0.5  # [rad], [m] bound of each step
 _FIRST_NOISE, _LEAST_NOISE = 0.0015, 0.0001  # [m] standard deviation of markers: first value, lower bound
 _FROM_BIAS: Final = 1.4  # ratio of a marker's place error to its mean residual: poses absorb half of it
@@ -136,6 +138,7 @@ class _SmoothedHand:
         self._hand, self._model, self._rate = hand_arrays(worn), spread_model(take, worn), take.rate
         self._noise, self._flesh = _FIRST_NOISE, 0.0  # [m]
         self._places = np.zeros((len(self._hand.digits), 2))  # RMS error along the skin, off it [m]
+        self._freedom = np.full(take.num_frames, np.nan)  # share of the markers' numbers left to residuals
 
     def solve(self, windows: Sequence[_Window]) -> tuple[Float[np.ndarray, "20"], Float[np.ndarray, "20 4"]]:
         """Solve all poses; return the cut-off of each angle [Hz] and its spread by `SOURCES` [deg]."""
@@ -195,8 +198,12 @@ class _SmoothedHand:
         normal, gradient, self._residuals[window.frames] = _frame_equations(
             self._hand, self._targets[window.frames], qpos, self._weight_noise**-2, _OUTLIER**-2
         )
+        seen, markers = np.isfinite(self._targets[window.frames, :, 0]), normal[::_COUNTED].copy()
         normal[:, :NUM_JOINTS, :NUM_JOINTS] += self._share * prior.precision
         normal += np.diag(_WEAK)
+        followed = np.linalg.solve(normal[::_COUNTED], markers).trace(axis1=1, axis2=2)
+        shown = np.maximum(3 * seen[::_COUNTED].sum(axis=1), 1)
+        self._freedom[window.frames][::_COUNTED] = 1.0 - followed / shown
         gradient[:, :NUM_JOINTS] += self._share * (qpos[:, 7:] - prior.angles) @ prior.precision
         return normal, gradient
 
@@ -233,7 +240,8 @@ class _SmoothedHand:
         noise = _spread(changes[seen[1:] & seen[:-1]]) / np.sqrt(2.0)
         self._noise = max(noise, _LEAST_NOISE)
         slow = max(_spread((residuals - bias)[seen]) ** 2 - noise**2, 0.0)
-        self._flesh = float(np.sqrt(3.0 * slow)) * freedom_factor(seen.shape[1])
+        # Poses follow flesh as far as markers alone decide a pose; residuals show the rest.
+        self._flesh = float(np.sqrt(slow / max(np.nanmean(self._freedom), _LEAST_FREEDOM)))
         lifts = (bias * self._hand.normals).sum(axis=1)
         slips = np.sqrt(np.maximum((bias**2).sum(axis=1) - lifts**2, 0.0) / 2.0)
         for part in (self._hand.digits < 0, self._hand.digits >= 0):

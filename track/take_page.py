@@ -337,7 +337,7 @@ def _error_section(title: str, settings: Mapping[str, Any], hand: HandFigures) -
         "squares of its four parts, each as root mean square over all frames. Gluing is a constant error, as "
         "is what stays of the person: sizes and directions of bones, and gestures unlike other people's. "
         "SEM: standard error of measurement between sessions of a person, all parts but the person's; of "
-        f"hands that are not calibrated {CHANGING[0]:g} times these and {CHANGING[-1]:g} times the person's. "
+        f"hands that are not calibrated the four parts times {', '.join(f'{one:g}' for one in CHANGING)}. "
         "MDD: minimal detectable difference of two sessions, 1.96 times the root of two times the SEM."
     )
     table = [["joint", "SD", *SOURCES, "SEM", "MDD", "cut-off [Hz]"]]

@@ -9,7 +9,7 @@ import pytest
 
 from gloves.takes.take import LOST, TRACKED
 from track.captures import track_capture
-from track.smoothed_take import _solve_in_time, smooth_take, times_unseen
+from track.smoothed_take import _SmoothedHand, _solve_in_time, _windows, smooth_take, times_unseen
 from train import simulate_take
 
 
@@ -64,6 +64,18 @@ def test_markers_that_stay_off_their_places_widen_the_part_of_gluing(truth, fitt
         take = smooth_take(dataclasses.replace(fitted, hands=tuple(hands), settings=settings))
         told.append(np.mean(list(take.settings["budget"].values()), axis=(0, 1)))
     assert told[1][1] > 2.0 * told[0][1]
+
+
+@pytest.mark.parametrize("glove", ["dense19", "starter10"])
+def test_flesh_is_as_large_as_it_is_however_few_markers_show_it(glove, rng):
+    take = simulate_take(glove=glove, num_frames=480, seed=4)
+    truth = take.observed(take.sides[0])
+    size, phases = 0.001, rng.uniform(0.0, 2.0 * np.pi, (*truth.shape[1:], 4))  # [m], per axis
+    waves = np.sin(2.0 * np.pi * take.times[:, None, None, None] * [0.4, 0.7, 0.9, 1.3] + phases)
+    hand = _SmoothedHand(take, 0)
+    hand._targets = truth + size * waves.sum(axis=-1) / np.sqrt(2.0)
+    hand.solve(_windows(take.status[:, 0]))
+    assert 0.7 * size < hand._flesh < 1.3 * size
 
 
 def test_a_frame_has_the_same_pose_at_the_start_and_at_the_end(fitted):

@@ -68,10 +68,11 @@ _LEAST_FREEDOM: Final = 3  # least number of marker coordinates beyond those tha
 SOURCES: Final = ("noise and gaps", "gluing", "flesh", "person")
 """Sources of an angle's uncertainty: noisy or unseen markers, their glued places, their motion over the
 bones, and what stays of a person: sizes and directions of bones, gestures unlike other people's."""
-CHANGING: Final = 0.82, 0.82, 0.82, 0.28
+CHANGING: Final = 1.0, 0.5, 1.2, 0.32
 """Shares of these parts of an uncalibrated hand's error that change between sessions of a person. The rest
 comes from its wrong shape, which stays, and from people's usual gestures, towards which a hand is drawn
-nearly alike. Found for two sessions of each of 53 simulated people (benchmarks/sessions.py)."""
+nearly alike. Flesh counts more than once, as residuals do not show all of it. Found for two sessions of each
+of 107, 67 and 40 simulated people in dense19, sparse13 and starter10 (benchmarks/sessions.py)."""
 DETECTABLE: Final = 1.96 * float(np.sqrt(2.0))
 """Ratio of the minimal detectable difference of two sessions to the standard error of measurement."""
 _OWN: Final = 10  # unknown numbers of a digit: knuckle, direction, bones (3 each), all its bones
