@@ -336,8 +336,9 @@ def _error_section(title: str, settings: Mapping[str, Any], hand: HandFigures) -
         "keeps half of its size. SD [deg]: standard deviation of the angle, the root of the sum of the "
         "squares of its four parts, each as root mean square over all frames. Gluing is a constant error, as "
         "is what stays of the person: sizes and directions of bones, and gestures unlike other people's. "
-        "SEM: standard error of measurement between sessions of a person, all parts but the person's; of "
-        f"hands that are not calibrated the four parts times {', '.join(f'{one:g}' for one in CHANGING)}. "
+        "SEM: standard error of measurement between sessions of a person, with the glove put on anew: "
+        "the SD of hands that are calibrated in each session; of other hands from the four parts times "
+        f"{', '.join(f'{one:g}' for one in CHANGING)}. "
         "MDD: minimal detectable difference of two sessions, 1.96 times the root of two times the SEM."
     )
     table = [["joint", "SD", *SOURCES, "SEM", "MDD", "cut-off [Hz]"]]

@@ -459,9 +459,13 @@ class SpreadModel:
 
 
 def measurement_error(budget: Float[np.ndarray, "*J 4"], origin: HandOrigin) -> Float[np.ndarray, "*J"]:
-    """Standard error of measurement between sessions of a person, in the unit of deviations by `SOURCES`."""
-    changing = (1.0, 1.0, 1.0, 0.0) if origin == "calibrated" else CHANGING
-    return np.asarray(np.linalg.norm(budget * np.array(changing), axis=-1))
+    """Standard error of measurement between sessions of a person, in the unit of deviations by `SOURCES`.
+
+    The glove is put on anew for each session. Then a calibrated hand is calibrated anew, too, and all parts
+    of its error change.
+    """
+    changing = 1.0 if origin == "calibrated" else np.array(CHANGING)
+    return np.asarray(np.linalg.norm(changing * budget, axis=-1))
 
 
 def freedom_factor(num_markers: int) -> float:
