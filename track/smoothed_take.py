@@ -32,7 +32,7 @@ from track.kinematics.marker_kinematics import (
     marker_residuals,
     workspace,
 )
-from track.kinematics.pose_spread import SpreadModel, resting_prior
+from track.kinematics.pose_spread import SpreadModel, freedom_factor, resting_prior
 from track.user import hand_origin, read_errors
 
 # Chosen on realistic simulated hands; the error hardly changes within a factor of ten.
@@ -136,7 +136,8 @@ class _SmoothedHand:
         self._unseen = times_unseen(take.times, np.isfinite(self._targets[..., 0]))
         self._residuals = np.full_like(self._targets, np.nan)  # in the frames of the bones [m]
         self._hand, self._model, self._rate = hand_arrays(worn), spread_model(take, worn), take.rate
-        self._noise, self._flesh = _FIRST_NOISE, 0.0  # [m]
+        # Standard deviations [m] of noise, of slow motion that residuals show, and of the flesh behind it.
+        self._noise, self._slow, self._flesh = _FIRST_NOISE, 0.0, 0.0
         self._places = np.zeros((len(self._hand.digits), 2))  # RMS error along the skin, off it [m]
         self._freedom = np.full(take.num_frames, np.nan)  # share of the markers' numbers left to residuals
 
@@ -189,8 +190,12 @@ class _SmoothedHand:
 
     @property
     def _weight_noise(self) -> float:
-        """Noise and flesh motion together [m], which weight a marker."""
-        return float(np.hypot(self._noise, self._flesh))
+        """Noise and slow motion together [m], which weight a marker.
+
+        Few markers weigh less than their flesh alone would tell: the prior makes up for wrong places.
+        """
+        slow = np.sqrt(3.0) * self._slow * freedom_factor(len(self._places))
+        return float(np.hypot(self._noise, slow))
 
     def _equations(self, window: _Window) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Normal matrices (F, 26, 26) and gradients (F, 26) of single frames."""
@@ -239,9 +244,9 @@ class _SmoothedHand:
         changes = np.diff(residuals, axis=0)
         noise = _spread(changes[seen[1:] & seen[:-1]]) / np.sqrt(2.0)
         self._noise = max(noise, _LEAST_NOISE)
-        slow = max(_spread((residuals - bias)[seen]) ** 2 - noise**2, 0.0)
+        self._slow = float(np.sqrt(max(_spread((residuals - bias)[seen]) ** 2 - noise**2, 0.0)))
         # Poses follow flesh as far as markers alone decide a pose; residuals show the rest.
-        self._flesh = float(np.sqrt(slow / max(np.nanmean(self._freedom), _LEAST_FREEDOM)))
+        self._flesh = self._slow / float(np.sqrt(max(np.nanmean(self._freedom), _LEAST_FREEDOM)))
         lifts = (bias * self._hand.normals).sum(axis=1)
         slips = np.sqrt(np.maximum((bias**2).sum(axis=1) - lifts**2, 0.0) / 2.0)
         for part in (self._hand.digits < 0, self._hand.digits >= 0):
