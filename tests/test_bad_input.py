@@ -251,7 +251,7 @@ CASES = {
     "export nobody.json --out hand.xml": "nobody.json | cannot be read",
     "export missing.npz --out hands.glb": "missing.npz | cannot be read",
     "export tracked.npz --out tracked.npz": "a name that ends in",
-    "export tracked.npz --out x.glb --fps 0": "the rate is 0 Hz | positive",
+    "export tracked.npz --out x.glb --fps 0": "the rate [Hz] is 0 | above 0",
     "view": "neither a file nor --live | a file or --live natnet://host",
     "view good.trc --live natnet://127.0.0.1": "--live natnet://127.0.0.1 | a file or --live",
     "view --live natnet://127.0.0.1 --out x.toml": ".npz",

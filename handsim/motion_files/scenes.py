@@ -45,7 +45,7 @@ from handsim.motion_files.motion import (
     smooth_quaternions,
     split_vertices,
 )
-from handsim.space.transforms import UpAxis, file_axes
+from handsim.space.transforms import UpAxis, file_axes, rigid
 
 _MATERIALS: Final = (SKIN, THING)
 Target = Literal["vertices", "indices"]
@@ -310,13 +310,8 @@ def _add_hand(stage: Any, hand: PosedHand, codes: NDArray[np.float64]) -> None:
     path = f"/hands/{hand.side}"
     root = UsdSkel.Root.Define(stage, path)
     skeleton = UsdSkel.Skeleton.Define(stage, f"{path}/{hand.side}_skeleton")
-    rest = hand.model.rest_transforms
-    local = np.stack(
-        [
-            rest[n] if bone.parent < 0 else np.linalg.inv(rest[bone.parent]) @ rest[n]
-            for n, bone in enumerate(BONES)
-        ]
-    )
+    rest, bones = hand.model.rest_transforms, hand.model.skeleton
+    local = rigid(bones.rotations, bones.offsets)
     skeleton.CreateJointsAttr(joint_paths(hand.side))
     skeleton.CreateBindTransformsAttr(Vt.Matrix4dArray([Gf.Matrix4d(one.T.tolist()) for one in rest]))
     skeleton.CreateRestTransformsAttr(Vt.Matrix4dArray([Gf.Matrix4d(one.T.tolist()) for one in local]))

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from handsim._checks import check_array, check_choice, check_type
 from handsim.errors import ArgumentError
 from handsim.kernels import kernel
-from handsim.space.transforms import rigid
+from handsim.space.transforms import are_rigid, rigid, unit
 
 LensKind = Literal["pinhole", "brown", "fisheye"]
 _COEFFICIENTS: Final[dict[str, int]] = {"pinhole": 0, "brown": 5, "fisheye": 4}
@@ -94,7 +94,7 @@ class Lens:
             return np.concatenate([along * np.sin(theta)[..., None], np.cos(theta)[..., None]], axis=-1)
         flat = points if self.kind == "pinhole" else self._undistort_brown(points)
         rays = np.concatenate([flat, np.ones_like(flat[..., :1])], axis=-1)
-        return np.asarray(rays / np.linalg.norm(rays, axis=-1, keepdims=True))
+        return unit(rays)
 
     @property
     def _radial(self) -> tuple[float, ...]:
@@ -311,12 +311,7 @@ class Camera:
             raise ArgumentError(
                 f"camera '{self.name}': K is not a matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]"
             )
-        rotation = self.T_world_camera[:3, :3]
-        if (
-            np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-5
-            or np.linalg.det(rotation) < 0.0
-            or not np.array_equal(self.T_world_camera[3], [0.0, 0.0, 0.0, 1.0])
-        ):
+        if not are_rigid(self.T_world_camera):
             raise ArgumentError(f"camera '{self.name}': T_world_camera is not a rigid transform")
 
     def __eq__(self, other: object) -> bool:
@@ -484,30 +479,24 @@ def _points_in_view(cameras: Any, points: Any, seen: Any) -> None:
             )  # fmt: skip
 
 
-def _presets() -> dict[str, Camera]:
-    return {
-        "vga": pinhole("vga", (640, 480), 600.0),
-        "vga_wide": pinhole("vga_wide", (640, 480), 380.0),
-        # Intel RealSense SR300 as in BigHand2.2M and HANDS17, Microsoft Kinect v2's and Azure Kinect's (NFOV)
-        # depth and Intel RealSense D435 as their makers state them: fields of view, rounded.
-        "sr300": pinhole("sr300", (640, 480), 475.07, (315.94, 245.29)),
-        "kinect2": pinhole("kinect2", (512, 424), 365.0),
-        "azure_kinect": pinhole("azure_kinect", (640, 576), 504.0),
-        "d435": pinhole("d435", (848, 480), 425.0),
-        "headset_fisheye": Camera(
-            "headset_fisheye",
-            (640, 480),
-            camera_matrix(240.0, 240.0, 320.0, 240.0),
-            lens=Lens("fisheye", (0.02, -0.006, 0.0, 0.0)),
-        ),
-    }
-
-
-PRESETS: Final = tuple(_presets())
+_PRESETS: Final = (
+    pinhole("vga", (640, 480), 600.0),
+    pinhole("vga_wide", (640, 480), 380.0),
+    # Intel RealSense SR300 as in BigHand2.2M and HANDS17, Microsoft Kinect v2's and Azure Kinect's (NFOV)
+    # depth and Intel RealSense D435 as their makers state them: fields of view, rounded.
+    pinhole("sr300", (640, 480), 475.07, (315.94, 245.29)),
+    pinhole("kinect2", (512, 424), 365.0),
+    pinhole("azure_kinect", (640, 576), 504.0),
+    pinhole("d435", (848, 480), 425.0),
+    dataclasses.replace(
+        pinhole("headset_fisheye", (640, 480), 240.0), lens=Lens("fisheye", (0.02, -0.006, 0.0, 0.0))
+    ),
+)
+PRESETS: Final = {camera.name: camera for camera in _PRESETS}
+"""The cameras that come with the package, at the world's origin, by their names."""
 
 
 def preset(name: str) -> Camera:
-    """One of the cameras that come with the package, at the world's origin."""
-    cameras = _presets()
-    check_choice(name, cameras, noun="camera")
-    return cameras[name]
+    """One of `PRESETS`."""
+    check_choice(name, PRESETS, noun="camera")
+    return PRESETS[name]
