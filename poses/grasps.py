@@ -530,11 +530,8 @@ class Held(NamedTuple):
 
 def sample_held_poses(
     model: HandModel, obj: RigidObject, hold: Hold, count: int, *, rng: np.random.Generator
-) -> tuple[Float[np.ndarray, "B 20"], Float[np.ndarray, "B 4 4"]]:
-    """Valid variants of a hold, joint angles [rad] and `T_wrist_object` [m].
-
-    Free digits lift, others tap or press, and the object tilts a little.
-    """
+) -> Held:
+    """Valid variants of a hold: free digits lift, others tap or press, and the object tilts a little."""
     scene, style = grasp_scene(model, obj), hold_style(model, obj, hold.name)
     start = Held(hold.angles[None], hold.T_wrist_object[None])
     if not is_held_valid(scene, start)[0]:
@@ -555,8 +552,7 @@ def sample_held_poses(
         step /= 2
         nearer = between(start, Held(*(part[todo] for part in target)), share[todo] + step)
         share[todo] += np.where(is_held_valid(scene, nearer), step, 0.0)
-    nearest = between(start, target, share)
-    return nearest.angles, nearest.poses
+    return between(start, target, share)
 
 
 def between(start: Held, end: Held, share: NDArray[np.float64]) -> Held:

@@ -303,7 +303,7 @@ def _scripts() -> dict[str, dict[str, Any]]:
 
 
 def scripted_motion(
-    model: HandModel | HandShape | str,
+    model: HandModel,
     script: str,
     duration: float,
     config: MotionConfig | None = None,
@@ -314,7 +314,6 @@ def scripted_motion(
 
     A script other than "free" brings its own `durations` and `hold`.
     """
-    model = load_model(model)
     check_choice(script, _scripts(), noun="script")
     if script == FREE:
         return sample_motion(model, duration, config, rng=rng)

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
-from handsim._checks import check_array, check_callable, check_choice, check_rng, check_type
+from handsim._checks import check_array, check_callable, check_choice, check_count, check_rng
 from handsim._plugins import call_plugin, list_plugins, load_plugin, plugin_name
 from handsim.errors import ArgumentError, PoseError
 from handsim.files.inputs import package_data
@@ -255,15 +255,11 @@ def resting_angles(model: HandModel) -> Float[np.ndarray, "20"]:
     return resting
 
 
-def make_valid(
-    model: HandModel | HandShape | str, angles: Float[np.ndarray, "T 20"]
-) -> Float[np.ndarray, "T 20"]:
+def make_valid(model: HandModel, angles: Float[np.ndarray, "T 20"]) -> Float[np.ndarray, "T 20"]:
     """Poses [rad] moved towards rest until they are valid; valid ones stay unchanged.
 
-    The thumb moves first, then thumb and abductions; the whole hand opens only if that is not enough. A shape
-    or the name of a size is a right hand.
+    The thumb moves first, then thumb and abductions; the whole hand opens only if that is not enough.
     """
-    model = load_model(model)
     resting = resting_angles(model)
     result = np.array(angles, dtype=np.float64)
     todo = np.flatnonzero(~is_valid(model, result))
@@ -354,10 +350,8 @@ def sample_poses(
         PoseError: This hand has no valid pose at rest: its fingers are too thick for its breadth.
     """
     hand = load_model(model)
-    check_type("num_poses", num_poses, (int, np.integer), "a number of poses")
+    check_count("num_poses", num_poses, 1)
     check_rng(rng)
-    if num_poses < 1:
-        raise ArgumentError(f"num_poses is {num_poses}, expected a positive number")
     drawn = load_sampler(sampler, is_tried=False)(hand, num_poses, rng=rng)
     qpos = join_qpos(make_valid(hand, drawn[:, -NUM_JOINTS:]))
     if drawn.shape[1] == NUM_QPOS:
