@@ -114,14 +114,9 @@ class _Player:
 
     def _keeps_touch(self, held: Held) -> bool:
         """Whether the holding digits are near the object after 1/4, 1/2 and 3/4 of the path."""
-        scene = self.scene
-        names = [scene.mj_model.geom(geom).name for geom in scene.hand_geoms]
-        for number in len(held.angles) * np.array([1, 2, 3]) // 4:
-            distances = scene.distances(scene.new_data(held.angles[number], held.poses[number]))
-            near = {name for name, gap in zip(names, distances, strict=True) if gap < _MAX_GAP}
-            if why_not_held(self.style, near):
-                return False
-        return True
+        middle = len(held.angles) * np.array([1, 2, 3]) // 4
+        near = (self.scene.touching(held.angles[n], held.poses[n], _MAX_GAP) for n in middle)
+        return not any(why_not_held(self.style, names) for names in near)
 
 
 def _scribble(frames: int, size: float, rate: float, *, rng: np.random.Generator) -> NDArray[np.float64]:

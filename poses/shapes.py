@@ -83,15 +83,10 @@ _DIP_ABOVE: Final = np.deg2rad(28.0)  # largest deviation of the DIP above its s
 _MCP_APART: Final = np.deg2rad([85.0, 70.0, 75.0])
 
 
-def finger_view(angles: Float[np.ndarray, "T 20"]) -> Float[np.ndarray, "T 5 4"]:
-    """View (T, 5, 4) of the angles, with one row per digit."""
-    return angles.reshape(*angles.shape[:-1], 5, 4)
-
-
 def apply_couplings(angles: Float[np.ndarray, "T 20"]) -> Float[np.ndarray, "T 20"]:
     """Clamp angles [rad] to ranges and couplings."""
     coupled = np.clip(angles, LOW, HIGH)
-    fingers = finger_view(coupled)[:, 1:]
+    fingers = coupled.reshape(-1, 5, 4)[:, 1:]  # a view
     flexion = fingers[..., 1]
     for near, far, apart in ((1, 0, 0), (1, 2, 1), (2, 3, 2)):
         limit = _MCP_APART[apart]
@@ -161,7 +156,7 @@ def _curl_fingers(count: int, rng: np.random.Generator) -> NDArray[np.float64]:
     from scipy.special import ndtr
 
     angles = _thumbs(count, rng)
-    digits = finger_view(angles)
+    digits = angles.reshape(count, 5, 4)  # a view
     within = rng.uniform(0.3, 1.0, size=(count, 1))  # correlation of the joints of one finger
     splits = rng.random((count, 3)) < _SPLIT
     knuckles = _grouped(splits, rng.standard_normal((count, 4)))

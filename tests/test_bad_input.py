@@ -147,7 +147,7 @@ CASES = {
     "track good.trc --live natnet://localhost --out out.npz": "good.trc | //localhost | a capture or --live",
     "track good.trc --seconds 3 --out out.npz": "--seconds is 3 | --live",
     "track --live natnet://localhost --calibrate --out out.npz": "--calibrate | natnet://localhost | twice",
-    "track --live natnet://localhost --seconds 0 --out out.npz": "--seconds is 0 | positive",
+    "track --live natnet://localhost --seconds 0 --out out.npz": "--seconds is 0 | above 0",
     "track --live localhost:1510 --out out.npz": "'localhost:1510' | natnet://host | qtm://host | module:",
     "track photos --out out.npz": "photos: this is a folder | .trc, .c3d, .csv, .tsv",
     "track good.trc --out out.c3d": "--out is out.c3d | .npz",

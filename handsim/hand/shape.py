@@ -191,13 +191,9 @@ class HandShape:
     def __post_init__(self) -> None:
         check_type("side", self.side, str, "the name of one", SIDES)
         check_choice(self.side, SIDES, noun="side")
-        for name, shape in (
-            ("bone_lengths", (5, 3)),
-            ("knuckles", (5, 3)),
-            ("base_angles", (5, 3)),
-            ("radii", (5, 4)),
-        ):
-            object.__setattr__(self, name, check_array(name, getattr(self, name), shape))
+        for name in ("bone_lengths", "knuckles", "base_angles", "radii"):
+            measures = check_array(name, getattr(self, name), HAND_DTYPE[name].shape)
+            object.__setattr__(self, name, measures)
         for name in ("length", "breadth", "palm_thickness", "bone_lengths", "radii"):
             smallest = np.min(getattr(self, name))
             if not smallest > 0.0:
@@ -288,8 +284,6 @@ def sample_shape(
         ArgumentError: An argument is of another type, or there is no such side.
     """
     check_type("population", population, Population, "a Population")
-    check_type("side", side, str, "the name of one", SIDES)
-    check_choice(side, SIDES, noun="side")
     check_rng(rng)
     sex = "female" if rng.random() < 0.5 else "male"
     (length_mean, length_sd), (breadth_mean, breadth_sd), correlation = _LENGTH_BREADTH[sex]

@@ -305,11 +305,11 @@ class Camera:
                 f"expected 1 to {_MAX_SIZE} each way"
             )
         object.__setattr__(self, "size", (int(sides[0]), int(sides[1])))
-        rest = self.K.copy()
-        rest[0, 0] = rest[1, 1] = rest[0, 2] = rest[1, 2] = 0.0
-        if not (self.K[0, 0] > 0.0 and self.K[1, 1] > 0.0) or np.abs(rest - np.diag([0, 0, 1])).max() > 0.0:
+        fx, fy, cx, cy = self.K[[0, 1, 0, 1], [0, 1, 2, 2]]
+        if not min(fx, fy) > 0.0 or not np.array_equal(self.K, camera_matrix(fx, fy, cx, cy)):
             raise ArgumentError(
-                f"camera '{self.name}': K is not a matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]"
+                f"camera '{self.name}': K is not a matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] "
+                f"with positive fx and fy: {self.K.tolist()}"
             )
         if not are_rigid(self.T_world_camera):
             raise ArgumentError(f"camera '{self.name}': T_world_camera is not a rigid transform")
