@@ -147,7 +147,6 @@ class MarkerLayout:
         check_type("radius of a layout", self.radius, (int, float, np.number), "a number [m]")
         check_type("sides of a layout", self.sides, (tuple, list), "the sides that it fits", SIDES)
         object.__setattr__(self, "markers", tuple(self.markers))
-        object.__setattr__(self, "sides", tuple(self.sides))
         if not self.name or not self.name.isprintable():
             raise LayoutError(f"layout name {self.name!r}: expected printable characters")
         if not FEWEST_MARKERS <= self.num_markers <= MOST_MARKERS:

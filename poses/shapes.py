@@ -371,17 +371,12 @@ def _drawn(
     name = plugin_name(sampler)
     function = load_plugin(sampler, group=SAMPLERS, noun=_NOUN) if isinstance(sampler, str) else sampler
     owner = f"what {_NOUN} '{name}' returns"
-    drawn = call_plugin(function, name, _NOUN, model, num_poses, rng=rng)
-    try:
-        values = np.asarray(drawn, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise ArgumentError(f"{owner} is {type(drawn).__name__}, expected joint angles [rad]") from error
+    values = check_array(owner, call_plugin(function, name, _NOUN, model, num_poses, rng=rng), (None,))
     if values.shape not in ((num_poses, NUM_JOINTS), (num_poses, NUM_QPOS)):
         raise ArgumentError(
             f"{owner} has shape {values.shape}, expected ({num_poses}, {NUM_JOINTS}) joint angles or "
             f"({num_poses}, {NUM_QPOS}) whole poses"
         )
-    check_array(owner, values, values.shape)
     widest = np.abs(values[:, -NUM_JOINTS:]).max()
     if widest > _MAX_ANGLE:
         raise ArgumentError(f"{owner} holds an angle of {widest:.4g} rad; are these degrees?")

@@ -120,7 +120,7 @@ def select_hands(capture: Capture, names: Sequence[str]) -> list[Float[np.ndarra
 
 def _while_there(markers: Float[np.ndarray, "T M 3"]) -> Float[np.ndarray, "K M 3"]:
     """The frames in which a marker was seen."""
-    return markers[np.isfinite(markers[..., 0]).any(axis=1)]
+    return np.asarray(markers[np.isfinite(markers[..., 0]).any(axis=1)])
 
 
 def unlabeled_frames(capture: Capture) -> list[Float[np.ndarray, "N 3"]]:

@@ -246,7 +246,7 @@ class Take:
         qpos, points = np.asarray(qpos), np.asarray(points)
         nowhere = np.full((len(points), len(bodies), 7), np.nan)
         poses = nowhere if body_poses is None else np.asarray(body_poses)
-        check_number("the rate [Hz]", rate, 0.0, above=True)
+        check_number("the rate [Hz]", float(rate), 0.0, above=True)
         return cls(
             rate=rate,
             times=np.arange(len(qpos)) / rate,

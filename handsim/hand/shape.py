@@ -194,19 +194,13 @@ class HandShape:
         for name in ("bone_lengths", "knuckles", "base_angles", "radii"):
             measures = check_array(name, getattr(self, name), HAND_DTYPE[name].shape)
             object.__setattr__(self, name, measures)
-        for name in ("length", "breadth", "palm_thickness", "bone_lengths", "radii"):
-            smallest = np.min(getattr(self, name))
-            if not smallest > 0.0:
-                raise ArgumentError(f"a hand's lengths must be positive, got {smallest:g} m")
+        _check_measure("length", self.length, 0.05, 0.35)
+        for name in ("breadth", "palm_thickness", "bone_lengths", "radii"):
             _check_measure(name, getattr(self, name), _SHORTEST, _LONGEST)
         _check_measure("knuckles", self.knuckles, -_LONGEST, _LONGEST)
         _check_measure("knuckles along the hand", self.knuckles[1:, 0], _SHORTEST, _LONGEST)
         if np.abs(self.base_angles).max() > 2.0 * np.pi:
             raise ArgumentError("base_angles of a hand are more than a turn, expected radians")
-        if not 0.05 <= self.length <= 0.35:
-            raise ArgumentError(
-                f"hand length {self.length:g} m is no human hand's; expected meters, 0.05 to 0.35"
-            )
 
     def with_side(self, side: Side) -> HandShape:
         """The same hand on the other (or the same) arm."""
@@ -216,7 +210,7 @@ class HandShape:
 def _check_measure(name: str, values: float | NDArray[np.float64], low: float, high: float) -> None:
     """Refuse measures [m] beyond those of any hand, from which no model can be built."""
     measures = np.asarray(values)
-    wrong = measures[(measures < low) | (measures > high)]
+    wrong = measures[~((measures >= low) & (measures <= high))]  # also NaN
     if len(wrong):
         raise ArgumentError(f"{name} of a hand: {wrong[0]:g} m, expected {low:g} to {high:g} m")
 

@@ -295,14 +295,11 @@ class Camera:
         object.__setattr__(self, "K", check_array("K", self.K, (3, 3)))
         object.__setattr__(self, "T_world_camera", check_array("T_world_camera", self.T_world_camera, (4, 4)))
         sides = np.asarray(self.size)
-        if sides.shape != (2,) or sides.dtype.kind not in "iuf" or (sides % 1 != 0).any():
+        whole = sides.shape == (2,) and sides.dtype.kind in "iuf" and (sides % 1 == 0).all()
+        if not whole or sides.min() < 1 or sides.max() > _MAX_SIZE:
             raise ArgumentError(
-                f"camera '{self.name}': size is {self.size}, expected width and height in whole pixels"
-            )
-        if not ((sides >= 1) & (sides <= _MAX_SIZE)).all():
-            raise ArgumentError(
-                f"camera '{self.name}' has pictures of {sides[0]} x {sides[1]} pixels, "
-                f"expected 1 to {_MAX_SIZE} each way"
+                f"camera '{self.name}': size is {self.size}, expected width and height, 1 to {_MAX_SIZE} "
+                "whole pixels each"
             )
         object.__setattr__(self, "size", (int(sides[0]), int(sides[1])))
         fx, fy, cx, cy = self.K[[0, 1, 0, 1], [0, 1, 2, 2]]
