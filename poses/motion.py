@@ -166,7 +166,7 @@ def wrist_path(
     frames: int,
     rate: float,
     *,
-    center: Sequence[float] = ROOM_CENTER,
+    center: Sequence[float] | Float[np.ndarray, "3"] = ROOM_CENTER,
     volume: float = 0.3,
     turning: float = 0.5,
     rng: np.random.Generator,
