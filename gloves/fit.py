@@ -22,7 +22,7 @@ from handsim.hand.shape import BONE_NAMES, DIGIT_OF_BONE, NUM_BONES, NUM_QPOS, P
 from handsim.hand.skin import all_weights, strongest_weights, vertex_normals
 from handsim.kernels import kernel
 from handsim.space.rig import CameraRig
-from handsim.space.transforms import MIRROR
+from handsim.space.transforms import MIRROR, unit
 
 _WIDTHS: Final = {"points": 3, "normals": 3, "bone_indices": 4, "bone_weights": 4}
 _MAX_NUMBER: Final = 100.0  # Larger positions [m], directions or bone indices are refused.
@@ -106,8 +106,7 @@ class Attachment:
         self, model: HandModel, T_world_bone: Float[np.ndarray, "T L 4 4"]
     ) -> tuple[Float[np.ndarray, "T M 3"], Float[np.ndarray, "T M 3"]]:
         """Marker centers [m] and outward unit directions in the world, for bones of the same hand."""
-        normals = self._carried(model, T_world_bone, self.normals, 0.0)
-        normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+        normals = unit(self._carried(model, T_world_bone, self.normals, 0.0))
         return self.centers(model, T_world_bone), normals
 
     def _carried(
@@ -184,16 +183,12 @@ def _put_on(
     needed = np.zeros(len(surface.vertices), dtype=np.bool_)
     needed[corners] = True
     around = surface.faces[needed[surface.faces].any(axis=1)]
-    normals = np.einsum("mk,mki->mi", bary, vertex_normals(surface.vertices, around)[corners])
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = unit(np.einsum("mk,mki->mi", bary, vertex_normals(surface.vertices, around)[corners]))
     feet = origins + distances[:, None] * directions
     points = feet + layout.heights[:, None] * normals
-    full = np.zeros((len(corners), len(BONE_NAMES)))  # skin weights, interpolated over each face's vertices
-    for corner in range(3):
-        vertex = corners[:, corner]
-        shares = bary[:, corner, None] * surface.bone_weights[vertex]
-        np.add.at(full, (np.arange(len(corners))[:, None], surface.bone_indices[vertex]), shares)
-    indices, weights = strongest_weights(full)
+    vertices = corners.ravel()
+    shares = all_weights(surface.bone_indices[vertices], bary.reshape(-1, 1) * surface.bone_weights[vertices])
+    indices, weights = strongest_weights(shares.reshape(*corners.shape, -1).sum(axis=1))
     bones = np.array([BONE_NAMES.index(marker.bone) for marker in markers])
     others = _other_digits(feet, points, bones, indices[:, 0], model)
     others = ["" if gone else other for gone, other in zip(missed, others, strict=True)]

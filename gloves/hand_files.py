@@ -8,21 +8,20 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float
 
-from gloves.fit import GloveFit, attach
-from gloves.layout import load_layout
-from gloves.takes.take import Take
+from gloves.fit import GloveFit
 from handsim.errors import ArgumentError
 from handsim.files.outputs import atomic_write
 from handsim.hand.model import HandModel, build_spec, join_qpos
 from handsim.hand.model_files import hand_osim, hand_urdf
 from handsim.hand.shape import NUM_JOINTS
+from handsim.motion_files.motion import Motion, PosedHand
+from handsim.motion_files.scenes import write_glb
 from handsim.space.transforms import UpAxis
 
 ENDINGS: Final = (".xml", ".urdf", ".osim", ".glb")
 WITH_MARKERS: Final = (".xml", ".osim")
 """Endings of files that hold the markers of a glove."""
 MESH_ENDINGS: Final = (".glb", ".obj", ".ply", ".stl")
-_USUAL_GLOVE: Final = "dense19"
 
 
 def write_hand(
@@ -55,10 +54,9 @@ def write_hand(
     if actuators and suffix != ".xml":
         raise ArgumentError(f"cannot write servos to '{path}', expected a name that ends in .xml")
     model = hand.model if isinstance(hand, GloveFit) else hand
-    if suffix == ".glb":  # a take needs a glove, which the file does not show
-        worn = hand if isinstance(hand, GloveFit) else attach(load_layout(_USUAL_GLOVE), model)
+    if suffix == ".glb":
         flat = join_qpos(np.zeros((1, NUM_JOINTS)))
-        Take.of_poses([worn], flat[:, None], rate=1.0).export(path)
+        write_glb(path, Motion(1.0, np.zeros(1), [PosedHand.of(model, flat)], []))
         return
     with atomic_write(path) as temporary:
         if suffix == ".urdf":

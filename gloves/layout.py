@@ -8,6 +8,7 @@ the file and meters in memory.
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import math
 import re
 import textwrap
@@ -45,6 +46,7 @@ _ALIASES: Final = {name.replace("little", "pinky"): name for name in BONE_NAMES 
 _SHIPPED: Final = Path(__file__).parent / "layouts"
 _LAYOUT_KEYS: Final = ("name", "description", "source", "sides", "radius_mm", "marker")
 _MARKER_KEYS: Final = ("name", "bone", "along", "around", "across", "height_mm")
+_OPTIONAL: Final = ("across", "height_mm")
 _STARTER: Final = """\
 # A marker glove. Places are fractions of the bones they sit on, so one file fits every size of hand.
 # Check it with `handsim glove check FILE`, which draws the markers on the hand.
@@ -145,7 +147,6 @@ class MarkerLayout:
         check_type("radius of a layout", self.radius, (int, float, np.number), "a number [m]")
         check_type("sides of a layout", self.sides, (tuple, list), "the sides that it fits", SIDES)
         object.__setattr__(self, "markers", tuple(self.markers))
-        object.__setattr__(self, "sides", tuple(self.sides))
         if not self.name or not self.name.isprintable():
             raise LayoutError(f"layout name {self.name!r}: expected printable characters")
         if not FEWEST_MARKERS <= self.num_markers <= MOST_MARKERS:
@@ -296,11 +297,15 @@ def layout_lines(layout: MarkerLayout) -> list[str]:
 
 def _marker_lines(marker: MarkerPlace) -> list[str]:
     """The lines of one [[marker]] table, after a blank one."""
-    lines = ["", "[[marker]]", f"name = {quoted(marker.name)}", f"bone = {quoted(marker.bone)}"]
-    lines += [f"along = {written(marker.along)}", f"around = {written(math.degrees(marker.around))}"]
-    lines += [f"across = {written(marker.across)}"] if marker.across else []
-    lines += [f"height_mm = {written(1e3 * marker.height)}"] if marker.height else []
-    return lines
+    return ["", "[[marker]]", *(f"{key} = {value}" for key, value in _marker_texts(marker).items())]
+
+
+def _marker_texts(marker: MarkerPlace) -> dict[str, str]:
+    """The values of a marker's table as TOML, without optional ones that are zero."""
+    texts = {"name": quoted(marker.name), "bone": quoted(marker.bone), "along": written(marker.along)}
+    texts |= {"around": written(math.degrees(marker.around)), "across": written(marker.across)}
+    texts |= {"height_mm": written(1e3 * marker.height)}
+    return {key: text for key, text in texts.items() if key not in _OPTIONAL or text != "0.0"}
 
 
 def parse_layout(table: Mapping[str, object]) -> MarkerLayout:
@@ -321,7 +326,7 @@ def parse_layout(table: Mapping[str, object]) -> MarkerLayout:
 def _parse_marker(table: Mapping[str, object], number: int) -> MarkerPlace:
     name = table.get("name")
     owner = f"marker '{name}'" if isinstance(name, str) else f"marker number {number}"
-    check_keys(table, owner, _MARKER_KEYS, optional=("across", "height_mm"))
+    check_keys(table, owner, _MARKER_KEYS, optional=_OPTIONAL)
     return MarkerPlace(
         text_of(table, "name", f"{owner}: "),
         text_of(table, "bone", f"{owner}: "),
@@ -334,7 +339,6 @@ def _parse_marker(table: Mapping[str, object], number: int) -> MarkerPlace:
 
 _TABLE: Final = re.compile(r"\s*\[\[\s*marker\s*\]\]\s*(?:#.*)?$")
 _ENTRY: Final = re.compile(r"(\s*(\w+)\s*=\s*)(\"[^\"\\]*\"|'[^']*'|[^\s#\"']+)(\s*(?:#.*)?)$")
-_TOLERANCE: Final = 1e-8
 
 
 def moved_text(text: str, layout: MarkerLayout) -> tuple[str, bool]:
@@ -356,28 +360,24 @@ def moved_text(text: str, layout: MarkerLayout) -> tuple[str, bool]:
 
 def _moved_table(lines: list[str], marker: MarkerPlace) -> list[str]:
     """The lines of one table with the values of a marker; equal values keep their text."""
-    numbers = {"along": marker.along, "around": math.degrees(marker.around)}
-    optional = {"across": marker.across, "height_mm": 1e3 * marker.height}
-    numbers |= optional
+    texts = _marker_texts(marker)
     result, met, last = [], set(), 0
     for line in lines:
         match = _ENTRY.match(line)
-        if match is None or match[2] not in (*numbers, "bone"):
+        if match is None or match[2] not in _MARKER_KEYS[1:]:
             result.append(line)
             last = len(result) if match is not None else last
             continue
         key = match[2]
         met.add(key)
-        if key in optional and not optional[key]:
+        if key not in texts:
             continue
-        value = quoted(marker.bone) if key == "bone" else written(numbers[key])
         same = False
-        with contextlib.suppress(ValueError):
-            same = key != "bone" and abs(float(match[3]) - numbers[key]) < _TOLERANCE
-        result.append(line if same else f"{match[1]}{value}{match[4]}")
+        with contextlib.suppress(ValueError):  # the bone is no number
+            same = written(float(match[3])) == texts[key]
+        result.append(line if same else f"{match[1]}{texts[key]}{match[4]}")
         last = len(result)
-    new = [f"{key} = {written(value)}" for key, value in optional.items() if value and key not in met]
-    result[last:last] = new
+    result[last:last] = [f"{key} = {texts[key]}" for key in _OPTIONAL if key in texts and key not in met]
     return result
 
 
@@ -387,12 +387,5 @@ def _describes(text: str, layout: MarkerLayout) -> bool:
         read = parse_layout(tomllib.loads(text))
     except (HandSimError, ValueError):
         return False
-    if (read.sides, read.names) != (layout.sides, layout.names):
-        return False
-    if [marker.bone for marker in read.markers] != [marker.bone for marker in layout.markers]:
-        return False
-    ours, theirs = (
-        np.array([(marker.along, marker.around, marker.across, marker.height) for marker in one.markers])
-        for one in (read, layout)
-    )
-    return bool((np.abs(ours - theirs) < _TOLERANCE).all())
+    same = dataclasses.replace(layout, name=read.name, radius=read.radius)
+    return layout_lines(read) == layout_lines(same)

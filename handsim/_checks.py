@@ -91,7 +91,7 @@ def check_number(name: str, value: float, low: float, high: float = np.inf, *, a
 
 def check_count(name: str, value: Any, low: int, high: float = np.inf) -> None:
     """Refuse what is not a whole number from `low` to `high`."""
-    check_type(name, value, int, "a whole number")
+    check_type(name, value, (int, np.integer), "a whole number")
     if not low <= value <= high:
         least = f"at least {low}" if low else "0 or more"
         raise ArgumentError(f"{name} is {value}, expected {least if high == np.inf else f'{low} to {high}'}")

@@ -100,7 +100,7 @@ _PACKAGE: Final = Path(__file__).parent
 
 def ensure_kernel_cache() -> None:
     """Name a temporary folder for compiled kernels if numba would find no other; workers inherit it."""
-    if not os.environ.get(VARIABLE) and not _is_writable(_PACKAGE) and not _is_writable(_user_cache()):
+    if not os.environ.get(VARIABLE) and not is_writable(_PACKAGE) and not is_writable(_user_cache()):
         os.environ[VARIABLE] = str(_own_folder())
 
 
@@ -109,7 +109,7 @@ def kernel_cache() -> tuple[Path, bool]:
     given = os.environ.get(VARIABLE)
     if given:
         return Path(given), not Path(given).is_relative_to(tempfile.gettempdir())
-    return (_PACKAGE, True) if _is_writable(_PACKAGE) else (_user_cache(), True)
+    return (_PACKAGE, True) if is_writable(_PACKAGE) else (_user_cache(), True)
 
 
 def _user_cache() -> Path:
@@ -117,7 +117,7 @@ def _user_cache() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"))
 
 
-def _is_writable(folder: Path) -> bool:
+def is_writable(folder: Path) -> bool:
     """Whether files can be made in a folder, or in the first of its parents that exists."""
     while not folder.exists() and folder != folder.parent:
         folder = folder.parent

@@ -14,6 +14,7 @@ import traceback
 from collections.abc import Callable
 from importlib import metadata
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any, Final
 from urllib.parse import parse_qsl
 
@@ -80,21 +81,17 @@ def _find(name: str, group: str, noun: str) -> Any:
                 f"{known}; expected module:name, or a name that a package registers as {group}"
             )
         target = points[name]
-    module, _, attribute = target.partition(":")
     here = str(Path.cwd())
     if here not in sys.path:
         sys.path.append(here)
     try:
-        found: Any = importlib.import_module(module)
-        for part in attribute.split("."):
-            found = getattr(found, part)
+        return resolve_name(target)
     except ModuleNotFoundError as error:
         raise ArgumentError(f"{noun} '{name}': {error}; it is looked for in {here} too") from error
     except AttributeError as error:
         raise ArgumentError(f"{noun} '{name}': {error}") from error
     except Exception as error:
         raise ArgumentError(f"{noun} '{name}' cannot be loaded: {_error_text(error)}") from error
-    return found
 
 
 def call_plugin(function: Callable[..., Any], name: str, noun: str, /, *args: Any, **options: Any) -> Any:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import base64
 import colorsys
-import importlib
 import io
 import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, Concatenate, Final, ParamSpec
 
 from handsim._checks import check_type, shown_value
@@ -110,8 +110,7 @@ def write_page(path: str | Path, thing: Any) -> None:
             f"thing is {shown_value(thing)}, expected a Take, a Dataset, a Registration, or a score of a "
             "glove or a rig"
         )
-    module, _, name = target.partition(":")
-    getattr(importlib.import_module(module), name)(Path(path), thing)
+    resolve_name(target)(Path(path), thing)
 
 
 def coordinates(point: Iterable[float], separator: str = " ") -> str:

@@ -267,7 +267,7 @@ def _group_of(name: str, changes: Mapping[str, Any], kind: Any, field: dataclass
 
 def _changed(kind: Any, usual: Any, changes: Mapping[str, Any], noun: str) -> Any:
     """An object of settings, or the usual one of its class, with some fields given by name."""
-    known = [field.name for field in dataclasses.fields(kind) if field.init]
+    known = [field.name for field in dataclasses.fields(kind)]
     for name in changes:
         check_choice(name, known, noun=noun)
     changes = {name: tuple(value) if isinstance(value, list) else value for name, value in changes.items()}

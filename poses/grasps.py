@@ -92,6 +92,14 @@ class GraspScene:
         hand = self.hand_geoms if geoms is None else geoms
         return np.array([min(distance(geom, part) for part in self.object_geoms) for geom in hand])
 
+    def touching(
+        self, angles: Float[np.ndarray, "20"], T_wrist_object: Float[np.ndarray, "4 4"], gap: float
+    ) -> tuple[str, ...]:
+        """Names of the hand's capsules that are nearer to the object than `gap` [m]."""
+        distances = self.distances(self.new_data(angles, T_wrist_object))
+        pairs = zip(self.hand_geoms, distances, strict=True)
+        return tuple(self.mj_model.geom(geom).name for geom, distance in pairs if distance < gap)
+
     def depth(
         self, angles: Float[np.ndarray, "T 20"], T_wrist_object: Float[np.ndarray, "T 4 4"]
     ) -> NDArray[np.float64]:
@@ -449,16 +457,11 @@ def try_hold(scene: GraspScene, style: HoldStyle, *, rng: np.random.Generator) -
         return "the fingers penetrate each other"
     if scene.depth(angles[None], pose[None])[0] > _MAX_SETTLED_DEPTH:
         return "the fingers penetrate it"
-    distances = scene.distances(scene.new_data(angles, pose))
-    names = [scene.mj_model.geom(geom).name for geom in scene.hand_geoms]
-    contacts = tuple(name for name, distance in zip(names, distances, strict=True) if distance < _TOUCHING)
-    why = why_not_held(style, set(contacts))
-    if why:
-        return why
-    return Hold(style.name, angles, pose, contacts)
+    contacts = scene.touching(angles, pose, _TOUCHING)
+    return why_not_held(style, contacts) or Hold(style.name, angles, pose, contacts)
 
 
-def why_not_held(style: HoldStyle, touching: set[str]) -> str:
+def why_not_held(style: HoldStyle, touching: Sequence[str]) -> str:
     """Why these touching capsules do not hold the object; an empty string if they do."""
     for need in style.needs:
         if not any(name.startswith(need) for name in touching):
@@ -530,11 +533,8 @@ class Held(NamedTuple):
 
 def sample_held_poses(
     model: HandModel, obj: RigidObject, hold: Hold, count: int, *, rng: np.random.Generator
-) -> tuple[Float[np.ndarray, "B 20"], Float[np.ndarray, "B 4 4"]]:
-    """Valid variants of a hold, joint angles [rad] and `T_wrist_object` [m].
-
-    Free digits lift, others tap or press, and the object tilts a little.
-    """
+) -> Held:
+    """Valid variants of a hold: free digits lift, others tap or press, and the object tilts a little."""
     scene, style = grasp_scene(model, obj), hold_style(model, obj, hold.name)
     start = Held(hold.angles[None], hold.T_wrist_object[None])
     if not is_held_valid(scene, start)[0]:
@@ -555,8 +555,7 @@ def sample_held_poses(
         step /= 2
         nearer = between(start, Held(*(part[todo] for part in target)), share[todo] + step)
         share[todo] += np.where(is_held_valid(scene, nearer), step, 0.0)
-    nearest = between(start, target, share)
-    return nearest.angles, nearest.poses
+    return between(start, target, share)
 
 
 def between(start: Held, end: Held, share: NDArray[np.float64]) -> Held:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain, pairwise
 from typing import Annotated, Any, Final
@@ -44,6 +44,7 @@ _AHEAD: Final = [np.ones(NUM_JOINTS, dtype=bool)] + [
     for first in (True, False)
     for digit in range(len(DIGITS))
 ]
+_WRIST_TIME: Final = (0.6, 2.0)
 _ROUNDS: Final = 2  # Each path is tried with this many random durations.
 _FANS: Final = (0.0, 0.3, 0.6, 1.0, 1.6)  # finger spread at the first stop, relative to "spread"
 
@@ -64,7 +65,7 @@ class MotionConfig(Settings):
     """Longest rest at a pose [s]."""
     volume: Annotated[float, Limits(0.0)] = 0.3
     """Half side of the cube the wrist moves in [m], around 1.1 m above the floor."""
-    wrist_time: Annotated[tuple[float, float], Limits(0.0, ascends=True)] = (0.6, 2.0)
+    wrist_time: Annotated[tuple[float, float], Limits(0.0, ascends=True)] = _WRIST_TIME
     """Shortest and longest time between two positions of the wrist [s]."""
 
 
@@ -141,20 +142,6 @@ _FORWARD: Final = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 """Orientation of a wrist with fingers along +y and the back of the hand up."""
 
 
-@dataclass(frozen=True, slots=True)
-class WristConfig(Settings):
-    """Positions and orientations of the wrist of a person at a table."""
-
-    center: tuple[float, float, float] = ROOM_CENTER
-    """Middle of the cube that the wrist moves in [m]."""
-    volume: Annotated[float, Limits(0.0)] = 0.3
-    """Half side of the cube that the wrist moves in [m]."""
-    turning: Annotated[float, Limits(0.0)] = 0.5
-    """Standard deviation of the rotation about each axis, from fingers ahead and palm down [rad]."""
-    times: Annotated[tuple[float, float], Limits(0.0, ascends=True)] = (0.6, 2.0)
-    """Shortest and longest time between two positions [s]."""
-
-
 def free_wrist_path(
     frames: int, config: MotionConfig, *, rng: np.random.Generator
 ) -> tuple[Float[np.ndarray, "T 3"], Float[np.ndarray, "T 4"]]:
@@ -176,16 +163,26 @@ def free_wrist_path(
 
 
 def wrist_path(
-    frames: int, rate: float, config: WristConfig, *, rng: np.random.Generator
+    frames: int,
+    rate: float,
+    *,
+    center: Sequence[float] | Float[np.ndarray, "3"] = ROOM_CENTER,
+    volume: float = 0.3,
+    turning: float = 0.5,
+    rng: np.random.Generator,
 ) -> tuple[Float[np.ndarray, "T 3"], Float[np.ndarray, "T 4"]]:
-    """Positions [m] and orientations (wxyz) of a wrist whose palm faces mostly down."""
+    """Positions [m] and orientations (wxyz) of the wrist of a person at a table.
+
+    It stays in a cube of half side `volume` around a center [m], and turns from fingers ahead and palm down
+    by the standard deviation `turning` about each axis [rad].
+    """
     shares = [np.zeros(1)]
     while sum(map(len, shares)) < max(frames, 2):  # Slerp needs two keys
-        steps = int(rng.uniform(*config.times) * rate) + 1
+        steps = int(rng.uniform(*_WRIST_TIME) * rate) + 1
         shares.append(len(shares) - 1 + minimum_jerk(steps))
     count = len(shares)
-    positions = config.center + rng.uniform(-config.volume, config.volume, size=(count, 3))
-    away = Rotation.from_rotvec(rng.normal(scale=config.turning, size=(count, 3)))
+    positions = np.asarray(center) + rng.uniform(-volume, volume, size=(count, 3))
+    away = Rotation.from_rotvec(rng.normal(scale=turning, size=(count, 3)))
     orientations = away * Rotation.from_matrix(_FORWARD)
     path, turned = along(positions, orientations, np.concatenate(shares)[:frames])
     return path, turned.as_quat(scalar_first=True)
@@ -273,14 +270,10 @@ def _next_path(
     resting = resting_angles(model)
     for _ in range(_MAX_DRAWS):
         for target in sample_valid_angles(model, _POSES_A_DRAW, rng=rng):
-            direct = straight_path(start, target, config, rng)
-            if is_valid(model, direct).all():
-                return _rested(direct, config, rng)
-            around = np.concatenate(
-                [straight_path(start, resting, config, rng), straight_path(resting, target, config, rng)]
-            )
-            if is_valid(model, around).all():
-                return _rested(around, config, rng)
+            for stops in ([start, target], [start, resting, target]):
+                path = np.concatenate([straight_path(*pair, config, rng) for pair in pairwise(stops)])
+                if is_valid(model, path).all():
+                    return _rested(path, config, rng)
     return _rested(path_to_rest(model, start, config, rng), config, rng)
 
 
@@ -303,7 +296,7 @@ def _scripts() -> dict[str, dict[str, Any]]:
 
 
 def scripted_motion(
-    model: HandModel | HandShape | str,
+    model: HandModel,
     script: str,
     duration: float,
     config: MotionConfig | None = None,
@@ -314,7 +307,6 @@ def scripted_motion(
 
     A script other than "free" brings its own `durations` and `hold`.
     """
-    model = load_model(model)
     check_choice(script, _scripts(), noun="script")
     if script == FREE:
         return sample_motion(model, duration, config, rng=rng)

@@ -14,7 +14,7 @@ from handsim.errors import PoseError
 from handsim.hand.capsules import overlap_between
 from handsim.hand.model import BodyMotion, HandModel, HandMotion, join_qpos
 from handsim.space.objects import RigidObject
-from handsim.space.transforms import axis_angle_matrix, pose_matrices, rigid, transform_poses
+from handsim.space.transforms import axis_angle_matrix, pose_matrices, rigid, transform_poses, unit
 from poses.grasps import (
     GraspScene,
     Held,
@@ -86,10 +86,8 @@ class _Player:
                 return self._rested(part), other
         model, obj = self.scene.hand, self.scene.obj
         for _ in range(_MAX_DRAWS):
-            angles, poses = sample_held_poses(model, obj, self.holds[current], _VARIANTS, rng=self.rng)
-            paths = (
-                self._path(start, Held(angles[[number]], poses[[number]])) for number in range(_VARIANTS)
-            )
+            ends = sample_held_poses(model, obj, self.holds[current], _VARIANTS, rng=self.rng)
+            paths = (self._path(start, Held(*(part[[n]] for part in ends))) for n in range(_VARIANTS))
             for part in (*paths, self._path(start, self._home(current))):
                 if is_held_valid(self.scene, part).all():
                     return self._rested(part), current
@@ -116,14 +114,9 @@ class _Player:
 
     def _keeps_touch(self, held: Held) -> bool:
         """Whether the holding digits are near the object after 1/4, 1/2 and 3/4 of the path."""
-        scene = self.scene
-        names = [scene.mj_model.geom(geom).name for geom in scene.hand_geoms]
-        for number in len(held.angles) * np.array([1, 2, 3]) // 4:
-            distances = scene.distances(scene.new_data(held.angles[number], held.poses[number]))
-            near = {name for name, gap in zip(names, distances, strict=True) if gap < _MAX_GAP}
-            if why_not_held(self.style, near):
-                return False
-        return True
+        middle = len(held.angles) * np.array([1, 2, 3]) // 4
+        near = (self.scene.touching(held.angles[n], held.poses[n], _MAX_GAP) for n in middle)
+        return not any(why_not_held(self.style, names) for names in near)
 
 
 def _scribble(frames: int, size: float, rate: float, *, rng: np.random.Generator) -> NDArray[np.float64]:
@@ -304,8 +297,7 @@ def _axes(outward: Float[np.ndarray, "*T 3"], lean: Float[np.ndarray, "*T 3"]) -
     """Directions of the pen at targets: off the skin, near upright, and smooth in both arguments."""
     axis = outward + lean
     facing = np.einsum("...i,...i->...", axis, outward)[..., None]
-    axis = axis + np.clip(0.5 - facing, 0.0, None) * outward
-    axis /= np.linalg.norm(axis, axis=-1, keepdims=True)
+    axis = unit(axis + np.clip(0.5 - facing, 0.0, None) * outward)
     upright = np.broadcast_to(_UPRIGHT, axis.shape)
     angle = np.arccos(np.clip(axis @ _UPRIGHT, -1.0, 1.0))[..., None]
     return _between(upright, axis, _CONE * np.tanh(angle / _CONE) / np.maximum(angle, 1e-9))

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
-from handsim._checks import check_array, check_callable, check_choice, check_rng, check_type
+from handsim._checks import check_array, check_callable, check_choice, check_count, check_rng
 from handsim._plugins import call_plugin, list_plugins, load_plugin, plugin_name
 from handsim.errors import ArgumentError, PoseError
 from handsim.files.inputs import package_data
@@ -83,15 +83,10 @@ _DIP_ABOVE: Final = np.deg2rad(28.0)  # largest deviation of the DIP above its s
 _MCP_APART: Final = np.deg2rad([85.0, 70.0, 75.0])
 
 
-def finger_view(angles: Float[np.ndarray, "T 20"]) -> Float[np.ndarray, "T 5 4"]:
-    """View (T, 5, 4) of the angles, with one row per digit."""
-    return angles.reshape(*angles.shape[:-1], 5, 4)
-
-
 def apply_couplings(angles: Float[np.ndarray, "T 20"]) -> Float[np.ndarray, "T 20"]:
     """Clamp angles [rad] to ranges and couplings."""
     coupled = np.clip(angles, LOW, HIGH)
-    fingers = finger_view(coupled)[:, 1:]
+    fingers = coupled.reshape(-1, 5, 4)[:, 1:]  # a view
     flexion = fingers[..., 1]
     for near, far, apart in ((1, 0, 0), (1, 2, 1), (2, 3, 2)):
         limit = _MCP_APART[apart]
@@ -161,7 +156,7 @@ def _curl_fingers(count: int, rng: np.random.Generator) -> NDArray[np.float64]:
     from scipy.special import ndtr
 
     angles = _thumbs(count, rng)
-    digits = finger_view(angles)
+    digits = angles.reshape(count, 5, 4)  # a view
     within = rng.uniform(0.3, 1.0, size=(count, 1))  # correlation of the joints of one finger
     splits = rng.random((count, 3)) < _SPLIT
     knuckles = _grouped(splits, rng.standard_normal((count, 4)))
@@ -255,15 +250,11 @@ def resting_angles(model: HandModel) -> Float[np.ndarray, "20"]:
     return resting
 
 
-def make_valid(
-    model: HandModel | HandShape | str, angles: Float[np.ndarray, "T 20"]
-) -> Float[np.ndarray, "T 20"]:
+def make_valid(model: HandModel, angles: Float[np.ndarray, "T 20"]) -> Float[np.ndarray, "T 20"]:
     """Poses [rad] moved towards rest until they are valid; valid ones stay unchanged.
 
-    The thumb moves first, then thumb and abductions; the whole hand opens only if that is not enough. A shape
-    or the name of a size is a right hand.
+    The thumb moves first, then thumb and abductions; the whole hand opens only if that is not enough.
     """
-    model = load_model(model)
     resting = resting_angles(model)
     result = np.array(angles, dtype=np.float64)
     todo = np.flatnonzero(~is_valid(model, result))
@@ -354,10 +345,8 @@ def sample_poses(
         PoseError: This hand has no valid pose at rest: its fingers are too thick for its breadth.
     """
     hand = load_model(model)
-    check_type("num_poses", num_poses, (int, np.integer), "a number of poses")
+    check_count("num_poses", num_poses, 1)
     check_rng(rng)
-    if num_poses < 1:
-        raise ArgumentError(f"num_poses is {num_poses}, expected a positive number")
     drawn = load_sampler(sampler, is_tried=False)(hand, num_poses, rng=rng)
     qpos = join_qpos(make_valid(hand, drawn[:, -NUM_JOINTS:]))
     if drawn.shape[1] == NUM_QPOS:
@@ -382,17 +371,12 @@ def _drawn(
     name = plugin_name(sampler)
     function = load_plugin(sampler, group=SAMPLERS, noun=_NOUN) if isinstance(sampler, str) else sampler
     owner = f"what {_NOUN} '{name}' returns"
-    drawn = call_plugin(function, name, _NOUN, model, num_poses, rng=rng)
-    try:
-        values = np.asarray(drawn, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise ArgumentError(f"{owner} is {type(drawn).__name__}, expected joint angles [rad]") from error
+    values = check_array(owner, call_plugin(function, name, _NOUN, model, num_poses, rng=rng), (None,))
     if values.shape not in ((num_poses, NUM_JOINTS), (num_poses, NUM_QPOS)):
         raise ArgumentError(
             f"{owner} has shape {values.shape}, expected ({num_poses}, {NUM_JOINTS}) joint angles or "
             f"({num_poses}, {NUM_QPOS}) whole poses"
         )
-    check_array(owner, values, values.shape)
     widest = np.abs(values[:, -NUM_JOINTS:]).max()
     if widest > _MAX_ANGLE:
         raise ArgumentError(f"{owner} holds an angle of {widest:.4g} rad; are these degrees?")

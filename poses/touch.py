@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from handsim._checks import check_array, check_choice
 from handsim.errors import PoseError
 from handsim.hand.capsules import Capsules
-from handsim.hand.model import HandModel, join_qpos, load_model
-from handsim.hand.shape import DIGITS, NUM_JOINTS, HandShape, bones_of
+from handsim.hand.model import HandModel, join_qpos
+from handsim.hand.shape import DIGITS, NUM_JOINTS, bones_of
 from handsim.kernels import kernel, segment_distance_squared
 from poses.shapes import HIGH, LOW, MAX_PENETRATION, gesture, is_valid, make_valid
 
@@ -55,11 +55,8 @@ class ThumbContact:
     """Cosine between pad direction and direction to the other bone, for thumb and finger; 1: pad to pad."""
 
 
-def thumb_contact(
-    model: HandModel | HandShape | str, angles: Float[np.ndarray, "T 20"], finger: str
-) -> ThumbContact:
+def thumb_contact(model: HandModel, angles: Float[np.ndarray, "T 20"], finger: str) -> ThumbContact:
     """The nearest points of thumb and finger ("index", "middle", "ring" or "little"), touching or not."""
-    model = load_model(model)
     check_choice(finger, FINGERS, noun="finger")
     return _contact(model.capsules, model.forward_kinematics(join_qpos(angles)), finger)
 
@@ -82,7 +79,7 @@ def _contact(capsules: Capsules, frames: NDArray[np.float64], finger: str) -> Th
 
 
 def touching_angles(
-    model: HandModel | HandShape | str, finger: str, start: Float[np.ndarray, "*starts 20"] | None = None
+    model: HandModel, finger: str, start: Float[np.ndarray, "*starts 20"] | None = None
 ) -> Float[np.ndarray, "20"]:
     """Joint angles [rad] at which the pads of thumb and finger touch; only these two digits move.
 
@@ -90,7 +87,6 @@ def touching_angles(
     deeper than `MAX_PENETRATION`. The search begins at each pose of `start` [rad] in turn, by default at the
     library's pinches of this finger.
     """
-    model = load_model(model)
     check_choice(finger, FINGERS, noun="finger")
     if start is None:
         pinches = [gesture(f"{kind}_{finger}") for kind in ("pinch_pad", "pinch_tip")]

@@ -16,7 +16,7 @@ from handsim.files.inputs import package_data
 from handsim.hand.model import HandModel, HandMotion, join_qpos
 from handsim.hand.shape import DIGITS, bones_of
 from handsim.space.rig import ROOM_CENTER
-from handsim.space.transforms import MIRROR, euler_matrix, random_quaternions, rotation_quaternions
+from handsim.space.transforms import MIRROR, euler_matrix, random_quaternions, rotation_quaternions, unit
 from poses.contact import (
     APPROACH,
     MAX_ACCELERATION,
@@ -169,7 +169,7 @@ def meet(sketches: Sequence[Sketch], still: HandModel, moving: HandModel) -> Mee
                 for sketch, part in zip(sketches, opened, strict=True)
             ]
         ),
-        axis=np.repeat(axis / np.linalg.norm(axis, axis=1, keepdims=True), counts, axis=0),
+        axis=np.repeat(unit(axis), counts, axis=0),
     )
 
 
@@ -186,10 +186,6 @@ class _Noise:
         size = (self.count, len(scale))
         lasting = self.rng.standard_normal((1, size[1]) if self.together else size)
         new = self.rng.standard_normal(size)
-        if wander == 0.0:
-            return scale * (common * lasting.clip(-2.0, 2.0)) + np.zeros(size)
-        if common == 0.0:
-            return scale * (wander * new.clip(-2.0, 2.0))
         return scale * (common * lasting.clip(-2.0, 2.0) + wander * new.clip(-2.0, 2.0))
 
 

@@ -101,22 +101,26 @@ def select_hands(capture: Capture, names: Sequence[str]) -> list[Float[np.ndarra
     """The named markers of every hand of a labeled capture, in their order.
 
     A capture of two hands, as `handsim track` and `handsim label` write it, has a set of columns for each,
-    "right:ThumbTip" and so on. Frames without any marker of a set are left out: the hand was not there.
+    "right:ThumbTip" and so on. Frames without any marker of a hand are left out: it was not there.
     """
     parts = [column.rpartition(":") for column in capture.names]
     columns = [(prefix.strip(), name.strip()) for prefix, _, name in parts]
     sets = list(dict.fromkeys(prefix for prefix, name in columns if name in names))
     held = [name for _, name in columns if name in names]
     if len(sets) < 2 or len(held) == len(set(held)):
-        return [select_markers(capture, names)]
+        return [_while_there(select_markers(capture, names))]
     hands = []
     for prefix in sets:
         mine = [number for number, (other, _) in enumerate(columns) if other == prefix]
         part = Capture(tuple(columns[number][1] for number in mine), capture.positions[:, mine], capture.rate)
         with errors_of(f"columns '{prefix}:...'", CaptureError):
-            markers = select_markers(part, names)
-        hands.append(markers[np.isfinite(markers[..., 0]).any(axis=1)])
+            hands.append(_while_there(select_markers(part, names)))
     return hands
+
+
+def _while_there(markers: Float[np.ndarray, "T M 3"]) -> Float[np.ndarray, "K M 3"]:
+    """The frames in which a marker was seen."""
+    return np.asarray(markers[np.isfinite(markers[..., 0]).any(axis=1)])
 
 
 def unlabeled_frames(capture: Capture) -> list[Float[np.ndarray, "N 3"]]:

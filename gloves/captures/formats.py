@@ -647,11 +647,7 @@ def find_captures(paths: Sequence[Path]) -> list[Path]:
 
 
 def read_hands(file: Path, names: Sequence[str]) -> tuple[list[Float[np.ndarray, "T M 3"]], float]:
-    """The named markers of each hand in a labeled capture [m], and its rate [Hz].
-
-    Frames in which all markers of a hand are missing are left out.
-    """
+    """The `select_hands` of a labeled capture [m], and its rate [Hz]."""
     capture = read_capture(file)
     with errors_of(file, CaptureError):
-        hands = select_hands(capture, names)
-    return [hand[np.isfinite(hand).any(axis=(1, 2))] for hand in hands], capture.rate
+        return select_hands(capture, names), capture.rate

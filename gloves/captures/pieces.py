@@ -27,27 +27,39 @@ def _pieces_of(names: Sequence[str], present: Float[np.ndarray, "N"]) -> Bool[np
     return many & (present < _LITTLE)
 
 
-def _packed(frames: Int[np.ndarray, "P"], columns: Int[np.ndarray, "P"]) -> tuple[NDArray[np.int64], int]:
-    """Assign points (P,) to as few columns as possible; returns these columns and their number.
+def shared_columns(
+    first: Int[np.ndarray, "R"], last: Int[np.ndarray, "R"]
+) -> tuple[Int[np.ndarray, "R"], int]:
+    """Assign runs, by their first and last frames, to as few columns as possible; also how many these are.
 
-    A piece is an unbroken run of points of a column. A blank frame separates the pieces in a new column.
+    Runs are in the order of their first frames. A blank frame separates the runs in a column.
     """
+    free: list[int] = []
+    busy: list[tuple[int, int]] = []  # the frame from which a column is free again, and that column
+    columns = np.empty(len(first), dtype=np.int64)
+    count = 0
+    for run, (begin, end) in enumerate(zip(first.tolist(), last.tolist(), strict=True)):
+        while busy and busy[0][0] <= begin:
+            heapq.heappush(free, heapq.heappop(busy)[1])
+        if free:
+            columns[run] = heapq.heappop(free)
+        else:
+            columns[run], count = count, count + 1
+        heapq.heappush(busy, (end + 2, int(columns[run])))
+    return columns, count
+
+
+def _packed(frames: Int[np.ndarray, "P"], columns: Int[np.ndarray, "P"]) -> tuple[NDArray[np.int64], int]:
+    """The shared columns of points (P,), and their number; a piece is a run of points of a column."""
     order = np.lexsort((frames, columns))
     frames, columns = frames[order], columns[order]
     begins = np.flatnonzero(np.diff(frames, prepend=-2) * (np.diff(columns, prepend=-1) == 0) != 1)
     ends = np.append(begins[1:], len(frames))
-    free: list[tuple[int, int]] = []  # the frame from which a new column is free, and that column
-    number, place = 0, np.empty(len(frames), dtype=np.int64)
-    for piece in np.argsort(frames[begins], kind="stable").tolist():
-        begin, end = begins[piece], ends[piece]
-        if free and free[0][0] <= frames[begin]:
-            chosen = heapq.heappop(free)[1]
-        else:
-            chosen, number = number, number + 1
-        place[begin:end] = chosen
-        heapq.heappush(free, (int(frames[end - 1]) + 2, chosen))
-    packed = np.empty_like(place)
-    packed[order] = place
+    in_time = np.argsort(frames[begins], kind="stable")
+    places = np.empty(len(begins), dtype=np.int64)
+    places[in_time], number = shared_columns(frames[begins[in_time]], frames[ends[in_time] - 1])
+    packed = np.empty(len(frames), dtype=np.int64)
+    packed[order] = np.repeat(places, ends - begins)
     return packed, number
 
 

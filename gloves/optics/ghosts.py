@@ -12,6 +12,7 @@ from handsim.kernels import kernel, segment_distance_squared
 from handsim.settings import Limits, Settings
 from handsim.space.camera import in_picture
 from handsim.space.rig import CameraRig
+from handsim.space.transforms import unit
 
 
 def reflect(
@@ -184,8 +185,7 @@ def sample_ghosts(
     strays[np.arange(MAX_GHOSTS) >= count[:, None]] = np.nan
     shiny = np.flatnonzero(rng.random(frames) < config.mirror_rate)
     low, high = low[shiny], high[shiny]
-    normal = rng.standard_normal((len(shiny), 3))
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    normal = unit(rng.standard_normal((len(shiny), 3)))
     half = np.linalg.norm(high - low, axis=1) / (2 * np.sqrt(3.0))
     distance = half + rng.uniform(*config.mirror_distance, size=len(shiny))
     plane = (low + high) / 2 - distance[:, None] * normal

@@ -8,13 +8,13 @@ chance.
 from __future__ import annotations
 
 import dataclasses
-import heapq
 from dataclasses import dataclass
 from typing import Annotated, Any, Final, NamedTuple, Self
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from gloves.captures.pieces import shared_columns
 from handsim.errors import ArgumentError
 from handsim.kernels import kernel, squared_distance
 from handsim.settings import Limits, Settings
@@ -485,22 +485,10 @@ def pack_columns(
     together get columns in random order, which does not reveal sources.
     """
     ids = number_runs(present)
-    first, source = np.nonzero(present & np.vstack([np.ones_like(present[:1]), ~present[:-1]]))
+    lengths = np.bincount(ids[present])
+    begins = present & (np.diff(ids, axis=0, prepend=-1) != 0)
+    first = np.nonzero(begins)[0]  # in the order of the IDs
     order = np.lexsort((rng.random(len(first)), first))
-    lengths = np.bincount(ids[present], minlength=len(first)) if len(first) else np.zeros(0, dtype=np.int64)
-    free: list[int] = []
-    busy: list[tuple[int, int]] = []  # (frame in which the column may be used again, column)
-    columns = np.full(present.shape, -1)
-    count = 0
-    for run in order:
-        begin, where = int(first[run]), int(source[run])
-        while busy and busy[0][0] <= begin:
-            heapq.heappush(free, heapq.heappop(busy)[1])
-        if free:
-            column = heapq.heappop(free)
-        else:
-            column, count = count, count + 1
-        end = begin + int(lengths[ids[begin, where]])
-        columns[begin:end, where] = column
-        heapq.heappush(busy, (end + 1, column))
-    return columns, count
+    columns = np.empty(len(first), dtype=np.int64)
+    columns[order], count = shared_columns(first[order], (first + lengths - 1)[order])
+    return np.append(columns, -1)[ids], count

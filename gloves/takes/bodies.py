@@ -84,7 +84,5 @@ def stored_body(
     vertices, faces = (arrays[key.format(number)] for key in (_VERTICES, _FACES))
     hull = Part("mesh", np.zeros(3), np.eye(4), vertices)
     upright = np.tile([0.0, 0.0, 1.0], (len(positions), 1))  # a file has no normals under markers
-    thing = RigidObject(
-        name, vertices, faces, (hull,), marker_names, positions, upright, 0.1, np.empty((0, 7))
-    )
+    thing = RigidObject(name, vertices, faces, (hull,), marker_names, positions, upright)
     return RigidBody(name, marker_names, positions, thing)

@@ -39,7 +39,7 @@ from gloves.takes.points import (
     fitted,
     spans,
 )
-from handsim._checks import check_choice, check_type
+from handsim._checks import check_choice, check_number, check_type
 from handsim.errors import ArgumentError, HandSimWarning, choices
 from handsim.files.outputs import check_ending
 from handsim.hand.angles import ISB_NAMES, Convention, isb_angles
@@ -246,8 +246,7 @@ class Take:
         qpos, points = np.asarray(qpos), np.asarray(points)
         nowhere = np.full((len(points), len(bodies), 7), np.nan)
         poses = nowhere if body_poses is None else np.asarray(body_poses)
-        if not 0.0 < rate < np.inf:
-            raise ArgumentError(f"the rate is {rate:g} Hz, expected a positive number")
+        check_number("the rate [Hz]", float(rate), 0.0, above=True)
         return cls(
             rate=rate,
             times=np.arange(len(qpos)) / rate,

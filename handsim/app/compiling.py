@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import functools
 import gc
-import importlib
 import json
 import time
 import warnings
@@ -18,6 +17,7 @@ from collections.abc import Mapping
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, wait
 from contextlib import ExitStack
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from handsim.app.messages import tell_state
@@ -92,13 +92,13 @@ def _type_of(row: str | list[Any], known: list[Any]) -> Any:
     from numba import types
 
     if isinstance(row, list):
-        kind = _found(row[0]) if row[0] else None
+        kind = resolve_name(row[0]) if row[0] else None
         return types.BaseTuple.from_types([known[part] for part in row[1:]], kind)
     name, *array = row.split()
     if name.startswith("="):
         return types.literal(json.loads(name[1:]))
     if ":" in name:
-        return types.Dispatcher(_found(name))
+        return types.Dispatcher(resolve_name(name))
     scalar = getattr(types, name)
     return types.Array(scalar, int(array[0]), array[1], readonly="const" in array) if array else scalar
 
@@ -131,11 +131,6 @@ def type_row(kind: Any, table: list[Any]) -> int:
     return table.index(row)
 
 
-def _found(place: str) -> Any:
-    module, _, name = place.partition(":")
-    return getattr(importlib.import_module(module), name)
-
-
 def missing_kernels(listed: Mapping[int, ListedKernel]) -> dict[int, ListedKernel]:
     """The kernels that the cache lacks, by their rows in the list."""
     from numba.core.registry import cpu_target
@@ -145,7 +140,7 @@ def missing_kernels(listed: Mapping[int, ListedKernel]) -> dict[int, ListedKerne
     for row, one in listed.items():
         arguments = tuple(known[number] for number in one.types)
         try:
-            cache = _found(one.name)._cache
+            cache = resolve_name(one.name)._cache
             there = cache._index_key(arguments, codegen) in cache._cache_file._load_index()
         except (AttributeError, ImportError, OSError):  # the kernel is gone, or needs what is not installed
             continue
@@ -175,7 +170,7 @@ class _Queue:
 
     def __init__(self, listed: Mapping[int, ListedKernel]) -> None:
         self.waiting, self.running = dict(listed), dict[int, ListedKernel]()
-        self._needs = {one.name: needed_kernels(_found(one.name)) for one in listed.values()}
+        self._needs = {one.name: needed_kernels(resolve_name(one.name)) for one in listed.values()}
         # Kernels that others wait for come first: those with the most to compile along one line of calls.
         self._rank: dict[str, float] = {}
         for one in sorted(listed.values(), key=lambda one: -len(self._needs[one.name])):
@@ -278,4 +273,4 @@ def _compile_row(row: int) -> None:
     listed, known = _prepared()
     one = listed[row]
     with contextlib.suppress(Exception):  # a kernel that cannot be compiled raises where it is called
-        _found(one.name).compile(tuple(known[number] for number in one.types))
+        resolve_name(one.name).compile(tuple(known[number] for number in one.types))

@@ -14,6 +14,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from datetime import timedelta
 from typing import TYPE_CHECKING, Final, Literal, TextIO
 
 from handsim.callbacks import Closing
@@ -319,7 +320,7 @@ def _line(task: Task, unit: str, seconds: float) -> str:
 
 
 def _clock(seconds: float) -> str:
-    return f"{seconds // 3600:.0f}:{seconds % 3600 // 60:02.0f}:{seconds % 60:02.0f}"
+    return str(timedelta(seconds=round(seconds)))
 
 
 def _speed(task: Task, unit: str) -> str:

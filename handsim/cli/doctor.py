@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes.util
-import os
 import re
 import shutil
 import subprocess
@@ -19,7 +18,7 @@ from urllib.parse import parse_qsl, urlsplit
 from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 
-from handsim._imports import SIBLINGS, VARIABLE, kernel_cache, shadowed_siblings
+from handsim._imports import SIBLINGS, VARIABLE, is_writable, kernel_cache, shadowed_siblings
 from handsim._plugins import EGL_PACKAGES
 from handsim.app.workers import usable_cores
 
@@ -225,7 +224,7 @@ def check_gpu(code: int, output: str) -> Finding:
 def check_kernel_cache() -> Finding:
     """The folder of compiled kernels, which are compiled anew at each start if it does not last."""
     folder, lasts = kernel_cache()
-    writable = _can_be_written(folder)
+    writable = is_writable(folder)
     remedy = "" if lasts and writable else f"set {VARIABLE} to a folder of yours that lasts"
     found = str(folder) if writable else f"{folder}, which cannot be written"
     return Finding("compiled kernels", found, "a folder that lasts", remedy, needed=False)
@@ -238,18 +237,12 @@ def check_learned_gloves() -> Finding:
     except ImportError:  # another finding names the missing dependency
         return Finding("learned gloves", "unknown")
     folder = learned_folder()
-    writable = _can_be_written(folder)
+    writable = is_writable(folder)
     remedy = (
         "" if writable else "set XDG_CACHE_HOME to a folder of yours, or a glove is learned in every call"
     )
     found = f"{len(learned_gloves())} in {folder}" if writable else f"{folder}, which cannot be written"
     return Finding("learned gloves", found, "a folder of yours", remedy, needed=False)
-
-
-def _can_be_written(folder: Path) -> bool:
-    """Whether a folder, or the nearest one above it that is there, can be written into."""
-    there = next(one for one in (folder, *folder.parents) if one.exists())
-    return there.is_dir() and os.access(there, os.W_OK)
 
 
 def check_room() -> Iterator[Finding]:

@@ -7,7 +7,6 @@ Exit codes: 0; 1 for a mistake of the user, explained in one line; 2 for usage; 
 from __future__ import annotations
 
 import errno
-import importlib
 import io
 import os
 import signal
@@ -16,6 +15,7 @@ import tempfile
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from pkgutil import resolve_name
 from typing import Any, Final
 
 from handsim import __version__
@@ -132,8 +132,7 @@ def load(target: str | Table) -> Any:
     """Import the object that "module:name" stands for, or those of a table as a dict."""
     if not isinstance(target, str):
         return {name: load(inner) for name, (inner, _) in target.items()}
-    module, _, attribute = target.partition(":")
-    return getattr(importlib.import_module(module), attribute)
+    return resolve_name(target)
 
 
 def _chosen(commands: Table, args: Sequence[str]) -> tuple[tuple[Any, str], str, Sequence[str]]:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import tyro
 
+from handsim._checks import check_number
 from handsim.errors import ArgumentError
 from handsim.hand.shape import Side
 from track.config import Size
@@ -72,8 +72,8 @@ def check_live(live: str | None, seconds: float | None) -> None:
 
     if seconds is not None and live is None:
         raise ArgumentError(f"--seconds is {seconds:g} without --live, expected both or neither")
-    if seconds is not None and not 0.0 < seconds < math.inf:
-        raise ArgumentError(f"--seconds is {seconds:g}, expected a positive number")
+    if seconds is not None:
+        check_number("--seconds", seconds, 0.0, above=True)
     if live is not None:
         check_address(live)  # before kernels are compiled, which takes long
 

@@ -155,7 +155,7 @@ def _settings(info: StructTypeInfo) -> StructConstructorSpec | None:
         told |= _field_docstrings(kind)
     fields = []
     for one in dataclasses.fields(info.type):
-        if not one.init or "follows" in one.metadata:
+        if "follows" in one.metadata:
             continue
         default: Any = tyro.MISSING
         if dataclasses.is_dataclass(info.default):

@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from train.forecast.rig_forecast import Forecast
 
 _STARTER: Final = Path(__file__).parents[1] / "data" / "starter_rig.toml"
-_Sides = tuple[float, float, float]
 
 
 def list_rig() -> None:
@@ -149,7 +148,7 @@ def score_rig(
 def plan_rig(
     out: Path,
     cameras: int,
-    room: _Sides,
+    room: tuple[float, float, float],
     settings: Annotated[PlanRigSettings, tyro.conf.arg(name="")],
 ) -> None:
     """Look for the best places of a number of cameras, for hands at work in a volume.

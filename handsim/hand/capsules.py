@@ -117,12 +117,8 @@ def build_capsules(shape: HandShape) -> Capsules:
         wrist = np.array([[-0.15 * shape.length, across, 0.0], [0.05 * shape.length, across, 0.0]])
         rows.append((PALM, wrist[0], wrist[1], FIRMNESS * 0.2 * shape.breadth))
     mirror = MIRROR if shape.side == "left" else np.eye(3)
-    return Capsules(
-        bones=np.array([row[0] for row in rows]),
-        starts=np.array([row[1] for row in rows]) @ mirror,
-        ends=np.array([row[2] for row in rows]) @ mirror,
-        radii=np.array([row[3] for row in rows]),
-    )
+    bones, starts, ends, radii = (np.array(column) for column in zip(*rows, strict=True))
+    return Capsules(bones, starts @ mirror, ends @ mirror, radii)
 
 
 def penetration_depth(

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
-from handsim._checks import check_array, check_type
+from handsim._checks import check_array, check_number, check_type
 from handsim.errors import ArgumentError
 from handsim.hand.capsules import Capsules, build_capsules, penetration_depth
 from handsim.hand.shape import (
@@ -36,7 +36,7 @@ from handsim.hand.shape import (
 )
 from handsim.hand.skin import HandSurface, build_surface, skin_frames
 from handsim.kernels import pose_bones
-from handsim.space.transforms import MIRROR, euler_matrix, rigid
+from handsim.space.transforms import MIRROR, are_rigid, euler_matrix, rigid
 
 if TYPE_CHECKING:
     import mujoco
@@ -405,8 +405,7 @@ class HandMotion:
             raise ArgumentError(
                 f"a motion needs frames: qpos has shape {self.qpos.shape}, expected (T, {NUM_QPOS})"
             )
-        if not 0.0 < self.rate < np.inf:
-            raise ArgumentError(f"the rate is {self.rate:g} Hz, expected a positive number")
+        check_number("the rate [Hz]", self.rate, 0.0, above=True)
 
     @property
     def duration(self) -> float:
@@ -433,13 +432,9 @@ class BodyMotion:
             raise ArgumentError(
                 f"a motion needs frames: T_world_body has shape {self.T_world_body.shape}, expected (T, 4, 4)"
             )
-        rotations = self.T_world_body[:, :3, :3]
-        square = np.abs(rotations @ np.swapaxes(rotations, 1, 2) - np.eye(3)).max()
-        last_row = np.abs(self.T_world_body[:, 3] - np.eye(4)[3]).max()
-        if max(square, last_row) > 1e-5 or not (np.linalg.det(rotations) > 0.0).all():
+        if not are_rigid(self.T_world_body):
             raise ArgumentError("T_world_body is not rigid transforms, expected rotations and positions")
-        if not 0.0 < self.rate < np.inf:
-            raise ArgumentError(f"the rate is {self.rate:g} Hz, expected a positive number")
+        check_number("the rate [Hz]", self.rate, 0.0, above=True)
 
     @property
     def duration(self) -> float:
@@ -449,18 +444,9 @@ class BodyMotion:
 
 def bridge_gaps(times: Float[np.ndarray, "T"], qpos: Float[np.ndarray, "T 27"], rate: float) -> HandMotion:
     """A motion with linear interpolation over missing poses (NaN); at least one is present."""
-    from scipy.spatial.transform import Rotation, Slerp
-
     there = np.flatnonzero(np.isfinite(qpos[:, 0]))
-    known = times[there]
-    asked = np.clip(times, known[0], known[-1])
-    bridged = np.empty_like(qpos)
-    for column in (*range(3), *range(7, NUM_QPOS)):
-        bridged[:, column] = np.interp(asked, known, qpos[there, column])
-    rotations = Rotation.from_quat(qpos[there, 3:7], scalar_first=True)
-    bridged[:, 3:7] = (Slerp(known, rotations)(asked) if len(known) > 1 else rotations).as_quat(
-        scalar_first=True
-    )
+    before, share, _ = _neighbors(times[there], times)
+    bridged = _between(qpos[there], before, share)
     bridged[there] = qpos[there]
     return HandMotion(bridged, rate)
 
@@ -473,8 +459,7 @@ def is_steady(times: Float[np.ndarray, "T"], rate: float) -> bool:
 
 def times_at(times: Float[np.ndarray, "T"], rate: float) -> Float[np.ndarray, "K"]:
     """The times [s] of frames at another rate, from the first to the last."""
-    if not 0.0 < rate < np.inf:
-        raise ArgumentError(f"the rate is {rate:g} Hz, expected a positive number")
+    check_number("the rate [Hz]", rate, 0.0, above=True)
     last = (times[-1] - times[0]) * rate + _STEADY
     if last >= _MAX_FRAMES:
         raise ArgumentError(f"{last:.3g} frames at {rate:g} Hz, expected at most {_MAX_FRAMES}")
@@ -488,20 +473,26 @@ def between_poses(
 
     They are NaN beside a missing old pose, and between old frames more than 0.1 s and 2.5 frames apart.
     """
-    old, new = times - times[0], new - times[0]
-    # The old frame before each new time, and the weight of the next one, NaN in a gap.
-    before, share = np.zeros(len(new), dtype=np.intp), np.zeros(len(new))
-    if len(old) > 1:
-        before = np.clip(np.searchsorted(old, new, side="right") - 1, 0, len(old) - 2)
-        step = old[before + 1] - old[before]
-        share = np.clip((new - old[before]) / step, 0.0, 1.0)
-        exact = (share < 1e-6) | (share > 1.0 - 1e-6)
-        is_gap = step > max(_MAX_GAP, _MAX_GAP_FRAMES / rate)
-        share = np.where(exact, np.round(share), np.where(is_gap, np.nan, share))
+    before, share, step = _neighbors(times, new)
+    exact = (share < 1e-6) | (share > 1.0 - 1e-6)
+    is_gap = step > max(_MAX_GAP, _MAX_GAP_FRAMES / rate)
+    share = np.where(exact, np.round(share), np.where(is_gap, np.nan, share))
     between = np.empty((len(new), *poses.shape[1:]))
     for number in range(poses.shape[1]):
         between[:, number] = _between(poses[:, number], before, share)
     return between
+
+
+def _neighbors(
+    times: Float[np.ndarray, "T"], new: Float[np.ndarray, "K"]
+) -> tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.float64]]:
+    """The old frame before each new time, the weight of the next one, and the time between them [s]."""
+    if len(times) == 1:
+        return np.zeros(len(new), dtype=np.intp), np.zeros(len(new)), np.zeros(len(new))
+    old, new = times - times[0], new - times[0]
+    before = np.clip(np.searchsorted(old, new, side="right") - 1, 0, len(old) - 2)
+    step = old[before + 1] - old[before]
+    return before, np.clip((new - old[before]) / step, 0.0, 1.0), step
 
 
 def _between(

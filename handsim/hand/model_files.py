@@ -23,6 +23,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
+from handsim.hand.capsules import Capsules
 from handsim.hand.model import KEYPOINT_BONES, KEYPOINT_NAMES, HandModel, Site, hand_keypoints, join_qpos
 from handsim.hand.shape import BONE_NAMES, BONES, JOINT_NAMES, JOINTS, NUM_JOINTS, PALM, Side
 from handsim.space.transforms import (
@@ -61,28 +62,31 @@ def hand_urdf(model: HandModel) -> str:
 def _add_link(root: ET.Element, model: HandModel, bone: int, name: str, share: float) -> None:
     """A link with a share of its bone's mass; the shapes belong to the bone's own link."""
     link = ET.SubElement(root, "link", name=name)
-    compiled, body = model.mj_model, bone + 1  # the world is body 0
+    mass, center, moments = _inertia(model, bone)
     inertial = ET.SubElement(link, "inertial")
-    ET.SubElement(inertial, "origin", xyz=vector_text(compiled.body_ipos[body]), rpy="0 0 0")
-    ET.SubElement(inertial, "mass", value=number_text(share * compiled.body_mass[body]))
-    axes = quaternion_matrix(compiled.body_iquat[body])
-    moments = share * axes @ np.diag(compiled.body_inertia[body]) @ axes.T
+    ET.SubElement(inertial, "origin", xyz=vector_text(center), rpy="0 0 0")
+    ET.SubElement(inertial, "mass", value=number_text(share * mass))
     entries = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}
-    ET.SubElement(inertial, "inertia", {key: number_text(moments[at]) for key, at in entries.items()})
+    ET.SubElement(inertial, "inertia", {key: number_text(share * moments[at]) for key, at in entries.items()})
     if name != BONE_NAMES[bone]:
         return
-    capsules = model.capsules
-    for index in np.flatnonzero(capsules.bones == bone).tolist():
-        start, end, radius = capsules.starts[index], capsules.ends[index], float(capsules.radii[index])
+    for index in np.flatnonzero(model.capsules.bones == bone).tolist():
         for kind in ("visual", "collision"):
-            _add_capsule(link, kind, start, end, radius)
+            _add_capsule(link, kind, model.capsules, index)
 
 
-def _add_capsule(
-    link: ET.Element, kind: str, start: Float[np.ndarray, "3"], end: Float[np.ndarray, "3"], radius: float
-) -> None:
+def _inertia(model: HandModel, bone: int) -> tuple[float, Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
+    """Mass [kg], center of mass [m] and inertia [kg m^2] of a bone, in its frame."""
+    compiled, body = model.mj_model, bone + 1  # the world is body 0
+    axes = quaternion_matrix(compiled.body_iquat[body])
+    moments = axes @ np.diag(compiled.body_inertia[body]) @ axes.T
+    return compiled.body_mass[body], compiled.body_ipos[body], moments
+
+
+def _add_capsule(link: ET.Element, kind: str, capsules: Capsules, index: int) -> None:
     """A cylinder and two spheres, since URDF has no capsule."""
-    length = float(np.linalg.norm(end - start))
+    start, end, radius = capsules.starts[index], capsules.ends[index], capsules.radii[index]
+    length = np.linalg.norm(end - start)
     along = (end - start) / length
     pitch, yaw = np.arccos(along[2]), np.arctan2(along[1], along[0])
     shapes = (
@@ -92,9 +96,7 @@ def _add_capsule(
     )
     for shape, sizes, center in shapes:
         part = ET.SubElement(link, kind)
-        turn = (
-            f"0 {number_text(pitch)} {number_text(yaw)}" if shape == "cylinder" else "0 0 0"
-        )  # z along the axis
+        turn = f"0 {number_text(pitch)} {number_text(yaw)}" if shape == "cylinder" else "0 0 0"  # along z
         ET.SubElement(part, "origin", xyz=vector_text(center), rpy=turn)
         ET.SubElement(ET.SubElement(part, "geometry"), shape, sizes)
         if kind == "visual":
@@ -125,7 +127,7 @@ def vector_text(vector: Float[np.ndarray, "K"]) -> str:
     return " ".join(number_text(value) for value in vector)
 
 
-def number_text(value: float) -> str:
+def number_text(value: float | np.floating) -> str:
     """A number with twelve digits; zero has no sign."""
     return f"{float(value) + 0.0:.12g}"
 
@@ -200,30 +202,25 @@ def hand_osim(
 
 def _add_body(bodies: ET.Element, model: HandModel, bone: int) -> None:
     """A bone with its mass and its capsules."""
-    compiled, number = model.mj_model, bone + 1  # the world is body 0
     name = f"{model.shape.side}_{BONE_NAMES[bone]}"
     body = ET.SubElement(bodies, "Body", name=name)
-    axes = quaternion_matrix(compiled.body_iquat[number])
-    moments = axes @ np.diag(compiled.body_inertia[number]) @ axes.T
+    mass, center, moments = _inertia(model, bone)
     shapes = ET.SubElement(body, "components")
-    capsules = model.capsules
-    for index in np.flatnonzero(capsules.bones == bone).tolist():
-        start, end, radius = capsules.starts[index], capsules.ends[index], float(capsules.radii[index])
-        _add_osim_capsule(shapes, f"{name}_{index}", start, end, radius)
-    _add(body, "mass", number_text(compiled.body_mass[number]))
-    _add(body, "mass_center", vector_text(compiled.body_ipos[number]))
+    for index in np.flatnonzero(model.capsules.bones == bone).tolist():
+        _add_osim_capsule(shapes, f"{name}_{index}", model.capsules, index)
+    _add(body, "mass", number_text(mass))
+    _add(body, "mass_center", vector_text(center))
     _add(body, "inertia", vector_text(moments[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]))
 
 
-def _add_osim_capsule(
-    shapes: ET.Element, name: str, start: Float[np.ndarray, "3"], end: Float[np.ndarray, "3"], radius: float
-) -> None:
+def _add_osim_capsule(shapes: ET.Element, name: str, capsules: Capsules, index: int) -> None:
     """A cylinder and two spheres, since OpenSim draws no capsule."""
     from scipy.spatial.transform import Rotation
 
-    along = (end - start) / np.linalg.norm(end - start)
-    turn, _ = Rotation.align_vectors(along[None], [[0.0, 1.0, 0.0]])  # cylinders lie along y
-    half_height = number_text(0.5 * float(np.linalg.norm(end - start)))
+    start, end, radius = capsules.starts[index], capsules.ends[index], capsules.radii[index]
+    length = np.linalg.norm(end - start)
+    turn, _ = Rotation.align_vectors((end - start)[None] / length, [[0.0, 1.0, 0.0]])  # cylinders lie along y
+    half_height = number_text(0.5 * length)
     places = (("middle", 0.5 * (start + end)), ("start", start), ("end", end))
     for place, center in places:
         frame = ET.SubElement(shapes, "PhysicalOffsetFrame", name=f"{name}_{place}")

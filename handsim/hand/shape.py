@@ -191,26 +191,16 @@ class HandShape:
     def __post_init__(self) -> None:
         check_type("side", self.side, str, "the name of one", SIDES)
         check_choice(self.side, SIDES, noun="side")
-        for name, shape in (
-            ("bone_lengths", (5, 3)),
-            ("knuckles", (5, 3)),
-            ("base_angles", (5, 3)),
-            ("radii", (5, 4)),
-        ):
-            object.__setattr__(self, name, check_array(name, getattr(self, name), shape))
-        for name in ("length", "breadth", "palm_thickness", "bone_lengths", "radii"):
-            smallest = np.min(getattr(self, name))
-            if not smallest > 0.0:
-                raise ArgumentError(f"a hand's lengths must be positive, got {smallest:g} m")
+        for name in ("bone_lengths", "knuckles", "base_angles", "radii"):
+            measures = check_array(name, getattr(self, name), HAND_DTYPE[name].shape)
+            object.__setattr__(self, name, measures)
+        _check_measure("length", self.length, 0.05, 0.35)
+        for name in ("breadth", "palm_thickness", "bone_lengths", "radii"):
             _check_measure(name, getattr(self, name), _SHORTEST, _LONGEST)
         _check_measure("knuckles", self.knuckles, -_LONGEST, _LONGEST)
         _check_measure("knuckles along the hand", self.knuckles[1:, 0], _SHORTEST, _LONGEST)
         if np.abs(self.base_angles).max() > 2.0 * np.pi:
             raise ArgumentError("base_angles of a hand are more than a turn, expected radians")
-        if not 0.05 <= self.length <= 0.35:
-            raise ArgumentError(
-                f"hand length {self.length:g} m is no human hand's; expected meters, 0.05 to 0.35"
-            )
 
     def with_side(self, side: Side) -> HandShape:
         """The same hand on the other (or the same) arm."""
@@ -220,7 +210,7 @@ class HandShape:
 def _check_measure(name: str, values: float | NDArray[np.float64], low: float, high: float) -> None:
     """Refuse measures [m] beyond those of any hand, from which no model can be built."""
     measures = np.asarray(values)
-    wrong = measures[(measures < low) | (measures > high)]
+    wrong = measures[~((measures >= low) & (measures <= high))]  # also NaN
     if len(wrong):
         raise ArgumentError(f"{name} of a hand: {wrong[0]:g} m, expected {low:g} to {high:g} m")
 
@@ -288,8 +278,6 @@ def sample_shape(
         ArgumentError: An argument is of another type, or there is no such side.
     """
     check_type("population", population, Population, "a Population")
-    check_type("side", side, str, "the name of one", SIDES)
-    check_choice(side, SIDES, noun="side")
     check_rng(rng)
     sex = "female" if rng.random() < 0.5 else "male"
     (length_mean, length_sd), (breadth_mean, breadth_sd), correlation = _LENGTH_BREADTH[sex]

@@ -252,18 +252,10 @@ class CageHands(NamedTuple):
     """`T_wrist_bone` of each digit's first bone at zero angles."""
 
     @classmethod
-    def of(cls, shapes: Sequence[HandShape]) -> Self:
-        """The measures of some hands, whatever their sides."""
-        knuckles = np.stack([shape.knuckles for shape in shapes])
-        frames = rigid(euler_matrix(np.stack([shape.base_angles for shape in shapes])), knuckles)
-        return cls(
-            np.array([shape.breadth for shape in shapes]),
-            np.array([shape.palm_thickness for shape in shapes]),
-            np.stack([shape.bone_lengths for shape in shapes]),
-            knuckles,
-            np.stack([shape.radii for shape in shapes]),
-            frames,
-        )
+    def of(cls, hands: NDArray[np.void]) -> Self:
+        """The measures of some hands, of type `HAND_DTYPE`, whatever their sides."""
+        measures = {name: hands[name].copy() for name in cls._fields[:-1]}  # copies are contiguous
+        return cls(**measures, frames=rigid(euler_matrix(hands["base_angles"]), hands["knuckles"]))
 
     def ring_girths(self) -> Float[np.ndarray, "B R"]:
         """Girth of the skin at each ring [m]: a little more at the joints, a little less between them."""
@@ -488,14 +480,18 @@ def build_surface(shape: HandShape) -> HandSurface:
 @functools.lru_cache(maxsize=4)
 def _right_vertices(measures: bytes) -> Float[np.ndarray, "V 3"]:
     """`rest_vertices` of the bytes of a `HAND_DTYPE` without the side, cached for both hands of a pair."""
-    shape: Any = np.frombuffer(b"\0" + measures, HAND_DTYPE).view(np.recarray)[0]
-    return np.asarray(rest_vertices([shape])[0])
+    return np.asarray(_rest_vertices(np.frombuffer(b"\0" + measures, HAND_DTYPE))[0])
 
 
 def rest_vertices(shapes: Sequence[HandShape]) -> Float[np.ndarray, "B V 3"]:
     """Vertices of the skins of hands as right hands, as in `build_surface` [m]; many cost little more."""
+    return _rest_vertices(np.array([pack_hand(shape) for shape in shapes], HAND_DTYPE))
+
+
+def _rest_vertices(hands: NDArray[np.void]) -> NDArray[np.float64]:
+    """`rest_vertices` of hands of type `HAND_DTYPE`."""
     template = _template()
-    return _subdivided(template.subdivide, _fitted_cages(CageHands.of(shapes), template))
+    return _subdivided(template.subdivide, _fitted_cages(CageHands.of(hands), template))
 
 
 def _subdivided(matrix: sparse.csr_array, cages: np.ndarray) -> np.ndarray:

@@ -18,7 +18,7 @@ from __future__ import annotations
 import json
 import struct
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import numpy as np
 from jaxtyping import Float
@@ -45,13 +45,12 @@ from handsim.motion_files.motion import (
     smooth_quaternions,
     split_vertices,
 )
-from handsim.space.transforms import UpAxis, file_axes
+from handsim.space.transforms import UpAxis, file_axes, rigid
 
 _MATERIALS: Final = (SKIN, THING)
-Target = Literal["vertices", "indices"]
 _COMPONENTS: Final = {"|u1": 5121, "<u2": 5123, "<u4": 5125, "<f4": 5126}
 _TYPES: Final = {(): "SCALAR", (2,): "VEC2", (3,): "VEC3", (4,): "VEC4", (4, 4): "MAT4"}
-_TARGETS: Final = {"vertices": 34962, "indices": 34963}
+_VERTICES, _INDICES = 34962, 34963  # targets of buffer views in glTF
 _HEADER: Final = struct.Struct("<4sII")
 _CHUNK: Final = struct.Struct("<I4s")
 _MOST: Final = (1 << 32) - 1  # bytes that the header can state
@@ -152,13 +151,13 @@ class _Scene:
         """The skin at rest, in the wrist's frame."""
         surface, add = model.surface, self._buffer.add
         attributes = {
-            "POSITION": add(surface.vertices.astype("<f4"), target="vertices", bounds=True),
-            "NORMAL": add(vertex_normals(surface.vertices, surface.faces).astype("<f4"), target="vertices"),
+            "POSITION": add(surface.vertices.astype("<f4"), target=_VERTICES, bounds=True),
+            "NORMAL": add(vertex_normals(surface.vertices, surface.faces).astype("<f4"), target=_VERTICES),
             # A bone without a share must be 0, or validators complain.
             "JOINTS_0": add(
-                np.where(surface.bone_weights > 0.0, surface.bone_indices, 0).astype("u1"), target="vertices"
+                np.where(surface.bone_weights > 0.0, surface.bone_indices, 0).astype("u1"), target=_VERTICES
             ),
-            "WEIGHTS_0": add(surface.bone_weights.astype("<f4"), target="vertices"),
+            "WEIGHTS_0": add(surface.bone_weights.astype("<f4"), target=_VERTICES),
         }
         return {"name": name, "primitives": [self._primitive(attributes, surface.faces, SKIN)]}
 
@@ -178,9 +177,9 @@ class _Scene:
             vertices, outward, faces = split_vertices(thing.shape.faces, normals)
             attributes = {
                 "POSITION": self._buffer.add(
-                    thing.shape.vertices[vertices].astype("<f4"), target="vertices", bounds=True
+                    thing.shape.vertices[vertices].astype("<f4"), target=_VERTICES, bounds=True
                 ),
-                "NORMAL": self._buffer.add(outward.astype("<f4"), target="vertices"),
+                "NORMAL": self._buffer.add(outward.astype("<f4"), target=_VERTICES),
             }
             primitive = self._primitive(attributes, faces, THING)
             self._meshes.append({"name": thing.name, "primitives": [primitive]})
@@ -193,7 +192,7 @@ class _Scene:
     def _primitive(
         self, attributes: dict[str, int], faces: NDArray[Any], material: Material
     ) -> dict[str, Any]:
-        indices = self._buffer.add(faces.ravel().astype("<u4"), target="indices")
+        indices = self._buffer.add(faces.ravel().astype("<u4"), target=_INDICES)
         return {"attributes": attributes, "indices": indices, "material": _MATERIALS.index(material)}
 
     def _animate(self, node: int, path: str, values: NDArray[np.float64]) -> None:
@@ -232,12 +231,12 @@ class GlbBuffer:
         self._views: list[dict[str, Any]] = []
         self._accessors: list[dict[str, Any]] = []
 
-    def add(self, array: NDArray[Any], *, target: Target | None = None, bounds: bool = False) -> int:
+    def add(self, array: NDArray[Any], *, target: int | None = None, bounds: bool = False) -> int:
         """Add an array and return the index of its accessor."""
         content = np.ascontiguousarray(np.swapaxes(array, 1, 2) if array.ndim == 3 else array)  # column-major
         view: dict[str, Any] = {"buffer": 0, "byteOffset": self._size, "byteLength": content.nbytes}
         if target is not None:
-            view["target"] = _TARGETS[target]
+            view["target"] = target
         accessor: dict[str, Any] = {
             "bufferView": len(self._views),
             "componentType": _COMPONENTS[content.dtype.str],
@@ -310,13 +309,8 @@ def _add_hand(stage: Any, hand: PosedHand, codes: NDArray[np.float64]) -> None:
     path = f"/hands/{hand.side}"
     root = UsdSkel.Root.Define(stage, path)
     skeleton = UsdSkel.Skeleton.Define(stage, f"{path}/{hand.side}_skeleton")
-    rest = hand.model.rest_transforms
-    local = np.stack(
-        [
-            rest[n] if bone.parent < 0 else np.linalg.inv(rest[bone.parent]) @ rest[n]
-            for n, bone in enumerate(BONES)
-        ]
-    )
+    rest, bones = hand.model.rest_transforms, hand.model.skeleton
+    local = rigid(bones.rotations, bones.offsets)
     skeleton.CreateJointsAttr(joint_paths(hand.side))
     skeleton.CreateBindTransformsAttr(Vt.Matrix4dArray([Gf.Matrix4d(one.T.tolist()) for one in rest]))
     skeleton.CreateRestTransformsAttr(Vt.Matrix4dArray([Gf.Matrix4d(one.T.tolist()) for one in local]))

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from handsim._checks import check_array, check_choice, check_type
 from handsim.errors import ArgumentError
 from handsim.kernels import kernel
-from handsim.space.transforms import rigid
+from handsim.space.transforms import are_rigid, rigid, unit
 
 LensKind = Literal["pinhole", "brown", "fisheye"]
 _COEFFICIENTS: Final[dict[str, int]] = {"pinhole": 0, "brown": 5, "fisheye": 4}
@@ -94,7 +94,7 @@ class Lens:
             return np.concatenate([along * np.sin(theta)[..., None], np.cos(theta)[..., None]], axis=-1)
         flat = points if self.kind == "pinhole" else self._undistort_brown(points)
         rays = np.concatenate([flat, np.ones_like(flat[..., :1])], axis=-1)
-        return np.asarray(rays / np.linalg.norm(rays, axis=-1, keepdims=True))
+        return unit(rays)
 
     @property
     def _radial(self) -> tuple[float, ...]:
@@ -295,28 +295,20 @@ class Camera:
         object.__setattr__(self, "K", check_array("K", self.K, (3, 3)))
         object.__setattr__(self, "T_world_camera", check_array("T_world_camera", self.T_world_camera, (4, 4)))
         sides = np.asarray(self.size)
-        if sides.shape != (2,) or sides.dtype.kind not in "iuf" or (sides % 1 != 0).any():
+        whole = sides.shape == (2,) and sides.dtype.kind in "iuf" and (sides % 1 == 0).all()
+        if not whole or sides.min() < 1 or sides.max() > _MAX_SIZE:
             raise ArgumentError(
-                f"camera '{self.name}': size is {self.size}, expected width and height in whole pixels"
-            )
-        if not ((sides >= 1) & (sides <= _MAX_SIZE)).all():
-            raise ArgumentError(
-                f"camera '{self.name}' has pictures of {sides[0]} x {sides[1]} pixels, "
-                f"expected 1 to {_MAX_SIZE} each way"
+                f"camera '{self.name}': size is {self.size}, expected width and height, 1 to {_MAX_SIZE} "
+                "whole pixels each"
             )
         object.__setattr__(self, "size", (int(sides[0]), int(sides[1])))
-        rest = self.K.copy()
-        rest[0, 0] = rest[1, 1] = rest[0, 2] = rest[1, 2] = 0.0
-        if not (self.K[0, 0] > 0.0 and self.K[1, 1] > 0.0) or np.abs(rest - np.diag([0, 0, 1])).max() > 0.0:
+        fx, fy, cx, cy = self.K[[0, 1, 0, 1], [0, 1, 2, 2]]
+        if not min(fx, fy) > 0.0 or not np.array_equal(self.K, camera_matrix(fx, fy, cx, cy)):
             raise ArgumentError(
-                f"camera '{self.name}': K is not a matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]"
+                f"camera '{self.name}': K is not a matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] "
+                f"with positive fx and fy: {self.K.tolist()}"
             )
-        rotation = self.T_world_camera[:3, :3]
-        if (
-            np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-5
-            or np.linalg.det(rotation) < 0.0
-            or not np.array_equal(self.T_world_camera[3], [0.0, 0.0, 0.0, 1.0])
-        ):
+        if not are_rigid(self.T_world_camera):
             raise ArgumentError(f"camera '{self.name}': T_world_camera is not a rigid transform")
 
     def __eq__(self, other: object) -> bool:
@@ -484,30 +476,24 @@ def _points_in_view(cameras: Any, points: Any, seen: Any) -> None:
             )  # fmt: skip
 
 
-def _presets() -> dict[str, Camera]:
-    return {
-        "vga": pinhole("vga", (640, 480), 600.0),
-        "vga_wide": pinhole("vga_wide", (640, 480), 380.0),
-        # Intel RealSense SR300 as in BigHand2.2M and HANDS17, Microsoft Kinect v2's and Azure Kinect's (NFOV)
-        # depth and Intel RealSense D435 as their makers state them: fields of view, rounded.
-        "sr300": pinhole("sr300", (640, 480), 475.07, (315.94, 245.29)),
-        "kinect2": pinhole("kinect2", (512, 424), 365.0),
-        "azure_kinect": pinhole("azure_kinect", (640, 576), 504.0),
-        "d435": pinhole("d435", (848, 480), 425.0),
-        "headset_fisheye": Camera(
-            "headset_fisheye",
-            (640, 480),
-            camera_matrix(240.0, 240.0, 320.0, 240.0),
-            lens=Lens("fisheye", (0.02, -0.006, 0.0, 0.0)),
-        ),
-    }
-
-
-PRESETS: Final = tuple(_presets())
+_PRESETS: Final = (
+    pinhole("vga", (640, 480), 600.0),
+    pinhole("vga_wide", (640, 480), 380.0),
+    # Intel RealSense SR300 as in BigHand2.2M and HANDS17, Microsoft Kinect v2's and Azure Kinect's (NFOV)
+    # depth and Intel RealSense D435 as their makers state them: fields of view, rounded.
+    pinhole("sr300", (640, 480), 475.07, (315.94, 245.29)),
+    pinhole("kinect2", (512, 424), 365.0),
+    pinhole("azure_kinect", (640, 576), 504.0),
+    pinhole("d435", (848, 480), 425.0),
+    dataclasses.replace(
+        pinhole("headset_fisheye", (640, 480), 240.0), lens=Lens("fisheye", (0.02, -0.006, 0.0, 0.0))
+    ),
+)
+PRESETS: Final = {camera.name: camera for camera in _PRESETS}
+"""The cameras that come with the package, at the world's origin, by their names."""
 
 
 def preset(name: str) -> Camera:
-    """One of the cameras that come with the package, at the world's origin."""
-    cameras = _presets()
-    check_choice(name, cameras, noun="camera")
-    return cameras[name]
+    """One of `PRESETS`."""
+    check_choice(name, PRESETS, noun="camera")
+    return PRESETS[name]

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import functools
 import itertools
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
-from handsim._checks import check_array, check_choice
+from handsim._checks import check_array, check_choice, check_number
 from handsim.errors import ArgumentError, ObjectError, shortened
 from handsim.files.inputs import check_regular, package_data
 from handsim.space.transforms import axis_angle_matrix, frame_with_z, rigid, unit
@@ -36,15 +36,11 @@ class Part:
     """MuJoCo's sizes [m]: radius; radius and half length along z; three half sizes; zeros for a mesh."""
     T_object_part: Float[np.ndarray, "4 4"]
     """The part's frame seen from the object [m]."""
-    vertices: Float[np.ndarray, "N 3"]
+    vertices: Float[np.ndarray, "N 3"] = field(default_factory=lambda: np.empty((0, 3)))
     """Corners of a mesh [m], in the part's frame; none for the other kinds."""
 
 
 Solid = tuple[list[Part], Any]
-
-
-def _part(kind: PartKind, size: Sequence[float] | NDArray[np.float64], pose: NDArray[np.float64]) -> Part:
-    return Part(kind, np.asarray(size, dtype=np.float64), pose, np.empty((0, 3)))
 
 
 def _along(start: NDArray[np.float64], end: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
@@ -56,7 +52,7 @@ def _sphere(numbers: NDArray[np.float64], trimesh: Any) -> Solid:
     position, radius = 1e-3 * numbers[:3], 1e-3 * numbers[3]
     pose = rigid(np.eye(3), position)
     mesh = trimesh.creation.icosphere(subdivisions=3, radius=radius)
-    return [_part("sphere", (radius, 0.0, 0.0), pose)], mesh.apply_transform(pose)
+    return [Part("sphere", np.array([radius, 0.0, 0.0]), pose)], mesh.apply_transform(pose)
 
 
 def _capsule(numbers: NDArray[np.float64], trimesh: Any) -> Solid:
@@ -64,20 +60,20 @@ def _capsule(numbers: NDArray[np.float64], trimesh: Any) -> Solid:
     pose, length = _along(1e-3 * numbers[:3], 1e-3 * numbers[3:6])
     mesh = trimesh.creation.capsule(height=length, radius=radius, count=[_AROUND, _AROUND // 2])
     mesh.apply_translation(-mesh.bounds.mean(axis=0))
-    return [_part("capsule", (radius, length / 2, 0.0), pose)], mesh.apply_transform(pose)
+    return [Part("capsule", np.array([radius, length / 2, 0.0]), pose)], mesh.apply_transform(pose)
 
 
 def _box(numbers: NDArray[np.float64], trimesh: Any) -> Solid:
     pose = rigid(axis_angle_matrix(np.eye(3)[1], np.deg2rad(numbers[6])), 1e-3 * numbers[:3])
     mesh = trimesh.creation.box(extents=2e-3 * numbers[3:6])
-    return [_part("box", 1e-3 * numbers[3:6], pose)], mesh.apply_transform(pose)
+    return [Part("box", 1e-3 * numbers[3:6], pose)], mesh.apply_transform(pose)
 
 
 def _ellipsoid(numbers: NDArray[np.float64], trimesh: Any) -> Solid:
     pose = rigid(axis_angle_matrix(np.eye(3)[1], np.deg2rad(numbers[6])), 1e-3 * numbers[:3])
     mesh = trimesh.creation.icosphere(subdivisions=2)
     mesh.apply_scale(1e-3 * numbers[3:6])
-    return [_part("ellipsoid", 1e-3 * numbers[3:6], pose)], mesh.apply_transform(pose)
+    return [Part("ellipsoid", 1e-3 * numbers[3:6], pose)], mesh.apply_transform(pose)
 
 
 def _cup(numbers: NDArray[np.float64], trimesh: Any) -> Solid:
@@ -87,7 +83,7 @@ def _cup(numbers: NDArray[np.float64], trimesh: Any) -> Solid:
     profile = [(0, low), (radius, low), (radius, high), (inner, high), (inner, floor), (0, floor)]
     mesh = trimesh.creation.revolve(profile, sections=_CUP_SIDES)
     pose = rigid(np.eye(3), (0.0, 0.0, (low + high) / 2))
-    return [_part("cylinder", (radius, (high - low) / 2, 0.0), pose)], mesh
+    return [Part("cylinder", np.array([radius, (high - low) / 2, 0.0]), pose)], mesh
 
 
 def _arc(numbers: NDArray[np.float64], trimesh: Any) -> Solid:
@@ -98,7 +94,7 @@ def _arc(numbers: NDArray[np.float64], trimesh: Any) -> Solid:
     outward = np.cos(angles)[:, None] * first + np.sin(angles)[:, None] * second
     points = center + radius * outward
     pieces = [_along(start, end) for start, end in itertools.pairwise(points)]
-    parts = [_part("capsule", (tube, length / 2, 0.0), pose) for pose, length in pieces]
+    parts = [Part("capsule", np.array([tube, length / 2, 0.0]), pose) for pose, length in pieces]
     return parts, _tube_mesh(
         trimesh, points, outward, np.cross(first, second), tube, bool(np.ptp(angles) > 6.28)
     )
@@ -171,14 +167,14 @@ class RigidObject:
     """Triangles, counter-clockwise from outside."""
     parts: tuple[Part, ...]
     """Convex pieces that fingers touch."""
-    marker_names: tuple[str, ...]
-    markers: Float[np.ndarray, "Q 3"]
+    marker_names: tuple[str, ...] = ()
+    markers: Float[np.ndarray, "Q 3"] = field(default_factory=lambda: np.empty((0, 3)))
     """Centers of its own retro-reflective markers [m]; none for most objects."""
-    marker_normals: Float[np.ndarray, "Q 3"]
+    marker_normals: Float[np.ndarray, "Q 3"] = field(default_factory=lambda: np.empty((0, 3)))
     """Outward unit normals of the surface under the markers."""
-    mass: float
+    mass: float = 0.1
     """Mass [kg]."""
-    shiny: Float[np.ndarray, "S 7"]
+    shiny: Float[np.ndarray, "S 7"] = field(default_factory=lambda: np.empty((0, 7)))
     """Mirror-like patches: a point [m], its outward unit normal, the patch's radius [m]."""
 
     def __post_init__(self) -> None:
@@ -197,8 +193,7 @@ class RigidObject:
             raise ArgumentError(
                 f"faces name vertices {faces.min()} to {faces.max()}, expected 0 to {len(self.vertices) - 1}"
             )
-        if not 0.0 < self.mass < np.inf:
-            raise ArgumentError(f"{self.name}: the mass is {self.mass:g} kg, expected a positive number")
+        check_number(f"{self.name}: the mass [kg]", self.mass, 0.0, above=True)
         if not self.parts:
             raise ArgumentError(f"{self.name}: an object needs parts that fingers can touch")
 
@@ -234,17 +229,7 @@ def load_object(path: str | Path, *, mass: float = 0.1) -> RigidObject:
     if size < _SMALLEST:
         raise ObjectError(f"{path}: the mesh is {size:.3g} m large, expected at least 2 mm, in meters")
     hull = _convex_hull(mesh, path)
-    return RigidObject(
-        name=path.name,
-        vertices=np.asarray(mesh.vertices),
-        faces=np.asarray(mesh.faces),
-        parts=(hull,),
-        marker_names=(),
-        markers=np.empty((0, 3)),
-        marker_normals=np.empty((0, 3)),
-        mass=mass,
-        shiny=np.empty((0, 7)),
-    )
+    return RigidObject(path.name, np.asarray(mesh.vertices), np.asarray(mesh.faces), (hull,), mass=mass)
 
 
 def _read_mesh(path: Path) -> Any:

@@ -12,14 +12,12 @@ import re
 import struct
 import warnings
 import xml.etree.ElementTree as ET
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Final, NamedTuple
 from xml.parsers import expat
 
 import numpy as np
-from jaxtyping import Float
-from numpy.typing import NDArray
 
 from handsim.errors import HandSimWarning, RigError, choices, errors_of, shortened
 from handsim.files.inputs import read_bytes, read_toml, shown, text_encoding, words_numbers
@@ -93,15 +91,6 @@ def picture_size(owner: str, width: float, height: float) -> tuple[int, int]:
     if width != int(width) or height != int(height) or min(width, height) < 1:
         raise RigError(f"{owner}: the picture is {width:g} x {height:g}, expected whole numbers of pixels")
     return int(width), int(height)
-
-
-def checked_matrix(owner: str, focal: Sequence[float], center: Sequence[float]) -> Float[np.ndarray, "3 3"]:
-    """K of focal lengths and a principal point [px]."""
-    if not min(focal) > 0.0:
-        raise RigError(
-            f"{owner}: the focal lengths are {focal[0]:g} and {focal[1]:g}, expected positive pixels"
-        )
-    return camera_matrix(*focal, *center)
 
 
 _MAX_XML_BYTES: Final = 1 << 25  # masks and thresholds of cameras lie in these files too
@@ -189,7 +178,7 @@ def _vicon_camera(entry: ET.Element, number: int) -> LabCamera | Skipped:
     focal, aspect = frame.number("FOCAL_LENGTH"), outer.number("PIXEL_ASPECT_RATIO", 1.0)
     if not aspect > 0.0:
         raise RigError(f"{owner}: PIXEL_ASPECT_RATIO is {aspect:g}, expected a positive number")
-    K = checked_matrix(owner, (focal, focal / aspect), frame.numbers("PRINCIPAL_POINT", 2))
+    K = camera_matrix(focal, focal / aspect, *frame.numbers("PRINCIPAL_POINT", 2))
     x, y, z, w = frame.numbers("ORIENTATION", 4)
     quaternion = np.array([w, x, y, z])
     length = float(np.linalg.norm(quaternion))
@@ -198,21 +187,23 @@ def _vicon_camera(entry: ET.Element, number: int) -> LabCamera | Skipped:
     pose = rigid(quaternion_matrix(quaternion).T, _MILLIMETER * np.array(frame.numbers("POSITION", 3)))
     kind = (entry.get("DISPLAY_TYPE") or entry.get("TYPE") or "").lower()
     video = entry.get("SYSTEM") == "DV" or entry.get("ISDV") == "1" or kind.startswith(_VIDEO)
-    return LabCamera(Camera(device, size, K, pose, _vicon_lens(frame, size, K)), video=video)
+    camera = Camera(device, size, K, pose)
+    return LabCamera(dataclasses.replace(camera, lens=_vicon_lens(frame, camera)), video=video)
 
 
-def _vicon_lens(frame: _Element, size: tuple[int, int], K: NDArray[np.float64]) -> Lens:
+def _vicon_lens(frame: _Element, camera: Camera) -> Lens:
     """Fit the inverse of Vicon's lens over the picture: ours distorts points, Vicon's undistorts them."""
     straighten = _vicon_coefficients(frame)
     if not any(straighten):
         return Lens()
-    corner = float(np.hypot(*np.maximum(K[:2, 2], size - K[:2, 2])))  # [px]
+    center = camera.K[:2, 2]
+    corner = float(np.hypot(*np.maximum(center, camera.size - center)))  # [px]
     measured = np.linspace(0.0, corner, _SAMPLES + 1)[1:]
     factor = 1.0 + sum(k * measured ** (2 * n) for n, k in enumerate(straighten, 1))
     if not np.abs(factor - 1.0).max() < _MAX_DISTORTION:
         _warn(f"{frame.owner}: its lens would move a corner by more than half its distance; it is left out")
         return Lens()
-    straight = measured * factor / K[0, 0]  # [focal lengths]
+    straight = measured * factor / camera.K[0, 0]  # [focal lengths]
     powers = straight[:, None] ** np.array([2, 4, 6])
     fitted = np.linalg.lstsq(powers * straight[:, None], straight / factor - straight, rcond=None)[0]
     k1, k2, k3 = map(float, fitted)
@@ -251,7 +242,7 @@ def _qualisys_camera(entry: ET.Element, number: int) -> LabCamera | Skipped:
     scale = 1.0 / (_SUBPIXELS * _binning(camera, view, inner))
     u, v = (inner.number(f"centerPoint{axis}") * scale for axis in "UV")
     fx, fy = (inner.number(f"focalLength{axis}") * scale for axis in "UV")
-    K = checked_matrix(camera.owner, (fx, fy), (u - left, v - top))
+    K = camera_matrix(fx, fy, u - left, v - top)
     rows = [[place.number(f"r{i}{j}") for j in (1, 2, 3)] for i in (1, 2, 3)]
     axes = nearest_rotation(f"{camera.owner}: the matrix r11 to r33", np.array(rows))
     position = np.array([place.number(axis) for axis in "xyz"])
@@ -286,7 +277,7 @@ def _motive_camera(entry: ET.Element, number: int) -> LabCamera | Skipped:
     size = picture_size(camera.owner, *(imager.number(f"ImagerPixel{side}") for side in ("Width", "Height")))
     fx, fy = (inner.number(f"{way}FocalLength") for way in ("Horizontal", "Vertical"))
     cx, cy = (inner.number(f"LensCenter{axis}") for axis in "XY")
-    K = checked_matrix(camera.owner, (fx, fy), (cx, cy))
+    K = camera_matrix(fx, fy, cx, cy)
     matrix = np.array([outer.number(f"OrientMatrix{n}") for n in range(9)]).reshape(3, 3)
     axes = nearest_rotation(f"{camera.owner}: OrientMatrix", matrix)
     position = np.array([outer.number(axis) for axis in "XYZ"])
@@ -442,15 +433,11 @@ def _colmap_image(path: Path, line: str, lenses: dict[str, Camera]) -> Camera:
 
 
 def _numbers(owner: str, words: list[str]) -> list[float]:
-    values = []
     for word in words:
-        try:
-            values.append(float(word))
-        except ValueError:
-            values.append(np.nan)
-        if not abs(values[-1]) < 1e9:
+        (value,) = words_numbers([word]) or (np.nan,)
+        if not abs(value) < _MAX_VALUE:
             raise RigError(f"{owner}: '{shortened(word)}' is no number that fits")
-    return values
+    return list(words_numbers(words))
 
 
 _MIN_UPRIGHT: Final = 0.3  # mean component of the cameras' upward axes along the axis that points up
@@ -530,8 +517,7 @@ def _of_xml(path: Path) -> tuple[LabCamera, ...]:
     if skipped:
         named = ", ".join(f"{shortened(one.name)} {one.why}" for one in skipped[:8])
         more = f" and {len(skipped) - 8} more" if len(skipped) > 8 else ""
-        told = f"{path}: {len(skipped)} of {len(read)} cameras are left out: {named}{more}"
-        warnings.warn(told, HandSimWarning, stacklevel=3)
+        _warn(f"{path}: {len(skipped)} of {len(read)} cameras are left out: {named}{more}")
     found = [one for one in read if isinstance(one, LabCamera)]
     names = camera_names([one.camera.name for one in found])
     renamed = [

@@ -152,6 +152,15 @@ def rotation_quaternions(rotations: Float[np.ndarray, "T 3 3"]) -> NDArray[np.fl
     return quaternions
 
 
+def are_rigid(transforms: Float[np.ndarray, "*batch 4 4"]) -> bool:
+    """Whether transforms are rotations, to five decimals, and positions, with no reflection among them."""
+    rotations, last_rows = transforms[..., :3, :3], transforms[..., 3, :]
+    square = np.abs(rotations @ np.swapaxes(rotations, -1, -2) - np.eye(3)).max()
+    return bool(
+        max(square, np.abs(last_rows - np.eye(4)[3]).max()) < 1e-5 and (np.linalg.det(rotations) > 0.0).all()
+    )
+
+
 def pose_matrices(poses: Float[np.ndarray, "T 7"]) -> NDArray[np.float64]:
     """Transforms (T, 4, 4) of positions and wxyz quaternions; NaN where these are NaN."""
     transforms = np.tile(np.eye(4), (len(poses), 1, 1))
@@ -200,9 +209,7 @@ def body_fixed_angles(rotations: Float[np.ndarray, "T 3 3"]) -> NDArray[np.float
 
 def random_quaternions(count: int, *, rng: np.random.Generator) -> NDArray[np.float64]:
     """Uniform random rotations as wxyz quaternions (count, 4); read as xyzw they are uniform, too."""
-    raw: NDArray[np.float64] = rng.standard_normal((count, 4))
-    raw /= np.linalg.norm(raw, axis=1, keepdims=True)
-    return raw
+    return unit(rng.standard_normal((count, 4)))
 
 
 def rigid_fit(

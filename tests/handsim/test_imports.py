@@ -80,7 +80,7 @@ def test_a_module_without_a_spec_is_told(monkeypatch: pytest.MonkeyPatch) -> Non
 def nowhere(tmp_path, monkeypatch):
     """Neither the installation nor the user's cache can be written; the temporary folder is another."""
     monkeypatch.delenv(VARIABLE, raising=False)
-    monkeypatch.setattr(_imports, "_is_writable", lambda folder: False)
+    monkeypatch.setattr(_imports, "is_writable", lambda folder: False)
     monkeypatch.setattr(_imports.tempfile, "gettempdir", lambda: str(tmp_path))
     monkeypatch.setattr(_imports.tempfile, "tempdir", str(tmp_path))
     yield tmp_path
@@ -111,7 +111,7 @@ def test_a_folder_that_others_can_write_is_not_trusted(nowhere):
 
 def test_a_kernel_compiles_where_only_the_temporary_folder_is(tmp_path):
     program = (
-        "import os; from handsim import _imports as k; k._is_writable = lambda folder: False; "
+        "import os; from handsim import _imports as k; k.is_writable = lambda folder: False; "
         "k.ensure_kernel_cache(); import numpy as np; from handsim.kernels import __name__ as n; "
         "print(os.environ[k.VARIABLE])"
     )

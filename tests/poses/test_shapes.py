@@ -232,7 +232,7 @@ def test_all_gestures_by_name():
 
 def test_mistakes_are_named(rng):
     model = HandModel.named("M")
-    with pytest.raises(ArgumentError, match="num_poses is 0, expected a positive number"):
+    with pytest.raises(ArgumentError, match="num_poses is 0, expected at least 1"):
         sample_poses(model, 0, rng=rng)
     with error_names(ArgumentError, "<lambda>' returns has shape (2, 20), expected (3, 20) joint angles"):
         sample_poses(model, 3, lambda model, num_poses, *, rng: np.zeros((2, 20)), rng=rng)

@@ -129,7 +129,7 @@ def test_worker_processes_import_it_too(folder):
     [
         ("flat", r"what pose sampler 'own_ideas:flat' returns has shape \(20,\), expected \(2, 20\)"),
         ("nans", "returns holds NaN or infinite values"),
-        ("text", "is list, expected joint angles"),
+        ("text", "expected an array of numbers"),
         ("half", "does not take the arguments"),
         ("absent", "has no attribute 'absent'"),
     ],

@@ -21,7 +21,6 @@ from handsim.space.objects import RigidObject, named_object
 from handsim.space.rig import CameraRig
 from poses.motion import (
     MotionConfig,
-    WristConfig,
     angles_through,
     can_be_left,
     count_frames,
@@ -138,8 +137,9 @@ def _free_hand(
 ) -> HandMotion:
     """Motion of a hand in the air, palm mostly down, at `offset` from the center of the room [m]."""
     qpos = scripted_motion(model, script, num_frames / RATE, rng=rng).qpos[:num_frames].copy()
-    config = WristConfig(center=(offset, 0.0, 1.1), volume=_VOLUME, turning=_WRIST_ROTATION)
-    qpos[:, :3], qpos[:, 3:7] = wrist_path(num_frames, RATE, config, rng=rng)
+    qpos[:, :3], qpos[:, 3:7] = wrist_path(
+        num_frames, RATE, center=(offset, 0.0, 1.1), volume=_VOLUME, turning=_WRIST_ROTATION, rng=rng
+    )
     return HandMotion(qpos, RATE)
 
 
@@ -182,8 +182,9 @@ def sample_calibration_scene(
     frames = min(len(part) for part in angles)
     moving = []
     for fit, part, offset in zip(hands, angles, (_HAND_OFFSET, -_HAND_OFFSET), strict=False):
-        wrist = WristConfig(center=(offset, 0.0, 1.1), volume=_VOLUME, turning=config.turning)
-        position, quaternion = wrist_path(frames, _FREE.rate, wrist, rng=rng)
+        position, quaternion = wrist_path(
+            frames, _FREE.rate, center=(offset, 0.0, 1.1), volume=_VOLUME, turning=config.turning, rng=rng
+        )
         qpos = join_qpos(part[:frames], position=position, quaternion=quaternion)
         moving.append(GlovedHand(fit, qpos))
     return SceneMotion(tuple(moving), rate=_FREE.rate)
@@ -308,5 +309,4 @@ def _path(
     scene: SceneMotion, center: Float[np.ndarray, "3"], volume: float, rng: np.random.Generator
 ) -> Float[np.ndarray, "T 3"]:
     """Slow motion in a cube of half side `volume` around a center [m]."""
-    config = WristConfig(center=tuple(center), volume=volume, turning=0.0)
-    return wrist_path(scene.num_frames, scene.rate, config, rng=rng)[0]
+    return wrist_path(scene.num_frames, scene.rate, center=center, volume=volume, turning=0.0, rng=rng)[0]

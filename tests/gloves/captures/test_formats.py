@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from gloves import Capture, read_capture, write_capture
+from gloves.captures.capture import select_hands
 from gloves.captures.formats import read_hands, read_motive_csv, read_qtm_tsv, read_trc, read_vicon_csv
 from handsim.errors import CaptureError
 from tests.sentences import error_names
@@ -616,6 +617,13 @@ def test_two_hands_are_counted_each_by_itself(tmp_path, two_hands):
     markers = np.concatenate(read_hands(tmp_path / "two.trc", MARKERS)[0])
     expected = np.concatenate([two_hands[[0, 1, 3], :3], two_hands[:, 3:6]])
     np.testing.assert_allclose(markers, expected, atol=1e-6)
+
+
+def test_one_hand_counts_while_it_is_there_in_a_file_and_in_memory(tmp_path, two_hands):
+    capture = Capture(MARKERS, two_hands[:, :3], 120.0)
+    write_capture(tmp_path / "one.trc", capture)
+    for (markers,) in (select_hands(capture, MARKERS), read_hands(tmp_path / "one.trc", MARKERS)[0]):
+        np.testing.assert_allclose(markers, two_hands[[0, 1, 3], :3], atol=1e-6)
 
 
 def test_a_hand_that_lacks_a_marker_is_named(tmp_path, two_hands):

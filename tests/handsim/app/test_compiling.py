@@ -51,7 +51,7 @@ def test_nearly_everything_on_the_list_is_there():
     known, listed, gone = known_types(), read_list(), 0.0
     for one in listed:
         try:
-            kernel = compiling._found(one.name)
+            kernel = compiling.resolve_name(one.name)
         except (AttributeError, ImportError):
             gone += one.seconds
             continue

@@ -100,6 +100,7 @@ def test_a_line_before_anything_is_done():
     bar = Progress(disable=True)
     bar.add_task("", total=1)
     assert _line(bar.tasks[0], "frames", 3661.2) == "getting ready, 1:01:01"
+    assert _line(bar.tasks[0], "frames", 59.7) == "getting ready, 0:01:00"
 
 
 def test_a_short_command_writes_no_line(capsys):

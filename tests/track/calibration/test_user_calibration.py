@@ -15,7 +15,7 @@ from gloves.fit import attach_markers, nominal_fit
 from handsim import HandModel, HandSimError, join_qpos
 from handsim.hand.shape import JOINT_NAMES, SIDES, named_shape
 from handsim.space.transforms import MIRROR
-from poses.motion import WristConfig, wrist_path
+from poses.motion import wrist_path
 from track import Calibration, HeldOut, Status, TrackedFrame, TrackedHand, User, load_user
 from track.calibration.user_calibration import MotionGuide, calibrate_hand
 from train.simulation.scenes import CalibrationTakeConfig, calibration_angles
@@ -42,7 +42,7 @@ def somebody():
     worn = displace_markers(attach_markers(LAYOUT, model), shape, 0.005, rng=rng)
     angles = calibration_angles(model, CalibrationTakeConfig(free=12.0, rounds=1), rng=rng)
     angles = angles[::4]
-    where = wrist_path(len(angles), RATE, WristConfig(), rng=rng)
+    where = wrist_path(len(angles), RATE, rng=rng)
     qpos = join_qpos(angles, position=where[0], quaternion=where[1])
     return GloveFit(model, worn), qpos
 
