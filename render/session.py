@@ -48,15 +48,7 @@ from render.depth_sensor import sample_depth_noise
 from render.formats.records import centered_K, without_colors
 from render.formats.shards import INDEX
 from render.formats.webdataset import TAR
-from render.formats.writer import (
-    CONFIG,
-    FORMATS,
-    WRITERS,
-    format_folder,
-    open_writer,
-    shard_files,
-    whole_shards,
-)
+from render.formats.writer import CONFIG, FORMATS, WRITERS, open_writers, shard_files, whole_shards
 from render.frames import Doubles, RenderedFrame
 from render.painting.figures import sample_people
 from render.scenery.backgrounds import photo_files
@@ -390,11 +382,7 @@ def render_take(
         lost = frozenset(left_out_frames(output.folder))
         if not drew and _is_complete(output):
             return views * sum(frame not in lost for shard in shards for frame in shard)
-        merged = [
-            path
-            for name in formats
-            for path in open_writer(name, format_folder(output.folder, formats, name)).finish()
-        ]
+        merged = [path for one in open_writers(output.folder, formats) for path in one.finish()]
         drawn = [[frame for frame in shard if frame not in lost] for shard in shards]
         if not any(drawn):
             raise HandSimError(
@@ -594,8 +582,8 @@ def _render_shard(
     kept = list(counted()) if len(formats) > 1 else counted()
     record = out / checksums_name(shard)
     record.unlink(missing_ok=True)
-    for name in formats:
-        open_writer(name, format_folder(out, formats, name)).write(shard, kept)
+    for writer in open_writers(out, formats):
+        writer.write(shard, kept)
     notes = [out / name.format(f"{shard:05d}") for name in (_LEFT_OUT, _CUT_OFF)]
     there = {path.name: path for path in notes if path.is_file()}
     save_checksums(record, shard_files(out, formats, shard) | there)

@@ -440,7 +440,7 @@ def _walls(camera: Camera, drawn: Sequence[Drawn], choices: FrameChoices) -> Sur
     """What is behind the hands and bodies."""
     background = choices.background
     if choices.enclosure is not None:
-        return draw_surroundings(background, choices.enclosure, camera)
+        return draw_surroundings(background, choices.enclosure, camera, bright=False)
     return surroundings_of_picture(background, camera, level_behind(background.backdrop, camera, drawn))
 
 

@@ -20,7 +20,6 @@ from gloves.layout import MarkerLayout
 from gloves.optics.reconstruction import OpticsConfig, reconstruct
 from gloves.takes.take import Take
 from handsim.errors import CaptureError
-from handsim.hand.model import BodyMotion
 from handsim.space.objects import MARKER_RADIUS
 from handsim.space.rig import FEWEST_CAMERAS, ROOM_CENTER, CameraRig
 from handsim.space.transforms import pose_matrices
@@ -120,7 +119,7 @@ def work_of_take(take: Take, layout: MarkerLayout | None, num_frames: int) -> di
             for number, body in enumerate(take.bodies):
                 thing, poses = body.shape, take.body_poses[part, number]
                 if held is None and thing is not None and np.isfinite(poses).all():
-                    held = MovingObject(thing, BodyMotion(pose_matrices(poses), take.rate))
+                    held = MovingObject(thing, pose_matrices(poses))
             scenes.append(SceneMotion(hands, held, take.rate))
     if not scenes:
         raise CaptureError(

@@ -59,7 +59,8 @@ class MovingObject:
     """An object and its path through the room."""
 
     rigid_object: RigidObject
-    motion: BodyMotion
+    T_world_body: Float[np.ndarray, "T 4 4"]
+    """Pose in each frame [m]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -85,8 +86,7 @@ class SceneMotion:
         hands = tuple(GlovedHand(hand.fit, hand.qpos[::times]) for hand in self.hands)
         held = self.moving_object
         if held is not None:
-            motion = BodyMotion(held.motion.T_world_body[::times], held.motion.rate)
-            held = dataclasses.replace(held, motion=motion)
+            held = MovingObject(held.rigid_object, held.T_world_body[::times])
         return SceneMotion(hands, held, self.rate)
 
     def moved(self, offsets: Float[np.ndarray, "*T 3"]) -> SceneMotion:
@@ -98,9 +98,8 @@ class SceneMotion:
             hands.append(GlovedHand(hand.fit, qpos))
         held = self.moving_object
         if held is not None:
-            poses = held.motion.T_world_body.copy()
-            poses[:, :3, 3] += offsets
-            held = dataclasses.replace(held, motion=BodyMotion(poses, held.motion.rate))
+            held = MovingObject(held.rigid_object, held.T_world_body.copy())
+            held.T_world_body[:, :3, 3] += offsets
         return dataclasses.replace(self, hands=tuple(hands), moving_object=held, others=None)
 
 
@@ -130,7 +129,8 @@ def sample_scene_motion(
     else:
         direction = np.tile(_RETREAT_DIRECTION, (num_frames, 1))
         holding, body = keep_apart(right.model, left.model, rigid_object, held, other, direction)
-    return SceneMotion(_gloved(fits, (holding, other), num_frames), MovingObject(rigid_object, body))
+    hands = _gloved(fits, (holding, other), num_frames)
+    return SceneMotion(hands, MovingObject(rigid_object, body.T_world_body))
 
 
 def _free_hand(

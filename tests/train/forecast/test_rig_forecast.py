@@ -10,7 +10,6 @@ from gloves.captures.capture import run_lengths
 from gloves.optics.reconstruction import reconstruct
 from handsim import load_rig, look_at
 from handsim.errors import CaptureError
-from handsim.hand.model import BodyMotion
 from handsim.space.transforms import pose_matrices
 from tests.rigs import mixed_rig, square_rig
 from train import simulate_take
@@ -58,7 +57,7 @@ def moving_thing(take):
     body = take.bodies[0] if take.bodies else None
     if body is None:
         return None
-    return MovingObject(body.shape, BodyMotion(pose_matrices(take.body_poses[:, 0]), take.rate))
+    return MovingObject(body.shape, pose_matrices(take.body_poses[:, 0]))
 
 
 def test_a_second_camera_at_the_same_place_can_go_and_others_cannot(work):
@@ -128,7 +127,7 @@ def test_an_object_stays_in_the_hand(work):
     offset = np.tile([1.0, 2.0, 0.1], (scene.num_frames, 1))
     there = scene.moved(offset)
     before, after = (
-        one.moving_object.motion.T_world_body[:, :3, 3] - one.hands[0].qpos[:, :3] for one in (scene, there)
+        one.moving_object.T_world_body[:, :3, 3] - one.hands[0].qpos[:, :3] for one in (scene, there)
     )
     assert after == pytest.approx(before)
     assert there.hands[1].qpos[:, :3] - scene.hands[1].qpos[:, :3] == pytest.approx(offset)
