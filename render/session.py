@@ -40,7 +40,6 @@ from handsim.files.outputs import check_free, save_json
 from handsim.files.signals import Stopped, interrupts_bare
 from handsim.space.camera import Camera
 from handsim.space.rig import CameraRig, check_names
-from handsim.space.rig_formats import load_cameras
 from render.captions import contact_sheet, write_png
 from render.color_sensor import sample_exposure, sample_shutter
 from render.config import RenderConfig, SpawnKey
@@ -50,7 +49,7 @@ from render.formats.shards import INDEX
 from render.formats.webdataset import TAR
 from render.formats.writer import CONFIG, FORMATS, WRITERS, open_writers, shard_files, whole_shards
 from render.frames import Doubles, RenderedFrame
-from render.painting.figures import sample_people
+from render.painting.figures import sample_appearance
 from render.scenery.backgrounds import photo_files
 from render.scenery.lights import sample_surroundings
 from render.studio import FrameChoices, Moment, Studio
@@ -257,12 +256,12 @@ def open_studio(
     light: bool = False,
 ) -> Studio:
     """A studio of one person with random looks, whose wrists a `UserBody` may bend."""
-    people = sample_people(len(hands), config.dress == "glove", tones=config.tones, rng=rng)
+    look = sample_appearance(config.dress == "glove", tones=config.tones, rng=rng)
     if has_user:
-        straight = dataclasses.replace(people[0].forearm, flexion=0.0, deviation=0.0)
-        people = tuple(dataclasses.replace(one, forearm=straight) for one in people)
+        straight = dataclasses.replace(look.forearm, flexion=0.0, deviation=0.0)
+        look = dataclasses.replace(look, forearm=straight)
     colors = [tuple(rng.uniform(0.05, 0.9, 3).tolist()) for _ in bodies]
-    return Studio(hands, people, config, bodies, colors, light=light, film=film)
+    return Studio(hands, look, config, bodies, colors, light=light, film=film)
 
 
 def sample_choices(
@@ -485,9 +484,8 @@ def _settings(drawing: Drawing, source: Source) -> dict[str, Any]:
     if drawing.config.view.cameras is None:
         del settings["view"]["cameras"]
     else:
-        own = drawing.config.view.cameras  # as given: `up` turns them when they are drawn again, too
-        cameras = load_cameras(own) if isinstance(own, str) else own
-        settings["view"]["cameras"] = [camera.record() for camera in cameras]
+        # as given: `up` turns them when they are drawn again, too
+        settings["view"]["cameras"] = [one.record() for one in drawing.config.view.own_cameras()]
     return settings if subject.poses is None else settings | {"poses": subject.poses}
 
 

@@ -25,7 +25,6 @@ from handsim.space.rig import FEWEST_CAMERAS, ROOM_CENTER, CameraRig
 from handsim.space.transforms import pose_matrices
 from train.simulation.room import (
     LightSources,
-    RoomConfig,
     SceneSight,
     label_false_points,
     sample_light_sources,
@@ -205,20 +204,14 @@ class LitScene(NamedTuple):
         return self._replace(sources=self.sources._replace(visible=visible))
 
 
-def light(
-    scenes: Sequence[SceneMotion], rig: CameraRig, room: RoomConfig, *, rng: np.random.Generator
-) -> list[LitScene]:
-    """Cast all lines of sight in a room; an `ArgumentError` if a camera is inside a hand."""
-    return [
-        LitScene(scene, sample_light_sources(SceneSight(scene, rig), room, rng=rng), room.optics)
-        for scene in scenes
-    ]
-
-
 def light_work(
     work: Mapping[str, Sequence[SceneMotion]], rig: CameraRig, *, rng: np.random.Generator
 ) -> dict[str, list[LitScene]]:
-    """Cast the lines of sight of scenes by kind of work, each in the default room of its kind."""
+    """Cast the lines of sight of scenes by kind of work, each in the default room of its kind.
+
+    Raises:
+        ArgumentError: A camera is inside a hand.
+    """
     lit: dict[str, list[LitScene]] = {}
     for kind, scenes in work.items():
         lit[kind] = []
@@ -226,7 +219,9 @@ def light_work(
             similar = kind if kind in SIMULATED_KINDS else "hand-pen"
             if similar != kind and scene.moving_object is None:
                 similar = "hand-hand" if len(scene.hands) > 1 else "single-hand"
-            lit[kind] += light([scene], rig, usual_room(similar), rng=rng)
+            room = usual_room(similar)
+            sources = sample_light_sources(SceneSight(scene, rig), room, rng=rng)
+            lit[kind].append(LitScene(scene, sources, room.optics))
     return lit
 
 

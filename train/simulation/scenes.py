@@ -18,7 +18,6 @@ from handsim.hand.model import BodyMotion, HandModel, HandMotion, join_qpos
 from handsim.hand.shape import EVERYBODY, NUM_JOINTS, SIDES
 from handsim.settings import Limits, Settings
 from handsim.space.objects import RigidObject, named_object
-from handsim.space.rig import CameraRig
 from poses.motion import (
     MotionConfig,
     WristConfig,
@@ -153,6 +152,7 @@ def _gloved(
 # A calibration capture.
 _MAX_DRAWS: Final = 20
 _STARTS: Final = ("pinch_pad", "pinch_tip")  # gestures before touches
+_TURNING: Final = 0.7  # [rad] standard deviation of the wrist's rotation about each axis
 _JITTER: Final = np.deg2rad(8.0)  # [rad] standard deviation of these gestures' joint angles
 _TOUCHING: Final = MotionConfig(durations=(0.4, 0.8), hold=0.8)
 _FREE: Final = MotionConfig(durations=(0.3, 0.9), hold=0.2)
@@ -160,16 +160,12 @@ _FREE: Final = MotionConfig(durations=(0.3, 0.9), hold=0.2)
 
 @dataclass(frozen=True, slots=True)
 class CalibrationTakeConfig(Settings):
-    """Exercises of a calibration capture, and the cameras that record it."""
+    """Exercises of a calibration capture."""
 
     free: Annotated[float, Limits(0.0, above=True)] = 40.0
     """Duration of free motion [s]."""
     rounds: Annotated[int, Limits(0)] = 3
     """Number of rounds in which the thumb touches each of the other fingertips."""
-    rig: CameraRig | str = "figure5"
-    """Camera rig: a shipped name, the path of a .toml file, or the rig itself."""
-    turning: Annotated[float, Limits(0.0)] = 0.7
-    """Standard deviation of the wrist's rotation about each axis [rad]."""
 
 
 def sample_calibration_scene(
@@ -182,7 +178,7 @@ def sample_calibration_scene(
     frames = min(len(part) for part in angles)
     moving = []
     for fit, part, offset in zip(hands, angles, (_HAND_OFFSET, -_HAND_OFFSET), strict=False):
-        wrist = WristConfig(center=(offset, 0.0, 1.1), volume=_VOLUME, turning=config.turning)
+        wrist = WristConfig(center=(offset, 0.0, 1.1), volume=_VOLUME, turning=_TURNING)
         position, quaternion = wrist_path(frames, _FREE.rate, wrist, rng=rng)
         qpos = join_qpos(part[:frames], position=position, quaternion=quaternion)
         moving.append(GlovedHand(fit, qpos))

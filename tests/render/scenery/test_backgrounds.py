@@ -58,6 +58,7 @@ def test_backgrounds_repeat_and_differ(kind: str) -> None:
     assert picture.dtype == np.float32
     assert picture.min() >= 0.0
     assert picture.max() <= 1.0
+    kept_background.cache_clear()
     assert picture.tobytes() == draw_background(again, SIZE).tobytes()
     assert np.abs(picture - draw_background(other, SIZE)).max() > 0.01
     values = json.loads(json.dumps(dataclasses.asdict(first)))
