@@ -14,8 +14,8 @@ from jaxtyping import Bool, Float, Int, UInt8
 from gloves.fit import GloveFit
 from gloves.layout import MarkerLayout
 from gloves.optics.visibility import visible_cameras
-from handsim.errors import ArgumentError, FileError
-from handsim.files.outputs import atomic_write, plain_path, unwritten, writing
+from handsim.errors import FileError
+from handsim.files.outputs import atomic_write, check_ending, plain_path, unwritten, writing
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import BONE_NAMES, SIZES
 from handsim.hand.skin import vertex_normals
@@ -168,7 +168,6 @@ def unoccluded(
     return np.asarray(inside & (ahead > 0) & ((first == 0) | (ahead <= first + slack)))
 
 
-SUFFIX: Final = ".mp4"
 _SIZE: Final = (800, 600)  # [px]
 _CODEC: Final = "mp4v"  # part of every build of OpenCV
 _AHEAD: Final = (-0.62, 0.62, -0.48)  # direction of view, as the viewer's first look
@@ -188,8 +187,7 @@ def write_clip(
     A frame has pairs of hands and their poses (27,) [m, rad], where hands without a pose are left out; points
     (N, 3) in the world [m], of this radius [m]; their colors (N, 3), sRGB in [0, 1]; and a line of text.
     """
-    if path.suffix.lower() != SUFFIX:
-        raise ArgumentError(f"cannot write a video as '{path}', expected a name that ends in {SUFFIX}")
+    check_ending(path, ".mp4", option="--video")
     view = view_along(np.array(_AHEAD), np.array([0.0, 0.0, 1.0]), shown, _SIZE)
 
     def pictures() -> Iterator[Picture]:

@@ -207,7 +207,7 @@ class Drawing:
             studio = self._open_studio(self.take.hands, rng=rng)
         kept: dict[int, FrameChoices] = {}
         for place, frame in numbered:
-            person = shard if cast is None else cast.person_in(frame, shard)
+            person = shard if cast is None or cast.person is None else int(cast.person[frame])
             if cast is not None:
                 studio = self._studio_of(person)
                 rng = SpawnKey.SHARD.rng(config.seed, shard, 0)  # all people of a shard are in one place
@@ -405,7 +405,9 @@ def _draw_shards(
 ) -> bool:
     """Draw the missing shards and return whether there were any; `counts` are all shards' pictures."""
     output.fetch(INDEX, names_of=[f"*{TAR}"])
-    done, total = _finished(output, formats), sum(counts)
+    done, changed = whole_shards(output.folder, formats)  # object stores check their own
+    output.warn_of(changed, "are damaged (other checksums), and are drawn again")
+    total = sum(counts)
     count = sum(counts[number] for number in done if number < len(counts))
     todo = [number for number in range(len(counts)) if number not in done]
     tell = _Counter(output.folder, count, total, progress)
@@ -523,13 +525,6 @@ def _check_space(out: Path, drawn: int, left: int) -> None:
     """Refuse to go on if the disk has no space for the other shards, at the size of those that are drawn."""
     needed = left * sum(file.stat().st_size for file in out.rglob("*") if file.is_file()) // drawn
     check_free(out, needed, f"the other {left} shards", "draw fewer frames (--every)", error=HandSimError)
-
-
-def _finished(output: Output, formats: Sequence[str]) -> frozenset[int]:
-    """The shards that need not be drawn; warns of damaged files. Object stores check their own."""
-    done, changed = whole_shards(output.folder, formats)
-    output.warn_of(changed, "are damaged (other checksums), and are drawn again")
-    return done
 
 
 def _is_complete(output: Output) -> bool:

@@ -239,10 +239,6 @@ class Cast:
     """Number of the person in each frame; None for another person in every shard."""
     shapes: tuple[HandShape, ...] | None = None  # hands of the people; None for random adults
 
-    def person_in(self, frame: int, shard: int) -> int:
-        """Number of the person in a frame of a shard."""
-        return shard if self.person is None else int(self.person[frame])
-
     def rng(self, person: int) -> np.random.Generator:
         """A generator for a person's skin, the same in all frames."""
         return SpawnKey.PERSON.rng(self.seed, person, 1)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final, NamedTuple, cast
+from typing import Final, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -30,19 +30,13 @@ from train.simulation.room import (
     sample_light_sources,
     usual_room,
 )
-from train.simulation.scenes import (
-    KINDS,
-    SIMULATED_KINDS,
-    Kind,
-    MovingObject,
-    SceneMotion,
-    sample_real_like_scene,
-)
+from train.simulation.scenes import KINDS, SIMULATED_KINDS, Kind, SceneMotion, sample_real_like_scene
 from train.simulation.takes import by_somebody, sample_scene
 from train.simulation.training_frames import (
     FrameScene,
     GenerateSettings,
     HandFrames,
+    MovingObject,
     observe_scene,
     sample_frame_scene,
     sample_hands,
@@ -53,7 +47,6 @@ HALF_SIDE: Final = 0.3
 """Half side of the default cube in which hands work [m]."""
 OPTICS: Final = OpticsConfig()
 """Noise of blobs and size of visible spots, equal in all rooms."""
-_REAL_LIKE: Final = "real-like"
 _MIN_FRAMES: Final = 12  # least number of successive frames that are used of a take
 _ROUND_TRIP: Final = (11.0, 14.0, 9.0)  # [s] time to walk through the volume and back along each axis
 _POSES_PER_PERSON: Final = 60
@@ -74,20 +67,17 @@ def sample_work(
     Hands work around the center of a volume [m]; people walk through a volume larger than their reach.
     """
     work: dict[str, list[SceneMotion]] = {}
-    for kind in (_REAL_LIKE, *KINDS):
+    kinds: tuple[Literal["real-like"] | Kind, ...] = ("real-like", *KINDS)
+    for kind in kinds:
         work[kind] = []
         for _ in range(people):
-            scene = _work_scene(kind, layout, num_frames, rng)
+            if kind == "real-like":
+                scene = by_somebody(kind, lambda: sample_real_like_scene(layout, num_frames, rng=rng))
+            else:
+                scene = sample_scene(kind, layout, num_frames, rng=rng)
             walk = _walk(scene.num_frames / scene.rate, scene.num_frames, sides, rng)
             work[kind].append(scene.moved(walk + center - ROOM_CENTER))
     return work
-
-
-def _work_scene(kind: str, layout: MarkerLayout, num_frames: int, rng: np.random.Generator) -> SceneMotion:
-    """A scene of a random person who can do this work."""
-    if kind != _REAL_LIKE:
-        return sample_scene(cast("Kind", kind), layout, num_frames, rng=rng)
-    return by_somebody(_REAL_LIKE, lambda: sample_real_like_scene(layout, num_frames, rng=rng))
 
 
 def _walk(

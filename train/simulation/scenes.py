@@ -17,7 +17,7 @@ from handsim.errors import ArgumentError, PoseError
 from handsim.hand.model import BodyMotion, HandModel, HandMotion, join_qpos
 from handsim.hand.shape import EVERYBODY, NUM_JOINTS, SIDES
 from handsim.settings import Limits, Settings
-from handsim.space.objects import RigidObject, named_object
+from handsim.space.objects import named_object
 from poses.motion import (
     MotionConfig,
     WristConfig,
@@ -32,7 +32,7 @@ from poses.object_motion import keep_apart, point_pen, pointing_path, sample_obj
 from poses.shapes import gesture, make_valid
 from poses.touch import FINGERS, touching_angles
 from poses.two_hands import sample_two_hand_motion
-from train.simulation.training_frames import move_skin, sample_hands, wear_gloves
+from train.simulation.training_frames import MovingObject, move_skin, sample_hands, wear_gloves
 
 Kind = Literal["single-hand", "hand-hand", "hand-pen", "hand-controller"]
 """A kind of capture: what the hands do (section 5 of Han et al. 2018)."""
@@ -51,15 +51,6 @@ _RETREAT_DIRECTION: Final = np.array([1.0, 0.0, 0.0])  # in which the right hand
 _PAUSE_BETWEEN_CONTACTS: Final = (2.0, 4.0)  # [s]
 _WRIST_ROTATION: Final = 0.5  # [rad] standard deviation about each axis
 _FREE_SCRIPT, _RESTING_SCRIPT = "piano", "typing"
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class MovingObject:
-    """An object and its path through the room."""
-
-    rigid_object: RigidObject
-    T_world_body: Float[np.ndarray, "T 4 4"]
-    """Pose in each frame [m]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

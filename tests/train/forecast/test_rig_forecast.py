@@ -24,7 +24,8 @@ from train.forecast.rig_forecast import (
     work_of_take,
 )
 from train.simulation.room import RoomConfig
-from train.simulation.scenes import MovingObject, SceneMotion
+from train.simulation.scenes import SceneMotion
+from train.simulation.training_frames import MovingObject
 
 
 def test_shares_are_those_of_the_lines_of_sight(six_lit):

@@ -19,7 +19,8 @@ from handsim.space.objects import named_object
 from poses import sample_motion
 from tests.rigs import square_rig
 from train.simulation.room import RoomConfig, SceneSight, record_take, sample_light_sources
-from train.simulation.scenes import MovingObject, SceneMotion
+from train.simulation.scenes import SceneMotion
+from train.simulation.training_frames import MovingObject
 
 RATE = 120.0
 FRAMES = 120
