@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -45,7 +45,9 @@ class FlatHand(NamedTuple):
     below: NDArray[np.bool_]
     """Which markers face the palm's side (M,)."""
 
-    def draw(self, panel: Axes, scale: float, shift: Float[np.ndarray, "2"], *, bone_width: float) -> None:
+    def draw(
+        self, panel: Axes, *, scale: float = 1.0, shift: Any = 0.0, bone_width: float, **bones: Any
+    ) -> None:
         """Draw outline and bones, scaled and then shifted."""
         from matplotlib.patches import PathPatch
         from matplotlib.path import Path
@@ -54,7 +56,7 @@ class FlatHand(NamedTuple):
         outline = Path.make_compound_path(*outlines)
         panel.add_patch(PathPatch(outline, facecolor=Paint.BAND, edgecolor=Paint.LINE, linewidth=1.0))
         for bone in scale * self.bones + shift:
-            panel.plot(*bone.T, color=Paint.LINE, linewidth=bone_width, solid_capstyle="round")
+            panel.plot(*bone.T, color=Paint.LINE, linewidth=bone_width, solid_capstyle="round", **bones)
 
 
 def flat_hand(layout: MarkerLayout) -> FlatHand:
@@ -141,7 +143,7 @@ def _draw_hand(
     """Draw hand, markers, arrows, names and color bar."""
     panel, (width, height), middle, scale = _canvas(figure, hand, hand.markers, 0.86)
     shift = np.array([0.46 * width, 0.5 * height]) - scale * middle
-    hand.draw(panel, scale, shift, bone_width=3.0)
+    hand.draw(panel, scale=scale, shift=shift, bone_width=3.0)
     dots = scale * hand.markers + shift
     _draw_arrows(panel, dots, arrows)
     colors = color_scale(min(99.0, float(np.floor(100.0 * accuracy.min()))), 100.0)
@@ -194,7 +196,7 @@ def _draw_slips(
         turn = np.array([flip, 1.0])
         shift = np.array([center * width, 0.5 * height]) - scale * turn * middle
         seen = hand._replace(outlines=[turn * loop for loop in hand.outlines], bones=turn * hand.bones)
-        seen.draw(panel, scale, shift, bone_width=2.0)
+        seen.draw(panel, scale=scale, shift=shift, bone_width=2.0)
         for marker, color in enumerate(colors):
             mine = scale * turn * dots[there[:, marker], marker] + shift
             panel.plot(*mine.T, "o", color=color, markersize=2.2, markeredgewidth=0, alpha=0.6)
