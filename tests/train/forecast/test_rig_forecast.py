@@ -18,12 +18,10 @@ from train.forecast.rig_forecast import (
     covariances,
     ellipsoid,
     forecast,
-    light,
     light_work,
     sample_work,
     work_of_take,
 )
-from train.simulation.room import RoomConfig
 from train.simulation.scenes import SceneMotion
 from train.simulation.training_frames import MovingObject
 
@@ -61,9 +59,14 @@ def moving_thing(take):
     return MovingObject(body.shape, pose_matrices(take.body_poses[:, 0]))
 
 
+def lit(scenes, rig):
+    """The scenes in the default room."""
+    return light_work({"calibration": scenes}, rig, rng=np.random.default_rng(2))["calibration"]
+
+
 def test_a_second_camera_at_the_same_place_can_go_and_others_cannot(work):
     rig = load_rig("figure5")
-    few = light(work[:2], rig, RoomConfig(), rng=np.random.default_rng(2))
+    few = lit(work[:2], rig)
     losses = camera_losses(few, rig)
     whole = forecast(few, rig)
     for number, loss in enumerate(losses):
@@ -71,9 +74,7 @@ def test_a_second_camera_at_the_same_place_can_go_and_others_cannot(work):
         others = np.delete(views, number, axis=1).sum(axis=1)
         assert loss.needed == pytest.approx((views[:, number] & (others < 2)).mean())
         assert loss.without.seen_by_two <= whole.seen_by_two
-    six = camera_losses(
-        light(work[:2], load_rig("six"), RoomConfig(), rng=np.random.default_rng(2)), load_rig("six")
-    )
+    six = camera_losses(lit(work[:2], load_rig("six")), load_rig("six"))
     assert min(one.needed for one in six) > max(one.needed for one in losses)
 
 
