@@ -35,7 +35,7 @@ from poses.shapes import gesture, make_valid
 from render import Backgrounds, ExposureConfig, RenderConfig, RenderedFrame
 from render.color_sensor import sample_exposure
 from render.formats.writer import open_writer
-from render.painting.figures import sample_people
+from render.painting.figures import sample_appearance
 from render.scenery.backgrounds import Background
 from render.scenery.lights import Lighting, sample_surroundings
 from render.skin.look import TONES
@@ -138,9 +138,9 @@ def photograph(
     """A picture of the hand, or of what is behind it."""
     qpos = case.qpos[None] if shown else np.full((1, len(case.qpos)), np.nan)
     hand = attach(load_layout("dense19"), case.model)
-    people = sample_people(1, False, tones=TONES[case.tone], rng=rng)
+    look = sample_appearance(False, tones=TONES[case.tone], rng=rng)
     config = RenderConfig(passes=("rgb", "ids", "depth"), painter="compiled")
-    studio = Studio([hand], people, config)
+    studio = Studio([hand], look, config)
     moment = Moment(Take.of_poses([hand], qpos[:, None], rate=60.0), 0)
     if shown:
         moment = studio.reaching(moment, [case.camera])

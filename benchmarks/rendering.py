@@ -28,7 +28,7 @@ from gloves import Take
 from handsim.app.workers import run_jobs
 from render import PictureStream, RenderConfig, RenderedFrame, ViewConfig
 from render.formats.writer import open_writer
-from render.painting.figures import sample_people
+from render.painting.figures import sample_appearance
 from render.painting.opengl import OPENGL_FROM_OPENCV, load_pyrender, offscreen_renderer
 from render.painting.rasterizer import join, rasterize
 from render.session import Drawing
@@ -178,9 +178,8 @@ def accuracy(frames: int) -> Figures:
 
 
 def bare_studio(take: Take) -> Studio:
-    rng = np.random.default_rng(0)
-    people = sample_people(len(take.hands), False, tones=ALL_TONES, rng=rng)
-    return Studio(take.hands, people, PLAIN)
+    look = sample_appearance(False, tones=ALL_TONES, rng=np.random.default_rng(0))
+    return Studio(take.hands, look, PLAIN)
 
 
 def main(frames: int = 200, save: str | None = None) -> None:

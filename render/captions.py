@@ -12,8 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 from scipy.optimize import isotonic_regression
 
-from handsim.errors import HandSimError
-from handsim.files.outputs import atomic_write
+from handsim.files.outputs import atomic_write, check_ending
 from handsim.hand.model import KEYPOINT_DIGITS, SKELETON, HandModel
 from handsim.hand.shape import BONES, DIGITS
 from handsim.hand.skin import vertex_normals
@@ -74,8 +73,7 @@ _PADDING: Final = 16  # between a picture and its texts [pixels]
 
 def write_png(path: str | Path, picture: Picture) -> None:
     """Write a picture as PNG."""
-    if Path(path).suffix.lower() != ".png":
-        raise HandSimError(f"{path}: expected a file name that ends in .png")
+    check_ending(Path(path), ".png")
     with atomic_write(path) as temporary:
         temporary.write_bytes(encode_png(picture))
 

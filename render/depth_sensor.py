@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from handsim._checks import check_choice
 from handsim.kernels import kernel
 from handsim.settings import Limits, Settings
-from handsim.space.camera import Camera, Lens, camera_matrix
+from handsim.space.camera import Camera
 from render.fields import normal_numbers, quantiles, random_words
-from render.frames import Flags, Floats, Integers
+from render.frames import Flags, Floats, Integers, at_rest
 
 _DOTS: Final = (-3, 0, 3)  # one pixel in nine is a dot, so that a window of 9 x 9 holds these
 _BYTES: Final = np.arange(256)
@@ -406,10 +406,10 @@ def apply_depth_noise(
 
 def _facing(normals: Floats, camera: Camera) -> Floats:
     """Cosines between normals and the rays that come back."""
-    (fx, _, cx), (_, fy, cy) = camera.K[:2].tolist()
     if camera.lens.kind == "pinhole":
+        (fx, _, cx), (_, fy, cy) = camera.K[:2].tolist()
         return np.asarray(_facing_pinhole(normals, fx, fy, cx, cy))
-    rays = _back(camera.size, (fx, fy, cx, cy), camera.lens)
+    rays = _back(at_rest(camera))
     cosines: Floats = rays[0] * normals[..., 0]
     cosines += rays[1] * normals[..., 1]
     cosines += rays[2] * normals[..., 2]
@@ -432,10 +432,9 @@ def _facing_pinhole(normals: Floats, fx: float, fy: float, cx: float, cy: float)
 
 
 @functools.lru_cache(maxsize=16)
-def _back(size: tuple[int, int], middle: tuple[float, float, float, float], lens: Lens) -> Floats:
+def _back(camera: Camera) -> Floats:
     """Directions (3, H, W) from what is seen to the camera."""
-    rays = np.nan_to_num(Camera("rays", size, camera_matrix(*middle), lens=lens).rays())
-    return np.ascontiguousarray(-np.moveaxis(rays, -1, 0), dtype=np.float32)
+    return np.ascontiguousarray(-np.moveaxis(np.nan_to_num(camera.rays()), -1, 0), dtype=np.float32)
 
 
 def reflectance_of(rgb: UInt8[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "H W"]:

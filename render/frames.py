@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final, NamedTuple
@@ -25,6 +26,11 @@ FOREARM: Final = NUM_BONES
 """Number of the forearm among a hand's parts, after those of its bones (`handsim.hand.shape.BONES`)."""
 PARTS_A_HAND: Final = 32
 """Part numbers per hand: a pixel of bone b of hand h has part 1 + b + 32 h; 0 is no hand."""
+
+
+def at_rest(camera: Camera) -> Camera:
+    """The camera in the origin and without a name: equal for all that share size, matrix and lens."""
+    return dataclasses.replace(camera, name="", T_world_camera=np.eye(4))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import cv2
 import numpy as np
@@ -14,8 +14,8 @@ from jaxtyping import Bool, Float, Int, UInt8
 from gloves.fit import GloveFit
 from gloves.layout import MarkerLayout
 from gloves.optics.visibility import visible_cameras
-from handsim.errors import ArgumentError, FileError
-from handsim.files.outputs import atomic_write, plain_path, unwritten, writing
+from handsim.errors import FileError
+from handsim.files.outputs import atomic_write, check_ending, plain_path, unwritten, writing
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import BONE_NAMES, SIZES
 from handsim.hand.skin import vertex_normals
@@ -43,7 +43,7 @@ from render.captions import (
 from render.frames import Doubles, Integers
 from render.painting.figures import MARKER_COLOR, Drawn, Material, ball_material, linear, sphere_surface
 from render.painting.painter import paint, put_before
-from render.painting.rasterizer import NEAR, Triangles, join, rasterize
+from render.painting.rasterizer import NEAR, Triangles, see
 from render.scenery.lights import STUDIO
 
 _BALL_LEVEL: Final = 3
@@ -160,7 +160,7 @@ def unoccluded(
     camera: Camera, hand: PosedHand, points: Float[np.ndarray, "N 3"], *, slack: float
 ) -> Bool[np.ndarray, "N"]:
     """Which points are in the picture with nothing more than `slack` [m] before them."""
-    depth = rasterize(camera, join([one.triangles for one in hand.surfaces()]), with_normals=False).depth
+    depth = see(camera, [one.triangles for one in hand.surfaces()], with_normals=False).depth
     column, row = np.floor(camera.project(points)).astype(int).T
     inside = (column >= 0) & (column < camera.size[0]) & (row >= 0) & (row < camera.size[1])
     first = depth[np.clip(row, 0, camera.size[1] - 1), np.clip(column, 0, camera.size[0] - 1)]
@@ -168,40 +168,37 @@ def unoccluded(
     return np.asarray(inside & (ahead > 0) & ((first == 0) | (ahead <= first + slack)))
 
 
-SUFFIX: Final = ".mp4"
 _SIZE: Final = (800, 600)  # [px]
 _CODEC: Final = "mp4v"  # part of every build of OpenCV
 _AHEAD: Final = (-0.62, 0.62, -0.48)  # direction of view, as the viewer's first look
 _TEXT: Final = (60, 60, 60)
 
 
-class ClipFrame(NamedTuple):
-    """One picture of a video."""
-
-    hands: Sequence[tuple[HandModel, Float[np.ndarray, "27"]]]
-    """Hands with their poses in the world [m, rad]."""
-    points: Float[np.ndarray, "N 3"]  # world [m]
-    colors: Float[np.ndarray, "N 3"]  # of the points, sRGB in [0, 1]
-    caption: str  # one line of text at the bottom
-
-
 def write_clip(
     path: Path,
-    frames: Iterable[tuple[object, ...]],
+    frames: Iterable[tuple[Any, ...]],
     *,
     rate: float,
     shown: Float[np.ndarray, "N 3"],
     radius: float,
 ) -> None:
-    """Write a video (.mp4) of frames with the fields of `ClipFrame`, whole or not at all.
+    """Write a video (.mp4), whole or not at all, with a view that shows some points in the world [m].
 
-    The view shows some points in the world [m]; points of frames have this radius [m].
+    A frame has pairs of hands and their poses (27,) [m, rad], where hands without a pose are left out; points
+    (N, 3) in the world [m], of this radius [m]; their colors (N, 3), sRGB in [0, 1]; and a line of text.
     """
-    if path.suffix.lower() != SUFFIX:
-        raise ArgumentError(f"cannot write a video as '{path}', expected a name that ends in {SUFFIX}")
+    check_ending(path, ".mp4", option="--video")
     view = view_along(np.array(_AHEAD), np.array([0.0, 0.0, 1.0]), shown, _SIZE)
-    pictures = (_draw_frame(ClipFrame(*frame), view, radius) for frame in frames)  # type: ignore[arg-type]
-    write_video(path, pictures, rate=rate, size=_SIZE)
+
+    def pictures() -> Iterator[Picture]:
+        for hands, points, colors, caption in frames:
+            posed = [PosedHand(model, qpos) for model, qpos in hands if np.isfinite(qpos).all()]
+            picture = draw_things(view, *posed, Balls(points, radius, colors))
+            place = (16, _SIZE[1] - 18)
+            cv2.putText(picture, caption, place, cv2.FONT_HERSHEY_SIMPLEX, 0.55, _TEXT, 1, cv2.LINE_AA)
+            yield picture
+
+    write_video(path, pictures(), rate=rate, size=_SIZE)
 
 
 def write_video(path: Path, pictures: Iterable[Picture], *, rate: float, size: tuple[int, int]) -> None:
@@ -226,15 +223,6 @@ def _check_written(path: Path) -> None:
             raise unwritten(path)
     finally:
         reader.release()
-
-
-def _draw_frame(frame: ClipFrame, view: Camera, radius: float) -> Picture:
-    """A picture of a frame; hands without a pose are left out."""
-    hands = [PosedHand(model, qpos) for model, qpos in frame.hands if np.isfinite(qpos).all()]
-    picture = draw_things(view, *hands, Balls(frame.points, radius, frame.colors))
-    place = (16, _SIZE[1] - 18)
-    cv2.putText(picture, frame.caption, place, cv2.FONT_HERSHEY_SIMPLEX, 0.55, _TEXT, 1, cv2.LINE_AA)
-    return picture
 
 
 FINGERS_UP: Final = np.array([1.0, 0.0, 0.0])

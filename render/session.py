@@ -40,7 +40,6 @@ from handsim.files.outputs import check_free, save_json
 from handsim.files.signals import Stopped, interrupts_bare
 from handsim.space.camera import Camera
 from handsim.space.rig import CameraRig, check_names
-from handsim.space.rig_formats import load_cameras
 from render.captions import contact_sheet, write_png
 from render.color_sensor import sample_exposure, sample_shutter
 from render.config import RenderConfig, SpawnKey
@@ -48,17 +47,9 @@ from render.depth_sensor import sample_depth_noise
 from render.formats.records import centered_K, without_colors
 from render.formats.shards import INDEX
 from render.formats.webdataset import TAR
-from render.formats.writer import (
-    CONFIG,
-    FORMATS,
-    WRITERS,
-    format_folder,
-    open_writer,
-    shard_files,
-    whole_shards,
-)
+from render.formats.writer import CONFIG, FORMATS, WRITERS, open_writers, shard_files, whole_shards
 from render.frames import Doubles, RenderedFrame
-from render.painting.figures import sample_people
+from render.painting.figures import sample_appearance
 from render.scenery.backgrounds import photo_files
 from render.scenery.lights import sample_surroundings
 from render.studio import FrameChoices, Moment, Studio
@@ -216,7 +207,7 @@ class Drawing:
             studio = self._open_studio(self.take.hands, rng=rng)
         kept: dict[int, FrameChoices] = {}
         for place, frame in numbered:
-            person = shard if cast is None else cast.person_in(frame, shard)
+            person = shard if cast is None or cast.person is None else int(cast.person[frame])
             if cast is not None:
                 studio = self._studio_of(person)
                 rng = SpawnKey.SHARD.rng(config.seed, shard, 0)  # all people of a shard are in one place
@@ -265,12 +256,12 @@ def open_studio(
     light: bool = False,
 ) -> Studio:
     """A studio of one person with random looks, whose wrists a `UserBody` may bend."""
-    people = sample_people(len(hands), config.dress == "glove", tones=config.tones, rng=rng)
+    look = sample_appearance(config.dress == "glove", tones=config.tones, rng=rng)
     if has_user:
-        straight = dataclasses.replace(people[0].forearm, flexion=0.0, deviation=0.0)
-        people = tuple(dataclasses.replace(one, forearm=straight) for one in people)
+        straight = dataclasses.replace(look.forearm, flexion=0.0, deviation=0.0)
+        look = dataclasses.replace(look, forearm=straight)
     colors = [tuple(rng.uniform(0.05, 0.9, 3).tolist()) for _ in bodies]
-    return Studio(hands, people, config, bodies, colors, light=light, film=film)
+    return Studio(hands, look, config, bodies, colors, light=light, film=film)
 
 
 def sample_choices(
@@ -390,11 +381,7 @@ def render_take(
         lost = frozenset(left_out_frames(output.folder))
         if not drew and _is_complete(output):
             return views * sum(frame not in lost for shard in shards for frame in shard)
-        merged = [
-            path
-            for name in formats
-            for path in open_writer(name, format_folder(output.folder, formats, name)).finish()
-        ]
+        merged = [path for one in open_writers(output.folder, formats) for path in one.finish()]
         drawn = [[frame for frame in shard if frame not in lost] for shard in shards]
         if not any(drawn):
             raise HandSimError(
@@ -418,7 +405,9 @@ def _draw_shards(
 ) -> bool:
     """Draw the missing shards and return whether there were any; `counts` are all shards' pictures."""
     output.fetch(INDEX, names_of=[f"*{TAR}"])
-    done, total = _finished(output, formats), sum(counts)
+    done, changed = whole_shards(output.folder, formats)  # object stores check their own
+    output.warn_of(changed, "are damaged (other checksums), and are drawn again")
+    total = sum(counts)
     count = sum(counts[number] for number in done if number < len(counts))
     todo = [number for number in range(len(counts)) if number not in done]
     tell = _Counter(output.folder, count, total, progress)
@@ -497,9 +486,8 @@ def _settings(drawing: Drawing, source: Source) -> dict[str, Any]:
     if drawing.config.view.cameras is None:
         del settings["view"]["cameras"]
     else:
-        own = drawing.config.view.cameras  # as given: `up` turns them when they are drawn again, too
-        cameras = load_cameras(own) if isinstance(own, str) else own
-        settings["view"]["cameras"] = [camera.record() for camera in cameras]
+        # as given: `up` turns them when they are drawn again, too
+        settings["view"]["cameras"] = [one.record() for one in drawing.config.view.own_cameras()]
     return settings if subject.poses is None else settings | {"poses": subject.poses}
 
 
@@ -537,13 +525,6 @@ def _check_space(out: Path, drawn: int, left: int) -> None:
     """Refuse to go on if the disk has no space for the other shards, at the size of those that are drawn."""
     needed = left * sum(file.stat().st_size for file in out.rglob("*") if file.is_file()) // drawn
     check_free(out, needed, f"the other {left} shards", "draw fewer frames (--every)", error=HandSimError)
-
-
-def _finished(output: Output, formats: Sequence[str]) -> frozenset[int]:
-    """The shards that need not be drawn; warns of damaged files. Object stores check their own."""
-    done, changed = whole_shards(output.folder, formats)
-    output.warn_of(changed, "are damaged (other checksums), and are drawn again")
-    return done
 
 
 def _is_complete(output: Output) -> bool:
@@ -594,8 +575,8 @@ def _render_shard(
     kept = list(counted()) if len(formats) > 1 else counted()
     record = out / checksums_name(shard)
     record.unlink(missing_ok=True)
-    for name in formats:
-        open_writer(name, format_folder(out, formats, name)).write(shard, kept)
+    for writer in open_writers(out, formats):
+        writer.write(shard, kept)
     notes = [out / name.format(f"{shard:05d}") for name in (_LEFT_OUT, _CUT_OFF)]
     there = {path.name: path for path in notes if path.is_file()}
     save_checksums(record, shard_files(out, formats, shard) | there)

@@ -27,13 +27,13 @@ from poses import PoseSampler, sample_poses
 from poses.shapes import load_sampler, mixed_angles
 from render.config import NEAR_SENSOR, RenderConfig, SpawnKey
 from render.depth_sensor import DepthSensor
+from render.formats.records import CENTER
 from render.frames import Doubles, HandTruth, Integers, RenderedFrame
 from render.session import configured, open_studio, sample_choices
 from render.studio import Moment, Studio
 from render.subject import Model, Subject, load_subject, models_of, source_of, subject_of_poses
 from render.viewpoints import around_hands, crop_around
 
-_CENTER: Final = 0.5  # COCO counts pixels from the first one's center, we count from its corner
 _FEWEST_KEYPOINTS: Final = 3  # least number of labeled keypoints of a hand that can be cut out
 _FREE: Final = 0.8  # share of the room around a hand in a picture that it is shifted within
 
@@ -78,7 +78,7 @@ def _hand(path: Path, name: str, label: dict[str, Any]) -> LabeledHand:
     photograph = next((one for one in places if one.is_file()), None)
     if photograph is None:
         raise DatasetError(f"{path}: no photograph {name} beside it or in its folder images")
-    pixels, flags = rows.reshape(-1, 3)[:, :2] + _CENTER, rows[2::3]
+    pixels, flags = rows.reshape(-1, 3)[:, :2] + CENTER, rows[2::3]
     side = label.get("side")
     return LabeledHand(
         photograph,

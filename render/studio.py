@@ -209,12 +209,12 @@ class Moment:
 
 
 class Studio:
-    """Draws moments of the same people and rigid bodies."""
+    """Draws moments of the same person and rigid bodies."""
 
     def __init__(
         self,
         hands: Sequence[GloveFit],
-        people: Sequence[Appearance],
+        look: Appearance,
         config: RenderConfig,
         bodies: Sequence[RigidBody] = (),
         body_colors: Sequence[tuple[float, float, float]] = (),
@@ -227,12 +227,10 @@ class Studio:
         self._config, self._passes, self._painter = config, set(config.passes), config.painter
         self._film = film  # whose pictures take the place of drawn colors
         self._light = light and film is None and config.painter == "compiled"
-        self._people = tuple(people)
-        self._looks = [dataclasses.asdict(look) for look in people]
+        self._look, self._people = look, [dataclasses.asdict(look)] * len(hands)
         first = np.cumsum([0, *(len(fit.attachment.points) for fit in hands)])
         self._hands = [
-            HandFigure(fit, look, first_marker=int(number))
-            for fit, look, number in zip(hands, people, first, strict=False)
+            HandFigure(fit, look, first_marker=int(number)) for fit, number in zip(hands, first, strict=False)
         ]
         self._bodies = [BodyFigure(body, color) for body, color in zip(bodies, body_colors, strict=True)]
         self._colors = tuple(body_colors)
@@ -240,8 +238,8 @@ class Studio:
 
     @property
     def skin(self) -> SkinLook | None:
-        """The people's skin; None where gloves hide it."""
-        return self._people[0].skin if self._people[0].glove is None else None
+        """The person's skin; None where gloves hide it."""
+        return self._look.skin if self._look.glove is None else None
 
     def photograph(
         self, moment: Moment, camera: Camera, choices: FrameChoices, *, recorded: bool = True
@@ -273,7 +271,7 @@ class Studio:
         if self._config.room_depth and self._film is None and {"depth", "normals"} & self._passes:
             _walls(camera, drawn, choices).put_behind(truth)
         if sensor is not None:
-            noisy_depth = self._noisy_depth(truth, rgb, present, camera, sensor, rng)
+            noisy_depth = self._noisy_depth(truth, rgb, len(present), camera, sensor, rng)
         asked = {"recorded": recorded, "openxr": self._config.openxr}
         hands = tuple(
             hand_truth(
@@ -349,7 +347,7 @@ class Studio:
         self,
         truth: Geometry,
         rgb: Bytes | None,
-        present: Sequence[int],
+        num_hands: int,
         camera: Camera,
         sensor: DepthNoise,
         rng: np.random.Generator,
@@ -359,9 +357,8 @@ class Studio:
         light = None
         if isinstance(sensor, TimeOfFlight):
             light = np.ones(truth.depth.shape, np.float32) if rgb is None else reflectance_of(rgb)
-            for index, number in enumerate(present):
-                if self._people[number].glove is None:
-                    light[truth.instances == index + 1] = self._people[number].skin.infrared
+            if self.skin is not None:
+                light[(truth.instances > 0) & (truth.instances <= num_hands)] = self.skin.infrared
         return apply_depth_noise(
             truth.depth, truth.normals, sensor, camera=camera, reflectance=light, rng=rng
         )
@@ -408,7 +405,7 @@ class Studio:
         if self._film is not None:
             return {"film": self._film.path.name}
         record = _as_record(dataclasses.replace(choices, seed=0)) | {"seed": choices.seed}
-        return {"people": self._looks, "body_colors": self._colors, **record}
+        return {"people": self._people, "body_colors": self._colors, **record}
 
 
 def _clearance(camera: Camera, drawn: Sequence[Drawn]) -> float:
@@ -440,7 +437,7 @@ def _walls(camera: Camera, drawn: Sequence[Drawn], choices: FrameChoices) -> Sur
     """What is behind the hands and bodies."""
     background = choices.background
     if choices.enclosure is not None:
-        return draw_surroundings(background, choices.enclosure, camera)
+        return draw_surroundings(background, choices.enclosure, camera, bright=False)
     return surroundings_of_picture(background, camera, level_behind(background.backdrop, camera, drawn))
 
 

@@ -59,24 +59,6 @@ class OwnPoses(NamedTuple):
     shapes: tuple[HandShape, ...] | None = None  # hands of the people; None if not given
 
 
-def read_pose_file(path: Path, sides: Sequence[Side] | None = None) -> tuple[OwnPoses, tuple[Side, ...]]:
-    """Poses and their sides from an `.npz` (docs/rendering.md) or a `.csv` of `handsim export`."""
-    if path.suffix.lower() == CSV:
-        table = read_joint_csv(path)
-        sides = tuple(sides or table.sides)
-        for side in sides:
-            if side not in table.sides:
-                raise CaptureError(f"{path}: {choices(side, table.sides, noun='hand')}")
-        qpos = table.qpos[:, [table.sides.index(side) for side in sides]]
-        arrays: dict[str, NDArray[Any]] = {"qpos": qpos, "times": table.times}
-    else:
-        arrays, sides = _arrays(path), tuple(sides or ("right",))
-    with errors_of(path, CaptureError):
-        poses = _own_poses(arrays, len(sides), _stored_shapes(arrays))
-    _tell_beyond(str(path), poses.qpos)
-    return poses, sides
-
-
 def _own_poses(
     arrays: Mapping[str, NDArray[Any]], num_hands: int, shapes: tuple[HandShape, ...] | None
 ) -> OwnPoses:
@@ -257,10 +239,6 @@ class Cast:
     """Number of the person in each frame; None for another person in every shard."""
     shapes: tuple[HandShape, ...] | None = None  # hands of the people; None for random adults
 
-    def person_in(self, frame: int, shard: int) -> int:
-        """Number of the person in a frame of a shard."""
-        return shard if self.person is None else int(self.person[frame])
-
     def rng(self, person: int) -> np.random.Generator:
         """A generator for a person's skin, the same in all frames."""
         return SpawnKey.PERSON.rng(self.seed, person, 1)
@@ -351,7 +329,7 @@ def source_of(
 
 
 def _holds_poses(path: Path) -> bool:
-    """Whether a file is one of `read_pose_file`, by the names of its arrays."""
+    """Whether a file has poses of a user's own, by the names of its arrays."""
     try:
         return bool({"qpos", "angles"} & set(_arrays(path)))
     except HandSimError:
@@ -419,15 +397,27 @@ def subject_of_poses(
 
 
 def _load_poses(file: PoseFile, seed: int) -> Subject:
-    poses, sides = read_pose_file(file.path, file.sides)
+    """The poses of an `.npz` (docs/rendering.md) or a `.csv` of `handsim export`."""
+    path = file.path
+    if path.suffix.lower() == CSV:
+        table = read_joint_csv(path)
+        sides = tuple(file.sides or table.sides)
+        for side in sides:
+            if side not in table.sides:
+                raise CaptureError(f"{path}: {choices(side, table.sides, noun='hand')}")
+        qpos = table.qpos[:, [table.sides.index(side) for side in sides]]
+        arrays: dict[str, NDArray[Any]] = {"qpos": qpos, "times": table.times}
+    else:
+        arrays, sides = _arrays(path), file.sides or ("right",)
+    with errors_of(path, CaptureError):
+        poses = _own_poses(arrays, len(sides), _stored_shapes(arrays))
+    _tell_beyond(str(path), poses.qpos)
     if poses.person is not None and file.people is not None:
         whose = "the hand of one person" if len(poses.shapes or ()) == 1 else "who is in each frame"
-        raise CaptureError(f"{file.path}: the file has {whose}; leave out --people")
-    record = {"sha256": checksum(file.path), "sides": list(sides), "people": file.people, "glove": file.glove}
+        raise CaptureError(f"{path}: the file has {whose}; leave out --people")
+    record = {"sha256": checksum(path), "sides": list(sides), "people": file.people, "glove": file.glove}
     models = tuple(HandModel.named("M", side=side) for side in sides)
-    return _posed(
-        file.path.name, poses, models, load_layout(file.glove), _cast(poses, file.people, seed), record
-    )
+    return _posed(path.name, poses, models, load_layout(file.glove), _cast(poses, file.people, seed), record)
 
 
 def _cast(poses: OwnPoses, people: int | None, seed: int) -> Cast:

@@ -218,7 +218,7 @@ class ViewConfig(Settings):
         given = self.changed(*_PLACING)
         if self.cameras is not None and given:
             raise ArgumentError(
-                f"the cameras are those of {self.own_cameras}; leave out the placement, the camera, the "
+                f"the cameras are those of {self.cameras_name}; leave out the placement, the camera, the "
                 "views, the share and the distance"
             )
         unused = [name for name in _UNUSED.get(self.placement, ()) if name in given]
@@ -238,11 +238,15 @@ class ViewConfig(Settings):
             )
 
     @property
-    def own_cameras(self) -> str:
+    def cameras_name(self) -> str:
         """What messages call your own cameras: their file, or their names."""
         if isinstance(self.cameras, tuple):
             return " ".join(camera.name for camera in self.cameras)
         return str(self.cameras)
+
+    def own_cameras(self) -> tuple[Camera, ...]:
+        """Your own cameras, from their file where it is given."""
+        return load_cameras(self.cameras) if isinstance(self.cameras, str) else self.cameras or ()
 
 
 class _Path(NamedTuple):
@@ -272,10 +276,9 @@ class Viewpoints:
         poses: Float[np.ndarray, "T 4 4"] | None = None,
     ) -> None:
         """Place the cameras; `poses` move the first of the user's own cameras."""
-        framing, own = Framing(take, user), config.cameras
-        if own is not None:
-            cameras = list(load_cameras(own) if isinstance(own, str) else own)
-            turn = rigid(upright(up), np.zeros(3)) if up != "z" else np.eye(4)
+        framing = Framing(take, user)
+        if config.cameras is not None:
+            cameras, turn = list(config.own_cameras()), rigid(upright(up), np.zeros(3))
             if up != "z":
                 cameras = [one.at(turn @ one.T_world_camera) for one in cameras]
             stay = (take.num_frames, 4, 4)
@@ -561,7 +564,7 @@ def check_hands_in_view(config: ViewConfig, viewpoints: Viewpoints, take: Take) 
     """Refuse the user's own cameras if none has a hand in its pictures, and warn of those that have none."""
     if config.cameras is None:
         return
-    cameras, name = viewpoints.cameras(0), config.own_cameras
+    cameras, name = viewpoints.cameras(0), config.cameras_name
     blind = list(cameras)
     for hand, qpos in zip(take.hands, np.swapaxes(take.qpos, 0, 1), strict=True):
         there = qpos[np.isfinite(qpos).all(axis=1)]

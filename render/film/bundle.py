@@ -42,30 +42,8 @@ class FoundFrame(NamedTuple):
     hands: Sequence[FoundHand] | None  # None where the detector did not look
 
 
-class Motion:
-    """Keypoints of a take's hands at any time."""
-
-    def __init__(self, take: Take) -> None:
-        self.times = take.times
-        self._points = take.keypoints()
-        self.sides = np.array([SIDES.index(side) for side in take.sides])
-
-    def at(self, times: Doubles, *which: Integers) -> Doubles:
-        """Keypoints (N, H, 21, 3) [m]; NaN where the take has none.
-
-        With numbers (N,) of hands, or of hands and keypoints, they are only those: (N, 21, 3) or (N, 3).
-        """
-        last = len(self.times) - 1
-        index = np.interp(times, self.times, np.arange(last + 1), np.nan, np.nan)
-        before = np.nan_to_num(index).astype(np.int64)
-        after = np.minimum(before + 1, last)
-        share = np.where(self.times[after] - self.times[before] > _MAX_GAP, np.nan, index - before)
-        first, second = self._points[before, *which], self._points[after, *which]
-        return np.asarray(first + share.reshape(-1, *(first.ndim - 1) * [1]) * (second - first))
-
-
 class Detections(NamedTuple):
-    """All detections of a video: D hands in F frames."""
+    """The detections of a video with enough keypoints: D hands in F frames."""
 
     times: Doubles  # (F,)
     looked: Integers  # (F,): the nearest frame in which hands were looked for
@@ -76,10 +54,15 @@ class Detections(NamedTuple):
 
     @classmethod
     def of(cls, found: Sequence[FoundFrame]) -> Detections:
-        """The detections in the frames of a video."""
+        """Those in the frames of a video."""
         looked = np.array([index for index, frame in enumerate(found) if frame.hands is not None])
         between = np.searchsorted(0.5 * (looked[1:] + looked[:-1]), np.arange(len(found)))
-        hands = [(index, hand) for index, frame in enumerate(found) for hand in frame.hands or ()]
+        hands = [
+            (index, hand)
+            for index, frame in enumerate(found)
+            for hand in frame.hands or ()
+            if (hand.scores >= _SURE).sum() >= FEWEST_KEYPOINTS
+        ]
         scores = np.array([hand.scores for _, hand in hands], dtype=np.float64).reshape(-1, NUM_KEYPOINTS)
         return cls(
             np.array([frame.time for frame in found]),
@@ -128,14 +111,22 @@ class Samples(NamedTuple):
 class Bundle:
     """Clock, lens and poses of a camera, from keypoints and outlines in its pictures."""
 
-    def __init__(
-        self, motion: Motion, found: Detections, size: tuple[int, int], given: Camera | None
-    ) -> None:
-        self.motion, self.size, self.given = motion, size, given
-        self._middle = float(np.median(found.times))
-        told = (found.weights > 0.0).sum(axis=1) >= FEWEST_KEYPOINTS
-        hands = {name: getattr(found, name)[told] for name in ("frames", "sides", "pixels", "weights")}
-        self.found = found._replace(**hands)
+    def __init__(self, take: Take, found: Detections, size: tuple[int, int], given: Camera | None) -> None:
+        self.take, self.found, self.size, self.given = take, found, size, given
+        self._points, self._middle = take.keypoints(), float(np.median(found.times))
+
+    def keypoints(self, times: Doubles, *which: Integers) -> Doubles:
+        """Keypoints (N, H, 21, 3) [m] at times in the take; NaN where it has none.
+
+        With numbers (N,) of hands and of keypoints, they are only those: (N, 3).
+        """
+        known = self.take.times
+        index = np.interp(times, known, np.arange(len(known)), np.nan, np.nan)
+        before = np.nan_to_num(index).astype(np.int64)
+        after = np.minimum(before + 1, len(known) - 1)
+        share = np.where(known[after] - known[before] > _MAX_GAP, np.nan, index - before)
+        first, second = self._points[before, *which], self._points[after, *which]
+        return np.asarray(first + share.reshape(-1, *(first.ndim - 1) * [1]) * (second - first))
 
     def clock(self, state: State) -> tuple[float, float]:
         """Offset [s] and drift of the take's time over the video's."""
@@ -171,7 +162,7 @@ class Bundle:
     def pictured(self, state: State) -> Doubles:
         """Where the camera sees the take's keypoints in each frame (F, H, 21, 2) [px]; NaN without a hand."""
         times = self.times(state)
-        return self.projected(state, np.arange(len(times)), self.motion.at(times))
+        return self.projected(state, np.arange(len(times)), self.keypoints(times))
 
     def match(self, state: State, gate: float) -> Matches:
         """The detections nearest to the hands of the take, within a median distance [px]."""
@@ -201,7 +192,7 @@ class Bundle:
         normals = np.tile(np.eye(2), (len(frames) // 2, 1)) * self.found.weights[which][:, None]
         return Samples(
             frames, self.found.pixels[which], normals, np.zeros((len(frames), 3)),
-            lambda times: self.motion.at(times, hands, keypoints),
+            lambda times: self.keypoints(times, hands, keypoints),
         )  # fmt: skip
 
     def solve(

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, NamedTuple, cast
+from typing import Any, Final, NamedTuple
 
 import cv2
 import numpy as np
@@ -73,10 +73,12 @@ class HandDetector:
     """
 
     def __init__(self, finder: bytes, keypoints: bytes) -> None:
+        networks = []
         for content in (finder, keypoints):
             if sign_model(content) != content:  # OpenCV may crash on damaged files
                 raise ValueError("the SHA-256 is another one")
-        self._finder, self._keypoints = _network(finder), _network(keypoints)
+            networks.append(cv2.dnn.readNetFromONNX(np.frombuffer(content, dtype=np.uint8)))
+        self._finder, self._keypoints = networks
         cells = FINDER_SIZE // CELL
         found = _run(self._finder, np.zeros((3, FINDER_SIZE, FINDER_SIZE), np.float32), ("cells",))
         told = _run(self._keypoints, np.zeros((3, CROP_SIZE, CROP_SIZE), np.float32), ("heat", "logits"))
@@ -109,9 +111,9 @@ class HandDetector:
         Raises:
             ArgumentError: The picture is no array of bytes with three channels.
         """
-        picture = _checked(image)
-        squares = [square_around(corners) for corners in self._places(picture)]
-        hands = [self._second_look(picture, self._look(picture, square)) for square in squares]
+        _check_picture(image)
+        squares = [square_around(corners) for corners in self._places(image)]
+        hands = [self._second_look(image, self._look(image, square)) for square in squares]
         boxes, sure = [hand.box.tolist() for hand in hands], [hand.confidence for hand in hands]
         return [hands[number] for number in cv2.dnn.NMSBoxes(boxes, sure, _LEAST_CONFIDENCE, _SAME)]
 
@@ -131,7 +133,7 @@ class HandDetector:
         Raises:
             ArgumentError: An argument has another shape, or a box no size.
         """
-        picture = _checked(image)
+        _check_picture(image)
         places = check_array("boxes", boxes, (4,)).reshape(-1, 4) if np.size(boxes) else np.empty((0, 4))
         if len(places) != len(sides):
             raise ArgumentError(
@@ -142,8 +144,8 @@ class HandDetector:
         found = []
         for box, side in zip(places, sides, strict=True):
             check_choice(side, SIDES, noun="side")
-            first = self._look(picture, square_around(np.array([box[:2], box[:2] + box[2:]])))
-            found.append(self._second_look(picture, first, side=side))
+            first = self._look(image, square_around(np.array([box[:2], box[:2] + box[2:]])))
+            found.append(self._second_look(image, first, side=side))
         return found
 
     def _places(self, picture: Bytes) -> list[Doubles]:
@@ -256,18 +258,12 @@ def peaks_of(heat: Floats) -> tuple[Doubles, Doubles]:
     return near @ places / scores[..., None], scores
 
 
-def _checked(image: object) -> Bytes:
+def _check_picture(image: Bytes) -> None:
     check_type("image", image, np.ndarray, "a picture (H, W, 3) of bytes")
-    picture = cast("Bytes", image)
-    if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] != 3 or not picture.size:
+    if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or not image.size:
         raise ArgumentError(
-            f"image is {picture.dtype} of shape {picture.shape}, expected uint8 of shape (H, W, 3), sRGB"
+            f"image is {image.dtype} of shape {image.shape}, expected uint8 of shape (H, W, 3), sRGB"
         )
-    return picture
-
-
-def _network(content: bytes) -> Any:
-    return cv2.dnn.readNetFromONNX(np.frombuffer(content, dtype=np.uint8))
 
 
 def _run(network: Any, picture: Floats, outputs: Sequence[str]) -> list[Floats]:

@@ -96,11 +96,12 @@ class _Outline(NamedTuple):
 
 
 class Outlines:
-    """Finds the edges of a take's hands in pictures of a video of this size."""
+    """Finds the edges of a take's hands in the pictures of a bundle's video."""
 
-    def __init__(self, take: Take, size: tuple[int, int]) -> None:
-        self._take, self._scale = take, min(1.0, _WIDEST / max(size))
-        self._size = round(self._scale * size[0]), max(1, round(self._scale * size[1]))
+    def __init__(self, bundle: Bundle) -> None:
+        self._bundle, (width, height), take = bundle, bundle.size, bundle.take
+        self._scale = min(1.0, _WIDEST / max(width, height))
+        self._size = round(self._scale * width), max(1, round(self._scale * height))
         self._skins = [PosableSkin(hand.model, bony=0.5) for hand in take.hands]
         self._bodies = [BodyFigure(body, (0.5, 0.5, 0.5)) for body in take.bodies]
         self._seen = np.zeros((len(take.hands), *3 * [_LEVELS]), np.float32)  # counts of the hands' colors
@@ -110,13 +111,14 @@ class Outlines:
         return np.asarray(cv2.resize(picture, self._size, interpolation=cv2.INTER_AREA))
 
     def edges(
-        self, bundle: Bundle, state: State, looks: Iterable[tuple[int, Bytes]], reach: float
+        self, state: State, looks: Iterable[tuple[int, Bytes]], reach: float
     ) -> tuple[Samples | None, Seen]:
         """Edges with unit normals within `reach` [widths] in numbered frames, and how well they are seen.
 
         None stands for no outline.
         """
-        take, times, cameras = self._take, bundle.times(state), bundle.cameras(state)
+        bundle, take = self._bundle, self._bundle.take
+        times, cameras = bundle.times(state), bundle.cameras(state)
         spans = state.spans(np.arange(len(times)))
         moments = shutter_times(take, times, [cameras[span] for span in spans], state.values[READOUT])
         qpos = np.stack([poses_at(take, moments + late) for late in (0.0, -_STEP, _STEP)], axis=2)
@@ -195,7 +197,7 @@ class Outlines:
 
         The hand's poses (3, 27) are those of the moment, of `_STEP` before it, and of `_STEP` after it.
         """
-        bones = self._take.hands[hand].model.forward_kinematics(qpos)[:, outline.bones]  # (3, N, 4, 4)
+        bones = self._bundle.take.hands[hand].model.forward_kinematics(qpos)[:, outline.bones]  # (3, N, 4, 4)
         now, step = bones[0], (bones[2] - bones[1]) / (2.0 * _STEP)
         local = np.einsum("nji,nj->ni", now[:, :3, :3], outline.points - now[:, :3, 3])
         return np.asarray(np.einsum("nij,nj->ni", step[:, :3, :3], local) + step[:, :3, 3])

@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from gloves.takes.take import Take
 from handsim.errors import HandSimError
+from handsim.hand.shape import SIDES
 from handsim.pages import coordinates
 from handsim.space.camera import Camera
 from render.film.bundle import (
@@ -32,7 +33,6 @@ from render.film.bundle import (
     Bundle,
     Detections,
     FoundFrame,
-    Motion,
     Samples,
     State,
 )
@@ -173,7 +173,7 @@ def register(
     A `given` camera has the lens of the video's. Without `pictures`, the frames, for the outlines of the
     hands, keypoints alone tell the camera, which are much coarser.
     """
-    bundle, width = Bundle(Motion(take), Detections.of(found), size, given), size[0]
+    bundle, width = Bundle(take, Detections.of(found), size, given), size[0]
     with_hands, looked = (len(np.unique(one)) for one in (bundle.found.frames, bundle.found.looked))
     if with_hands < _FEWEST_FRAMES:
         raise HandSimError(
@@ -187,7 +187,7 @@ def register(
     if pictures and len(state.starts) > 1:
         with contextlib.suppress(HandSimError):  # no camera that stood still fits
             still.append(_adjusted(bundle, start, splits=False)[0])
-    tried = [_outlined(bundle, take, one, pictures) for one in (*still, state)] if pictures else []
+    tried = [_outlined(bundle, one, pictures) for one in (*still, state)] if pictures else []
     if outlined := [one for one in tried if one is not None]:  # of a camera that stood still first
         away = np.array([fit.distances for *_, fit in outlined])
         away = np.nan_to_num(away[:, np.isfinite(away).any(axis=0)], nan=width).clip(max=_LEAST_BOUND * width)
@@ -235,7 +235,7 @@ def _adjusted(bundle: Bundle, state: State, *, splits: bool) -> tuple[State, Dou
 def _first_guess(bundle: Bundle) -> State:
     """Unknowns that explain most of what was found: clock by all shifts, pose by PnP."""
     gate, best, most = _GATE * bundle.size[0], None, 0.0
-    taken, filmed = bundle.motion.times, bundle.found.times
+    taken, filmed = bundle.take.times, bundle.found.times
     shifts = np.arange(taken[0] - filmed[-1], taken[-1] - filmed[0], _STEP)
     tried: list[float] = []
     # The best fits are computed again, because those of all shifts together would fill the memory.
@@ -264,14 +264,14 @@ def _affine_fit(bundle: Bundle, offset: float) -> tuple[float, Doubles, Doubles]
     It begins with the sides that the detector told, where the take has them, and then gives each detection to
     the hand that is nearest in the picture: a detector is often wrong about sides.
     """
-    found, motion = bundle.found, bundle.motion
+    found, sides = bundle.found, np.array([SIDES.index(side) for side in bundle.take.sides])
     some = np.unique(np.linspace(0, len(found.frames) - 1, _MOST_MATCHED).astype(int))
     pixels, weights = found.pixels[some], found.weights[some]
     times = found.times[found.frames[some]] + offset
-    points = np.nan_to_num(motion.at(times), nan=_NOWHERE)  # (N, H, 21, 3)
+    points = np.nan_to_num(bundle.keypoints(times), nan=_NOWHERE)  # (N, H, 21, 3)
     there = points[..., 0, 0] != _NOWHERE
     rows = np.concatenate([points, np.ones((*points.shape[:-1], 1))], axis=-1)
-    told = there & (motion.sides == found.sides[some, None])
+    told = there & (sides == found.sides[some, None])
     hand, each = np.where(told.any(axis=1), told.argmax(axis=1), there.argmax(axis=1)), np.arange(len(some))
     counts = there[each, hand].astype(float)
     for _ in range(_GUESSES):
@@ -315,23 +315,23 @@ def _posed(bundle: Bundle, offset: float, points: Doubles, pixels: Doubles) -> S
 
 
 def _outlined(
-    bundle: Bundle, take: Take, state: State, pictures: Callable[[], Iterable[Bytes]]
+    bundle: Bundle, state: State, pictures: Callable[[], Iterable[Bytes]]
 ) -> tuple[State, Doubles, _Fit] | None:
     """State, covariance and fit by the outlines of the hands; None where they are not seen."""
-    outlines, noise = Outlines(take, bundle.size), _FIRST_NOISE
+    outlines, noise = Outlines(bundle), _FIRST_NOISE
     shown = np.flatnonzero((bundle.match(state, _GATE * bundle.size[0]).numbers >= 0).any(axis=1))
     if not len(shown):
         return None
     chosen = set(shown[np.linspace(0, len(shown) - 1, _MOST_LOOKED).astype(int)].tolist())
     looks = [(n, outlines.shrunk(picture)) for n, picture in enumerate(pictures()) if n in chosen]
     for turn, reach in enumerate(_REACHES):
-        samples, _ = outlines.edges(bundle, state, looks, reach)
+        samples, _ = outlines.edges(state, looks, reach)
         if samples is None or len(samples.frames) < _FEWEST_EDGES * _FEWEST_FRAMES:
             return None
         state, _, covariance = bundle.solve(state, samples, noise, first=turn == 0)
         noise = max(0.3, float(np.median(np.abs(bundle.residuals(state, samples, 1.0)))) / 0.6745)
     every = ((n, outlines.shrunk(picture)) for n, picture in enumerate(pictures()))
-    _, seen = outlines.edges(bundle, state, every, _REACHES[1])
+    _, seen = outlines.edges(state, every, _REACHES[1])
     return state, covariance, _outline_fit(bundle, seen, _keypoint_fit(bundle, state))
 
 

@@ -51,6 +51,7 @@ from render.film.detector import (
     upright,
 )
 from render.film.network import FinderNetwork, KeypointNetwork
+from render.formats.records import encode_jpeg
 from render.frames import Bytes, Doubles, Floats
 from render.stream import PictureStream, load_labeled_hands, read_photograph
 
@@ -177,11 +178,10 @@ class Lesson(NamedTuple):
     sides: NDArray[np.int8]
 
     @classmethod
-    def of(cls, scene: Scene) -> Lesson:
+    def of(cls, picture: Bytes, keypoints: Doubles, sides: NDArray[np.int8]) -> Lesson:
         """A scene, compressed."""
-        bgr = cv2.cvtColor(scene.picture, cv2.COLOR_RGB2BGR)
-        file = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1]
-        return cls(np.asarray(file, dtype=np.uint8), scene.keypoints, scene.sides)
+        file = encode_jpeg(picture, quality=_QUALITY)
+        return cls(np.frombuffer(file, np.uint8), keypoints, sides)
 
     def picture(self) -> Bytes:
         """The decoded picture (H, W, 3) in sRGB."""
@@ -196,7 +196,7 @@ def lessons_of(scenes: Iterable[Scene], *, rng: np.random.Generator) -> tuple[li
         height, width = scene.picture.shape[:2]
         scale = VIEW_SIZE / max(height, width)
         small = cut(scene.picture, scale * np.eye(2, 3), (round(scale * width), round(scale * height)))
-        views.append(Lesson.of(Scene(small, scale * scene.keypoints, scene.sides)))
+        views.append(Lesson.of(small, scale * scene.keypoints, scene.sides))
         for number, points in enumerate(scene.keypoints):
             squares.append(_square(scene, points[np.isfinite(points[:, 0])], [number]))
         empty = _empty_place(scene, rng)
@@ -209,7 +209,7 @@ def _square(scene: Scene, points: Doubles, hands: list[int]) -> Lesson:
     """The square around points, with these hands."""
     matrix = square_around(points, WIDE_ROOM, WIDE)
     keypoints = scene.keypoints[hands] @ matrix[:, :2].T + matrix[:, 2]
-    return Lesson.of(Scene(cut(scene.picture, matrix, (WIDE, WIDE)), keypoints, scene.sides[hands]))
+    return Lesson.of(cut(scene.picture, matrix, (WIDE, WIDE)), keypoints, scene.sides[hands])
 
 
 def _empty_place(scene: Scene, rng: np.random.Generator) -> Doubles | None:

@@ -9,6 +9,7 @@ A dataset of InterHand2.6M is one capture, "0". Its cameras are called by numera
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import tempfile
 from collections.abc import Iterable, Iterator
@@ -34,7 +35,6 @@ from render.formats.records import (
     keypoint_flags,
     rounded,
     run_lengths,
-    shape_record,
     shifted_K,
     to_json,
     to_order,
@@ -103,7 +103,7 @@ def _hand_record(frame: RenderedFrame, number: int, hand: HandTruth) -> dict[str
         "side": hand.shape.side,
         "xyz": rounded(frame.camera.local(hand.keypoints_world), 9),
         "qpos": hand.qpos.tolist(),
-        "shape": shape_record(hand.shape),
+        "shape": dataclasses.asdict(hand.shape),
     }
     if len(hand.openxr):
         joints = np.linalg.inv(frame.camera.T_world_camera) @ hand.openxr

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from handsim.errors import HandSimError
 from handsim.files.outputs import atomic_write, plain_json, plain_path, unwritten
-from handsim.hand.shape import NUM_KEYPOINTS, HandShape, Side
+from handsim.hand.shape import NUM_KEYPOINTS, Side
 from handsim.kernels import kernel
 from handsim.space.camera import Camera
 from handsim.space.transforms import rotation_quaternions
@@ -125,12 +125,6 @@ def rigid_record(transform: Doubles) -> dict[str, list[float]]:
         "quaternion_wxyz": rotation_quaternions(transform[None, :3, :3])[0].tolist(),
         "translation_xyz": transform[:3, 3].tolist(),
     }
-
-
-def shape_record(shape: HandShape) -> dict[str, Any]:
-    """The fields of a `HandShape` as JSON."""
-    fields = {name: getattr(shape, name) for name in HandShape.__dataclass_fields__}
-    return {name: _listed(x) if isinstance(x, np.ndarray | np.generic) else x for name, x in fields.items()}
 
 
 def body_records(frame: RenderedFrame) -> list[dict[str, Any]]:

@@ -7,6 +7,7 @@ has four joint angles per digit and equal angles for mirrored poses, so that our
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import re
 from collections.abc import Iterable, Iterator, Sequence
@@ -32,7 +33,6 @@ from render.formats.records import (
     is_seen,
     rigid_record,
     rounded,
-    shape_record,
     to_json,
     to_order,
 )
@@ -145,7 +145,7 @@ def _truth(hand: HandTruth) -> dict[str, Any]:
     return {
         "keypoints": rounded(hand.keypoints_world, 9),
         "qpos": hand.qpos.tolist(),
-        "shape": shape_record(hand.shape),
+        "shape": dataclasses.asdict(hand.shape),
     }
 
 
@@ -219,7 +219,8 @@ class WebdatasetWriter:
                 for name, content in _sample(views):
                     add(f"{number:06d}.{name}", content)
                 for hand in views[0].hands:
-                    persons.setdefault(to_json({**shape_record(hand.shape), "side": None}), hand.shape)
+                    shape = dataclasses.asdict(hand.shape) | {"side": None}
+                    persons.setdefault(to_json(shape), hand.shape)
             if len(persons) == 1:  # a clip has room for one person
                 record = {"mano": [], "umetrack": umetrack_hand(*persons.values())}
                 add(HAND_SHAPES, to_json(record).encode())

@@ -33,7 +33,7 @@ from render.formats.shards import (
     save_index,
     shard_name,
 )
-from render.formats.webdataset import TAR, WebdatasetWriter, frame_record
+from render.formats.webdataset import WebdatasetWriter, frame_record
 from render.frames import RenderedFrame
 
 
@@ -88,25 +88,24 @@ WRITERS: Final = {
 FORMATS: Final = tuple(WRITERS)
 
 
-def format_folder(folder: Path, formats: Sequence[str], name: str) -> Path:
-    """The folder of one of a rendering's formats; each of several has its own."""
-    return folder if len(formats) == 1 else folder / name
-
-
 def open_writer(name: str, folder: str | Path) -> FrameWriter:
     """The writer of one of `FORMATS` into a folder."""
     check_choice(name, WRITERS, noun="format", error=HandSimError)
     return WRITERS[name].open(Path(folder))
 
 
+def open_writers(folder: Path, formats: Sequence[str]) -> list[FrameWriter]:
+    """The writers of a rendering's formats, each of several into a folder of its own."""
+    return [open_writer(name, folder if len(formats) == 1 else folder / name) for name in formats]
+
+
 def shard_files(folder: Path, formats: Sequence[str], shard: int) -> dict[str, Path]:
     """The files of a shard in all formats of a rendering by their names in its folder."""
-    found: dict[str, Path] = {}
-    for name in formats:
-        own = format_folder(folder, formats, name)
-        files = open_writer(name, own).files(shard).items()
-        found |= {(own / file).relative_to(folder).as_posix(): path for file, path in files}
-    return found
+    return {
+        (writer.folder / name).relative_to(folder).as_posix(): path
+        for writer in open_writers(folder, formats)
+        for name, path in writer.files(shard).items()
+    }
 
 
 def whole_shards(folder: Path, formats: Sequence[str]) -> tuple[frozenset[int], list[str]]:
@@ -114,9 +113,7 @@ def whole_shards(folder: Path, formats: Sequence[str]) -> tuple[frozenset[int], 
 
     All complete shards count in a folder of an earlier version, which wrote no checksums.
     """
-    done = frozenset.intersection(
-        *(open_writer(name, format_folder(folder, formats, name)).done() for name in formats)
-    )
+    done = frozenset.intersection(*(writer.done() for writer in open_writers(folder, formats)))
     if not any(folder.glob(CHECKSUMS)):
         return done, []
     whole, changed = [], []
@@ -184,13 +181,14 @@ def merge_renderings(folders: Sequence[str | Path], out: str | Path) -> int:
     count = sum(map(len, shards))
     if not count:
         raise HandSimError(f"{', '.join(map(str, parts))}: no finished shards of the format {formats[0]}")
-    for name in formats:
-        _merge_format(name, parts, shards, [one["take_frames"] for one in settings], formats, out)
-        open_writer(name, format_folder(out, formats, name)).finish()
+    frames = [one["take_frames"] for one in settings]
+    sources = (open_writers(folder, formats) for folder in parts)
+    for target, *own in zip(open_writers(out, formats), *sources, strict=True):
+        _merge_format(own, shards, frames, target)
+        target.finish()
     for number in range(count):
         save_checksums(out / checksums_name(number), shard_files(out, formats, number))
-    frames = sum(one["take_frames"] for one in settings)
-    save_json(out / CONFIG, {"formats": formats, "take_frames": frames, "merged": settings})
+    save_json(out / CONFIG, {"formats": formats, "take_frames": sum(frames), "merged": settings})
     return count
 
 
@@ -207,25 +205,17 @@ def _settings(folder: Path) -> dict[str, Any]:
 
 
 def _merge_format(
-    name: str,
-    folders: Sequence[Path],
-    shards: Sequence[Sequence[int]],
-    frames: Sequence[int],
-    formats: Sequence[str],
-    out: Path,
+    sources: Sequence[FrameWriter], shards: Sequence[list[int]], frames: Sequence[int], target: FrameWriter
 ) -> None:
     """Copy the shards of one format."""
     number, offset = 0, 0
-    target = open_writer(name, format_folder(out, formats, name))
-    for folder, chosen, count in zip(folders, shards, frames, strict=True):
-        source = open_writer(name, format_folder(folder, formats, name))
+    for source, chosen, count in zip(sources, shards, frames, strict=True):
         for shard in chosen:
-            with one_sentence(out, f"copying shard {shard} of {folder}"):
+            with one_sentence(target.folder, f"copying shard {shard} of {source.folder}"):
                 if isinstance(source, FolderWriter) and isinstance(target, FolderWriter):
                     _copy_folder(source, shard, target, number, offset)
                 else:
-                    start = format_folder(folder, formats, name) / f"{shard_name(shard)}{TAR}"
-                    end = format_folder(out, formats, name) / f"{shard_name(number)}{TAR}"
+                    (start,), (end,) = source.files(shard).values(), target.files(number).values()
                     _copy_tar(start, end, offset)
             number += 1
         offset += count

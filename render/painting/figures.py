@@ -99,11 +99,11 @@ def _unit_ball(level: int) -> trimesh.Trimesh:
 
 @dataclass(frozen=True, slots=True)
 class Appearance:
-    """Appearance of one hand."""
+    """Appearance of a person's hands: both have the same skin and the same sleeves."""
 
     skin: SkinLook
     forearm: Forearm
-    glove: GloveLook | None  # the marker glove on it, drawn with its markers; None for a bare hand
+    glove: GloveLook | None  # the marker gloves, drawn with their markers; None for bare hands
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -124,15 +124,13 @@ class Drawn:
         return self.triangles.faces if self.coarse_faces is None else self.coarse_faces
 
 
-def sample_people(
-    count: int, glove: bool, *, tones: Sequence[float], rng: np.random.Generator
-) -> tuple[Appearance, ...]:
-    """Hands of one person: both have the same skin and the same sleeves."""
+def sample_appearance(glove: bool, *, tones: Sequence[float], rng: np.random.Generator) -> Appearance:
+    """A random person, in gloves or bare."""
     skin, forearm = sample_skin_look(tones, rng=rng), sample_forearm(rng=rng)
-    cloth = sample_glove_look(rng=rng) if glove else None
-    if cloth is not None:
-        forearm = dataclasses.replace(forearm, cuff=cloth.cuff)
-    return (Appearance(skin, forearm, cloth),) * count
+    if not glove:
+        return Appearance(skin, forearm, None)
+    cloth = sample_glove_look(rng=rng)
+    return Appearance(skin, dataclasses.replace(forearm, cuff=cloth.cuff), cloth)
 
 
 class HandFigure:

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 
 from handsim.errors import ArgumentError
 from handsim.kernels import kernel
-from handsim.space.camera import Camera, Lens, camera_matrix
-from render.frames import Bytes, Doubles, Flags, Floats, Geometry, Integers
+from handsim.space.camera import Camera, camera_matrix
+from render.frames import Bytes, Doubles, Flags, Floats, Geometry, Integers, at_rest
 
 NEAR: Final = 0.01
 """Distance of the plane before the camera at which triangles are cut off [m]."""
@@ -321,7 +321,7 @@ def faces_for(camera: Camera) -> list[Camera]:
         return [camera]
     cameras = []
     for number, face in enumerate(_faces(camera)):
-        K = np.array([[face.focal, 0, face.center[0]], [0, face.focal, face.center[1]], [0, 0, 1.0]])
+        K = camera_matrix(face.focal, face.focal, *face.center)
         pose = camera.T_world_camera.copy()
         pose[:3, :3] = pose[:3, :3] @ face.rotation
         cameras.append(Camera(f"{camera.name}_face{number}", face.size, K, pose))
@@ -386,8 +386,7 @@ def _fill(whole: NDArray[Any], face: _Face, part: NDArray[Any]) -> None:
 
 
 def _faces(camera: Camera) -> tuple[_Face, ...]:
-    (fx, _, cx), (_, fy, cy) = camera.K[:2].tolist()
-    faces = _faces_of_lens(camera.size, (fx, fy, cx, cy), camera.lens)
+    faces = _faces_of_lens(at_rest(camera))
     if not faces or max(max(face.size) for face in faces) > 8192:
         largest = max((face.size for face in faces), default=(0, 0))
         raise ArgumentError(
@@ -398,10 +397,8 @@ def _faces(camera: Camera) -> tuple[_Face, ...]:
 
 
 @functools.lru_cache(maxsize=16)
-def _faces_of_lens(
-    size: tuple[int, int], middle: tuple[float, float, float, float], lens: Lens
-) -> tuple[_Face, ...]:
-    rays = Camera("rays", size, camera_matrix(*middle), lens=lens).rays()
+def _faces_of_lens(camera: Camera) -> tuple[_Face, ...]:
+    rays = camera.rays()
     known = np.isfinite(rays).all(axis=-1)
     rays = np.where(known[..., None], rays, 0.0)
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from handsim.kernels import kernel
 from handsim.space.camera import Camera
 from handsim.space.transforms import cross
-from render.color_sensor import GAMMA
+from render.color_sensor import GAMMA, light_of
 from render.frames import Doubles, Flags, Floats
 from render.painting.figures import Drawn
 from render.painting.rasterizer import NEAR, cut_off, nearest_faces, project
@@ -227,10 +227,7 @@ ROUGHEST: Final = np.float32(0.04)
 _EDGE: Final = np.float32(0.001)  # least cosine between a view and a normal
 _LEVELS: Final = 2048  # entries of the table of display values
 _PARTS: Final = np.float32(8.0)  # entries of the table of linear light per sRGB level
-_SRGB = np.arange(255 * int(_PARTS) + 1) / (255.0 * _PARTS)
-TO_LINEAR: Final = np.where(_SRGB <= 0.04045, _SRGB / 12.92, ((_SRGB + 0.055) / 1.055) ** 2.4).astype(
-    np.float32
-)
+TO_LINEAR: Final = light_of(np.arange(255 * int(_PARTS) + 1) / float(_PARTS)).astype(np.float32)
 """Linear light of sRGB values from 0 to 255 in eighths."""
 TO_DISPLAY: Final = (np.minimum(np.arange(_LEVELS + 1) / (_LEVELS - 1), 1.0) ** (2.0 / GAMMA)).astype(
     np.float32

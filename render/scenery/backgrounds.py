@@ -27,10 +27,10 @@ from handsim.errors import HandSimError, choices
 from handsim.files.inputs import check_regular
 from handsim.files.outputs import plain_path
 from handsim.kernels import kernel
-from handsim.space.camera import Camera, Lens, camera_matrix
+from handsim.space.camera import Camera, camera_matrix
 from render.color_sensor import GAMMA
 from render.fields import normal_numbers
-from render.frames import Bytes, Doubles, Flags, Floats, Geometry
+from render.frames import Bytes, Doubles, Flags, Floats, Geometry, at_rest
 from render.scenery.rooms import RoomLight, cast_room, draw_room, paint_tints
 
 MAP_SUFFIXES: Final = (".hdr", ".exr")
@@ -269,7 +269,7 @@ def sample_background(config: Backgrounds, *, rng: np.random.Generator) -> Backg
 
 def draw_background(background: Background, size: tuple[int, int]) -> Float32[np.ndarray, "H W 3"]:
     """The picture in linear light, 1 for full white."""
-    return enlarged(_coarse(background, size), size)
+    return enlarged(kept_background(background, size), size)
 
 
 def enlarged(picture: Float32[np.ndarray, "h w 3"], size: tuple[int, int]) -> Float32[np.ndarray, "H W 3"]:
@@ -282,14 +282,7 @@ def enlarged(picture: Float32[np.ndarray, "h w 3"], size: tuple[int, int]) -> Fl
 
 @functools.lru_cache(maxsize=2)  # each is drawn for its light, then behind the hands
 def kept_background(background: Background, size: tuple[int, int]) -> Float32[np.ndarray, "h w 3"]:
-    """The picture of `draw_background` before it is `enlarged`, read-only."""
-    picture = _coarse(background, size)
-    picture.setflags(write=False)
-    return picture
-
-
-def _coarse(background: Background, size: tuple[int, int]) -> Floats:
-    """The picture of `draw_background`, at half its size for kinds that are out of focus."""
+    """The picture of `draw_background`, read-only: half as large for kinds that are out of focus."""
     rng = np.random.default_rng(background.seed)
     first, second = (np.array(color, dtype=np.float32) for color in background.colors)
     halved = (max(2, size[0] // 2), max(2, size[1] // 2))
@@ -311,7 +304,9 @@ def _coarse(background: Background, size: tuple[int, int]) -> Floats:
         raise HandSimError(choices(background.kind, KINDS, noun="background"))
     if background.blur * height > 0.3:
         picture = cv2.GaussianBlur(picture, (0, 0), background.blur * height)
-    return np.asarray(np.clip(picture, 0.0, 1.0, dtype=np.float32))
+    picture = np.clip(picture, 0.0, 1.0, dtype=np.float32)
+    picture.setflags(write=False)
+    return np.asarray(picture)
 
 
 def _color(rng: np.random.Generator) -> tuple[float, float, float]:
@@ -557,27 +552,14 @@ def _corner(point: Doubles) -> Corner:
     return x, y, z
 
 
+@functools.lru_cache(maxsize=16)
 def draw_surroundings(
-    background: Background, enclosure: Enclosure, camera: Camera, *, bright: bool = False
+    background: Background, enclosure: Enclosure, camera: Camera, *, bright: bool
 ) -> Surroundings:
     """The box as a camera in it sees it, through any lens; cached for cameras that stand still."""
-    focal, pose = tuple(camera.K.ravel().tolist()), camera.T_world_camera.tobytes()
-    return _drawn(background, enclosure, camera.size, focal, camera.lens, pose, bright)
-
-
-@functools.lru_cache(maxsize=16)
-def _drawn(
-    background: Background,
-    enclosure: Enclosure,
-    size: tuple[int, int],
-    focal: tuple[float, ...],
-    lens: Lens,
-    pose: bytes,
-    bright: bool,
-) -> Surroundings:
-    T_world_camera, (rays, known) = np.frombuffer(pose).reshape(4, 4), _rays(size, focal, lens)
+    T_world_camera, (rays, known) = camera.T_world_camera, _rays(at_rest(camera))
     world = rays @ T_world_camera[:3, :3].T.astype(np.float32)
-    world, eye, shape = _sloping(world), T_world_camera[:3, 3], size[::-1]
+    world, eye, shape = _sloping(world), T_world_camera[:3, 3], camera.size[::-1]
     sigma = background.blur * shape[0]
     if background.kind == "room" or background.is_map:
         is_map = background.is_map
@@ -601,9 +583,9 @@ def _drawn(
 
 
 @functools.lru_cache(maxsize=4)
-def _rays(size: tuple[int, int], focal: tuple[float, ...], lens: Lens) -> tuple[Floats, Flags]:
+def _rays(camera: Camera) -> tuple[Floats, Flags]:
     """Rays (H W, 3) in a camera's axes, and where (H, W) the lens sees; elsewhere rays are arbitrary."""
-    rays = Camera("rays", size, np.reshape(focal, (3, 3)), lens=lens).rays()
+    rays = camera.rays()
     known = np.isfinite(rays).all(axis=-1)
     return np.where(known[..., None], rays, 1.0).reshape(-1, 3).astype(np.float32), known
 

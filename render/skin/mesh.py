@@ -444,15 +444,14 @@ class PosableSkin:
         transforms = self.model.forward_kinematics(qpos[None])
         return self.merged(transforms, self._flexion.shaped(self.rest, qpos[7:]))
 
-    def merged(self, transforms: Doubles, rest: Doubles | None = None) -> Doubles:
-        """Vertices (U, 3), of `rest` or given, in a pose of the bones' transforms (1, L, 4, 4) [m]."""
-        still = self.rest if rest is None else rest
-        moved = skin_frames(still, self._bones, self._weights, self.model.rest_transforms, transforms)
+    def merged(self, transforms: Doubles, rest: Doubles) -> Doubles:
+        """Vertices (U, 3) at rest in a pose of the bones' transforms (1, L, 4, 4) [m]."""
+        moved = skin_frames(rest, self._bones, self._weights, self.model.rest_transforms, transforms)
         return np.asarray(moved[0])
 
     def _rest_occlusion(self) -> Floats:
         """Occlusion of the flat hand; of a digit, only by itself and the palm, not by its neighbors."""
-        normals = vertex_normals(self.rest, self.faces)
+        normals = self._normals
         occluded = self._occluded(self.model.rest_transforms[None], self.rest, normals)
         capsules = self.model.capsules
         segments = capsules.posed(self.model.rest_transforms[None])[0]

@@ -16,7 +16,7 @@ from handsim.space.objects import load_object, named_object
 from poses import sample_poses
 from render import Pictures, draw
 from render.frames import FOREARM
-from render.painting.figures import BodyFigure, HandFigure, sample_people
+from render.painting.figures import BodyFigure, HandFigure, sample_appearance
 from render.painting.rasterizer import Triangles, join, rasterize
 from render.skin.look import ALL_TONES
 from render.studio import hand_truth
@@ -29,8 +29,8 @@ TIPS = np.arange(4, 21, 4)
 
 @pytest.fixture(scope="module")
 def figure() -> HandFigure:
-    people = sample_people(1, False, tones=ALL_TONES, rng=np.random.default_rng(0))
-    return HandFigure(attach(load_layout("dense19"), HandModel.named("M")), people[0], first_marker=0)
+    look = sample_appearance(False, tones=ALL_TONES, rng=np.random.default_rng(0))
+    return HandFigure(attach(load_layout("dense19"), HandModel.named("M")), look, first_marker=0)
 
 
 def cast(mesh: trimesh.Trimesh, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -163,7 +163,7 @@ def test_a_body_that_nothing_is_known_of_is_told(figure):
 
 
 def test_markers_stand_on_bases_that_reach_the_cloth():
-    glove = sample_people(1, True, tones=ALL_TONES, rng=np.random.default_rng(0))[0]
+    glove = sample_appearance(True, tones=ALL_TONES, rng=np.random.default_rng(0))
     layout = load_layout("dense19")
     figure = HandFigure(attach(layout, HandModel.named("M")), glove, first_marker=0)
     qpos = join_qpos(np.zeros((1, 20)))[0]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final, NamedTuple, cast
+from typing import Final, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -20,31 +20,23 @@ from gloves.layout import MarkerLayout
 from gloves.optics.reconstruction import OpticsConfig, reconstruct
 from gloves.takes.take import Take
 from handsim.errors import CaptureError
-from handsim.hand.model import BodyMotion
 from handsim.space.objects import MARKER_RADIUS
 from handsim.space.rig import FEWEST_CAMERAS, ROOM_CENTER, CameraRig
 from handsim.space.transforms import pose_matrices
 from train.simulation.room import (
     LightSources,
-    RoomConfig,
     SceneSight,
     label_false_points,
     sample_light_sources,
     usual_room,
 )
-from train.simulation.scenes import (
-    KINDS,
-    SIMULATED_KINDS,
-    Kind,
-    MovingObject,
-    SceneMotion,
-    sample_real_like_scene,
-)
+from train.simulation.scenes import KINDS, SIMULATED_KINDS, Kind, SceneMotion, sample_real_like_scene
 from train.simulation.takes import by_somebody, sample_scene
 from train.simulation.training_frames import (
     FrameScene,
     GenerateSettings,
     HandFrames,
+    MovingObject,
     observe_scene,
     sample_frame_scene,
     sample_hands,
@@ -55,7 +47,6 @@ HALF_SIDE: Final = 0.3
 """Half side of the default cube in which hands work [m]."""
 OPTICS: Final = OpticsConfig()
 """Noise of blobs and size of visible spots, equal in all rooms."""
-_REAL_LIKE: Final = "real-like"
 _MIN_FRAMES: Final = 12  # least number of successive frames that are used of a take
 _ROUND_TRIP: Final = (11.0, 14.0, 9.0)  # [s] time to walk through the volume and back along each axis
 _POSES_PER_PERSON: Final = 60
@@ -76,20 +67,17 @@ def sample_work(
     Hands work around the center of a volume [m]; people walk through a volume larger than their reach.
     """
     work: dict[str, list[SceneMotion]] = {}
-    for kind in (_REAL_LIKE, *KINDS):
+    kinds: tuple[Literal["real-like"] | Kind, ...] = ("real-like", *KINDS)
+    for kind in kinds:
         work[kind] = []
         for _ in range(people):
-            scene = _work_scene(kind, layout, num_frames, rng)
+            if kind == "real-like":
+                scene = by_somebody(kind, lambda: sample_real_like_scene(layout, num_frames, rng=rng))
+            else:
+                scene = sample_scene(kind, layout, num_frames, rng=rng)
             walk = _walk(scene.num_frames / scene.rate, scene.num_frames, sides, rng)
             work[kind].append(scene.moved(walk + center - ROOM_CENTER))
     return work
-
-
-def _work_scene(kind: str, layout: MarkerLayout, num_frames: int, rng: np.random.Generator) -> SceneMotion:
-    """A scene of a random person who can do this work."""
-    if kind != _REAL_LIKE:
-        return sample_scene(cast("Kind", kind), layout, num_frames, rng=rng)
-    return by_somebody(_REAL_LIKE, lambda: sample_real_like_scene(layout, num_frames, rng=rng))
 
 
 def _walk(
@@ -120,7 +108,7 @@ def work_of_take(take: Take, layout: MarkerLayout | None, num_frames: int) -> di
             for number, body in enumerate(take.bodies):
                 thing, poses = body.shape, take.body_poses[part, number]
                 if held is None and thing is not None and np.isfinite(poses).all():
-                    held = MovingObject(thing, BodyMotion(pose_matrices(poses), take.rate))
+                    held = MovingObject(thing, pose_matrices(poses))
             scenes.append(SceneMotion(hands, held, take.rate))
     if not scenes:
         raise CaptureError(
@@ -206,20 +194,14 @@ class LitScene(NamedTuple):
         return self._replace(sources=self.sources._replace(visible=visible))
 
 
-def light(
-    scenes: Sequence[SceneMotion], rig: CameraRig, room: RoomConfig, *, rng: np.random.Generator
-) -> list[LitScene]:
-    """Cast all lines of sight in a room; an `ArgumentError` if a camera is inside a hand."""
-    return [
-        LitScene(scene, sample_light_sources(SceneSight(scene, rig), room, rng=rng), room.optics)
-        for scene in scenes
-    ]
-
-
 def light_work(
     work: Mapping[str, Sequence[SceneMotion]], rig: CameraRig, *, rng: np.random.Generator
 ) -> dict[str, list[LitScene]]:
-    """Cast the lines of sight of scenes by kind of work, each in the default room of its kind."""
+    """Cast the lines of sight of scenes by kind of work, each in the default room of its kind.
+
+    Raises:
+        ArgumentError: A camera is inside a hand.
+    """
     lit: dict[str, list[LitScene]] = {}
     for kind, scenes in work.items():
         lit[kind] = []
@@ -227,7 +209,9 @@ def light_work(
             similar = kind if kind in SIMULATED_KINDS else "hand-pen"
             if similar != kind and scene.moving_object is None:
                 similar = "hand-hand" if len(scene.hands) > 1 else "single-hand"
-            lit[kind] += light([scene], rig, usual_room(similar), rng=rng)
+            room = usual_room(similar)
+            sources = sample_light_sources(SceneSight(scene, rig), room, rng=rng)
+            lit[kind].append(LitScene(scene, sources, room.optics))
     return lit
 
 

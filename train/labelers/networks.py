@@ -13,9 +13,10 @@ that was never trained on is labeled by its distances alone.
 from __future__ import annotations
 
 import copy
+import functools
 import math
 from dataclasses import dataclass
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 import torch
@@ -443,12 +444,22 @@ def batch_loss(
 
 
 def cnn_labeler(network: DeepLabelCNN, marker_names: tuple[str, ...]) -> CNNLabeler:
-    """The paper's network with trained weights as a labeler."""
-    batches = BatchNetwork(network.eval())
+    """The paper's network with trained weights as a labeler; its first batch copies it to the GPU, if any.
+
+    TF32 is off, so that labels differ from the CPU's only in near ties.
+    """
+    network.eval()
+
+    @functools.cache
+    def placed() -> tuple[nn.Module, torch.device]:
+        device, here = batch_device(), next(network.parameters()).device
+        return network if device == here else copy.deepcopy(network).to(device), device
 
     @torch.inference_mode()
     def positions(images: NDArray[np.float32]) -> NDArray[np.float32]:
-        return np.asarray(batches(torch.from_numpy(images)).cpu().numpy())
+        own, device = placed()
+        with labeling_threads(), torch.backends.cudnn.flags(enabled=True, allow_tf32=False):
+            return np.asarray(own(torch.from_numpy(images).to(device)).cpu().numpy())
 
     return CNNLabeler(positions, network.mean_hand.get(), network.config, marker_names)
 
@@ -464,24 +475,3 @@ def labeler_of(network: nn.Module, marker_names: tuple[str, ...]) -> Labeler:
 def batch_device() -> torch.device:
     """Device on which batches are labeled."""
     return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-
-
-class BatchNetwork:
-    """A trained network for batches; the first call copies it to the GPU, if there is one."""
-
-    def __init__(self, network: nn.Module) -> None:
-        self._network = network
-        self._placed: tuple[nn.Module, torch.device] | None = None
-
-    def __call__(self, *inputs: torch.Tensor) -> Any:
-        """Outputs of the network, on its device, for inputs on the CPU.
-
-        TF32 is off, so that labels differ from the CPU's only in near ties.
-        """
-        if self._placed is None:
-            device, here = batch_device(), next(self._network.parameters()).device
-            network = self._network if device == here else copy.deepcopy(self._network).to(device)
-            self._placed = network, device
-        network, device = self._placed
-        with labeling_threads(), torch.backends.cudnn.flags(enabled=True, allow_tf32=False):
-            return network(*(tensor.to(device) for tensor in inputs))

@@ -37,33 +37,6 @@ _P5, _P4, _P3 = np.float32(1.9875691500e-4), np.float32(1.3981999507e-3), np.flo
 _P2, _P1 = np.float32(4.1665795894e-2), np.float32(1.6666665459e-1)
 
 
-class TrainedSetLabeler:
-    """The set labeler with its own copy of weights and a prior of hands."""
-
-    def __init__(
-        self,
-        config: SetLabelerConfig,
-        weights: Weights,
-        prior: PosePrior | None,
-        marker_names: tuple[str, ...],
-    ) -> None:
-        self.prior = prior
-        self.marker_names = marker_names
-        self._scorer = CloudScorer(config, weights)
-
-    def label_frames(self, frames: Sequence[Float[np.ndarray, "N 3"]]) -> list[Labeling]:
-        """Label the points [m] of every frame, see `train.labelers.protocol.Labeler`."""
-        return [self._label(cloud) for cloud in check_clouds(frames)]
-
-    def _label(self, cloud: NDArray[np.float64]) -> Labeling:
-        """Label the points of one cloud [m]."""
-        if not len(cloud):
-            return Labeling(np.zeros(0, dtype=np.int64), np.zeros(0))
-        by_point, by_label = self._scorer.score(cloud)
-        check_output(by_label)
-        return Labeling(*match_scores(cloud, by_point, by_label, self.prior))
-
-
 class _Norm(NamedTuple):
     """Weights of the layer normalization in each of the D rounds of messages."""
 
@@ -102,10 +75,18 @@ class _Ends(NamedTuple):
     to_occluded_again: _Linear
 
 
-class CloudScorer:
-    """Scores single clouds with weights whose names and shapes are `weight_shapes`."""
+class TrainedSetLabeler:
+    """The set labeler with a prior of hands and its own copy of weights, see `weight_shapes`."""
 
-    def __init__(self, config: SetLabelerConfig, weights: Weights) -> None:
+    def __init__(
+        self,
+        config: SetLabelerConfig,
+        weights: Weights,
+        prior: PosePrior | None,
+        marker_names: tuple[str, ...],
+    ) -> None:
+        self.prior = prior
+        self.marker_names = marker_names
         self._sharpness = np.float32(-0.5 * ((config.num_distances - 1) / config.reach) ** 2)
         self._centers = _centers(config)
         weights = {name: np.asarray(one, dtype=np.float32) for name, one in weights.items()}
@@ -132,17 +113,24 @@ class CloudScorer:
             _linear(weights, [""], "to_occluded.2"),
         )
 
-    def score(
+    def label_frames(self, frames: Sequence[Float[np.ndarray, "N 3"]]) -> list[Labeling]:
+        """Label the points [m] of every frame, see `train.labelers.protocol.Labeler`."""
+        return [self._label(cloud) for cloud in check_clouds(frames)]
+
+    def _label(self, cloud: NDArray[np.float64]) -> Labeling:
+        """Label the points of one cloud [m]."""
+        if not len(cloud):
+            return Labeling(np.zeros(0, dtype=np.int64), np.zeros(0))
+        by_point, by_label = self.scores(cloud)
+        check_output(by_label)
+        return Labeling(*match_scores(cloud, by_point, by_label, self.prior))
+
+    def scores(
         self, points: Float[np.ndarray, "N 3"]
     ) -> tuple[Float32[np.ndarray, "N M+1"], Float32[np.ndarray, "M N+1"]]:
         """Log-probabilities of points and labels, as in `train.labelers.networks.LabelScores`."""
-        return _score(
-            np.ascontiguousarray(points, dtype=np.float64),
-            self._centers,
-            self._sharpness,
-            self._rounds,
-            self._ends,
-        )
+        cloud = np.ascontiguousarray(points, dtype=np.float64)
+        return _score(cloud, self._centers, self._sharpness, self._rounds, self._ends)
 
 
 def weight_shapes(config: SetLabelerConfig) -> dict[str, tuple[int, ...]]:

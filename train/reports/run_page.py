@@ -36,7 +36,7 @@ MODEL_CARD: Final = "README.md"
 UNKNOWN_LICENSE: Final = "unknown"
 """License in the card of weights whose owner has named none, as hubs of models call it."""
 _IN_WORDS: Final = {SEEN: SEEN, "clean": "where every marker is seen"}
-_KINDS: Final = {"set": "Set labeler", "cnn": "The paper's network"}
+_KINDS: Final = {"set": "A set labeler", "cnn": "The network of Han et al. 2018"}
 _MIN_SHARE: Final = 0.01  # [%] lower end of the confusions' color scale
 _MAX_WRITTEN: Final = 30  # largest number of classes for which cells have room for numbers
 
@@ -313,7 +313,6 @@ In Python, `train.load_labeler(folder).label_frames([points])`. The folder needs
 - Markers of this layout only; if moved by more than a centimeter they need a labeler of their own.
 - Computed in float32. In bfloat16, which some runtimes choose by themselves, labels change.
 """
-_CARD_KINDS: Final = {"set": "A set labeler", "cnn": "The network of Han et al. 2018"}
 _CARD_FIGURES: Final = {
     "slot_accuracy": "labels and gaps that are right",
     "point_accuracy": "points labeled right",
@@ -342,7 +341,7 @@ def model_card(card: dict[str, Any]) -> str:
         license=card["license"],
         layout=dataset["layout"]["name"],
         glove=GLOVE,
-        kind=_CARD_KINDS[card["train"]["labeler"]],
+        kind=_KINDS[card["train"]["labeler"]],
         version=card["handsim"],
         count=len(card["marker_names"]),
         markers=", ".join(card["marker_names"]),

@@ -138,7 +138,7 @@ class SceneSight:
             part[0][:] += moved
         held = self.scene.moving_object
         if held is not None:
-            pose, thing = held.motion.T_world_body, held.rigid_object
+            pose, thing = held.T_world_body, held.rigid_object
             rotation = pose[:, :3, :3]
             centers = np.einsum("tij,qj->tqi", rotation, thing.markers) + pose[:, None, :3, 3]
             parts.append((centers, np.einsum("tij,qj->tqi", rotation, thing.marker_normals)))
@@ -158,7 +158,7 @@ class SceneSight:
         held = self.scene.moving_object
         if held is None:
             return []
-        return [(MeshTree(held.rigid_object.vertices, held.rigid_object.faces), held.motion.T_world_body)]
+        return [(MeshTree(held.rigid_object.vertices, held.rigid_object.faces), held.T_world_body)]
 
     def free_of_hands(self, points: Float[np.ndarray, "T S 3"]) -> Bool[np.ndarray, "T S C"]:
         """Which cameras see points [m] that are not hidden by a hand's capsules."""
@@ -265,7 +265,7 @@ def mirror_images(
     parts: list[LightSources] = []
     if sight.scene.moving_object is None:
         return parts
-    pose = sight.scene.moving_object.motion.T_world_body
+    pose = sight.scene.moving_object.T_world_body
     rotation, translation = pose[:, :3, :3], pose[:, :3, 3]
     for patch in sight.scene.moving_object.rigid_object.shiny:
         point, normal = rotation @ patch[:3] + translation, rotation @ patch[3:6]
@@ -288,7 +288,7 @@ def stray_reflections(
         for hand, bones in zip(scene.hands, sight.T_world_bone, strict=True)
     ]
     if scene.moving_object is not None:
-        carriers.append((scene.moving_object.motion.T_world_body, np.zeros(3)))
+        carriers.append((scene.moving_object.T_world_body, np.zeros(3)))
     parts = []
     for pose, middle in carriers:
         positions, visible = sample_strays(
@@ -306,22 +306,11 @@ def record_take(
     *,
     rng: np.random.Generator,
 ) -> Take:
-    """Record a scene with an optical system, as a take with its truth and these settings."""
-    sources = sample_light_sources(SceneSight(scene, rig), config, rng=rng)
-    return pack_take(scene, sources, rig, config, settings, rng=rng)
+    """Record a scene with an optical system, as a take with its truth and these settings.
 
-
-def pack_take(
-    scene: SceneMotion,
-    sources: LightSources,
-    rig: CameraRig,
-    config: RoomConfig,
-    settings: dict[str, Any],
-    *,
-    rng: np.random.Generator,
-) -> Take:
-    """A take of points triangulated from light sources, in random columns and with random IDs."""
-    optics = config.optics
+    The points are in random columns and have random IDs.
+    """
+    optics, sources = config.optics, sample_light_sources(SceneSight(scene, rig), config, rng=rng)
     found = reconstruct(
         sources.positions, sources.visible, rig, optics, radii=sources.radii, continuous=True, rng=rng
     )
@@ -349,7 +338,7 @@ def pack_take(
         truth,
         rate=scene.rate,
         bodies=() if thing is None else (RigidBody.of(thing),),
-        body_poses=None if held is None else transform_poses(held.motion.T_world_body)[:, None],
+        body_poses=None if held is None else transform_poses(held.T_world_body)[:, None],
         settings=settings,
     )
 

@@ -17,8 +17,7 @@ from handsim.errors import ArgumentError, PoseError
 from handsim.hand.model import BodyMotion, HandModel, HandMotion, join_qpos
 from handsim.hand.shape import EVERYBODY, NUM_JOINTS, SIDES
 from handsim.settings import Limits, Settings
-from handsim.space.objects import RigidObject, named_object
-from handsim.space.rig import CameraRig
+from handsim.space.objects import named_object
 from poses.motion import (
     MotionConfig,
     angles_through,
@@ -32,7 +31,7 @@ from poses.object_motion import keep_apart, point_pen, pointing_path, sample_obj
 from poses.shapes import gesture, make_valid
 from poses.touch import FINGERS, touching_angles
 from poses.two_hands import sample_two_hand_motion
-from train.simulation.training_frames import move_skin, sample_hands, wear_gloves
+from train.simulation.training_frames import MovingObject, move_skin, sample_hands, wear_gloves
 
 Kind = Literal["single-hand", "hand-hand", "hand-pen", "hand-controller"]
 """A kind of capture: what the hands do (section 5 of Han et al. 2018)."""
@@ -51,14 +50,6 @@ _RETREAT_DIRECTION: Final = np.array([1.0, 0.0, 0.0])  # in which the right hand
 _PAUSE_BETWEEN_CONTACTS: Final = (2.0, 4.0)  # [s]
 _WRIST_ROTATION: Final = 0.5  # [rad] standard deviation about each axis
 _FREE_SCRIPT, _RESTING_SCRIPT = "piano", "typing"
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class MovingObject:
-    """An object and its path through the room."""
-
-    rigid_object: RigidObject
-    motion: BodyMotion
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,8 +75,7 @@ class SceneMotion:
         hands = tuple(GlovedHand(hand.fit, hand.qpos[::times]) for hand in self.hands)
         held = self.moving_object
         if held is not None:
-            motion = BodyMotion(held.motion.T_world_body[::times], held.motion.rate)
-            held = dataclasses.replace(held, motion=motion)
+            held = MovingObject(held.rigid_object, held.T_world_body[::times])
         return SceneMotion(hands, held, self.rate)
 
     def moved(self, offsets: Float[np.ndarray, "*T 3"]) -> SceneMotion:
@@ -97,9 +87,8 @@ class SceneMotion:
             hands.append(GlovedHand(hand.fit, qpos))
         held = self.moving_object
         if held is not None:
-            poses = held.motion.T_world_body.copy()
-            poses[:, :3, 3] += offsets
-            held = dataclasses.replace(held, motion=BodyMotion(poses, held.motion.rate))
+            held = MovingObject(held.rigid_object, held.T_world_body.copy())
+            held.T_world_body[:, :3, 3] += offsets
         return dataclasses.replace(self, hands=tuple(hands), moving_object=held, others=None)
 
 
@@ -129,7 +118,8 @@ def sample_scene_motion(
     else:
         direction = np.tile(_RETREAT_DIRECTION, (num_frames, 1))
         holding, body = keep_apart(right.model, left.model, rigid_object, held, other, direction)
-    return SceneMotion(_gloved(fits, (holding, other), num_frames), MovingObject(rigid_object, body))
+    hands = _gloved(fits, (holding, other), num_frames)
+    return SceneMotion(hands, MovingObject(rigid_object, body.T_world_body))
 
 
 def _free_hand(
@@ -153,6 +143,7 @@ def _gloved(
 # A calibration capture.
 _MAX_DRAWS: Final = 20
 _STARTS: Final = ("pinch_pad", "pinch_tip")  # gestures before touches
+_TURNING: Final = 0.7  # [rad] standard deviation of the wrist's rotation about each axis
 _JITTER: Final = np.deg2rad(8.0)  # [rad] standard deviation of these gestures' joint angles
 _TOUCHING: Final = MotionConfig(durations=(0.4, 0.8), hold=0.8)
 _FREE: Final = MotionConfig(durations=(0.3, 0.9), hold=0.2)
@@ -160,16 +151,12 @@ _FREE: Final = MotionConfig(durations=(0.3, 0.9), hold=0.2)
 
 @dataclass(frozen=True, slots=True)
 class CalibrationTakeConfig(Settings):
-    """Exercises of a calibration capture, and the cameras that record it."""
+    """Exercises of a calibration capture."""
 
     free: Annotated[float, Limits(0.0, above=True)] = 40.0
     """Duration of free motion [s]."""
     rounds: Annotated[int, Limits(0)] = 3
     """Number of rounds in which the thumb touches each of the other fingertips."""
-    rig: CameraRig | str = "figure5"
-    """Camera rig: a shipped name, the path of a .toml file, or the rig itself."""
-    turning: Annotated[float, Limits(0.0)] = 0.7
-    """Standard deviation of the wrist's rotation about each axis [rad]."""
 
 
 def sample_calibration_scene(
@@ -183,7 +170,7 @@ def sample_calibration_scene(
     moving = []
     for fit, part, offset in zip(hands, angles, (_HAND_OFFSET, -_HAND_OFFSET), strict=False):
         position, quaternion = wrist_path(
-            frames, _FREE.rate, center=(offset, 0.0, 1.1), volume=_VOLUME, turning=config.turning, rng=rng
+            frames, _FREE.rate, center=(offset, 0.0, 1.1), volume=_VOLUME, turning=_TURNING, rng=rng
         )
         qpos = join_qpos(part[:frames], position=position, quaternion=quaternion)
         moving.append(GlovedHand(fit, qpos))

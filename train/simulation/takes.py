@@ -129,12 +129,10 @@ def simulate_take(
 
 
 def simulate_calibration(
-    hands: tuple[GloveFit, ...], config: CalibrationTakeConfig | None = None, *, rng: np.random.Generator
+    hands: tuple[GloveFit, ...], config: CalibrationTakeConfig, *, rng: np.random.Generator
 ) -> Take:
-    """A calibration capture of one or both of the given hands in their gloves."""
-    config = config or CalibrationTakeConfig()
-    scene = sample_calibration_scene(hands, config, rng=rng)
-    rig = load_rig(config.rig)
+    """A calibration capture of one or both of the given hands in their gloves, before the rig figure5."""
+    scene, rig = sample_calibration_scene(hands, config, rng=rng), load_rig("figure5")
     settings = {"kind": "calibration", **config.record(), "rig": rig_setting(rig)}
     return record_take(scene, rig, RoomConfig(), settings, rng=rng)
 

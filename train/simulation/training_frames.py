@@ -120,13 +120,21 @@ class FrameSource(NamedTuple):
     sampler: PoseSampler | None = None
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class MovingObject:
+    """An object, and where it is in each frame."""
+
+    rigid_object: RigidObject
+    T_world_body: Float[np.ndarray, "T 4 4"]
+    """Poses [m]."""
+
+
 class FrameScene(NamedTuple):
     """Unrelated frames of one or two hands, and perhaps an object."""
 
     hands: tuple[HandModel, ...]
     qpos: tuple[Float[np.ndarray, "T 27"], ...]
-    rigid_object: RigidObject | None = None
-    T_world_object: Float[np.ndarray, "T 4 4"] | None = None
+    held: MovingObject | None = None
 
 
 class HandFrames(NamedTuple):
@@ -313,7 +321,8 @@ def sample_holding_hand(
     position = settings.center + rng.uniform(-settings.volume, settings.volume, size=(num_frames, 3))
     quaternion = random_quaternions(num_frames, rng=rng)
     qpos = join_qpos(angles, position=position, quaternion=quaternion)
-    return FrameScene((model,), (qpos,), rigid_object, pose_matrices(qpos[:, :7]) @ T_wrist_object)
+    held = MovingObject(rigid_object, pose_matrices(qpos[:, :7]) @ T_wrist_object)
+    return FrameScene((model,), (qpos,), held)
 
 
 def observe_scene(
@@ -340,9 +349,9 @@ def observe_scene(
     segments = np.concatenate(posed, axis=1)
     radii = np.concatenate([fit.model.capsules.radii for fit in fits])
     visible = visible_cameras(markers, normals, rig, segments, radii)
-    if scene.rigid_object is not None and scene.T_world_object is not None:
-        tree = _mesh_tree(scene.rigid_object.name)
-        visible = clear_of_body(tree, scene.T_world_object, markers, rig.positions, visible)
+    if scene.held is not None:
+        tree = _mesh_tree(scene.held.rigid_object.name)
+        visible = clear_of_body(tree, scene.held.T_world_body, markers, rig.positions, visible)
     radii_worn = np.array([optics.radius_of(fit.layout.radius) for fit in fits])
     sizes = np.repeat(radii_worn, [centers.shape[1] for centers, _ in worn])
     found = reconstruct(markers, visible, rig, optics, radii=sizes, continuous=False, rng=rng)

@@ -9,7 +9,7 @@ import tyro
 from handsim.cli.parsing import registry
 from handsim.cli.render import RenderOptions
 from render import DepthSensor, RenderConfig
-from render.painting.figures import sample_people
+from render.painting.figures import sample_appearance
 from render.skin.look import TONES
 
 
@@ -33,7 +33,7 @@ def test_named_tones_are_drawn_and_no_others(names: str, tones: tuple[float, ...
     config = parsed("--tones", *names.split())
     assert config.tones == tones
     rng = np.random.default_rng(4)
-    angles = [sample_people(1, False, tones=config.tones, rng=rng)[0].skin.typology_angle for _ in range(200)]
+    angles = [sample_appearance(False, tones=config.tones, rng=rng).skin.typology_angle for _ in range(200)]
     ends = [TONES[name.replace("-", " ")] for name in set(names.split())]
     for low, high in ends:
         share = np.mean([low <= angle <= high for angle in angles])

@@ -18,7 +18,7 @@ from handsim.hand.shape import SIDES, Side
 from handsim.space.camera import pinhole
 from poses.shapes import gesture
 from render.color_sensor import light_of
-from render.painting.figures import Drawn, HandFigure, Material, sample_people
+from render.painting.figures import Drawn, HandFigure, Material, sample_appearance
 from render.painting.painter import Painter, paint, put_before
 from render.painting.rasterizer import rasterize
 from render.scenery.lights import Lamp, Lighting, sample_lighting, surround
@@ -184,7 +184,7 @@ def test_a_rolled_camera_and_the_faces_of_a_lens_see_the_same_shading() -> None:
 def hand(side: Side, tone: str, seed: int) -> tuple[Camera, list[Drawn]]:
     rng = np.random.default_rng(seed)
     model = HandModel.named("M", side=side)
-    look = sample_people(1, False, tones=TONES[tone], rng=rng)[0]
+    look = sample_appearance(False, tones=TONES[tone], rng=rng)
     qpos = join_qpos(gesture("relaxed")[None])
     figure = HandFigure(attach(load_layout("dense19"), model), look, first_marker=0)
     eye = rng.normal(size=3)

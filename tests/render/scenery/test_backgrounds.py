@@ -58,6 +58,7 @@ def test_backgrounds_repeat_and_differ(kind: str) -> None:
     assert picture.dtype == np.float32
     assert picture.min() >= 0.0
     assert picture.max() <= 1.0
+    kept_background.cache_clear()
     assert picture.tobytes() == draw_background(again, SIZE).tobytes()
     assert np.abs(picture - draw_background(other, SIZE)).max() > 0.01
     values = json.loads(json.dumps(dataclasses.asdict(first)))
@@ -183,7 +184,7 @@ def looked_up(picture: np.ndarray, pixels: np.ndarray) -> np.ndarray:
 def test_two_cameras_see_one_place(kind: str, camera: str) -> None:
     box = enclose(POSITIONS, 5, LAMP)
     first, second = pair(camera)
-    one, two = (draw_surroundings(background(kind), box, view) for view in (first, second))
+    one, two = (draw_surroundings(background(kind), box, view, bright=False) for view in (first, second))
     pixels, depth, inside = seen_twice(first, second, one.depth)
     assert inside.mean() > (0.5 if camera == "vga" else 0.3)
     there = looked_up(two.depth, pixels)
@@ -199,7 +200,7 @@ def test_two_cameras_see_one_place(kind: str, camera: str) -> None:
 def test_an_empty_box_is_where_it_says() -> None:
     box = Enclosure((-1.0, -2.0, 0.0), (2.0, 1.5, 2.5), ((-0.5,) * 3, (0.5,) * 3), (0.0, 0.0, 2.0))
     camera = preset("vga").at(look_at(np.array([0.0, 0.0, 1.2]), np.array([0.5, 0.9, 1.0])))
-    seen = draw_surroundings(background("gradient"), box, camera)
+    seen = draw_surroundings(background("gradient"), box, camera, bright=False)
     rays = camera.rays()
     points = rays / rays[..., 2:] * seen.depth[..., None]
     world = points @ camera.T_world_camera[:3, :3].T + camera.T_world_camera[:3, 3]
@@ -254,7 +255,7 @@ def test_furniture_keeps_away_from_hands_and_cameras() -> None:
     for seed in range(8):
         box = enclose(POSITIONS, seed, LAMP)
         for camera in pair("headset_fisheye"):
-            seen = draw_surroundings(background("room", seed), box, camera)
+            seen = draw_surroundings(background("room", seed), box, camera, bright=False)
             ahead = seen.depth > 0.0
             assert (seen.depth[ahead] / camera.rays()[ahead][:, 2]).min() > 0.4
             assert (np.array(box.low) < POSITIONS.min(axis=0) - 0.7).all()
@@ -297,5 +298,5 @@ def test_a_rig_sees_photographs_on_the_walls(tmp_path) -> None:
     photo = dataclasses.replace(background("photo"), photo=str(file))
     rig = load_rig("six")
     box = enclose(np.concatenate([rig.positions, MIDDLE[None]]), 0, LAMP)
-    seen = draw_surroundings(photo, box, preset("vga").at(rig.T_world_camera[0]))
+    seen = draw_surroundings(photo, box, preset("vga").at(rig.T_world_camera[0]), bright=False)
     assert seen.rgb.min() < 60 and seen.rgb.max() > 200 and (seen.depth > 0.5).all()

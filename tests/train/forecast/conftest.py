@@ -8,8 +8,7 @@ import pytest
 from gloves import load_layout
 from handsim import load_rig
 from handsim.space.rig import ROOM_CENTER
-from train.forecast.rig_forecast import light, sample_work
-from train.simulation.room import RoomConfig
+from train.forecast.rig_forecast import light_work, sample_work
 
 SIDES = np.full(3, 0.6)
 
@@ -23,4 +22,4 @@ def work():
 
 @pytest.fixture(scope="session")
 def six_lit(work):
-    return light(work, load_rig("six"), RoomConfig(), rng=np.random.default_rng(1))
+    return light_work({"calibration": work}, load_rig("six"), rng=np.random.default_rng(1))["calibration"]

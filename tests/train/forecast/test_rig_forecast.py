@@ -10,7 +10,6 @@ from gloves.captures.capture import run_lengths
 from gloves.optics.reconstruction import reconstruct
 from handsim import load_rig, look_at
 from handsim.errors import CaptureError
-from handsim.hand.model import BodyMotion
 from handsim.space.transforms import pose_matrices
 from tests.rigs import mixed_rig, square_rig
 from train import simulate_take
@@ -19,13 +18,12 @@ from train.forecast.rig_forecast import (
     covariances,
     ellipsoid,
     forecast,
-    light,
     light_work,
     sample_work,
     work_of_take,
 )
-from train.simulation.room import RoomConfig
-from train.simulation.scenes import MovingObject, SceneMotion
+from train.simulation.scenes import SceneMotion
+from train.simulation.training_frames import MovingObject
 
 
 def test_shares_are_those_of_the_lines_of_sight(six_lit):
@@ -58,12 +56,17 @@ def moving_thing(take):
     body = take.bodies[0] if take.bodies else None
     if body is None:
         return None
-    return MovingObject(body.shape, BodyMotion(pose_matrices(take.body_poses[:, 0]), take.rate))
+    return MovingObject(body.shape, pose_matrices(take.body_poses[:, 0]))
+
+
+def lit(scenes, rig):
+    """The scenes in the default room."""
+    return light_work({"calibration": scenes}, rig, rng=np.random.default_rng(2))["calibration"]
 
 
 def test_a_second_camera_at_the_same_place_can_go_and_others_cannot(work):
     rig = load_rig("figure5")
-    few = light(work[:2], rig, RoomConfig(), rng=np.random.default_rng(2))
+    few = lit(work[:2], rig)
     losses = camera_losses(few, rig)
     whole = forecast(few, rig)
     for number, loss in enumerate(losses):
@@ -71,9 +74,7 @@ def test_a_second_camera_at_the_same_place_can_go_and_others_cannot(work):
         others = np.delete(views, number, axis=1).sum(axis=1)
         assert loss.needed == pytest.approx((views[:, number] & (others < 2)).mean())
         assert loss.without.seen_by_two <= whole.seen_by_two
-    six = camera_losses(
-        light(work[:2], load_rig("six"), RoomConfig(), rng=np.random.default_rng(2)), load_rig("six")
-    )
+    six = camera_losses(lit(work[:2], load_rig("six")), load_rig("six"))
     assert min(one.needed for one in six) > max(one.needed for one in losses)
 
 
@@ -128,7 +129,7 @@ def test_an_object_stays_in_the_hand(work):
     offset = np.tile([1.0, 2.0, 0.1], (scene.num_frames, 1))
     there = scene.moved(offset)
     before, after = (
-        one.moving_object.motion.T_world_body[:, :3, 3] - one.hands[0].qpos[:, :3] for one in (scene, there)
+        one.moving_object.T_world_body[:, :3, 3] - one.hands[0].qpos[:, :3] for one in (scene, there)
     )
     assert after == pytest.approx(before)
     assert there.hands[1].qpos[:, :3] - scene.hands[1].qpos[:, :3] == pytest.approx(offset)

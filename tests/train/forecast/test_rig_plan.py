@@ -13,10 +13,9 @@ from handsim import CameraRig, load_rig
 from handsim.errors import ArgumentError
 from handsim.space.camera import pinhole
 from train import plan_rig
-from train.forecast.rig_forecast import light
+from train.forecast.rig_forecast import light_work
 from train.forecast.rig_plan import Planning, places, view_candidates
 from train.forecast.settings import MOUNTS
-from train.simulation.room import RoomConfig
 
 
 @pytest.fixture(scope="module")
@@ -35,8 +34,8 @@ def seen_of(views):
 def test_candidates_see_what_a_rig_of_them_sees(candidates, work):
     ten, views = candidates
     rig = CameraRig("ten", ten)
-    lit = light([one.faster(4) for one in work], rig, RoomConfig(), rng=np.random.default_rng(0))
-    expected = np.concatenate([one.seen.reshape(-1, 10) for one in lit])
+    lit = light_work({"calibration": [one.faster(4) for one in work]}, rig, rng=np.random.default_rng(0))
+    expected = np.concatenate([one.seen.reshape(-1, 10) for one in lit["calibration"]])
     seen = seen_of(views)
     assert seen.shape == expected.shape
     assert (seen == expected).mean() > 0.98  # the visible spots are drawn anew

@@ -10,12 +10,12 @@ from benchmarks.held_out import held_out_markers
 from train import SetLabelerConfig, load_labeler
 from train.labelers.networks import SetLabeler
 from train.labelers.protocol import pad_clouds
-from train.labelers.set_inference import CloudScorer, TrainedSetLabeler, weight_shapes
+from train.labelers.set_inference import TrainedSetLabeler, weight_shapes
 from train.labelers.storage import load_network
 
 
-def scorer(network: SetLabeler) -> CloudScorer:
-    return CloudScorer(network.config, network.numpy_weights())
+def compiled(network: SetLabeler) -> TrainedSetLabeler:
+    return TrainedSetLabeler(network.config, network.numpy_weights(), None, ())
 
 
 @pytest.mark.parametrize("config", [SetLabelerConfig(), SetLabelerConfig(depth=2, gates=8, num_labels=7)])
@@ -27,7 +27,7 @@ def test_weights_have_the_networks_names_and_shapes(config):
 def compare(network: SetLabeler, points: np.ndarray) -> None:
     with torch.inference_mode():
         expected = network(*(torch.from_numpy(part) for part in pad_clouds([points])))
-    for mine, theirs in zip(scorer(network).score(points), expected, strict=True):
+    for mine, theirs in zip(compiled(network).scores(points), expected, strict=True):
         np.testing.assert_allclose(mine, theirs[0].numpy(), atol=1e-4)
 
 
@@ -49,7 +49,7 @@ def test_huge_scores_do_not_overflow(rng):
         for weight in network.parameters():
             weight.mul_(30.0)
     with np.errstate(over="raise", invalid="raise"):
-        for scores in scorer(network.eval()).score(rng.uniform(-0.1, 0.1, (9, 3))):
+        for scores in compiled(network.eval()).scores(rng.uniform(-0.1, 0.1, (9, 3))):
             assert np.isfinite(scores).all()
 
 

@@ -15,12 +15,12 @@ from gloves.optics.ghosts import StrayConfig
 from gloves.optics.visibility import MAX_FACING
 from handsim import HandModel, RigidObject, load_rig, look_at
 from handsim.errors import ArgumentError
-from handsim.hand.model import BodyMotion
 from handsim.space.objects import named_object
 from poses import sample_motion
 from tests.rigs import square_rig
-from train.simulation.room import RoomConfig, SceneSight, pack_take, record_take, sample_light_sources
-from train.simulation.scenes import MovingObject, SceneMotion
+from train.simulation.room import RoomConfig, SceneSight, record_take, sample_light_sources
+from train.simulation.scenes import SceneMotion
+from train.simulation.training_frames import MovingObject
 
 RATE = 120.0
 FRAMES = 120
@@ -46,7 +46,7 @@ def moving(thing: RigidObject) -> MovingObject:
         np.cos(angle), -np.sin(angle), np.sin(angle), np.cos(angle),
     )  # fmt: skip
     pose[:, :3, 3] = [0.0, 0.05, 1.1]
-    return MovingObject(thing, BodyMotion(pose, RATE))
+    return MovingObject(thing, pose)
 
 
 def two_hands(thing: RigidObject | None = None) -> SceneMotion:
@@ -105,7 +105,7 @@ def test_markers_are_seen_as_embree_sees_them(name, rng):
     frames = np.arange(0, FRAMES, 4)
     reference = np.zeros_like(ours)
     for frame in frames:
-        pose = thing.motion.T_world_body[frame]
+        pose = thing.T_world_body[frame]
         vertices_of_thing = thing.rigid_object.vertices @ pose[:3, :3].T + pose[:3, 3]
         meshes = [
             trimesh.Trimesh(vertices, faces, process=False)
@@ -140,7 +140,7 @@ def test_two_markers_make_no_body_but_three_do(rng):
         np.testing.assert_array_equal(labels[:38], np.arange(38))
         expected = np.arange(38, 41) if count == 3 else np.full(count, -1)
         np.testing.assert_array_equal(labels[38 : 38 + count], expected)
-        take = pack_take(scene, sources, RIG, CLEAN, {}, rng=rng)
+        take = record(scene, rng=rng)
         assert (take.labels >= 38).any() == (count == 3)
         assert take.bodies[0].marker_names == thing.marker_names
 
