@@ -499,7 +499,7 @@ def _fit(frames: Sequence[StreamedFrame], hands: Sequence[GloveFit], labeler: La
     unseen = {hand.side: set(range(markers)) for hand in hands}
     for frame in frames:
         tracked = tracker.step(frame.points, frame.ids, frame.time)
-        there = [one for one in tracked.hands if one.status in (Status.TRACKED, Status.INITIALIZED)]
+        there = [one for one in tracked.hands if one.status in _FITTED]
         count += bool(there)
         free = frame.points[tracked.labels < 0]
         for hand in there:

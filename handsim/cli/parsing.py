@@ -217,7 +217,7 @@ def _hinted(annotation: Any, aliases: list[str] | None = None) -> Any:
 
 
 def _with_hints(command: Command) -> Command:
-    """A command with the help of `_hinted` for all parameters, which returns the call instead of making it."""
+    """A command with the help of `_hinted` for all parameters; it returns the call instead of making it."""
     function: Any = command.func if isinstance(command, functools.partial) else command
     hints = get_type_hints(function, include_extras=True)
     signature = inspect.signature(command)
