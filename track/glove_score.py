@@ -27,7 +27,6 @@ from handsim.hand.shape import BONE_NAMES, BONES, DIGITS, JOINTS, NUM_JOINTS, PA
 from handsim.space.rig import CameraRig, load_rig
 from handsim.space.transforms import MIRROR
 from track.captures import label_capture, measure_hands, track_capture
-from track.config import BOTH
 from track.kinematics import pose_solver
 from track.kinematics.marker_kinematics import hand_arrays
 from track.kinematics.pose_spread import NOT_SMOOTHED, known_hand, pose_spreads, with_keypoints
@@ -358,10 +357,9 @@ def try_layout(
 def try_take(truth: Take, layout: MarkerLayout, labeler: Labeler) -> Trial:
     """Label and track a simulated capture of unknown hands, whose gloves have slipped a little."""
     capture = truth.capture()
-    sides = [side for side in BOTH if side in layout.sides]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", HandSimWarning)
-        user = measure_hands(capture, layout, labeler=labeler, hands=sides)
+        user = measure_hands(capture, layout, labeler=labeler)
         tracked = track_capture(capture, hands=user, labeler=labeler)
         labeled = label_capture(capture, glove=layout, hands=user, labeler=labeler)
     slots, frames = {}, {}

@@ -525,8 +525,9 @@ def _gloves() -> list[tuple[str, MarkerLayout]]:
     found = [(name, load_layout(name)) for name in list_layouts()]
     for path in sorted(Path().glob("*.toml"))[:_MOST_OWN]:
         with contextlib.suppress(HandSimError):  # a file of another kind, or a glove that no hand wears
-            check_layout(load_layout(path))
-            found.append((str(path), load_layout(path)))
+            layout = load_layout(path)
+            check_layout(layout)
+            found.append((str(path), layout))
     return sorted(found, key=lambda one: -one[1].num_markers)
 
 
