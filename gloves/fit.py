@@ -521,11 +521,7 @@ def attach(layout: MarkerLayout | str | Path, model: HandModel | HandShape | str
 
 
 def nominal_fit(layout: MarkerLayout | str | Path, size: str, side: Side) -> GloveFit:
-    """A hand of one of the five sizes XS to XL, with its glove put on as designed, see `settle_glove`.
-
-    Raises:
-        LayoutError: A hand of size M cannot wear the glove, or it is not for this side.
-    """
+    """A hand of one of the five sizes XS to XL, with its glove put on as designed, see `settle_glove`."""
     worn, model = load_layout(layout), HandModel.named(size, side=side)
     worn.check_side(side)
     check_layout(worn)

@@ -267,10 +267,8 @@ def _label(
 
 def _spread_out(markers: NDArray[np.float64], most: int) -> NDArray[np.float64]:
     """At most `most` frames of markers (F, M, 3), evenly spaced."""
-    chosen: NDArray[np.float64] = markers[
-        np.linspace(0, len(markers) - 1, min(most, len(markers))).astype(int)
-    ]
-    return chosen
+    rows = np.linspace(0, len(markers) - 1, min(most, len(markers))).astype(int)
+    return np.asarray(markers[rows])
 
 
 class _Search:

@@ -33,8 +33,8 @@ def evaluate(
             or training sets, which without drops and ghosts are counted as their rig saw them. Each hand of
             a capture of two, with columns right:ThumbTip and so on, is counted by itself.
         settings: What is evaluated.
-        glove: Marker layout: a shipped name or the path of a .toml file; when not given that which a take or
-            a training set names, or dense19.
+        glove: Marker layout: a shipped name or the path of a .toml file; when not given that of a take, or
+            dense19.
         labeler: Folder of a trained labeler, an exported .onnx file, or module:name; the shipped one when
             not given.
         truth: The .truth.npz of a simulated take. Labels that a capture of it already has, or a tracked take
@@ -42,13 +42,15 @@ def evaluate(
         json: File for the figures.
         threads: Threads of the labeler; more than one helps a large network on an idle machine.
     """
+    from gloves.takes.take import load_take
     from train.evaluation import evaluate_labeler, evaluate_labels, print_figures
     from train.labelers.protocol import label_on
     from train.labelers.storage import load_labeler
 
     check_outputs((*captures, glove, labeler, truth), [json])
     if truth is None:
-        glove = glove or _named_glove(captures)
+        takes = (load_take(one) for one in captures[:1] if one.suffix == ".npz")
+        glove = glove or next((str(take.settings.get("glove", "dense19")) for take in takes), "dense19")
         label_on(threads)
         report = evaluate_labeler(load_labeler(glove, labeler), captures, settings=settings)
         found: dict[str, Any] = {"glove": glove, **settings.record()}
@@ -77,19 +79,6 @@ def evaluate(
     worst = [name for name in sorted(by_marker, key=by_marker.__getitem__)[:3] if by_marker[name] < 1.0]
     if worst:
         print_line("worst markers: " + ", ".join(f"{name} {100 * by_marker[name]:.2f} %" for name in worst))
-
-
-def _named_glove(captures: tuple[Path, ...]) -> str:
-    """The glove that the first take or training set names; marker files name none."""
-    from gloves.takes.take import load_take
-    from train.data.shards import MANIFEST, load_manifest
-
-    for capture in captures[:1]:
-        if capture.suffix == ".npz":
-            return str(load_take(capture).settings.get("glove", "dense19"))
-        if (capture / MANIFEST).is_file():
-            return str(load_manifest(capture).config["glove"])
-    return "dense19"
 
 
 def _against_truth(report: LabelingReport) -> dict[str, Any]:

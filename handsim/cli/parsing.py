@@ -85,10 +85,10 @@ def _refusal(command: Command, unknown: Sequence[str], args: list[str]) -> str:
     table = next(line for line in script.splitlines() if line.startswith(_SPECIFICATION))
     (own,) = ast.literal_eval(table.removeprefix(_SPECIFICATION))["subcommands"].values()
     valid = [flag for option in own["options"] for flag in option["flags"] if flag.startswith("--")]
-    for word in unknown:
-        if word.startswith("-"):
-            return choices(word, valid, noun="option")
-    word, before = unknown[0], args[: args.index(unknown[0])]
+    word = next((one for one in unknown if one.startswith("-")), unknown[0])
+    if word.startswith("-"):
+        return choices(word, valid, noun="option")
+    before = args[: args.index(word)]
     after = f" after '{before[-1]}'" if before else ""
     return f"'{shortened(word)}'{after} is one value too many; valid options: {', '.join(valid)}"
 

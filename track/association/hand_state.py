@@ -231,10 +231,7 @@ class HandState:
         A point that had no label while the marker was seen is likely foreign. This counts only for markers
         that no point has now.
         """
-        log_odds: NDArray[np.float64] = _presence_log_odds(
-            first_seen, free_since, markers, self._last_seen, self._now
-        )
-        return log_odds
+        return np.asarray(_presence_log_odds(first_seen, free_since, markers, self._last_seen, self._now))
 
     def initialize(
         self, qpos: Float[np.ndarray, "27"], targets: Float[np.ndarray, "M 3"], time: float
