@@ -25,13 +25,12 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.paper.hand_errors import hand_errors
-from benchmarks.people import displace_markers, right_hands
+from benchmarks.people import displace_markers, flesh_motion, right_hands
 from benchmarks.record import Figures, describe, run, save_figures
 from gloves import GloveFit, MarkerLayout, load_layout
 from gloves.fit import attach_markers, nominal_fit
 from handsim import HandModel, HandShape, sample_shape
-from handsim.hand.shape import BONES, SIDES, SIZES, shape_from_measures
-from handsim.space.transforms import quaternion_matrix
+from handsim.hand.shape import SIDES, SIZES, shape_from_measures
 from track.calibration.user_calibration import calibrate_hand
 from track.kinematics.pose_solver import PoseSolver
 from train.simulation.scenes import CalibrationTakeConfig
@@ -82,18 +81,6 @@ def exchange_labels(markers: np.ndarray, true: GloveFit, rng: np.random.Generato
     return markers
 
 
-def move_flesh(markers: np.ndarray, qpos: np.ndarray, true: GloveFit, rng: np.random.Generator) -> np.ndarray:
-    """Markers moved with their digit's hinges, each in its own way; the palm's with the fingers' knuckles."""
-    turns, moved = quaternion_matrix(qpos[:, 3:7]), markers.copy()
-    for marker, bone in enumerate(true.attachment.bone_indices[:, 0]):
-        digit = BONES[bone].digit
-        angles = qpos[:, 7 + 4 * digit : 11 + 4 * digit] if digit >= 0 else qpos[:, 12::4]
-        way = (angles - angles.mean(axis=0)) @ rng.normal(size=(4, 3))
-        way *= FLESH / np.sqrt((way**2).sum(axis=1).mean())
-        moved[:, marker] += np.einsum("tij,tj->ti", turns, way)
-    return moved
-
-
 def tell(name: str, hand: GloveFit, true: GloveFit) -> list[float]:
     """Print how far a hand is from the truth; returns what is averaged over users."""
     errors = hand_errors(hand, true)
@@ -116,7 +103,7 @@ def run_user(
     ways = {
         "after": (markers, start),
         "1 % wrong labels": (exchange_labels(markers, true, rng), start),
-        "flesh": (move_flesh(markers, take.qpos[:, 0], true, rng), start),
+        "flesh": (markers + flesh_motion(true.attachment, take.qpos[:, 0], FLESH, rng=rng), start),
     }
     print(f"user {number}, {true.side}: {take.num_frames} frames")
     rows = {"before": tell("before", start, true)}

@@ -6,7 +6,7 @@
 Trains the network of `keypoint_training.py` once for each variant of the pictures, from
 equal poses and views, and prints the share of keypoints within a tenth of the box of the hand (PCK@0.1): on
 1,000 pictures that it learned from, on drawn hands of `ours` that it has not seen, and on photographs where
-the reference is sure. Variants:
+the reference (what `benchmarks.photograph_reference` writes) is sure. Variants:
 
 ours: what `handsim render` draws; name it first, and the others are compared with it.
 plain: the loop that a user would write with pyrender: the same skins and cameras, one color of skin a

@@ -9,7 +9,8 @@ import numpy as np
 
 from gloves.captures.formats import read_hands
 from gloves.fit import Attachment
-from handsim.hand.shape import HandShape
+from handsim.hand.shape import BONES, HandShape
+from handsim.space.transforms import quaternion_matrix
 from track.calibration.hand_parameters import (
     attachment_at,
     build_skin,
@@ -46,3 +47,19 @@ def displace_markers(
     )
     heights = worn.layout.heights + rng.normal(scale=lift, size=len(steps))
     return attachment_at(worn.layout, coordinates._replace(heights=heights), shape)
+
+
+def flesh_motion(worn: Attachment, qpos: np.ndarray, size: float, *, rng: np.random.Generator) -> np.ndarray:
+    """Motion of markers in the world (T, M, 3) [m], of this RMS, by linear functions of their digits' angles.
+
+    Markers of the palm move with the flexions of the fingers' knuckles.
+    """
+    turns = quaternion_matrix(qpos[:, 3:7])
+    moved = np.empty((len(turns), worn.layout.num_markers, 3))
+    for marker, bone in enumerate(worn.main_bones):
+        digit = BONES[bone].digit
+        angles = qpos[:, 7 + 4 * digit : 11 + 4 * digit] if digit >= 0 else qpos[:, 12::4]
+        way = (angles - angles.mean(axis=0)) @ rng.standard_normal((4, 3))
+        way *= size / max(float(np.sqrt((way**2).sum(axis=1).mean())), 1e-9)
+        moved[:, marker] = np.einsum("tij,tj->ti", turns, way)
+    return moved

@@ -10,7 +10,7 @@ import shlex
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from datetime import date
 from importlib import metadata
 from pathlib import Path
@@ -19,6 +19,8 @@ from typing import Any, Final
 
 import numpy as np
 import tyro
+from rich.markup import escape
+from rich.table import Table
 
 from handsim import __version__
 
@@ -55,6 +57,16 @@ def report(save: str | None, figures: Figures) -> None:
     for what, value in figures.values():
         print(f"{what}: {_rounded(value)}")
     save_figures(save, figures)
+
+
+def number_table(title: str, first: Iterable[str], columns: Iterable[str]) -> Table:
+    """A table of numbers, whose first columns name the rows."""
+    table = Table(title=escape(title))
+    for name in first:
+        table.add_column(name, no_wrap=True)
+    for name in columns:
+        table.add_column(escape(name), justify="right")
+    return table
 
 
 def timed(job: Callable[[], object], clock: Callable[[], float] = time.perf_counter) -> float:

@@ -21,12 +21,12 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import spearmanr
 
+from benchmarks.people import flesh_motion
 from benchmarks.record import describe, report, run
 from gloves import GloveFit, load_layout
 from gloves.fit import GlovedHand, nominal_fit
 from handsim import HandSimWarning, load_rig
-from handsim.hand.shape import BONES, EVERYBODY, JOINT_NAMES, NUM_JOINTS
-from handsim.space.transforms import quaternion_matrix
+from handsim.hand.shape import EVERYBODY, JOINT_NAMES, NUM_JOINTS
 from track import track_capture
 from track.kinematics.pose_spread import DETECTABLE, measurement_error
 from train.simulation.room import RoomConfig, record_take
@@ -45,19 +45,6 @@ def glued(fit: GloveFit, rng: np.random.Generator) -> GloveFit:
     return GloveFit(fit.model, dataclasses.replace(worn, points=worn.points + shifts))
 
 
-def flesh(hand: GlovedHand, rng: np.random.Generator) -> np.ndarray:
-    """Displacement of the markers in the world (T, M, 3) [m]."""
-    turns, size = quaternion_matrix(hand.qpos[:, 3:7]), rng.uniform(*FLESH) / np.sqrt(3.0)
-    moved = np.zeros((len(turns), hand.layout.num_markers, 3))
-    for marker, bone in enumerate(hand.fit.attachment.main_bones):
-        digit = BONES[bone].digit
-        angles = hand.qpos[:, 7 + 4 * digit : 11 + 4 * digit] if digit >= 0 else hand.qpos[:, 12::4]
-        way = (angles - angles.mean(axis=0)) @ rng.standard_normal((4, 3))
-        way *= size / max(np.sqrt((way**2).mean()), 1e-9)
-        moved[:, marker] = np.einsum("tij,tj->ti", turns, way)
-    return moved
-
-
 def sessions_of(user: int, glove: str, seconds: float, calibrate: bool) -> list[Session]:
     """True and found angles, standard deviations (T, 20) and their parts (20, 4) of both sessions [deg]."""
     rng = np.random.default_rng((user, 56))
@@ -69,7 +56,8 @@ def sessions_of(user: int, glove: str, seconds: float, calibrate: bool) -> list[
     made: list[Session] = []
     for _ in range(2):
         hand = GlovedHand(glued(worn, rng), scene.hands[0].qpos)
-        moving = dataclasses.replace(scene, hands=(hand,), skin=(flesh(hand, rng),))
+        moved = flesh_motion(hand.fit.attachment, hand.qpos, rng.uniform(*FLESH), rng=rng)
+        moving = dataclasses.replace(scene, hands=(hand,), skin=(moved,))
         take = record_take(moving, load_rig("figure5"), RoomConfig(), {}, rng=rng)
         found = track_capture(take.capture(), glove=layout, hands="right", calibrate=calibrate)
         assert found.angle_spread is not None

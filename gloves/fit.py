@@ -516,10 +516,11 @@ def attach(layout: MarkerLayout | str | Path, model: HandModel | HandShape | str
 
 
 def nominal_fit(layout: MarkerLayout | str | Path, size: str, side: Side) -> GloveFit:
-    """A hand of one of the five sizes XS to XL, with its glove put on as designed."""
+    """A hand of one of the five sizes XS to XL, with its glove put on as designed, see `settle_glove`."""
     worn, model = load_layout(layout), HandModel.named(size, side=side)
     worn.check_side(side)
-    return attach(worn, model)
+    check_layout(worn)
+    return settle_glove(worn, model)
 
 
 def nearest_markers(fit: GloveFit) -> tuple[str, str, float]:

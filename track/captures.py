@@ -98,8 +98,8 @@ def label_capture(
     if _is_continuous(frames):
         labeled = label_both_ways(take, frames, setup.tracker, on_count)
     else:
-        found = label_alone([frame.points for frame in frames], setup.user.hands, setup.labeler, on_count)
-        labels, confidence = (np.concatenate(values) for values in zip(*found, strict=True))
+        clouds = [frame.points for frame in frames]
+        labels, confidence = label_alone(clouds, setup.user.hands, setup.labeler, on_count)
         points = dataclasses.replace(take.point_list, labels=labels, confidence=confidence)
         labeled = dataclasses.replace(take, point_list=points)
     if (labeled.point_list.labels < 0).all():

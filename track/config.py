@@ -7,16 +7,14 @@ code that uses it.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, ClassVar, Final, Literal
+from typing import Annotated, ClassVar, Literal
 
-from handsim.hand.shape import Side
 from handsim.settings import Limits, Settings
 
 Size = Literal["auto", "XS", "S", "M", "L", "XL"]
 """Size of hands; `auto` measures them."""
 HandOrigin = Literal["named", "measured", "calibrated"]
 """Where a hand is from: of a named size, with size and proportions measured, or calibrated."""
-BOTH: Final[tuple[Side, ...]] = ("right", "left")
 _Positive = Annotated[float, Limits(0.0, above=True)]
 
 

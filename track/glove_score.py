@@ -27,7 +27,7 @@ from handsim.hand.shape import BONE_NAMES, BONES, DIGITS, JOINTS, NUM_JOINTS, PA
 from handsim.space.rig import CameraRig, load_rig
 from handsim.space.transforms import MIRROR
 from track.captures import label_capture, measure_hands, track_capture
-from track.config import BOTH
+from track.kinematics import pose_solver
 from track.kinematics.marker_kinematics import hand_arrays
 from track.kinematics.pose_spread import NOT_SMOOTHED, known_hand, pose_spreads, with_keypoints
 from track.user import AnyGlove
@@ -60,8 +60,6 @@ _TWIN_FRAMES: Final = 600  # frames of each simulated motion
 _NEAR: Final = 0.003  # [m] gap between two markers' surfaces at which gloves and blobs touch
 _SIDE_FRAMES: Final = 500
 _JOINT_FRAMES: Final = 600
-_FEWEST: Final = 4  # A pose needs this many markers.
-_FEWEST_OF_BODY: Final = 3  # A rigid body needs this many markers.
 _IN_LINE: Final = 1e-8  # [m^2] Markers with less information about a rotation are in a line.
 
 # Figures beyond these thresholds get a sentence of advice.
@@ -286,7 +284,7 @@ def layout_spreads(
     squares, count = np.zeros(NUM_JOINTS), 0
     limits = np.diag(free_spreads() ** -2.0)
     for fit, qpos, seen in poses:
-        good = seen.sum(axis=1) >= _FEWEST
+        good = seen.sum(axis=1) >= pose_solver.FEWEST_MARKERS
         unseen, known = np.where(seen[good], 0.0, np.inf), known_hand(hand_arrays(fit).digits, NOISE)
         variances, _ = pose_spreads(with_keypoints(fit), limits, known, qpos[good], unseen, NOT_SMOOTHED)
         squares += variances.sum(axis=(0, 2))
@@ -307,7 +305,7 @@ def palm_spread(places: Sequence[MarkerPlace], model: HandModel) -> float:
     Infinite with fewer than three markers on the palm, or three in a line.
     """
     palm = [place for place in places if place.bone == BONE_NAMES[PALM]]
-    if len(palm) < _FEWEST_OF_BODY:
+    if len(palm) < pose_solver.FEWEST_ON_PART:
         return float("inf")
     points = attach_markers(layout_of(palm, 0.003), model).points[: len(palm)]
     arms = points - points.mean(axis=0)
@@ -359,10 +357,9 @@ def try_layout(
 def try_take(truth: Take, layout: MarkerLayout, labeler: Labeler) -> Trial:
     """Label and track a simulated capture of unknown hands, whose gloves have slipped a little."""
     capture = truth.capture()
-    sides = [side for side in BOTH if side in layout.sides]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", HandSimWarning)
-        user = measure_hands(capture, layout, labeler=labeler, hands=sides)
+        user = measure_hands(capture, layout, labeler=labeler)
         tracked = track_capture(capture, hands=user, labeler=labeler)
         labeled = label_capture(capture, glove=layout, hands=user, labeler=labeler)
     slots, frames = {}, {}

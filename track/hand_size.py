@@ -267,10 +267,8 @@ def _label(
 
 def _spread_out(markers: NDArray[np.float64], most: int) -> NDArray[np.float64]:
     """At most `most` frames of markers (F, M, 3), evenly spaced."""
-    chosen: NDArray[np.float64] = markers[
-        np.linspace(0, len(markers) - 1, min(most, len(markers))).astype(int)
-    ]
-    return chosen
+    rows = np.linspace(0, len(markers) - 1, min(most, len(markers))).astype(int)
+    return np.asarray(markers[rows])
 
 
 class _Search:
@@ -499,7 +497,7 @@ def _fit(frames: Sequence[StreamedFrame], hands: Sequence[GloveFit], labeler: La
     unseen = {hand.side: set(range(markers)) for hand in hands}
     for frame in frames:
         tracked = tracker.step(frame.points, frame.ids, frame.time)
-        there = [one for one in tracked.hands if one.status in (Status.TRACKED, Status.INITIALIZED)]
+        there = [one for one in tracked.hands if one.status in _FITTED]
         count += bool(there)
         free = frame.points[tracked.labels < 0]
         for hand in there:
@@ -525,8 +523,9 @@ def _gloves() -> list[tuple[str, MarkerLayout]]:
     found = [(name, load_layout(name)) for name in list_layouts()]
     for path in sorted(Path().glob("*.toml"))[:_MOST_OWN]:
         with contextlib.suppress(HandSimError):  # a file of another kind, or a glove that no hand wears
-            check_layout(load_layout(path))
-            found.append((str(path), load_layout(path)))
+            layout = load_layout(path)
+            check_layout(layout)
+            found.append((str(path), layout))
     return sorted(found, key=lambda one: -one[1].num_markers)
 
 

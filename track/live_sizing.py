@@ -42,9 +42,7 @@ _RECENT: Final = 1.0  # [s] time constant of the newest residual's running mean
 _JUMP: Final = 1.5  # ratio to the usual residual beyond which the hands may be another person's
 _STEP: Final = 0.002  # [m] motion of the markers of a hand at rest per step to a new size
 _FEWEST_STEPS: Final = 4  # Learned marker biases fade out in at least this many steps.
-_EASE: Final = (
-    0.0025  # [m] A keypoint leaves its motion by at most this per frame while a size is taken over.
-)
+_EASE: Final = 0.0025  # [m] most by which a keypoint leaves its motion per frame while a size is taken over
 _NICE: Final = 5  # The measuring process has a lower priority than the tracker's.
 
 
@@ -176,14 +174,11 @@ def _measure(settings: dict[str, Any], frames: Sequence[StreamedFrame], before: 
     places = [np.concatenate([hand.attachment.points for hand in user]) for user in (before, after)]
     farthest = float(np.linalg.norm(places[1] - places[0], axis=1).max())
     count = max(_FEWEST_STEPS, int(np.ceil(farthest / _STEP)))
-    users = [_user_between(before, after, number / count) for number in range(1, count)]
+    users = []
+    for share in np.arange(1, count) / count:
+        hands = tuple(hand_between(*pair, float(share)) for pair in zip(before, after, strict=True))
+        users.append(dataclasses.replace(after, hands=hands))
     return _Measured([*users, after], told)
-
-
-def _user_between(before: User, after: User, share: float) -> User:
-    """The measured user with hands interpolated towards their size."""
-    hands = tuple(hand_between(*pair, share) for pair in zip(before, after, strict=True))
-    return dataclasses.replace(after, hands=hands)
 
 
 def _eased(before: TrackedHand, hand: TrackedHand, span: float, model: HandModel) -> TrackedHand:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Final, NamedTuple, Self
 
@@ -16,7 +16,7 @@ from rich.table import Table
 from benchmarks.held_out import held_out_markers
 from benchmarks.paper.printed import AUGMENTATIONS, TABLE2, TABLE3, TABLE4, TABLE6, TEST_SETS, GapCounts
 from benchmarks.people import read_markers
-from benchmarks.record import Figures, save_figures
+from benchmarks.record import Figures, number_table, save_figures
 from gloves import Take
 from gloves.captures.capture import run_lengths
 from gloves.captures.formats import find_captures
@@ -230,7 +230,7 @@ def count_gaps(present: Bool[np.ndarray, "T M"]) -> GapCounts:
 
 def _table3(measures: Mapping[str, TakeMeasures]) -> Table:
     columns = ("#Frame", "#Gap", "AGL", "AMF", "ghosts / labels")
-    table = _table("Test set", columns, title="Table 3: ours, and the paper's in brackets")
+    table = number_table("Table 3: ours, and the paper's in brackets", ["Test set"], columns)
     for kind, one in measures.items():
         forms = ("{:.0f}", "{:.0f}", "{:.2f}", "{:.2f}", "{:.2f} %")
         cells = (
@@ -278,20 +278,11 @@ def _tests_figures(
 
 def _by_marker(measures: Mapping[str, TakeMeasures]) -> Table:
     columns = ("mean", "least", "most", "median gap", "p90", "p99 [frames]")
-    table = _table("Test set", columns, title="Missing share and gap lengths per marker")
+    table = number_table("Missing share and gap lengths per marker", ["Test set"], columns)
     for kind, one in measures.items():
         shares, gaps = one.missing[:3], one.missing[3:]
         table.add_row(kind, *(f"{value:.2f} %" for value in shares), *(f"{value:.0f}" for value in gaps))
     table.add_row("real finger markers", "2.6-4.9 %", "0.2 %", "12.4 %", *PUBLISHED_GAPS, "320-340")
-    return table
-
-
-def _table(first: str, columns: Iterable[str], *, title: str) -> Table:
-    """A table of numbers, whose first column names the rows."""
-    table = Table(title=title)
-    table.add_column(first, no_wrap=True)
-    for column in columns:
-        table.add_column(column, justify="right")
     return table
 
 
@@ -346,7 +337,7 @@ def measure_tests(
 
 def print_table2(nets: Mapping[str, Mapping[str, LabelingReport]], *, title: str) -> Table:
     """Slot accuracy of networks (columns) on test sets (rows), the paper's in brackets."""
-    table = _table("test \\ net", nets, title=title)
+    table = number_table(title, ["test \\ net"], nets)
     for test in AUGMENTATIONS:
         paper = dict(zip(AUGMENTATIONS, TABLE2[test], strict=True))
         table.add_row(
@@ -360,7 +351,7 @@ def print_tests(
     reports: Mapping[str, LabelingReport], paper: Mapping[str, tuple[float, ...]], *, title: str
 ) -> Table:
     """Figures (rows) by test set (columns), the paper's in brackets where it has one."""
-    table = _table("[%]", reports, title=title)
+    table = number_table(title, ["[%]"], reports)
     for figure, words in FIGURES.items():
         printed = dict(zip(TEST_SETS, paper[figure], strict=True)) if figure in paper else {}
         cells = (_cell(report.figures[figure], printed.get(test)) for test, report in reports.items())

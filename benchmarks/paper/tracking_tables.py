@@ -11,7 +11,6 @@ import numpy as np
 import tyro
 from jaxtyping import Float
 from rich.console import Console
-from rich.markup import escape
 from rich.table import Table
 
 from benchmarks.paper.comparison import (
@@ -26,7 +25,7 @@ from benchmarks.paper.comparison import (
     trackers,
 )
 from benchmarks.paper.printed import CAMERAS, CAMERAS_FRAMES, HAN, TABLE5, TABLE7
-from benchmarks.record import Figures, save_figures
+from benchmarks.record import Figures, number_table, save_figures
 from gloves import Take
 from handsim.app.messages import progress_bar
 from train import SimulateSettings, load_labeler, simulate_take
@@ -288,12 +287,7 @@ def print_trials(measured: Sequence[Measurement]) -> Table:
 
 
 def _table(title: str, columns: Iterable[str]) -> Table:
-    table = Table(title=escape(title))
-    for name in _HEAD:
-        table.add_column(name, no_wrap=True)
-    for name in columns:
-        table.add_column(escape(name.replace("-", " ") if name in KINDS else name), justify="right")
-    return table
+    return number_table(title, _HEAD, (name.replace("-", " ") if name in KINDS else name for name in columns))
 
 
 def _rows(measured: Sequence[Measurement]) -> list[tuple[tuple[str, str], list[Measurement]]]:

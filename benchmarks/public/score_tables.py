@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any, Final
 
 import numpy as np
-from rich.markup import escape
 from rich.table import Table
 
 from benchmarks.public.difficulties import BENCHMARK, DIFFICULTIES
 from benchmarks.public.scoring import Score
+from benchmarks.record import number_table
 from handsim import __version__
 from handsim.hand.model import KEYPOINT_NAMES
 
@@ -34,18 +34,18 @@ def score_tables(score: Score) -> list[Table]:
     """By difficulty; frames right by kind and difficulty; errors of each joint, if there are any."""
     difficulties = difficulties_of(score)
     title = f"{BENCHMARK}, {score.benchmark.size}: right labels, joints found, errors"
-    first = _table(title, "difficulty", _FIGURES.values())
+    first = number_table(title, ["difficulty"], _FIGURES.values())
     for name in (*difficulties, ALL):
         means = score.mean(difficulty=None if name == ALL else name)
         first.add_row(name, *(figure_text(figure, means[figure]) for figure in _FIGURES))
-    second = _table("frames right by kind [%]", "kind", (*difficulties, ALL))
+    second = number_table("frames right by kind [%]", ["kind"], (*difficulties, ALL))
     for kind in dict.fromkeys(one.capture.kind for one in score.captures):
         right = [score.mean(difficulty=name, kind=kind)["frame_accuracy"] for name in (*difficulties, None)]
         second.add_row(kind, *(figure_text("frame_accuracy", share) for share in right))
     errors = [score.joint_errors(difficulty=name) for name in (*difficulties, None)]
     if np.isnan(errors).all():
         return [first, second]
-    third = _table("distance of joints from the truth [mm]", "joint", (*difficulties, ALL))
+    third = number_table("distance of joints from the truth [mm]", ["joint"], (*difficulties, ALL))
     for joint, row in zip(KEYPOINT_NAMES, np.transpose(errors), strict=True):
         third.add_row(joint, *(figure_text("mpjpe", value) for value in row))
     return [first, second, third]
@@ -96,11 +96,3 @@ def _record(figures: Mapping[str, float]) -> dict[str, float | None]:
 def _errors(errors: np.ndarray) -> dict[str, float | None]:
     values = (None if np.isnan(value) else 1e3 * float(value) for value in errors)
     return dict(zip(KEYPOINT_NAMES, values, strict=True))
-
-
-def _table(title: str, first: str, columns: Iterable[str]) -> Table:
-    table = Table(title=escape(title))
-    table.add_column(first, no_wrap=True)
-    for name in columns:
-        table.add_column(escape(name), justify="right")
-    return table

@@ -33,7 +33,8 @@ def evaluate(
             or training sets, which without drops and ghosts are counted as their rig saw them. Each hand of
             a capture of two, with columns right:ThumbTip and so on, is counted by itself.
         settings: What is evaluated.
-        glove: Marker layout: a shipped name or the path of a .toml file; dense19 when not given.
+        glove: Marker layout: a shipped name or the path of a .toml file; when not given that of a take, or
+            dense19.
         labeler: Folder of a trained labeler, an exported .onnx file, or module:name; the shipped one when
             not given.
         truth: The .truth.npz of a simulated take. Labels that a capture of it already has, or a tracked take
@@ -41,13 +42,15 @@ def evaluate(
         json: File for the figures.
         threads: Threads of the labeler; more than one helps a large network on an idle machine.
     """
+    from gloves.takes.take import load_take
     from train.evaluation import evaluate_labeler, evaluate_labels, print_figures
     from train.labelers.protocol import label_on
     from train.labelers.storage import load_labeler
 
     check_outputs((*captures, glove, labeler, truth), [json])
     if truth is None:
-        glove = glove or "dense19"
+        takes = (load_take(one) for one in captures[:1] if one.suffix == ".npz")
+        glove = glove or next((str(take.settings.get("glove", "dense19")) for take in takes), "dense19")
         label_on(threads)
         report = evaluate_labeler(load_labeler(glove, labeler), captures, settings=settings)
         found: dict[str, Any] = {"glove": glove, **settings.record()}

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import numpy as np
 import tyro
@@ -18,13 +19,10 @@ from gloves.layout import (
     starter_layout,
 )
 from handsim.app.messages import named_steps, print_line, print_table
-from handsim.errors import LayoutError, errors_of
+from handsim.errors import HandSimWarning, LayoutError
 from handsim.files.outputs import as_text, check_outputs, write_starter
 from handsim.hand.shape import SIZES, Size
 from train.forecast.settings import ImproveGloveSettings, ScoreGloveSettings
-
-if TYPE_CHECKING:
-    from gloves.fit import GloveFit
 
 
 def list_glove(out: Path | None = None) -> None:
@@ -48,10 +46,12 @@ def list_glove(out: Path | None = None) -> None:
         "--glove NAME --out SET && handsim train SET --out RUN, then give --labeler RUN."
     )
     if out is not None:
+        from gloves.fit import nominal_fit
         from render.captions import write_png
         from render.illustrations import draw_gloves
 
-        write_png(out, draw_gloves([_fitted(load_layout(name), "M") for name in list_layouts()]))
+        layouts = map(load_layout, list_layouts())
+        write_png(out, draw_gloves([nominal_fit(layout, "M", layout.sides[-1]) for layout in layouts]))
         print_line(f"{out}: the gloves on hands of size M")
 
 
@@ -97,6 +97,8 @@ def check_glove(
 ) -> None:
     """Check a layout on hands of all five sizes, and draw it from all sides with its slips on 100 people.
 
+    A layout must fit a hand of size M. What does not fit another size is told; there markers give way.
+
     Args:
         glove: A .toml file or a shipped name.
         out: The picture, a .png file; named after the glove when not given.
@@ -105,39 +107,40 @@ def check_glove(
     from gloves.fit import nearest_markers, nominal_fit
 
     layout = load_layout(glove)
+    side = layout.sides[-1]
     picture = Path(glove).with_suffix(".png") if out is None else out
     check_outputs([glove], [picture])
-    rows, overlaps = [["size", "nearest two markers", "centers apart [mm]"]], []
+    rows, overlaps = [["size", "nearest two markers", "centers apart [mm]"]], dict[str, str]()
     for name in SIZES:
-        first, second, distance = nearest_markers(_fitted(layout, name))
+        worn = nominal_fit(layout, name, side)
+        first, second, distance = nearest_markers(worn)
         pair = f"{first} and {second}"
         rows.append([name, pair, f"{1e3 * distance:.1f}"])
         if distance < 2 * layout.radius:
-            overlaps.append(f"{pair} on size {name}")
+            overlaps[name] = f"{pair} on size {name}"
+        moved = [
+            one.name for one, place in zip(layout.markers, worn.layout.markers, strict=True) if one != place
+        ]
+        if moved:
+            told = f"off its digit on size {name}, where it is worn nearer to the middle of its bone's back"
+            warnings.warn(f"{glove}: {', '.join(moved)} would be {told}", HandSimWarning, stacklevel=2)
     print_table(rows, left=2, title=f"{layout.name}: {layout.num_markers} markers")
     if overlaps:
-        raise LayoutError(
-            f"{glove}: markers of {2e3 * layout.radius:.1f} mm overlap: {', '.join(overlaps)}; "
-            "move them apart"
-        )
+        told = f"{glove}: markers of {2e3 * layout.radius:.1f} mm overlap: {', '.join(overlaps.values())}"
+        if "M" in overlaps:
+            raise LayoutError(f"{told}; move them apart")
+        warnings.warn(told, HandSimWarning, stacklevel=2)
     from render.captions import write_png
     from render.illustrations import draw_glove
     from train.simulation.training_frames import GenerateSettings, slipped_gloves
 
-    fit, rng = nominal_fit(layout, size, layout.sides[-1]), np.random.default_rng(0)
+    fit, rng = nominal_fit(layout, size, side), np.random.default_rng(0)
     slips = slipped_gloves(layout, fit.model, GenerateSettings(), rng=rng)
     write_png(picture, draw_glove(fit, slips=slips))
     print_line(
         f"{picture}: the glove on a hand of size {size}; below, where the slips of `handsim generate` put "
         f"each marker on {len(slips)} people"
     )
-
-
-def _fitted(layout: MarkerLayout, size: str) -> GloveFit:
-    from gloves.fit import nominal_fit
-
-    with errors_of(f"on a hand of size {size}", LayoutError):
-        return nominal_fit(layout, size, layout.sides[-1])
 
 
 def score_glove(

@@ -9,6 +9,7 @@ import dataclasses
 import functools
 import inspect
 import io
+import sys
 import textwrap
 import types
 from collections.abc import Callable, Mapping, Sequence
@@ -26,6 +27,8 @@ from tyro.constructors import (
     StructTypeInfo,
     UnsupportedTypeAnnotationError,
 )
+
+from handsim.errors import choices, shortened
 
 Command = Callable[..., Any]
 _UNIONS: Final = (Union, types.UnionType)
@@ -66,8 +69,28 @@ def run_command(
         table = {name: _with_hints(one) for name, one in command.items()}
         return tyro.extras.subcommand_cli_from_dict(
             table, prog=prog, description=help_line, args=args, registry=registry()
-        )
-    return tyro.cli(_with_hints(command), prog=prog, args=args, registry=registry())
+        )()
+    call, unknown = tyro.cli(
+        _with_hints(command), prog=prog, args=args, registry=registry(), return_unknown_args=True
+    )
+    if unknown:
+        print(f"{prog}: {_refusal(command, unknown, list(args or ()))}; see {prog} --help", file=sys.stderr)
+        raise SystemExit(2)
+    return call()
+
+
+def _refusal(command: Command, unknown: Sequence[str], args: list[str]) -> str:
+    """A sentence on an option that a command does not have, or on a value too many."""
+    script = completion_script({"it": command}, "bash")
+    table = next(line for line in script.splitlines() if line.startswith(_SPECIFICATION))
+    (own,) = ast.literal_eval(table.removeprefix(_SPECIFICATION))["subcommands"].values()
+    valid = [flag for option in own["options"] for flag in option["flags"] if flag.startswith("--")]
+    word = next((one for one in unknown if one.startswith("-")), unknown[0])
+    if word.startswith("-"):
+        return choices(word, valid, noun="option")
+    before = args[: args.index(word)]
+    after = f" after '{before[-1]}'" if before else ""
+    return f"'{shortened(word)}'{after} is one value too many; valid options: {', '.join(valid)}"
 
 
 def outline(table: Mapping[str, tuple[Any, str]]) -> dict[str, Command]:
@@ -194,7 +217,7 @@ def _hinted(annotation: Any, aliases: list[str] | None = None) -> Any:
 
 
 def _with_hints(command: Command) -> Command:
-    """A command with the help of `_hinted` for all parameters."""
+    """A command with the help of `_hinted` for all parameters; it returns the call instead of making it."""
     function: Any = command.func if isinstance(command, functools.partial) else command
     hints = get_type_hints(function, include_extras=True)
     signature = inspect.signature(command)
@@ -203,8 +226,8 @@ def _with_hints(command: Command) -> Command:
     ]
 
     @functools.wraps(function)
-    def wrapped(*args: Any, **options: Any) -> Any:
-        return command(*args, **options)
+    def wrapped(*args: Any, **options: Any) -> Callable[[], Any]:
+        return functools.partial(command, *args, **options)
 
     del wrapped.__wrapped__  # tyro would take the types from there
     wrapped.__annotations__ = {one.name: one.annotation for one in parameters} | {"return": Any}

@@ -114,6 +114,7 @@ class HandState:
         self.hand = hand
         self.config = config
         self.solver = PoseSolver(hand)
+        """Solver of its poses, whose markers are shifted by their biases."""
         self.qpos: NDArray[np.float64] | None = None
         """Pose of the last frame with one; None if the hand is lost."""
         self.time = 0.0
@@ -123,8 +124,6 @@ class HandState:
         count = self.num_markers = hand.attachment.layout.num_markers
         self.digits = hand.attachment.digits
         """Digit of each marker (M,), -1 for the palm."""
-        self.adapted = self.solver.hand
-        """The hand as arrays, with markers shifted by their biases."""
         self.variance = np.full(count, _INITIAL_SPREAD_MOST**2)
         """Variance (M,) of each marker around its position on the hand [m^2], at the last prediction."""
         self.positions = np.full((count, 3), np.nan)
@@ -143,7 +142,7 @@ class HandState:
         self._left_out = np.zeros(count, dtype=bool)  # markers without a point in the first fit
         self._spread_model = SpreadModel(hand, origin, angle_errors)
         self._usual_square = np.nan  # [m^2] mean squared RMS distance, biases included
-        self._designed = self.adapted.positions[:, 0].copy()  # [m] without biases
+        self._designed = self.solver.hand.positions[:, 0].copy()  # [m] without biases
         self._ranges = digit_ranges(hand)
         self._now = 0.0  # [s] of the last prediction
 
@@ -232,10 +231,7 @@ class HandState:
         A point that had no label while the marker was seen is likely foreign. This counts only for markers
         that no point has now.
         """
-        log_odds: NDArray[np.float64] = _presence_log_odds(
-            first_seen, free_since, markers, self._last_seen, self._now
-        )
-        return log_odds
+        return np.asarray(_presence_log_odds(first_seen, free_since, markers, self._last_seen, self._now))
 
     def initialize(
         self, qpos: Float[np.ndarray, "27"], targets: Float[np.ndarray, "M 3"], time: float
@@ -283,8 +279,7 @@ class HandState:
         """Continue with the same hand of another size, and a share of the biases."""
         self.hand, self.solver, self._spread_model = hand, PoseSolver(hand), SpreadModel(hand, origin)
         self.digits = hand.attachment.digits
-        self.adapted = self.solver.hand
-        self._designed = self.adapted.positions[:, 0].copy()
+        self._designed = self.solver.hand.positions[:, 0].copy()
         if not keep:
             self._ranges = digit_ranges(hand)
         self._bias *= keep
@@ -336,7 +331,7 @@ class HandState:
             self._bias,
             self._designed,
             self._variance,
-            self.adapted.positions,
+            self.solver.hand.positions,
         )
 
 

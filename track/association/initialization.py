@@ -441,20 +441,16 @@ def _link_distance(hand: GloveFit) -> float:
     return float(np.quantile(longest_links(markers), _LINKED_GESTURES))
 
 
-class FrameLabels(NamedTuple):
-    """Labels of a frame's points."""
-
-    labels: Int[np.ndarray, "N"]  # index of each point's marker, counted through the hands; -1 for none
-    confidence: Float[np.ndarray, "N"]  # confidence in each label, 0 to 1
-
-
 def label_alone(
     frames: Sequence[Float[np.ndarray, "N 3"]],
     hands: Sequence[GloveFit],
     labeler: Labeler,
     told: Callable[[int], None] = lambda count: None,
-) -> list[FrameLabels]:
-    """Label every frame by itself; a hand is present if a pose fits."""
+) -> tuple[Int[np.ndarray, "P"], Float[np.ndarray, "P"]]:
+    """Label every frame by itself; a hand is present if a pose fits.
+
+    Returns the labels of all points, counted through the hands, and the confidence in each, from 0 to 1.
+    """
     finder = HandInitializer([HandState(hand) for hand in hands], labeler, at_once=True)
     found = []
     for points in frames:
@@ -467,7 +463,7 @@ def label_alone(
     for (number, hand, cloud), one in zip(clouds, labelings, strict=True):
         labels[number][cloud] = np.where(one.labels >= 0, hand * hands[0].layout.num_markers + one.labels, -1)
         confidence[number][cloud] = one.confidence
-    return [FrameLabels(*row) for row in zip(labels, confidence, strict=True)]
+    return np.concatenate(labels), np.concatenate(confidence)
 
 
 def _clouds(

@@ -128,7 +128,7 @@ def _evaluate_hand(
     for digit in open_digits:
         row = first + digit
         evaluate_digit(
-            state.adapted,
+            state.solver.hand,
             confirmed if state.confirmed[digit] else unconfirmed,
             digit,
             digit_markers[row, digit_markers[row] >= 0],

@@ -1,1 +1,1 @@
-"""Calibration of a user's hands and gloves, and of rigid bodies, from captures of them."""
+"""Calibration of a user's hands and gloves from captures of them."""

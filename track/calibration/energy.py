@@ -91,7 +91,7 @@ class Contacts(NamedTuple):
     """K contacts of the thumb, each in one frame and with a point on either pad."""
 
     frames: Int[np.ndarray, "K"]
-    fingers: Int[np.ndarray, "K"]  # indices into `topology.DIGITS`
+    fingers: Int[np.ndarray, "K"]  # indices into `DIGITS`
     pads: SkinCoordinates  # points on the thumb, then those on the fingers
 
 

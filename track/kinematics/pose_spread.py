@@ -114,9 +114,7 @@ class HandDoubt(NamedTuple):
 
     noise: float  # marker around its place, independent in each frame [m]
     size: float  # log size of the whole hand
-    places: Float[
-        np.ndarray, "M 2"
-    ]  # of each marker on its bone: along the skin (each direction), off it [m]
+    places: Float[np.ndarray, "M 2"]  # of each marker on its bone: along the skin (each way), off it [m]
     knuckles: Float[np.ndarray, "5"]  # origin of each digit on the palm, in each direction [m]
     directions: Float[np.ndarray, "5 3"]  # direction of each digit, about the axes of the palm [rad]
     bones: Float[np.ndarray, "5 2"]  # log lengths of each bone of a digit, and of all of them together

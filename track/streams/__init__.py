@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Final, NamedTuple
+from typing import Annotated, Final
 from urllib.parse import parse_qsl, urlsplit
 
 from handsim.errors import ArgumentError, CaptureError, choices
@@ -33,19 +33,10 @@ class ReplaySettings(Settings):
     """UDP port to listen at; 0 takes a free one."""
 
 
-class NetworkAddress(NamedTuple):
-    """Parts of an address."""
-
-    host: str
-    """Host; this machine's loopback address if none is named."""
-    port: int
-    options: Mapping[str, str]
-
-
 def split_address(
     address: str, *, options: Mapping[str, Sequence[str]], port: int | None = None, any_port: bool = False
-) -> NetworkAddress:
-    """Split `scheme://host:port?option=value` into its parts.
+) -> tuple[str, int, Mapping[str, str]]:
+    """Split `scheme://host:port?option=value` into host, port and options; without a host it is this machine.
 
     Args:
         options: The valid values of each option, the default first.
@@ -71,4 +62,4 @@ def split_address(
             raise ArgumentError(f"{address}: {choices(name, options, noun='option') if options else nothing}")
         if value not in options[name]:
             raise ArgumentError(f"{address}: {choices(value, options[name], noun=name)}")
-    return NetworkAddress(host, number, {name: given.get(name, valid[0]) for name, valid in options.items()})
+    return host, number, {name: given.get(name, valid[0]) for name, valid in options.items()}

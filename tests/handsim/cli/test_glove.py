@@ -76,6 +76,17 @@ def test_check_tells_markers_that_overlap(mine, tmp_path, capsys):
     assert not (tmp_path / "x.png").exists()
 
 
+def test_check_and_simulate_take_a_layout_that_a_small_hand_wears_elsewhere(mine, tmp_path, capsys):
+    mine.write_text(
+        mine.read_text() + '\n[[marker]]\nname = "Side"\nbone = "ring_proximal"\nalong = 0.6\naround = 100\n'
+    )
+    assert main(["glove", "check", str(mine)]) == 0
+    assert "Side would be off its digit on size XS" in capsys.readouterr().err
+    command = ["simulate", "--glove", str(mine), "--num-frames", "3", "--out", str(tmp_path / "x.c3d")]
+    assert main(command) == 0
+    assert main(["hand", "--glove", str(mine), "--size", "XS", "--out", str(tmp_path / "x.xml")]) == 0
+
+
 @pytest.mark.slow
 def test_a_score_is_printed_and_drawn(mine, capsys):
     assert main(["glove", "score", str(mine), "--frames", "120", "--rig", "six", "--captures", "1"]) == 0

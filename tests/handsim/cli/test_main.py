@@ -97,6 +97,22 @@ def test_wrong_options_are_usage(args, invoke, capsys):
     assert "handsim fake --help" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("args", "said"),
+    [
+        (["--tims", "3"], "unknown option '--tims' (did you mean '--times'?); valid names: --help, --name, "),
+        (["--times", "3", "4"], "'4' after '3' is one value too many; valid options: --help, --name, "),
+        (["x"], "'x' after 'y' is one value too many; valid options: --help, --name, --times; see "),
+    ],
+)
+def test_what_a_command_does_not_take_is_named_with_what_it_takes(args, said, invoke, capsys):
+    with pytest.raises(SystemExit) as stop:
+        invoke(greet, "--name", "y", *args)
+    assert stop.value.code == 2
+    told = capsys.readouterr()
+    assert told.out == "" and told.err.count("\n") == 1 and told.err.startswith(f"handsim fake: {said}")
+
+
 def test_a_table_of_functions_becomes_subcommands(invoke, capsys):
     table = {"greet": greet, "fail": raising(LayoutError("no"))}
     assert invoke(table, "greet", "--name", "x") == 0

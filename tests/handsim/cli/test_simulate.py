@@ -77,6 +77,13 @@ def test_a_take_is_evaluated_with_its_own_gaps_and_ghosts(taken, tmp_path, capsy
     assert "240 hands in frames" in capsys.readouterr().out
 
 
+def test_a_take_is_evaluated_with_the_glove_that_it_names(tmp_path, capsys):
+    out = tmp_path / "take.c3d"
+    assert main(["simulate", "--glove", "sparse13", "--num-frames", "30", "--out", str(out)]) == 0
+    assert main(["evaluate", str(out.with_suffix(".truth.npz"))]) == 0
+    assert "60 hands in frames" in capsys.readouterr().out
+
+
 def test_every_nth_frame_of_a_capture_is_evaluated(tmp_path):
     capture, figures = tmp_path / "capture.trc", tmp_path / "figures.json"
     markers = held_out_markers("dense19", 40, seed=0)
@@ -90,6 +97,6 @@ def test_a_glove_that_the_labeler_does_not_know_is_told(tmp_path, capsys):
     out = tmp_path / "take.c3d"
     assert main(["simulate", "--num-frames", "5", "--glove", "sparse13", "--out", str(out)]) == 0
     capsys.readouterr()
-    assert main(["evaluate", str(out.with_suffix(".truth.npz"))]) == 1
+    assert main(["evaluate", str(out.with_suffix(".truth.npz")), "--glove", "dense19"]) == 1
     said = capsys.readouterr().err
     assert said.count("\n") == 1 and "the labeler knows" in said

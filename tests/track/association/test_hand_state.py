@@ -134,14 +134,14 @@ def test_a_small_bias_is_forgotten_and_a_large_one_stays(followed):
 
 
 def test_only_settled_labels_teach_a_bias(moving):
-    before = moving.adapted.positions.copy()
+    before = moving.solver.hand.positions.copy()
     prediction = moving.predict(30 / RATE)
     target = prediction.positions.copy()
     target[KNUCKLE] += 0.003
     estimate = moving.fit(target, prediction.qpos, prediction)
     moving.update(estimate, np.arange(19) != KNUCKLE, 30 / RATE)
-    np.testing.assert_array_equal(moving.adapted.positions[KNUCKLE], before[KNUCKLE])
-    assert (moving.adapted.positions != before).any()
+    np.testing.assert_array_equal(moving.solver.hand.positions[KNUCKLE], before[KNUCKLE])
+    assert (moving.solver.hand.positions != before).any()
 
 
 def test_a_marker_alone_on_its_digit_keeps_its_spread():
@@ -162,15 +162,15 @@ def test_biases_are_forgotten_and_recalled(followed):
     off = np.zeros((19, 3))
     off[KNUCKLE] = 0.0, 0.01, 0.01
     state = followed(off=off)
-    designed = HandState(state.hand).adapted.positions
-    biased, variance, biases = state.adapted.positions.copy(), state.variance.copy(), state.biases
+    designed = HandState(state.hand).solver.hand.positions
+    biased, variance, biases = state.solver.hand.positions.copy(), state.variance.copy(), state.biases
     state.forget(np.array([KNUCKLE]))
-    np.testing.assert_array_equal(state.adapted.positions[KNUCKLE], designed[KNUCKLE])
+    np.testing.assert_array_equal(state.solver.hand.positions[KNUCKLE], designed[KNUCKLE])
     others = np.delete(np.arange(19), KNUCKLE)
-    np.testing.assert_array_equal(state.adapted.positions[others], biased[others])
+    np.testing.assert_array_equal(state.solver.hand.positions[others], biased[others])
     assert state.variance[KNUCKLE] > variance[KNUCKLE]
     state.recall(biases)
-    np.testing.assert_array_equal(state.adapted.positions, biased)
+    np.testing.assert_array_equal(state.solver.hand.positions, biased)
     np.testing.assert_array_equal(state.variance, variance)
     assert np.linalg.norm(biased[KNUCKLE, 0] - designed[KNUCKLE, 0]) > 0.003
 
@@ -179,14 +179,14 @@ def test_biases_are_forgotten_and_recalled(followed):
 def test_a_hand_that_comes_back_keeps_its_biases_if_they_still_fit(followed, same):
     off = np.random.default_rng(1).uniform(-0.004, 0.004, (19, 3))
     state = followed(off=off)
-    qpos, biased = state.qpos, state.adapted.positions.copy()
+    qpos, biased = state.qpos, state.solver.hand.positions.copy()
     target = (
         state.solver.marker_positions(qpos)
         if same
         else HandState(state.hand).solver.marker_positions(qpos) - 2 * off
     )
     state.initialize(qpos, target, 2.0)
-    assert np.array_equal(state.adapted.positions, biased) == same
+    assert np.array_equal(state.solver.hand.positions, biased) == same
     assert (state.spread is None) != same and not state.confirmed.any()
 
 
