@@ -1,7 +1,7 @@
 """Writes docs/results.md from the figures in benchmarks/figures: `python -m benchmarks.results`.
 
 The page's text is results_template.md; `{table5.right_size[1]:.2f}` in it is a number of table5.json, and
-`{speed_run}` says how speed.json was made.
+`{speed_times}` and `{speed_rates}` are tables of all of speed.json, and `{speed_run}` says how it was made.
 """
 
 from __future__ import annotations
@@ -34,7 +34,8 @@ def filled(text: str) -> str:
         KeyError: A field names a file that is not there.
         AttributeError: A field names a figure that its file lacks.
     """
-    return text.format(**load_figures(), speed_run=speed_run())
+    times, rates = speed_tables()
+    return text.format(**load_figures(), speed_times=times, speed_rates=rates, speed_run=speed_run())
 
 
 def speed_run(folder: Path = FOLDER) -> str:
@@ -42,6 +43,28 @@ def speed_run(folder: Path = FOLDER) -> str:
     kept = json.loads((folder / "speed.json").read_text("utf-8"))
     origin = f"Commit {kept['commit']}, {kept['date']}, `{kept['command']}`; {kept['machine']}."
     return f"{Conditions(**kept['conditions'])} {origin}" if "conditions" in kept else origin
+
+
+def speed_tables(folder: Path = FOLDER) -> tuple[str, str]:
+    """The rows of speed.json, with times or rates. Each row ends with its unit, which is left out here."""
+    figures = json.loads((folder / "speed.json").read_text("utf-8"))["figures"]
+    times = [
+        "| what | median [ms] | 99th percentile [ms] | longest [ms] |",
+        "|---|---|---|---|",
+    ]
+    rates = ["| what | in a second |", "|---|---|"]
+    for key, figure in figures.items():
+        if key == "unit":
+            continue
+        *shown, _ = figure["value"]
+        row = f"| {' | '.join([figure['what'].rsplit(': ', 1)[0], *map(_shown, shown)])} |"
+        (times if len(shown) == 3 else rates).append(row)
+    return "\n".join(times), "\n".join(rates)
+
+
+def _shown(value: float) -> str:
+    """A number to three digits."""
+    return f"{float(f'{value:.3g}'):,g}"
 
 
 if __name__ == "__main__":

@@ -73,7 +73,7 @@ _PADDING: Final = 16  # between a picture and its texts [pixels]
 
 def write_png(path: str | Path, picture: Picture) -> None:
     """Write a picture as PNG."""
-    check_ending(Path(path), ".png")
+    check_ending(Path(path), ".png", option="path")
     with atomic_write(path) as temporary:
         temporary.write_bytes(encode_png(picture))
 

@@ -29,8 +29,8 @@ PARTS_A_HAND: Final = 32
 
 
 def at_rest(camera: Camera) -> Camera:
-    """The camera in the origin and without a name: equal for all that share size, matrix and lens."""
-    return dataclasses.replace(camera, name="", T_world_camera=np.eye(4))
+    """A copy in the origin and without a name: equal for all cameras that share size, matrix and lens."""
+    return dataclasses.replace(camera, name="", K=camera.K.copy(), T_world_camera=np.eye(4))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

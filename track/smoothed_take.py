@@ -42,8 +42,8 @@ _GESTURES: Final = 30.0  # [1/s] how often the prior counts: errors of markers l
 _WEAK: Final = np.repeat([0.0, 1.0], [NUM_JOINTS, 6])  # [1/m^2, 1/rad^2] keeps an unseen wrist solvable
 _WINDOW, _MARGIN = 2000, 200  # frames solved together, and additional ones at either end
 _ROUNDS: Final = 5  # Gauss-Newton steps
-_COUNTED: Final = 8  # One frame of so many tells how many numbers of the markers the poses follow.
-_LEAST_FREEDOM: Final = 0.1  # least share of the markers' numbers that poses do not follow
+_COUNTED: Final = 8  # In every eighth frame is counted how many coordinates of markers poses can follow.
+_LEAST_FREEDOM: Final = 0.1  # least share of coordinates that poses cannot follow
 _LONGEST_STEP: Final = 0.5  # [rad], [m] bound of each step
 _FIRST_NOISE, _LEAST_NOISE = 0.0015, 0.0001  # [m] standard deviation of markers: first value, lower bound
 _FROM_BIAS: Final = 1.4  # ratio of a marker's place error to its mean residual: poses absorb half of it
@@ -139,7 +139,8 @@ class _SmoothedHand:
         # Standard deviations [m] of noise, of slow motion that residuals show, and of the flesh behind it.
         self._noise, self._slow, self._flesh = _FIRST_NOISE, 0.0, 0.0
         self._places = np.zeros((len(self._hand.digits), 2))  # RMS error along the skin, off it [m]
-        self._freedom = np.full(take.num_frames, np.nan)  # share of the markers' numbers left to residuals
+        # Coordinates of the markers that are seen in a frame, and how many of them the pose can follow.
+        self._coordinates = np.zeros((take.num_frames, 2))
 
     def solve(self, windows: Sequence[_Window]) -> tuple[Float[np.ndarray, "20"], Float[np.ndarray, "20 4"]]:
         """Solve all poses; return the cut-off of each angle [Hz] and its spread by `SOURCES` [deg]."""
@@ -192,7 +193,8 @@ class _SmoothedHand:
     def _weight_noise(self) -> float:
         """Noise and slow motion together [m], which weight a marker.
 
-        Few markers weigh less than their flesh alone would tell: the prior makes up for wrong places.
+        Of gloves with few markers this is more than noise and flesh: the wrong place of a marker misleads a
+        pose most there, and the prior makes up for that.
         """
         slow = np.sqrt(3.0) * self._slow * freedom_factor(len(self._places))
         return float(np.hypot(self._noise, slow))
@@ -203,14 +205,20 @@ class _SmoothedHand:
         normal, gradient, self._residuals[window.frames] = _frame_equations(
             self._hand, self._targets[window.frames], qpos, self._weight_noise**-2, _OUTLIER**-2
         )
-        seen, markers = np.isfinite(self._targets[window.frames, :, 0]), normal[::_COUNTED].copy()
+        markers = normal[::_COUNTED].copy()
         normal[:, :NUM_JOINTS, :NUM_JOINTS] += self._share * prior.precision
         normal += np.diag(_WEAK)
-        followed = np.linalg.solve(normal[::_COUNTED], markers).trace(axis1=1, axis2=2)
-        shown = np.maximum(3 * seen[::_COUNTED].sum(axis=1), 1)
-        self._freedom[window.frames][::_COUNTED] = 1.0 - followed / shown
+        self._count(slice(window.frames.start, window.frames.stop, _COUNTED), markers, normal[::_COUNTED])
         gradient[:, :NUM_JOINTS] += self._share * (qpos[:, 7:] - prior.angles) @ prior.precision
         return normal, gradient
+
+    def _count(self, frames: slice, markers: NDArray[np.float64], whole: NDArray[np.float64]) -> None:
+        """Count coordinates; normal matrices are given by markers and limits alone, and with the prior."""
+        angles, (low, high) = self.qpos[frames, 7:], self._hand.ranges.T
+        hinges = np.arange(NUM_JOINTS)
+        markers[:, hinges, hinges] -= LIMIT_PRECISION * ((angles < low) | (angles > high))
+        self._coordinates[frames, 0] = 3 * np.isfinite(self._targets[frames, :, 0]).sum(axis=1)
+        self._coordinates[frames, 1] = np.linalg.solve(whole, markers).trace(axis1=1, axis2=2)
 
     def _step(
         self, window: _Window, equations: tuple[NDArray[np.float64], NDArray[np.float64]]
@@ -245,8 +253,10 @@ class _SmoothedHand:
         noise = _spread(changes[seen[1:] & seen[:-1]]) / np.sqrt(2.0)
         self._noise = max(noise, _LEAST_NOISE)
         self._slow = float(np.sqrt(max(_spread((residuals - bias)[seen]) ** 2 - noise**2, 0.0)))
-        # Poses follow flesh as far as markers alone decide a pose; residuals show the rest.
-        self._flesh = self._slow / float(np.sqrt(max(np.nanmean(self._freedom), _LEAST_FREEDOM)))
+        # Residuals show flesh only in the coordinates that poses cannot follow.
+        shown, followed = self._coordinates.sum(axis=0)
+        freedom = 1.0 - followed / max(shown, 1.0)
+        self._flesh = self._slow / float(np.sqrt(max(freedom, _LEAST_FREEDOM)))
         lifts = (bias * self._hand.normals).sum(axis=1)
         slips = np.sqrt(np.maximum((bias**2).sum(axis=1) - lifts**2, 0.0) / 2.0)
         for part in (self._hand.digits < 0, self._hand.digits >= 0):

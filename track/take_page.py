@@ -330,6 +330,7 @@ def _error_section(title: str, settings: Mapping[str, Any], hand: HandFigures) -
     errors = _joint_errors(settings, hand)
     if np.isnan(errors).all():
         return Section(title, "Filter: none, each pose was fitted to the markers of its frame.")
+    changing = ", ".join(f"{one:g} times {name}" for one, name in zip(CHANGING, SOURCES, strict=True))
     text = (
         "Filter: all poses were solved together, forward and backward in time, without a delay. It acts as a "
         "Butterworth filter of second order that runs forward and backward: at the cut-off an oscillation "
@@ -337,8 +338,8 @@ def _error_section(title: str, settings: Mapping[str, Any], hand: HandFigures) -
         "squares of its four parts, each as root mean square over all frames. Gluing is a constant error, as "
         "is what stays of the person: sizes and directions of bones, and gestures unlike other people's. "
         "SEM: standard error of measurement between sessions of a person, with the glove put on anew: "
-        "the SD of hands that are calibrated in each session; of other hands from the four parts times "
-        f"{', '.join(f'{one:g}' for one in CHANGING)}. "
+        "the SD of hands that are calibrated in each session; of other hands from "
+        f"{changing}. "
         "MDD: minimal detectable difference of two sessions, 1.96 times the root of two times the SEM."
     )
     table = [["joint", "SD", *SOURCES, "SEM", "MDD", "cut-off [Hz]"]]

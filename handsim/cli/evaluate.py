@@ -49,7 +49,7 @@ def evaluate(
 
     check_outputs((*captures, glove, labeler, truth), [json])
     if truth is None:
-        takes = (load_take(one) for one in captures[:1] if one.suffix == ".npz")
+        takes = (load_take(one) for one in captures[:1] if one.suffix.lower() == ".npz")
         glove = glove or next((str(take.settings.get("glove", "dense19")) for take in takes), "dense19")
         label_on(threads)
         report = evaluate_labeler(load_labeler(glove, labeler), captures, settings=settings)

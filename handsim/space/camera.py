@@ -7,6 +7,7 @@ theta^8).
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import functools
 from collections.abc import Mapping, Sequence
@@ -315,7 +316,8 @@ class Camera:
         return isinstance(other, Camera) and self.record() == other.record()
 
     def __hash__(self) -> int:
-        return hash((self.name, tuple(self.size), self.lens))
+        numbers = (*self.K.ravel().tolist(), *self.T_world_camera.ravel().tolist())
+        return hash((self.name, self.size, self.lens, numbers))
 
     @property
     def focal_lengths(self) -> tuple[float, float]:
@@ -494,6 +496,6 @@ PRESETS: Final = {camera.name: camera for camera in _PRESETS}
 
 
 def preset(name: str) -> Camera:
-    """One of `PRESETS`."""
+    """A copy of one of `PRESETS`."""
     check_choice(name, PRESETS, noun="camera")
-    return PRESETS[name]
+    return copy.deepcopy(PRESETS[name])

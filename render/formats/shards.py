@@ -200,5 +200,8 @@ class FolderWriter:
 
 def _write(path: Path, content: bytes) -> None:
     """Write a file into a folder, which is made for its first file."""
-    path.parent.mkdir(exist_ok=True)
-    path.write_bytes(content)
+    try:
+        path.write_bytes(content)
+    except FileNotFoundError:
+        path.parent.mkdir(exist_ok=True)
+        path.write_bytes(content)

@@ -552,12 +552,18 @@ def _corner(point: Doubles) -> Corner:
     return x, y, z
 
 
-@functools.lru_cache(maxsize=16)
 def draw_surroundings(
     background: Background, enclosure: Enclosure, camera: Camera, *, bright: bool
 ) -> Surroundings:
     """The box as a camera in it sees it, through any lens; cached for cameras that stand still."""
-    T_world_camera, (rays, known) = camera.T_world_camera, _rays(at_rest(camera))
+    return _drawn(background, enclosure, at_rest(camera), camera.T_world_camera.tobytes(), bright)
+
+
+@functools.lru_cache(maxsize=16)
+def _drawn(
+    background: Background, enclosure: Enclosure, camera: Camera, pose: bytes, bright: bool
+) -> Surroundings:
+    T_world_camera, (rays, known) = np.frombuffer(pose).reshape(4, 4), _rays(camera)
     world = rays @ T_world_camera[:3, :3].T.astype(np.float32)
     world, eye, shape = _sloping(world), T_world_camera[:3, 3], camera.size[::-1]
     sigma = background.blur * shape[0]
