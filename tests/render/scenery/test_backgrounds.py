@@ -197,6 +197,17 @@ def test_two_cameras_see_one_place(kind: str, camera: str) -> None:
     assert np.ptp(moved) > 3.0, "parallax: what is near moves more"
 
 
+def test_a_camera_that_was_changed_in_place_is_drawn_anew() -> None:
+    box, (camera, _) = enclose(POSITIONS, 5, LAMP), pair("headset_fisheye")
+    before = draw_surroundings(background("gradient"), box, camera, bright=False).depth
+    camera.K[:2, :2] *= 0.8
+    zoomed = draw_surroundings(background("gradient"), box, camera, bright=False).depth
+    camera.T_world_camera[2, 3] += 0.05
+    moved = draw_surroundings(background("gradient"), box, camera, bright=False).depth
+    assert not np.array_equal(before, zoomed) and not np.array_equal(zoomed, moved)
+    assert preset("headset_fisheye").K[0, 0] > camera.K[0, 0], "presets are copies"
+
+
 def test_an_empty_box_is_where_it_says() -> None:
     box = Enclosure((-1.0, -2.0, 0.0), (2.0, 1.5, 2.5), ((-0.5,) * 3, (0.5,) * 3), (0.0, 0.0, 2.0))
     camera = preset("vga").at(look_at(np.array([0.0, 0.0, 1.2]), np.array([0.5, 0.9, 1.0])))
