@@ -269,7 +269,7 @@ def sample_background(config: Backgrounds, *, rng: np.random.Generator) -> Backg
 
 def draw_background(background: Background, size: tuple[int, int]) -> Float32[np.ndarray, "H W 3"]:
     """The picture in linear light, 1 for full white."""
-    return enlarged(kept_background(background, size), size)
+    return enlarged(_coarse(background, size), size)
 
 
 def enlarged(picture: Float32[np.ndarray, "h w 3"], size: tuple[int, int]) -> Float32[np.ndarray, "H W 3"]:
@@ -282,7 +282,14 @@ def enlarged(picture: Float32[np.ndarray, "h w 3"], size: tuple[int, int]) -> Fl
 
 @functools.lru_cache(maxsize=2)  # each is drawn for its light, then behind the hands
 def kept_background(background: Background, size: tuple[int, int]) -> Float32[np.ndarray, "h w 3"]:
-    """The picture of `draw_background`, read-only: half as large for kinds that are out of focus."""
+    """The picture of `draw_background` before it is `enlarged`, read-only."""
+    picture = _coarse(background, size)
+    picture.setflags(write=False)
+    return picture
+
+
+def _coarse(background: Background, size: tuple[int, int]) -> Floats:
+    """The picture of `draw_background`, at half its size for kinds that are out of focus."""
     rng = np.random.default_rng(background.seed)
     first, second = (np.array(color, dtype=np.float32) for color in background.colors)
     halved = (max(2, size[0] // 2), max(2, size[1] // 2))
@@ -304,9 +311,7 @@ def kept_background(background: Background, size: tuple[int, int]) -> Float32[np
         raise HandSimError(choices(background.kind, KINDS, noun="background"))
     if background.blur * height > 0.3:
         picture = cv2.GaussianBlur(picture, (0, 0), background.blur * height)
-    picture = np.clip(picture, 0.0, 1.0, dtype=np.float32)
-    picture.setflags(write=False)
-    return np.asarray(picture)
+    return np.asarray(np.clip(picture, 0.0, 1.0, dtype=np.float32))
 
 
 def _color(rng: np.random.Generator) -> tuple[float, float, float]:
