@@ -36,7 +36,7 @@ def test_hands_in_a_named_glove_get_the_labeler_of_its_design():
     settings = TrackSettings(glove="dense19", hands=[nominal_fit(worn, "M", "right")])
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # of a labeler that is learned anew
-        assert TrackerSetup.of(settings).user.layout is worn
+        assert TrackerSetup.of(settings).user.layout == worn
 
 
 def test_hands_that_are_not_named_are_those_of_the_glove():

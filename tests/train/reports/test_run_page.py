@@ -73,7 +73,7 @@ def test_the_page_says_what_the_card_says(run):
     out, card = run
     text = (out / PAGE).read_text("utf-8")
     assert "<title>Labeler run</title>" in text
-    assert "Set labeler for glove dense19 (19 markers), trained on 2,560 clouds of a set of 400" in text
+    assert "A set labeler for glove dense19 (19 markers), trained on 2,560 clouds of a set of 400" in text
     for figures in card["held_out_simulated"].values():
         for figure in ("slot_accuracy", "macro_f1", "calibration_error", "error_without_least_sure"):
             assert f"<td>{percent(figures[figure])}</td>" in text
@@ -215,7 +215,7 @@ def test_any_glove_and_either_network_have_a_page(tmp_path, rng, count):
     history = History([(256, 3.0, 0.6), (512, 2.0, 0.6)], [(512, 0.1, 0.4)])
     page = write_run_page(tmp_path, card, history, report)
     text = page.read_text("utf-8")
-    assert "The paper&#x27;s network for glove &lt;i&gt;odd" in text
+    assert "The network of Han et al. 2018 for glove &lt;i&gt;odd" in text
     assert "<b>" not in text and "<i>" not in text
     assert len([ElementTree.fromstring(picture) for picture in pictures(page)]) == 4
     assert text.count("<td>&lt;b&gt;$") > 0
