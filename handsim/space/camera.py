@@ -296,7 +296,7 @@ class Camera:
         object.__setattr__(self, "K", check_array("K", self.K, (3, 3)))
         object.__setattr__(self, "T_world_camera", check_array("T_world_camera", self.T_world_camera, (4, 4)))
         sides = np.asarray(self.size)
-        whole = sides.shape == (2,) and sides.dtype.kind in "iuf" and (sides % 1 == 0).all()
+        whole = sides.shape == (2,) and sides.dtype.kind in "iuf" and (sides == np.floor(sides)).all()
         if not whole or sides.min() < 1 or sides.max() > _MAX_SIZE:
             raise ArgumentError(
                 f"camera '{self.name}': size is {self.size}, expected width and height, 1 to {_MAX_SIZE} "
