@@ -171,7 +171,7 @@ def wrist_path(
     turning: float = 0.5,
     rng: np.random.Generator,
 ) -> tuple[Float[np.ndarray, "T 3"], Float[np.ndarray, "T 4"]]:
-    """Positions [m] and orientations (wxyz) of the wrist of a person at a table.
+    """Sample how a wrist moves over a table, as positions [m] and orientations (wxyz).
 
     It stays in a cube of half side `volume` around a center [m], and turns from fingers ahead and palm down
     by the standard deviation `turning` about each axis [rad].

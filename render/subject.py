@@ -329,7 +329,7 @@ def source_of(
 
 
 def _holds_poses(path: Path) -> bool:
-    """Whether a file has poses of a user's own, by the names of its arrays."""
+    """Whether the names of a file's arrays are those of hand poses that a user made."""
     try:
         return bool({"qpos", "angles"} & set(_arrays(path)))
     except HandSimError:

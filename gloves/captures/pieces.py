@@ -50,7 +50,10 @@ def shared_columns(
 
 
 def _packed(frames: Int[np.ndarray, "P"], columns: Int[np.ndarray, "P"]) -> tuple[NDArray[np.int64], int]:
-    """The shared columns of points (P,), and their number; a piece is a run of points of a column."""
+    """Give each run of points in a column a shared column.
+
+    Returns the shared column of each point (P,), and how many shared columns there are.
+    """
     order = np.lexsort((frames, columns))
     frames, columns = frames[order], columns[order]
     begins = np.flatnonzero(np.diff(frames, prepend=-2) * (np.diff(columns, prepend=-1) == 0) != 1)

@@ -204,7 +204,7 @@ def _prefix(path: Path) -> str:
 
 
 def remove_leftovers(folder: Path, names: str = "**/.*.tmp-*") -> None:
-    """Remove the temporary files and folders that match a pattern; by default all in a folder and below it.
+    """Remove the files and folders that match a pattern, when not given all temporary ones at any depth.
 
     Call it only for what one job owns: what another process is writing there would be lost.
     """

@@ -492,7 +492,7 @@ _PRESETS: Final = (
     ),
 )
 PRESETS: Final = {camera.name: camera for camera in _PRESETS}
-"""The cameras that come with the package, at the world's origin, by their names."""
+"""Cameras that come with the package, by name. Each stands at the origin of the world."""
 
 
 def preset(name: str) -> Camera:

@@ -99,7 +99,7 @@ def _unit_ball(level: int) -> trimesh.Trimesh:
 
 @dataclass(frozen=True, slots=True)
 class Appearance:
-    """Appearance of a person's hands: both have the same skin and the same sleeves."""
+    """Skin and sleeves of a person, which are alike on both hands."""
 
     skin: SkinLook
     forearm: Forearm

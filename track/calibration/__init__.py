@@ -1,1 +1,1 @@
-"""Calibration of a user's hands and gloves from captures of them."""
+"""Estimates the shape of a user's hands, and where the glove's markers sit, from captures."""

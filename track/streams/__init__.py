@@ -36,7 +36,9 @@ class ReplaySettings(Settings):
 def split_address(
     address: str, *, options: Mapping[str, Sequence[str]], port: int | None = None, any_port: bool = False
 ) -> tuple[str, int, Mapping[str, str]]:
-    """Split `scheme://host:port?option=value` into host, port and options; without a host it is this machine.
+    """Split `scheme://host:port?option=value` into host, port and options.
+
+    An address without a host means this machine.
 
     Args:
         options: The valid values of each option, the default first.

@@ -197,7 +197,7 @@ class LitScene(NamedTuple):
 def light_work(
     work: Mapping[str, Sequence[SceneMotion]], rig: CameraRig, *, rng: np.random.Generator
 ) -> dict[str, list[LitScene]]:
-    """Cast the lines of sight of scenes by kind of work, each in the default room of its kind.
+    """Find which cameras see which markers in each scene, in the default room for its kind of work.
 
     Raises:
         ArgumentError: A camera is inside a hand.

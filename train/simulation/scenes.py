@@ -143,7 +143,7 @@ def _gloved(
 # A calibration capture.
 _MAX_DRAWS: Final = 20
 _STARTS: Final = ("pinch_pad", "pinch_tip")  # gestures before touches
-_TURNING: Final = 0.7  # [rad] standard deviation of the wrist's rotation about each axis
+_TURNING: Final = 0.7  # [rad] standard deviation of a calibrated wrist's turns about each axis
 _JITTER: Final = np.deg2rad(8.0)  # [rad] standard deviation of these gestures' joint angles
 _TOUCHING: Final = MotionConfig(durations=(0.4, 0.8), hold=0.8)
 _FREE: Final = MotionConfig(durations=(0.3, 0.9), hold=0.2)
