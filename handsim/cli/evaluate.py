@@ -49,8 +49,9 @@ def evaluate(
 
     check_outputs((*captures, glove, labeler, truth), [json])
     if truth is None:
-        takes = (load_take(one) for one in captures[:1] if one.suffix.lower() == ".npz")
-        glove = glove or next((str(take.settings.get("glove", "dense19")) for take in takes), "dense19")
+        if glove is None and captures and captures[0].suffix.lower() == ".npz":
+            glove = load_take(captures[0]).settings.get("glove")
+        glove = glove or "dense19"
         label_on(threads)
         report = evaluate_labeler(load_labeler(glove, labeler), captures, settings=settings)
         found: dict[str, Any] = {"glove": glove, **settings.record()}

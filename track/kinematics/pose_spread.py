@@ -69,7 +69,7 @@ SOURCES: Final = ("noise and gaps", "gluing", "flesh", "person")
 """Sources of an angle's uncertainty: noisy or unseen markers, their glued places, their motion over the
 bones, and what stays of a person: sizes and directions of bones, gestures unlike other people's."""
 CHANGING: Final = 1.0, 0.5, 1.2, 0.32
-"""Shares of these parts of an uncalibrated hand's error that change between sessions of a person. The rest
+"""Factors by which these parts of an uncalibrated hand's error change between sessions of a person. The rest
 comes from its wrong shape, which stays, and from people's usual gestures, towards which a hand is drawn
 nearly alike. Flesh counts more than once, as residuals do not show all of it. Found for two sessions of each
 of 107, 67 and 40 simulated people in dense19, sparse13 and starter10 (benchmarks/sessions.py)."""
