@@ -59,6 +59,8 @@ class ArrivingFrames(ABC):
     """Why no further frame comes, if the source failed."""
     without_points = "does the camera system see markers?"
     """Hint for frames without any point."""
+    without_frames = "is the server playing?"
+    """Why no frame comes, as far as the source knows."""
 
     def __init__(self) -> None:
         self.lost = 0
