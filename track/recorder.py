@@ -114,7 +114,8 @@ class Recorder(Closing):
         out = Path(path)
         check_ending(out, ".npz", option="path")
         remove_abandoned(out)  # left by a run that was killed in `finish`
-        self._out, self._tracker = out, tracker
+        self._tracker, self.out = tracker, out
+        """The file of the take."""
         self._settings = {**settings_of(tracker), **settings}
         sizes = {"H": len(tracker.hands), "B": len(tracker.bodies)}
         self._archive = GrowingArchive(
@@ -240,13 +241,13 @@ class Recorder(Closing):
             header = self._header(usual_rate(*first))
             step = max(1, -(-grown.num_frames // _SUMMARIZED))
             take = unpack_take(dict(header), grown.read(step))
-            finish_archive(grown, self._out, header, told=told)
+            finish_archive(grown, self.out, header, told=told)
         except Exception as error:  # keep the recording after any error
             reason = (error.strerror if isinstance(error, OSError) else None) or error
-            raise CaptureError(f"{self._out}: cannot be written ({reason}); {self.kept()}") from error
+            raise CaptureError(f"{self.out}: cannot be written ({reason}); {self.kept()}") from error
         if grown.num_frames < self.num_frames:
-            told = f"{self.part} was damaged by another program and stays: {self._out} has {grown.num_frames}"
-            warnings.warn(f"{told} of its {self.num_frames} frames", HandSimWarning, stacklevel=2)
+            lost = f"{self.part} was damaged by another program and stays: {self.out} has {grown.num_frames}"
+            warnings.warn(f"{lost} of its {self.num_frames} frames", HandSimWarning, stacklevel=2)
         else:
             self.part.unlink()
         return take, step

@@ -59,8 +59,6 @@ class ArrivingFrames(ABC):
     """Why no further frame comes, if the source failed."""
     without_points = "does the camera system see markers?"
     """Hint for frames without any point."""
-    without_frames = "is the server playing?"
-    """Why no frame comes, as far as the source knows."""
 
     def __init__(self) -> None:
         self.lost = 0
@@ -71,6 +69,11 @@ class ArrivingFrames(ABC):
     def counts(self) -> dict[str, int]:
         """Numbers of ignored packets, by name."""
         return {}
+
+    @property
+    def without_frames(self) -> str:
+        """Why no frame comes, as far as the source knows."""
+        return "is the server playing?"
 
     @property
     @abstractmethod
@@ -101,8 +104,9 @@ class ArrivingFrames(ABC):
 class SourceStream(ArrivingFrames):
     """Validated frames of a source, which is iterated in its own thread.
 
-    With `waits`, a source that is faster than the time stamps of its frames has to wait. A source may have an
-    attribute `without_points` with a hint for frames without points.
+    With `waits`, a source that is faster than the time stamps of its frames has to wait. A source may have
+    attributes: `without_points` and `without_frames` with hints for frames without points and for no frames,
+    and `counts` of ignored packets.
     """
 
     def __init__(self, source: FrameSource, name: str, *, waits: bool = True) -> None:
@@ -115,6 +119,16 @@ class SourceStream(ArrivingFrames):
         self._read_all = self._ended = self._closed = False
         self._thread = threading.Thread(target=self._read, name="frame source", daemon=True)
         self._thread.start()
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Numbers of ignored packets, by name."""
+        return dict(getattr(self._source, "counts", {}))
+
+    @property
+    def without_frames(self) -> str:
+        """Why no frame comes, as far as the source knows."""
+        return str(getattr(self._source, "without_frames", super().without_frames))
 
     @property
     def is_over(self) -> bool:
