@@ -5,11 +5,11 @@ from __future__ import annotations
 import gc
 import math
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from time import monotonic, sleep
-from typing import Final, NamedTuple, Protocol
+from typing import Any, Final, NamedTuple, NoReturn, Protocol
 
 import numpy as np
 
@@ -107,11 +107,7 @@ def track_live(
     """
     if out is not None:
         check_unused(growing_path(out))
-    with named_steps("getting ready"):
-        tracker = setup.tracker()
-        tracker.warm_up()
-        _start(outputs, tracker)
-        gc.freeze()  # A garbage collection would stop tracking for up to 0.25 s.
+    tracker = _ready_tracker(setup, outputs)
     patience = math.inf if seconds is None else max(seconds, _FIRST_FRAME)
     until = monotonic() + patience  # [s] end of tracking on the monotonic clock
     interrupted = InterruptFlag()
@@ -121,11 +117,8 @@ def track_live(
         ExitStack() as stack,
     ):
         stack.enter_context(interrupt_flag(interrupted))  # From here on a signal keeps the frames so far.
-        recorder = None
-        if out is not None:
-            recorder = stack.enter_context(Recorder(out, tracker, {"capture": address, **setup.settings}))
-            stack.enter_context(_recording_kept(recorder))
-        recording = _Recording(recorder, outputs, status)
+        settings = {"capture": address, **setup.settings}
+        recording = _Recording(stack, out, tracker, settings, outputs, status)
         sizing = stack.enter_context(LiveSizing(setup))
         status.show("waiting for the first frame")
         stream.forgive()
@@ -157,9 +150,8 @@ def track_live(
         stream.end(until)
         counts = stream.counts
         if not pace.frames and (out is not None or monotonic() >= until):
-            recording.discard()
             waited = f" in {patience:g} s" if monotonic() >= until else ""
-            raise CaptureError(f"{address}: 0 frames came{waited}; {stream.silence_doubt}")
+            recording.discard(f"{address}: 0 frames came{waited}; {stream.silence_doubt}")
         take, step = recording.finish(counts, pace)
     after = counts["frames_in_order"] + counts["reordered_frames"] - counts["dropped_frames"]
     counts["frames_after_end"] = max(0, after - pace.frames)
@@ -167,6 +159,16 @@ def track_live(
     sent = (note for output in outputs for note in output.notes())
     duration = pace.duration + (1.0 / take.rate if take is not None else 0.0)
     return LiveTake(take, pace.frames, duration, (*notes, *sent, *filter(None, [stream.point_doubt])))
+
+
+def _ready_tracker(setup: TrackerSetup, outputs: Sequence[FrameOutput]) -> Tracker:
+    """The tracker of a session, after all that would hold up its first frames."""
+    with named_steps("getting ready"):
+        tracker = setup.tracker()
+        tracker.warm_up()
+        _start(outputs, tracker)
+        gc.freeze()  # A garbage collection would stop tracking for up to 0.25 s.
+    return tracker
 
 
 def _start(outputs: Sequence[FrameOutput], tracker: Tracker) -> None:
@@ -190,13 +192,22 @@ def _open_answering(address: str, ended: Callable[[], bool], until: float, statu
 class _Recording:
     """The recording of a session, which may fail while outputs still get frames."""
 
-    def __init__(self, recorder: Recorder | None, outputs: Sequence[FrameOutput], status: LiveStatus) -> None:
-        self._recorder, self._outputs, self._status = recorder, outputs, status
+    def __init__(
+        self,
+        stack: ExitStack,
+        out: Path | None,
+        tracker: Tracker,
+        settings: Mapping[str, Any],
+        outputs: Sequence[FrameOutput],
+        status: LiveStatus,
+    ) -> None:
+        self._outputs, self._status = outputs, status
+        self._recorder: Recorder | None = None
         self._failure: CaptureError | None = None
-        if recorder is not None:
-            status.say(
-                f"recording to {recorder.part}, which becomes {recorder.out} at the end; Ctrl-C ends it"
-            )
+        if out is not None:
+            recorder = self._recorder = stack.enter_context(Recorder(out, tracker, settings))
+            stack.enter_context(_recording_kept(recorder))
+            status.say(f"recording to {recorder.part}, which becomes {out} at the end; Ctrl-C ends it")
 
     def add(self, frame: StreamedFrame, tracked: TrackedFrame) -> None:
         """Record a frame."""
@@ -207,11 +218,12 @@ class _Recording:
         self._status.say(f"size of the hands: {tracker.user}")
         self._try(Recorder.resize)
 
-    def discard(self) -> None:
-        """Remove a recording without frames."""
+    def discard(self, reason: str) -> NoReturn:
+        """Remove a recording without frames, and say why there are none."""
         if self._recorder is not None:
             with suppress(CaptureError):
                 self._recorder.finish()
+        raise CaptureError(reason)
 
     def finish(self, counts: dict[str, int], pace: _Pace) -> tuple[Take | None, int]:
         """Write the take, see `Recorder.finish`; without a recorder there is none."""

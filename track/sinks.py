@@ -468,6 +468,10 @@ class WebSocketSink:
             told = (
                 f"port {self.port} has {MOST_CONNECTIONS} connections and refuses others; end some receivers"
             )
+            told = (
+                f"port {self.port} refuses further connections: {MOST_CONNECTIONS} are open, or no other file"
+            )
+            told += " may be opened; end receivers that are not needed"
             warnings.warn(told, HandSimWarning, stacklevel=2)
         if message.header is not self._described:
             self._described, (self._header,) = message.header, self._format.header(message.header)

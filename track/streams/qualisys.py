@@ -85,16 +85,16 @@ class QualisysSource:
             async with asyncio.timeout(_PATIENCE):
                 _, protocol = await self._loop.create_connection(self._make_protocol, machine, self._port)
                 await protocol.set_version(_VERSION)
-        except ConnectionRefusedError as error:
-            raise NoServerError(
-                f"{url}: no QTM answers, no program of {machine} listens at port {self._port}; start QTM, or "
-                "compare the port with that of its real-time output"
-            ) from error
         except self._qtm.QRTCommandException as error:
             raise CaptureError(f"{url}: QTM refuses version {_VERSION} of its protocol ({error})") from error
         except OSError as error:  # TimeoutError is one
+            refused = f"no program of {machine} listens at port {self._port}"
+            reason = (
+                refused if isinstance(error, ConnectionRefusedError) else error.strerror or "it is silent"
+            )
             raise NoServerError(
-                f"{url}: no QTM answers, expected one that runs there ({error.strerror or 'no answer'})"
+                f"{url}: no QTM answers, expected one that runs there: {reason}; start QTM, or compare the "
+                "port with that of its real-time output"
             ) from error
         return self._qtm.QRTConnection(protocol, timeout=_PATIENCE)
 
