@@ -14,7 +14,7 @@ import numpy as np
 
 from handsim._plugins import import_extra
 from handsim.errors import CaptureError
-from track.frames import StreamedFrame
+from track.frames import LATEST_TIME, StreamedFrame
 from track.streams import NoServerError, find_host
 
 PORT: Final = 22223
@@ -178,7 +178,7 @@ def frame_of(packet: Any) -> StreamedFrame:
     positions = [(one.x, one.y, one.z) for one in identified + others]  # [mm], NaN if not seen
     points = 1e-3 * np.array(positions, dtype=np.float64).reshape(-1, 3)
     ids = [*range(len(identified)), *(_FIRST_ID + other.id % _IDS for other in others)]
-    there = np.isfinite(points).all(axis=1)
-    return StreamedFrame(
-        packet.framenumber, 1e-6 * packet.timestamp, points[there], np.array(ids, dtype=np.int64)[there]
-    )
+    there, time = np.isfinite(points).all(axis=1), 1e-6 * packet.timestamp
+    if not abs(time) < LATEST_TIME:
+        raise ValueError(f"a time of {time} s")
+    return StreamedFrame(packet.framenumber, time, points[there], np.array(ids, dtype=np.int64)[there])
