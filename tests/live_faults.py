@@ -2,11 +2,11 @@
 
     python -m tests.live_faults [--minutes 10 --rate 120 --kills 0 --seed 0]
 
-A server streams a simulated capture to `handsim track --live`, which records it and sends it on. Faults take
-turns: the server restarts, the recording's folder is removed, the recording is cut, connections that
-never close crowd the WebSocket sink, and packets of strangers and nonsense come. With `--kills` the command is
-killed as often by SIGKILL at random moments, and what is left of the recording is counted. Exit code 1 when a
-frame is neither in the take nor counted.
+A server streams a simulated capture to `handsim track --live`, which records it and sends it on. The server
+restarts, the recording's folder is removed, the recording is cut, connections that never close crowd the
+WebSocket sink, and packets of strangers and nonsense come. With `--kills` the command is killed as often by
+SIGKILL at random moments, and what is left of the recording is counted. Exit code 1 when a frame is neither
+in the take nor counted.
 """
 
 from __future__ import annotations
