@@ -64,8 +64,10 @@ class Session:
 
     def wait_for_frames(self, count: int) -> None:
         """Wait until the server has sent some more frames and the recording has grown."""
-        sent, there = self.server.sent + count, self.recorded()
-        wait_for(lambda: self.server.sent >= sent or self.process.poll() is not None)
+        sent = self.server.sent + count
+        while self.server.sent < sent and self.process.poll() is None:
+            time.sleep(0.1)
+        there = self.recorded()
         wait_for(lambda: self.recorded() > there or self.process.poll() is not None)
 
 
