@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from gloves.fit import GloveFit, check_layout, settle_glove
 from gloves.layout import MarkerLayout, load_layout
 from gloves.takes.take import Take, load_take
-from handsim._checks import check_choice, check_count, check_type
+from handsim._checks import as_numbers, check_choice, check_count, check_type
 from handsim.errors import ArgumentError, CaptureError, HandSimError, HandSimWarning, choices, errors_of
 from handsim.files.arrays import read_npz
 from handsim.files.inputs import check_regular, checksum
@@ -371,7 +371,7 @@ def subject_of_poses(
     seed: int = 0,
 ) -> Subject:
     """A user's own poses."""
-    array = np.asarray(qpos)
+    array = as_numbers("qpos", qpos)
     models = models_of(model, 2 if array.ndim == 3 else 1)
     if len(models) == 1 and array.ndim == 2 and array.shape[1] == NUM_JOINTS:
         array = join_qpos(array)

@@ -24,7 +24,7 @@ from gloves.layout import MarkerLayout
 from gloves.optics.ghosts import GHOST_REACH
 from gloves.takes.points import PointList
 from gloves.takes.take import Take, load_take
-from handsim._checks import check_rng, check_type
+from handsim._checks import as_numbers, check_rng, check_type
 from handsim.app.messages import print_table
 from handsim.errors import ArgumentError, CaptureError
 from handsim.hand.shape import SIDES
@@ -526,7 +526,7 @@ def _markers(
                 raise ArgumentError(
                     f"markers are {one.dtype} of shape {one.shape}, expected (T, {count}, 3) numbers [m]"
                 )
-            parts.append((one.astype(np.float64), None))
+            parts.append((as_numbers("truth", one), None))
         elif isinstance(one, Capture):
             parts.append(_of_hands(select_hands(one, names), one.rate))
         elif _is_set(one):
