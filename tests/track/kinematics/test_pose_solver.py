@@ -287,6 +287,6 @@ def test_masked_markers_are_missing(rng):
     hidden = np.zeros(markers.shape, dtype=bool)
     hidden[:, 3:6] = True
     wrong = np.where(hidden, markers + 0.1, markers)
-    masked = solve_pose(GloveFit(model, glove), np.ma.array(wrong, mask=hidden), qpos)
-    missing = solve_pose(GloveFit(model, glove), np.where(hidden, np.nan, markers), qpos)
+    masked = solve_pose(GloveFit(model, glove), np.ma.array(wrong, mask=hidden), initial=qpos)
+    missing = solve_pose(GloveFit(model, glove), np.where(hidden, np.nan, markers), initial=qpos)
     np.testing.assert_array_equal(masked.qpos, missing.qpos)
