@@ -536,5 +536,5 @@ def _number(value: float) -> str:
 
 
 def _time(seconds: float) -> str:
-    """A time with fifteen digits, which resolve a microsecond of a clock that counts since 1970."""
-    return f"{seconds:.15g}"
+    """A time with sixteen digits, which resolve a microsecond of a clock that counts since 1970."""
+    return f"{seconds:.16g}"
