@@ -65,8 +65,8 @@ def as_numbers(name: str, values: ArrayLike, kind: DTypeLike | None = np.float64
     """`values` as an array of `kind` (None: their own type); masked entries become NaN or -1."""
     try:
         array = as_array(values, kind)
-        if array.dtype.kind == "c":
-            raise TypeError("complex numbers")
+        if array.dtype.kind in "cSU":
+            raise TypeError("complex numbers or texts")
         return np.asarray(array, dtype=kind)
     except (TypeError, ValueError, OverflowError, RuntimeError) as error:  # torch raises the last one
         raise ArgumentError(f"{name} is {shown_value(values)}, expected an array of numbers") from error

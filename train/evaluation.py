@@ -521,11 +521,8 @@ def _markers(
     parts: list[tuple[NDArray[np.float64], NDArray[np.int64] | None]] = []
     for one in truth:
         if isinstance(one, np.ndarray):
-            count = len(names)
-            if one.ndim != 3 or one.shape[1:] != (count, 3) or one.dtype.kind not in "fiu":
-                raise ArgumentError(
-                    f"markers are {one.dtype} of shape {one.shape}, expected (T, {count}, 3) numbers [m]"
-                )
+            if one.ndim != 3 or one.shape[1:] != (len(names), 3):
+                raise ArgumentError(f"markers have shape {one.shape}, expected (T, {len(names)}, 3) [m]")
             parts.append((as_numbers("truth", one), None))
         elif isinstance(one, Capture):
             parts.append(_of_hands(select_hands(one, names), one.rate))

@@ -41,7 +41,7 @@ def test_a_tensor_is_read_without_its_gradient(gradient):
 
 
 @pytest.mark.parametrize(
-    "given", [np.full((2, 3), 1j), "abc", [[1.0, 2.0], [3.0]], (row for row in VALUES), object()]
+    "given", [np.full((2, 3), 1j), "abc", ["1", "2"], [[1.0, 2.0], [3.0]], (row for row in VALUES), object()]
 )
 def test_what_holds_no_numbers_is_told(given):
     with pytest.raises(ArgumentError, match=r"^points is .*, expected an array of numbers$"):
