@@ -208,6 +208,7 @@ def _anywhere(count: int, rng: np.random.Generator) -> NDArray[np.float64]:
 
 MAX_PENETRATION: Final = 0.001
 """Deepest self-penetration [m] of a valid pose: skin yields by about this much."""
+_ROUNDING: Final = 1e-6  # [rad] Single precision rounds angles by less.
 _HALVINGS: Final = 4
 _THUMB: Final = np.array([joint.name.startswith("thumb") for joint in JOINTS])
 _ABDUCTIONS: Final = np.array([joint.name.endswith("abduction") for joint in JOINTS])
@@ -218,7 +219,7 @@ def is_valid(
     model: HandModel, angles: Float[np.ndarray, "T 20"], *, max_penetration: float = MAX_PENETRATION
 ) -> Bool[np.ndarray, "T"]:
     """Whether each pose is in range, with a self-penetration of at most `max_penetration` [m]."""
-    inside = ((angles >= LOW - 1e-9) & (angles <= HIGH + 1e-9)).all(axis=1)
+    inside = ((angles >= LOW - _ROUNDING) & (angles <= HIGH + _ROUNDING)).all(axis=1)
     free: NDArray[np.bool_] = model.penetration(join_qpos(angles)) <= max_penetration
     return inside & free
 

@@ -536,5 +536,5 @@ def _number(value: float) -> str:
 
 
 def _time(seconds: float) -> str:
-    """A time with nine digits, which resolve 0.1 ms within a day."""
-    return f"{seconds:.9g}"
+    """A time with sixteen digits, which resolve a microsecond of a clock that counts since 1970."""
+    return f"{seconds:.16g}"

@@ -24,7 +24,7 @@ from gloves.layout import MarkerLayout
 from gloves.optics.ghosts import GHOST_REACH
 from gloves.takes.points import PointList
 from gloves.takes.take import Take, load_take
-from handsim._checks import check_rng, check_type
+from handsim._checks import as_numbers, check_rng, check_type
 from handsim.app.messages import print_table
 from handsim.errors import ArgumentError, CaptureError
 from handsim.hand.shape import SIDES
@@ -521,12 +521,9 @@ def _markers(
     parts: list[tuple[NDArray[np.float64], NDArray[np.int64] | None]] = []
     for one in truth:
         if isinstance(one, np.ndarray):
-            count = len(names)
-            if one.ndim != 3 or one.shape[1:] != (count, 3) or one.dtype.kind not in "fiu":
-                raise ArgumentError(
-                    f"markers are {one.dtype} of shape {one.shape}, expected (T, {count}, 3) numbers [m]"
-                )
-            parts.append((one.astype(np.float64), None))
+            if one.ndim != 3 or one.shape[1:] != (len(names), 3):
+                raise ArgumentError(f"markers have shape {one.shape}, expected (T, {len(names)}, 3) [m]")
+            parts.append((as_numbers("truth", one), None))
         elif isinstance(one, Capture):
             parts.append(_of_hands(select_hands(one, names), one.rate))
         elif _is_set(one):

@@ -52,6 +52,7 @@ def plain_path(path: Path) -> Iterator[Path]:
 
 
 _OLDER: Final = "-older"  # marks the second name of a file that is being replaced
+_SHOWN_STEM: Final = 32  # characters of a name that its temporary name shows
 _PROBE: Final = 1 << 20  # bytes that are written to learn why a library's write failed
 
 
@@ -75,7 +76,8 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
         mode = _usual_mode(temporary)
         try:
             yield temporary
-            os.chmod(temporary, mode)
+            with suppress(OSError):  # network drives and memory cards may keep no modes
+                os.chmod(temporary, mode)
             _flush(temporary)
             together = _TOGETHER.get()
             if together is None:
@@ -188,6 +190,8 @@ def unwritten(path: Path) -> OSError:
 def make_folder_of(path: Path) -> None:
     """Make the folders that are missing on the way to a file."""
     for folder in path.parents:
+        if str(folder) == "~" and not folder.exists():
+            raise ArgumentError(f"{path}: only shells replace ~, expected Path('{path}').expanduser()")
         if folder.exists() and not folder.is_dir():
             raise NotADirectoryError(errno.ENOTDIR, f"{folder} is a file, not a folder", str(folder))
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -199,8 +203,12 @@ def temporary_beside(path: Path, mark: str = "") -> Path:
 
 
 def _prefix(path: Path) -> str:
-    """The beginning of temporary names, with a hash of this machine, since only there IDs are unique."""
-    return f".{path.stem}.tmp-{zlib.crc32(platform.node().encode()):08x}-"
+    """The beginning of temporary names, which stay short, as a name may have 255 bytes.
+
+    It has a hash of the name and of this machine, since only there IDs are unique.
+    """
+    digest = zlib.crc32(os.fsencode(path.stem), zlib.crc32(platform.node().encode()))
+    return f".{path.stem[:_SHOWN_STEM]}.tmp-{digest:08x}-"
 
 
 def remove_leftovers(folder: Path, names: str = "**/.*.tmp-*") -> None:

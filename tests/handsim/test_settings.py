@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
@@ -107,3 +108,37 @@ def test_a_mixture_is_given_whole():
         Shares(1.0, -1.0)
     with pytest.raises(ArgumentError, match="unknown setting of shares 'three'"):
         Mixed(shares={"three": 1.0})
+
+
+@dataclass(frozen=True, slots=True)
+class Numbers(Settings):
+    rate: Annotated[float, Limits(0.0)] = 1.0
+    sure: bool = False
+    sides: Annotated[tuple[float, float], Limits(0.0)] = (0.0, 1.0)
+    bodies: Sequence[str | Thing] = ()
+
+
+@pytest.mark.parametrize(
+    ("options", "record"),
+    [
+        ({"rate": np.float32(0.5)}, {"rate": 0.5}),
+        ({"rate": np.float64(0.5)}, {"rate": 0.5}),
+        ({"rate": np.array(0.5)}, {"rate": 0.5}),
+        ({"rate": np.int16(3)}, {"rate": 3}),
+        ({"sure": np.bool_(True)}, {"sure": True}),
+        ({"sides": np.array([0.25, 2.0], np.float32)}, {"sides": [0.25, 2.0]}),
+        ({"sides": (np.float32(0.25), np.int64(2))}, {"sides": [0.25, 2]}),
+        ({"bodies": "pen"}, {"bodies": ["pen"]}),
+        ({"bodies": ["pen", Thing()]}, {"bodies": ["pen", "a thing"]}),
+    ],
+)
+def test_numbers_of_numpy_are_recorded_as_numbers(options, record):
+    found = Numbers(**options).record()
+    assert {name: found[name] for name in record} == record
+    assert Numbers.from_json(json.loads(json.dumps(found))).record() == found
+
+
+@pytest.mark.parametrize("bodies", [{"pen"}, (name for name in ["pen"]), 5])
+def test_what_has_no_order_is_no_list(bodies):
+    with pytest.raises(ArgumentError, match=r"bodies is .*, expected a tuple"):
+        Numbers(bodies=bodies)

@@ -238,3 +238,13 @@ def test_mistakes_are_named(rng):
         sample_poses(model, 3, lambda model, num_poses, *, rng: np.zeros((2, 20)), rng=rng)
     with pytest.raises(ArgumentError, match=r"qpos has shape \(1, 20\), expected \(..., any, 27\)"):
         validate(model, np.zeros((1, 20)))
+
+
+@pytest.mark.parametrize("size", ["XS", "M", "XL"])
+def test_single_precision_is_as_valid(rng, size):
+    qpos = sample_poses(size, 200, rng=rng)
+    at_limits = join_qpos(np.stack([np.clip(0.0, LOW, HIGH), np.where(LOW < 0.0, 0.0, LOW)]))
+    for poses in (qpos, at_limits):
+        np.testing.assert_array_equal(validate(size, poses.astype(np.float32)), validate(size, poses))
+    bent = join_qpos(np.where(np.arange(20) == 4, HIGH + 1e-3, 0.0)[None])
+    assert not validate(size, bent).any()

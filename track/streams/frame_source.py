@@ -14,7 +14,7 @@ from typing import Final, Protocol
 
 import numpy as np
 
-from handsim._checks import check_methods
+from handsim._checks import as_numbers, check_methods
 from handsim.errors import ArgumentError, CaptureError, HandSimWarning
 from track.frames import LATEST_TIME, StreamedFrame
 
@@ -202,7 +202,7 @@ def _checked(frame: StreamedFrame) -> StreamedFrame:
     """Validate a frame: arrays of the right types, and points without missing ones."""
     if not isinstance(frame, StreamedFrame):
         raise ArgumentError(f"a {type(frame).__name__} came, expected a track.StreamedFrame")
-    points, ids = np.asarray(frame.points, dtype=np.float64), np.asarray(frame.ids, dtype=np.int64)
+    points, ids = as_numbers("points", frame.points), as_numbers("ids", frame.ids, np.int64)
     if points.ndim != 2 or points.shape != (*ids.shape, 3):
         raise ArgumentError(f"points have shape {points.shape} and IDs {ids.shape}, expected (N, 3) and (N,)")
     if not abs(frame.time) < LATEST_TIME:
