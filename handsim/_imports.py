@@ -12,6 +12,7 @@ from __future__ import annotations
 import ast
 import importlib
 import importlib.util
+import inspect
 import os
 import stat
 import sys
@@ -20,6 +21,8 @@ import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
+
+from handsim._process import own_numerics, with_own_numerics
 
 
 def lazy_exports(package: str) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
@@ -38,7 +41,12 @@ def lazy_exports(package: str) -> tuple[Callable[[str], Any], Callable[[], list[
     def load(name: str) -> Any:
         if name not in lazy:
             raise AttributeError(f"module '{package}' has no attribute '{name}'")
-        value = getattr(importlib.import_module(lazy[name]), name)
+        with own_numerics():
+            module = importlib.import_module(lazy[name])
+        value = getattr(module, name)
+        if inspect.isfunction(value):
+            value = with_own_numerics(value)
+            setattr(module, name, value)
         setattr(own, name, value)
         return value
 

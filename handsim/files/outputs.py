@@ -11,6 +11,7 @@ import json
 import math
 import os
 import platform
+import re
 import shutil
 import tempfile
 import zlib
@@ -23,6 +24,7 @@ from typing import Any, Final, cast
 import numpy as np
 
 from handsim._checks import check_type
+from handsim._process import memory_limit, text_of_system
 from handsim.errors import ArgumentError, HandSimError, shortened
 from handsim.files.inputs import load_json
 from handsim.files.signals import signals_wait
@@ -345,15 +347,13 @@ def check_memory(needed: int, what: str, remedy: str) -> None:
 
 
 def available_bytes() -> int:
-    """Memory that is free without swapping [bytes]; all memory if the system does not state it."""
-    try:
-        lines = Path("/proc/meminfo").read_text().splitlines()
-    except OSError:
-        lines = []
-    for line in lines:
-        if line.startswith("MemAvailable:"):
-            return int(line.split()[1]) * 1024
-    return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    """Memory that is free without swapping, at most what control groups allow [bytes].
+
+    It is all memory if the system does not state what is free.
+    """
+    stated = re.search(r"^MemAvailable: *(\d{1,15}) kB$", text_of_system(Path("/proc/meminfo")), re.M)
+    free = 1024 * int(stated[1]) if stated else os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    return int(min(free, memory_limit()))
 
 
 def shown_bytes(count: float) -> str:
