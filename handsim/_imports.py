@@ -19,6 +19,7 @@ import sys
 import tempfile
 import warnings
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, Final
 
@@ -126,10 +127,18 @@ def _user_cache() -> Path:
 
 
 def is_writable(folder: Path) -> bool:
-    """Whether files can be made in a folder, or in the first of its parents that exists."""
-    while not folder.exists() and folder != folder.parent:
-        folder = folder.parent
-    return folder.is_dir() and os.access(folder, os.W_OK | os.X_OK)
+    """Whether files can be made in a folder, or in the first of its parents that exists.
+
+    Such a parent is tried with a nameless file, because some allow new files and refuse them, as /proc does.
+    """
+    there = next((one for one in (folder, *folder.parents) if os.path.exists(one)), folder)
+    if not os.path.isdir(there) or not os.access(there, os.W_OK | os.X_OK):
+        return False
+    try:
+        with nullcontext() if there == folder else tempfile.TemporaryFile(dir=there):
+            return True
+    except OSError:
+        return False
 
 
 def _own_folder() -> Path:
