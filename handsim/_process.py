@@ -148,6 +148,17 @@ def _use_own_torch(torch: Any, stack: ExitStack) -> None:
             stack.enter_context(torch.autocast(kind, enabled=False))
 
 
+@contextmanager
+def torch_kept() -> Iterator[None]:
+    """Leave torch's random state and its denormal numbers after the block as they were before it."""
+    torch, flushes = sys.modules["torch"], sys.float_info.min * 0.5 == 0.0
+    try:
+        with torch.random.fork_rng(range(torch.cuda.device_count())):
+            yield
+    finally:
+        torch.set_flush_denormal(flushes)
+
+
 def with_own_numerics(function: Callable[_P, _R]) -> Callable[_P, _R]:
     """A function that computes in `own_numerics`, like each step of a generator that it returns."""
 

@@ -276,9 +276,9 @@ def _opened(
     capture: AnyCapture, settings: LabelSettings, *, warns: bool = False
 ) -> tuple[Capture, list[StreamedFrame], TrackerSetup]:
     """A capture, its frames and the setup that tracks them, with measured hands unless settings give them."""
-    setup = TrackerSetup.of(settings)
     source = capture_of(capture)
     frames = checked_frames(source)
+    setup = TrackerSetup.of(settings)  # last, because a glove may have to be learned
     return source, frames, setup.measured(sample_frames(frames), warns=warns)
 
 
