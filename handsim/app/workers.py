@@ -37,7 +37,7 @@ Job = Callable[[int], int]
 """Writes files that depend on the number alone, and returns the number; it can be pickled."""
 _THREADS: Final = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 _MAX_PENDING: Final = 1000  # jobs that an executor holds: enough for hundreds of workers
-_WORKER: Final = 460_000_000  # bytes of a process that draws pictures, which needs most
+_WORKER: Final = 710_000_000  # bytes that a process holds at most, by benchmarks.scale
 _AGAIN: Final = "run the same command again to go on"
 _FEWER: Final = f"(out of memory?); {_AGAIN}, with fewer --workers if they need too much memory"
 _GUARD: Final = 'put the call under `if __name__ == "__main__":`, or give workers=1'
@@ -160,7 +160,13 @@ class LocalProcesses(ProcessPoolExecutor):
         self._needs_main = needs_main
         context = multiprocessing.get_context("spawn")
         theirs, self._ours = context.Pipe(duplex=False)
-        super().__init__(workers, mp_context=context, initializer=_end_with, initargs=(theirs,))
+        try:
+            super().__init__(workers, mp_context=context, initializer=_end_with, initargs=(theirs,))
+        except (ImportError, OSError) as error:
+            raise HandSimError(
+                f"no other processes can be started here ({error}): they need /dev/shm that can be written; "
+                "give --workers 1, or mount it"
+            ) from error
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         """Have a process call `fn(*args, **kwargs)`."""
