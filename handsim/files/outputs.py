@@ -202,23 +202,27 @@ def temporary_beside(path: Path, mark: str = "") -> Path:
 
 def _prefix(path: Path) -> str:
     """The beginning of temporary names, with a hash of this machine, since only there IDs are unique."""
-    return f".{path.stem}.tmp-{zlib.crc32(platform.node().encode()):08x}-"
+    return f".{path.stem}.tmp-{_machine()}-"
+
+
+def _machine() -> str:
+    """A hash of this machine's name."""
+    return f"{zlib.crc32(platform.node().encode()):08x}"
 
 
 def remove_leftovers(folder: Path, names: str = "**/.*.tmp-*") -> None:
     """Remove the files and folders that match a pattern, when not given all temporary ones at any depth.
 
-    Call it only for what one job owns: what another process is writing there would be lost.
+    What another running process of this machine writes there stays.
     """
     for leftover in folder.glob(names):
-        _remove(leftover)
-
-
-def _remove(leftover: Path) -> None:
-    if leftover.is_dir() and not leftover.is_symlink():
-        shutil.rmtree(leftover, ignore_errors=True)
-    else:
-        leftover.unlink(missing_ok=True)
+        writer = re.search(rf"\.tmp-{_machine()}-(\d{{1,9}})", leftover.name)
+        if writer and int(writer[1]) != os.getpid() and _is_running(int(writer[1])):
+            continue
+        if leftover.is_dir() and not leftover.is_symlink():
+            shutil.rmtree(leftover, ignore_errors=True)
+        else:
+            leftover.unlink(missing_ok=True)
 
 
 def remove_abandoned(final: Path) -> None:
@@ -226,8 +230,8 @@ def remove_abandoned(final: Path) -> None:
     prefix = _prefix(final)
     for leftover in final.parent.glob(f"{glob.escape(prefix)}*{glob.escape(final.suffix)}"):
         number = leftover.name.removeprefix(prefix).removesuffix(final.suffix).removesuffix(_OLDER)
-        if number.isdecimal() and not _is_running(int(number)):
-            _remove(leftover)
+        if number.isdecimal() and int(number) != os.getpid():
+            remove_leftovers(final.parent, glob.escape(leftover.name))
 
 
 def _is_running(process: int) -> bool:

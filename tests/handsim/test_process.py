@@ -218,7 +218,7 @@ tracked = track_capture(take, size="M", glove="dense19")
 assert (tracked.labels >= 0).mean() > 0.9 and (label_capture(take, size="M").labels >= 0).mean() > 0.9
 tracker = Tracker(take.hands)
 assert (tracker.step(take.points[0][np.isfinite(take.points[0, :, 0])], time=0.0).labels >= 0).any()
-(frame,) = draw(tracked, frames=[30], seed=1, passes=("rgb",), painter="software")
+(frame,) = draw(tracked, frames=[30], seed=1, passes=("rgb",), painter="compiled")
 assert np.geterr() == dict.fromkeys(("divide", "over", "under", "invalid"), "raise")
 """
     (tmp_path / "script.py").write_text(script)
