@@ -369,7 +369,7 @@ def render_take(
     absent = drawing.frames_without_hands()
     if absent and drawing.subject.film is None:  # frames of a video are left out for reasons that are told
         told = f"frames without a hand are not drawn: {len(absent)} of {drawing.take.num_frames}"
-        warnings.warn(f"{told} (the first: {absent[0]})", HandSimWarning, stacklevel=2)
+        warnings.warn(f"{told} (the first: {absent[0]})", HandSimWarning, stacklevel=3)
     shards, views = drawing.shards(), drawing.viewpoints.num_cameras
     make = functools.partial(_render_shard, kept, formats, config)
     record = _settings(drawing, kept) | {"formats": list(formats)}

@@ -104,7 +104,7 @@ def label_capture(
         labeled = dataclasses.replace(take, point_list=points)
     if (labeled.point_list.labels < 0).all():
         none = f"no hand found, expected hands in glove '{glove}' (--glove names another)"
-        warnings.warn(none if present.any() else no_points(take), HandSimWarning, stacklevel=2)
+        warnings.warn(none if present.any() else no_points(take), HandSimWarning, stacklevel=3)
     return labeled
 
 
@@ -155,7 +155,7 @@ def track_capture(
         return smooth_take(take) if chosen.smooth else take
     corrected = correct_take(take, pins)
     for sentence in unfitting_sentences(Path(corrections), corrected.unfitting):
-        warnings.warn(sentence, HandSimWarning, stacklevel=2)
+        warnings.warn(sentence, HandSimWarning, stacklevel=3)
     return corrected.take
 
 
@@ -208,12 +208,12 @@ def calibrate(
         take = tracked_take(source, frames, tracker, progress=on_label)
         done = calibrate_take(take, setup.start, setup.user, on_part)
     for sentence in misfits(take, calibrates=True):
-        warnings.warn(sentence, HandSimWarning, stacklevel=2)
+        warnings.warn(sentence, HandSimWarning, stacklevel=3)
     name = _named(capture, source).get("capture", "a capture")
     found = kept_user(take, done, setup.user, f"from {name}", on_part)
     for one in found.calibrations:
         if not one.is_better:
-            warnings.warn(f"{one.hand.side} hand: {one}", HandSimWarning, stacklevel=2)
+            warnings.warn(f"{one.hand.side} hand: {one}", HandSimWarning, stacklevel=3)
     return found
 
 
@@ -276,9 +276,9 @@ def _opened(
     capture: AnyCapture, settings: LabelSettings, *, warns: bool = False
 ) -> tuple[Capture, list[StreamedFrame], TrackerSetup]:
     """A capture, its frames and the setup that tracks them, with measured hands unless settings give them."""
-    setup = TrackerSetup.of(settings)
     source = capture_of(capture)
     frames = checked_frames(source)
+    setup = TrackerSetup.of(settings)  # last, because a glove may have to be learned
     return source, frames, setup.measured(sample_frames(frames), warns=warns)
 
 
@@ -305,7 +305,7 @@ def _calibrated(take: Take, setup: TrackerSetup) -> TrackerSetup:
     try:
         done = calibrate_take(take, setup.start, setup.user)
     except CalibrationError as error:
-        warnings.warn(f"not calibrated: {error}", HandSimWarning, stacklevel=3)
+        warnings.warn(f"not calibrated: {error}", HandSimWarning, stacklevel=4)
         return setup
     found = kept_user(take, done, setup.user, "on the take itself")
     better = {hand.side: hand for hand in found}

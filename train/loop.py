@@ -23,6 +23,8 @@ from torch import nn
 from gloves.layout import stored_layout
 from handsim import __version__
 from handsim._checks import check_count, check_type
+from handsim._process import torch_kept
+from handsim.app.workers import usable_cores
 from handsim.callbacks import OnStep, Progress, no_progress, no_step
 from handsim.errors import DatasetError, HandSimError, WeightsError
 from handsim.files.arrays import check_members
@@ -81,6 +83,7 @@ class TrainingError(HandSimError):
     """A training run that does not converge."""
 
 
+@torch_kept()
 def train_labeler(
     dataset: Dataset | str | Path,
     out: str | Path,
@@ -133,7 +136,8 @@ def train_labeler(
         progress, on_step = no_progress, no_step
     if threads is None:
         alone_on_cpu = fabric.device.type == "cpu" and fabric.world_size == 1
-        threads = torch.get_num_threads() if settings.labeler == "cnn" and alone_on_cpu else 1
+        many = settings.labeler == "cnn" and alone_on_cpu
+        threads = min(torch.get_num_threads(), usable_cores()) if many else 1
     with ExitStack() as stack, lost_peers_told(), torch_threads(threads):
         # The thread that writes curves complains if its process ends before the writer is closed.
         stack.callback(fabric.logger.finalize, "")

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from handsim.app.messages import print_line, print_table
-from handsim.errors import ArgumentError
+from handsim.errors import ArgumentError, CaptureError
+from handsim.files.inputs import check_there
 from handsim.files.outputs import check_outputs, save_json
 from train.settings import EvaluateSettings
 
@@ -48,6 +49,8 @@ def evaluate(
     from train.labelers.storage import load_labeler
 
     check_outputs((*captures, glove, labeler, truth), [json])
+    for capture in captures:
+        check_there(capture, error=CaptureError)
     if truth is None:
         if glove is None and captures and captures[0].suffix.lower() == ".npz":
             glove = load_take(captures[0]).settings.get("glove")

@@ -6,6 +6,7 @@ A wrong value raises a `HandSimError` that names the key; the caller, which know
 from __future__ import annotations
 
 import codecs
+import errno
 import functools
 import hashlib
 import json
@@ -55,6 +56,12 @@ def check_regular(path: Path, *, error: type[HandSimError], most: int | None = N
             raise error(f"{path}: this is {kind}, expected a regular file; write it to a file first")
     if most is not None and found.st_size > most and stat.S_ISREG(found.st_mode):
         raise error(f"{path}: the file is {found.st_size} bytes long, expected at most {most}")
+
+
+def check_there(path: Path, *, error: type[HandSimError]) -> None:
+    """Refuse a path where no file and no folder is, before long work that needs it later."""
+    if not path.exists():
+        raise error(f"{path}: cannot be read: {os.strerror(errno.ENOENT)}")
 
 
 def read_bytes(path: Path, *, error: type[HandSimError], most: int | None = None) -> bytes:

@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike
 from scipy.special import expit
 
 from handsim._checks import check_array, check_choice, check_type
+from handsim._process import with_own_numerics
 from handsim.errors import ArgumentError, WeightsError
 from handsim.files.inputs import read_bytes, sign_model
 from handsim.hand.shape import NUM_KEYPOINTS, SIDES, Side
@@ -105,6 +106,7 @@ class HandDetector:
                 "render.train_detector wrote"
             ) from error
 
+    @with_own_numerics
     def detect(self, image: UInt8[np.ndarray, "H W 3"]) -> list[FoundHand]:
         """All hands in an sRGB picture, the surest first.
 
@@ -117,6 +119,7 @@ class HandDetector:
         boxes, sure = [hand.box.tolist() for hand in hands], [hand.confidence for hand in hands]
         return [hands[number] for number in cv2.dnn.NMSBoxes(boxes, sure, _LEAST_CONFIDENCE, _SAME)]
 
+    @with_own_numerics
     def refine(
         self, image: UInt8[np.ndarray, "H W 3"], boxes: ArrayLike, sides: Sequence[Side]
     ) -> list[FoundHand]:

@@ -28,6 +28,7 @@ from torch.nn import functional
 from handsim import __version__
 from handsim._checks import check_count
 from handsim._plugins import import_extra
+from handsim._process import torch_kept
 from handsim.files.inputs import DIGEST, sign_model
 from handsim.files.outputs import atomic_write
 from handsim.hand.model import HandModel
@@ -86,6 +87,7 @@ Batch = tuple[torch.Tensor, Targets]
 """Pictures (B, 3, S, S) and what is learned of them in one step."""
 
 
+@torch_kept()
 def train_detector(
     out: str | Path,
     *,

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from gloves.captures.capture import check_unit
 from handsim._checks import as_numbers, check_count
 from handsim._plugins import call_plugin, load_plugin, plugin_name
+from handsim._process import with_own_numerics
 from handsim.errors import ArgumentError, WeightsError
 from train.labelers.matching import match_scores
 from train.labelers.pose_prior import PosePrior
@@ -72,6 +73,7 @@ def checked_names(names: object) -> tuple[str, ...]:
     return tuple(names)
 
 
+@with_own_numerics
 def label_in_batches(
     frames: Sequence[Float[np.ndarray, "N 3"]],
     label: Callable[[list[NDArray[np.float64]]], list[Labeling]],

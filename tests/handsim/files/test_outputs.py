@@ -31,6 +31,7 @@ from handsim.files.outputs import (
     check_outputs,
     claim,
     plain_path,
+    remove_leftovers,
     save_json,
     shown_bytes,
     temporary_beside,
@@ -214,6 +215,21 @@ def test_what_a_killed_process_left_is_removed(tmp_path: Path) -> None:
         temporary.write_text("whole")
     assert not left.exists()
     assert all(file.exists() for file in others), "of a running process, another file, another machine"
+
+
+@pytest.mark.parametrize("ending", [".npy", "-older.npy", ""])
+def test_what_another_process_is_writing_stays(ending: str, tmp_path: Path) -> None:
+    gone = subprocess.Popen([sys.executable, "-c", ""])
+    gone.wait()
+    name = temporary_beside(tmp_path / "shard").name
+    written, *left = (
+        tmp_path / (name.replace(str(os.getpid()), str(process)) + ending)
+        for process in (os.getppid(), os.getpid(), gone.pid)
+    )
+    for file in (written, *left):
+        file.touch()
+    remove_leftovers(tmp_path)
+    assert [*tmp_path.iterdir()] == [written]
 
 
 def test_a_folder_that_cannot_be_written_is_told_before_the_work(tmp_path: Path) -> None:
