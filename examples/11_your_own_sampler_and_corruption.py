@@ -34,8 +34,8 @@ def main() -> None:
         markers = dataset.rows()["markers"][-200:]  # (200, 19, 3) [m]
         figures = evaluate_labeler(folder / "run", markers).figures
         print(
-            f"{100 * figures['slot_accuracy']:.1f} % of slots right after {config.samples} clouds, where a guess "
-            "is right for 5 %: it begins to learn, and needs far more clouds for use"
+            f"{100 * figures['slot_accuracy']:.1f} % of slots right after {config.samples} clouds; a guess "
+            "is right for 5 %, and use takes far more clouds"
         )
         corruption: OwnCorruption = hide_a_side
         loader = DataLoader(CloudStream(dataset, corruption, batch=64), batch_size=None)
