@@ -478,7 +478,7 @@ def _settings(drawing: Drawing, source: Source) -> dict[str, Any]:
         files, broken = photo_files(Path(str(drawing.config.background.photos)))
         if broken:
             more = f" and {len(broken) - 1} more" if len(broken) > 1 else ""
-            told = f"left out: {broken[0]}{more}, not readable as photographs"
+            told = f"left out: {broken[0]}{more}"
             warnings.warn(told, HandSimWarning, stacklevel=3)
         listed = "\n".join(f"{file} {file.stat().st_size}" for file in files)
         names = listed.encode("utf-8", "surrogateescape")  # names of files need not be valid text

@@ -20,7 +20,6 @@ from handsim._checks import check_choice, check_number, check_type, shown_value
 from handsim._process import SharedStream, with_own_numerics
 from handsim.errors import ArgumentError, DatasetError, PoseError
 from handsim.files.inputs import load_json
-from handsim.files.outputs import plain_path
 from handsim.hand.model import HandModel, hand_keypoints
 from handsim.hand.shape import NUM_KEYPOINTS, NUM_QPOS, SIDES, HandShape, Side, pack_hand, sample_shape
 from handsim.space.camera import PRESETS, Camera, preset
@@ -30,6 +29,7 @@ from render.config import NEAR_SENSOR, RenderConfig, SpawnKey
 from render.depth_sensor import DepthSensor
 from render.formats.records import CENTER
 from render.frames import Doubles, HandTruth, Integers, RenderedFrame
+from render.photographs import read_photograph
 from render.session import configured, open_studio, sample_choices
 from render.studio import Moment, Studio
 from render.subject import Model, Subject, load_subject, models_of, source_of, subject_of_poses
@@ -87,15 +87,6 @@ def _hand(path: Path, name: str, label: dict[str, Any]) -> LabeledHand:
         flags > 1.0,
         SIDES.index(side) if side in SIDES else -1,
     )
-
-
-def read_photograph(path: Path) -> NDArray[np.uint8]:
-    """A photograph (H, W, 3), sRGB."""
-    with plain_path(path) as plain:
-        bgr = cv2.imread(str(plain), cv2.IMREAD_COLOR)
-    if bgr is None:
-        raise DatasetError(f"{path}: not a readable photograph")
-    return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 
 
 def cut_out(

@@ -54,7 +54,8 @@ from render.film.detector import (
 from render.film.network import FinderNetwork, KeypointNetwork
 from render.formats.records import encode_jpeg
 from render.frames import Bytes, Doubles, Floats
-from render.stream import PictureStream, load_labeled_hands, read_photograph
+from render.photographs import read_photograph
+from render.stream import PictureStream, load_labeled_hands
 
 BATCH: Final = 32
 BF16: Final = any(torch.cpu.get_capabilities().get(name) for name in ("amx_bf16", "avx512_bf16"))
