@@ -51,8 +51,8 @@ class Settings:
 
     Each field is checked by its annotation when an object is made: numbers by their `Limits`, names by their
     `Literal`, others by their type, which errors describe as `Expected`. A group of settings may be given as
-    a mapping of the fields that differ from its default (a `Mixture` as its shares), a tuple as a list, an
-    array or its only item, a path as a string, a number as one of numpy's.
+    a mapping of the fields that differ from its default, as on the command line, a tuple as a list, an array
+    or its only item, a path as a string, a number as one of numpy's.
 
     Raises:
         ArgumentError: A field has another type, is out of range, or is none of the valid names.
@@ -107,7 +107,7 @@ class Settings:
 
 
 class Mixture(Settings):
-    """Base of shares of kinds, which are normalized; a share that a mapping does not name is 0."""
+    """Base of shares of kinds, which are normalized; a share that is not named keeps its default."""
 
     __slots__ = ()
 
@@ -257,11 +257,9 @@ def _checked_number(name: str, value: Any, kind: type, limits: Limits | None) ->
 
 
 def _group_of(name: str, changes: Mapping[str, Any], kind: Any, field: dataclasses.Field[Any] | None) -> Any:
-    """A group of settings from the fields that differ from its default; a mixture from all its shares."""
+    """A group of settings from the fields that differ from its default."""
     usual = None
-    if issubclass(kind, Mixture):
-        changes = dict.fromkeys((one.name for one in dataclasses.fields(kind)), 0.0) | dict(changes)
-    elif field is not None and field.default_factory is not dataclasses.MISSING:
+    if field is not None and field.default_factory is not dataclasses.MISSING:
         usual = field.default_factory()
     return _changed(kind, usual if isinstance(usual, kind) else None, changes, f"setting of {name}")
 

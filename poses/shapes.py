@@ -240,11 +240,14 @@ def validate(model: HandModel | HandShape | str, qpos: Float[np.ndarray, "T 27"]
 @functools.lru_cache(maxsize=16)
 def resting_angles(model: HandModel) -> Float[np.ndarray, "20"]:
     """A valid relaxed pose of this hand, with fingers fanned as little as their girth allows; read-only."""
-    fans = np.arange(0.0, 13.0, 2.0)
+    fans = np.arange(0.0, 21.0, 2.0)
     tries = np.tile(gesture("relaxed"), (len(fans), 1))
     tries[:, 4::4] += fans[:, None] * _FAN
-    valid = is_valid(model, tries, max_penetration=0.8 * MAX_PENETRATION)
-    if not valid.any():
+    for share in (0.8, 1.0):  # with some room left where the girth allows it
+        valid = is_valid(model, tries, max_penetration=share * MAX_PENETRATION)
+        if valid.any():
+            break
+    else:
         raise PoseError("this hand's fingers overlap at rest: its girths are too large for its breadth")
     resting: NDArray[np.float64] = tries[valid.argmax()]
     resting.setflags(write=False)

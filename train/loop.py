@@ -215,7 +215,9 @@ class _Run:
         shown, saved = self.held_out[self._shown(_CURVE_FRAMES[settings.labeler])], time.monotonic()
         evaluated = state.history.accuracies[-1][0] if state.history.accuracies else 0
         while True:
-            if state.done > evaluated and _passed(state.done, settings, _NUM_EVALUATIONS):
+            if state.done > evaluated and _passed(
+                state.done, settings, _NUM_EVALUATIONS, _SAMPLES_A_FRAME * len(shown)
+            ):
                 evaluated = state.done
                 if state.fabric.is_global_zero:
                     on_step("held-out frames")
@@ -358,7 +360,7 @@ class TrainingState:
             )
         self.history.add(value)
         self.history.minutes += (time.perf_counter() - began) / 60.0
-        if _passed(self.done, self.settings, _CURVE_POINTS) or self.done >= self.settings.samples:
+        if _passed(self.done, self.settings, _CURVE_POINTS):
             (since, done), self.began = self.began, (time.monotonic(), self.done)
             speed = (self.done - done) / (self.began[0] - since)
             mean = self.history.close(self.done, rate)
@@ -471,10 +473,10 @@ def _check_stored(content: object, seen: set[int] | None = None) -> None:
             _check_stored(entry, seen)
 
 
-def _passed(done: int, settings: TrainSettings, parts: int) -> bool:
-    """Whether the last step ended one of `parts` equal parts of the run, each at least one step long."""
-    part = max(settings.batch, settings.samples // parts)
-    return (done - settings.batch) // part != done // part
+def _passed(done: int, settings: TrainSettings, parts: int, least: int = 1) -> bool:
+    """Whether the last step ended the run, or one of `parts` equal parts of at least `least` samples."""
+    part = max(settings.batch, settings.samples // parts, least)
+    return (done - settings.batch) // part != done // part or done >= settings.samples
 
 
 def choose_costs(network: DeepLabelCNN, marker_names: tuple[str, ...], rows: NDArray[np.void]) -> CNNConfig:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def evaluate(
-    captures: Annotated[tuple[Path, ...], tyro.conf.Positional],
+    captures: Annotated[tuple[str, ...], tyro.conf.Positional],
     settings: Annotated[EvaluateSettings, tyro.conf.arg(name="")],
     *,
     glove: str | None = None,
@@ -31,8 +31,9 @@ def evaluate(
 
     Args:
         captures: Labeled .trc, .c3d, .csv or .tsv files, folders searched for them, the .truth.npz of takes,
-            or training sets, which without drops and ghosts are counted as their rig saw them. Each hand of
-            a capture of two, with columns right:ThumbTip and so on, is counted by itself.
+            or training sets, also as s3://bucket/prefix, which without drops and ghosts are counted as their
+            rig saw them. Each hand of a capture of two, with columns right:ThumbTip and so on, is counted by
+            itself.
         settings: What is evaluated.
         glove: Marker layout: a shipped name or the path of a .toml file; when not given that of a take, or
             dense19.
@@ -52,7 +53,7 @@ def evaluate(
     for capture in captures:
         check_there(capture, error=CaptureError)
     if truth is None:
-        if glove is None and captures and captures[0].suffix.lower() == ".npz":
+        if glove is None and captures and Path(captures[0]).suffix.lower() == ".npz":
             glove = load_take(captures[0]).settings.get("glove")
         glove = glove or "dense19"
         label_on(threads)

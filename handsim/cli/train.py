@@ -17,7 +17,7 @@ from train.settings import KINDS, PRESETS, Preset, TrainSettings, usual_settings
 
 
 def _train(
-    dataset: Annotated[Path, tyro.conf.Positional],
+    dataset: Annotated[str, tyro.conf.Positional],
     out: Path,
     settings: Annotated[TrainSettings, tyro.conf.arg(name="")],
     preset: Preset | None = None,
@@ -26,7 +26,7 @@ def _train(
     """Train a labeler on a training set and write a page about it; run it again to continue a stopped run.
 
     Args:
-        dataset: Folder that `handsim generate` wrote.
+        dataset: Folder that `handsim generate` wrote, also in an object store, as s3://bucket/prefix.
         out: Folder for the weights, the model card, the checkpoint and report.html.
         settings: How to train.
         preset: A published recipe, which replaces the defaults; options given beside it hold.

@@ -41,9 +41,9 @@ def view(
     In a tracked take labels can be corrected, and are saved.
 
     Args:
-        file: A marker layout or camera rig (.toml, or a shipped name), a training set's folder, a capture
-            (.trc, .c3d, .csv or .tsv), a tracked take or a simulated take's truth (.npz), or a user's file
-            (.json).
+        file: A marker layout or camera rig (.toml, or a shipped name), the folder of a training set, also
+            as s3://bucket/prefix, a capture (.trc, .c3d, .csv or .tsv), a tracked take or a simulated take's
+            truth (.npz), or a user's file (.json).
         host: Address to serve the page at; only this machine reaches the default. There is no password.
         port: Port to serve the page at; the first free one from 8080 on when not given.
         out: File for a layout that was changed, a new name beside the layout when not given; or for the take

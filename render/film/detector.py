@@ -21,7 +21,8 @@ from scipy.special import expit
 from handsim._checks import check_array, check_choice, check_type
 from handsim._process import with_own_numerics
 from handsim.errors import ArgumentError, WeightsError
-from handsim.files.inputs import read_bytes, sign_model
+from handsim.files.inputs import read_bytes
+from handsim.files.models import check_model
 from handsim.hand.shape import NUM_KEYPOINTS, SIDES, Side
 from render.frames import Bytes, Doubles, Floats
 
@@ -76,8 +77,7 @@ class HandDetector:
     def __init__(self, finder: bytes, keypoints: bytes) -> None:
         networks = []
         for content in (finder, keypoints):
-            if sign_model(content) != content:  # OpenCV may crash on damaged files
-                raise ValueError("the SHA-256 is another one")
+            check_model(content)  # OpenCV may crash on damaged files
             networks.append(cv2.dnn.readNetFromONNX(np.frombuffer(content, dtype=np.uint8)))
         self._finder, self._keypoints = networks
         cells = FINDER_SIZE // CELL

@@ -29,7 +29,7 @@ from handsim import __version__
 from handsim._checks import check_count
 from handsim._plugins import import_extra
 from handsim._process import torch_kept
-from handsim.files.inputs import DIGEST, sign_model
+from handsim.files.models import DIGEST, stamp_model
 from handsim.files.outputs import atomic_write
 from handsim.hand.model import HandModel
 from handsim.hand.shape import NUM_KEYPOINTS, NUM_QPOS, SIDES
@@ -483,7 +483,7 @@ def export(network: Network, path: Path) -> None:
     helper.set_model_props(model, {"handsim.version": __version__, DIGEST: "0" * 64})
     onnx.checker.check_model(model, full_check=True)
     with atomic_write(path) as temporary:
-        temporary.write_bytes(sign_model(model.SerializeToString()))
+        temporary.write_bytes(stamp_model(model.SerializeToString()))
 
 
 def _load_folded(network: Network, path: Path) -> None:

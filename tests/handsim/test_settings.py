@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 import pytest
+import tyro
 
 from handsim.errors import ArgumentError
 from handsim.settings import Expected, Limits, Mixture, Settings
@@ -98,12 +99,21 @@ def test_options_change_settings():
         Options.of({"num_frames": 7})
 
 
-def test_a_mixture_is_given_whole():
-    assert Mixed(shares={"one": 2.0}).shares == Shares(2.0, 0.0)
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [({"one": 2.0}, (2.0, 0.5)), ({"one": 0.0}, (0.0, 0.5)), ({"two": 0}, (0.5, 0.0)), ({}, (0.5, 0.5))],
+)
+def test_shares_that_are_not_given_keep_their_defaults_as_on_the_command_line(given, expected):
+    assert Mixed(shares=given).shares == Shares(**given) == Shares(*expected)
+    words = [word for name, share in given.items() for word in (f"--shares.{name}", str(share))]
+    assert tyro.cli(Mixed, args=words).shares == Shares(*expected)
+
+
+def test_shares_are_normalized_and_checked():
     np.testing.assert_array_equal(Shares(1.0, 3.0).shares, [0.25, 0.75])
     assert Mixed.from_json(Mixed(shares=Shares(1.0, 0.0)).record()) == Mixed(shares=Shares(1.0, 0.0))
     with pytest.raises(ArgumentError, match="the sum of one, two is 0, expected a number above 0"):
-        Mixed(shares={"one": 0.0})
+        Mixed(shares={"one": 0.0, "two": 0.0})
     with pytest.raises(ArgumentError, match="two is -1, expected a number of at least 0"):
         Shares(1.0, -1.0)
     with pytest.raises(ArgumentError, match="unknown setting of shares 'three'"):

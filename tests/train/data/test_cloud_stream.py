@@ -17,7 +17,7 @@ from train import CloudStream, Corruption, Dataset, generate_dataset
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory) -> Dataset:
     out = tmp_path_factory.mktemp("stream") / "set"
-    alone = {"alone": 1.0}
+    alone = {"together": 0, "holding": 0}
     return generate_dataset(out, glove="tips8", num_frames=120, seed=2, workers=1, scenes=alone)
 
 
