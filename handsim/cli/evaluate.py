@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from handsim.app.messages import print_line, print_table
+from handsim.app.output import place_of
 from handsim.errors import ArgumentError, CaptureError
 from handsim.files.inputs import check_there
 from handsim.files.outputs import check_outputs, save_json
@@ -51,7 +52,8 @@ def evaluate(
 
     check_outputs((*captures, glove, labeler, truth), [json])
     for capture in captures:
-        check_there(capture, error=CaptureError)
+        if isinstance(place := place_of(capture), Path):  # An object store is read later.
+            check_there(place, error=CaptureError)
     if truth is None:
         if glove is None and captures and Path(captures[0]).suffix.lower() == ".npz":
             glove = load_take(captures[0]).settings.get("glove")
