@@ -44,10 +44,9 @@ from render.captions import contact_sheet, write_png
 from render.color_sensor import sample_exposure, sample_shutter
 from render.config import RenderConfig, SpawnKey
 from render.depth_sensor import sample_depth_noise
-from render.formats.records import centered_K, without_colors
 from render.formats.shards import INDEX
 from render.formats.webdataset import TAR
-from render.formats.writer import CONFIG, FORMATS, WRITERS, open_writers, shard_files, whole_shards
+from render.formats.writer import CONFIG, FORMATS, WITH_COLORS, open_writers, shard_files, whole_shards
 from render.frames import Doubles, RenderedFrame
 from render.painting.figures import sample_appearance
 from render.scenery.backgrounds import photo_files
@@ -153,7 +152,7 @@ class Drawing:
         has_user = self.subject.is_motion or config.view.placement == "head"
         self._user = UserBody(self.take) if has_user else None
         film = subject.film
-        self._film = None if film is None else Film(film.path, film.lens_of)
+        self._film = None if film is None else Film(film.path)
         self._open_studio = functools.partial(
             open_studio, config=config, bodies=bodies, has_user=has_user, film=self._film, light=light
         )
@@ -292,7 +291,6 @@ def sample_choices(
 
 SHEET: Final = "contact_sheet.png"
 _MERGED: Final = "checksums.json"  # checksums of the files that all shards make together
-_RENAMES: Final = "freihand"  # format that renames its pictures at the end
 _LEFT_OUT: Final = "left_out-{}.json"
 _CUT_OFF: Final = "cut_off-{}.json"
 _DRAWN: Final = ".drawn-{}"  # file of a shard in progress, which has one byte for each of its pictures
@@ -323,7 +321,7 @@ def render_take(
         source: What to draw, as in `draw`.
         out: Folder; or a folder of an object store, as `s3://bucket/prefix` or a `UPath`. Each of several
             formats has a folder of its own in it.
-        formats: Some of webdataset, coco, yolo, freihand, interhand, exr, png (docs/formats.md).
+        formats: Some of webdataset, coco, yolo, exr, png (docs/formats.md).
         config: What to draw.
         model: The hand of your own poses, or both in the poses' order; drawn people when not given.
         times: Time of each pose (T,) [s]; poses are no motion without them.
@@ -352,19 +350,12 @@ def render_take(
     config = configured(config, camera, settings).resolved()
     _check_formats(formats, config)
     place, workers = place_of(out), workers if isinstance(workers, Executor) else check_workers(workers)
-    if not isinstance(place, Path) and _RENAMES in formats:
-        raise HandSimError(
-            f"{out}: {_RENAMES} renames its pictures at the end, which no object store can; render into a "
-            "folder and copy it"
-        )
     kept = source_of(
         source, model=model, times=times, people=people, person=person, glove=glove, seed=config.seed
     )
     drawing = Drawing(load_subject(kept, seed=config.seed), config)
     cameras = drawing.viewpoints.cameras(0)
     check_names("cameras", cameras)
-    for one in cameras if not all(WRITERS[name].any_lens for name in formats) else ():
-        centered_K(one)  # refuses other lenses before a folder is begun
     check_hands_in_view(config.view, drawing.viewpoints, drawing.take)
     absent = drawing.frames_without_hands()
     if absent and drawing.subject.film is None:  # frames of a video are left out for reasons that are told
@@ -513,9 +504,9 @@ def _check_formats(formats: Sequence[str], config: RenderConfig) -> None:
     for name in formats:
         check_type("a format", name, str, "its name", FORMATS)
         check_choice(name, FORMATS, noun="format", error=HandSimError)
-        if WRITERS[name].needs_colors and "rgb" not in config.passes:
-            raise without_colors(name)
-    if config.openxr and not {"coco", "yolo"} & set(formats):
+        if name in WITH_COLORS and "rgb" not in config.passes:
+            raise HandSimError(f"the format {name} needs color pictures; add rgb to the passes")
+    if config.openxr and not set(WITH_COLORS) & set(formats):
         raise HandSimError(f"formats are {', '.join(formats)}, expected coco or yolo for openxr's joints")
     if not formats or len(set(formats)) < len(formats):
         raise HandSimError(f"formats are {', '.join(formats) or 'none'}, expected at least one, each once")

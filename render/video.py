@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -17,8 +16,8 @@ from handsim._checks import check_type
 from handsim.errors import CaptureError
 from handsim.files.inputs import check_regular
 from handsim.files.outputs import plain_path
-from handsim.space.camera import Camera, Lens
-from render.frames import Bytes, Floats
+from handsim.space.camera import Camera
+from render.frames import Bytes
 from render.photographs import quiet_decoder
 
 _USUAL_RATE: Final = 30.0  # [Hz] of a video that does not tell its own
@@ -26,13 +25,13 @@ _MOST_FRAMES: Final = 1 << 20
 
 
 class Film:
-    """A video file, read frame by frame, as it is or without the lens of its camera.
+    """A video file, read frame by frame.
 
     Raises:
         CaptureError: The file is missing, or no video that OpenCV reads.
     """
 
-    def __init__(self, path: str | Path, lens_of: Camera | None = None) -> None:
+    def __init__(self, path: str | Path) -> None:
         check_type("video", path, (str, os.PathLike), "the path of a video")
         self.path = Path(path)
         check_regular(self.path, error=CaptureError)
@@ -47,7 +46,6 @@ class Film:
         self.num_frames = int(min(max(count, 0), _MOST_FRAMES))
         """As the file tells it, which may be wrong."""
         Camera("film", self.size, np.diag([1.0, 1.0, 1.0]))  # refuses pictures that are too large
-        self._maps = None if lens_of is None else straightening(lens_of)
 
     def _open(self) -> None:
         os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # Quiet: the error below says enough.
@@ -78,8 +76,6 @@ class Film:
         if not done or picture.shape[1::-1] != self.size:
             raise CaptureError(f"{self.path}: a frame is damaged, or of another size than {self.size}")
         time = 1e-3 * float(self._reader.get(cv2.CAP_PROP_POS_MSEC))
-        if self._maps is not None:
-            picture = cv2.remap(picture, self._maps, None, cv2.INTER_LINEAR)
         return time, np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB))
 
     def picture(self, number: int) -> Bytes:
@@ -90,17 +86,6 @@ class Film:
         return frame[1]
 
 
-def straightening(camera: Camera) -> Floats:
-    """Where `cv2.remap` finds the pixels (H, W, 2) of a pinhole camera in a camera's picture."""
-    bent = camera.at(np.eye(4))
-    return np.asarray(bent.project(straight(bent).rays()) - 0.5, dtype=np.float32)
-
-
-def straight(camera: Camera) -> Camera:
-    """The camera without its lens."""
-    return dataclasses.replace(camera, lens=Lens())
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class FilmPictures:
     """The pictures of a video in the place of drawn ones, by the numbers of its frames."""
@@ -108,5 +93,3 @@ class FilmPictures:
     path: Path
     poses: Float[np.ndarray, "T 4 4"]
     """Pose of the camera in each frame [m]."""
-    lens_of: Camera | None = None
-    """The camera whose pictures are wanted without its lens; None for pictures as they are."""

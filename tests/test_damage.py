@@ -156,7 +156,7 @@ def test_a_take(tmp_path, take):
             assert (tmp_path / "copy.npz").read_bytes() == whole
 
 
-FORMATS = [("webdataset",), ("freihand",), ("yolo", "exr")]
+FORMATS = [("webdataset",), ("coco",), ("yolo", "exr")]
 PICTURES = RenderConfig(
     passes=("rgb", "depth"), every=12, frames_per_shard=1, depth_sensor=None, color_sensor=None,
     background={"plain": 1.0}, painter="compiled",

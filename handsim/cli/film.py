@@ -55,8 +55,7 @@ def film(
         options: What to write.
         camera: File with this camera's lens, as of handsim rig import; the lens is fitted when not given.
         detector: Folder of a hand detector of your own; the shipped one when not given.
-        format: File formats: webdataset, coco, yolo, freihand, interhand, exr, png; several go into
-            folders.
+        format: File formats: webdataset, coco, yolo, exr, png; several go into folders.
         workers: Processes that write; all cores when not given.
     """
     from render.film.detector import HandDetector

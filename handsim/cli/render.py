@@ -103,8 +103,7 @@ def render(
             when not given.
         merge: Folders of other renderings to be copied into one, with keys and ids of their own.
         options: What to draw.
-        format: File formats: webdataset, coco, yolo, freihand, interhand, exr, png; several go into
-            folders.
+        format: File formats: webdataset, coco, yolo, exr, png; several go into folders.
         workers: Processes; all cores when not given.
         cluster: Where else to draw shards: tcp://host:port of a Dask scheduler, its file (.json), or local;
             docs/cluster.md.

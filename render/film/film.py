@@ -28,12 +28,11 @@ from render.film.detector import HandDetector
 from render.film.outlines import poses_at, shutter_times
 from render.film.page import write_film_page
 from render.film.registration import Registration, register
-from render.formats.writer import WRITERS
 from render.frames import Bytes
 from render.illustrations import write_video
 from render.session import render_take
 from render.subject import subject_of_take
-from render.video import Film, FilmPictures, straight
+from render.video import Film, FilmPictures
 from render.viewpoints import ViewConfig
 
 RECORD, VIDEO, PAGE = "film.json", "film.mp4", "film.html"
@@ -136,7 +135,7 @@ def annotate_film(
         take: A tracked take or its path.
         video: The video.
         out: Folder.
-        formats: Formats as in `render_take`; freihand and interhand get pictures without distortion.
+        formats: As in `render_take`.
         camera: As in `register_camera`.
         detector: As in `register_camera`.
         workers: As in `render_take`.
@@ -163,14 +162,10 @@ def annotate_film(
     if not np.isfinite(posed.qpos[..., 0]).any():
         told = "; ".join(registration.left_out())
         raise HandSimError(f"{film.path}: no frame can be told: {told}")
-    names = (formats,) if isinstance(formats, str) else tuple(formats)
-    shown = first = registration.cameras[0]
-    if any(name in WRITERS and not WRITERS[name].any_lens for name in names):
-        shown = straight(first)
     poses = np.stack([registration.camera_of(n).T_world_camera for n in range(posed.num_frames)])
-    pictures = FilmPictures(film.path.absolute(), poses, None if shown.lens == first.lens else first)
+    pictures = FilmPictures(film.path.absolute(), poses)
     record = {"film": {"sha256": checksum(film.path), **registration.record()}}
-    config = dataclasses.replace(config, view=ViewConfig(cameras=(shown,)))
+    config = dataclasses.replace(config, view=ViewConfig(cameras=(registration.cameras[0],)))
     source: Any = dataclasses.replace(subject_of_take(posed), film=pictures, poses=record)  # not public
     on_step("writing pictures")
     render_take(source, out, formats, config, workers=workers, progress=progress)

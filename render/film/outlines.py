@@ -18,14 +18,13 @@ from scipy.ndimage import gaussian_filter
 from gloves.fit import GloveFit
 from gloves.takes.take import Take
 from handsim.hand.model import between_poses
-from handsim.space.camera import Camera
+from handsim.space.camera import Camera, Lens
 from handsim.space.transforms import pose_matrices, unit
 from render.film.bundle import READOUT, Bundle, Samples, State
 from render.frames import FOREARM, PARTS_A_HAND, Bytes, Doubles, Flags, Floats, Geometry, Integers
 from render.painting.figures import BodyFigure
 from render.painting.rasterizer import Triangles, see
 from render.skin.mesh import PosableSkin, face_parts, skin_atlas
-from render.video import straight, straightening
 
 _WIDEST: Final = 800  # [px] Wider pictures are shrunk to this width.
 _MOST_POINTS: Final = 80  # largest number of outline points of a hand in a picture
@@ -336,3 +335,14 @@ def _sharpened(colors: Floats) -> tuple[Flags, Doubles]:
     beyond = inside.sum(axis=1) - 0.5 * inside.shape[1]
     sharp = (np.sqrt((flat**2).mean(axis=1)) < _NOISIEST) & (np.abs(beyond) < 0.4 * inside.shape[1])
     return sharp, beyond.astype(np.float64)
+
+
+def straightening(camera: Camera) -> Floats:
+    """Where `cv2.remap` finds the pixels (H, W, 2) of a pinhole camera in a camera's picture."""
+    bent = camera.at(np.eye(4))
+    return np.asarray(bent.project(straight(bent).rays()) - 0.5, dtype=np.float32)
+
+
+def straight(camera: Camera) -> Camera:
+    """The camera without its lens."""
+    return dataclasses.replace(camera, lens=Lens())

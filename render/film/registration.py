@@ -36,9 +36,8 @@ from render.film.bundle import (
     Samples,
     State,
 )
-from render.film.outlines import Outlines, Seen
+from render.film.outlines import Outlines, Seen, straight
 from render.frames import Bytes, Doubles
-from render.video import straight
 
 _FEWEST_FRAMES: Final = 20  # A camera is registered from this many frames with a hand.
 _ROUNDS: Final = 3  # rounds of matching keypoints

@@ -1,10 +1,7 @@
-"""COCO keypoints (`annotations.json`), YOLO's labels beside them, and InterHand2.6M's files: docs/formats.md.
+"""COCO keypoints (`annotations.json`) and YOLO's labels beside them: docs/formats.md.
 
-COCO's keypoints and InterHand2.6M's projections count pixels from the first one's center, boxes from the
-picture's corner. YOLO's shares of a picture count from its corner.
-
-A dataset of InterHand2.6M is one capture, "0". Its cameras are called by numerals, because its loader calls
-`int` on them, and have one pose each, so that a camera that moves becomes many.
+COCO's keypoints count pixels from the first one's center, boxes from the picture's corner. YOLO's shares of a
+picture count from its corner.
 """
 
 from __future__ import annotations
@@ -19,25 +16,19 @@ from typing import Any, Final
 import numpy as np
 
 from handsim import __version__
-from handsim.errors import DatasetError
 from handsim.hand.model import KEYPOINT_NAMES, SKELETON
-from handsim.hand.shape import DIGITS, NUM_KEYPOINTS, SIDES, Side
+from handsim.hand.shape import NUM_KEYPOINTS
 from handsim.motion_files.motion import OPENXR_JOINTS
 from handsim.space.transforms import rotation_quaternions
 from render.formats.records import (
     CENTER,
-    as_sensed,
     body_records,
-    by_side,
-    centered_K,
     is_seen,
     keypoint_flags,
     rounded,
     run_lengths,
     shifted_K,
     to_json,
-    to_order,
-    without_colors,
 )
 from render.formats.shards import _LABELS, FolderWriter, _write, json_list, one_sentence, save_text
 from render.frames import Doubles, Flags, HandTruth, RenderedFrame
@@ -156,12 +147,8 @@ kpt_names: {{0: {json.dumps(KEYPOINT_NAMES)}}}
 class CocoWriter(FolderWriter):
     """`images/shard-00000/KEY.jpg`, `depth/shard-00000/KEY.png` ..., and `annotations.json` beside them."""
 
-    _record_of = staticmethod(picture_record)
-
     def _add(self, folder: Path, frame: RenderedFrame, name: str) -> dict[str, Any]:
-        if as_sensed(frame).rgb is None:
-            raise without_colors(type(self).__name__.removesuffix("Writer").lower())
-        record = self._record_of(frame, f"{name}/{frame.key}.jpg")
+        record = picture_record(frame, f"{name}/{frame.key}.jpg")
         record["image"] |= self._add_pictures(folder, frame, name)
         return record
 
@@ -169,7 +156,7 @@ class CocoWriter(FolderWriter):
         """Write `annotations.json`."""
         path = self.folder / "annotations.json"
         with one_sentence(self.folder, "writing the annotations"):
-            save_text(path, _coco_file(self._records(), CATEGORY, self.folder))
+            save_text(path, _coco_file(self._records(), self.folder))
         return [path]
 
 
@@ -189,7 +176,7 @@ class YoloWriter(CocoWriter):
         return [*super().finish(), path]
 
 
-def _coco_file(records: Iterable[dict[str, Any]], category: dict[str, Any], folder: Path) -> Iterator[str]:
+def _coco_file(records: Iterable[dict[str, Any]], folder: Path) -> Iterator[str]:
     """Pieces of a COCO file; annotations wait in a file of the folder, so that memory need not hold them."""
     yield f'{{"info":{to_json(INFO)},\n"licenses":[],\n"images":'
     fields = set[str]()  # of all annotations
@@ -209,135 +196,4 @@ def _coco_file(records: Iterable[dict[str, Any]], category: dict[str, Any], fold
         waiting.seek(0)
         yield from waiting
     known = {"openxr_joints": OPENXR_JOINTS} if "openxr_poses" in fields else {}
-    yield f'\n],\n"categories":{to_json([category | known])}}}\n'
-
-
-SPLIT: Final = "train"
-CAPTURE: Final = 0
-_ORDER: Final[tuple[Side, Side]] = (SIDES[1], SIDES[0])  # right, left
-
-
-def interhand_record(frame: RenderedFrame, file_name: str) -> dict[str, Any]:
-    """The picture, its camera and its joints, without ids."""
-    hands = by_side(frame)
-    seen = [hand.box for hand in frame.hands if is_seen(hand)]
-    annotation, (joints, valid), K = None, _joints(hands), centered_K(frame.camera)
-    kind = "interacting" if len(hands) == 2 else next(iter(hands), "right")
-    if seen:
-        corners = np.array(seen)
-        low, high = corners[:, :2].min(axis=0), (corners[:, :2] + corners[:, 2:]).max(axis=0)
-        annotation = {
-            "bbox": rounded(np.concatenate([low, high - low]), 3),
-            "joint_valid": valid,
-            "hand_type": kind,
-            "hand_type_valid": 1,
-            "category_id": 1,
-            "iscrowd": 0,
-        }
-    return {
-        "image": {
-            "file_name": file_name,
-            "width": frame.camera.size[0],
-            "height": frame.camera.size[1],
-            "capture": CAPTURE,
-            "subject": CAPTURE,
-            "seq_name": "handsim",
-            "frame_idx": frame.number,
-        },
-        "annotation": annotation,
-        "camera_name": frame.camera.name,
-        "camera": {
-            "campos": (1e3 * frame.camera.T_world_camera[:3, 3]).tolist(),
-            "camrot": frame.camera.T_world_camera[:3, :3].T.tolist(),
-            "focal": [K[0, 0], K[1, 1]],
-            "princpt": K[:2, 2].tolist(),
-        },
-        "joints": {
-            "world_coord": joints,
-            "joint_valid": [[value] for value in valid],
-            "hand_type": kind,
-            "hand_type_valid": True,
-        },
-    }
-
-
-def _with_numerals(records: Iterable[dict[str, Any]], cameras: dict[str, Any]) -> Iterator[dict[str, Any]]:
-    """Records for COCO's file; each pose of a camera is added to `cameras` with a numeral and a record."""
-    for record in records:
-        pose = to_json([record["camera_name"], record["camera"]])
-        numeral, _ = cameras.setdefault(pose, (str(len(cameras)), record["camera"]))
-        names = {"camera": numeral, "camera_name": record["camera_name"]}
-        annotations = [] if record["annotation"] is None else [record["annotation"]]
-        yield {"image": names | record["image"], "annotations": annotations}
-
-
-def frames_once(records: Iterable[dict[str, Any]]) -> Iterator[tuple[int, dict[str, Any]]]:
-    """Joints of every frame, once for all of its cameras."""
-    known: dict[int, int] = {}
-    for record in records:
-        number, joints = record["image"]["frame_idx"], record["joints"]
-        seal = hash(to_json(joints))
-        if number not in known:
-            known[number] = seal
-            yield number, joints
-        elif known[number] != seal:
-            raise DatasetError(
-                f"two pictures of frame {number} have different hands; interhand holds one take a folder"
-            )
-
-
-def skeleton_lines() -> str:
-    """`skeleton.txt`: name, index and parent's index of the 42 joints."""
-    lines = ["# joint_name joint_id joint_parent_id"]
-    for side_number, side in enumerate(_ORDER):
-        first, letter = NUM_KEYPOINTS * side_number, side[0]
-        for digit_number, digit in enumerate(DIGITS):
-            name = "pinky" if digit == "little" else digit
-            for step in range(4):
-                index = first + 4 * digit_number + step
-                parent = index + 1 if step < 3 else first + NUM_KEYPOINTS - 1
-                lines.append(f"{letter}_{name}{4 - step} {index} {parent}")
-        lines.append(f"{letter}_wrist {first + NUM_KEYPOINTS - 1} -1")
-    return "\n".join(lines) + "\n"
-
-
-def _joints(hands: dict[Side, HandTruth]) -> tuple[list[list[float]], list[int]]:
-    """42 joints in the world [mm], zero for an absent hand, and flags of those that are present."""
-    joints, valid = np.zeros((2 * NUM_KEYPOINTS, 3)), np.zeros(2 * NUM_KEYPOINTS, dtype=int)
-    for number, side in enumerate(_ORDER):
-        if side in hands:
-            rows = slice(NUM_KEYPOINTS * number, NUM_KEYPOINTS * (number + 1))
-            joints[rows], valid[rows] = 1e3 * to_order(hands[side].keypoints_world, "interhand"), 1
-    return rounded(joints, 6), valid.tolist()
-
-
-class InterhandWriter(CocoWriter):
-    """`images/train/shard-00000/KEY.jpg`, and InterHand2.6M's JSON files in `annotations/train`."""
-
-    _record_of = staticmethod(interhand_record)
-
-    def __init__(self, folder: Path) -> None:
-        super().__init__(folder, part=SPLIT)
-
-    def finish(self) -> list[Path]:
-        """Write the files in `annotations`."""
-        annotations = self.folder / "annotations"
-        start = annotations / SPLIT / f"InterHand2.6M_{SPLIT}"
-        cameras: dict[str, tuple[str, dict[str, Any]]] = {}
-
-        def joints() -> Iterator[str]:
-            yield f'{{"{CAPTURE}":{{'
-            for index, (number, record) in enumerate(frames_once(self._records())):
-                yield f'{"," if index else ""}\n"{number}":{to_json(record)}'
-            yield "\n}}\n"
-
-        category = {"id": 1, "name": "hand", "supercategory": "hand"}
-        with one_sentence(self.folder, "writing the annotations"):
-            save_text(Path(f"{start}_joint_3d.json"), joints())
-            pictures = _with_numerals(self._records(), cameras)
-            save_text(Path(f"{start}_data.json"), _coco_file(pictures, category, self.folder))
-            fields = ("campos", "camrot", "focal", "princpt")
-            table = {name: {number: one[name] for number, one in cameras.values()} for name in fields}
-            save_text(Path(f"{start}_camera.json"), [to_json({str(CAPTURE): table}) + "\n"])
-            save_text(annotations / "skeleton.txt", [skeleton_lines()])
-        return [path for path in annotations.rglob("*") if path.is_file()]
+    yield f'\n],\n"categories":{to_json([CATEGORY | known])}}}\n'

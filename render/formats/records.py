@@ -1,7 +1,7 @@
-"""What the file formats share: encoded pictures, masks, JSON, and joint orders of other data sets.
+"""What the file formats share: encoded pictures, masks, JSON, and the joint order of UmeTrack.
 
-We count pixels from the picture's corner, so that the first center is at 0.5. OpenCV, and with it FreiHAND,
-InterHand2.6M, UmeTrack and COCO's keypoints, count from the first center: `CENTER` is subtracted for them.
+We count pixels from the picture's corner, so that the first center is at 0.5. OpenCV, UmeTrack and COCO's
+keypoints count from the first center: `CENTER` is subtracted for them.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any, Final
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float32, UInt8
 from numpy.typing import NDArray
 
 from handsim.errors import HandSimError
@@ -43,16 +43,6 @@ def shifted_K(camera: Camera) -> Doubles:
     K = camera.K.copy()
     K[:2, 2] -= CENTER
     return K
-
-
-def centered_K(camera: Camera) -> Doubles:
-    """`shifted_K` of a pinhole camera; other lenses, which it does not describe, are refused."""
-    if camera.lens.kind != "pinhole":
-        raise HandSimError(
-            f"camera '{camera.name}' has a lens '{camera.lens.kind}', which this format cannot hold; "
-            "expected a pinhole camera, or the format webdataset, coco, yolo, exr or png"
-        )
-    return shifted_K(camera)
 
 
 def as_sensed(frame: RenderedFrame) -> Pictures:
@@ -104,11 +94,6 @@ def by_side(frame: RenderedFrame) -> dict[Side, HandTruth]:
     return hands
 
 
-def without_colors(name: str) -> HandSimError:
-    """The error for a format that needs color pictures."""
-    return HandSimError(f"the format {name} needs color pictures; add rgb to the passes")
-
-
 def rigid_record(transform: Doubles) -> dict[str, list[float]]:
     """A rigid transform (4, 4) as quaternion (wxyz) and translation [m]."""
     return {
@@ -142,18 +127,13 @@ def _listed(content: Any) -> Any:
 
 
 _DIGITS: Final = tuple(tuple(range(first, first + 4)) for first in range(1, NUM_KEYPOINTS, 4))
-# InterHand2.6M: thumb to little, tip to base, then the wrist; its files have a right hand and a left one.
-# UmeTrack and HOT3D: five tips, wrist, thumb without its base, three joints per finger.
-JOINT_ORDERS: Final[dict[str, tuple[int, ...]]] = {
-    "interhand": (*(joint for digit in _DIGITS for joint in digit[::-1]), 0),
-    "umetrack": (*(digit[3] for digit in _DIGITS), 0, 2, 3, *(j for digit in _DIGITS[1:] for j in digit[:3])),
-}
-"""Index in `KEYPOINT_NAMES` of every joint of another data set's order; ours is that of FreiHAND."""
+UMETRACK_JOINTS: Final = [
+    *(digit[3] for digit in _DIGITS), 0, 2, 3, *(joint for digit in _DIGITS[1:] for joint in digit[:3])
+]  # fmt: skip
+"""Index in `KEYPOINT_NAMES` of every joint of UmeTrack and HOT3D.
 
-
-def to_order(points: Float[np.ndarray, "*batch 21 k"], name: str) -> Float[np.ndarray, "*batch n k"]:
-    """Rows of our keypoints in one of `JOINT_ORDERS`."""
-    return points[..., list(JOINT_ORDERS[name]), :]
+They have five tips, the wrist, the thumb without its base, and three joints per finger.
+"""
 
 
 METERS_PER_UNIT: Final = 1e-4
@@ -164,9 +144,9 @@ _NORMAL_ZERO, _NORMAL_SCALE = 128, 127
 _JPEG_QUALITY: Final = 95
 
 
-def encode_jpeg(picture: UInt8[np.ndarray, "H W *C"], *, quality: int = _JPEG_QUALITY) -> bytes:
-    """An sRGB or gray picture as JPEG."""
-    ordered = cv2.cvtColor(picture, cv2.COLOR_RGB2BGR) if picture.ndim == 3 else picture
+def encode_jpeg(picture: UInt8[np.ndarray, "H W 3"], *, quality: int = _JPEG_QUALITY) -> bytes:
+    """An sRGB picture as JPEG."""
+    ordered = cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)
     done, data = cv2.imencode(".jpg", ordered, [cv2.IMWRITE_JPEG_QUALITY, quality])
     assert done, "JPEG holds any picture"
     return data.tobytes()

@@ -130,9 +130,8 @@ BESIDE: Final = (*PICTURES, _LABELS)
 class FolderWriter:
     """For each shard a folder of pictures, which are named after frames, with an index of records."""
 
-    def __init__(self, folder: Path, *, inside: str = _IMAGES, part: str = ".") -> None:
-        self.folder, self.part = folder, part
-        self.pictures = folder / inside / part
+    def __init__(self, folder: Path, *, inside: str = _IMAGES) -> None:
+        self.folder, self.pictures = folder, folder / inside
 
     def done(self) -> frozenset[int]:
         """Shards that are complete."""
@@ -171,7 +170,7 @@ class FolderWriter:
 
     def beside(self, shard: int) -> dict[str, Path]:
         """The folders of a shard's depth, ids and so on by kind, whether they exist or not."""
-        return {kind: self.folder / kind / self.part / shard_name(shard) for kind in BESIDE}
+        return {kind: self.folder / kind / shard_name(shard) for kind in BESIDE}
 
     def finish(self) -> list[Path]:
         """Merge all complete shards into the files that the format requires, if any; may be called again."""
@@ -190,7 +189,7 @@ class FolderWriter:
             kind, _, ending = suffix.strip(".").rpartition(".")
             _write(folder / kind / f"{frame.key}.{ending}", content)
             if kind:
-                files[f"{kind}_file"] = (Path(kind) / self.part / name / f"{frame.key}.{ending}").as_posix()
+                files[f"{kind}_file"] = f"{kind}/{name}/{frame.key}.{ending}"
         return files
 
     def _records(self) -> Iterator[dict[str, Any]]:

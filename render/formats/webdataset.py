@@ -25,8 +25,8 @@ from handsim.space.camera import Camera
 from handsim.space.transforms import quaternion_matrix, rigid
 from render.formats.records import (
     CENTER,
-    JOINT_ORDERS,
     METERS_PER_UNIT,
+    UMETRACK_JOINTS,
     body_records,
     by_side,
     encode_pictures,
@@ -34,7 +34,6 @@ from render.formats.records import (
     rigid_record,
     rounded,
     to_json,
-    to_order,
 )
 from render.formats.shards import new_tar, one_sentence, shard_name, shards_in
 from render.frames import Doubles, HandTruth, RenderedFrame
@@ -87,7 +86,7 @@ def hands_record(frames: Sequence[RenderedFrame]) -> dict[str, Any]:
                 "wrist_xform": wrist.tolist(),
                 "T_world_from_wrist": rigid_record(wrist),
             },
-            "landmarks": rounded(to_order(hand.keypoints_world, "umetrack"), 9),
+            "landmarks": rounded(hand.keypoints_world[UMETRACK_JOINTS], 9),
             **_truth(hand),
             "pixels": {name: rounded(hands[side].keypoints - CENTER, 5) for name, hands in streams},
             "visible": {name: hands[side].visible for name, hands in streams},
@@ -165,7 +164,7 @@ def umetrack_hand(shape: HandShape) -> dict[str, Any]:
     numbers, surface = np.arange(NUM_JOINTS), model.surface
     step, next_digit = numbers % _JOINTS_PER_DIGIT, numbers + _JOINTS_PER_DIGIT
     weights = np.pad(all_weights(surface.bone_indices, surface.bone_weights), ((0, 0), (_ROOT_FRAMES, 0)))
-    landmarks = to_order(hand_keypoints(model, join_qpos(np.zeros((1, NUM_JOINTS))))[0], "umetrack")
+    landmarks = hand_keypoints(model, join_qpos(np.zeros((1, NUM_JOINTS))))[0, UMETRACK_JOINTS]
     return {
         "joint_rotation_axes": rounded(axes @ _UMETRACK_FROM_OURS.T, 8),
         "joint_rest_positions": rounded(1e3 * rest[:, :3, 3] @ _UMETRACK_FROM_OURS.T, 5),
@@ -175,7 +174,7 @@ def umetrack_hand(shape: HandShape) -> dict[str, Any]:
         "joint_next_sibling": np.where((step == 0) & (next_digit < NUM_JOINTS), next_digit, -1).tolist(),
         "landmark_rest_positions": rounded(1e3 * landmarks @ _UMETRACK_FROM_OURS.T, 5),
         "landmark_rest_bone_weights": [[1.0]] * len(landmarks),
-        "landmark_rest_bone_indices": [[_ROOT_FRAMES + KEYPOINT_BONES[n]] for n in JOINT_ORDERS["umetrack"]],
+        "landmark_rest_bone_indices": [[_ROOT_FRAMES + KEYPOINT_BONES[n]] for n in UMETRACK_JOINTS],
         "mesh_vertices": rounded(1e3 * surface.vertices @ _UMETRACK_FROM_OURS.T, 4),
         "mesh_triangles": surface.faces.tolist(),
         "dense_bone_weights": rounded(weights, 6),

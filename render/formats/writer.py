@@ -13,15 +13,14 @@ import shutil
 import tarfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 from handsim._checks import check_choice, check_type
 from handsim.app.output import CHECKSUMS, checked_list, checksums_name, save_checksums
 from handsim.errors import DatasetError, HandSimError
 from handsim.files.inputs import load_json
 from handsim.files.outputs import check_free, save_json
-from render.formats.coco import CocoWriter, InterhandWriter, YoloWriter
-from render.formats.freihand import FreihandWriter
+from render.formats.coco import CocoWriter, YoloWriter
 from render.formats.records import to_json, write_exr
 from render.formats.shards import (
     INDEX,
@@ -63,35 +62,26 @@ class ExrWriter(PngWriter):
         return {}
 
 
-FrameWriter = FolderWriter | FreihandWriter | WebdatasetWriter
+FrameWriter = FolderWriter | WebdatasetWriter
 """A writer of one format, as `open_writer` returns it."""
 
 
-class Format(NamedTuple):
-    """A format and what it cannot hold."""
-
-    open: Callable[[Path], FrameWriter]
-    needs_colors: bool = False
-    any_lens: bool = True  # False: pinhole cameras alone
-    merges: bool = True  # whether renderings can be merged
-
-
-WRITERS: Final = {
-    "webdataset": Format(WebdatasetWriter),
-    "coco": Format(CocoWriter, needs_colors=True),
-    "yolo": Format(YoloWriter, needs_colors=True),
-    "freihand": Format(FreihandWriter, needs_colors=True, any_lens=False, merges=False),
-    "interhand": Format(InterhandWriter, needs_colors=True, any_lens=False, merges=False),
-    "exr": Format(ExrWriter),
-    "png": Format(PngWriter),
+_WRITERS: Final[dict[str, Callable[[Path], FrameWriter]]] = {
+    "webdataset": WebdatasetWriter,
+    "coco": CocoWriter,
+    "yolo": YoloWriter,
+    "exr": ExrWriter,
+    "png": PngWriter,
 }
-FORMATS: Final = tuple(WRITERS)
+FORMATS: Final = tuple(_WRITERS)
+WITH_COLORS: Final = ("coco", "yolo")
+"""Formats that need color pictures."""
 
 
 def open_writer(name: str, folder: str | Path) -> FrameWriter:
     """The writer of one of `FORMATS` into a folder."""
-    check_choice(name, WRITERS, noun="format", error=HandSimError)
-    return WRITERS[name].open(Path(folder))
+    check_choice(name, FORMATS, noun="format", error=HandSimError)
+    return _WRITERS[name](Path(folder))
 
 
 def open_writers(folder: Path, formats: Sequence[str]) -> list[FrameWriter]:
@@ -145,8 +135,8 @@ def merge_renderings(folders: Sequence[str | Path], out: str | Path) -> int:
         Number of shards of each format; pictures [px] and depth [m] are as they were.
 
     Raises:
-        HandSimError: A folder holds no rendering, their formats differ or have no place for several
-            renderings, `out` is not new, or the disk is too small.
+        HandSimError: A folder holds no rendering, their formats differ or are unknown, `out` is not
+            new, or the disk is too small.
         DatasetError: A shard is damaged.
     """
     check_type("folders", folders, (list, tuple), "paths of folders")
@@ -160,9 +150,7 @@ def merge_renderings(folders: Sequence[str | Path], out: str | Path) -> int:
                 f"{parts[0]}"
             )
     for name in formats:
-        if name not in WRITERS or not WRITERS[name].merges:
-            valid = ", ".join(one for one in WRITERS if WRITERS[one].merges)
-            raise HandSimError(f"renderings of the format {name} cannot be merged; expected {valid}")
+        check_choice(name, FORMATS, noun="format of a rendering", error=HandSimError)
     if len(parts) < 2 or len({folder.resolve() for folder in parts}) < len(parts):
         raise HandSimError("expected two or more different folders to merge")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):

@@ -100,7 +100,7 @@ def _kept(table):
 
 def test_annotations_are_the_same_whatever_passes_are_written(tmp_path):
     take = simulate_take(kind="hand-hand", num_frames=25)
-    found, formats = [], ("coco", "yolo", "freihand", "interhand", "webdataset", "png")
+    found, formats = [], ("coco", "yolo", "webdataset", "png")
     for number, passes in enumerate((PASSES, ("rgb",), ("rgb", "normals"))):
         out = tmp_path / str(number)
         render_take(take, out, formats, RenderConfig(vary="frame", every=25), passes=passes, workers=1)
@@ -109,9 +109,7 @@ def test_annotations_are_the_same_whatever_passes_are_written(tmp_path):
             coco = COCO(str(out / format / "annotations.json"))
             for hand in coco.loadAnns(coco.getAnnIds()):
                 assert 0 < hand["area"] == coco.annToMask(hand).sum() < hand["bbox"][2] * hand["bbox"][3]
-        pictures, masks = ([*out.glob(f"freihand/training/{kind}/*.jpg")] for kind in ("rgb", "mask"))
-        assert len(pictures) == len(masks) > 0
-    assert len(found[0]) > 10 and found[1] == found[0] == found[2]
+    assert len(found[0]) > 5 and found[1] == found[0] == found[2]
 
 
 def test_a_hand_is_masked_with_its_markers_without_its_forearm():

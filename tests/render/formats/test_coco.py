@@ -10,12 +10,9 @@ import pytest
 from pycocotools.coco import COCO
 from pycocotools.cocoeval import COCOeval
 
-from handsim import HandShape, HandSimError, look_at
-from handsim.errors import DatasetError
+from handsim import HandShape
 from handsim.hand.model import KEYPOINT_NAMES
 from render import RenderedFrame, SkinLook
-from render.formats.coco import skeleton_lines
-from render.formats.records import to_order
 from render.formats.writer import open_writer
 
 
@@ -185,69 +182,3 @@ def test_the_records_of_coco_are_beside_the_labels(yolo_folder: Path) -> None:
     for image, (picture, rows) in zip(content["images"], pictures_and_labels(yolo_folder), strict=True):
         hands = [hand for hand in content["annotations"] if hand["image_id"] == image["id"]]
         assert picture == yolo_folder / "images" / image["file_name"] and len(hands) == len(rows)
-
-
-NAME = "InterHand2.6M_train"
-
-
-def load(folder: Path, name: str) -> dict:
-    return json.loads((folder / "annotations" / "train" / f"{NAME}_{name}.json").read_text())
-
-
-@pytest.fixture
-def moving(make_frame, camera) -> list:
-    """Two pictures of the first time, from two cameras, and one of the second, when the first has moved."""
-    other = dataclasses.replace(camera, name="other").at(look_at(np.array([0.1, -0.5, -0.3]), np.zeros(3)))
-    moved = camera.at(look_at(np.array([-0.1, -0.5, 0.4]), np.zeros(3)))
-    return [
-        make_frame(0, ("right", "left")),
-        make_frame(0, ("right", "left"), camera=other),
-        make_frame(1, ("left",), camera=moved),
-    ]
-
-
-def test_interhand_and_coco_loaders_read_it(moving, tmp_path):
-    writer = open_writer("interhand", tmp_path)
-    writer.write(0, moving)
-    writer.finish()
-    coco = COCO(str(tmp_path / "annotations" / "train" / f"{NAME}_data.json"))
-    assert len(coco.anns) == len(coco.imgs) == 3
-    data, cameras, joints = (load(tmp_path, name) for name in ("data", "camera", "joint_3d"))
-    images = {image["id"]: image for image in data["images"]}
-    assert [image["camera"] for image in data["images"]] == ["0", "1", "2"]
-    assert [image["camera_name"] for image in data["images"]] == ["small", "other", "small"]
-    assert [record["hand_type"] for record in data["annotations"]] == ["interacting", "interacting", "left"]
-    for record, frame in zip(data["annotations"], moving, strict=True):
-        image = images[record["image_id"]]
-        camera = {name: np.array(table[image["camera"]]) for name, table in cameras["0"].items()}
-        world = np.array(joints["0"][str(image["frame_idx"])]["world_coord"])
-        local = (world - camera["campos"]) @ camera["camrot"].T
-        uv = local[:, :2] / local[:, 2:] * camera["focal"] + camera["princpt"]
-        valid = np.array(record["joint_valid"]).reshape(42) > 0
-        sides = [hand.shape.side for hand in frame.hands]
-        np.testing.assert_array_equal(valid, np.repeat(["right" in sides, "left" in sides], 21))
-        for hand in frame.hands:
-            rows = slice(0, 21) if hand.shape.side == "right" else slice(21, 42)
-            np.testing.assert_allclose(uv[rows], to_order(hand.keypoints, "interhand") - 0.5, atol=1e-4)
-            expected = 1e3 * to_order(hand.keypoints_world, "interhand")
-            np.testing.assert_allclose(world[rows], expected, atol=1e-5)
-        picture = cv2.imread(str(tmp_path / "images" / "train" / image["file_name"]))
-        assert picture.shape[:2] == (image["height"], image["width"])
-
-
-def test_the_skeleton_is_a_tree_of_the_same_joints() -> None:
-    rows = [line.split(" ") for line in skeleton_lines().splitlines() if not line.startswith("#")]
-    assert [int(row[1]) for row in rows] == list(range(42))
-    for row in ("r_thumb4 0 1", "r_thumb1 3 20", "r_wrist 20 -1", "l_wrist 41 -1", "l_pinky4 37 38"):
-        assert row.split() in rows
-
-
-def test_what_it_cannot_hold_is_told(make_frame, tmp_path: Path) -> None:
-    writer = open_writer("interhand", tmp_path)
-    with pytest.raises(HandSimError, match="hands right and right; this format holds at most one"):
-        writer.write(0, [make_frame(0, ("right", "right"))])
-    first = make_frame(0)
-    writer.write(0, [first])
-    writer.write(1, [dataclasses.replace(make_frame(1), number=0)])
-    with pytest.raises(DatasetError, match="two pictures of frame 0 have different hands"):
-        writer.finish()

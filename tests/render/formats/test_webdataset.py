@@ -13,7 +13,7 @@ from handsim.hand.model import hand_keypoints
 from handsim.hand.shape import Side
 from handsim.space.camera import pinhole
 from handsim.space.transforms import axis_angle_matrix, quaternion_matrix, random_quaternions
-from render.formats.records import to_json, to_order
+from render.formats.records import UMETRACK_JOINTS, to_json
 from render.formats.webdataset import (
     camera_record,
     crop_camera,
@@ -144,9 +144,7 @@ def test_the_formula_poses_our_hand(side: Side, rng: np.random.Generator) -> Non
     weights = np.zeros((20, 17))
     weights[np.arange(20), np.ravel(record["landmark_rest_bone_indices"])] = 1.0
     landmarks = skinned(np.array(record["landmark_rest_positions"]), weights, frames)
-    np.testing.assert_allclose(
-        landmarks, 1e3 * to_order(hand_keypoints(model, qpos)[0], "umetrack"), atol=1e-3
-    )
+    np.testing.assert_allclose(landmarks, 1e3 * hand_keypoints(model, qpos)[0, UMETRACK_JOINTS], atol=1e-3)
     vertices = skinned(np.array(record["mesh_vertices"]), np.array(record["dense_bone_weights"]), frames)
     np.testing.assert_allclose(vertices, 1e3 * model.skin(qpos)[0], atol=1e-2)  # [mm]
 

@@ -189,16 +189,14 @@ def test_without_the_packages_a_sentence_says_how_to_get_them(monkeypatch):
         make_dataset(CONFIG, "s3://b/x")
 
 
-def test_what_renames_its_files_or_merges_goes_to_a_folder(memory, tmp_path, capsys):
-    with pytest.raises(HandSimError, match=f"{memory}: freihand renames its .* a folder and copy it"):
-        render_take(tmp_path / "take.npz", memory, ["png", "freihand"], RenderConfig())
+def test_what_merges_goes_to_a_folder(memory, tmp_path, capsys):
     assert main(["render", "--merge", str(tmp_path), "--out", str(memory)]) == 1
     assert f"--merge copies into a folder, and {memory} is none" in capsys.readouterr().err
 
 
 def test_pictures_in_a_store_have_the_bytes_of_a_folder(memory, take, tmp_path):
     config = RenderConfig(depth_sensor=None, color_sensor=None, every=6, frames_per_shard=2)
-    formats = ("png", "coco", "interhand", "webdataset")
+    formats = ("png", "coco", "yolo", "webdataset")
     assert render_take(take, tmp_path / "here", formats, config, workers=1) == 4
 
     def stop(done, total):
