@@ -245,7 +245,7 @@ CASES = {
     "report tracked.npz --out page.pdf": "--out is page.pdf | .html",
     "report missing.npz --out page.html": "missing.npz | cannot be read",
     "report good.trc --out page.html": "good.trc",
-    "export tracked.npz --out hands.fbx": ".glb, .bvh, .usda, .usdc, .csv, .parquet",
+    "export tracked.npz --out hands.fbx": ".glb, .bvh, .usda, .usdc, .csv, .trc, .mot",
     "export tracked.npz --out hands.onnx": "cannot write a take",
     "export dense19 --out hands.glb": ".onnx | takes | .npz | .glb",
     "export nobody.json --out hand.xml": "nobody.json | cannot be read",

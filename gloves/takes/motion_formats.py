@@ -13,13 +13,10 @@ from gloves.captures.formats import write_capture
 from handsim.errors import ArgumentError
 from handsim.hand.model import KEYPOINT_NAMES, hand_keypoints
 from handsim.motion_files.motion import (
-    OPENXR_SUFFIX,
     Motion,
     write_bvh,
     write_joint_csv,
-    write_joint_parquet,
     write_mot,
-    write_openxr,
 )
 from handsim.motion_files.scenes import write_glb, write_usd
 from handsim.space.transforms import UpAxis, file_axes
@@ -62,9 +59,7 @@ MOTION_FORMATS: Final[dict[str, MotionFormat]] = {
     ".usda": MotionFormat(write_usd, "invisible"),
     ".usdc": MotionFormat(write_usd, "invisible"),
     ".csv": MotionFormat(write_joint_csv, "blank", keeps_axes=True),
-    ".parquet": MotionFormat(write_joint_parquet, "null", keeps_axes=True),
     ".trc": MotionFormat(_write_joint_trc, HELD, steady=True),
     ".mot": MotionFormat(write_mot, HELD),
-    OPENXR_SUFFIX: MotionFormat(write_openxr, "null"),
 }
 """The formats, by the endings of file names."""

@@ -615,8 +615,8 @@ class Take:
         """Write the motion for other programs, in a format by the ending of the file name.
 
         Args:
-            path: A .glb (skinned and animated), .bvh, .usda or .usdc, .csv or .parquet (joint angles and
-                positions), .trc (joint positions), .mot (joint angles for OpenSim) or .openxr.json file.
+            path: A .glb (skinned and animated), .bvh, .usda or .usdc, .csv (joint angles and positions),
+                .trc (joint positions) or .mot (joint angles for OpenSim) file.
             rate: Frames per second of the file [Hz]; those of the take when not given.
             up: The axis of the take's world that points up.
             neutral: The first and the last time [s] of a pose in which a table's angles of the ISB are zero;
@@ -638,7 +638,7 @@ class Take:
             )
         if neutral is not None and not form.keeps_axes:
             raise ArgumentError(
-                f"neutral is {neutral} and the file {path}, expected .csv or .parquet with the ISB's angles"
+                f"neutral is {neutral} and the file {path}, expected .csv with the ISB's angles"
             )
         take = poses_for(form, self, None if rate is None else float(rate))
         form.write(path, posed_motion(take, neutral), up)

@@ -51,7 +51,6 @@ _EXTRAS: Final = {
     "qualisys": "--live qtm://",
     "onnx": ".onnx labelers, training a detector",
     "usd": "export to .usdc",
-    "parquet": "export to .parquet",
     "cluster": "--cluster",
     "object-stores": "folders in s3://",
 }

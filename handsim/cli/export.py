@@ -26,15 +26,14 @@ def export(
     Args:
         source: A take (.npz, of `handsim track` or the .truth.npz of `handsim simulate`); a user's file
             (.json); or a labeler, by the name of a glove with a shipped one or the folder of a trained one.
-        out: The file. Of a take .glb (skinned and animated), .bvh, .usda or .usdc, .csv or .parquet (joint
-            angles and positions), .trc (joint positions), .mot (joint angles for OpenSim) or .openxr.json;
-            of a user .xml (MuJoCo), .urdf, .osim (OpenSim) or .glb; of a labeler .onnx, which labels without
-            torch.
+        out: The file. Of a take .glb (skinned and animated), .bvh, .usda or .usdc, .csv (joint angles
+            and positions), .trc (joint positions) or .mot (joint angles for OpenSim); of a user .xml
+            (MuJoCo), .urdf, .osim (OpenSim) or .glb; of a labeler .onnx, which labels without torch.
         fps: Frames per second of the file, such as 30 or 60 for a game; those of the take when not given.
         up: The axis of the take that points up; y for captures of Motive's default. Files have y up, but
-            .usda, .usdc, .csv and .parquet have the take's axes.
+            .usda, .usdc and .csv have the take's axes.
         neutral: First and last time [s] at which the hands are flat, or in another pose in which the angles
-            of the ISB in a .csv or .parquet are to be zero.
+            of the ISB in a .csv are to be zero.
     """
     from gloves.takes.archives import GROWING_SUFFIX
     from track.user import load_user

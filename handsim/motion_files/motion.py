@@ -1,9 +1,8 @@
 """Motions of hands and things for writers, and joints of hands as tables, as BVH and as OpenXR's joints.
 
-A table .csv or .parquet has a row per frame and hand and a column per number, with the unit in its name.
-Numbers of a hand without a pose are empty in a .csv and null in a .parquet. OpenSim's .mot has a row per
-frame, angles in degrees, and y up as OpenSim's world; a hand without a pose keeps its last one, because
-OpenSim ends at NaN.
+A table (.csv) has a row per frame and hand and a column per number, with the unit in its name. Numbers of a
+hand without a pose are empty. OpenSim's .mot has a row per frame, angles in degrees, and y up as OpenSim's
+world; a hand without a pose keeps its last one, because OpenSim ends at NaN.
 
 BVH has no unit and no comments, so the root is named `world_cm`: lengths are centimeters, which animation
 programs expect, with y up. Its children are the palms of the hands and the things, which have positions; all
@@ -14,14 +13,12 @@ A joint of OpenXR's hand tracking (XR_EXT_hand_tracking) is the near end of the 
 axis points along that bone to the fingertip, its +y axis out of the back (nail) side: OpenXR's x, y and z are
 our -y, z and -x. Tips have the axes of their last bone. The near ends of the four finger metacarpals, which
 do not move in our hand, lie at 38 percent of the way from the wrist to the knuckle (the carpus of Buryanov
-and Kotiuk); the palm joint is the middle of the middle metacarpal. The world has y up, like OpenXR's
-reference spaces, and quaternions are xyzw. A hand without a pose is null.
+and Kotiuk); the palm joint is the middle of the middle metacarpal.
 """
 
 from __future__ import annotations
 
 import csv
-import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Final, NamedTuple, cast
@@ -31,7 +28,6 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 from scipy import sparse
 
-from handsim._plugins import import_extra
 from handsim.errors import CaptureError, choices
 from handsim.files.inputs import read_bytes
 from handsim.files.outputs import as_text, atomic_write
@@ -280,26 +276,6 @@ def write_joint_csv(path: Path, motion: Motion, up: UpAxis = "z") -> None:
                 file.write(f"{frame},{time:.16g},{hand.side}{text}\n")
 
 
-def write_joint_parquet(path: Path, motion: Motion, up: UpAxis = "z") -> None:
-    """Write the table as Apache Parquet, in the take's axes whatever `up` is."""
-    pyarrow, parquet = (import_extra(name, ".parquet", "parquet") for name in ("pyarrow", "pyarrow.parquet"))
-    hands = motion.hands
-    count = len(hands)
-    titles = _titles(motion)
-    numbers = np.stack([_numbers(hand) for hand in hands], axis=1).reshape(-1, len(titles))
-    columns = {
-        "frame": pyarrow.array(np.repeat(np.arange(len(motion.times)), count)),
-        "time_s": pyarrow.array(np.repeat(motion.times, count)),
-        "hand": pyarrow.array([hand.side for hand in hands] * len(motion.times)),
-        **{
-            name: pyarrow.array(np.ascontiguousarray(column), from_pandas=True)  # NaN becomes null
-            for name, column in zip(titles, numbers.T, strict=True)
-        },
-    }
-    with atomic_write(path) as temporary, temporary.open("wb") as file:
-        parquet.write_table(pyarrow.table(columns), file)
-
-
 def _titles(motion: Motion) -> tuple[str, ...]:
     """The columns `NUMBERS`, and the angles of the ISB, whose names say if a neutral pose is zero."""
     isb = "isb" if motion.hands[0].neutral is None else "isb_neutral"
@@ -424,40 +400,10 @@ OPENXR_JOINTS: Final[tuple[str, ...]] = (
     ),
 )
 """The names of XrHandJointEXT, without XR_HAND_JOINT_ and _EXT, in its order."""
-OPENXR_SUFFIX: Final = ".openxr.json"
 _CARPUS: Final = 0.38  # share of the way from wrist to knuckle where a finger's metacarpal begins
 _MIDDLE: Final = 2  # the middle finger's number among the digits
 _AXES: Final = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 """OpenXR's axes as columns in a frame with x along the bone and z out of the back."""
-
-
-def write_openxr(path: Path, motion: Motion, up: UpAxis = "z") -> None:
-    """Write the joints of all hands as JSON."""
-    tracks = motion.hands
-    header = {
-        "format": "XR_EXT_hand_tracking joints by handsim",
-        "schema": 1,
-        "units": {"position": "m", "orientation": "xyzw", "radius": "m", "time": "s"},
-        "axes": "x right, y up, -z forward",
-        "pose": ["x", "y", "z", "qx", "qy", "qz", "qw"],
-        "rate": motion.rate,
-        "joints": OPENXR_JOINTS,
-        "radius": {hand.side: np.round(joint_radii(hand.model), 7).tolist() for hand in tracks},
-    }
-    turn, rows_of = file_axes(up), []  # positions and quaternions (xyzw) of each hand in the file's axes
-    for hand in tracks:
-        poses = joint_poses(hand.model, hand.qpos)
-        quaternions = np.roll(smooth_quaternions(turn @ poses[..., :3, :3]), -1, axis=-1)
-        rows_of.append(np.round(np.concatenate([poses[..., :3, 3] @ turn.T, quaternions], axis=-1), 8))
-    with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8", newline="\n") as file:
-        file.write(json.dumps(header, indent=1)[:-2] + ',\n "frames": [')
-        for frame, time in enumerate(motion.times.tolist()):
-            hands = {
-                hand.side: rows[frame].tolist() if hand.present[frame] else None
-                for hand, rows in zip(tracks, rows_of, strict=True)
-            }
-            file.write((",\n" if frame else "\n") + json.dumps({"time": time, "hands": hands}))
-        file.write("\n ]\n}\n")
 
 
 def joint_poses(model: HandModel, qpos: Float[np.ndarray, "T 27"]) -> Float[np.ndarray, "T 26 4 4"]:

@@ -332,7 +332,7 @@ def refused_or_exported(folder, arrays) -> None:
         warnings.simplefilter("error", RuntimeWarning)
         with contextlib.suppress(HandSimError):
             take = load_take(folder / "altered.npz")
-            for ending in (".glb", ".bvh", ".mot", ".openxr.json"):
+            for ending in (".glb", ".bvh", ".mot", ".csv"):
                 take.export(folder / f"altered{ending}")
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import dataclasses
 import itertools
-import json
 import warnings
 
 import numpy as np
@@ -28,9 +27,7 @@ from handsim.motion_files.motion import (
     split_vertices,
     write_bvh,
     write_joint_csv,
-    write_joint_parquet,
     write_mot,
-    write_openxr,
 )
 from handsim.space.transforms import MIRROR
 from tests.sentences import error_names
@@ -69,34 +66,21 @@ def test_a_ball_is_smooth():
 
 
 def rows_of(path):
-    if path.suffix == ".csv":
-        write = write_joint_csv
-    else:
-        pytest.importorskip("pyarrow", reason="pyarrow is not installed")
-        write = write_joint_parquet
-
-    def read(motion):
-        write(path, posed_motion(motion))
-        if path.suffix == ".csv":
-            with path.open(newline="") as file:
-                return list(csv.DictReader(file))
-        from pyarrow import parquet
-
-        return parquet.read_table(path).to_pylist()
-
-    return read
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
 
 
-@pytest.mark.parametrize("name", ["joints.csv", "joints.parquet"])
-def test_a_row_per_frame_and_hand_holds_the_pose(motion, tmp_path, name):
-    rows = rows_of(tmp_path / name)(motion)
+def test_a_row_per_frame_and_hand_holds_the_pose(motion, tmp_path):
+    path = tmp_path / "joints.csv"
+    write_joint_csv(path, posed_motion(motion))
+    rows = rows_of(path)
     assert len(rows) == 2 * motion.num_frames
     for number, row in enumerate(rows):
         frame, hand = number // 2, posed_motion(motion).hands[number % 2]
         assert (int(row["frame"]), row["hand"]) == (frame, hand.side)
         assert float(row["time_s"]) == pytest.approx(motion.times[frame], abs=1e-6)
         if not hand.present[frame]:
-            assert {row[key] for key in row if key not in ("frame", "time_s", "hand")} <= {"", None}
+            assert {row[key] for key in row if key not in ("frame", "time_s", "hand")} == {""}
             continue
         angles = [float(row[f"{joint}_rad"]) for joint in JOINT_NAMES]
         wrist = [float(row[f"wrist_{part}"]) for part in ("x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")]
@@ -129,24 +113,14 @@ def test_names_of_earlier_versions_are_read(motion, tmp_path):
     np.testing.assert_allclose(read_joint_csv(path).qpos, motion.qpos, rtol=1e-8, atol=1e-9)
 
 
-@pytest.mark.parametrize("name", ["joints.csv", "joints.parquet"])
-def test_angles_of_the_isb_stand_beside_the_models(motion, tmp_path, name):
-    path, between = tmp_path / name, (motion.times[2], motion.times[4])
-    if path.suffix == ".parquet":
-        pytest.importorskip("pyarrow", reason="pyarrow is not installed")
+def test_angles_of_the_isb_stand_beside_the_models(motion, tmp_path):
+    path, between = tmp_path / "joints.csv", (motion.times[2], motion.times[4])
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", HandSimWarning)  # the hand moves
         motion.export(path, neutral=between)
         wanted = motion.angles("right", convention="isb", neutral=between)
-    if path.suffix == ".csv":
-        with path.open(newline="") as file:
-            rows = list(csv.DictReader(file))
-        assert read_joint_csv(path).qpos.shape == motion.qpos.shape
-    else:
-        from pyarrow import parquet
-
-        rows = parquet.read_table(path).to_pylist()
-    rows = [row for row in rows if row["hand"] == "right"]
+    assert read_joint_csv(path).qpos.shape == motion.qpos.shape
+    rows = [row for row in rows_of(path) if row["hand"] == "right"]
     for joint, values in wanted.items():
         found = [float(row[f"{joint}_isb_neutral_rad"]) for row in rows]
         np.testing.assert_allclose(found, values, atol=1e-8)
@@ -382,21 +356,3 @@ def test_radii_reach_the_skin(hand):
     tips = np.array([name.endswith("TIP") for name in OPENXR_JOINTS])
     assert (nearest[~tips] < 1.35 * joint_radii(hand)[~tips]).all()
     assert nearest[tips].max() < 0.002  # our tips lie on the skin
-
-
-def test_file(motion, tmp_path):
-    path = tmp_path / "hands.openxr.json"
-    write_openxr(path, posed_motion(motion))
-    content = json.loads(path.read_text())
-    assert tuple(content["joints"]) == OPENXR_JOINTS and len(content["frames"]) == motion.num_frames
-    up = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
-    for frame, stored in enumerate(content["frames"]):
-        assert stored["time"] == motion.times[frame]
-        for hand in posed_motion(motion).hands:
-            rows = stored["hands"][hand.side]
-            assert (rows is not None) == hand.present[frame]
-            if rows is not None:
-                expected, rows = joint_poses(hand.model, hand.qpos[frame : frame + 1])[0], np.array(rows)
-                np.testing.assert_allclose(rows[:, :3], expected[:, :3, 3] @ up.T, atol=1e-7)
-                found = Rotation.from_quat(rows[:, 3:]).as_matrix()
-                np.testing.assert_allclose(found, up @ expected[:, :3, :3], atol=1e-6)
