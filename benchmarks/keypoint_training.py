@@ -35,7 +35,7 @@ SIZE = 128  # of a crop [px]
 HEAT = 16  # cells of a heat map, each way
 SPREAD = 0.06  # of the heat around a keypoint [share of the side]
 NEAR = 0.2  # of the heat that a keypoint is the mean of, around the peak [share of the side]
-VIEW = ViewConfig(placement="anywhere", distance=(0.45, 0.8))
+VIEW = ViewConfig(placement="orbit", distance=(0.45, 0.8))
 CONFIG = RenderConfig(passes=("rgb", "ids"), view=VIEW, vary="frame", frames_per_shard=8)
 
 

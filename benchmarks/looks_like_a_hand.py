@@ -3,7 +3,7 @@
     python -m benchmarks.looks_like_a_hand OUT [--clean 300 --mixed 300 --empty 100 --seed 0] [--judge FILE]
 
 Writes two sets of 640 x 480 pictures of one hand each, as `handsim render --format coco` writes them:
-OUT/clean (plain and graded backgrounds) and OUT/mixed (rooms, noise and clutter; pictures without a hand
+OUT/clean (plain and graded backgrounds) and OUT/mixed (rooms; pictures without a hand
 among them). Five kinds of pose x palm, back and edge views x six skin tones x both sides; the hand's box
 takes 20 to 30 % of the frame.
 OUT/*/judged.json is the COCO file with each picture's view, pose and tone.
@@ -54,7 +54,7 @@ POSES: Final[dict[str, tuple[str, ...]]] = {
 VIEWS: Final = {"palm": (0.0, 0.0, 1.0), "back": (0.0, 0.0, -1.0), "edge": (0.0, -1.0, 0.0)}
 SETS: Final = {
     "clean": Backgrounds({"plain": 1, "gradient": 1}),
-    "mixed": Backgrounds({"noise": 1, "clutter": 1, "room": 2}),
+    "mixed": Backgrounds({"room": 1}),
 }
 FILL: Final = (0.2, 0.3)  # the hand's box over the frame
 TILT: Final = np.deg2rad(22.0)  # how far a view is off its axis at most, each way

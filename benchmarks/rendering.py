@@ -151,7 +151,7 @@ def accuracy(frames: int) -> Figures:
     from trimesh.ray.ray_pyembree import RayMeshIntersector
 
     take = a_take(frames)
-    view = Viewpoints(ViewConfig("anywhere"), take, rng=np.random.default_rng(1))
+    view = Viewpoints(ViewConfig("orbit"), take, rng=np.random.default_rng(1))
     studio = bare_studio(take)
     off, agree = [], []
     for frame in np.linspace(0, take.num_frames - 1, 8).astype(int):

@@ -1,4 +1,4 @@
-"""Camera poses for each frame of a take: still, in orbit, on a head, anywhere, or on a rig.
+"""Camera poses for each frame of a take: still, in orbit, on a head, or on a rig.
 
 Paths are computed once for a whole take, from the motion of its hands, so that any frame can be drawn
 alone.
@@ -76,10 +76,10 @@ class Framing:
         longest = maximum_filter1d(distances, 2 * (self._window // 2) + 1, mode="nearest")
         return np.asarray(uniform_filter1d(longest, 2 * (self._window // 2) + 1, mode="nearest"))
 
-    def sides(self, rotations: Doubles, frames: Integers | None = None) -> Doubles:
-        """Longer side of the hands seen from far away, the mean of each frame (F,) [m]; NaN without hands."""
-        points, there = self._rows(frames)
-        longer = np.ptp(self._rotated(points, rotations)[..., :2], axis=2).max(axis=-1)
+    def sides(self, rotations: Doubles) -> Doubles:
+        """Longer side of the hands seen from far away, the mean of each frame (T,) [m]; NaN without hands."""
+        there = self._there
+        longer = np.ptp(self._rotated(self.points, rotations)[..., :2], axis=2).max(axis=-1)
         count = there.sum(axis=1)
         total = np.where(there, longer, 0.0).sum(axis=1)
         return np.where(count > 0, total / np.maximum(count, 1), np.nan)
@@ -152,12 +152,11 @@ def looking(directions: Doubles) -> Doubles:
     return np.stack([right, np.cross(forward, right), forward], axis=2)
 
 
-Placement = Literal["still", "orbit", "head", "anywhere", "rig"]
+Placement = Literal["still", "orbit", "head", "rig"]
 _MOUNTED: Final = 0.03  # largest distance of a head's camera from the eyes along each axis [m]
 _MOSTLY: Final = 0.92  # share of the frames in which a head that leans back sees all hands
 _LEAN: Final = 0.3  # largest distance by which a head leans back [m]
 _ORBIT_PERIOD: Final = 12.0  # time of one revolution of a camera in orbit [s]
-_LOWEST, _HIGHEST = np.deg2rad(-20.0), np.deg2rad(75.0)  # elevation of cameras that stand anywhere
 _TRIES: Final = 60  # random directions that are tried for one camera
 _CLOSER: Final = 1.35  # largest ratio between a hand's share and `ViewConfig.share`
 _ENOUGH: Final = 1.05  # ratio of the wanted share to the hands' up to which no other place is tried
@@ -172,9 +171,6 @@ _CENTERINGS: Final = 2  # times that a camera is turned to the middle of what it
 _LINGER: Final = 20.0  # exponent of the hands' share in the time that an orbit spends on a view
 _QUICKEST: Final = 0.02  # shortest time at an azimuth of an orbit, as a share of the longest
 _ASIDE: Final = np.deg2rad(90.0)  # largest angle that is added to the usual one from the front
-_HIDDEN: Final = 10.0  # penalty of a view from behind an arm, in multiples of the wanted distance
-_ARM: Final = 0.5  # length of a forearm that views keep clear of [m]
-_ARM_DISTANCE: Final = 0.2  # least distance between its axis and a camera [m]
 _ARM_CLEARANCE: Final = np.deg2rad(35.0)  # least angle between a view and a forearm
 
 
@@ -195,8 +191,8 @@ class ViewConfig(Settings):
     placement: Placement = "still"
     """Position of the cameras. still: in front of the hands, following them only where they leave the
     picture. orbit: around them, for less time where hands far apart are small. head: at the user's eyes.
-    anywhere: at another position in every frame. rig: at the cameras of a rig, turned to the hands, with
-    lenses as long as it takes, which zoom where hands would be small."""
+    rig: at the cameras of a rig, turned to the hands, with lenses as long as it takes, which zoom where hands
+    would be small."""
     camera: str = "vga"
     """Camera: vga, vga_wide, sr300, kinect2, azure_kinect, d435, headset_fisheye."""
     views: Annotated[int, Limits(1)] = 1
@@ -461,57 +457,6 @@ def _head(config: ViewConfig, take: Take, framing: Framing, rng: np.random.Gener
     return paths
 
 
-def _anywhere(config: ViewConfig, take: Take, framing: Framing, rng: np.random.Generator) -> list[_Path]:
-    """At another random position in every frame, not behind an arm, where hands look large enough."""
-    centers, paths, camera = framing.centers, [], preset(config.camera)
-    for _ in range(config.views):
-        best, chosen = np.full(take.num_frames, np.inf), np.tile([0.0, 0.0, 1.0], (take.num_frames, 1))
-        distances = np.ones(take.num_frames)
-        closer = rng.uniform(1.0, _CLOSER, take.num_frames)
-        remaining = np.arange(take.num_frames)
-        for attempt in range(_TRIES):
-            count, middles = len(remaining), centers[remaining]
-            azimuths = rng.uniform(-np.pi, np.pi, count)
-            rise = np.arcsin(rng.uniform(np.sin(_LOWEST), np.sin(_HIGHEST), count))
-            directions = _spherical(azimuths, rise)
-            rotations = looking(directions)
-            if config.distance is None:
-                usual = _distance_of(camera, framing.sides(rotations, remaining), config.share)
-                shortest = framing.shortest(camera, middles, rotations, remaining)
-                distance = np.maximum(usual / closer[remaining], shortest)
-                smaller = distance / usual
-                if attempt:
-                    poses = rigid(rotations, middles + distance[:, None] * directions)
-                    shares = framing.shares(camera, poses, _CLOSER * config.share, remaining)
-                    smaller = config.share / np.maximum(shares, 1e-6)
-                bad = np.maximum(np.nan_to_num(smaller, nan=1.0), _ENOUGH)
-            else:
-                distance, bad = rng.uniform(*config.distance, count), np.ones(count)
-            bad = bad + _HIDDEN * _behind_arms(
-                take.qpos[remaining, :, :3],
-                framing.forearms[remaining],
-                middles + distance[:, None] * directions,
-            )
-            better = bad < best[remaining]
-            rows = remaining[better]
-            best[rows], chosen[rows], distances[rows] = bad[better], directions[better], distance[better]
-            remaining = remaining[best[remaining] > _ENOUGH]
-            if not len(remaining):
-                break
-        distances = np.where(np.isfinite(distances), distances, 1.0)  # frames without hands
-        paths.append(_Path(camera, rigid(looking(chosen), centers + distances[:, None] * chosen)))
-    return paths
-
-
-def _behind_arms(wrists: Doubles, forearms: Doubles, positions: Doubles) -> Flags:
-    """Whether positions (T, 3) [m] are close to a forearm, or behind one, which would hide its hand."""
-    away = np.nan_to_num(positions)[:, None] - wrists
-    back = (away * forearms).sum(axis=-1)
-    behind = back > np.cos(_ARM_CLEARANCE) * np.linalg.norm(away, axis=-1)
-    beside = np.linalg.norm(away - np.clip(back, 0.0, _ARM)[..., None] * forearms, axis=-1) < _ARM_DISTANCE
-    return np.asarray((behind | beside).any(axis=1))
-
-
 def _rig(config: ViewConfig, take: Take, framing: Framing, rng: np.random.Generator) -> list[_Path]:
     """At the cameras of a rig, with lenses as long as the share takes, if they show nearly all hands.
 
@@ -543,7 +488,7 @@ def _rig(config: ViewConfig, take: Take, framing: Framing, rng: np.random.Genera
     return paths
 
 
-_PATHS: Final = {"still": _still, "orbit": _orbit, "head": _head, "anywhere": _anywhere, "rig": _rig}
+_PATHS: Final = {"still": _still, "orbit": _orbit, "head": _head, "rig": _rig}
 
 
 def _turned_to(position: Doubles, centers: Doubles) -> tuple[Doubles, Doubles]:

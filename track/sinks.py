@@ -16,9 +16,8 @@ import time
 import warnings
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing, suppress
+from contextlib import ExitStack, suppress
 from http import HTTPStatus
-from types import SimpleNamespace
 from typing import Any, Final
 
 import numpy as np
@@ -48,7 +47,7 @@ from track.live_message import (
 from track.rigid_body import RigidTemplate
 from track.streams import split_address
 
-VALID: Final = (*(f"{one}://host:port" for one in ("osc", "udp", "ws", "tcp")), "lsl:NAME", "module:name")
+VALID: Final = (*(f"{one}://host:port" for one in ("osc", "udp", "ws")), "lsl:NAME", "module:name")
 """Valid forms of an address."""
 GROUP: Final = "handsim.sinks"
 """Entry points of packages that provide sinks."""
@@ -57,11 +56,9 @@ STATUSES: Final = tuple(reversed(Status))
 _METHODS: Final = (("send", "close"), "the methods send and close of a sink")
 _YES: Final = ("no", "yes")  # valid values of an option
 _AXES: Final = {"axes": (WORLD, *PROGRAMS), "up": ("z", "y"), "unit": ("auto", "m", "cm"), "velocities": _YES}
-_LINES: Final = {"points": _YES, "joints": ("no", "openxr"), **_AXES}
-_DOCUMENTS: Final = {"format": FORMATS, **_LINES}
+_DOCUMENTS: Final = {"format": FORMATS, "points": _YES, "joints": ("no", "openxr"), **_AXES}
 _OPTIONS: Final[Mapping[str, Mapping[str, tuple[str, ...]]]] = {
     "osc": _AXES,
-    "tcp": _LINES,
     "udp": _DOCUMENTS,
     "ws": {**_DOCUMENTS, "every": _YES, "pages": ("own", "all")},
 }
@@ -179,8 +176,7 @@ def open_sink(address: str) -> LiveSink:
     """Open the sink of one address, see `open_sinks`."""
     scheme, _, rest = address.partition(":")
     if scheme in _OPTIONS and rest.startswith("//"):
-        serves = scheme in ("ws", "tcp")
-        host, port, options = split_address(address, options=_OPTIONS[scheme], any_port=serves)
+        host, port, options = split_address(address, options=_OPTIONS[scheme], any_port=scheme == "ws")
         content = Content(
             points=options.get("points") == "yes",
             joints=options.get("joints") == "openxr",
@@ -196,8 +192,7 @@ def open_sink(address: str) -> LiveSink:
         if scheme == "udp":
             return DatagramSink(host, port, format)
         every, all_pages = options.get("every") == "yes", options.get("pages") == "all"
-        server = LineSink if scheme == "tcp" else WebSocketSink
-        return server(host, port, format, every=every, all_pages=all_pages)
+        return WebSocketSink(host, port, format, every=every, all_pages=all_pages)
     if scheme == "lsl" and rest and not rest.startswith("//"):
         return LabStreamingSink(rest)
     name = address.partition("?")[0]
@@ -466,9 +461,6 @@ class WebSocketSink:
         if self._socket.refused and not self._is_told:
             self._is_told = True
             told = (
-                f"port {self.port} has {MOST_CONNECTIONS} connections and refuses others; end some receivers"
-            )
-            told = (
                 f"port {self.port} refuses further connections: {MOST_CONNECTIONS} are open, or no other file"
             )
             told += " may be opened; end receivers that are not needed"
@@ -501,10 +493,10 @@ class WebSocketSink:
             self._loop.close()
             self._ready.set()
 
-    async def _open(self) -> Any:
+    async def _listen_until_the_end(self) -> None:
         quiet = logging.getLogger("handsim.websocket")  # Invalid requests are not the user's mistakes.
         quiet.setLevel(logging.CRITICAL + 1)
-        return await self._serve(
+        server = await self._serve(
             lambda one: self._talk(one, only_asked=one.request.path == _ON_REQUEST),
             sock=self._socket,
             origins=self._origins,
@@ -514,9 +506,6 @@ class WebSocketSink:
             close_timeout=_FLUSH,
             logger=quiet,
         )
-
-    async def _listen_until_the_end(self) -> None:
-        server = await self._open()
         self._ready.set()
         await self._ending.wait()
         self._spread(*self._format.end())
@@ -592,28 +581,6 @@ def _refuse_other_paths(connection: Any, request: Any) -> Any:
     request.path = request.path.partition("?")[0].rstrip("/")
     known = request.path in ("", _ON_REQUEST)
     return None if known else connection.respond(HTTPStatus.NOT_FOUND, f"expected / or {_ON_REQUEST}\n")
-
-
-class LineSink(WebSocketSink):
-    """Serves lines to TCP clients: the header, then the newest frame for each line that a client sends."""
-
-    async def _open(self) -> Any:
-        async def talk(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-            async def receive() -> None:
-                if not await reader.readline():
-                    raise ConnectionResetError
-
-            async def send(message: bytes, text: bool) -> None:
-                writer.write(message + b"\n")
-                if self._ending.is_set():
-                    writer.close()  # after sending what it still holds
-                await writer.drain()
-
-            connection = SimpleNamespace(recv=receive, send=send, transport=writer.transport)
-            with closing(writer), suppress(OSError, ValueError):  # The client left, or sent too long a line.
-                await self._talk(connection, only_asked=True)
-
-        return await asyncio.start_server(talk, sock=self._socket, limit=_LARGEST)
 
 
 class _Client:

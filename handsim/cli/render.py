@@ -38,8 +38,8 @@ class RenderOptions(RenderConfig):
     """Classes of skin tone to draw from, and no others: very-light, light, intermediate, tan, brown, dark;
     all when not given."""
     background: tuple[BackgroundKind, ...] = ()  # type: ignore[assignment]  # names
-    """Kinds of background: plain, gradient, noise, clutter, room, photo; when not given, a mixture of the
-    others, or photographs alone where --photos is given."""
+    """Kinds of background: plain, gradient, room, photo; when not given, a mixture of the first
+    three, or photographs alone where --photos is given."""
     photos: Path | None = None
     """Folder of photographs, for backgrounds of the kind photo."""
     depth_sensor: tuple[str, ...] = ("auto",)  # type: ignore[assignment]  # names

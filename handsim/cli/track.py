@@ -52,8 +52,8 @@ def track(
         seconds: How long to track a live stream [s], from its first frame, which is awaited as long, at least
             ten seconds.
         send: Where hands are sent as they are tracked, one or several of osc://host:port, udp://host:port,
-            ws://host:port and tcp://host:port, which are servers, lsl:NAME, and module:name, a sink of your
-            own. Without a host it is this machine. A capture is then played at its own rate.
+            ws://host:port, which is a server, lsl:NAME, and module:name, a sink of your own.
+            Without a host it is this machine. A capture is then played at its own rate.
         options: Which hands to track.
         calibrate: Track a capture twice: first to calibrate its hands, then with those that fit frames better
             which they were not calibrated on. For those who did not capture a minute for handsim calibrate.

@@ -1,4 +1,4 @@
-"""Backgrounds: plain, gradient, noise, clutter, room or photograph; none of them looks like a hand.
+"""Backgrounds: plain, gradient, room or photograph; none of them looks like a hand.
 
 A background is a few plain values and a seed, so that drawing it again gives the same picture. Several
 cameras see a background at a place in the world: a room with its furniture, or a box with a picture on each
@@ -14,7 +14,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, get_args
 
 import cv2
 import numpy as np
@@ -26,7 +26,6 @@ from handsim.errors import FileError, HandSimError, HandSimWarning, choices
 from handsim.kernels import kernel
 from handsim.space.camera import Camera, camera_matrix
 from render.color_sensor import GAMMA
-from render.fields import normal_numbers
 from render.frames import Bytes, Doubles, Flags, Floats, Geometry, at_rest
 from render.photographs import PHOTO_SUFFIXES, check_photograph, is_map, read_map, read_photograph
 from render.scenery.rooms import RoomLight, cast_room, draw_room, paint_tints
@@ -140,14 +139,11 @@ _GAPS: Final = (0.02, 0.35)  # range of a backdrop's distance from the hands [m]
 _FAR: Final = 8.0  # distance of a backdrop without shadows over that of one with them
 _STEEPEST: Final = 0.35  # largest slope of a backdrop against the picture's plane
 _SOFTNESS: Final = (0.03, 0.25)  # range of shadows' softness, from that of a bare bulb to a window's
-BackgroundKind = Literal["plain", "gradient", "noise", "clutter", "room", "photo"]
-KINDS: Final[tuple[BackgroundKind, ...]] = ("plain", "gradient", "noise", "clutter", "room", "photo")
-_USUAL_SHARES: Final = {"plain": 0.1, "gradient": 0.1, "noise": 0.15, "clutter": 0.15, "room": 0.5}
-_CLOSE: Final = ("plain", "gradient", "noise", "clutter")  # kinds that may be as near as a wall or a table
-_OUT_OF_FOCUS: Final = ("gradient", "noise", "clutter", "room")  # kinds drawn at half the resolution
-_GRAINS: Final = (6.0, 60.0)  # range of the number of grains along the height of a picture
-_GRAIN_CONTRAST: Final = (0.1, 0.5)  # contrast of grain over that of any two colors
-_SIDE: Final = np.float32(0.6)  # light on an object's side over that on its top
+BackgroundKind = Literal["plain", "gradient", "room", "photo"]
+KINDS: Final[tuple[BackgroundKind, ...]] = get_args(BackgroundKind)
+_USUAL_SHARES: Final = {"plain": 0.15, "gradient": 0.15, "room": 0.7}
+_CLOSE: Final = ("plain", "gradient")  # kinds that may be as near as a wall or a table
+_OUT_OF_FOCUS: Final = ("gradient", "room")  # kinds drawn at half the resolution
 
 
 @dataclass(frozen=True, slots=True)
@@ -242,7 +238,7 @@ def sample_background(config: Backgrounds, *, rng: np.random.Generator) -> Backg
     shares = np.array(list(config.shares.values()))
     kind = KINDS[int(rng.choice(len(KINDS), p=shares / shares.sum()))]
     first, second = _color(rng), _color(rng)
-    blur = float(rng.uniform(0.0, 0.01)) if kind in ("room", "clutter", "photo") else 0.0
+    blur = float(rng.uniform(0.0, 0.01)) if kind in ("room", "photo") else 0.0
     photo = str(pick_photo(Path(str(config.photos)), rng)) if kind == "photo" else None
     backdrop = sample_backdrop(rng=rng) if kind in _CLOSE else _WALL
     return Background(kind, (first, second), int(rng.integers(2**31)), blur, photo, backdrop)
@@ -280,10 +276,6 @@ def _coarse(background: Background, size: tuple[int, int]) -> Floats:
         picture = np.broadcast_to(first, (height, width, 3)).copy()
     elif background.kind == "gradient":
         picture = _gradient(first, second, drawn_size, rng)
-    elif background.kind == "noise":
-        picture = _noise(first, second, drawn_size, rng)
-    elif background.kind == "clutter":
-        picture = _clutter(first, second, drawn_size, rng)
     elif background.kind == "room":
         picture = draw_room(drawn_size, background.seed).light
     elif background.kind == "photo":
@@ -309,97 +301,6 @@ def _gradient(first: Floats, second: Floats, size: tuple[int, int], rng: np.rand
     share = (x[None, :] + y[:, None])[..., None]
     share = 0.5 + 0.5 * share / np.abs(share).max()
     return np.asarray(first + share * (second - first))
-
-
-def _octaves(
-    size: tuple[int, int], channels: int, fall: float, rng: np.random.Generator, cells: int = 3
-) -> Floats:
-    """Noise of all scales with standard deviation 1: each has twice the cells and `fall` times the strength.
-
-    The coarsest scale has this number of `cells` along the picture's height.
-    """
-    width, height = size
-    cells, strength, squares = min(cells, height - 1), 1.0, 0.0
-    total = np.zeros((cells, max(2, cells * width // height), channels), dtype=np.float32)
-    while cells < height:
-        shape = (max(2, cells * width // height), cells)
-        total = cv2.resize(total, shape, interpolation=cv2.INTER_CUBIC).reshape(cells, shape[0], channels)
-        total += np.float32(strength) * normal_numbers(total.shape, rng=rng)
-        squares += strength**2
-        cells, strength = 2 * cells, fall * strength
-    total *= np.float32(1.0 / np.sqrt(squares))
-    whole: Floats = cv2.resize(total, size, interpolation=cv2.INTER_CUBIC)
-    return whole.reshape(height, width, channels)
-
-
-def _noise(first: Floats, second: Floats, size: tuple[int, int], rng: np.random.Generator) -> Floats:
-    """Stone, carpet, cloth or wood: grain of one scale and finer, often longer in one direction."""
-    cells = int(np.exp(rng.uniform(*np.log(_GRAINS))))
-    longer = float(rng.choice([1.0, rng.uniform(2.0, 8.0)]))
-    width, height = size
-    across = rng.random() < 0.5
-    grained = (width, max(2, int(height / longer))) if across else (max(2, int(width / longer)), height)
-    grain = _octaves(grained, 1, float(rng.uniform(0.5, 0.85)), rng, cells)
-    grain = cv2.resize(grain, size, interpolation=cv2.INTER_CUBIC)[..., None]
-    share = np.float32(rng.uniform(*_GRAIN_CONTRAST)) * (0.5 + 0.35 * grain)
-    color = 1.0 + 0.02 * _octaves(size, 3, float(rng.uniform(0.4, 0.8)), rng)
-    return np.asarray((first + np.clip(share, 0.0, 1.0) * (second - first)) * color)
-
-
-def _clutter(first: Floats, second: Floats, size: tuple[int, int], rng: np.random.Generator) -> Floats:
-    """Objects on a table: boxes, tins and cloths of all colors in a heap, each with its own light."""
-    picture = _noise(first, 0.6 * first + 0.4 * second, size, rng)
-    height = size[1]
-    turn = rng.uniform(0.0, 2.0 * np.pi)
-    up = np.array([np.cos(turn), np.sin(turn)])  # direction of heights in the picture
-    for _ in range(int(rng.integers(8, 30))):
-        color = np.array(_color(rng), dtype=np.float32)
-        center = rng.uniform(0.0, 1.0, 2) * size
-        radius = height * rng.uniform(0.05, 0.28)
-        corners = 24 if rng.random() < 0.25 else 4
-        stretch = rng.uniform(0.45, 1.0) if corners == 4 else rng.uniform(0.8, 1.0)
-        angles = rng.uniform(0.0, 2.0 * np.pi) + 2.0 * np.pi * np.arange(corners) / corners
-        outline = np.stack([np.cos(angles), stretch * np.sin(angles)], axis=1) * radius
-        tilt = rng.uniform(0.0, 2.0 * np.pi)
-        axes = np.array([[np.cos(tilt), np.sin(tilt)], [-np.sin(tilt), np.cos(tilt)]])
-        light = np.float32(rng.uniform(0.8, 1.15))
-        bottom = outline @ axes + center
-        top = bottom + radius * max(0.0, rng.uniform(-0.3, 0.7)) * up
-        hull = cv2.convexHull(np.concatenate([bottom, top]).astype(np.float32))[:, 0]
-        _paint_object(picture, hull, _SIDE * light * color)
-        _paint_object(picture, top, light * color, shadow=False)
-    return picture * (1.0 + 0.06 * _octaves(size, 1, 0.8, rng))
-
-
-def _paint_object(picture: Floats, outline: NDArray[Any], color: Floats, *, shadow: bool = True) -> None:
-    """Paint an object over a picture, with its shadow to the right and below."""
-    height, width = picture.shape[:2]
-    offset = 0.02 * height
-    low = np.clip(np.floor(outline.min(axis=0)).astype(int) - 8, 0, (width, height))
-    high = np.clip(np.ceil(outline.max(axis=0) + offset).astype(int) + 8, 0, (width, height))
-    if (low >= high).any():
-        return
-    part = picture[low[1] : high[1], low[0] : high[0]]
-    corners = np.rint(16.0 * (outline - low)).astype(np.int32)
-    covered, shaded = np.zeros((2, *part.shape[:2]), dtype=np.uint8)
-    cv2.fillPoly(covered, [corners], 255, cv2.LINE_AA, 4)
-    if shadow:
-        cv2.fillPoly(shaded, [corners + int(16.0 * offset)], 255, cv2.LINE_AA, 4)
-        shaded = cv2.blur(shaded, (5, 5))
-    _lay_over(part, covered, shaded, color.astype(np.float32))
-
-
-@kernel
-def _lay_over(part: Floats, covered: Bytes, shadow: Bytes, color: Floats) -> None:
-    """Lay a linear color over a part (h, w, 3); 255 covers a pixel, and in `shadow` halves its light."""
-    for row in range(part.shape[0]):
-        for column in range(part.shape[1]):
-            if covered[row, column] or shadow[row, column]:
-                share = np.float32(covered[row, column] / 255.0)
-                light = np.float32(1.0 - shadow[row, column] / 510.0)
-                for channel in range(3):
-                    value = part[row, column, channel] * light
-                    part[row, column, channel] = value + share * (color[channel] - value)
 
 
 Corner = tuple[float, float, float]

@@ -318,7 +318,7 @@ def check_markers(frame):
         assert np.linalg.norm(np.array([columns.mean(), rows.mean()]) + 0.5 - middle) < 8.0
 
 
-@pytest.mark.parametrize("kind", ["plain", "noise", "clutter", "room"])
+@pytest.mark.parametrize("kind", ["plain", "gradient", "room"])
 def test_one_camera_has_one_place_behind_the_hands(path, kind):
     config = dataclasses.replace(PLAIN, view=ViewConfig(), background=kind)
     first, second = drawn(path, config)
@@ -453,9 +453,7 @@ def test_a_rendering_without_any_frame_is_told(path, tmp_path):
 
 
 def test_files_have_the_pictures_that_are_drawn_in_memory(path, tmp_path):
-    config = dataclasses.replace(
-        PLAIN, view=ViewConfig("anywhere"), every=1, frames_per_shard=64, vary="frame"
-    )
+    config = dataclasses.replace(PLAIN, view=ViewConfig("orbit"), every=1, frames_per_shard=64, vary="frame")
     short = tmp_path / "short.truth.npz"
     load_take(path).cut(0, 10).save(short)
     render_take(short, tmp_path / "out", ["png"], config, workers=1)

@@ -13,7 +13,6 @@ from handsim import HandSimWarning, look_at
 from handsim.errors import RigError
 from handsim.hand.model import hand_keypoints
 from handsim.space.camera import pinhole
-from handsim.space.transforms import quaternion_matrix
 from render import ViewConfig
 from render.subject import subject_of_poses
 from render.viewpoints import Framing, Placement, Viewpoints, check_hands_in_view
@@ -41,27 +40,10 @@ def test_every_placement_sees_the_hands(take, placement):
 
 
 def test_the_same_seed_gives_the_same_places(take):
-    config = ViewConfig("anywhere", views=2)
+    config = ViewConfig("orbit", views=2)
     first, second = (Viewpoints(config, take, rng=np.random.default_rng(3)).cameras(5) for _ in range(2))
     for one, other in zip(first, second, strict=True):
         np.testing.assert_array_equal(one.T_world_camera, other.T_world_camera)
-
-
-def test_cameras_anywhere_keep_their_distance(take):
-    config = ViewConfig("anywhere", distance=(0.5, 0.6))
-    viewpoints, centers = Viewpoints(config, take, rng=np.random.default_rng(0)), Framing(take).centers
-    away = [np.linalg.norm(viewpoints.cameras(n)[0].T_world_camera[:3, 3] - centers[n]) for n in range(60)]
-    assert min(away) >= 0.5 - 1e-9 and max(away) <= 0.6 + 1e-9
-
-
-def test_cameras_anywhere_keep_clear_of_arms(take):
-    viewpoints = Viewpoints(ViewConfig("anywhere", views=8), take, rng=np.random.default_rng(3))
-    poses = take.qpos
-    for frame in range(take.num_frames):
-        for qpos in poses[frame][np.isfinite(poses[frame, :, 0])]:
-            arm = qpos[:3] - np.linspace(0.0, 0.5, 51)[:, None] * quaternion_matrix(qpos[None, 3:7])[0, :, 0]
-            for camera in viewpoints.cameras(frame):
-                assert np.linalg.norm(arm - camera.T_world_camera[:3, 3], axis=1).min() > 0.2
 
 
 def test_a_lost_hand_is_aimed_at_where_it_was_between(take):
@@ -136,13 +118,6 @@ def test_one_lens_serves_a_rig_unless_hands_would_be_small():
             for number, camera in enumerate(viewpoints.cameras(frame))
         }
         assert (len(lenses) > viewpoints.num_cameras) == zooms
-
-
-def test_a_share_is_kept():
-    take = a_take("hand-hand")
-    for share in (0.2, 0.4):
-        whole, side = measured(take, ViewConfig("anywhere", share=share))
-        assert whole == 1.0 and share <= side <= 1.4 * share
 
 
 def test_a_still_camera_stays_where_that_is_enough():

@@ -56,7 +56,8 @@ class Failing(Counter):
 
 
 NO_ADDRESSES = ("", "osc", "http://localhost:80", "wss://localhost:1", "lsl:", "lsl://name",
-                "localhost:9000", "a b:c", "ws:8765", "9module:name")  # fmt: skip
+                "localhost:9000", "a b:c", "ws:8765", "9module:name",
+                "tcp://localhost:9000", "tcp://:0?axes=unity")  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -73,7 +74,6 @@ NO_ADDRESSES = ("", "osc", "http://localhost:80", "wss://localhost:1", "lsl:", "
         ("udp://localhost:9000?format", "expected udp://host:port"),
         ("ws://:1?format=xml", "unknown format 'xml'; valid names: json, msgpack"),
         ("ws://:1?point=yes", "unknown option 'point' (did you mean 'points'?) | format | axes | every"),
-        ("tcp://:1?format=msgpack", "unknown option 'format'; valid names: points, joints"),
         ("ws://:1?unit=mm", "unknown unit 'mm' | auto, m, cm"),
         ("udp://:1?every=yes", "udp://:1?every=yes: unknown option 'every'; valid names: format, points"),
         ("osc://:1?format=json", "osc://:1?format=json: unknown option 'format'; valid names: axes, up"),
@@ -557,25 +557,14 @@ def half_close(port: int) -> socket.socket:
     return one
 
 
-@pytest.mark.parametrize(
-    ("scheme", "call"),
-    [
-        ("ws", read_nothing),
-        ("ws", say_nothing),
-        ("ws", babble),
-        ("ws", half_close),
-        ("tcp", say_nothing),
-        ("tcp", babble),
-        ("tcp", half_close),
-    ],
-)
-def test_connections_that_stay_are_counted_and_bounded(scheme, call, message, capfd, caplog, monkeypatch):
+@pytest.mark.parametrize("call", [read_nothing, say_nothing, babble, half_close])
+def test_connections_that_stay_are_counted_and_bounded(call, message, capfd, caplog, monkeypatch):
     """A good receiver gets every frame meanwhile, and another one is let in when some of the others left."""
     monkeypatch.setattr(sinks, "MOST_CONNECTIONS", 8)
     with contextlib.ExitStack() as stack:
-        sink = open_sink(f"{scheme}://:0")
+        sink = open_sink("ws://:0")
         stack.callback(sink.close)
-        good = stack.enter_context(say_nothing(sink.port) if scheme == "tcp" else connect(url(sink)))
+        good = stack.enter_context(connect(url(sink)))
         wait_for(lambda: sink.num_clients == 1)
         files = len(os.listdir("/proc/self/fd")) if os.path.exists("/proc/self/fd") else None
         others = []
@@ -591,16 +580,14 @@ def test_connections_that_stay_are_counted_and_bounded(scheme, call, message, ca
         else:
             with warnings.catch_warnings(action="ignore"):
                 sink.send(message(0))
-        if scheme == "ws":
-            assert received(good, 2)[1]["number"] == 0
+        assert received(good, 2)[1]["number"] == 0
         for one in others:
             one.close()
         wait_for(lambda: sink.num_clients == 1)
 
         def is_let_in() -> bool:
             with contextlib.suppress(OSError, InvalidMessage):
-                late = say_nothing(sink.port) if scheme == "tcp" else connect(url(sink))
-                stack.callback(late.close)
+                stack.enter_context(connect(url(sink)))
                 return True
             return False
 
@@ -620,12 +607,11 @@ sink.close()
 """
 
 
-@pytest.mark.parametrize("address", ["ws://:0", "tcp://:0"])
-def test_a_process_without_free_files_prints_no_traceback(address):
+def test_a_process_without_free_files_prints_no_traceback():
     """The system allows fewer files than connections."""
     pytest.importorskip("resource")
     process = subprocess.Popen(
-        [sys.executable, "-c", FEW_FILES, address],
+        [sys.executable, "-c", FEW_FILES, "ws://:0"],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -742,42 +728,6 @@ def test_clients_hear_of_a_new_size(message):
         heard = received(client, 2)
         assert [one["type"] for one in heard] == ["header", "frame"] and heard[0] == header
     sink.close()
-
-
-def test_a_tcp_client_gets_the_newest_line_for_each_line(message):
-    sink = open_sink("tcp://:0?axes=unreal")
-    with socket.create_connection(("127.0.0.1", sink.port)) as client, client.makefile("rwb") as lines:
-        wait_for(lambda: sink.num_clients == 1)
-        sink.send(message(0))
-        header = json.loads(lines.readline())
-        assert (header["type"], header["axes"]) == ("header", "unreal")
-        for last in range(10, 60, 10):
-            for number in range(last - 10, last + 1):
-                sink.send(message(number))
-            wait_for(lambda last=last: sink.dropped == last + 1)
-            lines.write(b"\n")
-            lines.flush()
-            assert json.loads(lines.readline())["number"] == last
-        closing = threading.Thread(target=sink.close)
-        closing.start()
-        assert json.loads(lines.readline()) == {"type": "end", "schema": 1}
-        assert lines.readline() == b""
-        closing.join()
-
-
-def test_tcp_clients_that_leave_or_babble_are_let_go(message):
-    sink = open_sink("tcp://:0")
-    with socket.create_connection(("127.0.0.1", sink.port)) as babbler:
-        wait_for(lambda: sink.num_clients == 1)
-        babbler.sendall(b"x" * 10_000)
-        wait_for(lambda: sink.num_clients == 0)
-    socket.create_connection(("127.0.0.1", sink.port)).close()
-    with socket.create_connection(("127.0.0.1", sink.port)) as stalled:
-        wait_for(lambda: sink.num_clients == 1)
-        for number in range(50):
-            sink.send(message(number))
-        sink.close()
-        stalled.settimeout(LONG)
 
 
 def test_a_stalled_client_does_not_hold_up_the_end(sink, message):
