@@ -35,8 +35,6 @@ from handsim.space.transforms import MIRROR, unit
 
 _WIDTHS: Final = {"points": 3, "normals": 3, "bone_indices": 4, "bone_weights": 4}
 _MAX_NUMBER: Final = 100.0  # Larger positions [m], directions or bone indices are refused.
-_SUM_TOLERANCE: Final = 1e-6  # The bone weights of a marker sum to one within this.
-_NORMAL_TOLERANCE: Final = 1e-3  # Normals have unit length within this.
 # The digit of each palm capsule: a metacarpal counts to its finger, the wrist to the thumb.
 _PALM_DIGITS: Final = np.array([1, 2, 3, 4, 0, 0])
 # From the wanted place of a marker (1) back to where it was designed (0), to the middle of its bone's back
@@ -47,7 +45,6 @@ _WAY_BACK: Final = (
 )
 _NEAR_END: Final = 0.1  # along the bone
 _LONGEST_SLIP: Final = 0.025  # A random shift moves a marker at most this far [m].
-_SLACK: Final = 1e-9  # Tolerance of barycentric weights, so that a ray through an edge hits a face.
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,14 +77,14 @@ class Attachment:
                     f"{name} holds numbers beyond {_MAX_NUMBER:g}, expected markers on a hand"
                 )
         lengths = np.linalg.norm(self.normals, axis=1)
-        if (np.abs(lengths - 1.0) > _NORMAL_TOLERANCE).any():
+        if (np.abs(lengths - 1.0) > 1e-3).any():
             raise ArgumentError("normals are not of unit length, expected the outward directions of markers")
         bones, shares = self.bone_indices, self.bone_weights
         if bones.dtype.kind != "i" or not ((bones >= 0) & (bones < NUM_BONES)).all():
             raise ArgumentError(
                 f"bone_indices are not bones, expected whole numbers from 0 to {NUM_BONES - 1}"
             )
-        if not ((shares >= 0.0).all() and (np.abs(shares.sum(axis=1) - 1.0) <= _SUM_TOLERANCE).all()):
+        if not ((shares >= 0.0).all() and (np.abs(shares.sum(axis=1) - 1.0) <= 1e-6).all()):
             raise ArgumentError("bone_weights are not shares, expected positive numbers that sum to one")
 
     @property
@@ -396,7 +393,8 @@ def _exits(origins: Any, directions: Any, vertices: Any, faces: Any) -> Any:
             _cross(offset, first, turned)
             u, v = _dot(offset, across) / determinant, _dot(turned, directions[r]) / determinant
             distance = _dot(second, turned) / determinant
-            if min(u, v, 1.0 - u - v) >= -_SLACK and 0.0 < distance < nearest[r]:
+            # The tolerance lets a ray through an edge hit a face.
+            if min(u, v, 1.0 - u - v) >= -1e-9 and 0.0 < distance < nearest[r]:
                 found[r], nearest[r] = f, distance
                 weights[r] = (1.0 - u - v, u, v)
     return found, weights, nearest
@@ -547,7 +545,6 @@ def nearest_markers(fit: GloveFit) -> tuple[str, str, float]:
     return fit.layout.names[first], fit.layout.names[second], float(distances[first, second])
 
 
-_STEPS: Final = 12
 _CONVERGED: Final = 1e-5  # [m] distance of a marker from its target
 _STALK_CONVERGED: Final = 2e-4  # [m] distance of a stalk's axis from its target
 _ACCEPTED: Final = 5e-4  # A marker keeps its bone if it comes this near to its target [m].
@@ -598,7 +595,7 @@ def _place_on(
     height, wanted, start = layout.markers[index].height, center, model.rest_transforms[bone]
     middle = start[:3, 3] + 0.5 * model.skeleton.lengths[bone] * start[:3, 0]
     best, least = layout, math.inf
-    for _ in range(_STEPS):  # the center lies on the skin's normal, not on the ray that finds the skin
+    for _ in range(12):  # the center lies on the skin's normal, not on the ray that finds the skin
         moved = dataclasses.replace(_place(layout.markers[index], bone, model, wanted), height=height)
         markers = (*layout.markers[:index], moved, *layout.markers[index + 1 :])
         candidate = dataclasses.replace(layout, markers=markers)

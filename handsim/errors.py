@@ -13,7 +13,6 @@ from typing import Final
 
 SENTENCE: Final = 500
 """The most characters of a sentence."""
-_NAME: Final = 120  # characters of an unknown name that a sentence shows
 
 
 def shortened(text: str, most: int = 40) -> str:
@@ -88,7 +87,7 @@ class WeightsError(FileError):
 def choices(given: str, valid: Iterable[str], *, noun: str) -> str:
     """Sentence for an unknown name: what was given, the nearest valid name, and all valid names."""
     names = list(valid)
-    given = shortened(given, _NAME)
+    given = shortened(given, 120)
     near = difflib.get_close_matches(given, names, n=1)
     hint = f" (did you mean '{near[0]}'?)" if near else ""
     return f"unknown {noun} '{given}'{hint}; valid names: {', '.join(names)}"

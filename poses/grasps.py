@@ -43,7 +43,6 @@ from poses.shapes import HIGH, LOW, gesture, is_valid
 
 MAX_OBJECT_PENETRATION: Final = 0.0015
 """Deepest overlap [m] of a hand and the object it holds that counts as valid."""
-_TIMESTEP: Final = 0.002
 _MOTOR_STIFFNESS: Final = 2.0  # [N m/rad]
 _DAMPING: Final = 0.04  # [N m s/rad]
 _ARMATURE: Final = 1e-4  # [kg m^2], inertia of tendons and muscles
@@ -144,7 +143,7 @@ def object_penetration(
 
 def _build_scene_spec(model: HandModel, obj: RigidObject) -> mujoco.MjSpec:
     spec = build_spec(model.skeleton, model.capsules)
-    spec.option.timestep = _TIMESTEP
+    spec.option.timestep = 0.002
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.option.impratio = 5.0
@@ -203,9 +202,7 @@ def _add_object(spec: mujoco.MjSpec, obj: RigidObject) -> None:
 
 _GAP: Final = 0.0005  # [m] between palm and object before the fingers close
 _SLIDE: Final = 0.15  # an object is raised to the palm from this far below it [m]
-_SLIDE_HALVINGS: Final = 12
 _ANY: Final = "any"  # library entry of objects that have none of their own
-_ROUNDS: Final = 12
 _STIFFNESS: Final = 0.006  # [m/rad] weight of joint deviations against residuals of the tips
 _MAX_STEP: Final = 0.2  # largest change of an angle in a round [rad]
 
@@ -340,7 +337,7 @@ def _slid_to_palm(scene: GraspScene, style: HoldStyle, pose: NDArray[np.float64]
     data = scene.new_data(style.open, pose)
     lowest = data.qpos[NUM_JOINTS + 2]
     low, high = -_SLIDE, 0.0  # heights at which the object is free, and too high
-    for _ in range(_SLIDE_HALVINGS):
+    for _ in range(12):
         middle = (low + high) / 2
         data.qpos[NUM_JOINTS + 2] = lowest + middle
         mujoco.mj_kinematics(scene.mj_model, data)
@@ -360,7 +357,7 @@ def retarget_angles(model: HandModel, angles: Float[np.ndarray, "P 20"]) -> Floa
     targets = _marks(mean, angles)[0]
     solutions = angles.copy()
     stiff = _STIFFNESS * np.eye(NUM_JOINTS)
-    for _ in range(_ROUNDS):
+    for _ in range(12):
         placed, jacobians = _marks(model, solutions)
         for number, jacobian in enumerate(jacobians):
             away = (targets - placed)[number].ravel()
@@ -511,7 +508,6 @@ def _shake(scene: GraspScene, data: mujoco.MjData) -> None:
 
 
 _MAX_HELD_DEPTH: Final = MAX_OBJECT_PENETRATION - 1e-6  # [m], with a margin for rounding in the world's frame
-_HALVINGS: Final = 4
 _LIFT_CHANCE: Final = 0.55  # chance that a free digit lifts off the object
 _TAP_CHANCE: Final = 0.3  # chance that a digit that may tap does
 _STILL_CHANCE: Final = 0.3  # chance that the object does not move in the hand
@@ -551,7 +547,7 @@ def sample_held_poses(
     share = np.where(is_held_valid(scene, target), 1.0, 0.0)
     step = 1.0
     todo = np.flatnonzero(share == 0.0)
-    for _ in range(_HALVINGS if len(todo) else 0):
+    for _ in range(4 if len(todo) else 0):
         step /= 2
         nearer = between(start, Held(*(part[todo] for part in target)), share[todo] + step)
         share[todo] += np.where(is_held_valid(scene, nearer), step, 0.0)

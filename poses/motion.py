@@ -45,7 +45,6 @@ _AHEAD: Final = [np.ones(NUM_JOINTS, dtype=bool)] + [
     for digit in range(len(DIGITS))
 ]
 _WRIST_TIME: Final = (0.6, 2.0)
-_ROUNDS: Final = 2  # Each path is tried with this many random durations.
 _FANS: Final = (0.0, 0.3, 0.6, 1.0, 1.6)  # finger spread at the first stop, relative to "spread"
 
 
@@ -99,7 +98,8 @@ def path_to_rest(
 ) -> NDArray[np.float64]:
     """Valid frames (T, 20) [rad] from a pose to rest: the straight path, or the first valid detour."""
     # Each round draws new durations: other frames of the same path may all be valid.
-    for stops in chain(*(_via_paths(start, resting_angles(model)) for _ in range(_ROUNDS))):
+    # Each path is tried with two random durations.
+    for stops in chain(*(_via_paths(start, resting_angles(model)) for _ in range(2))):
         path = np.concatenate([straight_path(*pair, config, rng) for pair in pairwise([start, *stops])])
         if is_valid(model, path).all():
             return path
@@ -201,10 +201,6 @@ def _draw_position(config: MotionConfig, rng: np.random.Generator) -> NDArray[np
     return ROOM_CENTER + rng.uniform(-config.volume, config.volume, size=3)
 
 
-_MAX_DRAWS: Final = 25
-_POSES_A_DRAW: Final = 8
-
-
 def sample_motion(
     model: HandModel | HandShape | str,
     duration: float,
@@ -268,8 +264,8 @@ def _next_path(
 ) -> NDArray[np.float64]:
     """Valid frames from one pose to a random one, with a rest there."""
     resting = resting_angles(model)
-    for _ in range(_MAX_DRAWS):
-        for target in sample_valid_angles(model, _POSES_A_DRAW, rng=rng):
+    for _ in range(25):
+        for target in sample_valid_angles(model, 8, rng=rng):
             for stops in ([start, target], [start, resting, target]):
                 path = np.concatenate([straight_path(*pair, config, rng) for pair in pairwise(stops)])
                 if is_valid(model, path).all():

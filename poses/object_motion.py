@@ -130,7 +130,6 @@ def _scribble(frames: int, size: float, rate: float, *, rng: np.random.Generator
     return size * swell[:, None] ** 2 * loops
 
 
-_MAX_RETREATS: Final = 12
 _RETREAT_STEP: Final = 0.003  # [m] added to the overlap in each retreat
 _SMOOTHING: Final = 0.25  # [s] window of a retreat
 
@@ -170,7 +169,7 @@ def keep_apart(
     """Draw a hand and its object back smoothly wherever either would touch the other hand."""
     motion, body = held
     back = np.zeros(len(direction))
-    for _ in range(_MAX_RETREATS):
+    for _ in range(12):
         qpos, poses = motion.qpos.copy(), body.T_world_body.copy()
         qpos[:, :3] += back[:, None] * direction
         poses[:, :3, 3] += back[:, None] * direction

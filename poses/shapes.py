@@ -209,7 +209,6 @@ def _anywhere(count: int, rng: np.random.Generator) -> NDArray[np.float64]:
 MAX_PENETRATION: Final = 0.001
 """Deepest self-penetration [m] of a valid pose: skin yields by about this much."""
 _ROUNDING: Final = 1e-6  # [rad] Single precision rounds angles by less.
-_HALVINGS: Final = 4
 _THUMB: Final = np.array([joint.name.startswith("thumb") for joint in JOINTS])
 _ABDUCTIONS: Final = np.array([joint.name.endswith("abduction") for joint in JOINTS])
 _FAN: Final = np.deg2rad([1.0, 0.2, -0.6, -1.4])  # one step of fanning at rest, index to little
@@ -269,7 +268,7 @@ def make_valid(model: HandModel, angles: Float[np.ndarray, "T 20"]) -> Float[np.
         helps = is_valid(model, end)
         end, target = end[helps], result[todo[helps]]
         low, high = np.zeros(len(target)), np.ones(len(target))  # shares of the target: valid, invalid
-        for _ in range(_HALVINGS):
+        for _ in range(4):
             middle = (low + high) / 2
             valid = is_valid(model, end + middle[:, None] * (target - end))
             low, high = np.where(valid, middle, low), np.where(valid, high, middle)

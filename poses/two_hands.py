@@ -404,7 +404,6 @@ PAUSE: Final = (0.0, 0.6)
 _TRAVEL_TIME: Final = (0.8, 2.5)  # between two positions of the pair [s]
 _ROTATION: Final = 0.5  # standard deviation of the rotation between two positions [rad]
 _MAX_DRAWS: Final = 60
-_MAX_PATHS: Final = 10
 
 
 def sample_two_hand_motion(
@@ -470,7 +469,7 @@ def _next_passages(
             continue
         if last is None:
             return [meeting]
-        for _ in range(_MAX_PATHS):
+        for _ in range(10):
             path = path_between(right, left, last, meeting.at([0]), pause, rng=rng)
             if path is not None:
                 return [path, meeting]

@@ -67,7 +67,6 @@ _FONT: Final = cv2.FONT_HERSHEY_SIMPLEX
 _INK: Final = (38, 42, 50)
 _PAPER: Final = tuple(round(255 * level) for level in BACKGROUND)
 _TEXT_HEIGHT: Final = 24  # [pixels], of names and titles
-_LINE_STEP: Final = 1.35
 _PADDING: Final = 16  # between a picture and its texts [pixels]
 
 
@@ -120,7 +119,7 @@ def with_names(
     shown = shown[np.argsort(pixels[shown, 1], kind="stable")]
     left = shown[pixels[shown, 0] < width / 2]
     right = shown[pixels[shown, 0] >= width / 2]
-    step = round(_TEXT_HEIGHT * _LINE_STEP)
+    step = round(_TEXT_HEIGHT * 1.35)
     rows = max(picture.shape[0], step * (max(len(left), len(right)) + 1))
     above = (rows - picture.shape[0]) // 2
     result = pad(picture, (above, rows - picture.shape[0] - above), (column, column))

@@ -46,7 +46,6 @@ from render.painting.painter import paint, put_before
 from render.painting.rasterizer import NEAR, Triangles, see
 from render.scenery.lights import STUDIO
 
-_BALL_LEVEL: Final = 3
 _OVERSAMPLING: Final = 2  # colors are painted this much larger and scaled down, for smooth outlines
 
 
@@ -64,7 +63,7 @@ class Balls(NamedTuple):
         centers = self.centers[known]
         if not len(centers):
             return []
-        vertices, normals, faces = sphere_surface(centers, self.radius, level=_BALL_LEVEL)
+        vertices, normals, faces = sphere_surface(centers, self.radius, level=3)
         tint = linear(np.broadcast_to(np.asarray(self.colors, dtype=np.float64), self.centers.shape)[known])
         colors = np.repeat(tint, len(vertices) // len(centers), axis=0)
         return [_surface(vertices, normals, faces, colors, ball_material())]
@@ -235,8 +234,6 @@ SIDES_OF_HAND: Final[Mapping[str, tuple[float, float, float]]] = {
 }
 _GAP: Final = 0.025  # between hands in a row [m]
 _WIDTH, _COLUMNS = 2000, 4  # width of a picture of rows [px]; number of gloves in a row
-_HEIGHT: Final = 900  # of a glove from one side [px]
-_SLIPS_HEIGHT: Final = 600  # of the slips of a glove from one side [px]
 _CAMERA_SIZE: Final = (1100, 900)  # [px], without names
 _LABELS_SIZE: Final = (640, 800)  # of one side without names [px]
 
@@ -313,13 +310,13 @@ def draw_glove(
     pictures, dots = [], np.concatenate([one.markers(qpos[None])[0][0] for one in slips] or [markers])
     below = []
     for side in sides:
-        view = _side_view(hand, side, np.concatenate([markers, dots]), _HEIGHT)
+        view = _side_view(hand, side, np.concatenate([markers, dots]), 900)
         shown = unoccluded(view, hand, markers, slack=slack)
         pixels = np.where(shown[:, None], view.project(markers), np.nan)
         picture = with_names(draw_things(view, hand), pixels, fit.layout.names, colors)
         pictures.append(titled(picture, side))
         if slips:
-            view = _side_view(hand, side, np.concatenate([markers, dots]), _SLIPS_HEIGHT)
+            view = _side_view(hand, side, np.concatenate([markers, dots]), 600)
             picture = draw_things(view, bare)
             shown = unoccluded(view, bare, dots, slack=slack)
             pixels, inks = np.rint(view.project(dots[shown])), np.tile(colors, (len(slips), 1))[shown]

@@ -57,8 +57,6 @@ from render.user_body import UserBody
 from render.video import Film
 from render.viewpoints import ViewConfig, Viewpoints, check_hands_in_view
 
-_MOST_STUDIOS: Final = 32  # largest number of studios that are kept, some 5 MB each
-
 Cameras = Camera | CameraRig | Sequence[Camera] | str
 """A camera, a rig or several cameras of the user's own, used as they are; or the name of a preset, which is
 placed."""
@@ -160,7 +158,8 @@ class Drawing:
         self.viewpoints = Viewpoints(
             config.view, self.take, rng=rng, up=config.up, user=self._user, poses=poses
         )
-        self._studio_of = functools.lru_cache(maxsize=_MOST_STUDIOS)(self._studio_of_person)
+        # A studio takes some 5 MB.
+        self._studio_of = functools.lru_cache(maxsize=32)(self._studio_of_person)
 
     def frames_without_hands(self) -> list[int]:
         """Numbers of the frames whose hands are all NaN."""
@@ -294,7 +293,6 @@ _MERGED: Final = "checksums.json"  # checksums of the files that all shards make
 _LEFT_OUT: Final = "left_out-{}.json"
 _CUT_OFF: Final = "cut_off-{}.json"
 _DRAWN: Final = ".drawn-{}"  # file of a shard in progress, which has one byte for each of its pictures
-_LOOK_INTERVAL: Final = 1.0  # time between two looks at these files [s]
 _SHOWN: Final = 0.5  # least share of a hand's keypoints in a picture that does not cut off the hand
 _ON_SHEET: Final = 9  # pictures on a contact sheet
 
@@ -447,7 +445,7 @@ class _Counter:
         self._tell()
 
     def _watch(self) -> None:
-        while not self._ended.wait(_LOOK_INTERVAL):
+        while not self._ended.wait(1.0):
             self._tell()
 
     def _tell(self) -> None:

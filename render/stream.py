@@ -16,7 +16,7 @@ from torch.utils.data import IterableDataset
 
 from gloves.layout import MarkerLayout
 from gloves.takes.take import Take
-from handsim._checks import check_choice, check_number, check_type, shown_value
+from handsim._checks import as_numbers, check_choice, check_count, check_number, check_type
 from handsim._process import SharedStream, with_own_numerics
 from handsim.errors import ArgumentError, DatasetError, PoseError
 from handsim.files.inputs import load_json
@@ -33,10 +33,9 @@ from render.photographs import read_photograph
 from render.session import configured, open_studio, sample_choices
 from render.studio import Moment, Studio
 from render.subject import Model, Subject, load_subject, models_of, source_of, subject_of_poses
-from render.viewpoints import around_hands, crop_around
+from render.viewpoints import FREE, around_hands, crop_around
 
 _FEWEST_KEYPOINTS: Final = 3  # least number of labeled keypoints of a hand that can be cut out
-_FREE: Final = 0.8  # share of the room around a hand in a picture that it is shifted within
 
 
 class LabeledHand(NamedTuple):
@@ -99,7 +98,7 @@ def cut_out(
     photograph = read_photograph(hand.file)
     low, high = np.nanmin(hand.keypoints, axis=0), np.nanmax(hand.keypoints, axis=0)
     side = max(float((high - low).max()), 1.0) / share
-    corner = 0.5 * (low + high - side) + _FREE * rng.uniform(-0.5, 0.5, 2) * (side - (high - low))
+    corner = 0.5 * (low + high - side) + FREE * rng.uniform(-0.5, 0.5, 2) * (side - (high - low))
     scale = size / side
     shift = -scale * corner + 0.5 * (scale - 1.0)  # OpenCV counts from the centers of pixels
     matrix = np.array([[scale, 0.0, shift[0]], [0.0, scale, shift[1]]])
@@ -117,7 +116,6 @@ def cut_out(
 
 _PICTURE, _PERSON, _PHOTOGRAPH = 0, 1, 2  # second number of a stream's spawn keys
 _CROPPED: Final = 0.5  # hands' share of the whole picture over their share of the crop
-_TRIES: Final = 20  # random viewpoints that are tried to find one outside of hands and objects
 _SIDE_CHOICES: Final = (*SIDES, "either")
 
 TakeSource = Take | str | Path
@@ -226,8 +224,7 @@ class PictureStream(SharedStream, IterableDataset[dict[str, torch.Tensor]]):
         check_choice(side, _SIDE_CHOICES, noun="side")
         counts = {"people": people, "sitting": sitting, "batch": batch, "start": start}
         for name, count in counts.items():
-            check_type(name, count, (int, np.integer), "a whole number")
-            check_number(name, count, 0 if name == "start" else 1)
+            check_count(name, count, 0 if name == "start" else 1)
         check_type("fill", fill, (tuple, list), "two numbers")
         if len(fill) != 2 or not 0.05 <= fill[0] <= fill[1] <= 1.0:
             raise ArgumentError(f"fill is {fill}, expected two numbers from 0.05 to 1, the smaller first")
@@ -326,7 +323,7 @@ class PictureStream(SharedStream, IterableDataset[dict[str, torch.Tensor]]):
         there = {n: pose for n, pose in poses.items() if pose is not None}
         keypoints = [hand_keypoints(take.hands[n].model, pose[None])[0] for n, pose in there.items()]
         points, wrists = np.concatenate(keypoints), np.stack(list(there.values()))
-        for _ in range(_TRIES):  # until the camera is outside of all surfaces
+        for _ in range(20):  # until the camera is outside of all surfaces
             share = float(rng.uniform(*self._fill))
             if self._crop is None:
                 camera = around_hands(self._camera, points, wrists, share, rng=rng)
@@ -376,10 +373,7 @@ def _camera(camera: Camera | str, crop: int | None) -> Camera:
 
 def _rows(poses: ArrayLike) -> Doubles:
     """A user's poses, one in each row."""
-    try:
-        rows = np.asarray(poses, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise ArgumentError(f"poses is {shown_value(poses)}, expected an array of numbers") from error
+    rows = as_numbers("poses", poses)
     if rows.ndim not in {2, 3} or not len(rows):
         raise ArgumentError(f"poses has shape {rows.shape}, expected (T, 20), (T, 27) or (T, 2, 27)")
     return rows

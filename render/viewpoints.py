@@ -161,8 +161,7 @@ _TRIES: Final = 60  # random directions that are tried for one camera
 _CLOSER: Final = 1.35  # largest ratio between a hand's share and `ViewConfig.share`
 _ENOUGH: Final = 1.05  # ratio of the wanted share to the hands' up to which no other place is tried
 _SKIN_CLEARANCE: Final = 0.08  # least depth of a keypoint before a camera around hands [m]
-_FREE: Final = 0.8  # share of the room around hands in a picture that they are shifted within
-_ROUNDS: Final = 8  # iterations that fit the hands into a picture
+FREE: Final = 0.8  # share of the room around hands in a picture that they are shifted within
 _NEARLY_ALL: Final = 0.97  # share of the frames that a lens without zoom shows whole
 _PLACES: Final = 16  # places, or orbits, that are tried for hands that are far apart
 _AZIMUTHS: Final = 36  # azimuths of an orbit whose views are compared
@@ -567,8 +566,8 @@ def around_hands(
     focal, size = camera.K[[0, 1], [0, 1]], np.array(camera.size, dtype=np.float64)
     nearest = _SKIN_CLEARANCE - float(local[:, 2].min())
     shift = np.array([0.0, 0.0, 4.0 * nearest])  # position of the hands in the camera's axes
-    room = rng.uniform(-0.5, 0.5, 2) * _FREE
-    for _ in range(_ROUNDS):  # several times, because perspective widens what is near
+    room = rng.uniform(-0.5, 0.5, 2) * FREE
+    for _ in range(8):  # several times, because perspective widens what is near
         pixels = focal * (local + shift)[:, :2] / (local + shift)[:, 2:]
         low, high = pixels.min(axis=0), pixels.max(axis=0)
         target = 0.5 * size - camera.K[:2, 2] + room * np.maximum(size - (high - low), 0.0)
@@ -588,7 +587,7 @@ def crop_around(
     pixels = camera.project(keypoints)
     low, high = pixels.min(axis=0), pixels.max(axis=0)
     side = float((high - low).max()) / share
-    corner = 0.5 * (low + high - side) + _FREE * rng.uniform(-0.5, 0.5, 2) * (side - (high - low))
+    corner = 0.5 * (low + high - side) + FREE * rng.uniform(-0.5, 0.5, 2) * (side - (high - low))
     K = camera.K.copy()
     K[:2, 2] -= corner
     K[:2] *= size / side

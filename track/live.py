@@ -32,7 +32,6 @@ from track.tracker import Tracker
 _PACE_PERIOD: Final = 1.0  # [s] between two reports on dropped frames
 _RETRY: Final = 0.5  # [s] between two attempts to reach a server
 _FIRST_FRAME: Final = 10.0  # [s] A first frame is awaited at least this long if the session has a length.
-_LAGS: Final = 100_000  # number of newest frames whose lag is kept
 _PACKETS: Final = {"damaged_packets": "damaged", "foreign_packets": "of other senders"}
 """Words for the counts of ignored packets."""
 _FRAMES: Final = {
@@ -265,7 +264,7 @@ class _Pace:
     """Measures rate, lag and dropped frames of a stream."""
 
     def __init__(self) -> None:
-        self.lags: deque[float] = deque(maxlen=_LAGS)
+        self.lags: deque[float] = deque(maxlen=100_000)
         """Times from the arrival of frames to their output [s]."""
         self.frames = 0
         """Number of frames."""

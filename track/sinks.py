@@ -70,11 +70,9 @@ _WAITING: Final = 256  # largest number of frames waiting for a client that want
 _UNCONFIRMED: Final = 0.05  # [s] A client with a frame unconfirmed for longer gets no other one.
 _TELL: Final = 1.0  # [s] least time between two reports of a client's lag, or two headers
 _ON_REQUEST: Final = "/newest"  # path for clients that request each frame
-_FLUSHED: Final = 0.01  # [s] interval of checks whether clients have read what waits
 _SEND_BUFFER: Final = 1 << 17  # [bytes] size of the system's send buffer for each client
 MOST_CONNECTIONS: Final = 64
 """Largest number of open connections of a server."""
-_LARGEST: Final = 1 << 10  # [bytes] largest message of a client; its content is ignored
 _FLUSH: Final = 1.0  # [s] time for clients to read waiting frames at the end
 _OWN_PAGES: Final = re.compile(r"https?://(localhost|127\.0\.0\.1|\[::1\])(:\d+)?")
 """Pages from this machine; the sink refuses other pages in its browsers."""
@@ -502,7 +500,8 @@ class WebSocketSink:
             origins=self._origins,
             process_request=_refuse_other_paths,
             compression=None,  # takes longer than a local network does
-            max_size=_LARGEST,
+            # The content of clients' messages is ignored.
+            max_size=1 << 10,
             close_timeout=_FLUSH,
             logger=quiet,
         )
@@ -525,7 +524,7 @@ class WebSocketSink:
         """Wait while a condition holds, at most one second."""
         until = self._loop.time() + _FLUSH
         while there_is() and self._loop.time() < until:
-            await asyncio.sleep(_FLUSHED)
+            await asyncio.sleep(0.01)
 
     async def _talk(self, connection: Any, *, only_asked: bool) -> None:
         """Send messages to a client until it disconnects."""

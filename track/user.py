@@ -34,7 +34,6 @@ MEASURED: Final = "auto, "
 """Prefix of the notes on measured hands; the size follows."""
 AS_MEASURED: Final = ", as measured"
 """Suffix of a calibration's sentence on a hand that stayed as measured."""
-_MOST: Final = 1 << 24  # [bytes] largest file; a user of two hands takes 40,000
 _ARRAYS: Final = {"points": "f8", "normals": "f8", "bone_indices": None, "bone_weights": "f8"}
 """Stored arrays of an attachment and their types; None keeps the type, so that fractional indices fail."""
 
@@ -218,7 +217,8 @@ def load_user(path: str | Path) -> User:
     check_type("path", path, (str, Path), "the path of a user's file, .json")
     path = Path(path)
     try:
-        content = json.loads(read_bytes(path, error=UserError, most=_MOST))
+        # A user of two hands takes 40,000 bytes.
+        content = json.loads(read_bytes(path, error=UserError, most=1 << 24))
     except (ValueError, RecursionError) as error:
         raise UserError(f"{path}: not a user's file of handsim calibrate (.json): no JSON text") from error
     if not isinstance(content, dict) or "schema" not in content:

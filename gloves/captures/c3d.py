@@ -41,7 +41,6 @@ BLOCK: Final = 512
 _CHARACTER, _BYTE, _INTEGER, _FLOAT = -1, 1, 2, 4
 _GROUPS: Final = {"POINT", "ANALOG", "TRIAL"}  # groups that locate the points; damage to others is ignored
 _MAX_BYTES: Final = 1 << 22  # All values fit into this; damaged records may overlap and state far more.
-_MAX_RECORD: Final = 1 << 17  # bytes; records are chained by 16-bit offsets
 
 
 def to_native(values: NDArray[np.generic], processor: int) -> NDArray[np.float64]:
@@ -119,7 +118,8 @@ def _records(data: bytes, at: int, processor: int, tell: Tell) -> Iterator[tuple
         offset_at = at + 2 + name_length
         name = data[at + 2 : offset_at].decode("latin-1").upper().strip()
         offset = int.from_bytes(data[offset_at : offset_at + 2], order)
-        yield group, name, view[offset_at + 2 : offset_at + 2 + _MAX_RECORD]
+        # Records are chained by 16-bit offsets.
+        yield group, name, view[offset_at + 2 : offset_at + 2 + (1 << 17)]
         if offset == 0:
             break
         at = offset_at + offset

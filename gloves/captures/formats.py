@@ -201,7 +201,6 @@ def _unnamed(rows: list[bytes], num_named: int) -> tuple[str, ...]:
     return tuple(f"*{num_named + number}" for number in range(1, extra // 3 + 1))
 
 
-_MOST_HEADER_LINES: Final = 20
 MOTIVE_BEGIN: Final = b"Format Version"
 _COUNT: Final = "Total Exported Frames"
 _UNIT: Final = "Length Units"
@@ -221,7 +220,7 @@ def read_motive_csv(data: bytes, tell: Tell = warn) -> Capture:
     if separator is None:
         raise CaptureError("not a Motive CSV export: line 1 does not begin with 'Format Version'")
     lines = plain_lines(lines, separator)
-    rows = [header_cells(line, number) for number, line in enumerate(lines[:_MOST_HEADER_LINES], 1)]
+    rows = [header_cells(line, number) for number, line in enumerate(lines[:20], 1)]
     end = next((index for index, row in enumerate(rows) if row and row[0] == "Frame"), None)
     if end is None or (end == len(lines) - 1 and not ended):
         raise CaptureError("the header is cut: no whole row begins with 'Frame'")

@@ -22,8 +22,6 @@ from handsim.space.camera import PINHOLE, distort_jacobian
 from handsim.space.objects import MARKER_RADIUS
 from handsim.space.rig import CameraRig
 
-_BLIND: Final = 1e-6  # determinant of a lens's Jacobian below which it makes no blob
-
 
 @kernel
 def draw_blobs(
@@ -62,7 +60,7 @@ def draw_blobs(
             if lens[0] != PINHOLE:
                 xx, xy, yx, yy = distort_jacobian(lens, right, down, depth)
                 determinant = xx * yy - xy * yx
-                if not determinant > _BLIND:  # also where the lens does not see: NaN
+                if not determinant > 1e-6:  # also where the lens does not see: NaN
                     continue
                 across, along = du / fx, dv / fy
                 du, dv = (

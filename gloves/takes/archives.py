@@ -47,7 +47,6 @@ _SPARE: Final = 4096  # bytes by which the header may grow while blocks follow
 _MAX_HEADER: Final = 1 << 26  # bytes
 _FULL_FRAMES: Final = 1 << 16  # frames after which a block is written early; half a second has far fewer
 _FULL_POINTS: Final = 1 << 21  # points after which a block is written early
-_PIECE: Final = 1 << 20  # bytes that are copied at a time
 
 
 def growing_path(archive: Path) -> Path:
@@ -178,7 +177,7 @@ class GrowingArchive(Closing):
         self._place, file = _open_near(self._place)
         self.path = self._place
         self._file.seek(0)
-        while content := self._file.read(_PIECE):
+        while content := self._file.read(1 << 20):
             _write_all(file, content)
         self._file.close()
         self._file = file

@@ -33,7 +33,6 @@ _FEW: Final = 4.0  # Processes are started only if there is more than this to co
 _TOLD: Final = 2.0  # [s] between two lines
 _MOST: Final = 8  # processes; more would wait for one another
 _KNOWN: Final = 3.0  # A process ranks a kernel so much higher if it has compiled others of its package.
-_GARBAGE: Final = 100_000  # new objects before Python collects garbage, which else takes 5 % of the time
 
 
 class ListedKernel(NamedTuple):
@@ -266,7 +265,8 @@ def plain_shape_errors() -> None:
 @functools.cache
 def _prepared() -> tuple[list[ListedKernel], list[Any]]:
     """Prepare a process that only compiles kernels; return the list of kernels, and the types it names."""
-    gc.set_threshold(_GARBAGE)
+    # Python would spend 5 % of the time on garbage.
+    gc.set_threshold(100_000)
     warnings.simplefilter("ignore")
     plain_shape_errors()
     return read_list(), known_types()

@@ -135,7 +135,6 @@ def _columns() -> int:
 
 
 _COUNTS: Final = re.compile(r"[\d.,]+")
-_PERIOD: Final = 600.0  # Speeds and the time left are averages over this time [s].
 _tellers: list[Callable[[str], None]] = []  # show a line in a bar or step; the innermost is last
 
 
@@ -235,7 +234,8 @@ def progress_bar(unit: str) -> Iterator[ProgressBar]:
         console=console,
         transient=True,
         disable=not console.is_terminal,
-        speed_estimate_period=_PERIOD,
+        # Speeds and the time left are averages over ten minutes.
+        speed_estimate_period=600.0,
     ) as bar:
         task = bar.add_task("", total=1)
         shown = ProgressBar(bar, task)

@@ -37,11 +37,8 @@ GESTURES: Final = ("fist", "spread", "pinch_index", "relaxed", "pinch_little")
 """Gestures in the picture; the last one is the thumb's opposition to the little finger."""
 _RAISED: Final = np.deg2rad(35.0)  # pitch of the hand in front of the camera
 _CAMERA: Final = 4
-_PICTURES: Final = 6
 _TRACKED: Final = 120  # frames of the capture
 _PAPER: Final = Corruption(occlude=5, ghosts=2)  # Han et al. 2018, section 5
-_TIMED: Final = 1024  # frames that time the labeler
-_CANDIDATES: Final = 400  # frames from which the shown one is chosen
 
 _FIGURES: Final = (
     "slot_accuracy",
@@ -139,7 +136,7 @@ def _generate_and_label(
         rng = np.random.default_rng(seed)
         columns[title] = evaluate_labeler(labeler, dataset, corruption, rng=rng).figures
     report("timing the labeler")
-    clouds = list(dataset.rows()["markers"][:_TIMED].astype(np.float64))
+    clouds = list(dataset.rows()["markers"][:1024].astype(np.float64))
     start = time.perf_counter()
     labeler.label_frames(clouds)
     labeled = len(clouds) / (time.perf_counter() - start)
@@ -203,7 +200,7 @@ def _clear_frame(rows: np.ndarray) -> int:
     """An early frame with hidden markers, whose seen markers are far apart in a view of the back."""
     best, widest = 0, -1.0
     model = HandModel.named("M")
-    for number in range(min(_CANDIDATES, len(rows))):
+    for number in range(min(400, len(rows))):
         row = rows[number]
         seen = np.isfinite(row["observed"][:, 0])
         if not 0.7 * len(seen) <= seen.sum() < len(seen):
@@ -225,7 +222,7 @@ def _track_and_draw(out: Path, labeler: Labeler, seed: int) -> Section:
         model, found = hand.model, tracked.motion(hand.side).qpos
         joints = [model.forward_kinematics(qpos)[..., :3, 3] for qpos in (found, take.qpos[:, number])]
         errors.append(1e3 * np.linalg.norm(joints[0] - joints[1], axis=-1).mean())
-    frames = np.linspace(0, tracked.num_frames - 1, _PICTURES).astype(int).tolist()
+    frames = np.linspace(0, tracked.num_frames - 1, 6).astype(int).tolist()
     drawn = draw(tracked, config=RenderConfig(seed=seed, vary="frame"), frames=frames)
     write_png(out / "pictures.png", contact_sheet(list(drawn)))
     return Section(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated
 
 import numpy as np
 import tyro
@@ -20,8 +20,6 @@ from train.simulation.generation import make_dataset
 from train.simulation.scenes import SimulatedKind
 from train.simulation.takes import WRIST_VOLUME, simulate_take
 from train.simulation.training_frames import GenerateSettings
-
-_TAKE_FRAMES: Final = 1200  # length of the take whose gaps the report shows
 
 
 def generate(
@@ -58,7 +56,5 @@ def _report(settings: GenerateSettings, out: Path) -> Path:
         if distances_to_volume(rig, np.array(settings.center), WRIST_VOLUME).min() < HAND_REACH:
             # A small rig stands where the hands of a simulated capture would move.
             return write_dataset_page(out / REPORT, Dataset(out))
-        take = simulate_take(
-            kind, num_frames=_TAKE_FRAMES, glove=settings.glove, rig=rig, center=settings.center
-        )
+        take = simulate_take(kind, num_frames=1200, glove=settings.glove, rig=rig, center=settings.center)
         return write_dataset_page(out / REPORT, Dataset(out), present=take.markers_present(), rate=take.rate)

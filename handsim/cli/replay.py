@@ -15,7 +15,6 @@ from track.streams import COMMAND_PORT, ReplaySettings
 if TYPE_CHECKING:
     from track.streams.natnet import ReplayServer
 
-_PERIOD: Final = 0.1  # [s] between two status lines
 _USUAL: Final = ReplaySettings(port=COMMAND_PORT)
 
 
@@ -39,7 +38,7 @@ def replay(
         with LiveStatus() as status:
             while not (ended() or server.finished):
                 status.show(_status_line(server))
-                time.sleep(_PERIOD)
+                time.sleep(0.1)
         print_line(f"{server.sent} frames played")
 
 

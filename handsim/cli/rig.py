@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import tyro
@@ -27,8 +27,6 @@ from train.forecast.settings import PlanRigSettings, ScoreRigSettings
 if TYPE_CHECKING:
     from train.forecast.rig_forecast import Forecast
 
-_STARTER: Final = Path(__file__).parents[1] / "data" / "starter_rig.toml"
-
 
 def list_rig() -> None:
     """List the camera rigs that come with handsim: how many cameras, their pictures, and what they are."""
@@ -44,7 +42,9 @@ def new_rig(file: Annotated[Path, tyro.conf.Positional]) -> None:
     Args:
         file: A new .toml file.
     """
-    write_starter(file, _STARTER.read_text("utf-8"), error=RigError)
+    write_starter(
+        file, (Path(__file__).parents[1] / "data" / "starter_rig.toml").read_text("utf-8"), error=RigError
+    )
     print_line(f"{file}: edit it, then run `handsim rig check {file}`")
 
 

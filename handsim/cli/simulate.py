@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated
 
 import tyro
 
@@ -16,10 +16,6 @@ from handsim.app.workers import chosen_workers, run_jobs
 from handsim.errors import ArgumentError
 from handsim.files.outputs import check_free, check_memory, check_outputs, written_together
 from train.simulation.takes import SimulateSettings, simulate_take
-
-_MEMORY: Final = 20_000
-"""Bytes that a frame of two hands takes while it is simulated; 18,000 were measured with 24,000 frames."""
-_DISK: Final = 2_000  # bytes of a frame in both files
 
 
 def simulate(
@@ -39,8 +35,9 @@ def simulate(
     num_frames = settings.num_frames or 0
     what = f"{num_frames} frames"
     remedy = "simulate shorter captures with different seeds"
-    check_memory(num_frames * _MEMORY, what, remedy)
-    check_free(out.parent, num_frames * _DISK, what, remedy, error=ArgumentError)
+    # A frame takes 20 kB of memory, and 2 kB in both files.
+    check_memory(num_frames * 20_000, what, remedy)
+    check_free(out.parent, num_frames * 2_000, what, remedy, error=ArgumentError)
     if cluster is None:
         _simulate_into(out, settings, 0)
     else:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections import deque
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import tyro
@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from track.live import LiveTake
     from track.settings import TrackSettings
     from track.sinks import SinkGroup
-
-_TIMED: Final = 100_000  # newest frames whose computing times are kept
 
 
 def track(
@@ -84,7 +82,7 @@ def track(
         check_suffix(labeled, WRITABLE)
     check_outputs((capture, *options.files()), (out, labeled))
     settings = options.settings(calibrate=calibrate, smooth=smooth)
-    times: deque[float] = deque(maxlen=_TIMED)  # [s]
+    times: deque[float] = deque(maxlen=100_000)  # [s]
 
     def on_frame(frame: StreamedFrame, tracked: TrackedFrame) -> None:
         times.append(tracked.seconds)

@@ -19,8 +19,6 @@ from typing import IO, Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-_MOST_MEMBERS: Final = 10_000
-_MOST_DIMENSIONS: Final = 8
 _ALWAYS: Final = 1 << 28  # bytes that any archive may hold
 _LARGEST_RATIO: Final = 20  # A larger archive may expand to this many times the size of its file.
 _DAMAGE: Final = (
@@ -114,7 +112,7 @@ def _check_archive(archive: zipfile.ZipFile, file: IO[bytes]) -> None:
 def check_members(archive: zipfile.ZipFile, size: int) -> None:
     """Raise a ValueError if an archive holds far more than a file of its size [bytes] may."""
     members, held, most = archive.infolist(), _held(archive), _most_held(size)
-    if len(members) > _MOST_MEMBERS or held > most:
+    if len(members) > 10_000 or held > most:
         raise ValueError(f"{len(members)} members of {held} bytes, expected at most {most} bytes")
 
 
@@ -138,7 +136,7 @@ def check_npy_header(file: IO[bytes], size: int) -> tuple[tuple[int, ...], np.dt
         shape, _, dtype = read(file)
     except Exception as error:  # numpy reads it as Python text, which fails in many ways
         raise ValueError("no header of an array") from error
-    if dtype.hasobject or dtype.itemsize == 0 or len(shape) > _MOST_DIMENSIONS or min(shape, default=0) < 0:
+    if dtype.hasobject or dtype.itemsize == 0 or len(shape) > 8 or min(shape, default=0) < 0:
         raise ValueError(f"an array of type {dtype} and shape {shape}")
     if math.prod(shape) * dtype.itemsize != size - file.tell():
         raise ValueError(f"an array of type {dtype} and shape {shape} in {size} bytes")

@@ -31,7 +31,6 @@ if TYPE_CHECKING:
 _NO_WAITING: Final = getattr(os, "O_NONBLOCK", 0)
 _MOST_TOML: Final = 1 << 18  # bytes; a layout of 60 markers has 6000
 _MOST_JSON: Final = 1 << 26  # bytes
-_INTEGER_BITS: Final = 63
 _DOTTED: Final = re.compile(r"""(?:\.\s{0,9}[\w"'-]+\s{0,9}){20}""")  # tomllib takes hours for very long ones
 _KINDS: Final = (
     (stat.S_ISFIFO, "a pipe"),
@@ -115,7 +114,7 @@ def _has_long_integer(value: object) -> bool:
     """Whether a table holds an integer beyond TOML's 64 bits, which Python accepts."""
     if isinstance(value, dict | list):
         return any(map(_has_long_integer, value.values() if isinstance(value, dict) else value))
-    return isinstance(value, int) and value.bit_length() > _INTEGER_BITS
+    return isinstance(value, int) and value.bit_length() > 63
 
 
 def load_json(path: Path) -> dict[str, Any]:

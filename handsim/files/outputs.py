@@ -55,7 +55,6 @@ def plain_path(path: Path) -> Iterator[Path]:
 
 _OLDER: Final = "-older"  # marks the second name of a file that is being replaced
 _SHOWN_STEM: Final = 32  # characters of a name that its temporary name shows
-_PROBE: Final = 1 << 20  # bytes that are written to learn why a library's write failed
 
 
 @contextmanager
@@ -183,7 +182,7 @@ def unwritten(path: Path) -> OSError:
     """The system's error for a file that a library did not write whole, without saying why."""
     try:
         with path.open("ab") as file:
-            file.write(bytes(_PROBE))
+            file.write(bytes(1 << 20))
     except OSError as error:
         return error
     return OSError(errno.EIO, os.strerror(errno.EIO), str(path))

@@ -18,7 +18,6 @@ ENDING: Final = tuple(
     getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
 )
 """Ctrl-C, the end of a batch job, and a terminal that closes."""
-_AGAIN: Final = 0.05  # A signal whose exception was lost is sent again after this time [s].
 
 
 class Stopped(KeyboardInterrupt):
@@ -100,7 +99,8 @@ class _Persistent(Stopped):
 
     def __del__(self) -> None:
         if not self._block.left:  # what is raised in __del__ is lost: a thread sends the signal again
-            threading.Timer(_AGAIN, self._block.send, (self.number,)).start()
+            # A signal whose exception was lost is sent again.
+            threading.Timer(0.05, self._block.send, (self.number,)).start()
 
 
 @contextmanager

@@ -387,8 +387,6 @@ class CageHands(NamedTuple):
         cages[:, :, topology.rings[0][0]] = ring[:, :, 0]
 
 
-_LEVELS: Final = 2
-_FIT_STEPS: Final = 4
 _FIRST_RING, _FIRST_PALM = 1.2, 1.1  # scales that suit the mean hand
 # Bone of the digit and its share on each ring past the web; the rest goes to the bone before it.
 _FINGER_RINGS: Final = ((1, 0.0), (1, 0.5), (1, 1.0), (2, 0.0), (2, 1.0), (2, 1.0), (2, 1.0))
@@ -446,7 +444,7 @@ def _template() -> _Template:
     quads, count = topology.quads, topology.num_vertices
     loops = [ring for rings in topology.rings for ring in rings] + [topology.palm[KNUCKLES]]
     subdivide = sparse.eye_array(count, format="csr")
-    for _ in range(_LEVELS):
+    for _ in range(2):
         step, next_quads = catmull_clark(quads, count)
         loops = subdivided_loops(loops, quads, count)
         subdivide = step @ subdivide
@@ -512,7 +510,7 @@ def _fitted_cages(hands: CageHands, template: _Template) -> np.ndarray:
     tip_rings = np.cumsum([len(digit) for digit in topology.rings]) - 1
     outermost = np.array([digit[-1] for digit in topology.rings])
     girths, reach = hands.ring_girths(), hands.bone_lengths.sum(axis=2)
-    for _ in range(_FIT_STEPS):
+    for _ in range(4):
         cages = still + sideways[..., None] * wide + upwards[..., None] * deep
         points = _subdivided(template.measured, cages)
         loops = points.take(template.ring_loops, axis=1)

@@ -401,7 +401,6 @@ OPENXR_JOINTS: Final[tuple[str, ...]] = (
 )
 """The names of XrHandJointEXT, without XR_HAND_JOINT_ and _EXT, in its order."""
 _CARPUS: Final = 0.38  # share of the way from wrist to knuckle where a finger's metacarpal begins
-_MIDDLE: Final = 2  # the middle finger's number among the digits
 _AXES: Final = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 """OpenXR's axes as columns in a frame with x along the bone and z out of the back."""
 
@@ -439,7 +438,7 @@ def _palm_joints(model: HandModel) -> Float[np.ndarray, "6 4 4"]:
     """`T_wrist_joint` of palm, wrist and the four finger metacarpals."""
     knuckles = np.array([model.skeleton.offsets[bones_of(digit)[0]] for digit in DIGITS[1:]])
     bases = _CARPUS * knuckles
-    middle = _MIDDLE - 1
+    middle = 1  # among the four fingers
     starts = [0.5 * (bases[middle] + knuckles[middle]), np.zeros(3), *bases]
     ways = [knuckles[middle] - bases[middle], bases[middle], *(knuckles - bases)]
     joints = []

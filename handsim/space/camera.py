@@ -29,7 +29,6 @@ PINHOLE: Final = 0
 """The kind of a pinhole in `Lens.row`; a Brown lens is 1."""
 _FISHEYE: Final = 2
 _STEP: Final = 1e-5  # step of a Jacobian's central differences [focal lengths]
-_NODES: Final = 1024  # nodes of the table that Newton's method starts from
 _STEPS: Final = 12  # most steps of Newton's method; three are enough away from a fold
 _CONVERGED: Final = 1e-12  # [focal lengths] largest change of the last step
 _MAX_TANGENT: Final = 1e3  # largest tangent of rays that a Brown lens without a fold sees: 89.94 degrees
@@ -120,7 +119,8 @@ class Lens:
         longest = min(most, 1.0)
         while longest < most and self._distorted(np.array(longest)) < finite.max(initial=0.0):
             longest = min(2.0 * longest, most)
-        nodes = np.linspace(0.0, longest, _NODES)
+        # Newton's method starts from a table of these nodes.
+        nodes = np.linspace(0.0, longest, 1024)
         r = np.interp(across, self._distorted(nodes), nodes)
         derivative = tuple((2 * n + 3) * k for n, k in enumerate(self._radial))
         for _ in range(_STEPS):

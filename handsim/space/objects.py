@@ -23,8 +23,6 @@ from handsim.space.transforms import axis_angle_matrix, frame_with_z, rigid, uni
 
 PartKind = Literal["sphere", "capsule", "cylinder", "box", "ellipsoid", "mesh"]
 _AROUND: Final = 16  # sides of a capsule
-_TUBE_SIDES: Final = 8
-_CUP_SIDES: Final = 40
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,7 +79,7 @@ def _cup(numbers: NDArray[np.float64], trimesh: Any) -> Solid:
     low, high, radius, wall, depth = 1e-3 * numbers
     inner, floor = radius - wall, high - depth
     profile = [(0, low), (radius, low), (radius, high), (inner, high), (inner, floor), (0, floor)]
-    mesh = trimesh.creation.revolve(profile, sections=_CUP_SIDES)
+    mesh = trimesh.creation.revolve(profile, sections=40)
     pose = rigid(np.eye(3), (0.0, 0.0, (low + high) / 2))
     return [Part("cylinder", np.array([radius, (high - low) / 2, 0.0]), pose)], mesh
 
@@ -109,7 +107,7 @@ def _tube_mesh(
     ring: bool,
 ) -> Any:
     """Mesh around a polyline: closed upon itself, or with flat ends."""
-    angle = np.linspace(0.0, 2 * np.pi, _TUBE_SIDES, endpoint=False)
+    angle = np.linspace(0.0, 2 * np.pi, 8, endpoint=False)
     cross = np.cos(angle)[:, None, None] * outward + np.sin(angle)[:, None, None] * across
     rows = (points + tube * cross).swapaxes(0, 1)  # (points, sides, 3)
     if ring:
@@ -148,7 +146,6 @@ centers lie this far above the surface."""
 MESH_SUFFIXES: Final = (".stl", ".obj", ".ply", ".glb")
 _LARGEST: Final = 1.0  # [m]
 _SMALLEST: Final = 0.002
-_MOST_BYTES: Final = 1 << 26
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -235,7 +232,7 @@ def load_object(path: str | Path, *, mass: float = 0.1) -> RigidObject:
 def _read_mesh(path: Path) -> Any:
     if path.suffix.lower() not in MESH_SUFFIXES:
         raise ObjectError(f"{path}: expected a mesh file that ends in {', '.join(MESH_SUFFIXES)}")
-    check_regular(path, error=ObjectError, most=_MOST_BYTES)
+    check_regular(path, error=ObjectError, most=1 << 26)
     if not path.is_file():
         raise ObjectError(f"{path}: no such file")
     import trimesh

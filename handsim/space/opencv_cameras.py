@@ -25,7 +25,6 @@ from handsim.space.camera import Camera, Lens, LensKind, brown_lens
 from handsim.space.rig import TOML_MATRIX, camera_names, checked_cameras, foreign_cameras, nearest_rotation
 from handsim.space.transforms import quaternion_matrix, rigid, vector_quaternions
 
-_MAX_OPENCV_BYTES: Final = 1 << 24
 _MAX_NUMBERS: Final = 16  # Longer lists of numbers, such as corners of a board, are ignored.
 _CENTER: Final = 0.5  # OpenCV measures pixels from the center of the first one, we from the picture's corner
 _LEAST_FOCAL: Final = 0.02  # of the width; in shares of the picture's size a focal length is about 1
@@ -443,7 +442,7 @@ def _read(path: Path) -> tuple[Values, Sections]:
     if path.suffix.lower() == ".toml":
         tables = foreign_cameras(read_toml(path, error=RigError))
         return {}, dict(_json_sections({name: one | {"K": one[TOML_MATRIX]} for name, one in tables.items()}))
-    data = read_bytes(path, error=RigError, most=_MAX_OPENCV_BYTES)
+    data = read_bytes(path, error=RigError, most=1 << 24)
     try:
         text = data.decode(text_encoding(data))
     except UnicodeDecodeError as error:

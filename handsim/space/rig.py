@@ -54,7 +54,6 @@ _PICTURE: Final = (*_SIZES, *_FOCALS, "center", *_LENS)
 _PLACE: Final = ("position", "target", "T_world_camera")
 _TOP: Final = ("name", "description", *_PICTURE, "camera")
 _CAMERA: Final = ("name", *_PICTURE, *_PLACE)
-_DEFAULT_RESOLUTION: Final = 1280  # [px]
 _MAX_FIELD_OF_VIEW: Final = 170.0  # [deg]
 _MAX_FILE_CAMERAS: Final = 256
 _MAX_DISTANCE: Final = 50.0  # largest distance of a camera from the origin [m]
@@ -62,8 +61,6 @@ _CLOSEST: Final = 1e-3  # least distance of a camera from its target or another 
 _NAME: Final = re.compile(r"[A-Za-z0-9_-]{1,64}")
 NAMELESS: Final = re.compile(r"[^A-Za-z0-9_-]+")
 """Characters that a camera's name cannot have."""
-_MAX_NAME: Final = 56  # characters of a name that a number may follow
-_ROTATION_TOLERANCE: Final = 1e-3  # deviation of a rounded matrix from a rotation
 
 
 class RigFile(NamedTuple):
@@ -108,7 +105,8 @@ def camera_names(given: Sequence[str]) -> list[str]:
     """Unique names of cameras, with letters, digits, - and _ only."""
     names: list[str] = []
     for number, text in enumerate(given, 1):
-        plain = NAMELESS.sub("_", text).strip("_")[:_MAX_NAME] or f"camera{number}"
+        # A number may follow the name.
+        plain = NAMELESS.sub("_", text).strip("_")[:56] or f"camera{number}"
         names.append(plain if plain not in names else f"{plain}_{number}")
     return names
 
@@ -117,7 +115,7 @@ def nearest_rotation(owner: str, matrix: Float[np.ndarray, "3 3"]) -> NDArray[np
     """The rotation (3, 3) nearest to a rounded one."""
     left, stretch, right = np.linalg.svd(np.asarray(matrix, dtype=np.float64))
     rotation: NDArray[np.float64] = left @ right
-    if np.abs(stretch - 1.0).max() > _ROTATION_TOLERANCE or np.linalg.det(rotation) < 0.0:
+    if np.abs(stretch - 1.0).max() > 1e-3 or np.linalg.det(rotation) < 0.0:
         raise RigError(f"{owner} is not a rotation matrix")
     return rotation
 
@@ -212,7 +210,7 @@ def _size(given: Mapping[str, Any], prefix: str) -> tuple[int, int]:
     if "size" in given and "resolution" in given:
         raise RigError(f"{prefix}size and resolution are given, expected one of them")
     if "size" not in given:
-        resolution = given.get("resolution", _DEFAULT_RESOLUTION)
+        resolution = given.get("resolution", 1280)
         if isinstance(resolution, bool) or not isinstance(resolution, int):
             raise RigError(f"{prefix}resolution is {shown(resolution)}, expected a whole number of pixels")
         return resolution, resolution

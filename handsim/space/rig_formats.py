@@ -157,7 +157,6 @@ def _parsed(text: str) -> ET.Element:
 
 _MILLIMETER: Final = 1e-3
 _MAX_DISTORTION: Final = 0.5  # shift of a picture's corner, as a share of its distance from the center
-_SAMPLES: Final = 256  # radii that a lens is fitted at
 _VIDEO: Final = ("vue", "videoinputdevice")
 _SUBPIXELS: Final = 64.0  # Qualisys' units per pixel
 _TO_OPENCV: Final = np.diag([1.0, -1.0, -1.0])
@@ -198,7 +197,7 @@ def _vicon_lens(frame: _Element, camera: Camera) -> Lens:
         return Lens()
     center = camera.K[:2, 2]
     corner = float(np.hypot(*np.maximum(center, camera.size - center)))  # [px]
-    measured = np.linspace(0.0, corner, _SAMPLES + 1)[1:]
+    measured = np.linspace(0.0, corner, 257)[1:]
     factor = 1.0 + sum(k * measured ** (2 * n) for n, k in enumerate(straighten, 1))
     if not np.abs(factor - 1.0).max() < _MAX_DISTORTION:
         _warn(f"{frame.owner}: its lens would move a corner by more than half its distance; it is left out")

@@ -122,10 +122,12 @@ def quaternion_matrix(quaternion: Float[np.ndarray, "*batch 4"]) -> NDArray[np.f
     return matrix
 
 
-def frame_with_z(direction: Float[np.ndarray, "3"]) -> NDArray[np.float64]:
-    """Any rotation (3, 3) whose z axis has this direction."""
+def frame_with_z(
+    direction: Float[np.ndarray, "3"], down: Float[np.ndarray, "3"] | None = None
+) -> NDArray[np.float64]:
+    """Any rotation (3, 3) whose z axis has this direction, or the one whose x axis is across `down`, too."""
     z = direction / np.linalg.norm(direction)
-    x = np.cross(np.eye(3)[np.abs(z).argmin()], z)
+    x = np.cross(np.eye(3)[np.abs(z).argmin()] if down is None else down, z)
     x /= np.linalg.norm(x)
     return np.stack([x, np.cross(z, x), z], axis=1)
 

@@ -40,7 +40,6 @@ from render.film.outlines import Outlines, Seen, straight
 from render.frames import Bytes, Doubles
 
 _FEWEST_FRAMES: Final = 20  # A camera is registered from this many frames with a hand.
-_ROUNDS: Final = 3  # rounds of matching keypoints
 _BOUND: Final = 3.0  # A frame does not fit beyond this many times the usual median distance.
 _LEAST_BOUND: Final = 0.008  # A frame fits up to this distance in any case [widths of the picture].
 _WORST: Final = 0.03  # [widths] A video whose usual median distance is larger does not show the take.
@@ -60,7 +59,6 @@ _MOST_LOOKED: Final = 150  # largest number of frames whose outlines are used
 _REACHES: Final = (0.04, 0.02, 0.01, 0.01)  # [widths] search ranges for edges, one for each round
 _FIRST_NOISE: Final = 2.0  # [px] standard deviation of edges in the first round
 _STEP: Final = 1.0 / 15.0  # [s] step between the shifts of the clock
-_GUESSES: Final = 4  # rounds of matching in the first guess
 _MOST_MATCHED: Final = 64  # largest number of detections that are matched
 _NOWHERE: Final = 1e3  # [m] where hands are that the take does not have
 _TRIED: Final = 3  # number of best shifts for which PnP is tried
@@ -251,7 +249,7 @@ def _register(
 def _adjusted(bundle: Bundle, state: State, *, splits: bool) -> tuple[State, Doubles, float]:
     """The state after some rounds of matching keypoints, its covariance, and their noise [px]."""
     noise = 0.25 * _GATE * bundle.size[0]
-    for turn in range(_ROUNDS):
+    for turn in range(3):
         if turn > 0 and splits:
             state = _split(bundle, state, noise)
         matches = bundle.match(state, max(4.0 * noise, 0.5 * _GATE * bundle.size[0]))
@@ -312,7 +310,7 @@ def _affine_fit(bundle: Bundle, offset: float) -> tuple[float, Doubles, Doubles]
     told = there & (sides == found.sides[some, None])
     hand, each = np.where(told.any(axis=1), told.argmax(axis=1), there.argmax(axis=1)), np.arange(len(some))
     counts = there[each, hand].astype(float)
-    for _ in range(_GUESSES):
+    for _ in range(4):
         mine = rows[each, hand]
         weighted = mine * (weights * counts[:, None])[..., None]
         normal = np.einsum("nki,nkj->ij", weighted, mine) + 1e-6 * np.eye(4)

@@ -79,7 +79,6 @@ _CAMERAS: Final = ("vga", "vga_wide", "vga", "sr300", "kinect2", "d435")
 _SITTING: Final = 16  # pictures of each person
 _FEWEST_SEEN: Final = 4  # keypoints of a hand that must be seen
 _EMPTY: Final = 0.35  # share of the scenes that also give a square without a hand
-_QUALITY: Final = 88  # of JPEG files
 
 Network = FinderNetwork | KeypointNetwork
 Targets = tuple[torch.Tensor, ...]
@@ -183,7 +182,7 @@ class Lesson(NamedTuple):
     @classmethod
     def of(cls, picture: Bytes, keypoints: Doubles, sides: NDArray[np.int8]) -> Lesson:
         """A scene, compressed."""
-        file = encode_jpeg(picture, quality=_QUALITY)
+        file = encode_jpeg(picture, quality=88)
         return cls(np.frombuffer(file, np.uint8), keypoints, sides)
 
     def picture(self) -> Bytes:

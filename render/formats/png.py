@@ -21,7 +21,6 @@ from render.frames import Bytes, Integers
 _SIGNATURE: Final = b"\x89PNG\r\n\x1a\n"
 _ZLIB: Final = b"\x78\x01"
 _GRAY, _COLORS = 0, 2  # PNG's types of color
-_UP: Final = 2  # PNG's filter that subtracts the row above
 # A symbol of DEFLATE is a byte, the end of a block, or the length of a run; 285 is the longest run alone.
 _END, _LONGEST_SYMBOL, _SYMBOLS = 256, 285, 286
 _SHORTEST, _LONGEST = 3, 258  # lengths of runs [bytes]
@@ -66,7 +65,8 @@ def _chunk(name: bytes, content: bytes) -> bytes:
 @kernel
 def _subtract_above(rows: Bytes, filtered: Bytes) -> None:
     """Write the differences of rows (H, N) from those above, each after its filter's number (H, 1 + N)."""
-    filtered[:, 0] = _UP
+    # The filter Up subtracts the row above.
+    filtered[:, 0] = 2
     filtered[0, 1:] = rows[0]
     for row in range(1, len(rows)):
         into, here, above = filtered[row, 1:], rows[row], rows[row - 1]

@@ -139,12 +139,10 @@ They have five tips, the wrist, the thumb without its base, and three joints per
 METERS_PER_UNIT: Final = 1e-4
 """Unit of a depth picture [m]."""
 _KEYWORD: Final = "metres_per_unit"
-_LARGEST: Final = 65535  # largest depth in these units
 _NORMAL_ZERO, _NORMAL_SCALE = 128, 127
-_JPEG_QUALITY: Final = 95
 
 
-def encode_jpeg(picture: UInt8[np.ndarray, "H W 3"], *, quality: int = _JPEG_QUALITY) -> bytes:
+def encode_jpeg(picture: UInt8[np.ndarray, "H W 3"], *, quality: int = 95) -> bytes:
     """An sRGB picture as JPEG."""
     ordered = cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)
     done, data = cv2.imencode(".jpg", ordered, [cv2.IMWRITE_JPEG_QUALITY, quality])
@@ -164,7 +162,7 @@ def _depth_steps(depth: Floats) -> Any:
     for row in range(depth.shape[0]):
         for column in range(depth.shape[1]):
             step = np.rint(depth[row, column] / METERS_PER_UNIT)
-            if 0.0 < step <= _LARGEST:  # False for NaN
+            if 0.0 < step <= 65535:  # False for NaN
                 steps[row, column] = int(step)
     return steps
 

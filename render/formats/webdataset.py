@@ -22,7 +22,7 @@ from handsim.hand.model import KEYPOINT_BONES, HandModel, hand_keypoints, join_q
 from handsim.hand.shape import JOINTS, NUM_JOINTS, HandShape
 from handsim.hand.skin import all_weights
 from handsim.space.camera import Camera
-from handsim.space.transforms import quaternion_matrix, rigid
+from handsim.space.transforms import frame_with_z, quaternion_matrix, rigid
 from render.formats.records import (
     CENTER,
     METERS_PER_UNIT,
@@ -281,7 +281,7 @@ def crop_camera(camera: Camera, keypoints: Doubles) -> tuple[Doubles, float] | N
     if target[2] < _NEAREST:
         return None
     for _ in range(_ROUNDS + 1):
-        rotation = _looking_along(target)
+        rotation = frame_with_z(target, down=np.array([0.0, 1.0, 0.0]))
         rotated = local @ rotation
         if rotated[:, 2].min() < _NEAREST:
             return None
@@ -293,11 +293,3 @@ def crop_camera(camera: Camera, keypoints: Doubles) -> tuple[Doubles, float] | N
     T_world_crop: Doubles = camera.T_world_camera.copy()
     T_world_crop[:3, :3] = T_world_crop[:3, :3] @ rotation
     return T_world_crop, angle
-
-
-def _looking_along(axis: Doubles) -> Doubles:
-    """Rotation whose z axis is this direction, and whose x axis is as level as the camera's."""
-    z = axis / np.linalg.norm(axis)
-    x = np.cross([0.0, 1.0, 0.0], z)
-    x /= np.linalg.norm(x)
-    return np.stack([x, np.cross(z, x), z], axis=1)

@@ -74,7 +74,6 @@ def shade_colors(shade: Float32[np.ndarray, "D"]) -> Float32[np.ndarray, "D 4"]:
     return colors
 
 
-_BALL_LEVEL: Final = 2
 _BASE: Final = (0.85, 0.4)  # radius of a marker's base on the glove and in the marker [marker radii]
 _BASE_SIDES: Final = 12
 _EDGE: Final = np.deg2rad(60.0)  # [rad] An edge is drawn sharp where two faces meet at a larger angle.
@@ -245,7 +244,7 @@ def _base_material() -> Material:
 
 def _drawn_balls(centers: Doubles, radius: float, *ids: Bytes) -> Drawn:
     """Balls with a part, an instance and a marker (N,) each."""
-    vertices, normals, faces = sphere_surface(centers, radius, level=_BALL_LEVEL)
+    vertices, normals, faces = sphere_surface(centers, radius, level=2)
     each = len(faces) // len(centers)
     triangles = Triangles(vertices, faces, normals, *(np.repeat(one, each) for one in ids))
     colors = np.tile(np.array([*linear(MARKER_COLOR), 1.0], np.float32), (len(vertices), 1))

@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 
 _BROKEN_PYRENDER = "0.1.45"  # cannot draw beside NumPy 2 on Python 3.12 and later
 _DEVICES: Final = ("dri/renderD*", "nvidia[0-9]*", "dxg")  # files of Mesa's, NVIDIA's and WSL's devices
-_SECONDS: Final = 60.0  # a first start of pyrender from a slow disk takes some seconds
 _SOFTWARE: Final = ("llvmpipe", "softpipe", "swrast", "software", "swiftshader")
 _NAME_OF_RENDERER: Final = (
     "from render.painting.opengl import offscreen_renderer\n"
@@ -114,7 +113,8 @@ def _renderer_name() -> str:
         [sys.executable, "-c", _NAME_OF_RENDERER],
         capture_output=True,
         text=True,
-        timeout=_SECONDS,
+        # A first start of pyrender from a slow disk takes some seconds.
+        timeout=60.0,
         check=False,
     )
     lines = [line for line in done.stdout.splitlines() if line.startswith("GL_RENDERER ")]

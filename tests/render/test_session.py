@@ -462,7 +462,7 @@ def test_files_have_the_pictures_that_are_drawn_in_memory(path, tmp_path):
         written = cv2.imread(str(file))
         np.testing.assert_array_equal(written[..., ::-1], frame.rgb)
         (file,) = (tmp_path / "out").glob(f"depth/shard-*/{frame.key}.png")
-        held = np.where(frame.depth < 6.5535, frame.depth, 0.0)
+        held = np.where(frame.depth < 6.55355, frame.depth, 0.0)
         np.testing.assert_allclose(depth_of(file.read_bytes()), held, atol=1e-4)
 
 

@@ -27,7 +27,6 @@ _STARTS: Final = ("EventConnected", "EventCaptureStarted", "EventRTfromFileStart
 _FIRST_ID: Final = 1 << 16  # first ID of unidentified markers; smaller ones are identified
 _IDS: Final = 1 << 30
 _HEAD: Final = struct.Struct("<2I")  # size and kind of a packet
-_LARGEST: Final = 1 << 24  # [bytes] far more than a packet of markers has
 _DAMAGED: Final = "damaged_packets"
 _LOST, _CLOSED = "lost", "closed"  # queued after the last frame of a connection, or of the source
 
@@ -157,7 +156,8 @@ class _Packets:
         self._rest += data
         while len(self._rest) >= _HEAD.size:
             size, kind = _HEAD.unpack_from(self._rest)
-            if not _HEAD.size <= size <= _LARGEST:
+            # This is far more than a packet of markers has.
+            if not _HEAD.size <= size <= 1 << 24:
                 self._counts[_DAMAGED] += 1
                 self._rest.clear()
                 self._protocol.transport.abort()

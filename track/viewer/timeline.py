@@ -31,7 +31,6 @@ _SLIDER_PERIOD: Final = 0.1  # [s] least time between moves of the slider while 
 _IDLE: Final = 0.2  # [s] longest interval between calls of `ended`
 _TEXT_PERIOD: Final = 0.1  # [s] least time between texts while playing
 _LIVE_TEXT_PERIOD: Final = 0.2  # [s] least time between texts of a live view
-_COLUMNS: Final = 600  # largest number of points in a plotted curve
 _STROKES: Final = ("#b8572b", "#3f7396", "#5b8c5a", "#7a5ba0")
 
 Key = Literal["space", "arrowleft", "arrowright", "home", "end", "pageup", "pagedown"]
@@ -224,7 +223,7 @@ def _columns(recording: Recording, names: list[str]) -> tuple[np.ndarray, ...]:
 
 def thinned(times: NDArray[np.float64], values: NDArray[np.float64]) -> tuple[np.ndarray, np.ndarray]:
     """Reduce a curve (T,), which may hold NaN, to the columns of a plot: their times and largest values."""
-    step = -(-len(times) // _COLUMNS)
+    step = -(-len(times) // 600)
     starts = np.arange(0, len(times), step)
     return times[starts], np.fmax.reduceat(values, starts)
 

@@ -49,7 +49,6 @@ _ERROR_COST: Final = 0.15  # cost of a millimeter of mean error
 _MAX_ERROR: Final = 1.5  # [mm] error of points seen by fewer than two cameras, or only along nearly one line
 _MIN_DISTANCE: Final = 0.3  # [m] least distance between two cameras
 _MIN_GAIN: Final = 1e-5  # least gain of an exchange
-_MAX_EXCHANGES: Final = 200
 _WIDE: Final = pinhole("wide", (1280, 1280), focal_of_angle(1280, np.deg2rad(170.0)))
 """Camera that has hands in view wherever it is aimed."""
 _ERROR_SAMPLES: Final = 1200  # marker-frames for the estimate of the error
@@ -315,7 +314,7 @@ class Planning:
         """Move one camera at a time to the best candidate while that helps; `told` gets each new value."""
         value, idle, number = self.value_of(self.chosen), 0, len(self._kept)
         free = len(self.chosen) - len(self._kept)
-        for _ in range(_MAX_EXCHANGES):
+        for _ in range(200):
             if idle >= free:
                 return
             others = self.chosen[:number] + self.chosen[number + 1 :]

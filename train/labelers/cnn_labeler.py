@@ -38,7 +38,6 @@ _MOMENTS: Final = tuple(
 NUM_MOMENTS: Final = len(_MOMENTS)
 _ALIGNED_SHARE: Final = 0.6  # share of aligned views in training; others are along principal axes
 _TURN_SPREAD: Final = np.radians(12.0)  # [rad] standard deviation of an aligned view's angle
-_ROUNDS: Final = 10  # rounds of averaging hands and aligning them with the average
 _REGULARIZATION: Final = 1e-4  # added to the variances of moments, which have no unit
 
 
@@ -62,7 +61,7 @@ class MeanHand:
     ) -> MeanHand:
         """Mean hand of a training set, from markers of right hands [m] and their clouds."""
         mean = markers[0]
-        for _ in range(_ROUNDS):
+        for _ in range(10):
             rotations, _ = rigid_fit(markers, mean)
             turned = (markers - markers.mean(1, keepdims=True)) @ rotations.swapaxes(1, 2)
             mean = turned.mean(axis=0)

@@ -66,7 +66,6 @@ NUM_POSES: Final = 40_000
 WEIGHTS: Final = "any_layout.safetensors"
 SHIPPED: Final = Path(__file__).parents[1] / "weights"
 _NETWORK, _PRIOR, _DISTANCES = "network.", "prior.", "distances"
-_CHUNK: Final = 500  # number of poses whose features are in memory together
 _MANY_MARKERS: Final = 24  # Larger layouts use fewer poses and clouds, as work is quadratic.
 _POSES_PER_PERSON: Final = 100
 
@@ -133,7 +132,8 @@ class LayoutLabeler:
 def mean_features(markers: Float[np.ndarray, "T M 3"], config: LayoutNetworkConfig) -> Float[Tensor, "M M K"]:
     """Mean over poses of the `distance_features` of a layout's markers [m]."""
     share = _share_of_work(markers.shape[1])
-    markers, chunk = markers[:: math.ceil(1.0 / share)], int(_CHUNK * share)
+    # The features of this many poses are in memory together.
+    markers, chunk = markers[:: math.ceil(1.0 / share)], int(500 * share)
     centered = torch.from_numpy((markers - markers.mean(axis=1, keepdims=True)).astype(np.float32))
     parts = torch.split(centered, chunk)
     # In a list, sums would lie between large freed tensors and keep their memory from being used again.

@@ -26,7 +26,6 @@ from handsim.kernels import horn_matrix, kernel, write_quaternion_matrix
 NEAREST: Final = 4
 """Number of components in a density: those with the mean hands nearest to the points."""
 _MIN_POINTS: Final = 4  # Fewer points fit any hand.
-_MAX_NEWTON_STEPS: Final = 60
 _ROUGH, _EXACT = 1e-9, 1e-14  # tolerances of the largest root, relative to its upper bound
 _MAX_COMPONENTS, _MAX_DIRECTIONS = 10_000, 100
 FloatArray = NDArray[np.float64]
@@ -193,7 +192,7 @@ def _largest_root(product: Float[np.ndarray, "9"], mirrored: bool, above: float,
         c1 = -c1
     c0 = 2.0 * (xx * xx + yy * yy + zz * zz + 2.0 * (xy * xy + xz * xz + yz * yz)) - total * total
     root = above
-    for _ in range(_MAX_NEWTON_STEPS):
+    for _ in range(60):
         value = ((root * root + c2) * root + c1) * root + c0
         slope = (4.0 * root * root + 2.0 * c2) * root + c1
         if slope <= 0.0:

@@ -32,7 +32,6 @@ LEARNED: Final = ".safetensors"
 _NOUN: Final = "labeler"
 MAX_POINTS: Final = 512
 MOST_THREADS: Final = 1024
-_BATCH: Final = 256
 _PAIRS: Final = 1 << 18  # largest number of pairs of points in a batch; memory grows with it
 _threads: ContextVar[int] = ContextVar("threads of labelers", default=1)
 
@@ -84,7 +83,7 @@ def label_in_batches(
     results = [Labeling(np.zeros(0, dtype=np.int64), np.zeros(0)) for _ in clouds]
     first = 0
     while first < len(order) and (longest := len(clouds[order[first]])):
-        chosen = order[first : first + min(_BATCH, max(1, _PAIRS // longest**2))]
+        chosen = order[first : first + min(256, max(1, _PAIRS // longest**2))]
         first += len(chosen)
         for number, labeling in zip(chosen, label([clouds[number] for number in chosen]), strict=True):
             results[number] = labeling

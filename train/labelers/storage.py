@@ -61,8 +61,6 @@ _ANY_LAYOUT: Final = "any_layout"  # file stem of the weights of the network for
 _PRIOR: Final = "pose_prior."  # prefix of the names of the prior's tensors
 _METADATA: Final = "__metadata__"  # key in the header of a safetensors file
 _LENGTH_BYTES: Final = 8  # bytes that hold the header's length
-_BYTES_PER_WEIGHT: Final = 4
-_MAX_CARD_BYTES: Final = 1 << 24
 _CONFIGS: Final[dict[Kind, type[NetworkConfig]]] = {"set": SetLabelerConfig, "cnn": CNNConfig}
 _SHIPPED: Final = Path(__file__).parents[1] / "weights"
 GLOVE: Final = "glove.toml"
@@ -294,7 +292,7 @@ def _read(weights: Path, card: Path) -> _Stored:
     from safetensors.numpy import load_file
 
     try:
-        content = json.loads(read_bytes(card, error=WeightsError, most=_MAX_CARD_BYTES))
+        content = json.loads(read_bytes(card, error=WeightsError, most=1 << 24))
     except (ValueError, RecursionError) as error:
         raise WeightsError(f"{card} is damaged or not a labeler's: it holds no JSON") from error
     try:
@@ -305,7 +303,7 @@ def _read(weights: Path, card: Path) -> _Stored:
         expected = _shapes_of(config)
         if content.get("sha256", digest := _digest(content, weights.read_bytes())) != digest:
             raise ValueError(f"its weights and {card.name} do not have the SHA-256 that the card names")
-        if weights.stat().st_size < _BYTES_PER_WEIGHT * sum(map(math.prod, expected.values())):
+        if weights.stat().st_size < 4 * sum(map(math.prod, expected.values())):
             raise ValueError("it is too short for the network that its card describes")
         tensors = load_file(weights)
         tables = {

@@ -27,7 +27,6 @@ HAND_CAPTION: Final = (
 MAX_LETTERS: Final = 20
 """Longest marker name drawn in full."""
 _SLIPS_SIZE: Final = (10.8, 6.6)  # [inch]
-_MAX_ARROWS: Final = 12
 _MARGIN: Final = 34.0  # [points] around the hand
 _BEND: Final = 0.22  # curvature of the arrows, so that two between a pair of markers lie side by side
 _BAR: Final = (0.90, 0.2, 0.016, 0.6)  # position of the color bar, as shares of the picture
@@ -116,7 +115,7 @@ class Mistake(NamedTuple):
     """Share of the marker's points."""
 
 
-def mistakes(confusion: Int[np.ndarray, "M+1 M+1"], most: int = _MAX_ARROWS) -> list[Mistake]:
+def mistakes(confusion: Int[np.ndarray, "M+1 M+1"], most: int = 12) -> list[Mistake]:
     """The most frequently confused pairs of markers, the most frequent first."""
     between = confusion[:-1, :-1] * ~np.eye(len(confusion) - 1, dtype=np.bool_)
     order = np.argsort(-between, axis=None, kind="stable")[:most]
