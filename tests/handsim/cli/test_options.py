@@ -63,7 +63,7 @@ QUICK = [
      "corruption tests.handsim.cli.test_options:unchanged|"
      "network.width 16|network.gates 4|network.depth 2|network.num-distances 8|network.reach 0.1"),
     ("render", "take.npz --out pics --num-frames 1 --format png --workers 1 --camera vga",
-     "passes rgb|dress glove|tones dark|background plain|depth-sensor kinect1|no-color-sensor|motion-blur|"
+     "passes rgb|dress glove|tones dark|background gradient|depth-sensor kinect1|no-color-sensor|motion-blur|"
      "num-frames 2|frames 4|seed 4|placement orbit|camera sr300|views 2|share 0.6|distance 0.9 1.0|"
      "cameras own.toml|background photo --photos photos"),
     ("render", "take.npz --out pics --num-frames 2 --format png --workers 1 --passes depth", "every 9"),
