@@ -223,7 +223,7 @@ def test_the_program_of_the_page_labels_as_handsim_does(program, tmp_path, stren
         model = HandModel.named(size, side=side)
         markers, _ = attach("sparse13", model).markers(sample_poses(model, 20, rng=rng))
         for occlude in (2, 7, 9):
-            cloud = corrupt(markers[occlude::3], Corruption(occlude=occlude, ghosts=2), rng=rng)
+            cloud = corrupt(markers[occlude::6], Corruption(occlude=occlude, ghosts=2), rng=rng)
             clouds += [points[there] for points, there in zip(cloud.points, cloud.present, strict=True)]
     clouds += [rng.uniform(-0.1, 0.1, (count, 3)) for count in (1, 1, 3, 4, 8, 8, 8, 8, 13)]
     expected = load_labeler(tmp_path).label_frames(clouds)
@@ -232,7 +232,7 @@ def test_the_program_of_the_page_labels_as_handsim_does(program, tmp_path, stren
         np.array_equal(page["label"](cloud, *labeler), one.labels)
         for cloud, one in zip(clouds, expected, strict=True)
     ]
-    assert len(same) > 150 and np.mean(same) >= 0.99
+    assert len(same) > 80 and np.mean(same) >= 0.99
 
 
 def test_damaged_files_are_told(exported, tmp_path):
