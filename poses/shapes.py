@@ -211,7 +211,9 @@ MAX_PENETRATION: Final = 0.001
 _ROUNDING: Final = 1e-6  # [rad] Single precision rounds angles by less.
 _THUMB: Final = np.array([joint.name.startswith("thumb") for joint in JOINTS])
 _ABDUCTIONS: Final = np.array([joint.name.endswith("abduction") for joint in JOINTS])
-_FAN: Final = np.deg2rad([1.0, 0.2, -0.6, -1.4])  # one step of fanning at rest, index to little
+_FAN: Final = np.deg2rad([1.0, 0.2, -0.6, -1.4])  # one degree of fanning at rest, index to little
+# For fingers that converge beyond their knuckles: the middle finger leans away from the index, too.
+_WIDE_FAN: Final = np.deg2rad([1.0, -0.2, -1.0, -1.8])
 
 
 def is_valid(
@@ -239,10 +241,9 @@ def validate(model: HandModel | HandShape | str, qpos: Float[np.ndarray, "T 27"]
 @functools.lru_cache(maxsize=16)
 def resting_angles(model: HandModel) -> Float[np.ndarray, "20"]:
     """A valid relaxed pose of this hand, with fingers fanned as little as their girth allows; read-only."""
-    fans = np.arange(0.0, 21.0, 2.0)
-    tries = np.tile(gesture("relaxed"), (len(fans), 1))
-    tries[:, 4::4] += fans[:, None] * _FAN
-    for share in (0.8, 1.0):  # with some room left where the girth allows it
+    for share, fan in ((0.8, _FAN), (1.0, _FAN), (1.0, _WIDE_FAN)):  # leaves room where the girth allows it
+        tries = np.tile(gesture("relaxed"), (11, 1))
+        tries[:, 4::4] += np.arange(0.0, 21.0, 2.0)[:, None] * fan
         valid = is_valid(model, tries, max_penetration=share * MAX_PENETRATION)
         if valid.any():
             break

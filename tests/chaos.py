@@ -2,9 +2,10 @@
 
     python -m tests.chaos [generate train ...] [--kills 20 --seed 0]
 
-Each command runs once undisturbed. Then it is killed by SIGTERM, SIGKILL and SIGINT in turn, at a random
-moment, and run again to its end. The table counts what must be zero: reruns whose files differ, processes
-that outlive the command, temporary files after the rerun, and files that stay in /dev/shm. Ctrl-C goes to
+Each command runs once undisturbed. Then it is killed by SIGTERM, SIGKILL, SIGINT and SIGHUP in turn, at a
+random moment, and run again to its end. The table counts what must be zero: reruns whose files differ,
+processes that outlive the command, temporary files after the rerun, files that stay in /dev/shm, and ends
+with a traceback or with an exit code that is not the signal's. Ctrl-C goes to
 the whole group of processes, as from a terminal; the other signals go to the command alone. The last column
 is the longest time from SIGTERM or SIGINT to the end. Exit code 1 when a count is not zero.
 """
@@ -26,7 +27,10 @@ from typing import Literal, get_args
 
 import tyro
 
-SIGNALS = (signal.SIGTERM, signal.SIGKILL, signal.SIGINT)
+from render.illustrations import write_video
+from tests.render.film.filmed import SIZE, Filming, moving_take
+
+SIGNALS = (signal.SIGTERM, signal.SIGKILL, signal.SIGINT, signal.SIGHUP)
 ROOT = Path(__file__).resolve().parents[1]
 COMMAND = "import sys; from handsim.cli.main import main; sys.exit(main())"
 # Python runs this as the command and its workers start, so that a small set has several shards. Processes
@@ -49,16 +53,18 @@ class Case:
     args: tuple[str, ...]
     files: str = "**/*"
     """Those of its files that depend on nothing but the settings."""
+    before: tuple[str, ...] = ()
+    """A command that ends before it in the same folder, whose output it enlarges."""
 
+
+GENERATE = ("generate", *ALONE, "--workers", "2", "--out", "OUT", "--num-frames")
+TRAIN = ("train", "WORK/set", "--out", "OUT", *NETWORK, "--threads", "1", "--samples")
 
 CASES = {
-    "generate": Case(
-        ("generate", "--num-frames", "900", *ALONE, "--workers", "2", "--out", "OUT"), "*.[nj]*"
-    ),
-    "train": Case(
-        ("train", "WORK/set", "--out", "OUT", "--samples", "20000", *NETWORK, "--threads", "1"),
-        "*.safetensors",
-    ),
+    "generate": Case((*GENERATE, "900"), "*.[nj]*"),
+    "grow-set": Case((*GENERATE, "900"), "*.[nj]*", before=(*GENERATE, "420")),
+    "train": Case((*TRAIN, "20000"), "*.safetensors"),
+    "grow-run": Case((*TRAIN, "20000"), "*.safetensors", before=(*TRAIN, "6400")),
     "render": Case(
         (
             *("render", "WORK/take.truth.npz", "--every", "4", "--frames-per-shard", "4", "--camera", "vga"),
@@ -69,6 +75,13 @@ CASES = {
     "track": Case(("track", "WORK/take.c3d", "--out", "OUT/tracked.npz")),
     "calibrate": Case(("calibrate", "WORK/long.c3d", "--hands", "right", "--out", "OUT/user.json")),
     "label": Case(("label", "WORK/take.c3d", "--out", "OUT/labeled.c3d")),
+    "folder": Case(("label", "WORK/captures", "--out", "OUT")),
+    "report": Case(("report", "WORK/take.truth.npz", "--out", "OUT/page.html")),
+    "export": Case(("export", "WORK/take.truth.npz", "--out", "OUT/hands.glb")),
+    "film": Case(
+        ("film", "WORK/filmed.npz", "WORK/video.mp4", "--num-frames", "4", "--workers", "2", "--out", "OUT"),
+        "**/*.tar",
+    ),
     "cnn": Case(
         (
             *("train", "WORK/set", "--out", "OUT", "--labeler", "cnn", "--samples", "640", "--batch", "32"),
@@ -82,8 +95,9 @@ CASES = {
 
 
 Command = Literal[
-    "generate", "train", "render", "simulate", "track", "calibrate", "label", "cnn", "improve", "plan"
-]
+    "generate", "grow-set", "train", "grow-run", "render", "simulate", "track", "calibrate", "label",
+    "folder", "report", "export", "film", "cnn", "improve", "plan",
+]  # fmt: skip
 ALL: tuple[Command, ...] = get_args(Command)
 
 
@@ -96,16 +110,17 @@ class Counts:
     orphans: int = 0
     temporary: int = 0
     segments: int = 0
+    untold: int = 0
     slowest: float = 0.0
 
     def failed(self) -> bool:
         """Whether a count is not zero."""
-        return bool(self.differing or self.orphans or self.temporary or self.segments)
+        return bool(self.differing or self.orphans or self.temporary or self.segments or self.untold)
 
 
 def main(commands: tyro.conf.Positional[tuple[Command, ...]] = ALL, kills: int = 20, seed: int = 0) -> None:
     print(
-        f"{'command':12s}{'kills':>7s}{'differ':>8s}{'orphans':>9s}{'temporary':>11s}{'shm':>5s}{'slowest':>9s}"
+        f"{'command':12s}{'kills':>7s}{'differ':>8s}{'orphans':>9s}{'temporary':>11s}{'shm':>5s}{'untold':>8s}{'slowest':>9s}"
     )
     failed = False
     with tempfile.TemporaryDirectory(prefix="chaos-") as folder:
@@ -118,7 +133,7 @@ def main(commands: tyro.conf.Positional[tuple[Command, ...]] = ALL, kills: int =
             failed |= counts.failed()
             print(
                 f"{name:12s}{counts.kills:7d}{counts.differing:8d}{counts.orphans:9d}{counts.temporary:11d}"
-                f"{counts.segments:5d}{counts.slowest:7.1f} s",
+                f"{counts.segments:5d}{counts.untold:8d}{counts.slowest:7.1f} s",
                 flush=True,
             )
     raise SystemExit(int(failed))
@@ -129,22 +144,32 @@ def prepare(work: Path) -> None:
     finish(("generate", "--num-frames", "900", *ALONE, "--out", f"{work}/set"))
     finish(("simulate", "--num-frames", "120", "--out", f"{work}/take.c3d"))
     finish(("simulate", "--kind", "hand-hand", "--num-frames", "900", "--out", f"{work}/long.c3d"))
+    (work / "captures").mkdir()
+    for name in ("a.c3d", "b.c3d", "c.c3d"):
+        shutil.copy(work / "take.c3d", work / "captures" / name)
+    filming, take = Filming(seed=21, seconds=8.0, rate=8.0, missing=0.0, swapped=0.0), moving_take()
+    take.save(work / "filmed.npz")
+    write_video(work / "video.mp4", iter(filming.pictures(take)), rate=filming.rate, size=SIZE)
 
 
 def torment(name: str, work: Path, kills: int, rng: random.Random) -> Counts:
     """Run a command undisturbed, then kill it and run it again many times."""
     case, counts = CASES[name], Counts()
-    whole, out = work / f"{name}-whole", work / f"{name}-out"
+    whole, out, small = (work / f"{name}-{kind}" for kind in ("whole", "out", "small"))
+    if case.before:
+        finish(arguments(case.before, work, small))
     start = time.monotonic()
-    finish(arguments(case, work, whole))
+    finish(arguments(case.args, work, whole))
     length = time.monotonic() - start
     expected = contents(whole, case.files)
     for number in range(kills):
         shutil.rmtree(out, ignore_errors=True)
+        if case.before:
+            shutil.copytree(small, out)
         shared = set(os.listdir("/dev/shm"))
-        args = arguments(case, work, out)
+        args = arguments(case.args, work, out)
         counts.slowest = max(
-            counts.slowest, kill(args, rng.uniform(0.0, length), SIGNALS[number % 3], counts)
+            counts.slowest, kill(args, rng.uniform(0.0, length), SIGNALS[number % len(SIGNALS)], counts)
         )
         counts.segments += len(set(os.listdir("/dev/shm")) - shared)
         finish(args)
@@ -156,7 +181,8 @@ def torment(name: str, work: Path, kills: int, rng: random.Random) -> Counts:
 
 def kill(args: tuple[str, ...], after: float, number: signal.Signals, counts: Counts) -> float:
     """Kill a command after some seconds; count what outlives it, and return how long it took to end."""
-    process = subprocess.Popen(program(args), start_new_session=True, stderr=subprocess.DEVNULL, **QUIET)
+    said = tempfile.TemporaryFile()
+    process = subprocess.Popen(program(args), start_new_session=True, stderr=said, **QUIET)
     try:
         process.wait(after)
     except subprocess.TimeoutExpired:
@@ -165,13 +191,17 @@ def kill(args: tuple[str, ...], after: float, number: signal.Signals, counts: Co
         else:
             process.send_signal(number)
     start = time.monotonic()
-    process.wait()
+    ended = process.wait()
     took = time.monotonic() - start
     while (left := members(process.pid)) and time.monotonic() < start + took + PATIENCE:
         time.sleep(0.02)
     counts.orphans += len(left)
     for orphan in left:
         os.kill(orphan, signal.SIGKILL)
+    said.seek(0)
+    words = said.read()
+    # Before the command has begun, Python itself is ended by the signal.
+    counts.untold += ended not in (0, -number, 128 + number) or (b"Traceback" in words and ended != -number)
     return 0.0 if number == signal.SIGKILL else took
 
 
@@ -203,9 +233,9 @@ def program(args: tuple[str, ...]) -> list[str]:
     return [sys.executable, "-c", COMMAND, *args]
 
 
-def arguments(case: Case, work: Path, out: Path) -> tuple[str, ...]:
+def arguments(words: tuple[str, ...], work: Path, out: Path) -> tuple[str, ...]:
     out.parent.mkdir(exist_ok=True)
-    return tuple(word.replace("WORK", str(work)).replace("OUT", str(out)) for word in case.args)
+    return tuple(word.replace("WORK", str(work)).replace("OUT", str(out)) for word in words)
 
 
 def contents(folder: Path, files: str) -> dict[str, str]:

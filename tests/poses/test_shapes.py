@@ -251,7 +251,9 @@ def test_single_precision_is_as_valid(rng, size):
 
 
 @pytest.mark.parametrize("population", [ADULTS, EVERYBODY], ids=["adults", "everybody"])
-@pytest.mark.parametrize("seed", [49, 112, 140, 175, 202, 254, 388, 417, 512, 1000, 1720])
+@pytest.mark.parametrize(
+    "seed", [49, 112, 140, 175, 202, 254, 388, 417, 512, 797, 1000, 1720, 6774, 7741, 13383, 21931]
+)
 def test_people_with_thick_fingers_can_be_sampled(population, seed):
     model = HandModel(sample_shape(population, rng=np.random.default_rng(seed)))
     assert validate(model, sample_poses(model, 20, rng=np.random.default_rng(seed))).all()

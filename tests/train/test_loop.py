@@ -104,6 +104,31 @@ def test_an_evaluation_that_was_cut_off_is_done_by_the_next_run(dataset, tmp_pat
     assert curve[0][0] == done
 
 
+@pytest.mark.parametrize(("samples", "evaluations"), [(320, 1), (640, 2), (960, 2), (1440, 3)])
+def test_a_run_is_evaluated_in_proportion_to_its_samples(
+    dataset, tmp_path, monkeypatch, samples, evaluations
+):
+    monkeypatch.setattr("train.loop._HELD_OUT", 0.2)
+    steps = []
+    with monkeypatch.context() as patch:
+        patch.setattr("train.loop.paper_report", counting(seen := []))
+        settings = dataclasses.replace(CONFIG, samples=samples)
+        card = train_labeler(dataset, tmp_path / "run", settings, on_step=steps.append)
+    assert len(card["curve"]) == evaluations and steps.count("held-out frames") == evaluations + 1
+    assert len(seen) == evaluations + 1
+    assert sum(seen[:-1]) <= samples / 8 + seen[0]
+
+
+def counting(seen):
+    """The evaluation of the paper's corruption, which notes how many frames it is made on."""
+
+    def report(labeler, rows):
+        seen.append(len(rows))
+        return paper_report(labeler, rows)
+
+    return report
+
+
 def test_a_loss_that_is_no_number_ends_the_run(dataset, tmp_path, monkeypatch):
     monkeypatch.setattr(
         "train.loop.batch_loss", lambda *args, **kwargs: torch.tensor(float("nan"), requires_grad=True)

@@ -190,9 +190,13 @@ def test_a_capture_is_labeled_without_torch(exported, tmp_path, rng):
     assert read_capture(tmp_path / "out.trc").names[:19] == names
 
 
-def test_the_program_of_the_page_labels_as_handsim_does_and_needs_no_handsim(exported):
-    """docs/how_to/onnx.md, on simulated hands with drops and ghosts."""
-    program = PAGE.read_text("utf-8").split("```python\n")[1].split("```")[0]
+@pytest.fixture(scope="module")
+def program():
+    """The program of docs/how_to/onnx.md."""
+    return PAGE.read_text("utf-8").split("```python\n")[1].split("```")[0]
+
+
+def test_the_program_of_the_page_is_short_and_needs_no_handsim(program):
     nodes = list(ast.walk(ast.parse(program)))
     imported = [
         one.names[0].name if isinstance(one, ast.Import) else one.module
@@ -203,21 +207,32 @@ def test_the_program_of_the_page_labels_as_handsim_does_and_needs_no_handsim(exp
     assert {name.partition(".")[0] for name in imported} == needed
     (function,) = [one for one in nodes if isinstance(one, ast.FunctionDef) and one.name == "label"]
     assert function.end_lineno - function.lineno < 43
-    page = {}
+
+
+@pytest.mark.parametrize("strength", [1.0, 0.3, 0.15], ids=["trained", "weak", "weaker"])
+def test_the_program_of_the_page_labels_as_handsim_does(program, tmp_path, strength):
+    network, card = load_network("sparse13")
+    with torch.no_grad():  # as of a short training: scores of labels are closer together
+        network.to_scores.weight *= strength
+        network.to_scores.bias *= strength
+    save_network(tmp_path, network, card)
+    export_onnx(network, card["marker_names"], tmp_path / "weak.onnx")
+    page, clouds, rng = {}, [], np.random.default_rng(3)
     exec(program, page)
-    labeler, clouds, rng = page["open_labeler"](str(exported)), [], np.random.default_rng(3)
     for size, side in itertools.product(("XS", "S", "M", "L", "XL"), ("right", "left")):
         model = HandModel.named(size, side=side)
-        markers, _ = attach("dense19", model).markers(sample_poses(model, 20, rng=rng))
-        cloud = corrupt(markers, Corruption(occlude=5, ghosts=2), rng=rng)
-        clouds += [points[there] for points, there in zip(cloud.points, cloud.present, strict=True)]
-    clouds += [rng.uniform(-0.1, 0.1, (count, 3)) for count in (1, 1, 3, 4, 8, 8, 8, 8, 19)]
-    expected = load_labeler("dense19").label_frames(clouds)
+        markers, _ = attach("sparse13", model).markers(sample_poses(model, 20, rng=rng))
+        for occlude in (2, 7, 9):
+            cloud = corrupt(markers[occlude::6], Corruption(occlude=occlude, ghosts=2), rng=rng)
+            clouds += [points[there] for points, there in zip(cloud.points, cloud.present, strict=True)]
+    clouds += [rng.uniform(-0.1, 0.1, (count, 3)) for count in (1, 1, 3, 4, 8, 8, 8, 8, 13)]
+    expected = load_labeler(tmp_path).label_frames(clouds)
+    labeler = page["open_labeler"](str(tmp_path / "weak.onnx"))
     same = [
         np.array_equal(page["label"](cloud, *labeler), one.labels)
         for cloud, one in zip(clouds, expected, strict=True)
     ]
-    assert len(same) == 209 and np.mean(same) >= 0.99
+    assert len(same) > 80 and np.mean(same) >= 0.99
 
 
 def test_damaged_files_are_told(exported, tmp_path):
