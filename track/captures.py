@@ -26,6 +26,7 @@ from gloves.takes.take import Take, label_names
 from handsim.callbacks import OnStep, Progress, no_progress, no_step
 from handsim.errors import CalibrationError, CaptureError, HandSimWarning, errors_of
 from handsim.hand.shape import NUM_QPOS, Side
+from track.alternatives.alternatives import judge_take, with_doubt
 from track.association.frame_state import change_of_distances
 from track.association.initialization import label_alone
 from track.bidirectional_labeling import label_both_ways
@@ -81,6 +82,22 @@ def label_capture(
         HandSimWarning: There is no hand in any frame, or another hand or glove fits clearly better.
     """
     source, frames, setup = _opened(capture, LabelSettings.of(settings, options))
+    labeled, _ = _judged(lambda setup: _labeled_take(capture, source, frames, setup, progress), setup)
+    if (labeled.point_list.labels < 0).all():
+        none = f"no hand found, expected hands in glove '{labeled.settings['glove']}' (--glove names another)"
+        none = none if len(labeled.point_list.points) else no_points(labeled)
+        warnings.warn(none, HandSimWarning, stacklevel=2)
+    return labeled
+
+
+def _labeled_take(
+    capture: AnyCapture,
+    source: Capture,
+    frames: Sequence[StreamedFrame],
+    setup: TrackerSetup,
+    progress: Progress,
+) -> Take:
+    """Label all frames of a capture."""
     present, glove = np.isfinite(source.positions[..., 0]), setup.settings["glove"]
     take = Take.of_truth(
         setup.user.hands,
@@ -96,16 +113,24 @@ def label_capture(
         progress(count, len(frames))
 
     if _is_continuous(frames):
-        labeled = label_both_ways(take, frames, setup.tracker, on_count)
-    else:
-        clouds = [frame.points for frame in frames]
-        labels, confidence = label_alone(clouds, setup.user.hands, setup.labeler, on_count)
-        points = dataclasses.replace(take.point_list, labels=labels, confidence=confidence)
-        labeled = dataclasses.replace(take, point_list=points)
-    if (labeled.point_list.labels < 0).all():
-        none = f"no hand found, expected hands in glove '{glove}' (--glove names another)"
-        warnings.warn(none if present.any() else no_points(take), HandSimWarning, stacklevel=2)
-    return labeled
+        return label_both_ways(take, frames, setup.tracker, on_count)
+    clouds = [frame.points for frame in frames]
+    labels, confidence = label_alone(clouds, setup.user.hands, setup.labeler, on_count)
+    points = dataclasses.replace(take.point_list, labels=labels, confidence=confidence)
+    return dataclasses.replace(take, point_list=points)
+
+
+def _judged(label: Callable[[TrackerSetup], Take], setup: TrackerSetup) -> tuple[Take, TrackerSetup]:
+    """Label a take, and once more with markers elsewhere if an alternative to its labels is likelier."""
+    take = label(setup)
+    judged = judge_take(take)
+    if setup.is_auto and any(one.is_changed for one in judged):
+        placed = {one.side: one.hand for one in judged if one.is_changed}
+        hands = tuple(placed.get(hand.side, hand) for hand in setup.user)
+        setup = setup.with_user(dataclasses.replace(setup.user, hands=hands))
+        take = label(setup)
+        judged = judge_take(take)
+    return with_doubt(take, judged), setup
 
 
 def track_capture(

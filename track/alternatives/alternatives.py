@@ -1,0 +1,320 @@
+"""Alternatives to the labels of a take: changes that hold for all of its frames.
+
+Two markers of a hand may be exchanged, labels shifted along a digit, two digits exchanged, or a marker lost
+whose points have no label. Each alternative is fitted to the same frames with free places of the markers
+(`track.alternatives.placement`); the likeliest is used, and the probability of the others is the doubt.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+from numpy.typing import NDArray
+
+from gloves.fit import GloveFit
+from gloves.takes.take import Take
+from handsim.hand.shape import BONES, DIGITS, PALM, Side
+from handsim.space.transforms import MIRROR
+from track.alternatives.placement import FIT_OPTIONS, Placement, offset_cost, place_again, place_markers
+from track.hand_size import mean_hand
+from track.kinematics.pose_solver import FEWEST_MARKERS, PoseSolver
+
+_FRAMES: Final = 10  # frames of a hand, whose errors are about independent
+_FEWEST_FRAMES: Final = 4
+_COMPLETE: Final = 0.75  # A frame shows this share of the usual number of markers.
+_ALIKE: Final = 0.3  # share of the frames that they are taken from
+_TRIED: Final = 5  # alternatives that are fitted, the likeliest by a rough cost first
+_ROUGH: Final = 30.0  # log-odds beyond which an alternative is not fitted
+_STRAY: Final = 10.0  # log-odds against a point that moves with the hand and is no marker
+_UNSEEN: Final = 5.0  # log-odds against a marker that is never seen
+_SELDOM: Final = 0.5  # share of the frames below which a marker is looked for among unlabeled points
+_STEADY: Final = 0.008  # [m] A point on a bone stays within this distance in the bone's frame.
+_REACH: Final = 0.12  # [m] largest distance of such a point from the bone's joint
+_CHANGES: Final = 3  # changes that are tried one after the other
+_ROUGH_NOISE, _ROUGH_MOST = 0.004, 0.02  # [m] scale and bound of residuals in rough costs
+_OFTEN: Final = 0.5  # share of the frames without the marker that show it
+_TEMPERATURE: Final = 1.5  # divides log-odds of alternatives, as no fit knows all errors of gloves
+_PRIOR: Final = 2.0  # log-odds against each alternative, as the tracker has seen more frames
+_LIKELY: Final = 0.01  # Alternatives are kept from this probability on.
+
+
+Order = tuple[int, ...]
+ALTERNATIVES: Final = "alternatives"
+"""Key of the alternatives in the settings of a take."""
+
+
+class Alternative(NamedTuple):
+    """A way to label a hand in all frames of a take."""
+
+    order: Order
+    """The column whose points each marker has: a label, or M and more for unlabeled points; -1 for none."""
+    words: str
+    """What it says of the labels, such as "RH1 and RH6 are exchanged"; empty for the labels as they are."""
+    probability: float
+
+
+class JudgedHand(NamedTuple):
+    """A hand of a take with the alternatives to its labels."""
+
+    side: Side
+    alternatives: tuple[Alternative, ...]
+    """The likeliest first."""
+    hand: GloveFit
+    """The hand with its markers where the likeliest one has them."""
+
+    @property
+    def is_changed(self) -> bool:
+        """Whether other labels are likelier than those of the take."""
+        return bool(self.alternatives[0].words)
+
+    @property
+    def record(self) -> list[dict[str, Any]]:
+        """The alternatives as JSON, for the settings of a take."""
+        return [
+            {
+                "words": one.words,
+                "probability": round(one.probability, 4),
+                "markers": [marker for marker, column in enumerate(one.order) if column != marker],
+            }
+            for one in self.alternatives
+        ]
+
+
+def judge_take(take: Take) -> tuple[JudgedHand, ...]:
+    """Compare the labels of each hand of a tracked take with their alternatives.
+
+    Hands that too few frames show are left out.
+    """
+    judged = [judge_hand(take, side) for side in take.sides]
+    return tuple(one for one in judged if one is not None)
+
+
+def with_doubt(take: Take, judged: Sequence[JudgedHand]) -> Take:
+    """The take with its alternatives in its settings, and with the confidence that they leave to its labels."""
+    settings = {**take.settings, ALTERNATIVES: {one.side: one.record for one in judged}}
+    take = dataclasses.replace(take, settings=settings)
+    points, right = take.point_list, np.append(label_probability(take), 1.0)
+    confidence = points.confidence * right[np.minimum(points.labels, len(right) - 1)]
+    return dataclasses.replace(take, point_list=dataclasses.replace(points, confidence=confidence))
+
+
+def label_probability(take: Take) -> Float[np.ndarray, "K"]:
+    """Probability that no likely alternative of the take gives the points of a label to another marker."""
+    sure = np.ones(take.hand_labels[-1].stop)
+    for side, part in zip(take.sides, take.hand_labels, strict=True):
+        for one in take.settings.get(ALTERNATIVES, {}).get(side, ()):
+            sure[np.array(part)[one["markers"]]] -= one["probability"]
+    return np.maximum(sure, 0.0)
+
+
+class Columns(NamedTuple):
+    """Points of a hand in some frames, as a right one."""
+
+    names: tuple[str, ...]
+    seen: Float[np.ndarray, "F C 3"]  # of each label, then steady unlabeled ones [m]; NaN where missing
+    worn: GloveFit  # the right hand in the glove as designed
+    frames: Int[np.ndarray, "F"]
+
+    def of(self, order: Sequence[int]) -> Float[np.ndarray, "F M 3"]:
+        """Points of the markers under an alternative."""
+        seen = self.seen[:, list(order)].copy()
+        seen[:, np.array(order) < 0] = np.nan
+        return seen
+
+    def left_over(self, order: Sequence[int]) -> float:
+        """Log-odds against an alternative for points that it leaves without a label, and unseen markers."""
+        shown = np.isfinite(self.seen[..., 0]).mean(axis=0)
+        left = np.delete(shown, [one for one in order if one >= 0]).sum()
+        return float(_STRAY * left + _UNSEEN * sum(one < 0 or not shown[one] for one in order))
+
+    def free(self, order: Sequence[int]) -> list[int]:
+        """Columns with points that an alternative leaves without a label."""
+        shown = np.isfinite(self.seen[..., 0]).any(axis=0)
+        return [one for one in range(len(shown)) if shown[one] and one not in order]
+
+    @property
+    def given(self) -> tuple[int, ...]:
+        """The labels as they are."""
+        return tuple(range(len(self.names)))
+
+
+def judge_hand(take: Take, side: Side) -> JudgedHand | None:
+    """Compare the labels of a hand with their alternatives; None if too few frames show the hand."""
+    columns = _columns_of(take, side)
+    if columns is None:
+        return None
+    given = columns.given
+    base = place_markers(columns.of(given), columns.worn)
+    fits, words = {given: base}, {given: ""}
+    costs = {given: base.cost + columns.left_over(given)}
+    best = given
+    for _ in range(_CHANGES):
+        for order, said in _candidates(columns, best, fits[best]):
+            if order not in fits:
+                fits[order], words[order] = place_again(columns.of(order), base), said
+                costs[order] = fits[order].cost + columns.left_over(order)
+        before, best = best, min(costs, key=lambda order: costs[order])
+        if best == before:
+            break
+    log_odds = np.array([-cost / _TEMPERATURE - _PRIOR * (one != given) for one, cost in costs.items()])
+    shares = np.exp(log_odds - log_odds.max())
+    shares /= shares.sum()
+    found = [Alternative(one, words[one], float(share)) for one, share in zip(costs, shares, strict=True)]
+    found = sorted((one for one in found if one.probability >= _LIKELY), key=lambda one: -one.probability)
+    return JudgedHand(side, tuple(found), fits[found[0].order].hand.with_side(side))
+
+
+def _columns_of(take: Take, side: Side) -> Columns | None:
+    """The points of a hand in frames spread over the take; None if too few frames show enough markers."""
+    number, mirror = take.hand_index(side), MIRROR if side == "left" else np.eye(3)
+    part, worn = take.hand_labels[number], take.hands[number]
+    there = np.isfinite(take.observed(part)[..., 0])
+    counts = there.sum(axis=1)
+    frames = np.flatnonzero(counts >= max(FEWEST_MARKERS, _COMPLETE * _usual(counts)))
+    if len(frames) < _FEWEST_FRAMES:
+        return None
+    # Labels may be right for a part of the take. The frames are alike in the labels that they show.
+    unlike = (there[frames] != (there[frames].mean(axis=0) > 0.5)).sum(axis=1)
+    frames = frames[unlike <= np.quantile(unlike, _ALIKE)]
+    frames = frames[np.linspace(0, len(frames) - 1, min(_FRAMES, len(frames))).astype(int)]
+    seen = take.point_list.labeled(part, frames)
+    shape, layout = worn.shape, worn.layout
+    columns = np.concatenate([seen, *(one[:, None] for one in _steady(take, worn, frames, seen))], axis=1)
+    designed = mean_hand(shape.length, shape.breadth, layout)
+    return Columns(layout.names, columns @ mirror, designed, frames)
+
+
+def _usual(counts: NDArray[np.int64]) -> float:
+    """Usual number of markers of the frames that show any."""
+    return float(np.median(counts[counts > 0])) if counts.any() else 0.0
+
+
+def _steady(
+    take: Take, worn: GloveFit, frames: NDArray[np.int64], seen: NDArray[np.float64]
+) -> Iterator[Float[np.ndarray, "F 3"]]:
+    """Unlabeled points that move with a bone that carries, or is next to, a marker that is seldom seen."""
+    missing = np.isnan(seen[..., 0])
+    if missing.mean(axis=0).max() <= _SELDOM:
+        return
+    bones = worn.model.forward_kinematics(PoseSolver(worn).solve(seen).qpos)
+    taken = np.zeros(len(take.point_list.points), dtype=bool)
+    for marker in np.flatnonzero(missing.mean(axis=0) > _SELDOM):
+        best: dict[int, int] = {}
+        digit = worn.attachment.digits[marker]
+        for bone in [PALM, *(bone for bone in range(len(BONES)) if BONES[bone].digit == digit >= 0)]:
+            found = _cluster(take, bones[:, bone], frames, taken, _REACH)
+            found = {row: point for row, point in found.items() if missing[row, marker]}
+            if len(found) > len(best):
+                best = found
+        if len(best) >= _OFTEN * missing[:, marker].sum():
+            taken[list(best.values())] = True
+            stray = np.full((len(frames), 3), np.nan)
+            stray[list(best)] = take.point_list.points[list(best.values())]
+            yield stray
+
+
+def _cluster(
+    take: Take, T_world_bone: NDArray[np.float64], frames: NDArray[np.int64], taken: NDArray[np.bool_], reach: float
+) -> dict[int, int]:
+    """The steadiest unlabeled point in the frame of a bone: its index by row of `frames`."""
+    rows, points, places = [], [], []
+    for row, (frame, pose) in enumerate(zip(frames, T_world_bone, strict=True)):
+        part = take.point_list.of(int(frame))
+        free = part.start + np.flatnonzero((take.point_list.labels[part] < 0) & ~taken[part])
+        local = (take.point_list.points[free] - pose[:3, 3]) @ pose[:3, :3]
+        near = np.linalg.norm(local, axis=1) < reach
+        rows += [row] * int(near.sum())
+        points += free[near].tolist()
+        places.append(local[near])
+    if not rows:
+        return {}
+    off = np.concatenate(places)
+    near = np.linalg.norm(off[:, None] - off, axis=2) < _STEADY
+    best = max(near, key=lambda one: len({rows[n] for n in np.flatnonzero(one)}))
+    return {rows[n]: points[n] for n in np.flatnonzero(best)}
+
+
+def _candidates(columns: Columns, now: Order, fit: Placement) -> list[tuple[Order, str]]:
+    """Changes of an order that a rough cost does not exclude, the likeliest first."""
+    found: dict[Order, tuple[float, str]] = {}
+    for order, words, cost in (*_reassigned(columns, now, fit), *_shifted(columns, now)):
+        if cost < _ROUGH and (order not in found or cost < found[order][0]):
+            found[order] = cost, words
+    ranked = sorted(found.items(), key=lambda one: one[1][0])
+    return [(order, words) for order, (_, words) in ranked[:_TRIED]]
+
+
+def _reassigned(columns: Columns, now: Order, fit: Placement) -> Iterator[tuple[Order, str, float]]:
+    """Orders in which one or two markers have other columns, with rough costs.
+
+    These are of places and of the spread of points in the frames of the bones, for poses as they are.
+    """
+    hand, names = fit.hand, columns.names
+    bones = hand.model.forward_kinematics(fit.estimate.qpos)
+    place = hand.attachment.centers(hand.model, bones)
+    main = hand.attachment.main_bones
+    rest = hand.model.rest_transforms[main][:, :3, :3]
+    count, total = len(names), columns.seen.shape[1]
+    cost = np.full((count, total + 1), _UNSEEN)  # The last column stands for no point.
+    for marker in range(count):
+        turns = rest[marker] @ bones[:, main[marker], :3, :3].swapaxes(1, 2)
+        off = np.einsum("fij,fcj->fci", turns, columns.seen - place[:, marker, None])
+        there = np.isfinite(off[..., 0])
+        mean = np.nansum(off, axis=0) / np.maximum(there.sum(axis=0), 1)[:, None]
+        spread = np.nansum((off - mean) ** 2, axis=(0, 2))
+        rough = offset_cost(mean + fit.offsets[marker]) + spread / (2.0 * FIT_OPTIONS["noise"] ** 2)
+        cost[marker, :total] = np.where(there.any(axis=0), rough, _UNSEEN)
+    own = cost[range(count), now]
+    for one, other in itertools.combinations(range(count), 2):
+        gain = cost[one, now[other]] + cost[other, now[one]] - own[one] - own[other]
+        words = f"{names[one]} and {names[other]} are exchanged"
+        yield _changed(now, {one: now[other], other: now[one]}), words, float(gain)
+    for marker, stray in itertools.product(range(count), columns.free(now)):
+        gain = cost[marker, stray] - own[marker]
+        yield _changed(now, {marker: stray}), f"{names[marker]} is a point without a label", float(gain)
+        for other in range(count):
+            gain = cost[marker, now[other]] + cost[other, stray] - own[marker] - own[other]
+            words = f"the points of {names[marker]} have the label {names[other]}"
+            if other != marker:
+                yield _changed(now, {marker: now[other], other: stray}), words, float(gain)
+
+
+def _changed(order: Order, changes: Mapping[int, int]) -> Order:
+    """An order with other columns for some markers."""
+    return tuple(changes.get(marker, column) for marker, column in enumerate(order))
+
+
+def _shifted(columns: Columns, now: Order) -> Iterator[tuple[Order, str, float]]:
+    """Orders with labels shifted along a digit, or exchanged between neighbors, with rough costs."""
+    digits, orders = columns.worn.attachment.digits, list[tuple[Order, str]]()
+    chains = [np.flatnonzero(digits == digit).tolist() for digit in range(len(DIGITS))]
+    ends = [-1, *columns.free(now)]
+    for name, chain in zip(DIGITS, chains, strict=True):
+        own = [now[marker] for marker in chain]
+        for end in ends if len(chain) > 1 else ():
+            for sources in ([*own[1:], end], [end, *own[:-1]]):
+                words = f"the labels of the {name} are one marker off"
+                orders.append((_changed(now, dict(zip(chain, sources, strict=True))), words))
+    for (one, first), (other, second) in itertools.pairwise(enumerate(chains)):
+        if len(first) == len(second) > 0:
+            changes = {a: now[b] for a, b in zip([*first, *second], [*second, *first], strict=True)}
+            orders.append((_changed(now, changes), f"{DIGITS[one]} and {DIGITS[other]} are exchanged"))
+    solver = PoseSolver(columns.worn)
+    rough = [
+        _rough(solver, columns.of(order)) + columns.left_over(order)
+        for order in [now, *(one for one, _ in orders)]
+    ]
+    for (order, words), cost in zip(orders, rough[1:], strict=True):
+        yield order, words, cost - rough[0]
+
+
+def _rough(solver: PoseSolver, seen: Float[np.ndarray, "F M 3"]) -> float:
+    """Rough cost of labels, by poses of the hand as designed; what repeats in all frames counts once."""
+    squares = np.minimum((solver.solve(seen).residuals ** 2).sum(axis=2), _ROUGH_MOST**2)
+    mean = np.nansum(squares, axis=0) / np.maximum(np.isfinite(squares).sum(axis=0), 1)
+    return float(mean.sum() / (2.0 * _ROUGH_NOISE**2))
