@@ -28,8 +28,8 @@ _FRAMES: Final = 10  # frames of a hand, whose errors are about independent
 _FEWEST_FRAMES: Final = 4
 _COMPLETE: Final = 0.75  # A frame shows this share of the usual number of markers.
 _ALIKE: Final = 0.3  # share of the frames that they are taken from
-_TRIED: Final = 5  # alternatives that are fitted, the likeliest by a rough cost first
-_ROUGH: Final = 30.0  # log-odds beyond which an alternative is not fitted
+_TRIED: Final = 4  # alternatives that are fitted, the likeliest by a rough cost first
+_ROUGH: Final = 12.0  # log-odds beyond which an alternative is not fitted
 _STRAY: Final = 10.0  # log-odds against a point that moves with the hand and is no marker
 _UNSEEN: Final = 5.0  # log-odds against a marker that is never seen
 _SELDOM: Final = 0.5  # share of the frames below which a marker is looked for among unlabeled points
@@ -39,11 +39,12 @@ _CHANGES: Final = 3  # changes that are tried one after the other
 _ROUGH_NOISE, _ROUGH_MOST = 0.004, 0.02  # [m] scale and bound of residuals in rough costs
 _OFTEN: Final = 0.5  # share of the frames without the marker that show it
 _TEMPERATURE: Final = 1.5  # divides log-odds of alternatives, as no fit knows all errors of gloves
-_PRIOR: Final = 2.0  # log-odds against each alternative, as the tracker has seen more frames
+_PRIOR: Final = 1.5  # log-odds against each alternative, as the tracker has seen more frames
 _LIKELY: Final = 0.01  # Alternatives are kept from this probability on.
 
 
 Order = tuple[int, ...]
+"""The column whose points each marker has: a label, or M and more for unlabeled points; -1 for none."""
 ALTERNATIVES: Final = "alternatives"
 """Key of the alternatives in the settings of a take."""
 
@@ -51,8 +52,8 @@ ALTERNATIVES: Final = "alternatives"
 class Alternative(NamedTuple):
     """A way to label a hand in all frames of a take."""
 
-    order: Order
-    """The column whose points each marker has: a label, or M and more for unlabeled points; -1 for none."""
+    markers: tuple[int, ...]
+    """Markers that have other points than in the take."""
     words: str
     """What it says of the labels, such as "RH1 and RH6 are exchanged"; empty for the labels as they are."""
     probability: float
@@ -79,7 +80,7 @@ class JudgedHand(NamedTuple):
             {
                 "words": one.words,
                 "probability": round(one.probability, 4),
-                "markers": [marker for marker, column in enumerate(one.order) if column != marker],
+                "markers": list(one.markers),
             }
             for one in self.alternatives
         ]
@@ -130,7 +131,7 @@ class Columns(NamedTuple):
         """Log-odds against an alternative for points that it leaves without a label, and unseen markers."""
         shown = np.isfinite(self.seen[..., 0]).mean(axis=0)
         left = np.delete(shown, [one for one in order if one >= 0]).sum()
-        return float(_STRAY * left + _UNSEEN * sum(one < 0 or not shown[one] for one in order))
+        return float(_STRAY * left + _UNSEEN * sum(one < 0 for one in order))
 
     def free(self, order: Sequence[int]) -> list[int]:
         """Columns with points that an alternative leaves without a label."""
@@ -138,9 +139,14 @@ class Columns(NamedTuple):
         return [one for one in range(len(shown)) if shown[one] and one not in order]
 
     @property
-    def given(self) -> tuple[int, ...]:
+    def given(self) -> Order:
         """The labels as they are."""
-        return tuple(range(len(self.names)))
+        return self.normal(range(len(self.names)))
+
+    def normal(self, order: Sequence[int]) -> Order:
+        """An order with -1 for columns without points."""
+        shown = np.append(np.isfinite(self.seen[..., 0]).any(axis=0), False)
+        return tuple(int(column) if shown[column] else -1 for column in order)
 
 
 def judge_hand(take: Take, side: Side) -> JudgedHand | None:
@@ -164,9 +170,18 @@ def judge_hand(take: Take, side: Side) -> JudgedHand | None:
     log_odds = np.array([-cost / _TEMPERATURE - _PRIOR * (one != given) for one, cost in costs.items()])
     shares = np.exp(log_odds - log_odds.max())
     shares /= shares.sum()
-    found = [Alternative(one, words[one], float(share)) for one, share in zip(costs, shares, strict=True)]
-    found = sorted((one for one in found if one.probability >= _LIKELY), key=lambda one: -one.probability)
-    return JudgedHand(side, tuple(found), fits[found[0].order].hand.with_side(side))
+    ranked = sorted(zip(costs, shares.tolist(), strict=True), key=lambda one: -one[1])
+    found = [
+        Alternative(_differences(given, order), words[order], share)
+        for order, share in ranked
+        if share >= _LIKELY
+    ]
+    return JudgedHand(side, tuple(found), fits[ranked[0][0]].hand.with_side(side))
+
+
+def _differences(given: Order, order: Order) -> tuple[int, ...]:
+    """Markers with other columns than those given."""
+    return tuple(marker for marker, pair in enumerate(zip(given, order, strict=True)) if pair[0] != pair[1])
 
 
 def _columns_of(take: Take, side: Side) -> Columns | None:
@@ -242,7 +257,8 @@ def _cluster(
 def _candidates(columns: Columns, now: Order, fit: Placement) -> list[tuple[Order, str]]:
     """Changes of an order that a rough cost does not exclude, the likeliest first."""
     found: dict[Order, tuple[float, str]] = {}
-    for order, words, cost in (*_reassigned(columns, now, fit), *_shifted(columns, now)):
+    for raw, words, cost in (*_reassigned(columns, now, fit), *_shifted(columns, now)):
+        order = columns.normal(raw)
         if cost < _ROUGH and (order not in found or cost < found[order][0]):
             found[order] = cost, words
     ranked = sorted(found.items(), key=lambda one: one[1][0])
