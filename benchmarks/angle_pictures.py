@@ -15,6 +15,7 @@ from handsim import Camera, HandModel, join_qpos
 from handsim.files.outputs import atomic_write
 from handsim.hand.angles import ISB_NAMES, isb_angles
 from handsim.hand.shape import BONE_NAMES, JOINT_NAMES, Side
+from handsim.pages import own_figures
 from handsim.space.camera import look_at
 from render import draw
 
@@ -71,13 +72,8 @@ _SHOWN: Final = {
 
 def main(path: str) -> None:
     """Draw the picture."""
-    from matplotlib import style
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    with style.context("default"):  # independent of the user's settings
-        figure = Figure(figsize=(9.0, 6.4), layout="constrained")
-        FigureCanvasAgg(figure)
+    with own_figures({}) as new_figure:
+        figure = new_figure(figsize=(9.0, 6.4), layout="constrained")
         for number, panel in enumerate(figure.subplots(2, 3).flat):
             _draw_panel(panel, number)
         with atomic_write(path) as temporary:

@@ -16,6 +16,7 @@ from gloves import GloveFit
 from handsim.files.outputs import atomic_write
 from handsim.hand.shape import BONES, PALM
 from handsim.hand.skin import vertex_normals
+from handsim.pages import own_figures
 from track import Calibration
 
 if TYPE_CHECKING:
@@ -37,13 +38,8 @@ def save_picture(path: str | Path, calibration: Calibration) -> None:
     Raises:
         OSError: The file cannot be written.
     """
-    from matplotlib import style
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    with style.context("default"):  # independent of the user's settings
-        figure = Figure(figsize=_SIZE, facecolor=_CARD, layout="constrained")
-        FigureCanvasAgg(figure)
+    with own_figures({}) as new_figure:
+        figure = new_figure(figsize=_SIZE, facecolor=_CARD, layout="constrained")
         panels = figure.subplots(1, 2)
         for panel, title, sign in zip(panels, _VIEWS, (1.0, -1.0), strict=True):
             _draw(panel, calibration, sign)

@@ -18,7 +18,16 @@ from gloves.layout import ACROSS_RANGE, ALONG_RANGE, MarkerLayout, MarkerPlace, 
 from gloves.optics.visibility import visible_cameras
 from handsim.errors import ArgumentError, LayoutError
 from handsim.hand.model import HandModel, Site, load_model
-from handsim.hand.shape import BONE_NAMES, DIGIT_OF_BONE, NUM_BONES, NUM_QPOS, PALM, HandShape, Side
+from handsim.hand.shape import (
+    BONE_NAMES,
+    DIGIT_OF_BONE,
+    JOINTS,
+    NUM_BONES,
+    NUM_QPOS,
+    PALM,
+    HandShape,
+    Side,
+)
 from handsim.hand.skin import all_weights, strongest_weights, vertex_normals
 from handsim.kernels import kernel
 from handsim.space.rig import CameraRig
@@ -90,6 +99,12 @@ class Attachment:
     def digits(self) -> Int[np.ndarray, "M"]:
         """Digit of the bone that carries most of each marker, -1 for the palm."""
         return np.asarray(DIGIT_OF_BONE[self.main_bones])
+
+    @property
+    def beyond(self) -> Bool[np.ndarray, "20 M"]:
+        """Whether each marker lies beyond each joint, and so can show its angle."""
+        bones, moved = self.main_bones, np.array([[joint.bone] for joint in JOINTS])
+        return np.asarray((bones >= moved) & (self.digits == DIGIT_OF_BONE[moved]))
 
     @property
     def feet(self) -> Float[np.ndarray, "M 3"]:

@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterable
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from handsim.errors import ArgumentError, HandSimError, choices
 
@@ -61,12 +61,35 @@ def shown_value(value: Any) -> str:
     return f"the class {kind.__name__}" if isinstance(value, type) else f"a {kind.__name__}"
 
 
+def as_numbers(name: str, values: ArrayLike, kind: DTypeLike | None = np.float64) -> NDArray[Any]:
+    """`values` as an array of `kind` (None: their own type); masked entries become NaN or -1."""
+    try:
+        array = as_array(values, kind)
+        if array.dtype.kind in "cSU":
+            raise TypeError("complex numbers or texts")
+        return np.asarray(array, dtype=kind)
+    except (TypeError, ValueError, OverflowError, RuntimeError) as error:  # torch raises the last one
+        raise ArgumentError(f"{name} is {shown_value(values)}, expected an array of numbers") from error
+
+
+def as_array(values: ArrayLike, kind: DTypeLike | None) -> NDArray[Any]:
+    """`values` as an array of their own type, a tensor of torch without its gradient.
+
+    What is masked, in an array or a list of arrays, becomes the missing value of `kind` (None: their own):
+    NaN, or -1 in whole numbers. NumPy alone would bring back the numbers below the mask.
+    """
+    items = values if isinstance(values, list | tuple) else [values]
+    if any(isinstance(item, np.ma.MaskedArray) for item in items):
+        masked: np.ma.MaskedArray[Any, Any] = np.ma.array(values, dtype=kind)
+        return np.asarray(masked.filled(np.nan if masked.dtype.kind == "f" else -1))
+    if hasattr(values, "detach"):
+        values = values.detach().cpu()
+    return np.asarray(values)
+
+
 def check_array(name: str, array: ArrayLike, shape: tuple[int | None, ...]) -> NDArray[np.float64]:
     """`array` as finite float64 whose last dimensions are `shape` (None: any length)."""
-    try:
-        values = np.asarray(array, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise ArgumentError(f"{name} is {shown_value(array)}, expected an array of numbers") from error
+    values = as_numbers(name, array)
     tail = values.shape[values.ndim - len(shape) :] if values.ndim >= len(shape) else ()
     if len(tail) != len(shape) or any(
         expected is not None and expected != got for expected, got in zip(shape, tail, strict=True)

@@ -12,14 +12,18 @@ from __future__ import annotations
 import ast
 import importlib
 import importlib.util
+import inspect
 import os
 import stat
 import sys
 import tempfile
 import warnings
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, Final
+
+from handsim._process import own_numerics, with_own_numerics
 
 
 def lazy_exports(package: str) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
@@ -38,7 +42,12 @@ def lazy_exports(package: str) -> tuple[Callable[[str], Any], Callable[[], list[
     def load(name: str) -> Any:
         if name not in lazy:
             raise AttributeError(f"module '{package}' has no attribute '{name}'")
-        value = getattr(importlib.import_module(lazy[name]), name)
+        with own_numerics():
+            module = importlib.import_module(lazy[name])
+        value = getattr(module, name)
+        if inspect.isfunction(value):
+            value = with_own_numerics(value)
+            setattr(module, name, value)
         setattr(own, name, value)
         return value
 
@@ -118,10 +127,18 @@ def _user_cache() -> Path:
 
 
 def is_writable(folder: Path) -> bool:
-    """Whether files can be made in a folder, or in the first of its parents that exists."""
-    while not folder.exists() and folder != folder.parent:
-        folder = folder.parent
-    return folder.is_dir() and os.access(folder, os.W_OK | os.X_OK)
+    """Whether files can be made in a folder, or in the first of its parents that exists.
+
+    Such a parent is tried with a nameless file, because some allow new files and refuse them, as /proc does.
+    """
+    there = next((one for one in (folder, *folder.parents) if os.path.exists(one)), folder)
+    if not os.path.isdir(there) or not os.access(there, os.W_OK | os.X_OK):
+        return False
+    try:
+        with nullcontext() if there == folder else tempfile.TemporaryFile(dir=there):
+            return True
+    except OSError:
+        return False
 
 
 def _own_folder() -> Path:

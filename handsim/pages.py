@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import base64
 import colorsys
+import importlib.util
 import io
 import os
-from collections.abc import Callable, Iterable, Sequence
+import sys
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import chdir, contextmanager, nullcontext
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
@@ -14,6 +17,7 @@ from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, Concatenate, Final, ParamSpec
 
 from handsim._checks import check_type, shown_value
+from handsim._process import environment
 from handsim.errors import ArgumentError
 from handsim.files.outputs import check_ending, write_text
 
@@ -169,6 +173,36 @@ def _html(section: Section) -> str:
     return "\n".join(parts)
 
 
+@contextmanager
+def own_figures(settings: dict[str, Any]) -> Iterator[type[Figure]]:
+    """The class of figures; within the block their settings are matplotlib's defaults and these.
+
+    matplotlib is imported here. pyplot, which needs a backend, is not used.
+    """
+    _import_matplotlib()
+    from matplotlib import rc_context, rcParamsDefault
+    from matplotlib.figure import Figure
+
+    usual: dict[Any, Any] = {name: value for name, value in rcParamsDefault.items() if name != "backend"}
+    with rc_context(usual | settings):
+        yield Figure
+
+
+def _import_matplotlib() -> None:
+    """Import matplotlib; without the user's backend and settings file if it cannot be imported with them."""
+    try:
+        importlib.import_module("matplotlib")
+    except (ValueError, OSError):
+        for name in [name for name in sys.modules if name.startswith("matplotlib.")]:
+            del sys.modules[name]  # half of a package cannot be imported again
+        found = importlib.util.find_spec("matplotlib")
+        usual = Path(str(found and found.origin)).with_name("mpl-data")
+        # A file in the current folder is read before the one that the variable names.
+        here = chdir(usual) if Path("matplotlibrc").exists() else nullcontext()
+        with environment(MPLBACKEND="", MATPLOTLIBRC=str(usual)), here:
+            importlib.import_module("matplotlib")
+
+
 def picture(
     size: tuple[float, float],
     draw: Callable[Concatenate[Figure, _Drawn], None],
@@ -177,14 +211,11 @@ def picture(
 ) -> str:
     """A figure of this size [inch], drawn by a function, as SVG in a `data:` URI.
 
-    The same numbers give the same bytes. matplotlib is imported here, and pyplot never.
+    The same numbers give the same bytes.
     """
-    from matplotlib import style
-    from matplotlib.figure import Figure
-
     drawn = io.BytesIO()
-    with style.context(["default", _PICTURES]):  # whatever the user's own settings are
-        figure = Figure(figsize=size, layout="constrained")
+    with own_figures(_PICTURES) as new_figure:
+        figure = new_figure(figsize=size, layout="constrained")
         draw(figure, *args, **options)
         figure.savefig(drawn, format="svg", metadata={"Date": None, "Creator": None})
     return "data:image/svg+xml;base64," + base64.b64encode(drawn.getvalue()).decode()

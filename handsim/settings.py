@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import types
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Final, Literal, Self, Union, get_args, get_origin, get_type_hints
@@ -51,8 +51,8 @@ class Settings:
 
     Each field is checked by its annotation when an object is made: numbers by their `Limits`, names by their
     `Literal`, others by their type, which errors describe as `Expected`. A group of settings may be given as
-    a mapping of the fields that differ from its default (a `Mixture` as its shares), a tuple as a list or as
-    its only item, a path as a string.
+    a mapping of the fields that differ from its default, as on the command line, a tuple as a list, an array
+    or its only item, a path as a string, a number as one of numpy's.
 
     Raises:
         ArgumentError: A field has another type, is out of range, or is none of the valid names.
@@ -107,7 +107,7 @@ class Settings:
 
 
 class Mixture(Settings):
-    """Base of shares of kinds, which are normalized; a share that a mapping does not name is 0."""
+    """Base of shares of kinds, which are normalized; a share that is not named keeps its default."""
 
     __slots__ = ()
 
@@ -153,14 +153,16 @@ def _checked(name: str, value: Any, hint: Any, field: dataclasses.Field[Any] | N
         hint, *extras = get_args(hint)
         limits = next((one for one in extras if isinstance(one, Limits)), limits)
         expected = next((one for one in extras if isinstance(one, Expected)), expected)
+    if isinstance(value, np.ndarray | np.generic):  # else records would hold their names
+        value = value.tolist()
     origin = get_origin(hint)
     if origin in _UNIONS:
         return _checked_union(name, value, get_args(hint), limits, expected, field)
     if origin is Literal:
         check_choice(value, get_args(hint), noun=name.replace("_", " "))
         return value
-    if origin is tuple:
-        return _checked_tuple(name, value, get_args(hint), limits)
+    if origin in (tuple, Sequence):  # items of a sequence are left to `check`
+        return _checked_tuple(name, value, get_args(hint) if origin is tuple else (object, ...), limits)
     if hint in (int, float):
         return _checked_number(name, value, hint, limits)
     if dataclasses.is_dataclass(hint) and isinstance(value, Mapping):
@@ -177,7 +179,7 @@ def _checked_object(name: str, value: Any, kind: Any, expected: Expected | None)
             raise ArgumentError(f"{name} is {shown_value(value)}, expected {_words(kind, expected)}")
     elif isinstance(kind, type) and get_origin(kind) is None:
         check_type(name, value, kind, _words(kind, expected), () if expected is None else expected.names())
-    return value  # values of a generic type, such as a sequence of several types, are left to `check`
+    return value  # values of a generic type are left to `check`
 
 
 def _checked_union(
@@ -210,11 +212,11 @@ def _suits(value: Any, hint: Any) -> bool:
         return _suits(value, get_args(hint)[0])
     if origin is Literal:
         return value in get_args(hint)
-    if origin is tuple:
-        kinds = get_args(hint)[:1]
+    if origin in (tuple, Sequence):
+        kinds = get_args(hint)[:1] if origin is tuple else (object,)
         return isinstance(value, tuple | list) and all(_suits(item, *kinds) for item in value)
     if hint in (int, float):
-        return isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
+        return isinstance(value, int | float) and not isinstance(value, bool)
     if getattr(hint, "_is_protocol", False):
         return all(hasattr(value, member) for member in _members(hint))
     kinds = (hint, str) if hint is Path else (origin or hint,)
@@ -244,23 +246,20 @@ def _checked_tuple(name: str, value: Any, arms: tuple[Any, ...], limits: Limits 
 
 def _checked_number(name: str, value: Any, kind: type, limits: Limits | None) -> Any:
     if kind is int:
-        number = value.item() if isinstance(value, np.integer) else value
         if limits is None:
-            check_type(name, number, int, "a whole number")
+            check_type(name, value, int, "a whole number")
         else:
-            check_count(name, number, int(limits.low), limits.high)
-        return number
+            check_count(name, value, int(limits.low), limits.high)
+        return value
     bounds = Limits(-np.inf) if limits is None else limits
     check_number(name, value, bounds.low, bounds.high, above=bounds.above)
     return value
 
 
 def _group_of(name: str, changes: Mapping[str, Any], kind: Any, field: dataclasses.Field[Any] | None) -> Any:
-    """A group of settings from the fields that differ from its default; a mixture from all its shares."""
+    """A group of settings from the fields that differ from its default."""
     usual = None
-    if issubclass(kind, Mixture):
-        changes = dict.fromkeys((one.name for one in dataclasses.fields(kind)), 0.0) | dict(changes)
-    elif field is not None and field.default_factory is not dataclasses.MISSING:
+    if field is not None and field.default_factory is not dataclasses.MISSING:
         usual = field.default_factory()
     return _changed(kind, usual if isinstance(usual, kind) else None, changes, f"setting of {name}")
 

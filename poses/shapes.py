@@ -208,6 +208,7 @@ def _anywhere(count: int, rng: np.random.Generator) -> NDArray[np.float64]:
 
 MAX_PENETRATION: Final = 0.001
 """Deepest self-penetration [m] of a valid pose: skin yields by about this much."""
+_ROUNDING: Final = 1e-6  # [rad] Single precision rounds angles by less.
 _HALVINGS: Final = 4
 _THUMB: Final = np.array([joint.name.startswith("thumb") for joint in JOINTS])
 _ABDUCTIONS: Final = np.array([joint.name.endswith("abduction") for joint in JOINTS])
@@ -218,7 +219,7 @@ def is_valid(
     model: HandModel, angles: Float[np.ndarray, "T 20"], *, max_penetration: float = MAX_PENETRATION
 ) -> Bool[np.ndarray, "T"]:
     """Whether each pose is in range, with a self-penetration of at most `max_penetration` [m]."""
-    inside = ((angles >= LOW - 1e-9) & (angles <= HIGH + 1e-9)).all(axis=1)
+    inside = ((angles >= LOW - _ROUNDING) & (angles <= HIGH + _ROUNDING)).all(axis=1)
     free: NDArray[np.bool_] = model.penetration(join_qpos(angles)) <= max_penetration
     return inside & free
 
@@ -239,11 +240,14 @@ def validate(model: HandModel | HandShape | str, qpos: Float[np.ndarray, "T 27"]
 @functools.lru_cache(maxsize=16)
 def resting_angles(model: HandModel) -> Float[np.ndarray, "20"]:
     """A valid relaxed pose of this hand, with fingers fanned as little as their girth allows; read-only."""
-    fans = np.arange(0.0, 13.0, 2.0)
+    fans = np.arange(0.0, 21.0, 2.0)
     tries = np.tile(gesture("relaxed"), (len(fans), 1))
     tries[:, 4::4] += fans[:, None] * _FAN
-    valid = is_valid(model, tries, max_penetration=0.8 * MAX_PENETRATION)
-    if not valid.any():
+    for share in (0.8, 1.0):  # with some room left where the girth allows it
+        valid = is_valid(model, tries, max_penetration=share * MAX_PENETRATION)
+        if valid.any():
+            break
+    else:
         raise PoseError("this hand's fingers overlap at rest: its girths are too large for its breadth")
     resting: NDArray[np.float64] = tries[valid.argmax()]
     resting.setflags(write=False)

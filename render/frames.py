@@ -84,6 +84,8 @@ class HandTruth:
     there than the finger is thick."""
     box: Float[np.ndarray, "4"]
     """Left, top, width, height [px] of the visible hand without its forearm; NaN where none is visible."""
+    mask: Bool[np.ndarray, "H W"]
+    """Pixels of the visible hand with its markers, without its forearm."""
     vertices: Float32[np.ndarray, "V 3"]
     """`HandModel.skin` in the world [m]; on pictures of bare hands joints shape it further."""
     openxr: Float[np.ndarray, "J 4 4"] = field(default_factory=lambda: np.empty((0, 4, 4)))

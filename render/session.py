@@ -369,7 +369,7 @@ def render_take(
     absent = drawing.frames_without_hands()
     if absent and drawing.subject.film is None:  # frames of a video are left out for reasons that are told
         told = f"frames without a hand are not drawn: {len(absent)} of {drawing.take.num_frames}"
-        warnings.warn(f"{told} (the first: {absent[0]})", HandSimWarning, stacklevel=2)
+        warnings.warn(f"{told} (the first: {absent[0]})", HandSimWarning, stacklevel=3)
     shards, views = drawing.shards(), drawing.viewpoints.num_cameras
     make = functools.partial(_render_shard, kept, formats, config)
     record = _settings(drawing, kept) | {"formats": list(formats)}
@@ -478,7 +478,7 @@ def _settings(drawing: Drawing, source: Source) -> dict[str, Any]:
         files, broken = photo_files(Path(str(drawing.config.background.photos)))
         if broken:
             more = f" and {len(broken) - 1} more" if len(broken) > 1 else ""
-            told = f"left out: {broken[0]}{more}, not readable as photographs"
+            told = f"left out: {broken[0]}{more}"
             warnings.warn(told, HandSimWarning, stacklevel=3)
         listed = "\n".join(f"{file} {file.stat().st_size}" for file in files)
         names = listed.encode("utf-8", "surrogateescape")  # names of files need not be valid text

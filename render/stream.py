@@ -12,14 +12,14 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike, NDArray
-from torch.utils.data import IterableDataset, get_worker_info
+from torch.utils.data import IterableDataset
 
 from gloves.layout import MarkerLayout
 from gloves.takes.take import Take
 from handsim._checks import check_choice, check_number, check_type, shown_value
+from handsim._process import SharedStream, with_own_numerics
 from handsim.errors import ArgumentError, DatasetError, PoseError
 from handsim.files.inputs import load_json
-from handsim.files.outputs import plain_path
 from handsim.hand.model import HandModel, hand_keypoints
 from handsim.hand.shape import NUM_KEYPOINTS, NUM_QPOS, SIDES, HandShape, Side, pack_hand, sample_shape
 from handsim.space.camera import PRESETS, Camera, preset
@@ -29,6 +29,7 @@ from render.config import NEAR_SENSOR, RenderConfig, SpawnKey
 from render.depth_sensor import DepthSensor
 from render.formats.records import CENTER
 from render.frames import Doubles, HandTruth, Integers, RenderedFrame
+from render.photographs import read_photograph
 from render.session import configured, open_studio, sample_choices
 from render.studio import Moment, Studio
 from render.subject import Model, Subject, load_subject, models_of, source_of, subject_of_poses
@@ -88,15 +89,6 @@ def _hand(path: Path, name: str, label: dict[str, Any]) -> LabeledHand:
     )
 
 
-def read_photograph(path: Path) -> NDArray[np.uint8]:
-    """A photograph (H, W, 3), sRGB."""
-    with plain_path(path) as plain:
-        bgr = cv2.imread(str(plain), cv2.IMREAD_COLOR)
-    if bgr is None:
-        raise DatasetError(f"{path}: not a readable photograph")
-    return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), dtype=np.uint8)
-
-
 def cut_out(
     hand: LabeledHand, size: int, share: float, *, rng: np.random.Generator
 ) -> dict[str, NDArray[np.generic]]:
@@ -140,7 +132,7 @@ class _Sitting(NamedTuple):
     person: int
 
 
-class PictureStream(IterableDataset[dict[str, torch.Tensor]]):
+class PictureStream(SharedStream, IterableDataset[dict[str, torch.Tensor]]):
     """Random pictures of hands with their truth, without end.
 
     Picture k depends on the seed and k alone. `people` people take turns: picture k shows number k modulo
@@ -194,10 +186,11 @@ class PictureStream(IterableDataset[dict[str, torch.Tensor]]):
         glove: Marker layout on the hands, where the config dresses them in gloves.
         batch: Number of pictures in a row that one worker draws. The batches of a `DataLoader` of this batch
             size are then the same with any number of workers; else it is the pictures, in another order.
+            Ranks of torch.distributed take turns like this too, or those that torchrun, srun or mpirun state.
         photographs: File of COCO keypoints of your own photographs (21 a hand, in our order), which are
             beside it or in a folder `images` there; it takes a `crop`.
         photograph_share: Share of the pictures that are photographs.
-        start: Number of the first picture.
+        start: Number of the first picture, the same for all ranks.
         seed: Seed of all random choices; the config's when not given.
 
     Raises:
@@ -269,9 +262,9 @@ class PictureStream(IterableDataset[dict[str, torch.Tensor]]):
             raise ArgumentError("photographs go with a crop, colors, and pictures of one hand")
         cv2.setNumThreads(1)  # forked workers would wait for the threads of this process forever
 
+    @with_own_numerics
     def __iter__(self) -> Iterator[dict[str, torch.Tensor]]:
-        worker = get_worker_info()
-        mine, workers = (0, 1) if worker is None else (worker.id, worker.num_workers)
+        mine, shares = self.share()
         if cv2.getNumThreads() > 1:  # this is a spawned worker
             cv2.setNumThreads(1)
         sitting: dict[int, tuple[int, _Sitting]] = {}
@@ -292,7 +285,7 @@ class PictureStream(IterableDataset[dict[str, torch.Tensor]]):
                     sitting[place] = person, self._new_sitting(person * self._people + place)
                 picture = self._picture(number, sitting[place][1], rank)
                 yield picture if self._photographs is None else _as_photographs(picture)
-            first += workers * self._batch
+            first += shares * self._batch
 
     def _new_sitting(self, person: int) -> _Sitting:
         """A new person, with poses for all of their pictures."""

@@ -85,7 +85,7 @@ def hand_truth(
     recorded: bool = True,
     openxr: bool = False,
 ) -> HandTruth:
-    """Ground truth of a hand, by its number among those in the picture; vertices only where `recorded`."""
+    """Ground truth of a hand, by its number among those in the picture; mask, vertices where `recorded`."""
     model = figure.fit.model
     keypoints = hand_keypoints(model, qpos[None])[0]
     poses = joint_poses(model, qpos[None])[0] if openxr else np.empty((0, 4, 4))
@@ -101,6 +101,7 @@ def hand_truth(
         keypoints_world=keypoints,
         visible=visible[: len(keypoints)],
         box=_box(pictures.parts, number),
+        mask=_mask(pictures, number) if recorded else np.empty((0, 0), dtype=bool),
         vertices=model.skin(qpos[None])[0].astype(np.float32) if recorded else np.empty((0, 3), np.float32),
         openxr=poses,
         openxr_visible=visible[len(keypoints) :],
@@ -137,6 +138,12 @@ def _box(parts: Bytes, number: int) -> Doubles:
     mine = cv2.inRange(parts, first, first + FOREARM - 1)
     left, top, width, height = cv2.boundingRect(mine)
     return np.array([left, top, width, height], np.float64) if width else np.full(4, np.nan)
+
+
+def _mask(pictures: Geometry, number: int) -> Flags:
+    """Mask (H, W) of a hand with its markers, without its forearm."""
+    forearm = 1 + PARTS_A_HAND * number + FOREARM
+    return np.asarray((pictures.instances == 1 + number) & (pictures.parts != forearm))
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from gloves.fit import GloveFit, check_layout, settle_glove
 from gloves.layout import MarkerLayout, load_layout
 from gloves.takes.take import Take, load_take
-from handsim._checks import check_choice, check_count, check_type
+from handsim._checks import as_array, as_numbers, check_choice, check_count, check_type
 from handsim.errors import ArgumentError, CaptureError, HandSimError, HandSimWarning, choices, errors_of
 from handsim.files.arrays import read_npz
 from handsim.files.inputs import check_regular, checksum
@@ -113,10 +113,7 @@ def _stored_qpos(arrays: Mapping[str, NDArray[Any]], count: int) -> Float[np.nda
 
 def _floats(arrays: Mapping[str, NDArray[Any]], name: str, shape: tuple[int, ...]) -> Doubles:
     """An array (T, *shape), NaN allowed; for one hand, its axis of hands may be missing."""
-    given = arrays[name]
-    if given.dtype.kind not in "fiu":
-        raise ArgumentError(f"{name} is of type {given.dtype}, expected numbers")
-    values = given.astype(np.float64)
+    given = values = as_numbers(name, arrays[name]).copy()  # orientations are normalized in place
     if shape[0] == 1 and values.ndim == len(shape):
         values = values[:, None]
     if values.shape[1:] != shape or not 1 <= len(values) <= _MOST_FRAMES:
@@ -170,12 +167,9 @@ def _tell_beyond(name: str, qpos: Doubles) -> None:
 def _times(arrays: Mapping[str, NDArray[Any]], frames: int) -> Doubles | None:
     if "times" not in arrays:
         return None
-    times = arrays["times"]
-    if times.dtype.kind not in "fiu" or times.shape != (frames,):
-        raise ArgumentError(
-            f"times is {times.dtype} of shape {times.shape}, expected ({frames},) numbers [s]"
-        )
-    times = times.astype(np.float64)
+    times = as_numbers("times", arrays["times"])
+    if times.shape != (frames,):
+        raise ArgumentError(f"times has shape {times.shape}, expected ({frames},) numbers [s]")
     if not np.isfinite(times).all() or (np.diff(times) <= 0.0).any():
         raise ArgumentError("times are not finite and increasing")
     return times if len(times) > 1 else None
@@ -371,7 +365,7 @@ def subject_of_poses(
     seed: int = 0,
 ) -> Subject:
     """A user's own poses."""
-    array = np.asarray(qpos)
+    array = as_numbers("qpos", qpos)
     models = models_of(model, 2 if array.ndim == 3 else 1)
     if len(models) == 1 and array.ndim == 2 and array.shape[1] == NUM_JOINTS:
         array = join_qpos(array)
@@ -384,7 +378,7 @@ def subject_of_poses(
     known = () if people is None or isinstance(people, int) else people
     shapes = tuple(load_model(one).shape for one in known) or None
     given = {"qpos": array, "times": times, "person": person}
-    arrays = {name: np.asarray(value) for name, value in given.items() if value is not None}
+    arrays = {name: as_array(value, None) for name, value in given.items() if value is not None}
     poses = _own_poses(arrays, len(models), shapes)
     _tell_beyond("poses", poses.qpos)
     cast = _cast(poses, count, seed) if model is None or people is not None else None

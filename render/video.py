@@ -19,6 +19,7 @@ from handsim.files.inputs import check_regular
 from handsim.files.outputs import plain_path
 from handsim.space.camera import Camera, Lens
 from render.frames import Bytes, Floats
+from render.photographs import quiet_decoder
 
 _USUAL_RATE: Final = 30.0  # [Hz] of a video that does not tell its own
 _MOST_FRAMES: Final = 1 << 20
@@ -50,13 +51,8 @@ class Film:
 
     def _open(self) -> None:
         os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # Quiet: the error below says enough.
-        level = cv2.utils.logging.getLogLevel()
-        cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-        try:
-            with plain_path(self.path) as plain:
-                self._reader, self._next = cv2.VideoCapture(str(plain), cv2.CAP_FFMPEG), 0
-        finally:
-            cv2.utils.logging.setLogLevel(level)
+        with quiet_decoder(), plain_path(self.path) as plain:
+            self._reader, self._next = cv2.VideoCapture(str(plain), cv2.CAP_FFMPEG), 0
         if not self._reader.isOpened():
             why = "not a video that can be read, expected an .mp4, .mov or .avi file"
             raise CaptureError(f"{self.path}: {why if self.path.exists() else 'no such file'}")

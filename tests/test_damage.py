@@ -81,7 +81,7 @@ def assert_never_truth(
 @EXTENT
 def test_a_training_set(tmp_path, monkeypatch, state, flips):
     monkeypatch.setattr(generation, "ROWS_PER_SHARD", 20)
-    settings = GenerateSettings(num_frames=50, frames_per_hand=10, scenes={"alone": 1.0})
+    settings = GenerateSettings(num_frames=50, frames_per_hand=10, scenes={"together": 0, "holding": 0})
 
     def again(folder: Path) -> None:
         make_dataset(settings, folder, workers=1)
@@ -104,7 +104,7 @@ def small_run(tmp_path, monkeypatch) -> Callable[..., object]:
     """Training of a tiny network, with a page that lacks its pictures."""
     for page in ("run_page", "dataset_page", "hand_plot"):
         monkeypatch.setattr(f"train.reports.{page}.picture", lambda *drawn: "data:,")
-    settings = GenerateSettings(num_frames=300, frames_per_hand=20, scenes={"alone": 1.0})
+    settings = GenerateSettings(num_frames=300, frames_per_hand=20, scenes={"together": 0, "holding": 0})
     make_dataset(settings, tmp_path / "set", workers=1)
     return functools.partial(train_labeler, tmp_path / "set", settings=RUN)
 

@@ -47,6 +47,7 @@ from track.user import AnyGlove, AnyLabeler, User, labeler_of, nominal_user
 OnFrame = Callable[[StreamedFrame, TrackedFrame], None]
 _COMPARED: Final = 200  # pairs of successive frames compared to see whether frames are continuous
 _CONTINUOUS: Final = 0.005  # [m] A pair is continuous if distances within a hand change less.
+_CORRECTIONS: Final = 2  # times that a take is labeled again because other labels are likelier
 _MOST: Final = 0.5  # Frames are tracked if at least this share of their pairs is continuous.
 
 
@@ -86,7 +87,7 @@ def label_capture(
     if (labeled.point_list.labels < 0).all():
         none = f"no hand found, expected hands in glove '{labeled.settings['glove']}' (--glove names another)"
         none = none if len(labeled.point_list.points) else no_points(labeled)
-        warnings.warn(none, HandSimWarning, stacklevel=2)
+        warnings.warn(none, HandSimWarning, stacklevel=3)
     return labeled
 
 
@@ -120,17 +121,22 @@ def _labeled_take(
     return dataclasses.replace(take, point_list=points)
 
 
-def _judged(label: Callable[[TrackerSetup], Take], setup: TrackerSetup) -> tuple[Take, TrackerSetup]:
-    """Label a take, and once more with markers elsewhere if an alternative to its labels is likelier."""
+def _judged(
+    label: Callable[[TrackerSetup], Take], setup: TrackerSetup, *, is_final: bool = False
+) -> tuple[Take, TrackerSetup]:
+    """Label a take, and again with markers elsewhere while an alternative to its labels is likelier.
+
+    Hands that were given or calibrated stay as they are, and a `final` take is not labeled again.
+    """
     take = label(setup)
-    judged = judge_take(take)
-    if setup.is_auto and any(one.is_changed for one in judged):
-        placed = {one.side: one.hand for one in judged if one.is_changed}
+    for _ in range(_CORRECTIONS if setup.is_auto and not is_final else 0):
+        placed = {one.hand.side: one.hand for one in judge_take(take) if one.is_changed}
+        if not placed:
+            break
         hands = tuple(placed.get(hand.side, hand) for hand in setup.user)
         setup = setup.with_user(dataclasses.replace(setup.user, hands=hands))
         take = label(setup)
-        judged = judge_take(take)
-    return with_doubt(take, judged), setup
+    return with_doubt(take, judge_take(take)), setup
 
 
 def track_capture(
@@ -171,8 +177,15 @@ def track_capture(
     source, frames, setup = _opened(capture, chosen, warns=True)
     pins = () if corrections is None else _checked_corrections(Path(corrections), source, setup)
     if chosen.calibrate:
-        setup = _calibrated(tracked_take(source, frames, setup.tracker(), progress=progress), setup)
-    take = tracked_take(source, frames, setup.tracker(), sinks, on_frame, progress)
+        first, setup = _judged(
+            lambda now: tracked_take(source, frames, now.tracker(), progress=progress), setup
+        )
+        setup = _calibrated(first, setup)
+    take, setup = _judged(
+        lambda now: tracked_take(source, frames, now.tracker(), sinks, on_frame, progress),
+        setup,
+        is_final=chosen.calibrate or bool(sinks),
+    )
     points = dataclasses.replace(take.point_list, confidence=label_confidence(take))
     record = {**take.settings, **_named(capture, source), **setup.settings}
     take = dataclasses.replace(take, point_list=points, settings=record)
@@ -180,7 +193,7 @@ def track_capture(
         return smooth_take(take) if chosen.smooth else take
     corrected = correct_take(take, pins)
     for sentence in unfitting_sentences(Path(corrections), corrected.unfitting):
-        warnings.warn(sentence, HandSimWarning, stacklevel=2)
+        warnings.warn(sentence, HandSimWarning, stacklevel=3)
     return corrected.take
 
 
@@ -226,19 +239,21 @@ def calibrate(
 
     source, frames, setup = _opened(capture, CalibrateSettings.of(settings, options))
     on_label = partial(on_part, "frames")
-    take = tracked_take(source, frames, setup.tracker(), progress=on_label)
+    take, setup = _judged(
+        lambda now: tracked_take(source, frames, now.tracker(), progress=on_label), setup
+    )
     done = calibrate_take(take, setup.start, setup.user, on_part)
     if leaves_markers(take, done):
         tracker = Tracker([one.hand for one in done], setup.labeler)
         take = tracked_take(source, frames, tracker, progress=on_label)
         done = calibrate_take(take, setup.start, setup.user, on_part)
     for sentence in misfits(take, calibrates=True):
-        warnings.warn(sentence, HandSimWarning, stacklevel=2)
+        warnings.warn(sentence, HandSimWarning, stacklevel=3)
     name = _named(capture, source).get("capture", "a capture")
     found = kept_user(take, done, setup.user, f"from {name}", on_part)
     for one in found.calibrations:
         if not one.is_better:
-            warnings.warn(f"{one.hand.side} hand: {one}", HandSimWarning, stacklevel=2)
+            warnings.warn(f"{one.hand.side} hand: {one}", HandSimWarning, stacklevel=3)
     return found
 
 
@@ -301,9 +316,9 @@ def _opened(
     capture: AnyCapture, settings: LabelSettings, *, warns: bool = False
 ) -> tuple[Capture, list[StreamedFrame], TrackerSetup]:
     """A capture, its frames and the setup that tracks them, with measured hands unless settings give them."""
-    setup = TrackerSetup.of(settings)
     source = capture_of(capture)
     frames = checked_frames(source)
+    setup = TrackerSetup.of(settings)  # last, because a glove may have to be learned
     return source, frames, setup.measured(sample_frames(frames), warns=warns)
 
 
@@ -330,7 +345,7 @@ def _calibrated(take: Take, setup: TrackerSetup) -> TrackerSetup:
     try:
         done = calibrate_take(take, setup.start, setup.user)
     except CalibrationError as error:
-        warnings.warn(f"not calibrated: {error}", HandSimWarning, stacklevel=3)
+        warnings.warn(f"not calibrated: {error}", HandSimWarning, stacklevel=4)
         return setup
     found = kept_user(take, done, setup.user, "on the take itself")
     better = {hand.side: hand for hand in found}

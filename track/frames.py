@@ -10,18 +10,17 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
-from numpy.typing import ArrayLike, NDArray
 
 from gloves.captures.capture import Capture, check_place, check_unit
 from gloves.captures.formats import READABLE, read_capture
 from gloves.optics.reconstruction import number_runs
 from gloves.takes.points import Status
 from gloves.takes.take import Take, load_take
-from handsim._checks import check_choice, shown_value
+from handsim._checks import as_numbers, check_choice, shown_value
 from handsim.errors import ArgumentError
 from handsim.hand.shape import JOINT_NAMES, NUM_JOINTS, NUM_KEYPOINTS, Side
 from track.config import TrackerConfig
@@ -134,8 +133,8 @@ class FrameValidator:
         self, points: Float[np.ndarray, "N 3"], ids: Int[np.ndarray, "N"] | None, time: float | None
     ) -> IncomingFrame:
         """Validate the next frame; an ID is -1 where there is none, and `ids` may be None."""
-        points = _numbers("points", points, np.float64)
-        ids = np.full(points.shape[:1], -1) if ids is None else _numbers("ids", ids, np.int64)
+        points = as_numbers("points", points)
+        ids = np.full(points.shape[:1], -1) if ids is None else as_numbers("ids", ids, np.int64)
         if ids.ndim != 1 or points.shape != (len(ids), 3):
             count = ids.size
             raise ArgumentError(f"points have shape {points.shape}, expected ({count}, 3) for {count} IDs")
@@ -177,14 +176,6 @@ class FrameValidator:
         newest = min(span, _LONGEST_INTERVAL * self._interval)
         self._interval += _INTERVAL_SMOOTHING * (newest - self._interval)
         return []
-
-
-def _numbers(name: str, values: ArrayLike, kind: type) -> NDArray[Any]:
-    """Convert values to an array of numbers; an `ArgumentError` if they are not numbers."""
-    try:
-        return np.asarray(values, dtype=kind)
-    except (TypeError, ValueError, OverflowError) as error:
-        raise ArgumentError(f"{name} is {shown_value(values)}, expected an array of numbers") from error
 
 
 Spreads = tuple[Float[np.ndarray, "20"], Float[np.ndarray, "21"]]

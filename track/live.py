@@ -5,11 +5,11 @@ from __future__ import annotations
 import gc
 import math
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from time import monotonic, sleep
-from typing import Final, NamedTuple, Protocol
+from typing import Any, Final, NamedTuple, NoReturn, Protocol
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from gloves.fit import GloveFit
 from gloves.takes.archives import check_unused, growing_path
 from gloves.takes.take import Take, load_take
 from handsim.app.messages import LiveStatus, named_steps
+from handsim.errors import CaptureError
 from handsim.files.signals import InterruptFlag, Stopped, interrupt_flag, interrupts_bare
 from track.captures import OnFrame
 from track.frames import StreamedFrame, TrackedFrame
@@ -30,9 +31,9 @@ from track.tracker import Tracker
 
 _PACE_PERIOD: Final = 1.0  # [s] between two reports on dropped frames
 _RETRY: Final = 0.5  # [s] between two attempts to reach a server
+_FIRST_FRAME: Final = 10.0  # [s] A first frame is awaited at least this long if the session has a length.
 _LAGS: Final = 100_000  # number of newest frames whose lag is kept
-_FOREIGN: Final = "foreign_packets"
-_PACKETS: Final = {"damaged_packets": "damaged", _FOREIGN: "of other senders"}
+_PACKETS: Final = {"damaged_packets": "damaged", "foreign_packets": "of other senders"}
 """Words for the counts of ignored packets."""
 _FRAMES: Final = {
     "frames_in_order": "in order",
@@ -96,65 +97,78 @@ def track_live(
 ) -> LiveTake:
     """Track a stream, into `out` if given, until `seconds` are over, the stream ends or a signal comes.
 
-    After each frame the text of `guide` is shown; if it is None, tracking ends. The first signal writes the
-    take without the waiting frames; a second one keeps the recording as it is.
+    The `seconds` count from the first frame, which is awaited as long, at least ten seconds; without
+    `seconds` it is awaited until a signal comes. After each frame the text of `guide` is shown; if it is
+    None, tracking ends. The first signal writes the take without the waiting frames; a second one keeps the
+    recording as it is. If the recording fails, outputs still get all frames.
+
+    Raises:
+        CaptureError: No server answered or no frame came in time, or the recording failed.
     """
     if out is not None:
         check_unused(growing_path(out))
-    with named_steps("getting ready"):
-        tracker = setup.tracker()
-        tracker.warm_up()
-        _start(outputs, tracker)
-        gc.freeze()  # A garbage collection would stop tracking for up to 0.25 s.
-    until = math.inf  # [s] end of tracking on the monotonic clock
+    tracker = _ready_tracker(setup, outputs)
+    patience = math.inf if seconds is None else max(seconds, _FIRST_FRAME)
+    until = monotonic() + patience  # [s] end of tracking on the monotonic clock
     interrupted = InterruptFlag()
     with (
         LiveStatus() as status,
-        _open_answering(address, lambda: interrupted() or monotonic() >= until, status) as stream,
+        _open_answering(address, lambda: interrupted() or monotonic() >= until, until, status) as stream,
         ExitStack() as stack,
     ):
         stack.enter_context(interrupt_flag(interrupted))  # From here on a signal keeps the frames so far.
-        recorder = None
-        if out is not None:
-            recorder = stack.enter_context(Recorder(out, tracker, {"capture": address, **setup.settings}))
-            stack.enter_context(_recording_kept(recorder))
-            status.say(f"recording to {recorder.part}, which becomes {out} at the end; Ctrl-C ends it")
+        settings = {"capture": address, **setup.settings}
+        recording = _Recording(stack, out, tracker, settings, outputs, status)
         sizing = stack.enter_context(LiveSizing(setup))
         status.show("waiting for the first frame")
         stream.forgive()
         pace, doubt = _Pace(), ""
         for frame in stream:
-            if seconds is not None and not frame.silent:
-                until = min(until, frame.arrived + seconds)
+            if seconds is not None and not frame.silent and not pace.frames:
+                until = frame.arrived + seconds
             if interrupted() or frame.arrived > until:
                 break
             tracked = sizing.eased(tracker.step(frame.points, frame.ids, frame.time), tracker)
             for output in outputs:
                 output.send(frame, tracked)
             pace.add(frame)
-            if recorder is not None:
-                recorder.add(frame, tracked)
+            recording.add(frame, tracked)
             on_frame(frame, tracked)
             if sizing.step(frame, tracked, tracker):
                 _start(outputs, tracker)
                 if sizing.is_settled:
-                    _note_size(tracker, recorder, status)
+                    recording.resize(tracker)
             if (wish := guide(tracked)) is None:
                 break
-            dropping = pace.tick(stream.counts)
-            if frame.silent or dropping or status.due:
-                line = _status_line(frame, tracked, stream.counts, outputs, pace)
-                status.show(line if frame.silent else wish or line, now=frame.silent or dropping)
+            new = pace.tick(stream.counts) or frame.silent > pace.is_silent
+            pace.is_silent = frame.silent
+            if new or status.due:
+                line = _status_line(frame, tracked, stream, outputs, pace)
+                status.show(line if frame.silent else wish or line, now=new)
             if not doubt and (doubt := stream.point_doubt):
                 status.say(doubt)
         stream.end(until)
         counts = stream.counts
-        take, step, duration = (None, 1, 0.0) if recorder is None else _written(recorder, out, counts, status)
+        if not pace.frames and (out is not None or monotonic() >= until):
+            waited = f" in {patience:g} s" if monotonic() >= until else ""
+            recording.discard(f"{address}: 0 frames came{waited}; {stream.silence_doubt}")
+        take, step = recording.finish(counts, pace)
     after = counts["frames_in_order"] + counts["reordered_frames"] - counts["dropped_frames"]
     counts["frames_after_end"] = max(0, after - pace.frames)
     notes = _notes(counts, step, pace, stream.order.interval)
     sent = (note for output in outputs for note in output.notes())
+    duration = pace.duration + (1.0 / take.rate if take is not None else 0.0)
     return LiveTake(take, pace.frames, duration, (*notes, *sent, *filter(None, [stream.point_doubt])))
+
+
+def _ready_tracker(setup: TrackerSetup, outputs: Sequence[FrameOutput]) -> Tracker:
+    """The tracker of a session, after all that would hold up its first frames."""
+    with named_steps("getting ready"):
+        tracker = setup.tracker()
+        tracker.warm_up()
+        _start(outputs, tracker)
+        gc.freeze()  # A garbage collection would stop tracking for up to 0.25 s.
+    return tracker
 
 
 def _start(outputs: Sequence[FrameOutput], tracker: Tracker) -> None:
@@ -163,31 +177,77 @@ def _start(outputs: Sequence[FrameOutput], tracker: Tracker) -> None:
         output.start(tracker.hands, tracker.bodies)
 
 
-def _note_size(tracker: Tracker, recorder: Recorder | None, status: LiveStatus) -> None:
-    """Print and record the new size of a tracker's hands."""
-    status.say(f"size of the hands: {tracker.user}")
-    if recorder is not None:
-        recorder.resize()
-
-
-def _open_answering(address: str, ended: Callable[[], bool], status: LiveStatus) -> LiveStream:
-    """Open a stream as soon as its server answers."""
+def _open_answering(address: str, ended: Callable[[], bool], until: float, status: LiveStatus) -> LiveStream:
+    """Open a stream as soon as its server answers, by a monotonic time `until` [s]."""
     while True:
         try:
             return open_source(address, ended=ended)
         except NoServerError as error:
+            if monotonic() >= until:
+                raise
             status.show(f"{error}; it is waited for, Ctrl-C ends it")
             sleep(_RETRY)  # a refused connection returns at once
 
 
-def _written(
-    recorder: Recorder, out: Path | None, counts: dict[str, int], status: LiveStatus
-) -> tuple[Take, int, float]:
-    """Write the take of a recording, see `Recorder.finish`; return its duration [s] as well."""
-    status.show(f"writing {out}", now=True)
-    kept = f"writing {out}; {recorder.part} is kept until then"
-    take, step = recorder.finish(counts, told=lambda: status.show(kept))
-    return take, step, recorder.duration + 1.0 / take.rate
+class _Recording:
+    """The recording of a session, which may fail while outputs still get frames."""
+
+    def __init__(
+        self,
+        stack: ExitStack,
+        out: Path | None,
+        tracker: Tracker,
+        settings: Mapping[str, Any],
+        outputs: Sequence[FrameOutput],
+        status: LiveStatus,
+    ) -> None:
+        self._outputs, self._status = outputs, status
+        self._recorder: Recorder | None = None
+        self._failure: CaptureError | None = None
+        if out is not None:
+            recorder = self._recorder = stack.enter_context(Recorder(out, tracker, settings))
+            stack.enter_context(_recording_kept(recorder))
+            status.say(f"recording to {recorder.part}, which becomes {out} at the end; Ctrl-C ends it")
+
+    def add(self, frame: StreamedFrame, tracked: TrackedFrame) -> None:
+        """Record a frame."""
+        self._try(lambda recorder: recorder.add(frame, tracked))
+
+    def resize(self, tracker: Tracker) -> None:
+        """Print and record the new size of the tracker's hands."""
+        self._status.say(f"size of the hands: {tracker.user}")
+        self._try(Recorder.resize)
+
+    def discard(self, reason: str) -> NoReturn:
+        """Remove a recording without frames, and say why there are none."""
+        if self._recorder is not None:
+            with suppress(CaptureError):
+                self._recorder.finish()
+        raise CaptureError(reason)
+
+    def finish(self, counts: dict[str, int], pace: _Pace) -> tuple[Take | None, int]:
+        """Write the take, see `Recorder.finish`; without a recorder there is none."""
+        recorder = self._recorder
+        if recorder is None:
+            return None, 1
+        if self._failure is not None:
+            lost = pace.frames - recorder.num_frames
+            raise CaptureError(f"{self._failure}; {lost} frames after them were not recorded")
+        self._status.show(f"writing {recorder.out}", now=True)
+        kept = f"writing {recorder.out}; {recorder.part} is kept until then"
+        return recorder.finish(counts, told=lambda: self._status.show(kept))
+
+    def _try(self, record: Callable[[Recorder], None]) -> None:
+        """Record something unless the recording has failed; raise a failure if there are no outputs."""
+        if self._recorder is None or self._failure is not None:
+            return
+        try:
+            record(self._recorder)
+        except CaptureError as error:
+            if not any(self._outputs):
+                raise
+            self._failure = error
+            self._status.say(f"{error}; tracking goes on without a recording")
 
 
 @contextmanager
@@ -198,7 +258,7 @@ def _recording_kept(recorder: Recorder) -> Iterator[None]:
             yield
     except KeyboardInterrupt as stop:
         recorder.close()
-        raise Stopped.again(stop, f"the recording is kept in {recorder.part}") from stop
+        raise Stopped.again(stop, recorder.kept()) from stop
 
 
 class _Pace:
@@ -211,12 +271,21 @@ class _Pace:
         """Number of frames."""
         self.words = ""
         """Summary of the last second."""
+        self.is_silent = False
+        """Whether the last frame stood for a silence."""
+        self._times = (0.0, 0.0)  # of the first and the last frame [s]
         self._begin, self._received, self._dropped = monotonic(), 0, 0
 
+    @property
+    def duration(self) -> float:
+        """Time from the first frame to the last [s]."""
+        return self._times[1] - self._times[0]
+
     def add(self, frame: StreamedFrame) -> None:
-        """Record the lag of a frame."""
+        """Count a frame and its lag."""
         if not frame.silent:
             self.lags.append(monotonic() - frame.arrived)
+            self._times = (self._times[0] if self.frames else frame.time, frame.time)
             self.frames += 1
 
     def tick(self, counts: dict[str, int]) -> bool:
@@ -262,14 +331,14 @@ def _notes(counts: dict[str, int], step: int, pace: _Pace, interval: float) -> I
 def _status_line(
     frame: StreamedFrame,
     tracked: TrackedFrame,
-    counts: dict[str, int],
+    stream: LiveStream,
     outputs: Sequence[FrameOutput],
     pace: _Pace,
 ) -> str:
     """Status line of a live stream."""
     if frame.silent:
-        foreign = f", but {counts.get(_FOREIGN)} packets of other senders; is this the right port?"
-        return f"no frames arrive{foreign if counts.get(_FOREIGN) else '; is the server playing?'}"
+        return f"no frames arrive; {stream.silence_doubt}"
+    counts = stream.counts
     words = [f"{hand.side} {hand.status}" for hand in tracked.hands]
     words += [f"{body.name} {body.status}" for body in tracked.bodies]
     rms = [hand.rms for hand in tracked.hands if np.isfinite(hand.rms)]

@@ -7,7 +7,9 @@ lacks at most the last half second if the process dies. `finish` turns it into `
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import MappingProxyType, TracebackType
 from typing import Any, Final
@@ -29,7 +31,7 @@ from gloves.takes.take import (
 )
 from handsim._checks import check_type
 from handsim.callbacks import Closing
-from handsim.errors import ArgumentError, CaptureError
+from handsim.errors import DAMAGE, ArgumentError, CaptureError, HandSimWarning
 from handsim.files.outputs import check_ending, remove_abandoned
 from handsim.files.signals import interrupt_behind
 from track.frames import FARTHEST, LATEST_TIME, StreamedFrame, TrackedFrame
@@ -112,13 +114,12 @@ class Recorder(Closing):
         out = Path(path)
         check_ending(out, ".npz", option="path")
         remove_abandoned(out)  # left by a run that was killed in `finish`
-        self.part = growing_path(out)
-        """The file of the recording."""
-        self._out, self._tracker = out, tracker
+        self._tracker, self.out = tracker, out
+        """The file of the take."""
         self._settings = {**settings_of(tracker), **settings}
         sizes = {"H": len(tracker.hands), "B": len(tracker.bodies)}
         self._archive = GrowingArchive(
-            self.part,
+            growing_path(out),
             self._header(None),
             worn_arrays(tracker.hands, tracker.bodies),
             [column.sized(sizes) for column in (*FRAMES, *POINTS, *OPTIONAL, KEYPOINTS)],
@@ -127,9 +128,23 @@ class Recorder(Closing):
         self._closed = False
 
     @property
+    def part(self) -> Path:
+        """The file of the recording."""
+        return self._archive.path
+
+    @property
     def num_frames(self) -> int:
         """Number of recorded frames."""
         return self._archive.num_frames
+
+    def kept(self, what: str = "the recording is") -> str:
+        """Say where the recording is kept, and how much of it, after a look at its file."""
+        try:
+            kept = GrownArchive(self.part, check=False).num_frames
+        except (OSError, *DAMAGE):
+            return f"nothing of it is kept in {self.part}"
+        what = what if kept >= self.num_frames else f"{kept} of its {self.num_frames} frames are"
+        return f"{what} kept in {self.part}"
 
     @property
     def duration(self) -> float:
@@ -145,28 +160,24 @@ class Recorder(Closing):
             ArgumentError: Its time is not after that of the frame before; what was recorded is kept.
             CaptureError: The file cannot be written; what was recorded until then is kept.
         """
-        try:
-            if frame.silent:
+        if frame.silent:
+            with self._writing():
                 self._archive.flush_due()
-                return
-            last = self._times[1] if self._times else -LATEST_TIME
-            if not last < frame.time < LATEST_TIME:
-                raise ArgumentError(
-                    f"frame {frame.number} is at {frame.time:g} s, expected a time after that of the frame "
-                    f"before, {last:g} s"
-                )
-            values = frame_values(frame, tracked)
-            usable = np.abs(values["points"]) < FARTHEST  # False for NaN
-            if not usable.all():
-                kept = usable.all(axis=1)
-                values |= {column.name: values[column.name][kept] for column in POINTS}
-            keypoints = keypoints_of(self._tracker.hands, values["qpos"][None])[0]
+            return
+        last = self._times[1] if self._times else -LATEST_TIME
+        if not last < frame.time < LATEST_TIME:
+            raise ArgumentError(
+                f"frame {frame.number} is at {frame.time:g} s, expected a time after that of the frame "
+                f"before, {last:g} s"
+            )
+        values = frame_values(frame, tracked)
+        usable = np.abs(values["points"]) < FARTHEST  # False for NaN
+        if not usable.all():
+            kept = usable.all(axis=1)
+            values |= {column.name: values[column.name][kept] for column in POINTS}
+        keypoints = keypoints_of(self._tracker.hands, values["qpos"][None])[0]
+        with self._writing():
             self._archive.add({**values, KEYPOINTS.name: keypoints}, len(values["points"]))
-        except OSError as error:
-            raise CaptureError(
-                f"the recording ended after {self.num_frames} frames ({error.strerror or error}); they are "
-                f"kept in {self.part}"
-            ) from error
         self._times = (self._times[0] if self._times else frame.time, frame.time)
 
     def resize(self) -> None:
@@ -177,12 +188,30 @@ class Recorder(Closing):
         sizes = self._settings.setdefault("sizes", [[0, self._settings.get("user", "")]])
         self._settings["user"] = self._tracker.user.notes
         sizes.append([self.num_frames, self._settings["user"]])
-        self._archive.replace_head(self._header(None), worn_arrays(self._tracker.hands, self._tracker.bodies))
+        with self._writing():
+            self._archive.replace_head(
+                self._header(None), worn_arrays(self._tracker.hands, self._tracker.bodies)
+            )
 
     def close(self) -> None:
         """Write waiting frames, and close the recording without writing the take."""
         self._closed = True
-        self._archive.close()
+        with self._writing():
+            self._archive.close()
+
+    @contextmanager
+    def _writing(self) -> Iterator[None]:
+        """Within the block an error of the system ends the recording; say what is kept."""
+        try:
+            yield
+        except OSError as error:
+            self._closed = True
+            with suppress(OSError):
+                self._archive.close()
+            raise CaptureError(
+                f"the recording ended after {self.num_frames} frames ({error.strerror or error}); "
+                f"{self.kept('they are')}"
+            ) from error
 
     def finish(
         self, stream: Mapping[str, int] | None = None, *, told: Callable[[], None] = lambda: None
@@ -198,27 +227,29 @@ class Recorder(Closing):
 
         Raises:
             CaptureError: Fewer than two frames came, or the take cannot be written; then the recording is
-                kept.
+                kept. It is kept as well, with a warning, if another program damaged it.
         """
         self.close()
         if self.num_frames < 2:
-            self.part.unlink()
+            self.part.unlink(missing_ok=True)
             raise CaptureError(f"{self.num_frames} frames came, expected two or more")
         if stream is not None:
             self._settings["stream"] = dict(stream)
         try:
-            grown = GrownArchive(self.part, check=False)
+            grown = GrownArchive(self.part)
             first = (grown.first(name, RATED_FRAMES) for name in ("times", NUMBERS.name))
             header = self._header(usual_rate(*first))
             step = max(1, -(-grown.num_frames // _SUMMARIZED))
             take = unpack_take(dict(header), grown.read(step))
-            finish_archive(grown, self._out, header, told=told)
+            finish_archive(grown, self.out, header, told=told)
         except Exception as error:  # keep the recording after any error
             reason = (error.strerror if isinstance(error, OSError) else None) or error
-            raise CaptureError(
-                f"{self._out}: cannot be written ({reason}); the recording is kept in {self.part}"
-            ) from error
-        self.part.unlink()
+            raise CaptureError(f"{self.out}: cannot be written ({reason}); {self.kept()}") from error
+        if grown.num_frames < self.num_frames:
+            lost = f"{self.part} was damaged by another program and stays: {self.out} has {grown.num_frames}"
+            warnings.warn(f"{lost} of its {self.num_frames} frames", HandSimWarning, stacklevel=2)
+        else:
+            self.part.unlink()
         return take, step
 
     def _header(self, rate: float | None) -> dict[str, Any]:

@@ -6,7 +6,7 @@ An address selects a sink, see `VALID`. Each frame goes to all sinks. A failing 
 from __future__ import annotations
 
 import asyncio
-import ipaddress
+import errno
 import logging
 import math
 import re
@@ -63,7 +63,7 @@ _OPTIONS: Final[Mapping[str, Mapping[str, tuple[str, ...]]]] = {
     "osc": _AXES,
     "tcp": _LINES,
     "udp": _DOCUMENTS,
-    "ws": {**_DOCUMENTS, "every": _YES},
+    "ws": {**_DOCUMENTS, "every": _YES, "pages": ("own", "all")},
 }
 _RESERVED: Final = re.compile(r"[^!-~]|[#*,/?\[\]{}]")  # not allowed in a part of an OSC address
 _BUNDLE_HEAD, _BUNDLE_ENTRY = 16, 4  # [bytes] overhead of an OSC bundle and of each message in it
@@ -75,6 +75,8 @@ _TELL: Final = 1.0  # [s] least time between two reports of a client's lag, or t
 _ON_REQUEST: Final = "/newest"  # path for clients that request each frame
 _FLUSHED: Final = 0.01  # [s] interval of checks whether clients have read what waits
 _SEND_BUFFER: Final = 1 << 17  # [bytes] size of the system's send buffer for each client
+MOST_CONNECTIONS: Final = 64
+"""Largest number of open connections of a server."""
 _LARGEST: Final = 1 << 10  # [bytes] largest message of a client; its content is ignored
 _FLUSH: Final = 1.0  # [s] time for clients to read waiting frames at the end
 _OWN_PAGES: Final = re.compile(r"https?://(localhost|127\.0\.0\.1|\[::1\])(:\d+)?")
@@ -193,8 +195,9 @@ def open_sink(address: str) -> LiveSink:
         format = document_format(options.get("format", "json"), content, largest=largest)
         if scheme == "udp":
             return DatagramSink(host, port, format)
+        every, all_pages = options.get("every") == "yes", options.get("pages") == "all"
         server = LineSink if scheme == "tcp" else WebSocketSink
-        return server(host, port, format, every=options.get("every") == "yes")
+        return server(host, port, format, every=every, all_pages=all_pages)
     if scheme == "lsl" and rest and not rest.startswith("//"):
         return LabStreamingSink(rest)
     name = address.partition("?")[0]
@@ -422,18 +425,20 @@ class WebSocketSink:
     A client receives the header, again when the hands change their size and thus the header, and the newest
     frame as soon as it has read the one before, which its WebSocket library confirms by a pong. A client
     of the path /newest gets one frame for each message that it sends. With `every` all frames wait for a
-    client, at most 256. A slow client loses frames, receives its lag, and delays nobody. A sink at a
-    loopback address serves pages of this machine and other programs; one at another address serves
-    everybody.
+    client, at most 256. A slow client loses frames, receives its lag, and delays nobody. Browsers' pages are
+    served if they are of this machine, or with `all_pages`; other programs always are. At most 64 connections
+    are open at a time; further ones are refused.
     """
 
-    def __init__(self, host: str, port: int, format: MessageFormat, *, every: bool = False) -> None:
+    def __init__(
+        self, host: str, port: int, format: MessageFormat, *, every: bool = False, all_pages: bool = False
+    ) -> None:
         self._serve: Any = import_extra("websockets.asyncio.server", "ws://", "send").serve
         self._closed_error: Any = import_extra("websockets.exceptions", "ws://", "send").ConnectionClosed
         self._format, self._every, self._socket = format, every, _listen(host, port)
-        address = self._socket.getsockname()
-        self._origins = [None, _OWN_PAGES] if ipaddress.ip_address(address[0]).is_loopback else None
-        self.port: int = address[1]
+        self._origins = None if all_pages else [None, _OWN_PAGES]
+        self.port: int = self._socket.getsockname()[1]
+        self._is_told = False  # of refused connections
         self.dropped = 0
         """Number of frames dropped for slow clients."""
         self._header = b""
@@ -450,8 +455,24 @@ class WebSocketSink:
         """Number of connected clients."""
         return len(self._clients)
 
+    @property
+    def note(self) -> str:
+        """How many connections were refused."""
+        refused = self._socket.refused
+        return f"{refused} connections were refused" if refused else ""
+
     def send(self, message: LiveMessage) -> None:
         """Pass a message on to the clients."""
+        if self._socket.refused and not self._is_told:
+            self._is_told = True
+            told = (
+                f"port {self.port} has {MOST_CONNECTIONS} connections and refuses others; end some receivers"
+            )
+            told = (
+                f"port {self.port} refuses further connections: {MOST_CONNECTIONS} are open, or no other file"
+            )
+            told += " may be opened; end receivers that are not needed"
+            warnings.warn(told, HandSimWarning, stacklevel=2)
         if message.header is not self._described:
             self._described, (self._header,) = message.header, self._format.header(message.header)
         if self._clients:
@@ -624,7 +645,47 @@ class _Client:
         return self.waiting.popleft()
 
 
-def _listen(host: str, port: int) -> socket.socket:
+class _Listener(socket.socket):
+    """A listening socket that closes connections beyond `MOST_CONNECTIONS` as soon as they come.
+
+    If the process may open no further file, a spare one makes room to take a connection and close it; asyncio
+    would print a traceback a second.
+    """
+
+    def __init__(self, listening: socket.socket) -> None:
+        super().__init__(fileno=listening.detach())
+        self.refused = 0
+        """Number of closed connections."""
+        self._accepted: list[socket.socket] = []
+        self._spare = socket.socket()
+
+    def accept(self) -> tuple[socket.socket, Any]:
+        """Return the next connection that is within the limit."""
+        while True:
+            try:
+                connection, address = super().accept()
+            except OSError as error:
+                if error.errno not in (errno.EMFILE, errno.ENFILE):
+                    raise
+                self._spare.close()
+                super().accept()[0].close()
+                self._spare = socket.socket()
+                self.refused += 1
+                continue
+            self._accepted = [one for one in self._accepted if one.fileno() >= 0]  # without closed ones
+            if len(self._accepted) < MOST_CONNECTIONS:
+                self._accepted.append(connection)
+                return connection, address
+            self.refused += 1
+            connection.close()
+
+    def close(self) -> None:
+        """Close the socket and the spare file."""
+        self._spare.close()
+        super().close()
+
+
+def _listen(host: str, port: int) -> _Listener:
     try:
         family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
         one = socket.create_server(address[:2], family=family)
@@ -634,4 +695,4 @@ def _listen(host: str, port: int) -> socket.socket:
             "of this machine"
         ) from error
     one.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)  # connections inherit it
-    return one
+    return _Listener(one)

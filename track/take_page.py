@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float, Int
 from gloves.captures.capture import runs_of
 from gloves.takes.take import COASTING, INITIALIZED, LOST, STATUSES, Take
 from handsim.files.outputs import atomic_write, check_ending, written_together
-from handsim.hand.shape import BONES, DIGITS, JOINT_NAMES, JOINTS, Side
+from handsim.hand.shape import DIGITS, JOINT_NAMES, JOINTS, Side
 from handsim.pages import NOTHING, Paint, Section, html_list, picture, write_sections
 from track.config import Size
 from track.kinematics.pose_spread import CHANGING, DETECTABLE, SOURCES, measurement_error
@@ -121,12 +121,8 @@ class HandFigures:
 
     @property
     def measured(self) -> Bool[np.ndarray, "T 20"]:
-        """Fitted frames in which a joint moves a seen marker, or the glove has no marker beyond the joint.
-
-        In all others the angle is predicted.
-        """
-        told = ~self.beyond.any(axis=1) | (self.seen @ self.beyond.T)
-        return np.asarray(self.fitted[:, None] & told)
+        """Fitted frames with a seen marker beyond the joint; in all others the angle is predicted."""
+        return np.asarray(self.fitted[:, None] & (self.seen @ self.beyond.T))
 
     def gaps(self, seen: Bool[np.ndarray, "T K"]) -> list[list[int]]:
         """Lengths of the gaps of each column, from the hand's first pose to its last [frames]."""
@@ -185,7 +181,7 @@ def hand_figures(take: Take) -> tuple[HandFigures, ...]:
     """The figures of each hand of a simulated or tracked take."""
     found = []
     for number, (hand, labels) in enumerate(zip(take.hands, take.hand_labels, strict=True)):
-        there, bones = take.status[:, number] != LOST, hand.attachment.main_bones
+        there = take.status[:, number] != LOST
         angles = np.where(there[:, None], np.rad2deg(take.qpos[:, number, 7:]), np.nan)
         confidence = np.full((take.num_frames, len(labels)), np.nan)
         points = take.point_list
@@ -199,12 +195,7 @@ def hand_figures(take: Take) -> tuple[HandFigures, ...]:
             residuals[part] = np.linalg.norm(observed[part] - expected, axis=2)
         spread = None if take.angle_spread is None else np.rad2deg(take.angle_spread[:, number])
         status, names = take.status[:, number], hand.layout.names
-        beyond = np.array(
-            [
-                [bone >= joint.bone and BONES[bone].digit == BONES[joint.bone].digit for bone in bones]
-                for joint in JOINTS
-            ]
-        )
+        beyond = hand.attachment.beyond
         found.append(HandFigures(hand.side, names, status, angles, spread, residuals, confidence, beyond))
     return tuple(found)
 
@@ -315,12 +306,12 @@ def _range_section(title: str, take: Take, hand: HandFigures) -> Section:
         cells += [percent(measured), f"{gap / take.rate:.3f}" if gap else NOTHING]
         table.append([joint.name.replace("_", " "), *cells])
     text = (
-        "An angle is measured in a frame whose pose was fitted while a marker beyond the joint was seen, if "
-        f"the glove has one, and predicted in all others. {int(hand.fitted.sum()):,} frames have a fitted "
-        "pose. The range is that of the measured frames; 5th and 95th are percentiles, which a single wrong "
-        "frame does not change. SD: standard deviation of the angle. A gap is a run of frames in which it is "
-        "not measured, from the hand's first pose to its last. At the limits of the model, which are soft by "
-        "a few degrees, a joint may bend further than the table says."
+        "An angle is measured in a frame whose pose was fitted while a marker beyond the joint was seen, and "
+        f"predicted in all others. {int(hand.fitted.sum()):,} frames have a fitted pose. The range is that "
+        "of the measured frames; 5th and 95th are percentiles, which a single wrong frame does not change. "
+        "SD: standard deviation of the angle. A gap is a run of frames in which it is not measured, from the "
+        "hand's first pose to its last. At the limits of the model, which are soft by a few degrees, a joint "
+        "may bend further than the table says."
     )
     return Section(title, text, table=table)
 
@@ -536,5 +527,5 @@ def _number(value: float) -> str:
 
 
 def _time(seconds: float) -> str:
-    """A time with nine digits, which resolve 0.1 ms within a day."""
-    return f"{seconds:.9g}"
+    """A time with sixteen digits, which resolve a microsecond of a clock that counts since 1970."""
+    return f"{seconds:.16g}"

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from gloves.captures.capture import AT_ORIGIN, all_at_origin, runs_of, unit_fault
+from gloves.fit import Attachment
 from gloves.takes.take import COASTING, LOST, STATUSES, Take
-from handsim.hand.shape import Side
+from handsim.hand.shape import DIGITS, JOINT_NAMES, Side
 from track.association.initialization import distances_to_nearest
 from track.label_confidence import Evidence, evidence_of, label_confidence
 from track.take_faults import SuspectSpan, find_faults
@@ -75,6 +76,9 @@ def summarize(take: Take) -> list[str]:
         else:
             line = f"{side} hand: not there"
         lines.append(line)
+        guesses = "; ".join(_guesses(take.hands[number].attachment))
+        if guesses and take.made_by_tracker:
+            lines.append(f"{side} hand: {guesses}")
     for number, body in enumerate(take.bodies):
         status, rms = take.body_status[:, number], take.body_rms[:, number]
         never = [] if (status != LOST).any() else ["it was never found: are these its markers?"]
@@ -87,6 +91,18 @@ def summarize(take: Take) -> list[str]:
     if foreign - near > _MANY_FAR * count:
         line += f", {near} of them at the hands"
     return [*lines, line]
+
+
+def _guesses(worn: Attachment) -> Iterator[str]:
+    """One sentence for each digit that has joints without a marker beyond them."""
+    lacking = ~worn.beyond.any(axis=1).reshape(len(DIGITS), -1)
+    for number, (digit, lacks) in enumerate(zip(DIGITS, lacking, strict=True)):
+        owner = digit if digit == "thumb" else f"{digit} finger"
+        if lacks.all():
+            yield f"no marker is on the {owner}: its angles are guesses"
+        elif lacks.any():
+            joint = JOINT_NAMES[number * len(lacks) + int(lacks.argmax())].split("_")[1]
+            yield f"no marker is beyond the {joint} of the {owner}: its angles from there on are guesses"
 
 
 def no_points(take: Take) -> str:

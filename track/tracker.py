@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from gloves.fit import GloveFit
 from gloves.takes.points import Status
 from handsim._checks import shown_value
+from handsim._process import with_own_numerics
 from handsim.errors import ArgumentError
 from handsim.hand.shape import NUM_QPOS
 from handsim.kernels import kernel, squared_distance
@@ -146,6 +147,7 @@ class Tracker:
         if not keep:
             self._initializer = HandInitializer(self._states, self.labeler, self.config)
 
+    @with_own_numerics
     def step(
         self,
         points: Float[np.ndarray, "N 3"],

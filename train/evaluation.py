@@ -24,12 +24,12 @@ from gloves.layout import MarkerLayout
 from gloves.optics.ghosts import GHOST_REACH
 from gloves.takes.points import PointList
 from gloves.takes.take import Take, load_take
-from handsim._checks import check_rng, check_type
+from handsim._checks import as_numbers, check_rng, check_type
 from handsim.app.messages import print_table
 from handsim.errors import ArgumentError, CaptureError
 from handsim.hand.shape import SIDES
 from train.data.batches import Cloud, Corruption, OwnCorruption, corrupt, draw_cloud, paper_corruption
-from train.data.shards import MANIFEST, Dataset, load_dataset
+from train.data.shards import Dataset, is_dataset, load_dataset
 from train.labelers.protocol import Labeler
 from train.labelers.storage import load_labeler
 from train.settings import EvaluateSettings
@@ -480,7 +480,7 @@ def evaluate_labeler(
         report = evaluate_frames(network, chain.from_iterable(map(_take_frames, simulated)))
         seconds = [np.tile(take.times.astype(np.int64), len(take.hands)) for take in simulated]
         report = _grouped(report, seconds, "seconds")
-    elif given and all(map(_is_set, given)):
+    elif given and all(map(is_dataset, given)):
         sets = [load_dataset(one) for one in given]
         rows = np.concatenate([_rows(one, network.marker_names) for one in sets])[:: settings.every]
         if corruption == CLEAN:
@@ -521,15 +521,12 @@ def _markers(
     parts: list[tuple[NDArray[np.float64], NDArray[np.int64] | None]] = []
     for one in truth:
         if isinstance(one, np.ndarray):
-            count = len(names)
-            if one.ndim != 3 or one.shape[1:] != (count, 3) or one.dtype.kind not in "fiu":
-                raise ArgumentError(
-                    f"markers are {one.dtype} of shape {one.shape}, expected (T, {count}, 3) numbers [m]"
-                )
-            parts.append((one.astype(np.float64), None))
+            if one.ndim != 3 or one.shape[1:] != (len(names), 3):
+                raise ArgumentError(f"markers have shape {one.shape}, expected (T, {len(names)}, 3) [m]")
+            parts.append((as_numbers("truth", one), None))
         elif isinstance(one, Capture):
             parts.append(_of_hands(select_hands(one, names), one.rate))
-        elif _is_set(one):
+        elif is_dataset(one):
             parts.append((_rows(load_dataset(one), names)["markers"].astype(np.float64), None))
         else:
             expected = "markers (T, M, 3) [m], a Dataset, Capture or Take, or the path of one"
@@ -560,12 +557,6 @@ def _grouped(
     firsts = np.cumsum([0, *(part.max(initial=-1) + 1 for part in known)])
     numbers = np.concatenate([first + part for first, part in zip(firsts[:-1], known, strict=True)])
     return dataclasses.replace(report, groups=numbers[::every], grouped_by=grouped_by)
-
-
-def _is_set(given: Any) -> bool:
-    """Whether a truth is a training set, or the path of one."""
-    at = Path(given) / MANIFEST if isinstance(given, str | Path) else None
-    return isinstance(given, Dataset) or (at is not None and at.is_file())
 
 
 def _rows(dataset: Dataset, names: tuple[str, ...]) -> NDArray[np.void]:

@@ -45,7 +45,9 @@ def start_fabric(settings: TrainSettings, out: Path) -> Fabric:
     torch.set_flush_denormal(True)  # Features underflow, and denormal numbers slow a core down.
     logging.getLogger("lightning_fabric").setLevel(logging.WARNING)  # Its messages do not concern users.
     warnings.filterwarnings("ignore", module="lightning_fabric")
-    if nodes == 1 and sys.platform in _LOOPBACK:  # Connections within one machine stay off the network.
+    if (
+        here > 1 and nodes == 1 and sys.platform in _LOOPBACK
+    ):  # Connections within one machine stay off the network.
         os.environ.setdefault("GLOO_SOCKET_IFNAME", _LOOPBACK[sys.platform])
     fabric = Fabric(
         accelerator="cuda" if has_gpu else "cpu",

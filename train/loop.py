@@ -23,6 +23,8 @@ from torch import nn
 from gloves.layout import stored_layout
 from handsim import __version__
 from handsim._checks import check_count, check_type
+from handsim._process import torch_kept
+from handsim.app.workers import usable_cores
 from handsim.callbacks import OnStep, Progress, no_progress, no_step
 from handsim.errors import DatasetError, HandSimError, WeightsError
 from handsim.files.arrays import check_members
@@ -81,6 +83,7 @@ class TrainingError(HandSimError):
     """A training run that does not converge."""
 
 
+@torch_kept()
 def train_labeler(
     dataset: Dataset | str | Path,
     out: str | Path,
@@ -133,7 +136,8 @@ def train_labeler(
         progress, on_step = no_progress, no_step
     if threads is None:
         alone_on_cpu = fabric.device.type == "cpu" and fabric.world_size == 1
-        threads = torch.get_num_threads() if settings.labeler == "cnn" and alone_on_cpu else 1
+        many = settings.labeler == "cnn" and alone_on_cpu
+        threads = min(torch.get_num_threads(), usable_cores()) if many else 1
     with ExitStack() as stack, lost_peers_told(), torch_threads(threads):
         # The thread that writes curves complains if its process ends before the writer is closed.
         stack.callback(fabric.logger.finalize, "")
@@ -211,7 +215,9 @@ class _Run:
         shown, saved = self.held_out[self._shown(_CURVE_FRAMES[settings.labeler])], time.monotonic()
         evaluated = state.history.accuracies[-1][0] if state.history.accuracies else 0
         while True:
-            if state.done > evaluated and _passed(state.done, settings, _NUM_EVALUATIONS):
+            if state.done > evaluated and _passed(
+                state.done, settings, _NUM_EVALUATIONS, _SAMPLES_A_FRAME * len(shown)
+            ):
                 evaluated = state.done
                 if state.fabric.is_global_zero:
                     on_step("held-out frames")
@@ -354,7 +360,7 @@ class TrainingState:
             )
         self.history.add(value)
         self.history.minutes += (time.perf_counter() - began) / 60.0
-        if _passed(self.done, self.settings, _CURVE_POINTS) or self.done >= self.settings.samples:
+        if _passed(self.done, self.settings, _CURVE_POINTS):
             (since, done), self.began = self.began, (time.monotonic(), self.done)
             speed = (self.done - done) / (self.began[0] - since)
             mean = self.history.close(self.done, rate)
@@ -467,10 +473,10 @@ def _check_stored(content: object, seen: set[int] | None = None) -> None:
             _check_stored(entry, seen)
 
 
-def _passed(done: int, settings: TrainSettings, parts: int) -> bool:
-    """Whether the last step ended one of `parts` equal parts of the run, each at least one step long."""
-    part = max(settings.batch, settings.samples // parts)
-    return (done - settings.batch) // part != done // part
+def _passed(done: int, settings: TrainSettings, parts: int, least: int = 1) -> bool:
+    """Whether the last step ended the run, or one of `parts` equal parts of at least `least` samples."""
+    part = max(settings.batch, settings.samples // parts, least)
+    return (done - settings.batch) // part != done // part or done >= settings.samples
 
 
 def choose_costs(network: DeepLabelCNN, marker_names: tuple[str, ...], rows: NDArray[np.void]) -> CNNConfig:

@@ -6,7 +6,7 @@ Table 3 of Han et al. 2018 counts the gaps that `run_lengths` measures.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from gloves.captures.text import check_rate
+from handsim._checks import as_numbers, check_type
 from handsim.errors import ArgumentError, CaptureError, HandSimWarning, choices, errors_of
 
 
@@ -22,6 +23,7 @@ class Capture:
     """Trajectories of a marker file: at least one frame and one trajectory.
 
     Raises:
+        ArgumentError: A name is no text, or positions are no numbers.
         CaptureError: The arrays do not fit together, a position is infinite, or the rate is not from 1 to
             5,000 Hz.
     """
@@ -36,23 +38,28 @@ class Capture:
     """How many values of a file were not read as measured points, by the reason."""
 
     def __post_init__(self) -> None:
-        positions = np.array(self.positions, dtype=np.float64)  # a copy: the next lines change it
-        if positions.ndim != 3 or positions.shape[1:] != (len(self.names), 3):
+        listed = isinstance(self.names, Iterable) and not isinstance(self.names, str)
+        names = tuple(self.names) if listed else (self.names,)
+        for name in names:
+            check_type("a name", name, str, "text, one per trajectory")
+        check_type("findings", self.findings, Mapping, "counts by their reasons")
+        positions = as_numbers("positions", self.positions).copy()  # the next lines change it
+        if positions.ndim != 3 or positions.shape[1:] != (len(names), 3):
             raise CaptureError(
-                f"positions have shape {positions.shape}, expected (T, {len(self.names)}, 3) for "
-                f"{len(self.names)} names"
+                f"positions have shape {positions.shape}, expected (T, {len(names)}, 3) for "
+                f"{len(names)} names"
             )
         if 0 in positions.shape:
             raise CaptureError(
                 f"a capture needs at least one frame and one marker, got {len(positions)} frames of "
-                f"{len(self.names)} markers"
+                f"{len(names)} markers"
             )
         if np.isinf(positions).any():
             raise CaptureError("positions hold infinite values, expected finite numbers or NaN")
         check_rate(self.rate)
         positions[np.isnan(positions).any(axis=-1)] = np.nan  # two coordinates do not make a point
         object.__setattr__(self, "positions", positions)
-        object.__setattr__(self, "names", tuple(self.names))
+        object.__setattr__(self, "names", names)
         object.__setattr__(self, "rate", float(self.rate))
         object.__setattr__(self, "findings", dict(self.findings))
 

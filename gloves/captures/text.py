@@ -41,8 +41,8 @@ MOST_CELLS: Final = 400_000
 """Largest number of cells in a row: twice as many as the largest C3D would need."""
 TAB: Final = b"\t"
 _BLANK: Final = math.nan
-_BLANKS: Final = ("", *"null none na n/a #n/a <na> - -- 1.#qnan -1.#ind nan(ind)".split())
-"""What programs write for no number, in small letters; Qualisys writes NULL."""
+_BLANK_CELL: Final = re.compile(r"(null|none|na|n/a|#n/a|<na>|--?|-?nan\(\w+\)|-?1\.#([qs]nan|ind)0*)?", re.I)
+"""What programs write for no number: Qualisys NULL, older programs of Windows -1.#IND00."""
 _MISWRITTEN: Final = {  # forms of cells that are no numbers, and why
     r"[^.,]*,[^.,]*": ", since others have decimal points",
     r"\d+[-. ]+[A-Z]\w\w\.?|[A-Z]\w\w[- ]\d+": ", but a date that a spreadsheet made of one; export it again",
@@ -96,7 +96,7 @@ def check_width(num_cells: int, number: int) -> None:
 def cell_number(text: str) -> float:
     """The number in a cell, which may have a decimal comma; NaN for a blank cell."""
     text = text.strip()
-    return _BLANK if text.lower() in _BLANKS else float(text.replace(",", "."))
+    return _BLANK if _BLANK_CELL.fullmatch(text) else float(text.replace(",", "."))
 
 
 def split_lines(data: bytes) -> tuple[list[bytes], bool]:
@@ -321,7 +321,7 @@ def _parse_cells(
     """The numbers of a row, NaN for a blank; an error names the cell that is not a finite number."""
     with contextlib.suppress(ValueError):
         values = np.array([float(cell) if cell else _BLANK for cell in cells])
-        if not np.isinf(values).any():
+        if not np.isinf(values).any() and b"_" not in b"".join(cells):
             return values
     return np.array([_cell_value(cell, number, titles, columns[n]) for n, cell in enumerate(cells)])
 
@@ -330,7 +330,7 @@ def _cell_value(cell: bytes, number: int, titles: Sequence[str], column: int) ->
     """The number of a cell that may hold blanks."""
     text = cell.decode("utf-8", "replace").strip().replace("\u2212", "-")  # a typographic minus
     try:
-        value = _BLANK if text.lower() in _BLANKS else float(text)
+        value = _BLANK if _BLANK_CELL.fullmatch(text) else float(text.replace("_", "x"))  # Python reads 1_000
         fault = "infinite, expected a finite number or a blank cell" if math.isinf(value) else ""
     except ValueError:
         reason = next((why for form, why in _MISWRITTEN.items() if re.fullmatch(form, text)), "")

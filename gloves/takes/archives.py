@@ -15,6 +15,7 @@ import math
 import os
 import struct
 import sys
+import tempfile
 import time
 import warnings
 import zlib
@@ -46,6 +47,7 @@ _SPARE: Final = 4096  # bytes by which the header may grow while blocks follow
 _MAX_HEADER: Final = 1 << 26  # bytes
 _FULL_FRAMES: Final = 1 << 16  # frames after which a block is written early; half a second has far fewer
 _FULL_POINTS: Final = 1 << 21  # points after which a block is written early
+_PIECE: Final = 1 << 20  # bytes that are copied at a time
 
 
 def growing_path(archive: Path) -> Path:
@@ -72,26 +74,30 @@ class GrowingArchive(Closing):
         arrays: Mapping[str, NDArray[Any]],
         columns: Sequence[Column],
     ) -> None:
-        self.path = path
+        self.path, self._place = path, path.absolute()
+        """Where the file is, as it was given; another path after another program took its place."""
         self._columns = (POINT_COUNTS, *columns)
         self._waiting: list[list[bytes]] = []  # each frame's entry of every column
-        self._points = self._block = self._written = 0
+        self._points = 0
         self._due = math.inf
         self._head = self._packed_head(header, arrays)
         if max(map(len, self._head)) > _MAX_HEADER:  # it could not be read again
             raise CaptureError(f"{path}: the settings take more than {_MAX_HEADER} bytes")
         make_folder_of(path)
         try:
-            self._file = open(path, "xb", buffering=0)
+            self._file = open(path, "x+b", buffering=0)
         except FileExistsError:
             check_unused(path)
             raise
         self._write_head()
+        self._blocks = [
+            (self._file.tell(), 0)
+        ]  # end of the head and of each block [bytes], frames until there
 
     @property
     def num_frames(self) -> int:
-        """Number of added frames."""
-        return self._written + len(self._waiting)
+        """Number of frames that are in the file or wait for it."""
+        return self._blocks[-1][1] + len(self._waiting)
 
     def add(self, values: Mapping[str, NDArray[Any] | float], num_points: int) -> None:
         """Add a frame; a column of points needs an entry for each of `num_points` points."""
@@ -128,20 +134,58 @@ class GrowingArchive(Closing):
         if not self._waiting:
             return
         with signals_wait():  # until the block is whole and counted
+            self._restore()
             rows, self._waiting, self._points, self._due = self._waiting, [], 0, math.inf
             counts, *others = (b"".join(column) for column in zip(*rows, strict=True))
             points = int(np.frombuffer(counts, POINT_COUNTS.dtype).sum(dtype=np.int64))
             content = b"".join((counts, *others))
-            head = _BLOCK.pack(_MARK, self._block, len(rows), points, zlib.crc32(content))
-            self._write(head + content)
-            self._block, self._written = self._block + 1, self._written + len(rows)
+            head = _BLOCK.pack(_MARK, len(self._blocks) - 1, len(rows), points, zlib.crc32(content))
+            _write_all(self._file, head + content)
+            self._blocks.append((self._file.tell(), self._blocks[-1][1] + len(rows)))
 
     def close(self) -> None:
         """Write the waiting frames, and close the file."""
+        if self._file.closed:
+            return
         try:
             self.flush()
+            with signals_wait():
+                self._restore()
         finally:
             self._file.close()
+
+    def _restore(self) -> None:
+        """Undo what another program did to the file: a change of its length, or its removal."""
+        there = os.fstat(self._file.fileno())
+        end, frames = self._blocks[-1]
+        if there.st_size != end:
+            while len(self._blocks) > 1 and self._blocks[-1][0] > there.st_size:
+                self._blocks.pop()
+            self._file.truncate(self._blocks[-1][0])
+            if len(self._blocks) == 1:
+                self._file.seek(0)
+                self._write_head()
+            if lost := frames - self._blocks[-1][1]:
+                told = f"{self.path} was cut by another program: {lost} of its {frames} frames are lost"
+                warnings.warn(told, HandSimWarning, stacklevel=2)
+        self._file.seek(0, os.SEEK_END)
+        if not _is_at(self._place, there):
+            self._write_again()
+
+    def _write_again(self) -> None:
+        """Write the whole file again at its path or, where that is taken or cannot be written, near it."""
+        gone = self.path
+        self._place, file = _open_near(self._place)
+        self.path = self._place
+        self._file.seek(0)
+        while content := self._file.read(_PIECE):
+            _write_all(file, content)
+        self._file.close()
+        self._file = file
+        told = (
+            f"{gone} was removed or replaced by another program: it is written again, whole, to {self.path}"
+        )
+        warnings.warn(told, HandSimWarning, stacklevel=2)
 
     def _packed_head(
         self, header: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], size: int = 0
@@ -157,12 +201,36 @@ class GrowingArchive(Closing):
         return [told.ljust(size or len(told) + _SPARE), *parts]
 
     def _write_head(self) -> None:
-        self._write(_MAGIC + b"".join(_SIZE.pack(len(part)) + part for part in self._head))
+        _write_all(self._file, _MAGIC + b"".join(_SIZE.pack(len(part)) + part for part in self._head))
 
-    def _write(self, content: bytes) -> None:
-        rest = memoryview(content)
-        while rest:
-            rest = rest[self._file.write(rest) :]
+
+def _write_all(file: io.FileIO, content: bytes) -> None:
+    """Write bytes to a file without a buffer, which may take fewer at a time."""
+    rest = memoryview(content)
+    while rest:
+        rest = rest[file.write(rest) :]
+
+
+def _is_at(path: Path, there: os.stat_result) -> bool:
+    """Whether a path leads to the file with this status."""
+    try:
+        return os.path.samestat(path.stat(), there)
+    except OSError:
+        return False
+
+
+def _open_near(path: Path) -> tuple[Path, io.FileIO]:
+    """Open a new file at a path, else under a similar name in its folder or that of temporary files."""
+    try:
+        make_folder_of(path)
+        return path, open(path, "x+b", buffering=0)
+    except OSError:
+        pass
+    try:
+        number, name = tempfile.mkstemp(GROWING_SUFFIX, f"{path.stem}-", path.parent)
+    except OSError:
+        number, name = tempfile.mkstemp(GROWING_SUFFIX, f"{path.stem}-")
+    return Path(name), open(number, "r+b", buffering=0)
 
 
 class _Block(NamedTuple):

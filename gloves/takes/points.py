@@ -23,6 +23,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike, NDArray
 
+from handsim._checks import as_array
 from handsim.hand.shape import HAND_DTYPE, NUM_JOINTS, NUM_KEYPOINTS, NUM_QPOS
 
 
@@ -120,7 +121,7 @@ STORED: Final = (*FRAMES, POINT_COUNTS, *POINTS, KEYPOINTS, *ATTACHMENT, BODY_MA
 
 def fitted(column: Column, values: ArrayLike, sizes: Mapping[str, int]) -> NDArray[Any]:
     """Values as an array of a column's type, after a check of its shape (`sizes` by letter) and range."""
-    array, dtype = np.asarray(values), np.dtype(column.dtype)
+    array, dtype = as_array(values, column.dtype), np.dtype(column.dtype)
     expected = column.sized(sizes).shape
     if array.shape != expected:
         shape = ", ".join(map(str, expected))

@@ -39,7 +39,7 @@ from gloves.takes.points import (
     fitted,
     spans,
 )
-from handsim._checks import check_choice, check_number, check_type
+from handsim._checks import as_numbers, check_choice, check_number, check_type
 from handsim.errors import ArgumentError, HandSimWarning, choices
 from handsim.files.outputs import check_ending
 from handsim.hand.angles import ISB_NAMES, Convention, isb_angles
@@ -243,9 +243,9 @@ class Take:
         Raises:
             ArgumentError: The arrays do not fit together, or hold what they cannot.
         """
-        qpos, points = np.asarray(qpos), np.asarray(points)
+        qpos, points = as_numbers("qpos", qpos), as_numbers("points", points)
         nowhere = np.full((len(points), len(bodies), 7), np.nan)
-        poses = nowhere if body_poses is None else np.asarray(body_poses)
+        poses = nowhere if body_poses is None else as_numbers("body_poses", body_poses)
         check_number("the rate [Hz]", float(rate), 0.0, above=True)
         return cls(
             rate=rate,

@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 from handsim.app.messages import tell_state
 from handsim.app.workers import LocalProcesses, usable_cores
 from handsim.callbacks import before_compiling
+from handsim.errors import HandSimError
 
 if TYPE_CHECKING:
     from numba.core.registry import CPUDispatcher
@@ -205,7 +206,10 @@ def _compile_all(listed: Mapping[int, ListedKernel]) -> None:
     told, first = time.monotonic(), (0.0, 0.0)  # speed counts from the first kernel, when processes run
     tell_state(what)
     with ExitStack() as stack:
-        processes = [LocalProcesses(1) for _ in range(min(usable_cores(), len(listed), _MOST))]
+        try:
+            processes = [LocalProcesses(1) for _ in range(min(usable_cores(), len(listed), _MOST))]
+        except HandSimError:  # each kernel is then compiled where it is called
+            return
         for one in processes:
             stack.callback(one.end)
         known = {one: set[str]() for one in processes}

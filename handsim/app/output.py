@@ -218,7 +218,7 @@ def open_output(out: str | Place) -> Iterator[Output]:
             if output._claimed:
                 remove_leftovers(place)
         return
-    _check_store(place)
+    check_store(place)
     name = Path(tempfile.gettempdir(), f"handsim-{zlib.crc32(str(place).encode()):08x}")
     remove_abandoned(name)  # left by a killed run
     here = temporary_beside(name)
@@ -250,7 +250,7 @@ class _Job:
                     "folder that all workers share, under the same path"
                 )
             return self.make(self.folder, number)
-        _check_store(self.place)  # a missing package must show before the work
+        check_store(self.place)  # a missing package must show before the work
         near = self.folder.parent  # removed at the end of the run, if this machine has it
         with tempfile.TemporaryDirectory(prefix="handsim-", dir=near if near.is_dir() else None) as name:
             self.make(Path(name), number)
@@ -258,7 +258,7 @@ class _Job:
         return number
 
 
-def _check_store(store: UPath) -> None:
+def check_store(store: UPath) -> None:
     """Import the packages that a store needs."""
     try:
         with _one_sentence(store, "opening"):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import functools
+import math
 import multiprocessing
 import os
 import pickle
@@ -27,33 +28,39 @@ from typing import Any, Final
 
 from handsim._checks import check_count
 from handsim._plugins import import_extra
+from handsim._process import core_quota, environment, is_number
 from handsim.errors import ArgumentError, DatasetError, HandSimError
 from handsim.files.inputs import load_json
+from handsim.files.outputs import available_bytes
 
 Job = Callable[[int], int]
 """Writes files that depend on the number alone, and returns the number; it can be pickled."""
 _THREADS: Final = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 _MAX_PENDING: Final = 1000  # jobs that an executor holds: enough for hundreds of workers
+_WORKER: Final = 710_000_000  # bytes that a process holds at most, by benchmarks.scale
 _AGAIN: Final = "run the same command again to go on"
+_FEWER: Final = f"(out of memory?); {_AGAIN}, with fewer --workers if they need too much memory"
 _GUARD: Final = 'put the call under `if __name__ == "__main__":`, or give workers=1'
 _GUARDED: Final = re.compile(r"^if\b.*\b__name__\b", re.M)
 _MAIN: Final = "__main__"
 
 
 def usable_cores() -> int:
-    """Cores that this process may run on."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    """Cores that this process may use: by its affinity, its task of Slurm and its quota, rounded up."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    task = os.environ.get("SLURM_CPUS_PER_TASK", "")
+    return max(1, math.ceil(min(cores, core_quota(), int(task) if is_number(task) else cores)))
 
 
 def check_workers(workers: int | None) -> int:
-    """Number of processes, by default one per core.
+    """Number of processes, by default one per core, and not more than the memory holds.
 
     A worker that runs its parent's script while it starts ends here, before it repeats the parent's work.
     """
     if getattr(multiprocessing.current_process(), "_inheriting", False):
         raise SystemExit(f"a process that starts runs this script again: {_GUARD}")
     if workers is None:
-        return usable_cores()
+        return max(1, min(usable_cores(), available_bytes() // _WORKER))
     check_count("workers", workers, 1)
     return workers
 
@@ -121,7 +128,7 @@ def _share_out(job: Job, todo: Sequence[int], executor: Executor) -> Iterator[in
             for future in done:
                 yield future.result()
     except BrokenProcessPool as error:
-        raise DatasetError(f"a worker died (out of memory?); {_AGAIN}") from error
+        raise DatasetError(f"a worker died {_FEWER}") from error
     except CancelledError as error:
         raise HandSimError(f"the workers are gone; {_AGAIN}") from error
     finally:
@@ -153,7 +160,13 @@ class LocalProcesses(ProcessPoolExecutor):
         self._needs_main = needs_main
         context = multiprocessing.get_context("spawn")
         theirs, self._ours = context.Pipe(duplex=False)
-        super().__init__(workers, mp_context=context, initializer=_end_with, initargs=(theirs,))
+        try:
+            super().__init__(workers, mp_context=context, initializer=_end_with, initargs=(theirs,))
+        except (ImportError, OSError) as error:
+            raise HandSimError(
+                f"no other processes can be started here ({error}): they need /dev/shm that can be written; "
+                "give --workers 1, or mount it"
+            ) from error
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         """Have a process call `fn(*args, **kwargs)`."""
@@ -191,13 +204,8 @@ def _end_with(channel: Connection) -> None:
 @contextmanager
 def one_thread() -> Iterator[None]:
     """Let processes started in the block use one thread each, unless the user chose otherwise."""
-    added = [name for name in _THREADS if name not in os.environ]
-    os.environ.update(dict.fromkeys(added, "1"))
-    try:
+    with environment(**{name: "1" for name in _THREADS if name not in os.environ}):
         yield
-    finally:
-        for name in added:
-            os.environ.pop(name, None)
 
 
 @contextmanager
@@ -240,8 +248,7 @@ def chosen_workers(
             yield ClusterExecutor(client)
         except distributed.KilledWorker as error:
             raise HandSimError(
-                f"a job was begun {error.allowed_failures + 1} times, and its worker died each time (out of "
-                "memory?); run the same command again to go on"
+                f"a job was begun {error.allowed_failures + 1} times, and its worker died each time {_FEWER}"
             ) from error
 
 

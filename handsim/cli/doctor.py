@@ -45,6 +45,19 @@ print(torch.cuda.get_device_name(0) if torch.cuda.is_available() else "none; the
 """
 
 
+_EXTRAS: Final = {
+    "view": "handsim view",
+    "send": "--send osc://, ws:// and lsl:",
+    "qualisys": "--live qtm://",
+    "onnx": ".onnx labelers, training a detector",
+    "usd": "export to .usdc",
+    "parquet": "export to .parquet",
+    "cluster": "--cluster",
+    "object-stores": "folders in s3://",
+}
+"""What each extra of handsim is for."""
+
+
 @dataclass(frozen=True, slots=True)
 class Finding:
     """One line of the report."""
@@ -157,9 +170,11 @@ def check_requirements() -> Iterator[Finding]:
     fits = SpecifierSet(limits).contains(python)
     remedy = "" if fits else "make a virtual environment with one of these versions"
     yield Finding("Python", python, limits, remedy)
-    for requirement in metadata.requires("handsim") or ():
-        if ";" not in requirement:  # requirements with markers belong to extras
-            yield check_requirement(requirement)
+    stated = [Requirement(requirement) for requirement in metadata.requires("handsim") or ()]
+    yield from (check_requirement(str(one)) for one in stated if one.marker is None)
+    for extra, purpose in _EXTRAS.items():
+        needed = [one for one in stated if one.marker is not None and one.marker.evaluate({"extra": extra})]
+        yield check_extra(extra, purpose, [f"{one.name}{one.specifier}" for one in needed])
 
 
 def check_requirement(requirement: str) -> Finding:
@@ -172,6 +187,14 @@ def check_requirement(requirement: str) -> Finding:
         return Finding(asked.name, "missing", limits, remedy)
     fits = asked.specifier.contains(found, prereleases=True)
     return Finding(asked.name, found, limits, "" if fits else remedy)
+
+
+def check_extra(extra: str, purpose: str, requirements: Sequence[str]) -> Finding:
+    """One of handsim's extras, with what it is for and what it requires."""
+    found = [check_requirement(requirement) for requirement in requirements]
+    lacking = ", ".join(f"{one.what} {one.found}" for one in found if one.remedy)
+    remedy = f"run `pip install 'handsim[{extra}]'` if you want it" if lacking else ""
+    return Finding(purpose, lacking or "installed", f"handsim[{extra}]", remedy, needed=False)
 
 
 def check_names(owners: Mapping[str, Sequence[str]], shadowed: Mapping[str, str]) -> Iterator[Finding]:
@@ -278,7 +301,7 @@ def _print_report(findings: Sequence[Finding]) -> None:
 
     rows: list[list[str | Text]] = [["", "what", "found", "expected"]]
     for finding in findings:
-        bad = Text("missing", "red") if finding.needed else Text("low", "yellow")
+        bad = Text("missing", "red") if finding.needed else Text("note", "yellow")
         mark = bad if finding.remedy else Text("ok", "green")
         rows.append([mark, finding.what, finding.found, finding.expected])
     print_table(rows, left=4, wraps=True)

@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from handsim.app.messages import print_line, print_table
-from handsim.errors import ArgumentError
+from handsim.app.output import place_of
+from handsim.errors import ArgumentError, CaptureError
+from handsim.files.inputs import check_there
 from handsim.files.outputs import check_outputs, save_json
 from train.settings import EvaluateSettings
 
@@ -17,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def evaluate(
-    captures: Annotated[tuple[Path, ...], tyro.conf.Positional],
+    captures: Annotated[tuple[str, ...], tyro.conf.Positional],
     settings: Annotated[EvaluateSettings, tyro.conf.arg(name="")],
     *,
     glove: str | None = None,
@@ -30,8 +32,9 @@ def evaluate(
 
     Args:
         captures: Labeled .trc, .c3d, .csv or .tsv files, folders searched for them, the .truth.npz of takes,
-            or training sets, which without drops and ghosts are counted as their rig saw them. Each hand of
-            a capture of two, with columns right:ThumbTip and so on, is counted by itself.
+            or training sets, also as s3://bucket/prefix, which without drops and ghosts are counted as their
+            rig saw them. Each hand of a capture of two, with columns right:ThumbTip and so on, is counted by
+            itself.
         settings: What is evaluated.
         glove: Marker layout: a shipped name or the path of a .toml file; when not given that of a take, or
             dense19.
@@ -48,8 +51,11 @@ def evaluate(
     from train.labelers.storage import load_labeler
 
     check_outputs((*captures, glove, labeler, truth), [json])
+    for capture in captures:
+        if isinstance(place := place_of(capture), Path):  # An object store is read later.
+            check_there(place, error=CaptureError)
     if truth is None:
-        if glove is None and captures and captures[0].suffix.lower() == ".npz":
+        if glove is None and captures and Path(captures[0]).suffix.lower() == ".npz":
             glove = load_take(captures[0]).settings.get("glove")
         glove = glove or "dense19"
         label_on(threads)

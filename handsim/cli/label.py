@@ -50,8 +50,9 @@ def label(
     files = _files(captures, out)  # checked before the work, not after it
     check_outputs((*files, glove, labeler), list(files.values()))
     settings = LabelSettings(glove, hands, labeler=labeler)
-    with named_steps(""):  # a glove may have to be learned
-        settings = dataclasses.replace(settings, labeler=TrackerSetup.of(settings).labeler)
+    if len(files) > 1 and any(map(Path.exists, files)):
+        with named_steps(""):  # a glove may have to be learned, once for all captures
+            settings = dataclasses.replace(settings, labeler=TrackerSetup.of(settings).labeler)
     failed = 0
     for capture, labeled in files.items():
         try:

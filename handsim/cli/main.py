@@ -9,6 +9,7 @@ from __future__ import annotations
 import errno
 import io
 import os
+import re
 import signal
 import sys
 import tempfile
@@ -80,6 +81,7 @@ def _target(command: str) -> str | Table:
 
 # Modules are imported when their command runs, and not for the help of a table.
 COMMANDS: Final[Table] = {name: (_target(name), line) for name, line in _HELP.items() if " " not in name}
+_EMPTY: Final = re.compile(r"(--[\w-]+=)?")
 _SHELLS: Final = ("bash", "fish", "zsh")
 _SYSTEM_SENTENCES: Final = {
     errno.ENOSPC: "the disk is full; free some space and run the same command again",
@@ -103,8 +105,11 @@ def main(args: Sequence[str] | None = None) -> int:
 
 def run(commands: Table, args: Sequence[str]) -> int:
     """Run a command of a table and return its exit code."""
+    args = list(map(_at_home, args))
     _, program, _ = _chosen(commands, args)
     _prepare_streams()
+    if not os.environ.get("COLUMNS", "").strip("0"):  # rich would print nothing into a width of 0
+        os.environ.pop("COLUMNS", None)
     # One core solves our small systems faster than several, and each worker has one core.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
@@ -126,6 +131,12 @@ def run(commands: Table, args: Sequence[str]) -> int:
         expected = isinstance(error, HandSimError | OSError | MemoryError | ImportError)
         _complain(f"{program}: {_sentence(error) if expected else _unexpected(program, error)}")
         return 1
+
+
+def _at_home(arg: str) -> str:
+    """An argument with the home folder for ~, which shells leave alone in quotes and behind `=`."""
+    option, equals, value = arg.partition("=") if arg.startswith("--") else ("", "", arg)
+    return f"{option}{equals}{os.path.expanduser(value)}"
 
 
 def load(target: str | Table) -> Any:
@@ -236,6 +247,12 @@ def _dispatch(commands: Table, args: Sequence[str]) -> int:
         from handsim.cli.parsing import outline, run_command
 
         (target, help_line), prog, args = _chosen(commands, args)
+        if any(map(_EMPTY.fullmatch, args)):  # the path "" would be the current folder
+            print(
+                f"{prog}: an argument is empty, expected a value; is a shell's variable unset?",
+                file=sys.stderr,
+            )
+            return 2
         command = load(target) if isinstance(target, str) else outline(target)
         with _compiled_ahead("-".join(prog.split()[1:])):
             result = run_command(command, prog=prog, help_line=help_line, args=args)

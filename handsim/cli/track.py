@@ -29,7 +29,7 @@ _TIMED: Final = 100_000  # newest frames whose computing times are kept
 def track(
     capture: Annotated[Path | None, tyro.conf.Positional] = None,
     *,
-    out: Path,
+    out: Path | None = None,
     live: str | None = None,
     seconds: float | None = None,
     send: tuple[str, ...] = (),
@@ -45,11 +45,12 @@ def track(
     Args:
         capture: A .trc, .c3d, .csv (Motive, Vicon) or .tsv (Qualisys) file; its names are not
             used.
-        out: The tracked take, a .npz file.
+        out: The tracked take, a .npz file; with --live and --send nothing is recorded when not given.
         live: A stream instead of a capture: natnet://host or natnet://host:port (OptiTrack), qtm://host
             (Qualisys), or module:name, a frame source of your own. Ctrl-C or the end of the terminal ends it.
             Frames are written as they come, to OUT.part until then.
-        seconds: How long to record a live stream [s].
+        seconds: How long to track a live stream [s], from its first frame, which is awaited as long, at least
+            ten seconds.
         send: Where hands are sent as they are tracked, one or several of osc://host:port, udp://host:port,
             ws://host:port and tcp://host:port, which are servers, lsl:NAME, and module:name, a sink of your
             own. Without a host it is this machine. A capture is then played at its own rate.
@@ -72,7 +73,13 @@ def track(
         raise ArgumentError(
             f"given --calibrate and --live {live}, expected a capture, which is tracked twice"
         )
-    check_take_file(out, live=live is not None)
+    if out is not None:
+        check_take_file(out, live=live is not None)
+    elif capture is not None or labeled is not None or not send:
+        given = f"a capture, {capture}" if capture is not None else f"--live {live}"
+        given += "" if labeled is None else f" and --labeled {labeled}"
+        expected = "--out FILE.npz" + ", --send ADDRESS or both" * (capture is None and labeled is None)
+        raise ArgumentError(f"given {given} without --out, expected {expected}")
     if labeled is not None:
         check_suffix(labeled, WRITABLE)
     check_outputs((capture, *options.files()), (out, labeled))
@@ -83,19 +90,21 @@ def track(
         times.append(tracked.seconds)
 
     with open_sinks(send) as sinks:
-        if capture is not None:
+        if capture is not None and out is not None:
             tracked = _track_file(capture, out, labeled, settings, sinks, on_frame)
         else:
             with named_steps(""):  # a glove may have to be learned
                 setup = TrackerSetup.of(settings)
             tracked = track_live(str(live), setup, [sinks], out=out, seconds=seconds, on_frame=on_frame)
-            if labeled is not None:  # last, because a failure must not cost the recording
+            if labeled is not None and out is not None:  # last, because a failure must not cost the recording
                 write_capture(labeled, tracked.whole_take(out).labeled_capture())
-    take = tracked.take
-    assert take is not None  # it was recorded
+    speed = f"{1e3 * float(np.median(times or [0.0])):.2f} ms per frame"
+    if out is None or tracked.take is None:
+        print_line(f"{tracked.num_frames} frames, {tracked.duration:.1f} s", *tracked.notes, speed)
+        return
     if options.shape is not None and options.glove is None:
-        print_line(f"{options.shape}: hands in the glove '{take.settings['glove']}'")
-    _print_take(out, take, tracked, 1e3 * float(np.median(times)))
+        print_line(f"{options.shape}: hands in the glove '{tracked.take.settings['glove']}'")
+    _print_take(out, tracked.take, tracked, speed)
 
 
 def _track_file(
@@ -137,7 +146,7 @@ def _track_file(
     return LiveTake(take, take.num_frames, take.duration, (*notes, *sinks.notes()))
 
 
-def _print_take(out: Path, take: Take, tracked: LiveTake, milliseconds: float) -> None:
+def _print_take(out: Path, take: Take, tracked: LiveTake, speed: str) -> None:
     """Print a summary of a take, and warn of signs of mistakes."""
     from track.take_summary import summarize, suspicions
     from track.user import MEASURED
@@ -147,6 +156,6 @@ def _print_take(out: Path, take: Take, tracked: LiveTake, milliseconds: float) -
     if user.startswith("calibrated on"):
         lines = user.split("; ")
     lines.append(f"{out}: {tracked.num_frames} frames, {tracked.duration:.1f} s at {take.rate:.4g} Hz")
-    print_line(*lines, *tracked.notes, *summarize(take), f"{milliseconds:.2f} ms per frame")
+    print_line(*lines, *tracked.notes, *summarize(take), speed)
     for suspicion in suspicions(take):
         warnings.warn(suspicion, HandSimWarning, stacklevel=3)

@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Final
 
 import tyro
 
+from handsim._process import rank_and_size
 from handsim.app.messages import print_line, progress_bar
 from handsim.cli.parsing import PresetCommand, given_option
 from train.settings import KINDS, PRESETS, Preset, TrainSettings, usual_settings
 
 
 def _train(
-    dataset: Annotated[Path, tyro.conf.Positional],
+    dataset: Annotated[str, tyro.conf.Positional],
     out: Path,
     settings: Annotated[TrainSettings, tyro.conf.arg(name="")],
     preset: Preset | None = None,
@@ -26,7 +26,7 @@ def _train(
     """Train a labeler on a training set and write a page about it; run it again to continue a stopped run.
 
     Args:
-        dataset: Folder that `handsim generate` wrote.
+        dataset: Folder that `handsim generate` wrote, also in an object store, as s3://bucket/prefix.
         out: Folder for the weights, the model card, the checkpoint and report.html.
         settings: How to train.
         preset: A published recipe, which replaces the defaults; options given beside it hold.
@@ -37,7 +37,7 @@ def _train(
     from train.reports.run_page import PAGE, held_out_people
 
     del preset  # it is in `settings`
-    if os.environ.get("RANK", os.environ.get("SLURM_PROCID", "0")) != "0":  # only the first process prints
+    if rank_and_size()[0]:  # only the first process prints
         train_labeler(dataset, out, settings, threads=threads)
         return
     with progress_bar("samples") as bar:

@@ -18,6 +18,7 @@ from track.streams import LOOPBACK
 from track.viewer import address_of, opened_server
 
 if TYPE_CHECKING:
+    from handsim.space.rig import CameraRig
     from track.settings import TrackerSetup
     from track.viewer.contents import Content
 
@@ -40,9 +41,9 @@ def view(
     In a tracked take labels can be corrected, and are saved.
 
     Args:
-        file: A marker layout or camera rig (.toml, or a shipped name), a training set's folder, a capture
-            (.trc, .c3d, .csv or .tsv), a tracked take or a simulated take's truth (.npz), or a user's file
-            (.json).
+        file: A marker layout or camera rig (.toml, or a shipped name), the folder of a training set, also
+            as s3://bucket/prefix, a capture (.trc, .c3d, .csv or .tsv), a tracked take or a simulated take's
+            truth (.npz), or a user's file (.json).
         host: Address to serve the page at; only this machine reaches the default. There is no password.
         port: Port to serve the page at; the first free one from 8080 on when not given.
         out: File for a layout that was changed, a new name beside the layout when not given; or for the take
@@ -54,6 +55,7 @@ def view(
         time: Time of a take, capture or training set that the page opens at [s]; its start when not given.
         up: The axis of a take, capture or stream that points up; y for Motive's default.
     """
+    from handsim.space.rig import load_rig
     from track.settings import TrackerSetup
     from track.viewer.contents import open_content
 
@@ -66,9 +68,10 @@ def view(
         if out is not None:
             check_take_file(out, live=True)
             check_outputs((rig, *options.files()), (out,))
+        cameras = None if rig is None else load_rig(rig)
         with named_steps(""):  # a glove may have to be learned
             setup = TrackerSetup.of(options.settings())
-        _view_live(live, setup, host, port, rig, out, up)
+        _view_live(live, setup, host, port, cameras, out, up)
         return
     _check_still(str(file), options, video, time)
     content = open_content(str(file), out=out, size=options.size, rig=rig, time=time, up=up)
@@ -113,16 +116,14 @@ def _view_live(
     setup: TrackerSetup,
     host: str,
     port: int | None,
-    rig: str | None,
+    cameras: CameraRig | None,
     out: Path | None,
     up: UpAxis,
 ) -> None:
     """Track a stream and show it until a signal or the stream ends it; record it if `out` is given."""
-    from handsim.space.rig import load_rig
     from track.live import track_live
     from track.viewer.timeline import LiveView
 
-    cameras = None if rig is None else load_rig(rig)
     with opened_server(host, port, "handsim view") as server, LiveView(server, cameras, up) as view:
         print_line(f"{url}: {address_of(server)} ; Ctrl-C ends it")
         tracked = track_live(url, setup, [view], out=out)

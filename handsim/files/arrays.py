@@ -5,6 +5,7 @@ What the reader refuses because of its size, the writer does not write.
 
 from __future__ import annotations
 
+import io
 import lzma
 import math
 import tokenize
@@ -70,18 +71,22 @@ def write_npz(path: Path, members: Iterable[Member]) -> None:
 
 def check_npz(path: Path) -> None:
     """Read an `.npz` to its end without keeping its arrays."""
-    with _damage_named(), zipfile.ZipFile(path) as archive:
-        _check_archive(archive, path)
+    with _damage_named(), path.open("rb") as file, zipfile.ZipFile(file) as archive:
+        _check_archive(archive, file)
         if archive.testzip() is not None:
             raise ValueError("damaged")
 
 
-def read_npz(path: Path) -> dict[str, np.ndarray[Any, Any]]:
-    """All arrays of an `.npz`, by name."""
-    with _damage_named():
-        with zipfile.ZipFile(path) as archive:
-            _check_archive(archive, path)
-        with np.load(path, allow_pickle=False) as stored:
+def read_npz(source: Path | bytes) -> dict[str, np.ndarray[Any, Any]]:
+    """All arrays of an `.npz`, given by its path or as its content, by name."""
+    with (
+        _damage_named(),
+        io.BytesIO(source) if isinstance(source, bytes) else source.open("rb") as file,
+        zipfile.ZipFile(file) as archive,
+    ):
+        _check_archive(archive, file)
+        file.seek(0)
+        with np.load(file, allow_pickle=False) as stored:
             return {name: stored[name] for name in stored.files}
 
 
@@ -98,12 +103,12 @@ def _damage_named() -> Iterator[None]:
         raise ValueError("damaged") from error
 
 
-def _check_archive(archive: zipfile.ZipFile, path: Path) -> None:
+def _check_archive(archive: zipfile.ZipFile, file: IO[bytes]) -> None:
     """Raise a ValueError unless an archive holds plain arrays, of no more bytes than its size allows."""
-    check_members(archive, path.stat().st_size)
+    check_members(archive, file.seek(0, io.SEEK_END))
     for member in archive.infolist():
-        with archive.open(member) as file:
-            check_npy_header(file, member.file_size)
+        with archive.open(member) as array:
+            check_npy_header(array, member.file_size)
 
 
 def check_members(archive: zipfile.ZipFile, size: int) -> None:

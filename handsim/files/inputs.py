@@ -6,6 +6,7 @@ A wrong value raises a `HandSimError` that names the key; the caller, which know
 from __future__ import annotations
 
 import codecs
+import errno
 import functools
 import hashlib
 import json
@@ -27,8 +28,6 @@ if TYPE_CHECKING:
     from upath import UPath
 
 
-DIGEST: Final = "handsim.sha256"
-"""Key of an ONNX model's own SHA-256, which is taken with 64 zeros in its place."""
 _NO_WAITING: Final = getattr(os, "O_NONBLOCK", 0)
 _MOST_TOML: Final = 1 << 18  # bytes; a layout of 60 markers has 6000
 _MOST_JSON: Final = 1 << 26  # bytes
@@ -57,6 +56,12 @@ def check_regular(path: Path, *, error: type[HandSimError], most: int | None = N
         raise error(f"{path}: the file is {found.st_size} bytes long, expected at most {most}")
 
 
+def check_there(path: Path, *, error: type[HandSimError]) -> None:
+    """Refuse a path where no file and no folder is, before long work that needs it later."""
+    if not path.exists():
+        raise error(f"{path}: cannot be read: {os.strerror(errno.ENOENT)}")
+
+
 def read_bytes(path: Path, *, error: type[HandSimError], most: int | None = None) -> bytes:
     """The bytes of a regular file of at most `most` bytes."""
     check_regular(path, error=error, most=most)
@@ -82,17 +87,6 @@ def checksum(path: Path | UPath) -> str:
 
 
 _LARGEST: Final = 1e9  # in any unit; keeps out NaN, infinity and integers beyond float
-
-
-def sign_model(content: bytes) -> bytes:
-    """The bytes of an ONNX model with a fresh SHA-256 in the place of its old one."""
-    key = DIGEST.encode() + b"\x12\x40"  # protobuf's tag of the value, and its length
-    if content.count(key) != 1:
-        raise ValueError("the file has no SHA-256")
-    first = content.index(key) + len(key)
-    place = slice(first, first + 64)
-    blank = content[: place.start] + b"0" * 64 + content[place.stop :]
-    return content[: place.start] + hashlib.sha256(blank).hexdigest().encode() + content[place.stop :]
 
 
 def read_toml(path: Path, *, error: type[HandSimError]) -> dict[str, Any]:

@@ -11,6 +11,7 @@ import json
 import math
 import os
 import platform
+import re
 import shutil
 import tempfile
 import zlib
@@ -23,6 +24,7 @@ from typing import Any, Final, cast
 import numpy as np
 
 from handsim._checks import check_type
+from handsim._process import memory_limit, text_of_system
 from handsim.errors import ArgumentError, HandSimError, shortened
 from handsim.files.inputs import load_json
 from handsim.files.signals import signals_wait
@@ -52,6 +54,7 @@ def plain_path(path: Path) -> Iterator[Path]:
 
 
 _OLDER: Final = "-older"  # marks the second name of a file that is being replaced
+_SHOWN_STEM: Final = 32  # characters of a name that its temporary name shows
 _PROBE: Final = 1 << 20  # bytes that are written to learn why a library's write failed
 
 
@@ -75,7 +78,8 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
         mode = _usual_mode(temporary)
         try:
             yield temporary
-            os.chmod(temporary, mode)
+            with suppress(OSError):  # network drives and memory cards may keep no modes
+                os.chmod(temporary, mode)
             _flush(temporary)
             together = _TOGETHER.get()
             if together is None:
@@ -188,6 +192,8 @@ def unwritten(path: Path) -> OSError:
 def make_folder_of(path: Path) -> None:
     """Make the folders that are missing on the way to a file."""
     for folder in path.parents:
+        if str(folder) == "~" and not folder.exists():
+            raise ArgumentError(f"{path}: only shells replace ~, expected Path('{path}').expanduser()")
         if folder.exists() and not folder.is_dir():
             raise NotADirectoryError(errno.ENOTDIR, f"{folder} is a file, not a folder", str(folder))
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -199,24 +205,34 @@ def temporary_beside(path: Path, mark: str = "") -> Path:
 
 
 def _prefix(path: Path) -> str:
-    """The beginning of temporary names, with a hash of this machine, since only there IDs are unique."""
-    return f".{path.stem}.tmp-{zlib.crc32(platform.node().encode()):08x}-"
+    """The beginning of temporary names, with a hash of this machine, since only there IDs are unique.
+
+    It has a hash in place of the end of a long name, as a name may have 255 bytes.
+    """
+    stem = path.stem
+    if len(stem) > _SHOWN_STEM:
+        stem = f"{stem[:_SHOWN_STEM]}-{zlib.crc32(os.fsencode(stem)):08x}"
+    return f".{stem}.tmp-{_machine()}-"
+
+
+def _machine() -> str:
+    """A hash of this machine's name."""
+    return f"{zlib.crc32(platform.node().encode()):08x}"
 
 
 def remove_leftovers(folder: Path, names: str = "**/.*.tmp-*") -> None:
     """Remove the files and folders that match a pattern, when not given all temporary ones at any depth.
 
-    Call it only for what one job owns: what another process is writing there would be lost.
+    What another running process of this machine writes there stays.
     """
     for leftover in folder.glob(names):
-        _remove(leftover)
-
-
-def _remove(leftover: Path) -> None:
-    if leftover.is_dir() and not leftover.is_symlink():
-        shutil.rmtree(leftover, ignore_errors=True)
-    else:
-        leftover.unlink(missing_ok=True)
+        writer = re.search(rf"\.tmp-{_machine()}-(\d{{1,9}})", leftover.name)
+        if writer and int(writer[1]) != os.getpid() and _is_running(int(writer[1])):
+            continue
+        if leftover.is_dir() and not leftover.is_symlink():
+            shutil.rmtree(leftover, ignore_errors=True)
+        else:
+            leftover.unlink(missing_ok=True)
 
 
 def remove_abandoned(final: Path) -> None:
@@ -224,8 +240,8 @@ def remove_abandoned(final: Path) -> None:
     prefix = _prefix(final)
     for leftover in final.parent.glob(f"{glob.escape(prefix)}*{glob.escape(final.suffix)}"):
         number = leftover.name.removeprefix(prefix).removesuffix(final.suffix).removesuffix(_OLDER)
-        if number.isdecimal() and not _is_running(int(number)):
-            _remove(leftover)
+        if number.isdecimal() and int(number) != os.getpid():
+            remove_leftovers(final.parent, glob.escape(leftover.name))
 
 
 def _is_running(process: int) -> bool:
@@ -345,15 +361,13 @@ def check_memory(needed: int, what: str, remedy: str) -> None:
 
 
 def available_bytes() -> int:
-    """Memory that is free without swapping [bytes]; all memory if the system does not state it."""
-    try:
-        lines = Path("/proc/meminfo").read_text().splitlines()
-    except OSError:
-        lines = []
-    for line in lines:
-        if line.startswith("MemAvailable:"):
-            return int(line.split()[1]) * 1024
-    return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    """Memory that is free without swapping, at most what control groups allow [bytes].
+
+    It is all memory if the system does not state what is free.
+    """
+    stated = re.search(r"^MemAvailable: *(\d{1,15}) kB$", text_of_system(Path("/proc/meminfo")), re.M)
+    free = 1024 * int(stated[1]) if stated else os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    return int(min(free, memory_limit()))
 
 
 def shown_bytes(count: float) -> str:

@@ -14,12 +14,10 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
-from handsim.hand.shape import BONES, DIGITS, PALM, HandShape
+from handsim.hand.shape import BONES, DIGITS, FIRMNESS, PALM, HandShape
 from handsim.kernels import kernel, segment_distance_squared
 from handsim.space.transforms import MIRROR
 
-FIRMNESS: Final = 0.8
-"""Capsule radius over skin radius."""
 _CARPUS_SPREAD: Final = 0.42  # sideways position of a metacarpal's near end, over that of its knuckle
 _CARPUS_RISE: Final = 0.28  # the carpus arches over the line from wrist to knuckles, in palm thicknesses
 

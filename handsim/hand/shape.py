@@ -147,6 +147,9 @@ SIZES: Final[dict[str, tuple[float, float]]] = {
     "L": (193.0, 88.0),
     "XL": (210.0, 96.0),
 }
+FIRMNESS: Final = 0.8
+"""Radius of the capsule that stands for a bone's flesh in collisions, over the skin's radius."""
+_PRESSED: Final = 0.00079  # [m] largest overlap of neighboring fingers at their knuckles, in every pose
 _SHORTEST, _LONGEST = 1e-4, 1.0  # bounds of every length in a hand [m], far beyond those of people
 HAND_DTYPE: Final = np.dtype(
     [
@@ -293,14 +296,25 @@ def sample_shape(
     angles = spread(np.deg2rad(population.angle_spread), (len(DIGITS), 3))
     angles[0] *= 3.0
     bones = np.exp(spread(population.digit_spread, (5, 1)) + spread(population.bone_spread, (5, 3)))
+    knuckles = mean.knuckles + youth * spread(population.knuckle_spread, (5, 3))
+    radii = mean.radii * np.exp(spread(population.girth_spread, (5, 1)))
+    _make_room(knuckles, radii)
     return dataclasses.replace(
         mean,
         bone_lengths=mean.bone_lengths * bones,
-        knuckles=mean.knuckles + youth * spread(population.knuckle_spread, (5, 3)),
+        knuckles=knuckles,
         base_angles=mean.base_angles + angles,
-        radii=mean.radii * np.exp(spread(population.girth_spread, (5, 1))),
+        radii=radii,
         palm_thickness=mean.palm_thickness * float(np.exp(spread(population.girth_spread, ()))),
     )
+
+
+def _make_room(knuckles: Float[np.ndarray, "5 3"], radii: Float[np.ndarray, "5 4"]) -> None:
+    """Slim neighboring fingers that would overlap at their knuckles, whatever their pose [m]."""
+    for finger in range(2, len(DIGITS)):
+        pair = slice(finger - 1, finger + 1)
+        room = np.linalg.norm(knuckles[finger] - knuckles[finger - 1]) + _PRESSED
+        radii[pair] *= min(1.0, room / (FIRMNESS * radii[pair, :2].mean(axis=1).sum()))
 
 
 def pack_hand(shape: HandShape) -> tuple[Any, ...]:

@@ -266,7 +266,7 @@ def _table(path: Path, rows: list[tuple[int, list[str]]]) -> JointTable:
 
 
 def write_joint_csv(path: Path, motion: Motion, up: UpAxis = "z") -> None:
-    """Write the table as text with nine digits, in the take's axes whatever `up` is."""
+    """Write the table as text with nine digits (times: sixteen), in the take's axes whatever `up` is."""
     hands = motion.hands
     tables = [_numbers(hand) for hand in hands]
     titles = _titles(motion)
@@ -277,7 +277,7 @@ def write_joint_csv(path: Path, motion: Motion, up: UpAxis = "z") -> None:
             for hand, table in zip(hands, tables, strict=True):
                 row = table[frame]
                 text = row_format % tuple(row.tolist()) if hand.present[frame] else "," * len(titles)
-                file.write(f"{frame},{time:.9g},{hand.side}{text}\n")
+                file.write(f"{frame},{time:.16g},{hand.side}{text}\n")
 
 
 def write_joint_parquet(path: Path, motion: Motion, up: UpAxis = "z") -> None:

@@ -12,7 +12,7 @@ import json
 import re
 import textwrap
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Final
 
@@ -33,7 +33,7 @@ _MAX_TURN: Final = 6.4  # longest rotation vector [rad]; longer ones are angles 
 _MAX_BASELINE: Final = 5.0  # largest distance of the cameras of a pair [m]
 _ENTRY: Final = re.compile(r"^[\"']?([A-Za-z_][\w .-]*?)[\"']?[ \t]*:(?=\s)", re.M)
 _DATA: Final = re.compile(r"\bdata[\"']?[ \t]*:[ \t]*\[([^\[\]]*)\]")
-_DASH: Final = re.compile(r"^[ \t]*-[ \t](?=[ \t]*[-+.\d\[])", re.M)
+_DASH: Final = re.compile(r"^[ \t]*(?:-[ \t]+)+(?=[-+.\d\[])", re.M)
 _LIST: Final = re.compile(r"[\[\],\s]+")
 _K: Final = ("camera_matrix", "cameraMatrix", "K", "mtx", "M")
 _D: Final = ("distortion_coefficients", "dist_coeffs", "distCoef", "D", "dist", "distortions")
@@ -66,8 +66,32 @@ _OTHER_LENSES: Final = {
     "mei", "omni", "omnidirectional", "ucm", "eucm", "ds", "doublesphere", "fov", "ftheta", "unified", "ocam",
     "scaramuzza", "equisolid", "stereographic", "orthographic",
 }  # fmt: skip
-_R: Final = ("R", "Rot", "rvec", "rotation")
-_T: Final = ("T", "t", "tvec", "translation")
+_R: Final = ("R", "Rot", "rvec", "rotation", "rotation_matrix", "rotation_vector")
+_T: Final = ("T", "t", "tvec", "translation", "translation_vector")
+_OURS: Final = "T_world_camera"
+_READ_POSES: Final = (
+    f"{_OURS}, or R (rotation_matrix, rotation_vector, rvec) and T (translation_vector, tvec), which take "
+    "the world to the camera"
+)
+_READ_LENSES: Final = "distortion_coefficients, dist_coeffs or D, or k1, k2, p1, p2, k3"
+_KNOWN: Final = (*_K, *_D, *_WIDTH, *_HEIGHT, *_SIZE, *_BROWN, *_R, *_T, _OURS, TOML_MATRIX)
+"""Keys with a meaning; single letters count as they are written, other names in any spelling."""
+_HARMLESS: Final = re.compile(
+    "error|std|deviation|covariance|count|points|rectif|projection|new|optimal|essential|fundamental|homography"
+    "|^[pqefh]$"
+)
+"""Keys, without signs and capital letters, of what is neither a pose nor a lens."""
+_OF_BOARDS: Final = ("rvecs", "tvecs", "extrinsic_parameters")
+"""Keys of the poses of OpenCV's board, one for each of its pictures."""
+_POSE: Final = re.compile(
+    "extr|pose|rot|transl|transf|[rt]vec|^rt$|world|[cw]2[cw]|position|location|orient|quat|euler"
+    "|^t(cw|wc)$|^(yaw|pitch|roll)$"
+)
+"""Keys, without signs and capital letters, that may mean a pose; so may any of 9, 12 or 16 numbers."""
+_POSE_COUNTS: Final = (9, 12, 16)
+_SHOWN_KEYS: Final = 8  # keys that a sentence names
+_COEFFICIENTS: Final = re.compile("distor|radial|tangential|coef|fisheye|^kc?[1-6]?$")
+"""Keys, without signs and capital letters, that may mean a lens."""
 _PAIRS: Final = {"intrinsics": "extrinsics", "intri": "extri"}
 """Files that belong together: of OpenCV's stereo sample, and of EasyMocap."""
 _OTHERS: Final = _PAIRS | {second: first for first, second in _PAIRS.items()}
@@ -114,6 +138,8 @@ def read_opencv_cameras(path: Path) -> tuple[Camera, ...]:
         alone = other != path and not other.is_file()
         hint = f"; {other.name}, which belongs to it, is not beside it" if alone else ""
         raise RigError(f"{path}: {error}{hint}") from error
+    for own in [values, *sections.values()]:
+        _warn_of_unread(path, own)
     return checked_cameras(path, cameras)
 
 
@@ -126,8 +152,8 @@ def _many(values: Values, sections: Sections) -> list[Camera]:
     common = {key: value for key, value in values.items() if key not in alone}
     for name, (given, own) in zip(camera_names(list(sections)), sections.items(), strict=True):
         with errors_of(f"camera '{shortened(given)}'", RigError):
-            if "T_world_camera" not in own and (_find(own, _R) is None or _find(own, _T) is None):
-                raise RigError("no R and T, the rotation and translation from the world to the camera")
+            if _OURS not in own and (_find(own, _R) is None or _find(own, _T) is None):
+                raise _no_pose(_unread_poses(common | own))
             cameras.append(_camera(common | own, name, _K, _D, _pose(own)))
     return cameras
 
@@ -136,7 +162,7 @@ def _without_rectification(path: Path, values: Values) -> Values:
     """Values of ROS' CameraInfo as OpenCV's; in ROS 2 the keys K, D, R and P are in lower case."""
     if {"k", "p", "distortion_model"} <= values.keys():
         values = {key.upper() if key in ("k", "d", "r", "p") else key: value for key, value in values.items()}
-    if not {"K", "P", "R"} <= values.keys() or _find(values, (*_T, "T_world_camera")) is not None:
+    if not {"K", "P", "R"} <= values.keys() or _find(values, (*_T, _OURS)) is not None:
         return values
     told = f"{path}: R beside P is ROS' rectification and no pose; the camera's axes are the world"
     warnings.warn(told, HandSimWarning, stacklevel=3)
@@ -175,9 +201,9 @@ def _camera(
 
 def _stereo(values: Values) -> list[Camera]:
     """A stereo pair, whose R and T map coordinates of the first camera to the second."""
-    first, shift = _own_pose(values), np.array(_value_numbers(values, "T", (3,)))
-    _check_baseline(shift)
-    second = first @ np.linalg.inv(rigid(_rotation(values, "R"), shift))
+    first, outer = _own_pose(values), _outer(values)
+    _check_baseline(outer[:3, 3])
+    second = first @ np.linalg.inv(outer)
     return [
         _camera(values, name, _numbered(_K, number), _numbered(_D, number), pose)
         for name, number, pose in (("left", 1, first), ("right", 2, second))
@@ -215,10 +241,13 @@ def _lens(values: Values, names: tuple[str, ...]) -> Lens:
         for key, value in values.items()
         if found is None and names is _D and len(value) == 1 and not isinstance(value, str)
     }
-    kinds = _lens_kinds(values, any(given) or "k1" in single)
-    if "k1" in single:
+    kinds = _lens_kinds(values, any(given) or not single.keys().isdisjoint(_BROWN))
+    if not single.keys().isdisjoint(_BROWN):
         found, order = "k1", ("k1", "k2", "k3", "k4") if "fisheye" in kinds else _BROWN
         given = tuple(_value_numbers(values, single[key], (1,))[0] if key in single else 0.0 for key in order)
+    unread = [] if found else [key for key, value in values.items() if _may_be_lens(key, value)]
+    if unread:
+        raise RigError(f"unknown keys of a lens: {_listed(unread)}; valid names: {_READ_LENSES}")
     if "fisheye" in kinds:
         if len(given) < 4 or any(given[4:]):
             raise RigError(f"a fisheye lens with {len(given)} coefficients, expected 4")
@@ -276,24 +305,85 @@ def _size(values: Values) -> tuple[int, int]:
     elif both is not None:
         size = _value_numbers(values, both, (2,))
     else:
-        raise RigError("no size of the pictures; add image_width and image_height in pixels")
+        raise RigError(
+            f"no size of the pictures among {_listed(values)}; add image_width and image_height in pixels"
+        )
     if not all(length == int(length) for length in size):
         raise RigError(f"the pictures are {size[0]:g} x {size[1]:g}, expected whole numbers of pixels")
     return int(size[0]), int(size[1])
 
 
 def _pose(values: Values) -> NDArray[np.float64]:
-    """`T_world_camera`, or the inverse of R and T; without them the identity."""
+    """`T_world_camera`, or the inverse of R and T; without them the identity, where nothing may be a pose."""
+    R, T, unread = _find(values, _R), _find(values, _T), _unread_poses(values)
+    if _OURS in values or not (R or T or unread):
+        return _own_pose(values)
+    if unread and not (R and T):
+        raise _no_pose(unread)
+    return np.linalg.inv(_outer(values)).astype(np.float64)
+
+
+def _no_pose(unread: list[str]) -> RigError:
+    """The error for a camera whose pose is missing, or under keys that are not read."""
+    found = f"; unknown keys of a pose: {_listed(unread)}" if unread else ""
+    return RigError(f"no R and T{found}; valid names: {_READ_POSES}")
+
+
+def _warn_of_unread(path: Path, values: Values) -> None:
+    """Name keys that may mean a pose beside the one that was read, and poses of the calibration's board."""
+    boards = [key for key in values if _find({key: key}, _OF_BOARDS)]
+    for keys, why in (
+        (_unread_poses(values), "not read beside the pose"),
+        ([] if _OURS in values or _find(values, _T) else boards, "poses of the board, not of the camera"),
+    ):
+        if keys:
+            warnings.warn(f"{path}: {why}: {_listed(keys)}", HandSimWarning, stacklevel=4)
+
+
+def _outer(values: Values) -> NDArray[np.float64]:
+    """R and T as one transform (4, 4)."""
     R, T = _find(values, _R), _find(values, _T)
-    if "T_world_camera" not in values and (R is not None or T is not None):
-        outer = rigid(_rotation(values, R or "R"), _value_numbers(values, T or "T", (3,)))
-        return np.linalg.inv(outer).astype(np.float64)
-    return _own_pose(values)
+    return rigid(_rotation(values, R or "R"), _value_numbers(values, T or "T", (3,)))
 
 
 def _own_pose(values: Values) -> NDArray[np.float64]:
     """`T_world_camera`, or the identity."""
-    return _matrix(values, ("T_world_camera",), (4, 4)) if "T_world_camera" in values else np.eye(4)
+    return _matrix(values, (_OURS,), (4, 4)) if _OURS in values else np.eye(4)
+
+
+def _unread_poses(values: Values) -> list[str]:
+    """Keys that may mean a pose, and that are not read."""
+    return [
+        key
+        for key, value in values.items()
+        if not _is_known(key)
+        and (
+            (_POSE.search(_plain(key)) and (not isinstance(value, str) or re.match(r"[{\[]|.*\n", value)))
+            or (not isinstance(value, str) and len(value) in _POSE_COUNTS)
+        )
+    ]
+
+
+def _may_be_lens(key: str, value: tuple[float, ...] | str) -> bool:
+    """Whether a key that is not read may hold coefficients of a lens."""
+    plain = _plain(key)
+    is_name = len(value) == 1 and (_FISHEYE.fullmatch(plain) or _MODEL.fullmatch(plain))
+    known = _is_known(key) or is_name or isinstance(value, str)
+    return not known and _COEFFICIENTS.search(plain) is not None and any(value)
+
+
+def _is_known(key: str) -> bool:
+    """Whether a key, with or without a number at its end, has a meaning or needs none."""
+    bases = (key, re.sub(r"_?\d+$", "", key))
+    read = any(_find({base: base}, (*_KNOWN, *_OF_BOARDS)) for base in bases)
+    return read or any(_HARMLESS.search(_plain(base)) for base in bases)
+
+
+def _listed(keys: Iterable[str]) -> str:
+    """Keys for a sentence: the first few, and the number of the others."""
+    names = [f"'{shortened(key)}'" for key in keys]
+    more = f" and {len(names) - _SHOWN_KEYS} more" if len(names) > _SHOWN_KEYS else ""
+    return ", ".join(names[:_SHOWN_KEYS]) + more if names else "no keys"
 
 
 def _rotation(values: Values, key: str) -> NDArray[np.float64]:
@@ -320,7 +410,8 @@ def _matrix(values: Values, names: tuple[str, ...], shape: tuple[int, int]) -> N
     found = _find(values, names)
     if found is None:
         raise RigError(
-            f"no '{names[0]}' at the top level or in a table of each camera, expected OpenCV's calibration"
+            f"no '{names[0]}' at the top level or in a table of each camera, expected OpenCV's calibration; "
+            f"there is {_listed(values)}"
         )
     return np.array(_value_numbers(values, found, shape)).reshape(shape)
 
@@ -365,7 +456,9 @@ def _read(path: Path) -> tuple[Values, Sections]:
         except (ValueError, RecursionError) as error:
             raise RigError(f"{path}: not a calibration: it is no JSON") from error
         content = {"cameras": content} if isinstance(content, list) else content
-        values, sections = _json_values(content), dict(_json_sections(content))
+        sections = dict(_json_sections(content))
+        inner = {"cameras", *sections} if sections else set()
+        values = _json_values({key: value for key, value in content.items() if key not in inner})
     else:
         values, sections = _yaml_tables(text)
     known = next((what for key, what in _UNREAD.items() if re.search(_KEY.format(key), text, re.M)), None)
@@ -389,7 +482,7 @@ def _yaml_tables(text: str) -> tuple[Values, Sections]:
             if not inner or "data" in inner:
                 values_of[key] = _yaml_value(inner.get("data", value))
             else:
-                values_of |= {f"{key}_{word}": _yaml_value(one) for word, one in inner.items()}
+                values_of |= {f"{key}.{word}": _yaml_value(one) for word, one in inner.items()}
     return values, sections
 
 
@@ -436,17 +529,17 @@ def _json_sections(content: Mapping[str, object]) -> Iterator[tuple[str, Values]
 
 
 def _json_values(table: Mapping[str, object]) -> Values:
-    """The values of a table, and those of tables in it with both keys: "distortion_model"."""
+    """The values of a table, and those of tables in it with both keys: "distortion.model"."""
     values: Values = {}
     for key, value in table.items():
         inner = value if isinstance(value, dict) and "data" not in value else {"": value}
-        values |= {f"{key}_{below}" if below else str(key): _json_value(one) for below, one in inner.items()}
+        values |= {f"{key}.{below}" if below else str(key): _json_value(one) for below, one in inner.items()}
     return values
 
 
 def _json_value(value: object) -> tuple[float, ...] | str:
-    if isinstance(value, dict):
-        value = value.get("data")
+    if isinstance(value, dict) and "data" in value:
+        value = value["data"]
     words: list[str] = []
     waiting = [value]
     while waiting and len(words) <= _MAX_NUMBERS:

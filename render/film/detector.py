@@ -19,8 +19,10 @@ from numpy.typing import ArrayLike
 from scipy.special import expit
 
 from handsim._checks import check_array, check_choice, check_type
+from handsim._process import with_own_numerics
 from handsim.errors import ArgumentError, WeightsError
-from handsim.files.inputs import read_bytes, sign_model
+from handsim.files.inputs import read_bytes
+from handsim.files.models import check_model
 from handsim.hand.shape import NUM_KEYPOINTS, SIDES, Side
 from render.frames import Bytes, Doubles, Floats
 
@@ -75,8 +77,7 @@ class HandDetector:
     def __init__(self, finder: bytes, keypoints: bytes) -> None:
         networks = []
         for content in (finder, keypoints):
-            if sign_model(content) != content:  # OpenCV may crash on damaged files
-                raise ValueError("the SHA-256 is another one")
+            check_model(content)  # OpenCV may crash on damaged files
             networks.append(cv2.dnn.readNetFromONNX(np.frombuffer(content, dtype=np.uint8)))
         self._finder, self._keypoints = networks
         cells = FINDER_SIZE // CELL
@@ -105,6 +106,7 @@ class HandDetector:
                 "render.train_detector wrote"
             ) from error
 
+    @with_own_numerics
     def detect(self, image: UInt8[np.ndarray, "H W 3"]) -> list[FoundHand]:
         """All hands in an sRGB picture, the surest first.
 
@@ -117,6 +119,7 @@ class HandDetector:
         boxes, sure = [hand.box.tolist() for hand in hands], [hand.confidence for hand in hands]
         return [hands[number] for number in cv2.dnn.NMSBoxes(boxes, sure, _LEAST_CONFIDENCE, _SAME)]
 
+    @with_own_numerics
     def refine(
         self, image: UInt8[np.ndarray, "H W 3"], boxes: ArrayLike, sides: Sequence[Side]
     ) -> list[FoundHand]:

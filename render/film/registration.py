@@ -72,6 +72,12 @@ _UNLIKE: Final = (
     "the hands in the video do not move as those of the take at any shift of the clock; expected a video of "
     "this take, cut to its time, of a camera that stood still"
 )
+_SLOW: Final = (
+    "the hands in the video move {0} times as slowly as those of the take: is it slow motion? Make it {0} "
+    "times as fast: ffmpeg -itsscale {1:.6g} -i slow.mp4 -an -c copy true.mp4"
+)
+_RATIOS: Final = (2, 4, 5, 8, 10, 16, 20, 32)
+"""How many times as slowly as it was taken slow motion is stored."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -173,6 +179,34 @@ def register(
     A `given` camera has the lens of the video's. Without `pictures`, the frames, for the outlines of the
     hands, keypoints alone tell the camera, which are much coarser.
     """
+    try:
+        return _register(take, found, size, given, pictures)
+    except HandSimError as error:
+        if str(error) == _UNLIKE and (ratio := _slowed(take, found, size, given)):
+            raise HandSimError(_SLOW.format(ratio, 1.0 / ratio)) from error
+        raise
+
+
+def _slowed(take: Take, found: Sequence[FoundFrame], size: tuple[int, int], given: Camera | None) -> int:
+    """How many times too slow a video's clock is; 0 if the hands of the take fit at no usual ratio."""
+    videos = {ratio: [one._replace(time=one.time / ratio) for one in found] for ratio in _RATIOS}
+    bundles = {ratio: Bundle(take, Detections.of(one), size, given) for ratio, one in videos.items()}
+    best = max(_RATIOS, key=lambda ratio: _shifts(bundles[ratio])[0][0])
+    try:
+        _register(take, videos[best], size, given)
+    except HandSimError:
+        return 0
+    return best
+
+
+def _register(
+    take: Take,
+    found: Sequence[FoundFrame],
+    size: tuple[int, int],
+    given: Camera | None,
+    pictures: Callable[[], Iterable[Bytes]] | None = None,
+) -> Registration:
+    """The registration of a video whose clock is right."""
     bundle, width = Bundle(take, Detections.of(found), size, given), size[0]
     with_hands, looked = (len(np.unique(one)) for one in (bundle.found.frames, bundle.found.looked))
     if with_hands < _FEWEST_FRAMES:
@@ -235,11 +269,9 @@ def _adjusted(bundle: Bundle, state: State, *, splits: bool) -> tuple[State, Dou
 def _first_guess(bundle: Bundle) -> State:
     """Unknowns that explain most of what was found: clock by all shifts, pose by PnP."""
     gate, best, most = _GATE * bundle.size[0], None, 0.0
-    taken, filmed = bundle.take.times, bundle.found.times
-    shifts = np.arange(taken[0] - filmed[-1], taken[-1] - filmed[0], _STEP)
     tried: list[float] = []
     # The best fits are computed again, because those of all shifts together would fill the memory.
-    for shift in sorted(shifts.tolist(), key=lambda shift: -_affine_fit(bundle, shift)[0]):
+    for _, shift in _shifts(bundle):
         if len(tried) == _TRIED:
             break
         if any(abs(shift - other) < _APART for other in tried):
@@ -256,6 +288,13 @@ def _first_guess(bundle: Bundle) -> State:
     if best is None:
         raise HandSimError(_UNLIKE)
     return best
+
+
+def _shifts(bundle: Bundle) -> list[tuple[float, float]]:
+    """How many detections an affine camera explains at each shift of the clock, and the shift; best first."""
+    taken, filmed = bundle.take.times, bundle.found.times
+    shifts = np.arange(taken[0] - filmed[-1], taken[-1] - filmed[0], _STEP).tolist()
+    return sorted(((_affine_fit(bundle, shift)[0], shift) for shift in shifts), reverse=True)
 
 
 def _affine_fit(bundle: Bundle, offset: float) -> tuple[float, Doubles, Doubles]:

@@ -28,7 +28,8 @@ from torch.nn import functional
 from handsim import __version__
 from handsim._checks import check_count
 from handsim._plugins import import_extra
-from handsim.files.inputs import DIGEST, sign_model
+from handsim._process import torch_kept
+from handsim.files.models import DIGEST, stamp_model
 from handsim.files.outputs import atomic_write
 from handsim.hand.model import HandModel
 from handsim.hand.shape import NUM_KEYPOINTS, NUM_QPOS, SIDES
@@ -53,7 +54,8 @@ from render.film.detector import (
 from render.film.network import FinderNetwork, KeypointNetwork
 from render.formats.records import encode_jpeg
 from render.frames import Bytes, Doubles, Floats
-from render.stream import PictureStream, load_labeled_hands, read_photograph
+from render.photographs import read_photograph
+from render.stream import PictureStream, load_labeled_hands
 
 BATCH: Final = 32
 BF16: Final = any(torch.cpu.get_capabilities().get(name) for name in ("amx_bf16", "avx512_bf16"))
@@ -86,6 +88,7 @@ Batch = tuple[torch.Tensor, Targets]
 """Pictures (B, 3, S, S) and what is learned of them in one step."""
 
 
+@torch_kept()
 def train_detector(
     out: str | Path,
     *,
@@ -480,7 +483,7 @@ def export(network: Network, path: Path) -> None:
     helper.set_model_props(model, {"handsim.version": __version__, DIGEST: "0" * 64})
     onnx.checker.check_model(model, full_check=True)
     with atomic_write(path) as temporary:
-        temporary.write_bytes(sign_model(model.SerializeToString()))
+        temporary.write_bytes(stamp_model(model.SerializeToString()))
 
 
 def _load_folded(network: Network, path: Path) -> None:

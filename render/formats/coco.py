@@ -30,7 +30,6 @@ from render.formats.records import (
     body_records,
     by_side,
     centered_K,
-    hand_mask,
     is_seen,
     keypoint_flags,
     rounded,
@@ -92,13 +91,14 @@ def numbered(records: Iterable[dict[str, Any]]) -> Iterator[tuple[dict[str, Any]
 
 def _hand_record(frame: RenderedFrame, number: int, hand: HandTruth) -> dict[str, Any]:
     """COCO's annotation of a hand, without ids."""
-    keypoints, mask = _triples(hand.keypoints, hand.visible, frame.camera.size), hand_mask(frame, number)
+    keypoints = _triples(hand.keypoints, hand.visible, frame.camera.size)
     record = {
         "category_id": CATEGORY["id"],
         "keypoints": keypoints,
         "num_keypoints": sum(flag > 0 for flag in keypoints[2::3]),
         "bbox": rounded(hand.box, 3),
-        "area": float(hand.box[2] * hand.box[3]) if mask is None else int(mask.sum()),
+        "area": int(hand.mask.sum()),
+        "segmentation": {"size": list(hand.mask.shape), "counts": run_lengths(hand.mask)},
         "iscrowd": 0,
         "side": hand.shape.side,
         "xyz": rounded(frame.camera.local(hand.keypoints_world), 9),
@@ -118,8 +118,6 @@ def _hand_record(frame: RenderedFrame, number: int, hand: HandTruth) -> dict[str
         angle = typology_angle(looks[number]["skin"]["lightness"], looks[number]["skin"]["yellowness"])
         record["look"] = looks[number]
         record["skin_tone"] = {"class": tone_name(angle), "typology_angle": round(angle, 3)}
-    if mask is not None:
-        record["segmentation"] = {"size": list(mask.shape), "counts": run_lengths(mask)}
     return record
 
 

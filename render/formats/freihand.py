@@ -21,7 +21,6 @@ from render.formats.records import (
     centered_K,
     encode_depth,
     encode_jpeg,
-    hand_mask,
     is_seen,
     rounded,
     to_json,
@@ -179,10 +178,9 @@ def _pictures(frame: RenderedFrame, hand: int) -> dict[str, bytes]:
     sensed = as_sensed(frame)
     if sensed.rgb is None:
         raise without_colors("freihand")
-    files = {"rgb": encode_jpeg(sensed.rgb)}
-    mask = hand_mask(frame, hand)
-    if mask is not None:  # FreiHAND's readers expect JPEG, whose best quality keeps black and white apart
-        files["mask"] = encode_jpeg(255 * mask.astype(np.uint8), quality=100)
+    # FreiHAND's readers expect masks as JPEG, whose best quality keeps black and white apart.
+    mask = encode_jpeg(255 * frame.hands[hand].mask.astype(np.uint8), quality=100)
+    files = {"rgb": encode_jpeg(sensed.rgb), "mask": mask}
     if sensed.depth is not None:
         files["depth"] = encode_depth(sensed.depth)
     return files

@@ -25,8 +25,6 @@ from handsim.space.transforms import rotation_quaternions
 from render.color_sensor import linear_of
 from render.formats.png import encode_png
 from render.frames import (
-    FOREARM,
-    PARTS_A_HAND,
     Doubles,
     Flags,
     Floats,
@@ -72,14 +70,6 @@ def keypoint_flags(pixels: Doubles, visible: Flags, size: tuple[int, int]) -> In
     """COCO's flags (K,) of keypoints in a picture of this size [px]: 0 outside, 1 hidden, 2 visible."""
     inside = np.all((pixels >= 0.0) & (pixels < size), axis=1)  # False for NaN
     return np.where(inside, np.where(visible, 2, 1), 0)
-
-
-def hand_mask(frame: RenderedFrame, hand: int) -> Flags | None:
-    """Mask (H, W) of one hand with its markers, without its forearm; None without an id picture."""
-    parts, instances = frame.ideal.parts, frame.ideal.instances
-    if parts is None or instances is None:
-        return None
-    return np.asarray((instances == 1 + hand) & (parts != 1 + PARTS_A_HAND * hand + FOREARM))
 
 
 def run_lengths(mask: Flags) -> str:

@@ -11,7 +11,7 @@ import dataclasses
 import functools
 import itertools
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -20,81 +20,72 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Int8, UInt8
 from numpy.typing import NDArray
-from PIL import Image, ImageOps
 
 from handsim._checks import check_choice
-from handsim.errors import HandSimError, choices
-from handsim.files.inputs import check_regular
-from handsim.files.outputs import plain_path
+from handsim.errors import FileError, HandSimError, HandSimWarning, choices
 from handsim.kernels import kernel
 from handsim.space.camera import Camera, camera_matrix
 from render.color_sensor import GAMMA
 from render.fields import normal_numbers
 from render.frames import Bytes, Doubles, Flags, Floats, Geometry, at_rest
+from render.photographs import PHOTO_SUFFIXES, check_photograph, is_map, read_map, read_photograph
 from render.scenery.rooms import RoomLight, cast_room, draw_room, paint_tints
 
-MAP_SUFFIXES: Final = (".hdr", ".exr")
-"""Files of environment maps: the light of all directions, longitudes across and latitudes down, z up."""
-PHOTO_SUFFIXES: Final = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff", *MAP_SUFFIXES)
 LUMINANCE: Final = np.array([0.2126, 0.7152, 0.0722])
 _MAP_LIGHT: Final = 0.5  # mean luminance of a map, 1 for a white surface in full light
 _TRIES: Final = 50  # unreadable files in turn after which a folder counts as one without photographs
-_MOST_PIXELS: Final = 100_000_000  # largest number of pixels of a photograph
 
 
 @functools.lru_cache(maxsize=2)
-def photo_files(folder: Path) -> tuple[tuple[Path, ...], tuple[Path, ...]]:
-    """Files of photographs in a folder and its subfolders: those that begin like pictures, and the others."""
+def photo_files(folder: Path) -> tuple[tuple[Path, ...], tuple[str, ...]]:
+    """Photographs in a folder and its subfolders, by how they begin, and a sentence on each of the others."""
     if not folder.is_dir():
         what = "a file, expected a" if folder.exists() else "no such"
         raise HandSimError(f"{folder}: {what} folder of photographs")
-    files = sorted(file for file in folder.rglob("*") if file.suffix.lower() in PHOTO_SUFFIXES)
-    good, broken = list[Path](), list[Path]()
-    for file in files:
-        with plain_path(file) as plain:
-            readable = file.suffix.lower() in MAP_SUFFIXES or cv2.haveImageReader(str(plain))
-            (good if readable else broken).append(file)
+    good, broken = list[Path](), list[str]()
+    for file in sorted(file for file in folder.rglob("*") if file.suffix.lower() in PHOTO_SUFFIXES):
+        try:
+            check_photograph(file)
+            good.append(file)
+        except FileError as error:
+            broken.append(str(error))
     if not good:
-        raise _no_photo(folder)
+        raise _no_photo(folder, broken)
     return tuple(good), tuple(broken)
 
 
 def pick_photo(folder: Path, rng: np.random.Generator) -> Path:
     """A random photograph that can be read whole."""
-    files, _ = photo_files(folder)
-    for index in rng.permutation(len(files))[:_TRIES]:
-        is_map = files[index].suffix.lower() in MAP_SUFFIXES
-        if (environment_map if is_map else _read)(files[index]) is not None:
-            return Path(files[index])
-    raise _no_photo(folder)
+    files, broken = photo_files(folder)
+    chosen = (files[index] for index in rng.permutation(len(files))[:_TRIES])
+    found: Path | None = next(filter(_can_be_read, chosen), None)
+    if found is None:
+        raise _no_photo(folder, broken)
+    return found
+
+
+def _can_be_read(file: Path) -> bool:
+    """Whether a photograph can be read whole; a warning tells why one cannot."""
+    try:
+        (environment_map if is_map(file) else read_photograph)(file)
+    except FileError as error:
+        warnings.warn(f"left out: {error}", HandSimWarning, stacklevel=2)
+        return False
+    return True
 
 
 @functools.lru_cache(maxsize=4)
-def environment_map(file: Path) -> Float32[np.ndarray, "H W 3"] | None:
-    """Linear light of an environment map, its mean luminance `_MAP_LIGHT`; None if it cannot be read."""
-    import OpenEXR
-
-    try:
-        if file.suffix.lower() == ".hdr":
-            content = np.fromfile(file, np.uint8)
-            light = np.asarray(cv2.imdecode(content, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH))[..., ::-1]
-        else:
-            with plain_path(file) as plain, OpenEXR.File(str(plain)) as opened:
-                colors = (one.pixels for name, one in opened.channels().items() if name[:3] == "RGB")
-                light = next(colors)[..., :3]
-        light = np.nan_to_num(np.maximum(light, 0.0).astype(np.float32), posinf=0.0)
-        share = np.sin(np.pi * (np.arange(len(light)) + 0.5) / len(light))
-        mean = np.average(light.mean(axis=1), axis=0, weights=share) @ LUMINANCE
-        return np.asarray(light * np.float32(_MAP_LIGHT / mean)) if mean > 0.0 else None
-    except (OSError, RuntimeError, StopIteration, IndexError, TypeError, cv2.error):
-        return None
+def environment_map(file: Path) -> Float32[np.ndarray, "H W 3"]:
+    """Linear light of an environment map, its mean luminance `_MAP_LIGHT`."""
+    light = read_map(file)
+    share = np.sin(np.pi * (np.arange(len(light)) + 0.5) / len(light))
+    mean = np.average(light.mean(axis=1), axis=0, weights=share) @ LUMINANCE
+    return np.asarray(light * np.float32(_MAP_LIGHT / mean))
 
 
 def _in_map(background: Background, rays: Floats, *, coarse: bool = False) -> RoomLight:
     """Light of an environment map, or of a small copy of it, along rays (N, 3); a map has no depth."""
     whole = environment_map(Path(str(background.photo)))
-    if whole is None:
-        raise HandSimError(f"{background.photo}: not a readable environment map")
     if coarse:  # so that small lamps are not missed
         whole = cv2.resize(whole, (64, 32), interpolation=cv2.INTER_AREA)
     x, y, z = (rays / np.linalg.norm(rays, axis=1, keepdims=True)).T
@@ -117,32 +108,22 @@ def photos_beside(file: Path, count: int) -> list[Path]:
     """A photograph and others of its folder, `count` in all; they are repeated if there are too few."""
     files, _ = photo_files(file.parent)
     start = files.index(file) + 1 if file in files else 0
-    others = (one for one in (*files[start:], *files[:start]) if one != file and _read(one) is not None)
+    others = (one for one in (*files[start:], *files[:start]) if one != file and _can_be_read(one))
     chosen = [file, *itertools.islice(others, count - 1)]
     return list(itertools.islice(itertools.cycle(chosen), count))
 
 
-def _no_photo(folder: Path) -> HandSimError:
+def _no_photo(folder: Path, broken: Sequence[str]) -> HandSimError:
     endings = ", ".join(PHOTO_SUFFIXES)
-    return HandSimError(f"{folder}: no photograph that can be read; expected files that end in {endings}")
-
-
-def _read(file: Path) -> Bytes | None:
-    """A photograph upright (H, W, 3); None for what is none, or is larger than `_MOST_PIXELS`."""
-    try:
-        check_regular(file, error=HandSimError)
-        with warnings.catch_warnings(action="ignore"), Image.open(file) as picture:
-            fits = picture.width * picture.height <= _MOST_PIXELS
-            return np.asarray(ImageOps.exif_transpose(picture).convert("RGB")) if fits else None
-    except Exception:  # files are damaged in many ways
-        return None
+    first = f" ({broken[0]})" if broken else ""
+    return HandSimError(
+        f"{folder}: no photograph that can be read{first}; expected files that end in {endings}"
+    )
 
 
 def draw_photo(file: Path, size: tuple[int, int], rng: np.random.Generator) -> Floats:
     """A random part of a photograph, scaled to a picture's size: at least half of what fits, each way."""
-    photo = _read(file)
-    if photo is None:
-        raise HandSimError(f"{file}: not a readable photograph")
+    photo = read_photograph(file)
     height, width = photo.shape[:2]
     scale = min(width / size[0], height / size[1]) * rng.uniform(0.5, 1.0)
     part = np.maximum(np.array(size) * scale, 1.0).astype(int)
@@ -253,7 +234,7 @@ class Background:
     @property
     def is_map(self) -> bool:
         """Whether it is an environment map, which lights the hands, too."""
-        return self.photo is not None and Path(self.photo).suffix.lower() in MAP_SUFFIXES
+        return self.photo is not None and is_map(Path(self.photo))
 
 
 def sample_background(config: Backgrounds, *, rng: np.random.Generator) -> Background:

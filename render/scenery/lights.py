@@ -19,9 +19,9 @@ from jaxtyping import Float
 from handsim._checks import check_count, check_type
 from handsim.files.outputs import atomic_write, check_ending
 from render.frames import Doubles, Integers
+from render.photographs import MAP_SUFFIXES
 from render.scenery.backgrounds import (
     LUMINANCE,
-    MAP_SUFFIXES,
     Background,
     Backgrounds,
     Enclosure,

@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -10,6 +15,23 @@ from gloves.fit import nominal_fit
 from handsim import join_qpos, write_page
 from handsim.errors import ArgumentError
 from handsim.pages import Section, write_sections
+
+ROOT = Path(__file__).resolve().parents[2]
+BROKEN = "font.size: 3\n# \xe9\n"
+ODD = "font.size: 30\nlines.linewidth: 9\ntext.usetex: True\nsvg.fonttype: none\nbackend: nonsense\n"
+
+
+DRAWN = """
+from handsim.pages import picture
+def drawn():
+    return picture((4, 3), lambda figure: figure.subplots().set_title("title $x$"))
+"""
+
+
+def drawn_here():
+    names = {}
+    exec(DRAWN, names)
+    return names["drawn"]()
 
 
 def test_a_take_has_a_page_and_tables(tmp_path):
@@ -42,3 +64,36 @@ def test_a_page_escapes_what_it_shows(tmp_path):
     ):
         assert shown in page
     assert 'alt="a &quot;b&quot; &amp; c"' in page and "http" not in page
+
+
+@pytest.mark.parametrize(
+    ("files", "variables"),
+    [
+        ({}, {"MPLBACKEND": "module://matplotlib_inline.backend_inline"}),
+        ({}, {"MPLBACKEND": "nonsense"}),
+        ({}, {"MPLBACKEND": "TkAgg"}),
+        ({"matplotlibrc": BROKEN}, {"MPLBACKEND": "nonsense"}),
+        ({"mine/matplotlibrc": BROKEN}, {"MATPLOTLIBRC": "mine"}),
+        ({"mine/matplotlibrc": BROKEN}, {"MPLCONFIGDIR": "mine"}),
+        ({"mine/stylelib/own.mplstyle": BROKEN}, {"MPLCONFIGDIR": "mine"}),
+        ({"matplotlibrc": ODD}, {}),
+        ({}, {"MPLCONFIGDIR": "/proc/nowhere"}),
+    ],
+)
+def test_pictures_are_the_same_whatever_the_users_matplotlib_is(files, variables, tmp_path):
+    for name, text in files.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text, "latin-1")
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), **variables}
+    command = [sys.executable, "-c", f"{DRAWN}print(drawn())"]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    assert done.stdout.strip() == drawn_here(), done.stderr
+
+
+def test_the_users_own_settings_stay(monkeypatch):
+    import matplotlib
+
+    monkeypatch.setitem(matplotlib.rcParams, "font.size", 33.0)
+    before = dict(matplotlib.rcParams)
+    drawn_here()
+    assert dict(matplotlib.rcParams) == before

@@ -1,12 +1,14 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
 import pytest
+import tyro
 
 from handsim.errors import ArgumentError
 from handsim.settings import Expected, Limits, Mixture, Settings
@@ -97,13 +99,56 @@ def test_options_change_settings():
         Options.of({"num_frames": 7})
 
 
-def test_a_mixture_is_given_whole():
-    assert Mixed(shares={"one": 2.0}).shares == Shares(2.0, 0.0)
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [({"one": 2.0}, (2.0, 0.5)), ({"one": 0.0}, (0.0, 0.5)), ({"two": 0}, (0.5, 0.0)), ({}, (0.5, 0.5))],
+)
+def test_shares_that_are_not_given_keep_their_defaults_as_on_the_command_line(given, expected):
+    assert Mixed(shares=given).shares == Shares(**given) == Shares(*expected)
+    words = [word for name, share in given.items() for word in (f"--shares.{name}", str(share))]
+    assert tyro.cli(Mixed, args=words).shares == Shares(*expected)
+
+
+def test_shares_are_normalized_and_checked():
     np.testing.assert_array_equal(Shares(1.0, 3.0).shares, [0.25, 0.75])
     assert Mixed.from_json(Mixed(shares=Shares(1.0, 0.0)).record()) == Mixed(shares=Shares(1.0, 0.0))
     with pytest.raises(ArgumentError, match="the sum of one, two is 0, expected a number above 0"):
-        Mixed(shares={"one": 0.0})
+        Mixed(shares={"one": 0.0, "two": 0.0})
     with pytest.raises(ArgumentError, match="two is -1, expected a number of at least 0"):
         Shares(1.0, -1.0)
     with pytest.raises(ArgumentError, match="unknown setting of shares 'three'"):
         Mixed(shares={"three": 1.0})
+
+
+@dataclass(frozen=True, slots=True)
+class Numbers(Settings):
+    rate: Annotated[float, Limits(0.0)] = 1.0
+    sure: bool = False
+    sides: Annotated[tuple[float, float], Limits(0.0)] = (0.0, 1.0)
+    bodies: Sequence[str | Thing] = ()
+
+
+@pytest.mark.parametrize(
+    ("options", "record"),
+    [
+        ({"rate": np.float32(0.5)}, {"rate": 0.5}),
+        ({"rate": np.float64(0.5)}, {"rate": 0.5}),
+        ({"rate": np.array(0.5)}, {"rate": 0.5}),
+        ({"rate": np.int16(3)}, {"rate": 3}),
+        ({"sure": np.bool_(True)}, {"sure": True}),
+        ({"sides": np.array([0.25, 2.0], np.float32)}, {"sides": [0.25, 2.0]}),
+        ({"sides": (np.float32(0.25), np.int64(2))}, {"sides": [0.25, 2]}),
+        ({"bodies": "pen"}, {"bodies": ["pen"]}),
+        ({"bodies": ["pen", Thing()]}, {"bodies": ["pen", "a thing"]}),
+    ],
+)
+def test_numbers_of_numpy_are_recorded_as_numbers(options, record):
+    found = Numbers(**options).record()
+    assert {name: found[name] for name in record} == record
+    assert Numbers.from_json(json.loads(json.dumps(found))).record() == found
+
+
+@pytest.mark.parametrize("bodies", [{"pen"}, (name for name in ["pen"]), 5])
+def test_what_has_no_order_is_no_list(bodies):
+    with pytest.raises(ArgumentError, match=r"bodies is .*, expected a tuple"):
+        Numbers(bodies=bodies)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from handsim import HandModel, join_qpos, sample_shape
 from handsim.errors import ArgumentError, PoseError
-from handsim.hand.shape import EVERYBODY, SIDES, SIZES
+from handsim.hand.shape import ADULTS, EVERYBODY, SIDES, SIZES
 from poses import PoseMix, load_gestures, sample_poses, validate
 from poses.shapes import (
     HIGH,
@@ -238,3 +238,20 @@ def test_mistakes_are_named(rng):
         sample_poses(model, 3, lambda model, num_poses, *, rng: np.zeros((2, 20)), rng=rng)
     with pytest.raises(ArgumentError, match=r"qpos has shape \(1, 20\), expected \(..., any, 27\)"):
         validate(model, np.zeros((1, 20)))
+
+
+@pytest.mark.parametrize("size", ["XS", "M", "XL"])
+def test_single_precision_is_as_valid(rng, size):
+    qpos = sample_poses(size, 200, rng=rng)
+    at_limits = join_qpos(np.stack([np.clip(0.0, LOW, HIGH), np.where(LOW < 0.0, 0.0, LOW)]))
+    for poses in (qpos, at_limits):
+        np.testing.assert_array_equal(validate(size, poses.astype(np.float32)), validate(size, poses))
+    bent = join_qpos(np.where(np.arange(20) == 4, HIGH + 1e-3, 0.0)[None])
+    assert not validate(size, bent).any()
+
+
+@pytest.mark.parametrize("population", [ADULTS, EVERYBODY], ids=["adults", "everybody"])
+@pytest.mark.parametrize("seed", [49, 112, 140, 175, 202, 254, 388, 417, 512, 1000, 1720])
+def test_people_with_thick_fingers_can_be_sampled(population, seed):
+    model = HandModel(sample_shape(population, rng=np.random.default_rng(seed)))
+    assert validate(model, sample_poses(model, 20, rng=np.random.default_rng(seed))).all()

@@ -122,6 +122,7 @@ def _hand(
         keypoints_world=keypoints,
         visible=inside & (np.arange(21) % 3 > 0),
         box=box,
+        mask=mine,
         vertices=vertices,
         marker_names=("first", "second") if place == 0 else (),
         markers=keypoints[[5, 9]] if place == 0 else np.empty((0, 3)),

@@ -3,11 +3,14 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import json
+import re
+import tarfile
 from typing import get_args
 
 import cv2
 import numpy as np
 import pytest
+from pycocotools.coco import COCO
 
 from gloves import load_take
 from handsim import Camera, HandModel, HandSimError, Lens, join_qpos, look_at
@@ -19,6 +22,7 @@ from handsim.space.camera import pinhole, preset
 from handsim.space.transforms import quaternion_matrix, rigid, turned_poses
 from poses import sample_poses
 from render import Backgrounds, DepthSensor, RenderConfig, ViewConfig, draw, render_take
+from render.frames import FOREARM, PARTS_A_HAND, PASSES
 from render.scenery.backgrounds import photo_files
 from render.session import SHEET, Drawing, cut_off_pictures, left_out_frames, open_studio
 from render.skin.look import TONES
@@ -72,6 +76,54 @@ def test_frames_are_spread_over_the_poses():
     assert numbers == [1, 4, 7]
     config = dataclasses.replace(BARE, frames=(0, 8, 2, 4), every=2)
     assert [frame.number for frame in draw(qpos, model=MODEL, camera=ABOVE, config=config)] == [2]
+
+
+_OF_PASSES = {
+    "depth_file", "depth_ideal_file", "ids_file", "normals_file", "depth_sensor", "depth_noise", "seed",
+}  # fmt: skip
+
+
+def _annotations(folder):
+    """All JSON that a rendering's readers look at, without the files and the noise of its pictures."""
+    texts = {path.relative_to(folder).as_posix(): path.read_text() for path in folder.rglob("*.json")}
+    for path in folder.rglob("*.tar"):
+        with tarfile.open(path) as clip:
+            names = [name for name in clip.getnames() if name.endswith(".json")]
+            texts |= {name: clip.extractfile(name).read().decode() for name in names}
+    own = re.compile(r"checksums|render\.|index\.")
+    return {name: json.loads(text, object_hook=_kept) for name, text in texts.items() if not own.search(name)}
+
+
+def _kept(table):
+    return {key: value for key, value in table.items() if key not in _OF_PASSES}
+
+
+def test_annotations_are_the_same_whatever_passes_are_written(tmp_path):
+    take = simulate_take(kind="hand-hand", num_frames=25)
+    found, formats = [], ("coco", "yolo", "freihand", "interhand", "webdataset", "png")
+    for number, passes in enumerate((PASSES, ("rgb",), ("rgb", "normals"))):
+        out = tmp_path / str(number)
+        render_take(take, out, formats, RenderConfig(vary="frame", every=25), passes=passes, workers=1)
+        found.append(_annotations(out))
+        for format in ("coco", "yolo"):
+            coco = COCO(str(out / format / "annotations.json"))
+            for hand in coco.loadAnns(coco.getAnnIds()):
+                assert 0 < hand["area"] == coco.annToMask(hand).sum() < hand["bbox"][2] * hand["bbox"][3]
+        pictures, masks = ([*out.glob(f"freihand/training/{kind}/*.jpg")] for kind in ("rgb", "mask"))
+        assert len(pictures) == len(masks) > 0
+    assert len(found[0]) > 10 and found[1] == found[0] == found[2]
+
+
+def test_a_hand_is_masked_with_its_markers_without_its_forearm():
+    config = dataclasses.replace(BARE, dress="glove")
+    for frame in draw(simulate_take(kind="hand-hand", num_frames=25), config=config, frames=(0, 24), seed=2):
+        for number, hand in enumerate(frame.hands):
+            parts, own = frame.ideal.parts[hand.mask], frame.ideal.instances == 1 + number
+            markers = own & (frame.ideal.markers > 0)
+            assert markers.any() and hand.mask[markers].all() and not hand.mask[~own].any()
+            assert (parts > 0).any() and not (parts == 1 + PARTS_A_HAND * number + FOREARM).any()
+            bones = own & (frame.ideal.parts > 0) & ~hand.mask
+            assert (frame.ideal.parts[bones] == 1 + PARTS_A_HAND * number + FOREARM).all()
 
 
 def test_a_picture_is_drawn_again_from_its_record(tmp_path):

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import itertools
+import json
 
 import numpy as np
 import pytest
 import torch
+from torch import distributed
 from torch.utils.data import DataLoader
 
 from handsim import HandModel, HandSimError, join_qpos
@@ -52,6 +54,27 @@ def test_batches_are_the_same_with_any_number_of_workers():
     for one, other in zip(alone, batches(2), strict=True):
         assert one.keys() == other.keys()
         assert all(torch.equal(one[name].nan_to_num(), other[name].nan_to_num()) for name in one)
+
+
+def draw_as(rank, file, results, workers, method):
+    """What a rank of two draws, told by numbers."""
+    distributed.init_process_group("gloo", init_method=f"file://{file}", rank=rank, world_size=2)
+    stream = PictureStream(config=BARE, crop=32, batch=4, seed=0)
+    loader = DataLoader(stream, batch_size=4, num_workers=workers, multiprocessing_context=method)
+    numbers = [batch["number"].tolist() for batch in itertools.islice(loader, 4)]
+    (results / str(rank)).write_text(json.dumps(numbers))
+    distributed.destroy_process_group()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("workers", "method"), [(0, None), (2, "fork"), (2, "spawn")])
+def test_ranks_of_torch_draw_different_pictures(workers, method, tmp_path):
+    """The ranks know of each other by torch.distributed alone, and so do the workers of their loaders."""
+    arguments = (tmp_path / "meeting", tmp_path, workers, method)
+    torch.multiprocessing.spawn(draw_as, args=arguments, nprocs=2)
+    drawn = [json.loads((tmp_path / str(rank)).read_text()) for rank in range(2)]
+    for number in range(8):
+        assert drawn[number % 2][number // 2] == list(range(4 * number, 4 * number + 4))
 
 
 def test_people_take_turns():

@@ -198,7 +198,7 @@ def changed(index, value):
     [
         ({"qpos": BASE[:, :26]}, r"qpos has shape \(2, 26\), expected \(T, 1, 27\) for a hand"),
         ({"qpos": np.stack([BASE] * 2, axis=1)}, r"has shape \(2, 2, 27\)"),
-        ({"qpos": BASE.astype(str)}, "is of type <U"),
+        ({"qpos": BASE.astype(str)}, "expected an array of numbers"),
         ({"poses": BASE}, "unknown array 'poses' .*valid names: qpos"),
         ({}, "expected qpos, or angles and T_world_wrist"),
         ({"qpos": BASE, "angles": BASE[:, 7:]}, "expected qpos, or angles and T_world_wrist"),
@@ -209,7 +209,7 @@ def changed(index, value):
         (changed((0, 0), np.inf), "infinite"),
         ({"qpos": np.full((2, 27), np.nan)}, "there is no hand in any frame"),
         ({"qpos": BASE, "times": [0.0, 0.0]}, "not finite and increasing"),
-        ({"qpos": BASE, "times": [0.0]}, "times is"),
+        ({"qpos": BASE, "times": [0.0]}, "times has shape"),
         ({"qpos": BASE, "person": [0, -1]}, "person is -1 to 0, expected 0 to"),
         ({"qpos": BASE, "person": [0.5, 1.0]}, "person is float64"),
         ({"qpos": BASE, "hand_size": [[0.19, 0.08]] * 3}, "holds 3 hands and 2 frames"),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import os
+import shutil
 import signal
 import threading
 import warnings
@@ -20,10 +21,11 @@ from gloves.fit import nominal_fit
 from gloves.takes import points
 from gloves.takes.archives import CutOffWarning
 from gloves.takes.take import LOST, STATUSES, TRACKED, usual_rate
-from handsim import join_qpos
+from handsim import HandSimWarning, join_qpos
 from handsim.errors import ArgumentError, CaptureError
 from handsim.space.objects import named_object
 from render.subject import load_subject
+from tests.limits import file_size_limit
 from track import (
     Recorder,
     ReplayServer,
@@ -165,23 +167,55 @@ def test_of_a_long_take_parts_are_read_for_its_summary(tmp_path, monkeypatch):
 
 
 def test_a_disk_that_is_full_keeps_the_recording(tmp_path):
-    if not os.path.exists("/dev/full"):
-        pytest.skip("this machine has no /dev/full")
     recorder = recorded(tmp_path)
     recorder._archive.flush()
-    recorder._archive._file.close()
-    recorder._archive._file = open("/dev/full", "wb", buffering=0)
     frame, one = tracked()[1][-1]
     frame = dataclasses.replace(frame, time=frame.time + 1.0)
     recorder._archive._due = 0.0
-    words = (
-        r"the recording ended after 24 frames \(No space left on device\); they are kept in .*take\.npz\.part"
-    )
-    with pytest.raises(CaptureError, match=words):
+    words = r"the recording ended after 24 frames \(File too large\); they are kept in .*take\.npz\.part"
+    with file_size_limit(recorder.part.stat().st_size + 10), pytest.raises(CaptureError, match=words):
         recorder.add(frame, one)
     recorder.close()
     with pytest.warns(CutOffWarning):
         assert_equal(load_take(recorder.part), in_memory())
+
+
+def test_what_is_said_to_be_kept_was_looked_at(tmp_path):
+    recorder = recorded(tmp_path)
+    recorder._archive.flush()
+    assert recorder.kept() == f"the recording is kept in {recorder.part}"
+    os.truncate(recorder.part, recorder.part.stat().st_size - 1)
+    assert recorder.kept() == f"0 of its 24 frames are kept in {recorder.part}"
+    shutil.rmtree(recorder.part.parent)
+    assert recorder.kept() == f"nothing of it is kept in {recorder.part}"
+    with pytest.warns(HandSimWarning) as told:
+        recorder.close()
+    cut, gone = (str(one.message) for one in told)
+    assert "24 of its 24 frames are lost" in cut and "was removed or replaced" in gone
+
+
+def test_a_folder_that_is_removed_costs_nothing(tmp_path):
+    recorder = recorded(tmp_path)
+    shutil.rmtree(recorder.part.parent)
+    with pytest.warns(HandSimWarning, match="was removed or replaced by another program: it is written"):
+        recorder.finish(COUNTS)
+    assert os.listdir(tmp_path / "new") == ["take.npz"]
+    assert_equal(load_take(tmp_path / "new" / "take.npz"), in_memory())
+
+
+def test_a_recording_that_is_overwritten_stays_and_its_loss_is_told(tmp_path):
+    recorder = recorded(tmp_path, frames=20)
+    recorder._archive.flush()
+    end = recorder.part.stat().st_size
+    for frame, one in tracked()[1][20:]:
+        recorder.add(frame, one)
+    recorder._archive.flush()
+    with recorder.part.open("r+b") as file:
+        file.seek(end + 200)
+        file.write(b"another program's bytes")
+    with pytest.warns(HandSimWarning, match=r"take\.npz has 20 of its 24 frames"):
+        recorder.finish(COUNTS)
+    assert load_take(tmp_path / "new" / "take.npz").num_frames == 20 and recorder.part.exists()
 
 
 def test_a_take_that_cannot_be_written_keeps_the_recording(tmp_path):

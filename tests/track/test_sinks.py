@@ -13,6 +13,7 @@ import subprocess
 import sys
 import threading
 import time
+import warnings
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -22,7 +23,7 @@ import pytest
 from pythonosc.dispatcher import Dispatcher
 from pythonosc.osc_bundle import OscBundle
 from pythonosc.osc_server import BlockingOSCUDPServer
-from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.exceptions import ConnectionClosed, InvalidMessage, InvalidStatus
 from websockets.sync.client import connect
 
 from gloves import Status, load_layout
@@ -520,12 +521,122 @@ def test_it_listens_on_loopback_and_refuses_pages_of_other_machines(sink):
             connect(url(sink), origin=origin)
 
 
-def test_an_address_of_the_network_serves_all_pages():
-    sink = open_sink("ws://0.0.0.0:0")
-    try:
-        connect(url(sink), origin="https://example.com").close()
-    finally:
-        sink.close()
+@pytest.mark.parametrize("path", ["", "/newest"])
+@pytest.mark.parametrize("host", ["", "0.0.0.0", "[::1]"])
+def test_pages_of_other_machines_are_served_if_they_are_allowed(host, path):
+    for pages in ("own", "all"):
+        with contextlib.closing(open_sink(f"ws://{host}:0?pages={pages}")) as sink:
+            address = f"ws://{host if host == '[::1]' else '127.0.0.1'}:{sink.port}{path}"
+            connect(address, origin="http://localhost:8000").close()
+            connect(address).close()  # no browser
+            refused = (
+                pytest.raises(InvalidStatus, match="403") if pages == "own" else contextlib.nullcontext()
+            )
+            for origin in ("https://example.com", "null", f"http://127.0.0.1.example.com:{sink.port}"):
+                with refused:
+                    connect(address, origin=origin).close()
+
+
+def read_nothing(port: int) -> socket.socket:
+    return raw_client(port)
+
+
+def say_nothing(port: int) -> socket.socket:
+    return socket.create_connection(("127.0.0.1", port))
+
+
+def babble(port: int) -> socket.socket:
+    one = say_nothing(port)
+    one.sendall(b"GET / HTTP/1.1\r\nX: ")
+    return one
+
+
+def half_close(port: int) -> socket.socket:
+    one = say_nothing(port)
+    one.shutdown(socket.SHUT_WR)
+    return one
+
+
+@pytest.mark.parametrize(
+    ("scheme", "call"),
+    [
+        ("ws", read_nothing),
+        ("ws", say_nothing),
+        ("ws", babble),
+        ("ws", half_close),
+        ("tcp", say_nothing),
+        ("tcp", babble),
+        ("tcp", half_close),
+    ],
+)
+def test_connections_that_stay_are_counted_and_bounded(scheme, call, message, capfd, caplog, monkeypatch):
+    """A good receiver gets every frame meanwhile, and another one is let in when some of the others left."""
+    monkeypatch.setattr(sinks, "MOST_CONNECTIONS", 8)
+    with contextlib.ExitStack() as stack:
+        sink = open_sink(f"{scheme}://:0")
+        stack.callback(sink.close)
+        good = stack.enter_context(say_nothing(sink.port) if scheme == "tcp" else connect(url(sink)))
+        wait_for(lambda: sink.num_clients == 1)
+        files = len(os.listdir("/proc/self/fd")) if os.path.exists("/proc/self/fd") else None
+        others = []
+        for _ in range(200):
+            with contextlib.suppress(ConnectionError, AssertionError):  # refused
+                others.append(call(sink.port))
+        if call is not half_close:  # whose connections end at once
+            wait_for(lambda: sink._socket.refused > 100)
+            with pytest.warns(HandSimWarning, match=f"port {sink.port} refuses further connections: 8 are"):
+                sink.send(message(0))
+            assert re.fullmatch(r"\d+ connections were refused", sink.note)
+            assert files is None or len(os.listdir("/proc/self/fd")) <= files + len(others) + 8
+        else:
+            with warnings.catch_warnings(action="ignore"):
+                sink.send(message(0))
+        if scheme == "ws":
+            assert received(good, 2)[1]["number"] == 0
+        for one in others:
+            one.close()
+        wait_for(lambda: sink.num_clients == 1)
+
+        def is_let_in() -> bool:
+            with contextlib.suppress(OSError, InvalidMessage):
+                late = say_nothing(sink.port) if scheme == "tcp" else connect(url(sink))
+                stack.callback(late.close)
+                return True
+            return False
+
+        wait_for(is_let_in)
+    assert capfd.readouterr() == ("", "") and "Traceback" not in caplog.text
+
+
+FEW_FILES = """
+import resource, socket, sys, time
+from track.sinks import open_sink
+resource.setrlimit(resource.RLIMIT_NOFILE, (40, 40))
+sink = open_sink(sys.argv[1])
+print(sink.port, flush=True)
+sys.stdin.readline()
+time.sleep(0.5)
+sink.close()
+"""
+
+
+@pytest.mark.parametrize("address", ["ws://:0", "tcp://:0"])
+def test_a_process_without_free_files_prints_no_traceback(address):
+    """The system allows fewer files than connections."""
+    pytest.importorskip("resource")
+    process = subprocess.Popen(
+        [sys.executable, "-c", FEW_FILES, address],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    port = int(process.stdout.readline())
+    clients = [socket.create_connection(("127.0.0.1", port)) for _ in range(60)]
+    _, said = process.communicate("\n", timeout=LONG)
+    for one in clients:
+        one.close()
+    assert (process.returncode, said) == (0, "")
 
 
 def test_the_last_frames_are_sent_before_it_closes(message, monkeypatch):

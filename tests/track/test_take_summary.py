@@ -7,10 +7,13 @@ import dataclasses
 import numpy as np
 import pytest
 
-from gloves import Capture, Take, write_capture
+from gloves import Capture, MarkerLayout, Take, attach, load_layout, write_capture
 from gloves.takes.take import LOST
+from handsim import HandModel
 from handsim.cli.main import main
+from poses import sample_poses
 from track import find_suspect_spans, track_capture
+from track.take_page import hand_figures, write_take_page
 from track.take_summary import frame_confidence, runs_of, summarize, suspicions
 from train import simulate_take
 
@@ -141,3 +144,61 @@ def test_doubtful_frames_of_a_tracked_take(tracked):
     assert find_suspect_spans(dataclasses.replace(tracked, labels=labels, confidence=known)) == (), (
         "it was corrected"
     )
+
+
+def without(*bones: str, sides: tuple[str, ...] = ("left", "right")) -> MarkerLayout:
+    """dense19 without the markers of some bones."""
+    dense = load_layout("dense19")
+    kept = tuple(marker for marker in dense.markers if not marker.bone.startswith(bones))
+    return dataclasses.replace(dense, name="part", markers=kept, sides=sides)
+
+
+LITTLE = "no marker is on the little finger: its angles are guesses"
+GLOVES = {
+    "no little finger": (without("little"), [16, 17, 18, 19], LITTLE),
+    "no index tip": (
+        without("index_distal"),
+        [7],
+        "no marker is beyond the DIP of the index finger: its angles from there on are guesses",
+    ),
+    "half a ring finger": (
+        without("ring_distal", "ring_middle"),
+        [14, 15],
+        "no marker is beyond the PIP of the ring finger: its angles from there on are guesses",
+    ),
+    "no thumb": (without("thumb"), [0, 1, 2, 3], "no marker is on the thumb: its angles are guesses"),
+    "half a thumb": (
+        without("thumb_distal", "thumb_proximal"),
+        [3],  # ThumbMCP lies beyond the end of its bone
+        "no marker is beyond the IP of the thumb: its angles from there on are guesses",
+    ),
+    "starter6": (
+        load_layout("starter6"),
+        [*range(12, 20)],
+        f"no marker is on the ring finger: its angles are guesses; {LITTLE}",
+    ),
+    "a left glove": (without("little", sides=("left",)), [16, 17, 18, 19], LITTLE),
+    "dense19": (load_layout("dense19"), [], ""),
+}
+
+
+@pytest.mark.parametrize("glove", GLOVES)
+def test_joints_that_no_marker_can_show_are_guesses_and_never_measured(glove, tmp_path):
+    layout, joints, sentence = GLOVES[glove]
+    hands = [HandModel.named("M", side=side) for side in layout.sides]
+    qpos = np.stack([sample_poses(hand, 6, rng=np.random.default_rng(0)) for hand in hands], axis=1)
+    qpos[:, :, 0] += np.arange(len(hands))
+    fits = [attach(layout, hand) for hand in hands]
+    points = np.concatenate([fit.markers(qpos[:, at])[0] for at, fit in enumerate(fits)], axis=1)
+    labels = np.tile(np.arange(points.shape[1]), (6, 1))
+    truth = Take.of_truth(fits, qpos, points, labels, labels, rate=100.0)
+    settings = {**truth.settings, "tracker": {}, "user": "M"}
+    take = dataclasses.replace(truth, rms=np.zeros(truth.rms.shape), settings=settings)
+    told = [line for line in summarize(take) if "guesses" in line]
+    assert told == [f"{side} hand: {sentence}" for side in layout.sides if sentence]
+    for figures in hand_figures(take):
+        unmeasured = np.flatnonzero(~figures.measured.any(axis=0))
+        assert unmeasured.tolist() == joints and np.isnan(figures.joints()[joints, :5]).all()
+    write_take_page(tmp_path / "page.html", take)
+    assert (tmp_path / "page.html").read_text().count(sentence) >= len(told)
+    assert not any("guesses" in line for line in summarize(truth)), "its angles are known"

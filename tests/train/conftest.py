@@ -14,7 +14,9 @@ from train.labelers.layout_labeler import LayoutLabeler, fine_tuned_labeler
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     """300 frames of hands alone."""
     out = tmp_path_factory.mktemp("sets") / "small"
-    return generate_dataset(out, num_frames=300, frames_per_hand=20, scenes={"alone": 1.0}, workers=1)
+    return generate_dataset(
+        out, num_frames=300, frames_per_hand=20, scenes={"together": 0, "holding": 0}, workers=1
+    )
 
 
 @pytest.fixture(scope="module", autouse=True)

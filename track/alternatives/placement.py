@@ -33,6 +33,7 @@ _NUGGET: Final = 1e-8  # [m^2] keeps the covariance of shared offsets regular
 _FIRST_WEIGHT: Final = 0.1  # of the offsets in the first round, so that a far place is reached
 _ROUNDS: Final = 3  # of weighting offsets
 _STEPS: Final = 3  # of the solver in each
+_REWEIGHTED: Final = 12  # iterations of offsets and weights after each
 
 
 class Placement(NamedTuple):
@@ -86,8 +87,7 @@ def _placed(problem: Problem, start: GloveFit, estimate: Estimate) -> Placement:
         problem.place_weights = weights
         estimate, fit, _ = levenberg_marquardt(problem, estimate, 0, _STEPS, None, SMALL_GAIN)
         offsets = fit.design_residuals + problem.design_shift
-        weights = (_TAILS + 3.0) / (_TAILS + (fit.design_residuals**2).sum(axis=1) / _GLUED**2)
-        problem.design_shift = _smooth_part(offsets, weights, covariance)
+        problem.design_shift, weights = _smooth_part(offsets, covariance)
     fit = problem.fit(estimate)
     off, shift = fit.design_residuals, problem.design_shift
     weighted = np.einsum("mi,mij,mj->", off, problem.position_precision(fit), off)
@@ -102,10 +102,14 @@ def offset_cost(off: Float[np.ndarray, "*B 3"]) -> Float[np.ndarray, "*B"]:
 
 
 def _smooth_part(
-    off: NDArray[np.float64], weights: NDArray[np.float64], covariance: NDArray[np.float64]
-) -> Float[np.ndarray, "M 3"]:
-    """The part of offsets that neighbors share, given the weight and the covariance of each."""
-    return np.asarray(covariance @ np.linalg.solve(covariance + np.diag(_GLUED**2 / weights), off))
+    off: NDArray[np.float64], covariance: NDArray[np.float64]
+) -> tuple[Float[np.ndarray, "M 3"], Float[np.ndarray, "M"]]:
+    """The part of offsets that neighbors share, given their covariance, and the weights of the rest."""
+    shared = np.zeros_like(off)
+    for _ in range(_REWEIGHTED):
+        weights = (_TAILS + 3.0) / (_TAILS + ((off - shared) ** 2).sum(axis=1) / _GLUED**2)
+        shared = covariance @ np.linalg.solve(covariance + np.diag(_GLUED**2 / weights), off)
+    return shared, weights
 
 
 def _covariance(points: NDArray[np.float64], of: NDArray[np.bool_]) -> Float[np.ndarray, "M M"]:

@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
 from gloves.fit import GloveFit
-from handsim._checks import check_array
+from handsim._checks import as_numbers, check_array
 from handsim.errors import ArgumentError
 from handsim.hand.model import join_qpos
 from handsim.hand.shape import DIGITS, NUM_JOINTS, NUM_QPOS
@@ -190,7 +190,7 @@ def solve_pose(
         ArgumentError: The arrays do not fit the glove or each other, or a frame has fewer than 4 markers.
     """
     count = fit.layout.num_markers
-    targets = np.asarray(targets, dtype=np.float64)
+    targets = as_numbers("targets", targets)
     if targets.ndim != 3 or targets.shape[1:] != (count, 3):
         raise ArgumentError(f"targets have shape {targets.shape}, expected (T, {count}, 3)")
     present = np.isfinite(targets).all(axis=-1).sum(axis=1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Final
@@ -65,3 +66,14 @@ def split_address(
         if value not in options[name]:
             raise ArgumentError(f"{address}: {choices(value, options[name], noun=name)}")
     return host, number, {name: given.get(name, valid[0]) for name, valid in options.items()}
+
+
+def find_host(url: str, host: str, family: int = 0) -> str:
+    """The numeric address of a stream's host."""
+    try:
+        return str(socket.getaddrinfo(host, None, family)[0][4][0])
+    except (OSError, UnicodeError) as error:
+        raise CaptureError(
+            f"{url}: '{host}' cannot be reached ({getattr(error, 'strerror', None) or error}), expected the "
+            "name or address of the camera system's machine, such as 192.168.1.5"
+        ) from error

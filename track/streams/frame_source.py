@@ -14,7 +14,7 @@ from typing import Final, Protocol
 
 import numpy as np
 
-from handsim._checks import check_methods
+from handsim._checks import as_numbers, check_methods
 from handsim.errors import ArgumentError, CaptureError, HandSimWarning
 from track.frames import LATEST_TIME, StreamedFrame
 
@@ -71,6 +71,11 @@ class ArrivingFrames(ABC):
         return {}
 
     @property
+    def without_frames(self) -> str:
+        """Why no frame comes, as far as the source knows."""
+        return "is the server playing?"
+
+    @property
     @abstractmethod
     def is_over(self) -> bool:
         """Whether no further frame comes."""
@@ -99,8 +104,9 @@ class ArrivingFrames(ABC):
 class SourceStream(ArrivingFrames):
     """Validated frames of a source, which is iterated in its own thread.
 
-    With `waits`, a source that is faster than the time stamps of its frames has to wait. A source may have an
-    attribute `without_points` with a hint for frames without points.
+    With `waits`, a source that is faster than the time stamps of its frames has to wait. A source may have
+    attributes: `without_points` and `without_frames` with hints for frames without points and for no frames,
+    and `counts` of ignored packets.
     """
 
     def __init__(self, source: FrameSource, name: str, *, waits: bool = True) -> None:
@@ -113,6 +119,16 @@ class SourceStream(ArrivingFrames):
         self._read_all = self._ended = self._closed = False
         self._thread = threading.Thread(target=self._read, name="frame source", daemon=True)
         self._thread.start()
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Numbers of ignored packets, by name."""
+        return dict(getattr(self._source, "counts", {}))
+
+    @property
+    def without_frames(self) -> str:
+        """Why no frame comes, as far as the source knows."""
+        return str(getattr(self._source, "without_frames", super().without_frames))
 
     @property
     def is_over(self) -> bool:
@@ -186,7 +202,7 @@ def _checked(frame: StreamedFrame) -> StreamedFrame:
     """Validate a frame: arrays of the right types, and points without missing ones."""
     if not isinstance(frame, StreamedFrame):
         raise ArgumentError(f"a {type(frame).__name__} came, expected a track.StreamedFrame")
-    points, ids = np.asarray(frame.points, dtype=np.float64), np.asarray(frame.ids, dtype=np.int64)
+    points, ids = as_numbers("points", frame.points), as_numbers("ids", frame.ids, np.int64)
     if points.ndim != 2 or points.shape != (*ids.shape, 3):
         raise ArgumentError(f"points have shape {points.shape} and IDs {ids.shape}, expected (N, 3) and (N,)")
     if not abs(frame.time) < LATEST_TIME:

@@ -196,6 +196,11 @@ class LiveStream(Closing, Iterator[StreamedFrame]):
             "left out; are they millimeters? Set the unit of the stream to meters"
         )
 
+    @property
+    def silence_doubt(self) -> str:
+        """Why no frame comes, as far as the source knows."""
+        return self._frames.without_frames
+
     def __next__(self) -> StreamedFrame:
         """Wait for the next frame; return a silent frame after each period of silence.
 

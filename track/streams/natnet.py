@@ -31,7 +31,7 @@ from handsim._checks import check_type
 from handsim.callbacks import Closing
 from handsim.errors import ArgumentError, CaptureError, choices
 from track.frames import StreamedFrame, read_points
-from track.streams import COMMAND_PORT, NoServerError, ReplaySettings, split_address
+from track.streams import COMMAND_PORT, NoServerError, ReplaySettings, find_host, split_address
 from track.streams.frame_source import ArrivingFrames
 
 Version = tuple[int, int]
@@ -56,6 +56,7 @@ _MARKER: Final = np.dtype(
 _PATIENCE: Final = 3.0  # longest wait for a server [s]
 _RETRY: Final = 0.5  # time between requests to a server that does not answer [s]
 _KEEP_ALIVE: Final = 2.0  # time between keep-alive packets [s]
+_UNANSWERED: Final = 7.0  # [s] A server that left three calls unanswered is away.
 _ATTENDED: Final = 0.1  # [s] Without a read for this time the thread empties the socket.
 _BUFFER: Final = 1 << 22  # size of the socket's receive buffer [bytes]
 _STAMPS: Final = 35 if sys.platform == "linux" else None  # SO_TIMESTAMPNS, which Python does not name
@@ -268,9 +269,8 @@ class _Reader:
 def open_stream(url: str) -> PointStream:
     """Connect to the server at `natnet://host:port`."""
     host, port, _ = split_address(url, options={}, port=COMMAND_PORT)
+    address = find_host(url, host, socket.AF_INET), port
     try:
-        server = socket.getaddrinfo(host, port, socket.AF_INET, socket.SOCK_DGRAM)[0][4]
-        address = (str(server[0]), port)
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
             probe.connect(address)  # sends nothing, but selects the network card towards the server
             commands = _bind(probe.getsockname()[0], 0)
@@ -304,9 +304,11 @@ class PointStream(ArrivingFrames):
         """Number of damaged packets."""
         self.foreign = 0
         """Number of packets of other senders."""
+        self._stranger = ""  # address of the last of them
+        self._has_frames = False
         self._listen()
         self._version = min(server.version, NEWEST)
-        self._asked = self._kept_alive = self._heard = time.monotonic()
+        self._asked = self._kept_alive = self._heard = self._answered = time.monotonic()
         self._reading = threading.Lock()
         self._ending = False
         self._closed = threading.Event()
@@ -317,6 +319,29 @@ class PointStream(ArrivingFrames):
     def counts(self) -> dict[str, int]:
         """Numbers of ignored packets, as a take records them."""
         return {"damaged_packets": self.damaged, "foreign_packets": self.foreign}
+
+    @property
+    def without_frames(self) -> str:
+        """Why no frame comes, as far as the packets of the server and of others tell."""
+        server = self.server
+        if time.monotonic() > self._answered + _UNANSWERED:
+            return f"the server at {self._address[0]} no longer answers; it is called again and again"
+        if self._has_frames:
+            return super().without_frames
+        if self.damaged:
+            return f"the server answers, but its {self.damaged} packets are no frames of NatNet 3.0 to 4.1"
+        if self.foreign:
+            return (
+                f"the server answers, but {self.foreign} packets came from {self._stranger} in place of its "
+                "address and ports; is this the right address and port?"
+            )
+        if server.group is not None:
+            return (
+                f"the server answers, but no frame of its multicast group {server.group}, port "
+                f"{server.data_port}, arrives: choose Unicast in Motive's streaming pane (WSL, Docker and "
+                "some networks do not pass multicast)"
+            )
+        return "the server answers, but sends no frame; is it playing?"
 
     @property
     def is_over(self) -> bool:
@@ -390,7 +415,9 @@ class PointStream(ArrivingFrames):
         """The frame of a packet; None if it has none."""
         if sender[0] != self._address[0] or sender[1] not in (self._address[1], self.server.data_port):
             self.foreign += 1
+            self._stranger = f"{sender[0]}:{sender[1]}"
             return None
+        self._answered = time.monotonic()
         try:
             kind, payload = unpack(packet)
             if kind == Kind.SERVER_INFO and sender == self._address:
@@ -408,7 +435,7 @@ class PointStream(ArrivingFrames):
         except DamagedPacket:
             self.damaged += 1
             return None
-        self._heard = time.monotonic()
+        self._heard, self._has_frames = self._answered, True
         return frame
 
 
@@ -430,6 +457,7 @@ def _bind(address: str, port: int) -> socket.socket:
 
 def _connect(commands: socket.socket, server: tuple[str, int], url: str) -> ServerInfo:
     """Request the server's description until it answers."""
+    strange = 0
     for _ in range(round(_PATIENCE / _RETRY)):
         _send(commands, pack_connect(), server)
         until = time.monotonic() + _RETRY
@@ -444,15 +472,37 @@ def _connect(commands: socket.socket, server: tuple[str, int], url: str) -> Serv
                     continue
                 info = parse_server_info(payload)
             except DamagedPacket:
+                strange += 1
                 continue
             if info.version < OLDEST:
                 major, minor = info.version
                 raise CaptureError(f"{url}: the server speaks NatNet {major}.{minor}, expected 3.0 or newer")
             return info
+    if strange:
+        heard = f"the program at port {server[1]} answers, but speaks no NatNet"
+    elif _is_refused(server):
+        heard = f"no NatNet server answers at port {server[1]}: no program of {server[0]} listens there"
+    else:
+        heard = f"no NatNet server answers at port {server[1]} of {server[0]}"
     raise NoServerError(
-        f"{url}: no NatNet server answers at port {server[1]}; in Motive, switch streaming on, choose the "
-        "network that this machine is in, and compare the command port"
+        f"{url}: {heard}; in Motive, switch streaming on, choose the network that this machine is in, and "
+        "compare the command port"
     )
+
+
+def _is_refused(server: tuple[str, int]) -> bool:
+    """Whether a machine says that no program listens at its port; many firewalls keep silent."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(server)
+            probe.send(pack(Kind.KEEP_ALIVE))
+            probe.settimeout(_RETRY)
+            probe.recv(LARGEST)
+        except ConnectionRefusedError:
+            return True
+        except OSError:
+            pass
+    return False
 
 
 def _join(info: ServerInfo, commands: socket.socket, url: str) -> socket.socket:

@@ -5,14 +5,17 @@ from __future__ import annotations
 import asyncio
 import dataclasses
 import logging
+import struct
 from collections.abc import Iterator
+from contextlib import suppress
 from typing import Any, Final
 
 import numpy as np
 
 from handsim._plugins import import_extra
-from track.frames import StreamedFrame
-from track.streams import NoServerError
+from handsim.errors import CaptureError
+from track.frames import LATEST_TIME, StreamedFrame
+from track.streams import NoServerError, find_host
 
 PORT: Final = 22223
 """QTM's port for little-endian clients."""
@@ -23,6 +26,9 @@ _COMPONENTS: Final = ["3d", "3dnolabels"]
 _STARTS: Final = ("EventConnected", "EventCaptureStarted", "EventRTfromFileStarted")
 _FIRST_ID: Final = 1 << 16  # first ID of unidentified markers; smaller ones are identified
 _IDS: Final = 1 << 30
+_HEAD: Final = struct.Struct("<2I")  # size and kind of a packet
+_LARGEST: Final = 1 << 24  # [bytes] far more than a packet of markers has
+_DAMAGED: Final = "damaged_packets"
 _LOST, _CLOSED = "lost", "closed"  # queued after the last frame of a connection, or of the source
 
 
@@ -40,6 +46,10 @@ class QualisysSource:
         self._qtm: Any = import_extra("qtm_rt", "qtm://", "qualisys")
         logging.getLogger("qtm_rt").setLevel(logging.CRITICAL + 1)  # our errors say the same
         self._host, self._port = host, port
+        self.without_frames = "is QTM measuring?"
+        """Why no frame comes, as far as QTM tells."""
+        self.counts = {_DAMAGED: 0}
+        """Number of packets that were left out."""
         self._arrived: asyncio.Queue[StreamedFrame | str] = asyncio.Queue()
         self._subscribing: asyncio.Task[None] | None = None
         self._loop = asyncio.new_event_loop()
@@ -69,25 +79,37 @@ class QualisysSource:
         self._loop.call_soon_threadsafe(self._arrived.put_nowait, _CLOSED)
 
     async def _connect(self) -> Any:
+        url = f"qtm://{self._host}:{self._port}"
+        machine = find_host(url, self._host)
         try:
-            connection = await asyncio.wait_for(
-                self._qtm.connect(
-                    self._host,
-                    self._port,
-                    version=_VERSION,
-                    on_event=self._react,
-                    on_disconnect=lambda _: self._arrived.put_nowait(_LOST),
-                    timeout=_PATIENCE,
-                ),
-                _PATIENCE,
+            async with asyncio.timeout(_PATIENCE):
+                _, protocol = await self._loop.create_connection(self._make_protocol, machine, self._port)
+                await protocol.set_version(_VERSION)
+        except self._qtm.QRTCommandException as error:
+            raise CaptureError(f"{url}: QTM refuses version {_VERSION} of its protocol ({error})") from error
+        except OSError as error:  # TimeoutError is one
+            refused = f"no program of {machine} listens at port {self._port}"
+            reason = (
+                refused if isinstance(error, ConnectionRefusedError) else error.strerror or "it is silent"
             )
-        except TimeoutError:
-            connection = None
-        if connection is None:
             raise NoServerError(
-                f"qtm://{self._host}:{self._port}: no QTM answers, expected one that runs there"
-            )
-        return connection
+                f"{url}: no QTM answers, expected one that runs there: {reason}; start QTM, or compare the "
+                "port with that of its real-time output"
+            ) from error
+        return self._qtm.QRTConnection(protocol, timeout=_PATIENCE)
+
+    def _make_protocol(self) -> Any:
+        """Make the protocol of qtm-rt, whose packets are checked first."""
+        protocol = import_extra("qtm_rt.protocol", "qtm://", "qualisys").QTMProtocol(
+            loop=self._loop, on_event=self._react, on_disconnect=self._leave
+        )
+        protocol._receiver = _Packets(protocol, self.counts)
+        return protocol
+
+    def _leave(self, _: object) -> None:
+        """Note that the connection is lost."""
+        self.without_frames = f"QTM at {self._host} went away; it is called again and again"
+        self._arrived.put_nowait(_LOST)
 
     async def _reconnect(self) -> bool:
         """Connect again as soon as QTM is back; return False if `close` was called before."""
@@ -112,13 +134,41 @@ class QualisysSource:
         self._subscribing = self._loop.create_task(self._stream())
 
     async def _stream(self) -> None:
-        try:
+        self.without_frames = "QTM answers, but sends no frame; start real time or a measurement in QTM"
+        with suppress(TimeoutError, self._qtm.QRTCommandException):  # An event announces a measurement.
             await self._connection.stream_frames(components=_COMPONENTS, on_packet=self._take)
-        except (TimeoutError, self._qtm.QRTCommandException):
-            pass  # No measurement is running; an event announces the next one.
 
     def _take(self, packet: Any) -> None:
         self._arrived.put_nowait(frame_of(packet))
+
+
+class _Packets:
+    """Divides a connection's bytes into packets for the receiver of qtm-rt, and leaves out damaged ones.
+
+    qtm-rt alone waits for ever for a packet of a false size, and loses the connection to one of false counts.
+    """
+
+    def __init__(self, protocol: Any, counts: dict[str, int]) -> None:
+        self._protocol, self._receiver, self._counts = protocol, protocol._receiver, counts
+        self._rest = bytearray()
+
+    def data_received(self, data: bytes) -> None:
+        """Pass whole packets on; end the connection at a size that no packet has."""
+        self._rest += data
+        while len(self._rest) >= _HEAD.size:
+            size, kind = _HEAD.unpack_from(self._rest)
+            if not _HEAD.size <= size <= _LARGEST:
+                self._counts[_DAMAGED] += 1
+                self._rest.clear()
+                self._protocol.transport.abort()
+            if not _HEAD.size <= size <= len(self._rest):
+                return
+            packet = bytes(self._rest[_HEAD.size : size])
+            del self._rest[:size]
+            try:
+                self._receiver._parse_received(packet, kind)
+            except Exception:  # qtm-rt does not say which errors damaged packets raise
+                self._counts[_DAMAGED] += 1
 
 
 def frame_of(packet: Any) -> StreamedFrame:
@@ -128,7 +178,7 @@ def frame_of(packet: Any) -> StreamedFrame:
     positions = [(one.x, one.y, one.z) for one in identified + others]  # [mm], NaN if not seen
     points = 1e-3 * np.array(positions, dtype=np.float64).reshape(-1, 3)
     ids = [*range(len(identified)), *(_FIRST_ID + other.id % _IDS for other in others)]
-    there = np.isfinite(points[:, 0])
-    return StreamedFrame(
-        packet.framenumber, 1e-6 * packet.timestamp, points[there], np.array(ids, dtype=np.int64)[there]
-    )
+    there, time = np.isfinite(points).all(axis=1), 1e-6 * packet.timestamp
+    if not abs(time) < LATEST_TIME:
+        raise ValueError(f"a time of {time} s")
+    return StreamedFrame(packet.framenumber, time, points[there], np.array(ids, dtype=np.int64)[there])

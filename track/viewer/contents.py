@@ -30,7 +30,7 @@ from track.viewer.editors import HEIGHT, Corrector, LabelEditor, LayoutEditor, e
 from track.viewer.recordings import CaptureRecording, DatasetRecording, Recording, TakeRecording
 from track.viewer.stage import FrameView, HandSkin, PointBalls, set_stage, show_rig, show_volume, switch
 from track.viewer.timeline import StatusPanel, Timeline
-from train.data.shards import Dataset
+from train.data.shards import Dataset, is_dataset
 
 if TYPE_CHECKING:
     from viser import ViserServer
@@ -73,7 +73,7 @@ def open_content(
     suffix = path.suffix.lower()
     if not path.exists() and name in (*list_layouts(), *list_rigs()):
         keys = {"radius_mm" if name in list_layouts() else "camera"}
-    elif not path.exists() and not suffix and not is_growing(path):
+    elif not (path.exists() or suffix or is_growing(path) or is_dataset(name)):
         raise ArgumentError(f"{name}: no such file, folder or shipped name, expected {ACCEPTED}")
     elif suffix == ".toml" and not path.is_dir():
         given, keys = path, set(read_toml(path, error=FileError))
@@ -106,8 +106,8 @@ def _moving(path: Path, name: str, rig: CameraRig | None, time: float | None, up
     """Frames of a file or folder, and a corrector for a tracked take."""
     recording: Recording
     corrector: Corrector | None = None
-    if path.is_dir():
-        recording = DatasetRecording(Dataset(path), rig)
+    if path.is_dir() or is_dataset(name):
+        recording = DatasetRecording(Dataset(name), rig)
     elif path.suffix.lower() in READABLE:
         recording = CaptureRecording(read_capture(path), rig)
     elif path.suffix.lower() == ".npz" or is_growing(path):

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
-from handsim._checks import check_callable, check_rng, check_type, shown_value
+from handsim._checks import as_numbers, check_callable, check_rng, check_type, shown_value
 from handsim._plugins import call_plugin, load_plugin, plugin_name
 from handsim.errors import ArgumentError
 from handsim.hand.shape import SIDES
@@ -71,7 +71,8 @@ def corrupt(
     """
     check_type("corruption", corruption, Corruption, "a Corruption")
     check_rng(rng)
-    if not isinstance(markers, np.ndarray) or markers.ndim != 3 or markers.shape[2] != 3:
+    markers = as_numbers("markers", markers)
+    if markers.ndim != 3 or markers.shape[2] != 3:
         raise ArgumentError(f"markers is {shown_value(markers)}, expected an array (B, M, 3) [m]")
     batch, count = markers.shape[:2]
     known = np.isfinite(markers).all(-1)
@@ -169,10 +170,10 @@ def draw_cloud(
     owner = f"{_NOUN} '{name}'"
     if not isinstance(returned, tuple) or len(returned) != 2:
         raise ArgumentError(f"{owner} returns {type(returned).__name__}, expected the pair points, labels")
-    try:
-        points, labels = np.asarray(returned[0], dtype=np.float64), np.asarray(returned[1])
-    except (TypeError, ValueError) as error:
-        raise ArgumentError(f"{owner} returns no arrays: {error}") from error
+    points, labels = (
+        as_numbers(f"points of {owner}", returned[0]),
+        as_numbers(f"labels of {owner}", returned[1], None),
+    )
     _check(owner, points, labels, *markers.shape[:2])
     present = np.asarray(np.isfinite(points).all(axis=-1))
     return shuffled(points, present, labels.astype(np.int64), rng=rng)

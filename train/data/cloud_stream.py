@@ -9,14 +9,15 @@ from pathlib import Path
 import numpy as np
 import torch
 from torch import Tensor
-from torch.utils.data import IterableDataset, get_worker_info
+from torch.utils.data import IterableDataset
 
 from handsim._checks import check_count, check_number
+from handsim._process import SharedStream, with_own_numerics
 from train.data.batches import BatchRecipe, Corruption, OwnCorruption, check_corruption, draw_batch
 from train.data.shards import Dataset, load_dataset
 
 
-class CloudStream(IterableDataset[tuple[Tensor, Tensor, Tensor]]):
+class CloudStream(SharedStream, IterableDataset[tuple[Tensor, Tensor, Tensor]]):
     """Clouds of points of one hand, each corrupted anew, in endless batches.
 
     An item is a batch: points (B, N, 3) [m], float32, relative to the center of the hand's markers, 0 in
@@ -25,7 +26,8 @@ class CloudStream(IterableDataset[tuple[Tensor, Tensor, Tensor]]):
 
     For `torch.utils.data.DataLoader(stream, batch_size=None, num_workers=...)`. Batch number n depends only
     on the set, the settings, the seed and n, and workers share the numbers: the sequence is the same for any
-    number of workers. Each pass begins at batch `start` again.
+    number of workers. So do the ranks of torch.distributed, or those that torchrun, srun or mpirun state: of
+    two, one has the even batches. Each pass begins at batch `start` again.
 
     Args:
         dataset: The training set, or its folder.
@@ -65,11 +67,11 @@ class CloudStream(IterableDataset[tuple[Tensor, Tensor, Tensor]]):
         self.seed, self.start = seed, start
 
     def __iter__(self) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-        worker = get_worker_info()
-        first, step = (0, 1) if worker is None else (worker.id, worker.num_workers)
+        first, step = self.share()
         for number in count(self.start + first, step):
             yield self.batch(number)
 
+    @with_own_numerics
     def batch(self, number: int) -> tuple[Tensor, Tensor, Tensor]:
         """Points (B, N, 3) [m], presence (B, N) and labels (B, N) of a batch."""
         rng = np.random.default_rng((self.seed, number))

@@ -24,7 +24,7 @@ from upath import UPath
 from gloves.layout import MarkerLayout, stored_layout
 from gloves.optics.ghosts import MAX_GHOSTS
 from handsim._checks import check_type
-from handsim.app.output import Place, place_of
+from handsim.app.output import CHECKSUMS, Output, Place, check_store, place_of
 from handsim.errors import ArgumentError, DatasetError, HandSimError, LayoutError
 from handsim.files.arrays import check_npy_header
 from handsim.files.inputs import checksum, load_json
@@ -58,11 +58,12 @@ def row_dtype(num_markers: int) -> np.dtype[np.void]:
 
 
 def worn_dtype(num_markers: int) -> np.dtype[np.void]:
-    """Record type of one hand: a `HAND_DTYPE`, and the `places` (M, 3) of its glove's markers as worn.
+    """Record type of one hand: a `HAND_DTYPE`, the `places` (M, 3) of its glove's markers as worn, `person`.
 
-    A place is `along`, `around` [rad] and `across` of a `MarkerPlace`; NaN for a hand without rows.
+    A place is `along`, `around` [rad] and `across` of a `MarkerPlace`; NaN for a hand without rows. The
+    `person` is numbered from 0 through the set; it has two records, its left hand and its right one.
     """
-    return np.dtype([*HAND_DTYPE.descr, ("places", "<f8", (num_markers, 3))])
+    return np.dtype([*HAND_DTYPE.descr, ("places", "<f8", (num_markers, 3)), ("person", "<u4")])
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,6 +150,8 @@ def save_array(path: Path, array: NDArray[Any]) -> None:
 def load_manifest(path: Path) -> Manifest:
     """Manifest of a finished training set; its other files are not checked."""
     file = path / MANIFEST
+    if path.is_file():
+        raise DatasetError(f"{path} is a file, expected the folder of a training set")
     if not file.is_file():
         again = "is unfinished; run handsim generate again"
         hint = again if (path / CONFIG).is_file() else "holds none; handsim generate makes one"
@@ -184,7 +187,21 @@ class Dataset:
     def __init__(self, path: str | Place) -> None:
         check_type("path", path, (str, Path, UPath), "the folder of a training set")
         place = place_of(path)
-        path = place if isinstance(place, Path) else self._copied(place)
+        if isinstance(place, Path):
+            self._open(place)
+            return
+        self._copy = tempfile.TemporaryDirectory(prefix="handsim-set-")  # removed with the `Dataset`
+        store, folder = Output(place, Path(self._copy.name)), Path(self._copy.name)
+        try:
+            check_store(place)
+            store.fetch(MANIFEST, CONFIG)
+            store.fetch(*load_manifest(folder).files)
+            self._open(folder)
+        except DatasetError as error:  # it names the copy
+            raise DatasetError(str(error).replace(self._copy.name, str(place))) from error
+
+    def _open(self, path: Path) -> None:
+        """Check the files of a folder, and map the rows."""
         self.manifest = load_manifest(path)
         for name, expected in self.manifest.files.items():
             file = path / name
@@ -203,17 +220,6 @@ class Dataset:
                 f"{path / MANIFEST} says {self.manifest.num_frames} frames, but the shards hold {found}; "
                 "run handsim generate again, which writes it anew"
             )
-
-    def _copied(self, place: UPath) -> Path:
-        """Copy the files of an object store; the copy is removed with the `Dataset`."""
-        self._copy = tempfile.TemporaryDirectory(prefix="handsim-set-")
-        folder = Path(self._copy.name)
-        for name in (MANIFEST, CONFIG):
-            if (place / name).exists():
-                (folder / name).write_bytes((place / name).read_bytes())
-        for name in load_manifest(folder).files:
-            (folder / name).write_bytes((place / name).read_bytes())
-        return folder
 
     def _map_shards(self) -> list[NDArray[np.void]]:
         """The memory-mapped rows of each shard."""
@@ -290,9 +296,19 @@ class Dataset:
         ]  # fmt: skip
 
     def _hand_records(self, shard: int) -> NDArray[np.void]:
-        """Memory-mapped hands of a shard; those of old sets have no places of markers."""
+        """Memory-mapped hands of a shard; old ones have no person, or no places of markers either."""
         worn = worn_dtype(len(self.manifest.marker_names))
-        return _load_records(self.path / hands_name(shard), worn, HAND_DTYPE)
+        return _load_records(self.path / hands_name(shard), worn, np.dtype(worn.descr[:-1]), HAND_DTYPE)
+
+
+def is_dataset(given: object) -> bool:
+    """Whether this is a training set, or names the folder of one, finished or not, or a place in a store."""
+    if not isinstance(given, str | Path | UPath):
+        return isinstance(given, Dataset)
+    place = place_of(given)
+    if not isinstance(place, Path):
+        return True
+    return place.is_dir() and any(file for name in (MANIFEST, CHECKSUMS) for file in place.glob(name))
 
 
 def load_dataset(dataset: Dataset | str | Place) -> Dataset:

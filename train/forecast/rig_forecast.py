@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
-from gloves.captures.capture import run_lengths, runs_of
+from gloves.captures.capture import column_runs, runs_of
 from gloves.fit import GlovedHand, GloveFit, check_layout, settle_glove
 from gloves.layout import MarkerLayout
 from gloves.optics.reconstruction import OpticsConfig, reconstruct
@@ -239,8 +239,9 @@ class Forecast:
     gaps: float
     """Gaps per marker [1/min]."""
     gap_median: float
-    """Median length of a gap [s]; NaN without gaps."""
+    """Median length of a gap that begins in a scene [s]; NaN without gaps, infinite if scenes are shorter."""
     gap_p95: float
+    """95th percentile of these lengths [s]; a gap that outlasts its scene counts as at least that long."""
     ghosts: float
     """Points per frame that are not markers."""
     error: ErrorEllipsoid
@@ -262,16 +263,16 @@ def forecast(lit: Sequence[LitScene], rig: CameraRig, *, seed: int = 0) -> Forec
     rng = np.random.default_rng(seed)
     counts, gaps, spreads = zip(*(_count(one, rig, rng) for one in lit), strict=True)
     frames, scene_frames, minutes, two, three, missing, ghosts = map(sum, zip(*counts, strict=True))
-    lengths = np.concatenate(gaps)
-    median, p95 = np.percentile(lengths, [50, 95]) if len(lengths) else (np.nan, np.nan)
+    runs = np.concatenate(gaps, axis=1)
+    begun = runs[:, runs[1] > 0.0]
     return Forecast(
         frames,
         two / frames,
         three / frames,
         missing / frames,
-        len(lengths) / minutes,
-        float(median),
-        float(p95),
+        runs.shape[1] / minutes,
+        duration_quantile(begun[0], begun[2] > 0.0, 0.5),
+        duration_quantile(begun[0], begun[2] > 0.0, 0.95),
         ghosts / scene_frames,
         ellipsoid(np.concatenate(spreads)),
     )
@@ -279,8 +280,10 @@ def forecast(lit: Sequence[LitScene], rig: CameraRig, *, seed: int = 0) -> Forec
 
 def _count(
     one: LitScene, rig: CameraRig, rng: np.random.Generator
-) -> tuple[tuple[int, int, float, int, int, int, int], Float[np.ndarray, "G"], Float[np.ndarray, "N 3 3"]]:
-    """Counts of a scene, lengths of its gaps [s], and covariances of some points [m^2].
+) -> tuple[tuple[int, int, float, int, int, int, int], Float[np.ndarray, "3 G"], Float[np.ndarray, "N 3 3"]]:
+    """Counts of a scene, its gaps, and covariances of some points [m^2].
+
+    Of each gap there are its length [s], and whether it begins and ends in the scene.
 
     The counts are: marker-frames; frames; minutes of markers; marker-frames seen by two cameras, seen by
     three, and without a point; ghosts.
@@ -310,7 +313,21 @@ def _count(
         int(triangulated[:, sources.labels < 0].sum() + false.sum()),
     )
     spreads = covariances(sources.positions[rows, columns], one.seen[rows, columns], rig, noise)
-    return counts, run_lengths(~present) / rate, spreads
+    _, first, last = column_runs(~present)
+    return counts, np.stack([(last - first + 1) / rate, first > 0, last < len(present) - 1]), spreads
+
+
+def duration_quantile(lengths: Float[np.ndarray, "G"], ended: Bool[np.ndarray, "G"], share: float) -> float:
+    """A quantile of durations, by Kaplan and Meier; those that did not end are at least as long as seen.
+
+    NaN without durations, infinite where too few have ended.
+    """
+    if not len(lengths):
+        return float("nan")
+    order = np.lexsort((~ended, lengths))  # of equal ones those that ended first
+    left = np.cumprod(1.0 - ended[order] / np.arange(len(order), 0, -1))
+    below = np.flatnonzero(left <= 1.0 - share + 1e-9)
+    return float(lengths[order[below[0]]]) if len(below) else float("inf")
 
 
 def camera_losses(lit: Sequence[LitScene], rig: CameraRig, *, seed: int = 0) -> list[CameraLoss]:

@@ -114,7 +114,9 @@ class LayoutLabeler:
             raise WeightsError(f"not a labeler of glove '{layout.name}': {error}") from error
         if distances.shape[:3] != (1, layout.num_markers, layout.num_markers):
             raise WeightsError(f"not a labeler of the {layout.num_markers} markers of glove '{layout.name}'")
-        return cls(layout, network, distances, PosePrior.of_tensors(prior) if prior else None)
+        return cls(
+            layout, network, distances, PosePrior.of_tensors(prior, layout.num_markers) if prior else None
+        )
 
     def label_frames(self, frames: Sequence[Float[np.ndarray, "N 3"]]) -> list[Labeling]:
         """Label the points [m] of every frame, see `train.labelers.protocol.Labeler`."""

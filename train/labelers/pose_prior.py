@@ -80,11 +80,16 @@ class PosePrior:
         return tables | {"directions": self.directions.astype(np.float16)}
 
     @classmethod
-    def of_tensors(cls, tensors: Mapping[str, NDArray[np.generic]]) -> PosePrior:
-        """The prior from the tables of a file."""
+    def of_tensors(cls, tensors: Mapping[str, NDArray[np.generic]], num_labels: int) -> PosePrior:
+        """The prior from the tables of a file, for a labeler of so many markers."""
         if set(tensors) != {field.name for field in fields(cls)}:
             raise WeightsError(f"the pose prior has the tables {', '.join(sorted(tensors)) or 'none'}")
-        return cls(**{name: np.asarray(table, dtype=np.float32) for name, table in tensors.items()})
+        if any(table.dtype not in (np.float16, np.float32) for table in tensors.values()):
+            raise WeightsError("the pose prior has tables of other types, expected float16 or float32")
+        prior = cls(**{name: np.asarray(table, dtype=np.float32) for name, table in tensors.items()})
+        if prior.num_markers != num_labels:
+            raise WeightsError(f"the pose prior has {prior.num_markers} markers for {num_labels} labels")
+        return prior
 
 
 class PriorTables(NamedTuple):

@@ -18,8 +18,9 @@ from jaxtyping import Bool, Float, Float32, Int
 from numpy.typing import NDArray
 
 from gloves.captures.capture import check_unit
-from handsim._checks import check_count
+from handsim._checks import as_numbers, check_count
 from handsim._plugins import call_plugin, load_plugin, plugin_name
+from handsim._process import with_own_numerics
 from handsim.errors import ArgumentError, WeightsError
 from train.labelers.matching import match_scores
 from train.labelers.pose_prior import PosePrior
@@ -72,6 +73,7 @@ def checked_names(names: object) -> tuple[str, ...]:
     return tuple(names)
 
 
+@with_own_numerics
 def label_in_batches(
     frames: Sequence[Float[np.ndarray, "N 3"]],
     label: Callable[[list[NDArray[np.float64]]], list[Labeling]],
@@ -91,7 +93,7 @@ def label_in_batches(
 
 def check_clouds(frames: Sequence[Float[np.ndarray, "N 3"]]) -> list[NDArray[np.float64]]:
     """The points of every frame [m], validated as `Labeler.label_frames` describes."""
-    clouds = [np.asarray(points, dtype=np.float64) for points in frames]
+    clouds = [as_numbers(f"frame {number}", points) for number, points in enumerate(frames)]
     for frame, cloud in enumerate(clouds):
         if cloud.ndim != 2 or cloud.shape[1] != 3:
             raise ArgumentError(f"frame {frame} has shape {cloud.shape}, expected (N, 3)")
@@ -214,8 +216,9 @@ class OwnLabeler:
         """Validate a labeling of `count` points."""
         owner = f"{_NOUN} '{self._name}'"
         try:
-            labels, confidence = np.asarray(labeling.labels), np.asarray(labeling.confidence, np.float64)
-        except (AttributeError, TypeError, ValueError) as error:
+            labels = as_numbers(f"labels of {owner}", labeling.labels, None)
+            confidence = as_numbers(f"confidence of {owner}", labeling.confidence)
+        except AttributeError as error:
             raise ArgumentError(f"{owner} returns {type(labeling).__name__}, expected a Labeling") from error
         if labels.shape != (count,) or labels.dtype.kind not in "iu" or confidence.shape != (count,):
             raise ArgumentError(

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int32
 from numpy.typing import NDArray
 
+from handsim._process import with_own_numerics
 from handsim.kernels import kernel
 from train.labelers.matching import match_scores
 from train.labelers.pose_prior import PosePrior
@@ -113,6 +114,7 @@ class TrainedSetLabeler:
             _linear(weights, [""], "to_occluded.2"),
         )
 
+    @with_own_numerics
     def label_frames(self, frames: Sequence[Float[np.ndarray, "N 3"]]) -> list[Labeling]:
         """Label the points [m] of every frame, see `train.labelers.protocol.Labeler`."""
         return [self._label(cloud) for cloud in check_clouds(frames)]

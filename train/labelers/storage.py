@@ -29,7 +29,9 @@ from handsim import __version__
 from handsim._checks import check_type
 from handsim._plugins import import_extra, is_plugin, list_plugins
 from handsim.errors import DAMAGE, ArgumentError, HandSimWarning, WeightsError, choices
-from handsim.files.inputs import DIGEST, read_bytes, sign_model
+from handsim.files.arrays import read_npz
+from handsim.files.inputs import read_bytes
+from handsim.files.models import DIGEST, MOST_MODEL_BYTES, bounded_session, stamp_model
 from handsim.files.outputs import atomic_write, plain_path, save_json, written_together
 from train.labelers.cnn_labeler import CNNLabeler, MeanHand
 from train.labelers.matching import matching_constants
@@ -313,11 +315,7 @@ def _read(weights: Path, card: Path) -> _Stored:
             found = tensors[name].shape if name in tensors else None
             if found != expected.get(name):
                 raise ValueError(f"{name} has shape {found}, expected {expected.get(name)}")
-        prior = PosePrior.of_tensors(tables) if tables else None
-        if prior is not None and prior.num_markers != config.num_labels:
-            raise WeightsError(
-                f"the pose prior has {prior.num_markers} markers for {config.num_labels} labels"
-            )
+        prior = PosePrior.of_tensors(tables, config.num_labels) if tables else None
     except WeightsError:
         raise
     except (*DAMAGE, SafetensorError, OSError) as error:
@@ -399,27 +397,17 @@ class OnnxLabeler:
         onnxruntime = import_extra("onnxruntime", "an .onnx labeler", "onnx")
         if not path.is_file():
             raise WeightsError(f"{path} is missing, expected an .onnx file that handsim export wrote")
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = options.inter_op_num_threads = 1  # A frame is too small for more.
-        options.log_severity_level = 4
-        options.add_session_config_entry("session.set_denormal_as_zero", "1")  # distance bumps underflow
+        content = read_bytes(path, error=WeightsError, most=MOST_MODEL_BYTES)
         try:
-            content = path.read_bytes()
-            if sign_model(content) != content:  # onnxruntime crashes on some damaged files
-                raise ValueError("the SHA-256 is another one")
-            # Without the fallback, which prints on standard output.
-            self._session = onnxruntime.InferenceSession(
-                content, options, providers=["CPUExecutionProvider"], enable_fallback=0
-            )
+            self._session = bounded_session(content)
             metadata = self._session.get_modelmeta().custom_metadata_map
             self._scores_alone = onnxruntime.RunOptions()  # skips the outputs for other programs
             self._scores_alone.only_execute_path_to_fetches = True
             self.marker_names = checked_names(json.loads(metadata[_NAMES]))
             self.prior = None
             if _ONNX_PRIOR in metadata:
-                stored = io.BytesIO(base64.b64decode(metadata[_ONNX_PRIOR], validate=True))
-                with np.load(stored) as tables:  # never unpickles
-                    self.prior = PosePrior.of_tensors(dict(tables))
+                stored = base64.b64decode(metadata[_ONNX_PRIOR], validate=True)
+                self.prior = PosePrior.of_tensors(read_npz(stored), len(self.marker_names))
             self._label = self._label_by_images(metadata[_CNN]) if _CNN in metadata else self._label_by_scores
             self._try(_IMAGES if _CNN in metadata else _INPUTS[0])
         except Exception as error:  # onnxruntime's errors have no common class.
@@ -513,4 +501,4 @@ def export_onnx(network: nn.Module, marker_names: Sequence[str], path: Path) -> 
             value.doc_string = properties[f"handsim.{value.name}"] = _MEANINGS[value.name]
         onnx.helper.set_model_props(model, properties)
         onnx.checker.check_model(model, full_check=True)
-        temporary.write_bytes(sign_model(model.SerializeToString()))
+        temporary.write_bytes(stamp_model(model.SerializeToString()))

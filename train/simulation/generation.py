@@ -9,6 +9,7 @@ import warnings
 from collections import Counter
 from collections.abc import Collection, Mapping
 from concurrent.futures import Executor
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
 
@@ -77,7 +78,7 @@ def generate_dataset(
         workers: Number of processes, all cores when not given, or an executor; one process for a sampler that
             other processes cannot import, such as a lambda.
         progress: Called after every shard with the numbers of frames done and in total.
-        options: Settings by name: `glove="sparse13"`, `num_frames=2000`, `scenes={"alone": 1.0}`, ...
+        options: Settings by name: `glove="sparse13"`, `num_frames=2000`, `scenes={"holding": 0.0}`, ...
 
     Returns:
         The set: `rows()` are its frames, positions in [m] and angles in [rad].
@@ -106,6 +107,7 @@ def make_dataset(
         _check_space(source, place)
     with open_output(place) as output:
         whole = _whole_files(output)
+        _restore_config(output)
         output.claim(
             CONFIG,
             _record(source),
@@ -200,6 +202,15 @@ def _whole_files(output: Output) -> dict[str, str]:
     return {name: one for name, one in recorded.items() if _number(name) not in numbers}
 
 
+def _restore_config(output: Output) -> None:
+    """Write the settings of a finished set again if their file is missing; the manifest has them too."""
+    if CONFIG not in output.sizes():
+        with suppress(DatasetError):  # no finished set
+            save_json(output.folder / CONFIG, load_manifest(output.folder).config)
+            output.publish(CONFIG)
+            output.warn_of([CONFIG], f"is missing, and is made again from {MANIFEST}")
+
+
 def _number(name: str) -> int:
     """Number of a shard from the name of one of its files; -1 for other names."""
     number = Path(name).stem.rpartition("-")[2]
@@ -288,6 +299,7 @@ def make_shard(source: FrameSource, out: Path, shard: int) -> int:
     rng = np.random.default_rng(np.random.SeedSequence(settings.seed, spawn_key=(shard,)))
     rows = np.zeros(_shard_size(settings.num_frames, shard), dtype=row_dtype(source.layout.num_markers))
     people = -(-len(rows) // settings.frames_per_hand)
+    before = shard * -(-ROWS_PER_SHARD // settings.frames_per_hand)  # people in earlier shards
     redrawn: Counter[str] = Counter()
     hands = np.zeros(len(SIDES) * people, dtype=worn_dtype(source.layout.num_markers))
     for person in range(people):
@@ -298,7 +310,7 @@ def make_shard(source: FrameSource, out: Path, shard: int) -> int:
         worn = {fit.side: [(one.along, one.around, one.across) for one in fit.layout.markers] for fit in fits}
         nowhere = np.full((source.layout.num_markers, 3), np.nan)
         for number, shape in enumerate((model.shape for model in models), first):
-            hands[number] = (*pack_hand(shape), worn.get(shape.side, nowhere))
+            hands[number] = (*pack_hand(shape), worn.get(shape.side, nowhere), before + person)
         block["hand"] += first
     save_array(out / hands_name(shard), hands)
     save_json(out / redrawn_name(shard), dict(sorted(redrawn.items())))

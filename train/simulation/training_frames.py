@@ -61,8 +61,7 @@ class GenerateSettings(Settings):
     """Everything that determines the bytes of a training set: people, poses, scenes, cameras and losses.
 
     A group of settings may be given as a mapping with those that differ from the default, such as
-    `ghosts={"stray_rate": 0.0}`; the shares of `poses` and `scenes` as a mapping with the nonzero ones:
-    `scenes={"alone": 1.0}`.
+    `ghosts={"stray_rate": 0.0}` or, for hands that are all alone, `scenes={"together": 0, "holding": 0}`.
     """
 
     noun: ClassVar[str] = "setting of a training set"

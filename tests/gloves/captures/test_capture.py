@@ -15,7 +15,7 @@ from gloves import Capture, read_capture, write_capture
 from gloves.captures.capture import check_place, run_lengths, unit_fault
 from gloves.captures.coordinates import settled
 from gloves.captures.formats import READABLE, WRITABLE
-from handsim import HandSimWarning
+from handsim import HandSimError, HandSimWarning
 from handsim.errors import CaptureError
 from tests.sentences import assert_names
 
@@ -260,3 +260,33 @@ def test_all_points_at_the_origin_are_told(tmp_path):
     write_capture(path, Capture(("a", "b"), np.zeros((20, 2, 3)), 120.0))
     with pytest.raises(CaptureError, match=r"all points are at the origin, \(0, 0, 0\), expected positions"):
         read_capture(path)
+
+
+def test_masked_points_are_missing(hand):
+    mask = np.zeros_like(hand.positions, dtype=bool)
+    mask[3:9, 2] = True
+    masked = np.ma.array(hand.positions, mask=mask)
+    found = Capture(hand.names, masked, hand.rate)
+    np.testing.assert_array_equal(np.isnan(found.positions), mask | np.isnan(hand.positions))
+
+
+@pytest.mark.parametrize(
+    ("names", "positions", "findings", "words"),
+    [
+        (None, np.ones((2, 1, 3)), {}, ("a name is None", "text")),
+        ((1, 2), np.ones((2, 2, 3)), {}, ("a name is 1", "text")),
+        (("a",), [[["x", 1, 2]]], {}, ("positions is", "an array of numbers")),
+        (("a",), [[[1, 2, 3]], [[1, 2]]], {}, ("positions is", "an array of numbers")),
+        (("a",), np.ones((2, 1, 3)), None, ("findings is None", "counts")),
+        ("abc", np.ones((2, 3, 3)), {}, ("shape (2, 3, 3)", "1 names")),
+    ],
+)
+def test_what_is_no_capture_is_told(names, positions, findings, words):
+    with pytest.raises(HandSimError) as told:
+        Capture(names, positions, 100.0, findings)
+    assert all(word in str(told.value) for word in words), str(told.value)
+
+
+def test_names_come_from_anything_that_lists_them():
+    for names in (iter("ab"), np.array(["a", "b"]), ["a", "b"]):
+        assert Capture(names, np.ones((2, 2, 3)), 100.0).names == ("a", "b")

@@ -93,3 +93,18 @@ def test_names_of_windows(tmp_path: Path) -> None:
     path = tmp_path / "take.tsv"
     path.write_bytes(qtm(names=("Zeigefingerspitze ü", "Fuß")).encode("cp1252"))
     assert read_capture(path).names == ("Zeigefingerspitze ü", "Fuß")
+
+
+@pytest.mark.parametrize(
+    "cell", ["-1.#IND00", "1.#QNAN0", "1.#IND", "-1.#QNAN", "nan(ind)", "-nan(ind)", "NAN(SNAN)", "N/A", "--"]
+)
+def test_what_programs_write_for_no_number_is_a_gap(tmp_path: Path, cell: str) -> None:
+    (tmp_path / "take.tsv").write_text(qtm().replace("10.500\t", f"{cell}\t"))
+    assert np.isnan(read_capture(tmp_path / "take.tsv").positions[1, 0]).all()
+
+
+@pytest.mark.parametrize("cell", ["1_0.500", "10_500", "1_000"])
+def test_numbers_of_python_alone_are_refused(tmp_path: Path, cell: str) -> None:
+    (tmp_path / "take.tsv").write_text(qtm().replace("10.500\t", f"{cell}\t"))
+    with pytest.raises(CaptureError, match=f"'{cell}' is not a number"):
+        read_capture(tmp_path / "take.tsv")

@@ -6,7 +6,9 @@ import contextlib
 import errno
 import json
 import os
+import shutil
 import warnings
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,11 +23,12 @@ from gloves.takes.archives import (
     growing_path,
     is_growing,
 )
-from handsim import HandSimError
+from handsim import HandSimError, HandSimWarning
 from handsim.errors import CaptureError
 from handsim.files import arrays as array_files
 from handsim.files.arrays import read_npz, write_npz
 from handsim.hand.shape import HAND_DTYPE
+from tests.limits import file_size_limit
 from train import simulate_take
 
 COLUMNS = (
@@ -163,20 +166,101 @@ def test_frames_wait_no_longer_than_half_a_second(rng, tmp_path, monkeypatch):
 
 
 def test_a_full_disk_keeps_what_was_written(rng, tmp_path):
-    if not os.path.exists("/dev/full"):
-        pytest.skip("this machine has no /dev/full")
     path = tmp_path / "x.part"
     archive = GrowingArchive(path, {}, FIXED, COLUMNS)
     archive.add(EMPTY, 0)
     archive.flush()
     archive.add(EMPTY, 0)
-    archive._file.close()
-    archive._file = open("/dev/full", "wb", buffering=0)
-    with pytest.raises(OSError) as error:
+    with file_size_limit(path.stat().st_size + 10), pytest.raises(OSError) as error:
         archive.flush()
-    assert error.value.errno == errno.ENOSPC and archive.num_frames == 1
+    assert error.value.errno == errno.EFBIG and archive.num_frames == 1
     archive.close()
-    assert GrownArchive(path).num_frames == 1
+    grown = GrownArchive(path)
+    assert grown.num_frames == 1 and grown.num_lost_bytes == 0
+
+
+def half_a_recording(path):
+    """An archive with three blocks of two frames."""
+    archive = GrowingArchive(path, {"kind": "test"}, FIXED, COLUMNS)
+    for number in range(6):
+        archive.add({**EMPTY, "times": number}, 0)
+        if number % 2:
+            archive.flush()
+    return archive
+
+
+def remove_folder(path):
+    shutil.rmtree(path.parent)
+
+
+def remove_file(path):
+    path.unlink()
+
+
+def rename_folder(path):
+    path.parent.rename(path.parent.with_name("renamed"))
+
+
+def put_a_copy_in_its_place(path):
+    shutil.copy(path, path.with_name("copy"))
+    os.replace(path.with_name("copy"), path)
+
+
+def put_a_file_in_place_of_its_folder(path):
+    shutil.rmtree(path.parent)
+    path.parent.write_text("a file")
+
+
+GONE = (remove_folder, remove_file, rename_folder, put_a_copy_in_its_place, put_a_file_in_place_of_its_folder)
+
+
+@pytest.mark.parametrize("when", ["while frames come", "before the end"])
+@pytest.mark.parametrize("gone", GONE)
+def test_a_recording_that_is_removed_is_written_again(gone, when, tmp_path):
+    path = tmp_path / "session" / "x.part"
+    archive = half_a_recording(path)
+    gone(path)
+    with pytest.warns(HandSimWarning, match="x.part was removed or replaced by another"):
+        if when == "while frames come":
+            archive.add({**EMPTY, "times": 6.0}, 0)
+            archive.flush()
+        archive.close()
+    times = GrownArchive(archive.path).read()["times"]
+    np.testing.assert_array_equal(times, np.arange(6 + (when == "while frames come")))
+    assert (archive.path == path) == (gone not in GONE[3:])
+    if not archive.path.is_relative_to(tmp_path):
+        archive.path.unlink()  # in the folder of temporary files, as there was no other
+
+
+def test_a_recording_is_written_again_where_it_was_from_another_working_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    archive = half_a_recording(Path("x.part"))
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    monkeypatch.chdir(elsewhere)
+    archive.add({**EMPTY, "times": 6.0}, 0)
+    archive.flush()
+    (tmp_path / "x.part").unlink()
+    with pytest.warns(HandSimWarning, match="was removed"):
+        archive.close()
+    assert GrownArchive(tmp_path / "x.part").num_frames == 7 and not list(elsewhere.iterdir())
+
+
+@pytest.mark.parametrize(("length", "left"), [("nothing", 0), ("head", 0), ("block", 2), ("longer", 6)])
+def test_a_recording_that_is_cut_goes_on_after_its_last_whole_block(length, left, tmp_path):
+    path = tmp_path / "x.part"
+    archive = half_a_recording(path)
+    whole = path.stat().st_size
+    ends = [end for end, _ in archive._blocks]
+    size = {"nothing": 0, "head": ends[0] // 2, "block": ends[2] - 1, "longer": whole + 100}[length]
+    os.truncate(path, size)
+    archive.add({**EMPTY, "times": 6.0}, 0)
+    told = f"x.part was cut by another program: {6 - left} of its 6 frames are lost"
+    with pytest.warns(HandSimWarning, match=told) if left < 6 else contextlib.nullcontext():
+        archive.close()
+    grown = GrownArchive(path)
+    assert archive.num_frames == grown.num_frames == left + 1 and grown.header == {"kind": "test"}
+    np.testing.assert_array_equal(grown.read()["times"], [*range(left), 6])
 
 
 def test_headers_that_lie_take_no_memory(rng, tmp_path):

@@ -97,8 +97,25 @@ def test_what_a_job_raises_comes_back():
 
 
 def test_a_worker_that_dies_is_told():
-    with pytest.raises(DatasetError, match=r"a worker died .*; run the same command again to go on"):
+    with pytest.raises(
+        DatasetError, match=r"a worker died .*; run the same command again to go on, with fewer --workers"
+    ):
         list(run_jobs(die_at_two, range(5), 2))
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="mounts a file system")
+@pytest.mark.parametrize(("options", "hides"), [("ro", "/dev/shm"), ("ro,size=4k", "/dev/shm")])
+def test_where_no_process_can_be_started_one_worker_is_named(options, hides):
+    jobs = "print(*run_jobs(operator.index, range(3), N))"
+    script = f"import operator; from handsim.app.workers import run_jobs; {jobs}"
+    inner = f"mount -t tmpfs -o {options} tmpfs {hides} && {sys.executable} -c '{script}'"
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    for workers, told in ((2, "give --workers 1"), (1, "0 1 2")):
+        command = ["unshare", "--mount", "--map-root-user", "sh", "-c", inner.replace("N)", f"{workers})")]
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+        if "unshare failed" in done.stderr or "mount:" in done.stderr:
+            pytest.skip("this user cannot mount")
+        assert told in done.stdout + done.stderr
 
 
 def test_a_block_that_raises_ends_workers_at_once(tmp_path):

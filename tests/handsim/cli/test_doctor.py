@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from handsim.cli import doctor
-from handsim.cli.doctor import Finding, check_drawing, check_names, check_requirement
+from handsim.cli.doctor import Finding, check_drawing, check_extra, check_names, check_requirement
 
 NUMPY, ANEW = metadata.version("numpy"), "run `pip uninstall render`, then install handsim anew"
 
@@ -71,6 +71,43 @@ def test_a_probe_tells_its_last_line_or_its_error() -> None:
     assert failed == (1, "RuntimeError: no driver")
     code, output = doctor._finish(doctor._start("import os; os.abort()"))
     assert code != 0 and output
+
+
+@pytest.mark.parametrize(
+    ("requirements", "found"),
+    [
+        (["numpy>=2.0"], "installed"),
+        (["no-such-thing>=1", "numpy>=2.0"], "no-such-thing missing"),
+        (["numpy>=99", "no-such-thing"], f"numpy {NUMPY}, no-such-thing missing"),
+    ],
+)
+def test_an_extra_is_told_with_what_it_is_for(requirements, found):
+    finding = check_extra("view", "handsim view", requirements)
+    assert (finding.what, finding.found, finding.needed) == ("handsim view", found, False)
+    assert (found != "installed") == ("pip install 'handsim[view]'" in finding.remedy)
+
+
+def test_every_extra_of_users_is_listed():
+    stated = metadata.metadata("handsim").get_all("Provides-Extra")
+    assert {*stated} - {"dev", "docs"} == {*doctor._EXTRAS}
+    told = {finding.expected: finding for finding in doctor.check_requirements()}
+    assert all(told[f"handsim[{extra}]"].found for extra in doctor._EXTRAS)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="needs /proc")
+@pytest.mark.parametrize("folder", ["/proc/nope", "/proc", "/proc/self/fd/nope", __file__])
+def test_a_cache_that_cannot_be_written_is_named(folder, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", folder)
+    finding = doctor.check_learned_gloves()
+    assert finding.found == f"{folder}/handsim/gloves, which cannot be written"
+    assert "XDG_CACHE_HOME" in finding.remedy
+    monkeypatch.setenv("NUMBA_CACHE_DIR", f"{folder}/kernels")
+    assert "cannot be written" in doctor.check_kernel_cache().found
+
+
+def test_a_cache_that_is_yet_to_be_made_is_fine(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "new" / "cache"))
+    assert doctor.check_learned_gloves().remedy == "" and not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(

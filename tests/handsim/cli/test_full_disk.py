@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-import sys
-
 import pytest
 
 from gloves.takes.motion_formats import MOTION_FORMATS
 from handsim.cli.main import main
-
-if sys.platform == "win32":
-    pytest.skip("no file size limits", allow_module_level=True)
-import resource
+from tests.limits import file_size_limit
 
 LIMIT = 2000  # bytes
 
@@ -45,12 +40,8 @@ def test_a_file_that_is_too_large_is_named(command, file, folder, monkeypatch, c
     assert main([*command.split(), file]) == 0  # kernels are kept in files too, once
     older, before = (folder / file).read_bytes(), sorted(folder.iterdir())
     capfd.readouterr()
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (LIMIT, hard))
-    try:
+    with file_size_limit(LIMIT):
         assert main([*command.split(), file]) == 1
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     *_, said = capfd.readouterr().err.strip().splitlines()
     assert f": {file}: " in said and "file too large" in said.lower()
     assert (folder / file).read_bytes() == older and sorted(folder.iterdir()) == before

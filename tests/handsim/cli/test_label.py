@@ -188,3 +188,31 @@ def test_a_labeled_c3d_keeps_what_its_source_has_beside_points(tmp_path, rng):
     before, after = ezc3d.c3d(str(source)), ezc3d.c3d(str(out))
     assert after["header"]["points"]["first_frame"] == before["header"]["points"]["first_frame"] == 41
     np.testing.assert_array_equal(after["data"]["analogs"], before["data"]["analogs"])
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        "label gone.c3d --out out.c3d",
+        "label gone.c3d lost.c3d --out labeled",
+        "label empty.c3d --out out.c3d",
+        "track gone.c3d --out out.npz",
+        "track gone.npz --out out.npz",
+        "track empty.c3d --out out.npz --calibrate",
+        "calibrate gone.trc --out user.json",
+        "evaluate gone.c3d",
+        "evaluate there.c3d gone.c3d",
+    ],
+)
+def test_a_capture_is_read_before_a_glove_is_learned(arguments, take, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    layout = load_layout("dense19")
+    dataclasses.replace(layout, name="mine", markers=layout.markers[:-1]).save("mine.toml")
+    write_capture("there.c3d", take.capture())
+    (tmp_path / "empty.c3d").touch()
+    before = {*tmp_path.iterdir()}
+    assert main([*arguments.split(), "--glove", "mine.toml"]) == 1
+    said = capsys.readouterr().err
+    assert "cannot be read" in said or "is empty" in said or "not labeled" in said
+    assert "learns it now" not in said and {*tmp_path.iterdir()} == before

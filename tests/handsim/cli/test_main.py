@@ -258,3 +258,34 @@ def test_help_loads_nothing_heavy():
         "    heavy = {'torch', 'numba', 'mujoco', 'scipy', 'matplotlib', 'cv2'}\n"
     )
     run_python(code, "--help", *LIGHT)
+
+
+@pytest.mark.parametrize(
+    ("args", "said"),
+    [
+        (["~/anna"], "hello /home/of/me/anna"),
+        (["--name=~/anna"], "hello /home/of/me/anna"),
+        (["--name", "~/anna"], "hello /home/of/me/anna"),
+        (["--name=~"], "hello /home/of/me"),
+        (["--name=a~/b"], "hello a~/b"),
+        (["--name=~nobody-of-this-name/b"], "hello ~nobody-of-this-name/b"),
+    ],
+)
+def test_the_tilde_is_the_home_folder(invoke, monkeypatch, capsys, args, said):
+    monkeypatch.setenv("HOME", "/home/of/me")
+    args = args if args[0].startswith("--") else ["--name", *args]
+    assert invoke(greet, *args) == 0
+    assert capsys.readouterr().out.strip() == said
+
+
+@pytest.mark.parametrize("args", [["--name", ""], ["--name="], ["--name", "anna", "--times="]])
+def test_an_empty_argument_is_no_folder(invoke, capsys, args):
+    assert invoke(greet, *args) == 2
+    assert "an argument is empty" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("columns", ["0", "00", ""])
+def test_a_terminal_without_a_width_shows_everything(columns, monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", columns)
+    assert main(["glove", "list"]) == 0
+    assert "dense19" in capsys.readouterr().out

@@ -146,7 +146,9 @@ def files(tmp_path_factory) -> Path:
     (folder / "lab.xcp").write_text(XCP)
     for name, count in (("capture", "60"), ("long", "200")):
         assert main(["simulate", "--num-frames", count, "--out", str(folder / f"{name}.c3d")]) == 0
-    generate_dataset(folder / "set", num_frames=300, frames_per_hand=20, scenes={"alone": 1.0}, workers=1)
+    generate_dataset(
+        folder / "set", num_frames=300, frames_per_hand=20, scenes={"together": 0, "holding": 0}, workers=1
+    )
     assert (
         main(["train", str(folder / "set"), "--out", str(folder / "run"), "--samples", "64", *SMALL.split()])
         == 0

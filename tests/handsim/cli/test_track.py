@@ -7,6 +7,7 @@ import functools
 import json
 import os
 import re
+import shutil
 import signal
 import socket
 import subprocess
@@ -28,6 +29,8 @@ from handsim import HandModel, sample_shape
 from handsim.app import messages
 from handsim.cli.main import main
 from handsim.space.objects import named_object
+from tests.limits import file_size_limit
+from tests.sentences import assert_names
 from tests.waiting import LONG, wait_for
 from track import Recorder, ReplayServer, User, captures, load_user, open_source, track_capture
 from track.rigid_body import load_body
@@ -612,6 +615,171 @@ def test_a_stream_without_frames_is_told(capture, tmp_path, capsys, monkeypatch)
     said = capsys.readouterr().err
     assert "1 frames came, expected two or more" in said
     assert not list(tmp_path.iterdir())
+
+
+@pytest.fixture
+def listener():
+    """A UDP socket that keeps all that is sent to it."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
+        one.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 24)
+        one.bind(("127.0.0.1", 0))
+        one.setblocking(False)
+        yield one
+
+
+def address_of(listener) -> str:
+    return f"udp://127.0.0.1:{listener.getsockname()[1]}"
+
+
+def numbers_heard(listener) -> set[int]:
+    """The numbers of all frames that a listener was sent."""
+    heard = set()
+    with contextlib.suppress(BlockingIOError):
+        while True:
+            message = json.loads(listener.recv(1 << 16))
+            if message["type"] == "frame":
+                heard.add(message["number"])
+    return heard
+
+
+def test_hands_are_sent_without_a_recording(capture, tmp_path, capsys, monkeypatch, listener):
+    monkeypatch.chdir(tmp_path)
+    with ReplayServer(capture.with_suffix(".truth.npz"), loop=True) as server:
+        sent = ["--live", server.url, "--seconds", "0.3", "--send", address_of(listener)]
+        assert main(["track", *sent, "--size", "M"]) == 0
+    heard, said = numbers_heard(listener), capsys.readouterr()
+    assert len(heard) > 1 and not list(tmp_path.iterdir()) and "recording" not in said.err
+    assert re.match(r"\d+ frames, \d\.\d s\n", said.out) and "frames sent to udp" in said.out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (
+            "--live natnet://host",
+            "given --live natnet://host without --out | --out FILE.npz, --send ADDRESS or",
+        ),
+        ("take.c3d", "given a capture, take.c3d without --out, expected --out FILE.npz"),
+        ("take.c3d --send udp://:9", "given a capture, take.c3d without --out, expected --out FILE.npz"),
+        (
+            "--live natnet://host --send udp://:9 --labeled l.trc",
+            "and --labeled l.trc without --out, expected",
+        ),
+        (
+            "--live natnet://host --seconds 5",
+            "without --out, expected --out FILE.npz, --send ADDRESS or both",
+        ),
+        ("", "given neither a capture nor --live"),
+    ],
+)
+def test_a_session_without_any_output_is_refused(arguments, words, capsys):
+    assert main(["track", *arguments.split()]) == 1
+    assert_names(capsys.readouterr().err.strip(), words)
+
+
+@pytest.mark.parametrize("seconds", [["--seconds", "0.2"], []])
+@pytest.mark.parametrize("output", ["--out", "--send", "--out --send"])
+def test_a_server_without_frames_ends_a_session_of_a_given_length(
+    seconds, output, tmp_path, capsys, monkeypatch, interrupt
+):
+    monkeypatch.setattr("track.live._FIRST_FRAME", 0.5)
+    monkeypatch.setattr("track.live.open_source", functools.partial(open_source, silence=0.1))
+    (tmp_path / "waits.py").write_text(LATE.replace("time.sleep(1.0)", "time.sleep(1e6)"))
+    monkeypatch.syspath_prepend(tmp_path)
+    out = tmp_path / "new" / "live.npz"
+    given = {"--out": ["--out", str(out)], "--send": ["--send", "udp://127.0.0.1:9"]}
+    outputs = [word for name in output.split() for word in given[name]]
+    shown = []
+    monkeypatch.setattr(messages.LiveStatus, "show", lambda status, line, now=False: shown.append(line))
+    if not seconds:
+        interrupt(signal.SIGINT, lambda: any("no frames arrive" in line for line in shown))
+    code = main(["track", "--live", "waits:Late", "--size", "M", *outputs, *seconds])
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert code == (0 if output == "--send" and not seconds else 1)
+    if code:
+        waited = " in 0.5 s" if seconds else ""
+        assert said == f"handsim track: waits:Late: 0 frames came{waited}; is the server playing?"
+    assert not out.parent.exists() or not list(out.parent.iterdir())
+
+
+@pytest.mark.parametrize("scheme", ["natnet", "qtm"])
+def test_a_server_that_never_answers_ends_a_session_of_a_given_length(scheme, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("track.live._FIRST_FRAME", 0.5)
+    monkeypatch.setattr(f"track.streams.{'natnet' if scheme == 'natnet' else 'qualisys'}._PATIENCE", 0.2)
+    with socket.socket(
+        socket.AF_INET, socket.SOCK_DGRAM if scheme == "natnet" else socket.SOCK_STREAM
+    ) as one:
+        one.bind(("127.0.0.1", 0))
+        address = f"{scheme}://127.0.0.1:{one.getsockname()[1]}"
+        live = ["--live", address, "--seconds", "0.2", "--size", "M", "--out", str(tmp_path / "live.npz")]
+        assert main(["track", *live]) == 1
+    assert f"handsim track: {address}: no " in capsys.readouterr().err and not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("sends", [False, True])
+def test_a_full_disk_ends_the_recording_and_the_hands_go_on(
+    sends, capture, tmp_path, capsys, monkeypatch, interrupt, listener
+):
+    out, part = tmp_path / "live.npz", tmp_path / "live.npz.part"
+    told, heard, say = threading.Event(), [set(), set()], messages.LiveStatus.say
+
+    def note(status, line):
+        say(status, line)
+        if "tracking goes on" in line:
+            heard[0] = numbers_heard(listener)
+            told.set()
+
+    def goes_on() -> bool:
+        heard[1] |= numbers_heard(listener) if told.is_set() else set()
+        return len(heard[1]) > 30
+
+    monkeypatch.setattr(messages.LiveStatus, "say", note)
+    with ReplayServer(capture.with_suffix(".truth.npz"), loop=True) as server, file_size_limit(400_000):
+        send = ["--send", address_of(listener)] if sends else []
+        if sends:
+            interrupt(signal.SIGINT, goes_on)
+        assert main(["track", "--live", server.url, "--size", "M", "--out", str(out), *send]) == 1
+    said = capsys.readouterr().err.splitlines()[-1]
+    with pytest.warns(CutOffWarning):
+        kept = load_take(part)
+    assert (
+        f"the recording ended after {kept.num_frames} frames (File too large); they are kept in {part}"
+        in said
+    )
+    assert len(heard[1]) > 30 if sends else "; tracking" not in said
+    if sends:
+        assert int(re.search(r"; (\d+) frames after them were not recorded", said)[1]) >= len(heard[1])
+
+
+@pytest.mark.parametrize("fault", ["removed", "renamed", "cut"])
+def test_a_recording_folder_that_changes_meanwhile_costs_nothing_that_is_not_told(
+    fault, capture, tmp_path, capsys, interrupt
+):
+    folder = tmp_path / "session"
+    out, part = folder / "live.npz", folder / "live.npz.part"
+    before = []
+
+    def damage() -> bool:
+        if len(before) == 0 and len(numbers := _numbers_in(part)) > 60:
+            before.append(len(numbers))
+            if fault == "removed":
+                shutil.rmtree(folder)
+            elif fault == "renamed":
+                folder.rename(tmp_path / "other")
+            else:
+                os.truncate(part, part.stat().st_size // 2)
+        return bool(before) and len(_numbers_in(part)) > 90
+
+    with ReplayServer(capture.with_suffix(".truth.npz"), loop=True) as server:
+        interrupt(signal.SIGINT, damage)
+        assert main(["track", "--live", server.url, "--size", "M", "--out", str(out)]) == 0
+    said, take = capsys.readouterr(), load_take(out)
+    lost = re.search(r"was cut by another program: (\d+) of its (\d+) frames are lost", said.err)
+    assert (lost is not None) == (fault == "cut")
+    assert ("was removed or replaced by another program" in said.err) == (fault in ("removed", "renamed"))
+    tracked = int(re.search(rf"{out}: (\d+) frames", said.out)[1])
+    assert take.num_frames == tracked - (int(lost[1]) if lost else 0)
+    assert os.listdir(folder) == ["live.npz"]
 
 
 def test_hands_are_sent_as_they_are_tracked(capture, tmp_path, capsys, monkeypatch):

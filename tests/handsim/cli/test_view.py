@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import signal
@@ -14,7 +15,9 @@ import numpy as np
 import pytest
 
 from gloves import load_take
+from handsim.app import messages
 from handsim.cli.main import main
+from tests.limits import file_size_limit
 from track import ReplayServer
 from track.viewer.recordings import chosen_frames
 from track.viewer.timeline import LiveView
@@ -29,8 +32,8 @@ def capture(tmp_path_factory):
     return out
 
 
-def ended_after(condition) -> threading.Thread:
-    """Sends Ctrl-C once a condition holds."""
+def ended_after(condition, number: int = signal.SIGINT) -> threading.Thread:
+    """Sends a signal, Ctrl-C by default, once a condition holds."""
     before = signal.getsignal(signal.SIGINT)
 
     def interrupt() -> None:
@@ -39,7 +42,7 @@ def ended_after(condition) -> threading.Thread:
             if time.monotonic() > end:
                 break
             time.sleep(0.05)
-        os.kill(os.getpid(), signal.SIGINT)
+        os.kill(os.getpid(), number)
 
     thread = threading.Thread(target=interrupt, daemon=True)
     thread.start()
@@ -92,6 +95,40 @@ def test_a_live_tracker_is_shown_and_recorded_and_frames_are_never_dropped(
     take = load_take(out)
     assert list(take.numbers) == offered and f"{out}: {frames} frames" in said
     assert take.settings["stream"]["missing_frames"] == 0
+
+
+@pytest.mark.parametrize("fault", [signal.SIGTERM, signal.SIGHUP, "full disk"])
+def test_a_live_view_ends_by_any_signal_and_goes_on_without_its_recording(
+    fault, capture, tmp_path, capsys, monkeypatch
+):
+    frames, said, plain, say = [], [], LiveView.send, messages.LiveStatus.say
+
+    def send(self, frame, tracked):
+        frames.append(frame.number)
+        plain(self, frame, tracked)
+
+    def is_enough() -> bool:
+        ended = next((count for line, count in said if "tracking goes on" in line), None)
+        return len(frames) > 60 and (fault != "full disk" or (ended is not None and len(frames) > ended + 30))
+
+    monkeypatch.setattr(LiveView, "send", send)
+    monkeypatch.setattr(
+        messages.LiveStatus, "say", lambda status, line: (said.append((line, len(frames))), say(status, line))
+    )
+    number, limit = fault, contextlib.nullcontext()
+    if fault == "full disk":
+        number, limit = signal.SIGINT, file_size_limit(300_000)
+    out = tmp_path / "take.npz"
+    with ReplayServer(capture.with_suffix(".truth.npz"), loop=True) as server, limit:
+        thread = ended_after(is_enough, number)
+        code = main(["view", "--live", server.url, "--size", "L", "--port", "0", "--out", str(out)])
+        thread.join()
+    assert code == (fault == "full disk")
+    assert os.listdir(tmp_path) == [f"take.npz{'.part' * code}"]
+    if code:
+        assert "frames after them were not recorded" in capsys.readouterr().err
+    else:
+        assert load_take(out).num_frames > 60
 
 
 def test_a_video_is_drawn_without_a_page(capture, tmp_path, capsys):

@@ -31,6 +31,7 @@ from handsim.files.outputs import (
     check_outputs,
     claim,
     plain_path,
+    remove_leftovers,
     save_json,
     shown_bytes,
     temporary_beside,
@@ -214,6 +215,21 @@ def test_what_a_killed_process_left_is_removed(tmp_path: Path) -> None:
         temporary.write_text("whole")
     assert not left.exists()
     assert all(file.exists() for file in others), "of a running process, another file, another machine"
+
+
+@pytest.mark.parametrize("ending", [".npy", "-older.npy", ""])
+def test_what_another_process_is_writing_stays(ending: str, tmp_path: Path) -> None:
+    gone = subprocess.Popen([sys.executable, "-c", ""])
+    gone.wait()
+    name = temporary_beside(tmp_path / "shard").name
+    written, *left = (
+        tmp_path / (name.replace(str(os.getpid()), str(process)) + ending)
+        for process in (os.getppid(), os.getpid(), gone.pid)
+    )
+    for file in (written, *left):
+        file.touch()
+    remove_leftovers(tmp_path)
+    assert [*tmp_path.iterdir()] == [written]
 
 
 def test_a_folder_that_cannot_be_written_is_told_before_the_work(tmp_path: Path) -> None:
@@ -472,3 +488,43 @@ def test_what_is_not_finite_becomes_null(tmp_path):
     assert json.loads(path.read_text(), parse_constant=pytest.fail) == {
         "recall": None, "curve": [1.0, None], "runs": {"a": [2, 0.5]}
     }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "name", ["a" * 251, "\N{LATIN SMALL LETTER A WITH DIAERESIS}" * 125, "\N{GRINNING FACE}" * 62]
+)
+def test_the_longest_names_are_written(tmp_path: Path, name: str) -> None:
+    path = tmp_path / f"{name}.csv"
+    for text in ("old", "new"):
+        with atomic_write(path) as temporary:
+            assert len(os.fsencode(temporary.name)) <= len(os.fsencode(path.name))
+            temporary.write_text(text)
+    assert path.read_text() == "new"
+    assert entries(tmp_path) == [path.name]
+
+
+def test_long_names_that_begin_alike_have_temporary_names_of_their_own(tmp_path: Path) -> None:
+    assert len({temporary_beside(tmp_path / f"{'a' * 100}{end}.csv") for end in "xyz"}) == 3
+
+
+@pytest.mark.parametrize("name", ["~/take.csv", "~/deep/take.csv", "~/take.npz"])
+def test_no_folder_is_made_for_the_tilde(tmp_path: Path, monkeypatch, name: str) -> None:
+    monkeypatch.chdir(tmp_path)
+    with (
+        pytest.raises(ArgumentError, match=r"only shells replace ~, expected .*expanduser"),
+        atomic_write(name),
+    ):
+        pass
+    assert entries(tmp_path) == []
+
+
+@pytest.mark.parametrize("code", [errno.EPERM, errno.ENOTSUP, errno.EACCES])
+def test_a_file_system_without_modes_is_written_to(tmp_path: Path, monkeypatch, code: int) -> None:
+    def refuse(path: object, mode: int) -> None:
+        raise OSError(code, os.strerror(code), str(path))
+
+    monkeypatch.setattr(os, "chmod", refuse)
+    with atomic_write(tmp_path / "take.csv") as temporary:
+        temporary.write_text("whole")
+    assert (tmp_path / "take.csv").read_text() == "whole"
+    assert entries(tmp_path) == ["take.csv"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import itertools
 import json
 import warnings
@@ -112,6 +113,13 @@ def test_what_was_written_is_read(motion, tmp_path):
     assert table.sides == ("right", "left")
     np.testing.assert_allclose(table.times, motion.times, atol=1e-6)
     np.testing.assert_allclose(table.qpos, motion.qpos, rtol=1e-8, atol=1e-9)  # NaN where ours are
+
+
+@pytest.mark.parametrize("start", [0.0, 86_400.0, 1.7e9])
+def test_times_of_any_clock_are_kept(motion, tmp_path, start):
+    path, late = tmp_path / "poses.csv", dataclasses.replace(motion, times=motion.times + start)
+    write_joint_csv(path, posed_motion(late))
+    np.testing.assert_allclose(np.diff(read_joint_csv(path).times), np.diff(motion.times), atol=3e-6)
 
 
 def test_names_of_earlier_versions_are_read(motion, tmp_path):

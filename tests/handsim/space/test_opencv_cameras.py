@@ -297,3 +297,135 @@ def test_half_of_a_calibration_asks_for_the_other(tmp_path, name, other):
     values = {"K_1": K, "dist_1": D} if name == "intri" else {"R_1": np.zeros((3, 1)), "T_1": T}
     with pytest.raises(RigError, match=rf"; {other}\.yml, which belongs to it, is not beside it"):
         load_cameras(stored(tmp_path / f"{name}.yml", values))
+
+
+POSE = np.vstack([np.c_[R, T], [[0.0, 0.0, 0.0, 1.0]]])
+VECTOR = cv2.Rodrigues(R)[0]
+LISTED = {"camera_matrix": K.tolist(), "dist_coeffs": D.ravel().tolist(), **SIZE}
+
+
+def dumped(path, values):
+    """A file as json, yaml.dump or OpenCV writes it."""
+    if path.suffix == ".yml":
+        return stored(
+            path, {key: np.array(one) if isinstance(one, list) else one for key, one in values.items()}
+        )
+    if path.suffix == ".yaml":
+        path.write_text(pytest.importorskip("yaml").dump(values))
+    else:
+        path.write_text(json.dumps(values))
+    return path
+
+
+@pytest.mark.parametrize("ending", ["yml", "yaml", "json"])
+@pytest.mark.parametrize(
+    ("rotation", "translation", "value"),
+    [
+        ("rotation_matrix", "translation_vector", R),
+        ("rotation_vector", "translation_vector", VECTOR),
+        ("rotationMatrix", "translationVector", R),
+        ("rvec", "tvec", VECTOR),
+        ("R", "translation_vector", R),
+    ],
+)
+def test_a_pose_under_any_name_that_says_its_direction(tmp_path, ending, rotation, translation, value):
+    path = dumped(tmp_path / f"c.{ending}", LISTED | {rotation: value.tolist(), translation: T.tolist()})
+    (camera,) = load_cameras(path)
+    np.testing.assert_allclose(camera.project(POINTS), projected(R, T, K, D), atol=1e-6)
+
+
+@pytest.mark.parametrize("ending", ["yaml", "json"])
+@pytest.mark.parametrize(
+    ("values", "keys"),
+    [
+        ({"extrinsic": POSE.tolist()}, "'extrinsic'"),
+        ({"extrinsics": {"R": R.tolist(), "t": T.ravel().tolist()}}, "'extrinsics.R', 'extrinsics.t'"),
+        ({"extrinsics": {"first": {"R": R.tolist()}}}, "'extrinsics.first'"),
+        ({"T_cam_world": POSE.tolist()}, "'T_cam_world'"),
+        ({"camera_pose": POSE[:3].tolist()}, "'camera_pose'"),
+        ({"RT": POSE[:3].tolist()}, "'RT'"),
+        ({"world2cam": POSE.tolist()}, "'world2cam'"),
+        ({"anything": POSE.ravel().tolist()}, "'anything'"),
+        ({"orientation": [1.0, 0.0, 0.0, 0.0], "position": [0.1, 0.2, 0.3]}, "'orientation', 'position'"),
+        ({"position": {"x": 1.0, "y": 2.0, "z": 3.0}}, "'position.x', 'position.y', 'position.z'"),
+        ({"quaternion": [1.0, 0.0, 0.0, 0.0], "t": [0.1, 0.2, 0.3]}, "'quaternion'"),
+        ({"camera_poses": [POSE.tolist()] * 3}, "'camera_poses'"),
+    ],
+)
+def test_a_pose_under_an_unknown_name_is_refused_by_name(tmp_path, ending, values, keys):
+    path = dumped(tmp_path / f"c.{ending}", LISTED | values)
+    with pytest.raises(RigError, match=f"unknown keys of a pose: {keys}; valid names: T_world_camera, or R"):
+        load_cameras(path)
+
+
+def test_opencvs_matrices_of_other_things_are_no_poses(tmp_path, recwarn):
+    values = {"rectification_matrix": np.eye(3), "projection_matrix": np.eye(3, 4), "Q": np.eye(4), "fps": 30}
+    values |= {"newCameraMatrix": K, "avg_reprojection_error": 0.2, "square_size": 0.03, "F": np.eye(3)}
+    (camera,) = load_cameras(stored(tmp_path / "c.yml", {"camera_matrix": K, **SIZE, **values}))
+    np.testing.assert_array_equal(camera.T_world_camera, np.eye(4))
+    assert not recwarn.list
+
+
+@pytest.mark.parametrize("key", ["rvecs", "tvecs", "extrinsic_parameters"])
+def test_poses_of_the_board_are_told(tmp_path, key):
+    path = dumped(tmp_path / "c.json", LISTED | {key: np.ones((9, 6)).tolist()})
+    with pytest.warns(HandSimWarning, match=f"poses of the board, not of the camera: '{key}'"):
+        (camera,) = load_cameras(path)
+    np.testing.assert_array_equal(camera.T_world_camera, np.eye(4))
+
+
+def test_a_second_pose_is_told(tmp_path):
+    path = dumped(tmp_path / "c.yaml", LISTED | {"R": R.tolist(), "T": T.tolist(), "pose": POSE.tolist()})
+    with pytest.warns(HandSimWarning, match="not read beside the pose: 'pose'"):
+        (camera,) = load_cameras(path)
+    np.testing.assert_allclose(camera.project(POINTS), projected(R, T, K, D), atol=1e-6)
+
+
+@pytest.mark.parametrize("ending", ["yaml", "json"])
+@pytest.mark.parametrize(
+    ("lens", "keys"),
+    [
+        (
+            {"radial_distortion": [-0.2, 0.1], "tangential_distortion": [0.0, 0.01]},
+            "'radial_distortion', 'tang",
+        ),
+        ({"RadialDistortion": [-0.2, 0.1, 0.0]}, "'RadialDistortion'"),
+        ({"kc": [-0.2, 0.1, 0.0, 0.0, 0.0]}, "'kc'"),
+        ({"fisheye": [0.1, 0.2, 0.3, 0.4]}, "'fisheye'"),
+        ({"lens": {"coeffs": [0.1, 0.2, 0.3, 0.4]}}, "'lens.coeffs'"),
+    ],
+)
+def test_a_lens_under_an_unknown_name_is_refused_by_name(tmp_path, ending, lens, keys):
+    bare = {key: value for key, value in LISTED.items() if key != "dist_coeffs"}
+    with pytest.raises(RigError, match=f"unknown keys of a lens: {keys}.*; valid names: distortion_coeff"):
+        load_cameras(dumped(tmp_path / f"c.{ending}", bare | lens))
+
+
+@pytest.mark.parametrize("size", [{"img_shape": [480, 640]}, {"w": 640, "h": 480}, {"cols": 640}])
+def test_a_size_under_an_unknown_name_is_told(tmp_path, size):
+    values = {"camera_matrix": K.tolist(), **size}
+    with pytest.raises(
+        RigError, match=f"no size .* among 'camera_matrix', '{next(iter(size))}'.*image_width"
+    ):
+        load_cameras(dumped(tmp_path / "c.json", values))
+
+
+ONE = {"K": K.tolist(), "dist": [D.ravel().tolist()], "image_size": [640, 480]}
+PLACED = {"R": R.tolist(), "T": T.ravel().tolist()}
+
+
+@pytest.mark.parametrize(
+    ("content", "keys"),
+    [
+        ({"nb_camera": 1, "camera_0": ONE | {"camera_pose_matrix": POSE.tolist()}}, "'camera_pose_matrix'"),
+        (
+            {"cameras": {"a": ONE, "b": ONE}, "camera_poses": {"a": PLACED, "b_to_a": PLACED}},
+            "'camera_poses.a', ",
+        ),
+        ({"cameras": [ONE | {"extrinsic_r": R.tolist(), "extrinsic_t": [0, 0, 1]}]}, "'extrinsic_r', 'extr"),
+    ],
+)
+def test_poses_of_several_cameras_under_unknown_names_are_told(tmp_path, content, keys):
+    (tmp_path / "c.json").write_text(json.dumps(content))
+    with pytest.raises(RigError, match=f"no R and T; unknown keys of a pose: {keys}"):
+        load_cameras(tmp_path / "c.json")

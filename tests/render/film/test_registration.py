@@ -142,6 +142,16 @@ def test_another_take_is_refused():
         register(moving_take(), [frame._replace(hands=[]) for frame in frames[:10]], SIZE)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(("ratio", "seconds", "rate"), [(8, 12.0, 10.0), (4, 12.0, 12.0), (8, 4.0, 20.0)])
+def test_slow_motion_is_told_with_its_ratio(ratio, seconds, rate):
+    take = moving_take()
+    found = Filming(seed=ratio, seconds=seconds, rate=rate).found(take)
+    slow = [frame._replace(time=ratio * frame.time) for frame in found]
+    with pytest.raises(HandSimError, match=rf"move {ratio} times as slowly .* -itsscale {1 / ratio:g} -i"):
+        register(take, slow, SIZE)
+
+
 def test_the_page_tells_the_camera(tmp_path):
     take = moving_take()
     found = register(take, Filming(seed=13).found(take), SIZE)

@@ -15,7 +15,7 @@ from handsim.errors import DatasetError
 from handsim.hand.model import KEYPOINT_NAMES
 from render import RenderedFrame, SkinLook
 from render.formats.coco import skeleton_lines
-from render.formats.records import hand_mask, to_order
+from render.formats.records import to_order
 from render.formats.writer import open_writer
 
 
@@ -101,7 +101,7 @@ def test_pycocotools_loads_it(folder: Path, frames: list[RenderedFrame]) -> None
     hands = coco.loadAnns(coco.getAnnIds(imgIds=[1]))
     for number, hand in enumerate(hands):
         mask = coco.annToMask(hand).astype(bool)
-        np.testing.assert_array_equal(mask, hand_mask(frames[0], number))
+        np.testing.assert_array_equal(mask, frames[0].hands[number].mask)
         assert hand["area"] == mask.sum()
         left, top, width, height = hand["bbox"]
         rows, columns = np.nonzero(mask)

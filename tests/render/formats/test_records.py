@@ -23,13 +23,11 @@ from render.formats.records import (
     encode_ids,
     encode_jpeg,
     encode_normals,
-    hand_mask,
     run_lengths,
     to_json,
     to_order,
     write_exr,
 )
-from render.frames import FOREARM, PARTS_A_HAND
 from tests.render.formats.reading import depth_of, exr_content
 
 
@@ -39,20 +37,6 @@ def test_pycocotools_reads_run_lengths(mask):
     record = {"size": list(mask.shape), "counts": counts}
     np.testing.assert_array_equal(coco_mask.decode(record).astype(bool), mask)
     assert coco_mask.encode(np.asfortranarray(mask.view(np.uint8)))["counts"].decode() == counts
-
-
-def test_a_hand_is_masked_without_its_forearm(make_frame) -> None:
-    frame = make_frame(sides=("right", "left"))
-    parts, instances = frame.ideal.parts, frame.ideal.instances
-    parts[:6, :6], instances[:6, :6] = 1 + PARTS_A_HAND + FOREARM, 2
-    instances[:3, 90:] = 2  # a marker, which is no bone's
-    mask = hand_mask(frame, 1)
-    assert not mask[:6, :6].any()
-    assert mask[:3, 90:].all()
-    np.testing.assert_array_equal(
-        mask & (parts > 0), (parts > PARTS_A_HAND) & (parts < 1 + PARTS_A_HAND + FOREARM)
-    )
-    assert not (mask & hand_mask(frame, 0)).any()
 
 
 def test_nan_becomes_null() -> None:

@@ -278,3 +278,15 @@ def test_bad_starts_are_told(rng):
         solve_pose(fit, targets, initial=np.zeros((1, 26)))
     with pytest.raises(ArgumentError, match="initial has a quaternion of length zero in frame 0"):
         solve_pose(fit, targets, initial=np.zeros((1, 27)))
+
+
+def test_masked_markers_are_missing(rng):
+    model, glove = gloved("right", rng)
+    qpos = random_poses(model, 5, rng)
+    markers = markers_of(model, glove, qpos)
+    hidden = np.zeros(markers.shape, dtype=bool)
+    hidden[:, 3:6] = True
+    wrong = np.where(hidden, markers + 0.1, markers)
+    masked = solve_pose(GloveFit(model, glove), np.ma.array(wrong, mask=hidden), initial=qpos)
+    missing = solve_pose(GloveFit(model, glove), np.where(hidden, np.nan, markers), initial=qpos)
+    np.testing.assert_array_equal(masked.qpos, missing.qpos)

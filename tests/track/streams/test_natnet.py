@@ -554,6 +554,98 @@ def test_servers_that_cannot_be_used_are_told(monkeypatch):
         open_stream("natnet://no-such-host.invalid")
 
 
+SILENT = "the server answers, but "
+
+
+@pytest.mark.parametrize("group", ["239.255.42.99", "239.1.2.3", "224.0.0.77"])
+def test_a_group_that_lets_no_frame_through_is_told(group):
+    with Puppet(ServerInfo("Motive", (3, 1), 1511, group)) as server:
+        try:
+            stream = opened(server.url, silence=0.2)
+        except CaptureError:
+            pytest.skip("no multicast on this machine's loopback")
+        with stream:
+            assert next(stream).silent
+            assert stream.silence_doubt == (
+                f"{SILENT}no frame of its multicast group {group}, port 1511, arrives: choose Unicast in "
+                "Motive's streaming pane (WSL, Docker and some networks do not pass multicast)"
+            )
+
+
+def test_why_no_frame_comes_is_told(monkeypatch):
+    with Puppet(unicast((4, 1))) as server, opened(server.url, silence=0.1) as stream:
+        assert stream.silence_doubt == f"{SILENT}sends no frame; is it playing?"
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+            stranger.bind((LOOPBACK, 0))
+            stranger.sendto(frame(0, (4, 1)), server.client)
+            name = f"{LOOPBACK}:{stranger.getsockname()[1]}"
+            wait_for(lambda: (next(stream), f"1 packets came from {name}" in stream.silence_doubt)[1])
+        server.say(pack(Kind.FRAME, b"nonsense"))
+        wait_for(lambda: (next(stream), "its 1 packets are no frames of NatNet" in stream.silence_doubt)[1])
+        server.say(frame(1, (4, 1)))
+        assert not next(one for one in stream if not one.silent).silent
+        assert stream.silence_doubt == "is the server playing?"
+        monkeypatch.setattr(natnet, "_UNANSWERED", -1.0)
+        assert (
+            stream.silence_doubt
+            == f"the server at {LOOPBACK} no longer answers; it is called again and again"
+        )
+
+
+@pytest.mark.parametrize("answer", [b"", b"HTTP/1.1 400 Bad Request", pack(Kind.SERVER_INFO, bytes(10))])
+def test_another_program_at_the_port_is_told(answer, monkeypatch):
+    monkeypatch.setattr(natnet, "_PATIENCE", 0.2)
+    monkeypatch.setattr(natnet, "_RETRY", 0.1)
+    with Puppet(answer) as server, pytest.raises(natnet.NoServerError, match="answers, but speaks no NatNet"):
+        open_stream(server.url)
+
+
+def test_a_port_at_which_no_program_listens_is_told(monkeypatch):
+    monkeypatch.setattr(natnet, "_PATIENCE", 0.2)
+    monkeypatch.setattr(natnet, "_RETRY", 0.1)
+    with Puppet() as server:
+        url, port = server.url, server.socket.getsockname()[1]
+        with pytest.raises(
+            natnet.NoServerError, match=f"no NatNet server answers at port {port} of {LOOPBACK};"
+        ):
+            open_stream(url)
+    with pytest.raises(natnet.NoServerError, match=f"at port {port}: no program of {LOOPBACK} listens there"):
+        open_stream(url)
+
+
+@pytest.mark.parametrize("version", [(0, 0), (5, 0), (99, 0), (255, 255)])
+def test_versions_that_no_server_has_are_read_as_the_nearest_or_refused(version):
+    with Puppet(unicast(version)) as server:
+        if version < natnet.OLDEST:
+            with pytest.raises(CaptureError, match=r"speaks NatNet 0\.0, expected 3\.0 or newer"):
+                open_stream(server.url)
+            return
+        with opened(server.url, silence=LONG) as stream:
+            for number in range(3):
+                server.say(frame(number, (4, 1)))
+            assert [one.number for one in itertools.islice(stream, 3)] == [0, 1, 2]
+
+
+@pytest.mark.parametrize(
+    "damaged",
+    [
+        lambda packet: packet[:4] + struct.pack("<iii", 3, 2**31 - 1, 0) + packet[16:],
+        lambda packet: packet[:4] + struct.pack("<iii", 3, -1, 0) + packet[16:],
+        lambda packet: packet[:-20],
+        lambda packet: packet[:2] + struct.pack("<H", 65535) + packet[4:],
+        lambda packet: packet[:2] + struct.pack("<H", 3) + packet[4:],
+    ],
+)
+def test_a_packet_that_lies_in_the_stream_is_counted_and_the_others_are_read(damaged):
+    with Puppet(unicast((4, 1))) as server, opened(server.url, silence=LONG) as stream:
+        for number in range(6):
+            packet = frame(number, (4, 1))
+            server.say(damaged(packet) if number == 3 else packet)
+        assert [one.number for one in itertools.islice(stream, 5)] == [0, 1, 2, 4, 5]
+        counts = stream.counts
+        assert counts["damaged_packets"] == 1 and counts["missing_frames"] == 1
+
+
 def test_what_cannot_be_replayed_is_told():
     points, ids = np.zeros((2, 3, 3)), np.zeros((2, 3), dtype=int)
     for arguments, options, words in (

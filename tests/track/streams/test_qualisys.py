@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 
 from handsim.errors import CaptureError
+from tests.sentences import error_names
+from tests.waiting import wait_for
 from track import open_source
 from track.streams import LOOPBACK, NoServerError
 from track.streams.qualisys import QualisysSource
@@ -58,6 +60,8 @@ class Qtm:
         self.port: int = self._socket.getsockname()[1]
         self._frames, self._answers = frames, answers
         self.measuring = measuring
+        self.junk = b""
+        """Bytes that are sent once, before frames."""
         self.heard: list[bytes] = []
         self._client: socket.socket | None = None
         self._thread = threading.Thread(target=self._serve, daemon=True)
@@ -87,6 +91,8 @@ class Qtm:
             if command.lower().startswith(b"version"):
                 client.sendall(packet(COMMAND, b"Version set to 1.23\0"))
             elif command.lower().startswith(b"streamframes") and self.measuring:
+                junk, self.junk = self.junk, b""
+                client.sendall(junk)
                 for number in range(1, 1 + self._frames):
                     client.sendall(frame(number))
                 client.sendall(packet(NO_MORE_DATA, b""))
@@ -123,6 +129,64 @@ def test_frames_arrive_in_meters_with_ids():
     assert server.heard == [b"version 1.23", b"streamframes allframes 3d 3dnolabels"]
 
 
+def lying(count: int = 1, size: int = 28, kind: int = LABELED, time: int = 0, components: int = 1) -> bytes:
+    """A data packet of a single point whose head says something else."""
+    content = struct.pack("<IIIHH", size, kind, count, 0, 0) + struct.pack("<fff", 1.0, 2.0, 3.0)
+    return packet(DATA, struct.pack("<QII", time, 1, components) + content)
+
+
+@pytest.mark.parametrize(
+    "junk",
+    [
+        lying(count=2**31),
+        lying(count=2**32 - 1),
+        lying(components=2**31),
+        lying(size=2**31, components=2),
+        lying(kind=99),
+        lying(time=2**63 - 1),
+        lying(time=2**63),
+        packet(DATA, b""),
+        packet(99, b"what is this?"),
+        packet(EVENT, b""),
+    ],
+)
+def test_a_packet_that_lies_is_counted_and_left_out(junk):
+    with Qtm() as server:
+        server.junk = junk
+        stream = open_source(server.url)
+        assert numbers(stream, 5) == [1, 2, 3, 4, 5]
+        assert stream.counts["damaged_packets"] == 1 and stream.counts["restarts"] == 0
+        stream.close()
+
+
+@pytest.mark.parametrize("size", [0, 7, 1 << 25, 1 << 31, (1 << 32) - 1])
+@pytest.mark.parametrize("kind", [DATA, COMMAND])
+def test_a_packet_of_a_false_size_ends_the_connection_and_a_new_one_begins(size, kind):
+    with Qtm() as server:
+        server.junk = struct.pack("<II", size, kind)
+        stream = open_source(server.url)
+        assert numbers(stream, 5) == [1, 2, 3, 4, 5]
+        assert stream.counts["damaged_packets"] == 1
+        stream.close()
+
+
+def test_why_no_frame_comes_is_told():
+    with Qtm(measuring=False) as server:
+        stream = open_source(server.url, silence=0.3)
+        assert next(stream).silent
+        assert stream.silence_doubt.startswith("QTM answers, but sends no frame; start real time")
+    assert next(stream).silent
+    wait_for(lambda: stream.silence_doubt == f"QTM at {LOOPBACK} went away; it is called again and again")
+    stream.close()
+
+
+@pytest.mark.parametrize("scheme", ["qtm", "natnet"])
+@pytest.mark.parametrize("host", ["no-such-host.invalid", "1.2.3.4.5", "a" * 70])
+def test_a_name_that_is_no_machine_is_one_sentence(scheme, host):
+    with error_names(CaptureError, f"'{host}' cannot be reached | such as 192.168.1.5"):
+        open_source(f"{scheme}://{host}")
+
+
 def test_a_measurement_that_begins_later_is_streamed():
     with Qtm(measuring=False) as server:
         stream = open_source(server.url, silence=0.3)
@@ -154,7 +218,9 @@ def test_nobody_there_is_one_sentence():
     with socket.socket() as one:
         one.bind((LOOPBACK, 0))
         port = one.getsockname()[1]
-        with pytest.raises(NoServerError, match=rf"^qtm://127.0.0.1:{port}: no QTM answers, expected one"):
+        with pytest.raises(
+            NoServerError, match=rf"^qtm://127.0.0.1:{port}: no QTM answers, .* listens at port {port}"
+        ):
             open_source(f"qtm://{LOOPBACK}:{port}")
 
 

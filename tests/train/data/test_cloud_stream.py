@@ -17,7 +17,7 @@ from train import CloudStream, Corruption, Dataset, generate_dataset
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory) -> Dataset:
     out = tmp_path_factory.mktemp("stream") / "set"
-    alone = {"alone": 1.0}
+    alone = {"together": 0, "holding": 0}
     return generate_dataset(out, glove="tips8", num_frames=120, seed=2, workers=1, scenes=alone)
 
 
@@ -51,6 +51,23 @@ def test_the_sequence_is_the_same_with_any_number_of_workers(dataset, workers):
         assert all(torch.equal(*pair) for pair in zip(one, other, strict=True))
     assert not torch.equal(alone[0][0], alone[1][0]), "every batch is another"
     assert torch.equal(next(iter(CloudStream(dataset, batch=8, seed=5, start=3)))[0], alone[3][0])
+
+
+@pytest.mark.parametrize(
+    ("workers", "method"),
+    [(0, None), (1, "fork"), (2, "fork"), pytest.param(2, "spawn", marks=pytest.mark.slow)],
+)
+def test_ranks_share_the_sequence(dataset, workers, method, monkeypatch):
+    stream, size = CloudStream(dataset, batch=8, seed=5), 2
+    alone, shared = list(islice(stream, 8)), []
+    monkeypatch.setenv("WORLD_SIZE", str(size))
+    for rank in range(size):
+        monkeypatch.setenv("RANK", str(rank))
+        loader = DataLoader(stream, batch_size=None, num_workers=workers, multiprocessing_context=method)
+        shared.append(list(islice(loader, 4)))
+    for number, one in enumerate(alone):
+        other = shared[number % size][number // size]
+        assert all(torch.equal(*pair) for pair in zip(one, other, strict=True))
 
 
 def test_a_corruption_of_ones_own_may_be_a_function(dataset):

@@ -16,6 +16,7 @@ from train import simulate_take
 from train.forecast.rig_forecast import (
     camera_losses,
     covariances,
+    duration_quantile,
     ellipsoid,
     forecast,
     light_work,
@@ -49,6 +50,26 @@ def test_the_forecast_is_what_simulated_takes_of_this_kind_have(kind):
     minutes = found.marker_frames / 120.0 / 60.0
     assert found.gaps * minutes == pytest.approx(sum(len(run_lengths(~one)) for one in present), rel=0.2)
     assert found.ghosts == pytest.approx(np.mean(ghosts), rel=0.6, abs=0.05)  # others are drawn
+
+
+@pytest.mark.parametrize("length", [0.5, 1.0, 4.0])
+@pytest.mark.parametrize("share", [0.5, 0.95])
+def test_gaps_that_outlast_a_scene_count(length, share):
+    """Exponential gaps of a second in scenes that end after the gap's beginning by 0 to 8 times `length`."""
+    rng = np.random.default_rng(3)
+    gaps, rest = rng.exponential(1.0, 20_000), rng.uniform(0.0, 8.0 * length, 20_000)
+    found = duration_quantile(np.minimum(gaps, rest), gaps <= rest, share)
+    assert found == pytest.approx(-np.log(1.0 - share), rel=0.06)
+    assert np.quantile(np.minimum(gaps, rest), share) < found
+
+
+def test_gaps_without_an_end_have_no_percentile():
+    ended = np.array([True, True, False, False])
+    assert duration_quantile(np.array([0.1, 0.2, 0.3, 0.4]), ended, 0.5) == 0.2
+    assert duration_quantile(np.array([0.1, 0.2, 0.3, 0.4]), ended, 0.95) == np.inf
+    assert np.isnan(duration_quantile(np.empty(0), np.empty(0, dtype=bool), 0.5))
+    lengths = np.array([0.4, 0.1, 0.2, 0.3])
+    assert duration_quantile(lengths, np.ones(4, dtype=bool), 0.5) == 0.2
 
 
 def moving_thing(take):

@@ -93,7 +93,7 @@ def test_three_points_fit_any_hand(rng):
 
 def test_tables_survive_a_file(rng):
     known = prior(rng, 2)
-    again = PosePrior.of_tensors(known.tensors())
+    again = PosePrior.of_tensors(known.tensors(), known.num_markers)
     np.testing.assert_array_equal(again.means, known.means)
     np.testing.assert_allclose(again.directions, known.directions, rtol=1e-3, atol=1e-7)
 
@@ -117,7 +117,7 @@ def test_missing_tables_are_refused(rng):
     tables = prior(rng, 2).tensors()
     del tables["means"]
     with pytest.raises(WeightsError, match="has the tables directions, log_weights, spreads"):
-        PosePrior.of_tensors(tables)
+        PosePrior.of_tensors(tables, 3)
 
 
 def bent(rng, count):

@@ -22,7 +22,7 @@ from gloves import Capture, MarkerLayout, MarkerPlace, attach, load_layout, read
 from handsim import HandModel, HandSimError, HandSimWarning
 from handsim.cli.main import main
 from handsim.errors import ArgumentError, WeightsError
-from handsim.files.inputs import sign_model
+from handsim.files.models import stamp_model
 from handsim.hand.shape import DIGITS
 from poses import sample_poses
 from tests.sentences import error_names
@@ -235,7 +235,7 @@ def test_damaged_files_are_told(exported, tmp_path):
 
 def test_a_changed_byte_is_told_before_onnxruntime_reads_it(exported, tmp_path, rng):
     content, path = exported.read_bytes(), tmp_path / "changed.onnx"
-    assert sign_model(content) == content
+    assert stamp_model(content) == content
     for place in rng.integers(len(content), size=200):
         changed = bytearray(content)
         changed[place] ^= 1 + int(rng.integers(255))
@@ -282,7 +282,7 @@ def test_a_file_whose_network_is_of_no_use_is_told(exported, tmp_path, damage):
         names = json.loads(entry.value)
         entry.value = json.dumps(names[:-1] if damage == "names" else [*names[:-1], names[0]])
     path = tmp_path / "damaged.onnx"
-    path.write_bytes(sign_model(model.SerializeToString()))
+    path.write_bytes(stamp_model(model.SerializeToString()))
     with pytest.raises(WeightsError, match=r"damaged.onnx is damaged or not a labeler's"):
         OnnxLabeler(path)
 

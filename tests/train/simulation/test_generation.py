@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.lib.recfunctions import repack_fields
 
 from gloves import MarkerLayout, MarkerPlace, attach, load_layout
 from handsim import HandModel, HandSimWarning, Population, join_qpos, load_rig
@@ -21,7 +22,6 @@ from handsim.cli.main import main
 from handsim.errors import ArgumentError, DatasetError, PoseError
 from handsim.files.inputs import checksum
 from handsim.files.signals import Stopped
-from handsim.hand.shape import HAND_DTYPE
 from handsim.space.rig import ROOM_CENTER, CameraRig
 from handsim.space.transforms import rigid
 from poses import sample_poses
@@ -31,7 +31,7 @@ from tests.sentences import assert_names
 from tests.waiting import wait_for
 from track.viewer.recordings import DatasetRecording
 from train import Dataset, GenerateSettings, SceneMix, generate_dataset, simulate_take
-from train.data.shards import MANIFEST, hands_name, redrawn_name, rows_name
+from train.data.shards import MANIFEST, hands_name, is_dataset, redrawn_name, rows_name
 from train.reports.dataset_page import REPORT, write_dataset_page
 from train.simulation import generation, training_frames
 from train.simulation.generation import make_dataset
@@ -145,18 +145,101 @@ def test_markers_move_with_flesh_where_that_is_asked_for(tmp_path):
     assert np.sqrt((np.concatenate(away) ** 2).mean()) == pytest.approx(np.hypot(NOISE, FLESH), rel=0.15)
 
 
-def test_a_set_of_a_version_that_kept_no_gloves_is_read(finished, tmp_path):
-    copy = shutil.copytree(finished, tmp_path / "copy")
+def with_hands_of(finished: Path, folder: Path, fields: list[str]) -> Dataset:
+    """A copy of the set whose first hands file has these fields alone, as an earlier version wrote it."""
+    copy = shutil.copytree(finished, folder / "copy")
     path, manifest = copy / hands_name(0), json.loads((copy / MANIFEST).read_text())
     records = np.load(path)
-    np.save(path, records[list(HAND_DTYPE.names)].astype(HAND_DTYPE))
+    np.save(path, repack_fields(records[fields]))
     manifest["files"][hands_name(0)] = checksum(path)
     (copy / MANIFEST).write_text(json.dumps(manifest))
-    old = Dataset(copy)
-    assert old.hands(0)[3].length == Dataset(finished).hands(0)[3].length
-    assert len(old.people()) == 700
-    with pytest.raises(DatasetError, match=r"hands-00000\.npy holds no places of markers"):
-        old.gloves(0)
+    return Dataset(copy)
+
+
+@pytest.mark.parametrize("lost", ["nothing", "person", "places"])
+def test_sets_of_earlier_versions_are_read(finished, tmp_path, lost):
+    names = list(np.load(finished / hands_name(0)).dtype.names)
+    old = with_hands_of(finished, tmp_path, names[: {"nothing": None, "person": -1, "places": -2}[lost]])
+    new = Dataset(finished)
+    assert old.hands(0)[3].length == new.hands(0)[3].length
+    np.testing.assert_array_equal(old.people(), new.people())
+    if lost == "places":
+        with pytest.raises(DatasetError, match=r"hands-00000\.npy holds no places of markers"):
+            old.gloves(0)
+    else:
+        assert old.gloves(0) == new.gloves(0)
+
+
+def test_both_hands_of_a_person_have_the_number_of_the_person(finished):
+    dataset, known = Dataset(finished), []
+    for shard, rows in enumerate(dataset.shards):
+        hands = np.load(finished / hands_name(shard))
+        known.append(hands["person"][rows["hand"]])
+        assert (hands["person"][0::2] == hands["person"][1::2]).all()
+        assert hands["left"].tolist() == [True, False] * (len(hands) // 2)
+    np.testing.assert_array_equal(np.concatenate(known), dataset.people())
+    assert np.bincount(dataset.people()).tolist() == [50] * 14
+
+
+def without(folder: Path, *names: str) -> Path:
+    for name in names:
+        for file in folder.glob(name):
+            file.unlink()
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("names", "sentence"),
+    [
+        ((), None),
+        (("config.json",), None),
+        (("manifest.json",), "is unfinished; run handsim generate again"),
+        (("manifest.json", "rows-00002.npy", "checksums-00003.json"), "is unfinished"),
+        (("rows-00001.npy",), "rows-00001.npy is missing; run handsim generate again"),
+        (("config.json", "hands-00000.npy"), "hands-00000.npy is missing; run handsim generate again"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore::handsim.HandSimWarning")
+def test_what_is_lost_of_a_set_is_made_again_and_opening_it_says_so(finished, tmp_path, names, sentence):
+    copy = without(shutil.copytree(finished, tmp_path / "set"), *names)
+    if sentence is None:
+        assert len(Dataset(copy)) == 700
+    else:
+        with pytest.raises(DatasetError, match=sentence):
+            Dataset(copy)
+    assert is_dataset(copy)
+    make_dataset(CONFIG, copy, workers=1)
+    assert contents(copy) == contents(finished)
+
+
+def test_settings_that_are_lost_are_those_of_the_manifest(finished, tmp_path):
+    copy = without(shutil.copytree(finished, tmp_path / "set"), "config.json")
+    with (
+        pytest.warns(HandSimWarning, match=r"config\.json is missing, and is made again from manifest\.json"),
+        pytest.raises(DatasetError, match="begun with other settings"),
+    ):
+        make_dataset(dataclasses.replace(CONFIG, seed=4), copy, workers=1)
+    with pytest.raises(DatasetError, match="is not empty and holds no training set"):
+        make_dataset(CONFIG, without(copy, "*.json"), workers=1)
+    with pytest.raises(DatasetError, match="holds none; handsim generate makes one"):
+        Dataset(copy)
+
+
+@pytest.mark.parametrize(
+    ("make", "sentence"),
+    [
+        (Path.touch, "is a file, expected the folder of a training set"),
+        (Path.mkdir, "holds none; handsim generate makes one"),
+        (lambda path: None, "holds none; handsim generate makes one"),
+    ],
+)
+def test_a_place_that_holds_no_set(tmp_path, make, sentence, capsys):
+    make(tmp_path / "set")
+    with pytest.raises(DatasetError, match=sentence):
+        Dataset(tmp_path / "set")
+    assert main(["train", str(tmp_path / "set"), "--out", str(tmp_path / "run")]) == 1
+    assert sentence in capsys.readouterr().err
+    assert not is_dataset(tmp_path / "set") and not (tmp_path / "run").exists()
 
 
 def test_hands_are_where_the_center_is(finished, tmp_path):
@@ -469,7 +552,7 @@ LAYOUT = MarkerLayout(
     ),
     radius=0.004,
 )
-ALONE = {"alone": 1.0}
+ALONE = {"together": 0, "holding": 0}
 
 
 def fists(model, num_poses, *, rng):

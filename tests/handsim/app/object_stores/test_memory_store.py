@@ -15,7 +15,7 @@ import pytest
 from fsspec.implementations.memory import MemoryFileSystem
 from upath import UPath
 
-from handsim import HandSimError
+from handsim import HandSimError, HandSimWarning
 from handsim.app.output import open_output, place_of
 from handsim.app.workers import run_jobs
 from handsim.cli.main import main
@@ -24,6 +24,7 @@ from handsim.files.signals import Stopped
 from render import RenderConfig, render_take
 from render.session import left_out_frames
 from tests.handsim.app.object_stores.stored_set import CONFIG, contents, copied, names, write_three
+from track.viewer.contents import open_content
 from train import Dataset
 from train.data.shards import MANIFEST, array_bytes, row_dtype, rows_name, save_array
 from train.simulation.generation import make_dataset
@@ -78,6 +79,28 @@ def test_a_store_that_holds_something_else_is_refused(memory, tmp_path):
     with pytest.raises(DatasetError, match=f"{memory} is not empty and holds no training set; name another"):
         make_dataset(CONFIG, memory, workers=1)
     assert names(memory) == {"mine.txt"}
+
+
+def test_every_command_reads_a_set_in_a_store(memory, tmp_path, capsys):
+    make_dataset(CONFIG, memory, workers=1)
+    content = open_content(str(memory))
+    assert content.kind == "dataset" and len(content.recording.times) == CONFIG.num_frames
+    assert main(["evaluate", str(memory), "--glove", "dense19"]) == 0
+    assert "hands in frames" in capsys.readouterr().out
+    small = "--samples 32 --batch 32 --network.width 16 --network.gates 4 --network.depth 1".split()
+    assert main(["train", str(memory), "--out", str(tmp_path / "run"), *small]) == 0
+    (memory / rows_name(1)).unlink()
+    for command in (["train", "--out", str(tmp_path / "other")], ["evaluate"], ["view"]):
+        assert main([command[0], str(memory), *command[1:]]) == 1
+        assert f"{memory}/{rows_name(1)} is missing" in capsys.readouterr().err
+    (memory / MANIFEST).unlink()
+    with pytest.raises(DatasetError, match=f"{memory} is unfinished"):
+        Dataset(memory)
+    make_dataset(CONFIG, memory, workers=1)
+    (memory / "config.json").unlink()
+    with pytest.warns(HandSimWarning, match="config.json is missing, and is made again"):
+        make_dataset(CONFIG, memory, workers=1)
+    assert "config.json" in names(memory) and len(Dataset(memory)) == CONFIG.num_frames
 
 
 def test_what_says_that_a_job_is_finished_comes_last(memory, monkeypatch):
