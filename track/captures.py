@@ -239,9 +239,7 @@ def calibrate(
 
     source, frames, setup = _opened(capture, CalibrateSettings.of(settings, options))
     on_label = partial(on_part, "frames")
-    take, setup = _judged(
-        lambda now: tracked_take(source, frames, now.tracker(), progress=on_label), setup
-    )
+    take, setup = _judged(lambda now: tracked_take(source, frames, now.tracker(), progress=on_label), setup)
     done = calibrate_take(take, setup.start, setup.user, on_part)
     if leaves_markers(take, done):
         tracker = Tracker([one.hand for one in done], setup.labeler)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -19,10 +19,11 @@ from numpy.typing import NDArray
 from gloves.fit import GloveFit
 from gloves.takes.take import Take
 from handsim.hand.shape import BONES, DIGITS, PALM, Side
-from handsim.space.transforms import MIRROR
+from handsim.space.transforms import MIRROR, rigid_fit
 from track.alternatives.placement import FIT_OPTIONS, Placement, offset_cost, place_again, place_markers
 from track.hand_size import mean_hand
 from track.kinematics.pose_solver import FEWEST_MARKERS, PoseSolver
+from train.labelers.matching import assign
 
 _FRAMES: Final = 10  # frames of a hand, whose errors are about independent
 _FEWEST_FRAMES: Final = 4
@@ -35,6 +36,7 @@ _UNSEEN: Final = 5.0  # log-odds against a marker that is never seen
 _SELDOM: Final = 0.5  # share of the frames below which a marker is looked for among unlabeled points
 _STEADY: Final = 0.008  # [m] A point on a bone stays within this distance in the bone's frame.
 _REACH: Final = 0.12  # [m] largest distance of such a point from the bone's joint
+_MIRROR_ROUNDS: Final = 5  # of matching the markers of both hands
 _CHANGES: Final = 3  # changes that are tried one after the other
 _ROUGH_NOISE, _ROUGH_MOST = 0.004, 0.02  # [m] scale and bound of residuals in rough costs
 _OFTEN: Final = 0.5  # share of the frames without the marker that show it
@@ -66,50 +68,71 @@ class JudgedHand(NamedTuple):
     alternatives: tuple[Alternative, ...]
     """The likeliest first."""
     hand: GloveFit
-    """The hand with its markers where the likeliest one has them."""
+    """The hand with its markers where the likeliest one has them; of the other side, if that is likelier."""
+    offsets: Float[np.ndarray, "M 3"]
+    """Their offsets from the places of the layout, at rest in the wrist's frame of a right hand [m]."""
 
     @property
     def is_changed(self) -> bool:
         """Whether other labels are likelier than those of the take."""
         return bool(self.alternatives[0].words)
 
-    @property
-    def record(self) -> list[dict[str, Any]]:
-        """The alternatives as JSON, for the settings of a take."""
-        return [
-            {
-                "words": one.words,
-                "probability": round(one.probability, 4),
-                "markers": list(one.markers),
-            }
-            for one in self.alternatives
-        ]
+
+class Doubt(NamedTuple):
+    """What is open of a hand's labels in a whole take."""
+
+    tried: tuple[Alternative, ...]
+    """The likeliest alternatives."""
+    distances: Float[np.ndarray, "M"]
+    """Distance of each marker from its place in the layout [m]."""
 
 
 def judge_take(take: Take) -> tuple[JudgedHand, ...]:
-    """Compare the labels of each hand of a tracked take with their alternatives.
+    """Compare the labels of each hand of a take with their alternatives.
 
-    Hands that too few frames show are left out.
+    Hands that too few frames show are left out. The sides of two hands are exchanged for both or for neither.
     """
-    judged = [judge_hand(take, side) for side in take.sides]
-    return tuple(one for one in judged if one is not None)
+    tried = [one for one in (_Trials.of(take, side) for side in take.sides) if one is not None]
+    mirrored = [one.mirrored() for one in tried]
+    gains = [fit.cost - one.least for one, fit in zip(tried, mirrored, strict=True) if fit is not None]
+    both = float(sum(gains)) if len(gains) == len(tried) else np.inf
+    return tuple(one.judged(fit, both) for one, fit in zip(tried, mirrored, strict=True))
 
 
 def with_doubt(take: Take, judged: Sequence[JudgedHand]) -> Take:
-    """The take with its alternatives in its settings, and with the confidence that they leave to its labels."""
-    settings = {**take.settings, ALTERNATIVES: {one.side: one.record for one in judged}}
-    take = dataclasses.replace(take, settings=settings)
+    """The take with its alternatives in its settings, and the confidence that they leave to its labels."""
+    record = {
+        one.side: {
+            "tried": [alternative._asdict() for alternative in one.alternatives],
+            "distances": np.linalg.norm(one.offsets, axis=1).round(5).tolist(),
+        }
+        for one in judged
+    }
+    take = dataclasses.replace(take, settings={**take.settings, ALTERNATIVES: record})
     points, right = take.point_list, np.append(label_probability(take), 1.0)
     confidence = points.confidence * right[np.minimum(points.labels, len(right) - 1)]
     return dataclasses.replace(take, point_list=dataclasses.replace(points, confidence=confidence))
 
 
+def doubts_of(take: Take) -> dict[Side, Doubt]:
+    """What is open of the labels of each hand, as the settings of a take record it; else it is found."""
+    if ALTERNATIVES not in take.settings:
+        take = with_doubt(take, judge_take(take))
+    return {
+        side: Doubt(tuple(Alternative(**one) for one in record["tried"]), np.array(record["distances"]))
+        for side, record in take.settings[ALTERNATIVES].items()
+    }
+
+
 def label_probability(take: Take) -> Float[np.ndarray, "K"]:
-    """Probability that no likely alternative of the take gives the points of a label to another marker."""
+    """Probability that no likely alternative gives the points of a label to another marker.
+
+    It is 1 for takes whose settings have no alternatives.
+    """
     sure = np.ones(take.hand_labels[-1].stop)
     for side, part in zip(take.sides, take.hand_labels, strict=True):
-        for one in take.settings.get(ALTERNATIVES, {}).get(side, ()):
-            sure[np.array(part)[one["markers"]]] -= one["probability"]
+        for one in take.settings.get(ALTERNATIVES, {}).get(side, {"tried": ()})["tried"]:
+            sure[np.array(part)[list(one["markers"])]] -= one["probability"]
     return np.maximum(sure, 0.0)
 
 
@@ -119,7 +142,6 @@ class Columns(NamedTuple):
     names: tuple[str, ...]
     seen: Float[np.ndarray, "F C 3"]  # of each label, then steady unlabeled ones [m]; NaN where missing
     worn: GloveFit  # the right hand in the glove as designed
-    frames: Int[np.ndarray, "F"]
 
     def of(self, order: Sequence[int]) -> Float[np.ndarray, "F M 3"]:
         """Points of the markers under an alternative."""
@@ -149,34 +171,76 @@ class Columns(NamedTuple):
         return tuple(int(column) if shown[column] else -1 for column in order)
 
 
-def judge_hand(take: Take, side: Side) -> JudgedHand | None:
-    """Compare the labels of a hand with their alternatives; None if too few frames show the hand."""
-    columns = _columns_of(take, side)
-    if columns is None:
-        return None
-    given = columns.given
-    base = place_markers(columns.of(given), columns.worn)
-    fits, words = {given: base}, {given: ""}
-    costs = {given: base.cost + columns.left_over(given)}
-    best = given
-    for _ in range(_CHANGES):
-        for order, said in _candidates(columns, best, fits[best]):
-            if order not in fits:
-                fits[order], words[order] = place_again(columns.of(order), base), said
-                costs[order] = fits[order].cost + columns.left_over(order)
-        before, best = best, min(costs, key=lambda order: costs[order])
-        if best == before:
-            break
-    log_odds = np.array([-cost / _TEMPERATURE - _PRIOR * (one != given) for one, cost in costs.items()])
-    shares = np.exp(log_odds - log_odds.max())
-    shares /= shares.sum()
-    ranked = sorted(zip(costs, shares.tolist(), strict=True), key=lambda one: -one[1])
-    found = [
-        Alternative(_differences(given, order), words[order], share)
-        for order, share in ranked
-        if share >= _LIKELY
-    ]
-    return JudgedHand(side, tuple(found), fits[ranked[0][0]].hand.with_side(side))
+class _Trials:
+    """A hand of a take under the alternatives that were tried."""
+
+    @classmethod
+    def of(cls, take: Take, side: Side) -> _Trials | None:
+        """Try the alternatives to the labels of a hand; None if too few frames show it."""
+        columns = _columns_of(take, side)
+        return None if columns is None else cls(columns, side)
+
+    def __init__(self, columns: Columns, side: Side) -> None:
+        self._columns, self._side = columns, side
+        self._given = best = columns.given
+        base = place_markers(columns.of(best), columns.worn)
+        self._fits, self._words = {best: base}, {best: ""}
+        self._costs = {best: base.cost + columns.left_over(best)}
+        for _ in range(_CHANGES):
+            for order, words in _candidates(columns, best, self._fits[best]):
+                if order not in self._fits:
+                    fit = self._fits[order] = place_again(columns.of(order), base)
+                    self._words[order] = words
+                    self._costs[order] = fit.cost + columns.left_over(order)
+            before, best = best, min(self._costs, key=lambda order: self._costs[order])
+            if best == before:
+                break
+        self.least = self._costs[best] - columns.left_over(self._given)
+        """Cost of the likeliest alternative."""
+
+    def mirrored(self) -> Placement | None:
+        """The same points as a hand of the other side; None where that is out of the question."""
+        columns, base = self._columns, self._fits[self._given]
+        solver, rough = PoseSolver(columns.worn), list[tuple[float, NDArray[np.float64]]]()
+        least = _rough(solver, columns.of(self._given))
+        for order in _mirror_orders(columns.worn.attachment.points):
+            seen = columns.of([self._given[marker] for marker in order]) @ MIRROR
+            rough.append((_rough(solver, seen) - least, seen))
+        gain, seen = min(rough, key=lambda one: one[0])
+        return place_again(seen, base) if gain < _ROUGH else None
+
+    def judged(self, mirrored: Placement | None, gain: float) -> JudgedHand:
+        """The alternatives by probability; with `gain` more cost the hand is one of the other side."""
+        given, side = self._given, self._side
+        other: Side = "left" if side == "right" else "right"
+        tried = [
+            (cost, Alternative(_differences(given, order), self._words[order], 0.0), self._fits[order], side)
+            for order, cost in self._costs.items()
+        ]
+        if mirrored is not None and gain < np.inf:
+            words = f"it is the {other} one"
+            every = Alternative(tuple(range(len(given))), words, 0.0)
+            tried.append((self.least + self._columns.left_over(given) + gain, every, mirrored, other))
+        log_odds = np.array([-cost / _TEMPERATURE - _PRIOR * bool(one.words) for cost, one, *_ in tried])
+        shares = np.exp(log_odds - log_odds.max())
+        shares /= shares.sum()
+        ranked = np.argsort(-shares, kind="stable")
+        found = [tried[n][1]._replace(probability=float(shares[n])) for n in ranked if shares[n] >= _LIKELY]
+        _, _, fit, of = tried[ranked[0]]
+        return JudgedHand(side, tuple(found), fit.hand.with_side(of), fit.offsets)
+
+
+def _mirror_orders(points: Float[np.ndarray, "M 3"]) -> Iterator[list[int]]:
+    """Markers of a hand that may be those of the other hand: thumb side exchanged, or back and palm."""
+    for turn in (np.diag([1.0, -1.0, 1.0]), np.diag([1.0, 1.0, -1.0])):
+        order, moved = np.arange(len(points)), points @ turn
+        for _ in range(_MIRROR_ROUNDS):
+            off = points.mean(axis=0) - moved.mean(axis=0)
+            costs = np.square(moved[:, None] + off - points).sum(axis=2)
+            _, order = assign(costs, np.full(len(points), 1.0))
+            rotation, translation = rigid_fit(points @ MIRROR, points[order])
+            moved = points @ MIRROR @ rotation.T + translation
+        yield order.tolist()
 
 
 def _differences(given: Order, order: Order) -> tuple[int, ...]:
@@ -193,15 +257,24 @@ def _columns_of(take: Take, side: Side) -> Columns | None:
     frames = np.flatnonzero(counts >= max(FEWEST_MARKERS, _COMPLETE * _usual(counts)))
     if len(frames) < _FEWEST_FRAMES:
         return None
-    # Labels may be right for a part of the take. The frames are alike in the labels that they show.
-    unlike = (there[frames] != (there[frames].mean(axis=0) > 0.5)).sum(axis=1)
-    frames = frames[unlike <= np.quantile(unlike, _ALIKE)]
-    frames = frames[np.linspace(0, len(frames) - 1, min(_FRAMES, len(frames))).astype(int)]
-    seen = take.point_list.labeled(part, frames)
+    # Where a point that moves with the hand has no label, labels are wrong in the frames that lack one. These
+    # may be most of the take; elsewhere frames with many markers tell more.
+    usual = there[frames].mean(axis=0) > 0.5
+    unlike = (there[frames] != usual).sum(axis=1)
+    alike = _spread_out(frames[unlike <= np.quantile(unlike, _ALIKE)])
+    seen = take.point_list.labeled(part, alike)
+    strays = [one[:, None] for one in _steady(take, worn, alike, seen)]
+    if not strays:
+        full = counts[frames] >= np.quantile(counts[frames], 1.0 - _ALIKE)
+        seen = take.point_list.labeled(part, _spread_out(frames[full]))
     shape, layout = worn.shape, worn.layout
-    columns = np.concatenate([seen, *(one[:, None] for one in _steady(take, worn, frames, seen))], axis=1)
-    designed = mean_hand(shape.length, shape.breadth, layout)
-    return Columns(layout.names, columns @ mirror, designed, frames)
+    columns = np.concatenate([seen, *strays], axis=1) @ mirror
+    return Columns(layout.names, columns, mean_hand(shape.length, shape.breadth, layout))
+
+
+def _spread_out(frames: Int[np.ndarray, "T"]) -> Int[np.ndarray, "F"]:
+    """Some of these frames, evenly spaced."""
+    return np.asarray(frames[np.linspace(0, len(frames) - 1, min(_FRAMES, len(frames))).astype(int)])
 
 
 def _usual(counts: NDArray[np.int64]) -> float:
@@ -234,7 +307,11 @@ def _steady(
 
 
 def _cluster(
-    take: Take, T_world_bone: NDArray[np.float64], frames: NDArray[np.int64], taken: NDArray[np.bool_], reach: float
+    take: Take,
+    T_world_bone: NDArray[np.float64],
+    frames: NDArray[np.int64],
+    taken: NDArray[np.bool_],
+    reach: float,
 ) -> dict[int, int]:
     """The steadiest unlabeled point in the frame of a bone: its index by row of `frames`."""
     rows, points, places = [], [], []

@@ -1,7 +1,7 @@
 """How well labeled points fit a hand whose markers may sit elsewhere than the layout says.
 
-Size, proportions, poses and places are solved together. An error that repeats counts once: a wrong place costs
-as one offset, not as one residual in each frame, and neighbors on the palm share an offset.
+Size, proportions, poses and places are solved together. An error that repeats counts once: a wrong place
+costs as one offset, not as one residual in each frame, and neighbors on the palm share an offset.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import dataclasses
 from typing import Final, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
 from gloves.fit import GloveFit
@@ -79,7 +79,7 @@ def place_again(seen: Float[np.ndarray, "F M 3"], base: Placement) -> Placement:
 
 def _placed(problem: Problem, start: GloveFit, estimate: Estimate) -> Placement:
     """Solve hand and places, and rate them."""
-    there = problem.present.any(axis=0)
+    there: Bool[np.ndarray, "M"] = np.asarray(problem.present.any(axis=0))
     covariance = _covariance(start.attachment.points, there & (start.attachment.main_bones == PALM))
     weights = np.full(len(there), _FIRST_WEIGHT)
     problem.design_shift = np.zeros((len(there), 3))
