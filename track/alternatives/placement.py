@@ -24,6 +24,7 @@ FIT_OPTIONS: Final = {"noise": 0.003, "robust_scale": 0.015, "relinearize": 0.05
 """Options of a `Problem` with few frames [m]: the noise is that of flesh, which repeats in similar frames."""
 SMALL_GAIN: Final = 1e-3
 """A step that gains a smaller share of such a problem's energy is the last one."""
+_RELINEARIZE: Final = 0.2  # A smaller value changes no probability by more than 0.01.
 _LIFT: Final = 0.0015  # [m] standard deviation of a marker's height above the layout's
 _GLUED: Final = 0.0035  # [m] scale of the offset of a marker along the skin
 _TAILS: Final = 2.0  # degrees of freedom of the t-distribution of offsets
@@ -61,7 +62,8 @@ def place_markers(seen: Float[np.ndarray, "F M 3"], start: GloveFit) -> Placemen
         seen: Labeled points of a right hand [m], NaN where missing.
         start: A right hand in the glove as designed, of about the right size.
     """
-    problem, estimate = first_estimate(start, seen, PoseSolver(start).solve(seen).qpos, **FIT_OPTIONS)
+    options = {**FIT_OPTIONS, "relinearize": _RELINEARIZE}
+    problem, estimate = first_estimate(start, seen, PoseSolver(start).solve(seen).qpos, **options)
     problem.position_spread, problem.height_spread = _GLUED, _LIFT
     return _placed(problem, start, estimate)
 
