@@ -26,6 +26,7 @@ from gloves.takes.take import Take, label_names
 from handsim.callbacks import OnStep, Progress, no_progress, no_step
 from handsim.errors import CalibrationError, CaptureError, HandSimWarning, errors_of
 from handsim.hand.shape import NUM_QPOS, Side
+from track.alternatives.alternatives import judge_take, with_doubt
 from track.association.frame_state import change_of_distances
 from track.association.initialization import label_alone
 from track.bidirectional_labeling import label_both_ways
@@ -46,6 +47,7 @@ from track.user import AnyGlove, AnyLabeler, User, labeler_of, nominal_user
 OnFrame = Callable[[StreamedFrame, TrackedFrame], None]
 _COMPARED: Final = 200  # pairs of successive frames compared to see whether frames are continuous
 _CONTINUOUS: Final = 0.005  # [m] A pair is continuous if distances within a hand change less.
+_CORRECTIONS: Final = 2  # times that a take is labeled again because other labels are likelier
 _MOST: Final = 0.5  # Frames are tracked if at least this share of their pairs is continuous.
 
 
@@ -81,6 +83,22 @@ def label_capture(
         HandSimWarning: There is no hand in any frame, or another hand or glove fits clearly better.
     """
     source, frames, setup = _opened(capture, LabelSettings.of(settings, options))
+    labeled, _ = _judged(lambda setup: _labeled_take(capture, source, frames, setup, progress), setup)
+    if (labeled.point_list.labels < 0).all():
+        none = f"no hand found, expected hands in glove '{labeled.settings['glove']}' (--glove names another)"
+        none = none if len(labeled.point_list.points) else no_points(labeled)
+        warnings.warn(none, HandSimWarning, stacklevel=3)
+    return labeled
+
+
+def _labeled_take(
+    capture: AnyCapture,
+    source: Capture,
+    frames: Sequence[StreamedFrame],
+    setup: TrackerSetup,
+    progress: Progress,
+) -> Take:
+    """Label all frames of a capture."""
     present, glove = np.isfinite(source.positions[..., 0]), setup.settings["glove"]
     take = Take.of_truth(
         setup.user.hands,
@@ -96,16 +114,29 @@ def label_capture(
         progress(count, len(frames))
 
     if _is_continuous(frames):
-        labeled = label_both_ways(take, frames, setup.tracker, on_count)
-    else:
-        clouds = [frame.points for frame in frames]
-        labels, confidence = label_alone(clouds, setup.user.hands, setup.labeler, on_count)
-        points = dataclasses.replace(take.point_list, labels=labels, confidence=confidence)
-        labeled = dataclasses.replace(take, point_list=points)
-    if (labeled.point_list.labels < 0).all():
-        none = f"no hand found, expected hands in glove '{glove}' (--glove names another)"
-        warnings.warn(none if present.any() else no_points(take), HandSimWarning, stacklevel=3)
-    return labeled
+        return label_both_ways(take, frames, setup.tracker, on_count)
+    clouds = [frame.points for frame in frames]
+    labels, confidence = label_alone(clouds, setup.user.hands, setup.labeler, on_count)
+    points = dataclasses.replace(take.point_list, labels=labels, confidence=confidence)
+    return dataclasses.replace(take, point_list=points)
+
+
+def _judged(
+    label: Callable[[TrackerSetup], Take], setup: TrackerSetup, *, is_final: bool = False
+) -> tuple[Take, TrackerSetup]:
+    """Label a take, and again with markers elsewhere while an alternative to its labels is likelier.
+
+    Hands that were given or calibrated stay as they are, and a `final` take is not labeled again.
+    """
+    take = label(setup)
+    for _ in range(_CORRECTIONS if setup.is_auto and not is_final else 0):
+        placed = {one.hand.side: one.hand for one in judge_take(take) if one.is_changed}
+        if not placed:
+            break
+        hands = tuple(placed.get(hand.side, hand) for hand in setup.user)
+        setup = setup.with_user(dataclasses.replace(setup.user, hands=hands))
+        take = label(setup)
+    return with_doubt(take, judge_take(take)), setup
 
 
 def track_capture(
@@ -146,8 +177,15 @@ def track_capture(
     source, frames, setup = _opened(capture, chosen, warns=True)
     pins = () if corrections is None else _checked_corrections(Path(corrections), source, setup)
     if chosen.calibrate:
-        setup = _calibrated(tracked_take(source, frames, setup.tracker(), progress=progress), setup)
-    take = tracked_take(source, frames, setup.tracker(), sinks, on_frame, progress)
+        first, setup = _judged(
+            lambda now: tracked_take(source, frames, now.tracker(), progress=progress), setup
+        )
+        setup = _calibrated(first, setup)
+    take, setup = _judged(
+        lambda now: tracked_take(source, frames, now.tracker(), sinks, on_frame, progress),
+        setup,
+        is_final=chosen.calibrate or bool(sinks),
+    )
     points = dataclasses.replace(take.point_list, confidence=label_confidence(take))
     record = {**take.settings, **_named(capture, source), **setup.settings}
     take = dataclasses.replace(take, point_list=points, settings=record)
@@ -201,7 +239,7 @@ def calibrate(
 
     source, frames, setup = _opened(capture, CalibrateSettings.of(settings, options))
     on_label = partial(on_part, "frames")
-    take = tracked_take(source, frames, setup.tracker(), progress=on_label)
+    take, setup = _judged(lambda now: tracked_take(source, frames, now.tracker(), progress=on_label), setup)
     done = calibrate_take(take, setup.start, setup.user, on_part)
     if leaves_markers(take, done):
         tracker = Tracker([one.hand for one in done], setup.labeler)

@@ -27,6 +27,7 @@ from handsim.errors import ArgumentError, HandSimError, HandSimWarning
 from handsim.hand.model import HandModel
 from handsim.hand.shape import SIZES, HandShape, Side, shape_from_measures
 from handsim.space.transforms import MIRROR
+from track.alternatives.placement import FIT_OPTIONS, SMALL_GAIN
 from track.association.hand_state import HandState
 from track.association.initialization import HandInitializer, distances_to_nearest
 from track.calibration.energy import (
@@ -67,15 +68,11 @@ _FITTED: Final = (Status.TRACKED, Status.INITIALIZED)
 _PATIENCE: Final = 20  # frames with enough points but no hand, after which another size is tried
 _WINDOWS: Final = 8  # parts of a capture that are used
 _WINDOW: Final = 16  # frames of each part
-_FIT_NOISE: Final = 0.003  # [m] twice that of real gloves, as errors of flesh repeat in similar frames
 _SURE: Final = 2.0  # standard deviations of a 95 % interval
 _USUAL: Final = TrackerConfig()
 _LENIENT: Final = TrackerConfig(least_evidence=2.0)  # for hands of few markers before they are measured
-_ROBUST_SCALE: Final = 0.015  # [m]
-_GLUED: Final = 0.0045  # [m] spread per axis of the markers of a glove that may not be as its layout says
 _FIT_STEPS, _FEW_STEPS = 15, 2
 _LEAST_PRECISION: Final = 1.0  # [1/m^2] smallest precision of a shift, so that none is divided by zero
-_SMALL_GAIN, _RELINEARIZE = 1e-3, 0.05  # ten times a calibration's: a size may be off by 0.2 mm
 _PART: Final = 30  # Hands are compared in two parts of this many frames.
 _LEAST_FRAMES: Final = 10  # Hands are not compared in fewer frames.
 _NEAR: Final = 0.04  # [m] distance from a hand's markers within which an unlabeled point counts against it
@@ -313,7 +310,7 @@ def _least(function: Callable[[float], float], low: float, high: float) -> float
 def _fit_proportions(seen: Float[np.ndarray, "F M 3"], start: GloveFit) -> SizeFit:
     """Fit one shape to right hands in some frames, by a calibration without touches."""
     problem, estimate = _first_proportions(seen, start)
-    estimate, fit, _ = levenberg_marquardt(problem, estimate, 0, _FIT_STEPS, None, _SMALL_GAIN)
+    estimate, fit, _ = levenberg_marquardt(problem, estimate, 0, _FIT_STEPS, None, SMALL_GAIN)
     hand = user_hand(start, problem, estimate)
     rms = float(np.median(PoseSolver(hand).solve(seen, estimate.qpos).rms))
     variance = shared_covariance(problem, estimate, fit)[0][LENGTH, LENGTH]
@@ -322,25 +319,7 @@ def _fit_proportions(seen: Float[np.ndarray, "F M 3"], start: GloveFit) -> SizeF
 
 def _first_proportions(seen: Float[np.ndarray, "F M 3"], start: GloveFit) -> tuple[Problem, Estimate]:
     """The problem of one shape of right hands in some frames, and the start as first estimate."""
-    options = {"noise": _FIT_NOISE, "robust_scale": _ROBUST_SCALE, "relinearize": _RELINEARIZE}
-    return first_estimate(start, seen, PoseSolver(start).solve(seen).qpos, **options)
-
-
-def glued_offsets(seen: Float[np.ndarray, "F M 3"], worn: GloveFit) -> Float[np.ndarray, "M"]:
-    """Distances of a hand's markers from the places of their layout [m], fitted with the hand's proportions.
-
-    `worn` has the right size; its own proportions and places may have adapted to a wrong layout.
-    """
-    shape = worn.model.shape
-    start = mean_hand(shape.length, shape.breadth, worn.layout)
-    problem, estimate = _first_proportions(seen @ (MIRROR if worn.side == "left" else np.eye(3)), start)
-    problem.position_spread, off = _GLUED, np.zeros(len(problem.heights))
-    # The second prior is as wide as the first offsets, so that a wrong place no longer bends the hand.
-    for _ in range(2):
-        problem.place_weights = (_GLUED / np.maximum(off, _GLUED)) ** 2
-        estimate, fit, _ = levenberg_marquardt(problem, estimate, 0, _FIT_STEPS, None, _SMALL_GAIN)
-        off = np.linalg.norm(fit.design_residuals, axis=1)
-    return off
+    return first_estimate(start, seen, PoseSolver(start).solve(seen).qpos, **FIT_OPTIONS)
 
 
 def glove_shifts(
@@ -357,7 +336,7 @@ def glove_shifts(
     """
     right = worn.with_side("right")
     problem, estimate = _first_proportions(seen @ (MIRROR if worn.side == "left" else np.eye(3)), right)
-    estimate, fit, _ = levenberg_marquardt(problem, estimate, 0, _FEW_STEPS, None, _SMALL_GAIN)
+    estimate, fit, _ = levenberg_marquardt(problem, estimate, 0, _FEW_STEPS, None, SMALL_GAIN)
     _, by_shared, residuals, _ = jacobians = problem.weighted_jacobians(estimate, fit)
     equations = problem.normal_equations(estimate, fit, jacobians)
     reduced, solved = eliminate_poses(equations, 0.0)

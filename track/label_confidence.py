@@ -17,6 +17,7 @@ from gloves.takes.take import LOST, Take
 from handsim.hand.shape import DIGITS, NUM_JOINTS
 from handsim.kernels import kernel, point_distance
 from handsim.space.transforms import quaternion_matrix
+from track.alternatives.alternatives import label_probability
 from track.kinematics.pose_spread import resting_prior
 
 _LEAST_RESIDUAL: Final = 0.0003  # [m] lower bound of a marker's usual residual: the noise of optical systems
@@ -287,5 +288,6 @@ def label_confidence(take: Take, evidence: Evidence | None = None) -> Float[np.n
         (~labeled, told.unlabeled, _UNLABELED),
     ):
         right[which] = 1.0 / (1.0 + np.exp(weights[0] + values @ np.array(weights[1:])))
+    right[labeled] *= label_probability(take)[told.labels[labeled]]
     confidence[told.points] = right
     return confidence

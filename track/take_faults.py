@@ -12,15 +12,13 @@ from typing import Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from numpy.typing import NDArray
 
 from gloves.fit import GloveFit
 from gloves.takes.take import TRACKED, Take
-from handsim.hand.shape import JOINTS, PALM, Side
-from handsim.space.transforms import rigid_fit
-from track.hand_size import glove_shifts, glued_offsets
-from track.kinematics.pose_solver import FEWEST_MARKERS, PoseSolver
-from train.labelers.matching import assign
+from handsim.hand.shape import JOINTS, Side
+from track.alternatives.alternatives import doubts_of
+from track.hand_size import glove_shifts
+from track.kinematics.pose_solver import FEWEST_MARKERS
 
 _FEWEST: Final = 60  # Faults are looked for from this many tracked frames of a hand on.
 _MOST_FRAMES: Final = 2000  # largest number of examined frames of a hand
@@ -35,13 +33,8 @@ _GLOVE_SLIP: Final = 0.0025  # [m] smallest slip of a whole glove that is report
 _SURE: Final = 2.75  # smallest such slip in standard deviations
 _SLIP_PART: Final = 1.9  # [s] least time before and after a slip
 _LEAST_VARIANCE: Final = 1e-8  # [m^2] noise of optical systems
-_OFTEN_MISSING: Final = 0.3  # A marker missing in this share of the frames is looked for elsewhere.
-_ELSEWHERE: Final = 0.028  # [m] largest distance of a misplaced marker from its place
-_MISPLACED: Final = 0.008  # [m] least reported distance from its place
-_STEADY: Final = 0.006  # [m] radius within which a point fixed to a bone stays in the bone's frame
-_OFTEN: Final = 0.5  # share of the frames without the marker that show such a point
-_TRIED: Final = 100  # number of unlabeled points tried as its center
 _OFF_DESIGN: Final = 0.012  # [m] least reported distance of a fitted place from the layout's
+_DOUBT: Final = 0.2  # An alternative to the labels is reported from this probability on.
 _LAST_GAP: Final = 1.9  # [s] least time without a marker at the end, and least time before
 _LONGER: Final = 3.0  # A last gap is reported if it is this many times the longest earlier gap.
 _SEEN: Final = 0.5  # share of the earlier frames in which it was seen
@@ -49,9 +42,6 @@ AT_LIMIT: Final = 0.5
 """Tolerance within which a joint counts as being at its limit [deg]."""
 _OFTEN_AT_LIMIT: Final = 0.4  # share of the frames at the limit
 _FITTED_FRAMES: Final = 120  # number of frames in which a slip of the glove is fitted
-_FEWER: Final = 3  # The layout, and the mirror image of a hand, are fitted in every third of them.
-_FITS: Final = 1.5  # largest ratio of the mirror image's RMS distance to that of the hand
-_FITS_WELL: Final = 0.0012  # [m] the mirror image fits if its RMS distance is below this
 
 
 class SuspectSpan(NamedTuple):
@@ -93,11 +83,6 @@ class _Hand(NamedTuple):
         of = f"{self.side}:{name}" if name else f"the {self.side} hand"
         return SuspectSpan(first, self.take.num_frames - 1, first, of, why, remedy, of_labels)
 
-    def off_place(self, name: str, off: float, first: int) -> SuspectSpan:
-        """The fault of a marker that is `off` [m] from its place in the layout."""
-        why = f"is {1e3 * off:.0f} mm from where the layout has it, from {self.take.times[first]:.2f} s on"
-        return self.span(first, name, why, "correct its place in the layout's file")
-
 
 @lru_cache(maxsize=1)  # A summary, its warnings and a report of a take ask one after the other.
 def find_faults(take: Take) -> tuple[SuspectSpan, ...]:
@@ -114,7 +99,7 @@ def find_faults(take: Take) -> tuple[SuspectSpan, ...]:
         enough = np.isfinite(seen[..., 0]).sum(axis=1) >= FEWEST_MARKERS
         offsets = take.marker_offsets(side, frames)
         hand = _Hand(take, side, take.hands[number], frames, offsets, some[enough], seen[enough])
-        for faults in (_unsure_side, _misplaced, _off_design, _slips, _fallen, _at_limits):
+        for faults in (_alternatives, _slips, _fallen, _at_limits):
             found += faults(hand)
     return tuple({one.of: one for one in reversed(found)}.values())[::-1]
 
@@ -125,6 +110,21 @@ def _first_of_size(take: Take) -> int:
         case [*_, [int(first), *_]]:
             return first
     return 0
+
+
+def _alternatives(hand: _Hand) -> Iterator[SuspectSpan]:
+    """Other labels that fit the whole take, and markers that are not where the layout has them."""
+    doubt = doubts_of(hand.take).get(hand.side)
+    if doubt is None:
+        return
+    for one in doubt.tried:
+        if one.words and one.probability >= _DOUBT:
+            why = f"may be labeled wrong ({100 * one.probability:.0f} %): {one.words}"
+            yield hand.span(0, "", why, "correct the layout, or move a marker to where no other label fits")
+    for marker in np.flatnonzero(doubt.distances > _OFF_DESIGN):
+        name, off = hand.worn.layout.names[marker], 1e3 * doubt.distances[marker]
+        why = f"is {off:.0f} mm from where the layout has it"
+        yield hand.span(int(hand.frames[0]), name, why, "correct its place in the layout's file")
 
 
 def _slips(hand: _Hand) -> Iterator[SuspectSpan]:
@@ -195,76 +195,3 @@ def _at_limits(hand: _Hand) -> Iterator[SuspectSpan]:
                 why = f"is at the model's limit, {limit:g} deg, in {share:.0f} % of frames from {start:.2f} s"
                 remedy = "calibrate the hand, or do not use this angle"
                 yield hand.span(first, joint.name, why, remedy, of_labels=False)
-
-
-def _misplaced(hand: _Hand) -> Iterator[SuspectSpan]:
-    """Markers misplaced on their bone: an unlabeled point moves with the bone instead."""
-    take, worn = hand.take, hand.worn
-    missing = np.isnan(hand.offsets[..., 0])
-    bones = worn.model.forward_kinematics(take.qpos[hand.frames, take.hand_index(hand.side)])
-    places = worn.attachment.centers(worn.model, bones)
-    enough = max(_OFTEN_MISSING, _LAST_GAP * take.rate / take.num_frames)
-    for marker in np.flatnonzero(missing.mean(axis=0) > enough):
-        rows = np.flatnonzero(missing[:, marker])
-        poses = bones[rows, worn.attachment.main_bones[marker]]
-        found, owners = list[NDArray[np.float64]](), list[int]()
-        for row, pose in zip(rows, poses, strict=True):
-            part = take.point_list.of(int(hand.frames[row]))
-            free = take.point_list.points[part][take.point_list.labels[part] < 0]
-            off = (free - places[row, marker]) @ pose[:3, :3]
-            off = off[np.linalg.norm(off, axis=1) < _ELSEWHERE]
-            found.append(off)
-            owners += [int(row)] * len(off)
-        every, frames = np.concatenate(found), np.array(owners)
-        tried = every[:: max(1, len(every) // _TRIED)]
-        steady = [np.linalg.norm(every - one, axis=1) < _STEADY for one in tried]
-        if not steady:
-            continue
-        best = max(steady, key=lambda near: len(np.unique(frames[near])))
-        share, far = len(np.unique(frames[best])) / len(rows), np.linalg.norm(np.median(every[best], axis=0))
-        if share > _OFTEN and far > _MISPLACED:
-            yield hand.off_place(worn.layout.names[marker], float(far), int(hand.frames[rows[0]]))
-
-
-def _off_design(hand: _Hand) -> Iterator[SuspectSpan]:
-    """Markers on the palm whose places on the moving hand are far from those in the layout.
-
-    On digits the length of a bone explains the same offsets where joints hardly turn.
-    """
-    on_palm = np.flatnonzero(hand.worn.attachment.main_bones == PALM)
-    if not len(hand.seen) or not len(on_palm):
-        return
-    off = glued_offsets(hand.seen[::_FEWER], hand.worn)
-    for marker in on_palm[off[on_palm] > _OFF_DESIGN]:
-        yield hand.off_place(hand.worn.layout.names[marker], float(off[marker]), int(hand.frames[0]))
-
-
-def _unsure_side(hand: _Hand) -> Iterator[SuspectSpan]:
-    """A hand in a glove like its mirror image, that a hand of the other side fits as well in motion."""
-    worn, seen = hand.worn, hand.seen[::_FEWER]
-    if not len(seen):
-        return
-    other: Side = "left" if hand.side == "right" else "right"
-    ours = np.median(PoseSolver(worn).solve(seen).rms)
-    mirrored = worn.with_side(other)
-    theirs = min(
-        np.median(PoseSolver(mirrored).solve(seen[:, order]).rms) for order in _exchanges(worn, mirrored)
-    )
-    if theirs < max(_FITS * ours, _FITS_WELL):
-        why = f"may be the {other} one: that fits the points to {1e3 * theirs:.1f} mm, this {1e3 * ours:.1f}"
-        yield hand.span(0, "", why, "make the glove less like its mirror image, or name the hand (--hands)")
-
-
-def _exchanges(worn: GloveFit, mirrored: GloveFit) -> Iterator[Int[np.ndarray, "M"]]:
-    """Orders in which the other hand's markers may be ours: with thumb side, or back and palm, exchanged."""
-    ours, theirs = worn.attachment.points, mirrored.attachment.points
-    for turn in (np.eye(3), np.diag([1.0, -1.0, -1.0])):
-        moved = theirs @ turn
-        order = np.arange(len(ours))
-        for _ in range(5):
-            shift = ours.mean(axis=0) - moved.mean(axis=0)
-            costs = np.square(moved[:, None] + shift - ours).sum(axis=2)
-            _, order = assign(costs, np.full(len(ours), 1.0))
-            rotation, translation = rigid_fit(theirs, ours[order])
-            moved = theirs @ rotation.T + translation
-        yield order

@@ -10,8 +10,9 @@ import pytest
 from gloves import GloveFit, MarkerLayout, MarkerPlace, Take, load_layout
 from handsim.hand.shape import JOINTS, PALM
 from track import find_suspect_spans, track_capture
+from track.alternatives.alternatives import _mirror_orders
 from track.kinematics.pose_solver import FEWEST_MARKERS, PoseSolver
-from track.take_faults import _exchanges, find_faults
+from track.take_faults import find_faults
 from track.take_page import hand_figures
 from track.take_summary import summarize, suspicions, vouch
 from train import simulate_take
@@ -214,10 +215,10 @@ def test_a_side_that_motion_shows_is_sure(mirror_like):
 def test_hands_of_the_wrong_side_are_never_silent(mirror_like, turned):
     (hand,) = mirror_like.hands
     other = hand.with_side("left")
-    seen = mirror_like.observed("right")[:, list(_exchanges(hand, other))[turned]]
+    seen = mirror_like.observed("right")[:, list(_mirror_orders(hand.attachment.points))[turned]]
     (fault,) = (
         one
         for one in find_faults(as_tracked([other], PoseSolver(other).solve(seen).qpos[:, None], seen))
         if one.of == "the left hand"
     )
-    assert fault.why.startswith("may be the right one") and fault.of_labels
+    assert fault.why.endswith("it is the right one") and fault.of_labels

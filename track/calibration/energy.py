@@ -11,6 +11,7 @@ sliding does not change it to first order.
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -161,12 +162,21 @@ class Problem:
         self.position_spread, self.height_spread = POSITION_SPREAD, HEIGHT_SPREAD
         self.place_weights = np.ones(targets.shape[1])
         """Weights (M,) of the prior of each marker's place."""
+        self.design_shift = np.zeros((targets.shape[1], 3))
+        """Shift of each marker's designed position that costs nothing, in the wrist's frame [m]."""
         self.data_noise = noise
         """Standard deviation of a marker's coordinates [m] without the flesh, for which `noise` is larger."""
         self.precision = shape_precision()
         self._ranges = HandModel(shape).skeleton.ranges
         self._surface_jacobian: NDArray[np.float64] | None = None
         self._linearized_at = np.zeros(NUM_PARAMETERS)
+
+    def with_targets(self, targets: Float[np.ndarray, "F M 3"]) -> Problem:
+        """The same problem for other labeled markers [m], NaN where missing."""
+        other = copy.copy(self)
+        other.present = np.isfinite(targets).all(axis=2)
+        other.targets = np.where(other.present[..., None], targets, 0.0)
+        return other
 
     def fit(self, estimate: Estimate) -> Fit:
         """Residuals and energy of an estimate."""
@@ -182,7 +192,8 @@ class Problem:
         design, _ = skin_points(self.design, corners.part(count, 2 * count))
         pads = corners.part(2 * count, None)
         geometry = contact_geometry(contacts, pads, model, bones[contacts.frames])
-        fit = Fit(model, bones, residuals, estimate.points - design, normals, geometry, 0.0)
+        off = estimate.points - design - self.design_shift
+        fit = Fit(model, bones, residuals, off, normals, geometry, 0.0)
         return fit._replace(cost=self._cost(estimate, fit))
 
     def _cost(self, estimate: Estimate, fit: Fit) -> float:
@@ -190,7 +201,7 @@ class Problem:
         cost = (squares / (1.0 + squares / self.robust_scale**2)).sum() / self.noise**2
         cost += estimate.parameters @ self.precision @ estimate.parameters
         off = fit.design_residuals
-        cost += np.einsum("mi,mij,mj->", off, self._position_precision(fit), off)
+        cost += np.einsum("mi,mij,mj->", off, self.position_precision(fit), off)
         cost += ((estimate.coordinates.heights - self.heights) ** 2).sum() / self.height_spread**2
         beyond, off = self._joint_angle_residuals(estimate)
         cost += (beyond**2).sum() / _LIMIT_SPREAD**2
@@ -199,7 +210,7 @@ class Problem:
         cost += (weights * fit.geometry.gaps**2).sum() / CONTACT_SPREAD**2
         return float(cost)
 
-    def _position_precision(self, fit: Fit) -> NDArray[np.float64]:
+    def position_precision(self, fit: Fit) -> NDArray[np.float64]:
         """Precision matrix of E_prior for each marker (M, 3, 3) [1/m^2]."""
         normal = fit.normals[:, :, None] * fit.normals[:, None]
         precision: NDArray[np.float64] = ALPHA_ALONG * np.eye(3) + (ALPHA_NORMAL - ALPHA_ALONG) * normal
@@ -306,7 +317,7 @@ class Problem:
         result.shared[:first, :first] += self.precision
         result.shared_gradient[:first] += self.precision @ estimate.parameters
         jacobian = np.concatenate([design_jacobian, by_marker], axis=2)
-        weighted = self._position_precision(fit) @ jacobian
+        weighted = self.position_precision(fit) @ jacobian
         result.shared[:] += np.einsum("mis,mir->sr", jacobian, weighted, optimize=True)
         result.shared_gradient[:] += np.einsum("mi,mis->s", fit.design_residuals, weighted)
         lifts, higher = np.einsum("mi,mis->ms", fit.normals, by_marker), estimate.coordinates.heights

@@ -1,0 +1,413 @@
+"""Alternatives to the labels of a take: changes that hold for all of its frames.
+
+Two markers of a hand may be exchanged, labels shifted along a digit, two digits exchanged, or a marker lost
+whose points have no label. Each alternative is fitted to the same frames with free places of the markers
+(`track.alternatives.placement`); the likeliest is used, and the probability of the others is the doubt.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Final, NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+from numpy.typing import NDArray
+
+from gloves.fit import GloveFit
+from gloves.takes.take import Take
+from handsim.hand.shape import BONES, DIGITS, PALM, Side
+from handsim.space.transforms import MIRROR, rigid_fit
+from track.alternatives.placement import FIT_OPTIONS, Placement, offset_cost, place_again, place_markers
+from track.hand_size import mean_hand
+from track.kinematics.pose_solver import FEWEST_MARKERS, PoseSolver
+from train.labelers.matching import assign
+
+_FRAMES: Final = 10  # frames of a hand, whose errors are about independent
+_FEWEST_FRAMES: Final = 4
+_COMPLETE: Final = 0.75  # A frame shows this share of the usual number of markers.
+_ALIKE: Final = 0.3  # share of the frames that they are taken from
+_TRIED: Final = 4  # alternatives that are fitted, the likeliest by a rough cost first
+_ROUGH: Final = 12.0  # log-odds beyond which an alternative is not fitted
+_STRAY: Final = 10.0  # log-odds against a point that moves with the hand and is no marker
+_UNSEEN: Final = 5.0  # log-odds against a marker that is never seen
+_SELDOM: Final = 0.5  # share of the frames below which a marker is looked for among unlabeled points
+_STEADY: Final = 0.008  # [m] A point on a bone stays within this distance in the bone's frame.
+_REACH: Final = 0.12  # [m] largest distance of such a point from the bone's joint
+_MIRROR_ROUNDS: Final = 5  # of matching the markers of both hands
+_CHANGES: Final = 3  # changes that are tried one after the other
+_ROUGH_NOISE, _ROUGH_MOST = 0.004, 0.02  # [m] scale and bound of residuals in rough costs
+_OFTEN: Final = 0.5  # share of the frames without the marker that show it
+_TEMPERATURE: Final = 1.5  # divides log-odds of alternatives, as no fit knows all errors of gloves
+_PRIOR: Final = 1.5  # log-odds against each alternative, as the tracker has seen more frames
+_LIKELY: Final = 0.01  # Alternatives are kept from this probability on.
+
+
+Order = tuple[int, ...]
+"""The column whose points each marker has: a label, or M and more for unlabeled points; -1 for none."""
+ALTERNATIVES: Final = "alternatives"
+"""Key of the alternatives in the settings of a take."""
+
+
+class Alternative(NamedTuple):
+    """A way to label a hand in all frames of a take."""
+
+    markers: tuple[int, ...]
+    """Markers that have other points than in the take."""
+    words: str
+    """What it says of the labels, such as "RH1 and RH6 are exchanged"; empty for the labels as they are."""
+    probability: float
+
+
+class JudgedHand(NamedTuple):
+    """A hand of a take with the alternatives to its labels."""
+
+    side: Side
+    alternatives: tuple[Alternative, ...]
+    """The likeliest first."""
+    hand: GloveFit
+    """The hand with its markers where the likeliest one has them; of the other side, if that is likelier."""
+    offsets: Float[np.ndarray, "M 3"]
+    """Their offsets from the places of the layout, at rest in the wrist's frame of a right hand [m]."""
+
+    @property
+    def is_changed(self) -> bool:
+        """Whether other labels are likelier than those of the take."""
+        return bool(self.alternatives[0].words)
+
+
+class Doubt(NamedTuple):
+    """What is open of a hand's labels in a whole take."""
+
+    tried: tuple[Alternative, ...]
+    """The likeliest alternatives."""
+    distances: Float[np.ndarray, "M"]
+    """Distance of each marker from its place in the layout [m]."""
+
+
+def judge_take(take: Take) -> tuple[JudgedHand, ...]:
+    """Compare the labels of each hand of a take with their alternatives.
+
+    Hands that too few frames show are left out. The sides of two hands are exchanged for both or for neither.
+    """
+    tried = [one for one in (_Trials.of(take, side) for side in take.sides) if one is not None]
+    mirrored = [one.mirrored() for one in tried]
+    gains = [fit.cost - one.least for one, fit in zip(tried, mirrored, strict=True) if fit is not None]
+    both = float(sum(gains)) if len(gains) == len(tried) else np.inf
+    return tuple(one.judged(fit, both) for one, fit in zip(tried, mirrored, strict=True))
+
+
+def with_doubt(take: Take, judged: Sequence[JudgedHand]) -> Take:
+    """The take with its alternatives in its settings, and the confidence that they leave to its labels."""
+    record = {
+        one.side: {
+            "tried": [alternative._asdict() for alternative in one.alternatives],
+            "distances": np.linalg.norm(one.offsets, axis=1).round(5).tolist(),
+        }
+        for one in judged
+    }
+    take = dataclasses.replace(take, settings={**take.settings, ALTERNATIVES: record})
+    points, right = take.point_list, np.append(label_probability(take), 1.0)
+    confidence = points.confidence * right[np.minimum(points.labels, len(right) - 1)]
+    return dataclasses.replace(take, point_list=dataclasses.replace(points, confidence=confidence))
+
+
+def doubts_of(take: Take) -> dict[Side, Doubt]:
+    """What is open of the labels of each hand, as the settings of a take record it; else it is found."""
+    if ALTERNATIVES not in take.settings:
+        take = with_doubt(take, judge_take(take))
+    return {
+        side: Doubt(tuple(Alternative(**one) for one in record["tried"]), np.array(record["distances"]))
+        for side, record in take.settings[ALTERNATIVES].items()
+    }
+
+
+def label_probability(take: Take) -> Float[np.ndarray, "K"]:
+    """Probability that no likely alternative gives the points of a label to another marker.
+
+    It is 1 for takes whose settings have no alternatives.
+    """
+    sure = np.ones(take.hand_labels[-1].stop)
+    for side, part in zip(take.sides, take.hand_labels, strict=True):
+        for one in take.settings.get(ALTERNATIVES, {}).get(side, {"tried": ()})["tried"]:
+            sure[np.array(part)[list(one["markers"])]] -= one["probability"]
+    return np.maximum(sure, 0.0)
+
+
+class Columns(NamedTuple):
+    """Points of a hand in some frames, as a right one."""
+
+    names: tuple[str, ...]
+    seen: Float[np.ndarray, "F C 3"]  # of each label, then steady unlabeled ones [m]; NaN where missing
+    worn: GloveFit  # the right hand in the glove as designed
+
+    def of(self, order: Sequence[int]) -> Float[np.ndarray, "F M 3"]:
+        """Points of the markers under an alternative."""
+        seen = self.seen[:, list(order)].copy()
+        seen[:, np.array(order) < 0] = np.nan
+        return seen
+
+    def left_over(self, order: Sequence[int]) -> float:
+        """Log-odds against an alternative for points that it leaves without a label, and unseen markers."""
+        shown = np.isfinite(self.seen[..., 0]).mean(axis=0)
+        left = np.delete(shown, [one for one in order if one >= 0]).sum()
+        return float(_STRAY * left + _UNSEEN * sum(one < 0 for one in order))
+
+    def free(self, order: Sequence[int]) -> list[int]:
+        """Columns with points that an alternative leaves without a label."""
+        shown = np.isfinite(self.seen[..., 0]).any(axis=0)
+        return [one for one in range(len(shown)) if shown[one] and one not in order]
+
+    @property
+    def given(self) -> Order:
+        """The labels as they are."""
+        return self.normal(range(len(self.names)))
+
+    def normal(self, order: Sequence[int]) -> Order:
+        """An order with -1 for columns without points."""
+        shown = np.append(np.isfinite(self.seen[..., 0]).any(axis=0), False)
+        return tuple(int(column) if shown[column] else -1 for column in order)
+
+
+class _Trials:
+    """A hand of a take under the alternatives that were tried."""
+
+    @classmethod
+    def of(cls, take: Take, side: Side) -> _Trials | None:
+        """Try the alternatives to the labels of a hand; None if too few frames show it."""
+        columns = _columns_of(take, side)
+        return None if columns is None else cls(columns, side)
+
+    def __init__(self, columns: Columns, side: Side) -> None:
+        self._columns, self._side = columns, side
+        self._given = best = columns.given
+        base = place_markers(columns.of(best), columns.worn)
+        self._fits, self._words = {best: base}, {best: ""}
+        self._costs = {best: base.cost + columns.left_over(best)}
+        for _ in range(_CHANGES):
+            for order, words in _candidates(columns, best, self._fits[best]):
+                if order not in self._fits:
+                    fit = self._fits[order] = place_again(columns.of(order), base)
+                    self._words[order] = words
+                    self._costs[order] = fit.cost + columns.left_over(order)
+            before, best = best, min(self._costs, key=lambda order: self._costs[order])
+            if best == before:
+                break
+        self.least = self._costs[best] - columns.left_over(self._given)
+        """Cost of the likeliest alternative."""
+
+    def mirrored(self) -> Placement | None:
+        """The same points as a hand of the other side; None where that is out of the question."""
+        columns, base = self._columns, self._fits[self._given]
+        solver, rough = PoseSolver(columns.worn), list[tuple[float, NDArray[np.float64]]]()
+        least = _rough(solver, columns.of(self._given))
+        for order in _mirror_orders(columns.worn.attachment.points):
+            seen = columns.of([self._given[marker] for marker in order]) @ MIRROR
+            rough.append((_rough(solver, seen) - least, seen))
+        gain, seen = min(rough, key=lambda one: one[0])
+        return place_again(seen, base) if gain < _ROUGH else None
+
+    def judged(self, mirrored: Placement | None, gain: float) -> JudgedHand:
+        """The alternatives by probability; with `gain` more cost the hand is one of the other side."""
+        given, side = self._given, self._side
+        other: Side = "left" if side == "right" else "right"
+        tried = [
+            (cost, Alternative(_differences(given, order), self._words[order], 0.0), self._fits[order], side)
+            for order, cost in self._costs.items()
+        ]
+        if mirrored is not None and gain < np.inf:
+            words = f"it is the {other} one"
+            every = Alternative(tuple(range(len(given))), words, 0.0)
+            tried.append((self.least + self._columns.left_over(given) + gain, every, mirrored, other))
+        log_odds = np.array([-cost / _TEMPERATURE - _PRIOR * bool(one.words) for cost, one, *_ in tried])
+        shares = np.exp(log_odds - log_odds.max())
+        shares /= shares.sum()
+        ranked = np.argsort(-shares, kind="stable")
+        found = [tried[n][1]._replace(probability=float(shares[n])) for n in ranked if shares[n] >= _LIKELY]
+        _, _, fit, of = tried[ranked[0]]
+        return JudgedHand(side, tuple(found), fit.hand.with_side(of), fit.offsets)
+
+
+def _mirror_orders(points: Float[np.ndarray, "M 3"]) -> Iterator[list[int]]:
+    """Markers of a hand that may be those of the other hand: thumb side exchanged, or back and palm."""
+    for turn in (np.diag([1.0, -1.0, 1.0]), np.diag([1.0, 1.0, -1.0])):
+        order, moved = np.arange(len(points)), points @ turn
+        for _ in range(_MIRROR_ROUNDS):
+            off = points.mean(axis=0) - moved.mean(axis=0)
+            costs = np.square(moved[:, None] + off - points).sum(axis=2)
+            _, order = assign(costs, np.full(len(points), 1.0))
+            rotation, translation = rigid_fit(points @ MIRROR, points[order])
+            moved = points @ MIRROR @ rotation.T + translation
+        yield order.tolist()
+
+
+def _differences(given: Order, order: Order) -> tuple[int, ...]:
+    """Markers with other columns than those given."""
+    return tuple(marker for marker, pair in enumerate(zip(given, order, strict=True)) if pair[0] != pair[1])
+
+
+def _columns_of(take: Take, side: Side) -> Columns | None:
+    """The points of a hand in frames spread over the take; None if too few frames show enough markers."""
+    number, mirror = take.hand_index(side), MIRROR if side == "left" else np.eye(3)
+    part, worn = take.hand_labels[number], take.hands[number]
+    there = np.isfinite(take.observed(part)[..., 0])
+    counts = there.sum(axis=1)
+    frames = np.flatnonzero(counts >= max(FEWEST_MARKERS, _COMPLETE * _usual(counts)))
+    if len(frames) < _FEWEST_FRAMES:
+        return None
+    # Where a point that moves with the hand has no label, labels are wrong in the frames that lack one. These
+    # may be most of the take; elsewhere frames with many markers tell more.
+    usual = there[frames].mean(axis=0) > 0.5
+    unlike = (there[frames] != usual).sum(axis=1)
+    alike = _spread_out(frames[unlike <= np.quantile(unlike, _ALIKE)])
+    seen = take.point_list.labeled(part, alike)
+    strays = [one[:, None] for one in _steady(take, worn, alike, seen)]
+    if not strays:
+        full = counts[frames] >= np.quantile(counts[frames], 1.0 - _ALIKE)
+        seen = take.point_list.labeled(part, _spread_out(frames[full]))
+    shape, layout = worn.shape, worn.layout
+    columns = np.concatenate([seen, *strays], axis=1) @ mirror
+    return Columns(layout.names, columns, mean_hand(shape.length, shape.breadth, layout))
+
+
+def _spread_out(frames: Int[np.ndarray, "T"]) -> Int[np.ndarray, "F"]:
+    """Some of these frames, evenly spaced."""
+    return np.asarray(frames[np.linspace(0, len(frames) - 1, min(_FRAMES, len(frames))).astype(int)])
+
+
+def _usual(counts: NDArray[np.int64]) -> float:
+    """Usual number of markers of the frames that show any."""
+    return float(np.median(counts[counts > 0])) if counts.any() else 0.0
+
+
+def _steady(
+    take: Take, worn: GloveFit, frames: NDArray[np.int64], seen: NDArray[np.float64]
+) -> Iterator[Float[np.ndarray, "F 3"]]:
+    """Unlabeled points that move with a bone that carries, or is next to, a marker that is seldom seen."""
+    missing = np.isnan(seen[..., 0])
+    if missing.mean(axis=0).max() <= _SELDOM:
+        return
+    bones = worn.model.forward_kinematics(PoseSolver(worn).solve(seen).qpos)
+    taken = np.zeros(len(take.point_list.points), dtype=bool)
+    for marker in np.flatnonzero(missing.mean(axis=0) > _SELDOM):
+        best: dict[int, int] = {}
+        digit = worn.attachment.digits[marker]
+        for bone in [PALM, *(bone for bone in range(len(BONES)) if BONES[bone].digit == digit >= 0)]:
+            found = _cluster(take, bones[:, bone], frames, taken, _REACH)
+            found = {row: point for row, point in found.items() if missing[row, marker]}
+            if len(found) > len(best):
+                best = found
+        if len(best) >= _OFTEN * missing[:, marker].sum():
+            taken[list(best.values())] = True
+            stray = np.full((len(frames), 3), np.nan)
+            stray[list(best)] = take.point_list.points[list(best.values())]
+            yield stray
+
+
+def _cluster(
+    take: Take,
+    T_world_bone: NDArray[np.float64],
+    frames: NDArray[np.int64],
+    taken: NDArray[np.bool_],
+    reach: float,
+) -> dict[int, int]:
+    """The steadiest unlabeled point in the frame of a bone: its index by row of `frames`."""
+    rows, points, places = [], [], []
+    for row, (frame, pose) in enumerate(zip(frames, T_world_bone, strict=True)):
+        part = take.point_list.of(int(frame))
+        free = part.start + np.flatnonzero((take.point_list.labels[part] < 0) & ~taken[part])
+        local = (take.point_list.points[free] - pose[:3, 3]) @ pose[:3, :3]
+        near = np.linalg.norm(local, axis=1) < reach
+        rows += [row] * int(near.sum())
+        points += free[near].tolist()
+        places.append(local[near])
+    if not rows:
+        return {}
+    off = np.concatenate(places)
+    near = np.linalg.norm(off[:, None] - off, axis=2) < _STEADY
+    best = max(near, key=lambda one: len({rows[n] for n in np.flatnonzero(one)}))
+    return {rows[n]: points[n] for n in np.flatnonzero(best)}
+
+
+def _candidates(columns: Columns, now: Order, fit: Placement) -> list[tuple[Order, str]]:
+    """Changes of an order that a rough cost does not exclude, the likeliest first."""
+    found: dict[Order, tuple[float, str]] = {}
+    for raw, words, cost in (*_reassigned(columns, now, fit), *_shifted(columns, now)):
+        order = columns.normal(raw)
+        if cost < _ROUGH and (order not in found or cost < found[order][0]):
+            found[order] = cost, words
+    ranked = sorted(found.items(), key=lambda one: one[1][0])
+    return [(order, words) for order, (_, words) in ranked[:_TRIED]]
+
+
+def _reassigned(columns: Columns, now: Order, fit: Placement) -> Iterator[tuple[Order, str, float]]:
+    """Orders in which one or two markers have other columns, with rough costs.
+
+    These are of places and of the spread of points in the frames of the bones, for poses as they are.
+    """
+    hand, names = fit.hand, columns.names
+    bones = hand.model.forward_kinematics(fit.estimate.qpos)
+    place = hand.attachment.centers(hand.model, bones)
+    main = hand.attachment.main_bones
+    rest = hand.model.rest_transforms[main][:, :3, :3]
+    count, total = len(names), columns.seen.shape[1]
+    cost = np.full((count, total + 1), _UNSEEN)  # The last column stands for no point.
+    for marker in range(count):
+        turns = rest[marker] @ bones[:, main[marker], :3, :3].swapaxes(1, 2)
+        off = np.einsum("fij,fcj->fci", turns, columns.seen - place[:, marker, None])
+        there = np.isfinite(off[..., 0])
+        mean = np.nansum(off, axis=0) / np.maximum(there.sum(axis=0), 1)[:, None]
+        spread = np.nansum((off - mean) ** 2, axis=(0, 2))
+        rough = offset_cost(mean + fit.offsets[marker]) + spread / (2.0 * FIT_OPTIONS["noise"] ** 2)
+        cost[marker, :total] = np.where(there.any(axis=0), rough, _UNSEEN)
+    own = cost[range(count), now]
+    for one, other in itertools.combinations(range(count), 2):
+        gain = cost[one, now[other]] + cost[other, now[one]] - own[one] - own[other]
+        words = f"{names[one]} and {names[other]} are exchanged"
+        yield _changed(now, {one: now[other], other: now[one]}), words, float(gain)
+    for marker, stray in itertools.product(range(count), columns.free(now)):
+        gain = cost[marker, stray] - own[marker]
+        yield _changed(now, {marker: stray}), f"{names[marker]} is a point without a label", float(gain)
+        for other in range(count):
+            gain = cost[marker, now[other]] + cost[other, stray] - own[marker] - own[other]
+            words = f"the points of {names[marker]} have the label {names[other]}"
+            if other != marker:
+                yield _changed(now, {marker: now[other], other: stray}), words, float(gain)
+
+
+def _changed(order: Order, changes: Mapping[int, int]) -> Order:
+    """An order with other columns for some markers."""
+    return tuple(changes.get(marker, column) for marker, column in enumerate(order))
+
+
+def _shifted(columns: Columns, now: Order) -> Iterator[tuple[Order, str, float]]:
+    """Orders with labels shifted along a digit, or exchanged between neighbors, with rough costs."""
+    digits, orders = columns.worn.attachment.digits, list[tuple[Order, str]]()
+    chains = [np.flatnonzero(digits == digit).tolist() for digit in range(len(DIGITS))]
+    ends = [-1, *columns.free(now)]
+    for name, chain in zip(DIGITS, chains, strict=True):
+        own = [now[marker] for marker in chain]
+        for end in ends if len(chain) > 1 else ():
+            for sources in ([*own[1:], end], [end, *own[:-1]]):
+                words = f"the labels of the {name} are one marker off"
+                orders.append((_changed(now, dict(zip(chain, sources, strict=True))), words))
+    for (one, first), (other, second) in itertools.pairwise(enumerate(chains)):
+        if len(first) == len(second) > 0:
+            changes = {a: now[b] for a, b in zip([*first, *second], [*second, *first], strict=True)}
+            orders.append((_changed(now, changes), f"{DIGITS[one]} and {DIGITS[other]} are exchanged"))
+    solver = PoseSolver(columns.worn)
+    rough = [
+        _rough(solver, columns.of(order)) + columns.left_over(order)
+        for order in [now, *(one for one, _ in orders)]
+    ]
+    for (order, words), cost in zip(orders, rough[1:], strict=True):
+        yield order, words, cost - rough[0]
+
+
+def _rough(solver: PoseSolver, seen: Float[np.ndarray, "F M 3"]) -> float:
+    """Rough cost of labels, by poses of the hand as designed; what repeats in all frames counts once."""
+    squares = np.minimum((solver.solve(seen).residuals ** 2).sum(axis=2), _ROUGH_MOST**2)
+    mean = np.nansum(squares, axis=0) / np.maximum(np.isfinite(squares).sum(axis=0), 1)
+    return float(mean.sum() / (2.0 * _ROUGH_NOISE**2))
