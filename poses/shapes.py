@@ -242,8 +242,7 @@ def validate(model: HandModel | HandShape | str, qpos: Float[np.ndarray, "T 27"]
 def resting_angles(model: HandModel) -> Float[np.ndarray, "20"]:
     """A valid relaxed pose of this hand, with fingers fanned as little as their girth allows; read-only."""
     for share, fan in ((0.8, _FAN), (1.0, _FAN), (1.0, _WIDE_FAN)):  # leaves room where the girth allows it
-        tries = np.tile(gesture("relaxed"), (11, 1))
-        tries[:, 4::4] += np.arange(0.0, 21.0, 2.0)[:, None] * fan
+        tries = _fanned(fan, 20.0)
         valid = is_valid(model, tries, max_penetration=share * MAX_PENETRATION)
         if valid.any():
             break
@@ -252,6 +251,20 @@ def resting_angles(model: HandModel) -> Float[np.ndarray, "20"]:
     resting: NDArray[np.float64] = tries[valid.argmax()]
     resting.setflags(write=False)
     return resting
+
+
+def rests_easily(model: HandModel) -> bool:
+    """Whether fingers have room at rest with at most 12 degrees of fanning, and do not cross when flat."""
+    rests = is_valid(model, _fanned(_FAN, 12.0), max_penetration=0.8 * MAX_PENETRATION).any()
+    return bool(rests and model.penetration(join_qpos(np.zeros((1, NUM_JOINTS))))[0] <= _MOST_CROSSED)
+
+
+def _fanned(fan: Float[np.ndarray, "4"], most: float) -> Float[np.ndarray, "K 20"]:
+    """The relaxed gesture with fingers fanned by 0 to `most` degrees."""
+    degrees = np.arange(0.0, most + 1.0, 2.0)
+    angles = np.tile(gesture("relaxed"), (len(degrees), 1))
+    angles[:, 4::4] += degrees[:, None] * fan
+    return angles
 
 
 def make_valid(model: HandModel, angles: Float[np.ndarray, "T 20"]) -> Float[np.ndarray, "T 20"]:

@@ -26,7 +26,7 @@ from handsim.space.objects import RigidObject, named_object, object_names
 from handsim.space.rig import ROOM_CENTER, AnyRig, CameraRig, Center
 from handsim.space.transforms import pose_matrices, quaternion_matrix, random_quaternions
 from poses.grasps import sample_held_poses, settle_hold
-from poses.shapes import SAMPLER, PoseMix, PoseSampler, make_valid, resting_angles, sample_valid_angles
+from poses.shapes import SAMPLER, PoseMix, PoseSampler, make_valid, rests_easily, sample_valid_angles
 from poses.two_hands import sample_two_hand_poses
 
 NO_REST: Final = "person: fingers overlap at rest"
@@ -159,13 +159,10 @@ def sample_hands(
     for _ in range(_MAX_PEOPLE):
         shape = sample_shape(population, side=SIDES[0], rng=rng)
         models = HandModel(shape), HandModel(shape.with_side(SIDES[1]))
-        try:
-            resting_angles(models[0])
-        except PoseError:
-            if redrawn is not None:
-                redrawn[NO_REST] += 1
-            continue
-        return models
+        if rests_easily(models[0]):
+            return models
+        if redrawn is not None:
+            redrawn[NO_REST] += 1
     raise ArgumentError(
         f"the fingers of all {_MAX_PEOPLE} people drawn from the population overlap at rest, expected a "
         f"population with smaller spreads than {population}"
