@@ -26,7 +26,7 @@ from gloves.takes.take import Take, label_names
 from handsim.callbacks import OnStep, Progress, no_progress, no_step
 from handsim.errors import CalibrationError, CaptureError, HandSimWarning, errors_of
 from handsim.hand.shape import NUM_QPOS, Side
-from track.alternatives.alternatives import judge_take, with_doubt
+from track.alternatives.alternatives import doubts_of, judge_take, with_doubt
 from track.association.frame_state import change_of_distances
 from track.association.initialization import label_alone
 from track.bidirectional_labeling import label_both_ways
@@ -80,7 +80,8 @@ def label_capture(
         WeightsError: The labeler is unknown, or knows other markers.
 
     Warns:
-        HandSimWarning: There is no hand in any frame, or another hand or glove fits clearly better.
+        HandSimWarning: There is no hand in any frame, another hand or glove fits clearly better, other labels
+            fit as well, or a marker is not where the layout has it.
     """
     source, frames, setup = _opened(capture, LabelSettings.of(settings, options))
     labeled, _ = _judged(lambda setup: _labeled_take(capture, source, frames, setup, progress), setup)
@@ -88,6 +89,10 @@ def label_capture(
         none = f"no hand found, expected hands in glove '{labeled.settings['glove']}' (--glove names another)"
         none = none if len(labeled.point_list.points) else no_points(labeled)
         warnings.warn(none, HandSimWarning, stacklevel=3)
+    names = labeled.hands[0].layout.names
+    for side, doubt in doubts_of(labeled).items():
+        for one in doubt.faults(side, names):
+            warnings.warn(f"{one.of} {one.why}; {one.remedy}", HandSimWarning, stacklevel=3)
     return labeled
 
 

@@ -33,8 +33,6 @@ _GLOVE_SLIP: Final = 0.0025  # [m] smallest slip of a whole glove that is report
 _SURE: Final = 2.75  # smallest such slip in standard deviations
 _SLIP_PART: Final = 1.9  # [s] least time before and after a slip
 _LEAST_VARIANCE: Final = 1e-8  # [m^2] noise of optical systems
-_OFF_DESIGN: Final = 0.012  # [m] least reported distance of a fitted place from the layout's
-_DOUBT: Final = 0.2  # An alternative to the labels is reported from this probability on.
 _LAST_GAP: Final = 1.9  # [s] least time without a marker at the end, and least time before
 _LONGER: Final = 3.0  # A last gap is reported if it is this many times the longest earlier gap.
 _SEEN: Final = 0.5  # share of the earlier frames in which it was seen
@@ -115,16 +113,9 @@ def _first_of_size(take: Take) -> int:
 def _alternatives(hand: _Hand) -> Iterator[SuspectSpan]:
     """Other labels that fit the whole take, and markers that are not where the layout has them."""
     doubt = doubts_of(hand.take).get(hand.side)
-    if doubt is None:
-        return
-    for one in doubt.tried:
-        if one.words and one.probability >= _DOUBT:
-            why = f"may be labeled wrong ({100 * one.probability:.0f} %): {one.words}"
-            yield hand.span(0, "", why, "correct the layout, or move a marker to where no other label fits")
-    for marker in np.flatnonzero(doubt.distances > _OFF_DESIGN):
-        name, off = hand.worn.layout.names[marker], 1e3 * doubt.distances[marker]
-        why = f"is {off:.0f} mm from where the layout has it"
-        yield hand.span(int(hand.frames[0]), name, why, "correct its place in the layout's file")
+    for one in () if doubt is None else doubt.faults(hand.side, hand.worn.layout.names):
+        last = hand.take.num_frames - 1
+        yield SuspectSpan(0, last, int(hand.frames[0]), *one)
 
 
 def _slips(hand: _Hand) -> Iterator[SuspectSpan]:

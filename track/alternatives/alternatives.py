@@ -42,6 +42,8 @@ _ROUGH_NOISE, _ROUGH_MOST = 0.004, 0.02  # [m] scale and bound of residuals in r
 _OFTEN: Final = 0.5  # share of the frames without the marker that show it
 _TEMPERATURE: Final = 1.5  # divides log-odds of alternatives, as no fit knows all errors of gloves
 _PRIOR: Final = 1.5  # log-odds against each alternative, as the tracker has seen more frames
+_DOUBTFUL: Final = 0.2  # An alternative is reported from this probability on.
+_OFF_DESIGN: Final = 0.012  # [m] least reported distance of a marker from its place in the layout
 _LIKELY: Final = 0.01  # Alternatives are kept from this probability on.
 
 
@@ -85,6 +87,25 @@ class Doubt(NamedTuple):
     """The likeliest alternatives."""
     distances: Float[np.ndarray, "M"]
     """Distance of each marker from its place in the layout [m]."""
+
+    def faults(self, side: Side, names: Sequence[str]) -> Iterator[Fault]:
+        """What deserves a look, for markers of these names."""
+        for one in self.tried:
+            if one.words and one.probability >= _DOUBTFUL:
+                why = f"may be labeled wrong ({100 * one.probability:.0f} %): {one.words}"
+                remedy = "correct the layout, or move a marker to where no other label fits"
+                yield Fault(f"the {side} hand", why, remedy)
+        for marker in np.flatnonzero(self.distances > _OFF_DESIGN):
+            why = f"is {1e3 * self.distances[marker]:.0f} mm from where the layout has it"
+            yield Fault(f"{side}:{names[int(marker)]}", why, "correct its place in the layout's file")
+
+
+class Fault(NamedTuple):
+    """A fault of a whole take, in words."""
+
+    of: str
+    why: str
+    remedy: str
 
 
 def judge_take(take: Take) -> tuple[JudgedHand, ...]:

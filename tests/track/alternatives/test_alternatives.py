@@ -89,11 +89,13 @@ def test_a_layout_with_two_markers_elsewhere_gives_right_labels(truth, off):
         for one in designed.markers
     ]
     layout = MarkerLayout("guessed", tuple(places), designed.radius)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
         take = label_capture(truth.capture(), glove=layout, hands="right", labeler="dense19")
     labels, true = take.point_list.labels, truth.point_list.labels
     wrong = labels != true
     sure = take.point_list.confidence >= 0.95
     assert wrong[sure].mean() < 0.005
     assert wrong.mean() < 0.005 or not sure[wrong].any()
+    if off > 0.15:  # 21 mm
+        assert any("mm from where the layout has it" in str(one.message) for one in told)
