@@ -27,6 +27,7 @@ from handsim.hand.shape import (
     PALM,
     HandShape,
     Side,
+    shape_from_measures,
 )
 from handsim.hand.skin import all_weights, strongest_weights, vertex_normals
 from handsim.kernels import kernel
@@ -300,6 +301,11 @@ def settle_glove(layout: MarkerLayout, model: HandModel) -> GloveFit:
     near end.
     """
     return GloveFit(model, _settled(layout, layout, model))
+
+
+def mean_hand(length: float, breadth: float, layout: MarkerLayout) -> GloveFit:
+    """A right hand of mean proportions in a glove as designed; length and breadth in [m]."""
+    return settle_glove(layout, HandModel(shape_from_measures(length, breadth, side="right")))
 
 
 def _settled(

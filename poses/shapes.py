@@ -209,7 +209,7 @@ def _anywhere(count: int, rng: np.random.Generator) -> NDArray[np.float64]:
 MAX_PENETRATION: Final = 0.001
 """Deepest self-penetration [m] of a valid pose: skin yields by about this much."""
 _ROUNDING: Final = 1e-6  # [rad] Single precision rounds angles by less.
-_MOST_CROSSED: Final = 0.006  # [m] Flat fingers that overlap more hide skin that carries markers.
+_MOST_CROSSED: Final = 0.0045  # [m] Flat fingers that overlap more hide skin that carries markers.
 _THUMB: Final = np.array([joint.name.startswith("thumb") for joint in JOINTS])
 _ABDUCTIONS: Final = np.array([joint.name.endswith("abduction") for joint in JOINTS])
 _FAN: Final = np.deg2rad([1.0, 0.2, -0.6, -1.4])  # one degree of fanning at rest, index to little

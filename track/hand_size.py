@@ -20,17 +20,18 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from gloves.captures.capture import spacing
-from gloves.fit import GloveFit, check_layout, settle_glove
+from gloves.fit import GloveFit, check_layout, mean_hand
 from gloves.layout import MarkerLayout, list_layouts, load_layout
 from gloves.takes.points import Status
 from handsim.errors import ArgumentError, HandSimError, HandSimWarning
 from handsim.hand.model import HandModel
-from handsim.hand.shape import SIZES, HandShape, Side, shape_from_measures
+from handsim.hand.shape import SIZES, HandShape, Side
 from handsim.space.transforms import MIRROR
-from track.alternatives.placement import FIT_OPTIONS, SMALL_GAIN
 from track.association.hand_state import HandState
 from track.association.initialization import HandInitializer, distances_to_nearest
 from track.calibration.energy import (
+    QUICK_GAIN,
+    QUICK_OPTIONS,
     Estimate,
     Problem,
     eliminate_poses,
@@ -229,11 +230,6 @@ def usual_breadth(length: float) -> float:
     return float(np.interp(inside, lengths, breadths)) * length / inside
 
 
-def mean_hand(length: float, breadth: float, layout: MarkerLayout) -> GloveFit:
-    """A right hand of mean proportions in a glove as designed; length and breadth in [m]."""
-    return settle_glove(layout, HandModel(shape_from_measures(length, breadth, side="right")))
-
-
 def _label(
     frames: Sequence[StreamedFrame],
     hand: GloveFit,
@@ -310,7 +306,7 @@ def _least(function: Callable[[float], float], low: float, high: float) -> float
 def _fit_proportions(seen: Float[np.ndarray, "F M 3"], start: GloveFit) -> SizeFit:
     """Fit one shape to right hands in some frames, by a calibration without touches."""
     problem, estimate = _first_proportions(seen, start)
-    estimate, fit, _ = levenberg_marquardt(problem, estimate, 0, _FIT_STEPS, None, SMALL_GAIN)
+    estimate, fit, _ = levenberg_marquardt(problem, estimate, 0, _FIT_STEPS, None, QUICK_GAIN)
     hand = user_hand(start, problem, estimate)
     rms = float(np.median(PoseSolver(hand).solve(seen, estimate.qpos).rms))
     variance = shared_covariance(problem, estimate, fit)[0][LENGTH, LENGTH]
@@ -319,7 +315,7 @@ def _fit_proportions(seen: Float[np.ndarray, "F M 3"], start: GloveFit) -> SizeF
 
 def _first_proportions(seen: Float[np.ndarray, "F M 3"], start: GloveFit) -> tuple[Problem, Estimate]:
     """The problem of one shape of right hands in some frames, and the start as first estimate."""
-    return first_estimate(start, seen, PoseSolver(start).solve(seen).qpos, **FIT_OPTIONS)
+    return first_estimate(start, seen, PoseSolver(start).solve(seen).qpos, **QUICK_OPTIONS)
 
 
 def glove_shifts(
@@ -336,7 +332,7 @@ def glove_shifts(
     """
     right = worn.with_side("right")
     problem, estimate = _first_proportions(seen @ (MIRROR if worn.side == "left" else np.eye(3)), right)
-    estimate, fit, _ = levenberg_marquardt(problem, estimate, 0, _FEW_STEPS, None, SMALL_GAIN)
+    estimate, fit, _ = levenberg_marquardt(problem, estimate, 0, _FEW_STEPS, None, QUICK_GAIN)
     _, by_shared, residuals, _ = jacobians = problem.weighted_jacobians(estimate, fit)
     equations = problem.normal_equations(estimate, fit, jacobians)
     reduced, solved = eliminate_poses(equations, 0.0)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Final, Self, get_args
 
-from gloves.fit import GloveFit
+from gloves.fit import GloveFit, mean_hand
 from gloves.layout import list_layouts, load_layout
 from handsim._checks import check_type, shown_value
 from handsim.errors import ArgumentError
@@ -16,7 +16,7 @@ from handsim.hand.shape import SIDES, Side
 from handsim.settings import Expected, Settings
 from track.config import Size, TrackerConfig
 from track.frames import StreamedFrame
-from track.hand_size import check_hands, check_scale, mean_hand, measured_user
+from track.hand_size import check_hands, check_scale, measured_user
 from track.rigid_body import AnyBody, RigidTemplate, load_bodies
 from track.tracker import Tracker
 from track.user import AnyGlove, AnyLabeler, User, as_user, labeler_of, nominal_user

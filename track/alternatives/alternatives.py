@@ -16,12 +16,12 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
-from gloves.fit import GloveFit
+from gloves.fit import GloveFit, mean_hand
 from gloves.takes.take import Take
 from handsim.hand.shape import BONES, DIGITS, PALM, Side
 from handsim.space.transforms import MIRROR, rigid_fit
-from track.alternatives.placement import FIT_OPTIONS, Placement, offset_cost, place_again, place_markers
-from track.hand_size import mean_hand
+from track.alternatives.placement import Placement, offset_cost, place_again, place_markers
+from track.calibration.energy import QUICK_OPTIONS
 from track.kinematics.pose_solver import FEWEST_MARKERS, PoseSolver
 from train.labelers.matching import assign
 
@@ -381,7 +381,7 @@ def _reassigned(columns: Columns, now: Order, fit: Placement) -> Iterator[tuple[
         there = np.isfinite(off[..., 0])
         mean = np.nansum(off, axis=0) / np.maximum(there.sum(axis=0), 1)[:, None]
         spread = np.nansum((off - mean) ** 2, axis=(0, 2))
-        rough = offset_cost(mean + fit.offsets[marker]) + spread / (2.0 * FIT_OPTIONS["noise"] ** 2)
+        rough = offset_cost(mean + fit.offsets[marker]) + spread / (2.0 * QUICK_OPTIONS["noise"] ** 2)
         cost[marker, :total] = np.where(there.any(axis=0), rough, _UNSEEN)
     own = cost[range(count), now]
     for one, other in itertools.combinations(range(count), 2):

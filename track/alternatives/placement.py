@@ -16,14 +16,18 @@ from numpy.typing import NDArray
 from gloves.fit import GloveFit
 from handsim.hand.model import HandModel
 from handsim.hand.shape import PALM
-from track.calibration.energy import Estimate, Problem, first_estimate, levenberg_marquardt, user_hand
+from track.calibration.energy import (
+    QUICK_GAIN,
+    QUICK_OPTIONS,
+    Estimate,
+    Problem,
+    first_estimate,
+    levenberg_marquardt,
+    user_hand,
+)
 from track.calibration.hand_parameters import attachment_at, shape_at
 from track.kinematics.pose_solver import PoseSolver
 
-FIT_OPTIONS: Final = {"noise": 0.003, "robust_scale": 0.015, "relinearize": 0.05}
-"""Options of a `Problem` with few frames [m]: the noise is that of flesh, which repeats in similar frames."""
-SMALL_GAIN: Final = 1e-3
-"""A step that gains a smaller share of such a problem's energy is the last one."""
 _RELINEARIZE: Final = 0.2  # A smaller value changes no probability by more than 0.01.
 _LIFT: Final = 0.0015  # [m] standard deviation of a marker's height above the layout's
 _GLUED: Final = 0.0035  # [m] scale of the offset of a marker along the skin
@@ -62,7 +66,7 @@ def place_markers(seen: Float[np.ndarray, "F M 3"], start: GloveFit) -> Placemen
         seen: Labeled points of a right hand [m], NaN where missing.
         start: A right hand in the glove as designed, of about the right size.
     """
-    options = {**FIT_OPTIONS, "relinearize": _RELINEARIZE}
+    options = {**QUICK_OPTIONS, "relinearize": _RELINEARIZE}
     problem, estimate = first_estimate(start, seen, PoseSolver(start).solve(seen).qpos, **options)
     problem.position_spread, problem.height_spread = _GLUED, _LIFT
     return _placed(problem, start, estimate)
@@ -87,7 +91,7 @@ def _placed(problem: Problem, start: GloveFit, estimate: Estimate) -> Placement:
     problem.design_shift = np.zeros((len(there), 3))
     for _ in range(_ROUNDS):
         problem.place_weights = weights
-        estimate, fit, _ = levenberg_marquardt(problem, estimate, 0, _STEPS, None, SMALL_GAIN)
+        estimate, fit, _ = levenberg_marquardt(problem, estimate, 0, _STEPS, None, QUICK_GAIN)
         offsets = fit.design_residuals + problem.design_shift
         problem.design_shift, weights = _smooth_part(offsets, covariance)
     fit = problem.fit(estimate)

@@ -86,6 +86,10 @@ _DAMPING_RAISE, _DAMPING_CUT = 10.0, 0.2  # factors after a failed and a good st
 _LEAST_RAISED_DAMPING: Final = 1e-6
 _MOST_DAMPING_TRIALS: Final = 8
 SMALL_GAIN: Final = 1e-4  # A step that gains a smaller share of the energy is the last one.
+QUICK_OPTIONS: Final = {"noise": 0.003, "robust_scale": 0.015, "relinearize": 0.05}
+"""Options of a `Problem` with few frames [m]: the noise is that of flesh, which repeats in similar frames."""
+QUICK_GAIN: Final = 1e-3
+"""`SMALL_GAIN` of such a problem; a hand's length may be off by 0.2 mm."""
 
 
 class Contacts(NamedTuple):

@@ -54,7 +54,7 @@ def test_the_depth_sensor_fits_the_placement() -> None:
 def test_photographs_alone_are_the_only_background() -> None:
     config = parsed("--photos", "folder")
     assert config.background.photos == "folder"
-    assert [*config.background.shares.values()] == [0.0, 0.0, 0.0, 0.0, 0.0, 1.0]
+    assert [*config.background.shares.values()] == [0.0, 0.0, 0.0, 1.0]
 
 
 def test_depth_alone_never_looks_for_hardware(monkeypatch: pytest.MonkeyPatch) -> None:

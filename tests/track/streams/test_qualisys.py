@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import socket
 import struct
@@ -75,11 +76,12 @@ class Qtm:
         while True:
             try:
                 self._client, _ = self._socket.accept()
+            except OSError:
+                return
+            with contextlib.suppress(OSError):  # The client may end the connection at any time.
                 if self._answers:
                     self._client.sendall(packet(COMMAND, b"QTM RT Interface connected\0"))
                 self._talk(self._client)
-            except OSError:
-                return
 
     def _talk(self, client: socket.socket) -> None:
         while head := client.recv(8, socket.MSG_WAITALL):

@@ -364,10 +364,7 @@ def test_errors_other_than_poses_out_of_reach_stop_the_generation(tmp_path, monk
 
 
 def test_people_are_not_drawn_for_ever(rng, monkeypatch):
-    def no_rest(model):
-        raise PoseError("this hand's fingers overlap at rest")
-
-    monkeypatch.setattr(training_frames, "resting_angles", no_rest)
+    monkeypatch.setattr(training_frames, "rests_easily", lambda model: False)
     with pytest.raises(ArgumentError, match="the fingers of all 1000 people drawn"):
         training_frames.sample_hands(Population(), rng=rng)
 
