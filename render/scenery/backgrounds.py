@@ -141,7 +141,7 @@ _STEEPEST: Final = 0.35  # largest slope of a backdrop against the picture's pla
 _SOFTNESS: Final = (0.03, 0.25)  # range of shadows' softness, from that of a bare bulb to a window's
 BackgroundKind = Literal["plain", "gradient", "room", "photo"]
 KINDS: Final[tuple[BackgroundKind, ...]] = get_args(BackgroundKind)
-_USUAL_SHARES: Final = {"plain": 0.15, "gradient": 0.15, "room": 0.7}
+_USUAL_SHARES: Final = {"plain": 0.25, "gradient": 0.25, "room": 0.5}
 _CLOSE: Final = ("plain", "gradient")  # kinds that may be as near as a wall or a table
 _OUT_OF_FOCUS: Final = ("gradient", "room")  # kinds drawn at half the resolution
 
