@@ -15,6 +15,7 @@ from render.skin.look import TONES, hyphened, typology_angle
 
 FEWEST = 150  # pixels of a back or a palm that count
 PICTURES = 64
+MOST_OFF = {"rgb": 8.0, "noisy_rgb": 10.0}  # [deg]; the exposure of a noisy camera follows the background
 
 
 def seen_colors(tone: str) -> dict[tuple[str, str], np.ndarray]:
@@ -44,7 +45,7 @@ def test_backs_have_the_tone_that_is_named_and_palms_are_lighter(tone: str) -> N
         assert min(len(backs), len(palms)) >= 10
         angle = np.median([typology_angle(lightness, yellowness) for lightness, _, yellowness in backs])
         off = angle - np.mean(TONES[tone])
-        assert abs(off) < 8.0, (
+        assert abs(off) < MOST_OFF[name], (
             f"{name}: the median typology angle is {off:.1f} degrees off the class's middle"
         )
         assert np.median(palms[:, 0]) > np.median(backs[:, 0]) + 0.5, name

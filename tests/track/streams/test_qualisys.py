@@ -110,7 +110,7 @@ class Qtm:
         return self
 
     def __exit__(self, *_: object) -> None:
-        for one in (self._client, self._socket):
+        for one in (self._socket, self._client):  # Nobody can connect in between.
             if one is not None:
                 try:
                     one.shutdown(socket.SHUT_RDWR)
