@@ -134,14 +134,16 @@ def _judged(
     Hands that were given or calibrated stay as they are, and a `final` take is not labeled again.
     """
     take = label(setup)
+    judged = judge_take(take)
     for _ in range(_CORRECTIONS if setup.is_auto and not is_final else 0):
-        placed = {one.hand.side: one.hand for one in judge_take(take) if one.is_changed}
+        placed = {one.hand.side: one.hand for one in judged if one.is_changed}
         if not placed:
             break
         hands = tuple(placed.get(hand.side, hand) for hand in setup.user)
         setup = setup.with_user(dataclasses.replace(setup.user, hands=hands))
         take = label(setup)
-    return with_doubt(take, judge_take(take)), setup
+        judged = judge_take(take)
+    return with_doubt(take, judged), setup
 
 
 def track_capture(

@@ -33,7 +33,7 @@ _TRIED: Final = 4  # alternatives that are fitted, the likeliest by a rough cost
 _ROUGH: Final = 12.0  # log-odds beyond which an alternative is not fitted
 _STRAY: Final = 10.0  # log-odds against a point that moves with the hand and is no marker
 _UNSEEN: Final = 5.0  # log-odds against a marker that is never seen
-_SELDOM: Final = 0.5  # share of the frames below which a marker is looked for among unlabeled points
+_SELDOM: Final = 0.5  # A marker that is missing in more than this share of the frames is looked for.
 _STEADY: Final = 0.008  # [m] A point on a bone stays within this distance in the bone's frame.
 _REACH: Final = 0.12  # [m] largest distance of such a point from the bone's joint
 _MIRROR_ROUNDS: Final = 5  # of matching the markers of both hands
@@ -89,7 +89,7 @@ class Doubt(NamedTuple):
     """Distance of each marker from its place in the layout [m]."""
 
     def faults(self, side: Side, names: Sequence[str]) -> Iterator[Fault]:
-        """What deserves a look, for markers of these names."""
+        """Likely other labels, and markers far from their places, in sentences with the markers' names."""
         for one in self.tried:
             if one.words and one.probability >= _DOUBTFUL:
                 why = f"may be labeled wrong ({100 * one.probability:.0f} %): {one.words}"
@@ -306,7 +306,7 @@ def _usual(counts: NDArray[np.int64]) -> float:
 def _steady(
     take: Take, worn: GloveFit, frames: NDArray[np.int64], seen: NDArray[np.float64]
 ) -> Iterator[Float[np.ndarray, "F 3"]]:
-    """Unlabeled points that move with a bone that carries, or is next to, a marker that is seldom seen."""
+    """Unlabeled points that move with the palm or a digit's bone, where a marker of that digit is missing."""
     missing = np.isnan(seen[..., 0])
     if missing.mean(axis=0).max() <= _SELDOM:
         return
@@ -316,7 +316,7 @@ def _steady(
         best: dict[int, int] = {}
         digit = worn.attachment.digits[marker]
         for bone in [PALM, *(bone for bone in range(len(BONES)) if BONES[bone].digit == digit >= 0)]:
-            found = _cluster(take, bones[:, bone], frames, taken, _REACH)
+            found = _cluster(take, bones[:, bone], frames, taken)
             found = {row: point for row, point in found.items() if missing[row, marker]}
             if len(found) > len(best):
                 best = found
@@ -332,7 +332,6 @@ def _cluster(
     T_world_bone: NDArray[np.float64],
     frames: NDArray[np.int64],
     taken: NDArray[np.bool_],
-    reach: float,
 ) -> dict[int, int]:
     """The steadiest unlabeled point in the frame of a bone: its index by row of `frames`."""
     rows, points, places = [], [], []
@@ -340,7 +339,7 @@ def _cluster(
         part = take.point_list.of(int(frame))
         free = part.start + np.flatnonzero((take.point_list.labels[part] < 0) & ~taken[part])
         local = (take.point_list.points[free] - pose[:3, 3]) @ pose[:3, :3]
-        near = np.linalg.norm(local, axis=1) < reach
+        near = np.linalg.norm(local, axis=1) < _REACH
         rows += [row] * int(near.sum())
         points += free[near].tolist()
         places.append(local[near])
