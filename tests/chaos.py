@@ -2,7 +2,7 @@
 
     python -m tests.chaos [generate train ...] [--kills 20 --seed 0]
 
-Each command runs once undisturbed. Then it is killed by SIGTERM, SIGKILL, SIGINT and SIGHUP in turn, at a
+Each command runs once undisturbed, one that enlarges an output after the one before it. Then it is killed by SIGTERM, SIGKILL, SIGINT and SIGHUP in turn, at a
 random moment, and run again to its end. The table counts what must be zero: reruns whose files differ,
 processes that outlive the command, temporary files after the rerun, files that stay in /dev/shm, and ends
 with a traceback or with an exit code that is not the signal's. Ctrl-C goes to
@@ -158,6 +158,7 @@ def torment(name: str, work: Path, kills: int, rng: random.Random) -> Counts:
     whole, out, small = (work / f"{name}-{kind}" for kind in ("whole", "out", "small"))
     if case.before:
         finish(arguments(case.before, work, small))
+        shutil.copytree(small, whole)
     start = time.monotonic()
     finish(arguments(case.args, work, whole))
     length = time.monotonic() - start
