@@ -633,10 +633,7 @@ class _Listener(socket.socket):
             except OSError as error:
                 if error.errno not in (errno.EMFILE, errno.ENFILE):
                     raise
-                self._spare.close()
-                super().accept()[0].close()
-                self._spare = socket.socket()
-                self.refused += 1
+                self._refuse_one()
                 continue
             self._accepted = [one for one in self._accepted if one.fileno() >= 0]  # without closed ones
             if len(self._accepted) < MOST_CONNECTIONS:
@@ -644,6 +641,18 @@ class _Listener(socket.socket):
                 return connection, address
             self.refused += 1
             connection.close()
+
+    def _refuse_one(self) -> None:
+        """Close the next connection with the spare file; `BlockingIOError` if none waits."""
+        self._spare.close()
+        try:
+            super().accept()[0].close()
+        except OSError as error:  # Without free files, the system tells of them before it looks for one.
+            raise BlockingIOError(*error.args) from error
+        else:
+            self.refused += 1
+        finally:
+            self._spare = socket.socket()
 
     def close(self) -> None:
         """Close the socket and the spare file."""

@@ -607,8 +607,9 @@ sink.close()
 """
 
 
-def test_a_process_without_free_files_prints_no_traceback():
-    """The system allows fewer files than connections."""
+@pytest.mark.parametrize("pause", [0.0, 0.005])
+def test_a_process_without_free_files_prints_no_traceback(pause):
+    """The system allows fewer files than connections, which come at once or one after the other."""
     pytest.importorskip("resource")
     process = subprocess.Popen(
         [sys.executable, "-c", FEW_FILES, "ws://:0"],
@@ -618,7 +619,10 @@ def test_a_process_without_free_files_prints_no_traceback():
         text=True,
     )
     port = int(process.stdout.readline())
-    clients = [socket.create_connection(("127.0.0.1", port)) for _ in range(60)]
+    clients = []
+    for _ in range(60):
+        clients.append(socket.create_connection(("127.0.0.1", port)))
+        time.sleep(pause)
     _, said = process.communicate("\n", timeout=LONG)
     for one in clients:
         one.close()
