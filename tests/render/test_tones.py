@@ -15,7 +15,7 @@ from render.skin.look import TONES, hyphened, typology_angle
 
 FEWEST = 150  # pixels of a back or a palm that count
 PICTURES = 64
-MOST_OFF = {"rgb": 8.0, "noisy_rgb": 10.0}  # [deg]; the exposure of a noisy camera follows the background
+MOST_OFF = {"rgb": 8.0, "noisy_rgb": 10.0}  # [deg]; 20 backs spread by 20 degrees
 
 
 def seen_colors(tone: str) -> dict[tuple[str, str], np.ndarray]:
