@@ -48,6 +48,7 @@ OnFrame = Callable[[StreamedFrame, TrackedFrame], None]
 _COMPARED: Final = 200  # pairs of successive frames compared to see whether frames are continuous
 _CONTINUOUS: Final = 0.005  # [m] A pair is continuous if distances within a hand change less.
 _CORRECTIONS: Final = 2  # times that a take is labeled again because other labels are likelier
+_ANY_RATE: Final = 120.0  # [Hz] Poses and labels do not depend on the rate of a take.
 _MOST: Final = 0.5  # Frames are tracked if at least this share of their pairs is continuous.
 
 
@@ -84,15 +85,13 @@ def label_capture(
             fit as well, or a marker is not where the layout has it.
     """
     source, frames, setup = _opened(capture, LabelSettings.of(settings, options))
-    labeled, _ = _judged(lambda setup: _labeled_take(capture, source, frames, setup, progress), setup)
+    labeled, *_ = _judged(lambda setup: _labeled_take(capture, source, frames, setup, progress), setup)
     if (labeled.point_list.labels < 0).all():
         none = f"no hand found, expected hands in glove '{labeled.settings['glove']}' (--glove names another)"
         none = none if len(labeled.point_list.points) else no_points(labeled)
         warnings.warn(none, HandSimWarning, stacklevel=3)
-    names = labeled.hands[0].layout.names
-    for side, doubt in doubts_of(labeled).items():
-        for one in doubt.faults(side, names):
-            warnings.warn(f"{one.of} {one.why}; {one.remedy}", HandSimWarning, stacklevel=3)
+    for sentence in label_faults(labeled):
+        warnings.warn(sentence, HandSimWarning, stacklevel=3)
     return labeled
 
 
@@ -128,22 +127,44 @@ def _labeled_take(
 
 def _judged(
     label: Callable[[TrackerSetup], Take], setup: TrackerSetup, *, is_final: bool = False
-) -> tuple[Take, TrackerSetup]:
+) -> tuple[Take, TrackerSetup, list[str]]:
     """Label a take, and again with markers elsewhere while an alternative to its labels is likelier.
 
-    Hands that were given or calibrated stay as they are, and a `final` take is not labeled again.
+    Hands that were given or calibrated stay as they are, and a `final` take is not labeled again. The last
+    result is what was changed, in words.
     """
-    take = label(setup)
+    take, changes = label(setup), list[str]()
     judged = judge_take(take)
     for _ in range(_CORRECTIONS if setup.is_auto and not is_final else 0):
         placed = {one.hand.side: one.hand for one in judged if one.is_changed}
         if not placed:
             break
+        changes += [f"the {one.side} hand: {one.alternatives[0].words}" for one in judged if one.is_changed]
         hands = tuple(placed.get(hand.side, hand) for hand in setup.user)
         setup = setup.with_user(dataclasses.replace(setup.user, hands=hands))
         take = label(setup)
         judged = judge_take(take)
-    return with_doubt(take, judged), setup
+    return with_doubt(take, judged), setup, changes
+
+
+def judged_setup(frames: Sequence[StreamedFrame], setup: TrackerSetup) -> tuple[TrackerSetup, list[str]]:
+    """Judge the labels of some frames of a stream: hands with markers where they are, and sentences.
+
+    These say which labels change, and what is open of the others.
+    """
+    positions = np.full((len(frames), max(len(frame.points) for frame in frames), 3), np.nan)
+    for row, frame in zip(positions, frames, strict=True):
+        row[: len(frame.points)] = frame.points
+    source = Capture(tuple(map(str, range(positions.shape[1]))), positions, _ANY_RATE)
+    take, setup, changes = _judged(lambda now: tracked_take(source, frames, now.tracker()), setup)
+    return setup, [*(f"the labels change for {one}" for one in changes), *label_faults(take)]
+
+
+def label_faults(take: Take) -> list[str]:
+    """What is open of the labels of a whole take, in sentences with their remedies."""
+    names = take.hands[0].layout.names
+    found = [one for side, doubt in doubts_of(take).items() for one in doubt.faults(side, names)]
+    return [f"{one.of} {one.why}; {one.remedy}" for one in found]
 
 
 def track_capture(
@@ -184,11 +205,11 @@ def track_capture(
     source, frames, setup = _opened(capture, chosen, warns=True)
     pins = () if corrections is None else _checked_corrections(Path(corrections), source, setup)
     if chosen.calibrate:
-        first, setup = _judged(
+        first, setup, _ = _judged(
             lambda now: tracked_take(source, frames, now.tracker(), progress=progress), setup
         )
         setup = _calibrated(first, setup)
-    take, setup = _judged(
+    take, setup, _ = _judged(
         lambda now: tracked_take(source, frames, now.tracker(), sinks, on_frame, progress),
         setup,
         is_final=chosen.calibrate or bool(sinks),
@@ -246,7 +267,9 @@ def calibrate(
 
     source, frames, setup = _opened(capture, CalibrateSettings.of(settings, options))
     on_label = partial(on_part, "frames")
-    take, setup = _judged(lambda now: tracked_take(source, frames, now.tracker(), progress=on_label), setup)
+    take, setup, _ = _judged(
+        lambda now: tracked_take(source, frames, now.tracker(), progress=on_label), setup
+    )
     done = calibrate_take(take, setup.start, setup.user, on_part)
     if leaves_markers(take, done):
         tracker = Tracker([one.hand for one in done], setup.labeler)

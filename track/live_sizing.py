@@ -24,6 +24,7 @@ from handsim.callbacks import Closing
 from handsim.errors import HandSimError, HandSimWarning
 from handsim.hand.model import HandModel, hand_keypoints
 from handsim.kernels import move, velocity_of
+from track.captures import judged_setup
 from track.frames import StreamedFrame, TrackedFrame, TrackedHand
 from track.hand_size import hand_between, sample_frames
 from track.settings import TrackerSetup, TrackSettings
@@ -52,7 +53,9 @@ class _Measured(NamedTuple):
     users: Sequence[User] = ()
     """Hands in small steps towards their measured size; empty if no hand was found."""
     told: Sequence[str] = ()
-    """Warnings about glove, hands or scale."""
+    """Warnings about glove, hands, labels or scale."""
+    is_relabeled: bool = False
+    """Whether other labels are likelier than those of hands in the glove as designed."""
 
 
 class LiveSizing(Closing):
@@ -72,7 +75,7 @@ class LiveSizing(Closing):
         self._measuring: Future[_Measured] | None = None
         self._steps: deque[User] = deque()
         self._shown_last: TrackedFrame | None = None
-        self._is_easing = False
+        self._is_easing = self._judges = False  # Are labels judged after one second, too?
 
     @property
     def is_settled(self) -> bool:
@@ -139,7 +142,9 @@ class LiveSizing(Closing):
         self._is_brief, self._due = self._shown < _ENOUGH, max(_ENOUGH, _LATER * self._shown)
         self._frames = sample_frames(self._frames)
         self._processes = LocalProcesses(1)
-        self._measuring = self._processes.submit(_measure, self._setup.settings, self._frames, user)
+        self._measuring = self._processes.submit(
+            _measure, self._setup.settings, self._frames, user, judges=self._judges or not self._is_brief
+        )
         self._processes.shutdown(wait=False)  # ends after this task
 
     def _end_measuring(self, measuring: Future[_Measured], tracker: Tracker) -> None:
@@ -153,6 +158,7 @@ class LiveSizing(Closing):
             warnings.warn(sentence, HandSimWarning, stacklevel=4)
         if not found.users:
             return
+        self._judges = self._judges or found.is_relabeled
         self._is_done, self._calm, self._usual = not self._is_brief, 0.0, 0.0
         before, after = (one[0].shape.length for one in (tracker.user, found.users[-1]))
         is_same = tracker.user.notes.startswith(MEASURED) and abs(after - before) < _SAME
@@ -160,17 +166,24 @@ class LiveSizing(Closing):
             self._steps = deque(found.users)
 
 
-def _measure(settings: dict[str, Any], frames: Sequence[StreamedFrame], before: User) -> _Measured:
-    """Measure the hands in some frames, in a process of low priority."""
+def _measure(
+    settings: dict[str, Any], frames: Sequence[StreamedFrame], before: User, *, judges: bool
+) -> _Measured:
+    """Measure the hands in some frames, and judge their labels, in a process of low priority."""
     if hasattr(os, "nice"):
         os.nice(_NICE)
     setup = TrackerSetup.of(TrackSettings.from_json(settings))
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", HandSimWarning)
-        after = setup.measured(frames, warns=False).user
+        setup = setup.measured(frames, warns=False)
+    after = measured = setup.user
     told = [str(one.message) for one in caught if issubclass(one.category, HandSimWarning)]
     if not after.notes.startswith(MEASURED):
         return _Measured(told=told)
+    if judges:
+        setup, sentences = judged_setup(frames, setup)
+        after, told = setup.user, told + sentences
+    is_relabeled = setup.user is not measured
     places = [np.concatenate([hand.attachment.points for hand in user]) for user in (before, after)]
     farthest = float(np.linalg.norm(places[1] - places[0], axis=1).max())
     count = max(_FEWEST_STEPS, int(np.ceil(farthest / _STEP)))
@@ -178,7 +191,7 @@ def _measure(settings: dict[str, Any], frames: Sequence[StreamedFrame], before: 
     for share in np.arange(1, count) / count:
         hands = tuple(hand_between(*pair, float(share)) for pair in zip(before, after, strict=True))
         users.append(dataclasses.replace(after, hands=hands))
-    return _Measured([*users, after], told)
+    return _Measured([*users, after], told, is_relabeled)
 
 
 def _eased(before: TrackedHand, hand: TrackedHand, span: float, model: HandModel) -> TrackedHand:

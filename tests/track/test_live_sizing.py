@@ -9,6 +9,7 @@ from functools import cache
 import numpy as np
 import pytest
 
+from gloves import MarkerLayout, load_layout
 from gloves.optics.reconstruction import number_runs
 from gloves.takes.take import keypoints_of
 from handsim.errors import ArgumentError, HandSimWarning
@@ -28,10 +29,10 @@ class AtOnce:
     def __init__(self, workers):
         pass
 
-    def submit(self, function, *arguments):
+    def submit(self, function, *arguments, **options):
         done = Future()
         try:
-            done.set_result(function(*arguments))
+            done.set_result(function(*arguments, **options))
         except ArgumentError as error:
             done.set_exception(error)
         return done
@@ -83,10 +84,34 @@ def test_a_hand_is_measured_twice_and_no_joint_jumps():
     assert tracker.user.notes.startswith("auto, ") and tracker.user.origin("right") == "measured"
 
 
+def test_labels_of_a_glove_with_markers_elsewhere_change_when_it_is_known(tmp_path):
+    """Two markers of the back are 3 cm from where the layout has them."""
+    take, designed = a_take(), load_layout("dense19")
+    moved = {"BackHand1": (0.2, 0.2), "BackHand2": (-0.25, -0.2)}
+    places = []
+    for one in designed.markers:
+        along, across = moved.get(one.name, (0.0, 0.0))
+        places.append(dataclasses.replace(one, along=one.along + along, across=one.across + across))
+    MarkerLayout("guessed", tuple(places), designed.radius).save(tmp_path / "guessed.toml")
+    setup = TrackerSetup.of(TrackSettings(glove=tmp_path / "guessed.toml", hands="right", labeler="dense19"))
+    tracker, sizing = setup.tracker(), LiveSizing(setup)
+    wrong = []
+    with pytest.warns(HandSimWarning) as told:
+        for frame in frames_of(take):
+            tracked = tracker.step(frame.points, frame.ids, frame.time)
+            sizing.step(frame, tracked, tracker)
+            true = take.labels[frame.number][np.isfinite(take.points[frame.number, :, 0])]
+            wrong.append((tracked.labels != true).mean())
+    change, *places = [str(one.message) for one in told]
+    assert change.startswith("the labels change for the right hand: BackHand1 ")
+    assert all("mm from where the layout has it" in one for one in places) and len(places) == 2
+    assert np.mean(wrong[:1200]) > 0.05 and np.mean(wrong[-60:]) < 0.002
+
+
 def found(length):
     """What a measurement gives that found a hand of a length [m]."""
 
-    def measure(settings, frames, before):
+    def measure(settings, frames, before, *, judges):
         calls.append(len(frames))
         user = TrackerSetup.of(TrackSettings(hands="right", size="M" if length < 0.19 else "XL")).user
         user = dataclasses.replace(user, notes="auto, measured")
@@ -189,7 +214,7 @@ def test_points_that_are_no_hand_are_measured_less_and_less_often(monkeypatch):
     setup = TrackerSetup.of(TrackSettings(hands="right"))
     sizing, tracker, calls = LiveSizing(setup), FakeTracker(setup.user), []
 
-    def measure(settings, frames, before):
+    def measure(settings, frames, before, *, judges):
         calls.append(len(frames))
         if len(calls) == 1:
             raise ArgumentError("the points fit hands at 0.001 of their size")
