@@ -1,8 +1,10 @@
-"""The report page of a layout's score: advice, labels with confusions, markers and joints."""
+"""The report page of a layout's score: advice, captures, labels with confusions, markers and joints."""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
+from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -14,27 +16,29 @@ from handsim.hand.shape import DIGITS, JOINTS
 from handsim.pages import NOTHING, Paint, Section, color_bar, color_scale, html_list, picture, write_sections
 from track.glove_score import METHODS, NOISE, LayoutScore, Trial
 from train.evaluation import percent, percent_between
-from train.reports.hand_plot import HAND_CAPTION, FlatHand, flat_hand, hand_picture, mistakes
+from train.reports.hand_plot import HAND_CAPTION, FlatHand, Mistake, flat_hand, hand_picture, mistakes
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _MOST: Final = 15.0  # end of the color scale [deg]
 _TRIALS: Final = (
-    "Shares of right slots and of completely right frames in short simulated captures of several people, "
+    "Labels that are wrong throughout a capture: those of markers that are right in fewer than half of its "
+    "frames, or else the probability of other labels that the take itself states. Shares of right slots "
+    "(mean, worst capture) and of completely right frames in short simulated captures of several people, "
     "labeled and tracked as by `handsim label` and `handsim track`, with measured but uncalibrated hands. "
     "Joints: root mean square error over all joints, of uncalibrated hands; the section on joints is on "
     "calibrated ones."
 )
-_PAIRS: Final = 5  # number of listed pairs of close markers
+_PAIRS: Final = 5  # number of listed pairs of close or similar markers
 
 
 def write_glove_page(path: Path, score: LayoutScore) -> None:
     """Write the page on a layout's score."""
     layout, nothing = score.layout, "No figure is beyond its threshold."
     sections = [
+        *([_captures_section(score)] if score.trials else []),
         Section("What to do", html_list(score.advice) if score.advice else nothing),
-        *([Section("Captures", _TRIALS, table=trial_rows(score.trials, layout))] if score.trials else []),
         _labels_section(score),
         _markers_section(score),
         _joints_section(score),
@@ -54,14 +58,53 @@ def write_glove_page(path: Path, score: LayoutScore) -> None:
 def trial_rows(trials: Mapping[str, Trial], layout: MarkerLayout) -> list[list[str]]:
     """Table of the simulated captures of each kind of work, header first."""
     rows = [
-        ["work", "label: slots, frames [%]", "track: slots, frames [%]", "worst marker", "joints [deg]",
-         "size off [mm]"]
+        ["work", "wrong throughout [%]", *(f"{name}: slots, worst, frames [%]" for name in METHODS),
+         "worst marker", "joints [deg]", "size off [mm]"]
     ]  # fmt: skip
     for work, trial in trials.items():
-        rights = [f"{percent(trial.share(name))}, {100 * trial.frames[name]:.0f}" for name in METHODS]
+        rights = [
+            f"{percent(trial.share(name))}, {percent(trial.least(name))}, {100 * trial.frames[name]:.0f}"
+            for name in METHODS
+        ]
         worst = f"{layout.names[trial.worst]} ({100 * trial.right[trial.worst]:.0f} %)"
-        rows.append([work, *rights, worst, f"{trial.joint_error:.1f}", f"{1e3 * trial.size_error:.1f}"])
+        rows.append(
+            [
+                work,
+                f"{100 * trial.wrong:.0f}",
+                *rights,
+                worst,
+                f"{trial.joint_error:.1f}",
+                f"{1e3 * trial.size_error:.1f}",
+            ]
+        )
     return rows
+
+
+def wrong_line(score: LayoutScore) -> str:
+    """Probability that labels are wrong throughout a capture, and what is likeliest to be, in a sentence."""
+    share, between = score.wrong
+    count = sum(len(trial.captures) for trial in score.trials.values())
+    likeliest = [f"{one.words} ({100 * one.probability:.1f} %)" for one in score.alternatives[:_PAIRS]]
+    return (
+        f"labels are wrong throughout a capture with a probability of {percent_between(share, between)} %, "
+        f"from {count} captures; most similar: {', '.join(likeliest) or 'no other labels fit nearly as well'}"
+    )
+
+
+def _captures_section(score: LayoutScore) -> Section:
+    """The captures of each kind of work, with the most similar labels on the hand."""
+    text = escape(wrong_line(score))
+    right = np.mean([trial.right for trial in score.trials.values()], axis=0)
+    arrows = [
+        Mistake(first, second, round(1e6 * one.probability), one.probability)
+        for one in score.alternatives
+        if len(one.markers) < score.layout.num_markers
+        for first, second in itertools.pairwise(one.markers)
+    ]
+    caption = f"{HAND_CAPTION}Arrows join markers whose labels may be exchanged, wider for the likelier ones."
+    drawn = [(hand_picture(score.layout, right, arrows), caption)] if arrows else []
+    table = trial_rows(score.trials, score.layout)
+    return Section("Captures", f"{text[0].upper()}{text[1:]}. {_TRIALS}", table=table, pictures=drawn)
 
 
 def _labels_section(score: LayoutScore) -> Section:

@@ -150,8 +150,8 @@ def score_glove(
 ) -> None:
     """Say how well a layout can be labeled and what it tells of each joint; nothing is trained.
 
-    Short captures of one hand, two apart and two that touch are simulated, and labeled and tracked as
-    `handsim label` and `handsim track` do with nothing calibrated: they are what to expect.
+    Short captures of hands apart, hands that touch and real-like motion are simulated, and labeled and
+    tracked as `handsim label` and `handsim track` do with nothing calibrated: they are what to expect.
 
     Args:
         glove: A .toml file or a shipped name.
@@ -161,11 +161,16 @@ def score_glove(
     page = Path(glove).with_suffix(".html") if out is None else out
     check_outputs([glove, settings.rig, settings.motion], [page], ".html")
     from track import glove_score
-    from track.glove_page import trial_rows, write_glove_page
+    from track.glove_page import trial_rows, write_glove_page, wrong_line
     from train.evaluation import percent, percent_between
 
     with named_steps("") as step:
         score = glove_score.score_glove(glove, settings, on_step=step)
+    if score.trials:
+        print_line(wrong_line(score))
+        print_line("captures, hands not calibrated; slots and whole frames that are right:")
+        print_table(trial_rows(score.trials, score.layout), left=6, wraps=True)
+    print_line("single frames, without tracking:")
     for title, report in (
         ("as the rig sees them", score.observed),
         ("with the paper's drops and ghosts", score.corrupted),
@@ -180,9 +185,6 @@ def score_glove(
         "joints of calibrated hands, frame by frame: standard deviation "
         f"{np.sqrt((joints**2).mean()):.1f} deg, the worst {joints.max():.1f} deg; {_palm_line(score.layout)}"
     )
-    if score.trials:
-        print_line("captures, hands not calibrated; slots and whole frames that are right:")
-        print_table(trial_rows(score.trials, score.layout), left=6, wraps=True)
     print_line(*(f"{number}. {sentence}" for number, sentence in enumerate(score.advice, 1)))
     write_glove_page(page, score)
     print_line(f"{page}: the hand with its confusions, markers and joints")
