@@ -112,7 +112,7 @@ def chosen_layouts() -> list[MarkerLayout]:
     """Twelve layouts of 6 to 19 markers: six shipped ones, and six with what makes layouts hard."""
     tips, ends = ([_on(digit, 3, 0.7) for digit in DIGITS], [_on(digit, 2, 0.9) for digit in DIGITS])
     knuckles, firsts = ([_on(digit, 1, along) for digit in DIGITS[1:]] for along in (0.55, 0.1))
-    back = _back(*product((0.15, 0.45, 0.8), (0.22, -0.22)))
+    back = _back(*product((0.25, 0.6, 0.85), (0.1, -0.2)))
     palm = [replace(one, name=f"Palm{number}", around=np.pi) for number, one in enumerate(back, 1)]
     made = {
         "palmback12": [*back, *palm],

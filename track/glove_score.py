@@ -41,7 +41,7 @@ from train.forecast.settings import POSES, TWINS, ScoreGloveSettings
 from train.labelers.layout_labeler import LayoutLabeler
 from train.labelers.pose_prior import SideClassifier
 from train.labelers.protocol import Labeler
-from train.labelers.storage import load_labeler
+from train.labelers.storage import load_labeler, untrained_labeler
 from train.reports.hand_plot import mistakes
 from train.simulation.scenes import SimulatedKind
 from train.simulation.takes import simulate_take
@@ -203,7 +203,8 @@ def score_glove(
     on_step("simulating hands")
     hands, seen = _hands(chosen, layout, rig, rng)
     on_step("learning the layout, about a minute the first time")
-    labeler = load_labeler(layout, chosen.labeler)
+    given = chosen.labeler
+    labeler = untrained_labeler(layout) if given is None else load_labeler(layout, given)
     on_step("labeling")
     score = score_layout(layout, hands, labeler, rng=rng)
     trials = try_layout(

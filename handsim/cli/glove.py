@@ -42,8 +42,8 @@ def list_glove(out: Path | None = None) -> None:
         rows.append([name, str(shipped.layout.num_markers), labeler, text])
     print_table(rows, left=4, wraps=True)
     print_line(
-        "The labeler for any layout needs no training. A better one of its own for NAME: handsim generate "
-        "--glove NAME --out SET && handsim train SET --out RUN, then give --labeler RUN."
+        "The labeler for any layout needs no training. One of its own for NAME: handsim generate --glove "
+        "NAME --out SET && handsim train SET --out RUN, which says whether to use it (--labeler RUN)."
     )
     if out is not None:
         from gloves.fit import nominal_fit

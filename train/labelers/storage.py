@@ -135,7 +135,9 @@ def load_labeler(
         return _resolved(glove)
     layout = load_layout(glove)  # type: ignore[arg-type]
     if labeler is None:
-        return _shipped_labeler(layout) or _any_layout_labeler(layout, glove)  # type: ignore[arg-type]
+        if _shipped_labeler(layout) is None:
+            _warn_untrained(layout, glove)  # type: ignore[arg-type]
+        return untrained_labeler(layout)
     if labeler == ANY_LAYOUT:
         from train.labelers.layout_labeler import learned_labeler  # torch
 
@@ -196,9 +198,16 @@ def _shipped_labeler(layout: MarkerLayout) -> Labeler | None:
     return next((_read(*_files(name)).labeler() for name in found), None)
 
 
-def _any_layout_labeler(layout: MarkerLayout, glove: MarkerLayout | str | Path) -> Labeler:
-    """The labeler for any layout, with a warning that the glove has no trained one."""
-    from train.labelers.layout_labeler import is_learned, learned_labeler  # torch
+def untrained_labeler(layout: MarkerLayout) -> Labeler:
+    """The labeler that a glove has without training: the shipped one, or the one for any layout."""
+    from train.labelers.layout_labeler import learned_labeler  # torch
+
+    return _shipped_labeler(layout) or learned_labeler(layout)
+
+
+def _warn_untrained(layout: MarkerLayout, glove: MarkerLayout | str | Path) -> None:
+    """Warn that the glove has no trained labeler, and of a glove that is nearly its own mirror image."""
+    from train.labelers.layout_labeler import is_learned  # torch
     from train.labelers.pose_prior import is_mirror_like  # kernels
 
     own = isinstance(glove, MarkerLayout) and layout not in map(load_layout, list_layouts())
@@ -209,9 +218,9 @@ def _any_layout_labeler(layout: MarkerLayout, glove: MarkerLayout | str | Path) 
         else "learns it now, once, in about a minute of an idle core"
     )
     warnings.warn(
-        f"no labeler was trained on glove '{name}', so that the one for any layout labels it, which {how}; a "
-        f"better one takes handsim generate --glove {'GLOVE.toml' if own else name} --out SET && handsim "
-        "train SET --out RUN, and --labeler RUN",
+        f"no labeler was trained on glove '{name}', so that the one for any layout labels it, which {how}; "
+        f"handsim generate --glove {'GLOVE.toml' if own else name} --out SET && handsim train SET --out RUN "
+        "trains one and says which of the two is better",
         HandSimWarning,
         stacklevel=3,
     )
@@ -222,7 +231,6 @@ def _any_layout_labeler(layout: MarkerLayout, glove: MarkerLayout | str | Path) 
             HandSimWarning,
             stacklevel=3,
         )
-    return learned_labeler(layout)
 
 
 def shipped_labelers() -> tuple[str, ...]:
