@@ -30,7 +30,7 @@ _TRIALS: Final = (
     "Joints: root mean square error over all joints, of uncalibrated hands; the section on joints is on "
     "calibrated ones."
 )
-_PAIRS: Final = 5  # number of listed pairs of close or similar markers
+_PAIRS: Final = 5  # number of listed similar labels
 
 
 def write_glove_page(path: Path, score: LayoutScore) -> None:
@@ -118,7 +118,7 @@ def _labels_section(score: LayoutScore) -> Section:
     caption = f"{HAND_CAPTION}Arrows lead from true to given labels, wider for more points."
     people = score.observed.num_groups
     over = f" Intervals of 95 % are over {people} people." if people > 1 else ""
-    text = f"Left and right are told apart in {percent(score.sides_right)} % of the frames.{over}"
+    text = f"Labels of single frames, without tracking.{over}"
     drawn = hand_picture(score.layout, accuracy, arrows)
     return Section("Labels", text, table=table, pictures=[(drawn, caption)])
 
@@ -126,26 +126,14 @@ def _labels_section(score: LayoutScore) -> Section:
 def _markers_section(score: LayoutScore) -> Section:
     names, accuracy = score.layout.names, score.observed.slot_accuracy_by_marker
     worst = {mistake.truth: mistake for mistake in reversed(mistakes(score.observed.confusion, 200))}
-    lost = np.rad2deg((score.joints_without - score.joints).max(axis=1))
-    table = [["marker", "seen [%]", "slots right [%]", "taken for", "of its points [%]", "joints lose [deg]"]]
+    table = [["marker", "seen [%]", "slots right [%]", "taken for", "of its points [%]"]]
     for number, name in enumerate(names):
         mistake = worst.get(number)
         taken = (names[mistake.called], percent(mistake.share)) if mistake else (NOTHING, NOTHING)
         shares = percent(score.seen[number]), percent(accuracy[number])
-        table.append([name, *shares, *taken, f"{lost[number]:.1f}"])
-    text = (
-        "Seen: share of frames in which the marker has a point. Joints lose: largest increase of a joint's "
-        "standard deviation without the marker."
-    )
-    near = np.triu(score.near)
-    order = np.argsort(-near, axis=None, kind="stable")[:_PAIRS]
-    pairs = "; ".join(
-        f"{names[first]} and {names[second]}: {percent(near[first, second])} %"
-        for first, second in zip(*np.unravel_index(order, near.shape), strict=True)
-        if near[first, second] > 0.0
-    )
-    notes = [f"Pairs that touch or nearly do, in shares of the frames: {pairs}."] if pairs else []
-    return Section("Markers", text, table=table, notes=notes)
+        table.append([name, *shares, *taken])
+    text = "Seen: share of frames in which the marker has a point."
+    return Section("Markers", text, table=table)
 
 
 def _joints_section(score: LayoutScore) -> Section:

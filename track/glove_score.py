@@ -25,9 +25,8 @@ from gloves.takes.take import Take, load_take
 from handsim.callbacks import OnStep, no_step
 from handsim.errors import HandSimWarning
 from handsim.hand.model import HandModel
-from handsim.hand.shape import BONE_NAMES, BONES, DIGITS, JOINTS, NUM_JOINTS, PALM, Side
+from handsim.hand.shape import BONE_NAMES, BONES, DIGITS, JOINTS, NUM_JOINTS, PALM
 from handsim.space.rig import CameraRig, load_rig
-from handsim.space.transforms import MIRROR
 from track.alternatives.alternatives import Alternative, doubts_of
 from track.captures import label_capture, track_capture
 from track.kinematics import pose_solver
@@ -39,7 +38,6 @@ from train.evaluation import LabelCounts, LabelingReport, cloud_frames, evaluate
 from train.forecast.rig_forecast import ObservedHand, observe_motion, observe_poses
 from train.forecast.settings import POSES, TWINS, ScoreGloveSettings
 from train.labelers.layout_labeler import LayoutLabeler
-from train.labelers.pose_prior import SideClassifier
 from train.labelers.protocol import Labeler
 from train.labelers.storage import load_labeler, untrained_labeler
 from train.reports.hand_plot import mistakes
@@ -61,7 +59,6 @@ SIDES_EXCHANGED: Final = "left and right are exchanged"
 NOISE: Final = 0.0015
 """Standard deviation of markers around a calibrated hand [m], from optics and moving skin."""
 _TWIN_FRAMES: Final = 600  # frames of each simulated motion
-_NEAR: Final = 0.003  # [m] gap between two markers' surfaces at which gloves and blobs touch
 _SOME_FRAMES: Final = 600  # frames from which joints and sides are judged
 _IN_LINE: Final = 1e-8  # [m^2] Markers with less information about a rotation are in a line.
 
@@ -70,7 +67,6 @@ _UNINFORMED: Final = 0.6  # ratio of a joint's spread to that of an unseen joint
 _SELDOM: Final = 0.02  # share of points, frames or captures in which labels are wrong or markers touch
 _OFTEN: Final = 0.1  # share of frames in which a marker is hidden, or too few markers are seen
 _AT_ONCE: Final = 0.75  # With a smaller share of its markers a hand is seldom found at once.
-_DISPENSABLE: Final = np.deg2rad(0.3)  # [rad] A marker is dispensable if no joint's spread grows more.
 _MOST_OF_A_KIND: Final = 4  # sentences of one kind
 
 
@@ -133,14 +129,8 @@ class LayoutScore:
     """Share of the frames in which each marker is seen by two cameras and becomes a point."""
     few_seen: float
     """Share of the frames in which fewer than three quarters of the markers are seen."""
-    near: Float[np.ndarray, "M M"]
-    """Share of the frames in which two markers touch or nearly do."""
     joints: Float[np.ndarray, "20"]
     """Standard deviation of each joint of a calibrated hand, given the markers [rad]."""
-    joints_without: Float[np.ndarray, "M 20"]
-    """The same without each marker [rad]."""
-    sides_right: float
-    """Share of the frames in which left and right are distinguished by the labeled markers."""
     trials: Mapping[str, Trial] = field(default_factory=dict)
     """Results on simulated captures by kind of work; empty if none was tried."""
     is_trained: bool = False
@@ -166,7 +156,7 @@ class LayoutScore:
     @property
     def advice(self) -> tuple[str, ...]:
         """Sentences on what to move, add or drop, the most important first."""
-        kinds = (_alternatives, _captures, _confusions, _joints, _hidden, _touching, _sides, _dispensable)
+        kinds = (_alternatives, _captures, _confusions, _joints, _hidden)
         found: list[_Advice] = []
         for kind in kinds:
             found += sorted(kind(self), key=lambda advice: -advice[0])[:_MOST_OF_A_KIND]
@@ -242,10 +232,7 @@ def score_layout(
     center = markers.mean(axis=1, keepdims=True)
     nothing = Corruption(occlude=0, ghosts=0)
     cloud = corrupt(observed - center, nothing, ghosts=ghosts - center, rng=rng)
-    recipe, some = paper_corruption(layout.num_markers), _some(hands)
-    apart = np.linalg.norm(markers[:, :, None] - markers[:, None], axis=-1)
-    near: Float[np.ndarray, "M M"] = (apart < 2.0 * layout.radius + _NEAR).mean(axis=0)
-    np.fill_diagonal(near, 0.0)
+    recipe = paper_corruption(layout.num_markers)
     # People differ in length; both hands of one are alike.
     _, person = np.unique([hand.fit.shape.length for hand in hands], return_inverse=True)
     people = np.repeat(person, [len(hand.qpos) for hand in hands])
@@ -258,12 +245,10 @@ def score_layout(
         )
     )
     is_seen = np.isfinite(observed[..., 0])
-    without = np.array([joint_spreads(some, without=marker) for marker in range(layout.num_markers)])
+    few_seen = float((is_seen.mean(axis=1) < _AT_ONCE).mean())
     return LayoutScore(
-        layout, seen, clean, corrupted, is_seen.mean(axis=0),
-        float((is_seen.mean(axis=1) < _AT_ONCE).mean()), near, joint_spreads(some), without,
-        _sides_right(layout, hands, rng),
-    )  # fmt: skip
+        layout, seen, clean, corrupted, is_seen.mean(axis=0), few_seen, joint_spreads(_some(hands))
+    )
 
 
 def _some(hands: Sequence[ObservedHand]) -> list[ObservedHand]:
@@ -275,27 +260,9 @@ def _some(hands: Sequence[ObservedHand]) -> list[ObservedHand]:
     ]
 
 
-def _sides_right(layout: MarkerLayout, hands: Sequence[ObservedHand], rng: np.random.Generator) -> float:
-    """Share of the frames whose side is recognized from the seen markers with their true labels."""
-    classifier, right, count = SideClassifier(layout, rng=rng), 0, 0
-    for hand in _some(hands):
-        observed, side = hand.frames.observed, hand.fit.side
-        other: Side = "left" if side == "right" else "right"
-        for markers, one in ((observed, side), (observed @ MIRROR, other)):
-            right += int(classifier.recognized(markers, one).sum())
-            count += len(markers)
-    return right / max(1, count)
-
-
-def joint_spreads(hands: Iterable[ObservedHand], *, without: int | None = None) -> Float[np.ndarray, "20"]:
-    """`layout_spreads` of observed hands, optionally without one marker."""
-    parts = []
-    for hand in hands:
-        seen = np.isfinite(hand.frames.observed[..., 0])
-        if without is not None:
-            seen[:, without] = False
-        parts.append((hand.fit, hand.qpos, seen))
-    return layout_spreads(parts)
+def joint_spreads(hands: Iterable[ObservedHand]) -> Float[np.ndarray, "20"]:
+    """`layout_spreads` of observed hands."""
+    return layout_spreads((hand.fit, hand.qpos, np.isfinite(hand.frames.observed[..., 0])) for hand in hands)
 
 
 def layout_spreads(
@@ -353,11 +320,9 @@ def try_layout(
     labeler: Labeler,
     *,
     count: int = CAPTURES,
-    first: int = 0,
-    frames: int = FRAMES,
     told: Callable[[str], None] = no_step,
 ) -> dict[str, Trial]:
-    """Label and track simulated captures, from number `first` + 1 on, of each kind of work the glove allows.
+    """Label and track some simulated captures of each kind of work that the glove allows.
 
     `told` is called with a description before each capture.
     """
@@ -367,7 +332,7 @@ def try_layout(
         tried = []
         for number in range(1, count + 1):
             told(f"{name}, capture {number} of {count}")
-            take = simulate_take(kind, glove=layout, num_frames=frames, rig=rig, seed=first + number)
+            take = simulate_take(kind, glove=layout, num_frames=FRAMES, rig=rig, seed=number)
             tried.append(try_take(take, layout, labeler))
         found[name] = mean_trial(tried)
     return found
@@ -577,40 +542,6 @@ def _hidden(score: LayoutScore) -> Iterator[_Advice]:
             )
 
 
-def _touching(score: LayoutScore) -> Iterator[_Advice]:
-    """Advice on touching pairs of one digit; tips of two digits touch whatever the layout."""
-    names, digits = score.layout.names, [digit_of(marker) for marker in score.layout.markers]
-    for first, second in zip(*np.nonzero(np.triu(score.near) > _SELDOM), strict=True):
-        share = float(score.near[first, second])
-        if digits[first] == digits[second]:
-            yield (
-                share,
-                f"Move {names[first]} and {names[second]} apart: they touch, or nearly, in "
-                f"{100 * share:.0f} % of the frames, and their blobs merge.",
-            )
-
-
 def digit_of(place: MarkerPlace) -> int:
     """The digit that a marker is on."""
     return BONES[BONE_NAMES.index(place.bone)].digit
-
-
-def _sides(score: LayoutScore) -> Iterator[_Advice]:
-    if score.sides_right < 1.0 - _SELDOM:
-        yield (
-            1.0 - score.sides_right,
-            f"Make the back of the hand less symmetric: left and right are mistaken in "
-            f"{100 * (1.0 - score.sides_right):.0f} % of the frames.",
-        )
-
-
-def _dispensable(score: LayoutScore) -> Iterator[_Advice]:
-    grown: Float[np.ndarray, "M"] = (score.joints_without - score.joints).max(axis=1)
-    for marker in np.argsort(grown):
-        if grown[marker] < _DISPENSABLE:
-            yield (
-                0.0,
-                f"{score.layout.names[marker]} can be dropped as far as joints go: without it none is known "
-                f"worse by more than {np.rad2deg(grown[marker]):.1f} deg. It may still help to tell the "
-                "others apart.",
-            )

@@ -178,8 +178,7 @@ def score_glove(
     ):
         share = percent_between(report.figures["slot_accuracy"], report.interval())
         print_line(f"{share} % of the slots right {title}")
-    sides = f"{percent(score.sides_right)} % of the hands told left from right"
-    print_line(f"{percent(score.seen.mean())} % of the markers seen; {sides}")
+    print_line(f"{percent(score.seen.mean())} % of the markers seen")
     joints = np.rad2deg(score.joints)
     print_line(
         "joints of calibrated hands, frame by frame: standard deviation "

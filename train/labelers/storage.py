@@ -135,9 +135,7 @@ def load_labeler(
         return _resolved(glove)
     layout = load_layout(glove)  # type: ignore[arg-type]
     if labeler is None:
-        if _shipped_labeler(layout) is None:
-            _warn_untrained(layout, glove)  # type: ignore[arg-type]
-        return untrained_labeler(layout)
+        return _shipped_labeler(layout) or _any_layout_labeler(layout, glove)  # type: ignore[arg-type]
     if labeler == ANY_LAYOUT:
         from train.labelers.layout_labeler import learned_labeler  # torch
 
@@ -200,14 +198,12 @@ def _shipped_labeler(layout: MarkerLayout) -> Labeler | None:
 
 def untrained_labeler(layout: MarkerLayout) -> Labeler:
     """The labeler that a glove has without training: the shipped one, or the one for any layout."""
-    from train.labelers.layout_labeler import learned_labeler  # torch
-
-    return _shipped_labeler(layout) or learned_labeler(layout)
+    return _shipped_labeler(layout) or load_labeler(layout, ANY_LAYOUT)
 
 
-def _warn_untrained(layout: MarkerLayout, glove: MarkerLayout | str | Path) -> None:
-    """Warn that the glove has no trained labeler, and of a glove that is nearly its own mirror image."""
-    from train.labelers.layout_labeler import is_learned  # torch
+def _any_layout_labeler(layout: MarkerLayout, glove: MarkerLayout | str | Path) -> Labeler:
+    """The labeler for any layout, with a warning that the glove has no trained one."""
+    from train.labelers.layout_labeler import is_learned, learned_labeler  # torch
     from train.labelers.pose_prior import is_mirror_like  # kernels
 
     own = isinstance(glove, MarkerLayout) and layout not in map(load_layout, list_layouts())
@@ -231,6 +227,7 @@ def _warn_untrained(layout: MarkerLayout, glove: MarkerLayout | str | Path) -> N
             HandSimWarning,
             stacklevel=3,
         )
+    return learned_labeler(layout)
 
 
 def shipped_labelers() -> tuple[str, ...]:
