@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 
 _MOST: Final = 15.0  # end of the color scale [deg]
 _TRIALS: Final = (
-    "Labels that are wrong throughout a capture: those of markers that are right in fewer than half of its "
-    "frames, or else the probability of other labels that the take itself states. Shares of right slots "
+    "A capture is wrong throughout if some marker is right in fewer than half of its frames; other captures "
+    "count with the probability of other labels that the take itself states. Shares of right slots "
     "(mean, worst capture) and of completely right frames in short simulated captures of several people, "
     "labeled and tracked as by `handsim label` and `handsim track`, with measured but uncalibrated hands. "
     "Joints: root mean square error over all joints, of uncalibrated hands; the section on joints is on "
@@ -58,7 +58,7 @@ def write_glove_page(path: Path, score: LayoutScore) -> None:
 def trial_rows(trials: Mapping[str, Trial], layout: MarkerLayout) -> list[list[str]]:
     """Table of the simulated captures of each kind of work, header first."""
     rows = [
-        ["work", "wrong throughout [%]", *(f"{name}: slots, worst, frames [%]" for name in METHODS),
+        ["work", "wrong captures [%]", *(f"{name}: slots, worst, frames [%]" for name in METHODS),
          "worst marker", "joints [deg]", "size off [mm]"]
     ]  # fmt: skip
     for work, trial in trials.items():
@@ -81,12 +81,13 @@ def trial_rows(trials: Mapping[str, Trial], layout: MarkerLayout) -> list[list[s
 
 
 def wrong_line(score: LayoutScore) -> str:
-    """Probability that labels are wrong throughout a capture, and what is likeliest to be, in a sentence."""
-    share, between = score.wrong
+    """A sentence: the probability that labels are wrong throughout a capture, and the most similar labels."""
+    share, ends = score.wrong
+    between = " to ".join(f"{100 * end:.0f}" for end in ends)
     count = sum(len(trial.captures) for trial in score.trials.values())
     likeliest = [f"{one.words} ({100 * one.probability:.1f} %)" for one in score.alternatives[:_PAIRS]]
     return (
-        f"labels are wrong throughout a capture with a probability of {percent_between(share, between)} %, "
+        f"labels are wrong throughout a capture with a probability of {100 * share:.0f} % ({between}), "
         f"from {count} captures; most similar: {', '.join(likeliest) or 'no other labels fit nearly as well'}"
     )
 

@@ -460,17 +460,10 @@ def _alternatives(score: LayoutScore) -> Iterator[_Advice]:
     """Advice on markers whose labels are wrong throughout a capture."""
     for one in score.alternatives:
         if one.probability >= _SELDOM:
-            is_whole = len(one.markers) == score.layout.num_markers
-            what = "one of them" if len(one.markers) > 1 else "it"
             yield (
                 one.probability,
                 f"{one.words[0].upper()}{one.words[1:]} in whole captures with a probability of "
-                f"{100 * one.probability:.0f} %: "
-                + (
-                    "make the back of the hand less symmetric."
-                    if is_whole
-                    else f"move {what} to where no other label fits."
-                ),
+                f"{100 * one.probability:.0f} %: move a marker to where no other label fits.",
             )
 
 
