@@ -88,8 +88,12 @@ def summary(rows: dict[str, dict[str, tuple[list[Row], list[Row]]]]) -> Figures:
                 f"captures {listed}"
             )
     for name, works in rows.items():
-        pairs = [[np.mean([one["wrong"] for one in part]) for part in parts] for parts in works.values()]
-        wrong.append(np.mean(pairs, axis=0))
+        said = [one["wrong"] for told_of, _ in works.values() for one in told_of]
+        # A capture that one of the two methods labels wrong throughout says so with a probability of a half.
+        true = [
+            any(share >= 0.5 for _, share in one["said"]) for _, others in works.values() for one in others
+        ]
+        wrong.append(np.array([np.mean(said), np.mean(true)]))
         print(
             f"{name}: wrong throughout {100 * wrong[-1][0]:.1f} % forecast, {100 * wrong[-1][1]:.1f} % found"
         )
