@@ -3,9 +3,8 @@
     python examples/05_train_for_your_own_glove.py
 
 The labeler is measured on people that it was not trained on. Training set and network are small, so that
-this takes twenty seconds; `handsim generate` and `handsim train` make a better one (docs/labeling.md). To
-begin with, a glove of your own needs no training set: `load_labeler(glove)` is then the labeler for any
-layout.
+this takes twenty seconds; `handsim generate` and `handsim train` take larger ones, and say whether the result
+is better than what a glove of your own has without training, the labeler for any layout (docs/labeling.md).
 """
 
 from __future__ import annotations

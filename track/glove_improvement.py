@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-import torch
 from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
@@ -44,11 +43,9 @@ from track.glove_score import (
 )
 from track.user import AnyGlove
 from train.data.batches import Corruption, corrupt
-from train.evaluation import LabelCounts
+from train.evaluation import cloud_frames, evaluate_frames
 from train.forecast.settings import ImproveGloveSettings
-from train.labelers.layout_labeler import learned_labeler, mean_features, shipped_network
-from train.labelers.matching import match_probabilities, pair_probabilities
-from train.labelers.protocol import labeling_threads
+from train.labelers.layout_labeler import LayoutLabeler, learned_labeler, mean_features, shipped_network
 from train.simulation.training_frames import GenerateSettings, sample_hands, sample_single_hand
 
 _PEOPLE, _POSES_EACH = 40, 40
@@ -230,7 +227,7 @@ class WornPlaces:
         self, num_people: int, poses_each: int, radius: float, rig: CameraRig, *, rng: np.random.Generator
     ) -> None:
         config = GenerateSettings()
-        self._radius, self._rig, self._rng = radius, rig, rng
+        self.radius, self._rig, self._rng = radius, rig, rng
         self._slip = config.slip_along, float(np.deg2rad(config.slip_around))
         self._people: list[tuple[HandModel, Float[np.ndarray, "T 27"], Float[np.ndarray, "T L 4 4"]]] = []
         for _ in range(num_people):
@@ -240,7 +237,7 @@ class WornPlaces:
 
     def put_on(self, places: Sequence[MarkerPlace]) -> Columns:
         """Attach markers to all hands, each slipped a little; raises a `LayoutError` off a hand's skin."""
-        glove, (along, around) = layout_of(places, self._radius), self._slip
+        glove, (along, around) = layout_of(places, self.radius), self._slip
         positions, seen, worn = [], [], []
         for model, qpos, bones in self._people:
             one = wear(glove, model, along=along, around=around, rng=self._rng)
@@ -259,7 +256,7 @@ class WornPlaces:
         poses_each = len(self._people[0][1])
         step = max(1, poses_each // _JOINT_POSES)
         parts = []
-        layout = MarkerLayout("places", columns.places, self._radius)
+        layout = MarkerLayout("places", columns.places, self.radius)
         for number, ((model, qpos, _), worn) in enumerate(zip(self._people, columns.worn, strict=True)):
             seen = columns.seen[number * poses_each : (number + 1) * poses_each : step]
             parts.append((GloveFit(model, Attachment(layout, **worn)), qpos[::step], seen))
@@ -279,19 +276,9 @@ def judge(people: WornPlaces, layout: Columns, *, seed: int) -> Worth:
     observed = np.where(layout.seen[::step, :, None], points, np.nan)
     half = len(layout.places) // 8  # The rig loses few: add half of the paper's occlusions.
     cloud = corrupt(observed, Corruption(occlude=half, ghosts=_GHOSTS), rng=rng)
-    with torch.inference_mode(), labeling_threads():
-        scores = network(
-            torch.from_numpy(cloud.points.astype(np.float32)), torch.from_numpy(cloud.present), features
-        )[-1]
-    count, right = len(layout.places), np.zeros(len(layout.places))
-    counts = LabelCounts()
-    for by_point, by_label, here, truth in zip(
-        scores.points.numpy(), scores.labels.numpy(), cloud.present, cloud.truth, strict=True
-    ):
-        of_points = np.concatenate([by_label[:, :-1][:, here], by_label[:, -1:]], axis=1)
-        labels = match_probabilities(pair_probabilities(by_point[here], of_points))
-        right += counts.add(labels, truth[here], count)
-    by_marker = right / len(cloud.truth)
+    worn = MarkerLayout("places", layout.places, people.radius)
+    report = evaluate_frames(LayoutLabeler(worn, network, features, None), [cloud_frames(cloud)])
+    by_marker = report.slot_accuracy_by_marker
     spreads = people.joint_spreads(layout)
     return Worth(float(by_marker.mean()), float(np.sqrt((spreads**2).mean())), by_marker)
 

@@ -1,8 +1,10 @@
-"""The report page of a layout's score: advice, labels with confusions, markers and joints."""
+"""The report page of a layout's score: advice, captures, labels with confusions, markers and joints."""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
+from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -14,27 +16,29 @@ from handsim.hand.shape import DIGITS, JOINTS
 from handsim.pages import NOTHING, Paint, Section, color_bar, color_scale, html_list, picture, write_sections
 from track.glove_score import METHODS, NOISE, LayoutScore, Trial
 from train.evaluation import percent, percent_between
-from train.reports.hand_plot import HAND_CAPTION, FlatHand, flat_hand, hand_picture, mistakes
+from train.reports.hand_plot import HAND_CAPTION, FlatHand, Mistake, flat_hand, hand_picture, mistakes
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _MOST: Final = 15.0  # end of the color scale [deg]
 _TRIALS: Final = (
-    "Shares of right slots and of completely right frames in short simulated captures of several people, "
+    "A capture is wrong throughout if some marker is right in fewer than half of its frames; other captures "
+    "count with the probability of other labels that the take itself states. Shares of right slots "
+    "(mean, worst capture) and of completely right frames in short simulated captures of several people, "
     "labeled and tracked as by `handsim label` and `handsim track`, with measured but uncalibrated hands. "
     "Joints: root mean square error over all joints, of uncalibrated hands; the section on joints is on "
     "calibrated ones."
 )
-_PAIRS: Final = 5  # number of listed pairs of close markers
+_PAIRS: Final = 5  # number of listed similar labels
 
 
 def write_glove_page(path: Path, score: LayoutScore) -> None:
     """Write the page on a layout's score."""
     layout, nothing = score.layout, "No figure is beyond its threshold."
     sections = [
+        *([_captures_section(score)] if score.trials else []),
         Section("What to do", html_list(score.advice) if score.advice else nothing),
-        *([Section("Captures", _TRIALS, table=trial_rows(score.trials, layout))] if score.trials else []),
         _labels_section(score),
         _markers_section(score),
         _joints_section(score),
@@ -54,14 +58,54 @@ def write_glove_page(path: Path, score: LayoutScore) -> None:
 def trial_rows(trials: Mapping[str, Trial], layout: MarkerLayout) -> list[list[str]]:
     """Table of the simulated captures of each kind of work, header first."""
     rows = [
-        ["work", "label: slots, frames [%]", "track: slots, frames [%]", "worst marker", "joints [deg]",
-         "size off [mm]"]
+        ["work", "wrong captures [%]", *(f"{name}: slots, worst, frames [%]" for name in METHODS),
+         "worst marker", "joints [deg]", "size off [mm]"]
     ]  # fmt: skip
     for work, trial in trials.items():
-        rights = [f"{percent(trial.share(name))}, {100 * trial.frames[name]:.0f}" for name in METHODS]
+        rights = [
+            f"{percent(trial.share(name))}, {percent(trial.least(name))}, {100 * trial.frames[name]:.0f}"
+            for name in METHODS
+        ]
         worst = f"{layout.names[trial.worst]} ({100 * trial.right[trial.worst]:.0f} %)"
-        rows.append([work, *rights, worst, f"{trial.joint_error:.1f}", f"{1e3 * trial.size_error:.1f}"])
+        rows.append(
+            [
+                work,
+                f"{100 * trial.wrong:.0f}",
+                *rights,
+                worst,
+                f"{trial.joint_error:.1f}",
+                f"{1e3 * trial.size_error:.1f}",
+            ]
+        )
     return rows
+
+
+def wrong_line(score: LayoutScore) -> str:
+    """A sentence: the probability that labels are wrong throughout a capture, and the most similar labels."""
+    share, ends = score.wrong
+    between = " to ".join(f"{100 * end:.0f}" for end in ends)
+    count = sum(len(trial.captures) for trial in score.trials.values())
+    likeliest = [f"{one.words} ({100 * one.probability:.1f} %)" for one in score.alternatives[:_PAIRS]]
+    return (
+        f"labels are wrong throughout a capture with a probability of {100 * share:.0f} % ({between}), "
+        f"from {count} captures; most similar: {', '.join(likeliest) or 'no other labels fit nearly as well'}"
+    )
+
+
+def _captures_section(score: LayoutScore) -> Section:
+    """The captures of each kind of work, with the most similar labels on the hand."""
+    text = escape(wrong_line(score))
+    right = np.mean([trial.right for trial in score.trials.values()], axis=0)
+    arrows = [
+        Mistake(first, second, round(1e6 * one.probability), one.probability)
+        for one in score.alternatives
+        if len(one.markers) < score.layout.num_markers
+        for first, second in itertools.pairwise(one.markers)
+    ]
+    caption = f"{HAND_CAPTION}Arrows join markers whose labels may be exchanged, wider for the likelier ones."
+    drawn = [(hand_picture(score.layout, right, arrows), caption)] if arrows else []
+    table = trial_rows(score.trials, score.layout)
+    return Section("Captures", f"{text[0].upper()}{text[1:]}. {_TRIALS}", table=table, pictures=drawn)
 
 
 def _labels_section(score: LayoutScore) -> Section:
@@ -75,7 +119,7 @@ def _labels_section(score: LayoutScore) -> Section:
     caption = f"{HAND_CAPTION}Arrows lead from true to given labels, wider for more points."
     people = score.observed.num_groups
     over = f" Intervals of 95 % are over {people} people." if people > 1 else ""
-    text = f"Left and right are told apart in {percent(score.sides_right)} % of the frames.{over}"
+    text = f"Labels of single frames, without tracking.{over}"
     drawn = hand_picture(score.layout, accuracy, arrows)
     return Section("Labels", text, table=table, pictures=[(drawn, caption)])
 
@@ -83,26 +127,14 @@ def _labels_section(score: LayoutScore) -> Section:
 def _markers_section(score: LayoutScore) -> Section:
     names, accuracy = score.layout.names, score.observed.slot_accuracy_by_marker
     worst = {mistake.truth: mistake for mistake in reversed(mistakes(score.observed.confusion, 200))}
-    lost = np.rad2deg((score.joints_without - score.joints).max(axis=1))
-    table = [["marker", "seen [%]", "slots right [%]", "taken for", "of its points [%]", "joints lose [deg]"]]
+    table = [["marker", "seen [%]", "slots right [%]", "taken for", "of its points [%]"]]
     for number, name in enumerate(names):
         mistake = worst.get(number)
         taken = (names[mistake.called], percent(mistake.share)) if mistake else (NOTHING, NOTHING)
         shares = percent(score.seen[number]), percent(accuracy[number])
-        table.append([name, *shares, *taken, f"{lost[number]:.1f}"])
-    text = (
-        "Seen: share of frames in which the marker has a point. Joints lose: largest increase of a joint's "
-        "standard deviation without the marker."
-    )
-    near = np.triu(score.near)
-    order = np.argsort(-near, axis=None, kind="stable")[:_PAIRS]
-    pairs = "; ".join(
-        f"{names[first]} and {names[second]}: {percent(near[first, second])} %"
-        for first, second in zip(*np.unravel_index(order, near.shape), strict=True)
-        if near[first, second] > 0.0
-    )
-    notes = [f"Pairs that touch or nearly do, in shares of the frames: {pairs}."] if pairs else []
-    return Section("Markers", text, table=table, notes=notes)
+        table.append([name, *shares, *taken])
+    text = "Seen: share of frames in which the marker has a point."
+    return Section("Markers", text, table=table)
 
 
 def _joints_section(score: LayoutScore) -> Section:

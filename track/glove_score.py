@@ -1,12 +1,13 @@
 """The score of a marker layout from simulation: labels, joints, simulated captures, and advice.
 
-Captures are short: simulated people wear the glove, and are labeled and tracked like users. Nothing is
-calibrated: hands are measured in each capture, as `handsim label` and `handsim track` do.
+Captures are short: simulated people wear the glove, and each capture is labeled and tracked by the calls of
+`handsim label` and `handsim track`. Nothing is calibrated.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -16,6 +17,7 @@ from typing import Any, Final
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.stats import beta
 
 from gloves.fit import GloveFit, attach_markers
 from gloves.layout import FEWEST_MARKERS, MarkerLayout, MarkerPlace, load_layout
@@ -23,10 +25,10 @@ from gloves.takes.take import Take, load_take
 from handsim.callbacks import OnStep, no_step
 from handsim.errors import HandSimWarning
 from handsim.hand.model import HandModel
-from handsim.hand.shape import BONE_NAMES, BONES, DIGITS, JOINTS, NUM_JOINTS, PALM, Side
+from handsim.hand.shape import BONE_NAMES, BONES, DIGITS, JOINTS, NUM_JOINTS, PALM
 from handsim.space.rig import CameraRig, load_rig
-from handsim.space.transforms import MIRROR
-from track.captures import label_capture, measure_hands, track_capture
+from track.alternatives.alternatives import Alternative, doubts_of
+from track.captures import label_capture, track_capture
 from track.kinematics import pose_solver
 from track.kinematics.marker_kinematics import hand_arrays
 from track.kinematics.pose_spread import NOT_SMOOTHED, known_hand, pose_spreads, with_keypoints
@@ -35,50 +37,42 @@ from train.data.batches import Corruption, corrupt, paper_corruption
 from train.evaluation import LabelCounts, LabelingReport, cloud_frames, evaluate_frames, evaluate_labeler
 from train.forecast.rig_forecast import ObservedHand, observe_motion, observe_poses
 from train.forecast.settings import POSES, TWINS, ScoreGloveSettings
-from train.labelers.layout_labeler import learned_labeler
-from train.labelers.pose_prior import SideClassifier
+from train.labelers.layout_labeler import LayoutLabeler
 from train.labelers.protocol import Labeler
-from train.labelers.storage import load_labeler
+from train.labelers.storage import load_labeler, untrained_labeler
 from train.reports.hand_plot import mistakes
 from train.simulation.scenes import SimulatedKind
 from train.simulation.takes import simulate_take
 
-METHODS: Final = ("label", "track")
+METHODS: Final = {"label": label_capture, "track": track_capture}
 CAPTURES: Final = 3
 """Captures of each kind of work. Equal numbers mean equal people and motions for every layout."""
 FRAMES: Final = 240
 """Frames of a capture: two seconds."""
-WORK: Final[Mapping[str, tuple[SimulatedKind, tuple[Side, ...]]]] = {
-    "one hand": ("single-hand", ("right",)),
-    "two apart": ("single-hand", ("right", "left")),
-    "two touching": ("hand-hand", ("right", "left")),
-}
-"""What hands do in captures."""
+WORK: Final[Mapping[str, SimulatedKind]] = {
+    "two apart": "single-hand", "two touching": "hand-hand", "real-like": "real-like",
+}  # fmt: skip
+"""What hands do in captures; a glove for one hand is tried on `ONE_HAND` alone."""
+ONE_HAND: Final[Mapping[str, SimulatedKind]] = {"one hand": "single-hand"}
+SIDES_EXCHANGED: Final = "left and right are exchanged"
+"""Words of labels that are those of the other hand."""
 NOISE: Final = 0.0015
 """Standard deviation of markers around a calibrated hand [m], from optics and moving skin."""
 _TWIN_FRAMES: Final = 600  # frames of each simulated motion
-_NEAR: Final = 0.003  # [m] gap between two markers' surfaces at which gloves and blobs touch
-_SIDE_FRAMES: Final = 500
-_JOINT_FRAMES: Final = 600
+_SOME_FRAMES: Final = 600  # frames from which joints and sides are judged
 _IN_LINE: Final = 1e-8  # [m^2] Markers with less information about a rotation are in a line.
 
 # Figures beyond these thresholds get a sentence of advice.
 _UNINFORMED: Final = 0.6  # ratio of a joint's spread to that of an unseen joint
-_UNCERTAIN: Final = np.deg2rad(5.0)  # [rad] spread of a joint
-_CONFUSED: Final = 0.02  # share of a marker's points that are labeled as another marker
-_HIDDEN: Final = 0.85  # share of frames in which a marker is seen
+_SELDOM: Final = 0.02  # share of points, frames or captures in which labels are wrong or markers touch
+_OFTEN: Final = 0.1  # share of frames in which a marker is hidden, or too few markers are seen
 _AT_ONCE: Final = 0.75  # With a smaller share of its markers a hand is seldom found at once.
-_FEW: Final = 0.1  # share of frames that show fewer
-_TOUCHING: Final = 0.02  # share of frames in which two markers touch
-_WRONG: Final = 0.97  # share of frames in which a marker is labeled right in captures
-_SIDES: Final = 0.99  # share of frames in which the side is recognized
-_DISPENSABLE: Final = np.deg2rad(0.3)  # [rad] A marker is dispensable if no joint's spread grows more.
 _MOST_OF_A_KIND: Final = 4  # sentences of one kind
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trial:
-    """Results on the simulated captures of one kind of work."""
+    """Results on one simulated capture, or their means over the captures of one kind of work."""
 
     slots: dict[str, Float[np.ndarray, "M"]]
     """Share of the frames in which each marker is labeled right, by method: `label` and `track`."""
@@ -88,6 +82,13 @@ class Trial:
     """Root mean square error of each joint angle from `track` [rad]; NaN if no hand was found."""
     size_error: float
     """Mean absolute error of the measured length of the hands [m]."""
+    wrong: float = 0.0
+    """Probability that some labels are wrong throughout a capture. It is 1 for labels that are wrong in most
+    frames, otherwise the probability of other labels that the take itself states; mean of both methods."""
+    alternatives: tuple[Alternative, ...] = ()
+    """What is wrong throughout a capture, each with its probability, the likeliest first."""
+    captures: tuple[Trial, ...] = ()
+    """The captures behind the means; empty for one capture."""
 
     @property
     def right(self) -> Float[np.ndarray, "M"]:
@@ -108,6 +109,10 @@ class Trial:
         """Share of all slots that are right."""
         return float(self.slots[method].mean())
 
+    def least(self, method: str) -> float:
+        """The same of the worst capture."""
+        return min(one.share(method) for one in self.captures or (self,))
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LayoutScore:
@@ -124,14 +129,8 @@ class LayoutScore:
     """Share of the frames in which each marker is seen by two cameras and becomes a point."""
     few_seen: float
     """Share of the frames in which fewer than three quarters of the markers are seen."""
-    near: Float[np.ndarray, "M M"]
-    """Share of the frames in which two markers touch or nearly do."""
     joints: Float[np.ndarray, "20"]
     """Standard deviation of each joint of a calibrated hand, given the markers [rad]."""
-    joints_without: Float[np.ndarray, "M 20"]
-    """The same without each marker [rad]."""
-    sides_right: float
-    """Share of the frames in which left and right are distinguished by the labeled markers."""
     trials: Mapping[str, Trial] = field(default_factory=dict)
     """Results on simulated captures by kind of work; empty if none was tried."""
     is_trained: bool = False
@@ -140,9 +139,24 @@ class LayoutScore:
     """Description of the motion and the rig."""
 
     @property
+    def wrong(self) -> tuple[float, tuple[float, float]]:
+        """Probability that labels are wrong throughout a capture of any work, and its 95 % interval."""
+        tried = [one for trial in self.trials.values() for one in trial.captures or (trial,)]
+        count = sum(one.wrong for one in tried)
+        # Jeffreys' interval also holds for no wrong capture of a few.
+        low, high = beta.ppf((0.025, 0.975), count + 0.5, len(tried) - count + 0.5)
+        share = count / max(1, len(tried))
+        return share, (min(float(low), share), max(float(high), share))
+
+    @property
+    def alternatives(self) -> tuple[Alternative, ...]:
+        """What is wrong throughout a capture of any work, each with its probability, the likeliest first."""
+        return _merged([trial.alternatives for trial in self.trials.values()])
+
+    @property
     def advice(self) -> tuple[str, ...]:
         """Sentences on what to move, add or drop, the most important first."""
-        kinds = (_captures, _confusions, _joints, _hidden, _touching, _sides, _dispensable)
+        kinds = (_alternatives, _captures, _confusions, _joints, _hidden)
         found: list[_Advice] = []
         for kind in kinds:
             found += sorted(kind(self), key=lambda advice: -advice[0])[:_MOST_OF_A_KIND]
@@ -156,7 +170,7 @@ def score_glove(
     on_step: OnStep = no_step,
     **options: Any,
 ) -> LayoutScore:
-    """Score a layout as `handsim glove score` does, with a given labeler or one learned in a minute.
+    """Score a layout as `handsim glove score` does, with a given labeler or that of the glove.
 
     Args:
         glove: Marker layout, or its shipped name or the path of its .toml file.
@@ -174,19 +188,21 @@ def score_glove(
         LayoutError, RigError, WeightsError: The glove, the rig or the labeler is unknown.
     """
     chosen = ScoreGloveSettings.of(settings, options)
-    layout, rig, given = load_layout(glove), load_rig(chosen.rig), chosen.labeler
+    layout, rig = load_layout(glove), load_rig(chosen.rig)
     rng = np.random.default_rng(chosen.seed)
     on_step("simulating hands")
     hands, seen = _hands(chosen, layout, rig, rng)
     on_step("learning the layout, about a minute the first time")
-    labeler = learned_labeler(layout, rig) if given is None else load_labeler(layout, given)
+    given = chosen.labeler
+    labeler = untrained_labeler(layout) if given is None else load_labeler(layout, given)
     on_step("labeling")
     score = score_layout(layout, hands, labeler, rng=rng)
     trials = try_layout(
         layout, rig, labeler, count=chosen.captures, told=lambda words: on_step(f"trying captures: {words}")
     )
     seen_by = f"{seen}, seen by rig {rig.name}"
-    return dataclasses.replace(score, trials=trials, is_trained=given is not None, seen_by=seen_by)
+    is_trained = not isinstance(labeler, LayoutLabeler)
+    return dataclasses.replace(score, trials=trials, is_trained=is_trained, seen_by=seen_by)
 
 
 def _hands(
@@ -216,10 +232,7 @@ def score_layout(
     center = markers.mean(axis=1, keepdims=True)
     nothing = Corruption(occlude=0, ghosts=0)
     cloud = corrupt(observed - center, nothing, ghosts=ghosts - center, rng=rng)
-    recipe, some = paper_corruption(layout.num_markers), _some(hands, _JOINT_FRAMES)
-    apart = np.linalg.norm(markers[:, :, None] - markers[:, None], axis=-1)
-    near: Float[np.ndarray, "M M"] = (apart < 2.0 * layout.radius + _NEAR).mean(axis=0)
-    np.fill_diagonal(near, 0.0)
+    recipe = paper_corruption(layout.num_markers)
     # People differ in length; both hands of one are alike.
     _, person = np.unique([hand.fit.shape.length for hand in hands], return_inverse=True)
     people = np.repeat(person, [len(hand.qpos) for hand in hands])
@@ -232,44 +245,24 @@ def score_layout(
         )
     )
     is_seen = np.isfinite(observed[..., 0])
-    without = np.array([joint_spreads(some, without=marker) for marker in range(layout.num_markers)])
+    few_seen = float((is_seen.mean(axis=1) < _AT_ONCE).mean())
     return LayoutScore(
-        layout, seen, clean, corrupted, is_seen.mean(axis=0),
-        float((is_seen.mean(axis=1) < _AT_ONCE).mean()), near, joint_spreads(some), without,
-        _sides_right(layout, hands, rng),
-    )  # fmt: skip
+        layout, seen, clean, corrupted, is_seen.mean(axis=0), few_seen, joint_spreads(_some(hands))
+    )
 
 
-def _some(hands: Sequence[ObservedHand], count: int) -> list[ObservedHand]:
-    """About `count` frames, evenly spaced."""
-    step = max(1, sum(len(hand.qpos) for hand in hands) // count)
+def _some(hands: Sequence[ObservedHand]) -> list[ObservedHand]:
+    """Some of the frames, evenly spaced."""
+    step = max(1, sum(len(hand.qpos) for hand in hands) // _SOME_FRAMES)
     return [
         ObservedHand(hand.fit, hand.qpos[::step], type(hand.frames)(*(part[::step] for part in hand.frames)))
         for hand in hands
     ]
 
 
-def _sides_right(layout: MarkerLayout, hands: Sequence[ObservedHand], rng: np.random.Generator) -> float:
-    """Share of the frames whose side is recognized from the seen markers with their true labels."""
-    classifier, right, count = SideClassifier(layout, rng=rng), 0, 0
-    for hand in _some(hands, _SIDE_FRAMES):
-        observed, side = hand.frames.observed, hand.fit.side
-        other: Side = "left" if side == "right" else "right"
-        for markers, one in ((observed, side), (observed @ MIRROR, other)):
-            right += int(classifier.recognized(markers, one).sum())
-            count += len(markers)
-    return right / max(1, count)
-
-
-def joint_spreads(hands: Iterable[ObservedHand], *, without: int | None = None) -> Float[np.ndarray, "20"]:
-    """`layout_spreads` of observed hands, optionally without one marker."""
-    parts = []
-    for hand in hands:
-        seen = np.isfinite(hand.frames.observed[..., 0])
-        if without is not None:
-            seen[:, without] = False
-        parts.append((hand.fit, hand.qpos, seen))
-    return layout_spreads(parts)
+def joint_spreads(hands: Iterable[ObservedHand]) -> Float[np.ndarray, "20"]:
+    """`layout_spreads` of observed hands."""
+    return layout_spreads((hand.fit, hand.qpos, np.isfinite(hand.frames.observed[..., 0])) for hand in hands)
 
 
 def layout_spreads(
@@ -327,28 +320,19 @@ def try_layout(
     labeler: Labeler,
     *,
     count: int = CAPTURES,
-    first: int = 0,
-    frames: int = FRAMES,
     told: Callable[[str], None] = no_step,
 ) -> dict[str, Trial]:
-    """Label and track simulated captures, from number `first` + 1 on, of each kind of work the glove allows.
+    """Label and track some simulated captures of each kind of work that the glove allows.
 
     `told` is called with a description before each capture.
     """
     found: dict[str, Trial] = {}
-    for name in WORK if count else ():
-        kind, needed = WORK[name]
-        sides = tuple(side for side in needed if side in layout.sides)
-        if name == "one hand":
-            sides = sides or layout.sides
-        elif len(sides) < len(needed):
-            continue
+    works = WORK if len(layout.sides) > 1 else ONE_HAND
+    for name, kind in works.items() if count else ():
         tried = []
         for number in range(1, count + 1):
             told(f"{name}, capture {number} of {count}")
-            take = simulate_take(
-                kind, glove=layout, num_frames=frames, rig=rig, seed=first + number, hands=sides
-            )
+            take = simulate_take(kind, glove=layout, num_frames=FRAMES, rig=rig, seed=number)
             tried.append(try_take(take, layout, labeler))
         found[name] = mean_trial(tried)
     return found
@@ -357,20 +341,25 @@ def try_layout(
 def try_take(truth: Take, layout: MarkerLayout, labeler: Labeler) -> Trial:
     """Label and track a simulated capture of unknown hands, whose gloves have slipped a little."""
     capture = truth.capture()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", HandSimWarning)
-        user = measure_hands(capture, layout, labeler=labeler)
-        tracked = track_capture(capture, hands=user, labeler=labeler)
-        labeled = label_capture(capture, glove=layout, hands=user, labeler=labeler)
-    slots, frames = {}, {}
-    for name, take in zip(METHODS, (labeled, tracked), strict=True):
-        slots[name], frames[name] = right_shares(truth, take)
+    slots, frames, wrong = {}, {}, []
+    for name, make in METHODS.items():
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", HandSimWarning)
+            take = make(capture, glove=layout, labeler=labeler)
+        share, counts = _counted(truth, take)
+        slots[name], frames[name] = share.mean(axis=0), counts.frames_right / counts.frames
+        wrong.append(_wrong_throughout(layout.names, share, counts) or _doubtful(take))
+    tracked = take  # by the last method
     errors = [
         (tracked.qpos[:, tracked.hand_index(hand.side), 7:] - truth.qpos[:, number, 7:]) ** 2
         for number, hand in enumerate(truth.hands)
     ]
     size_error = abs(tracked.hands[0].shape.length - truth.hands[0].shape.length)
-    return Trial(slots, frames, _root_mean(np.concatenate(errors)), size_error)
+    of_methods = [min(1.0, sum(one.probability for one in every)) for every in wrong]
+    return Trial(
+        slots, frames, _root_mean(np.concatenate(errors)), size_error, float(np.mean(of_methods)),
+        _merged(wrong),
+    )  # fmt: skip
 
 
 def mean_trial(trials: Sequence[Trial]) -> Trial:
@@ -380,7 +369,56 @@ def mean_trial(trials: Sequence[Trial]) -> Trial:
         {name: float(np.mean([one.frames[name] for one in trials])) for name in METHODS},
         _root_mean(np.array([one.joints**2 for one in trials])),
         float(np.mean([one.size_error for one in trials])),
+        float(np.mean([one.wrong for one in trials])),
+        _merged([one.alternatives for one in trials]),
+        tuple(trials),
     )
+
+
+def _merged(parts: Sequence[Iterable[Alternative]]) -> tuple[Alternative, ...]:
+    """Alternatives of several takes or kinds of work by their words, with their mean probability."""
+    found: dict[str, Alternative] = {}
+    for one in itertools.chain.from_iterable(parts):
+        before = found[one.words].probability if one.words in found else 0.0
+        found[one.words] = one._replace(probability=before + one.probability / len(parts))
+    return tuple(sorted(found.values(), key=lambda one: -one.probability))
+
+
+def _wrong_throughout(
+    names: Sequence[str], share: Float[np.ndarray, "H M"], counts: LabelCounts
+) -> tuple[Alternative, ...]:
+    """What is wrong with the labels of a take in most frames, in the words of its alternatives."""
+    found, count = {}, len(names)
+    called = counts.confusion.argmax(axis=1)
+    for slot in np.flatnonzero(share < 0.5):
+        mine, given = int(slot % count), int(called[slot])
+        markers: tuple[int, ...] = (mine,)
+        if given in (slot, share.size + 1):
+            words = f"{names[mine]} is lost"
+        elif given // count != slot // count:
+            markers, words = tuple(range(count)), SIDES_EXCHANGED
+        else:
+            pair = mine, given % count
+            is_mutual = called[given] == slot
+            markers = tuple(sorted(pair))
+            one, other = (names[marker] for marker in (markers if is_mutual else pair))
+            words = f"{one} and {other} are exchanged" if is_mutual else (
+                f"the points of {one} have the label {other}"
+            )  # fmt: skip
+        found[words] = Alternative(markers, words, 1.0)
+    return tuple(found.values())
+
+
+def _doubtful(take: Take) -> tuple[Alternative, ...]:
+    """Alternatives that a take itself states, each with its larger probability of both hands."""
+    found: dict[str, Alternative] = {}
+    for doubt in doubts_of(take).values():
+        for one in doubt.tried:
+            whole = len(one.markers) == take.hands[0].layout.num_markers
+            words = SIDES_EXCHANGED if whole else one.words
+            if words and (words not in found or found[words].probability < one.probability):
+                found[words] = one._replace(words=words)
+    return tuple(found.values())
 
 
 def _root_mean(squares: Float[np.ndarray, "T 20"]) -> Float[np.ndarray, "20"]:
@@ -392,29 +430,48 @@ def _root_mean(squares: Float[np.ndarray, "T 20"]) -> Float[np.ndarray, "20"]:
 
 def right_shares(truth: Take, take: Take) -> tuple[Float[np.ndarray, "M"], float]:
     """Share of the frames in which each marker of the true hands is right, and share of right frames."""
+    share, counts = _counted(truth, take)
+    return share.mean(axis=0), counts.frames_right / counts.frames
+
+
+def _counted(truth: Take, take: Take) -> tuple[Float[np.ndarray, "H M"], LabelCounts]:
+    """Share of the frames in which each marker of each true hand is right, and counts of the true labels.
+
+    One more label stands for all labels of hands that the truth does not have.
+    """
     markers = truth.hands[0].layout.num_markers
     names = truth.label_names
     of_hands = [names.index(name) if name in names else -1 for name in take.label_names]
-    others = len(truth.hands) * markers  # stands for all labels of hands that the truth does not have
+    others = len(truth.hands) * markers
     known = np.array([number if 0 <= number < others else others for number in of_hands] + [-1])
     counts, right = LabelCounts(), np.zeros(others)
     for points, true, given in zip(truth.points, truth.labels, take.labels, strict=True):
         here = np.isfinite(points[:, 0])
         worn = np.where(true[here] < others, true[here], -1)
         right += counts.add(known[given[here]], worn, others + 1)[:others]
-    share: Float[np.ndarray, "M"] = (right / counts.frames).reshape(len(truth.hands), markers).mean(axis=0)
-    return share, counts.frames_right / counts.frames
+    return (right / counts.frames).reshape(len(truth.hands), markers), counts
 
 
 _Advice = tuple[float, str]
 """Weight of a sentence (the share of points, frames or joints that it concerns), and the sentence."""
 
 
+def _alternatives(score: LayoutScore) -> Iterator[_Advice]:
+    """Advice on markers whose labels are wrong throughout a capture."""
+    for one in score.alternatives:
+        if one.probability >= _SELDOM:
+            yield (
+                one.probability,
+                f"{one.words[0].upper()}{one.words[1:]} in whole captures with a probability of "
+                f"{100 * one.probability:.0f} %: move a marker to where no other label fits.",
+            )
+
+
 def _captures(score: LayoutScore) -> Iterator[_Advice]:
     """Advice on the worst marker of the simulated captures."""
     for work, trial in score.trials.items():
         shares = {method: float(trial.slots[method][trial.worst]) for method in METHODS}
-        if min(shares.values()) < _WRONG:
+        if min(shares.values()) < 1.0 - _SELDOM:
             told = ", ".join(f"{100 * share:.0f} % with {method}" for method, share in shares.items())
             yield (
                 1.0 - min(shares.values()),
@@ -427,7 +484,7 @@ def _confusions(score: LayoutScore) -> Iterator[_Advice]:
     names, told = score.layout.names, set()
     for mistake in mistakes(score.observed.confusion, most=2 * _MOST_OF_A_KIND):
         pair = frozenset((mistake.truth, mistake.called))
-        if mistake.share < _CONFUSED or pair in told:
+        if mistake.share < _SELDOM or pair in told:
             continue
         told.add(pair)
         first, second = names[mistake.truth], names[mistake.called]
@@ -444,9 +501,7 @@ def _joints(score: LayoutScore) -> Iterator[_Advice]:
     carried = {marker.bone for marker in score.layout.markers}
     for digit, name in enumerate(DIGITS):
         joints = [number for number, joint in enumerate(JOINTS) if BONES[joint.bone].digit == digit]
-        poor = [
-            number for number in joints if share[number] > _UNINFORMED and score.joints[number] > _UNCERTAIN
-        ]
+        poor = [number for number in joints if share[number] > _UNINFORMED]
         bones = [BONES[JOINTS[number].bone].name for number in (*joints, *poor)]
         bone = next((one for one in reversed(bones) if one not in carried), None)
         if not poor or bone is None:
@@ -464,7 +519,7 @@ def _joints(score: LayoutScore) -> Iterator[_Advice]:
 
 def _hidden(score: LayoutScore) -> Iterator[_Advice]:
     """Advice where frames show too few of a hand's markers, and on each marker that is seldom seen."""
-    if score.few_seen > _FEW:
+    if score.few_seen > _OFTEN:
         count = score.layout.num_markers
         yield (
             score.few_seen,
@@ -472,7 +527,7 @@ def _hidden(score: LayoutScore) -> Iterator[_Advice]:
             f"fewer than {math.ceil(_AT_ONCE * count)} of {count} are seen, too few to find a hand at once.",
         )
     for name, seen in zip(score.layout.names, score.seen, strict=True):
-        if seen < _HIDDEN:
+        if seen < 1.0 - _OFTEN:
             yield (
                 1.0 - float(seen),
                 f"Move {name} towards the back of the hand: it is a point in {100 * seen:.0f} % of the "
@@ -480,40 +535,6 @@ def _hidden(score: LayoutScore) -> Iterator[_Advice]:
             )
 
 
-def _touching(score: LayoutScore) -> Iterator[_Advice]:
-    """Advice on touching pairs of one digit; tips of two digits touch whatever the layout."""
-    names, digits = score.layout.names, [digit_of(marker) for marker in score.layout.markers]
-    for first, second in zip(*np.nonzero(np.triu(score.near) > _TOUCHING), strict=True):
-        share = float(score.near[first, second])
-        if digits[first] == digits[second]:
-            yield (
-                share,
-                f"Move {names[first]} and {names[second]} apart: they touch, or nearly, in "
-                f"{100 * share:.0f} % of the frames, and their blobs merge.",
-            )
-
-
 def digit_of(place: MarkerPlace) -> int:
     """The digit that a marker is on."""
     return BONES[BONE_NAMES.index(place.bone)].digit
-
-
-def _sides(score: LayoutScore) -> Iterator[_Advice]:
-    if score.sides_right < _SIDES:
-        yield (
-            1.0 - score.sides_right,
-            f"Make the back of the hand less symmetric: left and right are mistaken in "
-            f"{100 * (1.0 - score.sides_right):.0f} % of the frames.",
-        )
-
-
-def _dispensable(score: LayoutScore) -> Iterator[_Advice]:
-    grown: Float[np.ndarray, "M"] = (score.joints_without - score.joints).max(axis=1)
-    for marker in np.argsort(grown):
-        if grown[marker] < _DISPENSABLE:
-            yield (
-                0.0,
-                f"{score.layout.names[marker]} can be dropped as far as joints go: without it none is known "
-                f"worse by more than {np.rad2deg(grown[marker]):.1f} deg. It may still help to tell the "
-                "others apart.",
-            )

@@ -61,7 +61,7 @@ from train.labelers.networks import (
 )
 from train.labelers.pose_prior import learn_pose_prior
 from train.labelers.protocol import MOST_THREADS, Labeling, torch_threads
-from train.labelers.storage import GLOVE, RUN_SETTINGS, save_network
+from train.labelers.storage import GLOVE, RUN_SETTINGS, save_network, untrained_labeler
 from train.reports.run_page import UNKNOWN_LICENSE, write_model_card, write_run_page
 from train.settings import CNNConfig, Kind, TrainSettings, batch_recipe, train_settings
 
@@ -180,6 +180,26 @@ def _prepare(dataset: Dataset, settings: TrainSettings, out: Path, fabric: Fabri
     return _Run(state, dataset.manifest, seen, rows.span(len(seen), len(rows)), unseen, out)
 
 
+def untrained_report(dataset: Dataset | str | Path, settings: TrainSettings) -> LabelingReport:
+    """Evaluate the labeler that a glove has without training on the held-out frames of a run.
+
+    The frames are those of the run's model card, as the rig saw them. The labeler for any layout learns a
+    new layout in about a minute.
+    """
+    dataset = load_dataset(dataset)
+    rows = dataset.mapped_rows()
+    settings = settings.for_set(len(dataset.marker_names), len(rows))
+    held_out = rows.span(_first_held_out(dataset.people()), len(rows))
+    shown = held_out[_shown(held_out, settings.samples, _CARD_FRAMES[settings.labeler])]
+    return rig_report(untrained_labeler(dataset.layout), shown, rng=np.random.default_rng(0))
+
+
+def _shown(held_out: MappedRows, samples: int, count: int) -> Int[np.ndarray, "R"]:
+    """At most `count` held-out rows, evenly spread; fewer for a short run, which they would outlast."""
+    count = min(count, max(_FEWEST_SHOWN, samples // _SAMPLES_A_FRAME))
+    return np.arange(0, len(held_out), -(-len(held_out) // count))
+
+
 def _first_held_out(people: Int[np.ndarray, "T"]) -> int:
     """The first row of a set's last people, who are held out from training.
 
@@ -212,7 +232,10 @@ class _Run:
         """
         state, settings, alone = self.state, self.state.settings, self.state.fabric.world_size == 1
         recipe, names = batch_recipe(settings, len(self.manifest.marker_names)), self.manifest.marker_names
-        shown, saved = self.held_out[self._shown(_CURVE_FRAMES[settings.labeler])], time.monotonic()
+        shown, saved = (
+            self.held_out[_shown(self.held_out, settings.samples, _CURVE_FRAMES[settings.labeler])],
+            time.monotonic(),
+        )
         evaluated = state.history.accuracies[-1][0] if state.history.accuracies else 0
         while True:
             if state.done > evaluated and _passed(
@@ -263,14 +286,16 @@ class _Run:
         network = self.state.averaged()
         if isinstance(network, DeepLabelCNN):
             on_step("costs of the paper's labeler")
-            choose_costs(network, names, self.held_out[self._shown(_COST_FRAMES)])
+            choose_costs(network, names, self.held_out[_shown(self.held_out, settings.samples, _COST_FRAMES)])
         else:
             assert isinstance(network, SetLabeler)
             on_step("pose prior")
             rng = np.random.default_rng(settings.seed)
             network.prior = learn_pose_prior(right_hands(self.rows, _PRIOR_STRETCH, rng=rng), rng=rng)
         on_step("held-out frames")
-        card, report = self._card(network, self._shown(_CARD_FRAMES[settings.labeler]))
+        card, report = self._card(
+            network, _shown(self.held_out, settings.samples, _CARD_FRAMES[settings.labeler])
+        )
         on_step("weights and report")
         with written_together():
             save_network(self.out, network, card)
@@ -278,11 +303,6 @@ class _Run:
             write_model_card(self.out, card)
             stored_layout(card["dataset"]["layout"]).save(self.out / GLOVE)
         return card
-
-    def _shown(self, count: int) -> Int[np.ndarray, "R"]:
-        """At most `count` held-out rows, evenly spread; fewer for a short run, which they would outlast."""
-        count = min(count, max(_FEWEST_SHOWN, self.state.settings.samples // _SAMPLES_A_FRAME))
-        return np.arange(0, len(self.held_out), -(-len(self.held_out) // count))
 
     def _card(self, network: nn.Module, shown: Int[np.ndarray, "R"]) -> tuple[dict[str, Any], LabelingReport]:
         """The model card, and the evaluation on held-out frames with the paper's corruption."""

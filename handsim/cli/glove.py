@@ -42,8 +42,8 @@ def list_glove(out: Path | None = None) -> None:
         rows.append([name, str(shipped.layout.num_markers), labeler, text])
     print_table(rows, left=4, wraps=True)
     print_line(
-        "The labeler for any layout needs no training. A better one of its own for NAME: handsim generate "
-        "--glove NAME --out SET && handsim train SET --out RUN, then give --labeler RUN."
+        "The labeler for any layout needs no training. One of its own for NAME: handsim generate --glove "
+        "NAME --out SET && handsim train SET --out RUN, which says whether to use it (--labeler RUN)."
     )
     if out is not None:
         from gloves.fit import nominal_fit
@@ -150,8 +150,8 @@ def score_glove(
 ) -> None:
     """Say how well a layout can be labeled and what it tells of each joint; nothing is trained.
 
-    Short captures of one hand, two apart and two that touch are simulated, and labeled and tracked as
-    `handsim label` and `handsim track` do with nothing calibrated: they are what to expect.
+    Short captures of hands apart, hands that touch and real-like motion are simulated, and labeled and
+    tracked as `handsim label` and `handsim track` do with nothing calibrated: they are what to expect.
 
     Args:
         glove: A .toml file or a shipped name.
@@ -161,11 +161,16 @@ def score_glove(
     page = Path(glove).with_suffix(".html") if out is None else out
     check_outputs([glove, settings.rig, settings.motion], [page], ".html")
     from track import glove_score
-    from track.glove_page import trial_rows, write_glove_page
+    from track.glove_page import trial_rows, write_glove_page, wrong_line
     from train.evaluation import percent, percent_between
 
     with named_steps("") as step:
         score = glove_score.score_glove(glove, settings, on_step=step)
+    if score.trials:
+        print_line(wrong_line(score))
+        print_line("captures, hands not calibrated; slots and whole frames that are right:")
+        print_table(trial_rows(score.trials, score.layout), left=6, wraps=True)
+    print_line("single frames, without tracking:")
     for title, report in (
         ("as the rig sees them", score.observed),
         ("with the paper's drops and ghosts", score.corrupted),
@@ -173,16 +178,12 @@ def score_glove(
     ):
         share = percent_between(report.figures["slot_accuracy"], report.interval())
         print_line(f"{share} % of the slots right {title}")
-    sides = f"{percent(score.sides_right)} % of the hands told left from right"
-    print_line(f"{percent(score.seen.mean())} % of the markers seen; {sides}")
+    print_line(f"{percent(score.seen.mean())} % of the markers seen")
     joints = np.rad2deg(score.joints)
     print_line(
         "joints of calibrated hands, frame by frame: standard deviation "
         f"{np.sqrt((joints**2).mean()):.1f} deg, the worst {joints.max():.1f} deg; {_palm_line(score.layout)}"
     )
-    if score.trials:
-        print_line("captures, hands not calibrated; slots and whole frames that are right:")
-        print_table(trial_rows(score.trials, score.layout), left=6, wraps=True)
     print_line(*(f"{number}. {sentence}" for number, sentence in enumerate(score.advice, 1)))
     write_glove_page(page, score)
     print_line(f"{page}: the hand with its confusions, markers and joints")

@@ -25,6 +25,9 @@ def _train(
 ) -> None:
     """Train a labeler on a training set and write a page about it; run it again to continue a stopped run.
 
+    At the end the labeler is compared with the one that the glove has without training, on the same frames
+    of people whom training did not see, and the better one is named.
+
     Args:
         dataset: Folder that `handsim generate` wrote, also in an object store, as s3://bucket/prefix.
         out: Folder for the weights, the model card, the checkpoint and report.html.
@@ -32,8 +35,8 @@ def _train(
         preset: A published recipe, which replaces the defaults; options given beside it hold.
         threads: Threads on a CPU; when not given, one for the set labeler and all for the paper's network.
     """
-    from train.evaluation import percent, print_figures
-    from train.loop import train_labeler
+    from train.evaluation import SEEN, percent, print_figures
+    from train.loop import train_labeler, untrained_report
     from train.reports.run_page import PAGE, held_out_people
 
     del preset  # it is in `settings`
@@ -52,6 +55,15 @@ def _train(
             print_line(f"{name}, 95 % over people: accuracy by {', '.join(ends)} %")
     print_line(f"weights and model card in {out}")
     print_line(f"report in {out / PAGE}")
+    ours, usual = (
+        one["slot_accuracy"]
+        for one in (card["held_out_simulated"][SEEN], untrained_report(dataset, settings).figures)
+    )
+    choice = f"use it, with --labeler {out}" if ours >= usual else "use that one, without --labeler"
+    print_line(
+        f"{percent(ours)} % of the slots are right {SEEN} with this labeler, {percent(usual)} % with the one "
+        f"that the glove has without training: {choice}"
+    )
 
 
 def _with_usual_settings(args: Sequence[str], prog: str) -> Callable[..., None]:

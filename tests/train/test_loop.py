@@ -14,6 +14,7 @@ import pytest
 import torch
 
 from benchmarks.held_out import held_out_markers
+from gloves import load_layout
 from handsim.cli.main import main
 from handsim.errors import WeightsError
 from handsim.files.signals import Stopped
@@ -21,22 +22,48 @@ from tests.sentences import assert_names
 from train import (
     CNNConfig,
     Corruption,
+    GenerateSettings,
     SetLabelerConfig,
     TrainSettings,
     evaluate_labeler,
     load_labeler,
     train_labeler,
 )
-from train.evaluation import paper_report
+from train.data.shards import load_dataset
+from train.evaluation import SEEN, paper_report, rig_report
 from train.labelers.cnn_network import DeepLabelCNN
+from train.labelers.layout_labeler import learned_labeler
 from train.labelers.networks import cnn_labeler, prepare_network
 from train.labelers.storage import CARD, WEIGHTS, load_network
-from train.loop import CHECKPOINT, TrainingError, choose_costs
+from train.loop import CHECKPOINT, TrainingError, choose_costs, untrained_report
 from train.settings import usual_settings
+from train.simulation.generation import make_dataset
 
 SMALL = SetLabelerConfig(width=8, gates=2, depth=1)
 CONFIG = TrainSettings(samples=640, batch=32, network=SMALL)
 OPTIONS = ["--batch", "32", "--network.width", "8", "--network.gates", "2", "--network.depth", "1"]
+
+
+@pytest.mark.usefixtures("quickly_learned")
+@pytest.mark.parametrize("glove", ["tips8", "sparse13", "mine.toml"])
+def test_the_labeler_without_training_is_evaluated_on_the_same_held_out_frames(glove, tmp_path):
+    """It is the shipped one, or the one for any layout; the others' people are those of the run's card."""
+    path = tmp_path / "mine.toml"
+    layout = load_layout("starter10" if glove.endswith(".toml") else glove)
+    dataclasses.replace(layout, name="mine", markers=layout.markers[::-1]).save(path)
+    folder = tmp_path / "set"
+    worn = path if glove.endswith(".toml") else glove
+    make_dataset(GenerateSettings(num_frames=300, glove=worn), folder, workers=1)
+    config = dataclasses.replace(CONFIG, samples=64)
+    card = train_labeler(folder, tmp_path / "run", config)
+    made, found = load_dataset(folder), untrained_report(folder, config)
+    last = made.rows()[made.people() == made.people()[-1]]  # of a few people
+    held_out, worn = last[:: -(-len(last) // 64)], made.layout
+    usual = load_labeler(worn) if glove == "sparse13" else learned_labeler(worn)
+    expected = rig_report(usual, held_out, rng=np.random.default_rng(0))
+    assert found.num_frames == len(held_out)
+    assert found.figures["slot_accuracy"] == expected.figures["slot_accuracy"]
+    assert card["held_out_simulated"][SEEN]["occlusion_ratio"] == found.figures["occlusion_ratio"]
 
 
 def done_in(run):

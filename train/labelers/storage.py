@@ -196,6 +196,11 @@ def _shipped_labeler(layout: MarkerLayout) -> Labeler | None:
     return next((_read(*_files(name)).labeler() for name in found), None)
 
 
+def untrained_labeler(layout: MarkerLayout) -> Labeler:
+    """The labeler that a glove has without training: the shipped one, or the one for any layout."""
+    return _shipped_labeler(layout) or load_labeler(layout, ANY_LAYOUT)
+
+
 def _any_layout_labeler(layout: MarkerLayout, glove: MarkerLayout | str | Path) -> Labeler:
     """The labeler for any layout, with a warning that the glove has no trained one."""
     from train.labelers.layout_labeler import is_learned, learned_labeler  # torch
@@ -209,9 +214,9 @@ def _any_layout_labeler(layout: MarkerLayout, glove: MarkerLayout | str | Path) 
         else "learns it now, once, in about a minute of an idle core"
     )
     warnings.warn(
-        f"no labeler was trained on glove '{name}', so that the one for any layout labels it, which {how}; a "
-        f"better one takes handsim generate --glove {'GLOVE.toml' if own else name} --out SET && handsim "
-        "train SET --out RUN, and --labeler RUN",
+        f"no labeler was trained on glove '{name}', so that the one for any layout labels it, which {how}; "
+        f"handsim generate --glove {'GLOVE.toml' if own else name} --out SET && handsim train SET --out RUN "
+        "trains one and says which of the two is better",
         HandSimWarning,
         stacklevel=3,
     )

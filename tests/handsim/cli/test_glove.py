@@ -91,10 +91,11 @@ def test_check_and_simulate_take_a_layout_that_a_small_hand_wears_elsewhere(mine
 def test_a_score_is_printed_and_drawn(mine, capsys):
     assert main(["glove", "score", str(mine), "--frames", "120", "--rig", "six", "--captures", "1"]) == 0
     told = capsys.readouterr().out
+    assert told.startswith("labels are wrong throughout a capture with a probability of ")
     assert "% of the slots right as the rig sees them" in told
-    assert all(f"{work} " in told for work in ("one hand", "two apart", "two touching"))
+    assert all(f"{work} " in told for work in ("two apart", "two touching", "real-like"))
     page = mine.with_suffix(".html").read_text("utf-8")
-    assert page.count("data:image/svg+xml") == 2 and "What to do" in page and "ThumbTip" in page
+    assert page.count("data:image/svg+xml") >= 2 and "What to do" in page and "ThumbTip" in page
 
 
 def test_an_improved_layout_is_written(mine, tmp_path, capsys):

@@ -8,8 +8,9 @@ import pytest
 
 import train.loop
 from handsim.cli.main import main
-from train import CNNConfig, Corruption, GenerateSettings, SceneMix, TrainSettings
+from train import CNNConfig, Corruption, GenerateSettings, SceneMix, TrainSettings, evaluate_labeler
 from train.data.batches import paper_corruption
+from train.evaluation import SEEN
 from train.loop import _rate
 from train.settings import EPOCHS, usual_settings
 from train.simulation.generation import make_dataset
@@ -25,7 +26,13 @@ def dataset(tmp_path_factory):
 
 
 @pytest.fixture
-def config_of(dataset, tmp_path, monkeypatch):
+def accuracy():
+    """Share of right slots of the trained labeler."""
+    return [1.0]
+
+
+@pytest.fixture
+def config_of(dataset, tmp_path, monkeypatch, accuracy):
     """The settings that `handsim train` hands to the training loop."""
 
     def config_of(*options: str) -> TrainSettings:
@@ -33,13 +40,27 @@ def config_of(dataset, tmp_path, monkeypatch):
 
         def keep(rows, out, settings, *, threads, progress, on_step):
             configs.append(settings.for_set(19, FRAMES))
-            return {"held_out_simulated": {"random": {"accuracy": 1.0}}, "held_out_intervals": {}}
+            return {"held_out_simulated": {SEEN: {"slot_accuracy": accuracy[0]}}, "held_out_intervals": {}}
 
         monkeypatch.setattr(train.loop, "train_labeler", keep)
         assert main(["train", str(dataset), "--out", str(tmp_path / "run"), *options]) == 0
         return configs[0]
 
     return config_of
+
+
+@pytest.mark.parametrize(("added", "better"), [(-0.3, False), (-1e-3, False), (0.0, True), (1e-3, True)])
+def test_the_better_of_trained_and_untrained_is_named(config_of, dataset, accuracy, capsys, added, better):
+    """The figure of the labeler without training is that on the same held-out frames."""
+    usual = evaluate_labeler("dense19", dataset).right_slots  # of all frames, the last of which are held out
+    held_out = max(1, int(0.02 * FRAMES))
+    without = float(usual[-held_out:].mean())
+    accuracy[0] = without + added
+    config_of("--samples", "64")
+    told = " ".join(capsys.readouterr().out.split())
+    assert f"{100 * accuracy[0]:.2f} % of the slots are right as the rig sees them with this labeler" in told
+    assert f"{100 * without:.2f} % with the one that the glove has without training" in told
+    assert ("use it, with --labeler" in told) == better == ("use that one, without" not in told)
 
 
 def test_a_preset_replaces_the_defaults(config_of):
