@@ -82,7 +82,7 @@ _ENOUGH_RANGE: Final = 0.3  # share of its range that each joint should cover
 _LEAST_NOISE, _MOST_NOISE = 0.0001, 0.003  # [m]
 _CHI2_MEDIAN: Final = 2.366  # median of the chi-squared distribution with three degrees of freedom
 _USUAL_SPREAD_COORDINATES: Final = 12.0  # coordinates of markers that the usual spread counts for
-_MOST_ERRORS: Final = 24  # largest number of independent errors that a user's file keeps of a hand
+_MOST_ERRORS: Final = 64  # independent errors that are kept of a hand: 99.9 % of its variances
 # How far a turn and a log length move a fingertip or its marker, roughly [m]: the largest errors are kept.
 _ARM, _BONE = 0.05, 0.03
 _INDEPENDENT_POSES: Final = 14.0  # number of frames with independent deformation of the flesh
