@@ -156,7 +156,8 @@ class User(Sequence[GloveFit]):
             raise ArgumentError("the hands wear different gloves, expected one layout for all")
         content = {
             "schema": SCHEMA,
-            "units": "metres, radians; every hand is described as a right one, its markers as they are",
+            "units": "metres, radians, errors in millionths; every hand is described as a right one, its markers "
+            "as they are",
             "notes": self.notes,
             "glove": dataclasses.asdict(self.layout),
             "hands": [_to_json(hand) for hand in self.hands],
@@ -235,11 +236,11 @@ def load_user(path: str | Path) -> User:
 
 
 def stored_errors(user: User) -> dict[Side, dict[str, Any]]:
-    """Errors that calibration left in a user's hands, as JSON with a micrometer's precision."""
+    """Errors that calibration left in a user's hands, as JSON in millionths of their units."""
     return {
-        side: {name: np.round(values, 6).tolist() for name, values in user.errors[side]._asdict().items()}
-        for side in user.sides
-        if side in user.errors
+        side: {name: np.rint(1e6 * values).astype(int).tolist() for name, values in kept._asdict().items()}
+        for side, kept in user.errors.items()
+        if side in user.sides
     }
 
 
@@ -248,11 +249,15 @@ def read_errors(stored: Any, hands: Sequence[GloveFit]) -> dict[Side, HandErrors
     errors = {}
     for hand in hands:
         if hand.side in stored:
-            values = [np.array(stored[hand.side][name], dtype=np.float64) for name in HandErrors._fields]
-            count = values[0].shape[-1]
+            values = [
+                1e-6 * np.array(stored[hand.side][name], dtype=np.float64) for name in HandErrors._fields
+            ]
+            count = max(values[0].size // NUM_NUMBERS, 1)
             shapes = [(NUM_NUMBERS, count), (hand.layout.num_markers, 3, count)]
-            if [one.shape for one in values] != shapes or not all(np.isfinite(one).all() for one in values):
-                raise ValueError(f"errors of the {hand.side} hand are not numbers of each bone and marker")
+            if [one.shape for one in values] != shapes or not all((abs(one) <= 1.0).all() for one in values):
+                raise ValueError(
+                    f"errors of the {hand.side} hand are not small numbers of each bone and marker"
+                )
             errors[hand.side] = HandErrors(*values)
     return errors
 

@@ -146,14 +146,14 @@ def test_measuring_and_calibration_make_them_narrower_and_noise_wider(rng):
     fit = nominal_fit("dense19", "M", "right")
     qpos, seen = sample_poses(fit.model, 5, rng=rng), np.zeros((5, 19))
     measured = hand_doubt(hand_arrays(fit).digits, "measured").errors
-    half = HandErrors(*(0.5 * values for values in measured))
+    little = HandErrors(*(0.1 * values for values in measured))
     widest, wide, middle, narrow = (
         model.spreads(qpos, seen, noise)
         for model, noise in (
             (SpreadModel(fit, "named"), 0.0005),
             (SpreadModel(fit, "measured"), 0.0005),
-            (SpreadModel(fit, "calibrated", half), 0.0005),
-            (SpreadModel(fit, "calibrated", half), 0.0001),
+            (SpreadModel(fit, "calibrated", little), 0.0005),
+            (SpreadModel(fit, "calibrated", little), 0.0001),
         )
     )
     for wider, narrower in pairwise((widest, wide, middle, narrow)):
