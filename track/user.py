@@ -156,8 +156,8 @@ class User(Sequence[GloveFit]):
             raise ArgumentError("the hands wear different gloves, expected one layout for all")
         content = {
             "schema": SCHEMA,
-            "units": "metres, radians, errors in millionths; every hand is described as a right one, its markers "
-            "as they are",
+            "units": "metres, radians, errors in millionths; every hand is described as a right one, "
+            "its markers as they are",
             "notes": self.notes,
             "glove": dataclasses.asdict(self.layout),
             "hands": [_to_json(hand) for hand in self.hands],
@@ -249,14 +249,13 @@ def read_errors(stored: Any, hands: Sequence[GloveFit]) -> dict[Side, HandErrors
     errors = {}
     for hand in hands:
         if hand.side in stored:
-            values = [
-                1e-6 * np.array(stored[hand.side][name], dtype=np.float64) for name in HandErrors._fields
-            ]
+            mine = stored[hand.side]
+            values = [1e-6 * np.array(mine[name], dtype=np.float64) for name in HandErrors._fields]
             count = max(values[0].size // NUM_NUMBERS, 1)
             shapes = [(NUM_NUMBERS, count), (hand.layout.num_markers, 3, count)]
             if [one.shape for one in values] != shapes or not all((abs(one) <= 1.0).all() for one in values):
                 raise ValueError(
-                    f"errors of the {hand.side} hand are not small numbers of each bone and marker"
+                    f"errors of the {hand.side} hand are not small numbers for bones and markers"
                 )
             errors[hand.side] = HandErrors(*values)
     return errors
