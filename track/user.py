@@ -254,9 +254,7 @@ def read_errors(stored: Any, hands: Sequence[GloveFit]) -> dict[Side, HandErrors
             count = max(values[0].size // NUM_NUMBERS, 1)
             shapes = [(NUM_NUMBERS, count), (hand.layout.num_markers, 3, count)]
             if [one.shape for one in values] != shapes or not all((abs(one) <= 1.0).all() for one in values):
-                raise ValueError(
-                    f"errors of the {hand.side} hand are not small numbers"
-                )
+                raise ValueError(f"errors of the {hand.side} hand are not small numbers")
             errors[hand.side] = HandErrors(*values)
     return errors
 
