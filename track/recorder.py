@@ -63,7 +63,7 @@ def settings_of(tracker: Tracker) -> dict[str, Any]:
     """Settings that a take records of its tracker, as JSON."""
     known: dict[str, Any] = {"user": tracker.user.notes} if tracker.user.notes else {}
     errors = stored_errors(tracker.user)
-    known |= {"angle_errors": errors} if errors else {}
+    known |= {"errors": errors} if errors else {}
     return {"glove": tracker.user.layout.name, **known, "tracker": dataclasses.asdict(tracker.config)}
 
 

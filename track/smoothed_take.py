@@ -97,7 +97,7 @@ def smooth_take(take: Take) -> Take:
 
 def spread_model(take: Take, hand: GloveFit) -> SpreadModel:
     """Model of the standard deviations of a take's hand, given what the settings record of the user."""
-    errors = read_errors(take.settings.get("angle_errors", {}))
+    errors = read_errors(take.settings.get("errors", {}), take.hands)
     origin = hand_origin(str(take.settings.get("user", "")), hand.side)
     return SpreadModel(hand, origin, errors.get(hand.side))
 

@@ -108,7 +108,7 @@ def kept_user(
     `done` comes from `calibrate_take`, `before` are the hands that labeled the take, and `source` tells where
     the frames are from, such as "from take.c3d".
     """
-    worn, hands, whole, errors = {hand.side: hand for hand in before}, [], [], dict(before.angle_errors)
+    worn, hands, whole, errors = {hand.side: hand for hand in before}, [], [], dict(before.errors)
     notes = [f"calibrated {source}, {before.notes.removeprefix(MEASURED) or before} to begin with"]
     for one in done:
         side, remark = one.hand.side, ""
@@ -116,7 +116,7 @@ def kept_user(
             markers, on_step = _markers(take, side), _steps(side, on_part)
             again = calibrate_hand(markers, one.start, take.rate, progress=on_step)
             one = dataclasses.replace(again, held_out=one.held_out)  # noqa: PLW2901
-            errors[side] = one.angle_errors
+            errors[side] = one.errors
         elif not before.is_calibrated(side):
             remark = AS_MEASURED  # `is_calibrated` recognizes this remark
         hands.append(one.hand if one.is_better else worn[side])

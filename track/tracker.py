@@ -100,7 +100,7 @@ class Tracker:
                 hand,
                 config,
                 origin=self.user.origin(hand.side),
-                angle_errors=self.user.angle_errors.get(hand.side),
+                errors=self.user.errors.get(hand.side),
             )
             for hand in self.hands
         ]

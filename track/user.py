@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, Final, cast, get_args, overload
 
 import numpy as np
-from jaxtyping import Float
 
 from gloves.fit import Attachment, GloveFit, nominal_fit
 from gloves.hand_files import write_hand
@@ -20,9 +19,10 @@ from handsim.errors import DAMAGE, ArgumentError, FileError
 from handsim.files.inputs import read_bytes
 from handsim.files.outputs import write_text, writing
 from handsim.hand.model import HandModel
-from handsim.hand.shape import NUM_JOINTS, SIDES, HandShape, Side
+from handsim.hand.shape import SIDES, HandShape, Side
 from track.calibration.user_calibration import Calibration
 from track.config import HandOrigin, Size
+from track.kinematics.pose_spread import NUM_NUMBERS, HandErrors
 from train.labelers.protocol import Labeler
 from train.labelers.storage import load_labeler
 
@@ -56,8 +56,8 @@ class User(Sequence[GloveFit]):
     """Origin of the hands, in words."""
     calibrations: tuple[Calibration, ...] = ()
     """Results of `calibrate` for each hand, with its fit to held-out frames; not stored in files."""
-    angle_errors: Mapping[Side, Float[np.ndarray, "20 2"]] = field(default_factory=dict)
-    """Errors of each joint angle that remain after calibration [rad]: from marker places, from bones."""
+    errors: Mapping[Side, HandErrors] = field(default_factory=dict)
+    """Errors that calibration left in each hand; standard deviations of its poses follow from them."""
 
     def __post_init__(self) -> None:
         expected = "a left hand, a right hand, or one of each in its glove"
@@ -156,11 +156,12 @@ class User(Sequence[GloveFit]):
             raise ArgumentError("the hands wear different gloves, expected one layout for all")
         content = {
             "schema": SCHEMA,
-            "units": "metres, radians; every hand is described as a right one, its markers as they are",
+            "units": "metres, radians, errors in millionths; every hand is described as a right one, "
+            "its markers as they are",
             "notes": self.notes,
             "glove": dataclasses.asdict(self.layout),
             "hands": [_to_json(hand) for hand in self.hands],
-            **({"angle_errors": errors} if (errors := stored_errors(self)) else {}),
+            **({"errors": errors} if (errors := stored_errors(self)) else {}),
         }
         with writing(path, UserError):
             write_text(path, json.dumps(content, indent=1, ensure_ascii=False) + "\n")
@@ -227,30 +228,34 @@ def load_user(path: str | Path) -> User:
         raise UserError(f"{path}: a user's file of schema {content['schema']!r}, expected {SCHEMA}")
     try:
         layout = stored_layout(content["glove"])
-        return User(
-            tuple(_from_json(hand, layout) for hand in content["hands"]),
-            str(content.get("notes", "")),
-            angle_errors=read_errors(content.get("angle_errors", {})),
-        )
+        hands = tuple(_from_json(hand, layout) for hand in content["hands"])
+        errors = read_errors(content.get("errors", {}), hands)
+        return User(hands, str(content.get("notes", "")), errors=errors)
     except DAMAGE as error:
         raise UserError(f"{path}: a damaged user's file: {_reason(error)}") from error
 
 
-def stored_errors(user: User) -> dict[Side, list[list[float]]]:
-    """Errors of a user's angles after calibration, as JSON."""
+def stored_errors(user: User) -> dict[Side, dict[str, Any]]:
+    """Errors that calibration left in a user's hands, as JSON in millionths of their units."""
     return {
-        side: np.round(user.angle_errors[side], 6).tolist()
-        for side in user.sides
-        if side in user.angle_errors
+        side: {name: np.rint(1e6 * values).astype(int).tolist() for name, values in kept._asdict().items()}
+        for side, kept in user.errors.items()
+        if side in user.sides
     }
 
 
-def read_errors(stored: Any) -> dict[Side, Float[np.ndarray, "20 2"]]:
-    """Inverse of `stored_errors`; a `ValueError` if the data are invalid."""
-    errors = {side: np.array(stored[side], dtype=np.float64) for side in SIDES if side in stored}
-    for values in errors.values():
-        if values.shape != (NUM_JOINTS, 2) or not (np.isfinite(values) & (values >= 0.0)).all():
-            raise ValueError(f"angle_errors are not {NUM_JOINTS} pairs of numbers from 0 on")
+def read_errors(stored: Any, hands: Sequence[GloveFit]) -> dict[Side, HandErrors]:
+    """Inverse of `stored_errors` for these hands; a `ValueError` if the data are invalid."""
+    errors = {}
+    for hand in hands:
+        if hand.side in stored:
+            mine = stored[hand.side]
+            values = [1e-6 * np.array(mine[name], dtype=np.float64) for name in HandErrors._fields]
+            count = max(values[0].size // NUM_NUMBERS, 1)
+            shapes = [(NUM_NUMBERS, count), (hand.layout.num_markers, 3, count)]
+            if [one.shape for one in values] != shapes or not all((abs(one) <= 1.0).all() for one in values):
+                raise ValueError(f"errors of the {hand.side} hand are not small numbers")
+            errors[hand.side] = HandErrors(*values)
     return errors
 
 

@@ -20,6 +20,7 @@ from handsim.errors import ArgumentError
 from handsim.hand.shape import SIDES
 from tests.sentences import error_names
 from track import User, load_user
+from track.kinematics.pose_spread import NUM_NUMBERS, HandErrors
 from track.user import AS_MEASURED, MEASURED, UserError, as_user
 
 
@@ -33,6 +34,29 @@ def hands(rng):
         worn = dataclasses.replace(worn, points=worn.points + rng.normal(scale=0.003, size=worn.points.shape))
         pair.append(GloveFit(HandModel(sample_shape(side=side, rng=rng)), worn))
     return tuple(pair)
+
+
+def errors_of_somebody():
+    """Three independent errors of a hand of a millimeter or a degree."""
+    rng = np.random.default_rng(3)
+    return HandErrors(0.01 * rng.normal(size=(NUM_NUMBERS, 3)), 0.001 * rng.normal(size=(19, 3, 3)))
+
+
+def test_errors_of_calibrated_hands_come_back(hands, tmp_path):
+    told = errors_of_somebody()
+    User(hands, errors={"right": told}).save(tmp_path / "user.json")
+    found = load_user(tmp_path / "user.json").errors
+    assert set(found) == {"right"}
+    for one, other in zip(told, found["right"], strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-6)
+
+
+def test_older_files_have_no_such_errors(hands, tmp_path):
+    User(hands).save(tmp_path / "user.json")
+    content = json.loads((tmp_path / "user.json").read_text("utf-8"))
+    content["angle_errors"] = {"right": [[0.01, 0.01]] * 20}
+    (tmp_path / "user.json").write_text(json.dumps(content), "utf-8")
+    assert load_user(tmp_path / "user.json").errors == {}
 
 
 def test_hands_come_back_exactly(hands, tmp_path):
@@ -105,12 +129,17 @@ def test_a_user_s_hand_leaves_with_its_markers(hands, tmp_path, capsys):
         ("hands.0.markers.bone_indices.0.0", 16, "whole numbers from 0 to 15"),
         ("hands.0.markers.bone_weights.0", [0.5, 0.0, 0.0, 0.0], "sum to one"),
         ("hands", None, "'hands' is missing"),
+        ("errors.right.numbers.45", None, "errors of the right hand are not small numbers"),
+        ("errors.right.markers.0.0.1", 10**7, "errors of the right hand are not small numbers"),
+        ("errors.right.markers.0", None, "errors of the right hand are not small numbers"),
+        ("errors.right.numbers", [[]] * 46, "errors of the right hand are not small numbers"),
+        ("errors.right.markers", None, "'markers' is missing"),
         ("hands.1.shape.side", "left", "expected a left hand, a right hand, or one of each"),
     ],
 )
 def test_damage_is_told_in_one_sentence(place, value, words, hands, tmp_path):
     path = tmp_path / "user.json"
-    User(hands).save(path)
+    User(hands, errors={"right": errors_of_somebody()}).save(path)
     content = json.loads(path.read_text("utf-8"))
     *way, last = [int(key) if key.isdigit() else key for key in place.split(".")]
     table = functools.reduce(operator.getitem, way, content)

@@ -24,6 +24,7 @@ from track.config import HandOrigin, TrackerConfig
 from track.frames import Spreads
 from track.kinematics.pose_solver import FEWEST_MARKERS, FramePriors, PoseSolver, priors_of_frame
 from track.kinematics.pose_spread import (
+    HandErrors,
     JointPrior,
     MarkerPrediction,
     SpreadModel,
@@ -109,7 +110,7 @@ class HandState:
         config: TrackerConfig = TrackerConfig(),  # noqa: B008 (frozen)
         *,
         origin: HandOrigin = "calibrated",
-        angle_errors: Float[np.ndarray, "20 2"] | None = None,
+        errors: HandErrors | None = None,
     ) -> None:
         self.hand = hand
         self.config = config
@@ -140,7 +141,7 @@ class HandState:
         self._last_seen = np.full(count, -np.inf)  # [s] of each marker since the hand was initialized
         self._started = 0.0  # [s] when the hand was initialized
         self._left_out = np.zeros(count, dtype=bool)  # markers without a point in the first fit
-        self._spread_model = SpreadModel(hand, origin, angle_errors)
+        self._spread_model = SpreadModel(hand, origin, errors)
         self._usual_square = np.nan  # [m^2] mean squared RMS distance, biases included
         self._designed = self.solver.hand.positions[:, 0].copy()  # [m] without biases
         self._ranges = digit_ranges(hand)

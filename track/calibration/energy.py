@@ -28,7 +28,6 @@ from handsim.hand.shape import BONES, DIGITS, NUM_BONES, NUM_JOINTS, HandShape, 
 from handsim.hand.skin import rest_vertices
 from handsim.kernels import move
 from handsim.space.transforms import quaternion_matrix
-from poses.shapes import LIBRARIES, gestures_of
 from poses.touch import FINGERS, thumb_contact
 from track.calibration.hand_parameters import (
     NUM_PARAMETERS,
@@ -62,7 +61,6 @@ _LIMIT_SPREAD: Final = np.deg2rad(2.0)  # [rad] standard deviation of an angle b
 _GESTURES: Final = 4.0  # The pose prior counts this many times per capture, as its frames are much alike.
 GESTURES_OF_USER: Final = np.repeat([1.0, _GESTURES], [4, 16])
 """Number of gestures, by joint angle, whose mean varies from person to person like the mean of a capture."""
-_MOST_GESTURES: Final = 80  # in which errors of angles are computed
 _LEAST_MOTION: Final = np.deg2rad(1.0)  # of a digit that flesh follows
 RELINEARIZE: Final = 0.005  # The skin's jacobian is renewed after such a change (log lengths, [rad], [m]).
 _DIFFERENCE_STEP: Final = 1e-5  # of finite differences
@@ -98,6 +96,11 @@ class Contacts(NamedTuple):
     frames: Int[np.ndarray, "K"]
     fingers: Int[np.ndarray, "K"]  # indices into `DIGITS`
     pads: SkinCoordinates  # points on the thumb, then those on the fingers
+
+    def part(self, some: Bool[np.ndarray, "K"]) -> Contacts:
+        """Some of the contacts."""
+        pads = SkinCoordinates(*(values[np.tile(some, 2)] for values in self.pads))
+        return Contacts(self.frames[some], self.fingers[some], pads)
 
 
 _NO_COORDINATES: Final = SkinCoordinates(np.empty(0, dtype=np.int64), np.empty((0, 3)), np.empty(0))
@@ -333,6 +336,17 @@ class Problem:
         result.pose[:, angles, angles] += (beyond != 0.0) / _LIMIT_SPREAD**2
         result.pose_gradient[:, 6:] += beyond / _LIMIT_SPREAD**2 + off @ self.pose_precision
 
+    def gap_spreads(self, estimate: Estimate, fit: Fit) -> Float[np.ndarray, "K"]:
+        """Standard deviations of the contacts' gaps [m] that markers and priors leave open."""
+        alone = dataclasses.replace(estimate, contacts=_NO_CONTACTS)
+        covariance, answers = shared_covariance(self, alone, self.fit(alone))
+        patch = SkinPatch(self._all_coordinates(estimate).faces)
+        rest = self._rest_jacobian(estimate, patch, fit.model.surface.vertices)
+        by_pose, by_shape = self._gap_jacobians(estimate, fit, rest[2 * len(estimate.points) :])
+        moved = -np.einsum("kp,kps->ks", by_pose, answers[estimate.contacts.frames])
+        moved[:, :NUM_PARAMETERS] += by_shape
+        return np.asarray(np.sqrt(np.einsum("ks,st,kt->k", moved, covariance, moved)))
+
     def _gap_jacobians(
         self, estimate: Estimate, fit: Fit, rest: NDArray[np.float64]
     ) -> list[NDArray[np.float64]]:
@@ -455,6 +469,14 @@ def initialize_contacts(
     frames = np.array([frame for frame, _ in touches], dtype=np.int64)
     fingers = np.array([DIGITS.index(finger) for _, finger in touches], dtype=np.int64)
     return slide_contacts(Contacts(frames, fingers, pads), model, T_world_bone)
+
+
+def are_touches(gaps: Float[np.ndarray, "K"], spreads: Float[np.ndarray, "K"]) -> Bool[np.ndarray, "K"]:
+    """Whether pads touch rather than rest anywhere near each other, by gaps without contacts [m]."""
+    # A touch has a normal gap, another pose any gap up to the largest. Pads that overlap touch.
+    spreads = np.hypot(spreads, CONTACT_SPREAD)
+    odds = _MOST_TOUCH_GAP / (np.sqrt(2.0 * np.pi) * spreads) * np.exp(-0.5 * (gaps / spreads) ** 2)
+    return np.asarray((gaps < 0.0) | (odds > 1.0))
 
 
 def _nearest_skin_points(model: HandModel, bones: NDArray[np.float64], finger: str) -> NDArray[np.float64]:
@@ -593,10 +615,8 @@ def shared_covariance(
     return np.linalg.inv(reduced[:, :-1]), solved[..., :-1]
 
 
-def error_covariance(
-    problem: Problem, estimate: Estimate, fit: Fit
-) -> tuple[Float[np.ndarray, "S S"], Float[np.ndarray, "F 26 S"]]:
-    """Covariance of the errors of the shared unknowns, and how poses answer to these unknowns.
+def error_covariance(problem: Problem, estimate: Estimate, fit: Fit) -> Float[np.ndarray, "S S"]:
+    """Covariance of the errors of the shared unknowns.
 
     Unlike noise, flesh that follows the angles of its digit is not averaged out by many frames, nor are the
     gestures of a user that differ from people's.
@@ -629,7 +649,7 @@ def error_covariance(
     of_noise = share * bases[:, 0, 0].size * (1.0 - (by_pose[:, 0].size + len(reduced)) / seen.size)
     flesh = max(found - of_noise, 0.0) / left
     across = np.concatenate(forces, axis=1)
-    return inverse @ (errors + flesh * across @ across.T) @ inverse, answers
+    return np.asarray(inverse @ (errors + flesh * across @ across.T) @ inverse)
 
 
 def _flesh_patterns(problem: Problem, estimate: Estimate, fit: Fit) -> Float[np.ndarray, "M F 3 12"]:
@@ -647,32 +667,6 @@ def _flesh_patterns(problem: Problem, estimate: Estimate, fit: Fit) -> Float[np.
         off *= roots[:, marker, None] / max(float(np.sqrt((off**2).sum(axis=1).mean())), _LEAST_MOTION)
         patterns.append(np.einsum("fki,fj->fkij", turned, off).reshape(len(off), 3, -1))
     return np.stack(patterns)
-
-
-def gesture_answers(problem: Problem, estimate: Estimate) -> Float[np.ndarray, "F 26 S"]:
-    """How poses answer to the shared unknowns in the gestures that people make, whatever the capture has."""
-    gestures = np.concatenate([gestures_of(library) for library in LIBRARIES])
-    qpos = join_qpos(gestures[:: -(-len(gestures) // _MOST_GESTURES)])
-    at = dataclasses.replace(estimate, qpos=qpos, contacts=_NO_CONTACTS)
-    targets = np.zeros((len(qpos), *estimate.points.shape))
-    scales = {"noise": problem.noise, "robust_scale": np.inf}
-    seen = Problem(problem.shape, problem.design, problem.heights, targets, **scales)
-    return shared_covariance(seen, at, seen.fit(at))[1]
-
-
-def angle_errors(
-    covariance: Float[np.ndarray, "S S"], answers: Float[np.ndarray, "F 26 S"]
-) -> Float[np.ndarray, "20 2"]:
-    """What is open of each joint angle [rad]: by places of markers, by the shape."""
-    # Both are correlated; the total variance is divided in the ratio of their separate variances.
-    by_angle = answers[:, 6:]
-    places, bones, both = (
-        np.einsum("fis,st,fit->i", of, covariance[part, part], of, optimize=True)
-        for part in (slice(NUM_PARAMETERS, None), slice(NUM_PARAMETERS), slice(None))
-        for of in (by_angle[..., part],)
-    )
-    variances = np.stack([places, bones], axis=1) * (both / (places + bones) / len(by_angle))[:, None]
-    return np.asarray(np.sqrt(variances))
 
 
 def _damped_step(

@@ -14,6 +14,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import compress
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -26,7 +27,7 @@ from handsim.errors import CalibrationError
 from handsim.hand.model import HandModel, build_skeleton
 from handsim.hand.shape import DIGITS, JOINT_NAMES, NUM_JOINTS, PALM, HandShape, Side
 from handsim.hand.skin import rest_vertices
-from handsim.space.transforms import MIRROR, quaternion_matrix, rigid_fit
+from handsim.space.transforms import MIRROR, euler_matrix, quaternion_matrix, rigid_fit
 from track.calibration.energy import (
     GESTURES_OF_USER,
     HEIGHT_SPREAD,
@@ -35,13 +36,12 @@ from track.calibration.energy import (
     Fit,
     Problem,
     Progress,
-    angle_errors,
+    are_touches,
     contact_geometry,
     contact_weights,
     error_covariance,
     find_touches,
     first_estimate,
-    gesture_answers,
     initialize_contacts,
     levenberg_marquardt,
     shared_covariance,
@@ -59,6 +59,7 @@ from track.calibration.hand_parameters import (
 )
 from track.frames import TrackedFrame
 from track.kinematics.pose_solver import PoseFit, PoseSolver
+from track.kinematics.pose_spread import HandErrors, errors_of_motions
 
 _WIDE_STEPS: Final = 6  # steps with the first robust scale, which includes distant markers
 _STEPS_WITHOUT_CONTACTS: Final = 10  # last step without contacts, as in the paper
@@ -81,6 +82,9 @@ _ENOUGH_RANGE: Final = 0.3  # share of its range that each joint should cover
 _LEAST_NOISE, _MOST_NOISE = 0.0001, 0.003  # [m]
 _CHI2_MEDIAN: Final = 2.366  # median of the chi-squared distribution with three degrees of freedom
 _USUAL_SPREAD_COORDINATES: Final = 12.0  # coordinates of markers that the usual spread counts for
+_MOST_ERRORS: Final = 64  # independent errors that are kept of a hand: 99.9 % of its variances
+# How far a turn and a log length move a fingertip or its marker, roughly [m]: the largest errors are kept.
+_ARM, _BONE = 0.05, 0.03
 _INDEPENDENT_POSES: Final = 14.0  # number of frames with independent deformation of the flesh
 
 
@@ -136,8 +140,8 @@ class Calibration:
     """Standard error of each marker's position on its bone; on the palm relative to the knuckles [m]."""
     length_errors: Float[np.ndarray, "5 3"]
     """Standard error of each bone's length [m]."""
-    angle_errors: Float[np.ndarray, "20 2"]
-    """Standard deviation of each joint angle [rad] from errors of marker places and of bones."""
+    errors: HandErrors
+    """Errors of bones and marker places that stay, as independent ones that are alike in all frames."""
     touches: tuple[Touch, ...]
     still_joints: tuple[str, ...]
     """Joints that moved too little to determine the bones on either side."""
@@ -266,7 +270,7 @@ def calibrate_hand(
     rough = user_hand(right, problem, estimate)
     rough_track = PoseSolver(rough).solve(seen)
     touches = find_touches(rough.model, rough_track.qpos[:, 7:], complete, rate)
-    problem, estimate = _with_touches(problem, estimate, fit, seen, rough_track, touches)
+    problem, estimate, touches = _with_touches(problem, estimate, fit, seen, rough_track, touches)
     for last in np.linspace(steps, MOST_STEPS, 1 + _SPREAD_ROUNDS).astype(int)[1:]:
         learn_spreads(problem, estimate, problem.fit(estimate))
         estimate, fit, steps = levenberg_marquardt(problem, estimate, steps, int(last), progress)
@@ -276,7 +280,7 @@ def calibrate_hand(
         touching = PoseSolver(right).solve(seen[[frame for frame, _ in touches]])
         before = contact_gaps(right.model, touches, touching.qpos)
     final = PoseSolver(done).solve(seen, rough_track.qpos)
-    covariance, answers = error_covariance(problem, estimate, fit)
+    covariance = error_covariance(problem, estimate, fit)
     position_errors, length_errors = standard_errors(problem, estimate, fit, covariance)
     return Calibration(
         hand=done.with_side(start.side),
@@ -286,9 +290,7 @@ def calibrate_hand(
         shifts=np.linalg.norm(fit.design_residuals, axis=1),
         position_errors=position_errors,
         length_errors=length_errors,
-        angle_errors=np.maximum(
-            *(angle_errors(covariance, one) for one in (answers, gesture_answers(problem, estimate)))
-        ),
+        errors=remaining_errors(problem, estimate, covariance, done.with_side(start.side)),
         touches=_touches(estimate, fit, touches, usable, before, mirror),
         still_joints=still_joints(final.qpos[:, 7:], complete, done.model),
     )
@@ -301,8 +303,8 @@ def _with_touches(
     markers: NDArray[np.float64],
     track: PoseFit,
     touches: list[tuple[int, str]],
-) -> tuple[Problem, Estimate]:
-    """The problem with the frames of the touches, and the noise of the first fit."""
+) -> tuple[Problem, Estimate, list[tuple[int, str]]]:
+    """The problem with the frames of the touches, and the noise of the first fit; and the likely touches."""
     # The other frames are selected again: wrong labels are recognized on a hand that nearly fits.
     noise = marker_noise(problem, fit)
     chosen = informative_frames(track, markers)
@@ -322,11 +324,15 @@ def _with_touches(
     larger.data_noise = noise
     estimate = dataclasses.replace(estimate, qpos=track.qpos[frames])
     if not touches:
-        return larger, estimate
+        return larger, estimate, touches
     model = HandModel(shape_at(problem.shape, estimate.parameters))
     contacts = initialize_contacts(model, touches, model.forward_kinematics(track.qpos[touching]))
     contacts = contacts._replace(frames=len(chosen) + np.arange(len(touches)))
-    return larger, dataclasses.replace(estimate, contacts=contacts)
+    estimate = dataclasses.replace(estimate, contacts=contacts)
+    at = larger.fit(estimate)
+    likely = are_touches(at.geometry.gaps, larger.gap_spreads(estimate, at))
+    estimate = dataclasses.replace(estimate, contacts=contacts.part(likely))
+    return larger, estimate, list(compress(touches, likely))
 
 
 def _touches(
@@ -459,6 +465,41 @@ def standard_errors(
     own = covariance[BONE_LENGTHS, BONE_LENGTHS].diagonal()
     logs = own + covariance[LENGTH, LENGTH] + 2.0 * covariance[BONE_LENGTHS, LENGTH]
     return positions, fit.model.shape.bone_lengths * np.sqrt(logs).reshape(5, 3)
+
+
+def remaining_errors(
+    problem: Problem, estimate: Estimate, covariance: Float[np.ndarray, "S S"], hand: GloveFit
+) -> HandErrors:
+    """The largest independent errors of a calibrated hand, from the covariance of its shared unknowns."""
+    patch = SkinPatch(estimate.coordinates.faces)
+    before = euler_matrix(shape_at(problem.shape, estimate.parameters).base_angles).swapaxes(1, 2)
+
+    def described(shapes: list[HandShape]) -> NDArray[np.float64]:
+        rows = []
+        for shape, vertices in zip(shapes, rest_vertices(shapes), strict=True):
+            turned = euler_matrix(shape.base_angles) @ before
+            turns = turned[:, [2, 0, 1], [1, 2, 0]]
+            numbers = np.hstack([shape.knuckles, turns, np.log(shape.bone_lengths)])
+            points, _ = skin_points(estimate.coordinates, patch.corners(vertices))
+            rows.append(np.append(numbers, points))
+        return np.array(rows)
+
+    count = 3 * len(estimate.points)
+    jacobian = np.pad(shape_jacobian(problem.shape, estimate.parameters, described), ((0, 0), (0, count)))
+    jacobian[-count:, -count:] += np.eye(count)
+    scales = np.append(np.tile(np.repeat([1.0, _ARM, _BONE], 3), len(DIGITS)), np.ones(count))
+    jacobian *= scales[:, None]
+    variances, ways = np.linalg.eigh(jacobian @ covariance @ jacobian.T)
+    kept = ways * np.sqrt(np.maximum(variances, 0.0)) / scales[:, None]
+    kept = kept[:, : -_MOST_ERRORS - 1 : -1]
+    numbers, motions = (
+        kept[:-count].reshape(len(DIGITS), 3, 3, -1),
+        kept[-count:].reshape(-1, 3, kept.shape[1]),
+    )
+    if hand.side == "left":  # A mirrored turn has the opposite sense.
+        mirror = np.diag(MIRROR)[:, None]
+        numbers, motions = numbers * np.stack([mirror, -mirror, np.ones((3, 1))]), motions * mirror
+    return errors_of_motions(hand, np.pad(numbers.reshape(-1, kept.shape[1]), ((0, 1), (0, 0))), motions)
 
 
 def contact_gaps(

@@ -51,19 +51,6 @@ _LEAST_INFORMATION: Final = 1e-9  # share of a marker's precision, added for an 
 _DRIFT: Final = 0.014  # [m/sqrt(s)] random walk of a hidden marker
 _ANYWHERE: Final = 0.01  # [1/m^2, 1/rad^2] prior precision of the wrist
 _LEAST_NOISE: Final = 0.0001  # [m] lower bound of a marker's noise
-_NOISE_STEP: Final = 1e-5  # [m] rounding of the noise
-# Standard deviations of a calibrated hand, chosen as `_MEASURED` is; they grow with the markers' noise.
-_FEW: Final = 1.4  # uncertainty factor of a digit with fewer than three markers
-_CALIBRATED_SIZE: Final = 3.0  # [1/m] of relative size, times the noise
-_CALIBRATED_PLACE: Final = 0.15  # of marker places, times the noise
-_CALIBRATED_PALM: Final = 0.45  # of the palm's marker places, times the noise
-_CALIBRATED_KNUCKLE: Final = 0.15  # of knuckles, times the noise
-_CALIBRATED_TURNS: Final = (0.5, 0.8, 1.5)  # [deg] directions; abduction hardly shows a digit's
-_CALIBRATED_THUMB: Final = 1.6  # factor of the thumb's directions over the fingers'
-_CALIBRATED_BONES: Final = (3.5, 3.0)  # [1/m] of log lengths, times the noise
-_CALIBRATED_WRIST: Final = 0.0007  # [m] wrist in the palm
-_CALIBRATED_JOINTS: Final = (0.00016, 0.00045)  # [m] joints, tips
-_SINGLE: Final = (7.0, 3.0)  # factors of these for a digit with one marker
 _LEAST_FREEDOM: Final = 3  # least number of marker coordinates beyond those that a pose needs
 SOURCES: Final = ("noise and gaps", "gluing", "flesh", "person")
 """Sources of an angle's uncertainty: noisy or unseen markers, their glued places, their motion over the
@@ -75,13 +62,11 @@ nearly alike. Flesh counts more than once, as residuals do not show all of it. F
 of 107, 67 and 40 simulated people in dense19, sparse13 and starter10 (benchmarks/sessions.py)."""
 DETECTABLE: Final = 1.96 * float(np.sqrt(2.0))
 """Ratio of the minimal detectable difference of two sessions to the standard error of measurement."""
-_OWN: Final = 10  # unknown numbers of a digit: knuckle, direction, bones (3 each), all its bones
-_NUMBERS: Final = 5 * _OWN + 1  # unknown numbers of a hand: those of its digits, and its size
+_OWN: Final = 9  # numbers of a digit: place of its knuckle, its direction, lengths of its bones (3 each)
+NUM_NUMBERS: Final = len(DIGITS) * _OWN + 1
+"""Numbers of a skeleton: those of its digits, and its size."""
 NOT_SMOOTHED: Final = np.empty((0, NUM_UNKNOWNS, NUM_UNKNOWNS))
 """No covariances: the poses were fitted frame by frame."""
-# Unknowns by which a digit's keypoints respond to each number: its own joint angles, and the wrist.
-_OWN_UNKNOWNS: Final = np.ones((NUM_UNKNOWNS, _NUMBERS))
-_OWN_UNKNOWNS[:NUM_JOINTS, :-1] = np.kron(np.eye(5), np.ones((4, _OWN)))
 
 
 class JointPrior(NamedTuple):
@@ -109,17 +94,21 @@ class MarkerPrediction(NamedTuple):
     information_vector: Float[np.ndarray, "20"]  # the matrix times the angles by the markers alone [1/rad]
 
 
+class HandErrors(NamedTuple):
+    """C independent errors of a hand model against its user's hand, each of one standard deviation."""
+
+    numbers: Float[np.ndarray, "46 C"]
+    """By digit: its knuckle [m], its turn about the palm's axes [rad], log lengths of its bones; log size."""
+    markers: Float[np.ndarray, "M 3 C"]
+    """Shift of each marker in the frame of its main bone [m], beyond its motion with the bones."""
+
+
 class HandDoubt(NamedTuple):
     """Standard deviations of the difference between a hand model and its user's hand."""
 
     noise: float  # marker around its place, independent in each frame [m]
-    size: float  # log size of the whole hand
+    errors: HandErrors  # alike in all frames
     places: Float[np.ndarray, "M 2"]  # of each marker on its bone: along the skin (each way), off it [m]
-    knuckles: Float[np.ndarray, "5"]  # origin of each digit on the palm, in each direction [m]
-    directions: Float[np.ndarray, "5 3"]  # direction of each digit, about the axes of the palm [rad]
-    bones: Float[np.ndarray, "5 2"]  # log lengths of each bone of a digit, and of all of them together
-    wrist: float  # place of the wrist in the palm, which no marker shows, in each direction [m]
-    joints: Float[np.ndarray, "5 2"]  # joints and tip of a digit, beyond what markers show, each way [m]
     flesh: float = 0.0  # marker around its place, alike in successive frames [m]
 
 
@@ -356,59 +345,47 @@ def _complete_digits(
 
 def known_hand(digits: Int[np.ndarray, "M"], noise: float) -> HandDoubt:
     """`HandDoubt` of a perfectly known hand whose markers have some noise [m]."""
-    count = len(DIGITS)
-    pairs, turns = np.zeros((count, 2)), np.zeros((count, 3))
-    return HandDoubt(noise, 0.0, np.zeros((len(digits), 2)), np.zeros(count), turns, pairs, 0.0, pairs)
+    return HandDoubt(noise, _same_markers(digits, np.zeros((NUM_NUMBERS, 1))), np.zeros((len(digits), 2)))
 
 
-def hand_doubt(digits: Int[np.ndarray, "M"], origin: HandOrigin, noise: float) -> HandDoubt:
-    """`HandDoubt` of a user's hand by its origin, for people and gloves like the simulated ones."""
-    # A calibrated hand is as accurate as the noise of its markers [m] allows; a digit with one marker remains
-    # half as uncertain as on a measured hand.
+def hand_doubt(digits: Int[np.ndarray, "M"], origin: HandOrigin) -> HandDoubt:
+    """`HandDoubt` of a user's hand that was not calibrated, for people and gloves like the simulated ones."""
     known, count = _NAMED if origin == "named" else _MEASURED, len(DIGITS)
-    turns = np.full((count, 3), np.deg2rad(known.turn))
-    turns[0] *= known.thumb
-    before = HandDoubt(
-        MARKER_NOISE,
-        known.size,
-        np.tile(known.place, (len(digits), 1)),
-        np.full(count, known.knuckle),
-        turns,
-        np.tile(known.bones, (count, 1)),
-        0.0,
-        np.zeros((count, 2)),
-    )
-    if origin != "calibrated":
-        return before
-    counts = np.bincount(digits[digits >= 0], minlength=count)
-    single, few = counts < 2, np.where(counts < FEWEST_ON_PART, _FEW, 1.0)
-    places = np.where(single[:, None], 0.6 * np.array(known.place), _CALIBRATED_PLACE * noise * few[:, None])
-    lengths, turns = np.outer(few, _CALIBRATED_BONES) * noise, np.outer(few, np.deg2rad(_CALIBRATED_TURNS))
-    turns[0] *= _CALIBRATED_THUMB * few[0]  # Few markers determine a thumb's direction even less.
-    return HandDoubt(
-        noise,
-        _CALIBRATED_SIZE * noise,
-        np.where(digits[:, None] < 0, _CALIBRATED_PALM * noise, places[np.maximum(digits, 0)]),
-        np.where(single, 0.5 * before.knuckles, _CALIBRATED_KNUCKLE * noise * few),
-        np.where(single[:, None], 0.5 * before.directions, turns),
-        np.where(single[:, None], 0.5 * before.bones, lengths),
-        _CALIBRATED_WRIST,
-        np.where(single[:, None], _SINGLE, few[:, None]) * _CALIBRATED_JOINTS,
-    )
+    turns = np.deg2rad(known.turn) * np.repeat([known.thumb, 1.0], [1, count - 1])
+    each, all_bones = known.bones
+    own = [np.repeat([known.knuckle, turn, each], 3) for turn in turns]
+    numbers = np.zeros((NUM_NUMBERS, NUM_NUMBERS + count))
+    np.fill_diagonal(numbers, [*np.ravel(own), known.size])
+    numbers[:-1, NUM_NUMBERS:] = np.kron(np.eye(count), np.repeat([[0.0], [all_bones]], [6, 3], axis=0))
+    return HandDoubt(MARKER_NOISE, _same_markers(digits, numbers), np.tile(known.place, (len(digits), 1)))
+
+
+def errors_of_motions(
+    fit: GloveFit, numbers: Float[np.ndarray, "46 C"], motions: Float[np.ndarray, "M 3 C"]
+) -> HandErrors:
+    """Errors of a hand, given by how they move the markers of the flat hand in the wrist's frame [m]."""
+    hand, work = hand_arrays(fit), workspace(len(motions))
+    compute_markers(hand, np.zeros(NUM_JOINTS), work)
+    moved = np.empty((3 * len(motions), numbers.shape[1]))
+    _move_points(hand, numbers, work, moved)
+    turns = work.rotations[hand.bones[:, 0]].swapaxes(1, 2)
+    return HandErrors(numbers, np.ascontiguousarray(turns @ (motions - moved.reshape(motions.shape))))
+
+
+def _same_markers(digits: Int[np.ndarray, "M"], numbers: Float[np.ndarray, "46 C"]) -> HandErrors:
+    """Errors of a skeleton whose markers keep their places on the bones."""
+    return HandErrors(numbers, np.zeros((len(digits), 3, numbers.shape[1])))
 
 
 class SpreadModel:
-    """Standard deviations of the poses of one hand, which depend on the hand's origin.
+    """Standard deviations of the poses of one hand: by what its calibration left open, else by its origin."""
 
-    `angle_errors` are those that remain after a calibration, see `energy.angle_errors`.
-    """
-
-    def __init__(
-        self, fit: GloveFit, origin: HandOrigin, angle_errors: Float[np.ndarray, "20 2"] | None = None
-    ) -> None:
-        self._hand, self._digits, self._origin = with_keypoints(fit), hand_arrays(fit).digits, origin
-        self._angle_errors = angle_errors
-        self._doubts: dict[int, HandDoubt] = {}  # by the noise [10 um], which hardly changes in a take
+    def __init__(self, fit: GloveFit, origin: HandOrigin, errors: HandErrors | None = None) -> None:
+        self._hand, self._is_calibrated = with_keypoints(fit), errors is not None
+        digits = hand_arrays(fit).digits
+        self._doubt = hand_doubt(digits, origin)
+        if errors is not None:
+            self._doubt = known_hand(digits, MARKER_NOISE)._replace(errors=errors)
 
     def of_pose(
         self, qpos: Float[np.ndarray, "27"], unseen: Float[np.ndarray, "M"], rms: float
@@ -421,8 +398,8 @@ class SpreadModel:
         self, qpos: Float[np.ndarray, "T 27"], unseen: Float[np.ndarray, "T M"], rms: float
     ) -> tuple[Float[np.ndarray, "T 20"], Float[np.ndarray, "T 21"]]:
         """Standard deviations of angles [rad] and keypoints [m]; `unseen` is in [s], infinite for never."""
-        digits = self._digits
-        noise = max(rms * freedom_factor(len(digits)), _LEAST_NOISE) if rms > 0.0 else MARKER_NOISE
+        factor = freedom_factor(unseen.shape[1])
+        noise = max(rms * factor, _LEAST_NOISE) if rms > 0.0 else MARKER_NOISE
         variances, keypoints = self.variances(qpos, unseen, noise)
         return np.sqrt(variances.sum(axis=-1)), keypoints
 
@@ -441,19 +418,10 @@ class SpreadModel:
         For smoothed poses are given: flesh motion and RMS errors of marker places, along the skin and off it
         [m], the covariances of the unknowns from noise and gaps, and the weight of the prior in one frame.
         """
-        steps = round(noise / _NOISE_STEP)
-        if steps not in self._doubts:
-            self._doubts[steps] = hand_doubt(self._digits, self._origin, steps * _NOISE_STEP)
-        doubt = self._doubts[steps]
-        doubt = doubt._replace(flesh=flesh, places=np.maximum(doubt.places, places))
-        prior = share * resting_prior().precision
-        variances, keypoints = pose_spreads(self._hand, prior, doubt, qpos, unseen, smoothed)
-        if self._angle_errors is not None:
-            unsure, errors = variances[..., [1, 3]], self._angle_errors**2
-            # Errors of the hand move its keypoints as they move its angles.
-            keypoints *= max(1.0, np.sqrt(errors.sum() / unsure.mean(axis=0).sum()))
-            variances[..., [1, 3]] = np.maximum(unsure, errors)
-        return variances, keypoints
+        doubt = self._doubt._replace(flesh=flesh, places=np.maximum(self._doubt.places, places))
+        if self._is_calibrated:
+            doubt = doubt._replace(noise=noise)
+        return pose_spreads(self._hand, share * resting_prior().precision, doubt, qpos, unseen, smoothed)
 
 
 def measurement_error(budget: Float[np.ndarray, "*J 4"], origin: HandOrigin) -> Float[np.ndarray, "*J"]:
@@ -501,14 +469,14 @@ def pose_spreads(
 ) -> tuple[Float[np.ndarray, "T 20 4"], Float[np.ndarray, "T 21"]]:
     """Variances of joint angles by `SOURCES` [rad^2] and standard deviations of keypoints [m].
 
-    `hand` is from `with_keypoints`. A marker off its place moves the fit as noise does. The hand's unknown
-    numbers move markers, through them the fit, and keypoints also directly.
+    `hand` is from `with_keypoints`. A marker off its place moves the fit as noise does. Errors of the hand
+    move markers, through them the fit, and keypoints also directly.
     """
     angles, keypoints = np.empty((len(qpos), NUM_JOINTS, 4)), np.empty((len(qpos), NUM_KEYPOINTS))
     count, work, weights = unseen.shape[1], workspace(len(hand.digits)), np.zeros(len(hand.digits))
-    moved, posterior = np.zeros((len(weights), 3, _NUMBERS)), np.empty((NUM_UNKNOWNS, NUM_UNKNOWNS))
-    weighted = np.empty((3 * count, NUM_UNKNOWNS))
-    jacobian, numbers = work.jacobian.reshape(-1, NUM_UNKNOWNS), moved.reshape(-1, _NUMBERS)
+    ways, posterior = doubt.errors.numbers.shape[1], np.empty((NUM_UNKNOWNS, NUM_UNKNOWNS))
+    moved, shifted = np.empty((3 * len(weights), ways)), np.empty((3 * count, ways))
+    weighted, jacobian = np.empty((3 * count, NUM_UNKNOWNS)), work.jacobian.reshape(-1, NUM_UNKNOWNS)
     work.residuals[:] = 0.0
     for frame in range(len(qpos)):
         for marker in range(count):
@@ -521,27 +489,25 @@ def pose_spreads(
             posterior[row, row] += _ANYWHERE if row >= NUM_JOINTS else 0.0
         posterior[:NUM_JOINTS, :NUM_JOINTS] += prior
         invert_positive(posterior)
-        _move_points(hand, doubt, work, moved)
+        _move_points(hand, doubt.errors.numbers, work, moved)
+        _shift_markers(hand, doubt.errors.markers, work, shifted)
         for row in range(3 * count):
             for unknown in range(NUM_UNKNOWNS):
                 weighted[row, unknown] = weights[row // 3] * jacobian[row, unknown]
-        forces = weighted.T @ numbers[: 3 * count]
-        off, answers = weighted @ posterior, posterior @ forces
-        covariance, noise = answers @ answers.T, smoothed[frame] if len(smoothed) > 0 else posterior
-        _write_variances(hand, doubt, work, noise, covariance, off, angles[frame])
-        covariance += noise + off.T @ off
-        spread = jacobian[3 * count :] @ covariance
-        response = jacobian[3 * count :] @ (posterior @ (_OWN_UNKNOWNS * forces))
+        off = weighted @ posterior
+        by_bones, by_places = off.T @ moved[: 3 * count], off.T @ shifted
+        noise, answers = smoothed[frame] if len(smoothed) > 0 else posterior, by_bones + by_places
+        _write_variances(hand, doubt, work, noise, by_bones, by_places, off, angles[frame])
+        spread = jacobian[3 * count :] @ (noise + off.T @ off)
+        left = moved[3 * count :] - jacobian[3 * count :] @ answers
         for keypoint in range(NUM_KEYPOINTS):
-            digit, total = (keypoint - 1) // 4, 0.0
+            total = 0.0
             for row in range(3 * keypoint, 3 * keypoint + 3):
                 for unknown in range(NUM_UNKNOWNS):
                     total += spread[row, unknown] * jacobian[3 * count + row, unknown]
-                for number in range(_NUMBERS):
-                    own = numbers[3 * count + row, number]
-                    total += own * (own - 2.0 * response[row, number])
-            beyond = doubt.joints[digit, (keypoint - 1) % 4 // 3] if keypoint > 0 else doubt.wrist
-            keypoints[frame, keypoint] = np.sqrt(max(total, 0.0) / 3.0 + beyond**2)
+                for way in range(ways):
+                    total += left[row, way] ** 2
+            keypoints[frame, keypoint] = np.sqrt(max(total, 0.0) / 3.0)
     return angles, keypoints
 
 
@@ -551,15 +517,23 @@ def _write_variances(
     doubt: HandDoubt,
     work: Workspace,
     noise: Float[np.ndarray, "26 26"],
-    bones: Float[np.ndarray, "26 26"],
+    by_bones: Float[np.ndarray, "26 C"],
+    by_places: Float[np.ndarray, "26 C"],
     off: Float[np.ndarray, "R 26"],
     variances: Float[np.ndarray, "20 4"],
 ) -> None:
     """Write the variances of angles [rad^2]; scales `off` from derivatives [rad/m] to deviations [rad]."""
-    # A slipped marker keeps its height over the bone, and the height tells most of the bone's flexion.
+    # A slipped marker keeps its height over the bone, and the height tells most of the bone's flexion. Errors
+    # of bones and places are correlated: their variance is divided in the ratio of the separate variances.
     variances[:] = 0.0
     for hinge in range(NUM_JOINTS):
-        variances[hinge, 0], variances[hinge, 3] = noise[hinge, hinge], bones[hinge, hinge]
+        bones, places, both = 0.0, 0.0, 0.0
+        for way in range(by_bones.shape[1]):
+            bone, place = by_bones[hinge, way], by_places[hinge, way]
+            bones, places, both = bones + bone**2, places + place**2, both + (bone + place) ** 2
+        both /= max(bones + places, 1e-30)
+        variances[hinge, 0] = noise[hinge, hinge]
+        variances[hinge, 1], variances[hinge, 3] = both * places, both * bones
     flesh = doubt.flesh**2
     for marker in range(len(off) // 3):
         normal = work.rotations[hand.bones[marker, 0]] @ hand.normals[marker]
@@ -578,18 +552,34 @@ def _write_variances(
 
 
 @kernel
-def _move_points(
-    hand: HandArrays, doubt: HandDoubt, work: Workspace, moved: Float[np.ndarray, "P 3 51"]
+def _shift_markers(
+    hand: HandArrays,
+    shifts: Float[np.ndarray, "M 3 C"],
+    work: Workspace,
+    shifted: Float[np.ndarray, "R C"],
 ) -> None:
-    """Write the motion of points by one standard deviation of each unknown number of the hand [m]."""
-    # Ten numbers per digit: origin, turns about three axes, lengths of bones and of all; then the size.
-    lever = np.empty(3)
-    for point in range(len(moved)):
+    """Write the shifts of markers in the wrist's frame [m]."""
+    shifted[:] = 0.0
+    for marker in range(len(shifts)):
+        bone = work.rotations[hand.bones[marker, 0]]
+        _add_product(bone, shifts[marker], shifted[3 * marker : 3 * marker + 3])
+
+
+@kernel
+def _move_points(
+    hand: HandArrays,
+    numbers: Float[np.ndarray, "46 C"],
+    work: Workspace,
+    moved: Float[np.ndarray, "R C"],
+) -> None:
+    """Write the motion of points with the bones by each error of a skeleton's numbers [m]."""
+    ways, lever, own = numbers.shape[1], np.empty(3), np.empty((3, _OWN))
+    for point in range(len(moved) // 3):
         for i in range(3):
-            moved[point, i, _NUMBERS - 1] = doubt.size * work.markers[point, i]
+            for way in range(ways):
+                moved[3 * point + i, way] = work.markers[point, i] * numbers[NUM_NUMBERS - 1, way]
         for digit in range(hand.hinge_span[point, 0] // 4, hand.hinge_span[point, 1] // 4):
-            shift, share = moved[point, :, _OWN * digit : _OWN * (digit + 1)], 0.0
-            shift[:], lever[:] = 0.0, 0.0
+            share, lever[:], own[:] = 0.0, 0.0, 0.0
             for link in range(2, -1, -1):
                 bone = 1 + 3 * digit + link
                 reach = share * hand.offsets[bone + 1, 0] if link < 2 else 0.0  # distance along the bone [m]
@@ -600,12 +590,23 @@ def _move_points(
                         for i in range(3):
                             lever[i] += work.bone_terms[point, slot, i]
                 for i in range(3):
-                    shift[i, 6 + link] = doubt.bones[digit, 0] * reach * work.rotations[bone, i, 0]
-                    shift[i, 9] += doubt.bones[digit, 1] * reach * work.rotations[bone, i, 0]
+                    own[i, 6 + link] = reach * work.rotations[bone, i, 0]
             for i in range(3):
                 lever[i] -= share * work.origins[1 + 3 * digit, i]
-                shift[i, i] = share * doubt.knuckles[digit]
-            turns = doubt.directions[digit]
-            shift[1, 3], shift[2, 3] = -turns[0] * lever[2], turns[0] * lever[1]
-            shift[0, 4], shift[2, 4] = turns[1] * lever[2], -turns[1] * lever[0]
-            shift[0, 5], shift[1, 5] = -turns[2] * lever[1], turns[2] * lever[0]
+                own[i, i] = share
+            own[1, 3], own[2, 3] = -lever[2], lever[1]
+            own[0, 4], own[2, 4] = lever[2], -lever[0]
+            own[0, 5], own[1, 5] = -lever[1], lever[0]
+            _add_product(own, numbers[_OWN * digit : _OWN * (digit + 1)], moved[3 * point : 3 * point + 3])
+
+
+@kernel
+def _add_product(
+    left: Float[np.ndarray, "3 N"], right: Float[np.ndarray, "N C"], total: Float[np.ndarray, "3 C"]
+) -> None:
+    """Add the product of two matrices, of which the left is mostly zero."""
+    for row in range(3):
+        for number in range(len(right)):
+            if left[row, number] != 0.0:
+                for way in range(right.shape[1]):
+                    total[row, way] += left[row, number] * right[number, way]

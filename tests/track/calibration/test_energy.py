@@ -20,13 +20,12 @@ from track.calibration.energy import (
     ContactGeometry,
     Estimate,
     Problem,
-    angle_errors,
+    are_touches,
     contact_geometry,
     contact_weights,
     eliminate_poses,
     error_covariance,
     find_touches,
-    gesture_answers,
     initialize_contacts,
     levenberg_marquardt,
     shared_covariance,
@@ -106,13 +105,22 @@ def test_elimination_solves_the_whole_system(problem_and_estimate):
     np.testing.assert_allclose(rest / np.sqrt(np.einsum("fpp->fp", equations.pose)), 0.0, atol=1e-6)
 
 
+def angle_spreads(problem, estimate, covariance):
+    """Standard deviations of joint angles over the frames of a problem [rad]."""
+    _, answers = shared_covariance(problem, estimate, problem.fit(estimate))
+    return np.sqrt(np.einsum("fis,st,fit->i", answers[:, 6:], covariance, answers[:, 6:]) / len(answers))
+
+
 def test_a_thumb_that_gestures_may_turn_is_told_as_unsure(problem_and_estimate):
     problem, estimate = copy(problem_and_estimate[0]), problem_and_estimate[1]
     problem.noise = problem.data_noise = 0.003  # so that the markers tell little
     fit = problem.fit(estimate)
     without, told = (
-        np.linalg.norm(angle_errors(*of(problem, estimate, fit)), axis=1)
-        for of in (shared_covariance, error_covariance)
+        angle_spreads(problem, estimate, covariance)
+        for covariance in (
+            shared_covariance(problem, estimate, fit)[0],
+            error_covariance(problem, estimate, fit),
+        )
     )
     assert (told >= without).all()
     assert told[0] > 1.05 * without[0] > 0.0
@@ -123,7 +131,7 @@ def test_flesh_that_follows_the_angles_is_found_and_not_averaged_out(problem_and
     problem.robust_scale, problem.data_noise = np.inf, 1e-6
     fit = problem.fit(estimate)
     fit = fit._replace(residuals=np.zeros_like(fit.residuals))
-    without, answers = error_covariance(problem, estimate, fit)
+    without, answers = error_covariance(problem, estimate, fit), shared_covariance(problem, estimate, fit)[1]
     digits = nominal_fit(load_layout("dense19"), "M", "right").attachment.digits
     turns, before = quaternion_matrix(estimate.qpos[:, 3:7]), problem.normal_equations(estimate, fit)
     by_pose, by_shared, _, _ = problem.weighted_jacobians(estimate, fit)
@@ -146,7 +154,7 @@ def test_flesh_that_follows_the_angles_is_found_and_not_averaged_out(problem_and
         poses = -solved[..., -1] - answers @ shared
         left = np.einsum("frp,fp->fr", by_pose, poses) + by_shared @ shared
         residuals = problem.noise * left[:, :-1].reshape(moved.shape) - moved
-        by_flesh = error_covariance(problem, estimate, fit._replace(residuals=residuals))[0] - without
+        by_flesh = error_covariance(problem, estimate, fit._replace(residuals=residuals)) - without
         variances = np.einsum("fis,st,fit->fi", answers[:, 6:], by_flesh, answers[:, 6:])
         ratios.append((answers[:, 6:] @ shared) ** 2 / variances)
     assert np.mean(ratios) == pytest.approx(1.0, abs=0.25)
@@ -156,19 +164,34 @@ def test_noise_that_is_known_to_be_less_than_its_weight_says_leaves_less_open(pr
     problem, estimate = copy(problem_and_estimate[0]), problem_and_estimate[1]
     fit = problem.fit(estimate)
     fit = fit._replace(residuals=np.zeros_like(fit.residuals))
-    before = angle_errors(*error_covariance(problem, estimate, fit))
+    before = error_covariance(problem, estimate, fit)
     problem.data_noise /= 2.0
-    assert (angle_errors(*error_covariance(problem, estimate, fit)) < before).all()
+    after = error_covariance(problem, estimate, fit)
+    assert (angle_spreads(problem, estimate, after) < angle_spreads(problem, estimate, before)).all()
 
 
-def test_gestures_tell_of_poses_that_a_capture_lacks(problem_and_estimate):
+@pytest.mark.parametrize(
+    ("gap", "spread", "touches"),
+    [
+        (0.0005, 0.001, True),
+        (0.0015, 0.001, True),
+        (-0.004, 0.001, True),  # pads that overlap
+        (0.006, 0.001, False),  # a thumb that rests beside a finger
+        (0.006, 0.002, False),
+        (0.003, 0.0, False),
+    ],
+)
+def test_pads_that_rest_near_each_other_are_no_touch(gap, spread, touches):
+    assert are_touches(np.array([gap]), np.array([spread])) == [touches]
+
+
+def test_gaps_are_as_open_as_hands_of_the_prior_make_them(problem_and_estimate):
     problem, estimate = problem_and_estimate
-    covariance, answers = error_covariance(problem, estimate, problem.fit(estimate))
-    still = dataclasses.replace(estimate, qpos=np.tile(estimate.qpos[:1], (FRAMES, 1)))
-    of_gestures = [gesture_answers(problem, one) for one in (estimate, still)]
-    np.testing.assert_array_equal(*of_gestures)
-    assert of_gestures[0].shape[1:] == answers.shape[1:] and len(of_gestures[0]) > FRAMES
-    assert np.isfinite(angle_errors(covariance, of_gestures[0])).all()
+    spreads = problem.gap_spreads(estimate, problem.fit(estimate))
+    assert ((spreads > 0.0005) & (spreads < 0.006)).all()
+    surer = copy(problem)
+    surer.precision = 100.0 * problem.precision
+    assert (surer.gap_spreads(estimate, surer.fit(estimate)) < spreads).all()
 
 
 def test_steps_go_down_and_are_told(problem_and_estimate):

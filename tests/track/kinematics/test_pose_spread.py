@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from itertools import pairwise
 from typing import get_args
 
 import numpy as np
@@ -21,9 +22,12 @@ from track.kinematics.marker_kinematics import hand_arrays
 from track.kinematics.pose_solver import PoseSolver
 from track.kinematics.pose_spread import (
     NOT_SMOOTHED,
+    NUM_NUMBERS,
+    HandErrors,
     MarkerPrediction,
     SpreadModel,
     digit_prior,
+    errors_of_motions,
     hand_doubt,
     known_hand,
     pose_spreads,
@@ -64,12 +68,11 @@ def test_they_are_what_other_bones_directions_and_places_make_of_the_solver(rng)
     digits, shape = hand_arrays(fit).digits, fit.shape
     qpos, solver = sample_poses(fit.model, 1, rng=rng), PoseSolver(fit)
     usual = known_hand(digits, 0.0002)
-    doubt = usual._replace(
-        places=np.full((30, 2), 0.0004),
-        knuckles=np.full(5, 0.0004),
-        directions=np.full((5, 3), np.deg2rad(0.8)),
-        bones=np.tile([0.01, 0.01], (5, 1)),
-    )
+    numbers = np.zeros((NUM_NUMBERS, 50))
+    np.fill_diagonal(numbers, np.tile(np.repeat([0.0004, np.deg2rad(0.8), 0.01], 3), 5))
+    numbers[:45, 45:] = np.kron(np.eye(5), np.repeat([0.0, 0.01], [6, 3])[:, None])
+    errors = HandErrors(numbers, np.zeros((30, 3, 50)))
+    doubt = usual._replace(places=np.full((30, 2), 0.0004), errors=errors)
     angles, keypoints = spreads_of(fit, doubt, qpos, np.zeros((1, 30)))
     off, places = [], []
     for _ in range(150):
@@ -141,20 +144,60 @@ def test_a_digit_that_is_hidden_is_wider_the_longer_and_at_last_as_wide_as_its_p
 
 def test_measuring_and_calibration_make_them_narrower_and_noise_wider(rng):
     fit = nominal_fit("dense19", "M", "right")
-    digits, qpos, seen = hand_arrays(fit).digits, sample_poses(fit.model, 5, rng=rng), np.zeros((5, 19))
-    named, measured, calibrated, noisy = (
-        spreads_of(fit, doubt, qpos, seen, resting_prior().precision)
-        for doubt in (
-            hand_doubt(digits, "named", 0.001),
-            hand_doubt(digits, "measured", 0.001),
-            hand_doubt(digits, "calibrated", 0.0002),
-            hand_doubt(digits, "calibrated", 0.001),
+    qpos, seen = sample_poses(fit.model, 5, rng=rng), np.zeros((5, 19))
+    measured = hand_doubt(hand_arrays(fit).digits, "measured").errors
+    little = HandErrors(*(0.1 * values for values in measured))
+    widest, wide, middle, narrow = (
+        model.spreads(qpos, seen, noise)
+        for model, noise in (
+            (SpreadModel(fit, "named"), 0.0005),
+            (SpreadModel(fit, "measured"), 0.0005),
+            (SpreadModel(fit, "calibrated", little), 0.0005),
+            (SpreadModel(fit, "calibrated", little), 0.0001),
         )
     )
-    for widest, wide, narrow, middle in zip(named, measured, calibrated, noisy, strict=True):
-        assert (narrow < wide).all()
-        assert (wide < widest).all()
-        assert (narrow < middle).all()
+    for wider, narrower in pairwise((widest, wide, middle, narrow)):
+        assert all((one < other).all() for one, other in zip(narrower, wider, strict=True))
+
+
+def test_a_calibrated_hand_without_stored_errors_is_as_unsure_as_a_measured_one(rng):
+    fit = nominal_fit("dense19", "M", "left")
+    qpos, seen = sample_poses(fit.model, 3, rng=rng), np.zeros((3, 19))
+    for one, other in zip(
+        *(SpreadModel(fit, origin).spreads(qpos, seen, 0.0003) for origin in ("calibrated", "measured")),
+        strict=True,
+    ):
+        np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize("side", SIDES)
+@pytest.mark.parametrize("part", ["knuckles", "base_angles", "bone_lengths"])
+def test_errors_of_a_hand_move_its_points_as_another_hand_does(part, side, rng):
+    """A hand with another bone and other marker places has the keypoints that the linear model says."""
+    fit = nominal_fit("dense19", "M", side)
+    change = 1e-4 * rng.standard_normal((5, 3))
+    scale = fit.shape.bone_lengths if part == "bone_lengths" else 1.0
+    shape = dataclasses.replace(fit.shape, **{part: getattr(fit.shape, part) + change * scale})
+    shifts = 1e-4 * rng.standard_normal((19, 3))
+    worn = dataclasses.replace(fit.attachment, points=fit.attachment.points + shifts)
+    other = GloveFit(HandModel(shape), worn)
+    skeletons = [one.model.skeleton for one in (fit, other)]
+    numbers = np.zeros((5, 3, 3))
+    numbers[:, 0] = np.subtract(*(one.offsets[1::3] for one in skeletons[::-1]))
+    turned = skeletons[1].rotations[1::3] @ skeletons[0].rotations[1::3].swapaxes(1, 2)
+    numbers[:, 1] = turned[:, [2, 0, 1], [1, 2, 0]]
+    numbers[:, 2] = np.log(shape.bone_lengths / fit.shape.bone_lengths)
+    errors = errors_of_motions(fit, np.append(numbers, 0.0)[:, None], shifts[..., None])
+    qpos = sample_poses(fit.model, 3, rng=rng)
+    solver = PoseSolver(fit)
+    solved = solver.solve(other.markers(qpos)[0], qpos).qpos
+    off = hand_keypoints(fit.model, solved) - hand_keypoints(other.model, qpos)
+    doubt = known_hand(hand_arrays(fit).digits, 1e-6)._replace(errors=errors)
+    angles, keypoints = spreads_of(fit, doubt, solved, np.zeros((3, 19)))
+    # Joints at their limits move less than the linear model says.
+    found = np.sqrt((off**2).mean(axis=2)), np.abs(solved - qpos)[:, 7:]
+    for one, stated in zip(found, (keypoints, angles), strict=True):
+        assert np.abs(one - stated).mean() < 0.15 * stated.mean()
 
 
 SEEDS = st.integers(0, 1000)
