@@ -41,7 +41,6 @@ _CHANGES: Final = 3  # changes that are tried one after the other
 _ROUGH_NOISE, _ROUGH_MOST = 0.004, 0.02  # [m] scale and bound of residuals in rough costs
 _OFTEN: Final = 0.5  # share of the frames without the marker that show it
 _TEMPERATURE: Final = 1.5  # divides log-odds of alternatives, as no fit knows all errors of gloves
-_PRIOR: Final = 1.5  # log-odds against each alternative, as the tracker has seen more frames
 _DOUBTFUL: Final = 0.2  # An alternative is reported from this probability on.
 _OFF_DESIGN: Final = 0.012  # [m] least reported distance of a marker from its place in the layout
 _LIKELY: Final = 0.01  # Alternatives are kept from this probability on.
@@ -148,13 +147,26 @@ def doubts_of(take: Take) -> dict[Side, Doubt]:
 def label_probability(take: Take) -> Float[np.ndarray, "K"]:
     """Probability that no likely alternative gives the points of a label to another marker.
 
-    It is 1 for takes whose settings have no alternatives.
+    Alternatives of different markers are independent. It is 1 for takes whose settings have no alternatives.
     """
     sure = np.ones(take.hand_labels[-1].stop)
     for side, part in zip(take.sides, take.hand_labels, strict=True):
-        for one in take.settings.get(ALTERNATIVES, {}).get(side, {"tried": ()})["tried"]:
-            sure[np.array(part)[list(one["markers"])]] -= one["probability"]
-    return np.maximum(sure, 0.0)
+        tried = take.settings.get(ALTERNATIVES, {}).get(side, {"tried": ()})["tried"]
+        others = [(frozenset(one["markers"]), one["probability"]) for one in tried if one["words"]]
+        given = max(1.0 - sum(share for _, share in others), np.finfo(float).tiny)
+        odds = [(markers, share / given) for markers, share in others]
+        for marker in frozenset[int]().union(*(markers for markers, _ in odds)):
+            kept = [one for one in odds if marker not in one[0]]
+            sure[part[marker]] = _all_odds(kept) / _all_odds(odds)
+    return sure
+
+
+def _all_odds(odds: Sequence[tuple[frozenset[int], float]]) -> float:
+    """Sum of the odds of all sets of changes of different markers, given the odds of each change."""
+    if not odds:
+        return 1.0
+    (markers, first), *others = odds
+    return _all_odds(others) + first * _all_odds([one for one in others if not one[0] & markers])
 
 
 class Columns(NamedTuple):
@@ -211,7 +223,7 @@ class _Trials:
             for order, words in _candidates(columns, best, self._fits[best]):
                 if order not in self._fits:
                     fit = self._fits[order] = place_again(columns.of(order), base)
-                    self._words[order] = words
+                    self._words[order] = _joined(self._words[best], words)
                     self._costs[order] = fit.cost + columns.left_over(order)
             before, best = best, min(self._costs, key=lambda order: self._costs[order])
             if best == before:
@@ -242,13 +254,18 @@ class _Trials:
             words = f"it is the {other} one"
             every = Alternative(tuple(range(len(given))), words, 0.0)
             tried.append((self.least + self._columns.left_over(given) + gain, every, mirrored, other))
-        log_odds = np.array([-cost / _TEMPERATURE - _PRIOR * bool(one.words) for cost, one, *_ in tried])
+        log_odds = np.array([-cost / _TEMPERATURE for cost, *_ in tried])
         shares = np.exp(log_odds - log_odds.max())
         shares /= shares.sum()
         ranked = np.argsort(-shares, kind="stable")
         found = [tried[n][1]._replace(probability=float(shares[n])) for n in ranked if shares[n] >= _LIKELY]
         _, _, fit, of = tried[ranked[0]]
         return JudgedHand(side, tuple(found), fit.hand.with_side(of), fit.offsets)
+
+
+def _joined(before: str, words: str) -> str:
+    """Words of successive changes, each once."""
+    return words if before in ("", words) else f"{before}; {words}"
 
 
 def _mirror_orders(points: Float[np.ndarray, "M 3"]) -> Iterator[list[int]]:
