@@ -112,7 +112,8 @@ def judge_take(take: Take) -> tuple[JudgedHand, ...]:
 
     Hands that too few frames show are left out. The sides of two hands are exchanged for both or for neither.
     """
-    tried = [one for one in (_Trials.of(take, side) for side in take.sides) if one is not None]
+    found = [(side, _columns_of(take, side)) for side in take.sides]
+    tried = [_Trials(columns, side) for side, columns in found if columns is not None]
     mirrored = [one.mirrored() for one in tried]
     gains = [fit.cost - one.least for one, fit in zip(tried, mirrored, strict=True) if fit is not None]
     both = float(sum(gains)) if len(gains) == len(tried) else np.inf
@@ -178,9 +179,7 @@ class Columns(NamedTuple):
 
     def of(self, order: Sequence[int]) -> Float[np.ndarray, "F M 3"]:
         """Points of the markers under an alternative."""
-        seen = self.seen[:, list(order)].copy()
-        seen[:, np.array(order) < 0] = np.nan
-        return seen
+        return np.where(np.array(order)[:, None] < 0, np.nan, self.seen[:, list(order)])
 
     def left_over(self, order: Sequence[int]) -> float:
         """Log-odds against an alternative for points that it leaves without a label, and unseen markers."""
@@ -193,11 +192,6 @@ class Columns(NamedTuple):
         shown = np.isfinite(self.seen[..., 0]).any(axis=0)
         return [one for one in range(len(shown)) if shown[one] and one not in order]
 
-    @property
-    def given(self) -> Order:
-        """The labels as they are."""
-        return self.normal(range(len(self.names)))
-
     def normal(self, order: Sequence[int]) -> Order:
         """An order with -1 for columns without points."""
         shown = np.append(np.isfinite(self.seen[..., 0]).any(axis=0), False)
@@ -207,15 +201,9 @@ class Columns(NamedTuple):
 class _Trials:
     """A hand of a take under the alternatives that were tried."""
 
-    @classmethod
-    def of(cls, take: Take, side: Side) -> _Trials | None:
-        """Try the alternatives to the labels of a hand; None if too few frames show it."""
-        columns = _columns_of(take, side)
-        return None if columns is None else cls(columns, side)
-
     def __init__(self, columns: Columns, side: Side) -> None:
         self._columns, self._side = columns, side
-        self._given = best = columns.given
+        self._given = best = columns.normal(range(len(columns.names)))
         base = place_markers(columns.of(best), columns.worn)
         self._fits, self._words = {best: base}, {best: ""}
         self._costs = {best: base.cost + columns.left_over(best)}
@@ -223,7 +211,8 @@ class _Trials:
             for order, words in _candidates(columns, best, self._fits[best]):
                 if order not in self._fits:
                     fit = self._fits[order] = place_again(columns.of(order), base)
-                    self._words[order] = _joined(self._words[best], words)
+                    earlier = self._words[best]
+                    self._words[order] = words if earlier in ("", words) else f"{earlier}; {words}"
                     self._costs[order] = fit.cost + columns.left_over(order)
             before, best = best, min(self._costs, key=lambda order: self._costs[order])
             if best == before:
@@ -246,13 +235,13 @@ class _Trials:
         """The alternatives by probability; with `gain` more cost the hand is one of the other side."""
         given, side = self._given, self._side
         other: Side = "left" if side == "right" else "right"
-        tried = [
-            (cost, Alternative(_differences(given, order), self._words[order], 0.0), self._fits[order], side)
-            for order, cost in self._costs.items()
-        ]
+        tried = []
+        for order, cost in self._costs.items():
+            changed = np.flatnonzero(np.not_equal(given, order)).tolist()
+            one = Alternative(tuple(changed), self._words[order], 0.0)
+            tried.append((cost, one, self._fits[order], side))
         if mirrored is not None and gain < np.inf:
-            words = f"it is the {other} one"
-            every = Alternative(tuple(range(len(given))), words, 0.0)
+            every = Alternative(tuple(range(len(given))), f"it is the {other} one", 0.0)
             tried.append((self.least + self._columns.left_over(given) + gain, every, mirrored, other))
         log_odds = np.array([-cost / _TEMPERATURE for cost, *_ in tried])
         shares = np.exp(log_odds - log_odds.max())
@@ -261,11 +250,6 @@ class _Trials:
         found = [tried[n][1]._replace(probability=float(shares[n])) for n in ranked if shares[n] >= _LIKELY]
         _, _, fit, of = tried[ranked[0]]
         return JudgedHand(side, tuple(found), fit.hand.with_side(of), fit.offsets)
-
-
-def _joined(before: str, words: str) -> str:
-    """Words of successive changes, each once."""
-    return words if before in ("", words) else f"{before}; {words}"
 
 
 def _mirror_orders(points: Float[np.ndarray, "M 3"]) -> Iterator[list[int]]:
@@ -281,18 +265,14 @@ def _mirror_orders(points: Float[np.ndarray, "M 3"]) -> Iterator[list[int]]:
         yield order.tolist()
 
 
-def _differences(given: Order, order: Order) -> tuple[int, ...]:
-    """Markers with other columns than those given."""
-    return tuple(marker for marker, pair in enumerate(zip(given, order, strict=True)) if pair[0] != pair[1])
-
-
 def _columns_of(take: Take, side: Side) -> Columns | None:
     """The points of a hand in frames spread over the take; None if too few frames show enough markers."""
     number, mirror = take.hand_index(side), MIRROR if side == "left" else np.eye(3)
     part, worn = take.hand_labels[number], take.hands[number]
     there = np.isfinite(take.observed(part)[..., 0])
     counts = there.sum(axis=1)
-    frames = np.flatnonzero(counts >= max(FEWEST_MARKERS, _COMPLETE * _usual(counts)))
+    usual_count = np.median(counts[counts > 0]) if counts.any() else 0
+    frames = np.flatnonzero(counts >= max(FEWEST_MARKERS, _COMPLETE * usual_count))
     if len(frames) < _FEWEST_FRAMES:
         return None
     # Where a point that moves with the hand has no label, labels are wrong in the frames that lack one. These
@@ -313,11 +293,6 @@ def _columns_of(take: Take, side: Side) -> Columns | None:
 def _spread_out(frames: Int[np.ndarray, "T"]) -> Int[np.ndarray, "F"]:
     """Some of these frames, evenly spaced."""
     return np.asarray(frames[np.linspace(0, len(frames) - 1, min(_FRAMES, len(frames))).astype(int)])
-
-
-def _usual(counts: NDArray[np.int64]) -> float:
-    """Usual number of markers of the frames that show any."""
-    return float(np.median(counts[counts > 0])) if counts.any() else 0.0
 
 
 def _steady(
