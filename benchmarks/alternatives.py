@@ -14,7 +14,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import warnings
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -41,13 +41,14 @@ KINDS = ("single-hand", "hand-hand", "real-like")
 FRAMES, TAKES_A_LAYOUT = 120, 5
 POSES = 10_000  # that describe a layout to its labeler
 RADIUS = 0.0032  # [m]
+labeler_of = cache(partial(LayoutLabeler.at_once, num_poses=POSES))  # not improved for the layout
 OFF = (0.010, 0.030)  # [m] how far from its place a marker is worn
 SURE = 0.99
 
 
 def random_layout(number: int, rng: np.random.Generator) -> MarkerLayout:
     """A random layout; of three in turn one has twin markers or is like its own mirror image."""
-    count, name = int(rng.integers(6, 31)), f"random{number}"
+    count = int(rng.integers(6, 31))
     if number % 6 == 3:
         return mirror_like(number // 6 % len(GLOVES))
     twins = 2 if number % 6 == 0 else 0
@@ -55,7 +56,7 @@ def random_layout(number: int, rng: np.random.Generator) -> MarkerLayout:
     for place in rng.choice(len(places), twins, replace=False):
         places.append(moved(places[place], 0.009, 0.014, rng))
     named = [dataclasses.replace(one, name=f"M{n}") for n, one in enumerate(places)]
-    return MarkerLayout(name, tuple(named), RADIUS)
+    return MarkerLayout(f"random{number}", tuple(named), RADIUS)
 
 
 def moved(place: MarkerPlace, least: float, most: float, rng: np.random.Generator) -> MarkerPlace:
@@ -72,12 +73,6 @@ def moved(place: MarkerPlace, least: float, most: float, rng: np.random.Generato
             continue
         if least < np.linalg.norm(points[1] - points[0]) < most:
             return other
-
-
-@cache
-def labeler_of(layout: MarkerLayout) -> LayoutLabeler:
-    """The labeler for any layout, not improved for this one."""
-    return LayoutLabeler.at_once(layout, num_poses=POSES)
 
 
 def labeled(number: int, seed: int) -> tuple[Take, np.ndarray, dict[str, Any]]:
@@ -129,12 +124,10 @@ def summary(rows: list[dict[str, Any]]) -> None:
     pooled = [(count * one).sum(axis=0) / np.maximum(total, 1) for one in (told, true)]
     error = 100 * (np.abs(pooled[0] - pooled[1]) * total).sum() / total.sum()
     labels = reliability(confidence, right)
-    columns = ("labels", "told [%]", "right [%]", "points", "told [%]", "right [%]")
-    table = number_table("confidence", ("bin",), columns)
-    for n in range(BINS):
-        parts = (labels.count[n], 100 * labels.confidence[n], 100 * labels.right[n], total[n])
-        values = (*parts, 100 * pooled[0][n], 100 * pooled[1][n])
-        table.add_row(f"{n / BINS:.2f}", *(f"{value:.1f}".removesuffix(".0") for value in values))
+    table = number_table("confidence by label of a take", ("bin",), ("labels", "told [%]", "right [%]"))
+    for n, (told_share, right_share, number) in enumerate(zip(*labels, strict=True)):
+        shares = (f"{100 * share:.1f}" for share in (told_share, right_share))
+        table.add_row(f"{n / BINS:.2f}", str(number), *shares)
     show(table)
     by_label = 100 * expected_calibration_error(confidence, right)
     print(f"ECE by label of a take {by_label:.2f} %, by point {error:.2f} %")
@@ -147,7 +140,7 @@ def summary(rows: list[dict[str, Any]]) -> None:
     print(f"wrong throughout: {[row['number'] for row in rows if row['wrong']]}")
 
 
-def main(out: Path, takes: int = 200, seed: int = 7000, first: int = 0) -> None:
+def main(out: Path = Path("alternatives.json"), takes: int = 200, seed: int = 7000, first: int = 0) -> None:
     torch.set_num_threads(1)
     print(describe("torch", "numba"))
     rows = [json.loads(line) for line in out.read_text().splitlines()] if out.exists() else []
@@ -157,10 +150,8 @@ def main(out: Path, takes: int = 200, seed: int = 7000, first: int = 0) -> None:
         rows.append(about | outcome(take, true))
         with out.open("a") as file:
             file.write(json.dumps(rows[-1]) + "\n")
-        told = {side: [(one["words"], round(one["probability"], 2)) for one in hand["tried"]]
-                for side, hand in rows[-1]["told"].items()}  # fmt: skip
         share = 100 * np.mean(true == take.point_list.labels)
-        print(*about.values(), f"{share:.2f} % right, wrong {rows[-1]['wrong']}, told {told}", flush=True)
+        print(*about.values(), f"{share:.2f} % right, wrong {rows[-1]['wrong']}", flush=True)
     summary(rows)
 
 
