@@ -125,8 +125,8 @@ def summary(rows: list[dict[str, Any]]) -> None:
     error = 100 * (np.abs(pooled[0] - pooled[1]) * total).sum() / total.sum()
     labels = reliability(confidence, right)
     table = number_table("confidence by label of a take", ("bin",), ("labels", "told [%]", "right [%]"))
-    for n, (told_share, right_share, number) in enumerate(zip(*labels, strict=True)):
-        shares = (f"{100 * share:.1f}" for share in (told_share, right_share))
+    for n, number in enumerate(labels.count):
+        shares = (f"{100 * share[n]:.1f}" for share in (labels.confidence, labels.right))
         table.add_row(f"{n / BINS:.2f}", str(number), *shares)
     show(table)
     by_label = 100 * expected_calibration_error(confidence, right)
