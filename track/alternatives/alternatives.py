@@ -41,7 +41,6 @@ _CHANGES: Final = 3  # changes that are tried one after the other
 _ROUGH_NOISE, _ROUGH_MOST = 0.004, 0.02  # [m] scale and bound of residuals in rough costs
 _OFTEN: Final = 0.5  # share of the frames without the marker that show it
 _TEMPERATURE: Final = 1.5  # divides log-odds of alternatives, as no fit knows all errors of gloves
-_PRIOR: Final = 1.5  # log-odds against each alternative, as the tracker has seen more frames
 _DOUBTFUL: Final = 0.2  # An alternative is reported from this probability on.
 _OFF_DESIGN: Final = 0.012  # [m] least reported distance of a marker from its place in the layout
 _LIKELY: Final = 0.01  # Alternatives are kept from this probability on.
@@ -113,7 +112,8 @@ def judge_take(take: Take) -> tuple[JudgedHand, ...]:
 
     Hands that too few frames show are left out. The sides of two hands are exchanged for both or for neither.
     """
-    tried = [one for one in (_Trials.of(take, side) for side in take.sides) if one is not None]
+    found = [(side, _columns_of(take, side)) for side in take.sides]
+    tried = [_Trials(columns, side) for side, columns in found if columns is not None]
     mirrored = [one.mirrored() for one in tried]
     gains = [fit.cost - one.least for one, fit in zip(tried, mirrored, strict=True) if fit is not None]
     both = float(sum(gains)) if len(gains) == len(tried) else np.inf
@@ -148,13 +148,26 @@ def doubts_of(take: Take) -> dict[Side, Doubt]:
 def label_probability(take: Take) -> Float[np.ndarray, "K"]:
     """Probability that no likely alternative gives the points of a label to another marker.
 
-    It is 1 for takes whose settings have no alternatives.
+    Alternatives of different markers are independent. It is 1 for takes whose settings have no alternatives.
     """
     sure = np.ones(take.hand_labels[-1].stop)
     for side, part in zip(take.sides, take.hand_labels, strict=True):
-        for one in take.settings.get(ALTERNATIVES, {}).get(side, {"tried": ()})["tried"]:
-            sure[np.array(part)[list(one["markers"])]] -= one["probability"]
-    return np.maximum(sure, 0.0)
+        tried = take.settings.get(ALTERNATIVES, {}).get(side, {"tried": ()})["tried"]
+        others = [(frozenset(one["markers"]), one["probability"]) for one in tried if one["words"]]
+        given = max(1.0 - sum(share for _, share in others), np.finfo(float).tiny)
+        odds = [(markers, share / given) for markers, share in others]
+        for marker in frozenset[int]().union(*(markers for markers, _ in odds)):
+            kept = [one for one in odds if marker not in one[0]]
+            sure[part[marker]] = _all_odds(kept) / _all_odds(odds)
+    return sure
+
+
+def _all_odds(odds: Sequence[tuple[frozenset[int], float]]) -> float:
+    """Sum of the odds of all sets of changes of different markers, given the odds of each change."""
+    if not odds:
+        return 1.0
+    (markers, first), *others = odds
+    return _all_odds(others) + first * _all_odds([one for one in others if not one[0] & markers])
 
 
 class Columns(NamedTuple):
@@ -166,9 +179,7 @@ class Columns(NamedTuple):
 
     def of(self, order: Sequence[int]) -> Float[np.ndarray, "F M 3"]:
         """Points of the markers under an alternative."""
-        seen = self.seen[:, list(order)].copy()
-        seen[:, np.array(order) < 0] = np.nan
-        return seen
+        return np.where(np.array(order)[:, None] < 0, np.nan, self.seen[:, list(order)])
 
     def left_over(self, order: Sequence[int]) -> float:
         """Log-odds against an alternative for points that it leaves without a label, and unseen markers."""
@@ -181,11 +192,6 @@ class Columns(NamedTuple):
         shown = np.isfinite(self.seen[..., 0]).any(axis=0)
         return [one for one in range(len(shown)) if shown[one] and one not in order]
 
-    @property
-    def given(self) -> Order:
-        """The labels as they are."""
-        return self.normal(range(len(self.names)))
-
     def normal(self, order: Sequence[int]) -> Order:
         """An order with -1 for columns without points."""
         shown = np.append(np.isfinite(self.seen[..., 0]).any(axis=0), False)
@@ -195,15 +201,9 @@ class Columns(NamedTuple):
 class _Trials:
     """A hand of a take under the alternatives that were tried."""
 
-    @classmethod
-    def of(cls, take: Take, side: Side) -> _Trials | None:
-        """Try the alternatives to the labels of a hand; None if too few frames show it."""
-        columns = _columns_of(take, side)
-        return None if columns is None else cls(columns, side)
-
     def __init__(self, columns: Columns, side: Side) -> None:
         self._columns, self._side = columns, side
-        self._given = best = columns.given
+        self._given = best = columns.normal(range(len(columns.names)))
         base = place_markers(columns.of(best), columns.worn)
         self._fits, self._words = {best: base}, {best: ""}
         self._costs = {best: base.cost + columns.left_over(best)}
@@ -211,7 +211,8 @@ class _Trials:
             for order, words in _candidates(columns, best, self._fits[best]):
                 if order not in self._fits:
                     fit = self._fits[order] = place_again(columns.of(order), base)
-                    self._words[order] = words
+                    earlier = self._words[best]
+                    self._words[order] = words if earlier in ("", words) else f"{earlier}; {words}"
                     self._costs[order] = fit.cost + columns.left_over(order)
             before, best = best, min(self._costs, key=lambda order: self._costs[order])
             if best == before:
@@ -234,15 +235,15 @@ class _Trials:
         """The alternatives by probability; with `gain` more cost the hand is one of the other side."""
         given, side = self._given, self._side
         other: Side = "left" if side == "right" else "right"
-        tried = [
-            (cost, Alternative(_differences(given, order), self._words[order], 0.0), self._fits[order], side)
-            for order, cost in self._costs.items()
-        ]
+        tried = []
+        for order, cost in self._costs.items():
+            changed = np.flatnonzero(np.not_equal(given, order)).tolist()
+            one = Alternative(tuple(changed), self._words[order], 0.0)
+            tried.append((cost, one, self._fits[order], side))
         if mirrored is not None and gain < np.inf:
-            words = f"it is the {other} one"
-            every = Alternative(tuple(range(len(given))), words, 0.0)
+            every = Alternative(tuple(range(len(given))), f"it is the {other} one", 0.0)
             tried.append((self.least + self._columns.left_over(given) + gain, every, mirrored, other))
-        log_odds = np.array([-cost / _TEMPERATURE - _PRIOR * bool(one.words) for cost, one, *_ in tried])
+        log_odds = np.array([-cost / _TEMPERATURE for cost, *_ in tried])
         shares = np.exp(log_odds - log_odds.max())
         shares /= shares.sum()
         ranked = np.argsort(-shares, kind="stable")
@@ -264,18 +265,14 @@ def _mirror_orders(points: Float[np.ndarray, "M 3"]) -> Iterator[list[int]]:
         yield order.tolist()
 
 
-def _differences(given: Order, order: Order) -> tuple[int, ...]:
-    """Markers with other columns than those given."""
-    return tuple(marker for marker, pair in enumerate(zip(given, order, strict=True)) if pair[0] != pair[1])
-
-
 def _columns_of(take: Take, side: Side) -> Columns | None:
     """The points of a hand in frames spread over the take; None if too few frames show enough markers."""
     number, mirror = take.hand_index(side), MIRROR if side == "left" else np.eye(3)
     part, worn = take.hand_labels[number], take.hands[number]
     there = np.isfinite(take.observed(part)[..., 0])
     counts = there.sum(axis=1)
-    frames = np.flatnonzero(counts >= max(FEWEST_MARKERS, _COMPLETE * _usual(counts)))
+    usual_count = np.median(counts[counts > 0]) if counts.any() else 0
+    frames = np.flatnonzero(counts >= max(FEWEST_MARKERS, _COMPLETE * usual_count))
     if len(frames) < _FEWEST_FRAMES:
         return None
     # Where a point that moves with the hand has no label, labels are wrong in the frames that lack one. These
@@ -296,11 +293,6 @@ def _columns_of(take: Take, side: Side) -> Columns | None:
 def _spread_out(frames: Int[np.ndarray, "T"]) -> Int[np.ndarray, "F"]:
     """Some of these frames, evenly spaced."""
     return np.asarray(frames[np.linspace(0, len(frames) - 1, min(_FRAMES, len(frames))).astype(int)])
-
-
-def _usual(counts: NDArray[np.int64]) -> float:
-    """Usual number of markers of the frames that show any."""
-    return float(np.median(counts[counts > 0])) if counts.any() else 0.0
 
 
 def _steady(

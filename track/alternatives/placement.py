@@ -1,7 +1,7 @@
 """How well labeled points fit a hand whose markers may sit elsewhere than the layout says.
 
 Size, proportions, poses and places are solved together. An error that repeats counts once: a wrong place
-costs as one offset, not as one residual in each frame, and neighbors on the palm share an offset.
+costs as one offset, not as one residual in each frame, and neighbors share an offset.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from gloves.fit import GloveFit
 from handsim.hand.model import HandModel
-from handsim.hand.shape import PALM
 from track.calibration.energy import (
     QUICK_GAIN,
     QUICK_OPTIONS,
@@ -32,7 +31,7 @@ _RELINEARIZE: Final = 0.2  # A smaller value changes no probability by more than
 _LIFT: Final = 0.0015  # [m] standard deviation of a marker's height above the layout's
 _GLUED: Final = 0.0035  # [m] scale of the offset of a marker along the skin
 _TAILS: Final = 2.0  # degrees of freedom of the t-distribution of offsets
-_SHARED: Final = 0.008  # [m] standard deviation of the offset that neighbors on the palm share
+_SHARED: Final = 0.008  # [m] standard deviation of the offset that neighbors share
 _NEIGHBORHOOD: Final = 0.035  # [m] distance within which they share it
 _NUGGET: Final = 1e-8  # [m^2] keeps the covariance of shared offsets regular
 _FIRST_WEIGHT: Final = 0.1  # of the offsets in the first round, so that a far place is reached
@@ -86,7 +85,7 @@ def place_again(seen: Float[np.ndarray, "F M 3"], base: Placement) -> Placement:
 def _placed(problem: Problem, start: GloveFit, estimate: Estimate) -> Placement:
     """Solve hand and places, and rate them."""
     there: Bool[np.ndarray, "M"] = np.asarray(problem.present.any(axis=0))
-    covariance = _covariance(start.attachment.points, there & (start.attachment.main_bones == PALM))
+    covariance = _covariance(start.attachment.points, there)
     weights = np.full(len(there), _FIRST_WEIGHT)
     problem.design_shift = np.zeros((len(there), 3))
     for _ in range(_ROUNDS):

@@ -8,7 +8,8 @@ import warnings
 import numpy as np
 import pytest
 
-from gloves import MarkerLayout, Take, load_layout
+from gloves import MarkerLayout, MarkerPlace, Take, load_layout
+from gloves.fit import mean_hand
 from track import label_capture
 from track.alternatives.alternatives import ALTERNATIVES, doubts_of, judge_take, label_probability, with_doubt
 from train import simulate_take
@@ -60,6 +61,82 @@ def test_labels_that_are_wrong_throughout_are_found(truth, new):
     best = judged.alternatives[0]
     assert judged.is_changed and best.words and best.probability > 0.5
     assert markers_of(truth, best.markers) == {*new, *filter(None, new.values())}
+
+
+def moved(digit: str, along: float) -> Take:
+    """A hand whose markers on a digit all sit elsewhere along its bones than the layout says."""
+    layout = load_layout("dense19")
+    places = [
+        dataclasses.replace(one, along=one.along + along) if one.name.startswith(digit) else one
+        for one in layout.markers
+    ]
+    worn = dataclasses.replace(layout, markers=tuple(places))
+    take = simulate_take("single-hand", glove=worn, hands=("right",), num_frames=120, seed=5).without_body()
+    shape = take.hands[0].shape
+    return dataclasses.replace(take, hands=(mean_hand(shape.length, shape.breadth, layout),))
+
+
+@pytest.mark.parametrize(
+    "markers",
+    [
+        ("ThumbTip", "ThumbIP", "ThumbMCP", "ThumbCMC"),
+        ("IndexTip", "IndexPIP", "IndexMCP"),
+        ("RingTip", "RingPIP", "RingMCP"),
+    ],
+)
+def test_a_shift_along_a_digit_whose_markers_are_all_off_is_found(markers):
+    take = moved(markers[0].removesuffix("Tip"), -0.2)
+    (right,) = judge_take(take)
+    assert not right.is_changed and right.alternatives[0].probability > 0.9
+    shifted = with_labels(take, dict(zip(markers, [*markers[1:], None], strict=True)))
+    (judged,) = judge_take(shifted)
+    assert judged.is_changed and judged.alternatives[0].probability > 0.9
+    assert markers_of(take, judged.alternatives[0].markers) == set(markers)
+
+
+@pytest.mark.parametrize(
+    "twin",
+    [
+        MarkerPlace("Twin", "index_proximal", along=0.45, around=0.35),
+        MarkerPlace("Twin", "ring_middle", along=0.5, around=-0.5),
+        MarkerPlace("Twin", "palm", along=0.45, around=0.0, across=0.06),
+    ],
+    ids=lambda twin: twin.bone,
+)
+def test_the_doubt_between_look_alikes_does_not_depend_on_which_labels_they_have(twin):
+    other = dataclasses.replace(twin, name="Other", around=-twin.around, across=-twin.across)
+    sparse = load_layout("starter10")
+    layout = dataclasses.replace(sparse, markers=(*sparse.markers, twin, other))
+    take = simulate_take("single-hand", glove=layout, hands=("right",), num_frames=120, seed=8).without_body()
+    shape = take.hands[0].shape
+    take = dataclasses.replace(take, hands=(mean_hand(shape.length, shape.breadth, layout),))
+    exchanged = with_labels(take, {"Twin": "Other", "Other": "Twin"})
+    given, changed = (
+        next((one for one in judge_take(labeled)[0].alternatives if bool(one.words) == is_changed), None)
+        for labeled, is_changed in ((take, False), (exchanged, True))
+    )
+    assert given and changed
+    assert given.probability == pytest.approx(changed.probability, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("tried", "sure"),
+    [
+        ([((), 0.5), ((0, 1), 0.5)], {0: 0.5, 1: 0.5}),
+        ([((), 0.25), ((0, 1), 0.25), ((2, 3), 0.25), ((4, 5), 0.25)], dict.fromkeys(range(6), 0.5)),
+        ([((), 0.2), ((0, 1), 0.4), ((1, 2), 0.4)], {0: 0.6, 1: 0.2, 2: 0.6}),
+        ([((0, 1), 1.0)], {0: 0.0, 1: 0.0}),
+        ([((), 1.0)], {}),
+    ],
+    ids=["one pair", "three pairs", "two that share a marker", "wrong", "right"],
+)
+def test_pairs_of_look_alikes_are_independent(truth, tried, sure):
+    record = [{"markers": of, "words": "x" if of else "", "probability": share} for of, share in tried]
+    settings = truth.settings | {ALTERNATIVES: {"right": {"tried": record, "distances": []}}}
+    expected = np.ones(truth.hand_labels[-1].stop)
+    expected[list(sure)] = list(sure.values())
+    found = label_probability(dataclasses.replace(truth, settings=settings))
+    np.testing.assert_allclose(found, expected, atol=1e-12)
 
 
 def test_the_doubt_is_in_the_confidence_and_in_the_settings(truth):
