@@ -27,6 +27,7 @@ from handsim.callbacks import OnStep, Progress, no_progress, no_step
 from handsim.errors import CalibrationError, CaptureError, HandSimWarning, errors_of
 from handsim.hand.shape import NUM_QPOS, Side
 from track.alternatives.alternatives import doubts_of, judge_take, with_doubt
+from track.alternatives.hands import other_hands_of, with_other_hands
 from track.association.frame_state import change_of_distances
 from track.association.initialization import label_alone
 from track.bidirectional_labeling import label_both_ways
@@ -85,7 +86,8 @@ def label_capture(
             fit as well, or a marker is not where the layout has it.
     """
     source, frames, setup = _opened(capture, LabelSettings.of(settings, options))
-    labeled, *_ = _judged(lambda setup: _labeled_take(capture, source, frames, setup, progress), setup)
+    labeled, setup, _ = _judged(lambda setup: _labeled_take(capture, source, frames, setup, progress), setup)
+    labeled = _with_other_hands(labeled, setup)
     if (labeled.point_list.labels < 0).all():
         none = f"no hand found, expected hands in glove '{labeled.settings['glove']}' (--glove names another)"
         none = none if len(labeled.point_list.points) else no_points(labeled)
@@ -167,6 +169,15 @@ def label_faults(take: Take) -> list[str]:
     return [f"{one.of} {one.why}; {one.remedy}" for one in found]
 
 
+def _with_other_hands(take: Take, setup: TrackerSetup) -> Take:
+    """The take with the alternatives to its hands, with a warning of each."""
+    given = {} if setup.is_auto else {side: setup.user.origin(side) for side in setup.user.sides}
+    take = with_other_hands(take, given, setup.labeler)
+    for one in other_hands_of(take):
+        warnings.warn(str(one), HandSimWarning, stacklevel=4)
+    return take
+
+
 def track_capture(
     capture: AnyCapture,
     settings: TrackSettings | None = None,
@@ -214,6 +225,7 @@ def track_capture(
         setup,
         is_final=chosen.calibrate or bool(sinks),
     )
+    take = _with_other_hands(take, setup)
     points = dataclasses.replace(take.point_list, confidence=label_confidence(take))
     record = {**take.settings, **_named(capture, source), **setup.settings}
     take = dataclasses.replace(take, point_list=points, settings=record)
@@ -270,6 +282,7 @@ def calibrate(
     take, setup, _ = _judged(
         lambda now: tracked_take(source, frames, now.tracker(), progress=on_label), setup
     )
+    _with_other_hands(take, setup)
     done = calibrate_take(take, setup.start, setup.user, on_part)
     if leaves_markers(take, done):
         tracker = Tracker([one.hand for one in done], setup.labeler)

@@ -17,6 +17,7 @@ from gloves.fit import GloveFit
 from gloves.takes.take import TRACKED, Take
 from handsim.hand.shape import JOINTS, Side
 from track.alternatives.alternatives import doubts_of
+from track.alternatives.hands import other_hands_of
 from track.hand_size import glove_shifts
 from track.kinematics.pose_solver import FEWEST_MARKERS
 
@@ -85,7 +86,11 @@ class _Hand(NamedTuple):
 @lru_cache(maxsize=1)  # A summary, its warnings and a report of a take ask one after the other.
 def find_faults(take: Take) -> tuple[SuspectSpan, ...]:
     """Find the faults of a tracked take, each from the frame in which it begins."""
-    found: list[SuspectSpan] = []
+    found, last = list[SuspectSpan](), take.num_frames - 1
+    hands = [
+        SuspectSpan(one.first, last, one.first, f"the {one.side} hand", one.why, one.remedy, of_labels=False)
+        for one in other_hands_of(take)
+    ]
     for number, side in enumerate(take.sides) if take.made_by_tracker else ():
         frames = np.flatnonzero(take.status[:, number] == TRACKED)
         frames = frames[frames >= _first_of_size(take)]
@@ -99,7 +104,7 @@ def find_faults(take: Take) -> tuple[SuspectSpan, ...]:
         hand = _Hand(take, side, take.hands[number], frames, offsets, some[enough], seen[enough])
         for faults in (_alternatives, _slips, _fallen, _at_limits):
             found += faults(hand)
-    return tuple({one.of: one for one in reversed(found)}.values())[::-1]
+    return (*hands, *tuple({one.of: one for one in reversed(found)}.values())[::-1])
 
 
 def _first_of_size(take: Take) -> int:

@@ -13,6 +13,7 @@ from gloves.fit import Attachment
 from gloves.takes.take import COASTING, LOST, STATUSES, Take
 from handsim.hand.shape import DIGITS, JOINT_NAMES, Side
 from track.association.initialization import distances_to_nearest
+from track.hand_size import AT_HAND
 from track.label_confidence import Evidence, evidence_of, label_confidence
 from track.take_faults import SuspectSpan, find_faults
 
@@ -21,7 +22,6 @@ _MOST_FILLED: Final = 0.35  # share of filled-in markers; two hands that hide ea
 _MOST_RMS: Final = 0.005  # [m]; hands of the nearest size reach 0.004
 _MOST_UNLABELED: Final = 0.25  # share of the points at the hands
 _MANY_FAR: Final = 0.05  # Unlabeled points away from the hands are mentioned from this share on.
-_AT_HAND: Final = 0.04  # [m] distance from a hand's markers within which a point counts as its own
 # Frames whose points all have at least this confidence need no look. A limit of 0.87 would list a third more
 # frames and hardly cover more errors. A limit of 0.7, or leaving out short spans, would miss more errors.
 _CERTAIN: Final = 0.8
@@ -151,7 +151,7 @@ def _unlabeled_at_hands(take: Take) -> int:
         seen = markers[frame, np.isfinite(markers[frame, :, 0])]
         if len(seen):
             distances = distances_to_nearest(points.points[points.of(frame)], seen)
-            near += int((distances < _AT_HAND).sum())
+            near += int((distances < AT_HAND).sum())
     return near
 
 

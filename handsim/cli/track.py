@@ -146,6 +146,7 @@ def _track_file(
 
 def _print_take(out: Path, take: Take, tracked: LiveTake, speed: str) -> None:
     """Print a summary of a take, and warn of signs of mistakes."""
+    from track.alternatives.hands import other_hands_of
     from track.take_summary import summarize, suspicions
     from track.user import MEASURED
 
@@ -155,5 +156,7 @@ def _print_take(out: Path, take: Take, tracked: LiveTake, speed: str) -> None:
         lines = user.split("; ")
     lines.append(f"{out}: {tracked.num_frames} frames, {tracked.duration:.1f} s at {take.rate:.4g} Hz")
     print_line(*lines, *tracked.notes, *summarize(take), speed)
+    told = set(map(str, other_hands_of(take)))  # while it was tracked
     for suspicion in suspicions(take):
-        warnings.warn(suspicion, HandSimWarning, stacklevel=3)
+        if suspicion not in told:
+            warnings.warn(suspicion, HandSimWarning, stacklevel=3)

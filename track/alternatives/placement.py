@@ -58,16 +58,18 @@ class Placement(NamedTuple):
         return user_hand(self.start, self.problem, self.estimate)
 
 
-def place_markers(seen: Float[np.ndarray, "F M 3"], start: GloveFit) -> Placement:
+def place_markers(seen: Float[np.ndarray, "F M 3"], start: GloveFit, left_open: float = 1.0) -> Placement:
     """Fit a hand and the places of its markers.
 
     Args:
         seen: Labeled points of a right hand [m], NaN where missing.
-        start: A right hand in the glove as designed, of about the right size.
+        start: A right hand in the glove as designed, of about the right size; or the hand of a person.
+        left_open: Standard deviations of the hand's shape from that of `start`, as a share of people's.
     """
     options = {**QUICK_OPTIONS, "relinearize": _RELINEARIZE}
     problem, estimate = first_estimate(start, seen, PoseSolver(start).solve(seen).qpos, **options)
     problem.position_spread, problem.height_spread = _GLUED, _LIFT
+    problem.precision = problem.precision / left_open**2
     return _placed(problem, start, estimate)
 
 
