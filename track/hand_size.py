@@ -11,7 +11,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import warnings
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -50,27 +50,48 @@ from train.labelers.protocol import Labeler, Labeling
 from train.labelers.storage import labeler_at_once
 
 _LENGTHS: Final = (0.187, 0.205, 0.168, 0.150, 0.125)  # [m] tried for the first labels, the likeliest first
+_SHORTEST, _LONGEST = 0.125, 0.225  # [m] hand lengths: 0.6 of an adult's to beyond ANSUR II's longest
+_BREADTHS: Final = (0.88, 1.12)  # breadth over the usual one of a length: three standard deviations
 _FAR: Final = 0.012  # [m] Hands are labeled again after a larger change of length.
-_MOST_FRAMES: Final = 40  # frames of each hand that its size is fitted to
+_PRECISION: Final = 0.001  # [m] precision of length and breadth
+_USUAL_LENGTH, _LENGTH_SPREAD = 0.187, 0.012  # [m] mean and deviation of adults, ANSUR II
+_BREADTH_SPREAD: Final = 0.04  # standard deviation of the breadth over the usual one of a length
+_MARKER_SPREAD: Final = 0.002  # [m] standard deviation of glued markers per axis
+_INDEPENDENT: Final = 4.0  # All frames count as this many: errors of glue and flesh repeat.
+_FRAMES: Final = 8  # frames of each hand in the search of length and breadth
+_PROPORTION_FRAMES: Final = 40  # frames of each hand in the fit of proportions
+_MOST_FRAMES: Final = 0.5  # Measured hands must be found in this share of the frames.
+_SOME_FRAMES: Final = 0.1  # The same for hands that fit well: touching hands are seldom initialized.
+_FITS_WELL: Final = 0.00175  # [m] median RMS distance of hands that fit well; false hands have a larger one
 _FEWEST: Final = 3  # A size needs this many frames.
 _MISSING: Final = 0.2  # A frame shows a hand if at most this share of its markers is missing.
 _FITTED: Final = (Status.TRACKED, Status.INITIALIZED)
+_PATIENCE: Final = 20  # frames with enough points but no hand, after which another size is tried
 _WINDOWS: Final = 8  # parts of a capture that are used
-_WINDOW: Final = 16  # frames of each part; after as many in vain another size is tried
+_WINDOW: Final = 16  # frames of each part
+_SURE: Final = 2.0  # standard deviations of a 95 % interval
 _USUAL: Final = TrackerConfig()
 _LENIENT: Final = TrackerConfig(least_evidence=2.0)  # for hands of few markers before they are measured
 _FIT_STEPS, _FEW_STEPS = 15, 2
+_LEAST_PRECISION: Final = 1.0  # [1/m^2] smallest precision of a shift, so that none is divided by zero
 _PART: Final = 30  # Hands are compared in two parts of this many frames.
+_LEAST_FRAMES: Final = 10  # Hands are not compared in fewer frames.
 AT_HAND: Final = 0.04
 """Distance from a hand's markers within which a point counts as its own [m]."""
 _PENALTY: Final = 3.0  # log-odds lost for such a point without a label, and for a missing marker
-_GOOD: Final = 0.45  # evidence of a fit so good that no others are tried; moving skin leaves 0.5 to 0.7
-_MOST_NEAR: Final = 0.25  # nearby points of such a fit, per marker; dense19 taken for sparse13 has 0.4
-_LEAST: Final = 0.18  # evidence that hands of few markers need to be measured; touching ones have 0.5
-_BETTER: Final = 1.15  # Suggest other hands only if their log-odds are 1.15 times ours.
+_FOUND: Final = 0.6  # share of the frames in which a good fit finds hands
+_MOST_MISSING, _MOST_NEAR = 0.15, 0.2  # missing markers and nearby points of a good fit, per marker
+_MOST_HIDDEN: Final = 0.35  # the same for missing markers if every marker is seen at times
+_FEW_NEAR: Final = 2.5  # number of nearby points that may be ghosts
+_MOST_RMS: Final = 0.004  # [m] median RMS distance of a good fit
+_LEAST_FOUND: Final = 0.5  # Suggested hands must be found in at least this share of the frames.
+_BETTER: Final = 1.15  # Suggest another glove only if its log-odds are 1.15 times ours.
+_MUCH_BETTER: Final = 2.0  # the same for another scale
 _UNITS: Final = {"millimeters": 1e-3, "centimeters": 1e-2, "meters": 1.0, "inches": 0.0254, "feet": 0.3048}
 _READ: Final = ("millimeters", "centimeters", "meters")  # units that files state
 _WANDS: Final = (2.0, 0.5)  # scales if the calibration wand's length was entered wrongly
+_FAR_OFF: Final = 4.0  # ratio of spacings beyond which points cannot be a hand at this scale
+_LEAST_SPACING: Final = 1e-9  # [m] avoids a division by zero
 _MOST_OWN: Final = 16  # largest number of tried gloves of the working folder
 
 
@@ -83,10 +104,8 @@ class SizeFit(NamedTuple):
 
     def __str__(self) -> str:
         """Length and breadth, and the 95 % uncertainty of the length [mm]."""
-        shape = self.hand.shape
-        return (
-            f"{1e3 * shape.length:.0f} x {1e3 * shape.breadth:.0f} mm, unsure by {2e3 * self.spread:.0f} mm"
-        )
+        shape, unsure = self.hand.shape, _SURE * self.spread
+        return f"{1e3 * shape.length:.0f} x {1e3 * shape.breadth:.0f} mm, unsure by {1e3 * unsure:.0f} mm"
 
     def hands(self, sides: Sequence[Side]) -> tuple[GloveFit, ...]:
         """The measured hands of the given sides."""
@@ -114,22 +133,21 @@ def fit_size(
     A child's hand, some markers of which get no label or a wrong one, may pass for a larger hand. So a hand
     beside which points have no label, or of which a marker is never seen, is compared with smaller ones.
     """
-    some = _compared(frames)
+    some = [] if is_quick else _compared(frames)
     for config in (_LENIENT,) if is_quick else (_USUAL, _LENIENT):
         rated: list[tuple[float, SizeFit]] = []
         for length in _LENGTHS[:2] if is_quick else _LENGTHS:
             if any(length > fit.hand.shape.length for _, fit in rated):
                 continue
             fit = _fit_from(length, frames, layout, sides, labeler, config)
-            if fit is None:
+            if fit is None or not (config is _USUAL or _is_found(fit, frames, sides, labeler)):
                 continue
-            if is_quick or not some:
+            if not some:
                 return fit
             match = _fit(some, fit.hands(sides), labeler)
-            if match.is_good:
+            if match.is_good and match.is_whole:
                 return fit
-            if config is _USUAL or match.evidence >= _LEAST:
-                rated.append((match.log_odds, fit))
+            rated.append((match.log_odds, fit))
         if rated:
             return max(rated, key=lambda one: one[0])[1]
     return None
@@ -170,16 +188,30 @@ def _fit_from(
     config: TrackerConfig,
 ) -> SizeFit | None:
     """Measure hands that are first labeled as hands of a given length [m]."""
-    fit = None
+    markers: list[NDArray[np.float64]] = []
     for _ in range(2):  # Labels improve with hands of about their own size.
         start = mean_hand(length, usual_breadth(length), layout)
-        markers = _label(frames, start, sides, labeler, config)
-        if markers:
-            fit = _fit_proportions(np.concatenate(markers), start)
-        if fit is None or abs(fit.hand.shape.length - length) <= _FAR:
+        markers = _label(frames, start, sides, labeler, config) or markers
+        if not markers:
+            return None
+        search, before = _Search(markers, start), length
+        length = search.length(usual_breadth, _SHORTEST, _LONGEST)
+        if abs(length - before) <= _FAR:
             break
-        length = fit.hand.shape.length
-    return fit
+    return _fit_proportions(np.concatenate(markers), mean_hand(*search.measures(length), layout))
+
+
+def _is_found(fit: SizeFit, frames: Sequence[StreamedFrame], sides: Sequence[Side], labeler: Labeler) -> bool:
+    """Whether measured hands are found in most frames, or in some where most markers fit well."""
+    tracker, count = Tracker(fit.hands(sides), labeler), fit.hand.layout.num_markers
+    enough = [frame for frame in frames if _are_enough(frame, count)]
+    tracked = [tracker.step(frame.points, frame.ids, frame.time).hands for frame in enough]
+    if sum(any(hand.has_pose for hand in hands) for hands in tracked) >= max(1.0, _MOST_FRAMES * len(enough)):
+        return True
+    shown = [[hand.rms for hand in hands if _is_shown(hand, count)] for hands in tracked]
+    rms = [one for row in shown for one in row]
+    some = sum(map(bool, shown)) >= max(1.0, _SOME_FRAMES * len(enough))
+    return some and float(np.median(rms)) <= _FITS_WELL
 
 
 def _are_enough(frame: StreamedFrame, count: int) -> bool:
@@ -212,7 +244,7 @@ def _label(
     found: list[list[NDArray[np.float64]]] = [[] for _ in sides]
     in_vain = 0
     for frame in frames:
-        if in_vain == _WINDOW and not any(found):
+        if in_vain == _PATIENCE and not any(found):
             break
         in_vain += _are_enough(frame, count)
         for seen, some in zip(tracker.step(frame.points, frame.ids, frame.time).hands, found, strict=True):
@@ -221,16 +253,55 @@ def _label(
                 markers[seen.filled] = np.nan
                 some.append(markers)
     return [
-        _spread_out(np.array(some)) @ (MIRROR if side == "left" else np.eye(3))
+        _spread_out(np.array(some), _PROPORTION_FRAMES) @ (MIRROR if side == "left" else np.eye(3))
         for side, some in zip(sides, found, strict=True)
         if len(some) >= _FEWEST
     ]
 
 
-def _spread_out(markers: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Some of these frames of markers (F, M, 3), evenly spaced."""
-    rows = np.linspace(0, len(markers) - 1, min(_MOST_FRAMES, len(markers))).astype(int)
+def _spread_out(markers: NDArray[np.float64], most: int) -> NDArray[np.float64]:
+    """At most `most` frames of markers (F, M, 3), evenly spaced."""
+    rows = np.linspace(0, len(markers) - 1, min(most, len(markers))).astype(int)
     return np.asarray(markers[rows])
+
+
+class _Search:
+    """Search of the likeliest length and breadth of hands of mean proportions, given labeled markers."""
+
+    # Few markers fit hands of many sizes, so the distribution of people's sizes counts, too.
+
+    def __init__(self, markers: Sequence[Float[np.ndarray, "F M 3"]], start: GloveFit) -> None:
+        few = [_spread_out(some, _FRAMES) for some in markers]
+        seen = np.mean([np.isfinite(some[..., 0]).sum(axis=1).mean() for some in few])
+        self._evidence = _INDEPENDENT * float(seen) / _MARKER_SPREAD**2  # [1/m^2]
+        self._markers, self._layout = np.concatenate(few), start.layout
+        self._poses = PoseSolver(start).solve(self._markers).qpos
+
+    def length(self, breadth: Callable[[float], float], shortest: float, longest: float) -> float:
+        """The likeliest length [m] in a range; `breadth` maps a length to a breadth [m]."""
+        return _least(lambda tried: self._cost(tried, breadth(tried)), shortest, longest)
+
+    def measures(self, length: float) -> tuple[float, float]:
+        """The likeliest length and breadth [m]."""
+        usual = usual_breadth(length)
+        low, high = (factor * usual for factor in _BREADTHS)
+        breadth = _least(lambda tried: self._cost(length, tried), low, high)
+        return self.length(lambda tried: breadth, 0.95 * length, 1.05 * length), breadth
+
+    def _cost(self, length: float, breadth: float) -> float:
+        solver = PoseSolver(mean_hand(length, breadth, self._layout))
+        beyond = (length - _USUAL_LENGTH) / _LENGTH_SPREAD
+        broad = (breadth / usual_breadth(length) - 1.0) / _BREADTH_SPREAD
+        square = float(np.median(solver.solve(self._markers, self._poses).rms)) ** 2
+        return 0.5 * (self._evidence * square + beyond**2 + broad**2)
+
+
+def _least(function: Callable[[float], float], low: float, high: float) -> float:
+    """The argument between two bounds [m] with the least value of a function."""
+    from scipy.optimize import minimize_scalar
+
+    options = {"xatol": _PRECISION}
+    return float(minimize_scalar(function, bounds=(low, high), method="bounded", options=options).x)
 
 
 def _fit_proportions(seen: Float[np.ndarray, "F M 3"], start: GloveFit) -> SizeFit:
@@ -272,7 +343,7 @@ def glove_shifts(
     of_frames -= np.einsum("fp,fps->fs", equations.mixed @ way, solved)
     late = of_frames[::-1].cumsum(axis=0)[::-1]
     left = late[:, :-1] @ np.linalg.inv(reduced[:, :-1])  # what the shared unknowns take of each shift
-    precision = np.maximum(late[:, :-1] @ way - (left * late[:, :-1]).sum(axis=1), 1.0)  # [1/m^2], never zero
+    precision = np.maximum(late[:, :-1] @ way - (left * late[:, :-1]).sum(axis=1), _LEAST_PRECISION)
     shifts = (left @ reduced[:, -1] - late[:, -1]) / precision
     return shifts, shifts * np.sqrt(precision)
 
@@ -281,18 +352,19 @@ class _Fit(NamedTuple):
     """How well hands fit some frames."""
 
     log_odds: float = 0.0  # log-odds of the hands less penalties, mean over the frames
-    evidence: float = 0.0  # the same for one hand, as share of that of a hand without noise and gaps
     found: dict[Side, int] = {}  # noqa: RUF012
     """Number of frames in which each hand is found."""
     shown: int = 0  # number of frames in which at least one hand is found
     is_good: bool = False  # whether the fit is so good that no others are tried
+    is_whole: bool = False  # whether every marker is seen at times; otherwise the glove may have fewer
 
 
 class _Other(NamedTuple):
-    """A glove that may fit better."""
+    """A glove or scale that may fit better."""
 
     name: str  # name of the glove, or path of its file
     layout: MarkerLayout
+    scale: float  # factor that converts the points to meters
     fit: _Fit
 
 
@@ -308,18 +380,18 @@ class _AtOnce:
 
 
 def check_scale(frames: Sequence[StreamedFrame], hands: Sequence[GloveFit], labeler: Labeler) -> None:
-    """Refuse points that are hands at the wrong scale that the distances between neighbors suggest."""
+    """Refuse points at a wrong scale, recognized by the distances between neighbors."""
     some = _compared(frames)
-    found = float(np.median([spacing(frame.points) for frame in some])) if some else 0.0
-    if found == 0.0:
+    if not some:
         return
-    factor = spacing(hands[0].attachment.points) / found
-    scale = min((1.0, *_scales()), key=lambda one: abs(np.log(one / factor)))
-    if scale == 1.0:
+    found = float(np.median([spacing(frame.points) for frame in some]))
+    factor = spacing(hands[0].attachment.points) / max(found, _LEAST_SPACING)
+    if 1.0 / _FAR_OFF < factor < _FAR_OFF:
         return
+    scale = min(_scales(), key=lambda one: abs(np.log(one / factor)))
     scaled = [dataclasses.replace(frame, points=scale * frame.points) for frame in some]
     fit = _measured_fit(scaled, designed_glove(hands[0].layout), labeler)
-    if fit.is_good and fit.log_odds > _BETTER * _fit(some, hands, labeler).log_odds:
+    if fit.is_good and fit.log_odds > _MUCH_BETTER * _fit(some, hands, labeler).log_odds:
         raise ArgumentError(_of_scale(1.0 / scale))
 
 
@@ -330,18 +402,24 @@ def check_hands(
     *,
     options: Collection[str] = ("--hands", "--glove"),
 ) -> None:
-    """Warn of hands that fit badly if those of the other side or of another glove fit clearly better."""
+    """Warn of hands that fit badly if other hands fit clearly better; refuse a wrong unit."""
     # Takes seconds if the fit is bad. Gloves of .toml files in the working folder are tried, too.
     some = _compared(frames)
+    if not some:
+        return
     asked = _fit(some, hands, labeler)
-    if not some or asked.is_good:
+    if asked.is_good:
         return
     glove = designed_glove(hands[0].layout)
-    best = max(_others(some, glove, labeler), key=lambda other: other.fit.log_odds)
-    fit = best.fit
-    if not fit.is_good or fit.log_odds <= _BETTER * asked.log_odds:
+    others = _others(some, glove, labeler)  # A glove of few markers fits anything somehow.
+    likely = [other for other in others if other.layout == glove or other.fit.is_good]
+    best = max(likely, key=lambda other: other.fit.log_odds)
+    fit, factor = best.fit, _BETTER if best.scale == 1.0 else _MUCH_BETTER
+    if fit.shown < _LEAST_FOUND * len(some) or fit.log_odds <= factor * asked.log_odds:
         return
-    there = [side for side, count in fit.found.items() if count >= 0.5 * fit.shown]
+    if best.scale != 1.0:
+        raise ArgumentError(_of_scale(1.0 / best.scale))
+    there = [side for side, count in fit.found.items() if count >= _LEAST_FOUND * fit.shown]
     remedy = [] if set(there) <= {hand.side for hand in hands} else [f"--hands {' '.join(there)}"]
     named = "two hands" if len(there) == 2 else f"a {there[0]} hand"
     if best.layout != glove:
@@ -359,17 +437,25 @@ def _compared(frames: Sequence[StreamedFrame]) -> list[StreamedFrame]:
     """Frames in which hands are compared; none if there are too few."""
     shown = [frame for frame in frames if len(frame.points) >= FEWEST_MARKERS]
     half = max(_PART, len(shown) // (2 * _PART) * _PART)
-    return [*shown[:_PART], *shown[half : half + _PART]] if len(shown) >= _FEWEST else []
+    some = [*shown[:_PART], *shown[half : half + _PART]]
+    return some if len(some) >= _LEAST_FRAMES else []
 
 
-def _others(frames: Sequence[StreamedFrame], glove: MarkerLayout, labeler: Labeler) -> Iterator[_Other]:
-    """Fits of both hands in the given glove, then in other gloves until one fits well."""
-    yield _Other(glove.name, glove, fit := _measured_fit(frames, glove, labeler))
+def _others(frames: Sequence[StreamedFrame], glove: MarkerLayout, labeler: Labeler) -> list[_Other]:
+    """Fits of both hands in the given glove, in other gloves, and at other scales."""
+    others = [_Other(glove.name, glove, 1.0, _measured_fit(frames, glove, labeler))]
+    if others[0].fit.is_good:
+        return others
     for name, layout in _gloves():
-        if fit.is_good:
-            return
         if layout != glove:
-            yield _Other(name, layout, fit := _measured_fit(frames, layout, _AtOnce(layout)))
+            others.append(_Other(name, layout, 1.0, _measured_fit(frames, layout, _AtOnce(layout))))
+        if others[-1].fit.is_good and others[-1].fit.is_whole:
+            return others
+    if max(other.fit.shown for other in others) < _LEAST_FOUND * len(frames):
+        for scale in _scales():
+            scaled = [dataclasses.replace(frame, points=scale * frame.points) for frame in frames]
+            others.append(_Other(glove.name, glove, scale, _measured_fit(scaled, glove, labeler)))
+    return others
 
 
 def _measured_fit(frames: Sequence[StreamedFrame], layout: MarkerLayout, labeler: Labeler) -> _Fit:
@@ -382,33 +468,41 @@ def _fit(frames: Sequence[StreamedFrame], hands: Sequence[GloveFit], labeler: La
     """Rate the fit of hands to some frames."""
     tracker, markers = Tracker(hands, labeler), hands[0].layout.num_markers
     score = HandInitializer([HandState(hands[0])], labeler).score
-    found, shown, log_odds, beside = {hand.side: 0 for hand in hands}, 0, 0.0, 0
+    found = {hand.side: 0 for hand in hands}
+    rms, missing, near, count, log_odds = [], [], [], 0, 0.0
+    unseen = {hand.side: set(range(markers)) for hand in hands}
     for frame in frames:
         tracked = tracker.step(frame.points, frame.ids, frame.time)
         there = [one for one in tracked.hands if one.status in _FITTED]
-        shown += bool(there)
+        count += bool(there)
         free = frame.points[tracked.labels < 0]
         for hand in there:
             found[hand.side] += 1
-            missing = len(hand.filled)
-            near = int((distances_to_nearest(free, hand.markers) < AT_HAND).sum())
-            beside += near
-            log_odds += max(0.0, score(markers - missing, hand.rms) - _PENALTY * (missing + near))
-    times = max(1, sum(found.values()))
-    evidence = log_odds / times / score(markers, _USUAL.marker_noise) * shown / max(1, len(frames))
-    is_good = evidence >= _GOOD and beside <= _MOST_NEAR * markers * times
-    return _Fit(log_odds / max(1, len(frames)), evidence, found, shown, is_good)
+            rms.append(hand.rms)
+            missing.append(len(hand.filled))
+            unseen[hand.side] &= {int(marker) for marker in hand.filled}
+            near.append(int((distances_to_nearest(free, hand.markers) < AT_HAND).sum()))
+            odds = score(markers - missing[-1], hand.rms)
+            log_odds += max(0.0, odds - _PENALTY * (missing[-1] + near[-1]))
+    is_whole = not any(unseen[side] for side, times in found.items() if times)
+    is_good = (
+        count >= _FOUND * len(frames)
+        and float(np.median(rms)) <= _MOST_RMS
+        and float(np.mean(missing)) <= (_MOST_HIDDEN if is_whole else _MOST_MISSING) * markers
+        and float(np.mean(near)) <= max(_MOST_NEAR * markers, _FEW_NEAR)
+    )
+    return _Fit(log_odds / len(frames), found, count, is_good, is_whole)
 
 
 def _gloves() -> list[tuple[str, MarkerLayout]]:
-    """Gloves of the working folder, then shipped ones, with their paths or names, most markers first."""
-    own, shipped = list[tuple[str, MarkerLayout]](), [(name, load_layout(name)) for name in list_layouts()]
+    """Shipped gloves and those of the working folder with their names or paths, most markers first."""
+    found = [(name, load_layout(name)) for name in list_layouts()]
     for path in sorted(Path().glob("*.toml"))[:_MOST_OWN]:
         with contextlib.suppress(HandSimError):  # a file of another kind, or a glove that no hand wears
             layout = load_layout(path)
             check_layout(layout)
-            own.append((str(path), layout))
-    return [one for some in (own, shipped) for one in sorted(some, key=lambda one: -one[1].num_markers)]
+            found.append((str(path), layout))
+    return sorted(found, key=lambda one: -one[1].num_markers)
 
 
 def _scales() -> list[float]:
