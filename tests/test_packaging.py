@@ -2,9 +2,6 @@ from __future__ import annotations
 
 import importlib
 import re
-import shutil
-import subprocess
-import sys
 import tomllib
 import zipfile
 from importlib import metadata
@@ -12,23 +9,12 @@ from importlib import metadata
 import pytest
 
 from tests.programs import ROOT, run_python
-
-PACKAGES = ("handsim", "poses", "gloves", "render", "train", "track")
+from tests.wheels import PACKAGES, build_wheel
 
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> zipfile.ZipFile:
-    """The wheel, built from a copy: what setuptools leaves beside the sources must not enter the next one."""
-    source, out = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("wheel")
-    for name in (*PACKAGES, "tests"):
-        shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
-    for name in ("pyproject.toml", "README.md", "LICENSE"):
-        shutil.copy(ROOT / name, source)
-    options = ["--quiet", "--no-deps", "--no-build-isolation", "--no-index"]
-    command = [sys.executable, "-m", "pip", "wheel", *options, "--wheel-dir", str(out), str(source)]
-    subprocess.run(command, check=True)
-    (path,) = out.glob("handsim-*.whl")
-    return zipfile.ZipFile(path)
+    return zipfile.ZipFile(build_wheel(tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("wheel")))
 
 
 def test_wheel_holds_the_six_packages_and_nothing_else(wheel: zipfile.ZipFile) -> None:
