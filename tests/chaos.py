@@ -2,8 +2,8 @@
 
     python -m tests.chaos [generate train ...] [--kills 20 --seed 0]
 
-Each command runs once undisturbed, one that enlarges an output after the one before it. Then it is killed by SIGTERM, SIGKILL, SIGINT and SIGHUP in turn, at a
-random moment, and run again to its end. The table counts what must be zero: reruns whose files differ,
+Each command runs once undisturbed, one that enlarges an output after the one before it. Then it is killed by
+SIGTERM, SIGKILL, SIGINT and SIGHUP in turn, at a random moment, and run again to its end. The table counts what must be zero: reruns whose files differ,
 processes that outlive the command, temporary files after the rerun, files that stay in /dev/shm, and ends
 with a traceback or with an exit code that is not the signal's. Ctrl-C goes to
 the whole group of processes, as from a terminal; the other signals go to the command alone. The last column
