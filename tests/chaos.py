@@ -3,11 +3,11 @@
     python -m tests.chaos [generate train ...] [--kills 20 --seed 0]
 
 Each command runs once undisturbed, one that enlarges an output after the one before it. Then it is killed by
-SIGTERM, SIGKILL, SIGINT and SIGHUP in turn, at a random moment, and run again to its end. The table counts what must be zero: reruns whose files differ,
-processes that outlive the command, temporary files after the rerun, files that stay in /dev/shm, and ends
-with a traceback or with an exit code that is not the signal's. Ctrl-C goes to
-the whole group of processes, as from a terminal; the other signals go to the command alone. The last column
-is the longest time from SIGTERM or SIGINT to the end. Exit code 1 when a count is not zero.
+SIGTERM, SIGKILL, SIGINT and SIGHUP in turn, at a random moment, and run again to its end. The table counts
+what must be zero: reruns whose files differ, processes that outlive the command, temporary files after the
+rerun, files that stay in /dev/shm, and ends with a traceback or with an exit code that is not the signal's.
+Ctrl-C goes to the whole group of processes, as from a terminal; the other signals go to the command alone.
+The last column is the longest time from SIGTERM or SIGINT to the end. Exit code 1 when a count is not zero.
 """
 
 from __future__ import annotations
