@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from handsim.space.rig import CameraRig as CameraRig
     from handsim.space.rig import load_rig as load_rig
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 __getattr__, __dir__ = lazy_exports(__name__)
 
 ensure_kernel_cache()

@@ -34,7 +34,18 @@ def describe(package: Path, release: str) -> str:
     if not (checkout / ".git").exists():  # as in site-packages, even within a repository of the user's
         return release
     tag = f"v{release}"
-    command = ["git", "-C", str(checkout), "describe", "--always", "--long", "--dirty", "--match", tag]
+    command = [
+        "git",
+        "-C",
+        str(checkout),
+        "describe",
+        "--always",
+        "--tags",
+        "--long",
+        "--dirty",
+        "--match",
+        tag,
+    ]
     own = {name: value for name, value in os.environ.items() if not name.startswith("GIT_")}
     try:
         told = subprocess.run(command, capture_output=True, text=True, env=own, check=True).stdout.strip()

@@ -40,6 +40,7 @@ from gloves.takes.points import (
     spans,
 )
 from handsim._checks import as_numbers, check_choice, check_number, check_type
+from handsim._version import full_version
 from handsim.errors import ArgumentError, HandSimWarning, choices
 from handsim.files.outputs import check_ending
 from handsim.hand.angles import ISB_NAMES, Convention, isb_angles
@@ -733,6 +734,7 @@ def take_header(
     return {
         "kind": "take",
         "schema": SCHEMA,
+        "handsim": full_version(),
         "units": "metres, radians, seconds, wxyz, world frame",
         "rate": rate,
         "layouts": [dataclasses.asdict(hand.layout) for hand in hands],

@@ -19,7 +19,7 @@ from contextlib import contextmanager
 from pkgutil import resolve_name
 from typing import Any, Final
 
-from handsim import __version__
+from handsim._version import full_version
 from handsim.app.messages import told_warnings
 from handsim.callbacks import before_compiling
 from handsim.errors import SENTENCE, HandSimError, choices, shortened
@@ -198,7 +198,7 @@ def _unexpected(program: str, error: Exception) -> str:
         with tempfile.NamedTemporaryFile(
             "w", prefix=prefix, suffix=".log", delete=False, encoding="utf-8", errors="backslashreplace"
         ) as log:
-            log.write(f"handsim {__version__}, Python {sys.version}\n{sys.argv}\n\n{trace}")
+            log.write(f"handsim {full_version()}, Python {sys.version}\n{sys.argv}\n\n{trace}")
     except OSError:
         return f"{what}; this is a mistake in handsim, please report it with this:\n{trace}"
     return f"{what}; this is a mistake in handsim, please report it with {log.name}"
@@ -234,7 +234,7 @@ def _dispatch(commands: Table, args: Sequence[str]) -> int:
     if name in ("-h", "--help"):
         _print_overview(commands)
     elif name == "--version":
-        print(f"handsim {__version__}")
+        print(f"handsim {full_version()}")
     elif name == "--print-completion":
         from handsim.cli.parsing import completion_script
 

@@ -81,6 +81,8 @@ class Manifest(Settings):
     """SHA-256 of every file, by name."""
     redrawn: dict[str, int] | None = None
     """Numbers of redrawn people and scenes, by reason; None in old sets, which did not count them."""
+    handsim: str = ""
+    """Version that finished the set; empty in old sets."""
     units: str = "metres, radians, world frame"
     schema: int = SCHEMA
 
