@@ -28,7 +28,6 @@ from handsim.files.inputs import check_keys, number_of, quoted, read_toml, table
 from handsim.files.outputs import write_text, writing
 from handsim.hand.shape import BONE_NAMES, BONES, DIGITS, PALM, SIDES, Side
 from handsim.settings import Expected
-from handsim.space.transforms import unit
 
 FEWEST_MARKERS: Final = 5
 MOST_MARKERS: Final = 60
@@ -186,6 +185,7 @@ class MarkerLayout:
         """The card that notebooks show: the markers on a flat hand of size M."""
         from gloves.fit import attach  # stands above this module
         from handsim.hand.model import HandModel, hand_keypoints
+        from handsim.space.transforms import unit
 
         fit, flat = attach(self, HandModel.named("M", side=self.sides[-1])), np.eye(1, 27, 3)
         keypoints, markers = hand_keypoints(fit.model, flat)[0], fit.markers(flat)[0][0]
