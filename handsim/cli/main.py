@@ -19,6 +19,7 @@ from contextlib import contextmanager
 from pkgutil import resolve_name
 from typing import Any, Final
 
+from handsim import callbacks
 from handsim._version import full_version
 from handsim.app.messages import told_warnings
 from handsim.callbacks import before_compiling
@@ -99,8 +100,11 @@ def main(args: Sequence[str] | None = None) -> int:
     Raises:
         SystemExit: After a command's help (code 0) or a mistake in its options (code 2).
     """
-    args = sys.argv[1:] if args is None else args
-    return run(COMMANDS, [*args[1:], "--help"] if args and args[0] == "help" else args)
+    given = sys.argv[1:] if args is None else args
+    given = [*given[1:], "--help"] if given and given[0] == "help" else given
+    # A process that prints help alone needs no compiler, whose import takes long.
+    callbacks.runs_kernels = args is not None or given[-1:] not in (["--help"], ["-h"])
+    return run(COMMANDS, given)
 
 
 def run(commands: Table, args: Sequence[str]) -> int:
