@@ -8,6 +8,7 @@ from __future__ import annotations
 import functools
 import os
 import subprocess
+import sys
 from pathlib import Path
 from typing import Final
 
@@ -17,9 +18,8 @@ BAKED: Final = "version.txt"
 @functools.cache
 def full_version() -> str:
     """The version that files, pages and `handsim --version` state, such as "0.2.0+12.g5e3e440.dirty"."""
-    from handsim import __version__
-
-    return describe(Path(__file__).parent, __version__)
+    release: str = sys.modules["handsim"].__version__
+    return describe(Path(__file__).parent, release)
 
 
 def describe(package: Path, release: str) -> str:
