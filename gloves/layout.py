@@ -16,13 +16,13 @@ import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Annotated, Any, Final
 
 import numpy as np
 from jaxtyping import Float
 
 from handsim._checks import check_choice, check_type
-from handsim.cards import card, map_drawing
 from handsim.errors import HandSimError, LayoutError, choices, errors_of
 from handsim.files.inputs import check_keys, number_of, quoted, read_toml, tables_of, text_of, written
 from handsim.files.outputs import write_text, writing
@@ -182,21 +182,8 @@ class MarkerLayout:
         return self.radius + np.array([marker.height for marker in self.markers])
 
     def _repr_html_(self) -> str:
-        """The card that notebooks show: the markers on a flat hand of size M."""
-        from gloves.fit import attach  # stands above this module
-        from handsim.hand.model import HandModel, hand_keypoints
-        from handsim.space.transforms import unit
-
-        fit, flat = attach(self, HandModel.named("M", side=self.sides[-1])), np.eye(1, 27, 3)
-        keypoints, markers = hand_keypoints(fit.model, flat)[0], fit.markers(flat)[0][0]
-        along, across = unit(keypoints[[9, 5]] - keypoints[[0, 17]])  # to the fingers, and to the thumb
-        axes = np.array([across if fit.side == "left" else -across, along])
-        digits = [keypoints[[0, *range(first, first + 4)]] @ axes.T for first in range(1, 21, 4)]
-        facts = {
-            "markers": f"{self.num_markers}, radius {self.radius * 1e3:g} mm",
-            "hands": ", ".join(self.sides),
-        }
-        return card(f"Layout {self.name}", facts, map_drawing(markers @ axes.T, self.names, digits))
+        """The card that notebooks show; its hand stands above this module."""
+        return str(resolve_name("gloves.fit:layout_card")(self))
 
     def check_side(self, side: Side) -> None:
         """Raise a `LayoutError` if the glove does not fit hands of this side."""

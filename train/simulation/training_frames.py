@@ -25,7 +25,9 @@ from handsim.settings import Limits, Mixture, Settings
 from handsim.space.objects import RigidObject, named_object, object_names
 from handsim.space.rig import ROOM_CENTER, AnyRig, CameraRig, Center
 from handsim.space.transforms import pose_matrices, quaternion_matrix, random_quaternions
+from poses.grasps import sample_held_poses, settle_hold
 from poses.shapes import SAMPLER, PoseMix, PoseSampler, make_valid, rests_easily, sample_valid_angles
+from poses.two_hands import sample_two_hand_poses
 
 NO_REST: Final = "person: fingers overlap at rest"
 """Reason to draw another person."""
@@ -267,8 +269,6 @@ def sample_frame_scene(
     try:
         if kind == 1:
             left, right = models
-            from poses.two_hands import sample_two_hand_poses  # imports MuJoCo
-
             both = sample_two_hand_poses(right, left, -(-num_rows // 2), rng=rng)
             for qpos in both:
                 qpos[:, :3] += np.subtract(settings.center, ROOM_CENTER)
@@ -312,8 +312,6 @@ def sample_holding_hand(
     """Poses of a hand that holds a random object, anywhere in the volume."""
     names = object_names()
     rigid_object = named_object(names[rng.integers(len(names))])
-    from poses.grasps import sample_held_poses, settle_hold  # imports MuJoCo
-
     hold = settle_hold(model, rigid_object, rng=rng)
     angles, T_wrist_object = sample_held_poses(model, rigid_object, hold, num_frames, rng=rng)
     position = settings.center + rng.uniform(-settings.volume, settings.volume, size=(num_frames, 3))

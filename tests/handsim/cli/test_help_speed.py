@@ -32,7 +32,6 @@ finally:
         "label",
         "track",
         "render",
-        "generate",
         "train",
         "evaluate",
         "hand",
