@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 
 from gloves.layout import ACROSS_RANGE, ALONG_RANGE, MarkerLayout, MarkerPlace, load_layout
 from gloves.optics.visibility import visible_cameras
-from handsim.cards import card, map_drawing
 from handsim.errors import ArgumentError, LayoutError
-from handsim.hand.model import HandModel, Site, hand_keypoints, load_model
+from handsim.hand.model import HandModel, Site, load_model
 from handsim.hand.shape import (
     BONE_NAMES,
     DIGIT_OF_BONE,
@@ -634,17 +633,3 @@ def _place(marker: MarkerPlace, bone: int, model: HandModel, point: NDArray[np.f
         return MarkerPlace(marker.name, BONE_NAMES[bone], along, math.atan2(y, z))
     across = float(np.clip(y / model.shape.breadth, *ACROSS_RANGE))
     return MarkerPlace(marker.name, BONE_NAMES[bone], along, 0.0 if z >= 0.0 else math.pi, across)
-
-
-def layout_card(layout: MarkerLayout) -> str:
-    """The card of a layout in notebooks: its markers on a flat hand of size M."""
-    fit, flat = attach(layout, HandModel.named("M", side=layout.sides[-1])), np.eye(1, 27, 3)
-    keypoints, markers = hand_keypoints(fit.model, flat)[0], fit.markers(flat)[0][0]
-    along, across = unit(keypoints[[9, 5]] - keypoints[[0, 17]])  # to the fingers, and to the thumb
-    axes = np.array([across if fit.side == "left" else -across, along])
-    digits = [keypoints[[0, *range(first, first + 4)]] @ axes.T for first in range(1, 21, 4)]
-    facts = {
-        "markers": f"{layout.num_markers}, radius {layout.radius * 1e3:g} mm",
-        "hands": ", ".join(layout.sides),
-    }
-    return card(f"Layout {layout.name}", facts, map_drawing(markers @ axes.T, layout.names, digits))
