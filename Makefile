@@ -15,7 +15,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-slow lint format fuzz fuzz-coverage tables results chaos truth docs clean drawing
+.PHONY: help demo test test-slow lint format fuzz fuzz-coverage tables results chaos truth docs dist clean drawing
 
 help:  ## list the targets (this)
 	@echo "usage: make TARGET [PYTHON=python3.12]"
@@ -54,11 +54,14 @@ chaos: $(DEVELOPER)  ## kill every long command at random moments and run it aga
 docs: $(DEVELOPER)  ## the guide, the commands and the API reference, into build/docs
 	$(BIN)/sphinx-build -W --keep-going -q -j 2 docs build/docs
 
+dist: $(DEVELOPER)  ## the wheel and the source archive of this commit, made twice to compare, into dist/
+	PYTHON=$(abspath $(BIN))/python .ci/dist
+
 tables: $(DEVELOPER)  ## print the paper's tables beside ours, half an hour; ONLY=table5 for one
 	for table in $(or $(ONLY),table3 table4 table5 table6 table7 cameras); do \
 	  OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.paper $$table || exit 1; done
 
-results: $(DEVELOPER)  ## write docs/results.md from the figures in benchmarks/figures
+results: $(DEVELOPER)  ## write docs/results.md and docs/trust.md from the figures in benchmarks/figures
 	$(BIN)/python -m benchmarks.results
 
 truth: $(DEVELOPER)  ## the tracker on real hands in motion: DATA=path of Mocap_SIG18_Data

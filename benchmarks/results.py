@@ -1,4 +1,4 @@
-"""Writes docs/results.md from the figures in benchmarks/figures: `python -m benchmarks.results`.
+"""Writes docs/results.md and docs/trust.md from benchmarks/figures: `python -m benchmarks.results`.
 
 The page's text is results_template.md; `{table5.right_size[1]:.2f}` in it is a number of table5.json, and
 `{speed_times}` and `{speed_rates}` are tables of all of speed.json, and `{speed_run}` says how it was made.
@@ -11,6 +11,8 @@ from pathlib import Path
 from typing import Final
 
 from benchmarks.record import FOLDER, Conditions, load_figures
+from benchmarks.trust import PAGE as TRUST
+from benchmarks.trust import trust_page
 
 PAGE: Final = Path(__file__).resolve().parents[1] / "docs" / "results.md"
 TEMPLATE: Final = Path(__file__).with_name("results_template.md")
@@ -69,4 +71,5 @@ def _shown(value: float) -> str:
 
 if __name__ == "__main__":
     PAGE.write_text(filled(TEMPLATE.read_text("utf-8")), "utf-8")
-    print(PAGE)
+    TRUST.write_text(trust_page(), "utf-8")
+    print(PAGE, TRUST)

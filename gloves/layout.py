@@ -22,6 +22,7 @@ import numpy as np
 from jaxtyping import Float
 
 from handsim._checks import check_choice, check_type
+from handsim.cards import card, map_drawing
 from handsim.errors import HandSimError, LayoutError, choices, errors_of
 from handsim.files.inputs import check_keys, number_of, quoted, read_toml, tables_of, text_of, written
 from handsim.files.outputs import write_text, writing
@@ -124,6 +125,15 @@ class MarkerPlace:
             )
 
 
+def _flat_position(marker: MarkerPlace) -> tuple[float, float]:
+    """Where a drawing has a marker: across the digits from the thumb, and along the palm and three bones."""
+    bone = BONE_NAMES.index(marker.bone)
+    if bone == PALM:
+        return 2.5 + 3.0 * marker.across, marker.along
+    digit, part = divmod(bone - 1, 3)
+    return digit + 0.25 * math.sin(marker.around), 1.0 + part + marker.along
+
+
 @dataclass(frozen=True, slots=True)
 class MarkerLayout:
     """A marker glove: 5 to 60 markers of one radius, in the order of their labels.
@@ -179,6 +189,16 @@ class MarkerLayout:
     def heights(self) -> Float[np.ndarray, "M"]:
         """Heights of the marker centers above the skin [m]: the radius, and the stalk where there is one."""
         return self.radius + np.array([marker.height for marker in self.markers])
+
+    def _repr_html_(self) -> str:
+        """The card that notebooks show: the markers on the bones of a hand that is laid out flat."""
+        points = [_flat_position(marker) for marker in self.markers]
+        digits = [np.array([[2.0, 0.0], [digit, 1.0], [digit, 4.0]]) for digit in range(5)]
+        facts = {
+            "markers": f"{self.num_markers}, radius {self.radius * 1e3:g} mm",
+            "hands": ", ".join(self.sides),
+        }
+        return card(f"Layout {self.name}", facts, map_drawing(np.array(points), self.names, digits))
 
     def check_side(self, side: Side) -> None:
         """Raise a `LayoutError` if the glove does not fit hands of this side."""

@@ -8,7 +8,7 @@ wrist orientation (wxyz), twenty joint angles [rad]. A `CameraRig` is a set of c
 from typing import TYPE_CHECKING
 
 from handsim._imports import ShadowedPackageWarning as ShadowedPackageWarning
-from handsim._imports import ensure_kernel_cache, lazy_exports, warn_if_shadowed
+from handsim._imports import ensure_kernel_cache, find_own_packages, lazy_exports, warn_if_shadowed
 from handsim.errors import HandSimError as HandSimError
 from handsim.errors import HandSimWarning as HandSimWarning
 
@@ -27,8 +27,9 @@ if TYPE_CHECKING:
     from handsim.space.rig import CameraRig as CameraRig
     from handsim.space.rig import load_rig as load_rig
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 __getattr__, __dir__ = lazy_exports(__name__)
 
 ensure_kernel_cache()
+find_own_packages()
 warn_if_shadowed()

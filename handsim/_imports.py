@@ -1,7 +1,8 @@
 """What happens when a package is imported: lazy public names (PEP 562), name conflicts, a place for kernels.
 
-A user may well call a script `train.py` or `render.py`. Python then fails deep inside handsim with a message
-that does not name the cause, so a warning about the five generic import names comes first.
+A user may well call a script `train.py` or `render.py`. handsim finds its own packages nevertheless, under
+`handsim.train` too, and warns that `import train` finds the other. It refuses to work on another `train` that
+is imported already, because Python has one module of a name.
 
 Compiled kernels are kept beside their files, else in the user's cache, else in a temporary folder: numba
 refuses to import a kernel that it can keep nowhere, as in a read-only installation without a home.
@@ -20,10 +21,14 @@ import tempfile
 import warnings
 from collections.abc import Callable
 from contextlib import nullcontext
+from importlib.abc import Loader, MetaPathFinder
+from importlib.machinery import ModuleSpec
 from pathlib import Path
+from types import ModuleType
 from typing import Any, Final
 
 from handsim._process import own_numerics, with_own_numerics
+from handsim.errors import HandSimError
 
 
 def lazy_exports(package: str) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
@@ -33,6 +38,7 @@ def lazy_exports(package: str) -> tuple[Callable[[str], Any], Callable[[], list[
     name`), which type checkers take as public too. Those under `if TYPE_CHECKING` are imported when they are
     first used, and are ordinary attributes afterwards.
     """
+    claim(*_NEEDS.get(package, ()))
     own = sys.modules[package]
     body = ast.parse(Path(str(own.__file__)).read_text(encoding="utf-8")).body
     lazy = {name: module for one in body if isinstance(one, ast.If) for name, module in _exports(one.body)}
@@ -40,6 +46,8 @@ def lazy_exports(package: str) -> tuple[Callable[[str], Any], Callable[[], list[
     vars(own)["__all__"] = public
 
     def load(name: str) -> Any:
+        if package == "handsim" and name in SIBLINGS:
+            return importlib.import_module(f"handsim.{name}")
         if name not in lazy:
             raise AttributeError(f"module '{package}' has no attribute '{name}'")
         with own_numerics():
@@ -69,14 +77,87 @@ SIBLINGS: Final = ("poses", "gloves", "render", "train", "track")
 _HOME: Final = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
 
 
+_NEEDS: Final = {
+    "render": ("poses", "gloves"),
+    "train": ("poses", "gloves"),
+    "track": ("poses", "gloves", "train"),
+}
+"""Packages that each package imports."""
+_REMEDY: Final = "import handsim.{0} before it, rename it, or keep it off the path"
+
+
 class ShadowedPackageWarning(UserWarning):
     """Another file or package has an import name that handsim needs."""
+
+
+class ShadowedPackageError(HandSimError, ImportError):
+    """Another file or package that is imported already has an import name that handsim needs."""
+
+
+class _OwnPackages(MetaPathFinder, Loader):
+    """Finds claimed packages beside `handsim`, and each `handsim.train.x` as the module `train.x` itself."""
+
+    def __init__(self) -> None:
+        self.claimed: set[str] = set()
+
+    def find_spec(self, fullname: str, path: object = None, target: object = None) -> ModuleSpec | None:
+        """The specification of a module, if it is one of these."""
+        if fullname in self.claimed:
+            file = os.path.join(_own(fullname), "__init__.py")
+            return importlib.util.spec_from_file_location(fullname, file)
+        first, _, inner = fullname.partition(".")
+        if first != "handsim" or inner.partition(".")[0] not in SIBLINGS:
+            return None
+        return ModuleSpec(fullname, self)
+
+    def create_module(self, spec: ModuleSpec) -> ModuleType:
+        """The module of the name without `handsim.`."""
+        name = spec.name.removeprefix("handsim.")
+        claim(name.partition(".")[0])
+        module = importlib.import_module(name)
+        spec.loader_state = module.__spec__
+        return module
+
+    def exec_module(self, module: ModuleType) -> None:
+        """Give a module back its own specification, in whose place Python has put that of the other name."""
+        assert module.__spec__ is not None
+        module.__spec__ = module.__spec__.loader_state
+
+
+_OWN: Final = _OwnPackages()
+
+
+def find_own_packages() -> None:
+    """Let Python find handsim's packages by their names within `handsim` as well."""
+    if _OWN not in sys.meta_path:
+        sys.meta_path.insert(0, _OWN)
+
+
+def claim(*names: str) -> None:
+    """Make sure that these names stand for handsim's packages from now on.
+
+    Raises:
+        ShadowedPackageError: Another module of such a name is imported already.
+    """
+    for name in names:
+        place = _location(name) if name in sys.modules else None
+        if place and os.path.realpath(place) != os.path.realpath(_own(name)):
+            raise ShadowedPackageError(
+                f"handsim needs its own package '{name}', but {place} is imported under this name; "
+                + _REMEDY.format(name)
+            )
+        _OWN.claimed.add(name)
+
+
+def _own(name: str, home: str = _HOME) -> str:
+    """Folder of one of handsim's packages."""
+    return os.path.join(home, name)
 
 
 def shadowed_siblings(home: str = _HOME) -> dict[str, str]:
     """Locations of siblings that are found elsewhere than in `home`, the folder that holds `handsim`."""
     found = {name: _location(name) for name in SIBLINGS}
-    own = {name: os.path.realpath(os.path.join(home, name)) for name in SIBLINGS}
+    own = {name: os.path.realpath(_own(name, home)) for name in SIBLINGS}
     return {name: place for name, place in found.items() if place and os.path.realpath(place) != own[name]}
 
 
@@ -84,19 +165,23 @@ def warn_if_shadowed() -> None:
     """Warn once for each sibling that is found elsewhere; nothing is imported."""
     for name, location in shadowed_siblings().items():
         warnings.warn(
-            f"handsim needs its own package '{name}', but `import {name}` finds {location}; rename that, "
-            "or keep it off the path (python -P leaves out the script's folder)",
+            f"handsim needs its own package '{name}', but `import {name}` finds {location}; "
+            + _REMEDY.format(name),
             ShadowedPackageWarning,
             stacklevel=3,
         )
 
 
 def _location(name: str) -> str | None:
-    """Folder of a package or file of a module, without importing it; None when there is none."""
-    try:
-        spec = importlib.util.find_spec(name)
-    except ValueError:  # a module put into sys.modules by hand carries no spec
-        return getattr(sys.modules.get(name), "__file__", None) or f"a module made by hand, '{name}'"
+    """Folder of a package or file of a module, as Python finds it without our help; None if there is none."""
+    if name in sys.modules:
+        module = sys.modules[name]
+        spec = module.__spec__
+        if spec is None:  # a module put into sys.modules by hand
+            return getattr(module, "__file__", None) or f"a module made by hand, '{name}'"
+    else:
+        finders = (one.find_spec(name, None) for one in sys.meta_path if one is not _OWN)
+        spec = next(filter(None, finders), None)
     if spec is None:
         return None
     folders = spec.submodule_search_locations

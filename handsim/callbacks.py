@@ -20,6 +20,8 @@ def no_step(name: str) -> None:
     """The `OnStep` of work that nobody watches."""
 
 
+runs_kernels = True
+"""Whether this process may call kernels; one that prints help leaves them as they are, and numba out."""
 before_compiling: list[Callable[[], None]] = []
 """Callbacks; the last one is removed and called before a kernel that the cache lacks is compiled."""
 

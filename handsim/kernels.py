@@ -11,11 +11,11 @@ import hashlib
 from collections.abc import Callable
 from typing import Any, ParamSpec, TypeVar, overload
 
-import numba
 import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
+from handsim import callbacks
 from handsim.callbacks import before_compiling
 
 P = ParamSpec("P")
@@ -43,6 +43,10 @@ def kernel(function: Callable[P, R] | None = None, /, *, inline: bool = False) -
 
 
 def _compiled(function: Callable[P, R], *, inline: bool) -> Any:
+    if not callbacks.runs_kernels:
+        return function
+    import numba
+
     compiled = numba.njit(
         cache=True,
         error_model="numpy",

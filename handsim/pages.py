@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, Concatenate, Final, ParamSpec
 
 from handsim._checks import check_type, shown_value
 from handsim._process import environment
+from handsim._version import full_version
 from handsim.errors import ArgumentError
 from handsim.files.outputs import check_ending, write_text
 
@@ -139,12 +140,14 @@ class Section:
 def write_sections(path: Path, sections: Sequence[Section], *, title: str, lead: str) -> None:
     """Write a page of sections, with a title and the lead below it; it loads nothing from the network."""
     body = "\n".join(_html(section) for section in sections)
+    version = f"handsim {full_version()}"
     page = (
         '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        f'<meta name="generator" content="{version}">\n'
         f"<title>{escape(title)}</title>\n<style>{_STYLE}</style>\n</head>\n<body>\n"
         f'<h1>{escape(title)}</h1>\n<p class="lead">{escape(lead)}</p>\n'
-        f"{body}\n</body>\n</html>\n"
+        f'{body}\n<p class="note">Made by {version}.</p>\n</body>\n</html>\n'
     )
     write_text(path, page)
 

@@ -10,7 +10,6 @@ from typing import Final, Literal
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
-from scipy.optimize import isotonic_regression
 
 from handsim.files.outputs import atomic_write, check_ending
 from handsim.hand.model import KEYPOINT_DIGITS, SKELETON, HandModel
@@ -140,6 +139,8 @@ def with_names(
 
 def spread_out(desired: Float[np.ndarray, "N"], step: float, low: float, high: float) -> Doubles:
     """Ascending heights nearest to the desired ones, at least `step` apart, between `low` and `high` [px]."""
+    from scipy.optimize import isotonic_regression
+
     slots: Doubles = step * np.arange(len(desired), dtype=np.float64)
     if not len(desired):
         return slots

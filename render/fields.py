@@ -13,7 +13,6 @@ from typing import Any, Final
 import numpy as np
 from jaxtyping import Float32, UInt16
 from numpy.typing import NDArray
-from scipy.special import ndtri
 
 from handsim.kernels import kernel
 from render.frames import Doubles, Floats
@@ -22,6 +21,8 @@ from render.frames import Doubles, Floats
 @functools.cache
 def quantiles() -> Float32[np.ndarray, "65536"]:
     """Quantiles of the standard normal at the middle of each sixteen-bit number's share."""
+    from scipy.special import ndtri
+
     table = ndtri((np.arange(65536) + 0.5) / 65536)
     return np.asarray((table / table.std()).astype(np.float32))
 

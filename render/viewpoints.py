@@ -14,7 +14,6 @@ from typing import Annotated, Any, Final, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy.ndimage import maximum_filter1d, uniform_filter1d
 
 from gloves.takes.take import Take
 from handsim.errors import ArgumentError, HandSimWarning, RigError
@@ -69,10 +68,14 @@ class Framing:
 
     def followed(self) -> Doubles:
         """The centers (T, 3) [m] averaged over half a second, as a person with a camera follows them."""
+        from scipy.ndimage import uniform_filter1d
+
         return np.asarray(uniform_filter1d(self.centers, self._window, axis=0, mode="nearest"))
 
     def held(self, distances: Doubles) -> Doubles:
         """Distances (T,) that change slowly and are nowhere shorter than these [m]."""
+        from scipy.ndimage import maximum_filter1d, uniform_filter1d
+
         longest = maximum_filter1d(distances, 2 * (self._window // 2) + 1, mode="nearest")
         return np.asarray(uniform_filter1d(longest, 2 * (self._window // 2) + 1, mode="nearest"))
 
@@ -115,6 +118,8 @@ class Framing:
 
     def centered(self, centers: Doubles, rotations: Doubles, distances: Doubles) -> Doubles:
         """Points near these centers (T, 3) [m] to look at with all hands in the middle of the picture."""
+        from scipy.ndimage import uniform_filter1d
+
         around = self.points - centers[:, None, None].astype(np.float32)
         local = self._rotated(around, rotations).reshape(len(centers), -1, 3)
         there = self._there.any(axis=1)

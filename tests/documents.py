@@ -73,19 +73,21 @@ def blocks_of(page: Path) -> list[Block]:
     ]
 
 
-def run_blocks(blocks: list[Block], folder: Path, commands: Path) -> list[str]:
-    """What each block prints; `commands` is a folder for the command handsim, as it is in these sources."""
+def run_blocks(
+    blocks: list[Block], folder: Path, commands: Path, python: str = sys.executable, path: str = str(ROOT)
+) -> list[str]:
+    """What each block prints; `commands` is a folder for the command handsim of this Python and path."""
     command = commands / "handsim"
-    command.write_text(HANDSIM.format(python=sys.executable))
+    command.write_text(HANDSIM.format(python=python))
     command.chmod(0o755)
     environment = {
         **os.environ,
-        "PATH": f"{commands}:{Path(sys.executable).parent}:{os.environ['PATH']}",
-        "PYTHONPATH": str(ROOT),
+        "PATH": f"{commands}:{Path(python).parent}:{os.environ['PATH']}",
+        "PYTHONPATH": path,
         "OMP_NUM_THREADS": "1",
     }
     done = subprocess.run(
-        [sys.executable, "-c", RUNNER],
+        [python, "-c", RUNNER],
         input=json.dumps([(block.name, block.kind, block.code) for block in blocks]),
         cwd=folder,
         env=environment,

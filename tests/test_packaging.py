@@ -1,34 +1,22 @@
 from __future__ import annotations
 
 import importlib
+import json
 import re
-import shutil
-import subprocess
-import sys
 import tomllib
 import zipfile
 from importlib import metadata
 
 import pytest
+import yaml
 
 from tests.programs import ROOT, run_python
-
-PACKAGES = ("handsim", "poses", "gloves", "render", "train", "track")
+from tests.wheels import PACKAGES, build_wheel
 
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> zipfile.ZipFile:
-    """The wheel, built from a copy: what setuptools leaves beside the sources must not enter the next one."""
-    source, out = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("wheel")
-    for name in (*PACKAGES, "tests"):
-        shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
-    for name in ("pyproject.toml", "README.md", "LICENSE"):
-        shutil.copy(ROOT / name, source)
-    options = ["--quiet", "--no-deps", "--no-build-isolation", "--no-index"]
-    command = [sys.executable, "-m", "pip", "wheel", *options, "--wheel-dir", str(out), str(source)]
-    subprocess.run(command, check=True)
-    (path,) = out.glob("handsim-*.whl")
-    return zipfile.ZipFile(path)
+    return zipfile.ZipFile(build_wheel(tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("wheel")))
 
 
 def test_wheel_holds_the_six_packages_and_nothing_else(wheel: zipfile.ZipFile) -> None:
@@ -61,6 +49,55 @@ def test_wheel_carries_license_command_and_one_version(wheel: zipfile.ZipFile) -
     assert "version" not in _project_table()  # pyproject.toml repeats no version
     assert f"version: {stated.group(1)}\n" in (ROOT / "CITATION.cff").read_text()
     assert f"## [{stated.group(1)}]" in (ROOT / "CHANGELOG.md").read_text()
+
+
+def test_files_that_cite_the_release_agree() -> None:
+    """The version and the date of the newest release, in every file that states them."""
+    changes = (ROOT / "CHANGELOG.md").read_text("utf-8")
+    assert changes.index("## [Unreleased]\n") < changes.index("\n## [0")
+    found = re.search(r"\n## \[(\d\S*)\] - (\d{4}-\d\d-\d\d)\n", changes)
+    assert found is not None
+    version, day = found.groups()
+    assert version == importlib.import_module("handsim").__version__
+    assert f'\nversion: {version}\ndate-released: "{day}"\n' in (ROOT / "CITATION.cff").read_text("utf-8")
+    archived = json.loads((ROOT / ".zenodo.json").read_text("utf-8"))
+    assert (archived["version"], archived["publication_date"]) == (version, day)
+    assert f'version: "{version}"' in (ROOT / "conda" / "recipe.yaml").read_text("utf-8")
+
+
+@pytest.mark.parametrize(
+    "path", sorted((ROOT / ".github" / "workflows").glob("*.yml")), ids=lambda path: path.stem
+)
+def test_workflows_call_targets_and_files_that_exist(path) -> None:
+    text = path.read_text("utf-8")
+    targets = re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text("utf-8"), re.M)
+    assert set(re.findall(r"\bmake ([a-z-]+)", text)) <= set(targets)
+    assert all(
+        (ROOT / file).exists() for file in re.findall(r"(?:tests/\S+\.py|\.ci/\w+|docs/\S+\.md)", text)
+    )
+    assert yaml.safe_load(text)["jobs"]
+
+
+def test_the_recipe_for_conda_has_every_dependency() -> None:
+    recipe = yaml.safe_load((ROOT / "conda" / "recipe.yaml").read_text("utf-8"))
+    renamed = {"mujoco-python": "mujoco", "pytorch": "torch", "openexr-python": "openexr",
+               "py-opencv": "opencv-python-headless", "matplotlib-base": "matplotlib"}  # fmt: skip
+    named = {
+        renamed.get(name, name): limits for name, limits in map(str.split, recipe["requirements"]["run"])
+    }
+    ours = dict(re.fullmatch(r"([\w-]+)(\S+)", one).groups() for one in _project_table()["dependencies"])
+    assert {_canonical(name): limits for name, limits in named.items() if name != "python"} == {
+        _canonical(name): limits for name, limits in ours.items()
+    }
+
+
+def test_the_dockerfile_installs_what_exists() -> None:
+    text = (ROOT / "Dockerfile").read_text("utf-8")
+    (extras,) = re.findall(r"handsim\[([\w,-]+)\]", text)
+    assert set(extras.split(",")) <= set(_project_table()["optional-dependencies"])
+    packages = re.search(r"^DRAWING_PACKAGES := (.+)$", (ROOT / "Makefile").read_text("utf-8"), re.M)
+    assert packages is not None and packages[1] in text
+    json.loads((ROOT / ".devcontainer" / "devcontainer.json").read_text("utf-8"))
 
 
 def _project_table():

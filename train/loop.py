@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from torch import nn
 
 from gloves.layout import stored_layout
-from handsim import __version__
 from handsim._checks import check_count, check_type
 from handsim._process import torch_kept
+from handsim._version import full_version
 from handsim.app.workers import usable_cores
 from handsim.callbacks import OnStep, Progress, no_progress, no_step
 from handsim.errors import DatasetError, HandSimError, WeightsError
@@ -322,7 +322,7 @@ class _Run:
         card = {
             "marker_names": list(names),
             "trained_on": "simulated frames only",
-            "handsim": __version__,
+            "handsim": full_version(),
             "license": UNKNOWN_LICENSE,
             "dataset": self.manifest.config,
             "train": settings.record() | {"devices": self.state.fabric.world_size},

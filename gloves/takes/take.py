@@ -40,6 +40,8 @@ from gloves.takes.points import (
     spans,
 )
 from handsim._checks import as_numbers, check_choice, check_number, check_type
+from handsim._version import full_version
+from handsim.cards import card, span_drawing
 from handsim.errors import ArgumentError, HandSimWarning, choices
 from handsim.files.outputs import check_ending
 from handsim.hand.angles import ISB_NAMES, Convention, isb_angles
@@ -189,6 +191,15 @@ class Take:
             f"Take({self.num_frames} frames at {self.rate:g} Hz of {', '.join(self.sides)}{bodies}; "
             f"{self.point_list.num_columns} columns of points)"
         )
+
+    def _repr_html_(self) -> str:
+        """The card that notebooks show: what the take holds, and when each hand is tracked."""
+        facts = {
+            "frames": f"{self.num_frames} at {self.rate:g} Hz, {self.duration:.1f} s",
+            "gloves": ", ".join(f"{hand.side} {hand.layout.name}" for hand in self.hands),
+            "bodies": ", ".join(body.name for body in self.bodies) or "none",
+        }
+        return card("Take", facts, span_drawing({side: self.is_tracked(side) for side in self.sides}))
 
     @property
     def points(self) -> Float[np.ndarray, "T N 3"]:
@@ -733,6 +744,7 @@ def take_header(
     return {
         "kind": "take",
         "schema": SCHEMA,
+        "handsim": full_version(),
         "units": "metres, radians, seconds, wxyz, world frame",
         "rate": rate,
         "layouts": [dataclasses.asdict(hand.layout) for hand in hands],

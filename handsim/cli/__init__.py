@@ -2,3 +2,7 @@
 
 `main` parses the first word and calls the command that its table names for it.
 """
+
+from handsim._imports import SIBLINGS, claim
+
+claim(*SIBLINGS)

@@ -13,7 +13,7 @@ import numpy as np
 
 from gloves.fit import nominal_fit
 from gloves.layout import load_layout
-from handsim import __version__
+from handsim._version import full_version
 from handsim.app.workers import usable_cores
 from handsim.hand.model import HandModel, join_qpos
 from handsim.pages import Section
@@ -159,7 +159,7 @@ def _generate_and_label(
         notes=[
             f"generated {num_frames / seconds:,.0f} frames/s (start included), "
             f"labeled {labeled:,.0f} frames/s, on {usable_cores()} CPU cores",
-            f"handsim {__version__}, Python {platform.python_version()}, {versions}.",
+            f"handsim {full_version()}, Python {platform.python_version()}, {versions}.",
         ],
     )
 

@@ -19,7 +19,8 @@ from contextlib import contextmanager
 from pkgutil import resolve_name
 from typing import Any, Final
 
-from handsim import __version__
+from handsim import callbacks
+from handsim._version import full_version
 from handsim.app.messages import told_warnings
 from handsim.callbacks import before_compiling
 from handsim.errors import SENTENCE, HandSimError, choices, shortened
@@ -99,8 +100,11 @@ def main(args: Sequence[str] | None = None) -> int:
     Raises:
         SystemExit: After a command's help (code 0) or a mistake in its options (code 2).
     """
-    args = sys.argv[1:] if args is None else args
-    return run(COMMANDS, [*args[1:], "--help"] if args and args[0] == "help" else args)
+    given = sys.argv[1:] if args is None else args
+    given = [*given[1:], "--help"] if given and given[0] == "help" else given
+    # A process that prints help alone needs no compiler, whose import takes long.
+    callbacks.runs_kernels = args is not None or given[-1:] not in (["--help"], ["-h"])
+    return run(COMMANDS, given)
 
 
 def run(commands: Table, args: Sequence[str]) -> int:
@@ -198,7 +202,7 @@ def _unexpected(program: str, error: Exception) -> str:
         with tempfile.NamedTemporaryFile(
             "w", prefix=prefix, suffix=".log", delete=False, encoding="utf-8", errors="backslashreplace"
         ) as log:
-            log.write(f"handsim {__version__}, Python {sys.version}\n{sys.argv}\n\n{trace}")
+            log.write(f"handsim {full_version()}, Python {sys.version}\n{sys.argv}\n\n{trace}")
     except OSError:
         return f"{what}; this is a mistake in handsim, please report it with this:\n{trace}"
     return f"{what}; this is a mistake in handsim, please report it with {log.name}"
@@ -234,7 +238,7 @@ def _dispatch(commands: Table, args: Sequence[str]) -> int:
     if name in ("-h", "--help"):
         _print_overview(commands)
     elif name == "--version":
-        print(f"handsim {__version__}")
+        print(f"handsim {full_version()}")
     elif name == "--print-completion":
         from handsim.cli.parsing import completion_script
 

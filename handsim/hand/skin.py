@@ -22,13 +22,14 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple, Self
 import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
-from scipy import sparse
 
 from handsim.hand.shape import DIGITS, HAND_DTYPE, NUM_BONES, PALM, pack_hand
 from handsim.kernels import kernel
 from handsim.space.transforms import MIRROR, euler_matrix, rigid
 
 if TYPE_CHECKING:
+    from scipy import sparse
+
     from handsim.hand.shape import HandShape
 
 
@@ -44,6 +45,8 @@ def catmull_clark(
     quads: Int[np.ndarray, "Q 4"], num_vertices: int
 ) -> tuple[sparse.csr_array, Int[np.ndarray, "Q4 4"]]:
     """One step of Catmull-Clark on a closed quad mesh."""
+    from scipy import sparse
+
     edges, edge_of_corner = edge_table(quads)
     num_edges, num_quads = len(edges), len(quads)
     corner, quad = quads.ravel(), np.repeat(np.arange(num_quads), 4)
@@ -440,6 +443,8 @@ class _Template(NamedTuple):
 
 @functools.cache
 def _template() -> _Template:
+    from scipy import sparse
+
     topology = cage_topology()
     quads, count = topology.quads, topology.num_vertices
     loops = [ring for rings in topology.rings for ring in rings] + [topology.palm[KNUCKLES]]

@@ -24,8 +24,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from handsim import __version__
 from handsim._plugins import import_extra
+from handsim._version import full_version
 from handsim.errors import ArgumentError
 from handsim.files.outputs import atomic_write, plain_path, unwritten
 from handsim.hand.model import HandModel, hand_keypoints
@@ -87,7 +87,7 @@ class _Scene:
     def pack(self) -> bytes:
         """The content of the file; an `ArgumentError` if it is larger than a .glb can be."""
         document: dict[str, Any] = {
-            "asset": {"version": "2.0", "generator": f"handsim {__version__}"},
+            "asset": {"version": "2.0", "generator": f"handsim {full_version()}"},
             "scene": 0,
             "scenes": [{"nodes": self._top}],
             "nodes": self._nodes,

@@ -20,6 +20,7 @@ from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
 from handsim._checks import check_type
+from handsim.cards import card, map_drawing
 from handsim.errors import ArgumentError, RigError, choices, errors_of, shortened
 from handsim.files.inputs import (
     check_keys,
@@ -335,6 +336,15 @@ class CameraRig:
     def positions(self) -> Float[np.ndarray, "C 3"]:
         """Optical centers in the world [m]."""
         return self.T_world_camera[:, :3, 3]
+
+    def _repr_html_(self) -> str:
+        """The card that notebooks show: the cameras from above, each with the way that it looks."""
+        ground, ways = self.positions[:, :2], self.T_world_camera[:, :2, 2]
+        lines = [np.array([one, one + 0.5 * way]) for one, way in zip(ground, ways, strict=True)]
+        heights = f"{self.positions[:, 2].min():.2f} to {self.positions[:, 2].max():.2f} m"
+        facts = {"cameras": str(len(self.cameras)), "pictures": self.pictures(), "heights": heights}
+        names = [camera.name for camera in self.cameras]
+        return card(f"Rig {self.name}", facts, map_drawing(ground, names, lines))
 
     def in_view(self, points: Float[np.ndarray, "*batch 3"]) -> Bool[np.ndarray, "*batch C"]:
         """Which cameras have each point [m], in the world, in front of them and inside their pictures."""

@@ -25,10 +25,10 @@ from scipy.spatial.transform import Rotation
 from torch import nn
 from torch.nn import functional
 
-from handsim import __version__
 from handsim._checks import check_count
 from handsim._plugins import import_extra
 from handsim._process import torch_kept
+from handsim._version import full_version
 from handsim.files.models import DIGEST, stamp_model
 from handsim.files.outputs import atomic_write
 from handsim.hand.model import HandModel
@@ -479,7 +479,7 @@ def export(network: Network, path: Path) -> None:
             tensor.CopyFrom(numpy_helper.from_array(values.astype(np.float16), name + _HALF))
             cast = helper.make_node("Cast", [name + _HALF], [name], to=TensorProto.FLOAT)
             model.graph.node.insert(0, cast)
-    helper.set_model_props(model, {"handsim.version": __version__, DIGEST: "0" * 64})
+    helper.set_model_props(model, {"handsim.version": full_version(), DIGEST: "0" * 64})
     onnx.checker.check_model(model, full_check=True)
     with atomic_write(path) as temporary:
         temporary.write_bytes(stamp_model(model.SerializeToString()))

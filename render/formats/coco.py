@@ -15,7 +15,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from handsim import __version__
+from handsim._version import full_version
 from handsim.hand.model import KEYPOINT_NAMES, SKELETON
 from handsim.hand.shape import NUM_KEYPOINTS
 from handsim.motion_files.motion import OPENXR_JOINTS
@@ -34,10 +34,7 @@ from render.formats.shards import _LABELS, FolderWriter, _write, json_list, one_
 from render.frames import Doubles, Flags, HandTruth, RenderedFrame
 from render.skin.look import tone_name, typology_angle
 
-INFO: Final[dict[str, Any]] = {  # without a date, so that the same frames give the same bytes
-    "description": "Hands drawn by handsim; keypoints count pixels from the first one's center",
-    "version": __version__,
-}
+_ABOUT: Final = "Hands drawn by handsim; keypoints count pixels from the first one's center"
 CATEGORY: Final[dict[str, Any]] = {
     "id": 1,
     "name": "hand",
@@ -178,7 +175,9 @@ class YoloWriter(CocoWriter):
 
 def _coco_file(records: Iterable[dict[str, Any]], folder: Path) -> Iterator[str]:
     """Pieces of a COCO file; annotations wait in a file of the folder, so that memory need not hold them."""
-    yield f'{{"info":{to_json(INFO)},\n"licenses":[],\n"images":'
+    # Without a date, so that the same frames give the same bytes.
+    info = {"description": _ABOUT, "version": full_version()}
+    yield f'{{"info":{to_json(info)},\n"licenses":[],\n"images":'
     fields = set[str]()  # of all annotations
     with tempfile.TemporaryFile("w+", dir=folder, encoding="utf-8") as waiting:
 

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Final
 
 import cv2
 import numpy as np
-import trimesh
 from jaxtyping import Float, Float32, Int, UInt8
 
 from gloves.fit import GloveFit
@@ -24,6 +23,8 @@ from render.skin.mesh import PosableSkin
 from render.skin.texture import GloveLook, glove_texture, sample_glove_look, skin_texture
 
 if TYPE_CHECKING:
+    import trimesh
+
     from render.skin.texture import SkinTexture
 
 MARKER_COLOR: Final = (0.98, 0.98, 1.0)
@@ -93,6 +94,8 @@ def sphere_surface(
 
 @functools.cache
 def _unit_ball(level: int) -> trimesh.Trimesh:
+    import trimesh
+
     return trimesh.creation.icosphere(subdivisions=level)
 
 
@@ -194,6 +197,8 @@ class BodyFigure:
         self._markers = body.positions if self._thing is None else self._thing.markers
         self._material = functools.cache(lambda: Material(linear(color), 0.5))  # such as plastic
         if self._thing is not None:
+            import trimesh
+
             vertices, faces = self._thing.vertices, self._thing.faces
             solid = trimesh.Trimesh(vertices, faces, process=False)
             smooth = solid.face_adjacency[solid.face_adjacency_angles < _EDGE]

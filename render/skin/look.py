@@ -18,7 +18,6 @@ from dataclasses import dataclass
 from typing import Annotated, Final
 
 import numpy as np
-from scipy.interpolate import PchipInterpolator
 
 from handsim._checks import check_choice, check_type
 from handsim.errors import ArgumentError
@@ -370,6 +369,8 @@ def _out_of_pictures(
 
 def _half_axes(shape: HandShape, forearm: Forearm, behind: Doubles) -> tuple[Doubles, Doubles]:
     """Half width and half depth of the arm's sections [m]: flat at the wrist, rounder and thicker behind."""
+    from scipy.interpolate import PchipInterpolator
+
     girth = forearm.girth * shape.breadth * PchipInterpolator(_PLACES, _GIRTHS)(behind / shape.length)
     flatness = 0.70 + 0.18 * smooth(behind, 0.0, shape.length)
     # Ramanujan's formula for the girth of an ellipse over its half width

@@ -20,8 +20,7 @@ from handsim._imports import (
     shadowed_siblings,
     warn_if_shadowed,
 )
-
-ROOT = Path(__file__).resolve().parents[2]
+from tests.programs import ROOT, run_python
 
 
 def import_in(folder: Path, code: str, *flags: str) -> subprocess.CompletedProcess[str]:
@@ -44,22 +43,73 @@ def test_every_sibling_counts_as_a_stranger_from_another_home(tmp_path: Path) ->
     assert tuple(shadowed_siblings(str(tmp_path))) == SIBLINGS
 
 
-def test_a_script_called_train_is_told_before_the_confusing_error(tmp_path: Path) -> None:
-    (tmp_path / "train.py").write_text("")
-    result = import_in(tmp_path, "import handsim\nimport track, train.presets")
+def lay(folder: Path, name: str, *, package: bool) -> Path:
+    """Lay a foreign module or package of a name into a folder, and return the place that messages name."""
+    if not package:
+        (folder / f"{name}.py").write_text("x = 1")
+        return folder / f"{name}.py"
+    (folder / name).mkdir()
+    (folder / name / "__init__.py").write_text("x = 1")
+    return folder / name
+
+
+FOREIGN = pytest.mark.parametrize(
+    ("name", "package"), [("train", False), ("render", True), ("poses", False), ("gloves", True)]
+)
+
+
+@FOREIGN
+def test_a_foreign_name_on_the_path_is_told_and_ours_is_found_within_handsim(tmp_path, name, package):
+    place = lay(tmp_path, name, package=package)
+    code = f"import handsim\nimport handsim.{name} as ours, track, sys\nprint(ours.__file__, {name}.__file__)"
+    result = import_in(tmp_path, code.replace("track,", f"track, {name},"))
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.split() == [str(ROOT / name / "__init__.py")] * 2
+    assert f"handsim needs its own package '{name}', but `import {name}` finds {place};" in result.stderr
+    assert f"{tmp_path}/script.py:1:" in result.stderr  # the warning points at the user's line
+
+
+@FOREIGN
+@pytest.mark.parametrize("user", ["handsim.{}", "track", "handsim.cli.main"])
+def test_a_foreign_name_that_is_imported_is_an_error_with_its_path(tmp_path, name, package, user):
+    if (name, user) == ("render", "track"):
+        pytest.skip("track does not need render")
+    place = lay(tmp_path, name, package=package)
+    result = import_in(tmp_path, f"import {name}, {user.format(name)}")
     assert result.returncode == 1
-    told, _, error = result.stderr.partition("'train' is not a package")
-    assert "ShadowedPackageWarning" in told and error
-    assert f"handsim needs its own package 'train', but `import train` finds {tmp_path}/train.py" in told
-    assert f"{tmp_path}/script.py:1:" in told  # the warning points at the user's line
+    told = result.stderr.splitlines()[-1]
+    assert told.startswith(
+        f"handsim._imports.ShadowedPackageError: handsim needs its own package '{name}', but"
+    )
+    assert f"{place} is imported" in told and f"import handsim.{name} before it" in told
 
 
-def test_a_foreign_package_is_told(tmp_path: Path) -> None:
-    (tmp_path / "render").mkdir()
-    (tmp_path / "render" / "__init__.py").write_text("")
-    result = import_in(tmp_path, "import handsim")
-    assert result.returncode == 0
-    assert f"`import render` finds {tmp_path}/render;" in result.stderr
+@pytest.mark.parametrize("name", ["train", "render", "track"])
+def test_a_script_of_such_a_name_works_by_the_safe_names(tmp_path, name):
+    script = tmp_path / f"{name}.py"
+    script.write_text(
+        "from handsim.gloves import load_layout\nimport handsim.track, handsim.train, handsim.render\n"
+        "print(handsim.track.Status, load_layout('dense19').name)"
+    )
+    environment = {"PYTHONPATH": str(ROOT), "PATH": "/usr/bin:/bin"}
+    done = subprocess.run(
+        [sys.executable, script], capture_output=True, text=True, env=environment, check=False
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_module_is_the_same_under_both_names() -> None:
+    code = (
+        "import handsim.train.labelers.protocol as a, train.labelers.protocol as b, sys, handsim\n"
+        "import handsim.poses, poses\n"
+        "from handsim.gloves import load_layout; import gloves\n"
+        "assert a is b and handsim.poses is poses and load_layout is gloves.load_layout\n"
+        "assert a.__name__ == a.__spec__.name == 'train.labelers.protocol'\n"
+        "assert a.__package__ == 'train.labelers'\n"
+        "assert handsim.track.Status is gloves.Status and 'track' in sys.modules"
+    )
+    result = run_python(code, check=False)
+    assert result.returncode == 0, result.stderr
 
 
 def test_a_mere_folder_is_harmless_and_so_is_safe_path(tmp_path: Path) -> None:

@@ -25,6 +25,7 @@ from gloves.layout import MarkerLayout, stored_layout
 from gloves.optics.ghosts import MAX_GHOSTS
 from handsim._checks import check_type
 from handsim.app.output import CHECKSUMS, Output, Place, check_store, place_of
+from handsim.cards import card, share_drawing
 from handsim.errors import ArgumentError, DatasetError, HandSimError, LayoutError
 from handsim.files.arrays import check_npy_header
 from handsim.files.inputs import checksum, load_json
@@ -81,6 +82,8 @@ class Manifest(Settings):
     """SHA-256 of every file, by name."""
     redrawn: dict[str, int] | None = None
     """Numbers of redrawn people and scenes, by reason; None in old sets, which did not count them."""
+    handsim: str = ""
+    """Version that finished the set; empty in old sets."""
     units: str = "metres, radians, world frame"
     schema: int = SCHEMA
 
@@ -254,6 +257,18 @@ class Dataset:
     def marker_names(self) -> tuple[str, ...]:
         """Markers in label order."""
         return self.manifest.marker_names
+
+    def _repr_html_(self) -> str:
+        """The card that notebooks show: how often the rig sees each marker, in frames from all of the set."""
+        some = self.mapped_rows()[np.linspace(0, len(self) - 1, min(len(self), 1000)).astype(np.int64)]
+        seen = np.isfinite(some["observed"]).all(axis=-1).mean(axis=0)
+        facts = {
+            "frames": str(len(self)),
+            "folder": str(self.path),
+            "handsim": self.manifest.handsim or "unknown",
+        }
+        shares = dict(zip(self.marker_names, map(float, seen), strict=True))
+        return card("Training set", facts, share_drawing(shares))
 
     def rows(self) -> Shaped[np.ndarray, "T"]:
         """All T rows in order, read into memory; see `row_dtype` for their fields."""

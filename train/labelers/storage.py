@@ -25,9 +25,9 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from gloves.layout import MarkerLayout, list_layouts, load_layout
-from handsim import __version__
 from handsim._checks import check_type
 from handsim._plugins import import_extra, is_plugin, list_plugins
+from handsim._version import full_version
 from handsim.errors import DAMAGE, ArgumentError, HandSimWarning, WeightsError, choices
 from handsim.files.arrays import read_npz
 from handsim.files.inputs import read_bytes
@@ -463,7 +463,7 @@ def export_onnx(network: nn.Module, marker_names: Sequence[str], path: Path) -> 
     from train.labelers.networks import PairedScores
 
     onnx = import_extra("onnx", "exporting", "onnx")
-    properties = {_NAMES: json.dumps(list(marker_names)), DIGEST: "0" * 64, "handsim.version": __version__}
+    properties = {_NAMES: json.dumps(list(marker_names)), DIGEST: "0" * 64, "handsim.version": full_version()}
     example: tuple[torch.Tensor, ...]
     if isinstance(network, DeepLabelCNN):
         example, inputs, outputs = (torch.zeros(2, 1, 52, 52),), [_IMAGES], ["positions"]
@@ -498,7 +498,7 @@ def export_onnx(network: nn.Module, marker_names: Sequence[str], path: Path) -> 
             dynamo=False,
         )
         model = onnx.load(str(plain))
-        model.producer_name, model.producer_version = "handsim", __version__
+        model.producer_name, model.producer_version = "handsim", full_version()
         model.doc_string = model.graph.doc_string = _DESCRIPTION
         for value in (*model.graph.input, *model.graph.output):
             value.doc_string = properties[f"handsim.{value.name}"] = _MEANINGS[value.name]

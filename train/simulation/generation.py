@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import pickle
+import re
 import warnings
 from collections import Counter
 from collections.abc import Collection, Mapping
@@ -18,6 +19,7 @@ import numpy as np
 from gloves.fit import check_layout
 from gloves.layout import load_layout
 from handsim._plugins import plugin_name
+from handsim._version import full_version
 from handsim.app.output import (
     CHECKSUMS,
     Output,
@@ -257,8 +259,13 @@ def _complete(source: FrameSource, output: Output, whole: dict[str, str]) -> Man
         files={name: recorded[name] for name in names},
         redrawn=load_redrawn(output.folder, len(shards)),
     )
-    path, content = output.folder / MANIFEST, dataclasses.asdict(manifest)
-    if path.is_file() and path.read_bytes() != json_text(content).encode():
+    path = output.folder / MANIFEST
+    found = path.read_text("utf-8", "replace") if path.is_file() else ""
+    stated = re.search(r'"handsim": "([^"]*)"', found)
+    version = stated[1] if stated else full_version()  # another version changes nothing in a finished set
+    manifest = dataclasses.replace(manifest, handsim=version)
+    content = dataclasses.asdict(manifest)
+    if found and found != json_text(content):
         told = f"{output}: {MANIFEST} is not what the shards give, and is written anew"
         warnings.warn(told, HandSimWarning, stacklevel=4)
     save_json(path, content)

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-import handsim
+from handsim._version import full_version
 from handsim.cli.main import COMMANDS, load, main, run
 from handsim.errors import LayoutError
 from handsim.files.signals import Stopped
@@ -58,7 +58,7 @@ def test_overview_lists_every_command(args: list[str], capsys: pytest.CaptureFix
 
 def test_version(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--version"]) == 0
-    assert capsys.readouterr().out == f"handsim {handsim.__version__}\n"
+    assert capsys.readouterr().out == f"handsim {full_version()}\n"
 
 
 @pytest.mark.parametrize(

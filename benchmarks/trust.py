@@ -1,0 +1,55 @@
+"""Writes docs/trust.md from the figures in benchmarks/figures: `make results`.
+
+The rows stand in trust_rows.toml, with figures as in results_template.md. The best row comes first: outputs
+are ordered by how many kinds of evidence they have, in the file's order where these are equal.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Final
+
+from benchmarks.record import load_figures
+
+PAGE: Final = Path(__file__).resolve().parents[1] / "docs" / "trust.md"
+ROWS: Final = Path(__file__).with_name("trust_rows.toml")
+_COLUMNS: Final = {
+    "output": "output",
+    "real": "judged on real data",
+    "others": "judged by others",
+    "simulated": "judged on simulated data",
+    "deviation": "deviation it states, and how often that held",
+    "never": "never judged",
+}
+_EVIDENCE: Final = ("real", "others", "simulated", "deviation")
+_LEAD: Final = """# What was judged, and by what
+
+`make results` writes this page from `benchmarks/figures/` and `benchmarks/trust_rows.toml`. A row is an
+output of handsim. The rows with the most kinds of evidence stand first; "-" means that there is none. Real
+data are those of two people in the public Mocap_SIG18_Data, unless a row says otherwise, and a figure on two
+people says little about a third. [Results](results.md) has the commands of most figures; quoted ones have
+theirs in `benchmarks/figures/quoted.json`.
+"""
+
+
+def trust_rows() -> list[dict[str, str]]:
+    """The rows with their figures, the one with the most kinds of evidence first."""
+    figures = load_figures()
+    rows = [
+        {key: row.get(key, "-").format(**figures) for key in _COLUMNS}
+        for row in tomllib.loads(ROWS.read_text("utf-8"))["row"]
+    ]
+    return sorted(rows, key=lambda row: sum(row[key] == "-" for key in _EVIDENCE))
+
+
+def trust_page() -> str:
+    """The page."""
+    lines = [list(_COLUMNS.values()), ["---"] * len(_COLUMNS), *(list(row.values()) for row in trust_rows())]
+    return _LEAD + "\n" + "".join(f"| {' | '.join(cells)} |\n" for cells in lines)
+
+
+def readme_rows() -> list[str]:
+    """The three best and the three worst rows, as README.md has them."""
+    rows = trust_rows()
+    return [f"| {row['output']} | {row['real']} | {row['never']} |" for row in (*rows[:3], *rows[-3:])]

@@ -1,0 +1,57 @@
+"""The version of this copy of handsim: the release and, between two releases, the commit.
+
+A wheel and a source archive hold it as a file, which `handsim._building` writes.
+"""
+
+from __future__ import annotations
+
+import functools
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Final
+
+BAKED: Final = "version.txt"
+
+
+@functools.cache
+def full_version() -> str:
+    """The version that files, pages and `handsim --version` state, such as "0.2.0+12.g5e3e440.dirty"."""
+    release: str = sys.modules["handsim"].__version__
+    return describe(Path(__file__).parent, release)
+
+
+def describe(package: Path, release: str) -> str:
+    """The version of a package's folder: baked, else by git; the mere release without both.
+
+    The part after "+" is missing at the commit with the release's tag. Elsewhere it holds the number of
+    commits since that tag, the commit, and "dirty" if files differ from it.
+    """
+    baked, checkout = package / BAKED, package.parent
+    if baked.is_file():
+        return baked.read_text("utf-8").strip()
+    if not (checkout / ".git").exists():  # as in site-packages, even within a repository of the user's
+        return release
+    tag = f"v{release}"
+    command = [
+        "git",
+        "-C",
+        str(checkout),
+        "describe",
+        "--always",
+        "--tags",
+        "--long",
+        "--dirty",
+        "--match",
+        tag,
+    ]
+    own = {name: value for name, value in os.environ.items() if not name.startswith("GIT_")}
+    try:
+        told = subprocess.run(command, capture_output=True, text=True, env=own, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return release
+    # Without the tag among the ancestors git tells the commit alone.
+    local = told.removeprefix(f"{tag}-") if told.startswith(tag) else f"g{told}"
+    is_release = local.startswith("0-") and not local.endswith("-dirty")
+    return release if is_release else f"{release}+{local.replace('-', '.')}"
