@@ -15,6 +15,7 @@ from handsim._imports import lazy_exports
 
 if TYPE_CHECKING:
     from gloves.takes.points import Status as Status
+    from track.alternatives.alternatives import Alternative as Alternative
     from track.calibration.user_calibration import Calibration as Calibration
     from track.calibration.user_calibration import HeldOut as HeldOut
     from track.calibration.user_calibration import Touch as Touch
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
     from track.glove_score import score_glove as score_glove
     from track.kinematics.pose_solver import PoseFit as PoseFit
     from track.kinematics.pose_solver import solve_pose as solve_pose
+    from track.kinematics.pose_spread import HandErrors as HandErrors
     from track.live_message import LiveBody as LiveBody
     from track.live_message import LiveHand as LiveHand
     from track.live_message import LiveHeader as LiveHeader
