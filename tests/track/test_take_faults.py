@@ -156,7 +156,7 @@ def test_a_slip_of_the_whole_glove_is_told_on_moving_skin(shift):
     assert all(abs(fault.first - half) <= RATE / 2 for fault in found)
 
 
-@pytest.mark.parametrize("across", [(-0.18, 0.18), (0.18, -0.18)])  # 15 mm
+@pytest.mark.parametrize("across", [(-0.2, 0.2), (0.2, -0.2)])  # 17 mm
 def test_places_that_are_off_are_named(truth, across):
     designed, off = load_layout("dense19"), dict(zip(("BackHand1", "BackHand3"), across, strict=True))
     places = [

@@ -42,7 +42,7 @@ _ROUGH_NOISE, _ROUGH_MOST = 0.004, 0.02  # [m] scale and bound of residuals in r
 _OFTEN: Final = 0.5  # share of the frames without the marker that show it
 _TEMPERATURE: Final = 1.5  # divides log-odds of alternatives, as no fit knows all errors of gloves
 _DOUBTFUL: Final = 0.2  # An alternative is reported from this probability on.
-_OFF_DESIGN: Final = 0.015  # [m] least reported distance of a marker from its place; right ones reach 13 mm
+_OFF_DESIGN: Final = 0.014  # [m] least reported distance of a marker from its place; right ones reach 13 mm
 _LIKELY: Final = 0.01  # Alternatives are kept from this probability on.
 
 
