@@ -42,7 +42,7 @@ if any(word.startswith(({COMMAND!r}, "from multiprocessing.")) for word in sys.o
     from train.simulation import generation
     generation.ROWS_PER_SHARD = 150
 """
-PATIENCE = 2.0  # seconds in which processes and files of a killed command must be gone
+PATIENCE = 10.0  # [s] A killed command is gone by then; workers that are starting end when they have started.
 ALONE = ("--scenes.together", "0", "--scenes.holding", "0")
 NETWORK = ("--network.width", "8", "--network.gates", "2", "--network.depth", "1", "--batch", "32")
 
