@@ -51,7 +51,7 @@ def describe(package: Path, release: str) -> str:
         told = subprocess.run(command, capture_output=True, text=True, env=own, check=True).stdout.strip()
     except (OSError, subprocess.CalledProcessError):
         return release
-    # Without the tag among the ancestors git tells the commit alone.
+    # If no ancestor has the tag, git prints the hash of the commit alone.
     local = told.removeprefix(f"{tag}-") if told.startswith(tag) else f"g{told}"
     is_release = local.startswith("0-") and not local.endswith("-dirty")
     return release if is_release else f"{release}+{local.replace('-', '.')}"

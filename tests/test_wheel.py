@@ -19,7 +19,7 @@ EXAMPLES = ("01", "03", "10")  # a hand, the weights, pictures
 
 
 class Installation(NamedTuple):
-    """A wheel that is installed."""
+    """An environment with handsim installed from its wheel."""
 
     wheel: Path
     python: Path

@@ -52,7 +52,7 @@ FRAMES: Final = 240
 WORK: Final[Mapping[str, SimulatedKind]] = {
     "two apart": "single-hand", "two touching": "hand-hand", "real-like": "real-like",
 }  # fmt: skip
-"""What hands do in captures; a glove for one hand is tried on `ONE_HAND` alone."""
+"""What hands do in simulated captures. A glove that fits one side only is tried with `ONE_HAND` alone."""
 ONE_HAND: Final[Mapping[str, SimulatedKind]] = {"one hand": "single-hand"}
 SIDES_EXCHANGED: Final = "left and right are exchanged"
 """Words of labels that are those of the other hand."""

@@ -54,7 +54,8 @@ _SHORTEST, _LONGEST = 0.125, 0.225  # [m] hand lengths: 0.6 of an adult's to bey
 _BREADTHS: Final = (0.88, 1.12)  # breadth over the usual one of a length: three standard deviations
 _FAR: Final = 0.012  # [m] Hands are labeled again after a larger change of length.
 _PRECISION: Final = 0.001  # [m] precision of length and breadth
-_USUAL_LENGTH, _LENGTH_SPREAD = 0.187, 0.012  # [m] mean and deviation of adults, ANSUR II
+ADULT_LENGTH: Final = (0.187, 0.012)
+"""Mean and standard deviation of the length of adults' hands, ANSUR II [m]."""
 _BREADTH_SPREAD: Final = 0.04  # standard deviation of the breadth over the usual one of a length
 _MARKER_SPREAD: Final = 0.002  # [m] standard deviation of glued markers per axis
 _INDEPENDENT: Final = 4.0  # All frames count as this many: errors of glue and flesh repeat.
@@ -253,16 +254,16 @@ def _label(
                 markers[seen.filled] = np.nan
                 some.append(markers)
     return [
-        _spread_out(np.array(some), _PROPORTION_FRAMES) @ (MIRROR if side == "left" else np.eye(3))
+        spread_out(np.array(some), _PROPORTION_FRAMES) @ (MIRROR if side == "left" else np.eye(3))
         for side, some in zip(sides, found, strict=True)
         if len(some) >= _FEWEST
     ]
 
 
-def _spread_out(markers: NDArray[np.float64], most: int) -> NDArray[np.float64]:
-    """At most `most` frames of markers (F, M, 3), evenly spaced."""
-    rows = np.linspace(0, len(markers) - 1, min(most, len(markers))).astype(int)
-    return np.asarray(markers[rows])
+def spread_out(frames: NDArray[Any], most: int) -> NDArray[Any]:
+    """At most `most` of an array's frames (F, ...), evenly spaced."""
+    rows = np.linspace(0, len(frames) - 1, min(most, len(frames))).astype(int)
+    return np.asarray(frames[rows])
 
 
 class _Search:
@@ -271,7 +272,7 @@ class _Search:
     # Few markers fit hands of many sizes, so the distribution of people's sizes counts, too.
 
     def __init__(self, markers: Sequence[Float[np.ndarray, "F M 3"]], start: GloveFit) -> None:
-        few = [_spread_out(some, _FRAMES) for some in markers]
+        few = [spread_out(some, _FRAMES) for some in markers]
         seen = np.mean([np.isfinite(some[..., 0]).sum(axis=1).mean() for some in few])
         self._evidence = _INDEPENDENT * float(seen) / _MARKER_SPREAD**2  # [1/m^2]
         self._markers, self._layout = np.concatenate(few), start.layout
@@ -290,7 +291,7 @@ class _Search:
 
     def _cost(self, length: float, breadth: float) -> float:
         solver = PoseSolver(mean_hand(length, breadth, self._layout))
-        beyond = (length - _USUAL_LENGTH) / _LENGTH_SPREAD
+        beyond = (length - ADULT_LENGTH[0]) / ADULT_LENGTH[1]
         broad = (breadth / usual_breadth(length) - 1.0) / _BREADTH_SPREAD
         square = float(np.median(solver.solve(self._markers, self._poses).rms)) ** 2
         return 0.5 * (self._evidence * square + beyond**2 + broad**2)

@@ -338,7 +338,7 @@ class CameraRig:
         return self.T_world_camera[:, :3, 3]
 
     def _repr_html_(self) -> str:
-        """The card that notebooks show: the cameras from above, each with the way that it looks."""
+        """The card that notebooks show: the cameras from above, each with its viewing direction."""
         ground, ways = self.positions[:, :2], self.T_world_camera[:, :2, 2]
         lines = [np.array([one, one + 0.5 * way]) for one, way in zip(ground, ways, strict=True)]
         heights = f"{self.positions[:, 2].min():.2f} to {self.positions[:, 2].max():.2f} m"

@@ -208,7 +208,7 @@ def take():
 
 
 def trial_of(count):
-    """Captures of a layout of so many markers that are all right."""
+    """Trials in which every label is right, of a layout with a given number of markers."""
     return Trial(dict.fromkeys(METHODS, np.ones(count)), dict.fromkeys(METHODS, 1.0), np.zeros(20), 0.0)
 
 

@@ -13,21 +13,27 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from numpy.typing import NDArray
 
 from gloves.fit import GloveFit, mean_hand
 from gloves.takes.take import Take
 from handsim.hand.shape import BONES, DIGITS, PALM, Side
 from handsim.space.transforms import MIRROR, rigid_fit
-from track.alternatives.placement import Placement, offset_cost, place_again, place_markers
+from track.alternatives.placement import (
+    FRAMES,
+    Placement,
+    are_complete,
+    offset_cost,
+    place_again,
+    place_markers,
+)
 from track.calibration.energy import QUICK_OPTIONS
-from track.kinematics.pose_solver import FEWEST_MARKERS, PoseSolver
+from track.hand_size import spread_out
+from track.kinematics.pose_solver import PoseSolver
 from train.labelers.matching import assign
 
-_FRAMES: Final = 10  # frames of a hand, whose errors are about independent
 _FEWEST_FRAMES: Final = 4
-_COMPLETE: Final = 0.75  # A frame shows this share of the usual number of markers.
 _ALIKE: Final = 0.3  # share of the frames that they are taken from
 _TRIED: Final = 4  # alternatives that are fitted, the likeliest by a rough cost first
 _ROUGH: Final = 12.0  # log-odds beyond which an alternative is not fitted
@@ -100,7 +106,7 @@ class Doubt(NamedTuple):
 
 
 class Fault(NamedTuple):
-    """A fault of a whole take, in words."""
+    """A sentence on a fault that holds for a whole take."""
 
     of: str
     why: str
@@ -271,28 +277,22 @@ def _columns_of(take: Take, side: Side) -> Columns | None:
     part, worn = take.hand_labels[number], take.hands[number]
     there = np.isfinite(take.observed(part)[..., 0])
     counts = there.sum(axis=1)
-    usual_count = np.median(counts[counts > 0]) if counts.any() else 0
-    frames = np.flatnonzero(counts >= max(FEWEST_MARKERS, _COMPLETE * usual_count))
+    frames = np.flatnonzero(are_complete(counts))
     if len(frames) < _FEWEST_FRAMES:
         return None
     # Where a point that moves with the hand has no label, labels are wrong in the frames that lack one. These
     # may be most of the take; elsewhere frames with many markers tell more.
     usual = there[frames].mean(axis=0) > 0.5
     unlike = (there[frames] != usual).sum(axis=1)
-    alike = _spread_out(frames[unlike <= np.quantile(unlike, _ALIKE)])
+    alike = spread_out(frames[unlike <= np.quantile(unlike, _ALIKE)], FRAMES)
     seen = take.point_list.labeled(part, alike)
     strays = [one[:, None] for one in _steady(take, worn, alike, seen)]
     if not strays:
         full = counts[frames] >= np.quantile(counts[frames], 1.0 - _ALIKE)
-        seen = take.point_list.labeled(part, _spread_out(frames[full]))
+        seen = take.point_list.labeled(part, spread_out(frames[full], FRAMES))
     shape, layout = worn.shape, worn.layout
     columns = np.concatenate([seen, *strays], axis=1) @ mirror
     return Columns(layout.names, columns, mean_hand(shape.length, shape.breadth, layout))
-
-
-def _spread_out(frames: Int[np.ndarray, "T"]) -> Int[np.ndarray, "F"]:
-    """Some of these frames, evenly spaced."""
-    return np.asarray(frames[np.linspace(0, len(frames) - 1, min(_FRAMES, len(frames))).astype(int)])
 
 
 def _steady(

@@ -18,18 +18,15 @@ from gloves.fit import GloveFit, mean_hand
 from gloves.takes.take import Take
 from handsim.hand.shape import HandShape, Side
 from handsim.space.transforms import MIRROR
-from track.alternatives.placement import place_markers
+from track.alternatives.placement import COMPLETE, FRAMES, are_complete, place_markers
 from track.association.initialization import label_alone
 from track.config import HandOrigin
-from track.kinematics.pose_solver import FEWEST_MARKERS, PoseSolver
+from track.hand_size import ADULT_LENGTH, spread_out
+from track.kinematics.pose_solver import PoseSolver
 from train.labelers.protocol import Labeler
 
 OTHER_HANDS: Final = "other_hands"
 """Key of these alternatives in the settings of a take."""
-ADULT_LENGTH: Final = (0.187, 0.012)
-"""Mean and standard deviation of the length of adults' hands, ANSUR II [m]."""
-_FRAMES: Final = 10  # compared frames of a hand
-_COMPLETE: Final = 0.75  # A compared frame shows this share of the usual number of markers.
 # Of 16 simulated hands in three gloves none was doubted by these two, and 14 of 16 hands of other people were
 # told; those missed were in gloves of 10 and 13 markers. With twice the share scales by 1.15 are missed, too.
 _LEFT_OPEN: Final = 0.15  # share of people's spread that a calibration leaves open
@@ -43,7 +40,7 @@ class OtherHands(NamedTuple):
 
     side: Side
     first: int
-    """The frame from which on it holds."""
+    """The first frame that shows other hands."""
     why: str
     remedy: str
     probability: float
@@ -81,17 +78,15 @@ def other_hands_of(take: Take) -> tuple[OtherHands, ...]:
 def _parts(take: Take, side: Side) -> list[Int[np.ndarray, "F"]]:
     """Frames that show most markers of a hand, apart wherever the hand has no label in between."""
     counts = np.isfinite(take.observed(side)[..., 0]).sum(axis=1)
-    usual = float(np.median(counts[counts > 0])) if counts.any() else 0.0
-    good = counts >= max(FEWEST_MARKERS, _COMPLETE * usual)
+    good = are_complete(counts)
     runs = [first + np.flatnonzero(good[first : last + 1]) for first, last in runs_of(counts > 0)]
-    return [frames for frames in runs if len(frames) >= _FRAMES]
+    return [frames for frames in runs if len(frames) >= FRAMES]
 
 
 def _seen(take: Take, side: Side, frames: Int[np.ndarray, "F"], most: int) -> Float[np.ndarray, "S M 3"]:
     """Markers of a hand, as a right one, in some of these frames [m]."""
-    some = frames[np.linspace(0, len(frames) - 1, min(most, len(frames))).astype(int)]
     labels = take.hand_labels[take.hand_index(side)]
-    seen = take.point_list.labeled(labels, some)
+    seen = take.point_list.labeled(labels, spread_out(frames, most))
     return np.asarray(seen @ (MIRROR if side == "left" else np.eye(3)))
 
 
@@ -107,7 +102,7 @@ def _of_person(
         remedy = "check the length of the calibration wand and the unit of the file, and scale its positions"
         yield OtherHands(side, 0, why, remedy, _probability(odds))
         return
-    seen = _seen(take, side, frames, _FRAMES)
+    seen = _seen(take, side, frames, FRAMES)
     free = place_markers(seen, _mean(worn))
     known = place_markers(seen, worn, _LEFT_OPEN if origin == "calibrated" else 1.0)
     fitted = free.hand.shape
@@ -124,11 +119,11 @@ def _of_parts(take: Take, side: Side, parts: list[Int[np.ndarray, "F"]]) -> Iter
         return
     start = _mean(take.hands[take.hand_index(side)].with_side("right"))
     first, *others = sorted(parts, key=len, reverse=True)
-    early = _seen(take, side, first, _FRAMES // 2)
+    early = _seen(take, side, first, FRAMES // 2)
     own = place_markers(early, start)
     solver = PoseSolver(own.hand)
-    other = max(others, key=lambda part: float(np.median(solver.solve(_seen(take, side, part, _FRAMES)).rms)))
-    late = _seen(take, side, other, _FRAMES // 2)
+    other = max(others, key=lambda part: float(np.median(solver.solve(_seen(take, side, part, FRAMES)).rms)))
+    late = _seen(take, side, other, FRAMES // 2)
     apart, both = place_markers(late, start), place_markers(np.concatenate([early, late]), start)
     sizes = [_size(one.hand.shape) for one in (own, apart)]
     later, (before, after) = max(first[0], other[0]), sizes if first[0] < other[0] else sizes[::-1]
@@ -142,10 +137,10 @@ def _at_once(take: Take, side: Side, frames: Int[np.ndarray, "F"], labeler: Labe
     """Points without a label may be those of a second hand of the same side."""
     points, hand = take.point_list, take.hands[take.hand_index(side)]
     left = points.without(points.labels >= 0)
-    some = frames[left.counts[frames] >= _COMPLETE * hand.layout.num_markers]
-    some = some[np.linspace(0, len(some) - 1, min(_FRAMES, len(some))).astype(int)]
+    some = frames[left.counts[frames] >= COMPLETE * hand.layout.num_markers]
     if not len(some):
         return
+    some = spread_out(some, FRAMES)
     clouds = [left.points[left.of(frame)] for frame in some]
     hands = [hand, hand.with_side("left" if side == "right" else "right")]
     labels, _ = label_alone(clouds, hands, labeler)

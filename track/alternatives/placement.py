@@ -10,7 +10,7 @@ import dataclasses
 from typing import Final, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
 from gloves.fit import GloveFit
@@ -25,8 +25,12 @@ from track.calibration.energy import (
     user_hand,
 )
 from track.calibration.hand_parameters import attachment_at, shape_at
-from track.kinematics.pose_solver import PoseSolver
+from track.kinematics.pose_solver import FEWEST_MARKERS, PoseSolver
 
+FRAMES: Final = 10
+"""Compared frames of a hand, whose errors are about independent."""
+COMPLETE: Final = 0.75
+"""A compared frame shows this share of the usual number of markers."""
 _RELINEARIZE: Final = 0.2  # A smaller value changes no probability by more than 0.01.
 _LIFT: Final = 0.0015  # [m] standard deviation of a marker's height above the layout's
 _GLUED: Final = 0.0035  # [m] scale of the offset of a marker along the skin
@@ -56,6 +60,12 @@ class Placement(NamedTuple):
     def hand(self) -> GloveFit:
         """The hand with its markers where they are."""
         return user_hand(self.start, self.problem, self.estimate)
+
+
+def are_complete(counts: Int[np.ndarray, "T"]) -> Bool[np.ndarray, "T"]:
+    """Whether frames that show so many markers of a hand are compared."""
+    usual = float(np.median(counts[counts > 0])) if counts.any() else 0.0
+    return np.asarray(counts >= max(FEWEST_MARKERS, COMPLETE * usual))
 
 
 def place_markers(seen: Float[np.ndarray, "F M 3"], start: GloveFit, left_open: float = 1.0) -> Placement:

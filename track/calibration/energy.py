@@ -473,7 +473,7 @@ def initialize_contacts(
 
 def are_touches(gaps: Float[np.ndarray, "K"], spreads: Float[np.ndarray, "K"]) -> Bool[np.ndarray, "K"]:
     """Whether pads touch rather than rest anywhere near each other, by gaps without contacts [m]."""
-    # A touch has a normal gap, another pose any gap up to the largest. Pads that overlap touch.
+    # Gaps of touching pads are normally distributed around zero; those of others are uniform up to a largest.
     spreads = np.hypot(spreads, CONTACT_SPREAD)
     odds = _MOST_TOUCH_GAP / (np.sqrt(2.0 * np.pi) * spreads) * np.exp(-0.5 * (gaps / spreads) ** 2)
     return np.asarray((gaps < 0.0) | (odds > 1.0))

@@ -378,7 +378,10 @@ def _same_markers(digits: Int[np.ndarray, "M"], numbers: Float[np.ndarray, "46 C
 
 
 class SpreadModel:
-    """Standard deviations of the poses of one hand: by what its calibration left open, else by its origin."""
+    """Standard deviations of the poses of one hand.
+
+    They follow from the errors that its calibration left, or from its origin if these are not known.
+    """
 
     def __init__(self, fit: GloveFit, origin: HandOrigin, errors: HandErrors | None = None) -> None:
         self._hand, self._is_calibrated = with_keypoints(fit), errors is not None
