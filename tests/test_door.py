@@ -18,9 +18,9 @@ BOOKKEEPING = {"__version__", "ShadowedPackageWarning"}
 UNIT = re.compile(r"\[(m|m\^2|rad|s|min|Hz|deg|px|pixels|mm|1/s)(?=[ ,;/\]])")
 ARRAY = re.compile(r"\b(Float|Int|Bool)(32|64)?\[[^,\]]+, *\"")
 NO_QUANTITY = {
-    "Backgrounds", "CalibrateSettings", "CameraLoss", "EvaluateSettings", "HandSimError", "HandSimWarning",
-    "ImprovedGlove", "LabelSettings", "Labeler", "LiveHeader", "PoseFile", "PoseMix", "SceneMix",
-    "ScoreGloveSettings", "SinkGroup", "Status", "SuspectSpan", "find_suspect_spans", "load_labeler",
+    "Alternative", "Backgrounds", "CalibrateSettings", "CameraLoss", "EvaluateSettings", "HandSimError",
+    "HandSimWarning", "ImprovedGlove", "LabelSettings", "Labeler", "LiveHeader", "PoseFile", "PoseMix",
+    "SceneMix", "ScoreGloveSettings", "SinkGroup", "Status", "SuspectSpan", "find_suspect_spans", "load_labeler",
 }  # fmt: skip
 """Public names without a physical quantity of their own, or whose quantities are in the types they return."""
 

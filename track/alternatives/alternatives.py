@@ -66,6 +66,7 @@ class Alternative(NamedTuple):
     words: str
     """What it says of the labels, such as "RH1 and RH6 are exchanged"; empty for the labels as they are."""
     probability: float
+    """Probability that the points of the take are labeled this way, from 0 to 1."""
 
 
 class JudgedHand(NamedTuple):
