@@ -20,7 +20,8 @@ ARRAY = re.compile(r"\b(Float|Int|Bool)(32|64)?\[[^,\]]+, *\"")
 NO_QUANTITY = {
     "Alternative", "Backgrounds", "CalibrateSettings", "CameraLoss", "EvaluateSettings", "HandSimError",
     "HandSimWarning", "ImprovedGlove", "LabelSettings", "Labeler", "LiveHeader", "PoseFile", "PoseMix",
-    "SceneMix", "ScoreGloveSettings", "SinkGroup", "Status", "SuspectSpan", "find_suspect_spans", "load_labeler",
+    "SceneMix", "ScoreGloveSettings", "SinkGroup", "Status", "SuspectSpan", "find_suspect_spans",
+    "load_labeler",
 }  # fmt: skip
 """Public names without a physical quantity of their own, or whose quantities are in the types they return."""
 
