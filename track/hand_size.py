@@ -22,10 +22,10 @@ from numpy.typing import NDArray
 from gloves.captures.capture import spacing
 from gloves.fit import GloveFit, check_layout, mean_hand
 from gloves.layout import MarkerLayout, list_layouts, load_layout
-from gloves.takes.points import Status
+from gloves.takes.points import Status, spread_out
 from handsim.errors import ArgumentError, HandSimError, HandSimWarning
 from handsim.hand.model import HandModel
-from handsim.hand.shape import SIZES, HandShape, Side
+from handsim.hand.shape import ADULT_LENGTH, SIZES, HandShape, Side
 from handsim.space.transforms import MIRROR
 from track.association.hand_state import HandState
 from track.association.initialization import HandInitializer, distances_to_nearest
@@ -54,8 +54,6 @@ _SHORTEST, _LONGEST = 0.125, 0.225  # [m] hand lengths: 0.6 of an adult's to bey
 _BREADTHS: Final = (0.88, 1.12)  # breadth over the usual one of a length: three standard deviations
 _FAR: Final = 0.012  # [m] Hands are labeled again after a larger change of length.
 _PRECISION: Final = 0.001  # [m] precision of length and breadth
-ADULT_LENGTH: Final = (0.187, 0.012)
-"""Mean and standard deviation of the length of adults' hands, ANSUR II [m]."""
 _BREADTH_SPREAD: Final = 0.04  # standard deviation of the breadth over the usual one of a length
 _MARKER_SPREAD: Final = 0.002  # [m] standard deviation of glued markers per axis
 _INDEPENDENT: Final = 4.0  # All frames count as this many: errors of glue and flesh repeat.
@@ -258,12 +256,6 @@ def _label(
         for side, some in zip(sides, found, strict=True)
         if len(some) >= _FEWEST
     ]
-
-
-def spread_out(frames: NDArray[Any], most: int) -> NDArray[Any]:
-    """At most `most` of an array's frames (F, ...), evenly spaced."""
-    rows = np.linspace(0, len(frames) - 1, min(most, len(frames))).astype(int)
-    return np.asarray(frames[rows])
 
 
 class _Search:

@@ -149,6 +149,12 @@ def check_stored(arrays: Mapping[str, NDArray[Any]], sizes: Mapping[str, int]) -
             raise ValueError(f"{column.name} is of type {array.dtype} and shape {array.shape}")
 
 
+def spread_out(frames: NDArray[Any], most: int) -> NDArray[Any]:
+    """At most `most` of an array's frames (F, ...), evenly spaced."""
+    rows = np.linspace(0, len(frames) - 1, min(most, len(frames))).astype(int)
+    return np.asarray(frames[rows])
+
+
 def spans(counts: Sequence[int]) -> tuple[range, ...]:
     """Index ranges of consecutive groups of these sizes."""
     bounds = np.cumsum([0, *counts]).tolist()

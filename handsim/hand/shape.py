@@ -147,6 +147,8 @@ SIZES: Final[dict[str, tuple[float, float]]] = {
     "L": (193.0, 88.0),
     "XL": (210.0, 96.0),
 }
+ADULT_LENGTH: Final = (0.187, 0.012)
+"""Mean and standard deviation of the length of adults' hands, ANSUR II [m]."""
 FIRMNESS: Final = 0.8
 """Radius of the capsule that stands for a bone's flesh in collisions, over the skin's radius."""
 _PRESSED: Final = 0.00079  # [m] largest overlap of neighboring fingers at their knuckles, in every pose

@@ -17,6 +17,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from gloves.fit import GloveFit, mean_hand
+from gloves.takes.points import spread_out
 from gloves.takes.take import Take
 from handsim.hand.shape import BONES, DIGITS, PALM, Side
 from handsim.space.transforms import MIRROR, rigid_fit
@@ -29,7 +30,6 @@ from track.alternatives.placement import (
     place_markers,
 )
 from track.calibration.energy import QUICK_OPTIONS
-from track.hand_size import spread_out
 from track.kinematics.pose_solver import PoseSolver
 from train.labelers.matching import assign
 

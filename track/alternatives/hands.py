@@ -15,13 +15,13 @@ from jaxtyping import Float, Int
 
 from gloves.captures.capture import runs_of
 from gloves.fit import GloveFit, mean_hand
+from gloves.takes.points import spread_out
 from gloves.takes.take import Take
-from handsim.hand.shape import HandShape, Side
+from handsim.hand.shape import ADULT_LENGTH, HandShape, Side
 from handsim.space.transforms import MIRROR
 from track.alternatives.placement import COMPLETE, FRAMES, are_complete, place_markers
 from track.association.initialization import label_alone
 from track.config import HandOrigin
-from track.hand_size import ADULT_LENGTH, spread_out
 from track.kinematics.pose_solver import PoseSolver
 from train.labelers.protocol import Labeler
 
