@@ -1,0 +1,387 @@
+"""A glove that labeled captures show: where each marker sits, on whose hands, and how well that labels.
+
+Nobody has to say which column is which marker. Columns that stay near each other may be a hand; a search
+finds the bone that carries each of them (`marker_search`), hands and places are fitted together (`fit`), and
+the places of all hands make one layout. The last third of each capture is kept for the proof: it is labeled
+with the layout, from points without names.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import warnings
+from collections import Counter
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any, Final, NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from gloves.captures.capture import Capture
+from gloves.fit import GloveFit, attach, place_marker, settle_glove
+from gloves.layout import FEWEST_MARKERS, MOST_MARKERS, AnyLayout, MarkerLayout, MarkerPlace, load_layout
+from gloves.takes.points import spread_out
+from handsim.callbacks import OnStep, no_step
+from handsim.errors import CaptureError, LayoutError
+from handsim.hand.model import HandModel
+from handsim.hand.shape import SIDES, Side
+from handsim.settings import Limits, Settings
+from handsim.space.transforms import MIRROR
+from track.frames import AnyCapture, capture_of
+from track.gloves.fit import FINE, PLACE_SPREAD, FittedPlaces, fit_places
+from track.gloves.marker_search import FittedHand, diverse_frames, search_places
+from track.kinematics.pose_solver import PoseSolver
+from track.user import User
+
+_FRAMES: Final = 60  # of each capture, in which hands and places are fitted
+_HAND: Final = 0.26  # [m] Two markers of a hand are never farther apart.
+_LEARNED: Final = 2 / 3  # share of each capture that is learned from
+_COMMON_SPREAD: Final = 0.004  # [m] standard deviation of a marker's place between people
+_ROUNDS: Final = 2  # of a common layout and fits of all hands to it
+_STARTS: Final = ("S", "L")  # sizes of the hands that a fit begins with
+_FITS: Final = 0.003  # [m] A hand whose markers are farther from their places in the median is none.
+_TEMPERATURE: Final = 4.0  # by which differences in energy are divided: errors of hands repeat
+_SAME: Final = 0.015  # [m] A marker that is nearer to a place is there.
+_SURE: Final = 0.95  # A place with a smaller probability is told.
+_LOOKED_AT: Final = 300  # frames in which exchanged columns are looked for
+_OUTLIER: Final = 0.01  # [m] robust scale of poses then
+_EXCHANGED: Final = 0.02  # Exchanges in a larger share of them are told.
+_SHOWN: Final = 8  # names in a sentence
+_PAIRED: Final = 0.02  # [m] Markers of the other hand at most this far from a place are the same marker.
+
+
+@dataclass(frozen=True, slots=True)
+class LearnSettings(Settings):
+    """How a glove is learned from captures: options of `handsim glove learn`, arguments of `learn_glove`."""
+
+    radius_mm: Annotated[float | None, Limits(0.5, 15.0)] = None
+    """Radius of the markers [mm]; needed unless there is a start."""
+    start: AnyLayout | None = None
+    """A guess of the layout, the path of a .toml file: its places are corrected. The captures then need no
+    labels."""
+    hands: tuple[Side, ...] = SIDES
+    """Which hands may be in the captures."""
+
+
+class TrialHand(NamedTuple):
+    """A hand of one of the captures in the learned glove."""
+
+    capture: int
+    """Number of the capture."""
+    columns: Mapping[str, int]
+    """Column of each marker that the capture has."""
+    hand: GloveFit
+    """The hand with the capture's own places."""
+    residuals: Float[np.ndarray, "M"]
+    """Root mean square distance of each of these markers from its place [m]."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LearnedGlove:
+    """A layout that captures show, and the hands in them."""
+
+    layout: MarkerLayout
+    hands: tuple[TrialHand, ...]
+    left_out: tuple[str, ...]
+    """Sentences on columns that do not belong to a hand, or not to the glove."""
+    spreads: Float[np.ndarray, "M"]
+    """How far each marker's place differs between the hands and the layout, root mean square [m]."""
+    sure: Float[np.ndarray, "M"]
+    """Probability of each marker's place: that no other hand fits as well with it elsewhere."""
+    doubt: tuple[str, ...]
+    """Sentences on places that are unsure, and on columns that exchange their markers."""
+
+    def users(self) -> tuple[User, ...]:
+        """A user for each capture: the hands in it, with their own places."""
+        captures = sorted({one.capture for one in self.hands})
+        return tuple(
+            User(
+                tuple(one.hand for one in self.hands if one.capture == number), "learned from a labeled trial"
+            )
+            for number in captures
+        )
+
+
+class _Part(NamedTuple):
+    """Columns of a capture that stay together like a hand."""
+
+    capture: int
+    columns: Int[np.ndarray, "N"]
+    names: tuple[str, ...]
+    points: Float[np.ndarray, "T N 3"]
+
+
+def learn_glove(
+    captures: AnyCapture | Sequence[AnyCapture],
+    settings: LearnSettings | None = None,
+    *,
+    name: str = "learned",
+    on_step: OnStep = no_step,
+    **options: Any,
+) -> LearnedGlove:
+    """Learn a marker layout from labeled captures of one or more people, as `handsim glove learn` does.
+
+    Args:
+        captures: Captures or paths of marker files. Each column is one marker in all captures that have it,
+            whatever it is called; columns of arms and objects may be among them.
+        settings: What is known already.
+        name: Name of the layout.
+        on_step: Called with the name of each step.
+        options: Fields of `settings`, by name: `radius_mm=3.2` [mm].
+
+    Returns:
+        The layout, and the hands of the captures with their own places [m].
+
+    Raises:
+        ArgumentError: A setting has another type or is out of range.
+        CaptureError: A capture cannot be read, or no hand is in it.
+        LayoutError: The start is unknown, or there is neither a start nor a radius.
+    """
+    chosen = LearnSettings.of(settings, options)
+    listed = captures if isinstance(captures, Sequence) and not isinstance(captures, str) else [captures]
+    sources = [capture_of(one) for one in listed]
+    start = None if chosen.start is None else load_layout(chosen.start)
+    if start is None and chosen.radius_mm is None:
+        raise LayoutError("the radius of the markers is unknown; give radius_mm, half their diameter in mm")
+    radius = start.radius if start is not None else 1e-3 * (chosen.radius_mm or 0.0)
+    return _Learning(sources, radius, chosen.hands, on_step).learned(name, start)
+
+
+class _Found(NamedTuple):
+    """A hand in some columns: the number of each marker's column in its part."""
+
+    part: _Part
+    side: Side
+    columns: Mapping[str, int]
+
+
+class _Learning:
+    """Captures from which a glove is learned."""
+
+    def __init__(
+        self, sources: Sequence[Capture], radius: float, sides: tuple[Side, ...], on_step: OnStep
+    ) -> None:
+        self._sources, self._radius, self._sides, self._on_step = sources, radius, sides, on_step
+        self._sure = dict[str, float]()
+
+    def learned(self, name: str, start: MarkerLayout | None) -> LearnedGlove:
+        """Find the hands in all parts, and fit one layout to them."""
+        layout, hands = start, list[_Found]()
+        parts = [part for number, source in enumerate(self._sources) for part in _parts(number, source)]
+        for part in sorted(parts, key=lambda one: one.points.shape[:2][::-1], reverse=True):
+            known = () if layout is None else tuple(one for one in layout.names if one in part.names)
+            if layout is not None and len(known) >= FEWEST_MARKERS:
+                columns = {one: part.names.index(one) for one in known}
+                fits = {side: self._fitted(_Found(part, side, columns), layout) for side in self._sides}
+                hands.append(_Found(part, min(fits, key=lambda side: fits[side].cost), columns))
+            elif (found := self._searched(part)) is not None:
+                shown, columns = layout_of(found.hand, found.hand.layout), found.columns
+                if layout is None:
+                    layout = dataclasses.replace(shown, name=name)
+                else:
+                    pairs = _paired(layout, shown)
+                    columns = {one: columns[other] for one, other in pairs.items()}
+                if columns:
+                    hands.append(_Found(part, found.side, columns))
+        if layout is None or not hands:
+            raise CaptureError("no hand is in the captures, expected columns of 5 or more markers of one")
+        return self._common(dataclasses.replace(layout, name=name), hands)
+
+    def _searched(self, part: _Part) -> _SearchedHand | None:
+        """The likeliest hand in the columns of a part; None if none fits."""
+        found = search_places(part.points, part.names, self._radius, sides=self._sides, on_step=self._on_step)
+        best = found[0]
+        if np.median(best.residuals) > _FITS or len(best.columns) < FEWEST_MARKERS:
+            return None
+        self._sure |= _probabilities(found)
+        columns = {part.names[column]: int(column) for column in best.columns}
+        return _SearchedHand(best.hand, best.side, columns)
+
+    def _common(self, layout: MarkerLayout, hands: Sequence[_Found]) -> LearnedGlove:
+        """Fit all hands to one layout, and the layout to all hands, by turns."""
+        self._on_step("fitting hands and places together")
+        for number in range(_ROUNDS + 1):
+            spread = PLACE_SPREAD if number == 0 else _COMMON_SPREAD
+            fitted = [self._fitted(one, layout, spread) for one in hands]
+            places = [{place.name: place for place in layout_of(one.hand, layout).markers} for one in fitted]
+            layout = _mean_layout(layout, places)
+        layout = dataclasses.replace(layout, sides=tuple(sorted({one.side for one in hands})))
+        done, doubt = list[TrialHand](), list[str]()
+        for one, fit in zip(hands, fitted, strict=True):
+            columns = {name: int(one.part.columns[at]) for name, at in one.columns.items()}
+            done.append(TrialHand(one.part.capture, columns, fit.hand.with_side(one.side), fit.residuals))
+            doubt += _exchanges(one, fit.hand, self._sources[one.part.capture])
+        sure = np.array([self._sure.get(name, 1.0) for name in layout.names])
+        for name, marker, share in zip(layout.names, layout.markers, sure, strict=True):
+            if share < _SURE:
+                doubt.append(f"{name} may sit elsewhere than on {marker.bone} ({100 * (1 - share):.0f} %)")
+        left_out = tuple(_left_out(self._sources, done))
+        return LearnedGlove(layout, tuple(done), left_out, _spreads(layout, fitted), sure, tuple(doubt))
+
+    def _fitted(self, one: _Found, layout: MarkerLayout, spread: float = PLACE_SPREAD) -> FittedPlaces:
+        """A hand in the markers of a layout that it has, begun from a small and from a large hand."""
+        own = _only(layout, one.columns)
+        points = _canonical(one, own.names)
+        points = points[diverse_frames(points, _FRAMES)]
+        starts = [settle_glove(own, HandModel.named(size)) for size in _STARTS]
+        return min((fit_places(points, start, spread, FINE) for start in starts), key=lambda fit: fit.cost)
+
+
+class _SearchedHand(NamedTuple):
+    """The hand that a search found."""
+
+    hand: GloveFit
+    side: Side
+    columns: dict[str, int]
+
+
+def _parts(number: int, source: Capture) -> Iterator[_Part]:
+    """The groups of a capture's columns that may be hands, in the frames that are learned from."""
+    learned = source.positions[: _num_learned(source)]
+    for columns in _together(learned):
+        names = tuple(source.names[column].rsplit(":", 1)[-1].strip() for column in columns)
+        yield _Part(number, columns, names, learned[:, columns])
+
+
+def _num_learned(source: Capture) -> int:
+    """Number of a capture's first frames that are learned from."""
+    return max(1, round(_LEARNED * source.num_frames))
+
+
+def held_out(source: Capture) -> Capture:
+    """The frames of a capture that are not learned from."""
+    first = min(_num_learned(source), source.num_frames - 1)
+    return dataclasses.replace(source, positions=source.positions[first:])
+
+
+def _only(layout: MarkerLayout, names: Collection[str]) -> MarkerLayout:
+    """The layout with some of its markers, for both hands."""
+    return dataclasses.replace(
+        layout, markers=tuple(one for one in layout.markers if one.name in names), sides=SIDES
+    )
+
+
+def _canonical(one: _Found, names: Sequence[str]) -> Float[np.ndarray, "T M 3"]:
+    """The markers of a hand in some order [m], as those of a right one."""
+    points = one.part.points[:, [one.columns[name] for name in names]]
+    return points @ MIRROR if one.side == "left" else points
+
+
+def _probabilities(found: Sequence[FittedHand]) -> dict[str, float]:
+    """Probability of each marker's place on the best hand, by the energies of all hands that were tried."""
+    best = found[0]
+    names, points = best.hand.layout.names, best.hand.attachment.points
+    total, same = 0.0, np.zeros(len(names))
+    for one in found:
+        weight = float(np.exp(-0.5 * (one.cost - best.cost) / _TEMPERATURE))
+        own = dict(zip(one.columns.tolist(), one.hand.attachment.points, strict=True))
+        far = np.full(3, np.inf)
+        shown = np.array([own.get(column, far) for column in best.columns.tolist()])
+        same += weight * ((np.linalg.norm(shown - points, axis=1) < _SAME) & (one.side == best.side))
+        total += weight
+    return dict(zip(names, (same / total).tolist(), strict=True))
+
+
+def _exchanges(one: _Found, hand: GloveFit, source: Capture) -> Iterator[str]:
+    """Sentences on columns that have another marker's points in a part of the capture."""
+    names = hand.layout.names
+    points = _canonical(one, names)
+    seen = np.isfinite(points[..., 0]).sum(axis=1) >= FEWEST_MARKERS
+    rows = spread_out(np.flatnonzero(seen), _LOOKED_AT)
+    poses = PoseSolver(hand, outlier_distance=_OUTLIER).solve(points[rows])
+    markers = hand.markers(poses.qpos)[0]
+    off = np.linalg.norm(points[rows] - markers, axis=2)
+    for first, second in itertools.combinations(range(len(names)), 2):
+        apart = np.linalg.norm(markers[:, first] - markers[:, second], axis=1)
+        crossed = np.maximum(
+            np.linalg.norm(points[rows, first] - markers[:, second], axis=1),
+            np.linalg.norm(points[rows, second] - markers[:, first], axis=1),
+        )
+        wrong = (crossed < 0.5 * apart) & (np.maximum(off[:, first], off[:, second]) > 0.5 * apart)
+        if wrong.mean() > _EXCHANGED:
+            time = rows[wrong.argmax()] / source.rate
+            yield f"{names[first]} and {names[second]} are exchanged from {time:.1f} s on, or for a time"
+
+
+def _left_out(sources: Sequence[Capture], hands: Sequence[TrialHand]) -> Iterator[str]:
+    """A sentence on the columns of each capture that are no marker of the glove."""
+    for number, source in enumerate(sources):
+        own = {column for one in hands if one.capture == number for column in one.columns.values()}
+        others = [name for column, name in enumerate(source.names) if column not in own]
+        if others:
+            shown = ", ".join(others[:_SHOWN]) + (", ..." if len(others) > _SHOWN else "")
+            where = f"capture {number + 1}: " if len(sources) > 1 else ""
+            count = f"{len(others)} of {len(source.names)} columns"
+            yield f"{where}{shown}: {count} move with no bone of a hand"
+
+
+def layout_of(hand: GloveFit, like: MarkerLayout) -> MarkerLayout:
+    """The layout with the places of a hand's markers, which stay on the bones of a layout where they can."""
+    known = {one.name: one for one in like.markers}
+    layout = dataclasses.replace(hand.layout, markers=tuple(known[one] for one in hand.layout.names))
+    for index, point in enumerate(hand.attachment.points):
+        layout = place_marker(layout, index, hand.model, point)
+    return layout
+
+
+def _together(points: Float[np.ndarray, "T N 3"]) -> Iterator[Int[np.ndarray, "N"]]:
+    """Groups of columns that are never farther from each other than markers of a hand."""
+    from scipy.cluster.hierarchy import fcluster, linkage
+
+    some = points[np.linspace(0, len(points) - 1, min(len(points), 300)).astype(int)]
+    first, second = np.triu_indices(points.shape[1], 1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # columns that are never seen together
+        apart = np.nanquantile(np.linalg.norm(some[:, first] - some[:, second], axis=2), 0.98, axis=0)
+    apart = np.where(np.isfinite(apart), apart, 1.0)
+    groups = fcluster(linkage(apart, "complete"), _HAND, "distance")
+    for group in np.unique(groups):
+        columns = np.flatnonzero(groups == group)
+        if FEWEST_MARKERS <= len(columns) <= MOST_MARKERS:
+            yield columns
+
+
+def _paired(layout: MarkerLayout, other: MarkerLayout) -> dict[str, str]:
+    """The markers of another layout at the places of a layout's; none if fewer than five are the same."""
+    from scipy.optimize import linear_sum_assignment
+
+    points = [attach(one, "M").attachment.points for one in (layout, other)]
+    apart = np.linalg.norm(points[0][:, None] - points[1], axis=2)
+    rows, columns = linear_sum_assignment(apart)
+    near = apart[rows, columns] < _PAIRED
+    if near.sum() < FEWEST_MARKERS:
+        return {}
+    return {
+        layout.names[row]: other.names[column] for row, column in zip(rows[near], columns[near], strict=True)
+    }
+
+
+def _mean_layout(layout: MarkerLayout, places: Sequence[Mapping[str, MarkerPlace]]) -> MarkerLayout:
+    """The layout with each marker at the mean of its places, on the bone that most of them are on."""
+    markers = []
+    for marker in layout.markers:
+        shown = [one[marker.name] for one in places if marker.name in one]
+        bone = Counter(one.bone for one in shown).most_common(1)[0][0] if shown else marker.bone
+        same = [one for one in shown if one.bone == bone] or [marker]
+        turn = np.angle(np.mean(np.exp(1j * np.array([one.around for one in same]))))
+        along, across = (float(np.mean([getattr(one, key) for one in same])) for key in ("along", "across"))
+        moved = dataclasses.replace(marker, bone=bone, along=along, around=float(turn), across=across)
+        markers.append(moved)
+    return dataclasses.replace(layout, markers=tuple(markers))
+
+
+def _spreads(layout: MarkerLayout, fitted: Sequence[FittedPlaces]) -> Float[np.ndarray, "M"]:
+    """Root mean square distance of the hands' places from the layout's [m]."""
+    off: dict[str, list[float]] = {name: [] for name in layout.names}
+    for one in fitted:
+        own = tuple(marker for marker in layout.markers if marker.name in one.hand.layout.names)
+        worn = settle_glove(dataclasses.replace(layout, markers=own, sides=SIDES), one.hand.model)
+        for name, distance in zip(
+            worn.layout.names,
+            np.linalg.norm(worn.attachment.points - one.hand.attachment.points, axis=1),
+            strict=True,
+        ):
+            off[name].append(float(distance))
+    return np.array([np.sqrt(np.mean(np.square(values))) if values else np.nan for values in off.values()])

@@ -1,0 +1,93 @@
+"""The proof of a learned glove: frames that it was not learned from are labeled from points without names."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from typing import Final, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
+
+from gloves.captures.capture import Capture, run_lengths
+from track.captures import label_capture
+from track.gloves.learned_glove import LearnedGlove, held_out
+
+_BLOCK: Final = 1.0  # [s] Frames of a block are alike and count once.
+_FEWEST_GAPS: Final = 10  # Captures with fewer gaps are given gaps of these numbers.
+_GAP, _MISSING = 0.05, 0.04  # mean length [s] and share of the markers, as optical systems have them
+_LEVEL: Final = 0.95
+
+
+class Proof(NamedTuple):
+    """How the frames of some captures are labeled that a glove was not learned from."""
+
+    frames: float
+    """Share of the frames in which every label is right."""
+    interval: tuple[float, float]
+    """95 % interval of this share, in which every second counts once."""
+    slots: float
+    """Share of the markers in all frames that are right."""
+    by_capture: tuple[float, ...]
+    """Share of right frames of each capture."""
+
+
+def prove_glove(learned: LearnedGlove, captures: Sequence[Capture], *, rng: np.random.Generator) -> Proof:
+    """Label the last thirds of labeled captures with a glove that was learned from the rest.
+
+    Markers are left out at random where a capture has hardly any gaps, because somebody filled them.
+    """
+    frames, slots, by_capture = list[NDArray[np.float64]](), list[float](), list[float]()
+    for number, source in enumerate(captures):
+        columns = {
+            f"{one.hand.side}:{name}": column
+            for one in learned.hands
+            if one.capture == number
+            for name, column in one.columns.items()
+        }
+        if not columns:
+            continue
+        tried = held_out(source)
+        positions = _with_gaps(tried.positions, list(columns.values()), source.rate, rng)
+        unnamed = Capture(tuple(f"Unlabeled{n}" for n in range(len(source.names))), positions, source.rate)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # what is open of the labels is counted here
+            take = label_capture(unnamed, glove=learned.layout)
+        true = np.full(positions.shape[:2], -1)
+        for name, column in columns.items():
+            true[:, column] = take.label_names.index(name)
+        wrong = (take.labels != true) & np.isfinite(positions[..., 0])
+        right = ~wrong.any(axis=1)
+        block = max(1, round(_BLOCK * source.rate))
+        frames += [right[first : first + block] for first in range(0, len(right), block)]
+        by_capture.append(float(right.mean()))
+        slots.append(1.0 - float(wrong[:, list(columns.values())].mean()))
+    shares = np.array([one.mean() for one in frames])
+    return Proof(
+        float(np.concatenate(frames).mean()), _interval(shares), float(np.mean(slots)), tuple(by_capture)
+    )
+
+
+def _with_gaps(
+    positions: Float[np.ndarray, "T N 3"], columns: Sequence[int], rate: float, rng: np.random.Generator
+) -> Float[np.ndarray, "T N 3"]:
+    """The positions with gaps in some columns, if these have hardly any."""
+    own = positions[:, columns, 0]
+    if len(run_lengths(np.isnan(own), inside=True)) >= _FEWEST_GAPS:
+        return positions
+    changed = positions.copy()
+    count, gap = len(positions), max(1.0, _GAP * rate)
+    for column in columns:
+        for first in rng.integers(0, count, rng.poisson(_MISSING * count / gap)):
+            changed[first : first + rng.geometric(1.0 / gap), column] = np.nan
+    return changed
+
+
+def _interval(shares: Float[np.ndarray, "B"]) -> tuple[float, float]:
+    """Interval of a mean share of B blocks: Wilson's, as if each block were right or wrong."""
+    from scipy.stats import binomtest
+
+    count = len(shares)
+    found = binomtest(int(np.floor(shares.sum())), count).proportion_ci(_LEVEL, "wilson")
+    return float(found.low), float(found.high)
