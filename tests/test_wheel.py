@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -62,7 +63,9 @@ def test_every_command_tells_its_options(installed, tmp_path, command):
 def test_the_demo_runs_the_whole_chain(installed, tmp_path):
     told = installed.run("handsim", "demo", "--num-frames", "200", folder=tmp_path)
     assert told.returncode == 0, told.stderr
-    assert (tmp_path / "demo" / "index.html").stat().st_size > 10_000
+    page = tmp_path / "demo" / "index.html"
+    pictures = re.findall(r'src="([^"]+)"', page.read_text())
+    assert len(pictures) > 3 and all((page.parent / one).stat().st_size for one in pictures)
 
 
 @pytest.mark.parametrize("number", EXAMPLES)

@@ -154,14 +154,15 @@ class User(Sequence[GloveFit]):
         """
         if any(hand.layout != self.layout for hand in self.hands):
             raise ArgumentError("the hands wear different gloves, expected one layout for all")
+        errors = stored_errors(self)
+        units = "metres, radians, errors in millionths" if errors else "metres, radians"
         content = {
             "schema": SCHEMA,
-            "units": "metres, radians, errors in millionths; every hand is described as a right one, "
-            "its markers as they are",
+            "units": f"{units}; every hand is described as a right one, its markers as they are",
             "notes": self.notes,
             "glove": dataclasses.asdict(self.layout),
             "hands": [_to_json(hand) for hand in self.hands],
-            **({"errors": errors} if (errors := stored_errors(self)) else {}),
+            **({"errors": errors} if errors else {}),
         }
         with writing(path, UserError):
             write_text(path, json.dumps(content, indent=1, ensure_ascii=False) + "\n")

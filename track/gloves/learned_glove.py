@@ -29,6 +29,7 @@ from handsim.hand.model import HandModel
 from handsim.hand.shape import SIDES, Side
 from handsim.settings import Limits, Settings
 from handsim.space.transforms import MIRROR
+from track.captures import label_capture
 from track.frames import AnyCapture, capture_of
 from track.gloves.fit import FINE, PLACE_SPREAD, FittedPlaces, fit_places
 from track.gloves.marker_search import FittedHand, diverse_frames, search_places
@@ -37,14 +38,15 @@ from track.user import User
 
 _FRAMES: Final = 60  # of each capture, in which hands and places are fitted
 _HAND: Final = 0.26  # [m] Two markers of a hand are never farther apart.
+_RIGID: Final = 0.004  # [m] Columns whose distances change less belong to a rigid object.
 _LEARNED: Final = 2 / 3  # share of each capture that is learned from
 _COMMON_SPREAD: Final = 0.004  # [m] standard deviation of a marker's place between people
 _ROUNDS: Final = 2  # of a common layout and fits of all hands to it
 _STARTS: Final = ("S", "L")  # sizes of the hands that a fit begins with
 _FITS: Final = 0.003  # [m] A hand whose markers are farther from their places in the median is none.
-_TEMPERATURE: Final = 4.0  # by which differences in energy are divided: errors of hands repeat
+_TEMPERATURE: Final = 2.0  # by which differences in energy are divided: errors of hands repeat
 _SAME: Final = 0.015  # [m] A marker that is nearer to a place is there.
-_SURE: Final = 0.95  # A place with a smaller probability is told.
+_SURE: Final = 0.8  # A place with a smaller probability is told.
 _LOOKED_AT: Final = 300  # frames in which exchanged columns are looked for
 _OUTLIER: Final = 0.01  # [m] robust scale of poses then
 _EXCHANGED: Final = 0.02  # Exchanges in a larger share of them are told.
@@ -146,6 +148,9 @@ def learn_glove(
     if start is None and chosen.radius_mm is None:
         raise LayoutError("the radius of the markers is unknown; give radius_mm, half their diameter in mm")
     radius = start.radius if start is not None else 1e-3 * (chosen.radius_mm or 0.0)
+    if start is not None:
+        on_step("labeling with the start")
+        sources = [_labeled(source, start) for source in sources]
     return _Learning(sources, radius, chosen.hands, on_step).learned(name, start)
 
 
@@ -237,11 +242,27 @@ class _SearchedHand(NamedTuple):
     columns: dict[str, int]
 
 
+def _labeled(source: Capture, layout: MarkerLayout) -> Capture:
+    """A capture with columns of a layout's names: as it is, or labeled with the layout if it has none."""
+    if len(set(layout.names) & {_bare(name) for name in source.names}) >= FEWEST_MARKERS:
+        return source
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of markers that are elsewhere, which are corrected here
+        take = label_capture(source, glove=layout)
+    names = tuple(f"{side}:{name}" for side in take.sides for name in layout.names)
+    return Capture(names, np.concatenate([take.observed(side) for side in take.sides], axis=1), source.rate)
+
+
+def _bare(name: str) -> str:
+    """The name of a column without its subject."""
+    return name.rsplit(":", 1)[-1].strip()
+
+
 def _parts(number: int, source: Capture) -> Iterator[_Part]:
     """The groups of a capture's columns that may be hands, in the frames that are learned from."""
     learned = source.positions[: _num_learned(source)]
     for columns in _together(learned):
-        names = tuple(source.names[column].rsplit(":", 1)[-1].strip() for column in columns)
+        names = tuple(_bare(source.names[column]) for column in columns)
         yield _Part(number, columns, names, learned[:, columns])
 
 
@@ -314,7 +335,7 @@ def _left_out(sources: Sequence[Capture], hands: Sequence[TrialHand]) -> Iterato
             shown = ", ".join(others[:_SHOWN]) + (", ..." if len(others) > _SHOWN else "")
             where = f"capture {number + 1}: " if len(sources) > 1 else ""
             count = f"{len(others)} of {len(source.names)} columns"
-            yield f"{where}{shown}: {count} move with no bone of a hand"
+            yield f"{where}{count} are on no bone of the hand: {shown}"
 
 
 def layout_of(hand: GloveFit, like: MarkerLayout) -> MarkerLayout:
@@ -327,19 +348,22 @@ def layout_of(hand: GloveFit, like: MarkerLayout) -> MarkerLayout:
 
 
 def _together(points: Float[np.ndarray, "T N 3"]) -> Iterator[Int[np.ndarray, "N"]]:
-    """Groups of columns that are never farther from each other than markers of a hand."""
+    """Groups of columns that are never farther apart than markers of a hand, and move against each other."""
     from scipy.cluster.hierarchy import fcluster, linkage
 
-    some = points[np.linspace(0, len(points) - 1, min(len(points), 300)).astype(int)]
+    some = spread_out(points, _LOOKED_AT)
     first, second = np.triu_indices(points.shape[1], 1)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # columns that are never seen together
-        apart = np.nanquantile(np.linalg.norm(some[:, first] - some[:, second], axis=2), 0.98, axis=0)
-    apart = np.where(np.isfinite(apart), apart, 1.0)
-    groups = fcluster(linkage(apart, "complete"), _HAND, "distance")
+        apart = np.linalg.norm(some[:, first] - some[:, second], axis=2)
+        low, high = np.nanquantile(apart, (0.02, 0.98), axis=0)
+    high = np.where(np.isfinite(high), high, 1.0)
+    groups = fcluster(linkage(high, "complete"), _HAND, "distance")
     for group in np.unique(groups):
         columns = np.flatnonzero(groups == group)
-        if FEWEST_MARKERS <= len(columns) <= MOST_MARKERS:
+        own = np.isin(first, columns) & np.isin(second, columns)
+        is_rigid = np.nanmax(high[own] - low[own], initial=0.0) < _RIGID
+        if FEWEST_MARKERS <= len(columns) <= MOST_MARKERS and not is_rigid:
             yield columns
 
 
