@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
 from gloves.fit import Attachment, GloveFit, carried
-from gloves.layout import MarkerLayout, MarkerPlace
+from gloves.layout import FEWEST_MARKERS, MarkerLayout, MarkerPlace
 from gloves.takes.points import spread_out
 from handsim.callbacks import OnStep, no_step
 from handsim.hand.model import HandModel, join_qpos
@@ -28,7 +28,7 @@ from handsim.hand.skin import vertex_normals
 from handsim.space.transforms import MIRROR, quaternion_matrix, rotation_quaternions
 from poses.shapes import sample_poses
 from track.gloves.fit import fit_places
-from track.kinematics.pose_solver import FEWEST_MARKERS, RESTING, PoseSolver
+from track.kinematics.pose_solver import RESTING, PoseSolver
 from track.kinematics.pose_spread import resting_prior
 
 _FRAMES, _FIRST_FRAMES = 12, 6  # frames in which hands are compared, and those of the first poses
@@ -319,8 +319,7 @@ class _Search:
             pose = 0.25 * float(np.einsum("fi,ij,fj->f", off, resting_prior().precision, off).mean())
             before, energy = energy, float(costs.sum()) + pose
             on_hand = costs < _LEFT_OUT
-            if on_hand.sum() < FEWEST_MARKERS:  # everything far away stays, as nothing else could pull
-                on_hand[:] = True
+            on_hand[np.argsort(costs)[:FEWEST_MARKERS]] = True
             if number == rounds or energy > before - _CONVERGED:
                 break
             shown = np.where(on_hand[:, None], points, np.nan)
