@@ -142,8 +142,7 @@ def learn_glove(
         LayoutError: The start is unknown, or there is neither a start nor a radius.
     """
     chosen = LearnSettings.of(settings, options)
-    listed = captures if isinstance(captures, Sequence) and not isinstance(captures, str) else [captures]
-    sources = [capture_of(one) for one in listed]
+    sources = captures_of(captures)
     start = None if chosen.start is None else load_layout(chosen.start)
     if start is None and chosen.radius_mm is None:
         raise LayoutError("the radius of the markers is unknown; give radius_mm, half their diameter in mm")
@@ -152,6 +151,12 @@ def learn_glove(
         on_step("labeling with the start")
         sources = [_labeled(source, start) for source in sources]
     return _Learning(sources, radius, chosen.hands, on_step).learned(name, start)
+
+
+def captures_of(captures: AnyCapture | Sequence[AnyCapture]) -> list[Capture]:
+    """Read one or several captures."""
+    is_one = isinstance(captures, str) or not isinstance(captures, Sequence)
+    return [capture_of(one) for one in ([captures] if is_one else captures)]
 
 
 class _Found(NamedTuple):

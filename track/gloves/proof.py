@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from gloves.captures.capture import Capture, run_lengths
 from track.captures import label_capture
-from track.gloves.learned_glove import LearnedGlove, held_out
+from track.frames import AnyCapture
+from track.gloves.learned_glove import LearnedGlove, captures_of, held_out
 
 _BLOCK: Final = 1.0  # [s] Frames of a block are alike and count once.
 _FEWEST_GAPS: Final = 10  # Captures with fewer gaps are given gaps of these numbers.
@@ -33,13 +34,28 @@ class Proof(NamedTuple):
     """Share of right frames of each capture."""
 
 
-def prove_glove(learned: LearnedGlove, captures: Sequence[Capture], *, rng: np.random.Generator) -> Proof:
+def prove_glove(
+    learned: LearnedGlove, captures: AnyCapture | Sequence[AnyCapture], *, rng: np.random.Generator
+) -> Proof:
     """Label the last thirds of labeled captures with a glove that was learned from the rest.
 
-    Markers are left out at random where a capture has hardly any gaps, because somebody filled them.
+    Points lose their names. Markers are left out at random where a capture has hardly any gaps, because
+    somebody filled them.
+
+    Args:
+        learned: What `learn_glove` returned for the captures.
+        captures: The captures, in the same order.
+        rng: Source of the gaps.
+
+    Returns:
+        Shares of right frames and markers.
+
+    Raises:
+        CaptureError: A capture cannot be read.
     """
+    sources = captures_of(captures)
     frames, slots, by_capture = list[NDArray[np.float64]](), list[float](), list[float]()
-    for number, source in enumerate(captures):
+    for number, source in enumerate(sources):
         columns = {
             f"{one.hand.side}:{name}": column
             for one in learned.hands
