@@ -14,6 +14,7 @@ import warnings
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any, Final, NamedTuple
 
 import numpy as np
@@ -23,6 +24,7 @@ from gloves.captures.capture import Capture
 from gloves.fit import GloveFit, attach, place_marker, settle_glove
 from gloves.layout import FEWEST_MARKERS, MOST_MARKERS, AnyLayout, MarkerLayout, MarkerPlace, load_layout
 from gloves.takes.points import spread_out
+from gloves.takes.take import Take
 from handsim.callbacks import OnStep, no_step
 from handsim.errors import CaptureError, LayoutError
 from handsim.hand.model import HandModel
@@ -155,8 +157,9 @@ def learn_glove(
 
 def captures_of(captures: AnyCapture | Sequence[AnyCapture]) -> list[Capture]:
     """Read one or several captures."""
-    is_one = isinstance(captures, str) or not isinstance(captures, Sequence)
-    return [capture_of(one) for one in ([captures] if is_one else captures)]
+    if isinstance(captures, str | Path | Capture | Take):
+        return [capture_of(captures)]
+    return [capture_of(one) for one in captures]
 
 
 class _Found(NamedTuple):
