@@ -8,6 +8,7 @@ with the layout, from points without names.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import itertools
 import warnings
@@ -53,6 +54,7 @@ _LOOKED_AT: Final = 300  # frames in which exchanged columns are looked for
 _OUTLIER: Final = 0.01  # [m] robust scale of poses then
 _EXCHANGED: Final = 0.02  # Exchanges in a larger share of them are told.
 _SHOWN: Final = 8  # names in a sentence
+_INWARDS: Final = (0.0, 0.2, 0.4, 0.6)  # shares of the way to the middle of its bone that a marker moves
 _PAIRED: Final = 0.02  # [m] Markers of the other hand at most this far from a place are the same marker.
 
 
@@ -351,7 +353,18 @@ def layout_of(hand: GloveFit, like: MarkerLayout) -> MarkerLayout:
     known = {one.name: one for one in like.markers}
     layout = dataclasses.replace(hand.layout, markers=tuple(known[one] for one in hand.layout.names))
     for index, point in enumerate(hand.attachment.points):
-        layout = place_marker(layout, index, hand.model, point)
+        layout = _placed(layout, index, hand, point)
+    return layout
+
+
+def _placed(layout: MarkerLayout, index: int, hand: GloveFit, point: Float[np.ndarray, "3"]) -> MarkerLayout:
+    """The layout with one marker at a point [m], or nearer to its bone's middle where no skin is there."""
+    bone = int(hand.attachment.main_bones[index])
+    start = hand.model.rest_transforms[bone]
+    middle = start[:3, 3] + 0.5 * hand.model.skeleton.lengths[bone] * start[:3, 0]
+    for share in _INWARDS:
+        with contextlib.suppress(LayoutError):
+            return place_marker(layout, index, hand.model, point + share * (middle - point))
     return layout
 
 
