@@ -126,11 +126,7 @@ class Attachment:
         self, model: HandModel, T_world_bone: NDArray[np.float64], rest: NDArray[np.float64], last: float
     ) -> NDArray[np.float64]:
         """Move rest points (`last` 1) or directions (`last` 0) with their bones: (T, M, 3) in the world."""
-        inverse = np.linalg.inv(model.rest_transforms)
-        local = np.einsum("lij,mj->mli", inverse, np.insert(rest, 3, last, axis=1))
-        weights = all_weights(self.bone_indices, self.bone_weights)
-        bones = np.swapaxes(T_world_bone[..., :3, :], -1, -2).reshape(len(T_world_bone), -1, 3)
-        return np.asarray((weights[..., None] * local).reshape(len(rest), -1) @ bones)
+        return carried(model, T_world_bone, rest, self.bone_indices, self.bone_weights, last)
 
     def sites(self, model: HandModel) -> tuple[Site, ...]:
         """The markers as MuJoCo sites, each on the bone that carries most of it."""
@@ -141,6 +137,22 @@ class Attachment:
             Site(name, int(bone), position, self.layout.radius)
             for name, bone, position in zip(self.layout.names, bones, local, strict=True)
         )
+
+
+def carried(
+    model: HandModel,
+    T_world_bone: Float[np.ndarray, "T L 4 4"],
+    rest: Float[np.ndarray, "M 3"],
+    bone_indices: Int[np.ndarray, "M 4"],
+    bone_weights: Float[np.ndarray, "M 4"],
+    last: float = 1.0,
+) -> Float[np.ndarray, "T M 3"]:
+    """Points of the rest hand [m], or directions with `last` 0, as the bones with these shares carry them."""
+    inverse = np.linalg.inv(model.rest_transforms)
+    local = np.einsum("lij,mj->mli", inverse, np.insert(rest, 3, last, axis=1))
+    weights = all_weights(bone_indices, bone_weights)
+    bones = np.swapaxes(T_world_bone[..., :3, :], -1, -2).reshape(len(T_world_bone), -1, 3)
+    return np.asarray((weights[..., None] * local).reshape(len(rest), -1) @ bones)
 
 
 def attach_markers(layout: MarkerLayout, model: HandModel) -> Attachment:

@@ -1,0 +1,1 @@
+"""Gloves learned from recordings of hands that wear them."""

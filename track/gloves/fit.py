@@ -1,0 +1,44 @@
+"""A hand's shape, its poses and the places of its markers, fitted together to labeled frames of a new glove."""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from gloves.fit import GloveFit
+from track.calibration.energy import GESTURES_OF_USER, first_estimate, levenberg_marquardt, user_hand
+from track.kinematics.pose_solver import PoseSolver
+
+PLACE_SPREAD: Final = 0.008
+"""Standard deviation of a marker along the skin from a place of which hardly more than its bone is known [m]."""
+_HEIGHT_SPREAD: Final = 0.0015  # [m] the same of its height over the skin
+_NOISE, _SCALE, _OUTLIER = 0.003, 0.02, 0.03  # [m] flesh that repeats, robust scales of markers and poses
+_RELINEARIZE: Final = 0.2  # The skin's jacobian is renewed after such a change, see `Problem`.
+_MOST_STEPS: Final = 12
+ROUGH: Final = 1e-2
+"""A fit ends with a step that gains a smaller share of its energy."""
+
+
+class FittedPlaces(NamedTuple):
+    """A right hand with its markers where a capture shows them."""
+
+    hand: GloveFit
+    cost: float
+    """Energy of the fit."""
+    residuals: Float[np.ndarray, "M"]
+    """Root mean square distance of each marker from its place [m]."""
+
+
+def fit_places(
+    points: Float[np.ndarray, "F M 3"], glove: GloveFit, spread: float = PLACE_SPREAD, gain: float = ROUGH
+) -> FittedPlaces:
+    """Fit a right hand and the places of its markers to their points [m], NaN where missing."""
+    poses = PoseSolver(glove, outlier_distance=_OUTLIER).solve(points).qpos
+    options = {"noise": _NOISE, "robust_scale": _SCALE, "relinearize": _RELINEARIZE}
+    problem, estimate = first_estimate(glove, points, poses, gestures=GESTURES_OF_USER, **options)
+    problem.position_spread, problem.height_spread = spread, _HEIGHT_SPREAD
+    estimate, fit, _ = levenberg_marquardt(problem, estimate, 0, _MOST_STEPS, None, gain)
+    squares = (fit.residuals**2).sum(axis=2).sum(axis=0) / np.maximum(problem.present.sum(axis=0), 1)
+    return FittedPlaces(user_hand(glove, problem, estimate), fit.cost, np.sqrt(squares))

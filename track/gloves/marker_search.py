@@ -1,0 +1,446 @@
+"""A search for the places of markers that nobody described: which bone carries each column of a recording.
+
+The points of a column belong to one marker, all the time. A hand of mean proportions is laid into a few
+frames in many orientations and gestures. Each column then takes the place on the skin that is nearest to its
+points over all these frames, and poses are solved for these places, by turns, until no place changes. A
+column that is near no place does not belong to the hand. Fingers are alike, so that the best solutions are
+tried again with their fingers exchanged.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+from collections.abc import Iterable, Iterator
+from typing import Final, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpy.typing import NDArray
+
+from gloves.fit import Attachment, GloveFit, carried
+from gloves.layout import MarkerLayout, MarkerPlace
+from gloves.takes.points import spread_out
+from handsim.callbacks import OnStep, no_step
+from handsim.hand.model import HandModel, join_qpos
+from handsim.hand.shape import BONE_NAMES, BONES, DIGIT_OF_BONE, DIGITS, PALM, SIDES, SIZES, Side
+from handsim.hand.skin import vertex_normals
+from handsim.space.transforms import MIRROR, quaternion_matrix, rotation_quaternions
+from poses.shapes import sample_poses
+from track.gloves.fit import fit_places
+from track.kinematics.pose_solver import FEWEST_MARKERS, RESTING, PoseSolver
+from track.kinematics.pose_spread import resting_prior
+
+_FRAMES, _FIRST_FRAMES = 12, 6  # frames in which hands are compared, and those of the first poses
+_POOL: Final = 600  # frames that these are chosen from
+_PLACES: Final = 500  # places on the skin, 6 mm apart
+_MOVES: Final = 0.003  # [m] standard deviation of a marker against its bone
+_NEAR: Final = 0.005  # [m] standard deviation of its distance from the nearest place
+_OWN: Final = 0.6  # share of this distance that its own place has
+_LEFT_OUT: Final = 25.0  # cost of a column that does not belong to the hand
+FARTHEST: Final = 0.02
+"""A column that is farther from every place does not belong to the hand [m]."""
+_CONVERGED: Final = 0.1  # smallest gain in energy of a round
+_PALMAR: Final = 2.0  # cost of a place on the side of the bone, in variances; twice as much on the palm's side
+_ROTATIONS, _GESTURES = 120, 10  # of the hand that is laid into a frame
+_DRAWN: Final = 400  # poses from which these gestures are chosen
+_REFERENCES: Final = 3  # frames that it is laid into
+_RIGID_ROUNDS: Final = (4, 8)  # of all such hands, and of the better quarter
+_RIGID_SCALE: Final = 0.015  # [m] robust scale of their alignment
+_ARTICULATED, _COMPARED, _TRIED, _STARTS = 150, 20, 8, 2  # numbers of solutions in each step
+_OUTLIER: Final = 0.03  # [m] robust scale of poses
+_STEPS: Final = 5  # of poses, at each robust scale
+_ASIDE: Final = 0.1  # [rad] Markers farther around a finger may belong to the next one.
+_GAIN: Final = 0.98  # Another hand must cost less by this factor.
+# Changes of a hand under its markers: slides along and across [m], and a size more or less.
+_SLIDES: Final = (
+    *((0.015, 0.0, 0), (-0.015, 0.0, 0), (0.03, 0.0, 0), (-0.03, 0.0, 0)),
+    *((0.0, 0.02, 0), (0.0, -0.02, 0), (0.0, 0.0, 1), (0.0, 0.0, -1)),
+)
+_USUAL: Final = list(SIZES).index("M")
+
+
+class Solution(NamedTuple):
+    """Places of N columns on a hand, and the poses that go with them."""
+
+    energy: float
+    """Squared distances in variances, with the costs of unlikely places and poses."""
+    side: Side
+    size: int
+    """Number of the hand's size, XS to XL."""
+    places: Int[np.ndarray, "N"]
+    """Rows of the table of places."""
+    on_hand: Bool[np.ndarray, "N"]
+    """Whether each column belongs to the hand."""
+    qpos: Float[np.ndarray, "F 27"]
+    """Poses of a right hand; the points of a left one are mirrored."""
+
+
+class FittedHand(NamedTuple):
+    """A right hand in a glove of some of N columns."""
+
+    cost: float
+    """Energy of its calibration, with a cost for each column that is left out."""
+    side: Side
+    """Side of the hand that was recorded; the hand is its mirror image if this is left."""
+    hand: GloveFit
+    columns: Int[np.ndarray, "M"]
+    """The columns of its markers."""
+    solution: Solution
+
+
+class PlaceTable:
+    """P places for markers, evenly on the skin of a right hand of some size; alike on hands of all sizes."""
+
+    def __init__(self, size: str, radius: float) -> None:
+        self.model = HandModel.named(size)
+        surface = self.model.surface
+        normals, rows = vertex_normals(surface.vertices, surface.faces), _spread_vertices()
+        self.radius, self.normals = radius, normals[rows]
+        self.points = surface.vertices[rows] + radius * self.normals
+        self.bone_indices, self.bone_weights = surface.bone_indices[rows], surface.bone_weights[rows]
+        self.bones: Int[np.ndarray, "P"] = self.bone_indices[np.arange(len(rows)), self.bone_weights.argmax(1)]
+        rest = self.model.rest_transforms[self.bones]
+        local = np.einsum("pji,pj->pi", rest[:, :3, :3], self.points - rest[:, :3, 3])
+        outward = np.einsum("pji,pj->pi", rest[:, :3, :3], self.normals)
+        self.along = local[:, 0] / self.model.skeleton.lengths[self.bones]
+        self.around = np.arctan2(outward[:, 1], outward[:, 2])
+        self.cost: Float[np.ndarray, "P"] = _PALMAR * (1.0 - np.cos(self.around))
+        """Cost of each place: markers are seldom on the palm's side."""
+
+    def centers(self, qpos: Float[np.ndarray, "F 27"]) -> Float[np.ndarray, "F P 3"]:
+        """Marker centers [m] at all places."""
+        bones = self.model.forward_kinematics(qpos)
+        return carried(self.model, bones, self.points, self.bone_indices, self.bone_weights)
+
+    def glove(
+        self,
+        places: Int[np.ndarray, "N"],
+        names: Iterable[str],
+        at: Float[np.ndarray, "N 3"] | None = None,
+    ) -> GloveFit:
+        """A hand with markers at some places, or carried like these and `at` other points [m]."""
+        markers = tuple(
+            MarkerPlace(name, BONE_NAMES[self.bones[place]], 0.5, 0.0) for name, place in zip(names, places)
+        )
+        layout = MarkerLayout("learned", markers, self.radius)
+        parts = (self.normals, self.bone_indices, self.bone_weights)
+        points = self.points[places] if at is None else at
+        return GloveFit(self.model, Attachment(layout, points, *(part[places] for part in parts)))
+
+    def nearest(
+        self, points: Float[np.ndarray, "F N 3"], T_world_bone: Float[np.ndarray, "F L 4 4"]
+    ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+        """The likeliest place of each column: its row, a point [m] between it and the column's mean, and its
+        cost."""
+        turned = T_world_bone[:, None, :, :3, :3].swapaxes(-1, -2)
+        local = (turned @ (points[:, :, None] - T_world_bone[:, None, :, :3, 3])[..., None])[..., 0]
+        seen = np.isfinite(points[:, :, :1])
+        count = np.maximum(seen.sum(axis=0), 1)
+        mean = np.where(seen[..., None], local, 0.0).sum(axis=0) / count[..., None]
+        square = np.minimum(((local - mean) ** 2).sum(axis=-1), FARTHEST**2)
+        varied = np.where(seen, square, 0.0).sum(axis=0) / count
+        rest = self.model.rest_transforms
+        mean = (rest[:, :3, :3] @ mean[..., None])[..., 0] + rest[:, :3, 3]
+        off = mean[:, self.bones] - self.points
+        costs = varied[:, self.bones] / _MOVES**2 + (off**2).sum(axis=-1) / _NEAR**2 + self.cost
+        rows, columns = costs.argmin(axis=1), np.arange(len(costs))
+        at = self.points[rows] + _OWN * off[columns, rows]
+        return rows, at, np.minimum(costs[columns, rows], _LEFT_OUT)
+
+    def like(self, place: int, bone: int) -> int:
+        """The place on another bone that is most like a place."""
+        there = np.flatnonzero(self.bones == bone)
+        turn = np.abs(np.angle(np.exp(1j * (self.around[there] - self.around[place]))))
+        return int(there[(np.abs(self.along[there] - self.along[place]) + 0.3 * turn).argmin()])
+
+
+def search_places(
+    points: Float[np.ndarray, "T N 3"],
+    names: Iterable[str],
+    radius: float,
+    *,
+    sides: Iterable[Side] = SIDES,
+    on_step: OnStep = no_step,
+) -> list[FittedHand]:
+    """Look for the places of 5 to 60 columns [m] of one hand, NaN where missing; likely hands, best first."""
+    search, found = _Search(points, tuple(names), radius), list[Solution]()
+    for side in sides:
+        on_step(f"laying a {side} hand into the frames")
+        found += search.first_solutions(side)
+    on_step("fitting hands")
+    found = [search.solved(one, one.places) for one in search.distinct(found)[:_COMPARED]]
+    fitted = sorted(map(search.fitted, search.distinct(found)), key=lambda one: one.cost)
+    on_step("sliding the hand and exchanging fingers")
+    for start in fitted[:_STARTS]:
+        fitted += search.improved(start)
+    return sorted(fitted, key=lambda one: one.cost)
+
+
+def diverse_frames(points: Float[np.ndarray, "T N 3"], count: int) -> NDArray[np.int64]:
+    """Frames that show many columns [m], with distances between them as different as possible; widest first."""
+    seen = np.isfinite(points[..., 0]).mean(axis=1)
+    pool = spread_out(np.flatnonzero(seen >= min(0.9, np.quantile(seen, 0.7))), _POOL)
+    first, second = np.triu_indices(points.shape[1], 1)
+    apart = np.linalg.norm(points[pool][:, first] - points[pool][:, second], axis=2)
+    usual = np.nan_to_num(np.nanmedian(apart, axis=0))
+    apart = np.where(np.isfinite(apart), apart, usual)
+    chosen, far = [int(apart.sum(axis=1).argmax())], np.full(len(pool), np.inf)
+    while len(chosen) < min(count, len(pool)):
+        far = np.minimum(far, ((apart - apart[chosen[-1]]) ** 2).sum(axis=1))
+        chosen.append(int(far.argmax()))
+    return np.asarray(pool[chosen])
+
+
+@functools.cache
+def _spread_vertices() -> NDArray[np.int64]:
+    """Vertices of the skin that are as far from each other as possible."""
+    points = HandModel.named("M").surface.vertices
+    chosen, far = [0], np.full(len(points), np.inf)
+    while len(chosen) < _PLACES:
+        far = np.minimum(far, ((points - points[chosen[-1]]) ** 2).sum(axis=1))
+        chosen.append(int(far.argmax()))
+    return np.array(chosen)
+
+
+class _Search:
+    """Columns of a recording in a few frames, and the places that they may have."""
+
+    def __init__(self, points: NDArray[np.float64], names: tuple[str, ...], radius: float) -> None:
+        self.tables, self._names = [PlaceTable(size, radius) for size in SIZES], names
+        some = points[diverse_frames(points, _FRAMES)]
+        self._fitted = set[tuple[object, ...]]()
+        self._points: dict[Side, NDArray[np.float64]] = {"right": some, "left": some @ MIRROR}
+        self._gestures = _gestures(self.tables[_USUAL].model)
+
+    def distinct(self, found: list[Solution]) -> list[Solution]:
+        """The solutions with different bones, best first."""
+        kept, bones = dict[tuple[object, ...], Solution](), self.tables[_USUAL].bones
+        for one in sorted(found, key=lambda solution: solution.energy):
+            kept.setdefault((one.side, *bones[one.places].tolist()), one)
+        return list(kept.values())
+
+    def first_solutions(self, side: Side) -> list[Solution]:
+        """Solutions in the first frames, each from a rigid hand in one of them."""
+        points, found = self._points[side][:_FIRST_FRAMES], list[Solution]()
+        for reference in range(min(_REFERENCES, len(points))):
+            motions = _relative_motions(points, reference)
+            tried = set[tuple[int, ...]]()
+            for angles, rotation, position, places in self._rigid_hands(points[reference]):
+                bones = tuple(self.tables[_USUAL].bones[places].tolist())
+                if bones in tried:
+                    continue
+                tried.add(bones)
+                if len(tried) > _ARTICULATED // _REFERENCES // 2:
+                    break
+                turned, moved = (np.stack(part) for part in zip(*motions, strict=True))
+                qpos = join_qpos(np.tile(angles, (len(points), 1)))
+                qpos[:, :3] = turned @ position + moved
+                qpos[:, 3:7] = rotation_quaternions(turned @ rotation)
+                found.append(self._alternated(side, _USUAL, points, qpos, 6))
+        return found
+
+    def solved(self, like: Solution, places: Int[np.ndarray, "N"], rounds: int = 6) -> Solution:
+        """The solution that begins with some places, on a hand like that of another, and general poses."""
+        points = self._points[like.side]
+        qpos = self._poses(like.size, points, places, None)
+        return self._alternated(like.side, like.size, points, qpos, rounds)
+
+    def fitted(self, solution: Solution) -> FittedHand:
+        """A solution with the hand's shape and the markers' places fitted."""
+        own = np.flatnonzero(solution.on_hand)
+        glove = self.tables[solution.size].glove(solution.places[own], [self._names[row] for row in own])
+        hand, cost, _ = fit_places(self._points[solution.side][:, own], glove)
+        cost += self.tables[solution.size].cost[solution.places[own]].sum()
+        cost += _LEFT_OUT * float((~solution.on_hand).sum())
+        return FittedHand(cost, solution.side, hand, own, solution)
+
+    def improved(self, start: FittedHand) -> list[FittedHand]:
+        """Hands that slides, other sizes and exchanges of fingers lead to, as long as these fit better."""
+        found, best = list[FittedHand](), start
+        while True:
+            tried = self.distinct([*self._slid(best.solution), *self._moved(best.solution)])
+            new = list(map(self.fitted, itertools.islice(filter(self._is_new, tried), _TRIED)))
+            found += new
+            better = min(new, key=lambda one: one.cost, default=best)
+            if better.cost > _GAIN * best.cost:
+                return found
+            best = better
+
+    def _is_new(self, one: Solution) -> bool:
+        """Whether no hand with these bones was fitted; it counts as fitted from now on."""
+        key = (one.side, one.size, *self.tables[_USUAL].bones[one.places].tolist())
+        is_new = key not in self._fitted
+        self._fitted.add(key)
+        return is_new
+
+    def _moved(self, start: Solution) -> list[Solution]:
+        """Solutions after exchanges of fingers."""
+        return [self.solved(start, places, rounds=3) for places in self._moves(start.places)]
+
+    def _slid(self, start: Solution) -> list[Solution]:
+        """Solutions after sliding the hand under its markers, and of other sizes."""
+        turned, tried = quaternion_matrix(start.qpos[:, 3:7]), list[Solution]()
+        for along, across, larger in _SLIDES:
+            size = start.size + larger
+            if 0 <= size < len(self.tables):
+                qpos = start.qpos.copy()
+                qpos[:, :3] += turned @ np.array([along, across, 0.0])
+                tried.append(self._alternated(start.side, size, self._points[start.side], qpos, 6))
+        return tried
+
+    def _alternated(
+        self, side: Side, size: int, points: NDArray[np.float64], qpos: NDArray[np.float64], rounds: int
+    ) -> Solution:
+        """Choose places and solve poses by turns."""
+        table, energy = self.tables[size], np.inf
+        for number in range(rounds + 1):
+            places, at, costs = table.nearest(points, table.model.forward_kinematics(qpos))
+            off = qpos[:, 7:] - resting_prior().angles
+            pose = 0.25 * float(np.einsum("fi,ij,fj->f", off, resting_prior().precision, off).mean())
+            before, energy = energy, float(costs.sum()) + pose
+            on_hand = costs < _LEFT_OUT
+            if on_hand.sum() < FEWEST_MARKERS:  # everything far away stays, as nothing else could pull
+                on_hand[:] = True
+            if number == rounds or energy > before - _CONVERGED:
+                break
+            shown = np.where(on_hand[:, None], points, np.nan)
+            qpos = self._poses(size, shown, places, qpos, at)
+        return Solution(energy, side, size, places, on_hand, qpos)
+
+    def _poses(
+        self,
+        size: int,
+        points: NDArray[np.float64],
+        places: NDArray[np.int64],
+        starts: NDArray[np.float64] | None,
+        at: NDArray[np.float64] | None = None,
+    ) -> NDArray[np.float64]:
+        """Poses (F, 27) with markers at these places."""
+        solver = PoseSolver(self.tables[size].glove(places, self._names, at), outlier_distance=_OUTLIER)
+        usual = np.tile(RESTING, (len(points), 1)), 0.5
+        return solver.solve(points, starts, prior=usual, iterations=_STEPS).qpos
+
+    def _rigid_hands(
+        self, points: Float[np.ndarray, "N 3"]
+    ) -> list[tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]]:
+        """Joint angles, rotation, position and nearest places of hands laid into a frame, best first."""
+        table, hands, seen = self.tables[_USUAL], [], points[np.isfinite(points[:, 0])]
+        shown = np.flatnonzero(np.isfinite(points[:, 0]))
+        for angles, centers in zip(self._gestures, table.centers(join_qpos(self._gestures)), strict=True):
+            rotations = _even_rotations(_ROTATIONS)
+            middle = centers[table.cost < _PALMAR].mean(axis=0)
+            positions = seen.mean(axis=0) - rotations @ middle
+            for rounds in _RIGID_ROUNDS:
+                fitted = self._aligned(seen, centers, rotations, positions, rounds)
+                best = np.argsort(fitted[2], kind="stable")[: -(-len(rotations) // 4)]
+                rotations, positions = fitted[0][best], fitted[1][best]
+            for row in best:
+                places = np.zeros(len(points), dtype=np.int64)
+                places[shown] = fitted[3][row]
+                hands.append((float(fitted[2][row]), angles, fitted[0][row], fitted[1][row], places))
+        hands.sort(key=lambda one: one[0])
+        return [one[1:] for one in hands]
+
+    def _aligned(
+        self,
+        points: Float[np.ndarray, "S 3"],
+        centers: Float[np.ndarray, "P 3"],
+        rotations: Float[np.ndarray, "R 3 3"],
+        positions: Float[np.ndarray, "R 3"],
+        rounds: int,
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
+        """Rotations, positions, energies (R,) and nearest places (R, S) of rigid hands, aligned by turns."""
+        size = (centers**2).sum(axis=1)
+        for number in range(rounds + 1):
+            local = (points - positions[:, None]) @ rotations
+            square = (local**2).sum(axis=2)[..., None] + size - 2.0 * local @ centers.T
+            costs = np.minimum(square, FARTHEST**2) / _NEAR**2 + self.tables[_USUAL].cost
+            places = costs.argmin(axis=2)
+            if number == rounds:
+                break
+            off = np.take_along_axis(square, places[..., None], axis=2)[..., 0]
+            rotations, positions = _robust_alignment(points, centers[places], off)
+        return rotations, positions, costs.min(axis=2).sum(axis=1), places
+
+    def _moves(self, places: Int[np.ndarray, "N"]) -> Iterator[Int[np.ndarray, "N"]]:
+        """The places with digits exchanged, inserted elsewhere or divided, or with one's markers a bone farther."""
+        table, count = self.tables[_USUAL], len(DIGITS)
+        digits = DIGIT_OF_BONE[table.bones[places]]
+        orders = list[list[int]]()
+        for one, other in itertools.combinations(range(count), 2):
+            swapped = list(range(count))
+            swapped[one], swapped[other] = other, one
+            orders.append(swapped)
+        for one, other in itertools.permutations(range(count), 2):
+            if abs(one - other) > 1:
+                inserted = [digit for digit in range(count) if digit != one]
+                inserted.insert(other, one)
+                orders.append(inserted)
+        bones = table.bones[places]
+        targets = [np.where(digits >= 0, bones + 3 * (np.array(order)[digits] - digits), PALM) for order in orders]
+        for digit, sign in itertools.product(range(count), (1, -1)):
+            own = digits == digit
+            aside = own & (sign * table.around[places] > _ASIDE)
+            if aside.any() and not aside[own].all():
+                beside = [other for other in range(count) if 0 < abs(other - digit) <= 2]
+                targets += [np.where(aside, bones + 3 * (other - digit), bones) for other in beside]
+            parts = (bones - 1) % 3
+            targets.append(np.where(own, bones + np.clip(parts + sign, 0, 2) - parts, bones))
+        for target in targets:
+            if (target != bones).any():
+                triples = zip(places.tolist(), bones.tolist(), target.tolist(), strict=True)
+                yield np.array([one if own == new else table.like(one, new) for one, own, new in triples])
+
+
+def _gestures(model: HandModel) -> Float[np.ndarray, "K 20"]:
+    """Joint angles [rad] of usual gestures: an almost flat and a relaxed hand, and others far from these."""
+    drawn = sample_poses(model, _DRAWN, rng=np.random.default_rng(1))[:, 7:]
+    chosen, far = [RESTING * 0.3, RESTING], np.full(len(drawn), np.inf)
+    for _ in range(_GESTURES):
+        far = np.minimum(far, ((drawn - chosen[-1]) ** 2).sum(axis=1))
+        usual = np.where(far > np.quantile(far, 0.9), -1.0, far)  # the farthest are contorted
+        chosen.append(drawn[usual.argmax()])
+    return np.array(chosen)
+
+
+def _even_rotations(count: int) -> Float[np.ndarray, "R 3 3"]:
+    """Evenly distributed rotations: a super-Fibonacci spiral (Alexa 2022)."""
+    from scipy.spatial.transform import Rotation
+
+    steps = np.arange(count) + 0.5
+    share, turn = steps / count, 2.0 * np.pi * steps
+    first, second = turn / np.sqrt(2.0), turn / 1.533751168755204288118041
+    low, high = np.sqrt(share), np.sqrt(1.0 - share)
+    parts = (low * np.sin(first), low * np.cos(first), high * np.sin(second), high * np.cos(second))
+    return np.asarray(Rotation.from_quat(np.stack(parts, axis=1)).as_matrix())
+
+
+def _robust_alignment(
+    points: Float[np.ndarray, "S 3"], targets: Float[np.ndarray, "R S 3"], off: Float[np.ndarray, "R S"]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Rotations and positions of hands whose places `targets` are nearest to the points; `off` is squared."""
+    weights = 1.0 / (1.0 + np.maximum(off, 0.0) / _RIGID_SCALE**2)
+    weights /= weights.sum(axis=1, keepdims=True)
+    middle, wanted = np.einsum("rs,rsi->ri", weights, targets), weights @ points
+    across = np.einsum("rs,rsi,rsj->rij", weights, targets - middle[:, None], points - wanted[:, None])
+    left, _, right = np.linalg.svd(across)
+    left[:, :, 2] *= np.sign(np.linalg.det(left @ right))[:, None]
+    rotations = (left @ right).swapaxes(1, 2)
+    return rotations, wanted - np.einsum("rij,rj->ri", rotations, middle)
+
+
+def _relative_motions(
+    points: Float[np.ndarray, "F N 3"], reference: int
+) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    """Rotation and translation of each frame from a reference, by the columns that move least."""
+    motions = []
+    for frame in points:
+        both = np.isfinite(frame[:, 0]) & np.isfinite(points[reference, :, 0])
+        here, there = points[reference, both], frame[both]
+        off = np.zeros((1, len(here)))
+        for _ in range(10):
+            rotation, position = _robust_alignment(there, here[None], off)
+            off = ((here @ rotation[0].T + position[0] - there) ** 2).sum(axis=1)[None]
+        motions.append((rotation[0], position[0]))
+    return motions
