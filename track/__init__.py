@@ -5,7 +5,8 @@ takes one frame of points at a time and returns a `TrackedFrame`; `measure_hands
 `calibrate` fits hands and gloves to their user as a `User`. `open_source` opens a live stream, `ReplayServer`
 plays a capture as one, `open_sinks` sends hands to other programs, and a `Recorder` writes the take.
 `solve_pose` is the inverse kinematics alone: poses from labeled markers. `find_suspect_spans` lists the
-doubtful frames of a take. `score_glove` and `improve_glove` judge and improve a glove by simulation.
+doubtful frames of a take. `learn_glove` learns a glove from labeled captures. `score_glove` and
+`improve_glove` judge and improve one by simulation.
 """
 
 from typing import TYPE_CHECKING
@@ -34,6 +35,10 @@ if TYPE_CHECKING:
     from track.glove_score import LayoutScore as LayoutScore
     from track.glove_score import Trial as Trial
     from track.glove_score import score_glove as score_glove
+    from track.gloves.learned_glove import LearnedGlove as LearnedGlove
+    from track.gloves.learned_glove import LearnSettings as LearnSettings
+    from track.gloves.learned_glove import TrialHand as TrialHand
+    from track.gloves.learned_glove import learn_glove as learn_glove
     from track.kinematics.pose_solver import PoseFit as PoseFit
     from track.kinematics.pose_solver import solve_pose as solve_pose
     from track.kinematics.pose_spread import HandErrors as HandErrors
