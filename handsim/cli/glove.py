@@ -120,7 +120,7 @@ def learn_glove(
     from track.gloves import learned_glove
     from track.gloves.learned_page import hand_rows, marker_rows, origin, write_learned_page
 
-    with named_steps("reading captures") as step:
+    with named_steps("") as step:
         learned = learned_glove.learn_glove(captures, settings, name=as_text(out.stem), on_step=step)
     layout, used = learned.layout, sorted({one.capture for one in learned.hands})
     source = f"handsim glove learn, {date.today()}, from {', '.join(names[number] for number in used)}"
