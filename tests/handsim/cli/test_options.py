@@ -29,7 +29,8 @@ from train.labelers.storage import CARD, WEIGHTS
 
 ELSEWHERE = {
     "demo": "out", "hand": "out mesh", "glove list": "out", "glove check": "out", "glove score": "out",
-    "glove improve": "out", "glove learn": "out users", "rig import": "out", "rig score": "out json", "rig plan": "out",
+    "glove improve": "out", "glove learn": "out users", "rig import": "out", "rig score": "out json",
+    "rig plan": "out",
     "generate": "out workers cluster sampler", "train": "out threads", "label": "out threads",
     "export": "out", "evaluate": "json threads", "simulate": "out cluster",
     "calibrate": "out live seconds", "track": "out live seconds send labelled", "report": "out",
