@@ -101,7 +101,8 @@ def marker_residuals(learned: LearnedGlove) -> Float[np.ndarray, "M"]:
 def _place(marker: MarkerPlace) -> list[str]:
     """The numbers of a place, as in a layout's file."""
     across = f"{marker.across:.2f}" if marker.bone == "palm" else ""
-    return [f"{marker.along:.2f}", f"{np.rad2deg(marker.around):.0f}", across]
+    around = np.rad2deg(marker.around).round() + 0.0  # never -0
+    return [f"{marker.along:.2f}", f"{around:.0f}", across]
 
 
 def _millimeters(distance: float) -> str:
