@@ -213,14 +213,25 @@ class MarkerLayout:
         """Number of markers, M."""
         return len(self.markers)
 
-    def save(self, path: str | Path) -> None:
+    def save(self, path: str | Path, *, description: str = "", source: str = "") -> None:
         """Write the layout as TOML, numbers to nine decimals; `load_layout` gives the same layout again.
+
+        Args:
+            path: The .toml file; it has lengths in [mm] and angles in [deg].
+            description: A sentence on the layout for the file's readers.
+            source: Where its places come from.
 
         Raises:
             LayoutError: The file cannot be written.
         """
+        told = [
+            f"{key} = {quoted(text)}"
+            for key, text in (("description", description), ("source", source))
+            if text
+        ]
+        name, *others = layout_lines(self)
         with writing(path, LayoutError):
-            write_text(path, "\n".join(layout_lines(self)) + "\n")
+            write_text(path, "\n".join([name, *told, *others]) + "\n")
 
 
 @dataclass(frozen=True, slots=True)

@@ -33,6 +33,7 @@ _WRITERS: Final = {
     "train.data.shards.Dataset": "train.reports.dataset_page:write_dataset_page",
     "render.film.registration.Registration": "render.film.page:write_film_page",
     "track.glove_score.LayoutScore": "track.glove_page:write_glove_page",
+    "track.gloves.learned_glove.LearnedGlove": "track.gloves.learned_page:write_learned_page",
     "train.forecast.rig_score.RigScore": "train.forecast.rig_score:write_rig_page",
 }
 
@@ -99,8 +100,8 @@ def write_page(path: str | Path, thing: Any) -> None:
 
     Args:
         path: The page, an .html file; the tables of a take (.csv) lie beside it.
-        thing: A take, a training set, or what `register_camera`, `score_glove` or `score_rig` returned; pages
-            show angles in [deg] and distances in [mm].
+        thing: A take, a training set, or what `register_camera`, `learn_glove`, `score_glove` or `score_rig`
+            returned; pages show angles in [deg] and distances in [mm].
 
     Raises:
         ArgumentError: It is something else, or the page's name does not end in .html.
@@ -112,8 +113,8 @@ def write_page(path: str | Path, thing: Any) -> None:
     target = next((_WRITERS[kind] for kind in kinds if kind in _WRITERS), None)
     if target is None:
         raise ArgumentError(
-            f"thing is {shown_value(thing)}, expected a Take, a Dataset, a Registration, or a score of a "
-            "glove or a rig"
+            f"thing is {shown_value(thing)}, expected a Take, a Dataset, a Registration, a LearnedGlove, or "
+            "a score of a glove or a rig"
         )
     resolve_name(target)(Path(path), thing)
 

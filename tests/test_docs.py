@@ -32,6 +32,7 @@ SLOW = {
     "tutorials/my_captures",
     "tutorials/my_layout",
     "tutorials/my_pictures",
+    "tutorials/my_trial",
 }
 RUN = [page for page in PAGES if blocks_of(page)]
 

@@ -5,7 +5,8 @@ takes one frame of points at a time and returns a `TrackedFrame`; `measure_hands
 `calibrate` fits hands and gloves to their user as a `User`. `open_source` opens a live stream, `ReplayServer`
 plays a capture as one, `open_sinks` sends hands to other programs, and a `Recorder` writes the take.
 `solve_pose` is the inverse kinematics alone: poses from labeled markers. `find_suspect_spans` lists the
-doubtful frames of a take. `score_glove` and `improve_glove` judge and improve a glove by simulation.
+doubtful frames of a take. `learn_glove` learns a glove from labeled captures, and `prove_glove` tries it on
+the rest of them. `score_glove` and `improve_glove` judge and improve one by simulation.
 """
 
 from typing import TYPE_CHECKING

@@ -1,8 +1,9 @@
-"""The commands `handsim glove list | show | new | check | score | improve`."""
+"""The commands `handsim glove list | show | new | learn | check | score | improve`."""
 
 from __future__ import annotations
 
 import warnings
+from datetime import date
 from pathlib import Path
 from typing import Annotated
 
@@ -19,9 +20,11 @@ from gloves.layout import (
     starter_layout,
 )
 from handsim.app.messages import named_steps, print_line, print_table
-from handsim.errors import HandSimWarning, LayoutError
+from handsim.errors import CaptureError, HandSimWarning, LayoutError
+from handsim.files.inputs import check_there
 from handsim.files.outputs import as_text, check_outputs, write_starter
 from handsim.hand.shape import SIZES, Size
+from track.gloves.learned_glove import LearnSettings
 from train.forecast.settings import ImproveGloveSettings, ScoreGloveSettings
 
 
@@ -88,6 +91,64 @@ def new_glove(file: Annotated[Path, tyro.conf.Positional]) -> None:
     """
     write_starter(file, starter_layout(), error=LayoutError)
     print_line(f"{file}: edit it, then run `handsim glove check {file}`")
+
+
+def learn_glove(
+    captures: Annotated[tuple[Path, ...], tyro.conf.Positional],
+    out: Path,
+    settings: Annotated[LearnSettings, tyro.conf.arg(name="")],
+    users: Path | None = None,
+    prove: bool = True,
+) -> None:
+    """Learn a layout from labeled captures: where each marker sits, whatever its column is called.
+
+    Each column must be one marker all the time. Which one is found, in about a minute; columns of arms and
+    objects are left out. Best is a minute in which all fingers bend and spread.
+
+    Args:
+        captures: Labeled .c3d, .trc, .csv (Motive, Vicon) or .tsv (Qualisys) files, of one or more people.
+        out: The layout, a .toml file; its page (.html) lies beside it.
+        settings: What is known of the glove.
+        users: A folder for a user's file of each capture, NAME.json: its hands, with their own places.
+        prove: Whether the last third of each capture, which is not learned from, is labeled at the end.
+    """
+    page, names = out.with_suffix(".html"), [as_text(one.name) for one in captures]
+    files = [] if users is None else [users / f"{one.stem}.json" for one in captures]
+    check_outputs([*captures, settings.start], [out, page, *files], ".toml")
+    if not captures:
+        raise CaptureError("no capture was given, expected one labeled marker file or more")
+    for capture in captures:
+        check_there(capture, error=CaptureError)
+    from track.gloves import learned_glove
+    from track.gloves.learned_page import hand_rows, marker_rows, origin, write_learned_page
+    from track.gloves.proof import prove_glove
+    from train.evaluation import percent, percent_between
+
+    with named_steps("") as step:
+        learned = learned_glove.learn_glove(captures, settings, name=as_text(out.stem), on_step=step)
+    layout, used = learned.layout, sorted({one.capture for one in learned.hands})
+    source = f"handsim glove learn, {date.today()}, from {', '.join(names[number] for number in used)}"
+    layout.save(out, description=origin(learned), source=source)
+    print_table(marker_rows(learned), left=2, title=f"{layout.name}: {layout.num_markers} markers")
+    for hand in hand_rows(learned, names):
+        size = f"{hand.length} x {hand.breadth} mm"
+        print_line(f"{hand.capture}: a {hand.side} hand of {size} with {hand.markers} markers")
+    print_line(*learned.left_out, *learned.doubt)
+    write_learned_page(page, learned, names)
+    print_line(f"{page}: the markers on the hand")
+    if users is not None:
+        for number, user in zip(used, learned.users(), strict=True):
+            user.save(files[number])
+            print_line(f"{files[number]}: the hands of {names[number]}, for --shape")
+    if prove and settings.start is None:
+        with named_steps("labeling what was not learned from"):
+            proof = prove_glove(learned, captures, rng=np.random.default_rng(0))
+        share, worst = percent_between(proof.frames, proof.interval), percent(min(proof.by_capture))
+        what = "of the frames of the captures' last thirds are labeled right in every marker"
+        print_line(
+            f"{share} % {what}; {worst} % in the worst capture, {percent(proof.slots)} % of the markers"
+        )
+    print_line(f"{out}: run `handsim label NEXT.c3d --glove {out} --out labeled.c3d` on the next capture")
 
 
 def check_glove(

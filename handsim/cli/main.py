@@ -32,10 +32,11 @@ Table = Mapping[str, tuple[Any, str]]
 _HELP: Final = {
     "demo": "Run the whole chain on a built-in example; ends with a page of pictures.",
     "hand": "Write a hand as a MuJoCo or OpenSim model, a URDF or a rigged mesh.",
-    "glove": "List, show, start and check marker layouts; score and improve one before it is worn.",
+    "glove": "List, show, start, learn and check marker layouts; score and improve one before it is worn.",
     "glove list": "List the marker layouts that come with handsim: markers, labeler and source of each.",
     "glove show": "Show a layout's markers.",
     "glove new": "Write a commented layout file as a start for a glove of your own.",
+    "glove learn": "Learn a layout from labeled captures, whatever their columns are called.",
     "glove check": "Check a layout on hands of all five sizes, and draw it from all sides with its slips on "
     "100 people.",
     "glove score": "Say how well a layout can be labeled and what it tells of each joint; nothing is "

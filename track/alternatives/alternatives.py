@@ -50,6 +50,7 @@ _TEMPERATURE: Final = 1.5  # divides log-odds of alternatives, as no fit knows a
 _DOUBTFUL: Final = 0.2  # An alternative is reported from this probability on.
 _OFF_DESIGN: Final = 0.014  # [m] least reported distance of a marker from its place; right ones reach 13 mm
 _LIKELY: Final = 0.01  # Alternatives are kept from this probability on.
+_CORRECTION: Final = "`handsim glove learn CAPTURE --start FILE.toml --out NEW.toml` corrects it"
 
 
 Order = tuple[int, ...]
@@ -103,7 +104,7 @@ class Doubt(NamedTuple):
                 yield Fault(f"the {side} hand", why, remedy)
         for marker in np.flatnonzero(self.distances > _OFF_DESIGN):
             why = f"is {1e3 * self.distances[marker]:.0f} mm from where the layout has it"
-            yield Fault(f"{side}:{names[int(marker)]}", why, "correct its place in the layout's file")
+            yield Fault(f"{side}:{names[int(marker)]}", why, _CORRECTION)
 
 
 class Fault(NamedTuple):

@@ -129,24 +129,34 @@ def mistakes(confusion: Int[np.ndarray, "M+1 M+1"], most: int = 12) -> list[Mist
 
 def hand_picture(layout: MarkerLayout, accuracy: Float[np.ndarray, "M"], arrows: list[Mistake]) -> str:
     """Picture of the hand with each marker's slot accuracy, and arrows for mistakes."""
-    return picture(HAND_SIZE, _draw_hand, flat_hand(layout), layout.names, accuracy, arrows)
+    percent = 100.0 * accuracy
+    scale = (min(99.0, float(np.floor(percent.min()))), 100.0, "slots right [%]")
+    return picture(HAND_SIZE, _draw_hand, flat_hand(layout), layout.names, percent, scale, arrows)
+
+
+def residual_picture(layout: MarkerLayout, residuals: Float[np.ndarray, "M"]) -> str:
+    """Picture of the hand with each marker's distance from its place in a fit [m], 0 to 10 mm."""
+    scale = (10.0, 0.0, "distance from its place [mm]")
+    return picture(HAND_SIZE, _draw_hand, flat_hand(layout), layout.names, 1e3 * residuals, scale, [])
 
 
 def _draw_hand(
     figure: Figure,
     hand: FlatHand,
     names: tuple[str, ...],
-    accuracy: Float[np.ndarray, "M"],
+    values: Float[np.ndarray, "M"],
+    scale_of: tuple[float, float, str],
     arrows: list[Mistake],
 ) -> None:
-    """Draw hand, markers, arrows, names and color bar."""
+    """Draw hand, markers, arrows, names and color bar; its worst and best value and title are `scale_of`."""
     panel, (width, height), middle, scale = _canvas(figure, hand, hand.markers, 0.86)
     shift = np.array([0.46 * width, 0.5 * height]) - scale * middle
     hand.draw(panel, scale=scale, shift=shift, bone_width=3.0)
     dots = scale * hand.markers + shift
     _draw_arrows(panel, dots, arrows)
-    colors = color_scale(min(99.0, float(np.floor(100.0 * accuracy.min()))), 100.0)
-    for dot, color, ring in zip(dots, colors.to_rgba(100.0 * accuracy), hand.below, strict=True):
+    worst, best, title = scale_of
+    colors = color_scale(worst, best)
+    for dot, color, ring in zip(dots, colors.to_rgba(values), hand.below, strict=True):
         edge, face, width = (color, Paint.CARD, 2.2) if ring else (Paint.INK, color, 0.7)
         panel.plot(*dot, "o", markersize=2.0 * _DOT_RADIUS, zorder=5, markeredgecolor=edge,
                    markerfacecolor=face, markeredgewidth=width)  # fmt: skip
@@ -155,7 +165,7 @@ def _draw_hand(
     centers = place_names(labels, dots, curves, (width, height))
     for name, dot, center in zip(labels, dots, centers, strict=True):
         _draw_name(panel, name, dot, center)
-    color_bar(figure, colors, "slots right [%]", cax=figure.add_axes(_BAR))
+    color_bar(figure, colors, title, cax=figure.add_axes(_BAR))
 
 
 def _canvas(

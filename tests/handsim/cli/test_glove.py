@@ -1,13 +1,21 @@
 from __future__ import annotations
 
+import dataclasses
+import json
+from datetime import date
 from pathlib import Path
 
 import cv2
+import numpy as np
 import pytest
 
-from gloves import load_layout, load_take
+from gloves import Capture, load_layout, load_take, write_capture
+from gloves.captures.capture import select_markers
 from gloves.layout import list_layouts, starter_layout
 from handsim.cli.main import main
+from tests.track.gloves.trials import OTHERS, lab_trial
+from track import load_user
+from train import Labeling
 from train.labelers.storage import shipped_labelers
 
 
@@ -105,3 +113,95 @@ def test_an_improved_layout_is_written(mine, tmp_path, capsys):
     assert load_layout(out).num_markers == 7
     told = capsys.readouterr().out
     assert "before: 8 markers" in told and "after:  7 markers" in told and "drop " in told
+
+
+@pytest.fixture(scope="module")
+def trial(tmp_path_factory):
+    """A labeled capture with names of a lab's own, and dense19 as a layout with these names."""
+    folder = tmp_path_factory.mktemp("trial")
+    capture, truth = lab_trial("calibration", 300, 4)
+    write_capture(folder / "trial.c3d", capture)
+    known = {marker.name: marker for marker in load_layout("dense19").markers}
+    markers = tuple(dataclasses.replace(known[marker], name=name) for name, marker in truth.items())
+    dataclasses.replace(load_layout("dense19"), markers=markers).save(folder / "guess.toml")
+    return folder
+
+
+def learn(folder: Path, words: str) -> int:
+    return main(["glove", "learn", *(str(folder / one) if "." in one else one for one in words.split())])
+
+
+def test_a_guess_is_corrected_and_written_with_page_and_users(trial, tmp_path, capsys):
+    out, users = tmp_path / "mine.toml", tmp_path / "people"
+    options = ["--out", str(out), "--users", str(users), "--hands", "right"]
+    captures = [str(trial / "trial.c3d"), "--start", str(trial / "guess.toml")]
+    assert main(["glove", "learn", *captures, *options]) == 0
+    told = capsys.readouterr().out
+    layout = load_layout(out)
+    assert (layout.name, layout.num_markers, layout.sides) == ("mine", 19, ("right",))
+    assert all(f"{marker.name} " in told and marker.bone in told for marker in layout.markers)
+    assert not any(name in layout.names for name in OTHERS)
+    assert f"handsim label NEXT.c3d --glove {out} --out" in told.splitlines()[-1]
+    text = out.read_text("utf-8")
+    assert f'source = "handsim glove learn, {date.today()}, from trial.c3d"' in text
+    assert 'description = "19 markers, learned from one hand in labeled captures"' in text
+    page = out.with_suffix(".html").read_text("utf-8")
+    assert "trial.c3d" in page and "data:image/svg+xml" in page
+    (hand,) = load_user(users / "trial.json")
+    assert hand.side == "right" and set(hand.layout.names) == set(layout.names)
+    assert f"a right hand of {1e3 * hand.model.shape.length:.0f} x" in told
+
+
+@pytest.mark.slow
+def test_a_glove_is_learned_from_a_labs_own_names(tmp_path, capsys):
+    write_capture(tmp_path / "trial.c3d", lab_trial("calibration", 1200, 2)[0])
+    out = tmp_path / "mine.toml"
+    assert main(["glove", "learn", str(tmp_path / "trial.c3d"), "--radius-mm", "3.2", "--out", str(out)]) == 0
+    assert load_layout(out).num_markers == 19 and load_layout(out).radius == pytest.approx(0.0032)
+    assert "mine: 19 markers" in capsys.readouterr().out
+
+
+LEARNED = {
+    "trial.c3d --out mine.toml": "the radius of the markers is unknown; give radius_mm",
+    "missing.c3d --radius-mm 3 --out mine.toml": "missing.c3d: cannot be read: No such file",
+    "trial.c3d --start missing.toml --out mine.toml": "missing.toml: cannot be read",
+    "trial.c3d --radius-mm 40 --out mine.toml": "radius_mm is 40, expected a number from 0.5 to 15",
+    "trial.c3d --radius-mm 3 --out mine.json": "expected a file name that ends in .toml",
+    "trial.c3d --start guess.toml --out guess.toml": "is the input",
+    "--radius-mm 3 --out mine.toml": "no capture was given, expected one labeled marker file or more",
+    "three.trc --radius-mm 3 --out mine.toml": "no hand is in the captures",
+}
+
+
+@pytest.mark.parametrize("words", LEARNED)
+def test_what_cannot_be_learned_from_is_refused(words, trial, capsys):
+    points = np.random.default_rng(0).uniform(0.0, 0.1, (12, 3, 3))
+    write_capture(trial / "three.trc", Capture(tuple("ABC"), points, 120.0))
+    assert learn(trial, words) == 1
+    *_, said = capsys.readouterr().err.splitlines()
+    assert said.startswith("handsim glove learn: ") and LEARNED[words] in said
+    assert not (trial / "mine.toml").exists() and not (trial / "mine.html").exists()
+
+
+class KnowingLabeler:
+    """A labeler that knows the points of the trial: it labels right what it gets as the file has it."""
+
+    marker_names = tuple(f"A{number}" for number in range(19))
+
+    def __init__(self) -> None:
+        capture = lab_trial("calibration", 300, 4)[0]
+        points = select_markers(capture, self.marker_names)
+        self._known, self._labels = points.reshape(-1, 3), np.tile(np.arange(19), len(points))
+
+    def label_frames(self, frames):
+        apart = [np.linalg.norm(one[:, None] - self._known, axis=2) for one in frames]
+        return [Labeling(self._labels[np.nanargmin(one, axis=1)], np.ones(len(one))) for one in apart]
+
+
+def test_a_capture_of_own_names_with_other_columns_is_a_truth_to_evaluate(trial, tmp_path):
+    labeler = "tests.handsim.cli.test_glove:KnowingLabeler"
+    command = ["evaluate", str(trial / "trial.c3d"), "--glove", str(trial / "guess.toml"), "--every", "10"]
+    assert main([*command, "--labeler", labeler, "--json", str(tmp_path / "x.json")]) == 0
+    found = json.loads((tmp_path / "x.json").read_text())
+    assert found["frames"] == 30 and set(found["slot_accuracy_by_marker"]) == {f"A{one}" for one in range(19)}
+    assert found["figures"]["slot_accuracy"] == 1.0

@@ -29,7 +29,8 @@ from train.labelers.storage import CARD, WEIGHTS
 
 ELSEWHERE = {
     "demo": "out", "hand": "out mesh", "glove list": "out", "glove check": "out", "glove score": "out",
-    "glove improve": "out", "rig import": "out", "rig score": "out json", "rig plan": "out",
+    "glove improve": "out", "glove learn": "out users", "rig import": "out", "rig score": "out json",
+    "rig plan": "out",
     "generate": "out workers cluster sampler", "train": "out threads", "label": "out threads",
     "export": "out", "evaluate": "json threads", "simulate": "out cluster",
     "calibrate": "out live seconds", "track": "out live seconds send labelled", "report": "out",
@@ -50,6 +51,7 @@ QUICK = [
     ("hand", "--out h.xml", "size XL|side left|glove dense19|actuators|shape user.json|take take.npz"),
     ("hand", "--take take.npz --out h.osim", "up y"),
     ("glove check", "dense19 --out g.png", "size XS"),
+    ("glove learn", "labeled.trc --out g.toml --start dense19", "start sparse13|hands left"),
     ("rig import", "lab.xcp --out r.toml", "up y"),
     ("export", "take.npz --out x.bvh", "fps 30|up y"),
     ("export", "take.npz --out x.csv", "neutral 0 0.1"),
@@ -88,6 +90,7 @@ SLOW = [
      "camera lens.toml|passes rgb depth|dress skin|every 2|num-frames 3|up y"),
     ("glove score", "starter6 --out s.html --num-frames 100 --captures 0",
      "rig six|motion twins|num-frames 140|captures 1|seed 3"),
+    ("glove learn", "labeled.trc --out g.toml --radius-mm 3.2", "radius-mm 4"),
     ("glove improve", "starter6 --out i.toml --minutes 0.02 --captures 0",
      "markers 7"),
     ("rig score", "six --out s.html --json s.json --num-frames 60",
