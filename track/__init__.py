@@ -36,11 +36,11 @@ if TYPE_CHECKING:
     from track.glove_score import Trial as Trial
     from track.glove_score import score_glove as score_glove
     from track.gloves.learned_glove import LearnedGlove as LearnedGlove
-    from track.gloves.learned_glove import LearnSettings as LearnSettings
     from track.gloves.learned_glove import TrialHand as TrialHand
     from track.gloves.learned_glove import learn_glove as learn_glove
     from track.gloves.proof import Proof as Proof
     from track.gloves.proof import prove_glove as prove_glove
+    from track.gloves.settings import LearnSettings as LearnSettings
     from track.kinematics.pose_solver import PoseFit as PoseFit
     from track.kinematics.pose_solver import solve_pose as solve_pose
     from track.kinematics.pose_spread import HandErrors as HandErrors

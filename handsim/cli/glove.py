@@ -24,7 +24,7 @@ from handsim.errors import CaptureError, HandSimWarning, LayoutError
 from handsim.files.inputs import check_there
 from handsim.files.outputs import as_text, check_outputs, write_starter
 from handsim.hand.shape import SIZES, Size
-from track.gloves.learned_glove import LearnSettings
+from track.gloves.settings import LearnSettings
 from train.forecast.settings import ImproveGloveSettings, ScoreGloveSettings
 
 

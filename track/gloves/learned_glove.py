@@ -16,26 +16,26 @@ from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from gloves.captures.capture import Capture
 from gloves.fit import GloveFit, attach, place_marker, settle_glove
-from gloves.layout import FEWEST_MARKERS, MOST_MARKERS, AnyLayout, MarkerLayout, MarkerPlace, load_layout
+from gloves.layout import FEWEST_MARKERS, MOST_MARKERS, MarkerLayout, MarkerPlace, load_layout
 from gloves.takes.points import spread_out
 from gloves.takes.take import Take
 from handsim.callbacks import OnStep, no_step
 from handsim.errors import CaptureError, LayoutError
 from handsim.hand.model import HandModel
 from handsim.hand.shape import SIDES, Side
-from handsim.settings import Limits, Settings
 from handsim.space.transforms import MIRROR
 from track.captures import label_capture
 from track.frames import AnyCapture, capture_of
 from track.gloves.fit import FINE, PLACE_SPREAD, FittedPlaces, fit_places
 from track.gloves.marker_search import FittedHand, diverse_frames, search_places
+from track.gloves.settings import LearnSettings
 from track.kinematics.pose_solver import PoseSolver
 from track.user import User
 
@@ -56,19 +56,6 @@ _EXCHANGED: Final = 0.02  # Exchanges in a larger share of them are told.
 _SHOWN: Final = 8  # names in a sentence
 _INWARDS: Final = (0.0, 0.2, 0.4, 0.6)  # shares of the way to the middle of its bone that a marker moves
 _PAIRED: Final = 0.02  # [m] Markers of the other hand at most this far from a place are the same marker.
-
-
-@dataclass(frozen=True, slots=True)
-class LearnSettings(Settings):
-    """How a glove is learned from captures: options of `handsim glove learn`, arguments of `learn_glove`."""
-
-    radius_mm: Annotated[float | None, Limits(0.5, 15.0)] = None
-    """Radius of the markers [mm]; needed unless there is a start."""
-    start: AnyLayout | None = None
-    """A guess of the layout, the path of a .toml file: its places are corrected. The captures then need no
-    labels."""
-    hands: tuple[Side, ...] = SIDES
-    """Which hands may be in the captures."""
 
 
 class TrialHand(NamedTuple):
