@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from gloves.captures.capture import Capture
-from gloves.fit import GloveFit, attach, place_marker, settle_glove
+from gloves.fit import Attachment, GloveFit, attach, place_marker, settle_glove
 from gloves.layout import FEWEST_MARKERS, MOST_MARKERS, MarkerLayout, MarkerPlace, load_layout
 from gloves.takes.points import spread_out
 from gloves.takes.take import Take
@@ -66,9 +66,9 @@ class TrialHand(NamedTuple):
     columns: Mapping[str, int]
     """Column of each marker that the capture has."""
     hand: GloveFit
-    """The hand with the capture's own places."""
+    """The hand in the whole glove, with the capture's own places for these markers."""
     residuals: Float[np.ndarray, "M"]
-    """Root mean square distance of each of these markers from its place [m]."""
+    """Root mean square distance of each marker of the layout from its place [m]; NaN if it has no column."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -148,6 +148,8 @@ def captures_of(captures: AnyCapture | Sequence[AnyCapture]) -> list[Capture]:
     """Read one or several captures."""
     if isinstance(captures, str | Path | Capture | Take):
         return [capture_of(captures)]
+    if not captures:
+        raise CaptureError("no capture was given, expected one labeled capture or more")
     return [capture_of(one) for one in captures]
 
 
@@ -212,15 +214,19 @@ class _Learning:
         layout = dataclasses.replace(layout, sides=tuple(sorted({one.side for one in hands})))
         done, doubt = list[TrialHand](), list[str]()
         for one, fit in zip(hands, fitted, strict=True):
-            columns = {name: int(one.part.columns[at]) for name, at in one.columns.items()}
-            done.append(TrialHand(one.part.capture, columns, fit.hand.with_side(one.side), fit.residuals))
+            own = [name for name in layout.names if name in one.columns]
+            columns = {name: int(one.part.columns[one.columns[name]]) for name in own}
+            residuals = np.full(layout.num_markers, np.nan)
+            residuals[[layout.names.index(name) for name in fit.hand.layout.names]] = fit.residuals
+            hand = _in_whole_glove(fit.hand, layout).with_side(one.side)
+            done.append(TrialHand(one.part.capture, columns, hand, residuals))
             doubt += _exchanges(one, fit.hand, self._sources[one.part.capture])
         sure = np.array([self._sure.get(name, 1.0) for name in layout.names])
         for name, marker, share in zip(layout.names, layout.markers, sure, strict=True):
             if share < _SURE:
                 doubt.append(f"{name} may sit elsewhere than on {marker.bone} ({100 * (1 - share):.0f} %)")
         left_out = tuple(_left_out(self._sources, done))
-        return LearnedGlove(layout, tuple(done), left_out, _spreads(layout, fitted), sure, tuple(doubt))
+        return LearnedGlove(layout, tuple(done), left_out, _spreads(layout, done), sure, tuple(doubt))
 
     def _fitted(self, one: _Found, layout: MarkerLayout, spread: float = PLACE_SPREAD) -> FittedPlaces:
         """A hand in the markers of a layout that it has, begun from a small and from a large hand."""
@@ -355,6 +361,16 @@ def _placed(layout: MarkerLayout, index: int, hand: GloveFit, point: Float[np.nd
     return layout
 
 
+def _in_whole_glove(hand: GloveFit, layout: MarkerLayout) -> GloveFit:
+    """A hand in all markers of a layout: its own stay where they are."""
+    worn = settle_glove(layout, hand.model).attachment
+    rows = [layout.names.index(name) for name in hand.layout.names]
+    parts = {key: getattr(worn, key).copy() for key in ("points", "normals", "bone_indices", "bone_weights")}
+    for key, values in parts.items():
+        values[rows] = getattr(hand.attachment, key)
+    return GloveFit(hand.model, Attachment(layout, **parts))
+
+
 def _together(points: Float[np.ndarray, "T N 3"]) -> Iterator[Int[np.ndarray, "N"]]:
     """Groups of columns that are never farther apart than markers of a hand, and move against each other."""
     from scipy.cluster.hierarchy import fcluster, linkage
@@ -404,16 +420,13 @@ def _mean_layout(layout: MarkerLayout, places: Sequence[Mapping[str, MarkerPlace
     return dataclasses.replace(layout, markers=tuple(markers))
 
 
-def _spreads(layout: MarkerLayout, fitted: Sequence[FittedPlaces]) -> Float[np.ndarray, "M"]:
-    """Root mean square distance of the hands' places from the layout's [m]."""
-    off: dict[str, list[float]] = {name: [] for name in layout.names}
-    for one in fitted:
-        own = tuple(marker for marker in layout.markers if marker.name in one.hand.layout.names)
-        worn = settle_glove(dataclasses.replace(layout, markers=own, sides=SIDES), one.hand.model)
-        for name, distance in zip(
-            worn.layout.names,
-            np.linalg.norm(worn.attachment.points - one.hand.attachment.points, axis=1),
-            strict=True,
-        ):
-            off[name].append(float(distance))
-    return np.array([np.sqrt(np.mean(np.square(values))) if values else np.nan for values in off.values()])
+def _spreads(layout: MarkerLayout, hands: Sequence[TrialHand]) -> Float[np.ndarray, "M"]:
+    """Root mean square distance of the hands' places from the layout's [m], NaN where no hand has one."""
+    squares = np.empty((len(hands), layout.num_markers))
+    for row, one in zip(squares, hands, strict=True):
+        worn = settle_glove(layout, one.hand.with_side("right").model).attachment.points
+        off = worn - one.hand.with_side("right").attachment.points
+        row[:] = np.where(np.isfinite(one.residuals), (off**2).sum(axis=1), np.nan)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # a marker without a column
+        return np.asarray(np.sqrt(np.nanmean(squares, axis=0)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -66,7 +67,7 @@ def marker_rows(learned: LearnedGlove) -> list[list[str]]:
     rows = [
         ["marker", "bone", "along", "around [deg]", "across", "residual [mm]", "between hands [mm]"]
     ]  # fmt: skip
-    worn = [name for one in learned.hands for name in one.hand.layout.names]
+    worn = [name for one in learned.hands for name in one.columns]
     figures = zip(learned.layout.markers, marker_residuals(learned), learned.spreads, strict=True)
     for marker, residual, spread in figures:
         # One hand does not differ from itself, beyond what the layout's rounding does to its places.
@@ -91,11 +92,10 @@ def hand_rows(learned: LearnedGlove, captures: Sequence[str] = ()) -> list[HandR
 
 def marker_residuals(learned: LearnedGlove) -> Float[np.ndarray, "M"]:
     """Root mean square residual of each marker over the hands that have it [m]; NaN if none has."""
-    found: dict[str, list[float]] = {name: [] for name in learned.layout.names}
-    for one in learned.hands:
-        for name, residual in zip(one.hand.layout.names, one.residuals, strict=True):
-            found[name].append(float(residual))
-    return np.array([np.sqrt(np.mean(np.square(one))) if one else np.nan for one in found.values()])
+    residuals = np.array([one.residuals for one in learned.hands])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # a marker without a column
+        return np.asarray(np.sqrt(np.nanmean(residuals**2, axis=0)))
 
 
 def _place(marker: MarkerPlace) -> list[str]:

@@ -27,7 +27,7 @@ class Proof(NamedTuple):
     frames: float
     """Share of the frames in which every label is right."""
     interval: tuple[float, float]
-    """95 % interval of this share, in which every second counts once."""
+    """95 % interval of this share, in which frames of one second [s] count once."""
     slots: float
     """Share of the markers in all frames that are right."""
     by_capture: tuple[float, ...]
@@ -44,7 +44,7 @@ def prove_glove(
 
     Args:
         learned: What `learn_glove` returned for the captures.
-        captures: The captures, in the same order.
+        captures: The captures [m] or paths of marker files, in the same order.
         rng: Source of the gaps.
 
     Returns:

@@ -39,7 +39,8 @@ ELSEWHERE = {
     "render": "out merge format workers cluster painter frames-per-shard",
 }  # fmt: skip
 """Options that say only where something is or goes, as what, or how quickly."""
-SHOWN = {"view": "rig time up glove size shape hands body labeler", "glove improve": "captures"}
+SHOWN = {"view": "rig time up glove size shape hands body labeler", "glove improve": "captures",
+         "glove learn": "prove"}
 """Options of what is shown and not written."""
 SEARCHED = {
     "glove improve": "keep rig minutes seed",
@@ -90,7 +91,7 @@ SLOW = [
      "camera lens.toml|passes rgb depth|dress skin|every 2|num-frames 3|up y"),
     ("glove score", "starter6 --out s.html --num-frames 100 --captures 0",
      "rig six|motion twins|num-frames 140|captures 1|seed 3"),
-    ("glove learn", "labeled.trc --out g.toml --radius-mm 3.2", "radius-mm 4"),
+    ("glove learn", "labeled.trc --out g.toml --radius-mm 3.2 --no-prove", "radius-mm 4"),
     ("glove improve", "starter6 --out i.toml --minutes 0.02 --captures 0",
      "markers 7"),
     ("rig score", "six --out s.html --json s.json --num-frames 60",
