@@ -39,8 +39,11 @@ ELSEWHERE = {
     "render": "out merge format workers cluster painter frames-per-shard",
 }  # fmt: skip
 """Options that say only where something is or goes, as what, or how quickly."""
-SHOWN = {"view": "rig time up glove size shape hands body labeler", "glove improve": "captures",
-         "glove learn": "prove"}
+SHOWN = {
+    "view": "rig time up glove size shape hands body labeler",
+    "glove improve": "captures",
+    "glove learn": "prove",
+}
 """Options of what is shown and not written."""
 SEARCHED = {
     "glove improve": "keep rig minutes seed",
