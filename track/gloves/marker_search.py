@@ -50,7 +50,10 @@ _DRAWN: Final = 400  # poses from which these gestures are chosen
 _REFERENCES: Final = 3  # frames that it is laid into
 _RIGID_ROUNDS: Final = (4, 8)  # of all such hands, and of the better quarter
 _RIGID_SCALE: Final = 0.015  # [m] robust scale of their alignment
-_ARTICULATED, _COMPARED, _TRIED, _STARTS = 150, 14, 8, 2  # numbers of solutions in each step
+_ARTICULATED, _TRIED = 150, 8  # numbers of solutions in each step
+# Hands that are improved: 2, and up to 8 for gloves of few columns, which more hands fit; so many times as many
+# solutions are compared to choose them.
+_STARTS, _FEWEST_STARTS, _COMPARED = 80, 2, 7
 _OUTLIER: Final = 0.03  # [m] robust scale of poses
 _STEPS: Final = 5  # of poses, at each robust scale
 _ASIDE: Final = 0.1  # [rad] Markers farther around a finger may belong to the next one.
@@ -176,10 +179,11 @@ def search_places(
         on_step(f"laying a {side} hand into the frames")
         found += search.first_solutions(side)
     on_step("fitting hands")
-    found = [search.solved(one) for one in search.distinct(found)[:_COMPARED]]
+    starts = max(_FEWEST_STARTS, _STARTS // points.shape[1] - _FEWEST_STARTS)
+    found = [search.solved(one) for one in search.distinct(found)[: _COMPARED * starts]]
     fitted = sorted(map(search.fitted, search.distinct(found)), key=lambda one: one.cost)
     on_step("sliding the hand and exchanging fingers")
-    for start in fitted[:_STARTS]:
+    for start in fitted[:starts]:
         fitted += search.improved(start)
     return sorted(fitted, key=lambda one: one.cost)
 
