@@ -41,9 +41,7 @@ _LEFT_OUT: Final = 25.0  # cost of a column that does not belong to the hand
 FARTHEST: Final = 0.02
 """A column that is farther from every place does not belong to the hand [m]."""
 _CONVERGED: Final = 0.1  # smallest gain in energy of a round
-_PALMAR: Final = (
-    2.0  # cost of a place on the side of the bone, in variances; twice as much on the palm's side
-)
+_PALMAR: Final = 2.0  # cost of a place on a bone's side; on the palm's side it is twice as high
 _BEHIND: Final = -0.1  # [palm lengths] Places behind the wrist's joint are of the arm.
 _ROTATIONS, _GESTURES = 120, 10  # of the hand that is laid into a frame
 _DRAWN: Final = 400  # poses from which these gestures are chosen
@@ -51,8 +49,8 @@ _REFERENCES: Final = 3  # frames that it is laid into
 _RIGID_ROUNDS: Final = (4, 8)  # of all such hands, and of the better quarter
 _RIGID_SCALE: Final = 0.015  # [m] robust scale of their alignment
 _ARTICULATED, _TRIED = 150, 8  # numbers of solutions in each step
-# Hands that are improved: 2, and up to 8 for gloves of few columns, which more hands fit; so many times as many
-# solutions are compared to choose them.
+# Hands that are improved: two, and up to eight for few columns, which more hands fit. They are chosen from
+# seven times as many.
 _STARTS, _FEWEST_STARTS, _COMPARED = 80, 2, 7
 _OUTLIER: Final = 0.03  # [m] robust scale of poses
 _STEPS: Final = 5  # of poses, at each robust scale
