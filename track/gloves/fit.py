@@ -16,8 +16,8 @@ PLACE_SPREAD: Final = 0.008
 _HEIGHT_SPREAD: Final = 0.0015  # [m] the same of its height over the skin
 _NOISE, _SCALE, _OUTLIER = 0.003, 0.02, 0.03  # [m] flesh that repeats, robust scales of markers and poses
 _RELINEARIZE: Final = 0.2  # The skin's jacobian is renewed after such a change, see `Problem`.
-_MOST_STEPS: Final = 12
-ROUGH, FINE = 1e-2, 3e-3
+_MOST_STEPS: Final = 20
+ROUGH, FINE = 1e-2, 1e-3
 """A fit ends with a step that gains a smaller share of its energy."""
 
 
