@@ -155,6 +155,15 @@ def spread_out(frames: NDArray[Any], most: int) -> NDArray[Any]:
     return np.asarray(frames[rows])
 
 
+def far_apart(rows: Float[np.ndarray, "R K"], first: int, count: int) -> list[int]:
+    """At most `count` rows, each as far as possible from those before it, from the row `first` on."""
+    chosen, far = [first], np.full(len(rows), np.inf)
+    while len(chosen) < min(count, len(rows)):
+        far = np.minimum(far, ((rows - rows[chosen[-1]]) ** 2).sum(axis=1))
+        chosen.append(int(far.argmax()))
+    return chosen
+
+
 def spans(counts: Sequence[int]) -> tuple[range, ...]:
     """Index ranges of consecutive groups of these sizes."""
     bounds = np.cumsum([0, *counts]).tolist()

@@ -22,7 +22,7 @@ from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
 from gloves.fit import Attachment, GloveFit
-from gloves.takes.points import Status
+from gloves.takes.points import Status, far_apart
 from handsim.errors import CalibrationError
 from handsim.hand.model import HandModel, build_skeleton
 from handsim.hand.shape import DIGITS, JOINT_NAMES, NUM_JOINTS, PALM, HandShape, Side
@@ -383,11 +383,8 @@ def informative_frames(track: PoseFit, markers: Float[np.ndarray, "T M 3"]) -> N
         if len(candidates) >= min(3 * NUM_FRAMES, well_fitted.sum()):
             break
     angles = track.qpos[candidates, 7:]
-    distance = np.full(len(candidates), np.inf)
-    chosen = [int(np.abs(angles - angles.mean(axis=0)).sum(axis=1).argmax())]
-    while len(chosen) < min(NUM_FRAMES, len(candidates)):
-        distance = np.minimum(distance, ((angles - angles[chosen[-1]]) ** 2).sum(axis=1))
-        chosen.append(int(distance.argmax()))
+    first = int(np.abs(angles - angles.mean(axis=0)).sum(axis=1).argmax())
+    chosen = far_apart(angles, first, NUM_FRAMES)
     return np.asarray(candidates[np.sort(chosen)])
 
 

@@ -181,7 +181,8 @@ class _Learning:
                 fits = {side: self._fitted(_Found(part, side, columns), layout) for side in self._sides}
                 hands.append(_Found(part, min(fits, key=lambda side: fits[side].cost), columns))
             elif (found := self._searched(part)) is not None:
-                shown, columns = layout_of(found.hand, found.hand.layout), found.columns
+                shown = layout_of(found.hand, found.hand.layout)
+                columns = {part.names[column]: int(column) for column in found.columns}
                 if layout is None:
                     layout = dataclasses.replace(shown, name=name)
                 else:
@@ -193,15 +194,14 @@ class _Learning:
             raise CaptureError("no hand is in the captures, expected columns of 5 or more markers of one")
         return self._common(dataclasses.replace(layout, name=name), hands)
 
-    def _searched(self, part: _Part) -> _SearchedHand | None:
+    def _searched(self, part: _Part) -> FittedHand | None:
         """The likeliest hand in the columns of a part; None if none fits."""
         found = search_places(part.points, part.names, self._radius, sides=self._sides, on_step=self._on_step)
         best = found[0]
         if np.median(best.residuals) > _FITS or len(best.columns) < FEWEST_MARKERS:
             return None
         self._sure |= _probabilities(found)
-        columns = {part.names[column]: int(column) for column in best.columns}
-        return _SearchedHand(best.hand, best.side, columns)
+        return best
 
     def _common(self, layout: MarkerLayout, hands: Sequence[_Found]) -> LearnedGlove:
         """Fit all hands to one layout, and the layout to all hands, by turns."""
@@ -237,14 +237,6 @@ class _Learning:
         return min(
             (fit_places(points, start, _PLACE_SPREAD, FINE) for start in starts), key=lambda fit: fit.cost
         )
-
-
-class _SearchedHand(NamedTuple):
-    """The hand that a search found."""
-
-    hand: GloveFit
-    side: Side
-    columns: dict[str, int]
 
 
 def _labeled(source: Capture, layout: MarkerLayout) -> Capture:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from gloves.fit import Attachment, GloveFit, carried
 from gloves.layout import FEWEST_MARKERS, MarkerLayout, MarkerPlace
-from gloves.takes.points import spread_out
+from gloves.takes.points import far_apart, spread_out
 from handsim.callbacks import OnStep, no_step
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import BONE_NAMES, DIGIT_OF_BONE, DIGITS, PALM, SIDES, SIZES, Side
@@ -38,8 +38,7 @@ _MOVES: Final = 0.003  # [m] standard deviation of a marker against its bone
 _NEAR: Final = 0.005  # [m] standard deviation of its distance from the nearest place
 _OWN: Final = 0.6  # share of this distance that its own place has
 _LEFT_OUT: Final = 25.0  # cost of a column that does not belong to the hand
-FARTHEST: Final = 0.02
-"""A column that is farther from every place does not belong to the hand [m]."""
+_FARTHEST: Final = 0.02  # [m] Larger distances cost no more.
 _CONVERGED: Final = 0.1  # smallest gain in energy of a round
 _PALMAR: Final = 2.0  # cost of a place on a bone's side; on the palm's side it is twice as high
 _BEHIND: Final = -0.1  # [palm lengths] Places behind the wrist's joint are of the arm.
@@ -146,7 +145,7 @@ class PlaceTable:
         seen = np.isfinite(points[:, :, :1])
         count = np.maximum(seen.sum(axis=0), 1)
         mean = np.where(seen[..., None], local, 0.0).sum(axis=0) / count[..., None]
-        square = np.minimum(((local - mean) ** 2).sum(axis=-1), FARTHEST**2)
+        square = np.minimum(((local - mean) ** 2).sum(axis=-1), _FARTHEST**2)
         varied = np.where(seen, square, 0.0).sum(axis=0) / count
         rest = self.model.rest_transforms
         mean = (rest[:, :3, :3] @ mean[..., None])[..., 0] + rest[:, :3, 3]
@@ -194,11 +193,7 @@ def diverse_frames(points: Float[np.ndarray, "T N 3"], count: int) -> NDArray[np
     apart = np.linalg.norm(points[pool][:, first] - points[pool][:, second], axis=2)
     usual = np.nan_to_num(np.nanmedian(apart, axis=0))
     apart = np.where(np.isfinite(apart), apart, usual)
-    chosen, far = [int(apart.sum(axis=1).argmax())], np.full(len(pool), np.inf)
-    while len(chosen) < min(count, len(pool)):
-        far = np.minimum(far, ((apart - apart[chosen[-1]]) ** 2).sum(axis=1))
-        chosen.append(int(far.argmax()))
-    return np.asarray(pool[chosen])
+    return np.asarray(pool[far_apart(apart, int(apart.sum(axis=1).argmax()), count)])
 
 
 @functools.cache
@@ -210,12 +205,7 @@ def _spread_vertices() -> NDArray[np.int64]:
     is_palm = main == PALM
     behind = surface.vertices[:, 0] < _BEHIND * model.skeleton.lengths[PALM]
     kept = np.flatnonzero(~is_palm | ((normals[:, 2] > 0.0) & ~behind))
-    points, chosen = surface.vertices[kept], [0]
-    far = np.full(len(points), np.inf)
-    while len(chosen) < _PLACES:
-        far = np.minimum(far, ((points - points[chosen[-1]]) ** 2).sum(axis=1))
-        chosen.append(int(far.argmax()))
-    return np.asarray(kept[chosen])
+    return np.asarray(kept[far_apart(surface.vertices[kept], 0, _PLACES)])
 
 
 class _Search:
@@ -346,9 +336,9 @@ class _Search:
     ) -> list[tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]]:
         """Joint angles, rotation, position and nearest places of hands laid into a frame, best first."""
         table, hands, seen = self.tables[_USUAL], [], points[np.isfinite(points[:, 0])]
-        shown = np.flatnonzero(np.isfinite(points[:, 0]))
+        shown, even = np.flatnonzero(np.isfinite(points[:, 0])), _even_rotations(_ROTATIONS)
         for angles, centers in zip(self._gestures, table.centers(join_qpos(self._gestures)), strict=True):
-            rotations = _even_rotations(_ROTATIONS)
+            rotations = even
             middle = centers[table.cost < _PALMAR].mean(axis=0)
             positions = seen.mean(axis=0) - rotations @ middle
             for rounds in _RIGID_ROUNDS:
@@ -375,7 +365,7 @@ class _Search:
         for number in range(rounds + 1):
             local = (points - positions[:, None]) @ rotations
             square = (local**2).sum(axis=2)[..., None] + size - 2.0 * local @ centers.T
-            costs = np.minimum(square, FARTHEST**2) / _NEAR**2 + self.tables[_USUAL].cost
+            costs = np.minimum(square, _FARTHEST**2) / _NEAR**2 + self.tables[_USUAL].cost
             places = costs.argmin(axis=2)
             if number == rounds:
                 break
