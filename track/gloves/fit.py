@@ -11,13 +11,15 @@ from gloves.fit import GloveFit
 from track.calibration.energy import GESTURES_OF_USER, first_estimate, levenberg_marquardt, user_hand
 from track.kinematics.pose_solver import PoseSolver
 
-PLACE_SPREAD: Final = 0.008
-"""Standard deviation of a marker along the skin from a roughly known place [m]."""
+FLESH: Final = 0.003
+"""Standard deviation of a marker against its bone [m], where residuals have not shown it."""
+_LEAST_FLESH: Final = 0.001  # [m] the least that residuals may show: the same error repeats in many frames
+_PLACE_SPREAD: Final = 0.02  # [m] standard deviation of a marker along the skin from a roughly known place
 _HEIGHT_SPREAD: Final = 0.0015  # [m] the same of its height over the skin
-_NOISE, _SCALE, _OUTLIER = 0.003, 0.02, 0.03  # [m] flesh that repeats, robust scales of markers and poses
+_SCALE, _OUTLIER = 0.02, 0.03  # [m] robust scales of markers and poses
 _RELINEARIZE: Final = 0.2  # The skin's jacobian is renewed after such a change, see `Problem`.
 _MOST_STEPS: Final = 20
-ROUGH, FINE = 1e-2, 1e-3
+ROUGH, FINE = 3e-2, 1e-3
 """A fit ends with a step that gains a smaller share of its energy."""
 
 
@@ -32,13 +34,18 @@ class FittedPlaces(NamedTuple):
 
 
 def fit_places(
-    points: Float[np.ndarray, "F M 3"], glove: GloveFit, spread: float = PLACE_SPREAD, gain: float = ROUGH
+    points: Float[np.ndarray, "F M 3"], glove: GloveFit, *, gain: float = ROUGH, flesh: float = FLESH
 ) -> FittedPlaces:
     """Fit a right hand and the places of its markers to their points [m], NaN where missing."""
     poses = PoseSolver(glove, outlier_distance=_OUTLIER).solve(points).qpos
-    options = {"noise": _NOISE, "robust_scale": _SCALE, "relinearize": _RELINEARIZE}
+    options = {"noise": flesh, "robust_scale": _SCALE, "relinearize": _RELINEARIZE}
     problem, estimate = first_estimate(glove, points, poses, gestures=GESTURES_OF_USER, **options)
-    problem.position_spread, problem.height_spread = spread, _HEIGHT_SPREAD
+    problem.position_spread, problem.height_spread = _PLACE_SPREAD, _HEIGHT_SPREAD
     estimate, fit, _ = levenberg_marquardt(problem, estimate, 0, _MOST_STEPS, None, gain)
     squares = (fit.residuals**2).sum(axis=2).sum(axis=0) / np.maximum(problem.present.sum(axis=0), 1)
     return FittedPlaces(user_hand(glove, problem, estimate), fit.cost, np.sqrt(squares))
+
+
+def shown_flesh(residuals: Float[np.ndarray, "M"]) -> float:
+    """Standard deviation of markers against their bones [m] that the residuals of a good fit show."""
+    return max(_LEAST_FLESH, float(np.sqrt(np.mean(residuals**2))))

@@ -33,7 +33,7 @@ from handsim.hand.shape import SIDES, Side
 from handsim.space.transforms import MIRROR
 from track.captures import label_capture
 from track.frames import AnyCapture, capture_of
-from track.gloves.fit import FINE, FittedPlaces, fit_places
+from track.gloves.fit import FINE, FLESH, FittedPlaces, fit_places, shown_flesh
 from track.gloves.marker_search import FittedHand, diverse_frames, search_places
 from track.gloves.settings import LearnSettings
 from track.kinematics.pose_solver import PoseSolver
@@ -43,11 +43,10 @@ _FRAMES: Final = 60  # of each capture, in which hands and places are fitted
 _HAND: Final = 0.26  # [m] Two markers of a hand are never farther apart.
 _RIGID: Final = 0.004  # [m] Columns whose distances change less belong to a rigid object.
 _LEARNED: Final = 2 / 3  # share of each capture that is learned from
-_PLACE_SPREAD: Final = 0.02  # [m] standard deviation of a place: a search finds it roughly
 _ROUNDS: Final = 3  # of fits of all hands to a common layout
 _STARTS: Final = ("S", "L")  # sizes of the hands that a fit begins with
 _FITS: Final = 0.003  # [m] A hand whose markers are farther from their places in the median is none.
-_TEMPERATURE: Final = 2.0  # by which differences in energy are divided: errors of hands repeat
+_TEMPERATURE: Final = 4.0  # by which differences in energy are divided: errors of hands repeat
 _SAME: Final = 0.015  # [m] A marker that is nearer to a place is there.
 _SURE: Final = 0.8  # A place with a smaller probability is told.
 _LOOKED_AT: Final = 300  # frames in which exchanged columns are looked for
@@ -206,8 +205,10 @@ class _Learning:
     def _common(self, layout: MarkerLayout, hands: Sequence[_Found]) -> LearnedGlove:
         """Fit all hands to one layout, and the layout to all hands, by turns."""
         self._on_step("fitting hands and places together")
+        flesh = FLESH
         for _ in range(_ROUNDS):
-            fitted = [self._fitted(one, layout) for one in hands]
+            fitted = [self._fitted(one, layout, flesh) for one in hands]
+            flesh = shown_flesh(np.concatenate([one.residuals for one in fitted]))
             places = [{place.name: place for place in layout_of(one.hand, layout).markers} for one in fitted]
             layout = _mean_layout(layout, places)
         wearable = settle_glove(_only(layout, layout.names), HandModel.named("M")).layout
@@ -228,14 +229,14 @@ class _Learning:
         left_out = tuple(_left_out(self._sources, done))
         return LearnedGlove(layout, tuple(done), left_out, _spreads(layout, done), sure, tuple(doubt))
 
-    def _fitted(self, one: _Found, layout: MarkerLayout) -> FittedPlaces:
+    def _fitted(self, one: _Found, layout: MarkerLayout, flesh: float = FLESH) -> FittedPlaces:
         """A hand in the markers of a layout that it has, begun from a small and from a large hand."""
         own = _only(layout, one.columns)
         points = _canonical(one, own.names)
         points = points[diverse_frames(points, _FRAMES)]
         starts = [settle_glove(own, HandModel.named(size)) for size in _STARTS]
         return min(
-            (fit_places(points, start, _PLACE_SPREAD, FINE) for start in starts), key=lambda fit: fit.cost
+            (fit_places(points, start, gain=FINE, flesh=flesh) for start in starts), key=lambda fit: fit.cost
         )
 
 

@@ -3,8 +3,8 @@
 The points of a column belong to one marker, all the time. A hand of mean proportions is laid into a few
 frames in many orientations and gestures. Each column then takes the place on the skin that is nearest to its
 points over all these frames, and poses are solved for these places, by turns, until no place changes. A
-column that is near no place does not belong to the hand. Fingers are alike, so that the best solutions are
-tried again with their fingers exchanged.
+column that is near no place does not belong to the hand. A hand may slide along its own fingers, and fingers
+are alike: the best hands are tried again slid, in other sizes, and with their fingers exchanged.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from handsim.callbacks import OnStep, no_step
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import BONE_NAMES, DIGIT_OF_BONE, DIGITS, PALM, SIDES, SIZES, Side
 from handsim.hand.skin import vertex_normals
-from handsim.space.transforms import MIRROR, quaternion_matrix, rotation_quaternions
+from handsim.space.transforms import MIRROR, rotation_quaternions
 from poses.shapes import sample_poses
-from track.gloves.fit import fit_places
+from track.gloves.fit import FLESH, fit_places, shown_flesh
 from track.kinematics.pose_solver import RESTING, PoseSolver
 from track.kinematics.pose_spread import resting_prior
 
@@ -48,18 +48,19 @@ _REFERENCES: Final = 3  # frames that it is laid into
 _RIGID_ROUNDS: Final = (4, 8)  # of all such hands, and of the better quarter
 _RIGID_SCALE: Final = 0.015  # [m] robust scale of their alignment
 _ARTICULATED, _TRIED = 150, 8  # numbers of solutions in each step
-# Hands that are improved: two, and up to eight for few columns, which more hands fit. They are chosen from
-# seven times as many.
-_STARTS, _FEWEST_STARTS, _COMPARED = 80, 2, 7
+# Hands of which more are fitted the fewer columns there are; then so many of these with the flesh they show.
+_STARTS, _FEWEST_STARTS, _FINER = 560, 14, 8
+_PATIENCE, _MOST_FITS = 3, 100  # moved hands that gain nothing, and all fits, after which a search ends
 _OUTLIER: Final = 0.03  # [m] robust scale of poses
 _STEPS: Final = 5  # of poses, at each robust scale
 _ASIDE: Final = 0.1  # [rad] Markers farther around a finger may belong to the next one.
 _GAIN: Final = 0.98  # Another hand must cost less by this factor.
-# Changes of a hand under its markers: slides along and across [m], and a size more or less.
 _SLIDES: Final = (
-    *((0.015, 0.0, 0), (-0.015, 0.0, 0), (0.03, 0.0, 0), (-0.03, 0.0, 0)),
-    *((0.0, 0.02, 0), (0.0, -0.02, 0), (0.0, 0.0, 1), (0.0, 0.0, -1)),
+    *((0.01, 0.0), (-0.01, 0.0), (0.02, 0.0), (-0.02, 0.0), (0.03, 0.0), (-0.03, 0.0)),
+    *((0.0, 0.02), (0.0, -0.02)),
 )
+"""How far markers move along and across the hand [m], all of them or those of a digit."""
+_TURN: Final = 0.01  # [m] A right angle between normals is like this distance.
 _USUAL: Final = list(SIZES).index("M")
 
 
@@ -155,6 +156,13 @@ class PlaceTable:
         at = self.points[rows] + _OWN * off[columns, rows]
         return rows, at, np.minimum(costs[columns, rows], _LEFT_OUT)
 
+    def slid(self, places: Int[np.ndarray, "N"], along: float, across: float) -> Int[np.ndarray, "N"]:
+        """The places that lie so far [m] toward the fingertips and the thumb from others."""
+        ahead = self.model.rest_transforms[self.bones[places], :3, :2] @ np.array([along, across])
+        off = ((self.points[places] + ahead)[:, None] - self.points) ** 2
+        turned = ((self.normals[places][:, None] - self.normals) ** 2).sum(axis=2)
+        return np.asarray((off.sum(axis=2) + _TURN**2 * turned).argmin(axis=1))
+
     def like(self, place: int, bone: int) -> int:
         """The place on another bone that is most like a place."""
         there = np.flatnonzero(self.bones == bone)
@@ -177,12 +185,10 @@ def search_places(
         found += search.first_solutions(side)
     on_step("fitting hands")
     starts = max(_FEWEST_STARTS, _STARTS // points.shape[1] - _FEWEST_STARTS)
-    found = [search.solved(one) for one in search.distinct(found)[: _COMPARED * starts]]
-    fitted = sorted(map(search.fitted, search.distinct(found)), key=lambda one: one.cost)
+    solved = [search.solved(one) for one in search.distinct(found)[:starts]]
+    fitted = [search.fitted(one) for one in search.distinct(solved)]
     on_step("sliding the hand and exchanging fingers")
-    for start in fitted[:starts]:
-        fitted += search.improved(start)
-    return sorted(fitted, key=lambda one: one.cost)
+    return search.improved(fitted)
 
 
 def diverse_frames(points: Float[np.ndarray, "T N 3"], count: int) -> NDArray[np.int64]:
@@ -214,7 +220,7 @@ class _Search:
     def __init__(self, points: NDArray[np.float64], names: tuple[str, ...], radius: float) -> None:
         self.tables, self._names = [PlaceTable(size, radius) for size in SIZES], names
         some = points[diverse_frames(points, _FRAMES)]
-        self._fitted = set[tuple[object, ...]]()
+        self._fitted, self._flesh = set[tuple[object, ...]](), FLESH
         self._points: dict[Side, NDArray[np.float64]] = {"right": some, "left": some @ MIRROR}
         self._gestures = _gestures(self.tables[_USUAL].model)
 
@@ -255,22 +261,28 @@ class _Search:
         """A solution with the hand's shape and the markers' places fitted."""
         own = np.flatnonzero(solution.on_hand)
         glove = self.tables[solution.size].glove(solution.places[own], [self._names[row] for row in own])
-        hand, cost, residuals = fit_places(self._points[solution.side][:, own], glove)
+        hand, cost, residuals = fit_places(self._points[solution.side][:, own], glove, flesh=self._flesh)
         cost += self.tables[solution.size].cost[solution.places[own]].sum()
         cost += _LEFT_OUT * float((~solution.on_hand).sum())
         return FittedHand(cost, solution.side, hand, own, residuals, solution)
 
-    def improved(self, start: FittedHand) -> list[FittedHand]:
-        """Hands that slides, other sizes and exchanges of fingers lead to, as long as these fit better."""
-        found, best = list[FittedHand](), start
-        while True:
-            tried = self.distinct([*self._slid(best.solution), *self._moved(best.solution)])
+    def improved(self, fitted: list[FittedHand]) -> list[FittedHand]:
+        """These hands and those that slides, sizes and exchanges of fingers lead to, best first.
+
+        Always the best hand that was not moved yet is moved.
+        """
+        ranked = sorted(fitted, key=lambda one: one.cost)
+        self._flesh = shown_flesh(ranked[0].residuals)
+        waiting, done, failed = [self.fitted(one.solution) for one in ranked[:_FINER]], list[FittedHand](), 0
+        while waiting and failed < _PATIENCE and len(self._fitted) < _MOST_FITS:
+            best = min(one.cost for one in (*done, *waiting))
+            start = min(waiting, key=lambda one: one.cost)
+            tried = [self._settled(start), *self.distinct(self._moved(start.solution))]
             new = list(map(self.fitted, itertools.islice(filter(self._is_new, tried), _TRIED)))
-            found += new
-            better = min(new, key=lambda one: one.cost, default=best)
-            if better.cost > _GAIN * best.cost:
-                return found
-            best = better
+            waiting = [one for one in (*waiting, *new) if one is not start]
+            done.append(start)
+            failed = 0 if min((one.cost for one in new), default=np.inf) < _GAIN * best else failed + 1
+        return sorted((*done, *waiting), key=lambda one: one.cost)
 
     def _is_new(self, one: Solution) -> bool:
         """Whether no hand with these bones was fitted; it counts as fitted from now on."""
@@ -279,26 +291,30 @@ class _Search:
         self._fitted.add(key)
         return is_new
 
+    def _settled(self, fitted: FittedHand) -> Solution:
+        """The solution whose places are nearest to those of a fitted hand."""
+        start, table = fitted.solution, self.tables[fitted.solution.size]
+        points, bones = fitted.hand.attachment.points, fitted.hand.attachment.main_bones
+        rest, usual = fitted.hand.model.rest_transforms[bones], table.model.rest_transforms[bones]
+        longer = table.model.skeleton.lengths[bones] / fitted.hand.model.skeleton.lengths[bones]
+        local = np.einsum("mji,mj->mi", rest[:, :3, :3], points - rest[:, :3, 3]) * longer[:, None]
+        at = np.einsum("mij,mj->mi", usual[:, :3, :3], local) + usual[:, :3, 3]
+        places = start.places.copy()
+        places[fitted.columns] = ((at[:, None] - table.points) ** 2).sum(axis=2).argmin(axis=1)
+        return start._replace(places=places)
+
     def _moved(self, start: Solution) -> list[Solution]:
-        """Solutions after exchanges of fingers, which begin relaxed."""
+        """Solutions after slides, exchanges of fingers, and with other sizes; all begin relaxed."""
         points, found = self._points[start.side], list[Solution]()
         relaxed = start.qpos.copy()
         relaxed[:, 7:] = RESTING
-        for places in self._moves(start.places):
-            qpos = self._poses(start.size, points, places, relaxed)
-            found.append(self._alternated(start.side, start.size, points, qpos, 3))
+        tried = [(start.size, places) for places in self._moves(start.places)]
+        sizes = (start.size - 1, start.size + 1)
+        tried += [(size, start.places) for size in sizes if 0 <= size < len(self.tables)]
+        for size, places in tried:
+            qpos = self._poses(size, points, places, relaxed)
+            found.append(self._alternated(start.side, size, points, qpos, 3))
         return found
-
-    def _slid(self, start: Solution) -> list[Solution]:
-        """Solutions after sliding the hand under its markers, and of other sizes."""
-        turned, tried = quaternion_matrix(start.qpos[:, 3:7]), list[Solution]()
-        for along, across, larger in _SLIDES:
-            size = start.size + larger
-            if 0 <= size < len(self.tables):
-                qpos = start.qpos.copy()
-                qpos[:, :3] += turned @ np.array([along, across, 0.0])
-                tried.append(self._alternated(start.side, size, self._points[start.side], qpos, 6))
-        return tried
 
     def _alternated(
         self, side: Side, size: int, points: NDArray[np.float64], qpos: NDArray[np.float64], rounds: int
@@ -374,7 +390,7 @@ class _Search:
         return rotations, positions, costs.min(axis=2).sum(axis=1), places
 
     def _moves(self, places: Int[np.ndarray, "N"]) -> Iterator[Int[np.ndarray, "N"]]:
-        """The places with digits exchanged, moved or divided, or with a digit's markers one bone farther."""
+        """The places slid, with digits exchanged, moved or divided, or with a digit one bone farther."""
         table, count = self.tables[_USUAL], len(DIGITS)
         digits = DIGIT_OF_BONE[table.bones[places]]
         orders = list[list[int]]()
@@ -388,6 +404,11 @@ class _Search:
                 inserted.insert(other, one)
                 orders.append(inserted)
         bones = table.bones[places]
+        for along, across in _SLIDES:
+            slid = table.slid(places, along, across)
+            yield slid
+            if across == 0.0:
+                yield from (np.where(digits == digit, slid, places) for digit in np.unique(digits))
         targets = [
             np.where(digits >= 0, bones + 3 * (np.array(order)[digits] - digits), PALM) for order in orders
         ]
