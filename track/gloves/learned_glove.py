@@ -40,20 +40,25 @@ from track.kinematics.pose_solver import PoseSolver
 from track.user import User
 
 _FRAMES: Final = 60  # of each capture, in which hands and places are fitted
-_HAND: Final = 0.26  # [m] Two markers of a hand are never farther apart.
+_HAND: Final = 0.26  # [m] largest distance between two markers of a hand
 _RIGID: Final = 0.004  # [m] Columns whose distances change less belong to a rigid object.
 _LEARNED: Final = 2 / 3  # share of each capture that is learned from
 _ROUNDS: Final = 3  # of fits of all hands to a common layout
 _STARTS: Final = ("S", "L")  # sizes of the hands that a fit begins with
 _FITS: Final = 0.003  # [m] A hand whose markers are farther from their places in the median is none.
-_TEMPERATURE: Final = 4.0  # by which differences in energy are divided: errors of hands repeat
+_TEMPERATURE: Final = 2.0  # by which differences in energy are divided: errors of hands repeat
 _SAME: Final = 0.015  # [m] A marker that is nearer to a place is there.
-_SURE: Final = 0.8  # A place with a smaller probability is told.
+_SURE: Final = 0.9  # A place with a smaller probability is told.
 _LOOKED_AT: Final = 300  # frames in which exchanged columns are looked for
 _OUTLIER: Final = 0.01  # [m] robust scale of poses then
 _EXCHANGED: Final = 0.02  # Exchanges in a larger share of them are told.
 _SHOWN: Final = 8  # names in a sentence
-_INWARDS: Final = (0.0, 0.2, 0.4, 0.6)  # shares of the way to the middle of its bone that a marker moves
+_INWARDS: Final = (
+    0.0,
+    0.2,
+    0.4,
+    0.6,
+)  # A marker beyond the skin moves so far toward its bone, as shares of the way.
 _PAIRED: Final = 0.02  # [m] Markers of the other hand at most this far from a place are the same marker.
 
 
@@ -289,18 +294,17 @@ def _canonical(one: _Found, names: Sequence[str]) -> Float[np.ndarray, "T M 3"]:
 
 
 def _probabilities(found: Sequence[FittedHand]) -> dict[str, float]:
-    """Probability of each marker's place on the best hand, by the energies of all hands that were tried."""
-    best = found[0]
-    names, points = best.hand.layout.names, best.hand.attachment.points
-    total, same = 0.0, np.zeros(len(names))
+    """Probability of each marker's place on the best hand, against the best hand that has it elsewhere."""
+    best, rival = found[0], np.full(len(found[0].columns), np.inf)
     for one in found:
-        weight = float(np.exp(-0.5 * (one.cost - best.cost) / _TEMPERATURE))
         own = dict(zip(one.columns.tolist(), one.hand.attachment.points, strict=True))
         far = np.full(3, np.inf)
         shown = np.array([own.get(column, far) for column in best.columns.tolist()])
-        same += weight * ((np.linalg.norm(shown - points, axis=1) < _SAME) & (one.side == best.side))
-        total += weight
-    return dict(zip(names, (same / total).tolist(), strict=True))
+        off = np.linalg.norm(shown - best.hand.attachment.points, axis=1)
+        elsewhere = (off > _SAME) | (one.side != best.side)
+        rival[elsewhere] = np.minimum(rival[elsewhere], one.cost - best.cost)
+    shares = 1.0 / (1.0 + np.exp(-0.5 * rival / _TEMPERATURE))
+    return dict(zip(best.hand.layout.names, shares.tolist(), strict=True))
 
 
 def _exchanges(one: _Found, hand: GloveFit, source: Capture) -> Iterator[str]:
