@@ -53,12 +53,8 @@ _LOOKED_AT: Final = 300  # frames in which exchanged columns are looked for
 _OUTLIER: Final = 0.01  # [m] robust scale of poses then
 _EXCHANGED: Final = 0.02  # Exchanges in a larger share of them are told.
 _SHOWN: Final = 8  # names in a sentence
-_INWARDS: Final = (
-    0.0,
-    0.2,
-    0.4,
-    0.6,
-)  # A marker beyond the skin moves so far toward its bone, as shares of the way.
+# A point beyond every skin moves toward the middle of its bone, by these shares of the way.
+_INWARDS: Final = (0.0, 0.2, 0.4, 0.6)
 _PAIRED: Final = 0.02  # [m] Markers of the other hand at most this far from a place are the same marker.
 
 
