@@ -12,8 +12,9 @@ from track.calibration.energy import GESTURES_OF_USER, first_estimate, levenberg
 from track.kinematics.pose_solver import PoseSolver
 
 FLESH: Final = 0.003
-"""Standard deviation of a marker against its bone [m], where residuals have not shown it."""
-_LEAST_FLESH: Final = 0.001  # [m] the least that residuals may show: the same error repeats in many frames
+"""Standard deviation of a marker against its bone [m] in a first fit, before residuals are known."""
+# [m] A smaller one is not believed: errors that repeat in many frames are fitted, and leave small residuals.
+_LEAST_FLESH: Final = 0.001
 _PLACE_SPREAD: Final = 0.02  # [m] standard deviation of a marker along the skin from a roughly known place
 _HEIGHT_SPREAD: Final = 0.0015  # [m] the same of its height over the skin
 _SCALE, _OUTLIER = 0.02, 0.03  # [m] robust scales of markers and poses
@@ -34,9 +35,16 @@ class FittedPlaces(NamedTuple):
 
 
 def fit_places(
-    points: Float[np.ndarray, "F M 3"], glove: GloveFit, *, gain: float = ROUGH, flesh: float = FLESH
+    points: Float[np.ndarray, "F M 3"], glove: GloveFit, *, flesh: float, gain: float = ROUGH
 ) -> FittedPlaces:
-    """Fit a right hand and the places of its markers to their points [m], NaN where missing."""
+    """Fit a right hand and the places of its markers to their points [m], NaN where missing.
+
+    Args:
+        points: Points of the markers in some frames.
+        glove: A hand in the glove, to begin with.
+        flesh: Standard deviation of a marker against its bone [m].
+        gain: Share of the energy that a step must gain; with less the fit ends.
+    """
     poses = PoseSolver(glove, outlier_distance=_OUTLIER).solve(points).qpos
     options = {"noise": flesh, "robust_scale": _SCALE, "relinearize": _RELINEARIZE}
     problem, estimate = first_estimate(glove, points, poses, gestures=GESTURES_OF_USER, **options)
@@ -47,5 +55,5 @@ def fit_places(
 
 
 def shown_flesh(residuals: Float[np.ndarray, "M"]) -> float:
-    """Standard deviation of markers against their bones [m] that the residuals of a good fit show."""
+    """Standard deviation of markers against their bones [m], from the residuals [m] of a good fit."""
     return max(_LEAST_FLESH, float(np.sqrt(np.mean(residuals**2))))

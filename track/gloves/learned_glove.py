@@ -48,7 +48,7 @@ _STARTS: Final = ("S", "L")  # sizes of the hands that a fit begins with
 _FITS: Final = 0.003  # [m] A hand whose markers are farther from their places in the median is none.
 _TEMPERATURE: Final = 2.0  # by which differences in energy are divided: errors of hands repeat
 _SAME: Final = 0.015  # [m] A marker that is nearer to a place is there.
-_SURE: Final = 0.9  # A place with a smaller probability is told.
+_SURE: Final = 0.9  # A marker is told as doubtful if its place has a smaller probability.
 _LOOKED_AT: Final = 300  # frames in which exchanged columns are looked for
 _OUTLIER: Final = 0.01  # [m] robust scale of poses then
 _EXCHANGED: Final = 0.02  # Exchanges in a larger share of them are told.
@@ -290,7 +290,10 @@ def _canonical(one: _Found, names: Sequence[str]) -> Float[np.ndarray, "T M 3"]:
 
 
 def _probabilities(found: Sequence[FittedHand]) -> dict[str, float]:
-    """Probability of each marker's place on the best hand, against the best hand that has it elsewhere."""
+    """Probability that each marker is where the best hand has it.
+
+    The best of the hands that have the marker elsewhere is the alternative.
+    """
     best, rival = found[0], np.full(len(found[0].columns), np.inf)
     for one in found:
         own = dict(zip(one.columns.tolist(), one.hand.attachment.points, strict=True))

@@ -48,9 +48,10 @@ _REFERENCES: Final = 3  # frames that it is laid into
 _RIGID_ROUNDS: Final = (4, 8)  # of all such hands, and of the better quarter
 _RIGID_SCALE: Final = 0.015  # [m] robust scale of their alignment
 _ARTICULATED, _TRIED = 150, 8  # numbers of solutions in each step
-# Hands of which more are fitted the fewer columns there are; then so many of these with the flesh they show.
+# Numbers of hands that are fitted, more for few columns, which more hands fit; and of those fitted again.
 _STARTS, _FEWEST_STARTS, _FINER = 560, 14, 8
-_PATIENCE, _MOST_FITS = 3, 100  # moved hands that gain nothing, and all fits, after which a search ends
+# A search ends when moving three hands gained nothing, or when it has fitted a hundred moved hands.
+_PATIENCE, _MOST_FITS = 3, 100
 _OUTLIER: Final = 0.03  # [m] robust scale of poses
 _STEPS: Final = 5  # of poses, at each robust scale
 _ASIDE: Final = 0.1  # [rad] Markers farther around a finger may belong to the next one.
@@ -59,8 +60,8 @@ _SLIDES: Final = (
     *((0.01, 0.0), (-0.01, 0.0), (0.02, 0.0), (-0.02, 0.0), (0.03, 0.0), (-0.03, 0.0)),
     *((0.0, 0.02), (0.0, -0.02)),
 )
-"""How far markers move along and across the hand [m], all of them or those of a digit."""
-_TURN: Final = 0.01  # [m] A right angle between normals is like this distance.
+"""Slides of markers along and across the hand [m]: of all markers, or of those of a digit or the palm."""
+_TURN: Final = 0.01  # [m] distance that counts like a difference of one between unit normals
 _USUAL: Final = list(SIZES).index("M")
 
 
@@ -157,7 +158,7 @@ class PlaceTable:
         return rows, at, np.minimum(costs[columns, rows], _LEFT_OUT)
 
     def slid(self, places: Int[np.ndarray, "N"], along: float, across: float) -> Int[np.ndarray, "N"]:
-        """The places that lie so far [m] toward the fingertips and the thumb from others."""
+        """The places nearest to others that were moved [m] toward the fingertips and toward the thumb."""
         ahead = self.model.rest_transforms[self.bones[places], :3, :2] @ np.array([along, across])
         off = ((self.points[places] + ahead)[:, None] - self.points) ** 2
         turned = ((self.normals[places][:, None] - self.normals) ** 2).sum(axis=2)
@@ -186,7 +187,7 @@ def search_places(
     on_step("fitting hands")
     starts = max(_FEWEST_STARTS, _STARTS // points.shape[1] - _FEWEST_STARTS)
     solved = [search.solved(one) for one in search.distinct(found)[:starts]]
-    fitted = [search.fitted(one) for one in search.distinct(solved)]
+    fitted = [search.fitted(one, FLESH) for one in search.distinct(solved)]
     on_step("sliding the hand and exchanging fingers")
     return search.improved(fitted)
 
@@ -220,7 +221,7 @@ class _Search:
     def __init__(self, points: NDArray[np.float64], names: tuple[str, ...], radius: float) -> None:
         self.tables, self._names = [PlaceTable(size, radius) for size in SIZES], names
         some = points[diverse_frames(points, _FRAMES)]
-        self._fitted, self._flesh = set[tuple[object, ...]](), FLESH
+        self._fitted = set[tuple[object, ...]]()
         self._points: dict[Side, NDArray[np.float64]] = {"right": some, "left": some @ MIRROR}
         self._gestures = _gestures(self.tables[_USUAL].model)
 
@@ -257,28 +258,29 @@ class _Search:
         qpos = self._poses(start.size, points, start.places, None)
         return self._alternated(start.side, start.size, points, qpos, 6)
 
-    def fitted(self, solution: Solution) -> FittedHand:
-        """A solution with the hand's shape and the markers' places fitted."""
+    def fitted(self, solution: Solution, flesh: float) -> FittedHand:
+        """A solution with the hand's shape and the places of markers fitted, see `fit_places`."""
         own = np.flatnonzero(solution.on_hand)
         glove = self.tables[solution.size].glove(solution.places[own], [self._names[row] for row in own])
-        hand, cost, residuals = fit_places(self._points[solution.side][:, own], glove, flesh=self._flesh)
+        hand, cost, residuals = fit_places(self._points[solution.side][:, own], glove, flesh=flesh)
         cost += self.tables[solution.size].cost[solution.places[own]].sum()
         cost += _LEFT_OUT * float((~solution.on_hand).sum())
         return FittedHand(cost, solution.side, hand, own, residuals, solution)
 
     def improved(self, fitted: list[FittedHand]) -> list[FittedHand]:
-        """These hands and those that slides, sizes and exchanges of fingers lead to, best first.
+        """The best of these hands, and hands that slides, sizes and exchanges of fingers lead to; best first.
 
-        Always the best hand that was not moved yet is moved.
+        Each step moves the best hand that was not moved before. All are fitted with the flesh that the first
+        hands show, so that their costs compare.
         """
         ranked = sorted(fitted, key=lambda one: one.cost)
-        self._flesh = shown_flesh(ranked[0].residuals)
-        waiting, done, failed = [self.fitted(one.solution) for one in ranked[:_FINER]], list[FittedHand](), 0
+        fit = functools.partial(self.fitted, flesh=shown_flesh(ranked[0].residuals))
+        waiting, done, failed = [fit(one.solution) for one in ranked[:_FINER]], list[FittedHand](), 0
         while waiting and failed < _PATIENCE and len(self._fitted) < _MOST_FITS:
             best = min(one.cost for one in (*done, *waiting))
             start = min(waiting, key=lambda one: one.cost)
             tried = [self._settled(start), *self.distinct(self._moved(start.solution))]
-            new = list(map(self.fitted, itertools.islice(filter(self._is_new, tried), _TRIED)))
+            new = list(map(fit, itertools.islice(filter(self._is_new, tried), _TRIED)))
             waiting = [one for one in (*waiting, *new) if one is not start]
             done.append(start)
             failed = 0 if min((one.cost for one in new), default=np.inf) < _GAIN * best else failed + 1
@@ -292,7 +294,7 @@ class _Search:
         return is_new
 
     def _settled(self, fitted: FittedHand) -> Solution:
-        """The solution whose places are nearest to those of a fitted hand."""
+        """The solution of a fitted hand with each marker at the place of the table that is nearest to it."""
         start, table = fitted.solution, self.tables[fitted.solution.size]
         points, bones = fitted.hand.attachment.points, fitted.hand.attachment.main_bones
         rest, usual = fitted.hand.model.rest_transforms[bones], table.model.rest_transforms[bones]
@@ -304,7 +306,7 @@ class _Search:
         return start._replace(places=places)
 
     def _moved(self, start: Solution) -> list[Solution]:
-        """Solutions after slides, exchanges of fingers, and with other sizes; all begin relaxed."""
+        """Solutions near one: slid, with fingers exchanged, or of another size. Their poses begin relaxed."""
         points, found = self._points[start.side], list[Solution]()
         relaxed = start.qpos.copy()
         relaxed[:, 7:] = RESTING
@@ -390,7 +392,7 @@ class _Search:
         return rotations, positions, costs.min(axis=2).sum(axis=1), places
 
     def _moves(self, places: Int[np.ndarray, "N"]) -> Iterator[Int[np.ndarray, "N"]]:
-        """The places slid, with digits exchanged, moved or divided, or with a digit one bone farther."""
+        """Places near these: markers slide, digits are exchanged or divided, or a digit moves by a bone."""
         table, count = self.tables[_USUAL], len(DIGITS)
         digits = DIGIT_OF_BONE[table.bones[places]]
         orders = list[list[int]]()
