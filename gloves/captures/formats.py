@@ -1,4 +1,4 @@
-"""Marker files by their suffix: TRC, C3D and Motive CSV both ways, Vicon CSV and Qualisys TSV in.
+"""Marker files by their suffix: TRC, C3D and Motive CSV both ways, Vicon CSV, Qualisys TSV and tables in.
 
 A TRC is tab-separated, with five header lines (file type, keys, their values, marker names, axes) and one
 line per frame: number, time, and three cells per marker. Rows may hold more trajectories than line 4 names.
@@ -15,6 +15,8 @@ blank line. Other sections (Devices, Model Outputs, ...) may precede and follow 
 Qualisys Track Manager's TSV of 3D data has lines of keys and values (NO_OF_FRAMES, FREQUENCY, MARKER_NAMES,
 ...; newer exports begin with FILE_VERSION), optionally a line of column names, and one line per frame:
 optionally frame number and time, then three cells per marker in millimeters.
+
+Other tables (.csv, .tsv) have a line of column names, a column of times [s], and three columns per marker.
 """
 
 from __future__ import annotations
@@ -25,6 +27,7 @@ import itertools
 import re
 import warnings
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Final, TextIO
 
@@ -469,20 +472,66 @@ def _begin_of_rows(lines: list[bytes], start: int, width: int) -> tuple[int, int
     return start, leading
 
 
+_LEADING_TITLE: Final = re.compile(r"frame|time|#|$", re.I)
+_AXIS: Final = re.compile(r"(.+?)[ ._:-]?([xyz])", re.I)
+_COPY: Final = re.compile(r"(.+)\.[12]")  # pandas numbers columns of the same name
+
+
+def read_table(data: bytes, tell: Tell = warn) -> Capture:
+    """Read the markers in the bytes of a table with times [s] and three columns for each marker.
+
+    The three have one name, or end with x, y and z. The unit is that in which a frame's points span what
+    markers do.
+    """
+    lines, ended = split_lines(data)
+    lines = plain_lines(lines, max(b",", b";", TAB, key=lines[0].count))
+    titles = header_cells(lines[0], 1)
+    num_leading = next((n for n, title in enumerate(titles) if not _LEADING_TITLE.match(title)), len(titles))
+    timed = next((n for n in range(num_leading) if titles[n].lower().startswith("time")), None)
+    names = [_marker_name(titles[n : n + 3]) for n in range(num_leading, len(titles), 3)]
+    if timed is None or not names or "" in names:
+        raise CaptureError(
+            "not a table of markers: expected a line of column names, one of them 'time' (in seconds) and "
+            "three for each marker (RH1_x, RH1_y, RH1_z); arrays become a gloves.Capture"
+        )
+    axes = len(lines) > 1 and {cell.lower() for cell in header_cells(lines[1], 2)[num_leading:]} <= set("xyz")
+    first = num_leading + 3 * np.arange(len(names))
+    columns = TableColumns(titles, names, first, np.ones(len(names)))
+    rows, read = parse_table(lines, columns, start=1 + axes, ended=ended)
+    leading = np.stack([np.full(len(rows), np.nan), rows[:, timed]], axis=1)
+    capture = _timed(read, leading, {}, ("the rate", "the number of frames"), tell)
+    fault = unit_fault(unlabeled_frames(capture))
+    unit = "meters" if fault is None else fault.guess
+    tell(f"the table states no unit of length, read as {unit}")
+    return replace(capture, positions=capture.positions * meters_per(unit))
+
+
+def _marker_name(titles: list[str]) -> str:
+    """Name of the marker whose coordinates have these titles; empty if it is not one marker."""
+    axes = [found for title in titles if (found := _AXIS.fullmatch(title))]
+    if [axis[2].lower() for axis in axes] == ["x", "y", "z"]:
+        titles = [axis[1] for axis in axes]
+    titles = [copy[1] if (copy := _COPY.fullmatch(title)) else title for title in titles]
+    return titles[0] if len(titles) == 3 and len(set(titles)) == 1 else ""
+
+
+def _read_tsv(data: bytes, tell: Tell) -> Capture:
+    """Read a TSV of Qualisys or another table, told apart by their content."""
+    qualisys = separator_behind(_BEGINS, split_lines(data[:_FIRST_BYTES])[0][0]) is not None
+    return read_qtm_tsv(data, tell) if qualisys else read_table(data, tell)
+
+
 def _read_csv(data: bytes, tell: Tell) -> Capture:
-    """Read a CSV of Motive or of Vicon, told apart by their content."""
+    """Read a CSV of Motive or of Vicon, or another table, told apart by their content."""
     if separator_behind([MOTIVE_BEGIN], split_lines(data[:_FIRST_BYTES])[0][0]) is not None:
         return read_motive_csv(data, tell)
     if vicon_sections(split_lines(data)[0]):
         return read_vicon_csv(data, tell)
-    raise CaptureError(
-        "not a CSV of markers: expected Motive's, whose line 1 begins with 'Format Version', or Vicon's, "
-        "where a line reads 'Trajectories'; other tables become a gloves.Capture of an array"
-    )
+    return read_table(data, tell)
 
 
 _FIRST_BYTES: Final = 200  # bytes that show which program wrote a CSV
-_READERS: Final = {".trc": read_trc, ".c3d": read_c3d, ".csv": _read_csv, ".tsv": read_qtm_tsv}
+_READERS: Final = {".trc": read_trc, ".c3d": read_c3d, ".csv": _read_csv, ".tsv": _read_tsv}
 _TEXT_WRITERS: Final = {".trc": write_trc, ".csv": write_motive_csv}
 READABLE: Final = tuple(_READERS)
 _SKELETON: Final = "the motion of a skeleton without its markers; export the markers where it was made"
@@ -520,7 +569,7 @@ WRITABLE: Final = (".trc", ".c3d", ".csv")
 
 
 def read_capture(capture: Capture | str | Path) -> Capture:
-    """Read a `.trc` or `.c3d` file, a `.csv` of Motive or Vicon, or a `.tsv` of Qualisys.
+    """Read a `.trc` or `.c3d` file, a `.csv` of Motive or Vicon, a `.tsv` of Qualisys, or another table.
 
     Args:
         capture: The file, whose suffix decides the format; a `Capture` is returned as it is.

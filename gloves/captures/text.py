@@ -519,10 +519,11 @@ def _rate_of_times(
     tell: Callable[[str], None],
 ) -> float:
     """The rate of evenly spaced times [Hz], for a file without a stated rate."""
-    text = f"{stated.rate_name} is '{stated.rate.strip()[:40]}', expected a positive number"
+    value = stated.rate.strip()[:40]
+    text = f"{stated.rate_name} is '{value}'" if value else f"{stated.rate_name} is not stated"
     intervals = np.empty(0) if times is None else np.diff(times) / steps
     if len(intervals) < 2 or np.ptp(intervals) > _INTERVAL_TOLERANCE * intervals.mean():
-        raise CaptureError(f"{text} of frames per second")
+        raise CaptureError(f"{text}, expected a positive number of frames per second")
     rate = float(1.0 / intervals.mean())
     tell(f"{text}; by the column of times it is {rate:.6g} Hz")
     return rate

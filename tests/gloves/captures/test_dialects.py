@@ -136,11 +136,11 @@ REFUSED = {
     "Qualisys' own": (".qtm", b"x", "Qualisys | C3D, or TSV"),
     "OpenSim's angles": (".mot", b"x", "OpenSim | TRC"),
     "a skeleton": (".bvh", b"x", "skeleton | export the markers | .c3d"),
-    "a TRC by another ending": (".csv", TRC, "not a CSV of markers | the content of a TRC; name it .trc"),
+    "a TRC by another ending": (".csv", TRC, "not a table of markers | the content of a TRC; name it .trc"),
     "Motive's by another ending": (".tsv", MOTIVE, "Motive's CSV; name it .csv"),
     "DeepLabCut": (".csv", "scorer,a,a,a\nbodyparts,x,x,x\n", "DeepLabCut | write a TRC"),
     "bodies of Vicon Tracker": (".csv", "Objects\n100\n,,A\nFrame,Sub Frame,RX\n", "Vicon Tracker | bodies"),
-    "ROS": (".csv", "%time,field.header.seq\n", "a topic of ROS | gloves.Capture of an array"),
+    "ROS": (".csv", "%time,field.header.seq\n", "a topic of ROS | gloves.Capture"),
     "D-Flow": (".tsv", "TimeStamp\tFrameNumber\tA.PosX\n", "D-Flow | C3D or TRC"),
     **{
         f"a pointer in place of a {suffix}": (

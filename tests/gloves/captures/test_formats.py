@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +11,7 @@ import pytest
 from gloves import Capture, read_capture, write_capture
 from gloves.captures.capture import select_hands
 from gloves.captures.formats import read_hands, read_motive_csv, read_qtm_tsv, read_trc, read_vicon_csv
-from handsim.errors import CaptureError
+from handsim.errors import CaptureError, HandSimWarning
 from tests.sentences import error_names
 
 
@@ -122,8 +122,8 @@ def test_a_rate_that_only_the_times_state_is_told(rate: str) -> None:
     rows = [ROW.replace("0\t0", f"{frame}\t{frame / 90.0:.4f}", 1) for frame in range(8)]
     capture = read_trc(trc(*rows, rate=rate), told.append)
     assert capture.rate == pytest.approx(90.0, rel=1e-3)
-    sentence = f"DataRate is '{rate}', expected a positive number; by the column of times it is 89.9743 Hz"
-    assert told == [sentence]
+    found = f"'{rate}'" if rate else "not stated"
+    assert told == [f"DataRate is {found}; by the column of times it is 89.9743 Hz"]
 
 
 def test_what_we_write_ends_its_rows_and_their_header_in_a_tab(tmp_path: Path) -> None:
@@ -186,7 +186,7 @@ BAD = {
     "no unit": (trc(ROW, units=""), "lines 2 and 3 | Units"),
     "rate is a word": (trc(ROW, rate="fast"), "DataRate is 'fast' | positive number"),
     "rate is zero": (trc(ROW, rate="0"), "DataRate is '0' | positive number"),
-    "rate is missing": (trc(ROW, rate=""), "DataRate is '' | positive number"),
+    "rate is missing": (trc(ROW, rate=""), "DataRate is not stated | positive number"),
     "no markers": (trc("0\t0", names="Frame#\tTime\t\t"), "no markers | line 4 | 'Frame#', 'Time'"),
     "line 4 holds no names": (trc(ROW, names="1\t0\t1\t2\t3"), "no markers | line 4 | 'Frame#', 'Time'"),
     "names and axes differ": (trc(ROW, names="Frame#\tTime\ta\tb\tc"), "line 4 | 3 marker names | 6 axes"),
@@ -350,13 +350,12 @@ def test_blank_cells_are_gaps() -> None:
 
 MOTIVE = motive(LABELED, UNLABELED)
 BAD_MOTIVE = {
-    "not Motive": ("a,b,c\n1,2,3\n", "not a CSV of markers | 'Format Version' | 'Trajectories'"),
     "only rigid bodies": (motive(BODY, BODY_MARKER), "no markers | 'Marker' | Rigid Body, Rigid Body Marker"),
     "no columns": (motive(), "no markers | 'Marker' | 'Position' | none"),
     "unknown unit": (motive(LABELED, unit="Feet"), "'Feet' | mm, cm, m"),
     "no rate": (
         motive(LABELED, rows=2, first="Format Version,1.23").replace("Export Frame Rate,120.000000", "x,y"),
-        "Capture Frame Rate is '' | positive number",
+        "Capture Frame Rate is not stated | positive number",
     ),
     "no frames": (motive(LABELED, rows=0), "no frames"),
     "header cut": (MOTIVE[: MOTIVE.index("Frame,")], "header is cut | 'Frame'"),
@@ -461,12 +460,8 @@ def test_blank_cells_are_gaps_of_vicon() -> None:
 
 NEXUS = nexus()
 BAD_NEXUS = {
-    "neither Motive nor Vicon": (
-        "Frame,X,Y,Z\n1,2,3,4\n",
-        "not a CSV of markers | 'Format Version' | 'Trajectories'",
-    ),
     "other sections": (DEVICES + OUTPUTS, "'Trajectories' | Devices, Model Outputs"),
-    "the word alone": ("Trajectories\n\n", "not a CSV of markers | 'Format Version' | 'Trajectories'"),
+    "the word alone": ("Trajectories\n\n", "not a table of markers"),
     "header cut": (NEXUS[: NEXUS.index("Frame")], "header is cut | rate, names and axes | 'Trajectories'"),
     "header cut in its axes": (NEXUS[: NEXUS.index("Frame") + 20], "header is cut | rate, names and axes"),
     "no frame in the axes": (NEXUS.replace("Frame,Sub Frame", "Number,Other"), "line 4 | 'Number' | 'Frame'"),
@@ -557,9 +552,56 @@ def test_more_frames_than_stated_are_told() -> None:
     assert told == ["NO_OF_FRAMES is 2, and 3 frames are there; all are read"]
 
 
+HAND = np.array([[12.5, 34.25, 56], [40, 30, 20], [60.5, 10, 15], [75, 0.5, 5], [90, 8, 1]])
+
+
+def table(titles: Sequence[str], behind: str = "", scale: float = 1.0, separator: str = ",") -> str:
+    """A hand that moves along x in a table with this line of names, and another line behind it."""
+    rows = [[0.01 * n, *(scale * (HAND + [n, 0.0, 0.0])).ravel()] for n in range(20)]
+    lines = [separator.join(f"{value:.6g}" for value in row) for row in rows]
+    return "\n".join([separator.join(["Time (s)", *titles]), *([behind] if behind else []), *lines, ""])
+
+
+def titled(*ends: str) -> list[str]:
+    return [f"{name}{end}" for name in ("RH1", "Index", "RIF2", "RIF3", "RIF4") for end in ends]
+
+
+@pytest.mark.parametrize("scale", [1e-3, 0.1, 1.0])
+@pytest.mark.parametrize(
+    ("titles", "behind", "separator"),
+    [
+        (titled("", "", ""), "", ","),
+        (titled("", "", ""), "," + ",".join("xyz" * 5), ","),
+        (titled("", ".1", ".2"), "", ";"),
+        (titled("_X", "_Y", "_Z"), "", "\t"),
+    ],
+    ids=["one name", "axes below", "as pandas numbers them", "axes behind"],
+)
+def test_a_table_has_three_columns_a_marker(tmp_path, titles, behind, separator, scale) -> None:
+    path = tmp_path / ("take.tsv" if separator == "\t" else "take.csv")
+    path.write_text(table(titles, behind, scale, separator))
+    with pytest.warns(HandSimWarning, match="no unit of length, read as") as told:
+        capture = read_capture(path)
+    assert capture.names == ("RH1", "Index", "RIF2", "RIF3", "RIF4")
+    assert capture.rate == pytest.approx(100.0)
+    np.testing.assert_allclose(capture.positions[0], 1e-3 * HAND, atol=1e-6)
+    unit = {1e-3: "meters", 0.1: "centimeters", 1.0: "millimeters"}[scale]
+    assert any(str(one.message).endswith(unit) for one in told)
+
+
+BAD_TABLES = {
+    "no markers": ("a,b,c\n1,2,3\n", "not a table of markers | 'time' | RH1_x"),
+    "no times": ("Frame,X,Y,Z\n1,2,3,4\n", "not a table of markers | 'time'"),
+    "two columns of a marker": (table(titled("_x", "_y")), "not a table of markers | three for each"),
+    "no rows": ("time,A_x,A_y,A_z\n", ""),
+    "uneven times": (
+        table(titled("", "", "")).replace("0.05,", "0.0566,").replace("0.06,", "0.069,"),
+        "the rate is not stated | positive number",
+    ),
+}
+
 QTM = qtm()
 BAD_QTM = {
-    "not Qualisys": ("a\tb\tc\n1\t2\t3\n", "not a Qualisys TSV | line 1 | 'NO_OF_FRAMES' | 'FILE_VERSION'"),
     "angles": (QTM.replace("DATA_INCLUDED\t3D", "DATA_INCLUDED\tAngle"), "DATA_INCLUDED is 'Angle' | '3D'"),
     "no names": (QTM.replace("MARKER_NAMES", "MARKERS"), "MARKER_NAMES"),
     "no name": (qtm(names=(), columns=False), "no markers | MARKER_NAMES"),
@@ -588,6 +630,7 @@ DAMAGED = [
         ("Motive", ".csv", BAD_MOTIVE),
         ("Vicon", ".csv", BAD_NEXUS),
         ("Qualisys", ".tsv", BAD_QTM),
+        ("a table", ".csv", BAD_TABLES),
     )
     for case, (content, words) in cases.items()
 ]
