@@ -25,11 +25,10 @@ _COLUMNS: Final = {
 _EVIDENCE: Final = ("real", "others", "simulated", "deviation")
 _LEAD: Final = """# What was judged, and by what
 
-`make results` writes this page from `benchmarks/figures/` and `benchmarks/trust_rows.toml`. A row is an
-output of handsim. The rows with the most kinds of evidence stand first; "-" means that there is none. Real
-data are those of two people in the public Mocap_SIG18_Data, unless a row says otherwise, and a figure on two
-people says little about a third. [Results](results.md) has the commands of most figures; quoted ones have
-theirs in `benchmarks/figures/quoted.json`.
+`make results` writes this page. A row is an output of handsim; those with the most kinds of evidence stand
+first, and "-" means that there is none. Real data are those of two people in the public Mocap_SIG18_Data,
+unless a row says otherwise, and a figure on two people says little about a third. [Results](results.md) and
+`benchmarks/figures/quoted.json` have the commands.
 """
 
 

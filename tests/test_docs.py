@@ -26,8 +26,6 @@ SLOW = {
     "stored_arrays",
     "tracking",
     "formats",
-    "training_on_many_devices",
-    "tracking_commands",
     "troubleshooting",
     "tutorials/my_captures",
     "tutorials/my_layout",

@@ -1,6 +1,6 @@
 """Live streams for a tracker: in order, on a clock that never goes back, without outdated frames.
 
-Each arriving frame is passed on once, in order, or counted; docs/tracking_commands.md says how long frames
+Each arriving frame is passed on once, in order, or counted; docs/tracking.md says how long frames
 wait behind a gap. A frame continues the stream if its steps in time and number agree, and its time is at most
 sixteen frames ahead of its arrival. Any other frame is a jump. A jump is accepted only when five successive
 frames fit together, as after a restart of a recording or server. Frames of shorter jumps are dropped as wild.

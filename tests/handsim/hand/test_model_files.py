@@ -63,7 +63,7 @@ def test_cylinders_lie_along_the_capsules(model):
 
 
 FRAMES = 12
-PAGE = Path(__file__).parents[3] / "docs" / "how_to" / "other_programs.md"
+PAGE = Path(__file__).parents[3] / "docs" / "motion_files.md"
 
 
 @pytest.fixture(params=["right", "left"])
@@ -248,7 +248,7 @@ def test_opensim_has_bodies_and_markers_where_mujoco_has_them(fit, qpos, tmp_pat
 
 
 def test_inverse_kinematics_of_opensim_on_our_trc_finds_our_angles(fit, qpos, tmp_path, monkeypatch):
-    """The program of docs/how_to/other_programs.md, as it stands there."""
+    """The program of docs/motion_files.md, as it stands there."""
     opensim = pytest.importorskip("opensim")
     monkeypatch.chdir(tmp_path)
     qpos = qpos.copy()
