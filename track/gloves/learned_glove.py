@@ -51,7 +51,10 @@ _SAME: Final = 0.015  # [m] A marker that is nearer to a place is there.
 _SURE: Final = 0.9  # A marker is told as doubtful if its place has a smaller probability.
 _LOOKED_AT: Final = 300  # frames in which exchanged columns are looked for
 _OUTLIER: Final = 0.01  # [m] robust scale of poses then
-_EXCHANGED: Final = 0.02  # Exchanges in a larger share of them are told.
+_BENT: Final = 0.008  # [m] In frames where a marker is farther from its place, columns may be exchanged.
+_SUSPECTS: Final = 4  # The markers with the largest distances there are tried.
+_FITS_AGAIN: Final = 0.5  # An exchange leaves a smaller share of the squared distances.
+_EXCHANGED: Final = 0.02  # Exchanges in a larger share of the frames are told.
 _SHOWN: Final = 8  # names in a sentence
 # A point beyond every skin moves toward the middle of its bone, by these shares of the way.
 _INWARDS: Final = (0.0, 0.2, 0.4, 0.6)
@@ -307,24 +310,30 @@ def _probabilities(found: Sequence[FittedHand]) -> dict[str, float]:
 
 
 def _exchanges(one: _Found, hand: GloveFit, source: Capture) -> Iterator[str]:
-    """Sentences on columns that have another marker's points in a part of the capture."""
+    """Sentences on columns that have another marker's points in a part of the capture.
+
+    The hand bends to such points; if they are exchanged back, it fits again.
+    """
     names = hand.layout.names
     points = _canonical(one, names)
     seen = np.isfinite(points[..., 0]).sum(axis=1) >= FEWEST_MARKERS
     rows = spread_out(np.flatnonzero(seen), _LOOKED_AT)
-    poses = PoseSolver(hand, outlier_distance=_OUTLIER).solve(points[rows])
-    markers = hand.markers(poses.qpos)[0]
-    off = np.linalg.norm(points[rows] - markers, axis=2)
-    for first, second in itertools.combinations(range(len(names)), 2):
-        apart = np.linalg.norm(markers[:, first] - markers[:, second], axis=1)
-        crossed = np.maximum(
-            np.linalg.norm(points[rows, first] - markers[:, second], axis=1),
-            np.linalg.norm(points[rows, second] - markers[:, first], axis=1),
-        )
-        wrong = (crossed < 0.5 * apart) & (np.maximum(off[:, first], off[:, second]) > 0.5 * apart)
-        if wrong.mean() > _EXCHANGED:
-            time = rows[wrong.argmax()] / source.rate
+    squares = _squares(hand, points[rows])
+    bad = squares.max(axis=1) > _BENT**2
+    worst = np.argsort(squares[bad].mean(axis=0))[-_SUSPECTS:] if bad.any() else ()
+    for first, second in itertools.combinations(sorted(worst), 2):
+        changed = points[rows[bad]]
+        changed[:, [first, second]] = changed[:, [second, first]]
+        wrong = _squares(hand, changed).sum(axis=1) < _FITS_AGAIN * squares[bad].sum(axis=1)
+        if wrong.sum() > _EXCHANGED * len(rows):
+            time = rows[bad][wrong.argmax()] / source.rate
             yield f"{names[first]} and {names[second]} are exchanged from {time:.1f} s on, or for a time"
+
+
+def _squares(hand: GloveFit, points: Float[np.ndarray, "F M 3"]) -> Float[np.ndarray, "F M"]:
+    """Squared distance of each point from its marker on the posed hand [m^2]; zero where missing."""
+    poses = PoseSolver(hand, outlier_distance=_OUTLIER).solve(points)
+    return np.nan_to_num(((points - hand.markers(poses.qpos)[0]) ** 2).sum(axis=2))
 
 
 def _left_out(sources: Sequence[Capture], hands: Sequence[TrialHand]) -> Iterator[str]:

@@ -113,6 +113,21 @@ def test_a_start_is_corrected_from_a_capture_with_its_names():
     assert off.max() < 0.01, dict(zip(found.names, (1e3 * off).round(1), strict=True))
 
 
+@pytest.mark.parametrize(
+    "pair", [("IndexMCP", "MiddlePIP"), ("IndexPIP", "ThumbTip"), ("RingPIP", "PinkyPIP")]
+)
+def test_columns_that_are_exchanged_halfway_are_named(pair):
+    capture, truth = lab_trial("calibration", 400, 3)
+    designed = in_order_of(truth, truth)
+    assert learn_glove(capture, start=designed).doubt == ()
+    first, second = (next(name for name in truth if truth[name] == one) for one in pair)
+    both = [capture.names.index(first), capture.names.index(second)]
+    positions = capture.positions.copy()
+    positions[200:, both] = positions[200:, both[::-1]]
+    (told,) = learn_glove(dataclasses.replace(capture, positions=positions), start=designed).doubt
+    assert {first, second} <= set(told.split()) and "exchanged" in told
+
+
 def test_captures_without_a_radius_are_refused():
     with pytest.raises(HandSimError, match="the radius of the markers is unknown; give radius_mm"):
         learn_glove(Capture(("A", "B"), np.zeros((3, 2, 3)), 120.0))
