@@ -12,7 +12,6 @@ wrong if the points with some label are mostly another marker's, or of no marker
 from __future__ import annotations
 
 import dataclasses
-import json
 import warnings
 from functools import cache, partial
 from pathlib import Path
@@ -23,7 +22,7 @@ import torch
 from rich import print as show
 
 from benchmarks.mirror_like import GLOVES, mirror_like
-from benchmarks.record import describe, number_table, run
+from benchmarks.record import describe, kept_rows, number_table, run
 from gloves import MarkerLayout, MarkerPlace, Take
 from gloves.fit import attach_markers
 from handsim import HandModel
@@ -143,16 +142,15 @@ def summary(rows: list[dict[str, Any]]) -> None:
 def main(out: Path = Path("alternatives.json"), takes: int = 200, seed: int = 7000, first: int = 0) -> None:
     torch.set_num_threads(1)
     print(describe("torch", "numba"))
-    rows = [json.loads(line) for line in out.read_text().splitlines()] if out.exists() else []
-    done = {row["number"] for row in rows}
-    for number in (one for one in range(first, first + takes) if one not in done):
+
+    def make(number: int) -> dict[str, Any]:
         take, true, about = labeled(number, seed)
-        rows.append(about | outcome(take, true))
-        with out.open("a") as file:
-            file.write(json.dumps(rows[-1]) + "\n")
+        row = about | outcome(take, true)
         share = 100 * np.mean(true == take.point_list.labels)
-        print(*about.values(), f"{share:.2f} % right, wrong {rows[-1]['wrong']}", flush=True)
-    summary(rows)
+        print(*about.values(), f"{share:.2f} % right, wrong {row['wrong']}", flush=True)
+        return row
+
+    summary(kept_rows(out, range(first, first + takes), make))
 
 
 if __name__ == "__main__":

@@ -10,7 +10,6 @@ python -m benchmarks.layout_forecast FOLDER [--layouts dense19 mirror0]
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -20,7 +19,7 @@ import numpy as np
 from scipy.stats import spearmanr
 
 from benchmarks.mirror_like import mirror_like
-from benchmarks.record import Figures, describe, report, run
+from benchmarks.record import Figures, describe, kept, report, run
 from gloves import MarkerLayout, MarkerPlace, load_layout
 from handsim.hand.shape import BONE_NAMES, DIGITS, bones_of
 from track.glove_improvement import sample_places
@@ -36,7 +35,6 @@ Row = dict[str, Any]
 def main(folder: Path, layouts: tuple[str, ...] = (), save: str | None = None) -> None:
     print(describe("torch", "numpy"))
     chosen = [layout for layout in chosen_layouts() if not layouts or layout.name in layouts]
-    folder.mkdir(parents=True, exist_ok=True)
     # The same seeds of all layouts come first, so that a part of the run is of many layouts.
     for seed, layout, work in product(_in_turn(), chosen, WORK):
         row = captured(folder, layout, work, seed)
@@ -47,14 +45,14 @@ def main(folder: Path, layouts: tuple[str, ...] = (), save: str | None = None) -
 
 def captured(folder: Path, layout: MarkerLayout, work: str, seed: int) -> Row:
     """Shares of right slots of a capture, by method, and the probability that labels are wrong throughout."""
-    path = folder / f"{layout.name}-{WORK[work]}-{seed}.json"
-    if not path.exists():
+
+    def make() -> Row:
         take = simulate_take(WORK[work], glove=layout, num_frames=FRAMES, seed=seed)
         trial = try_take(take, layout, load_labeler(layout))
-        row = {method: trial.share(method) for method in METHODS}
         said = [[one.words, one.probability] for one in trial.alternatives]
-        path.write_text(json.dumps({**row, "wrong": trial.wrong, "said": said}))
-    found: Row = json.loads(path.read_text())
+        return {**{method: trial.share(method) for method in METHODS}, "wrong": trial.wrong, "said": said}
+
+    found: Row = kept(folder / f"{layout.name}-{WORK[work]}-{seed}.json", make)
     return found
 
 

@@ -10,8 +10,8 @@ glove; gloves that it has are not made again.
 from __future__ import annotations
 
 import dataclasses
-import json
 import warnings
+from functools import partial
 from pathlib import Path
 from time import process_time
 from typing import Any
@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from benchmarks.record import describe, run
+from benchmarks.record import describe, kept_rows, run
 from gloves import Capture, MarkerLayout
 from gloves.fit import attach, settle_glove
 from handsim import HandModel
@@ -73,39 +73,29 @@ def compared(layout: MarkerLayout, found: MarkerLayout) -> dict[str, Any]:
     return {"off": off.tolist(), "right": right, "digits": list(map(bool, digits)), "clear": clear}
 
 
+def outcome(number: int, seed: int) -> dict[str, Any]:
+    """What was learned of one glove: see `compared`; or why it was refused."""
+    layout, kind, side = random_glove(number, seed), KINDS[number % 2], SIDES[number // 2 % 2]
+    captures = [labeled_capture(layout, kind, side, seed + 2 * number + person) for person in (0, 1)]
+    began, row = process_time(), {"number": number, "markers": layout.num_markers, "kind": kind}
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            learned = learn_glove(captures, radius_mm=1e3 * RADIUS)
+        row |= {"side": learned.layout.sides == (side,), "told": learned.doubt}
+        row |= compared(layout, learned.layout)
+        share = 100 * np.mean(np.array(row["right"])[np.array(row["clear"])])
+        print(f"glove {number}: bones {share:.0f} %, off {np.median(row['off']):.1f} mm", flush=True)
+    except HandSimError as error:
+        row |= {"refused": str(error)}
+        print(f"glove {number}: {error}", flush=True)
+    return row | {"seconds": process_time() - began}
+
+
 def main(out: Path = Path("learned.json"), gloves: int = 40, seed: int = 9100, first: int = 0) -> None:
     torch.set_num_threads(1)
     print(describe("torch", "numba"))
-    rows = [json.loads(line) for line in out.read_text().splitlines()] if out.exists() else []
-    done = {row["number"] for row in rows}
-    for number in (one for one in range(first, first + gloves) if one not in done):
-        layout, kind, side = random_glove(number, seed), KINDS[number % 2], SIDES[number // 2 % 2]
-        captures = [labeled_capture(layout, kind, side, seed + 2 * number + person) for person in (0, 1)]
-        began, row = process_time(), {"number": number, "markers": layout.num_markers, "kind": kind}
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
-                learned = learn_glove(captures, radius_mm=1e3 * RADIUS)
-            row |= {"side": learned.layout.sides == (side,), "told": learned.doubt}
-            row |= compared(layout, learned.layout)
-        except HandSimError as error:
-            row |= {"refused": str(error)}
-        row["seconds"] = process_time() - began
-        rows.append(row)
-        with out.open("a") as file:
-            file.write(json.dumps(row) + "\n")
-        print(
-            {key: value for key, value in row.items() if key not in ("off", "right", "digits", "clear")},
-            end=" ",
-        )
-        if "off" in row:
-            sure = np.array(row["clear"])
-            share = 100 * np.mean(np.array(row["right"])[sure])
-            print(
-                f"bones {share:.0f} %, off {np.median(row['off']):.1f} mm, worst {np.max(row['off']):.1f}",
-                flush=True,
-            )
-    summary(rows)
+    summary(kept_rows(out, range(first, first + gloves), partial(outcome, seed=seed)))
 
 
 def summary(rows: list[dict[str, Any]]) -> None:

@@ -10,15 +10,15 @@ outcomes in a folder, from which another run continues.
 
 from __future__ import annotations
 
-import json
 import warnings
+from functools import partial
 from itertools import product
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from benchmarks.record import describe, run
+from benchmarks.record import describe, kept, run
 from gloves import MarkerLayout, MarkerPlace, Take, load_layout
 from track import find_suspect_spans, label_capture, track_capture
 from train import load_labeler, simulate_take
@@ -85,13 +85,7 @@ def main(
     rows: dict[str, list[list[float]]] = {"label": [], "track": []}
     for number, seed, kind in product(gloves, seeds, KINDS):
         path = None if store is None else store / f"{number}_{kind}_{seed}_{frames}.json"
-        if path is not None and path.exists():
-            found = json.loads(path.read_text())
-        else:
-            found = outcome(number, kind, seed, frames)
-            if path is not None:
-                path.parent.mkdir(parents=True, exist_ok=True)
-                path.write_text(json.dumps(found))
+        found = kept(path, partial(outcome, number, kind, seed, frames))
         for name, row in found.items():
             rows[name].append(row)
         told = "; ".join(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import os
 import platform
@@ -81,39 +80,8 @@ def resident_memory() -> int:
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
-@dataclasses.dataclass(frozen=True)
-class Conditions:
-    """What the figures of a run of `benchmarks.speed` depend on."""
-
-    seeds: tuple[int, ...]
-    is_quick: bool
-    """Whether every part was tried with a few frames."""
-    left_out: tuple[str, ...]
-    """Sections, and other software, that were not measured."""
-    processors: int
-    """Processors that the run was allowed to use."""
-    vectors: str
-    """Vector instructions that torch found, such as AVX512."""
-    threads: dict[str, str]
-    """What each library that has threads of its own was told, by library."""
-    load: tuple[float, float]
-    """Processes that wanted to run in the last minute, before the run and at its end."""
-
-    def __str__(self) -> str:
-        """Sentences of a page on the run."""
-        seeds = ", ".join(map(str, self.seeds))
-        few = " a few frames of" if self.is_quick else ""
-        left_out = f"Left out: {'; '.join(self.left_out)}" if self.left_out else "Nothing was left out"
-        threads = ", ".join(f"{library} {count}" for library, count in self.threads.items())
-        return (
-            f"This run was of{few} the seeds {seeds}, on {self.processors} processors with {self.vectors}. "
-            f"{left_out}. Threads: {threads}. {self.load[0]:.1f} processes wanted to run before it, and "
-            f"{self.load[1]:.1f} at its end."
-        )
-
-
 def save_figures(
-    name: str | None, figures: Figures, folder: Path = FOLDER, conditions: Conditions | None = None
+    name: str | None, figures: Figures, folder: Path = FOLDER, conditions: str | None = None
 ) -> Path | None:
     """Write the figures of one benchmark, in place of those that its file had.
 
@@ -121,7 +89,7 @@ def save_figures(
         name: Name of the file, without its ending; None writes nothing.
         figures: The figures.
         folder: Folder of the files.
-        conditions: What they depend on.
+        conditions: What they depend on, in sentences.
 
     Returns:
         The file.
@@ -143,7 +111,7 @@ def save_figures(
         "date": date.today().isoformat(),
     }
     if conditions is not None:
-        head["conditions"] = dataclasses.asdict(conditions)
+        head["conditions"] = conditions
     rows = {key: {"what": what, "value": _rounded(value)} for key, (what, value) in figures.items()}
     path.write_text(file_text(head, rows), "utf-8")
     return path
@@ -166,6 +134,30 @@ def _rounded(value: Any) -> Any:
     if not np.isfinite(number):
         return None
     return int(number) if number.is_integer() else number
+
+
+def kept(path: Path | None, make: Callable[[], Any]) -> Any:
+    """What a JSON file holds; where it is missing, it is made and kept there. Without a path it is made."""
+    if path is None:
+        return make()
+    if not path.exists():
+        made = json.dumps(make())
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(made)
+    return json.loads(path.read_text())
+
+
+def kept_rows(
+    path: Path, numbers: Iterable[int], make: Callable[[int], dict[str, Any]]
+) -> list[dict[str, Any]]:
+    """Rows by their key `number`, a JSON line each; those that the file lacks are made and added to it."""
+    rows = [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+    done = {row["number"] for row in rows}
+    for number in (one for one in numbers if one not in done):
+        rows.append(make(number))
+        with path.open("a") as file:
+            file.write(json.dumps(rows[-1]) + "\n")
+    return rows
 
 
 def load_figures(folder: Path = FOLDER) -> dict[str, SimpleNamespace]:

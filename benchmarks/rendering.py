@@ -3,9 +3,7 @@
     python -m benchmarks.rendering [--frames 200]
 
 What is timed are 640 x 480 pictures of two hands from a simulated take: depth alone; colors, depth, ids and
-keypoints; the same painted by OpenGL, and written as WebDataset. Beside them the loop that a user would write
-with pyrender (the same meshes, plain material, one light) and MuJoCo's own renderer (the hand's capsules, no
-skin), each for depth and for colors.
+keypoints; the same painted by OpenGL, and written as WebDataset.
 """
 
 from __future__ import annotations
@@ -18,7 +16,6 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Final
 
-import mujoco
 import numpy as np
 import trimesh
 from torch.utils.data import DataLoader
@@ -29,7 +26,6 @@ from handsim.app.workers import run_jobs
 from render import PictureStream, RenderConfig, RenderedFrame, ViewConfig
 from render.formats.writer import open_writer
 from render.painting.figures import sample_appearance
-from render.painting.opengl import OPENGL_FROM_OPENCV, load_pyrender, offscreen_renderer
 from render.painting.rasterizer import join, rasterize
 from render.session import Drawing
 from render.skin.look import ALL_TONES
@@ -85,42 +81,6 @@ def rate_in_processes(job: Callable[[int], int], cores: int, frames: int) -> flo
         ends.append(time.perf_counter())
     steady = ends[1 + cores : -cores]  # the first is drawn before there are processes
     return (len(steady) - 1) * frames / (steady[-1] - steady[0])
-
-
-def plain_pyrender(take: Take, color: bool, size: tuple[int, int] = (640, 480)) -> None:
-    """What a user would write: one scene per frame, skinned meshes, one light."""
-    pyrender = load_pyrender()
-    view = Viewpoints(PLAIN.view, take, rng=np.random.default_rng(0))
-    renderer = offscreen_renderer(*size)
-    for frame in range(take.num_frames):
-        scene, camera = pyrender.Scene(), view.cameras(frame)[0]
-        for number, hand in enumerate(take.hands):
-            skin = hand.model.skin(take.qpos[frame : frame + 1, number])[0]
-            mesh = trimesh.Trimesh(skin, hand.model.surface.faces, process=False)
-            scene.add(pyrender.Mesh.from_trimesh(mesh))
-        pose = camera.T_world_camera @ OPENGL_FROM_OPENCV
-        scale = size[1] / 480
-        lens = pyrender.IntrinsicsCamera(600.0 * scale, 600.0 * scale, size[0] / 2, size[1] / 2)
-        scene.add(lens, pose=pose)
-        scene.add(pyrender.DirectionalLight(intensity=3.0), pose=pose)
-        renderer.render(scene, flags=pyrender.RenderFlags.NONE if color else pyrender.RenderFlags.DEPTH_ONLY)
-
-
-def mujoco_loop(take: Take, color: bool) -> None:
-    """MuJoCo's renderer on one hand's capsules; it needs MUJOCO_GL=egl where there is no screen."""
-    model = take.hands[0].model.mj_model
-    data = mujoco.MjData(model)
-    with mujoco.Renderer(model, 480, 640) as renderer:
-        if not color:
-            renderer.enable_depth_rendering()
-        camera = mujoco.MjvCamera()
-        camera.distance = 0.6
-        for qpos in take.qpos[:, 0]:
-            data.qpos[:] = qpos
-            mujoco.mj_kinematics(model, data)
-            camera.lookat[:] = qpos[:3]
-            renderer.update_scene(data, camera)
-            renderer.render()
 
 
 def jobs(frames: int, folder: Path) -> dict[str, tuple[str, Callable[[int], int]]]:

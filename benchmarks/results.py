@@ -10,7 +10,7 @@ import json
 from pathlib import Path
 from typing import Final
 
-from benchmarks.record import FOLDER, Conditions, load_figures
+from benchmarks.record import FOLDER, load_figures
 from benchmarks.trust import PAGE as TRUST
 from benchmarks.trust import trust_page
 
@@ -44,7 +44,7 @@ def speed_run(folder: Path = FOLDER) -> str:
     """Where the figures of speed.json come from, in sentences; what the file does not tell is not told."""
     kept = json.loads((folder / "speed.json").read_text("utf-8"))
     origin = f"Commit {kept['commit']}, {kept['date']}, `{kept['command']}`; {kept['machine']}."
-    return f"{Conditions(**kept['conditions'])} {origin}" if "conditions" in kept else origin
+    return f"{kept['conditions']} {origin}" if "conditions" in kept else origin
 
 
 def speed_tables(folder: Path = FOLDER) -> tuple[str, str]:

@@ -1,7 +1,7 @@
 """Every speed that pages quote, in one run, each also in a unit that the machine gave a moment before.
 
     OPENBLAS_NUM_THREADS=1 MUJOCO_GL=egl python -m benchmarks.speed
-        [--only tracker labels ...] [--seeds 0 1 2 3 4] [--cnn RUN] [--quick] [--save speed]
+        [--only tracker labels ...] [--seeds 0 1 2 3 4] [--quick] [--save speed]
 
 The unit is the time of 1,000 calls of MuJoCo's `mj_kinematics` on our hand, measured anew before each
 section: where another machine or another hour has another unit, compare figures in units. Times are the
@@ -11,16 +11,12 @@ tracker: a frame with two hands, for each kind of capture, of the true hands and
     calibrate them; of hand-hand with a new ID for every point in every frame; a frame in which both hands are
     initialized, and the longest of five frames after a second of darkness.
 labels: one hand with drops and ghosts, alone and in batches; of a glove without weights, and learning it.
-paper: the same by the paper's network (trained, with --cnn), one view of a hand, which is all that is tried
-    where the first one fits, and its images.
 commands: `handsim label` and `handsim track` of captures of 24 and 1,200 frames, and `handsim label --help`.
-training: images that the paper's network learns from, alone and beside a busy process.
 pictures: 640 x 480 of two hands, in one process and in one a core, and written; the stream of training
-    pictures; a plain pyrender loop and MuJoCo's renderer.
+    pictures.
 generation: training frames of single hands and of the default mix.
-solvers: a pose from the frame before by our solver, MuJoCo's Jacobian in numpy, SciPy, and mink where it is
-    installed (`pip install --constraint constraints.txt "mink[daqp]"`), from nothing, and from eight starts.
-rays: lines of sight past a hand by our kernel and by `mj_multiRay`.
+solvers: a pose from the frame before, from nothing, and from eight starts.
+rays: lines of sight past a hand.
 
 Run it where nothing else runs. --quick tries every part with a few frames and one seed. The conditions of the
 run are printed and saved with its figures: seeds, what was left out, processors, threads and load.
@@ -29,14 +25,12 @@ run are printed and saved with its figures: seeds, what was left out, processors
 from __future__ import annotations
 
 import functools
-import multiprocessing
 import os
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Final, Literal, get_args
@@ -45,23 +39,23 @@ import mujoco
 import numpy as np
 import torch
 
-from benchmarks import inverse_kinematics, rendering
-from benchmarks.agreement import blocked_rays
+from benchmarks import rendering
 from benchmarks.held_out import held_out_markers
-from benchmarks.paper.take_evaluation import nominal_users, seen_frame, true_users
-from benchmarks.paper.trials import hide_points
-from benchmarks.record import Conditions, Figures, describe, run, save_figures, timed
-from benchmarks.tracking import calibrated_users, labeler, twin
+from benchmarks.paper.take_evaluation import hide_points, nominal_users, seen_frame, true_users
+from benchmarks.paper.tracking_tables import calibrated_users
+from benchmarks.record import Figures, describe, run, save_figures, timed
 from gloves import GloveFit, Take, load_layout, write_capture
 from gloves.fit import attach_markers
 from gloves.optics.visibility import free_rays
 from handsim import HandModel, join_qpos, load_rig
+from handsim.kernels import move
+from handsim.space.transforms import random_quaternions
+from poses import sample_motion
 from poses.shapes import sample_valid_angles
 from track import Tracker
+from track.kinematics.pose_solver import PoseSolver
 from train import (
-    CNNConfig,
     Corruption,
-    Dataset,
     GenerateSettings,
     Labeler,
     SceneMix,
@@ -69,23 +63,15 @@ from train import (
     load_labeler,
     simulate_take,
 )
-from train.data.batches import draw_batch
-from train.fabric import start_fabric
-from train.labelers.cnn_labeler import CNNLabeler
-from train.labelers.networks import labeler_of, new_network
-from train.labelers.protocol import torch_threads
 from train.labelers.storage import OnnxLabeler, export_onnx, load_network
-from train.loop import TrainingState
-from train.settings import batch_recipe, usual_settings
 from train.simulation.generation import make_dataset
 from train.simulation.scenes import KINDS
 
 NEW_GLOVE: Final = Path(__file__).parents[1] / "examples" / "ten_markers.toml"
 WARM_UP: Final = 30  # frames of a tracker that do not count
+NOISE: Final = 3e-4  # of markers [m]
 BEFORE, DARK, AFTER = 60, 120, 5  # frames around a second of darkness
-Section = Literal[
-    "tracker", "labels", "paper", "commands", "training", "pictures", "generation", "solvers", "rays"
-]
+Section = Literal["tracker", "labels", "commands", "pictures", "generation", "solvers", "rays"]
 CORES: Final = os.cpu_count() or 1
 COMMAND: Final = "import sys; from handsim.cli.main import main; sys.exit(main())"
 
@@ -93,8 +79,8 @@ COMMAND: Final = "import sys; from handsim.cli.main import main; sys.exit(main()
 class Speeds:
     """What is measured: printed, and kept as figures."""
 
-    def __init__(self, seeds: tuple[int, ...], cnn: Path | None, *, quick: bool) -> None:
-        self.seeds, self.cnn = seeds, cnn
+    def __init__(self, seeds: tuple[int, ...], *, quick: bool) -> None:
+        self.seeds = seeds
         self._quick = quick
         self.figures: Figures = {}
         self._unit = unit()
@@ -143,8 +129,18 @@ def each_time(job: Callable[[np.ndarray], object], inputs: Sequence[np.ndarray])
     return [timed(functools.partial(job, one)) for one in inputs]
 
 
+@cache
+def labeler() -> Labeler:
+    """The shipped labeler of dense19."""
+    return load_labeler("dense19")
+
+
 def tracker(speeds: Speeds) -> None:
-    takes = {kind: [twin(kind, speeds.some(1200, 120), seed) for seed in speeds.seeds] for kind in KINDS}
+    frames = speeds.some(1200, 120)
+    takes = {
+        kind: [simulate_take(kind=kind, num_frames=frames, seed=seed).without_body() for seed in speeds.seeds]
+        for kind in KINDS
+    }
     for kind, some in takes.items():
         Tracker(nominal_users(some[0]), labeler()).warm_up()
         key = kind.replace("-", "_")
@@ -222,20 +218,14 @@ def label(speeds: Speeds, key: str, what: str, some: Labeler, hands: list[np.nda
     speeds.times(f"{key}_batch", f"one hand of many, {what}", per_hand)
 
 
-def exported(network: torch.nn.Module, names: tuple[str, ...], folder: str) -> OnnxLabeler:
-    """A network as others get it."""
-    path = Path(folder) / "labeler.onnx"
-    export_onnx(network, names, path)
-    return OnnxLabeler(path)
-
-
 def labels(speeds: Speeds) -> None:
     hands = clouds("dense19", speeds.some(1000, 50), tuple(speeds.seeds))
     label(speeds, "set", "set labeler", load_labeler("dense19"), hands)
     network, card = load_network("dense19")
     with tempfile.TemporaryDirectory() as folder:
-        onnx = exported(network, tuple(card["marker_names"]), folder)
-        label(speeds, "set_onnx", "set labeler, onnxruntime", onnx, hands)
+        path = Path(folder) / "labeler.onnx"
+        export_onnx(network, tuple(card["marker_names"]), path)
+        label(speeds, "set_onnx", "set labeler, onnxruntime", OnnxLabeler(path), hands)
         before = os.environ.get("XDG_CACHE_HOME")
         os.environ["XDG_CACHE_HOME"] = folder  # where nothing was learned before
         try:
@@ -249,27 +239,6 @@ def labels(speeds: Speeds) -> None:
                 os.environ["XDG_CACHE_HOME"] = before
     hands = clouds(str(NEW_GLOVE), speeds.some(300, 20), tuple(speeds.seeds))
     label(speeds, "new_glove", "a glove without weights", learned, hands)
-
-
-def paper(speeds: Speeds) -> None:
-    hands = clouds("dense19", speeds.some(100, 10), tuple(speeds.seeds))
-    network = new_network(CNNConfig()) if speeds.cnn is None else load_network(speeds.cnn)[0]
-    names = load_layout("dense19").names
-    how = "untrained, so that it tries every view" if speeds.cnn is None else "trained"
-    with tempfile.TemporaryDirectory() as folder:
-        onnx = exported(network, names, folder)
-        label(speeds, "cnn_onnx", f"the paper's network, onnxruntime, {how}", onnx, hands)
-    ours = labeler_of(network, names)
-    label(speeds, "cnn", f"the paper's network, torch, {how}", ours, hands)
-    assert isinstance(ours, CNNLabeler)
-    upright = np.eye(3)[None]
-    views = each_time(lambda hand: ours.predict(hand[None], np.ones((1, len(hand)), bool), upright), hands)
-    speeds.times("cnn_view", "one hand in one view, the paper's network, torch", views)
-    images = torch.rand(8, 1, 52, 52)
-    with torch.inference_mode():
-        for count, key in ((1, "image"), (8, "eight_images")):
-            times = [timed(lambda: network(images[:count])) for _ in range(speeds.some(100, 5))]  # noqa: B023
-            speeds.times(key, f"the paper's network, torch, images at once: {count}", times)
 
 
 def commands(speeds: Speeds) -> None:
@@ -292,65 +261,14 @@ def commands(speeds: Speeds) -> None:
             speeds.times(key, shown, times[1:])  # the first compiles
 
 
-def training(speeds: Speeds) -> None:
-    config = usual_settings("cnn")
-    with tempfile.TemporaryDirectory() as folder:
-        make_dataset(GenerateSettings(num_frames=2000), Path(folder) / "set")
-        rows = Dataset(Path(folder) / "set").rows()
-        state = TrainingState(config, start_fabric(config, Path(folder)), rows)
-        rng, recipe = np.random.default_rng(0), batch_recipe(config, rows["markers"].shape[1])
-
-        def images(seconds: float) -> float:
-            """Images a second over a while."""
-            count, start = 0, time.perf_counter()
-            while time.perf_counter() - start < seconds:
-                state.step(draw_batch(rows, recipe, rng=rng), rng=rng)
-                count += config.batch
-            return count / (time.perf_counter() - start)
-
-        with torch_threads(CORES):
-            images(speeds.some(20, 1))
-            alone = images(speeds.some(60, 2))
-            with busy_process():
-                beside = images(speeds.some(60, 2))
-    speeds.rate("training", "images learned by the paper's network", alone)
-    speeds.rate("training_beside", "the same beside a busy process", beside)
-
-
-@contextmanager
-def busy_process() -> Iterator[None]:
-    """Within the block another process computes all the time."""
-    process = multiprocessing.get_context("spawn").Process(target=compute, daemon=True)
-    process.start()
-    try:
-        yield
-    finally:
-        process.kill()
-        process.join()
-
-
-def compute() -> None:
-    """Compute without end."""
-    while True:
-        sum(range(100_000))
-
-
 def pictures(speeds: Speeds) -> None:
     frames = speeds.some(200, 8)
-    take = rendering.a_take(frames)
     with tempfile.TemporaryDirectory() as folder:
         for key, (name, job) in rendering.jobs(frames, Path(folder)).items():
             speeds.rate(key, f"pictures, {name}", rendering.rate(functools.partial(job, 0), frames))
             if not speeds.some(0, 1):
                 many = rendering.rate_in_processes(job, CORES, frames)
                 speeds.rate(f"{key}_all", f"pictures, {name}, {CORES} processes", many)
-    for color, name in ((False, "depth"), (True, "colors")):
-        loop = functools.partial(rendering.plain_pyrender, take, color)
-        what = f"pictures, a plain pyrender loop, {name}"
-        speeds.rate(f"pyrender_{name}", what, rendering.rate(loop, frames))
-        loop = functools.partial(rendering.mujoco_loop, take, color)
-        what = f"pictures, MuJoCo's renderer, capsules without skin, {name}"
-        speeds.rate(f"mujoco_{name}", what, rendering.rate(loop, frames))
     stream = iter(rendering.a_stream())
     drawing = lambda: [next(stream) for _ in range(frames)]  # noqa: E731
     size = f"{rendering.CROP} x {rendering.CROP}"
@@ -359,10 +277,6 @@ def pictures(speeds: Speeds) -> None:
     seconds = timed(lambda: [next(batches) for _ in range(count)])
     many = count * rendering.BATCH / seconds
     speeds.rate("stream_all", f"pictures of the stream, {CORES} workers of a DataLoader", many)
-    one = simulate_take(kind="single-hand", num_frames=frames, hands=("right",))
-    loop = functools.partial(rendering.plain_pyrender, one, True, (rendering.CROP, rendering.CROP))
-    what = f"pictures, a plain pyrender loop, one hand, {size}, colors"
-    speeds.rate("pyrender_one", what, rendering.rate(loop, frames))
 
 
 def generation(speeds: Speeds) -> None:
@@ -378,8 +292,37 @@ def generation(speeds: Speeds) -> None:
 
 
 def solvers(speeds: Speeds) -> None:
-    for key, what, seconds in inverse_kinematics.times(speeds.seeds, speeds.some(300, 20)):
-        speeds.times(key, what, seconds)
+    model, frames = HandModel.named("M"), speeds.some(300, 20)
+    worn = attach_markers(load_layout("dense19"), model)
+    solver, followed, eight, cold = PoseSolver(GloveFit(model, worn)), [], [], []
+    for seed in speeds.seeds:
+        rng = np.random.default_rng(seed)
+
+        def seen(qpos: np.ndarray) -> np.ndarray:
+            """The markers of poses, with noise."""
+            points = worn.centers(model, model.forward_kinematics(qpos))
+            noisy: np.ndarray = points + NOISE * rng.standard_normal(points.shape)  # noqa: B023
+            return noisy
+
+        qpos = sample_motion(model, frames / 120.0, rng=rng).qpos
+        pose = qpos[:1]
+        for target in seen(qpos)[1:]:
+            start = time.perf_counter()
+            pose = solver.solve(target[None], pose).qpos
+            followed.append(time.perf_counter() - start)
+        starts = move(np.repeat(qpos, 8, axis=0), 0.03 * rng.standard_normal((8 * len(qpos), 26)))
+        pairs = zip(np.repeat(seen(qpos), 8, axis=0).reshape(-1, 8, *worn.points.shape),
+                    starts.reshape(-1, 8, starts.shape[-1]), strict=True)  # fmt: skip
+        eight += [timed(functools.partial(solver.solve, *pair)) for pair in pairs]
+        anywhere = join_qpos(
+            sample_valid_angles(model, frames, rng=rng),
+            position=rng.normal(size=(frames, 3)),
+            quaternion=random_quaternions(frames, rng=rng),
+        )
+        cold += [timed(functools.partial(solver.solve, target[None])) for target in seen(anywhere)]
+    speeds.times("solver_ours_skin", "a pose from the frame before", followed)
+    speeds.times("solver_eight", "a pose, eight starts", eight)
+    speeds.times("solver_cold", "a pose from nothing", cold)
 
 
 def rays(speeds: Speeds) -> None:
@@ -393,24 +336,11 @@ def rays(speeds: Speeds) -> None:
     lines = markers.shape[1] * len(cameras)
     ours = np.median([timed(lambda: free_rays(markers, cameras, segments, radii)) for _ in range(5)])
     speeds.rate("rays", "lines of sight past a hand", count * lines / float(ours))
-    data = mujoco.MjData(model.mj_model)
-
-    def by_mujoco(frames: Iterable[int]) -> None:
-        for frame in frames:
-            data.qpos[:] = qpos[frame]
-            mujoco.mj_kinematics(model.mj_model, data)
-            blocked_rays(model, data, markers[frame], cameras)
-
-    few = range(min(count, 200))
-    theirs = np.median([timed(lambda: by_mujoco(few)) for _ in range(5)])
-    what = "the same by mj_multiRay, kinematics included"
-    speeds.rate("rays_mujoco", what, len(few) * lines / float(theirs))
 
 
 def main(
     only: tuple[Section, ...] = get_args(Section),
     seeds: tuple[int, ...] = (0, 1, 2, 3, 4),
-    cnn: Path | None = None,
     quick: bool = False,
     save: str | None = None,
 ) -> None:
@@ -419,29 +349,19 @@ def main(
     torch.set_num_threads(1)
     torch.set_flush_denormal(True)
     print(describe("mujoco", "numba", "torch"))
-    speeds = Speeds(seeds[:1] if quick else seeds, cnn, quick=quick)
+    speeds = Speeds(seeds[:1] if quick else seeds, quick=quick)
     load = os.getloadavg()[0]
     for name in only:
         speeds.begin(name)
         globals()[name](speeds)
-    sections = [name for name in get_args(Section) if name not in only]
-    missing = [f"the sections {', '.join(sections)}"] if sections else []
-    if "solvers" in only and not inverse_kinematics.HAS_MINK:
-        missing.append("mink")
-    if "paper" in only and cnn is None:
-        missing.append("trained weights of the paper's network")
-    conditions = Conditions(
-        seeds=speeds.seeds,
-        is_quick=quick,
-        left_out=tuple(missing),
-        processors=len(os.sched_getaffinity(0)),
-        vectors=torch.backends.cpu.get_cpu_capability(),
-        threads={
-            "torch": str(torch.get_num_threads()),
-            "OpenBLAS": os.environ.get("OPENBLAS_NUM_THREADS", "as many as processors"),
-            "OpenMP": os.environ.get("OMP_NUM_THREADS", "as many as processors"),
-        },
-        load=(round(load, 2), round(os.getloadavg()[0], 2)),
+    left_out = ", ".join(name for name in get_args(Section) if name not in only) or "nothing"
+    openblas = os.environ.get("OPENBLAS_NUM_THREADS", "as many as processors")
+    cores, vectors = len(os.sched_getaffinity(0)), torch.backends.cpu.get_cpu_capability()
+    conditions = (
+        f"This run was of{' a few frames of' if quick else ''} the seeds "
+        f"{', '.join(map(str, speeds.seeds))}, on {cores} processors with {vectors}. Left out: {left_out}. "
+        f"Threads: torch {torch.get_num_threads()}, OpenBLAS {openblas}. {load:.1f} processes wanted to run "
+        f"before it, and {os.getloadavg()[0]:.1f} at its end."
     )
     print(f"\n{conditions}")
     save_figures(save, speeds.figures, conditions=conditions)

@@ -2,7 +2,7 @@
 
     python examples/14_train_a_keypoint_network.py [STEPS]     # 20 by default, too few to learn much
 
-No picture touches the disk. `benchmarks/keypoint_network.py` trains for hours and looks at photographs.
+No picture touches the disk. docs/picture_quality.md has figures of longer trainings, on photographs.
 """
 
 from __future__ import annotations

@@ -5,6 +5,9 @@ from __future__ import annotations
 import numpy as np
 import trimesh
 
+from handsim import HandModel
+from handsim.hand.capsules import overlap_between
+
 
 def blend_skin(points, bone_indices, bone_weights, rest_transforms, transforms):
     """Points (N, 3) at rest, carried by the bones into every pose (..., N, 3)."""
@@ -21,3 +24,11 @@ def winding(solid: trimesh.Trimesh, points: np.ndarray) -> np.ndarray:
     dot = np.einsum("pfi,pfi->pf", a, b) * lc + np.einsum("pfi,pfi->pf", b, c) * la
     dot += np.einsum("pfi,pfi->pf", c, a) * lb + la * lb * lc
     return 2 * np.arctan2(np.einsum("pfi,pfi->pf", a, np.cross(b, c)), dot).sum(axis=1) / (4 * np.pi)
+
+
+def hands_overlap(
+    right: HandModel, left: HandModel, right_qpos: np.ndarray, left_qpos: np.ndarray
+) -> np.ndarray:
+    """Deepest overlap (T,) of any capsule of one hand with any of the other [m]; negative where apart."""
+    bones = right.forward_kinematics(right_qpos), left.forward_kinematics(left_qpos)
+    return overlap_between(right.capsules, bones[0], left.capsules, bones[1])

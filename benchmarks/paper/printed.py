@@ -1,9 +1,7 @@
-"""What Han et al. 2018 printed, as shares; two of its tables are set right.
+"""What Han et al. 2018 printed, as shares; one of its tables is set right.
 
-Table 2's header is transposed in print: its rows are test sets and its columns networks, which its text and
-Table 4 (whose synthetic accuracy is the last cell) agree on. Table 5 has the paper's own figures of hand-hand
-and hand-pen in each other's row: 4477 frames are more than the 3312 of hand-hand, and 3101 of 3312 is the
-product of Table 7's two shares.
+Table 5 has the paper's own figures of hand-hand and hand-pen in each other's row: 4477 frames are more than
+the 3312 of hand-hand, and 3101 of 3312 is the product of Table 7's two shares.
 """
 
 from __future__ import annotations
@@ -24,17 +22,6 @@ class GapCounts(NamedTuple):
     average_missing: float
     """Average missing markers (AMF) of the frames that miss any; NaN without gaps."""
 
-
-AUGMENTATIONS: Final = ("Base", "Base+O", "Base+G", "Base+O+G")
-"""The networks and the test sets of Table 2."""
-
-TABLE2: Final = {
-    "Base": (0.9776, 0.9756, 0.9780, 0.9776),
-    "Base+O": (0.8335, 0.9287, 0.8426, 0.9351),
-    "Base+G": (0.9231, 0.9126, 0.9487, 0.9530),
-    "Base+O+G": (0.7401, 0.8188, 0.7685, 0.8581),
-}
-"""Accuracy by test set, then network."""
 
 TEST_SETS: Final = ("synthetic", "single-hand", "hand-hand", "hand-pen", "hand-controller")
 """Columns of Tables 4 and 6."""

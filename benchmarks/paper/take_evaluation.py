@@ -1,8 +1,8 @@
-"""Evaluation of a tracker on a simulated take: labels, poses and time per frame, against the truth."""
+"""Evaluation of a tracker on a simulated take: labels and poses, against the truth."""
 
 from __future__ import annotations
 
-import time
+import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple, Protocol
@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
-from benchmarks.paper.plain_hand import MOST_RMS
 from gloves import GloveFit, Take, load_layout
 from gloves.fit import nominal_fit
 from handsim import HandModel
@@ -20,6 +19,8 @@ from track import StreamedFrame, TrackedFrame
 from track.hand_size import fit_size, sample_frames
 from train import Labeler
 
+MOST_RMS: Final = 0.008
+"""RMS distance [m] above which a pose is rejected; Han et al. 2018, section 4.4."""
 OCCLUSIONS: Final = ((0, 0), (1, 2), (3, 5), (6, 99))
 """Classes of a hand's number of missing markers, from and to, for pose errors."""
 
@@ -56,15 +57,12 @@ class TrackingReport:
     """Mean distance of the wrist and the 15 joints of the digits from the truth [m]; NaN without a pose."""
     angle_error: Float[np.ndarray, "T H"]
     """Mean absolute error of the 20 joint angles [rad]; NaN without a pose."""
-    seconds: Float[np.ndarray, "T"]
-    """Computing time [s]."""
 
     def figures(self) -> dict[str, float]:
         """Averages over the take, by name; NaN where nothing was counted.
 
         Shares in [0, 1]: `right`; `valid`; `right_of_valid`, Table 7's second number; `valid_and_right`, its
-        product. Errors in frames with a pose: `joint_error` [m], `angle_error` [rad]. Time per frame [s]:
-        `seconds_p50`, `seconds_p99`.
+        product. Errors in frames with a pose: `joint_error` [m], `angle_error` [rad].
         """
         both = self.valid & self.right
         return {
@@ -74,8 +72,6 @@ class TrackingReport:
             "valid_and_right": float(both.mean()),
             "joint_error": _mean(self.joint_error),
             "angle_error": _mean(self.angle_error),
-            "seconds_p50": float(np.quantile(self.seconds, 0.5)),
-            "seconds_p99": float(np.quantile(self.seconds, 0.99)),
         }
 
     def by_occlusion(self) -> dict[tuple[int, int], tuple[int, float, float]]:
@@ -97,6 +93,15 @@ def seen_frame(take: Take, frame: int) -> SeenFrame:
     here = np.isfinite(take.points[frame, :, 0])
     labels = take.labels[frame, here].astype(np.int64)
     return SeenFrame(take.points[frame, here], take.ids[frame, here].astype(np.int64), labels)
+
+
+def hide_points(take: Take, first: int, frames: int) -> Take:
+    """A take with all points of some frames hidden, from `first` on; later points have new IDs."""
+    points = take.point_list
+    is_later = (points.frames >= first) & (points.ids >= 0)
+    ids = points.ids + np.where(is_later, points.ids.max(initial=-1) + 1, 0)
+    hidden = (points.frames >= first) & (points.frames < first + frames)
+    return dataclasses.replace(take, point_list=dataclasses.replace(points, ids=ids).without(hidden))
 
 
 def true_users(take: Take) -> list[GloveFit]:
@@ -158,12 +163,10 @@ def evaluate_tracker(
     """
     frames = range(take.num_frames)
     right, valid = np.zeros(len(frames), dtype=bool), np.zeros(len(frames), dtype=bool)
-    seconds, poses = np.zeros(len(frames)), np.full((len(users), len(frames), NUM_QPOS), np.nan)
+    poses = np.full((len(users), len(frames), NUM_QPOS), np.nan)
     for frame in frames:
         seen = seen_frame(take, frame)
-        start = time.perf_counter()
         tracked = tracker.step(seen.points, seen.ids, frame / take.rate)
-        seconds[frame] = time.perf_counter() - start
         right[frame], valid[frame] = is_right(take, tracked, seen), is_valid(tracked)
         poses[:, frame] = [hand.qpos for hand in tracked.hands]
         if done is not None:
@@ -174,7 +177,7 @@ def evaluate_tracker(
         for number, (user, hand) in enumerate(zip(users, take.hands, strict=True))
     ]
     joints, angles = (np.stack(parts, axis=1) for parts in zip(*errors, strict=True))
-    return TrackingReport(right, valid, np.stack(missing, axis=1), joints, angles, seconds)
+    return TrackingReport(right, valid, np.stack(missing, axis=1), joints, angles)
 
 
 def is_right(take: Take, tracked: TrackedFrame, seen: SeenFrame) -> bool:

@@ -1,334 +1,201 @@
-"""The paper's tables of tracking, with its figures in separate rows."""
+"""Tables 5 and 7 of the paper, and few cameras: our tracker and the paper's loop on the same takes."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Final
 
 import numpy as np
 import tyro
-from jaxtyping import Float
-from rich.console import Console
-from rich.table import Table
 
-from benchmarks.paper.comparison import (
-    NEED_FIRST_LABELS,
-    OURS,
-    PAPERS_LOOP,
-    TRIALS,
-    USERS,
-    Measurement,
-    compare_trackers,
-    measure_with_body,
-    trackers,
+from benchmarks.paper.paper_tracker import PaperTracker
+from benchmarks.paper.printed import CAMERAS, CAMERAS_FRAMES, TABLE5, TABLE7
+from benchmarks.paper.take_evaluation import (
+    OCCLUSIONS,
+    FrameTracker,
+    TrackingReport,
+    evaluate_tracker,
+    measured_users,
+    true_users,
 )
-from benchmarks.paper.printed import CAMERAS, CAMERAS_FRAMES, HAN, TABLE5, TABLE7
-from benchmarks.record import Figures, number_table, save_figures
-from gloves import Take
+from benchmarks.record import Figures, report
+from gloves import GloveFit, Take
 from handsim.app.messages import progress_bar
-from train import SimulateSettings, load_labeler, simulate_take
-from train.simulation.scenes import KINDS
+from handsim.space.objects import named_object
+from track import RigidTemplate, Tracker, calibrate
+from train import Labeler, SimulateSettings, load_labeler, simulate_take
+from train.simulation.scenes import KINDS, CalibrationTakeConfig
+from train.simulation.takes import simulate_calibration
 
-_HEAD: Final = ("method", "hands")
-_PAPERS_GLOVE: Final = "dense19"
-_WITH_BODY: Final = "hand-controller"
-_METHOD_KEYS: Final = dict(
-    zip((OURS, PAPERS_LOOP, *NEED_FIRST_LABELS), ("", "loop_", "nearest_", "hungarian_"), strict=True)
-)
-_USER_KEYS: Final = {"calibrated": "true", "uncalibrated": "size"}
-
-
-@dataclass(frozen=True, slots=True)
-class TableConfig:
-    """Settings of a table of tracking."""
-
-    glove: str = _PAPERS_GLOVE
-    """Marker layout: a shipped name or the path of a .toml file."""
-    labeler: Path | None = None
-    """Folder of a trained labeler, or an exported .onnx file; the shipped one when not given."""
-    num_frames: int | None = None
-    """Frames of each capture; the paper's numbers when not given."""
-    seed: int = 0
-    """Seed of the captures and of random choices in tracking; 0 gives the twins."""
-    save: str | None = None
-    """Name under which the figures are kept in benchmarks/figures, such as table5_seed1."""
-
-
-_Config = Annotated[TableConfig, tyro.conf.arg(name="")]
+GLOVE: Final = "dense19"
+WITH_BODY: Final = "hand-controller"
+TRACKERS: Final[dict[str, Callable[[Sequence[GloveFit], Labeler, int], FrameTracker]]] = {
+    "handsim": lambda hands, labeler, _: Tracker(hands, labeler),
+    "paper's loop": lambda hands, labeler, seed: PaperTracker(
+        hands, labeler, rng=np.random.default_rng(seed)
+    ),
+}
+USERS: Final[dict[str, Callable[[Take, Labeler], list[GloveFit]]]] = {
+    "calibrated": lambda take, _: true_users(take),
+    "uncalibrated": measured_users,
+}
+_KEYS: Final = {"handsim": "", "paper's loop": "loop_", "calibrated": "true", "uncalibrated": "size"}
+_ERRORS: Final = "errors of joints [mm], angles [deg], by markers missing: none, 1-2, 3-5, 6 or more"
+Measured = dict[tuple[str, str], dict[str, TrackingReport]]
+"""Reports by tracker and users, then by capture."""
+_Labeler = Annotated[Path | None, tyro.conf.arg(help="Folder of a trained labeler, or an .onnx file.")]
+_Frames = Annotated[int | None, tyro.conf.arg(help="Frames of each capture; the paper's when not given.")]
+_Seed = Annotated[int, tyro.conf.arg(help="Seed of captures and of the paper's loop; 0 gives the twins.")]
+_Save = Annotated[str | None, tyro.conf.arg(help="Name of the file in benchmarks/figures.")]
 
 
-def table5(config: _Config) -> None:
-    """Trackers on the twins of the paper's captures: frames all of whose labels are right; errors.
+def table5(labeler: _Labeler = None, num_frames: _Frames = None, seed: _Seed = 0, save: _Save = None) -> None:
+    """Tables 5 and 7: frames all of whose labels are right, frames whose poses fit, and errors."""
+    network = load_labeler(GLOVE, labeler)
+    takes = {kind: simulate_take(kind=kind, num_frames=num_frames, seed=seed) for kind in KINDS}
+    measured = compare_trackers({kind: take.without_body() for kind, take in takes.items()}, network, seed)
+    body = measure_with_body(takes[WITH_BODY], network)
+    with_body = {
+        f"body_{_KEYS[users]}": (f"{WITH_BODY}, controller too, right [%]: handsim, {users}", share)
+        for users, share in body.items()
+    }
+    report(save, printed_figures() | table_figures(measured) | with_body)
+
+
+def cameras(
+    rig: str = "six",
+    labeler: _Labeler = None,
+    num_frames: int = CAMERAS_FRAMES,
+    seed: _Seed = 0,
+    save: _Save = None,
+) -> None:
+    """Hands in the air before fewer cameras: the paper switches off more than half of its 16."""
+    take = simulate_take(settings=SimulateSettings("single-hand", num_frames, GLOVE, rig, seed))
+    figures: Figures = {
+        "paper": ("Han 2018, calibrated: valid, right of these [%]", 100 * np.array(CAMERAS)),
+        "missing": (f"share of markers missing before rig {rig} [%]", 100 * missing_share(take)),
+    }
+    for (method, users), reports in compare_trackers(
+        {"single-hand": take}, load_labeler(GLOVE, labeler), seed
+    ).items():
+        one = reports["single-hand"].figures()
+        shares = [100 * one[name] for name in ("valid", "right_of_valid", "valid_and_right")]
+        errors = [1e3 * one["joint_error"], np.rad2deg(one["angle_error"])]
+        what = f"valid, right of these, both [%]; joints [mm], joint angles [deg]: {method}, {users}"
+        figures[_KEYS[method] + _KEYS[users]] = what, [*shares, *errors]
+    report(save, figures)
+
+
+def calibrated(num_frames: _Frames = None, seed: _Seed = 0, free: float = 40.0, save: _Save = None) -> None:
+    """Our tracker with hands that `handsim calibrate` finds in a capture of the same people.
 
     Args:
-        config: Settings of the measurement.
+        num_frames: Frames of each capture; the paper's when not given.
+        seed: Seed of the captures; 0 gives the twins.
+        free: Free motion in the calibration captures [s].
+        save: Name of the file in benchmarks/figures.
     """
-    takes, measured = _measure(config, trials=TRIALS)
-    with_body = _measure_with_body(takes[_WITH_BODY], config)
-    console = Console()
-    console.print(print_table5([*measured, *with_body], with_paper=config.glove == _PAPERS_GLOVE))
-    console.print(*print_errors(measured), print_trials(measured), sep="\n")
-    save_figures(config.save, table5_figures(measured) | body_figures(with_body))
-
-
-def table7(config: _Config) -> None:
-    """Trackers with calibrated hands and without: frames whose poses fit, and those of them that are right.
-
-    Args:
-        config: Settings of the measurement.
-    """
-    _, measured = _measure(config)
-    Console().print(print_table7(measured, with_paper=config.glove == _PAPERS_GLOVE))
-    save_figures(config.save, table7_figures(measured))
-
-
-def cameras(config: _Config, rig: str = "six") -> None:
-    """Trackers on hands in the air before fewer cameras: the paper switches off more than half of its 16.
-
-    Args:
-        config: Settings of the measurement; the paper has 2875 frames.
-        rig: Camera rig: a shipped name or the path of a .toml file.
-    """
-    num_frames = CAMERAS_FRAMES if config.num_frames is None else config.num_frames
-    twin = SimulateSettings("single-hand", num_frames, config.glove, rig, config.seed)
-    takes, measured = _measure_on({"single-hand": twin}, config)
-    missing = 1.0 - takes["single-hand"].markers_present().mean()
-    with_paper = config.glove == _PAPERS_GLOVE
-    Console().print(print_cameras(measured, missing, rig=rig, with_paper=with_paper))
-    what = f"share of markers missing before rig {rig} [%]"
-    save_figures(config.save, cameras_figures(measured) | {"missing": (what, 100 * missing)})
+    network, reports = load_labeler(GLOVE), {}
+    for kind in KINDS:
+        take = simulate_take(kind=kind, num_frames=num_frames, seed=seed).without_body()
+        hands = calibrated_users(take, seed, free)
+        reports[kind] = evaluate_tracker(take, hands, Tracker(hands, network))
+    errors = np.nanmax([errors_by_occlusion([one]) for one in reports.values()], axis=0)
+    report(
+        save,
+        {
+            "right": (f"frames all of whose labels are right [%]: {', '.join(reports)}", _right(reports)),
+            "errors": (f"mean {_ERRORS}: calibrated from a capture, the worst of the takes", errors),
+        },
+    )
 
 
 TRACKING_TABLES: Final[dict[str, Callable[..., None]]] = {
     "table5": table5,
-    "table7": table7,
     "cameras": cameras,
+    "calibrated": calibrated,
 }
 
 
-def _measure(config: TableConfig, *, trials: int = 0) -> tuple[dict[str, Take], list[Measurement]]:
-    """Simulate captures of all kinds, and run all trackers over them."""
-    twins: dict[str, SimulateSettings] = {
-        kind: SimulateSettings(kind, config.num_frames, config.glove, seed=config.seed) for kind in KINDS
-    }
-    return _measure_on(twins, config, trials=trials)
-
-
-def _measure_on(
-    twins: Mapping[str, SimulateSettings], config: TableConfig, *, trials: int = 0
-) -> tuple[dict[str, Take], list[Measurement]]:
-    """Simulate captures, and run all trackers over them without their bodies, which most cannot track."""
-    network = load_labeler(config.glove, config.labeler)
-    takes: dict[str, Take] = {}
-    with progress_bar("captures") as bar:
-        bar(0, len(twins))
-        for kind, twin in twins.items():
-            takes[kind] = simulate_take(settings=twin)
-            bar.advance()
-    bare = {kind: take.without_body() for kind, take in takes.items()}
-    frames = sum(take.num_frames for take in takes.values())
-    with progress_bar("frames") as bar:
-        bar(0, frames * len(USERS) * len(trackers(network, config.seed)))
-        measured = compare_trackers(bare, network, seed=config.seed, trials=trials, done=bar.advance)
-    return takes, measured
-
-
-def _measure_with_body(take: Take, config: TableConfig) -> list[Measurement]:
-    """Our tracker on the capture whose object has markers, with the object tracked as well."""
-    network = load_labeler(config.glove, config.labeler)
-    with progress_bar("frames") as bar:
-        bar(0, take.num_frames * len(USERS))
-        return measure_with_body(_WITH_BODY, take, network, done=bar.advance)
-
-
-def table5_figures(measured: Sequence[Measurement]) -> Figures:
-    """The figures of Table 5 and of the tables below it."""
-    kept: Figures = {}
-    for key, who, row in _keyed(measured):
-        right = [100 * one.report.figures()["right"] for one in row]
-        errors = [
-            _mean_errors([one.report.by_occlusion()[bound] for one in row])
-            for bound in row[0].report.by_occlusion()
-        ]
-        kept[f"right_{key}"] = f"frames all of whose labels are right [%], {_captures(row)}: {who}", right
-        kept[f"errors_{key}"] = (
-            f"mean errors of joints [mm], angles [deg], by markers missing: none, 1-2, 3-5, 6 or more: {who}",
-            [[1e3 * joint, np.rad2deg(angle)] for joint, angle in errors],
-        )
-        if row[0].method == PAPERS_LOOP and row[0].users == "calibrated" and len(row[0].recovery):
-            waits = [np.concatenate([one.initialization for one in row])]
-            waits.append(np.concatenate([one.recovery for one in row]))
-            never = [np.where(np.isnan(wait), np.inf, wait) for wait in waits]
-            kept["loop_starts"] = (
-                "the paper's loop, frames until all is right: median, p90 from nothing, after a dark second",
-                np.ravel([np.quantile(wait, [0.5, 0.9], method="higher") for wait in never]),
-            )
-    return kept
-
-
-def body_figures(measured: Sequence[Measurement]) -> Figures:
-    """The figures of our tracker with a body beside the hands."""
-    return {
-        f"body_{_USER_KEYS[one.users]}": (
-            f"{one.capture}, frames all of whose labels are right [%]: {one.method}, {one.users}",
-            100 * one.report.figures()["right"],
-        )
-        for one in measured
-    }
-
-
-def table7_figures(measured: Sequence[Measurement]) -> Figures:
-    """The figures of Table 7."""
-    kept: Figures = {}
-    for key, who, row in _keyed(measured):
-        figures = [one.report.figures() for one in row]
-        shares = [[100 * one["valid"], 100 * one["right_of_valid"]] for one in figures]
-        kept[key] = f"valid frames, right ones of these [%], {_captures(row)}: {who}", shares
-    return kept
-
-
-def cameras_figures(measured: Sequence[Measurement]) -> Figures:
-    """The figures of few cameras."""
-    kept: Figures = {}
-    for key, who, (one,) in _keyed(measured):
-        figures = one.report.figures()
-        shares = [100 * figures[name] for name in ("valid", "right_of_valid", "valid_and_right")]
-        errors = [1e3 * figures["joint_error"], np.rad2deg(figures["angle_error"])]
-        what = f"valid, right of these, both [%]; joints [mm], joint angles [deg]: {who}"
-        kept[key] = what, [*shares, *errors]
-    return kept
-
-
-def _keyed(measured: Sequence[Measurement]) -> Iterable[tuple[str, str, list[Measurement]]]:
-    """Results by method and hands: their key, the words for it, and what was measured."""
-    for (method, users), row in _rows(measured):
-        yield f"{_METHOD_KEYS[method]}{_USER_KEYS[users]}", f"{method}, {users}", row
-
-
-def _captures(row: Sequence[Measurement]) -> str:
-    return ", ".join(one.capture for one in row)
-
-
-def print_table5(measured: Sequence[Measurement], *, with_paper: bool) -> Table:
-    """Frames all of whose labels are right [%], one column per capture; blank where nothing was measured."""
-    table = _table("Table 5: frames all of whose labels are right [%]", KINDS)
-    if with_paper:
-        for method, shares in TABLE5.items():
-            table.add_row(method, "calibrated", *(_percent(shares[kind]) for kind in KINDS))
-        table.add_section()
-    for (method, users), row in _rows(measured):
-        right = {one.capture: one.report.figures()["right"] for one in row}
-        table.add_row(method, users, *(_percent(right.get(kind, np.nan)) for kind in KINDS))
-    return table
-
-
-def print_table7(measured: Sequence[Measurement], *, with_paper: bool) -> Table:
-    """Share of valid frames, and of right ones among them [%], one column per capture."""
-    table = _table("Table 7: frames whose poses fit / right ones of these [%]", KINDS)
-    if with_paper:
-        for users, shares in TABLE7.items():
-            table.add_row(HAN, users, *(_pair(*shares[kind]) for kind in KINDS))
-        table.add_section()
-    for (method, users), row in _rows(measured):
-        figures = [one.report.figures() for one in row]
-        table.add_row(method, users, *(_pair(one["valid"], one["right_of_valid"]) for one in figures))
-    return table
-
-
-def print_cameras(measured: Sequence[Measurement], missing: float, *, rig: str, with_paper: bool) -> Table:
-    """Results with few cameras.
+def compare_trackers(takes: Mapping[str, Take], labeler: Labeler, seed: int) -> Measured:
+    """Run both trackers over every take, with calibrated and uncalibrated hands.
 
     Args:
-        measured: Results on one capture.
-        missing: Share of markers without a point.
-        rig: Name of the camera rig.
-        with_paper: Whether to add the paper's row.
+        takes: Simulated takes, by name.
+        labeler: Labeler of their glove.
+        seed: Seed of the paper's loop.
     """
-    title = f"Rig {rig}: {_percent(missing)} % of the markers missing"
-    table = _table(title, ("fit [%]", "right of these [%]", "both [%]", "joints [mm]", "angles [deg]"))
-    if with_paper:
-        both = CAMERAS[0] * CAMERAS[1]
-        table.add_row(HAN, "calibrated", *map(_percent, (*CAMERAS, both)), "", "")
-        table.add_section()
-    for (method, users), row in _rows(measured):
-        figures = row[0].report.figures()
-        shares = (_percent(figures[name]) for name in ("valid", "right_of_valid", "valid_and_right"))
-        table.add_row(method, users, *shares, _length(figures["joint_error"]), _angle(figures["angle_error"]))
-    return table
+    measured: Measured = {(method, users): {} for method in TRACKERS for users in USERS}
+    with progress_bar("frames") as bar:
+        bar(0, len(measured) * sum(take.num_frames for take in takes.values()))
+        for name, take in takes.items():
+            wearers = {users: hands_of(take, labeler) for users, hands_of in USERS.items()}
+            for method, users in measured:
+                tracker = TRACKERS[method](wearers[users], labeler, seed)
+                measured[method, users][name] = evaluate_tracker(
+                    take, wearers[users], tracker, done=bar.advance
+                )
+    return measured
 
 
-def print_errors(measured: Sequence[Measurement]) -> tuple[Table, Table]:
-    """Errors of joints [mm] and joint angles [deg] by the number of missing markers, over all captures."""
-    bounds = list(measured[0].report.by_occlusion())
-    words = ["none", *(f"{low}-{high}" for low, high in bounds[1:-1]), f"{bounds[-1][0]} or more"]
-    what = "by markers that a hand lacks"
-    joints = _table(f"Mean distance of joints from the truth {what} [mm]", words)
-    angles = _table(f"Mean error of joint angles {what} [deg]", words)
-    for head, row in _rows(measured):
-        errors = [_mean_errors([one.report.by_occlusion()[bound] for one in row]) for bound in bounds]
-        joints.add_row(*head, *(_length(joint) for joint, _ in errors))
-        angles.add_row(*head, *(_angle(angle) for _, angle in errors))
-    return joints, angles
+def measure_with_body(take: Take, labeler: Labeler) -> dict[str, float]:
+    """Share of right frames [%] of our tracker, by users, with the take's body tracked beside the hands."""
+    body = RigidTemplate.of(named_object(take.bodies[0].name))
+    shares = {}
+    for users, hands_of in USERS.items():
+        hands = hands_of(take, labeler)
+        found = evaluate_tracker(take, hands, Tracker(hands, labeler, (body,)))
+        shares[users] = 100 * float(found.right.mean())
+    return shares
 
 
-def print_trials(measured: Sequence[Measurement]) -> Table:
-    """Frames until all is right, at first and after a second without points, over all captures."""
-    columns = ("first: median", "p90", "in 1 s [%]", "hidden: median", "p90", "in 1 s [%]")
-    table = _table("Frames until all is right, from random frames and after a second without points", columns)
-    for (method, users), row in _rows(measured):
-        waits = [
-            np.concatenate([one.initialization for one in row]),
-            np.concatenate([one.recovery for one in row]),
-        ]
-        table.add_row(method, users, *(cell for wait in waits for cell in _quantiles(wait)))
-    return table
+def calibrated_users(take: Take, seed: int, free: float) -> list[GloveFit]:
+    """The people of a take as `handsim calibrate` finds them in a capture that they make for it."""
+    config, rng = CalibrationTakeConfig(free=free), np.random.default_rng((seed, 1))
+    made = simulate_calibration(tuple(take.hands), config, rng=rng)
+    return list(calibrate(made).of_sides(take.sides))
 
 
-def _table(title: str, columns: Iterable[str]) -> Table:
-    return number_table(title, _HEAD, (name.replace("-", " ") if name in KINDS else name for name in columns))
+def printed_figures() -> Figures:
+    """The figures that the paper prints in Tables 5 and 7."""
+    kept: Figures = {}
+    for method, shares in TABLE5.items():
+        words = f"frames all of whose labels are right [%]: {method}, calibrated"
+        kept[f"printed_{method.split()[0].lower()}"] = words, [100 * shares[kind] for kind in KINDS]
+    for users, pairs in TABLE7.items():
+        words = f"valid frames, right ones of these [%]: Han 2018, {users}"
+        kept[f"printed_valid_{_KEYS[users]}"] = words, [100 * np.array(pairs[kind]) for kind in KINDS]
+    return kept
 
 
-def _rows(measured: Sequence[Measurement]) -> list[tuple[tuple[str, str], list[Measurement]]]:
-    """Results by method and hands, in order."""
-    rows: dict[tuple[str, str], list[Measurement]] = {}
-    for one in measured:
-        rows.setdefault((one.method, one.users), []).append(one)
-    return list(rows.items())
+def table_figures(measured: Measured) -> Figures:
+    """The figures of Tables 5 and 7, and errors over all captures."""
+    kept: Figures = {}
+    for (method, users), reports in measured.items():
+        key, who = _KEYS[method] + _KEYS[users], f"{', '.join(reports)}: {method}, {users}"
+        shares = [one.figures() for one in reports.values()]
+        valid = [[100 * one["valid"], 100 * one["right_of_valid"]] for one in shares]
+        kept[f"right_{key}"] = f"frames all of whose labels are right [%], {who}", _right(reports)
+        kept[f"valid_{key}"] = f"valid frames, right ones of these [%], {who}", valid
+        errors = errors_by_occlusion(list(reports.values()))
+        kept[f"errors_{key}"] = f"mean {_ERRORS}: {method}, {users}", errors
+    return kept
 
 
-def _percent(share: float) -> str:
-    return "" if np.isnan(share) else f"{100 * share:.2f}"
+def errors_by_occlusion(reports: Sequence[TrackingReport]) -> list[list[float]]:
+    """Mean errors of joints [mm] and joint angles [deg] over all poses, by the number of missing markers."""
+    parts = np.array([[one.by_occlusion()[bound] for bound in OCCLUSIONS] for one in reports])
+    weights, errors = parts[..., :1], np.nan_to_num(parts[..., 1:])
+    with np.errstate(invalid="ignore"):
+        means = (weights * errors).sum(axis=0) / weights.sum(axis=0)
+    return [[1e3 * joint, np.rad2deg(angle)] for joint, angle in means]
 
 
-def _pair(valid: float, right: float) -> str:
-    return f"{_percent(valid)} / {_percent(right) or '-'}"
+def missing_share(take: Take) -> float:
+    """Share of the markers without a point."""
+    return 1.0 - float(take.markers_present().mean())
 
 
-def _length(meters: float) -> str:
-    return "" if np.isnan(meters) else f"{1e3 * meters:.2f}"
-
-
-def _angle(radians: float) -> str:
-    return "" if np.isnan(radians) else f"{np.rad2deg(radians):.2f}"
-
-
-def _mean_errors(parts: Sequence[tuple[int, float, float]]) -> tuple[float, float]:
-    """Errors of joints [m] and joint angles [rad] over several captures, weighted by the number of poses."""
-    counted = [part for part in parts if part[0]]
-    if not counted:
-        return np.nan, np.nan
-    weights = np.array([part[0] for part in counted])
-    joint, angle = weights @ np.array([part[1:] for part in counted]) / weights.sum()
-    return float(joint), float(angle)
-
-
-def _quantiles(frames: Float[np.ndarray, "S"]) -> tuple[str, str, str]:
-    """Median, 90th percentile and share of successful trials; 'never' for a quantile that was not reached."""
-    if not len(frames):
-        return "", "", ""
-    never = np.where(np.isnan(frames), np.inf, frames)
-    found = (float(np.quantile(never, q, method="higher")) for q in (0.5, 0.9))
-    words = [f"{value:.0f}" if np.isfinite(value) else "never" for value in found]
-    return words[0], words[1], _percent(float(np.isfinite(never).mean()))
+def _right(reports: Mapping[str, TrackingReport]) -> list[float]:
+    return [100 * float(one.right.mean()) for one in reports.values()]

@@ -17,7 +17,6 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from benchmarks.public.answers import Answers, BenchmarkError, poses_of, save_answers
-from benchmarks.public.card import data_card, describe_captures
 from benchmarks.public.difficulties import BENCHMARK, DIFFICULTIES, GLOVE, Plan, PlannedCapture
 from benchmarks.public.manifest import (
     LICENSE,
@@ -34,13 +33,26 @@ from handsim import HandModel, load_rig
 from handsim.files.outputs import atomic_write, check_free, claim, remove_leftovers
 from track import User, load_user
 from train.simulation.room import record_take
-from train.simulation.scenes import Kind, sample_real_like_scene
+from train.simulation.scenes import RATE, Kind, sample_real_like_scene
 from train.simulation.takes import sample_scene
 
 Progress = Callable[[int, int], None]
 """Called with frames done and frames expected."""
 PLAN: Final = "plan.json"
 CAPTURES: Final = "captures/captures.csv"
+_CARD: Final = """\
+# {name}, {size}
+
+{captures} simulated captures of two hands in marker gloves, {frames:,} frames at {rate:g} Hz, made by
+handsim: unlabeled points, as an optical system with several cameras exports them. A tracker may read
+`captures/`, and nothing else; `truth/` is for `python -m benchmarks.public score THIS_FOLDER RESULTS`.
+
+benchmarks/public/README.md in handsim's sources describes the files, the forms of results, what is counted,
+and the limits. With results name the benchmark, its size, and whether users were calibrated. Do not train on
+these captures. `python -m benchmarks.public make --size {size}` makes them again.
+
+License: CC BY 4.0, see `LICENSE.txt`. Credit: the handsim authors.
+"""
 _LICENSE_FILE: Final = "LICENSE.txt"
 _GLOVE_FILE: Final = "captures/glove.toml"
 _BYTES_PER_FRAME: Final = 2500
@@ -165,7 +177,9 @@ def _complete(plan: Plan, out: Path) -> Benchmark:
     _write(out / CAPTURES, _table_of_captures(plan, out))
     with atomic_write(out / _LICENSE_FILE) as temporary:
         shutil.copyfile(Path(__file__).with_name(f"{LICENSE}.txt"), temporary)
-    _write(out / "README.md", data_card(plan, describe_captures(plan, out)))
+    frames = sum(one.num_frames for one in plan.captures)
+    card = _CARD.format(name=BENCHMARK, size=plan.size, captures=len(plan.captures), frames=frames, rate=RATE)
+    _write(out / "README.md", card)
     for one in plan.captures:
         files += [capture_path(one.name), user_path(one.name), truth_path(one.name)]
     return write_manifest(out, plan, files)

@@ -27,7 +27,7 @@ MANIFEST: Final = "manifest.json"
 LICENSE: Final = "CC-BY-4.0"
 _SCHEMA: Final = 1
 PUBLISHED: Final = Path(__file__).with_name("published.json")
-"""Checksums of the published files; `python -m benchmarks.public publish` writes them."""
+"""Checksums of the published files."""
 _NAME: Final = re.compile(r"[a-z0-9][a-z0-9-]{0,79}")
 _MOST_FRAMES, _MOST_CAPTURES = 100_000, 10_000
 

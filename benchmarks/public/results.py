@@ -3,7 +3,6 @@
 - `NAME.csv`: columns `frame,point,label`, as the capture's `.trc` names frames and points.
 - `NAME.npz`: arrays like those of the truth (`answers`).
 - `NAME.npz`: a take of `handsim track`.
-- `NAME.trc`, `.c3d` or Motive's `.csv`: labeled points, as `handsim label` and `handsim track` write them.
 """
 
 from __future__ import annotations
@@ -18,7 +17,6 @@ import numpy as np
 from jaxtyping import Int
 
 from benchmarks.public.answers import (
-    SIDES,
     Answers,
     BenchmarkError,
     check_labels,
@@ -26,21 +24,18 @@ from benchmarks.public.answers import (
     poses_of,
     unpack_answers,
 )
-from gloves import Capture, load_take, read_capture
-from gloves.captures.capture import UNLABELED
-from gloves.captures.formats import MOTIVE_BEGIN
+from gloves import Capture, load_take
 from handsim import HandSimError
 from handsim.errors import choices, shortened
 from handsim.files.inputs import check_regular, read_bytes
 
-SUFFIXES: Final = (".npz", ".csv", ".trc", ".c3d")
+SUFFIXES: Final = (".npz", ".csv")
 """Endings of results' files."""
 COLUMNS: Final = ("frame", "point", "label")
 """Columns of a result as `.csv`."""
 NO_LABEL: Final = ("", "none")
 """What a `.csv` may hold for a point of no marker."""
 _MOST_CSV: Final = 1 << 26  # bytes; half an hour of two hands takes as many
-_GRID: Final = 1e5  # steps per meter on which points are written
 _MOST_SHOWN: Final = 60  # characters of a cell
 
 
@@ -94,17 +89,11 @@ def read_result(path: Path, capture: Capture, label_names: tuple[str, ...]) -> A
 
 
 def _read(path: Path, capture: Capture, label_names: tuple[str, ...]) -> Answers:
-    suffix = path.suffix.lower()
-    if suffix == ".npz":
-        arrays = load_arrays(path)
-        if "header" in arrays:
-            return _of_tracked_take(path, capture, label_names)
-        return unpack_answers(arrays)
-    if suffix == ".csv":
+    if path.suffix.lower() == ".csv":
         data = read_bytes(path, error=BenchmarkError, most=_MOST_CSV)
-        if not data.startswith(MOTIVE_BEGIN):
-            return Answers(_labels_of_table(data, capture, label_names))
-    return Answers(_labels_of_points(read_capture(path), capture, label_names))
+        return Answers(_labels_of_table(data, capture, label_names))
+    arrays = load_arrays(path)
+    return _of_tracked_take(path, capture, label_names) if "header" in arrays else unpack_answers(arrays)
 
 
 def _labels_of_table(data: bytes, capture: Capture, label_names: tuple[str, ...]) -> Int[np.ndarray, "T N"]:
@@ -159,59 +148,18 @@ def _cells(
     return number - 1, columns[point], numbers[label]
 
 
-def _labels_of_points(
-    labeled: Capture, capture: Capture, label_names: tuple[str, ...]
-) -> Int[np.ndarray, "T N"]:
-    """Labels (T, N) of a capture's points, by the columns of a marker file that hold the same points."""
-    _check_frames(labeled.num_frames, capture)
-    labels = np.full(capture.positions.shape[:2], -1)
-    places = {place: column for place, column in zip(*_grid(capture), strict=True)}
-    given = [_label_of(name, label_names) for name in labeled.names]
-    for place, column in zip(*_grid(labeled), strict=True):
-        if given[column] < 0:
-            continue
-        if place not in places:
-            raise BenchmarkError(
-                f"frame {place[0] + 1} has {labeled.names[column]} where the capture has no point, expected "
-                "its points unchanged"
-            )
-        labels[place[0], places[place]] = given[column]
-    return labels
-
-
-def _grid(capture: Capture) -> tuple[list[tuple[int, ...]], list[int]]:
-    """Frame and place on the grid of every point, and its column."""
-    frames, columns = np.nonzero(np.isfinite(capture.positions[..., 0]))
-    places = np.rint(capture.positions[frames, columns] * _GRID).astype(np.int64)
-    return list(map(tuple, np.column_stack([frames, places]).tolist())), columns.tolist()
-
-
-def _label_of(column: str, label_names: tuple[str, ...]) -> int:
-    """The label that the name of a column stands for; -1 for unlabeled points and markers of rigid bodies."""
-    if column in label_names:
-        return label_names.index(column)
-    side, colon, _ = column.partition(":")
-    if column.startswith((UNLABELED, "*")) or (colon and side not in SIDES):
-        return -1
-    raise BenchmarkError(choices(_shown(column), label_names, noun="label"))
-
-
 def _of_tracked_take(path: Path, capture: Capture, label_names: tuple[str, ...]) -> Answers:
-    """Labels and poses of a take of `handsim track`."""
+    """Labels and poses of a take of `handsim track`; markers of bodies are no labels."""
     take = load_take(path)
-    _check_frames(take.num_frames, capture)
     if take.points.shape != capture.positions.shape:
+        frames, columns = capture.positions.shape[:2]
         raise BenchmarkError(
-            f"has {take.points.shape[1]} columns of points, expected the capture's "
-            f"{capture.positions.shape[1]}"
+            f"has {take.num_frames} frames of {take.points.shape[1]} columns, expected the capture's "
+            f"{frames} of {columns}"
         )
-    numbers = np.array([*(_label_of(name, label_names) for name in take.label_names), -1])
-    return Answers(numbers[take.labels], *poses_of(take.hands, take.qpos))
-
-
-def _check_frames(frames: int, capture: Capture) -> None:
-    if frames != capture.num_frames:
-        raise BenchmarkError(f"has {frames} frames, expected the capture's {capture.num_frames}")
+    numbers = {name: number for number, name in enumerate(label_names)}
+    table = np.array([*(numbers.get(name, -1) for name in take.label_names), -1])
+    return Answers(table[take.labels], *poses_of(take.hands, take.qpos))
 
 
 def _shown(text: str) -> str:

@@ -9,18 +9,22 @@ from __future__ import annotations
 
 import dataclasses
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from jaxtyping import Bool, Float
+from rich.table import Table
 
 from benchmarks.public.answers import Answers
+from benchmarks.public.difficulties import BENCHMARK, DIFFICULTIES
 from benchmarks.public.manifest import Benchmark, BenchmarkCapture, label_names
 from benchmarks.public.results import find_results, read_result
-from handsim import HandSimWarning
+from benchmarks.record import number_table
+from handsim import HandSimWarning, __version__
+from handsim.hand.model import KEYPOINT_NAMES
 from handsim.hand.shape import NUM_KEYPOINTS
 from train.evaluation import LabelCounts
 
@@ -28,6 +32,18 @@ NEAR: Final = 0.005
 """Distance from the truth within which a joint counts as found [m]."""
 POSE_SHARES: Final = ("posed", "within_5mm")
 _MOST_TOLD: Final = 5
+_COLUMNS: Final = {
+    "frame_accuracy": "frames [%]",
+    "slot_accuracy": "slots [%]",
+    "point_accuracy": "points [%]",
+    "macro_f1": "F1 [%]",
+    "posed": "posed [%]",
+    "mpjpe": "MPJPE [mm]",
+    "within_5mm": "5 mm [%]",
+    "angle_error": "angles [deg]",
+}
+_UNITS: Final = {"mpjpe": ("mpjpe_mm", 1e3), "angle_error": ("angle_error_deg", float(np.rad2deg(1.0)))}
+"""Figures that are no shares: their names in JSON, and their reported units."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,20 +70,17 @@ class Score:
 
     def mean(self, *, difficulty: str | None = None, kind: str | None = None) -> dict[str, float]:
         """Means over captures of one difficulty or kind, or over all; NaN are left out."""
-        chosen = self._of(difficulty, kind)
-        return {name: _mean([one.figures[name] for one in chosen]) for name in self.captures[0].figures}
-
-    def joint_errors(self, *, difficulty: str | None = None) -> Float[np.ndarray, "21"]:
-        """Mean over captures of each joint's error [m]."""
-        errors = np.array([one.joint_errors for one in self._of(difficulty, None)])
-        return np.array([_mean(column) for column in errors.T])
-
-    def _of(self, difficulty: str | None, kind: str | None) -> list[CaptureScore]:
-        return [
+        chosen = [
             one
             for one in self.captures
             if difficulty in (None, one.capture.difficulty) and kind in (None, one.capture.kind)
         ]
+        return {name: _mean([one.figures[name] for one in chosen]) for name in self.captures[0].figures}
+
+    def joint_errors(self) -> Float[np.ndarray, "21"]:
+        """Mean over captures of each joint's error [m]."""
+        errors = np.array([one.joint_errors for one in self.captures])
+        return np.array([_mean(column) for column in errors.T])
 
 
 def score_results(benchmark: Benchmark, results: Path, *, done: Callable[[], None] | None = None) -> Score:
@@ -142,6 +155,61 @@ def score_capture(
         "angle_error": angle,
     }
     return CaptureScore(capture, figures, errors)
+
+
+def score_table(score: Score) -> Table:
+    """Means by difficulty, by kind and over all captures, in percent, millimeters and degrees."""
+    table = number_table(f"{BENCHMARK}, {score.benchmark.size}", ["captures"], _COLUMNS.values())
+    rows = {name: score.mean(difficulty=name) for name in difficulties_of(score)}
+    rows |= {
+        kind: score.mean(kind=kind) for kind in dict.fromkeys(one.capture.kind for one in score.captures)
+    }
+    for row, means in {**rows, "all": score.mean()}.items():
+        values = {name: _UNITS.get(name, ("", 100.0))[1] * means[name] for name in _COLUMNS}
+        table.add_row(row, *("-" if np.isnan(value) else f"{value:.2f}" for value in values.values()))
+    return table
+
+
+def difficulties_of(score: Score) -> tuple[str, ...]:
+    """The difficulties of a benchmark's captures, the easiest first."""
+    there = {one.capture.difficulty for one in score.captures}
+    return (*(name for name in DIFFICULTIES if name in there), *sorted(there - DIFFICULTIES.keys()))
+
+
+def score_record(score: Score, results: str) -> dict[str, Any]:
+    """All figures for JSON: shares in [0, 1], errors in mm and degrees; None where nothing was counted.
+
+    Args:
+        score: The score.
+        results: What was scored.
+    """
+    return {
+        "benchmark": BENCHMARK,
+        "size": score.benchmark.size,
+        "handsim": __version__,
+        "results": results,
+        "missing": [one.capture.name for one in score.captures if one.missing],
+        "all": _record(score.mean()),
+        "by_difficulty": {name: _record(score.mean(difficulty=name)) for name in difficulties_of(score)},
+        "joint_errors_mm": _errors(score.joint_errors()),
+        "captures": {
+            one.capture.name: _record(one.figures) | {"joint_errors_mm": _errors(one.joint_errors)}
+            for one in score.captures
+        },
+    }
+
+
+def _record(figures: Mapping[str, float]) -> dict[str, float | None]:
+    named = {}
+    for name, value in figures.items():
+        key, factor = _UNITS.get(name, (name, 1.0))
+        named[key] = None if np.isnan(value) else float(factor * value)
+    return named
+
+
+def _errors(errors: np.ndarray) -> dict[str, float | None]:
+    values = (None if np.isnan(value) else 1e3 * float(value) for value in errors)
+    return dict(zip(KEYPOINT_NAMES, values, strict=True))
 
 
 def _completed(capture: BenchmarkCapture, score: CaptureScore | None, posed: bool) -> CaptureScore:

@@ -37,7 +37,7 @@ Job = Callable[[int], int]
 """Writes files that depend on the number alone, and returns the number; it can be pickled."""
 _THREADS: Final = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 _MAX_PENDING: Final = 1000  # jobs that an executor holds: enough for hundreds of workers
-_WORKER: Final = 710_000_000  # bytes that a process holds at most, by benchmarks.scale
+_WORKER: Final = 710_000_000  # bytes that a process holds at most, docs/cluster.md
 _AGAIN: Final = "run the same command again to go on"
 _FEWER: Final = f"(out of memory?); {_AGAIN}, with fewer --workers if they need too much memory"
 _GUARD: Final = 'put the call under `if __name__ == "__main__":`, or give workers=1'

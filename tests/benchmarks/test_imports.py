@@ -19,7 +19,7 @@ MODULES = sorted(
     for path in FOLDER.rglob("*.py")
     if path.name != "__init__.py"
 )
-ELSEWHERE = ("embreex", "mediapipe")  # that only single benchmarks need
+ELSEWHERE = ("embreex",)  # that only single benchmarks need
 
 
 @pytest.mark.parametrize("name", MODULES)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import re
 import subprocess
@@ -11,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.record import FOLDER, Conditions, load_figures, save_figures
+from benchmarks.record import FOLDER, kept, kept_rows, load_figures, save_figures
 from benchmarks.results import PAGE, README, TEMPLATE, filled, speed_run
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -56,24 +55,24 @@ def test_figures_are_kept_with_their_origin(tmp_path):
 
 
 def test_the_sentence_on_a_run_comes_from_what_the_run_saved(tmp_path):
-    conditions = Conditions(
-        seeds=(3, 4),
-        is_quick=False,
-        left_out=("the sections rays, labels", "mink"),
-        processors=6,
-        vectors="AVX2",
-        threads={"torch": "1", "OpenBLAS": "5"},
-        load=(0.04, 1.26),
-    )
-    path = save_figures("speed", {}, tmp_path, conditions)
+    path = save_figures("speed", {}, tmp_path, "Two processors.")
     origin = json.loads(path.read_text("utf-8"))
-    assert speed_run(tmp_path) == (
-        "This run was of the seeds 3, 4, on 6 processors with AVX2. Left out: the sections rays, labels; "
-        "mink. Threads: torch 1, OpenBLAS 5. 0.0 processes wanted to run before it, and 1.3 at its end. "
-        f"Commit {origin['commit']}, {origin['date']}, `{origin['command']}`; {origin['machine']}."
-    )
-    whole = str(dataclasses.replace(conditions, left_out=(), is_quick=True))
-    assert whole.startswith("This run was of a few frames of the seeds 3, 4, on 6 processors")
-    assert " Nothing was left out. " in whole
+    said = f"Commit {origin['commit']}, {origin['date']}, `{origin['command']}`; {origin['machine']}."
+    assert speed_run(tmp_path) == f"Two processors. {said}"
     save_figures("speed", {}, tmp_path)
-    assert speed_run(tmp_path).startswith(f"Commit {origin['commit']}")
+    assert speed_run(tmp_path) == said
+
+
+def test_what_was_made_is_kept(tmp_path):
+    made = []
+
+    def make(number=0):
+        made.append(number)
+        return {"number": number}
+
+    for _ in range(2):
+        assert kept(tmp_path / "folder" / "one.json", make) == {"number": 0}
+    assert kept(None, make) == {"number": 0} and made == [0, 0]
+    assert [row["number"] for row in kept_rows(tmp_path / "rows", [4, 5], make)] == [4, 5]
+    assert [row["number"] for row in kept_rows(tmp_path / "rows", [5, 6], make)] == [4, 5, 6]
+    assert made[2:] == [4, 5, 6]

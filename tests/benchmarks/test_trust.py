@@ -37,5 +37,6 @@ def test_a_quoted_figure_stands_in_its_page_and_names_its_command(name):
     page, _, rest = QUOTED[name]["what"].partition(": ")
     text = " ".join((ROOT / "docs" / page).read_text("utf-8").split())
     assert all(value in text for value in QUOTED[name]["value"])
-    module = re.search(r"python -m benchmarks\.(\w+)", rest)
-    assert module is not None and (ROOT / "benchmarks" / f"{module[1]}.py").exists()
+    if re.search(r"benchmarks/\w+ at commit [0-9a-f]{7}\b", rest) is None:
+        module = re.search(r"python -m benchmarks\.(\w+)", rest)
+        assert module is not None and (ROOT / "benchmarks" / f"{module[1]}.py").exists()

@@ -11,7 +11,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from benchmarks.validity import two_hands_penetration
 from gloves import load_layout
 from gloves.fit import attach_markers
 from handsim import HandModel, HandMotion, RigidObject, join_qpos, sample_shape
@@ -45,7 +44,7 @@ from poses.object_motion import (
     sample_object_motion,
 )
 from poses.shapes import MAX_PENETRATION, is_valid, resting_angles
-from tests.meshes import winding
+from tests.meshes import hands_overlap, winding
 
 FACETS = 0.0008  # a mesh of few triangles lies inside the round part it stands for [m]
 
@@ -361,7 +360,7 @@ def test_a_hand_leads_the_pen_without_touching_the_other(rng):
         for hand, thing in (held, (motion, body))
     )
     np.testing.assert_allclose(after, before, atol=1e-9)
-    assert two_hands_penetration(right, left, motion.qpos, other.qpos).max() <= 0.001
+    assert hands_overlap(right, left, motion.qpos, other.qpos).max() <= 0.001
     assert object_penetration(left, pen, other.qpos, body.T_world_body).max() <= 0.001
     tip = np.einsum("tij,j->ti", body.T_world_body, np.append(pen.markers[0], 1.0))[:, :3]
     assert (np.linalg.norm(tip[:, None] - places, axis=2).min(axis=1) < 0.025).mean() > 0.4
@@ -382,10 +381,10 @@ def test_a_hand_makes_room_only_where_it_must_and_smoothly(rng):
     # Where the other hand's wrist goes through the first one's in the middle of the motion.
     there = held[0].qpos[FRAMES // 2, :3]
     other = resting(left, FRAMES, tuple(there))
-    assert two_hands_penetration(right, left, held[0].qpos, other.qpos).max() > 0.01
+    assert hands_overlap(right, left, held[0].qpos, other.qpos).max() > 0.01
     aside = np.tile([1.0, 0.0, 0.0], (FRAMES, 1))
     moved, carried = keep_apart(right, left, controller, held, other, aside)
-    assert two_hands_penetration(right, left, moved.qpos, other.qpos).max() <= 0.001
+    assert hands_overlap(right, left, moved.qpos, other.qpos).max() <= 0.001
     assert object_penetration(left, controller, other.qpos, carried.T_world_body).max() <= 0.001
     np.testing.assert_array_equal(moved.qpos[:, 1:2], held[0].qpos[:, 1:2])
     np.testing.assert_array_equal(moved.qpos[:, 3:], held[0].qpos[:, 3:])

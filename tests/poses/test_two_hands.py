@@ -10,10 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from benchmarks.validity import two_hands_penetration
 from handsim import HandModel, join_qpos, sample_shape
 from handsim.files.inputs import package_data
-from handsim.hand.capsules import overlap_between
 from handsim.hand.model import build_spec
 from handsim.hand.shape import EVERYBODY
 from handsim.space.transforms import random_quaternions
@@ -27,6 +25,7 @@ from poses.contact import (
 )
 from poses.shapes import gesture_names, is_valid, resting_angles
 from poses.two_hands import INTERACTIONS, sample_two_hand_motion, sample_two_hand_poses
+from tests.meshes import hands_overlap
 
 DEEPEST = 0.001
 TOUCHING = 0.001
@@ -37,19 +36,10 @@ def hands() -> tuple[HandModel, HandModel]:
     return HandModel.named("M"), HandModel.named("M", side="left")
 
 
-def overlap(right: HandModel, left: HandModel, right_qpos: np.ndarray, left_qpos: np.ndarray) -> np.ndarray:
-    return overlap_between(
-        right.capsules,
-        right.forward_kinematics(right_qpos),
-        left.capsules,
-        left.forward_kinematics(left_qpos),
-    )
-
-
 def assert_valid(right, left, right_qpos, left_qpos):
     assert is_valid(right, right_qpos[:, 7:]).all()
     assert is_valid(left, left_qpos[:, 7:]).all()
-    assert two_hands_penetration(right, left, right_qpos, left_qpos).max() <= DEEPEST
+    assert hands_overlap(right, left, right_qpos, left_qpos).max() <= DEEPEST
 
 
 def mujoco_distances(right: HandModel, left: HandModel, qpos: np.ndarray) -> np.ndarray:
@@ -84,12 +74,11 @@ def test_overlap_of_two_hands_is_mujocos(rng):
             position=rng.normal(scale=0.03, size=(40, 3)),
             quaternion=random_quaternions(40, rng=rng),
         )
-    ours = overlap(right, left, *posed)
+    ours = hands_overlap(right, left, *posed)
     theirs = -mujoco_distances(right, left, np.concatenate(posed, axis=1))
     assert (ours > 0.005).sum() >= 5, "the test needs hands that collide"
     assert (ours < -0.001).any(), "and hands apart"
     np.testing.assert_allclose(ours, theirs, atol=1e-7)
-    np.testing.assert_array_equal(two_hands_penetration(right, left, *posed), np.maximum(ours, 0.0))
 
 
 @pytest.mark.parametrize("name", INTERACTIONS)
@@ -99,7 +88,7 @@ def test_every_frame_is_valid_and_the_hands_really_touch(name, rng):
     assert [len(motion.qpos) for motion in motions] == [961, 961]
     qpos = [motion.qpos for motion in motions]
     assert_valid(right, left, *qpos)
-    touching = overlap(right, left, *qpos) >= -TOUCHING
+    touching = hands_overlap(right, left, *qpos) >= -TOUCHING
     assert touching.mean() > 0.25, "ways between meetings included"
     for motion in motions:
         speeds = motion.speeds()
@@ -125,7 +114,7 @@ def test_single_poses_touch_and_differ(rng):
     qpos = sample_two_hand_poses(right, left, 400, rng=rng)
     assert [each.shape for each in qpos] == [(400, 27), (400, 27)]
     assert_valid(right, left, *qpos)
-    gaps = -overlap(right, left, *qpos)
+    gaps = -hands_overlap(right, left, *qpos)
     assert (gaps <= TOUCHING).mean() > 0.6
     assert (gaps > 0.01).mean() > 0.05, "some nearly touch"
     for each in qpos:
@@ -138,7 +127,7 @@ def test_clapping_hands_come_and_go(rng):
     qpos = [
         motion.qpos for motion in sample_two_hand_motion(right, left, 6.0, interactions=["clap"], rng=rng)
     ]
-    touching = overlap(right, left, *qpos) >= -TOUCHING
+    touching = hands_overlap(right, left, *qpos) >= -TOUCHING
     beats = np.flatnonzero(touching[1:] & ~touching[:-1])
     assert len(beats) >= 4
     between = np.diff(beats) / 120.0
@@ -151,7 +140,7 @@ def test_pointing_touches_palms_with_an_index_finger(rng):
         motion.qpos
         for motion in sample_two_hand_motion(right, left, 6.0, interactions=["point_at_palm"], rng=rng)
     ]
-    touching = overlap(right, left, *qpos) >= -TOUCHING
+    touching = hands_overlap(right, left, *qpos) >= -TOUCHING
     wrists = [model.forward_kinematics(each) for model, each in zip(hands(), qpos, strict=True)]
     tips = [
         frames[:, 6, :3, 3] + model.skeleton.lengths[6] * frames[:, 6, :3, 0]
@@ -180,7 +169,7 @@ def test_hands_are_brought_together_from_the_free_side(rng):
     for extra in (0.0, 0.001, 0.02, 0.1):
         placed = moving.copy()
         placed[:, :3] += (reach + extra)[:, None] * axis
-        depth = overlap(right, left, still, placed)
+        depth = hands_overlap(right, left, still, placed)
         assert (depth <= 0.0005 + 1e-6).all()
         if extra == 0.0:
             np.testing.assert_allclose(depth[met], 0.0005, atol=3e-5)
@@ -200,9 +189,9 @@ def test_fingers_close_until_they_meet_something():
     near[0, :7] = 0.02, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0  # palm to palm
     axis = np.array([[0.0, 0.0, -1.0]])
     near[:, :3] += (first_contact(right, opened, left, near, axis) + 0.002) * axis
-    assert overlap(right, left, opened, near)[0] < 0.0
+    assert hands_overlap(right, left, opened, near)[0] < 0.0
     held = close_fingers(right, opened, closed, np.ones((1, 5)), other=left, other_qpos=near)
-    depth = overlap(right, left, join_qpos(held), near)[0]
+    depth = hands_overlap(right, left, join_qpos(held), near)[0]
     assert 0.0 < depth <= 0.0008 + 1e-6
     assert (held <= closed + 1e-12).all()
     assert (held < closed - 0.1).any()

@@ -123,7 +123,7 @@ class _Proportions(NamedTuple):
     bones: tuple[float, float]  # log lengths: each bone, all of a digit
 
 
-# Chosen on simulated people that benchmarks.doubt does not use. Smaller than differences between people, as
+# Chosen on simulated people, not those of docs/tracking.md. Smaller than differences between people, as
 # the fit of proportions makes up for part of them.
 _MEASURED: Final = _Proportions(0.001, (0.0014, 0.0005), 0.0003, 1.8, 4.0, (0.01, 0.02))
 # Nearest of five sizes: differences between people, and half a step between sizes. Marker places include

@@ -10,10 +10,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from benchmarks.paper.paper_tracker import GATE, PaperTracker, cluster_points, labeler_cloud
-from benchmarks.paper.plain_hand import label_by_proximity
-from benchmarks.paper.take_evaluation import evaluate_tracker, seen_frame, true_users
-from benchmarks.paper.trials import hide_points
+from benchmarks.paper.paper_tracker import (
+    GATE,
+    PaperTracker,
+    cluster_points,
+    label_by_proximity,
+    labeler_cloud,
+)
+from benchmarks.paper.take_evaluation import evaluate_tracker, hide_points, seen_frame, true_users
 from gloves import GloveFit, Status, Take
 from handsim.hand.shape import JOINT_NAMES
 from tests.labelers import CountingLabeler

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import shutil
 import subprocess
 import sys
 
@@ -10,7 +11,6 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.any_layout_training import save_layout_network
 from gloves import load_layout
 from handsim.cli.doctor import check_learned_gloves
 from handsim.errors import HandSimWarning, WeightsError
@@ -85,14 +85,12 @@ def test_labels_follow_the_order_of_the_layout(labeler):
     assert equal.mean() > 0.97  # the two know the layout from other poses
 
 
-def test_the_network_is_saved_and_read_again(tmp_path, monkeypatch):
-    network = shipped_network()
-    save_layout_network(tmp_path, network, 1)
+def test_a_damaged_network_is_told(tmp_path, monkeypatch):
+    shutil.copytree(layout_labeler.SHIPPED, tmp_path, dirs_exist_ok=True)
     monkeypatch.setattr(layout_labeler, "SHIPPED", tmp_path)
     shipped_network.cache_clear()
     try:
-        for name, tensor in shipped_network().state_dict().items():
-            assert np.array_equal(tensor.numpy(), network.state_dict()[name].numpy()), name
+        assert shipped_network().state_dict()
         (tmp_path / layout_labeler.WEIGHTS).write_bytes(b"nothing")
         shipped_network.cache_clear()
         with pytest.raises(WeightsError, match="missing or damaged"):

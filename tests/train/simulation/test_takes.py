@@ -11,7 +11,6 @@ import pytest
 
 from benchmarks.paper.labeling_tables import count_gaps
 from benchmarks.paper.printed import TABLE3
-from benchmarks.validity import two_hands_penetration
 from gloves import Take, load_layout, load_take
 from handsim import HandModel, load_rig
 from handsim.errors import ArgumentError, PoseError
@@ -20,6 +19,7 @@ from handsim.space.rig import ROOM_CENTER, CameraRig
 from handsim.space.transforms import pose_matrices, quaternion_matrix, rigid
 from poses.grasps import object_penetration
 from poses.shapes import HIGH, LOW
+from tests.meshes import hands_overlap
 from tests.rigs import mixed_rig
 from tests.sentences import error_names
 from train import OpticsOptions, SimulateSettings, simulate_take
@@ -73,7 +73,7 @@ def test_every_frame_is_valid(kind):
         assert (angles >= LOW - 1e-9).all() and (angles <= HIGH + 1e-9).all()
         assert model.penetration(hand.qpos).max() <= SELF_DEEPEST + 1e-9
         assert np.abs(hand.qpos[:, :3] - ROOM_CENTER).max() <= WRIST_VOLUME, "where no camera may stand"
-    assert two_hands_penetration(right, left, *(hand.qpos for hand in take.moving_hands())).max() <= DEEPEST
+    assert hands_overlap(right, left, *(hand.qpos for hand in take.moving_hands())).max() <= DEEPEST
     for number, body in enumerate(take.bodies):
         thing, poses = named_object(body.name), pose_matrices(take.body_poses[:, number])
         for model, hand in zip((right, left), take.moving_hands(), strict=True):
