@@ -1,4 +1,4 @@
-"""Tables 5 and 7 of the paper, and few cameras: our tracker and the paper's loop on the same takes."""
+"""Tables 5 and 7 of the paper, and few cameras: our tracker beside the paper's figures."""
 
 from __future__ import annotations
 
@@ -9,11 +9,9 @@ from typing import Annotated, Final
 import numpy as np
 import tyro
 
-from benchmarks.paper.paper_tracker import PaperTracker
 from benchmarks.paper.printed import CAMERAS, CAMERAS_FRAMES, TABLE5, TABLE7
 from benchmarks.paper.take_evaluation import (
     OCCLUSIONS,
-    FrameTracker,
     TrackingReport,
     evaluate_tracker,
     measured_users,
@@ -30,23 +28,17 @@ from train.simulation.takes import simulate_calibration
 
 GLOVE: Final = "dense19"
 WITH_BODY: Final = "hand-controller"
-TRACKERS: Final[dict[str, Callable[[Sequence[GloveFit], Labeler, int], FrameTracker]]] = {
-    "handsim": lambda hands, labeler, _: Tracker(hands, labeler),
-    "paper's loop": lambda hands, labeler, seed: PaperTracker(
-        hands, labeler, rng=np.random.default_rng(seed)
-    ),
-}
 USERS: Final[dict[str, Callable[[Take, Labeler], list[GloveFit]]]] = {
     "calibrated": lambda take, _: true_users(take),
     "uncalibrated": measured_users,
 }
-_KEYS: Final = {"handsim": "", "paper's loop": "loop_", "calibrated": "true", "uncalibrated": "size"}
+_KEYS: Final = {"calibrated": "true", "uncalibrated": "size"}
 _ERRORS: Final = "errors of joints [mm], angles [deg], by markers missing: none, 1-2, 3-5, 6 or more"
-Measured = dict[tuple[str, str], dict[str, TrackingReport]]
-"""Reports by tracker and users, then by capture."""
+Measured = dict[str, dict[str, TrackingReport]]
+"""Reports by users, then by capture."""
 _Labeler = Annotated[Path | None, tyro.conf.arg(help="Folder of a trained labeler, or an .onnx file.")]
 _Frames = Annotated[int | None, tyro.conf.arg(help="Frames of each capture; the paper's when not given.")]
-_Seed = Annotated[int, tyro.conf.arg(help="Seed of captures and of the paper's loop; 0 gives the twins.")]
+_Seed = Annotated[int, tyro.conf.arg(help="Seed of the captures; 0 gives the twins.")]
 _Save = Annotated[str | None, tyro.conf.arg(help="Name of the file in benchmarks/figures.")]
 
 
@@ -54,7 +46,7 @@ def table5(labeler: _Labeler = None, num_frames: _Frames = None, seed: _Seed = 0
     """Tables 5 and 7: frames all of whose labels are right, frames whose poses fit, and errors."""
     network = load_labeler(GLOVE, labeler)
     takes = {kind: simulate_take(kind=kind, num_frames=num_frames, seed=seed) for kind in KINDS}
-    measured = compare_trackers({kind: take.without_body() for kind, take in takes.items()}, network, seed)
+    measured = measure({kind: take.without_body() for kind, take in takes.items()}, network)
     body = measure_with_body(takes[WITH_BODY], network)
     with_body = {
         f"body_{_KEYS[users]}": (f"{WITH_BODY}, controller too, right [%]: handsim, {users}", share)
@@ -76,14 +68,12 @@ def cameras(
         "paper": ("Han 2018, calibrated: valid, right of these [%]", 100 * np.array(CAMERAS)),
         "missing": (f"share of markers missing before rig {rig} [%]", 100 * missing_share(take)),
     }
-    for (method, users), reports in compare_trackers(
-        {"single-hand": take}, load_labeler(GLOVE, labeler), seed
-    ).items():
+    for users, reports in measure({"single-hand": take}, load_labeler(GLOVE, labeler)).items():
         one = reports["single-hand"].figures()
         shares = [100 * one[name] for name in ("valid", "right_of_valid", "valid_and_right")]
         errors = [1e3 * one["joint_error"], np.rad2deg(one["angle_error"])]
-        what = f"valid, right of these, both [%]; joints [mm], joint angles [deg]: {method}, {users}"
-        figures[_KEYS[method] + _KEYS[users]] = what, [*shares, *errors]
+        what = f"valid, right of these, both [%]; joints [mm], joint angles [deg]: handsim, {users}"
+        figures[_KEYS[users]] = what, [*shares, *errors]
     report(save, figures)
 
 
@@ -96,7 +86,8 @@ def calibrated(num_frames: _Frames = None, seed: _Seed = 0, free: float = 40.0, 
         free: Free motion in the calibration captures [s].
         save: Name of the file in benchmarks/figures.
     """
-    network, reports = load_labeler(GLOVE), {}
+    network = load_labeler(GLOVE)
+    reports: dict[str, TrackingReport] = {}
     for kind in KINDS:
         take = simulate_take(kind=kind, num_frames=num_frames, seed=seed).without_body()
         hands = calibrated_users(take, seed, free)
@@ -118,24 +109,15 @@ TRACKING_TABLES: Final[dict[str, Callable[..., None]]] = {
 }
 
 
-def compare_trackers(takes: Mapping[str, Take], labeler: Labeler, seed: int) -> Measured:
-    """Run both trackers over every take, with calibrated and uncalibrated hands.
-
-    Args:
-        takes: Simulated takes, by name.
-        labeler: Labeler of their glove.
-        seed: Seed of the paper's loop.
-    """
-    measured: Measured = {(method, users): {} for method in TRACKERS for users in USERS}
+def measure(takes: Mapping[str, Take], labeler: Labeler) -> Measured:
+    """Run our tracker over every take, with calibrated and uncalibrated hands."""
+    measured: Measured = {users: {} for users in USERS}
     with progress_bar("frames") as bar:
         bar(0, len(measured) * sum(take.num_frames for take in takes.values()))
         for name, take in takes.items():
-            wearers = {users: hands_of(take, labeler) for users, hands_of in USERS.items()}
-            for method, users in measured:
-                tracker = TRACKERS[method](wearers[users], labeler, seed)
-                measured[method, users][name] = evaluate_tracker(
-                    take, wearers[users], tracker, done=bar.advance
-                )
+            for users, reports in measured.items():
+                hands = USERS[users](take, labeler)
+                reports[name] = evaluate_tracker(take, hands, Tracker(hands, labeler), done=bar.advance)
     return measured
 
 
@@ -172,14 +154,14 @@ def printed_figures() -> Figures:
 def table_figures(measured: Measured) -> Figures:
     """The figures of Tables 5 and 7, and errors over all captures."""
     kept: Figures = {}
-    for (method, users), reports in measured.items():
-        key, who = _KEYS[method] + _KEYS[users], f"{', '.join(reports)}: {method}, {users}"
+    for users, reports in measured.items():
+        key, who = _KEYS[users], f"{', '.join(reports)}: handsim, {users}"
         shares = [one.figures() for one in reports.values()]
         valid = [[100 * one["valid"], 100 * one["right_of_valid"]] for one in shares]
         kept[f"right_{key}"] = f"frames all of whose labels are right [%], {who}", _right(reports)
         kept[f"valid_{key}"] = f"valid frames, right ones of these [%], {who}", valid
         errors = errors_by_occlusion(list(reports.values()))
-        kept[f"errors_{key}"] = f"mean {_ERRORS}: {method}, {users}", errors
+        kept[f"errors_{key}"] = f"mean {_ERRORS}: handsim, {users}", errors
     return kept
 
 

@@ -1,4 +1,4 @@
-"""Tables 5 and 7, and few cameras: the paper's figures, and those of both trackers."""
+"""Tables 5 and 7, and few cameras: the paper's figures, and those of our tracker."""
 
 from __future__ import annotations
 
@@ -11,11 +11,10 @@ from benchmarks.command_line import run
 from benchmarks.paper.printed import CAMERAS, HAN, TABLE3, TABLE5, TABLE7
 from benchmarks.paper.take_evaluation import TrackingReport
 from benchmarks.paper.tracking_tables import (
-    TRACKERS,
     TRACKING_TABLES,
     USERS,
-    compare_trackers,
     errors_by_occlusion,
+    measure,
     measure_with_body,
     table_figures,
 )
@@ -35,12 +34,12 @@ def test_the_papers_tables_agree_with_each_other():
 
 
 @pytest.mark.slow
-def test_both_trackers_are_compared_with_both_kinds_of_hands():
+def test_both_kinds_of_hands_are_measured():
     takes = {kind: simulate_take(kind=kind, num_frames=6).without_body() for kind in KINDS}
-    measured = compare_trackers(takes, load_labeler("dense19"), 0)
-    assert set(measured) == {(method, users) for method in TRACKERS for users in USERS}
+    measured = measure(takes, load_labeler("dense19"))
+    assert set(measured) == set(USERS)
     kept = {name: value for name, (_, value) in table_figures(measured).items()}
-    for key in ("true", "size", "loop_true", "loop_size"):
+    for key in ("true", "size"):
         assert len(kept[f"right_{key}"]) == len(kept[f"valid_{key}"]) == len(KINDS)
     assert kept["right_true"][0] == 100.0 and kept["valid_true"][0] == [100.0, 100.0]
     assert kept["errors_true"][0][0] < 0.5 < kept["errors_size"][0][0]
@@ -66,8 +65,7 @@ def test_few_cameras(capsys):
     missing = 100 * (1.0 - take.markers_present().mean())
     assert f"before rig six [%]: {missing:.6g}" in said
     assert "Han 2018, calibrated: valid, right of these [%]: [95.55, 92.32]" in said
-    for method in TRACKERS:
-        assert all(f": {method}, {users}: [" in said for users in USERS)
+    assert all(f": handsim, {users}: [" in said for users in USERS)
 
 
 @pytest.mark.slow
