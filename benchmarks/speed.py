@@ -305,7 +305,8 @@ def solvers(speeds: Speeds) -> None:
             return noisy
 
         qpos = sample_motion(model, frames / 120.0, rng=rng).qpos
-        pose = qpos[:1]
+        solver.solve(seen(qpos[:1]))  # to warm up
+        pose = solver.solve(seen(qpos[:1]), qpos[:1]).qpos
         for target in seen(qpos)[1:]:
             start = time.perf_counter()
             pose = solver.solve(target[None], pose).qpos
