@@ -22,8 +22,8 @@ from benchmarks.mirror_like import mirror_like
 from benchmarks.record import Figures, describe, kept, report, run
 from gloves import MarkerLayout, MarkerPlace, load_layout
 from handsim.hand.shape import BONE_NAMES, DIGITS, bones_of
-from track.glove_improvement import sample_places
-from track.glove_score import CAPTURES, FRAMES, METHODS, WORK, try_take
+from track.gloves.glove_improvement import sample_places
+from track.gloves.glove_score import CAPTURES, FRAMES, METHODS, WORK, try_take
 from train import load_labeler, simulate_take
 
 TOLD, FOUND = tuple(range(1, CAPTURES + 1)), (51, 52)  # seeds of the score's captures, and of the others

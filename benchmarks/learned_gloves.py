@@ -26,7 +26,7 @@ from handsim import HandModel
 from handsim.errors import HandSimError
 from handsim.hand.shape import BONE_NAMES, DIGIT_OF_BONE, PALM, SIDES
 from track import learn_glove
-from track.glove_improvement import sample_places
+from track.gloves.glove_improvement import sample_places
 from train import simulate_take
 
 SECONDS, RATE, RADIUS = 20.0, 120.0, 0.003

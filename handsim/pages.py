@@ -29,10 +29,10 @@ if TYPE_CHECKING:
 
 # By names, because the packages that make pages lie above this one.
 _WRITERS: Final = {
-    "gloves.takes.take.Take": "track.take_page:write_take_page",
+    "gloves.takes.take.Take": "track.takes.take_page:write_take_page",
     "train.data.shards.Dataset": "train.reports.dataset_page:write_dataset_page",
     "render.film.registration.Registration": "render.film.page:write_film_page",
-    "track.glove_score.LayoutScore": "track.glove_page:write_glove_page",
+    "track.gloves.glove_score.LayoutScore": "track.gloves.glove_page:write_glove_page",
     "track.gloves.learned_glove.LearnedGlove": "track.gloves.learned_page:write_learned_page",
     "train.forecast.rig_score.RigScore": "train.forecast.rig_score:write_rig_page",
 }

@@ -17,6 +17,7 @@ from handsim._imports import lazy_exports
 if TYPE_CHECKING:
     from gloves.takes.points import Status as Status
     from track.alternatives.alternatives import Alternative as Alternative
+    from track.bodies.rigid_body import RigidTemplate as RigidTemplate
     from track.calibration.user_calibration import Calibration as Calibration
     from track.calibration.user_calibration import HeldOut as HeldOut
     from track.calibration.user_calibration import Touch as Touch
@@ -29,12 +30,12 @@ if TYPE_CHECKING:
     from track.frames import TrackedBody as TrackedBody
     from track.frames import TrackedFrame as TrackedFrame
     from track.frames import TrackedHand as TrackedHand
-    from track.glove_improvement import ImprovedGlove as ImprovedGlove
-    from track.glove_improvement import Worth as Worth
-    from track.glove_improvement import improve_glove as improve_glove
-    from track.glove_score import LayoutScore as LayoutScore
-    from track.glove_score import Trial as Trial
-    from track.glove_score import score_glove as score_glove
+    from track.gloves.glove_improvement import ImprovedGlove as ImprovedGlove
+    from track.gloves.glove_improvement import Worth as Worth
+    from track.gloves.glove_improvement import improve_glove as improve_glove
+    from track.gloves.glove_score import LayoutScore as LayoutScore
+    from track.gloves.glove_score import Trial as Trial
+    from track.gloves.glove_score import score_glove as score_glove
     from track.gloves.learned_glove import LearnedGlove as LearnedGlove
     from track.gloves.learned_glove import TrialHand as TrialHand
     from track.gloves.learned_glove import learn_glove as learn_glove
@@ -44,25 +45,24 @@ if TYPE_CHECKING:
     from track.kinematics.pose_solver import PoseFit as PoseFit
     from track.kinematics.pose_solver import solve_pose as solve_pose
     from track.kinematics.pose_spread import HandErrors as HandErrors
-    from track.live_message import LiveBody as LiveBody
-    from track.live_message import LiveHand as LiveHand
-    from track.live_message import LiveHeader as LiveHeader
-    from track.live_message import LiveMessage as LiveMessage
-    from track.live_message import LiveSink as LiveSink
-    from track.recorder import Recorder as Recorder
-    from track.rigid_body import RigidTemplate as RigidTemplate
+    from track.live.live_message import LiveBody as LiveBody
+    from track.live.live_message import LiveHand as LiveHand
+    from track.live.live_message import LiveHeader as LiveHeader
+    from track.live.live_message import LiveMessage as LiveMessage
+    from track.live.live_message import LiveSink as LiveSink
+    from track.live.recorder import Recorder as Recorder
+    from track.live.sinks import SinkGroup as SinkGroup
+    from track.live.sinks import open_sinks as open_sinks
     from track.settings import CalibrateSettings as CalibrateSettings
     from track.settings import LabelSettings as LabelSettings
     from track.settings import TrackSettings as TrackSettings
-    from track.sinks import SinkGroup as SinkGroup
-    from track.sinks import open_sinks as open_sinks
     from track.streams import ReplaySettings as ReplaySettings
     from track.streams.frame_source import FrameSource as FrameSource
     from track.streams.live_stream import LiveStream as LiveStream
     from track.streams.live_stream import open_source as open_source
     from track.streams.natnet import ReplayServer as ReplayServer
-    from track.take_faults import SuspectSpan as SuspectSpan
-    from track.take_summary import find_suspect_spans as find_suspect_spans
+    from track.takes.take_faults import SuspectSpan as SuspectSpan
+    from track.takes.take_summary import find_suspect_spans as find_suspect_spans
     from track.tracker import Tracker as Tracker
     from track.user import User as User
     from track.user import load_user as load_user

@@ -35,9 +35,9 @@ from track.association.label_consistency import (
     refit_labels,
 )
 from track.association.label_new_points import SETTLED_EVIDENCE, digit_table, label_new_points
+from track.bodies.rigid_body import AnyBody, BodyTracker, load_bodies
 from track.config import TrackerConfig
 from track.frames import FrameValidator, IncomingFrame, TrackedBody, TrackedFrame, TrackedHand
-from track.rigid_body import AnyBody, BodyTracker, load_bodies
 from track.user import AnyLabeler, User, as_user, labeler_of
 
 _EVIDENCE_PER_FRAME: Final = 2.0  # log-odds gained by a label per frame, less half its squared distance

@@ -26,8 +26,8 @@ def body(source: Annotated[Path, tyro.conf.Positional], *, out: Path) -> None:
     """
     from gloves.captures.formats import read_capture
     from gloves.takes.take import SUFFIX, load_take
-    from track.rigid_body import SUFFIX as TOML
-    from track.rigid_body import RigidTemplate, learn_body, save_body
+    from track.bodies.rigid_body import SUFFIX as TOML
+    from track.bodies.rigid_body import RigidTemplate, learn_body, save_body
 
     check_outputs([source], [out], TOML)
     if source.name.endswith(SUFFIX):

@@ -77,7 +77,7 @@ def calibrate(
 def _record(live: str, options: TrackerOptions, out: Path, seconds: float) -> None:
     """Record a stream until every joint has covered its range, or the time is over."""
     from track.calibration.user_calibration import MotionGuide
-    from track.live import track_live
+    from track.live.live_tracking import track_live
     from track.settings import TrackerSetup
 
     with named_steps(""):  # a glove may have to be learned

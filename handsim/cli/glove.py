@@ -221,8 +221,8 @@ def score_glove(
     """
     page = Path(glove).with_suffix(".html") if out is None else out
     check_outputs([glove, settings.rig, settings.motion], [page], ".html")
-    from track import glove_score
-    from track.glove_page import trial_rows, write_glove_page, wrong_line
+    from track.gloves import glove_score
+    from track.gloves.glove_page import trial_rows, write_glove_page, wrong_line
     from train.evaluation import percent, percent_between
 
     with named_steps("") as step:
@@ -265,8 +265,8 @@ def improve_glove(
         settings: How to search.
     """
     check_outputs([glove, settings.rig], [out], ".toml")
-    from track import glove_improvement
-    from track.glove_page import trial_rows
+    from track.gloves import glove_improvement
+    from track.gloves.glove_page import trial_rows
 
     with named_steps("") as step:
         improved = glove_improvement.improve_glove(glove, settings, name=as_text(out.stem), on_step=step)
@@ -291,7 +291,7 @@ def improve_glove(
 
 def _palm_line(layout: MarkerLayout) -> str:
     from handsim.hand.model import HandModel
-    from track.glove_score import palm_spread
+    from track.gloves.glove_score import palm_spread
 
     spread = np.rad2deg(palm_spread(layout.markers, HandModel.named("M")))
     if not np.isfinite(spread):

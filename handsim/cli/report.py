@@ -22,7 +22,7 @@ def report(take: Annotated[Path, tyro.conf.Positional], out: Path) -> None:
         out: The page, an .html file, whole in itself.
     """
     from gloves.takes.take import load_take
-    from track.take_page import table_paths, write_take_page
+    from track.takes.take_page import table_paths, write_take_page
 
     check_outputs([take], [out, *table_paths(out)])
     page, frames, *tables = write_take_page(out, load_take(take), source=str(take))

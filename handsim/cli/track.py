@@ -19,9 +19,9 @@ if TYPE_CHECKING:
     from gloves.takes.take import Take
     from track.captures import OnFrame
     from track.frames import StreamedFrame, TrackedFrame
-    from track.live import LiveTake
+    from track.live.live_tracking import LiveTake
+    from track.live.sinks import SinkGroup
     from track.settings import TrackSettings
-    from track.sinks import SinkGroup
 
 
 def track(
@@ -61,9 +61,9 @@ def track(
             so on, other points Unlabeled1, Unlabeled2, ...
     """
     from gloves.captures.formats import WRITABLE, check_suffix, write_capture
-    from track.live import track_live
+    from track.live.live_tracking import track_live
+    from track.live.sinks import open_sinks
     from track.settings import TrackerSetup
-    from track.sinks import open_sinks
 
     check_source("capture", capture, live)
     check_live(live, seconds)
@@ -117,7 +117,7 @@ def _track_file(
     from gloves.captures.formats import write_capture
     from gloves.takes.corrections import corrections_path
     from track.captures import track_capture
-    from track.live import LiveTake
+    from track.live.live_tracking import LiveTake
 
     corrections = corrections_path(out)
     after = iter([*["calibrating"] * settings.calibrate, *["smoothing"] * settings.smooth])
@@ -147,7 +147,7 @@ def _track_file(
 def _print_take(out: Path, take: Take, tracked: LiveTake, speed: str) -> None:
     """Print a summary of a take, and warn of signs of mistakes."""
     from track.alternatives.hands import other_hands_of
-    from track.take_summary import summarize, suspicions
+    from track.takes.take_summary import summarize, suspicions
     from track.user import MEASURED
 
     user = take.settings["user"]

@@ -121,7 +121,7 @@ def _view_live(
     up: UpAxis,
 ) -> None:
     """Track a stream and show it until a signal or the stream ends it; record it if `out` is given."""
-    from track.live import track_live
+    from track.live.live_tracking import track_live
     from track.viewer.timeline import LiveView
 
     with opened_server(host, port, "handsim view") as server, LiveView(server, cameras, up) as view:

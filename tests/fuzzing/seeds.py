@@ -21,7 +21,7 @@ from gloves.takes.take import STATUSES, keypoints_of, take_header, worn_arrays
 from handsim import HandModel, sample_shape
 from handsim.space.objects import named_object
 from track import RigidTemplate, StreamedFrame, User
-from track.rigid_body import save_body
+from track.bodies.rigid_body import save_body
 from track.streams.natnet import ServerInfo, pack_frame, pack_server_info
 
 FRAMES, COLUMNS = 4, 24

@@ -28,7 +28,7 @@ from tests.fuzzing import seeds
 from tests.fuzzing.engine import Target
 from tests.fuzzing.mutations import mutate_archive, mutate_checkpoint, mutate_tail, mutate_take
 from track import load_user
-from track.rigid_body import load_body
+from track.bodies.rigid_body import load_body
 from track.streams.natnet import DamagedPacket, Kind, parse_frame, parse_server_info, unpack
 
 _CLOUD: Final = np.array([[0.0, 0.0, 0.0], [0.05, 0.0, 0.0], [0.0, 0.07, 0.0], [0.0, 0.02, 0.08]])

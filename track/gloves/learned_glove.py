@@ -320,8 +320,8 @@ def _exchanges(one: _Found, hand: GloveFit, source: Capture) -> Iterator[str]:
     rows = spread_out(np.flatnonzero(seen), _LOOKED_AT)
     squares = _squares(hand, points[rows])
     bad = squares.max(axis=1) > _BENT**2
-    worst = np.argsort(squares[bad].mean(axis=0))[-_SUSPECTS:] if bad.any() else ()
-    for first, second in itertools.combinations(sorted(worst), 2):
+    worst = sorted(np.argsort(squares[bad].sum(axis=0))[-_SUSPECTS:].tolist())
+    for first, second in itertools.combinations(worst if bad.any() else (), 2):
         changed = points[rows[bad]]
         changed[:, [first, second]] = changed[:, [second, first]]
         wrong = _squares(hand, changed).sum(axis=1) < _FITS_AGAIN * squares[bad].sum(axis=1)

@@ -29,7 +29,7 @@ from handsim.files.inputs import read_bytes
 from handsim.files.outputs import write_text, writing
 from handsim.hand.model import HandModel
 from handsim.hand.shape import NUM_QPOS
-from track.corrected_take import correct_take
+from track.takes.corrected_take import correct_take
 from track.viewer.recordings import TakeRecording
 from track.viewer.stage import HandSkin, PointBalls, set_stage
 

@@ -23,10 +23,10 @@ from handsim.hand.shape import NUM_QPOS
 from handsim.pages import distinct_colors
 from handsim.space.rig import CameraRig, list_rigs, load_rig
 from handsim.space.transforms import UpAxis, turned_poses, upright
+from track.bodies.rigid_body import RigidTemplate
 from track.frames import StreamedFrame, TrackedFrame
-from track.rigid_body import RigidTemplate
-from track.take_faults import SuspectSpan
-from track.take_summary import find_suspect_spans, frame_confidence
+from track.takes.take_faults import SuspectSpan
+from track.takes.take_summary import find_suspect_spans, frame_confidence
 from train.data.shards import Dataset
 
 GHOST_COLOR: Final = (128, 128, 128)

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from gloves.fit import GloveFit
 from handsim.callbacks import Closing
 from handsim.space.transforms import UpAxis
+from track.bodies.rigid_body import RigidTemplate
 from track.frames import StreamedFrame, TrackedFrame
-from track.rigid_body import RigidTemplate
 from track.viewer.recordings import LiveRecording, Recording, ShownFrame
 from track.viewer.stage import FrameView, set_stage
 

@@ -33,7 +33,7 @@ from tests.limits import file_size_limit
 from tests.sentences import assert_names
 from tests.waiting import LONG, wait_for
 from track import Recorder, ReplayServer, User, captures, load_user, open_source, track_capture
-from track.rigid_body import load_body
+from track.bodies.rigid_body import load_body
 from track.streams import natnet
 from track.streams.live_stream import LiveStream
 from track.viewer.editors import Corrector
@@ -292,7 +292,7 @@ def test_the_command_and_python_track_alike(capture, tmp_path):
 
 
 def test_a_stream_is_tracked_for_some_seconds(capture, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("track.live.open_source", functools.partial(open_source, silence=20.0))
+    monkeypatch.setattr("track.live.live_tracking.open_source", functools.partial(open_source, silence=20.0))
     # However busy the machine is, no frame is dropped.
     monkeypatch.setattr(LiveStream, "forgive", lambda stream: setattr(stream, "forgiven_until", np.inf))
     out = tmp_path / "live.npz"
@@ -408,7 +408,7 @@ class Late:
 def test_seconds_count_from_the_first_frame(tmp_path, monkeypatch):
     (tmp_path / "late_source.py").write_text(LATE)
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr("track.live.open_source", functools.partial(open_source, silence=0.1))
+    monkeypatch.setattr("track.live.live_tracking.open_source", functools.partial(open_source, silence=0.1))
     out = tmp_path / "live.npz"
     options = ["--size", "M", "--seconds", "0.5", "--out", str(out)]
     assert main(["track", "--live", "late_source:Late", *options]) == 0
@@ -431,7 +431,7 @@ REFUSED = LATE.replace(
 def test_a_source_of_the_user_s_own_that_is_refused_is_tried_again(tmp_path, monkeypatch, capsys):
     (tmp_path / "refused.py").write_text(REFUSED)
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr("track.live._RETRY", 0.01)
+    monkeypatch.setattr("track.live.live_tracking._RETRY", 0.01)
     out = tmp_path / "live.npz"
     assert main(["track", "--live", "refused:Late", "--size", "M", "--out", str(out)]) == 0
     assert load_take(out).num_frames == 30
@@ -607,7 +607,7 @@ def test_a_signal_while_hands_are_awaited_keeps_the_points(capture, tmp_path, ca
 
 
 def test_a_stream_without_frames_is_told(capture, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("track.live.open_source", functools.partial(open_source, silence=0.2))
+    monkeypatch.setattr("track.live.live_tracking.open_source", functools.partial(open_source, silence=0.2))
     take = load_take(capture.with_suffix(".truth.npz"))
     with ReplayServer(SimpleNamespace(points=take.points[:1], ids=take.ids[:1], rate=120.0)) as server:
         arguments = ["track", "--live", server.url, "--seconds", "0.5", "--out", str(tmp_path / "live.npz")]
@@ -682,8 +682,8 @@ def test_a_session_without_any_output_is_refused(arguments, words, capsys):
 def test_a_server_without_frames_ends_a_session_of_a_given_length(
     seconds, output, tmp_path, capsys, monkeypatch, interrupt
 ):
-    monkeypatch.setattr("track.live._FIRST_FRAME", 0.5)
-    monkeypatch.setattr("track.live.open_source", functools.partial(open_source, silence=0.1))
+    monkeypatch.setattr("track.live.live_tracking._FIRST_FRAME", 0.5)
+    monkeypatch.setattr("track.live.live_tracking.open_source", functools.partial(open_source, silence=0.1))
     (tmp_path / "waits.py").write_text(LATE.replace("time.sleep(1.0)", "time.sleep(1e6)"))
     monkeypatch.syspath_prepend(tmp_path)
     out = tmp_path / "new" / "live.npz"
@@ -704,7 +704,7 @@ def test_a_server_without_frames_ends_a_session_of_a_given_length(
 
 @pytest.mark.parametrize("scheme", ["natnet", "qtm"])
 def test_a_server_that_never_answers_ends_a_session_of_a_given_length(scheme, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("track.live._FIRST_FRAME", 0.5)
+    monkeypatch.setattr("track.live.live_tracking._FIRST_FRAME", 0.5)
     monkeypatch.setattr(f"track.streams.{'natnet' if scheme == 'natnet' else 'qualisys'}._PATIENCE", 0.2)
     with socket.socket(
         socket.AF_INET, socket.SOCK_DGRAM if scheme == "natnet" else socket.SOCK_STREAM

@@ -14,7 +14,7 @@ from handsim import HandSimWarning
 from handsim.errors import HandSimError
 from track import calibrate, label_capture, track_capture
 from track.alternatives.hands import OTHER_HANDS, other_hands_of, with_other_hands
-from track.take_summary import suspicions
+from track.takes.take_summary import suspicions
 from train import load_labeler, simulate_take
 
 FRAMES = 120

@@ -1,0 +1,1 @@
+"""Rigid bodies, found by their constellations of markers."""

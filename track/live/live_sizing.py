@@ -1,0 +1,207 @@
+"""The size of the hands of a live stream, measured in a separate process while tracking goes on.
+
+Tracking begins with hands of the usual size. They are measured after one second of frames with enough points,
+and again after ten seconds. The tracker adopts a new size in small steps, one per frame, so that no joint
+jumps. After a pause, or if the fit suddenly worsens, the hands may be another person's: measure again.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import warnings
+from collections import deque
+from collections.abc import Sequence
+from concurrent.futures import Future
+from concurrent.futures.process import BrokenProcessPool
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from gloves.takes.points import Status
+from handsim.app.workers import LocalProcesses
+from handsim.callbacks import Closing
+from handsim.errors import HandSimError, HandSimWarning
+from handsim.hand.model import HandModel, hand_keypoints
+from handsim.kernels import move, velocity_of
+from track.calibration.hand_size import hand_between, sample_frames
+from track.captures import judged_setup
+from track.frames import StreamedFrame, TrackedFrame, TrackedHand
+from track.settings import TrackerSetup, TrackSettings
+from track.tracker import Tracker
+from track.user import MEASURED, User
+
+_FIRST: Final = 1.0  # [s] duration of frames with enough points before the first measurement
+_ENOUGH: Final = 10.0  # [s] the same for the final measurement
+_LATER: Final = 2.0  # If no hand was found, try again after this multiple of that time.
+_LONGEST_STEP: Final = 0.1  # [s] A longer gap between two frames counts as this much time with hands.
+_MOST_FRAMES: Final = 20_000  # largest number of kept frames; a stream may show no hand for hours
+_PAUSE: Final = 1.0  # [s] without a hand, after which the hands may be another person's
+_SAME: Final = 0.006  # [m] Measurements from one second of the same hands differ by less.
+_CALM: Final = 5.0  # [s] time after a measurement over which the usual residual is averaged
+_RECENT: Final = 1.0  # [s] time constant of the newest residual's running mean
+_JUMP: Final = 1.5  # ratio to the usual residual beyond which the hands may be another person's
+_STEP: Final = 0.002  # [m] motion of the markers of a hand at rest per step to a new size
+_FEWEST_STEPS: Final = 4  # Learned marker biases fade out in at least this many steps.
+_EASE: Final = 0.0025  # [m] most by which a keypoint leaves its motion per frame while a size is taken over
+_NICE: Final = 5  # The measuring process has a lower priority than the tracker's.
+
+
+class _Measured(NamedTuple):
+    """Result of measuring the hands in some frames."""
+
+    users: Sequence[User] = ()
+    """Hands in small steps towards their measured size; empty if no hand was found."""
+    told: Sequence[str] = ()
+    """Warnings about glove, hands, labels or scale."""
+    is_relabeled: bool = False
+    """Whether other labels are likelier than those of hands in the glove as designed."""
+
+
+class LiveSizing(Closing):
+    """Measures the hands of a stream and resizes those of its tracker; usable in a `with` block.
+
+    Args:
+        setup: The tracker's hands, measured only if their size is automatic, and their labeler.
+    """
+
+    def __init__(self, setup: TrackerSetup) -> None:
+        self._setup, self._frames = setup, list[StreamedFrame]()
+        self._shown, self._due = 0.0, _FIRST  # [s] frames with enough points: so far, needed
+        self._last = self._seen = -np.inf  # [s] times of the last such frame and hand
+        self._is_brief, self._is_done = True, False  # is the last measurement brief, the size final?
+        self._calm = self._usual = self._newest = 0.0  # [s] since measured; [m] residuals
+        self._processes: LocalProcesses | None = None
+        self._measuring: Future[_Measured] | None = None
+        self._steps: deque[User] = deque()
+        self._shown_last: TrackedFrame | None = None
+        self._is_easing = self._judges = False  # Are labels judged after one second, too?
+
+    @property
+    def is_settled(self) -> bool:
+        """Whether the tracker has adopted the newest size."""
+        return not self._steps
+
+    def close(self) -> None:
+        """Cancel a running measurement."""
+        if self._processes is not None:
+            self._processes.end()
+
+    def eased(self, tracked: TrackedFrame, tracker: Tracker) -> TrackedFrame:
+        """The frame to show: a new size may find a hand in another pose, to which it goes in small steps."""
+        before, self._shown_last = self._shown_last, tracked
+        if self._is_easing and before is not None:
+            span = tracked.time - before.time
+            pairs = zip(before.hands, tracked.hands, tracker.hands, strict=True)
+            hands = tuple(_eased(last, hand, span, fit.model) for last, hand, fit in pairs)
+            self._is_easing = hands != tracked.hands or not self.is_settled
+            self._shown_last = dataclasses.replace(tracked, hands=hands)
+        return self._shown_last
+
+    def step(self, frame: StreamedFrame, tracked: TrackedFrame, tracker: Tracker) -> bool:
+        """Process a tracked frame; return whether the tracker's hands were resized."""
+        if not self._setup.is_auto:
+            return False
+        is_there = any(hand.has_pose for hand in tracked.hands)
+        came = frame.time > self._seen + _PAUSE and (is_there or self._is_done)
+        if came or self._fit_worse(tracked, min(frame.time - self._seen, _LONGEST_STEP)):
+            self._frames.clear()
+            self._shown, self._due, self._is_brief, self._is_done = 0.0, _FIRST, True, False
+        self._seen = frame.time if is_there else self._seen
+        if not self._is_done and len(frame.points) >= self._setup.fewest_points:
+            self._shown += min(frame.time - self._last, _LONGEST_STEP)
+            self._last = frame.time
+            self._frames.append(frame)
+            if len(self._frames) > _MOST_FRAMES:
+                self._frames = sample_frames(self._frames)
+        if self._measuring is not None and self._measuring.done():
+            self._end_measuring(self._measuring, tracker)
+        if self._measuring is None and self._shown >= self._due and not self._is_done:
+            self._begin_measuring(tracker.user)
+        if not self._steps:
+            return False
+        user, self._is_easing = self._steps.popleft(), True
+        tracker.resize(user, keep=len(self._steps) / (len(self._steps) + 1))
+        return True
+
+    def _fit_worse(self, tracked: TrackedFrame, span: float) -> bool:
+        """Whether the fit is much worse than just after the measurement; `span` [s] is the time step."""
+        rms = [hand.rms for hand in tracked.hands if hand.status is Status.TRACKED]
+        if self._steps or not self._is_done or not rms:
+            return False
+        mean = sum(rms) / len(rms)
+        self._calm += span
+        if self._calm < _CALM:
+            self._usual += (mean - self._usual) * span / self._calm
+            self._newest = self._usual
+        self._newest += (mean - self._newest) * span / _RECENT
+        return self._newest > _JUMP * self._usual
+
+    def _begin_measuring(self, user: User) -> None:
+        """Start to measure the hands in the frames so far."""
+        self._is_brief, self._due = self._shown < _ENOUGH, max(_ENOUGH, _LATER * self._shown)
+        self._frames = sample_frames(self._frames)
+        self._processes = LocalProcesses(1)
+        self._measuring = self._processes.submit(
+            _measure, self._setup.settings, self._frames, user, judges=self._judges or not self._is_brief
+        )
+        self._processes.shutdown(wait=False)  # ends after this task
+
+    def _end_measuring(self, measuring: Future[_Measured], tracker: Tracker) -> None:
+        """Adopt the result of a measurement."""
+        self._measuring = None
+        try:
+            found = measuring.result()
+        except (HandSimError, BrokenProcessPool) as error:
+            found = _Measured(told=[str(error)])
+        for sentence in found.told:
+            warnings.warn(sentence, HandSimWarning, stacklevel=4)
+        if not found.users:
+            return
+        self._judges = self._judges or found.is_relabeled
+        self._is_done, self._calm, self._usual = not self._is_brief, 0.0, 0.0
+        before, after = (one[0].shape.length for one in (tracker.user, found.users[-1]))
+        is_same = tracker.user.notes.startswith(MEASURED) and abs(after - before) < _SAME
+        if not (self._is_brief and is_same):
+            self._steps = deque(found.users)
+
+
+def _measure(
+    settings: dict[str, Any], frames: Sequence[StreamedFrame], before: User, *, judges: bool
+) -> _Measured:
+    """Measure the hands in some frames, and judge their labels, in a process of low priority."""
+    if hasattr(os, "nice"):
+        os.nice(_NICE)
+    setup = TrackerSetup.of(TrackSettings.from_json(settings))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", HandSimWarning)
+        setup = setup.measured(frames, warns=False)
+    after = measured = setup.user
+    told = [str(one.message) for one in caught if issubclass(one.category, HandSimWarning)]
+    if not after.notes.startswith(MEASURED):
+        return _Measured(told=told)
+    if judges:
+        setup, sentences = judged_setup(frames, setup)
+        after, told = setup.user, told + sentences
+    is_relabeled = setup.user is not measured
+    places = [np.concatenate([hand.attachment.points for hand in user]) for user in (before, after)]
+    farthest = float(np.linalg.norm(places[1] - places[0], axis=1).max())
+    count = max(_FEWEST_STEPS, int(np.ceil(farthest / _STEP)))
+    users = []
+    for share in np.arange(1, count) / count:
+        hands = tuple(hand_between(*pair, float(share)) for pair in zip(before, after, strict=True))
+        users.append(dataclasses.replace(after, hands=hands))
+    return _Measured([*users, after], told, is_relabeled)
+
+
+def _eased(before: TrackedHand, hand: TrackedHand, span: float, model: HandModel) -> TrackedHand:
+    """A hand's pose, or one on the way to it from that which was shown `span` seconds before."""
+    if not before.has_pose or hand.status not in (Status.TRACKED, Status.COASTING):
+        return hand
+    due = move(before.qpos[None], span * np.nan_to_num(before.velocity)[None])[0]
+    ways = np.diff(hand_keypoints(model, np.stack([due, hand.qpos])), axis=0)
+    share = _EASE / max(float(np.linalg.norm(ways, axis=-1).max()), _EASE)
+    if share == 1.0:
+        return hand
+    qpos = move(due[None], share * velocity_of(due, hand.qpos, 1.0)[None])[0]
+    return dataclasses.replace(hand, qpos=qpos, velocity=before.velocity)

@@ -1,0 +1,193 @@
+"""Faults of a tracked take beyond single labels: in its glove, and in the sides of its hands.
+
+The layout may not fit, a glove may slip, a marker may fall off, or a symmetric glove may leave the side of a
+hand open. Each fault is a span of frames with a sentence that names marker or hand, and the time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import lru_cache
+from typing import Final, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from gloves.fit import GloveFit
+from gloves.takes.take import TRACKED, Take
+from handsim.hand.shape import JOINTS, Side
+from track.alternatives.alternatives import doubts_of
+from track.alternatives.hands import other_hands_of
+from track.calibration.hand_size import glove_shifts
+from track.kinematics.pose_solver import FEWEST_MARKERS
+
+_FEWEST: Final = 60  # Faults are looked for from this many tracked frames of a hand on.
+_MOST_FRAMES: Final = 2000  # largest number of examined frames of a hand
+_FARTHEST: Final = 0.02  # [m] offsets of markers are clipped here
+_PART: Final = 60  # least number of a marker's frames before and after a slip
+# A slip shifts a marker for good; shifts by flesh and posture, of up to 3 mm, are temporary.
+_SLIP: Final = 0.0035  # [m] least reported shift of a marker
+_SLIP_SHARE: Final = 0.55  # least share of the variance of its offsets that the shift explains
+_SMALL_SLIP: Final = 0.0008  # [m] the same for a steady marker: the pose absorbs most of a slip
+_SMALL_SHARE: Final = 0.85  # least explained share for such a small shift
+_GLOVE_SLIP: Final = 0.0025  # [m] smallest slip of a whole glove that is reported
+_SURE: Final = 2.75  # smallest such slip in standard deviations
+_SLIP_PART: Final = 1.9  # [s] least time before and after a slip
+_LEAST_VARIANCE: Final = 1e-8  # [m^2] noise of optical systems
+_LAST_GAP: Final = 1.9  # [s] least time without a marker at the end, and least time before
+_LONGER: Final = 3.0  # A last gap is reported if it is this many times the longest earlier gap.
+_SEEN: Final = 0.5  # share of the earlier frames in which it was seen
+AT_LIMIT: Final = 0.5
+"""Tolerance within which a joint counts as being at its limit [deg]."""
+_OFTEN_AT_LIMIT: Final = 0.4  # share of the frames at the limit
+_FITTED_FRAMES: Final = 120  # number of frames in which a slip of the glove is fitted
+
+
+class SuspectSpan(NamedTuple):
+    """Frames that deserve a look, and the reason."""
+
+    first: int
+    last: int
+    """The last frame, inclusive."""
+    worst: int
+    """The frame to look at first."""
+    of: str
+    """The side of a hand, or the name of a label."""
+    why: str
+    """The reason, as a predicate for `of`."""
+    remedy: str = ""
+    """Remedy of a fault of the whole take; empty for a doubtful label."""
+    of_labels: bool = True
+    """Whether labels are in doubt in these frames, not only angles."""
+
+    @property
+    def words(self) -> str:
+        """The whole sentence: `of` and `why`."""
+        return f"{self.of} {self.why}"
+
+
+class _Hand(NamedTuple):
+    """A tracked hand of a take, in some of its frames (F)."""
+
+    take: Take
+    side: Side
+    worn: GloveFit
+    frames: Int[np.ndarray, "F"]
+    offsets: Float[np.ndarray, "F M 3"]  # [m] of seen markers from their places, in the bones' frames
+    some: Int[np.ndarray, "S"]  # those of these frames that show enough markers for a pose, at most 120
+    seen: Float[np.ndarray, "S M 3"]  # markers in these [m]
+
+    def span(self, first: int, name: str, why: str, remedy: str, *, of_labels: bool = True) -> SuspectSpan:
+        """A fault from frame `first` to the end, of a marker or joint; of the whole hand without `name`."""
+        of = f"{self.side}:{name}" if name else f"the {self.side} hand"
+        return SuspectSpan(first, self.take.num_frames - 1, first, of, why, remedy, of_labels)
+
+
+@lru_cache(maxsize=1)  # A summary, its warnings and a report of a take ask one after the other.
+def find_faults(take: Take) -> tuple[SuspectSpan, ...]:
+    """Find the faults of a tracked take, each from the frame in which it begins."""
+    found, last = list[SuspectSpan](), take.num_frames - 1
+    hands = [
+        SuspectSpan(one.first, last, one.first, f"the {one.side} hand", one.why, one.remedy, of_labels=False)
+        for one in other_hands_of(take)
+    ]
+    for number, side in enumerate(take.sides) if take.made_by_tracker else ():
+        frames = np.flatnonzero(take.status[:, number] == TRACKED)
+        frames = frames[frames >= _first_of_size(take)]
+        if len(frames) < _FEWEST:
+            continue
+        frames = frames[:: -(-len(frames) // _MOST_FRAMES)]
+        some = frames[:: -(-len(frames) // _FITTED_FRAMES)]
+        seen = take.point_list.labeled(take.hand_labels[number], some)
+        enough = np.isfinite(seen[..., 0]).sum(axis=1) >= FEWEST_MARKERS
+        offsets = take.marker_offsets(side, frames)
+        hand = _Hand(take, side, take.hands[number], frames, offsets, some[enough], seen[enough])
+        for faults in (_alternatives, _slips, _fallen, _at_limits):
+            found += faults(hand)
+    return (*hands, *tuple({one.of: one for one in reversed(found)}.values())[::-1])
+
+
+def _first_of_size(take: Take) -> int:
+    """The first frame with the final size of the hands, which a live tracker measures on the way."""
+    match take.settings.get("sizes"):
+        case [*_, [int(first), *_]]:
+            return first
+    return 0
+
+
+def _alternatives(hand: _Hand) -> Iterator[SuspectSpan]:
+    """Other labels that fit the whole take, and markers that are not where the layout has them."""
+    doubt = doubts_of(hand.take).get(hand.side)
+    for one in () if doubt is None else doubt.faults(hand.side, hand.worn.layout.names):
+        last = hand.take.num_frames - 1
+        yield SuspectSpan(0, last, int(hand.frames[0]), *one)
+
+
+def _slips(hand: _Hand) -> Iterator[SuspectSpan]:
+    """The slip of the marker with the clearest lasting shift, or that of the whole glove if there is none."""
+    known = np.isfinite(hand.offsets[..., 0])
+    values = np.where(known[..., None], hand.offsets.clip(-_FARTHEST, _FARTHEST), 0.0)
+    before, sums = np.cumsum(known, axis=0), np.cumsum(values, axis=0)
+    total, whole = np.maximum(before[-1], 1), sums[-1]
+    after = before[-1] - before
+    early, late = sums / np.maximum(before, 1)[..., None], (whole - sums) / np.maximum(after, 1)[..., None]
+    steps = np.where(np.minimum(before, after) < _PART, 0.0, np.linalg.norm(late - early, axis=-1))
+    variance = np.square(values).sum(axis=(0, 2)) - np.square(whole).sum(axis=1) / total
+    explained = before * after / total * steps**2
+    share = explained / np.maximum(variance, _LEAST_VARIANCE * total)
+    share *= ((steps > _SLIP) & (share > _SLIP_SHARE)) | ((steps > _SMALL_SLIP) & (share > _SMALL_SHARE))
+    share *= _is_amid(hand.take.times[hand.frames])[:, None]
+    when, marker = np.unravel_index(int(share.argmax()), share.shape)
+    remedy = "track the frames before and after apart, each with a calibration of its own"
+    if share[when, marker] > 0.0:
+        frame, name = int(hand.frames[when]), hand.worn.layout.names[marker]
+        why = f"slips by {1e3 * steps[when, marker]:.1f} mm or more at {hand.take.times[frame]:.2f} s"
+        yield hand.span(frame, name, why, remedy, of_labels=False)
+    elif (amid := _is_amid(hand.take.times[hand.some])).any():
+        shifts, sure = glove_shifts(hand.seen, hand.worn)
+        at = int(np.where(amid, np.abs(sure), 0.0).argmax())
+        if abs(sure[at]) > _SURE and abs(shifts[at]) > _GLOVE_SLIP:
+            frame = int(hand.some[at])
+            why = f"slips by {1e3 * abs(shifts[at]):.1f} mm or more at about {hand.take.times[frame]:.1f} s"
+            fault = hand.span(frame, "", why, remedy, of_labels=False)
+            yield fault._replace(of=f"the {hand.side} glove")
+
+
+def _is_amid(times: Float[np.ndarray, "F"]) -> Bool[np.ndarray, "F"]:
+    """Whether each time [s] is long enough after the first and before the last for a slip."""
+    return np.asarray(np.minimum(times - times[:1], times[-1:] - times) >= _SLIP_PART)
+
+
+def _fallen(hand: _Hand) -> Iterator[SuspectSpan]:
+    """Markers that are not seen from some time on, although their hand is."""
+    take = hand.take
+    seen = np.isfinite(take.observed(hand.side)[..., 0])
+    shown = take.is_tracked(hand.side)
+    gaps = [np.diff(np.flatnonzero(seen[:, marker])).max(initial=1) - 1 for marker in range(seen.shape[1])]
+    for name, row, longest in zip(hand.worn.layout.names, seen.T, gaps, strict=True):
+        if not row.any():
+            if shown.sum() >= _LAST_GAP * take.rate:
+                remedy = "compare the layout with the glove"
+                yield hand.span(0, name, "is never seen", remedy, of_labels=False)
+            continue
+        begin = take.num_frames - int(row[::-1].argmax())
+        gap = float(shown[begin:].sum()) / take.rate
+        least = max(_LAST_GAP, _LONGER * longest / take.rate, max(gaps) / take.rate)
+        is_usual = begin >= _LAST_GAP * take.rate and row[:begin][shown[:begin]].mean() >= _SEEN
+        if gap >= least and is_usual:
+            why = f"is not seen after {take.times[begin - 1]:.2f} s, for {gap:.1f} s to the end"
+            yield hand.span(begin, name, why, "look for the marker that fell off", of_labels=False)
+
+
+def _at_limits(hand: _Hand) -> Iterator[SuspectSpan]:
+    """Joints at the limit of the model's range in many frames, which may have gone beyond."""
+    angles = np.rad2deg(hand.take.qpos[hand.frames, hand.take.hand_index(hand.side), 7:])
+    for joint, values in zip(JOINTS, angles.T, strict=True):
+        low, high = values < joint.low + AT_LIMIT, values > joint.high - AT_LIMIT
+        for limit, there in ((joint.low, low), (joint.high, high)):
+            if there.mean() > _OFTEN_AT_LIMIT:
+                first = int(hand.frames[there.argmax()])
+                share, start = 100 * there.mean(), hand.take.times[first]
+                why = f"is at the model's limit, {limit:g} deg, in {share:.0f} % of frames from {start:.2f} s"
+                remedy = "calibrate the hand, or do not use this angle"
+                yield hand.span(first, joint.name, why, remedy, of_labels=False)

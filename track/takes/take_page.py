@@ -1,0 +1,531 @@
+"""The report page on a take and its tables, for checking the angles before they are used.
+
+Angles are in degrees and residuals in millimeters. In the tables (.csv) column names contain the units, and
+an empty cell stands for an unknown number.
+"""
+
+from __future__ import annotations
+
+import csv
+import shlex
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, get_args
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from gloves.captures.capture import runs_of
+from gloves.takes.take import COASTING, INITIALIZED, LOST, STATUSES, Take
+from handsim.files.outputs import atomic_write, check_ending, written_together
+from handsim.hand.shape import DIGITS, JOINT_NAMES, JOINTS, Side
+from handsim.pages import NOTHING, Paint, Section, html_list, picture, write_sections
+from track.config import Size
+from track.kinematics.pose_spread import CHANGING, DETECTABLE, SOURCES, measurement_error
+from track.takes.take_faults import AT_LIMIT, SuspectSpan
+from track.takes.take_summary import find_suspect_spans, summarize, suspicions, vouch
+from track.user import MEASURED, hand_origin
+from train.evaluation import percent
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_TABLES: Final = (".frames.csv", ".joints.csv", ".markers.csv", ".doubts.csv")
+_RANGE: Final = {"least": 0.0, "5th": 5.0, "median": 50.0, "95th": 95.0, "largest": 100.0}
+"""Columns of a range of motion, and the percentile of each."""
+_CHUNK: Final = 4096  # frames per call of forward kinematics
+_WANTED: Final = 0.99  # share of right frames for which the page gives a number of looks
+_MOST_SPANS: Final = 100  # rows of the page's table of doubtful spans
+_BINS: Final = 750  # bins of a long take's curve, which shows the extremes of each
+_STROKES: Final = (Paint.VIOLET, Paint.BLUE, Paint.WARM, Paint.GREEN)
+"""Colors of a digit's joints, from proximal to distal."""
+_COASTING: Final = "#efd9c9"
+_SHADES: Final = "Gray: the hand is lost and has no pose. Orange: it coasts, its pose is predicted."
+_BANDS: Final = "The bands say how far off each joint angle may be; with a calibrated hand they are narrower."
+_CALIBRATE: Final = (
+    "A capture of half a minute in which every joint moves and the thumb touches each fingertip tells more: "
+    "<code>handsim calibrate minute.c3d --out user.json</code>, then <code>handsim track ... --shape "
+    "user.json</code>."
+)
+
+
+def write_take_page(out: str | Path, take: Take, *, source: str = "take.npz") -> tuple[Path, ...]:
+    """Write the page on a take and its tables, all or none, as `handsim report` does.
+
+    The page shows commands for the take's file `source`. Returns the paths of the page and of its tables:
+    frames, joints, markers and doubtful frames.
+    """
+    out = Path(out)
+    check_ending(out, ".html")
+    hands, spans, paths = hand_figures(take), find_suspect_spans(take, most=None), table_paths(out)
+    sections = [
+        _summary_section(take),
+        _calibration_section(take),
+        *(section for hand in hands for section in _hand_sections(take, hand)),
+        _spans_section(take, spans, source),
+    ]
+    tables = [rows(take, hands) for rows in (_frame_rows, _joint_rows, _marker_rows)]
+    tables.append(_span_rows(take, spans))
+    with written_together():
+        write_sections(out, sections, title=f"Take {Path(source).name}", lead=_lead(take))
+        for path, rows in zip(paths, tables, strict=True):
+            with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
+                csv.writer(file, lineterminator="\n").writerows(rows)
+    return out, *paths
+
+
+def table_paths(page: Path) -> tuple[Path, ...]:
+    """Paths of a page's tables: frames, ranges of motion, markers, doubtful frames."""
+    return tuple(page.with_suffix(ending) for ending in _TABLES)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HandFigures:
+    """Figures of one hand over the T frames of a take, with its M markers."""
+
+    side: Side
+    marker_names: tuple[str, ...]
+    status: Int[np.ndarray, "T"]
+    """Indices into `STATUSES`."""
+    angles: Float[np.ndarray, "T 20"]
+    """Joint angles in the order of `JOINT_NAMES` [deg]; NaN where the hand is lost."""
+    angle_spread: Float[np.ndarray, "T 20"] | None
+    """Standard deviation of each angle [deg]; None if the take has none."""
+    residuals: Float[np.ndarray, "T M"]
+    """Distance of each labeled point from the pose's marker [m]; NaN without a point or a pose."""
+    confidence: Float[np.ndarray, "T M"]
+    """Confidence in each marker's label; NaN where the marker has no point."""
+    beyond: Bool[np.ndarray, "20 M"]
+    """Which markers each joint moves."""
+
+    @property
+    def seen(self) -> Bool[np.ndarray, "T M"]:
+        """Which markers have a point."""
+        return np.asarray(np.isfinite(self.confidence))
+
+    @property
+    def fitted(self) -> Bool[np.ndarray, "T"]:
+        """Frames whose pose was fitted to points, not predicted."""
+        return self.status >= INITIALIZED
+
+    @property
+    def rms(self) -> Float[np.ndarray, "T"]:
+        """RMS of the residuals of each frame [m], also of simulated takes; NaN where there are none."""
+        known = np.isfinite(self.residuals)
+        total = np.sum(np.square(self.residuals), axis=1, where=known)
+        count = np.where(known.any(axis=1), known.sum(axis=1), np.nan)
+        return np.asarray(np.sqrt(total / count))
+
+    @property
+    def measured(self) -> Bool[np.ndarray, "T 20"]:
+        """Fitted frames with a seen marker beyond the joint; in all others the angle is predicted."""
+        return np.asarray(self.fitted[:, None] & (self.seen @ self.beyond.T))
+
+    def gaps(self, seen: Bool[np.ndarray, "T K"]) -> list[list[int]]:
+        """Lengths of the gaps of each column, from the hand's first pose to its last [frames]."""
+        there = np.flatnonzero(self.status != LOST)
+        hidden = ~seen[there[0] : there[-1] + 1] if len(there) else seen[:0]
+        return [[last - first + 1 for first, last in runs_of(column)] for column in hidden.T]
+
+    def joints(self) -> Float[np.ndarray, "20 9"]:
+        """Each angle's `_RANGE` where measured, median SD [deg], shares at a limit, measured, longest gap."""
+        found, measured = np.full((len(JOINTS), len(_RANGE) + 4), np.nan), self.measured
+        for row, angles, told in zip(found, self.angles.T, measured.T, strict=True):
+            if told.any():
+                row[: len(_RANGE)] = np.percentile(angles[told], list(_RANGE.values()))
+        if self.fitted.any():
+            if self.angle_spread is not None:
+                found[:, -4] = np.median(self.angle_spread[self.fitted], axis=0)
+            low, high = np.array([(joint.low, joint.high) for joint in JOINTS]).T
+            angles = self.angles[self.fitted]
+            found[:, -3] = ((angles < low + AT_LIMIT) | (angles > high - AT_LIMIT)).mean(axis=0)
+        found[:, -2] = measured.mean(axis=0)
+        found[:, -1] = [max(gaps, default=0) for gaps in self.gaps(measured)]
+        return found
+
+    def markers(self) -> Iterator[MarkerFigures]:
+        """Figures of each marker, in the glove's order."""
+        seen = self.seen
+        for marker, (name, gaps) in enumerate(zip(self.marker_names, self.gaps(seen), strict=True)):
+            frames = np.flatnonzero(seen[:, marker])
+            residuals = self.residuals[:, marker]
+            known = residuals[np.isfinite(residuals)]
+            median, high = np.percentile(known, (50.0, 95.0)).tolist() if len(known) else (np.nan, np.nan)
+            confidence = float(np.median(self.confidence[frames, marker])) if len(frames) else np.nan
+            share, longest = float(seen[:, marker].mean()), max(gaps, default=0)
+            yield MarkerFigures(name, share, len(gaps), longest, median, high, confidence)
+
+
+class MarkerFigures(NamedTuple):
+    """Figures of one marker; NaN if it was never seen or there is no pose."""
+
+    name: str
+    seen: float
+    """Share of all frames in which it has a point."""
+    num_gaps: int
+    """Number of gaps between the hand's first and last pose."""
+    longest_gap: int
+    """Length of the longest gap [frames]."""
+    median_residual: float
+    """Median distance from the pose's marker [m]."""
+    high_residual: float
+    """95th percentile of that distance [m]."""
+    median_confidence: float
+    """Median confidence in its labels."""
+
+
+def hand_figures(take: Take) -> tuple[HandFigures, ...]:
+    """The figures of each hand of a simulated or tracked take."""
+    found = []
+    for number, (hand, labels) in enumerate(zip(take.hands, take.hand_labels, strict=True)):
+        there = take.status[:, number] != LOST
+        angles = np.where(there[:, None], np.rad2deg(take.qpos[:, number, 7:]), np.nan)
+        confidence = np.full((take.num_frames, len(labels)), np.nan)
+        points = take.point_list
+        own = (points.labels >= labels.start) & (points.labels < labels.stop)
+        confidence[points.frames[own], points.labels[own] - labels.start] = points.confidence[own]
+        residuals = np.full((take.num_frames, len(labels)), np.nan)
+        observed, shown = take.observed(hand.side), np.flatnonzero(there)
+        for first in range(0, len(shown), _CHUNK):
+            part = shown[first : first + _CHUNK]
+            expected, _ = hand.markers(take.qpos[part, number])
+            residuals[part] = np.linalg.norm(observed[part] - expected, axis=2)
+        spread = None if take.angle_spread is None else np.rad2deg(take.angle_spread[:, number])
+        status, names = take.status[:, number], hand.layout.names
+        beyond = hand.attachment.beyond
+        found.append(HandFigures(hand.side, names, status, angles, spread, residuals, confidence, beyond))
+    return tuple(found)
+
+
+def _lead(take: Take) -> str:
+    """Capture, glove, hands and length of the take, in a sentence."""
+    settings, user = take.settings, str(take.settings.get("user", ""))
+    parts = [f"capture {settings['capture']}"] if "capture" in settings else []
+    parts.append(f"glove {settings.get('glove', take.hands[0].layout.name)}")
+    parts.append(f"hands {' and '.join(take.sides)}")
+    if user.startswith(MEASURED):
+        parts.append(f"size measured in the capture, {user.removeprefix(MEASURED)}")
+    elif user in get_args(Size):
+        parts.append(f"size {user}")
+    end = f"{take.num_frames:,} frames, {take.duration:.1f} s at {take.rate:.4g} Hz."
+    first = ", ".join(parts)
+    return f"{first[0].upper()}{first[1:]}; {end}"
+
+
+def _summary_section(take: Take) -> Section:
+    told = suspicions(take) if take.made_by_tracker else []
+    items = html_list([line[0].upper() + line[1:] for line in summarize(take)], "ul")
+    kind = (
+        "Found: the frame in which a hand is initialized. Tracked: its pose follows from the frame before. "
+        "Coasting: for up to a tenth of a second its pose is predicted. Lost: it has no pose."
+        if take.made_by_tracker
+        else "The take is not of a tracker: its poses and labels are what was simulated or given."
+    )
+    return Section("The take", f"{kind}{items}", notes=told)
+
+
+def _calibration_section(take: Take) -> Section:
+    """Whether the hands are calibrated, and what that means for the angles, as HTML."""
+    notes = str(take.settings.get("user", ""))
+    if not take.made_by_tracker:
+        text = "The hands are those that the take was made with: there is nothing to calibrate."
+    elif notes.startswith(MEASURED) or notes in get_args(Size):
+        named = f"the mean hands of size {notes}, in a glove as designed"
+        known = "measured in the capture" if notes.startswith(MEASURED) else named
+        text = f"The hands are not calibrated but {known}. {_BANDS} {_CALIBRATE}"
+    elif notes:
+        text = f"The hands are a user's, as calibrated or given: {escape(notes)}."
+    else:
+        text = "The hands were given, and the take does not say whether they are calibrated. "
+        text += _BANDS
+    return Section("Calibration", text)
+
+
+def _hand_sections(take: Take, hand: HandFigures) -> list[Section]:
+    side = hand.side.capitalize()
+    if not hand.fitted.any():
+        return [Section(f"{side} hand", "It has no pose in any frame.")]
+    angles = (
+        "Angles of the model (docs/angles.md): zero is the flat hand. Flexion counts positive towards the "
+        "palm, extension negative. Abduction counts positive towards the thumb; that of the first "
+        "metacarpal, which is relative to the hand, away from the palm."
+    )
+    if hand.angle_spread is not None:
+        angles += " The band is one standard deviation (SD) to either side."
+    curves = picture((9.6, 9.6), _draw_angles, take.times, hand)
+    rms = hand.rms[np.isfinite(hand.rms)]
+    residuals, drawn = "None of its markers has a point.", []
+    if len(rms):
+        residuals = (
+            "RMS distance of the labeled points of each frame from the pose's markers: median "
+            f"{1e3 * np.median(rms):.2f} mm, 95th percentile {1e3 * np.percentile(rms, 95.0):.2f} mm."
+        )
+        drawn = [(picture((9.6, 2.2), _draw_residuals, take.times, hand), _SHADES)]
+    return [
+        Section(f"{side} hand: joint angles", angles, pictures=[(curves, _SHADES)]),
+        _range_section(f"{side} hand: range of motion", take, hand),
+        _error_section(f"{side} hand: errors of angles", take.settings, hand),
+        _markers_section(f"{side} hand: markers", take, hand),
+        Section(f"{side} hand: residuals", residuals, pictures=drawn),
+    ]
+
+
+def _draw_angles(figure: Figure, times: Float[np.ndarray, "T"], hand: HandFigures) -> None:
+    """Draw one panel per digit with its four angles and their bands; shade lost and coasting frames."""
+    panels = figure.subplots(len(DIGITS), 1, sharex=True)
+    starts, _ = _bins(len(times))
+    shape = len(times), len(DIGITS), -1
+    angles = hand.angles.reshape(shape)
+    spread = None if hand.angle_spread is None else hand.angle_spread.reshape(shape)
+    names = np.reshape([joint.split("_", 1)[1].replace("_", " ") for joint in JOINT_NAMES], angles.shape[1:])
+    for number, (digit, panel) in enumerate(zip(DIGITS, panels, strict=True)):
+        _prepare(panel, times, hand.status)
+        panel.axhline(0.0, color=Paint.LINE, linewidth=0.8)
+        for joint, (name, stroke) in enumerate(zip(names[number], _STROKES, strict=True)):
+            values = angles[:, number, joint]
+            panel.plot(*decimated(times, values), color=stroke, linewidth=1.1, label=name)
+            if spread is not None:
+                low, high = values - spread[:, number, joint], values + spread[:, number, joint]
+                low, high = np.fmin.reduceat(low, starts), np.fmax.reduceat(high, starts)
+                panel.fill_between(times[starts], low, high, color=stroke, alpha=0.15, linewidth=0.0)
+        panel.set_ylabel(f"{digit} [deg]")
+        panel.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, handlelength=1.2)
+    panels[-1].set_xlabel("time [s]")
+    figure.align_ylabels()
+
+
+def _range_section(title: str, take: Take, hand: HandFigures) -> Section:
+    shares = "at its limits [%]", "measured [%]"
+    table = [["joint [deg]", *_RANGE, "median SD", "model's range", *shares, "longest gap [s]"]]
+    for joint, (*first, limits, measured, gap) in zip(JOINTS, hand.joints().tolist(), strict=True):
+        cells = [NOTHING if np.isnan(one) else f"{one:.1f}" for one in first]
+        cells += [f"{joint.low:g} to {joint.high:g}", percent(limits) if limits > 0.0 else NOTHING]
+        cells += [percent(measured), f"{gap / take.rate:.3f}" if gap else NOTHING]
+        table.append([joint.name.replace("_", " "), *cells])
+    text = (
+        "An angle is measured in a frame whose pose was fitted while a marker beyond the joint was seen, and "
+        f"predicted in all others. {int(hand.fitted.sum()):,} frames have a fitted pose. The range is that "
+        "of the measured frames; 5th and 95th are percentiles, which a single wrong frame does not change. "
+        "SD: standard deviation of the angle. A gap is a run of frames in which it is not measured, from the "
+        "hand's first pose to its last. At the limits of the model, which are soft by a few degrees, a joint "
+        "may bend further than the table says."
+    )
+    return Section(title, text, table=table)
+
+
+def _error_section(title: str, settings: Mapping[str, Any], hand: HandFigures) -> Section:
+    """The standard deviation of each angle by its sources, and the cut-off of its filter."""
+    errors = _joint_errors(settings, hand)
+    if np.isnan(errors).all():
+        return Section(title, "Filter: none, each pose was fitted to the markers of its frame.")
+    changing = ", ".join(f"{one:g} times {name}" for one, name in zip(CHANGING, SOURCES, strict=True))
+    text = (
+        "Filter: all poses were solved together, forward and backward in time, without a delay. It acts as a "
+        "Butterworth filter of second order that runs forward and backward: at the cut-off an oscillation "
+        "keeps half of its size. SD [deg]: standard deviation of the angle, the root of the sum of the "
+        "squares of its four parts, each as root mean square over all frames. Gluing is a constant error, as "
+        "is what stays of the person: sizes and directions of bones, and gestures unlike other people's. "
+        "SEM: standard error of measurement between sessions of a person, with the glove put on anew: "
+        "the SD of hands that are calibrated in each session; of other hands from "
+        f"{changing}. "
+        "MDD: minimal detectable difference of two sessions, 1.96 times the root of two times the SEM."
+    )
+    table = [["joint", "SD", *SOURCES, "SEM", "MDD", "cut-off [Hz]"]]
+    for joint, cells in zip(JOINTS, errors.tolist(), strict=True):
+        table.append([joint.name.replace("_", " "), *(f"{cell:.1f}" for cell in cells)])
+    return Section(title, text, table=table)
+
+
+def _joint_errors(settings: Mapping[str, Any], hand: HandFigures) -> Float[np.ndarray, "20 E"]:
+    """Each angle's SD, its `SOURCES`, SEM, MDD [deg] and cut-off [Hz]; NaN of takes that are not smoothed."""
+    cutoffs, budget = (settings.get(name, {}).get(hand.side) for name in ("filter", "budget"))
+    if cutoffs is None or budget is None:
+        return np.full((len(JOINTS), len(SOURCES) + 4), np.nan)
+    error = measurement_error(np.array(budget), hand_origin(str(settings.get("user", "")), hand.side))
+    return np.column_stack([np.linalg.norm(budget, axis=1), budget, error, DETECTABLE * error, cutoffs])
+
+
+def _markers_section(title: str, take: Take, hand: HandFigures) -> Section:
+    header = ["marker", "seen [%]", "gaps", "longest [s]", "residual: median [mm]", "95th [mm]"]
+    table = [[*header, "confidence: median [%]"]]
+    for marker in hand.markers():
+        longest = f"{marker.longest_gap / take.rate:.3f}" if marker.num_gaps else NOTHING
+        residuals = [
+            NOTHING if np.isnan(one) else f"{1e3 * one:.2f}"
+            for one in (marker.median_residual, marker.high_residual)
+        ]
+        first = [marker.name, percent(marker.seen), f"{marker.num_gaps:,}", longest]
+        table.append([*first, *residuals, percent(marker.median_confidence)])
+    drawn = picture((9.6, 1.0 + 0.17 * len(hand.marker_names)), _draw_presence, take.times, hand)
+    text = (
+        "Seen: the share of all frames in which a point has the marker's label. A gap is a run of frames "
+        "without it, from the hand's first pose to its last. Residual: how far the point is from the marker "
+        "of the pose."
+    )
+    caption = "Blue where the marker was seen; pale where it was seen in some of the frames of a column."
+    return Section(title, text, pictures=[(drawn, caption)], table=table)
+
+
+def _draw_presence(figure: Figure, times: Float[np.ndarray, "T"], hand: HandFigures) -> None:
+    """Draw a strip for each marker: blue where it was seen; in long takes by the share seen."""
+    from matplotlib.colors import LinearSegmentedColormap
+
+    panel = figure.subplots()
+    starts, ends = _bins(len(times))
+    share = np.add.reduceat(hand.seen, starts, axis=0, dtype=np.float64) / (ends - starts)[:, None]
+    colors = LinearSegmentedColormap.from_list("seen", (Paint.CARD, Paint.BLUE))
+    edges = np.append(times[starts], _end(times))
+    rows = np.arange(share.shape[1] + 1)
+    panel.pcolormesh(edges, rows, share.T, cmap=colors, vmin=0.0, vmax=1.0, rasterized=True)
+    panel.hlines(rows[1:-1], edges[0], edges[-1], color=Paint.CARD, linewidth=1.5)
+    panel.set_yticks(rows[:-1] + 0.5, hand.marker_names, fontsize=7.5)
+    panel.tick_params(axis="y", length=0.0)
+    panel.invert_yaxis()
+    panel.set_xlim(edges[0], edges[-1])
+    panel.set_xlabel("time [s]")
+
+
+def _draw_residuals(figure: Figure, times: Float[np.ndarray, "T"], hand: HandFigures) -> None:
+    panel = figure.subplots()
+    _prepare(panel, times, hand.status)
+    panel.plot(*decimated(times, 1e3 * hand.rms), color=Paint.BLUE, linewidth=1.1)
+    panel.set_ylim(bottom=0.0)
+    panel.set_ylabel("RMS [mm]")
+    panel.set_xlabel("time [s]")
+
+
+def _prepare(panel: Axes, times: Float[np.ndarray, "T"], status: Int[np.ndarray, "T"]) -> None:
+    """Set grid and limits of a panel, and shade the frames in which the hand is lost or coasts."""
+    panel.grid(axis="y", color=Paint.BAND, linewidth=0.8)
+    panel.set_xlim(times[0], _end(times))
+    for state, color in ((COASTING, _COASTING), (LOST, Paint.LINE)):
+        spans, across = shaded(times, status == state), panel.get_xaxis_transform()
+        panel.broken_barh(spans, (0.0, 1.0), transform=across, facecolors=color, linewidth=0.0)
+    panel.tick_params(labelcolor=Paint.SOFT)
+
+
+def decimated(
+    times: Float[np.ndarray, "T"], values: Float[np.ndarray, "T"]
+) -> tuple[Float[np.ndarray, "K"], Float[np.ndarray, "K"]]:
+    """Reduce a curve to the least and largest value of each of at most 750 bins of frames; NaN if unknown."""
+    starts, ends = _bins(len(times))
+    if len(starts) == len(times):
+        return times, values
+    middles = (starts + ends) // 2
+    pairs = np.stack([np.fmin.reduceat(values, starts), np.fmax.reduceat(values, starts)], axis=1)
+    return np.stack([times[starts], times[middles]], axis=1).ravel(), pairs.ravel()
+
+
+def shaded(times: Float[np.ndarray, "T"], flags: Bool[np.ndarray, "T"]) -> list[tuple[float, float]]:
+    """Begin and length of the runs of flagged frames [s], rounded up to whole bins."""
+    starts, ends = _bins(len(times))
+    edges = np.append(times, _end(times))
+    runs = runs_of(np.logical_or.reduceat(flags, starts))
+    return [(float(edges[starts[a]]), float(edges[ends[b]] - edges[starts[a]])) for a, b in runs]
+
+
+def _bins(num_frames: int) -> tuple[Int[np.ndarray, "K"], Int[np.ndarray, "K"]]:
+    """First frame of each bin, and the frame after its last; one bin per frame of a short take."""
+    width = 1 if num_frames <= 2 * _BINS else -(-num_frames // _BINS)
+    starts = np.arange(0, num_frames, width)
+    return starts, np.append(starts[1:], num_frames)
+
+
+def _end(times: Float[np.ndarray, "T"]) -> float:
+    """End of the last frame [s], which lasts as long as the one before."""
+    return float(2.0 * times[-1] - times[-2]) if len(times) > 1 else float(times[-1]) + 1.0
+
+
+def _spans_section(take: Take, spans: Sequence[SuspectSpan], source: str) -> Section:
+    command = f"handsim view {shlex.quote(source)}"
+    if not spans:
+        return Section("Doubtful frames", "No label is probably wrong or missing.")
+    table = [["frames", "start [s]", "end [s]", "of", "why", "to look at", "in"]]
+    for span in spans[:_MOST_SPANS]:
+        frames = f"{span.first}" if span.first == span.last else f"{span.first} to {span.last}"
+        start, end, worst = (f"{take.times[one]:.3f}" for one in (span.first, span.last, span.worst))
+        look = f"frame {span.worst}, {worst} s"
+        table.append([frames, start, end, span.of, span.why, look, f"{command} --time {worst}"])
+    vouched = vouch(take, spans)
+    text = (
+        f"{len(spans):,} rows; {100 * vouched.listed:.1f} % of the frames have doubtful labels. Faults of "
+        "the take come first, then spans in which a label is probably wrong or a marker lacks its own, those "
+        "with the most such frames first; the percentage is the least confidence in a point. "
+        f"<code>{escape(command)}</code> lists the first of them too; a click leads there, "
+        "and a wrong label can be corrected."
+    )
+    more = f"These are the first {_MOST_SPANS} of {len(spans):,}; the table beside the page has all."
+    if take.made_by_tracker and (looks := vouched.looks(_WANTED)):
+        text += f" After a look at the first {looks}, {100 * _WANTED:g} % of all frames should be right."
+    elif take.made_by_tracker and vouched.after:
+        text += f" After a look at all, {100 * vouched.after[-1]:.1f} % or more should be right."
+    return Section("Doubtful frames", text, table=table, notes=[more] if len(spans) > _MOST_SPANS else [])
+
+
+_Rows = list[list[object]]
+
+
+def _frame_rows(take: Take, hands: Sequence[HandFigures]) -> _Rows:
+    """One row per frame and hand; header first."""
+    header = ["frame", "time_s", "hand", "status", "markers_seen", "residual_rms_mm"]
+    header += [f"{joint}_deg" for joint in JOINT_NAMES]
+    rows: _Rows = [[*header, *(f"{joint}_spread_deg" for joint in JOINT_NAMES)]]
+    numbers = []
+    for hand in hands:
+        spread = np.full_like(hand.angles, np.nan) if hand.angle_spread is None else hand.angle_spread
+        numbers.append(np.column_stack([1e3 * hand.rms, hand.angles, spread]).tolist())
+    counts = [hand.seen.sum(axis=1).tolist() for hand in hands]
+    for frame, time in enumerate(take.times.tolist()):
+        for hand, count, row in zip(hands, counts, numbers, strict=True):
+            first = [frame, _time(time), hand.side, STATUSES[hand.status[frame]], count[frame]]
+            rows.append([*first, *map(_number, row[frame])])
+    return rows
+
+
+def _joint_rows(take: Take, hands: Sequence[HandFigures]) -> _Rows:
+    """Rows of the table of joints: range of motion, range of the model, errors between sessions."""
+    columns = [f"{name}_deg" for name in (*_RANGE, "model_low", "model_high", "spread")]
+    columns += ["at_limits_share", "measured_share", "longest_gap_s", "sem_deg", "mdd_deg", "cutoff_hz"]
+    rows: _Rows = [["hand", "joint", *columns]]
+    for hand in hands:
+        errors = _joint_errors(take.settings, hand)[:, -3:].tolist()
+        for joint, figures, error in zip(JOINTS, hand.joints().tolist(), errors, strict=True):
+            *row, spread, limits, measured, gap = figures
+            cells = *row, joint.low, joint.high, spread, limits, measured, gap / take.rate, *error
+            rows.append([hand.side, joint.name, *map(_number, cells)])
+    return rows
+
+
+def _marker_rows(take: Take, hands: Sequence[HandFigures]) -> _Rows:
+    """Rows of the figures of each marker."""
+    header = ["hand", "marker", "seen_share", "gaps", "longest_gap_frames", "longest_gap_s"]
+    rows: _Rows = [[*header, "residual_median_mm", "residual_95th_mm", "confidence_median"]]
+    for hand in hands:
+        for marker in hand.markers():
+            gaps = [marker.num_gaps, marker.longest_gap, _number(marker.longest_gap / take.rate)]
+            residuals = (1e3 * marker.median_residual, 1e3 * marker.high_residual)
+            last = map(_number, (*residuals, marker.median_confidence))
+            rows.append([hand.side, marker.name, _number(marker.seen), *gaps, *last])
+    return rows
+
+
+def _span_rows(take: Take, spans: Sequence[SuspectSpan]) -> _Rows:
+    """Rows of doubtful spans, the worst first; `frame` is the one to look at."""
+    rows: _Rows = [["first_frame", "last_frame", "start_s", "end_s", "frame", "of", "why"]]
+    for span in spans:
+        times = [_time(float(take.times[one])) for one in (span.first, span.last)]
+        rows.append([span.first, span.last, *times, span.worst, span.of, span.why])
+    return rows
+
+
+def _number(value: float) -> str:
+    """A number with six digits; empty for NaN."""
+    return "" if np.isnan(value) else f"{value:.6g}"
+
+
+def _time(seconds: float) -> str:
+    """A time with sixteen digits, which resolve a microsecond of a clock that counts since 1970."""
+    return f"{seconds:.16g}"
