@@ -1,12 +1,8 @@
 """The hand's skin: a smooth closed mesh that is a function of the shape, and linear blend skinning.
 
 A control cage of 360 quads is rounded by two steps of subdivision, which spread the weights of the bones as
-they spread vertices. The palm of the cage is a flattened tube of eight rows from behind the wrist to the
-webs; a row's eighteen vertices run over the back from the index side to the little one (columns 0 to 8) and
-return under the palm. Columns 1, 3, 5 and 7 follow the four fingers, the even ones the webs between them and
-the two edges. On the last row each finger takes the six vertices of its own three columns as its first ring;
-the thumb grows out of a hole in the edge under the index. A ring's vertices stand at 30, 90, ... 330 degrees
-from the bone's y axis about its x axis: 90 is the back, 270 the pad.
+they spread vertices. `data/hand_cage.json`, which `benchmarks/hand_cage.py` explains and writes, has its
+faces, the shares of the bones, and the measures that its vertices follow from.
 
 Skinning is compiled: the whole skin in every frame, fast enough to cast rays against it.
 """
@@ -14,7 +10,6 @@ Skinning is compiled: the whole skin in every frame, fast enough to cast rays ag
 from __future__ import annotations
 
 import functools
-import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, Self
@@ -23,7 +18,8 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
-from handsim.hand.shape import DIGITS, HAND_DTYPE, NUM_BONES, PALM, pack_hand
+from handsim.files.inputs import package_data
+from handsim.hand.shape import DIGITS, HAND_DTYPE, NUM_BONES, pack_hand
 from handsim.kernels import kernel
 from handsim.space.transforms import MIRROR, euler_matrix, rigid
 
@@ -31,6 +27,22 @@ if TYPE_CHECKING:
     from scipy import sparse
 
     from handsim.hand.shape import HandShape
+
+
+NUM_ROWS: Final = 8
+AROUND: Final = 18
+PALM_VERTICES: Final = np.arange(NUM_ROWS * AROUND).reshape(NUM_ROWS, AROUND)
+"""Vertices of the cage on the palm's rows, from behind the wrist to the webs, each around the palm."""
+_ON_RING: Final = 6
+RINGS: Final = (
+    PALM_VERTICES.size + np.arange(8 * _ON_RING).reshape(1, 8, _ON_RING),
+    PALM_VERTICES.size + 8 * _ON_RING + np.arange(4 * 7 * _ON_RING).reshape(4, 7, _ON_RING),
+)
+"""Vertices of the cage on the thumb's rings, outwards, and on those of the four fingers past the webs."""
+_THUMB, _FINGERS = slice(0, 1), slice(1, len(DIGITS))
+_PAST_KNUCKLES, _WEB = 6, 7  # rows of the palm
+_CARPUS_RISE: Final = 0.42  # the carpus arches over the line from wrist to knuckles, in palm thicknesses
+_FIRST_RING, _FIRST_PALM = 1.2, 1.1  # scales that suit the mean hand
 
 
 def edge_table(quads: Int[np.ndarray, "Q 4"]) -> tuple[Int[np.ndarray, "E 2"], Int[np.ndarray, "Q 4"]]:
@@ -73,174 +85,40 @@ def catmull_clark(
     return sparse.csr_array(sparse.vstack([vertex_points, edge_points, faces])), new_quads
 
 
-def subdivided_loops(
-    loops: Sequence[Int[np.ndarray, "K"]], quads: Int[np.ndarray, "Q 4"], num_vertices: int
-) -> list[Int[np.ndarray, "2*K"]]:
-    """The vertices that each closed loop of edges passes through after one `catmull_clark` step."""
-    edges, _ = edge_table(quads)
-    number = {(a, b): num_vertices + index for index, (a, b) in enumerate(edges.tolist())}
-    results = []
-    for loop in loops:
-        result = []
-        for first, second in zip(loop.tolist(), np.roll(loop, -1).tolist(), strict=True):
-            result += [first, number[min(first, second), max(first, second)]]
-        results.append(np.array(result))
-    return results
+class Cage(NamedTuple):
+    """The control cage and its measures: K vertices, Q quads, R rings, V vertices of the skin."""
+
+    quads: NDArray[np.int64]  # (Q, 4), counter-clockwise from outside
+    weights: NDArray[np.float64]  # (K, 16) share of every bone
+    ring_loops: NDArray[np.int64]  # (R, 24) vertices of the skin around each ring
+    knuckle_loop: NDArray[np.int64]  # (72,) around the palm's row at the knuckles
+    wrist_loop: NDArray[np.int64]  # (72,) around the row at the wrist
+    tips: NDArray[np.int64]  # (5, 15) vertices of the skin that close each digit
+    back_and_palm: NDArray[np.int64]  # (2,) vertices between which the palm's thickness is measured
+    finger_slots: NDArray[np.int64]  # (4, 6) indices in a palm row of the vertices around each finger
+    row_positions: NDArray[
+        np.float64
+    ]  # (6,) of palm rows along the metacarpals, 0 at the wrist, 1 at the joints
+    heights: NDArray[np.float64]  # (6, 9) of the back above the metacarpals, in palm thicknesses
+    depths: NDArray[np.float64]  # (6, 9) of the palm under them, from the little finger's side
+    wrist_columns: NDArray[np.float64]  # (4,) y of the rays at the wrist, in breadths
+    edges: NDArray[np.float64]  # (2, 6) from the outer rays to the palm's edges, in breadths
+    web_distances: NDArray[np.float64]  # (4, 6) of the web row along each first phalanx, in its lengths
+    base_section: NDArray[np.float64]  # (6, 2) (y, z) of a finger's base about its axis, in radii
+    sections: NDArray[np.float64]  # (8, 6, 2) (y, z) of the rings about the axis, in radii
+    waists: NDArray[np.float64]  # (8,) girth of the rings over the shape's
+    thumb_base: NDArray[np.int64]  # (12,) vertices of the palm around the thumb's metacarpal
+    thumb_base_targets: NDArray[
+        np.float64
+    ]  # (12, 4) along [lengths], sideways, upwards [radii], share of the way
+    thumb_ring: NDArray[np.float64]  # (6, 2) section of the thumb's first ring
+    thumb_ring_along: NDArray[np.float64]  # (6,) its positions along the metacarpal [lengths]
 
 
-WRIST, CARPUS, THENAR, METACARPUS, KNUCKLES, PAST_KNUCKLES, WEB = range(1, 8)
-NUM_ROWS: Final = 8
-AROUND: Final = 18
-# Rings of a finger past the web, and of the thumb; the last two form the tip.
-FINGER_RINGS: Final = ("before 1", "at 1", "after 1", "before 2", "after 2", "pad", "tip")
-THUMB_RINGS: Final = ("metacarpal", *FINGER_RINGS)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class CageTopology:
-    """Vertex numbers of the cage; the same for every hand."""
-
-    palm: Int[np.ndarray, "8 18"]
-    """Rows of the palm."""
-    rings: tuple[Int[np.ndarray, "R 6"], ...]
-    """Rings of each digit, outwards; a finger's shared first ring on the web row is not among them."""
-    quads: Int[np.ndarray, "Q 4"]
-    """Faces, counter-clockwise from outside."""
-    tips: Int[np.ndarray, "5 2"]
-    """The two faces that close each digit."""
-
-    @property
-    def num_vertices(self) -> int:
-        """Number of cage vertices."""
-        return int(self.quads.max()) + 1
-
-
-def palmar(column: int) -> int:
-    """Index of a palm column in a palm row; that of a back column is its number."""
-    return AROUND - 1 - column
-
-
-def finger_slots(finger: int) -> list[int]:
-    """Indices in a palm row of the six vertices around a finger (0 to 3), in a ring's order."""
-    columns = range(2 * finger, 2 * finger + 3)
-    return [*columns, *map(palmar, reversed(columns))]
-
-
-def cage_topology() -> CageTopology:
-    """Vertices and faces of the cage."""
-    palm = np.arange(NUM_ROWS * AROUND).reshape(NUM_ROWS, AROUND)
-    rings, first = [], palm.size
-    for digit in range(len(DIGITS)):
-        count = len(THUMB_RINGS if digit == 0 else FINGER_RINGS)
-        rings.append(first + np.arange(count * 6).reshape(count, 6))
-        first += count * 6
-    front, three = palmar(0), (CARPUS, THENAR, METACARPUS)
-    hole = {(row, front) for row in three[:2]}
-    quads = [
-        [palm[row, index], palm[row, next_index], palm[row + 1, next_index], palm[row + 1, index]]
-        for row in range(NUM_ROWS - 1)
-        for index in range(AROUND)
-        for next_index in [(index + 1) % AROUND]
-        if (row, index) not in hole
-    ]
-    quads += [
-        [palm[0, c], palm[0, palmar(c)], palm[0, palmar(c + 1)], palm[0, c + 1]]
-        for c in range(AROUND // 2 - 1)
-    ]
-    a, b, c = (palm[row] for row in three)
-    bases = [np.array([a[front], a[0], b[0], c[0], c[front], b[front]])]
-    bases += [palm[WEB, finger_slots(finger)] for finger in range(4)]
-    tips = []
-    for base, digit_rings in zip(bases, rings, strict=True):
-        loops = [base, *digit_rings]
-        for near, far in itertools.pairwise(loops):
-            quads += np.stack([near, np.roll(near, -1), np.roll(far, -1), far], axis=-1).tolist()
-        tips.append([len(quads), len(quads) + 1])
-        quads += loops[-1][[[1, 2, 3, 4], [4, 5, 0, 1]]].tolist()
-    return CageTopology(palm, tuple(rings), np.array(quads), np.array(tips))
-
-
-# Height of the back above, and depth of the palm under, the metacarpals, in palm thicknesses, by column.
-_HEIGHTS: Final = np.array(
-    [
-        [0.24, 0.43, 0.52, 0.54, 0.54, 0.52, 0.48, 0.40, 0.20],
-        [0.24, 0.43, 0.52, 0.54, 0.54, 0.52, 0.48, 0.40, 0.20],
-        [0.30, 0.46, 0.52, 0.54, 0.54, 0.52, 0.50, 0.45, 0.22],
-        [0.30, 0.47, 0.50, 0.52, 0.51, 0.50, 0.49, 0.44, 0.20],
-        [0.26, 0.46, 0.47, 0.49, 0.46, 0.49, 0.46, 0.46, 0.20],
-        [0.24, 0.57, 0.38, 0.58, 0.39, 0.56, 0.38, 0.53, 0.20],
-    ]
-)
-_DEPTHS: Final = np.array(
-    [
-        [0.50, 0.80, 0.90, 0.92, 0.92, 0.92, 0.90, 0.80, 0.42],
-        [0.50, 0.80, 0.88, 0.90, 0.90, 0.92, 0.92, 0.82, 0.42],
-        [0.60, 1.00, 1.00, 0.95, 0.90, 0.92, 0.96, 0.90, 0.50],
-        [0.80, 1.25, 0.95, 0.80, 0.70, 0.71, 0.82, 0.86, 0.55],
-        [0.52, 0.66, 0.62, 0.58, 0.56, 0.60, 0.66, 0.70, 0.42],
-        [0.40, 0.62, 0.64, 0.64, 0.64, 0.64, 0.64, 0.60, 0.38],
-    ]
-)
-# Position of each palm row along the metacarpals: 0 at the wrist, 1 at the joints.
-_ROW_POSITIONS: Final = np.array([-0.26, -0.05, 0.16, 0.42, 0.70, 0.97])
-_WRIST_COLUMNS: Final = np.array([0.215, 0.075, -0.07, -0.205])  # y of the rays at the wrist, in breadths
-_EDGES: Final = np.array([[0.15, 0.14, 0.12, 0.13, 0.13, 0.145], [0.15, 0.14, 0.16, 0.17, 0.155, 0.145]])
-
-_CARPUS_RISE: Final = 0.42  # the carpus arches over the line from wrist to knuckles, in palm thicknesses
-_ARCH: Final = np.array([0.0, 0.0, 0.04, 0.08, 0.08, 0.02])  # added to the back's height, by row
-# Finger joints lie nearer to the back than to the pad: the middle (y, z) of a section, in radii.
-_PALMWARD: Final = np.array([0.0, -0.14])
-# Distance of the web row along each first phalanx, in its lengths; webs slope from the back to the palm.
-_WEB_DISTANCES: Final = np.array(
-    [
-        [0.43, 0.43, 0.31, 0.38, 0.45, 0.43],
-        [0.31, 0.43, 0.31, 0.38, 0.45, 0.38],
-        [0.31, 0.43, 0.31, 0.38, 0.45, 0.38],
-        [0.31, 0.43, 0.43, 0.43, 0.45, 0.38],
-    ]
-)
-
-# Targets of the palm's vertices around the thumb's metacarpal: position along it in its lengths, sideways and
-# upwards in its radii, and the share of the way that each vertex moves to its target.
-_THUMB_BASE_ROWS: Final = np.repeat([CARPUS, THENAR, METACARPUS], [4, 5, 3])
-_THUMB_BASE_COLUMNS: Final = np.array(
-    [0, *map(palmar, range(3)), 0, *map(palmar, range(4)), *map(palmar, range(3))]
-)
-_THUMB_BASE: Final = np.array(
-    [
-        [-0.1, -0.9, 0.9, 0.5],
-        [-0.03, 1.18, 0.47, 0.8],
-        [-0.02, 1.68, -0.35, 0.75],
-        [-0.11, 1.57, -1.36, 0.5],
-        [0.25, -1.2, 0.5, 0.5],
-        [0.48, 1.08, -0.78, 0.9],
-        [0.50, 0.50, -1.32, 0.9],
-        [0.41, 0.77, -1.94, 0.7],
-        [0.29, 0.59, -2.77, 0.4],
-        [0.65, -0.25, -1.20, 0.9],
-        [0.68, -0.55, -1.75, 0.8],
-        [0.69, -0.17, -2.31, 0.4],
-    ]
-)
-
-_RING_ANGLES: Final = np.deg2rad(np.arange(30.0, 360.0, 60.0))
-_ROUND: Final = np.stack([1.03 * np.cos(_RING_ANGLES), 0.97 * np.sin(_RING_ANGLES)], axis=-1)
-# Sections (y, z) of the rings about the axis: knuckles stand out on the back, the nail is flat, the pad full.
-_SECTIONS: Final = {
-    "metacarpal": _ROUND,
-    "before 1": _ROUND,
-    "at 1": _ROUND * [1.0, 1.0] + [0.0, 0.03],
-    "after 1": _ROUND,
-    "before 2": _ROUND,
-    "after 2": _ROUND * [1.02, 0.97],
-    "pad": np.array([[0.92, 0.52], [0.0, 0.80], [-0.92, 0.52], [-0.86, -0.62], [0.0, -1.12], [0.86, -0.62]]),
-    "tip": np.array([[0.52, 0.28], [0.0, 0.46], [-0.52, 0.28], [-0.46, -0.44], [0.0, -0.68], [0.46, -0.44]]),
-}
-
-
-_WAISTS: Final = {"before 1": 0.985, "at 1": 1.01, "after 1": 0.985}  # girth of a ring over the shape's
-_THUMB, _FINGERS = slice(0, 1), slice(1, len(DIGITS))
-_GROUPS: Final = ((_THUMB, THUMB_RINGS), (_FINGERS, FINGER_RINGS))  # digits with the same rings
+@functools.cache
+def load_cage() -> Cage:
+    """The cage of every hand."""
+    return Cage(**{name: np.array(values) for name, values in package_data("handsim", "hand_cage").items()})
 
 
 class CageHands(NamedTuple):
@@ -263,31 +141,29 @@ class CageHands(NamedTuple):
     def ring_girths(self) -> Float[np.ndarray, "B R"]:
         """Girth of the skin at each ring [m]: a little more at the joints, a little less between them."""
         girths = []
-        for digits, names in _GROUPS:
-            waist = np.array([_WAISTS.get(name, 1.0) for name in names])
+        for digits, rings in zip((_THUMB, _FINGERS), RINGS, strict=True):
+            waists = load_cage().waists[-rings.shape[1] :]
             radii = self._radius_at(digits, self._ring_distances(digits))
-            girths.append((2.0 * np.pi * waist * radii).reshape(len(radii), -1))
+            girths.append((2.0 * np.pi * waists * radii).reshape(len(radii), -1))
         return np.concatenate(girths, axis=1)
 
-    def cage_parts(self, topology: CageTopology) -> Float[np.ndarray, "3 B K 3"]:
+    def cage_parts(self) -> Float[np.ndarray, "3 B K 3"]:
         """Cage vertices in the wrist frame [m], affine in two scales: at zero, per width, per depth.
 
         Width scales rings and the palm's breadth; depth pushes the last rings out and scales the palm's
         thickness.
         """
         wide, deep = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
-        cages = np.empty((len(self.breadth), 3, topology.num_vertices, 3))
-        cages[:, :, topology.palm] = self._palm(wide, deep)
-        for digits, names in _GROUPS:
+        cages = np.empty((len(self.breadth), 3, len(load_cage().weights), 3))
+        cages[:, :, PALM_VERTICES] = self._palm(wide, deep)
+        for digits, rings in zip((_THUMB, _FINGERS), RINGS, strict=True):
             distances = self._ring_distances(digits)[:, None]  # (B, 1, D, R)
-            sections = np.array([_SECTIONS[name] for name in names])
-            sections[:-2] += _PALMWARD
+            sections = load_cage().sections[-rings.shape[1] :]
             radii = self._radius_at(digits, distances[:, 0])[:, None] * wide[:, None, None]  # (B, 3, D, R)
             along = np.repeat(distances, 3, axis=1)
             along[..., -1] += deep[:, None]
-            rings = np.stack(topology.rings[digits])
             cages[:, :, rings] = self._around(digits, along[..., None], sections * radii[..., None, None])
-        self._shape_thumb_base(cages, topology)
+        self._shape_thumb_base(cages)
         parts = cages.swapaxes(0, 1)
         parts[1:] -= parts[0].copy()
         return parts
@@ -336,80 +212,56 @@ class CageHands(NamedTuple):
 
     def _palm(self, wide: NDArray[np.float64], deep: NDArray[np.float64]) -> NDArray[np.float64]:
         """The palm's rows (B, 3, 8, 18, 3) at three scales of breadth and thickness [m]."""
-        count = len(self.breadth)
+        cage, count = load_cage(), len(self.breadth)
         wrist = np.zeros((count, 1, 4, 3))
-        wrist[..., 1] = _WRIST_COLUMNS * self.breadth[:, None, None]
+        wrist[..., 1] = cage.wrist_columns * self.breadth[:, None, None]
         wrist[..., 2] = _CARPUS_RISE * self.palm_thickness[:, None, None]
         knuckles = self.knuckles[:, None, 1:]
-        along = np.clip(_ROW_POSITIONS, 0.0, 1.0)[:, None, None]
+        positions = cage.row_positions[:, None]
+        along = np.clip(positions, 0.0, 1.0)[..., None]
         centers = (1.0 - along) * wrist + along * knuckles  # (B, 6, 4, 3)
-        centers[..., 0] = _ROW_POSITIONS[:, None] * np.where(
-            _ROW_POSITIONS[:, None] < 0.0, knuckles[:, :, 1:2, 0], knuckles[..., 0]
-        )
+        reach = np.where(positions < 0.0, knuckles[:, :, 1:2, 0], knuckles[..., 0])
+        centers[..., 0] = positions * reach
         columns = np.empty((count, 1, 6, 9, 3))
         columns[:, 0, :, 1::2] = centers
         columns[:, 0, :, 2:-1:2] = 0.5 * (centers[:, :, :-1] + centers[:, :, 1:])
         columns[..., 0, :], columns[..., 8, :] = columns[..., 1, :], columns[..., 7, :]
         columns = np.repeat(columns, 3, axis=1)
-        edges = _EDGES * self.breadth[:, None, None, None] * wide[:, None, None]  # (B, 3, 2, 6)
+        edges = cage.edges * self.breadth[:, None, None, None] * wide[:, None, None]  # (B, 3, 2, 6)
         columns[..., 0, 1] += edges[:, :, 0]
         columns[..., 8, 1] -= edges[:, :, 1]
         thickness = (self.palm_thickness[:, None] * deep)[..., None, None]
         rows = np.empty((count, 3, NUM_ROWS, AROUND, 3))
         rows[:, :, :6, :9], rows[:, :, :6, 9:] = columns, columns[..., ::-1, :]
-        rows[:, :, :6, :9, 2] += (_HEIGHTS + _ARCH[:, None]) * thickness
-        rows[:, :, :6, 9:, 2] -= _DEPTHS[:, ::-1] * thickness
+        rows[:, :, :6, :9, 2] += cage.heights * thickness
+        rows[:, :, :6, 9:, 2] -= cage.depths * thickness
         past = np.repeat(0.7 * self.radii[:, 1:, :1], 6, axis=2)
-        rows[:, :, PAST_KNUCKLES] = self._finger_bases(past, 0.12)
-        rows[:, :, WEB] = self._finger_bases(_WEB_DISTANCES * self.bone_lengths[:, 1:, :1], 0.0)
+        rows[:, :, _PAST_KNUCKLES] = self._finger_bases(past, 0.12)
+        rows[:, :, _WEB] = self._finger_bases(cage.web_distances * self.bone_lengths[:, 1:, :1], 0.0)
         return rows
 
     def _finger_bases(self, distances: NDArray[np.float64], deepen: float) -> NDArray[np.float64]:
         """A palm row (B, 1, 18, 3) across the fingers, `distances` (B, 4, 6) [m] past their first joints."""
         radius = 1.2 * self._radius_at(_FINGERS, distances)
-        section = (_ROUND + _PALMWARD) * radius[..., None]
+        section = load_cage().base_section * radius[..., None]
         section[..., 3:, 1] -= deepen * radius[..., 3:]
         bases = self._around(_FINGERS, distances[:, None], section[:, None])
-        row, shared = np.zeros((len(distances), 1, AROUND, 3)), np.zeros(AROUND)
-        for finger in range(len(DIGITS) - 1):
-            slots = finger_slots(finger)
-            row[:, :, slots] += bases[:, :, finger]
-            shared[slots] += 1.0
-        return row / shared[:, None]
+        row, slots = np.zeros((len(distances), 1, AROUND, 3)), load_cage().finger_slots
+        for finger, own in enumerate(slots):
+            row[:, :, own] += bases[:, :, finger]
+        return row / np.bincount(slots.ravel())[:, None]
 
-    def _shape_thumb_base(self, cages: NDArray[np.float64], topology: CageTopology) -> None:
+    def _shape_thumb_base(self, cages: NDArray[np.float64]) -> None:
         """Thenar muscle and first web, in place: the palm's rows around the thumb's metacarpal."""
         length, radius = self.bone_lengths[:, None, :1, :1], self.radii[:, None, :1, :1]
-        moved = topology.palm[_THUMB_BASE_ROWS, _THUMB_BASE_COLUMNS]
-        along, across, share = np.split(_THUMB_BASE, [1, 3], axis=1)
+        cage = load_cage()
+        moved = cage.thumb_base
+        along, across, share = np.split(cage.thumb_base_targets, [1, 3], axis=1)
         targets = self._around(_THUMB, along[:, 0] * length, radius[..., None] * across)[:, :, 0]
         cages[:, :, moved] = (1.0 - share) * cages[:, :, moved] + share * targets
-        section = np.array([[1.02, 0.6], [0.0, 1.1], [-1.1, 0.7], [-1.4, -0.6], [0.2, -1.0], [0.95, -0.62]])
-        along = np.array([0.55, 0.5, 0.55, 0.72, 0.77, 0.67]) * length
-        ring = self._around(_THUMB, along, (1.12 * radius)[..., None] * section)
-        cages[:, :, topology.rings[0][0]] = ring[:, :, 0]
-
-
-_FIRST_RING, _FIRST_PALM = 1.2, 1.1  # scales that suit the mean hand
-# Bone of the digit and its share on each ring past the web; the rest goes to the bone before it.
-_FINGER_RINGS: Final = ((1, 0.0), (1, 0.5), (1, 1.0), (2, 0.0), (2, 1.0), (2, 1.0), (2, 1.0))
-# Share of the thumb's metacarpal on the palm's rows around it: (row, index, share).
-_THENAR: Final = (
-    (CARPUS, 0, 0.25),
-    (CARPUS, palmar(0), 0.35),
-    (CARPUS, palmar(1), 0.15),
-    (THENAR, 0, 0.5),
-    (THENAR, 1, 0.05),
-    (THENAR, palmar(0), 0.8),
-    (THENAR, palmar(1), 0.6),
-    (THENAR, palmar(2), 0.3),
-    (THENAR, palmar(3), 0.05),
-    (METACARPUS, 0, 0.15),
-    (METACARPUS, palmar(0), 0.4),
-    (METACARPUS, palmar(1), 0.25),
-)
-# Share of the fingers' first bones on the palm's rows, on a finger's column and on a web's.
-_KNUCKLE_SHARES: Final = {KNUCKLES: (0.35, 0.25), PAST_KNUCKLES: (0.9, 0.7), WEB: (1.0, 0.9)}
+        along = cage.thumb_ring_along * length
+        ring = self._around(_THUMB, along, (1.12 * radius)[..., None] * cage.thumb_ring)
+        cages[:, :, RINGS[0][0, 0]] = ring[:, :, 0]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -429,7 +281,6 @@ class HandSurface:
 class _Template(NamedTuple):
     """What all hands share. The last four are rows of `measured`, the vertices that the fit measures."""
 
-    topology: CageTopology
     subdivide: sparse.csr_array
     faces: np.ndarray
     bone_indices: np.ndarray
@@ -445,26 +296,19 @@ class _Template(NamedTuple):
 def _template() -> _Template:
     from scipy import sparse
 
-    topology = cage_topology()
-    quads, count = topology.quads, topology.num_vertices
-    loops = [ring for rings in topology.rings for ring in rings] + [topology.palm[KNUCKLES]]
-    subdivide = sparse.eye_array(count, format="csr")
+    cage = load_cage()
+    quads, subdivide = cage.quads, sparse.eye_array(len(cage.weights), format="csr")
     for _ in range(2):
-        step, next_quads = catmull_clark(quads, count)
-        loops = subdivided_loops(loops, quads, count)
+        step, quads = catmull_clark(quads, subdivide.shape[0])
         subdivide = step @ subdivide
-        quads, count = next_quads, step.shape[0]
-    children = np.arange(len(quads)).reshape(len(topology.quads), -1)  # quads that came from each cage quad
-    tips = np.array([np.unique(quads[children[pair]]) for pair in topology.tips])
     faces = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
-    indices, weights = strongest_weights(subdivide @ cage_weights(topology))
+    indices, weights = strongest_weights(subdivide @ cage.weights)
     for array in (faces, indices, weights):
         array.setflags(write=False)
-    back_and_palm = topology.palm[METACARPUS][[3, palmar(3)]]
-    looked_at = (np.array(loops[:-1]), loops[-1], tips, back_and_palm)
+    looked_at = (cage.ring_loops, cage.knuckle_loop, cage.tips, cage.back_and_palm)
     rows = np.unique(np.concatenate([part.ravel() for part in looked_at]))
     parts = [np.searchsorted(rows, part) for part in looked_at]
-    return _Template(topology, subdivide, faces, indices, weights, subdivide[rows], *parts)
+    return _Template(subdivide, faces, indices, weights, subdivide[rows], *parts)
 
 
 def build_surface(shape: HandShape) -> HandSurface:
@@ -506,14 +350,13 @@ def _subdivided(matrix: sparse.csr_array, cages: np.ndarray) -> np.ndarray:
 
 def _fitted_cages(hands: CageHands, template: _Template) -> np.ndarray:
     """Cage vertices (B, K, 3) after a few corrections of their scales by expected over measured sizes."""
-    topology, count = template.topology, len(hands.breadth)
-    still, wide, deep = hands.cage_parts(topology)
-    palm, on_ring = topology.palm.size, topology.rings[0].shape[1]
-    sideways, upwards = np.full((2, count, topology.num_vertices), _FIRST_PALM)
+    palm, count = PALM_VERTICES.size, len(hands.breadth)
+    still, wide, deep = hands.cage_parts()
+    sideways, upwards = np.full((2, *still.shape[:2]), _FIRST_PALM)
     sideways[:, palm:], upwards[:, palm:] = _FIRST_RING, 0.0
-    rings = sideways[:, palm:].reshape(count, -1, on_ring)  # a view
-    tip_rings = np.cumsum([len(digit) for digit in topology.rings]) - 1
-    outermost = np.array([digit[-1] for digit in topology.rings])
+    rings = sideways[:, palm:].reshape(count, -1, _ON_RING)  # a view
+    outermost = np.concatenate([digits[:, -1] for digits in RINGS])
+    tip_rings = (outermost[:, 0] - palm) // _ON_RING
     girths, reach = hands.ring_girths(), hands.bone_lengths.sum(axis=2)
     for _ in range(4):
         cages = still + sideways[..., None] * wide + upwards[..., None] * deep
@@ -562,29 +405,6 @@ def _vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
             for i in range(3):
                 normals[v, i] /= length
     return normals
-
-
-def cage_weights(topology: CageTopology) -> Float[np.ndarray, "K 16"]:
-    """Share of every bone in every cage vertex; rows sum to one."""
-    weights = np.zeros((topology.num_vertices, NUM_BONES))
-    for row, (on_finger, on_web) in _KNUCKLE_SHARES.items():
-        for column in range(9):
-            beside = (column // 2,) if column % 2 else (column // 2 - 1, column // 2)
-            fingers = [finger for finger in beside if 0 <= finger < 4]
-            share = on_finger if column % 2 or len(fingers) == 1 else on_web
-            for index in (column, palmar(column)):
-                weights[topology.palm[row, index], [4 + 3 * f for f in fingers]] = share / len(fingers)
-    for row, index, share in _THENAR:
-        weights[topology.palm[row, index], 1] = share
-    for digit, rings in enumerate(topology.rings):
-        first = 1 + 3 * digit
-        if digit == 0:
-            weights[rings[0], first] = 0.95
-        for ring, (bone, share) in zip(rings[-len(_FINGER_RINGS) :], _FINGER_RINGS, strict=True):
-            weights[ring, first + bone - 1] = 1.0 - share
-            weights[ring, first + bone] = share
-    weights[:, PALM] = 1.0 - weights[:, PALM + 1 :].sum(axis=1)
-    return weights
 
 
 def strongest_weights(

@@ -26,12 +26,11 @@ from scipy import sparse
 from handsim.hand.model import HandModel
 from handsim.hand.shape import BONES, DIGIT_OF_BONE, DIGITS, JOINT_NAMES, JOINTS, NUM_BONES, NUM_JOINTS, PALM
 from handsim.hand.skin import (
-    WRIST,
+    PALM_VERTICES,
     all_weights,
-    cage_topology,
     catmull_clark,
+    load_cage,
     skin_frames,
-    subdivided_loops,
     vertex_normals,
 )
 from handsim.kernels import kernel
@@ -81,22 +80,20 @@ class Atlas(NamedTuple):
 @functools.cache
 def skin_atlas() -> Atlas:
     """The atlas of all hands; cached."""
-    topology = cage_topology()
-    quads, count = topology.quads, topology.num_vertices
-    loop = topology.palm[WRIST]
+    cage = load_cage()
+    quads, count = cage.quads, len(cage.weights)
     coordinates = np.broadcast_to(
         np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]), (len(quads), 4, 2)
     )
     for _ in range(_LEVELS):
-        (loop,) = subdivided_loops([loop], quads, count)
         step, quads = catmull_clark(quads, count)
         count = step.shape[0]
         coordinates = _child_coordinates(coordinates)
     # Left out are the stump behind the wrist, that is a strip of the palm, and the faces that close it.
-    kept = ~np.isin(topology.quads, topology.palm[:WRIST]).any(axis=1)
-    grids = _grids(quads, coordinates, len(topology.quads))[kept]
+    kept = ~np.isin(cage.quads, PALM_VERTICES[0]).any(axis=1)
+    grids = _grids(quads, coordinates, len(cage.quads))[kept]
     used = np.unique(grids)
-    return _assemble(used, np.searchsorted(used, grids), np.searchsorted(used, loop))
+    return _assemble(used, np.searchsorted(used, grids), np.searchsorted(used, cage.wrist_loop))
 
 
 def _child_coordinates(coordinates: Doubles) -> Doubles:
