@@ -46,6 +46,11 @@ _WAY_BACK: Final = (
 )
 _NEAR_END: Final = 0.1  # along the bone
 _LONGEST_SLIP: Final = 0.025  # A random shift moves a marker at most this far [m].
+_CONVERGED: Final = 1e-5  # [m] distance of a marker from its target
+_STALK_CONVERGED: Final = 2e-4  # [m] distance of a stalk's axis from its target
+_ACCEPTED: Final = 5e-4  # A marker keeps its bone if it comes this near to its target [m].
+_CURVATURE_RADIUS: Final = 0.006  # radius of curvature of a fingertip's skin [m]
+_SPACING: Final = 4e-3  # rough distance between neighboring skin vertices [m]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -561,13 +566,6 @@ def nearest_markers(fit: GloveFit) -> tuple[str, str, float]:
     np.fill_diagonal(distances, np.inf)
     first, second = divmod(int(distances.argmin()), len(points))
     return fit.layout.names[first], fit.layout.names[second], float(distances[first, second])
-
-
-_CONVERGED: Final = 1e-5  # [m] distance of a marker from its target
-_STALK_CONVERGED: Final = 2e-4  # [m] distance of a stalk's axis from its target
-_ACCEPTED: Final = 5e-4  # A marker keeps its bone if it comes this near to its target [m].
-_CURVATURE_RADIUS: Final = 0.006  # radius of curvature of a fingertip's skin [m]
-_SPACING: Final = 4e-3  # rough distance between neighboring skin vertices [m]
 
 
 def place_marker(

@@ -67,6 +67,8 @@ radius_mm = 3.2  # of every marker, 0.5 to 15
 #   height_mm  optional: the length of a stalk, 0 to 50; without it the marker lies on the skin
 # A labeler tells markers apart by their pattern: keep the three on the back away from any symmetry, and every
 # marker where a camera can see it in most poses."""
+_TABLE: Final = re.compile(r"\s*\[\[\s*marker\s*\]\]\s*(?:#.*)?$")
+_ENTRY: Final = re.compile(r"(\s*(\w+)\s*=\s*)(\"[^\"\\]*\"|'[^']*'|[^\s#\"']+)(\s*(?:#.*)?)$")
 
 
 @dataclass(frozen=True, slots=True)
@@ -366,10 +368,6 @@ def _parse_marker(table: Mapping[str, object], number: int) -> MarkerPlace:
         across=number_of(table, "across", f"{owner}: ", default=0.0),
         height=number_of(table, "height_mm", f"{owner}: ", default=0.0) * 1e-3,
     )
-
-
-_TABLE: Final = re.compile(r"\s*\[\[\s*marker\s*\]\]\s*(?:#.*)?$")
-_ENTRY: Final = re.compile(r"(\s*(\w+)\s*=\s*)(\"[^\"\\]*\"|'[^']*'|[^\s#\"']+)(\s*(?:#.*)?)$")
 
 
 def moved_text(text: str, layout: MarkerLayout) -> tuple[str, bool]:

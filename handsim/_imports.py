@@ -30,6 +30,18 @@ from typing import Any, Final
 from handsim._process import own_numerics, with_own_numerics
 from handsim.errors import HandSimError
 
+SIBLINGS: Final = ("poses", "gloves", "render", "train", "track")
+_HOME: Final = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
+_NEEDS: Final = {
+    "render": ("poses", "gloves"),
+    "train": ("poses", "gloves"),
+    "track": ("poses", "gloves", "train"),
+}
+"""Packages that each package imports."""
+_REMEDY: Final = "import handsim.{0} before it, rename it, or keep it off the path"
+VARIABLE: Final = "NUMBA_CACHE_DIR"
+_PACKAGE: Final = Path(__file__).parent
+
 
 def lazy_exports(package: str) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
     """The `__getattr__` and `__dir__` of a package; its `__all__` is set.
@@ -71,19 +83,6 @@ def _exports(body: list[ast.stmt]) -> list[tuple[str, str]]:
         for alias in one.names
         if alias.name == alias.asname
     ]
-
-
-SIBLINGS: Final = ("poses", "gloves", "render", "train", "track")
-_HOME: Final = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
-
-
-_NEEDS: Final = {
-    "render": ("poses", "gloves"),
-    "train": ("poses", "gloves"),
-    "track": ("poses", "gloves", "train"),
-}
-"""Packages that each package imports."""
-_REMEDY: Final = "import handsim.{0} before it, rename it, or keep it off the path"
 
 
 class ShadowedPackageWarning(UserWarning):
@@ -186,10 +185,6 @@ def _location(name: str) -> str | None:
         return None
     folders = spec.submodule_search_locations
     return str(next(iter(folders))) if folders else spec.origin
-
-
-VARIABLE: Final = "NUMBA_CACHE_DIR"
-_PACKAGE: Final = Path(__file__).parent
 
 
 def ensure_kernel_cache() -> None:

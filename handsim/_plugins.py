@@ -22,6 +22,8 @@ from handsim.errors import ArgumentError, HandSimError, choices, shortened
 
 _NAME: Final = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_][\w.]*")
 _ADDRESS: Final = re.compile(r" at 0x[0-9a-f]+")
+EGL_PACKAGES: Final = "libegl1 libegl-mesa0 libgl1-mesa-dri libgl1 libopengl0"
+"""Packages of Debian and Ubuntu, which pip cannot install, for OpenGL without a screen."""
 
 
 def is_plugin(name: str) -> bool:
@@ -120,10 +122,6 @@ def _error_text(error: Exception) -> str:
     """An error and the line that raised it."""
     last = traceback.extract_tb(error.__traceback__)[-1]
     return f"{type(error).__name__}: {error} ({last.filename}, line {last.lineno})"
-
-
-EGL_PACKAGES: Final = "libegl1 libegl-mesa0 libgl1-mesa-dri libgl1 libopengl0"
-"""Packages of Debian and Ubuntu, which pip cannot install, for OpenGL without a screen."""
 
 
 def import_extra(module: str, what: str, extra: str) -> Any:

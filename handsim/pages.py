@@ -36,35 +36,8 @@ _WRITERS: Final = {
     "track.gloves.learned_glove.LearnedGlove": "track.gloves.learned_page:write_learned_page",
     "train.forecast.rig_score.RigScore": "train.forecast.rig_score:write_rig_page",
 }
-
-
-class Paint:
-    """The colors of all pictures."""
-
-    INK, SOFT, LINE, BAND, CARD = "#23272f", "#5b6270", "#c3c8d0", "#e0e4e9", "#f4f5f7"
-    BLUE, PALE, AMBER, WARM, GREEN, VIOLET = "#3f7396", "#a9c3d4", "#d9a441", "#b8572b", "#5b8c5a", "#7a5ba0"
-
-
 NOTHING: Final = "-"
 """The cell of a table where there is no number."""
-_PICTURES: Final[dict[str, Any]] = {
-    "font.size": 9.0,
-    "text.color": Paint.INK,
-    "axes.labelcolor": Paint.SOFT,
-    "axes.labelsize": 9.0,
-    "axes.titlesize": 9.5,
-    "axes.edgecolor": Paint.LINE,
-    "axes.facecolor": "none",
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "xtick.color": Paint.LINE,
-    "ytick.color": Paint.LINE,
-    "xtick.labelcolor": Paint.SOFT,
-    "ytick.labelcolor": Paint.SOFT,
-    "figure.facecolor": Paint.CARD,  # the page's card, which dark pages invert with the figure
-    "savefig.facecolor": Paint.CARD,
-    "svg.hashsalt": "handsim",  # ids that do not change from one run to the next
-}
 _STYLE: Final = """
 :root { color-scheme: light dark; --ink: #23272f; --soft: #5b6270; --paper: #ffffff; --card: #f4f5f7;
   --line: #d9dde3; }
@@ -92,6 +65,33 @@ th:first-child, td:first-child { text-align: left; padding-right: 2.5rem; }
   h2, h2 + p, tr:first-child { break-after: avoid; } figure, tr { break-inside: avoid; }
 }
 """
+
+
+class Paint:
+    """The colors of all pictures."""
+
+    INK, SOFT, LINE, BAND, CARD = "#23272f", "#5b6270", "#c3c8d0", "#e0e4e9", "#f4f5f7"
+    BLUE, PALE, AMBER, WARM, GREEN, VIOLET = "#3f7396", "#a9c3d4", "#d9a441", "#b8572b", "#5b8c5a", "#7a5ba0"
+
+
+_PICTURES: Final[dict[str, Any]] = {
+    "font.size": 9.0,
+    "text.color": Paint.INK,
+    "axes.labelcolor": Paint.SOFT,
+    "axes.labelsize": 9.0,
+    "axes.titlesize": 9.5,
+    "axes.edgecolor": Paint.LINE,
+    "axes.facecolor": "none",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "xtick.color": Paint.LINE,
+    "ytick.color": Paint.LINE,
+    "xtick.labelcolor": Paint.SOFT,
+    "ytick.labelcolor": Paint.SOFT,
+    "figure.facecolor": Paint.CARD,  # the page's card, which dark pages invert with the figure
+    "savefig.facecolor": Paint.CARD,
+    "svg.hashsalt": "handsim",  # ids that do not change from one run to the next
+}
 _Drawn = ParamSpec("_Drawn")
 
 

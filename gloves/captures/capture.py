@@ -17,6 +17,19 @@ from gloves.captures.text import check_rate
 from handsim._checks import as_numbers, check_type
 from handsim.errors import ArgumentError, CaptureError, HandSimWarning, choices, errors_of
 
+UNLABELED: Final = "Unlabeled"
+"""Columns of points without a marker are called Unlabeled1, Unlabeled2, ..."""
+MAX_SPAN: Final = 30.0
+"""Largest median span of clouds that are in meters [m]; a hand in millimeters would span more."""
+AT_ORIGIN: Final = "all points are at the origin, (0, 0, 0)"
+"""What errors say of clouds for which `all_at_origin` is true."""
+_MIN_SPAN: Final = 0.02  # [m]: smallest median span; a fist with five markers spans three times as much
+_MIN_CENTIMETERS: Final = 0.002  # [m]: smallest span of hands in centimeters that were read as millimeters
+_MAX_SPACING: Final = 1.5  # [m]: largest median distance of a point from the nearest other one
+_MIN_POINTS: Final = 5  # A cloud needs this many points to show its unit; fewer may all be strays.
+_MIN_FRAMES: Final = 10  # Small or wide clouds count in this many frames; fewer may show strays alone.
+_SAMPLED: Final = 200  # frames that are looked at, evenly spread
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Capture:
@@ -87,10 +100,6 @@ def runs_of(flags: Bool[np.ndarray, "T"]) -> list[tuple[int, int]]:
     return [(first, last) for _, first, last in column_runs(flags[:, None]).T.tolist()]
 
 
-UNLABELED: Final = "Unlabeled"
-"""Columns of points without a marker are called Unlabeled1, Unlabeled2, ..."""
-
-
 def select_markers(capture: Capture, names: Sequence[str]) -> Float[np.ndarray, "T M 3"]:
     """The columns of the named markers, in their order; a subject's prefix ("Anna:ThumbTip") is ignored."""
     bare = [column.rsplit(":", 1)[-1].strip() for column in capture.names]
@@ -151,18 +160,6 @@ def labeled_columns(
         positions[frame, column] = points
     columns = [*names, *(f"{UNLABELED}{number + 1}" for number in range(extra))]
     return Capture(tuple(columns), positions, rate)
-
-
-MAX_SPAN: Final = 30.0
-"""Largest median span of clouds that are in meters [m]; a hand in millimeters would span more."""
-AT_ORIGIN: Final = "all points are at the origin, (0, 0, 0)"
-"""What errors say of clouds for which `all_at_origin` is true."""
-_MIN_SPAN: Final = 0.02  # [m]: smallest median span; a fist with five markers spans three times as much
-_MIN_CENTIMETERS: Final = 0.002  # [m]: smallest span of hands in centimeters that were read as millimeters
-_MAX_SPACING: Final = 1.5  # [m]: largest median distance of a point from the nearest other one
-_MIN_POINTS: Final = 5  # A cloud needs this many points to show its unit; fewer may all be strays.
-_MIN_FRAMES: Final = 10  # Small or wide clouds count in this many frames; fewer may show strays alone.
-_SAMPLED: Final = 200  # frames that are looked at, evenly spread
 
 
 class UnitFault(NamedTuple):

@@ -74,6 +74,61 @@ _BEGIN: Final = b"PathFileType"
 _HEADER_LINES: Final = 5
 _NO_MARKERS: Final = "no markers: line 4 should read 'Frame#', 'Time', then the marker names"
 _KEYS: Final = "DataRate CameraRate NumFrames NumMarkers Units OrigDataRate OrigDataStartFrame OrigNumFrames"
+MOTIVE_BEGIN: Final = b"Format Version"
+_COUNT: Final = "Total Exported Frames"
+_UNIT: Final = "Length Units"
+_SPACE: Final = "Coordinate Space"
+_RATES: Final = ("Export Frame Rate", "Capture Frame Rate")
+_MOTIVE_KEYS: Final = {
+    key.lower(): key for key in ("Format Version", "Take Name", "Take Notes", *_RATES, _COUNT, _UNIT, _SPACE)
+}
+_AXES: Final = ["X", "Y", "Z"]
+_TYPES: Final = {"Marker", "Rigid Body", "Rigid Body Marker", "Bone", "Bone Marker"}
+_TITLE: Final = "Trajectories"
+_SECTIONS: Final = (_TITLE, "Devices", "Model Outputs", "Joints", "Segments")
+_FIRST_CELLS: Final = ("frame", "field #")
+_OUTPUT_UNITS: Final = {"deg", "rad", "n", "nmm", "n.mm", "nm", "n.m", "w", "kg", "v", "mv"}
+"""Units of angles, forces, moments, powers and signals, in lower case."""
+_BLANKS: Final = b' \t",;'
+_BEGINS: Final = (b"NO_OF_FRAMES", b"FILE_VERSION")
+_KEY: Final = re.compile(rb"(?!NULL\t)[A-Z][A-Z0-9_]*(\t|$)")
+_QTM_LEADING: Final = ("frame", "time")
+_LEADING_TITLE: Final = re.compile(r"frame|time|#|$", re.I)
+_AXIS: Final = re.compile(r"(.+?)[ ._:-]?([xyz])", re.I)
+_COPY: Final = re.compile(r"(.+)\.[12]")  # pandas numbers columns of the same name
+_FIRST_BYTES: Final = 200  # bytes that show which program wrote a CSV
+_SKELETON: Final = "the motion of a skeleton without its markers; export the markers where it was made"
+_VICON: Final = "a file of Vicon's own; export C3D or ASCII with trajectories from Nexus"
+_CORTEX: Final = "a binary file of Cortex; export TRC or C3D from there"
+_OPENSIM: Final = "angles or forces of OpenSim and no markers; give the TRC that they were made of"
+_UNREAD: Final = {
+    ".tak": "a take of Motive, a closed format; export CSV or C3D with unlabeled markers from Motive",
+    ".qtm": "a file of Qualisys' own; export C3D, or TSV of 3D data, from QTM",
+    **dict.fromkeys((".gz", ".zip", ".7z", ".rar"), "compressed; unpack it"),
+    ".mat": "a file of MATLAB; export C3D, or TSV of 3D data, from the program that wrote it",
+    ".npz": "an archive of NumPy; if it is a take, load_take reads it, and its capture() has the points",
+    **dict.fromkeys((".x1d", ".x2d", ".v", ".vsk", ".enf", ".system"), _VICON),
+    **dict.fromkeys((".trb", ".cap"), _CORTEX),
+    **dict.fromkeys((".mot", ".sto", ".osim"), _OPENSIM),
+    **dict.fromkeys((".bvh", ".fbx", ".amc", ".asf", ".htr", ".mvnx", ".glb"), _SKELETON),
+}
+"""Descriptions of other programs' files and what to export instead, by ending."""
+_FOREIGN: Final = {
+    _BEGIN.lower(): "the content of a TRC; name it .trc",
+    MOTIVE_BEGIN.lower(): "the content of Motive's CSV; name it .csv",
+    **{word.lower(): "the content of a TSV of Qualisys; name it .tsv" for word in _BEGINS},
+    b"comment,this file was exported from": "a CSV of Tracking Tools; export its take from Motive",
+    b"objects": "a CSV of Vicon Tracker with bodies and no markers",
+    b"%time,": "a topic of ROS",
+    b"timestamp\tframenumber": "a text of D-Flow; export C3D or TRC from where it was captured",
+    b"version https://git-lfs": "a pointer of Git LFS to the file; git lfs pull brings it",
+    b"scorer,": "a CSV of DeepLabCut with points of pictures; triangulate them and write a TRC",
+    b"pk\3\4": "a workbook of Excel or another archive; save it as text",
+    b"<": "XML or a page of the web",
+    b"{": "JSON",
+}
+"""Descriptions of files, by the lower-case bytes that they begin with."""
+WRITABLE: Final = (".trc", ".c3d", ".csv")
 
 
 def read_trc(data: bytes, tell: Tell = warn) -> Capture:
@@ -204,18 +259,6 @@ def _unnamed(rows: list[bytes], num_named: int) -> tuple[str, ...]:
     return tuple(f"*{num_named + number}" for number in range(1, extra // 3 + 1))
 
 
-MOTIVE_BEGIN: Final = b"Format Version"
-_COUNT: Final = "Total Exported Frames"
-_UNIT: Final = "Length Units"
-_SPACE: Final = "Coordinate Space"
-_RATES: Final = ("Export Frame Rate", "Capture Frame Rate")
-_MOTIVE_KEYS: Final = {
-    key.lower(): key for key in ("Format Version", "Take Name", "Take Notes", *_RATES, _COUNT, _UNIT, _SPACE)
-}
-_AXES: Final = ["X", "Y", "Z"]
-_TYPES: Final = {"Marker", "Rigid Body", "Rigid Body Marker", "Bone", "Bone Marker"}
-
-
 def read_motive_csv(data: bytes, tell: Tell = warn) -> Capture:
     """Read the markers, labeled or not, in the bytes of a Motive CSV; rigid bodies and bones are ignored."""
     lines, ended = split_lines(data)
@@ -324,14 +367,6 @@ def _marker_columns(types: list[str], quantities: list[str], axes: list[str]) ->
     return columns
 
 
-_TITLE: Final = "Trajectories"
-_SECTIONS: Final = (_TITLE, "Devices", "Model Outputs", "Joints", "Segments")
-_FIRST_CELLS: Final = ("frame", "field #")
-_OUTPUT_UNITS: Final = {"deg", "rad", "n", "nmm", "n.mm", "nm", "n.m", "w", "kg", "v", "mv"}
-"""Units of angles, forces, moments, powers and signals, in lower case."""
-_BLANKS: Final = b' \t",;'
-
-
 def vicon_sections(lines: list[bytes]) -> dict[str, int]:
     """Index of the title line of each section of a Vicon export."""
     titles = {name.lower().encode(): name for name in _SECTIONS}
@@ -397,11 +432,6 @@ def _scales(
         units, columns = units[lengths], columns[lengths]
     scales = {unit: meters_per(str(unit)) for unit in np.unique(units)}
     return row + 1, columns, np.array([scales[unit] for unit in units])
-
-
-_BEGINS: Final = (b"NO_OF_FRAMES", b"FILE_VERSION")
-_KEY: Final = re.compile(rb"(?!NULL\t)[A-Z][A-Z0-9_]*(\t|$)")
-_QTM_LEADING: Final = ("frame", "time")
 
 
 def read_qtm_tsv(data: bytes, tell: Tell = warn) -> Capture:
@@ -472,11 +502,6 @@ def _begin_of_rows(lines: list[bytes], start: int, width: int) -> tuple[int, int
     return start, leading
 
 
-_LEADING_TITLE: Final = re.compile(r"frame|time|#|$", re.I)
-_AXIS: Final = re.compile(r"(.+?)[ ._:-]?([xyz])", re.I)
-_COPY: Final = re.compile(r"(.+)\.[12]")  # pandas numbers columns of the same name
-
-
 def read_table(data: bytes, tell: Tell = warn) -> Capture:
     """Read the markers in the bytes of a table with times [s] and three columns for each marker.
 
@@ -530,42 +555,9 @@ def _read_csv(data: bytes, tell: Tell) -> Capture:
     return read_table(data, tell)
 
 
-_FIRST_BYTES: Final = 200  # bytes that show which program wrote a CSV
 _READERS: Final = {".trc": read_trc, ".c3d": read_c3d, ".csv": _read_csv, ".tsv": _read_tsv}
 _TEXT_WRITERS: Final = {".trc": write_trc, ".csv": write_motive_csv}
 READABLE: Final = tuple(_READERS)
-_SKELETON: Final = "the motion of a skeleton without its markers; export the markers where it was made"
-_VICON: Final = "a file of Vicon's own; export C3D or ASCII with trajectories from Nexus"
-_CORTEX: Final = "a binary file of Cortex; export TRC or C3D from there"
-_OPENSIM: Final = "angles or forces of OpenSim and no markers; give the TRC that they were made of"
-_UNREAD: Final = {
-    ".tak": "a take of Motive, a closed format; export CSV or C3D with unlabeled markers from Motive",
-    ".qtm": "a file of Qualisys' own; export C3D, or TSV of 3D data, from QTM",
-    **dict.fromkeys((".gz", ".zip", ".7z", ".rar"), "compressed; unpack it"),
-    ".mat": "a file of MATLAB; export C3D, or TSV of 3D data, from the program that wrote it",
-    ".npz": "an archive of NumPy; if it is a take, load_take reads it, and its capture() has the points",
-    **dict.fromkeys((".x1d", ".x2d", ".v", ".vsk", ".enf", ".system"), _VICON),
-    **dict.fromkeys((".trb", ".cap"), _CORTEX),
-    **dict.fromkeys((".mot", ".sto", ".osim"), _OPENSIM),
-    **dict.fromkeys((".bvh", ".fbx", ".amc", ".asf", ".htr", ".mvnx", ".glb"), _SKELETON),
-}
-"""Descriptions of other programs' files and what to export instead, by ending."""
-_FOREIGN: Final = {
-    _BEGIN.lower(): "the content of a TRC; name it .trc",
-    MOTIVE_BEGIN.lower(): "the content of Motive's CSV; name it .csv",
-    **{word.lower(): "the content of a TSV of Qualisys; name it .tsv" for word in _BEGINS},
-    b"comment,this file was exported from": "a CSV of Tracking Tools; export its take from Motive",
-    b"objects": "a CSV of Vicon Tracker with bodies and no markers",
-    b"%time,": "a topic of ROS",
-    b"timestamp\tframenumber": "a text of D-Flow; export C3D or TRC from where it was captured",
-    b"version https://git-lfs": "a pointer of Git LFS to the file; git lfs pull brings it",
-    b"scorer,": "a CSV of DeepLabCut with points of pictures; triangulate them and write a TRC",
-    b"pk\3\4": "a workbook of Excel or another archive; save it as text",
-    b"<": "XML or a page of the web",
-    b"{": "JSON",
-}
-"""Descriptions of files, by the lower-case bytes that they begin with."""
-WRITABLE: Final = (".trc", ".c3d", ".csv")
 
 
 def read_capture(capture: Capture | str | Path) -> Capture:

@@ -59,6 +59,17 @@ _MOST_DENSE: Final = 8_000_000  # A table with more cells than this is read spar
 
 Tell = Callable[[str], None]
 """Called with a sentence about something suspicious in a file that is read nevertheless."""
+LOWEST_RATE: Final = 1.0
+HIGHEST_RATE: Final = 5000.0
+"""Highest frame rate of an optical system [Hz]."""
+_RATE_TOLERANCE: Final = 0.02  # relative difference of equal rates: 119.88 is called 120, 29.97 is called 30
+_MIN_DECIMALS: Final = 1  # Times have at least this many decimals: no frame is timed in whole seconds.
+_MAX_DECIMALS: Final = 9  # Times have at most this many decimals.
+_INTERVAL_TOLERANCE: Final = 0.1  # relative spread of the intervals when no rate is stated
+_JITTER: Final = 0.25  # A time that is late by less than this share of a frame shows no gap.
+_MAX_MISSING: Final = 10  # missing frames for each frame that is present
+MAX_DIGITS: Final = 12  # Counts are cut to this many digits.
+_SHOWN_GAPS: Final = 3  # gaps that a warning lists
 
 
 def warn(text: str) -> None:
@@ -338,19 +349,6 @@ def _cell_value(cell: bytes, number: int, titles: Sequence[str], column: int) ->
     if fault:
         raise CaptureError(f"line {number}, column {column + 1} ({titles[column]}): {fault}")
     return value
-
-
-LOWEST_RATE: Final = 1.0
-HIGHEST_RATE: Final = 5000.0
-"""Highest frame rate of an optical system [Hz]."""
-_RATE_TOLERANCE: Final = 0.02  # relative difference of equal rates: 119.88 is called 120, 29.97 is called 30
-_MIN_DECIMALS: Final = 1  # Times have at least this many decimals: no frame is timed in whole seconds.
-_MAX_DECIMALS: Final = 9  # Times have at most this many decimals.
-_INTERVAL_TOLERANCE: Final = 0.1  # relative spread of the intervals when no rate is stated
-_JITTER: Final = 0.25  # A time that is late by less than this share of a frame shows no gap.
-_MAX_MISSING: Final = 10  # missing frames for each frame that is present
-MAX_DIGITS: Final = 12  # Counts are cut to this many digits.
-_SHOWN_GAPS: Final = 3  # gaps that a warning lists
 
 
 @dataclass(frozen=True, slots=True)

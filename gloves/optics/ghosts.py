@@ -14,6 +14,11 @@ from handsim.space.camera import in_picture
 from handsim.space.rig import CameraRig
 from handsim.space.transforms import unit
 
+MAX_GHOSTS: Final = 4
+"""Ghosts kept per frame; more are dropped at random."""
+GHOST_REACH: Final = 0.1
+"""Largest distance [m] of a ghost in a hand's cloud from the nearest marker; the paper clusters at 200 mm."""
+
 
 def reflect(
     points: Float[np.ndarray, "*batch 3"],
@@ -137,12 +142,6 @@ def sample_strays(
             at, shown = at + steps, not shown
     lit = rng.random((count, num_cameras)) < config.camera_share
     return positions, shining[..., None] & lit
-
-
-MAX_GHOSTS: Final = 4
-"""Ghosts kept per frame; more are dropped at random."""
-GHOST_REACH: Final = 0.1
-"""Largest distance [m] of a ghost in a hand's cloud from the nearest marker; the paper clusters at 200 mm."""
 
 
 @dataclass(frozen=True, slots=True)

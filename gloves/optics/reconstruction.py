@@ -22,6 +22,11 @@ from handsim.space.camera import PINHOLE, distort_jacobian
 from handsim.space.objects import MARKER_RADIUS
 from handsim.space.rig import CameraRig
 
+_FALSE_REACH = 0.25  # a point farther than this from every source is outside the capture volume [m]
+_FALSE_STEP = 0.015  # a false point that moved at most this far since the last frame is the same one [m]
+MAX_FALSE_POINTS: Final = 6
+"""False intersections kept per frame."""
+
 
 @kernel
 def draw_blobs(
@@ -126,10 +131,6 @@ def cast_rays(
             length = np.sqrt(u * u + v * v + 1.0)
             for i in range(3):
                 directions[s, c, i] = (pose[i, 0] * u + pose[i, 1] * v + pose[i, 2]) / length
-
-
-_FALSE_REACH = 0.25  # a point farther than this from every source is outside the capture volume [m]
-_FALSE_STEP = 0.015  # a false point that moved at most this far since the last frame is the same one [m]
 
 
 @kernel
@@ -346,10 +347,6 @@ def _false_column(point: Any, before: Any, now: Any) -> tuple[int, bool]:
             if free < 0 and np.isnan(before[column, 0]):
                 free = column
     return free, False
-
-
-MAX_FALSE_POINTS: Final = 6
-"""False intersections kept per frame."""
 
 
 @dataclass(frozen=True, slots=True)

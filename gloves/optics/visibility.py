@@ -17,6 +17,9 @@ from handsim.space.camera import in_picture
 from handsim.space.rig import CameraRig
 
 _PAD: Final = 1e-9  # margin of every box [m]: exceeds rounding, and gives flat boxes a volume
+_LEAF: Final = 4  # A leaf has at most this many triangles.
+MAX_FACING: Final = np.deg2rad(85.0)
+"""Largest angle between a marker's outward direction and the ray to a camera that still sees it [rad]."""
 
 
 @kernel
@@ -123,9 +126,6 @@ def clear_lines(vertices: Any, lines: Any, nodes: Any, spots: Any, boxes: Any) -
                 if needed[t, p, c] and np.isfinite(start[0] + start[1] + start[2]):
                     clear[t, p, c] = not _meets(start, cameras[c], mesh, nodes, boxes)
     return clear
-
-
-_LEAF: Final = 4  # A leaf has at most this many triangles.
 
 
 class MeshTree:
@@ -273,10 +273,6 @@ def _starts(points: NDArray[np.float64]) -> NDArray[np.float64]:
     """Starts (T, P, 1 or C, 3) of lines."""
     starts = np.ascontiguousarray(points, dtype=np.float64)
     return starts[:, :, None] if starts.ndim == 3 else starts
-
-
-MAX_FACING: Final = np.deg2rad(85.0)
-"""Largest angle between a marker's outward direction and the ray to a camera that still sees it [rad]."""
 
 
 def free_rays(

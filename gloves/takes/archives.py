@@ -47,6 +47,11 @@ _SPARE: Final = 4096  # bytes by which the header may grow while blocks follow
 _MAX_HEADER: Final = 1 << 26  # bytes
 _FULL_FRAMES: Final = 1 << 16  # frames after which a block is written early; half a second has far fewer
 _FULL_POINTS: Final = 1 << 21  # points after which a block is written early
+SCHEMA: Final = 4
+"""Version of the files of takes. Points are tables up to 3; up to 2 simulated and tracked takes differ."""
+_READABLE: Final = (3, SCHEMA)
+_KINDS: Final = ("take", "tracked take")
+"""Kinds in headers; trackers wrote the second one before schema 3."""
 
 
 def growing_path(archive: Path) -> Path:
@@ -386,12 +391,6 @@ def _column(stored: Mapping[str, Any]) -> Column:
 
 
 Content = TypeVar("Content")
-
-SCHEMA: Final = 4
-"""Version of the files of takes. Points are tables up to 3; up to 2 simulated and tracked takes differ."""
-_READABLE: Final = (3, SCHEMA)
-_KINDS: Final = ("take", "tracked take")
-"""Kinds in headers; trackers wrote the second one before schema 3."""
 
 
 class CutOffWarning(HandSimWarning):

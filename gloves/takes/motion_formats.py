@@ -21,6 +21,8 @@ from handsim.motion_files.motion import (
 from handsim.motion_files.scenes import write_glb, write_usd
 from handsim.space.transforms import UpAxis, file_axes
 
+HELD: Final = "held at its last pose"
+
 
 class MotionFormat(NamedTuple):
     """A format of motion."""
@@ -52,7 +54,6 @@ def _write_joint_trc(path: Path, motion: Motion, up: UpAxis) -> None:
     write_capture(path, Capture(tuple(names), np.concatenate(positions, axis=1), motion.rate))
 
 
-HELD: Final = "held at its last pose"
 MOTION_FORMATS: Final[dict[str, MotionFormat]] = {
     ".glb": MotionFormat(write_glb, "hidden (scale 0)"),
     ".bvh": MotionFormat(write_bvh, HELD, steady=True),

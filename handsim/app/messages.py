@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 _RENEWED: Final = 0.2  # [s] between two lines on a terminal
 EVERY: Final = 10.0  # [s] between two lines elsewhere, as in the log of a batch job
 _WIDTH: Final = 80  # columns of a terminal whose width is unknown
+_COUNTS: Final = re.compile(r"[\d.,]+")
 
 
 def print_line(*lines: str) -> None:
@@ -134,7 +135,6 @@ def _columns() -> int:
         return _WIDTH
 
 
-_COUNTS: Final = re.compile(r"[\d.,]+")
 _tellers: list[Callable[[str], None]] = []  # show a line in a bar or step; the innermost is last
 
 

@@ -43,6 +43,11 @@ _FEWER: Final = f"(out of memory?); {_AGAIN}, with fewer --workers if they need 
 _GUARD: Final = 'put the call under `if __name__ == "__main__":`, or give workers=1'
 _GUARDED: Final = re.compile(r"^if\b.*\b__name__\b", re.M)
 _MAIN: Final = "__main__"
+LOCAL: Final = "local"
+"""Name of a scheduler and workers on this machine that end with the command."""
+_COMPARED: Final = ("handsim", "numpy", "scipy", "mujoco", "numba", "opencv-python-headless")
+"""Packages that the bytes of results depend on."""
+_TIMEOUT: Final = 5.0  # [s] for the answer of a scheduler
 
 
 def usable_cores() -> int:
@@ -219,13 +224,6 @@ def without_signals() -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-LOCAL: Final = "local"
-"""Name of a scheduler and workers on this machine that end with the command."""
-_COMPARED: Final = ("handsim", "numpy", "scipy", "mujoco", "numba", "opencv-python-headless")
-"""Packages that the bytes of results depend on."""
-_TIMEOUT: Final = 5.0  # [s] for the answer of a scheduler
 
 
 @contextmanager

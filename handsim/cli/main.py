@@ -70,6 +70,16 @@ _HELP: Final = {
     "doctor": "Say what is missing on this machine, and how to get it.",
 }
 """Every command with its line of help; `handsim glove list` is `list_glove` in the module `glove`."""
+_EMPTY: Final = re.compile(r"(--[\w-]+=)?")
+_SHELLS: Final = ("bash", "fish", "zsh")
+_SYSTEM_SENTENCES: Final = {
+    errno.ENOSPC: "the disk is full; free some space and run the same command again",
+    errno.ENOENT: "no such file or folder",
+    errno.EACCES: "permission denied",
+    errno.EISDIR: "this is a folder, expected a file",
+    errno.ENOTDIR: "this is a file, expected a folder",
+    errno.EEXIST: "exists already",
+}
 
 
 def _target(command: str) -> str | Table:
@@ -83,16 +93,6 @@ def _target(command: str) -> str | Table:
 
 # Modules are imported when their command runs, and not for the help of a table.
 COMMANDS: Final[Table] = {name: (_target(name), line) for name, line in _HELP.items() if " " not in name}
-_EMPTY: Final = re.compile(r"(--[\w-]+=)?")
-_SHELLS: Final = ("bash", "fish", "zsh")
-_SYSTEM_SENTENCES: Final = {
-    errno.ENOSPC: "the disk is full; free some space and run the same command again",
-    errno.ENOENT: "no such file or folder",
-    errno.EACCES: "permission denied",
-    errno.EISDIR: "this is a folder, expected a file",
-    errno.ENOTDIR: "this is a file, expected a folder",
-    errno.EEXIST: "exists already",
-}
 
 
 def main(args: Sequence[str] | None = None) -> int:

@@ -38,6 +38,7 @@ _KINDS: Final = (
     (stat.S_ISCHR, "a device"),
     (stat.S_ISBLK, "a device"),
 )
+_LARGEST: Final = 1e9  # in any unit; keeps out NaN, infinity and integers beyond float
 
 
 def check_regular(path: Path, *, error: type[HandSimError], most: int | None = None) -> None:
@@ -83,9 +84,6 @@ def checksum(path: Path | UPath) -> str:
     """SHA-256 of a file."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()  # type: ignore[arg-type]
-
-
-_LARGEST: Final = 1e9  # in any unit; keeps out NaN, infinity and integers beyond float
 
 
 def read_toml(path: Path, *, error: type[HandSimError]) -> dict[str, Any]:

@@ -30,6 +30,12 @@ from handsim.files.inputs import load_json
 from handsim.files.signals import signals_wait
 
 _REPLACEMENT: Final = "\N{REPLACEMENT CHARACTER}"
+_OLDER: Final = "-older"  # marks the second name of a file that is being replaced
+_SHOWN_STEM: Final = 32  # characters of a name that its temporary name shows
+_TOGETHER: Final[ContextVar[dict[Path, Path] | None]] = ContextVar("together", default=None)
+"""Temporary files that wait for the end of a block of `written_together`, by their final names."""
+_UNITS: Final = ("bytes", "kB", "MB", "GB", "TB", "PB", "EB")
+_MOST_SHOWN: Final = 4  # settings that a message lists
 
 
 def as_text(name: str) -> str:
@@ -51,10 +57,6 @@ def plain_path(path: Path) -> Iterator[Path]:
                 shutil.copyfile(link, path)
     else:
         yield path
-
-
-_OLDER: Final = "-older"  # marks the second name of a file that is being replaced
-_SHOWN_STEM: Final = 32  # characters of a name that its temporary name shows
 
 
 @contextmanager
@@ -99,10 +101,6 @@ def _naming_final(final: Path, temporary: Path) -> Iterator[None]:
         if error.errno is not None and error.filename in (None, str(temporary), temporary):
             error.filename = str(final)
         raise
-
-
-_TOGETHER: Final[ContextVar[dict[Path, Path] | None]] = ContextVar("together", default=None)
-"""Temporary files that wait for the end of a block of `written_together`, by their final names."""
 
 
 @contextmanager
@@ -274,9 +272,6 @@ def _flush(path: Path) -> None:
         os.close(descriptor)
 
 
-_UNITS: Final = ("bytes", "kB", "MB", "GB", "TB", "PB", "EB")
-
-
 def check_outputs(inputs: Iterable[object], outputs: Sequence[Path | None], *endings: str) -> None:
     """Refuse an output that is an input or another output, in whatever spelling, or cannot be written.
 
@@ -375,9 +370,6 @@ def shown_bytes(count: float) -> str:
     while count >= 1000.0 and unit < len(_UNITS) - 1:
         count, unit = count / 1000.0, unit + 1
     return f"{count:.3g} {_UNITS[unit]}"
-
-
-_MOST_SHOWN: Final = 4  # settings that a message lists
 
 
 def save_json(path: Path, content: dict[str, Any]) -> None:

@@ -47,6 +47,43 @@ _CHAIN: Final = np.array([(bone.parent, (_BONE == number).sum()) for number, bon
 """Parent of each bone, and the number of its joints."""
 _AXES: Final = np.array([joint.axis for joint in JOINTS])
 _RANGES: Final = np.deg2rad([(joint.low, joint.high) for joint in JOINTS])
+FLESH_DENSITY: Final = 1100.0
+"""Density of the hand [kg/m^3], soft tissue and bone together."""
+CAPSULE_GROUP: Final = 0
+SERVO_STIFFNESS: Final = 1.0
+"""Torque of a servo per angle off its control [N m/rad]."""
+SERVO_DAMPING: Final = 0.03
+"""Torque of a servo against the speed of its joint [N m s/rad]."""
+_PARTS: Final = (("CMC", "MCP", "IP", "tip"), *[("MCP", "PIP", "DIP", "tip")] * 4)
+KEYPOINT_NAMES: Final[tuple[str, ...]] = (
+    "wrist",
+    *(f"{digit}_{part}" for digit, parts in zip(DIGITS, _PARTS, strict=True) for part in parts),
+)
+KEYPOINT_BONES: Final[tuple[int, ...]] = (
+    PALM,
+    *(bone for digit in DIGITS for bone in (*bones_of(digit), bones_of(digit)[-1])),
+)
+"""Index in `BONES` of the bone that begins at each keypoint, or ends at a tip."""
+KEYPOINT_DIGITS: Final[tuple[int, ...]] = (-1, *np.repeat(np.arange(len(DIGITS)), 4).tolist())
+"""Digit of each keypoint, -1 for the wrist."""
+SKELETON: Final[tuple[tuple[int, int], ...]] = tuple(
+    (0 if part == 0 else 4 * digit + part, 4 * digit + part + 1)
+    for digit in range(len(DIGITS))
+    for part in range(4)
+)
+"""Pairs of keypoints that a drawing joins by a line."""
+_WRIST_THICKNESS: Final = 1.3  # thickness of the wrist over that of the palm
+NUM_VELOCITIES: Final = 6 + NUM_JOINTS
+"""MuJoCo's nv: wrist velocity in the world, wrist angular velocity in its own frame, joint rates."""
+# The first joint of a bone rotates about an axis of the parent, the second about one of the bone.
+_FIRST: Final = np.diff(_BONE, prepend=-1) != 0
+_PARENT: Final = _CHAIN[_BONE, 0]
+# A joint moves its own bone and those further out on its digit (J, L).
+_MOVED: Final = (DIGIT_OF_BONE == DIGIT_OF_BONE[_BONE, None]) & (np.arange(NUM_BONES) >= _BONE[:, None])
+_MAX_FRAMES: Final = 1 << 22
+_STEADY: Final = 0.01  # largest deviation of times from a steady rate, in frames
+_MAX_GAP: Final = 0.1  # [s] that interpolation bridges
+_MAX_GAP_FRAMES: Final = 2.5  # old frames that interpolation bridges, if that is longer
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,15 +129,6 @@ def bone_transforms(skeleton: Skeleton, qpos: Float[np.ndarray, "T 27"]) -> Floa
     return np.asarray(
         pose_bones(np.ascontiguousarray(qpos), skeleton.offsets, skeleton.rotations, skeleton.axes, _CHAIN)
     )
-
-
-FLESH_DENSITY: Final = 1100.0
-"""Density of the hand [kg/m^3], soft tissue and bone together."""
-CAPSULE_GROUP: Final = 0
-SERVO_STIFFNESS: Final = 1.0
-"""Torque of a servo per angle off its control [N m/rad]."""
-SERVO_DAMPING: Final = 0.03
-"""Torque of a servo against the speed of its joint [N m s/rad]."""
 
 
 class Site(NamedTuple):
@@ -296,27 +324,6 @@ def join_qpos(
     return qpos
 
 
-_PARTS: Final = (("CMC", "MCP", "IP", "tip"), *[("MCP", "PIP", "DIP", "tip")] * 4)
-KEYPOINT_NAMES: Final[tuple[str, ...]] = (
-    "wrist",
-    *(f"{digit}_{part}" for digit, parts in zip(DIGITS, _PARTS, strict=True) for part in parts),
-)
-KEYPOINT_BONES: Final[tuple[int, ...]] = (
-    PALM,
-    *(bone for digit in DIGITS for bone in (*bones_of(digit), bones_of(digit)[-1])),
-)
-"""Index in `BONES` of the bone that begins at each keypoint, or ends at a tip."""
-KEYPOINT_DIGITS: Final[tuple[int, ...]] = (-1, *np.repeat(np.arange(len(DIGITS)), 4).tolist())
-"""Digit of each keypoint, -1 for the wrist."""
-SKELETON: Final[tuple[tuple[int, int], ...]] = tuple(
-    (0 if part == 0 else 4 * digit + part, 4 * digit + part + 1)
-    for digit in range(len(DIGITS))
-    for part in range(4)
-)
-"""Pairs of keypoints that a drawing joins by a line."""
-_WRIST_THICKNESS: Final = 1.3  # thickness of the wrist over that of the palm
-
-
 def hand_keypoints(model: HandModel, qpos: Float[np.ndarray, "T 27"]) -> Float[np.ndarray, "T 21 3"]:
     """Keypoints in the world [m]."""
     transforms, tips = model.forward_kinematics(qpos), list(KEYPOINT_BONES[4::4])
@@ -328,17 +335,6 @@ def hand_keypoints(model: HandModel, qpos: Float[np.ndarray, "T 27"]) -> Float[n
 def keypoint_thickness(shape: HandShape) -> Float[np.ndarray, "21"]:
     """Thickness of the wrist or the finger at each keypoint [m]."""
     return np.array([_WRIST_THICKNESS * shape.palm_thickness, *(2.0 * shape.radii).ravel()])
-
-
-NUM_VELOCITIES: Final = 6 + NUM_JOINTS
-"""MuJoCo's nv: wrist velocity in the world, wrist angular velocity in its own frame, joint rates."""
-
-
-# The first joint of a bone rotates about an axis of the parent, the second about one of the bone.
-_FIRST: Final = np.diff(_BONE, prepend=-1) != 0
-_PARENT: Final = _CHAIN[_BONE, 0]
-# A joint moves its own bone and those further out on its digit (J, L).
-_MOVED: Final = (DIGIT_OF_BONE == DIGIT_OF_BONE[_BONE, None]) & (np.arange(NUM_BONES) >= _BONE[:, None])
 
 
 def joint_axes(
@@ -378,12 +374,6 @@ def skinned_jacobian(
     lever -= shares.sum(-1).T[..., None] * anchors[:, None]
     jacobian[..., 6:] = np.cross(axes[:, None], lever).swapaxes(-1, -2)
     return jacobian
-
-
-_MAX_FRAMES: Final = 1 << 22
-_STEADY: Final = 0.01  # largest deviation of times from a steady rate, in frames
-_MAX_GAP: Final = 0.1  # [s] that interpolation bridges
-_MAX_GAP_FRAMES: Final = 2.5  # old frames that interpolation bridges, if that is longer
 
 
 @dataclass(frozen=True, slots=True, eq=False)

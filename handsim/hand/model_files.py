@@ -39,6 +39,12 @@ _SMALL_SHARE: Final = 0.01  # share of a bone's mass for the link between its tw
 _MOST_TORQUE: Final = 2.0  # [N m], about that of a strong finger's first joint
 _MOST_SPEED: Final = 40.0  # [rad/s], above that of the fastest fingers
 _COLOR: Final = "0.85 0.65 0.55 1"
+_VERSION: Final = "40000"  # document version that OpenSim 4.0 and later read
+_GRAVITY: Final = "0 -9.80665 0"  # OpenSim's world has y up
+_OSIM_COLOR: Final = "0.85 0.65 0.55"
+_FARTHEST: Final = 5.0  # range of the wrist's positions, both ways [m]
+_MOST_TURN: Final = 2.0 * np.pi  # range of the wrist's rotations, both ways [rad]
+_PARALLEL: Final = 0.5  # Axes with a larger cosine between them are too parallel for one joint.
 
 
 def hand_urdf(model: HandModel) -> str:
@@ -130,14 +136,6 @@ def vector_text(vector: Float[np.ndarray, "K"]) -> str:
 def number_text(value: float | np.floating) -> str:
     """A number with twelve digits; zero has no sign."""
     return f"{float(value) + 0.0:.12g}"
-
-
-_VERSION: Final = "40000"  # document version that OpenSim 4.0 and later read
-_GRAVITY: Final = "0 -9.80665 0"  # OpenSim's world has y up
-_OSIM_COLOR: Final = "0.85 0.65 0.55"
-_FARTHEST: Final = 5.0  # range of the wrist's positions, both ways [m]
-_MOST_TURN: Final = 2.0 * np.pi  # range of the wrist's rotations, both ways [rad]
-_PARALLEL: Final = 0.5  # Axes with a larger cosine between them are too parallel for one joint.
 
 
 def coordinate_names(side: Side) -> tuple[str, ...]:

@@ -26,47 +26,9 @@ Side = Literal["left", "right"]
 Size = Literal["XS", "S", "M", "L", "XL"]
 SIDES: Final[tuple[Side, Side]] = ("left", "right")
 DIGITS: Final = ("thumb", "index", "middle", "ring", "little")
-
-
-class Bone(NamedTuple):
-    """A rigid segment: its name, its parent's index in `BONES` (palm: -1), and its digit (palm: -1)."""
-
-    name: str
-    parent: int
-    digit: int
-
-
-class Joint(NamedTuple):
-    """A hinge joint: its name, the index in `BONES` of the bone it moves, its axis, its range [deg]."""
-
-    name: str
-    bone: int
-    axis: tuple[float, float, float]
-    low: float
-    high: float
-
-
 _ABDUCTION: Final = (0.0, 0.0, 1.0)  # positive: towards the thumb; for the thumb itself: away from the palm
 _FLEXION: Final = (0.0, 1.0, 0.0)  # positive: towards the palm
-
 PALM: Final = 0
-BONES: Final[tuple[Bone, ...]] = (
-    Bone("palm", -1, -1),
-    Bone("thumb_metacarpal", 0, 0),
-    Bone("thumb_proximal", 1, 0),
-    Bone("thumb_distal", 2, 0),
-    *(
-        Bone(f"{digit}_{segment}", PALM if index == 0 else 1 + 3 * number + index - 1, number)
-        for number, digit in enumerate(DIGITS)
-        if number > 0
-        for index, segment in enumerate(("proximal", "middle", "distal"))
-    ),
-)
-BONE_NAMES: Final[tuple[str, ...]] = tuple(bone.name for bone in BONES)
-NUM_BONES: Final = len(BONES)
-DIGIT_OF_BONE: Final = np.array([bone.digit for bone in BONES])
-"""Digit of each bone, -1 for the palm."""
-
 # Ranges [deg]: active ranges of the AAOS and e-hand tables, MCP extension and PIP flexion as in the wider of
 # the published sets (docs/angles.md lists them side by side). The thumb's first two count from its rest.
 _RANGES: Final = {
@@ -80,34 +42,11 @@ _SUFFIXES: Final = {
     "thumb": ("metacarpal_abduction", "metacarpal_flexion", "MCP_flexion", "IP_flexion"),
     "finger": ("MCP_abduction", "MCP_flexion", "PIP_flexion", "DIP_flexion"),
 }
-
-JOINTS: Final[tuple[Joint, ...]] = tuple(
-    Joint(
-        f"{digit}_{suffix}",
-        1 + 3 * number + max(0, index - 1),
-        _ABDUCTION if index == 0 else _FLEXION,
-        *_RANGES[digit][index],
-    )
-    for number, digit in enumerate(DIGITS)
-    for index, suffix in enumerate(_SUFFIXES["thumb" if number == 0 else "finger"])
-)
-JOINT_NAMES: Final[tuple[str, ...]] = tuple(joint.name for joint in JOINTS)
-NUM_JOINTS: Final = len(JOINTS)
-NUM_QPOS: Final = 7 + NUM_JOINTS
 NUM_KEYPOINTS: Final = 1 + 4 * len(DIGITS)
 """Number of keypoints: the wrist, and three joints and the tip of each digit."""
-
-
-def bones_of(digit: str) -> tuple[int, int, int]:
-    """Indices in `BONES` of a digit's three bones, from the knuckle outwards."""
-    first = 1 + 3 * DIGITS.index(digit)
-    return first, first + 1, first + 2
-
-
 # A man of hand length 193.9 mm (Buryanov's middle ray on a 37 mm carpus) and breadth 88.3 mm (ANSUR II mean).
 REFERENCE_LENGTH: Final = 0.1939
 REFERENCE_BREADTH: Final = 0.0883
-
 # Moving bones [mm]: proximal, middle, distal with its soft tip; for the thumb metacarpal, proximal, distal.
 _BONE_LENGTHS: Final = np.array(
     [[46.2, 31.6, 27.3], [39.8, 22.4, 19.7], [44.6, 26.3, 21.4], [41.4, 25.7, 21.3], [32.7, 18.1, 19.7]]
@@ -133,7 +72,6 @@ _RADII: Final = np.array(
     ]
 )
 _PALM_THICKNESS: Final = 28.0  # [mm] at the metacarpals, without the thenar
-
 # ANSUR II [mm]: mean and SD of length and breadth, and their correlation, for women and men.
 _LENGTH_BREADTH: Final = {
     "female": ((181.1, 10.1), (78.2, 3.8), 0.57),
@@ -165,6 +103,63 @@ HAND_DTYPE: Final = np.dtype(
         ("palm_thickness", "<f8"),
     ]
 )
+
+
+class Bone(NamedTuple):
+    """A rigid segment: its name, its parent's index in `BONES` (palm: -1), and its digit (palm: -1)."""
+
+    name: str
+    parent: int
+    digit: int
+
+
+class Joint(NamedTuple):
+    """A hinge joint: its name, the index in `BONES` of the bone it moves, its axis, its range [deg]."""
+
+    name: str
+    bone: int
+    axis: tuple[float, float, float]
+    low: float
+    high: float
+
+
+BONES: Final[tuple[Bone, ...]] = (
+    Bone("palm", -1, -1),
+    Bone("thumb_metacarpal", 0, 0),
+    Bone("thumb_proximal", 1, 0),
+    Bone("thumb_distal", 2, 0),
+    *(
+        Bone(f"{digit}_{segment}", PALM if index == 0 else 1 + 3 * number + index - 1, number)
+        for number, digit in enumerate(DIGITS)
+        if number > 0
+        for index, segment in enumerate(("proximal", "middle", "distal"))
+    ),
+)
+BONE_NAMES: Final[tuple[str, ...]] = tuple(bone.name for bone in BONES)
+NUM_BONES: Final = len(BONES)
+DIGIT_OF_BONE: Final = np.array([bone.digit for bone in BONES])
+"""Digit of each bone, -1 for the palm."""
+
+
+JOINTS: Final[tuple[Joint, ...]] = tuple(
+    Joint(
+        f"{digit}_{suffix}",
+        1 + 3 * number + max(0, index - 1),
+        _ABDUCTION if index == 0 else _FLEXION,
+        *_RANGES[digit][index],
+    )
+    for number, digit in enumerate(DIGITS)
+    for index, suffix in enumerate(_SUFFIXES["thumb" if number == 0 else "finger"])
+)
+JOINT_NAMES: Final[tuple[str, ...]] = tuple(joint.name for joint in JOINTS)
+NUM_JOINTS: Final = len(JOINTS)
+NUM_QPOS: Final = 7 + NUM_JOINTS
+
+
+def bones_of(digit: str) -> tuple[int, int, int]:
+    """Indices in `BONES` of a digit's three bones, from the knuckle outwards."""
+    first = 1 + 3 * DIGITS.index(digit)
+    return first, first + 1, first + 2
 
 
 @dataclass(frozen=True, slots=True, eq=False)

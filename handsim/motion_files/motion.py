@@ -51,6 +51,38 @@ CHILDREN: Final = tuple(
 )
 """Indices of the children of each bone."""
 _PARENTS: Final = np.array([bone.parent for bone in BONES])
+_SMOOTH_EDGE: Final = np.cos(np.deg2rad(40.0))
+_FIRST: Final = ("frame", "time_s", "hand")
+_QPOS: Final = (
+    *(f"wrist_{axis}_m" for axis in "xyz"),
+    *(f"wrist_q{part}" for part in "wxyz"),
+    *(f"{joint}_rad" for joint in JOINT_NAMES),
+)
+NUMBERS: Final[tuple[str, ...]] = (
+    *_QPOS,
+    *(f"{keypoint}_{axis}_m" for keypoint in KEYPOINT_NAMES[1:] for axis in "xyz"),
+)
+"""Columns after `frame`, `time_s` and `hand`, with positions in the world."""
+_FORMER: Final = {f"thumb_CMC_{n}_rad": f"thumb_metacarpal_{n}_rad" for n in ("abduction", "flexion")}
+"""Columns of earlier versions: markers on skin do not measure the carpometacarpal joint."""
+_BVH_ROOT: Final = "world_cm"
+_CENTIMETERS: Final = 100.0
+_ROTATIONS: Final = "Zrotation Yrotation Xrotation"
+_POSITIONS: Final = "Xposition Yposition Zposition"
+OPENXR_JOINTS: Final[tuple[str, ...]] = (
+    "PALM",
+    "WRIST",
+    *(f"THUMB_{part}" for part in ("METACARPAL", "PROXIMAL", "DISTAL", "TIP")),
+    *(
+        f"{digit.upper()}_{part}"
+        for digit in DIGITS[1:]
+        for part in ("METACARPAL", "PROXIMAL", "INTERMEDIATE", "DISTAL", "TIP")
+    ),
+)
+"""The names of XrHandJointEXT, without XR_HAND_JOINT_ and _EXT, in its order."""
+_CARPUS: Final = 0.38  # share of the way from wrist to knuckle where a finger's metacarpal begins
+_AXES: Final = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+"""OpenXR's axes as columns in a frame with x along the bone and z out of the back."""
 
 
 class Material(NamedTuple):
@@ -152,9 +184,6 @@ def smooth_quaternions(rotations: Float[np.ndarray, "T *batch 3 3"]) -> Float[np
     return quaternions
 
 
-_SMOOTH_EDGE: Final = np.cos(np.deg2rad(40.0))
-
-
 def corner_normals(
     vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]
 ) -> Float[np.ndarray, "F 3 3"]:
@@ -186,21 +215,6 @@ def _unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     unit: NDArray[np.float64] = np.divide(vectors, lengths, out=np.zeros_like(vectors), where=lengths > 0.0)
     unit[lengths[:, 0] == 0.0] = (0.0, 0.0, 1.0)
     return unit
-
-
-_FIRST: Final = ("frame", "time_s", "hand")
-_QPOS: Final = (
-    *(f"wrist_{axis}_m" for axis in "xyz"),
-    *(f"wrist_q{part}" for part in "wxyz"),
-    *(f"{joint}_rad" for joint in JOINT_NAMES),
-)
-NUMBERS: Final[tuple[str, ...]] = (
-    *_QPOS,
-    *(f"{keypoint}_{axis}_m" for keypoint in KEYPOINT_NAMES[1:] for axis in "xyz"),
-)
-"""Columns after `frame`, `time_s` and `hand`, with positions in the world."""
-_FORMER: Final = {f"thumb_CMC_{n}_rad": f"thumb_metacarpal_{n}_rad" for n in ("abduction", "flexion")}
-"""Columns of earlier versions: markers on skin do not measure the carpometacarpal joint."""
 
 
 class JointTable(NamedTuple):
@@ -315,12 +329,6 @@ def write_mot(path: Path, motion: Motion, up: UpAxis = "z") -> None:
         np.savetxt(file, table, fmt="%.9f", delimiter="\t")
 
 
-_BVH_ROOT: Final = "world_cm"
-_CENTIMETERS: Final = 100.0
-_ROTATIONS: Final = "Zrotation Yrotation Xrotation"
-_POSITIONS: Final = "Xposition Yposition Zposition"
-
-
 def write_bvh(path: Path, motion: Motion, up: UpAxis = "z") -> None:
     """Write hands and things of a motion at a steady rate."""
     turn = file_axes(up)
@@ -387,22 +395,6 @@ def _offset(offset: Float[np.ndarray, "3"]) -> str:
 
 def _indented(lines: list[str]) -> list[str]:
     return [f"\t{line}" for line in lines]
-
-
-OPENXR_JOINTS: Final[tuple[str, ...]] = (
-    "PALM",
-    "WRIST",
-    *(f"THUMB_{part}" for part in ("METACARPAL", "PROXIMAL", "DISTAL", "TIP")),
-    *(
-        f"{digit.upper()}_{part}"
-        for digit in DIGITS[1:]
-        for part in ("METACARPAL", "PROXIMAL", "INTERMEDIATE", "DISTAL", "TIP")
-    ),
-)
-"""The names of XrHandJointEXT, without XR_HAND_JOINT_ and _EXT, in its order."""
-_CARPUS: Final = 0.38  # share of the way from wrist to knuckle where a finger's metacarpal begins
-_AXES: Final = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-"""OpenXR's axes as columns in a frame with x along the bone and z out of the back."""
 
 
 def joint_poses(model: HandModel, qpos: Float[np.ndarray, "T 27"]) -> Float[np.ndarray, "T 26 4 4"]:

@@ -54,6 +54,7 @@ _VERTICES, _INDICES = 34962, 34963  # targets of buffer views in glTF
 _HEADER: Final = struct.Struct("<4sII")
 _CHUNK: Final = struct.Struct("<I4s")
 _MOST: Final = (1 << 32) - 1  # bytes that the header can state
+_AROUND: Final = 0.03  # thickness of skin around keypoints in a hand's extent [m]
 
 
 def write_glb(path: Path, motion: Motion, up: UpAxis = "z") -> None:
@@ -264,9 +265,6 @@ class GlbBuffer:
             raise ArgumentError(f"a .glb of {size} bytes, expected at most {_MOST}; export at a lower rate")
         head = _HEADER.pack(b"glTF", 2, size) + _CHUNK.pack(len(text), b"JSON")
         return b"".join([head, text, _CHUNK.pack(self._size, b"BIN\0"), *self._parts])
-
-
-_AROUND: Final = 0.03  # thickness of skin around keypoints in a hand's extent [m]
 
 
 def write_usd(path: Path, motion: Motion, up: UpAxis = "z") -> None:

@@ -32,6 +32,8 @@ _STEP: Final = 1e-5  # step of a Jacobian's central differences [focal lengths]
 _STEPS: Final = 12  # most steps of Newton's method; three are enough away from a fold
 _CONVERGED: Final = 1e-12  # [focal lengths] largest change of the last step
 _MAX_TANGENT: Final = 1e3  # largest tangent of rays that a Brown lens without a fold sees: 89.94 degrees
+_MAX_SIZE: Final = 8192  # largest width or height of a picture [px]
+_NEAREST: Final = 1e-6  # [m] least depth of visible points
 
 
 @dataclass(frozen=True, slots=True)
@@ -259,10 +261,6 @@ def _fold_radius(radial: tuple[float, ...], most: float) -> float:
     roots = np.roots([*reversed(derivative), 1.0])
     folds = roots.real[(np.abs(roots.imag) < 1e-9 * np.maximum(np.abs(roots), 1.0)) & (roots.real > 0.0)]
     return min(float(np.sqrt(folds.min())), most) if len(folds) else most
-
-
-_MAX_SIZE: Final = 8192  # largest width or height of a picture [px]
-_NEAREST: Final = 1e-6  # [m] least depth of visible points
 
 
 @dataclass(frozen=True, slots=True, eq=False)

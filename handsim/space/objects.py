@@ -23,6 +23,12 @@ from handsim.space.transforms import axis_angle_matrix, frame_with_z, rigid, uni
 
 PartKind = Literal["sphere", "capsule", "cylinder", "box", "ellipsoid", "mesh"]
 _AROUND: Final = 16  # sides of a capsule
+MARKER_RADIUS: Final = 0.0032
+"""Radius of the spheres of Han et al. 2018 (section 3) [m]: of strays, and of an object's own markers; their
+centers lie this far above the surface."""
+MESH_SUFFIXES: Final = (".stl", ".obj", ".ply", ".glb")
+_LARGEST: Final = 1.0  # [m]
+_SMALLEST: Final = 0.002
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -138,14 +144,6 @@ _SOLIDS: Final[dict[str, Callable[[NDArray[np.float64], Any], Solid]]] = {
     "cup": _cup,
     "arc": _arc,
 }
-
-
-MARKER_RADIUS: Final = 0.0032
-"""Radius of the spheres of Han et al. 2018 (section 3) [m]: of strays, and of an object's own markers; their
-centers lie this far above the surface."""
-MESH_SUFFIXES: Final = (".stl", ".obj", ".ply", ".glb")
-_LARGEST: Final = 1.0  # [m]
-_SMALLEST: Final = 0.002
 
 
 @dataclass(frozen=True, slots=True, eq=False)

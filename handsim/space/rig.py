@@ -62,6 +62,19 @@ _CLOSEST: Final = 1e-3  # least distance of a camera from its target or another 
 _NAME: Final = re.compile(r"[A-Za-z0-9_-]{1,64}")
 NAMELESS: Final = re.compile(r"[^A-Za-z0-9_-]+")
 """Characters that a camera's name cannot have."""
+TOML_MATRIX: Final = "matrix"
+"""The key of a camera's K in the TOML files of Pose2Sim and anipose."""
+FEWEST_CAMERAS: Final = 2
+MAX_CAMERAS: Final = 32
+"""A marker's visibility is one bit per camera in 32 bits."""
+ROOM_CENTER: Final = (0.0, 0.0, 1.1)
+"""Middle of the space that hands move in, in front of a seated user [m]."""
+LONGEST_SIDE: Final = 50.0
+"""Largest side of a volume or room, and largest coordinate of its middle [m]."""
+HAND_REACH: Final = 0.25
+"""Longest reach of a hand from its wrist [m], and the least distance of a camera from the wrists' volume."""
+_CLEARANCE: Final = 0.05  # [m] least distance of a camera from a hand
+_SHIPPED: Final = Path(__file__).parents[1] / "rigs"
 
 
 class RigFile(NamedTuple):
@@ -157,10 +170,6 @@ def _picture_lines(camera: Camera) -> Iterator[str]:
 def _written(values: Sequence[float]) -> str:
     """A list of TOML floats, to the last digit."""
     return f"[{', '.join(repr(float(value) + 0.0) for value in values)}]"
-
-
-TOML_MATRIX: Final = "matrix"
-"""The key of a camera's K in the TOML files of Pose2Sim and anipose."""
 
 
 def foreign_cameras(table: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
@@ -268,19 +277,8 @@ def _pose(table: Mapping[str, Any], owner: str) -> NDArray[np.float64]:
     return look_at(position, target)
 
 
-FEWEST_CAMERAS: Final = 2
-MAX_CAMERAS: Final = 32
-"""A marker's visibility is one bit per camera in 32 bits."""
-ROOM_CENTER: Final = (0.0, 0.0, 1.1)
-"""Middle of the space that hands move in, in front of a seated user [m]."""
-LONGEST_SIDE: Final = 50.0
-"""Largest side of a volume or room, and largest coordinate of its middle [m]."""
 Center = Annotated[tuple[float, float, float], Limits(-LONGEST_SIDE, LONGEST_SIDE)]
 """The middle of a volume or room [m]."""
-HAND_REACH: Final = 0.25
-"""Longest reach of a hand from its wrist [m], and the least distance of a camera from the wrists' volume."""
-_CLEARANCE: Final = 0.05  # [m] least distance of a camera from a hand
-_SHIPPED: Final = Path(__file__).parents[1] / "rigs"
 
 
 @dataclass(frozen=True)

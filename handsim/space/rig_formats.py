@@ -34,6 +34,45 @@ from handsim.space.rig import (
 from handsim.space.transforms import UpAxis, quaternion_matrix, rigid, upright
 
 _MAX_VALUE: Final = 1e9  # largest number in a calibration, in any unit
+_MAX_XML_BYTES: Final = 1 << 25  # masks and thresholds of cameras lie in these files too
+_MAX_ELEMENTS: Final = 200_000
+_MAX_DEPTH: Final = 64
+_DECLARATION: Final = re.compile(r"^\s*<\?xml[^>]*\?>")
+_MILLIMETER: Final = 1e-3
+_MAX_DISTORTION: Final = 0.5  # shift of a picture's corner, as a share of its distance from the center
+_VIDEO: Final = ("vue", "videoinputdevice")
+_SUBPIXELS: Final = 64.0  # Qualisys' units per pixel
+_TO_OPENCV: Final = np.diag([1.0, -1.0, -1.0])
+_MOTIVE_LENS: Final = ("k1", "k2", "TangentialX", "TangentialY", "k3")
+_COLOR: Final = "30"  # `ImagerIndex` of Motive's color cameras
+CAMERAS: Final = "cameras.txt"
+IMAGES: Final = "images.txt"
+_MAX_COLMAP_BYTES: Final = 1 << 28  # images.txt lists all points of each image
+_MODELS: Final = {
+    "SIMPLE_PINHOLE": 3,
+    "PINHOLE": 4,
+    "SIMPLE_RADIAL": 4,
+    "RADIAL": 5,
+    "OPENCV": 8,
+    "FULL_OPENCV": 12,
+    "SIMPLE_RADIAL_FISHEYE": 4,
+    "RADIAL_FISHEYE": 5,
+    "OPENCV_FISHEYE": 8,
+}
+"""Known camera models, and their numbers of parameters."""
+_BINARY_MODELS: Final = (
+    "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV",
+    "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE",
+)  # fmt: skip
+_ONE_FOCAL: Final = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
+_MIN_UPRIGHT: Final = 0.3  # mean component of the cameras' upward axes along the axis that points up
+_OPENCV: Final = (".yml", ".yaml", ".json")
+_XML: Final = (".xcp", ".xml", ".txt", ".mcal")
+_CLOSED: Final = {
+    ".cal": "Motive's .cal is a closed format; load it in Motive 3.2 or newer and export the calibration "
+    "from there as .mcal",
+    ".qca": "QTM's .qca is a closed format; export the calibration from QTM as .txt or .xml",
+}
 
 
 class LabCamera(NamedTuple):
@@ -93,12 +132,6 @@ def picture_size(owner: str, width: float, height: float) -> tuple[int, int]:
     return int(width), int(height)
 
 
-_MAX_XML_BYTES: Final = 1 << 25  # masks and thresholds of cameras lie in these files too
-_MAX_ELEMENTS: Final = 200_000
-_MAX_DEPTH: Final = 64
-_DECLARATION: Final = re.compile(r"^\s*<\?xml[^>]*\?>")
-
-
 class _Refused(Exception):
     """The parser met something that no calibration has."""
 
@@ -153,15 +186,6 @@ def _parsed(text: str) -> ET.Element:
     parser.StartDoctypeDeclHandler = parser.EntityDeclHandler = refuse
     parser.Parse(text.encode("utf-8", "surrogatepass"), True)
     return builder.close()
-
-
-_MILLIMETER: Final = 1e-3
-_MAX_DISTORTION: Final = 0.5  # shift of a picture's corner, as a share of its distance from the center
-_VIDEO: Final = ("vue", "videoinputdevice")
-_SUBPIXELS: Final = 64.0  # Qualisys' units per pixel
-_TO_OPENCV: Final = np.diag([1.0, -1.0, -1.0])
-_MOTIVE_LENS: Final = ("k1", "k2", "TangentialX", "TangentialY", "k3")
-_COLOR: Final = "30"  # `ImagerIndex` of Motive's color cameras
 
 
 def _vicon_camera(entry: ET.Element, number: int) -> LabCamera | Skipped:
@@ -284,28 +308,6 @@ def _motive_camera(entry: ET.Element, number: int) -> LabCamera | Skipped:
     video = serial.startswith("C") or own.get("ImagerIndex") == _COLOR
     pose = rigid(axes @ _TO_OPENCV, position)
     return LabCamera(Camera(serial, size, K, pose, brown_lens(*bends)), video=video, y_up=True)
-
-
-CAMERAS: Final = "cameras.txt"
-IMAGES: Final = "images.txt"
-_MAX_COLMAP_BYTES: Final = 1 << 28  # images.txt lists all points of each image
-_MODELS: Final = {
-    "SIMPLE_PINHOLE": 3,
-    "PINHOLE": 4,
-    "SIMPLE_RADIAL": 4,
-    "RADIAL": 5,
-    "OPENCV": 8,
-    "FULL_OPENCV": 12,
-    "SIMPLE_RADIAL_FISHEYE": 4,
-    "RADIAL_FISHEYE": 5,
-    "OPENCV_FISHEYE": 8,
-}
-"""Known camera models, and their numbers of parameters."""
-_BINARY_MODELS: Final = (
-    "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV",
-    "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE",
-)  # fmt: skip
-_ONE_FOCAL: Final = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 
 
 def read_colmap_cameras(path: Path) -> tuple[Camera, ...]:
@@ -439,20 +441,12 @@ def _numbers(owner: str, words: list[str]) -> list[float]:
     return list(words_numbers(words))
 
 
-_MIN_UPRIGHT: Final = 0.3  # mean component of the cameras' upward axes along the axis that points up
-_OPENCV: Final = (".yml", ".yaml", ".json")
-_XML: Final = (".xcp", ".xml", ".txt", ".mcal")
 _READERS: Final[dict[str, tuple[str, Callable[[ET.Element, int], LabCamera | Skipped]]]] = {
     "Cameras": ("Camera", _vicon_camera),
     "calibration": ("camera", _qualisys_camera),
     "calibrationProfile": ("Camera", _motive_camera),
 }
 """The tag of the cameras and the reader of one, by the root's tag."""
-_CLOSED: Final = {
-    ".cal": "Motive's .cal is a closed format; load it in Motive 3.2 or newer and export the calibration "
-    "from there as .mcal",
-    ".qca": "QTM's .qca is a closed format; export the calibration from QTM as .txt or .xml",
-}
 
 
 def load_cameras(path: str | Path) -> tuple[Camera, ...]:

@@ -17,6 +17,16 @@ UpAxis = Literal["y", "z"]
 """The axis of a file that points up."""
 MIRROR = np.diag([1.0, -1.0, 1.0])
 """Right hand to left hand and back, in the wrist frame."""
+_Z_UP: Final = {"z": np.eye(3), "y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])}
+_PROGRAMS: Final = {  # axes in a world with z up, what is mirrored in a thing's own axes, and the unit
+    "ros": (((1, 0, 0), (0, 1, 0), (0, 0, 1)), (1, 1, 1), "m"),  # REP 103: x forward, y left, z up
+    "openxr": (((1, 0, 0), (0, 0, 1), (0, -1, 0)), (1, 1, 1), "m"),  # x right, y up, z backward
+    "opengl": (((1, 0, 0), (0, 0, 1), (0, -1, 0)), (1, 1, 1), "m"),
+    "unity": (((1, 0, 0), (0, 0, 1), (0, 1, 0)), (1, 1, -1), "m"),  # x right, y up, z forward
+    "unreal": (((1, 0, 0), (0, -1, 0), (0, 0, 1)), (1, -1, 1), "cm"),  # x forward, y right, z up
+}
+PROGRAMS: Final = tuple(_PROGRAMS)
+"""Names of the programs whose axes are known."""
 
 
 def file_axes(up: UpAxis) -> Float[np.ndarray, "3 3"]:
@@ -46,18 +56,6 @@ class ProgramAxes(NamedTuple):
     def quaternions(self, quaternions: Float[np.ndarray, "*batch 4"]) -> NDArray[np.float64]:
         """Wxyz quaternions (..., 4) of the world in the program's axes."""
         return np.asarray(quaternions @ self.quaternion.T)
-
-
-_Z_UP: Final = {"z": np.eye(3), "y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])}
-_PROGRAMS: Final = {  # axes in a world with z up, what is mirrored in a thing's own axes, and the unit
-    "ros": (((1, 0, 0), (0, 1, 0), (0, 0, 1)), (1, 1, 1), "m"),  # REP 103: x forward, y left, z up
-    "openxr": (((1, 0, 0), (0, 0, 1), (0, -1, 0)), (1, 1, 1), "m"),  # x right, y up, z backward
-    "opengl": (((1, 0, 0), (0, 0, 1), (0, -1, 0)), (1, 1, 1), "m"),
-    "unity": (((1, 0, 0), (0, 0, 1), (0, 1, 0)), (1, 1, -1), "m"),  # x right, y up, z forward
-    "unreal": (((1, 0, 0), (0, -1, 0), (0, 0, 1)), (1, -1, 1), "cm"),  # x forward, y right, z up
-}
-PROGRAMS: Final = tuple(_PROGRAMS)
-"""Names of the programs whose axes are known."""
 
 
 @functools.cache
