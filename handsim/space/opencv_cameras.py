@@ -1,8 +1,8 @@
 """Cameras as OpenCV calibrates them: a YAML or JSON file of one camera, a stereo pair, or many.
 
 ROS' CameraInfo is such a file, and so is the TOML of Pose2Sim and anipose with a table for each camera.
-YAML and JSON are flat tables of numbers, which are parsed here: OpenCV's parser may never return from a
-damaged file, and the fast one of PyYAML ends the process where lists are nested deeply.
+YAML is read by PyYAML's own parser: OpenCV's may never return from a damaged file, and PyYAML's fast one ends
+the process where lists are nested deeply.
 """
 
 from __future__ import annotations
@@ -10,11 +10,10 @@ from __future__ import annotations
 import itertools
 import json
 import re
-import textwrap
 import warnings
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,10 +29,7 @@ _CENTER: Final = 0.5  # OpenCV measures pixels from the center of the first one,
 _LEAST_FOCAL: Final = 0.02  # of the width; in shares of the picture's size a focal length is about 1
 _MAX_TURN: Final = 6.4  # longest rotation vector [rad]; longer ones are angles in degrees
 _MAX_BASELINE: Final = 5.0  # largest distance of the cameras of a pair [m]
-_ENTRY: Final = re.compile(r"^[\"']?([A-Za-z_][\w .-]*?)[\"']?[ \t]*:(?=\s)", re.M)
-_DATA: Final = re.compile(r"\bdata[\"']?[ \t]*:[ \t]*\[([^\[\]]*)\]")
-_DASH: Final = re.compile(r"^[ \t]*(?:-[ \t]+)+(?=[-+.\d\[])", re.M)
-_LIST: Final = re.compile(r"[\[\],\s]+")
+_VERSION: Final = re.compile(r"^%YAML.*$", re.M)  # OpenCV writes it as no other program reads it
 _K: Final = ("camera_matrix", "cameraMatrix", "K", "mtx", "M")
 _D: Final = ("distortion_coefficients", "dist_coeffs", "distCoef", "D", "dist", "distortions")
 _WIDTH: Final = ("image_width", "img_width", "width")
@@ -106,9 +102,10 @@ _UNREAD: Final = {
     "Camera1.fx": f"a settings file of ORB-SLAM; {_ANEW}",
 }
 """Descriptions of other programs' files, by a key that these contain."""
-_SECTION: Final = re.compile(r"^[ \t]+[\"']?(?:" + "|".join(_K) + r")[\"']?[ \t]*:(?=\s)", re.M)
 _KEY: Final = r"(?:^|[{{,])[ \t\n]{{0,99}}[\"']?{}[\"']?[ \t]*:"
 _MAX_CAMERAS: Final = 256
+_MAX_BYTES: Final = 1 << 22
+_MAX_PARTS: Final = 1000  # lists and numbers of a value that are looked at
 
 Values = dict[str, tuple[float, ...] | str]
 Sections = dict[str, Values]
@@ -441,77 +438,40 @@ def _value_numbers(values: Values, key: str, shape: tuple[int, ...] | None) -> t
 def _read(path: Path) -> tuple[Values, Sections]:
     if path.suffix.lower() == ".toml":
         tables = foreign_cameras(read_toml(path, error=RigError))
-        return {}, dict(_json_sections({name: one | {"K": one[TOML_MATRIX]} for name, one in tables.items()}))
-    data = read_bytes(path, error=RigError, most=1 << 24)
+        return {}, dict(_sections({name: one | {"K": one[TOML_MATRIX]} for name, one in tables.items()}))
+    data = read_bytes(path, error=RigError, most=_MAX_BYTES)
     try:
         text = data.decode(text_encoding(data))
     except UnicodeDecodeError as error:
         raise RigError(f"{path}: not a calibration: it is not UTF-8 text") from error
     if text.lstrip().startswith("<"):
         raise RigError(f"{path}: this is XML, expected OpenCV's YAML or JSON")
-    if text.lstrip().startswith(("{", "[")):
-        try:
-            content = json.loads(text)
-        except (ValueError, RecursionError) as error:
-            raise RigError(f"{path}: not a calibration: it is no JSON") from error
-        content = {"cameras": content} if isinstance(content, list) else content
-        sections = dict(_json_sections(content))
-        inner = {"cameras", *sections} if sections else set()
-        values = _json_values({key: value for key, value in content.items() if key not in inner})
-    else:
-        values, sections = _yaml_tables(text)
+    content = _tables(path, text)
+    sections = dict(_sections(content))
+    inner = {"cameras", *sections} if sections else set()
+    values = _values({key: value for key, value in content.items() if key not in inner})
     known = next((what for key, what in _UNREAD.items() if re.search(_KEY.format(key), text, re.M)), None)
     if known is not None and not sections and _find(values, _K) is None:
         raise RigError(f"{path}: this is {known}")
     return values, sections
 
 
-def _yaml_tables(text: str) -> tuple[Values, Sections]:
-    """The values at the top level, and the cameras below them."""
-    values: Values = {}
-    sections: Sections = {}
-    for name, body in _yaml_bodies(text):
-        below = {name: body}
-        if _SECTION.search(body):
-            below, values_of = _yaml_below(body), sections.setdefault(name, {})
+def _tables(path: Path, text: str) -> dict[str, Any]:
+    """The content of JSON or YAML as one table; a list of cameras is that of its key `cameras`."""
+    import yaml
+
+    try:
+        if text.lstrip().startswith(("{", "[")):
+            parts = [json.loads(text)]
         else:
-            values_of = values
-        for key, value in below.items():
-            inner = _yaml_below(value)
-            if not inner or "data" in inner:
-                values_of[key] = _yaml_value(inner.get("data", value))
-            else:
-                values_of |= {f"{key}.{word}": _yaml_value(one) for word, one in inner.items()}
-    return values, sections
+            parts = list(yaml.load_all(_VERSION.sub("", text), yaml.BaseLoader))
+    except (ValueError, RecursionError, yaml.YAMLError) as error:
+        raise RigError(f"{path}: not a calibration: it is neither JSON nor YAML") from error
+    parts = [{"cameras": part} if isinstance(part, list) else part for part in parts]
+    return {str(key): value for part in parts if isinstance(part, dict) for key, value in part.items()}
 
 
-def _yaml_below(body: str) -> dict[str, str]:
-    """The entries that are indented below a key."""
-    return dict(_yaml_bodies(textwrap.dedent(body.strip("\n"))))
-
-
-def _yaml_bodies(text: str) -> Iterator[tuple[str, str]]:
-    """Each key at the left margin, and the text after it."""
-    starts = list(_ENTRY.finditer(text))
-    ends = [start.start() for start in starts[1:]]
-    for start, end in itertools.zip_longest(starts, ends):
-        yield start[1], text[start.end() : end]
-
-
-def _yaml_value(body: str) -> tuple[float, ...] | str:
-    """The numbers of a number, list or matrix; anything else as text."""
-    body = _DASH.sub(" ", body).strip()
-    data = _DATA.search(body)
-    words = [word for word in _LIST.split(data[1] if data else body, _MAX_NUMBERS + 2) if word]
-    return _few_numbers(words) or body.strip("\"' ")
-
-
-def _few_numbers(words: list[str]) -> tuple[float, ...]:
-    """Words as numbers; empty if a word is not a number, or if there are too many."""
-    return words_numbers(words) if len(words) <= _MAX_NUMBERS else ()
-
-
-def _json_sections(content: Mapping[str, object]) -> Iterator[tuple[str, Values]]:
+def _sections(content: Mapping[str, object]) -> Iterator[tuple[str, Values]]:
     """The tables of cameras, at the top level or in a table or list `cameras`."""
     cameras = content.get("cameras", content)
     if isinstance(cameras, list):
@@ -524,27 +484,30 @@ def _json_sections(content: Mapping[str, object]) -> Iterator[tuple[str, Values]
         named = list(cameras.items()) if isinstance(cameras, dict) else []
     for name, one in named[: _MAX_CAMERAS + 1]:
         if isinstance(one, dict) and _find(one, _K) is not None:
-            yield name, _json_values(one)
+            yield name, _values(one)
 
 
-def _json_values(table: Mapping[str, object]) -> Values:
+def _values(table: Mapping[str, object]) -> Values:
     """The values of a table, and those of tables in it with both keys: "distortion.model"."""
     values: Values = {}
     for key, value in table.items():
         inner = value if isinstance(value, dict) and "data" not in value else {"": value}
-        values |= {f"{key}.{below}" if below else str(key): _json_value(one) for below, one in inner.items()}
+        values |= {f"{key}.{below}" if below else str(key): _value(one) for below, one in inner.items()}
     return values
 
 
-def _json_value(value: object) -> tuple[float, ...] | str:
+def _value(value: object) -> tuple[float, ...] | str:
+    """A number, or the numbers of nested lists, if they are few; anything else as text."""
     if isinstance(value, dict) and "data" in value:
         value = value["data"]
     words: list[str] = []
     waiting = [value]
-    while waiting and len(words) <= _MAX_NUMBERS:
+    for _ in range(_MAX_PARTS):
+        if not waiting or len(words) > _MAX_NUMBERS:
+            break
         first = waiting.pop(0)
         if isinstance(first, list):
             waiting[:0] = first[: _MAX_NUMBERS + 1]
         else:
-            words.append(str(float(first) if isinstance(first, bool) else first))
-    return _few_numbers(words) or str(value)[:80]
+            words += str(float(first) if isinstance(first, bool) else first).split()
+    return (words_numbers(words) if len(words) <= _MAX_NUMBERS else ()) or str(value)[:80]
