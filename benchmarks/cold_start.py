@@ -41,6 +41,7 @@ import gc, json, sys, time
 from numba.core import event
 from numba.core.registry import CPUDispatcher
 
+from benchmarks.cold_start import type_row
 from handsim.app import compiling
 from handsim.cli.main import main
 
@@ -52,7 +53,7 @@ table, seconds, running = [], {}, []
 def row_of(kernel, types):
     place = f"{kernel.py_func.__module__}:{kernel.py_func.__qualname__}"
     try:
-        return json.dumps([place, [compiling.type_row(one, table) for one in types]])
+        return json.dumps([place, [type_row(one, table) for one in types]])
     except ValueError as error:
         print(f"{place} is left out: {error}", file=sys.stderr)
 
@@ -85,6 +86,34 @@ sys.exit(code)
 """
 
 
+def type_row(kind: Any, table: list[Any]) -> int:
+    """The row of a type in a table, to which it is added if it is missing; used to record the list.
+
+    Raises:
+        ValueError: The list has no words for the type.
+    """
+    from numba import types
+
+    row: str | list[Any] = kind.name
+    if isinstance(kind, types.BaseTuple):
+        place = getattr(kind, "instance_class", None)
+        name = "" if place is None else f"{place.__module__}:{place.__qualname__}"
+        row = [name, *(type_row(part, table) for part in kind)]
+    elif isinstance(kind, types.Array):
+        row = f"{kind.dtype.name} {kind.ndim} {kind.layout}" + " const" * (not kind.mutable)
+    elif isinstance(kind, types.Literal):
+        row = f"={json.dumps(kind.literal_value)}"
+    elif isinstance(kind, types.Dispatcher):
+        row = f"{kind.dispatcher.py_func.__module__}:{kind.dispatcher.py_func.__qualname__}"
+    elif getattr(types, kind.name, None) is not kind:
+        row = next((name for name, one in vars(types).items() if one is kind), "")
+        if not row:
+            raise ValueError(f"no words for the type {kind}")
+    if row not in table:
+        table.append(row)
+    return table.index(row)
+
+
 def measure(names: list[str], folder: Path) -> None:
     """Print what each command costs with an empty cache of its own."""
     print(f"{'command':12}{'wall [s]':>9}{'processor [s]':>15}{'kernels':>9}")
@@ -101,7 +130,8 @@ def measure(names: list[str], folder: Path) -> None:
 
 def record(names: list[str], folder: Path) -> None:
     """Write the list, and print its dearest kernels."""
-    environment = {**os.environ, "NUMBA_CACHE_DIR": str(folder / "cache")}
+    ours = str(Path(__file__).parents[1])  # for `type_row`
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(folder / "cache"), "PYTHONPATH": ours}
     table: list[Any] = []
     seconds: dict[str, float] = {}
     users: dict[str, set[str]] = {}

@@ -11,7 +11,6 @@ import contextlib
 import dataclasses
 import math
 import re
-import textwrap
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -26,7 +25,7 @@ from handsim.cards import card, map_drawing
 from handsim.errors import HandSimError, LayoutError, choices, errors_of
 from handsim.files.inputs import check_keys, number_of, quoted, read_toml, tables_of, text_of, written
 from handsim.files.outputs import write_text, writing
-from handsim.hand.shape import BONE_NAMES, BONES, DIGITS, PALM, SIDES, Side
+from handsim.hand.shape import BONE_NAMES, BONES, PALM, SIDES, Side
 from handsim.settings import Expected
 
 FEWEST_MARKERS: Final = 5
@@ -48,25 +47,7 @@ _SHIPPED: Final = Path(__file__).parent / "layouts"
 _LAYOUT_KEYS: Final = ("name", "description", "source", "sides", "radius_mm", "marker")
 _MARKER_KEYS: Final = ("name", "bone", "along", "around", "across", "height_mm")
 _OPTIONAL: Final = ("across", "height_mm")
-_STARTER: Final = """\
-# A marker glove. Places are fractions of the bones they sit on, so one file fits every size of hand.
-# Check it with `handsim glove check FILE`, which draws the markers on the hand.
-
-name = "my_glove"
-description = "Five finger tips and three markers on the back of the hand"
-radius_mm = 3.2  # of every marker, 0.5 to 15
-
-# One [[marker]] table per marker, 5 to 60 of them; labels count in this order.
-#   name    your own; no two alike
-#   bone    one of: BONES
-#   along   0 = the bone's near end, 1 = its far end; -0.3 to 1.3
-#           (markers at the wrist: palm, -0.15 to 0)
-#   around  degrees about the bone: 0 = back of the hand (nail side), 90 = thumb side,
-#           -90 = little-finger side, 180 = palm side
-#   across  palm only: sideways from the middle of the palm, in hand breadths, positive towards the thumb
-#   height_mm  optional: the length of a stalk, 0 to 50; without it the marker lies on the skin
-# A labeler tells markers apart by their pattern: keep the three on the back away from any symmetry, and every
-# marker where a camera can see it in most poses."""
+_STARTER: Final = Path(__file__).parent / "data" / "starter_layout.toml"
 _TABLE: Final = re.compile(r"\s*\[\[\s*marker\s*\]\]\s*(?:#.*)?$")
 _ENTRY: Final = re.compile(r"(\s*(\w+)\s*=\s*)(\"[^\"\\]*\"|'[^']*'|[^\s#\"']+)(\s*(?:#.*)?)$")
 
@@ -305,17 +286,7 @@ def stored_layout(stored: Mapping[str, Any]) -> MarkerLayout:
 
 def starter_layout() -> str:
     """A commented layout file to start your own glove from; it loads as it is."""
-    rows = [(f"{digit.capitalize()}Tip", f"{digit}_distal", 0.45, 0.0) for digit in DIGITS]
-    rows += [
-        ("BackHand1", "palm", 0.55, -0.17),
-        ("BackHand2", "palm", 0.2, -0.13),
-        ("BackHand3", "palm", 0.42, 0.27),
-    ]
-    bones = textwrap.fill(", ".join(BONE_NAMES), 85, subsequent_indent="#           ")
-    lines = [_STARTER.replace("BONES", bones)]
-    for name, bone, along, across in rows:
-        lines += _marker_lines(MarkerPlace(name, bone, along, 0.0, across))
-    return "\n".join(lines) + "\n"
+    return _STARTER.read_text("utf-8")
 
 
 def layout_lines(layout: MarkerLayout) -> list[str]:

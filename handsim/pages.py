@@ -38,33 +38,7 @@ _WRITERS: Final = {
 }
 NOTHING: Final = "-"
 """The cell of a table where there is no number."""
-_STYLE: Final = """
-:root { color-scheme: light dark; --ink: #23272f; --soft: #5b6270; --paper: #ffffff; --card: #f4f5f7;
-  --line: #d9dde3; }
-@media screen and (prefers-color-scheme: dark) {
-  :root { --ink: #e6e8ec; --soft: #a3abb8; --paper: #16181c; --card: #212327; --line: #3a3f48; }
-  div.card { --card: #f4f5f7; --line: #d9dde3; filter: invert(.9) hue-rotate(180deg); }
-}
-body { margin: 0 auto; padding: 2rem 1.2rem 4rem; max-width: 70rem; background: var(--paper);
-  color: var(--ink); font: 1rem/1.55 system-ui, -apple-system, "Segoe UI", Roboto, sans-serif; }
-h1 { font-size: 1.9rem; margin: 0 0 .2rem; } h2 { font-size: 1.3rem; margin: 2.6rem 0 .4rem; }
-p { max-width: 46rem; margin: .4rem 0 1rem; } .lead, figcaption, .note { color: var(--soft); }
-figure { margin: 1rem 0 1.6rem; }
-.card { display: block; background: var(--card); border: 1px solid var(--line); border-radius: .6rem;
-  padding: .6rem; }
-img { display: block; max-width: 100%; max-height: 44rem; margin: 0 auto; }
-div.card img { max-height: none; }
-figcaption, .note { font-size: .92rem; margin-top: .4rem; }
-table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
-th, td { padding: .35rem .9rem .35rem 0; border-bottom: 1px solid var(--line); text-align: right; }
-th:first-child, td:first-child { text-align: left; padding-right: 2.5rem; }
-@media print {
-  :root { color-scheme: light; --ink: #23272f; --soft: #5b6270; --paper: #ffffff; --line: #d9dde3; }
-  @page { margin: 14mm; }
-  body { max-width: none; padding: 0; font-size: .8rem; }
-  h2, h2 + p, tr:first-child { break-after: avoid; } figure, tr { break-inside: avoid; }
-}
-"""
+_STYLE: Final = Path(__file__).parent / "data" / "page.css"
 
 
 class Paint:
@@ -146,7 +120,7 @@ def write_sections(path: Path, sections: Sequence[Section], *, title: str, lead:
         '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         f'<meta name="generator" content="{version}">\n'
-        f"<title>{escape(title)}</title>\n<style>{_STYLE}</style>\n</head>\n<body>\n"
+        f"<title>{escape(title)}</title>\n<style>\n{_STYLE.read_text('utf-8')}</style>\n</head>\n<body>\n"
         f'<h1>{escape(title)}</h1>\n<p class="lead">{escape(lead)}</p>\n'
         f'{body}\n<p class="note">Made by {version}.</p>\n</body>\n</html>\n'
     )

@@ -103,34 +103,6 @@ def _type_of(row: str | list[Any], known: list[Any]) -> Any:
     return types.Array(scalar, int(array[0]), array[1], readonly="const" in array) if array else scalar
 
 
-def type_row(kind: Any, table: list[Any]) -> int:
-    """The row of a type in a table, to which it is added if it is missing; used to record the list.
-
-    Raises:
-        ValueError: The list has no words for the type.
-    """
-    from numba import types
-
-    row: str | list[Any] = kind.name
-    if isinstance(kind, types.BaseTuple):
-        place = getattr(kind, "instance_class", None)
-        name = "" if place is None else f"{place.__module__}:{place.__qualname__}"
-        row = [name, *(type_row(part, table) for part in kind)]
-    elif isinstance(kind, types.Array):
-        row = f"{kind.dtype.name} {kind.ndim} {kind.layout}" + " const" * (not kind.mutable)
-    elif isinstance(kind, types.Literal):
-        row = f"={json.dumps(kind.literal_value)}"
-    elif isinstance(kind, types.Dispatcher):
-        row = f"{kind.dispatcher.py_func.__module__}:{kind.dispatcher.py_func.__qualname__}"
-    elif getattr(types, kind.name, None) is not kind:
-        row = next((name for name, one in vars(types).items() if one is kind), "")
-        if not row:
-            raise ValueError(f"no words for the type {kind}")
-    if row not in table:
-        table.append(row)
-    return table.index(row)
-
-
 def missing_kernels(listed: Mapping[int, ListedKernel]) -> dict[int, ListedKernel]:
     """The kernels that the cache lacks, by their rows in the list."""
     from numba.core.registry import cpu_target

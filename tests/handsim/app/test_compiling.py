@@ -14,8 +14,9 @@ import pytest
 from numba import types
 from numba.core.registry import CPUDispatcher
 
+from benchmarks.cold_start import type_row
 from handsim.app import compiling
-from handsim.app.compiling import ListedKernel, compile_kernels, known_types, read_list, type_row
+from handsim.app.compiling import ListedKernel, compile_kernels, known_types, read_list
 from handsim.callbacks import before_compiling
 from handsim.kernels import align_rigid, horn_matrix
 
