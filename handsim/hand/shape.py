@@ -123,16 +123,13 @@ class Joint(NamedTuple):
     high: float
 
 
+_PARTS: Final = (("metacarpal", "proximal", "distal"), *[("proximal", "middle", "distal")] * 4)
 BONES: Final[tuple[Bone, ...]] = (
     Bone("palm", -1, -1),
-    Bone("thumb_metacarpal", 0, 0),
-    Bone("thumb_proximal", 1, 0),
-    Bone("thumb_distal", 2, 0),
     *(
-        Bone(f"{digit}_{segment}", PALM if index == 0 else 1 + 3 * number + index - 1, number)
-        for number, digit in enumerate(DIGITS)
-        if number > 0
-        for index, segment in enumerate(("proximal", "middle", "distal"))
+        Bone(f"{DIGITS[digit]}_{part}", 3 * digit + step if step else PALM, digit)
+        for digit, parts in enumerate(_PARTS)
+        for step, part in enumerate(parts)
     ),
 )
 BONE_NAMES: Final[tuple[str, ...]] = tuple(bone.name for bone in BONES)

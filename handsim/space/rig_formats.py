@@ -8,6 +8,7 @@ lens of Motive's `IntrinsicStandardCameraModel` is OpenCV's; the one of its `Int
 from __future__ import annotations
 
 import dataclasses
+import io
 import re
 import struct
 import warnings
@@ -132,20 +133,27 @@ def picture_size(owner: str, width: float, height: float) -> tuple[int, int]:
     return int(width), int(height)
 
 
-class _Refused(Exception):
-    """The parser met something that no calibration has."""
-
-
 def read_xml(path: Path) -> ET.Element:
     """The root of an XML file in UTF-8, UTF-16 or Latin-1."""
     text = _decoded(path, read_bytes(path, error=RigError, most=_MAX_XML_BYTES))
+    if "<!DOCTYPE" in text:
+        raise RigError(f"{path}: the XML has a document type, which no calibration has; it is not read")
+    root, depth = ET.Element(""), 0
+    data = io.BytesIO(text.encode("utf-8", "surrogatepass"))
     try:
-        return _parsed(text)
-    except _Refused as error:
-        raise RigError(f"{path}: {error}") from error
-    except expat.ExpatError as error:
+        for number, (event, element) in enumerate(ET.iterparse(data, ("start", "end"))):
+            root, depth = element, depth + (1 if event == "start" else -1)
+            if number > 2 * _MAX_ELEMENTS or depth > _MAX_DEPTH:
+                raise RigError(
+                    f"{path}: the XML has more than {_MAX_ELEMENTS} elements or is nested deeper than "
+                    f"{_MAX_DEPTH}, expected the calibration of a camera system"
+                )
+    except ET.ParseError as error:
         reason = expat.ErrorString(error.code)
-        raise RigError(f"{path}: not a calibration: it is no XML (line {error.lineno}: {reason})") from error
+        raise RigError(
+            f"{path}: not a calibration: it is no XML (line {error.position[0]}: {reason})"
+        ) from error
+    return root  # its end comes last
 
 
 def _decoded(path: Path, data: bytes) -> str:
@@ -157,35 +165,6 @@ def _decoded(path: Path, data: bytes) -> str:
             raise RigError(f"{path}: not a calibration: it is no XML text") from error
         text = data.decode("latin-1")
     return _DECLARATION.sub("", text, count=1)
-
-
-def _parsed(text: str) -> ET.Element:
-    builder, parser = ET.TreeBuilder(), expat.ParserCreate("utf-8")
-    elements = depth = 0
-
-    def start(tag: str, attributes: dict[str, str]) -> None:
-        nonlocal elements, depth
-        elements, depth = elements + 1, depth + 1
-        if elements > _MAX_ELEMENTS or depth > _MAX_DEPTH:
-            raise _Refused(
-                f"the XML has more than {_MAX_ELEMENTS} elements or is nested deeper than {_MAX_DEPTH}, "
-                "expected the calibration of a camera system"
-            )
-        builder.start(tag, attributes)
-
-    def end(tag: str) -> None:
-        nonlocal depth
-        depth -= 1
-        builder.end(tag)
-
-    def refuse(*_: object) -> None:
-        raise _Refused("the XML has a document type, which no calibration has; it is not read")
-
-    parser.StartElementHandler, parser.EndElementHandler = start, end
-    parser.CharacterDataHandler = builder.data
-    parser.StartDoctypeDeclHandler = parser.EntityDeclHandler = refuse
-    parser.Parse(text.encode("utf-8", "surrogatepass"), True)
-    return builder.close()
 
 
 def _vicon_camera(entry: ET.Element, number: int) -> LabCamera | Skipped:
