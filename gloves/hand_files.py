@@ -38,12 +38,12 @@ def write_hand(
         path: The file: .xml (MuJoCo: free joint, twenty hinges, capsules), .urdf, .osim (OpenSim, with the
             coordinates of the .mot of a take), or .glb (its skin with bones and weights, y up).
         hand: The hand; markers of its glove become sites of the .xml and markers of the .osim.
-        actuators: Position servos in the .xml, whose controls are angles within the joints' ranges.
+        actuators: Whether an .xml has position servos, whose controls are angles within the joints' ranges.
         start: Pose that the .osim begins in [m, rad]; flat when not given.
         up: The axis of that pose's world that points up.
 
     Raises:
-        ArgumentError: The file has another ending, or servos are asked for in a file other than .xml.
+        ArgumentError: The file has another ending.
         OSError: The file cannot be written.
     """
     suffix = path.suffix.lower()
@@ -51,8 +51,6 @@ def write_hand(
         raise ArgumentError(
             f"cannot write a hand as '{path}', expected a name that ends in {', '.join(ENDINGS)}"
         )
-    if actuators and suffix != ".xml":
-        raise ArgumentError(f"cannot write servos to '{path}', expected a name that ends in .xml")
     model = hand.model if isinstance(hand, GloveFit) else hand
     if suffix == ".glb":
         flat = join_qpos(np.zeros((1, NUM_JOINTS)))

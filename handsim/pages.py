@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 from pkgutil import resolve_name
+from string import Template
 from typing import TYPE_CHECKING, Any, Concatenate, Final, ParamSpec
 
 from handsim._checks import check_type, shown_value
@@ -38,7 +39,7 @@ _WRITERS: Final = {
 }
 NOTHING: Final = "-"
 """The cell of a table where there is no number."""
-_STYLE: Final = Path(__file__).parent / "data" / "page.css"
+_PAGE: Final = Path(__file__).parent / "data" / "page.html"
 
 
 class Paint:
@@ -114,17 +115,9 @@ class Section:
 
 def write_sections(path: Path, sections: Sequence[Section], *, title: str, lead: str) -> None:
     """Write a page of sections, with a title and the lead below it; it loads nothing from the network."""
+    words = {"title": escape(title), "lead": escape(lead), "version": f"handsim {full_version()}"}
     body = "\n".join(_html(section) for section in sections)
-    version = f"handsim {full_version()}"
-    page = (
-        '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f'<meta name="generator" content="{version}">\n'
-        f"<title>{escape(title)}</title>\n<style>\n{_STYLE.read_text('utf-8')}</style>\n</head>\n<body>\n"
-        f'<h1>{escape(title)}</h1>\n<p class="lead">{escape(lead)}</p>\n'
-        f'{body}\n<p class="note">Made by {version}.</p>\n</body>\n</html>\n'
-    )
-    write_text(path, page)
+    write_text(path, Template(_PAGE.read_text("utf-8")).substitute(words, body=body))
 
 
 def html_list(sentences: Sequence[str], kind: str = "ol") -> str:

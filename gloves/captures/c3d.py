@@ -39,9 +39,7 @@ _MAX_BYTES: Final = 1 << 22  # All values fit into this; damaged records may ove
 MOST_FRAMES: Final = 65535  # largest 16-bit count; longer takes state their length in ACTUAL_END_FIELD
 _MAX_PADDING: Final = 2 * BLOCK  # bytes after the last frame
 _SCALE_TOLERANCE: Final = 1e-3  # relative difference of the two scales of a file
-_MOST_LABEL_BYTES: Final = 255
-_MOST_LABELS: Final = 255  # of a parameter; more follow in LABELS2, LABELS3, ...
-_LONG_LABELS: Final = 12345  # word of the header: labels of events have four characters
+_BYTE_COUNT: Final = 255  # as many labels are in a parameter; more follow in LABELS2, LABELS3, ...
 _EVENTS_AT: Final = slice(304, 376)  # bytes of the header with times of events; flags and labels follow
 _OF_POINTS: Final = ("USED", "SCALE", "RATE", "FRAMES", "LONG_FRAMES", "UNITS", "LABELS", "DESCRIPTIONS")
 """Prefixes of the parameters in group POINT that describe the points."""
@@ -372,9 +370,9 @@ def write_c3d(path: Path, capture: Capture, source: bytes | None = None) -> None
     this field, such as ezc3d 1.7, see the first 65,535 frames.
     """
     for name in capture.names:
-        if len(name.encode()) > _MOST_LABEL_BYTES:
+        if len(name.encode()) > _BYTE_COUNT:
             raise CaptureError(
-                f"marker name '{shortened(name)}' is longer than the {_MOST_LABEL_BYTES} bytes of a label"
+                f"marker name '{shortened(name)}' is longer than the {_BYTE_COUNT} bytes of a label"
             )
     num_frames, num_points = capture.positions.shape[:2]
     kept = _nothing_kept(num_frames) if source is None else _kept_of(source)
@@ -417,7 +415,7 @@ def _nothing_kept(num_frames: int) -> _Kept:
     """What a file without a source states of other things than points."""
     head = bytearray(BLOCK)
     struct.pack_into("<H", head, 6, 1)
-    struct.pack_into("<H", head, 298, _LONG_LABELS)
+    struct.pack_into("<H", head, 298, 12345)  # labels of events have four characters
     records = [
         _record(-2, "ANALOG", b"\0"),
         _parameter(2, "USED", _INTEGER, struct.pack("<H", 0)),
@@ -479,8 +477,8 @@ def _data_start(group: int, block: int) -> bytes:
 
 def _texts(group: int, name: str, texts: Sequence[str]) -> Iterator[bytes]:
     """A parameter of texts, and its continuations."""
-    for part, start in enumerate(range(0, len(texts), _MOST_LABELS), 1):
-        words = [text.encode() for text in texts[start : start + _MOST_LABELS]]
+    for part, start in enumerate(range(0, len(texts), _BYTE_COUNT), 1):
+        words = [text.encode() for text in texts[start : start + _BYTE_COUNT]]
         width = max(map(len, words))
         content = b"".join(word.ljust(width) for word in words)
         yield _parameter(group, name + str(part) * (part > 1), _CHARACTER, content, width, len(words))
