@@ -96,9 +96,7 @@ class Cage(NamedTuple):
     tips: NDArray[np.int64]  # (5, 15) vertices of the skin that close each digit
     back_and_palm: NDArray[np.int64]  # (2,) vertices between which the palm's thickness is measured
     finger_slots: NDArray[np.int64]  # (4, 6) indices in a palm row of the vertices around each finger
-    row_positions: NDArray[
-        np.float64
-    ]  # (6,) of palm rows along the metacarpals, 0 at the wrist, 1 at the joints
+    row_positions: NDArray[np.float64]  # (6,) of palm rows: 0 at the wrist, 1 at the joints
     heights: NDArray[np.float64]  # (6, 9) of the back above the metacarpals, in palm thicknesses
     depths: NDArray[np.float64]  # (6, 9) of the palm under them, from the little finger's side
     wrist_columns: NDArray[np.float64]  # (4,) y of the rays at the wrist, in breadths
@@ -108,9 +106,7 @@ class Cage(NamedTuple):
     sections: NDArray[np.float64]  # (8, 6, 2) (y, z) of the rings about the axis, in radii
     waists: NDArray[np.float64]  # (8,) girth of the rings over the shape's
     thumb_base: NDArray[np.int64]  # (12,) vertices of the palm around the thumb's metacarpal
-    thumb_base_targets: NDArray[
-        np.float64
-    ]  # (12, 4) along [lengths], sideways, upwards [radii], share of the way
+    thumb_base_targets: NDArray[np.float64]  # (12, 4) along, sideways, upwards, share of the way
     thumb_ring: NDArray[np.float64]  # (6, 2) section of the thumb's first ring
     thumb_ring_along: NDArray[np.float64]  # (6,) its positions along the metacarpal [lengths]
 
