@@ -295,13 +295,8 @@ def layout_lines(layout: MarkerLayout) -> list[str]:
     if set(layout.sides) != set(SIDES):
         lines.append(f"sides = [{', '.join(map(quoted, layout.sides))}]")
     for marker in layout.markers:
-        lines += _marker_lines(marker)
+        lines += ["", "[[marker]]", *(f"{key} = {text}" for key, text in _marker_texts(marker).items())]
     return lines
-
-
-def _marker_lines(marker: MarkerPlace) -> list[str]:
-    """The lines of one [[marker]] table, after a blank one."""
-    return ["", "[[marker]]", *(f"{key} = {value}" for key, value in _marker_texts(marker).items())]
 
 
 def _marker_texts(marker: MarkerPlace) -> dict[str, str]:

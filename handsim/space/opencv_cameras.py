@@ -29,6 +29,7 @@ _CENTER: Final = 0.5  # OpenCV measures pixels from the center of the first one,
 _LEAST_FOCAL: Final = 0.02  # of the width; in shares of the picture's size a focal length is about 1
 _MAX_TURN: Final = 6.4  # longest rotation vector [rad]; longer ones are angles in degrees
 _MAX_BASELINE: Final = 5.0  # largest distance of the cameras of a pair [m]
+_LONG: Final = re.compile(r"\[[^\[\]]{2000,}\]")  # lists of numbers of no camera, which take long to parse
 _VERSION: Final = re.compile(r"^%YAML.*$", re.M)  # OpenCV writes it as no other program reads it
 _K: Final = ("camera_matrix", "cameraMatrix", "K", "mtx", "M")
 _D: Final = ("distortion_coefficients", "dist_coeffs", "distCoef", "D", "dist", "distortions")
@@ -105,6 +106,7 @@ _UNREAD: Final = {
 _KEY: Final = r"(?:^|[{{,])[ \t\n]{{0,99}}[\"']?{}[\"']?[ \t]*:"
 _MAX_CAMERAS: Final = 256
 _MAX_BYTES: Final = 1 << 22
+_MAX_DEPTH: Final = 64
 _MAX_PARTS: Final = 1000  # lists and numbers of a value that are looked at
 
 Values = dict[str, tuple[float, ...] | str]
@@ -441,7 +443,7 @@ def _read(path: Path) -> tuple[Values, Sections]:
         return {}, dict(_sections({name: one | {"K": one[TOML_MATRIX]} for name, one in tables.items()}))
     data = read_bytes(path, error=RigError, most=_MAX_BYTES)
     try:
-        text = data.decode(text_encoding(data))
+        text = _LONG.sub('"long"', data.decode(text_encoding(data)))
     except UnicodeDecodeError as error:
         raise RigError(f"{path}: not a calibration: it is not UTF-8 text") from error
     if text.lstrip().startswith("<"):
@@ -460,6 +462,9 @@ def _tables(path: Path, text: str) -> dict[str, Any]:
     """The content of JSON or YAML as one table; a list of cameras is that of its key `cameras`."""
     import yaml
 
+    steps = (1 if bracket in "[{" else -1 for bracket in re.findall(r"[\[\]{}]", text))
+    if max(itertools.accumulate(steps), default=0) > _MAX_DEPTH:  # PyYAML's time is quadratic in it
+        raise RigError(f"{path}: not a calibration: its brackets are nested more than {_MAX_DEPTH} deep")
     try:
         if text.lstrip().startswith(("{", "[")):
             parts = [json.loads(text)]
@@ -510,4 +515,6 @@ def _value(value: object) -> tuple[float, ...] | str:
             waiting[:0] = first[: _MAX_NUMBERS + 1]
         else:
             words += str(float(first) if isinstance(first, bool) else first).split()
-    return (words_numbers(words) if len(words) <= _MAX_NUMBERS else ()) or str(value)[:80]
+    found = words_numbers(words) if len(words) <= _MAX_NUMBERS else ()
+    # The text of lists that hold one list again and again would be endless.
+    return found or ("[...]" if value and isinstance(value, dict | list) else str(value)[:80])
