@@ -21,13 +21,14 @@ import numpy as np
 import tyro
 from scipy.spatial.transform import Rotation
 
+from film import register_camera
+from film.annotation import filmed_take
 from gloves import Take
 from handsim import Camera, Lens, look_at
 from handsim.hand.model import between_poses
 from handsim.space.camera import camera_matrix
 from handsim.space.transforms import rigid
-from render import RenderConfig, ShutterConfig, draw, register_camera
-from render.film.film import filmed_take
+from render import RenderConfig, ShutterConfig, draw
 from render.illustrations import write_video
 from train import simulate_take
 

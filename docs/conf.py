@@ -26,7 +26,7 @@ from handsim.cli.main import (  # noqa: E402
     main,
 )
 
-PACKAGES: Final = ("handsim", "poses", "gloves", "render", "train", "track")
+PACKAGES: Final = ("handsim", "poses", "gloves", "render", "train", "track", "film")
 COLUMNS: Final = 126  # of the help: lines of docstrings are not wrapped once more
 ESCAPE: Final = re.compile(r"\x1b\[[0-9;]*[A-Za-z]")  # colors of terminals
 

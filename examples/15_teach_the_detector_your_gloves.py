@@ -14,8 +14,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from film import HandDetector, annotate_film, train_detector
 from handsim import Camera, look_at
-from render import HandDetector, annotate_film, draw, train_detector
+from render import draw
 from train import simulate_take
 
 

@@ -30,12 +30,13 @@ from typing import Any, Final
 from handsim._process import own_numerics, with_own_numerics
 from handsim.errors import HandSimError
 
-SIBLINGS: Final = ("poses", "gloves", "render", "train", "track")
+SIBLINGS: Final = ("poses", "gloves", "render", "train", "track", "film")
 _HOME: Final = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
 _NEEDS: Final = {
     "render": ("poses", "gloves"),
     "train": ("poses", "gloves"),
     "track": ("poses", "gloves", "train"),
+    "film": ("poses", "gloves", "render"),
 }
 """Packages that each package imports."""
 _REMEDY: Final = "import handsim.{0} before it, rename it, or keep it off the path"

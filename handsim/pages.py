@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 _WRITERS: Final = {
     "gloves.takes.take.Take": "track.takes.take_page:write_take_page",
     "train.data.shards.Dataset": "train.reports.dataset_page:write_dataset_page",
-    "render.film.registration.Registration": "render.film.page:write_film_page",
+    "film.registration.Registration": "film.page:write_film_page",
     "track.gloves.glove_score.LayoutScore": "track.gloves.glove_page:write_glove_page",
     "track.gloves.learned_glove.LearnedGlove": "track.gloves.learned_page:write_learned_page",
     "train.forecast.rig_score.RigScore": "train.forecast.rig_score:write_rig_page",

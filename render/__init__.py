@@ -2,8 +2,7 @@
 
 `draw` yields pictures of a take or of your own poses in memory, `render_take` writes them into files,
 `PictureStream` feeds a training loop without end. A `RenderConfig` says what is drawn, a `ViewConfig` from
-where. `merge_renderings` makes one folder of several. `HandDetector` finds hands in pictures, and
-`train_detector` makes one from drawn pictures and your own.
+where. `merge_renderings` makes one folder of several.
 """
 
 from typing import TYPE_CHECKING
@@ -16,12 +15,6 @@ if TYPE_CHECKING:
     from render.color_sensor import ShutterConfig as ShutterConfig
     from render.config import RenderConfig as RenderConfig
     from render.depth_sensor import DepthSensor as DepthSensor
-    from render.film.detector import FoundHand as FoundHand
-    from render.film.detector import HandDetector as HandDetector
-    from render.film.film import annotate_film as annotate_film
-    from render.film.film import register_camera as register_camera
-    from render.film.registration import Registration as Registration
-    from render.film.training import train_detector as train_detector
     from render.formats.writer import merge_renderings as merge_renderings
     from render.frames import BodyTruth as BodyTruth
     from render.frames import HandTruth as HandTruth

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, Protocol
 
 import numpy as np
 from jaxtyping import Bool, Float, Float16, Float32, Int, UInt8
@@ -64,6 +64,21 @@ class Geometry(NamedTuple):
     parts: UInt8[np.ndarray, "H W"]
     instances: UInt8[np.ndarray, "H W"]
     markers: UInt8[np.ndarray, "H W"]
+
+
+class Footage(Protocol):
+    """Pictures that a real camera took of a take's hands, in the place of drawn colors; it can be pickled."""
+
+    @property
+    def poses(self) -> Float[np.ndarray, "T 4 4"]:
+        """Pose of the camera in each frame of the take [m]."""
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """What pictures tell of their origin, as JSON."""
+
+    def picture(self, frame: int) -> Bytes:
+        """The picture (sRGB) of a frame."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

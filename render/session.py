@@ -47,14 +47,13 @@ from render.depth_sensor import sample_depth_noise
 from render.formats.shards import INDEX
 from render.formats.webdataset import TAR
 from render.formats.writer import CONFIG, FORMATS, WITH_COLORS, open_writers, shard_files, whole_shards
-from render.frames import Doubles, RenderedFrame
+from render.frames import Doubles, Footage, RenderedFrame
 from render.painting.figures import sample_appearance
 from render.scenery.backgrounds import photo_files
 from render.scenery.lights import sample_surroundings
 from render.studio import FrameChoices, Moment, Studio
 from render.subject import Model, PoseFile, Source, Subject, load_subject, source_of
 from render.user_body import UserBody
-from render.video import Film
 from render.viewpoints import ViewConfig, Viewpoints, check_hands_in_view
 
 Cameras = Camera | CameraRig | Sequence[Camera] | str
@@ -149,12 +148,10 @@ class Drawing:
         # Poses that are no motion may be of many people, but cameras at the eyes need one person.
         has_user = self.subject.is_motion or config.view.placement == "head"
         self._user = UserBody(self.take) if has_user else None
-        film = subject.film
-        self._film = None if film is None else Film(film.path)
         self._open_studio = functools.partial(
-            open_studio, config=config, bodies=bodies, has_user=has_user, film=self._film, light=light
+            open_studio, config=config, bodies=bodies, has_user=has_user, footage=subject.footage, light=light
         )
-        poses = None if film is None else film.poses
+        poses = None if subject.footage is None else subject.footage.poses
         self.viewpoints = Viewpoints(
             config.view, self.take, rng=rng, up=config.up, user=self._user, poses=poses
         )
@@ -199,7 +196,7 @@ class Drawing:
         viewpoints = self.viewpoints
         enclosed = viewpoints.num_cameras > 1 or (viewpoints.moves and config.vary == "shard")
         enclosed |= viewpoints.cameras(0)[0].lens.kind != "pinhole"  # which bends what is behind the hands
-        around = viewpoints.positions() if enclosed and self._film is None else None
+        around = viewpoints.positions() if enclosed and self.subject.footage is None else None
         rng = SpawnKey.SHARD.rng(config.seed, shard, 0)
         if cast is None:  # a take has its own hands, whose looks change with the shard
             studio = self._open_studio(self.take.hands, rng=rng)
@@ -250,7 +247,7 @@ def open_studio(
     bodies: Sequence[RigidBody] = (),
     rng: np.random.Generator,
     has_user: bool = False,
-    film: Film | None = None,
+    footage: Footage | None = None,
     light: bool = False,
 ) -> Studio:
     """A studio of one person with random looks, whose wrists a `UserBody` may bend."""
@@ -259,7 +256,7 @@ def open_studio(
         straight = dataclasses.replace(look.forearm, flexion=0.0, deviation=0.0)
         look = dataclasses.replace(look, forearm=straight)
     colors = [tuple(rng.uniform(0.05, 0.9, 3).tolist()) for _ in bodies]
-    return Studio(hands, look, config, bodies, colors, light=light, film=film)
+    return Studio(hands, look, config, bodies, colors, light=light, footage=footage)
 
 
 def sample_choices(
@@ -356,7 +353,7 @@ def render_take(
     check_names("cameras", cameras)
     check_hands_in_view(config.view, drawing.viewpoints, drawing.take)
     absent = drawing.frames_without_hands()
-    if absent and drawing.subject.film is None:  # frames of a video are left out for reasons that are told
+    if absent and drawing.subject.footage is None:  # frames of a video are left out for reasons that are told
         told = f"frames without a hand are not drawn: {len(absent)} of {drawing.take.num_frames}"
         warnings.warn(f"{told} (the first: {absent[0]})", HandSimWarning, stacklevel=3)
     shards, views = drawing.shards(), drawing.viewpoints.num_cameras

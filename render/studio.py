@@ -34,6 +34,7 @@ from render.frames import (
     Doubles,
     Flags,
     Floats,
+    Footage,
     Geometry,
     HandTruth,
     Integers,
@@ -56,7 +57,6 @@ from render.scenery.backgrounds import (
 from render.scenery.lights import Lighting
 from render.skin.look import SkinLook, upper_arms
 from render.user_body import UserBody
-from render.video import Film
 
 
 def _allowed_parts() -> Flags:
@@ -227,13 +227,13 @@ class Studio:
         body_colors: Sequence[tuple[float, float, float]] = (),
         *,
         light: bool = False,
-        film: Film | None = None,
+        footage: Footage | None = None,
     ) -> None:
         """The configuration is resolved; `light` asks for that of colors, which our own painter has."""
         assert config.painter != "auto"
         self._config, self._passes, self._painter = config, set(config.passes), config.painter
-        self._film = film  # whose pictures take the place of drawn colors
-        self._light = light and film is None and config.painter == "compiled"
+        self._footage = footage
+        self._light = light and footage is None and config.painter == "compiled"
         self._look, self._people = look, [dataclasses.asdict(look)] * len(hands)
         first = np.cumsum([0, *(len(fit.attachment.points) for fit in hands)])
         self._hands = [
@@ -267,15 +267,16 @@ class Studio:
         sensor = choices.depth_noise if "depth" in self._passes else None
         surfaces = [one.triangles for one in drawn]
         truth = see(camera, surfaces, with_normals=sensor is not None or "normals" in self._passes)
+        footage = self._footage
         rgb = light = noisy_rgb = noisy_depth = None
         if "rgb" in self._passes:
-            rgb = self._colors_of(camera, drawn, choices) if self._film is None else self._film.picture(frame)
+            rgb = self._colors_of(camera, drawn, choices) if footage is None else footage.picture(frame)
             noisy_rgb = self._exposed(moment, camera, rgb, choices, rng)
             if self._light:
                 most = np.where(rgb < 255, rgb + 1.0, np.inf)  # parts of a pixel are cut at white one by one
                 levels = np.clip(self._colors_of(camera, drawn, choices, bright=True), rgb - 1.0, most)
                 light = light_of(levels).astype(np.float16)
-        if self._config.room_depth and self._film is None and {"depth", "normals"} & self._passes:
+        if self._config.room_depth and footage is None and {"depth", "normals"} & self._passes:
             _walls(camera, drawn, choices).put_behind(truth)
         if sensor is not None:
             noisy_depth = self._noisy_depth(truth, rgb, len(present), camera, sensor, rng)
@@ -409,8 +410,8 @@ class Studio:
         return Pictures(rgb, light, **{name: getattr(truth, name) for name in names})
 
     def _record(self, choices: FrameChoices) -> dict[str, Any]:
-        if self._film is not None:
-            return {"film": self._film.path.name}
+        if self._footage is not None:
+            return self._footage.record
         record = _as_record(dataclasses.replace(choices, seed=0)) | {"seed": choices.seed}
         return {"people": self._people, "body_colors": self._colors, **record}
 

@@ -38,8 +38,7 @@ from handsim.motion_files.motion import read_joint_csv
 from handsim.space.transforms import UpAxis, rotation_quaternions, turned_poses, upright
 from poses.shapes import HIGH, LOW
 from render.config import SpawnKey
-from render.frames import Doubles
-from render.video import FilmPictures
+from render.frames import Doubles, Footage
 
 KEYS: Final = ("qpos", "angles", "T_world_wrist", "times", "person", "hands", "hand_size")
 CSV: Final = ".csv"
@@ -256,7 +255,7 @@ class Subject:
     cast: Cast | None = None  # people; None if the take's hands are drawn
     is_motion: bool = True  # whether frames follow one another in time
     poses: dict[str, Any] | None = None  # other settings of poses, as JSON; None for a take
-    film: FilmPictures | None = None  # pictures of a video in the place of drawn colors
+    footage: Footage | None = None  # pictures of a camera in the place of drawn colors
 
     def __post_init__(self) -> None:
         if not np.isfinite(self.take.qpos[..., 0]).any():

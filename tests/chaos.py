@@ -29,7 +29,7 @@ from typing import Literal, get_args
 import tyro
 
 from render.illustrations import write_video
-from tests.render.film.filmed import SIZE, Filming, moving_take
+from tests.film.filmed import SIZE, Filming, moving_take
 
 SIGNALS = (signal.SIGTERM, signal.SIGKILL, signal.SIGINT, signal.SIGHUP)
 ROOT = Path(__file__).resolve().parents[1]

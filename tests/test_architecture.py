@@ -12,7 +12,7 @@ import grimp
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-PACKAGES = ("handsim", "poses", "gloves", "render", "train", "track")
+PACKAGES = ("handsim", "poses", "gloves", "render", "train", "track", "film")
 SOURCES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
 MOST_LEVELS = 11
 LOADERS = {"handsim/cli/main.py", "handsim/_imports.py", "handsim/pages.py"}

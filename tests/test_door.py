@@ -1,4 +1,4 @@
-"""The public names of the six packages: documented, typed, lazily imported, used by an example that runs."""
+"""The public names of the seven packages: documented, typed, lazily imported, in an example that runs."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 from tests.documents import PAGES
 from tests.programs import ROOT, run_python
 
-PACKAGES = ("handsim", "poses", "gloves", "render", "train", "track")
+PACKAGES = ("handsim", "poses", "gloves", "render", "train", "track", "film")
 BOOKKEEPING = {"__version__", "ShadowedPackageWarning"}
 UNIT = re.compile(r"\[(m|m\^2|rad|s|min|Hz|deg|px|pixels|mm|1/s)(?=[ ,;/\]])")
 ARRAY = re.compile(r"\b(Float|Int|Bool)(32|64)?\[[^,\]]+, *\"")

@@ -19,7 +19,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> zipfile.ZipFile:
     return zipfile.ZipFile(build_wheel(tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("wheel")))
 
 
-def test_wheel_holds_the_six_packages_and_nothing_else(wheel: zipfile.ZipFile) -> None:
+def test_wheel_holds_the_seven_packages_and_nothing_else(wheel: zipfile.ZipFile) -> None:
     tops = {name.split("/")[0] for name in wheel.namelist()}
     (about,) = (top for top in tops if top.endswith(".dist-info"))
     assert tops == {*PACKAGES, about}
@@ -27,7 +27,7 @@ def test_wheel_holds_the_six_packages_and_nothing_else(wheel: zipfile.ZipFile) -
 
 
 def test_wheel_holds_every_source_and_data_file(wheel: zipfile.ZipFile) -> None:
-    """Every file under the six packages is in the wheel: layouts, poses and weights too."""
+    """Every file under the seven packages is in the wheel: layouts, poses and weights too."""
     wanted = {
         path.relative_to(ROOT).as_posix()
         for package in PACKAGES

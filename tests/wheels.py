@@ -13,7 +13,7 @@ import pytest
 
 from tests.programs import ROOT
 
-PACKAGES = ("handsim", "poses", "gloves", "render", "train", "track")
+PACKAGES = ("handsim", "poses", "gloves", "render", "train", "track", "film")
 
 
 def build_wheel(source: Path, out: Path) -> Path:

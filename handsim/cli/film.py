@@ -58,8 +58,8 @@ def film(
         format: File formats: webdataset, coco, yolo, exr, png; several go into folders.
         workers: Processes that write; all cores when not given.
     """
-    from render.film.detector import HandDetector
-    from render.film.film import PAGE, annotate_film
+    from film.annotation import PAGE, annotate_film
+    from film.detector import HandDetector
 
     check_outputs((take, video, camera, detector), (out,))
     begin = time.perf_counter()

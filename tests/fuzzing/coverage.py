@@ -19,7 +19,7 @@ from typing import Final
 import atheris
 import numpy as np
 
-_PACKAGES: Final = ["handsim", "gloves", "poses", "render", "track", "train"]
+_PACKAGES: Final = ["film", "handsim", "gloves", "poses", "render", "track", "train"]
 _ENVIRONMENT: Final = os.environ | {"NUMBA_DISABLE_JIT": "1"}  # numba cannot compile what is instrumented
 _HERE: Final = "--here"  # in the process that fuzzes a target, whose imports are instrumented
 

@@ -31,7 +31,7 @@ from handsim.files.outputs import available_bytes
 
 ROOT = Path(__file__).resolve().parents[2]
 LAUNCHED = [name for names in _process._LAUNCHERS for name in names]
-PACKAGES = ("handsim", "poses", "gloves", "render", "train", "track")
+PACKAGES = ("handsim", "poses", "gloves", "render", "train", "track", "film")
 
 
 @pytest.fixture

@@ -7,10 +7,10 @@ import cv2
 import numpy as np
 import pytest
 
+from film.detector import HandDetector
 from handsim.cli.main import main
-from render.film.detector import HandDetector
 from render.illustrations import write_video
-from tests.render.film.filmed import SIZE, Filming, moving_take
+from tests.film.filmed import SIZE, Filming, moving_take
 
 FILMING = Filming(seed=21, seconds=8.0, rate=8.0, missing=0.0, swapped=0.0, readout=(0.0, 0.0))
 

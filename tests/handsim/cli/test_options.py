@@ -20,8 +20,8 @@ from handsim.cli.parsing import PresetCommand, _with_hints, registry
 from handsim.space.camera import pinhole
 from handsim.space.rig import CameraRig
 from render.illustrations import write_video
+from tests.film.filmed import SIZE, Filming, moving_take
 from tests.handsim.space.known_rig import XCP
-from tests.render.film.filmed import SIZE, Filming, moving_take
 from tests.train.simulation.test_options import GENERATE, SIMULATE
 from track.settings import nominal_user
 from train import generate_dataset, simulate_take

@@ -11,6 +11,12 @@ from typing import Any, Final
 
 import numpy as np
 
+from film.bundle import FoundFrame
+from film.detector import HandDetector
+from film.outlines import poses_at, shutter_times
+from film.page import write_film_page
+from film.registration import Registration, register
+from film.video import Film, FilmFootage
 from gloves.takes.take import Take, load_take
 from handsim._checks import check_type
 from handsim.callbacks import OnStep, Progress, no_progress, no_step
@@ -23,16 +29,10 @@ from handsim.space.camera import Camera
 from handsim.space.rig_formats import load_cameras
 from render.captions import draw_keypoints
 from render.config import RenderConfig
-from render.film.bundle import FoundFrame
-from render.film.detector import HandDetector
-from render.film.outlines import poses_at, shutter_times
-from render.film.page import write_film_page
-from render.film.registration import Registration, register
 from render.frames import Bytes
 from render.illustrations import write_video
 from render.session import render_take
 from render.subject import subject_of_take
-from render.video import Film, FilmPictures
 from render.viewpoints import ViewConfig
 
 RECORD, VIDEO, PAGE = "film.json", "film.mp4", "film.html"
@@ -163,10 +163,10 @@ def annotate_film(
         told = "; ".join(registration.left_out())
         raise HandSimError(f"{film.path}: no frame can be told: {told}")
     poses = np.stack([registration.camera_of(n).T_world_camera for n in range(posed.num_frames)])
-    pictures = FilmPictures(film.path.absolute(), poses)
     record = {"film": {"sha256": checksum(film.path), **registration.record()}}
     config = dataclasses.replace(config, view=ViewConfig(cameras=(registration.cameras[0],)))
-    source: Any = dataclasses.replace(subject_of_take(posed), film=pictures, poses=record)  # not public
+    footage = FilmFootage(film, poses)
+    source: Any = dataclasses.replace(subject_of_take(posed), footage=footage, poses=record)  # not public
     on_step("writing pictures")
     render_take(source, out, formats, config, workers=workers, progress=progress)
     on_step(f"writing {VIDEO} and {PAGE}")

@@ -12,11 +12,8 @@ import numpy as np
 import pytest
 import torch
 
-from handsim.errors import ArgumentError, WeightsError
-from handsim.hand.shape import SIDES
-from render import HandDetector, train_detector
-from render.film import training
-from render.film.detector import (
+from film import HandDetector, train_detector, training
+from film.detector import (
     FINDER,
     HEAT_SIZE,
     KEYPOINTS,
@@ -28,8 +25,10 @@ from render.film.detector import (
     square_around,
     upright,
 )
-from render.film.network import FinderNetwork, KeypointNetwork
-from render.film.training import SCENES, Scene, draw_scenes, lessons_of
+from film.network import FinderNetwork, KeypointNetwork
+from film.training import SCENES, Scene, draw_scenes, lessons_of
+from handsim.errors import ArgumentError, WeightsError
+from handsim.hand.shape import SIDES
 from tests.sentences import error_names
 
 BARE, GLOVED, TWO_GLOVED = 0, 1, 5  # numbers of shards

@@ -18,12 +18,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from gloves.takes.take import Take
-from handsim.errors import HandSimError
-from handsim.hand.shape import SIDES
-from handsim.pages import coordinates
-from handsim.space.camera import Camera
-from render.film.bundle import (
+from film.bundle import (
     DRIFT,
     FEWEST_KEYPOINTS,
     FOCAL,
@@ -36,7 +31,12 @@ from render.film.bundle import (
     Samples,
     State,
 )
-from render.film.outlines import Outlines, Seen, straight
+from film.outlines import Outlines, Seen, straight
+from gloves.takes.take import Take
+from handsim.errors import HandSimError
+from handsim.hand.shape import SIDES
+from handsim.pages import coordinates
+from handsim.space.camera import Camera
 from render.frames import Bytes, Doubles
 
 _FEWEST_FRAMES: Final = 20  # A camera is registered from this many frames with a hand.

@@ -1,6 +1,6 @@
 """Training of the hand detector on drawn pictures, and on labeled photographs of your own.
 
-    python -m render.film.training OUT [--samples 192000 --seed 0] [--start FOLDER] [--photographs FILE]
+    python -m film.training OUT [--samples 192000 --seed 0] [--start FOLDER] [--photographs FILE]
 
 OUT gets the weights that `HandDetector.load` reads.
 """
@@ -25,17 +25,7 @@ from scipy.spatial.transform import Rotation
 from torch import nn
 from torch.nn import functional
 
-from handsim._checks import check_count
-from handsim._plugins import import_extra
-from handsim._process import torch_kept
-from handsim._version import full_version
-from handsim.files.models import DIGEST, stamp_model
-from handsim.files.outputs import atomic_write
-from handsim.hand.model import HandModel
-from handsim.hand.shape import NUM_KEYPOINTS, NUM_QPOS, SIDES
-from poses import sample_poses
-from render.config import RenderConfig
-from render.film.detector import (
+from film.detector import (
     CELL,
     CROP_SIZE,
     FINDER,
@@ -51,7 +41,17 @@ from render.film.detector import (
     square_around,
     upright,
 )
-from render.film.network import FinderNetwork, KeypointNetwork
+from film.network import FinderNetwork, KeypointNetwork
+from handsim._checks import check_count
+from handsim._plugins import import_extra
+from handsim._process import torch_kept
+from handsim._version import full_version
+from handsim.files.models import DIGEST, stamp_model
+from handsim.files.outputs import atomic_write
+from handsim.hand.model import HandModel
+from handsim.hand.shape import NUM_KEYPOINTS, NUM_QPOS, SIDES
+from poses import sample_poses
+from render.config import RenderConfig
 from render.formats.records import encode_jpeg
 from render.frames import Bytes, Doubles, Floats
 from render.photographs import read_photograph

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from film.bundle import FoundFrame
+from film.detector import FoundHand
 from gloves.fit import settle_glove
 from gloves.layout import load_layout
 from gloves.takes.take import Take
@@ -16,8 +18,6 @@ from handsim.hand.shape import Side
 from handsim.space.camera import camera_matrix
 from handsim.space.transforms import rigid
 from render import RenderConfig, draw
-from render.film.bundle import FoundFrame
-from render.film.detector import FoundHand
 
 SIZE = (640, 480)
 OTHER: dict[Side, Side] = {"left": "right", "right": "left"}

@@ -2,7 +2,7 @@
 
 A finder looks at the whole picture and tells centers and sizes of hands; a second network looks at each hand
 twice: upright, then turned so that its fingers point up. Both learned from drawn pictures alone
-(`render.film.training`). OpenCV runs them.
+(`film.training`). OpenCV runs them.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class HandDetector:
     """Finds hands in pictures, on one core.
 
     Args:
-        finder: ONNX model that `render.film.training` writes: where hands are in a picture.
+        finder: ONNX model that `film.training` writes: where hands are in a picture.
         keypoints: The other one: where 21 keypoints are in a hand's square.
     """
 
@@ -103,7 +103,7 @@ class HandDetector:
         except Exception as error:  # OpenCV's errors of damaged files have no class of their own
             raise WeightsError(
                 f"{folder}: {FINDER} and {KEYPOINTS} are damaged or not a hand detector's, expected what "
-                "render.train_detector wrote"
+                "film.train_detector wrote"
             ) from error
 
     @with_own_numerics

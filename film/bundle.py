@@ -17,7 +17,7 @@ from handsim.space.transforms import rigid
 from render.frames import Doubles, Integers
 
 if TYPE_CHECKING:
-    from render.film.detector import FoundHand
+    from film.detector import FoundHand
 
 _MAX_GAP: Final = 0.1  # [s] Poses are interpolated over gaps up to this length.
 FEWEST_KEYPOINTS: Final = 8  # A hand in a frame is judged by this many keypoints.

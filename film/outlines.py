@@ -15,12 +15,12 @@ import cv2
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
+from film.bundle import READOUT, Bundle, Samples, State
 from gloves.fit import GloveFit
 from gloves.takes.take import Take
 from handsim.hand.model import between_poses
 from handsim.space.camera import Camera, Lens
 from handsim.space.transforms import pose_matrices, unit
-from render.film.bundle import READOUT, Bundle, Samples, State
 from render.frames import FOREARM, PARTS_A_HAND, Bytes, Doubles, Flags, Floats, Geometry, Integers
 from render.painting.figures import BodyFigure
 from render.painting.rasterizer import Triangles, see

@@ -12,7 +12,7 @@ from handsim.pages import Paint, Section, html_list, picture, write_sections
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from render.film.registration import Registration
+    from film.registration import Registration
 
 
 def write_film_page(path: Path, found: Registration) -> None:

@@ -1,4 +1,4 @@
-"""`Film`, a video file, and its pictures in the place of drawn ones."""
+"""`Film`, a video file, and `FilmFootage`, its pictures in the place of drawn ones."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import cv2
 import numpy as np
@@ -25,7 +25,7 @@ _MOST_FRAMES: Final = 1 << 20
 
 
 class Film:
-    """A video file, read frame by frame.
+    """A video file, read frame by frame; a copy in another process opens the file itself.
 
     Raises:
         CaptureError: The file is missing, or no video that OpenCV reads.
@@ -46,6 +46,9 @@ class Film:
         self.num_frames = int(min(max(count, 0), _MOST_FRAMES))
         """As the file tells it, which may be wrong."""
         Camera("film", self.size, np.diag([1.0, 1.0, 1.0]))  # refuses pictures that are too large
+
+    def __reduce__(self) -> tuple[type[Film], tuple[Path]]:
+        return Film, (self.path.absolute(),)
 
     def _open(self) -> None:
         os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # Quiet: the error below says enough.
@@ -87,9 +90,18 @@ class Film:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class FilmPictures:
-    """The pictures of a video in the place of drawn ones, by the numbers of its frames."""
+class FilmFootage:
+    """The pictures of a video as `render` takes them in the place of drawn ones."""
 
-    path: Path
+    film: Film
     poses: Float[np.ndarray, "T 4 4"]
     """Pose of the camera in each frame [m]."""
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """What pictures tell of their origin, as JSON."""
+        return {"film": self.film.path.name}
+
+    def picture(self, frame: int) -> Bytes:
+        """The picture (sRGB) of a frame."""
+        return self.film.picture(frame)

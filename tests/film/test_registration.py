@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from film.registration import Registration, register
 from gloves.takes.take import Take
 from handsim import Camera, HandSimError, Lens, write_page
-from render.film.registration import Registration, register
-from tests.render.film.filmed import SIZE, Filming, moving_take
+from tests.film.filmed import SIZE, Filming, moving_take
 
 
 def errors(found: Camera, true: Camera) -> tuple[float, float, float]:

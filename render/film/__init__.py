@@ -1,1 +1,0 @@
-"""Hands in pictures that a camera took: they are found, and registered to a tracked take."""
