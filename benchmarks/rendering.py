@@ -24,10 +24,11 @@ from benchmarks.record import Figures, describe, report, run, timed
 from gloves import Take
 from handsim.app.workers import run_jobs
 from render import PictureStream, RenderConfig, RenderedFrame, ViewConfig
+from render.config import resolve
+from render.drawing import Drawing
 from render.formats.writer import open_writer
 from render.painting.figures import sample_appearance
 from render.painting.rasterizer import join, rasterize
-from render.session import Drawing
 from render.skin.look import ALL_TONES
 from render.studio import Moment, Studio
 from render.subject import subject_of_take
@@ -53,7 +54,7 @@ def a_take(frames: int) -> Take:
 
 def pictures(config: RenderConfig, frames: int, shard: int) -> Iterator[RenderedFrame]:
     """One worker's share."""
-    drawing = Drawing(subject_of_take(a_take(frames)), config.resolved())
+    drawing = Drawing(subject_of_take(a_take(frames)), resolve(config))
     return drawing.frames(shard, enumerate(range(frames)))
 
 

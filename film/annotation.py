@@ -12,6 +12,7 @@ from typing import Any, Final
 import numpy as np
 
 from film.bundle import FoundFrame
+from film.config import FilmConfig
 from film.detector import HandDetector
 from film.outlines import poses_at, shutter_times
 from film.page import write_film_page
@@ -20,7 +21,7 @@ from film.video import Film, FilmFootage
 from gloves.takes.take import Take, load_take
 from handsim._checks import check_type
 from handsim.callbacks import OnStep, Progress, no_progress, no_step
-from handsim.errors import ArgumentError, CaptureError, HandSimError
+from handsim.errors import CaptureError, HandSimError
 from handsim.files.inputs import checksum
 from handsim.files.outputs import save_json
 from handsim.hand.model import between_poses
@@ -38,9 +39,6 @@ from render.viewpoints import ViewConfig
 RECORD, VIDEO, PAGE = "film.json", "film.mp4", "film.html"
 """Files beside the pictures: the registration, the video with the hands drawn over it, and the page."""
 _LOOKS: Final = 10.0  # [Hz] how often the detector runs; the take has the motion between two runs
-_FILMED: Final = RenderConfig(dress="glove", depth_sensor=None, color_sensor=None, painter="compiled")
-_NOT_FILMED: Final = ("view", "tones", "background", "vary", "depth_sensor", "room_depth", "color_sensor",
-                      "painter", "shutter")  # fmt: skip
 
 
 def register_camera(
@@ -118,6 +116,7 @@ def annotate_film(
     video: str | Path,
     out: str | Path,
     formats: str | Sequence[str] = ("webdataset",),
+    config: FilmConfig | None = None,
     *,
     camera: Camera | str | Path | None = None,
     detector: HandDetector | None = None,
@@ -136,13 +135,13 @@ def annotate_film(
         video: The video.
         out: Folder.
         formats: As in `render_take`.
+        config: What is written.
         camera: As in `register_camera`.
         detector: As in `register_camera`.
         workers: As in `render_take`.
         progress: Called with numbers of done and of all frames, first of finding hands, then of writing.
         on_step: As in `register_camera`.
-        settings: Settings of `RenderConfig` that a film has: passes, openxr, dress (a glove when not given),
-            frames, every, num_frames, frames_per_shard, seed and up.
+        settings: Settings of `FilmConfig` that differ from `config`, as `dress="skin"` or `num_frames=100`.
 
     Returns:
         The registration: pose [m], lens [px], clock [s], and which frames fit.
@@ -150,10 +149,7 @@ def annotate_film(
     Raises:
         HandSimError: As in `register_camera` and `render_take`, or no frame fits.
     """
-    for name in settings:
-        if name in _NOT_FILMED:
-            raise ArgumentError(f"{name} is a setting of drawn pictures, which a video has not")
-    config = RenderConfig.of(_FILMED, settings)
+    config = FilmConfig.of(config, settings)
     taken, film = _taken(take), Film(video)
     registration = register_camera(
         taken, video, camera=camera, detector=detector, progress=progress, on_step=on_step
@@ -164,11 +160,17 @@ def annotate_film(
         raise HandSimError(f"{film.path}: no frame can be told: {told}")
     poses = np.stack([registration.camera_of(n).T_world_camera for n in range(posed.num_frames)])
     record = {"film": {"sha256": checksum(film.path), **registration.record()}}
-    config = dataclasses.replace(config, view=ViewConfig(cameras=(registration.cameras[0],)))
+    drawn = RenderConfig(
+        **dataclasses.asdict(config),
+        view=ViewConfig(cameras=(registration.cameras[0],)),
+        depth_sensor=None,
+        color_sensor=None,
+        painter="compiled",
+    )
     footage = FilmFootage(film, poses)
     source: Any = dataclasses.replace(subject_of_take(posed), footage=footage, poses=record)  # not public
     on_step("writing pictures")
-    render_take(source, out, formats, config, workers=workers, progress=progress)
+    render_take(source, out, formats, drawn, workers=workers, progress=progress)
     on_step(f"writing {VIDEO} and {PAGE}")
     folder = Path(out)
     save_json(folder / RECORD, registration.record())

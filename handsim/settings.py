@@ -46,6 +46,21 @@ class Expected:
     """The valid names."""
 
 
+@dataclass(frozen=True, slots=True)
+class Spelled:
+    """How the command line spells a field that has no words: `Annotated[A | None, Spelled(bool, True)]`.
+
+    The class of the field takes such values in Python, too.
+    """
+
+    kind: Any = None
+    """The type whose words are given; the field's own when None."""
+    default: Any = None
+    """What an option of that type is when it is not given."""
+    name: str | None = None
+    """The option's name; empty for a group whose fields stand among the others."""
+
+
 class Settings:
     """Base of the frozen dataclasses of settings.
 

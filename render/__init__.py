@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from render.color_sensor import ShutterConfig as ShutterConfig
     from render.config import RenderConfig as RenderConfig
     from render.depth_sensor import DepthSensor as DepthSensor
+    from render.drawing import draw as draw
     from render.formats.writer import merge_renderings as merge_renderings
     from render.frames import BodyTruth as BodyTruth
     from render.frames import HandTruth as HandTruth
@@ -22,7 +23,6 @@ if TYPE_CHECKING:
     from render.frames import RenderedFrame as RenderedFrame
     from render.scenery.backgrounds import Backgrounds as Backgrounds
     from render.scenery.lights import write_environment_map as write_environment_map
-    from render.session import draw as draw
     from render.session import render_take as render_take
     from render.skin.look import SkinLook as SkinLook
     from render.stream import PictureStream as PictureStream

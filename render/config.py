@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import dataclasses
 import enum
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import Annotated, Any, ClassVar, Final, Literal
 
 import numpy as np
 
 from handsim._checks import check_choice, check_type
 from handsim.errors import ArgumentError
-from handsim.settings import Expected, Limits, Settings
+from handsim.settings import Expected, Limits, Settings, Spelled
+from handsim.space.camera import Camera
+from handsim.space.rig import CameraRig
 from handsim.space.transforms import UpAxis
 from render.color_sensor import ExposureConfig, ShutterConfig
-from render.depth_sensor import SENSORS, DepthSensor
+from render.depth_sensor import OTHER_NAMES, SENSORS, DepthSensor
 from render.frames import PASSES
 from render.painting.painter import PainterChoice, choose_painter
 from render.scenery.backgrounds import Backgrounds
@@ -46,52 +50,25 @@ class SpawnKey(enum.IntEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class RenderConfig(Settings):
-    """Everything that decides the bytes of a rendering; it is saved beside the pictures.
+class FrameConfig(Settings):
+    """What drawn pictures and those of a video have in common.
 
     Raises:
         ArgumentError: A pass is unknown, or a number is out of range.
     """
 
-    noun: ClassVar[str] = "setting of a rendering"
-
     passes: tuple[str, ...] = PASSES
-    """Pictures to draw: some of rgb, depth, normals, ids."""
-    view: ViewConfig = field(default_factory=ViewConfig)
-    """Cameras, and where they stand; a mapping holds what differs from the usual ones."""
+    """Pictures to write: some of rgb, depth, normals, ids."""
     dress: Literal["skin", "glove"] = "skin"
-    """Bare skin, or the marker glove with its markers."""
-    tones: tuple[float, ...] = ALL_TONES
-    """Ranges of individual typology angles that skins are drawn from [deg], the ends of each one after the
-    other; names of classes, as very-light, brown, stand for those of `render.skin.look.TONES`."""
-    background: Backgrounds = field(default_factory=Backgrounds)
-    """Kinds of background and their shares, as `{"room": 3, "plain": 1}`, and beside them the folder `photos`
-    of photographs; names of kinds have equal shares, and what is not named has none."""
-    vary: Literal["shard", "frame"] = "shard"
-    """Whether light and background change with every shard or every frame; people change with every shard."""
-    depth_sensor: Annotated[
-        DepthSensor | Literal["auto"] | None,
-        Expected("a DepthSensor, its name, or auto, or None", lambda: SENSORS),
-    ] = "auto"
-    """Sensor that adds noise to depth, or its name; auto: one whose range fits the placement, see
-    `NEAR_SENSOR`; None: perfect depth alone."""
-    room_depth: bool = True
-    """Whether depth and normals show the room or the wall behind hands and objects. Otherwise both are 0
-    there, as they are before an environment map, which has no depth."""
+    """What the hands wear: nothing, or the marker glove with its markers."""
     openxr: bool = False
     """Whether COCO's annotations have the 26 joints of OpenXR, too, with their poses."""
-    color_sensor: ExposureConfig | None = field(default_factory=ExposureConfig)
-    """Exposure and noise of colors; None: perfect colors alone."""
-    painter: PainterChoice = "auto"
-    """What paints colors: our own compiled code, opengl, or auto: opengl where there is hardware for it."""
-    shutter: ShutterConfig | None = None
-    """Motion blur and rolling shutters, which take a drawing per sub-frame; None: pictures of an instant."""
     frames: Annotated[tuple[int, ...] | None, Limits(0)] = None
-    """Numbers of the frames that are drawn; all frames with a hand when not given."""
+    """Numbers of the frames that are written; all frames with a hand when not given."""
     every: Annotated[int, Limits(1)] = 1
-    """Step between the frames that are drawn."""
+    """Step between the frames that are written."""
     num_frames: Annotated[int | None, Limits(1)] = None
-    """Number of these frames at most, spread evenly over the take; all when not given."""
+    """Number of these frames at most, spread evenly over all of them; all when not given."""
     frames_per_shard: Annotated[int, Limits(1)] = 64
     """Frames that are written together."""
     seed: Annotated[int, Limits(0)] = 0
@@ -100,6 +77,56 @@ class RenderConfig(Settings):
     """The axis of the take, and of your own cameras, that points up; y for captures of Motive's default. The
     truth of pictures has z up."""
 
+    def check(self) -> None:
+        """Refuse unknown passes."""
+        for name in self.passes:
+            check_choice(name, PASSES, noun="pass")
+        if not self.passes:
+            raise ArgumentError(f"passes are none, expected some of {', '.join(PASSES)}")
+
+
+@dataclass(frozen=True, slots=True)
+class RenderConfig(FrameConfig):
+    """Everything that decides the bytes of a rendering; it is saved beside the pictures.
+
+    Raises:
+        ArgumentError: A pass is unknown, or a number is out of range.
+    """
+
+    noun: ClassVar[str] = "setting of a rendering"
+
+    view: Annotated[ViewConfig, Spelled(name="")] = field(default_factory=ViewConfig)
+    """Cameras, and where they stand; a mapping holds what differs from the usual ones."""
+    tones: Annotated[tuple[float, ...], Spelled(tuple[str, ...], ())] = ALL_TONES
+    """Classes of skin tone to draw from: very-light, light, intermediate, tan, brown, dark; all when not
+    given. In Python also ranges of individual typology angles [deg], the ends of each one after the other."""
+    background: Annotated[Backgrounds, Spelled(name="")] = field(default_factory=Backgrounds)
+    """Kinds of background and their shares, as `{"room": 3, "plain": 1}`, and beside them the folder `photos`
+    of photographs; names of kinds have equal shares, and what is not named has none."""
+    vary: Literal["shard", "frame"] = "shard"
+    """Whether light and background change with every shard or every frame; people change with every shard."""
+    depth_sensor: Annotated[
+        DepthSensor | Literal["auto"] | None,
+        Expected("a DepthSensor, its name, or auto, or None", lambda: SENSORS),
+        Spelled(tuple[str, ...], ("auto",)),
+    ] = "auto"
+    """Sensor that adds noise to depth, or several, one of which is drawn each time: kinect1, d435, kinect2,
+    azure_kinect; or none for perfect depth only, or auto: d435, and kinect2, which needs half a meter, for
+    the placement rig and distances from 0.6 m on."""
+    room_depth: bool = True
+    """Whether depth and normals show the room or the wall behind hands and objects. Otherwise both are 0
+    there, as they are before an environment map, which has no depth."""
+    color_sensor: Annotated[ExposureConfig | None, Spelled(bool, True)] = field(
+        default_factory=ExposureConfig
+    )
+    """Whether noisy colors are written beside perfect ones. In Python also their exposure and noise; None
+    stands for perfect colors alone."""
+    painter: PainterChoice = "auto"
+    """What paints colors: our own compiled code, opengl, or auto: opengl where there is hardware for it."""
+    shutter: Annotated[ShutterConfig | None, Spelled(bool, False, "motion-blur")] = None
+    """Shutters that blur motion, some of which roll, in eight drawings a picture. In Python, None stands for
+    pictures of an instant."""
+
     def __post_init__(self) -> None:
         given, named = self.background, dict[str, Any]()
         named["background"] = given if isinstance(given, Backgrounds) else Backgrounds(given)
@@ -107,8 +134,13 @@ class RenderConfig(Settings):
         tones = (self.tones,) if isinstance(self.tones, str) else tuple(self.tones)
         if any(isinstance(tone, str) for tone in tones):
             named["tones"] = named_tones(tones)  # type: ignore[arg-type]  # names
-        if isinstance(self.depth_sensor, str) and self.depth_sensor != "auto":
-            named["depth_sensor"] = DepthSensor((self.depth_sensor,))
+        elif not tones:
+            named["tones"] = ALL_TONES
+        if isinstance(self.depth_sensor, str | tuple | list):
+            named["depth_sensor"] = _sensor_of(self.depth_sensor)
+        for name, usual in (("color_sensor", ExposureConfig), ("shutter", ShutterConfig)):
+            if isinstance(getattr(self, name), bool):
+                named[name] = usual() if getattr(self, name) else None
         for name, value in named.items():
             object.__setattr__(self, name, value)
         Settings.__post_init__(self)
@@ -116,10 +148,7 @@ class RenderConfig(Settings):
     def check(self) -> None:
         """Refuse unknown passes, ranges of tones that fall, and settings of pictures that are not drawn."""
         check_tones(self.tones)
-        for name in self.passes:
-            check_choice(name, PASSES, noun="pass")
-        if not self.passes:
-            raise ArgumentError(f"passes are none, expected some of {', '.join(PASSES)}")
+        FrameConfig.check(self)
         used = {
             "rgb": {
                 "tones": self.tones != ALL_TONES,
@@ -138,15 +167,57 @@ class RenderConfig(Settings):
                     f"given {', '.join(given)} and the passes {passes}, expected {name} among them"
                 )
 
-    def resolved(self) -> RenderConfig:
-        """The same without auto: the painter of this machine, and the depth sensor of the placement."""
-        painter, sensor, view = self.painter, self.depth_sensor, self.view
-        if painter == "auto":  # without colors there is no need to look
-            painter = choose_painter() if "rgb" in self.passes else "compiled"
-        if sensor == "auto" and "depth" not in self.passes:
-            sensor = None
-        elif sensor == "auto":
-            set_far = view.distance is not None and view.distance[0] >= _FAR
-            far = view.cameras is None and (view.placement == "rig" or set_far)
-            sensor = DepthSensor((FAR_SENSOR if far else NEAR_SENSOR,))
-        return dataclasses.replace(self, painter=painter, depth_sensor=sensor)
+
+def _sensor_of(given: str | Sequence[str]) -> DepthSensor | Literal["auto"] | None:
+    """The depth sensor of names, as the command line has them."""
+    names = (given,) if isinstance(given, str) else tuple(given)
+    if names == ("auto",):
+        return "auto"
+    for name in names:
+        check_choice(OTHER_NAMES.get(name, name), (*SENSORS, "none"), noun="depth sensor")
+    return None if names == ("none",) else DepthSensor(names)
+
+
+Cameras = Camera | CameraRig | Sequence[Camera] | str
+"""A camera, a rig or several cameras of the user's own, used as they are; or the name of a preset, which is
+placed."""
+
+
+def resolve(
+    config: RenderConfig | None = None,
+    settings: Mapping[str, Any] = MappingProxyType({}),
+    camera: Cameras | None = None,
+    *,
+    near: bool = False,
+) -> RenderConfig:
+    """The configuration with what a call gives beside it, and without auto.
+
+    Auto is the painter of this machine, and the depth sensor of the placement, or of cameras `near` hands.
+    """
+    config = RenderConfig() if config is None else config
+    check_type("config", config, RenderConfig, "a RenderConfig")
+    config = RenderConfig.of(config, settings)
+    view, painter, sensor = _view(config.view, camera), config.painter, config.depth_sensor
+    if painter == "auto":  # without colors there is no need to look
+        painter = choose_painter() if "rgb" in config.passes else "compiled"
+    if sensor == "auto" and "depth" not in config.passes:
+        sensor = None
+    elif sensor == "auto":
+        set_far = view.distance is not None and view.distance[0] >= _FAR
+        far = not near and view.cameras is None and (view.placement == "rig" or set_far)
+        sensor = DepthSensor((FAR_SENSOR if far else NEAR_SENSOR,))
+    return dataclasses.replace(config, view=view, painter=painter, depth_sensor=sensor)
+
+
+def _view(view: ViewConfig, camera: Cameras | None) -> ViewConfig:
+    """The cameras that a call gives, or those of the configuration."""
+    if camera is None:
+        return view
+    if isinstance(camera, str):
+        return dataclasses.replace(view, camera=camera)
+    several = camera.cameras if isinstance(camera, CameraRig) else camera
+    given = (several,) if isinstance(several, Camera) else several
+    cameras = tuple(given) if isinstance(given, Iterable) else ()
+    if not cameras or not all(isinstance(one, Camera) for one in cameras):
+        raise ArgumentError(f"camera is {camera!r}, expected a Camera, several, or the name of a preset")
+    return ViewConfig(cameras=cameras)

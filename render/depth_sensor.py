@@ -342,7 +342,7 @@ DEPTH_NOISES: Final[dict[str, DepthNoise]] = {
 SENSORS: Final = tuple(DEPTH_NOISES)
 
 
-_OTHER_NAMES: Final = {"realsense_d435": "d435"}
+OTHER_NAMES: Final = {"realsense_d435": "d435"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -364,7 +364,7 @@ class DepthSensor(Settings):
 
     def check(self) -> None:
         """Refuse names of sensors that are unknown."""
-        names = tuple(_OTHER_NAMES.get(name, name) for name in self.sensors)
+        names = tuple(OTHER_NAMES.get(name, name) for name in self.sensors)
         for name in names:
             check_choice(name, SENSORS, noun="depth sensor")
         object.__setattr__(self, "sensors", names)

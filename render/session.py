@@ -1,4 +1,4 @@
-"""`draw`, pictures in memory; and `render_take`, pictures in files, resumable."""
+"""`render_take`: pictures in files, resumable."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import functools
 import hashlib
 import threading
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any, Final
@@ -16,9 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
-from gloves.fit import GloveFit
 from gloves.layout import MarkerLayout
-from gloves.takes.bodies import RigidBody
 from gloves.takes.take import Take
 from handsim._checks import check_choice, check_type
 from handsim.app.output import (
@@ -34,256 +32,21 @@ from handsim.app.output import (
 )
 from handsim.app.workers import check_workers, run_jobs
 from handsim.callbacks import Progress, no_progress
-from handsim.errors import ArgumentError, HandSimError, HandSimWarning
-from handsim.files.inputs import checksum, load_json
+from handsim.errors import HandSimError, HandSimWarning
+from handsim.files.inputs import load_json
 from handsim.files.outputs import check_free, save_json
 from handsim.files.signals import Stopped, interrupts_bare
-from handsim.space.camera import Camera
-from handsim.space.rig import CameraRig, check_names
+from handsim.space.rig import check_names
 from render.captions import contact_sheet, write_png
-from render.color_sensor import sample_exposure, sample_shutter
-from render.config import RenderConfig, SpawnKey
-from render.depth_sensor import sample_depth_noise
+from render.config import Cameras, RenderConfig, resolve
+from render.drawing import Drawing
 from render.formats.shards import INDEX
 from render.formats.webdataset import TAR
 from render.formats.writer import CONFIG, FORMATS, WITH_COLORS, open_writers, shard_files, whole_shards
-from render.frames import Doubles, Footage, RenderedFrame
-from render.painting.figures import sample_appearance
+from render.frames import RenderedFrame
 from render.scenery.backgrounds import photo_files
-from render.scenery.lights import sample_surroundings
-from render.studio import FrameChoices, Moment, Studio
-from render.subject import Model, PoseFile, Source, Subject, load_subject, source_of
-from render.user_body import UserBody
-from render.viewpoints import ViewConfig, Viewpoints, check_hands_in_view
-
-Cameras = Camera | CameraRig | Sequence[Camera] | str
-"""A camera, a rig or several cameras of the user's own, used as they are; or the name of a preset, which is
-placed."""
-
-
-def draw(
-    source: Take | str | Path | ArrayLike,
-    *,
-    model: Model | tuple[Model, Model] | None = None,
-    glove: MarkerLayout | str | None = None,
-    camera: Cameras | None = None,
-    frames: Iterable[int] | None = None,
-    record: Mapping[str, Any] | None = None,
-    config: RenderConfig | None = None,
-    **settings: Any,
-) -> Iterator[RenderedFrame]:
-    """Draw frames of a take or poses of your own, in memory.
-
-    A frame's picture is the same whatever other frames are asked for.
-
-    Args:
-        source: A take or its path; the path of a .csv of `handsim export`; or poses (T, 27), joint angles
-            (T, 20) with the wrist at the origin, or poses of two hands (T, 2, 27) [m, rad]. NaN is a hand
-            that is not there.
-        model: The hand of your own poses, or both in the poses' order; drawn people when not given.
-        glove: Marker layout on the hands of your poses, where they wear gloves; dense19 when not given.
-        camera: Camera of your own, fixed in the world and used as it is, or several; or the name of a preset.
-            Without it, viewpoints are drawn as `RenderConfig.view` says.
-        frames: Numbers of the frames; those that `RenderConfig` chooses when not given.
-        record: A picture's record in files, whose frame is drawn again as it was, with the configuration that
-            `RenderConfig.from_json` reads from their render.json.
-        config: What to draw.
-        settings: Settings of `RenderConfig` that differ from `config`, as `seed=1` or `background="room"`.
-
-    Yields:
-        Each frame once per camera: `rgb` (H, W, 3), `depth` (H, W) [m], `normals`, `ids`, and for each hand
-        `keypoints` (21, 2) [px], `keypoints_world` (21, 3) [m] and more, see `RenderedFrame`.
-
-    Raises:
-        HandSimError: The source or the settings cannot be drawn, or a camera stands in a hand or an object.
-    """
-    config = configured(config, camera, settings).resolved()
-    kept = source_of(source, model=model, glove=glove, seed=config.seed)
-    drawing = Drawing(load_subject(kept, seed=config.seed), config)
-    check_hands_in_view(config.view, drawing.viewpoints, drawing.take)
-    if record is None:
-        return drawing.frames(0, ((n, n) for n in drawing.chosen_frames(frames)))
-    check_type("record", record, Mapping, "a picture's record, as formats of files have it")
-    number, choices = record.get("number", record.get("frame")), record.get("choices", {})
-    if frames is not None or number is None or not {"shard", "place"} <= set(choices):
-        raise ArgumentError("expected frames or a picture's record, with shard and place in its choices")
-    return drawing.frames(choices["shard"], [(choices["place"], *drawing.chosen_frames([number]))])
-
-
-def configured(
-    config: RenderConfig | None, camera: Cameras | None, settings: Mapping[str, Any]
-) -> RenderConfig:
-    """The configuration with the camera and the settings that were given beside it."""
-    config = RenderConfig() if config is None else config
-    check_type("config", config, RenderConfig, "a RenderConfig")
-    config = RenderConfig.of(config, settings)
-    if camera is None:
-        return config
-    if isinstance(camera, str):
-        return dataclasses.replace(config, view=dataclasses.replace(config.view, camera=camera))
-    several = camera.cameras if isinstance(camera, CameraRig) else camera
-    given = (several,) if isinstance(several, Camera) else several
-    cameras = tuple(given) if isinstance(given, Iterable) else ()
-    if not cameras or not all(isinstance(one, Camera) for one in cameras):
-        raise ArgumentError(f"camera is {camera!r}, expected a Camera, several, or the name of a preset")
-    return dataclasses.replace(config, view=ViewConfig(cameras=cameras))
-
-
-class Drawing:
-    """A subject and its cameras; draws any of its frames."""
-
-    def __init__(self, subject: Subject, config: RenderConfig, *, light: bool = False) -> None:
-        if config.shutter is not None and not subject.is_motion:
-            raise ArgumentError("poses without times have no motion to blur; add the array times")
-        bodies = subject.take.bodies
-        for body in bodies:
-            if body.shape is None and not len(body.positions):
-                told = (
-                    f"{body.name} has neither a surface nor markers and is not drawn; "
-                    "RigidBody.of gives a body the surface of its object"
-                )
-                warnings.warn(told, HandSimWarning, stacklevel=3)
-        self.subject, self.config = subject.upright(config.up), config
-        self.take, rng = self.subject.take, SpawnKey.VIEWPOINTS.rng(config.seed)
-        # Poses that are no motion may be of many people, but cameras at the eyes need one person.
-        has_user = self.subject.is_motion or config.view.placement == "head"
-        self._user = UserBody(self.take) if has_user else None
-        self._open_studio = functools.partial(
-            open_studio, config=config, bodies=bodies, has_user=has_user, footage=subject.footage, light=light
-        )
-        poses = None if subject.footage is None else subject.footage.poses
-        self.viewpoints = Viewpoints(
-            config.view, self.take, rng=rng, up=config.up, user=self._user, poses=poses
-        )
-        # A studio takes some 5 MB.
-        self._studio_of = functools.lru_cache(maxsize=32)(self._studio_of_person)
-
-    def frames_without_hands(self) -> list[int]:
-        """Numbers of the frames whose hands are all NaN."""
-        present = np.isfinite(self.take.qpos[..., 0]).any(axis=1)
-        return [int(number) for number in np.flatnonzero(~present)]
-
-    def chosen_frames(self, frames: Iterable[int] | None = None) -> list[int]:
-        """Numbers of the requested frames, checked; without a request those that have a hand."""
-        if frames is None:
-            absent, chosen = set(self.frames_without_hands()), self.config.frames
-            given = range(self.take.num_frames) if chosen is None else self.chosen_frames(chosen)
-            found = [n for n in given[:: self.config.every] if n not in absent]
-            most = len(found) if self.config.num_frames is None else self.config.num_frames
-            return [found[n * len(found) // most] for n in range(most)] if most < len(found) else found
-        check_type("frames", frames, Iterable, "numbers of frames")
-        numbers = list(frames)
-        for number in numbers:
-            check_type("a frame", number, (int, np.integer), "a whole number")
-            if not 0 <= number < self.take.num_frames:
-                raise ArgumentError(f"frame {number} was asked for, expected 0 to {self.take.num_frames - 1}")
-        return [int(number) for number in numbers]
-
-    def shards(self) -> list[list[int]]:
-        """Frames of each shard."""
-        frames, size = self.chosen_frames(), self.config.frames_per_shard
-        return [frames[first : first + size] for first in range(0, len(frames), size)]
-
-    def frames(
-        self,
-        shard: int,
-        numbered: Iterable[tuple[int, int]],
-        *,
-        leave_out: Callable[[int], None] | None = None,
-    ) -> Iterator[RenderedFrame]:
-        """Pictures of frames by all cameras; the frames are given with their places in the shard."""
-        config, cast = self.config, self.subject.cast
-        viewpoints = self.viewpoints
-        enclosed = viewpoints.num_cameras > 1 or (viewpoints.moves and config.vary == "shard")
-        enclosed |= viewpoints.cameras(0)[0].lens.kind != "pinhole"  # which bends what is behind the hands
-        around = viewpoints.positions() if enclosed and self.subject.footage is None else None
-        rng = SpawnKey.SHARD.rng(config.seed, shard, 0)
-        if cast is None:  # a take has its own hands, whose looks change with the shard
-            studio = self._open_studio(self.take.hands, rng=rng)
-        kept: dict[int, FrameChoices] = {}
-        for place, frame in numbered:
-            person = shard if cast is None or cast.person is None else int(cast.person[frame])
-            if cast is not None:
-                studio = self._studio_of(person)
-                rng = SpawnKey.SHARD.rng(config.seed, shard, 0)  # all people of a shard are in one place
-            own = SpawnKey.SHARD.rng(config.seed, shard, 1 + place)
-            if config.vary == "frame":
-                chosen = sample_choices(config, viewpoints.viewer, viewpoints.size, around, rng=own)
-            else:
-                if person not in kept:
-                    scene = sample_choices(config, viewpoints.viewer, viewpoints.size, around, rng=rng)
-                    kept[person] = self._held(scene)
-                chosen = kept[person]
-            cameras, placed = viewpoints.cameras(frame), {"shard": shard, "place": place}
-            moment = Moment(self.take, frame, None if cast is None else cast.person)
-            moment = studio.reaching(moment, cameras, self._user)
-            if leave_out is not None and not studio.is_clear(moment, cameras):
-                leave_out(frame)
-                continue
-            for camera in cameras:
-                fresh = dataclasses.replace(chosen, seed=int(own.integers(2**31)))
-                drawn = studio.photograph(moment, camera, fresh)
-                yield dataclasses.replace(drawn, choices={"person": person, **placed, **drawn.choices})
-
-    def _held(self, scene: FrameChoices) -> FrameChoices:
-        """The choices with a backdrop that stays where it is, behind the hands of all frames."""
-        backdrop = scene.background.backdrop
-        level, arms = (self.viewpoints.nearest(backdrop.normal, arms=arms) for arms in (False, True))
-        held = dataclasses.replace(backdrop, level=level - backdrop.gap, arms=arms)
-        return dataclasses.replace(scene, background=dataclasses.replace(scene.background, backdrop=held))
-
-    def _studio_of_person(self, person: int) -> Studio:
-        """The studio of one of the people of `subject.cast`."""
-        cast = self.subject.cast
-        assert cast is not None
-        hands = cast.hands(person, self.take.hands)
-        return self._open_studio(hands, rng=cast.rng(person))
-
-
-def open_studio(
-    hands: Sequence[GloveFit],
-    config: RenderConfig,
-    *,
-    bodies: Sequence[RigidBody] = (),
-    rng: np.random.Generator,
-    has_user: bool = False,
-    footage: Footage | None = None,
-    light: bool = False,
-) -> Studio:
-    """A studio of one person with random looks, whose wrists a `UserBody` may bend."""
-    look = sample_appearance(config.dress == "glove", tones=config.tones, rng=rng)
-    if has_user:
-        straight = dataclasses.replace(look.forearm, flexion=0.0, deviation=0.0)
-        look = dataclasses.replace(look, forearm=straight)
-    colors = [tuple(rng.uniform(0.05, 0.9, 3).tolist()) for _ in bodies]
-    return Studio(hands, look, config, bodies, colors, light=light, footage=footage)
-
-
-def sample_choices(
-    config: RenderConfig,
-    viewer: Doubles,
-    size: tuple[int, int],
-    around: Doubles | None = None,
-    *,
-    rng: np.random.Generator,
-) -> FrameChoices:
-    """Random choices of a picture, with light for a viewer with these axes (3, 3).
-
-    Several places `around` (N, 3) of cameras and hands share an enclosure.
-    """
-    background, lighting, enclosure = sample_surroundings(config.background, viewer, size, around, rng=rng)
-    sensor = config.depth_sensor
-    assert sensor != "auto"
-    return FrameChoices(
-        lighting=lighting,
-        background=background,
-        exposure=None if config.color_sensor is None else sample_exposure(config.color_sensor, rng=rng),
-        shutter=None if config.shutter is None else sample_shutter(config.shutter, rng=rng),
-        depth_noise=None if sensor is None else sample_depth_noise(sensor, rng=rng),
-        seed=0,
-        enclosure=enclosure,
-    )
-
+from render.subject import Model, PoseFile, Subject, subject_of
+from render.viewpoints import check_hands_in_view
 
 SHEET: Final = "contact_sheet.png"
 _MERGED: Final = "checksums.json"  # checksums of the files that all shards make together
@@ -342,23 +105,23 @@ def render_take(
     """
     check_type("formats", formats, (str, list, tuple), "names of formats", FORMATS)
     formats = (formats,) if isinstance(formats, str) else tuple(formats)
-    config = configured(config, camera, settings).resolved()
+    config = resolve(config, settings, camera)
     _check_formats(formats, config)
     place, workers = place_of(out), workers if isinstance(workers, Executor) else check_workers(workers)
-    kept = source_of(
+    subject = subject_of(
         source, model=model, times=times, people=people, person=person, glove=glove, seed=config.seed
     )
-    drawing = Drawing(load_subject(kept, seed=config.seed), config)
+    drawing = Drawing(subject, config)
     cameras = drawing.viewpoints.cameras(0)
     check_names("cameras", cameras)
     check_hands_in_view(config.view, drawing.viewpoints, drawing.take)
     absent = drawing.frames_without_hands()
-    if absent and drawing.subject.footage is None:  # frames of a video are left out for reasons that are told
+    if absent and subject.footage is None:  # frames of a video are left out for reasons that are told
         told = f"frames without a hand are not drawn: {len(absent)} of {drawing.take.num_frames}"
         warnings.warn(f"{told} (the first: {absent[0]})", HandSimWarning, stacklevel=3)
     shards, views = drawing.shards(), drawing.viewpoints.num_cameras
-    make = functools.partial(_render_shard, kept, formats, config)
-    record = _settings(drawing, kept) | {"formats": list(formats)}
+    make = functools.partial(_render_shard, subject, formats, config)
+    record = _settings(drawing) | {"formats": list(formats)}
     with open_output(place) as output:
         output.claim(CONFIG, record, noun="rendering", error=HandSimError)
         counts = [views * len(shard) for shard in shards]
@@ -454,11 +217,10 @@ class _Counter:
                 self._progress(count, self._total)
 
 
-def _settings(drawing: Drawing, source: Source) -> dict[str, Any]:
+def _settings(drawing: Drawing) -> dict[str, Any]:
     """What decides the pictures, as JSON: digests of files, and of the names and sizes of photographs."""
     subject = drawing.subject
-    name = f"{subject.name}, sha256:{checksum(source)}" if isinstance(source, Path) else subject.name
-    settings: dict[str, Any] = {"take": name, "take_frames": subject.take.num_frames}
+    settings: dict[str, Any] = {"take": subject.name, "take_frames": subject.take.num_frames}
     settings |= dataclasses.asdict(drawing.config)
     if drawing.config.background.shares["photo"] > 0.0:
         files, broken = photo_files(Path(str(drawing.config.background.photos)))
@@ -523,18 +285,18 @@ def _is_complete(output: Output) -> bool:
 
 
 @functools.lru_cache(maxsize=1)
-def _opened(source: Source, config: RenderConfig, light: bool) -> Drawing:
-    """The drawing of a source; cached, because a worker draws many of its shards."""
+def _opened(subject: Subject, config: RenderConfig, light: bool) -> Drawing:
+    """The drawing of a subject; cached, because a worker draws many of its shards."""
     cv2.setNumThreads(1)  # there is one process per core
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", HandSimWarning)  # the main process has warned already
-        return Drawing(load_subject(source, seed=config.seed), config, light=light)
+        return Drawing(subject, config, light=light)
 
 
 def _render_shard(
-    source: Source, formats: tuple[str, ...], config: RenderConfig, out: Path, shard: int
+    subject: Subject, formats: tuple[str, ...], config: RenderConfig, out: Path, shard: int
 ) -> int:
-    drawing = _opened(source, config, "exr" in formats)
+    drawing = _opened(subject, config, "exr" in formats)
     lost: list[int] = []
 
     def leave_out(frame: int) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple
@@ -25,14 +24,13 @@ from handsim.hand.shape import NUM_KEYPOINTS, NUM_QPOS, SIDES, HandShape, Side, 
 from handsim.space.camera import PRESETS, Camera, preset
 from poses import PoseSampler, sample_poses
 from poses.shapes import load_sampler, mixed_angles
-from render.config import NEAR_SENSOR, RenderConfig, SpawnKey
-from render.depth_sensor import DepthSensor
+from render.conditions import sample_conditions
+from render.config import RenderConfig, SpawnKey, resolve
 from render.formats.records import CENTER
 from render.frames import Doubles, HandTruth, Integers, RenderedFrame
 from render.photographs import read_photograph
-from render.session import configured, open_studio, sample_choices
 from render.studio import Moment, Studio
-from render.subject import Model, Subject, load_subject, models_of, source_of, subject_of_poses
+from render.subject import Model, Subject, models_of, subject_of, subject_of_poses
 from render.viewpoints import FREE, around_hands, crop_around
 
 _FEWEST_KEYPOINTS: Final = 3  # least number of labeled keypoints of a hand that can be cut out
@@ -228,10 +226,7 @@ class PictureStream(SharedStream, IterableDataset[dict[str, torch.Tensor]]):
         check_type("fill", fill, (tuple, list), "two numbers")
         if len(fill) != 2 or not 0.05 <= fill[0] <= fill[1] <= 1.0:
             raise ArgumentError(f"fill is {fill}, expected two numbers from 0.05 to 1, the smaller first")
-        config = configured(config, None, {} if seed is None else {"seed": seed})
-        if config.depth_sensor == "auto" and "depth" in config.passes:  # its cameras are near the hands
-            config = dataclasses.replace(config, depth_sensor=DepthSensor((NEAR_SENSOR,)))
-        self.config = config.resolved()
+        self.config = resolve(config, {} if seed is None else {"seed": seed}, near=True)
         self.seed = self.config.seed
         self._camera = _camera(self.config.view.camera if camera is None else camera, crop)
         self._crop, self._fill = crop, fill
@@ -243,8 +238,7 @@ class PictureStream(SharedStream, IterableDataset[dict[str, torch.Tensor]]):
             check_type("takes", takes, (Take, str, Path, list, tuple), "a Take or its path, or several")
         given = (takes,) if isinstance(takes, Take | str | Path) else takes or ()
         self._takes = [
-            load_subject(source_of(take, model=model), seed=self.seed).upright(self.config.up)
-            for take in given
+            subject_of(take, model=model, seed=self.seed).upright(self.config.up) for take in given
         ]
         if len({len(one.take.hands) for one in self._takes}) > 1:
             raise ArgumentError("the takes have different numbers of hands, expected the same in all")
@@ -293,7 +287,7 @@ class PictureStream(SharedStream, IterableDataset[dict[str, torch.Tensor]]):
             frames = rng.choice(frames, self._sitting)
         else:
             subject, frames = self._posed(rng), np.arange(self._sitting)
-        studio = open_studio(subject.take.hands, self.config, bodies=subject.take.bodies, rng=rng)
+        studio = Studio.sample(subject.take.hands, self.config, subject.take.bodies, rng=rng)
         return _Sitting(studio, subject, frames, person)
 
     def _posed(self, rng: np.random.Generator) -> Subject:
@@ -336,9 +330,8 @@ class PictureStream(SharedStream, IterableDataset[dict[str, torch.Tensor]]):
         skin = sitting.studio.skin
         eye = camera.T_world_camera[:3, 3]
         around = None if camera.lens.kind == "pinhole" else np.stack([eye, points.mean(axis=0)])
-        chosen = sample_choices(self.config, camera.T_world_camera[:3, :3], camera.size, around, rng=rng)
-        fresh = dataclasses.replace(chosen, seed=int(rng.integers(2**31)))
-        frame = sitting.studio.photograph(reaching, camera, fresh, recorded=False)
+        chosen = sample_conditions(self.config, camera.T_world_camera[:3, :3], camera.size, around, rng=rng)
+        frame = sitting.studio.photograph(reaching, camera, chosen.reseeded(rng), recorded=False)
         truth = dict(zip(there, frame.hands, strict=True))
         hands = [_hand_arrays(truth.get(n), camera, fit.shape) for n, fit in enumerate(take.hands)]
         merged = {name: np.stack([hand[name] for hand in hands]) for name in hands[0]}

@@ -23,7 +23,8 @@ from handsim.kernels import kernel
 from handsim.motion_files.motion import joint_poses
 from handsim.space.camera import Camera
 from handsim.space.transforms import pose_matrices
-from render.color_sensor import GAMMA, Exposure, Shutter, combine, expose, light_of, linear_of, shutter_times
+from render.color_sensor import GAMMA, Exposure, combine, expose, light_of, linear_of, shutter_times
+from render.conditions import Conditions
 from render.config import RenderConfig
 from render.depth_sensor import DepthNoise, TimeOfFlight, apply_depth_noise, reflectance_of
 from render.frames import (
@@ -41,20 +42,18 @@ from render.frames import (
     Pictures,
     RenderedFrame,
 )
-from render.painting.figures import Appearance, BodyFigure, Drawn, HandFigure
+from render.painting.figures import Appearance, BodyFigure, Drawn, HandFigure, sample_appearance
 from render.painting.painter import paint, put_before
 from render.painting.rasterizer import NEAR, see
 from render.painting.shading import level_behind, light_behind
 from render.scenery.backgrounds import (
     Background,
-    Enclosure,
     Surroundings,
     draw_surroundings,
     enlarged,
     kept_background,
     surroundings_of_picture,
 )
-from render.scenery.lights import Lighting
 from render.skin.look import SkinLook, upper_arms
 from render.user_body import UserBody
 
@@ -146,20 +145,6 @@ def _mask(pictures: Geometry, number: int) -> Flags:
     return np.asarray((pictures.instances == 1 + number) & (pictures.parts != forearm))
 
 
-@dataclass(frozen=True, slots=True)
-class FrameChoices:
-    """Random choices of one picture, apart from people and camera."""
-
-    lighting: Lighting
-    background: Background
-    exposure: Exposure | None  # None for a perfect color sensor
-    shutter: Shutter | None  # None for a picture of an instant
-    depth_noise: DepthNoise | None  # None for a perfect depth sensor
-    seed: int  # seed of the sensors' noise
-    enclosure: Enclosure | None = None
-    """Box whose walls show the background to several cameras; None for the picture of one camera."""
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Moment:
     """One frame of a take, and the motion around it, which shutters blur."""
@@ -243,19 +228,39 @@ class Studio:
         self._colors = tuple(body_colors)
         self._posed: tuple[Moment, list[Drawn]] | None = None  # surfaces of the last moment
 
+    @classmethod
+    def sample(
+        cls,
+        hands: Sequence[GloveFit],
+        config: RenderConfig,
+        bodies: Sequence[RigidBody] = (),
+        *,
+        rng: np.random.Generator,
+        has_user: bool = False,
+        light: bool = False,
+        footage: Footage | None = None,
+    ) -> Studio:
+        """The studio of one person with random looks, whose wrists a `UserBody` may bend."""
+        look = sample_appearance(config.dress == "glove", tones=config.tones, rng=rng)
+        if has_user:
+            straight = dataclasses.replace(look.forearm, flexion=0.0, deviation=0.0)
+            look = dataclasses.replace(look, forearm=straight)
+        colors = [tuple(rng.uniform(0.05, 0.9, 3).tolist()) for _ in bodies]
+        return cls(hands, look, config, bodies, colors, light=light, footage=footage)
+
     @property
     def skin(self) -> SkinLook | None:
         """The person's skin; None where gloves hide it."""
         return self._look.skin if self._look.glove is None else None
 
     def photograph(
-        self, moment: Moment, camera: Camera, choices: FrameChoices, *, recorded: bool = True
+        self, moment: Moment, camera: Camera, conditions: Conditions, *, recorded: bool = True
     ) -> RenderedFrame:
         """Draw one moment of the hands and bodies.
 
         The frame has its choices as JSON, and the hands' vertices, only where `recorded`: both take time.
         """
-        take, frame, rng = moment.take, moment.frame, np.random.default_rng(choices.seed)
+        take, frame, rng = moment.take, moment.frame, np.random.default_rng(conditions.seed)
         drawn = self._still(moment)
         nearest = _clearance(camera, drawn)
         if nearest < 2.0 * NEAR:
@@ -264,20 +269,20 @@ class Studio:
                 f"expected {2e3 * NEAR:.0f} mm or more; place it elsewhere"
             )
         present = [number for number in range(len(self._hands)) if moment.hand(number) is not None]
-        sensor = choices.depth_noise if "depth" in self._passes else None
+        sensor = conditions.depth_noise if "depth" in self._passes else None
         surfaces = [one.triangles for one in drawn]
         truth = see(camera, surfaces, with_normals=sensor is not None or "normals" in self._passes)
         footage = self._footage
         rgb = light = noisy_rgb = noisy_depth = None
         if "rgb" in self._passes:
-            rgb = self._colors_of(camera, drawn, choices) if footage is None else footage.picture(frame)
-            noisy_rgb = self._exposed(moment, camera, rgb, choices, rng)
+            rgb = self._colors_of(camera, drawn, conditions) if footage is None else footage.picture(frame)
+            noisy_rgb = self._exposed(moment, camera, rgb, conditions, rng)
             if self._light:
                 most = np.where(rgb < 255, rgb + 1.0, np.inf)  # parts of a pixel are cut at white one by one
-                levels = np.clip(self._colors_of(camera, drawn, choices, bright=True), rgb - 1.0, most)
+                levels = np.clip(self._colors_of(camera, drawn, conditions, bright=True), rgb - 1.0, most)
                 light = light_of(levels).astype(np.float16)
         if self._config.room_depth and footage is None and {"depth", "normals"} & self._passes:
-            _walls(camera, drawn, choices).put_behind(truth)
+            _walls(camera, drawn, conditions).put_behind(truth)
         if sensor is not None:
             noisy_depth = self._noisy_depth(truth, rgb, len(present), camera, sensor, rng)
         asked = {"recorded": recorded, "openxr": self._config.openxr}
@@ -304,7 +309,7 @@ class Studio:
             points=take.point_list.points[seen_points],
             labels=take.point_list.labels[seen_points],
             label_names=take.label_names,
-            choices=self._record(choices) if recorded else {},
+            choices=self._record(conditions) if recorded else {},
         )
 
     def reaching(self, moment: Moment, cameras: Sequence[Camera], user: UserBody | None = None) -> Moment:
@@ -372,36 +377,36 @@ class Studio:
         )
 
     def _colors_of(
-        self, camera: Camera, drawn: Sequence[Drawn], choices: FrameChoices, *, bright: bool = False
+        self, camera: Camera, drawn: Sequence[Drawn], conditions: Conditions, *, bright: bool = False
     ) -> NDArray[Any]:
         """The perfect color picture as bytes, or bright: as levels that do not end at 255."""
-        background = choices.background
-        whole = paint(camera, drawn, choices.lighting, "bright" if bright else self._painter)
-        if choices.enclosure is not None:
-            behind = draw_surroundings(background, choices.enclosure, camera, bright=bright).rgb
+        background = conditions.background
+        whole = paint(camera, drawn, conditions.lighting, "bright" if bright else self._painter)
+        if conditions.enclosure is not None:
+            behind = draw_surroundings(background, conditions.enclosure, camera, bright=bright).rgb
             return put_before(whole, behind)
         plain, light = _background(background, camera.size), None
         if background.backdrop.shadows and camera.lens.kind == "pinhole":
-            light = light_behind(camera, drawn, choices.lighting, background.backdrop)
+            light = light_behind(camera, drawn, conditions.lighting, background.backdrop)
         if light is not None:
             shade = cv2.cvtColor(cv2.pow(light, 1.0 / GAMMA), cv2.COLOR_GRAY2RGB)
             plain = np.asarray(cv2.multiply(plain, shade, dst=shade))
         return put_before(whole, plain)
 
     def _exposed(
-        self, moment: Moment, camera: Camera, rgb: Bytes, choices: FrameChoices, rng: np.random.Generator
+        self, moment: Moment, camera: Camera, rgb: Bytes, conditions: Conditions, rng: np.random.Generator
     ) -> Bytes | None:
         """The color picture of shutter and sensor; None if they change nothing."""
-        if choices.exposure is None and choices.shutter is None:
+        if conditions.exposure is None and conditions.shutter is None:
             return None
-        if choices.shutter is None:
+        if conditions.shutter is None:
             light = linear_of(rgb)
         else:
-            one = choices.shutter
+            one = conditions.shutter
             times, weights = shutter_times(one.exposure, one.readout, one.sub_frames, camera.size[1])
-            moments = (self._colors_of(camera, self._drawn(moment, time), choices) for time in times)
+            moments = (self._colors_of(camera, self._drawn(moment, time), conditions) for time in times)
             light = combine(moments, weights)
-        return expose(light, choices.exposure or Exposure(), rng=rng)
+        return expose(light, conditions.exposure or Exposure(), rng=rng)
 
     def _requested(self, truth: Geometry, rgb: Bytes | None, light: NDArray[Any] | None) -> Pictures:
         """The pictures of the requested passes."""
@@ -409,11 +414,10 @@ class Studio:
         names = [name for kind in kinds if kind in self._passes for name in kinds[kind]]
         return Pictures(rgb, light, **{name: getattr(truth, name) for name in names})
 
-    def _record(self, choices: FrameChoices) -> dict[str, Any]:
+    def _record(self, conditions: Conditions) -> dict[str, Any]:
         if self._footage is not None:
             return self._footage.record
-        record = _as_record(dataclasses.replace(choices, seed=0)) | {"seed": choices.seed}
-        return {"people": self._people, "body_colors": self._colors, **record}
+        return {"people": self._people, "body_colors": self._colors, **conditions.record()}
 
 
 def _clearance(camera: Camera, drawn: Sequence[Drawn]) -> float:
@@ -441,11 +445,11 @@ def _tracking(take: Take, frame: int, number: int) -> dict[str, Any] | None:
     return {"status": STATUSES[take.status[frame, number]], "rms": float(take.rms[frame, number]), **known}
 
 
-def _walls(camera: Camera, drawn: Sequence[Drawn], choices: FrameChoices) -> Surroundings:
+def _walls(camera: Camera, drawn: Sequence[Drawn], conditions: Conditions) -> Surroundings:
     """What is behind the hands and bodies."""
-    background = choices.background
-    if choices.enclosure is not None:
-        return draw_surroundings(background, choices.enclosure, camera, bright=False)
+    background = conditions.background
+    if conditions.enclosure is not None:
+        return draw_surroundings(background, conditions.enclosure, camera, bright=False)
     return surroundings_of_picture(background, camera, level_behind(background.backdrop, camera, drawn))
 
 
@@ -454,14 +458,3 @@ def _background(background: Background, size: tuple[int, int]) -> Floats:
     """A background (H, W, 3) in sRGB, from 0 to 255."""
     display = cv2.pow(kept_background(background, size), 1.0 / GAMMA)
     return enlarged(np.multiply(display, np.float32(255.0), out=display), size)
-
-
-@functools.lru_cache(maxsize=64)
-def _as_record(choices: FrameChoices) -> dict[str, Any]:
-    """Choices as JSON; cached, because pictures of a shard have all but their seed in common."""
-    noise = choices.depth_noise
-    kind = {} if noise is None else {"depth_sensor": type(noise).__name__}
-    record = kind | dataclasses.asdict(choices)
-    if choices.enclosure is None:
-        del record["enclosure"]
-    return record

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, SupportsIndex
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -256,10 +257,16 @@ class Subject:
     is_motion: bool = True  # whether frames follow one another in time
     poses: dict[str, Any] | None = None  # other settings of poses, as JSON; None for a take
     footage: Footage | None = None  # pictures of a camera in the place of drawn colors
+    origin: tuple[Path | PoseFile, int] | None = None  # file and seed, from which other processes read it
 
     def __post_init__(self) -> None:
         if not np.isfinite(self.take.qpos[..., 0]).any():
             raise ArgumentError("there is no hand in any frame, expected one to draw")
+
+    def __reduce_ex__(self, protocol: SupportsIndex) -> Any:
+        if self.origin is None:
+            return object.__reduce_ex__(self, protocol)
+        return _read_again, (*self.origin, self.name)
 
     def upright(self, up: UpAxis) -> Subject:
         """This subject in a world with z up, if `up` is the axis that points up in the take's own world."""
@@ -268,9 +275,8 @@ class Subject:
         take, turn = self.take, upright(up)
         points = dataclasses.replace(take.point_list, points=take.point_list.points @ turn.T)
         qpos, poses = turned_poses(take.qpos, turn), turned_poses(take.body_poses, turn)
-        return dataclasses.replace(
-            self, take=dataclasses.replace(take, qpos=qpos, body_poses=poses, point_list=points)
-        )
+        turned = dataclasses.replace(take, qpos=qpos, body_poses=poses, point_list=points)
+        return dataclasses.replace(self, take=turned, origin=None)
 
 
 @dataclass(frozen=True, slots=True)
@@ -300,25 +306,45 @@ class PoseFile:
         _check_people(self.people)
 
 
-Source = Path | PoseFile | Subject
-"""A subject or its file; every process that draws reads files again."""
-
-
-def source_of(
+def subject_of(
     source: Take | str | Path | PoseFile | Subject | ArrayLike, *, seed: int = 0, **options: Any
-) -> Source:
-    """The source that a user gave; the options are those of `subject_of_poses`."""
+) -> Subject:
+    """The subject that a user gave, or its file; the options are those of `subject_of_poses`."""
     given = {name: value for name, value in options.items() if value is not None}
     if not isinstance(source, Take | str | Path | PoseFile | Subject):
         return subject_of_poses(source, seed=seed, **given)
     for name in given:
         raise ArgumentError(f"{name} belongs to poses of your own; a take and a file have their own")
-    if isinstance(source, Take):
-        return subject_of_take(source)
-    if isinstance(source, PoseFile | Subject):
+    if isinstance(source, Subject):
         return source
+    return subject_of_take(source) if isinstance(source, Take) else _read(source, seed)
+
+
+def _read(source: str | Path | PoseFile, seed: int) -> Subject:
+    """A take or poses of a file."""
+    if isinstance(source, PoseFile):
+        return _load_poses(source, seed)
     path = Path(source)
-    return PoseFile(path) if path.suffix.lower() == CSV else path
+    if path.suffix.lower() == CSV:
+        return _load_poses(PoseFile(path), seed)
+    try:
+        take = load_take(path)
+    except HandSimError as error:
+        if not _holds_poses(path):
+            raise
+        raise CaptureError(
+            f"{path}: no take, but poses of your own; give them to --poses, or as a PoseFile"
+        ) from error
+    with errors_of(path, CaptureError):
+        return Subject(take, f"{path.name}, sha256:{checksum(path)}", origin=(path, seed))
+
+
+@functools.lru_cache(maxsize=1)
+def _read_again(source: Path | PoseFile, seed: int, name: str) -> Subject:
+    """The same in another process, which draws several parts of it; its name tells whether it changed."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", HandSimWarning)  # the main process has warned already
+        return _read(source, seed)
 
 
 def _holds_poses(path: Path) -> bool:
@@ -327,24 +353,6 @@ def _holds_poses(path: Path) -> bool:
         return bool({"qpos", "angles"} & set(_arrays(path)))
     except HandSimError:
         return False
-
-
-def load_subject(source: Source, *, seed: int) -> Subject:
-    """Read what is drawn."""
-    if isinstance(source, Subject):
-        return source
-    if isinstance(source, PoseFile):
-        return _load_poses(source, seed)
-    try:
-        take = load_take(source)
-    except HandSimError as error:
-        if not _holds_poses(source):
-            raise
-        raise CaptureError(
-            f"{source}: no take, but poses of your own; give them to --poses, or as a PoseFile"
-        ) from error
-    with errors_of(source, CaptureError):
-        return Subject(take, source.name)
 
 
 def subject_of_take(take: Take) -> Subject:
@@ -410,7 +418,8 @@ def _load_poses(file: PoseFile, seed: int) -> Subject:
         raise CaptureError(f"{path}: the file has {whose}; leave out --people")
     record = {"sha256": checksum(path), "sides": list(sides), "people": file.people, "glove": file.glove}
     models = tuple(HandModel.named("M", side=side) for side in sides)
-    return _posed(path.name, poses, models, load_layout(file.glove), _cast(poses, file.people, seed), record)
+    cast = _cast(poses, file.people, seed)
+    return _posed(path.name, poses, models, load_layout(file.glove), cast, record, (file, seed))
 
 
 def _cast(poses: OwnPoses, people: int | None, seed: int) -> Cast:
@@ -427,6 +436,7 @@ def _posed(
     layout: MarkerLayout,
     cast: Cast | None,
     record: dict[str, Any],
+    origin: tuple[PoseFile, int] | None = None,
 ) -> Subject:
     """The subject of poses on these hands in gloves."""
     check_layout(layout)
@@ -435,7 +445,7 @@ def _posed(
     times = _SECOND * np.arange(len(poses.qpos)) if poses.times is None else poses.times
     rate = _SECOND if poses.times is None else 1.0 / max(float(np.median(np.diff(times))), 1e-6)
     take = Take.of_poses(hands, poses.qpos, rate=rate, times=times)
-    return Subject(take, name, cast, poses.times is not None, record)
+    return Subject(take, name, cast, poses.times is not None, record, origin=origin)
 
 
 def models_of(model: Model | tuple[Model, Model] | None, num_hands: int) -> tuple[HandModel, ...]:

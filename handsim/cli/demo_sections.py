@@ -21,8 +21,8 @@ from handsim.space.rig import load_rig
 from poses.shapes import gesture
 from render.captions import contact_sheet, write_png
 from render.config import RenderConfig
+from render.drawing import draw
 from render.illustrations import PosedHand, draw_camera, draw_gestures, draw_glove, draw_labels, draw_sizes
-from render.session import draw
 from track.captures import track_capture
 from train.data.batches import Corruption, corrupt
 from train.data.shards import Dataset

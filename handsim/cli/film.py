@@ -3,34 +3,14 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import tyro
 
+from film.config import FilmConfig
 from handsim.app.messages import print_line, print_table, progress_bar
 from handsim.files.outputs import check_outputs
-from handsim.space.transforms import UpAxis
-from render.frames import PASSES
-
-
-@dataclass(frozen=True, slots=True)
-class FilmOptions:
-    """What is written of a video."""
-
-    passes: tuple[str, ...] = PASSES
-    """Pictures to write: some of rgb, depth, normals, ids; rgb is the video's, the others are drawn."""
-    dress: Literal["skin", "glove"] = "glove"
-    """What the hands in the video wear: the marker glove, or nothing."""
-    every: int = 1
-    """Step between the frames that are written."""
-    num_frames: int | None = None
-    """Number of these frames at most, spread evenly over the video; all when not given."""
-    frames_per_shard: int = 64
-    """Frames that are written together."""
-    up: UpAxis = "z"
-    """The axis of the take that points up; the truth of pictures has z up."""
 
 
 def film(
@@ -38,7 +18,7 @@ def film(
     video: Annotated[Path, tyro.conf.Positional],
     *,
     out: Path,
-    options: Annotated[FilmOptions, tyro.conf.arg(name="")],
+    options: Annotated[FilmConfig, tyro.conf.arg(name="")],
     camera: Path | None = None,
     detector: Path | None = None,
     format: tuple[str, ...] = ("webdataset",),
@@ -69,12 +49,12 @@ def film(
             video,
             out,
             format,
+            options,
             camera=camera,
             detector=HandDetector.load(detector),
             workers=workers,
             progress=bar,
             on_step=bar.step,
-            **{name: getattr(options, name) for name in FilmOptions.__dataclass_fields__},
         )
     print_table(found.figures(), left=1)
     print_line(*found.doubts(), *(f"Left out: {told}." for told in found.left_out()))

@@ -29,6 +29,7 @@ from tyro.constructors import (
 )
 
 from handsim.errors import choices, shortened
+from handsim.settings import Spelled
 
 Command = Callable[..., Any]
 _UNIONS: Final = (Union, types.UnionType)
@@ -187,8 +188,14 @@ def _settings(info: StructTypeInfo) -> StructConstructorSpec | None:
             default = one.default
         elif one.default_factory is not dataclasses.MISSING:
             default = one.default_factory()
+        kind, name = hints[one.name], None
+        for spelled in getattr(kind, "__metadata__", ()):
+            if isinstance(spelled, Spelled):
+                name = spelled.name
+                if spelled.kind is not None:
+                    kind, default = spelled.kind, spelled.default
         is_count = one.name == "num_frames" and "frames" not in hints
-        kind = _hinted(hints[one.name], aliases=["--frames"] if is_count else None)
+        kind = _hinted(kind, aliases=["--frames"] if is_count else None, name=name)
         fields.append(StructFieldSpec(one.name, kind, default, told.get(one.name)))
     return StructConstructorSpec(instantiate=info.type, fields=tuple(fields))
 
@@ -211,9 +218,9 @@ def _hint(default: str) -> str:
     return "" if default in ("", "None") else f"(default: {default})"
 
 
-def _hinted(annotation: Any, aliases: list[str] | None = None) -> Any:
+def _hinted(annotation: Any, aliases: list[str] | None = None, name: str | None = None) -> Any:
     """A type whose help shows the default, unless that is None or empty."""
-    return Annotated[annotation, tyro.conf.arg(help_behavior_hint=_hint, aliases=aliases)]
+    return Annotated[annotation, tyro.conf.arg(name=name, help_behavior_hint=_hint, aliases=aliases)]
 
 
 def _with_hints(command: Command) -> Command:

@@ -3,72 +3,21 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Annotated, Any, Final, cast
+from typing import Annotated, cast
 
 import tyro
 
-from handsim._checks import check_choice
 from handsim.app.messages import print_line, progress_bar
 from handsim.app.output import place_of
 from handsim.app.workers import chosen_workers
 from handsim.errors import HandSimError
 from handsim.files.outputs import check_outputs
 from handsim.hand.shape import Side
-from render.color_sensor import ExposureConfig, ShutterConfig
 from render.config import RenderConfig
-from render.depth_sensor import SENSORS, DepthSensor
 from render.formats.writer import merge_renderings
-from render.scenery.backgrounds import BackgroundKind, Backgrounds
 from render.session import SHEET, cut_off_pictures, left_out_frames, render_take
-from render.skin.look import ALL_TONES
 from render.subject import CSV, PoseFile
-from render.viewpoints import ViewConfig
-
-_FLAT: Final = tyro.conf.arg(name="")
-
-
-@dataclass(frozen=True, slots=True)
-class RenderOptions(RenderConfig):
-    """`RenderConfig` as the command line spells it, not checked."""
-
-    view: Annotated[ViewConfig, _FLAT] = field(default_factory=ViewConfig)
-    tones: tuple[str, ...] = ()  # type: ignore[assignment]  # names
-    """Classes of skin tone to draw from, and no others: very-light, light, intermediate, tan, brown, dark;
-    all when not given."""
-    background: tuple[BackgroundKind, ...] = ()  # type: ignore[assignment]  # names
-    """Kinds of background: plain, gradient, room, photo; when not given, a mixture of the first
-    three, or photographs alone where --photos is given."""
-    photos: Path | None = None
-    """Folder of photographs, for backgrounds of the kind photo."""
-    depth_sensor: tuple[str, ...] = ("auto",)  # type: ignore[assignment]  # names
-    """Depth sensors: kinect1, d435, kinect2, azure_kinect, or none for perfect depth only, or auto: d435,
-    and kinect2, which needs half a meter, for the placement rig and from --distance 0.6 on."""
-    color_sensor: bool = True  # type: ignore[assignment]  # a switch
-    """Whether noisy colors are written beside the perfect ones."""
-    shutter: Annotated[bool, tyro.conf.arg(name="motion-blur")] = False  # type: ignore[assignment]
-    """Whether shutters blur motion, and some of them roll; takes eight drawings per picture."""
-
-    def __post_init__(self) -> None: ...
-
-    def config(self) -> RenderConfig:
-        """The configuration that these options stand for; an error where one is refused."""
-        given: dict[str, Any] = {one.name: getattr(self, one.name) for one in fields(RenderConfig)}
-        kinds: dict[str, Any] = dict.fromkeys(self.background or (("photo",) if self.photos else ()), 1.0)
-        names = () if self.depth_sensor == ("none",) else self.depth_sensor
-        for name in names if names != ("auto",) else ():
-            check_choice(name, (*SENSORS, "none"), noun="depth sensor")
-        return RenderConfig(
-            **given
-            | {
-                "tones": self.tones or ALL_TONES,
-                "background": Backgrounds(kinds | {"photos": self.photos}) if kinds else Backgrounds(),
-                "depth_sensor": "auto" if names == ("auto",) else DepthSensor(names) if names else None,
-                "color_sensor": ExposureConfig() if self.color_sensor else None,
-                "shutter": ShutterConfig() if self.shutter else None,
-            }
-        )
 
 
 def render(
@@ -80,7 +29,7 @@ def render(
     people: int | None = None,
     glove: str | None = None,
     merge: tuple[Path, ...] = (),
-    options: Annotated[RenderOptions, _FLAT],
+    options: Annotated[RenderConfig, tyro.conf.arg(name="")],
     format: tuple[str, ...] = ("webdataset",),
     workers: int | None = None,
     cluster: str | None = None,
@@ -115,7 +64,7 @@ def render(
         if not isinstance(place, Path):
             raise HandSimError(f"--merge copies into a folder, and {place} is none; copy that folder then")
         own = {hands, people, glove, workers, cluster} - {None}
-        if options != RenderOptions() or format != ("webdataset",) or own:
+        if options != RenderConfig() or format != ("webdataset",) or own:
             raise HandSimError("--merge copies pictures as they are; leave out the options of drawing")
         print_line(f"{out}: {merge_renderings(merge, place)} shards of {len(merge)} renderings")
         return
@@ -126,7 +75,7 @@ def render(
     check_outputs(
         (take, poses, cast("str | None", options.view.cameras)), (place if isinstance(place, Path) else None,)
     )
-    config, start, counts = options.config(), time.perf_counter(), []
+    start, counts = time.perf_counter(), list[tuple[int, int]]()
     with progress_bar("images") as bar, chosen_workers(cluster, workers, bar.say) as chosen:
 
         def show(done: int, total: int) -> None:
@@ -135,7 +84,7 @@ def render(
             bar.step(doing)
             bar(done, total)
 
-        count = render_take(source, place, format, config, workers=chosen, progress=show)
+        count = render_take(source, place, format, options, workers=chosen, progress=show)
     seconds = time.perf_counter() - start
     if lost := left_out_frames(place):
         print_line(
@@ -148,5 +97,5 @@ def render(
         print_line(f"{out}: complete already, with all of its {count} images")
     else:
         print_line(f"{out}: {count} images in {seconds:.0f} s, {count / seconds:.1f} a second")
-    if {"rgb", "depth"} & set(config.passes):
+    if {"rgb", "depth"} & set(options.passes):
         print_line(f"{place}/{SHEET}: some of them at one glance")

@@ -14,7 +14,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final, Literal, get_args
+from typing import Annotated, Any, Final, Literal, get_args
 
 import cv2
 import numpy as np
@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from handsim._checks import check_choice
 from handsim.errors import FileError, HandSimError, HandSimWarning, choices
 from handsim.kernels import kernel
+from handsim.settings import Spelled
 from handsim.space.camera import Camera, camera_matrix
 from render.color_sensor import GAMMA
 from render.frames import Bytes, Doubles, Flags, Floats, Geometry, at_rest
@@ -190,10 +191,13 @@ class Backgrounds:
             without a folder.
     """
 
-    shares: Mapping[str, float] = field(default_factory=lambda: dict(_USUAL_SHARES), hash=False)
-    """Share of each kind of `KINDS`, of any sum, and beside them maybe `photos`; a kind that is not named has
-    none. A name, or several, have equal shares."""
-    photos: str | None = None
+    shares: Annotated[Mapping[str, float], Spelled(tuple[BackgroundKind, ...], (), "background")] = field(
+        default_factory=lambda: dict(_USUAL_SHARES), hash=False
+    )
+    """Kinds of background: plain, gradient, room, photo. Names have equal shares; a mapping has the share of
+    each, of any sum, and beside them maybe `photos`; a kind that is not named has none. When none is given, a
+    mixture of the first three, or photographs alone where there is a folder of them."""
+    photos: Annotated[str | None, Spelled(Path | None)] = None
     """Folder of photographs, its subfolders included."""
 
     def __post_init__(self) -> None:
@@ -201,6 +205,8 @@ class Backgrounds:
         shares: dict[str, Any] = dict(given) if isinstance(given, Mapping) else dict.fromkeys(given, 1.0)
         object.__setattr__(self, "photos", shares.pop("photos", self.photos))
         shares = shares.get("shares", shares)  # as records have them
+        if not shares:
+            shares = dict(_USUAL_SHARES) if self.photos is None else {"photo": 1.0}
         for kind in shares:
             check_choice(kind, KINDS, noun="background")
         every = {kind: float(shares.get(kind, 0.0)) for kind in KINDS}

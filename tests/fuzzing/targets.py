@@ -23,7 +23,7 @@ from handsim.space.objects import load_object
 from handsim.space.rig_formats import import_cameras, load_cameras
 from render import PoseFile
 from render.scenery.backgrounds import draw_photo, photo_files
-from render.subject import load_subject
+from render.subject import subject_of
 from tests.fuzzing import seeds
 from tests.fuzzing.engine import Target
 from tests.fuzzing.mutations import mutate_archive, mutate_checkpoint, mutate_tail, mutate_take
@@ -136,7 +136,7 @@ _ALL: Final = (
     Target("rig", seeds.rig, load_rig),
     Target("cameras", seeds.camera_files, load_cameras),
     Target("calibrations", seeds.calibrations, _read_calibration),
-    Target("poses", seeds.own_poses, lambda path: load_subject(PoseFile(path), seed=0), mutate_archive),
+    Target("poses", seeds.own_poses, lambda path: subject_of(PoseFile(path), seed=0), mutate_archive),
     Target("body", seeds.body, load_body),
     Target("mesh", seeds.mesh, load_object),
     Target("truth", seeds.truth, _read_take, mutate_take),

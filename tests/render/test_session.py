@@ -22,11 +22,13 @@ from handsim.space.camera import pinhole, preset
 from handsim.space.transforms import quaternion_matrix, rigid, turned_poses
 from poses import sample_poses
 from render import Backgrounds, DepthSensor, RenderConfig, ViewConfig, draw, render_take
+from render.config import resolve
+from render.drawing import Drawing
 from render.frames import FOREARM, PARTS_A_HAND, PASSES
 from render.scenery.backgrounds import photo_files
-from render.session import SHEET, Drawing, cut_off_pictures, left_out_frames, open_studio
+from render.session import SHEET, cut_off_pictures, left_out_frames
 from render.skin.look import TONES
-from render.studio import Moment
+from render.studio import Moment, Studio
 from render.subject import subject_of_take
 from render.user_body import UserBody
 from render.viewpoints import Placement, Viewpoints
@@ -248,7 +250,7 @@ def test_a_take_has_its_own_hands():
 @pytest.mark.parametrize("kind", ["single-hand", "hand-hand"])
 def test_no_arm_ends_in_a_picture(kind):
     take = simulate_take(kind=kind, num_frames=120, seed=2)
-    studio = open_studio(take.hands, RenderConfig().resolved(), rng=np.random.default_rng(0))
+    studio = Studio.sample(take.hands, resolve(), rng=np.random.default_rng(0))
     pictures = 0
     for placement, user in itertools.product(get_args(Placement), (None, UserBody(take))):
         rng = np.random.default_rng(1)

@@ -18,8 +18,9 @@ from handsim.hand.shape import HAND_DTYPE, named_shape, pack_hand
 from handsim.space.transforms import quaternion_matrix, random_quaternions
 from poses import sample_poses
 from render import PoseFile, RenderConfig, ShutterConfig, ViewConfig, render_take
-from render.session import Drawing
-from render.subject import load_subject, source_of
+from render.config import resolve
+from render.drawing import Drawing
+from render.subject import subject_of
 
 K = np.array([[300.0, 0, 161.5], [0, 302.0, 118.25], [0, 0, 1]])
 D = np.array([[-0.2, 0.06, 0.001, -0.0015, 0.01]])
@@ -47,11 +48,11 @@ def cameras(tmp_path):
 
 
 def load_poses(file, seed=0):
-    return load_subject(file, seed=seed)
+    return subject_of(file, seed=seed)
 
 
 def drawn(subject, config, frames, shard=0):
-    return Drawing(subject, config.resolved()).frames(shard, enumerate(frames))
+    return Drawing(subject, resolve(config)).frames(shard, enumerate(frames))
 
 
 def saved(folder, **arrays):
@@ -116,7 +117,7 @@ def test_a_table_of_an_exported_take_is_drawn_as_its_poses(tmp_path, qpos):
     both[1, 0] = np.nan
     fits = [attach("dense19", HandModel.named("M", side=side)) for side in ("left", "right")]
     Take.of_poses(fits, both, rate=30.0).export(tmp_path / "poses.csv")
-    for source in (PoseFile(tmp_path / "poses.csv"), source_of(str(tmp_path / "poses.csv"))):
+    for source in (PoseFile(tmp_path / "poses.csv"), str(tmp_path / "poses.csv")):
         subject = load_poses(source)
         assert [fit.side for fit in subject.take.hands] == ["left", "right"] and subject.is_motion
         assert subject.take.rate == pytest.approx(30.0)
@@ -249,7 +250,7 @@ def test_arguments(tmp_path):
 def test_poses_that_are_given_as_a_take_are_told(tmp_path, qpos):
     np.savez(tmp_path / "poses.npz", qpos=qpos)
     with pytest.raises(CaptureError, match="no take, but poses of your own; give them to --poses"):
-        load_subject(source_of(tmp_path / "poses.npz"), seed=0)
+        subject_of(tmp_path / "poses.npz", seed=0)
 
 
 def test_frames_without_a_hand_are_counted(tmp_path, qpos):

@@ -35,7 +35,7 @@ ELSEWHERE = {
     "export": "out", "evaluate": "json threads", "simulate": "out cluster",
     "calibrate": "out live seconds", "track": "out live seconds send labelled", "report": "out",
     "replay": "host port rate loop", "view": "host port out video live", "body": "out",
-    "doctor": "compile send", "film": "out format workers detector frames-per-shard",
+    "doctor": "compile send", "film": "out format workers detector frames-per-shard openxr frames seed",
     "render": "out merge format workers cluster painter frames-per-shard",
 }  # fmt: skip
 """Options that say only where something is or goes, as what, or how quickly."""

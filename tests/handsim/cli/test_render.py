@@ -7,14 +7,14 @@ import pytest
 import tyro
 
 from handsim.cli.parsing import registry
-from handsim.cli.render import RenderOptions
 from render import DepthSensor, RenderConfig
+from render.config import resolve
 from render.painting.figures import sample_appearance
 from render.skin.look import TONES
 
 
 def parsed(*words: str) -> RenderConfig:
-    return tyro.cli(RenderOptions, args=words, registry=registry()).config()
+    return tyro.cli(RenderConfig, args=words, registry=registry())
 
 
 def test_no_option_gives_the_default_configuration() -> None:
@@ -43,11 +43,11 @@ def test_named_tones_are_drawn_and_no_others(names: str, tones: tuple[float, ...
 
 
 def test_the_depth_sensor_fits_the_placement() -> None:
-    assert parsed("--placement", "head").resolved().depth_sensor == DepthSensor(("d435",))
-    assert parsed("--placement", "orbit").resolved().depth_sensor == DepthSensor(("d435",))
-    assert parsed("--distance", "0.6", "0.9").resolved().depth_sensor == DepthSensor(("kinect2",))
-    assert parsed("--placement", "rig").resolved().depth_sensor == DepthSensor(("kinect2",))
-    given = parsed("--placement", "head", "--depth-sensor", "kinect2", "kinect1").resolved()
+    assert resolve(parsed("--placement", "head")).depth_sensor == DepthSensor(("d435",))
+    assert resolve(parsed("--placement", "orbit")).depth_sensor == DepthSensor(("d435",))
+    assert resolve(parsed("--distance", "0.6", "0.9")).depth_sensor == DepthSensor(("kinect2",))
+    assert resolve(parsed("--placement", "rig")).depth_sensor == DepthSensor(("kinect2",))
+    given = resolve(parsed("--placement", "head", "--depth-sensor", "kinect2", "kinect1"))
     assert given.depth_sensor == DepthSensor(("kinect2", "kinect1"))
 
 
@@ -59,5 +59,5 @@ def test_photographs_alone_are_the_only_background() -> None:
 
 def test_depth_alone_never_looks_for_hardware(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("render.config.choose_painter", lambda: pytest.fail("looked"))
-    assert RenderConfig(passes=("depth",)).resolved().painter == "compiled"
-    assert RenderConfig(painter="opengl").resolved().painter == "opengl"
+    assert resolve(RenderConfig(passes=("depth",))).painter == "compiled"
+    assert resolve(RenderConfig(painter="opengl")).painter == "opengl"

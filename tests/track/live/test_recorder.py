@@ -24,7 +24,7 @@ from gloves.takes.take import LOST, STATUSES, TRACKED, usual_rate
 from handsim import HandSimWarning, join_qpos
 from handsim.errors import ArgumentError, CaptureError
 from handsim.space.objects import named_object
-from render.subject import load_subject
+from render.subject import subject_of
 from tests.limits import file_size_limit
 from track import (
     Recorder,
@@ -118,7 +118,7 @@ def test_a_recording_that_was_cut_off_is_read(tmp_path):
     with pytest.warns(CutOffWarning, match=r"take\.npz\.part: a recording that was cut off .* 24 frames"):
         assert_equal(load_take(recorder.part), in_memory())
     with pytest.warns(CutOffWarning):
-        assert load_subject(recorder.part, seed=0).take.num_frames == FRAMES
+        assert subject_of(recorder.part, seed=0).take.num_frames == FRAMES
     with pytest.raises(CaptureError, match=r"take\.npz: no such file, but .*take\.npz\.part is a recording"):
         load_take(tmp_path / "new" / "take.npz")
     with pytest.raises(CaptureError, match="exists: a recording that was cut off"):
