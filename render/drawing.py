@@ -22,7 +22,7 @@ from render.frames import Doubles, RenderedFrame
 from render.studio import Moment, Studio
 from render.subject import Model, Subject, subject_of
 from render.user_body import UserBody
-from render.viewpoints import Viewpoints, check_hands_in_view
+from render.viewpoints import Viewpoints
 
 
 def draw(
@@ -63,7 +63,7 @@ def draw(
     """
     config = resolve(config, settings, camera)
     drawing = Drawing(subject_of(source, model=model, glove=glove, seed=config.seed), config)
-    check_hands_in_view(config.view, drawing.viewpoints, drawing.take)
+    drawing.viewpoints.check_hands_in_view()
     if record is None:
         return drawing.frames(0, ((n, n) for n in drawing.chosen_frames(frames)))
     check_type("record", record, Mapping, "a picture's record, as formats of files have it")

@@ -46,7 +46,6 @@ from render.formats.writer import CONFIG, FORMATS, WITH_COLORS, open_writers, sh
 from render.frames import RenderedFrame
 from render.scenery.backgrounds import photo_files
 from render.subject import Model, PoseFile, Subject, subject_of
-from render.viewpoints import check_hands_in_view
 
 SHEET: Final = "contact_sheet.png"
 _MERGED: Final = "checksums.json"  # checksums of the files that all shards make together
@@ -114,7 +113,7 @@ def render_take(
     drawing = Drawing(subject, config)
     cameras = drawing.viewpoints.cameras(0)
     check_names("cameras", cameras)
-    check_hands_in_view(config.view, drawing.viewpoints, drawing.take)
+    drawing.viewpoints.check_hands_in_view()
     absent = drawing.frames_without_hands()
     if absent and subject.footage is None:  # frames of a video are left out for reasons that are told
         told = f"frames without a hand are not drawn: {len(absent)} of {drawing.take.num_frames}"

@@ -306,15 +306,14 @@ class PictureStream(SharedStream, IterableDataset[dict[str, torch.Tensor]]):
                 if self._model is not None:
                     raise
         if qpos.ndim == 3 and self._model is None:
-            model = (HandModel(shape.with_side("right")), HandModel(shape.with_side("left")))
+            model = HandModel(shape.with_side("right"))  # the other hand is its mirror image
         return subject_of_poses(qpos, model=model, glove=self._glove)
 
     def _picture(self, number: int, sitting: _Sitting, rank: int) -> dict[str, torch.Tensor]:
         rng = SpawnKey.STREAM.rng(self.seed, _PICTURE, number)
         take = sitting.subject.take
         moment = Moment(take, int(sitting.frames[rank]))
-        poses = {n: moment.hand(n) for n in range(len(take.hands))}
-        there = {n: pose for n, pose in poses.items() if pose is not None}
+        there = moment.hands()
         keypoints = [hand_keypoints(take.hands[n].model, pose[None])[0] for n, pose in there.items()]
         points, wrists = np.concatenate(keypoints), np.stack(list(there.values()))
         for _ in range(20):  # until the camera is outside of all surfaces

@@ -158,11 +158,13 @@ class Moment:
     forearms: Float[np.ndarray, "H 3"] | None = None
     """Unit direction of each hand's forearm; None for wrists at rest."""
 
-    def hand(self, number: int, shift: float = 0.0) -> Doubles | None:
-        """Pose (27,) of a hand `shift` seconds after the frame; None where the frame has none."""
-        rows = self.take.qpos[:, number]
-        if not np.isfinite(rows[self.frame]).all():
-            return None
+    def hands(self, shift: float = 0.0) -> dict[int, Doubles]:
+        """Poses (27,) of the hands that the frame has by their numbers, `shift` seconds after it."""
+        there = np.flatnonzero(np.isfinite(self.take.qpos[self.frame]).all(axis=1))
+        return {int(number): self._hand(self.take.qpos[:, number], shift) for number in there}
+
+    def _hand(self, rows: Doubles, shift: float) -> Doubles:
+        """The pose (27,) of a hand that has these rows (T, 27)."""
         pose: Doubles = rows[self.frame].copy()
         if shift != 0.0:
             (before, after), share = self._around(rows, shift)
@@ -268,7 +270,7 @@ class Studio:
                 f"camera '{camera.name}' is {1e3 * nearest:.0f} mm from a hand or object in frame {frame}, "
                 f"expected {2e3 * NEAR:.0f} mm or more; place it elsewhere"
             )
-        present = [number for number in range(len(self._hands)) if moment.hand(number) is not None]
+        present = [*moment.hands()]
         sensor = conditions.depth_noise if "depth" in self._passes else None
         surfaces = [one.triangles for one in drawn]
         truth = see(camera, surfaces, with_normals=sensor is not None or "normals" in self._passes)
@@ -314,9 +316,7 @@ class Studio:
 
     def reaching(self, moment: Moment, cameras: Sequence[Camera], user: UserBody | None = None) -> Moment:
         """The moment with upper arms, the user's or others, that leave the pictures of these cameras."""
-        found = np.full((len(self._hands), 3), np.nan)
-        poses = {number: moment.hand(number) for number in range(len(self._hands))}
-        there = {number: pose for number, pose in poses.items() if pose is not None}
+        found, there = np.full((len(self._hands), 3), np.nan), moment.hands()
         forearms = None if user is None else user.forearms[moment.frame]
         if there:
             lines = (
@@ -341,14 +341,11 @@ class Studio:
 
     def _drawn(self, moment: Moment, shift: float) -> list[Drawn]:
         """Surfaces of the hands and bodies that the frame has, `shift` seconds later."""
-        drawn: list[Drawn] = []
-        number = 0
-        for index, hand in enumerate(self._hands):
-            pose = moment.hand(index, shift)
-            if pose is not None:
-                arm = (None if ways is None else ways[index] for ways in (moment.upper_arms, moment.forearms))
-                drawn += hand.drawn(pose, number, *arm)
-                number += 1
+        drawn, poses = list[Drawn](), moment.hands(shift)
+        for number, (index, pose) in enumerate(poses.items()):
+            arm = (None if ways is None else ways[index] for ways in (moment.upper_arms, moment.forearms))
+            drawn += self._hands[index].drawn(pose, number, *arm)
+        number = len(poses)
         for index, body in enumerate(self._bodies):
             T_world_body = moment.body(index, shift)
             if T_world_body is not None:

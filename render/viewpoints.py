@@ -289,9 +289,29 @@ class Viewpoints:
             paths = _PATHS[config.placement](config, take, framing, rng)
             cameras = [dataclasses.replace(path.camera, name=f"view{n}") for n, path in enumerate(paths)]
             self._paths = [path._replace(camera=camera) for path, camera in zip(paths, cameras, strict=True)]
-        self._framing = framing
+        self._config, self._take, self._framing = config, take, framing
         self.viewer: Doubles = looking(-_towards_user(framing.forearms)[None])[0]
         """Axes of somebody before the user, as columns in the world's; light is drawn for them."""
+
+    def check_hands_in_view(self) -> None:
+        """Refuse own cameras if none has a hand in its pictures, and warn of those that have none."""
+        if self._config.cameras is None:
+            return
+        cameras, name, points = self.cameras(0), self._config.cameras_name, self._framing.points
+        blind = list(cameras)
+        for first in range(0, len(points), _CHUNK):
+            blind = [one for one in blind if not _any_inside(one, points[first : first + _CHUNK])]
+        if len(blind) == len(cameras):
+            one, qpos = blind[0], self._take.qpos
+            middle, place = np.nanmedian(qpos[..., :3], axis=(0, 1)), one.T_world_camera[:3, 3]
+            raise RigError(
+                f"{name}: no camera has a hand in its picture in any of {len(qpos)} frames: wrists are "
+                f"around {_shown(middle)} m, and camera '{one.name}' stands at {_shown(place)} m and looks "
+                f"along {_shown(one.T_world_camera[:3, 2])}"
+            )
+        for camera in blind:
+            told = f"{name}: camera '{camera.name}' has no hand in its picture in any frame"
+            warnings.warn(told, HandSimWarning, stacklevel=2)
 
     @property
     def num_cameras(self) -> int:
@@ -509,33 +529,7 @@ def zoomed(camera: Camera, zoom: float) -> Camera:
     return dataclasses.replace(camera, K=K)
 
 
-def check_hands_in_view(config: ViewConfig, viewpoints: Viewpoints, take: Take) -> None:
-    """Refuse the user's own cameras if none has a hand in its pictures, and warn of those that have none."""
-    if config.cameras is None:
-        return
-    cameras, name = viewpoints.cameras(0), config.cameras_name
-    blind = list(cameras)
-    for hand, qpos in zip(take.hands, np.swapaxes(take.qpos, 0, 1), strict=True):
-        there = qpos[np.isfinite(qpos).all(axis=1)]
-        for first in range(0, len(there), _CHUNK):
-            points = hand_keypoints(hand.model, there[first : first + _CHUNK])
-            blind = [camera for camera in blind if not _any_inside(camera, points)]
-            if not blind:
-                return
-    if len(blind) == len(cameras):
-        one = blind[0]
-        middle, place = np.nanmedian(take.qpos[..., :3], axis=(0, 1)), one.T_world_camera[:3, 3]
-        raise RigError(
-            f"{name}: no camera has a hand in its picture in any of {take.num_frames} frames: wrists are "
-            f"around {_shown(middle)} m, and camera '{one.name}' stands at {_shown(place)} m and looks along "
-            f"{_shown(one.T_world_camera[:3, 2])}"
-        )
-    for camera in blind:
-        told = f"{name}: camera '{camera.name}' has no hand in its picture in any frame"
-        warnings.warn(told, HandSimWarning, stacklevel=2)
-
-
-def _any_inside(camera: Camera, points: Doubles) -> bool:
+def _any_inside(camera: Camera, points: Floats) -> bool:
     pixels = camera.project(points)
     return bool(((pixels >= 0.0) & (pixels < camera.size)).all(axis=-1).any())  # never so for NaN
 

@@ -142,7 +142,7 @@ class HandFigure:
         self.fit, self.look = fit, look
         bony = look.skin.relief if look.glove is None else 0.0  # cloth hides bones
         self.skin = PosableSkin(fit.model, look.forearm, bony)
-        self._painted: Material | None = None
+        self._material = functools.cache(self._paint)
         self._marker_bones = bones = fit.attachment.main_bones
         self._marker_numbers = (1 + first_marker + np.arange(len(bones))).astype(np.uint8)
         self.thickness: Float[np.ndarray, "21"] = keypoint_thickness(fit.model.shape)
@@ -179,14 +179,12 @@ class HandFigure:
             drawn.append(_drawn_bases(feet, markers, normals, radius, parts, instances, np.zeros_like(parts)))
         return drawn
 
-    def _material(self) -> Material:
-        if self._painted is None:
-            look, side = self.look, self.fit.side
-            texture = skin_texture(look.skin, look.forearm, side=side)
-            if look.glove is not None:
-                texture = glove_texture(look.glove, texture, look.forearm, side=side)
-            self._painted = skin_material(texture)
-        return self._painted
+    def _paint(self) -> Material:
+        look, side = self.look, self.fit.side
+        texture = skin_texture(look.skin, look.forearm, side=side)
+        if look.glove is not None:
+            texture = glove_texture(look.glove, texture, look.forearm, side=side)
+        return skin_material(texture)
 
 
 class BodyFigure:

@@ -15,7 +15,7 @@ from handsim.hand.model import hand_keypoints
 from handsim.space.camera import pinhole
 from render import ViewConfig
 from render.subject import subject_of_poses
-from render.viewpoints import Framing, Placement, Viewpoints, check_hands_in_view
+from render.viewpoints import Framing, Placement, Viewpoints
 from train import simulate_take
 from train.simulation.takes import SimulatedKind
 
@@ -62,7 +62,7 @@ def test_cameras_must_look_at_the_hands():
 
     def check(*cameras):
         config = ViewConfig(cameras=cameras)
-        check_hands_in_view(config, Viewpoints(config, take, rng=np.random.default_rng(0)), take)
+        Viewpoints(config, take, rng=np.random.default_rng(0)).check_hands_in_view()
 
     check(seeing)
     with pytest.warns(HandSimWarning, match="camera 'blind' has no hand"):
