@@ -440,8 +440,10 @@ def _posed(
 ) -> Subject:
     """The subject of poses on these hands in gloves."""
     check_layout(layout)
-    hands = tuple(settle_glove(layout, HandModel(model.shape.with_side("right"))) for model in models)
-    hands = tuple(fit.with_side(model.shape.side) for fit, model in zip(hands, models, strict=True))
+    hands = [
+        settle_glove(layout, HandModel(shape.with_side("right"))).with_side(shape.side)
+        for shape in (model.shape for model in models)
+    ]
     times = _SECOND * np.arange(len(poses.qpos)) if poses.times is None else poses.times
     rate = _SECOND if poses.times is None else 1.0 / max(float(np.median(np.diff(times))), 1e-6)
     take = Take.of_poses(hands, poses.qpos, rate=rate, times=times)
