@@ -178,9 +178,14 @@ _ASIDE: Final = np.deg2rad(90.0)  # largest angle that is added to the usual one
 _ARM_CLEARANCE: Final = np.deg2rad(35.0)  # least angle between a view and a forearm
 
 
-_PLACING: Final = ("placement", "camera", "views", "share", "distance")
+_PLACING: Final = ("placement", "camera", "views", "share", "distance", "rig")
 """Options that place cameras, which your own cameras do not need."""
-_UNUSED: Final = {"head": ("share", "distance"), "rig": ("views", "share", "distance")}
+_UNUSED: Final = {
+    "still": ("rig",),
+    "orbit": ("rig",),
+    "head": ("share", "distance", "rig"),
+    "rig": ("views", "share", "distance"),
+}
 """Options that a placement has no use for."""
 
 
@@ -219,9 +224,9 @@ class ViewConfig(Settings):
         if self.cameras is not None and given:
             raise ArgumentError(
                 f"the cameras are those of {self.cameras_name}; leave out the placement, the camera, the "
-                "views, the share and the distance"
+                "views, the share, the distance and the rig"
             )
-        unused = [name for name in _UNUSED.get(self.placement, ()) if name in given]
+        unused = [name for name in _UNUSED[self.placement] if name in given]
         if unused:
             raise ArgumentError(
                 f"given {', '.join(unused)} and the placement {self.placement}, expected another placement"
@@ -232,10 +237,6 @@ class ViewConfig(Settings):
             )
         if self.cameras == ():
             raise ArgumentError("cameras is empty, expected at least one camera")
-        if self.placement != "rig" and self.changed("rig"):
-            raise ArgumentError(
-                f"the rig is '{self.rig}' and the placement '{self.placement}', expected the placement rig"
-            )
 
     @property
     def cameras_name(self) -> str:
