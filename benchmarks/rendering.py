@@ -29,7 +29,6 @@ from render.drawing import Drawing
 from render.formats.writer import open_writer
 from render.painting.figures import sample_appearance
 from render.painting.rasterizer import join, rasterize
-from render.skin.look import ALL_TONES
 from render.studio import Moment, Studio
 from render.subject import subject_of_take
 from render.viewpoints import Viewpoints
@@ -139,8 +138,7 @@ def accuracy(frames: int) -> Figures:
 
 
 def bare_studio(take: Take) -> Studio:
-    look = sample_appearance(False, tones=ALL_TONES, rng=np.random.default_rng(0))
-    return Studio(take.hands, look, PLAIN)
+    return Studio(take.hands, PLAIN, rng=np.random.default_rng(0))
 
 
 def main(frames: int = 200, save: str | None = None) -> None:

@@ -5,13 +5,14 @@ from __future__ import annotations
 import dataclasses
 import functools
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from gloves.fit import GloveFit
 from gloves.layout import MarkerLayout
 from gloves.takes.take import Take
 from handsim._checks import check_type
@@ -86,20 +87,12 @@ class Drawing:
                     "RigidBody.of gives a body the surface of its object"
                 )
                 warnings.warn(told, HandSimWarning, stacklevel=3)
-        self.subject, self.config, footage = subject.upright(config.up), config, subject.footage
+        self.subject, self.config, self._light = subject.upright(config.up), config, light
         self.take, rng = self.subject.take, SpawnKey.VIEWPOINTS.rng(config.seed)
         # Poses that are no motion may be of many people, but cameras at the eyes need one person.
         has_user = subject.is_motion or config.view.placement == "head"
         self._user = UserBody(self.take) if has_user else None
-        self._open_studio = functools.partial(
-            Studio.sample,
-            config=config,
-            bodies=self.take.bodies,
-            has_user=has_user,
-            footage=footage,
-            light=light,
-        )
-        poses = None if footage is None else footage.poses
+        poses = None if subject.footage is None else subject.footage.poses
         self.viewpoints = Viewpoints(
             config.view, self.take, rng=rng, up=config.up, user=self._user, poses=poses
         )
@@ -143,7 +136,7 @@ class Drawing:
         config, cast, viewpoints = self.config, self.subject.cast, self.viewpoints
         rng = SpawnKey.SHARD.rng(config.seed, shard, 0)
         if cast is None:  # a take has its own hands, whose looks change with the shard
-            studio = self._open_studio(self.take.hands, rng=rng)
+            studio = self._studio(self.take.hands, rng)
         sample = functools.partial(
             sample_conditions, config, viewpoints.viewer, viewpoints.size, self._enclosed()
         )
@@ -183,4 +176,9 @@ class Drawing:
         """The studio of one of the people of `subject.cast`."""
         cast = self.subject.cast
         assert cast is not None
-        return self._open_studio(cast.hands(person, self.take.hands), rng=cast.rng(person))
+        return self._studio(cast.hands(person, self.take.hands), cast.rng(person))
+
+    def _studio(self, hands: Sequence[GloveFit], rng: np.random.Generator) -> Studio:
+        """The studio of somebody with these hands."""
+        about = {"has_user": self._user is not None, "light": self._light}
+        return Studio(hands, self.config, self.take.bodies, rng=rng, footage=self.subject.footage, **about)

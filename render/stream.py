@@ -287,7 +287,7 @@ class PictureStream(SharedStream, IterableDataset[dict[str, torch.Tensor]]):
             frames = rng.choice(frames, self._sitting)
         else:
             subject, frames = self._posed(rng), np.arange(self._sitting)
-        studio = Studio.sample(subject.take.hands, self.config, subject.take.bodies, rng=rng)
+        studio = Studio(subject.take.hands, self.config, subject.take.bodies, rng=rng)
         return _Sitting(studio, subject, frames, person)
 
     def _posed(self, rng: np.random.Generator) -> Subject:

@@ -42,7 +42,7 @@ from render.frames import (
     Pictures,
     RenderedFrame,
 )
-from render.painting.figures import Appearance, BodyFigure, Drawn, HandFigure, sample_appearance
+from render.painting.figures import BodyFigure, Drawn, HandFigure, sample_appearance
 from render.painting.painter import paint, put_before
 from render.painting.rasterizer import NEAR, see
 from render.painting.shading import level_behind, light_behind
@@ -174,11 +174,13 @@ class Moment:
         pose[3:7] /= np.linalg.norm(pose[3:7])
         return pose
 
-    def body(self, number: int, shift: float = 0.0) -> Doubles | None:
-        """Pose (4, 4) of a rigid body `shift` seconds after the frame; None where the frame has none."""
-        rows = self.take.body_poses[:, number]
-        if not np.isfinite(rows[self.frame]).all():
-            return None
+    def bodies(self, shift: float = 0.0) -> dict[int, Doubles]:
+        """Poses (4, 4) of the rigid bodies that the frame has by their numbers, `shift` seconds after it."""
+        there = np.flatnonzero(np.isfinite(self.take.body_poses[self.frame]).all(axis=1))
+        return {int(number): self._body(self.take.body_poses[:, number], shift) for number in there}
+
+    def _body(self, rows: Doubles, shift: float) -> Doubles:
+        """The pose (4, 4) of a rigid body that has these rows (T, 7)."""
         poses, share = self._around(rows, shift)
         before, after = pose_matrices(poses)
         T_world_body: Doubles = before + share * (after - before)
@@ -208,32 +210,6 @@ class Studio:
     def __init__(
         self,
         hands: Sequence[GloveFit],
-        look: Appearance,
-        config: RenderConfig,
-        bodies: Sequence[RigidBody] = (),
-        body_colors: Sequence[tuple[float, float, float]] = (),
-        *,
-        light: bool = False,
-        footage: Footage | None = None,
-    ) -> None:
-        """The configuration is resolved; `light` asks for that of colors, which our own painter has."""
-        assert config.painter != "auto"
-        self._config, self._passes, self._painter = config, set(config.passes), config.painter
-        self._footage = footage
-        self._light = light and footage is None and config.painter == "compiled"
-        self._look, self._people = look, [dataclasses.asdict(look)] * len(hands)
-        first = np.cumsum([0, *(len(fit.attachment.points) for fit in hands)])
-        self._hands = [
-            HandFigure(fit, look, first_marker=int(number)) for fit, number in zip(hands, first, strict=False)
-        ]
-        self._bodies = [BodyFigure(body, color) for body, color in zip(bodies, body_colors, strict=True)]
-        self._colors = tuple(body_colors)
-        self._posed: tuple[Moment, list[Drawn]] | None = None  # surfaces of the last moment
-
-    @classmethod
-    def sample(
-        cls,
-        hands: Sequence[GloveFit],
         config: RenderConfig,
         bodies: Sequence[RigidBody] = (),
         *,
@@ -241,14 +217,28 @@ class Studio:
         has_user: bool = False,
         light: bool = False,
         footage: Footage | None = None,
-    ) -> Studio:
-        """The studio of one person with random looks, whose wrists a `UserBody` may bend."""
+    ) -> None:
+        """Choose looks at random; the configuration is resolved.
+
+        A `UserBody` bends the wrists of those who have one. `light` asks for that of colors, which our own
+        painter has.
+        """
+        assert config.painter != "auto"
+        self._config, self._passes, self._painter = config, set(config.passes), config.painter
+        self._footage = footage
+        self._light = light and footage is None and config.painter == "compiled"
         look = sample_appearance(config.dress == "glove", tones=config.tones, rng=rng)
         if has_user:
             straight = dataclasses.replace(look.forearm, flexion=0.0, deviation=0.0)
             look = dataclasses.replace(look, forearm=straight)
-        colors = [tuple(rng.uniform(0.05, 0.9, 3).tolist()) for _ in bodies]
-        return cls(hands, look, config, bodies, colors, light=light, footage=footage)
+        self._look, self._people = look, [dataclasses.asdict(look)] * len(hands)
+        first = np.cumsum([0, *(len(fit.attachment.points) for fit in hands)])
+        self._hands = [
+            HandFigure(fit, look, first_marker=int(number)) for fit, number in zip(hands, first, strict=False)
+        ]
+        self._colors = tuple(tuple(rng.uniform(0.05, 0.9, 3).tolist()) for _ in bodies)
+        self._bodies = [BodyFigure(body, color) for body, color in zip(bodies, self._colors, strict=True)]
+        self._posed: tuple[Moment, list[Drawn]] | None = None  # surfaces of the last moment
 
     @property
     def skin(self) -> SkinLook | None:
@@ -345,12 +335,8 @@ class Studio:
         for number, (index, pose) in enumerate(poses.items()):
             arm = (None if ways is None else ways[index] for ways in (moment.upper_arms, moment.forearms))
             drawn += self._hands[index].drawn(pose, number, *arm)
-        number = len(poses)
-        for index, body in enumerate(self._bodies):
-            T_world_body = moment.body(index, shift)
-            if T_world_body is not None:
-                number += 1
-                drawn += body.drawn(T_world_body, number)
+        for number, (index, T_world_body) in enumerate(moment.bodies(shift).items(), 1 + len(poses)):
+            drawn += self._bodies[index].drawn(T_world_body, number)
         return drawn
 
     def _noisy_depth(

@@ -250,7 +250,7 @@ def test_a_take_has_its_own_hands():
 @pytest.mark.parametrize("kind", ["single-hand", "hand-hand"])
 def test_no_arm_ends_in_a_picture(kind):
     take = simulate_take(kind=kind, num_frames=120, seed=2)
-    studio = Studio.sample(take.hands, resolve(), rng=np.random.default_rng(0))
+    studio = Studio(take.hands, resolve(), rng=np.random.default_rng(0))
     pictures = 0
     for placement, user in itertools.product(get_args(Placement), (None, UserBody(take))):
         rng = np.random.default_rng(1)
