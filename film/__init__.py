@@ -13,7 +13,6 @@ from handsim._imports import lazy_exports
 if TYPE_CHECKING:
     from film.annotation import annotate_film as annotate_film
     from film.annotation import register_camera as register_camera
-    from film.config import FilmConfig as FilmConfig
     from film.detector import FoundHand as FoundHand
     from film.detector import HandDetector as HandDetector
     from film.registration import Registration as Registration

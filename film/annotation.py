@@ -12,7 +12,7 @@ from typing import Any, Final
 import numpy as np
 
 from film.bundle import FoundFrame
-from film.config import FilmConfig
+from film.config import USUAL
 from film.detector import HandDetector
 from film.outlines import poses_at, shutter_times
 from film.page import write_film_page
@@ -29,7 +29,7 @@ from handsim.hand.shape import NUM_KEYPOINTS
 from handsim.space.camera import Camera
 from handsim.space.rig_formats import load_cameras
 from render.captions import draw_keypoints
-from render.config import RenderConfig
+from render.config import FrameConfig, RenderConfig
 from render.frames import Bytes
 from render.illustrations import write_video
 from render.session import render_take
@@ -116,7 +116,7 @@ def annotate_film(
     video: str | Path,
     out: str | Path,
     formats: str | Sequence[str] = ("webdataset",),
-    config: FilmConfig | None = None,
+    config: FrameConfig | None = None,
     *,
     camera: Camera | str | Path | None = None,
     detector: HandDetector | None = None,
@@ -135,13 +135,13 @@ def annotate_film(
         video: The video.
         out: Folder.
         formats: As in `render_take`.
-        config: What is written.
+        config: What is written; of hands in gloves when not given.
         camera: As in `register_camera`.
         detector: As in `register_camera`.
         workers: As in `render_take`.
         progress: Called with numbers of done and of all frames, first of finding hands, then of writing.
         on_step: As in `register_camera`.
-        settings: Settings of `FilmConfig` that differ from `config`, as `dress="skin"` or `num_frames=100`.
+        settings: Settings of `FrameConfig` that differ from `config`, as `dress="skin"` or `num_frames=100`.
 
     Returns:
         The registration: pose [m], lens [px], clock [s], and which frames fit.
@@ -149,7 +149,7 @@ def annotate_film(
     Raises:
         HandSimError: As in `register_camera` and `render_take`, or no frame fits.
     """
-    config = FilmConfig.of(config, settings)
+    config = FrameConfig.of(USUAL if config is None else config, settings)
     taken, film = _taken(take), Film(video)
     registration = register_camera(
         taken, video, camera=camera, detector=detector, progress=progress, on_step=on_step
@@ -161,7 +161,7 @@ def annotate_film(
     poses = np.stack([registration.camera_of(n).T_world_camera for n in range(posed.num_frames)])
     record = {"film": {"sha256": checksum(film.path), **registration.record()}}
     drawn = RenderConfig(
-        **dataclasses.asdict(config),
+        **{one.name: getattr(config, one.name) for one in dataclasses.fields(FrameConfig)},
         view=ViewConfig(cameras=(registration.cameras[0],)),
         depth_sensor=None,
         color_sensor=None,

@@ -13,6 +13,7 @@ from handsim._imports import lazy_exports
 if TYPE_CHECKING:
     from render.color_sensor import ExposureConfig as ExposureConfig
     from render.color_sensor import ShutterConfig as ShutterConfig
+    from render.config import FrameConfig as FrameConfig
     from render.config import RenderConfig as RenderConfig
     from render.depth_sensor import DepthSensor as DepthSensor
     from render.drawing import draw as draw

@@ -57,6 +57,8 @@ class FrameConfig(Settings):
         ArgumentError: A pass is unknown, or a number is out of range.
     """
 
+    noun: ClassVar[str] = "setting of pictures"
+
     passes: tuple[str, ...] = PASSES
     """Pictures to write: some of rgb, depth, normals, ids."""
     dress: Literal["skin", "glove"] = "skin"

@@ -19,8 +19,8 @@ UNIT = re.compile(r"\[(m|m\^2|rad|s|min|Hz|deg|px|pixels|mm|1/s)(?=[ ,;/\]])")
 ARRAY = re.compile(r"\b(Float|Int|Bool)(32|64)?\[[^,\]]+, *\"")
 NO_QUANTITY = {
     "Alternative", "Backgrounds", "CalibrateSettings", "CameraLoss", "EvaluateSettings", "HandSimError",
-    "HandSimWarning", "ImprovedGlove", "LabelSettings", "Labeler", "LiveHeader", "PoseFile", "PoseMix",
-    "SceneMix", "ScoreGloveSettings", "SinkGroup", "Status", "SuspectSpan", "find_suspect_spans",
+    "FrameConfig", "HandSimWarning", "ImprovedGlove", "LabelSettings", "Labeler", "LiveHeader", "PoseFile",
+    "PoseMix", "SceneMix", "ScoreGloveSettings", "SinkGroup", "Status", "SuspectSpan", "find_suspect_spans",
     "load_labeler",
 }  # fmt: skip
 """Public names without a physical quantity of their own, or whose quantities are in the types they return."""

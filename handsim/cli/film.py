@@ -8,9 +8,10 @@ from typing import Annotated
 
 import tyro
 
-from film.config import FilmConfig
+from film.config import USUAL
 from handsim.app.messages import print_line, print_table, progress_bar
 from handsim.files.outputs import check_outputs
+from render.config import FrameConfig
 
 
 def film(
@@ -18,7 +19,7 @@ def film(
     video: Annotated[Path, tyro.conf.Positional],
     *,
     out: Path,
-    options: Annotated[FilmConfig, tyro.conf.arg(name="")],
+    options: Annotated[FrameConfig, tyro.conf.arg(name="")] = USUAL,
     camera: Path | None = None,
     detector: Path | None = None,
     format: tuple[str, ...] = ("webdataset",),
