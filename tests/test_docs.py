@@ -110,7 +110,7 @@ def test_every_module_that_a_page_names_exists():
     missing = []
     for path in [ROOT / "README.md", *PAGES]:
         for name in re.findall(
-            r"`((?:handsim|poses|gloves|render|train|track|film)(?:\.(?!(?:py|json|jpg|npz)\b)\w+)+)",
+            r"`((?:handsim|poses|gloves|render|train|track|film)(?:\.(?!(?:py|json|jpg|npz|mp4|html)\b)\w+)+)",
             path.read_text(),
         ):
             if name not in GROUPS and not _exists(name):
