@@ -27,7 +27,6 @@ from render import PictureStream, RenderConfig, RenderedFrame, ViewConfig
 from render.config import resolve
 from render.drawing import Drawing
 from render.formats.writer import open_writer
-from render.painting.figures import sample_appearance
 from render.painting.rasterizer import join, rasterize
 from render.studio import Moment, Studio
 from render.subject import subject_of_take
