@@ -333,7 +333,8 @@ def _exchanges(one: _Found, hand: GloveFit, source: Capture) -> Iterator[str]:
 def _squares(hand: GloveFit, points: Float[np.ndarray, "F M 3"]) -> Float[np.ndarray, "F M"]:
     """Squared distance of each point from its marker on the posed hand [m^2]; zero where missing."""
     poses = PoseSolver(hand, outlier_distance=_OUTLIER).solve(points)
-    return np.nan_to_num(((points - hand.markers(poses.qpos)[0]) ** 2).sum(axis=2))
+    squares = ((points - hand.markers(poses.qpos)[0]) ** 2).sum(axis=2)
+    return np.where(np.isfinite(squares), squares, 0.0)
 
 
 def _left_out(sources: Sequence[Capture], hands: Sequence[TrialHand]) -> Iterator[str]:
