@@ -28,6 +28,28 @@ _STEP: Final = 0.15  # step of closing fingers, summed over joints [rad]
 _HALVINGS: Final = 6  # bisections of the first blocked step, at most
 _PRECISION: Final = 0.003  # change at which bisection stops, summed over joints [rad]
 
+# Fingers close in two stages: all joints, then the two outer ones. Each stage has the depth [m] that a finger
+# may press into a hand, and its joints.
+_STAGES: Final = ((0.0006, slice(0, 4)), (0.0008, slice(2, 4)))
+_ORDER: Final = (1, 2, 3, 4, 0)  # the thumb closes last, over what the fingers hold
+
+MAX_OVERLAP: Final = 0.001
+"""Largest overlap of two hands [m]."""
+RATE: Final = 120.0
+"""Frames per second [Hz]."""
+MAX_SPEED: Final = 10.0
+"""Highest joint speed [rad/s]."""
+MAX_ACCELERATION: Final = 200.0
+"""Largest joint acceleration [rad/s^2]."""
+WRIST_SPEED: Final = 1.0
+"""Highest speed of the pair of hands, and of a hand relative to the pair between meetings [m/s]."""
+APPROACH: Final = (0.4, 0.8)
+"""Shortest and longest time of an approach or a release [s]."""
+VOLUME: Final = 0.2
+"""Half side of the cube in which the middle of the wrists travels [m], around 1.1 m above the floor."""
+_TURNING: Final = 8.0  # fastest rotation of one hand relative to the other [rad/s]
+_DISTANCE: Final = (0.25, 0.45)  # distance of the wrists while hands rest apart [m]
+
 
 class Digit(NamedTuple):
     """A digit for compiled searches: three bones, four joints, three capsules."""
@@ -240,12 +262,6 @@ def pose_digit(wrists: Any, angles: Any, parts: Any) -> Any:
     return posed
 
 
-# Fingers close in two stages: all joints, then the two outer ones. Each stage has the depth [m] that a finger
-# may press into a hand, and its joints.
-_STAGES: Final = ((0.0006, slice(0, 4)), (0.0008, slice(2, 4)))
-_ORDER: Final = (1, 2, 3, 4, 0)  # the thumb closes last, over what the fingers hold
-
-
 def first_contact(
     still: HandModel,
     still_qpos: Float[np.ndarray, "T 27"],
@@ -340,24 +356,6 @@ def digit_parts(model: HandModel, digit: int) -> Digit:
         meets=meets[indices],
         reach=float(skeleton.lengths[first : first + 3].sum() + capsules.radii[indices].max()),
     )
-
-
-MAX_OVERLAP: Final = 0.001
-"""Largest overlap of two hands [m]."""
-RATE: Final = 120.0
-"""Frames per second [Hz]."""
-MAX_SPEED: Final = 10.0
-"""Highest joint speed [rad/s]."""
-MAX_ACCELERATION: Final = 200.0
-"""Largest joint acceleration [rad/s^2]."""
-WRIST_SPEED: Final = 1.0
-"""Highest speed of the pair of hands, and of a hand relative to the pair between meetings [m/s]."""
-APPROACH: Final = (0.4, 0.8)
-"""Shortest and longest time of an approach or a release [s]."""
-VOLUME: Final = 0.2
-"""Half side of the cube in which the middle of the wrists travels [m], around 1.1 m above the floor."""
-_TURNING: Final = 8.0  # fastest rotation of one hand relative to the other [rad/s]
-_DISTANCE: Final = (0.25, 0.45)  # distance of the wrists while hands rest apart [m]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

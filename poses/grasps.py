@@ -54,6 +54,34 @@ _CONTACT_TIME: Final = (0.005, 1.0)  # MuJoCo's solref of contacts: time constan
 _GUIDE_TIME: Final = (0.03, 1.0)  # solref of the soft constraint that holds the object while fingers close
 _MAX_DISTANCE: Final = 0.5  # distances of capsules from the object are measured up to this one [m]
 
+_GAP: Final = 0.0005  # [m] between palm and object before the fingers close
+_SLIDE: Final = 0.15  # an object is raised to the palm from this far below it [m]
+_ANY: Final = "any"  # library entry of objects that have none of their own
+_STIFFNESS: Final = 0.006  # [m/rad] weight of joint deviations against residuals of the tips
+_MAX_STEP: Final = 0.2  # largest change of an angle in a round [rad]
+
+_MAX_TRIES: Final = 40
+_TRY_SPREADS: Final = np.deg2rad([1.0, 2.0, 3.0, 4.0, 5.0])  # deviation of angles in tries 1, 2, 3, 4, later
+_RAMP: Final = 10  # steps of the motors' targets from open to closed
+_CLOSE, _SETTLE, _SHAKE, _REST = 400, 200, 60, 60  # steps of 2 ms
+_GRAVITY: Final = 9.81
+_TETRAHEDRON: Final = np.array([(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)]) / np.sqrt(3.0)
+_MAX_DRIFT: Final = 0.004  # largest displacement of the shaken object [m]
+_MAX_ROTATION: Final = np.deg2rad(8.0)  # largest rotation of the shaken object
+_TOUCHING: Final = 0.0005  # [m] largest distance of a contact
+_MAX_SETTLED_DEPTH: Final = MAX_OBJECT_PENETRATION - 1e-5  # [m]
+_MAX_FINAL_SPEED: Final = 0.5  # [rad/s] of the hinges
+
+_MAX_HELD_DEPTH: Final = MAX_OBJECT_PENETRATION - 1e-6  # [m], with a margin for rounding in the world's frame
+_LIFT_CHANCE: Final = 0.55  # chance that a free digit lifts off the object
+_TAP_CHANCE: Final = 0.3  # chance that a digit that may tap does
+_STILL_CHANCE: Final = 0.3  # chance that the object does not move in the hand
+# Largest opening of a lifted or tapping thumb (first row) and finger: abduction (both ways), MCP, PIP, DIP.
+_LIFT: Final = np.deg2rad([[14.0, 30.0, 20.0, 25.0], [5.0, 45.0, 45.0, 30.0]])
+_TAP: Final = np.deg2rad([[4.0, 10.0, 6.0, 8.0], [1.0, 14.0, 10.0, 6.0]])
+_TREMBLE: Final = np.deg2rad([0.5, 1.2, 1.8, 1.8])  # standard deviations of joints of digits that hold
+_WOBBLE: Final = (0.0006, np.deg2rad(1.2))  # standard deviations of the object in the hand: [m], [rad]
+
 
 class GraspScene:
     """A compiled model of one hand and one object, without a state. Poses are in the wrist's frame."""
@@ -198,13 +226,6 @@ def _add_object(spec: mujoco.MjSpec, obj: RigidObject) -> None:
         name2="guide",
         solref=_GUIDE_TIME,
     )
-
-
-_GAP: Final = 0.0005  # [m] between palm and object before the fingers close
-_SLIDE: Final = 0.15  # an object is raised to the palm from this far below it [m]
-_ANY: Final = "any"  # library entry of objects that have none of their own
-_STIFFNESS: Final = 0.006  # [m/rad] weight of joint deviations against residuals of the tips
-_MAX_STEP: Final = 0.2  # largest change of an angle in a round [rad]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -385,19 +406,6 @@ def _marks(model: HandModel, angles: NDArray[np.float64]) -> tuple[NDArray[np.fl
     return placed, skinned_jacobian(model, bones, points, indices, weights)[..., 6:]
 
 
-_MAX_TRIES: Final = 40
-_TRY_SPREADS: Final = np.deg2rad([1.0, 2.0, 3.0, 4.0, 5.0])  # deviation of angles in tries 1, 2, 3, 4, later
-_RAMP: Final = 10  # steps of the motors' targets from open to closed
-_CLOSE, _SETTLE, _SHAKE, _REST = 400, 200, 60, 60  # steps of 2 ms
-_GRAVITY: Final = 9.81
-_TETRAHEDRON: Final = np.array([(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)]) / np.sqrt(3.0)
-_MAX_DRIFT: Final = 0.004  # largest displacement of the shaken object [m]
-_MAX_ROTATION: Final = np.deg2rad(8.0)  # largest rotation of the shaken object
-_TOUCHING: Final = 0.0005  # [m] largest distance of a contact
-_MAX_SETTLED_DEPTH: Final = MAX_OBJECT_PENETRATION - 1e-5  # [m]
-_MAX_FINAL_SPEED: Final = 0.5  # [rad/s] of the hinges
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Hold:
     """A grasp: a hand that holds an object."""
@@ -505,17 +513,6 @@ def _shake(scene: GraspScene, data: mujoco.MjData) -> None:
         mujoco.mj_step(scene.mj_model, data, nstep=_SHAKE)
     data.xfrc_applied[body] = 0.0
     mujoco.mj_step(scene.mj_model, data, nstep=_REST)
-
-
-_MAX_HELD_DEPTH: Final = MAX_OBJECT_PENETRATION - 1e-6  # [m], with a margin for rounding in the world's frame
-_LIFT_CHANCE: Final = 0.55  # chance that a free digit lifts off the object
-_TAP_CHANCE: Final = 0.3  # chance that a digit that may tap does
-_STILL_CHANCE: Final = 0.3  # chance that the object does not move in the hand
-# Largest opening of a lifted or tapping thumb (first row) and finger: abduction (both ways), MCP, PIP, DIP.
-_LIFT: Final = np.deg2rad([[14.0, 30.0, 20.0, 25.0], [5.0, 45.0, 45.0, 30.0]])
-_TAP: Final = np.deg2rad([[4.0, 10.0, 6.0, 8.0], [1.0, 14.0, 10.0, 6.0]])
-_TREMBLE: Final = np.deg2rad([0.5, 1.2, 1.8, 1.8])  # standard deviations of joints of digits that hold
-_WOBBLE: Final = (0.0006, np.deg2rad(1.2))  # standard deviations of the object in the hand: [m], [rad]
 
 
 class Held(NamedTuple):

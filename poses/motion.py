@@ -47,6 +47,14 @@ _AHEAD: Final = [np.ones(NUM_JOINTS, dtype=bool)] + [
 _WRIST_TIME: Final = (0.6, 2.0)
 _FANS: Final = (0.0, 0.3, 0.6, 1.0, 1.6)  # finger spread at the first stop, relative to "spread"
 
+_FREE_ROTATION: Final = 0.6  # standard deviation about each axis between two positions [rad]
+_FORWARD: Final = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+"""Orientation of a wrist with fingers along +y and the back of the hand up."""
+
+FREE: Final = "free"
+"""The name of a motion without a script: what `sample_motion` makes."""
+_POSES_AT_ONCE: Final = 16
+
 
 @dataclass(frozen=True, slots=True)
 class MotionConfig(Settings):
@@ -135,11 +143,6 @@ def can_be_left(model: HandModel, poses: Float[np.ndarray, "K 20"]) -> Bool[np.n
             path_to_rest(model, poses[number], one_duration, unused)
             free[number] = True
     return free
-
-
-_FREE_ROTATION: Final = 0.6  # standard deviation about each axis between two positions [rad]
-_FORWARD: Final = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-"""Orientation of a wrist with fingers along +y and the back of the hand up."""
 
 
 def free_wrist_path(
@@ -279,11 +282,6 @@ def with_wrist(
     """A motion of these joint angles [rad] with a random path of the wrist."""
     position, quaternion = free_wrist_path(len(angles), config, rng=rng)
     return HandMotion(join_qpos(angles, position=position, quaternion=quaternion), config.rate)
-
-
-FREE: Final = "free"
-"""The name of a motion without a script: what `sample_motion` makes."""
-_POSES_AT_ONCE: Final = 16
 
 
 def _scripts() -> dict[str, dict[str, Any]]:

@@ -42,6 +42,29 @@ _MAX_GAP: Final = 0.003  # [m] between a shifting object and the digits that hol
 _SLIDING, _ROLLING = 0.15, 4.0  # fastest shift of the object in the hand [m/s], [rad/s]
 _MARGIN: Final = 0.9  # share of the limits of speed and acceleration that paths use
 
+_RETREAT_STEP: Final = 0.003  # [m] added to the overlap in each retreat
+_SMOOTHING: Final = 0.25  # [s] window of a retreat
+
+DISTANCE: Final = (0.006, 0.02)
+"""Smallest and largest distance of the tip from its target [m]."""
+SPEED: Final = 0.6
+"""Highest speed of the tip between still targets, without the retreat [m/s]."""
+TURNING: Final = 3.0
+"""Highest rotation speed of the pen between still targets [rad/s]."""
+RETREAT: Final = 0.05
+"""Distance that the tip draws back between two targets [m]."""
+_STAY: Final = (0.15, 0.6)  # shortest and longest time at a target [s]
+PATH: Final = (0.4, 0.9)
+"""Shortest and longest time from target to target [s]."""
+_TILT: Final = 0.6  # standard deviation of the pen's lean from the outward direction, as a tangent
+_UPRIGHT: Final = np.array([0.36, -0.26, 0.9]) / np.linalg.norm([0.36, -0.26, 0.9])
+"""Direction of a pen in the right hand of a person at -y, over a palm that faces down."""
+_ARM: Final = np.array([0.8, -0.6, 0.0])  # direction from the pen to the writing arm
+_CONE: Final = 1.2  # largest angle of the pen from upright [rad]
+_MAX_LEAN: Final = 1.0  # largest lean of the pen from the outward direction, as a tangent
+_MIN_FACING: Final = -0.2  # smallest cosine of a target's outward direction and the upright pen
+_STEADY: Final = 0.15  # [s] standard deviation of the smoothing of outward directions
+
 
 def sample_object_motion(
     model: HandModel, obj: RigidObject, duration: float, *, rng: np.random.Generator
@@ -130,10 +153,6 @@ def _scribble(frames: int, size: float, rate: float, *, rng: np.random.Generator
     return size * swell[:, None] ** 2 * loops
 
 
-_RETREAT_STEP: Final = 0.003  # [m] added to the overlap in each retreat
-_SMOOTHING: Final = 0.25  # [s] window of a retreat
-
-
 def point_pen(
     holder: HandModel,
     other: HandModel,
@@ -186,27 +205,6 @@ def keep_apart(
         window = 2 * int(_SMOOTHING * motion.rate / 2) + 1
         back = uniform_filter1d(maximum_filter1d(needed, window), window)
     raise PoseError("the hands touch, however far one of them draws back")
-
-
-DISTANCE: Final = (0.006, 0.02)
-"""Smallest and largest distance of the tip from its target [m]."""
-SPEED: Final = 0.6
-"""Highest speed of the tip between still targets, without the retreat [m/s]."""
-TURNING: Final = 3.0
-"""Highest rotation speed of the pen between still targets [rad/s]."""
-RETREAT: Final = 0.05
-"""Distance that the tip draws back between two targets [m]."""
-_STAY: Final = (0.15, 0.6)  # shortest and longest time at a target [s]
-PATH: Final = (0.4, 0.9)
-"""Shortest and longest time from target to target [s]."""
-_TILT: Final = 0.6  # standard deviation of the pen's lean from the outward direction, as a tangent
-_UPRIGHT: Final = np.array([0.36, -0.26, 0.9]) / np.linalg.norm([0.36, -0.26, 0.9])
-"""Direction of a pen in the right hand of a person at -y, over a palm that faces down."""
-_ARM: Final = np.array([0.8, -0.6, 0.0])  # direction from the pen to the writing arm
-_CONE: Final = 1.2  # largest angle of the pen from upright [rad]
-_MAX_LEAN: Final = 1.0  # largest lean of the pen from the outward direction, as a tangent
-_MIN_FACING: Final = -0.2  # smallest cosine of a target's outward direction and the upright pen
-_STEADY: Final = 0.15  # [s] standard deviation of the smoothing of outward directions
 
 
 def pointing_path(

@@ -23,6 +23,56 @@ LIBRARIES: Final = ("gestures", "fingerspelling", "numbers", "counting", "grasps
 """Names of all libraries; no two libraries share a name of a gesture."""
 _GESTURE_SPREAD: Final = np.array([12.0, 2.0, -8.0, -18.0])  # [deg] index to little, positive to the thumb
 
+# Couplings between joints, as of a relaxed hand. Sources (docs/angles.md): DIP follows PIP (two thirds on
+# average; Lin, Wu and Huang 2000), abduction dies away as the MCP flexes (collateral ligaments tighten), and
+# neighbors share tendons, so that one finger's flexion drags the next.
+LOW: Final = np.deg2rad([joint.low for joint in JOINTS])
+HIGH: Final = np.deg2rad([joint.high for joint in JOINTS])
+
+_TIGHT_FLEXION: Final = np.deg2rad(85.0)  # MCP flexion from which abduction has its smallest range
+_TIGHT_ABDUCTION: Final = 0.25  # share of the abduction range that remains there
+_DIP_SHARE: Final = 2.0 / 3.0  # DIP flexion as a share of the PIP's
+_DIP_BELOW: Final = np.deg2rad(32.0)  # largest deviation of the DIP below its share of the PIP
+_DIP_ABOVE: Final = np.deg2rad(28.0)  # largest deviation of the DIP above its share of the PIP
+# Largest difference of MCP flexion between neighbors [rad]: index-middle, middle-ring, ring-little.
+_MCP_APART: Final = np.deg2rad([85.0, 70.0, 75.0])
+
+_FLEXION_NOISE: Final = np.deg2rad(6.0)
+_ABDUCTION_NOISE: Final = np.deg2rad(2.0)
+_SWAY: Final = np.deg2rad(3.0)  # standard deviation of all fingers leaning to one side
+# Chance that neighbors curl independently: index-middle, middle-ring, ring-little.
+_SPLIT: Final = np.array([0.3, 0.2, 0.25])
+_NEIGHBOR_CORRELATION: Final = 0.993
+# One standard deviation of a curl that grows from index to little finger, in units of the normals.
+_SLOPE: Final = 0.15 * np.array([-1.5, -0.5, 0.5, 1.5])
+_CURL_DIP_SHARE: Final = 0.68
+_DIP_LAG: Final = np.deg2rad(6.0)
+_DIP_NOISE: Final = np.deg2rad(9.0)
+_MCP_OPEN, _MCP_CLOSED = np.deg2rad([-18.0, 92.0])
+_PIP_OPEN, _PIP_CLOSED = np.deg2rad([-3.0, 112.0])
+_FAN_SPREAD: Final = np.deg2rad([7.0, 1.5, -5.0, -11.0])  # one standard deviation of fanning, index to little
+
+MAX_PENETRATION: Final = 0.001
+"""Deepest self-penetration [m] of a valid pose: skin yields by about this much."""
+_ROUNDING: Final = 1e-6  # [rad] Single precision rounds angles by less.
+_MOST_CROSSED: Final = 0.0045  # [m] Flat fingers that overlap more hide skin that carries markers.
+_THUMB: Final = np.array([joint.name.startswith("thumb") for joint in JOINTS])
+_ABDUCTIONS: Final = np.array([joint.name.endswith("abduction") for joint in JOINTS])
+_FAN: Final = np.deg2rad([1.0, 0.2, -0.6, -1.4])  # one degree of fanning at rest, index to little
+# For fingers that converge beyond their knuckles: the middle finger leans away from the index, too.
+_WIDE_FAN: Final = np.deg2rad([1.0, -0.2, -1.0, -1.8])
+
+SAMPLERS: Final = "handsim.pose_samplers"
+"""Group of entry points of pose samplers."""
+SAMPLER: Final = Expected(
+    "a function (model, num_poses, *, rng), module:name of one, or its entry point",
+    lambda: list_plugins(SAMPLERS),
+)
+"""Description of a sampler in errors on settings."""
+_NOUN: Final = "pose sampler"
+_MAX_ANGLE: Final = 2.0 * np.pi  # largest joint angle that a sampler may return [rad]
+_MAX_WRIST_DISTANCE: Final = 100.0  # largest wrist coordinate that a sampler may return [m]
+
 
 @cache
 def _library(library: str) -> dict[str, NDArray[np.float64]]:
@@ -68,21 +118,6 @@ def load_gestures() -> dict[str, Float[np.ndarray, "20"]]:
     return {name: angles.copy() for name, angles in _gestures().items()}
 
 
-# Couplings between joints, as of a relaxed hand. Sources (docs/angles.md): DIP follows PIP (two thirds on
-# average; Lin, Wu and Huang 2000), abduction dies away as the MCP flexes (collateral ligaments tighten), and
-# neighbors share tendons, so that one finger's flexion drags the next.
-LOW: Final = np.deg2rad([joint.low for joint in JOINTS])
-HIGH: Final = np.deg2rad([joint.high for joint in JOINTS])
-
-_TIGHT_FLEXION: Final = np.deg2rad(85.0)  # MCP flexion from which abduction has its smallest range
-_TIGHT_ABDUCTION: Final = 0.25  # share of the abduction range that remains there
-_DIP_SHARE: Final = 2.0 / 3.0  # DIP flexion as a share of the PIP's
-_DIP_BELOW: Final = np.deg2rad(32.0)  # largest deviation of the DIP below its share of the PIP
-_DIP_ABOVE: Final = np.deg2rad(28.0)  # largest deviation of the DIP above its share of the PIP
-# Largest difference of MCP flexion between neighbors [rad]: index-middle, middle-ring, ring-little.
-_MCP_APART: Final = np.deg2rad([85.0, 70.0, 75.0])
-
-
 def apply_couplings(angles: Float[np.ndarray, "T 20"]) -> Float[np.ndarray, "T 20"]:
     """Clamp angles [rad] to ranges and couplings."""
     coupled = np.clip(angles, LOW, HIGH)
@@ -97,22 +132,6 @@ def apply_couplings(angles: Float[np.ndarray, "T 20"]) -> Float[np.ndarray, "T 2
     follow = _DIP_SHARE * np.maximum(fingers[..., 2], 0.0)
     fingers[..., 3] = np.clip(fingers[..., 3], follow - _DIP_BELOW, follow + _DIP_ABOVE)
     return np.asarray(np.clip(coupled, LOW, HIGH))
-
-
-_FLEXION_NOISE: Final = np.deg2rad(6.0)
-_ABDUCTION_NOISE: Final = np.deg2rad(2.0)
-_SWAY: Final = np.deg2rad(3.0)  # standard deviation of all fingers leaning to one side
-# Chance that neighbors curl independently: index-middle, middle-ring, ring-little.
-_SPLIT: Final = np.array([0.3, 0.2, 0.25])
-_NEIGHBOR_CORRELATION: Final = 0.993
-# One standard deviation of a curl that grows from index to little finger, in units of the normals.
-_SLOPE: Final = 0.15 * np.array([-1.5, -0.5, 0.5, 1.5])
-_CURL_DIP_SHARE: Final = 0.68
-_DIP_LAG: Final = np.deg2rad(6.0)
-_DIP_NOISE: Final = np.deg2rad(9.0)
-_MCP_OPEN, _MCP_CLOSED = np.deg2rad([-18.0, 92.0])
-_PIP_OPEN, _PIP_CLOSED = np.deg2rad([-3.0, 112.0])
-_FAN_SPREAD: Final = np.deg2rad([7.0, 1.5, -5.0, -11.0])  # one standard deviation of fanning, index to little
 
 
 @dataclass(frozen=True, slots=True)
@@ -206,17 +225,6 @@ def _anywhere(count: int, rng: np.random.Generator) -> NDArray[np.float64]:
     return rng.uniform(LOW, HIGH, size=(count, len(LOW)))
 
 
-MAX_PENETRATION: Final = 0.001
-"""Deepest self-penetration [m] of a valid pose: skin yields by about this much."""
-_ROUNDING: Final = 1e-6  # [rad] Single precision rounds angles by less.
-_MOST_CROSSED: Final = 0.0045  # [m] Flat fingers that overlap more hide skin that carries markers.
-_THUMB: Final = np.array([joint.name.startswith("thumb") for joint in JOINTS])
-_ABDUCTIONS: Final = np.array([joint.name.endswith("abduction") for joint in JOINTS])
-_FAN: Final = np.deg2rad([1.0, 0.2, -0.6, -1.4])  # one degree of fanning at rest, index to little
-# For fingers that converge beyond their knuckles: the middle finger leans away from the index, too.
-_WIDE_FAN: Final = np.deg2rad([1.0, -0.2, -1.0, -1.8])
-
-
 def is_valid(
     model: HandModel, angles: Float[np.ndarray, "T 20"], *, max_penetration: float = MAX_PENETRATION
 ) -> Bool[np.ndarray, "T"]:
@@ -297,18 +305,6 @@ def sample_valid_angles(
 ) -> Float[np.ndarray, "T 20"]:
     """Random valid poses [rad] of one hand, inside ranges, couplings and `MAX_PENETRATION`."""
     return make_valid(model, sample_angles(count, mix, rng=rng))
-
-
-SAMPLERS: Final = "handsim.pose_samplers"
-"""Group of entry points of pose samplers."""
-SAMPLER: Final = Expected(
-    "a function (model, num_poses, *, rng), module:name of one, or its entry point",
-    lambda: list_plugins(SAMPLERS),
-)
-"""Description of a sampler in errors on settings."""
-_NOUN: Final = "pose sampler"
-_MAX_ANGLE: Final = 2.0 * np.pi  # largest joint angle that a sampler may return [rad]
-_MAX_WRIST_DISTANCE: Final = 100.0  # largest wrist coordinate that a sampler may return [m]
 
 
 class PoseSampler(Protocol):

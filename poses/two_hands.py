@@ -46,6 +46,18 @@ _WANDER: Final = 0.4  # noise from beat to beat, relative to the noise of the wh
 INTERACTIONS: Final[tuple[str, ...]] = tuple(package_data("poses", "interactions")["interactions"])
 """Names of all interactions."""
 
+_CONTACT_WINDOW: Final = 0.12  # over which backing off is smoothed [s]
+_FINGER_WINDOW: Final = 0.35  # over which closing fingers are smoothed [s]
+_PARTED: Final = (0.08, 0.16)  # distance of the hands before and after an interaction [m]
+# Single poses: share of touching ones, largest distance of the others [m], share with half-closed fingers.
+_TOUCHING, _GAP, _HALF_CLOSED = 0.7, 0.06, 0.3
+
+PAUSE: Final = (0.0, 0.6)
+"""Shortest and longest rest between two meetings [s]."""
+_TRAVEL_TIME: Final = (0.8, 2.5)  # between two positions of the pair [s]
+_ROTATION: Final = 0.5  # standard deviation of the rotation between two positions [rad]
+_MAX_DRAWS: Final = 60
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fingers:
@@ -230,13 +242,6 @@ def _anchors(
     return np.tile(moving.shape.length * np.array(anchor) @ mirror, (len(opened), 1))
 
 
-_CONTACT_WINDOW: Final = 0.12  # over which backing off is smoothed [s]
-_FINGER_WINDOW: Final = 0.35  # over which closing fingers are smoothed [s]
-_PARTED: Final = (0.08, 0.16)  # distance of the hands before and after an interaction [m]
-# Single poses: share of touching ones, largest distance of the others [m], share with half-closed fingers.
-_TOUCHING, _GAP, _HALF_CLOSED = 0.7, 0.06, 0.3
-
-
 class _Course(NamedTuple):
     """The course of a meeting, each array (T,)."""
 
@@ -397,13 +402,6 @@ def _course(variant: dict[str, Any], count: int, rng: np.random.Generator) -> _C
     grip[: sum(map(len, lift[:2]))] = np.concatenate([np.zeros(ends[0]), minimum_jerk(grips[0])])
     grip[len(grip) - ends[1] - grips[1] :] = np.concatenate([1.0 - minimum_jerk(grips[1]), np.zeros(ends[1])])
     return _Course(np.concatenate(beats), np.concatenate(lift), grip)
-
-
-PAUSE: Final = (0.0, 0.6)
-"""Shortest and longest rest between two meetings [s]."""
-_TRAVEL_TIME: Final = (0.8, 2.5)  # between two positions of the pair [s]
-_ROTATION: Final = 0.5  # standard deviation of the rotation between two positions [rad]
-_MAX_DRAWS: Final = 60
 
 
 def sample_two_hand_motion(

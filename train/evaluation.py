@@ -39,6 +39,18 @@ BINS: Final = 15
 LEAST_SURE: Final = 0.02
 """Share of the points that a person might check by hand."""
 
+_CHUNK: Final = 4096
+_BOOTSTRAPS: Final = 1000  # draws of people for a confidence interval
+ACCURACIES: Final = ("slot_accuracy", "point_accuracy", "frame_accuracy")
+"""The figures that have intervals."""
+CLEAN: Final = Corruption(occlude=0, ghosts=0)
+"""Only the order of points is changed."""
+SEEN: Final = "as the rig sees them"
+"""Name of the figures for markers and ghosts as seen by a rig."""
+
+_SAME_POINT: Final = 1e-3  # [m] distance of a point between two files of a capture
+_SAME_CAPTURE: Final = 0.5  # The truth must have this share of a labeled capture's points.
+
 
 @dataclass(slots=True)
 class LabelCounts:
@@ -220,16 +232,6 @@ def print_figures(
         for name in next(iter(columns.values()))
     ]
     print_table([["figure", *(f"{name} [%]" for name in columns)], *shares], title=title)
-
-
-_CHUNK: Final = 4096
-_BOOTSTRAPS: Final = 1000  # draws of people for a confidence interval
-ACCURACIES: Final = ("slot_accuracy", "point_accuracy", "frame_accuracy")
-"""The figures that have intervals."""
-CLEAN: Final = Corruption(occlude=0, ghosts=0)
-"""Only the order of points is changed."""
-SEEN: Final = "as the rig sees them"
-"""Name of the figures for markers and ghosts as seen by a rig."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -569,10 +571,6 @@ def _check_markers(owner: str, has: Sequence[str], knows: Sequence[str]) -> None
     """Refuse markers that are not those of the labeler."""
     if tuple(has) != tuple(knows):
         raise CaptureError(f"{owner} has markers {', '.join(has)}, the labeler knows {', '.join(knows)}")
-
-
-_SAME_POINT: Final = 1e-3  # [m] distance of a point between two files of a capture
-_SAME_CAPTURE: Final = 0.5  # The truth must have this share of a labeled capture's points.
 
 
 def evaluate_labels(labeled: Take | Capture | str | Path, truth: Take | str | Path) -> LabelingReport:

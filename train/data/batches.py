@@ -22,6 +22,12 @@ if TYPE_CHECKING:
 MAX_CHANGED: Final = 100
 """Largest number of points to add to a cloud or to drop from it."""
 
+CORRUPTIONS: Final = "handsim.corruptions"
+"""Group of entry points for corruptions."""
+_NOUN: Final = "corruption"
+_MAX_COORDINATE: Final = 10.0  # [m] largest coordinate of a point relative to the markers' center
+_MAX_POINTS: Final = 512  # largest number of points in a cloud
+
 
 @dataclass(frozen=True, slots=True)
 class Corruption(Settings):
@@ -125,13 +131,6 @@ def _draw_ghosts(
     num_ghosts = rng.integers(0, most + 1, size=batch)
     ghosts[np.arange(most) >= num_ghosts[:, None]] = np.nan
     return ghosts
-
-
-CORRUPTIONS: Final = "handsim.corruptions"
-"""Group of entry points for corruptions."""
-_NOUN: Final = "corruption"
-_MAX_COORDINATE: Final = 10.0  # [m] largest coordinate of a point relative to the markers' center
-_MAX_POINTS: Final = 512  # largest number of points in a cloud
 
 
 class OwnCorruption(Protocol):

@@ -74,6 +74,21 @@ _SMALL_MARKER: Final = 2.0  # [px] diameter of a marker in the picture
 _COVERED: Final = 0.9  # share of the cube in view of two cameras
 _UPSIDE_DOWN: Final = -0.2  # cosine between its up and the world's, below which a camera is upside down
 
+_COLUMNS: Final = (
+    *("by 2 [%]", "by 3 [%]", "missing [%]", "gaps [1/min]"),
+    *("median [ms]", "p95 [ms]", "ghosts", "error [mm]"),
+)
+COLUMNS_TOLD: Final = (
+    "By 2, by 3: share of the marker-frames (every marker of every hand in every frame) that so many "
+    "cameras see. Missing: those without a point, whether unseen, merged with a neighbor or with too few "
+    "rays. Gaps: of one marker, and their lengths. Ghosts: points of a frame that are no marker, where rays "
+    "meet by chance, in mirror images, and of reflections. Losses and reflections are those of `handsim "
+    "simulate` with the same kind of work. Error: root mean square distance from the true center."
+)
+"""Explanation of both tables' columns."""
+_VIEWS: Final = (("from above", 0, 1), ("from the front", 0, 2))
+_ARROW: Final = 0.3  # [m] length of the line that shows a camera's direction
+
 
 class VolumeMap(NamedTuple):
     """Forecast for a hand at each of G points of a volume."""
@@ -398,22 +413,6 @@ def pixels_of_a_marker(rig: CameraRig, point: Float[np.ndarray, "3"]) -> NDArray
 
 def _place(point: Float[np.ndarray, "3"]) -> str:
     return f"({coordinates(point, ', ')}) m"
-
-
-_COLUMNS: Final = (
-    *("by 2 [%]", "by 3 [%]", "missing [%]", "gaps [1/min]"),
-    *("median [ms]", "p95 [ms]", "ghosts", "error [mm]"),
-)
-COLUMNS_TOLD: Final = (
-    "By 2, by 3: share of the marker-frames (every marker of every hand in every frame) that so many "
-    "cameras see. Missing: those without a point, whether unseen, merged with a neighbor or with too few "
-    "rays. Gaps: of one marker, and their lengths. Ghosts: points of a frame that are no marker, where rays "
-    "meet by chance, in mirror images, and of reflections. Losses and reflections are those of `handsim "
-    "simulate` with the same kind of work. Error: root mean square distance from the true center."
-)
-"""Explanation of both tables' columns."""
-_VIEWS: Final = (("from above", 0, 1), ("from the front", 0, 2))
-_ARROW: Final = 0.3  # [m] length of the line that shows a camera's direction
 
 
 def write_rig_page(path: Path, score: RigScore) -> None:

@@ -40,6 +40,25 @@ _ALIGNED_SHARE: Final = 0.6  # share of aligned views in training; others are al
 _TURN_SPREAD: Final = np.radians(12.0)  # [rad] standard deviation of an aligned view's angle
 _REGULARIZATION: Final = 1e-4  # added to the variances of moments, which have no unit
 
+IMAGE_SIZE = 52
+"""Width and height of a depth image [pixel]."""
+MARGIN = 0.1
+"""Empty border on each side, as share of the image."""
+NEAREST, FARTHEST = 0.1, 1.0
+"""Brightness of the nearest and farthest point; 0 is background."""
+SMALLEST_EXTENT = 0.01
+"""Least extent from the mean assumed by the zoom [m]; a single point has no extent."""
+FLAT = 1e-6
+"""Smaller depth ranges are rounding errors [m]; their points get the middle brightness."""
+
+_SEARCH_REJECT: Final = 0.04  # [m] default cost of a point without a label
+_SPREAD: Final = 0.005  # [m] default scale of the confidence
+_ACCEPTED_DISTANCE: Final = 0.01  # [m] A view with a smaller mean distance of labeled points is accepted.
+_ACCEPTED_GHOSTS: Final = 2  # largest number of unlabeled points in an accepted view
+_TOGETHER: Final = (1, 2)  # numbers of first views tried together, before all others
+_TURNS: Final = 2  # number of times that each first view is aligned by the predictions
+_IMAGES: Final = 128  # largest number of images in one call of the network
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MeanHand:
@@ -177,18 +196,6 @@ def _nearest_axes(
     return np.asarray(rotations[nearest][:, :, None] * axes)
 
 
-IMAGE_SIZE = 52
-"""Width and height of a depth image [pixel]."""
-MARGIN = 0.1
-"""Empty border on each side, as share of the image."""
-NEAREST, FARTHEST = 0.1, 1.0
-"""Brightness of the nearest and farthest point; 0 is background."""
-SMALLEST_EXTENT = 0.01
-"""Least extent from the mean assumed by the zoom [m]; a single point has no extent."""
-FLAT = 1e-6
-"""Smaller depth ranges are rounding errors [m]; their points get the middle brightness."""
-
-
 @dataclass(frozen=True, slots=True)
 class ViewFrames:
     """The cameras of a batch of depth images."""
@@ -257,15 +264,6 @@ def _view_frames(
         nearest=nearest,
         depth_ranges=np.where(ranges > FLAT, ranges, 0.0),
     )
-
-
-_SEARCH_REJECT: Final = 0.04  # [m] default cost of a point without a label
-_SPREAD: Final = 0.005  # [m] default scale of the confidence
-_ACCEPTED_DISTANCE: Final = 0.01  # [m] A view with a smaller mean distance of labeled points is accepted.
-_ACCEPTED_GHOSTS: Final = 2  # largest number of unlabeled points in an accepted view
-_TOGETHER: Final = (1, 2)  # numbers of first views tried together, before all others
-_TURNS: Final = 2  # number of times that each first view is aligned by the predictions
-_IMAGES: Final = 128  # largest number of images in one call of the network
 
 
 class _View(NamedTuple):

@@ -30,6 +30,8 @@ from train.settings import CNNConfig, TrainSettings
 
 _TAPS = 9  # weights of a 3x3 filter
 
+_NUM_SPARSE: Final = 10  # layers up to the third filter, after which sparsity no longer helps
+
 
 class SparseFeatures(NamedTuple):
     """Features of a batch of images with a uniform background."""
@@ -201,9 +203,6 @@ def _pair(pixels: NDArray[np.int32], count: int) -> tuple[NDArray[np.int32], NDA
                             outputs += 1
                         sources[outputs - 1, part] = source
     return reached, sources[:outputs]
-
-
-_NUM_SPARSE: Final = 10  # layers up to the third filter, after which sparsity no longer helps
 
 
 class DeepLabelCNN(nn.Module):

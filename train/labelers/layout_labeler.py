@@ -69,6 +69,12 @@ _NETWORK, _PRIOR, _DISTANCES = "network.", "prior.", "distances"
 _MANY_MARKERS: Final = 24  # Larger layouts use fewer poses and clouds, as work is quadratic.
 _POSES_PER_PERSON: Final = 100
 
+MAX_KEPT: Final = 32
+"""Number of labelers in the cache; one takes about four megabytes."""
+NUM_CLOUDS: Final = 15_000
+_BATCH, _LEAST_BATCH = 64, 16  # clouds of a step
+_PEAK_RATE, _WARM_UP = 2e-3, 20  # learning rate; number of steps until it is reached
+
 
 class LayoutLabeler:
     """Labels a glove with the network for any layout and the glove's `mean_features`."""
@@ -181,13 +187,6 @@ def sample_worn_markers(
         (fit,) = wear_gloves(layout, scene.hands, along=slip, around=roll, rng=rng)
         parts.append(fit.attachment.centers(right, right.forward_kinematics(scene.qpos[0])))
     return np.concatenate(parts)
-
-
-MAX_KEPT: Final = 32
-"""Number of labelers in the cache; one takes about four megabytes."""
-NUM_CLOUDS: Final = 15_000
-_BATCH, _LEAST_BATCH = 64, 16  # clouds of a step
-_PEAK_RATE, _WARM_UP = 2e-3, 20  # learning rate; number of steps until it is reached
 
 
 def is_learned(layout: MarkerLayout, rig: CameraRig | str = "figure5") -> bool:

@@ -47,6 +47,19 @@ IMPOSSIBLE: Final = 1e6
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
+_SURE: Final = 0.95  # Pairs of a higher probability are final.
+_MAX_UNSURE: Final = 8  # number of least certain pairs of a labeling that are excluded in turn
+_ROUNDS: Final = 3  # largest number of pairs excluded from a labeling
+_WIDTH: Final = 3  # number of best labelings with which the next round starts
+_MAX_LABELINGS: Final = 1 + _MAX_UNSURE * (1 + (_ROUNDS - 1) * _WIDTH)
+_MAX_EXTRA_COST: Final = 14.0  # [nats, for points plus labels] above the cost of the likeliest labeling
+_PRIOR_WEIGHT: Final = 2.0  # weight of the prior's log-density, chosen on held-out simulated frames
+_GHOST: Final = 4.0  # log-density of a ghost, uniform around the hand [1/m^3]
+_NEAR_COMPONENTS: Final = 40  # number of the prior's components that are considered for a cloud
+_TEMPERATURE: Final = 0.25  # temperature of the odds between labelings, for the confidence
+_MIN_LABELED: Final = 4  # least number of labeled points of a hand
+_MIN_DENSITY: Final = 2.5  # least log-density of a hand per coordinate; true labels have 2.8 to 4.2
+
 
 def pair_probabilities(
     point_scores: Float[np.ndarray, "N M+1"], label_scores: Float[np.ndarray, "M N+1"]
@@ -202,20 +215,6 @@ def balance(
                 for j in range(num_labels + 1):
                     plan[i, j] *= scale
     return plan
-
-
-_SURE: Final = 0.95  # Pairs of a higher probability are final.
-_MAX_UNSURE: Final = 8  # number of least certain pairs of a labeling that are excluded in turn
-_ROUNDS: Final = 3  # largest number of pairs excluded from a labeling
-_WIDTH: Final = 3  # number of best labelings with which the next round starts
-_MAX_LABELINGS: Final = 1 + _MAX_UNSURE * (1 + (_ROUNDS - 1) * _WIDTH)
-_MAX_EXTRA_COST: Final = 14.0  # [nats, for points plus labels] above the cost of the likeliest labeling
-_PRIOR_WEIGHT: Final = 2.0  # weight of the prior's log-density, chosen on held-out simulated frames
-_GHOST: Final = 4.0  # log-density of a ghost, uniform around the hand [1/m^3]
-_NEAR_COMPONENTS: Final = 40  # number of the prior's components that are considered for a cloud
-_TEMPERATURE: Final = 0.25  # temperature of the odds between labelings, for the confidence
-_MIN_LABELED: Final = 4  # least number of labeled points of a hand
-_MIN_DENSITY: Final = 2.5  # least log-density of a hand per coordinate; true labels have 2.8 to 4.2
 
 
 def matching_constants() -> dict[str, float]:

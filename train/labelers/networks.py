@@ -34,6 +34,13 @@ from train.labelers.protocol import Labeler, labeling_threads
 from train.labelers.set_inference import TrainedSetLabeler
 from train.settings import CNNConfig, NetworkConfig, SetLabelerConfig, TrainSettings, batch_recipe
 
+_USUAL_POINTS: Final = 20.0  # divisor of the number of points in a cloud
+_MIN_SHARE: Final = 1e-3  # added to shares of poses, so that logarithms are finite
+_EARLY_WEIGHT: Final = 0.3  # weight of the loss of all comparisons but the last
+_IMPOSSIBLE: Final = -1e4  # score of padding
+
+_MEAN_HAND_FRAMES: Final = 20_000
+
 
 class LabelScores(NamedTuple):
     """Log-probabilities of both outputs of a network."""
@@ -175,12 +182,6 @@ def labeling_loss(scores: LabelScores, truth: Tensor, present: Tensor, *, weight
     of_label = of_label.scatter(1, known, indices)[:, :num_labels]
     label_loss = -scores.labels.gather(-1, of_label[..., None]).mean()
     return weights.points * point_loss + weights.clouds * label_loss
-
-
-_USUAL_POINTS: Final = 20.0  # divisor of the number of points in a cloud
-_MIN_SHARE: Final = 1e-3  # added to shares of poses, so that logarithms are finite
-_EARLY_WEIGHT: Final = 0.3  # weight of the loss of all comparisons but the last
-_IMPOSSIBLE: Final = -1e4  # score of padding
 
 
 @dataclass(frozen=True, slots=True)
@@ -399,9 +400,6 @@ def layout_loss(found: list[LabelScores], truth: Tensor, present: Tensor) -> Ten
     """Loss of all comparisons, see `labeling_loss`."""
     losses = torch.stack([labeling_loss(scores, truth, present) for scores in found])
     return losses[-1] + _EARLY_WEIGHT * losses[:-1].sum()
-
-
-_MEAN_HAND_FRAMES: Final = 20_000
 
 
 def new_network(config: NetworkConfig) -> nn.Module:

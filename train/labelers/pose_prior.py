@@ -30,6 +30,23 @@ _ROUGH, _EXACT = 1e-9, 1e-14  # tolerances of the largest root, relative to its 
 _MAX_COMPONENTS, _MAX_DIRECTIONS = 10_000, 100
 FloatArray = NDArray[np.float64]
 
+_MAX_LEARNED_COMPONENTS: Final = 400
+_FRAMES_PER_COMPONENT: Final = 400
+_MIN_COMPONENTS: Final = 12  # With fewer components a prior knows less than the network.
+_MIN_MEMBERS: Final = 20  # least number of frames of a component
+_DIRECTIONS: Final = 24  # about the degrees of freedom of a hand
+_NOISE: Final = 0.0012  # [m] noise of a marker's coordinate in a capture, from optics and skin
+_NEIGHBOR_FRAMES: Final = 100.0  # weight of the neighbors' covariance, in frames
+_NEIGHBORS: Final = 8
+_ITERATIONS: Final = 4  # iterations of each clustering and alignment
+_RIGID: Final = 6  # degrees of freedom that the alignment removes
+_CHUNK: Final = 8192  # number of frames compared with the centers at once
+_MAX_FRAMES: Final = 200_000
+
+_MAX_FOURS: Final = 3000
+_POSES: Final = 100  # number of poses of a hand of each size
+_RECOGNIZED: Final = 0.98  # Layouts with fewer recognized complete hands resemble their mirror image.
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PosePrior:
@@ -338,20 +355,6 @@ def log_normal(
     return log
 
 
-_MAX_LEARNED_COMPONENTS: Final = 400
-_FRAMES_PER_COMPONENT: Final = 400
-_MIN_COMPONENTS: Final = 12  # With fewer components a prior knows less than the network.
-_MIN_MEMBERS: Final = 20  # least number of frames of a component
-_DIRECTIONS: Final = 24  # about the degrees of freedom of a hand
-_NOISE: Final = 0.0012  # [m] noise of a marker's coordinate in a capture, from optics and skin
-_NEIGHBOR_FRAMES: Final = 100.0  # weight of the neighbors' covariance, in frames
-_NEIGHBORS: Final = 8
-_ITERATIONS: Final = 4  # iterations of each clustering and alignment
-_RIGID: Final = 6  # degrees of freedom that the alignment removes
-_CHUNK: Final = 8192  # number of frames compared with the centers at once
-_MAX_FRAMES: Final = 200_000
-
-
 def learn_pose_prior(markers: Float[np.ndarray, "T M 3"], *, rng: np.random.Generator) -> PosePrior | None:
     """Learn the prior of right hands from complete frames [m]; None for too few frames or markers."""
     markers = markers[np.isfinite(markers).all(axis=(1, 2))].astype(np.float64, copy=False)
@@ -449,11 +452,6 @@ def _shrunk_covariances(
             sizes[cluster] + _NEIGHBOR_FRAMES
         )
     return covariances
-
-
-_MAX_FOURS: Final = 3000
-_POSES: Final = 100  # number of poses of a hand of each size
-_RECOGNIZED: Final = 0.98  # Layouts with fewer recognized complete hands resemble their mirror image.
 
 
 class SideClassifier:

@@ -40,6 +40,61 @@ _KINDS: Final = {"set": "A set labeler", "cnn": "The network of Han et al. 2018"
 _MIN_SHARE: Final = 0.01  # [%] lower end of the confusions' color scale
 _MAX_WRITTEN: Final = 30  # largest number of classes for which cells have room for numbers
 
+_CARD: Final = """\
+---
+license: {license}
+library_name: handsim
+pipeline_tag: other
+tags:
+- handsim
+- motion-capture
+- hand-tracking
+- point-cloud
+- marker-labeling
+---
+
+# Labeler of hand markers: {layout}
+
+{kind} of handsim {version}. It gets the points of one
+hand in one frame, in meters, and says for each which of {count} markers it is, or that
+it is a ghost.
+
+Markers: {markers}.
+
+## Data
+
+Trained on {trained_on}: {num_frames:,} of them, from `handsim generate` with
+seed {seed}, of which training saw {samples:,} clouds. `labeler.json` holds
+every setting.
+
+## Figures
+
+On {people}, in percent, with the 95 % interval over people:
+
+{figures}
+
+## Use
+
+```
+handsim label take.c3d --glove THIS_FOLDER/{glove} --labeler THIS_FOLDER --out labeled.c3d
+handsim export THIS_FOLDER --out labeler.onnx
+```
+
+In Python, `train.load_labeler(folder).label_frames([points])`. The folder needs
+`labeler.safetensors` and `labeler.json`; both are read without unpickling.
+
+## Limits
+
+- One hand in one frame; it does not tell left from right.
+- Markers of this layout only; if moved by more than a centimeter they need a labeler of their own.
+- Computed in float32. In bfloat16, which some runtimes choose by themselves, labels change.
+"""
+_CARD_FIGURES: Final = {
+    "slot_accuracy": "labels and gaps that are right",
+    "point_accuracy": "points labeled right",
+    "frame_accuracy": "frames without a mistake",
+}
+
 
 def write_run_page(out: Path, card: dict[str, Any], history: History, report: LabelingReport) -> Path:
     """Write the page of a run and return its path; the report is on frames with the paper's corruption."""
@@ -262,62 +317,6 @@ def draw_reliability(figure: Figure, bins: Reliability, error: float) -> None:
     lower.set_xlabel("confidence [%]")
     lower.set_xlim(0.0, 100.5)
     figure.align_ylabels()
-
-
-_CARD: Final = """\
----
-license: {license}
-library_name: handsim
-pipeline_tag: other
-tags:
-- handsim
-- motion-capture
-- hand-tracking
-- point-cloud
-- marker-labeling
----
-
-# Labeler of hand markers: {layout}
-
-{kind} of handsim {version}. It gets the points of one
-hand in one frame, in meters, and says for each which of {count} markers it is, or that
-it is a ghost.
-
-Markers: {markers}.
-
-## Data
-
-Trained on {trained_on}: {num_frames:,} of them, from `handsim generate` with
-seed {seed}, of which training saw {samples:,} clouds. `labeler.json` holds
-every setting.
-
-## Figures
-
-On {people}, in percent, with the 95 % interval over people:
-
-{figures}
-
-## Use
-
-```
-handsim label take.c3d --glove THIS_FOLDER/{glove} --labeler THIS_FOLDER --out labeled.c3d
-handsim export THIS_FOLDER --out labeler.onnx
-```
-
-In Python, `train.load_labeler(folder).label_frames([points])`. The folder needs
-`labeler.safetensors` and `labeler.json`; both are read without unpickling.
-
-## Limits
-
-- One hand in one frame; it does not tell left from right.
-- Markers of this layout only; if moved by more than a centimeter they need a labeler of their own.
-- Computed in float32. In bfloat16, which some runtimes choose by themselves, labels change.
-"""
-_CARD_FIGURES: Final = {
-    "slot_accuracy": "labels and gaps that are right",
-    "point_accuracy": "points labeled right",
-    "frame_accuracy": "frames without a mistake",
-}
 
 
 def write_model_card(out: Path, card: dict[str, Any]) -> Path:

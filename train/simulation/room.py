@@ -38,6 +38,8 @@ SKIN_CHUNK: Final = 16
 _CHUNK: Final = 256  # number of frames whose lines of sight are in memory together
 _MIN_BODY_MARKERS: Final = 3  # An object needs this many markers to be tracked as a rigid body.
 
+_SAME_ROOM: Final[dict[str, str]] = {"real-like": "hand-hand", "free": "single-hand"}
+
 
 @dataclass(frozen=True, slots=True)
 class RoomConfig(Settings):
@@ -111,7 +113,6 @@ TWINS: Final[dict[str, Twin]] = {
     "hand-pen": Twin.of(4511, 3.0, (0.002, 0.17, 1.4, 6), draw=15),
     "hand-controller": Twin.of(2645, 1.7, (0.115, 0.0, 1.0, 1), draw=2),
 }
-_SAME_ROOM: Final[dict[str, str]] = {"real-like": "hand-hand", "free": "single-hand"}
 
 
 def usual_room(kind: SimulatedKind) -> RoomConfig:

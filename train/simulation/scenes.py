@@ -51,6 +51,38 @@ _PAUSE_BETWEEN_CONTACTS: Final = (2.0, 4.0)  # [s]
 _WRIST_ROTATION: Final = 0.5  # [rad] standard deviation about each axis
 _FREE_SCRIPT, _RESTING_SCRIPT = "piano", "typing"
 
+# A calibration capture.
+_MAX_DRAWS: Final = 20
+_STARTS: Final = ("pinch_pad", "pinch_tip")  # gestures before touches
+_TURNING: Final = 0.7  # [rad] standard deviation of a calibrated wrist's turns about each axis
+_JITTER: Final = np.deg2rad(8.0)  # [rad] standard deviation of these gestures' joint angles
+_TOUCHING: Final = MotionConfig(durations=(0.4, 0.8), hold=0.8)
+_FREE: Final = MotionConfig(durations=(0.3, 0.9), hold=0.2)
+
+# Realistic hands, after the published captures of Han et al. 2018 (docs/room.md): no pose of our hand model
+# comes closer to the markers than 1.5 mm per axis, similar poses share three tenths of that variance, and
+# half of the captures are about twice as fast as simulated hands.
+NUM_FRAMES: Final = 3000
+"""Default number of frames of real-like and free takes."""
+SPEED: Final = 2
+"""Speed of realistic hands relative to the other takes."""
+_SLIP_ALONG, _SLIP_AROUND = 0.1, np.deg2rad(10.0)  # slip of a glove [bone lengths, rad], as in training sets
+
+# Markers of others move rigidly with an arm, a thing or a person.
+MAX_OTHERS: Final = 60
+"""Largest number of markers of others."""
+_STRAIGHT: Final = 0.6  # weight of the hand's direction in that of the forearm
+_SHOULDER: Final = (0.45, 0.18, 0.25)  # [m] behind the hands, beside and above them
+_WRIST: Final = ((0.03, 0.028, 0.02), (0.035, -0.028, 0.02))  # [m] behind the wrist, across, above
+_ELBOW: Final = (0.26, 0.03, 0.02)
+_FOREARM: Final = ((0.12, 0.0, 0.03), (0.2, -0.03, 0.02))
+_THING: Final = ((0.10, 0.0, -0.06), (0.14, 0.03, -0.09), (0.17, -0.02, -0.07), (0.21, 0.01, -0.12))  # [m]
+_HEAD: Final = ((0.09, 0.0, 0.25), (-0.09, 0.0, 0.25), (0.0, 0.08, 0.27), (0.0, -0.08, 0.2))  # [m]
+_BACK: Final = ((-0.12, 0.05, -0.1), (-0.12, -0.05, -0.25))
+_PERSON: Final = 1.2  # [m] distance of the other person
+_SWAY: Final = 0.03  # [m] half side of the cube in which a swaying body stays
+_BODY_SIZE: Final = (0.3, 0.3, 0.7)  # [m] half sides of the box of the other person's markers
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SceneMotion:
@@ -140,15 +172,6 @@ def _gloved(
     return tuple(GlovedHand(fit, motion.qpos[:num_frames]) for fit, motion in zip(fits, motions, strict=True))
 
 
-# A calibration capture.
-_MAX_DRAWS: Final = 20
-_STARTS: Final = ("pinch_pad", "pinch_tip")  # gestures before touches
-_TURNING: Final = 0.7  # [rad] standard deviation of a calibrated wrist's turns about each axis
-_JITTER: Final = np.deg2rad(8.0)  # [rad] standard deviation of these gestures' joint angles
-_TOUCHING: Final = MotionConfig(durations=(0.4, 0.8), hold=0.8)
-_FREE: Final = MotionConfig(durations=(0.3, 0.9), hold=0.2)
-
-
 @dataclass(frozen=True, slots=True)
 class CalibrationTakeConfig(Settings):
     """Exercises of a calibration capture."""
@@ -213,38 +236,12 @@ def _touch_fingers(model: HandModel, rng: np.random.Generator) -> list[NDArray[n
     return poses
 
 
-# Realistic hands, after the published captures of Han et al. 2018 (docs/room.md): no pose of our hand model
-# comes closer to the markers than 1.5 mm per axis, similar poses share three tenths of that variance, and
-# half of the captures are about twice as fast as simulated hands.
-NUM_FRAMES: Final = 3000
-"""Default number of frames of real-like and free takes."""
-SPEED: Final = 2
-"""Speed of realistic hands relative to the other takes."""
-_SLIP_ALONG, _SLIP_AROUND = 0.1, np.deg2rad(10.0)  # slip of a glove [bone lengths, rad], as in training sets
-
-
 def sample_real_like_scene(layout: MarkerLayout, num_frames: int, *, rng: np.random.Generator) -> SceneMotion:
     """Two hands of an adult or a child that meet and part, with markers that move with the skin."""
     models = sorted(sample_hands(EVERYBODY, rng=rng), key=lambda model: model.shape.side, reverse=True)
     fits = wear_gloves(layout, models, along=_SLIP_ALONG, around=_SLIP_AROUND, rng=rng)
     fast = sample_scene_motion("hand-hand", fits, SPEED * num_frames, rng=rng).faster(SPEED)
     return dataclasses.replace(fast, skin=tuple(move_skin(hand, rng=rng) for hand in fast.hands))
-
-
-# Markers of others move rigidly with an arm, a thing or a person.
-MAX_OTHERS: Final = 60
-"""Largest number of markers of others."""
-_STRAIGHT: Final = 0.6  # weight of the hand's direction in that of the forearm
-_SHOULDER: Final = (0.45, 0.18, 0.25)  # [m] behind the hands, beside and above them
-_WRIST: Final = ((0.03, 0.028, 0.02), (0.035, -0.028, 0.02))  # [m] behind the wrist, across, above
-_ELBOW: Final = (0.26, 0.03, 0.02)
-_FOREARM: Final = ((0.12, 0.0, 0.03), (0.2, -0.03, 0.02))
-_THING: Final = ((0.10, 0.0, -0.06), (0.14, 0.03, -0.09), (0.17, -0.02, -0.07), (0.21, 0.01, -0.12))  # [m]
-_HEAD: Final = ((0.09, 0.0, 0.25), (-0.09, 0.0, 0.25), (0.0, 0.08, 0.27), (0.0, -0.08, 0.2))  # [m]
-_BACK: Final = ((-0.12, 0.05, -0.1), (-0.12, -0.05, -0.25))
-_PERSON: Final = 1.2  # [m] distance of the other person
-_SWAY: Final = 0.03  # [m] half side of the cube in which a swaying body stays
-_BODY_SIZE: Final = (0.3, 0.3, 0.7)  # [m] half sides of the box of the other person's markers
 
 
 def other_markers(scene: SceneMotion, count: int, *, rng: np.random.Generator) -> Float[np.ndarray, "T Q 3"]:
