@@ -52,77 +52,6 @@ _SAME_POINT: Final = 1e-3  # [m] distance of a point between two files of a capt
 _SAME_CAPTURE: Final = 0.5  # The truth must have this share of a labeled capture's points.
 
 
-@dataclass(slots=True)
-class LabelCounts:
-    """Running counts of right and wrong labels.
-
-    Precision is NaN if nothing was occluded, or no point was a ghost: it could only be zero.
-    """
-
-    frames: int = 0
-    frames_right: int = 0
-    slots: int = 0
-    slots_right: int = 0
-    occluded: int = 0
-    occluded_given: int = 0
-    occluded_right: int = 0
-    confusion: Int[np.ndarray, "M+1 M+1"] = field(
-        default_factory=lambda: np.zeros((0, 0), dtype=np.int64), compare=False
-    )
-    """Points by true label (rows) and given label (columns): markers in label order, then ghost.
-    Empty before the first frame."""
-
-    def add(
-        self, labels: Int[np.ndarray, "N"], truth: Int[np.ndarray, "N"], num_labels: int
-    ) -> Bool[np.ndarray, "M"]:
-        """Count one frame with its labels and the true ones, -1 for a ghost; return which slots are right."""
-        given, true = _slots(labels, num_labels), _slots(truth, num_labels)
-        right: np.ndarray = given == true
-        self.frames += 1
-        self.frames_right += bool(right.all() and (labels == truth).all())
-        self.slots += num_labels
-        self.slots_right += int(right.sum())
-        self.occluded += int((true < 0).sum())
-        self.occluded_given += int((given < 0).sum())
-        self.occluded_right += int(((given < 0) & (true < 0)).sum())
-        if not self.confusion.size:
-            self.confusion = np.zeros((num_labels + 1, num_labels + 1), dtype=np.int64)
-        np.add.at(self.confusion, (truth, labels), 1)  # -1, a ghost, is the last row and column
-        return right
-
-    def figures(self) -> dict[str, float]:
-        """All figures by name: shares in [0, 1], NaN if there was nothing to count."""
-        counts = self.numbers()
-        occluded, occluded_right = counts["occluded"], counts["occluded_right"]
-        ghosts, ghosts_right, nan = counts["ghosts"], counts["ghosts_right"], float("nan")
-        return {
-            "slot_accuracy": _share(self.slots_right, self.slots),
-            "point_accuracy": _share(int(np.trace(self.confusion)), counts["points"]),
-            "frame_accuracy": _share(self.frames_right, self.frames),
-            "occlusion_ratio": _share(occluded, self.slots),
-            "occlusion_precision": _share(occluded_right, counts["occluded_given"]) if occluded else nan,
-            "occlusion_recall": _share(occluded_right, occluded),
-            "ghost_ratio": _share(ghosts, self.slots),
-            "ghost_precision": _share(ghosts_right, counts["ghosts_given"]) if ghosts else nan,
-            "ghost_recall": _share(ghosts_right, ghosts),
-            "macro_f1": macro_f1(self.confusion),
-        }
-
-    def numbers(self) -> dict[str, int]:
-        """The counts behind the shares of occlusions and ghosts."""
-        confusion = self.confusion if self.confusion.size else np.zeros((1, 1), dtype=np.int64)
-        return {
-            "slots": self.slots,
-            "points": int(confusion.sum()),
-            "occluded": self.occluded,
-            "occluded_given": self.occluded_given,
-            "occluded_right": self.occluded_right,
-            "ghosts": int(confusion[-1].sum()),
-            "ghosts_given": int(confusion[:, -1].sum()),
-            "ghosts_right": int(confusion[-1, -1]),
-        }
-
-
 def macro_f1(confusion: Int[np.ndarray, "K K"]) -> float:
     """Mean F1 of the classes that occur as true (rows) or given labels; NaN if none does."""
     occurs = confusion.sum(axis=0) + confusion.sum(axis=1)
@@ -310,7 +239,7 @@ Frames = tuple[list[Float[np.ndarray, "N 3"]], list[Int[np.ndarray, "N"]]]
 
 def evaluate_frames(labeler: Labeler, parts: Iterable[Frames]) -> LabelingReport:
     """Label points with known truth, and count errors."""
-    return _count(
+    return count_labels(
         labeler.marker_names,
         (
             (labeling.labels, labeling.confidence, truth)
@@ -320,36 +249,70 @@ def evaluate_frames(labeler: Labeler, parts: Iterable[Frames]) -> LabelingReport
     )
 
 
-def _count(
+def count_labels(
     names: tuple[str, ...], frames: Iterable[tuple[NDArray[Any], NDArray[Any], NDArray[Any]]]
 ) -> LabelingReport:
-    """Count errors in frames of given labels, their confidence, and true labels.
+    """Count errors in frames of given labels, their confidence, and true labels, -1 for a ghost.
 
-    Labels with NaN as confidence are left out of the figures on confidence.
+    Labels with NaN as confidence are left out of the figures on confidence. Precision is NaN if nothing was
+    occluded, or no point was a ghost: it could only be zero.
     """
     num_labels = len(names)
-    counts = LabelCounts(confusion=np.zeros((num_labels + 1, num_labels + 1), dtype=np.int64))
-    right_slots: list[NDArray[np.bool_]] = []
+    confusion = np.zeros((num_labels + 1, num_labels + 1), dtype=np.int64)
+    slots: list[tuple[NDArray[np.int64], NDArray[np.int64]]] = []
     confidences: list[NDArray[np.float64]] = [np.zeros(0)]
     right: list[NDArray[np.bool_]] = [np.zeros(0, dtype=np.bool_)]
     for labels, confidence_of, truth in frames:
-        right_slots.append(counts.add(labels, truth, num_labels))
+        slots.append((_slots(labels, num_labels), _slots(truth, num_labels)))
+        np.add.at(confusion, (truth, labels), 1)  # -1, a ghost, is the last row and column
         confidences.append(confidence_of)
         right.append(labels == truth)
+    given, true = np.array(slots, dtype=np.int64).reshape(-1, 2, num_labels).swapaxes(0, 1)
+    right_slots = given == true
     confidence, is_right = np.concatenate(confidences), np.concatenate(right)
     known = np.isfinite(confidence)
+    numbers = {
+        "slots": true.size,
+        "points": int(confusion.sum()),
+        "occluded": int((true < 0).sum()),
+        "occluded_given": int((given < 0).sum()),
+        "occluded_right": int(((given < 0) & (true < 0)).sum()),
+        "ghosts": int(confusion[-1].sum()),
+        "ghosts_given": int(confusion[:, -1].sum()),
+        "ghosts_right": int(confusion[-1, -1]),
+    }
+    occluded, found = numbers["occluded"], numbers["occluded_right"]
+    ghosts, nan = numbers["ghosts"], float("nan")
     figures = {
-        **counts.figures(),
+        "slot_accuracy": _share(int(right_slots.sum()), true.size),
+        "point_accuracy": _share(int(np.trace(confusion)), numbers["points"]),
+        "frame_accuracy": _share(sum(bool(one.all()) for one in right[1:]), len(true)),
+        "occlusion_ratio": _share(occluded, true.size),
+        "occlusion_precision": _share(numbers["occluded_right"], numbers["occluded_given"])
+        if occluded
+        else nan,
+        "occlusion_recall": _share(found, occluded),
+        "ghost_ratio": _share(ghosts, true.size),
+        "ghost_precision": _share(numbers["ghosts_right"], numbers["ghosts_given"]) if ghosts else nan,
+        "ghost_recall": _share(numbers["ghosts_right"], ghosts),
+        "macro_f1": macro_f1(confusion),
         "calibration_error": expected_calibration_error(confidence[known], is_right[known]),
         "error_without_least_sure": error_without(confidence[known], is_right[known]),
     }
-    slots = np.array(right_slots, dtype=np.bool_).reshape(-1, num_labels)
     num_points = np.array([len(one) for one in right[1:]], dtype=np.int64)
-    by_marker = slots.sum(axis=0) / max(1, counts.frames)
+    by_marker = right_slots.sum(axis=0) / max(1, len(true))
     return LabelingReport(
-        figures, by_marker, counts.frames, counts.confusion, confidence, is_right, counts.numbers(), slots,
-        names, num_points,
-    )  # fmt: skip
+        figures,
+        by_marker,
+        len(true),
+        confusion,
+        confidence,
+        is_right,
+        numbers,
+        right_slots,
+        names,
+        num_points,
+    )
 
 
 def evaluate_markers(
@@ -628,7 +591,7 @@ def evaluate_labels(labeled: Take | Capture | str | Path, truth: Take | str | Pa
     order = np.argsort(frames, kind="stable")
     starts = np.searchsorted(frames[order], np.arange(1, given.num_frames))
     by_frame = (np.split(one[order], starts) for one in (labels, confidence, true))
-    report = _count(names, zip(*by_frame, strict=True))
+    report = count_labels(names, zip(*by_frame, strict=True))
     report.numbers["points_of_truth_alone"] = count - int((~alone).sum())
     report.numbers["points_of_capture_alone"] = int(alone.sum())
     return dataclasses.replace(report, groups=actual.times.astype(np.int64), grouped_by="seconds")

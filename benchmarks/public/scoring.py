@@ -26,11 +26,16 @@ from benchmarks.record import number_table
 from handsim import HandSimWarning, __version__
 from handsim.hand.model import KEYPOINT_NAMES
 from handsim.hand.shape import NUM_KEYPOINTS
-from train.evaluation import LabelCounts
+from train.evaluation import count_labels
 
 NEAR: Final = 0.005
 """Distance from the truth within which a joint counts as found [m]."""
 POSE_SHARES: Final = ("posed", "within_5mm")
+LABEL_SHARES: Final = (
+    *("slot_accuracy", "point_accuracy", "frame_accuracy"),
+    *("occlusion_ratio", "occlusion_precision", "occlusion_recall"),
+    *("ghost_ratio", "ghost_precision", "ghost_recall", "macro_f1"),
+)
 _MOST_TOLD: Final = 5
 _COLUMNS: Final = {
     "frame_accuracy": "frames [%]",
@@ -52,7 +57,7 @@ class CaptureScore:
 
     capture: BenchmarkCapture
     figures: dict[str, float]
-    """Shares in [0, 1] of `train.evaluation.LabelCounts`; `posed`, the share of joints that were
+    """Shares in [0, 1] of `train.evaluation.count_labels`; `posed`, the share of joints that were
     given; `within_5mm`, of those that are right to 5 mm; `mpjpe`, mean distance of joints from the truth [m];
     `angle_error`, mean absolute error of joint angles [rad]. NaN where nothing was counted."""
     joint_errors: Float[np.ndarray, "21"]
@@ -134,9 +139,11 @@ def score_capture(
         present: Where the capture has points.
         num_labels: Number of labels.
     """
-    counts = LabelCounts()
-    for given, true, here in zip(result.labels, truth.labels, present, strict=True):
-        counts.add(given[here].astype(np.int64), true[here].astype(np.int64), num_labels)
+    frames = (
+        (given[here].astype(np.int64), np.full(here.sum(), np.nan), true[here].astype(np.int64))
+        for given, true, here in zip(result.labels, truth.labels, present, strict=True)
+    )
+    labels = count_labels(tuple(map(str, range(num_labels))), frames).figures
     errors = np.full(NUM_KEYPOINTS, np.nan)
     posed, near, mpjpe, angle = (np.nan,) * 4
     if result.joints is not None and truth.joints is not None:
@@ -148,7 +155,7 @@ def score_capture(
     if result.angles is not None and truth.angles is not None:
         angle = _mean(np.abs(result.angles.astype(np.float64) - truth.angles))
     figures = {
-        **counts.figures(),
+        **{name: labels[name] for name in LABEL_SHARES},
         "posed": posed,
         "within_5mm": near,
         "mpjpe": mpjpe,
@@ -222,7 +229,7 @@ def _completed(capture: BenchmarkCapture, score: CaptureScore | None, posed: boo
     """
     zeros = dict.fromkeys(POSE_SHARES, 0.0) if posed else {}
     if score is None:
-        shares = dict.fromkeys(LabelCounts().figures(), 0.0)
+        shares = dict.fromkeys(LABEL_SHARES, 0.0)
         # Those of the capture itself are no merit of a result.
         shares |= dict.fromkeys(("occlusion_ratio", "ghost_ratio"), np.nan)
         figures = shares | dict.fromkeys((*POSE_SHARES, "mpjpe", "angle_error"), np.nan) | zeros

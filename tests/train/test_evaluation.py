@@ -16,7 +16,7 @@ from train import Corruption, Labeling, evaluate_labeler, evaluate_labels, simul
 from train.evaluation import (
     BINS,
     History,
-    LabelCounts,
+    count_labels,
     error_without,
     expected_calibration_error,
     print_figures,
@@ -34,19 +34,23 @@ def _one_each(pairs):
     return table[:, 0], table[:, 1]
 
 
+def counted(num_labels, *frames):
+    """The report on frames of labels and truth."""
+    names = tuple(map(str, range(num_labels)))
+    return count_labels(names, ((labels, np.full(len(labels), np.nan), truth) for labels, truth in frames))
+
+
 def test_a_frame_counted_by_hand():
-    counts = LabelCounts()
     # Points: marker 0, marker 2, a ghost. Marker 1 is hidden. The labeler takes the ghost for marker 1.
-    counts.add(np.array([0, 2, 1]), np.array([0, 2, -1]), num_labels=3)
-    figures = counts.figures()
+    wrong = np.array([0, 2, 1]), np.array([0, 2, -1])
+    figures = counted(3, wrong).figures
     assert figures["slot_accuracy"] == pytest.approx(2 / 3)
     assert figures["point_accuracy"] == pytest.approx(2 / 3)
     assert figures["frame_accuracy"] == 0.0
     assert figures["occlusion_recall"] == 0.0
     assert figures["ghost_recall"] == 0.0
     assert np.isnan(figures["ghost_precision"])
-    counts.add(np.array([1, 0, -1]), np.array([1, 0, -1]), num_labels=3)
-    figures = counts.figures()
+    figures = counted(3, wrong, (np.array([1, 0, -1]), np.array([1, 0, -1]))).figures
     assert figures["frame_accuracy"] == 0.5
     assert figures["occlusion_recall"] == 0.5
     assert figures["occlusion_precision"] == 1.0
@@ -55,9 +59,7 @@ def test_a_frame_counted_by_hand():
 
 
 def test_an_empty_frame_is_all_occluded_and_figures_are_printed_in_percent(capsys):
-    counts = LabelCounts()
-    counts.add(np.zeros(0, dtype=int), np.zeros(0, dtype=int), num_labels=19)
-    figures = counts.figures()
+    figures = counted(19, (np.zeros(0, dtype=int), np.zeros(0, dtype=int))).figures
     assert figures["slot_accuracy"] == figures["occlusion_recall"] == 1.0
     print_figures({"clean": {**figures, "macro_f1": 0.98765}}, title="Figures")
     said = capsys.readouterr().out
@@ -65,16 +67,16 @@ def test_an_empty_frame_is_all_occluded_and_figures_are_printed_in_percent(capsy
 
 
 def test_confusion_and_macro_f1_by_hand():
-    counts = LabelCounts()
-    assert np.isnan(counts.figures()["macro_f1"])
+    assert np.isnan(counted(4).figures["macro_f1"])
     # Marker 3 neither occurs nor is said: it is no class of these frames.
-    counts.add(np.array([0, 1, -1, 2]), np.array([0, 2, -1, -1]), num_labels=4)
-    counts.add(np.array([0, -1]), np.array([0, 2]), num_labels=4)
+    report = counted(
+        4, (np.array([0, 1, -1, 2]), np.array([0, 2, -1, -1])), (np.array([0, -1]), np.array([0, 2]))
+    )
     wanted = np.zeros((5, 5), dtype=int)
     wanted[0, 0], wanted[2, 1], wanted[2, 4], wanted[4, 4], wanted[4, 2] = 2, 1, 1, 1, 1
-    np.testing.assert_array_equal(counts.confusion, wanted)
+    np.testing.assert_array_equal(report.confusion, wanted)
     # F1 is 1 for marker 0, 0 for 1 (said, never there) and 2 (there, never said right), 1/2 for ghosts.
-    assert counts.figures()["macro_f1"] == pytest.approx(1.5 / 4)
+    assert report.figures["macro_f1"] == pytest.approx(1.5 / 4)
 
 
 @given(
@@ -83,14 +85,12 @@ def test_confusion_and_macro_f1_by_hand():
     )
 )
 def test_confusion_agrees_with_the_counts(frames):
-    counts = LabelCounts()
-    for labels, truth in frames:
-        counts.add(labels, truth, num_labels=7)
-    confusion, figures = counts.confusion, counts.figures()
+    report = counted(7, *frames)
+    confusion, figures = report.confusion, report.figures
     nothing = np.zeros(0, dtype=np.int64)
     given = np.concatenate([nothing, *(labels for labels, _ in frames)])
     true = np.concatenate([nothing, *(truth for _, truth in frames)])
-    assert confusion.sum() == counts.numbers()["points"] == len(true)
+    assert confusion.sum() == report.numbers["points"] == len(true)
     assert confusion.trace() == (given == true).sum()
     if frames:
         assert confusion[-1].sum() == (true < 0).sum() and confusion[:, -1].sum() == (given < 0).sum()

@@ -34,7 +34,7 @@ from track.kinematics.marker_kinematics import hand_arrays
 from track.kinematics.pose_spread import NOT_SMOOTHED, known_hand, pose_spreads, with_keypoints
 from track.user import AnyGlove
 from train.data.batches import Corruption, corrupt, paper_corruption
-from train.evaluation import LabelCounts, LabelingReport, cloud_frames, evaluate_frames, evaluate_labeler
+from train.evaluation import LabelingReport, cloud_frames, count_labels, evaluate_frames, evaluate_labeler
 from train.forecast.rig_forecast import ObservedHand, observe_motion, observe_poses
 from train.forecast.settings import POSES, TWINS, ScoreGloveSettings
 from train.labelers.layout_labeler import LayoutLabeler
@@ -346,9 +346,9 @@ def try_take(truth: Take, layout: MarkerLayout, labeler: Labeler) -> Trial:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", HandSimWarning)
             take = make(capture, glove=layout, labeler=labeler)
-        share, counts = _counted(truth, take)
-        slots[name], frames[name] = share.mean(axis=0), counts.frames_right / counts.frames
-        wrong.append(_wrong_throughout(layout.names, share, counts) or _doubtful(take))
+        share, report = _counted(truth, take)
+        slots[name], frames[name] = share.mean(axis=0), report.figures["frame_accuracy"]
+        wrong.append(_wrong_throughout(layout.names, share, report) or _doubtful(take))
     tracked = take  # by the last method
     errors = [
         (tracked.qpos[:, tracked.hand_index(hand.side), 7:] - truth.qpos[:, number, 7:]) ** 2
@@ -385,11 +385,11 @@ def _merged(parts: Sequence[Iterable[Alternative]]) -> tuple[Alternative, ...]:
 
 
 def _wrong_throughout(
-    names: Sequence[str], share: Float[np.ndarray, "H M"], counts: LabelCounts
+    names: Sequence[str], share: Float[np.ndarray, "H M"], report: LabelingReport
 ) -> tuple[Alternative, ...]:
     """What is wrong with the labels of a take in most frames, in the words of its alternatives."""
     found, count = {}, len(names)
-    called = counts.confusion.argmax(axis=1)
+    called = report.confusion.argmax(axis=1)
     for slot in np.flatnonzero(share < 0.5):
         mine, given = int(slot % count), int(called[slot])
         markers: tuple[int, ...] = (mine,)
@@ -430,26 +430,24 @@ def _root_mean(squares: Float[np.ndarray, "T 20"]) -> Float[np.ndarray, "20"]:
 
 def right_shares(truth: Take, take: Take) -> tuple[Float[np.ndarray, "M"], float]:
     """Share of the frames in which each marker of the true hands is right, and share of right frames."""
-    share, counts = _counted(truth, take)
-    return share.mean(axis=0), counts.frames_right / counts.frames
+    share, report = _counted(truth, take)
+    return share.mean(axis=0), report.figures["frame_accuracy"]
 
 
-def _counted(truth: Take, take: Take) -> tuple[Float[np.ndarray, "H M"], LabelCounts]:
-    """Share of the frames in which each marker of each true hand is right, and counts of the true labels.
+def _counted(truth: Take, take: Take) -> tuple[Float[np.ndarray, "H M"], LabelingReport]:
+    """Share of the frames in which each marker of each true hand is right, and the count of the true labels.
 
     One more label stands for all labels of hands that the truth does not have.
     """
-    markers = truth.hands[0].layout.num_markers
     names = truth.label_names
     of_hands = [names.index(name) if name in names else -1 for name in take.label_names]
-    others = len(truth.hands) * markers
+    others = len(truth.hands) * truth.hands[0].layout.num_markers
     known = np.array([number if 0 <= number < others else others for number in of_hands] + [-1])
-    counts, right = LabelCounts(), np.zeros(others)
-    for points, true, given in zip(truth.points, truth.labels, take.labels, strict=True):
-        here = np.isfinite(points[:, 0])
-        worn = np.where(true[here] < others, true[here], -1)
-        right += counts.add(known[given[here]], worn, others + 1)[:others]
-    return (right / counts.frames).reshape(len(truth.hands), markers), counts
+    here = np.isfinite(truth.points[..., 0])
+    worn, given = np.where(truth.labels < others, truth.labels, -1), known[take.labels]
+    frames = ((given[t][one], np.full(one.sum(), np.nan), worn[t][one]) for t, one in enumerate(here))
+    report = count_labels((*names[:others], "another hand"), frames)
+    return report.slot_accuracy_by_marker[:others].reshape(len(truth.hands), -1), report
 
 
 _Advice = tuple[float, str]
