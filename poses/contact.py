@@ -16,7 +16,7 @@ from handsim.hand.capsules import overlap_between
 from handsim.hand.model import HandModel, join_qpos
 from handsim.kernels import kernel, pose_digit_axes, segment_distance_squared, squared_distance
 from handsim.space.transforms import quaternion_matrix, rotation_quaternions
-from poses.motion import PEAK_ACCELERATION, PEAK_SPEED, minimum_jerk
+from poses.motion import PEAK_SPEED, RATE, MotionConfig, minimum_jerk
 from poses.shapes import is_valid, sample_valid_angles
 
 FARTHEST: Final = 0.4
@@ -35,12 +35,6 @@ _ORDER: Final = (1, 2, 3, 4, 0)  # the thumb closes last, over what the fingers 
 
 MAX_OVERLAP: Final = 0.001
 """Largest overlap of two hands [m]."""
-RATE: Final = 120.0
-"""Frames per second [Hz]."""
-MAX_SPEED: Final = 10.0
-"""Highest joint speed [rad/s]."""
-MAX_ACCELERATION: Final = 200.0
-"""Largest joint acceleration [rad/s^2]."""
 WRIST_SPEED: Final = 1.0
 """Highest speed of the pair of hands, and of a hand relative to the pair between meetings [m/s]."""
 APPROACH: Final = (0.4, 0.8)
@@ -434,8 +428,7 @@ def _straight(start: Passage, end: Passage, rng: np.random.Generator) -> Passage
     bend = max(np.abs(end.right - start.right).max(), np.abs(end.left - start.left).max())
     seconds = max(
         rng.uniform(*APPROACH),
-        PEAK_SPEED * bend / MAX_SPEED,
-        np.sqrt(PEAK_ACCELERATION * bend / MAX_ACCELERATION),
+        MotionConfig().least_time(bend),
         PEAK_SPEED * (rotations[0].inv() * rotations[1]).magnitude() / _TURNING,
         PEAK_SPEED * 0.5 * float(np.linalg.norm(end.position - start.position)) / WRIST_SPEED,
     )

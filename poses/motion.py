@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain, pairwise
@@ -34,6 +33,12 @@ from poses.shapes import (
 )
 from poses.touch import touching_angles
 
+RATE: Final = 120.0
+"""Frames per second [Hz]."""
+MAX_SPEED: Final = 10.0
+"""Highest joint speed [rad/s]; rapid finger tapping reaches about this."""
+MAX_ACCELERATION: Final = 200.0
+"""Largest joint acceleration [rad/s^2]."""
 PEAK_SPEED: Final = 1.875
 """Peak speed of the minimum-jerk profile, in distances per duration."""
 PEAK_ACCELERATION: Final = 5.7735
@@ -60,11 +65,11 @@ _POSES_AT_ONCE: Final = 16
 class MotionConfig(Settings):
     """Speeds of a hand, and the volume in which its wrist moves."""
 
-    rate: Annotated[float, Limits(0.0, above=True)] = 120.0
+    rate: Annotated[float, Limits(0.0, above=True)] = RATE
     """Frames per second [Hz]."""
-    max_speed: Annotated[float, Limits(0.0, above=True)] = 10.0
+    max_speed: Annotated[float, Limits(0.0, above=True)] = MAX_SPEED
     """Highest joint speed [rad/s]; rapid finger tapping reaches about this."""
-    max_acceleration: Annotated[float, Limits(0.0, above=True)] = 200.0
+    max_acceleration: Annotated[float, Limits(0.0, above=True)] = MAX_ACCELERATION
     """Largest joint acceleration [rad/s^2]."""
     durations: Annotated[tuple[float, float], Limits(0.0, ascends=True)] = (0.15, 0.8)
     """Shortest and longest time of a path; speed limits may make it longer [s]."""
@@ -74,6 +79,11 @@ class MotionConfig(Settings):
     """Half side of the cube the wrist moves in [m], around 1.1 m above the floor."""
     wrist_time: Annotated[tuple[float, float], Limits(0.0, ascends=True)] = _WRIST_TIME
     """Shortest and longest time between two positions of the wrist [s]."""
+
+    def least_time(self, bend: float, share: float = 1.0) -> float:
+        """Shortest time [s] of a minimum-jerk path that bends a joint so far [rad]."""
+        speed, acceleration = share * self.max_speed, share * self.max_acceleration
+        return max(PEAK_SPEED * bend / speed, float(np.sqrt(PEAK_ACCELERATION * bend / acceleration)))
 
 
 def minimum_jerk(frames: int) -> Float[np.ndarray, "T"]:
@@ -86,11 +96,7 @@ def straight_path(
     start: NDArray[np.float64], target: NDArray[np.float64], config: MotionConfig, rng: np.random.Generator
 ) -> NDArray[np.float64]:
     """Frames (T, 20) [rad] from one pose (not included) to another, with a random duration."""
-    distance = np.abs(target - start).max()
-    quickest = max(
-        PEAK_SPEED * distance / config.max_speed,
-        np.sqrt(PEAK_ACCELERATION * distance / config.max_acceleration),
-    )
+    quickest = config.least_time(np.abs(target - start).max())
     frames = int(np.ceil(max(quickest, rng.uniform(*config.durations)) * config.rate)) + 1
     return start + minimum_jerk(frames)[:, None] * (target - start)
 
@@ -149,10 +155,11 @@ def free_wrist_path(
     frames: int, config: MotionConfig, *, rng: np.random.Generator
 ) -> tuple[Float[np.ndarray, "T 3"], Float[np.ndarray, "T 4"]]:
     """Positions [m] and orientations (wxyz) of a wrist that takes any orientation."""
-    positions, orientations = [_draw_position(config, rng)], [random_quaternions(1, rng=rng)[0]]
+    positions = [ROOM_CENTER + rng.uniform(-config.volume, config.volume, size=3)]
+    orientations = [random_quaternions(1, rng=rng)[0]]
     shares = [np.zeros(1)]
     while sum(map(len, shares)) < frames:
-        positions.append(_draw_position(config, rng))
+        positions.append(ROOM_CENTER + rng.uniform(-config.volume, config.volume, size=3))
         rotation = Rotation.from_rotvec(rng.normal(scale=_FREE_ROTATION, size=3)).as_quat(scalar_first=True)
         earlier = Rotation.from_quat(orientations[-1], scalar_first=True)
         orientations.append(
@@ -198,10 +205,6 @@ def along(
     keys = np.arange(len(positions))
     position = np.stack([np.interp(progress, keys, axis) for axis in positions.T], axis=1)
     return position, Slerp(keys, orientations)(progress)
-
-
-def _draw_position(config: MotionConfig, rng: np.random.Generator) -> NDArray[np.float64]:
-    return ROOM_CENTER + rng.uniform(-config.volume, config.volume, size=3)
 
 
 def sample_motion(
@@ -290,12 +293,7 @@ def _scripts() -> dict[str, dict[str, Any]]:
 
 
 def scripted_motion(
-    model: HandModel,
-    script: str,
-    duration: float,
-    config: MotionConfig | None = None,
-    *,
-    rng: np.random.Generator,
+    model: HandModel, script: str, duration: float, *, rng: np.random.Generator
 ) -> HandMotion:
     """Smooth motion of one hand that follows a named script for a duration [s], valid at every frame.
 
@@ -303,11 +301,9 @@ def scripted_motion(
     """
     check_choice(script, _scripts(), noun="script")
     if script == FREE:
-        return sample_motion(model, duration, config, rng=rng)
+        return sample_motion(model, duration, rng=rng)
     entry = _scripts()[script]
-    config = dataclasses.replace(
-        config or MotionConfig(), durations=tuple(entry["durations"]), hold=entry["hold"]
-    )
+    config = MotionConfig(durations=tuple(entry["durations"]), hold=entry["hold"])
     frames = count_frames(duration, config)
     poses = script_poses(model, script)
     at = int(rng.integers(len(poses)))

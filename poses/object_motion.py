@@ -31,7 +31,7 @@ from poses.grasps import (
     settle_hold,
     why_not_held,
 )
-from poses.motion import PEAK_ACCELERATION, PEAK_SPEED, MotionConfig, free_wrist_path, minimum_jerk
+from poses.motion import PEAK_SPEED, MotionConfig, free_wrist_path, minimum_jerk
 from poses.shapes import MAX_PENETRATION
 
 _VARIANTS: Final = 12  # held poses of one draw
@@ -121,10 +121,8 @@ class _Player:
 
     def _path(self, start: Held, target: Held) -> Held:
         config = self.config
-        distance = np.abs(target.angles - start.angles).max()
         quickest = max(
-            PEAK_SPEED * distance / (_MARGIN * config.max_speed),
-            np.sqrt(PEAK_ACCELERATION * distance / (_MARGIN * config.max_acceleration)),
+            config.least_time(np.abs(target.angles - start.angles).max(), _MARGIN),
             PEAK_SPEED * float(np.linalg.norm((target.poses - start.poses)[0, :3, 3])) / _SLIDING,
             PEAK_SPEED * float(np.linalg.norm(rotation_between(start, target)[0])) / _ROLLING,
         )
@@ -212,16 +210,15 @@ def pointing_path(
     outward: Float[np.ndarray, "T M 3"],
     rate: float,
     *,
-    speed: float = SPEED,
     rng: np.random.Generator,
 ) -> Float[np.ndarray, "T 4 4"]:
     """Poses of a pen (tip at the origin, body along +z) that visits moving targets at random.
 
-    Targets [m] are reached from their outward unit directions, by a tip no faster than `speed` [m/s].
+    Targets [m] are reached from their outward unit directions, by a tip no faster than `SPEED`.
     """
     outward = gaussian_filter1d(outward, _STEADY * rate, axis=0, mode="nearest")
     outward = outward / np.maximum(np.linalg.norm(outward, axis=-1, keepdims=True), 1e-9)
-    visits = _plan(positions, outward, rate, speed, rng)
+    visits = _plan(positions, outward, rate, rng)
     share = np.concatenate([visit.share for visit in visits])
     number = np.repeat(np.arange(len(visits)), [len(visit.share) for visit in visits])
     now = np.arange(len(positions))
@@ -256,7 +253,6 @@ def _plan(
     positions: Float[np.ndarray, "T M 3"],
     outward: Float[np.ndarray, "T M 3"],
     rate: float,
-    speed: float,
     rng: np.random.Generator,
 ) -> list[_Visit]:
     """Visits for all frames, and one more at the end of the last path."""
@@ -270,7 +266,7 @@ def _plan(
         turn = float(np.arccos(np.clip(axis @ next_axis, -1.0, 1.0)))
         seconds = max(
             rng.uniform(*PATH),
-            PEAK_SPEED * float(np.linalg.norm(here[following] - here[target])) / speed,
+            PEAK_SPEED * float(np.linalg.norm(here[following] - here[target])) / SPEED,
             PEAK_SPEED * turn / TURNING,
         )
         stay = np.zeros(max(1, round(rng.uniform(*_STAY) * rate)))

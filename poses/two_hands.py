@@ -19,10 +19,7 @@ from handsim.space.rig import ROOM_CENTER
 from handsim.space.transforms import MIRROR, euler_matrix, random_quaternions, rotation_quaternions, unit
 from poses.contact import (
     APPROACH,
-    MAX_ACCELERATION,
-    MAX_SPEED,
     NEAREST,
-    RATE,
     VOLUME,
     WRIST_SPEED,
     Passage,
@@ -34,7 +31,7 @@ from poses.contact import (
     smooth_above,
     valid_frames,
 )
-from poses.motion import PEAK_SPEED, along, minimum_jerk
+from poses.motion import MAX_ACCELERATION, MAX_SPEED, PEAK_SPEED, RATE, along, minimum_jerk
 from poses.shapes import HIGH, LOW, gesture, gesture_names, is_valid, make_valid, resting_angles
 
 _FLEXION_NOISE: Final = np.deg2rad(4.0)
@@ -410,19 +407,17 @@ def sample_two_hand_motion(
     duration: float,
     *,
     pause: tuple[float, float] = PAUSE,
-    interactions: Sequence[str] | None = None,
     rng: np.random.Generator,
 ) -> tuple[HandMotion, HandMotion]:
     """Random smooth motion of two hands through a series of interactions, valid at every frame.
 
-    It has `round(duration * RATE) + 1` frames; the interactions default to `INTERACTIONS`. Between two
-    meetings hands rest apart for a time within `pause` [s]. The left hand may be another person's.
+    It has `round(duration * RATE) + 1` frames. Between two meetings hands rest apart for a time within
+    `pause` [s]. The left hand may be another person's.
     """
-    names = INTERACTIONS if interactions is None else tuple(interactions)
     frames = round(duration * RATE) + 1
-    passages = _next_passages(right, left, None, names, pause, rng=rng)
+    passages = _next_passages(right, left, None, pause, rng=rng)
     while sum(map(len, passages)) < frames:
-        passages += _next_passages(right, left, passages[-1].at([-1]), names, pause, rng=rng)
+        passages += _next_passages(right, left, passages[-1].at([-1]), pause, rng=rng)
     whole = join_passages(passages).at(slice(frames))
     right_qpos, left_qpos = _in_world(whole, *_travel(frames, rng))
     return HandMotion(right_qpos, RATE), HandMotion(left_qpos, RATE)
@@ -454,13 +449,12 @@ def _next_passages(
     right: HandModel,
     left: HandModel,
     last: Passage | None,
-    names: tuple[str, ...],
     pause: tuple[float, float],
     *,
     rng: np.random.Generator,
 ) -> list[Passage]:
     """The next meeting, after the path to it from the last frame, if any."""
-    name = names[rng.integers(len(names))]
+    name = INTERACTIONS[rng.integers(len(INTERACTIONS))]
     for _ in range(_MAX_DRAWS):
         meeting = play_meeting(right, left, name, rng=rng)
         if meeting is None:

@@ -31,9 +31,10 @@ from gloves import Capture, GloveFit, Take, load_layout, write_capture
 from gloves.captures.capture import UNLABELED
 from handsim import HandModel, load_rig
 from handsim.files.outputs import atomic_write, check_free, claim, remove_leftovers
+from poses.motion import RATE
 from track import User, load_user
 from train.simulation.room import record_take
-from train.simulation.scenes import RATE, Kind, sample_real_like_scene
+from train.simulation.scenes import Kind, sample_real_like_scene
 from train.simulation.takes import sample_scene
 
 Progress = Callable[[int, int], None]

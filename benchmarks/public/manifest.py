@@ -20,8 +20,8 @@ from handsim.errors import DatasetError
 from handsim.files.inputs import checksum, load_json
 from handsim.files.outputs import save_json
 from handsim.hand.model import KEYPOINT_NAMES
+from poses.motion import RATE
 from track import User, load_user
-from train.simulation.scenes import RATE
 
 MANIFEST: Final = "manifest.json"
 LICENSE: Final = "CC-BY-4.0"

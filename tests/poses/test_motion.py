@@ -144,7 +144,7 @@ def test_a_pianist_presses_four_to_eight_keys_a_second():
 
 def test_the_wrist_is_the_one_of_the_config():
     model, still = HandModel.named("M"), MotionConfig(volume=0.0, rate=60.0)
-    motion = scripted_motion(model, "counting", 2.0, still, rng=np.random.default_rng(0))
+    motion = sample_motion(model, 2.0, still, rng=np.random.default_rng(0))
     assert len(motion.qpos) == 121
     np.testing.assert_allclose(motion.qpos[:, :3], np.tile([0.0, 0.0, 1.1], (121, 1)))
 

@@ -319,16 +319,15 @@ def test_whatever_it_points_at_the_pen_never_jumps(seed):
     assert turns(path).max() < 2.0 * TURNING
 
 
-def test_it_follows_places_that_move(rng):
+def test_it_follows_places_that_move(rng, monkeypatch):
+    monkeypatch.setattr("poses.object_motion.SPEED", 50.0)
     hand = hands()[1]
     motion = resting(hand, FRAMES)
     places, outward = markers_of(hand, motion)
     shift = np.linspace(0.0, 0.3, FRAMES)[:, None] * [1.0, 0.0, 0.0]
     seed = int(rng.integers(1000))
-    still = pointing_path(places, outward, RATE, speed=50.0, rng=np.random.default_rng(seed))
-    moving = pointing_path(
-        places + shift[:, None], outward, RATE, speed=50.0, rng=np.random.default_rng(seed)
-    )
+    still = pointing_path(places, outward, RATE, rng=np.random.default_rng(seed))
+    moving = pointing_path(places + shift[:, None], outward, RATE, rng=np.random.default_rng(seed))
     np.testing.assert_allclose(moving[:, :3, 3] - shift, still[:, :3, 3], atol=1e-9)
     np.testing.assert_allclose(moving[:, :3, :3], still[:, :3, :3], atol=1e-9)
 

@@ -16,13 +16,12 @@ from handsim.hand.model import build_spec
 from handsim.hand.shape import EVERYBODY
 from handsim.space.transforms import random_quaternions
 from poses.contact import (
-    MAX_ACCELERATION,
-    MAX_SPEED,
     close_fingers,
     first_contact,
     smooth_above,
     smooth_below,
 )
+from poses.motion import MAX_ACCELERATION, MAX_SPEED
 from poses.shapes import gesture_names, is_valid, resting_angles
 from poses.two_hands import INTERACTIONS, sample_two_hand_motion, sample_two_hand_poses
 from tests.meshes import hands_overlap
@@ -82,9 +81,10 @@ def test_overlap_of_two_hands_is_mujocos(rng):
 
 
 @pytest.mark.parametrize("name", INTERACTIONS)
-def test_every_frame_is_valid_and_the_hands_really_touch(name, rng):
+def test_every_frame_is_valid_and_the_hands_really_touch(name, rng, monkeypatch):
+    monkeypatch.setattr("poses.two_hands.INTERACTIONS", (name,))
     right, left = hands()
-    motions = sample_two_hand_motion(right, left, 8.0, interactions=[name], rng=rng)
+    motions = sample_two_hand_motion(right, left, 8.0, rng=rng)
     assert [len(motion.qpos) for motion in motions] == [961, 961]
     qpos = [motion.qpos for motion in motions]
     assert_valid(right, left, *qpos)
@@ -122,11 +122,10 @@ def test_single_poses_touch_and_differ(rng):
         assert np.abs(each[:, :3] - [0.0, 0.0, 1.1]).max() < 0.5
 
 
-def test_clapping_hands_come_and_go(rng):
+def test_clapping_hands_come_and_go(rng, monkeypatch):
+    monkeypatch.setattr("poses.two_hands.INTERACTIONS", ("clap",))
     right, left = hands()
-    qpos = [
-        motion.qpos for motion in sample_two_hand_motion(right, left, 6.0, interactions=["clap"], rng=rng)
-    ]
+    qpos = [motion.qpos for motion in sample_two_hand_motion(right, left, 6.0, rng=rng)]
     touching = hands_overlap(right, left, *qpos) >= -TOUCHING
     beats = np.flatnonzero(touching[1:] & ~touching[:-1])
     assert len(beats) >= 4
@@ -134,12 +133,10 @@ def test_clapping_hands_come_and_go(rng):
     assert 0.15 < np.median(between) < 0.6
 
 
-def test_pointing_touches_palms_with_an_index_finger(rng):
+def test_pointing_touches_palms_with_an_index_finger(rng, monkeypatch):
+    monkeypatch.setattr("poses.two_hands.INTERACTIONS", ("point_at_palm",))
     right, left = hands()
-    qpos = [
-        motion.qpos
-        for motion in sample_two_hand_motion(right, left, 6.0, interactions=["point_at_palm"], rng=rng)
-    ]
+    qpos = [motion.qpos for motion in sample_two_hand_motion(right, left, 6.0, rng=rng)]
     touching = hands_overlap(right, left, *qpos) >= -TOUCHING
     wrists = [model.forward_kinematics(each) for model, each in zip(hands(), qpos, strict=True)]
     tips = [

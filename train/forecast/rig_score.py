@@ -500,9 +500,7 @@ def _draw_losses(figure: Figure, losses: list[CameraLoss], missing: float) -> No
     panel.axhline(100 * missing, color=Paint.WARM, linewidth=1.2)
     end = (numbers[-1] + 0.5, 100 * missing)
     panel.annotate("with all cameras", end, color=Paint.WARM, ha="right", va="bottom", fontsize=8)
-    panel.set_xticks(numbers)
-    panel.set_xlabel("without camera")
-    panel.set_ylabel("marker-frames missing [%]")
+    panel.set(xticks=numbers, xlabel="without camera", ylabel="marker-frames missing [%]")
 
 
 def _draw_map(figure: Figure, volume: VolumeMap, rig: CameraRig) -> None:
@@ -519,14 +517,12 @@ def _draw_map(figure: Figure, volume: VolumeMap, rig: CameraRig) -> None:
         )  # fmt: skip
         for number, pose in enumerate(rig.T_world_camera, 1):
             begin, ahead = pose[[right, up], 3], pose[[right, up], 2]
-            panel.plot(
-                *np.stack([begin, begin + _ARROW * ahead]).T, color=Paint.LINE, linewidth=2.0, zorder=2
-            )
+            line = np.stack([begin, begin + _ARROW * ahead])
+            panel.plot(*line.T, color=Paint.LINE, linewidth=2.0, zorder=2)
             panel.plot(*begin, "o", color=Paint.CARD, markeredgecolor=Paint.INK, markersize=11, zorder=3)
             place: dict[str, Any] = {"ha": "center", "va": "center_baseline", "zorder": 4}
             panel.annotate(str(number), begin, fontsize=6.5, color=Paint.INK, **place)
         panel.set_title(title, color=Paint.SOFT)
-        panel.set_xlabel("x [m]")
-        panel.set_ylabel(f"{'xyz'[up]} [m]")
+        panel.set(xlabel="x [m]", ylabel=f"{'xyz'[up]} [m]")
         panel.set_aspect("equal", adjustable="datalim")
     color_bar(figure, colors, "markers seen by two cameras [%]", ax=panels, shrink=0.7)

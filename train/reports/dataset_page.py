@@ -190,8 +190,7 @@ def _draw_visibility(
             left, f"{100 * share:.1f}", (100 * share, row), (4, 0), va="center", color=Paint.SOFT, fontsize=8
         )
     left.set_yticks(rows, names, color=Paint.INK, parse_math=False)
-    left.set_ylim(len(names) - 0.4, -0.6)
-    left.set_xlim(0.0, max(0.1, 115.0 * float(lost.max(initial=0.0))))
+    left.set(ylim=(len(names) - 0.4, -0.6), xlim=(0.0, max(0.1, 115.0 * float(lost.max(initial=0.0)))))
     left.set_xlabel("frames in which it is lost [%]")
     left.tick_params(axis="y", length=0)
     most = int(np.flatnonzero(seen_by.sum(axis=0))[-1]) if seen_by.any() else 0
@@ -243,19 +242,16 @@ def _draw_ghosts(figure: Figure, counts: Int[np.ndarray, "G+1"], distances: Floa
     left.bar(np.arange(len(counts)), shares, color=Paint.BLUE, width=0.62)
     for count, share in enumerate(shares):
         annotate(left, f"{share:.1f}", (count, share), (0, 3), ha="center", color=Paint.SOFT, fontsize=8.0)
-    left.set_xlabel("ghosts in a frame")
-    left.set_ylabel("share of frames [%]")
+    left.set(xlabel="ghosts in a frame", ylabel="share of frames [%]")
     left.locator_params(axis="x", integer=True)
     right.stairs(*_histogram(distances, _bins(distances)), fill=True, color=Paint.BLUE)
-    right.set_ylabel("share of ghosts [% per mm]")
+    right.set(xlabel="from a ghost to the nearest marker [mm]", ylabel="share of ghosts [% per mm]")
     right.set_xlim(left=0.0)
     right.margins(y=0.12)
-    if not distances.size:
-        right.set_ylim(0.0, 1.0)
-    right.set_xlabel("from a ghost to the nearest marker [mm]")
     if len(distances):
         _mark(right, 1e3 * float(np.median(distances)), "median {:.0f} mm", Paint.INK)
     else:
+        right.set_ylim(0.0, 1.0)
         right.annotate("no ghosts", (0.5, 0.5), xycoords="axes fraction", ha="center", color=Paint.SOFT)
 
 
@@ -308,8 +304,7 @@ def _draw_neighbors(figure: Figure, distances: Float[np.ndarray, "T M"], diamete
     panel.stairs(*_histogram(distances.ravel(), bins), fill=True, color=Paint.PALE)
     panel.stairs(*_histogram(nearest, bins), color=Paint.BLUE, linewidth=1.6)
     panel.margins(y=0.12)
-    panel.set_ylabel("share [% per mm]")
-    panel.set_xlabel("distance to the nearest other marker, center to center [mm]")
+    panel.set(xlabel="distance to the nearest other marker, center to center [mm]", ylabel="share [% per mm]")
     for values, name, color in (
         (nearest, "nearest pair\nof each frame", Paint.BLUE),
         (distances, "every marker", Paint.SOFT),
@@ -371,12 +366,9 @@ def _draw_gaps(figure: Figure, lengths: Int[np.ndarray, "G"], rate: float) -> No
     steps = np.arange(1, longest + 2)
     shares = 100.0 * np.searchsorted(ordered, steps, side="right") / len(ordered)
     panel.step(steps, shares, where="post", color=Paint.BLUE, linewidth=1.8)
-    panel.set_xscale("log")
-    panel.set_xlim(0.9, 1.15 * longest)
-    panel.set_ylim(0.0, 103.0)
+    panel.set(xscale="log", xlim=(0.9, 1.15 * longest), ylim=(0.0, 103.0))
+    panel.set(xlabel="length of a gap [frames]", ylabel="gaps no longer than that [%]")
     panel.xaxis.set_major_formatter("{x:.0f}")
-    panel.set_xlabel("length of a gap [frames]")
-    panel.set_ylabel("gaps no longer than that [%]")
     milliseconds = panel.secondary_xaxis(
         "top", functions=(partial(np.multiply, 1e3 / rate), partial(np.multiply, rate / 1e3))
     )

@@ -208,11 +208,8 @@ def draw_curves(figure: Figure, history: History) -> None:
     middle.set_ylabel("held-out slots\nright [%]")
     middle.margins(y=0.2)
     lower.plot(done, rates, color=Paint.SOFT, linewidth=1.4, marker=single)
-    lower.set_ylabel("learning\nrate")
-    lower.set_ylim(bottom=0.0)
-    lower.set_xlim(left=0.0)
+    lower.set(xlabel="samples", ylabel="learning\nrate", xlim=(0.0, None), ylim=(0.0, None))
     lower.xaxis.set_major_formatter("{x:,.0f}")
-    lower.set_xlabel("samples")
     for panel in (upper, middle, lower):
         panel.grid(axis="y", which="major", color=Paint.BAND, linewidth=0.8)
     figure.align_ylabels()
@@ -250,13 +247,10 @@ def draw_confusion(figure: Figure, names: Sequence[str], confusion: Int[np.ndarr
     small = 8.0 if len(classes) <= _MAX_WRITTEN else 6.5
     panel.set_xticks(places, classes, rotation=90, fontsize=small, color=Paint.INK, parse_math=False)
     panel.set_yticks(places, classes, fontsize=small, color=Paint.INK, parse_math=False)
-    panel.set_xlim(edges[0], edges[-1])
-    panel.set_ylim(edges[-1], edges[0])
-    panel.set_aspect("equal")
+    panel.set(xlim=(edges[0], edges[-1]), ylim=(edges[-1], edges[0]), aspect="equal")
+    panel.set(xlabel="given label", ylabel="true label")
     panel.tick_params(length=0)
     panel.spines[:].set_visible(False)
-    panel.set_xlabel("given label")
-    panel.set_ylabel("true label")
     bar = color_bar(
         figure, shades, "share of the row's points [%]", ax=panel, pad=0.02, aspect=40, shrink=0.8
     )
@@ -306,16 +300,12 @@ def draw_reliability(figure: Figure, bins: Reliability, error: float) -> None:
     confidence, right = 100.0 * bins.confidence[there], 100.0 * bins.right[there]
     upper.vlines(confidence, confidence, right, color=Paint.WARM, linewidth=2.0, zorder=2)
     upper.plot(confidence, right, "o-", color=Paint.BLUE, markersize=5.0, linewidth=1.4, zorder=3)
-    upper.set_ylim(-3.0, 103.0)
-    upper.set_ylabel("points right [%]")
+    upper.set(ylim=(-3.0, 103.0), ylabel="points right [%]")
     upper.set_title(f"expected calibration error {100.0 * error:.2f} %", loc="left", color=Paint.WARM)
     edges = np.linspace(0.0, 100.0, BINS + 1)
     lower.stairs(np.maximum(bins.count, 0.5), edges, fill=True, color=Paint.PALE, baseline=0.5)
-    lower.set_yscale("log")
-    lower.set_ylim(0.5, 2.0 * max(1, int(bins.count.max())))
-    lower.set_ylabel("points")
-    lower.set_xlabel("confidence [%]")
-    lower.set_xlim(0.0, 100.5)
+    lower.set(yscale="log", ylim=(0.5, 2.0 * max(1, int(bins.count.max()))), xlim=(0.0, 100.5))
+    lower.set(xlabel="confidence [%]", ylabel="points")
     figure.align_ylabels()
 
 

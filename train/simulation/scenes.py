@@ -19,6 +19,7 @@ from handsim.hand.shape import EVERYBODY, NUM_JOINTS, SIDES
 from handsim.settings import Limits, Settings
 from handsim.space.objects import named_object
 from poses.motion import (
+    RATE,
     MotionConfig,
     angles_through,
     can_be_left,
@@ -41,8 +42,6 @@ SimulatedKind = Literal[
 ]
 """The paper's kinds, realistic hands, the exercises for a user's calibration, and freely moving hands."""
 SIMULATED_KINDS: Final[tuple[SimulatedKind, ...]] = get_args(SimulatedKind)
-RATE: Final = 120.0
-"""Frames per second of simulated takes [Hz]."""
 
 _HAND_OFFSET: Final = 0.22  # [m] distance of a hand that touches nothing from the center of the room
 _VOLUME: Final = 0.1  # [m] half side of the cube around the wrist of such a hand

@@ -19,11 +19,11 @@ from handsim.errors import ArgumentError, LayoutError, PoseError
 from handsim.hand.shape import Side
 from handsim.settings import Limits, Settings
 from handsim.space.rig import ROOM_CENTER, AnyRig, Center, check_outside_volume, load_rig, rig_setting
+from poses.motion import RATE
 from train.simulation.room import TWINS, OpticsOptions, RoomConfig, record_take, usual_room
 from train.simulation.scenes import (
     MAX_OTHERS,
     NUM_FRAMES,
-    RATE,
     SIMULATED_KINDS,
     CalibrationTakeConfig,
     Kind,

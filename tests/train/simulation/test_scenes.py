@@ -12,12 +12,12 @@ from gloves import Take, attach, load_layout
 from handsim import HandModel
 from handsim.errors import ArgumentError, PoseError
 from handsim.space.transforms import quaternion_matrix
+from poses.motion import RATE
 from poses.shapes import is_valid
 from poses.touch import FINGERS, is_touching
 from train import simulate_take
 from train.simulation import scenes
 from train.simulation.scenes import (
-    RATE,
     CalibrationTakeConfig,
     SceneMotion,
     calibration_angles,

@@ -18,13 +18,14 @@ from handsim.space.objects import named_object
 from handsim.space.rig import ROOM_CENTER, CameraRig
 from handsim.space.transforms import pose_matrices, quaternion_matrix, rigid
 from poses.grasps import object_penetration
+from poses.motion import RATE
 from poses.shapes import HIGH, LOW
 from tests.meshes import hands_overlap
 from tests.rigs import mixed_rig
 from tests.sentences import error_names
 from train import OpticsOptions, SimulateSettings, simulate_take
 from train.simulation import takes
-from train.simulation.scenes import KINDS, RATE
+from train.simulation.scenes import KINDS
 from train.simulation.takes import WRIST_VOLUME
 
 FRAMES = 200
