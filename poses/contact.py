@@ -41,6 +41,8 @@ APPROACH: Final = (0.4, 0.8)
 """Shortest and longest time of an approach or a release [s]."""
 VOLUME: Final = 0.2
 """Half side of the cube in which the middle of the wrists travels [m], around 1.1 m above the floor."""
+PAUSE: Final = (2.0, 4.0)
+"""Shortest and longest rest of hands apart, between two meetings [s]."""
 _TURNING: Final = 8.0  # fastest rotation of one hand relative to the other [rad/s]
 _DISTANCE: Final = (0.25, 0.45)  # distance of the wrists while hands rest apart [m]
 
@@ -384,18 +386,17 @@ def path_between(
     left: HandModel,
     start: Passage,
     end: Passage,
-    pause: tuple[float, float],
     *,
     rng: np.random.Generator,
 ) -> Passage | None:
-    """Frames from one pose to another, with a rest [s] of hands apart between them; None if not valid."""
+    """Frames from one pose to another, with a rest of hands apart between them; None if not valid."""
     roll = rng.uniform(0.0, np.pi)  # from hands side by side to palms that face each other
     rotation = Rotation.from_rotvec(rng.normal(scale=0.4, size=3)) * Rotation.from_rotvec([-roll, 0.0, 0.0])
     direction = np.array([rng.uniform(-0.3, 0.3), np.cos(roll / 2), -np.sin(roll / 2)])
     position = rng.uniform(*_DISTANCE) * direction[None] / np.linalg.norm(direction)
     angles = [sample_valid_angles(model, 1, rng=rng) for model in (right, left)]
     apart = Passage(rotation.as_matrix()[None], position, *angles)
-    rest = apart.at(np.zeros(int(rng.uniform(*pause) * RATE), dtype=int))
+    rest = apart.at(np.zeros(int(rng.uniform(*PAUSE) * RATE), dtype=int))
     path = join_passages([_straight(start, apart, rng), rest, _straight(apart, end, rng)])
     return path if valid_frames(right, left, path).all() else None
 

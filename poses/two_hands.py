@@ -49,8 +49,6 @@ _PARTED: Final = (0.08, 0.16)  # distance of the hands before and after an inter
 # Single poses: share of touching ones, largest distance of the others [m], share with half-closed fingers.
 _TOUCHING, _GAP, _HALF_CLOSED = 0.7, 0.06, 0.3
 
-PAUSE: Final = (0.0, 0.6)
-"""Shortest and longest rest between two meetings [s]."""
 _TRAVEL_TIME: Final = (0.8, 2.5)  # between two positions of the pair [s]
 _ROTATION: Final = 0.5  # standard deviation of the rotation between two positions [rad]
 _MAX_DRAWS: Final = 60
@@ -402,22 +400,16 @@ def _course(variant: dict[str, Any], count: int, rng: np.random.Generator) -> _C
 
 
 def sample_two_hand_motion(
-    right: HandModel,
-    left: HandModel,
-    duration: float,
-    *,
-    pause: tuple[float, float] = PAUSE,
-    rng: np.random.Generator,
+    right: HandModel, left: HandModel, duration: float, *, rng: np.random.Generator
 ) -> tuple[HandMotion, HandMotion]:
     """Random smooth motion of two hands through a series of interactions, valid at every frame.
 
-    It has `round(duration * RATE) + 1` frames. Between two meetings hands rest apart for a time within
-    `pause` [s]. The left hand may be another person's.
+    It has `round(duration * RATE) + 1` frames. The left hand may be another person's.
     """
     frames = round(duration * RATE) + 1
-    passages = _next_passages(right, left, None, pause, rng=rng)
+    passages = _next_passages(right, left, None, rng=rng)
     while sum(map(len, passages)) < frames:
-        passages += _next_passages(right, left, passages[-1].at([-1]), pause, rng=rng)
+        passages += _next_passages(right, left, passages[-1].at([-1]), rng=rng)
     whole = join_passages(passages).at(slice(frames))
     right_qpos, left_qpos = _in_world(whole, *_travel(frames, rng))
     return HandMotion(right_qpos, RATE), HandMotion(left_qpos, RATE)
@@ -446,12 +438,7 @@ def sample_two_hand_poses(
 
 
 def _next_passages(
-    right: HandModel,
-    left: HandModel,
-    last: Passage | None,
-    pause: tuple[float, float],
-    *,
-    rng: np.random.Generator,
+    right: HandModel, left: HandModel, last: Passage | None, *, rng: np.random.Generator
 ) -> list[Passage]:
     """The next meeting, after the path to it from the last frame, if any."""
     name = INTERACTIONS[rng.integers(len(INTERACTIONS))]
@@ -462,7 +449,7 @@ def _next_passages(
         if last is None:
             return [meeting]
         for _ in range(10):
-            path = path_between(right, left, last, meeting.at([0]), pause, rng=rng)
+            path = path_between(right, left, last, meeting.at([0]), rng=rng)
             if path is not None:
                 return [path, meeting]
     raise PoseError(f"no valid path was found in {_MAX_DRAWS} tries to bring these hands to '{name}'")

@@ -232,10 +232,7 @@ class _Run:
         """
         state, settings, alone = self.state, self.state.settings, self.state.fabric.world_size == 1
         recipe, names = batch_recipe(settings, len(self.manifest.marker_names)), self.manifest.marker_names
-        shown, saved = (
-            self.held_out[_shown(self.held_out, settings.samples, _CURVE_FRAMES[settings.labeler])],
-            time.monotonic(),
-        )
+        shown, saved = self.held_out[self._shown(_CURVE_FRAMES[settings.labeler])], time.monotonic()
         evaluated = state.history.accuracies[-1][0] if state.history.accuracies else 0
         while True:
             if state.done > evaluated and _passed(
@@ -264,6 +261,9 @@ class _Run:
         on_step("checkpoint")
         state.save(self.out / CHECKPOINT)
 
+    def _shown(self, count: int) -> Int[np.ndarray, "R"]:
+        return _shown(self.held_out, self.state.settings.samples, count)
+
     @contextmanager
     def kept(self) -> Iterator[None]:
         """Write a checkpoint if a signal ends the block."""
@@ -286,16 +286,14 @@ class _Run:
         network = self.state.averaged()
         if isinstance(network, DeepLabelCNN):
             on_step("costs of the paper's labeler")
-            choose_costs(network, names, self.held_out[_shown(self.held_out, settings.samples, _COST_FRAMES)])
+            choose_costs(network, names, self.held_out[self._shown(_COST_FRAMES)])
         else:
             assert isinstance(network, SetLabeler)
             on_step("pose prior")
             rng = np.random.default_rng(settings.seed)
             network.prior = learn_pose_prior(right_hands(self.rows, _PRIOR_STRETCH, rng=rng), rng=rng)
         on_step("held-out frames")
-        card, report = self._card(
-            network, _shown(self.held_out, settings.samples, _CARD_FRAMES[settings.labeler])
-        )
+        card, report = self._card(network, self._shown(_CARD_FRAMES[settings.labeler]))
         on_step("weights and report")
         with written_together():
             save_network(self.out, network, card)

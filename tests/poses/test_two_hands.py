@@ -80,6 +80,11 @@ def test_overlap_of_two_hands_is_mujocos(rng):
     np.testing.assert_allclose(ours, theirs, atol=1e-7)
 
 
+@pytest.fixture(autouse=True)
+def short_rests(monkeypatch):
+    monkeypatch.setattr("poses.contact.PAUSE", (0.0, 0.6))
+
+
 @pytest.mark.parametrize("name", INTERACTIONS)
 def test_every_frame_is_valid_and_the_hands_really_touch(name, rng, monkeypatch):
     monkeypatch.setattr("poses.two_hands.INTERACTIONS", (name,))

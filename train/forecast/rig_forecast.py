@@ -131,11 +131,10 @@ def observe_poses(
 ) -> list[ObservedHand]:
     """Random people's hands in poses and scenes as in training sets, in at least `num_frames` frames."""
     config, observed, done = GenerateSettings(), [], 0
-    slip, roll = config.slip_along, np.deg2rad(config.slip_around)
     while done < num_frames:
         models = sample_hands(config.population, rng=rng)
         scene = sample_frame_scene(models, _POSES_PER_PERSON, config, rng=rng)
-        fits = wear_gloves(layout, scene.hands, along=slip, around=roll, rng=rng)
+        fits = wear_gloves(layout, scene.hands, **config.slips, rng=rng)
         hands = list(_observe(scene, fits, rig, rng))
         observed += hands
         done += sum(len(hand.qpos) for hand in hands)

@@ -45,7 +45,6 @@ from train.labelers.protocol import (
     Labeling,
     label_by_scores,
     label_in_batches,
-    labeling_threads,
     learned_folder,
     learned_gloves,
     pad_clouds,
@@ -130,7 +129,7 @@ class LayoutLabeler:
     @torch.inference_mode()
     def _label(self, clouds: list[NDArray[np.float64]]) -> list[Labeling]:
         points, present = pad_clouds(clouds)
-        with labeling_threads():
+        with torch_threads():
             scores = self.network(torch.from_numpy(points), torch.from_numpy(present), self.distances)[-1]
         return label_by_scores(clouds, scores.points.numpy(), scores.labels.numpy(), self.prior)
 
@@ -177,14 +176,13 @@ def sample_worn_markers(
 ) -> Float[np.ndarray, "T M 3"]:
     """Markers [m] of right hands in valid poses, with a new person and glove fit every hundred frames."""
     config = GenerateSettings()
-    slip, roll = config.slip_along, np.deg2rad(config.slip_around)
     parts, show = [], told_share(f"learning glove '{layout.name}', once: its poses")
     for first in range(0, num_frames, _POSES_PER_PERSON):
         show(first, num_frames)
         count = min(_POSES_PER_PERSON, num_frames - first)
-        right = next(hand for hand in sample_hands(config.population, rng=rng) if hand.shape.side == SIDES[1])
+        right = sample_hands(config.population, rng=rng)[SIDES.index("right")]
         scene = sample_single_hand(right, count, config, rng=rng)
-        (fit,) = wear_gloves(layout, scene.hands, along=slip, around=roll, rng=rng)
+        (fit,) = wear_gloves(layout, scene.hands, **config.slips, rng=rng)
         parts.append(fit.attachment.centers(right, right.forward_kinematics(scene.qpos[0])))
     return np.concatenate(parts)
 

@@ -41,7 +41,7 @@ SINKHORN: Final = {
     "sinkhorn_rounds": _SINKHORN_ROUNDS,
     "least_probability": _MIN_PROBABILITY,
 }
-"""Constants of `pair_probabilities`, for other programs."""
+"""Constants of `balance`, for other programs."""
 IMPOSSIBLE: Final = 1e6
 """Cost of an excluded pair."""
 FloatArray = NDArray[np.float64]
@@ -59,23 +59,6 @@ _NEAR_COMPONENTS: Final = 40  # number of the prior's components that are consid
 _TEMPERATURE: Final = 0.25  # temperature of the odds between labelings, for the confidence
 _MIN_LABELED: Final = 4  # least number of labeled points of a hand
 _MIN_DENSITY: Final = 2.5  # least log-density of a hand per coordinate; true labels have 2.8 to 4.2
-
-
-def pair_probabilities(
-    point_scores: Float[np.ndarray, "N M+1"], label_scores: Float[np.ndarray, "M N+1"]
-) -> Float[np.ndarray, "N+1 M+1"]:
-    """Probability of each label for each point if no two points share one; rows of points sum to 1.
-
-    The last column stands for a ghost, the last row for an occluded label.
-    """
-    return balance(
-        point_scores.astype(np.float64), label_scores.astype(np.float64), _SCORE_WEIGHT, _SINKHORN_ROUNDS
-    )
-
-
-def match_probabilities(probabilities: Float[np.ndarray, "N+1 M+1"]) -> Int[np.ndarray, "N"]:
-    """The one-to-one labeling with the largest product of probabilities; `GHOST` for points without label."""
-    return assign(*assignment_costs(probabilities))[1]
 
 
 def match_distances(distances: Float[np.ndarray, "N M"], reject: float) -> Int[np.ndarray, "N"]:
@@ -187,7 +170,8 @@ def balance(
 ) -> NDArray[np.float64]:
     """Sinkhorn's iteration on the weighted sum of log-probabilities by point (N, M + 1) and label (M, N + 1).
 
-    Returns probabilities (N + 1, M + 1); the last column stands for a ghost, the last row for occlusion.
+    Returns probabilities (N + 1, M + 1) of pairs, if no two points share a label; rows of points sum to 1.
+    The last column stands for a ghost, the last row for occlusion.
     """
     count, num_labels = len(point_scores), len(label_scores)
     plan = np.zeros((count + 1, num_labels + 1))
@@ -246,8 +230,9 @@ def match_scores(
 
     A point may be a `GHOST`, and a label occluded. Without a prior the scores alone decide.
     """
-    probabilities = pair_probabilities(point_scores, label_scores)
-    labels = match_probabilities(probabilities)
+    scores = point_scores.astype(np.float64), label_scores.astype(np.float64)
+    probabilities = balance(*scores, _SCORE_WEIGHT, _SINKHORN_ROUNDS)
+    _, labels = assign(*assignment_costs(probabilities))
     confidence = probabilities[np.arange(len(labels)), labels]  # GHOST, -1, is the last column
     num_labels = probabilities.shape[1] - 1
     if (

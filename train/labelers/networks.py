@@ -30,7 +30,7 @@ from train.labelers.cnn_labeler import CNNLabeler, MeanHand
 from train.labelers.cnn_network import DeepLabelCNN, cnn_loss
 from train.labelers.matching import IMPOSSIBLE, SINKHORN
 from train.labelers.pose_prior import PosePrior
-from train.labelers.protocol import Labeler, labeling_threads
+from train.labelers.protocol import Labeler, torch_threads
 from train.labelers.set_inference import TrainedSetLabeler
 from train.settings import CNNConfig, NetworkConfig, SetLabelerConfig, TrainSettings, batch_recipe
 
@@ -456,7 +456,7 @@ def cnn_labeler(network: DeepLabelCNN, marker_names: tuple[str, ...]) -> CNNLabe
     @torch.inference_mode()
     def positions(images: NDArray[np.float32]) -> NDArray[np.float32]:
         own, device = placed()
-        with labeling_threads(), torch.backends.cudnn.flags(enabled=True, allow_tf32=False):
+        with torch_threads(), torch.backends.cudnn.flags(enabled=True, allow_tf32=False):
             return np.asarray(own(torch.from_numpy(images).to(device)).cpu().numpy())
 
     return CNNLabeler(positions, network.mean_hand.get(), network.config, marker_names)

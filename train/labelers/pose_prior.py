@@ -25,7 +25,6 @@ from handsim.kernels import horn_matrix, kernel, write_quaternion_matrix
 
 NEAREST: Final = 4
 """Number of components in a density: those with the mean hands nearest to the points."""
-_MIN_POINTS: Final = 4  # Fewer points fit any hand.
 _ROUGH, _EXACT = 1e-9, 1e-14  # tolerances of the largest root, relative to its upper bound
 _MAX_COMPONENTS, _MAX_DIRECTIONS = 10_000, 100
 FloatArray = NDArray[np.float64]
@@ -79,16 +78,6 @@ class PosePrior:
     def num_markers(self) -> int:
         """Number of markers of the layout."""
         return int(self.means.shape[1])
-
-    def log_density(
-        self, points: Float[np.ndarray, "N 3"], labels: Int[np.ndarray, "N"], *, mirrored: bool
-    ) -> float:
-        """Log-density of labeled points [m], of a left hand if `mirrored`; -inf for fewer than four."""
-        if len(points) < _MIN_POINTS:
-            return -np.inf
-        cloud, tables = seen_as_right(points, mirrored), tables_of(self)
-        nearest = np.argsort(procrustes_errors(cloud, labels, tables.by_marker))[:NEAREST]
-        return float(log_density(cloud, labels, nearest, tables))
 
     def tensors(self) -> dict[str, NDArray[np.generic]]:
         """The tables by name, for a file, with directions in half precision."""

@@ -162,21 +162,15 @@ def label_on(threads: int) -> None:
 
 
 @contextmanager
-def labeling_threads() -> Iterator[None]:
-    """Use the number of threads set for labelers in torch, within the block."""
-    with torch_threads(_threads.get()):
-        yield
-
-
-@contextmanager
-def torch_threads(count: int) -> Iterator[None]:
-    """Use this many threads in torch and labelers, within the block.
+def torch_threads(count: int | None = None) -> Iterator[None]:
+    """Use this many threads in torch and labelers, within the block; by default those of `label_on`.
 
     With torch's default of one thread per core, a small network is many times slower on a busy machine,
     because its threads wait for one another in every operation.
     """
     import torch
 
+    count = _threads.get() if count is None else count
     before, token = torch.get_num_threads(), _threads.set(count)
     torch.set_num_threads(count)
     try:

@@ -93,12 +93,11 @@ class TrainedSetLabeler:
         weights = {name: np.asarray(one, dtype=np.float32) for name, one in weights.items()}
         rounds = [f"rounds.{number}." for number in range(config.depth)]
         ends = _linear(weights, rounds, "ends")
-        gate_bias = np.stack([weights[f"{one}distance_gate.bias"] for one in rounds])
-        ends.bias[:, : config.gates] += gate_bias
+        ends.bias[:, : config.gates] += _stacked(weights, rounds, "distance_gate.bias")
         self._rounds = _Rounds(
             _norm(weights, rounds, "norm"),
             ends,
-            np.ascontiguousarray(np.stack([weights[f"{one}distance_gate.weight"] for one in rounds])),
+            _stacked(weights, rounds, "distance_gate.weight"),
             _linear(weights, rounds, "values"),
             _linear(weights, rounds, "mix"),
             _norm(weights, rounds, "think.0"),
@@ -171,18 +170,17 @@ def _centers(config: SetLabelerConfig) -> Float32[np.ndarray, "K"]:
 
 def _linear(weights: Weights, parts: list[str], name: str) -> _Linear:
     """The linear layer of this name in several parts of the network."""
-    return _Linear(
-        np.stack([np.ascontiguousarray(weights[f"{part}{name}.weight"].T) for part in parts]),
-        np.stack([weights[f"{part}{name}.bias"] for part in parts]),
-    )
+    transposed = np.ascontiguousarray(_stacked(weights, parts, f"{name}.weight").transpose(0, 2, 1))
+    return _Linear(transposed, _stacked(weights, parts, f"{name}.bias"))
 
 
 def _norm(weights: Weights, parts: list[str], name: str) -> _Norm:
     """The layer norm of this name in several parts of the network."""
-    weight, bias = (
-        np.stack([weights[f"{part}{name}.{kind}"] for part in parts]) for kind in ("weight", "bias")
-    )
-    return _Norm(weight, bias)
+    return _Norm(_stacked(weights, parts, f"{name}.weight"), _stacked(weights, parts, f"{name}.bias"))
+
+
+def _stacked(weights: Weights, parts: list[str], name: str) -> Floats:
+    return np.stack([weights[f"{part}{name}"] for part in parts])
 
 
 @kernel

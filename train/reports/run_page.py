@@ -40,55 +40,6 @@ _KINDS: Final = {"set": "A set labeler", "cnn": "The network of Han et al. 2018"
 _MIN_SHARE: Final = 0.01  # [%] lower end of the confusions' color scale
 _MAX_WRITTEN: Final = 30  # largest number of classes for which cells have room for numbers
 
-_CARD: Final = """\
----
-license: {license}
-library_name: handsim
-pipeline_tag: other
-tags:
-- handsim
-- motion-capture
-- hand-tracking
-- point-cloud
-- marker-labeling
----
-
-# Labeler of hand markers: {layout}
-
-{kind} of handsim {version}. It gets the points of one
-hand in one frame, in meters, and says for each which of {count} markers it is, or that
-it is a ghost.
-
-Markers: {markers}.
-
-## Data
-
-Trained on {trained_on}: {num_frames:,} of them, from `handsim generate` with
-seed {seed}, of which training saw {samples:,} clouds. `labeler.json` holds
-every setting.
-
-## Figures
-
-On {people}, in percent, with the 95 % interval over people:
-
-{figures}
-
-## Use
-
-```
-handsim label take.c3d --glove THIS_FOLDER/{glove} --labeler THIS_FOLDER --out labeled.c3d
-handsim export THIS_FOLDER --out labeler.onnx
-```
-
-In Python, `train.load_labeler(folder).label_frames([points])`. The folder needs
-`labeler.safetensors` and `labeler.json`; both are read without unpickling.
-
-## Limits
-
-- One hand in one frame; it does not tell left from right.
-- Markers of this layout only; if moved by more than a centimeter they need a labeler of their own.
-- Computed in float32. In bfloat16, which some runtimes choose by themselves, labels change.
-"""
 _CARD_FIGURES: Final = {
     "slot_accuracy": "labels and gaps that are right",
     "point_accuracy": "points labeled right",
@@ -326,7 +277,8 @@ def model_card(card: dict[str, Any]) -> str:
         f"| {words} | {' | '.join(_shown(card, column, name) for column in columns)} |"
         for name, words in _CARD_FIGURES.items()
     ]
-    return _CARD.format(
+    template = Path(__file__).with_name("model_card.md").read_text("utf-8")
+    return template.format(
         license=card["license"],
         layout=dataset["layout"]["name"],
         glove=GLOVE,

@@ -38,7 +38,7 @@ from handsim.files.inputs import load_json
 from handsim.files.outputs import check_free, json_text, save_json
 from handsim.files.signals import Stopped, interrupts_bare
 from handsim.hand.shape import SIDES, pack_hand
-from handsim.space.rig import ROOM_CENTER, check_outside_volume, load_rig, rig_setting
+from handsim.space.rig import check_outside_volume, load_rig, rig_setting
 from poses.shapes import PoseSampler, load_sampler
 from train.data.shards import (
     CONFIG,
@@ -157,13 +157,9 @@ def _record(source: FrameSource) -> dict[str, Any]:
     """Everything that determines the bytes of a set, as JSON."""
     settings, layout, rig, _ = source
     record = dataclasses.replace(settings, optics=settings.optics.worn(layout.radius)).record()
-    if settings.sampler is None:
-        del record["sampler"]
-    if settings.center == ROOM_CENTER:  # continues sets of versions without this setting
-        del record["center"]
-    if not settings.flesh:
-        del record["flesh"]
-    return record | {
+    newer = "sampler", "center", "flesh"  # Without them, sets of versions without these settings go on.
+    left_out = set(newer) - set(settings.changed(*newer))
+    return {name: value for name, value in record.items() if name not in left_out} | {
         "rig": rig_setting(rig),
         "rig_digest": rig.digest(),  # releases may change a shipped rig
         "layout": dataclasses.asdict(layout),

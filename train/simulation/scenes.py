@@ -32,7 +32,13 @@ from poses.object_motion import keep_apart, point_pen, pointing_path, sample_obj
 from poses.shapes import gesture, make_valid
 from poses.touch import FINGERS, touching_angles
 from poses.two_hands import sample_two_hand_motion
-from train.simulation.training_frames import MovingObject, move_skin, sample_hands, wear_gloves
+from train.simulation.training_frames import (
+    GenerateSettings,
+    MovingObject,
+    move_skin,
+    sample_hands,
+    wear_gloves,
+)
 
 Kind = Literal["single-hand", "hand-hand", "hand-pen", "hand-controller"]
 """A kind of capture: what the hands do (section 5 of Han et al. 2018)."""
@@ -46,7 +52,6 @@ SIMULATED_KINDS: Final[tuple[SimulatedKind, ...]] = get_args(SimulatedKind)
 _HAND_OFFSET: Final = 0.22  # [m] distance of a hand that touches nothing from the center of the room
 _VOLUME: Final = 0.1  # [m] half side of the cube around the wrist of such a hand
 _RETREAT_DIRECTION: Final = np.array([1.0, 0.0, 0.0])  # in which the right hand avoids the left
-_PAUSE_BETWEEN_CONTACTS: Final = (2.0, 4.0)  # [s]
 _WRIST_ROTATION: Final = 0.5  # [rad] standard deviation about each axis
 _FREE_SCRIPT, _RESTING_SCRIPT = "piano", "typing"
 
@@ -65,7 +70,6 @@ NUM_FRAMES: Final = 3000
 """Default number of frames of real-like and free takes."""
 SPEED: Final = 2
 """Speed of realistic hands relative to the other takes."""
-_SLIP_ALONG, _SLIP_AROUND = 0.1, np.deg2rad(10.0)  # slip of a glove [bone lengths, rad], as in training sets
 
 # Markers of others move rigidly with an arm, a thing or a person.
 MAX_OTHERS: Final = 60
@@ -129,15 +133,11 @@ def sample_scene_motion(
     """Random motion of a right and a left hand, and of the object in the right hand, if any."""
     right, left = fits
     if kind == "hand-hand":
-        both = sample_two_hand_motion(
-            right.model, left.model, num_frames / RATE, pause=_PAUSE_BETWEEN_CONTACTS, rng=rng
-        )
+        both = sample_two_hand_motion(right.model, left.model, num_frames / RATE, rng=rng)
         return SceneMotion(_gloved(fits, both, num_frames))
     if kind == "single-hand":
-        free = (
-            _free_hand(right.model, _FREE_SCRIPT, _HAND_OFFSET, num_frames, rng),
-            _free_hand(left.model, _FREE_SCRIPT, -_HAND_OFFSET, num_frames, rng),
-        )
+        sides = zip(fits, (_HAND_OFFSET, -_HAND_OFFSET), strict=True)
+        free = [_free_hand(fit.model, _FREE_SCRIPT, offset, num_frames, rng) for fit, offset in sides]
         return SceneMotion(_gloved(fits, free, num_frames))
     rigid_object = named_object("pen" if kind == "hand-pen" else "controller")
     holding, body = sample_object_motion(right.model, rigid_object, num_frames / RATE, rng=rng)
@@ -238,7 +238,7 @@ def _touch_fingers(model: HandModel, rng: np.random.Generator) -> list[NDArray[n
 def sample_real_like_scene(layout: MarkerLayout, num_frames: int, *, rng: np.random.Generator) -> SceneMotion:
     """Two hands of an adult or a child that meet and part, with markers that move with the skin."""
     models = sorted(sample_hands(EVERYBODY, rng=rng), key=lambda model: model.shape.side, reverse=True)
-    fits = wear_gloves(layout, models, along=_SLIP_ALONG, around=_SLIP_AROUND, rng=rng)
+    fits = wear_gloves(layout, models, **GenerateSettings().slips, rng=rng)
     fast = sample_scene_motion("hand-hand", fits, SPEED * num_frames, rng=rng).faster(SPEED)
     return dataclasses.replace(fast, skin=tuple(move_skin(hand, rng=rng) for hand in fast.hands))
 

@@ -101,6 +101,11 @@ class GenerateSettings(Settings):
     dropout: Annotated[tuple[float, float], Limits(0.0, 1.0, ascends=True)] = (0.0, 0.4)
     """Range of the probability per frame that some cameras lose their pictures, drawn for every person."""
 
+    @property
+    def slips(self) -> dict[str, float]:
+        """The slips as `wear_gloves` takes them, in [bone lengths] and [rad]."""
+        return {"along": self.slip_along, "around": float(np.deg2rad(self.slip_around))}
+
     def check(self) -> None:
         """Refuse optics over time, as their losses are drawn for each person."""
         if isinstance(self.optics, OpticsConfig):
@@ -194,8 +199,7 @@ def slipped_gloves(
 ) -> tuple[GloveFit, ...]:
     """Gloves of a hundred people, with slips as in a training set, whose places are put on one hand."""
     people = [sample_shape(settings.population, side=model.shape.side, rng=rng) for _ in range(_SHOWN_PEOPLE)]
-    along, around = settings.slip_along, np.deg2rad(settings.slip_around)
-    worn = (wear_gloves(layout, [HandModel(one)], along=along, around=around, rng=rng) for one in people)
+    worn = (wear_gloves(layout, [HandModel(one)], **settings.slips, rng=rng) for one in people)
     return tuple(settle_glove(fit.layout, model) for (fit,) in worn)
 
 
@@ -227,8 +231,7 @@ def simulate_frames(
     """
     settings, layout, rig, sampler = source
     scene = sample_frame_scene(models, len(block), settings, sampler=sampler, redrawn=redrawn, rng=rng)
-    around = np.deg2rad(settings.slip_around)
-    fits = wear_gloves(layout, scene.hands, along=settings.slip_along, around=around, rng=rng)
+    fits = wear_gloves(layout, scene.hands, **settings.slips, rng=rng)
     optics = OpticsConfig(  # Every person has another optical system.
         **dataclasses.asdict(settings.optics),
         blob_loss=rng.uniform(*settings.blob_loss),

@@ -14,7 +14,7 @@ from gloves import attach, load_layout
 from handsim import HandModel, sample_shape
 from poses import sample_poses
 from train import load_labeler
-from train.labelers.matching import GHOST, assign, match_probabilities, match_scores, pair_probabilities
+from train.labelers.matching import GHOST, SINKHORN, assign, assignment_costs, balance, match_scores
 
 
 def log_softmax(raw):
@@ -25,6 +25,10 @@ def scores(seed, count, num_labels, sharp=2.0):
     rng = np.random.default_rng(seed)
     by_point = log_softmax(sharp * rng.normal(size=(count, num_labels + 1)))
     return by_point, log_softmax(sharp * rng.normal(size=(num_labels, count + 1)))
+
+
+def pair_probabilities(by_point, by_label):
+    return balance(by_point, by_label, SINKHORN["score_weight"], SINKHORN["sinkhorn_rounds"])
 
 
 def product(labels, probabilities):
@@ -48,7 +52,7 @@ def one_to_one(count, num_labels):
 @settings(max_examples=60, deadline=None)
 def test_no_labeling_is_likelier(seed, count, num_labels):
     probabilities = pair_probabilities(*scores(seed, count, num_labels))
-    labels = match_probabilities(probabilities)
+    _, labels = assign(*assignment_costs(probabilities))
     best = max(product(choice, probabilities) for choice in one_to_one(count, num_labels))
     assert np.isclose(product(labels.tolist(), probabilities), best)
     named = labels[labels != GHOST]
