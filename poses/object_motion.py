@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -218,28 +218,23 @@ def pointing_path(
     """
     outward = gaussian_filter1d(outward, _STEADY * rate, axis=0, mode="nearest")
     outward = outward / np.maximum(np.linalg.norm(outward, axis=-1, keepdims=True), 1e-9)
-    visits = _plan(positions, outward, rate, rng)
-    share = np.concatenate([visit.share for visit in visits])
-    number = np.repeat(np.arange(len(visits)), [len(visit.share) for visit in visits])
+    targets, distances, leans, shares = zip(*_plan(positions, outward, rate, rng), strict=True)
     now = np.arange(len(positions))
-    share, number = share[now], number[now]
+    blend = np.concatenate(shares)[now, None]
+    number = np.repeat(np.arange(len(shares)), [len(share) for share in shares])[now]
 
     def at(which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        target = np.array([visit.target for visit in visits])[which]
-        lean = np.stack([visit.lean for visit in visits])[which]
-        distance = np.array([visit.distance for visit in visits])[which]
-        axis = _axes(outward[now, target], lean)
-        return positions[now, target] + distance[:, None] * axis, axis
+        target = np.array(targets)[which]
+        axis = _axes(outward[now, target], np.stack(leans)[which])
+        return positions[now, target] + np.array(distances)[which, None] * axis, axis
 
     (here, axis_here), (there, axis_there) = at(number), at(number + 1)
-    blend = share[:, None]
     axis = _between(axis_here, axis_there, blend)
     lift = RETREAT * np.sin(np.pi * blend) ** 2
     return _frames((1.0 - blend) * here + blend * there + lift * axis, axis)
 
 
-@dataclass(frozen=True, slots=True)
-class _Visit:
+class _Visit(NamedTuple):
     """A target, and the path to the next one."""
 
     target: int
