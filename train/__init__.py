@@ -41,7 +41,12 @@ if TYPE_CHECKING:
     from train.settings import SetLabelerConfig as SetLabelerConfig
     from train.settings import TrainSettings as TrainSettings
     from train.simulation.generation import generate_dataset as generate_dataset
+    from train.simulation.measured_room import MeasuredRoom as MeasuredRoom
+    from train.simulation.measured_room import measure_room as measure_room
     from train.simulation.room import OpticsOptions as OpticsOptions
+    from train.simulation.room import StrayOptions as StrayOptions
+    from train.simulation.room_like import RoomLike as RoomLike
+    from train.simulation.room_like import room_like as room_like
     from train.simulation.takes import SimulateSettings as SimulateSettings
     from train.simulation.takes import simulate_take as simulate_take
     from train.simulation.training_frames import GenerateSettings as GenerateSettings

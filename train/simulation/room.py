@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Annotated, Any, Final, NamedTuple
+from typing import Annotated, Any, Final, NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -36,6 +36,7 @@ from train.simulation.scenes import SceneMotion, SimulatedKind
 SKIN_CHUNK: Final = 16
 """Number of frames whose skins are posed together, few enough for the processor's cache."""
 _CHUNK: Final = 256  # number of frames whose lines of sight are in memory together
+Group = TypeVar("Group", OpticsConfig, StrayConfig)
 _MIN_BODY_MARKERS: Final = 3  # An object needs this many markers to be tracked as a rigid body.
 
 _SAME_ROOM: Final[dict[str, str]] = {"real-like": "hand-hand", "free": "single-hand"}
@@ -53,8 +54,31 @@ class RoomConfig(Settings):
     """Share of the mirror images in shiny patches that are bright enough to be seen."""
 
 
+class _Options(Settings):
+    """Base of settings that replace some of a group; None keeps the group's own."""
+
+    __slots__ = ()
+
+    def applied(self, group: Group) -> Group:
+        """Replace settings of a group by these options, and validate them."""
+        given = {name: value for name, value in dataclasses.asdict(self).items() if value is not None}  # type: ignore[call-overload]  # every subclass is a dataclass
+        return dataclasses.replace(group, **given)
+
+
 @dataclass(frozen=True, slots=True)
-class OpticsOptions(Settings):
+class StrayOptions(_Options):
+    """Fields of `StrayConfig`; the default of each is fitted to the kind of capture."""
+
+    number: float | None = None
+    """Mean number of reflecting spots on each hand and the object."""
+    shown: float | None = None
+    """Mean time that a spot reflects [s]."""
+    hidden: float | None = None
+    """Mean time between two flashes of a spot [s]."""
+
+
+@dataclass(frozen=True, slots=True)
+class OpticsOptions(_Options):
     """The fields of `OpticsConfig`; the default of each is fitted to the kind of capture."""
 
     noise: float | None = None
@@ -83,11 +107,6 @@ class OpticsOptions(Settings):
     """Number of rays that must meet for a point."""
     min_rays_to_start: int | None = None
     """Number of rays that must meet for a point that was not there in the frame before."""
-
-    def applied(self, optics: OpticsConfig) -> OpticsConfig:
-        """Replace settings of an optical system by these options, and validate them."""
-        given = {name: value for name, value in dataclasses.asdict(self).items() if value is not None}
-        return dataclasses.replace(optics, **given)
 
 
 class Twin(NamedTuple):

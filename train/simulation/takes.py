@@ -20,7 +20,7 @@ from handsim.hand.shape import Side
 from handsim.settings import Limits, Settings
 from handsim.space.rig import ROOM_CENTER, AnyRig, Center, check_outside_volume, load_rig, rig_setting
 from poses.motion import RATE
-from train.simulation.room import TWINS, OpticsOptions, RoomConfig, record_take, usual_room
+from train.simulation.room import TWINS, OpticsOptions, RoomConfig, StrayOptions, record_take, usual_room
 from train.simulation.scenes import (
     MAX_OTHERS,
     NUM_FRAMES,
@@ -66,6 +66,8 @@ class SimulateSettings(Settings):
     """Center of the space in which hands move, in the rig's room [m]."""
     optics: OpticsOptions = field(default_factory=OpticsOptions)
     """Settings of the optical system that differ from those fitted to this kind of capture."""
+    strays: StrayOptions = field(default_factory=StrayOptions)
+    """Stray reflections, where they differ from those fitted to this kind of capture."""
     hands: tuple[Side, ...] = BOTH
     """Hands to simulate: right, left, or both, which meet or hold an object together in the kinds hand-hand,
     hand-pen, hand-controller and real-like. A glove for one hand simulates that hand alone."""
@@ -80,7 +82,14 @@ class SimulateSettings(Settings):
                 f"hands are {' '.join(self.hands) or 'none'}, expected right and left, or one of them for "
                 f"the kinds {', '.join(APART)}"
             )
-        self.optics.applied(usual_room(self.kind).optics)
+        self.room()
+
+    def room(self) -> RoomConfig:
+        """The room of this kind of capture with these optics and strays."""
+        usual = usual_room(self.kind)
+        return dataclasses.replace(
+            usual, optics=self.optics.applied(usual.optics), strays=self.strays.applied(usual.strays)
+        )
 
 
 def simulate_take(
@@ -115,10 +124,10 @@ def simulate_take(
         scene = scene.moved(np.subtract(given.center, ROOM_CENTER))
     if given.others:
         scene = dataclasses.replace(scene, others=other_markers(scene, given.others, rng=rng))
-    room = usual_room(given.kind)
-    room = dataclasses.replace(room, optics=given.optics.applied(room.optics).worn(layout.radius))
+    room = given.room()
+    room = dataclasses.replace(room, optics=room.optics.worn(layout.radius))
     record = given.record() | {"rig": rig_setting(rig), "room": room.record()}
-    del record["optics"]  # the room has all of them
+    del record["optics"], record["strays"]  # the room has all of them
     if given.center == ROOM_CENTER:
         del record["center"]
     if set(given.hands) == set(BOTH):

@@ -1,0 +1,234 @@
+"""Settings of simulated captures and training sets whose optics do what those of a lab do.
+
+What noise, losses and strays make of a rig's views has no closed form: captures are simulated, measured like
+the lab's, and the settings are corrected by the ratios, some times.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final, Generic, TypeVar
+
+import numpy as np
+
+from gloves.layout import load_layout
+from handsim.callbacks import OnStep, no_step
+from handsim.space.rig import load_rig
+from train.simulation.generation import generate_dataset
+from train.simulation.measured_room import AnyTrial, MeasuredRoom, measure_room, measure_simulated
+from train.simulation.scenes import RATE
+from train.simulation.takes import SimulateSettings, simulate_take
+from train.simulation.training_frames import GenerateSettings
+
+Kind = TypeVar("Kind", SimulateSettings, GenerateSettings)
+_FRAMES: Final = 1200  # frames of a simulated capture that is measured
+_ROWS, _ROWS_PER_PERSON = 1024, 32  # of a training set that is measured
+_ROUNDS: Final = 7  # of corrections
+_LARGEST: Final = 4.0  # ratio of a correction
+_LOST_CAMERAS: Final = 0.375  # share of the cameras that lose pictures together: 6 of the 16 of figure5
+_SPOTS: Final = 30.0  # reflecting spots on a hand; many that flash rarely make any number of ghosts
+_LIT: Final = 0.95  # largest share of the time that a spot reflects
+_EXPECTED: Final = 30.0  # frames in which pairs would be nearer, from which their absence shows merging
+
+
+@dataclass(frozen=True, slots=True)
+class RoomLike(Generic[Kind]):
+    """Settings that follow captures of a lab, and how near they come."""
+
+    settings: Kind
+    values: Mapping[str, Any]
+    """The settings that follow the captures, by their names as options."""
+    table: tuple[tuple[str, str, str], ...]
+    """Rows of figures: what, as found in the captures, and as simulated with the settings."""
+    untold: tuple[str, ...]
+    """What the captures do not tell; those settings are the defaults."""
+
+    def sentences(self, settings: Kind) -> list[str]:
+        """Which values of the settings in use are from the captures, and what these do not tell."""
+        kept = [
+            f"{name} {_words(value)}"
+            for name, value in self.values.items()
+            if setting(settings, name) == value
+        ]
+        lines = [f"from the trial: {', '.join(kept) or 'nothing'}"]
+        return lines + [f"the trial does not tell {one}" for one in self.untold]
+
+
+def room_like(
+    captures: AnyTrial | Sequence[AnyTrial], settings: Kind, *, on_step: OnStep = no_step
+) -> RoomLike[Kind]:
+    """Settings of a simulated capture or of a training set whose optics are like those of a lab's captures.
+
+    Args:
+        captures: Captures, takes or their paths, labeled or not, of one optical system.
+        settings: The other settings, as the glove and the rig. Settings of optics and ghosts that are not
+            the defaults are kept.
+        on_step: Called with the name of each step.
+
+    Returns:
+        The settings, and a table of figures, found and simulated.
+
+    Raises:
+        CaptureError: A capture cannot be read, or has fewer than two markers.
+        ArgumentError: Positions are not in meters.
+    """
+    on_step("measuring the trial")
+    found = measure_room(captures)
+    on_step("simulating captures like it")
+    if isinstance(settings, GenerateSettings):
+        return _training_like(found, settings)
+    return _capture_like(found, settings)
+
+
+def filled(settings: Kind, values: Mapping[str, Any]) -> Kind:
+    """The settings with other values, by their names as options."""
+    groups = dict[str, Any]()
+    for name, value in values.items():
+        group, _, field = name.rpartition(".")
+        usual = groups.get(group, getattr(settings, group)) if group else None
+        groups[group or name] = value if usual is None else dataclasses.replace(usual, **{field: value})
+    return dataclasses.replace(settings, **groups)
+
+
+def setting(settings: Kind, name: str) -> Any:
+    """A setting by its name as an option."""
+    group, _, field = name.rpartition(".")
+    return getattr(getattr(settings, group) if group else settings, field)
+
+
+def _free(settings: Kind, values: Mapping[str, Any]) -> dict[str, Any]:
+    """Those values, with four digits, whose settings are the defaults."""
+    usual = type(settings)()
+    rounded = {
+        name: float(f"{value:.4g}") if isinstance(value, float) else value for name, value in values.items()
+    }
+    return {name: value for name, value in rounded.items() if setting(settings, name) == setting(usual, name)}
+
+
+def _words(value: Any) -> str:
+    return " ".join(f"{one:g}" for one in (value if isinstance(value, tuple) else (value,)))
+
+
+def _ratio(wanted: float | None, made: float | None) -> float:
+    """By what a setting is multiplied to make what is wanted."""
+    if wanted is None or made is None:
+        return 1.0
+    return float(np.clip(wanted / max(made, 1e-12), 1 / _LARGEST, _LARGEST))
+
+
+def _capture_like(found: MeasuredRoom, settings: SimulateSettings) -> RoomLike[SimulateSettings]:
+    """Settings of a simulated capture like those that were measured."""
+    room, rig = settings.room(), load_rig(settings.rig)
+    hands = max(1, round(found.num_markers / load_layout(settings.glove).num_markers))
+    found = _per_hand(found, hands)
+    noise, shown, lit = room.optics.noise, found.ghost_time or room.strays.shown, 0.02
+    length = max(1.0, RATE * found.gap_time) if found.gap_time else room.optics.dropout_length
+    values: dict[str, Any] = {
+        "optics.blob_loss": 0.0,
+        "optics.dropout_cameras": max(1, round(_LOST_CAMERAS * len(rig.positions))),
+    }
+    if found.ghosts is not None:
+        values["strays.number"] = _SPOTS if found.ghosts else 0.0
+    least = _simulated(settings, values | {"optics.dropout": 0.0})
+    untold, merging = list(found.untold), (least.nearest_pairs < found.nearest).mean() * found.num_frames
+    if found.nearest < room.optics.min_distance or merging >= _EXPECTED:
+        values["optics.min_distance"] = found.nearest
+    else:
+        untold.append("at which distance points merge: no markers came near enough")
+    above = max(0.0, found.missing - least.missing)
+    dropout = above / length
+    for _ in range(_ROUNDS):
+        values |= {"optics.noise": noise, "optics.dropout": dropout, "optics.dropout_length": length}
+        if found.ghosts:
+            values |= {"strays.shown": shown, "strays.hidden": shown * (1.0 / lit - 1.0)}
+        made = _simulated(settings, values)
+        noise *= _ratio(found.noise, made.noise)
+        shown *= _ratio(found.ghost_time, made.ghost_time) ** 0.5
+        lit = min(_LIT, lit * _ratio(found.ghosts, made.ghosts))
+        if above:
+            dropout = min(1.0, dropout * _ratio(above, made.missing - least.missing))
+            length = max(1.0, length * _ratio(found.gap_time, made.gap_time) ** 0.5)
+    values = _free(settings, values)
+    rows = _table(
+        ("noise per axis [mm]", found.noise, made.noise, 1e3),
+        ("markers missing [%]", found.missing, made.missing, 1e2),
+        ("mean gap [ms]", found.gap_time, made.gap_time, 1e3),
+        ("ghosts per frame and hand", found.ghosts, made.ghosts, 1.0),
+        ("mean time of a ghost [ms]", found.ghost_time, made.ghost_time, 1e3),
+        ("nearest pair [mm]", found.nearest, made.nearest, 1e3),
+        ("mean time of an ID [s]", found.id_time, made.id_time, 1.0),
+        ("frames per second", found.rate, made.rate, 1.0),
+    )
+    return RoomLike(filled(settings, values), values, rows, tuple(untold))
+
+
+def _simulated(settings: SimulateSettings, values: Mapping[str, Any]) -> MeasuredRoom:
+    """What a simulated capture with these values shows."""
+    chosen = filled(settings, _free(settings, values))
+    take = simulate_take(settings=dataclasses.replace(chosen, num_frames=_FRAMES))
+    return _per_hand(measure_simulated(take), len(take.hands))
+
+
+def _per_hand(room: MeasuredRoom, hands: int) -> MeasuredRoom:
+    """Figures with ghosts per hand."""
+    return room if room.ghosts is None else dataclasses.replace(room, ghosts=room.ghosts / hands)
+
+
+def _training_like(found: MeasuredRoom, settings: GenerateSettings) -> RoomLike[GenerateSettings]:
+    """Settings of a training set like the captures that were measured."""
+    free = SimulateSettings("free", glove=settings.glove, rig=settings.rig, center=settings.center)
+    capture = _capture_like(found, free)
+    hands = max(1, round(found.num_markers / load_layout(settings.glove).num_markers))
+    found = _per_hand(found, hands)
+    shared = {"optics.noise", "optics.min_distance"} & set(capture.values)
+    values = {name: capture.values[name] for name in sorted(shared)}
+    least, _ = _rows_of(settings, values | _losses(settings, 0.0))
+    losses, ghosts, above = 1.0, 1.0, max(0.0, found.missing - least)
+    for _ in range(_ROUNDS):
+        values |= _losses(settings, losses if above else 0.0)
+        if found.ghosts is not None:
+            values |= {
+                "ghosts.stray_rate": settings.ghosts.stray_rate * ghosts,
+                "ghosts.mirror_rate": min(1.0, settings.ghosts.mirror_rate * ghosts),
+            }
+        missing, made = _rows_of(settings, values)
+        losses *= _ratio(above, missing - least)
+        ghosts *= _ratio(found.ghosts, made)
+    values = _free(settings, values)
+    rows = _table(
+        ("markers missing [%]", found.missing, missing, 1e2),
+        ("ghosts per frame and hand", found.ghosts, made, 1.0),
+    )
+    optical = [row for row in capture.table if row[0] in ("noise per axis [mm]", "nearest pair [mm]")]
+    return RoomLike(filled(settings, values), values, (*optical, *rows), capture.untold)
+
+
+def _losses(settings: GenerateSettings, times: float) -> dict[str, Any]:
+    """The ranges of losses, times a number."""
+    return {
+        name: tuple(min(1.0, float(f"{times * end:.4g}")) for end in setting(settings, name))
+        for name in ("blob_loss", "dropout")
+    }
+
+
+def _rows_of(settings: GenerateSettings, values: Mapping[str, Any]) -> tuple[float, float]:
+    """Share of markers missing, and ghosts per row, of a small training set with these values."""
+    chosen = filled(settings, _free(settings, values))
+    with tempfile.TemporaryDirectory() as folder:
+        rows = generate_dataset(
+            folder, chosen, num_frames=_ROWS, frames_per_hand=_ROWS_PER_PERSON, workers=1
+        ).rows()
+        missing, ghosts = np.isnan(rows["observed"][..., 0]).mean(), np.isfinite(rows["ghosts"][..., 0])
+    return float(missing), float(ghosts.sum(axis=1).mean())
+
+
+def _table(*rows: tuple[str, float | None, float | None, float]) -> tuple[tuple[str, str, str], ...]:
+    """Rows of a table, from names, figures found and simulated, and the number of units in one."""
+    return tuple((name, _cell(found, scale), _cell(made, scale)) for name, found, made, scale in rows)
+
+
+def _cell(figure: float | None, scale: float) -> str:
+    return "not told" if figure is None else f"{figure * scale:.3g}"
