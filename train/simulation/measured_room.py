@@ -179,7 +179,7 @@ def _measured(source: AnyTrial) -> _Seen:
     points = capture.positions[np.isfinite(capture.positions[..., 0]).any(axis=1)]
     tracks, old_columns = _tracks(points, capture.rate)
     present, labeled = tracks >= 0, np.empty(0, dtype=np.int64)
-    if len(old_columns) >= _ENOUGH and np.mean(old_columns) >= _LASTING:
+    if len(old_columns) < _ENOUGH or np.mean(old_columns) >= _LASTING:
         named = [not name.rpartition(":")[2].strip().lower().startswith(_NAMELESS) for name in capture.names]
         whole = present.any(axis=0) & named
         tracks[present] += len(whole)

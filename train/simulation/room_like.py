@@ -26,7 +26,7 @@ from train.simulation.training_frames import GenerateSettings
 Kind = TypeVar("Kind", SimulateSettings, GenerateSettings)
 _FRAMES: Final = 1200  # frames of a simulated capture that is measured
 _ROWS, _ROWS_PER_PERSON = 1024, 32  # of a training set that is measured
-_ROUNDS: Final = 7  # of corrections
+_ROUNDS: Final = 8  # of corrections
 _LARGEST: Final = 4.0  # ratio of a correction
 _LOST_CAMERAS: Final = 0.375  # share of the cameras that lose pictures together: 6 of the 16 of figure5
 _SPOTS: Final = 30.0  # reflecting spots on a hand; many that flash rarely make any number of ghosts
@@ -149,7 +149,7 @@ def _capture_like(found: MeasuredRoom, settings: SimulateSettings) -> RoomLike[S
         shown *= _ratio(found.ghost_time, made.ghost_time) ** 0.5
         lit = min(_LIT, lit * _ratio(found.ghosts, made.ghosts))
         if above:
-            dropout = min(1.0, dropout * _ratio(above, made.missing - least.missing))
+            dropout = min(1.0, dropout * _ratio(above, made.missing - least.missing) ** 0.5)
             length = max(1.0, length * _ratio(found.gap_time, made.gap_time) ** 0.5)
     values = _free(settings, values)
     rows = _table(
@@ -195,7 +195,7 @@ def _training_like(found: MeasuredRoom, settings: GenerateSettings) -> RoomLike[
                 "ghosts.mirror_rate": min(1.0, settings.ghosts.mirror_rate * ghosts),
             }
         missing, made = _rows_of(settings, values)
-        losses *= _ratio(above, missing - least)
+        losses *= _ratio(above, missing - least) ** 0.5  # several cameras lose a marker together
         ghosts *= _ratio(found.ghosts, made)
     values = _free(settings, values)
     rows = _table(

@@ -48,8 +48,10 @@ SHOWN = {
 SEARCHED = {
     "glove improve": "keep rig minutes seed",
     "glove score": "labeler",
+    "generate": "like",
+    "simulate": "like",
 }
-"""Options that are not varied: those of a search may leave its outcome as it is."""
+"""Options that are not varied: those of a search may leave its outcome as it is, and it may take long."""
 SMALL = "--batch 32 --network.width 8 --network.gates 2 --network.depth 1"
 QUICK = [
     ("hand", "--out h.xml", "size XL|side left|glove dense19|actuators|shape user.json|take take.npz"),

@@ -100,3 +100,35 @@ def test_a_glove_that_the_labeler_does_not_know_is_told(tmp_path, capsys):
     assert main(["evaluate", str(out.with_suffix(".truth.npz")), "--glove", "dense19"]) == 1
     said = capsys.readouterr().err
     assert said.count("\n") == 1 and "the labeler knows" in said
+
+
+def test_a_capture_like_a_trial_says_what_came_from_it(taken, tmp_path, capsys):
+    out = tmp_path / "like.c3d"
+    command = ["simulate", "--kind", "free", "--num-frames", "60", "--like", str(taken), "--out", str(out)]
+    assert main([*command, "--optics.noise", "0.3"]) == 0
+    said = capsys.readouterr().out
+    assert "found" in said and "markers missing [%]" in said
+    line = next(one for one in said.splitlines() if one.startswith("from the trial: "))
+    optics = load_take(out.with_suffix(".truth.npz")).settings["room"]["optics"]
+    assert optics["noise"] == 0.3 and "optics.noise" not in line
+    assert f"optics.dropout {optics['dropout']:g}" in line
+    assert "the trial does not tell " in said
+
+
+def test_a_trial_with_one_marker_is_refused_in_one_sentence(tmp_path, capsys):
+    trial, path = tmp_path / "one.trc", np.zeros((50, 1, 3)) + [0.1, 0.2, 1.0]
+    write_capture(trial, Capture(("RH1",), path, 100.0))
+    assert main(["simulate", "--like", str(trial), "--out", str(tmp_path / "out.c3d")]) == 1
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert said.endswith("only one marker stays for half of the frames, expected the markers of a hand")
+    assert not (tmp_path / "out.c3d").exists()
+
+
+def test_a_training_set_like_a_trial_keeps_the_options_that_are_given(taken, tmp_path, capsys):
+    out = tmp_path / "set"
+    command = ["generate", "--like", str(taken), "--num-frames", "64", "--workers", "1", "--out", str(out)]
+    assert main([*command, "--blob-loss", "0.0", "0.15"]) == 0  # the default, but given
+    said = capsys.readouterr().out
+    config = json.loads((out / "config.json").read_text())
+    assert config["blob_loss"] == [0.0, 0.15] and "blob_loss" not in said
+    assert f"optics.noise {config['optics']['noise']:g}" in said

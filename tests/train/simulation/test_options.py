@@ -27,7 +27,8 @@ STRONG = {
     "roundness": 40.0, "min_angle": 60.0, "min_distance": 0.03, "max_residual": 0.0002, "partial": 3.0,
     "min_rays": 6, "min_rays_to_start": 8, "dropout": 0.3, "dropout_length": 9.0, "dropout_cameras": 9,
     "blob_loss": 0.3, "min_cameras": 6, "children": 0.9, "marker_radius": 0.008, "noise": 0.5,
-    "knuckle_spread": 0.004, "holding": 0.0,
+    "knuckle_spread": 0.004, "holding": 0.0, "strays.number": 9.0,
+    "strays.shown": 0.1, "strays.hidden": 0.2,
 }  # fmt: skip
 
 
@@ -89,6 +90,8 @@ def test_every_option_of_simulate_acts(name, value):
     usual = SimulateSettings(num_frames=FRAMES)
     if name == "optics.min_rays":  # a point may not begin with fewer rays than it needs to go on
         usual = changed(usual, "optics.min_rays_to_start", STRONG["min_rays_to_start"])
+    if name in ("strays.shown", "strays.hidden"):  # the usual capture has no strays
+        usual = changed(usual, "strays.number", STRONG["strays.number"])
     assert points_of(changed(usual, name, other(name, value))) != points_of(usual)
 
 
