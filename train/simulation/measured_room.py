@@ -180,11 +180,11 @@ def _measured(source: AnyTrial) -> _Seen:
     tracks, old_columns = _tracks(points, capture.rate)
     present, labeled = tracks >= 0, np.empty(0, dtype=np.int64)
     if len(old_columns) < _ENOUGH or np.mean(old_columns) >= _LASTING:
-        named = [not name.rpartition(":")[2].strip().lower().startswith(_NAMELESS) for name in capture.names]
-        whole = present.any(axis=0) & named
+        names = [name.rpartition(":")[2].strip().lower() for name in capture.names]
+        whole = np.array([not name.startswith(_NAMELESS) for name in names])
         tracks[present] += len(whole)
         tracks[:, whole] = np.where(present[:, whole], np.flatnonzero(whole), -1)
-        labeled = np.flatnonzero(whole)
+        labeled = np.flatnonzero(whole & (present.sum(axis=0) > 0))
     lasts = np.flatnonzero(np.bincount(tracks[present]) >= _MARKER * len(points))
     markers = np.union1d(labeled, lasts)
     if len(markers) < 2:
@@ -257,7 +257,7 @@ def _chained(tracks: Int[np.ndarray, "T N"], rate: float) -> NDArray[np.int64]:
     brief = int(_BRIEF * rate)
     chain = np.arange(len(counts)) + len(long)
     chain[long], _ = shared_columns(begins[long], np.maximum(ends[long] - brief, begins[long]))
-    return np.append(chain, -1)[tracks]
+    return np.asarray(np.append(chain, -1)[tracks])
 
 
 def _returned(
@@ -287,7 +287,7 @@ def _predicted(
     near = np.argsort(np.linalg.norm(points[last, before] - point, axis=1))[:_ANCHORS]
     source, target = points[last, before[near]], points[t, now[near]]
     if len(near) < 3:
-        return point
+        return np.asarray(point)
     rotation, translation = rigid_fit(source, target)
     return np.asarray(rotation @ point + translation)
 
