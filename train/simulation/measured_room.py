@@ -84,6 +84,11 @@ class MeasuredRoom:
         return bool(self.lasting_ids) or self.ghosts is None
 
     @property
+    def tells_losses(self) -> bool:
+        """Whether gaps are those of the optics: a labeled capture with hardly any may have been filled."""
+        return not self.is_labeled or len(self.gaps) >= _ENOUGH
+
+    @property
     def gap_time(self) -> float | None:
         """Mean length of a gap [s]; None if there are too few."""
         return float(np.mean(self.gaps)) if len(self.gaps) >= _ENOUGH else None
@@ -148,7 +153,7 @@ def _averaged(seen: Sequence[_Seen]) -> MeasuredRoom:
     untold = {
         "ghosts: every point is a marker's, as where a capture was labeled": not told,
         f"how long ghosts stay: only {len(flashes)} were seen": told and len(flashes) < _ENOUGH,
-        f"how long gaps last: only {len(gaps)} were seen": len(gaps) < _ENOUGH,
+        f"how long gaps last, or whether they were filled: only {len(gaps)} were seen": len(gaps) < _ENOUGH,
         f"gaps of more than {longest:.2g} s: the captures are short": longest < _LONG,
         "whether IDs last over gaps: few markers returned": lasting is None,
         "noise: no marker is seen in six frames in a row": not noise,

@@ -126,13 +126,13 @@ def _capture_like(found: MeasuredRoom, settings: SimulateSettings) -> RoomLike[S
     found = _per_hand(found, hands)
     noise, shown, lit = room.optics.noise, found.ghost_time or room.strays.shown, 0.02
     length = max(1.0, RATE * found.gap_time) if found.gap_time else room.optics.dropout_length
-    values: dict[str, Any] = {
-        "optics.blob_loss": 0.0,
-        "optics.dropout_cameras": max(1, round(_LOST_CAMERAS * len(rig.positions))),
-    }
+    values = dict[str, Any]()
+    if found.tells_losses:
+        lost = max(1, round(_LOST_CAMERAS * len(rig.positions)))
+        values |= {"optics.blob_loss": 0.0, "optics.dropout": 0.0, "optics.dropout_cameras": lost}
     if found.ghosts is not None:
         values["strays.number"] = _SPOTS if found.ghosts else 0.0
-    least = _simulated(settings, values | {"optics.dropout": 0.0})
+    least = _simulated(settings, values)
     untold, merging = list(found.untold), (least.nearest_pairs < found.nearest).mean() * found.num_frames
     if found.nearest < room.optics.min_distance or merging >= _EXPECTED:
         values["optics.min_distance"] = found.nearest
@@ -141,9 +141,15 @@ def _capture_like(found: MeasuredRoom, settings: SimulateSettings) -> RoomLike[S
     above = max(0.0, found.missing - least.missing)
     dropout = above / length
     for _ in range(_ROUNDS):
-        values |= {"optics.noise": noise, "optics.dropout": dropout, "optics.dropout_length": length}
+        values["optics.noise"] = noise
+        if found.tells_losses:
+            values["optics.dropout"] = dropout
+        if found.gap_time is not None:
+            values["optics.dropout_length"] = length
         if found.ghosts:
-            values |= {"strays.shown": shown, "strays.hidden": shown * (1.0 / lit - 1.0)}
+            values["strays.hidden"] = shown * (1.0 / lit - 1.0)
+        if found.ghost_time is not None:
+            values["strays.shown"] = shown
         made = _simulated(settings, values)
         noise *= _ratio(found.noise, made.noise)
         shown *= _ratio(found.ghost_time, made.ghost_time) ** 0.5
@@ -188,7 +194,8 @@ def _training_like(found: MeasuredRoom, settings: GenerateSettings) -> RoomLike[
     least, _ = _rows_of(settings, values | _losses(settings, 0.0))
     losses, ghosts, above = 1.0, 1.0, max(0.0, found.missing - least)
     for _ in range(_ROUNDS):
-        values |= _losses(settings, losses if above else 0.0)
+        if found.tells_losses:
+            values |= _losses(settings, losses if above else 0.0)
         if found.ghosts is not None:
             values |= {
                 "ghosts.stray_rate": settings.ghosts.stray_rate * ghosts,

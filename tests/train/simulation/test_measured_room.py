@@ -90,7 +90,7 @@ def test_several_captures_count_together():
 
 def test_what_a_short_labeled_capture_does_not_tell_is_said():
     source = take().labeled_capture()
-    markers = Capture(source.names[:19], source.positions[:30, :19], source.rate)
+    markers = Capture(source.names[:5], source.positions[:30, :5], source.rate)
     room = measure_room(markers)
     assert room.ghosts is None and room.ghost_time is None and room.gap_time is None
     told = "\n".join(room.untold)
