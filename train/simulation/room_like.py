@@ -17,9 +17,9 @@ import numpy as np
 from gloves.layout import load_layout
 from handsim.callbacks import OnStep, no_step
 from handsim.space.rig import load_rig
+from poses.motion import RATE
 from train.simulation.generation import generate_dataset
 from train.simulation.measured_room import AnyTrial, MeasuredRoom, measure_room, measure_simulated
-from train.simulation.scenes import RATE
 from train.simulation.takes import SimulateSettings, simulate_take
 from train.simulation.training_frames import GenerateSettings
 
