@@ -57,9 +57,9 @@ def make_scene(folder: Path, condition: str, *, seed: int, frames: int = 0) -> S
         left = _brought_close(right, far, rate, rng) if condition == "close" else far
         points = np.concatenate([right, left], axis=1)
         if condition != "clean":
-            ghosts = [ghost for hand in (right, left) for ghost in _ghosts(hand, rng)]
+            ghosts = [ghost for hand in (right, left) for ghost in sample_ghosts(hand, rng)]
             for column in points.swapaxes(0, 1):
-                column[_gaps(len(column), rng)] = np.nan
+                column[sample_gaps(len(column), rng)] = np.nan
             points = np.concatenate([points, *(ghost[:, None] for ghost in ghosts)], axis=1)
         dark = np.full((int(_DARK * rate), points.shape[1], 3), np.nan)
         parts += [points, dark]
@@ -123,7 +123,7 @@ def _brought_close(right: np.ndarray, left: np.ndarray, rate: float, rng: np.ran
     return moved
 
 
-def _gaps(frames: int, rng: np.random.Generator) -> np.ndarray:
+def sample_gaps(frames: int, rng: np.random.Generator) -> np.ndarray:
     """When a marker is missing (T,): for 4 frames at a time in the median, 30 in one of ten."""
     gone, pause = np.zeros(frames, dtype=bool), _USUAL_GAP * (1.0 - _MISSING) / _MISSING
     t = rng.exponential(pause)
@@ -134,7 +134,7 @@ def _gaps(frames: int, rng: np.random.Generator) -> np.ndarray:
     return gone
 
 
-def _ghosts(hand: np.ndarray, rng: np.random.Generator) -> Iterator[np.ndarray]:
+def sample_ghosts(hand: np.ndarray, rng: np.random.Generator) -> Iterator[np.ndarray]:
     """Points (T, 3) [m] in a hand's box that go along with it for one to five frames, NaN else."""
     low, high = hand.min(1), hand.max(1)
     first = rng.exponential(20.0)
