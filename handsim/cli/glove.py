@@ -144,9 +144,10 @@ def learn_glove(
         with named_steps("labeling what was not learned from"):
             proof = prove_glove(learned, captures, rng=np.random.default_rng(0))
         share, worst = percent_between(proof.frames, proof.interval), percent(min(proof.by_capture))
-        what = "of the frames of the captures' last thirds are labeled right in every marker"
+        what = "(95 % interval, one frame a second counts) of the frames of the captures' last thirds"
         print_line(
-            f"{share} % {what}; {worst} % in the worst capture, {percent(proof.slots)} % of the markers"
+            f"{share} % {what} are labeled right in every marker; {worst} % in the worst capture, "
+            f"{percent(proof.slots)} % of the markers"
         )
     print_line(f"{out}: run `handsim label NEXT.c3d --glove {out} --out labeled.c3d` on the next capture")
 

@@ -249,7 +249,7 @@ class _Trials:
             one = Alternative(tuple(changed), self._words[order], 0.0)
             tried.append((cost, one, self._fits[order], side))
         if mirrored is not None and gain < np.inf:
-            every = Alternative(tuple(range(len(given))), f"it is the {other} one", 0.0)
+            every = Alternative(tuple(range(len(given))), f"it is the {other} hand", 0.0)
             tried.append((self.least + self._columns.left_over(given) + gain, every, mirrored, other))
         log_odds = np.array([-cost / _TEMPERATURE for cost, *_ in tried])
         shares = np.exp(log_odds - log_odds.max())

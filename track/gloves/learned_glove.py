@@ -171,7 +171,7 @@ class _Learning:
         self, sources: Sequence[Capture], radius: float, sides: tuple[Side, ...], on_step: OnStep
     ) -> None:
         self._sources, self._radius, self._sides, self._on_step = sources, radius, sides, on_step
-        self._sure = dict[str, float]()
+        self._sure, self._doubt = dict[str, float](), list[str]()
 
     def learned(self, name: str, start: MarkerLayout | None) -> LearnedGlove:
         """Find the hands in all parts, and fit one layout to them."""
@@ -198,12 +198,20 @@ class _Learning:
         return self._common(dataclasses.replace(layout, name=name), hands)
 
     def _searched(self, part: _Part) -> FittedHand | None:
-        """The likeliest hand in the columns of a part; None if none fits."""
-        found = search_places(part.points, part.names, self._radius, sides=self._sides, on_step=self._on_step)
-        best = found[0]
+        """The likeliest hand in the columns of a part; None if none fits.
+
+        Both sides are tried whatever was asked for, because a hand of the wrong side fits nearly as well.
+        """
+        found = search_places(part.points, part.names, self._radius, on_step=self._on_step)
+        asked = [one for one in found if one.side in self._sides]
+        best, likeliest = (asked or found)[0], found[0]
         if np.median(best.residuals) > _FITS or len(best.columns) < FEWEST_MARKERS:
             return None
-        self._sure |= _probabilities(found)
+        if best.side not in self._sides:
+            raise CaptureError(f"the columns fit a {best.side} hand and none that is asked for; give hands")
+        if likeliest.side != best.side:
+            self._doubt.append(f"the columns fit a {likeliest.side} hand better than a {best.side} one")
+        self._sure |= _probabilities(asked)
         return best
 
     def _common(self, layout: MarkerLayout, hands: Sequence[_Found]) -> LearnedGlove:
@@ -217,7 +225,7 @@ class _Learning:
             layout = _mean_layout(layout, places)
         wearable = settle_glove(_only(layout, layout.names), HandModel.named("M")).layout
         layout = dataclasses.replace(wearable, sides=tuple(sorted({one.side for one in hands})))
-        done, doubt = list[TrialHand](), list[str]()
+        done, doubt = list[TrialHand](), list(self._doubt)
         for one, fit in zip(hands, fitted, strict=True):
             own = [name for name in layout.names if name in one.columns]
             columns = {name: int(one.part.columns[one.columns[name]]) for name in own}

@@ -176,12 +176,11 @@ def search_places(
     names: Iterable[str],
     radius: float,
     *,
-    sides: Iterable[Side] = SIDES,
     on_step: OnStep = no_step,
 ) -> list[FittedHand]:
     """Look for the places of 5 to 60 columns [m] of one hand, NaN where missing; likely hands, best first."""
     search, found = _Search(points, tuple(names), radius), list[Solution]()
-    for side in sides:
+    for side in SIDES:
         on_step(f"laying a {side} hand into the frames")
         found += search.first_solutions(side)
     on_step("fitting hands")

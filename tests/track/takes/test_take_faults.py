@@ -221,4 +221,4 @@ def test_hands_of_the_wrong_side_are_never_silent(mirror_like, turned):
         for one in find_faults(as_tracked([other], PoseSolver(other).solve(seen).qpos[:, None], seen))
         if one.of == "the left hand"
     )
-    assert fault.why.endswith("it is the right one") and fault.of_labels
+    assert fault.why.endswith("it is the right hand") and fault.of_labels
