@@ -61,7 +61,7 @@ tables: $(DEVELOPER)  ## print the paper's tables beside ours, half an hour; ONL
 	for table in $(or $(ONLY),table3 table4 table5 table6 cameras calibrated); do \
 	  OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.paper $$table || exit 1; done
 
-results: $(DEVELOPER)  ## write docs/results.md, trust.md and ablation.md from the figures in benchmarks/figures
+results: $(DEVELOPER)  ## write docs/results.md and docs/trust.md from the figures in benchmarks/figures
 	$(BIN)/python -m benchmarks.results
 
 truth: $(DEVELOPER)  ## the tracker on real hands in motion: DATA=path of Mocap_SIG18_Data

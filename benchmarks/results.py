@@ -1,4 +1,4 @@
-"""Writes results.md, trust.md and ablation.md in docs/ from the figures: `python -m benchmarks.results`.
+"""Writes docs/results.md and docs/trust.md from benchmarks/figures: `python -m benchmarks.results`.
 
 The page's text is results_template.md; `{table5.right_size[1]:.2f}` in it is a number of table5.json, and
 `{speed_times}` and `{speed_rates}` are tables of all of speed.json, and `{speed_run}` says how it was made.
@@ -10,8 +10,6 @@ import json
 from pathlib import Path
 from typing import Final
 
-from benchmarks.ablation_page import PAGE as ABLATION
-from benchmarks.ablation_page import ablation_page
 from benchmarks.record import FOLDER, load_figures
 from benchmarks.trust import PAGE as TRUST
 from benchmarks.trust import trust_page
@@ -74,5 +72,4 @@ def _shown(value: float) -> str:
 if __name__ == "__main__":
     PAGE.write_text(filled(TEMPLATE.read_text("utf-8")), "utf-8")
     TRUST.write_text(trust_page(), "utf-8")
-    ABLATION.write_text(ablation_page(), "utf-8")
-    print(PAGE, TRUST, ABLATION)
+    print(PAGE, TRUST)

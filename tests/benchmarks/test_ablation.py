@@ -1,4 +1,4 @@
-"""Numbers of modules are found, with what reads them, and the page of ablations has the kept figures."""
+"""Numbers of modules are found, with what reads them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import pytest
 
 from benchmarks.ablation import CHANGES, MODULES, _Varying, varied
 from benchmarks.ablation_numbers import ROOT, Sources, numbers
-from benchmarks.ablation_page import PAGE, ablation_page
 
 FOUND = {number.key: number for number in numbers(MODULES)}
 
@@ -61,7 +60,3 @@ def test_a_module_is_loaded_with_another_value_and_what_is_derived_follows(monke
     monkeypatch.setitem(sys.modules, name, before)
     assert after.MARKER_NOISE == 2.0 * before.MARKER_NOISE
     assert after._MARKER_PRECISION == pytest.approx(0.25 * before._MARKER_PRECISION)
-
-
-def test_the_page_is_what_the_script_writes():
-    assert PAGE.read_text("utf-8") == ablation_page(), "`make results` puts it right"
