@@ -31,7 +31,7 @@ from benchmarks.real_scenes import CONDITIONS, FAST, NAMES, Condition, Scene, ma
 from benchmarks.record import Figures, describe, run, save_figures
 from gloves import load_layout
 from track import StreamedFrame, Tracker, label_capture
-from track.calibration.hand_size import fit_size, sample_frames
+from track.hand_size import fit_size, sample_frames
 from train import load_labeler
 
 SIDES = ("right", "left")

@@ -9,7 +9,7 @@ import pytest
 
 from poses.shapes import SAMPLERS
 from tests.documents import PAGES, ROOT, blocks_of, name_of, run_blocks
-from track.live.sinks import GROUP as SINKS
+from track.output.sinks import GROUP as SINKS
 from track.streams.live_stream import GROUP as SOURCES
 from train.data.batches import CORRUPTIONS
 from train.labelers.protocol import LABELERS

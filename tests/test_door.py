@@ -6,7 +6,7 @@ import ast
 import importlib
 import inspect
 import re
-from typing import get_args, get_type_hints
+from typing import get_args, get_origin, get_type_hints
 
 import pytest
 
@@ -72,6 +72,7 @@ def test_a_list_of_arguments_is_whole(package, name):
 def our_types(annotation: object) -> set[type]:
     """The classes of our packages in a type."""
     found = {one for part in get_args(annotation) for one in our_types(part)}
+    annotation = get_origin(annotation) or annotation
     if inspect.isclass(annotation) and annotation.__module__.split(".")[0] in PACKAGES:
         found.add(annotation)
     return found

@@ -12,7 +12,7 @@ import pytest
 
 from gloves import Capture
 from handsim import HandModel, HandSimError
-from train import Corruption
+from train import Corruption, SimulateSettings
 
 PACKAGES = ("handsim", "poses", "gloves", "train")
 WRONG = (5, None, [1, 2], {"a": 1}, object(), 2.5, "no such thing", b"bytes", HandSimError)
@@ -45,7 +45,9 @@ VALID: dict[str, dict[str, object]] = {
     "train.evaluate_labels": {"labeled": CAPTURE, "truth": "gone.truth.npz"},
     "train.generate_dataset": {"out": "set", "glove": "tips8", "rig": "six", "num_frames": 10, "seed": 0},
     "train.load_labeler": {"glove": "dense19"},
+    "train.measure_room": {"captures": CAPTURE},
     "train.plan_rig": {"cameras": 2, "room": (2.4, 1.8, 2.2), "glove": "tips8", "seed": 0},
+    "train.room_like": {"captures": CAPTURE, "settings": SimulateSettings("free")},
     "train.score_rig": {"rig": "six", "glove": "tips8", "num_frames": 60, "seed": 0},
     "train.simulate_take": {"kind": "free", "glove": "tips8", "rig": "six", "num_frames": 2, "seed": 0},
     "train.train_labeler": {"dataset": "set", "out": "run"},

@@ -45,14 +45,14 @@ if TYPE_CHECKING:
     from track.kinematics.pose_solver import PoseFit as PoseFit
     from track.kinematics.pose_solver import solve_pose as solve_pose
     from track.kinematics.pose_spread import HandErrors as HandErrors
-    from track.live.live_message import LiveBody as LiveBody
-    from track.live.live_message import LiveHand as LiveHand
-    from track.live.live_message import LiveHeader as LiveHeader
-    from track.live.live_message import LiveMessage as LiveMessage
-    from track.live.live_message import LiveSink as LiveSink
-    from track.live.recorder import Recorder as Recorder
-    from track.live.sinks import SinkGroup as SinkGroup
-    from track.live.sinks import open_sinks as open_sinks
+    from track.output.live_message import LiveBody as LiveBody
+    from track.output.live_message import LiveHand as LiveHand
+    from track.output.live_message import LiveHeader as LiveHeader
+    from track.output.live_message import LiveMessage as LiveMessage
+    from track.output.live_message import LiveSink as LiveSink
+    from track.output.recorder import Recorder as Recorder
+    from track.output.sinks import SinkGroup as SinkGroup
+    from track.output.sinks import open_sinks as open_sinks
     from track.settings import CalibrateSettings as CalibrateSettings
     from track.settings import LabelSettings as LabelSettings
     from track.settings import TrackSettings as TrackSettings

@@ -28,19 +28,19 @@ from handsim.errors import CalibrationError, CaptureError, HandSimWarning, error
 from handsim.hand.shape import NUM_QPOS, Side
 from track.alternatives.alternatives import doubts_of, judge_take, with_doubt
 from track.alternatives.hands import other_hands_of, with_other_hands
-from track.association.bidirectional_labeling import label_both_ways
 from track.association.frame_state import change_of_distances
 from track.association.initialization import label_alone
-from track.association.label_confidence import label_confidence
-from track.calibration.hand_size import measured_user, sample_frames
-from track.calibration.take_calibration import calibrate_take, kept_user, leaves_markers
 from track.frames import AnyCapture, StreamedFrame, TrackedFrame, capture_of, checked_frames
+from track.hand_size import measured_user, sample_frames
 from track.kinematics.pose_solver import FEWEST_MARKERS
-from track.live.recorder import frame_values, take_of_rows
-from track.live.sinks import SinkGroup
+from track.output.recorder import frame_values, take_of_rows
+from track.output.sinks import SinkGroup
 from track.settings import USUAL_SIZE, CalibrateSettings, LabelSettings, TrackerSetup, TrackSettings
+from track.takes.bidirectional_labeling import label_both_ways
 from track.takes.corrected_take import correct_take
+from track.takes.label_confidence import label_confidence
 from track.takes.smoothed_take import smooth_take
+from track.takes.take_calibration import calibrate_take, kept_user, leaves_markers
 from track.takes.take_summary import misfits, no_points
 from track.tracker import Tracker
 from track.user import AnyGlove, AnyLabeler, User, labeler_of, nominal_user

@@ -15,9 +15,9 @@ from handsim.errors import ArgumentError
 from handsim.hand.shape import SIDES, Side
 from handsim.settings import Expected, Settings
 from track.bodies.rigid_body import AnyBody, RigidTemplate, load_bodies
-from track.calibration.hand_size import check_hands, check_scale, measured_user
 from track.config import Size, TrackerConfig
 from track.frames import StreamedFrame
+from track.hand_size import check_hands, check_scale, measured_user
 from track.tracker import Tracker
 from track.user import AnyGlove, AnyLabeler, User, as_user, labeler_of, nominal_user
 from train.labelers.protocol import Labeler

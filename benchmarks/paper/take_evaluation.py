@@ -16,7 +16,7 @@ from gloves.fit import nominal_fit
 from handsim import HandModel
 from handsim.hand.shape import NUM_QPOS, SIZES
 from track import StreamedFrame, TrackedFrame
-from track.calibration.hand_size import fit_size, sample_frames
+from track.hand_size import fit_size, sample_frames
 from train import Labeler
 
 MOST_RMS: Final = 0.008

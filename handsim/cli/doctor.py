@@ -114,8 +114,8 @@ def send_pointing_hand(address: str, ended: Callable[[], bool], tell: Callable[[
     from handsim.hand.shape import JOINT_NAMES
     from handsim.space.transforms import UpAxis, program_axes, rotation_quaternions
     from track.frames import StreamedFrame, TrackedFrame, TrackedHand
-    from track.live.live_message import WORLD, Content
-    from track.live.sinks import open_sinks
+    from track.output.live_message import WORLD, Content
+    from track.output.sinks import open_sinks
 
     bent = [name.startswith(("middle", "ring", "little")) and "flexion" in name for name in JOINT_NAMES]
     with open_sinks(address) as sinks:

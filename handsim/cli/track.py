@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from track.captures import OnFrame
     from track.frames import StreamedFrame, TrackedFrame
     from track.live.live_tracking import LiveTake
-    from track.live.sinks import SinkGroup
+    from track.output.sinks import SinkGroup
     from track.settings import TrackSettings
 
 
@@ -62,7 +62,7 @@ def track(
     """
     from gloves.captures.formats import WRITABLE, check_suffix, write_capture
     from track.live.live_tracking import track_live
-    from track.live.sinks import open_sinks
+    from track.output.sinks import open_sinks
     from track.settings import TrackerSetup
 
     check_source("capture", capture, live)

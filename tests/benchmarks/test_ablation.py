@@ -42,7 +42,7 @@ def test_a_number_is_plain_if_functions_of_its_module_alone_read_it(sources):
     assert sources.is_plain(FOUND["track/tracker.py:_DOUBT_SHARE"])
     assert not sources.is_plain(FOUND["track/association/label_consistency.py:_GATE"])  # a kernel
     assert not sources.is_plain(FOUND["track/takes/take_summary.py:_MOST_DOUBTS"])  # a default of an argument
-    assert not sources.is_plain(FOUND["track/calibration/hand_size.py:AT_HAND"])  # another module
+    assert not sources.is_plain(FOUND["track/hand_size.py:AT_HAND"])  # another module
     ran = {("track/tracker.py", sources._lines["_DOUBT_SHARE"][0][1])}
     assert sources.is_read(FOUND["track/tracker.py:_DOUBT_SHARE"], ran)
     assert not sources.is_read(FOUND["track/tracker.py:_DOUBT_RMS"], ran)

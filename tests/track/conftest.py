@@ -13,7 +13,7 @@ from gloves.fit import nominal_fit
 from handsim.hand.shape import NUM_QPOS
 from handsim.space.objects import named_object
 from track import LiveMessage, RigidTemplate, StreamedFrame, TrackedBody, TrackedFrame, TrackedHand
-from track.live.live_message import MessageEncoder
+from track.output.live_message import MessageEncoder
 
 
 @functools.cache

@@ -23,7 +23,7 @@ from track import (
     open_source,
     track_capture,
 )
-from track.live.recorder import Recorder
+from track.output.recorder import Recorder
 from train import evaluate_labeler, load_labeler, simulate_take
 
 FRAMES, RATE = 60, 120.0
@@ -262,7 +262,7 @@ from numba.core.registry import CPUDispatcher
 from gloves.fit import nominal_fit
 from gloves.layout import load_layout
 from track.captures import track_capture
-from track.association.label_confidence import label_confidence
+from track.takes.label_confidence import label_confidence
 from track.tracker import Tracker
 from track.frames import checked_frames
 from train.labelers.storage import load_labeler

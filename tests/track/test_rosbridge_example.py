@@ -15,7 +15,7 @@ from websockets.sync.server import serve
 
 from handsim.hand.shape import JOINT_NAMES
 from tests.waiting import wait_for
-from track.live.sinks import open_sink
+from track.output.sinks import open_sink
 
 FIELDS = {
     "sensor_msgs/msg/JointState": {"header", "name", "position", "velocity", "effort"},

@@ -1,1 +1,1 @@
-"""Live tracking: people who come and go, what is sent, and what is recorded."""
+"""Live tracking, of people who come and go."""

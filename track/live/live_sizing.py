@@ -24,9 +24,9 @@ from handsim.callbacks import Closing
 from handsim.errors import HandSimError, HandSimWarning
 from handsim.hand.model import HandModel, hand_keypoints
 from handsim.kernels import move, velocity_of
-from track.calibration.hand_size import hand_between, sample_frames
 from track.captures import judged_setup
 from track.frames import StreamedFrame, TrackedFrame, TrackedHand
+from track.hand_size import hand_between, sample_frames
 from track.settings import TrackerSetup, TrackSettings
 from track.tracker import Tracker
 from track.user import MEASURED, User

@@ -23,7 +23,7 @@ from track.bodies.rigid_body import RigidTemplate
 from track.captures import OnFrame
 from track.frames import StreamedFrame, TrackedFrame
 from track.live.live_sizing import LiveSizing
-from track.live.recorder import Recorder
+from track.output.recorder import Recorder
 from track.settings import TrackerSetup
 from track.streams import NoServerError
 from track.streams.live_stream import LiveStream, open_source

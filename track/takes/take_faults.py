@@ -18,7 +18,7 @@ from gloves.takes.take import TRACKED, Take
 from handsim.hand.shape import JOINTS, Side
 from track.alternatives.alternatives import doubts_of
 from track.alternatives.hands import other_hands_of
-from track.calibration.hand_size import glove_shifts
+from track.hand_size import glove_shifts
 from track.kinematics.pose_solver import FEWEST_MARKERS
 
 _FEWEST: Final = 60  # Faults are looked for from this many tracked frames of a hand on.

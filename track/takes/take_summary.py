@@ -13,8 +13,8 @@ from gloves.fit import Attachment
 from gloves.takes.take import COASTING, LOST, STATUSES, Take
 from handsim.hand.shape import DIGITS, JOINT_NAMES, Side
 from track.association.initialization import distances_to_nearest
-from track.association.label_confidence import Evidence, evidence_of, label_confidence
-from track.calibration.hand_size import AT_HAND
+from track.hand_size import AT_HAND
+from track.takes.label_confidence import Evidence, evidence_of, label_confidence
 from track.takes.take_faults import SuspectSpan, find_faults
 
 _LEAST_SEEN: Final = 0.1  # A hand should have a pose in this share of the frames.

@@ -22,10 +22,12 @@ from gloves.captures.formats import read_capture
 from gloves.captures.pieces import shared_columns
 from gloves.optics.ghosts import GHOST_REACH
 from gloves.takes.take import Take, load_take
+from handsim._checks import check_type
 from handsim.errors import CaptureError
 from handsim.space.transforms import rigid_fit
 
 AnyTrial = Capture | Take | str | Path
+_A_TRIAL: Final = "a Capture, a Take or the path of a file"
 """A capture; a take, of which only the points are used; or the path of one."""
 _STEP: Final = 4.0  # [m/s] A column whose point moves faster goes on with another one.
 _GATE: Final = 0.02  # [m] A point returns at most this far from where its neighbors predict it.
@@ -119,13 +121,17 @@ def measure_room(captures: AnyTrial | Sequence[AnyTrial]) -> MeasuredRoom:
         captures: Captures, takes or their paths, labeled or not: of one optical system and one glove.
 
     Returns:
-        Figures of all captures together.
+        Figures of all captures together, lengths in [m] and times in [s].
 
     Raises:
         CaptureError: A capture cannot be read, or has fewer than two markers.
-        ArgumentError: Positions are not in meters.
+        ArgumentError: A capture has another type, or positions are not in meters.
     """
-    given = [captures] if isinstance(captures, Capture | Take | str | Path) else list(captures)
+    one = isinstance(captures, Capture | Take | str | Path)
+    given: Sequence[AnyTrial] = [captures] if one else captures  # type: ignore[list-item,assignment]
+    check_type("captures", given, (list, tuple), f"{_A_TRIAL}, or a list of them")
+    for trial in given:
+        check_type("a capture", trial, (Capture, Take, str, Path), _A_TRIAL)
     if not given:
         raise CaptureError("no capture was given, expected one or more")
     return _averaged([_measured(one) for one in given])

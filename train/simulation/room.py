@@ -54,19 +54,14 @@ class RoomConfig(Settings):
     """Share of the mirror images in shiny patches that are bright enough to be seen."""
 
 
-class _Options(Settings):
-    """Base of settings that replace some of a group; None keeps the group's own."""
-
-    __slots__ = ()
-
-    def applied(self, group: Group) -> Group:
-        """Replace settings of a group by these options, and validate them."""
-        given = {name: value for name, value in dataclasses.asdict(self).items() if value is not None}  # type: ignore[call-overload]  # every subclass is a dataclass
-        return dataclasses.replace(group, **given)
+def with_given(group: Group, options: StrayOptions | OpticsOptions) -> Group:
+    """A group with the settings of these options that are not None, validated."""
+    given = {name: value for name, value in dataclasses.asdict(options).items() if value is not None}
+    return dataclasses.replace(group, **given)
 
 
 @dataclass(frozen=True, slots=True)
-class StrayOptions(_Options):
+class StrayOptions(Settings):
     """Fields of `StrayConfig`; the default of each is fitted to the kind of capture."""
 
     number: float | None = None
@@ -78,7 +73,7 @@ class StrayOptions(_Options):
 
 
 @dataclass(frozen=True, slots=True)
-class OpticsOptions(_Options):
+class OpticsOptions(Settings):
     """The fields of `OpticsConfig`; the default of each is fitted to the kind of capture."""
 
     noise: float | None = None
@@ -107,6 +102,10 @@ class OpticsOptions(_Options):
     """Number of rays that must meet for a point."""
     min_rays_to_start: int | None = None
     """Number of rays that must meet for a point that was not there in the frame before."""
+
+    def applied(self, optics: OpticsConfig) -> OpticsConfig:
+        """Replace settings of the optics by these options, and validate them."""
+        return with_given(optics, self)
 
 
 class Twin(NamedTuple):

@@ -20,7 +20,7 @@ from handsim.space.rig import load_rig
 from poses.motion import RATE
 from train.simulation.generation import generate_dataset
 from train.simulation.measured_room import AnyTrial, MeasuredRoom, measure_room, measure_simulated
-from train.simulation.takes import SimulateSettings, simulate_take
+from train.simulation.takes import SimulateSettings, room_of, simulate_take
 from train.simulation.training_frames import GenerateSettings
 
 Kind = TypeVar("Kind", SimulateSettings, GenerateSettings)
@@ -42,7 +42,7 @@ class RoomLike(Generic[Kind]):
     values: Mapping[str, Any]
     """The settings that follow the captures, by their names as options."""
     table: tuple[tuple[str, str, str], ...]
-    """Rows of figures: what, as found in the captures, and as simulated with the settings."""
+    """Rows of figures with their units, such as [mm]: what, as found, and as simulated."""
     untold: tuple[str, ...]
     """What the captures do not tell; those settings are the defaults."""
 
@@ -69,7 +69,7 @@ def room_like(
         on_step: Called with the name of each step.
 
     Returns:
-        The settings, and a table of figures, found and simulated.
+        The settings, and a table of figures, found and simulated, lengths in [mm].
 
     Raises:
         CaptureError: A capture cannot be read, or has fewer than two markers.
@@ -121,7 +121,7 @@ def _ratio(wanted: float | None, made: float | None) -> float:
 
 def _capture_like(found: MeasuredRoom, settings: SimulateSettings) -> RoomLike[SimulateSettings]:
     """Settings of a simulated capture like those that were measured."""
-    room, rig = settings.room(), load_rig(settings.rig)
+    room, rig = room_of(settings), load_rig(settings.rig)
     hands = max(1, round(found.num_markers / load_layout(settings.glove).num_markers))
     found = _per_hand(found, hands)
     noise, shown, lit = room.optics.noise, found.ghost_time or room.strays.shown, 0.02

@@ -20,7 +20,15 @@ from handsim.hand.shape import Side
 from handsim.settings import Limits, Settings
 from handsim.space.rig import ROOM_CENTER, AnyRig, Center, check_outside_volume, load_rig, rig_setting
 from poses.motion import RATE
-from train.simulation.room import TWINS, OpticsOptions, RoomConfig, StrayOptions, record_take, usual_room
+from train.simulation.room import (
+    TWINS,
+    OpticsOptions,
+    RoomConfig,
+    StrayOptions,
+    record_take,
+    usual_room,
+    with_given,
+)
 from train.simulation.scenes import (
     MAX_OTHERS,
     NUM_FRAMES,
@@ -82,14 +90,14 @@ class SimulateSettings(Settings):
                 f"hands are {' '.join(self.hands) or 'none'}, expected right and left, or one of them for "
                 f"the kinds {', '.join(APART)}"
             )
-        self.room()
+        room_of(self)
 
-    def room(self) -> RoomConfig:
-        """The room of this kind of capture with these optics and strays."""
-        usual = usual_room(self.kind)
-        return dataclasses.replace(
-            usual, optics=self.optics.applied(usual.optics), strays=self.strays.applied(usual.strays)
-        )
+
+def room_of(settings: SimulateSettings) -> RoomConfig:
+    """The room of this kind of capture with these optics and strays."""
+    usual = usual_room(settings.kind)
+    optics, strays = settings.optics.applied(usual.optics), with_given(usual.strays, settings.strays)
+    return dataclasses.replace(usual, optics=optics, strays=strays)
 
 
 def simulate_take(
@@ -124,7 +132,7 @@ def simulate_take(
         scene = scene.moved(np.subtract(given.center, ROOM_CENTER))
     if given.others:
         scene = dataclasses.replace(scene, others=other_markers(scene, given.others, rng=rng))
-    room = given.room()
+    room = room_of(given)
     room = dataclasses.replace(room, optics=room.optics.worn(layout.radius))
     record = given.record() | {"rig": rig_setting(rig), "room": room.record()}
     del record["optics"], record["strays"]  # the room has all of them

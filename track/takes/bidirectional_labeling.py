@@ -18,8 +18,8 @@ from gloves.captures.capture import runs_of
 from gloves.takes.points import PointList
 from gloves.takes.take import LOST, TRACKED, Take
 from handsim.hand.shape import NUM_QPOS
-from track.association.label_confidence import label_confidence
 from track.frames import StreamedFrame, TrackedHand
+from track.takes.label_confidence import label_confidence
 from track.tracker import Tracker
 
 _EXACT_LOG_ODDS: Final = 6.0  # log-odds that a point exactly at a marker is that marker and not a stray

@@ -31,7 +31,7 @@ from handsim.errors import ArgumentError, HandSimWarning
 from handsim.space.transforms import PROGRAMS
 from track.bodies.rigid_body import RigidTemplate
 from track.frames import StreamedFrame, TrackedFrame
-from track.live.live_message import (
+from track.output.live_message import (
     FORMATS,
     LARGEST_DATAGRAM,
     SCHEMA,

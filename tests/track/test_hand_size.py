@@ -13,9 +13,9 @@ from handsim import HandModel, HandSimWarning, join_qpos, sample_shape
 from handsim.errors import ArgumentError
 from handsim.hand.shape import ADULTS, DIGITS, SIZES, shape_from_measures
 from poses import sample_motion
-from track import StreamedFrame, label_capture, measure_hands, track_capture
-from track.calibration import hand_size
-from track.calibration.hand_size import (
+from track import StreamedFrame, hand_size, label_capture, measure_hands, track_capture
+from track.frames import checked_frames
+from track.hand_size import (
     SizeFit,
     _is_found,
     check_scale,
@@ -23,7 +23,6 @@ from track.calibration.hand_size import (
     sample_frames,
     usual_breadth,
 )
-from track.frames import checked_frames
 from track.user import nominal_user
 from train import load_labeler, simulate_take
 

@@ -38,8 +38,8 @@ from track import (
     open_source,
 )
 from track.frames import capture_frames
-from track.live import recorder as module
-from track.live.recorder import frame_values
+from track.output import recorder as module
+from track.output.recorder import frame_values
 from train import load_labeler, simulate_take
 
 FRAMES = 24

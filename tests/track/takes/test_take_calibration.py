@@ -13,8 +13,8 @@ from gloves.takes.take import LOST
 from handsim import HandSimWarning
 from handsim.errors import CalibrationError
 from track import User, track_capture
-from track.calibration.take_calibration import calibrate_take, kept_user
 from track.kinematics.pose_solver import PoseSolver
+from track.takes.take_calibration import calibrate_take, kept_user
 from track.user import MEASURED, nominal_user
 from train import simulate_take
 

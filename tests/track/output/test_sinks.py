@@ -33,9 +33,9 @@ from handsim.errors import ArgumentError
 from tests.sentences import error_names
 from tests.waiting import LONG, wait_for
 from track import SinkGroup, StreamedFrame, TrackedFrame, TrackedHand, open_sinks
-from track.live import sinks
-from track.live.live_message import Content
-from track.live.sinks import VALID, channels_of, open_sink, osc_format, sample_of
+from track.output import sinks
+from track.output.live_message import Content
+from track.output.sinks import VALID, channels_of, open_sink, osc_format, sample_of
 
 SOURCE = """
 class Counter:
@@ -371,12 +371,12 @@ def test_an_inlet_gets_samples_and_the_description(message, tmp_path):
     settings.write_text(
         "[multicast]\nResolveScope = machine\n[lab]\nKnownPeers = {127.0.0.1}\n[log]\nlevel = -3\n"
     )
-    root = Path(__file__).resolve().parents[2]
+    root = Path(__file__).resolve().parents[3]
     code = """
 import json
 import pylsl
 from tests.track.conftest import make_message
-from track.live.sinks import open_sink
+from track.output.sinks import open_sink
 sink = open_sink("lsl:hands")
 sink.send(make_message(0))
 (info,) = pylsl.resolve_byprop("name", "hands", timeout=120.0)
@@ -598,7 +598,7 @@ def test_connections_that_stay_are_counted_and_bounded(call, message, capfd, cap
 
 FEW_FILES = """
 import resource, socket, sys, time
-from track.live.sinks import open_sink
+from track.output.sinks import open_sink
 resource.setrlimit(resource.RLIMIT_NOFILE, (40, 40))
 sink = open_sink(sys.argv[1])
 print(sink.port, flush=True)
@@ -686,7 +686,7 @@ def test_a_client_may_ask_for_the_newest_frame(path, message):
 
 
 def test_the_client_of_the_page_runs_as_it_stands_until_the_end(message, capsys):
-    page = (Path(__file__).parents[2] / "docs" / "live_output.md").read_text()
+    page = (Path(__file__).parents[3] / "docs" / "live_output.md").read_text()
     (code,) = re.findall(r"^import json\nfrom websockets.*?(?=^```)", page, re.DOTALL | re.MULTILINE)
     sink = open_sink("ws://:0")
     client = threading.Thread(target=exec, args=(code.replace("8765", str(sink.port)), {}))

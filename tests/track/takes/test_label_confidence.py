@@ -10,7 +10,7 @@ import pytest
 from gloves import Take
 from gloves.takes.take import LOST
 from track import track_capture
-from track.association.label_confidence import evidence_of, label_confidence
+from track.takes.label_confidence import evidence_of, label_confidence
 from train import simulate_take
 
 FRAMES = 120

@@ -20,7 +20,7 @@ from handsim.hand.model import hand_keypoints
 from handsim.hand.shape import BONE_NAMES, JOINT_NAMES
 from handsim.motion_files.motion import OPENXR_JOINTS
 from track import StreamedFrame, TrackedFrame
-from track.live.live_message import (
+from track.output.live_message import (
     FORMATS,
     LARGEST_DATAGRAM,
     Content,
@@ -168,7 +168,7 @@ def test_latency_counts_from_exposure(message):
 
 def test_the_page_shows_what_is_sent(message):
     """Keys and kinds of values in docs/live_output.md are those of real documents."""
-    page = Path(__file__).parents[2] / "docs" / "live_output.md"
+    page = Path(__file__).parents[3] / "docs" / "live_output.md"
     shown = [json.loads(block) for block in re.findall(r"```json\n(.*?)```", page.read_text(), re.DOTALL)]
     one = message(lost=True)
     header, frame = header_document(one.header), frame_document(one)

@@ -10,7 +10,7 @@ from scipy.sparse.csgraph import connected_components
 
 from gloves import PointList
 from gloves.takes.take import LOST, TRACKED
-from track.association.bidirectional_labeling import _components, _events_of, _exchanges, _is_likelier
+from track.takes.bidirectional_labeling import _components, _events_of, _exchanges, _is_likelier
 
 
 def test_runs_of_exchanged_hands_are_found():

@@ -1,0 +1,1 @@
+"""What is sent and recorded of tracked frames: messages, sinks and takes."""
