@@ -42,7 +42,7 @@ from benchmarks.record import Figures, run, save_figures
 MODULES: Final = (
     *(f"track/{name}" for name in ("association", "tracker.py", "alternatives", "takes", "captures.py")),
     *(f"track/{name}" for name in ("frames.py", "bodies/constellation.py", "live/live_sizing.py")),
-    *(f"track/{name}" for name in ("kinematics", "calibration")),
+    *(f"track/{name}" for name in ("kinematics", "calibration", "hand_size.py")),
     *(f"train/labelers/{name}.py" for name in ("matching", "pose_prior", "networks", "storage")),
     *(f"gloves/captures/{name}.py" for name in ("capture", "coordinates", "pieces")),
 )
