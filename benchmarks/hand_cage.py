@@ -27,7 +27,7 @@ from handsim.hand.skin import AROUND, NUM_ROWS, PALM_VERTICES, RINGS, catmull_cl
 
 DATA: Final = Path(handsim.__file__).parent / "data" / "hand_cage.json"
 _WRIST, _CARPUS, _THENAR, _METACARPUS, _KNUCKLES, _PAST_KNUCKLES, _WEB = range(1, 8)  # rows of the palm
-# Rings of the thumb, and without the first one of a finger past the web; the last two form the tip.
+# The thumb has all of these rings, and a finger all but the first. The last two form the tip.
 _RING_NAMES: Final = ("metacarpal", "before 1", "at 1", "after 1", "before 2", "after 2", "pad", "tip")
 
 

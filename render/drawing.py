@@ -159,7 +159,7 @@ class Drawing:
                 yield dataclasses.replace(drawn, choices=about | dict(drawn.choices))
 
     def _enclosed(self) -> Doubles | None:
-        """Places (N, 3) of cameras and hands that see a background from several sides; None for a picture."""
+        """Places (N, 3) of cameras and hands that share a background [m]; None for one camera."""
         viewpoints = self.viewpoints
         enclosed = viewpoints.num_cameras > 1 or (viewpoints.moves and self.config.vary == "shard")
         enclosed |= viewpoints.cameras(0)[0].lens.kind != "pinhole"  # which bends what is behind the hands

@@ -517,7 +517,9 @@ def read_table(data: bytes, tell: Tell = warn) -> Capture:
     if timed is None or not names or "" in names:
         raise CaptureError(
             "not a table of markers: expected a line of column names, one of them 'time' (in seconds) and "
-            "three for each marker (RH1_x, RH1_y, RH1_z); arrays become a gloves.Capture"
+            "three for each marker (RH1_x, RH1_y, RH1_z), or the export of a program: a CSV of Motive begins "
+            "with 'Format Version', one of Vicon has a line 'Trajectories', a TSV of Qualisys begins with "
+            "'NO_OF_FRAMES' or 'FILE_VERSION'; arrays become a gloves.Capture"
         )
     axes = len(lines) > 1 and {cell.lower() for cell in header_cells(lines[1], 2)[num_leading:]} <= set("xyz")
     first = num_leading + 3 * np.arange(len(names))

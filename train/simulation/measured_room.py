@@ -127,8 +127,7 @@ def measure_room(captures: AnyTrial | Sequence[AnyTrial]) -> MeasuredRoom:
         CaptureError: A capture cannot be read, or has fewer than two markers.
         ArgumentError: A capture has another type, or positions are not in meters.
     """
-    one = isinstance(captures, Capture | Take | str | Path)
-    given: Sequence[AnyTrial] = [captures] if one else captures  # type: ignore[list-item,assignment]
+    given = [captures] if isinstance(captures, Capture | Take | str | Path) else captures
     check_type("captures", given, (list, tuple), f"{_A_TRIAL}, or a list of them")
     for trial in given:
         check_type("a capture", trial, (Capture, Take, str, Path), _A_TRIAL)

@@ -31,7 +31,7 @@ _LARGEST: Final = 4.0  # ratio of a correction
 _LOST_CAMERAS: Final = 0.375  # share of the cameras that lose pictures together: 6 of the 16 of figure5
 _SPOTS: Final = 30.0  # reflecting spots on a hand; many that flash rarely make any number of ghosts
 _LIT: Final = 0.95  # largest share of the time that a spot reflects
-_EXPECTED: Final = 30.0  # frames in which pairs would be nearer, from which their absence shows merging
+_EXPECTED: Final = 30.0  # Points merge if simulated pairs are nearer than any found in so many frames.
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,8 +122,7 @@ def _ratio(wanted: float | None, made: float | None) -> float:
 def _capture_like(found: MeasuredRoom, settings: SimulateSettings) -> RoomLike[SimulateSettings]:
     """Settings of a simulated capture like those that were measured."""
     room, rig = room_of(settings), load_rig(settings.rig)
-    hands = max(1, round(found.num_markers / load_layout(settings.glove).num_markers))
-    found = _per_hand(found, hands)
+    found = _per_hand(found, max(1, round(found.num_markers / load_layout(settings.glove).num_markers)))
     noise, shown, lit = room.optics.noise, found.ghost_time or room.strays.shown, 0.02
     length = max(1.0, RATE * found.gap_time) if found.gap_time else room.optics.dropout_length
     values = dict[str, Any]()
@@ -187,8 +186,7 @@ def _training_like(found: MeasuredRoom, settings: GenerateSettings) -> RoomLike[
     """Settings of a training set like the captures that were measured."""
     free = SimulateSettings("free", glove=settings.glove, rig=settings.rig, center=settings.center)
     capture = _capture_like(found, free)
-    hands = max(1, round(found.num_markers / load_layout(settings.glove).num_markers))
-    found = _per_hand(found, hands)
+    found = _per_hand(found, max(1, round(found.num_markers / load_layout(settings.glove).num_markers)))
     shared = {"optics.noise", "optics.min_distance"} & set(capture.values)
     values = {name: capture.values[name] for name in sorted(shared)}
     least, _ = _rows_of(settings, values | _losses(settings, 0.0))

@@ -461,7 +461,10 @@ def test_blank_cells_are_gaps_of_vicon() -> None:
 NEXUS = nexus()
 BAD_NEXUS = {
     "other sections": (DEVICES + OUTPUTS, "'Trajectories' | Devices, Model Outputs"),
-    "the word alone": ("Trajectories\n\n", "not a table of markers"),
+    "the word alone": (
+        "Trajectories\n\n",
+        "not a table of markers | 'Format Version' | 'Trajectories'",
+    ),
     "header cut": (NEXUS[: NEXUS.index("Frame")], "header is cut | rate, names and axes | 'Trajectories'"),
     "header cut in its axes": (NEXUS[: NEXUS.index("Frame") + 20], "header is cut | rate, names and axes"),
     "no frame in the axes": (NEXUS.replace("Frame,Sub Frame", "Number,Other"), "line 4 | 'Number' | 'Frame'"),
@@ -590,10 +593,13 @@ def test_a_table_has_three_columns_a_marker(tmp_path, titles, behind, separator,
 
 
 BAD_TABLES = {
-    "no markers": ("a,b,c\n1,2,3\n", "not a table of markers | 'time' | RH1_x"),
+    "no markers": (
+        "a,b,c\n1,2,3\n",
+        "not a table of markers | 'time' | RH1_x | 'Format Version' | 'Trajectories' | 'NO_OF_FRAMES'",
+    ),
     "no times": ("Frame,X,Y,Z\n1,2,3,4\n", "not a table of markers | 'time'"),
     "two columns of a marker": (table(titled("_x", "_y")), "not a table of markers | three for each"),
-    "no rows": ("time,A_x,A_y,A_z\n", ""),
+    "no rows": ("time,A_x,A_y,A_z\n", "no frames"),
     "uneven times": (
         table(titled("", "", "")).replace("0.05,", "0.0566,").replace("0.06,", "0.069,"),
         "the rate is not stated | positive number",
