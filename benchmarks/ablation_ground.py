@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
+from benchmarks.mirror_like import mirror_like
 from benchmarks.real_scenes import make_scene, sample_gaps, sample_ghosts
 from gloves import Capture, MarkerLayout, load_layout
 from gloves.layout import layout_lines
@@ -75,11 +76,13 @@ def _makers(data: Path | None, level: int) -> Iterator[tuple[str, Callable[[], T
     chosen = np.sort(np.random.default_rng(11).permutation(dense.num_markers)[:12])
     own = dataclasses.replace(dense, name="own12", markers=tuple(dense.markers[k] for k in chosen))
     if level == 1:
-        yield "own12", lambda: _simulated(own, "free", frames, ("label", "track"), level, hands=("right",))
-        yield "dense19", lambda: _simulated(dense, "real-like", frames, ("track",), level)
+        yield "own12", lambda: _simulated(own, "free", frames, ("label", "track"), seed=10, hands=("right",))
+        yield "dense19", lambda: _simulated(dense, "real-like", frames, ("track",), seed=10 * level)
+        mirror = mirror_like(0)
+        yield "mirror", lambda: _simulated(mirror, "hand-hand", frames, ("label", "track"), seed=51)
     else:
-        yield "own12", lambda: _simulated(own, "real-like", frames, ("label",), level)
-        yield "touching", lambda: _simulated(dense, "hand-hand", frames, ("track",), level)
+        yield "own12", lambda: _simulated(own, "real-like", frames, ("label",), seed=10 * level)
+        yield "touching", lambda: _simulated(dense, "hand-hand", frames, ("track",), seed=10 * level)
     if data is None:
         return
     people = data / "sig18"
@@ -106,7 +109,7 @@ def _corrupted(markers: np.ndarray, seed: int) -> np.ndarray:
 def _simulated(
     layout: MarkerLayout, kind: Any, frames: int, verbs: tuple[str, ...], seed: int, **options: Any
 ) -> Truth:
-    take = simulate_take(kind, glove=layout, num_frames=frames, seed=10 * seed, **options)
+    take = simulate_take(kind, glove=layout, num_frames=frames, seed=seed, **options)
     markers = np.stack([take.observed(side) for side in take.sides], axis=1)
     return Truth(layout, take.sides, _corrupted(markers, seed), take.rate, verbs, take.keypoints())
 
