@@ -1,10 +1,11 @@
-"""Live output: frames lost from a NatNet server to WebSocket and OSC clients, and the latency that is added.
+"""Live output: frames lost from a NatNet server to other programs, and the latency that is added.
 
-A simulated capture of two hands is replayed at 120 Hz by a process of its own, tracked here, and sent to two
-clients, which are processes of their own. In the middle the server is restarted. The latency that is added to
-the tracker's own time is from when the server takes up a frame to the client's `recv`.
+A simulated capture of two hands is replayed at 120 Hz by a process of its own, tracked here, and sent to
+readers, which are processes of their own. They read as fast as they can, at half the rate, or five times a
+second. In the middle the server is restarted. The latency that is added to the tracker's own time is from
+when the server takes up a frame to when the reader has it.
 
-python -m benchmarks.live_output [--seconds 600]
+python -m benchmarks.live_output [--seconds 600] [--pauses 0 0.0167 0.2]
 """
 
 from __future__ import annotations
@@ -13,13 +14,15 @@ import json
 import multiprocessing
 import socket
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from multiprocessing.sharedctypes import Synchronized
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 from pythonosc.osc_bundle import OscBundle
+from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 from benchmarks.paper.take_evaluation import true_users
@@ -61,28 +64,72 @@ def serve(
     over.value = 1
 
 
-def listen_websocket(port: int, times: Times, ready: Synchronized[int], restarts: int) -> None:
-    """Note when which frame arrives at a WebSocket client."""
-    with connect(f"ws://{LOOPBACK}:{port}") as server:
-        ready.value += 1
-        _note(((time.monotonic(), json.loads(message)) for message in server), times, restarts)
+def listen_websocket(port: int, times: Times, ready: Synchronized[int], half: int, pause: float) -> None:
+    """Note when which frame arrives at a client that asks for every one."""
+    _listen(f"ws://{LOOPBACK}:{port}/?every=1", times, ready, half, pause)
 
 
-def listen_osc(port: int, times: Times, ready: Synchronized[int], restarts: int) -> None:
-    """Note when which frame arrives at an OSC client."""
+def listen_plain(port: int, times: Times, ready: Synchronized[int], half: int, pause: float) -> None:
+    """The same of a client that asks for nothing."""
+    _listen(f"ws://{LOOPBACK}:{port}", times, ready, half, pause)
+
+
+def listen_newest(port: int, times: Times, ready: Synchronized[int], half: int, pause: float) -> None:
+    """The same of a client that asks for one frame after the other."""
+    _listen(f"ws://{LOOPBACK}:{port}/newest", times, ready, half, pause, asks=True)
+
+
+def listen_osc(port: int, times: Times, ready: Synchronized[int], half: int, pause: float) -> None:
+    """The same of the newest waiting datagram of OSC."""
+    _note(_datagrams(port, ready, pause, _osc_document), times, half)
+
+
+def listen_udp(port: int, times: Times, ready: Synchronized[int], half: int, pause: float) -> None:
+    """The same of the newest waiting datagram of JSON."""
+    _note(_datagrams(port, ready, pause, json.loads), times, half)
+
+
+def _listen(
+    url: str, times: Times, ready: Synchronized[int], half: int, pause: float, *, asks: bool = False
+) -> None:
+    with connect(url) as server, suppress(ConnectionClosed):
+        with ready.get_lock():
+            ready.value += 1
+        _note(_messages(server, pause, asks=asks), times, half)
+
+
+def _messages(server: Any, pause: float, *, asks: bool) -> Iterator[tuple[float, dict[str, Any]]]:
+    json.loads(server.recv())  # the header, for which nobody asks
+    while True:
+        if asks:
+            server.send("")
+        text = server.recv()
+        yield time.monotonic(), json.loads(text)
+        time.sleep(pause)
+
+
+def _datagrams(
+    port: int, ready: Synchronized[int], pause: float, decode: Callable[[bytes], dict[str, Any]]
+) -> Iterator[tuple[float, dict[str, Any]]]:
     one = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     one.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
     one.bind((LOOPBACK, port))
-    ready.value += 1
-    _note(_osc_frames(one), times, restarts)
-
-
-def _osc_frames(one: socket.socket) -> Iterator[tuple[float, dict[str, Any]]]:
+    with ready.get_lock():
+        ready.value += 1
     while True:
-        datagram, now = one.recv(1 << 16), time.monotonic()
-        contents = {message.address: list(message.params) for message in OscBundle(datagram)}
-        number, _, silent = contents.get("/handsim/frame", (0, 0.0, 1))
-        yield now, {"type": "frame", "number": number, "silent": silent}
+        waiting = [one.recv(1 << 16)]
+        with suppress(BlockingIOError):
+            while True:
+                waiting.append(one.recv(1 << 16, socket.MSG_DONTWAIT))
+        for document in map(decode, waiting[-1:] if pause else waiting):
+            yield time.monotonic(), document
+        time.sleep(pause)
+
+
+def _osc_document(datagram: bytes) -> dict[str, Any]:
+    contents = {message.address: list(message.params) for message in OscBundle(datagram)}
+    number, _, silent = contents.get("/handsim/frame", (0, 0.0, 1))
+    return {"type": "frame", "number": number, "silent": silent}
 
 
 def _note(documents: Iterable[tuple[float, dict[str, Any]]], times: Times, half: int) -> None:
@@ -95,32 +142,53 @@ def _note(documents: Iterable[tuple[float, dict[str, Any]]], times: Times, half:
             times[first + last] = now
 
 
-def main(seconds: float = 600.0) -> None:
-    frames = round(seconds * RATE)
+def main(seconds: float = 600.0, pauses: tuple[float, ...] = (0.0, 2.0 / RATE, 0.2)) -> None:
     print(describe("numba", "torch", "websockets", "python-osc"))
-    take, half = simulate_take(kind="hand-hand", num_frames=1200), frames // 2
-    sent, websocket, osc = (SPAWN.Array("d", frames, lock=False) for _ in range(3))
+    take = simulate_take(kind="hand-hand", num_frames=1200)
+    for pause in pauses:
+        print(f"readers that pause for {1e3 * pause:.0f} ms after each frame")
+        measure(take, round(seconds * RATE), pause)
+
+
+def measure(take: Take, frames: int, pause: float) -> None:
+    """Run a session with readers that pause after each frame [s], and print what they got."""
+    half = frames // 2
     ready, over = SPAWN.Value("i", 0), SPAWN.Value("i", 0)
-    command, web, bundles = _free_ports(socket.SOCK_DGRAM, socket.SOCK_STREAM, socket.SOCK_DGRAM)
+    command, web, bundles, datagrams = _free_ports(
+        socket.SOCK_DGRAM, socket.SOCK_STREAM, socket.SOCK_DGRAM, socket.SOCK_DGRAM
+    )
+    readers: dict[str, tuple[Any, int]] = {
+        "ws://?every=1": (listen_websocket, web),
+        "ws://": (listen_plain, web),
+        "/newest": (listen_newest, web),
+        "osc://": (listen_osc, bundles),
+        "udp://": (listen_udp, datagrams),
+    }
+    sent = SPAWN.Array("d", frames, lock=False)
+    arrived = {name: SPAWN.Array("d", frames, lock=False) for name in readers}
     tracker = Tracker(true_users(take), load_labeler("dense19"))
     tracker.warm_up()
     ranges = [(0, half), (half, frames - half)]
-    with open_sinks([f"ws://{LOOPBACK}:{web}?every=yes", f"osc://{LOOPBACK}:{bundles}"]) as sinks:
+    addresses = [
+        f"{one}://{LOOPBACK}:{port}"
+        for one, port in zip(("ws", "osc", "udp"), (web, bundles, datagrams), strict=True)
+    ]
+    with open_sinks(addresses) as sinks:
         sinks.start(tracker.hands, tracker.bodies)
-        jobs: list[tuple[Any, tuple[Any, ...]]] = [
-            (serve, (take, command, ranges, sent, over)),
-            (listen_websocket, (web, websocket, ready, half)),
-            (listen_osc, (bundles, osc, ready, half)),
-        ]
+        jobs: list[tuple[Any, tuple[Any, ...]]] = [(serve, (take, command, ranges, sent, over))]
+        for name, (target, port) in readers.items():
+            jobs.append((target, (port, arrived[name], ready, half, pause)))
         processes = [SPAWN.Process(target=target, args=given, daemon=True) for target, given in jobs]
         for process in processes:
             process.start()
-        while ready.value < 2:
+        while ready.value < len(readers):
             time.sleep(0.1)
         own, counts = _track(f"natnet://{LOOPBACK}:{command}", tracker, sinks, half, frames, over)
         print(f"{frames} frames at {RATE:g} Hz; {counts}; dropped {sinks.counts}")
         time.sleep(0.5)
-    _tell(np.array(sent), own, {"WebSocket": np.array(websocket), "OSC": np.array(osc)})
+    for process in processes:
+        process.terminate()
+    _tell(np.array(sent), own, {name: np.array(times) for name, times in arrived.items()})
 
 
 def _track(
@@ -145,10 +213,10 @@ def _tell(sent: np.ndarray, own: np.ndarray, arrived: dict[str, np.ndarray]) -> 
     for name, times in arrived.items():
         there = times > 0
         added = 1e3 * (times - sent - own)[there & np.isfinite(own)]
-        p50, p99 = np.percentile(added, [50, 99])
+        p50, p90, p99 = np.percentile(added, [50, 90, 99])
         print(
-            f"{name}: {(~there).sum()} frames lost; added p50 {p50:.2f} ms, p99 {p99:.2f} ms, "
-            f"most {added.max():.1f} ms"
+            f"{name}: {(~there).sum()} frames not read; added p50 {p50:.2f} ms, p90 {p90:.2f} ms, "
+            f"p99 {p99:.2f} ms, most {added.max():.1f} ms"
         )
 
 

@@ -19,6 +19,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from http import HTTPStatus
 from typing import Any, Final
+from urllib.parse import parse_qsl
 
 import numpy as np
 
@@ -55,12 +56,13 @@ STATUSES: Final = tuple(reversed(Status))
 """A status channel of LSL holds an index into these."""
 _METHODS: Final = (("send", "close"), "the methods send and close of a sink")
 _YES: Final = ("no", "yes")  # valid values of an option
+_EVERY: Final = (*_YES, "1")  # the same of `every`, for which clients ask, too
 _AXES: Final = {"axes": (WORLD, *PROGRAMS), "up": ("z", "y"), "unit": ("auto", "m", "cm"), "velocities": _YES}
 _DOCUMENTS: Final = {"format": FORMATS, "points": _YES, "joints": ("no", "openxr"), **_AXES}
 _OPTIONS: Final[Mapping[str, Mapping[str, tuple[str, ...]]]] = {
     "osc": _AXES,
     "udp": _DOCUMENTS,
-    "ws": {**_DOCUMENTS, "every": _YES, "pages": ("own", "all")},
+    "ws": {**_DOCUMENTS, "every": _EVERY, "pages": ("own", "all")},
 }
 _RESERVED: Final = re.compile(r"[^!-~]|[#*,/?\[\]{}]")  # not allowed in a part of an OSC address
 _BUNDLE_HEAD, _BUNDLE_ENTRY = 16, 4  # [bytes] overhead of an OSC bundle and of each message in it
@@ -189,7 +191,7 @@ def open_sink(address: str) -> LiveSink:
         format = document_format(options.get("format", "json"), content, largest=largest)
         if scheme == "udp":
             return DatagramSink(host, port, format)
-        every, all_pages = options.get("every") == "yes", options.get("pages") == "all"
+        every, all_pages = options.get("every") in _EVERY[1:], options.get("pages") == "all"
         return WebSocketSink(host, port, format, every=every, all_pages=all_pages)
     if scheme == "lsl" and rest and not rest.startswith("//"):
         return LabStreamingSink(rest)
@@ -416,11 +418,11 @@ class WebSocketSink:
     """Serves messages to any number of WebSocket clients from its own thread; port 0 selects a free port.
 
     A client receives the header, again when the hands change their size and thus the header, and the newest
-    frame as soon as it has read the one before, which its WebSocket library confirms by a pong. A client
-    of the path /newest gets one frame for each message that it sends. With `every` all frames wait for a
-    client, at most 256. A slow client loses frames, receives its lag, and delays nobody. Browsers' pages are
-    served if they are of this machine, or with `all_pages`; other programs always are. At most 64 connections
-    are open at a time; further ones are refused.
+    frame as soon as it has read the one before, which its WebSocket library confirms by a pong. A client of
+    the path /newest gets one frame for each message that it sends. For a client of /?every=1 all frames
+    wait, at most 256; with `every` they do for each client. A slow client loses frames, receives its lag,
+    and delays nobody. Browsers' pages are served if they are of this machine, or with `all_pages`; other
+    programs always are. At most 64 connections are open at a time; further ones are refused.
     """
 
     def __init__(
@@ -495,7 +497,7 @@ class WebSocketSink:
         quiet = logging.getLogger("handsim.websocket")  # Invalid requests are not the user's mistakes.
         quiet.setLevel(logging.CRITICAL + 1)
         server = await self._serve(
-            lambda one: self._talk(one, only_asked=one.request.path == _ON_REQUEST),
+            self._talk,
             sock=self._socket,
             origins=self._origins,
             process_request=_refuse_other_paths,
@@ -526,9 +528,11 @@ class WebSocketSink:
         while there_is() and self._loop.time() < until:
             await asyncio.sleep(0.01)
 
-    async def _talk(self, connection: Any, *, only_asked: bool) -> None:
+    async def _talk(self, connection: Any) -> None:
         """Send messages to a client until it disconnects."""
-        client = _Client(_WAITING if self._every else 1, only_asked=only_asked)
+        path, every = _wishes(connection.request)
+        only_asked = path == _ON_REQUEST
+        client = _Client(every=(every or self._every) and not only_asked, only_asked=only_asked)
         self._clients[client] = connection
         sending = asyncio.ensure_future(self._deliver(connection, client))
         try:
@@ -571,23 +575,29 @@ class WebSocketSink:
                     told = now
                     await connection.send(self._format.lag(behind, client.dropped), text=is_text)
                 await connection.send(message, text=is_text)
-                if not (self._every or client.only_asked):
+                if not (client.every or client.only_asked):
                     unconfirmed.append((self._loop.time(), await connection.ping()))
 
 
 def _refuse_other_paths(connection: Any, request: Any) -> Any:
     """Refuse a misspelled /newest: its client expects to ask, and would get a stream."""
-    request.path = request.path.partition("?")[0].rstrip("/")
-    known = request.path in ("", _ON_REQUEST)
+    known = _wishes(request)[0] in ("", _ON_REQUEST)
     return None if known else connection.respond(HTTPStatus.NOT_FOUND, f"expected / or {_ON_REQUEST}\n")
+
+
+def _wishes(request: Any) -> tuple[str, bool]:
+    """The path of a client's request, and whether it asks for every frame."""
+    path, _, query = request.path.partition("?")
+    return path.rstrip("/"), dict(parse_qsl(query)).get("every") in _EVERY[1:]
 
 
 class _Client:
     """Queue and requests of one WebSocket client."""
 
-    def __init__(self, most: int, *, only_asked: bool) -> None:
-        self.waiting: deque[tuple[float, bytes]] = deque(maxlen=most)
+    def __init__(self, *, every: bool, only_asked: bool) -> None:
+        self.waiting: deque[tuple[float, bytes]] = deque(maxlen=_WAITING if every else 1)
         """Messages with the times at which they were queued [s]."""
+        self.every = every
         self.woken = asyncio.Event()
         self.dropped = 0
         self.only_asked = only_asked
@@ -669,5 +679,7 @@ def _listen(host: str, port: int) -> _Listener:
             f"port {port} of {host} cannot be listened at ({error.strerror or error}), expected a free port "
             "of this machine"
         ) from error
-    one.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)  # connections inherit it
+    # Connections inherit both. Without the second one a frame may wait 40 ms for TCP to confirm the last.
+    one.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)
+    one.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     return _Listener(one)

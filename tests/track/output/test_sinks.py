@@ -458,6 +458,30 @@ def test_a_slow_client_loses_frames_and_delays_nobody(message):
         reader.join()
 
 
+@pytest.mark.parametrize("path", ["?every=1", "/?every=yes"])
+def test_a_client_may_ask_for_every_frame(path, message):
+    sink = open_sink("ws://:0")
+    with connect(url(sink) + path) as every, connect(url(sink) + "/newest" + path.strip("/")) as newest:
+        wait_for(lambda: sink.num_clients == 2)
+        for number in range(100):
+            sink.send(message(number))
+        header, *frames = received(every, 101)
+        assert header["type"] == "header" and [frame["number"] for frame in frames] == list(range(100))
+        assert received(newest, 1)[0]["type"] == "header"
+        newest.send("")
+        assert received(newest, 1)[0]["number"] == 99
+    sink.close()
+
+
+def test_no_connection_waits_for_confirmations(sink):
+    with connect(url(sink)):
+        wait_for(lambda: sink.num_clients == 1)
+        (connection,) = sink._clients.values()
+        one = connection.transport.get_extra_info("socket")
+        assert one.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
+        assert sink._socket.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
+
+
 def read_until_closed(client):
     try:
         while True:
