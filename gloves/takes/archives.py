@@ -2,8 +2,9 @@
 
 A growing archive is on disk up to the last half second, however the recording ends. It begins with a JSON
 header and the arrays that do not grow. Blocks follow, each with some frames, their number and a checksum; a
-block that was cut off is ignored. `finish_archive` turns a growing archive into an .npz block by block, so
-that memory does not grow with the recording.
+block that was cut off is ignored. A block may instead hold the hands of the frames before it, where other
+hands follow. `finish_archive` turns a growing archive into an .npz block by block, so that memory does not
+grow with the recording.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gloves.takes.points import POINT_COUNTS, Column
+from gloves.takes.worn import FORMER
 from handsim.callbacks import Closing
 from handsim.errors import DAMAGE, ArgumentError, CaptureError, HandSimWarning, shortened
 from handsim.files.arrays import Member, check_npy_header, check_npz, read_npz, write_npz
@@ -41,6 +43,7 @@ _MAGIC: Final = b"handsim recording 1\n"
 _SIZE: Final = struct.Struct("<I")
 _BLOCK: Final = struct.Struct("<4s4I")  # mark, number of the block, frames, points, CRC-32 of its columns
 _MARK: Final = b"blk\n"
+_ENTRY_MARK: Final = b"one\n"  # of a block with former hands, whose size stands in place of points
 _CHECKSUM: Final = "checksum"
 _INTERVAL: Final = 0.5  # [s] between two blocks
 _SPARE: Final = 4096  # bytes by which the header may grow while blocks follow
@@ -127,6 +130,13 @@ class GrowingArchive(Closing):
                 self._write_head()
                 self._file.seek(0, os.SEEK_END)
 
+    def add_former(self, entry: NDArray[Any]) -> None:
+        """Write the hands of the frames until now (1,), which have ended; the archive knows their `stop`."""
+        self.flush()
+        with signals_wait():
+            self._restore()
+            self._write_block(_ENTRY_MARK, 0, entry.nbytes, entry.tobytes())
+
     def flush_due(self) -> None:
         """Write the waiting frames if they are many, or half a second old."""
         is_full = len(self._waiting) >= _FULL_FRAMES or self._points >= _FULL_POINTS
@@ -143,9 +153,12 @@ class GrowingArchive(Closing):
             counts, *others = (b"".join(column) for column in zip(*rows, strict=True))
             points = int(np.frombuffer(counts, POINT_COUNTS.dtype).sum(dtype=np.int64))
             content = b"".join((counts, *others))
-            head = _BLOCK.pack(_MARK, len(self._blocks) - 1, len(rows), points, zlib.crc32(content))
-            _write_all(self._file, head + content)
-            self._blocks.append((self._file.tell(), self._blocks[-1][1] + len(rows)))
+            self._write_block(_MARK, len(rows), points, content)
+
+    def _write_block(self, mark: bytes, frames: int, count: int, content: bytes) -> None:
+        head = _BLOCK.pack(mark, len(self._blocks) - 1, frames, count, zlib.crc32(content))
+        _write_all(self._file, head + content)
+        self._blocks.append((self._file.tell(), self._blocks[-1][1] + frames))
 
     def close(self) -> None:
         """Write the waiting frames, and close the file."""
@@ -263,6 +276,7 @@ class GrownArchive:
             self._arrays = dict(zip(names, map(_array_of, parts), strict=True))
             self._columns = (POINT_COUNTS, *map(_column, self.header.pop("columns")))
             self._end = file.tell()
+            self._former = list[tuple[int, bytes]]()  # entries with the number of blocks of frames before
             self._blocks = list(self._scan(file, check))
         self.num_lost_bytes = self._size - self._end
         self.num_frames = sum(block.frames for block in self._blocks)
@@ -270,7 +284,8 @@ class GrownArchive:
     def read(self, step: int = 1) -> dict[str, NDArray[Any]]:
         """All arrays, with the frames of every `step`-th block."""
         blocks = self._blocks[::step]
-        return {**self._arrays, **{column.name: self._joined(column, blocks) for column in self._columns}}
+        columns = {column.name: self._joined(column, blocks) for column in self._columns}
+        return {**self._fixed(step), **columns}
 
     def first(self, name: str, most: int) -> NDArray[Any]:
         """The first entries of a column of frames: at least `most`, or all if there are fewer."""
@@ -280,17 +295,34 @@ class GrownArchive:
 
     def members(self, told: Callable[[], None]) -> Iterator[Member]:
         """Every array, read block by block, with a call of `told` after each block."""
-        yield from (Member.of(name, array) for name, array in self._arrays.items())
+        yield from (Member.of(name, array) for name, array in self._fixed().items())
         num_points = sum(block.points for block in self._blocks)
         for column in self._columns:
             shape = (num_points if column.of_points else self.num_frames, *column.entry)
             yield Member(column.name, np.dtype(column.dtype), shape, partial(self._parts, column, told))
 
+    def _fixed(self, step: int = 1) -> dict[str, NDArray[Any]]:
+        """The arrays that have no frames; former hands end after every `step`-th block of those before."""
+        arrays = dict(self._arrays)
+        if (empty := arrays.pop(FORMER, None)) is not None and self._former:
+            entries = np.frombuffer(b"".join(entry for _, entry in self._former), empty.dtype).copy()
+            ends = np.cumsum([0, *(block.frames for block in self._blocks[::step])])
+            entries["stop"] = ends[[-(-before // step) for before, _ in self._former]]
+            arrays[FORMER] = entries
+        return arrays
+
     def _scan(self, file: io.BufferedReader, check: bool) -> Iterator[_Block]:
         """The blocks before the first one that is cut off or damaged."""
-        number = 0
+        number = count = 0
         while len(head := file.read(_BLOCK.size)) == _BLOCK.size:
             mark, index, frames, points, checksum = _BLOCK.unpack(head)
+            if mark == _ENTRY_MARK and index == number:
+                entry = file.read(min(points, self._size))
+                if len(entry) < points or zlib.crc32(entry) != checksum:
+                    return
+                self._former.append((count, entry))
+                self._end, number = file.tell(), number + 1
+                continue
             if mark != _MARK or index != number:
                 return
             block = _Block(file.tell(), frames, points)
@@ -302,7 +334,7 @@ class GrownArchive:
             if int(self._column(POINT_COUNTS, block).sum(dtype=np.int64)) != points:
                 return
             file.seek(block.at + size)
-            number += 1
+            number, count = number + 1, count + 1
             self._end = file.tell()
             yield block
 

@@ -11,7 +11,7 @@ import numpy as np
 from gloves.captures.capture import Capture
 from gloves.captures.formats import write_capture
 from handsim.errors import ArgumentError
-from handsim.hand.model import KEYPOINT_NAMES, hand_keypoints
+from handsim.hand.model import KEYPOINT_NAMES
 from handsim.motion_files.motion import (
     Motion,
     write_bvh,
@@ -49,7 +49,7 @@ def _write_joint_trc(path: Path, motion: Motion, up: UpAxis) -> None:
     """Write a .trc file for OpenSim: every keypoint of the hands is a marker, and the y axis points up."""
     turn, positions, names = file_axes(up), [], []
     for hand in motion.hands:
-        positions.append(hand_keypoints(hand.model, hand.qpos) @ turn.T)
+        positions.append(hand.keypoints() @ turn.T)
         names += [f"{hand.side}_{name}" for name in KEYPOINT_NAMES]
     write_capture(path, Capture(tuple(names), np.concatenate(positions, axis=1), motion.rate))
 

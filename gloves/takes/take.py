@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, NoReturn, Self, get_args
@@ -18,13 +18,12 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike, NDArray
 
 from gloves.captures.capture import Capture, labeled_columns
-from gloves.fit import Attachment, GlovedHand, GloveFit
+from gloves.fit import GlovedHand, GloveFit
 from gloves.layout import stored_layout
 from gloves.takes.archives import SCHEMA, read_archive, settings_of, write_archive
 from gloves.takes.bodies import RigidBody, body_arrays, stored_body
 from gloves.takes.motion_formats import MOTION_FORMATS, MotionFormat, motion_format
 from gloves.takes.points import (
-    ATTACHMENT,
     FRAMES,
     KEYPOINTS,
     NUMBERS,
@@ -39,6 +38,15 @@ from gloves.takes.points import (
     fitted,
     spans,
 )
+from gloves.takes.worn import (
+    FORMER,
+    FormerHands,
+    check_former,
+    former_array,
+    hand_arrays,
+    unpack_former,
+    unpack_hands,
+)
 from handsim._checks import as_numbers, check_choice, check_number, check_type
 from handsim._version import full_version
 from handsim.cards import card, span_drawing
@@ -47,7 +55,6 @@ from handsim.files.outputs import check_ending
 from handsim.hand.angles import ISB_NAMES, Convention, isb_angles
 from handsim.hand.model import (
     KEYPOINT_NAMES,
-    HandModel,
     HandMotion,
     between_poses,
     bridge_gaps,
@@ -55,15 +62,7 @@ from handsim.hand.model import (
     is_steady,
     times_at,
 )
-from handsim.hand.shape import (
-    HAND_DTYPE,
-    JOINT_NAMES,
-    NUM_JOINTS,
-    NUM_KEYPOINTS,
-    Side,
-    pack_hand,
-    unpack_hand,
-)
+from handsim.hand.shape import JOINT_NAMES, NUM_JOINTS, NUM_KEYPOINTS, Side
 from handsim.motion_files.motion import Motion, PosedBody, PosedHand
 from handsim.space.transforms import UpAxis
 
@@ -131,6 +130,8 @@ class Take:
     """3D RMS distance of the labeled markers from the pose's [m]; NaN where no pose was fitted."""
     settings: dict[str, Any]
     """Settings that made it, as JSON; for a stream, also the numbers of missing and of left-out frames."""
+    former: tuple[FormerHands, ...] = ()
+    """The hands of earlier frames where they are not `hands`: of other people, or of another size."""
     numbers: Int[np.ndarray, "T"] | None = None
     """The server's number of each frame of a stream, which shows where frames are missing; None otherwise."""
     angle_spread: Float[np.ndarray, "T H 20"] | None = None
@@ -152,6 +153,7 @@ class Take:
         body_status: ArrayLike,
         body_rms: ArrayLike,
         settings: dict[str, Any],
+        former: Sequence[FormerHands] = (),
         point_list: PointList | None = None,
         points: ArrayLike | None = None,
         ids: ArrayLike | None = None,
@@ -169,7 +171,8 @@ class Take:
         check_type("hands", hands, Sequence, "a list of GloveFits")
         for hand in hands:
             check_type("a hand", hand, GloveFit, "a GloveFit, as attach and nominal_fit return it")
-        others = dict(rate=rate, hands=tuple(hands), bodies=tuple(bodies), settings=settings)
+        others = dict(rate=rate, hands=tuple(hands), bodies=tuple(bodies), settings=settings,
+                      former=tuple(former))  # fmt: skip
         for name, value in (*by_frame.items(), *others.items()):
             object.__setattr__(self, name, value)
         try:
@@ -345,11 +348,12 @@ class Take:
             HandSimWarning: The hand moves between these times.
         """
         check_choice(convention, get_args(Convention), noun="convention")
-        angles = self.qpos[:, self.hand_index(side), 7:]
+        number = self.hand_index(side)
+        angles = self.qpos[:, number, 7:]
         zero = None if neutral is None else self.mean_pose(side, neutral)
         if convention == "isb":
-            shape = self.hands[self.hand_index(side)].model.shape
-            return _Angles(zip(ISB_NAMES, isb_angles(shape, angles, zero).T, strict=True))
+            parts = [isb_angles(hands[number].shape, angles[one], zero) for one, hands in self.worn()]
+            return _Angles(zip(ISB_NAMES, np.concatenate(parts).T, strict=True))
         return _Angles(zip(JOINT_NAMES, (angles if zero is None else angles - zero).T, strict=True))
 
     def mean_pose(self, side: Side, between: tuple[float, float]) -> Float[np.ndarray, "20"]:
@@ -402,6 +406,18 @@ class Take:
         check_choice(side, self.sides, noun="hand")
         return self.sides.index(side)
 
+    def worn(self) -> Iterator[tuple[slice, tuple[GloveFit, ...]]]:
+        """The frames of each hands, in order."""
+        first = 0
+        for stop, hands in (*((one.stop, one.hands) for one in self.former), (self.num_frames, self.hands)):
+            if stop > first:
+                yield slice(first, stop), hands
+                first = stop
+
+    def hands_at(self, frame: int) -> tuple[GloveFit, ...]:
+        """The hands of a frame with their gloves as worn."""
+        return next((one.hands for one in self.former if frame < one.stop), self.hands)
+
     def moving_hands(self) -> tuple[GlovedHand, ...]:
         """Each hand with its poses."""
         return tuple(
@@ -449,6 +465,9 @@ class Take:
             side: The hand.
             frames: The frames; all when None.
         """
+        if self.former:
+            frames = np.arange(self.num_frames) if frames is None else frames
+            return np.concatenate([part.pose_markers(side, some) for part, some in self._parts(frames)])
         number, bias = self.hand_index(side), self.marker_bias(side)
         worn, qpos = self.hands[number], self.qpos[:, number]
         qpos = qpos if frames is None else qpos[frames]
@@ -480,12 +499,23 @@ class Take:
         return bias
 
     def marker_offsets(self, side: Side, frames: Int[np.ndarray, "F"]) -> Float[np.ndarray, "F M 3"]:
-        """Computed minus observed markers of a hand, in the frames of their bones [m]; NaN if unseen."""
+        """Computed minus observed markers of a hand, in the frames of their bones [m]; NaN if unseen.
+
+        The frames are in increasing order.
+        """
+        if self.former:
+            return np.concatenate([part.marker_offsets(side, some) for part, some in self._parts(frames)])
         number = self.hand_index(side)
         worn, qpos = self.hands[number], self.qpos[frames, number]
         seen = self.point_list.labeled(self.hand_labels[number], frames)
         rotations = worn.model.forward_kinematics(qpos)[:, worn.attachment.main_bones, :3, :3]
         return np.asarray(np.einsum("tmji,tmj->tmi", rotations, worn.markers(qpos)[0] - seen))
+
+    def _parts(self, frames: Int[np.ndarray, "F"]) -> Iterator[tuple[Take, Int[np.ndarray, "K"]]]:
+        """The takes of each hands, and which of their frames are among those given, in increasing order."""
+        for span, _ in self.worn():
+            some = frames[(frames >= span.start) & (frames < span.stop)] - span.start
+            yield self.cut(span.start, span.stop), some
 
     def markers_present(self) -> Bool[np.ndarray, "T M"]:
         """Whether each marker of all hands has a point in each frame."""
@@ -496,7 +526,7 @@ class Take:
 
         They are NaN where a hand has no pose.
         """
-        return keypoints_of(self.hands, self.qpos)
+        return np.concatenate([keypoints_of(hands, self.qpos[frames]) for frames, hands in self.worn()])
 
     def motion(self, side: Side) -> HandMotion:
         """The motion of a hand, with linear interpolation over the frames where it is lost.
@@ -532,7 +562,8 @@ class Take:
         moving = np.flatnonzero(np.isfinite(poses[..., 0]).any(axis=0))
         if not len(shown):
             raise ArgumentError("no hand has a pose in any frame, expected one at least")
-        return Take.of_poses(
+        ends = np.searchsorted(times, [self.times[one.stop] for one in self.former]).tolist()
+        alone = Take.of_poses(
             [self.hands[number] for number in shown],
             qpos[:, shown],
             rate=self.rate if rate is None else rate,
@@ -541,6 +572,11 @@ class Take:
             body_poses=poses[:, moving],
             settings=self.settings,
         )
+        former = (
+            one._replace(stop=stop, hands=tuple(one.hands[number] for number in shown))
+            for stop, one in zip(ends, self.former, strict=True)
+        )
+        return dataclasses.replace(alone, former=tuple(former))
 
     def capture(self) -> Capture:
         """The points without labels, as an optical system exports them: one trajectory per column.
@@ -613,7 +649,11 @@ class Take:
         if not whole or not 0 <= first < last <= self.num_frames:
             raise ArgumentError(f"frames {first} to {last}, expected a part of 0 to {self.num_frames}")
         parts = {column.name: getattr(self, column.name)[first:last] for column in (*FRAMES, *self._known())}
-        return dataclasses.replace(self, **parts, point_list=self.point_list.cut(first, last))
+        ended = [one._replace(stop=one.stop - first) for one in self.former if first < one.stop < last]
+        others: dict[str, Any] = {"former": ended, "point_list": self.point_list.cut(first, last)}
+        if (worn := next((one for one in self.former if one.stop >= last), None)) is not None:
+            others |= {"hands": worn.hands, "settings": {**self.settings, "user": worn.notes}}
+        return dataclasses.replace(self, **parts, **others)
 
     def export(
         self,
@@ -669,6 +709,8 @@ class Take:
         points, num_columns = self.point_list.stored()
         arrays = {column.name: getattr(self, column.name) for column in (*FRAMES, *self._known())} | points
         arrays |= {KEYPOINTS.name: self.keypoints(), **worn_arrays(self.hands, self.bodies)}
+        if self.former:
+            arrays[FORMER] = former_array(self.former, [hand.layout for hand in self.hands])
         header = take_header(self.hands, self.bodies, self.rate, self.settings)
         header["num_columns"] = num_columns
         write_archive(Path(path), header, arrays)
@@ -687,7 +729,12 @@ def poses_for(form: MotionFormat, take: Take, rate: float | None) -> Take:
 def posed_motion(take: Take, neutral: tuple[float, float] | None = None) -> Motion:
     """The hands and bodies of a take as the writers of motion files need them; each has a pose somewhere."""
     zeros = [None if neutral is None else take.mean_pose(side, neutral) for side in take.sides]
-    hands = [PosedHand.of(hand.model, take.qpos[:, n], zeros[n]) for n, hand in enumerate(take.hands)]
+    hands = [
+        PosedHand.of(
+            hand.model, take.qpos[:, n], zeros[n], [(one.stop, one.hands[n].model) for one in take.former]
+        )
+        for n, hand in enumerate(take.hands)
+    ]
     bodies = [PosedBody.of(one.name, one.shape, take.body_poses[:, n]) for n, one in enumerate(take.bodies)]
     return Motion(take.rate, take.times, hands, bodies)
 
@@ -757,13 +804,7 @@ def take_header(
 
 def worn_arrays(hands: Sequence[GloveFit], bodies: Sequence[RigidBody]) -> dict[str, NDArray[Any]]:
     """The arrays of a file that have no frames: hands, gloves and the bodies' markers."""
-    packed = [pack_hand(hand.shape) for hand in hands]
-    arrays: dict[str, NDArray[Any]] = {"hands": np.array(packed, dtype=HAND_DTYPE)}
-    for column in ATTACHMENT:
-        field = column.name.removeprefix("attachment_")
-        parts = [getattr(hand.attachment, field) for hand in hands]
-        arrays[column.name] = np.concatenate(parts).astype(column.dtype)
-    return arrays | body_arrays(bodies)
+    return hand_arrays(hands) | body_arrays(bodies)
 
 
 def unpack_take(header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Take:
@@ -779,10 +820,6 @@ def unpack_take(header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Take
         arrays.update(listed)
     sizes = {"T": len(arrays["times"]), "P": len(arrays["ids"]), "H": len(layouts), "B": len(named)}
     check_stored(arrays, sizes | {"M": sum(counts[0]), "Q": sum(counts[1])})
-    hands = []
-    for record, layout, span in zip(arrays["hands"], layouts, spans(counts[0]), strict=True):
-        parts = (arrays[column.name][span.start : span.stop] for column in ATTACHMENT)
-        hands.append(GloveFit(HandModel(unpack_hand(record)), Attachment(layout, *parts)))
     bodies = tuple(
         stored_body(number, one, span, arrays)
         for number, (one, span) in enumerate(zip(named, spans(counts[1]), strict=True))
@@ -795,7 +832,8 @@ def unpack_take(header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Take
         points = PointList(counted, **entries, columns=columns, num_columns=num_columns)
     return Take(
         rate=float(header["rate"] or usual_rate(arrays["times"], arrays[NUMBERS.name])),
-        hands=hands,
+        hands=unpack_hands(arrays, layouts),
+        former=unpack_former(arrays[FORMER], layouts) if FORMER in arrays else (),
         bodies=bodies,
         settings=settings_of(header),
         point_list=points,
@@ -825,6 +863,7 @@ def _check(take: Take) -> None:
         _check_range(poses, -_MAX_LENGTH, _MAX_LENGTH)
         if (np.abs(np.linalg.norm(poses[..., 3:7], axis=-1) - 1.0) > _QUATERNION_TOLERANCE).any():
             raise ValueError("an orientation is not a quaternion of unit length")
+    check_former(take.former, take.hands, frames)
     points = take.point_list
     if len(points.counts) != frames:
         raise ValueError(f"points of {len(points.counts)} frames, expected {frames}")

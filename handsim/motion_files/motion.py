@@ -19,7 +19,7 @@ and Kotiuk); the palm joint is the middle of the middle metacarpal.
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Final, NamedTuple, cast
 
@@ -108,6 +108,8 @@ class PosedHand(NamedTuple):
     """Poses [m, rad]; missing ones repeat the last pose, or else the first."""
     neutral: Float[np.ndarray, "20"] | None = None
     """Joint angles [rad] of the pose in which those of the ISB are zero; None for the convention's zero."""
+    former: Sequence[tuple[int, HandModel]] = ()
+    """Models of earlier frames, each with the first frame after them; `model` is that of the last frames."""
 
     @property
     def side(self) -> Side:
@@ -116,11 +118,40 @@ class PosedHand(NamedTuple):
 
     @classmethod
     def of(
-        cls, model: HandModel, qpos: Float[np.ndarray, "T 27"], neutral: Float[np.ndarray, "20"] | None = None
+        cls,
+        model: HandModel,
+        qpos: Float[np.ndarray, "T 27"],
+        neutral: Float[np.ndarray, "20"] | None = None,
+        former: Sequence[tuple[int, HandModel]] = (),
     ) -> PosedHand:
         """A hand with its poses, NaN where it has none."""
         present: NDArray[np.bool_] = np.isfinite(qpos[:, 0])
-        return cls(model, present, _held(qpos, present), neutral)
+        return cls(model, present, _held(qpos, present), neutral, former)
+
+    def by_frame(
+        self, compute: Callable[[HandModel, Float[np.ndarray, "K 27"]], NDArray[np.float64]]
+    ) -> NDArray[np.float64]:
+        """What a function computes of a model and poses (K, ...), for all frames by the models of each."""
+        first, parts = 0, []
+        for stop, model in (*self.former, (len(self.qpos), self.model)):
+            if stop > first:
+                parts.append(compute(model, self.qpos[first:stop]))
+                first = stop
+        return np.concatenate(parts)
+
+    def bones(self) -> Float[np.ndarray, "T L 4 4"]:
+        """`T_world_bone` of all bones [m]."""
+        return self.by_frame(lambda model, qpos: model.forward_kinematics(qpos))
+
+    def offsets(self) -> Float[np.ndarray, "T L 3"]:
+        """The position of each bone in its parent's frame, and the palm's in the world [m]."""
+        offsets = self.by_frame(lambda model, qpos: np.tile(model.skeleton.offsets, (len(qpos), 1, 1)))
+        offsets[:, PALM] = self.qpos[:, :3]
+        return offsets
+
+    def keypoints(self) -> Float[np.ndarray, "T 21 3"]:
+        """Wrist, joints and fingertips in the world [m]."""
+        return self.by_frame(hand_keypoints)
 
 
 class PosedBody(NamedTuple):
@@ -299,8 +330,8 @@ def _titles(motion: Motion) -> tuple[str, ...]:
 def _numbers(hand: PosedHand) -> Float[np.ndarray, "T K"]:
     """The columns of `_titles`; NaN in frames without a pose."""
     qpos = hand.qpos
-    keypoints = hand_keypoints(hand.model, qpos)[:, 1:].reshape(len(qpos), -1)
-    isb = isb_angles(hand.model.shape, qpos[:, 7:], hand.neutral)
+    keypoints = hand.keypoints()[:, 1:].reshape(len(qpos), -1)
+    isb = hand.by_frame(lambda model, poses: isb_angles(model.shape, poses[:, 7:], hand.neutral))
     numbers = np.concatenate([qpos, keypoints, isb], axis=1)
     numbers[~hand.present] = np.nan
     return numbers
@@ -336,9 +367,8 @@ def write_bvh(path: Path, motion: Motion, up: UpAxis = "z") -> None:
     lines = [f"ROOT {_BVH_ROOT}", "{", *_indented(_joint(np.zeros(3), moves=True))]
     for hand in motion.hands:
         lines += _indented(_bone_lines(hand.model, hand.side, PALM, _CENTIMETERS * turn))
-        rest = np.swapaxes(hand.model.rest_transforms[:, :3, :3], -1, -2)
         # In BVH all joints have the axes of the file at rest.
-        rotations = turn @ hand.model.forward_kinematics(hand.qpos)[..., :3, :3] @ rest @ turn.T
+        rotations = turn @ hand.by_frame(_from_rest) @ turn.T
         local = local_rotations(rotations)
         columns.append(_CENTIMETERS * hand.qpos[:, :3] @ turn.T)
         columns += [_degrees(local[:, bone]) for bone in _order(PALM)]
@@ -354,6 +384,12 @@ def write_bvh(path: Path, motion: Motion, up: UpAxis = "z") -> None:
         table = np.concatenate(columns, axis=1)
         file.write(f"MOTION\nFrames: {len(table)}\nFrame Time: {1.0 / motion.rate:.9f}\n")
         np.savetxt(file, table, fmt="%.6f")
+
+
+def _from_rest(model: HandModel, qpos: Float[np.ndarray, "T 27"]) -> Float[np.ndarray, "T L 3 3"]:
+    """The rotation of each bone in the world from its orientation at rest."""
+    rest = np.swapaxes(model.rest_transforms[:, :3, :3], -1, -2)
+    return np.asarray(model.forward_kinematics(qpos)[..., :3, :3] @ rest)
 
 
 def _degrees(rotations: Float[np.ndarray, "T 3 3"]) -> NDArray[np.float64]:

@@ -28,7 +28,7 @@ from handsim._plugins import import_extra
 from handsim._version import full_version
 from handsim.errors import ArgumentError
 from handsim.files.outputs import atomic_write, plain_path, unwritten
-from handsim.hand.model import HandModel, hand_keypoints
+from handsim.hand.model import HandModel
 from handsim.hand.shape import BONE_NAMES, BONES, NUM_BONES, PALM, Side
 from handsim.hand.skin import vertex_normals
 from handsim.motion_files.motion import (
@@ -114,8 +114,8 @@ class _Scene:
         return self._buffer.pack(document)
 
     def _add_hand(self, hand: PosedHand) -> None:
-        qpos = hand.qpos
-        positions, rotations = qpos[:, :3] @ self._turn.T, hand.model.forward_kinematics(qpos)[..., :3, :3]
+        offsets, rotations = hand.offsets(), hand.bones()[..., :3, :3]
+        positions = offsets[:, PALM] @ self._turn.T
         quaternions = smooth_quaternions(local_rotations(self._turn @ rotations))
         root, first = len(self._nodes), len(self._nodes) + 1
         self._nodes.append({"name": f"{hand.side}_skeleton", "children": [first + PALM]})
@@ -129,6 +129,8 @@ class _Scene:
                 node["children"] = [first + child for child in CHILDREN[bone]]
             self._nodes.append(node)
             self._animate(first + bone, "rotation", _xyzw(quaternions[:, bone]))
+            if hand.former and bone != PALM:
+                self._animate(first + bone, "translation", offsets[:, bone])
         self._animate(first, "translation", positions)
         self._hide(first, hand.present)
         self._skins.append(
@@ -317,7 +319,7 @@ def _add_hand(stage: Any, hand: PosedHand, codes: NDArray[np.float64]) -> None:
     _add_skin(stage, hand, f"{path}/{hand.side}_hand", skeleton)
     _add_motion(motion, hand, codes)
     _set_visibility(root, hand.present, codes)
-    keypoints = hand_keypoints(hand.model, hand.qpos)
+    keypoints = hand.keypoints()
     extent = root.CreateExtentAttr()
     corners = np.stack([keypoints.min(axis=1) - _AROUND, keypoints.max(axis=1) + _AROUND], axis=1)
     for code, box in zip(codes.tolist(), corners.astype(np.float32), strict=True):
@@ -346,10 +348,8 @@ def _add_motion(motion: Any, hand: PosedHand, codes: NDArray[np.float64]) -> Non
     """Translations, rotations and scales of all bones in every frame."""
     from pxr import Vt
 
-    qpos = hand.qpos
-    rotations = smooth_quaternions(local_rotations(hand.model.forward_kinematics(qpos)[..., :3, :3]))
-    translations = np.tile(hand.model.skeleton.offsets, (len(qpos), 1, 1))
-    translations[:, PALM] = qpos[:, :3]
+    rotations = smooth_quaternions(local_rotations(hand.bones()[..., :3, :3]))
+    translations = hand.offsets()
     motion.CreateJointsAttr(joint_paths(hand.side))
     motion.CreateScalesAttr(Vt.Vec3hArray.FromNumpy(np.ones((NUM_BONES, 3), dtype=np.float16)))
     # usd-core takes quaternions from arrays with the real part last.

@@ -136,7 +136,7 @@ def track_live(
             if sizing.step(frame, tracked, tracker):
                 _start(outputs, tracker)
                 if sizing.is_settled:
-                    recording.resize(tracker)
+                    status.say(f"size of the hands: {tracker.user}")
             if (wish := guide(tracked)) is None:
                 break
             new = pace.tick(stream.counts) or frame.silent > pace.is_silent
@@ -209,13 +209,16 @@ class _Recording:
             status.say(f"recording to {recorder.part}, which becomes {out} at the end; Ctrl-C ends it")
 
     def add(self, frame: StreamedFrame, tracked: TrackedFrame) -> None:
-        """Record a frame."""
-        self._try(lambda recorder: recorder.add(frame, tracked))
-
-    def resize(self, tracker: Tracker) -> None:
-        """Print and record the new size of the tracker's hands."""
-        self._status.say(f"size of the hands: {tracker.user}")
-        self._try(Recorder.resize)
+        """Record a frame unless the recording has failed; raise a failure if there are no outputs."""
+        if self._recorder is None or self._failure is not None:
+            return
+        try:
+            self._recorder.add(frame, tracked)
+        except CaptureError as error:
+            if not any(self._outputs):
+                raise
+            self._failure = error
+            self._status.say(f"{error}; tracking goes on without a recording")
 
     def discard(self, reason: str) -> NoReturn:
         """Remove a recording without frames, and say why there are none."""
@@ -235,18 +238,6 @@ class _Recording:
         self._status.show(f"writing {recorder.out}", now=True)
         kept = f"writing {recorder.out}; {recorder.part} is kept until then"
         return recorder.finish(counts, told=lambda: self._status.show(kept))
-
-    def _try(self, record: Callable[[Recorder], None]) -> None:
-        """Record something unless the recording has failed; raise a failure if there are no outputs."""
-        if self._recorder is None or self._failure is not None:
-            return
-        try:
-            record(self._recorder)
-        except CaptureError as error:
-            if not any(self._outputs):
-                raise
-            self._failure = error
-            self._status.say(f"{error}; tracking goes on without a recording")
 
 
 @contextmanager

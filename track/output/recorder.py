@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gloves.captures.capture import Capture
+from gloves.layout import MarkerLayout
 from gloves.takes.archives import GrowingArchive, GrownArchive, finish_archive, growing_path
 from gloves.takes.points import FRAMES, KEYPOINTS, NUMBERS, OPTIONAL, POINTS, SPREADS, PointList
 from gloves.takes.take import (
@@ -29,6 +30,7 @@ from gloves.takes.take import (
     usual_rate,
     worn_arrays,
 )
+from gloves.takes.worn import FORMER, FormerHands, former_array
 from handsim._checks import check_type
 from handsim.callbacks import Closing
 from handsim.errors import DAMAGE, ArgumentError, CaptureError, HandSimWarning
@@ -117,11 +119,12 @@ class Recorder(Closing):
         self._tracker, self.out = tracker, out
         """The file of the take."""
         self._settings = {**settings_of(tracker), **settings}
+        self._user = tracker.user
         sizes = {"H": len(tracker.hands), "B": len(tracker.bodies)}
         self._archive = GrowingArchive(
             growing_path(out),
             self._header(None),
-            worn_arrays(tracker.hands, tracker.bodies),
+            self._worn_arrays(),
             [column.sized(sizes) for column in (*FRAMES, *POINTS, *OPTIONAL, KEYPOINTS)],
         )
         self._times: tuple[float, float] | None = None
@@ -177,21 +180,29 @@ class Recorder(Closing):
             values |= {column.name: values[column.name][kept] for column in POINTS}
         keypoints = keypoints_of(self._tracker.hands, values["qpos"][None])[0]
         with self._writing():
+            if self._tracker.user is not self._user:
+                self._end_hands()
             self._archive.add({**values, KEYPOINTS.name: keypoints}, len(values["points"]))
         self._times = (self._times[0] if self._times else frame.time, frame.time)
 
-    def resize(self) -> None:
-        """Note that the tracker's hands change their size now; the finished take has hands of the last size.
+    def _end_hands(self) -> None:
+        """Record that the frames until now are of other hands, or of another size, than the tracker's now."""
+        before, self._user = self._user, self._tracker.user
+        self._settings["user"] = self._user.notes
+        if self.num_frames:
+            ended = FormerHands(self.num_frames, before.hands, before.notes)
+            self._archive.add_former(former_array([ended], self._layouts))
+        self._archive.replace_head(self._header(None), self._worn_arrays())
 
-        `sizes` in the settings lists all sizes with their first frames.
-        """
-        sizes = self._settings.setdefault("sizes", [[0, self._settings.get("user", "")]])
-        self._settings["user"] = self._tracker.user.notes
-        sizes.append([self.num_frames, self._settings["user"]])
-        with self._writing():
-            self._archive.replace_head(
-                self._header(None), worn_arrays(self._tracker.hands, self._tracker.bodies)
-            )
+    def _worn_arrays(self) -> dict[str, NDArray[Any]]:
+        return {
+            **worn_arrays(self._tracker.hands, self._tracker.bodies),
+            FORMER: former_array((), self._layouts),
+        }
+
+    @property
+    def _layouts(self) -> list[MarkerLayout]:
+        return [hand.layout for hand in self._tracker.hands]
 
     def close(self) -> None:
         """Write waiting frames, and close the recording without writing the take."""

@@ -83,7 +83,7 @@ def _fit_again(
     take: Take, hand: int, frames: NDArray[np.int64], targets: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Fit a hand that is not lost to labeled markers in some frames; poses and RMS [m]."""
-    worn, qpos = take.hands[hand], take.qpos[frames, hand]
+    worn, qpos = take.hands_at(int(frames[0]))[hand], take.qpos[frames, hand]
     enough = np.isfinite(targets[..., 0]).sum(axis=1) >= FEWEST_MARKERS
     rms = np.full(len(frames), np.nan)
     if enough.any():

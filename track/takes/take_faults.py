@@ -86,6 +86,18 @@ class _Hand(NamedTuple):
 @lru_cache(maxsize=1)  # A summary, its warnings and a report of a take ask one after the other.
 def find_faults(take: Take) -> tuple[SuspectSpan, ...]:
     """Find the faults of a tracked take, each from the frame in which it begins."""
+    found = list[SuspectSpan]()
+    for span, _ in take.worn():  # Other hands, or another size of them, have faults of their own.
+        first = span.start
+        found += (
+            one._replace(first=first + one.first, last=first + one.last, worst=first + one.worst)
+            for one in _faults_of_hands(take.cut(first, span.stop) if take.former else take)
+        )
+    return tuple(found)
+
+
+def _faults_of_hands(take: Take) -> tuple[SuspectSpan, ...]:
+    """The faults of a take in which hands are those of the last frame."""
     found, last = list[SuspectSpan](), take.num_frames - 1
     hands = [
         SuspectSpan(one.first, last, one.first, f"the {one.side} hand", one.why, one.remedy, of_labels=False)
@@ -93,7 +105,6 @@ def find_faults(take: Take) -> tuple[SuspectSpan, ...]:
     ]
     for number, side in enumerate(take.sides) if take.made_by_tracker else ():
         frames = np.flatnonzero(take.status[:, number] == TRACKED)
-        frames = frames[frames >= _first_of_size(take)]
         if len(frames) < _FEWEST:
             continue
         frames = frames[:: -(-len(frames) // _MOST_FRAMES)]
@@ -105,14 +116,6 @@ def find_faults(take: Take) -> tuple[SuspectSpan, ...]:
         for faults in (_alternatives, _slips, _fallen, _at_limits):
             found += faults(hand)
     return (*hands, *tuple({one.of: one for one in reversed(found)}.values())[::-1])
-
-
-def _first_of_size(take: Take) -> int:
-    """The first frame with the final size of the hands, which a live tracker measures on the way."""
-    match take.settings.get("sizes"):
-        case [*_, [int(first), *_]]:
-            return first
-    return 0
 
 
 def _alternatives(hand: _Hand) -> Iterator[SuspectSpan]:

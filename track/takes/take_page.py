@@ -40,6 +40,7 @@ _CHUNK: Final = 4096  # frames per call of forward kinematics
 _WANTED: Final = 0.99  # share of right frames for which the page gives a number of looks
 _MOST_SPANS: Final = 100  # rows of the page's table of doubtful spans
 _BINS: Final = 750  # bins of a long take's curve, which shows the extremes of each
+_SHOWN_SPAN: Final = 0.5  # [s] Hands of fewer frames are steps from one size to another.
 _STROKES: Final = (Paint.VIOLET, Paint.BLUE, Paint.WARM, Paint.GREEN)
 """Colors of a digit's joints, from proximal to distal."""
 _COASTING: Final = "#efd9c9"
@@ -188,11 +189,13 @@ def hand_figures(take: Take) -> tuple[HandFigures, ...]:
         own = (points.labels >= labels.start) & (points.labels < labels.stop)
         confidence[points.frames[own], points.labels[own] - labels.start] = points.confidence[own]
         residuals = np.full((take.num_frames, len(labels)), np.nan)
-        observed, shown = take.observed(hand.side), np.flatnonzero(there)
-        for first in range(0, len(shown), _CHUNK):
-            part = shown[first : first + _CHUNK]
-            expected, _ = hand.markers(take.qpos[part, number])
-            residuals[part] = np.linalg.norm(observed[part] - expected, axis=2)
+        observed = take.observed(hand.side)
+        for span, worn in take.worn():
+            shown = span.start + np.flatnonzero(there[span])
+            for first in range(0, len(shown), _CHUNK):
+                part = shown[first : first + _CHUNK]
+                expected, _ = worn[number].markers(take.qpos[part, number])
+                residuals[part] = np.linalg.norm(observed[part] - expected, axis=2)
         spread = None if take.angle_spread is None else np.rad2deg(take.angle_spread[:, number])
         status, names = take.status[:, number], hand.layout.names
         beyond = hand.attachment.beyond
@@ -241,7 +244,21 @@ def _calibration_section(take: Take) -> Section:
     else:
         text = "The hands were given, and the take does not say whether they are calibrated. "
         text += _BANDS
+    if take.former:
+        text += f" They changed while the take was recorded:{html_list(_changes(take), 'ul')}"
     return Section("Calibration", text)
+
+
+def _changes(take: Take) -> list[str]:
+    """From when to when which hands were tracked, without steps from one size to the next."""
+    notes = [*(one.notes for one in take.former), str(take.settings.get("user", ""))]
+    stops = [*(one.stop for one in take.former), take.num_frames]
+    firsts = [0, *stops[:-1]]
+    return [
+        f"{take.times[first]:.1f} to {take.times[stop - 1]:.1f} s: {note.removeprefix(MEASURED)}"
+        for first, stop, note in zip(firsts, stops, notes, strict=True)
+        if take.times[stop - 1] - take.times[first] >= _SHOWN_SPAN
+    ]
 
 
 def _hand_sections(take: Take, hand: HandFigures) -> list[Section]:

@@ -94,7 +94,6 @@ class TakeRecording(Recording):
     """A take with the given cameras, or those in its settings."""
 
     def __init__(self, take: Take, rig: CameraRig | None = None) -> None:
-        self._models = tuple(hand.model for hand in take.hands)
         self.times, self.label_names = take.times, take.label_names
         self.most_points = int(take.point_list.counts.max()) + take.hand_labels[-1].stop
         self.radius, self.bodies = take.hands[0].layout.radius, tuple(take.bodies)
@@ -115,7 +114,7 @@ class TakeRecording(Recording):
         return ShownFrame(
             time=float(take.times[index]),
             words=tuple(self._words(index)),
-            hands=self._models,
+            hands=tuple(hand.model for hand in take.hands_at(index)),
             qpos=take.qpos[index],
             points=np.concatenate([points.points[there], self._markers[index, filled]]),
             labels=np.concatenate([points.labels[there].astype(np.int64), filled]),

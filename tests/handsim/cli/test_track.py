@@ -341,29 +341,32 @@ def test_hands_of_a_stream_are_measured_beside_the_tracker(capture, tmp_path, ca
     (tmp_path / "sized_source.py").write_text(SIZED)
     monkeypatch.syspath_prepend(tmp_path)
     out, part, source = tmp_path / "live.npz", tmp_path / "live.npz.part", capture.with_suffix(".truth.npz")
-    take_over, grown = Recorder.resize, []
+    add, grown, users = Recorder.add, [], [None]
 
-    def resize(recorder: Recorder) -> None:
-        take_over(recorder)
-        recorded = GrownArchive(part)
-        grown.append((recorded.header["settings"], recorded.read()["hands"]["length"]))
-        os.kill(os.getpid(), signal.SIGTERM)
+    def check(recorder: Recorder, *frame: object) -> None:
+        add(recorder, *frame)
+        users.append(recorder._tracker.user)
+        if users[-1].notes.startswith("auto") and users[-1] is users[-2] and not grown:  # the last step
+            recorder._archive.flush()
+            recorded = GrownArchive(part)
+            grown.append((recorded.header["settings"], recorded.read()["hands"]["length"]))
+            os.kill(os.getpid(), signal.SIGTERM)
 
-    monkeypatch.setattr(Recorder, "resize", resize)
+    monkeypatch.setattr(Recorder, "add", check)
     address = f"sized_source:Sized?file={source}"
     assert main(["track", "--live", address, "--out", str(out)]) == 0
     take, said = load_take(out), capsys.readouterr()
-    (first, at_first), (later, measured) = take.settings["sizes"]
-    assert (first, at_first, measured) == (0, "M", take.settings["user"]) and 0 < later <= take.num_frames
+    first, measured = take.former[0], take.settings["user"]
+    assert first.notes == "M" and 0 < first.stop < take.num_frames
     assert measured.startswith("auto, ")
     assert f"size of the hands: {measured.split(', unsure')[0].removeprefix('auto, ')}\n" in said.err
     assert said.out.startswith(f"size of the hands: {measured.removeprefix('auto, ')}\n")
     assert take.hands[0].shape.length != pytest.approx(0.187, abs=1e-4)
     ((settings, length),) = grown
-    assert settings["sizes"] == take.settings["sizes"]
+    assert settings["user"] == take.settings["user"]
     assert length == pytest.approx(take.hands[0].shape.length)
-    with np.load(out) as stored:  # keypoints are as they were sent
-        assert np.nanmax(np.abs(stored["keypoints"][5] - take.keypoints()[5])) > 0.001
+    with np.load(out) as stored:  # as they were sent
+        np.testing.assert_allclose(stored["keypoints"], take.keypoints(), atol=1e-9)
 
 
 def test_a_server_may_start_after_the_tracker(capture, tmp_path, capsys, monkeypatch):

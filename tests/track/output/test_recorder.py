@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import dataclasses
 import functools
 import os
@@ -16,15 +17,18 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from gloves import RigidBody, Status, Take, load_layout, load_take
+from gloves import RigidBody, Status, Take, load_layout, load_take, read_capture
 from gloves.fit import nominal_fit
 from gloves.takes import points
 from gloves.takes.archives import CutOffWarning
-from gloves.takes.take import LOST, STATUSES, TRACKED, usual_rate
+from gloves.takes.take import LOST, STATUSES, TRACKED, keypoints_of, usual_rate
 from handsim import HandSimWarning, join_qpos
 from handsim.errors import ArgumentError, CaptureError
+from handsim.hand.model import KEYPOINT_NAMES
 from handsim.space.objects import named_object
+from handsim.space.transforms import file_axes
 from render.subject import subject_of
+from tests.handsim.motion_files.test_scenes import Glb
 from tests.limits import file_size_limit
 from track import (
     Recorder,
@@ -40,6 +44,7 @@ from track import (
 from track.frames import capture_frames
 from track.output import recorder as module
 from track.output.recorder import frame_values
+from track.settings import TrackerSetup, TrackSettings
 from train import load_labeler, simulate_take
 
 FRAMES = 24
@@ -108,6 +113,120 @@ def test_the_take_on_disk_is_that_in_memory(tmp_path):
         assert one.settings["tracker"] == dataclasses.asdict(tracked()[0].config)
     take.save(tmp_path / "again.npz")
     assert_equal(load_take(tmp_path / "again.npz"), take)
+
+
+@functools.cache
+def resized():
+    """Frames of hands that change their size twice, and the size of each frame."""
+    _, pairs = tracked()
+    users = [TrackerSetup.of(TrackSettings(size=size)).user for size in ("S", "M", "L")]
+    sizes = np.repeat([0, 1, 2], [5, 1, FRAMES - 6])
+    expected = [
+        keypoints_of(users[size].hands, np.array([[hand.qpos for hand in one.hands]]))[0]
+        for size, (_, one) in zip(sizes, pairs, strict=True)
+    ]
+    return users, sizes, np.array(expected)
+
+
+def record_sizes(folder) -> Recorder:
+    (users, sizes, _), (tracker, pairs) = resized(), tracked()
+    before = tracker.user
+    tracker.resize(users[0])
+    recorder = Recorder(folder / "new" / "take.npz", tracker)
+    for size, (frame, one) in zip(sizes, pairs, strict=True):
+        if tracker.user is not users[size]:
+            tracker.resize(users[size])
+        recorder.add(frame, one)
+    tracker.resize(before)
+    return recorder
+
+
+@pytest.fixture
+def sized(tmp_path):
+    return record_sizes(tmp_path)
+
+
+def lengths(hands) -> list[float]:
+    return [hand.shape.length for hand in hands]
+
+
+@pytest.mark.filterwarnings("ignore::gloves.takes.archives.CutOffWarning")
+def test_every_frame_keeps_its_hands(sized, tmp_path):
+    users, sizes, expected = resized()
+    sized._archive.flush()
+    growing = load_take(sized.part)
+    sized.finish(COUNTS)
+    take = load_take(tmp_path / "new" / "take.npz")
+    take.save(tmp_path / "again.npz")
+    for one in (take, growing, load_take(tmp_path / "again.npz")):
+        assert [former.stop for former in one.former] == [5, 6]
+        assert [former.notes for former in one.former] == ["S", "M"]
+        for frame, size in enumerate(sizes):
+            assert lengths(one.hands_at(frame)) == lengths(users[size].hands)
+        np.testing.assert_allclose(one.keypoints(), expected, atol=1e-9)
+    with np.load(tmp_path / "new" / "take.npz") as stored:
+        np.testing.assert_array_equal(stored["keypoints"], take.keypoints())
+    for first, last in ((0, 5), (0, 6), (3, 9), (4, FRAMES), (6, 10), (2, 4)):
+        part = take.cut(first, last)
+        np.testing.assert_allclose(part.keypoints(), expected[first:last], atol=1e-9)
+        assert part.settings["user"] == "SML"[sizes[last - 1]]
+        assert lengths(part.hands) == lengths(users[sizes[last - 1]].hands)
+    with pytest.raises(ArgumentError, match="former hands end at frames"):
+        dataclasses.replace(take, former=take.former[::-1])
+    with pytest.raises(ArgumentError, match="other sides or gloves"):
+        dataclasses.replace(take, former=[take.former[0]._replace(hands=take.hands[:1])])
+
+
+def test_markers_and_offsets_are_those_of_each_frame_s_hands(sized, tmp_path):
+    users, sizes, _ = resized()
+    sized.finish(COUNTS)
+    take = load_take(tmp_path / "new" / "take.npz")
+    there = np.flatnonzero(take.status[:, 0] != LOST)
+    assert len(there) > FRAMES // 2
+    markers, offsets = take.pose_markers(take.sides[0], there), take.marker_offsets(take.sides[0], there)
+    for row, frame in enumerate(there):
+        worn, alone = users[sizes[frame]].hands[0], take.cut(frame, frame + 1)
+        np.testing.assert_allclose(markers[row], worn.markers(take.qpos[frame, :1])[0][0], atol=1e-9)
+        np.testing.assert_array_equal(offsets[row], alone.marker_offsets(take.sides[0], np.array([0]))[0])
+
+
+def test_exports_have_the_keypoints_that_were_sent(sized, tmp_path):
+    _, _, expected = resized()
+    sized.finish(COUNTS)
+    take = load_take(tmp_path / "new" / "take.npz")
+    there = take.status[:, 0] != LOST
+    take.export(tmp_path / "hands.trc")
+    take.export(tmp_path / "hands.csv")
+    take.export(tmp_path / "hands.glb")
+    capture = read_capture(tmp_path / "hands.trc")
+    right = [name.startswith(f"{take.sides[0]}_") for name in capture.names]
+    positions = capture.positions[:, right] @ file_axes("z")
+    np.testing.assert_allclose(positions[there], expected[there, 0], atol=1e-4)
+    rows = list(csv.DictReader((tmp_path / "hands.csv").open()))
+    tips = [[float(row[f"index_tip_{axis}_m"] or "nan") for axis in "xyz"] for row in rows]
+    hands = [row["hand"] == take.sides[0] for row in rows]
+    tip = KEYPOINT_NAMES.index("index_tip")
+    np.testing.assert_allclose(np.array(tips)[hands][there], expected[there, 0, tip], atol=1e-6)
+    glb = Glb(tmp_path / "hands.glb")
+    for frame in np.flatnonzero(there):
+        places = glb.worlds(take.times[frame] - take.times[0])
+        joint = places[glb.named(f"{take.sides[0]}_index_distal")][:3, 3]
+        shown = file_axes("z") @ expected[frame, 0, KEYPOINT_NAMES.index("index_DIP")]
+        np.testing.assert_allclose(joint, shown, atol=5e-4)
+
+
+def test_a_recording_of_several_sizes_may_be_cut_at_any_byte(sized, tmp_path):
+    sized.close()
+    whole, (_, _, expected) = sized.part.read_bytes(), resized()
+    for end in np.linspace(len(whole) - 40_000, len(whole) - 1, 40, dtype=int):
+        sized.part.write_bytes(whole[:end])
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", CutOffWarning)
+            try:
+                take = load_take(sized.part)
+            except CaptureError:
+                continue
+        np.testing.assert_allclose(take.keypoints()[:5], expected[: take.num_frames][:5], atol=1e-9)
 
 
 def test_a_recording_that_was_cut_off_is_read(tmp_path):

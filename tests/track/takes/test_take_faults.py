@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from gloves import GloveFit, MarkerLayout, MarkerPlace, Take, load_layout
+from gloves.fit import nominal_fit
+from gloves.takes.worn import FormerHands
 from handsim.hand.shape import JOINTS, PALM
 from track import find_suspect_spans, track_capture
 from track.alternatives.alternatives import _mirror_orders
@@ -222,3 +224,32 @@ def test_hands_of_the_wrong_side_are_never_silent(mirror_like, turned):
         if one.of == "the left hand"
     )
     assert fault.why.endswith("it is the right hand") and fault.of_labels
+
+
+def test_hands_of_two_users_are_no_fault(truth, tracked):
+    """Poses of each are judged by their own hands, not by those of the last frames."""
+    larger = tuple(nominal_fit(hand.layout, "XL", hand.side) for hand in truth.hands)
+    later = track_capture(
+        dataclasses.replace(truth, points=enlarged(truth, larger)), hands=larger, labeler="dense19"
+    )
+    both = dataclasses.replace(
+        tracked,
+        **{name: np.concatenate([getattr(tracked, name)[:HALF], getattr(later, name)[HALF:]])
+           for name in ("qpos", "status", "rms", "points", "ids", "labels", "confidence")},
+        hands=larger,
+        former=[FormerHands(HALF, tracked.hands, "M")],
+    )  # fmt: skip
+    assert find_faults(both) == find_faults(tracked.cut(0, HALF)) == ()
+    mixed = dataclasses.replace(both, former=())
+    assert any("where the layout has it" in one.why or "slips" in one.why for one in find_faults(mixed))
+    figures, wrong = hand_figures(both)[0], hand_figures(mixed)[0]
+    assert np.nanmedian(figures.rms[:HALF]) < 0.5 * np.nanmedian(wrong.rms[:HALF])
+
+
+def enlarged(truth, hands):
+    """The points of a take, with each marker where other hands have it."""
+    points = truth.points.copy()
+    parts = [hand.markers(truth.qpos[:, number])[0] for number, hand in enumerate(hands)]
+    frames, columns = np.nonzero((truth.labels >= 0) & (truth.labels < truth.hand_labels[-1].stop))
+    points[frames, columns] = np.concatenate(parts, axis=1)[frames, truth.labels[frames, columns]]
+    return points
