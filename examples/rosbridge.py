@@ -1,6 +1,6 @@
 """A sink of your own for ROS 2: tf and joint states, as JSON for a rosbridge server; no ROS is needed here.
 
-On the machine with ROS, and on this one, where a hand that points along x, y and z tries it first:
+On the machine with ROS, and on this one, where a hand that points forward, left and up tries it first:
 
     ros2 launch rosbridge_server rosbridge_websocket_launch.xml
     cd examples
@@ -28,6 +28,7 @@ from websockets.sync.client import connect
 
 from gloves import Status, attach
 from handsim import HandModel, join_qpos
+from handsim.space.transforms import program_axes
 from track import LiveMessage, StreamedFrame, TrackedFrame, TrackedHand, open_sinks
 
 RETRY = 1.0  # [s] between two attempts to connect
@@ -37,9 +38,10 @@ Topic = tuple[str, str, dict[str, Any]]  # name, type and message
 class Rosbridge:
     """Publishes the newest frame when the server has taken the one before, and waits for the server."""
 
-    def __init__(self, host: str = "localhost", port: str = "9090", up: str = "z") -> None:
+    def __init__(self, host: str = "localhost", port: str = "9090", up: str = "z", forward: str = "x") -> None:
         self.url, self.published, self.dropped = f"ws://{host}:{port}", 0, 0
-        self.upright = Rotation.from_euler("x", 90 if up == "y" else 0, degrees=True)  # to z up (REP 103)
+        turn = program_axes("ros", "y" if up == "y" else "z", forward=forward).turn
+        self.upright = Rotation.from_matrix(turn)  # to x forward, y left, z up (REP 103)
         self.offset = math.nan  # [s] of ROS's time over the camera system's
         self.newest: LiveMessage | None = None
         self.changed, self.closed = threading.Condition(), False

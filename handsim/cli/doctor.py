@@ -24,8 +24,8 @@ from handsim.app.workers import usable_cores
 
 _PROBE_SECONDS: Final = 120.0
 _RATE: Final = 60.0  # frame rate of the pointing hand [Hz]
-_POINTING: Final = 120  # frames for which the hand points along each axis
-_WRIST: Final = (0.1, 0.2, 0.3)  # wrist of the pointing hand in the receiver's axes [m]
+_POINTING: Final = 120  # frames for which the hand points in each direction
+_WRIST: Final = (0.1, 0.2, 0.3)  # wrist of the pointing hand in the room: forward, left, up [m]
 _BENT: Final = 1.2  # flexion of the fingers that do not point [rad]
 # These programs run in processes of their own, because a broken driver kills its process.
 _DRAW: Final = """
@@ -76,7 +76,7 @@ def doctor(compile: bool = False, send: str | None = None) -> int:
 
     Args:
         compile: Compile all kernels instead, so that no command has to wait for that.
-        send: Send a hand instead that points along the receiver's x, y and z in turn, to an address as of
+        send: Send a hand instead that points forward, left and up in the room in turn, to an address as of
             handsim track --send, and say what should be seen; Ctrl-C ends it.
 
     Returns:
@@ -105,14 +105,14 @@ def doctor(compile: bool = False, send: str | None = None) -> int:
 
 
 def send_pointing_hand(address: str, ended: Callable[[], bool], tell: Callable[[str], None]) -> None:
-    """Send a right hand whose index finger points along the receiver's axes in turn, until it is ended."""
+    """Send a right hand whose index finger points along the room's axes in turn, until it is ended."""
     import numpy as np
 
     from gloves.fit import nominal_fit
     from gloves.takes.points import Status
     from handsim.hand.model import KEYPOINT_NAMES, hand_keypoints, join_qpos
     from handsim.hand.shape import JOINT_NAMES
-    from handsim.space.transforms import UpAxis, program_axes, rotation_quaternions
+    from handsim.space.transforms import DIRECTIONS, UpAxis, program_axes, room_axes, rotation_quaternions
     from track.frames import StreamedFrame, TrackedFrame, TrackedHand
     from track.output.live_message import WORLD, Content
     from track.output.sinks import open_sinks
@@ -121,21 +121,28 @@ def send_pointing_hand(address: str, ended: Callable[[], bool], tell: Callable[[
     with open_sinks(address) as sinks:
         asked = dict(parse_qsl(urlsplit(address).query))  # `open_sinks` has checked it
         up: UpAxis = "y" if asked.get("up") == "y" else "z"
-        content = Content(axes=asked.get("axes", WORLD), up=up, unit=asked.get("unit", "auto"))
+        forward = asked.get("forward", "x")
+        content = Content(
+            axes=asked.get("axes", WORLD), up=up, unit=asked.get("unit", "auto"), forward=forward
+        )
         axes, hand = content.program or program_axes("ros", "z"), nominal_fit("dense19", "M", "right")
+        room = room_axes(up, forward)
         sinks.start([hand], [])
         number = 0
         while not ended():
             along = number // _POINTING % 3
-            pointing, back = axes.turn[along], axes.turn[(along + 1) % 3]
+            pointing, back = room[along], room[(along + 1) % 3]
             turn = np.stack([pointing, np.cross(back, pointing), back], axis=1)[None]
             qpos = join_qpos(
-                _BENT * np.array([bent]), position=_WRIST @ axes.turn, quaternion=rotation_quaternions(turn)
+                _BENT * np.array([bent]), position=_WRIST @ room, quaternion=rotation_quaternions(turn)
             )
             if number % _POINTING == 0:
                 tip = axes.positions(hand_keypoints(hand.model, qpos)[0, KEYPOINT_NAMES.index("index_tip")])
                 place = " ".join(f"{value:.3f}" for value in tip)
-                tell(f"the index finger points along +{'xyz'[along]}, its tip is at {place} {axes.unit}")
+                seen = axes.turn @ pointing
+                axis = f"{'-' if seen.sum() < 0 else '+'}{'xyz'[np.abs(seen).argmax()]}"
+                where = f"{DIRECTIONS[along]}, along {axis}"
+                tell(f"the index finger points {where}, its tip is at {place} {axes.unit}")
             nobody = np.empty((0, 3)), np.empty(0, dtype=np.int64)
             frame = StreamedFrame(number, number / _RATE, *nobody, arrived=time.monotonic())
             shown = TrackedHand("right", Status.TRACKED, qpos[0], np.nan, *nobody)

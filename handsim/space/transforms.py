@@ -13,17 +13,23 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
+from handsim.errors import ArgumentError
+
 UpAxis = Literal["y", "z"]
 """The axis of a file that points up."""
 MIRROR = np.diag([1.0, -1.0, 1.0])
 """Right hand to left hand and back, in the wrist frame."""
-_Z_UP: Final = {"z": np.eye(3), "y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])}
-_PROGRAMS: Final = {  # axes in a world with z up, what is mirrored in a thing's own axes, and the unit
-    "ros": (((1, 0, 0), (0, 1, 0), (0, 0, 1)), (1, 1, 1), "m"),  # REP 103: x forward, y left, z up
-    "openxr": (((1, 0, 0), (0, 0, 1), (0, -1, 0)), (1, 1, 1), "m"),  # x right, y up, z backward
-    "opengl": (((1, 0, 0), (0, 0, 1), (0, -1, 0)), (1, 1, 1), "m"),
-    "unity": (((1, 0, 0), (0, 0, 1), (0, 1, 0)), (1, 1, -1), "m"),  # x right, y up, z forward
-    "unreal": (((1, 0, 0), (0, -1, 0), (0, 0, 1)), (1, -1, 1), "cm"),  # x forward, y right, z up
+DIRECTIONS: Final = ("forward", "left", "up")
+"""The axes of a room: those of ROS (REP 103), from which the axes of all programs follow."""
+FORWARD: Final = ("x", "-x", "y", "-y", "z", "-z")
+"""Axes of the camera system that may be forward."""
+_OPPOSITES: Final = {"backward": "forward", "right": "left"}
+_PROGRAMS: Final = {  # directions of x, y and z, what is mirrored in a thing's own axes, and the unit
+    "ros": (("forward", "left", "up"), (1, 1, 1), "m"),
+    "openxr": (("right", "up", "backward"), (1, 1, 1), "m"),
+    "opengl": (("right", "up", "backward"), (1, 1, 1), "m"),
+    "unity": (("right", "up", "forward"), (1, 1, -1), "m"),
+    "unreal": (("forward", "right", "up"), (1, -1, 1), "cm"),
 }
 PROGRAMS: Final = tuple(_PROGRAMS)
 """Names of the programs whose axes are known."""
@@ -31,7 +37,7 @@ PROGRAMS: Final = tuple(_PROGRAMS)
 
 def file_axes(up: UpAxis) -> Float[np.ndarray, "3 3"]:
     """Rotation of the world to axes with y up (glTF, BVH, OpenXR, OpenSim), about x."""
-    return np.asarray(np.array(_PROGRAMS["openxr"][0]) @ _Z_UP[up])
+    return program_axes("openxr", up, forward="y" if up == "z" else "-z").turn
 
 
 class ProgramAxes(NamedTuple):
@@ -59,10 +65,11 @@ class ProgramAxes(NamedTuple):
 
 
 @functools.cache
-def program_axes(name: str, up: UpAxis, unit: str = "auto") -> ProgramAxes:
-    """The axes of one of `PROGRAMS` in its own unit or another, from a world whose axis `up` points up."""
-    axes, mirror, own_unit = _PROGRAMS[name]
-    turn = np.array(axes, dtype=float) @ _Z_UP[up]
+def program_axes(name: str, up: UpAxis, unit: str = "auto", *, forward: str = "x") -> ProgramAxes:
+    """The axes of one of `PROGRAMS` in its own unit or another, from a world whose axes point up and forward."""
+    directions, mirror, own_unit = _PROGRAMS[name]
+    room = dict(zip(DIRECTIONS, room_axes(up, forward), strict=True))
+    turn = np.array([-room[_OPPOSITES[one]] if one in _OPPOSITES else room[one] for one in directions])
     # A mirrored rotation keeps the part of its axis along the mirrored direction, and turns the other way.
     mirrored = np.diag([1.0, *np.prod(mirror) * np.array(mirror)])
     return ProgramAxes(
@@ -76,9 +83,24 @@ def _turning(turn: Float[np.ndarray, "3 3"]) -> NDArray[np.float64]:
     return np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
 
 
+@functools.cache
+def room_axes(up: UpAxis, forward: str = "x") -> Float[np.ndarray, "3 3"]:
+    """The directions `DIRECTIONS` of a room in the axes of its camera system, as rows.
+
+    Raises:
+        ArgumentError: The same axis points up and forward.
+    """
+    ahead = (-1.0 if forward.startswith("-") else 1.0) * np.eye(3)["xyz".index(forward[-1])]
+    upward = np.eye(3)["xyz".index(up)]
+    if ahead @ upward:
+        level = ", ".join(axis for axis in FORWARD if axis[-1] != up)
+        raise ArgumentError(f"forward is {forward} where {up} points up, expected one of {level}")
+    return np.stack([ahead, np.cross(upward, ahead), upward])
+
+
 def upright(up: UpAxis) -> Float[np.ndarray, "3 3"]:
     """Rotation of a world in which an axis points up to ours, with z up."""
-    return _Z_UP[up]
+    return room_axes(up)
 
 
 def turned_poses(poses: Float[np.ndarray, "*batch K"], turn: Float[np.ndarray, "3 3"]) -> NDArray[np.float64]:

@@ -260,13 +260,15 @@ class Content(NamedTuple):
     """The axis of the camera system that points up."""
     unit: str = "auto"
     """Unit of length, m or cm; auto is the program's."""
+    forward: str = "x"
+    """The axis of the camera system that is forward, one of `FORWARD`."""
 
     @property
     def program(self) -> ProgramAxes | None:
         """The program's axes; None for those of the camera system in meters."""
         if self.axes == WORLD:
             return program_axes("ros", "z", self.unit) if self.unit == "cm" else None
-        return program_axes(self.axes, self.up, self.unit)
+        return program_axes(self.axes, self.up, self.unit, forward=self.forward)
 
 
 def document_format(

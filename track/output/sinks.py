@@ -29,7 +29,7 @@ from handsim._checks import check_methods, check_type
 from handsim._plugins import import_extra, is_plugin, list_plugins, make_plugin
 from handsim.callbacks import Closing
 from handsim.errors import ArgumentError, HandSimWarning
-from handsim.space.transforms import PROGRAMS
+from handsim.space.transforms import FORWARD, PROGRAMS, room_axes
 from track.bodies.rigid_body import RigidTemplate
 from track.frames import StreamedFrame, TrackedFrame
 from track.output.live_message import (
@@ -57,7 +57,13 @@ STATUSES: Final = tuple(reversed(Status))
 _METHODS: Final = (("send", "close"), "the methods send and close of a sink")
 _YES: Final = ("no", "yes")  # valid values of an option
 _EVERY: Final = (*_YES, "1")  # the same of `every`, for which clients ask, too
-_AXES: Final = {"axes": (WORLD, *PROGRAMS), "up": ("z", "y"), "unit": ("auto", "m", "cm"), "velocities": _YES}
+_AXES: Final = {
+    "axes": (WORLD, *PROGRAMS),
+    "up": ("z", "y"),
+    "forward": FORWARD,
+    "unit": ("auto", "m", "cm"),
+    "velocities": _YES,
+}
 _DOCUMENTS: Final = {"format": FORMATS, "points": _YES, "joints": ("no", "openxr"), **_AXES}
 _OPTIONS: Final[Mapping[str, Mapping[str, tuple[str, ...]]]] = {
     "osc": _AXES,
@@ -184,7 +190,9 @@ def open_sink(address: str) -> LiveSink:
             axes=options["axes"],
             up="y" if options["up"] == "y" else "z",
             unit=options["unit"],
+            forward=options["forward"],
         )
+        room_axes(content.up, content.forward)  # raises an error if these are one axis
         if scheme == "osc":
             return DatagramSink(host, port, osc_format(content))
         largest = LARGEST_DATAGRAM if scheme == "udp" else math.inf

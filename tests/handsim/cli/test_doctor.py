@@ -139,8 +139,16 @@ def test_this_machine_is_examined() -> None:
 
 
 @pytest.mark.parametrize("axes", ["world", "ros", "openxr", "unity", "unreal"])
-def test_a_hand_points_along_the_receivers_axes_in_turn(axes, monkeypatch):
-    """What is received, by the numbers alone: the tip lies ahead of the wrist along x, y and z."""
+@pytest.mark.parametrize("forward", ["x", "-z"])
+def test_a_hand_points_along_the_axes_of_the_room_in_turn(axes, forward, monkeypatch):
+    """What is received, by the numbers alone: the tip lies ahead of the wrist forward, to the left and up."""
+    seen = {
+        "ros": ["+x", "+y", "+z"],
+        "openxr": ["-z", "-x", "+y"],
+        "unity": ["+z", "-x", "+y"],
+        "unreal": ["+x", "-y", "+z"],
+        "world": ["+x", "-z", "+y"] if forward == "x" else ["-z", "-x", "+y"],
+    }[axes]
     monkeypatch.setattr(doctor, "_POINTING", 3)
     monkeypatch.setattr(doctor, "_RATE", 1e3)
     told, frames = [], []
@@ -156,17 +164,20 @@ def test_a_hand_points_along_the_receivers_axes_in_turn(axes, monkeypatch):
             except BlockingIOError:
                 return len(told) > 3
 
-        address = f"udp://127.0.0.1:{receiver.getsockname()[1]}?axes={axes}&up=y&velocities=yes"
+        address = (
+            f"udp://127.0.0.1:{receiver.getsockname()[1]}?axes={axes}&up=y&forward={forward}&velocities=yes"
+        )
         doctor.send_pointing_hand(address, ended, told.append)
     poses = [hand for hand in frames if "positions" in hand]
     unit = 100.0 if axes == "unreal" else 1.0
     for along in range(3):
         hand = poses[3 * along]
         wrist, tip = np.array(hand["wrist"]["position"]), np.array(hand["positions"][8])
-        np.testing.assert_allclose(wrist, unit * np.array([0.1, 0.2, 0.3]), atol=1e-6 * unit)
-        ahead = (tip - wrist) / unit
+        room = np.array([(-1 if one[0] == "-" else 1) * np.eye(3)["xyz".index(one[1])] for one in seen])
+        np.testing.assert_allclose(room @ wrist, unit * np.array([0.1, 0.2, 0.3]), atol=1e-6 * unit)
+        ahead = room @ (tip - wrist) / unit
         assert 0.15 < ahead[along] < 0.22 and np.abs(np.delete(ahead, along)).max() < 0.04
-        assert f"along +{'xyz'[along]}," in told[along]
+        assert f"{('forward', 'left', 'up')[along]}, along {seen[along]}," in told[along]
         said = [float(one) for one in re.findall(r"-?\d+\.\d+", told[along])]
         np.testing.assert_allclose(said, tip, atol=6e-4)
     assert hand["angles"][4:8] == [0.0] * 4

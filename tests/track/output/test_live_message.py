@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import re
 import time
@@ -16,9 +17,13 @@ from scipy.spatial.transform import Rotation
 
 from gloves import load_layout
 from gloves.fit import nominal_fit
+from handsim import HandModel, join_qpos
+from handsim.errors import ArgumentError
 from handsim.hand.model import hand_keypoints
 from handsim.hand.shape import BONE_NAMES, JOINT_NAMES
 from handsim.motion_files.motion import OPENXR_JOINTS
+from handsim.space.transforms import rotation_quaternions
+from tests.sentences import error_names
 from track import StreamedFrame, TrackedFrame
 from track.output.live_message import (
     FORMATS,
@@ -30,6 +35,7 @@ from track.output.live_message import (
     header_document,
     in_axes,
 )
+from track.output.sinks import open_sink
 
 DECODE = {"json": json.loads, "msgpack": msgpack.unpackb}
 
@@ -218,8 +224,8 @@ def test_a_lost_hand_has_no_numbers(message):
 
 
 def as_openxr(position, rotation):
-    """OpenXR: x right, y up, z backward; a world with z up is turned about x by -90 degrees."""
-    turn = Rotation.from_euler("x", -90, degrees=True)
+    """OpenXR: x right, y up, z backward; x of the world is forward there, z is up."""
+    turn = Rotation.from_matrix([[0, -1, 0], [0, 0, 1], [-1, 0, 0]])
     return turn.apply(position), turn * rotation
 
 
@@ -275,6 +281,47 @@ def test_poses_are_those_of_each_program(program, up, message):
     header = header_document(one.header, Content(joints=True, axes=program, up=up))
     assert header["axes"] == program and header["units"]["length"] == unit
     assert 0.003 < header["radii"][0][9] / (100.0 if unit == "cm" else 1.0) < 0.02
+
+
+# In words: what a receiver of each program takes for forward, left and up, and its unit [m].
+BY_WORDS = {
+    "ros": ((1, 0, 0), (0, 1, 0), (0, 0, 1), 1.0),
+    "openxr": ((0, 0, -1), (-1, 0, 0), (0, 1, 0), 1.0),
+    "opengl": ((0, 0, -1), (-1, 0, 0), (0, 1, 0), 1.0),
+    "unity": ((0, 0, 1), (-1, 0, 0), (0, 1, 0), 1.0),
+    "unreal": ((1, 0, 0), (0, -1, 0), (0, 0, 1), 0.01),
+}
+
+
+@pytest.mark.parametrize("up", ["z", "y"])
+@pytest.mark.parametrize("forward", ["x", "-x", "y", "-y", "z", "-z"])
+def test_a_hand_that_points_to_the_door_does_so_in_all_worlds(forward, up, message):
+    """Positions agree to 0.01 mm and orientations to 0.1 degrees, in forward, left and up."""
+    if forward[-1] == up:
+        with error_names(ArgumentError, f"forward is {forward} where {up} points up"):
+            open_sink(f"udp://127.0.0.1:9?up={up}&forward={forward}")
+        return
+    door = (-1.0 if forward[0] == "-" else 1.0) * np.eye(3)["xyz".index(forward[-1])]
+    above = np.eye(3)["xyz".index(up)]
+    hand = HandModel.named("M")
+    pointing = np.stack([door, np.cross(above, door), above], axis=1)  # the hand's x, y and z
+    qpos = join_qpos(np.zeros((1, 20)), position=0.4 * door, quaternion=rotation_quaternions(pointing[None]))
+    positions = hand_keypoints(hand, qpos)[0]
+    one = dataclasses.replace(
+        message(0).hands[0], position=qpos[0, :3], quaternion=qpos[0, 3:7], positions=positions
+    )
+    one = dataclasses.replace(message(0), hands=(one,))
+    for program, (*directions, unit) in BY_WORDS.items():
+        sent = in_axes(one, Content(axes=program, up=up, forward=forward).program).hands[0]
+        room = unit * sent.positions @ np.array(directions).T
+        own = positions @ pointing  # where forward, left and up are the hand's own axes
+        np.testing.assert_allclose(room, own, atol=1e-5)
+        w, *xyz = sent.quaternion
+        turned = Rotation.from_quat([*xyz, w]).as_matrix()
+        # Left-handed programs mirror the hand's own axes, too: z in Unity, y in Unreal.
+        mirror = {"unity": (1, 1, -1), "unreal": (1, -1, 1)}.get(program, (1, 1, 1))
+        turned = np.array(directions) @ turned @ np.diag(mirror)
+        assert np.degrees(Rotation.from_matrix(turned).magnitude()) < 0.1
 
 
 def test_what_is_lost_has_no_pose_in_any_axes(message):
