@@ -652,7 +652,8 @@ class Take:
         ended = [one._replace(stop=one.stop - first) for one in self.former if first < one.stop < last]
         others: dict[str, Any] = {"former": ended, "point_list": self.point_list.cut(first, last)}
         if (worn := next((one for one in self.former if one.stop >= last), None)) is not None:
-            others |= {"hands": worn.hands, "settings": {**self.settings, "user": worn.notes}}
+            settings = {**self.settings, "user": worn.notes, "size_state": ""}
+            others |= {"hands": worn.hands, "settings": settings}
         return dataclasses.replace(self, **parts, **others)
 
     def export(

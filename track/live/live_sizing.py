@@ -14,6 +14,7 @@ from collections import deque
 from collections.abc import Sequence
 from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
+from time import monotonic
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -44,6 +45,7 @@ _JUMP: Final = 1.5  # ratio to the usual residual beyond which the hands may be 
 _STEP: Final = 0.002  # [m] motion of the markers of a hand at rest per step to a new size
 _FEWEST_STEPS: Final = 4  # Learned marker biases fade out in at least this many steps.
 _EASE: Final = 0.0025  # [m] most by which a keypoint leaves its motion per frame while a size is taken over
+_USUAL_TIME: Final = 3.0  # [s] A measurement that takes longer lacks processor time.
 _NICE: Final = 5  # The measuring process has a lower priority than the tracker's.
 
 
@@ -71,7 +73,10 @@ class LiveSizing(Closing):
         self._last = self._seen = -np.inf  # [s] times of the last such frame and hand
         self._is_brief, self._is_done = True, False  # is the last measurement brief, the size final?
         self._calm = self._usual = self._newest = 0.0  # [s] since measured; [m] residuals
+        self._is_measured, self._reason, self._begun = False, "", 0.0  # [s] `_begun` on the monotonic clock
         self._processes: LocalProcesses | None = None
+        if setup.is_auto:
+            self._start_process()
         self._measuring: Future[_Measured] | None = None
         self._steps: deque[User] = deque()
         self._shown_last: TrackedFrame | None = None
@@ -81,6 +86,16 @@ class LiveSizing(Closing):
     def is_settled(self) -> bool:
         """Whether the tracker has adopted the newest size."""
         return not self._steps
+
+    @property
+    def state(self) -> str:
+        """Why the hands are not measured, or not those of another user yet; empty if they need not be."""
+        if self._is_measured or not self._setup.is_auto:
+            return ""
+        if self._measuring is None:
+            return self._reason or f"not measured yet: seen for {self._shown:.1f} of {self._due:.0f} s"
+        has_time = monotonic() < self._begun + _USUAL_TIME
+        return "being measured" if has_time else "not measured yet: no processor time"
 
     def close(self) -> None:
         """Cancel a running measurement."""
@@ -107,6 +122,7 @@ class LiveSizing(Closing):
         if came or self._fit_worse(tracked, min(frame.time - self._seen, _LONGEST_STEP)):
             self._frames.clear()
             self._shown, self._due, self._is_brief, self._is_done = 0.0, _FIRST, True, False
+            self._is_measured, self._reason = False, ""
         self._seen = frame.time if is_there else self._seen
         if not self._is_done and len(frame.points) >= self._setup.fewest_points:
             self._shown += min(frame.time - self._last, _LONGEST_STEP)
@@ -127,7 +143,7 @@ class LiveSizing(Closing):
     def _fit_worse(self, tracked: TrackedFrame, span: float) -> bool:
         """Whether the fit is much worse than just after the measurement; `span` [s] is the time step."""
         rms = [hand.rms for hand in tracked.hands if hand.status is Status.TRACKED]
-        if self._steps or not self._is_done or not rms:
+        if self._steps or not self._is_measured or not rms:
             return False
         mean = sum(rms) / len(rms)
         self._calm += span
@@ -140,12 +156,17 @@ class LiveSizing(Closing):
     def _begin_measuring(self, user: User) -> None:
         """Start to measure the hands in the frames so far."""
         self._is_brief, self._due = self._shown < _ENOUGH, max(_ENOUGH, _LATER * self._shown)
-        self._frames = sample_frames(self._frames)
-        self._processes = LocalProcesses(1)
-        self._measuring = self._processes.submit(
+        self._frames, self._begun = sample_frames(self._frames), monotonic()
+        processes = self._processes or self._start_process()
+        self._measuring = processes.submit(
             _measure, self._setup.settings, self._frames, user, judges=self._judges or not self._is_brief
         )
-        self._processes.shutdown(wait=False)  # ends after this task
+
+    def _start_process(self) -> LocalProcesses:
+        """Start the process that measures, which takes as long to load as to measure."""
+        self._processes = LocalProcesses(1)
+        self._processes.submit(_give_way)
+        return self._processes
 
     def _end_measuring(self, measuring: Future[_Measured], tracker: Tracker) -> None:
         """Adopt the result of a measurement."""
@@ -154,10 +175,14 @@ class LiveSizing(Closing):
             found = measuring.result()
         except (HandSimError, BrokenProcessPool) as error:
             found = _Measured(told=[str(error)])
+            if isinstance(error, BrokenProcessPool):
+                self._processes = None
         for sentence in found.told:
             warnings.warn(sentence, HandSimWarning, stacklevel=4)
         if not found.users:
+            self._reason = "not measured yet: no hand was found"
             return
+        self._is_measured = True
         self._judges = self._judges or found.is_relabeled
         self._is_done, self._calm, self._usual = not self._is_brief, 0.0, 0.0
         before, after = (one[0].shape.length for one in (tracker.user, found.users[-1]))
@@ -166,12 +191,16 @@ class LiveSizing(Closing):
             self._steps = deque(found.users)
 
 
+def _give_way() -> None:
+    """Lower the priority of this process."""
+    if hasattr(os, "nice"):
+        os.nice(_NICE)
+
+
 def _measure(
     settings: dict[str, Any], frames: Sequence[StreamedFrame], before: User, *, judges: bool
 ) -> _Measured:
-    """Measure the hands in some frames, and judge their labels, in a process of low priority."""
-    if hasattr(os, "nice"):
-        os.nice(_NICE)
+    """Measure the hands in some frames, and judge their labels."""
     setup = TrackerSetup.of(TrackSettings.from_json(settings))
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", HandSimWarning)

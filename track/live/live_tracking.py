@@ -142,7 +142,7 @@ def track_live(
             new = pace.tick(stream.counts) or frame.silent > pace.is_silent
             pace.is_silent = frame.silent
             if new or status.due:
-                line = _status_line(frame, tracked, stream, outputs, pace)
+                line = _status_line(frame, tracked, stream, outputs, pace, sizing.state)
                 status.show(line if frame.silent else wish or line, now=new)
             if not doubt and (doubt := stream.point_doubt):
                 status.say(doubt)
@@ -151,10 +151,12 @@ def track_live(
         if not pace.frames and (out is not None or monotonic() >= until):
             waited = f" in {patience:g} s" if monotonic() >= until else ""
             recording.discard(f"{address}: 0 frames came{waited}; {stream.silence_doubt}")
-        take, step = recording.finish(counts, pace)
+        take, step = recording.finish(counts, pace, sizing.state)
     after = counts["frames_in_order"] + counts["reordered_frames"] - counts["dropped_frames"]
     counts["frames_after_end"] = max(0, after - pace.frames)
-    notes = _notes(counts, step, pace, stream.order.interval)
+    notes = list(_notes(counts, step, pace, stream.order.interval))
+    if sizing.state and pace.frames:
+        notes.append(f"the last hands are {sizing.state.replace(' yet', '')}; track the recording again")
     sent = (note for output in outputs for note in output.notes())
     duration = pace.duration + (1.0 / take.rate if take is not None else 0.0)
     return LiveTake(take, pace.frames, duration, (*notes, *sent, *filter(None, [stream.point_doubt])))
@@ -227,8 +229,8 @@ class _Recording:
                 self._recorder.finish()
         raise CaptureError(reason)
 
-    def finish(self, counts: dict[str, int], pace: _Pace) -> tuple[Take | None, int]:
-        """Write the take, see `Recorder.finish`; without a recorder there is none."""
+    def finish(self, counts: dict[str, int], pace: _Pace, size: str) -> tuple[Take | None, int]:
+        """Write the take, see `Recorder.finish`; `size` says why the last hands are not measured."""
         recorder = self._recorder
         if recorder is None:
             return None, 1
@@ -237,7 +239,7 @@ class _Recording:
             raise CaptureError(f"{self._failure}; {lost} frames after them were not recorded")
         self._status.show(f"writing {recorder.out}", now=True)
         kept = f"writing {recorder.out}; {recorder.part} is kept until then"
-        return recorder.finish(counts, told=lambda: self._status.show(kept))
+        return recorder.finish(counts, size=size, told=lambda: self._status.show(kept))
 
 
 @contextmanager
@@ -324,8 +326,9 @@ def _status_line(
     stream: LiveStream,
     outputs: Sequence[FrameOutput],
     pace: _Pace,
+    size: str,
 ) -> str:
-    """Status line of a live stream."""
+    """Status line of a live stream; `size` says why hands are not measured."""
     if frame.silent:
         return f"no frames arrive; {stream.silence_doubt}"
     counts = stream.counts
@@ -333,6 +336,7 @@ def _status_line(
     words += [f"{body.name} {body.status}" for body in tracked.bodies]
     rms = [hand.rms for hand in tracked.hands if np.isfinite(hand.rms)]
     words += [f"RMS {1e3 * max(rms):.1f} mm"] if rms else []
+    words += [f"hands {size}"] if size else []
     words += [pace.words] if pace.words else []
     left_out = counts["late_frames"] + counts["frames_with_wild_times"] + counts.get("damaged_packets", 0)
     for number, what in (

@@ -225,12 +225,17 @@ class Recorder(Closing):
             ) from error
 
     def finish(
-        self, stream: Mapping[str, int] | None = None, *, told: Callable[[], None] = lambda: None
+        self,
+        stream: Mapping[str, int] | None = None,
+        *,
+        size: str = "",
+        told: Callable[[], None] = lambda: None,
     ) -> tuple[Take, int]:
         """Write the take, read it back, and remove the recording; with fewer than two frames only remove it.
 
         Args:
             stream: Counts of the stream's frames (`counts` of `open_source`), for the take's settings.
+            size: Why the last hands are not measured; the settings keep it as `size_state`.
             told: Called after every part.
 
         Returns:
@@ -246,6 +251,8 @@ class Recorder(Closing):
             raise CaptureError(f"{self.num_frames} frames came, expected two or more")
         if stream is not None:
             self._settings["stream"] = dict(stream)
+        if size:
+            self._settings["size_state"] = size
         try:
             grown = GrownArchive(self.part)
             first = (grown.first(name, RATED_FRAMES) for name in ("times", NUMBERS.name))

@@ -20,6 +20,7 @@ from track.alternatives.alternatives import doubts_of
 from track.alternatives.hands import other_hands_of
 from track.hand_size import glove_shifts
 from track.kinematics.pose_solver import FEWEST_MARKERS
+from track.settings import USUAL_SIZE
 
 _FEWEST: Final = 60  # Faults are looked for from this many tracked frames of a hand on.
 _MOST_FRAMES: Final = 2000  # largest number of examined frames of a hand
@@ -113,7 +114,10 @@ def _faults_of_hands(take: Take) -> tuple[SuspectSpan, ...]:
         enough = np.isfinite(seen[..., 0]).sum(axis=1) >= FEWEST_MARKERS
         offsets = take.marker_offsets(side, frames)
         hand = _Hand(take, side, take.hands[number], frames, offsets, some[enough], seen[enough])
-        for faults in (_alternatives, _slips, _fallen, _at_limits):
+        # Hands that are not measured do not fit, which looks like a slip.
+        of_size = take.settings.get("size"), take.settings.get("user")
+        slips = () if of_size == ("auto", USUAL_SIZE) or take.settings.get("size_state") else (_slips,)
+        for faults in (_alternatives, *slips, _fallen, _at_limits):
             found += faults(hand)
     return (*hands, *tuple({one.of: one for one in reversed(found)}.values())[::-1])
 

@@ -239,3 +239,39 @@ def test_hands_of_a_known_size_are_not_measured(monkeypatch):
     monkeypatch.setattr(live_sizing, "_measure", measure)
     shown(sizing, tracker, 0.0, 15.0)
     assert not calls and sizing.is_settled
+
+
+def test_why_hands_are_not_measured_is_known(monkeypatch):
+    setup = TrackerSetup.of(TrackSettings(hands="right"))
+    sizing, tracker, clock = LiveSizing(setup), FakeTracker(setup.user), [0.0]
+    monkeypatch.setattr(live_sizing, "monotonic", lambda: clock[0])
+    shown(sizing, tracker, 0.0, 0.4)
+    assert sizing.state == "not measured yet: seen for 0.5 of 1 s"
+    pending = Future()
+    monkeypatch.setattr(AtOnce, "submit", lambda *given, **options: pending)
+    shown(sizing, tracker, 0.5, 1.0)
+    assert sizing.state == "being measured"
+    clock[0] = 5.0
+    assert sizing.state == "not measured yet: no processor time"
+    pending.set_result(live_sizing._Measured())
+    shown(sizing, tracker, 1.5, 0.1)
+    assert sizing.state == "not measured yet: no hand was found"
+    pending = Future()
+    shown(sizing, tracker, 1.6, 10.0)
+    pending.set_result(live_sizing._Measured([dataclasses.replace(setup.user, notes="auto, measured")]))
+    shown(sizing, tracker, 11.6, 0.1)
+    assert sizing.state == ""
+    shown(sizing, tracker, 20.0, 0.5)
+    assert sizing.state.startswith("not measured yet: seen for"), "somebody else may have come"
+    assert LiveSizing(TrackerSetup.of(TrackSettings(hands="right", size="L"))).state == ""
+
+
+def test_another_user_without_a_pause_is_noticed_before_the_last_measurement(monkeypatch):
+    setup = TrackerSetup.of(TrackSettings(hands="right"))
+    sizing, tracker = LiveSizing(setup), FakeTracker(setup.user)
+    monkeypatch.setattr(live_sizing, "_measure", found(0.187)[0])
+    shown(sizing, tracker, 0.0, 7.0)
+    measure, calls = found(0.205)
+    monkeypatch.setattr(live_sizing, "_measure", measure)
+    shown(sizing, tracker, 7.0, 3.0, rms=0.003)
+    assert len(calls) == 1 and tracker.user[0].shape.length > 0.19

@@ -101,15 +101,19 @@ def test_a_short_gap_at_the_end_is_no_fault(tracked):
     assert find_faults(without_marker(tracked, 6, FRAMES - 60)) == ()
 
 
-@pytest.mark.parametrize("part", ["palm", "whole"])
-def test_a_glove_that_slips_is_named_with_the_time(truth, part):
+def slipped(truth: Take, part: str) -> Take:
+    """A take whose first glove, or its palm, is 8 mm nearer to the fingertips in the second half."""
     points, hand = truth.points.copy(), truth.hands[0]
     bones, own = hand.model.forward_kinematics(truth.qpos[:, 0]), hand.attachment.main_bones
     for frame in range(HALF, FRAMES):
         for marker in np.flatnonzero(own == PALM) if part == "palm" else range(len(own)):
             points[frame, columns_of(truth, frame, marker)] += 0.008 * bones[frame, own[marker], :3, 0]
-    slipped = dataclasses.replace(truth, points=points)
-    take = track_capture(slipped, hands=truth.hands, labeler="dense19")
+    return dataclasses.replace(truth, points=points)
+
+
+@pytest.mark.parametrize("part", ["palm", "whole"])
+def test_a_glove_that_slips_is_named_with_the_time(truth, part):
+    take = track_capture(slipped(truth, part), hands=truth.hands, labeler="dense19")
     found = [fault for fault in find_faults(take) if fault.why.startswith("slips by ")]
     assert [fault.of.split(":")[0] for fault in found] == [truth.sides[0]]
     assert abs(found[0].first - HALF) <= 3 and not found[0].of_labels
@@ -253,3 +257,17 @@ def enlarged(truth, hands):
     frames, columns = np.nonzero((truth.labels >= 0) & (truth.labels < truth.hand_labels[-1].stop))
     points[frames, columns] = np.concatenate(parts, axis=1)[frames, truth.labels[frames, columns]]
     return points
+
+
+def test_no_slip_is_told_of_hands_that_are_not_measured(truth):
+    """The glove slips on hands that the take calls measured, or not."""
+    take = track_capture(slipped(truth, "whole"), hands=truth.hands, labeler="dense19")
+
+    def slips(**settings):
+        known = dataclasses.replace(take, settings={**take.settings, **settings})
+        return [one.words for one in find_faults(known) if "slips" in one.why]
+
+    assert slips(size="auto", user="auto, 180 x 80 mm") == slips(size="M", user="M") != []
+    assert (
+        slips(size="auto", user="M") == slips(size="auto", user="auto, x", size_state="being measured") == []
+    )
