@@ -21,7 +21,7 @@ from gloves.takes.take import label_names
 from handsim import __version__
 from handsim._plugins import import_extra
 from handsim.hand.model import KEYPOINT_NAMES, HandModel, hand_keypoints
-from handsim.hand.shape import JOINT_NAMES, Side
+from handsim.hand.shape import DIGITS, JOINT_NAMES, Side
 from handsim.kernels import move
 from handsim.motion_files.motion import OPENXR_JOINTS, joint_poses, joint_radii
 from handsim.space.transforms import ProgramAxes, UpAxis, program_axes, transform_poses
@@ -37,7 +37,8 @@ LARGEST_DATAGRAM: Final = 1400
 """Largest size of a datagram that usual networks carry in one packet [bytes]."""
 _DECIMALS: Final = 6  # resolution of micrometers and microradians
 _STEP: Final = 1e-3  # [s] Velocities are differences of poses this far apart in time.
-_POSE: Final = ("side", "status", "wrist", "angles", "positions")  # entries of a hand that share one part
+# Entries of a hand that share one part.
+_POSE: Final = ("side", "status", "seen", "digits", "wrist", "angles", "positions")
 _HALF: Final = len(OPENXR_JOINTS) // 2
 _HINT: Final = "a client of the path /newest gets the newest frame for each message that it sends"
 
@@ -54,6 +55,8 @@ class LiveHeader:
     """The joint positions: the wrist, and the joints and the tip of each digit."""
     bodies: tuple[str, ...]
     """The rigid bodies in their order."""
+    digits: tuple[str, ...]
+    """The digits, from the thumb."""
     markers: tuple[str, ...]
     """Marker names that labels index: `right:ThumbTip`, ..., first the hands' markers, then the bodies'."""
     radii: tuple[tuple[float, ...], ...]
@@ -66,6 +69,10 @@ class LiveHand:
 
     side: Side
     status: Status
+    seen: float
+    """Share of the hand's markers that were seen in the frame, from 0 to 1."""
+    digits: tuple[Status, ...]
+    """Status of each digit: coasting where none of its markers was seen, otherwise that of the hand."""
     position: Float[np.ndarray, "3"]
     """Wrist position in the world [m]."""
     quaternion: Float[np.ndarray, "4"]
@@ -153,11 +160,13 @@ class MessageEncoder:
 
     def __init__(self, hands: Sequence[GloveFit], bodies: Sequence[RigidTemplate]) -> None:
         self._models = [hand.model for hand in hands]
+        self._digits = [hand.attachment.digits for hand in hands]
         self.header = LiveHeader(
             tuple(hand.side for hand in hands),
             JOINT_NAMES,
             KEYPOINT_NAMES,
             tuple(body.name for body in bodies),
+            DIGITS,
             label_names(hands, bodies),
             tuple(tuple(joint_radii(hand.model).tolist()) for hand in hands),
         )
@@ -188,7 +197,17 @@ class MessageEncoder:
         spreads = hand.angle_spread, hand.keypoint_spread
         velocities = functools.partial(_velocities, self._models[number], hand)
         joints = functools.partial(_openxr_joints, self._models[number], hand.qpos)
-        return LiveHand(hand.side, hand.status, *pose, *spreads, hand.velocity[6:], velocities, joints)
+        seen = np.full(len(self._digits[number]), hand.has_pose)
+        seen[hand.filled] = False
+        told = set(self._digits[number][seen].tolist())
+        digits = tuple(
+            hand.status if number in told else min(hand.status, Status.COASTING)
+            for number in range(len(DIGITS))
+        )
+        doubt = float(seen.mean()), digits
+        return LiveHand(
+            hand.side, hand.status, *doubt, *pose, *spreads, hand.velocity[6:], velocities, joints
+        )
 
 
 def _velocities(model: HandModel, hand: TrackedHand) -> Float[np.ndarray, "21 3"]:
@@ -376,6 +395,8 @@ def _hand_document(hand: LiveHand, content: Content) -> dict[str, Any]:
     return {
         "side": hand.side,
         "status": str(hand.status),
+        "seen": round(hand.seen, 3),
+        "digits": [str(status) for status in hand.digits],
         "wrist": _pose(hand),
         "angles": _rounded(hand.angles) if hand.has_pose else None,
         "positions": _rounded(hand.positions) if hand.has_pose else None,

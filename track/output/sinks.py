@@ -71,6 +71,7 @@ _OPTIONS: Final[Mapping[str, Mapping[str, tuple[str, ...]]]] = {
     "ws": {**_DOCUMENTS, "every": _EVERY, "pages": ("own", "all")},
 }
 _RESERVED: Final = re.compile(r"[^!-~]|[#*,/?\[\]{}]")  # not allowed in a part of an OSC address
+_LARGEST_BUNDLE: Final = 8000  # [bytes] A frame is one bundle, which networks carry in several packets.
 _BUNDLE_HEAD, _BUNDLE_ENTRY = 16, 4  # [bytes] overhead of an OSC bundle and of each message in it
 _LARGEST_INTEGER: Final = 0x7FFFFFFF  # largest integer of an OSC message
 _HEADER_PERIOD: Final = 1.0  # [s] The header is repeated after this time for receivers that came late.
@@ -279,7 +280,7 @@ def osc_format(content: Content = Content()) -> MessageFormat:  # noqa: B008 (im
         for message in others or [first]:
             if message.size + _BUNDLE_ENTRY > room:
                 made.append(bundles.OscBundleBuilder(bundles.IMMEDIATELY))
-                room = LARGEST_DATAGRAM - _BUNDLE_HEAD
+                room = _LARGEST_BUNDLE - _BUNDLE_HEAD
                 if message is not first:
                     made[-1].add_content(first)
                     room -= first.size + _BUNDLE_ENTRY
@@ -301,6 +302,7 @@ def _osc_header(header: LiveHeader) -> Iterator[_Content]:
     yield _strings("/handsim/sides", header.sides)
     yield _strings("/handsim/angles", header.angles)
     yield _strings("/handsim/positions", header.positions)
+    yield _strings("/handsim/digits", header.digits)
     yield _strings("/handsim/bodies", [_part(name) for name in header.bodies])
 
 
@@ -314,9 +316,14 @@ def _osc_frame(message: LiveMessage, content: Content) -> Iterator[_Content]:
         address = f"/handsim/{hand.side}"
         yield _strings(f"{address}/status", [str(hand.status)])
         if hand.has_pose:
+            yield _floats(f"{address}/seen", np.array([hand.seen]))
+            yield _strings(f"{address}/digits", [str(status) for status in hand.digits])
             yield _floats(f"{address}/wrist", hand.position, hand.quaternion)
             yield _floats(f"{address}/angles", hand.angles)
             yield _floats(f"{address}/positions", hand.positions.ravel())
+        if not np.isnan(hand.angle_spread).any():
+            yield _floats(f"{address}/angle_spread", hand.angle_spread)
+            yield _floats(f"{address}/position_spread", hand.position_spread)
         if content.velocities and not np.isnan(hand.angle_velocities).any():
             yield _floats(f"{address}/angle_velocities", hand.angle_velocities)
             yield _floats(f"{address}/velocities", hand.find_velocities().ravel())
@@ -399,6 +406,11 @@ def channels_of(header: LiveHeader) -> Iterator[_Channel]:
     for body in header.bodies:
         yield from _pose_channels(f"{body}_status", body)
     yield ("lag", "seconds", "Lag")
+    for side in header.sides:
+        yield (f"{side}_seen", "", "Share")
+        yield from ((f"{side}_{digit}_status", "", "Status") for digit in header.digits)
+        yield from ((f"{side}_{joint}_spread", "radians", "Spread") for joint in header.angles)
+        yield from ((f"{side}_{place}_spread", "meters", "Spread") for place in header.positions)
 
 
 def _pose_channels(status: str, name: str) -> Iterator[_Channel]:
@@ -419,6 +431,9 @@ def sample_of(message: LiveMessage) -> np.ndarray:
     for body in message.bodies:
         parts += [[STATUSES.index(body.status)], body.position, body.quaternion]
     parts.append([message.lag])
+    for hand in message.hands:
+        parts += [[hand.seen if hand.has_pose else math.nan], [STATUSES.index(one) for one in hand.digits]]
+        parts += [hand.angle_spread, hand.position_spread]
     return np.concatenate(parts)
 
 

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from pythonosc.osc_bundle import OscBundle
 from scipy.spatial.transform import Rotation
 
 from gloves import load_layout
@@ -20,11 +21,11 @@ from gloves.fit import nominal_fit
 from handsim import HandModel, join_qpos
 from handsim.errors import ArgumentError
 from handsim.hand.model import hand_keypoints
-from handsim.hand.shape import BONE_NAMES, JOINT_NAMES
+from handsim.hand.shape import BONE_NAMES, DIGITS, JOINT_NAMES
 from handsim.motion_files.motion import OPENXR_JOINTS
 from handsim.space.transforms import rotation_quaternions
 from tests.sentences import error_names
-from track import StreamedFrame, TrackedFrame
+from track import Status, StreamedFrame, TrackedFrame, TrackedHand
 from track.output.live_message import (
     FORMATS,
     LARGEST_DATAGRAM,
@@ -35,7 +36,7 @@ from track.output.live_message import (
     header_document,
     in_axes,
 )
-from track.output.sinks import open_sink
+from track.output.sinks import channels_of, open_sink, osc_format, sample_of
 
 DECODE = {"json": json.loads, "msgpack": msgpack.unpackb}
 
@@ -74,7 +75,7 @@ def test_the_header_names_everything(name, message):
     document = DECODE[name](sent)
     assert (document["type"], document["schema"]) == ("header", 1)
     assert document["units"] == {"length": "m", "angle": "rad", "time": "s", "quaternion": "wxyz"}
-    for key in ("sides", "angles", "positions", "bodies", "markers"):
+    for key in ("sides", "angles", "positions", "digits", "bodies", "markers"):
         assert document[key] == list(getattr(header, key))
 
 
@@ -116,7 +117,7 @@ def test_parts_of_at_most_1400_bytes_hold_everything_between_them(name, lost, me
             if "hands" in expected:  # whoever needs poses alone needs no other part
                 poses = [hand for part in parts for hand in part.get("hands", []) if "wrist" in hand]
                 assert [set(hand) for hand in poses] == [
-                    {"side", "status", "wrist", "angles", "positions"}
+                    {"side", "status", "seen", "digits", "wrist", "angles", "positions"}
                 ] * 2
             whole = put_together(parts)
             assert whole == {key: value for key, value in expected.items() if value != []}
@@ -213,6 +214,34 @@ def test_joint_positions_are_those_of_the_pose(message):
             np.testing.assert_allclose(place[joint], bones[BONE_NAMES.index(bone), :3, 3], atol=1e-12)
         tip = np.linalg.inv(bones[BONE_NAMES.index("ring_distal")]) @ [*place["ring_tip"], 1.0]
         assert tip[0] > 0.015 and abs(tip[1:3]).max() < 1e-9, "ahead of its bone"
+
+
+def test_fingers_without_markers_are_told():
+    """Of the right hand only the palm and the index finger are seen."""
+    fits = [nominal_fit("dense19", "M", side) for side in ("right", "left")]
+    digits = fits[0].attachment.digits
+    filled = np.flatnonzero((digits != 1) & (digits >= 0))
+    qpos = join_qpos(np.zeros((1, 20)))[0]
+    markers = np.zeros((19, 3))
+    hands = [
+        TrackedHand("right", Status.TRACKED, qpos, 0.001, markers, filled),
+        TrackedHand("left", Status.INITIALIZED, qpos, 0.001, markers, filled[:0]),
+    ]
+    nobody = np.zeros(0, dtype=int)
+    frame = StreamedFrame(0, 0.0, np.zeros((0, 3)), nobody)
+    message = MessageEncoder(fits, []).encode(frame, TrackedFrame(0.0, tuple(hands), nobody, np.zeros(0)))
+    right, left = frame_document(message)["hands"]
+    assert right["digits"] == ["coasting", "tracked", "coasting", "coasting", "coasting"]
+    assert right["seen"] == pytest.approx(1.0 - len(filled) / 19, abs=1e-3)
+    assert (left["digits"], left["seen"]) == (["found"] * 5, 1.0)
+    packets = osc_format().frame(message)
+    got = {one.address: list(one.params) for one in OscBundle(packets[0])}
+    assert len(packets) == 1 and got["/handsim/right/digits"] == right["digits"]
+    assert got["/handsim/right/seen"] == [pytest.approx(right["seen"], abs=1e-3)]
+    channels = [label for label, _, _ in channels_of(message.header)]
+    sample = dict(zip(channels, sample_of(message), strict=True))
+    assert [sample[f"right_{digit}_status"] for digit in DIGITS] == [2.0, 0.0, 2.0, 2.0, 2.0]
+    assert sample["right_seen"] == pytest.approx(right["seen"], abs=1e-3)
 
 
 def test_a_lost_hand_has_no_numbers(message):
