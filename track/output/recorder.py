@@ -54,6 +54,7 @@ def take_of_rows(rows: Sequence[Mapping[str, NDArray[Any]]], tracker: Tracker, c
         hands=tracker.hands,
         bodies=tracker.bodies,
         settings=settings_of(tracker),
+        former=(),
         point_list=PointList(
             present.sum(axis=1), **entries, columns=np.nonzero(present)[1], num_columns=present.shape[1]
         ),
