@@ -105,8 +105,8 @@ def called() -> list[tuple[str, str]]:
     return [one for one, value in zip(names, values, strict=True) if value not in given]
 
 
-INNER = {"ArrivingFrames", "Part", "Site"}
-"""Types of what `open_source`, a rigid object and a glove are made of, which no user makes or reads."""
+INNER = {"ArrivingFrames", "FormerHands", "Part", "Site"}
+"""Types of what `open_source`, a take, a rigid object and a glove are made of, which no user makes."""
 
 
 @pytest.mark.parametrize(("package", "name"), exported())

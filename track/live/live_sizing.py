@@ -133,7 +133,7 @@ class LiveSizing(Closing):
         if self._measuring is not None and self._measuring.done():
             self._end_measuring(self._measuring, tracker)
         if self._measuring is None and self._shown >= self._due and not self._is_done:
-            self._begin_measuring(tracker.user)
+            self._begin_measuring(self._steps[-1] if self._steps else tracker.user)
         if not self._steps:
             return False
         user, self._is_easing = self._steps.popleft(), True

@@ -92,13 +92,15 @@ def find_faults(take: Take) -> tuple[SuspectSpan, ...]:
         first = span.start
         found += (
             one._replace(first=first + one.first, last=first + one.last, worst=first + one.worst)
-            for one in _faults_of_hands(take.cut(first, span.stop) if take.former else take)
+            for one in _faults_of_hands(
+                take.cut(first, span.stop) if take.former else take, is_last=span.stop == take.num_frames
+            )
         )
     return tuple(found)
 
 
-def _faults_of_hands(take: Take) -> tuple[SuspectSpan, ...]:
-    """The faults of a take in which hands are those of the last frame."""
+def _faults_of_hands(take: Take, *, is_last: bool) -> tuple[SuspectSpan, ...]:
+    """The faults of a take with the same hands in all frames; others follow unless it is the last."""
     found, last = list[SuspectSpan](), take.num_frames - 1
     hands = [
         SuspectSpan(one.first, last, one.first, f"the {one.side} hand", one.why, one.remedy, of_labels=False)
@@ -114,9 +116,9 @@ def _faults_of_hands(take: Take) -> tuple[SuspectSpan, ...]:
         enough = np.isfinite(seen[..., 0]).sum(axis=1) >= FEWEST_MARKERS
         offsets = take.marker_offsets(side, frames)
         hand = _Hand(take, side, take.hands[number], frames, offsets, some[enough], seen[enough])
-        # Hands that are not measured do not fit, which looks like a slip.
-        of_size = take.settings.get("size"), take.settings.get("user")
-        slips = () if of_size == ("auto", USUAL_SIZE) or take.settings.get("size_state") else (_slips,)
+        # Hands that are not measured, or of a user whom another follows, do not fit, which looks like a slip.
+        is_usual = (take.settings.get("size"), take.settings.get("user")) == ("auto", USUAL_SIZE)
+        slips = () if is_usual or not is_last or take.settings.get("size_state") else (_slips,)
         for faults in (_alternatives, *slips, _fallen, _at_limits):
             found += faults(hand)
     return (*hands, *tuple({one.of: one for one in reversed(found)}.values())[::-1])

@@ -275,3 +275,21 @@ def test_another_user_without_a_pause_is_noticed_before_the_last_measurement(mon
     monkeypatch.setattr(live_sizing, "_measure", measure)
     shown(sizing, tracker, 7.0, 3.0, rms=0.003)
     assert len(calls) == 1 and tracker.user[0].shape.length > 0.19
+
+
+def test_a_second_measurement_goes_on_from_the_first(monkeypatch):
+    """The first one has so little processor time that the second follows at once."""
+    setup = TrackerSetup.of(TrackSettings(hands="right"))
+    sizing, tracker, asked, pending = LiveSizing(setup), FakeTracker(setup.user), [], [Future(), Future()]
+    larger = TrackerSetup.of(TrackSettings(hands="right", size="XL")).user
+
+    def submit(self, function, settings, frames, before, **options):
+        asked.append(before)
+        return pending[len(asked) - 1]
+
+    monkeypatch.setattr(AtOnce, "submit", submit)
+    shown(sizing, tracker, 0.0, 12.0)
+    assert asked == [setup.user]
+    pending[0].set_result(live_sizing._Measured([dataclasses.replace(larger, notes="auto, measured")]))
+    shown(sizing, tracker, 12.0, 0.1)
+    assert len(asked) == 2 and asked[1].hands == larger.hands
