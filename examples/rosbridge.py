@@ -28,7 +28,6 @@ from websockets.sync.client import connect
 
 from gloves import Status, attach
 from handsim import HandModel, join_qpos
-from handsim.space.transforms import program_axes
 from track import LiveMessage, StreamedFrame, TrackedFrame, TrackedHand, open_sinks
 
 RETRY = 1.0  # [s] between two attempts to connect
@@ -38,10 +37,12 @@ Topic = tuple[str, str, dict[str, Any]]  # name, type and message
 class Rosbridge:
     """Publishes the newest frame when the server has taken the one before, and waits for the server."""
 
-    def __init__(self, host: str = "localhost", port: str = "9090", up: str = "z", forward: str = "x") -> None:
+    def __init__(
+        self, host: str = "localhost", port: str = "9090", up: str = "z", forward: str = "x"
+    ) -> None:
         self.url, self.published, self.dropped = f"ws://{host}:{port}", 0, 0
-        turn = program_axes("ros", "y" if up == "y" else "z", forward=forward).turn
-        self.upright = Rotation.from_matrix(turn)  # to x forward, y left, z up (REP 103)
+        ahead, above = axis(forward), axis(up)  # to x forward, y left, z up (REP 103)
+        self.upright = Rotation.from_matrix(np.stack([ahead, np.cross(above, ahead), above]))
         self.offset = math.nan  # [s] of ROS's time over the camera system's
         self.newest: LiveMessage | None = None
         self.changed, self.closed = threading.Condition(), False
@@ -116,6 +117,11 @@ class Rosbridge:
         ahead = time.time() - age - message.time - self.offset
         self.offset = self.offset + 0.001 * ahead if abs(ahead) < 0.5 else time.time() - age - message.time
         return message.time + self.offset
+
+
+def axis(name: str) -> np.ndarray:
+    """The direction of an axis, as x or -z."""
+    return (-1.0 if name.startswith("-") else 1.0) * np.eye(3)["xyz".index(name[-1])]
 
 
 def main() -> None:
