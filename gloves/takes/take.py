@@ -409,7 +409,7 @@ class Take:
     def worn(self) -> Iterator[tuple[slice, tuple[GloveFit, ...]]]:
         """The frames of each hands, in order."""
         first = 0
-        for stop, hands in (*((one.stop, one.hands) for one in self.former), (self.num_frames, self.hands)):
+        for stop, hands in (*(one[:2] for one in self.former), (self.num_frames, self.hands)):
             if stop > first:
                 yield slice(first, stop), hands
                 first = stop

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import metadata, util
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 from urllib.parse import parse_qsl, urlsplit
 
 from packaging.requirements import Requirement
@@ -114,19 +114,17 @@ def send_pointing_hand(address: str, ended: Callable[[], bool], tell: Callable[[
     from handsim.hand.shape import JOINT_NAMES
     from handsim.space.transforms import DIRECTIONS, UpAxis, program_axes, room_axes, rotation_quaternions
     from track.frames import StreamedFrame, TrackedFrame, TrackedHand
-    from track.output.live_message import WORLD, Content
+    from track.output.live_message import Content
     from track.output.sinks import open_sinks
 
     bent = [name.startswith(("middle", "ring", "little")) and "flexion" in name for name in JOINT_NAMES]
     with open_sinks(address) as sinks:
         asked = dict(parse_qsl(urlsplit(address).query))  # `open_sinks` has checked it
         up: UpAxis = "y" if asked.get("up") == "y" else "z"
-        forward = asked.get("forward", "x")
-        content = Content(
-            axes=asked.get("axes", WORLD), up=up, unit=asked.get("unit", "auto"), forward=forward
-        )
+        wanted: dict[str, Any] = {key: asked[key] for key in ("axes", "unit", "forward") if key in asked}
+        content = Content(up=up, **wanted)
         axes, hand = content.program or program_axes("ros", "z"), nominal_fit("dense19", "M", "right")
-        room = room_axes(up, forward)
+        room = room_axes(up, content.forward)
         sinks.start([hand], [])
         number = 0
         while not ended():

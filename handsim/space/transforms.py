@@ -66,7 +66,7 @@ class ProgramAxes(NamedTuple):
 
 @functools.cache
 def program_axes(name: str, up: UpAxis, unit: str = "auto", *, forward: str = "x") -> ProgramAxes:
-    """The axes of one of `PROGRAMS` in its own unit or another, from a world whose axes point up and forward."""
+    """The axes of one of `PROGRAMS` in its own unit or another, from a world with axes up and forward."""
     directions, mirror, own_unit = _PROGRAMS[name]
     room = dict(zip(DIRECTIONS, room_axes(up, forward), strict=True))
     turn = np.array([-room[_OPPOSITES[one]] if one in _OPPOSITES else room[one] for one in directions])
