@@ -25,6 +25,7 @@ from gloves.takes.points import PointList
 from gloves.takes.take import Take, label_names
 from handsim.callbacks import OnStep, Progress, no_progress, no_step
 from handsim.errors import CalibrationError, CaptureError, HandSimWarning, errors_of
+from handsim.files.inputs import checksum
 from handsim.hand.shape import NUM_QPOS, Side
 from track.alternatives.alternatives import doubts_of, judge_take, with_doubt
 from track.alternatives.hands import other_hands_of, with_other_hands
@@ -364,8 +365,10 @@ def _opened(
 
 
 def _named(capture: AnyCapture, source: Capture) -> dict[str, Any]:
-    """Entries of a take's settings: the name of the capture's file, and the reader's findings."""
-    name = {"capture": Path(capture).name} if isinstance(capture, str | Path) else {}
+    """Entries of a take's settings: name and checksum of the capture's file, and the reader's findings."""
+    name: dict[str, Any] = {}
+    if isinstance(capture, str | Path):
+        name = {"capture": Path(capture).name, "capture_sha256": checksum(Path(capture))}
     return {**name, **({"findings": dict(source.findings)} if source.findings else {})}
 
 

@@ -328,7 +328,11 @@ class Take:
         return KEYPOINT_NAMES
 
     def angles(
-        self, side: Side, *, convention: Convention = "model", neutral: tuple[float, float] | None = None
+        self,
+        side: Side,
+        *,
+        convention: Convention = "model",
+        neutral: tuple[float, float] | Take | None = None,
     ) -> dict[str, Float[np.ndarray, "T"]]:
         """The angles of a hand's joints over time [rad], by their names; NaN where it has no pose.
 
@@ -336,7 +340,8 @@ class Take:
             side: The hand.
             convention: `model` for the hinges of the model, `isb` for angles as the ISB writes them.
             neutral: The first and the last time [s] of a pose of which all angles are taken as zero, such as
-                the flat hand for a second; zero of the convention when not given.
+                the flat hand for a second, or the take of a trial that shows this pose; zero of the
+                convention when not given.
 
         Raises:
             ArgumentError: The hand or the convention is unknown, or no pose is between these times.
@@ -352,8 +357,11 @@ class Take:
             return _Angles(zip(ISB_NAMES, isb_angles(shape, angles, zero).T, strict=True))
         return _Angles(zip(JOINT_NAMES, (angles if zero is None else angles - zero).T, strict=True))
 
-    def mean_pose(self, side: Side, between: tuple[float, float]) -> Float[np.ndarray, "20"]:
-        """The mean joint angles of a hand between two times [rad]; warns if it moves there."""
+    def mean_pose(self, side: Side, between: tuple[float, float] | Take) -> Float[np.ndarray, "20"]:
+        """The mean joint angles of a hand between two times, or in another take [rad]; warns if it moves."""
+        if isinstance(between, Take):
+            start = float(np.nextafter(between.times[0], -np.inf))  # before the end also of one frame
+            return between.mean_pose(side, (start, float(between.times[-1])))
         first, last = between
         if not first < last:
             raise ArgumentError(f"neutral is {first:g} to {last:g} s, expected the earlier time first")
@@ -621,7 +629,7 @@ class Take:
         *,
         rate: float | None = None,
         up: UpAxis = "z",
-        neutral: tuple[float, float] | None = None,
+        neutral: tuple[float, float] | Take | None = None,
     ) -> None:
         """Write the motion for other programs, in a format by the ending of the file name.
 
@@ -630,8 +638,8 @@ class Take:
                 .trc (joint positions) or .mot (joint angles for OpenSim) file.
             rate: Frames per second of the file [Hz]; those of the take when not given.
             up: The axis of the take's world that points up.
-            neutral: The first and the last time [s] of a pose in which a table's angles of the ISB are zero;
-                see `angles`.
+            neutral: The first and the last time [s] of a pose in which a table's angles of the ISB are zero,
+                or the take of a trial that shows it; see `angles`.
 
         Raises:
             ArgumentError: The ending or the axis is unknown, no hand has a pose, or the rate is out of range.
@@ -684,7 +692,7 @@ def poses_for(form: MotionFormat, take: Take, rate: float | None) -> Take:
     return poses.poses_alone(poses.rate) if form.steady and not is_steady(poses.times, poses.rate) else poses
 
 
-def posed_motion(take: Take, neutral: tuple[float, float] | None = None) -> Motion:
+def posed_motion(take: Take, neutral: tuple[float, float] | Take | None = None) -> Motion:
     """The hands and bodies of a take as the writers of motion files need them; each has a pose somewhere."""
     zeros = [None if neutral is None else take.mean_pose(side, neutral) for side in take.sides]
     hands = [PosedHand.of(hand.model, take.qpos[:, n], zeros[n]) for n, hand in enumerate(take.hands)]

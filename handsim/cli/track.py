@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
 import warnings
 from collections import deque
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import tyro
 
 from handsim.app.messages import named_steps, print_line, progress_bar
 from handsim.cli.options import TrackerOptions, check_live, check_source, check_take_file
+from handsim.cli.study import Step, StudyFile, is_study, run_study, study_files
 from handsim.errors import ArgumentError, HandSimWarning
 from handsim.files.outputs import check_outputs, written_together
 
@@ -25,7 +27,7 @@ if TYPE_CHECKING:
 
 
 def track(
-    capture: Annotated[Path | None, tyro.conf.Positional] = None,
+    captures: Annotated[tuple[Path, ...], tyro.conf.Positional] = (),
     *,
     out: Path | None = None,
     live: str | None = None,
@@ -38,12 +40,14 @@ def track(
 ) -> None:
     """Track hands in a marker capture or a live stream; writes motion, labels and status.
 
-    Corrections that handsim view saved beside OUT are applied again.
+    Corrections that handsim view saved beside OUT are applied again. Of several captures one that cannot be
+    tracked is told, and the others are tracked; what OUT has of the same captures and options stays.
 
     Args:
-        capture: A .trc, .c3d, .csv (Motive, Vicon) or .tsv (Qualisys) file; its names are not
-            used.
-        out: The tracked take, a .npz file; with --live and --send nothing is recorded when not given.
+        captures: A .trc, .c3d, .csv (Motive, Vicon) or .tsv (Qualisys) file, whose names are not used;
+            several of them, folders, or the table of a study (.csv), see docs/how_to/study.md.
+        out: The tracked take, a .npz file; of several captures a folder of takes with the captures' names.
+            With --live and --send nothing is recorded when not given.
         live: A stream instead of a capture: natnet://host or natnet://host:port (OptiTrack), qtm://host
             (Qualisys), or module:name, a frame source of your own. Ctrl-C or the end of the terminal ends it.
             Frames are written as they come, to OUT.part until then.
@@ -65,8 +69,12 @@ def track(
     from track.output.sinks import open_sinks
     from track.settings import TrackerSetup
 
+    capture = captures[0] if captures else None
     check_source("capture", capture, live)
     check_live(live, seconds)
+    if captures and is_study(captures, out):
+        _track_study(captures, out, options, one_file=(labeled, *send), calibrate=calibrate, smooth=smooth)
+        return
     if calibrate and live is not None:
         raise ArgumentError(
             f"given --calibrate and --live {live}, expected a capture, which is tracked twice"
@@ -103,6 +111,32 @@ def track(
     if options.shape is not None and options.glove is None:
         print_line(f"{options.shape}: hands in the glove '{tracked.take.settings['glove']}'")
     _print_take(out, tracked.take, tracked, speed)
+
+
+def _track_study(
+    captures: tuple[Path, ...],
+    out: Path | None,
+    options: TrackerOptions,
+    one_file: tuple[object, ...],
+    **other: bool,
+) -> None:
+    """Track several captures, each with the options that a table has for it."""
+    from gloves.takes.corrections import corrections_path
+
+    if any(one_file):
+        raise ArgumentError("given --labeled or --send and several captures, expected one capture")
+
+    def plan(file: StudyFile) -> Step:
+        take = Path(out or "") / file.name.with_suffix(".npz")
+        own = file.options(glove=options.glove, shape=options.shape, hands=options.hands)
+        chosen = dataclasses.replace(options, **own)
+        inputs = *chosen.files(), corrections_path(take)
+        return Step((take,), inputs, {"options": chosen, **other})
+
+    def track_one(capture: Path, **given: Any) -> None:
+        track((capture,), **given)
+
+    run_study(study_files(captures, out, [".npz"]), Path(out or ""), track_one, plan, "tracked")
 
 
 def _track_file(

@@ -20,10 +20,12 @@ from jaxtyping import Bool, Float, Int
 from gloves.captures.capture import runs_of
 from gloves.takes.take import COASTING, INITIALIZED, LOST, STATUSES, Take
 from handsim.files.outputs import atomic_write, check_ending, written_together
+from handsim.hand.angles import Convention
 from handsim.hand.shape import DIGITS, JOINT_NAMES, JOINTS, Side
 from handsim.pages import NOTHING, Paint, Section, html_list, picture, write_sections
 from track.config import Size
 from track.kinematics.pose_spread import CHANGING, DETECTABLE, SOURCES, measurement_error
+from track.takes.methods import made_of, methods_paragraph
 from track.takes.take_faults import AT_LIMIT, SuspectSpan
 from track.takes.take_summary import find_suspect_spans, summarize, suspicions, vouch
 from track.user import MEASURED, hand_origin
@@ -33,7 +35,15 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_TABLES: Final = (".frames.csv", ".joints.csv", ".markers.csv", ".doubts.csv")
+_TABLES: Final = (".frames.csv", ".joints.csv", ".markers.csv", ".doubts.csv", ".angles.csv")
+_RECORD: Final = "made of"
+"""Last column of all tables: version, date and checksums of the take; in its first row, in a study in all."""
+_WORDS: Final = ("capture", "person", "session")
+"""Columns of words, which may look like numbers."""
+_ANGLES: Final = (*_WORDS, "side", "joint", "measure", "value [deg]", "SD", "SD constant", "MDD",
+                  "share measured", "convention", _RECORD)  # fmt: skip
+_CONSTANT: Final = [SOURCES.index("gluing"), SOURCES.index("person")]
+"""Sources of an error that is the same in all frames of a session."""
 _RANGE: Final = {"least": 0.0, "5th": 5.0, "median": 50.0, "95th": 95.0, "largest": 100.0}
 """Columns of a range of motion, and the percentile of each."""
 _CHUNK: Final = 4096  # frames per call of forward kinematics
@@ -52,11 +62,25 @@ _CALIBRATE: Final = (
 )
 
 
-def write_take_page(out: str | Path, take: Take, *, source: str = "take.npz") -> tuple[Path, ...]:
+@dataclass(frozen=True, slots=True, eq=False)
+class PageSettings:
+    """What a page and its tables are to show of a take."""
+
+    person: str = ""
+    session: str = ""
+    neutral: tuple[float, float] | Take | None = None
+    """The pose in which the angles of a study are zero, see `Take.angles`."""
+    decimal: str = "."
+    """The decimal mark of the tables; with a comma their cells are separated by semicolons."""
+
+
+def write_take_page(
+    out: str | Path, take: Take, *, source: str = "take.npz", settings: PageSettings = PageSettings()
+) -> tuple[Path, ...]:
     """Write the page on a take and its tables, all or none, as `handsim report` does.
 
     The page shows commands for the take's file `source`. Returns the paths of the page and of its tables:
-    frames, joints, markers and doubtful frames.
+    frames, joints, markers, doubtful frames, and angles as a study compares them.
     """
     out = Path(out)
     check_ending(out, ".html")
@@ -66,19 +90,48 @@ def write_take_page(out: str | Path, take: Take, *, source: str = "take.npz") ->
         _calibration_section(take),
         *(section for hand in hands for section in _hand_sections(take, hand)),
         _spans_section(take, spans, source),
+        *([_methods_section(take, spans, settings)] if take.made_by_tracker else []),
     ]
     tables = [rows(take, hands) for rows in (_frame_rows, _joint_rows, _marker_rows)]
-    tables.append(_span_rows(take, spans))
+    tables = [_with_record(rows, take) for rows in (*tables, _span_rows(take, spans))]
+    tables.append(_angle_rows(take, hands, source, settings))
     with written_together():
         write_sections(out, sections, title=f"Take {Path(source).name}", lead=_lead(take))
         for path, rows in zip(paths, tables, strict=True):
-            with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
-                csv.writer(file, lineterminator="\n").writerows(rows)
+            _write_table(path, rows, settings.decimal)
     return out, *paths
 
 
+def _with_record(rows: _Rows, take: Take) -> _Rows:
+    """A table with a last column that says in the first row what the take was made of."""
+    cells = [_RECORD, made_of(take.settings), *[""] * (len(rows) - 2)]
+    return [[*row, cell] for row, cell in zip(rows, cells, strict=False)]
+
+
+def _write_table(path: Path, rows: _Rows, decimal: str) -> None:
+    """Write a table with a decimal mark."""
+    header, *others = rows
+    if decimal == ",":
+        others = [
+            [cell if name in _WORDS else _with_comma(cell) for name, cell in zip(header, row, strict=True)]
+            for row in others
+        ]
+    with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
+        separator = ";" if decimal == "," else ","
+        csv.writer(file, delimiter=separator, lineterminator="\n").writerows([header, *others])
+
+
+def _with_comma(cell: object) -> object:
+    """A number with a decimal comma; other cells as they are."""
+    try:
+        float(str(cell))
+    except ValueError:
+        return cell
+    return str(cell).replace(".", ",")
+
+
 def table_paths(page: Path) -> tuple[Path, ...]:
-    """Paths of a page's tables: frames, ranges of motion, markers, doubtful frames."""
+    """Paths of a page's tables: frames, ranges of motion, markers, doubtful frames, angles of a study."""
     return tuple(page.with_suffix(ending) for ending in _TABLES)
 
 
@@ -465,6 +518,14 @@ def _spans_section(take: Take, spans: Sequence[SuspectSpan], source: str) -> Sec
     return Section("Doubtful frames", text, table=table, notes=[more] if len(spans) > _MOST_SPANS else [])
 
 
+def _methods_section(take: Take, spans: Sequence[SuspectSpan], settings: PageSettings) -> Section:
+    """The paragraph for a paper, and what the take was made of."""
+    has_neutral = settings.neutral is not None
+    text = methods_paragraph(take, vouch(take, spans).listed, has_neutral=has_neutral)
+    made = made_of(take.settings)
+    return Section("Methods", escape(text), notes=[f"Made of: {made}."] if made else [])
+
+
 _Rows = list[list[object]]
 
 
@@ -518,6 +579,38 @@ def _span_rows(take: Take, spans: Sequence[SuspectSpan]) -> _Rows:
     for span in spans:
         times = [_time(float(take.times[one])) for one in (span.first, span.last)]
         rows.append([span.first, span.last, *times, span.worst, span.of, span.why])
+    return rows
+
+
+def _angle_rows(take: Take, hands: Sequence[HandFigures], source: str, settings: PageSettings) -> _Rows:
+    """Rows of the angles of a study: by hand, convention, joint and measure, in measured frames.
+
+    SD, its constant part and MDD are those of a single angle, so that a range of motion has none.
+    """
+    rows: _Rows = [[*_ANGLES]]
+    first = [take.settings.get("capture", Path(source).name), settings.person, settings.session]
+    joints = {tuple(name.split("_")[:2]): number for number, name in enumerate(JOINT_NAMES)}
+    for hand in hands:
+        errors = _joint_errors(take.settings, hand)
+        constant = np.linalg.norm(errors[:, [1 + source for source in _CONSTANT]], axis=1)
+        known = dict(zip(JOINT_NAMES, np.c_[hand.joints()[:, -4], constant, errors[:, -2]], strict=True))
+        for convention in get_args(Convention) if hand.fitted.any() else ():
+            zero = "" if settings.neutral is None else ", zero in the neutral pose"
+            angles = take.angles(hand.side, convention=convention, neutral=settings.neutral)
+            for name, values in angles.items():
+                measured = hand.measured[:, joints[tuple(name.split("_")[:2])]]
+                degrees = np.rad2deg(values[measured]) if measured.any() else np.array([np.nan])
+                low, high = np.percentile(degrees, (5.0, 95.0))
+                error, none = known.get(name, np.full(3, np.nan)), np.full(3, np.nan)
+                last = _number(measured.mean()), f"{convention}{zero}", made_of(take.settings)
+                for measure, value, told in (
+                    ("mean", degrees.mean(), error),
+                    ("5th percentile", low, error),
+                    ("95th percentile", high, error),
+                    ("range of motion", high - low, none),
+                ):
+                    numbers = map(_number, (value, *told))
+                    rows.append([*first, hand.side, name, measure, *numbers, *last])
     return rows
 
 
