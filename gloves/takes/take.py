@@ -11,6 +11,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Final, NoReturn, Self, get_args
 
 import numpy as np
@@ -74,6 +75,8 @@ STATUSES: Final = tuple(map(str, Status))
 LOST, COASTING, INITIALIZED, TRACKED = Status
 RATED_FRAMES: Final = 100_000
 """Number of frames of a stream that its rate is measured on."""
+HARDLY_SEEN: Final = 0.05
+"""A marker that is seen in a smaller share of its hand's frames shows no joint."""
 _MAX_LENGTH: Final = 1e9  # [m]
 _MAX_TIME: Final = 1e12  # [s], and the largest rate [Hz]; clocks of computers count 2e9 s
 _QUATERNION_TOLERANCE: Final = 1e-2  # Quaternions have unit length within this; our own within 1e-6.
@@ -390,6 +393,17 @@ class Take:
         """Frames in which a hand's pose follows from the points; in the others it coasts or is lost."""
         return np.asarray(self.status[:, self.hand_index(side)] >= INITIALIZED)
 
+    def shown_joints(self, side: Side) -> Bool[np.ndarray, "20"]:
+        """Joints of a hand beyond which a marker was seen in some of its frames; others are guesses.
+
+        All joints of a take that no tracker made, or that never shows the hand, count as shown.
+        """
+        number, there = self.hand_index(side), np.flatnonzero(self.is_tracked(side))
+        if not self.made_by_tracker or not len(there) or not len(self.point_list.points):
+            return np.ones(NUM_JOINTS, dtype=np.bool_)
+        seen = np.isfinite(self.point_list.labeled(self.hand_labels[number], there)[..., 0])
+        return np.asarray(self.hands[number].attachment.beyond @ (seen.mean(axis=0) >= HARDLY_SEEN))
+
     @property
     def sides(self) -> tuple[Side, ...]:
         """Sides of the hands, in their order."""
@@ -630,6 +644,7 @@ class Take:
         rate: float | None = None,
         up: UpAxis = "z",
         neutral: tuple[float, float] | Take | None = None,
+        guesses: bool = False,
     ) -> None:
         """Write the motion for other programs, in a format by the ending of the file name.
 
@@ -640,6 +655,7 @@ class Take:
             up: The axis of the take's world that points up.
             neutral: The first and the last time [s] of a pose in which a table's angles of the ISB are zero,
                 or the take of a trial that shows it; see `angles`.
+            guesses: Whether a table also has joints that nothing shows, see `shown_joints`.
 
         Raises:
             ArgumentError: The ending or the axis is unknown, no hand has a pose, or the rate is out of range.
@@ -660,7 +676,8 @@ class Take:
                 f"neutral is {neutral} and the file {path}, expected .csv with the ISB's angles"
             )
         take = poses_for(form, self, None if rate is None else float(rate))
-        form.write(path, posed_motion(take, neutral), up)
+        shown = {} if guesses else {side: self.shown_joints(side) for side in take.sides}
+        form.write(path, posed_motion(take, neutral, shown), up)
 
     def save(self, path: str | Path) -> None:
         """Write the take as an .npz file, whole or not at all, which `load_take` reads.
@@ -692,10 +709,17 @@ def poses_for(form: MotionFormat, take: Take, rate: float | None) -> Take:
     return poses.poses_alone(poses.rate) if form.steady and not is_steady(poses.times, poses.rate) else poses
 
 
-def posed_motion(take: Take, neutral: tuple[float, float] | Take | None = None) -> Motion:
+def posed_motion(
+    take: Take,
+    neutral: tuple[float, float] | Take | None = None,
+    shown: Mapping[Side, Bool[np.ndarray, "20"]] = MappingProxyType({}),
+) -> Motion:
     """The hands and bodies of a take as the writers of motion files need them; each has a pose somewhere."""
     zeros = [None if neutral is None else take.mean_pose(side, neutral) for side in take.sides]
-    hands = [PosedHand.of(hand.model, take.qpos[:, n], zeros[n]) for n, hand in enumerate(take.hands)]
+    hands = [
+        PosedHand.of(hand.model, take.qpos[:, n], zeros[n], shown.get(hand.side))
+        for n, hand in enumerate(take.hands)
+    ]
     bodies = [PosedBody.of(one.name, one.shape, take.body_poses[:, n]) for n, one in enumerate(take.bodies)]
     return Motion(take.rate, take.times, hands, bodies)
 

@@ -21,6 +21,7 @@ def export(
     fps: float | None = None,
     up: UpAxis = "z",
     neutral: tuple[str, ...] | None = None,
+    guesses: bool = False,
 ) -> None:
     """Write the motion of a take, a user's hand, or a trained labeler, for other programs.
 
@@ -35,16 +36,17 @@ def export(
             .usda, .usdc and .csv have the take's axes.
         neutral: First and last time [s] at which the hands are flat, or in another pose in which the angles
             of the ISB in a .csv are to be zero; or the take (.npz) of a trial that shows this pose.
+        guesses: Whether a .csv has numbers, too, for joints beyond which no marker was seen.
     """
     from gloves.takes.archives import GROWING_SUFFIX
     from track.user import load_user
 
     if source.lower().endswith((".npz", f".npz{GROWING_SUFFIX}")):
-        _export_take(Path(source), out, fps, up, neutral)
+        _export_take(Path(source), out, fps, up, neutral, guesses)
         return
-    if fps is not None or up != "z" or neutral is not None:
+    if fps is not None or up != "z" or neutral is not None or guesses:
         given = f"--neutral {' '.join(neutral)}" if neutral else f"--up {up}"
-        given = f"--fps {fps:g}" if fps is not None else given
+        given = f"--fps {fps:g}" if fps is not None else "--guesses" if guesses else given
         raise ArgumentError(f"given {given} and {source}, expected a take with it, whose motion is written")
     if source.lower().endswith(".json"):
         check_outputs([source], [out])
@@ -56,7 +58,12 @@ def export(
 
 
 def _export_take(
-    source: Path, out: Path, fps: float | None, up: UpAxis, neutral: tuple[str, ...] | None
+    source: Path,
+    out: Path,
+    fps: float | None,
+    up: UpAxis,
+    neutral: tuple[str, ...] | None,
+    guesses: bool,
 ) -> None:
     from gloves.takes.motion_formats import motion_format
     from gloves.takes.take import load_take, poses_for
@@ -67,7 +74,7 @@ def _export_take(
     if not np.isfinite(take.qpos[..., 0]).any():
         raise CaptureError(f"{source}: there is no hand in any frame, expected one to export")
     motion = poses_for(form, take, fps)
-    motion.export(out, up=up, neutral=neutral_pose(neutral))
+    take.export(out, rate=fps, up=up, neutral=neutral_pose(neutral), guesses=guesses)
     sides = " and ".join(motion.sides)
     things = "".join(f", {body.name}" for body in motion.bodies)
     print_line(

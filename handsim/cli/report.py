@@ -18,6 +18,7 @@ def report(
     out: Path,
     neutral: tuple[str, ...] | None = None,
     decimal: Literal[".", ","] = ".",
+    guesses: bool = False,
 ) -> None:
     """Write a page on a take: joint angles, range of motion, gaps, residuals, doubtful frames.
 
@@ -33,18 +34,19 @@ def report(
         neutral: First and last time [s] of a pose in which the angles of .angles.csv are zero, or the take
             (.npz) of a trial that shows this pose, such as the flat hand before the session.
         decimal: A comma for tables as programs in much of Europe read them, with semicolons between cells.
+        guesses: Whether curves and .frames.csv have angles, too, of joints beyond which no marker was seen.
     """
     from track.takes.take_page import table_paths
 
     if not is_study(takes, out):
-        _report(takes[0], out, neutral=neutral, decimal=decimal)
+        _report(takes[0], out, neutral=neutral, decimal=decimal, guesses=guesses)
         return
 
     def plan(file: StudyFile) -> Step:
         page = out / file.name.with_suffix(".html")
         zero = (file.cells["neutral"],) if "neutral" in file.cells else neutral
         words = {name: file.cells.get(name, "") for name in ("person", "session")}
-        options = {**words, "neutral": zero, "decimal": decimal}
+        options = {**words, "neutral": zero, "decimal": decimal, "guesses": guesses}
         return Step((page, *table_paths(page)), zero or (), options)
 
     def join(steps: list[Step]) -> None:

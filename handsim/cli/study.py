@@ -225,10 +225,10 @@ def _table_files(table: Path) -> Iterator[StudyFile]:
                 raise ArgumentError("there is no capture, expected the name of its file")
             if "side" in cells:
                 check_choice(cells["side"], SIDES, noun="side")
-        name = Path(cells["capture"])
-        inside = not name.is_absolute() and ".." not in name.parts
+        own = Path(cells["capture"])
+        inside = not own.is_absolute() and ".." not in own.parts
         for column in _PATHS:
             beside = table.parent.resolve() / cells.get(column, "")
             if column in cells and (column != "glove" or beside.is_file()):  # or it is a shipped one
                 cells[column] = str(beside)
-        yield StudyFile(Path(cells.pop("capture")), name if inside else Path(name.name), cells)
+        yield StudyFile(Path(cells.pop("capture")), own if inside else Path(own.name), cells)

@@ -110,7 +110,7 @@ def track(
         return
     if options.shape is not None and options.glove is None:
         print_line(f"{options.shape}: hands in the glove '{tracked.take.settings['glove']}'")
-    _print_take(out, tracked.take, tracked, speed)
+    _print_take(out, tracked.take, tracked, speed, live=live is not None)
 
 
 def _track_study(
@@ -178,9 +178,8 @@ def _track_file(
     return LiveTake(take, take.num_frames, take.duration, (*notes, *sinks.notes()))
 
 
-def _print_take(out: Path, take: Take, tracked: LiveTake, speed: str) -> None:
-    """Print a summary of a take, and warn of signs of mistakes."""
-    from track.alternatives.hands import other_hands_of
+def _print_take(out: Path, take: Take, tracked: LiveTake, speed: str, *, live: bool) -> None:
+    """Print a summary of a take; of a stream, warn of signs of mistakes, too."""
     from track.takes.take_summary import summarize, suspicions
     from track.user import MEASURED
 
@@ -190,7 +189,5 @@ def _print_take(out: Path, take: Take, tracked: LiveTake, speed: str) -> None:
         lines = user.split("; ")
     lines.append(f"{out}: {tracked.num_frames} frames, {tracked.duration:.1f} s at {take.rate:.4g} Hz")
     print_line(*lines, *tracked.notes, *summarize(take), speed)
-    told = set(map(str, other_hands_of(take)))  # while it was tracked
-    for suspicion in suspicions(take):
-        if suspicion not in told:
-            warnings.warn(suspicion, HandSimWarning, stacklevel=3)
+    for suspicion in suspicions(take) if live else ():
+        warnings.warn(suspicion, HandSimWarning, stacklevel=3)

@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float, Int
 from gloves.captures.capture import runs_of
 from gloves.takes.take import COASTING, INITIALIZED, LOST, STATUSES, Take
 from handsim.files.outputs import atomic_write, check_ending, written_together
-from handsim.hand.angles import Convention
+from handsim.hand.angles import ISB_JOINTS, ISB_NAMES, Convention
 from handsim.hand.shape import DIGITS, JOINT_NAMES, JOINTS, Side
 from handsim.pages import NOTHING, Paint, Section, html_list, picture, write_sections
 from track.config import Size
@@ -72,6 +72,8 @@ class PageSettings:
     """The pose in which the angles of a study are zero, see `Take.angles`."""
     decimal: str = "."
     """The decimal mark of the tables; with a comma their cells are separated by semicolons."""
+    guesses: bool = False
+    """Whether curves and frames have angles of joints that nothing shows, see `Take.shown_joints`."""
 
 
 def write_take_page(
@@ -84,7 +86,8 @@ def write_take_page(
     """
     out = Path(out)
     check_ending(out, ".html")
-    hands, spans, paths = hand_figures(take), find_suspect_spans(take, most=None), table_paths(out)
+    hands, spans = hand_figures(take, guesses=settings.guesses), find_suspect_spans(take, most=None)
+    paths = table_paths(out)
     sections = [
         _summary_section(take),
         _calibration_section(take),
@@ -144,7 +147,7 @@ class HandFigures:
     status: Int[np.ndarray, "T"]
     """Indices into `STATUSES`."""
     angles: Float[np.ndarray, "T 20"]
-    """Joint angles in the order of `JOINT_NAMES` [deg]; NaN where the hand is lost."""
+    """Joint angles in the order of `JOINT_NAMES` [deg]; NaN where lost, or where nothing shows a joint."""
     angle_spread: Float[np.ndarray, "T 20"] | None
     """Standard deviation of each angle [deg]; None if the take has none."""
     residuals: Float[np.ndarray, "T M"]
@@ -152,7 +155,7 @@ class HandFigures:
     confidence: Float[np.ndarray, "T M"]
     """Confidence in each marker's label; NaN where the marker has no point."""
     beyond: Bool[np.ndarray, "20 M"]
-    """Which markers each joint moves."""
+    """Which markers each joint moves; none for a joint that nothing shows."""
 
     @property
     def seen(self) -> Bool[np.ndarray, "T M"]:
@@ -230,25 +233,27 @@ class MarkerFigures(NamedTuple):
     """Median confidence in its labels."""
 
 
-def hand_figures(take: Take) -> tuple[HandFigures, ...]:
-    """The figures of each hand of a simulated or tracked take."""
+def hand_figures(take: Take, *, guesses: bool = False) -> tuple[HandFigures, ...]:
+    """The figures of each hand of a simulated or tracked take; with guesses for joints that nothing shows."""
     found = []
     for number, (hand, labels) in enumerate(zip(take.hands, take.hand_labels, strict=True)):
         there = take.status[:, number] != LOST
-        angles = np.where(there[:, None], np.rad2deg(take.qpos[:, number, 7:]), np.nan)
+        shown = take.shown_joints(hand.side)
+        known = there[:, None] & (shown | guesses)
+        angles = np.where(known, np.rad2deg(take.qpos[:, number, 7:]), np.nan)
         confidence = np.full((take.num_frames, len(labels)), np.nan)
         points = take.point_list
         own = (points.labels >= labels.start) & (points.labels < labels.stop)
         confidence[points.frames[own], points.labels[own] - labels.start] = points.confidence[own]
         residuals = np.full((take.num_frames, len(labels)), np.nan)
-        observed, shown = take.observed(hand.side), np.flatnonzero(there)
-        for first in range(0, len(shown), _CHUNK):
-            part = shown[first : first + _CHUNK]
+        observed, posed = take.observed(hand.side), np.flatnonzero(there)
+        for first in range(0, len(posed), _CHUNK):
+            part = posed[first : first + _CHUNK]
             expected, _ = hand.markers(take.qpos[part, number])
             residuals[part] = np.linalg.norm(observed[part] - expected, axis=2)
         spread = None if take.angle_spread is None else np.rad2deg(take.angle_spread[:, number])
         status, names = take.status[:, number], hand.layout.names
-        beyond = hand.attachment.beyond
+        beyond = hand.attachment.beyond & shown[:, None]
         found.append(HandFigures(hand.side, names, status, angles, spread, residuals, confidence, beyond))
     return tuple(found)
 
@@ -589,7 +594,7 @@ def _angle_rows(take: Take, hands: Sequence[HandFigures], source: str, settings:
     """
     rows: _Rows = [[*_ANGLES]]
     first = [take.settings.get("capture", Path(source).name), settings.person, settings.session]
-    joints = {tuple(name.split("_")[:2]): number for number, name in enumerate(JOINT_NAMES)}
+    joints = dict(zip(ISB_NAMES, ISB_JOINTS, strict=True)) | {name: n for n, name in enumerate(JOINT_NAMES)}
     for hand in hands:
         errors = _joint_errors(take.settings, hand)
         constant = np.linalg.norm(errors[:, [1 + source for source in _CONSTANT]], axis=1)
@@ -598,7 +603,7 @@ def _angle_rows(take: Take, hands: Sequence[HandFigures], source: str, settings:
             zero = "" if settings.neutral is None else ", zero in the neutral pose"
             angles = take.angles(hand.side, convention=convention, neutral=settings.neutral)
             for name, values in angles.items():
-                measured = hand.measured[:, joints[tuple(name.split("_")[:2])]]
+                measured = hand.measured[:, joints[name]]
                 degrees = np.rad2deg(values[measured]) if measured.any() else np.array([np.nan])
                 low, high = np.percentile(degrees, (5.0, 95.0))
                 error, none = known.get(name, np.full(3, np.nan)), np.full(3, np.nan)
