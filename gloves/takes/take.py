@@ -716,10 +716,8 @@ def posed_motion(
 ) -> Motion:
     """The hands and bodies of a take as the writers of motion files need them; each has a pose somewhere."""
     zeros = [None if neutral is None else take.mean_pose(side, neutral) for side in take.sides]
-    hands = [
-        PosedHand.of(hand.model, take.qpos[:, n], zeros[n], shown.get(hand.side))
-        for n, hand in enumerate(take.hands)
-    ]
+    hands = [PosedHand.of(hand.model, take.qpos[:, n], zeros[n]) for n, hand in enumerate(take.hands)]
+    hands = [hand._replace(shown=shown.get(hand.side)) for hand in hands]
     bodies = [PosedBody.of(one.name, one.shape, take.body_poses[:, n]) for n, one in enumerate(take.bodies)]
     return Motion(take.rate, take.times, hands, bodies)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Final
 
 import numpy as np
 import tyro
@@ -65,10 +65,7 @@ def calibrate(
             own = {**file.options(glove=glove, hands=hands), "size": size, "labeler": labeler}
             return Step((out / file.name.with_suffix(".json"),), (own["glove"], labeler), own)
 
-        def calibrate_one(capture: Path, **given: Any) -> None:
-            calibrate((capture,), **given)
-
-        run_study(study_files(captures, out, [".json"]), out, calibrate_one, plan, "calibrated")
+        run_study(study_files(captures, out, [".json"]), out, calibrate, plan, "calibrated")
         return
     check_outputs((capture, glove, labeler), [out], ".json")
     if live is not None:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import tyro
@@ -42,7 +43,7 @@ def export(
     from track.user import load_user
 
     if source.lower().endswith((".npz", f".npz{GROWING_SUFFIX}")):
-        _export_take(Path(source), out, fps, up, neutral, guesses)
+        _export_take(Path(source), out, fps, neutral or (), up=up, guesses=guesses)
         return
     if fps is not None or up != "z" or neutral is not None or guesses:
         given = f"--neutral {' '.join(neutral)}" if neutral else f"--up {up}"
@@ -57,24 +58,17 @@ def export(
         _export_labeler(source, out)
 
 
-def _export_take(
-    source: Path,
-    out: Path,
-    fps: float | None,
-    up: UpAxis,
-    neutral: tuple[str, ...] | None,
-    guesses: bool,
-) -> None:
+def _export_take(source: Path, out: Path, fps: float | None, neutral: Sequence[str], **options: Any) -> None:
     from gloves.takes.motion_formats import motion_format
     from gloves.takes.take import load_take, poses_for
 
     form = motion_format(out)
-    check_outputs([source, *(neutral or ())], [out])
+    check_outputs([source, *neutral], [out])
     take = load_take(source)
     if not np.isfinite(take.qpos[..., 0]).any():
         raise CaptureError(f"{source}: there is no hand in any frame, expected one to export")
     motion = poses_for(form, take, fps)
-    take.export(out, rate=fps, up=up, neutral=neutral_pose(neutral), guesses=guesses)
+    take.export(out, rate=fps, neutral=neutral_pose(neutral), **options)
     sides = " and ".join(motion.sides)
     things = "".join(f", {body.name}" for body in motion.bodies)
     print_line(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import tyro
@@ -62,10 +62,8 @@ def label(
         own = file.options(glove=glove, hands=hands)
         return Step((out / name,), (own["glove"], labeler), {**own, "labeler": labeler})
 
-    def label_one(
-        capture: Path, out: Path, glove: str, hands: tuple[Side, ...] | None, labeler: object
-    ) -> None:
-        _label(load, capture, out, glove, hands)
+    def label_one(captures: tuple[Path, ...], labeler: object, **given: Any) -> None:
+        _label(load, captures[0], **given)
 
     run_study(study_files(captures, out, WRITABLE), out, label_one, plan, "labeled")
 

@@ -65,7 +65,7 @@ def neutral_pose(given: Sequence[str] | None) -> tuple[float, float] | Take | No
     """The value of --neutral: two times of the same take [s], or the take of another trial."""
     from gloves.takes.take import load_take
 
-    if given is None:
+    if not given:
         return None
     if len(given) == 1:
         return load_take(given[0])

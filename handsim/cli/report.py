@@ -39,7 +39,7 @@ def report(
     from track.takes.take_page import table_paths
 
     if not is_study(takes, out):
-        _report(takes[0], out, neutral=neutral, decimal=decimal, guesses=guesses)
+        _report(takes, out, neutral=neutral, decimal=decimal, guesses=guesses)
         return
 
     def plan(file: StudyFile) -> Step:
@@ -58,11 +58,12 @@ def report(
     run_study(study_files(takes, out, [".html"], [".npz"]), out, _report, plan, "reported", join)
 
 
-def _report(take: Path, out: Path, *, neutral: tuple[str, ...] | None, **settings: Any) -> None:
+def _report(takes: tuple[Path, ...], out: Path, *, neutral: tuple[str, ...] | None, **settings: Any) -> None:
     """Write the page on a take and its tables."""
     from gloves.takes.take import load_take
     from track.takes.take_page import PageSettings, table_paths, write_take_page
 
+    (take,) = takes
     check_outputs([take, *(neutral or ())], [out, *table_paths(out)])
     chosen = PageSettings(neutral=neutral_pose(neutral), **settings)
     page, frames, *tables = write_take_page(out, load_take(take), source=str(take), settings=chosen)

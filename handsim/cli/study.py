@@ -107,7 +107,7 @@ def run_study(
     Args:
         files: The files of the study.
         out: The folder of their outputs.
-        make: The command for one file, `make(source, out=..., **options)`.
+        make: The command for one file, `make((source,), out=..., **options)`.
         plan: The work on a file.
         done: The participle of the command, such as "tracked".
         last: Called with the steps whose outputs are there.
@@ -129,11 +129,11 @@ def run_study(
         if "neutral" in cells:
             cells["neutral"] = own.get(Path(cells["neutral"]).resolve(), cells["neutral"])
         key = _key(out, step)
-        entry = entries.pop(key, {})
+        old = entry = entries.pop(key, {})
         of = {"settings": json.loads(json.dumps(step.options, default=_plain)), "inputs": _checksums(read)}
         try:
             if {**entry, **of} != entry or entry["sums"] != _checksums(step.outputs):
-                make(file.source, out=step.outputs[0], **step.options)
+                make((file.source,), out=step.outputs[0], **step.options)
                 made += 1
                 names = [one.relative_to(out).as_posix() for one in step.outputs]
                 entry = {**of, **provenance(), "names": names, "sums": _checksums(step.outputs)}
@@ -142,8 +142,10 @@ def run_study(
         except HandSimError as error:
             bad.append(str(file.source))
             tell_state(f"{file.source}: not {done}: {str(error).removeprefix(f'{file.source}: ')}")
-        if there or (out / RECORD).is_file():
+        if entries.get(key, {}) != old:
             save_json(out / RECORD, record)
+    if there or (out / RECORD).is_file():
+        save_json(out / RECORD, record)
     last(there)
     print_line(f"{out}: {made} files {done} now, {len(there) - made} before")
     if bad:

@@ -6,7 +6,7 @@ import dataclasses
 import warnings
 from collections import deque
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import tyro
@@ -73,7 +73,9 @@ def track(
     check_source("capture", capture, live)
     check_live(live, seconds)
     if captures and is_study(captures, out):
-        _track_study(captures, out, options, one_file=(labeled, *send), calibrate=calibrate, smooth=smooth)
+        if labeled is not None or send:
+            raise ArgumentError("given --labeled or --send and several captures, expected one capture")
+        _track_study(captures, out, options, calibrate=calibrate, smooth=smooth)
         return
     if calibrate and live is not None:
         raise ArgumentError(
@@ -114,29 +116,18 @@ def track(
 
 
 def _track_study(
-    captures: tuple[Path, ...],
-    out: Path | None,
-    options: TrackerOptions,
-    one_file: tuple[object, ...],
-    **other: bool,
+    captures: tuple[Path, ...], out: Path | None, options: TrackerOptions, **other: bool
 ) -> None:
     """Track several captures, each with the options that a table has for it."""
     from gloves.takes.corrections import corrections_path
-
-    if any(one_file):
-        raise ArgumentError("given --labeled or --send and several captures, expected one capture")
 
     def plan(file: StudyFile) -> Step:
         take = Path(out or "") / file.name.with_suffix(".npz")
         own = file.options(glove=options.glove, shape=options.shape, hands=options.hands)
         chosen = dataclasses.replace(options, **own)
-        inputs = *chosen.files(), corrections_path(take)
-        return Step((take,), inputs, {"options": chosen, **other})
+        return Step((take,), (*chosen.files(), corrections_path(take)), {"options": chosen, **other})
 
-    def track_one(capture: Path, **given: Any) -> None:
-        track((capture,), **given)
-
-    run_study(study_files(captures, out, [".npz"]), Path(out or ""), track_one, plan, "tracked")
+    run_study(study_files(captures, out, [".npz"]), Path(out or ""), track, plan, "tracked")
 
 
 def _track_file(

@@ -118,15 +118,11 @@ class PosedHand(NamedTuple):
 
     @classmethod
     def of(
-        cls,
-        model: HandModel,
-        qpos: Float[np.ndarray, "T 27"],
-        neutral: Float[np.ndarray, "20"] | None = None,
-        shown: Bool[np.ndarray, "20"] | None = None,
+        cls, model: HandModel, qpos: Float[np.ndarray, "T 27"], neutral: Float[np.ndarray, "20"] | None = None
     ) -> PosedHand:
         """A hand with its poses, NaN where it has none."""
         present: NDArray[np.bool_] = np.isfinite(qpos[:, 0])
-        return cls(model, present, _held(qpos, present), neutral, shown)
+        return cls(model, present, _held(qpos, present), neutral)
 
 
 class PosedBody(NamedTuple):

@@ -42,6 +42,7 @@ _WORDS: Final = ("capture", "person", "session")
 """Columns of words, which may look like numbers."""
 _ANGLES: Final = (*_WORDS, "side", "joint", "measure", "value [deg]", "SD", "SD constant", "MDD",
                   "share measured", "convention", _RECORD)  # fmt: skip
+_MEASURES: Final = "mean", "5th percentile", "95th percentile", "range of motion"
 _CONSTANT: Final = [SOURCES.index("gluing"), SOURCES.index("person")]
 """Sources of an error that is the same in all frames of a session."""
 _RANGE: Final = {"least": 0.0, "5th": 5.0, "median": 50.0, "95th": 95.0, "largest": 100.0}
@@ -606,15 +607,10 @@ def _angle_rows(take: Take, hands: Sequence[HandFigures], source: str, settings:
                 measured = hand.measured[:, joints[name]]
                 degrees = np.rad2deg(values[measured]) if measured.any() else np.array([np.nan])
                 low, high = np.percentile(degrees, (5.0, 95.0))
-                error, none = known.get(name, np.full(3, np.nan)), np.full(3, np.nan)
                 last = _number(measured.mean()), f"{convention}{zero}", made_of(take.settings)
-                for measure, value, told in (
-                    ("mean", degrees.mean(), error),
-                    ("5th percentile", low, error),
-                    ("95th percentile", high, error),
-                    ("range of motion", high - low, none),
-                ):
-                    numbers = map(_number, (value, *told))
+                for measure, value in zip(_MEASURES, (degrees.mean(), low, high, high - low), strict=True):
+                    is_angle = name in known and measure != _MEASURES[-1]
+                    numbers = map(_number, (value, *(known[name] if is_angle else [np.nan] * 3)))
                     rows.append([*first, hand.side, name, measure, *numbers, *last])
     return rows
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from gloves import GloveFit, MarkerLayout, MarkerPlace, Take, load_layout
+from handsim import HandSimWarning
 from handsim.hand.shape import JOINT_NAMES, JOINTS, PALM
 from track import find_suspect_spans, track_capture
 from track.alternatives.alternatives import _mirror_orders
@@ -130,6 +131,12 @@ def test_a_marker_that_is_hardly_seen_is_named_and_shows_no_joint(truth, tracked
             *(f"index_tip_{axis}_m" for axis in "xyz"),
         }
         assert {name for name, cell in rows[9].items() if not cell} == (set() if guesses else hidden)
+
+
+def test_python_is_warned_of_faults(truth):
+    marker = truth.hands[0].layout.names.index("IndexTip")
+    with pytest.warns(HandSimWarning, match=f"{truth.sides[0]}:IndexTip is never seen; compare the layout"):
+        track_capture(without_marker(truth, marker, 0), hands=truth.hands, labeler="dense19", smooth=False)
 
 
 def test_a_short_gap_at_the_end_is_no_fault(tracked):
