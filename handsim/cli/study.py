@@ -133,6 +133,7 @@ def run_study(
         of = {"settings": json.loads(json.dumps(step.options, default=_plain)), "inputs": _checksums(read)}
         try:
             if {**entry, **of} != entry or entry["sums"] != _checksums(step.outputs):
+                tell_state(str(file.source))  # whose the next warnings are
                 make((file.source,), out=step.outputs[0], **step.options)
                 made += 1
                 names = [one.relative_to(out).as_posix() for one in step.outputs]
