@@ -23,7 +23,16 @@ from jaxtyping import Float
 from handsim._checks import check_choice, check_type
 from handsim.cards import card, map_drawing
 from handsim.errors import HandSimError, LayoutError, choices, errors_of
-from handsim.files.inputs import check_keys, number_of, quoted, read_toml, tables_of, text_of, written
+from handsim.files.inputs import (
+    check_keys,
+    checksum,
+    number_of,
+    quoted,
+    read_toml,
+    tables_of,
+    text_of,
+    written,
+)
 from handsim.files.outputs import write_text, writing
 from handsim.hand.shape import BONE_NAMES, BONES, PALM, SIDES, Side
 from handsim.settings import Expected
@@ -255,10 +264,8 @@ def load_layout(glove: MarkerLayout | str | Path) -> MarkerLayout:
     if isinstance(glove, MarkerLayout):
         return glove
     check_type("glove", glove, (str, Path), "a MarkerLayout, or the name or path of one", list_layouts())
-    path = Path(glove)
-    if str(glove) in list_layouts():
-        path = _SHIPPED / f"{glove}.toml"
-    elif path.suffix.lower() != ".toml":
+    path = _layout_path(glove)
+    if path.suffix.lower() != ".toml":
         beside = Path(f"{glove}.toml")
         if beside.is_file():
             raise LayoutError(f"unknown glove '{glove}'; give the name of its file, {beside}")
@@ -267,6 +274,17 @@ def load_layout(glove: MarkerLayout | str | Path) -> MarkerLayout:
     table = read_toml(path, error=LayoutError)
     with errors_of(path, LayoutError):
         return parse_layout(table)
+
+
+def _layout_path(glove: str | Path) -> Path:
+    """The file of a layout that is given by its shipped name or by its path."""
+    return _SHIPPED / f"{glove}.toml" if str(glove) in list_layouts() else Path(glove)
+
+
+def layout_checksum(glove: str | Path) -> str:
+    """SHA-256 of a layout's file by its shipped name or path; empty if there is none."""
+    path = _layout_path(glove)
+    return checksum(path) if path.is_file() else ""
 
 
 def shipped_layout(name: str) -> ShippedLayout:

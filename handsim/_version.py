@@ -5,6 +5,7 @@ A wheel and a source archive hold it as a file, which `handsim._building` writes
 
 from __future__ import annotations
 
+import datetime
 import functools
 import os
 import subprocess
@@ -20,6 +21,11 @@ def full_version() -> str:
     """The version that files, pages and `handsim --version` state, such as "0.2.0+12.g5e3e440.dirty"."""
     release: str = sys.modules["handsim"].__version__
     return describe(Path(__file__).parent, release)
+
+
+def provenance() -> dict[str, str]:
+    """The version and the date, as results record them."""
+    return {"handsim": full_version(), "date": datetime.date.today().isoformat()}
 
 
 def describe(package: Path, release: str) -> str:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -25,6 +25,7 @@ from gloves.takes.points import PointList
 from gloves.takes.take import Take, label_names
 from handsim.callbacks import OnStep, Progress, no_progress, no_step
 from handsim.errors import CalibrationError, CaptureError, HandSimWarning, errors_of
+from handsim.files.inputs import checksum
 from handsim.hand.shape import NUM_QPOS, Side
 from track.alternatives.alternatives import doubts_of, judge_take, with_doubt
 from track.alternatives.hands import other_hands_of, with_other_hands
@@ -41,7 +42,7 @@ from track.takes.corrected_take import correct_take
 from track.takes.label_confidence import label_confidence
 from track.takes.smoothed_take import smooth_take
 from track.takes.take_calibration import calibrate_take, kept_user, leaves_markers
-from track.takes.take_summary import misfits, no_points
+from track.takes.take_summary import misfits, no_points, suspicions
 from track.tracker import Tracker
 from track.user import AnyGlove, AnyLabeler, User, labeler_of, nominal_user
 
@@ -88,12 +89,11 @@ def label_capture(
     source, frames, setup = _opened(capture, LabelSettings.of(settings, options))
     labeled, setup, _ = _judged(lambda setup: _labeled_take(capture, source, frames, setup, progress), setup)
     labeled = _with_other_hands(labeled, setup)
+    told = [*map(str, other_hands_of(labeled)), *label_faults(labeled)]
     if (labeled.point_list.labels < 0).all():
         none = f"no hand found, expected hands in glove '{labeled.settings['glove']}' (--glove names another)"
-        none = none if len(labeled.point_list.points) else no_points(labeled)
-        warnings.warn(none, HandSimWarning, stacklevel=3)
-    for sentence in label_faults(labeled):
-        warnings.warn(sentence, HandSimWarning, stacklevel=3)
+        told.append(none if len(labeled.point_list.points) else no_points(labeled))
+    _warn(told)
     return labeled
 
 
@@ -170,12 +170,15 @@ def label_faults(take: Take) -> list[str]:
 
 
 def _with_other_hands(take: Take, setup: TrackerSetup) -> Take:
-    """The take with the alternatives to its hands, with a warning of each."""
+    """The take with the alternatives to its hands."""
     given = {} if setup.is_auto else {side: setup.user.origin(side) for side in setup.user.sides}
-    take = with_other_hands(take, given, setup.labeler)
-    for one in other_hands_of(take):
-        warnings.warn(str(one), HandSimWarning, stacklevel=4)
-    return take
+    return with_other_hands(take, given, setup.labeler)
+
+
+def _warn(sentences: Iterable[str]) -> None:
+    """Warn the caller of a public function of this module."""
+    for sentence in sentences:
+        warnings.warn(sentence, HandSimWarning, stacklevel=3)
 
 
 def track_capture(
@@ -211,6 +214,11 @@ def track_capture(
         UserError: A user's file cannot be read.
         LayoutError: The glove is unknown, or does not fit a hand.
         WeightsError: The labeler is unknown, or knows other markers.
+
+    Warns:
+        HandSimWarning: Signs that the glove, the hands or the file are not what they should be, as the page
+            on the take lists them: hands of another person or of two, markers that fell off, slipped or were
+            never seen, joints at their limits, frames that repeat.
     """
     chosen = TrackSettings.of(settings, options)
     source, frames, setup = _opened(capture, chosen, warns=True)
@@ -230,11 +238,13 @@ def track_capture(
     record = {**take.settings, **_named(capture, source), **setup.settings}
     take = dataclasses.replace(take, point_list=points, settings=record)
     if corrections is None:
-        return smooth_take(take) if chosen.smooth else take
-    corrected = correct_take(take, pins)
-    for sentence in unfitting_sentences(Path(corrections), corrected.unfitting):
-        warnings.warn(sentence, HandSimWarning, stacklevel=3)
-    return corrected.take
+        take = smooth_take(take) if chosen.smooth else take
+    else:
+        corrected = correct_take(take, pins)
+        take = corrected.take
+        _warn(unfitting_sentences(Path(corrections), corrected.unfitting))
+    _warn(suspicions(take))
+    return take
 
 
 def calibrate(
@@ -282,19 +292,16 @@ def calibrate(
     take, setup, _ = _judged(
         lambda now: tracked_take(source, frames, now.tracker(), progress=on_label), setup
     )
-    _with_other_hands(take, setup)
+    _warn(map(str, other_hands_of(_with_other_hands(take, setup))))
     done = calibrate_take(take, setup.start, setup.user, on_part)
     if leaves_markers(take, done):
         tracker = Tracker([one.hand for one in done], setup.labeler)
         take = tracked_take(source, frames, tracker, progress=on_label)
         done = calibrate_take(take, setup.start, setup.user, on_part)
-    for sentence in misfits(take, calibrates=True):
-        warnings.warn(sentence, HandSimWarning, stacklevel=3)
+    _warn(misfits(take, calibrates=True))
     name = _named(capture, source).get("capture", "a capture")
     found = kept_user(take, done, setup.user, f"from {name}", on_part)
-    for one in found.calibrations:
-        if not one.is_better:
-            warnings.warn(f"{one.hand.side} hand: {one}", HandSimWarning, stacklevel=3)
+    _warn(f"{one.hand.side} hand: {one}" for one in found.calibrations if not one.is_better)
     return found
 
 
@@ -364,8 +371,10 @@ def _opened(
 
 
 def _named(capture: AnyCapture, source: Capture) -> dict[str, Any]:
-    """Entries of a take's settings: the name of the capture's file, and the reader's findings."""
-    name = {"capture": Path(capture).name} if isinstance(capture, str | Path) else {}
+    """Entries of a take's settings: name and checksum of the capture's file, and the reader's findings."""
+    name: dict[str, Any] = {}
+    if isinstance(capture, str | Path):
+        name = {"capture": Path(capture).name, "capture_sha256": checksum(Path(capture))}
     return {**name, **({"findings": dict(source.findings)} if source.findings else {})}
 
 

@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Final, Self, get_args
 
 from gloves.fit import GloveFit, mean_hand
-from gloves.layout import list_layouts, load_layout
+from gloves.layout import layout_checksum, list_layouts, load_layout
 from handsim._checks import check_type, shown_value
+from handsim._version import provenance
 from handsim.errors import ArgumentError
 from handsim.hand.shape import SIDES, Side
 from handsim.settings import Expected, Settings
@@ -109,6 +110,9 @@ class TrackerSetup:
         labeler, record = labeler_of(glove, settings.labeler), settings.record()
         record |= {"glove": record["glove"] or user.layout.name, "user": user.notes or str(user)}
         record["hands"] = record["hands"] or list(user.sides)
+        named = record["glove"]  # that of hands or a layout given as objects may have no file
+        sums = {"user_sha256": user.checksum, "glove_sha256": layout_checksum(named)}
+        record |= provenance() | {key: value for key, value in sums.items() if value}
         return cls(user, is_auto, labeler, bodies, config, record)
 
     @property

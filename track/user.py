@@ -16,7 +16,7 @@ from gloves.hand_files import write_hand
 from gloves.layout import MarkerLayout, list_layouts, load_layout, stored_layout
 from handsim._checks import check_choice, check_type, shown_value
 from handsim.errors import DAMAGE, ArgumentError, FileError
-from handsim.files.inputs import read_bytes
+from handsim.files.inputs import checksum, read_bytes
 from handsim.files.outputs import write_text, writing
 from handsim.hand.model import HandModel
 from handsim.hand.shape import SIDES, HandShape, Side
@@ -58,6 +58,8 @@ class User(Sequence[GloveFit]):
     """Results of `calibrate` for each hand, with its fit to held-out frames; not stored in files."""
     errors: Mapping[Side, HandErrors] = field(default_factory=dict)
     """Errors that calibration left in each hand; standard deviations of its poses follow from them."""
+    checksum: str = ""
+    """SHA-256 of the file that it was read from; empty if there is none."""
 
     def __post_init__(self) -> None:
         expected = "a left hand, a right hand, or one of each in its glove"
@@ -231,7 +233,7 @@ def load_user(path: str | Path) -> User:
         layout = stored_layout(content["glove"])
         hands = tuple(_from_json(hand, layout) for hand in content["hands"])
         errors = read_errors(content.get("errors", {}), hands)
-        return User(hands, str(content.get("notes", "")), errors=errors)
+        return User(hands, str(content.get("notes", "")), errors=errors, checksum=checksum(path))
     except DAMAGE as error:
         raise UserError(f"{path}: a damaged user's file: {_reason(error)}") from error
 

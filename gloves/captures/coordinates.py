@@ -28,6 +28,7 @@ _STAND_INS: Final = "stand_ins"
 _DOUBLED: Final = "doubled"
 _HELD: Final = "held"
 _STRAIGHT: Final = "interpolated"
+_REPEATED: Final = "repeated_frames"
 _SENTENCES: Final = {
     OUTPUTS: "{} columns are outputs of models, such as angles and forces, and are left out",
     UNMARKED: "all points are marked as missing (residual -1), and the {} with coordinates are read",
@@ -39,6 +40,8 @@ _SENTENCES: Final = {
     _HELD: "{} points repeat their position while others move, as in gaps filled with the last one, and are "
     "read as missing",
     _STRAIGHT: "{} points move by equal steps, as in gaps that were interpolated, and are read as missing",
+    _REPEATED: "{} frames repeat the one before, as where frames were lost or the rate was raised; motion "
+    "jumps after them",
 }
 """The kinds of findings, the keys of `Capture.findings`, in the order in which they are told."""
 _MODELED: Final = re.compile(
@@ -78,6 +81,7 @@ def settled(capture: Capture) -> Capture:
             if filled.any():
                 positions = np.where(filled[..., None], np.nan, capture.positions)
                 capture = dataclasses.replace(capture, positions=positions)
+        counts[_REPEATED] = _repeated_frames(capture.positions)
     told = Counter(capture.findings) + Counter(counts)  # the sum drops counts of zero
     return dataclasses.replace(capture, findings=dict(told))
 
@@ -220,6 +224,14 @@ def _held(positions: Float[np.ndarray, "T N 3"]) -> Bool[np.ndarray, "T N"]:
         missing = np.cumsum(marks, axis=0)[:-1] > 0
         alive |= missing[1:].any(axis=1)  # if one point is held where nothing moves, all others are, too
     return missing
+
+
+def _repeated_frames(positions: Float[np.ndarray, "T N 3"]) -> int:
+    """Number of frames that repeat all points of the one before; 0 if nothing ever moves."""
+    before, after = positions[:-1], positions[1:]
+    there = np.isfinite(after).any(axis=(1, 2))
+    repeats = ((before == after) | (np.isnan(before) & np.isnan(after))).all(axis=(1, 2))
+    return int((repeats & there).sum()) if (there & ~repeats).any() else 0
 
 
 def _interpolated(positions: Float[np.ndarray, "T N 3"]) -> Bool[np.ndarray, "T N"]:

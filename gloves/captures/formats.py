@@ -675,15 +675,15 @@ def check_suffix(path: Path, valid: tuple[str, ...]) -> None:
         raise CaptureError(f"{path}: {choices(path.suffix, valid, noun='file type')}")
 
 
-def find_captures(paths: Sequence[Path]) -> list[Path]:
-    """The given capture files, and those in the given folders."""
+def find_captures(paths: Sequence[Path], endings: Sequence[str] = READABLE) -> list[Path]:
+    """The given capture files, and those in the given folders, whose names have one of the endings."""
     files = []
     for path in paths:
         inside = [path]
         if path.is_dir():
-            inside = sorted(file for file in path.rglob("[!.]*") if file.suffix.lower() in READABLE)
+            inside = sorted(file for file in path.rglob("[!.]*") if file.suffix.lower() in endings)
         if not inside:
-            raise CaptureError(f"{path} holds no capture; expected files {', '.join(READABLE)}")
+            raise CaptureError(f"{path} holds no capture; expected files {', '.join(endings)}")
         files += inside
     return files
 

@@ -11,6 +11,7 @@ import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Final, NoReturn, Self, get_args
 
 import numpy as np
@@ -73,6 +74,8 @@ STATUSES: Final = tuple(map(str, Status))
 LOST, COASTING, INITIALIZED, TRACKED = Status
 RATED_FRAMES: Final = 100_000
 """Number of frames of a stream that its rate is measured on."""
+HARDLY_SEEN: Final = 0.05
+"""A marker that is seen in a smaller share of its hand's frames shows no joint."""
 _MAX_LENGTH: Final = 1e9  # [m]
 _MAX_TIME: Final = 1e12  # [s], and the largest rate [Hz]; clocks of computers count 2e9 s
 _QUATERNION_TOLERANCE: Final = 1e-2  # Quaternions have unit length within this; our own within 1e-6.
@@ -331,7 +334,11 @@ class Take:
         return KEYPOINT_NAMES
 
     def angles(
-        self, side: Side, *, convention: Convention = "model", neutral: tuple[float, float] | None = None
+        self,
+        side: Side,
+        *,
+        convention: Convention = "model",
+        neutral: tuple[float, float] | Take | None = None,
     ) -> dict[str, Float[np.ndarray, "T"]]:
         """The angles of a hand's joints over time [rad], by their names; NaN where it has no pose.
 
@@ -339,7 +346,8 @@ class Take:
             side: The hand.
             convention: `model` for the hinges of the model, `isb` for angles as the ISB writes them.
             neutral: The first and the last time [s] of a pose of which all angles are taken as zero, such as
-                the flat hand for a second; zero of the convention when not given.
+                the flat hand for a second, or the take of a trial that shows this pose; zero of the
+                convention when not given.
 
         Raises:
             ArgumentError: The hand or the convention is unknown, or no pose is between these times.
@@ -356,8 +364,11 @@ class Take:
             return _Angles(zip(ISB_NAMES, np.concatenate(parts).T, strict=True))
         return _Angles(zip(JOINT_NAMES, (angles if zero is None else angles - zero).T, strict=True))
 
-    def mean_pose(self, side: Side, between: tuple[float, float]) -> Float[np.ndarray, "20"]:
-        """The mean joint angles of a hand between two times [rad]; warns if it moves there."""
+    def mean_pose(self, side: Side, between: tuple[float, float] | Take) -> Float[np.ndarray, "20"]:
+        """The mean joint angles of a hand between two times, or in another take [rad]; warns if it moves."""
+        if isinstance(between, Take):
+            start = float(np.nextafter(between.times[0], -np.inf))  # before the end also of one frame
+            return between.mean_pose(side, (start, float(between.times[-1])))
         first, last = between
         if not first < last:
             raise ArgumentError(f"neutral is {first:g} to {last:g} s, expected the earlier time first")
@@ -385,6 +396,17 @@ class Take:
     def is_tracked(self, side: Side) -> Bool[np.ndarray, "T"]:
         """Frames in which a hand's pose follows from the points; in the others it coasts or is lost."""
         return np.asarray(self.status[:, self.hand_index(side)] >= INITIALIZED)
+
+    def shown_joints(self, side: Side) -> Bool[np.ndarray, "20"]:
+        """Joints of a hand beyond which a marker was seen in some of its frames; others are guesses.
+
+        All joints of a take that no tracker made, or that never shows the hand, count as shown.
+        """
+        number, there = self.hand_index(side), np.flatnonzero(self.is_tracked(side))
+        if not self.made_by_tracker or not len(there) or not len(self.point_list.points):
+            return np.ones(NUM_JOINTS, dtype=np.bool_)
+        seen = np.isfinite(self.point_list.labeled(self.hand_labels[number], there)[..., 0])
+        return np.asarray(self.hands[number].attachment.beyond @ (seen.mean(axis=0) >= HARDLY_SEEN))
 
     @property
     def sides(self) -> tuple[Side, ...]:
@@ -662,7 +684,8 @@ class Take:
         *,
         rate: float | None = None,
         up: UpAxis = "z",
-        neutral: tuple[float, float] | None = None,
+        neutral: tuple[float, float] | Take | None = None,
+        guesses: bool = False,
     ) -> None:
         """Write the motion for other programs, in a format by the ending of the file name.
 
@@ -671,8 +694,9 @@ class Take:
                 .trc (joint positions) or .mot (joint angles for OpenSim) file.
             rate: Frames per second of the file [Hz]; those of the take when not given.
             up: The axis of the take's world that points up.
-            neutral: The first and the last time [s] of a pose in which a table's angles of the ISB are zero;
-                see `angles`.
+            neutral: The first and the last time [s] of a pose in which a table's angles of the ISB are zero,
+                or the take of a trial that shows it; see `angles`.
+            guesses: Whether a table also has joints that nothing shows, see `shown_joints`.
 
         Raises:
             ArgumentError: The ending or the axis is unknown, no hand has a pose, or the rate is out of range.
@@ -693,7 +717,8 @@ class Take:
                 f"neutral is {neutral} and the file {path}, expected .csv with the ISB's angles"
             )
         take = poses_for(form, self, None if rate is None else float(rate))
-        form.write(path, posed_motion(take, neutral), up)
+        shown = {} if guesses else {side: self.shown_joints(side) for side in take.sides}
+        form.write(path, posed_motion(take, neutral, shown), up)
 
     def save(self, path: str | Path) -> None:
         """Write the take as an .npz file, whole or not at all, which `load_take` reads.
@@ -727,13 +752,17 @@ def poses_for(form: MotionFormat, take: Take, rate: float | None) -> Take:
     return poses.poses_alone(poses.rate) if form.steady and not is_steady(poses.times, poses.rate) else poses
 
 
-def posed_motion(take: Take, neutral: tuple[float, float] | None = None) -> Motion:
+def posed_motion(
+    take: Take,
+    neutral: tuple[float, float] | Take | None = None,
+    shown: Mapping[Side, Bool[np.ndarray, "20"]] = MappingProxyType({}),
+) -> Motion:
     """The hands and bodies of a take as the writers of motion files need them; each has a pose somewhere."""
     zeros = [None if neutral is None else take.mean_pose(side, neutral) for side in take.sides]
     hands = [
         PosedHand.of(
             hand.model, take.qpos[:, n], zeros[n], [(one.stop, one.hands[n].model) for one in take.former]
-        )
+        )._replace(shown=shown.get(hand.side))
         for n, hand in enumerate(take.hands)
     ]
     bodies = [PosedBody.of(one.name, one.shape, take.body_poses[:, n]) for n, one in enumerate(take.bodies)]

@@ -11,6 +11,7 @@ import tyro
 from gloves.layout import load_layout
 from handsim.app.messages import named_steps, print_line, progress_bar
 from handsim.cli.options import TrackerOptions, check_live, check_source, check_take_file
+from handsim.cli.study import Step, StudyFile, is_study, run_study, study_files
 from handsim.files.outputs import check_outputs
 from handsim.hand.shape import Side
 from track.config import Size
@@ -22,7 +23,7 @@ _LONGEST: Final = 180.0  # longest recording of a stream by default [s]
 
 
 def calibrate(
-    capture: Annotated[Path | None, tyro.conf.Positional] = None,
+    captures: Annotated[tuple[Path, ...], tyro.conf.Positional] = (),
     *,
     out: Path,
     live: str | None = None,
@@ -38,8 +39,10 @@ def calibrate(
     rest; a hand that is no better there stays as it was.
 
     Args:
-        capture: A .trc, .c3d, .csv (Motive, Vicon) or .tsv (Qualisys) file; its names are not used.
-        out: The user's file, .json, for handsim track --shape.
+        captures: A .trc, .c3d, .csv (Motive, Vicon) or .tsv (Qualisys) file, whose names are not used;
+            several of them, folders, or the table of a study (.csv), see docs/how_to/study.md.
+        out: The user's file, .json, for handsim track --shape; of several captures a folder of such files
+            with the captures' names.
         live: A stream instead of a capture, as of handsim track. What is still to be moved is shown until
             every joint has covered its range; Ctrl-C ends it before. The recording stays beside OUT, as
             NAME.calibration.npz.
@@ -50,11 +53,20 @@ def calibrate(
         labeler: Folder of a trained labeler, an exported .onnx file, or module:name; the shipped one when
             not given.
     """
-    from track import captures
+    from track.captures import calibrate as fit_user
     from track.settings import CalibrateSettings
 
+    capture = captures[0] if captures else None
     check_source("capture", capture, live)
     check_live(live, seconds)
+    if captures and is_study(captures, out):
+
+        def plan(file: StudyFile) -> Step:
+            own = {**file.options(glove=glove, hands=hands), "size": size, "labeler": labeler}
+            return Step((out / file.name.with_suffix(".json"),), (own["glove"], labeler), own)
+
+        run_study(study_files(captures, out, [".json"]), out, calibrate, plan, "calibrated")
+        return
     check_outputs((capture, glove, labeler), [out], ".json")
     if live is not None:
         capture = out.with_suffix(".calibration.npz")
@@ -64,7 +76,7 @@ def calibrate(
     assert capture is not None  # `check_source` refused a call with neither source
     with progress_bar("") as bar:
         settings = CalibrateSettings(glove=glove, hands=hands, size=size, labeler=labeler)
-        user = captures.calibrate(capture, settings, progress=bar, on_step=bar.step)
+        user = fit_user(capture, settings, progress=bar, on_step=bar.step)
     user.save(out)
     sides = " and ".join(hand.side for hand in user)
     print_line(f"{out}: {sides} hand in glove {glove}")

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import tyro
 
 from handsim.app.messages import print_line
+from handsim.cli.options import neutral_pose
 from handsim.errors import ArgumentError, CaptureError
 from handsim.files.outputs import check_outputs
 from handsim.space.transforms import UpAxis
@@ -19,7 +21,8 @@ def export(
     out: Path,
     fps: float | None = None,
     up: UpAxis = "z",
-    neutral: tuple[float, float] | None = None,
+    neutral: tuple[str, ...] | None = None,
+    guesses: bool = False,
 ) -> None:
     """Write the motion of a take, a user's hand, or a trained labeler, for other programs.
 
@@ -33,17 +36,18 @@ def export(
         up: The axis of the take that points up; y for captures of Motive's default. Files have y up, but
             .usda, .usdc and .csv have the take's axes.
         neutral: First and last time [s] at which the hands are flat, or in another pose in which the angles
-            of the ISB in a .csv are to be zero.
+            of the ISB in a .csv are to be zero; or the take (.npz) of a trial that shows this pose.
+        guesses: Whether a .csv has numbers, too, for joints beyond which no marker was seen.
     """
     from gloves.takes.archives import GROWING_SUFFIX
     from track.user import load_user
 
     if source.lower().endswith((".npz", f".npz{GROWING_SUFFIX}")):
-        _export_take(Path(source), out, fps, up, neutral)
+        _export_take(Path(source), out, fps, neutral or (), up=up, guesses=guesses)
         return
-    if fps is not None or up != "z" or neutral is not None:
-        given = f"--neutral {neutral[0]:g} {neutral[1]:g}" if neutral else f"--up {up}"
-        given = f"--fps {fps:g}" if fps is not None else given
+    if fps is not None or up != "z" or neutral is not None or guesses:
+        given = f"--neutral {' '.join(neutral)}" if neutral else f"--up {up}"
+        given = f"--fps {fps:g}" if fps is not None else "--guesses" if guesses else given
         raise ArgumentError(f"given {given} and {source}, expected a take with it, whose motion is written")
     if source.lower().endswith(".json"):
         check_outputs([source], [out])
@@ -54,19 +58,17 @@ def export(
         _export_labeler(source, out)
 
 
-def _export_take(
-    source: Path, out: Path, fps: float | None, up: UpAxis, neutral: tuple[float, float] | None
-) -> None:
+def _export_take(source: Path, out: Path, fps: float | None, neutral: Sequence[str], **options: Any) -> None:
     from gloves.takes.motion_formats import motion_format
     from gloves.takes.take import load_take, poses_for
 
     form = motion_format(out)
-    check_outputs([source], [out])
+    check_outputs([source, *neutral], [out])
     take = load_take(source)
     if not np.isfinite(take.qpos[..., 0]).any():
         raise CaptureError(f"{source}: there is no hand in any frame, expected one to export")
     motion = poses_for(form, take, fps)
-    motion.export(out, up=up, neutral=neutral)
+    take.export(out, rate=fps, neutral=neutral_pose(neutral), **options)
     sides = " and ".join(motion.sides)
     things = "".join(f", {body.name}" for body in motion.bodies)
     print_line(

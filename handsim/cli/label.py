@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
+from collections.abc import Callable
+from functools import lru_cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import tyro
@@ -13,7 +14,7 @@ from jaxtyping import Bool
 from handsim.hand.shape import Side
 
 if TYPE_CHECKING:
-    from track.settings import LabelSettings
+    from train.labelers.protocol import Labeler
 
 
 def label(
@@ -27,10 +28,12 @@ def label(
     """Label the hands in every frame of captures: none, one or two; their columns' names are not used.
 
     Where a frame holds two hands, the columns are called right:ThumbTip and so on, as by handsim track. Of
-    several captures one that cannot be labeled is told, and the others are labeled.
+    several captures one that cannot be labeled is told, and the others are labeled; what OUT has of the same
+    captures and options stays.
 
     Args:
-        captures: .trc, .c3d, .csv (Motive, Vicon) or .tsv (Qualisys) files, or folders searched for them.
+        captures: .trc, .c3d, .csv (Motive, Vicon) or .tsv (Qualisys) files, folders searched for them, or the
+            table of a study (.csv), see docs/how_to/study.md.
         out: Labeled .trc, .c3d or Motive .csv file; points that are not markers become columns Unlabeled1,
             Unlabeled2, ... For several captures or a folder of them a folder, whose files have the captures'
             names; those of .tsv files end in .c3d.
@@ -40,63 +43,52 @@ def label(
             not given.
         threads: Threads of the labeler; more than one helps a large network on an idle machine.
     """
-    from handsim.app.messages import named_steps, tell_state
-    from handsim.errors import CaptureError, HandSimError
+    from gloves.captures.formats import WRITABLE, check_suffix
+    from handsim.cli.study import Step, StudyFile, is_study, run_study, study_files
     from handsim.files.outputs import check_outputs
-    from track.settings import LabelSettings, TrackerSetup
     from train.labelers.protocol import label_on
 
     label_on(threads)
-    files = _files(captures, out)  # checked before the work, not after it
-    check_outputs((*files, glove, labeler), list(files.values()))
-    settings = LabelSettings(glove, hands, labeler=labeler)
-    if len(files) > 1 and any(map(Path.exists, files)):
-        with named_steps(""):  # a glove may have to be learned, once for all captures
-            settings = dataclasses.replace(settings, labeler=TrackerSetup.of(settings).labeler)
-    failed = 0
-    for capture, labeled in files.items():
-        try:
-            _label(capture, labeled, settings)
-        except HandSimError as error:
-            if len(files) == 1:
-                raise
-            failed += 1
-            tell_state(f"{capture}: not labeled: {str(error).removeprefix(f'{capture}: ')}")
-    if failed:
-        raise CaptureError(f"{failed} of {len(files)} captures were not labeled")
-
-
-def _files(captures: tuple[Path, ...], out: Path) -> dict[Path, Path]:
-    """The labeled file of each capture."""
-    from gloves.captures.formats import WRITABLE, check_suffix, find_captures
-    from handsim.errors import ArgumentError
-
-    if len(captures) == 1 and not captures[0].is_dir() and not out.is_dir():
+    load = lru_cache(maxsize=1)(partial(_load_labeler, labeler=labeler))
+    if not is_study(captures, out):
         check_suffix(out, WRITABLE)
-        return {captures[0]: out}
-    if captures and out.suffix.lower() in WRITABLE and not out.is_dir():
-        raise ArgumentError(f"--out is {out} for several captures, expected a folder")
-    files = {}
-    for given in captures:
-        # a folder of captures may hold what an earlier run labeled
-        earlier = out.resolve() if given.resolve() in out.resolve().parents else None
-        for file in find_captures([given]):
-            if earlier not in file.resolve().parents:
-                name = file.relative_to(given) if given.is_dir() else Path(file.name)
-                files[file] = out / (name if name.suffix.lower() in WRITABLE else name.with_suffix(".c3d"))
-    if not files:
-        raise ArgumentError(f"no capture outside of {out} is given, expected files or folders")
-    return files
+        check_outputs((*captures, glove, labeler), [out])
+        _label(load, captures[0], out, glove, hands)
+        return
+
+    def plan(file: StudyFile) -> Step:
+        is_writable = file.name.suffix.lower() in WRITABLE
+        name = file.name if is_writable else file.name.with_suffix(".c3d")
+        own = file.options(glove=glove, hands=hands)
+        return Step((out / name,), (own["glove"], labeler), {**own, "labeler": labeler})
+
+    def label_one(captures: tuple[Path, ...], labeler: object, **given: Any) -> None:
+        _label(load, captures[0], **given)
+
+    run_study(study_files(captures, out, WRITABLE), out, label_one, plan, "labeled")
 
 
-def _label(capture: Path, out: Path, settings: LabelSettings) -> None:
+def _load_labeler(glove: str, labeler: str | None) -> Labeler:
+    """The labeler of a glove, which may have to be learned."""
+    from handsim.app.messages import named_steps
+    from track.settings import LabelSettings, TrackerSetup
+
+    with named_steps(""):
+        return TrackerSetup.of(LabelSettings(glove, labeler=labeler)).labeler
+
+
+def _label(
+    load: Callable[[str], Labeler], capture: Path, out: Path, glove: str, hands: tuple[Side, ...] | None
+) -> None:
     """Label a capture, and print a line on it."""
     from gloves.captures.formats import write_capture
     from handsim.app.messages import print_line, progress_bar
     from track.captures import label_capture
+    from track.frames import read_points
 
+    source = read_points(capture)  # before a glove is learned
     with progress_bar("frames") as bar:
-        take = label_capture(capture, settings, progress=bar)
+        take = label_capture(source, glove=glove, hands=hands, labeler=load(glove), progress=bar)
     points = take.point_list
     labeled = points.labels >= 0
     side_of = np.array([*(name.split(":")[0] for name in take.label_names), ""])  # -1 is the last one

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,10 +12,12 @@ import tyro
 
 from handsim._checks import check_number
 from handsim.errors import ArgumentError
+from handsim.files.inputs import words_numbers
 from handsim.hand.shape import Side
 from track.config import Size
 
 if TYPE_CHECKING:
+    from gloves.takes.take import Take
     from track.settings import AnyHands, TrackSettings
 
 
@@ -56,6 +59,20 @@ class TrackerOptions:
         return TrackSettings(
             self.glove, hands, size, self.labeler, bodies=self.body, calibrate=calibrate, smooth=smooth
         )
+
+
+def neutral_pose(given: Sequence[str] | None) -> tuple[float, float] | Take | None:
+    """The value of --neutral: two times of the same take [s], or the take of another trial."""
+    from gloves.takes.take import load_take
+
+    if not given:
+        return None
+    if len(given) == 1:
+        return load_take(given[0])
+    times = words_numbers(given)
+    if len(times) != 2:
+        raise ArgumentError(f"--neutral is {' '.join(given)}, expected two times [s] or a take (.npz)")
+    return times[0], times[1]
 
 
 def check_source(noun: str, file: object, live: str | None) -> None:

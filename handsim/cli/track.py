@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import warnings
 from collections import deque
 from pathlib import Path
@@ -12,6 +13,7 @@ import tyro
 
 from handsim.app.messages import named_steps, print_line, progress_bar
 from handsim.cli.options import TrackerOptions, check_live, check_source, check_take_file
+from handsim.cli.study import Step, StudyFile, is_study, run_study, study_files
 from handsim.errors import ArgumentError, HandSimWarning
 from handsim.files.outputs import check_outputs, written_together
 
@@ -25,7 +27,7 @@ if TYPE_CHECKING:
 
 
 def track(
-    capture: Annotated[Path | None, tyro.conf.Positional] = None,
+    captures: Annotated[tuple[Path, ...], tyro.conf.Positional] = (),
     *,
     out: Path | None = None,
     live: str | None = None,
@@ -38,12 +40,14 @@ def track(
 ) -> None:
     """Track hands in a marker capture or a live stream; writes motion, labels and status.
 
-    Corrections that handsim view saved beside OUT are applied again.
+    Corrections that handsim view saved beside OUT are applied again. Of several captures one that cannot be
+    tracked is told, and the others are tracked; what OUT has of the same captures and options stays.
 
     Args:
-        capture: A .trc, .c3d, .csv (Motive, Vicon) or .tsv (Qualisys) file; its names are not
-            used.
-        out: The tracked take, a .npz file; with --live and --send nothing is recorded when not given.
+        captures: A .trc, .c3d, .csv (Motive, Vicon) or .tsv (Qualisys) file, whose names are not used;
+            several of them, folders, or the table of a study (.csv), see docs/how_to/study.md.
+        out: The tracked take, a .npz file; of several captures a folder of takes with the captures' names.
+            With --live and --send nothing is recorded when not given.
         live: A stream instead of a capture: natnet://host or natnet://host:port (OptiTrack), qtm://host
             (Qualisys), or module:name, a frame source of your own. Ctrl-C or the end of the terminal ends it.
             Frames are written as they come, to OUT.part until then.
@@ -65,8 +69,14 @@ def track(
     from track.output.sinks import open_sinks
     from track.settings import TrackerSetup
 
+    capture = captures[0] if captures else None
     check_source("capture", capture, live)
     check_live(live, seconds)
+    if captures and is_study(captures, out):
+        if labeled is not None or send:
+            raise ArgumentError("given --labeled or --send and several captures, expected one capture")
+        _track_study(captures, out, options, calibrate=calibrate, smooth=smooth)
+        return
     if calibrate and live is not None:
         raise ArgumentError(
             f"given --calibrate and --live {live}, expected a capture, which is tracked twice"
@@ -102,7 +112,22 @@ def track(
         return
     if options.shape is not None and options.glove is None:
         print_line(f"{options.shape}: hands in the glove '{tracked.take.settings['glove']}'")
-    _print_take(out, tracked.take, tracked, speed)
+    _print_take(out, tracked.take, tracked, speed, live=live is not None)
+
+
+def _track_study(
+    captures: tuple[Path, ...], out: Path | None, options: TrackerOptions, **other: bool
+) -> None:
+    """Track several captures, each with the options that a table has for it."""
+    from gloves.takes.corrections import corrections_path
+
+    def plan(file: StudyFile) -> Step:
+        take = Path(out or "") / file.name.with_suffix(".npz")
+        own = file.options(glove=options.glove, shape=options.shape, hands=options.hands)
+        chosen = dataclasses.replace(options, **own)
+        return Step((take,), (*chosen.files(), corrections_path(take)), {"options": chosen, **other})
+
+    run_study(study_files(captures, out, [".npz"]), Path(out or ""), track, plan, "tracked")
 
 
 def _track_file(
@@ -144,9 +169,8 @@ def _track_file(
     return LiveTake(take, take.num_frames, take.duration, (*notes, *sinks.notes()))
 
 
-def _print_take(out: Path, take: Take, tracked: LiveTake, speed: str) -> None:
-    """Print a summary of a take, and warn of signs of mistakes."""
-    from track.alternatives.hands import other_hands_of
+def _print_take(out: Path, take: Take, tracked: LiveTake, speed: str, *, live: bool) -> None:
+    """Print a summary of a take; of a stream, warn of signs of mistakes, too."""
     from track.takes.take_summary import summarize, suspicions
     from track.user import MEASURED
 
@@ -156,7 +180,5 @@ def _print_take(out: Path, take: Take, tracked: LiveTake, speed: str) -> None:
         lines = user.split("; ")
     lines.append(f"{out}: {tracked.num_frames} frames, {tracked.duration:.1f} s at {take.rate:.4g} Hz")
     print_line(*lines, *tracked.notes, *summarize(take), speed)
-    told = set(map(str, other_hands_of(take)))  # while it was tracked
-    for suspicion in suspicions(take):
-        if suspicion not in told:
-            warnings.warn(suspicion, HandSimWarning, stacklevel=3)
+    for suspicion in suspicions(take) if live else ():
+        warnings.warn(suspicion, HandSimWarning, stacklevel=3)

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from handsim.hand.shape import DIGITS, HandShape
+from handsim.hand.shape import DIGITS, JOINT_NAMES, HandShape
 from handsim.space.transforms import axis_angle_matrix, euler_matrix
 
 Convention = Literal["model", "isb"]
@@ -28,6 +28,11 @@ _THUMB: Final = (
 )
 _FINGER: Final = ("MCP_flexion", "MCP_ulnar_deviation", "MCP_pronation", "PIP_flexion", "DIP_flexion")
 ISB_NAMES: Final = (*_THUMB, *(f"{digit}_{name}" for digit in DIGITS[1:] for name in _FINGER))
+ISB_JOINTS: Final = tuple(
+    next(number for number, joint in enumerate(JOINT_NAMES) if joint.split("_")[:2] == name.split("_")[:2])
+    for name in ISB_NAMES
+)
+"""Index of a hinge of the model that is of the same joint, for each of these angles."""
 _BONE_ISB: Final = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, 0.0, 0.0]])
 """The ISB's axes X, Y and Z as columns, in our frame of a bone."""
 

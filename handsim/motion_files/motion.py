@@ -31,7 +31,7 @@ from scipy import sparse
 from handsim.errors import CaptureError, choices
 from handsim.files.inputs import read_bytes
 from handsim.files.outputs import as_text, atomic_write
-from handsim.hand.angles import ISB_NAMES, isb_angles
+from handsim.hand.angles import ISB_JOINTS, ISB_NAMES, isb_angles
 from handsim.hand.model import KEYPOINT_NAMES, HandModel, hand_keypoints
 from handsim.hand.model_files import coordinate_names, coordinate_values
 from handsim.hand.shape import BONE_NAMES, BONES, DIGITS, JOINT_NAMES, PALM, SIDES, Side, bones_of
@@ -110,6 +110,8 @@ class PosedHand(NamedTuple):
     """Joint angles [rad] of the pose in which those of the ISB are zero; None for the convention's zero."""
     former: Sequence[tuple[int, HandModel]] = ()
     """Models of earlier frames, each with the first frame after them; `model` is that of the last frames."""
+    shown: Bool[np.ndarray, "20"] | None = None
+    """Which joints markers showed; tables leave out the others. None if all are known."""
 
     @property
     def side(self) -> Side:
@@ -318,6 +320,7 @@ def write_joint_csv(path: Path, motion: Motion, up: UpAxis = "z") -> None:
             for hand, table in zip(hands, tables, strict=True):
                 row = table[frame]
                 text = row_format % tuple(row.tolist()) if hand.present[frame] else "," * len(titles)
+                text = text if hand.shown is None else text.replace("nan", "")
                 file.write(f"{frame},{time:.16g},{hand.side}{text}\n")
 
 
@@ -328,12 +331,18 @@ def _titles(motion: Motion) -> tuple[str, ...]:
 
 
 def _numbers(hand: PosedHand) -> Float[np.ndarray, "T K"]:
-    """The columns of `_titles`; NaN in frames without a pose."""
+    """The columns of `_titles`; NaN in frames without a pose, and of joints that nothing shows."""
     qpos = hand.qpos
     keypoints = hand.keypoints()[:, 1:].reshape(len(qpos), -1)
     isb = hand.by_frame(lambda model, poses: isb_angles(model.shape, poses[:, 7:], hand.neutral))
     numbers = np.concatenate([qpos, keypoints, isb], axis=1)
     numbers[~hand.present] = np.nan
+    if hand.shown is not None:
+        hidden = ~hand.shown
+        moved = np.logical_or.accumulate(hidden.reshape(len(DIGITS), -1), axis=1)
+        moved[:, 0] = False  # a digit's first keypoint does not move
+        wrist, isb = np.zeros(qpos.shape[1] - len(hidden), dtype=np.bool_), hidden[list(ISB_JOINTS)]
+        numbers[:, np.concatenate([wrist, hidden, np.repeat(moved, 3), isb])] = np.nan
     return numbers
 
 

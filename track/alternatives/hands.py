@@ -93,14 +93,14 @@ def _seen(take: Take, side: Side, frames: Int[np.ndarray, "F"], most: int) -> Fl
 def _of_person(
     take: Take, side: Side, frames: Int[np.ndarray, "F"], origin: HandOrigin | None
 ) -> Iterator[OtherHands]:
-    """A given hand may be another person's; a measured one may be too long for any."""
+    """A hand may be too long for any person's, and a given one another person's."""
     worn = take.hands[take.hand_index(side)].with_side("right")
+    mean, spread = ADULT_LENGTH
+    odds = 0.5 * max(0.0, (worn.shape.length - mean) / spread) ** 2 - _WRONG_SCALE
+    why = f"is {1e3 * worn.shape.length:.0f} mm long, longer than people's"
+    remedy = "check the length of the calibration wand and the unit of the file, and scale its positions"
+    yield OtherHands(side, 0, why, remedy, _probability(odds))
     if origin is None:
-        mean, spread = ADULT_LENGTH
-        odds = 0.5 * max(0.0, (worn.shape.length - mean) / spread) ** 2 - _WRONG_SCALE
-        why = f"is {1e3 * worn.shape.length:.0f} mm long, longer than people's"
-        remedy = "check the length of the calibration wand and the unit of the file, and scale its positions"
-        yield OtherHands(side, 0, why, remedy, _probability(odds))
         return
     seen = _seen(take, side, frames, FRAMES)
     free = place_markers(seen, _mean(worn))

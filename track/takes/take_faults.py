@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from gloves.fit import GloveFit
-from gloves.takes.take import TRACKED, Take
+from gloves.takes.take import HARDLY_SEEN, TRACKED, Take
 from handsim.hand.shape import JOINTS, Side
 from track.alternatives.alternatives import doubts_of
 from track.alternatives.hands import other_hands_of
@@ -168,16 +168,17 @@ def _is_amid(times: Float[np.ndarray, "F"]) -> Bool[np.ndarray, "F"]:
 
 
 def _fallen(hand: _Hand) -> Iterator[SuspectSpan]:
-    """Markers that are not seen from some time on, although their hand is."""
+    """Markers that are hardly seen, or not from some time on, although their hand is."""
     take = hand.take
     seen = np.isfinite(take.observed(hand.side)[..., 0])
     shown = take.is_tracked(hand.side)
     gaps = [np.diff(np.flatnonzero(seen[:, marker])).max(initial=1) - 1 for marker in range(seen.shape[1])]
     for name, row, longest in zip(hand.worn.layout.names, seen.T, gaps, strict=True):
-        if not row.any():
+        share = row[shown].mean()
+        if share < HARDLY_SEEN:
             if shown.sum() >= _LAST_GAP * take.rate:
-                remedy = "compare the layout with the glove"
-                yield hand.span(0, name, "is never seen", remedy, of_labels=False)
+                why = f"is seen in {100 * share:.1f} % of the hand's frames" if row.any() else "is never seen"
+                yield hand.span(0, name, why, "compare the layout with the glove", of_labels=False)
             continue
         begin = take.num_frames - int(row[::-1].argmax())
         gap = float(shown[begin:].sum()) / take.rate

@@ -20,10 +20,12 @@ from jaxtyping import Bool, Float, Int
 from gloves.captures.capture import runs_of
 from gloves.takes.take import COASTING, INITIALIZED, LOST, STATUSES, Take
 from handsim.files.outputs import atomic_write, check_ending, written_together
+from handsim.hand.angles import ISB_JOINTS, ISB_NAMES, Convention
 from handsim.hand.shape import DIGITS, JOINT_NAMES, JOINTS, Side
 from handsim.pages import NOTHING, Paint, Section, html_list, picture, write_sections
 from track.config import Size
 from track.kinematics.pose_spread import CHANGING, DETECTABLE, SOURCES, measurement_error
+from track.takes.methods import made_of, methods_paragraph
 from track.takes.take_faults import AT_LIMIT, SuspectSpan
 from track.takes.take_summary import find_suspect_spans, summarize, suspicions, vouch
 from track.user import MEASURED, hand_origin
@@ -33,7 +35,16 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_TABLES: Final = (".frames.csv", ".joints.csv", ".markers.csv", ".doubts.csv")
+_TABLES: Final = (".frames.csv", ".joints.csv", ".markers.csv", ".doubts.csv", ".angles.csv")
+_RECORD: Final = "made of"
+"""Last column of all tables: version, date and checksums of the take; in its first row, in a study in all."""
+_WORDS: Final = ("capture", "person", "session")
+"""Columns of words, which may look like numbers."""
+_ANGLES: Final = (*_WORDS, "side", "joint", "measure", "value [deg]", "SD", "SD constant", "MDD",
+                  "share measured", "convention", _RECORD)  # fmt: skip
+_MEASURES: Final = "mean", "5th percentile", "95th percentile", "range of motion"
+_CONSTANT: Final = [SOURCES.index("gluing"), SOURCES.index("person")]
+"""Sources of an error that is the same in all frames of a session."""
 _RANGE: Final = {"least": 0.0, "5th": 5.0, "median": 50.0, "95th": 95.0, "largest": 100.0}
 """Columns of a range of motion, and the percentile of each."""
 _CHUNK: Final = 4096  # frames per call of forward kinematics
@@ -53,33 +64,79 @@ _CALIBRATE: Final = (
 )
 
 
-def write_take_page(out: str | Path, take: Take, *, source: str = "take.npz") -> tuple[Path, ...]:
+@dataclass(frozen=True, slots=True, eq=False)
+class PageSettings:
+    """What a page and its tables are to show of a take."""
+
+    person: str = ""
+    session: str = ""
+    neutral: tuple[float, float] | Take | None = None
+    """The pose in which the angles of a study are zero, see `Take.angles`."""
+    decimal: str = "."
+    """The decimal mark of the tables; with a comma their cells are separated by semicolons."""
+    guesses: bool = False
+    """Whether curves and frames have angles of joints that nothing shows, see `Take.shown_joints`."""
+
+
+def write_take_page(
+    out: str | Path, take: Take, *, source: str = "take.npz", settings: PageSettings = PageSettings()
+) -> tuple[Path, ...]:
     """Write the page on a take and its tables, all or none, as `handsim report` does.
 
     The page shows commands for the take's file `source`. Returns the paths of the page and of its tables:
-    frames, joints, markers and doubtful frames.
+    frames, joints, markers, doubtful frames, and angles as a study compares them.
     """
     out = Path(out)
     check_ending(out, ".html")
-    hands, spans, paths = hand_figures(take), find_suspect_spans(take, most=None), table_paths(out)
+    hands, spans = hand_figures(take, guesses=settings.guesses), find_suspect_spans(take, most=None)
+    paths = table_paths(out)
     sections = [
         _summary_section(take),
         _calibration_section(take),
         *(section for hand in hands for section in _hand_sections(take, hand)),
         _spans_section(take, spans, source),
+        *([_methods_section(take, spans, settings)] if take.made_by_tracker else []),
     ]
     tables = [rows(take, hands) for rows in (_frame_rows, _joint_rows, _marker_rows)]
-    tables.append(_span_rows(take, spans))
+    tables = [_with_record(rows, take) for rows in (*tables, _span_rows(take, spans))]
+    tables.append(_angle_rows(take, hands, source, settings))
     with written_together():
         write_sections(out, sections, title=f"Take {Path(source).name}", lead=_lead(take))
         for path, rows in zip(paths, tables, strict=True):
-            with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
-                csv.writer(file, lineterminator="\n").writerows(rows)
+            _write_table(path, rows, settings.decimal)
     return out, *paths
 
 
+def _with_record(rows: _Rows, take: Take) -> _Rows:
+    """A table with a last column that says in the first row what the take was made of."""
+    cells = [_RECORD, made_of(take.settings), *[""] * (len(rows) - 2)]
+    return [[*row, cell] for row, cell in zip(rows, cells, strict=False)]
+
+
+def _write_table(path: Path, rows: _Rows, decimal: str) -> None:
+    """Write a table with a decimal mark."""
+    header, *others = rows
+    if decimal == ",":
+        others = [
+            [cell if name in _WORDS else _with_comma(cell) for name, cell in zip(header, row, strict=True)]
+            for row in others
+        ]
+    with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
+        separator = ";" if decimal == "," else ","
+        csv.writer(file, delimiter=separator, lineterminator="\n").writerows([header, *others])
+
+
+def _with_comma(cell: object) -> object:
+    """A number with a decimal comma; other cells as they are."""
+    try:
+        float(str(cell))
+    except ValueError:
+        return cell
+    return str(cell).replace(".", ",")
+
+
 def table_paths(page: Path) -> tuple[Path, ...]:
-    """Paths of a page's tables: frames, ranges of motion, markers, doubtful frames."""
+    """Paths of a page's tables: frames, ranges of motion, markers, doubtful frames, angles of a study."""
     return tuple(page.with_suffix(ending) for ending in _TABLES)
 
 
@@ -92,7 +149,7 @@ class HandFigures:
     status: Int[np.ndarray, "T"]
     """Indices into `STATUSES`."""
     angles: Float[np.ndarray, "T 20"]
-    """Joint angles in the order of `JOINT_NAMES` [deg]; NaN where the hand is lost."""
+    """Joint angles in the order of `JOINT_NAMES` [deg]; NaN where lost, or where nothing shows a joint."""
     angle_spread: Float[np.ndarray, "T 20"] | None
     """Standard deviation of each angle [deg]; None if the take has none."""
     residuals: Float[np.ndarray, "T M"]
@@ -100,7 +157,7 @@ class HandFigures:
     confidence: Float[np.ndarray, "T M"]
     """Confidence in each marker's label; NaN where the marker has no point."""
     beyond: Bool[np.ndarray, "20 M"]
-    """Which markers each joint moves."""
+    """Which markers each joint moves; none for a joint that nothing shows."""
 
     @property
     def seen(self) -> Bool[np.ndarray, "T M"]:
@@ -178,12 +235,14 @@ class MarkerFigures(NamedTuple):
     """Median confidence in its labels."""
 
 
-def hand_figures(take: Take) -> tuple[HandFigures, ...]:
-    """The figures of each hand of a simulated or tracked take."""
+def hand_figures(take: Take, *, guesses: bool = False) -> tuple[HandFigures, ...]:
+    """The figures of each hand of a simulated or tracked take; with guesses for joints that nothing shows."""
     found = []
     for number, (hand, labels) in enumerate(zip(take.hands, take.hand_labels, strict=True)):
         there = take.status[:, number] != LOST
-        angles = np.where(there[:, None], np.rad2deg(take.qpos[:, number, 7:]), np.nan)
+        shown = take.shown_joints(hand.side)
+        known = there[:, None] & (shown | guesses)
+        angles = np.where(known, np.rad2deg(take.qpos[:, number, 7:]), np.nan)
         confidence = np.full((take.num_frames, len(labels)), np.nan)
         points = take.point_list
         own = (points.labels >= labels.start) & (points.labels < labels.stop)
@@ -191,14 +250,14 @@ def hand_figures(take: Take) -> tuple[HandFigures, ...]:
         residuals = np.full((take.num_frames, len(labels)), np.nan)
         observed = take.observed(hand.side)
         for span, worn in take.worn():
-            shown = span.start + np.flatnonzero(there[span])
-            for first in range(0, len(shown), _CHUNK):
-                part = shown[first : first + _CHUNK]
+            posed = span.start + np.flatnonzero(there[span])
+            for first in range(0, len(posed), _CHUNK):
+                part = posed[first : first + _CHUNK]
                 expected, _ = worn[number].markers(take.qpos[part, number])
                 residuals[part] = np.linalg.norm(observed[part] - expected, axis=2)
         spread = None if take.angle_spread is None else np.rad2deg(take.angle_spread[:, number])
         status, names = take.status[:, number], hand.layout.names
-        beyond = hand.attachment.beyond
+        beyond = hand.attachment.beyond & shown[:, None]
         found.append(HandFigures(hand.side, names, status, angles, spread, residuals, confidence, beyond))
     return tuple(found)
 
@@ -482,6 +541,14 @@ def _spans_section(take: Take, spans: Sequence[SuspectSpan], source: str) -> Sec
     return Section("Doubtful frames", text, table=table, notes=[more] if len(spans) > _MOST_SPANS else [])
 
 
+def _methods_section(take: Take, spans: Sequence[SuspectSpan], settings: PageSettings) -> Section:
+    """The paragraph for a paper, and what the take was made of."""
+    has_neutral = settings.neutral is not None
+    text = methods_paragraph(take, vouch(take, spans).listed, has_neutral=has_neutral)
+    made = made_of(take.settings)
+    return Section("Methods", escape(text), notes=[f"Made of: {made}."] if made else [])
+
+
 _Rows = list[list[object]]
 
 
@@ -535,6 +602,33 @@ def _span_rows(take: Take, spans: Sequence[SuspectSpan]) -> _Rows:
     for span in spans:
         times = [_time(float(take.times[one])) for one in (span.first, span.last)]
         rows.append([span.first, span.last, *times, span.worst, span.of, span.why])
+    return rows
+
+
+def _angle_rows(take: Take, hands: Sequence[HandFigures], source: str, settings: PageSettings) -> _Rows:
+    """Rows of the angles of a study: by hand, convention, joint and measure, in measured frames.
+
+    SD, its constant part and MDD are those of a single angle, so that a range of motion has none.
+    """
+    rows: _Rows = [[*_ANGLES]]
+    first = [take.settings.get("capture", Path(source).name), settings.person, settings.session]
+    joints = dict(zip(ISB_NAMES, ISB_JOINTS, strict=True)) | {name: n for n, name in enumerate(JOINT_NAMES)}
+    for hand in hands:
+        errors = _joint_errors(take.settings, hand)
+        constant = np.linalg.norm(errors[:, [1 + source for source in _CONSTANT]], axis=1)
+        known = dict(zip(JOINT_NAMES, np.c_[hand.joints()[:, -4], constant, errors[:, -2]], strict=True))
+        for convention in get_args(Convention) if hand.fitted.any() else ():
+            zero = "" if settings.neutral is None else ", zero in the neutral pose"
+            angles = take.angles(hand.side, convention=convention, neutral=settings.neutral)
+            for name, values in angles.items():
+                measured = hand.measured[:, joints[name]]
+                degrees = np.rad2deg(values[measured]) if measured.any() else np.array([np.nan])
+                low, high = np.percentile(degrees, (5.0, 95.0))
+                last = _number(measured.mean()), f"{convention}{zero}", made_of(take.settings)
+                for measure, value in zip(_MEASURES, (degrees.mean(), low, high, high - low), strict=True):
+                    is_angle = name in known and measure != _MEASURES[-1]
+                    numbers = map(_number, (value, *(known[name] if is_angle else [np.nan] * 3)))
+                    rows.append([*first, hand.side, name, measure, *numbers, *last])
     return rows
 
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from gloves.captures.capture import AT_ORIGIN, all_at_origin, runs_of, unit_fault
 from gloves.fit import Attachment
@@ -76,8 +76,8 @@ def summarize(take: Take) -> list[str]:
         else:
             line = f"{side} hand: not there"
         lines.append(line)
-        guesses = "; ".join(_guesses(take.hands[number].attachment))
-        if guesses and take.made_by_tracker:
+        guesses = "; ".join(_guesses(take.hands[number].attachment, take.shown_joints(side)))
+        if guesses:
             lines.append(f"{side} hand: {guesses}")
     for number, body in enumerate(take.bodies):
         status, rms = take.body_status[:, number], take.body_rms[:, number]
@@ -93,16 +93,19 @@ def summarize(take: Take) -> list[str]:
     return [*lines, line]
 
 
-def _guesses(worn: Attachment) -> Iterator[str]:
-    """One sentence for each digit that has joints without a marker beyond them."""
-    lacking = ~worn.beyond.any(axis=1).reshape(len(DIGITS), -1)
-    for number, (digit, lacks) in enumerate(zip(DIGITS, lacking, strict=True)):
-        owner = digit if digit == "thumb" else f"{digit} finger"
+def _guesses(worn: Attachment, shown: Bool[np.ndarray, "20"]) -> Iterator[str]:
+    """One sentence for each digit that has joints beyond which the glove has no marker, or none was seen."""
+    worn_beyond, lacking = (each.reshape(len(DIGITS), -1) for each in (worn.beyond.any(axis=1), ~shown))
+    for number, (digit, has, lacks) in enumerate(zip(DIGITS, worn_beyond, lacking, strict=True)):
+        owner, verb = (
+            digit if digit == "thumb" else f"{digit} finger",
+            "was seen" if has[lacks].any() else "is",
+        )
         if lacks.all():
-            yield f"no marker is on the {owner}: its angles are guesses"
+            yield f"no marker {verb} on the {owner}: its angles are guesses"
         elif lacks.any():
             joint = JOINT_NAMES[number * len(lacks) + int(lacks.argmax())].split("_")[1]
-            yield f"no marker is beyond the {joint} of the {owner}: its angles from there on are guesses"
+            yield f"no marker {verb} beyond the {joint} of the {owner}: its angles from there on are guesses"
 
 
 def no_points(take: Take) -> str:

@@ -36,10 +36,10 @@ def with_positions(capture: Capture, positions: np.ndarray) -> Capture:
     return dataclasses.replace(capture, positions=positions)
 
 
-def untouched(capture: Capture) -> None:
-    """Nothing is found in it, and nothing changed."""
+def untouched(capture: Capture, **findings: int) -> None:
+    """Nothing else is found in it, and nothing changed."""
     read = settled(capture)
-    assert not read.findings
+    assert read.findings == findings
     np.testing.assert_array_equal(read.positions, capture.positions)
 
 
@@ -113,7 +113,8 @@ def test_what_is_still_stays(moving):
     still = np.repeat(moving.positions[:1], FRAMES, axis=0)
     untouched(with_positions(moving, still))
     steps = moving.positions[np.arange(FRAMES) // 10]
-    untouched(with_positions(moving, steps))  # a simulated capture that shows each pose for a while
+    # a simulated capture that shows each pose for a while
+    untouched(with_positions(moving, steps), repeated_frames=FRAMES - FRAMES // 10)
     standing = moving.positions.copy()
     standing[:, 4:8] = standing[0, 4:8]  # a thing without noise
     untouched(with_positions(moving, standing))
@@ -123,7 +124,14 @@ def test_what_is_still_stays(moving):
     lifted[100:, 4:8] += (np.arange(FRAMES - 100) * 1e-3)[:, None, None]
     untouched(with_positions(moving, lifted))
     there_and_back = moving.positions[np.r_[:60, 59:-1:-1]]
-    untouched(with_positions(moving, there_and_back))  # with one frame twice
+    untouched(with_positions(moving, there_and_back), repeated_frames=1)
+    twice = moving.positions[np.arange(FRAMES) // 2]
+    twice[8:10] = np.nan  # without points
+    untouched(with_positions(moving, twice), repeated_frames=FRAMES // 2 - 1)
+    told = findings_sentence({"repeated_frames": 59})
+    assert told.startswith(
+        "59 frames repeat the one before, as where frames were lost or the rate was raised"
+    )
 
 
 @pytest.mark.parametrize("millimeters", [0.1, 0.25, 1.0])

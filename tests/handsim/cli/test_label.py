@@ -83,17 +83,18 @@ def test_a_folder_is_labeled_by_one_labeler_past_a_capture_that_cannot_be_read(
     for name in ("a.c3d", "b.trc", "day/a.c3d"):
         write_capture(captures / name, short)
     (captures / "b.trc").write_text("no marker file")
-    for _ in range(2):  # what is labeled already is no capture of the second time
+    for count in (2, 0):  # what is labeled already is neither a capture nor labeled the second time
         loaded.clear()
         assert main(["label", str(captures), "--out", str(out)]) == 1
         said = capsys.readouterr()
-        assert len([line for line in said.out.splitlines() if "two hands in 4 frames" in line]) == 2
+        assert len([line for line in said.out.splitlines() if "two hands in 4 frames" in line]) == count
         assert f"{captures / 'b.trc'}: not labeled: not a TRC file" in said.err
-        assert said.err.splitlines()[-1] == "handsim label: 1 of 3 captures were not labeled"
-        assert len({id(of[1]) for of in loaded if hasattr(of[1], "label_frames")}) == 1
-        assert len([of for of in loaded if of[1] is None]) == 1
+        last = said.err.splitlines()[-1]
+        assert last == f"handsim label: 1 of 3 files were not labeled: {captures / 'b.trc'}"
+        assert len({id(of[1]) for of in loaded if hasattr(of[1], "label_frames")}) == bool(count)
+        assert len([of for of in loaded if of[1] is None]) == bool(count)
     files = {path.relative_to(out).as_posix() for path in out.rglob("*.*")}
-    assert files == {"a.c3d", "day/a.c3d"}
+    assert files == {"a.c3d", "day/a.c3d", "study.json"}
     assert read_capture(out / "day" / "a.c3d").names[0] == f"right:{NAMES[0]}"
 
 

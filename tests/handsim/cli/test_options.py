@@ -50,8 +50,11 @@ SEARCHED = {
     "glove score": "labeler",
     "generate": "like",
     "simulate": "like",
+    "export": "guesses",
+    "report": "guesses",
 }
-"""Options that are not varied: those of a search may leave its outcome as it is, and it may take long."""
+"""Options that are not varied: those of a search may leave its outcome as it is, and it may take long;
+guesses are of takes without a marker (tests/track/takes/test_take_faults.py)."""
 SMALL = "--batch 32 --network.width 8 --network.gates 2 --network.depth 1"
 QUICK = [
     ("hand", "--out h.xml", "size XL|side left|glove dense19|actuators|shape user.json|take take.npz"),
@@ -60,7 +63,8 @@ QUICK = [
     ("glove learn", "labeled.trc --out g.toml --start dense19", "start sparse13|hands left"),
     ("rig import", "lab.xcp --out r.toml", "up y"),
     ("export", "take.npz --out x.bvh", "fps 30|up y"),
-    ("export", "take.npz --out x.csv", "neutral 0 0.1"),
+    ("export", "take.npz --out x.csv", "neutral 0 0.1|neutral take.npz"),
+    ("report", "take.npz --out p.html", "neutral 0 0.1|neutral take.npz|decimal ,"),
     ("evaluate", "labeled.trc --json f.json --occlude 4 --ghosts 2",
      "glove sparse13|labeler run|occlude 1|ghosts 0|every 7|seed 4"),
     ("evaluate", "labeled.trc --json f.json", "truth single.truth.npz"),

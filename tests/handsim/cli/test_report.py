@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import csv
+import hashlib
+from pathlib import Path
 
 import pytest
 
+import gloves
 from handsim.cli.main import main
 
 FRAMES = 60
+DENSE19 = Path(gloves.__file__).parent / "layouts" / "dense19.toml"
 
 
 @pytest.fixture(scope="module")
@@ -27,10 +31,16 @@ def test_a_page_and_its_tables_are_written(folder, tmp_path, capsys):
     said = capsys.readouterr().out
     assert said.startswith(f"{out}: page on {folder / name}; tables in ") and said.count("\n") == 1
     names = {path.name for path in out.parent.iterdir()}
-    assert names == {"page.html", "page.frames.csv", "page.joints.csv", "page.markers.csv", "page.doubts.csv"}
+    endings = ("html", "frames.csv", "joints.csv", "markers.csv", "doubts.csv", "angles.csv")
+    assert names == {f"page.{ending}" for ending in endings}
     assert all(one in said for one in names)
     with (out.parent / "page.frames.csv").open(newline="") as file:
         assert len(list(csv.DictReader(file))) == 2 * FRAMES
     page = out.read_text(encoding="utf-8")
     assert f"<h1>Take {name}</h1>" in page and "Right hand: joint angles" in page
     assert "mean hands of size M" in page
+    sums = [hashlib.sha256(path.read_bytes()).hexdigest() for path in (folder / "take.c3d", DENSE19)]
+    with (out.parent / "page.angles.csv").open(newline="") as file:
+        made = next(csv.DictReader(file))["made of"]
+    for text in (made, page):
+        assert f"capture take.c3d (SHA-256 {sums[0]}), glove dense19 (SHA-256 {sums[1]})" in text

@@ -87,6 +87,12 @@ def test_a_measured_hand_that_is_longer_than_peoples_is_told(length, is_told):
     ] * is_told
 
 
+def test_a_given_hand_that_is_longer_than_peoples_is_told():
+    hand = mean_hand(0.235, 0.44 * 0.235, load_layout("dense19"))
+    sentences = told(in_hand(person(100), hand), right="calibrated")
+    assert sentences[0].startswith("the right hand is 235 mm long, longer than people's")
+
+
 @pytest.mark.parametrize(("seed", "other"), [(100, 105), (101, 100), (105, 104)])
 def test_a_second_persons_hand_after_the_first_is_told(seed, other):
     take = after_another(person(seed), person(other), 30)

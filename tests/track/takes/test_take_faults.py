@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import dataclasses
 
 import numpy as np
@@ -10,12 +11,13 @@ import pytest
 from gloves import GloveFit, MarkerLayout, MarkerPlace, Take, load_layout
 from gloves.fit import nominal_fit
 from gloves.takes.worn import FormerHands
-from handsim.hand.shape import JOINTS, PALM
+from handsim import HandSimWarning
+from handsim.hand.shape import JOINT_NAMES, JOINTS, PALM
 from track import find_suspect_spans, track_capture
 from track.alternatives.alternatives import _mirror_orders
 from track.kinematics.pose_solver import FEWEST_MARKERS, PoseSolver
 from track.takes.take_faults import find_faults
-from track.takes.take_page import hand_figures
+from track.takes.take_page import PageSettings, hand_figures, write_take_page
 from track.takes.take_summary import summarize, suspicions, vouch
 from train import simulate_take
 
@@ -95,6 +97,48 @@ def test_labels_are_vouched_for_without_a_marker_that_is_never_seen(tracked):
     take = without_marker(tracked, 6, 0)
     assert [fault.why for fault in find_faults(take)] == ["is never seen"]
     assert vouch(take).listed < 0.1
+
+
+def test_a_marker_that_is_hardly_seen_is_named_and_shows_no_joint(truth, tracked, tmp_path):
+    marker = truth.hands[0].layout.names.index("IndexTip")
+    side, dip = truth.sides[0], JOINT_NAMES.index("index_DIP_flexion")
+    often, hardly = (without_marker(tracked, marker, FRAMES // part) for part in (10, 30))
+    assert not any("% of the hand's frames" in fault.why for fault in find_faults(often))
+    (fault,) = find_faults(hardly)
+    assert fault.words == f"{side}:IndexTip is seen in 3.3 % of the hand's frames" and not fault.of_labels
+    assert often.shown_joints(side).all() and np.flatnonzero(~hardly.shown_joints(side)).tolist() == [dip]
+    told = f"{side} hand: no marker was seen beyond the DIP of the index finger: its angles from there on are"
+    assert any(line.startswith(told) for line in summarize(hardly)) and not any(
+        told in s for s in summarize(often)
+    )
+    for guesses in (False, True):
+        page, *_, angles = write_take_page(
+            tmp_path / "page.html", hardly, settings=PageSettings(guesses=guesses)
+        )
+        with page.with_suffix(".frames.csv").open() as file:
+            rows = [row for row in csv.DictReader(file) if row["hand"] == side]
+        assert {bool(row["index_DIP_flexion_deg"]) for row in rows} == {guesses}
+        assert all(row["index_PIP_flexion_deg"] for row in rows)
+        with angles.open() as file:
+            mine = [
+                one for one in csv.DictReader(file) if (one["side"], one["joint"]) == (side, JOINT_NAMES[dip])
+            ]
+        assert {(one["value [deg]"], one["share measured"]) for one in mine} == {("", "0")}
+        hardly.export(tmp_path / "angles.csv", guesses=guesses)
+        with (tmp_path / "angles.csv").open() as file:
+            rows = [row for row in csv.DictReader(file) if row["hand"] == side]
+        hidden = {
+            "index_DIP_flexion_rad",
+            "index_DIP_flexion_isb_rad",
+            *(f"index_tip_{axis}_m" for axis in "xyz"),
+        }
+        assert {name for name, cell in rows[9].items() if not cell} == (set() if guesses else hidden)
+
+
+def test_python_is_warned_of_faults(truth):
+    marker = truth.hands[0].layout.names.index("IndexTip")
+    with pytest.warns(HandSimWarning, match=f"{truth.sides[0]}:IndexTip is never seen; compare the layout"):
+        track_capture(without_marker(truth, marker, 0), hands=truth.hands, labeler="dense19", smooth=False)
 
 
 def test_a_short_gap_at_the_end_is_no_fault(tracked):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import dataclasses
 
 import numpy as np
@@ -11,6 +12,7 @@ from gloves import Capture, MarkerLayout, Take, attach, load_layout, write_captu
 from gloves.takes.take import LOST
 from handsim import HandModel
 from handsim.cli.main import main
+from handsim.hand.shape import JOINT_NAMES
 from poses import sample_poses
 from track import find_suspect_spans, track_capture
 from track.takes.take_page import hand_figures, write_take_page
@@ -201,4 +203,10 @@ def test_joints_that_no_marker_can_show_are_guesses_and_never_measured(glove, tm
         assert unmeasured.tolist() == joints and np.isnan(figures.joints()[joints, :5]).all()
     write_take_page(tmp_path / "page.html", take)
     assert (tmp_path / "page.html").read_text().count(sentence) >= len(told)
+    take.export(tmp_path / "angles.csv")
+    for name, unit in (("page.frames.csv", "deg"), ("angles.csv", "rad")):
+        with (tmp_path / name).open() as file:
+            for row in csv.DictReader(file):
+                blank = [number for number, joint in enumerate(JOINT_NAMES) if not row[f"{joint}_{unit}"]]
+                assert blank == joints
     assert not any("guesses" in line for line in summarize(truth)), "its angles are known"

@@ -1,0 +1,237 @@
+"""Studies: a command over several files, folders of them or a table; what is done already is skipped.
+
+The folder of the outputs has a record, `study.json`: the settings of each output, and checksums of the files
+that it was made of. Dates of files count for nothing. What the table says of a person stays in the record for
+the next command of the study.
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import json
+import os
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+from gloves.captures.formats import READABLE, find_captures
+from handsim._checks import check_choice
+from handsim._version import provenance
+from handsim.app.messages import print_line, tell_state
+from handsim.errors import ArgumentError, CaptureError, HandSimError, errors_of
+from handsim.files.inputs import check_regular, checksum, load_json, read_bytes, text_encoding
+from handsim.files.outputs import check_outputs, save_json
+from handsim.hand.shape import SIDES
+
+RECORD: Final = "study.json"
+COLUMNS: Final = ("capture", "person", "session", "side", "glove", "neutral", "shape")
+"""Columns of a study's table; all but the first may be missing or blank."""
+_PATHS: Final = ("capture", "glove", "neutral", "shape")
+_TABLES: Final = (".csv", ".tsv")
+_LONGEST_HEADER: Final = 4096  # bytes
+_MOST_TABLE: Final = 1 << 24  # bytes
+
+
+@dataclass(frozen=True, slots=True)
+class StudyFile:
+    """A capture or take of a study."""
+
+    source: Path
+    name: Path
+    """The name of its outputs in their folder, but for the ending."""
+    cells: Mapping[str, str]
+    """What the table says of it by `COLUMNS`, without blank cells; paths are absolute."""
+
+    def options(self, **given: Any) -> dict[str, Any]:
+        """Options of a command (`glove`, `hands`, `shape`); those of the table replace the given ones."""
+        own: dict[str, Any] = dict(self.cells)
+        if "side" in own:
+            own["hands"] = (own["side"],)
+        if "shape" in own:
+            own["shape"] = Path(own["shape"])
+        return {name: own.get(name, value) for name, value in given.items()}
+
+
+class Step(NamedTuple):
+    """The work on one file of a study."""
+
+    outputs: tuple[Path, ...]
+    inputs: tuple[object, ...]
+    """Files that it reads beside its source; what is no file counts for nothing."""
+    options: dict[str, Any]
+    """Keyword arguments of the command beside `out`, the first output."""
+
+
+def is_study(sources: Sequence[Path], out: Path | None) -> bool:
+    """Whether a command has not one file to read and one to write."""
+    folder = out is not None and out.is_dir()
+    return len(sources) != 1 or folder or sources[0].is_dir() or _is_table(sources[0])
+
+
+def study_files(
+    sources: Sequence[Path], out: Path | None, written: Sequence[str], endings: Sequence[str] = READABLE
+) -> list[StudyFile]:
+    """The files of a study, whose outputs have the endings `written`, from files, folders and tables."""
+    if out is None or (sources and out.suffix.lower() in written and not out.is_dir()):
+        raise ArgumentError(f"--out is {out} for several captures, expected a folder")
+    files = list[StudyFile]()
+    for given in sources:
+        if given.is_dir():
+            # A folder may hold what an earlier command wrote.
+            earlier = out.resolve() if given.resolve() in out.resolve().parents else None
+            found = [*_recorded_files(given, endings)] or [
+                StudyFile(file, file.relative_to(given), {}) for file in find_captures([given], endings)
+            ]
+            files += [file for file in found if earlier not in file.source.resolve().parents]
+        else:
+            files += _table_files(given) if _is_table(given) else [StudyFile(given, Path(given.name), {})]
+    if not files:
+        raise ArgumentError(f"no capture outside of {out} is given, expected files or folders")
+    counts = Counter(file.name for file in files)
+    return [_named_by_side(file) if counts[file.name] > 1 else file for file in files]
+
+
+def run_study(
+    files: Sequence[StudyFile],
+    out: Path,
+    make: Callable[..., object],
+    plan: Callable[[StudyFile], Step],
+    done: str,
+    last: Callable[[list[Step]], object] = len,
+) -> None:
+    """Make the outputs of each file that are not there with the same inputs and settings.
+
+    Args:
+        files: The files of the study.
+        out: The folder of their outputs.
+        make: The command for one file, `make((source,), out=..., **options)`.
+        plan: The work on a file.
+        done: The participle of the command, such as "tracked".
+        last: Called with the steps whose outputs are there.
+
+    Raises:
+        CaptureError: Files were not read or used; the message names them, and the others are done.
+    """
+    steps = [plan(file) for file in files]
+    inputs = [[file.source, *step.inputs] for file, step in zip(files, steps, strict=True)]
+    outputs = [out / RECORD, *(one for step in steps for one in step.outputs)]
+    check_outputs([one for read in inputs for one in read], outputs)
+    record = load_json(out / RECORD) if (out / RECORD).is_file() else {"outputs": {}}
+    entries: dict[str, Any] = record["outputs"]
+    own = {file.source.resolve(): _key(out, step) for file, step in zip(files, steps, strict=True)}
+    record["study"] = [_key(out, step) for step in steps]
+    there, bad, made = list[Step](), list[str](), 0
+    for file, step, read in zip(files, steps, inputs, strict=True):
+        cells = {**file.cells}
+        if "neutral" in cells:
+            cells["neutral"] = own.get(Path(cells["neutral"]).resolve(), cells["neutral"])
+        key = _key(out, step)
+        old = entry = entries.pop(key, {})
+        of = {"settings": json.loads(json.dumps(step.options, default=_plain)), "inputs": _checksums(read)}
+        try:
+            if {**entry, **of} != entry or entry["sums"] != _checksums(step.outputs):
+                tell_state(str(file.source))  # whose the next warnings are
+                make((file.source,), out=step.outputs[0], **step.options)
+                made += 1
+                names = [one.relative_to(out).as_posix() for one in step.outputs]
+                entry = {**of, **provenance(), "names": names, "sums": _checksums(step.outputs)}
+            entries[key] = {**entry, "cells": cells}
+            there.append(step)
+        except HandSimError as error:
+            bad.append(str(file.source))
+            tell_state(f"{file.source}: not {done}: {str(error).removeprefix(f'{file.source}: ')}")
+        if entries.get(key, {}) != old:
+            save_json(out / RECORD, record)
+    if there or (out / RECORD).is_file():
+        save_json(out / RECORD, record)
+    last(there)
+    print_line(f"{out}: {made} files {done} now, {len(there) - made} before")
+    if bad:
+        raise CaptureError(f"{len(bad)} of {len(files)} files were not {done}: {', '.join(bad)}")
+
+
+def _key(out: Path, step: Step) -> str:
+    """The name of a step in the record."""
+    return step.outputs[0].relative_to(out).as_posix()
+
+
+def _plain(value: Any) -> Any:
+    """Options as JSON."""
+    return dataclasses.asdict(value) if dataclasses.is_dataclass(value) else str(value)  # type: ignore[arg-type]
+
+
+def _checksums(files: Sequence[object]) -> list[str]:
+    """The checksums of files, and of the files in folders."""
+    paths = [Path(one) for one in files if isinstance(one, str | Path)]
+    inside = [one for path in paths for one in (sorted(path.iterdir()) if path.is_dir() else [path])]
+    return [checksum(one) for one in inside if one.is_file() and os.access(one, os.R_OK)]
+
+
+def _named_by_side(file: StudyFile) -> StudyFile:
+    """A file whose outputs are named by the side, too, as the capture stands in the table more than once."""
+    side = file.cells.get("side")
+    name = file.name.with_stem(f"{file.name.stem}-{side}") if side else file.name
+    return dataclasses.replace(file, name=name)
+
+
+def _recorded_files(folder: Path, endings: Sequence[str]) -> Iterator[StudyFile]:
+    """What the last command of a study made in a folder."""
+    record = load_json(folder / RECORD) if (folder / RECORD).is_file() else {"study": []}
+    for key in record["study"]:
+        entry = record["outputs"].get(key, {"names": [], "cells": {}})
+        cells = {**entry["cells"]}
+        if "neutral" in cells:
+            cells["neutral"] = str(folder / cells["neutral"])
+        for name in entry["names"]:
+            if Path(name).suffix in endings:
+                yield StudyFile(folder / name, Path(name), cells)
+
+
+def _is_table(path: Path) -> bool:
+    """Whether a file is a study's table: its first line has a column `capture`."""
+    if path.suffix.lower() not in _TABLES or not path.is_file():
+        return False
+    check_regular(path, error=CaptureError)
+    with path.open("rb") as file:
+        line = file.readline(_LONGEST_HEADER)
+    return COLUMNS[0] in _header(line.decode(text_encoding(line), "ignore"))
+
+
+def _header(line: str) -> list[str]:
+    """The columns of a table's first line."""
+    return [cell.strip().strip('"').lower() for cell in line.split(_separator(line))]
+
+
+def _separator(line: str) -> str:
+    """The separator of a table's cells: comma, semicolon as in Europe, or tab."""
+    return max(",;\t", key=line.count)
+
+
+def _table_files(table: Path) -> Iterator[StudyFile]:
+    """The files in a study's table; paths start at its folder."""
+    data = read_bytes(table, error=CaptureError, most=_MOST_TABLE)
+    lines = data.decode(text_encoding(data), "replace").splitlines()
+    header = _header(lines[0])
+    for name in filter(None, header):
+        with errors_of(table, ArgumentError):
+            check_choice(name, COLUMNS, noun="column")
+    for number, row in enumerate(csv.reader(lines[1:], delimiter=_separator(lines[0])), 2):
+        given = dict(zip(header, map(str.strip, row), strict=False))
+        cells = {name: given[name] for name in COLUMNS if given.get(name)}
+        if not cells:
+            continue
+        with errors_of(f"{table}: line {number}", ArgumentError):
+            if "capture" not in cells:
+                raise ArgumentError("there is no capture, expected the name of its file")
+            if "side" in cells:
+                check_choice(cells["side"], SIDES, noun="side")
+        own = Path(cells["capture"])
+        inside = not own.is_absolute() and ".." not in own.parts
+        for column in _PATHS:
+            beside = table.parent.resolve() / cells.get(column, "")
+            if column in cells and (column != "glove" or beside.is_file()):  # or it is a shipped one
+                cells[column] = str(beside)
+        yield StudyFile(Path(cells.pop("capture")), own if inside else Path(own.name), cells)
