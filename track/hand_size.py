@@ -25,7 +25,7 @@ from gloves.layout import MarkerLayout, list_layouts, load_layout
 from gloves.takes.points import Status, spread_out
 from handsim.errors import ArgumentError, HandSimError, HandSimWarning
 from handsim.hand.model import HandModel
-from handsim.hand.shape import ADULT_LENGTH, SIZES, HandShape, Side
+from handsim.hand.shape import ADULT_LENGTH, DIGITS, SIZES, HandShape, Side
 from handsim.space.transforms import MIRROR
 from track.association.hand_state import HandState
 from track.association.initialization import HandInitializer, distances_to_nearest
@@ -477,14 +477,24 @@ def _fit(frames: Sequence[StreamedFrame], hands: Sequence[GloveFit], labeler: La
             near.append(int((distances_to_nearest(free, hand.markers) < AT_HAND).sum()))
             odds = score(markers - missing[-1], hand.rms)
             log_odds += max(0.0, odds - _PENALTY * (missing[-1] + near[-1]))
-    is_whole = not any(unseen[side] for side, times in found.items() if times)
+    there = [unseen[side] for side, times in found.items() if times]
+    lost = max((_lost_digit(hands[0], one) for one in there), key=len, default=set[int]())
+    is_whole = not any(one - lost for one in there)
     is_good = (
         count >= _FOUND * len(frames)
         and float(np.median(rms)) <= _MOST_RMS
-        and float(np.mean(missing)) <= (_MOST_HIDDEN if is_whole else _MOST_MISSING) * markers
+        and float(np.mean(missing)) - len(lost) <= (_MOST_HIDDEN if is_whole else _MOST_MISSING) * markers
         and float(np.mean(near)) <= max(_MOST_NEAR * markers, _FEW_NEAR)
     )
     return _Fit(log_odds / len(frames), found, count, is_good, is_whole)
+
+
+def _lost_digit(hand: GloveFit, unseen: set[int]) -> set[int]:
+    """The markers of a digit if none of them is ever seen, as of a finger that is missing; empty else."""
+    digits = hand.attachment.digits
+    own = [set(np.flatnonzero(digits == digit).tolist()) for digit in range(len(DIGITS))]
+    lost = [markers for markers in own if markers and markers <= unseen]
+    return lost[0] if len(lost) == 1 else set()
 
 
 def _gloves() -> list[tuple[str, MarkerLayout]]:
