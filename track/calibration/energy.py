@@ -47,7 +47,7 @@ from track.calibration.hand_parameters import (
     skinned_shape_jacobian,
     skinning_terms,
 )
-from track.kinematics.pose_spread import resting_prior
+from track.kinematics.pose_spread import GESTURES_OF_USER, learned_prior, resting_prior
 
 ALPHA_NORMAL, ALPHA_ALONG = 2.0, 1.0
 """Weights of E_prior along the normal and in the skin (Han et al. 2018, section 4.5)."""
@@ -59,8 +59,6 @@ CONTACT_SPREAD: Final = 0.0007
 """Standard deviation of a pad's compression around `PAD_COMPRESSION` [m]; (noise / spread)^2 is lambda_2."""
 _LIMIT_SPREAD: Final = np.deg2rad(2.0)  # [rad] standard deviation of an angle beyond its range
 _GESTURES: Final = 4.0  # The pose prior counts this many times per capture, as its frames are much alike.
-GESTURES_OF_USER: Final = np.repeat([1.0, _GESTURES], [4, 16])
-"""Number of gestures, by joint angle, whose mean varies from person to person like the mean of a capture."""
 _LEAST_MOTION: Final = np.deg2rad(1.0)  # of a digit that flesh follows
 RELINEARIZE: Final = 0.005  # The skin's jacobian is renewed after such a change (log lengths, [rad], [m]).
 _DIFFERENCE_STEP: Final = 1e-5  # of finite differences
@@ -164,8 +162,9 @@ class Problem:
         """Whether each marker is present."""
         self.targets = np.where(self.present[..., None], targets, 0.0)
         self.noise, self.robust_scale = noise, robust_scale
-        roots = np.sqrt(np.minimum(1.0, gestures / np.full(NUM_JOINTS, len(targets))))
-        self.pose_precision = np.outer(roots, roots) * resting_prior().precision
+        self._counts = gestures * np.ones(NUM_JOINTS)
+        self.gestures = resting_prior()
+        """The person's usual joint angles, learned on the way."""
         self.position_spread, self.height_spread = POSITION_SPREAD, HEIGHT_SPREAD
         self.place_weights = np.ones(targets.shape[1])
         """Weights (M,) of the prior of each marker's place."""
@@ -177,6 +176,16 @@ class Problem:
         self._ranges = HandModel(shape).skeleton.ranges
         self._surface_jacobian: NDArray[np.float64] | None = None
         self._linearized_at = np.zeros(NUM_PARAMETERS)
+
+    @property
+    def pose_precision(self) -> Float[np.ndarray, "20 20"]:
+        """Precision of the prior of joint angles in one frame [1/rad^2]."""
+        roots = np.sqrt(np.minimum(1.0, self._counts / len(self.targets)))
+        return np.outer(roots, roots) * self.gestures.precision
+
+    def learn_gestures(self, estimate: Estimate) -> None:
+        """Learn the person's gestures from the poses of an estimate."""
+        self.gestures = learned_prior(estimate.qpos[:, 7:])
 
     def with_targets(self, targets: Float[np.ndarray, "F M 3"]) -> Problem:
         """The same problem for other labeled markers [m], NaN where missing."""
@@ -228,7 +237,7 @@ class Problem:
         angles = estimate.qpos[:, 7:]
         low, high = self._ranges.T
         beyond = np.maximum(angles - high, 0.0) + np.minimum(angles - low, 0.0)
-        return beyond, angles - resting_prior().angles
+        return beyond, angles - self.gestures.angles
 
     def roots(self, fit: Fit) -> Float[np.ndarray, "F M"]:
         """Roots of the markers' weights [1/m]."""
@@ -629,7 +638,7 @@ def error_covariance(problem: Problem, estimate: Estimate, fit: Fit) -> Float[np
     share = (problem.data_noise / problem.noise) ** 2
     errors = share * reduced[:, :-1] + (1.0 - share) * (equations.shared - flat.T @ flat)
     turns = answers[:, 6:].sum(axis=0).T @ problem.pose_precision / np.sqrt(GESTURES_OF_USER)
-    errors += turns @ resting_prior().covariance @ turns.T
+    errors += turns @ problem.gestures.covariance @ turns.T
     # Of flesh of a size, the fit leaves a part in the residuals; by that the size is estimated.
     patterns = _flesh_patterns(problem, estimate, fit)
     bases = np.stack([np.linalg.qr(one.reshape(-1, one.shape[2]))[0] for one in patterns])

@@ -29,7 +29,6 @@ from handsim.hand.shape import DIGITS, JOINT_NAMES, NUM_JOINTS, PALM, HandShape,
 from handsim.hand.skin import rest_vertices
 from handsim.space.transforms import MIRROR, euler_matrix, quaternion_matrix, rigid_fit
 from track.calibration.energy import (
-    GESTURES_OF_USER,
     HEIGHT_SPREAD,
     POSITION_SPREAD,
     Estimate,
@@ -59,7 +58,7 @@ from track.calibration.hand_parameters import (
 )
 from track.frames import TrackedFrame
 from track.kinematics.pose_solver import PoseFit, PoseSolver
-from track.kinematics.pose_spread import HandErrors, errors_of_motions
+from track.kinematics.pose_spread import GESTURES_OF_USER, HandErrors, errors_of_motions
 
 _WIDE_STEPS: Final = 6  # steps with the first robust scale, which includes distant markers
 _STEPS_WITHOUT_CONTACTS: Final = 10  # last step without contacts, as in the paper
@@ -272,6 +271,7 @@ def calibrate_hand(
     touches = find_touches(rough.model, rough_track.qpos[:, 7:], complete, rate)
     problem, estimate, touches = _with_touches(problem, estimate, fit, seen, rough_track, touches)
     for last in np.linspace(steps, MOST_STEPS, 1 + _SPREAD_ROUNDS).astype(int)[1:]:
+        problem.learn_gestures(estimate)
         learn_spreads(problem, estimate, problem.fit(estimate))
         estimate, fit, steps = levenberg_marquardt(problem, estimate, steps, int(last), progress)
     done = user_hand(right, problem, estimate)

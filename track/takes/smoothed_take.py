@@ -32,7 +32,7 @@ from track.kinematics.marker_kinematics import (
     marker_residuals,
     workspace,
 )
-from track.kinematics.pose_spread import SpreadModel, freedom_factor, resting_prior
+from track.kinematics.pose_spread import SpreadModel, freedom_factor, learned_prior
 from track.user import hand_origin, read_errors
 
 # Chosen on realistic simulated hands; the error hardly changes within a factor of ten.
@@ -136,6 +136,7 @@ class _SmoothedHand:
         self._unseen = times_unseen(take.times, np.isfinite(self._targets[..., 0]))
         self._residuals = np.full_like(self._targets, np.nan)  # in the frames of the bones [m]
         self._hand, self._model, self._rate = hand_arrays(worn), spread_model(take, worn), take.rate
+        self._learn_gestures()
         # Standard deviations [m] of noise, of slow motion that residuals show, and of the flesh behind it.
         self._noise, self._slow, self._flesh = _FIRST_NOISE, 0.0, 0.0
         self._places = np.zeros((len(self._hand.digits), 2))  # RMS error along the skin, off it [m]
@@ -148,6 +149,7 @@ class _SmoothedHand:
             for window in windows:
                 self._step(window, self._equations(window))
             self._estimate_noise()
+            self._learn_gestures()
         cutoffs, parts = [], []
         for window in windows:
             equations = self._equations(window)
@@ -155,8 +157,8 @@ class _SmoothedHand:
             kept, inner = window.kept, window.inner
             alone = np.linalg.inv(equations[0])[inner]
             # Errors of the prior are alike in successive frames.
-            by_hinges = self._share * alone[:, :, :NUM_JOINTS]
-            same = by_hinges @ resting_prior().precision @ by_hinges.swapaxes(1, 2)
+            by_hinges = alone[:, :, :NUM_JOINTS] * self._share
+            same = by_hinges @ self._gestures.precision @ by_hinges.swapaxes(1, 2)
             variances, self.keypoints[kept] = self._model.variances(
                 self.qpos[kept],
                 self._unseen[kept],
@@ -164,7 +166,7 @@ class _SmoothedHand:
                 self._flesh,
                 self._places,
                 covariances[inner] + same,
-                self._share,
+                self._prior,
             )
             self.angles[kept] = np.sqrt(variances.sum(axis=-1))
             pulled = same.diagonal(axis1=1, axis2=2)[:, :NUM_JOINTS]
@@ -190,6 +192,16 @@ class _SmoothedHand:
         return min(1.0, _GESTURES / self._rate)
 
     @property
+    def _prior(self) -> Float[np.ndarray, "20 20"]:
+        """Precision of the prior of joint angles in one frame [1/rad^2]."""
+        return self._share * self._gestures.precision
+
+    def _learn_gestures(self) -> None:
+        """Learn the person's gestures from the poses."""
+        there = np.isfinite(self.qpos).all(axis=1)
+        self._gestures = learned_prior(self.qpos[there, 7:])
+
+    @property
     def _weight_noise(self) -> float:
         """Noise and slow motion together [m], which weight a marker.
 
@@ -201,15 +213,15 @@ class _SmoothedHand:
 
     def _equations(self, window: _Window) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Normal matrices (F, 26, 26) and gradients (F, 26) of single frames."""
-        qpos, prior = self.qpos[window.frames], resting_prior()
+        qpos, prior = self.qpos[window.frames], self._prior
         normal, gradient, self._residuals[window.frames] = _frame_equations(
             self._hand, self._targets[window.frames], qpos, self._weight_noise**-2, _OUTLIER**-2
         )
         markers = normal[::_COUNTED].copy()
-        normal[:, :NUM_JOINTS, :NUM_JOINTS] += self._share * prior.precision
+        normal[:, :NUM_JOINTS, :NUM_JOINTS] += prior
         normal += np.diag(_WEAK)
         self._count(slice(window.frames.start, window.frames.stop, _COUNTED), markers, normal[::_COUNTED])
-        gradient[:, :NUM_JOINTS] += self._share * (qpos[:, 7:] - prior.angles) @ prior.precision
+        gradient[:, :NUM_JOINTS] += (qpos[:, 7:] - self._gestures.angles) @ prior
         return normal, gradient
 
     def _count(self, frames: slice, markers: NDArray[np.float64], whole: NDArray[np.float64]) -> None:
