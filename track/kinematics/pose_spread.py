@@ -150,17 +150,14 @@ def resting_prior() -> JointPrior:
     return JointPrior(gestures.mean(axis=0), covariance, np.linalg.inv(covariance))
 
 
-def learned_prior(angles: Float[np.ndarray, "F 20"]) -> JointPrior:
-    """Prior of a person's joint angles, given those of a capture.
+def widened_gestures(angles: Float[np.ndarray, "F 20"]) -> Float[np.ndarray, "20"]:
+    """Factors by which a person's usual angles may differ more than people's do, given angles of a capture.
 
     A joint that does not move shows one angle, however many frames repeat it, and perhaps never moves: where
     it stands, people's gestures hardly tell.
     """
-    resting = resting_prior()
-    moved = angles.std(axis=0) / (_STILL * resting.spread)
-    wider = np.sqrt(1.0 + np.maximum(moved, 1.0 / _WIDEST) ** -4.0)
-    both = np.outer(wider, wider)
-    return JointPrior(resting.angles, both * resting.covariance, resting.precision / both)
+    moved = angles.std(axis=0) / (_STILL * resting_prior().spread)
+    return np.asarray(np.sqrt(1.0 + np.maximum(moved, 1.0 / _WIDEST) ** -4.0))
 
 
 def predict_joints(

@@ -32,7 +32,7 @@ from track.kinematics.marker_kinematics import (
     marker_residuals,
     workspace,
 )
-from track.kinematics.pose_spread import SpreadModel, freedom_factor, learned_prior
+from track.kinematics.pose_spread import SpreadModel, freedom_factor, resting_prior, widened_gestures
 from track.user import hand_origin, read_errors
 
 # Chosen on realistic simulated hands; the error hardly changes within a factor of ten.
@@ -155,10 +155,13 @@ class _SmoothedHand:
             equations = self._equations(window)
             covariances = self._step(window, equations)
             kept, inner = window.kept, window.inner
+            # A joint that does not move stands where its markers are, and nobody knows what is usual.
+            wide = self._prior / np.outer(self._wider, self._wider)
+            equations[0][:, :NUM_JOINTS, :NUM_JOINTS] += wide - self._prior
             alone = np.linalg.inv(equations[0])[inner]
             # Errors of the prior are alike in successive frames.
-            by_hinges = alone[:, :, :NUM_JOINTS] * self._share
-            same = by_hinges @ self._gestures.precision @ by_hinges.swapaxes(1, 2)
+            by_hinges = alone[:, :, :NUM_JOINTS]
+            same = self._share * by_hinges @ wide @ by_hinges.swapaxes(1, 2)
             variances, self.keypoints[kept] = self._model.variances(
                 self.qpos[kept],
                 self._unseen[kept],
@@ -166,7 +169,7 @@ class _SmoothedHand:
                 self._flesh,
                 self._places,
                 covariances[inner] + same,
-                self._prior,
+                wide,
             )
             self.angles[kept] = np.sqrt(variances.sum(axis=-1))
             pulled = same.diagonal(axis1=1, axis2=2)[:, :NUM_JOINTS]
@@ -194,12 +197,14 @@ class _SmoothedHand:
     @property
     def _prior(self) -> Float[np.ndarray, "20 20"]:
         """Precision of the prior of joint angles in one frame [1/rad^2]."""
-        return self._share * self._gestures.precision
+        return self._share * resting_prior().precision
 
     def _learn_gestures(self) -> None:
-        """Learn the person's gestures from the poses."""
-        there = np.isfinite(self.qpos).all(axis=1)
-        self._gestures = learned_prior(self.qpos[there, 7:])
+        """Learn where joints stand that do not move."""
+        angles, resting = self.qpos[np.isfinite(self.qpos).all(axis=1), 7:], resting_prior()
+        self._wider = widened_gestures(angles)
+        still = 1.0 - self._wider**-2.0
+        self._usual = resting.angles + still * (angles.mean(axis=0) - resting.angles)
 
     @property
     def _weight_noise(self) -> float:
@@ -221,7 +226,7 @@ class _SmoothedHand:
         normal[:, :NUM_JOINTS, :NUM_JOINTS] += prior
         normal += np.diag(_WEAK)
         self._count(slice(window.frames.start, window.frames.stop, _COUNTED), markers, normal[::_COUNTED])
-        gradient[:, :NUM_JOINTS] += (qpos[:, 7:] - self._gestures.angles) @ prior
+        gradient[:, :NUM_JOINTS] += (qpos[:, 7:] - self._usual) @ prior
         return normal, gradient
 
     def _count(self, frames: slice, markers: NDArray[np.float64], whole: NDArray[np.float64]) -> None:
