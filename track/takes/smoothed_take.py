@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from gloves.captures.capture import runs_of
 from gloves.fit import GloveFit
 from gloves.takes.take import INITIALIZED, LOST, Take
-from handsim.hand.shape import NUM_JOINTS, NUM_KEYPOINTS
+from handsim.hand.shape import JOINT_NAMES, NUM_JOINTS, NUM_KEYPOINTS
 from handsim.kernels import kernel, move, velocity_of
 from handsim.space.transforms import quaternion_matrix
 from track.kinematics.marker_kinematics import (
@@ -39,6 +39,9 @@ from track.user import hand_origin, read_errors
 _ACCELERATIONS: Final = np.repeat([10.0, 0.5, 10.0], [NUM_JOINTS, 3, 3])
 """Power spectral density of acceleration: joints [rad^2/s^3], wrist [m^2/s^3], [rad^2/s^3]."""
 _GESTURES: Final = 30.0  # [1/s] how often the prior counts: errors of markers last this long
+_KNOWN: Final = float(np.deg2rad(3.0))
+"""Standard deviation of an angle that a goniometer found [rad]: a therapist's finger angles repeat within
+5 degrees in 95 % (Ellis and Bruton 2002), and joints are bent a little on the way."""
 _WEAK: Final = np.repeat([0.0, 1.0], [NUM_JOINTS, 6])  # [1/m^2, 1/rad^2] keeps an unseen wrist solvable
 _WINDOW, _MARGIN = 2000, 200  # frames solved together, and additional ones at either end
 _ROUNDS: Final = 5  # Gauss-Newton steps
@@ -136,6 +139,9 @@ class _SmoothedHand:
         self._unseen = times_unseen(take.times, np.isfinite(self._targets[..., 0]))
         self._residuals = np.full_like(self._targets, np.nan)  # in the frames of the bones [m]
         self._hand, self._model, self._rate = hand_arrays(worn), spread_model(take, worn), take.rate
+        known = take.settings.get("known", {})
+        self._known = np.deg2rad([known.get(f"{worn.side}:{name}", np.nan) for name in JOINT_NAMES])
+        self._sure = np.diag(np.isfinite(self._known) / _KNOWN**2)  # precision of known angles [1/rad^2]
         self._learn_gestures()
         # Standard deviations [m] of noise, of slow motion that residuals show, and of the flesh behind it.
         self._noise, self._slow, self._flesh = _FIRST_NOISE, 0.0, 0.0
@@ -159,9 +165,9 @@ class _SmoothedHand:
             wide = self._prior / np.outer(self._wider, self._wider)
             equations[0][:, :NUM_JOINTS, :NUM_JOINTS] += wide - self._prior
             alone = np.linalg.inv(equations[0])[inner]
-            # Errors of the prior are alike in successive frames.
+            # Errors of the prior and of known angles are alike in successive frames.
             by_hinges = alone[:, :, :NUM_JOINTS]
-            same = self._share * by_hinges @ wide @ by_hinges.swapaxes(1, 2)
+            same = by_hinges @ (self._share * wide + self._sure) @ by_hinges.swapaxes(1, 2)
             variances, self.keypoints[kept] = self._model.variances(
                 self.qpos[kept],
                 self._unseen[kept],
@@ -169,7 +175,7 @@ class _SmoothedHand:
                 self._flesh,
                 self._places,
                 covariances[inner] + same,
-                wide,
+                wide + self._sure,
             )
             self.angles[kept] = np.sqrt(variances.sum(axis=-1))
             pulled = same.diagonal(axis1=1, axis2=2)[:, :NUM_JOINTS]
@@ -223,10 +229,11 @@ class _SmoothedHand:
             self._hand, self._targets[window.frames], qpos, self._weight_noise**-2, _OUTLIER**-2
         )
         markers = normal[::_COUNTED].copy()
-        normal[:, :NUM_JOINTS, :NUM_JOINTS] += prior
+        normal[:, :NUM_JOINTS, :NUM_JOINTS] += prior + self._sure
         normal += np.diag(_WEAK)
         self._count(slice(window.frames.start, window.frames.stop, _COUNTED), markers, normal[::_COUNTED])
         gradient[:, :NUM_JOINTS] += (qpos[:, 7:] - self._usual) @ prior
+        gradient[:, :NUM_JOINTS] += np.nan_to_num(qpos[:, 7:] - self._known) @ self._sure
         return normal, gradient
 
     def _count(self, frames: slice, markers: NDArray[np.float64], whole: NDArray[np.float64]) -> None:
