@@ -72,7 +72,6 @@ _SURE: Final = 2.0  # standard deviations of a 95 % interval
 _USUAL: Final = TrackerConfig()
 _LENIENT: Final = TrackerConfig(least_evidence=2.0)  # for hands of few markers before they are measured
 _FIT_STEPS, _FEW_STEPS = 15, 2
-_ROUNDS: Final = 3  # fits of proportions, each with gestures that the one before has learned
 _LEAST_PRECISION: Final = 1.0  # [1/m^2] smallest precision of a shift, so that none is divided by zero
 _PART: Final = 30  # Hands are compared in two parts of this many frames.
 _LEAST_FRAMES: Final = 10  # Hands are not compared in fewer frames.
@@ -301,9 +300,7 @@ def _least(function: Callable[[float], float], low: float, high: float) -> float
 def _fit_proportions(seen: Float[np.ndarray, "F M 3"], start: GloveFit) -> SizeFit:
     """Fit one shape to right hands in some frames, by a calibration without touches."""
     problem, estimate = _first_proportions(seen, start)
-    for _ in range(_ROUNDS):
-        estimate, fit, _ = levenberg_marquardt(problem, estimate, 0, _FIT_STEPS, None, QUICK_GAIN)
-        problem.learn_gestures(estimate)
+    estimate, fit, _ = levenberg_marquardt(problem, estimate, 0, _FIT_STEPS, None, QUICK_GAIN)
     hand = user_hand(start, problem, estimate)
     rms = float(np.median(PoseSolver(hand).solve(seen, estimate.qpos).rms))
     variance = shared_covariance(problem, estimate, fit)[0][LENGTH, LENGTH]

@@ -71,8 +71,8 @@ class TrackSettings(LabelSettings):
     """Whether the poses of a file are solved over its whole time, forward and backward. Those of a stream are
     solved frame by frame."""
     known: Mapping[str, float] = field(default_factory=dict)
-    """Angles of joints that do not move, as a goniometer found them [deg], by side and name, such as
-    `right:index_PIP_flexion`; the poses of a file follow them."""
+    """Angles of joints that do not move, as a goniometer found them [deg], by name, such as
+    `index_PIP_flexion`, or `right:index_PIP_flexion` of one hand; the poses of a file follow them."""
     tracker: TrackerConfig = field(default_factory=TrackerConfig)
     """Settings of the tracker itself, distances in [m] and times in [s]."""
 
@@ -81,8 +81,8 @@ class TrackSettings(LabelSettings):
         if self.known and not self.smooth:
             raise ArgumentError("known angles were given with smooth=False, expected poses solved over time")
         for name, angle in self.known.items():
-            side, _, joint = str(name).partition(":")
-            check_choice(side, SIDES, noun="side of a known angle")
+            *sides, joint = str(name).split(":", 1)
+            check_choice("".join(sides) or SIDES[0], SIDES, noun="side of a known angle")
             check_choice(joint, JOINT_NAMES, noun="joint with a known angle")
             check_number(f"the known angle of {name}", angle, -180.0, 180.0)
 

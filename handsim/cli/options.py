@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import tyro
 
@@ -42,8 +42,8 @@ class TrackerOptions:
         """Options that may name files, which no output must overwrite."""
         return self.shape, self.glove, self.labeler, *self.body
 
-    def settings(self, *, calibrate: bool = False, smooth: bool = True) -> TrackSettings:
-        """The settings of `track_capture`."""
+    def settings(self, **others: Any) -> TrackSettings:
+        """The settings of `track_capture`, the others by their names."""
         from track.settings import TrackSettings
         from track.user import load_user
 
@@ -53,9 +53,7 @@ class TrackerOptions:
         if self.shape is not None and self.hands is not None:
             hands = dataclasses.replace(load_user(self.shape).of_sides(self.hands), notes=self.shape.name)
         size = self.size or "auto"
-        return TrackSettings(
-            self.glove, hands, size, self.labeler, bodies=self.body, calibrate=calibrate, smooth=smooth
-        )
+        return TrackSettings(self.glove, hands, size, self.labeler, bodies=self.body, **others)
 
 
 def check_source(noun: str, file: object, live: str | None) -> None:

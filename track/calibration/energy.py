@@ -47,7 +47,7 @@ from track.calibration.hand_parameters import (
     skinned_shape_jacobian,
     skinning_terms,
 )
-from track.kinematics.pose_spread import GESTURES_OF_USER, resting_prior, widened_gestures
+from track.kinematics.pose_spread import GESTURES_OF_USER, own_variances, resting_prior
 
 ALPHA_NORMAL, ALPHA_ALONG = 2.0, 1.0
 """Weights of E_prior along the normal and in the skin (Han et al. 2018, section 4.5)."""
@@ -60,7 +60,7 @@ CONTACT_SPREAD: Final = 0.0007
 _LIMIT_SPREAD: Final = np.deg2rad(2.0)  # [rad] standard deviation of an angle beyond its range
 _GESTURES: Final = 4.0  # The pose prior counts this many times per capture, as its frames are much alike.
 _LEAST_MOTION: Final = np.deg2rad(1.0)  # of a digit that flesh follows
-_LEAST_OWN: Final = 1e-4  # added variance of the usual angle of a joint that moves, so that none is zero
+_LEAST_OWN: Final = 1e-6  # [rad^2] least variance of a person's usual angle, so that none is divided by zero
 RELINEARIZE: Final = 0.005  # The skin's jacobian is renewed after such a change (log lengths, [rad], [m]).
 _DIFFERENCE_STEP: Final = 1e-5  # of finite differences
 PAD_COMPRESSION: Final = 0.001
@@ -166,8 +166,8 @@ class Problem:
         self.targets = np.where(self.present[..., None], targets, 0.0)
         self.noise, self.robust_scale = noise, robust_scale
         self._counts = gestures * np.ones(NUM_JOINTS)
-        self.wider = np.ones(NUM_JOINTS)
-        """Factors by which this person's usual joint angles may differ more than people's do."""
+        self.own = np.zeros(NUM_JOINTS)
+        """Variances of this person's usual joint angles around people's [rad^2]."""
         self.position_spread, self.height_spread = POSITION_SPREAD, HEIGHT_SPREAD
         self.place_weights = np.ones(targets.shape[1])
         """Weights (M,) of the prior of each marker's place."""
@@ -182,7 +182,7 @@ class Problem:
 
     def learn_gestures(self, estimate: Estimate) -> None:
         """Learn which joints do not move, so that their usual angles are their own."""
-        self.wider = widened_gestures(estimate.qpos[:, 7:])
+        self.own = own_variances(estimate.qpos[:, 7:])
 
     @property
     def pose_precision(self) -> Float[np.ndarray, "20 20"]:
@@ -193,8 +193,7 @@ class Problem:
     @property
     def usual_precision(self) -> Float[np.ndarray, "20 20"]:
         """Precision of the person's usual joint angles around people's [1/rad^2]."""
-        own = np.sqrt(np.maximum(self.wider**2 - 1.0, _LEAST_OWN))
-        return len(self.targets) * self.pose_precision / np.outer(own, own)
+        return np.diag(1.0 / np.maximum(self.own, _LEAST_OWN))
 
     def usual_angles(self, estimate: Estimate) -> Float[np.ndarray, "20"]:
         """The likeliest usual joint angles of the person, relative to people's [rad]."""
@@ -663,9 +662,13 @@ def error_covariance(problem: Problem, estimate: Estimate, fit: Fit) -> Float[np
     flat = by_shared.reshape(-1, len(reduced))
     share = (problem.data_noise / problem.noise) ** 2
     errors = share * reduced[:, :-1] + (1.0 - share) * (equations.shared - flat.T @ flat)
-    pull = equations.pull @ (np.eye(NUM_JOINTS) - len(answers) * np.linalg.solve(equations.usual, equations.pull))
-    turns = answers[:, 6:].sum(axis=0).T @ pull * problem.wider / np.sqrt(GESTURES_OF_USER)
-    errors += turns @ resting_prior().covariance @ turns.T
+    # Poses follow an error of people's usual angles as far as the person's own ones do not.
+    pull = equations.pull @ (
+        np.eye(NUM_JOINTS) - len(answers) * np.linalg.solve(equations.usual, equations.pull)
+    )
+    turns = answers[:, 6:].sum(axis=0).T @ pull
+    counts = np.outer(GESTURES_OF_USER, GESTURES_OF_USER) ** 0.5
+    errors += turns @ (resting_prior().covariance / counts + np.diag(problem.own)) @ turns.T
     # Of flesh of a size, the fit leaves a part in the residuals; by that the size is estimated.
     patterns = _flesh_patterns(problem, estimate, fit)
     bases = np.stack([np.linalg.qr(one.reshape(-1, one.shape[2]))[0] for one in patterns])

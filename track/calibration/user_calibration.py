@@ -271,7 +271,6 @@ def calibrate_hand(
     touches = find_touches(rough.model, rough_track.qpos[:, 7:], complete, rate)
     problem, estimate, touches = _with_touches(problem, estimate, fit, seen, rough_track, touches)
     for last in np.linspace(steps, MOST_STEPS, 1 + _SPREAD_ROUNDS).astype(int)[1:]:
-        problem.learn_gestures(estimate)
         learn_spreads(problem, estimate, problem.fit(estimate))
         estimate, fit, steps = levenberg_marquardt(problem, estimate, steps, int(last), progress)
     done = user_hand(right, problem, estimate)
@@ -280,6 +279,7 @@ def calibrate_hand(
         touching = PoseSolver(right).solve(seen[[frame for frame, _ in touches]])
         before = contact_gaps(right.model, touches, touching.qpos)
     final = PoseSolver(done).solve(seen, rough_track.qpos)
+    problem.learn_gestures(estimate)
     covariance = error_covariance(problem, estimate, fit)
     position_errors, length_errors = standard_errors(problem, estimate, fit, covariance)
     return Calibration(

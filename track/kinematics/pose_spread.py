@@ -46,8 +46,8 @@ from track.kinematics.pose_solver import FEWEST_ON_PART
 _JOINT_MEMORY: Final = 0.3  # [s] time constant of the process of joint angles
 _JOINT_SPREAD: Final = float(np.deg2rad(0.5))  # [rad] least standard deviation of a predicted angle
 _GESTURE_MARGIN: Final = float(np.deg2rad(6.0))  # [rad] added to that of the gestures, for other poses
-_STILL: Final = 0.35  # share of its usual standard deviation, below which a joint does not move
-_WIDEST: Final = 3.0  # Of a joint that does not move, gestures are wider by the square of this factor.
+_STILL: Final = 0.25  # share of its usual standard deviation, below which a joint does not move
+_OWN_ANGLE: Final = float(np.deg2rad(40.0))  # [rad] standard deviation of the angle of such a joint
 GESTURES_OF_USER: Final = np.repeat([1.0, 4.0], [4, 16])
 """Number of gestures, by joint angle, whose mean varies from person to person like the mean of a capture."""
 _ARC: Final = 0.04  # [m] usual radius of the arcs of markers: the length of a finger's bones
@@ -150,14 +150,14 @@ def resting_prior() -> JointPrior:
     return JointPrior(gestures.mean(axis=0), covariance, np.linalg.inv(covariance))
 
 
-def widened_gestures(angles: Float[np.ndarray, "F 20"]) -> Float[np.ndarray, "20"]:
-    """Factors by which a person's usual angles may differ more than people's do, given angles of a capture.
+def own_variances(angles: Float[np.ndarray, "F 20"]) -> Float[np.ndarray, "20"]:
+    """Variances of a person's usual angles around people's [rad^2], given the angles of a capture.
 
-    A joint that does not move shows one angle, however many frames repeat it, and perhaps never moves: where
-    it stands, people's gestures hardly tell.
+    A joint that does not move shows one angle, however many frames repeat it, and perhaps never moves: how
+    far it is from what is usual, people's gestures do not tell.
     """
     moved = angles.std(axis=0) / (_STILL * resting_prior().spread)
-    return np.asarray(np.sqrt(1.0 + np.maximum(moved, 1.0 / _WIDEST) ** -4.0))
+    return np.asarray((_OWN_ANGLE / (1.0 + moved**4)) ** 2)
 
 
 def predict_joints(

@@ -32,7 +32,7 @@ from track.kinematics.marker_kinematics import (
     marker_residuals,
     workspace,
 )
-from track.kinematics.pose_spread import SpreadModel, freedom_factor, resting_prior, widened_gestures
+from track.kinematics.pose_spread import SpreadModel, freedom_factor, own_variances, resting_prior
 from track.user import hand_origin, read_errors
 
 # Chosen on realistic simulated hands; the error hardly changes within a factor of ten.
@@ -139,10 +139,14 @@ class _SmoothedHand:
         self._unseen = times_unseen(take.times, np.isfinite(self._targets[..., 0]))
         self._residuals = np.full_like(self._targets, np.nan)  # in the frames of the bones [m]
         self._hand, self._model, self._rate = hand_arrays(worn), spread_model(take, worn), take.rate
+        spans, seen = self._hand.hinge_span, np.isfinite(self._targets[..., 0]).any(axis=0)
+        joints = np.arange(NUM_JOINTS)[:, None]
+        # Whether a marker beyond each joint is seen.
+        self._shown = ((spans[:, 0] <= joints) & (joints < spans[:, 1]) & seen).any(axis=1)
         known = take.settings.get("known", {})
-        self._known = np.deg2rad([known.get(f"{worn.side}:{name}", np.nan) for name in JOINT_NAMES])
+        names = [(f"{worn.side}:{name}", name) for name in JOINT_NAMES]
+        self._known = np.deg2rad([known.get(one, known.get(each, np.nan)) for one, each in names])
         self._sure = np.diag(np.isfinite(self._known) / _KNOWN**2)  # precision of known angles [1/rad^2]
-        self._learn_gestures()
         # Standard deviations [m] of noise, of slow motion that residuals show, and of the flesh behind it.
         self._noise, self._slow, self._flesh = _FIRST_NOISE, 0.0, 0.0
         self._places = np.zeros((len(self._hand.digits), 2))  # RMS error along the skin, off it [m]
@@ -155,14 +159,11 @@ class _SmoothedHand:
             for window in windows:
                 self._step(window, self._equations(window))
             self._estimate_noise()
-            self._learn_gestures()
-        cutoffs, parts = [], []
+        cutoffs, parts, wide = [], [], self._doubted_prior()
         for window in windows:
             equations = self._equations(window)
             covariances = self._step(window, equations)
             kept, inner = window.kept, window.inner
-            # A joint that does not move stands where its markers are, and nobody knows what is usual.
-            wide = self._prior / np.outer(self._wider, self._wider)
             equations[0][:, :NUM_JOINTS, :NUM_JOINTS] += wide - self._prior
             alone = np.linalg.inv(equations[0])[inner]
             # Errors of the prior and of known angles are alike in successive frames.
@@ -205,12 +206,11 @@ class _SmoothedHand:
         """Precision of the prior of joint angles in one frame [1/rad^2]."""
         return self._share * resting_prior().precision
 
-    def _learn_gestures(self) -> None:
-        """Learn where joints stand that do not move."""
-        angles, resting = self.qpos[np.isfinite(self.qpos).all(axis=1), 7:], resting_prior()
-        self._wider = widened_gestures(angles)
-        still = 1.0 - self._wider**-2.0
-        self._usual = resting.angles + still * (angles.mean(axis=0) - resting.angles)
+    def _doubted_prior(self) -> Float[np.ndarray, "20 20"]:
+        """The same where nobody knows what is usual for joints that do not move."""
+        angles = self.qpos[np.isfinite(self.qpos).all(axis=1), 7:]
+        own = own_variances(angles) * self._shown
+        return self._share * np.linalg.inv(resting_prior().covariance + np.diag(own))
 
     @property
     def _weight_noise(self) -> float:
@@ -232,7 +232,7 @@ class _SmoothedHand:
         normal[:, :NUM_JOINTS, :NUM_JOINTS] += prior + self._sure
         normal += np.diag(_WEAK)
         self._count(slice(window.frames.start, window.frames.stop, _COUNTED), markers, normal[::_COUNTED])
-        gradient[:, :NUM_JOINTS] += (qpos[:, 7:] - self._usual) @ prior
+        gradient[:, :NUM_JOINTS] += (qpos[:, 7:] - resting_prior().angles) @ prior
         gradient[:, :NUM_JOINTS] += np.nan_to_num(qpos[:, 7:] - self._known) @ self._sure
         return normal, gradient
 
