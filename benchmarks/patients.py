@@ -5,7 +5,7 @@ python -m benchmarks.patients FOLDER [--patients 24] [--seed 9300] [--healthy] [
 Each simulated patient moves one hand in which one or two digits have two fixed joints: PIP and DIP of a finger,
 or MCP and IP of the thumb, anywhere between -20 and 90 and -15 and 60 degrees. The gloves dense19, sparse13 and
 starter15 take turns; they are worn with slips, and their markers move with the flesh. Each capture is tracked
-with measured hands and with --calibrate. With --healthy, the same people move without fixed joints.
+with measured hands, with --calibrate, and with the inner fixed joint of each digit known. With --healthy, the same people move without fixed joints.
 
 The folder keeps captures and results, so that a stopped run continues.
 """
@@ -33,7 +33,7 @@ from train.simulation.training_frames import move_skin, sample_hands, wear_glove
 
 GLOVES = ("dense19", "sparse13", "starter15")
 INNER, OUTER = (-20.0, 90.0), (-15.0, 60.0)  # [deg] of the PIP and DIP; of the thumb MCP and IP, within its ranges
-METHODS = {"measured": False, "calibrated": True}
+METHODS = ("measured", "calibrated", "known")
 
 
 def patient(number: int, seed: int, seconds: float, is_healthy: bool) -> Take:
@@ -64,8 +64,13 @@ def tracked(path: Path, take: Take, method: str) -> dict[str, Any]:
         began = time.process_time()
         with warnings.catch_warnings(record=True) as said:
             warnings.simplefilter("always")
+            inner = list(take.settings["fixed"].items())[::2] if method == "known" else ()
             found = track_capture(
-                take.capture(), glove=take.hands[0].layout, hands="right", calibrate=METHODS[method]
+                take.capture(),
+                glove=take.hands[0].layout,
+                hands="right",
+                calibrate=method == "calibrated",
+                known={f"right:{name}": angle for name, angle in inner},
             )
         assert found.angle_spread is not None
         off = np.rad2deg(found.qpos[:, 0, 7:] - take.qpos[:, 0, 7:])
@@ -92,7 +97,7 @@ def main(
     seed: int = 9300,
     seconds: float = 12.0,
     healthy: bool = False,
-    methods: tuple[str, ...] = tuple(METHODS),
+    methods: tuple[str, ...] = METHODS[:2],
     save: str | None = None,
 ) -> None:
     warnings.simplefilter("ignore", HandSimWarning)
@@ -110,7 +115,7 @@ def main(
             found = tracked(folder / f"{stem}.{method}.json", take, method)
             joints = [JOINT_NAMES.index(name) for name in take.settings["fixed"]]
             told = []
-            for joint in joints if not healthy else ():
+            for joint in [] if healthy else joints[1::2] if method == "known" else joints:
                 rows[method].append((found["mean"][joint], found["spread"][joint]))
                 true = take.settings["fixed"][JOINT_NAMES[joint]]
                 told.append(f"{JOINT_NAMES[joint]} {true:.0f}: {found['mean'][joint]:+.1f} +- {found['spread'][joint]:.1f}")

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Final, Self, get_args
 
 from gloves.fit import GloveFit, mean_hand
 from gloves.layout import layout_checksum, list_layouts, load_layout
-from handsim._checks import check_type, shown_value
+from handsim._checks import check_choice, check_number, check_type, shown_value
 from handsim._version import provenance
 from handsim.errors import ArgumentError
-from handsim.hand.shape import SIDES, Side
+from handsim.hand.shape import JOINT_NAMES, SIDES, Side
 from handsim.settings import Expected, Settings
 from track.bodies.rigid_body import AnyBody, RigidTemplate, load_bodies
 from track.config import Size, TrackerConfig
@@ -71,8 +71,21 @@ class TrackSettings(LabelSettings):
     smooth: bool = True
     """Whether the poses of a file are solved over its whole time, forward and backward. Those of a stream are
     solved frame by frame."""
+    known: Mapping[str, float] = field(default_factory=dict)
+    """Angles of joints that do not move, as a goniometer found them [deg], by name, such as
+    `index_PIP_flexion`, or `right:index_PIP_flexion` of one hand; the poses of a file follow them."""
     tracker: TrackerConfig = field(default_factory=TrackerConfig)
     """Settings of the tracker itself, distances in [m] and times in [s]."""
+
+    def check(self) -> None:
+        """Refuse names that no joint has, and known angles of poses that are not solved over time."""
+        if self.known and not self.smooth:
+            raise ArgumentError("known angles were given with smooth=False, expected poses solved over time")
+        for name, angle in self.known.items():
+            *sides, joint = str(name).split(":", 1)
+            check_choice("".join(sides) or SIDES[0], SIDES, noun="side of a known angle")
+            check_choice(joint, JOINT_NAMES, noun="joint with a known angle")
+            check_number(f"the known angle of {name}", angle, -180.0, 180.0)
 
     def record(self) -> dict[str, Any]:
         """The settings as JSON: objects by their names, hands in their gloves by their sides."""

@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import tyro
 
@@ -45,8 +45,8 @@ class TrackerOptions:
         """Options that may name files, which no output must overwrite."""
         return self.shape, self.glove, self.labeler, *self.body
 
-    def settings(self, *, calibrate: bool = False, smooth: bool = True) -> TrackSettings:
-        """The settings of `track_capture`."""
+    def settings(self, **others: Any) -> TrackSettings:
+        """The settings of `track_capture`, the others by their names."""
         from track.settings import TrackSettings
         from track.user import load_user
 
@@ -56,9 +56,7 @@ class TrackerOptions:
         if self.shape is not None and self.hands is not None:
             hands = dataclasses.replace(load_user(self.shape).of_sides(self.hands), notes=self.shape.name)
         size = self.size or "auto"
-        return TrackSettings(
-            self.glove, hands, size, self.labeler, bodies=self.body, calibrate=calibrate, smooth=smooth
-        )
+        return TrackSettings(self.glove, hands, size, self.labeler, bodies=self.body, **others)
 
 
 def neutral_pose(given: Sequence[str] | None) -> tuple[float, float] | Take | None:

@@ -36,6 +36,7 @@ def track(
     options: Annotated[TrackerOptions, tyro.conf.arg(name="")] = TrackerOptions(),  # noqa: B008 (frozen)
     calibrate: bool = False,
     smooth: bool = True,
+    known: tuple[str, ...] = (),
     labeled: Annotated[Path | None, tyro.conf.arg(aliases=["--labelled"])] = None,
 ) -> None:
     """Track hands in a marker capture or a live stream; writes motion, labels and status.
@@ -61,6 +62,8 @@ def track(
             which they were not calibrated on. For those who did not capture a minute for handsim calibrate.
         smooth: Solve the poses of a capture over all of its time, forward and backward, in place of frame by
             frame. A live stream is tracked frame by frame.
+        known: Angles of joints that do not move, as a goniometer found them [deg], such as
+            index_PIP_flexion=60, or right:index_PIP_flexion=60 of one hand.
         labeled: File for the labeled points, .trc, .c3d or Motive .csv; markers are called right:ThumbTip and
             so on, other points Unlabeled1, Unlabeled2, ...
     """
@@ -91,7 +94,7 @@ def track(
     if labeled is not None:
         check_suffix(labeled, WRITABLE)
     check_outputs((capture, *options.files()), (out, labeled))
-    settings = options.settings(calibrate=calibrate, smooth=smooth)
+    settings = options.settings(calibrate=calibrate, smooth=smooth, known=_angles(known))
     times: deque[float] = deque(maxlen=100_000)  # [s]
 
     def on_frame(frame: StreamedFrame, tracked: TrackedFrame) -> None:
@@ -128,6 +131,19 @@ def _track_study(
         return Step((take,), (*chosen.files(), corrections_path(take)), {"options": chosen, **other})
 
     run_study(study_files(captures, out, [".npz"]), Path(out or ""), track, plan, "tracked")
+
+
+def _angles(given: tuple[str, ...]) -> dict[str, float]:
+    """Angles [deg] by the joint's name, from words as NAME=ANGLE."""
+    angles = {}
+    for word in given:
+        name, _, angle = word.partition("=")
+        try:
+            angles[name] = float(angle)
+        except ValueError:
+            expected = "NAME=ANGLE, such as index_PIP_flexion=60"
+            raise ArgumentError(f"--known is '{word}', expected {expected}") from None
+    return angles
 
 
 def _track_file(

@@ -57,3 +57,17 @@ def test_fields_that_are_named_differ_from_the_settings():
         TrackSettings.of("dense19", {})  # type: ignore[arg-type]
     with pytest.raises(ArgumentError, match="unknown setting of tracker 'noise'"):
         TrackSettings.from_json({"tracker": {"noise": 1.0}})
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"known": {"index_PIP": 60.0}}, "index_PIP_flexion"),
+        ({"known": {"both:index_PIP_flexion": 60.0}}, "side of a known angle"),
+        ({"known": {"index_PIP_flexion": 600.0}}, "from -180 to 180"),
+        ({"known": {"index_PIP_flexion": 60.0}, "smooth": False}, "smooth=False"),
+    ],
+)
+def test_known_angles_are_of_joints_and_need_poses_over_time(options, message):
+    with pytest.raises(ArgumentError, match=message):
+        TrackSettings(**options)

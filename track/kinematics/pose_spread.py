@@ -46,6 +46,10 @@ from track.kinematics.pose_solver import FEWEST_ON_PART
 _JOINT_MEMORY: Final = 0.3  # [s] time constant of the process of joint angles
 _JOINT_SPREAD: Final = float(np.deg2rad(0.5))  # [rad] least standard deviation of a predicted angle
 _GESTURE_MARGIN: Final = float(np.deg2rad(6.0))  # [rad] added to that of the gestures, for other poses
+_STILL: Final = 0.25  # share of its usual standard deviation, below which a joint does not move
+_OWN_ANGLE: Final = float(np.deg2rad(40.0))  # [rad] standard deviation of the angle of such a joint
+GESTURES_OF_USER: Final = np.repeat([1.0, 4.0], [4, 16])
+"""Number of gestures, by joint angle, whose mean varies from person to person like the mean of a capture."""
 _ARC: Final = 0.04  # [m] usual radius of the arcs of markers: the length of a finger's bones
 _LEAST_INFORMATION: Final = 1e-9  # share of a marker's precision, added for an inverse
 _DRIFT: Final = 0.014  # [m/sqrt(s)] random walk of a hidden marker
@@ -144,6 +148,16 @@ def resting_prior() -> JointPrior:
     gestures = np.concatenate([gestures_of(library) for library in LIBRARIES])
     covariance = np.cov(gestures.T) + _GESTURE_MARGIN**2 * np.eye(NUM_JOINTS)
     return JointPrior(gestures.mean(axis=0), covariance, np.linalg.inv(covariance))
+
+
+def own_variances(angles: Float[np.ndarray, "F 20"]) -> Float[np.ndarray, "20"]:
+    """Variances of a person's usual angles around people's [rad^2], given the angles of a capture.
+
+    A joint that does not move shows one angle, however many frames repeat it, and perhaps never moves: how
+    far it is from what is usual, people's gestures do not tell.
+    """
+    moved = angles.std(axis=0) / (_STILL * resting_prior().spread)
+    return np.asarray((_OWN_ANGLE / (1.0 + moved**4)) ** 2)
 
 
 def predict_joints(
@@ -414,17 +428,18 @@ class SpreadModel:
         flesh: float = 0.0,
         places: Float[np.ndarray, "M 2"] | float = 0.0,
         smoothed: Float[np.ndarray, "S 26 26"] = NOT_SMOOTHED,
-        share: float = 1.0,
+        prior: Float[np.ndarray, "20 20"] | None = None,
     ) -> tuple[Float[np.ndarray, "T 20 4"], Float[np.ndarray, "T 21"]]:
         """Variances of angles by `SOURCES` [rad^2], and standard deviations of keypoints [m].
 
         For smoothed poses are given: flesh motion and RMS errors of marker places, along the skin and off it
-        [m], the covariances of the unknowns from noise and gaps, and the weight of the prior in one frame.
+        [m], the covariances of the unknowns from noise and gaps, and the precision of the prior in one frame.
         """
         doubt = self._doubt._replace(flesh=flesh, places=np.maximum(self._doubt.places, places))
         if self._is_calibrated:
             doubt = doubt._replace(noise=noise)
-        return pose_spreads(self._hand, share * resting_prior().precision, doubt, qpos, unseen, smoothed)
+        prior = resting_prior().precision if prior is None else prior
+        return pose_spreads(self._hand, prior, doubt, qpos, unseen, smoothed)
 
 
 def measurement_error(budget: Float[np.ndarray, "*J 4"], origin: HandOrigin) -> Float[np.ndarray, "*J"]:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from gloves.captures.capture import runs_of
 from gloves.fit import GloveFit
 from gloves.takes.take import INITIALIZED, LOST, Take
-from handsim.hand.shape import NUM_JOINTS, NUM_KEYPOINTS
+from handsim.hand.shape import JOINT_NAMES, NUM_JOINTS, NUM_KEYPOINTS
 from handsim.kernels import kernel, move, velocity_of
 from handsim.space.transforms import quaternion_matrix
 from track.kinematics.marker_kinematics import (
@@ -32,13 +32,16 @@ from track.kinematics.marker_kinematics import (
     marker_residuals,
     workspace,
 )
-from track.kinematics.pose_spread import SpreadModel, freedom_factor, resting_prior
+from track.kinematics.pose_spread import SpreadModel, freedom_factor, own_variances, resting_prior
 from track.user import hand_origin, read_errors
 
 # Chosen on realistic simulated hands; the error hardly changes within a factor of ten.
 _ACCELERATIONS: Final = np.repeat([10.0, 0.5, 10.0], [NUM_JOINTS, 3, 3])
 """Power spectral density of acceleration: joints [rad^2/s^3], wrist [m^2/s^3], [rad^2/s^3]."""
 _GESTURES: Final = 30.0  # [1/s] how often the prior counts: errors of markers last this long
+_KNOWN: Final = float(np.deg2rad(3.0))
+"""Standard deviation of an angle that a goniometer found [rad]: a therapist's finger angles repeat within
+5 degrees in 95 % (Ellis and Bruton 2002), and joints are bent a little on the way."""
 _WEAK: Final = np.repeat([0.0, 1.0], [NUM_JOINTS, 6])  # [1/m^2, 1/rad^2] keeps an unseen wrist solvable
 _WINDOW, _MARGIN = 2000, 200  # frames solved together, and additional ones at either end
 _ROUNDS: Final = 5  # Gauss-Newton steps
@@ -136,6 +139,14 @@ class _SmoothedHand:
         self._unseen = times_unseen(take.times, np.isfinite(self._targets[..., 0]))
         self._residuals = np.full_like(self._targets, np.nan)  # in the frames of the bones [m]
         self._hand, self._model, self._rate = hand_arrays(worn), spread_model(take, worn), take.rate
+        spans, seen = self._hand.hinge_span, np.isfinite(self._targets[..., 0]).any(axis=0)
+        joints = np.arange(NUM_JOINTS)[:, None]
+        # Whether a marker beyond each joint is seen.
+        self._shown = ((spans[:, 0] <= joints) & (joints < spans[:, 1]) & seen).any(axis=1)
+        known = take.settings.get("known", {})
+        names = [(f"{worn.side}:{name}", name) for name in JOINT_NAMES]
+        self._known = np.deg2rad([known.get(one, known.get(each, np.nan)) for one, each in names])
+        self._sure = np.diag(np.isfinite(self._known) / _KNOWN**2)  # precision of known angles [1/rad^2]
         # Standard deviations [m] of noise, of slow motion that residuals show, and of the flesh behind it.
         self._noise, self._slow, self._flesh = _FIRST_NOISE, 0.0, 0.0
         self._places = np.zeros((len(self._hand.digits), 2))  # RMS error along the skin, off it [m]
@@ -148,15 +159,16 @@ class _SmoothedHand:
             for window in windows:
                 self._step(window, self._equations(window))
             self._estimate_noise()
-        cutoffs, parts = [], []
+        cutoffs, parts, wide = [], [], self._doubted_prior()
         for window in windows:
             equations = self._equations(window)
             covariances = self._step(window, equations)
             kept, inner = window.kept, window.inner
+            equations[0][:, :NUM_JOINTS, :NUM_JOINTS] += wide - self._prior
             alone = np.linalg.inv(equations[0])[inner]
-            # Errors of the prior are alike in successive frames.
-            by_hinges = self._share * alone[:, :, :NUM_JOINTS]
-            same = by_hinges @ resting_prior().precision @ by_hinges.swapaxes(1, 2)
+            # Errors of the prior and of known angles are alike in successive frames.
+            by_hinges = alone[:, :, :NUM_JOINTS]
+            same = by_hinges @ (self._share * wide + self._sure) @ by_hinges.swapaxes(1, 2)
             variances, self.keypoints[kept] = self._model.variances(
                 self.qpos[kept],
                 self._unseen[kept],
@@ -164,7 +176,7 @@ class _SmoothedHand:
                 self._flesh,
                 self._places,
                 covariances[inner] + same,
-                self._share,
+                wide + self._sure,
             )
             self.angles[kept] = np.sqrt(variances.sum(axis=-1))
             pulled = same.diagonal(axis1=1, axis2=2)[:, :NUM_JOINTS]
@@ -190,6 +202,17 @@ class _SmoothedHand:
         return min(1.0, _GESTURES / self._rate)
 
     @property
+    def _prior(self) -> Float[np.ndarray, "20 20"]:
+        """Precision of the prior of joint angles in one frame [1/rad^2]."""
+        return self._share * resting_prior().precision
+
+    def _doubted_prior(self) -> Float[np.ndarray, "20 20"]:
+        """The same where nobody knows what is usual for joints that do not move."""
+        angles = self.qpos[np.isfinite(self.qpos).all(axis=1), 7:]
+        own = own_variances(angles) * self._shown
+        return self._share * np.linalg.inv(resting_prior().covariance + np.diag(own))
+
+    @property
     def _weight_noise(self) -> float:
         """Noise and slow motion together [m], which weight a marker.
 
@@ -201,15 +224,16 @@ class _SmoothedHand:
 
     def _equations(self, window: _Window) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Normal matrices (F, 26, 26) and gradients (F, 26) of single frames."""
-        qpos, prior = self.qpos[window.frames], resting_prior()
+        qpos, prior = self.qpos[window.frames], self._prior
         normal, gradient, self._residuals[window.frames] = _frame_equations(
             self._hand, self._targets[window.frames], qpos, self._weight_noise**-2, _OUTLIER**-2
         )
         markers = normal[::_COUNTED].copy()
-        normal[:, :NUM_JOINTS, :NUM_JOINTS] += self._share * prior.precision
+        normal[:, :NUM_JOINTS, :NUM_JOINTS] += prior + self._sure
         normal += np.diag(_WEAK)
         self._count(slice(window.frames.start, window.frames.stop, _COUNTED), markers, normal[::_COUNTED])
-        gradient[:, :NUM_JOINTS] += self._share * (qpos[:, 7:] - prior.angles) @ prior.precision
+        gradient[:, :NUM_JOINTS] += (qpos[:, 7:] - resting_prior().angles) @ prior
+        gradient[:, :NUM_JOINTS] += np.nan_to_num(qpos[:, 7:] - self._known) @ self._sure
         return normal, gradient
 
     def _count(self, frames: slice, markers: NDArray[np.float64], whole: NDArray[np.float64]) -> None:

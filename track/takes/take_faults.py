@@ -20,6 +20,7 @@ from track.alternatives.alternatives import doubts_of
 from track.alternatives.hands import other_hands_of
 from track.hand_size import glove_shifts
 from track.kinematics.pose_solver import FEWEST_MARKERS
+from track.kinematics.pose_spread import own_variances, resting_prior
 from track.settings import USUAL_SIZE
 
 _FEWEST: Final = 60  # Faults are looked for from this many tracked frames of a hand on.
@@ -41,6 +42,8 @@ _SEEN: Final = 0.5  # share of the earlier frames in which it was seen
 AT_LIMIT: Final = 0.5
 """Tolerance within which a joint counts as being at its limit [deg]."""
 _OFTEN_AT_LIMIT: Final = 0.4  # share of the frames at the limit
+_OPEN: Final = 8.0  # [deg] standard deviation from which on the angle of a still joint is told
+_WIDER: Final = 0.5  # A joint is still if its own usual angle varies by this share of people's variance.
 _FITTED_FRAMES: Final = 120  # number of frames in which a slip of the glove is fitted
 
 
@@ -119,7 +122,7 @@ def _faults_of_hands(take: Take, *, is_last: bool) -> tuple[SuspectSpan, ...]:
         # Hands that are not measured, or of a user whom another follows, do not fit, which looks like a slip.
         is_usual = (take.settings.get("size"), take.settings.get("user")) == ("auto", USUAL_SIZE)
         slips = () if is_usual or not is_last or take.settings.get("size_state") else (_slips,)
-        for faults in (_alternatives, *slips, _fallen, _at_limits):
+        for faults in (_alternatives, *slips, _fallen, _at_limits, _still):
             found += faults(hand)
     return (*hands, *tuple({one.of: one for one in reversed(found)}.values())[::-1])
 
@@ -201,3 +204,17 @@ def _at_limits(hand: _Hand) -> Iterator[SuspectSpan]:
                 why = f"is at the model's limit, {limit:g} deg, in {share:.0f} % of frames from {start:.2f} s"
                 remedy = "calibrate the hand, or do not use this angle"
                 yield hand.span(first, joint.name, why, remedy, of_labels=False)
+
+
+def _still(hand: _Hand) -> Iterator[SuspectSpan]:
+    """Joints that do not move, so that angle and places of markers cannot be told apart."""
+    spread, number = hand.take.angle_spread, hand.take.hand_index(hand.side)
+    if spread is None:
+        return
+    spreads = np.rad2deg(np.median(spread[hand.frames, number], axis=0))
+    own = own_variances(hand.take.qpos[hand.frames, number, 7:])
+    for joint in np.flatnonzero((own > _WIDER * resting_prior().spread ** 2) & (spreads > _OPEN)):
+        name = JOINTS[joint].name
+        why = f"hardly moves; the places of its markers tell its angle to {spreads[joint]:.0f} deg"
+        remedy = f"measure the angle with a goniometer and name it, --known {name}=ANGLE"
+        yield hand.span(int(hand.frames[0]), name, why, remedy, of_labels=False)

@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from gloves import GloveFit, Take
 from gloves.takes.take import LOST, TRACKED
 from track.captures import track_capture
 from track.takes.smoothed_take import _SmoothedHand, _solve_in_time, _windows, smooth_take, times_unseen
@@ -50,6 +51,32 @@ def test_the_parts_of_the_deviations_sum_up_to_them(smooth):
             np.sqrt(np.nanmean(spread**2, axis=0)), np.linalg.norm(budget, axis=1), rtol=0.01
         )
         assert (np.array(smooth.settings["filter"][side]) > 0.5).all()
+
+
+@pytest.fixture(scope="module")
+def stiff():
+    """A hand with a boutonniere of the index finger, in a glove whose markers are not quite at their places."""
+    rng, take = np.random.default_rng(9), simulate_take("single-hand", num_frames=480, seed=9)
+    hand, qpos = take.hands[0], take.qpos[:, 0].copy()
+    qpos[:, [13, 14]] = np.deg2rad([60.0, -10.0])
+    shifted = hand.attachment.points + 0.0015 * rng.standard_normal(hand.attachment.points.shape)
+    worn = GloveFit(hand.model, dataclasses.replace(hand.attachment, points=shifted))
+    markers = worn.markers(qpos)[0] + 0.001 * rng.standard_normal((480, hand.layout.num_markers, 3))
+    truth = Take.of_poses([worn], qpos[:, None], rate=take.rate)
+    return truth, Take.of_truth(
+        [hand], qpos[:, None], markers, np.tile(np.arange(19), (480, 1)), np.tile(np.arange(19), (480, 1)), rate=take.rate
+    )
+
+
+@pytest.mark.parametrize("known", [{}, {"right:index_PIP_flexion": 60.0}], ids=["unknown", "known"])
+def test_angles_of_a_finger_that_does_not_move_follow_its_markers(stiff, known):
+    truth, seen = stiff
+    take = smooth_take(dataclasses.replace(seen, settings={"user": "auto, 190 mm", "known": known}))
+    off = np.rad2deg((take.qpos - truth.qpos)[:, 0, [13, 14]]).mean(axis=0)
+    told = np.rad2deg(take.angle_spread[:, 0, 6:8]).mean(axis=0)
+    assert (np.abs(off) < 2.0 * told).all()
+    assert (told < ([3.5, 12.0] if known else [16.0, 30.0])).all()
+    assert (np.abs(off) < ([4.0, 12.0] if known else [20.0, 30.0])).all()
 
 
 def test_markers_that_stay_off_their_places_widen_the_part_of_gluing(truth, fitted, rng):

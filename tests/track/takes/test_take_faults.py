@@ -45,6 +45,16 @@ def tracked(truth) -> Take:
     return track_capture(truth, hands=truth.hands, labeler="dense19")
 
 
+def test_a_joint_that_hardly_moves_is_named_unless_its_angle_is_sure(tracked):
+    qpos = tracked.qpos.copy()
+    qpos[..., [13, 14]] = np.deg2rad([60.0, -10.0])
+    for sure, names in ((12.0, {"right:index_PIP_flexion", "right:index_DIP_flexion"}), (3.0, set())):
+        spread = np.full_like(tracked.angle_spread, np.deg2rad(3.0))
+        spread[:, tracked.hand_index("right"), 6:8] = np.deg2rad(sure)
+        take = dataclasses.replace(tracked, qpos=qpos, angle_spread=spread)
+        assert {one.of for one in find_suspect_spans(take) if "hardly moves" in one.why} == names
+
+
 def columns_of(truth: Take, frame: int, marker: int) -> np.ndarray:
     return np.flatnonzero(truth.labels[frame] == marker)
 
