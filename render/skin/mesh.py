@@ -387,13 +387,8 @@ class PosableSkin:
         beyond = self._elbow - np.linalg.norm(np.diff(middles, axis=0), axis=1).sum()
         self._elbow_at: Doubles = middles[-1] + beyond * self._ahead
 
-    def forearm_line(self, qpos: Doubles, forearm: Doubles | None = None) -> tuple[Doubles, Doubles]:
-        """The elbow (3,) [m], and the unit direction (3,) to it from the wrist, in the world.
-
-        The direction is the one that is given, or that of a wrist at rest.
-        """
-        if forearm is not None:
-            return qpos[:3] + self._elbow * forearm, forearm
+    def forearm_line(self, qpos: Doubles) -> tuple[Doubles, Doubles]:
+        """The elbow (3,) [m] of a wrist at rest, and the unit direction (3,) to it, in the world."""
         rotation = quaternion_matrix(qpos[3:7])
         return qpos[:3] + rotation @ self._elbow_at, rotation @ self._ahead
 
