@@ -336,9 +336,11 @@ class Studio:
     def _drawn(self, moment: Moment, shift: float) -> list[Drawn]:
         """Surfaces of the hands and bodies that the frame has, `shift` seconds later."""
         drawn, poses = list[Drawn](), moment.hands(shift)
+        flesh = {index: self._hands[index].skin.flesh(pose) for index, pose in poses.items()}
         for number, (index, pose) in enumerate(poses.items()):
             arm = (None if ways is None else ways[index] for ways in (moment.upper_arms, moment.forearms))
-            drawn += self._hands[index].drawn(pose, number, *arm)
+            others = [one for other, one in flesh.items() if other != index]
+            drawn += self._hands[index].drawn(pose, number, *arm, others)
         for number, (index, T_world_body) in enumerate(moment.bodies(shift).items(), 1 + len(poses)):
             drawn += self._bodies[index].drawn(T_world_body, number)
         return drawn

@@ -180,8 +180,9 @@ class UserBody:
             *wrists.shape[:-2], -1, 3
         )
         axes = forearm_axes(wrists[..., None, :], elbows).reshape(-1, hands * tried, 2, 3)
-        points = np.broadcast_to(along, (*batch, *along.shape[-2:])).reshape(-1, *along.shape[-2:])
-        eyes = np.broadcast_to(eyes, (*batch, 3)).reshape(-1, 1, 3)
+        points = np.array(np.broadcast_to(along, (*batch, *along.shape[-2:])), order="C")
+        points = points.reshape(-1, *along.shape[-2:])
+        eyes = np.array(np.broadcast_to(eyes, (*batch, 3)), order="C").reshape(-1, 1, 3)
         return np.asarray(hiding_costs(axes, eyes, points).reshape(*batch, hands, tried))
 
 

@@ -114,7 +114,8 @@ class Framing:
         """
         if self._arms is None:
             return 1.0
-        hidden = most_hidden(self._arms[frames], positions, self.points[frames].astype(np.float64))
+        points = self.points[frames].astype(np.float64)
+        hidden = most_hidden(self._arms[frames], np.ascontiguousarray(positions), points)
         return float((hidden < _FREE).mean())
 
     def sampled(self) -> Integers:
