@@ -62,16 +62,16 @@ def bend_arms(
         ways = behind[hand, None] if arms.shoulders is None else arms.shoulders[hand] - elbows
         return _upper_arms(elbows, fore, ways, axis, cameras, points)
 
-    for hand, (wrist, ways, places, bends) in enumerate(zip(*arms[:4], strict=True)):
-        costs = bends + hiding_costs(forearm_axes(wrist, places)[None], eyes, points)[0]
-        best = costs.argsort(kind="stable")[:_COMPARED]
-        fore, elbows, costs = ways[best], places[best], costs[best]
-        way, (tried, bad) = fore, upper(hand, elbows, fore)
-        costs = costs + bad.min(axis=1)
+    for hand, (wrist, fore, elbows, costs) in enumerate(zip(*arms[:4], strict=True)):
+        way, elbow = fore, elbows
         if len(elbows) > 1:
-            mean = np.exp((costs.min() - costs) / _SOFTNESS) @ fore
+            bad = costs + hiding_costs(forearm_axes(wrist, elbows)[None], eyes, points)[0]
+            best = bad.argsort(kind="stable")[:_COMPARED]
+            bad = bad[best] + upper(hand, elbows[best], fore[best])[1].min(axis=1)
+            mean = np.exp((bad.min() - bad) / _SOFTNESS) @ fore[best]
             way = mean[None] / np.linalg.norm(mean)
-            tried, bad = upper(hand, wrist + np.linalg.norm(elbows[0] - wrist) * way, way)
+            elbow = wrist + np.linalg.norm(elbows[0] - wrist) * way
+        tried, bad = upper(hand, elbow, way)
         forearms[hand], upper_arms[hand] = way[0], tried[0, bad[0].argmin()]
     return forearms, upper_arms
 

@@ -336,11 +336,14 @@ class Studio:
     def _drawn(self, moment: Moment, shift: float) -> list[Drawn]:
         """Surfaces of the hands and bodies that the frame has, `shift` seconds later."""
         drawn, poses = list[Drawn](), moment.hands(shift)
-        flesh = {index: self._hands[index].skin.flesh(pose) for index, pose in poses.items()}
+        several = poses if len(poses) > 1 else {}
+        flesh = {index: self._hands[index].skin.flesh(pose) for index, pose in several.items()}
         for number, (index, pose) in enumerate(poses.items()):
-            arm = (None if ways is None else ways[index] for ways in (moment.upper_arms, moment.forearms))
+            upper, fore = (
+                None if ways is None else ways[index] for ways in (moment.upper_arms, moment.forearms)
+            )
             others = [one for other, one in flesh.items() if other != index]
-            drawn += self._hands[index].drawn(pose, number, *arm, others)
+            drawn += self._hands[index].drawn(pose, number, upper, fore, others)
         for number, (index, T_world_body) in enumerate(moment.bodies(shift).items(), 1 + len(poses)):
             drawn += self._bodies[index].drawn(T_world_body, number)
         return drawn
