@@ -1,11 +1,12 @@
 """Joints that do not move: whether their angles are found, and whether the stated deviations have the error.
 
-python -m benchmarks.patients FOLDER [--patients 24] [--seed 9300] [--healthy] [--seconds 12] [--frames right]
+python -m benchmarks.patients FOLDER [--patients 24] [--seed 9300] [--healthy] [--methods ...]
 
-Each simulated patient moves one hand in which one or two digits have two fixed joints: PIP and DIP of a finger,
-or MCP and IP of the thumb, anywhere between -20 and 90 and -15 and 60 degrees. The gloves dense19, sparse13 and
-starter15 take turns; they are worn with slips, and their markers move with the flesh. Each capture is tracked
-with measured hands, with --calibrate, and with the inner fixed joint of each digit known. With --healthy, the same people move without fixed joints.
+Each simulated patient moves one hand in which one or two digits have two fixed joints: PIP and DIP of a
+finger, or MCP and IP of the thumb, anywhere between -20 and 90 and -15 and 60 degrees. The gloves dense19,
+sparse13 and starter15 take turns; they are worn with slips, and their markers move with the flesh. Each capture
+is tracked with measured hands, with --calibrate, or with the inner fixed joint of each digit known. With
+--healthy, the same people move without fixed joints.
 
 The folder keeps captures and results, so that a stopped run continues.
 """
@@ -32,7 +33,10 @@ from train.simulation.scenes import CalibrationTakeConfig, sample_calibration_sc
 from train.simulation.training_frames import move_skin, sample_hands, wear_gloves
 
 GLOVES = ("dense19", "sparse13", "starter15")
-INNER, OUTER = (-20.0, 90.0), (-15.0, 60.0)  # [deg] of the PIP and DIP; of the thumb MCP and IP, within its ranges
+INNER, OUTER = (
+    (-20.0, 90.0),
+    (-15.0, 60.0),
+)  # [deg] of the PIP and DIP; of the thumb MCP and IP, within its ranges
 METHODS = ("measured", "calibrated", "known")
 
 
@@ -118,12 +122,14 @@ def main(
             for joint in [] if healthy else joints[1::2] if method == "known" else joints:
                 rows[method].append((found["mean"][joint], found["spread"][joint]))
                 true = take.settings["fixed"][JOINT_NAMES[joint]]
-                told.append(f"{JOINT_NAMES[joint]} {true:.0f}: {found['mean'][joint]:+.1f} +- {found['spread'][joint]:.1f}")
+                off, told_off = found["mean"][joint], found["spread"][joint]
+                told.append(f"{JOINT_NAMES[joint]} {true:.0f}: {off:+.1f} +- {told_off:.1f}")
             digits = {hand for hand in take.hands[0].attachment.digits.tolist() if hand >= 0}
             rest = [j for j in range(20) if j // 4 in digits and (healthy or j not in joints)]
             others[method] += [found["rmse"][joint] for joint in rest]
-            print(number, take.hands[0].layout.name, method, *told, f"rest {np.mean(np.array(found['rmse'])[rest]):.2f},",
-                  f"RMS {found['rms']:.2f} mm, {found['seconds']:.0f} s", sep="; ", flush=True)  # fmt: skip
+            moving = f"rest {np.mean(np.array(found['rmse'])[rest]):.2f}, RMS {found['rms']:.2f} mm"
+            name, spent = take.hands[0].layout.name, f"{found['seconds']:.0f} s"
+            print(number, name, method, *told, moving, spent, sep="; ", flush=True)
     figures: Figures = {}
     for method in methods:
         figures[f"{method}_rest"] = "RMSE of the joints that move [deg], mean", float(np.mean(others[method]))

@@ -51,6 +51,8 @@ SHEET: Final = "contact_sheet.png"
 _MERGED: Final = "checksums.json"  # checksums of the files that all shards make together
 _LEFT_OUT: Final = "left_out-{}.json"
 _CUT_OFF: Final = "cut_off-{}.json"
+_HIDDEN: Final = "hidden-{}.json"
+_VISIBLE: Final = "visible-{}.json"
 _DRAWN: Final = ".drawn-{}"  # file of a shard in progress, which has one byte for each of its pictures
 _SHOWN: Final = 0.5  # least share of a hand's keypoints in a picture that does not cut off the hand
 _ON_SHEET: Final = 9  # pictures on a contact sheet
@@ -96,7 +98,8 @@ def render_take(
     Returns:
         Number of pictures. Depth is in [m], pixels are in [px], as the format has them. Frames with a camera
         inside a hand or an object are left out; `left_out_frames` tells which, and `cut_off_pictures` which
-        pictures lack a hand of their frame.
+        pictures lack a hand of their frame. So are pictures without a visible keypoint, unless the cameras
+        are your own; `hidden_pictures` tells which, and `visible_hands` how many hands the pictures show.
 
     Raises:
         HandSimError: The take or the settings cannot be drawn, or all frames would be left out; finished
@@ -125,22 +128,25 @@ def render_take(
         output.claim(CONFIG, record, noun="rendering", error=HandSimError)
         counts = [views * len(shard) for shard in shards]
         drew = _draw_shards(output, formats, make, counts, workers, progress)
-        output.fetch(INDEX, _LEFT_OUT.format("*"))
-        lost = frozenset(left_out_frames(output.folder))
-        if not drew and _is_complete(output):
-            return views * sum(frame not in lost for shard in shards for frame in shard)
-        merged = [path for one in open_writers(output.folder, formats) for path in one.finish()]
+        output.fetch(INDEX, _LEFT_OUT.format("*"), _HIDDEN.format("*"))
+        lost, hidden = frozenset(left_out_frames(output.folder)), hidden_pictures(output.folder)
         drawn = [[frame for frame in shard if frame not in lost] for shard in shards]
-        if not any(drawn):
+        count = views * sum(map(len, drawn)) - len(hidden)
+        if not drew and _is_complete(output):
+            return count
+        merged = [path for one in open_writers(output.folder, formats) for path in one.finish()]
+        if not count:
             raise HandSimError(
                 f"{out}: no pictures: in all {len(lost)} frames a camera would be inside a hand or an "
                 "object; give another placement, distance or seed"
+                if lost and not hidden
+                else f"{out}: no pictures: none would show a hand; give another placement or seed"
             )
         merged += _write_sheet(output.folder, drawing, drawn)
         files = {path.relative_to(output.folder).as_posix(): path for path in merged}
         save_checksums(output.folder / _MERGED, files)
         output.publish(SHEET)
-    return views * sum(map(len, drawn))
+    return count
 
 
 def _draw_shards(
@@ -248,6 +254,16 @@ def cut_off_pictures(out: str | Place) -> list[str]:
     return _noted(out, _CUT_OFF, "pictures")
 
 
+def hidden_pictures(out: str | Place) -> list[str]:
+    """Pictures that a rendering left out: no keypoint of a hand would be visible."""
+    return _noted(out, _HIDDEN, "pictures")
+
+
+def visible_hands(out: str | Place) -> list[int]:
+    """Numbers of hands with a visible keypoint in the pictures of a rendering, in ascending order."""
+    return _noted(out, _VISIBLE, "hands")
+
+
 def _noted(out: str | Place, name: str, key: str) -> list[Any]:
     """What the workers wrote about all shards."""
     with open_output(out) as output:
@@ -302,7 +318,8 @@ def _render_shard(
         lost.append(frame)  # written before the shard, so that no kill loses it
         save_json(out / _LEFT_OUT.format(f"{shard:05d}"), {"frames": lost})
 
-    cut: list[str] = []
+    cut, hidden, visible = list[str](), list[str](), list[int]()
+    is_placed = config.view.cameras is None and subject.footage is None
 
     def counted() -> Iterator[RenderedFrame]:
         with (out / _DRAWN.format(shard)).open("ab", buffering=0) as drawn:
@@ -311,20 +328,27 @@ def _render_shard(
                     ((hand.keypoints >= 0.0) & (hand.keypoints < frame.camera.size)).all(axis=1)
                     for hand in frame.hands
                 ]
-                if any(float(shown.mean()) < _SHOWN for shown in inside):
-                    cut.append(frame.key)
-                yield frame
+                count = sum(bool(hand.visible.any()) for hand in frame.hands)
+                if is_placed and not count:
+                    hidden.append(frame.key)
+                else:
+                    visible.append(count)
+                    if any(float(shown.mean()) < _SHOWN for shown in inside):
+                        cut.append(frame.key)
+                    yield frame
                 drawn.write(b".")
         (out / _DRAWN.format(shard)).unlink(missing_ok=True)
-        if cut:
-            save_json(out / _CUT_OFF.format(f"{shard:05d}"), {"pictures": cut})
+        notes = (_CUT_OFF, "pictures", cut), (_HIDDEN, "pictures", hidden), (_VISIBLE, "hands", visible)
+        for name, key, noted in notes:
+            if noted:
+                save_json(out / name.format(f"{shard:05d}"), {key: noted})
 
     kept = list(counted()) if len(formats) > 1 else counted()
     record = out / checksums_name(shard)
     record.unlink(missing_ok=True)
     for writer in open_writers(out, formats):
         writer.write(shard, kept)
-    notes = [out / name.format(f"{shard:05d}") for name in (_LEFT_OUT, _CUT_OFF)]
+    notes = [out / name.format(f"{shard:05d}") for name in (_LEFT_OUT, _CUT_OFF, _HIDDEN, _VISIBLE)]
     there = {path.name: path for path in notes if path.is_file()}
     save_checksums(record, shard_files(out, formats, shard) | there)
     return shard

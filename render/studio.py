@@ -23,6 +23,7 @@ from handsim.kernels import kernel
 from handsim.motion_files.motion import joint_poses
 from handsim.space.camera import Camera
 from handsim.space.transforms import pose_matrices
+from render.arms import Arms, bend_arms
 from render.color_sensor import GAMMA, Exposure, combine, expose, light_of, linear_of, shutter_times
 from render.conditions import Conditions
 from render.config import RenderConfig
@@ -54,7 +55,7 @@ from render.scenery.backgrounds import (
     kept_background,
     surroundings_of_picture,
 )
-from render.skin.look import SkinLook, upper_arms
+from render.skin.look import SkinLook
 from render.user_body import UserBody
 
 
@@ -305,18 +306,21 @@ class Studio:
         )
 
     def reaching(self, moment: Moment, cameras: Sequence[Camera], user: UserBody | None = None) -> Moment:
-        """The moment with upper arms, the user's or others, that leave the pictures of these cameras."""
-        found, there = np.full((len(self._hands), 3), np.nan), moment.hands()
-        forearms = None if user is None else user.forearms[moment.frame]
-        if there:
-            lines = (
-                self._hands[number].skin.forearm_line(pose, None if forearms is None else forearms[number])
-                for number, pose in there.items()
-            )
-            elbows, ways = map(np.array, zip(*lines, strict=True))
-            shoulders = None if user is None else user.shoulders[[*there]]
-            found[[*there]] = upper_arms(elbows, ways, cameras, shoulders)
-        return dataclasses.replace(moment, upper_arms=found, forearms=forearms)
+        """The moment with arms, the user's or others, that leave hands free and the cameras' pictures."""
+        there = moment.hands()
+        if not there:
+            return moment
+        numbers = [*there]
+        if user is None:
+            lines = [self._hands[number].skin.forearm_line(pose) for number, pose in there.items()]
+            elbows, ways = (np.array(one)[:, None] for one in zip(*lines, strict=True))
+            arms = Arms(np.stack([*there.values()])[:, :3], ways, elbows, np.zeros(ways.shape[:2]))
+        else:
+            arms = user.arms(moment.take.qpos[moment.frame], numbers)
+        keypoints = [hand_keypoints(self._hands[n].fit.model, pose[None])[0] for n, pose in there.items()]
+        found = np.full((2, len(self._hands), 3), np.nan)
+        found[:, numbers] = bend_arms(arms, np.concatenate(keypoints), cameras)
+        return dataclasses.replace(moment, upper_arms=found[1], forearms=None if user is None else found[0])
 
     def is_clear(self, moment: Moment, cameras: Sequence[Camera]) -> bool:
         """Whether all cameras are outside of hands and objects, so that the moment can be drawn."""
@@ -332,9 +336,14 @@ class Studio:
     def _drawn(self, moment: Moment, shift: float) -> list[Drawn]:
         """Surfaces of the hands and bodies that the frame has, `shift` seconds later."""
         drawn, poses = list[Drawn](), moment.hands(shift)
+        several = poses if len(poses) > 1 else {}
+        flesh = {index: self._hands[index].skin.flesh(pose) for index, pose in several.items()}
         for number, (index, pose) in enumerate(poses.items()):
-            arm = (None if ways is None else ways[index] for ways in (moment.upper_arms, moment.forearms))
-            drawn += self._hands[index].drawn(pose, number, *arm)
+            upper, fore = (
+                None if ways is None else ways[index] for ways in (moment.upper_arms, moment.forearms)
+            )
+            others = [one for other, one in flesh.items() if other != index]
+            drawn += self._hands[index].drawn(pose, number, upper, fore, others)
         for number, (index, T_world_body) in enumerate(moment.bodies(shift).items(), 1 + len(poses)):
             drawn += self._bodies[index].drawn(T_world_body, number)
         return drawn

@@ -7,6 +7,7 @@ Drillis and Contini (1966), Body segment parameters, over that of the hand.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
@@ -14,6 +15,7 @@ from jaxtyping import Float
 
 from gloves import Take
 from handsim.space.transforms import quaternion_matrix
+from render.arms import Arms, forearm_axes, hiding_costs
 from render.frames import Doubles
 from render.skin.look import ELBOW
 
@@ -21,9 +23,9 @@ _HAND: Final = 0.108  # length of a hand, as a share of the stature
 _UPPER_ARM: Final = 0.186 / _HAND  # in hand lengths, as the next two
 _SHOULDER: Final = 0.129 / _HAND  # distance of a shoulder from the neck's axis
 _EYES: Final = (0.5, 0.118 / _HAND)  # before and above the shoulders; a head that looks down leans forward
-_WRIST: Final = np.deg2rad([[76.0, 75.0], [36.0, 22.0]])
-"""Largest flexion and extension, ulnar and radial deviation of a wrist [rad], a little less than the means of
-the American Academy of Orthopaedic Surgeons (1965)."""
+_WRIST: Final = np.deg2rad([[54.0, 60.0], [40.0, 17.0]])
+"""Largest flexion and extension, ulnar and radial deviation of a wrist [rad]: those of daily work (Ryu et al.
+1991, J. Hand Surg. 16A:409), about three quarters of what wrists can."""
 
 _FRAMES: Final = 8  # frames that places of the person are compared in
 _COARSE: Final = (np.deg2rad(np.arange(0.0, 360.0, 20.0)), [0.5, 0.65], np.deg2rad([35.0]), [0.0])
@@ -39,13 +41,14 @@ _UNUSUAL: Final = 0.15  # weight of the cost of other distances and angles
 _SWIVELS: Final = np.deg2rad(np.arange(-100.0, 101.0, 20.0))
 """Angles of the elbow about the line from the wrist to the shoulder that are tried [rad]; 0 is the lowest."""
 _SWIVEL: Final = np.deg2rad(50.0)  # spread of these angles
+_OUTWARDS: Final = (0.0, -0.4, 0.4)  # angles that shoulders turn forearms by when they give way [rad]
+_OUTWARD: Final = 0.4  # spread of these angles [rad]
 _SOFTNESS: Final = 0.3  # difference of costs within which elbows are averaged, so that they do not jump
 _OVERREACH: Final = 0.05  # distance beyond an arm's length whose cost is 1 [m]
-_HIDING: Final = (0.12, 0.04)  # distance of a forearm from a line of sight that it hides, and its spread [m]
 _NEAR: Final = (0.36, 0.06)  # distance of an arm before the eyes that takes up the view, and its spread [m]
 _RISE: Final = 0.1  # spread of the tangent by which elbows are seen above the middle of the view
 _VIEW: Final = np.cos(np.deg2rad(40.0))  # cosine of half the angle of the view that arms take up
-_ALONG: Final = np.linspace(0.25, 1.0, 4)  # places between wrist and elbow that are looked at
+_ALONG: Final = np.linspace(0.25, 1.0, 4)  # places along forearms and hands that are looked at
 _WORST: Final = 12.0  # largest cost of an arm that counts
 
 
@@ -82,6 +85,21 @@ class UserBody:
                 self.eyes, self.shoulders, self.right = eyes[first], shoulders[first], right[first]
         self.forearms = self._forearms(take.qpos)
 
+    def axes(self, wrists: Float[np.ndarray, "T H 3"], forearms: Float[np.ndarray, "T H 3"]) -> Doubles:
+        """Axes (T, 2 H, 2, 3) of forearms in these directions, and of upper arms to the shoulders [m]."""
+        elbows = wrists + (ELBOW * self._lengths)[:, None] * forearms
+        upper = np.stack(np.broadcast_arrays(elbows, self.shoulders), axis=-2)
+        return np.concatenate([forearm_axes(wrists, elbows), upper], axis=1)
+
+    def arms(self, qpos: Float[np.ndarray, "H 27"], hands: Sequence[int]) -> Arms:
+        """Where the arms can be of the hands with these numbers, in these poses of all."""
+        wrists, axes = qpos[:, :3], quaternion_matrix(qpos[:, 3:7])
+        tried = [self._elbows(wrists, axes, self.shoulders, self.eyes, tilt) for tilt in _OUTWARDS]
+        ways, costs = (np.concatenate(parts, axis=1) for parts in zip(*tried, strict=True))
+        costs += np.repeat(np.square(np.array(_OUTWARDS) / _OUTWARD), len(_SWIVELS))
+        elbows = wrists[:, None] + (ELBOW * self._lengths)[:, None, None] * ways
+        return Arms(wrists[hands], ways[hands], elbows[hands], costs[hands], self.shoulders[hands])
+
     def _stand(
         self, middle: Doubles, azimuth: Doubles, distance: Doubles, down: Doubles, facing: Doubles
     ) -> tuple[Doubles, Doubles, Doubles]:
@@ -107,9 +125,12 @@ class UserBody:
         return np.asarray(mean / np.linalg.norm(mean, axis=-1, keepdims=True))
 
     def _elbows(
-        self, wrists: Doubles, axes: Doubles, shoulders: Doubles, eyes: Doubles
+        self, wrists: Doubles, axes: Doubles, shoulders: Doubles, eyes: Doubles, outwards: float = 0.0
     ) -> tuple[Doubles, Doubles]:
-        """Unit directions (..., H, S, 3) from wrists to the elbows that are tried, and their costs."""
+        """Unit directions (..., H, S, 3) from wrists to the elbows that are tried, and their costs.
+
+        Forearms are turned outwards [rad] from where they reach shoulders that do not move.
+        """
         fore, upper = ELBOW * self._lengths, _UPPER_ARM * self._lengths
         line = shoulders - wrists
         distance = np.linalg.norm(line, axis=-1)
@@ -121,6 +142,9 @@ class UserBody:
         swivel = _SWIVELS[:, None]
         circle = np.cos(swivel) * down[..., None, :] + np.sin(swivel) * np.cross(line, down)[..., None, :]
         radius = np.sqrt(np.maximum(1.0 - along**2, 0.0))
+        if outwards:
+            angle = np.arctan2(radius, along) + outwards
+            along, radius = np.cos(angle), np.sin(angle)
         ways = (along[..., None] * line)[..., None, :] + radius[..., None, None] * circle
         ways, load = _bent_wrists(ways, axes[..., None, :, :], self._mirrors[:, None])
         costs = load**2 + np.square(_SWIVELS / _SWIVEL)
@@ -140,18 +164,26 @@ class UserBody:
             axis=-1
         ).clip(0.1)
         costs = np.square(np.maximum(rise, 0.0) / _RISE)
+        near = np.maximum(_NEAR[0] - far, 0.0) / _NEAR[1]
         for hand in range(palms.shape[-2]):
             sight = palms[..., hand, :] - eyes
-            length = np.linalg.norm(sight, axis=-1)
-            sight = np.nan_to_num(sight / length[..., None])[..., None, None, None, :]
-            length = np.nan_to_num(length)[..., None, None, None]
-            depth = (places * sight).sum(axis=-1)
-            beside = np.sqrt(np.maximum(far**2 - depth**2, 0.0))
-            hides = np.maximum(_HIDING[0] * depth / np.maximum(length, 0.1) - beside, 0.0) / _HIDING[1]
-            costs += np.square(np.where((depth > 0.0) & (depth < length), hides, 0.0)).max(axis=-1)
-            near = np.maximum(_NEAR[0] - far, 0.0) / _NEAR[1]
+            sight = np.nan_to_num(sight / np.linalg.norm(sight, axis=-1, keepdims=True))
+            depth = (places * sight[..., None, None, None, :]).sum(axis=-1)
             costs += np.square(np.where(depth > _VIEW * far, near, 0.0)).max(axis=-1)
-        return np.asarray(costs)
+        return np.asarray(costs) + self._hiding(ways, wrists, wrists + 2.0 * (palms - wrists), eyes)
+
+    def _hiding(self, ways: Doubles, wrists: Doubles, tips: Doubles, eyes: Doubles) -> Doubles:
+        """Costs (..., H, S) of forearms that hide hands, from wrists to tips of flat ones, from the eyes."""
+        elbows = wrists[..., None, :] + (ELBOW * self._lengths)[:, None, None] * ways
+        batch, (hands, tried) = ways.shape[:-3], ways.shape[-3:-1]
+        along = (wrists[..., None, :] + _ALONG[:, None] * (tips - wrists)[..., None, :]).reshape(
+            *wrists.shape[:-2], -1, 3
+        )
+        axes = forearm_axes(wrists[..., None, :], elbows).reshape(-1, hands * tried, 2, 3)
+        points = np.array(np.broadcast_to(along, (*batch, *along.shape[-2:])), order="C")
+        points = points.reshape(-1, *along.shape[-2:])
+        eyes = np.array(np.broadcast_to(eyes, (*batch, 3)), order="C").reshape(-1, 1, 3)
+        return np.asarray(hiding_costs(axes, eyes, points).reshape(*batch, hands, tried))
 
 
 def _middle(points: Doubles) -> Doubles:

@@ -23,6 +23,7 @@ from handsim.space.camera import Camera, look_at, preset
 from handsim.space.rig import load_rig
 from handsim.space.rig_formats import load_cameras
 from handsim.space.transforms import UpAxis, quaternion_matrix, rigid, upright
+from render.arms import most_hidden
 from render.frames import Doubles, Flags, Floats, Integers
 from render.user_body import UserBody
 
@@ -54,6 +55,7 @@ class Framing:
                 rows = there[first : first + _CHUNK]
                 self.points[rows, number] = hand_keypoints(hand.model, take.qpos[rows, number])[:, _OUTLINE]
         self._there = np.isfinite(self.points[..., 0, 0])
+        self._arms = None if user is None else user.axes(take.qpos[..., :3], user.forearms)
         known = np.flatnonzero(self._there.any(axis=1))
         flat = self.points[known].reshape(len(known), -1, 3).astype(np.float64)
         middles = 0.5 * (np.nanmin(flat, axis=1) + np.nanmax(flat, axis=1))
@@ -104,6 +106,21 @@ class Framing:
             covered = common / np.maximum((high - low).prod(axis=-1).min(axis=1), 1e-9)
             total = total * (1.0 - np.nan_to_num(covered))
         return np.where(there.any(axis=1), total, np.nan)
+
+    def free(self, positions: Doubles, frames: Integers) -> float:
+        """Share of these frames with half of each hand's keypoints, and more, that arms leave free.
+
+        The cameras are at these positions (F, 3) [m]. Nobody has arms if their user is not known.
+        """
+        if self._arms is None:
+            return 1.0
+        points = self.points[frames].astype(np.float64)
+        hidden = most_hidden(self._arms[frames], np.ascontiguousarray(positions), points)
+        return float((hidden < _FREE).mean())
+
+    def sampled(self) -> Integers:
+        """Some frames, in which views are compared."""
+        return np.unique(np.linspace(0, len(self.points) - 1, _SAMPLES).astype(int))
 
     def shortest(
         self, camera: Camera, centers: Doubles, rotations: Doubles, frames: Integers | None = None
@@ -174,6 +191,9 @@ _SAMPLES: Final = 48  # frames in which they are compared
 _CENTERINGS: Final = 2  # times that a camera is turned to the middle of what it sees
 _LINGER: Final = 20.0  # exponent of the hands' share in the time that an orbit spends on a view
 _QUICKEST: Final = 0.02  # shortest time at an azimuth of an orbit, as a share of the longest
+_FREE: Final = 0.4  # largest share of a hand's keypoints that arms hide in a picture that shows it
+_USUALLY: Final = 0.97  # share of pictures that show all hands up to which other places are tried
+_GIVES_WAY: Final = 3.0  # power of that share that outweighs the size of the hands
 _ASIDE: Final = np.deg2rad(90.0)  # largest angle that is added to the usual one from the front
 _ARM_CLEARANCE: Final = np.deg2rad(35.0)  # least angle between a view and a forearm
 
@@ -399,13 +419,15 @@ def _largest(
     config: ViewConfig, framing: Framing, ways: Iterator[Doubles], rng: np.random.Generator
 ) -> _Path:
     """A camera in the first of these directions (T, 3) that shows hands large enough, or in the best one."""
-    best, chosen = np.inf, None
+    best, chosen, frames = np.inf, None, framing.sampled()
     for directions in ways:
         farther, path = _followed(config, framing, directions, rng)
-        if chosen is None and (config.distance or farther <= _ENOUGH):
+        free = framing.free(path.poses[frames, :3, 3], frames)
+        if chosen is None and (config.distance or farther <= _ENOUGH) and free >= _USUALLY:
             return path
         shares = framing.shares(path.camera, path.poses, _CLOSER * config.share)
-        smaller = config.share / max(float(np.nanmedian(shares)), 1e-6)
+        smaller = 1.0 if config.distance else config.share / max(float(np.nanmedian(shares)), 1e-6)
+        smaller /= max(min(free / _USUALLY, 1.0), 1e-6) ** _GIVES_WAY
         if smaller < best:
             best, chosen = smaller, path
         if best <= _ENOUGH:
@@ -417,15 +439,15 @@ def _largest(
 def _lingering(config: ViewConfig, framing: Framing, turned: Doubles, elevation: float) -> Doubles:
     """Azimuths (T,) of an even turn, changed so that they pass quickly where hands would be small."""
     camera, azimuths = preset(config.camera), np.linspace(0.0, 2.0 * np.pi, _AZIMUTHS, endpoint=False)
-    frames = np.unique(np.linspace(0, len(turned) - 1, _SAMPLES).astype(int))
-    shares = []
+    frames, shares = framing.sampled(), []
     for azimuth in azimuths:
         directions = np.tile(_spherical(azimuth, elevation), (len(frames), 1))
         centers, rotations = framing.centers[frames], looking(directions)
         away = framing.shortest(camera, centers, rotations, frames)[:, None] * directions
         poses = rigid(rotations, centers + away)
-        shares.append(np.nanmedian(framing.shares(camera, poses, _CLOSER * config.share, frames)))
-    time = np.minimum(np.array(shares) / config.share, 1.0) ** _LINGER
+        share = np.nanmedian(framing.shares(camera, poses, _CLOSER * config.share, frames))
+        shares.append(min(share, config.share) * framing.free(poses[:, :3, 3], frames))
+    time = (np.array(shares) / config.share) ** _LINGER
     time = np.maximum(time, _QUICKEST * time.max())
     passed = np.concatenate([[0.0], np.cumsum(time)]) / time.sum() * 2.0 * np.pi
     laps, rest = np.divmod(turned, 2.0 * np.pi)

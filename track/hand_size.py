@@ -477,9 +477,9 @@ def _fit(frames: Sequence[StreamedFrame], hands: Sequence[GloveFit], labeler: La
             near.append(int((distances_to_nearest(free, hand.markers) < AT_HAND).sum()))
             odds = score(markers - missing[-1], hand.rms)
             log_odds += max(0.0, odds - _PENALTY * (missing[-1] + near[-1]))
-    there = [unseen[side] for side, times in found.items() if times]
-    lost = max((_lost_digit(hands[0], one) for one in there), key=len, default=set[int]())
-    is_whole = not any(one - lost for one in there)
+    gone = [unseen[side] for side, times in found.items() if times]
+    lost = max((_lost_digit(hands[0], one) for one in gone), key=len, default=set[int]())
+    is_whole = not any(one - lost for one in gone)
     is_good = (
         count >= _FOUND * len(frames)
         and float(np.median(rms)) <= _MOST_RMS

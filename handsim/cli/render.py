@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from pathlib import Path
 from typing import Annotated, cast
 
@@ -16,7 +17,14 @@ from handsim.files.outputs import check_outputs
 from handsim.hand.shape import Side
 from render.config import RenderConfig
 from render.formats.writer import merge_renderings
-from render.session import SHEET, cut_off_pictures, left_out_frames, render_take
+from render.session import (
+    SHEET,
+    cut_off_pictures,
+    hidden_pictures,
+    left_out_frames,
+    render_take,
+    visible_hands,
+)
 from render.subject import CSV, PoseFile
 
 
@@ -93,6 +101,13 @@ def render(
         )
     if cut := cut_off_pictures(place):
         print_line(f"{out}: images that lack a hand of their frame: {len(cut)} (the first: {cut[0]})")
+    if hidden := hidden_pictures(place):
+        print_line(
+            f"{out}: images left out: {len(hidden)} (the first: {hidden[0]}), which would show no hand"
+        )
+    if visible := Counter(visible_hands(place)):
+        shown = (f"{hands or 'no'} hand{'s' * (hands > 1)} in {visible[hands]}" for hands in sorted(visible))
+        print_line(f"{out}: images show {', '.join(shown)}")
     if counts and counts[0][0] == counts[0][1]:
         print_line(f"{out}: complete already, with all of its {count} images")
     else:

@@ -156,9 +156,10 @@ class HandFigure:
         number: int,
         upper_arm: Float[np.ndarray, "3"] | None = None,
         forearm: Float[np.ndarray, "3"] | None = None,
+        others: Sequence[tuple[Doubles, Doubles]] = (),
     ) -> list[Drawn]:
-        """Skin, and markers on their bases where a glove is worn."""
-        skin, first_part = self.skin.posed(qpos, upper_arm, forearm), 1 + PARTS_A_HAND * number
+        """Skin, and markers on their bases where a glove is worn, beside the flesh of others."""
+        skin, first_part = self.skin.posed(qpos, upper_arm, forearm, others), 1 + PARTS_A_HAND * number
         count = len(skin.faces)
         triangles = Triangles(
             skin.vertices,

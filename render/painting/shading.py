@@ -213,7 +213,7 @@ def _fall(
         distance /= count
 
 
-_FACING: Final = np.float32(0.04)  # specular reflectance of dielectrics at normal incidence
+_FACING: Final = np.float32(0.028)  # specular reflectance at normal incidence, of skin (index 1.4)
 _LIFT: Final = 1.7  # distance from a slanted surface at which shadows are looked up [biases]
 _UNDER: Final = 0.012  # thickness of skin that light passes at a scatter of 1 [m]
 _PI: Final = np.float32(np.pi)

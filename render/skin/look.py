@@ -23,7 +23,6 @@ from handsim._checks import check_choice, check_type
 from handsim.errors import ArgumentError
 from handsim.hand.shape import HandShape
 from handsim.settings import Limits, Settings
-from handsim.space.camera import Camera
 from handsim.space.transforms import MIRROR, cross
 from render.fields import smooth
 from render.frames import Doubles
@@ -190,16 +189,10 @@ BEND: Final = 0.32
 """Length of the bend of the wrist [hand lengths]."""
 ELBOW: Final = _PLACES[4]
 """Place of the elbow behind the wrist [hand lengths]."""
-ELBOW_BEND: Final = 0.07
+ELBOW_BEND: Final = 0.05
 """Length on either side of the elbow that bends with it [m]."""
 REACH: Final = 1.8
 """Length behind the elbow of arms that leave a picture [m]."""
-_TURNS: Final = np.deg2rad([0, 20, -20, 40, -40, 60, -60, 90, -90, 120, -120, 150, -150, 180])
-_TILTS: Final = (0.0, 0.4)  # slopes of an upper arm towards the cameras that are tried
-_DOWN: Final = np.array([0.0, 0.0, -0.5])  # downward part of the direction from the elbows to the body
-_MOST_BENT: Final = np.cos(np.deg2rad(130.0))  # cosine of the largest angle of an elbow
-_CLEAR: Final = 0.12  # least distance between an upper arm and a camera [m]
-_MARGIN: Final = 0.1  # border around a picture where no arm may end, as a share of its size
 
 
 @dataclass(frozen=True, slots=True)
@@ -315,56 +308,6 @@ def bent_rings(
     bent = rings.copy()
     bent[turned] = places[:, None] + offsets
     return bent
-
-
-def upper_arms(
-    elbows: Doubles, forearms: Doubles, cameras: Sequence[Camera], shoulders: Doubles | None = None
-) -> Doubles:
-    """Unit directions (H, 3) from elbows in which arms leave the pictures of all cameras, if possible.
-
-    They are those to shoulders (H, 3) where these are known and the pictures allow it.
-    """
-    axis = np.mean([camera.T_world_camera[:3, 2] for camera in cameras], axis=0)
-    if np.linalg.norm(axis) < 0.2:  # the cameras stand all around the arms
-        axis = cameras[0].T_world_camera[:3, 2]
-    axis = axis / np.linalg.norm(axis)
-    body = forearms.mean(axis=0) * [1.0, 1.0, 0.0] + _DOWN
-    body -= (body @ axis) * axis
-    body /= max(float(np.linalg.norm(body)), 1e-6)
-    if shoulders is None:
-        flat = forearms - (forearms @ axis)[:, None] * axis
-        level = np.linalg.norm(flat, axis=1, keepdims=True)
-        back = np.minimum(flat @ body, 0.0)[:, None] / np.maximum(level, 1e-6) ** 2
-        ways = flat + (1.0 - level) * (body - back * np.minimum(5.0 * level, 1.0) * flat)
-        ways[np.linalg.norm(ways, axis=1) < 1e-3] = cameras[0].T_world_camera[:3, 1]
-    else:
-        ways = shoulders - elbows
-    ways = ways / np.linalg.norm(ways, axis=1, keepdims=True)
-    arms = zip(elbows, forearms, ways, strict=True)
-    return np.array([_out_of_pictures(*one, axis, cameras) for one in arms])
-
-
-def _out_of_pictures(
-    elbow: Doubles, forearm: Doubles, way: Doubles, axis: Doubles, cameras: Sequence[Camera]
-) -> Doubles:
-    """The direction nearest to `way`, rotated about `axis`, in which an arm ends in no picture."""
-    aside = cross(axis, way)
-    flat = np.cos(_TURNS)[:, None] * way + np.sin(_TURNS)[:, None] * aside
-    tried = np.concatenate([flat - tilt * axis for tilt in _TILTS])
-    tried /= np.linalg.norm(tried, axis=1, keepdims=True)
-    bad = np.tile(np.abs(_TURNS), len(_TILTS)) / np.pi + np.repeat(_TILTS, len(_TURNS))
-    bad += 3.0 * (tried @ forearm < _MOST_BENT)
-    ends = elbow + REACH * tried
-    for camera in cameras:
-        size = np.array(camera.size, dtype=np.float64)
-        with np.errstate(invalid="ignore"):
-            pixels = camera.project(ends) / size
-        inside = (np.abs(pixels - 0.5) < 0.5 + _MARGIN).all(axis=1)
-        bad += 10.0 * (inside & (camera.local(ends)[:, 2] > 0.0))
-        to_camera = camera.T_world_camera[:3, 3] - elbow
-        nearest = np.clip(tried @ to_camera, 0.0, REACH)[:, None] * tried
-        bad += 5.0 * (np.linalg.norm(to_camera - nearest, axis=1) < _CLEAR)
-    return np.asarray(tried[int(bad.argmin())])
 
 
 def _half_axes(shape: HandShape, forearm: Forearm, behind: Doubles) -> tuple[Doubles, Doubles]:

@@ -15,7 +15,7 @@ smooth hills on the skin at rest, whose heights follow angles. Heights are those
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
@@ -387,13 +387,8 @@ class PosableSkin:
         beyond = self._elbow - np.linalg.norm(np.diff(middles, axis=0), axis=1).sum()
         self._elbow_at: Doubles = middles[-1] + beyond * self._ahead
 
-    def forearm_line(self, qpos: Doubles, forearm: Doubles | None = None) -> tuple[Doubles, Doubles]:
-        """The elbow (3,) [m], and the unit direction (3,) to it from the wrist, in the world.
-
-        The direction is the one that is given, or that of a wrist at rest.
-        """
-        if forearm is not None:
-            return qpos[:3] + self._elbow * forearm, forearm
+    def forearm_line(self, qpos: Doubles) -> tuple[Doubles, Doubles]:
+        """The elbow (3,) [m] of a wrist at rest, and the unit direction (3,) to it, in the world."""
         rotation = quaternion_matrix(qpos[3:7])
         return qpos[:3] + rotation @ self._elbow_at, rotation @ self._ahead
 
@@ -401,10 +396,19 @@ class PosableSkin:
         """The arm's rings (K, R, 3)."""
         return rest[skin_atlas().num_hand : -1].reshape(RINGS, -1, 3)
 
+    def flesh(self, qpos: Doubles) -> tuple[Doubles, Doubles]:
+        """Axes (K, 2, 3) and radii (K,) of the flesh around this hand's bones in one pose [m]."""
+        capsules = self.model.capsules
+        return capsules.posed(self.model.forward_kinematics(qpos[None]))[0], capsules.radii * _FLESH
+
     def posed(
-        self, qpos: Doubles, upper_arm: Doubles | None = None, forearm: Doubles | None = None
+        self,
+        qpos: Doubles,
+        upper_arm: Doubles | None = None,
+        forearm: Doubles | None = None,
+        others: Sequence[tuple[Doubles, Doubles]] = (),
     ) -> DrawnSkin:
-        """The skin in one pose.
+        """The skin in one pose, in the ambient light that the `flesh` of others leaves.
 
         Without the upper arm's direction (3,) the arm is straight and short, and without the forearm's the
         wrist is at rest.
@@ -423,7 +427,10 @@ class PosableSkin:
         points = self.merged(transforms, shaped)
         normals = vertex_normals(points, self.faces)
         occluded = self._occluded(transforms, points, normals)
-        shade = np.clip(1.0 - np.maximum(occluded - self._rest_occluded, 0.0), _DARKEST, 1.0)
+        shade = 1.0 - np.maximum(occluded - self._rest_occluded, 0.0)
+        for axes, radii in others:
+            shade *= 1.0 - _occluded_share(points, normals, axes, radii)
+        shade = np.clip(shade, _DARKEST, 1.0)
         shade *= np.exp(_PALE * raised)
         corners = atlas.corners
         return DrawnSkin(

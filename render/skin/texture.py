@@ -308,7 +308,7 @@ def _tangent_scales() -> tuple[Doubles, Doubles, Doubles]:
 
 _SHADED: Final = 0.006  # length of skin in the shadow of a sleeve [m]
 _SHADE: Final = 0.4  # share of the lightness that this shadow takes
-_FOLD: Final = 0.002  # height of a sleeve's folds [m]
+_FOLD: Final = 0.001  # height of a sleeve's folds [m]
 _STITCH: Final = 0.0034  # period of a glove's knit [m]
 _CREASE: Final = (-0.012, 0.035)  # distances behind the wrist between which the palm's skin ends [m]
 _VEIN: Final = 0.0017  # half width of a vein [m]
@@ -500,7 +500,7 @@ def _sleeve(paint: _Paint, forearm: Forearm, rng: np.random.Generator) -> None:
         paint.lab[:, channel] += cloth * (painted - paint.lab[:, channel])
     inside = smooth(behind, -_SHADED, 0.0) * (1.0 - smooth(behind, 0.5 * CUFF, CUFF))
     paint.lab[:, 0] *= 1.0 - np.float32(_SHADE) * inside
-    paint.roughness[:] += cloth * (0.9 - paint.roughness)
+    paint.roughness[:] += cloth * (1.0 - paint.roughness)
     paint.height[:] += cloth * (np.float32(_FOLD) * folds - paint.height)
 
 

@@ -10,15 +10,18 @@ from typing import get_args
 import cv2
 import numpy as np
 import pytest
+import trimesh
 from pycocotools.coco import COCO
 
-from gloves import load_take
+from gloves import Take, attach, load_layout, load_take
+from gloves.takes.bodies import RigidBody
 from handsim import Camera, HandModel, HandSimError, Lens, join_qpos, look_at
 from handsim.cli.main import main
 from handsim.errors import ArgumentError
 from handsim.hand.model import hand_keypoints
 from handsim.motion_files.motion import OPENXR_JOINTS, joint_poses
 from handsim.space.camera import pinhole, preset
+from handsim.space.objects import load_object
 from handsim.space.transforms import quaternion_matrix, rigid, turned_poses
 from poses import sample_poses
 from render import Backgrounds, DepthSensor, RenderConfig, ViewConfig, draw, render_take
@@ -26,7 +29,7 @@ from render.config import resolve
 from render.drawing import Drawing
 from render.frames import FOREARM, PARTS_A_HAND, PASSES
 from render.scenery.backgrounds import photo_files
-from render.session import SHEET, cut_off_pictures, left_out_frames
+from render.session import SHEET, cut_off_pictures, left_out_frames, visible_hands
 from render.skin.look import TONES
 from render.studio import Moment, Studio
 from render.subject import subject_of_take
@@ -478,6 +481,29 @@ def test_pictures_that_lack_a_hand_are_told(path, tmp_path):
     config = dataclasses.replace(PLAIN, view=ViewConfig(), every=1)
     render_take(qpos, tmp_path / "out", ["png"], config, model=models, camera=eye, workers=1)
     assert "eye_000001" in cut_off_pictures(tmp_path / "out")
+
+
+def test_pictures_that_show_no_hand_are_left_out_and_counted(tmp_path, capsys):
+    """In the first of two frames, a box is around the hand."""
+    trimesh.creation.box((0.3, 0.2, 0.2)).export(tmp_path / "box.obj")
+    poses = np.tile([0.1, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0], (2, 1, 1))
+    poses[1, 0, 2] = -20.0
+    fit, bodies = attach(load_layout("dense19"), MODEL), [RigidBody.of(load_object(tmp_path / "box.obj"))]
+    qpos = join_qpos(np.zeros((2, 20)))[:, None]
+    Take.of_poses([fit], qpos, rate=60.0, bodies=bodies, body_poses=poses).save(tmp_path / "take.npz")
+    words = f"render {tmp_path / 'take.npz'} --out {tmp_path / 'out'} --format png --passes depth --workers 1"
+    for done in ("1 images in", "complete already, with all of its 1 images"):
+        assert main(words.split()) == 0
+        said = capsys.readouterr().out
+        assert done in said and "images show 1 hand in 1\n" in said
+        assert "images left out: 1 (the first: view0_000000), which would show no hand" in said
+    assert [file.stem for file in (tmp_path / "out" / "depth").rglob("*.png")] == ["view0_000001"]
+    with pytest.raises(HandSimError, match="no pictures: none would show a hand"):
+        render_take(tmp_path / "take.npz", tmp_path / "none", "png", BARE, frames=(0,), workers=1)
+    eye = Drawing(subject_of_take(load_take(tmp_path / "take.npz")), resolve()).viewpoints.cameras(0)[0]
+    own = dataclasses.replace(BARE, view=ViewConfig(cameras=(eye,)))
+    assert render_take(tmp_path / "take.npz", tmp_path / "own", "png", own, workers=1) == 2
+    assert visible_hands(tmp_path / "own") == [0, 1]
 
 
 def test_depth_sensors_see_hands_of_all_tones_alike(path):

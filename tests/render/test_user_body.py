@@ -27,8 +27,8 @@ def test_wrists_bend_no_farther_than_wrists_do(take):
         x, y, z = rotations(take.qpos[:, number]).inv().apply(forearms[:, number]).T
         flexion = np.rad2deg(np.arctan2(-z, -x))
         radial = np.rad2deg(np.arcsin(y if hand.side == "right" else -y))
-        assert flexion.min() >= -75.1 and flexion.max() <= 76.1
-        assert radial.min() >= -36.1 and radial.max() <= 22.1
+        assert flexion.min() >= -60.1 and flexion.max() <= 54.1
+        assert radial.min() >= -40.1 and radial.max() <= 17.1
 
 
 def test_elbows_do_not_jump(take):

@@ -130,7 +130,7 @@ class Fit(NamedTuple):
 
 
 class NormalEquations(NamedTuple):
-    """Gauss-Newton matrix and gradient in blocks: poses of each frame, S shared unknowns, and usual angles."""
+    """Gauss-Newton matrix and gradient in blocks: poses of a frame, S shared unknowns, and usual angles."""
 
     pose: Float[np.ndarray, "F 26 26"]
     mixed: Float[np.ndarray, "F 26 S"]
@@ -188,7 +188,7 @@ class Problem:
     def pose_precision(self) -> Float[np.ndarray, "20 20"]:
         """Precision of joint angles in one frame around the person's usual ones [1/rad^2]."""
         roots = np.sqrt(np.minimum(1.0, self._counts / len(self.targets)))
-        return np.outer(roots, roots) * resting_prior().precision
+        return np.asarray(np.outer(roots, roots) * resting_prior().precision)
 
     @property
     def usual_precision(self) -> Float[np.ndarray, "20 20"]:

@@ -47,8 +47,8 @@ def test_light_from_everywhere_shows_a_surface_in_its_own_color(level: float, st
 def test_a_wall_that_faces_the_lamp_sends_back_its_color_and_a_glint() -> None:
     wall = thing(trimesh.creation.box((8.0, 8.0, 0.1)).apply_translation([0, 0, 2.0]), plain(), smooth=False)
     shown = paint(CAMERA, [wall], Lighting((Lamp((0.0, 0.0, -1.0), 1.0),), DARK))[36, 48]
-    # What is not mirrored of its 0.5, and the peak of chalk's microfacets: a quarter of 0.04.
-    light = 0.5 * 0.96 * 0.96 + 0.04 / 4
+    # What is not mirrored of its 0.5, and the peak of chalk's microfacets: a quarter of 0.028.
+    light = 0.5 * 0.972 * 0.972 + 0.028 / 4
     assert np.abs(shown[:3] - 255.0 * light ** (1 / 2.2)).max() <= 1.5
     behind = paint(CAMERA, [wall], Lighting((Lamp((0.0, 0.0, 1.0), 1.0),), DARK))[36, 48]
     assert behind.tolist() == [0, 0, 0, 255]
@@ -60,7 +60,7 @@ def test_bright_pictures_do_not_end_at_white() -> None:
         lighting = Lighting((Lamp((0.0, 0.0, -1.0), strength),), DARK)
         whole, bright = paint(CAMERA, [wall], lighting), paint(CAMERA, [wall], lighting, "bright")
         assert np.abs(np.minimum(bright, 255.0) - whole).max() <= 0.75
-        wanted = strength * (0.5 * 0.96 * 0.96 + 0.04 / 4)
+        wanted = strength * (0.5 * 0.972 * 0.972 + 0.028 / 4)
         if wanted > 1.0:
             assert light_of(bright[36, 48, :3]) == pytest.approx([wanted] * 3, rel=5e-3)
 
@@ -145,10 +145,10 @@ def test_light_stays_where_it_is_for_cameras_all_around_and_rolled_ones() -> Non
         for lamp in lighting.lamps:
             towards = np.array(lamp.direction) / np.linalg.norm(lamp.direction)
             half = towards + views
-            fresnel = 0.04 + 0.96 * (1.0 - 0.5 * np.linalg.norm(half, axis=1)) ** 5
+            fresnel = 0.028 + 0.972 * (1.0 - 0.5 * np.linalg.norm(half, axis=1)) ** 5
             cosine = np.maximum(normals @ towards, 0.0)
             mirrored = cosine * fresnel / (4.0 * (0.5 * facing + 0.5) * (0.5 * cosine + 0.5))
-            matt = 0.4 * 0.96 * (1.0 - fresnel) * cosine
+            matt = 0.4 * 0.972 * (1.0 - fresnel) * cosine
             light += (lamp.strength * (matt + mirrored))[:, None] * lamp.color
             edge |= np.abs(normals @ towards) < 0.1  # beside the edge of a shadow
         shown = (painted[rows, columns, :3] / 255.0) ** 2.2

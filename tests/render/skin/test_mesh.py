@@ -39,6 +39,17 @@ def test_the_hands_own_vertices_are_the_models(model: HandModel) -> None:
     assert model.surface.vertices[gone, 0].max() < -0.003
 
 
+def test_another_hand_takes_light_where_it_is_near_and_nowhere_else(model: HandModel) -> None:
+    mesh, qpos = PosableSkin(model), join_qpos(gesture("flat")[None])[0]
+    below, far = join_qpos(np.tile(gesture("flat"), (2, 1)), position=np.array([[0, 0, -0.04], [0, 0, -5.0]]))
+    alone = mesh.posed(qpos)
+    np.testing.assert_allclose(mesh.posed(qpos, others=[mesh.flesh(far)]).shade, alone.shade, atol=1e-3)
+    taken = alone.shade - mesh.posed(qpos, others=[mesh.flesh(below)]).shade
+    middle, up = np.abs(alone.vertices[:, 0] - 0.06) < 0.02, alone.normals[:, 2]
+    palm, back = taken[middle & (up < -0.7)], taken[middle & (up > 0.7)]
+    assert palm.mean() > 0.2 and back.mean() < 0.01 and taken.min() > -1e-6
+
+
 def test_drawn_faces_are_the_closed_surfaces_own(model: HandModel) -> None:
     mesh, atlas = PosableSkin(model), skin_atlas()
     drawn = mesh.posed(join_qpos(gesture("flat")[None])[0])

@@ -106,7 +106,9 @@ def test_elimination_solves_the_whole_system(problem_and_estimate):
     scale = np.sqrt(equations.shared.diagonal())
     np.testing.assert_allclose((left + equations.shared_gradient) / scale, 0.0, atol=1e-6)
     rest = np.einsum("fpq,fq->fp", equations.pose, poses) + equations.mixed @ shared + equations.pose_gradient
-    rest[:, 6:] -= equations.pull @ np.linalg.solve(equations.usual, equations.pull @ poses[:, 6:].sum(axis=0))
+    rest[:, 6:] -= equations.pull @ np.linalg.solve(
+        equations.usual, equations.pull @ poses[:, 6:].sum(axis=0)
+    )
     np.testing.assert_allclose(rest / np.sqrt(np.einsum("fpp->fp", equations.pose)), 0.0, atol=1e-6)
 
 

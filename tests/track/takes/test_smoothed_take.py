@@ -55,7 +55,7 @@ def test_the_parts_of_the_deviations_sum_up_to_them(smooth):
 
 @pytest.fixture(scope="module")
 def stiff():
-    """A hand with a boutonniere of the index finger, in a glove whose markers are not quite at their places."""
+    """A hand with a boutonniere of the index finger, in a glove whose markers are off their places."""
     rng, take = np.random.default_rng(9), simulate_take("single-hand", num_frames=480, seed=9)
     hand, qpos = take.hands[0], take.qpos[:, 0].copy()
     qpos[:, [13, 14]] = np.deg2rad([60.0, -10.0])
@@ -64,7 +64,12 @@ def stiff():
     markers = worn.markers(qpos)[0] + 0.001 * rng.standard_normal((480, hand.layout.num_markers, 3))
     truth = Take.of_poses([worn], qpos[:, None], rate=take.rate)
     return truth, Take.of_truth(
-        [hand], qpos[:, None], markers, np.tile(np.arange(19), (480, 1)), np.tile(np.arange(19), (480, 1)), rate=take.rate
+        [hand],
+        qpos[:, None],
+        markers,
+        np.tile(np.arange(19), (480, 1)),
+        np.tile(np.arange(19), (480, 1)),
+        rate=take.rate,
     )
 
 
