@@ -1,12 +1,12 @@
 """Joints that do not move: whether their angles are found, and whether the stated deviations have the error.
 
-python -m benchmarks.patients FOLDER [--patients 24] [--seed 9300] [--healthy] [--methods ...]
+python -m benchmarks.patients FOLDER [--patients 24] [--seed 9300] [--healthy] [--methods measured]
 
 Each simulated patient moves one hand in which one or two digits have two fixed joints: PIP and DIP of a
 finger, or MCP and IP of the thumb, anywhere between -20 and 90 and -15 and 60 degrees. The gloves dense19,
-sparse13 and starter15 take turns; they are worn with slips, and their markers move with the flesh. Each capture
-is tracked with measured hands, with --calibrate, or with the inner fixed joint of each digit known. With
---healthy, the same people move without fixed joints.
+sparse13 and starter15 take turns; they are worn with slips, and their markers move with the flesh. Each
+capture is tracked with measured hands, with --calibrate, or with the inner fixed joint of each digit known.
+With --healthy, the same people move without fixed joints.
 
 The folder keeps captures and results, so that a stopped run continues.
 """

@@ -47,7 +47,7 @@ from track.calibration.hand_parameters import (
     skinned_shape_jacobian,
     skinning_terms,
 )
-from track.kinematics.pose_spread import GESTURES_OF_USER, own_variances, resting_prior
+from track.kinematics.pose_spread import resting_prior
 
 ALPHA_NORMAL, ALPHA_ALONG = 2.0, 1.0
 """Weights of E_prior along the normal and in the skin (Han et al. 2018, section 4.5)."""
@@ -59,8 +59,9 @@ CONTACT_SPREAD: Final = 0.0007
 """Standard deviation of a pad's compression around `PAD_COMPRESSION` [m]; (noise / spread)^2 is lambda_2."""
 _LIMIT_SPREAD: Final = np.deg2rad(2.0)  # [rad] standard deviation of an angle beyond its range
 _GESTURES: Final = 4.0  # The pose prior counts this many times per capture, as its frames are much alike.
+GESTURES_OF_USER: Final = np.repeat([1.0, _GESTURES], [4, 16])
+"""Number of gestures, by joint angle, whose mean varies from person to person like the mean of a capture."""
 _LEAST_MOTION: Final = np.deg2rad(1.0)  # of a digit that flesh follows
-_LEAST_OWN: Final = 1e-6  # [rad^2] least variance of a person's usual angle, so that none is divided by zero
 RELINEARIZE: Final = 0.005  # The skin's jacobian is renewed after such a change (log lengths, [rad], [m]).
 _DIFFERENCE_STEP: Final = 1e-5  # of finite differences
 PAD_COMPRESSION: Final = 0.001
@@ -130,15 +131,13 @@ class Fit(NamedTuple):
 
 
 class NormalEquations(NamedTuple):
-    """Gauss-Newton matrix and gradient in blocks: poses of a frame, S shared unknowns, and usual angles."""
+    """Gauss-Newton matrix and gradient in blocks: poses of each frame, and S shared unknowns."""
 
     pose: Float[np.ndarray, "F 26 26"]
     mixed: Float[np.ndarray, "F 26 S"]
     shared: Float[np.ndarray, "S S"]
     pose_gradient: Float[np.ndarray, "F 26"]
     shared_gradient: Float[np.ndarray, "S"]
-    pull: Float[np.ndarray, "20 20"]  # of the usual joint angles on those of a frame; their gradient is zero
-    usual: Float[np.ndarray, "20 20"]
 
 
 WeightedJacobians = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
@@ -165,9 +164,8 @@ class Problem:
         """Whether each marker is present."""
         self.targets = np.where(self.present[..., None], targets, 0.0)
         self.noise, self.robust_scale = noise, robust_scale
-        self._counts = gestures * np.ones(NUM_JOINTS)
-        self.own = np.zeros(NUM_JOINTS)
-        """Variances of this person's usual joint angles around people's [rad^2]."""
+        roots = np.sqrt(np.minimum(1.0, gestures / np.full(NUM_JOINTS, len(targets))))
+        self.pose_precision = np.outer(roots, roots) * resting_prior().precision
         self.position_spread, self.height_spread = POSITION_SPREAD, HEIGHT_SPREAD
         self.place_weights = np.ones(targets.shape[1])
         """Weights (M,) of the prior of each marker's place."""
@@ -179,27 +177,6 @@ class Problem:
         self._ranges = HandModel(shape).skeleton.ranges
         self._surface_jacobian: NDArray[np.float64] | None = None
         self._linearized_at = np.zeros(NUM_PARAMETERS)
-
-    def learn_gestures(self, estimate: Estimate) -> None:
-        """Learn which joints do not move, so that their usual angles are their own."""
-        self.own = own_variances(estimate.qpos[:, 7:])
-
-    @property
-    def pose_precision(self) -> Float[np.ndarray, "20 20"]:
-        """Precision of joint angles in one frame around the person's usual ones [1/rad^2]."""
-        roots = np.sqrt(np.minimum(1.0, self._counts / len(self.targets)))
-        return np.asarray(np.outer(roots, roots) * resting_prior().precision)
-
-    @property
-    def usual_precision(self) -> Float[np.ndarray, "20 20"]:
-        """Precision of the person's usual joint angles around people's [1/rad^2]."""
-        return np.diag(1.0 / np.maximum(self.own, _LEAST_OWN))
-
-    def usual_angles(self, estimate: Estimate) -> Float[np.ndarray, "20"]:
-        """The likeliest usual joint angles of the person, relative to people's [rad]."""
-        pull, frames = self.pose_precision, len(estimate.qpos)
-        off = (estimate.qpos[:, 7:] - resting_prior().angles).sum(axis=0)
-        return np.asarray(np.linalg.solve(frames * pull + self.usual_precision, pull @ off))
 
     def with_targets(self, targets: Float[np.ndarray, "F M 3"]) -> Problem:
         """The same problem for other labeled markers [m], NaN where missing."""
@@ -236,8 +213,6 @@ class Problem:
         beyond, off = self._joint_angle_residuals(estimate)
         cost += (beyond**2).sum() / _LIMIT_SPREAD**2
         cost += ((off @ self.pose_precision) * off).sum()
-        usual = self.usual_angles(estimate)
-        cost += usual @ self.usual_precision @ usual
         weights = contact_weights(fit.geometry, estimate.contacts.fingers)
         cost += (weights * fit.geometry.gaps**2).sum() / CONTACT_SPREAD**2
         return float(cost)
@@ -249,11 +224,11 @@ class Problem:
         return precision * self.place_weights[:, None, None] / self.position_spread**2
 
     def _joint_angle_residuals(self, estimate: Estimate) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Joint angles (F, 20) [rad] beyond their limits, and relative to the person's usual ones."""
+        """Joint angles (F, 20) [rad] beyond their limits, and relative to the mean of the gestures."""
         angles = estimate.qpos[:, 7:]
         low, high = self._ranges.T
         beyond = np.maximum(angles - high, 0.0) + np.minimum(angles - low, 0.0)
-        return beyond, angles - resting_prior().angles - self.usual_angles(estimate)
+        return beyond, angles - resting_prior().angles
 
     def roots(self, fit: Fit) -> Float[np.ndarray, "F M"]:
         """Roots of the markers' weights [1/m]."""
@@ -309,8 +284,6 @@ class Problem:
             flat.T @ flat,
             (transposed @ residuals[..., None])[..., 0],
             residuals.ravel() @ flat,
-            self.pose_precision,
-            len(by_pose) * self.pose_precision + self.usual_precision,
         )
         self._add_priors(estimate, fit, moved, result)
         return result
@@ -624,21 +597,14 @@ def eliminate_poses(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Schur complement of the damped poses (S, S + 1), gradient last, and their solution (F, 26, S + 1)."""
     pose = equations.pose.copy()
-    diagonal, size = np.arange(pose.shape[1]), len(equations.shared)
+    diagonal = np.arange(pose.shape[1])
     pose[:, diagonal, diagonal] *= 1.0 + damping
-    pulled = np.zeros((len(pose), pose.shape[1], NUM_JOINTS))
-    pulled[:, -NUM_JOINTS:] = -equations.pull
-    right = np.concatenate([equations.mixed, equations.pose_gradient[..., None], pulled], axis=2)
+    right = np.concatenate([equations.mixed, equations.pose_gradient[..., None]], axis=2)
     solved = np.linalg.solve(pose, right)
-    flat = np.concatenate([equations.mixed, pulled], axis=2).reshape(-1, size + NUM_JOINTS)
-    reduced = -flat.T @ solved.reshape(len(flat), -1)
-    reduced[:size, :size] += equations.shared
-    reduced[:size, size] += equations.shared_gradient
-    reduced[size:, -NUM_JOINTS:] += equations.usual
-    usual = np.linalg.solve(reduced[size:, -NUM_JOINTS:], reduced[size:, : size + 1])
-    solved[..., : size + 1] -= solved[..., -NUM_JOINTS:] @ usual
-    reduced[:size, : size + 1] -= reduced[:size, -NUM_JOINTS:] @ usual
-    return reduced[:size, : size + 1], solved[..., : size + 1]
+    flat = equations.mixed.reshape(-1, equations.mixed.shape[2])
+    reduced = np.concatenate([equations.shared, equations.shared_gradient[:, None]], axis=1)
+    reduced -= flat.T @ solved.reshape(len(flat), -1)
+    return reduced, solved
 
 
 def shared_covariance(
@@ -662,13 +628,8 @@ def error_covariance(problem: Problem, estimate: Estimate, fit: Fit) -> Float[np
     flat = by_shared.reshape(-1, len(reduced))
     share = (problem.data_noise / problem.noise) ** 2
     errors = share * reduced[:, :-1] + (1.0 - share) * (equations.shared - flat.T @ flat)
-    # Poses follow an error of people's usual angles as far as the person's own ones do not.
-    pull = equations.pull @ (
-        np.eye(NUM_JOINTS) - len(answers) * np.linalg.solve(equations.usual, equations.pull)
-    )
-    turns = answers[:, 6:].sum(axis=0).T @ pull
-    counts = np.outer(GESTURES_OF_USER, GESTURES_OF_USER) ** 0.5
-    errors += turns @ (resting_prior().covariance / counts + np.diag(problem.own)) @ turns.T
+    turns = answers[:, 6:].sum(axis=0).T @ problem.pose_precision / np.sqrt(GESTURES_OF_USER)
+    errors += turns @ resting_prior().covariance @ turns.T
     # Of flesh of a size, the fit leaves a part in the residuals; by that the size is estimated.
     patterns = _flesh_patterns(problem, estimate, fit)
     bases = np.stack([np.linalg.qr(one.reshape(-1, one.shape[2]))[0] for one in patterns])

@@ -29,6 +29,7 @@ from handsim.hand.shape import DIGITS, JOINT_NAMES, NUM_JOINTS, PALM, HandShape,
 from handsim.hand.skin import rest_vertices
 from handsim.space.transforms import MIRROR, euler_matrix, quaternion_matrix, rigid_fit
 from track.calibration.energy import (
+    GESTURES_OF_USER,
     HEIGHT_SPREAD,
     POSITION_SPREAD,
     Estimate,
@@ -58,7 +59,7 @@ from track.calibration.hand_parameters import (
 )
 from track.frames import TrackedFrame
 from track.kinematics.pose_solver import PoseFit, PoseSolver
-from track.kinematics.pose_spread import GESTURES_OF_USER, HandErrors, errors_of_motions
+from track.kinematics.pose_spread import HandErrors, errors_of_motions
 
 _WIDE_STEPS: Final = 6  # steps with the first robust scale, which includes distant markers
 _STEPS_WITHOUT_CONTACTS: Final = 10  # last step without contacts, as in the paper
@@ -279,7 +280,6 @@ def calibrate_hand(
         touching = PoseSolver(right).solve(seen[[frame for frame, _ in touches]])
         before = contact_gaps(right.model, touches, touching.qpos)
     final = PoseSolver(done).solve(seen, rough_track.qpos)
-    problem.learn_gestures(estimate)
     covariance = error_covariance(problem, estimate, fit)
     position_errors, length_errors = standard_errors(problem, estimate, fit, covariance)
     return Calibration(

@@ -8,9 +8,8 @@ import numpy as np
 from jaxtyping import Float
 
 from gloves.fit import GloveFit
-from track.calibration.energy import first_estimate, levenberg_marquardt, user_hand
+from track.calibration.energy import GESTURES_OF_USER, first_estimate, levenberg_marquardt, user_hand
 from track.kinematics.pose_solver import PoseSolver
-from track.kinematics.pose_spread import GESTURES_OF_USER
 
 FLESH: Final = 0.003
 """Standard deviation of a marker against its bone [m] in a first fit, before residuals are known."""

@@ -16,10 +16,10 @@
 from __future__ import annotations
 
 from functools import cache
-from typing import Final, NamedTuple
+from typing import Final, Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from gloves.fit import GloveFit
 from handsim.hand.shape import ADULTS, DIGITS, NUM_JOINTS, NUM_KEYPOINTS, PALM
@@ -48,8 +48,7 @@ _JOINT_SPREAD: Final = float(np.deg2rad(0.5))  # [rad] least standard deviation 
 _GESTURE_MARGIN: Final = float(np.deg2rad(6.0))  # [rad] added to that of the gestures, for other poses
 _STILL: Final = 0.25  # share of its usual standard deviation, below which a joint does not move
 _OWN_ANGLE: Final = float(np.deg2rad(40.0))  # [rad] standard deviation of the angle of such a joint
-GESTURES_OF_USER: Final = np.repeat([1.0, 4.0], [4, 16])
-"""Number of gestures, by joint angle, whose mean varies from person to person like the mean of a capture."""
+_STILL_SHARE: Final = 0.5  # A joint hardly moves from this share of that deviation on.
 _ARC: Final = 0.04  # [m] usual radius of the arcs of markers: the length of a finger's bones
 _LEAST_INFORMATION: Final = 1e-9  # share of a marker's precision, added for an inverse
 _DRIFT: Final = 0.014  # [m/sqrt(s)] random walk of a hidden marker
@@ -59,11 +58,19 @@ _LEAST_FREEDOM: Final = 3  # least number of marker coordinates beyond those tha
 SOURCES: Final = ("noise and gaps", "gluing", "flesh", "person")
 """Sources of an angle's uncertainty: noisy or unseen markers, their glued places, their motion over the
 bones, and what stays of a person: sizes and directions of bones, gestures unlike other people's."""
-CHANGING: Final = 1.0, 0.5, 1.2, 0.32
+Measure = Literal["frame", "mean", "peak", "range"]
+"""What of an angle is compared between sessions: its value in a frame, its mean, its 5th or 95th percentile
+in a take, or its range of motion, between these."""
+CHANGING: Final[dict[Measure, tuple[float, float, float, float]]] = {
+    "frame": (0.0, 0.0, 1.39, 0.25),
+    "mean": (0.0, 0.0, 0.73, 0.22),
+    "peak": (0.0, 0.0, 1.56, 0.27),
+    "range": (0.0, 0.0, 2.01, 0.31),
+}
 """Factors by which these parts of an uncalibrated hand's error change between sessions of a person. The rest
 comes from its wrong shape, which stays, and from people's usual gestures, towards which a hand is drawn
-nearly alike. Flesh counts more than once, as residuals do not show all of it. Found for two sessions of each
-of 107, 67 and 40 simulated people in dense19, sparse13 and starter10 (benchmarks/sessions.py)."""
+nearly alike; glued places are seen in the part of flesh, as fits make up for most of them. Fitted to two
+sessions of each of 64 simulated people, half in dense19 and half in sparse13 (benchmarks/sessions.py)."""
 DETECTABLE: Final = 1.96 * float(np.sqrt(2.0))
 """Ratio of the minimal detectable difference of two sessions to the standard error of measurement."""
 _OWN: Final = 9  # numbers of a digit: place of its knuckle, its direction, lengths of its bones (3 each)
@@ -158,6 +165,11 @@ def own_variances(angles: Float[np.ndarray, "F 20"]) -> Float[np.ndarray, "20"]:
     """
     moved = angles.std(axis=0) / (_STILL * resting_prior().spread)
     return np.asarray((_OWN_ANGLE / (1.0 + moved**4)) ** 2)
+
+
+def are_still(angles: Float[np.ndarray, "F 20"]) -> Bool[np.ndarray, "20"]:
+    """Whether each joint hardly moves in a capture: its own usual angle may be any one."""
+    return np.asarray(own_variances(angles) > (_STILL_SHARE * _OWN_ANGLE) ** 2)
 
 
 def predict_joints(
@@ -398,7 +410,7 @@ class SpreadModel:
     """
 
     def __init__(self, fit: GloveFit, origin: HandOrigin, errors: HandErrors | None = None) -> None:
-        self._hand, self._is_calibrated = with_keypoints(fit), errors is not None
+        self._hand, self.is_calibrated = with_keypoints(fit), errors is not None
         digits = hand_arrays(fit).digits
         self._doubt = hand_doubt(digits, origin)
         if errors is not None:
@@ -436,20 +448,26 @@ class SpreadModel:
         [m], the covariances of the unknowns from noise and gaps, and the precision of the prior in one frame.
         """
         doubt = self._doubt._replace(flesh=flesh, places=np.maximum(self._doubt.places, places))
-        if self._is_calibrated:
+        if self.is_calibrated:
             doubt = doubt._replace(noise=noise)
         prior = resting_prior().precision if prior is None else prior
         return pose_spreads(self._hand, prior, doubt, qpos, unseen, smoothed)
 
 
-def measurement_error(budget: Float[np.ndarray, "*J 4"], origin: HandOrigin) -> Float[np.ndarray, "*J"]:
+def measurement_error(
+    budget: Float[np.ndarray, "*J 4"], origin: HandOrigin, measure: Measure = "frame"
+) -> Float[np.ndarray, "*J"]:
     """Standard error of measurement between sessions of a person, in the unit of deviations by `SOURCES`.
 
     The glove is put on anew for each session. Then a calibrated hand is calibrated anew, too, and all parts
-    of its error change.
+    of its error change; other measures than a frame keep their ratio to it.
     """
-    changing = 1.0 if origin == "calibrated" else np.array(CHANGING)
-    return np.asarray(np.linalg.norm(changing * budget, axis=-1))
+    changing = {
+        name: np.linalg.norm(np.array(factors) * budget, axis=-1) for name, factors in CHANGING.items()
+    }
+    if origin == "calibrated":
+        return np.asarray(np.linalg.norm(budget, axis=-1) * changing[measure] / changing["frame"])
+    return np.asarray(changing[measure])
 
 
 def freedom_factor(num_markers: int) -> float:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from gloves.captures.capture import runs_of
 from gloves.fit import GloveFit
 from gloves.takes.take import INITIALIZED, LOST, Take
-from handsim.hand.shape import JOINT_NAMES, NUM_JOINTS, NUM_KEYPOINTS
+from handsim.hand.shape import DIGITS, JOINT_NAMES, NUM_JOINTS, NUM_KEYPOINTS
 from handsim.kernels import kernel, move, velocity_of
 from handsim.space.transforms import quaternion_matrix
 from track.kinematics.marker_kinematics import (
@@ -32,7 +32,13 @@ from track.kinematics.marker_kinematics import (
     marker_residuals,
     workspace,
 )
-from track.kinematics.pose_spread import SpreadModel, freedom_factor, own_variances, resting_prior
+from track.kinematics.pose_spread import (
+    SpreadModel,
+    are_still,
+    freedom_factor,
+    own_variances,
+    resting_prior,
+)
 from track.user import hand_origin, read_errors
 
 # Chosen on realistic simulated hands; the error hardly changes within a factor of ten.
@@ -147,6 +153,9 @@ class _SmoothedHand:
         names = [(f"{worn.side}:{name}", name) for name in JOINT_NAMES]
         self._known = np.deg2rad([known.get(one, known.get(each, np.nan)) for one, each in names])
         self._sure = np.diag(np.isfinite(self._known) / _KNOWN**2)  # precision of known angles [1/rad^2]
+        # A digit with a known angle is not as digits usually are.
+        self._stiff = np.isfinite(self._known).reshape(len(DIGITS), -1).any(axis=1).repeat(4) & self._shown
+        self._prior = self._prior_of(self._stiff)
         # Standard deviations [m] of noise, of slow motion that residuals show, and of the flesh behind it.
         self._noise, self._slow, self._flesh = _FIRST_NOISE, 0.0, 0.0
         self._places = np.zeros((len(self._hand.digits), 2))  # RMS error along the skin, off it [m]
@@ -159,7 +168,12 @@ class _SmoothedHand:
             for window in windows:
                 self._step(window, self._equations(window))
             self._estimate_noise()
-        cutoffs, parts, wide = [], [], self._doubted_prior()
+            self._prior = self._prior_of(self._stiff)
+        cutoffs, parts, wide = [], [], self._prior_of(self._shown)
+        # Of a joint that does not move a calibration finds no more than measuring does.
+        still, models = are_still(self._angles()) & self._shown, [self._model]
+        if still.any() and self._model.is_calibrated:
+            models.append(SpreadModel(self._worn, "measured"))
         for window in windows:
             equations = self._equations(window)
             covariances = self._step(window, equations)
@@ -169,15 +183,20 @@ class _SmoothedHand:
             # Errors of the prior and of known angles are alike in successive frames.
             by_hinges = alone[:, :, :NUM_JOINTS]
             same = by_hinges @ (self._share * wide + self._sure) @ by_hinges.swapaxes(1, 2)
-            variances, self.keypoints[kept] = self._model.variances(
-                self.qpos[kept],
-                self._unseen[kept],
-                self._weight_noise,
-                self._flesh,
-                self._places,
-                covariances[inner] + same,
-                wide + self._sure,
+            (variances, self.keypoints[kept]), *measured = (
+                model.variances(
+                    self.qpos[kept],
+                    self._unseen[kept],
+                    self._weight_noise,
+                    self._flesh,
+                    self._places,
+                    covariances[inner] + same,
+                    wide + self._sure,
+                )
+                for model in models
             )
+            for other, _ in measured:
+                variances[:, still] = np.maximum(variances, other)[:, still]
             self.angles[kept] = np.sqrt(variances.sum(axis=-1))
             pulled = same.diagonal(axis1=1, axis2=2)[:, :NUM_JOINTS]
             # How far the prior pulls an angle stays the same, as the person does.
@@ -201,16 +220,17 @@ class _SmoothedHand:
         """Weight of the prior of joint angles in one frame."""
         return min(1.0, _GESTURES / self._rate)
 
-    @property
-    def _prior(self) -> Float[np.ndarray, "20 20"]:
-        """Precision of the prior of joint angles in one frame [1/rad^2]."""
-        return self._share * resting_prior().precision
+    def _angles(self) -> Float[np.ndarray, "F 20"]:
+        """The joint angles of the frames with a pose [rad]."""
+        return self.qpos[np.isfinite(self.qpos).all(axis=1), 7:]
 
-    def _doubted_prior(self) -> Float[np.ndarray, "20 20"]:
-        """The same where nobody knows what is usual for joints that do not move."""
-        angles = self.qpos[np.isfinite(self.qpos).all(axis=1), 7:]
-        own = own_variances(angles) * self._shown
-        return self._share * np.linalg.inv(resting_prior().covariance + np.diag(own))
+    def _prior_of(self, joints: Bool[np.ndarray, "20"]) -> Float[np.ndarray, "20 20"]:
+        """Precision of the prior of joint angles in one frame [1/rad^2].
+
+        Of these joints, those that do not move may have any usual angle.
+        """
+        own = own_variances(self._angles()) * joints
+        return np.asarray(self._share * np.linalg.inv(resting_prior().covariance + np.diag(own)))
 
     @property
     def _weight_noise(self) -> float:

@@ -20,7 +20,7 @@ from track.alternatives.alternatives import doubts_of
 from track.alternatives.hands import other_hands_of
 from track.hand_size import glove_shifts
 from track.kinematics.pose_solver import FEWEST_MARKERS
-from track.kinematics.pose_spread import own_variances, resting_prior
+from track.kinematics.pose_spread import are_still
 from track.settings import USUAL_SIZE
 
 _FEWEST: Final = 60  # Faults are looked for from this many tracked frames of a hand on.
@@ -43,7 +43,8 @@ AT_LIMIT: Final = 0.5
 """Tolerance within which a joint counts as being at its limit [deg]."""
 _OFTEN_AT_LIMIT: Final = 0.4  # share of the frames at the limit
 _OPEN: Final = 8.0  # [deg] standard deviation from which on the angle of a still joint is told
-_WIDER: Final = 0.5  # A joint is still if its own usual angle varies by this share of people's variance.
+_LONG: Final = 5.0  # [s] A capture that is shorter shows little of what a hand does.
+_RESTS: Final = 0.3  # A hand rests as a whole if this share of its joints hardly moves.
 _FITTED_FRAMES: Final = 120  # number of frames in which a slip of the glove is fitted
 
 
@@ -212,8 +213,10 @@ def _still(hand: _Hand) -> Iterator[SuspectSpan]:
     if spread is None:
         return
     spreads = np.rad2deg(np.median(spread[hand.frames, number], axis=0))
-    own = own_variances(hand.take.qpos[hand.frames, number, 7:])
-    for joint in np.flatnonzero((own > _WIDER * resting_prior().spread ** 2) & (spreads > _OPEN)):
+    still = are_still(hand.take.qpos[hand.frames, number, 7:])
+    if np.ptp(hand.take.times[hand.frames]) < _LONG or still.mean() > _RESTS:
+        return
+    for joint in np.flatnonzero(still & (spreads > _OPEN)):
         name = JOINTS[joint].name
         why = f"hardly moves; the places of its markers tell its angle to {spreads[joint]:.0f} deg"
         remedy = f"measure the angle with a goniometer and name it, --known {name}=ANGLE"

@@ -397,31 +397,36 @@ def _error_section(title: str, settings: Mapping[str, Any], hand: HandFigures) -
     errors = _joint_errors(settings, hand)
     if np.isnan(errors).all():
         return Section(title, "Filter: none, each pose was fitted to the markers of its frame.")
-    changing = ", ".join(f"{one:g} times {name}" for one, name in zip(CHANGING, SOURCES, strict=True))
+    factors = zip(CHANGING["frame"], SOURCES, strict=True)
+    changing = " and ".join(f"{one:g} times {name}" for one, name in factors if one > 0.0)
     text = (
         "Filter: all poses were solved together, forward and backward in time, without a delay. It acts as a "
         "Butterworth filter of second order that runs forward and backward: at the cut-off an oscillation "
         "keeps half of its size. SD [deg]: standard deviation of the angle, the root of the sum of the "
         "squares of its four parts, each as root mean square over all frames. Gluing is a constant error, as "
         "is what stays of the person: sizes and directions of bones, and gestures unlike other people's. "
-        "SEM: standard error of measurement between sessions of a person, with the glove put on anew: "
-        "the SD of hands that are calibrated in each session; of other hands from "
-        f"{changing}. "
-        "MDD: minimal detectable difference of two sessions, 1.96 times the root of two times the SEM."
+        "SEM: standard error of measurement of the angle in a frame between sessions of a person, with the "
+        "glove put on anew: the SD of hands that are calibrated in each session; of other hands from "
+        f"{changing}. MDD: minimal detectable difference of two sessions, 1.96 times the root of two times "
+        "the SEM, of the angle in a frame, of its mean, of its 5th or 95th percentile (peak), and of its "
+        "range of motion between these, each with a SEM of its own."
     )
-    table = [["joint", "SD", *SOURCES, "SEM", "MDD", "cut-off [Hz]"]]
+    table = [["joint", "SD", *SOURCES, "SEM", *(f"MDD, {one}" for one in CHANGING), "cut-off [Hz]"]]
     for joint, cells in zip(JOINTS, errors.tolist(), strict=True):
         table.append([joint.name.replace("_", " "), *(f"{cell:.1f}" for cell in cells)])
     return Section(title, text, table=table)
 
 
 def _joint_errors(settings: Mapping[str, Any], hand: HandFigures) -> Float[np.ndarray, "20 E"]:
-    """Each angle's SD, its `SOURCES`, SEM, MDD [deg] and cut-off [Hz]; NaN of takes that are not smoothed."""
+    """Each angle's SD, its `SOURCES`, SEM, MDD by measure [deg], cut-off [Hz]; NaN if it is not smoothed."""
     cutoffs, budget = (settings.get(name, {}).get(hand.side) for name in ("filter", "budget"))
     if cutoffs is None or budget is None:
-        return np.full((len(JOINTS), len(SOURCES) + 4), np.nan)
-    error = measurement_error(np.array(budget), hand_origin(str(settings.get("user", "")), hand.side))
-    return np.column_stack([np.linalg.norm(budget, axis=1), budget, error, DETECTABLE * error, cutoffs])
+        return np.full((len(JOINTS), len(SOURCES) + len(CHANGING) + 3), np.nan)
+    origin = hand_origin(str(settings.get("user", "")), hand.side)
+    errors = np.transpose([measurement_error(np.array(budget), origin, measure) for measure in CHANGING])
+    return np.column_stack(
+        [np.linalg.norm(budget, axis=1), budget, errors[:, 0], DETECTABLE * errors, cutoffs]
+    )
 
 
 def _markers_section(title: str, take: Take, hand: HandFigures) -> Section:
@@ -572,10 +577,11 @@ def _frame_rows(take: Take, hands: Sequence[HandFigures]) -> _Rows:
 def _joint_rows(take: Take, hands: Sequence[HandFigures]) -> _Rows:
     """Rows of the table of joints: range of motion, range of the model, errors between sessions."""
     columns = [f"{name}_deg" for name in (*_RANGE, "model_low", "model_high", "spread")]
-    columns += ["at_limits_share", "measured_share", "longest_gap_s", "sem_deg", "mdd_deg", "cutoff_hz"]
+    columns += ["at_limits_share", "measured_share", "longest_gap_s", "sem_deg"]
+    columns += [*(f"mdd_{measure}_deg" for measure in CHANGING), "cutoff_hz"]
     rows: _Rows = [["hand", "joint", *columns]]
     for hand in hands:
-        errors = _joint_errors(take.settings, hand)[:, -3:].tolist()
+        errors = _joint_errors(take.settings, hand)[:, 1 + len(SOURCES) :].tolist()
         for joint, figures, error in zip(JOINTS, hand.joints().tolist(), errors, strict=True):
             *row, spread, limits, measured, gap = figures
             cells = *row, joint.low, joint.high, spread, limits, measured, gap / take.rate, *error
@@ -608,7 +614,7 @@ def _span_rows(take: Take, spans: Sequence[SuspectSpan]) -> _Rows:
 def _angle_rows(take: Take, hands: Sequence[HandFigures], source: str, settings: PageSettings) -> _Rows:
     """Rows of the angles of a study: by hand, convention, joint and measure, in measured frames.
 
-    SD, its constant part and MDD are those of a single angle, so that a range of motion has none.
+    SD and its constant part are those of a single angle, so that a range of motion has none.
     """
     rows: _Rows = [[*_ANGLES]]
     first = [take.settings.get("capture", Path(source).name), settings.person, settings.session]
@@ -616,7 +622,7 @@ def _angle_rows(take: Take, hands: Sequence[HandFigures], source: str, settings:
     for hand in hands:
         errors = _joint_errors(take.settings, hand)
         constant = np.linalg.norm(errors[:, [1 + source for source in _CONSTANT]], axis=1)
-        known = dict(zip(JOINT_NAMES, np.c_[hand.joints()[:, -4], constant, errors[:, -2]], strict=True))
+        known = dict(zip(JOINT_NAMES, np.c_[hand.joints()[:, -4], constant, errors[:, -4:-1]], strict=True))
         for convention in get_args(Convention) if hand.fitted.any() else ():
             zero = "" if settings.neutral is None else ", zero in the neutral pose"
             angles = take.angles(hand.side, convention=convention, neutral=settings.neutral)
@@ -625,9 +631,11 @@ def _angle_rows(take: Take, hands: Sequence[HandFigures], source: str, settings:
                 degrees = np.rad2deg(values[measured]) if measured.any() else np.array([np.nan])
                 low, high = np.percentile(degrees, (5.0, 95.0))
                 last = _number(measured.mean()), f"{convention}{zero}", made_of(take.settings)
-                for measure, value in zip(_MEASURES, (degrees.mean(), low, high, high - low), strict=True):
-                    is_angle = name in known and measure != _MEASURES[-1]
-                    numbers = map(_number, (value, *(known[name] if is_angle else [np.nan] * 3)))
+                spread, same, mean, peak, moved = known.get(name, [np.nan] * 5)
+                errors_of = [(spread, same, one) for one in (mean, peak, peak)] + [(np.nan, np.nan, moved)]
+                of_measures = (degrees.mean(), low, high, high - low), errors_of
+                for measure, value, error in zip(_MEASURES, *of_measures, strict=True):
+                    numbers = map(_number, (value, *error))
                     rows.append([*first, hand.side, name, measure, *numbers, *last])
     return rows
 
