@@ -149,7 +149,7 @@ CASES = {
     "track --live natnet://localhost --calibrate --out out.npz": "--calibrate | natnet://localhost | twice",
     "track --live natnet://localhost --seconds 0 --out out.npz": "--seconds is 0 | above 0",
     "track --live localhost:1510 --out out.npz": "'localhost:1510' | natnet://host | qtm://host | module:",
-    "track photos --out out.npz": "photos: this is a folder | .trc, .c3d, .csv, .tsv",
+    "track photos --out out.npz": "--out is out.npz | several captures | a folder",
     "track good.trc --out out.c3d": "--out is out.c3d | .npz",
     "track good.trc --out good.truth.npz": "--out is good.truth.npz | not in .truth.npz",
     "track good.trc --labeled out.tsv --out out.npz": "out.tsv | '.tsv' | .trc, .c3d, .csv",

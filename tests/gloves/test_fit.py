@@ -176,7 +176,7 @@ def test_a_marker_goes_to_the_skin_below_the_point(side, index, place, height):
     center = attach_markers(place_marker(LAYOUT, index, model, point), model).points[index]
     nearest = np.linalg.norm(surface.vertices - point, axis=1).min()
     assume(nearest > LAYOUT.radius + height - 1e-4)  # no marker fits into the folds between the fingers
-    assert np.linalg.norm(center - point) < height + 0.016  # the wrist's cut is beyond what a layout reaches
+    assert np.linalg.norm(center - point) < height + 0.02  # the wrist's cut is beyond what a layout reaches
     assert LAYOUT.radius - 1e-3 < np.linalg.norm(surface.vertices - center, axis=1).min() < 0.008
 
 

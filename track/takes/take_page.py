@@ -121,7 +121,9 @@ def _write_table(path: Path, rows: _Rows, decimal: str) -> None:
             [cell if name in _WORDS else _with_comma(cell) for name, cell in zip(header, row, strict=True)]
             for row in others
         ]
-    with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
+    # Names of files need not be valid text.
+    how = {"encoding": "utf-8", "errors": "backslashreplace", "newline": ""}
+    with atomic_write(path) as temporary, temporary.open("w", **how) as file:
         separator = ";" if decimal == "," else ","
         csv.writer(file, delimiter=separator, lineterminator="\n").writerows([header, *others])
 

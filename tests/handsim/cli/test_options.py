@@ -93,7 +93,8 @@ SLOW = [
      "labeler set|knee 0.5|cnn.views random|cnn.reject 0.005|cnn.spread 0.05"),
     ("train", "set --out run2 --samples 32 --batch 16", "preset han2018 --average 0.5"),
     ("track", "capture.c3d --out t.npz",
-     "glove sparse13|size XL|shape user.json|hands right|body pen|labeler run|calibrate|no-smooth"),
+     "glove sparse13|size XL|shape user.json|hands right|body pen|labeler run|calibrate|no-smooth|"
+     "known index_PIP_flexion=60"),
     ("calibrate", "long.c3d --out u.json", "glove sparse13|size XL|hands right|labeler run"),
     ("demo", "--out d --num-frames 200", "seed 3|num-frames 300"),
     ("film", "moving.npz video.mp4 --out f --format png --num-frames 2 --workers 1",
