@@ -122,8 +122,10 @@ def _write_table(path: Path, rows: _Rows, decimal: str) -> None:
             for row in others
         ]
     # Names of files need not be valid text.
-    how = {"encoding": "utf-8", "errors": "backslashreplace", "newline": ""}
-    with atomic_write(path) as temporary, temporary.open("w", **how) as file:
+    with (
+        atomic_write(path) as temporary,
+        temporary.open("w", encoding="utf-8", errors="backslashreplace", newline="") as file,
+    ):
         separator = ";" if decimal == "," else ","
         csv.writer(file, delimiter=separator, lineterminator="\n").writerows([header, *others])
 
