@@ -367,8 +367,8 @@ class Take:
     def mean_pose(self, side: Side, between: tuple[float, float] | Take) -> Float[np.ndarray, "20"]:
         """The mean joint angles of a hand between two times, or in another take [rad]; warns if it moves."""
         if isinstance(between, Take):
-            start = float(np.nextafter(between.times[0], -np.inf))  # before the end also of one frame
-            return between.mean_pose(side, (start, float(between.times[-1])))
+            end = float(np.nextafter(between.times[-1], np.inf))  # after the start also of one frame
+            return between.mean_pose(side, (float(between.times[0]), end))
         first, last = between
         if not first < last:
             raise ArgumentError(f"neutral is {first:g} to {last:g} s, expected the earlier time first")
