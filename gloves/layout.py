@@ -282,7 +282,7 @@ def _layout_path(glove: str | Path) -> Path:
 
 
 def layout_checksum(glove: str | Path) -> str:
-    """SHA-256 of a layout's file by its shipped name or path; empty if there is none."""
+    """SHA-256 of the file of a layout, which a shipped name or a path names; empty without a file."""
     path = _layout_path(glove)
     return checksum(path) if path.is_file() else ""
 

@@ -37,7 +37,7 @@ class Arms(NamedTuple):
     wrists: Float[np.ndarray, "H 3"]
     """Positions [m]."""
     forearms: Float[np.ndarray, "H S 3"]
-    """Unit directions from the wrists to the elbows."""
+    """Unit vectors from each wrist to its S possible elbows."""
     elbows: Float[np.ndarray, "H S 3"]
     """Positions [m]."""
     costs: Float[np.ndarray, "H S"]

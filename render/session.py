@@ -260,7 +260,7 @@ def hidden_pictures(out: str | Place) -> list[str]:
 
 
 def visible_hands(out: str | Place) -> list[int]:
-    """Numbers of hands with a visible keypoint in the pictures of a rendering, in ascending order."""
+    """How many hands each picture of a rendering shows by a visible keypoint, in ascending order."""
     return _noted(out, _VISIBLE, "hands")
 
 

@@ -27,7 +27,7 @@ class FormerHands(NamedTuple):
     hands: tuple[GloveFit, ...]
     """The hands with their gloves as worn, in the order of the take's."""
     notes: str
-    """What is known of the user: a size, how it was measured."""
+    """Where these hands are from, in words, such as their size and how it was measured."""
 
 
 def check_former(former: Sequence[FormerHands], hands: Sequence[GloveFit], num_frames: int) -> None:

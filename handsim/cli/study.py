@@ -32,7 +32,7 @@ COLUMNS: Final = ("capture", "person", "session", "side", "glove", "neutral", "s
 _PATHS: Final = ("capture", "glove", "neutral", "shape")
 _TABLES: Final = (".csv", ".tsv")
 _LONGEST_HEADER: Final = 4096  # bytes
-_MOST_TABLE: Final = 1 << 24  # bytes
+_MOST_TABLE: Final = 1 << 24  # largest size of a study's table [bytes]
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,7 +191,7 @@ def _recorded_files(folder: Path, endings: Sequence[str]) -> Iterator[StudyFile]
 
 
 def _is_table(path: Path) -> bool:
-    """Whether a file is a study's table: its first line has a column `capture`."""
+    """Whether a file is the table of a study, whose first line names a column `capture`."""
     if path.suffix.lower() not in _TABLES or not path.is_file():
         return False
     check_regular(path, error=CaptureError)

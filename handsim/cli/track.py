@@ -78,7 +78,7 @@ def track(
     if captures and is_study(captures, out):
         if labeled is not None or send:
             raise ArgumentError("given --labeled or --send and several captures, expected one capture")
-        _track_study(captures, out, options, calibrate=calibrate, smooth=smooth)
+        _track_study(captures, out, options, calibrate=calibrate, smooth=smooth, known=known)
         return
     if calibrate and live is not None:
         raise ArgumentError(
@@ -119,7 +119,7 @@ def track(
 
 
 def _track_study(
-    captures: tuple[Path, ...], out: Path | None, options: TrackerOptions, **other: bool
+    captures: tuple[Path, ...], out: Path | None, options: TrackerOptions, **other: object
 ) -> None:
     """Track several captures, each with the options that a table has for it."""
     from gloves.takes.corrections import corrections_path

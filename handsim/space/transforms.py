@@ -24,7 +24,8 @@ DIRECTIONS: Final = ("forward", "left", "up")
 FORWARD: Final = ("x", "-x", "y", "-y", "z", "-z")
 """Axes of the camera system that may be forward."""
 _OPPOSITES: Final = {"backward": "forward", "right": "left"}
-_PROGRAMS: Final = {  # directions of x, y and z, what is mirrored in a thing's own axes, and the unit
+# Of each program: where its x, y and z point, the signs of a thing's own axes, and its unit of length.
+_PROGRAMS: Final = {
     "ros": (("forward", "left", "up"), (1, 1, 1), "m"),
     "openxr": (("right", "up", "backward"), (1, 1, 1), "m"),
     "opengl": (("right", "up", "backward"), (1, 1, 1), "m"),

@@ -47,8 +47,8 @@ _JOINT_MEMORY: Final = 0.3  # [s] time constant of the process of joint angles
 _JOINT_SPREAD: Final = float(np.deg2rad(0.5))  # [rad] least standard deviation of a predicted angle
 _GESTURE_MARGIN: Final = float(np.deg2rad(6.0))  # [rad] added to that of the gestures, for other poses
 _STILL: Final = 0.25  # share of its usual standard deviation, below which a joint does not move
-_OWN_ANGLE: Final = float(np.deg2rad(40.0))  # [rad] standard deviation of the angle of such a joint
-_STILL_SHARE: Final = 0.5  # A joint hardly moves from this share of that deviation on.
+_OWN_ANGLE: Final = float(np.deg2rad(40.0))  # [rad] standard deviation of the angle of a still joint
+_STILL_SHARE: Final = 0.5  # From this share of `_OWN_ANGLE` on a joint hardly moves.
 _ARC: Final = 0.04  # [m] usual radius of the arcs of markers: the length of a finger's bones
 _LEAST_INFORMATION: Final = 1e-9  # share of a marker's precision, added for an inverse
 _DRIFT: Final = 0.014  # [m/sqrt(s)] random walk of a hidden marker
@@ -462,12 +462,11 @@ def measurement_error(
     The glove is put on anew for each session. Then a calibrated hand is calibrated anew, too, and all parts
     of its error change; other measures than a frame keep their ratio to it.
     """
-    changing = {
-        name: np.linalg.norm(np.array(factors) * budget, axis=-1) for name, factors in CHANGING.items()
-    }
+    changing = np.linalg.norm(np.array(CHANGING[measure]) * budget, axis=-1)
     if origin == "calibrated":
-        return np.asarray(np.linalg.norm(budget, axis=-1) * changing[measure] / changing["frame"])
-    return np.asarray(changing[measure])
+        frame = np.linalg.norm(np.array(CHANGING["frame"]) * budget, axis=-1)
+        return np.asarray(np.linalg.norm(budget, axis=-1) * changing / frame)
+    return np.asarray(changing)
 
 
 def freedom_factor(num_markers: int) -> float:

@@ -280,7 +280,7 @@ class Content(NamedTuple):
     unit: str = "auto"
     """Unit of length, m or cm; auto is the program's."""
     forward: str = "x"
-    """The axis of the camera system that is forward, one of `FORWARD`."""
+    """The axis of the cameras' coordinates that points forward in the room, one of `FORWARD`."""
 
     @property
     def program(self) -> ProgramAxes | None:

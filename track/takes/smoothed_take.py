@@ -145,10 +145,8 @@ class _SmoothedHand:
         self._unseen = times_unseen(take.times, np.isfinite(self._targets[..., 0]))
         self._residuals = np.full_like(self._targets, np.nan)  # in the frames of the bones [m]
         self._hand, self._model, self._rate = hand_arrays(worn), spread_model(take, worn), take.rate
-        spans, seen = self._hand.hinge_span, np.isfinite(self._targets[..., 0]).any(axis=0)
-        joints = np.arange(NUM_JOINTS)[:, None]
-        # Whether a marker beyond each joint is seen.
-        self._shown = ((spans[:, 0] <= joints) & (joints < spans[:, 1]) & seen).any(axis=1)
+        seen = np.isfinite(self._targets[..., 0]).any(axis=0)
+        self._shown = worn.attachment.beyond[:, seen].any(axis=1)  # joints beyond which a marker is seen
         known = take.settings.get("known", {})
         names = [(f"{worn.side}:{name}", name) for name in JOINT_NAMES]
         self._known = np.deg2rad([known.get(one, known.get(each, np.nan)) for one, each in names])
@@ -225,9 +223,9 @@ class _SmoothedHand:
         return self.qpos[np.isfinite(self.qpos).all(axis=1), 7:]
 
     def _prior_of(self, joints: Bool[np.ndarray, "20"]) -> Float[np.ndarray, "20 20"]:
-        """Precision of the prior of joint angles in one frame [1/rad^2].
+        """Precision of the prior of the joint angles in one frame [1/rad^2].
 
-        Of these joints, those that do not move may have any usual angle.
+        The prior says nothing of those of the given joints that do not move.
         """
         own = own_variances(self._angles()) * joints
         return np.asarray(self._share * np.linalg.inv(resting_prior().covariance + np.diag(own)))

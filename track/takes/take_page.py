@@ -114,7 +114,7 @@ def _with_record(rows: _Rows, take: Take) -> _Rows:
 
 
 def _write_table(path: Path, rows: _Rows, decimal: str) -> None:
-    """Write a table with a decimal mark."""
+    """Write a table as CSV, with points or commas in its numbers."""
     header, *others = rows
     if decimal == ",":
         others = [

@@ -253,7 +253,7 @@ def test_a_lost_hand_has_no_numbers(message):
 
 
 def as_openxr(position, rotation):
-    """OpenXR: x right, y up, z backward; x of the world is forward there, z is up."""
+    """A pose in OpenXR's axes (x right, y up, z backward), of a world whose x is forward and z up."""
     turn = Rotation.from_matrix([[0, -1, 0], [0, 0, 1], [-1, 0, 0]])
     return turn.apply(position), turn * rotation
 
