@@ -145,8 +145,10 @@ class _SmoothedHand:
         self._unseen = times_unseen(take.times, np.isfinite(self._targets[..., 0]))
         self._residuals = np.full_like(self._targets, np.nan)  # in the frames of the bones [m]
         self._hand, self._model, self._rate = hand_arrays(worn), spread_model(take, worn), take.rate
-        seen = np.isfinite(self._targets[..., 0]).any(axis=0)
-        self._shown = worn.attachment.beyond[:, seen].any(axis=1)  # joints beyond which a marker is seen
+        spans, seen = self._hand.hinge_span, np.isfinite(self._targets[..., 0]).any(axis=0)
+        joints = np.arange(NUM_JOINTS)[:, None]
+        # Whether each joint moves a marker that is seen.
+        self._shown = ((spans[:, 0] <= joints) & (joints < spans[:, 1]) & seen).any(axis=1)
         known = take.settings.get("known", {})
         names = [(f"{worn.side}:{name}", name) for name in JOINT_NAMES]
         self._known = np.deg2rad([known.get(one, known.get(each, np.nan)) for one, each in names])
