@@ -19,6 +19,7 @@ from jaxtyping import Bool, Float, Int
 
 from gloves.captures.capture import runs_of
 from gloves.takes.take import COASTING, INITIALIZED, LOST, STATUSES, Take
+from handsim._checks import check_choice
 from handsim.files.outputs import atomic_write, check_ending, written_together
 from handsim.hand.angles import ISB_JOINTS, ISB_NAMES, Convention
 from handsim.hand.shape import DIGITS, JOINT_NAMES, JOINTS, Side
@@ -28,6 +29,15 @@ from track.kinematics.pose_spread import CHANGING, DETECTABLE, SOURCES, measurem
 from track.takes.methods import made_of, methods_paragraph
 from track.takes.take_faults import AT_LIMIT, SuspectSpan
 from track.takes.take_summary import find_suspect_spans, summarize, suspicions, vouch
+from track.takes.trials import (
+    FIGURES,
+    PERCENTS,
+    Cycles,
+    cycles_of,
+    draw_cycles,
+    mean_and_spread,
+    thumb_reach,
+)
 from track.user import MEASURED, hand_origin
 from train.evaluation import percent
 
@@ -35,7 +45,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_TABLES: Final = (".frames.csv", ".joints.csv", ".markers.csv", ".doubts.csv", ".angles.csv")
+_TABLES: Final = (".frames.csv", ".joints.csv", ".markers.csv", ".doubts.csv", ".reach.csv", ".angles.csv")
+_CYCLES: Final = ".cycles.csv"
 _RECORD: Final = "made of"
 """Last column of all tables: version, date and checksums of the take; in its first row, in a study in all."""
 _WORDS: Final = ("capture", "person", "session")
@@ -76,6 +87,8 @@ class PageSettings:
     """The decimal mark of the tables; with a comma their cells are separated by semicolons."""
     guesses: bool = False
     """Whether curves and frames have angles of joints that nothing shows, see `Take.shown_joints`."""
+    cycles: str | None = None
+    """The joint, as in `JOINT_NAMES`, between whose least angles are the cycles of a movement."""
 
 
 def write_take_page(
@@ -84,22 +97,33 @@ def write_take_page(
     """Write the page on a take and its tables, all or none, as `handsim report` does.
 
     The page shows commands for the take's file `source`. Returns the paths of the page and of its tables:
-    frames, joints, markers, doubtful frames, and angles as a study compares them.
+    frames, joints, markers, doubtful frames, what the thumb reaches, cycles if asked for, and angles as a
+    study compares them.
+
+    Raises:
+        ArgumentError: The path does not end in .html, or the joint of the cycles is unknown.
     """
     out = Path(out)
     check_ending(out, ".html")
+    if settings.cycles is not None:
+        check_choice(settings.cycles, JOINT_NAMES, noun="joint")
     hands, spans = hand_figures(take, guesses=settings.guesses), find_suspect_spans(take, most=None)
-    paths = table_paths(out)
+    paths, cycles = table_paths(out, settings), _cycles(take, hands, settings)
     sections = [
         _summary_section(take),
         _calibration_section(take),
         *(section for hand in hands for section in _hand_sections(take, hand)),
+        *(_cycles_section(hand.side, found, settings) for hand, found in zip(hands, cycles, strict=False)),
         _spans_section(take, spans, source),
         *([_methods_section(take, spans, settings)] if take.made_by_tracker else []),
     ]
     tables = [rows(take, hands) for rows in (_frame_rows, _joint_rows, _marker_rows)]
-    tables = [_with_record(rows, take) for rows in (*tables, _span_rows(take, spans))]
-    tables.append(_angle_rows(take, hands, source, settings))
+    tables = [*tables, _span_rows(take, spans), _reach_rows(take, hands)]
+    first = [take.settings.get("capture", Path(source).name), settings.person, settings.session]
+    if settings.cycles is not None:
+        tables.append(_cycle_rows(take, hands, cycles, first))
+    tables = [_with_record(rows, take) for rows in tables]
+    tables.append(_angle_rows(take, hands, first, settings))
     with written_together():
         write_sections(out, sections, title=f"Take {Path(source).name}", lead=_lead(take))
         for path, rows in zip(paths, tables, strict=True):
@@ -139,9 +163,11 @@ def _with_comma(cell: object) -> object:
     return str(cell).replace(".", ",")
 
 
-def table_paths(page: Path) -> tuple[Path, ...]:
-    """Paths of a page's tables: frames, ranges of motion, markers, doubtful frames, angles of a study."""
-    return tuple(page.with_suffix(ending) for ending in _TABLES)
+def table_paths(page: Path, settings: PageSettings = PageSettings()) -> tuple[Path, ...]:
+    """Paths of a page's tables; the last is that of the angles of a study, before it that of cycles."""
+    *endings, last = _TABLES
+    cycles = [] if settings.cycles is None else [_CYCLES]
+    return tuple(page.with_suffix(ending) for ending in (*endings, *cycles, last))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -615,13 +641,75 @@ def _span_rows(take: Take, spans: Sequence[SuspectSpan]) -> _Rows:
     return rows
 
 
-def _angle_rows(take: Take, hands: Sequence[HandFigures], source: str, settings: PageSettings) -> _Rows:
+def _cycles(take: Take, hands: Sequence[HandFigures], settings: PageSettings) -> list[Cycles]:
+    """The cycles of each hand, if they are asked for."""
+    joint = settings.cycles
+    if joint is None:
+        return []
+    found = []
+    for hand in hands:
+        angles = take.angles(hand.side, neutral=settings.neutral).values()
+        found.append(cycles_of(np.rad2deg(np.transpose([*angles])), hand.measured, joint, take.rate))
+    return found
+
+
+def _cycles_section(side: Side, cycles: Cycles, settings: PageSettings) -> Section:
+    """Mean and standard deviation of the angles over the cycles, as curves and in numbers."""
+    title, joint = f"{side.capitalize()} hand: cycles", str(settings.cycles).replace("_", " ")
+    text = (
+        f"A cycle is from one least angle of {joint} to the next, if it bends by half of its range between."
+    )
+    if not cycles.spans:
+        return Section(title, f"{text} There is none.")
+    table = [["joint", "cycles", *(f"{name}: mean, SD" for name in FIGURES)]]
+    (_, means), (_, spreads) = mean_and_spread(cycles.figures)
+    counts = np.isfinite(cycles.figures[:, :, 0]).sum(axis=0).tolist()
+    for name, count, *rows in zip(JOINT_NAMES, counts, means, spreads, strict=True):
+        pairs = zip(*(row.tolist() for row in rows), strict=True)
+        cells = [", ".join(NOTHING if np.isnan(one) else f"{one:.3g}" for one in pair) for pair in pairs]
+        table.append([name.replace("_", " "), f"{count}", *cells])
+    text += " Each joint counts in the cycles in nine tenths of which it is measured. SD: over the cycles."
+    drawn = picture((9.6, 2.6), draw_cycles, cycles, _STROKES)
+    return Section(title, text, [(drawn, "Mean over the cycles; the band is one SD to either side.")], table)
+
+
+def _cycle_rows(
+    take: Take, hands: Sequence[HandFigures], cycles: Sequence[Cycles], first: list[object]
+) -> _Rows:
+    """Rows of figures and curves: by hand and joint of each cycle, their mean and standard deviation."""
+    header = [*_WORDS, "side", "joint", "cycle", "start [s]", *FIGURES]
+    rows: _Rows = [[*header, *(f"{percent:g} %" for percent in PERCENTS)]]
+    for hand, found in zip(hands, cycles, strict=True):
+        starts = take.times[[span[0] for span in found.spans]]
+        numbers = np.concatenate([found.figures, found.curves], axis=2)
+        every = [
+            (f"{n + 1}", _time(start), one)
+            for n, (start, one) in enumerate(zip(starts, numbers, strict=True))
+        ]
+        every += [(name, "", one) for name, one in mean_and_spread(numbers)] if every else []
+        for name, start, joints in every:
+            for joint, values in zip(JOINT_NAMES, joints.tolist(), strict=True):
+                rows.append([*first, hand.side, joint, name, start, *map(_number, values)])
+    return rows
+
+
+def _reach_rows(take: Take, hands: Sequence[HandFigures]) -> _Rows:
+    """Rows of how near the thumb came to each target of a test of opposition."""
+    rows: _Rows = [["side", "target", "gap_mm", "spread_mm", "time_s"]]
+    for hand in hands:
+        for name, gap, time, spread in thumb_reach(take, hand.side):
+            rows.append([hand.side, name, _number(1e3 * gap), _number(1e3 * spread), _time(time)])
+    return rows
+
+
+def _angle_rows(
+    take: Take, hands: Sequence[HandFigures], first: list[object], settings: PageSettings
+) -> _Rows:
     """Rows of the angles of a study: by hand, convention, joint and measure, in measured frames.
 
     SD and its constant part are those of a single angle, so that a range of motion has none.
     """
     rows: _Rows = [[*_ANGLES]]
-    first = [take.settings.get("capture", Path(source).name), settings.person, settings.session]
     joints = dict(zip(ISB_NAMES, ISB_JOINTS, strict=True)) | {name: n for n, name in enumerate(JOINT_NAMES)}
     for hand in hands:
         errors = _joint_errors(take.settings, hand)

@@ -31,7 +31,7 @@ def test_a_page_and_its_tables_are_written(folder, tmp_path, capsys):
     said = capsys.readouterr().out
     assert said.startswith(f"{out}: page on {folder / name}; tables in ") and said.count("\n") == 1
     names = {path.name for path in out.parent.iterdir()}
-    endings = ("html", "frames.csv", "joints.csv", "markers.csv", "doubts.csv", "angles.csv")
+    endings = ("html", "frames.csv", "joints.csv", "markers.csv", "doubts.csv", "reach.csv", "angles.csv")
     assert names == {f"page.{ending}" for ending in endings}
     assert all(one in said for one in names)
     with (out.parent / "page.frames.csv").open(newline="") as file:
