@@ -129,7 +129,7 @@ def test_markers_have_their_gaps_and_residuals(take, report):
 
 
 def test_the_page_is_whole_and_leads_to_the_frames_to_look_at(take, report):
-    page, (_, joints, _, doubts, _) = report
+    page, (_, joints, _, doubts, *_) = report
     side = take.sides[0]
     (doubt,) = doubts
     assert (doubt["first_frame"], doubt["last_frame"]) == ("22", "29"), "the frames in which it was lost"
@@ -175,9 +175,9 @@ def test_the_page_ends_with_the_methods_and_what_the_take_was_made_of(take, repo
     assert "doubtful (13.3 %) were LEFT OUT" in text
     made = f"handsim {take.settings['handsim']}, {take.settings['date']}"
     assert f"Made of: {made}" in text
-    for rows in tables[:4]:
+    for rows in tables[:5]:
         assert rows[0]["made of"].startswith(made) and not any(row["made of"] for row in rows[1:])
-    assert all(row["made of"].startswith(made) for row in tables[4])
+    assert all(row["made of"].startswith(made) for row in tables[5])
     page, _ = written(tmp_path, dataclasses.replace(take, settings={**take.settings, "filter": {}}))
     assert "Each frame was solved by itself, without a filter." in page
 
@@ -202,7 +202,7 @@ def test_whose_hands_they_are(take, tmp_path, monkeypatch):
 
 
 def test_a_truth_has_no_doubt_and_residuals_of_its_noise(truth, tmp_path):
-    page, (frames, _, _, doubts, _) = written(tmp_path, truth)
+    page, (frames, _, _, doubts, *_) = written(tmp_path, truth)
     assert doubts == [] and "No label is probably wrong or missing" in page and "nothing to calibrate" in page
     for side, hand in zip(truth.sides, truth.hands, strict=True):
         off = truth.observed(side) - hand.markers(truth.qpos[:, truth.hand_index(side)])[0]
@@ -219,7 +219,7 @@ def test_hands_that_are_not_there_and_points_that_are_not(take, truth, tmp_path)
         rms=np.full_like(take.rms, np.nan),
         labels=np.full_like(take.labels, -1),
     )
-    page, (frames, joints, markers, doubts, _) = written(tmp_path, lost)
+    page, (frames, joints, markers, doubts, *_) = written(tmp_path, lost)
     assert page.count("It has no pose in any frame.") == 2 and "not there" in page and "<img" not in page
     assert {row["status"] for row in frames} == {"lost"} and doubts == []
     assert np.isnan(numbers(joints, "median_deg")).all() and (numbers(markers, "gaps") == 0).all()
@@ -233,7 +233,8 @@ def test_hands_that_are_not_there_and_points_that_are_not(take, truth, tmp_path)
 
 def test_tables_have_names_beside_the_page():
     assert [path.name for path in table_paths(Path("a.b.html"))] == [
-        "a.b.frames.csv", "a.b.joints.csv", "a.b.markers.csv", "a.b.doubts.csv", "a.b.angles.csv"
+        "a.b.frames.csv", "a.b.joints.csv", "a.b.markers.csv", "a.b.doubts.csv", "a.b.reach.csv",
+        "a.b.angles.csv"
     ]  # fmt: skip
 
 
