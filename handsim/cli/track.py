@@ -80,10 +80,9 @@ def track(
             raise ArgumentError("given --labeled or --send and several captures, expected one capture")
         _track_study(captures, out, options, calibrate=calibrate, smooth=smooth, known=known)
         return
-    if calibrate and live is not None:
-        raise ArgumentError(
-            f"given --calibrate and --live {live}, expected a capture, which is tracked twice"
-        )
+    if live is not None and (calibrate or known):
+        option = "--calibrate" if calibrate else "--known"
+        raise ArgumentError(f"given {option} and --live {live}, expected a capture, all of which is there")
     if out is not None:
         check_take_file(out, live=live is not None)
     elif capture is not None or labeled is not None or not send:

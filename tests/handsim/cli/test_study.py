@@ -164,7 +164,10 @@ def test_a_study_is_done_once_past_interruptions_and_a_damaged_file(simulated, t
             name: cell.replace(".", "," if name in numbers else ".") for name, cell in one.items()
         }
     tracked.clear()
-    assert main([*track, "--no-smooth"]) == 0 and sorted(tracked) == sorted(NAMES)  # a setting of all
+    # A setting of all.
+    assert main([*track, "--known", "index_PIP_flexion=20"]) == 0 and sorted(tracked) == sorted(NAMES)
+    known = [load_take((takes / name).with_suffix(".npz")).settings["known"] for name in NAMES]
+    assert known == [{"index_PIP_flexion": 20.0}] * len(NAMES)
     record = json.loads((takes / "study.json").read_text())
     assert list(record["study"]) == [name.replace(".trc", ".npz") for name in NAMES]
 
@@ -198,6 +201,14 @@ def test_one_capture_has_one_file(tmp_path, capsys):
         assert f"{name} for several captures, expected a folder" in capsys.readouterr().err
     assert main(["track", *both, "--out", str(tmp_path), "--labeled", "a.trc"]) == 1
     assert "expected one capture" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("option", [["--calibrate"], ["--known", "index_PIP_flexion=60"]])
+def test_what_needs_a_whole_capture_is_refused_for_a_stream(option, tmp_path, capsys):
+    asked = ["track", "--live", "natnet://127.0.0.1", *option, "--out", str(tmp_path / "take.npz")]
+    assert main(asked) == 1
+    said = capsys.readouterr().err
+    assert f"given {option[0]} and --live natnet://127.0.0.1, expected a capture, all of which is" in said
     for command in ("track", "calibrate"):
         assert main([command, *both, "--out", str(tmp_path / command)]) == 1
         assert (
