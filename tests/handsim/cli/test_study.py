@@ -201,6 +201,11 @@ def test_one_capture_has_one_file(tmp_path, capsys):
         assert f"{name} for several captures, expected a folder" in capsys.readouterr().err
     assert main(["track", *both, "--out", str(tmp_path), "--labeled", "a.trc"]) == 1
     assert "expected one capture" in capsys.readouterr().err
+    for command in ("track", "calibrate"):
+        assert main([command, *both, "--out", str(tmp_path / command)]) == 1
+        assert (
+            f"2 of 2 files were not {command.rstrip('e')}ed: {both[0]}, {both[1]}" in capsys.readouterr().err
+        )
 
 
 @pytest.mark.parametrize("option", [["--calibrate"], ["--known", "index_PIP_flexion=60"]])
@@ -209,8 +214,3 @@ def test_what_needs_a_whole_capture_is_refused_for_a_stream(option, tmp_path, ca
     assert main(asked) == 1
     said = capsys.readouterr().err
     assert f"given {option[0]} and --live natnet://127.0.0.1, expected a capture, all of which is" in said
-    for command in ("track", "calibrate"):
-        assert main([command, *both, "--out", str(tmp_path / command)]) == 1
-        assert (
-            f"2 of 2 files were not {command.rstrip('e')}ed: {both[0]}, {both[1]}" in capsys.readouterr().err
-        )
