@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from film.detector import FoundHand as FoundHand
     from film.detector import HandDetector as HandDetector
     from film.registration import Registration as Registration
+    from film.stored_hands import StoredHands as StoredHands
     from film.training import train_detector as train_detector
 
 __getattr__, __dir__ = lazy_exports(__name__)

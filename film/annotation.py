@@ -17,6 +17,7 @@ from film.detector import HandDetector
 from film.outlines import poses_at, shutter_times
 from film.page import write_film_page
 from film.registration import Registration, register
+from film.stored_hands import StoredHands
 from film.video import Film, FilmFootage
 from gloves.takes.take import Take, load_take
 from handsim._checks import check_type
@@ -46,7 +47,7 @@ def register_camera(
     video: str | Path,
     *,
     camera: Camera | str | Path | None = None,
-    detector: HandDetector | None = None,
+    detector: HandDetector | StoredHands | None = None,
     progress: Progress = no_progress,
     on_step: OnStep = no_step,
 ) -> Registration:
@@ -57,7 +58,8 @@ def register_camera(
         video: The video: of one camera that stood still, and of one shot.
         camera: A camera with the lens of the video's, or a file of it; its pose does not count. The focal
             length, the center and two coefficients are found, too, when not given.
-        detector: Finds the hands in the pictures; the shipped one when not given.
+        detector: Finds the hands in the pictures, or those that another program found; the shipped one when
+            not given.
         progress: Called with the numbers of frames that were read, and of all.
         on_step: Called with the name of each step.
 
@@ -99,15 +101,21 @@ def _given(camera: Camera | str | Path | None, size: tuple[int, int]) -> Camera 
     return fitting[0]
 
 
-def find_hands(film: Film, detector: HandDetector, progress: Progress) -> list[FoundFrame]:
+def find_hands(film: Film, detector: HandDetector | StoredHands, progress: Progress) -> list[FoundFrame]:
     """The frames of a video, some of them with the hands in them."""
     found: list[FoundFrame] = []
     step = max(1, round(film.rate / _LOOKS))
     for number, (time, picture) in enumerate(film.frames()):
         progress(number + 1, max(film.num_frames, number + 1))
-        found.append(FoundFrame(time, None if number % step else detector.detect(picture)))
+        if isinstance(detector, StoredHands):
+            found.append(FoundFrame(time, detector.frames.get(number)))
+        else:
+            found.append(FoundFrame(time, None if number % step else detector.detect(picture)))
     if not found:
         raise CaptureError(f"{film.path}: no frame can be read, expected a video")
+    last = max(detector.frames) if isinstance(detector, StoredHands) else 0
+    if last >= len(found):
+        raise CaptureError(f"hands of frame {last} were given, and {film.path} has {len(found)} frames")
     return found
 
 
@@ -119,7 +127,7 @@ def annotate_film(
     config: FrameConfig | None = None,
     *,
     camera: Camera | str | Path | None = None,
-    detector: HandDetector | None = None,
+    detector: HandDetector | StoredHands | None = None,
     workers: int | Executor | None = None,
     progress: Progress = no_progress,
     on_step: OnStep = no_step,

@@ -35,15 +35,19 @@ def film(
         out: Folder for the pictures, their annotations, film.json, film.mp4 and film.html.
         options: What to write.
         camera: File with this camera's lens, as of handsim rig import; the lens is fitted when not given.
-        detector: Folder of a hand detector of your own; the shipped one when not given.
+        detector: Folder of a hand detector of your own, or a .json file of COCO keypoints that another
+            program found (docs/how_to/film.md); the shipped detector when not given.
         format: File formats: webdataset, coco, yolo, exr, png; several go into folders.
         workers: Processes that write; all cores when not given.
     """
     from film.annotation import PAGE, annotate_film
     from film.detector import HandDetector
+    from film.stored_hands import StoredHands
 
     check_outputs((take, video, camera, detector), (out,))
     begin = time.perf_counter()
+    is_file = detector is not None and detector.suffix.lower() == ".json"
+    finder = StoredHands.load(detector) if detector and is_file else HandDetector.load(detector)
     with progress_bar("frames") as bar:
         found = annotate_film(
             take,
@@ -52,7 +56,7 @@ def film(
             format,
             options,
             camera=camera,
-            detector=HandDetector.load(detector),
+            detector=finder,
             workers=workers,
             progress=bar,
             on_step=bar.step,
