@@ -32,6 +32,13 @@ _DIGIT_COLORS: Final = (
 _PALM_COLOR: Final = (0.32, 0.36, 0.42)
 _BASE: Final = {"skin": (0.86, 0.66, 0.56), "glove": GLOVE_COLOR}
 _ROUGHNESS: Final = {"skin": 0.62, "glove": 0.85}
+_FONT: Final = cv2.FONT_HERSHEY_SIMPLEX
+_INK: Final = (38, 42, 50)
+_PAPER: Final = tuple(round(255 * level) for level in BACKGROUND)
+_TEXT_HEIGHT: Final = 24  # [pixels], of names and titles
+_PADDING: Final = 16  # between a picture and its texts [pixels]
+_GAP: Final = 6  # between the pictures of a sheet [px]
+_FRACTION_BITS: Final = 4  # OpenCV gets positions in sixteenths of a pixel
 
 
 def bone_colors() -> Float[np.ndarray, "L 3"]:
@@ -61,12 +68,6 @@ def skin_tint(model: HandModel) -> Float[np.ndarray, "V 3"]:
 
 
 Picture = UInt8[np.ndarray, "H W 3"]
-
-_FONT: Final = cv2.FONT_HERSHEY_SIMPLEX
-_INK: Final = (38, 42, 50)
-_PAPER: Final = tuple(round(255 * level) for level in BACKGROUND)
-_TEXT_HEIGHT: Final = 24  # [pixels], of names and titles
-_PADDING: Final = 16  # between a picture and its texts [pixels]
 
 
 def write_png(path: str | Path, picture: Picture) -> None:
@@ -164,10 +165,6 @@ def text_width(text: str) -> int:
 
 def _write(picture: Picture, text: str, origin: tuple[int, int], ink: tuple[int, ...]) -> None:
     cv2.putText(picture, text, origin, _FONT, _TEXT_HEIGHT / 32.0, ink, 2, cv2.LINE_AA)
-
-
-_GAP: Final = 6  # between the pictures of a sheet [px]
-_FRACTION_BITS: Final = 4  # OpenCV gets positions in sixteenths of a pixel
 
 
 def contact_sheet(frames: Sequence[RenderedFrame], *, columns: int = 3, width: int = 320) -> Picture:

@@ -28,6 +28,11 @@ from render.frames import Flags, Floats, Integers, at_rest
 _DOTS: Final = (-3, 0, 3)  # one pixel in nine is a dot, so that a window of 9 x 9 holds these
 _BYTES: Final = np.arange(256)
 _SHADOW_SLACK: Final = 2.0  # [px] of disparity that a surface may differ from itself
+_WALL: Final = 0.8  # reflectance of the white walls that noise was published for
+_BANDS: Final = 1024  # of cosines in the tables below
+_FADING: Final = 0.09  # [rad] over which surfaces go before the steepest
+_NOTHING: Final = np.float32(1e6)
+OTHER_NAMES: Final = {"realsense_d435": "d435"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,12 +210,6 @@ def _match(
             depth[row, column] = far if kept[row, column] and value > least else zero
 
 
-_WALL: Final = 0.8  # reflectance of the white walls that noise was published for
-_BANDS: Final = 1024  # of cosines in the tables below
-_FADING: Final = 0.09  # [rad] over which surfaces go before the steepest
-_NOTHING: Final = np.float32(1e6)
-
-
 @dataclass(frozen=True, slots=True)
 class TimeOfFlight(Settings):
     """Noise of a time-of-flight sensor; see `docs/sensors.md` for the sources of the numbers."""
@@ -340,9 +339,6 @@ DEPTH_NOISES: Final[dict[str, DepthNoise]] = {
     ),
 }
 SENSORS: Final = tuple(DEPTH_NOISES)
-
-
-OTHER_NAMES: Final = {"realsense_d435": "d435"}
 
 
 @dataclass(frozen=True, slots=True)

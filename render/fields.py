@@ -17,6 +17,9 @@ from numpy.typing import NDArray
 from handsim.kernels import kernel
 from render.frames import Doubles, Floats
 
+_KNOTS: Final = 32
+"""Knots of noise along each axis, a power of two; the noise repeats after them, unnoticed on a hand."""
+
 
 @functools.cache
 def quantiles() -> Float32[np.ndarray, "65536"]:
@@ -38,10 +41,6 @@ def normal_numbers(shape: tuple[int, ...], *, rng: np.random.Generator) -> Float
     """Independent standard normal numbers."""
     numbers = np.empty(shape, np.float32)
     return quantiles().take(random_words(shape, rng=rng), mode="clip", out=numbers)
-
-
-_KNOTS: Final = 32
-"""Knots of noise along each axis, a power of two; the noise repeats after them, unnoticed on a hand."""
 
 
 def noise(positions: Doubles, sizes: tuple[float, ...], *, rng: np.random.Generator) -> Floats:

@@ -47,6 +47,22 @@ from render.painting.rasterizer import NEAR, Triangles, see
 from render.scenery.lights import STUDIO
 
 _OVERSAMPLING: Final = 2  # colors are painted this much larger and scaled down, for smooth outlines
+_SIZE: Final = (800, 600)  # [px]
+_CODEC: Final = "mp4v"  # part of every build of OpenCV
+_AHEAD: Final = (-0.62, 0.62, -0.48)  # direction of view, as the viewer's first look
+_TEXT: Final = (60, 60, 60)
+FINGERS_UP: Final = np.array([1.0, 0.0, 0.0])
+# Directions of view in the wrist frame of a right hand; mirrored for a left hand.
+SIDES_OF_HAND: Final[Mapping[str, tuple[float, float, float]]] = {
+    "back": (0.0, 0.0, -1.0),
+    "palm": (0.0, 0.0, 1.0),
+    "thumb side": (0.0, -1.0, -0.25),
+    "little finger side": (0.0, 1.0, -0.25),
+}
+_GAP: Final = 0.025  # between hands in a row [m]
+_WIDTH, _COLUMNS = 2000, 4  # width of a picture of rows [px]; number of gloves in a row
+_CAMERA_SIZE: Final = (1100, 900)  # [px], without names
+_LABELS_SIZE: Final = (640, 800)  # of one side without names [px]
 
 
 class Balls(NamedTuple):
@@ -167,12 +183,6 @@ def unoccluded(
     return np.asarray(inside & (ahead > 0) & ((first == 0) | (ahead <= first + slack)))
 
 
-_SIZE: Final = (800, 600)  # [px]
-_CODEC: Final = "mp4v"  # part of every build of OpenCV
-_AHEAD: Final = (-0.62, 0.62, -0.48)  # direction of view, as the viewer's first look
-_TEXT: Final = (60, 60, 60)
-
-
 def write_clip(
     path: Path,
     frames: Iterable[tuple[Any, ...]],
@@ -222,20 +232,6 @@ def _check_written(path: Path) -> None:
             raise unwritten(path)
     finally:
         reader.release()
-
-
-FINGERS_UP: Final = np.array([1.0, 0.0, 0.0])
-# Directions of view in the wrist frame of a right hand; mirrored for a left hand.
-SIDES_OF_HAND: Final[Mapping[str, tuple[float, float, float]]] = {
-    "back": (0.0, 0.0, -1.0),
-    "palm": (0.0, 0.0, 1.0),
-    "thumb side": (0.0, -1.0, -0.25),
-    "little finger side": (0.0, 1.0, -0.25),
-}
-_GAP: Final = 0.025  # between hands in a row [m]
-_WIDTH, _COLUMNS = 2000, 4  # width of a picture of rows [px]; number of gloves in a row
-_CAMERA_SIZE: Final = (1100, 900)  # [px], without names
-_LABELS_SIZE: Final = (640, 800)  # of one side without names [px]
 
 
 def draw_row(

@@ -36,6 +36,22 @@ from render.frames import (
 
 CENTER: Final = 0.5
 """Center of the first pixel in our count [px]."""
+_DIGITS: Final = tuple(tuple(range(first, first + 4)) for first in range(1, NUM_KEYPOINTS, 4))
+UMETRACK_JOINTS: Final = [
+    *(digit[3] for digit in _DIGITS), 0, 2, 3, *(joint for digit in _DIGITS[1:] for joint in digit[:3])
+]  # fmt: skip
+"""Index in `KEYPOINT_NAMES` of every joint of UmeTrack and HOT3D.
+
+They have five tips, the wrist, the thumb without its base, and three joints per finger.
+"""
+METERS_PER_UNIT: Final = 1e-4
+"""Unit of a depth picture [m]."""
+_KEYWORD: Final = "metres_per_unit"
+_NORMAL_ZERO, _NORMAL_SCALE = 128, 127
+_RGB: Final = ("R", "G", "B")
+_NORMALS: Final = ("N.X", "N.Y", "N.Z")
+_IDS: Final = {"parts": "id.part", "instances": "id.instance", "markers": "id.marker"}
+_SENSOR: Final = "sensor."
 
 
 def shifted_K(camera: Camera) -> Doubles:
@@ -126,22 +142,6 @@ def _listed(content: Any) -> Any:
     raise TypeError
 
 
-_DIGITS: Final = tuple(tuple(range(first, first + 4)) for first in range(1, NUM_KEYPOINTS, 4))
-UMETRACK_JOINTS: Final = [
-    *(digit[3] for digit in _DIGITS), 0, 2, 3, *(joint for digit in _DIGITS[1:] for joint in digit[:3])
-]  # fmt: skip
-"""Index in `KEYPOINT_NAMES` of every joint of UmeTrack and HOT3D.
-
-They have five tips, the wrist, the thumb without its base, and three joints per finger.
-"""
-
-
-METERS_PER_UNIT: Final = 1e-4
-"""Unit of a depth picture [m]."""
-_KEYWORD: Final = "metres_per_unit"
-_NORMAL_ZERO, _NORMAL_SCALE = 128, 127
-
-
 def encode_jpeg(picture: UInt8[np.ndarray, "H W 3"], *, quality: int = 95) -> bytes:
     """An sRGB picture as JPEG."""
     ordered = cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)
@@ -208,12 +208,6 @@ def encode_pictures(frame: RenderedFrame, *, lossless: bool) -> dict[str, bytes]
     if ids is not None:
         files[".ids.png"] = ids
     return files
-
-
-_RGB: Final = ("R", "G", "B")
-_NORMALS: Final = ("N.X", "N.Y", "N.Z")
-_IDS: Final = {"parts": "id.part", "instances": "id.instance", "markers": "id.marker"}
-_SENSOR: Final = "sensor."
 
 
 def write_exr(path: str | Path, frame: RenderedFrame) -> None:

@@ -24,6 +24,12 @@ from render.frames import RenderedFrame
 INDEX: Final = "index.json"
 """Index file of a shard's folder: a list of records of its pictures."""
 _NAME: Final = re.compile(r"shard-(\d{5,})(\.tar)?")
+_IMAGES: Final = "images"
+PICTURES: Final = ("depth", "depth_ideal", "normals", "ids")
+"""Kinds of pictures beside the photographs, each of which has a folder."""
+_LABELS: Final = "labels"
+BESIDE: Final = (*PICTURES, _LABELS)
+"""Folders that may stand beside that of the photographs."""
 
 
 def shard_name(shard: int) -> str:
@@ -117,14 +123,6 @@ def json_list(items: Iterable[Any]) -> Iterator[str]:
     for number, item in enumerate(items):
         yield (",\n" if number else "\n") + to_json(item)
     yield "\n]"
-
-
-_IMAGES: Final = "images"
-PICTURES: Final = ("depth", "depth_ideal", "normals", "ids")
-"""Kinds of pictures beside the photographs, each of which has a folder."""
-_LABELS: Final = "labels"
-BESIDE: Final = (*PICTURES, _LABELS)
-"""Folders that may stand beside that of the photographs."""
 
 
 class FolderWriter:

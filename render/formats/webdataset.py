@@ -45,6 +45,12 @@ _MODELS: Final = {"pinhole": "PinholePlane", "brown": "OpenCV", "fisheye": "Ocul
 _UMETRACK_FROM_OURS: Final = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 _JOINTS_PER_DIGIT: Final = 4
 _ROOT_FRAMES: Final = 1  # a root that moves with the wrist comes before our bones
+_STREAM: Final = re.compile(r"[A-Za-z0-9_-]+")
+TAR: Final = ".tar"
+_FILLED: Final = 0.8  # distance of the outermost keypoint from a crop's middle over half the crop's width
+_WIDEST: Final = np.deg2rad(120.0)  # largest angle of view of a crop
+_ROUNDS: Final = 5  # times that a crop's camera is turned to the keypoints' middle, which then moves a little
+_NEAREST: Final = 1e-3  # least depth of a keypoint in a crop [m]
 
 
 def camera_record(camera: Camera, T_world_device: Float[np.ndarray, "4 4"]) -> dict[str, Any]:
@@ -180,14 +186,6 @@ def umetrack_hand(shape: HandShape) -> dict[str, Any]:
         "dense_bone_weights": rounded(weights, 6),
         "joint_limits": rounded(model.skeleton.ranges, 6),
     }
-
-
-_STREAM: Final = re.compile(r"[A-Za-z0-9_-]+")
-TAR: Final = ".tar"
-_FILLED: Final = 0.8  # distance of the outermost keypoint from a crop's middle over half the crop's width
-_WIDEST: Final = np.deg2rad(120.0)  # largest angle of view of a crop
-_ROUNDS: Final = 5  # times that a crop's camera is turned to the keypoints' middle, which then moves a little
-_NEAREST: Final = 1e-3  # least depth of a keypoint in a crop [m]
 
 
 class WebdatasetWriter:

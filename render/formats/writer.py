@@ -35,6 +35,11 @@ from render.formats.shards import (
 from render.formats.webdataset import WebdatasetWriter, frame_record
 from render.frames import RenderedFrame
 
+CONFIG: Final = "render.json"
+"""Settings of a rendering, in its folder."""
+_LARGEST: Final = 1 << 30  # largest file of a picture [bytes]
+_SAMPLE: Final = re.compile(r"(\d+)(\..+)")
+
 
 class PngWriter(FolderWriter):
     """`images/shard-00000/KEY.png`, `depth/shard-00000/KEY.png` ..., and `KEY.json` beside the photograph.
@@ -113,12 +118,6 @@ def whole_shards(folder: Path, formats: Sequence[str]) -> tuple[frozenset[int], 
         changed += found
         whole += [shard] if record and not found else []
     return frozenset(whole), changed
-
-
-CONFIG: Final = "render.json"
-"""Settings of a rendering, in its folder."""
-_LARGEST: Final = 1 << 30  # largest file of a picture [bytes]
-_SAMPLE: Final = re.compile(r"(\d+)(\..+)")
 
 
 def merge_renderings(folders: Sequence[str | Path], out: str | Path) -> int:

@@ -31,6 +31,10 @@ MARKER_COLOR: Final = (0.98, 0.98, 1.0)
 _SCATTER: Final = (0.30, 0.13, 0.08)
 """Scatter of skin; red light travels farthest (Jensen et al. 2001: free paths of 3.7, 1.4 and 0.7 mm)."""
 _FOLDS: Final = 0.85  # strength of ambient shade; below 1, because lamps light folds in part
+_BASE: Final = (0.85, 0.4)  # radius of a marker's base on the glove and in the marker [marker radii]
+_BASE_SIDES: Final = 12
+_EDGE: Final = np.deg2rad(60.0)  # [rad] An edge is drawn sharp where two faces meet at a larger angle.
+_BODY_BALLS: Final = 0.0032  # [m] radius of the markers of rigid bodies, 6.4 mm in diameter (Han et al. 2018)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,12 +77,6 @@ def shade_colors(shade: Float32[np.ndarray, "D"]) -> Float32[np.ndarray, "D 4"]:
     for channel, power in enumerate((0.8, 1.0, 1.05)):
         colors[:, channel] = cv2.pow(lit, power).reshape(-1)
     return colors
-
-
-_BASE: Final = (0.85, 0.4)  # radius of a marker's base on the glove and in the marker [marker radii]
-_BASE_SIDES: Final = 12
-_EDGE: Final = np.deg2rad(60.0)  # [rad] An edge is drawn sharp where two faces meet at a larger angle.
-_BODY_BALLS: Final = 0.0032  # [m] radius of the markers of rigid bodies, 6.4 mm in diameter (Han et al. 2018)
 
 
 def sphere_surface(

@@ -31,6 +31,12 @@ _NAME_OF_RENDERER: Final = (
     "from OpenGL.GL import GL_RENDERER, glGetString\n"
     "print('GL_RENDERER', glGetString(GL_RENDERER).decode())\n"
 )
+OPENGL_FROM_OPENCV: Final = np.diag([1.0, -1.0, -1.0, 1.0])
+"""Turns a camera's axes: OpenCV's x right, y down, z ahead into OpenGL's x right, y up, z back."""
+_NEAR, _FAR = 0.01, 30.0  # least and largest depth that is drawn [m]
+_GL_LINEAR: Final = 0x2601
+_DISTANCE: Final = 300.0  # [m], so far that a lamp's rays are as good as parallel
+_SHADOW_DEPTH: Final = 60.0  # depth of the camera that sees the shadows [scene diagonals]
 
 
 def load_pyrender() -> Any:
@@ -119,14 +125,6 @@ def _renderer_name() -> str:
     )
     lines = [line for line in done.stdout.splitlines() if line.startswith("GL_RENDERER ")]
     return lines[-1].removeprefix("GL_RENDERER ") if done.returncode == 0 and lines else ""
-
-
-OPENGL_FROM_OPENCV: Final = np.diag([1.0, -1.0, -1.0, 1.0])
-"""Turns a camera's axes: OpenCV's x right, y down, z ahead into OpenGL's x right, y up, z back."""
-_NEAR, _FAR = 0.01, 30.0  # least and largest depth that is drawn [m]
-_GL_LINEAR: Final = 0x2601
-_DISTANCE: Final = 300.0  # [m], so far that a lamp's rays are as good as parallel
-_SHADOW_DEPTH: Final = 60.0  # depth of the camera that sees the shadows [scene diagonals]
 
 
 def paint_opengl(camera: Camera, drawn: Sequence[Drawn], lighting: Lighting) -> UInt8[np.ndarray, "H W 4"]:

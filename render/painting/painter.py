@@ -42,6 +42,7 @@ _SHADED_AROUND: Final = 0.1  # border whose vertices may have faces in the pictu
 _BLOCK: Final = 1000  # points shaded at a time: they fit into the cache, and rows are no power of two apart
 
 _NO_TEXELS: Final = np.empty((0, 0, 2), dtype=np.uint32)
+_STEP: Final = 64  # windows' sizes are multiples of it, because OpenGL reallocates buffers for new sizes [px]
 
 
 class _Mesh(NamedTuple):
@@ -287,7 +288,6 @@ def _write_spot(
 
 Painter = Literal["compiled", "bright", "opengl"]
 PainterChoice = Literal["auto", "compiled", "opengl"]
-_STEP: Final = 64  # windows' sizes are multiples of it, because OpenGL reallocates buffers for new sizes [px]
 
 
 def choose_painter() -> PainterChoice:

@@ -26,6 +26,18 @@ from render.frames import Bytes, Doubles, Flags, Floats, Geometry, Integers, at_
 NEAR: Final = 0.01
 """Distance of the plane before the camera at which triangles are cut off [m]."""
 _ROUNDING: Final = 1e-12  # of barycentric coordinates, so that a pixel on a common side belongs to a face
+_MARGIN: Final = 2  # border of a face around the pixels that are looked up in it [px]
+_WIDEST: Final = 1.4  # largest tangent of an angle from the axis in one flat picture: 54 degrees
+_ONE_SURFACE: Final = 0.01  # largest difference of depth between neighbors of one surface, as a share of it
+# Axes of the cube's faces in the camera's axes, as columns: ahead, right, left, down, up, back.
+_FACE_AXES: Final = (
+    ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
+    ((0, 0, 1), (0, 1, 0), (-1, 0, 0)),
+    ((0, 0, -1), (0, 1, 0), (1, 0, 0)),
+    ((1, 0, 0), (0, 0, 1), (0, -1, 0)),
+    ((1, 0, 0), (0, 0, -1), (0, 1, 0)),
+    ((-1, 0, 0), (0, 1, 0), (0, 0, -1)),
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -279,20 +291,6 @@ def _interpolate(
             scale = 1.0 / np.sqrt(total)
             for i in range(3):
                 picture[row, column, i] *= scale
-
-
-_MARGIN: Final = 2  # border of a face around the pixels that are looked up in it [px]
-_WIDEST: Final = 1.4  # largest tangent of an angle from the axis in one flat picture: 54 degrees
-_ONE_SURFACE: Final = 0.01  # largest difference of depth between neighbors of one surface, as a share of it
-# Axes of the cube's faces in the camera's axes, as columns: ahead, right, left, down, up, back.
-_FACE_AXES: Final = (
-    ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
-    ((0, 0, 1), (0, 1, 0), (-1, 0, 0)),
-    ((0, 0, -1), (0, 1, 0), (1, 0, 0)),
-    ((1, 0, 0), (0, 0, 1), (0, -1, 0)),
-    ((1, 0, 0), (0, 0, -1), (0, 1, 0)),
-    ((-1, 0, 0), (0, 1, 0), (0, 0, -1)),
-)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -34,6 +34,23 @@ from render.scenery.rooms import RoomLight, cast_room, draw_room, paint_tints
 LUMINANCE: Final = np.array([0.2126, 0.7152, 0.0722])
 _MAP_LIGHT: Final = 0.5  # mean luminance of a map, 1 for a white surface in full light
 _TRIES: Final = 50  # unreadable files in turn after which a folder counts as one without photographs
+SHARE: Final = 0.6
+"""Share of the plain backgrounds that catch shadows; the others are too far away."""
+_GAPS: Final = (0.02, 0.35)  # range of a backdrop's distance from the hands [m]
+_FAR: Final = 8.0  # distance of a backdrop without shadows over that of one with them
+_STEEPEST: Final = 0.35  # largest slope of a backdrop against the picture's plane
+_SOFTNESS: Final = (0.03, 0.25)  # range of shadows' softness, from that of a bare bulb to a window's
+_USUAL_SHARES: Final = {"plain": 0.25, "gradient": 0.25, "room": 0.5}
+_CLOSE: Final = ("plain", "gradient")  # kinds that may be as near as a wall or a table
+_OUT_OF_FOCUS: Final = ("gradient", "room")  # kinds drawn at half the resolution
+_MARGIN: Final = (0.8, 2.2)  # range of the distance between the outermost camera or hand and a wall [m]
+_FREE: Final = 0.5  # distance of furniture from the box around hands and cameras [m]
+_TEXTURE: Final = 512  # width and height of a wall's picture [px]
+_TO_WALL: Final = 0.95  # share of the way to a wall at which a room's lamp is
+_STRIP: Final = 2**14  # pixels of a picture that `remap` fills at once; it takes at most 32767 rows
+_SHARP: Final = 0.3  # blur that is not drawn [px]
+_ONE_SURFACE: Final = 0.03  # share by which nearness inside a pixel of a coarse picture may differ
+_SHORTEST: Final = 1e-6  # least component of a ray, so that it meets a wall along each axis
 
 
 @functools.lru_cache(maxsize=2)
@@ -134,17 +151,8 @@ def draw_photo(file: Path, size: tuple[int, int], rng: np.random.Generator) -> F
     return np.asarray((scaled.astype(np.float32) / 255.0) ** GAMMA)
 
 
-SHARE: Final = 0.6
-"""Share of the plain backgrounds that catch shadows; the others are too far away."""
-_GAPS: Final = (0.02, 0.35)  # range of a backdrop's distance from the hands [m]
-_FAR: Final = 8.0  # distance of a backdrop without shadows over that of one with them
-_STEEPEST: Final = 0.35  # largest slope of a backdrop against the picture's plane
-_SOFTNESS: Final = (0.03, 0.25)  # range of shadows' softness, from that of a bare bulb to a window's
 BackgroundKind = Literal["plain", "gradient", "room", "photo"]
 KINDS: Final[tuple[BackgroundKind, ...]] = get_args(BackgroundKind)
-_USUAL_SHARES: Final = {"plain": 0.25, "gradient": 0.25, "room": 0.5}
-_CLOSE: Final = ("plain", "gradient")  # kinds that may be as near as a wall or a table
-_OUT_OF_FOCUS: Final = ("gradient", "room")  # kinds drawn at half the resolution
 
 
 @dataclass(frozen=True, slots=True)
@@ -310,14 +318,6 @@ def _gradient(first: Floats, second: Floats, size: tuple[int, int], rng: np.rand
 
 
 Corner = tuple[float, float, float]
-_MARGIN: Final = (0.8, 2.2)  # range of the distance between the outermost camera or hand and a wall [m]
-_FREE: Final = 0.5  # distance of furniture from the box around hands and cameras [m]
-_TEXTURE: Final = 512  # width and height of a wall's picture [px]
-_TO_WALL: Final = 0.95  # share of the way to a wall at which a room's lamp is
-_STRIP: Final = 2**14  # pixels of a picture that `remap` fills at once; it takes at most 32767 rows
-_SHARP: Final = 0.3  # blur that is not drawn [px]
-_ONE_SURFACE: Final = 0.03  # share by which nearness inside a pixel of a coarse picture may differ
-_SHORTEST: Final = 1e-6  # least component of a ray, so that it meets a wall along each axis
 
 
 @dataclass(frozen=True, slots=True)

@@ -40,6 +40,25 @@ ALL_TONES: Final = (TONES["dark"][0], TONES["very light"][1])
 _ANGLES: Final = (-52.0, -30.0, 0.0, 20.0, 35.0, 50.0, 64.0)
 _YELLOWNESS: Final = (12.0, 15.5, 18.5, 18.5, 17.5, 15.5, 12.5)  # CIELAB b* of the back of the hand
 _REDNESS: Final = (8.8, 10.5, 12.0, 11.5, 10.5, 9.5, 8.5)  # CIELAB a*
+_PLACES: Final = (0.0, 0.28, 0.62, 1.0, 1.42, 1.9, 2.6, 6.0)
+"""Places behind the wrist [hand lengths]; the fifth is the elbow."""
+_GIRTHS: Final = (1.92, 2.1, 2.7, 3.0, 2.85, 3.2, 3.6, 3.8)
+"""Girths of the arm at these places [hand breadths]."""
+CUFF: Final = 0.0004
+"""Length of the step from an arm to its sleeve, between two rings [m]."""
+_THICK: Final = 0.0012  # thickness of a glove's hem [m]
+_HEM: Final = 0.004  # distance of this step from the next rings, so that shading does not round it [m]
+_SQUARE: Final = 0.8  # power of cosine and sine in an arm's section, which is squarer than an ellipse (1)
+_LONGER: Final = 1.04  # girth of this section over that of the ellipse with the same axes
+_BLEND: Final = 0.22  # length of the blend from the hand's section to the arm's [hand lengths]
+BEND: Final = 0.32
+"""Length of the bend of the wrist [hand lengths]."""
+ELBOW: Final = _PLACES[4]
+"""Place of the elbow behind the wrist [hand lengths]."""
+ELBOW_BEND: Final = 0.05
+"""Length on either side of the elbow that bends with it [m]."""
+REACH: Final = 1.8
+"""Length behind the elbow of arms that leave a picture [m]."""
 
 
 def typology_angle(lightness: float, yellowness: float) -> float:
@@ -172,27 +191,6 @@ def _draw_angle(tones: Sequence[float], rng: np.random.Generator) -> float:
     along = rng.uniform(0.0, ends[-1])
     number = int(np.searchsorted(ends[:-1], along, side="right"))
     return float(tones[::2][number] + along - (ends - widths)[number])
-
-
-_PLACES: Final = (0.0, 0.28, 0.62, 1.0, 1.42, 1.9, 2.6, 6.0)
-"""Places behind the wrist [hand lengths]; the fifth is the elbow."""
-_GIRTHS: Final = (1.92, 2.1, 2.7, 3.0, 2.85, 3.2, 3.6, 3.8)
-"""Girths of the arm at these places [hand breadths]."""
-CUFF: Final = 0.0004
-"""Length of the step from an arm to its sleeve, between two rings [m]."""
-_THICK: Final = 0.0012  # thickness of a glove's hem [m]
-_HEM: Final = 0.004  # distance of this step from the next rings, so that shading does not round it [m]
-_SQUARE: Final = 0.8  # power of cosine and sine in an arm's section, which is squarer than an ellipse (1)
-_LONGER: Final = 1.04  # girth of this section over that of the ellipse with the same axes
-_BLEND: Final = 0.22  # length of the blend from the hand's section to the arm's [hand lengths]
-BEND: Final = 0.32
-"""Length of the bend of the wrist [hand lengths]."""
-ELBOW: Final = _PLACES[4]
-"""Place of the elbow behind the wrist [hand lengths]."""
-ELBOW_BEND: Final = 0.05
-"""Length on either side of the elbow that bends with it [m]."""
-REACH: Final = 1.8
-"""Length behind the elbow of arms that leave a picture [m]."""
 
 
 @dataclass(frozen=True, slots=True)

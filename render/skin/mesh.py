@@ -48,6 +48,13 @@ RINGS: Final = 20
 """Rings of the forearm beyond the wrist's."""
 _LEVELS: Final = 2  # number of times that the cage is subdivided
 _SIDE: Final = 2**_LEVELS  # faces of the skin along a tile
+_REFERENCE: Final = 0.0118  # radius of the finger at its knuckle that the lengths below are made for [m]
+_THUMB_RADIUS: Final = 0.018  # distance from the thumb's axis within which the skin is the thumb's [m]
+_FINGERS: Final = ("index", "middle", "ring", "little")
+_LEAST_SHARE: Final = 0.04  # Vertices bend where twice the product of two bones' weights is larger.
+_FLESH: Final = 1.2  # radius of the flesh around a capsule over the capsule's radius
+_PALE: Final = 35.0  # logarithm of the light of skin that bones stretch, over how far they raise it [1/m]
+_DARKEST: Final = 0.12  # share of the ambient light that the deepest folds receive
 
 
 class Atlas(NamedTuple):
@@ -164,12 +171,6 @@ def _squares(nodes: Integers) -> Integers:
     first = np.stack([a, b, c], axis=-1).reshape(-1, 3)
     second = np.stack([a, c, d], axis=-1).reshape(-1, 3)
     return np.concatenate([first, second])
-
-
-_REFERENCE: Final = 0.0118  # radius of the finger at its knuckle that the lengths below are made for [m]
-_THUMB_RADIUS: Final = 0.018  # distance from the thumb's axis within which the skin is the thumb's [m]
-_FINGERS: Final = ("index", "middle", "ring", "little")
-_LEAST_SHARE: Final = 0.04  # Vertices bend where twice the product of two bones' weights is larger.
 
 
 class _Hill(NamedTuple):
@@ -330,11 +331,6 @@ def _finger(skin: _Skin, number: int, digit: str, wide: float) -> Iterator[_Hill
         pads = 0.0018 * bump(place[:, 0] - 0.5 * end, 0.009) - 0.0016 * bump(place[:, 0] - end, 0.0022)
         pads *= bump(place[:, 1], 0.007) * smooth(-facing, 0.1, 0.7) * (place[:, 2] < 0.004)
         yield _Hill(f"{digit}_{joint}_flexion", 20.0, full, size * pads)
-
-
-_FLESH: Final = 1.2  # radius of the flesh around a capsule over the capsule's radius
-_PALE: Final = 35.0  # logarithm of the light of skin that bones stretch, over how far they raise it [1/m]
-_DARKEST: Final = 0.12  # share of the ambient light that the deepest folds receive
 
 
 @dataclass(frozen=True, slots=True, eq=False)

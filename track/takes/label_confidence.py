@@ -29,6 +29,14 @@ _SHORT: Final = 20.0  # Lives of at least this many frames count as long.
 _FAR: Final = 1.0  # [m] stands for the distance of a missing neighbor
 _MOST_OFF: Final = 100.0  # upper bound of a residual in the evidence, in usual residuals
 _REPEATED: Final = 0.005  # [m] Points that come and go within this distance in a hand may be one marker.
+_LABELED: Final = (-8.11, 0.72, 3.08, 0.08, 0.68, 1.49, 2.49, 0.78)
+"""Log-odds of a wrong label: bias, and weight of each piece of evidence."""
+_UNLABELED: Final = (-9.44, 3.91, 3.13, 6.01, -0.76, 3.30, 1.62, 0.76, 1.35, 2.0)
+"""Log-odds that an unlabeled point is a marker: bias, and weight of each piece of evidence.
+
+The last weight is not fitted, as markers that are hardly ever seen are rare in the captures: from 1.7 on it
+lists a fingertip that is seen in nine of 600 frames, 24 mm from where the pose has it.
+"""
 
 
 class Evidence(NamedTuple):
@@ -260,16 +268,6 @@ def _nearest(points: Float[np.ndarray, "N 3"], place: Float[np.ndarray, "3"], mo
         if distance < most:
             most, found = distance, i
     return found
-
-
-_LABELED: Final = (-8.11, 0.72, 3.08, 0.08, 0.68, 1.49, 2.49, 0.78)
-"""Log-odds of a wrong label: bias, and weight of each piece of evidence."""
-_UNLABELED: Final = (-9.44, 3.91, 3.13, 6.01, -0.76, 3.30, 1.62, 0.76, 1.35, 2.0)
-"""Log-odds that an unlabeled point is a marker: bias, and weight of each piece of evidence.
-
-The last weight is not fitted, as markers that are hardly ever seen are rare in the captures: from 1.7 on it
-lists a fingertip that is seen in nine of 600 frames, 24 mm from where the pose has it.
-"""
 
 
 def label_confidence(take: Take, evidence: Evidence | None = None) -> Float[np.ndarray, "P"]:
