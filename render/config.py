@@ -20,11 +20,11 @@ from handsim.space.transforms import UpAxis
 from render.color_sensor import ExposureConfig, ShutterConfig
 from render.depth_sensor import OTHER_NAMES, SENSORS, DepthSensor
 from render.frames import PASSES
-from render.painting.painter import PainterChoice, choose_painter
 from render.scenery.backgrounds import Backgrounds
 from render.skin.look import ALL_TONES, TONES, check_tones, hyphened, named_tones
 from render.viewpoints import ViewConfig
 
+PainterChoice = Literal["auto", "compiled", "opengl"]
 NEAR_SENSOR: Final = "d435"
 """Depth sensor of cameras that may be as near as 0.3 m to the hands: it measures from 0.2 m on."""
 FAR_SENSOR: Final = "kinect2"
@@ -201,6 +201,8 @@ def resolve(
     config = RenderConfig.of(config, settings)
     view, painter, sensor = _view(config.view, camera), config.painter, config.depth_sensor
     if painter == "auto":  # without colors there is no need to look
+        from render.painting.painter import choose_painter  # not for the help of commands
+
         painter = choose_painter() if "rgb" in config.passes else "compiled"
     if sensor == "auto" and "depth" not in config.passes:
         sensor = None

@@ -16,16 +16,6 @@ from handsim.errors import HandSimError
 from handsim.files.outputs import check_outputs
 from handsim.hand.shape import Side
 from render.config import RenderConfig
-from render.formats.writer import merge_renderings
-from render.session import (
-    SHEET,
-    cut_off_pictures,
-    hidden_pictures,
-    left_out_frames,
-    render_take,
-    visible_hands,
-)
-from render.subject import CSV, PoseFile
 
 
 def render(
@@ -65,6 +55,17 @@ def render(
         cluster: Where else to draw shards: tcp://host:port of a Dask scheduler, its file (.json), or local;
             docs/cluster.md.
     """
+    from render.formats.writer import merge_renderings
+    from render.session import (
+        SHEET,
+        cut_off_pictures,
+        hidden_pictures,
+        left_out_frames,
+        render_take,
+        visible_hands,
+    )
+    from render.subject import CSV, PoseFile
+
     if sum((take is not None, poses is not None, bool(merge))) != 1:
         raise HandSimError("expected a take, --poses or --merge, and one of them alone")
     place = place_of(out)

@@ -26,7 +26,6 @@ from typing import Final, NamedTuple, cast
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
-from scipy import sparse
 
 from handsim.errors import CaptureError, choices
 from handsim.files.inputs import read_bytes
@@ -221,6 +220,8 @@ def corner_normals(
     vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]
 ) -> Float[np.ndarray, "F 3 3"]:
     """Outward unit normal at each corner of a face, over adjacent faces within 40 degrees of it."""
+    from scipy import sparse  # takes a quarter of a second, which help does not need
+
     first, second, third = (vertices[faces[:, corner]] for corner in range(3))
     areas = np.cross(second - first, third - first)
     units = _unit(areas)

@@ -287,10 +287,9 @@ def _write_spot(
 
 
 Painter = Literal["compiled", "bright", "opengl"]
-PainterChoice = Literal["auto", "compiled", "opengl"]
 
 
-def choose_painter() -> PainterChoice:
+def choose_painter() -> Literal["compiled", "opengl"]:
     """OpenGL where it draws on hardware, and our own painter elsewhere."""
     return "opengl" if opengl_has_hardware() else "compiled"
 

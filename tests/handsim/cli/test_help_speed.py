@@ -9,6 +9,8 @@ from tests.programs import run_python
 HEAVY = (
     "numba",
     "torch",
+    "scipy.ndimage",
+    "scipy.sparse",
     "scipy.spatial",
     "scipy.interpolate",
     "scipy.optimize",

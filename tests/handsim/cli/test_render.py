@@ -58,6 +58,6 @@ def test_photographs_alone_are_the_only_background() -> None:
 
 
 def test_depth_alone_never_looks_for_hardware(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("render.config.choose_painter", lambda: pytest.fail("looked"))
+    monkeypatch.setattr("render.painting.painter.choose_painter", lambda: pytest.fail("looked"))
     assert resolve(RenderConfig(passes=("depth",))).painter == "compiled"
     assert resolve(RenderConfig(painter="opengl")).painter == "opengl"
