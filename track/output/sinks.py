@@ -76,9 +76,12 @@ _BUNDLE_HEAD, _BUNDLE_ENTRY = 16, 4  # [bytes] overhead of an OSC bundle and of 
 _LARGEST_INTEGER: Final = 0x7FFFFFFF  # largest integer of an OSC message
 _HEADER_PERIOD: Final = 1.0  # [s] The header is repeated after this time for receivers that came late.
 _WAITING: Final = 256  # largest number of frames waiting for a client that wants every frame
-_UNCONFIRMED: Final = 0.05  # [s] A client with a frame unconfirmed for longer gets no other one.
+_BEHIND: Final = 0.05  # [s] A client that wants every frame is told of a longer lag.
 _TELL: Final = 1.0  # [s] least time between two reports of a client's lag, or two headers
 _ON_REQUEST: Final = "/newest"  # path for clients that request each frame
+_QUEUEING: Final = "websockets/"  # user agent of Python's websockets, which holds 16 parts of messages
+_SLOW: Final = 0.01  # [s] A program that reads its frame later than this is waited for.
+_PARTS: Final = 17  # With this many it reads no further, nor answers a ping, until its program reads.
 _SEND_BUFFER: Final = 1 << 17  # [bytes] size of the system's send buffer for each client
 MOST_CONNECTIONS: Final = 64
 """Largest number of open connections of a server."""
@@ -441,18 +444,19 @@ class WebSocketSink:
     """Serves messages to any number of WebSocket clients from its own thread; port 0 selects a free port.
 
     A client receives the header, again when the hands change their size and thus the header, and the newest
-    frame as soon as it has read the one before, which its WebSocket library confirms by a pong. A client of
-    the path /newest gets one frame for each message that it sends. For a client of /?every=1 all frames
-    wait, at most 256; with `every` they do for each client. A slow client loses frames, receives its lag,
-    and delays nobody. Browsers' pages are served if they are of this machine, or with `all_pages`; other
-    programs always are. At most 64 connections are open at a time; further ones are refused.
+    frame whenever it answers a ping, which libraries do as their programs read. A client of the path /newest
+    gets one frame for each message that it sends. For a client of /?every=1 all frames wait, at most 256, and
+    it receives its lag; with `every` they do for each client. A slow client delays nobody. Browsers' pages
+    are served if they are of this machine, or with `all_pages`; other programs always are. At most 64
+    connections are open at a time; further ones are refused.
     """
 
     def __init__(
         self, host: str, port: int, format: MessageFormat, *, every: bool = False, all_pages: bool = False
     ) -> None:
         self._serve: Any = import_extra("websockets.asyncio.server", "ws://", "send").serve
-        self._closed_error: Any = import_extra("websockets.exceptions", "ws://", "send").ConnectionClosed
+        errors: Any = import_extra("websockets.exceptions", "ws://", "send")
+        self._closed_error, self._state_error = errors.ConnectionClosed, errors.InvalidState
         self._format, self._every, self._socket = format, every, _listen(host, port)
         self._origins = None if all_pages else [None, _OWN_PAGES]
         self.port: int = self._socket.getsockname()[1]
@@ -497,8 +501,15 @@ class WebSocketSink:
     def close(self) -> None:
         """Give clients a second to read what waits for them and the end message, then disconnect them."""
         if self._thread.is_alive():
-            self._loop.call_soon_threadsafe(self._ending.set)
+            self._loop.call_soon_threadsafe(self._end)
             self._thread.join()
+
+    def _end(self) -> None:
+        """Queue the end message, which clients get also if they do not ask for it."""
+        self._ending.set()
+        self._spread(*self._format.end())
+        for client in self._clients:
+            client.ask()
 
     def _spread(self, message: bytes) -> None:
         """Queue a message for every client; a full queue drops its oldest message."""
@@ -506,7 +517,7 @@ class WebSocketSink:
             full = len(client.waiting) == client.waiting.maxlen
             self.dropped += full
             client.dropped += full
-            client.waiting.append((self._loop.time(), message))
+            client.waiting.append((time.monotonic(), message))
             client.woken.set()
 
     def _run(self) -> None:
@@ -532,9 +543,6 @@ class WebSocketSink:
         )
         self._ready.set()
         await self._ending.wait()
-        self._spread(*self._format.end())
-        for client in self._clients:
-            client.ask()
         await self._wait_while(lambda: any(client.waiting for client in self._clients))
         for client, connection in self._clients.items():
             if client.waiting:
@@ -554,52 +562,75 @@ class WebSocketSink:
     async def _talk(self, connection: Any) -> None:
         """Send messages to a client until it disconnects."""
         path, every = _wishes(connection.request)
-        only_asked = path == _ON_REQUEST
-        client = _Client(every=(every or self._every) and not only_asked, only_asked=only_asked)
+        requests = path == _ON_REQUEST
+        client = _Client(every=(every or self._every) and not requests, requests=requests)
         self._clients[client] = connection
         sending = asyncio.ensure_future(self._deliver(connection, client))
         try:
             with suppress(self._closed_error):
                 while True:
                     await connection.recv()  # also notices pongs and the end of the connection
-                    client.ask()
+                    if requests:
+                        client.ask()
         finally:
             del self._clients[client]
             sending.cancel()
 
     async def _deliver(self, connection: Any, client: _Client) -> None:
         """Send a client the header, then message after message."""
-        unconfirmed: deque[tuple[float, asyncio.Future[float]]] = deque()  # send times and pongs of frames
-        told = described = -math.inf
-        is_text = self._format.is_text
-        with suppress(self._closed_error, OSError):
+        told, sent, is_text = -math.inf, math.inf, self._format.is_text
+        is_plain, is_slow = not (client.every or client.requests), False
+        queues = is_plain and _QUEUEING in connection.request.headers.get("User-Agent", "")
+        with suppress(self._closed_error, self._state_error, OSError):
             await client.woken.wait()
             if header := self._header:
+                client.header = header
                 await connection.send(header, text=is_text)
-            while True:
-                behind = 0.0
-                while unconfirmed and unconfirmed[0][0] < self._loop.time() - _UNCONFIRMED:
-                    sent, pong = unconfirmed.popleft()
-                    if not pong.done():
-                        await pong
-                        behind = max(behind, self._loop.time() - sent)
+            while client.waiting or not self._ending.is_set():
+                if is_slow:  # It gets the rest when its program asks.
+                    _begin_message(connection, is_text=is_text)
+                if queues:  # It reads the first ping with the message, and the second one when it reads on.
+                    await (await connection.ping())
+                if is_plain:
+                    (await connection.ping()).add_done_callback(lambda _: client.ask())
                 await client.next()
-                laid_out, message = client.take()
-                now = self._loop.time()
-                behind = max(behind, now - laid_out)
-                is_other = self._header != header and now > described + _TELL
-                if is_other and not self._ending.is_set():
-                    header, described = self._header, now
-                    await connection.send(header, text=is_text)
-                    if client.only_asked:
-                        continue  # The header was the answer to the request.
-                # A client that requests frames expects one message per request, and is never behind.
-                if behind > _UNCONFIRMED and now > told + _TELL and not client.only_asked:
+                now = time.monotonic()
+                behind = now - client.waiting[0][0]
+                if client.every and behind > _BEHIND and now > told + _TELL:
                     told = now
                     await connection.send(self._format.lag(behind, client.dropped), text=is_text)
-                await connection.send(message, text=is_text)
-                if not (client.every or client.only_asked):
-                    unconfirmed.append((self._loop.time(), await connection.ping()))
+                message = self._take(client)
+                if queues and not (is_slow or self._ending.is_set()):
+                    _begin_message(connection, is_text=is_text)
+                if connection.protocol.expect_continuation_frame:
+                    _end_message(connection, message)
+                else:
+                    await connection.send(message, text=is_text)
+                is_slow, sent = queues and client.asked > sent + _SLOW, now
+
+    def _take(self, client: _Client) -> bytes:
+        """The message for a client: a changed header, once a second at most, or the oldest that waits."""
+        now = time.monotonic()
+        is_other = self._header != client.header and now > client.described + _TELL
+        if is_other and not self._ending.is_set():
+            client.header, client.described = self._header, now
+            return self._header
+        return client.waiting.popleft()[1]
+
+
+def _begin_message(connection: Any, *, is_text: bool) -> None:
+    """Send the first parts of a message, which are empty, at once."""
+    protocol = connection.protocol
+    (protocol.send_text if is_text else protocol.send_binary)(b"", fin=False)
+    for _ in range(_PARTS - 1):
+        protocol.send_continuation(b"", fin=False)
+    connection.transport.write(b"".join(protocol.data_to_send()))
+
+
+def _end_message(connection: Any, message: bytes) -> None:
+    """Send the last part of a message, which holds all of it."""
+    connection.protocol.send_continuation(message, fin=True)
+    connection.transport.write(b"".join(connection.protocol.data_to_send()))
 
 
 def _refuse_other_paths(connection: Any, request: Any) -> Any:
@@ -617,18 +648,22 @@ def _wishes(request: Any) -> tuple[str, bool]:
 class _Client:
     """Queue and requests of one WebSocket client."""
 
-    def __init__(self, *, every: bool, only_asked: bool) -> None:
+    def __init__(self, *, every: bool, requests: bool) -> None:
         self.waiting: deque[tuple[float, bytes]] = deque(maxlen=_WAITING if every else 1)
         """Messages with the times at which they were queued [s]."""
-        self.every = every
+        self.every, self.requests = every, requests
         self.woken = asyncio.Event()
         self.dropped = 0
-        self.only_asked = only_asked
-        self._asks = not only_asked
+        self.header = b""
+        """The last header that was sent, and in `described` when a changed one was [s]."""
+        self.described = -math.inf
+        self.asked = -math.inf
+        """When it asked for a message, by a message or a pong [s]."""
+        self._asks = every
 
     def ask(self) -> None:
-        """Note that the client requests a message."""
-        self._asks = True
+        """Note that the client asks for a message."""
+        self.asked, self._asks = time.monotonic(), True
         if self.waiting:
             self.woken.set()
 
@@ -637,11 +672,7 @@ class _Client:
         while not (self.waiting and self._asks):
             self.woken.clear()
             await self.woken.wait()
-
-    def take(self) -> tuple[float, bytes]:
-        """Remove and return the oldest waiting message with its time [s]."""
-        self._asks = not self.only_asked
-        return self.waiting.popleft()
+        self._asks = self.every
 
 
 class _Listener(socket.socket):

@@ -676,26 +676,74 @@ def test_the_last_frames_are_sent_before_it_closes(message, monkeypatch):
     assert end == {"type": "end", "schema": 1}
 
 
-def test_a_client_that_does_not_read_gets_no_old_frames_but_the_end(message, monkeypatch):
-    """It takes the next frame when it has confirmed the one before; those between are dropped."""
+@pytest.mark.parametrize("format", ["json", "msgpack"])
+def test_a_slow_client_gets_the_newest_frame_whenever_it_reads(format, message, monkeypatch):
+    """Whatever its library reads ahead: what comes while its program does other things is dropped."""
     monkeypatch.setattr(sinks, "_FLUSH", LONG)
-    sink, sent = open_sink("ws://:0"), 0
-    with connect(url(sink), max_queue=1) as client:
+    sink = open_sink(f"ws://:0?format={format}")
+    decode = json.loads if format == "json" else msgpack.unpackb
+    for options in ({}, {"max_queue": 1}):
+        with connect(url(sink), close_timeout=0.1, **options) as client:
+            wait_for(lambda: sink.num_clients == 1)
+            sink.send(message(0))
+            assert decode(client.recv(timeout=LONG))["type"] == "header"
+            for number in (1, 2):  # by which the sink knows that it is slow
+                time.sleep(5.0 * sinks._SLOW)
+                assert decode(client.recv(timeout=LONG))["type"] == "frame"
+                sink.send(message(number))
+            for last in range(10, 60, 10):
+                dropped = sink.dropped
+                for number in range(last - 9, last + 1):
+                    sink.send(message(number))
+                wait_for(lambda dropped=dropped: sink.dropped >= dropped + 9)
+                time.sleep(5.0 * sinks._SLOW)
+                assert decode(client.recv(timeout=LONG))["number"] == last
+        wait_for(lambda: sink.num_clients == 0)
+    sink.close()
+
+
+@pytest.mark.parametrize("agent", ["Python websockets/16.1.1", "other"])
+def test_clients_that_read_at_once_get_frames_until_the_end(agent, message, monkeypatch):
+    monkeypatch.setattr(sinks, "_FLUSH", LONG)
+    sink, got = open_sink("ws://:0"), []
+    with connect(url(sink), user_agent_header=agent) as client:
         wait_for(lambda: sink.num_clients == 1)
-        while sink.dropped < 300:
-            sink.send(message(sent))
-            sent += 1
+        reader = threading.Thread(target=lambda: got.extend(map(json.loads, client)))  # ends without an error
+        reader.start()
+        for number in range(20):
+            sink.send(message(number))
+            wait_for(lambda number=number: got and got[-1].get("number") == number)
+        sink.close()
+        reader.join()
+    assert [one["type"] for one in got] == ["header", *["frame"] * 20, "end"] and sink.dropped == 0
+
+
+def test_a_client_that_does_not_read_gets_one_old_frame_and_the_end(message, monkeypatch):
+    monkeypatch.setattr(sinks, "_FLUSH", LONG)
+    sink = open_sink("ws://:0")
+    with connect(url(sink)) as client:
+        wait_for(lambda: sink.num_clients == 1)
+        while sink.dropped < 50:
+            sink.send(message())
             time.sleep(0.001)
         closing = threading.Thread(target=sink.close)
         closing.start()
-        header, *others, end = map(json.loads, read_until_closed(client))
+        assert [json.loads(text)["type"] for text in client] == ["header", "frame", "end"]
     closing.join()
-    frames = [one for one in others if one["type"] == "frame"]
-    lags = [one for one in others if one["type"] == "lag"]
-    assert all(one["lag"] > 0.05 and one["dropped"] > 0 for one in lags) and len(lags) >= 1
-    assert "/newest" in lags[0]["hint"]
-    assert (header["type"], end["type"]) == ("header", "end")
-    assert len(frames) + sink.dropped == sent
+
+
+def test_a_client_of_every_frame_hears_how_far_it_is_behind(message):
+    sink = open_sink("ws://:0?points=yes")
+    with connect(f"{url(sink)}/?every=1", max_queue=1, close_timeout=0.1) as client:
+        wait_for(lambda: sink.num_clients == 1)
+        while sink.dropped < 20:
+            sink.send(message(points=2000))
+            time.sleep(0.001)
+        got = []
+        while not got or got[-1]["type"] != "lag":
+            got += received(client, 1)
+    assert got[-1]["lag"] > 0.05 and "/newest" in got[-1]["hint"]
+    sink.close()
 
 
 @pytest.mark.parametrize("path", ["/newest", "/newest/", "/newest?who=robot"])
@@ -758,8 +806,8 @@ def test_clients_hear_of_a_new_size(message):
         asking.send("")
         (header,) = received(asking, 1)
         assert header["type"] == "header" and header["radii"] == [[0.02] * 26] * len(larger.sides)
-        asking.send("")
         sink.send(dataclasses.replace(message(3), header=larger))
+        asking.send("")
         assert received(asking, 1)[0]["number"] == 3
         heard = received(client, 2)
         assert [one["type"] for one in heard] == ["header", "frame"] and heard[0] == header
