@@ -36,7 +36,7 @@ from handsim.hand.shape import (
     unpack_hand,
 )
 from handsim.motion_files.motion import read_joint_csv
-from handsim.space.transforms import UpAxis, rotation_quaternions, turned_poses, upright
+from handsim.space.transforms import UpAxis, rotation_quaternions, upright
 from poses.shapes import HIGH, LOW
 from render.config import SpawnKey
 from render.frames import Doubles, Footage
@@ -272,11 +272,7 @@ class Subject:
         """This subject in a world with z up, if `up` is the axis that points up in the take's own world."""
         if up == "z":
             return self
-        take, turn = self.take, upright(up)
-        points = dataclasses.replace(take.point_list, points=take.point_list.points @ turn.T)
-        qpos, poses = turned_poses(take.qpos, turn), turned_poses(take.body_poses, turn)
-        turned = dataclasses.replace(take, qpos=qpos, body_poses=poses, point_list=points)
-        return dataclasses.replace(self, take=turned, origin=None)
+        return dataclasses.replace(self, take=self.take.turned(upright(up)), origin=None)
 
 
 @dataclass(frozen=True, slots=True)

@@ -65,7 +65,7 @@ from handsim.hand.model import (
 )
 from handsim.hand.shape import JOINT_NAMES, NUM_JOINTS, NUM_KEYPOINTS, Side
 from handsim.motion_files.motion import Motion, PosedBody, PosedHand
-from handsim.space.transforms import UpAxis
+from handsim.space.transforms import FORWARD, ForwardAxis, UpAxis, facing, turned_poses
 
 SUFFIX: Final = ".truth.npz"
 """Ending of the name of a simulated take that lies beside its capture."""
@@ -661,6 +661,12 @@ class Take:
             body_rms=self.body_rms[:, :0],
         )
 
+    def turned(self, turn: Float[np.ndarray, "3 3"]) -> Take:
+        """This take after a rotation of its world."""
+        points = dataclasses.replace(self.point_list, points=self.point_list.points @ turn.T)
+        qpos, poses = turned_poses(self.qpos, turn), turned_poses(self.body_poses, turn)
+        return dataclasses.replace(self, qpos=qpos, body_poses=poses, point_list=points)
+
     def cut(self, first: int, last: int) -> Take:
         """The frames from `first` up to, not including, `last`, with their times.
 
@@ -684,6 +690,7 @@ class Take:
         *,
         rate: float | None = None,
         up: UpAxis = "z",
+        forward: ForwardAxis | None = None,
         neutral: tuple[float, float] | Take | None = None,
         guesses: bool = False,
     ) -> None:
@@ -694,6 +701,8 @@ class Take:
                 .trc (joint positions) or .mot (joint angles for OpenSim) file.
             rate: Frames per second of the file [Hz]; those of the take when not given.
             up: The axis of the take's world that points up.
+            forward: Its axis that becomes -z, which is forward in OpenXR, of a file with y up; when not given
+                the world is turned about x alone.
             neutral: The first and the last time [s] of a pose in which a table's angles of the ISB are zero,
                 or the take of a trial that shows it; see `angles`.
             guesses: Whether a table also has joints that nothing shows, see `shown_joints`.
@@ -712,11 +721,19 @@ class Take:
                 f"up is {up} and the file {path}, expected a format with a direction that is up: "
                 f"{', '.join(ending for ending, one in MOTION_FORMATS.items() if not one.keeps_axes)}"
             )
+        if forward is not None and form.keeps_forward:
+            raise ArgumentError(
+                f"forward is {forward} and the file {path}, expected a format with y up: "
+                f"{', '.join(ending for ending, one in MOTION_FORMATS.items() if not one.keeps_forward)}"
+            )
         if neutral is not None and not form.keeps_axes:
             raise ArgumentError(
                 f"neutral is {neutral} and the file {path}, expected .csv with the ISB's angles"
             )
         take = poses_for(form, self, None if rate is None else float(rate))
+        if forward is not None:
+            check_choice(forward, FORWARD, noun="axis that points forward")
+            take = take.turned(facing(up, forward))
         shown = {} if guesses else {side: self.shown_joints(side) for side in take.sides}
         form.write(path, posed_motion(take, neutral, shown), up)
 

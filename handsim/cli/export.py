@@ -13,7 +13,7 @@ from handsim.app.messages import print_line
 from handsim.cli.options import neutral_pose
 from handsim.errors import ArgumentError, CaptureError
 from handsim.files.outputs import check_outputs
-from handsim.space.transforms import UpAxis
+from handsim.space.transforms import ForwardAxis, UpAxis
 
 
 def export(
@@ -21,6 +21,7 @@ def export(
     out: Path,
     fps: float | None = None,
     up: UpAxis = "z",
+    forward: ForwardAxis | None = None,
     neutral: tuple[str, ...] | None = None,
     guesses: bool = False,
 ) -> None:
@@ -35,6 +36,8 @@ def export(
         fps: Frames per second of the file, such as 30 or 60 for a game; those of the take when not given.
         up: The axis of the take that points up; y for captures of Motive's default. Files have y up, but
             .usda, .usdc and .csv have the take's axes.
+        forward: The axis of the take that is forward in the room, as forward= in an address of --send: it
+            becomes -z, as in OpenXR. When not given files with y up are turned about x alone.
         neutral: First and last time [s] at which the hands are flat, or in another pose in which the angles
             of the ISB in a .csv are to be zero; or the take (.npz) of a trial that shows this pose.
         guesses: Whether a .csv has numbers, too, for joints beyond which no marker was seen.
@@ -43,10 +46,11 @@ def export(
     from track.user import load_user
 
     if source.lower().endswith((".npz", f".npz{GROWING_SUFFIX}")):
-        _export_take(Path(source), out, fps, neutral or (), up=up, guesses=guesses)
+        _export_take(Path(source), out, fps, neutral or (), up=up, forward=forward, guesses=guesses)
         return
-    if fps is not None or up != "z" or neutral is not None or guesses:
-        given = f"--neutral {' '.join(neutral)}" if neutral else f"--up {up}"
+    if fps is not None or up != "z" or forward is not None or neutral is not None or guesses:
+        given = f"--forward {forward}" if forward is not None else f"--up {up}"
+        given = f"--neutral {' '.join(neutral)}" if neutral else given
         given = f"--fps {fps:g}" if fps is not None else "--guesses" if guesses else given
         raise ArgumentError(f"given {given} and {source}, expected a take with it, whose motion is written")
     if source.lower().endswith(".json"):

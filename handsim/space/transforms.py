@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from typing import Final, Literal, NamedTuple
+from typing import Final, Literal, NamedTuple, get_args
 
 import numpy as np
 from jaxtyping import Float
@@ -21,7 +21,9 @@ MIRROR = np.diag([1.0, -1.0, 1.0])
 """Right hand to left hand and back, in the wrist frame."""
 DIRECTIONS: Final = ("forward", "left", "up")
 """The axes of a room: those of ROS (REP 103), from which the axes of all programs follow."""
-FORWARD: Final = ("x", "-x", "y", "-y", "z", "-z")
+ForwardAxis = Literal["x", "-x", "y", "-y", "z", "-z"]
+"""The axis of the camera system that points forward."""
+FORWARD: Final = get_args(ForwardAxis)
 """Axes of the camera system that may be forward."""
 _OPPOSITES: Final = {"backward": "forward", "right": "left"}
 # Of each program: where its x, y and z point, the signs of a thing's own axes, and its unit of length.
@@ -102,6 +104,11 @@ def room_axes(up: UpAxis, forward: str = "x") -> Float[np.ndarray, "3 3"]:
 def upright(up: UpAxis) -> Float[np.ndarray, "3 3"]:
     """Rotation of a world in which an axis points up to ours, with z up."""
     return room_axes(up)
+
+
+def facing(up: UpAxis, forward: str) -> Float[np.ndarray, "3 3"]:
+    """Rotation of the world about its axis `up`, after which `file_axes` takes `forward` to -z, as OpenXR."""
+    return np.asarray(file_axes(up).T @ program_axes("openxr", up, forward=forward).turn)
 
 
 def turned_poses(poses: Float[np.ndarray, "*batch K"], turn: Float[np.ndarray, "3 3"]) -> NDArray[np.float64]:

@@ -12,7 +12,7 @@ from gloves.takes.take import LOST
 from handsim import HandModel, HandSimWarning, join_qpos
 from handsim.cli.main import main
 from handsim.hand.model import KEYPOINT_NAMES
-from handsim.space.transforms import random_quaternions
+from handsim.space.transforms import facing, program_axes, random_quaternions
 
 FRAMES, RATE = 12, 120.0
 ENDINGS = (".glb", ".bvh", ".usda", ".usdc", ".csv", ".trc", ".mot")
@@ -69,6 +69,29 @@ def test_trc_holds_the_keypoints_with_y_up_and_no_gap(folder, up, tmp_path, caps
     if up == "z":
         expected = np.stack([expected[..., 0], expected[..., 2], -expected[..., 1]], axis=-1)
     np.testing.assert_allclose(found, expected, atol=1e-8)
+
+
+@pytest.mark.parametrize("forward", ["x", "-y", "z"])
+def test_forward_in_a_file_is_that_of_openxr_in_what_is_sent(folder, forward, tmp_path, capsys):
+    up = "y" if forward == "z" else "z"
+    out, take = tmp_path / "joints.trc", load_take(folder / "tracked.npz")
+    options = ["--up", up, f"--forward={forward}"]
+    assert main(["export", str(folder / "tracked.npz"), "--out", str(out), *options]) == 0
+    with pytest.warns(HandSimWarning, match="repeat their position"):
+        positions = read_capture(out).positions
+    axes = program_axes("openxr", up, forward=forward)
+    expected = axes.positions(take.keypoints()[:, 0])
+    np.testing.assert_allclose(positions[:, : len(KEYPOINT_NAMES)], expected, atol=1e-8)
+    turned = take.turned(facing(up, forward))
+    sent = axes.quaternions(take.qpos[:, :, 3:7])
+    written = program_axes("openxr", up, forward="y" if up == "z" else "-z").quaternions(
+        turned.qpos[..., 3:7]
+    )
+    np.testing.assert_allclose(np.abs((sent * written).sum(axis=-1))[take.status > 0], 1.0, atol=1e-9)
+    np.testing.assert_allclose(turned.points[0], take.points[0] @ facing(up, forward).T)
+    for name in ("hands.csv", "hands.usdc"):
+        assert main(["export", str(folder / "tracked.npz"), "--out", str(tmp_path / name), *options[2:]]) == 1
+        assert f"forward is {forward} and the file" in capsys.readouterr().err
 
 
 def test_fps_resamples(folder, tmp_path):
