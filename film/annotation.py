@@ -198,10 +198,17 @@ def filmed_take(take: Take, registration: Registration, *, every: bool = False) 
     if not every:
         qpos[[bool(reason) for reason in registration.reasons]] = np.nan
     bodies = between_poses(take.times, times, take.body_poses, take.rate)
-    return Take.of_poses(
-        take.hands, qpos, rate=take.rate, times=times, bodies=take.bodies, body_poses=bodies,
+    hands, former = take.worn_at(times)
+    filmed = Take.of_poses(
+        hands,
+        qpos,
+        rate=take.rate,
+        times=times,
+        bodies=take.bodies,
+        body_poses=bodies,
         settings=take.settings,
-    )  # fmt: skip
+    )
+    return dataclasses.replace(filmed, former=tuple(former))
 
 
 def _drawn_over(film: Film, take: Take, registration: Registration) -> Iterator[Bytes]:

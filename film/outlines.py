@@ -8,6 +8,7 @@ and Reid 2012, Int. J. Comput. Vis. 98:335; Stoiber et al. 2022, Int. J. Comput.
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Iterable, Sequence
 from typing import Final, NamedTuple
 
@@ -101,7 +102,7 @@ class Outlines:
         self._bundle, (width, height), take = bundle, bundle.size, bundle.take
         self._scale = min(1.0, _WIDEST / max(width, height))
         self._size = round(self._scale * width), max(1, round(self._scale * height))
-        self._skins = [PosableSkin(hand.model, bony=0.5) for hand in take.hands]
+        self._skin_of = functools.lru_cache(2 * len(take.hands))(lambda fit: PosableSkin(fit.model, bony=0.5))
         self._bodies = [BodyFigure(body, (0.5, 0.5, 0.5)) for body in take.bodies]
         self._seen = np.zeros((len(take.hands), *3 * [_LEVELS]), np.float32)  # counts of the hands' colors
 
@@ -128,12 +129,14 @@ class Outlines:
         seen, parts = np.full((5, *moments.shape), np.nan), []
         for frame, picture in looks:
             there = np.flatnonzero(np.isfinite(qpos[frame, :, :, 0]).all(axis=1)).tolist()
-            drawn, room = [self._hand(hand, qpos[frame, hand, 0]) for hand in there], 2 * radius + _AROUND
+            worn = take.hands_at(int(np.searchsorted(take.times, times[frame], "right")) - 1)
+            room = 2 * radius + _AROUND
+            drawn = [self._hand(hand, worn[hand], qpos[frame, hand, 0]) for hand in there]
             look = self._look(picture, maps, straight(views[spans[frame]]), drawn, bodies[frame], room)
             if look is None:
                 continue
             for hand in there:
-                outline = _outline(look, hand, take.hands[hand], qpos[frame, hand, 0])
+                outline = _outline(look, hand, worn[hand], qpos[frame, hand, 0])
                 if outline is None:
                     continue
                 chosen, offsets, odds = self._across(look, hand, outline, radius)
@@ -143,7 +146,7 @@ class Outlines:
                 seen[:, frame, hand] = tried, len(away), middle, most, odds
                 places = look.corner + outline.pixels + offsets[:, None] * outline.normals
                 pixels, normals = self._pictured(views[0], places, outline.normals)
-                velocities = self._moved(hand, qpos[frame, hand], outline)
+                velocities = self._moved(worn[hand], qpos[frame, hand], outline)
                 kept = np.isfinite(normals[:, 0])  # others are beyond what the lens sees
                 here, then = np.full(len(away), frame), np.full(len(away), moments[frame, hand])
                 found = here, pixels, normals, outline.outward, outline.points, velocities, then
@@ -170,15 +173,15 @@ class Outlines:
             return None
         for number, T_world_body in enumerate(pose_matrices(bodies)):
             if np.isfinite(T_world_body).all():
-                instance = 1 + len(self._skins) + number
+                instance = 1 + len(self._bundle.take.hands) + number
                 drawn += [one.triangles for one in self._bodies[number].drawn(T_world_body, instance)]
         colors = cv2.remap(picture, maps[top:bottom, left:right], None, cv2.INTER_LINEAR)
         part = view.part(left, top, right - left, bottom - top)
         return _Look(np.array([left, top]), part, np.asarray(colors), see(part, drawn, with_normals=False))
 
-    def _hand(self, hand: int, qpos: Doubles) -> Triangles:
+    def _hand(self, hand: int, fit: GloveFit, qpos: Doubles) -> Triangles:
         """A drawn hand, without normals."""
-        skin = self._skins[hand]
+        skin = self._skin_of(fit)
         vertices, count = skin.surface(qpos), len(skin.faces)
         ids = (1 + PARTS_A_HAND * hand + face_parts(), np.full(count, 1 + hand), np.zeros(count))
         return Triangles(vertices, skin.faces, vertices, *(one.astype(np.uint8) for one in ids))
@@ -191,12 +194,12 @@ class Outlines:
         along = points[1] - points[0]
         return points[0] / self._scale, unit(along[:, ::-1] * [1.0, -1.0])
 
-    def _moved(self, hand: int, qpos: Doubles, outline: _Outline) -> Doubles:
+    def _moved(self, fit: GloveFit, qpos: Doubles, outline: _Outline) -> Doubles:
         """Velocities (N, 3) [m/s] of an outline's points by central differences.
 
         The hand's poses (3, 27) are those of the moment, of `_STEP` before it, and of `_STEP` after it.
         """
-        bones = self._bundle.take.hands[hand].model.forward_kinematics(qpos)[:, outline.bones]  # (3, N, 4, 4)
+        bones = fit.model.forward_kinematics(qpos)[:, outline.bones]  # (3, N, 4, 4)
         now, step = bones[0], (bones[2] - bones[1]) / (2.0 * _STEP)
         local = np.einsum("nji,nj->ni", now[:, :3, :3], outline.points - now[:, :3, 3])
         return np.asarray(np.einsum("nij,nj->ni", step[:, :3, :3], local) + step[:, :3, 3])

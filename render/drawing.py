@@ -136,7 +136,8 @@ class Drawing:
         config, cast, viewpoints = self.config, self.subject.cast, self.viewpoints
         rng = SpawnKey.SHARD.rng(config.seed, shard, 0)
         if cast is None:  # a take has its own hands, whose looks change with the shard
-            studio = self._studio(self.take.hands, rng)
+            worn = self.take.hands
+            studio = self._studio(worn, rng)
         sample = functools.partial(
             sample_conditions, config, viewpoints.viewer, viewpoints.size, self._enclosed()
         )
@@ -145,6 +146,8 @@ class Drawing:
             person = shard if cast is None or cast.person is None else int(cast.person[frame])
             if cast is not None:
                 studio = self._studio_of(person)
+            elif (hands := self.take.hands_at(frame)) is not worn:
+                worn, studio = hands, self._studio(hands, SpawnKey.SHARD.rng(config.seed, shard, 0))
             own = SpawnKey.SHARD.rng(config.seed, shard, 1 + place)
             conditions = sample(rng=own) if common is None else common
             cameras = viewpoints.cameras(frame)

@@ -285,9 +285,12 @@ class PictureStream(SharedStream, IterableDataset[dict[str, torch.Tensor]]):
             subject = self._takes[rng.integers(len(self._takes))]
             frames = np.flatnonzero(np.isfinite(subject.take.qpos[..., 0]).any(axis=1))
             frames = rng.choice(frames, self._sitting)
+            first = subject.take.hands_at(int(frames[0]))  # A person has one pair of hands.
+            frames = np.resize([n for n in frames if subject.take.hands_at(int(n)) is first], len(frames))
         else:
             subject, frames = self._posed(rng), np.arange(self._sitting)
-        studio = Studio(subject.take.hands, self.config, subject.take.bodies, rng=rng)
+        hands = subject.take.hands_at(int(frames[0]))
+        studio = Studio(hands, self.config, subject.take.bodies, rng=rng)
         return _Sitting(studio, subject, frames, person)
 
     def _posed(self, rng: np.random.Generator) -> Subject:
@@ -311,10 +314,10 @@ class PictureStream(SharedStream, IterableDataset[dict[str, torch.Tensor]]):
 
     def _picture(self, number: int, sitting: _Sitting, rank: int) -> dict[str, torch.Tensor]:
         rng = SpawnKey.STREAM.rng(self.seed, _PICTURE, number)
-        take = sitting.subject.take
-        moment = Moment(take, int(sitting.frames[rank]))
+        take, shown = sitting.subject.take, int(sitting.frames[rank])
+        moment, worn = Moment(take, shown), take.hands_at(shown)
         there = moment.hands()
-        keypoints = [hand_keypoints(take.hands[n].model, pose[None])[0] for n, pose in there.items()]
+        keypoints = [hand_keypoints(worn[n].model, pose[None])[0] for n, pose in there.items()]
         points, wrists = np.concatenate(keypoints), np.stack(list(there.values()))
         for _ in range(20):  # until the camera is outside of all surfaces
             share = float(rng.uniform(*self._fill))
@@ -332,7 +335,7 @@ class PictureStream(SharedStream, IterableDataset[dict[str, torch.Tensor]]):
         chosen = sample_conditions(self.config, camera.T_world_camera[:3, :3], camera.size, around, rng=rng)
         frame = sitting.studio.photograph(reaching, camera, chosen.reseeded(rng), recorded=False)
         truth = dict(zip(there, frame.hands, strict=True))
-        hands = [_hand_arrays(truth.get(n), camera, fit.shape) for n, fit in enumerate(take.hands)]
+        hands = [_hand_arrays(truth.get(n), camera, fit.shape) for n, fit in enumerate(worn)]
         merged = {name: np.stack([hand[name] for hand in hands]) for name in hands[0]}
         if len(hands) == 1:
             merged = {name: array[0] for name, array in merged.items()}

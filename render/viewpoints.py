@@ -49,8 +49,8 @@ class Framing:
         shape = (take.num_frames, len(take.hands), len(_OUTLINE), 3)
         self.points: Floats = np.full(shape, np.nan, dtype=np.float32)
         """Keypoints of all hands in the world (T, H, P, 3) [m]; NaN where a hand is absent."""
-        for number, hand in enumerate(take.hands):
-            there = np.flatnonzero(np.isfinite(take.qpos[:, number]).all(axis=1))
+        for span, number, hand in ((s, *one) for s, hands in take.worn() for one in enumerate(hands)):
+            there = span.start + np.flatnonzero(np.isfinite(take.qpos[span, number]).all(axis=1))
             for first in range(0, len(there), _CHUNK):
                 rows = there[first : first + _CHUNK]
                 self.points[rows, number] = hand_keypoints(hand.model, take.qpos[rows, number])[:, _OUTLINE]

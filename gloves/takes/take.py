@@ -440,6 +440,13 @@ class Take:
         """The hands of a frame with their gloves as worn."""
         return next((one.hands for one in self.former if frame < one.stop), self.hands)
 
+    def worn_at(self, times: Float[np.ndarray, "F"]) -> tuple[tuple[GloveFit, ...], list[FormerHands]]:
+        """The last hands at other times [s] than the take's, and the earlier ones, by rows of these times."""
+        stops = np.searchsorted(times, [self.times[one.stop] for one in self.former]).tolist()
+        worn = [one._replace(stop=stop) for one, stop in zip(self.former, stops, strict=True)]
+        last = next((one.hands for one in worn if one.stop >= len(times)), self.hands)
+        return last, [one for one in worn if one.stop < len(times)]
+
     def moving_hands(self) -> tuple[GlovedHand, ...]:
         """Each hand with its poses."""
         return tuple(
@@ -584,9 +591,9 @@ class Take:
         moving = np.flatnonzero(np.isfinite(poses[..., 0]).any(axis=0))
         if not len(shown):
             raise ArgumentError("no hand has a pose in any frame, expected one at least")
-        ends = np.searchsorted(times, [self.times[one.stop] for one in self.former]).tolist()
+        hands, former = self.worn_at(times)
         alone = Take.of_poses(
-            [self.hands[number] for number in shown],
+            [hands[number] for number in shown],
             qpos[:, shown],
             rate=self.rate if rate is None else rate,
             times=times,
@@ -594,10 +601,7 @@ class Take:
             body_poses=poses[:, moving],
             settings=self.settings,
         )
-        former = (
-            one._replace(stop=stop, hands=tuple(one.hands[number] for number in shown))
-            for stop, one in zip(ends, self.former, strict=True)
-        )
+        former = [one._replace(hands=tuple(one.hands[number] for number in shown)) for one in former]
         return dataclasses.replace(alone, former=tuple(former))
 
     def capture(self) -> Capture:

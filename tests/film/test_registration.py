@@ -1,12 +1,18 @@
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from film.annotation import filmed_take
 from film.registration import Registration, register
+from gloves.fit import settle_glove
+from gloves.layout import load_layout
 from gloves.takes.take import Take
-from handsim import Camera, HandSimError, Lens, write_page
+from gloves.takes.worn import FormerHands
+from handsim import Camera, HandModel, HandSimError, Lens, write_page
 from tests.film.filmed import SIZE, Filming, moving_take
 
 
@@ -67,6 +73,38 @@ def test_outlines_tell_the_camera_within_its_bounds(dress):
         np.mean([not reason for reason, is_bent in zip(found.reasons, bent, strict=True) if not is_bent])
         > 0.7
     )
+
+
+def test_a_video_shows_the_hands_of_its_frames():
+    """The take has two users, and the video ends with the first, or after both."""
+    filming, last = Filming(seed=1, seconds=9.0), moving_take()
+    small = settle_glove(load_layout("dense19"), HandModel.named("S"))
+    frames = np.arange(270)
+    found = Registration(
+        filming.cameras()[:1], (0,), 2.3, 0.0, (0.0, 0.0), {}, frames / 30.0, 0.0 * frames, ("",) * 270
+    )
+    for change in (6.0, 14.0):
+        stop = int(np.searchsorted(last.times, change))
+        take = dataclasses.replace(last, former=[FormerHands(stop, (small,), "S")])
+        filmed = filmed_take(take, found, every=True)
+        for frame in (0, filmed.num_frames - 1):
+            worn = small if filmed.times[frame] < change else last.hands[0]
+            assert filmed.hands_at(frame)[0].model.shape == worn.model.shape
+        assert len(filmed.former) == (change == 6.0)
+
+
+@pytest.mark.slow
+def test_outlines_are_those_of_the_hands_of_the_frame():
+    """A small hand is found where it is, though a large one comes after the video."""
+    filming, take = Filming(seed=31, seconds=9.0, rate=8.0, readout=(0.0, 0.0)), moving_take()
+    large = settle_glove(load_layout("dense19"), HandModel.named("XL"))
+    frames, pictures = filming.found(take), filming.pictures(take)
+    worn = dataclasses.replace(
+        take, hands=(large,), former=[FormerHands(take.num_frames - 1, take.hands, "M")]
+    )
+    one, other = (register(each, frames, SIZE, pictures=lambda: pictures) for each in (take, worn))
+    np.testing.assert_allclose(one.distances, other.distances)
+    np.testing.assert_allclose(one.cameras[0].T_world_camera, other.cameras[0].T_world_camera)
 
 
 def test_a_push_makes_two_spans():

@@ -14,7 +14,9 @@ import trimesh
 from pycocotools.coco import COCO
 
 from gloves import Take, attach, load_layout, load_take
+from gloves.fit import settle_glove
 from gloves.takes.bodies import RigidBody
+from gloves.takes.worn import FormerHands
 from handsim import Camera, HandModel, HandSimError, Lens, join_qpos, look_at
 from handsim.cli.main import main
 from handsim.errors import ArgumentError
@@ -24,7 +26,7 @@ from handsim.space.camera import pinhole, preset
 from handsim.space.objects import load_object
 from handsim.space.transforms import quaternion_matrix, rigid, turned_poses
 from poses import sample_poses
-from render import Backgrounds, DepthSensor, RenderConfig, ViewConfig, draw, render_take
+from render import Backgrounds, DepthSensor, PictureStream, RenderConfig, ViewConfig, draw, render_take
 from render.config import resolve
 from render.drawing import Drawing
 from render.frames import FOREARM, PARTS_A_HAND, PASSES
@@ -34,7 +36,7 @@ from render.skin.look import TONES
 from render.studio import Moment, Studio
 from render.subject import subject_of_take
 from render.user_body import UserBody
-from render.viewpoints import Placement, Viewpoints
+from render.viewpoints import Framing, Placement, Viewpoints
 from tests.programs import run_python
 from tests.render.formats.reading import depth_of, exr_content
 from train import simulate_take
@@ -189,6 +191,32 @@ def test_takes_are_drawn_from_memory_and_from_files_alike(tmp_path):
     for one, other in pairs:
         np.testing.assert_array_equal(one.depth, other.depth)
         assert one.bodies[0].name == "pen" and one.ids.max() == len(one.hands) + 1
+
+
+def test_frames_show_the_hands_that_made_them(tmp_path):
+    """A recording of two users: a small hand in the first frames, a large one in the last."""
+    small, large = (settle_glove(load_layout("dense19"), HandModel.named(size)) for size in "SL")
+    qpos = join_qpos(np.full((6, 20), 0.2))
+    last = Take.of_poses([large], qpos[:, None], rate=60.0)
+    take = dataclasses.replace(last, former=[FormerHands(3, (small,), "S")])
+    for one in draw(take, camera=ABOVE, frames=(5, 2, 0, 3), config=BARE):
+        model = (small if one.number < 3 else large).model
+        expected = hand_keypoints(model, qpos[one.number][None])[0]
+        np.testing.assert_allclose(one.hands[0].keypoints_world, expected, atol=1e-9)
+        assert one.hands[0].shape == model.shape
+    alone = next(
+        draw(Take.of_poses([small], qpos[:, None], rate=60.0), camera=ABOVE, frames=(0,), config=BARE)
+    )
+    one = next(draw(take, camera=ABOVE, frames=(0,), config=BARE))
+    np.testing.assert_array_equal(one.hands[0].vertices, alone.hands[0].vertices)
+    assert (one.ids != alone.ids).mean() < 0.01, "the arms are those of one person"
+    first = Framing(take).points[0, 0]
+    np.testing.assert_array_equal(
+        first, Framing(Take.of_poses([small], qpos[:, None], rate=60.0)).points[0, 0]
+    )
+    stream = PictureStream(takes=take, crop=32, people=1, sitting=4, config=BARE)
+    shown = {float(one["shape"][0]) for one in itertools.islice(stream, 24)}
+    assert shown == {float(np.float32(one.model.shape.length)) for one in (small, large)}
 
 
 @pytest.mark.parametrize("camera", [None, ABOVE])
