@@ -79,8 +79,9 @@ class LiveSizing(Closing):
             self._start_process()
         self._measuring: Future[_Measured] | None = None
         self._steps: deque[User] = deque()
-        self._shown_last: TrackedFrame | None = None
-        self._is_easing = self._judges = False  # Are labels judged after one second, too?
+        self._before: tuple[TrackedFrame, TrackedFrame] | None = None  # tracked and shown
+        self._is_easing = self._is_resized = False  # Is the next frame the first of another size?
+        self._judges = False  # Are labels judged after one second, too?
 
     @property
     def is_settled(self) -> bool:
@@ -104,14 +105,15 @@ class LiveSizing(Closing):
 
     def eased(self, tracked: TrackedFrame, tracker: Tracker) -> TrackedFrame:
         """The frame to show: a new size may find a hand in another pose, to which it goes in small steps."""
-        before, self._shown_last = self._shown_last, tracked
-        if self._is_easing and before is not None:
-            span = tracked.time - before.time
-            pairs = zip(before.hands, tracked.hands, tracker.hands, strict=True)
-            hands = tuple(_eased(last, hand, span, fit.model) for last, hand, fit in pairs)
+        shown, last = tracked, self._before
+        if self._is_easing and last is not None:
+            span = tracked.time - last[0].time if self._is_resized else None
+            each = zip(*(one.hands for one in (*last, tracked)), tracker.hands, strict=True)
+            hands = tuple(_eased(*three, fit.model, span) for *three, fit in each)
             self._is_easing = hands != tracked.hands or not self.is_settled
-            self._shown_last = dataclasses.replace(tracked, hands=hands)
-        return self._shown_last
+            shown = dataclasses.replace(tracked, hands=hands)
+        self._before, self._is_resized = (tracked, shown), False
+        return shown
 
     def step(self, frame: StreamedFrame, tracked: TrackedFrame, tracker: Tracker) -> bool:
         """Process a tracked frame; return whether the tracker's hands were resized."""
@@ -136,7 +138,7 @@ class LiveSizing(Closing):
             self._begin_measuring(self._steps[-1] if self._steps else tracker.user)
         if not self._steps:
             return False
-        user, self._is_easing = self._steps.popleft(), True
+        user, self._is_easing, self._is_resized = self._steps.popleft(), True, True
         tracker.resize(user, keep=len(self._steps) / (len(self._steps) + 1))
         return True
 
@@ -223,14 +225,23 @@ def _measure(
     return _Measured([*users, after], told, is_relabeled)
 
 
-def _eased(before: TrackedHand, hand: TrackedHand, span: float, model: HandModel) -> TrackedHand:
-    """A hand's pose, or one on the way to it from that which was shown `span` seconds before."""
-    if not before.has_pose or hand.status not in (Status.TRACKED, Status.COASTING):
+def _eased(
+    tracked: TrackedHand, shown: TrackedHand, hand: TrackedHand, model: HandModel, span: float | None
+) -> TrackedHand:
+    """A hand's pose, or one on the way to it from the shown one of the frame before.
+
+    The shown hand moves as the tracked one does, or for `span` seconds as before if another size has moved
+    that, too.
+    """
+    if not shown.has_pose or hand.status not in (Status.TRACKED, Status.COASTING):
         return hand
-    due = move(before.qpos[None], span * np.nan_to_num(before.velocity)[None])[0]
+    motion = (
+        velocity_of(tracked.qpos, hand.qpos, 1.0) if span is None else span * np.nan_to_num(shown.velocity)
+    )
+    due = move(shown.qpos[None], motion[None])[0]
     ways = np.diff(hand_keypoints(model, np.stack([due, hand.qpos])), axis=0)
     share = _EASE / max(float(np.linalg.norm(ways, axis=-1).max()), _EASE)
     if share == 1.0:
         return hand
     qpos = move(due[None], share * velocity_of(due, hand.qpos, 1.0)[None])[0]
-    return dataclasses.replace(hand, qpos=qpos, velocity=before.velocity)
+    return dataclasses.replace(hand, qpos=qpos, velocity=hand.velocity if span is None else shown.velocity)

@@ -40,6 +40,8 @@ _NOTHING: Final = "choose"
 _HALO: Final = 2.5  # radius of the halo around the chosen point, in radii of a marker
 _HALO_COLOR: Final = (255, 190, 0)
 _LISTED: Final = 12  # largest number of corrections in the list
+_WORSE: Final = 2.0  # ratio of a hand's RMS after a correction to that before, from which it is doubted
+_BAD_RMS: Final = 0.003  # [m] least such RMS
 HEIGHT: Final = 0.06  # height of the wrist above the ground [m]
 _GIZMO: Final = 0.03  # size of the handle that moves a marker [m]
 
@@ -132,6 +134,17 @@ def label_of(take: Take, frame: int, column: int) -> str:
     return take.label_names[label] if label >= 0 else NO_MARKER
 
 
+def doubt_of(before: Take, after: Take, correction: Correction) -> str:
+    """What speaks against a correction: a hand that fits its markers much worse than before; or nothing."""
+    frames = slice(correction.first, correction.last + 1)
+    rms = np.array([np.fmax.reduce(take.rms[frames], axis=0) for take in (before, after)])
+    worse = np.flatnonzero((rms[1] > _WORSE * rms[0]) & (rms[1] > _BAD_RMS))
+    told = (
+        f"{after.sides[n]} RMS rises from {1e3 * rms[0, n]:.1f} to {1e3 * rms[1, n]:.1f} mm" for n in worse
+    )
+    return ", ".join(told) + "; Undo takes it back" * (len(worse) > 0)
+
+
 def _state_of(path: Path) -> tuple[int, int] | None:
     """Time and size of a file, to notice changes; None if it is gone."""
     try:
@@ -197,13 +210,15 @@ class LabelEditor:
             self.state.content = "Choose a point first: click on it, or take it from the list."
             return
         first, last = (int(value) for value in self.span.value)
+        before, self.state.content = self._corrector.take, "working: poses are fitted to the corrected labels"
         try:
             correction = self._corrector.add(*self.chosen, (first, last), self.label.value)
         except CaptureError as error:
             self.state.content = str(error)
             return
         self._renew()
-        self.state.content = f"corrected: {correction}"
+        doubt = doubt_of(before, self._corrector.take, correction)
+        self.state.content = f"corrected: {correction}" + (f"; **{doubt}**" if doubt else "")
 
     def save(self) -> None:
         """Save the corrections and the take, or show why that is impossible."""
@@ -223,8 +238,10 @@ class LabelEditor:
             )
             ends = gui.add_button_group("shown frame is", ("first", "last"))
             self.label = gui.add_dropdown("right label", (NO_MARKER, *self._recording.label_names))
-            gui.add_button("Correct").on_click(lambda _: self.correct())
-            gui.add_button("Undo", color="gray", hint="What was not saved").on_click(lambda _: self._undo())
+            self._correct = gui.add_button("Correct")
+            self._correct.on_click(self._work(self.correct))
+            undo = gui.add_button("Undo", color="gray", hint="What was not saved")
+            undo.on_click(self._work(self._undo))
             saves = gui.add_button("Save take", color="gray", hint=f"Writes {self._corrector.path}")
             saves.on_click(lambda _: self.save())
             self.list = gui.add_markdown("")
@@ -239,6 +256,19 @@ class LabelEditor:
             (first, last), frame = self.span.value, self._frame
             is_first = event.target.value == "first"
             _set(self.span, (frame, max(frame, last)) if is_first else (min(first, frame), frame))
+
+    def _work(self, action: Callable[[], None]) -> Callable[[Any], None]:
+        """A handler that does what takes seconds; clicks meanwhile do nothing, as one button shows."""
+
+        def handle(_event: object) -> None:
+            if not self._correct.disabled:
+                self._correct.disabled = True
+                try:
+                    action()
+                finally:
+                    self._correct.disabled = False
+
+        return handle
 
     def _undo(self) -> None:
         self._corrector.undo()
@@ -362,7 +392,9 @@ class LayoutEditor:
         """Move a marker to the skin near a point of the page [m], if there is any."""
         with self._lock:
             try:
-                layout = place_marker(self.fit.layout, index, self.fit.model, point - self.shift)
+                layout = place_marker(
+                    self.fit.layout, index, self.fit.model, point - self.shift, keeps_bone=False
+                )
             except LayoutError as error:
                 self.state.content = str(error)
                 return

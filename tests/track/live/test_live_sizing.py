@@ -192,6 +192,33 @@ def test_a_hand_that_jumps_while_a_size_is_taken_over_is_shown_on_its_way(monkey
     assert shown is tracked and abs(places[-1][0, 1] - 0.02) < 1e-9
 
 
+def test_a_hand_that_turns_back_while_a_size_is_taken_over_is_not_lost(monkeypatch):
+    """It swings at up to 1.3 m/s, faster than the shown hand may come nearer."""
+    setup = TrackerSetup.of(TrackSettings(hands="right"))
+    sizing, tracker = LiveSizing(setup), FakeTracker(setup.user)
+    monkeypatch.setattr(live_sizing, "_measure", found(0.187)[0])
+    resized, away = [], []
+    for number in range(round(2.0 * RATE)):
+        time = number / RATE
+        place, speed = 0.1 * np.sin(4.0 * np.pi * time), 0.4 * np.pi * np.cos(4.0 * np.pi * time)
+        qpos = join_qpos(np.zeros((1, 20)), position=np.array([place, 0.02 * bool(resized), 0.0]))[0]
+        hand = TrackedHand(
+            "right",
+            Status.TRACKED,
+            qpos,
+            0.001,
+            np.zeros((20, 3)),
+            np.arange(0),
+            velocity=np.eye(26)[0] * speed,
+        )
+        tracked = TrackedFrame(time, (hand,), np.full(20, -1), np.ones(20))
+        shown = sizing.eased(tracked, tracker)
+        away.append(np.linalg.norm(shown.hands[0].qpos[:3] - qpos[:3]))
+        if sizing.step(StreamedFrame(number, time, np.zeros((20, 3)), np.arange(20)), tracked, tracker):
+            resized.append(number)
+    assert 0.015 < max(away) < 0.06 and not any(away[resized[-1] + 30 :])
+
+
 def test_another_user_is_noticed_by_the_residual_without_a_pause(monkeypatch):
     setup = TrackerSetup.of(TrackSettings(hands="right"))
     sizing, tracker = LiveSizing(setup), FakeTracker(setup.user)

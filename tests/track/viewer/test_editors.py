@@ -14,6 +14,7 @@ from gloves.layout import starter_layout
 from gloves.takes.corrections import corrections_of, corrections_path
 from handsim import HandModel, HandSimWarning
 from handsim.errors import ArgumentError, CaptureError, LayoutError
+from handsim.hand.shape import BONE_NAMES
 from track.viewer.contents import open_content, show_recording
 from track.viewer.editors import Corrector, LayoutEditor, edited_path
 from track.viewer.recordings import TakeRecording
@@ -84,6 +85,19 @@ def test_a_click_two_labels_and_a_save(open_page, path, tracked):
     assert [one.label for one in corrections_of(path)] == [names[2], names[3]]
     again = Corrector(path, saved)
     assert again.take is saved, "what the take has is not made again"
+
+
+def test_a_bad_correction_is_told_before_it_is_saved(open_page, path, tracked):
+    page = open_page
+    page.press("point", f"ID 5: {tracked.label_names[5]}")
+    page.wait(lambda: page.says("**ID 5:"))
+    page.press("right label", next(name for name in tracked.label_names if name.endswith("PinkyTip")))
+    page.settle()
+    page.press("Correct")
+    page.wait(lambda: page.says("right RMS rises from "))
+    assert page.says("Undo takes it back") and not corrections_path(path).exists()
+    page.press("Undo")
+    page.wait(lambda: page.says("taken back"))
 
 
 def test_what_was_not_saved_is_taken_back(open_page, path, tracked):
@@ -216,6 +230,17 @@ def test_a_dragged_marker_is_saved_where_it_was_let_go(server, page_of, glove):
     np.testing.assert_allclose(page.places["/move"], center, atol=1e-5)
     assert out.read_text().count("#") == glove.read_text().count("#"), "remarks are kept"
     assert glove.read_text() == starter_layout()
+
+
+def test_a_marker_dragged_over_a_joint_moves_with_the_skin_there(server, page_of, glove):
+    editor = LayoutEditor(server, glove, load_layout(glove), HandModel.named("M"), edited_path(glove))
+    index = editor.fit.layout.names.index("IndexTip")
+    transforms, length = editor.fit.model.rest_transforms, editor.fit.model.skeleton.lengths
+    for bone in ("index_middle", "index_proximal", "index_distal"):
+        number = BONE_NAMES.index(bone)
+        middle = transforms[number] @ [0.5 * length[number], 0.0, 0.01, 1.0]
+        editor.move(index, middle[:3] + editor.shift)
+        assert editor.fit.layout.markers[index].bone == bone
 
 
 def test_a_click_chooses_the_marker_under_it(server, page_of, glove):
