@@ -9,6 +9,7 @@ import asyncio
 import errno
 import logging
 import math
+import os
 import re
 import socket
 import threading
@@ -18,6 +19,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from http import HTTPStatus
+from pathlib import Path
 from typing import Any, Final
 from urllib.parse import parse_qsl
 
@@ -52,6 +54,8 @@ VALID: Final = (*(f"{one}://host:port" for one in ("osc", "udp", "ws")), "lsl:NA
 """Valid forms of an address."""
 GROUP: Final = "handsim.sinks"
 """Entry points of packages that provide sinks."""
+_LSL_FILES: Final = ("lsl_api.cfg", "~/lsl_api/lsl_api.cfg", "/etc/lsl_api/lsl_api.cfg")
+_LSL_QUIET: Final = "[log]\nlevel = -1\n"  # LSL writes warnings alone, where the user has not configured it.
 STATUSES: Final = tuple(reversed(Status))
 """A status channel of LSL holds an index into these."""
 _METHODS: Final = (("send", "close"), "the methods send and close of a sink")
@@ -360,6 +364,10 @@ class LabStreamingSink:
 
     def __init__(self, name: str) -> None:
         self._lsl: Any = import_extra("pylsl", "lsl:", "send")
+        configured = "LSLAPICFG" in os.environ or any(Path(one).expanduser().exists() for one in _LSL_FILES)
+        if not configured:
+            with suppress(AttributeError, NotImplementedError):  # old versions cannot be told
+                self._lsl.set_config_content(_LSL_QUIET)
         self._name = name
         self._outlet: Any = None
 

@@ -408,6 +408,23 @@ sink.close()
     np.testing.assert_array_equal(samples[-1], sample_of(message(5)))
 
 
+def test_lsl_writes_nothing_between_our_lines(tmp_path):
+    pytest.importorskip("pylsl")
+    code = """
+from tests.track.conftest import make_message
+from track.output.sinks import open_sink
+sink = open_sink("lsl:quiet")
+sink.send(make_message(0))
+sink.close()
+"""
+    root = Path(__file__).resolve().parents[3]
+    environment = {key: value for key, value in os.environ.items() if key != "LSLAPICFG"}
+    environment |= {"PYTHONPATH": str(root), "HOME": str(tmp_path)}
+    command = [sys.executable, "-W", "ignore", "-c", code]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True)
+    assert (done.stdout, done.stderr) == ("", "")
+
+
 @pytest.fixture
 def sink():
     one = open_sink("ws://:0?every=yes")
