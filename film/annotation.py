@@ -200,14 +200,9 @@ def filmed_take(take: Take, registration: Registration, *, every: bool = False) 
     bodies = between_poses(take.times, times, take.body_poses, take.rate)
     hands, former = take.worn_at(times)
     filmed = Take.of_poses(
-        hands,
-        qpos,
-        rate=take.rate,
-        times=times,
-        bodies=take.bodies,
-        body_poses=bodies,
+        hands, qpos, rate=take.rate, times=times, bodies=take.bodies, body_poses=bodies,
         settings=take.settings,
-    )
+    )  # fmt: skip
     return dataclasses.replace(filmed, former=tuple(former))
 
 

@@ -569,17 +569,12 @@ def nearest_markers(fit: GloveFit) -> tuple[str, str, float]:
 
 
 def place_marker(
-    layout: MarkerLayout,
-    index: int,
-    model: HandModel,
-    point: Float[np.ndarray, "3"],
-    *,
-    keeps_bone: bool = True,
+    layout: MarkerLayout, index: int, model: HandModel, point: Float[np.ndarray, "3"], *, stays: bool = True
 ) -> MarkerLayout:
     """The layout with one marker moved to the place on the skin nearest to a point [m] of the flat hand.
 
     The marker stays on its bone if that reaches the point, or else moves to the bone that carries the skin
-    there; without `keeps_bone` the latter comes first. A marker on a stalk keeps its height, and its stalk
+    there; unless it `stays` the latter comes first. A marker on a stalk keeps its height, and its stalk
     points at the point.
     """
     surface = model.surface
@@ -591,7 +586,7 @@ def place_marker(
     center = surface.vertices[nearest] + aside + layout.radius * normal
     bones = (BONE_NAMES.index(layout.markers[index].bone), int(surface.bone_indices[nearest, 0]))
     best, least = layout, math.inf
-    for bone in dict.fromkeys(bones if keeps_bone else bones[::-1]):
+    for bone in dict.fromkeys(bones if stays else bones[::-1]):
         candidate, missed = _place_on(layout, index, bone, model, center, point)
         if missed < least:
             best, least = candidate, missed

@@ -285,11 +285,10 @@ class PictureStream(SharedStream, IterableDataset[dict[str, torch.Tensor]]):
             subject = self._takes[rng.integers(len(self._takes))]
             frames = np.flatnonzero(np.isfinite(subject.take.qpos[..., 0]).any(axis=1))
             frames = rng.choice(frames, self._sitting)
-            first = subject.take.hands_at(int(frames[0]))  # A person has one pair of hands.
-            frames = np.resize([n for n in frames if subject.take.hands_at(int(n)) is first], len(frames))
         else:
             subject, frames = self._posed(rng), np.arange(self._sitting)
-        hands = subject.take.hands_at(int(frames[0]))
+        hands = subject.take.hands_at(int(frames[0]))  # A person has one pair of hands.
+        frames = np.resize([n for n in frames if subject.take.hands_at(int(n)) is hands], len(frames))
         studio = Studio(hands, self.config, subject.take.bodies, rng=rng)
         return _Sitting(studio, subject, frames, person)
 

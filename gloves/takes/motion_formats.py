@@ -33,9 +33,7 @@ class MotionFormat(NamedTuple):
     steady: bool = False
     """Whether frames are written without times, so that they must come at a steady rate."""
     keeps_axes: bool = False
-    """Whether positions stay in the take's axes, whatever points up."""
-    keeps_forward: bool = False
-    """Whether positions stay in the take's axes, whatever is forward."""
+    """Whether positions stay in the take's axes, whatever points up or forward."""
 
 
 def motion_format(path: Path) -> MotionFormat:
@@ -59,9 +57,9 @@ def _write_joint_trc(path: Path, motion: Motion, up: UpAxis) -> None:
 MOTION_FORMATS: Final[dict[str, MotionFormat]] = {
     ".glb": MotionFormat(write_glb, "hidden (scale 0)"),
     ".bvh": MotionFormat(write_bvh, HELD, steady=True),
-    ".usda": MotionFormat(write_usd, "invisible", keeps_forward=True),
-    ".usdc": MotionFormat(write_usd, "invisible", keeps_forward=True),
-    ".csv": MotionFormat(write_joint_csv, "blank", keeps_axes=True, keeps_forward=True),
+    ".usda": MotionFormat(write_usd, "invisible"),
+    ".usdc": MotionFormat(write_usd, "invisible"),
+    ".csv": MotionFormat(write_joint_csv, "blank", keeps_axes=True),
     ".trc": MotionFormat(_write_joint_trc, HELD, steady=True),
     ".mot": MotionFormat(write_mot, HELD),
 }

@@ -705,8 +705,8 @@ class Take:
                 .trc (joint positions) or .mot (joint angles for OpenSim) file.
             rate: Frames per second of the file [Hz]; those of the take when not given.
             up: The axis of the take's world that points up.
-            forward: Its axis that becomes -z, which is forward in OpenXR, of a file with y up; when not given
-                the world is turned about x alone.
+            forward: Its axis that becomes -z, as in OpenXR, of a file with y up, and y of a .usdc with z up;
+                when not given, y if z points up and -z if y does.
             neutral: The first and the last time [s] of a pose in which a table's angles of the ISB are zero,
                 or the take of a trial that shows it; see `angles`.
             guesses: Whether a table also has joints that nothing shows, see `shown_joints`.
@@ -720,15 +720,11 @@ class Take:
         check_choice(up, get_args(UpAxis), noun="axis that points up")
         path = Path(path)
         form = motion_format(path)
-        if up != "z" and form.keeps_axes:
+        if (up != "z" or forward is not None) and form.keeps_axes:
+            given = f"up is {up}" if forward is None else f"forward is {forward}"
             raise ArgumentError(
-                f"up is {up} and the file {path}, expected a format with a direction that is up: "
+                f"{given} and the file {path}, expected a format with a direction that is up: "
                 f"{', '.join(ending for ending, one in MOTION_FORMATS.items() if not one.keeps_axes)}"
-            )
-        if forward is not None and form.keeps_forward:
-            raise ArgumentError(
-                f"forward is {forward} and the file {path}, expected a format with y up: "
-                f"{', '.join(ending for ending, one in MOTION_FORMATS.items() if not one.keeps_forward)}"
             )
         if neutral is not None and not form.keeps_axes:
             raise ArgumentError(

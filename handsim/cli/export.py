@@ -37,7 +37,7 @@ def export(
         up: The axis of the take that points up; y for captures of Motive's default. Files have y up, but
             .usda, .usdc and .csv have the take's axes.
         forward: The axis of the take that is forward in the room, as forward= in an address of --send: it
-            becomes -z, as in OpenXR. When not given files with y up are turned about x alone.
+            becomes -z, as in OpenXR, or y of a .usdc with z up. When not given, y if z points up, else -z.
         neutral: First and last time [s] at which the hands are flat, or in another pose in which the angles
             of the ISB in a .csv are to be zero; or the take (.npz) of a trial that shows this pose.
         guesses: Whether a .csv has numbers, too, for joints beyond which no marker was seen.

@@ -235,9 +235,9 @@ def _eased(
     """
     if not shown.has_pose or hand.status not in (Status.TRACKED, Status.COASTING):
         return hand
-    motion = (
-        velocity_of(tracked.qpos, hand.qpos, 1.0) if span is None else span * np.nan_to_num(shown.velocity)
-    )
+    motion = np.nan_to_num(shown.velocity) * (span or 0.0)
+    if span is None:
+        motion = velocity_of(tracked.qpos, hand.qpos, 1.0)
     due = move(shown.qpos[None], motion[None])[0]
     ways = np.diff(hand_keypoints(model, np.stack([due, hand.qpos])), axis=0)
     share = _EASE / max(float(np.linalg.norm(ways, axis=-1).max()), _EASE)

@@ -64,6 +64,11 @@ class Corrector:
             with errors_of(corrections_path(path), CaptureError):
                 self._make(())
 
+    @property
+    def is_busy(self) -> bool:
+        """Whether labels are being corrected."""
+        return self._lock.locked()
+
     def span_of(self, frame: int, column: int) -> tuple[int, int]:
         """First and last frame around a frame in which its point keeps ID and label without a gap."""
         take, points = self.take, self.take.point_list
@@ -139,10 +144,8 @@ def doubt_of(before: Take, after: Take, correction: Correction) -> str:
     frames = slice(correction.first, correction.last + 1)
     rms = np.array([np.fmax.reduce(take.rms[frames], axis=0) for take in (before, after)])
     worse = np.flatnonzero((rms[1] > _WORSE * rms[0]) & (rms[1] > _BAD_RMS))
-    told = (
-        f"{after.sides[n]} RMS rises from {1e3 * rms[0, n]:.1f} to {1e3 * rms[1, n]:.1f} mm" for n in worse
-    )
-    return ", ".join(told) + "; Undo takes it back" * (len(worse) > 0)
+    told = [f"{after.sides[n]} RMS was {1e3 * rms[0, n]:.1f}, is {1e3 * rms[1, n]:.1f} mm" for n in worse]
+    return f"; **{', '.join(told)}; Undo takes it back**" if told else ""
 
 
 def _state_of(path: Path) -> tuple[int, int] | None:
@@ -209,6 +212,8 @@ class LabelEditor:
         if self.chosen is None:
             self.state.content = "Choose a point first: click on it, or take it from the list."
             return
+        if self._corrector.is_busy:
+            return  # The click before is still being worked on.
         first, last = (int(value) for value in self.span.value)
         before, self.state.content = self._corrector.take, "working: poses are fitted to the corrected labels"
         try:
@@ -217,8 +222,7 @@ class LabelEditor:
             self.state.content = str(error)
             return
         self._renew()
-        doubt = doubt_of(before, self._corrector.take, correction)
-        self.state.content = f"corrected: {correction}" + (f"; **{doubt}**" if doubt else "")
+        self.state.content = f"corrected: {correction}{doubt_of(before, self._corrector.take, correction)}"
 
     def save(self) -> None:
         """Save the corrections and the take, or show why that is impossible."""
@@ -238,10 +242,8 @@ class LabelEditor:
             )
             ends = gui.add_button_group("shown frame is", ("first", "last"))
             self.label = gui.add_dropdown("right label", (NO_MARKER, *self._recording.label_names))
-            self._correct = gui.add_button("Correct")
-            self._correct.on_click(self._work(self.correct))
-            undo = gui.add_button("Undo", color="gray", hint="What was not saved")
-            undo.on_click(self._work(self._undo))
+            gui.add_button("Correct").on_click(lambda _: self.correct())
+            gui.add_button("Undo", color="gray", hint="What was not saved").on_click(lambda _: self._undo())
             saves = gui.add_button("Save take", color="gray", hint=f"Writes {self._corrector.path}")
             saves.on_click(lambda _: self.save())
             self.list = gui.add_markdown("")
@@ -256,19 +258,6 @@ class LabelEditor:
             (first, last), frame = self.span.value, self._frame
             is_first = event.target.value == "first"
             _set(self.span, (frame, max(frame, last)) if is_first else (min(first, frame), frame))
-
-    def _work(self, action: Callable[[], None]) -> Callable[[Any], None]:
-        """A handler that does what takes seconds; clicks meanwhile do nothing, as one button shows."""
-
-        def handle(_event: object) -> None:
-            if not self._correct.disabled:
-                self._correct.disabled = True
-                try:
-                    action()
-                finally:
-                    self._correct.disabled = False
-
-        return handle
 
     def _undo(self) -> None:
         self._corrector.undo()
@@ -392,9 +381,7 @@ class LayoutEditor:
         """Move a marker to the skin near a point of the page [m], if there is any."""
         with self._lock:
             try:
-                layout = place_marker(
-                    self.fit.layout, index, self.fit.model, point - self.shift, keeps_bone=False
-                )
+                layout = place_marker(self.fit.layout, index, self.fit.model, point - self.shift, stays=False)
             except LayoutError as error:
                 self.state.content = str(error)
                 return

@@ -94,7 +94,7 @@ def test_a_bad_correction_is_told_before_it_is_saved(open_page, path, tracked):
     page.press("right label", next(name for name in tracked.label_names if name.endswith("PinkyTip")))
     page.settle()
     page.press("Correct")
-    page.wait(lambda: page.says("right RMS rises from "))
+    page.wait(lambda: page.says("right RMS was "))
     assert page.says("Undo takes it back") and not corrections_path(path).exists()
     page.press("Undo")
     page.wait(lambda: page.says("taken back"))
