@@ -156,7 +156,8 @@ def carried(
     inverse = np.linalg.inv(model.rest_transforms)
     local = np.einsum("lij,mj->mli", inverse, np.insert(rest, 3, last, axis=1))
     weights = all_weights(bone_indices, bone_weights)
-    bones = np.swapaxes(T_world_bone[..., :3, :], -1, -2).reshape(len(T_world_bone), -1, 3)
+    count, num_bones = T_world_bone.shape[:2]
+    bones = np.swapaxes(T_world_bone[..., :3, :], -1, -2).reshape(count, 4 * num_bones, 3)
     return np.asarray((weights[..., None] * local).reshape(len(rest), -1) @ bones)
 
 

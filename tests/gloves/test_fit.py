@@ -30,6 +30,11 @@ from tests.meshes import blend_skin
 MODELS = {side: HandModel.named("M", side=side) for side in ("left", "right")}
 
 
+def test_no_poses_have_no_markers():
+    centers, normals = nominal_fit("dense19", "M", "right").markers(np.empty((0, 27)))
+    assert centers.shape == normals.shape == (0, 19, 3)
+
+
 @pytest.mark.parametrize("glove", ["dense19", "sparse13"])
 def test_markers_sit_one_radius_above_the_skin(glove, rng):
     model = HandModel(sample_shape(EVERYBODY, rng=rng))

@@ -328,4 +328,6 @@ def test_no_slip_is_told_of_hands_that_are_not_measured(truth):
     assert slips(size="auto", user="M") == []
     assert slips(size="auto", user="auto, 180 x 80 mm", size_state="being measured") == []
     followed = dataclasses.replace(take, former=[FormerHands(FRAMES - 10, take.hands, "auto, 180 x 80 mm")])
+    some = followed.marker_offsets("right", np.arange(5))  # of one of the hands alone
+    np.testing.assert_array_equal(some, take.marker_offsets("right", np.arange(5)))
     assert [one for one in find_faults(followed) if "slips" in one.why] == [], "another user followed"
