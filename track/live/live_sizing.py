@@ -108,8 +108,8 @@ class LiveSizing(Closing):
         shown, last = tracked, self._before
         if self._is_easing and last is not None:
             span = tracked.time - last[0].time if self._is_resized else None
-            each = zip(*(one.hands for one in (*last, tracked)), tracker.hands, strict=True)
-            hands = tuple(_eased(*three, fit.model, span) for *three, fit in each)
+            each = zip(last[0].hands, last[1].hands, tracked.hands, tracker.hands, strict=True)
+            hands = tuple(_eased(was, seen, hand, fit.model, span) for was, seen, hand, fit in each)
             self._is_easing = hands != tracked.hands or not self.is_settled
             shown = dataclasses.replace(tracked, hands=hands)
         self._before, self._is_resized = (tracked, shown), False
