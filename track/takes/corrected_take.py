@@ -19,7 +19,8 @@ from track.kinematics.pose_solver import FEWEST_MARKERS, PoseSolver
 from track.takes.smoothed_take import smooth_take, spread_model
 
 _ANGLE_SPREAD: Final = 0.3  # [rad] prior standard deviation of joint angles around the tracked ones
-_BAD_RMS: Final = 0.006  # [m] A fit that is worse is tried again from general poses.
+BAD_RMS: Final = 0.006
+"""A fit that is worse is tried again from general poses [m]."""
 
 
 class CorrectedTake(NamedTuple):
@@ -101,7 +102,7 @@ def _solved(
     solver = PoseSolver(worn)
     solver.hand.positions[:, 0] -= bias
     fit = solver.solve(targets, near, prior=(near[:, 7:], _ANGLE_SPREAD))
-    qpos, bad = fit.qpos.copy(), np.flatnonzero(fit.rms > _BAD_RMS)
+    qpos, bad = fit.qpos.copy(), np.flatnonzero(fit.rms > BAD_RMS)
     if len(bad):
         other = solver.solve(targets[bad])  # A wrong label may have bent the starting pose too far.
         better = other.rms < 0.5 * fit.rms[bad]

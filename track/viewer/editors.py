@@ -29,7 +29,7 @@ from handsim.files.inputs import read_bytes
 from handsim.files.outputs import write_text, writing
 from handsim.hand.model import HandModel
 from handsim.hand.shape import NUM_QPOS
-from track.takes.corrected_take import correct_take
+from track.takes.corrected_take import BAD_RMS, correct_take
 from track.viewer.recordings import TakeRecording
 from track.viewer.stage import HandSkin, PointBalls, set_stage
 
@@ -40,8 +40,6 @@ _NOTHING: Final = "choose"
 _HALO: Final = 2.5  # radius of the halo around the chosen point, in radii of a marker
 _HALO_COLOR: Final = (255, 190, 0)
 _LISTED: Final = 12  # largest number of corrections in the list
-_WORSE: Final = 2.0  # ratio of a hand's RMS after a correction to that before, from which it is doubted
-_BAD_RMS: Final = 0.003  # [m] least such RMS
 HEIGHT: Final = 0.06  # height of the wrist above the ground [m]
 _GIZMO: Final = 0.03  # size of the handle that moves a marker [m]
 
@@ -140,10 +138,10 @@ def label_of(take: Take, frame: int, column: int) -> str:
 
 
 def doubt_of(before: Take, after: Take, correction: Correction) -> str:
-    """What speaks against a correction: a hand that fits its markers much worse than before; or nothing."""
+    """What speaks against a correction: a hand that fits its markers no longer; or nothing."""
     frames = slice(correction.first, correction.last + 1)
     rms = np.array([np.fmax.reduce(take.rms[frames], axis=0) for take in (before, after)])
-    worse = np.flatnonzero((rms[1] > _WORSE * rms[0]) & (rms[1] > _BAD_RMS))
+    worse = np.flatnonzero((rms[0] < BAD_RMS) & (rms[1] > BAD_RMS))
     told = [f"{after.sides[n]} RMS was {1e3 * rms[0, n]:.1f}, is {1e3 * rms[1, n]:.1f} mm" for n in worse]
     return f"; **{', '.join(told)}; Undo takes it back**" if told else ""
 
