@@ -207,6 +207,12 @@ def find_suspect_spans(take: Take, most: int | None = _MOST_DOUBTS) -> tuple[Sus
     Returns:
         Spans of frames `first` to `last`, with the `worst` frame, what they concern, and why.
     """
+    has_faults = np.isfinite(take.qpos).any() and not _is_known(take)
+    return (*(find_faults(take) if has_faults else ()), *_label_spans(take)[:most])
+
+
+def _label_spans(take: Take) -> list[SuspectSpan]:
+    """Spans with probably wrong or missing labels, the most doubtful first."""
     evidence = evidence_of(take) if np.isfinite(take.qpos).any() and not _is_known(take) else None
     points = take.point_list
     confidence, markers = _confidence(take, evidence), points.labels.astype(np.int64)
@@ -221,14 +227,14 @@ def find_suspect_spans(take: Take, most: int | None = _MOST_DOUBTS) -> tuple[Sus
         why += f", {100 * least[worst]:.0f} %"
         found.append((float((1.0 - least[first : last + 1]).sum()), SuspectSpan(first, last, worst, of, why)))
     found.sort(key=lambda entry: (-entry[0], entry[1].first))
-    return (*(() if evidence is None else find_faults(take)), *(doubt for _, doubt in found[:most]))
+    return [doubt for _, doubt in found]
 
 
 def vouch(take: Take, spans: Sequence[SuspectSpan] | None = None) -> Vouch:
     """Bound the wrong frames of a take by the confidences in its labels, and by its doubtful spans."""
     doubt = 1.0 - np.nan_to_num(frame_confidence(take), nan=1.0)
     listed, masses = np.zeros(take.num_frames, dtype=np.bool_), list[float]()
-    for span in find_suspect_spans(take, most=None) if spans is None else spans:
+    for span in _label_spans(take) if spans is None else spans:
         part = slice(span.first, span.last + 1 if span.of_labels else span.first)
         masses.append(float(doubt[part][~listed[part]].sum()))
         listed[part] = True
