@@ -149,7 +149,11 @@ class Drawing:
             conditions = sample(rng=own) if common is None else common
             cameras = viewpoints.cameras(frame)
             moment = Moment(self.take, frame, None if cast is None else cast.person)
-            moment = studio.reaching(moment, cameras, self._user)
+            if self._arms is None:
+                moment = studio.reaching(moment, cameras, self._user)
+            else:
+                fore, upper = (ways[frame] for ways in self._arms)
+                moment = dataclasses.replace(moment, forearms=fore, upper_arms=upper)
             if leave_out is not None and not studio.is_clear(moment, cameras):
                 leave_out(frame)
                 continue
@@ -157,6 +161,13 @@ class Drawing:
             for camera in cameras:
                 drawn = studio.photograph(moment, camera, conditions.reseeded(own))
                 yield dataclasses.replace(drawn, choices=about | dict(drawn.choices))
+
+    @functools.cached_property
+    def _arms(self) -> tuple[Doubles, Doubles] | None:
+        """Directions (T, H, 3) of forearms and upper arms in a motion of somebody; None for single poses."""
+        if self._user is None or not self.subject.is_motion:
+            return None
+        return self._user.moving_arms(self.take, self.viewpoints.cameras)
 
     def _enclosed(self) -> Doubles | None:
         """Places (N, 3) of cameras and hands that share a background [m]; None for one camera."""

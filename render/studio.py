@@ -306,20 +306,24 @@ class Studio:
         )
 
     def reaching(self, moment: Moment, cameras: Sequence[Camera], user: UserBody | None = None) -> Moment:
-        """The moment with arms, the user's or others, that leave hands free and the cameras' pictures."""
+        """The moment with arms, the user's or others, that leave hands free and the cameras' pictures.
+
+        It is no part of a motion, whose arms are `UserBody.moving_arms`.
+        """
         there = moment.hands()
         if not there:
             return moment
         numbers = [*there]
         if user is None:
             lines = [self._hands[number].skin.forearm_line(pose) for number, pose in there.items()]
-            elbows, ways = (np.array(one)[:, None] for one in zip(*lines, strict=True))
-            arms = Arms(np.stack([*there.values()])[:, :3], ways, elbows, np.zeros(ways.shape[:2]))
+            elbows, ways = (np.array(one)[None, :, None] for one in zip(*lines, strict=True))
+            arms = Arms(np.stack([*there.values()])[None, :, :3], ways, elbows, np.zeros(ways.shape[:3]))
         else:
-            arms = user.arms(moment.take.qpos[moment.frame], numbers)
+            arms = user.arms(moment.take.qpos[None, moment.frame], numbers)
         keypoints = [hand_keypoints(self._hands[n].fit.model, pose[None])[0] for n, pose in there.items()]
         found = np.full((2, len(self._hands), 3), np.nan)
-        found[:, numbers] = bend_arms(arms, np.concatenate(keypoints), cameras)
+        forearms, upper_arms = bend_arms(arms, np.concatenate(keypoints)[None], [cameras])
+        found[:, numbers] = forearms[0], upper_arms[0]
         return dataclasses.replace(moment, upper_arms=found[1], forearms=None if user is None else found[0])
 
     def is_clear(self, moment: Moment, cameras: Sequence[Camera]) -> bool:
