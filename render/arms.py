@@ -25,7 +25,7 @@ _INNER: Final = 0.035  # distance of an arm's axis from a line of sight that it 
 _OUTER: Final = 0.075  # least distance of one that it leaves free [m]
 _HIDING: Final = 15.0  # cost of an arm that hides all keypoints from a camera
 _COMPARED: Final = 10  # forearms whose upper arms are tried
-_STEADY: Final = 1.0  # cost of an arm that turns by 60 degrees from one choice to the next
+_STEADY: Final = 2.0  # cost of an arm that turns by 60 degrees between two choices
 _TURNS: Final = np.deg2rad([0, 20, -20, 40, -40, 60, -60, 90, -90, 120, -120, 150, -150, 180])
 _TILTS: Final = (0.0, 0.4)  # slopes of an upper arm towards the cameras that are tried
 _DOWN: Final = np.array([0.0, 0.0, -0.5])  # downward part of the direction from the elbows to the body
@@ -188,12 +188,12 @@ def _upper_arms(
     bad = np.tile(np.abs(_TURNS), len(_TILTS)) / np.pi + np.repeat(_TILTS, len(_TURNS))
     angles = np.arccos(np.clip(np.einsum("ksui,ksi->ksu", tried, forearms), -1.0, 1.0))
     bad = bad + 3.0 * np.square(np.maximum(angles - _BENT[0], 0.0) / (_BENT[1] - _BENT[0]))
-    for worse, ends, viewing in zip(bad, elbows[:, :, None] + REACH * tried, cameras, strict=True):
+    for number, (ends, viewing) in enumerate(zip(elbows[:, :, None] + REACH * tried, cameras, strict=True)):
         for camera in viewing:
             with np.errstate(invalid="ignore"):
                 pixels = camera.project(ends) / np.array(camera.size, dtype=np.float64)
             inside = (np.abs(pixels - 0.5) < 0.5 + _MARGIN).all(axis=-1)
-            worse += 10.0 * (inside & (camera.local(ends)[..., 2] > 0.0))
+            bad[number] += 10.0 * (inside & (camera.local(ends)[..., 2] > 0.0))
     return tried, bad
 
 

@@ -23,7 +23,7 @@ from render.frames import Doubles, RenderedFrame
 from render.studio import Moment, Studio
 from render.subject import Model, Subject, subject_of
 from render.user_body import UserBody
-from render.viewpoints import Viewpoints
+from render.viewpoints import Viewpoints, rig_positions
 
 
 def draw(
@@ -91,7 +91,8 @@ class Drawing:
         self.take, rng = self.subject.take, SpawnKey.VIEWPOINTS.rng(config.seed)
         # Poses that are no motion may be of many people, but cameras at the eyes need one person.
         has_user = subject.is_motion or config.view.placement == "head"
-        self._user = UserBody(self.take) if has_user else None
+        known = rig_positions(config.view) if config.view.placement == "rig" else None
+        self._user = UserBody(self.take, known) if has_user else None
         poses = None if subject.footage is None else subject.footage.poses
         self.viewpoints = Viewpoints(
             config.view, self.take, rng=rng, up=config.up, user=self._user, poses=poses

@@ -43,7 +43,13 @@ _UNUSUAL: Final = 0.15  # weight of the cost of other distances and angles
 _SWIVELS: Final = np.deg2rad(np.arange(-100.0, 101.0, 20.0))
 """Angles of the elbow about the line from the wrist to the shoulder that are tried [rad]; 0 is the lowest."""
 _SWIVEL: Final = np.deg2rad(50.0)  # spread of these angles
-_OUTWARDS: Final = (0.0, -0.4, 0.4)  # angles that shoulders turn forearms by when they give way [rad]
+_OUTWARDS: Final = (
+    0.0,
+    -0.4,
+    0.4,
+    -0.8,
+    0.8,
+)  # angles that shoulders turn forearms by when they give way [rad]
 _OUTWARD: Final = 0.4  # spread of these angles [rad]
 _SOFTNESS: Final = 0.3  # difference of costs within which elbows are averaged for placing cameras
 _CHOSEN: Final = 0.2  # time between frames of a motion whose arms are chosen [s]
@@ -68,7 +74,9 @@ class UserBody:
     forearms: Doubles
     """Unit directions from wrists to elbows in all frames (T, H, 3); NaN where there is no hand."""
 
-    def __init__(self, take: Take) -> None:
+    def __init__(self, take: Take, cameras: Float[np.ndarray, "C 3"] | None = None) -> None:
+        """Place the person where arms leave hands free, also from cameras at these positions [m]."""
+        self._cameras: Doubles = np.empty((0, 3)) if cameras is None else cameras
         self._lengths = np.array([hand.shape.length for hand in take.hands])
         self._mirrors = np.array([-1.0 if hand.side == "left" else 1.0 for hand in take.hands])
         there = np.flatnonzero(np.isfinite(take.qpos[..., 0]).any(axis=1))
@@ -204,7 +212,7 @@ class UserBody:
         return np.asarray(costs) + self._hiding(ways, wrists, wrists + 2.0 * (palms - wrists), eyes)
 
     def _hiding(self, ways: Doubles, wrists: Doubles, tips: Doubles, eyes: Doubles) -> Doubles:
-        """Costs (..., H, S) of forearms that hide hands, from wrists to tips of flat ones, from the eyes."""
+        """Costs (..., H, S) of forearms that hide hands, from wrists to tips of flat ones."""
         elbows = wrists[..., None, :] + (ELBOW * self._lengths)[:, None, None] * ways
         batch, (hands, tried) = ways.shape[:-3], ways.shape[-3:-1]
         along = (wrists[..., None, :] + _ALONG[:, None] * (tips - wrists)[..., None, :]).reshape(
@@ -214,6 +222,8 @@ class UserBody:
         points = np.array(np.broadcast_to(along, (*batch, *along.shape[-2:])), order="C")
         points = points.reshape(-1, *along.shape[-2:])
         eyes = np.array(np.broadcast_to(eyes, (*batch, 3)), order="C").reshape(-1, 1, 3)
+        others = np.broadcast_to(self._cameras, (len(eyes), *self._cameras.shape))
+        eyes = np.concatenate([eyes, others], axis=1)
         return np.asarray(hiding_costs(axes, eyes, points).reshape(*batch, hands, tried))
 
 
