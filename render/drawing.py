@@ -7,7 +7,7 @@ import functools
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,6 +17,7 @@ from gloves.layout import MarkerLayout
 from gloves.takes.take import Take
 from handsim._checks import check_type
 from handsim.errors import ArgumentError, HandSimWarning
+from handsim.space.camera import Camera
 from render.conditions import Conditions, sample_conditions
 from render.config import Cameras, RenderConfig, SpawnKey, resolve
 from render.frames import Doubles, RenderedFrame
@@ -62,16 +63,49 @@ def draw(
     Raises:
         HandSimError: The source or the settings cannot be drawn, or a camera stands in a hand or an object.
     """
+    asked = asked_pictures(source, model, glove, camera, frames, record, config, **settings)
+    return asked.drawing.frames(asked.shard, asked.numbered)
+
+
+class Asked(NamedTuple):
+    """Pictures that a call asks for."""
+
+    drawing: Drawing
+    shard: int
+    numbered: Iterable[tuple[int, int]]  # frames with their places in the shard
+
+
+def asked_pictures(
+    source: Take | str | Path | ArrayLike,
+    model: Model | tuple[Model, Model] | None = None,
+    glove: MarkerLayout | str | None = None,
+    camera: Cameras | None = None,
+    frames: Iterable[int] | None = None,
+    record: Mapping[str, Any] | None = None,
+    config: RenderConfig | None = None,
+    **settings: Any,
+) -> Asked:
+    """What the arguments of `draw` ask for."""
     config = resolve(config, settings, camera)
     drawing = Drawing(subject_of(source, model=model, glove=glove, seed=config.seed), config)
     drawing.viewpoints.check_hands_in_view()
     if record is None:
-        return drawing.frames(0, ((n, n) for n in drawing.chosen_frames(frames)))
+        return Asked(drawing, 0, ((n, n) for n in drawing.chosen_frames(frames)))
     check_type("record", record, Mapping, "a picture's record, as formats of files have it")
     number, choices = record.get("number", record.get("frame")), record.get("choices", {})
     if frames is not None or number is None or not {"shard", "place"} <= set(choices):
         raise ArgumentError("expected frames or a picture's record, with shard and place in its choices")
-    return drawing.frames(choices["shard"], [(choices["place"], *drawing.chosen_frames([number]))])
+    return Asked(drawing, choices["shard"], [(choices["place"], *drawing.chosen_frames([number]))])
+
+
+class Scene(NamedTuple):
+    """What one picture shows."""
+
+    studio: Studio
+    moment: Moment
+    camera: Camera
+    conditions: Conditions
+    about: dict[str, int]  # person, shard, and place in it
 
 
 class Drawing:
@@ -134,6 +168,18 @@ class Drawing:
         leave_out: Callable[[int], None] | None = None,
     ) -> Iterator[RenderedFrame]:
         """Pictures of frames by all cameras; the frames are given with their places in the shard."""
+        for studio, moment, camera, conditions, about in self.scenes(shard, numbered, leave_out=leave_out):
+            drawn = studio.photograph(moment, camera, conditions)
+            yield dataclasses.replace(drawn, choices=about | dict(drawn.choices))
+
+    def scenes(
+        self,
+        shard: int,
+        numbered: Iterable[tuple[int, int]],
+        *,
+        leave_out: Callable[[int], None] | None = None,
+    ) -> Iterator[Scene]:
+        """What these pictures show."""
         config, cast, viewpoints = self.config, self.subject.cast, self.viewpoints
         rng = SpawnKey.SHARD.rng(config.seed, shard, 0)
         if cast is None:  # a take has its own hands, whose looks change with the shard
@@ -160,8 +206,7 @@ class Drawing:
                 continue
             about = {"person": person, "shard": shard, "place": place}
             for camera in cameras:
-                drawn = studio.photograph(moment, camera, conditions.reseeded(own))
-                yield dataclasses.replace(drawn, choices=about | dict(drawn.choices))
+                yield Scene(studio, moment, camera, conditions.reseeded(own), about)
 
     @functools.cached_property
     def _arms(self) -> tuple[Doubles, Doubles] | None:

@@ -254,7 +254,7 @@ class Studio:
         The frame has its choices as JSON, and the hands' vertices, only where `recorded`: both take time.
         """
         take, frame, rng = moment.take, moment.frame, np.random.default_rng(conditions.seed)
-        drawn = self._still(moment)
+        drawn = self.surfaces(moment)
         nearest = _clearance(camera, drawn)
         if nearest < 2.0 * NEAR:
             raise HandSimError(
@@ -320,19 +320,23 @@ class Studio:
             arms = Arms(np.stack([*there.values()])[None, :, :3], ways, elbows, np.zeros(ways.shape[:3]))
         else:
             arms = user.arms(moment.take.qpos[None, moment.frame], numbers)
-        keypoints = [hand_keypoints(self._hands[n].fit.model, pose[None])[0] for n, pose in there.items()]
         found = np.full((2, len(self._hands), 3), np.nan)
-        forearms, upper_arms = bend_arms(arms, np.concatenate(keypoints)[None], [cameras])
+        forearms, upper_arms = bend_arms(arms, np.concatenate(self.keypoints(moment))[None], [cameras])
         found[:, numbers] = forearms[0], upper_arms[0]
         return dataclasses.replace(moment, upper_arms=found[1], forearms=None if user is None else found[0])
 
+    def keypoints(self, moment: Moment) -> list[Doubles]:
+        """Keypoints (21, 3) in the world [m] of each hand that the frame has."""
+        hands = moment.hands().items()
+        return [hand_keypoints(self._hands[number].fit.model, pose[None])[0] for number, pose in hands]
+
     def is_clear(self, moment: Moment, cameras: Sequence[Camera]) -> bool:
         """Whether all cameras are outside of hands and objects, so that the moment can be drawn."""
-        drawn = self._still(moment)
+        drawn = self.surfaces(moment)
         return all(_clearance(camera, drawn) >= 2.0 * NEAR for camera in cameras)
 
-    def _still(self, moment: Moment) -> list[Drawn]:
-        """Surfaces of a moment."""
+    def surfaces(self, moment: Moment) -> list[Drawn]:
+        """Surfaces of a moment: those of its hands, then of its bodies."""
         if self._posed is None or self._posed[0] is not moment:
             self._posed = moment, self._drawn(moment, 0.0)
         return self._posed[1]
@@ -378,11 +382,9 @@ class Studio:
         """The perfect color picture as bytes, or bright: as levels that do not end at 255."""
         background = conditions.background
         whole = paint(camera, drawn, conditions.lighting, "bright" if bright else self._painter)
-        if conditions.enclosure is not None:
-            behind = draw_surroundings(background, conditions.enclosure, camera, bright=bright).rgb
-            return put_before(whole, behind)
-        plain, light = _background(background, camera.size), None
-        if background.backdrop.shadows and camera.lens.kind == "pinhole":
+        plain, light = picture_behind(camera, conditions, bright=bright), None
+        shadows = background.backdrop.shadows and conditions.enclosure is None
+        if shadows and camera.lens.kind == "pinhole":
             light = light_behind(camera, drawn, conditions.lighting, background.backdrop)
         if light is not None:
             shade = cv2.cvtColor(cv2.pow(light, 1.0 / GAMMA), cv2.COLOR_GRAY2RGB)
@@ -414,6 +416,13 @@ class Studio:
         if self._footage is not None:
             return self._footage.record
         return {"people": self._people, "body_colors": self._colors, **conditions.record()}
+
+
+def picture_behind(camera: Camera, conditions: Conditions, *, bright: bool = False) -> NDArray[Any]:
+    """Levels (H, W, 3) of sRGB behind hands and objects, from 0 to 255, without their shadows."""
+    if conditions.enclosure is not None:
+        return draw_surroundings(conditions.background, conditions.enclosure, camera, bright=bright).rgb
+    return _background(conditions.background, camera.size)
 
 
 def _clearance(camera: Camera, drawn: Sequence[Drawn]) -> float:
