@@ -37,6 +37,14 @@ _FILM: Final = 0.36  # width of the film [tenths of a meter, USD's unit], that o
 _BEYOND: Final = 0.1  # distance of the plane behind everything else [m]
 _INDEX: Final = 1.4  # index of refraction of skin (Jensen et al. 2001)
 
+_INPUTS: Final = {
+    "color": ("diffuseColor", "rgb", "sRGB"),
+    "light": ("emissiveColor", "rgb", "sRGB"),
+    "rough": ("roughness", "r", "raw"),
+    "relief": ("normal", "rgb", "raw"),
+}
+"""Input of the shader, channels and color space of each kind of texture."""
+
 
 def write_scene(
     path: str | Path,
@@ -146,15 +154,6 @@ def _shader(stage: Any, path: str) -> Any:
     from pxr import UsdShade
 
     return UsdShade.Shader.Define(stage, path)
-
-
-_INPUTS: Final = {
-    "color": ("diffuseColor", "rgb", "sRGB"),
-    "light": ("emissiveColor", "rgb", "sRGB"),
-    "rough": ("roughness", "r", "raw"),
-    "relief": ("normal", "rgb", "raw"),
-}
-"""Input of the shader, channels and color space of each kind of texture."""
 
 
 def _add_texture(stage: Any, path: Path, surface: str, kind: str, picture: NDArray[Any], name: str) -> None:
