@@ -21,6 +21,7 @@ from handsim.space.camera import Camera
 from render.conditions import Conditions, sample_conditions
 from render.config import Cameras, RenderConfig, SpawnKey, resolve
 from render.frames import Doubles, RenderedFrame
+from render.mano import load_mano
 from render.studio import Moment, Studio
 from render.subject import Model, Subject, subject_of
 from render.user_body import UserBody
@@ -114,6 +115,8 @@ class Drawing:
     def __init__(self, subject: Subject, config: RenderConfig, *, light: bool = False) -> None:
         if config.shutter is not None and not subject.is_motion:
             raise ArgumentError("poses without times have no motion to blur; add the array times")
+        if config.mano is not None:
+            load_mano(config.mano)  # a file that is none is refused before anything is drawn
         for body in subject.take.bodies:
             if body.shape is None and not len(body.positions):
                 told = (

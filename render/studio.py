@@ -43,6 +43,7 @@ from render.frames import (
     Pictures,
     RenderedFrame,
 )
+from render.mano import mano_fit
 from render.painting.figures import BodyFigure, Drawn, HandFigure, sample_appearance
 from render.painting.painter import paint, put_before
 from render.painting.rasterizer import NEAR, see
@@ -84,6 +85,7 @@ def hand_truth(
     *,
     recorded: bool = True,
     openxr: bool = False,
+    mano: str | None = None,
 ) -> HandTruth:
     """Ground truth of a hand, by its number among those in the picture; mask, vertices where `recorded`."""
     model = figure.fit.model
@@ -94,6 +96,7 @@ def hand_truth(
     rules = np.append(np.arange(len(keypoints)), _OPENXR[: len(poses)])
     visible = _visible(points, rules, figure.thickness[rules], number, camera, pictures)
     worn = figure.look.glove is not None
+    seen_from = np.linalg.inv(camera.T_world_camera)
     return HandTruth(
         shape=model.shape,
         qpos=qpos,
@@ -106,6 +109,7 @@ def hand_truth(
         openxr=poses,
         openxr_visible=visible[len(keypoints) :],
         tracking=tracking,
+        mano=mano_fit(mano, model.shape).records(qpos[None], seen_from)[0] if mano and recorded else None,
         marker_names=figure.fit.layout.names if worn else (),
         markers=figure.fit.markers(qpos[None])[0][0] if worn else np.empty((0, 3)),
     )
@@ -278,7 +282,7 @@ class Studio:
             _walls(camera, drawn, conditions).put_behind(truth)
         if sensor is not None:
             noisy_depth = self._noisy_depth(truth, rgb, len(present), camera, sensor, rng)
-        asked = {"recorded": recorded, "openxr": self._config.openxr}
+        asked = {"recorded": recorded, "openxr": self._config.openxr, "mano": self._config.mano}
         hands = tuple(
             hand_truth(
                 self._hands[n], take.qpos[frame, n], index, camera, truth, _tracking(take, frame, n), **asked
