@@ -159,7 +159,8 @@ class Mano:
             right = (pull[:, 51:] - np.einsum("bsp,bp->bs", square[:, 51:, :51], own)).sum(axis=0)
             change = np.linalg.solve(left, right - usual * shape)
             shape, found = shape + change, own - to_shape @ change
-        return self._turned(turns, found[:, :48].reshape(-1, 16, 3)), shape, move + found[:, 48:51]
+        by = np.asarray(found[:, :48].reshape(-1, 16, 3), dtype=np.float64)
+        return self._turned(turns, by), shape, move + found[:, 48:51]
 
     def _turned(self, turns: Doubles, by: Doubles) -> Doubles:
         """Rotations of joints that are turned in the world by rotation vectors (B, 16, 3)."""
@@ -228,7 +229,7 @@ class ManoFit:
         self._known = (far < _FARTHEST).astype(np.float64)
 
     def _worlds(self, turns: Doubles) -> Doubles:
-        worlds = turns[0].copy()
+        worlds: Doubles = turns[0].copy()
         for joint, parent in list(enumerate(self._mano._parents))[1:]:
             worlds[joint] = worlds[parent] @ turns[0, joint]
         return worlds
