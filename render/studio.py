@@ -282,10 +282,17 @@ class Studio:
             _walls(camera, drawn, conditions).put_behind(truth)
         if sensor is not None:
             noisy_depth = self._noisy_depth(truth, rgb, len(present), camera, sensor, rng)
-        asked = {"recorded": recorded, "openxr": self._config.openxr, "mano": self._config.mano}
         hands = tuple(
             hand_truth(
-                self._hands[n], take.qpos[frame, n], index, camera, truth, _tracking(take, frame, n), **asked
+                self._hands[n],
+                take.qpos[frame, n],
+                index,
+                camera,
+                truth,
+                _tracking(take, frame, n),
+                recorded=recorded,
+                openxr=self._config.openxr,
+                mano=self._config.mano,
             )
             for index, n in enumerate(present)
         )
