@@ -60,6 +60,8 @@ def write_scene(
 ) -> None:
     """Write what `draw` shows in one picture as an OpenUSD scene: skin, lamps, camera and background.
 
+    The scene is that of the world, with z up; its lengths are in [m].
+
     Args:
         path: The file, .usdc or .usda; textures are written into the folder beside it that has its name.
         source: What `draw` takes.
