@@ -223,7 +223,7 @@ class UserBody:
         points = points.reshape(-1, *along.shape[-2:])
         eyes = np.array(np.broadcast_to(eyes, (*batch, 3)), order="C").reshape(-1, 1, 3)
         others = np.broadcast_to(self._cameras, (len(eyes), *self._cameras.shape))
-        eyes = np.concatenate([eyes, others], axis=1)
+        eyes = np.ascontiguousarray(np.concatenate([eyes, others], axis=1))  # one type for the compiler
         return np.asarray(hiding_costs(axes, eyes, points).reshape(*batch, hands, tried))
 
 
