@@ -114,7 +114,8 @@ def hiding_costs(
     for one in range(len(axes)):
         for arm in range(axes.shape[1]):
             hidden, start, end = 0.0, axes[one, arm, 0], axes[one, arm, 1]
-            for eye in eyes[one]:
+            for camera in range(eyes.shape[1]):
+                eye = eyes[one, camera]
                 covers = _is_close(eye, start, end)
                 for point in points[one]:
                     hidden += 1.0 if covers else _hidden(eye, point, start, end)
@@ -133,8 +134,8 @@ def most_hidden(
             hidden = 0.0
             for point in hand:
                 covered = 0.0
-                for axis in axes[frame]:
-                    start, end = axis[0], axis[1]
+                for arm in range(axes.shape[1]):
+                    start, end = axes[frame, arm, 0], axes[frame, arm, 1]
                     covers = 1.0 if _is_close(eyes[frame], start, end) else 0.0
                     covered = max(covered, covers, _hidden(eyes[frame], point, start, end))
                 hidden += covered
