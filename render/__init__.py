@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from render.frames import HandTruth as HandTruth
     from render.frames import Pictures as Pictures
     from render.frames import RenderedFrame as RenderedFrame
+    from render.scene_file import write_scene as write_scene
     from render.scenery.backgrounds import Backgrounds as Backgrounds
     from render.scenery.lights import write_environment_map as write_environment_map
     from render.session import render_take as render_take

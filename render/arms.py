@@ -1,5 +1,8 @@
 """Arms in pictures: elbows and upper arms that leave hands free, and end in no picture where they can.
 
+Arms of a motion are chosen a few times a second, so that they hide little and turn little, and turn evenly
+from one choice to the next.
+
 Elbows flex by 150 degrees at most (American Academy of Orthopaedic Surgeons 1965), and by 30 to 130 at daily
 work (Morrey, Askew and Chao 1981, J. Bone Joint Surg. 63-A:872).
 """
@@ -14,7 +17,7 @@ from jaxtyping import Float
 
 from handsim.kernels import kernel, segment_distance_squared
 from handsim.space.camera import Camera
-from render.frames import Doubles
+from render.frames import Doubles, Integers
 from render.skin.look import REACH
 
 _BARE: Final = 0.15  # share of a forearm, from the wrist on, that may be before its own hand
@@ -22,7 +25,7 @@ _INNER: Final = 0.035  # distance of an arm's axis from a line of sight that it 
 _OUTER: Final = 0.075  # least distance of one that it leaves free [m]
 _HIDING: Final = 15.0  # cost of an arm that hides all keypoints from a camera
 _COMPARED: Final = 10  # forearms whose upper arms are tried
-_SOFTNESS: Final = 0.3  # difference of costs within which forearms are averaged, so that they do not jump
+_STEADY: Final = 2.0  # cost of an arm that turns by 60 degrees between two choices
 _TURNS: Final = np.deg2rad([0, 20, -20, 40, -40, 60, -60, 90, -90, 120, -120, 150, -150, 180])
 _TILTS: Final = (0.0, 0.4)  # slopes of an upper arm towards the cameras that are tried
 _DOWN: Final = np.array([0.0, 0.0, -0.5])  # downward part of the direction from the elbows to the body
@@ -32,48 +35,69 @@ _MARGIN: Final = 0.1  # border around a picture where no arm may end, as a share
 
 
 class Arms(NamedTuple):
-    """Where the arms of H hands can be: S elbows each, and what each of these costs."""
+    """Where the arms of H hands can be in K frames: S elbows each, and what each of these costs."""
 
-    wrists: Float[np.ndarray, "H 3"]
+    wrists: Float[np.ndarray, "K H 3"]
     """Positions [m]."""
-    forearms: Float[np.ndarray, "H S 3"]
+    forearms: Float[np.ndarray, "K H S 3"]
     """Unit vectors from each wrist to its S possible elbows."""
-    elbows: Float[np.ndarray, "H S 3"]
+    elbows: Float[np.ndarray, "K H S 3"]
     """Positions [m]."""
-    costs: Float[np.ndarray, "H S"]
+    costs: Float[np.ndarray, "K H S"]
     """Costs of their bends."""
     shoulders: Float[np.ndarray, "H 3"] | None = None
     """Positions [m]; None for people whose place is not known."""
 
 
 def bend_arms(
-    arms: Arms, points: Float[np.ndarray, "N 3"], cameras: Sequence[Camera]
+    arms: Arms, points: Float[np.ndarray, "K N 3"], cameras: Sequence[Sequence[Camera]]
 ) -> tuple[Doubles, Doubles]:
-    """Unit directions (H, 3) of forearms from wrists, and of upper arms from elbows.
+    """Unit directions (K, H, 3) of forearms from wrists, and of upper arms from elbows.
 
-    Arms hide as few of the hands' points [m] from the cameras as they can, and end in no picture.
+    Arms hide as few of the hands' points [m] from each frame's cameras as they can, end in no picture, and
+    turn little from one of the frames to the next.
     """
-    eyes, points = _eyes(cameras), points[None]
-    axis = _common_axis(cameras)
-    behind = _towards_body(arms.forearms[:, 0], axis, cameras)
-    forearms, upper_arms = np.empty((2, len(arms.wrists), 3))
-
-    def upper(hand: int, elbows: Doubles, fore: Doubles) -> tuple[Doubles, Doubles]:
-        ways = behind[hand, None] if arms.shoulders is None else arms.shoulders[hand] - elbows
-        return _upper_arms(elbows, fore, ways, axis, cameras, points)
-
-    for hand, (wrist, fore, elbows, costs) in enumerate(zip(*arms[:4], strict=True)):
-        way, elbow = fore, elbows
-        if len(elbows) > 1:
-            bad = costs + hiding_costs(forearm_axes(wrist, elbows)[None], eyes, points)[0]
-            best = bad.argsort(kind="stable")[:_COMPARED]
-            bad = bad[best] + upper(hand, elbows[best], fore[best])[1].min(axis=1)
-            mean = np.exp((bad.min() - bad) / _SOFTNESS) @ fore[best]
-            way = mean[None] / np.linalg.norm(mean)
-            elbow = wrist + np.linalg.norm(elbows[0] - wrist) * way
-        tried, bad = upper(hand, elbow, way)
-        forearms[hand], upper_arms[hand] = way[0], tried[0, bad[0].argmin()]
+    eyes = np.array([[one.T_world_camera[:3, 3] for one in viewing] for viewing in cameras])
+    axes = np.array([_common_axis(viewing) for viewing in cameras])
+    forearms, upper_arms = np.empty((2, *arms.wrists.shape))
+    behind = [_towards_body(*one) for one in zip(arms.forearms[:, :, 0], axes, cameras, strict=True)]
+    for hand in range(arms.wrists.shape[1]):
+        fore, elbows, bad = arms.forearms[:, hand], arms.elbows[:, hand], arms.costs[:, hand]
+        bad = bad + hiding_costs(forearm_axes(arms.wrists[:, hand, None], elbows), eyes, points)
+        best = bad.argsort(axis=1, kind="stable")[:, :_COMPARED, None]
+        fore, elbows = (np.take_along_axis(one, best, axis=1) for one in (fore, elbows))
+        ways = np.array(behind)[:, hand, None] if arms.shoulders is None else arms.shoulders[hand] - elbows
+        upper, worse = _upper_arms(elbows, fore, ways, axes, cameras)
+        worse += hiding_costs(_upper_axes(elbows, upper), eyes, points).reshape(worse.shape)
+        bad = np.take_along_axis(bad, best[..., 0], axis=1) + worse.min(axis=2)
+        rows, chosen = np.arange(len(fore)), _steadiest(bad, fore)
+        forearms[:, hand], upper, worse = fore[rows, chosen], upper[rows, chosen], worse[rows, chosen]
+        upper_arms[:, hand] = upper[rows, _steadiest(worse, upper)]
     return forearms, upper_arms
+
+
+def _steadiest(costs: Doubles, ways: Doubles) -> Integers:
+    """The choice (K,) among S directions (K, S, 3) of each frame whose costs (K, S) and turns are least."""
+    total, origins = costs[0], list[Integers]()
+    for before, after, cost in zip(ways[:-1], ways[1:], costs[1:], strict=True):
+        moved = total + _STEADY * np.square(after[:, None] - before).sum(axis=2)
+        origins.append(moved.argmin(axis=1))
+        total = cost + moved.min(axis=1)
+    chosen = [total.argmin()]
+    for origin in reversed(origins):
+        chosen.append(origin[chosen[-1]])
+    return np.array(chosen[::-1])
+
+
+def turning(ways: Float[np.ndarray, "K H 3"], step: int, num_frames: int) -> Float[np.ndarray, "T H 3"]:
+    """Unit directions of all frames from those of every `step`-th: they turn evenly, and slowly at first."""
+    from scipy.ndimage import uniform_filter1d
+
+    share = np.arange(num_frames) / step
+    first = np.minimum(share.astype(int), len(ways) - 1)
+    after, part = ways[np.minimum(first + 1, len(ways) - 1)], (share - first)[:, None, None]
+    mean = uniform_filter1d(ways[first] + part * (after - ways[first]), step, axis=0, mode="nearest")
+    return np.asarray(mean / np.linalg.norm(mean, axis=-1, keepdims=True))
 
 
 def forearm_axes(wrists: Doubles, elbows: Doubles) -> Doubles:
@@ -89,10 +113,12 @@ def hiding_costs(
     costs = np.zeros(axes.shape[:2])
     for one in range(len(axes)):
         for arm in range(axes.shape[1]):
-            hidden = 0.0
-            for eye in eyes[one]:
+            hidden, start, end = 0.0, axes[one, arm, 0], axes[one, arm, 1]
+            for camera in range(eyes.shape[1]):
+                eye = eyes[one, camera]
+                covers = _is_close(eye, start, end)
                 for point in points[one]:
-                    hidden += _hidden(eye, point, axes[one, arm, 0], axes[one, arm, 1])
+                    hidden += 1.0 if covers else _hidden(eye, point, start, end)
             costs[one, arm] = _HIDING * hidden / points.shape[1]
     return costs
 
@@ -108,25 +134,26 @@ def most_hidden(
             hidden = 0.0
             for point in hand:
                 covered = 0.0
-                for axis in axes[frame]:
-                    covered = max(covered, _hidden(eyes[frame], point, axis[0], axis[1]))
+                for arm in range(axes.shape[1]):
+                    start, end = axes[frame, arm, 0], axes[frame, arm, 1]
+                    covers = 1.0 if _is_close(eyes[frame], start, end) else 0.0
+                    covered = max(covered, covers, _hidden(eyes[frame], point, start, end))
                 hidden += covered
             most[frame] = max(most[frame], hidden / points.shape[2])
     return most
 
 
 @kernel
+def _is_close(eye: Any, start: Any, end: Any) -> bool:
+    """Whether an arm is so close to an eye that it hides all."""
+    return bool(segment_distance_squared(eye, eye, start, end) < _CLEAR**2)
+
+
+@kernel
 def _hidden(eye: Any, point: Any, start: Any, end: Any) -> float:
-    """How much, from 0 to 1, an arm hides a point from an eye: all where it is close to the eye."""
-    if segment_distance_squared(eye, eye, start, end) < _CLEAR**2:
-        return 1.0
+    """How much, from 0 to 1, an arm hides a point from an eye that is not close to it."""
     away = np.sqrt(segment_distance_squared(eye, point, start, end))
     return min(1.0, (_OUTER - away) / (_OUTER - _INNER)) if away < _OUTER else 0.0
-
-
-def _eyes(cameras: Sequence[Camera]) -> Doubles:
-    """Positions (1, C, 3) of cameras [m]."""
-    return np.array([[camera.T_world_camera[:3, 3] for camera in cameras]])
 
 
 def _common_axis(cameras: Sequence[Camera]) -> Doubles:
@@ -151,26 +178,27 @@ def _towards_body(forearms: Doubles, axis: Doubles, cameras: Sequence[Camera]) -
 
 
 def _upper_arms(
-    elbows: Doubles,
-    forearms: Doubles,
-    ways: Doubles,
-    axis: Doubles,
-    cameras: Sequence[Camera],
-    points: Doubles,
+    elbows: Doubles, forearms: Doubles, ways: Doubles, axes: Doubles, cameras: Sequence[Sequence[Camera]]
 ) -> tuple[Doubles, Doubles]:
-    """Upper arms (S, K, 3) near these ways (S, 3), turned about `axis`, and their costs (S, K)."""
-    ways = ways / np.linalg.norm(ways, axis=-1, keepdims=True)
-    turns = np.cos(_TURNS)[:, None] * ways[:, None] + np.sin(_TURNS)[:, None] * np.cross(axis, ways)[:, None]
-    tried = np.concatenate([turns - tilt * axis for tilt in _TILTS], axis=1)
+    """Upper arms (K, S, U, 3) near these ways (K, S, 3), turned about `axes` (K, 3), and costs (K, S, U)."""
+    ways, axis = ways / np.linalg.norm(ways, axis=-1, keepdims=True), axes[:, None]
+    aside, tilt = np.cross(axis, ways)[:, :, None], np.array(_TILTS)[:, None, None] * axes[:, None, None]
+    turns = np.cos(_TURNS)[:, None] * ways[:, :, None] + np.sin(_TURNS)[:, None] * aside
+    tried = (turns[:, :, None] - tilt[:, None]).reshape(*turns.shape[:2], -1, 3)
     tried /= np.linalg.norm(tried, axis=-1, keepdims=True)
     bad = np.tile(np.abs(_TURNS), len(_TILTS)) / np.pi + np.repeat(_TILTS, len(_TURNS))
-    angles = np.arccos(np.clip(np.einsum("ski,si->sk", tried, forearms), -1.0, 1.0))
+    angles = np.arccos(np.clip(np.einsum("ksui,ksi->ksu", tried, forearms), -1.0, 1.0))
     bad = bad + 3.0 * np.square(np.maximum(angles - _BENT[0], 0.0) / (_BENT[1] - _BENT[0]))
-    ends = elbows[:, None] + REACH * tried
-    for camera in cameras:
-        with np.errstate(invalid="ignore"):
-            pixels = camera.project(ends) / np.array(camera.size, dtype=np.float64)
-        inside = (np.abs(pixels - 0.5) < 0.5 + _MARGIN).all(axis=-1)
-        bad += 10.0 * (inside & (camera.local(ends)[..., 2] > 0.0))
-    axes = np.stack([np.broadcast_to(elbows[:, None], ends.shape), ends], axis=2)
-    return tried, bad + hiding_costs(axes.reshape(1, -1, 2, 3), _eyes(cameras), points).reshape(bad.shape)
+    for number, (ends, viewing) in enumerate(zip(elbows[:, :, None] + REACH * tried, cameras, strict=True)):
+        for camera in viewing:
+            with np.errstate(invalid="ignore"):
+                pixels = camera.project(ends) / np.array(camera.size, dtype=np.float64)
+            inside = (np.abs(pixels - 0.5) < 0.5 + _MARGIN).all(axis=-1)
+            bad[number] += 10.0 * (inside & (camera.local(ends)[..., 2] > 0.0))
+    return tried, bad
+
+
+def _upper_axes(elbows: Doubles, upper_arms: Doubles) -> Doubles:
+    """Axes (K, S U, 2, 3) of upper arms (K, S, U, 3) from elbows (K, S, 3) [m]."""
+    starts, ends = np.broadcast_arrays(elbows[:, :, None], elbows[:, :, None] + REACH * upper_arms)
+    return np.stack([starts, ends], axis=3).reshape(len(elbows), -1, 2, 3)

@@ -129,6 +129,9 @@ class RenderConfig(FrameConfig):
     """Shutters that blur motion, some of which roll, in eight drawings a picture. In Python, None stands for
     pictures of an instant."""
 
+    mano: str | None = None
+    """Your own MANO_RIGHT as .npz, whose pose and shape annotations then have beside keypoints."""
+
     def __post_init__(self) -> None:
         given, named = self.background, dict[str, Any]()
         named["background"] = given if isinstance(given, Backgrounds) else Backgrounds(given)

@@ -7,7 +7,7 @@ import functools
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,13 +17,15 @@ from gloves.layout import MarkerLayout
 from gloves.takes.take import Take
 from handsim._checks import check_type
 from handsim.errors import ArgumentError, HandSimWarning
+from handsim.space.camera import Camera
 from render.conditions import Conditions, sample_conditions
 from render.config import Cameras, RenderConfig, SpawnKey, resolve
 from render.frames import Doubles, RenderedFrame
+from render.mano import load_mano
 from render.studio import Moment, Studio
 from render.subject import Model, Subject, subject_of
 from render.user_body import UserBody
-from render.viewpoints import Viewpoints
+from render.viewpoints import Viewpoints, rig_positions
 
 
 def draw(
@@ -62,16 +64,49 @@ def draw(
     Raises:
         HandSimError: The source or the settings cannot be drawn, or a camera stands in a hand or an object.
     """
+    asked = asked_pictures(source, model, glove, camera, frames, record, config, **settings)
+    return asked.drawing.frames(asked.shard, asked.numbered)
+
+
+class Asked(NamedTuple):
+    """Pictures that a call asks for."""
+
+    drawing: Drawing
+    shard: int
+    numbered: Iterable[tuple[int, int]]  # frames with their places in the shard
+
+
+def asked_pictures(
+    source: Take | str | Path | ArrayLike,
+    model: Model | tuple[Model, Model] | None = None,
+    glove: MarkerLayout | str | None = None,
+    camera: Cameras | None = None,
+    frames: Iterable[int] | None = None,
+    record: Mapping[str, Any] | None = None,
+    config: RenderConfig | None = None,
+    **settings: Any,
+) -> Asked:
+    """What the arguments of `draw` ask for."""
     config = resolve(config, settings, camera)
     drawing = Drawing(subject_of(source, model=model, glove=glove, seed=config.seed), config)
     drawing.viewpoints.check_hands_in_view()
     if record is None:
-        return drawing.frames(0, ((n, n) for n in drawing.chosen_frames(frames)))
+        return Asked(drawing, 0, ((n, n) for n in drawing.chosen_frames(frames)))
     check_type("record", record, Mapping, "a picture's record, as formats of files have it")
     number, choices = record.get("number", record.get("frame")), record.get("choices", {})
     if frames is not None or number is None or not {"shard", "place"} <= set(choices):
         raise ArgumentError("expected frames or a picture's record, with shard and place in its choices")
-    return drawing.frames(choices["shard"], [(choices["place"], *drawing.chosen_frames([number]))])
+    return Asked(drawing, choices["shard"], [(choices["place"], *drawing.chosen_frames([number]))])
+
+
+class Scene(NamedTuple):
+    """What one picture shows."""
+
+    studio: Studio
+    moment: Moment
+    camera: Camera
+    conditions: Conditions
+    about: dict[str, int]  # person, shard, and place in it
 
 
 class Drawing:
@@ -80,6 +115,8 @@ class Drawing:
     def __init__(self, subject: Subject, config: RenderConfig, *, light: bool = False) -> None:
         if config.shutter is not None and not subject.is_motion:
             raise ArgumentError("poses without times have no motion to blur; add the array times")
+        if config.mano is not None:
+            load_mano(config.mano)  # a file that is none is refused before anything is drawn
         for body in subject.take.bodies:
             if body.shape is None and not len(body.positions):
                 told = (
@@ -91,7 +128,8 @@ class Drawing:
         self.take, rng = self.subject.take, SpawnKey.VIEWPOINTS.rng(config.seed)
         # Poses that are no motion may be of many people, but cameras at the eyes need one person.
         has_user = subject.is_motion or config.view.placement == "head"
-        self._user = UserBody(self.take) if has_user else None
+        known = rig_positions(config.view) if config.view.placement == "rig" else None
+        self._user = UserBody(self.take, known) if has_user else None
         poses = None if subject.footage is None else subject.footage.poses
         self.viewpoints = Viewpoints(
             config.view, self.take, rng=rng, up=config.up, user=self._user, poses=poses
@@ -133,6 +171,18 @@ class Drawing:
         leave_out: Callable[[int], None] | None = None,
     ) -> Iterator[RenderedFrame]:
         """Pictures of frames by all cameras; the frames are given with their places in the shard."""
+        for studio, moment, camera, conditions, about in self.scenes(shard, numbered, leave_out=leave_out):
+            drawn = studio.photograph(moment, camera, conditions)
+            yield dataclasses.replace(drawn, choices=about | dict(drawn.choices))
+
+    def scenes(
+        self,
+        shard: int,
+        numbered: Iterable[tuple[int, int]],
+        *,
+        leave_out: Callable[[int], None] | None = None,
+    ) -> Iterator[Scene]:
+        """What these pictures show."""
         config, cast, viewpoints = self.config, self.subject.cast, self.viewpoints
         rng = SpawnKey.SHARD.rng(config.seed, shard, 0)
         if cast is None:  # a take has its own hands, whose looks change with the shard
@@ -152,14 +202,24 @@ class Drawing:
             conditions = sample(rng=own) if common is None else common
             cameras = viewpoints.cameras(frame)
             moment = Moment(self.take, frame, None if cast is None else cast.person)
-            moment = studio.reaching(moment, cameras, self._user)
+            if self._arms is None:
+                moment = studio.reaching(moment, cameras, self._user)
+            else:
+                fore, upper = (ways[frame] for ways in self._arms)
+                moment = dataclasses.replace(moment, forearms=fore, upper_arms=upper)
             if leave_out is not None and not studio.is_clear(moment, cameras):
                 leave_out(frame)
                 continue
             about = {"person": person, "shard": shard, "place": place}
             for camera in cameras:
-                drawn = studio.photograph(moment, camera, conditions.reseeded(own))
-                yield dataclasses.replace(drawn, choices=about | dict(drawn.choices))
+                yield Scene(studio, moment, camera, conditions.reseeded(own), about)
+
+    @functools.cached_property
+    def _arms(self) -> tuple[Doubles, Doubles] | None:
+        """Directions (T, H, 3) of forearms and upper arms in a motion of somebody; None for single poses."""
+        if self._user is None or not self.subject.is_motion:
+            return None
+        return self._user.moving_arms(self.take, self.viewpoints.cameras)
 
     def _enclosed(self) -> Doubles | None:
         """Places (N, 3) of cameras and hands that share a background [m]; None for one camera."""

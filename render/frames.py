@@ -109,6 +109,8 @@ class HandTruth:
     """Whether they are visible, as of keypoints; those in the palm are on its pixels."""
     tracking: Mapping[str, Any] | None = None
     """Status, RMS [m] and standard deviations ([rad], [m]) of a tracked pose; None for others."""
+    mano: Mapping[str, Any] | None = None
+    """Parameters of `RenderConfig.mano` in the camera's axes, and the error [mm]; None without it."""
     marker_names: tuple[str, ...] = ()
     markers: Float[np.ndarray, "M 3"] = field(default_factory=lambda: np.empty((0, 3)))
     """Centers of the glove's markers as the pose has them, in the world [m]."""

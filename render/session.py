@@ -280,6 +280,8 @@ def _check_formats(formats: Sequence[str], config: RenderConfig) -> None:
             raise HandSimError(f"the format {name} needs color pictures; add rgb to the passes")
     if config.openxr and not set(WITH_COLORS) & set(formats):
         raise HandSimError(f"formats are {', '.join(formats)}, expected coco or yolo for openxr's joints")
+    if config.mano is not None and not set(WITH_COLORS) & set(formats):
+        raise HandSimError(f"formats are {', '.join(formats)}, expected coco or yolo for MANO's parameters")
     if not formats or len(set(formats)) < len(formats):
         raise HandSimError(f"formats are {', '.join(formats) or 'none'}, expected at least one, each once")
 

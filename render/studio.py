@@ -43,6 +43,7 @@ from render.frames import (
     Pictures,
     RenderedFrame,
 )
+from render.mano import mano_fit
 from render.painting.figures import BodyFigure, Drawn, HandFigure, sample_appearance
 from render.painting.painter import paint, put_before
 from render.painting.rasterizer import NEAR, see
@@ -84,6 +85,7 @@ def hand_truth(
     *,
     recorded: bool = True,
     openxr: bool = False,
+    mano: str | None = None,
 ) -> HandTruth:
     """Ground truth of a hand, by its number among those in the picture; mask, vertices where `recorded`."""
     model = figure.fit.model
@@ -94,6 +96,7 @@ def hand_truth(
     rules = np.append(np.arange(len(keypoints)), _OPENXR[: len(poses)])
     visible = _visible(points, rules, figure.thickness[rules], number, camera, pictures)
     worn = figure.look.glove is not None
+    seen_from = np.linalg.inv(camera.T_world_camera)
     return HandTruth(
         shape=model.shape,
         qpos=qpos,
@@ -106,6 +109,7 @@ def hand_truth(
         openxr=poses,
         openxr_visible=visible[len(keypoints) :],
         tracking=tracking,
+        mano=mano_fit(mano, model.shape).records(qpos[None], seen_from)[0] if mano and recorded else None,
         marker_names=figure.fit.layout.names if worn else (),
         markers=figure.fit.markers(qpos[None])[0][0] if worn else np.empty((0, 3)),
     )
@@ -254,7 +258,7 @@ class Studio:
         The frame has its choices as JSON, and the hands' vertices, only where `recorded`: both take time.
         """
         take, frame, rng = moment.take, moment.frame, np.random.default_rng(conditions.seed)
-        drawn = self._still(moment)
+        drawn = self.surfaces(moment)
         nearest = _clearance(camera, drawn)
         if nearest < 2.0 * NEAR:
             raise HandSimError(
@@ -278,10 +282,17 @@ class Studio:
             _walls(camera, drawn, conditions).put_behind(truth)
         if sensor is not None:
             noisy_depth = self._noisy_depth(truth, rgb, len(present), camera, sensor, rng)
-        asked = {"recorded": recorded, "openxr": self._config.openxr}
         hands = tuple(
             hand_truth(
-                self._hands[n], take.qpos[frame, n], index, camera, truth, _tracking(take, frame, n), **asked
+                self._hands[n],
+                take.qpos[frame, n],
+                index,
+                camera,
+                truth,
+                _tracking(take, frame, n),
+                recorded=recorded,
+                openxr=self._config.openxr,
+                mano=self._config.mano,
             )
             for index, n in enumerate(present)
         )
@@ -306,29 +317,37 @@ class Studio:
         )
 
     def reaching(self, moment: Moment, cameras: Sequence[Camera], user: UserBody | None = None) -> Moment:
-        """The moment with arms, the user's or others, that leave hands free and the cameras' pictures."""
+        """The moment with arms, the user's or others, that leave hands free and the cameras' pictures.
+
+        It is no part of a motion, whose arms are `UserBody.moving_arms`.
+        """
         there = moment.hands()
         if not there:
             return moment
         numbers = [*there]
         if user is None:
             lines = [self._hands[number].skin.forearm_line(pose) for number, pose in there.items()]
-            elbows, ways = (np.array(one)[:, None] for one in zip(*lines, strict=True))
-            arms = Arms(np.stack([*there.values()])[:, :3], ways, elbows, np.zeros(ways.shape[:2]))
+            elbows, ways = (np.array(one)[None, :, None] for one in zip(*lines, strict=True))
+            arms = Arms(np.stack([*there.values()])[None, :, :3], ways, elbows, np.zeros(ways.shape[:3]))
         else:
-            arms = user.arms(moment.take.qpos[moment.frame], numbers)
-        keypoints = [hand_keypoints(self._hands[n].fit.model, pose[None])[0] for n, pose in there.items()]
+            arms = user.arms(moment.take.qpos[None, moment.frame], numbers)
         found = np.full((2, len(self._hands), 3), np.nan)
-        found[:, numbers] = bend_arms(arms, np.concatenate(keypoints), cameras)
+        forearms, upper_arms = bend_arms(arms, np.concatenate(self.keypoints(moment))[None], [cameras])
+        found[:, numbers] = forearms[0], upper_arms[0]
         return dataclasses.replace(moment, upper_arms=found[1], forearms=None if user is None else found[0])
+
+    def keypoints(self, moment: Moment) -> list[Doubles]:
+        """Keypoints (21, 3) in the world [m] of each hand that the frame has."""
+        hands = moment.hands().items()
+        return [hand_keypoints(self._hands[number].fit.model, pose[None])[0] for number, pose in hands]
 
     def is_clear(self, moment: Moment, cameras: Sequence[Camera]) -> bool:
         """Whether all cameras are outside of hands and objects, so that the moment can be drawn."""
-        drawn = self._still(moment)
+        drawn = self.surfaces(moment)
         return all(_clearance(camera, drawn) >= 2.0 * NEAR for camera in cameras)
 
-    def _still(self, moment: Moment) -> list[Drawn]:
-        """Surfaces of a moment."""
+    def surfaces(self, moment: Moment) -> list[Drawn]:
+        """Surfaces of a moment: those of its hands, then of its bodies."""
         if self._posed is None or self._posed[0] is not moment:
             self._posed = moment, self._drawn(moment, 0.0)
         return self._posed[1]
@@ -374,11 +393,9 @@ class Studio:
         """The perfect color picture as bytes, or bright: as levels that do not end at 255."""
         background = conditions.background
         whole = paint(camera, drawn, conditions.lighting, "bright" if bright else self._painter)
-        if conditions.enclosure is not None:
-            behind = draw_surroundings(background, conditions.enclosure, camera, bright=bright).rgb
-            return put_before(whole, behind)
-        plain, light = _background(background, camera.size), None
-        if background.backdrop.shadows and camera.lens.kind == "pinhole":
+        plain, light = picture_behind(camera, conditions, bright=bright), None
+        shadows = background.backdrop.shadows and conditions.enclosure is None
+        if shadows and camera.lens.kind == "pinhole":
             light = light_behind(camera, drawn, conditions.lighting, background.backdrop)
         if light is not None:
             shade = cv2.cvtColor(cv2.pow(light, 1.0 / GAMMA), cv2.COLOR_GRAY2RGB)
@@ -410,6 +427,13 @@ class Studio:
         if self._footage is not None:
             return self._footage.record
         return {"people": self._people, "body_colors": self._colors, **conditions.record()}
+
+
+def picture_behind(camera: Camera, conditions: Conditions, *, bright: bool = False) -> NDArray[Any]:
+    """Levels (H, W, 3) of sRGB behind hands and objects, from 0 to 255, without their shadows."""
+    if conditions.enclosure is not None:
+        return draw_surroundings(conditions.background, conditions.enclosure, camera, bright=bright).rgb
+    return _background(conditions.background, camera.size)
 
 
 def _clearance(camera: Camera, drawn: Sequence[Drawn]) -> float:

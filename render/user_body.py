@@ -7,15 +7,17 @@ Drillis and Contini (1966), Body segment parameters, over that of the hand.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Final
 
 import numpy as np
 from jaxtyping import Float
 
 from gloves import Take
+from handsim.hand.model import hand_keypoints
+from handsim.space.camera import Camera
 from handsim.space.transforms import quaternion_matrix
-from render.arms import Arms, forearm_axes, hiding_costs
+from render.arms import Arms, bend_arms, forearm_axes, hiding_costs, turning
 from render.frames import Doubles
 from render.skin.look import ELBOW
 
@@ -41,9 +43,17 @@ _UNUSUAL: Final = 0.15  # weight of the cost of other distances and angles
 _SWIVELS: Final = np.deg2rad(np.arange(-100.0, 101.0, 20.0))
 """Angles of the elbow about the line from the wrist to the shoulder that are tried [rad]; 0 is the lowest."""
 _SWIVEL: Final = np.deg2rad(50.0)  # spread of these angles
-_OUTWARDS: Final = (0.0, -0.4, 0.4)  # angles that shoulders turn forearms by when they give way [rad]
+_OUTWARDS: Final = (
+    0.0,
+    -0.4,
+    0.4,
+    -0.8,
+    0.8,
+)  # angles that shoulders turn forearms by when they give way [rad]
 _OUTWARD: Final = 0.4  # spread of these angles [rad]
-_SOFTNESS: Final = 0.3  # difference of costs within which elbows are averaged, so that they do not jump
+_SOFTNESS: Final = 0.3  # difference of costs within which elbows are averaged for placing cameras
+_CHOSEN: Final = 0.2  # time between frames of a motion whose arms are chosen [s]
+_CHUNK: Final = 512  # such frames that are chosen at once
 _OVERREACH: Final = 0.05  # distance beyond an arm's length whose cost is 1 [m]
 _NEAR: Final = (0.36, 0.06)  # distance of an arm before the eyes that takes up the view, and its spread [m]
 _RISE: Final = 0.1  # spread of the tangent by which elbows are seen above the middle of the view
@@ -64,7 +74,9 @@ class UserBody:
     forearms: Doubles
     """Unit directions from wrists to elbows in all frames (T, H, 3); NaN where there is no hand."""
 
-    def __init__(self, take: Take) -> None:
+    def __init__(self, take: Take, cameras: Float[np.ndarray, "C 3"] | None = None) -> None:
+        """Place the person where arms leave hands free, also from cameras at these positions [m]."""
+        self._cameras: Doubles = np.empty((0, 3)) if cameras is None else cameras
         self._lengths = np.array([hand.shape.length for hand in take.hands])
         self._mirrors = np.array([-1.0 if hand.side == "left" else 1.0 for hand in take.hands])
         there = np.flatnonzero(np.isfinite(take.qpos[..., 0]).any(axis=1))
@@ -91,14 +103,41 @@ class UserBody:
         upper = np.stack(np.broadcast_arrays(elbows, self.shoulders), axis=-2)
         return np.concatenate([forearm_axes(wrists, elbows), upper], axis=1)
 
-    def arms(self, qpos: Float[np.ndarray, "H 27"], hands: Sequence[int]) -> Arms:
+    def arms(self, qpos: Float[np.ndarray, "K H 27"], hands: Sequence[int]) -> Arms:
         """Where the arms can be of the hands with these numbers, in these poses of all."""
-        wrists, axes = qpos[:, :3], quaternion_matrix(qpos[:, 3:7])
+        wrists, axes = qpos[..., :3], quaternion_matrix(qpos[..., 3:7])
         tried = [self._elbows(wrists, axes, self.shoulders, self.eyes, tilt) for tilt in _OUTWARDS]
-        ways, costs = (np.concatenate(parts, axis=1) for parts in zip(*tried, strict=True))
+        ways, costs = (np.concatenate(parts, axis=2) for parts in zip(*tried, strict=True))
         costs += np.repeat(np.square(np.array(_OUTWARDS) / _OUTWARD), len(_SWIVELS))
-        elbows = wrists[:, None] + (ELBOW * self._lengths)[:, None, None] * ways
-        return Arms(wrists[hands], ways[hands], elbows[hands], costs[hands], self.shoulders[hands])
+        elbows = wrists[..., None, :] + (ELBOW * self._lengths)[:, None, None] * ways
+        return Arms(
+            wrists[:, hands], ways[:, hands], elbows[:, hands], costs[:, hands], self.shoulders[hands]
+        )
+
+    def moving_arms(self, take: Take, cameras: Callable[[int], Sequence[Camera]]) -> tuple[Doubles, Doubles]:
+        """Unit directions (T, H, 3) of forearms and upper arms in all frames of a motion, before cameras.
+
+        Hands that are away wait at the nearest place where they are.
+        """
+        step = max(1, round(_CHOSEN * take.rate))
+        frames, hands = np.arange(0, take.num_frames, step), range(len(take.hands))
+        qpos, points = take.qpos[frames], list[Doubles]()
+        for number, hand in enumerate(take.hands):
+            there = np.flatnonzero(np.isfinite(take.qpos[:, number]).all(axis=1))
+            nearest = np.rint(np.interp(frames, there, np.arange(len(there)))).astype(int)
+            qpos[:, number] = take.qpos[there[nearest], number]
+            points.append(hand_keypoints(hand.model, qpos[:, number]))
+        chosen = []
+        for first in range(0, len(frames), _CHUNK):
+            some = slice(first, first + _CHUNK)
+            seen = np.concatenate([one[some] for one in points], axis=1)
+            chosen.append(
+                bend_arms(self.arms(qpos[some], hands), seen, [*map(cameras, frames[some].tolist())])
+            )
+        fore, upper = (
+            turning(np.concatenate(ways), step, take.num_frames) for ways in zip(*chosen, strict=True)
+        )
+        return _bent_wrists(fore, quaternion_matrix(take.qpos[..., 3:7]), self._mirrors)[0], upper
 
     def _stand(
         self, middle: Doubles, azimuth: Doubles, distance: Doubles, down: Doubles, facing: Doubles
@@ -173,7 +212,7 @@ class UserBody:
         return np.asarray(costs) + self._hiding(ways, wrists, wrists + 2.0 * (palms - wrists), eyes)
 
     def _hiding(self, ways: Doubles, wrists: Doubles, tips: Doubles, eyes: Doubles) -> Doubles:
-        """Costs (..., H, S) of forearms that hide hands, from wrists to tips of flat ones, from the eyes."""
+        """Costs (..., H, S) of forearms that hide hands, from wrists to tips of flat ones."""
         elbows = wrists[..., None, :] + (ELBOW * self._lengths)[:, None, None] * ways
         batch, (hands, tried) = ways.shape[:-3], ways.shape[-3:-1]
         along = (wrists[..., None, :] + _ALONG[:, None] * (tips - wrists)[..., None, :]).reshape(
@@ -183,6 +222,8 @@ class UserBody:
         points = np.array(np.broadcast_to(along, (*batch, *along.shape[-2:])), order="C")
         points = points.reshape(-1, *along.shape[-2:])
         eyes = np.array(np.broadcast_to(eyes, (*batch, 3)), order="C").reshape(-1, 1, 3)
+        others = np.broadcast_to(self._cameras, (len(eyes), *self._cameras.shape))
+        eyes = np.ascontiguousarray(np.concatenate([eyes, others], axis=1))  # one type for the compiler
         return np.asarray(hiding_costs(axes, eyes, points).reshape(*batch, hands, tried))
 
 

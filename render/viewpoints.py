@@ -504,6 +504,11 @@ def _head(config: ViewConfig, take: Take, framing: Framing, rng: np.random.Gener
     return paths
 
 
+def rig_positions(config: ViewConfig) -> Float[np.ndarray, "C 3"]:
+    """Positions of the rig's cameras [m], which are known before all others."""
+    return np.asarray(load_rig(config.rig).T_world_camera[:, :3, 3])
+
+
 def _rig(config: ViewConfig, take: Take, framing: Framing, rng: np.random.Generator) -> list[_Path]:
     """At the cameras of a rig, with lenses as long as the share takes, if they show nearly all hands.
 

@@ -18,12 +18,14 @@ from handsim.space.transforms import ForwardAxis, UpAxis
 
 def export(
     source: Annotated[str, tyro.conf.Positional],
-    out: Path,
+    out: Path | None = None,
     fps: float | None = None,
     up: UpAxis = "z",
     forward: ForwardAxis | None = None,
     neutral: tuple[str, ...] | None = None,
     guesses: bool = False,
+    scene: Path | None = None,
+    frame: int | None = None,
 ) -> None:
     """Write the motion of a take, a user's hand, or a trained labeler, for other programs.
 
@@ -41,10 +43,21 @@ def export(
         neutral: First and last time [s] at which the hands are flat, or in another pose in which the angles
             of the ISB in a .csv are to be zero; or the take (.npz) of a trial that shows this pose.
         guesses: Whether a .csv has numbers, too, for joints beyond which no marker was seen.
+        scene: Instead of --out, a file (.usdc, .usda) of what a picture of a take shows by default: skin with
+            textures, lamps, camera and background, for path tracers (docs/rendering.md).
+        frame: Number of this frame; the first with a hand when not given.
     """
     from gloves.takes.archives import GROWING_SUFFIX
     from track.user import load_user
 
+    if (out is None) == (scene is None) or (frame is not None and scene is None):
+        raise ArgumentError("expected --out, or --scene and maybe --frame")
+    if scene is not None:
+        if fps is not None or neutral is not None or guesses:
+            raise ArgumentError("given --fps, --neutral or --guesses and --scene, expected --out with them")
+        _export_scene(Path(source), scene, frame, up)
+        return
+    assert out is not None
     if source.lower().endswith((".npz", f".npz{GROWING_SUFFIX}")):
         _export_take(Path(source), out, fps, neutral or (), up=up, forward=forward, guesses=guesses)
         return
@@ -82,6 +95,14 @@ def _export_take(source: Path, out: Path, fps: float | None, neutral: Sequence[s
     for side, absent in zip(motion.sides, np.isnan(motion.qpos[..., 0]).sum(axis=0), strict=True):
         if absent:
             print_line(f"{side} hand: without a pose in {absent} frames, {form.without_pose} there")
+
+
+def _export_scene(source: Path, scene: Path, frame: int | None, up: UpAxis) -> None:
+    from render.scene_file import write_scene
+
+    check_outputs([source], [scene])
+    write_scene(scene, source, frame=frame, up=up)
+    print_line(f"{scene}: what the picture of a frame shows; textures are in {scene.with_suffix('')}")
 
 
 def _export_labeler(source: str, out: Path) -> None:

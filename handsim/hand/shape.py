@@ -89,7 +89,7 @@ ADULT_LENGTH: Final = (0.187, 0.012)
 """Mean and standard deviation of the length of adults' hands, ANSUR II [m]."""
 FIRMNESS: Final = 0.8
 """Radius of the capsule that stands for a bone's flesh in collisions, over the skin's radius."""
-_PRESSED: Final = 0.00079  # [m] largest overlap of neighboring fingers at their knuckles, in every pose
+_PRESSED: Final = 0.00079  # [m] largest overlap of digits at knuckles and across phalanges, in every pose
 _SHORTEST, _LONGEST = 1e-4, 1.0  # bounds of every length in a hand [m], far beyond those of people
 HAND_DTYPE: Final = np.dtype(
     [
@@ -292,10 +292,11 @@ def sample_shape(
     bones = np.exp(spread(population.digit_spread, (5, 1)) + spread(population.bone_spread, (5, 3)))
     knuckles = mean.knuckles + youth * spread(population.knuckle_spread, (5, 3))
     radii = mean.radii * np.exp(spread(population.girth_spread, (5, 1)))
-    _make_room(knuckles, radii)
+    lengths = mean.bone_lengths * bones
+    _make_room(knuckles, lengths, radii)
     return dataclasses.replace(
         mean,
-        bone_lengths=mean.bone_lengths * bones,
+        bone_lengths=lengths,
         knuckles=knuckles,
         base_angles=mean.base_angles + angles,
         radii=radii,
@@ -303,12 +304,16 @@ def sample_shape(
     )
 
 
-def _make_room(knuckles: Float[np.ndarray, "5 3"], radii: Float[np.ndarray, "5 4"]) -> None:
-    """Slim neighboring fingers that would overlap at their knuckles, whatever their pose [m]."""
+def _make_room(
+    knuckles: Float[np.ndarray, "5 3"], lengths: Float[np.ndarray, "5 3"], radii: Float[np.ndarray, "5 4"]
+) -> None:
+    """Slim digits that would overlap whatever their pose [m]: at knuckles, and across a short phalanx."""
     for finger in range(2, len(DIGITS)):
         pair = slice(finger - 1, finger + 1)
         room = np.linalg.norm(knuckles[finger] - knuckles[finger - 1]) + _PRESSED
         radii[pair] *= min(1.0, room / (FIRMNESS * radii[pair, :2].mean(axis=1).sum()))
+    across = FIRMNESS * 0.5 * radii.sum(axis=1)  # of the bones before and behind the middle one
+    radii *= np.minimum(1.0, (lengths[:, 1] + _PRESSED) / across)[:, None]
 
 
 def pack_hand(shape: HandShape) -> tuple[Any, ...]:

@@ -271,7 +271,7 @@ class GlbBuffer:
 
 def write_usd(path: Path, motion: Motion, up: UpAxis = "z") -> None:
     """Write hands and things."""
-    Tf, Usd, UsdGeom = (import_extra(f"pxr.{one}", path.suffix, "usd") for one in ("Tf", "Usd", "UsdGeom"))
+    Usd, UsdGeom = (import_extra(f"pxr.{one}", path.suffix, "usd") for one in ("Usd", "UsdGeom"))
     stage = Usd.Stage.CreateInMemory()
     UsdGeom.SetStageUpAxis(stage, up.upper())
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
@@ -285,6 +285,12 @@ def write_usd(path: Path, motion: Motion, up: UpAxis = "z") -> None:
         _add_hand(stage, hand, codes)
     for number, thing in enumerate(motion.bodies):
         _add_thing(stage, thing, number, codes)
+    save_stage(stage, path)
+
+
+def save_stage(stage: Any, path: Path) -> None:
+    """Write a stage of OpenUSD."""
+    Tf = import_extra("pxr.Tf", path.suffix, "usd")
     with atomic_write(path) as temporary, plain_path(temporary) as plain:
         try:
             done = stage.GetRootLayer().Export(str(plain))
@@ -331,7 +337,7 @@ def _add_skin(stage: Any, hand: PosedHand, path: str, skeleton: Any) -> None:
     from pxr import Gf, UsdGeom, UsdSkel, Vt
 
     surface = hand.model.surface
-    mesh = _add_mesh(stage, path, surface.vertices, surface.faces, SKIN)
+    mesh = add_mesh(stage, path, surface.vertices, surface.faces, SKIN)
     normals = vertex_normals(surface.vertices, surface.faces)
     mesh.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(normals.astype(np.float32)))
     mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
@@ -379,20 +385,20 @@ def _add_thing(stage: Any, thing: PosedBody, number: int, codes: NDArray[np.floa
         turn.Set(Gf.Quatf(*quaternion), code)
     _set_visibility(body, thing.present, codes)
     if thing.shape is not None:
-        mesh = _add_mesh(stage, f"{path}/mesh", thing.shape.vertices, thing.shape.faces, THING)
+        mesh = add_mesh(stage, f"{path}/mesh", thing.shape.vertices, thing.shape.faces, THING)
         normals = corner_normals(thing.shape.vertices, thing.shape.faces).reshape(-1, 3)
         mesh.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(normals.astype(np.float32)))
         mesh.SetNormalsInterpolation(UsdGeom.Tokens.faceVarying)
 
 
-def _add_mesh(
+def add_mesh(
     stage: Any,
     path: str,
     vertices: Float[np.ndarray, "V 3"],
     faces: NDArray[Any],
     material: Material,
 ) -> Any:
-    """Triangles of one material, not subdivided."""
+    """Add triangles, not subdivided, and their material beside them, whose shader is `surface`."""
     from pxr import Gf, Sdf, UsdGeom, UsdShade, Vt
 
     mesh = UsdGeom.Mesh.Define(stage, path)

@@ -99,6 +99,8 @@ def _hand_record(frame: RenderedFrame, number: int, hand: HandTruth) -> dict[str
         pixels = frame.camera.project(hand.openxr[:, :3, 3])
         record["openxr_keypoints"] = _triples(pixels, hand.openxr_visible, frame.camera.size)
         record["openxr_poses"] = rounded(np.concatenate([joints[:, :3, 3], turns], axis=1), 9)
+    if hand.mano:
+        record["mano"] = hand.mano
     if hand.tracking:
         record["tracking"] = {k: x if k == "status" else rounded(x, 6) for k, x in hand.tracking.items()}
     looks = frame.choices.get("people", ())

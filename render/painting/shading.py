@@ -154,7 +154,7 @@ def light_behind(
     if not mask.any():
         return None
     blur = backdrop.softness * distance[0] / distance[1] * camera.K[0, 0] / _COARSE
-    mask = cv2.GaussianBlur(mask, (0, 0), max(0.5, float(blur)))
+    mask = cv2.GaussianBlur(mask, (0, 0), max(0.8, float(blur)))
     falls = []  # light of each lamp on the backdrop
     for lamp in lighting.lamps:
         direction = np.array(lamp.direction)

@@ -425,7 +425,7 @@ def _blood() -> tuple[Floats, Floats]:
 
 
 def _veins(rng: np.random.Generator) -> Floats:
-    """Visibility (N,) of three veins that wind along the back of hand and forearm."""
+    """Visibility (N,) of three veins that wind along the back of hand and forearm, and fade in places."""
     near, x, y, back = _vein_texels()
     veins = np.zeros(len(skin_texels().back), dtype=np.float32)
     for start in (0.016, -0.004, -0.022):
@@ -434,7 +434,8 @@ def _veins(rng: np.random.Generator) -> Floats:
         away = y - np.interp(x, knots, course).astype(np.float32)
         (close,) = np.nonzero(np.abs(away) < 4.0 * _VEIN)
         rows = near[close]
-        veins[rows] = np.maximum(veins[rows], back[close] * bump(away[close], np.float32(_VEIN)))
+        shown = back[close] * np.interp(x[close], knots, rng.uniform(-0.4, 1.0, 9)).clip(0.0)
+        veins[rows] = np.maximum(veins[rows], shown * bump(away[close], np.float32(_VEIN)))
     return veins
 
 

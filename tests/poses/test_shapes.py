@@ -257,3 +257,10 @@ def test_single_precision_is_as_valid(rng, size):
 def test_people_with_thick_fingers_can_be_sampled(population, seed):
     model = HandModel(sample_shape(population, rng=np.random.default_rng(seed)))
     assert validate(model, sample_poses(model, 20, rng=np.random.default_rng(seed))).all()
+
+
+@pytest.mark.parametrize("seed", [8014, 417, 3237])
+def test_people_with_short_phalanges_have_valid_poses(seed):
+    model = HandModel(sample_shape(rng=np.random.default_rng(seed)))
+    qpos = sample_poses(model, 3, rng=np.random.default_rng(0))
+    assert validate(model, qpos).all()

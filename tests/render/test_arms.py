@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from gloves import Take
+from handsim.space.transforms import quaternion_matrix
 from render import draw
 from render.arms import hiding_costs, most_hidden
 from render.config import resolve
 from render.drawing import Drawing
 from render.frames import FOREARM, PARTS_A_HAND, RenderedFrame
-from render.studio import Moment, Studio
 from render.subject import subject_of_take
 from render.viewpoints import Placement
 from train import simulate_take
@@ -67,16 +67,48 @@ def test_arms_leave_both_hands_free(kind, seed, placement):
     assert np.mean([are_free(frame) for frame in frames]) >= (0.85 if placement == "rig" else 0.95)
 
 
-def test_elbows_bend_no_farther_than_elbows_do():
+@functools.cache
+def arms_of(kind: str, seed: int, placement: Placement) -> tuple[np.ndarray, np.ndarray]:
+    """Directions (T, H, 3) of forearms and upper arms of a take's pictures."""
+    settings = resolve(settings={"view": {"placement": placement}})
+    arms = Drawing(subject_of_take(a_take(kind, seed)), settings)._arms
+    assert arms is not None
+    return arms
+
+
+@pytest.mark.parametrize("placement", get_args(Placement))
+def test_elbows_and_wrists_bend_no_farther_than_they_do(placement):
     take = a_take("hand-hand", 61)
-    bends = []
-    for placement in get_args(Placement):
-        drawing = Drawing(subject_of_take(take), resolve(settings={"view": {"placement": placement}}))
-        studio = Studio(take.hands, drawing.config, rng=np.random.default_rng(0), has_user=True)
-        for frame in range(0, 240, 20):
-            cameras = drawing.viewpoints.cameras(frame)
-            moment = studio.reaching(Moment(take, frame), cameras, drawing._user)
-            np.testing.assert_allclose(np.linalg.norm(moment.forearms, axis=1), 1.0)
-            cosines = (moment.forearms * moment.upper_arms).sum(axis=1)
-            bends += np.rad2deg(np.arccos(np.clip(cosines, -1.0, 1.0))).tolist()
-    assert max(bends) <= 130.0
+    forearms, upper_arms = arms_of("hand-hand", 61, placement)
+    for ways in (forearms, upper_arms):
+        np.testing.assert_allclose(np.linalg.norm(ways, axis=-1), 1.0)
+    bends = np.arccos(np.clip((forearms * upper_arms).sum(axis=-1), -1.0, 1.0))
+    assert np.rad2deg(bends.max()) <= 130.0
+    away = np.einsum("thij,thi->thj", quaternion_matrix(take.qpos[..., 3:7]), forearms)
+    assert np.rad2deg(np.arctan2(-away[..., 2], -away[..., 0])).max() <= 54.5
+
+
+@pytest.mark.parametrize("placement", get_args(Placement))
+@pytest.mark.parametrize(("kind", "seed"), [("hand-hand", 61), ("single-hand", 9405)])
+def test_arms_do_not_jump_between_frames(kind, seed, placement):
+    take = a_take(kind, seed)
+    forearms, upper_arms = arms_of(kind, seed, placement)
+    lengths = np.array([[hand.shape.length] for hand in take.hands])
+    elbows = take.qpos[..., :3] + 1.42 * lengths * forearms
+    for places in (elbows, elbows + 1.72 * lengths * upper_arms):
+        steps = np.linalg.norm(np.diff(places, axis=0), axis=-1)
+        assert np.nanmax(steps) * take.rate < 3.6, "at 120 Hz, 30 mm from one frame to the next"
+
+
+def test_arms_of_every_frame_are_the_same_whatever_is_drawn_and_hands_may_be_away():
+    take = a_take("hand-hand", 61)
+    qpos = take.qpos.copy()
+    qpos[60:120, 0] = np.nan
+    away = Take.of_poses(take.hands, qpos, rate=take.rate)
+    config = resolve(settings={"view": {"placement": "still"}, "passes": ("ids",)})
+    forearms, upper_arms = Drawing(subject_of_take(away), config)._arms
+    assert np.isfinite(upper_arms).all() and np.isfinite(forearms[~np.isnan(qpos[..., 0])]).all()
+    alone, among = (
+        list(draw(away, config=config, frames=frames))[-1].ideal.parts for frames in ([59], [0, 30, 59])
+    )
+    np.testing.assert_array_equal(alone, among)

@@ -82,8 +82,8 @@ def test_it_falls_where_the_lamp_is_hidden(aside, above, right, down, gap):
     to_center = CENTER - places
     off = np.linalg.norm(np.cross(to_center, towards / np.linalg.norm(towards)), axis=1)
     hidden = (off < RADIUS).reshape(light.shape)
-    around = binary_dilation(hidden, iterations=9) & ~hidden
-    inside = ~binary_dilation(~hidden, iterations=9)
+    around = binary_dilation(hidden, iterations=13) & ~hidden
+    inside = ~binary_dilation(~hidden, iterations=13)
     outside = ~hidden & ~around
     assert (light[outside] > 0.98).all()
     assert (light[inside] < 0.2).all()
