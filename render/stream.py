@@ -34,6 +34,9 @@ from render.subject import Model, Subject, models_of, subject_of, subject_of_pos
 from render.viewpoints import FREE, around_hands, crop_around
 
 _FEWEST_KEYPOINTS: Final = 3  # least number of labeled keypoints of a hand that can be cut out
+_PICTURE, _PERSON, _PHOTOGRAPH = 0, 1, 2  # second number of a stream's spawn keys
+_CROPPED: Final = 0.5  # hands' share of the whole picture over their share of the crop
+_SIDE_CHOICES: Final = (*SIDES, "either")
 
 
 class LabeledHand(NamedTuple):
@@ -111,10 +114,6 @@ def cut_out(
         "side": np.array(hand.side, dtype=np.int64),
     }
 
-
-_PICTURE, _PERSON, _PHOTOGRAPH = 0, 1, 2  # second number of a stream's spawn keys
-_CROPPED: Final = 0.5  # hands' share of the whole picture over their share of the crop
-_SIDE_CHOICES: Final = (*SIDES, "either")
 
 TakeSource = Take | str | Path
 

@@ -59,6 +59,10 @@ from render.scenery.backgrounds import (
 from render.skin.look import SkinLook
 from render.user_body import UserBody
 
+_PALM_JOINTS: Final = {0: (0, 0), **{first: (0, first) for first in range(5, 21, 4)}}
+_OPENXR: Final = np.array([n for keypoint in range(21) for n in _PALM_JOINTS.get(keypoint, (keypoint,))])
+"""Keypoint at each of `OPENXR_JOINTS`; the wrist for those in the palm."""
+
 
 def _allowed_parts() -> Flags:
     """Which parts of the hand may show each keypoint (21, 32): its digit's; palm or forearm for the wrist."""
@@ -70,9 +74,6 @@ def _allowed_parts() -> Flags:
 
 
 _ALLOWED: Final = _allowed_parts()
-_PALM_JOINTS: Final = {0: (0, 0), **{first: (0, first) for first in range(5, 21, 4)}}
-_OPENXR: Final = np.array([n for keypoint in range(21) for n in _PALM_JOINTS.get(keypoint, (keypoint,))])
-"""Keypoint at each of `OPENXR_JOINTS`; the wrist for those in the palm."""
 
 
 def hand_truth(

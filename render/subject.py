@@ -47,6 +47,7 @@ MOST_PEOPLE: Final = 1_000_000
 _MOST_FRAMES: Final = 10_000_000
 _FARTHEST: Final = 50.0  # largest coordinate of a wrist [m]
 _BEYOND: Final = np.deg2rad(10.0)  # angle beyond a joint's range from which on users are warned
+_SECOND: Final = 1.0  # time between frames without times, which are poses without a motion [s]
 
 
 class OwnPoses(NamedTuple):
@@ -217,8 +218,6 @@ def _stored_shapes(arrays: Mapping[str, NDArray[Any]]) -> tuple[HandShape, ...] 
         raise ArgumentError("hand_size is not within 0.03 to 0.35, expected length and breadth [m]")
     return tuple(shape_from_measures(float(length), float(breadth)) for length, breadth in sizes)
 
-
-_SECOND: Final = 1.0  # time between frames without times, which are poses without a motion [s]
 
 Model = HandModel | HandShape | str
 """A hand, or its shape, or the name of its size: XS, S, M, L or XL."""

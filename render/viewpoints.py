@@ -36,6 +36,36 @@ _BESIDE: Final = 0.15  # border beside a picture that arms are seen in, as a sha
 _BORDER: Final = 0.04  # border of a picture that hands keep free, as a share of half its width or height
 _NEAREST_KEYPOINT: Final = 0.15  # least depth of a keypoint before a camera [m]
 _WIDEST_TANGENT: Final = 2.0  # largest tangent of half an angle of view that hands may fill
+_MOUNTED: Final = 0.03  # largest distance of a head's camera from the eyes along each axis [m]
+_MOSTLY: Final = 0.92  # share of the frames in which a head that leans back sees all hands
+_LEAN: Final = 0.3  # largest distance by which a head leans back [m]
+_ORBIT_PERIOD: Final = 12.0  # time of one revolution of a camera in orbit [s]
+_TRIES: Final = 60  # random directions that are tried for one camera
+_CLOSER: Final = 1.35  # largest ratio between a hand's share and `ViewConfig.share`
+_ENOUGH: Final = 1.05  # ratio of the wanted share to the hands' up to which no other place is tried
+_SKIN_CLEARANCE: Final = 0.08  # least depth of a keypoint before a camera around hands [m]
+FREE: Final = 0.8  # share of the room around hands in a picture that they are shifted within
+_NEARLY_ALL: Final = 0.97  # share of the frames that a lens without zoom shows whole
+_PLACES: Final = 16  # places, or orbits, that are tried for hands that are far apart
+_AZIMUTHS: Final = 36  # azimuths of an orbit whose views are compared
+_SAMPLES: Final = 48  # frames in which they are compared
+_CENTERINGS: Final = 2  # times that a camera is turned to the middle of what it sees
+_LINGER: Final = 20.0  # exponent of the hands' share in the time that an orbit spends on a view
+_QUICKEST: Final = 0.02  # shortest time at an azimuth of an orbit, as a share of the longest
+_FREE: Final = 0.4  # largest share of a hand's keypoints that arms hide in a picture that shows it
+_USUALLY: Final = 0.97  # Other places are tried until this share of the pictures shows all hands.
+_GIVES_WAY: Final = 3.0  # power of that share that outweighs the size of the hands
+_ASIDE: Final = np.deg2rad(90.0)  # largest angle that is added to the usual one from the front
+_ARM_CLEARANCE: Final = np.deg2rad(35.0)  # least angle between a view and a forearm
+_PLACING: Final = ("placement", "camera", "views", "share", "distance", "rig")
+"""Options that place cameras, which your own cameras do not need."""
+_UNUSED: Final = {
+    "still": ("rig",),
+    "orbit": ("rig",),
+    "head": ("share", "distance", "rig"),
+    "rig": ("views", "share", "distance"),
+}
+"""Options that a placement has no use for."""
 
 
 class Framing:
@@ -175,38 +205,6 @@ def looking(directions: Doubles) -> Doubles:
 
 
 Placement = Literal["still", "orbit", "head", "rig"]
-_MOUNTED: Final = 0.03  # largest distance of a head's camera from the eyes along each axis [m]
-_MOSTLY: Final = 0.92  # share of the frames in which a head that leans back sees all hands
-_LEAN: Final = 0.3  # largest distance by which a head leans back [m]
-_ORBIT_PERIOD: Final = 12.0  # time of one revolution of a camera in orbit [s]
-_TRIES: Final = 60  # random directions that are tried for one camera
-_CLOSER: Final = 1.35  # largest ratio between a hand's share and `ViewConfig.share`
-_ENOUGH: Final = 1.05  # ratio of the wanted share to the hands' up to which no other place is tried
-_SKIN_CLEARANCE: Final = 0.08  # least depth of a keypoint before a camera around hands [m]
-FREE: Final = 0.8  # share of the room around hands in a picture that they are shifted within
-_NEARLY_ALL: Final = 0.97  # share of the frames that a lens without zoom shows whole
-_PLACES: Final = 16  # places, or orbits, that are tried for hands that are far apart
-_AZIMUTHS: Final = 36  # azimuths of an orbit whose views are compared
-_SAMPLES: Final = 48  # frames in which they are compared
-_CENTERINGS: Final = 2  # times that a camera is turned to the middle of what it sees
-_LINGER: Final = 20.0  # exponent of the hands' share in the time that an orbit spends on a view
-_QUICKEST: Final = 0.02  # shortest time at an azimuth of an orbit, as a share of the longest
-_FREE: Final = 0.4  # largest share of a hand's keypoints that arms hide in a picture that shows it
-_USUALLY: Final = 0.97  # Other places are tried until this share of the pictures shows all hands.
-_GIVES_WAY: Final = 3.0  # power of that share that outweighs the size of the hands
-_ASIDE: Final = np.deg2rad(90.0)  # largest angle that is added to the usual one from the front
-_ARM_CLEARANCE: Final = np.deg2rad(35.0)  # least angle between a view and a forearm
-
-
-_PLACING: Final = ("placement", "camera", "views", "share", "distance", "rig")
-"""Options that place cameras, which your own cameras do not need."""
-_UNUSED: Final = {
-    "still": ("rig",),
-    "orbit": ("rig",),
-    "head": ("share", "distance", "rig"),
-    "rig": ("views", "share", "distance"),
-}
-"""Options that a placement has no use for."""
 
 
 @dataclass(frozen=True, slots=True)

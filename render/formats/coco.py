@@ -42,6 +42,16 @@ CATEGORY: Final[dict[str, Any]] = {
     "keypoints": list(KEYPOINT_NAMES),
     "skeleton": [[start + 1, end + 1] for start, end in SKELETON],  # COCO counts keypoints from one
 }
+_DATA_YAML: Final = f"""\
+# For ultralytics: yolo pose train data=data.yaml model=yolo11n-pose.pt
+train: images
+# The same pictures: render others with another --seed and name their folder here.
+val: images
+kpt_shape: [{NUM_KEYPOINTS}, 3]
+flip_idx: {list(range(NUM_KEYPOINTS))}
+names: {{0: hand}}
+kpt_names: {{0: {json.dumps(KEYPOINT_NAMES)}}}
+"""
 
 
 def picture_record(frame: RenderedFrame, file_name: str) -> dict[str, Any]:
@@ -129,18 +139,6 @@ def label_lines(frame: RenderedFrame) -> str:
         rows = (f"{x:.6f} {y:.6f} {flag}" for (x, y), flag in zip(points, flags.tolist(), strict=True))
         lines.append(" ".join(["0", *(f"{value:.6f}" for value in box), *rows]) + "\n")
     return "".join(lines)
-
-
-_DATA_YAML: Final = f"""\
-# For ultralytics: yolo pose train data=data.yaml model=yolo11n-pose.pt
-train: images
-# The same pictures: render others with another --seed and name their folder here.
-val: images
-kpt_shape: [{NUM_KEYPOINTS}, 3]
-flip_idx: {list(range(NUM_KEYPOINTS))}
-names: {{0: hand}}
-kpt_names: {{0: {json.dumps(KEYPOINT_NAMES)}}}
-"""
 
 
 class CocoWriter(FolderWriter):

@@ -35,6 +35,33 @@ _COARSE: Final = 4  # size of a pixel of the shadow's mask, whose edges are soft
 _MARGIN: Final = 0.15  # border around a picture where a hand still counts as in it, as a share of its size
 _FLATTEST: Final = 0.15  # cosine between a lamp and a backdrop's normal below which there is no shadow
 _SHADED: Final = 0.9  # share of a lamp's light that a shadow takes; the rest is reflected into it
+_FACING: Final = np.float32(0.028)  # specular reflectance at normal incidence, of skin (index 1.4)
+_LIFT: Final = 1.7  # distance from a slanted surface at which shadows are looked up [biases]
+_UNDER: Final = 0.012  # thickness of skin that light passes at a scatter of 1 [m]
+_PI: Final = np.float32(np.pi)
+_ZERO: Final = np.float32(0.0)
+_ONE: Final = np.float32(1.0)
+_HALF: Final = np.float32(0.5)
+_TINY: Final = np.float32(1e-12)
+_LEAST: Final = np.float32(1e-30)
+ROUGHEST: Final = np.float32(0.04)
+"""Roughness of the smoothest mirror."""
+_EDGE: Final = np.float32(0.001)  # least cosine between a view and a normal
+_LEVELS: Final = 2048  # entries of the table of display values
+_PARTS: Final = np.float32(8.0)  # entries of the table of linear light per sRGB level
+TO_LINEAR: Final = light_of(np.arange(255 * int(_PARTS) + 1) / float(_PARTS)).astype(np.float32)
+"""Linear light of sRGB values from 0 to 255 in eighths."""
+TO_DISPLAY: Final = (np.minimum(np.arange(_LEVELS + 1) / (_LEVELS - 1), 1.0) ** (2.0 / GAMMA)).astype(
+    np.float32
+)
+"""Display values in [0, 1] by the square root of linear light, where the curve is nearly straight."""
+SPOT: Final = 23
+"""Number of rows of a table of surface points, which has a column for each point.
+
+Position [m] (3) and normal (3) in the camera's axes; tint (3); linear color (3); roughness; the direction
+in which u grows (3) and the texture's normal (3), both unused without a texture; and what `shade` computes:
+the unit vector to the camera (3) and its cosine with the normal."""
+POSITION, NORMAL, TINT, COLOR, ROUGH, TANGENT, BUMP, VIEW, FACING = 0, 3, 6, 9, 12, 13, 16, 19, 22
 
 
 class ShadowMap(NamedTuple):
@@ -211,36 +238,6 @@ def _fall(
             distance[1] += fallen[number, 2]
     if count:
         distance /= count
-
-
-_FACING: Final = np.float32(0.028)  # specular reflectance at normal incidence, of skin (index 1.4)
-_LIFT: Final = 1.7  # distance from a slanted surface at which shadows are looked up [biases]
-_UNDER: Final = 0.012  # thickness of skin that light passes at a scatter of 1 [m]
-_PI: Final = np.float32(np.pi)
-_ZERO: Final = np.float32(0.0)
-_ONE: Final = np.float32(1.0)
-_HALF: Final = np.float32(0.5)
-_TINY: Final = np.float32(1e-12)
-_LEAST: Final = np.float32(1e-30)
-ROUGHEST: Final = np.float32(0.04)
-"""Roughness of the smoothest mirror."""
-_EDGE: Final = np.float32(0.001)  # least cosine between a view and a normal
-_LEVELS: Final = 2048  # entries of the table of display values
-_PARTS: Final = np.float32(8.0)  # entries of the table of linear light per sRGB level
-TO_LINEAR: Final = light_of(np.arange(255 * int(_PARTS) + 1) / float(_PARTS)).astype(np.float32)
-"""Linear light of sRGB values from 0 to 255 in eighths."""
-TO_DISPLAY: Final = (np.minimum(np.arange(_LEVELS + 1) / (_LEVELS - 1), 1.0) ** (2.0 / GAMMA)).astype(
-    np.float32
-)
-"""Display values in [0, 1] by the square root of linear light, where the curve is nearly straight."""
-
-SPOT: Final = 23
-"""Number of rows of a table of surface points, which has a column for each point.
-
-Position [m] (3) and normal (3) in the camera's axes; tint (3); linear color (3); roughness; the direction
-in which u grows (3) and the texture's normal (3), both unused without a texture; and what `shade` computes:
-the unit vector to the camera (3) and its cosine with the normal."""
-POSITION, NORMAL, TINT, COLOR, ROUGH, TANGENT, BUMP, VIEW, FACING = 0, 3, 6, 9, 12, 13, 16, 19, 22
 
 
 @kernel

@@ -39,6 +39,21 @@ _PALM_LINES: Final = (
     ((71.0, 31.0), (66.0, 18.0), (54.0, 8.0), (38.0, 2.0), (20.0, 1.0), (8.0, 5.0)),
 )
 _WRIST_LINES: Final = (-0.001, -0.009)  # across the palm's side of the wrist [m]
+_STEEPEST: Final = 0.9  # largest slope of the relief
+_SHADED: Final = 0.006  # length of skin in the shadow of a sleeve [m]
+_SHADE: Final = 0.4  # share of the lightness that this shadow takes
+_FOLD: Final = 0.001  # height of a sleeve's folds [m]
+_STITCH: Final = 0.0034  # period of a glove's knit [m]
+_CREASE: Final = (-0.012, 0.035)  # distances behind the wrist between which the palm's skin ends [m]
+_VEIN: Final = 0.0017  # half width of a vein [m]
+_UNEVEN: Final = np.float32(0.03)  # unevenness of the palm's end over that of the pigment's edge [m]
+_GRAIN: Final = 4.5e-5  # height of the relief that breaks gloss [m]: furrows are 20 to 100 um deep
+_GRAIN_SIZES: Final = (0.0032, 0.0016, 0.0009)  # lengths of its waves [m]
+_GRAINED: Final = (-0.035, 0.005)  # places along the wrist between which it fades in [m]
+_MATT_GRAIN: Final = np.float32(0.05)  # additional roughness of its ridges, which are drier than furrows
+_INNER_ARM: Final = 0.8  # pigment of the inner forearm; that of the back of the hand is 1
+GLOVE_COLOR: Final = (0.235, 0.25, 0.29)
+"""Color of an average glove, sRGB in [0, 1]."""
 
 
 class DigitTexels(NamedTuple):
@@ -229,9 +244,6 @@ def _lines_of_all() -> tuple[Integers, tuple[Floats, ...], Floats]:
     return near, lines, depth.astype(np.float32)
 
 
-_STEEPEST: Final = 0.9  # largest slope of the relief
-
-
 def normal_map(height: NDArray[Any], side: Side) -> UInt8[np.ndarray, "H W 3"]:
     """Normal map in the tangent frame of pyrender's shader: along u, and normal x that."""
     width, rows = skin_atlas().size
@@ -304,20 +316,6 @@ def _tangent_scales() -> tuple[Doubles, Doubles, Doubles]:
     aside, ahead = (along_column * first).sum(axis=1), (along_column * second).sum(axis=1)
     ahead = np.where(np.abs(ahead) < 2e-5, np.copysign(2e-5, ahead), ahead)
     return 1.0 / length, aside / ahead, 1.0 / ahead
-
-
-_SHADED: Final = 0.006  # length of skin in the shadow of a sleeve [m]
-_SHADE: Final = 0.4  # share of the lightness that this shadow takes
-_FOLD: Final = 0.001  # height of a sleeve's folds [m]
-_STITCH: Final = 0.0034  # period of a glove's knit [m]
-_CREASE: Final = (-0.012, 0.035)  # distances behind the wrist between which the palm's skin ends [m]
-_VEIN: Final = 0.0017  # half width of a vein [m]
-_UNEVEN: Final = np.float32(0.03)  # unevenness of the palm's end over that of the pigment's edge [m]
-_GRAIN: Final = 4.5e-5  # height of the relief that breaks gloss [m]: furrows are 20 to 100 um deep
-_GRAIN_SIZES: Final = (0.0032, 0.0016, 0.0009)  # lengths of its waves [m]
-_GRAINED: Final = (-0.035, 0.005)  # places along the wrist between which it fades in [m]
-_MATT_GRAIN: Final = np.float32(0.05)  # additional roughness of its ridges, which are drier than furrows
-_INNER_ARM: Final = 0.8  # pigment of the inner forearm; that of the back of the hand is 1
 
 
 class SkinTexture(NamedTuple):
@@ -503,10 +501,6 @@ def _sleeve(paint: _Paint, forearm: Forearm, rng: np.random.Generator) -> None:
     paint.lab[:, 0] *= 1.0 - np.float32(_SHADE) * inside
     paint.roughness[:] += cloth * (1.0 - paint.roughness)
     paint.height[:] += cloth * (np.float32(_FOLD) * folds - paint.height)
-
-
-GLOVE_COLOR: Final = (0.235, 0.25, 0.29)
-"""Color of an average glove, sRGB in [0, 1]."""
 
 
 @dataclass(frozen=True, slots=True)
