@@ -64,8 +64,11 @@ class Vouch(NamedTuple):
         )
 
 
-def summarize(take: Take) -> list[str]:
-    """One line per hand and body, one on confidence, and one on unlabeled points."""
+def summarize(take: Take, spans: Sequence[SuspectSpan] | None = None) -> list[str]:
+    """One line per hand and body, one on confidence, and one on unlabeled points.
+
+    The take's suspect spans, all of them, are looked for if they are not given.
+    """
     lines = []
     for number, side in enumerate(take.sides):
         status, rms = take.status[:, number], take.rms[:, number]
@@ -84,7 +87,7 @@ def summarize(take: Take) -> list[str]:
         never = [] if (status != LOST).any() else ["it was never found: are these its markers?"]
         lines.append("; ".join([f"{body.name}: {_status_shares(status)}", *_median_rms(rms), *never]))
     if take.made_by_tracker and (take.status != LOST).any():
-        lines.append(str(vouch(take)))
+        lines.append(str(vouch(take, spans)))
     count, foreign = len(take.point_list.labels), int((take.point_list.labels < 0).sum())
     line = f"{foreign} of {count} points are not markers"
     near = _unlabeled_at_hands(take)
@@ -113,8 +116,8 @@ def no_points(take: Take) -> str:
     return f"no point is in any of the {take.num_frames} frames; does the camera system see markers?"
 
 
-def suspicions(take: Take) -> list[str]:
-    """Signs of a wrong setup, one sentence each with its remedy."""
+def suspicions(take: Take, spans: Sequence[SuspectSpan] | None = None) -> list[str]:
+    """Signs of a wrong setup, one sentence each with its remedy; `spans` as for `summarize`."""
     points = take.point_list
     if not len(points.points):
         return [no_points(take)]
@@ -124,7 +127,8 @@ def suspicions(take: Take) -> list[str]:
     fault = unit_fault(clouds, only_wide=True)
     if fault is not None:
         return [f"{fault.found}, expected meters; set the unit of the stream to meters{fault.hint}"]
-    return misfits(take) + [f"{fault.words}; {fault.remedy}" for fault in find_faults(take)]
+    faults = find_faults(take) if spans is None else [one for one in spans if one.remedy]
+    return misfits(take) + [f"{fault.words}; {fault.remedy}" for fault in faults]
 
 
 def misfits(take: Take, *, calibrates: bool = False) -> list[str]:
@@ -207,12 +211,6 @@ def find_suspect_spans(take: Take, most: int | None = _MOST_DOUBTS) -> tuple[Sus
     Returns:
         Spans of frames `first` to `last`, with the `worst` frame, what they concern, and why.
     """
-    has_faults = np.isfinite(take.qpos).any() and not _is_known(take)
-    return (*(find_faults(take) if has_faults else ()), *_label_spans(take)[:most])
-
-
-def _label_spans(take: Take) -> list[SuspectSpan]:
-    """Spans with probably wrong or missing labels, the most doubtful first."""
     evidence = evidence_of(take) if np.isfinite(take.qpos).any() and not _is_known(take) else None
     points = take.point_list
     confidence, markers = _confidence(take, evidence), points.labels.astype(np.int64)
@@ -227,14 +225,14 @@ def _label_spans(take: Take) -> list[SuspectSpan]:
         why += f", {100 * least[worst]:.0f} %"
         found.append((float((1.0 - least[first : last + 1]).sum()), SuspectSpan(first, last, worst, of, why)))
     found.sort(key=lambda entry: (-entry[0], entry[1].first))
-    return [doubt for _, doubt in found]
+    return (*(() if evidence is None else find_faults(take)), *(doubt for _, doubt in found[:most]))
 
 
 def vouch(take: Take, spans: Sequence[SuspectSpan] | None = None) -> Vouch:
     """Bound the wrong frames of a take by the confidences in its labels, and by its doubtful spans."""
     doubt = 1.0 - np.nan_to_num(frame_confidence(take), nan=1.0)
     listed, masses = np.zeros(take.num_frames, dtype=np.bool_), list[float]()
-    for span in _label_spans(take) if spans is None else spans:
+    for span in find_suspect_spans(take, most=None) if spans is None else spans:
         part = slice(span.first, span.last + 1 if span.of_labels else span.first)
         masses.append(float(doubt[part][~listed[part]].sum()))
         listed[part] = True
