@@ -146,7 +146,7 @@ CASES = {
     "track --out out.npz": "a capture or --live natnet://host",
     "track good.trc --live natnet://localhost --out out.npz": "good.trc | //localhost | a capture or --live",
     "track good.trc --seconds 3 --out out.npz": "--seconds is 3 | --live",
-    "track --live natnet://localhost --calibrate --out out.npz": "--calibrate | natnet://localhost | twice",
+    "track --live natnet://localhost --calibrate --out out.npz": "--calibrate | natnet://localhost | all of",
     "track --live natnet://localhost --seconds 0 --out out.npz": "--seconds is 0 | above 0",
     "track --live localhost:1510 --out out.npz": "'localhost:1510' | natnet://host | qtm://host | module:",
     "track photos --out out.npz": "--out is out.npz | several captures | a folder",

@@ -32,7 +32,7 @@ ELSEWHERE = {
     "glove improve": "out", "glove learn": "out users", "rig import": "out", "rig score": "out json",
     "rig plan": "out",
     "generate": "out workers cluster sampler", "train": "out threads", "label": "out threads",
-    "export": "out", "evaluate": "json threads", "simulate": "out cluster",
+    "export": "out scene", "evaluate": "json threads", "simulate": "out cluster",
     "calibrate": "out live seconds", "track": "out live seconds send labelled", "report": "out",
     "replay": "host port rate loop", "view": "host port out video live", "body": "out",
     "doctor": "compile send", "film": "out format workers detector frames-per-shard openxr frames seed",
@@ -50,11 +50,13 @@ SEARCHED = {
     "glove score": "labeler",
     "generate": "like",
     "simulate": "like",
-    "export": "guesses",
+    "export": "guesses frame",
     "report": "guesses",
+    "render": "mano",
 }
 """Options that are not varied: those of a search may leave its outcome as it is, and it may take long;
-guesses are of takes without a marker (tests/track/takes/test_take_faults.py)."""
+guesses are of takes without a marker (tests/track/takes/test_take_faults.py), a frame is that of a scene
+(tests/render/test_scene_file.py), and a MANO file is not at hand (tests/render/test_mano.py)."""
 SMALL = "--batch 32 --network.width 8 --network.gates 2 --network.depth 1"
 QUICK = [
     ("hand", "--out h.xml", "size XL|side left|glove dense19|actuators|shape user.json|take take.npz"),
@@ -64,7 +66,7 @@ QUICK = [
     ("rig import", "lab.xcp --out r.toml", "up y"),
     ("export", "take.npz --out x.bvh", "fps 30|up y|forward x"),
     ("export", "take.npz --out x.csv", "neutral 0 0.1|neutral take.npz"),
-    ("report", "take.npz --out p.html", "neutral 0 0.1|neutral take.npz|decimal ,"),
+    ("report", "take.npz --out p.html", "neutral 0 0.1|neutral take.npz|decimal ,|cycles index_PIP_flexion"),
     ("evaluate", "labeled.trc --json f.json --occlude 4 --ghosts 2",
      "glove sparse13|labeler run|occlude 1|ghosts 0|every 7|seed 4"),
     ("evaluate", "labeled.trc --json f.json", "truth single.truth.npz"),
