@@ -186,7 +186,7 @@ def _track_file(
 
 def _print_take(out: Path, take: Take, tracked: LiveTake, speed: str, *, live: bool) -> None:
     """Print a summary of a take; of a stream, warn of signs of mistakes, too."""
-    from track.takes.take_summary import find_suspect_spans, summarize, suspicions
+    from track.takes.take_summary import summarize, suspicions
     from track.user import MEASURED
 
     user = take.settings["user"]
@@ -194,7 +194,6 @@ def _print_take(out: Path, take: Take, tracked: LiveTake, speed: str, *, live: b
     if user.startswith("calibrated on"):
         lines = user.split("; ")
     lines.append(f"{out}: {tracked.num_frames} frames, {tracked.duration:.1f} s at {take.rate:.4g} Hz")
-    spans = find_suspect_spans(take, most=None)
-    print_line(*lines, *tracked.notes, *summarize(take, spans), speed)
-    for suspicion in suspicions(take, spans) if live else ():
+    print_line(*lines, *tracked.notes, *summarize(take), speed)
+    for suspicion in suspicions(take) if live else ():
         warnings.warn(suspicion, HandSimWarning, stacklevel=3)

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 from gloves.fit import GloveFit
 from gloves.takes.take import HARDLY_SEEN, TRACKED, Take
 from handsim.hand.shape import JOINTS, Side
-from track.alternatives.alternatives import doubts_of
+from track.alternatives.alternatives import Doubt, doubts_of
 from track.alternatives.hands import other_hands_of
 from track.hand_size import glove_shifts
 from track.kinematics.pose_solver import FEWEST_MARKERS
@@ -110,6 +110,7 @@ def _faults_of_hands(take: Take, *, is_last: bool) -> tuple[SuspectSpan, ...]:
         SuspectSpan(one.first, last, one.first, f"the {one.side} hand", one.why, one.remedy, of_labels=False)
         for one in other_hands_of(take)
     ]
+    doubts = dict[Side, Doubt]()
     for number, side in enumerate(take.sides) if take.made_by_tracker else ():
         frames = np.flatnonzero(take.status[:, number] == TRACKED)
         if len(frames) < _FEWEST:
@@ -123,14 +124,15 @@ def _faults_of_hands(take: Take, *, is_last: bool) -> tuple[SuspectSpan, ...]:
         # Hands that are not measured, or of a user whom another follows, do not fit, which looks like a slip.
         is_usual = (take.settings.get("size"), take.settings.get("user")) == ("auto", USUAL_SIZE)
         slips = () if is_usual or not is_last or take.settings.get("size_state") else (_slips,)
-        for faults in (_alternatives, *slips, _fallen, _at_limits, _still):
+        doubts = doubts or doubts_of(take)  # of all hands at once, which takes seconds
+        found += _alternatives(hand, doubts.get(side))
+        for faults in (*slips, _fallen, _at_limits, _still):
             found += faults(hand)
     return (*hands, *tuple({one.of: one for one in reversed(found)}.values())[::-1])
 
 
-def _alternatives(hand: _Hand) -> Iterator[SuspectSpan]:
+def _alternatives(hand: _Hand, doubt: Doubt | None) -> Iterator[SuspectSpan]:
     """Other labels that fit the whole take, and markers that are not where the layout has them."""
-    doubt = doubts_of(hand.take).get(hand.side)
     for one in () if doubt is None else doubt.faults(hand.side, hand.worn.layout.names):
         last = hand.take.num_frames - 1
         yield SuspectSpan(0, last, int(hand.frames[0]), *one)

@@ -110,7 +110,7 @@ def write_take_page(
     hands, spans = hand_figures(take, guesses=settings.guesses), find_suspect_spans(take, most=None)
     paths, cycles = table_paths(out, settings), _cycles(take, hands, settings)
     sections = [
-        _summary_section(take, spans),
+        _summary_section(take),
         _calibration_section(take),
         *(section for hand in hands for section in _hand_sections(take, hand)),
         *(_cycles_section(hand.side, found, settings) for hand, found in zip(hands, cycles, strict=False)),
@@ -307,9 +307,9 @@ def _lead(take: Take) -> str:
     return f"{first[0].upper()}{first[1:]}; {end}"
 
 
-def _summary_section(take: Take, spans: Sequence[SuspectSpan]) -> Section:
-    told = suspicions(take, spans) if take.made_by_tracker else []
-    items = html_list([line[0].upper() + line[1:] for line in summarize(take, spans)], "ul")
+def _summary_section(take: Take) -> Section:
+    told = suspicions(take) if take.made_by_tracker else []
+    items = html_list([line[0].upper() + line[1:] for line in summarize(take)], "ul")
     kind = (
         "Found: the frame in which a hand is initialized. Tracked: its pose follows from the frame before. "
         "Coasting: for up to a tenth of a second its pose is predicted. Lost: it has no pose."

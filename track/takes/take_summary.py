@@ -64,11 +64,8 @@ class Vouch(NamedTuple):
         )
 
 
-def summarize(take: Take, spans: Sequence[SuspectSpan] | None = None) -> list[str]:
-    """One line per hand and body, one on confidence, and one on unlabeled points.
-
-    The take's suspect spans, all of them, are looked for if they are not given.
-    """
+def summarize(take: Take) -> list[str]:
+    """One line per hand and body, one on confidence, and one on unlabeled points."""
     lines = []
     for number, side in enumerate(take.sides):
         status, rms = take.status[:, number], take.rms[:, number]
@@ -87,7 +84,7 @@ def summarize(take: Take, spans: Sequence[SuspectSpan] | None = None) -> list[st
         never = [] if (status != LOST).any() else ["it was never found: are these its markers?"]
         lines.append("; ".join([f"{body.name}: {_status_shares(status)}", *_median_rms(rms), *never]))
     if take.made_by_tracker and (take.status != LOST).any():
-        lines.append(str(vouch(take, spans)))
+        lines.append(str(vouch(take)))
     count, foreign = len(take.point_list.labels), int((take.point_list.labels < 0).sum())
     line = f"{foreign} of {count} points are not markers"
     near = _unlabeled_at_hands(take)
@@ -116,8 +113,8 @@ def no_points(take: Take) -> str:
     return f"no point is in any of the {take.num_frames} frames; does the camera system see markers?"
 
 
-def suspicions(take: Take, spans: Sequence[SuspectSpan] | None = None) -> list[str]:
-    """Signs of a wrong setup, one sentence each with its remedy; `spans` as for `summarize`."""
+def suspicions(take: Take) -> list[str]:
+    """Signs of a wrong setup, one sentence each with its remedy."""
     points = take.point_list
     if not len(points.points):
         return [no_points(take)]
@@ -127,8 +124,7 @@ def suspicions(take: Take, spans: Sequence[SuspectSpan] | None = None) -> list[s
     fault = unit_fault(clouds, only_wide=True)
     if fault is not None:
         return [f"{fault.found}, expected meters; set the unit of the stream to meters{fault.hint}"]
-    faults = find_faults(take) if spans is None else [one for one in spans if one.remedy]
-    return misfits(take) + [f"{fault.words}; {fault.remedy}" for fault in faults]
+    return misfits(take) + [f"{fault.words}; {fault.remedy}" for fault in find_faults(take)]
 
 
 def misfits(take: Take, *, calibrates: bool = False) -> list[str]:
