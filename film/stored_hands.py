@@ -13,8 +13,8 @@ from film.detector import FoundHand
 from handsim._checks import check_choice
 from handsim.errors import DatasetError, errors_of
 from handsim.files.inputs import load_json
-from handsim.hand.shape import NUM_KEYPOINTS, SIDES
-from render.formats.records import CENTER
+from handsim.hand.shape import SIDES
+from render.formats.records import labeled_keypoints
 
 _SEEN: Final = 2.0  # COCO's flag of a keypoint that is seen; 1 is hidden, 0 not found
 
@@ -60,15 +60,12 @@ def _number(given: Any) -> int:
 
 def _hand(label: Mapping[str, Any]) -> FoundHand:
     """The hand of an annotation."""
-    rows = np.asarray(label["keypoints"], dtype=np.float64)
-    if rows.shape != (3 * NUM_KEYPOINTS,) or not np.isfinite(rows).all():
-        raise DatasetError(
-            f"{rows.size} numbers of keypoints of a hand, expected {3 * NUM_KEYPOINTS}: u, v and a flag of "
-            f"{NUM_KEYPOINTS}"
-        )
+    pixels, flags = labeled_keypoints(label)
+    if not np.isfinite([*pixels.ravel(), *flags]).all():
+        raise DatasetError("keypoints of a hand are not finite, expected pixels and COCO's flags")
     check_choice(label["side"], SIDES, noun="side")
-    pixels, sure = rows.reshape(-1, 3)[:, :2] + CENTER, float(label.get("score", 1.0))
-    scores = sure * np.clip(rows[2::3] / _SEEN, 0.0, 1.0)
+    sure = float(label.get("score", 1.0))
+    scores = sure * np.clip(flags / _SEEN, 0.0, 1.0)
     known = pixels[scores > 0.0] if (scores > 0.0).any() else pixels
     box = np.concatenate([known.min(axis=0), np.ptp(known, axis=0)])
     return FoundHand(label["side"], box, sure, pixels, scores)

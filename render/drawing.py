@@ -64,7 +64,9 @@ def draw(
     Raises:
         HandSimError: The source or the settings cannot be drawn, or a camera stands in a hand or an object.
     """
-    asked = asked_pictures(source, model, glove, camera, frames, record, config, **settings)
+    config = resolve(config, settings, camera)
+    subject = subject_of(source, model=model, glove=glove, seed=config.seed)
+    asked = asked_pictures(subject, config, frames, record)
     return asked.drawing.frames(asked.shard, asked.numbered)
 
 
@@ -77,18 +79,10 @@ class Asked(NamedTuple):
 
 
 def asked_pictures(
-    source: Take | str | Path | ArrayLike,
-    model: Model | tuple[Model, Model] | None = None,
-    glove: MarkerLayout | str | None = None,
-    camera: Cameras | None = None,
-    frames: Iterable[int] | None = None,
-    record: Mapping[str, Any] | None = None,
-    config: RenderConfig | None = None,
-    **settings: Any,
+    subject: Subject, config: RenderConfig, frames: Iterable[int] | None, record: Mapping[str, Any] | None
 ) -> Asked:
-    """What the arguments of `draw` ask for."""
-    config = resolve(config, settings, camera)
-    drawing = Drawing(subject_of(source, model=model, glove=glove, seed=config.seed), config)
+    """The pictures of some frames of a subject, or the one of a picture's record; see `draw`."""
+    drawing = Drawing(subject, config)
     drawing.viewpoints.check_hands_in_view()
     if record is None:
         return Asked(drawing, 0, ((n, n) for n in drawing.chosen_frames(frames)))

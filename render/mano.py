@@ -42,12 +42,8 @@ _CONVERT: Final = (
 )
 _BONES: Final = np.array([0, 4, 5, 6, 7, 8, 9, 13, 14, 15, 10, 11, 12, 1, 2, 3])  # our bone of each joint
 _DIGITS: Final = (13, 1, 4, 10, 7)  # first joint of each digit in our order
-_ROUGH, _CLOSE, _SHARED, _STEPS = (
-    12,
-    20,
-    12,
-    3,
-)  # steps by keypoints, by the surface, of some poses, of any pose
+_ROUGH, _CLOSE = 12, 20  # steps of the first pose, by keypoints and by the surface
+_SHARED, _STEPS = 12, 3  # steps of the poses that tell the shape, and of any pose
 _KEYPOINT: Final = 0.3  # weight of a keypoint over that of a vertex: MANO has its joints a little elsewhere
 _SLIDE: Final = 0.05  # weight of distances along our skin over those across it, where vertices may slide
 _ALIKE: Final = 0.02  # distance that stands for vertices whose bones have nothing in common [m]
@@ -163,7 +159,7 @@ class Mano:
         return self._turned(turns, by), shape, move + found[:, 48:51]
 
     def _turned(self, turns: Doubles, by: Doubles) -> Doubles:
-        """Rotations of joints that are turned in the world by rotation vectors (B, 16, 3)."""
+        """Rotations after each joint has turned about the world's axes by a rotation vector (B, 16, 3)."""
         from scipy.spatial.transform import Rotation
 
         worlds, turned = turns.copy(), turns.copy()

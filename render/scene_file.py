@@ -24,13 +24,13 @@ from handsim.motion_files.motion import Material
 from handsim.motion_files.scenes import add_mesh, save_stage
 from handsim.space.camera import Camera
 from handsim.space.transforms import cross
-from render.config import Cameras, RenderConfig
+from render.config import Cameras, RenderConfig, resolve
 from render.drawing import Scene, asked_pictures
 from render.frames import Doubles
 from render.painting.figures import Drawn
 from render.scenery.lights import Lamp
 from render.studio import picture_behind
-from render.subject import Model
+from render.subject import Model, subject_of
 
 ENDINGS: Final = (".usdc", ".usda")
 _FILM: Final = 0.36  # width of the film [tenths of a meter, USD's unit], that of most cameras in programs
@@ -80,7 +80,9 @@ def write_scene(
     """
     path, frames = Path(path), None if frame is None else [frame]
     check_ending(path, *ENDINGS, option="path")
-    asked = asked_pictures(source, model, glove, camera, frames, record, config, **settings)
+    config = resolve(config, settings, camera)
+    subject = subject_of(source, model=model, glove=glove, seed=config.seed)
+    asked = asked_pictures(subject, config, frames, record)
     name = None if record is None else record.get("camera")
     shown = asked.drawing.scenes(asked.shard, asked.numbered)
     scene = next(one for one in shown if name in (None, one.camera.name))
@@ -233,7 +235,7 @@ def _towards(lamp: Lamp) -> Doubles:
 
 
 def _add_behind(stage: Any, path: Path, scene: Scene, surfaces: list[Drawn]) -> None:
-    """Add the picture behind the hands on a plane that fills the camera's view and emits it."""
+    """Add a plane that fills the camera's view and glows with the picture behind the hands."""
     from pxr import Sdf
 
     camera = scene.camera

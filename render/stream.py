@@ -17,7 +17,7 @@ from gloves.layout import MarkerLayout
 from gloves.takes.take import Take
 from handsim._checks import as_numbers, check_choice, check_count, check_number, check_type
 from handsim._process import SharedStream, with_own_numerics
-from handsim.errors import ArgumentError, DatasetError, PoseError
+from handsim.errors import ArgumentError, DatasetError, PoseError, errors_of
 from handsim.files.inputs import load_json
 from handsim.hand.model import HandModel, hand_keypoints
 from handsim.hand.shape import NUM_KEYPOINTS, NUM_QPOS, SIDES, HandShape, Side, pack_hand, sample_shape
@@ -26,7 +26,7 @@ from poses import PoseSampler, sample_poses
 from poses.shapes import load_sampler, mixed_angles
 from render.conditions import sample_conditions
 from render.config import RenderConfig, SpawnKey, resolve
-from render.formats.records import CENTER
+from render.formats.records import labeled_keypoints
 from render.frames import Doubles, HandTruth, Integers, RenderedFrame
 from render.photographs import read_photograph
 from render.studio import Moment, Studio
@@ -69,17 +69,12 @@ def load_labeled_hands(file: str | Path) -> list[LabeledHand]:
 
 
 def _hand(path: Path, name: str, label: dict[str, Any]) -> LabeledHand:
-    rows = np.asarray(label["keypoints"], dtype=np.float64)
-    if rows.shape != (3 * NUM_KEYPOINTS,):
-        raise DatasetError(
-            f"{path}: {rows.size} numbers of keypoints of a hand, expected {3 * NUM_KEYPOINTS}: x, y and "
-            f"visibility of {NUM_KEYPOINTS}"
-        )
+    with errors_of(path, DatasetError):
+        pixels, flags = labeled_keypoints(label)
     places = (path.parent / name, path.parent / "images" / name)
     photograph = next((one for one in places if one.is_file()), None)
     if photograph is None:
         raise DatasetError(f"{path}: no photograph {name} beside it or in its folder images")
-    pixels, flags = rows.reshape(-1, 3)[:, :2] + CENTER, rows[2::3]
     side = label.get("side")
     return LabeledHand(
         photograph,

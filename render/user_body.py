@@ -43,13 +43,8 @@ _UNUSUAL: Final = 0.15  # weight of the cost of other distances and angles
 _SWIVELS: Final = np.deg2rad(np.arange(-100.0, 101.0, 20.0))
 """Angles of the elbow about the line from the wrist to the shoulder that are tried [rad]; 0 is the lowest."""
 _SWIVEL: Final = np.deg2rad(50.0)  # spread of these angles
-_OUTWARDS: Final = (
-    0.0,
-    -0.4,
-    0.4,
-    -0.8,
-    0.8,
-)  # angles that shoulders turn forearms by when they give way [rad]
+_OUTWARDS: Final = (0.0, -0.4, 0.4, -0.8, 0.8)
+"""Angles that shoulders turn forearms by when they give way [rad]."""
 _OUTWARD: Final = 0.4  # spread of these angles [rad]
 _SOFTNESS: Final = 0.3  # difference of costs within which elbows are averaged for placing cameras
 _CHOSEN: Final = 0.2  # time between frames of a motion whose arms are chosen [s]
@@ -75,7 +70,7 @@ class UserBody:
     """Unit directions from wrists to elbows in all frames (T, H, 3); NaN where there is no hand."""
 
     def __init__(self, take: Take, cameras: Float[np.ndarray, "C 3"] | None = None) -> None:
-        """Place the person where arms leave hands free, also from cameras at these positions [m]."""
+        """Place the person where arms hide no hand from the eyes, nor from cameras at these positions [m]."""
         self._cameras: Doubles = np.empty((0, 3)) if cameras is None else cameras
         self._lengths = np.array([hand.shape.length for hand in take.hands])
         self._mirrors = np.array([-1.0 if hand.side == "left" else 1.0 for hand in take.hands])

@@ -107,7 +107,7 @@ def upright(up: UpAxis) -> Float[np.ndarray, "3 3"]:
 
 
 def facing(up: UpAxis, forward: str) -> Float[np.ndarray, "3 3"]:
-    """Rotation of the world about its axis `up`, after which `file_axes` takes `forward` to -z, as OpenXR."""
+    """Rotation about the axis `up` that lets `file_axes` turn the axis `forward` to -z, as in OpenXR."""
     return np.asarray(file_axes(up).T @ program_axes("openxr", up, forward=forward).turn)
 
 

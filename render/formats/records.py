@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -16,7 +17,7 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 from numpy.typing import NDArray
 
-from handsim.errors import HandSimError
+from handsim.errors import DatasetError, HandSimError
 from handsim.files.outputs import atomic_write, plain_json, plain_path, unwritten
 from handsim.hand.shape import NUM_KEYPOINTS, Side
 from handsim.kernels import kernel
@@ -52,6 +53,21 @@ _RGB: Final = ("R", "G", "B")
 _NORMALS: Final = ("N.X", "N.Y", "N.Z")
 _IDS: Final = {"parts": "id.part", "instances": "id.instance", "markers": "id.marker"}
 _SENSOR: Final = "sensor."
+
+
+def labeled_keypoints(label: Mapping[str, Any]) -> tuple[Doubles, Doubles]:
+    """Keypoints (21, 2) [px] from the picture's corner, and flags (21,), of an annotation of COCO's.
+
+    Raises:
+        DatasetError: There is another number of keypoints.
+    """
+    rows = np.asarray(label["keypoints"], dtype=np.float64)
+    if rows.shape != (3 * NUM_KEYPOINTS,):
+        raise DatasetError(
+            f"{rows.size} numbers of keypoints of a hand, expected {3 * NUM_KEYPOINTS}: x, y and visibility "
+            f"of {NUM_KEYPOINTS}"
+        )
+    return rows.reshape(-1, 3)[:, :2] + CENTER, rows[2::3]
 
 
 def shifted_K(camera: Camera) -> Doubles:

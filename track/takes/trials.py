@@ -54,7 +54,7 @@ class Cycles(NamedTuple):
     spans: list[tuple[int, int]]
     """First frame of each, and the first of the next."""
     figures: Float[np.ndarray, "C 20 6"]
-    """See `FIGURES`; NaN where a joint was not measured."""
+    """What `FIGURES` names, of each joint in each cycle; NaN where the joint was not measured."""
     curves: Float[np.ndarray, "C 20 101"]
     """Angles at `PERCENTS` of the cycle [deg]; NaN where the joint was not measured."""
 
