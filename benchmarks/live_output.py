@@ -5,7 +5,7 @@ readers, which are processes of their own. They read as fast as they can, at hal
 second. In the middle the server is restarted. The latency that is added to the tracker's own time is from
 when the server takes up a frame to when the reader has it.
 
-python -m benchmarks.live_output [--seconds 600] [--pauses 0 0.0167 0.2]
+python -m benchmarks.live_output [--seconds 600] [--pauses 0 0.0167 0.2] [--readers ws:// lsl:]
 """
 
 from __future__ import annotations
@@ -33,6 +33,7 @@ from track.streams import LOOPBACK
 from train import load_labeler, simulate_take
 
 RATE = 120.0
+READERS = ("ws://?every=1", "ws://", "/newest", "osc://", "udp://", "lsl:")
 SPAWN = multiprocessing.get_context("spawn")
 Times = Any  # a shared array of monotonic times [s] by frame
 
@@ -89,6 +90,24 @@ def listen_udp(port: int, times: Times, ready: Synchronized[int], half: int, pau
     _note(_datagrams(port, ready, pause, json.loads), times, half)
 
 
+def listen_lsl(name: str, times: Times, ready: Synchronized[int], half: int, pause: float) -> None:
+    """The same of the newest waiting sample of LSL, whose stream opens with the first frame."""
+    import pylsl
+
+    def samples() -> Iterator[tuple[float, dict[str, Any]]]:
+        inlet = pylsl.StreamInlet(pylsl.resolve_byprop("name", name, timeout=60.0)[0])
+        while True:
+            waiting = [inlet.pull_sample()[0]]
+            waiting += inlet.pull_chunk()[0]
+            for sample in waiting[-1:] if pause else waiting:
+                yield time.monotonic(), {"type": "frame", "number": int(sample[0]), "silent": False}
+            time.sleep(pause)
+
+    with ready.get_lock():
+        ready.value += 1
+    _note(samples(), times, half)
+
+
 def _listen(
     url: str, times: Times, ready: Synchronized[int], half: int, pause: float, *, asks: bool = False
 ) -> None:
@@ -142,27 +161,36 @@ def _note(documents: Iterable[tuple[float, dict[str, Any]]], times: Times, half:
             times[first + last] = now
 
 
-def main(seconds: float = 600.0, pauses: tuple[float, ...] = (0.0, 2.0 / RATE, 0.2)) -> None:
-    print(describe("numba", "torch", "websockets", "python-osc"))
+def main(
+    seconds: float = 600.0,
+    pauses: tuple[float, ...] = (0.0, 2.0 / RATE, 0.2),
+    readers: tuple[str, ...] = READERS,
+) -> None:
+    print(describe("numba", "torch", "websockets", "python-osc", "pylsl"))
     take = simulate_take(kind="hand-hand", num_frames=1200)
     for pause in pauses:
         print(f"readers that pause for {1e3 * pause:.0f} ms after each frame")
-        measure(take, round(seconds * RATE), pause)
+        measure(take, round(seconds * RATE), pause, readers)
 
 
-def measure(take: Take, frames: int, pause: float) -> None:
+def measure(take: Take, frames: int, pause: float, names: tuple[str, ...]) -> None:
     """Run a session with readers that pause after each frame [s], and print what they got."""
     half = frames // 2
     ready, over = SPAWN.Value("i", 0), SPAWN.Value("i", 0)
     command, web, bundles, datagrams = _free_ports(
         socket.SOCK_DGRAM, socket.SOCK_STREAM, socket.SOCK_DGRAM, socket.SOCK_DGRAM
     )
-    readers: dict[str, tuple[Any, int]] = {
-        "ws://?every=1": (listen_websocket, web),
-        "ws://": (listen_plain, web),
-        "/newest": (listen_newest, web),
-        "osc://": (listen_osc, bundles),
-        "udp://": (listen_udp, datagrams),
+    stream = f"handsim-{web}"
+    every = (
+        (listen_websocket, web),
+        (listen_plain, web),
+        (listen_newest, web),
+        (listen_osc, bundles),
+        (listen_udp, datagrams),
+        (listen_lsl, stream),
+    )
+    readers: dict[str, tuple[Any, int | str]] = {
+        name: reader for name, reader in zip(READERS, every, strict=True) if name in names
     }
     sent = SPAWN.Array("d", frames, lock=False)
     arrived = {name: SPAWN.Array("d", frames, lock=False) for name in readers}
@@ -173,6 +201,7 @@ def measure(take: Take, frames: int, pause: float) -> None:
         f"{one}://{LOOPBACK}:{port}"
         for one, port in zip(("ws", "osc", "udp"), (web, bundles, datagrams), strict=True)
     ]
+    addresses += [f"lsl:{stream}"] * ("lsl:" in names)
     with open_sinks(addresses) as sinks:
         sinks.start(tracker.hands, tracker.bodies)
         jobs: list[tuple[Any, tuple[Any, ...]]] = [(serve, (take, command, ranges, sent, over))]
@@ -213,6 +242,9 @@ def _tell(sent: np.ndarray, own: np.ndarray, arrived: dict[str, np.ndarray]) -> 
     for name, times in arrived.items():
         there = times > 0
         added = 1e3 * (times - sent - own)[there & np.isfinite(own)]
+        if not added.size:
+            print(f"{name}: no frame read")
+            continue
         p50, p90, p99 = np.percentile(added, [50, 90, 99])
         print(
             f"{name}: {(~there).sum()} frames not read; added p50 {p50:.2f} ms, p90 {p90:.2f} ms, "

@@ -14,7 +14,7 @@ from tests.renames import fails_at
 COMMANDS = {
     "simulate": ("simulate --kind single-hand --num-frames 20 --out out/a.c3d", 2),
     "track": ("track take.c3d --size M --out out/a.npz --labeled out/a.trc", 2),
-    "report": ("report take.truth.npz --out out/a.html", 6),
+    "report": ("report take.truth.npz --out out/a.html", 7),
     "hand": ("hand --out out/a.urdf --mesh out/a.stl", 2),
     "rig score": ("rig score six --frames 60 --out out/a.html --json out/a.json", 2),
     "demo": ("demo --out out --num-frames 50", 7),
