@@ -114,13 +114,13 @@ class HeldOut(NamedTuple):
     """The same with the calibrated hand [m]."""
     num_frames: int
     """Number of frames."""
-    hidden: str = ""
-    """A rarely seen marker whose label may belong to the next finger's marker; empty if there is none."""
+    other_labels: str = ""
+    """Labels that fit the points better than those that were given, such as "RH1 and RH6 are exchanged"."""
 
     @property
     def is_better(self) -> bool:
         """Whether the calibrated hand fits better by more than chance, and no label is doubtful."""
-        return not self.hidden and self.after < _BETTER_SHARE * self.before
+        return not self.other_labels and self.after < _BETTER_SHARE * self.before
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -162,12 +162,11 @@ class Calibration:
         """Residuals on held-out frames and error of marker places, in a line [mm]."""
         if self.held_out is None:
             return "too few frames to try a calibration on, so that it stays as it was"
-        before, after, frames, hidden = self.held_out
+        before, after, frames, other_labels = self.held_out
         line = f"markers {1e3 * before:.2f} mm off before and {1e3 * after:.2f} mm after calibration, "
         line += f"on {frames} frames held out"
-        if hidden:
-            line += f", but {hidden} is rarely seen, and the next finger's fits in its place as well"
-            return f"{line}, so that it stays as it was"
+        if other_labels:
+            return f"{line}, but it is likelier that {other_labels}, so that it stays as it was"
         if not self.is_better:
             return f"{line}: no better, so that it stays as it was"
         return f"{line}, their places known to {1e3 * self.place_error:.1f} mm"
@@ -186,9 +185,7 @@ class Calibration:
 
     def suggestions(self) -> tuple[str, ...]:
         """Sentences on what to do in a better capture; empty if nothing is missing."""
-        hidden = self.held_out.hidden if self.held_out is not None else ""
-        sentences = [f"let {hidden} be seen most of the time"] if hidden else []
-        sentences += _motions(self.still_joints)
+        sentences = list(_motions(self.still_joints))
         touched = {touch.finger for touch in self.significant_touches}
         missing = [finger for finger in DIGITS[1:] if finger not in touched]
         if missing:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 from collections.abc import Callable, Sequence
 from typing import Final
 
@@ -14,7 +13,8 @@ from numpy.typing import NDArray
 from gloves.fit import GloveFit
 from gloves.takes.take import INITIALIZED, TRACKED, Take
 from handsim.errors import CalibrationError
-from handsim.hand.shape import BONES, Side
+from handsim.hand.shape import Side
+from track.alternatives.alternatives import doubts_of
 from track.calibration.energy import Progress
 from track.calibration.user_calibration import MOST_STEPS, Calibration, HeldOut, calibrate_hand
 from track.kinematics.pose_solver import PoseSolver
@@ -30,9 +30,6 @@ _BLOCKS: Final = 6  # least number of such blocks
 _HELD_OUT: Final = 3  # one of this many blocks is held out
 _MOST_CHECKED: Final = 400  # largest number of held-out frames
 _FEWEST_SEEN: Final = 0.75  # Held-out frames must show this share of the markers.
-_RARELY: Final = 0.75  # A marker in fewer of the hand's frames may wear the next finger's label.
-_NEXT_FINGER: Final = 3  # difference of bone numbers between neighbor fingers
-_AS_WELL: Final = 1.2  # Labels fit as well up to this factor of residual times marker shifts.
 
 
 def calibrate_take(
@@ -62,38 +59,19 @@ def calibrate_take(
         one = calibrate_hand(seen, hand, take.rate, progress=_steps(hand.side, on_part))
         tried = _tried(markers[out], worn[hand.side], one.hand)
         if tried is not None and tried.is_better:
-            tried = tried._replace(hidden=_hidden(markers, out, one, tried.after, take.rate))
+            tried = tried._replace(other_labels=_likelier_labels(take, hand.side))
         done.append(dataclasses.replace(one, held_out=tried))
     return tuple(done)
 
 
-def _hidden(
-    markers: Float[np.ndarray, "T M 3"], out: Bool[np.ndarray, "T"], one: Calibration, off: float, rate: float
-) -> str:
-    """Name of a rarely seen marker whose place fits the next finger's points as well; empty if none.
+def _likelier_labels(take: Take, side: Side) -> str:
+    """What the likeliest labels of a hand's points say; empty where these are the take's.
 
-    Around a held object, sparse markers of a finger may have the next finger's labels throughout. Shifted
-    marker places explain such labels, and held-out frames, labeled alike, confirm them. Right labels fit
-    better, or with places nearer to the design. `off` is the residual of held-out frames with the original
-    labels [m].
+    Shifted places of markers explain labels that are wrong throughout, and held-out frames, labeled alike,
+    confirm them.
     """
-    worn, shown = one.start.attachment, np.isfinite(markers[..., 0])
-    rare = shown.mean(axis=0) < _RARELY * shown.any(axis=1).mean()
-    on_bone = {int(bone): marker for marker, bone in enumerate(worn.main_bones) if BONES[bone].digit > 0}
-    for bone, beside in itertools.product(on_bone, (-_NEXT_FINGER, _NEXT_FINGER)):
-        if not rare[on_bone[bone]] or bone + beside not in on_bone:
-            continue
-        hidden, taken, other = on_bone[bone], on_bone[bone + beside], markers.copy()
-        other[:, hidden], other[:, taken] = markers[:, taken], np.nan
-        try:
-            found = calibrate_hand(np.where(out[:, None, None], np.nan, other), one.start, rate)
-        except CalibrationError:  # too few frames without the marker
-            return worn.layout.names[hidden]
-        tried = _tried(other[out], one.start, found.hand)
-        farther = np.linalg.norm(found.shifts) / np.linalg.norm(one.shifts)
-        if tried is None or tried.after * farther < _AS_WELL * off:
-            return worn.layout.names[hidden]
-    return ""
+    doubt = doubts_of(take).get(side)
+    return doubt.tried[0].words if doubt is not None else ""
 
 
 def kept_user(
