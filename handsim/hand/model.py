@@ -370,7 +370,7 @@ def skinned_jacobian(
     axes, anchors = joint_axes(model, T_world_bone)
     # derivative by a joint, over the bones that it moves: axis x (sum of w (p - anchor))
     shares = bone_weights * _MOVED[:, bone_indices]  # (J, M, 4)
-    lever = np.einsum("jmk,tmki->tmji", shares, carried)
+    lever = shares.swapaxes(0, 1) @ carried
     lever -= shares.sum(-1).T[..., None] * anchors[:, None]
     jacobian[..., 6:] = np.cross(axes[:, None], lever).swapaxes(-1, -2)
     return jacobian

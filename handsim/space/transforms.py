@@ -220,6 +220,15 @@ def euler_matrix(angles: Float[np.ndarray, "*batch 3"]) -> NDArray[np.float64]:
     return axis_angle_matrix(z, yaw) @ axis_angle_matrix(y, pitch) @ axis_angle_matrix(x, roll)
 
 
+def euler_axes(angles: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3 3"]:
+    """Unit axes, one a row, about which `euler_matrix` turns as each of its angles grows."""
+    axes = np.zeros((*angles.shape, 3))
+    axes[..., 0, 2] = 1.0
+    axes[..., 1, 0], axes[..., 1, 1] = -np.sin(angles[..., 0]), np.cos(angles[..., 0])
+    axes[..., 2, :] = euler_matrix(angles)[..., 0]
+    return axes
+
+
 def euler_angles(rotations: Float[np.ndarray, "T 3 3"]) -> NDArray[np.float64]:
     """Angles (T, 3) [rad] with which `euler_matrix` makes these rotations: yaw, pitch, roll."""
     flat = np.hypot(rotations[:, 0, 0], rotations[:, 1, 0])

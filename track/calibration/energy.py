@@ -370,11 +370,11 @@ class Problem:
         rest: NDArray[np.float64],
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Jacobians of skinned points by poses, parameters and rest points; points moved by each bone."""
-        bones, qpos = fit.bones[frames], estimate.qpos[frames]
+        bones = fit.bones[frames]
         by_point, by_bone = skinning_terms(fit.model, bones, points, weights)
         all_bones = np.tile(np.arange(NUM_BONES), (len(points), 1))
         by_pose = skinned_jacobian(fit.model, bones, points, all_bones, weights)
-        by_shape = skinned_shape_jacobian(self.shape, estimate.parameters, qpos, points, weights)
+        by_shape = skinned_shape_jacobian(fit.model, estimate.parameters, bones, points, weights, by_bone)
         return by_pose, by_shape + by_point @ rest, by_point, by_bone
 
     def apply_step(

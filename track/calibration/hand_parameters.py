@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 
 from gloves.fit import Attachment
 from gloves.layout import MarkerLayout
-from handsim.hand.model import HandModel, bone_transforms, build_skeleton
+from handsim.hand.model import HandModel
 from handsim.hand.shape import ADULTS, DIGIT_OF_BONE, DIGITS, HandShape, named_shape
 from handsim.hand.skin import all_weights, build_surface, catmull_clark, strongest_weights, vertex_normals
+from handsim.space.transforms import euler_axes
 
 if TYPE_CHECKING:
     from scipy import sparse
@@ -76,37 +77,56 @@ def shape_jacobian(
     start: HandShape,
     parameters: Float[np.ndarray, "53"],
     function: Callable[[list[HandShape]], Float[np.ndarray, "B *shape"]],
-    count: int = NUM_PARAMETERS,
 ) -> Float[np.ndarray, "*shape 53"]:
-    """Derivative of a function of the shape by its first `count` parameters, by finite differences."""
-    nudged = parameters + _DIFFERENCE_STEP * np.eye(1 + count, NUM_PARAMETERS, -1)  # first row unchanged
-    values = function([shape_at(start, one) for one in nudged])
-    jacobian = np.zeros((NUM_PARAMETERS, *values.shape[1:]))  # derivatives by one parameter are contiguous
-    jacobian[:count] = (values[1:] - values[0]) / _DIFFERENCE_STEP
-    return np.moveaxis(jacobian, 0, -1)
+    """Derivative of a function of the shape by its parameters, by finite differences."""
+    nudged = parameters + _DIFFERENCE_STEP * np.eye(1 + NUM_PARAMETERS, NUM_PARAMETERS, -1)
+    values = function([shape_at(start, one) for one in nudged])  # The first one is unchanged.
+    # Derivatives by one parameter are contiguous.
+    return np.moveaxis((values[1:] - values[0]) / _DIFFERENCE_STEP, 0, -1)
 
 
 def skinned_shape_jacobian(
-    start: HandShape,
+    model: HandModel,
     parameters: Float[np.ndarray, "53"],
-    qpos: Float[np.ndarray, "T 27"],
+    T_world_bone: Float[np.ndarray, "T L 4 4"],
     points: Float[np.ndarray, "M 3"],
     weights: Float[np.ndarray, "M 16"],
+    by_bone: Float[np.ndarray, "T M L 3"],
 ) -> Float[np.ndarray, "T M 3 53"]:
-    """Derivative of skinned points by the parameters, for fixed rest points [m] and poses."""
-    homogeneous = np.pad(points, ((0, 0), (0, 1)), constant_values=1.0)
+    """Derivative of skinned points by the parameters of a hand, for fixed rest points [m] and poses.
 
-    def skinned(shapes: list[HandShape]) -> NDArray[np.float64]:
-        skeletons = [build_skeleton(shape) for shape in shapes]
-        rest = np.stack([skeleton.rest_transforms() for skeleton in skeletons])
-        local = weights.T[:, None] * (np.linalg.inv(rest) @ homogeneous.T)  # (B, L, 4, M)
-        posed = np.empty((len(shapes), 3 * len(qpos), len(points)))
-        for row, skeleton, one in zip(posed, skeletons, local, strict=True):
-            bones = bone_transforms(skeleton, qpos)[:, :, :3].swapaxes(1, 2).reshape(3 * len(qpos), -1)
-            np.matmul(bones, one.reshape(-1, len(points)), out=row)
-        return posed.reshape(len(shapes), len(qpos), 3, -1).swapaxes(2, 3)
-
-    return shape_jacobian(start, parameters, skinned, GIRTHS.start)
+    A bone carries a point p to o + A (p - r): its joint is at r in the rest hand and at o in the world, and A
+    turns it. Knuckles and lengths move r and o; directions turn the digit around its knuckle in both.
+    """
+    shape, frames, count = model.shape, len(T_world_bone), len(points)
+    wrist, digits = T_world_bone[:, 0, :3, :3], T_world_bone[:, 1:].reshape(-1, len(DIGITS), 3, 4, 4)
+    rest, shares = model.rest_transforms[1:].reshape(len(DIGITS), 3, 4, 4), weights[:, 1:].reshape(-1, 5, 3)
+    # The shares of each bone with the bones after it, and their turns.
+    turns = digits[..., :3, :3] @ rest[..., :3, :3].swapaxes(-1, -2)
+    turns = shares[:, :, ::-1, None, None] * turns[:, None, :, ::-1]
+    turns = turns.cumsum(axis=3)[:, :, :, ::-1]
+    after = shares[:, :, ::-1].cumsum(axis=2)[:, :, ::-1, None]
+    jacobian = np.zeros((frames, count, 3, NUM_PARAMETERS))
+    of_digits = [
+        jacobian[..., one].reshape(frames, count, 3, len(DIGITS), 3)
+        for one in (BONE_LENGTHS, KNUCKLES, DIRECTIONS)
+    ]
+    by_length, by_knuckle, by_direction = (np.moveaxis(one, 2, -1) for one in of_digits)
+    along = (turns[:, :, :, 1:] @ rest[:, :2, :3, :1])[..., 0]
+    by_length[:, :, :, :2] = after[:, :, 1:] * digits[:, None, :, :2, :3, 0] - along
+    by_length *= shape.bone_lengths[..., None]
+    moved = after[:, :, 0, None] * wrist[:, None, None] - turns[:, :, :, 0]
+    by_knuckle[:] = moved.swapaxes(-1, -2)
+    axes, arms = euler_axes(shape.base_angles), points[:, None] - rest[:, 0, :3, 3]
+    placed = np.einsum("mdb,tmdbi->tmdi", shares, by_bone[:, :, 1:].reshape(frames, count, 5, 3, 3))
+    placed -= after[:, :, 0] * digits[:, None, :, 0, :3, 3]
+    swept = np.cross((axes @ wrist[:, None].swapaxes(-1, -2))[:, None], placed[..., None, :])
+    by_direction[:] = swept - np.cross(axes, arms[:, :, None]) @ turns[:, :, :, 0].swapaxes(-1, -2)
+    scaled = shape.knuckles - parameters[KNUCKLES].reshape(5, 3)
+    across = scaled[..., None] * by_knuckle
+    jacobian[..., LENGTH] = by_length.sum(axis=(2, 3)) + across[:, :, :, 0].sum(axis=2)
+    jacobian[..., BREADTH] = across[:, :, :, 1:].sum(axis=(2, 3))
+    return jacobian
 
 
 def skinning_terms(

@@ -10,8 +10,9 @@ import pytest
 from benchmarks.people import displace_markers
 from gloves import MarkerLayout, MarkerPlace, load_layout
 from gloves.fit import attach_markers, settle_glove
-from handsim import HandModel, sample_shape
+from handsim import HandModel, join_qpos, sample_shape
 from handsim.hand.shape import DIGIT_OF_BONE, DIGITS, named_shape, shape_from_measures
+from handsim.space.transforms import random_quaternions
 from track.calibration.hand_parameters import (
     NUM_PARAMETERS,
     SkinPatch,
@@ -26,6 +27,8 @@ from track.calibration.hand_parameters import (
     skin_points,
     skin_weight_jacobian,
     skin_weights,
+    skinned_shape_jacobian,
+    skinning_terms,
 )
 
 
@@ -51,6 +54,27 @@ def test_jacobian_of_a_linear_function(rng):
     )
     np.testing.assert_allclose(jacobian[:, 17:32], np.eye(15), atol=1e-9)
     np.testing.assert_allclose(jacobian[::3, 0], shape.knuckles[:, 0], rtol=1e-4)
+
+
+def test_skinned_points_follow_the_parameters(rng):
+    covariance = np.linalg.inv(shape_precision())
+    parameters = rng.multivariate_normal(np.zeros(NUM_PARAMETERS), covariance)
+    start = sample_shape(rng=rng)
+    qpos = join_qpos(rng.uniform(-0.3, 1.2, (3, 20)), quaternion=random_quaternions(3, rng=rng))
+    points, weights = rng.uniform(-0.1, 0.1, (5, 3)), rng.dirichlet(np.ones(16), 5)
+
+    def skinned(shapes):
+        return np.array([skinned_points(HandModel(shape))[0] for shape in shapes])
+
+    def skinned_points(model):
+        bones = model.forward_kinematics(qpos)
+        by_bone = skinning_terms(model, bones, points, weights)[1]
+        return np.einsum("ml,tmli->tmi", weights, by_bone), bones, by_bone
+
+    model = HandModel(shape_at(start, parameters))
+    _, bones, by_bone = skinned_points(model)
+    exact = skinned_shape_jacobian(model, parameters, bones, points, weights, by_bone)
+    np.testing.assert_allclose(exact, shape_jacobian(start, parameters, skinned), atol=5e-6)
 
 
 def points_of(coordinates, shape):
