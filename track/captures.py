@@ -41,7 +41,7 @@ from track.takes.bidirectional_labeling import label_both_ways
 from track.takes.corrected_take import correct_take
 from track.takes.label_confidence import label_confidence
 from track.takes.smoothed_take import smooth_take
-from track.takes.take_calibration import calibrate_take, kept_user, leaves_markers
+from track.takes.take_calibration import OnPart, calibrate_take, kept_user, leaves_markers
 from track.takes.take_summary import misfits, no_points, suspicions
 from track.tracker import Tracker
 from track.user import AnyGlove, AnyLabeler, User, labeler_of, nominal_user
@@ -188,6 +188,7 @@ def track_capture(
     corrections: str | Path | None = None,
     sinks: SinkGroup | None = None,
     progress: Progress = no_progress,
+    on_step: OnStep = no_step,
     on_frame: OnFrame | None = None,
     **options: Any,
 ) -> Take:
@@ -199,7 +200,8 @@ def track_capture(
         corrections: A file of labels that a person corrected, as `handsim view` saves it beside a take.
         sinks: Receives every frame as it is tracked, from `open_sinks`; the capture is then played at its own
             rate.
-        progress: Called after each frame with the number of tracked frames and of all frames.
+        progress: Called with what is done of a step, and all there is to do in it.
+        on_step: Called with the name of each step, such as "frames".
         on_frame: Called with each frame and its `TrackedFrame`.
         options: Fields of `TrackSettings` that differ from `settings`, as `glove="dense19"`, `size="M"`,
             `hands="user.json"`, `bodies=["mug"]` or `calibrate=True`.
@@ -223,11 +225,13 @@ def track_capture(
     chosen = TrackSettings.of(settings, options)
     source, frames, setup = _opened(capture, chosen, warns=True)
     pins = () if corrections is None else _checked_corrections(Path(corrections), source, setup)
+    on_step("frames")
     if chosen.calibrate:
         first, setup, _ = _judged(
             lambda now: tracked_take(source, frames, now.tracker(), progress=progress), setup
         )
-        setup = _calibrated(first, setup)
+        setup = _calibrated(first, setup, _parts(progress, on_step))
+        on_step("frames")
     take, setup, _ = _judged(
         lambda now: tracked_take(source, frames, now.tracker(), sinks, on_frame, progress),
         setup,
@@ -237,9 +241,10 @@ def track_capture(
     points = dataclasses.replace(take.point_list, confidence=label_confidence(take))
     record = {**take.settings, **_named(capture, source), **setup.settings}
     take = dataclasses.replace(take, point_list=points, settings=record)
-    if corrections is None:
-        take = smooth_take(take) if chosen.smooth else take
-    else:
+    if corrections is None and chosen.smooth:
+        on_step("smoothing")
+        take = smooth_take(take)
+    elif corrections is not None:
         corrected = correct_take(take, pins)
         take = corrected.take
         _warn(unfitting_sentences(Path(corrections), corrected.unfitting))
@@ -282,11 +287,7 @@ def calibrate(
     Warns:
         HandSimWarning: The points do not fit the hands or the glove, or a hand is kept as it was.
     """
-
-    def on_part(what: str, done: int, total: int) -> None:
-        on_step(what)
-        progress(done, total)
-
+    on_part = _parts(progress, on_step)
     source, frames, setup = _opened(capture, CalibrateSettings.of(settings, options))
     on_label = partial(on_part, "frames")
     take, setup, _ = _judged(
@@ -390,14 +391,24 @@ def _is_continuous(frames: Sequence[StreamedFrame]) -> bool:
     return bool(changes and np.mean([change < _CONTINUOUS for change in changes]) >= _MOST)
 
 
-def _calibrated(take: Take, setup: TrackerSetup) -> TrackerSetup:
+def _parts(progress: Progress, on_step: OnStep) -> OnPart:
+    """A callback of a step's name with what is done of it."""
+
+    def on_part(step: str, done: int, total: int) -> None:
+        on_step(step)
+        progress(done, total)
+
+    return on_part
+
+
+def _calibrated(take: Take, setup: TrackerSetup, on_part: OnPart) -> TrackerSetup:
     """Replace the hands of a setup by hands calibrated on a take, where these fit held-out frames better."""
     try:
-        done = calibrate_take(take, setup.start, setup.user)
+        done = calibrate_take(take, setup.start, setup.user, on_part)
     except CalibrationError as error:
         warnings.warn(f"not calibrated: {error}", HandSimWarning, stacklevel=4)
         return setup
-    found = kept_user(take, done, setup.user, "on the take itself")
+    found = kept_user(take, done, setup.user, "on the take itself", on_part)
     better = {hand.side: hand for hand in found}
     hands = tuple(better.get(hand.side, hand) for hand in setup.user)
     return setup.with_user(dataclasses.replace(found, hands=hands))

@@ -181,7 +181,9 @@ class ProgressBar:
         self._bar, self._task, self._step = bar, task, ""
 
     def __call__(self, done: int, total: int) -> None:
-        """Show what is done; this is a `handsim.callbacks.Progress`."""
+        """Show what is done, a `handsim.callbacks.Progress`; another total begins another estimate."""
+        if total != self._bar.tasks[0].total:
+            self._bar.reset(self._task, total=total)
         self._bar.update(self._task, completed=done, total=total, description=self._step)
 
     def advance(self, count: int = 1) -> None:

@@ -160,19 +160,14 @@ def _track_file(
     from track.live.live_tracking import LiveTake
 
     corrections = corrections_path(out)
-    after = iter([*["calibrating"] * settings.calibrate, *["smoothing"] * settings.smooth])
-    with progress_bar("frames") as bar:
-
-        def show(done: int, total: int) -> None:
-            bar.step(next(after, "") if done == total else "")
-            bar(done, total)
-
+    with progress_bar("") as bar:
         take = track_capture(
             capture,
             settings,
             corrections=corrections if corrections.exists() else None,
             sinks=sinks,
-            progress=show,
+            progress=bar,
+            on_step=bar.step,
             on_frame=on_frame,
         )
     with written_together():
