@@ -53,8 +53,9 @@ def export(
     if (out is None) == (scene is None) or (frame is not None and scene is None):
         raise ArgumentError("expected --out, or --scene and maybe --frame")
     if scene is not None:
-        if fps is not None or neutral is not None or guesses:
-            raise ArgumentError("given --fps, --neutral or --guesses and --scene, expected --out with them")
+        if fps is not None or forward is not None or neutral is not None or guesses:
+            given = "--fps, --forward, --neutral or --guesses"
+            raise ArgumentError(f"given {given} and --scene, expected --out with them")
         _export_scene(Path(source), scene, frame, up)
         return
     assert out is not None
