@@ -26,6 +26,7 @@ from handsim.motion_files.motion import OPENXR_JOINTS
 from handsim.space.transforms import rotation_quaternions
 from tests.sentences import error_names
 from track import Status, StreamedFrame, TrackedFrame, TrackedHand
+from track.output.lab_streaming import channels_of, sample_of
 from track.output.live_message import (
     FORMATS,
     LARGEST_DATAGRAM,
@@ -36,7 +37,8 @@ from track.output.live_message import (
     header_document,
     in_axes,
 )
-from track.output.sinks import channels_of, open_sink, osc_format, sample_of
+from track.output.osc import osc_format
+from track.output.sinks import open_sink
 
 DECODE = {"json": json.loads, "msgpack": msgpack.unpackb}
 
