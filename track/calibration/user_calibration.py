@@ -85,7 +85,7 @@ _USUAL_SPREAD_COORDINATES: Final = 12.0  # coordinates of markers that the usual
 _MOST_ERRORS: Final = 64  # independent errors that are kept of a hand: 99.9 % of its variances
 # How far a turn and a log length move a fingertip or its marker, roughly [m]: the largest errors are kept.
 _ARM, _BONE = 0.05, 0.03
-_INDEPENDENT_POSES: Final = 14.0  # number of frames with independent deformation of the flesh
+_INDEPENDENT_POSES: Final = 14.0  # number of frames with independent deformation of the flesh, at most
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -309,12 +309,13 @@ def _with_touches(
     frames = np.concatenate([chosen, touching])
     # Flesh moves alike in similar poses, so many frames tell no more about it than a few.
     flesh = repeated_share(track.qpos, track.residuals) * noise**2
+    repeats = len(frames) / min(independent_count(track.qpos[:, 7:]), _INDEPENDENT_POSES)
     larger = Problem(
         problem.shape,
         problem.design,
         problem.heights,
         markers[frames],
-        noise=float(np.sqrt(noise**2 + flesh * max(len(frames) / _INDEPENDENT_POSES - 1.0, 0.0))),
+        noise=float(np.sqrt(noise**2 + flesh * max(repeats - 1.0, 0.0))),
         robust_scale=_SCALE_IN_NOISES * noise,
         gestures=GESTURES_OF_USER,
     )
@@ -404,6 +405,15 @@ def repeated_share(qpos: Float[np.ndarray, "T 27"], residuals: Float[np.ndarray,
     products, squares = local * local[nearest], 0.5 * (local**2 + local[nearest] ** 2)
     both = np.isfinite(products)
     return float(np.clip(products[both].sum() / max(squares[both].sum(), 1e-18), 0.0, 1.0))
+
+
+def independent_count(values: Float[np.ndarray, "T J"]) -> float:
+    """Number of samples as independent as a sequence, by its autocorrelation up to where it vanishes."""
+    off = values - values.mean(axis=0)
+    spectrum = np.square(np.abs(np.fft.rfft(off, 2 * len(off), axis=0))).sum(axis=1)
+    correlation = np.fft.irfft(spectrum)[: len(off)]
+    ends = np.append(np.flatnonzero(correlation <= 0.0), len(off))[0]
+    return float(len(off) / max(2.0 * correlation[:ends].sum() / max(correlation[0], 1e-18) - 1.0, 1.0))
 
 
 def learn_spreads(problem: Problem, estimate: Estimate, fit: Fit) -> None:

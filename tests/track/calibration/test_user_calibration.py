@@ -17,7 +17,7 @@ from handsim.hand.shape import JOINT_NAMES, SIDES, named_shape
 from handsim.space.transforms import MIRROR
 from poses.motion import wrist_path
 from track import Calibration, HeldOut, Status, TrackedFrame, TrackedHand, User, load_user
-from track.calibration.user_calibration import MotionGuide, calibrate_hand
+from track.calibration.user_calibration import MotionGuide, calibrate_hand, independent_count
 from train.simulation.scenes import CalibrationTakeConfig, calibration_angles
 
 LAYOUT = load_layout("dense19")
@@ -102,6 +102,18 @@ def test_errors_are_as_large_as_told():
 
 
 @pytest.mark.slow
+def test_samples_that_follow_one_another_count_less(rng):
+    kept = np.array([0.0, 0.9])  # of each sample in the next one; such samples count (1 - kept) / (1 + kept)
+    noise = rng.normal(size=(20_000, 8, 1)) * np.sqrt(1.0 - kept**2)
+    values = noise.copy()
+    for number in range(1, len(values)):
+        values[number] += kept * values[number - 1]
+    for column, share in enumerate((1.0, 0.1 / 1.9)):
+        count = independent_count(values[..., column])
+        assert 0.8 * share * len(values) < count <= 1.2 * share * len(values)
+    assert independent_count(np.ones((50, 3))) == 50.0
+
+
 def test_touches_are_found_and_closed():
     _, result, _ = calibrated()["right"]
     fingers = {touch.finger for touch in result.touches if touch.weight > 0.5}
