@@ -104,6 +104,7 @@ class _OwnPackages(MetaPathFinder, Loader):
         """The specification of a module, if it is one of these."""
         if fullname in self.claimed:
             file = os.path.join(_own(fullname), "__init__.py")
+            _check_own(fullname, file)
             return importlib.util.spec_from_file_location(fullname, file)
         first, _, inner = fullname.partition(".")
         if first != "handsim" or inner.partition(".")[0] not in SIBLINGS:
@@ -154,6 +155,19 @@ def _own(name: str, home: str = _HOME) -> str:
     return os.path.join(home, name)
 
 
+def _check_own(name: str, file: str) -> None:
+    """Refuse another package's files in place of our own, as the PyPI package `render` leaves them there."""
+    try:
+        text = Path(file).read_text("utf-8", errors="replace")
+    except OSError:
+        text = ""
+    if "lazy_exports" not in text:
+        raise ShadowedPackageError(
+            f"handsim needs its own package '{name}', but {file} is {'of another' if text else 'missing'}; "
+            f"run `pip uninstall {name}`, then install handsim anew with pip's --force-reinstall --no-deps"
+        )
+
+
 def shadowed_siblings(home: str = _HOME) -> dict[str, str]:
     """Locations of siblings that are found elsewhere than in `home`, the folder that holds `handsim`."""
     found = {name: _location(name) for name in SIBLINGS}
@@ -190,7 +204,7 @@ def _location(name: str) -> str | None:
 
 def ensure_kernel_cache() -> None:
     """Name a temporary folder for compiled kernels if numba would find no other; workers inherit it."""
-    if not os.environ.get(VARIABLE) and not is_writable(_PACKAGE) and not is_writable(_user_cache()):
+    if not os.environ.get(VARIABLE) and not is_writable(_PACKAGE) and not is_writable(user_cache()):
         os.environ[VARIABLE] = str(_own_folder())
 
 
@@ -199,10 +213,10 @@ def kernel_cache() -> tuple[Path, bool]:
     given = os.environ.get(VARIABLE)
     if given:
         return Path(given), not Path(given).is_relative_to(tempfile.gettempdir())
-    return (_PACKAGE, True) if is_writable(_PACKAGE) else (_user_cache(), True)
+    return (_PACKAGE, True) if is_writable(_PACKAGE) else (user_cache(), True)
 
 
-def _user_cache() -> Path:
+def user_cache() -> Path:
     """The folder of a user's caches, as numba looks for it."""
     return Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"))
 

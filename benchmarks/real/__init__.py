@@ -1,1 +1,1 @@
-"""Public recordings of real hands, which everybody fetches from their authors: none of them is part of handsim."""
+"""Public recordings of real hands, which everybody fetches from their authors; none is part of handsim."""

@@ -23,6 +23,7 @@ from handsim import callbacks
 from handsim._version import full_version
 from handsim.app.messages import told_warnings
 from handsim.callbacks import before_compiling
+from handsim.cli.kept_help import print_help
 from handsim.errors import SENTENCE, HandSimError, choices, shortened
 from handsim.files.signals import Stopped, signals_raise
 
@@ -249,8 +250,6 @@ def _dispatch(commands: Table, args: Sequence[str]) -> int:
             return 2
         print(completion_script({name: load(target) for name, (target, _) in commands.items()}, args[1]))
     elif name in commands:
-        from handsim.cli.parsing import outline, run_command
-
         (target, help_line), prog, args = _chosen(commands, args)
         if any(map(_EMPTY.fullmatch, args)):  # the path "" would be the current folder
             print(
@@ -258,9 +257,18 @@ def _dispatch(commands: Table, args: Sequence[str]) -> int:
                 file=sys.stderr,
             )
             return 2
-        command = load(target) if isinstance(target, str) else outline(target)
+
+        def work() -> Any:
+            from handsim.cli.parsing import outline, run_command
+
+            command = load(target) if isinstance(target, str) else outline(target)
+            return run_command(command, prog=prog, help_line=help_line, args=args)
+
+        if list(args) in (["--help"], ["-h"]):
+            print_help(prog, work)
+            return 0
         with _compiled_ahead("-".join(prog.split()[1:])):
-            result = run_command(command, prog=prog, help_line=help_line, args=args)
+            result = work()
         return result if isinstance(result, int) else 0
     else:
         noun = "option" if name.startswith("-") else "command"
