@@ -53,16 +53,15 @@ def lazy_exports(package: str) -> tuple[Callable[[str], Any], Callable[[], list[
     """
     claim(*_NEEDS.get(package, ()))
     own = sys.modules[package]
-    body = ast.parse(Path(str(own.__file__)).read_text(encoding="utf-8")).body
-    lazy = {name: module for one in body if isinstance(one, ast.If) for name, module in _exports(one.body)}
-    public = sorted({*lazy, *dict(_exports(body)), "__version__"})
+    lazy, loaded = _public_names(Path(str(own.__file__)))
+    public = sorted({*lazy, *loaded, "__version__"})
     vars(own)["__all__"] = public
 
     def load(name: str) -> Any:
         if package == "handsim" and name in SIBLINGS:
             return importlib.import_module(f"handsim.{name}")
         if name not in lazy:
-            raise AttributeError(f"module '{package}' has no attribute '{name}'")
+            raise AttributeError(f"module '{package}' has no attribute '{name}'{_elsewhere(name)}")
         with own_numerics():
             module = importlib.import_module(lazy[name])
         value = getattr(module, name)
@@ -73,6 +72,22 @@ def lazy_exports(package: str) -> tuple[Callable[[str], Any], Callable[[], list[
         return value
 
     return load, lambda: sorted({*vars(own), *public})
+
+
+def _public_names(source: Path) -> tuple[dict[str, str], dict[str, str]]:
+    """Public names of a package with their modules: those that are imported at first use, and the others."""
+    body = ast.parse(source.read_text(encoding="utf-8")).body
+    lazy = {name: module for one in body if isinstance(one, ast.If) for name, module in _exports(one.body)}
+    return lazy, dict(_exports(body))
+
+
+def _elsewhere(name: str) -> str:
+    """Which of the packages has a public name, as the end of a sentence; empty if none does."""
+    for package in () if name.startswith("_") else ("handsim", *SIBLINGS):
+        source = Path(_own(package), "__init__.py")
+        if source.exists() and name in _public_names(source)[0]:
+            return f"; {package}.{name} has this name"
+    return ""
 
 
 def _exports(body: list[ast.stmt]) -> list[tuple[str, str]]:

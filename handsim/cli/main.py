@@ -105,6 +105,7 @@ def main(args: Sequence[str] | None = None) -> int:
     given = sys.argv[1:] if args is None else args
     given = [*given[1:], "--help"] if given and given[0] == "help" else given
     # A process that prints help alone needs no compiler, whose import takes long.
+    callbacks.is_command = True
     callbacks.runs_kernels = args is not None or given[-1:] not in (["--help"], ["-h"])
     return run(COMMANDS, given)
 

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+import handsim
 from handsim import ShadowedPackageWarning, _imports
 from handsim._imports import (
     SIBLINGS,
@@ -108,6 +109,13 @@ def test_files_of_another_package_in_place_of_ours_are_told_with_the_remedy(tmp_
         (home / "render" / "__init__.py").write_text(source)
     told = run_python("from handsim.render import draw", folder=home, check=False, PYTHONPATH=str(home))
     assert f"render/__init__.py {what}; run `pip uninstall render`" in told.stderr
+
+
+def test_a_public_name_of_another_package_is_told():
+    with pytest.raises(AttributeError, match=r"'handsim' has no attribute 'load_take'; gloves.load_take has"):
+        handsim.load_take  # noqa: B018
+    with pytest.raises(AttributeError, match=r"no attribute 'nonsense'$"):
+        handsim.nonsense  # noqa: B018
 
 
 def test_a_module_is_the_same_under_both_names() -> None:
