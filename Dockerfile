@@ -2,6 +2,8 @@
 #   docker build -t handsim . && docker run --rm -v "$PWD:/work" handsim track take.c3d --glove dense19 --out take.npz
 FROM python:3.12-slim-bookworm
 
+# Debian keeps no old versions of its packages, so that pinned ones would soon be gone.
+# hadolint ignore=DL3008
 RUN apt-get update \
     && apt-get install -y --no-install-recommends git libegl1 libegl-mesa0 libgl1-mesa-dri libgl1 libopengl0 \
     && rm -rf /var/lib/apt/lists/*

@@ -53,16 +53,15 @@ def lazy_exports(package: str) -> tuple[Callable[[str], Any], Callable[[], list[
     """
     claim(*_NEEDS.get(package, ()))
     own = sys.modules[package]
-    body = ast.parse(Path(str(own.__file__)).read_text(encoding="utf-8")).body
-    lazy = {name: module for one in body if isinstance(one, ast.If) for name, module in _exports(one.body)}
-    public = sorted({*lazy, *dict(_exports(body)), "__version__"})
+    lazy, loaded = _public_names(Path(str(own.__file__)))
+    public = sorted({*lazy, *loaded, "__version__"})
     vars(own)["__all__"] = public
 
     def load(name: str) -> Any:
         if package == "handsim" and name in SIBLINGS:
             return importlib.import_module(f"handsim.{name}")
         if name not in lazy:
-            raise AttributeError(f"module '{package}' has no attribute '{name}'")
+            raise AttributeError(f"module '{package}' has no attribute '{name}'{_elsewhere(name)}")
         with own_numerics():
             module = importlib.import_module(lazy[name])
         value = getattr(module, name)
@@ -73,6 +72,22 @@ def lazy_exports(package: str) -> tuple[Callable[[str], Any], Callable[[], list[
         return value
 
     return load, lambda: sorted({*vars(own), *public})
+
+
+def _public_names(source: Path) -> tuple[dict[str, str], dict[str, str]]:
+    """Public names of a package with their modules: those that are imported at first use, and the others."""
+    body = ast.parse(source.read_text(encoding="utf-8")).body
+    lazy = {name: module for one in body if isinstance(one, ast.If) for name, module in _exports(one.body)}
+    return lazy, dict(_exports(body))
+
+
+def _elsewhere(name: str) -> str:
+    """Which of the packages has a public name, as the end of a sentence; empty if none does."""
+    for package in () if name.startswith("_") else ("handsim", *SIBLINGS):
+        source = Path(_own(package), "__init__.py")
+        if source.exists() and name in _public_names(source)[0]:
+            return f"; {package}.{name} has this name"
+    return ""
 
 
 def _exports(body: list[ast.stmt]) -> list[tuple[str, str]]:
@@ -104,6 +119,7 @@ class _OwnPackages(MetaPathFinder, Loader):
         """The specification of a module, if it is one of these."""
         if fullname in self.claimed:
             file = os.path.join(_own(fullname), "__init__.py")
+            _check_own(fullname, file)
             return importlib.util.spec_from_file_location(fullname, file)
         first, _, inner = fullname.partition(".")
         if first != "handsim" or inner.partition(".")[0] not in SIBLINGS:
@@ -154,6 +170,19 @@ def _own(name: str, home: str = _HOME) -> str:
     return os.path.join(home, name)
 
 
+def _check_own(name: str, file: str) -> None:
+    """Refuse another package's files in place of our own, as the PyPI package `render` leaves them there."""
+    try:
+        text = Path(file).read_text("utf-8", errors="replace")
+    except OSError:
+        text = ""
+    if "lazy_exports" not in text:
+        raise ShadowedPackageError(
+            f"handsim needs its own package '{name}', but {file} is {'of another' if text else 'missing'}; "
+            f"run `pip uninstall {name}`, then install handsim anew with pip's --force-reinstall --no-deps"
+        )
+
+
 def shadowed_siblings(home: str = _HOME) -> dict[str, str]:
     """Locations of siblings that are found elsewhere than in `home`, the folder that holds `handsim`."""
     found = {name: _location(name) for name in SIBLINGS}
@@ -190,7 +219,7 @@ def _location(name: str) -> str | None:
 
 def ensure_kernel_cache() -> None:
     """Name a temporary folder for compiled kernels if numba would find no other; workers inherit it."""
-    if not os.environ.get(VARIABLE) and not is_writable(_PACKAGE) and not is_writable(_user_cache()):
+    if not os.environ.get(VARIABLE) and not is_writable(_PACKAGE) and not is_writable(user_cache()):
         os.environ[VARIABLE] = str(_own_folder())
 
 
@@ -199,10 +228,10 @@ def kernel_cache() -> tuple[Path, bool]:
     given = os.environ.get(VARIABLE)
     if given:
         return Path(given), not Path(given).is_relative_to(tempfile.gettempdir())
-    return (_PACKAGE, True) if is_writable(_PACKAGE) else (_user_cache(), True)
+    return (_PACKAGE, True) if is_writable(_PACKAGE) else (user_cache(), True)
 
 
-def _user_cache() -> Path:
+def user_cache() -> Path:
     """The folder of a user's caches, as numba looks for it."""
     return Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"))
 

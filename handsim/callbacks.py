@@ -22,6 +22,8 @@ def no_step(name: str) -> None:
 
 runs_kernels = True
 """Whether this process may call kernels; one that prints help leaves them as they are, and numba out."""
+is_command = False
+"""Whether this process is a command, which tells that it compiles by itself."""
 before_compiling: list[Callable[[], None]] = []
 """Callbacks; the last one is removed and called before a kernel that the cache lacks is compiled."""
 

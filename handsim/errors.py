@@ -89,6 +89,8 @@ def choices(given: str, valid: Iterable[str], *, noun: str) -> str:
     names = list(valid)
     given = shortened(given, 120)
     near = difflib.get_close_matches(given, names, n=1)
+    if not near and given.strip("-"):  # one letter: of another case, or of an option
+        near = [one for one in names if one.lower() == given.lower() or one.startswith(f"-{given}")]
     hint = f" (did you mean '{near[0]}'?)" if near else ""
     return f"unknown {noun} '{given}'{hint}; valid names: {', '.join(names)}"
 

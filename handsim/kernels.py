@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import logging
+import multiprocessing
 from collections.abc import Callable
 from typing import Any, ParamSpec, TypeVar, overload
 
@@ -68,7 +70,19 @@ def _load_or_prepare(load: Callable[..., Any], types: object, target: object) ->
     while found is None and before_compiling:
         before_compiling.pop()()
         found = load(types, target)
+    if found is None:
+        _tell_program()
     return found
+
+
+@functools.cache
+def _tell_program() -> None:
+    """Tell once, in a program that is no command, why its first calls take long."""
+    if not callbacks.is_command and multiprocessing.parent_process() is None:
+        logging.getLogger("handsim").warning(
+            "handsim: compiling, once on this machine, which can take minutes; "
+            "`handsim doctor --compile` compiles everything on all cores"
+        )
 
 
 def _save_by_types(kept: Any, save: Callable[..., None], key: object, data: object) -> None:

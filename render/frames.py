@@ -148,6 +148,12 @@ class RenderedFrame:
     choices: Mapping[str, Any]
     """Every random choice that made the pictures, as JSON."""
 
+    def __repr__(self) -> str:
+        """What the frame holds, without its arrays."""
+        hands = " and ".join(hand.shape.side for hand in self.hands) or "no hands"
+        size = " x ".join(map(str, self.camera.size))
+        return f"RenderedFrame({self.key} at {self.time:.3f} s, {size}: {hands}; {len(self.points)} points)"
+
     @property
     def rgb(self) -> UInt8[np.ndarray, "H W 3"] | None:
         """The perfect color picture (sRGB); `noisy.rgb` is the simulated sensor's."""

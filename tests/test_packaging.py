@@ -80,8 +80,9 @@ def test_workflows_call_targets_and_files_that_exist(path) -> None:
 
 def test_the_recipe_for_conda_has_every_dependency() -> None:
     recipe = yaml.safe_load((ROOT / "conda" / "recipe.yaml").read_text("utf-8"))
-    renamed = {"mujoco-python": "mujoco", "pytorch": "torch", "openexr-python": "openexr",
-               "py-opencv": "opencv-python-headless", "matplotlib-base": "matplotlib"}  # fmt: skip
+    renamed = {"mujoco-python": "mujoco", "pytorch": "torch", "pytorch-lightning": "lightning-fabric",
+               "openexr-python": "openexr", "py-opencv": "opencv-python-headless",
+               "matplotlib-base": "matplotlib"}  # fmt: skip
     named = {
         renamed.get(name, name): limits for name, limits in map(str.split, recipe["requirements"]["run"])
     }

@@ -23,6 +23,7 @@ from handsim import callbacks
 from handsim._version import full_version
 from handsim.app.messages import told_warnings
 from handsim.callbacks import before_compiling
+from handsim.cli.kept_help import print_help
 from handsim.errors import SENTENCE, HandSimError, choices, shortened
 from handsim.files.signals import Stopped, signals_raise
 
@@ -104,6 +105,7 @@ def main(args: Sequence[str] | None = None) -> int:
     given = sys.argv[1:] if args is None else args
     given = [*given[1:], "--help"] if given and given[0] == "help" else given
     # A process that prints help alone needs no compiler, whose import takes long.
+    callbacks.is_command = True
     callbacks.runs_kernels = args is not None or given[-1:] not in (["--help"], ["-h"])
     return run(COMMANDS, given)
 
@@ -249,8 +251,6 @@ def _dispatch(commands: Table, args: Sequence[str]) -> int:
             return 2
         print(completion_script({name: load(target) for name, (target, _) in commands.items()}, args[1]))
     elif name in commands:
-        from handsim.cli.parsing import outline, run_command
-
         (target, help_line), prog, args = _chosen(commands, args)
         if any(map(_EMPTY.fullmatch, args)):  # the path "" would be the current folder
             print(
@@ -258,9 +258,18 @@ def _dispatch(commands: Table, args: Sequence[str]) -> int:
                 file=sys.stderr,
             )
             return 2
-        command = load(target) if isinstance(target, str) else outline(target)
+
+        def work() -> Any:
+            from handsim.cli.parsing import outline, run_command
+
+            command = load(target) if isinstance(target, str) else outline(target)
+            return run_command(command, prog=prog, help_line=help_line, args=args)
+
+        if list(args) in (["--help"], ["-h"]):
+            print_help(prog, work)
+            return 0
         with _compiled_ahead("-".join(prog.split()[1:])):
-            result = run_command(command, prog=prog, help_line=help_line, args=args)
+            result = work()
         return result if isinstance(result, int) else 0
     else:
         noun = "option" if name.startswith("-") else "command"
@@ -297,3 +306,7 @@ def _print_overview(commands: Table) -> None:
     console.print("usage: handsim COMMAND [OPTIONS]\n", markup=False)
     console.print(table)
     console.print("\nhandsim COMMAND --help tells a command's options; handsim --version, the version.")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

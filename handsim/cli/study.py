@@ -76,7 +76,8 @@ def study_files(
 ) -> list[StudyFile]:
     """The files of a study, whose outputs have the endings `written`, from files, folders and tables."""
     if out is None or (sources and out.suffix.lower() in written and not out.is_dir()):
-        raise ArgumentError(f"--out is {out} for several captures, expected a folder")
+        meant = f"; did you mean --out {sources[-1]}?" if out is None and not sources[-1].exists() else ""
+        raise ArgumentError(f"--out is {out} for several captures, expected a folder{meant}")
     files = list[StudyFile]()
     for given in sources:
         if given.is_dir():

@@ -86,7 +86,7 @@ def track(
     if out is not None:
         check_take_file(out, live=live is not None)
     elif capture is not None or labeled is not None or not send:
-        given = f"a capture, {capture}" if capture is not None else f"--live {live}"
+        given = f"the capture {capture}" if capture is not None else f"--live {live}"
         given += "" if labeled is None else f" and --labeled {labeled}"
         expected = "--out FILE.npz" + ", --send ADDRESS or both" * (capture is None and labeled is None)
         raise ArgumentError(f"given {given} without --out, expected {expected}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 import types
@@ -11,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+import handsim
 from handsim import ShadowedPackageWarning, _imports
 from handsim._imports import (
     SIBLINGS,
@@ -96,6 +98,24 @@ def test_a_script_of_such_a_name_works_by_the_safe_names(tmp_path, name):
         [sys.executable, script], capture_output=True, text=True, env=environment, check=False
     )
     assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize(("source", "what"), [("x = 1\n", "is of another"), (None, "is missing")])
+def test_files_of_another_package_in_place_of_ours_are_told_with_the_remedy(tmp_path, source, what):
+    home = tmp_path / "site"
+    shutil.copytree(ROOT / "handsim", home / "handsim", ignore=shutil.ignore_patterns("__pycache__", "data"))
+    if source is not None:
+        (home / "render").mkdir()
+        (home / "render" / "__init__.py").write_text(source)
+    told = run_python("from handsim.render import draw", folder=home, check=False, PYTHONPATH=str(home))
+    assert f"render/__init__.py {what}; run `pip uninstall render`" in told.stderr
+
+
+def test_a_public_name_of_another_package_is_told():
+    with pytest.raises(AttributeError, match=r"'handsim' has no attribute 'load_take'; gloves.load_take has"):
+        handsim.load_take  # noqa: B018
+    with pytest.raises(AttributeError, match=r"no attribute 'nonsense'$"):
+        handsim.nonsense  # noqa: B018
 
 
 def test_a_module_is_the_same_under_both_names() -> None:

@@ -34,6 +34,7 @@ from handsim.kernels import (
 from handsim.space.transforms import quaternion_matrix, random_quaternions, rigid_fit
 from poses.contact import digit_parts
 from poses.shapes import HIGH, LOW
+from tests.programs import run_python
 
 SEEDS = st.integers(0, 100_000)
 
@@ -233,3 +234,14 @@ def test_what_prepares_kernels_is_called_once_before_one_is_compiled(tmp_path, m
 
     compiled = kernel(twice)
     assert (compiled(1.5), compiled(1), called) == (3.0, 2, [1])
+
+
+def test_a_program_is_told_once_that_its_first_calls_compile(tmp_path):
+    source = tmp_path / "doubled.py"
+    source.write_text(
+        "from handsim.kernels import kernel\n\n\n@kernel\ndef twice(x):\n    return x + x\n\n\n"
+        "print(twice(1), twice(1.5))\n"
+    )
+    first, again = (run_python(f"import runpy; runpy.run_path({str(source)!r})") for _ in range(2))
+    assert first.stdout == again.stdout == "2 3.0\n"
+    assert first.stderr.count("compiling, once on this machine") == 1 and again.stderr == ""

@@ -43,11 +43,14 @@ finally:
         "export",
     ],
 )
-def test_help_loads_nothing_heavy(command):
-    told = run_python(CODE.format(heavy=HEAVY), *command.split(), "--help", check=False)
+def test_help_loads_nothing_heavy(command, tmp_path):
+    own = {"XDG_CACHE_HOME": str(tmp_path)}  # no kept page
+    told = run_python(CODE.format(heavy=HEAVY), *command.split(), "--help", check=False, **own)
     assert told.returncode == 0, told.stderr
     assert f"usage: handsim {command}" in told.stdout
     assert told.stdout.splitlines()[-1] == "loaded"
+    kept = run_python(CODE.format(heavy=(*HEAVY, "tyro", "numpy")), *command.split(), "--help", **own)
+    assert kept.stdout == told.stdout
 
 
 def test_kernels_stay_compiled_in_a_program_that_asks_for_help():

@@ -101,6 +101,7 @@ def test_wrong_options_are_usage(args, invoke, capsys):
     ("args", "said"),
     [
         (["--tims", "3"], "unknown option '--tims' (did you mean '--times'?); valid names: --help, --name, "),
+        (["-t", "3"], "unknown option '-t' (did you mean '--times'?); valid names: --help, --name, "),
         (["--times", "3", "4"], "'4' after '3' is one value too many; valid options: --help, --name, "),
         (["x"], "'x' after 'y' is one value too many; valid options: --help, --name, --times; see "),
     ],

@@ -199,6 +199,8 @@ def test_one_capture_has_one_file(tmp_path, capsys):
     ):
         assert main([command, *both, "--out", str(tmp_path / name)]) == 1
         assert f"{name} for several captures, expected a folder" in capsys.readouterr().err
+    assert main(["track", both[0], str(tmp_path / "new.npz")]) == 1
+    assert f"expected a folder; did you mean --out {tmp_path / 'new.npz'}?" in capsys.readouterr().err
     assert main(["track", *both, "--out", str(tmp_path), "--labeled", "a.trc"]) == 1
     assert "expected one capture" in capsys.readouterr().err
     for command in ("track", "calibrate"):

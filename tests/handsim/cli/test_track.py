@@ -662,8 +662,8 @@ def test_hands_are_sent_without_a_recording(capture, tmp_path, capsys, monkeypat
             "--live natnet://host",
             "given --live natnet://host without --out | --out FILE.npz, --send ADDRESS or",
         ),
-        ("take.c3d", "given a capture, take.c3d without --out, expected --out FILE.npz"),
-        ("take.c3d --send udp://:9", "given a capture, take.c3d without --out, expected --out FILE.npz"),
+        ("take.c3d", "given the capture take.c3d without --out, expected --out FILE.npz"),
+        ("take.c3d --send udp://:9", "given the capture take.c3d without --out, expected --out FILE.npz"),
         (
             "--live natnet://host --send udp://:9 --labeled l.trc",
             "and --labeled l.trc without --out, expected",

@@ -1,0 +1,79 @@
+"""Help pages are kept, one file a command: tyro and the command's modules take up to a second to write one.
+
+A page is kept for what it depends on: the sources of handsim and of tyro, Python, and the terminal. Nothing
+else may stand in a page, such as the names of files that are there.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import importlib.util
+import io
+import os
+import shutil
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+from handsim._imports import SIBLINGS, user_cache
+
+_VARIABLES: Final = ("FORCE_COLOR", "NO_COLOR", "TERM")
+
+
+class _Page(io.StringIO):
+    """A page that takes itself for the standard output, whose terminal may have colors and boxes."""
+
+    encoding = getattr(sys.__stdout__, "encoding", "utf-8")
+
+    def isatty(self) -> bool:
+        """Whether the page is shown by a terminal."""
+        return sys.__stdout__ is not None and sys.__stdout__.isatty()
+
+
+def print_help(prog: str, make: Callable[[], object]) -> None:
+    """Print the help of a command: the kept page, or the one that `make` prints, which is kept.
+
+    Raises:
+        SystemExit: After a page that `make` has printed, with its exit code.
+    """
+    page = _Page()
+    key = hashlib.sha256(repr(_state(page)).encode()).hexdigest()
+    path = user_cache() / "handsim" / "help" / f"{prog.replace(' ', '-')}.txt"
+    with contextlib.suppress(OSError, ValueError):
+        found, _, text = path.read_text("utf-8").partition("\n")
+        if found == key:
+            print(text, end="")
+            return
+    try:
+        with contextlib.redirect_stdout(page):
+            make()
+    except SystemExit as end:
+        if not end.code:
+            _keep(path, f"{key}\n{page.getvalue()}")
+        raise
+    finally:
+        print(page.getvalue(), end="")
+
+
+def _state(page: _Page) -> list[object]:
+    """What a page depends on."""
+    home = Path(__file__).parents[2]
+    tyro = importlib.util.find_spec("tyro")
+    files = [tyro.origin] if tyro is not None and tyro.origin else []
+    for package in ("handsim", *SIBLINGS):
+        for folder, _, names in os.walk(home / package):
+            files += [os.path.join(folder, name) for name in names if name.endswith(".py")]
+    times = sorted((file, os.stat(file).st_mtime_ns) for file in files)
+    shown = (page.isatty(), page.encoding, shutil.get_terminal_size().columns)
+    return [times, sys.version, shown, [os.environ.get(name) for name in _VARIABLES]]
+
+
+def _keep(path: Path, text: str) -> None:
+    """Keep a page where there is room for it."""
+    with contextlib.suppress(OSError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        own = path.with_name(f"{path.name}.{os.getpid()}")
+        own.write_text(text, "utf-8")
+        own.replace(path)
