@@ -254,7 +254,8 @@ def calibrate_hand(
     usable = usable_frames(markers, start)
     seen, complete = markers[usable], complete_digits(markers[usable], right.attachment)
     # Solve poses of frames spread over the capture, with the first hand.
-    some = seen[:: max(1, len(usable) // _INITIAL_FRAMES)]
+    every = max(1, len(usable) // _INITIAL_FRAMES)
+    some = seen[::every]
     track = PoseSolver(right).solve(some)
     chosen, scales = informative_frames(track, some), {"noise": _FIRST_NOISE, "robust_scale": _FIRST_SCALE}
     problem, estimate = first_estimate(
@@ -265,7 +266,7 @@ def calibrate_hand(
     problem.robust_scale = _SCALE_IN_NOISES * marker_noise(problem, fit)
     estimate, fit, steps = levenberg_marquardt(problem, estimate, steps, _STEPS_WITHOUT_CONTACTS, progress)
     rough = user_hand(right, problem, estimate)
-    rough_track = PoseSolver(rough).solve(seen)
+    rough_track = PoseSolver(rough).solve(seen, track.qpos[np.arange(len(seen)) // every])
     touches = find_touches(rough.model, rough_track.qpos[:, 7:], complete, rate)
     problem, estimate, touches = _with_touches(problem, estimate, fit, seen, rough_track, touches)
     for last in np.linspace(steps, MOST_STEPS, 1 + _SPREAD_ROUNDS).astype(int)[1:]:

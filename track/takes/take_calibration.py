@@ -126,8 +126,9 @@ def _tried(markers: Float[np.ndarray, "T M 3"], before: GloveFit, after: GloveFi
     if not len(frames):
         return None
     seen = markers[frames[:: -(-len(frames) // _MOST_CHECKED)]]
-    off = [float(np.median(PoseSolver(hand).solve(seen).rms)) for hand in (before, after)]
-    return HeldOut(off[0], off[1], len(seen))
+    first = PoseSolver(before).solve(seen)
+    last = PoseSolver(after).solve(seen, first.qpos)
+    return HeldOut(float(np.median(first.rms)), float(np.median(last.rms)), len(seen))
 
 
 def _steps(side: Side, on_part: OnPart) -> Progress:
