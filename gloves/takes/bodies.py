@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 
 from gloves.takes.archives import names_of
 from gloves.takes.points import BODY_MARKERS
+from handsim._checks import check_choice
 from handsim.errors import ArgumentError
+from handsim.hand.shape import SIDES, Side
 from handsim.space.objects import Part, RigidObject, named_object, object_names
 
 _VERTICES: Final = "body_vertices_{}"
@@ -24,7 +26,7 @@ class RigidBody:
     """A rigid body with markers of its own.
 
     Raises:
-        ArgumentError: A name is no text, or there is not one position per marker.
+        ArgumentError: A name is no text, there is not one position per marker, or the forearm is no side.
     """
 
     name: str
@@ -33,6 +35,10 @@ class RigidBody:
     """Markers in the body's own frame [m]."""
     surface: RigidObject | None = None
     """The body's own surface; None if it has none, or is an object that comes with handsim."""
+    forearm: Side | None = None
+    """The hand whose forearm it is."""
+    has_axes: bool = False
+    """Whether its frame is that of a forearm: that of the hand's wrist when the wrist is straight."""
 
     @classmethod
     def of(cls, thing: RigidObject) -> RigidBody:
@@ -48,6 +54,8 @@ class RigidBody:
             )
         if not all(isinstance(name, str) for name in (self.name, *self.marker_names)):
             raise ArgumentError(f"{self.name!r}: a name is no text, expected text for body and markers")
+        if self.forearm is not None:
+            check_choice(self.forearm, SIDES, noun="side of a forearm")
 
     @property
     def shape(self) -> RigidObject | None:
@@ -58,8 +66,9 @@ class RigidBody:
 
     def record(self) -> dict[str, Any]:
         """The body in the header of a take's file, without its arrays."""
-        named = {"name": self.name, "marker_names": list(self.marker_names)}
-        return named if self.surface is None else named | {"surface": True}
+        named: dict[str, Any] = {"name": self.name, "marker_names": list(self.marker_names)}
+        named |= {} if self.surface is None else {"surface": True}
+        return named if self.forearm is None else named | {"forearm": self.forearm, "axes": self.has_axes}
 
 
 def body_arrays(bodies: Sequence[RigidBody]) -> dict[str, NDArray[Any]]:
@@ -78,11 +87,12 @@ def stored_body(
 ) -> RigidBody:
     """A body of a file by its record; `RigidObject` checks the arrays of its surface."""
     name, marker_names = stored["name"], names_of(stored["marker_names"])
+    forearm = stored.get("forearm"), bool(stored.get("axes", False))
     positions = arrays[BODY_MARKERS.name][markers.start : markers.stop]
     if not stored.get("surface", False):
-        return RigidBody(name, marker_names, positions)
+        return RigidBody(name, marker_names, positions, None, *forearm)
     vertices, faces = (arrays[key.format(number)] for key in (_VERTICES, _FACES))
     hull = Part("mesh", np.zeros(3), np.eye(4), vertices)
     upright = np.tile([0.0, 0.0, 1.0], (len(positions), 1))  # a file has no normals under markers
     thing = RigidObject(name, vertices, faces, (hull,), marker_names, positions, upright)
-    return RigidBody(name, marker_names, positions, thing)
+    return RigidBody(name, marker_names, positions, thing, *forearm)

@@ -53,7 +53,7 @@ from handsim._version import full_version
 from handsim.cards import card, span_drawing
 from handsim.errors import ArgumentError, HandSimWarning, choices
 from handsim.files.outputs import check_ending
-from handsim.hand.angles import ISB_NAMES, Convention, isb_angles
+from handsim.hand.angles import ISB_NAMES, WRIST_NAMES, Convention, isb_angles, wrist_angles
 from handsim.hand.model import (
     KEYPOINT_NAMES,
     HandMotion,
@@ -65,7 +65,7 @@ from handsim.hand.model import (
 )
 from handsim.hand.shape import JOINT_NAMES, NUM_JOINTS, NUM_KEYPOINTS, Side
 from handsim.motion_files.motion import Motion, PosedBody, PosedHand
-from handsim.space.transforms import FORWARD, ForwardAxis, UpAxis, facing, turned_poses
+from handsim.space.transforms import FORWARD, ForwardAxis, UpAxis, facing, quaternion_matrix, turned_poses
 
 SUFFIX: Final = ".truth.npz"
 """Ending of the name of a simulated take that lies beside its capture."""
@@ -141,6 +141,8 @@ class Take:
     """Standard deviation of each joint angle [rad]; NaN where a hand has no pose, None if unknown."""
     keypoint_spread: Float[np.ndarray, "T H 21"] | None = None
     """Standard deviation of each keypoint per axis [m]; NaN where a hand has no pose, None if unknown."""
+    wrist_spread: Float[np.ndarray, "T H 2"] | None = None
+    """Standard deviation of the angles of each wrist [rad]; NaN without a forearm, None if unknown."""
 
     def __init__(
         self,
@@ -165,10 +167,12 @@ class Take:
         numbers: ArrayLike | None = None,
         angle_spread: ArrayLike | None = None,
         keypoint_spread: ArrayLike | None = None,
+        wrist_spread: ArrayLike | None = None,
     ) -> None:
         by_frame = dict(times=times, qpos=qpos, status=status, rms=rms, body_poses=body_poses,
                         body_status=body_status, body_rms=body_rms, numbers=numbers,
-                        angle_spread=angle_spread, keypoint_spread=keypoint_spread)  # fmt: skip
+                        angle_spread=angle_spread, keypoint_spread=keypoint_spread,
+                        wrist_spread=wrist_spread)  # fmt: skip
         tables = dict(points=points, ids=ids, labels=labels, confidence=confidence)
         given = {name: table for name, table in tables.items() if table is not None}
         check_type("hands", hands, Sequence, "a list of GloveFits")
@@ -344,7 +348,9 @@ class Take:
 
         Args:
             side: The hand.
-            convention: `model` for the hinges of the model, `isb` for angles as the ISB writes them.
+            convention: `model` for the hinges of the model, `isb` for angles as the ISB writes them, with
+                those of the wrist (`WRIST_NAMES`) if the hand's forearm is among the bodies: NaN without a
+                neutral pose and without axes of the forearm.
             neutral: The first and the last time [s] of a pose of which all angles are taken as zero, such as
                 the flat hand for a second, or the take of a trial that shows this pose; zero of the
                 convention when not given.
@@ -361,14 +367,69 @@ class Take:
         zero = None if neutral is None else self.mean_pose(side, neutral)
         if convention == "isb":
             parts = [isb_angles(hands[number].shape, angles[one], zero) for one, hands in self.worn()]
-            return _Angles(zip(ISB_NAMES, np.concatenate(parts).T, strict=True))
+            found = _Angles(zip(ISB_NAMES, np.concatenate(parts).T, strict=True))
+            if (wrist := self.wrist_angles(side, neutral)) is not None:
+                found.update(zip(WRIST_NAMES, wrist.T, strict=True))
+            return found
         return _Angles(zip(JOINT_NAMES, (angles if zero is None else angles - zero).T, strict=True))
+
+    def forearm_index(self, side: Side) -> int | None:
+        """The index of a hand's forearm among the bodies; None if there is none."""
+        return next((number for number, body in enumerate(self.bodies) if body.forearm == side), None)
+
+    def wrist_angles(
+        self, side: Side, neutral: tuple[float, float] | Take | None
+    ) -> Float[np.ndarray, "T 2"] | None:
+        """The angles `WRIST_NAMES` of a hand [rad]; None if its forearm is not among the bodies.
+
+        They are NaN where hand or forearm have no pose. The axes of the forearm are those of the hand in the
+        neutral pose, else those of the body; if it has none, all are NaN.
+        """
+        from scipy.spatial.transform import Rotation
+
+        if (body := self.forearm_index(side)) is None:
+            return None
+        turns = self.turns_on(body, side)
+        if neutral is not None:
+            take, there = self._neutral_frames(side, neutral)
+            other = take.forearm_index(side)
+            straight = turns[:0] if other is None else take.turns_on(other, side)[there]
+            straight = straight[np.isfinite(straight[:, 0, 0])]
+            zero = (
+                Rotation.from_matrix(straight).mean().as_matrix()
+                if len(straight)
+                else np.full((3, 3), np.nan)
+            )
+            turns = zero.T @ turns
+        elif not self.bodies[body].has_axes:
+            turns = np.full_like(turns, np.nan)
+        return wrist_angles(side, turns)
+
+    def turns_on(self, body: int, side: Side) -> Float[np.ndarray, "T 3 3"]:
+        """Rotations of a hand in the frame of a body, by the index of this; NaN where one has no pose."""
+        axes = quaternion_matrix(self.body_poses[:, body, 3:])
+        return np.asarray(axes.swapaxes(1, 2) @ quaternion_matrix(self.qpos[:, self.hand_index(side), 3:7]))
 
     def mean_pose(self, side: Side, between: tuple[float, float] | Take) -> Float[np.ndarray, "20"]:
         """The mean joint angles of a hand between two times, or in another take [rad]; warns if it moves."""
+        take, there = self._neutral_frames(side, between)
+        angles, times = take.qpos[there, take.hand_index(side), 7:], take.times[there]
+        spread = np.rad2deg(angles.std(axis=0))
+        if spread.max() > _STILL:
+            moving = f"{JOINT_NAMES[spread.argmax()]} by {spread.max():.1f} degrees (standard deviation)"
+            text = (
+                f"the {side} hand moves from {times[0]:g} to {times[-1]:g} s, {moving}; expected a still pose"
+            )
+            warnings.warn(text, HandSimWarning, stacklevel=3)
+        return np.asarray(angles.mean(axis=0))
+
+    def _neutral_frames(
+        self, side: Side, between: tuple[float, float] | Take
+    ) -> tuple[Take, Bool[np.ndarray, "T"]]:
+        """The take of a neutral pose, and its frames in which the hand is tracked then."""
         if isinstance(between, Take):
             end = float(np.nextafter(between.times[-1], np.inf))  # after the start also of one frame
-            return between.mean_pose(side, (float(between.times[0]), end))
+            return between._neutral_frames(side, (float(between.times[0]), end))
         first, last = between
         if not first < last:
             raise ArgumentError(f"neutral is {first:g} to {last:g} s, expected the earlier time first")
@@ -378,20 +439,17 @@ class Take:
                 f"neutral is {first:g} to {last:g} s, where the {side} hand has no pose; expected a part of "
                 f"{self.times[0]:g} to {self.times[-1]:g} s in which it is tracked"
             )
-        angles = self.qpos[there, self.hand_index(side), 7:]
-        spread = np.rad2deg(angles.std(axis=0))
-        if spread.max() > _STILL:
-            moving = f"{JOINT_NAMES[spread.argmax()]} by {spread.max():.1f} degrees (standard deviation)"
-            text = f"the {side} hand moves from {first:g} to {last:g} s, {moving}; expected a still pose"
-            warnings.warn(text, HandSimWarning, stacklevel=3)
-        return np.asarray(angles.mean(axis=0))
+        return self, there
 
     def angle_spreads(self, side: Side) -> dict[str, Float[np.ndarray, "T"]]:
         """The standard deviation of each joint's angle over time [rad]; NaN where it is not known."""
         spread = self.angle_spread
         if spread is None:
             spread = np.full((*self.status.shape, NUM_JOINTS), np.nan, dtype=np.float32)
-        return _Angles(zip(JOINT_NAMES, spread[:, self.hand_index(side)].T, strict=True))
+        found = _Angles(zip(JOINT_NAMES, spread[:, self.hand_index(side)].T, strict=True))
+        if self.wrist_spread is not None and self.forearm_index(side) is not None:
+            found.update(zip(WRIST_NAMES, self.wrist_spread[:, self.hand_index(side)].T, strict=True))
+        return found
 
     def is_tracked(self, side: Side) -> Bool[np.ndarray, "T"]:
         """Frames in which a hand's pose follows from the points; in the others it coasts or is lost."""
@@ -779,7 +837,7 @@ def posed_motion(
     hands = [
         PosedHand.of(
             hand.model, take.qpos[:, n], zeros[n], [(one.stop, one.hands[n].model) for one in take.former]
-        )._replace(shown=shown.get(hand.side))
+        )._replace(shown=shown.get(hand.side), wrist=take.wrist_angles(hand.side, neutral))
         for n, hand in enumerate(take.hands)
     ]
     bodies = [PosedBody.of(one.name, one.shape, take.body_poses[:, n]) for n, one in enumerate(take.bodies)]
@@ -918,7 +976,7 @@ def _check(take: Take) -> None:
         _check_range(body.positions, -_MAX_LENGTH, _MAX_LENGTH)
         if body.surface is not None:
             _check_range(body.surface.vertices, -_MAX_LENGTH, _MAX_LENGTH)
-    for distances in (take.rms, take.body_rms, take.angle_spread, take.keypoint_spread):
+    for distances in (take.rms, take.body_rms, take.angle_spread, take.keypoint_spread, take.wrist_spread):
         if distances is not None:
             _check_range(distances, 0.0, _MAX_LENGTH)
     _check_range(take.times, -_MAX_TIME, _MAX_TIME)

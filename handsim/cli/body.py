@@ -11,10 +11,18 @@ import tyro
 from handsim.app.messages import print_line
 from handsim.errors import ArgumentError
 from handsim.files.outputs import as_text, check_outputs
+from handsim.hand.shape import Side
 from handsim.space.objects import named_object
 
 
-def body(source: Annotated[Path, tyro.conf.Positional], *, out: Path) -> None:
+def body(
+    source: Annotated[Path, tyro.conf.Positional],
+    *,
+    out: Path,
+    markers: tuple[str, ...] = (),
+    forearm: Side | None = None,
+    landmarks: tuple[str, ...] = (),
+) -> None:
     """Write the markers of a rigid body, from a capture of the moving body and nothing else.
 
     The body has the name of the file, and its markers are Marker1, Marker2, ...; both may be changed there.
@@ -23,14 +31,21 @@ def body(source: Annotated[Path, tyro.conf.Positional], *, out: Path) -> None:
         source: A .trc, .c3d, .csv (Motive, Vicon) or .tsv (Qualisys) file, whose names are not used; or the
             .truth.npz of a simulated capture, for its object.
         out: The body's file, .toml.
+        markers: Columns of a labeled capture that are the body's markers; all when none is given.
+        forearm: The hand whose forearm carries the markers.
+        landmarks: Columns of a labeled capture at the forearm's radial styloid, ulnar styloid and one or two
+            epicondyles, which give its axes; without them a neutral pose does.
     """
     from gloves.captures.formats import read_capture
     from gloves.takes.take import SUFFIX, load_take
+    from track.bodies.forearm import forearm_of_landmarks
     from track.bodies.rigid_body import SUFFIX as TOML
     from track.bodies.rigid_body import RigidTemplate, learn_body, save_body
 
     check_outputs([source], [out], TOML)
     if source.name.endswith(SUFFIX):
+        if markers or forearm or landmarks:
+            raise ArgumentError(f"{source}: the object of a take has no columns, expected a labeled capture")
         bodies = load_take(source).bodies
         if not bodies:
             raise ArgumentError(
@@ -38,7 +53,10 @@ def body(source: Annotated[Path, tyro.conf.Positional], *, out: Path) -> None:
             )
         found = RigidTemplate.of(named_object(bodies[0].name))
     else:
-        found = learn_body(read_capture(source), as_text(out.stem))
+        capture = read_capture(source)
+        found = learn_body(capture, as_text(out.stem), markers, forearm)
+        if landmarks:
+            found = forearm_of_landmarks(found, capture, landmarks)
     save_body(out, found)
     widest = 1e3 * np.max(found.distances)
     print_line(f"{out}: {found.name}, {len(found.positions)} markers, at most {widest:.1f} mm apart")

@@ -6,6 +6,9 @@ deviation), and about Y of the outer bone (pronation). A left hand is mirrored f
 
 A finger's metacarpal has the axes of the flat finger. Skin markers do not measure the trapezium, so the first
 metacarpal turns relative to the hand: towards the palm, to the thumb's side, and about its length.
+
+The wrist is the third metacarpal relative to the forearm, as in section 4 of Wu and others: both have the same
+axes when the wrist is straight. Its pronation is skin that moves over the radius, and is left out.
 """
 
 from __future__ import annotations
@@ -16,8 +19,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from handsim.hand.shape import DIGITS, JOINT_NAMES, HandShape
-from handsim.space.transforms import axis_angle_matrix, euler_matrix
+from handsim.hand.shape import DIGITS, JOINT_NAMES, HandShape, Side
+from handsim.space.transforms import MIRROR, axis_angle_matrix, euler_matrix
 
 Convention = Literal["model", "isb"]
 """Convention of joint angles: `model` has those of the model's hinges, `isb` those of Wu and others 2005."""
@@ -33,6 +36,8 @@ ISB_JOINTS: Final = tuple(
     for name in ISB_NAMES
 )
 """Index of a hinge of the model that is of the same joint, for each of these angles."""
+WRIST_NAMES: Final = ("wrist_flexion", "wrist_radial_deviation")
+"""Angles of a wrist whose forearm has markers."""
 _BONE_ISB: Final = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, 0.0, 0.0]])
 """The ISB's axes X, Y and Z as columns, in our frame of a bone."""
 
@@ -45,20 +50,36 @@ def isb_angles(
     In the pose `neutral` all of them are zero; if it is None, those of the fingers are zero in the flat hand,
     and those of the first metacarpal where it points along the hand.
     """
-    from scipy.spatial.transform import Rotation
-
     known = np.isfinite(angles[:, 0])
     outer, turns = angles[known], _first_bones(shape, angles[known])
     if neutral is not None:
         outer = outer - neutral
         turns = turns @ np.swapaxes(_first_bones(shape, neutral[None]), -1, -2)
-    turns = _BONE_ISB.T @ turns @ _BONE_ISB
-    first = Rotation.from_matrix(turns.reshape(-1, 3, 3)).as_euler("ZXY").reshape(-1, len(DIGITS), 3)
+    first = _cardan_angles(turns.reshape(-1, 3, 3)).reshape(-1, len(DIGITS), 3)
     first[:, 0, 1] *= -1.0  # radial abduction of the thumb is the opposite of ulnar deviation
     found = np.full((len(angles), len(ISB_NAMES)), np.nan)
     both = first, outer.reshape(len(outer), len(DIGITS), -1)[..., 2:]
     found[known] = np.concatenate(both, axis=2).reshape(-1, len(ISB_NAMES))
     return found
+
+
+def wrist_angles(side: Side, turns: Float[np.ndarray, "T 3 3"]) -> Float[np.ndarray, "T 2"]:
+    """The angles of `WRIST_NAMES` [rad] of a hand with these rotations in the forearm's frame; NaN stays NaN.
+
+    Radial deviation is minus the ISB's second angle, which counts ulnar deviation positive.
+    """
+    known, found = np.isfinite(turns[:, 0, 0]), np.full((len(turns), len(WRIST_NAMES)), np.nan)
+    if side == "left":
+        turns = MIRROR @ turns @ MIRROR
+    found[known] = _cardan_angles(turns[known])[:, :2] * [1.0, -1.0]
+    return found
+
+
+def _cardan_angles(turns: Float[np.ndarray, "K 3 3"]) -> NDArray[np.float64]:
+    """Flexion, ulnar deviation and pronation (K, 3) [rad] of rotations in our frame of the inner bone."""
+    from scipy.spatial.transform import Rotation
+
+    return np.asarray(Rotation.from_matrix(_BONE_ISB.T @ turns @ _BONE_ISB).as_euler("ZXY"))
 
 
 def _first_bones(shape: HandShape, angles: Float[np.ndarray, "T 20"]) -> NDArray[np.float64]:

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from handsim.errors import CaptureError, choices
 from handsim.files.inputs import read_bytes
 from handsim.files.outputs import as_text, atomic_write
-from handsim.hand.angles import ISB_JOINTS, ISB_NAMES, isb_angles
+from handsim.hand.angles import ISB_JOINTS, ISB_NAMES, WRIST_NAMES, isb_angles
 from handsim.hand.model import KEYPOINT_NAMES, HandModel, hand_keypoints
 from handsim.hand.model_files import coordinate_names, coordinate_values
 from handsim.hand.shape import BONE_NAMES, BONES, DIGITS, JOINT_NAMES, PALM, SIDES, Side, bones_of
@@ -111,6 +111,8 @@ class PosedHand(NamedTuple):
     """Models of earlier frames, each with the first frame after them; `model` is that of the last frames."""
     shown: Bool[np.ndarray, "20"] | None = None
     """Which joints markers showed; tables leave out the others. None if all are known."""
+    wrist: Float[np.ndarray, "T 2"] | None = None
+    """Angles of the wrist in the order of `WRIST_NAMES` [rad], NaN where unknown; None without a forearm."""
 
     @property
     def side(self) -> Side:
@@ -311,9 +313,8 @@ def _table(path: Path, rows: list[tuple[int, list[str]]]) -> JointTable:
 
 def write_joint_csv(path: Path, motion: Motion, up: UpAxis = "z") -> None:
     """Write the table as text with nine digits (times: sixteen), in the take's axes whatever `up` is."""
-    hands = motion.hands
-    tables = [_numbers(hand) for hand in hands]
-    titles = _titles(motion)
+    hands, titles = motion.hands, _titles(motion)
+    tables = [_numbers(hand, len(titles)) for hand in hands]
     row_format = ",%.9g" * len(titles)
     with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8", newline="\n") as file:
         file.write(",".join([*_FIRST, *titles]) + "\n")
@@ -321,18 +322,19 @@ def write_joint_csv(path: Path, motion: Motion, up: UpAxis = "z") -> None:
             for hand, table in zip(hands, tables, strict=True):
                 row = table[frame]
                 text = row_format % tuple(row.tolist()) if hand.present[frame] else "," * len(titles)
-                text = text if hand.shown is None else text.replace("nan", "")
+                text = text.replace("nan", "")
                 file.write(f"{frame},{time:.16g},{hand.side}{text}\n")
 
 
 def _titles(motion: Motion) -> tuple[str, ...]:
     """The columns `NUMBERS`, and the angles of the ISB, whose names say if a neutral pose is zero."""
     isb = "isb" if motion.hands[0].neutral is None else "isb_neutral"
-    return *NUMBERS, *(f"{name}_{isb}_rad" for name in ISB_NAMES)
+    names = ISB_NAMES if all(hand.wrist is None for hand in motion.hands) else (*ISB_NAMES, *WRIST_NAMES)
+    return *NUMBERS, *(f"{name}_{isb}_rad" for name in names)
 
 
-def _numbers(hand: PosedHand) -> Float[np.ndarray, "T K"]:
-    """The columns of `_titles`; NaN in frames without a pose, and of joints that nothing shows."""
+def _numbers(hand: PosedHand, count: int) -> Float[np.ndarray, "T K"]:
+    """The `count` columns of `_titles`; NaN in frames without a pose, and of joints that nothing shows."""
     qpos = hand.qpos
     keypoints = hand.keypoints()[:, 1:].reshape(len(qpos), -1)
     isb = hand.by_frame(lambda model, poses: isb_angles(model.shape, poses[:, 7:], hand.neutral))
@@ -344,6 +346,9 @@ def _numbers(hand: PosedHand) -> Float[np.ndarray, "T K"]:
         moved[:, 0] = False  # a digit's first keypoint does not move
         wrist, isb = np.zeros(qpos.shape[1] - len(hidden), dtype=np.bool_), hidden[list(ISB_JOINTS)]
         numbers[:, np.concatenate([wrist, hidden, np.repeat(moved, 3), isb])] = np.nan
+    if count > numbers.shape[1]:
+        unknown = np.full((len(qpos), len(WRIST_NAMES)), np.nan)
+        numbers = np.concatenate([numbers, unknown if hand.wrist is None else hand.wrist], axis=1)
     return numbers
 
 

@@ -8,23 +8,24 @@ three suffice for both.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, cast
 
 import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
-from gloves.captures.capture import Capture, check_unit
+from gloves.captures.capture import Capture, check_unit, select_markers
 from gloves.takes.bodies import RigidBody
 from gloves.takes.points import Status
 from handsim._checks import check_array, check_type
 from handsim.errors import ArgumentError, CalibrationError, HandSimError, choices, errors_of
 from handsim.files.inputs import check_keys, numbers, quoted, read_toml, tables_of, text_of, written
 from handsim.files.outputs import write_text, writing
-from handsim.hand.shape import SIDES
+from handsim.hand.shape import SIDES, Side
 from handsim.kernels import move, velocity_of, write_quaternion_matrix
 from handsim.space.objects import RigidObject, named_object, object_names
 from track.bodies.constellation import (
@@ -37,12 +38,23 @@ from track.bodies.constellation import (
 )
 from track.frames import StreamedFrame, capture_frames
 
-GATE: Final = 0.003
-"""Largest distance of a labeled point from its marker [m]: ten times the noise of a good system."""
-_TIGHT: Final = 0.001  # [m] largest residual of points that determine a pose, and in a search
-_TIGHTEST: Final = 0.0005  # [m] largest residual in a search that matches three points, maybe by chance
+
+class _Tolerances(NamedTuple):
+    """Largest distances of points from a body's markers [m]."""
+
+    gate: float  # of labeled points
+    tight: float  # of points that determine a pose
+    search: float  # in a search
+    tightest: float  # in a search that matches three points, maybe by chance
+
+
+_RIGID: Final = _Tolerances(0.003, 0.001, 0.001, 0.0005)
+"""Tolerances of objects: ten times the noise of a good system."""
+_SKIN: Final = _Tolerances(0.005, 0.004, 0.002, 0.001)
+"""Tolerances of a forearm, whose skin moves markers by 1 to 2 mm. A recorded one of five markers, two of them at
+the epicondyles, is labeled in all frames, with 2 mm as `tight` and 3 mm as `gate` in 57 % of them."""
 _LEAST_WIDTH: Final = 0.005  # [m] least RMS distance of the markers from their best line
-_LEAST_MARKER_DISTANCE: Final = 2.0 * GATE  # [m] Closer markers could exchange labels.
+_LEAST_MARKER_DISTANCE: Final = 2.0 * _RIGID.gate  # [m] Closer markers could exchange labels.
 _LONGEST_COAST: Final = 0.026  # [s] longest prediction (three frames at 120 Hz) without three markers
 _VELOCITY_FITS: Final = 5  # The velocity is known after this many consecutive fits.
 _VELOCITY_SMOOTHING: Final = 0.4  # weight of the newest velocity; fits to three markers are noisy
@@ -54,7 +66,8 @@ _MOST_CANDIDATE_MOTION: Final = 0.02  # [m] largest motion per frame of an uncon
 _MOST_SEARCHED_POINTS: Final = 250  # largest number of points in a search: 30 ms, cubic in it
 SUFFIX: Final = ".toml"
 _EXPECTED: Final = "RigidTemplates, names of handsim's objects, or paths of .toml files"
-_BODY_KEYS: Final = ("name", "description", "marker")
+_OPTIONAL: Final = ("description", "forearm", "forearm_axes", "marker")
+_BODY_KEYS: Final = ("name", *_OPTIONAL)
 _MARKER_KEYS: Final = ("name", "place_mm")
 _MOST_LEARNED_MARKERS: Final = 20
 _COUNT_QUANTILE: Final = 0.9  # quantile of the frames' numbers of points that gives the number of markers
@@ -75,6 +88,7 @@ class RigidTemplate(RigidBody):
     def __post_init__(self) -> None:
         positions = np.array(check_array("positions", self.positions, (len(self.marker_names), 3)), order="C")
         object.__setattr__(self, "positions", positions)
+        RigidBody.__post_init__(self)
         fault = self._fault()
         if fault is not None:
             raise ArgumentError(f"{self.name}: {fault}")
@@ -131,11 +145,16 @@ def _symmetry(positions: NDArray[np.float64], distances: NDArray[np.float64]) ->
             for order in orders
             for to in range(count)
             if to not in order
-            and all(abs(distances[marker, k] - distances[to, order[k]]) < 2.0 * _TIGHT for k in range(marker))
+            and all(
+                abs(distances[marker, k] - distances[to, order[k]]) < 2.0 * _RIGID.tight
+                for k in range(marker)
+            )
         ]
     for order in orders:
         if order != tuple(range(count)):
-            agree, _ = fit_inliers(positions, positions, np.array(order), np.empty(7), _TIGHT, _TIGHT)
+            agree, _ = fit_inliers(
+                positions, positions, np.array(order), np.empty(7), _RIGID.tight, _RIGID.tight
+            )
             if agree == count:  # a rotation, not a reflection
                 return order
     return None
@@ -168,6 +187,7 @@ class BodyTracker:
     def __init__(self, template: RigidTemplate) -> None:
         self.template = template
         self._positions, self._distances = template.positions, template.distances
+        self._tolerances = _RIGID if template.forearm is None else _SKIN
         self._reset()
         for number in range(18):  # Compile or load all kernels before the stream's first frame.
             there = self._positions if number < 17 else self._positions[:0]
@@ -200,10 +220,9 @@ class BodyTracker:
         self, points: NDArray[np.float64], ids: NDArray[np.int64], time: float, elapsed: float
     ) -> BodyFrame | None:
         """Track the body by the IDs of its points, or near its predicted pose; None if that fails."""
+        gate, tight, *_ = self._tolerances
         pose, assignment = self._no_match
-        count, rms = track_by_ids(
-            self._positions, points, ids, self._last_ids, pose, _TIGHT, GATE, assignment
-        )
+        count, rms = track_by_ids(self._positions, points, ids, self._last_ids, pose, tight, gate, assignment)
         match = _Match(count, rms, pose, assignment)
         if count < FEWEST and 0.0 < elapsed <= _LONGEST_PREDICTION:
             match = self._match(points, self._predict(elapsed), self._search_radius(elapsed))
@@ -228,7 +247,7 @@ class BodyTracker:
             off = points[assignment[seen]] - transform_markers(self._positions, pose)[seen]
             shift = off.mean(axis=0)
             distances = np.linalg.norm(off - shift, axis=1)
-            if max(distances.max(), np.linalg.norm(shift)) <= GATE:
+            if max(distances.max(), np.linalg.norm(shift)) <= self._tolerances.gate:
                 pose[:3] += shift
                 rms = float(np.sqrt((distances**2).mean()))
             else:
@@ -272,18 +291,19 @@ class BodyTracker:
         self, points: NDArray[np.float64], near: NDArray[np.float64] | None = None, radius: float = np.inf
     ) -> _Match:
         """The unique match of the markers, within a radius [m] of a pose or anywhere."""
+        gate, tight, search, tightest = self._tolerances
         pose, assignment = self._no_match
         expected = self._positions if near is None else transform_markers(self._positions, near)
         if len(points) > _MOST_SEARCHED_POINTS:
             return _Match(0, np.nan, pose, assignment)
         count, _, rival = search_constellation(
-            self._positions, self._distances, points, expected, radius, _TIGHT, assignment, pose
+            self._positions, self._distances, points, expected, radius, search, assignment, pose
         )
         if count == FEWEST > rival:
-            count, _ = fit_inliers(self._positions, points, assignment, pose, _TIGHTEST, _TIGHTEST)
+            count, _ = fit_inliers(self._positions, points, assignment, pose, tightest, tightest)
         if count < FEWEST or rival >= count:
             return _Match(0, np.nan, pose, assignment)
-        fit = assign_remaining(self._positions, points, assignment, pose, _TIGHT, GATE)
+        fit = assign_remaining(self._positions, points, assignment, pose, tight, gate)
         return _Match(*fit, pose, assignment)
 
     @property
@@ -366,6 +386,8 @@ def load_bodies(names_or_paths: AnyBody | Iterable[AnyBody]) -> tuple[RigidTempl
                 f"{owner}a body is named '{body.name}', expected a name of its own; taken are "
                 f"{', '.join(taken)}"
             )
+        if body.forearm is not None and body.forearm in (other.forearm for other in bodies):
+            raise ArgumentError(f"'{body.name}' is a second {body.forearm} forearm, expected one at most")
         bodies.append(body)
     return tuple(bodies)
 
@@ -373,6 +395,8 @@ def load_bodies(names_or_paths: AnyBody | Iterable[AnyBody]) -> tuple[RigidTempl
 def save_body(path: str | Path, body: RigidTemplate) -> None:
     """Write a body as TOML with nine decimals; `load_body` reads the same body again."""
     lines = [f"name = {quoted(body.name)}"]
+    if body.forearm is not None:
+        lines += [f"forearm = {quoted(body.forearm)}", f"forearm_axes = {str(body.has_axes).lower()}"]
     for name, position in zip(body.marker_names, 1e3 * body.positions, strict=True):
         numbers_mm = ", ".join(written(value) for value in position.tolist())
         lines += ["", "[[marker]]", f"name = {quoted(name)}", f"place_mm = [{numbers_mm}]"]
@@ -381,12 +405,15 @@ def save_body(path: str | Path, body: RigidTemplate) -> None:
 
 
 def _parse_body(table: Mapping[str, object]) -> RigidTemplate:
-    check_keys(table, "the file", _BODY_KEYS, optional=("description", "marker"))
+    check_keys(table, "the file", _BODY_KEYS, optional=_OPTIONAL)
     text_of(table, "description", default="")
     name = _printable("the body's name", text_of(table, "name"))
     markers = [_parse_marker(entry, number) for number, entry in enumerate(tables_of(table, "marker"), 1)]
     positions = np.array([position for _, position in markers]).reshape(-1, 3)
-    return RigidTemplate(name, tuple(marker for marker, _ in markers), 1e-3 * positions)
+    forearm = cast("Side", text_of(table, "forearm")) if "forearm" in table else None
+    axes, names = table.get("forearm_axes", False), tuple(marker for marker, _ in markers)
+    check_type("forearm_axes", axes, bool, "true or false")
+    return RigidTemplate(name, names, 1e-3 * positions, None, forearm, has_axes=bool(axes))
 
 
 def _parse_marker(table: Mapping[str, object], number: int) -> tuple[str, list[float]]:
@@ -405,12 +432,34 @@ def _printable(what: str, name: str) -> str:
     return name
 
 
-def learn_body(capture: Capture, name: str) -> RigidTemplate:
-    """Learn the markers of a body from a capture of it alone; its origin is the mean of its markers."""
+def learn_body(
+    capture: Capture, name: str, markers: Sequence[str] = (), forearm: Side | None = None
+) -> RigidTemplate:
+    """Learn the markers of a body from a capture of it alone; its origin is the mean of its markers.
+
+    Args:
+        capture: The capture.
+        name: The body's name.
+        markers: Columns of a labeled capture, the others of which are left out; the markers have their names.
+        forearm: The hand whose forearm it is.
+
+    Raises:
+        ArgumentError: The points have a wrong unit.
+        CalibrationError: They are not those of one rigid body.
+        CaptureError: A column is missing.
+    """
+    if markers:
+        capture = Capture(tuple(markers), select_markers(capture, markers), capture.rate)
+        body = learn_body(capture, name, forearm=forearm)
+        if len(body.positions) < len(markers):
+            raise CalibrationError(
+                f"{len(body.positions)} of the markers {', '.join(markers)} are seen at most times, expected all"
+            )
+        return dataclasses.replace(body, marker_names=tuple(markers))
     frames = list(capture_frames(capture))
     check_unit([frame.points for frame in frames])
     counts = np.array([len(frame.points) for frame in frames])
-    body, tracked = _best_template(name, frames, counts)
+    body, tracked = _best_template(name, forearm, frames, counts)
     labeled = _num_labeled(tracked)
     if labeled < _LEAST_LABELED_SHARE * counts.sum():
         raise CalibrationError(
@@ -419,13 +468,13 @@ def learn_body(capture: Capture, name: str) -> RigidTemplate:
         )
     for _ in range(_AVERAGING_ROUNDS):
         positions = _median_positions(body, frames, tracked)
-        body = _template(name, positions)
+        body = _template(name, forearm, positions)
         tracked = _track(body, frames)
     return body
 
 
 def _best_template(
-    name: str, frames: Sequence[StreamedFrame], counts: NDArray[np.int64]
+    name: str, forearm: Side | None, frames: Sequence[StreamedFrame], counts: NDArray[np.int64]
 ) -> tuple[RigidTemplate, list[BodyFrame]]:
     """The template, among those of several frames, that labels most points, and its track."""
     count = int(np.quantile(counts, _COUNT_QUANTILE, method="lower"))
@@ -439,7 +488,7 @@ def _best_template(
     candidates, faults = [], []
     for number in np.unique(chosen):
         try:
-            body = _template(name, frames[number].points)
+            body = _template(name, forearm, frames[number].points)
         except CalibrationError as error:
             faults.append(error)
         else:
@@ -449,13 +498,18 @@ def _best_template(
     return max(candidates, key=lambda candidate: _num_labeled(candidate[1]))
 
 
-def _template(name: str, positions: NDArray[np.float64]) -> RigidTemplate:
+def _template(name: str, forearm: Side | None, positions: NDArray[np.float64]) -> RigidTemplate:
     """A body with markers at these positions (Q, 3) [m], its origin moved to their mean."""
     names = tuple(f"Marker{number + 1}" for number in range(len(positions)))
     try:
-        return RigidTemplate(name, names, positions - positions.mean(axis=0))
+        return RigidTemplate(name, names, positions - positions.mean(axis=0), forearm=forearm)
     except ArgumentError as error:
         raise CalibrationError(str(error)) from error
+
+
+def track_body(body: RigidTemplate, capture: Capture) -> list[BodyFrame]:
+    """Track a body through a capture."""
+    return _track(body, list(capture_frames(capture)))
 
 
 def _track(body: RigidTemplate, frames: Sequence[StreamedFrame]) -> list[BodyFrame]:

@@ -280,7 +280,7 @@ def layout_spreads(
         good = seen.sum(axis=1) >= pose_solver.FEWEST_MARKERS
         unseen, known = np.where(seen[good], 0.0, np.inf), known_hand(hand_arrays(fit).digits, NOISE)
         variances, _ = pose_spreads(with_keypoints(fit), limits, known, qpos[good], unseen, NOT_SMOOTHED)
-        squares += variances.sum(axis=(0, 2))
+        squares += variances[:, :NUM_JOINTS].sum(axis=(0, 2))
         squares += np.count_nonzero(~good) * free_spreads() ** 2
         count += len(good)
     return np.sqrt(squares / max(1, count))

@@ -430,7 +430,7 @@ class SpreadModel:
         factor = freedom_factor(unseen.shape[1])
         noise = max(rms * factor, _LEAST_NOISE) if rms > 0.0 else MARKER_NOISE
         variances, keypoints = self.variances(qpos, unseen, noise)
-        return np.sqrt(variances.sum(axis=-1)), keypoints
+        return np.sqrt(variances[:, :NUM_JOINTS].sum(axis=-1)), keypoints
 
     def variances(
         self,
@@ -441,8 +441,8 @@ class SpreadModel:
         places: Float[np.ndarray, "M 2"] | float = 0.0,
         smoothed: Float[np.ndarray, "S 26 26"] = NOT_SMOOTHED,
         prior: Float[np.ndarray, "20 20"] | None = None,
-    ) -> tuple[Float[np.ndarray, "T 20 4"], Float[np.ndarray, "T 21"]]:
-        """Variances of angles by `SOURCES` [rad^2], and standard deviations of keypoints [m].
+    ) -> tuple[Float[np.ndarray, "T 26 4"], Float[np.ndarray, "T 21"]]:
+        """Variances of all unknowns by `SOURCES` [rad^2, m^2], and standard deviations of keypoints [m].
 
         For smoothed poses are given: flesh motion and RMS errors of marker places, along the skin and off it
         [m], the covariances of the unknowns from noise and gaps, and the precision of the prior in one frame.
@@ -501,13 +501,13 @@ def pose_spreads(
     qpos: Float[np.ndarray, "T 27"],
     unseen: Float[np.ndarray, "T M"],
     smoothed: Float[np.ndarray, "S 26 26"],
-) -> tuple[Float[np.ndarray, "T 20 4"], Float[np.ndarray, "T 21"]]:
-    """Variances of joint angles by `SOURCES` [rad^2] and standard deviations of keypoints [m].
+) -> tuple[Float[np.ndarray, "T 26 4"], Float[np.ndarray, "T 21"]]:
+    """Variances of all unknowns by `SOURCES` [rad^2, m^2] and standard deviations of keypoints [m].
 
-    `hand` is from `with_keypoints`. A marker off its place moves the fit as noise does. Errors of the hand
+    The unknowns are the joint angles, then the wrist's position and rotation about its own axes. `hand` is from `with_keypoints`. A marker off its place moves the fit as noise does. Errors of the hand
     move markers, through them the fit, and keypoints also directly.
     """
-    angles, keypoints = np.empty((len(qpos), NUM_JOINTS, 4)), np.empty((len(qpos), NUM_KEYPOINTS))
+    found, keypoints = np.empty((len(qpos), NUM_UNKNOWNS, 4)), np.empty((len(qpos), NUM_KEYPOINTS))
     count, work, weights = unseen.shape[1], workspace(len(hand.digits)), np.zeros(len(hand.digits))
     ways, posterior = doubt.errors.numbers.shape[1], np.empty((NUM_UNKNOWNS, NUM_UNKNOWNS))
     moved, shifted = np.empty((3 * len(weights), ways)), np.empty((3 * count, ways))
@@ -532,7 +532,7 @@ def pose_spreads(
         off = weighted @ posterior
         by_bones, by_places = off.T @ moved[: 3 * count], off.T @ shifted
         noise, answers = smoothed[frame] if len(smoothed) > 0 else posterior, by_bones + by_places
-        _write_variances(hand, doubt, work, noise, by_bones, by_places, off, angles[frame])
+        _write_variances(hand, doubt, work, noise, by_bones, by_places, off, found[frame])
         spread = jacobian[3 * count :] @ (noise + off.T @ off)
         left = moved[3 * count :] - jacobian[3 * count :] @ answers
         for keypoint in range(NUM_KEYPOINTS):
@@ -543,7 +543,7 @@ def pose_spreads(
                 for way in range(ways):
                     total += left[row, way] ** 2
             keypoints[frame, keypoint] = np.sqrt(max(total, 0.0) / 3.0)
-    return angles, keypoints
+    return found, keypoints
 
 
 @kernel
@@ -555,20 +555,20 @@ def _write_variances(
     by_bones: Float[np.ndarray, "26 C"],
     by_places: Float[np.ndarray, "26 C"],
     off: Float[np.ndarray, "R 26"],
-    variances: Float[np.ndarray, "20 4"],
+    variances: Float[np.ndarray, "26 4"],
 ) -> None:
-    """Write the variances of angles [rad^2]; scales `off` from derivatives [rad/m] to deviations [rad]."""
+    """Write the variances of unknowns [rad^2, m^2]; scales `off` from derivatives by [m] to deviations."""
     # A slipped marker keeps its height over the bone, and the height tells most of the bone's flexion. Errors
     # of bones and places are correlated: their variance is divided in the ratio of the separate variances.
     variances[:] = 0.0
-    for hinge in range(NUM_JOINTS):
+    for unknown in range(NUM_UNKNOWNS):
         bones, places, both = 0.0, 0.0, 0.0
         for way in range(by_bones.shape[1]):
-            bone, place = by_bones[hinge, way], by_places[hinge, way]
+            bone, place = by_bones[unknown, way], by_places[unknown, way]
             bones, places, both = bones + bone**2, places + place**2, both + (bone + place) ** 2
         both /= max(bones + places, 1e-30)
-        variances[hinge, 0] = noise[hinge, hinge]
-        variances[hinge, 1], variances[hinge, 3] = both * places, both * bones
+        variances[unknown, 0] = noise[unknown, unknown]
+        variances[unknown, 1], variances[unknown, 3] = both * places, both * bones
     flesh = doubt.flesh**2
     for marker in range(len(off) // 3):
         normal = work.rotations[hand.bones[marker, 0]] @ hand.normals[marker]
@@ -579,9 +579,8 @@ def _write_variances(
             for i in range(3):
                 square += rows[i, unknown] ** 2
                 lift += normal[i] * rows[i, unknown]
-            if unknown < NUM_JOINTS:
-                variances[unknown, 1] += along * (square - lift**2) + above * lift**2
-                variances[unknown, 2] += flesh * square
+            variances[unknown, 1] += along * (square - lift**2) + above * lift**2
+            variances[unknown, 2] += flesh * square
             for i in range(3):
                 rows[i, unknown] = wide * rows[i, unknown] + (high - wide) * lift * normal[i]
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from gloves.captures.capture import Capture
 from gloves.layout import MarkerLayout
 from gloves.takes.archives import GrowingArchive, GrownArchive, finish_archive, growing_path
-from gloves.takes.points import FRAMES, KEYPOINTS, NUMBERS, OPTIONAL, POINTS, SPREADS, PointList
+from gloves.takes.points import FRAMES, KEYPOINTS, NUMBERS, POINTS, SPREADS, PointList
 from gloves.takes.take import (
     RATED_FRAMES,
     Take,
@@ -126,7 +126,7 @@ class Recorder(Closing):
             growing_path(out),
             self._header(None),
             self._worn_arrays(),
-            [column.sized(sizes) for column in (*FRAMES, *POINTS, *OPTIONAL, KEYPOINTS)],
+            [column.sized(sizes) for column in (*FRAMES, *POINTS, NUMBERS, *SPREADS, KEYPOINTS)],
         )
         self._times: tuple[float, float] | None = None
         self._closed = False

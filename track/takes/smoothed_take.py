@@ -20,9 +20,11 @@ from numpy.typing import NDArray
 from gloves.captures.capture import runs_of
 from gloves.fit import GloveFit
 from gloves.takes.take import INITIALIZED, LOST, Take
+from handsim.hand.angles import WRIST_NAMES
 from handsim.hand.shape import DIGITS, JOINT_NAMES, NUM_JOINTS, NUM_KEYPOINTS
 from handsim.kernels import kernel, move, velocity_of
 from handsim.space.transforms import quaternion_matrix
+from track.bodies.forearm import wrist_variances
 from track.kinematics.marker_kinematics import (
     LIMIT_PRECISION,
     NUM_UNKNOWNS,
@@ -33,6 +35,7 @@ from track.kinematics.marker_kinematics import (
     workspace,
 )
 from track.kinematics.pose_spread import (
+    SOURCES,
     SpreadModel,
     are_still,
     freedom_factor,
@@ -80,28 +83,43 @@ def smooth_take(take: Take) -> Take:
     """Smooth the poses of a take's hands, and compute their standard deviations.
 
     Labels and statuses stay. The settings get for each hand under "filter" the cut-off of each joint angle
-    [Hz], and under "budget" its standard deviation by `SOURCES` [deg].
+    [Hz], and under "budget" its standard deviation by `SOURCES` [deg]; of hands whose forearm has markers, under
+    "wrist_budget" those of the wrist's angles.
     """
     qpos, rms = take.qpos.copy(), take.rms.copy()
     angles = np.full((*rms.shape, NUM_JOINTS), np.nan)
     keypoints, cutoffs, budgets = np.full((*rms.shape, NUM_KEYPOINTS), np.nan), {}, {}
+    wrists, wrist_budgets = np.full((*rms.shape, len(WRIST_NAMES)), np.nan), {}
     for number, side in enumerate(take.sides):
         windows = _windows(take.status[:, number])
         if windows:
             hand = _SmoothedHand(take, number)
-            cutoff, budget = hand.solve(windows)
-            cutoffs[side], budgets[side] = np.round(cutoff, 2).tolist(), np.round(budget, 3).tolist()
+            cutoff, variances = hand.solve(windows)
+            cutoffs[side], budgets[side] = np.round(cutoff, 2).tolist(), _budget(variances[:, :NUM_JOINTS])
             qpos[:, number], fits = hand.qpos, np.isfinite(rms[:, number])
             rms[fits, number] = hand.rms()[fits]
             angles[:, number], keypoints[:, number] = hand.angles, hand.keypoints
+            if (body := take.forearm_index(side)) is not None:
+                parts = wrist_variances(take, side, body, variances[:, -3:])
+                if np.isfinite(parts).any():
+                    wrists[:, number] = np.sqrt(parts.sum(axis=-1))
+                    wrist_budgets[side] = _budget(parts)
+    settings = {**take.settings, "filter": cutoffs, "budget": budgets}
     return dataclasses.replace(
         take,
         qpos=qpos,
         rms=rms,
         angle_spread=angles,
         keypoint_spread=keypoints,
-        settings={**take.settings, "filter": cutoffs, "budget": budgets},
+        wrist_spread=wrists if wrist_budgets else None,
+        settings=settings | ({"wrist_budget": wrist_budgets} if wrist_budgets else {}),
     )
+
+
+def _budget(variances: Float[np.ndarray, "T K 4"]) -> list[list[float]]:
+    """Standard deviations of angles by `SOURCES` [deg], as root mean square over the frames that have them."""
+    found: list[list[float]] = np.rad2deg(np.sqrt(np.nanmean(variances, axis=0))).round(3).tolist()
+    return found
 
 
 def spread_model(take: Take, hand: GloveFit) -> SpreadModel:
@@ -162,17 +180,20 @@ class _SmoothedHand:
         # Coordinates of the markers that are seen in a frame, and how many of them the pose can follow.
         self._coordinates = np.zeros((take.num_frames, 2))
 
-    def solve(self, windows: Sequence[_Window]) -> tuple[Float[np.ndarray, "20"], Float[np.ndarray, "20 4"]]:
-        """Solve all poses; return the cut-off of each angle [Hz] and its spread by `SOURCES` [deg]."""
+    def solve(
+        self, windows: Sequence[_Window]
+    ) -> tuple[Float[np.ndarray, "20"], Float[np.ndarray, "T 26 4"]]:
+        """Solve all poses; return the cut-off of each angle [Hz] and the unknowns' variances by `SOURCES`."""
         for _ in range(_ROUNDS):
             for window in windows:
                 self._step(window, self._equations(window))
             self._estimate_noise()
             self._prior = self._prior_of(self._stiff)
-        cutoffs, parts, wide = [], [], self._prior_of(self._shown)
+        cutoffs, wide = [], self._prior_of(self._shown)
+        parts = np.full((len(self.qpos), NUM_UNKNOWNS, len(SOURCES)), np.nan)
         # Of a joint that does not move a calibration finds no more than measuring does.
-        still, models = are_still(self._angles()) & self._shown, [self._model]
-        if still.any() and self._model.is_calibrated:
+        still, models = np.flatnonzero(are_still(self._angles()) & self._shown), [self._model]
+        if len(still) and self._model.is_calibrated:
             models.append(SpreadModel(self._worn, "measured"))
         for window in windows:
             equations = self._equations(window)
@@ -197,14 +218,13 @@ class _SmoothedHand:
             )
             for other, _ in measured:
                 variances[:, still] = np.maximum(variances, other)[:, still]
-            self.angles[kept] = np.sqrt(variances.sum(axis=-1))
-            pulled = same.diagonal(axis1=1, axis2=2)[:, :NUM_JOINTS]
-            # How far the prior pulls an angle stays the same, as the person does.
-            parts.append(variances + pulled[..., None] * [-1.0, 0.0, 0.0, 1.0])
+            self.angles[kept] = np.sqrt(variances[:, :NUM_JOINTS].sum(axis=-1))
+            # How far the prior pulls an unknown stays the same, as the person does.
+            pulled = same.diagonal(axis1=1, axis2=2)
+            parts[kept] = variances + pulled[..., None] * [-1.0, 0.0, 0.0, 1.0]
             spreads = alone[:, range(NUM_JOINTS), range(NUM_JOINTS)]
             cutoffs.append((_ACCELERATIONS[:NUM_JOINTS] * self._rate / spreads) ** 0.25 / (2.0 * np.pi))
-        budget = np.rad2deg(np.sqrt(np.concatenate(parts).mean(axis=0)))
-        return np.median(np.concatenate(cutoffs), axis=0), budget
+        return np.median(np.concatenate(cutoffs), axis=0), parts
 
     def rms(self) -> Float[np.ndarray, "T"]:
         """RMS distance of the markers from those of the smoothed poses [m]; NaN without markers."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import csv
 import shlex
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
@@ -21,7 +21,7 @@ from gloves.captures.capture import runs_of
 from gloves.takes.take import COASTING, INITIALIZED, LOST, STATUSES, Take
 from handsim._checks import check_choice
 from handsim.files.outputs import atomic_write, check_ending, written_together
-from handsim.hand.angles import ISB_JOINTS, ISB_NAMES, Convention
+from handsim.hand.angles import ISB_JOINTS, ISB_NAMES, WRIST_NAMES, Convention
 from handsim.hand.shape import DIGITS, JOINT_NAMES, JOINTS, Side
 from handsim.pages import NOTHING, Paint, Section, html_list, picture, write_sections
 from track.config import Size
@@ -113,6 +113,11 @@ def write_take_page(
         _summary_section(take),
         _calibration_section(take),
         *(section for hand in hands for section in _hand_sections(take, hand)),
+        *(
+            _wrist_section(take, hand, settings)
+            for hand in hands
+            if take.forearm_index(hand.side) is not None
+        ),
         *(_cycles_section(hand.side, found, settings) for hand, found in zip(hands, cycles, strict=False)),
         _spans_section(take, spans, source),
         *([_methods_section(take, spans, settings)] if take.made_by_tracker else []),
@@ -382,7 +387,6 @@ def _hand_sections(take: Take, hand: HandFigures) -> list[Section]:
 def _draw_angles(figure: Figure, times: Float[np.ndarray, "T"], hand: HandFigures) -> None:
     """Draw one panel per digit with its four angles and their bands; shade lost and coasting frames."""
     panels = figure.subplots(len(DIGITS), 1, sharex=True)
-    starts, _ = _bins(len(times))
     shape = len(times), len(DIGITS), -1
     angles = hand.angles.reshape(shape)
     spread = None if hand.angle_spread is None else hand.angle_spread.reshape(shape)
@@ -390,17 +394,95 @@ def _draw_angles(figure: Figure, times: Float[np.ndarray, "T"], hand: HandFigure
     for number, (digit, panel) in enumerate(zip(DIGITS, panels, strict=True)):
         _prepare(panel, times, hand.status)
         panel.axhline(0.0, color=Paint.LINE, linewidth=0.8)
-        for joint, (name, stroke) in enumerate(zip(names[number], _STROKES, strict=True)):
-            values = angles[:, number, joint]
-            panel.plot(*decimated(times, values), color=stroke, linewidth=1.1, label=name)
-            if spread is not None:
-                low, high = values - spread[:, number, joint], values + spread[:, number, joint]
-                low, high = np.fmin.reduceat(low, starts), np.fmax.reduceat(high, starts)
-                panel.fill_between(times[starts], low, high, color=stroke, alpha=0.15, linewidth=0.0)
+        bands = None if spread is None else spread[:, number]
+        _draw_curves(panel, times, names[number], angles[:, number], bands)
         panel.set_ylabel(f"{digit} [deg]")
-        panel.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, handlelength=1.2)
     panels[-1].set_xlabel("time [s]")
     figure.align_ylabels()
+
+
+def _draw_curves(
+    panel: Axes,
+    times: Float[np.ndarray, "T"],
+    names: Iterable[str],
+    angles: Float[np.ndarray, "T K"],
+    spread: Float[np.ndarray, "T K"] | None,
+) -> None:
+    """Draw angles with their names, and bands of a standard deviation if they are known."""
+    starts, _ = _bins(len(times))
+    for number, (name, stroke) in enumerate(zip(names, _STROKES, strict=False)):
+        values = angles[:, number]
+        panel.plot(*decimated(times, values), color=stroke, linewidth=1.1, label=name)
+        if spread is not None:
+            low, high = values - spread[:, number], values + spread[:, number]
+            low, high = np.fmin.reduceat(low, starts), np.fmax.reduceat(high, starts)
+            panel.fill_between(times[starts], low, high, color=stroke, alpha=0.15, linewidth=0.0)
+    panel.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, handlelength=1.2)
+
+
+class _WristFigures(NamedTuple):
+    """Angles of a wrist over the frames of a take, in the order of `WRIST_NAMES`."""
+
+    angles: Float[np.ndarray, "T 2"]
+    """Angles [deg]; NaN where hand or forearm have no pose, or the forearm's axes are unknown."""
+    spread: Float[np.ndarray, "T 2"]
+    """Their standard deviations [deg]; NaN where unknown."""
+    measured: Bool[np.ndarray, "T"]
+    """Frames in which both poses were fitted to points."""
+    constant: Float[np.ndarray, "2"]
+    """Parts of the standard deviations that are the same in all frames [deg]."""
+
+
+def _wrist_figures(take: Take, hand: HandFigures, settings: PageSettings) -> _WristFigures:
+    """The figures of a wrist whose forearm is among the bodies."""
+    angles, number = take.wrist_angles(hand.side, settings.neutral), take.hand_index(hand.side)
+    assert angles is not None
+    measured = hand.fitted & (take.body_status[:, take.forearm_index(hand.side)] >= INITIALIZED)
+    spread = np.full(angles.shape, np.nan) if take.wrist_spread is None else take.wrist_spread[:, number]
+    budget = np.array(
+        take.settings.get("wrist_budget", {}).get(hand.side, np.full((2, len(SOURCES)), np.nan))
+    )
+    constant = np.linalg.norm(budget[:, _CONSTANT], axis=1)
+    return _WristFigures(
+        np.rad2deg(angles), np.rad2deg(spread), measured & np.isfinite(angles[:, 0]), constant
+    )
+
+
+def _wrist_section(take: Take, hand: HandFigures, settings: PageSettings) -> Section:
+    """Curves and range of motion of a wrist."""
+    title, wrist = f"{hand.side.capitalize()} wrist", _wrist_figures(take, hand, settings)
+    if not wrist.measured.any():
+        return Section(
+            title,
+            "Hand and forearm are never tracked together, or the axes of the forearm are unknown: "
+            "<code>--neutral</code> gives them, as do landmarks (docs/angles.md).",
+        )
+    text = (
+        "Angles of the ISB between forearm and third metacarpal (docs/angles.md): flexion counts positive, "
+        "extension negative; radial deviation positive, ulnar deviation negative. The band is one standard "
+        "deviation (SD) to either side; how well the axes of the forearm are known is not in it. SD constant "
+        "is the part of it that is the same in all frames."
+    )
+    table = [["angle [deg]", *_RANGE, "median SD", "SD constant", "measured [%]"]]
+    for number, name in enumerate(WRIST_NAMES):
+        of = np.percentile(wrist.angles[wrist.measured, number], list(_RANGE.values()))
+        cells = [*of, _medians(wrist.spread[wrist.measured])[number], wrist.constant[number]]
+        shown = [NOTHING if np.isnan(cell) else f"{cell:.1f}" for cell in cells]
+        table.append([name.replace("_", " "), *shown, percent(float(wrist.measured.mean()))])
+    curves = picture((9.6, 2.6), _draw_wrist, take.times, hand, wrist)
+    return Section(title, text, pictures=[(curves, _SHADES)], table=table)
+
+
+def _draw_wrist(
+    figure: Figure, times: Float[np.ndarray, "T"], hand: HandFigures, wrist: _WristFigures
+) -> None:
+    panel = figure.subplots()
+    _prepare(panel, times, hand.status)
+    panel.axhline(0.0, color=Paint.LINE, linewidth=0.8)
+    names = [name.split("_", 1)[1].replace("_", " ") for name in WRIST_NAMES]
+    _draw_curves(panel, times, names, wrist.angles, wrist.spread)
+    panel.set_ylabel("wrist [deg]")
+    panel.set_xlabel("time [s]")
 
 
 def _range_section(title: str, take: Take, hand: HandFigures) -> Section:
@@ -715,11 +797,17 @@ def _angle_rows(
         errors = _joint_errors(take.settings, hand)
         constant = np.linalg.norm(errors[:, [1 + source for source in _CONSTANT]], axis=1)
         known = dict(zip(JOINT_NAMES, np.c_[hand.joints()[:, -4], constant, errors[:, -4:-1]], strict=True))
+        measured_of = {name: hand.measured[:, number] for name, number in joints.items()}
+        if take.forearm_index(hand.side) is not None:
+            wrist = _wrist_figures(take, hand, settings)
+            measured_of |= dict.fromkeys(WRIST_NAMES, wrist.measured)
+            of_wrist = zip(WRIST_NAMES, _medians(wrist.spread[wrist.measured]), wrist.constant, strict=True)
+            known |= {name: np.array([spread, same, *[np.nan] * 3]) for name, spread, same in of_wrist}
         for convention in get_args(Convention) if hand.fitted.any() else ():
             zero = "" if settings.neutral is None else ", zero in the neutral pose"
             angles = take.angles(hand.side, convention=convention, neutral=settings.neutral)
             for name, values in angles.items():
-                measured = hand.measured[:, joints[name]]
+                measured = measured_of[name]
                 degrees = np.rad2deg(values[measured]) if measured.any() else np.array([np.nan])
                 low, high = np.percentile(degrees, (5.0, 95.0))
                 last = _number(measured.mean()), f"{convention}{zero}", made_of(take.settings)
@@ -730,6 +818,12 @@ def _angle_rows(
                     numbers = map(_number, (value, *error))
                     rows.append([*first, hand.side, name, measure, *numbers, *last])
     return rows
+
+
+def _medians(values: Float[np.ndarray, "F K"]) -> Float[np.ndarray, "K"]:
+    """Medians of the columns, over the rows that are known; NaN if none is."""
+    known = np.isfinite(values).all(axis=1)
+    return np.median(values[known], axis=0) if known.any() else np.full(values.shape[1], np.nan)
 
 
 def _number(value: float) -> str:

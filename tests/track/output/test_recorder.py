@@ -76,7 +76,7 @@ def in_memory() -> Take:
     rows = [frame_values(*pair) for pair in pairs]
     arrays = {
         column.name: np.array([row[column.name] for row in rows])
-        for column in (*points.FRAMES, *points.OPTIONAL)
+        for column in (*points.FRAMES, points.NUMBERS, *points.SPREADS)
     }
     entries = {column.name: np.concatenate([row[column.name] for row in rows]) for column in points.POINTS}
     return Take(
