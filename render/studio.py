@@ -331,7 +331,7 @@ class Studio:
             elbows, ways = (np.array(one)[None, :, None] for one in zip(*lines, strict=True))
             arms = Arms(np.stack([*there.values()])[None, :, :3], ways, elbows, np.zeros(ways.shape[:3]))
         else:
-            arms = user.arms(moment.take.qpos[None, moment.frame], numbers)
+            arms = user.arms(moment.take.qpos[None, moment.frame], numbers, np.array([moment.frame]))
         found = np.full((2, len(self._hands), 3), np.nan)
         forearms, upper_arms = bend_arms(arms, np.concatenate(self.keypoints(moment))[None], [cameras])
         found[:, numbers] = forearms[0], upper_arms[0]

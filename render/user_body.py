@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from typing import Final
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from gloves import Take
 from handsim.hand.model import hand_keypoints
@@ -90,7 +90,8 @@ class UserBody:
             if means[first] < best:
                 best, azimuth = float(means[first]), float(tried[first, 0])
                 self.eyes, self.shoulders, self.right = eyes[first], shoulders[first], right[first]
-        self.forearms = self._forearms(take.qpos)
+        self._tracked = _tracked_forearms(take)
+        self.forearms = _where_known(self._tracked, self._forearms(take.qpos))
 
     def axes(self, wrists: Float[np.ndarray, "T H 3"], forearms: Float[np.ndarray, "T H 3"]) -> Doubles:
         """Axes (T, 2 H, 2, 3) of forearms in these directions, and of upper arms to the shoulders [m]."""
@@ -98,12 +99,15 @@ class UserBody:
         upper = np.stack(np.broadcast_arrays(elbows, self.shoulders), axis=-2)
         return np.concatenate([forearm_axes(wrists, elbows), upper], axis=1)
 
-    def arms(self, qpos: Float[np.ndarray, "K H 27"], hands: Sequence[int]) -> Arms:
-        """Where the arms can be of the hands with these numbers, in these poses of all."""
+    def arms(
+        self, qpos: Float[np.ndarray, "K H 27"], hands: Sequence[int], frames: Int[np.ndarray, "K"]
+    ) -> Arms:
+        """Where the arms can be of the hands with these numbers, in these poses of all in these frames."""
         wrists, axes = qpos[..., :3], quaternion_matrix(qpos[..., 3:7])
         tried = [self._elbows(wrists, axes, self.shoulders, self.eyes, tilt) for tilt in _OUTWARDS]
         ways, costs = (np.concatenate(parts, axis=2) for parts in zip(*tried, strict=True))
         costs += np.repeat(np.square(np.array(_OUTWARDS) / _OUTWARD), len(_SWIVELS))
+        ways = _where_known(self._tracked[frames, :, None], ways)
         elbows = wrists[..., None, :] + (ELBOW * self._lengths)[:, None, None] * ways
         return Arms(
             wrists[:, hands], ways[:, hands], elbows[:, hands], costs[:, hands], self.shoulders[hands]
@@ -127,12 +131,15 @@ class UserBody:
             some = slice(first, first + _CHUNK)
             seen = np.concatenate([one[some] for one in points], axis=1)
             chosen.append(
-                bend_arms(self.arms(qpos[some], hands), seen, [*map(cameras, frames[some].tolist())])
+                bend_arms(
+                    self.arms(qpos[some], hands, frames[some]), seen, [*map(cameras, frames[some].tolist())]
+                )
             )
         fore, upper = (
             turning(np.concatenate(ways), step, take.num_frames) for ways in zip(*chosen, strict=True)
         )
-        return _bent_wrists(fore, quaternion_matrix(take.qpos[..., 3:7]), self._mirrors)[0], upper
+        fore, _ = _bent_wrists(fore, quaternion_matrix(take.qpos[..., 3:7]), self._mirrors)
+        return _where_known(self._tracked, fore), upper
 
     def _stand(
         self, middle: Doubles, azimuth: Doubles, distance: Doubles, down: Doubles, facing: Doubles
@@ -220,6 +227,21 @@ class UserBody:
         others = np.broadcast_to(self._cameras, (len(eyes), *self._cameras.shape))
         eyes = np.ascontiguousarray(np.concatenate([eyes, others], axis=1))  # one type for the compiler
         return np.asarray(hiding_costs(axes, eyes, points).reshape(*batch, hands, tried))
+
+
+def _tracked_forearms(take: Take) -> Doubles:
+    """Unit directions (T, H, 3) from wrists to elbows of forearms with axes; NaN elsewhere."""
+    found = np.full((*take.status.shape, 3), np.nan)
+    for number, side in enumerate(take.sides):
+        body = take.forearm_index(side)
+        if body is not None and take.bodies[body].has_axes:
+            found[:, number] = -quaternion_matrix(take.body_poses[:, body, 3:])[..., 0]
+    return np.asarray(np.where(np.isfinite(take.qpos[..., :1]), found, np.nan))
+
+
+def _where_known(known: Doubles, others: Doubles) -> Doubles:
+    """The known directions, and others where these are NaN."""
+    return np.asarray(np.where(np.isfinite(known), known, others))
 
 
 def _middle(points: Doubles) -> Doubles:

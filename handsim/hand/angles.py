@@ -7,8 +7,8 @@ deviation), and about Y of the outer bone (pronation). A left hand is mirrored f
 A finger's metacarpal has the axes of the flat finger. Skin markers do not measure the trapezium, so the first
 metacarpal turns relative to the hand: towards the palm, to the thumb's side, and about its length.
 
-The wrist is the third metacarpal relative to the forearm, as in section 4 of Wu and others: both have the same
-axes when the wrist is straight. Its pronation is skin that moves over the radius, and is left out.
+The wrist's angles are those of the third metacarpal relative to the forearm; both have the same axes when
+the wrist is straight. The third angle, pronation, is left out: it is mostly skin that slides on the forearm.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """The forearm as a rigid body: its axes by landmarks, and the variances of the wrist's angles.
 
-The axes are those of Wu and others 2005 (section 3, forearm) in our order: x to the hand, y in the plane of the
-styloids to the thumb's side, as of a hand whose wrist is straight. The origin lies midway between the styloids,
-not at the ulnar one, so that the forearm's axis ends in the middle of the wrist.
+The forearm's frame is that of the hand's wrist when the wrist is straight. Its plane is that of Wu and others
+2005: through both styloids and the elbow, midway between the epicondyles. The origin is midway between the
+styloids, not at the ulnar one, so that the long axis ends in the middle of the wrist.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float
-from numpy.typing import NDArray
 
 from gloves.captures.capture import Capture, select_markers
 from gloves.takes.take import Take
@@ -28,8 +27,8 @@ def forearm_of_landmarks(body: RigidTemplate, capture: Capture, landmarks: Seque
     Args:
         body: The forearm, whose markers have the names of columns.
         capture: A labeled capture of some seconds.
-        landmarks: Columns at the radial and the ulnar styloid, and at one or two epicondyles of the elbow, whose
-            middle is the elbow.
+        landmarks: Columns at the radial styloid, the ulnar styloid, and one or two epicondyles, whose middle
+            is the elbow.
 
     Raises:
         ArgumentError: There are not three or four landmarks.
@@ -51,7 +50,7 @@ def forearm_of_landmarks(body: RigidTemplate, capture: Capture, landmarks: Seque
     for name, seen in zip(landmarks, np.isfinite(local[..., 0]).any(axis=0), strict=True):
         if not seen:
             raise CalibrationError(
-                f"landmark {name} is never seen while the forearm is, expected both in a frame"
+                f"landmark {name} is never seen with the forearm, expected both in a frame"
             )
     radial, ulnar, *epicondyles = np.nanmedian(local, axis=0)
     wrist, across = 0.5 * (radial + ulnar), radial - ulnar if body.forearm == "right" else ulnar - radial
@@ -68,7 +67,7 @@ def forearm_of_landmarks(body: RigidTemplate, capture: Capture, landmarks: Seque
 def wrist_variances(
     take: Take, side: Side, body: int, hand: Float[np.ndarray, "T 3 4"]
 ) -> Float[np.ndarray, "T 2 4"]:
-    """Variances of the angles of a wrist [rad^2] by source, for small deviations; axes of the forearm are known.
+    """Variances of a wrist's angles [rad^2] by source, for small deviations and known axes of the forearm.
 
     Args:
         take: The take.

@@ -51,8 +51,8 @@ class _Tolerances(NamedTuple):
 _RIGID: Final = _Tolerances(0.003, 0.001, 0.001, 0.0005)
 """Tolerances of objects: ten times the noise of a good system."""
 _SKIN: Final = _Tolerances(0.005, 0.004, 0.002, 0.001)
-"""Tolerances of a forearm, whose skin moves markers by 1 to 2 mm. A recorded one of five markers, two of them at
-the epicondyles, is labeled in all frames, with 2 mm as `tight` and 3 mm as `gate` in 57 % of them."""
+"""Tolerances of a forearm, whose skin moves markers by 1 to 2 mm. Five markers of a recorded one, two of them
+at the epicondyles, are labeled in all frames; with 2 mm as `tight` and 3 mm as `gate` in 57 % of them."""
 _LEAST_WIDTH: Final = 0.005  # [m] least RMS distance of the markers from their best line
 _LEAST_MARKER_DISTANCE: Final = 2.0 * _RIGID.gate  # [m] Closer markers could exchange labels.
 _LONGEST_COAST: Final = 0.026  # [s] longest prediction (three frames at 120 Hz) without three markers
@@ -440,7 +440,7 @@ def learn_body(
     Args:
         capture: The capture.
         name: The body's name.
-        markers: Columns of a labeled capture, the others of which are left out; the markers have their names.
+        markers: Columns of a labeled capture that are the body's; its markers have their names.
         forearm: The hand whose forearm it is.
 
     Raises:
@@ -453,7 +453,7 @@ def learn_body(
         body = learn_body(capture, name, forearm=forearm)
         if len(body.positions) < len(markers):
             raise CalibrationError(
-                f"{len(body.positions)} of the markers {', '.join(markers)} are seen at most times, expected all"
+                f"{len(body.positions)} of the markers {', '.join(markers)} are seen mostly, expected all"
             )
         return dataclasses.replace(body, marker_names=tuple(markers))
     frames = list(capture_frames(capture))

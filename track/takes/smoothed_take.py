@@ -83,8 +83,8 @@ def smooth_take(take: Take) -> Take:
     """Smooth the poses of a take's hands, and compute their standard deviations.
 
     Labels and statuses stay. The settings get for each hand under "filter" the cut-off of each joint angle
-    [Hz], and under "budget" its standard deviation by `SOURCES` [deg]; of hands whose forearm has markers, under
-    "wrist_budget" those of the wrist's angles.
+    [Hz], and under "budget" its standard deviation by `SOURCES` [deg]; under "wrist_budget" those of a wrist
+    whose forearm is tracked.
     """
     qpos, rms = take.qpos.copy(), take.rms.copy()
     angles = np.full((*rms.shape, NUM_JOINTS), np.nan)
@@ -117,7 +117,7 @@ def smooth_take(take: Take) -> Take:
 
 
 def _budget(variances: Float[np.ndarray, "T K 4"]) -> list[list[float]]:
-    """Standard deviations of angles by `SOURCES` [deg], as root mean square over the frames that have them."""
+    """Root mean square over the known frames of standard deviations of angles by `SOURCES` [deg]."""
     found: list[list[float]] = np.rad2deg(np.sqrt(np.nanmean(variances, axis=0))).round(3).tolist()
     return found
 
