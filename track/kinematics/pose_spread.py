@@ -505,8 +505,8 @@ def pose_spreads(
     """Variances of all unknowns by `SOURCES` [rad^2, m^2] and standard deviations of keypoints [m].
 
     The unknowns are the joint angles, then position and rotation of the wrist along its own axes. `hand` is
-    from `with_keypoints`. A marker off its place moves the fit as noise does. Errors of the hand move markers,
-    by them the fit, and keypoints also directly.
+    from `with_keypoints`. A marker off its place moves the fit as noise does. Errors of the hand move
+    markers, through them the fit, and keypoints also directly.
     """
     found, keypoints = np.empty((len(qpos), NUM_UNKNOWNS, 4)), np.empty((len(qpos), NUM_KEYPOINTS))
     count, work, weights = unseen.shape[1], workspace(len(hand.digits)), np.zeros(len(hand.digits))
