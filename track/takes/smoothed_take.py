@@ -100,7 +100,8 @@ def smooth_take(take: Take) -> Take:
             rms[fits, number] = hand.rms()[fits]
             angles[:, number], keypoints[:, number] = hand.angles, hand.keypoints
             if (body := take.forearm_index(side)) is not None:
-                parts = wrist_variances(take, side, body, variances[:, -3:])
+                calibrated = hand.model.is_calibrated
+                parts = wrist_variances(take, side, body, variances[:, -3:], is_calibrated=calibrated)
                 if np.isfinite(parts).any():
                     wrists[:, number] = np.sqrt(parts.sum(axis=-1))
                     wrist_budgets[side] = _budget(parts)
@@ -162,7 +163,7 @@ class _SmoothedHand:
         self._targets = np.ascontiguousarray(take.observed(worn.side))
         self._unseen = times_unseen(take.times, np.isfinite(self._targets[..., 0]))
         self._residuals = np.full_like(self._targets, np.nan)  # in the frames of the bones [m]
-        self._hand, self._model, self._rate = hand_arrays(worn), spread_model(take, worn), take.rate
+        self._hand, self.model, self._rate = hand_arrays(worn), spread_model(take, worn), take.rate
         spans, seen = self._hand.hinge_span, np.isfinite(self._targets[..., 0]).any(axis=0)
         joints = np.arange(NUM_JOINTS)[:, None]
         # Whether each joint moves a marker that is seen.
@@ -192,8 +193,8 @@ class _SmoothedHand:
         cutoffs, wide = [], self._prior_of(self._shown)
         parts = np.full((len(self.qpos), NUM_UNKNOWNS, len(SOURCES)), np.nan)
         # Of a joint that does not move a calibration finds no more than measuring does.
-        still, models = np.flatnonzero(are_still(self._angles()) & self._shown), [self._model]
-        if len(still) and self._model.is_calibrated:
+        still, models = np.flatnonzero(are_still(self._angles()) & self._shown), [self.model]
+        if len(still) and self.model.is_calibrated:
             models.append(SpreadModel(self._worn, "measured"))
         for window in windows:
             equations = self._equations(window)
