@@ -49,7 +49,7 @@ HEIGHT_RANGE: Final = (0.0, 0.05)
 """Range of `MarkerPlace.height` [m]."""
 _ARM: Final = {
     "wrist": "for a marker that moves with the hand write palm, with along from -0.15 to 0",
-    "forearm": "markers beyond the wrist's joint move against the hand and are not modeled",
+    "forearm": "markers beyond the wrist's joint are a rigid body of their own (handsim body --forearm)",
 }
 _ALIASES: Final = {name.replace("little", "pinky"): name for name in BONE_NAMES if name.startswith("little")}
 _SHIPPED: Final = Path(__file__).parent / "layouts"

@@ -16,6 +16,7 @@ from train.labelers.protocol import LABELERS
 
 NUMBER = re.compile(r"-?\d+(?:\.\d+)?")
 SLOW = {
+    "angles",
     "calibration",
     "layouts",
     "own_labelers",
