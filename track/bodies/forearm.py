@@ -22,9 +22,9 @@ from track.bodies.constellation import FEWEST
 from track.bodies.rigid_body import RigidTemplate, track_body
 from track.kinematics.pose_spread import SOURCES
 
-# Factor of these errors of an uncalibrated palm, whose many markers make up for each other. Found constant
-# errors over stated ones are 0.49 to 0.64, in either angle of 36 simulated hands in dense19 and sparse13.
-_SHARE: Final = {"gluing": 0.55, "person": 0.55}
+_SHARE: Final = 0.6
+"""Factor of gluing and person in the turn of an uncalibrated palm, whose many markers make up for each other:
+constant errors found are 0.43 to 0.70 of those stated, in either angle of 60 simulated hands (docs/angles.md)."""
 
 
 def forearm_of_landmarks(body: RigidTemplate, capture: Capture, landmarks: Sequence[str]) -> RigidTemplate:
@@ -96,7 +96,7 @@ def wrist_variances(
         squares = np.einsum("tq,tqi,tqj->tij", seen, local, local)
         inertia = squares.trace(axis1=1, axis2=2)[:, None, None] * np.eye(3) - squares
         by_markers = noise * turns.swapaxes(1, 2) @ np.linalg.inv(inertia) @ turns
-        shares = np.array([1.0 if is_calibrated else _SHARE.get(source, 1.0) for source in SOURCES])
-        found[shown] = hand[shown, 1:] * shares**2
+        is_less = np.isin(SOURCES, ("gluing", "person")) & (not is_calibrated)
+        found[shown] = hand[shown, 1:] * np.where(is_less, _SHARE**2, 1.0)
         found[shown, :, 0] += by_markers.diagonal(axis1=1, axis2=2)[:, 1:]
     return found
