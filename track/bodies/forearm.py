@@ -24,7 +24,7 @@ from track.kinematics.pose_spread import SOURCES
 
 _SHARE: Final = 0.6
 """Factor of gluing and person in the turn of an uncalibrated palm, whose many markers make up for each other:
-constant errors found are 0.43 to 0.70 of those stated, in either angle of 60 simulated hands (docs/angles.md)."""
+constant errors found are 0.43 to 0.70 of those stated, in either angle of 60 simulated hands."""
 
 
 def forearm_of_landmarks(body: RigidTemplate, capture: Capture, landmarks: Sequence[str]) -> RigidTemplate:
