@@ -13,6 +13,7 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from gloves import Capture, Take, attach, load_take, write_capture
+from handsim import HandModel, sample_shape
 from handsim.cli.main import main
 from handsim.errors import ArgumentError, CalibrationError
 from handsim.hand.angles import WRIST_NAMES
@@ -23,6 +24,7 @@ from track import RigidTemplate, track_capture
 from track.bodies.forearm import forearm_of_landmarks
 from track.bodies.rigid_body import learn_body, load_bodies, load_body, save_body
 from track.takes.take_page import PageSettings, write_take_page
+from train.simulation.training_frames import wear_gloves
 
 RATE = 120.0
 NOISE = 0.0003  # [m]
@@ -48,10 +50,13 @@ def wander(rng, frames: int, every: float, reach) -> np.ndarray:
 
 
 @functools.cache
-def scene(side: str, frames: int = 360) -> Scene:
+def scene(side: str, frames: int = 360, person: int = 0) -> Scene:
     """A gloved hand that bends at the wrist; the bends are chosen, the forearm's markers follow from them."""
-    rng = np.random.default_rng(7)
+    rng = np.random.default_rng(7 + person)
     fit = attach("dense19", "M" if side == "right" else "L").with_side(side)
+    if person:
+        models = [HandModel(sample_shape(side=side, rng=rng))]
+        (fit,) = wear_gloves(fit.layout, models, along=0.05, around=np.deg2rad(5.0), rng=rng)
     qpos = np.array(sample_motion(fit.model, (frames - 1) / RATE, rng=rng).qpos)
     bends = wander(rng, frames, 0.6, np.deg2rad([50.0, 18.0, 4.0]))
     bends[: STRAIGHT + 30] *= np.clip((np.arange(STRAIGHT + 30) - STRAIGHT) / 30.0, 0.0, 1.0)[:, None]
@@ -107,9 +112,24 @@ def test_a_tracked_wrist_bends_as_it_did_and_knows_how_well(side):
     off = np.rad2deg(wrist_of(take) - scene(side).angles)[there]
     assert np.sqrt((off**2).mean(axis=0)).max() < 1.0
     ratios = np.abs(off) / np.rad2deg(spreads[there])
-    assert 0.6 < (ratios < 1.0).mean() < 0.97 and (ratios < 2.0).mean() > 0.92
+    assert 0.3 < np.sqrt((ratios**2).mean()) < 1.0, "the hand is known better than the tracker knows"
     noise, gluing, flesh, person = np.array(take.settings["wrist_budget"][side]).T
     assert (noise > 0.1).all() and (np.hypot(gluing, person) > noise).all() and (flesh < noise).all()
+
+
+@pytest.mark.slow
+def test_stated_deviations_of_measured_hands_hold():
+    ratios = []
+    for person, side in enumerate(("right", "left") * 6, 1):
+        one = scene(side, 480, person)
+        take = track_capture(one.capture, glove="dense19", hands=(side,), bodies=[one.arm])
+        off = wrist_of(take) - one.angles
+        assert np.rad2deg(np.sqrt(np.nanmean(off**2, axis=0))).max() < 3.0
+        spreads = [take.angle_spreads(side)[name] for name in WRIST_NAMES]
+        ratios.append(np.abs(off) / np.transpose(spreads))
+    whole = np.concatenate(ratios)
+    whole = whole[np.isfinite(whole)]
+    assert 0.55 < (whole < 1.0).mean() < 0.82 and 0.89 < (whole < 2.0).mean() < 0.995
 
 
 def test_every_label_of_the_arm_is_right():
