@@ -74,7 +74,9 @@ def register_camera(
     on_step("finding hands")
     found = find_hands(film, detector or HandDetector.load(), progress)
     on_step("fitting the camera")
-    return register(taken, found, film.size, given, lambda: (picture for _, picture in film.frames()))
+    return register(
+        taken, found, film.size, given, lambda: (picture for _, picture in film.frames()), progress
+    )
 
 
 def _taken(take: Take | str | Path) -> Take:

@@ -25,6 +25,7 @@ _SURE: Final = 0.25  # Keypoints with a lower score are not used.
 _MOST_BUNDLED: Final = 5000  # largest number of keypoints in a bundle
 _ROBUST: Final = 2.0  # Residuals beyond this many standard deviations count less.
 _NOTHING: Final = 1e-2  # prior information on free unknowns
+_PARTS: Final = 8  # number of parts of a video that are held out, one after the other
 _DEPENDENT: Final = 16.0  # This many samples count as one with an independent error.
 
 # Places of the unknowns in a state's values. From POSES on, each span has six numbers for its camera's pose.
@@ -230,6 +231,22 @@ class Bundle:
         inverse = np.linalg.inv(done.jac.T @ done.jac + _NOTHING * np.eye(len(done.x)))
         covariance[np.ix_(free, free)] = _DEPENDENT * inverse
         return widened(done.x), 2.0 * float(done.cost) / max(count, 1), covariance
+
+    def held_out(self, state: State, samples: Samples, noise: float) -> tuple[Doubles, Doubles]:
+        """Standard deviations of the unknowns, and residuals (N,) [px], from solutions without a part of the time.
+
+        Each of the parts is left out once (a jackknife), so that errors that last count as what they are.
+        Residuals are those of the samples that their solution did not see.
+        """
+        ends = np.quantile(samples.frames, np.linspace(0.0, 1.0, _PARTS + 1)[1:-1])
+        parts, away, found = np.searchsorted(ends, samples.frames), np.empty(len(samples.frames)), []
+        for part in range(_PARTS):
+            out = parts == part
+            kept = samples._replace(normals=np.where(out[:, None], 0.0, samples.normals))
+            other = self.solve(state, kept, noise)[0]
+            away[out] = self.residuals(other, samples, 1.0)[out]
+            found.append(other.values)
+        return np.std(found, axis=0) * np.sqrt(_PARTS - 1), away
 
     def residuals(self, state: State, samples: Samples, noise: float) -> Doubles:
         """Distances (N,) from the lines, over the noise; 0 where the take has no pose."""

@@ -9,7 +9,7 @@ pixel, and the last bundles are of these.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
@@ -33,6 +33,7 @@ from film.bundle import (
 )
 from film.outlines import Outlines, Seen, straight
 from gloves.takes.take import Take
+from handsim.callbacks import Progress, no_progress
 from handsim.errors import HandSimError
 from handsim.hand.shape import SIDES
 from handsim.pages import coordinates
@@ -61,7 +62,12 @@ _FIRST_NOISE: Final = 2.0  # [px] standard deviation of edges in the first round
 _STEP: Final = 1.0 / 15.0  # [s] step between the shifts of the clock
 _MOST_MATCHED: Final = 64  # largest number of detections that are matched
 _NOWHERE: Final = 1e3  # [m] where hands are that the take does not have
-_TRIED: Final = 3  # number of best shifts for which PnP is tried
+_TRIED: Final = 5  # number of best shifts for which PnP is tried
+_SCREENED: Final = 30  # number of frames whose outlines judge a hypothesis
+_NEAR: Final = 0.004  # [widths] An edge this near to an outline agrees.
+_MARGIN: Final = 0.8  # Another clock explains at most this share of what the best does.
+_SAME_CLOCK: Final = 0.05  # [s]
+_STILL: Final = 0.7  # No push is looked for if this share agrees with a camera that stood still.
 _APART: Final = 0.3  # [s] least distance of two shifts for which PnP is tried
 _FOCALS: Final = (0.5, 0.65, 0.85, 1.1, 1.45, 1.9, 2.5, 3.3)  # [picture widths] tried by PnP
 _GATE: Final = 0.08  # [widths] A detection is not of a hand whose keypoints are farther off in the median.
@@ -75,6 +81,9 @@ _SLOW: Final = (
 )
 _RATIOS: Final = (2, 4, 5, 8, 10, 16, 20, 32)
 """How many times as slowly as it was taken slow motion is stored."""
+
+
+_Looks = list[tuple[int, Bytes]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -167,6 +176,7 @@ def register(
     size: tuple[int, int],
     given: Camera | None = None,
     pictures: Callable[[], Iterable[Bytes]] | None = None,
+    progress: Progress = no_progress,
 ) -> Registration:
     """The registration of a video of this size [px] in which a detector found hands.
 
@@ -174,7 +184,7 @@ def register(
     hands, keypoints alone tell the camera, which are much coarser.
     """
     try:
-        return _register(take, found, size, given, pictures)
+        return _register(take, found, size, given, pictures, progress)
     except HandSimError as error:
         if str(error) == _UNLIKE and (ratio := _slowed(take, found, size, given)):
             raise HandSimError(_SLOW.format(ratio, 1.0 / ratio)) from error
@@ -199,6 +209,7 @@ def _register(
     size: tuple[int, int],
     given: Camera | None,
     pictures: Callable[[], Iterable[Bytes]] | None = None,
+    progress: Progress = no_progress,
 ) -> Registration:
     """The registration of a video whose clock is right."""
     bundle, width = Bundle(take, Detections.of(found), size, given), size[0]
@@ -208,19 +219,14 @@ def _register(
             f"hands were found in {with_hands} of the {looked} frames that were searched, expected "
             f"{_FEWEST_FRAMES} at least: hands that fill a third of the picture's height, for some seconds"
         )
-    start = _first_guess(bundle)
-    state, covariance, noise = _adjusted(bundle, start, splits=True)
-    # Errors of the detector may look like a push, those of outlines do not.
-    still = []
-    if pictures and len(state.starts) > 1:
-        with contextlib.suppress(HandSimError):  # no camera that stood still fits
-            still.append(_adjusted(bundle, start, splits=False)[0])
-    tried = [_outlined(bundle, one, pictures) for one in (*still, state)] if pictures else []
-    if outlined := [one for one in tried if one is not None]:  # of a camera that stood still first
-        away = np.array([fit.distances for *_, fit in outlined])
-        away = np.nan_to_num(away[:, np.isfinite(away).any(axis=0)], nan=width).clip(max=_LEAST_BOUND * width)
-        state, covariance, fit = outlined[int((away.sum(axis=1) * _LIKELY ** np.arange(len(away))).argmin())]
-    elif noise > _WORST * width:
+    looks = _looks(bundle, pictures) if pictures else []
+    tried = _hypotheses(bundle, looks, progress)
+    best, state, covariance = tried[0], tried[0].state, tried[0].covariance
+    _check_margin(bundle, tried)
+    outlined = _outlined(bundle, state, looks, pictures, progress) if pictures else None
+    if outlined is not None:
+        state, covariance, fit = outlined
+    elif best.noise > _WORST * width:
         raise HandSimError(_UNLIKE)
     else:
         fit = _keypoint_fit(bundle, state)
@@ -229,8 +235,8 @@ def _register(
     (offset, drift), deviations = bundle.clock(state), np.sqrt(np.diag(covariance))
     unknowns: dict[str, int | slice] = {"offset": OFFSET, "drift": DRIFT, "readout": READOUT, "focal": FOCAL}
     known = {name: float(np.max(deviations[numbers])) for name, numbers in unknowns.items()}
-    pose = deviations[POSES : POSES + 6].reshape(2, 3)
-    known["rotation"], known["position"] = np.linalg.norm(pose, axis=1).tolist()
+    poses = np.linalg.norm(deviations[POSES:].reshape(-1, 2, 3), axis=2)
+    known["rotation"], known["position"] = poses.max(axis=0).tolist()  # of the span that is known least
     if known["position"] > _UNKNOWN:
         raise HandSimError(
             f"the hands tell the camera's place to {1e3 * known['position']:.0f} mm only; expected hands "
@@ -260,9 +266,77 @@ def _adjusted(bundle: Bundle, state: State, *, splits: bool) -> tuple[State, Dou
     return state, covariance, noise
 
 
-def _first_guess(bundle: Bundle) -> State:
-    """Unknowns that explain most of what was found: clock by all shifts, pose by PnP."""
-    gate, best, most = _GATE * bundle.size[0], None, 0.0
+class _Hypothesis(NamedTuple):
+    """A clock and a camera that may be the video's."""
+
+    agreement: float  # share of what is seen that it explains
+    state: State
+    covariance: Doubles
+    noise: float  # of keypoints [px]
+
+
+def _hypotheses(bundle: Bundle, looks: _Looks, progress: Progress) -> list[_Hypothesis]:
+    """What may be the video's clock and camera, best first; a push is looked for if no still camera fits."""
+    some = looks[:: max(1, len(looks) // _SCREENED)]
+    found: list[tuple[_Hypothesis, State]] = []
+    guesses, frames = _first_guesses(bundle), len(bundle.found.times)
+
+    def judge(start: State, *, splits: bool) -> None:
+        with contextlib.suppress(HandSimError):  # the others are tried all the same
+            state, covariance, noise = _adjusted(bundle, start, splits=splits)
+            agreement, state = _agreement(bundle, state, some)
+            found.append((_Hypothesis(agreement, state, covariance, noise), start))
+            import sys
+            print(f"  hyp {bundle.clock(start)[0]:.3f} -> {bundle.clock(state)[0]:.4f} starts {state.starts} noise {noise:.1f} agreement {agreement:.3f} f {np.exp(state.values[FOCAL]):.3f}", file=sys.stderr, flush=True)
+
+    for number, start in enumerate(guesses):
+        judge(start, splits=False)
+        progress((number + 1) * frames // len(guesses), 2 * frames)
+    found.sort(key=lambda one: -one[0].agreement)
+    if not found or found[0][0].agreement < _STILL:
+        others = [one for one in found[1:] if not _are_same(bundle, found[0][0].state, one[0].state)]
+        for start in [start for _, start in (*found[:1], *others[:1])] or guesses[:1]:
+            judge(start, splits=True)
+    if not found:
+        raise HandSimError(_UNLIKE)
+    return sorted((one for one, _ in found), key=lambda one: -one.agreement)
+
+
+def _agreement(bundle: Bundle, state: State, looks: _Looks) -> tuple[float, State]:
+    """The share of the hands' outlines that is where pictures have edges, and the state adjusted to these.
+
+    Without pictures it is how near keypoints are.
+    """
+    if not looks:
+        away = bundle.match(state, np.inf).distances / (_GATE * bundle.size[0])
+        return float(np.nansum((1.0 - away).clip(min=0.0)) / len(bundle.found.frames)), state
+    outlines, share = Outlines(bundle), 0.0
+    for reach in _REACHES[:3]:
+        samples, seen = outlines.edges(state, looks, reach)
+        if samples is None:
+            return 0.0, state
+        state, *_ = bundle.solve(state, samples, _FIRST_NOISE, first=True)
+        near = np.abs(bundle.residuals(state, samples, 1.0)) < _NEAR * bundle.size[0]
+        share = float(near.sum() / np.nansum(seen.tried))
+    return share, state
+
+
+def _check_margin(bundle: Bundle, tried: list[_Hypothesis]) -> None:
+    """Raise if another clock or camera explains nearly as much as the best."""
+    best = tried[0]
+    for other in tried[1:]:
+        same = _are_same(bundle, best.state, other.state)
+        if not same and other.agreement > _MARGIN * best.agreement:
+            raise HandSimError(
+                f"clocks of {bundle.clock(best.state)[0]:.2f} s and {bundle.clock(other.state)[0]:.2f} s explain "
+                f"{100 * best.agreement:.0f} and {100 * other.agreement:.0f} % of the hands in the video; expected "
+                "motion that tells which: a longer video, or keypoints of another detector"
+            )
+
+
+def _first_guesses(bundle: Bundle) -> list[State]:
+    """Unknowns that explain much of what was found: clock by all shifts, pose by PnP."""
+    gate, guesses = _GATE * bundle.size[0], list[State]()
     tried: list[float] = []
     # The best fits are computed again, because those of all shifts together would fill the memory.
     for _, shift in _shifts(bundle):
@@ -276,12 +350,17 @@ def _first_guess(bundle: Bundle) -> State:
             continue
         samples = bundle.samples(bundle.match(start, gate))
         state, *_ = bundle.solve(start, samples, 0.01 * bundle.size[0], first=True)
-        agreeing = float(np.nansum(1.0 - bundle.match(state, gate).distances / gate))
-        if agreeing > most:
-            best, most = state, agreeing
-    if best is None:
+        if not any(_are_same(bundle, state, other) for other in guesses):
+            guesses.append(state)
+    if not guesses:
         raise HandSimError(_UNLIKE)
-    return best
+    return guesses
+
+
+def _are_same(bundle: Bundle, one: State, other: State) -> bool:
+    """Whether two states have the same clock and, nearly, the same place of the camera."""
+    clocks = np.abs(bundle.times(one) - bundle.times(other))[[0, -1]]
+    return bool(clocks.max() < _SAME_CLOCK and np.linalg.norm(one.pose(0)[3:] - other.pose(0)[3:]) < _UNKNOWN)
 
 
 def _shifts(bundle: Bundle) -> list[tuple[float, float]]:
@@ -347,24 +426,41 @@ def _posed(bundle: Bundle, offset: float, points: Doubles, pixels: Doubles) -> S
     return best
 
 
+def _looks(bundle: Bundle, pictures: Callable[[], Iterable[Bytes]]) -> _Looks:
+    """Numbered pictures, shrunk, of some frames in which hands were found."""
+    outlines, shown = Outlines(bundle), np.unique(bundle.found.frames)
+    chosen = set(shown[np.linspace(0, len(shown) - 1, _MOST_LOOKED).astype(int)].tolist())
+    return [(n, outlines.shrunk(picture)) for n, picture in enumerate(pictures()) if n in chosen]
+
+
 def _outlined(
-    bundle: Bundle, state: State, pictures: Callable[[], Iterable[Bytes]]
+    bundle: Bundle,
+    state: State,
+    looks: _Looks,
+    pictures: Callable[[], Iterable[Bytes]],
+    progress: Progress,
 ) -> tuple[State, Doubles, _Fit] | None:
     """State, covariance and fit by the outlines of the hands; None where they are not seen."""
     outlines, noise = Outlines(bundle), _FIRST_NOISE
-    shown = np.flatnonzero((bundle.match(state, _GATE * bundle.size[0]).numbers >= 0).any(axis=1))
-    if not len(shown):
-        return None
-    chosen = set(shown[np.linspace(0, len(shown) - 1, _MOST_LOOKED).astype(int)].tolist())
-    looks = [(n, outlines.shrunk(picture)) for n, picture in enumerate(pictures()) if n in chosen]
     for turn, reach in enumerate(_REACHES):
         samples, _ = outlines.edges(state, looks, reach)
         if samples is None or len(samples.frames) < _FEWEST_EDGES * _FEWEST_FRAMES:
             return None
         state, _, covariance = bundle.solve(state, samples, noise, first=turn == 0)
         noise = max(0.3, float(np.median(np.abs(bundle.residuals(state, samples, 1.0)))) / 0.6745)
-    every = ((n, outlines.shrunk(picture)) for n, picture in enumerate(pictures()))
-    _, seen = outlines.edges(state, every, _REACHES[1])
+    jack, away = bundle.held_out(state, samples, noise)
+    import sys
+    ins = bundle.residuals(state, samples, 1.0); ends = np.quantile(samples.frames, np.linspace(0, 1, 9)[1:-1]); parts = np.searchsorted(ends, samples.frames)
+    print("  jack/formal", np.round(jack / np.sqrt(np.diag(covariance)), 2), "held", [f"{np.median(np.abs(away[parts == k])):.2f}/{np.median(np.abs(ins[parts == k])):.2f}" for k in range(8)], "thick", state.values[7], "center", state.values[3:5]*640, "sd", np.sqrt(np.diag(covariance))[3:5]*640, jack[3:5]*640, file=sys.stderr, flush=True)
+    covariance = np.diag(np.maximum(np.diag(covariance), jack**2))
+    frames = len(bundle.found.times)
+
+    def every() -> Iterator[tuple[int, Bytes]]:
+        for number, picture in enumerate(pictures()):
+            progress(frames + number + 1, 2 * frames)
+            yield number, outlines.shrunk(picture)
+
+    _, seen = outlines.edges(state, every(), _REACHES[1])
     return state, covariance, _outline_fit(bundle, seen, _keypoint_fit(bundle, state))
 
 
@@ -431,7 +527,7 @@ def _outline_fit(bundle: Bundle, seen: Seen, fit: _Fit) -> _Fit:
     told = seen.found >= np.maximum(_FEWEST_EDGES, _SEEN * seen.tried)
     middle, most = (np.where(told, one, np.nan) for one in (seen.middle, seen.most))
     usual = float(np.nanmedian(most)) if told.any() else 0.0
-    bound = max(_BOUND * usual, 0.5 * _LEAST_BOUND * bundle.size[0])
+    bound = float(np.clip(_BOUND * usual, *(share * _LEAST_BOUND * bundle.size[0] for share in (0.5, 1.0))))
     whole = told.any(axis=1) & (told | ~(seen.tried > 0.0)).all(axis=1)
     cases = {
         f"the hand's outline is more than {bound:.1f} px off": (most > bound).any(axis=1),
