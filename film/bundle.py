@@ -33,7 +33,7 @@ _DEPENDENT: Final = 16.0  # This many samples count as one with an independent e
 # thicker the filmed hands are than the tracked ones [m], because of cloth or an error of a measured hand.
 OFFSET, DRIFT, FOCAL, THICKER, POSES = 0, 1, 2, 7, 10
 _CENTER, _LENS, READOUT = slice(3, 5), slice(5, 7), slice(8, 10)
-_PRIORS: Final = np.array([np.inf, 1e-4, 0.7, 0.005, 0.005, 0.05, 0.05, 0.0007, 0.015, 0.015])
+_PRIORS: Final = np.array([np.inf, 1e-4, 0.7, 0.01, 0.01, 0.05, 0.05, 0.0007, 0.015, 0.015])
 
 
 class FoundFrame(NamedTuple):
@@ -232,21 +232,22 @@ class Bundle:
         covariance[np.ix_(free, free)] = _DEPENDENT * inverse
         return widened(done.x), 2.0 * float(done.cost) / max(count, 1), covariance
 
-    def held_out(self, state: State, samples: Samples, noise: float) -> tuple[Doubles, Doubles]:
-        """Standard deviations of the unknowns, and residuals (N,) [px], from solutions without a part of the time.
+    def held_out(self, state: State, samples: Samples, noise: float) -> tuple[Doubles, float]:
+        """Standard deviations of the unknowns from solutions that each leave out a part of the time.
 
-        Each of the parts is left out once (a jackknife), so that errors that last count as what they are.
-        Residuals are those of the samples that their solution did not see.
+        In this jackknife errors that last count as what they are. The second value is the median residual
+        [px] of the part that the solution without it fits least.
         """
         ends = np.quantile(samples.frames, np.linspace(0.0, 1.0, _PARTS + 1)[1:-1])
-        parts, away, found = np.searchsorted(ends, samples.frames), np.empty(len(samples.frames)), []
+        parts, surprise, found = np.searchsorted(ends, samples.frames), 0.0, []
         for part in range(_PARTS):
             out = parts == part
             kept = samples._replace(normals=np.where(out[:, None], 0.0, samples.normals))
             other = self.solve(state, kept, noise)[0]
-            away[out] = self.residuals(other, samples, 1.0)[out]
+            away = np.abs(self.residuals(other, samples, 1.0)[out])
+            surprise = max(surprise, float(np.median(away))) if out.any() else surprise
             found.append(other.values)
-        return np.std(found, axis=0) * np.sqrt(_PARTS - 1), away
+        return np.std(found, axis=0) * np.sqrt(_PARTS - 1), surprise
 
     def residuals(self, state: State, samples: Samples, noise: float) -> Doubles:
         """Distances (N,) from the lines, over the noise; 0 where the take has no pose."""

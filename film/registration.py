@@ -65,7 +65,10 @@ _NOWHERE: Final = 1e3  # [m] where hands are that the take does not have
 _TRIED: Final = 5  # number of best shifts for which PnP is tried
 _SCREENED: Final = 30  # number of frames whose outlines judge a hypothesis
 _NEAR: Final = 0.004  # [widths] An edge this near to an outline agrees.
+_LEAST_AGREEMENT: Final = 0.5  # share of the outlines; of wrong clocks and cameras it was 0.01 to 0.37
 _MARGIN: Final = 0.8  # Another clock explains at most this share of what the best does.
+_SURPRISE: Final = 0.003  # [widths] Outlines of a part that was held out are at most this far off.
+_ZOOMED: Final = 3.0  # Focal lengths of two spans differ by more than this many standard deviations.
 _SAME_CLOCK: Final = 0.05  # [s]
 _STILL: Final = 0.7  # No push is looked for if this share agrees with a camera that stood still.
 _APART: Final = 0.3  # [s] least distance of two shifts for which PnP is tried
@@ -74,6 +77,10 @@ _GATE: Final = 0.08  # [widths] A detection is not of a hand whose keypoints are
 _UNLIKE: Final = (
     "the hands in the video do not move as those of the take at any shift of the clock; expected a video of "
     "this take, cut to its time, of a camera that stood still"
+)
+_CHANGED: Final = (
+    "the camera's {} is not the same in all of the video; expected one focal length, no image stabilization, "
+    "and a camera that is pushed three times at most: cut the video, and register the parts"
 )
 _SLOW: Final = (
     "the hands in the video move {0} times as slowly as those of the take: is it slow motion? Make it {0} "
@@ -222,6 +229,8 @@ def _register(
     looks = _looks(bundle, pictures) if pictures else []
     tried = _hypotheses(bundle, looks, progress)
     best, state, covariance = tried[0], tried[0].state, tried[0].covariance
+    if looks and best.agreement < _LEAST_AGREEMENT:
+        raise HandSimError(_UNLIKE)
     _check_margin(bundle, tried)
     outlined = _outlined(bundle, state, looks, pictures, progress) if pictures else None
     if outlined is not None:
@@ -284,6 +293,8 @@ def _hypotheses(bundle: Bundle, looks: _Looks, progress: Progress) -> list[_Hypo
     def judge(start: State, *, splits: bool) -> None:
         with contextlib.suppress(HandSimError):  # the others are tried all the same
             state, covariance, noise = _adjusted(bundle, start, splits=splits)
+            if any(_are_same(bundle, state, one.state) for one, _ in found if one.state.starts == state.starts):
+                return
             agreement, state = _agreement(bundle, state, some)
             found.append((_Hypothesis(agreement, state, covariance, noise), start))
             import sys
@@ -293,7 +304,7 @@ def _hypotheses(bundle: Bundle, looks: _Looks, progress: Progress) -> list[_Hypo
         judge(start, splits=False)
         progress((number + 1) * frames // len(guesses), 2 * frames)
     found.sort(key=lambda one: -one[0].agreement)
-    if not found or found[0][0].agreement < _STILL:
+    if not found or not looks or found[0][0].agreement < _STILL:
         others = [one for one in found[1:] if not _are_same(bundle, found[0][0].state, one[0].state)]
         for start in [start for _, start in (*found[:1], *others[:1])] or guesses[:1]:
             judge(start, splits=True)
@@ -327,10 +338,11 @@ def _check_margin(bundle: Bundle, tried: list[_Hypothesis]) -> None:
     for other in tried[1:]:
         same = _are_same(bundle, best.state, other.state)
         if not same and other.agreement > _MARGIN * best.agreement:
+            (clock, _), (another, _) = bundle.clock(best.state), bundle.clock(other.state)
             raise HandSimError(
-                f"clocks of {bundle.clock(best.state)[0]:.2f} s and {bundle.clock(other.state)[0]:.2f} s explain "
+                f"cameras with the clock at {clock:.2f} and at {another:.2f} s explain "
                 f"{100 * best.agreement:.0f} and {100 * other.agreement:.0f} % of the hands in the video; expected "
-                "motion that tells which: a longer video, or keypoints of another detector"
+                "hands that move in all directions and do not repeat themselves, and a longer video"
             )
 
 
@@ -448,11 +460,14 @@ def _outlined(
             return None
         state, _, covariance = bundle.solve(state, samples, noise, first=turn == 0)
         noise = max(0.3, float(np.median(np.abs(bundle.residuals(state, samples, 1.0)))) / 0.6745)
-    jack, away = bundle.held_out(state, samples, noise)
+    deviations, surprise = bundle.held_out(state, samples, noise)
     import sys
-    ins = bundle.residuals(state, samples, 1.0); ends = np.quantile(samples.frames, np.linspace(0, 1, 9)[1:-1]); parts = np.searchsorted(ends, samples.frames)
-    print("  jack/formal", np.round(jack / np.sqrt(np.diag(covariance)), 2), "held", [f"{np.median(np.abs(away[parts == k])):.2f}/{np.median(np.abs(ins[parts == k])):.2f}" for k in range(8)], "thick", state.values[7], "center", state.values[3:5]*640, "sd", np.sqrt(np.diag(covariance))[3:5]*640, jack[3:5]*640, file=sys.stderr, flush=True)
-    covariance = np.diag(np.maximum(np.diag(covariance), jack**2))
+    print("  jack/formal", (deviations / np.sqrt(np.diag(covariance))).round(2), "surprise", surprise, "thick", state.values[7], "center", state.values[3:5]*640, "sd", np.sqrt(np.diag(covariance))[3:5]*640, file=sys.stderr, flush=True)
+    if surprise > _SURPRISE * bundle.size[0]:
+        raise HandSimError(_CHANGED.format("place or zoom"))
+    np.fill_diagonal(covariance, np.maximum(np.diag(covariance), deviations**2))
+    if len(state.starts) > 1 and _zoomed(bundle, state, samples, noise):
+        raise HandSimError(_CHANGED.format("focal length"))
     frames = len(bundle.found.times)
 
     def every() -> Iterator[tuple[int, Bytes]]:
@@ -462,6 +477,19 @@ def _outlined(
 
     _, seen = outlines.edges(state, every(), _REACHES[1])
     return state, covariance, _outline_fit(bundle, seen, _keypoint_fit(bundle, state))
+
+
+def _zoomed(bundle: Bundle, state: State, samples: Samples, noise: float) -> bool:
+    """Whether spans, each by itself, have focal lengths that differ."""
+    spans, focals, variances = state.spans(samples.frames), [], []
+    for span in range(len(state.starts)):
+        alone = samples._replace(normals=np.where((spans == span)[:, None], samples.normals, 0.0))
+        found, _, covariance = bundle.solve(state, alone, noise)
+        focals.append(found.values[FOCAL])
+        variances.append(covariance[FOCAL, FOCAL])
+    import sys
+    print("  focals", np.exp(focals), np.sqrt(variances), file=sys.stderr)
+    return bool(np.ptp(focals) > _ZOOMED * np.sqrt(np.sum(variances)))
 
 
 def _split(bundle: Bundle, state: State, noise: float) -> State:
