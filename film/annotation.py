@@ -57,7 +57,8 @@ def register_camera(
         take: A tracked take or its path.
         video: The video: of one camera that stood still, and of one shot.
         camera: A camera with the lens of the video's, or a file of it; its pose does not count. The focal
-            length, the center and two coefficients are found, too, when not given.
+            length and two coefficients are found, too, when not given, and the center as far as motion tells it:
+            else it is near the middle of the picture.
         detector: Finds the hands in the pictures, or those that another program found; the shipped one when
             not given.
         progress: Called with the numbers of frames that were read, and of all.

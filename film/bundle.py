@@ -30,10 +30,14 @@ _DEPENDENT: Final = 16.0  # This many samples count as one with an independent e
 
 # Places of the unknowns in a state's values. From POSES on, each span has six numbers for its camera's pose.
 # _PRIORS holds the standard deviation of each unknown before any picture is seen. THICKER says how much
-# thicker the filmed hands are than the tracked ones [m], because of cloth or an error of a measured hand.
-OFFSET, DRIFT, FOCAL, THICKER, POSES = 0, 1, 2, 7, 10
-_CENTER, _LENS, READOUT = slice(3, 5), slice(5, 7), slice(8, 10)
-_PRIORS: Final = np.array([np.inf, 1e-4, 0.7, 0.01, 0.01, 0.05, 0.05, 0.0007, 0.015, 0.015])
+# thicker the filmed hands are than the tracked ones [m], because of cloth or an error of a measured hand, and
+# LARGER by which share they are larger.
+OFFSET, DRIFT, FOCAL, THICKER, LARGER, POSES = 0, 1, 2, 7, 8, 11
+CENTER, _LENS, READOUT = slice(3, 5), slice(5, 7), slice(9, 11)
+USUAL_CENTER: Final = 0.01  # [widths] standard deviation of lens centers from the middle of the picture
+_PRIORS: Final = np.array(
+    [np.inf, 1e-4, 0.7, USUAL_CENTER, USUAL_CENTER, 0.05, 0.05, 0.0007, 0.02, 0.015, 0.015]
+)
 
 
 class FoundFrame(NamedTuple):
@@ -105,6 +109,7 @@ class Samples(NamedTuple):
     pixels: Doubles  # (N, 2): a point of the line
     normals: Doubles  # (N, 2): normal of the line, as long as its weight
     outward: Doubles  # (N, 3): the way in which a thicker hand moves the point
+    larger: Doubles  # (N, 3): from the hand's middle to the point [m]
     points_at: Callable[[Doubles], Doubles]
     """Points (N, 3) [m] at their times (N,) in the take."""
 
@@ -144,7 +149,7 @@ class Bundle:
         camera, cameras = self.given, []
         if camera is None:
             focal = self.size[0] * np.exp(state.values[FOCAL])
-            center = 0.5 * np.array(self.size) + self.size[0] * state.values[_CENTER]
+            center = 0.5 * np.array(self.size) + self.size[0] * state.values[CENTER]
             lens = brown_lens(*state.values[_LENS], 0.0, 0.0, 0.0)
             camera = Camera("film", self.size, camera_matrix(focal, focal, *center), lens=lens)
         for span in range(len(state.starts)):
@@ -192,7 +197,7 @@ class Bundle:
         which = matches.numbers[frames, hands], keypoints
         normals = np.tile(np.eye(2), (len(frames) // 2, 1)) * self.found.weights[which][:, None]
         return Samples(
-            frames, self.found.pixels[which], normals, np.zeros((len(frames), 3)),
+            frames, self.found.pixels[which], normals, *np.zeros((2, len(frames), 3)),
             lambda times: self.keypoints(times, hands, keypoints),
         )  # fmt: skip
 
@@ -202,13 +207,13 @@ class Bundle:
         """Adjust a state to samples; return it with its cost per sample and its covariance.
 
         Samples of weight 1 have the standard deviation `noise` [px]. Samples that are far off in the given
-        state count less. With `first`, the lens and the thickness of the hands stay as they are.
+        state count less. With `first`, the lens and the size of the hands stay as they are.
         """
         size, count = len(state.values), len(samples.frames)
         free = np.ones(size, dtype=bool)
         free[FOCAL:THICKER] = self.given is None
         if first:
-            free[DRIFT] = free[_CENTER] = free[_LENS] = free[THICKER] = free[READOUT] = False
+            free[DRIFT] = free[CENTER] = free[_LENS] = free[THICKER] = free[LARGER] = free[READOUT] = False
         priors = np.concatenate([_PRIORS, np.full(size - POSES, np.inf)])
         robust = 1.0 / np.sqrt(1.0 + (self.residuals(state, samples, noise) / _ROBUST) ** 2)
 
@@ -253,7 +258,8 @@ class Bundle:
         """Distances (N,) from the lines, over the noise; 0 where the take has no pose."""
         late = (samples.pixels / self.size - 0.5) @ state.values[READOUT]
         points = samples.points_at(self.times(state)[samples.frames] + late)
-        pixels = self.projected(state, samples.frames, points + state.values[THICKER] * samples.outward)
+        shift = state.values[THICKER] * samples.outward + state.values[LARGER] * samples.larger
+        pixels = self.projected(state, samples.frames, points + shift)
         away = ((pixels - samples.pixels) * samples.normals).sum(axis=1) / noise
         away = np.nan_to_num(away, nan=self.size[0] / noise)  # behind the camera
         return np.where(np.isfinite(points[:, 0]), away, 0.0)

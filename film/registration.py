@@ -1,9 +1,9 @@
 """`Registration`: where the camera stood that filmed the hands of a take, its lens and its clock.
 
 The clock comes first: for each shift of it, an affine camera is fitted to the keypoints that a detector
-found. Then PnP finds the pose for a few focal lengths, and one bundle over all frames refines clock, lens and
-pose at once. Keypoints of a detector are several pixels off. The outlines of the hands are seen within half a
-pixel, and the last bundles are of these.
+found. For the best shifts PnP finds the pose for a few focal lengths, and a bundle over all frames refines
+clock, lens and pose at once. Keypoints of a detector are several pixels off. The outlines of the hands are seen
+within half a pixel: these decide between the shifts, and the last bundles are of these.
 """
 
 from __future__ import annotations
@@ -19,12 +19,14 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from film.bundle import (
+    CENTER,
     DRIFT,
     FEWEST_KEYPOINTS,
     FOCAL,
     OFFSET,
     POSES,
     READOUT,
+    USUAL_CENTER,
     Bundle,
     Detections,
     FoundFrame,
@@ -110,7 +112,8 @@ class Registration:
     readout: tuple[float, float]
     """How much later the right edge is read than the left one, and the lower edge than the upper one [s]."""
     deviations: dict[str, float]
-    """Standard deviations: offset and readout [s], drift, focal [share], position [m], rotation [rad]."""
+    """Standard deviations: offset and readout [s], drift, focal [share], center [px], position [m],
+    rotation [rad]."""
     times: Float[np.ndarray, "F"]
     """Time of each frame in the video [s]."""
     distances: Float[np.ndarray, "F"]
@@ -140,6 +143,8 @@ class Registration:
             "the camera and away from it.": found["focal"] > 0.01,
             f"The clock is known to {1e3 * found['offset']:.1f} ms only: the hands hardly move.":
                 found["offset"] > 0.003,
+            f"The lens's center is hardly told by the hands: it is taken as near the picture's middle, within "
+            f"{found['center']:.1f} px.": found["center"] > 0.7 * USUAL_CENTER * self.cameras[0].size[0],
             f"The camera's place is known to {1e3 * found['position']:.1f} mm only.":
                 found["position"] > 0.004,
             f"The camera was moved at {when}: there are {len(self.cameras)} spans, each with its pose.":
@@ -157,7 +162,7 @@ class Registration:
             ("drift of the clock", f"{1e6 * self.drift:.0f} ppm", f"{1e6 * known['drift']:.0f} ppm"),
             ("readout, across and down", f"{readout} ms", f"{1e3 * known['readout']:.1f} ms"),
             ("focal length", f"{camera.focal_length:.1f} px", f"{100 * known['focal']:.2f} %"),
-            ("center", f"{coordinates(camera.K[:2, 2])} px", ""),
+            ("center", f"{coordinates(camera.K[:2, 2])} px", f"{known['center']:.1f} px"),
             ("lens", " ".join([camera.lens.kind, coordinates(camera.lens.coefficients)]), ""),
         ]
         turn = f"{np.rad2deg(known['rotation']):.2f} degrees"
@@ -245,6 +250,7 @@ def _register(
     unknowns: dict[str, int | slice] = {"offset": OFFSET, "drift": DRIFT, "readout": READOUT, "focal": FOCAL}
     known = {name: float(np.max(deviations[numbers])) for name, numbers in unknowns.items()}
     poses = np.linalg.norm(deviations[POSES:].reshape(-1, 2, 3), axis=2)
+    known["center"] = float(width * np.max(deviations[CENTER]))
     known["rotation"], known["position"] = poses.max(axis=0).tolist()  # of the span that is known least
     if known["position"] > _UNKNOWN:
         raise HandSimError(
@@ -293,12 +299,12 @@ def _hypotheses(bundle: Bundle, looks: _Looks, progress: Progress) -> list[_Hypo
     def judge(start: State, *, splits: bool) -> None:
         with contextlib.suppress(HandSimError):  # the others are tried all the same
             state, covariance, noise = _adjusted(bundle, start, splits=splits)
-            if any(_are_same(bundle, state, one.state) for one, _ in found if one.state.starts == state.starts):
+            if any(
+                _are_same(bundle, state, one.state) for one, _ in found if one.state.starts == state.starts
+            ):
                 return
             agreement, state = _agreement(bundle, state, some)
             found.append((_Hypothesis(agreement, state, covariance, noise), start))
-            import sys
-            print(f"  hyp {bundle.clock(start)[0]:.3f} -> {bundle.clock(state)[0]:.4f} starts {state.starts} noise {noise:.1f} agreement {agreement:.3f} f {np.exp(state.values[FOCAL]):.3f}", file=sys.stderr, flush=True)
 
     for number, start in enumerate(guesses):
         judge(start, splits=False)
@@ -461,8 +467,6 @@ def _outlined(
         state, _, covariance = bundle.solve(state, samples, noise, first=turn == 0)
         noise = max(0.3, float(np.median(np.abs(bundle.residuals(state, samples, 1.0)))) / 0.6745)
     deviations, surprise = bundle.held_out(state, samples, noise)
-    import sys
-    print("  jack/formal", (deviations / np.sqrt(np.diag(covariance))).round(2), "surprise", surprise, "thick", state.values[7], "center", state.values[3:5]*640, "sd", np.sqrt(np.diag(covariance))[3:5]*640, file=sys.stderr, flush=True)
     if surprise > _SURPRISE * bundle.size[0]:
         raise HandSimError(_CHANGED.format("place or zoom"))
     np.fill_diagonal(covariance, np.maximum(np.diag(covariance), deviations**2))
@@ -487,8 +491,6 @@ def _zoomed(bundle: Bundle, state: State, samples: Samples, noise: float) -> boo
         found, _, covariance = bundle.solve(state, alone, noise)
         focals.append(found.values[FOCAL])
         variances.append(covariance[FOCAL, FOCAL])
-    import sys
-    print("  focals", np.exp(focals), np.sqrt(variances), file=sys.stderr)
     return bool(np.ptp(focals) > _ZOOMED * np.sqrt(np.sum(variances)))
 
 
