@@ -255,7 +255,7 @@ def _register(
     unknowns: dict[str, int | slice] = {"offset": OFFSET, "drift": DRIFT, "readout": READOUT, "focal": FOCAL}
     known = {name: float(np.max(deviations[numbers])) for name, numbers in unknowns.items()}
     poses = np.linalg.norm(deviations[POSES:].reshape(-1, 2, 3), axis=2)
-    known["center"] = float(width * np.max(deviations[CENTER]))
+    known["center"] = float(width * min(USUAL_CENTER, np.max(deviations[CENTER])))
     known["rotation"], known["position"] = poses.max(axis=0).tolist()  # of the span that is known least
     if known["position"] > _UNKNOWN:
         raise HandSimError(
@@ -381,9 +381,10 @@ def _first_guesses(bundle: Bundle) -> list[State]:
 
 
 def _are_same(bundle: Bundle, one: State, other: State) -> bool:
-    """Whether two states have the same clock and, nearly, the same place of the camera."""
+    """Whether two states have the same clock and, with the same spans, nearly the same place of the camera."""
     clocks = np.abs(bundle.times(one) - bundle.times(other))[[0, -1]]
-    return bool(clocks.max() < _SAME_CLOCK and np.linalg.norm(one.pose(0)[3:] - other.pose(0)[3:]) < _UNKNOWN)
+    near = np.linalg.norm(one.pose(0)[3:] - other.pose(0)[3:]) < _UNKNOWN
+    return bool(clocks.max() < _SAME_CLOCK and (near or one.starts != other.starts))
 
 
 def _shifts(bundle: Bundle) -> list[tuple[float, float]]:
