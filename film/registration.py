@@ -316,9 +316,7 @@ def _hypotheses(bundle: Bundle, looks: _Looks, progress: Progress) -> list[_Hypo
         progress((number + 1) * frames // len(guesses), 2 * frames)
     found.sort(key=lambda one: -one[0].agreement)
     if not found or not looks or found[0][0].agreement < _STILL:
-        others = [one for one in found[1:] if not _are_same(bundle, found[0][0].state, one[0].state)]
-        for start in [start for _, start in (*found[:1], *others[:1])] or guesses[:1]:
-            judge(start, splits=True)
+        judge(found[0][1] if found else guesses[0], splits=True)
     if not found:
         raise HandSimError(_UNLIKE)
     return sorted((one for one, _ in found), key=lambda one: -one.agreement)
@@ -381,7 +379,7 @@ def _first_guesses(bundle: Bundle) -> list[State]:
 
 
 def _are_same(bundle: Bundle, one: State, other: State) -> bool:
-    """Whether two states have the same clock and, with the same spans, nearly the same place of the camera."""
+    """Whether two states have the same clock and, with the same spans, nearly the same place."""
     clocks = np.abs(bundle.times(one) - bundle.times(other))[[0, -1]]
     near = np.linalg.norm(one.pose(0)[3:] - other.pose(0)[3:]) < _UNKNOWN
     return bool(clocks.max() < _SAME_CLOCK and (near or one.starts != other.starts))
