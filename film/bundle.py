@@ -196,8 +196,9 @@ class Bundle:
         frames, hands, keypoints = (np.repeat(one[kept], 2) for one in (frames, hands, keypoints))
         which = matches.numbers[frames, hands], keypoints
         normals = np.tile(np.eye(2), (len(frames) // 2, 1)) * self.found.weights[which][:, None]
+        still = np.zeros((len(frames), 3))
         return Samples(
-            frames, self.found.pixels[which], normals, *np.zeros((2, len(frames), 3)),
+            frames, self.found.pixels[which], normals, still, still,
             lambda times: self.keypoints(times, hands, keypoints),
         )  # fmt: skip
 
