@@ -465,9 +465,10 @@ def _outlined(
     """State, covariance and fit by the outlines of the hands; None where they are not seen."""
     outlines, noise = Outlines(bundle), _FIRST_NOISE
     for turn, reach in enumerate(_REACHES):
-        samples, _ = outlines.edges(state, looks, reach)
-        if samples is None or len(samples.frames) < _FEWEST_EDGES * _FEWEST_FRAMES:
+        edges, _ = outlines.edges(state, looks, reach)
+        if edges is None or len(edges.frames) < _FEWEST_EDGES * _FEWEST_FRAMES:
             return None
+        samples = edges
         state, _, covariance = bundle.solve(state, samples, noise, first=turn == 0)
         noise = max(0.3, float(np.median(np.abs(bundle.residuals(state, samples, 1.0)))) / 0.6745)
     deviations, surprise = bundle.held_out(state, samples, noise)
@@ -561,7 +562,8 @@ def _outline_fit(bundle: Bundle, seen: Seen, fit: _Fit) -> _Fit:
     told = seen.found >= np.maximum(_FEWEST_EDGES, _SEEN * seen.tried)
     middle, most = (np.where(told, one, np.nan) for one in (seen.middle, seen.most))
     usual = float(np.nanmedian(most)) if told.any() else 0.0
-    bound = float(np.clip(_BOUND * usual, *(share * _LEAST_BOUND * bundle.size[0] for share in (0.5, 1.0))))
+    least = 0.5 * _LEAST_BOUND * bundle.size[0]
+    bound = min(max(_BOUND * usual, least), 2.0 * least)
     whole = told.any(axis=1) & (told | ~(seen.tried > 0.0)).all(axis=1)
     cases = {
         f"the hand's outline is more than {bound:.1f} px off": (most > bound).any(axis=1),
