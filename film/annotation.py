@@ -56,11 +56,12 @@ def register_camera(
     Args:
         take: A tracked take or its path.
         video: The video: of one camera that stood still, and of one shot.
-        camera: A camera with the lens of the video's, or a file of it; its pose does not count. The focal
-            length, the center and two coefficients are found, too, when not given.
+        camera: A camera with the lens of the video's, or a file of it; its pose does not count. When
+            not given, the focal length and two coefficients are found, too, and the center as far as motion
+            tells it: otherwise it is near the middle of the picture.
         detector: Finds the hands in the pictures, or those that another program found; the shipped one when
             not given.
-        progress: Called with the numbers of frames that were read, and of all.
+        progress: Called with the numbers of done and of all frames, first of finding hands, then of the fit.
         on_step: Called with the name of each step.
 
     Returns:
@@ -74,7 +75,9 @@ def register_camera(
     on_step("finding hands")
     found = find_hands(film, detector or HandDetector.load(), progress)
     on_step("fitting the camera")
-    return register(taken, found, film.size, given, lambda: (picture for _, picture in film.frames()))
+    return register(
+        taken, found, film.size, given, lambda: (picture for _, picture in film.frames()), progress
+    )
 
 
 def _taken(take: Take | str | Path) -> Take:
@@ -147,7 +150,7 @@ def annotate_film(
         camera: As in `register_camera`.
         detector: As in `register_camera`.
         workers: As in `render_take`.
-        progress: Called with numbers of done and of all frames, first of finding hands, then of writing.
+        progress: Called with numbers of done and of all frames, of finding hands, of the fit, and of writing.
         on_step: As in `register_camera`.
         settings: Settings of `FrameConfig` that differ from `config`, as `dress="skin"` or `num_frames=100`.
 

@@ -25,14 +25,19 @@ _SURE: Final = 0.25  # Keypoints with a lower score are not used.
 _MOST_BUNDLED: Final = 5000  # largest number of keypoints in a bundle
 _ROBUST: Final = 2.0  # Residuals beyond this many standard deviations count less.
 _NOTHING: Final = 1e-2  # prior information on free unknowns
+_PARTS: Final = 8  # number of parts of a video that are held out, one after the other
 _DEPENDENT: Final = 16.0  # This many samples count as one with an independent error.
 
 # Places of the unknowns in a state's values. From POSES on, each span has six numbers for its camera's pose.
 # _PRIORS holds the standard deviation of each unknown before any picture is seen. THICKER says how much
-# thicker the filmed hands are than the tracked ones [m], because of cloth or an error of a measured hand.
-OFFSET, DRIFT, FOCAL, THICKER, POSES = 0, 1, 2, 7, 10
-_CENTER, _LENS, READOUT = slice(3, 5), slice(5, 7), slice(8, 10)
-_PRIORS: Final = np.array([np.inf, 1e-4, 0.7, 0.005, 0.005, 0.05, 0.05, 0.0007, 0.015, 0.015])
+# thicker the filmed hands are than the tracked ones [m], because of cloth or an error of a measured hand, and
+# LARGER by which share they are larger.
+OFFSET, DRIFT, FOCAL, THICKER, LARGER, POSES = 0, 1, 2, 7, 8, 11
+CENTER, _LENS, READOUT = slice(3, 5), slice(5, 7), slice(9, 11)
+USUAL_CENTER: Final = 0.01  # [widths] standard deviation of lens centers from the middle of the picture
+_PRIORS: Final = np.array(
+    [np.inf, 1e-4, 0.7, USUAL_CENTER, USUAL_CENTER, 0.05, 0.05, 0.0007, 0.02, 0.015, 0.015]
+)
 
 
 class FoundFrame(NamedTuple):
@@ -104,6 +109,7 @@ class Samples(NamedTuple):
     pixels: Doubles  # (N, 2): a point of the line
     normals: Doubles  # (N, 2): normal of the line, as long as its weight
     outward: Doubles  # (N, 3): the way in which a thicker hand moves the point
+    larger: Doubles  # (N, 3): from the hand's middle to the point [m]
     points_at: Callable[[Doubles], Doubles]
     """Points (N, 3) [m] at their times (N,) in the take."""
 
@@ -143,7 +149,7 @@ class Bundle:
         camera, cameras = self.given, []
         if camera is None:
             focal = self.size[0] * np.exp(state.values[FOCAL])
-            center = 0.5 * np.array(self.size) + self.size[0] * state.values[_CENTER]
+            center = 0.5 * np.array(self.size) + self.size[0] * state.values[CENTER]
             lens = brown_lens(*state.values[_LENS], 0.0, 0.0, 0.0)
             camera = Camera("film", self.size, camera_matrix(focal, focal, *center), lens=lens)
         for span in range(len(state.starts)):
@@ -190,8 +196,9 @@ class Bundle:
         frames, hands, keypoints = (np.repeat(one[kept], 2) for one in (frames, hands, keypoints))
         which = matches.numbers[frames, hands], keypoints
         normals = np.tile(np.eye(2), (len(frames) // 2, 1)) * self.found.weights[which][:, None]
+        still = np.zeros((len(frames), 3))
         return Samples(
-            frames, self.found.pixels[which], normals, np.zeros((len(frames), 3)),
+            frames, self.found.pixels[which], normals, still, still,
             lambda times: self.keypoints(times, hands, keypoints),
         )  # fmt: skip
 
@@ -201,13 +208,13 @@ class Bundle:
         """Adjust a state to samples; return it with its cost per sample and its covariance.
 
         Samples of weight 1 have the standard deviation `noise` [px]. Samples that are far off in the given
-        state count less. With `first`, the lens and the thickness of the hands stay as they are.
+        state count less. With `first`, the lens and the size of the hands stay as they are.
         """
         size, count = len(state.values), len(samples.frames)
         free = np.ones(size, dtype=bool)
         free[FOCAL:THICKER] = self.given is None
         if first:
-            free[DRIFT] = free[_CENTER] = free[_LENS] = free[THICKER] = free[READOUT] = False
+            free[DRIFT] = free[CENTER] = free[_LENS] = free[THICKER] = free[LARGER] = free[READOUT] = False
         priors = np.concatenate([_PRIORS, np.full(size - POSES, np.inf)])
         robust = 1.0 / np.sqrt(1.0 + (self.residuals(state, samples, noise) / _ROBUST) ** 2)
 
@@ -231,11 +238,29 @@ class Bundle:
         covariance[np.ix_(free, free)] = _DEPENDENT * inverse
         return widened(done.x), 2.0 * float(done.cost) / max(count, 1), covariance
 
+    def held_out(self, state: State, samples: Samples, noise: float) -> tuple[Doubles, float]:
+        """Standard deviations of the unknowns from solutions that each leave out a part of the time.
+
+        In this jackknife errors that last count as what they are. The second value is the median residual
+        [px] of the part that the solution without it fits least.
+        """
+        ends = np.quantile(samples.frames, np.linspace(0.0, 1.0, _PARTS + 1)[1:-1])
+        parts, surprise, found = np.searchsorted(ends, samples.frames), 0.0, []
+        for part in range(_PARTS):
+            out = parts == part
+            kept = samples._replace(normals=np.where(out[:, None], 0.0, samples.normals))
+            other = self.solve(state, kept, noise)[0]
+            away = np.abs(self.residuals(other, samples, 1.0)[out])
+            surprise = max(surprise, float(np.median(away))) if out.any() else surprise
+            found.append(other.values)
+        return np.std(found, axis=0) * np.sqrt(_PARTS - 1), surprise
+
     def residuals(self, state: State, samples: Samples, noise: float) -> Doubles:
         """Distances (N,) from the lines, over the noise; 0 where the take has no pose."""
         late = (samples.pixels / self.size - 0.5) @ state.values[READOUT]
         points = samples.points_at(self.times(state)[samples.frames] + late)
-        pixels = self.projected(state, samples.frames, points + state.values[THICKER] * samples.outward)
+        shift = state.values[THICKER] * samples.outward + state.values[LARGER] * samples.larger
+        pixels = self.projected(state, samples.frames, points + shift)
         away = ((pixels - samples.pixels) * samples.normals).sum(axis=1) / noise
         away = np.nan_to_num(away, nan=self.size[0] / noise)  # behind the camera
         return np.where(np.isfinite(points[:, 0]), away, 0.0)

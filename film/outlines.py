@@ -149,15 +149,21 @@ class Outlines:
                 velocities = self._moved(worn[hand], qpos[frame, hand], outline)
                 kept = np.isfinite(normals[:, 0])  # others are beyond what the lens sees
                 here, then = np.full(len(away), frame), np.full(len(away), moments[frame, hand])
-                found = here, pixels, normals, outline.outward, outline.points, velocities, then
+                larger = outline.points - outline.points.sum(axis=0) / max(len(away), 1)
+                found = here, pixels, normals, outline.outward, larger, outline.points, velocities, then
                 parts.append([values[kept] for values in found])
         if not parts:
             return None, Seen(*seen)
-        frames, pixels, normals, outward, points, velocities, then = map(
+        frames, pixels, normals, outward, larger, points, velocities, then = map(
             np.concatenate, zip(*parts, strict=True)
         )
         edges = Samples(
-            frames, pixels, normals, outward, lambda times: points + velocities * (times - then)[:, None]
+            frames,
+            pixels,
+            normals,
+            outward,
+            larger,
+            lambda times: points + velocities * (times - then)[:, None],
         )
         return edges, Seen(*seen)
 

@@ -1,15 +1,15 @@
 """`Registration`: where the camera stood that filmed the hands of a take, its lens and its clock.
 
 The clock comes first: for each shift of it, an affine camera is fitted to the keypoints that a detector
-found. Then PnP finds the pose for a few focal lengths, and one bundle over all frames refines clock, lens and
-pose at once. Keypoints of a detector are several pixels off. The outlines of the hands are seen within half a
-pixel, and the last bundles are of these.
+found. For the best shifts PnP finds the pose for a few focal lengths, and a bundle over all frames refines
+clock, lens and pose at once. Keypoints of a detector are several pixels off. The outlines of the hands are
+seen within half a pixel: they decide between the shifts, and the last bundles are of them.
 """
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
@@ -19,12 +19,14 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from film.bundle import (
+    CENTER,
     DRIFT,
     FEWEST_KEYPOINTS,
     FOCAL,
     OFFSET,
     POSES,
     READOUT,
+    USUAL_CENTER,
     Bundle,
     Detections,
     FoundFrame,
@@ -33,6 +35,7 @@ from film.bundle import (
 )
 from film.outlines import Outlines, Seen, straight
 from gloves.takes.take import Take
+from handsim.callbacks import Progress, no_progress
 from handsim.errors import HandSimError
 from handsim.hand.shape import SIDES
 from handsim.pages import coordinates
@@ -61,7 +64,20 @@ _FIRST_NOISE: Final = 2.0  # [px] standard deviation of edges in the first round
 _STEP: Final = 1.0 / 15.0  # [s] step between the shifts of the clock
 _MOST_MATCHED: Final = 64  # largest number of detections that are matched
 _NOWHERE: Final = 1e3  # [m] where hands are that the take does not have
-_TRIED: Final = 3  # number of best shifts for which PnP is tried
+_TRIED: Final = 5  # number of best shifts for which PnP is tried
+_SCREENED: Final = 30  # number of frames whose outlines judge a hypothesis
+_NEAR: Final = 0.004  # [widths] An edge this near to an outline agrees.
+_LEAST_AGREEMENT: Final = 0.5  # share of the outlines; of wrong clocks and cameras it was 0.01 to 0.39
+_MARGIN: Final = 0.8  # Another clock explains at most this share of what the best does.
+_SURPRISE: Final = 0.003  # [widths] Outlines of a part that was held out are at most this far off.
+_SHAPE: Final = 2.0
+"""Deviations are this many times larger, as errors of a hand's shape are the same in all frames.
+
+In six videos of another renderer errors were up to 1.5 times the deviations with it, and 2.9 times without.
+"""
+_ZOOMED: Final = 3.0  # Focal lengths of two spans differ by more than this many standard deviations.
+_SAME_CLOCK: Final = 0.05  # [s]
+_STILL: Final = 0.7  # No push is looked for if this share agrees with a camera that stood still.
 _APART: Final = 0.3  # [s] least distance of two shifts for which PnP is tried
 _FOCALS: Final = (0.5, 0.65, 0.85, 1.1, 1.45, 1.9, 2.5, 3.3)  # [picture widths] tried by PnP
 _GATE: Final = 0.08  # [widths] A detection is not of a hand whose keypoints are farther off in the median.
@@ -69,12 +85,19 @@ _UNLIKE: Final = (
     "the hands in the video do not move as those of the take at any shift of the clock; expected a video of "
     "this take, cut to its time, of a camera that stood still"
 )
+_CHANGED: Final = (
+    "the camera's {} is not the same in all of the video; expected one focal length, no image stabilization, "
+    "and a camera that is pushed three times at most: cut the video, and register the parts"
+)
 _SLOW: Final = (
     "the hands in the video move {0} times as slowly as those of the take: is it slow motion? Make it {0} "
     "times as fast: ffmpeg -itsscale {1:.6g} -i slow.mp4 -an -c copy true.mp4"
 )
 _RATIOS: Final = (2, 4, 5, 8, 10, 16, 20, 32)
 """How many times as slowly as it was taken slow motion is stored."""
+
+
+_Looks = list[tuple[int, Bytes]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,7 +117,8 @@ class Registration:
     readout: tuple[float, float]
     """How much later the right edge is read than the left one, and the lower edge than the upper one [s]."""
     deviations: dict[str, float]
-    """Standard deviations: offset and readout [s], drift, focal [share], position [m], rotation [rad]."""
+    """Standard deviations: offset and readout [s], drift, focal [share], center [px], position [m],
+    rotation [rad]."""
     times: Float[np.ndarray, "F"]
     """Time of each frame in the video [s]."""
     distances: Float[np.ndarray, "F"]
@@ -124,6 +148,8 @@ class Registration:
             "the camera and away from it.": found["focal"] > 0.01,
             f"The clock is known to {1e3 * found['offset']:.1f} ms only: the hands hardly move.":
                 found["offset"] > 0.003,
+            f"The lens's center is known to {found['center']:.1f} px only: it is near the picture's middle.":
+                found["center"] > 0.7 * USUAL_CENTER * self.cameras[0].size[0],
             f"The camera's place is known to {1e3 * found['position']:.1f} mm only.":
                 found["position"] > 0.004,
             f"The camera was moved at {when}: there are {len(self.cameras)} spans, each with its pose.":
@@ -141,7 +167,7 @@ class Registration:
             ("drift of the clock", f"{1e6 * self.drift:.0f} ppm", f"{1e6 * known['drift']:.0f} ppm"),
             ("readout, across and down", f"{readout} ms", f"{1e3 * known['readout']:.1f} ms"),
             ("focal length", f"{camera.focal_length:.1f} px", f"{100 * known['focal']:.2f} %"),
-            ("center", f"{coordinates(camera.K[:2, 2])} px", ""),
+            ("center", f"{coordinates(camera.K[:2, 2])} px", f"{known['center']:.1f} px"),
             ("lens", " ".join([camera.lens.kind, coordinates(camera.lens.coefficients)]), ""),
         ]
         turn = f"{np.rad2deg(known['rotation']):.2f} degrees"
@@ -167,6 +193,7 @@ def register(
     size: tuple[int, int],
     given: Camera | None = None,
     pictures: Callable[[], Iterable[Bytes]] | None = None,
+    progress: Progress = no_progress,
 ) -> Registration:
     """The registration of a video of this size [px] in which a detector found hands.
 
@@ -174,7 +201,7 @@ def register(
     hands, keypoints alone tell the camera, which are much coarser.
     """
     try:
-        return _register(take, found, size, given, pictures)
+        return _register(take, found, size, given, pictures, progress)
     except HandSimError as error:
         if str(error) == _UNLIKE and (ratio := _slowed(take, found, size, given)):
             raise HandSimError(_SLOW.format(ratio, 1.0 / ratio)) from error
@@ -199,6 +226,7 @@ def _register(
     size: tuple[int, int],
     given: Camera | None,
     pictures: Callable[[], Iterable[Bytes]] | None = None,
+    progress: Progress = no_progress,
 ) -> Registration:
     """The registration of a video whose clock is right."""
     bundle, width = Bundle(take, Detections.of(found), size, given), size[0]
@@ -208,19 +236,16 @@ def _register(
             f"hands were found in {with_hands} of the {looked} frames that were searched, expected "
             f"{_FEWEST_FRAMES} at least: hands that fill a third of the picture's height, for some seconds"
         )
-    start = _first_guess(bundle)
-    state, covariance, noise = _adjusted(bundle, start, splits=True)
-    # Errors of the detector may look like a push, those of outlines do not.
-    still = []
-    if pictures and len(state.starts) > 1:
-        with contextlib.suppress(HandSimError):  # no camera that stood still fits
-            still.append(_adjusted(bundle, start, splits=False)[0])
-    tried = [_outlined(bundle, one, pictures) for one in (*still, state)] if pictures else []
-    if outlined := [one for one in tried if one is not None]:  # of a camera that stood still first
-        away = np.array([fit.distances for *_, fit in outlined])
-        away = np.nan_to_num(away[:, np.isfinite(away).any(axis=0)], nan=width).clip(max=_LEAST_BOUND * width)
-        state, covariance, fit = outlined[int((away.sum(axis=1) * _LIKELY ** np.arange(len(away))).argmin())]
-    elif noise > _WORST * width:
+    looks = _looks(bundle, pictures) if pictures else []
+    tried = _hypotheses(bundle, looks, progress)
+    best, state, covariance = tried[0], tried[0].state, tried[0].covariance
+    if looks and best.agreement < _LEAST_AGREEMENT:
+        raise HandSimError(_UNLIKE)
+    _check_margin(bundle, tried)
+    outlined = _outlined(bundle, state, looks, pictures, progress) if pictures else None
+    if outlined is not None:
+        state, covariance, fit = outlined
+    elif best.noise > _WORST * width:
         raise HandSimError(_UNLIKE)
     else:
         fit = _keypoint_fit(bundle, state)
@@ -229,8 +254,9 @@ def _register(
     (offset, drift), deviations = bundle.clock(state), np.sqrt(np.diag(covariance))
     unknowns: dict[str, int | slice] = {"offset": OFFSET, "drift": DRIFT, "readout": READOUT, "focal": FOCAL}
     known = {name: float(np.max(deviations[numbers])) for name, numbers in unknowns.items()}
-    pose = deviations[POSES : POSES + 6].reshape(2, 3)
-    known["rotation"], known["position"] = np.linalg.norm(pose, axis=1).tolist()
+    poses = np.linalg.norm(deviations[POSES:].reshape(-1, 2, 3), axis=2)
+    known["center"] = float(width * min(USUAL_CENTER, np.max(deviations[CENTER])))
+    known["rotation"], known["position"] = poses.max(axis=0).tolist()  # of the span that is known least
     if known["position"] > _UNKNOWN:
         raise HandSimError(
             f"the hands tell the camera's place to {1e3 * known['position']:.0f} mm only; expected hands "
@@ -260,9 +286,78 @@ def _adjusted(bundle: Bundle, state: State, *, splits: bool) -> tuple[State, Dou
     return state, covariance, noise
 
 
-def _first_guess(bundle: Bundle) -> State:
-    """Unknowns that explain most of what was found: clock by all shifts, pose by PnP."""
-    gate, best, most = _GATE * bundle.size[0], None, 0.0
+class _Hypothesis(NamedTuple):
+    """A clock and a camera that may be the video's."""
+
+    agreement: float  # share of what is seen that it explains
+    state: State
+    covariance: Doubles
+    noise: float  # of keypoints [px]
+
+
+def _hypotheses(bundle: Bundle, looks: _Looks, progress: Progress) -> list[_Hypothesis]:
+    """What may be the video's clock and camera, best first; a push is looked for if no still camera fits."""
+    some = looks[:: max(1, len(looks) // _SCREENED)]
+    found: list[tuple[_Hypothesis, State]] = []
+    guesses, frames = _first_guesses(bundle), len(bundle.found.times)
+
+    def judge(start: State, *, splits: bool) -> None:
+        with contextlib.suppress(HandSimError):  # the others are tried all the same
+            state, covariance, noise = _adjusted(bundle, start, splits=splits)
+            if any(
+                _are_same(bundle, state, one.state) for one, _ in found if one.state.starts == state.starts
+            ):
+                return
+            agreement, state = _agreement(bundle, state, some)
+            found.append((_Hypothesis(agreement, state, covariance, noise), start))
+
+    for number, start in enumerate(guesses):
+        judge(start, splits=False)
+        progress((number + 1) * frames // len(guesses), 2 * frames)
+    found.sort(key=lambda one: -one[0].agreement)
+    if not found or not looks or found[0][0].agreement < _STILL:
+        judge(found[0][1] if found else guesses[0], splits=True)
+    if not found:
+        raise HandSimError(_UNLIKE)
+    return sorted((one for one, _ in found), key=lambda one: -one.agreement)
+
+
+def _agreement(bundle: Bundle, state: State, looks: _Looks) -> tuple[float, State]:
+    """The share of the hands' outlines that is where pictures have edges, and the state adjusted to these.
+
+    Without pictures it is how near keypoints are.
+    """
+    if not looks:
+        away = bundle.match(state, np.inf).distances / (_GATE * bundle.size[0])
+        return float(np.nansum((1.0 - away).clip(min=0.0)) / len(bundle.found.frames)), state
+    outlines, share = Outlines(bundle), 0.0
+    for reach in _REACHES[:3]:
+        samples, seen = outlines.edges(state, looks, reach)
+        if samples is None:
+            return 0.0, state
+        state, *_ = bundle.solve(state, samples, _FIRST_NOISE, first=True)
+        near = np.abs(bundle.residuals(state, samples, 1.0)) < _NEAR * bundle.size[0]
+        share = float(near.sum() / np.nansum(seen.tried))
+    return share, state
+
+
+def _check_margin(bundle: Bundle, tried: list[_Hypothesis]) -> None:
+    """Raise if another clock or camera explains nearly as much as the best."""
+    best = tried[0]
+    for other in tried[1:]:
+        same = _are_same(bundle, best.state, other.state)
+        if not same and other.agreement > _MARGIN * best.agreement:
+            (clock, _), (another, _) = bundle.clock(best.state), bundle.clock(other.state)
+            raise HandSimError(
+                f"cameras with the clock at {clock:.2f} and at {another:.2f} s explain "
+                f"{100 * best.agreement:.0f} and {100 * other.agreement:.0f} % of the hands in the video; "
+                "expected hands that move in all directions without repeating themselves, and a longer video"
+            )
+
+
+def _first_guesses(bundle: Bundle) -> list[State]:
+    """Unknowns that explain much of what was found: clock by all shifts, pose by PnP."""
+    gate, guesses = _GATE * bundle.size[0], list[State]()
     tried: list[float] = []
     # The best fits are computed again, because those of all shifts together would fill the memory.
     for _, shift in _shifts(bundle):
@@ -276,12 +371,18 @@ def _first_guess(bundle: Bundle) -> State:
             continue
         samples = bundle.samples(bundle.match(start, gate))
         state, *_ = bundle.solve(start, samples, 0.01 * bundle.size[0], first=True)
-        agreeing = float(np.nansum(1.0 - bundle.match(state, gate).distances / gate))
-        if agreeing > most:
-            best, most = state, agreeing
-    if best is None:
+        if not any(_are_same(bundle, state, other) for other in guesses):
+            guesses.append(state)
+    if not guesses:
         raise HandSimError(_UNLIKE)
-    return best
+    return guesses
+
+
+def _are_same(bundle: Bundle, one: State, other: State) -> bool:
+    """Whether two states have the same clock and, with the same spans, nearly the same place."""
+    clocks = np.abs(bundle.times(one) - bundle.times(other))[[0, -1]]
+    near = np.linalg.norm(one.pose(0)[3:] - other.pose(0)[3:]) < _UNKNOWN
+    return bool(clocks.max() < _SAME_CLOCK and (near or one.starts != other.starts))
 
 
 def _shifts(bundle: Bundle) -> list[tuple[float, float]]:
@@ -347,25 +448,55 @@ def _posed(bundle: Bundle, offset: float, points: Doubles, pixels: Doubles) -> S
     return best
 
 
+def _looks(bundle: Bundle, pictures: Callable[[], Iterable[Bytes]]) -> _Looks:
+    """Numbered pictures, shrunk, of some frames in which hands were found."""
+    outlines, shown = Outlines(bundle), np.unique(bundle.found.frames)
+    chosen = set(shown[np.linspace(0, len(shown) - 1, _MOST_LOOKED).astype(int)].tolist())
+    return [(n, outlines.shrunk(picture)) for n, picture in enumerate(pictures()) if n in chosen]
+
+
 def _outlined(
-    bundle: Bundle, state: State, pictures: Callable[[], Iterable[Bytes]]
+    bundle: Bundle,
+    state: State,
+    looks: _Looks,
+    pictures: Callable[[], Iterable[Bytes]],
+    progress: Progress,
 ) -> tuple[State, Doubles, _Fit] | None:
     """State, covariance and fit by the outlines of the hands; None where they are not seen."""
     outlines, noise = Outlines(bundle), _FIRST_NOISE
-    shown = np.flatnonzero((bundle.match(state, _GATE * bundle.size[0]).numbers >= 0).any(axis=1))
-    if not len(shown):
-        return None
-    chosen = set(shown[np.linspace(0, len(shown) - 1, _MOST_LOOKED).astype(int)].tolist())
-    looks = [(n, outlines.shrunk(picture)) for n, picture in enumerate(pictures()) if n in chosen]
     for turn, reach in enumerate(_REACHES):
-        samples, _ = outlines.edges(state, looks, reach)
-        if samples is None or len(samples.frames) < _FEWEST_EDGES * _FEWEST_FRAMES:
+        edges, _ = outlines.edges(state, looks, reach)
+        if edges is None or len(edges.frames) < _FEWEST_EDGES * _FEWEST_FRAMES:
             return None
+        samples = edges
         state, _, covariance = bundle.solve(state, samples, noise, first=turn == 0)
         noise = max(0.3, float(np.median(np.abs(bundle.residuals(state, samples, 1.0)))) / 0.6745)
-    every = ((n, outlines.shrunk(picture)) for n, picture in enumerate(pictures()))
-    _, seen = outlines.edges(state, every, _REACHES[1])
+    deviations, surprise = bundle.held_out(state, samples, noise)
+    if surprise > _SURPRISE * bundle.size[0]:
+        raise HandSimError(_CHANGED.format("place or zoom"))
+    covariance = _SHAPE**2 * np.diag(np.maximum(np.diag(covariance), deviations**2))
+    if len(state.starts) > 1 and _zoomed(bundle, state, samples, noise):
+        raise HandSimError(_CHANGED.format("focal length"))
+    frames = len(bundle.found.times)
+
+    def every() -> Iterator[tuple[int, Bytes]]:
+        for number, picture in enumerate(pictures()):
+            progress(frames + number + 1, 2 * frames)
+            yield number, outlines.shrunk(picture)
+
+    _, seen = outlines.edges(state, every(), _REACHES[1])
     return state, covariance, _outline_fit(bundle, seen, _keypoint_fit(bundle, state))
+
+
+def _zoomed(bundle: Bundle, state: State, samples: Samples, noise: float) -> bool:
+    """Whether spans, each by itself, have focal lengths that differ."""
+    spans, focals, variances = state.spans(samples.frames), [], []
+    for span in range(len(state.starts)):
+        alone = samples._replace(normals=np.where((spans == span)[:, None], samples.normals, 0.0))
+        found, _, covariance = bundle.solve(state, alone, noise)
+        focals.append(found.values[FOCAL])
+        variances.append(covariance[FOCAL, FOCAL])
+    return bool(np.ptp(focals) > _ZOOMED * np.sqrt(np.sum(variances)))
 
 
 def _split(bundle: Bundle, state: State, noise: float) -> State:
@@ -431,7 +562,8 @@ def _outline_fit(bundle: Bundle, seen: Seen, fit: _Fit) -> _Fit:
     told = seen.found >= np.maximum(_FEWEST_EDGES, _SEEN * seen.tried)
     middle, most = (np.where(told, one, np.nan) for one in (seen.middle, seen.most))
     usual = float(np.nanmedian(most)) if told.any() else 0.0
-    bound = max(_BOUND * usual, 0.5 * _LEAST_BOUND * bundle.size[0])
+    least = 0.5 * _LEAST_BOUND * bundle.size[0]
+    bound = min(max(_BOUND * usual, least), 2.0 * least)
     whole = told.any(axis=1) & (told | ~(seen.tried > 0.0)).all(axis=1)
     cases = {
         f"the hand's outline is more than {bound:.1f} px off": (most > bound).any(axis=1),

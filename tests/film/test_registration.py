@@ -63,7 +63,9 @@ def test_outlines_tell_the_camera_within_its_bounds(dress):
     qpos = take.qpos.copy()
     qpos[(take.times > 6.0) & (take.times < 7.0), 0, 12:16] += 0.9
     wrong = Take.of_poses(take.hands, qpos, rate=take.rate)
-    found = register(wrong, frames, SIZE, pictures=lambda: pictures)
+    steps: list[tuple[int, int]] = []
+    found = register(wrong, frames, SIZE, None, lambda: pictures, lambda *step: steps.append(step))
+    assert len(steps) > 72 and steps == sorted(steps) and steps[-1] == (144, 144)
     turn, away, focal = errors(found.cameras[0], filming.cameras()[0])
     assert len(found.cameras) == 1 and turn < 0.2 and away < 3.0 and focal < 0.6
     assert clock_error(found, filming) < 1.5 and found.residual() < 1.0
@@ -73,6 +75,22 @@ def test_outlines_tell_the_camera_within_its_bounds(dress):
         np.mean([not reason for reason, is_bent in zip(found.reasons, bent, strict=True) if not is_bent])
         > 0.7
     )
+
+
+def test_a_stabilized_video_is_refused():
+    """Its pictures are shifted by up to 9 px, as much as keypoints are off."""
+    filming, take = Filming(seed=31, seconds=9.0, rate=8.0, noise=8.0, readout=(0.0, 0.0)), moving_take()
+    shifts = np.rint(9.0 * np.sin(np.arange(72)[:, None] * [0.9, 1.3])).astype(int)
+    shown = [np.roll(*both, axis=(0, 1)) for both in zip(filming.pictures(take), shifts, strict=True)]
+    with pytest.raises(HandSimError, match="do not move as those of the take at any shift"):
+        register(take, filming.found(take), SIZE, pictures=lambda: shown)
+
+
+def test_motion_that_repeats_itself_tells_no_clock():
+    take, filming = moving_take(8.0), Filming(seed=1, seconds=5.0)
+    twice = Take.of_poses(take.hands, np.concatenate([take.qpos, take.qpos]), rate=take.rate)
+    with pytest.raises(HandSimError, match=r"clock at \d.*\.3\d and at \d.*\.3\d s explain \d+ and \d+ %"):
+        register(twice, filming.found(take), SIZE)
 
 
 def test_a_video_shows_the_hands_of_its_frames():
