@@ -40,7 +40,8 @@ def report(
         cycles: A joint of the model, such as index_PIP_flexion: the movement is cut where it is least, and
             page and .cycles.csv tell all joints' angles over the cycles, their ranges and velocities.
     """
-    from track.takes.take_page import PageSettings, table_paths
+    from track.takes.take_figures import PageSettings
+    from track.takes.take_tables import table_paths
 
     if not is_study(takes, out):
         _report(takes, out, neutral=neutral, decimal=decimal, guesses=guesses, cycles=cycles)
@@ -66,7 +67,9 @@ def report(
 def _report(takes: tuple[Path, ...], out: Path, *, neutral: tuple[str, ...] | None, **settings: Any) -> None:
     """Write the page on a take and its tables."""
     from gloves.takes.take import load_take
-    from track.takes.take_page import PageSettings, table_paths, write_take_page
+    from track.takes.take_figures import PageSettings
+    from track.takes.take_page import write_take_page
+    from track.takes.take_tables import table_paths
 
     (take,) = takes
     chosen = PageSettings(neutral=neutral_pose(neutral), **settings)

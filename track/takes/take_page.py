@@ -1,64 +1,51 @@
-"""The report page on a take and its tables, for checking the angles before they are used.
+"""The report page on a take, for checking the angles before they are used.
 
-Angles are in degrees and residuals in millimeters. In the tables (.csv) column names contain the units, and
-an empty cell stands for an unknown number.
+Angles are in degrees and residuals in millimeters.
 """
 
 from __future__ import annotations
 
-import csv
 import shlex
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, get_args
+from typing import TYPE_CHECKING, Any, Final, get_args
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from gloves.captures.capture import runs_of
-from gloves.takes.take import COASTING, INITIALIZED, LOST, STATUSES, Take
+from gloves.takes.take import COASTING, LOST, Take
 from handsim._checks import check_choice
-from handsim.files.outputs import atomic_write, check_ending, written_together
-from handsim.hand.angles import ISB_JOINTS, ISB_NAMES, WRIST_NAMES, Convention
+from handsim.files.outputs import check_ending, written_together
+from handsim.hand.angles import WRIST_NAMES
 from handsim.hand.shape import DIGITS, JOINT_NAMES, JOINTS, Side
 from handsim.pages import NOTHING, Paint, Section, html_list, picture, write_sections
 from track.config import Size
-from track.kinematics.pose_spread import CHANGING, DETECTABLE, SOURCES, measurement_error
+from track.kinematics.pose_spread import CHANGING, SOURCES
 from track.takes.methods import made_of, methods_paragraph
-from track.takes.take_faults import AT_LIMIT, SuspectSpan
-from track.takes.take_summary import find_suspect_spans, summarize, suspicions, vouch
-from track.takes.trials import (
-    FIGURES,
-    PERCENTS,
-    Cycles,
-    cycles_of,
-    draw_cycles,
-    mean_and_spread,
-    thumb_reach,
+from track.takes.take_faults import SuspectSpan
+from track.takes.take_figures import (
+    RANGE,
+    HandFigures,
+    PageSettings,
+    WristFigures,
+    cycles_of_hands,
+    hand_figures,
+    joint_errors,
+    medians,
+    wrist_figures,
 )
-from track.user import MEASURED, hand_origin
+from track.takes.take_summary import find_suspect_spans, summarize, suspicions, vouch
+from track.takes.take_tables import write_tables
+from track.takes.trials import FIGURES, Cycles, draw_cycles, mean_and_spread
+from track.user import MEASURED
 from train.evaluation import percent
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_TABLES: Final = (".frames.csv", ".joints.csv", ".markers.csv", ".doubts.csv", ".reach.csv", ".angles.csv")
-_CYCLES: Final = ".cycles.csv"
-_RECORD: Final = "made of"
-"""Last column of all tables: version, date and checksums of the take; in its first row, in a study in all."""
-_WORDS: Final = ("capture", "person", "session")
-"""Columns of words, which may look like numbers."""
-_ANGLES: Final = (*_WORDS, "side", "joint", "measure", "value [deg]", "SD", "SD constant", "MDD",
-                  "share measured", "convention", _RECORD)  # fmt: skip
-_MEASURES: Final = "mean", "5th percentile", "95th percentile", "range of motion"
-_CONSTANT: Final = [SOURCES.index("gluing"), SOURCES.index("person")]
-"""Sources of an error that is the same in all frames of a session."""
-_RANGE: Final = {"least": 0.0, "5th": 5.0, "median": 50.0, "95th": 95.0, "largest": 100.0}
-"""Columns of a range of motion, and the percentile of each."""
-_CHUNK: Final = 4096  # frames per call of forward kinematics
 _WANTED: Final = 0.99  # share of right frames for which the page gives a number of looks
 _MOST_SPANS: Final = 100  # rows of the page's table of doubtful spans
 _BINS: Final = 750  # bins of a long take's curve, which shows the extremes of each
@@ -75,24 +62,12 @@ _CALIBRATE: Final = (
 )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PageSettings:
-    """What a page and its tables are to show of a take."""
-
-    person: str = ""
-    session: str = ""
-    neutral: tuple[float, float] | Take | None = None
-    """The pose in which the angles of a study are zero, see `Take.angles`."""
-    decimal: str = "."
-    """The decimal mark of the tables; with a comma their cells are separated by semicolons."""
-    guesses: bool = False
-    """Whether curves and frames have angles of joints that nothing shows, see `Take.shown_joints`."""
-    cycles: str | None = None
-    """The joint, as in `JOINT_NAMES`, between whose least angles are the cycles of a movement."""
-
-
 def write_take_page(
-    out: str | Path, take: Take, *, source: str = "take.npz", settings: PageSettings = PageSettings()
+    out: str | Path,
+    take: Take,
+    *,
+    source: str = "take.npz",
+    settings: PageSettings = PageSettings(),  # noqa: B008 (immutable)
 ) -> tuple[Path, ...]:
     """Write the page on a take and its tables, all or none, as `handsim report` does.
 
@@ -108,7 +83,7 @@ def write_take_page(
     if settings.cycles is not None:
         check_choice(settings.cycles, JOINT_NAMES, noun="joint")
     hands, spans = hand_figures(take, guesses=settings.guesses), find_suspect_spans(take, most=None)
-    paths, cycles = table_paths(out, settings), _cycles(take, hands, settings)
+    cycles = cycles_of_hands(take, hands, settings)
     sections = [
         _summary_section(take),
         _calibration_section(take),
@@ -122,179 +97,10 @@ def write_take_page(
         _spans_section(take, spans, source),
         *([_methods_section(take, spans, settings)] if take.made_by_tracker else []),
     ]
-    tables = [rows(take, hands) for rows in (_frame_rows, _joint_rows, _marker_rows)]
-    tables = [*tables, _span_rows(take, spans), _reach_rows(take, hands)]
-    first = [take.settings.get("capture", Path(source).name), settings.person, settings.session]
-    if settings.cycles is not None:
-        tables.append(_cycle_rows(take, hands, cycles, first))
-    tables = [_with_record(rows, take) for rows in tables]
-    tables.append(_angle_rows(take, hands, first, settings))
     with written_together():
         write_sections(out, sections, title=f"Take {Path(source).name}", lead=_lead(take))
-        for path, rows in zip(paths, tables, strict=True):
-            _write_table(path, rows, settings.decimal)
+        paths = write_tables(out, take, hands, spans, cycles, source=source, settings=settings)
     return out, *paths
-
-
-def _with_record(rows: _Rows, take: Take) -> _Rows:
-    """A table with a last column that says in the first row what the take was made of."""
-    cells = [_RECORD, made_of(take.settings), *[""] * (len(rows) - 2)]
-    return [[*row, cell] for row, cell in zip(rows, cells, strict=False)]
-
-
-def _write_table(path: Path, rows: _Rows, decimal: str) -> None:
-    """Write a table as CSV, with points or commas in its numbers."""
-    header, *others = rows
-    if decimal == ",":
-        others = [
-            [cell if name in _WORDS else _with_comma(cell) for name, cell in zip(header, row, strict=True)]
-            for row in others
-        ]
-    # Names of files need not be valid text.
-    with (
-        atomic_write(path) as temporary,
-        temporary.open("w", encoding="utf-8", errors="backslashreplace", newline="") as file,
-    ):
-        separator = ";" if decimal == "," else ","
-        csv.writer(file, delimiter=separator, lineterminator="\n").writerows([header, *others])
-
-
-def _with_comma(cell: object) -> object:
-    """A number with a decimal comma; other cells as they are."""
-    try:
-        float(str(cell))
-    except ValueError:
-        return cell
-    return str(cell).replace(".", ",")
-
-
-def table_paths(page: Path, settings: PageSettings = PageSettings()) -> tuple[Path, ...]:
-    """Paths of a page's tables; the last is that of the angles of a study, before it that of cycles."""
-    *endings, last = _TABLES
-    cycles = [] if settings.cycles is None else [_CYCLES]
-    return tuple(page.with_suffix(ending) for ending in (*endings, *cycles, last))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class HandFigures:
-    """Figures of one hand over the T frames of a take, with its M markers."""
-
-    side: Side
-    marker_names: tuple[str, ...]
-    status: Int[np.ndarray, "T"]
-    """Indices into `STATUSES`."""
-    angles: Float[np.ndarray, "T 20"]
-    """Joint angles in the order of `JOINT_NAMES` [deg]; NaN where lost, or where nothing shows a joint."""
-    angle_spread: Float[np.ndarray, "T 20"] | None
-    """Standard deviation of each angle [deg]; None if the take has none."""
-    residuals: Float[np.ndarray, "T M"]
-    """Distance of each labeled point from the pose's marker [m]; NaN without a point or a pose."""
-    confidence: Float[np.ndarray, "T M"]
-    """Confidence in each marker's label; NaN where the marker has no point."""
-    beyond: Bool[np.ndarray, "20 M"]
-    """Which markers each joint moves; none for a joint that nothing shows."""
-
-    @property
-    def seen(self) -> Bool[np.ndarray, "T M"]:
-        """Which markers have a point."""
-        return np.asarray(np.isfinite(self.confidence))
-
-    @property
-    def fitted(self) -> Bool[np.ndarray, "T"]:
-        """Frames whose pose was fitted to points, not predicted."""
-        return self.status >= INITIALIZED
-
-    @property
-    def rms(self) -> Float[np.ndarray, "T"]:
-        """RMS of the residuals of each frame [m], also of simulated takes; NaN where there are none."""
-        known = np.isfinite(self.residuals)
-        total = np.sum(np.square(self.residuals), axis=1, where=known)
-        count = np.where(known.any(axis=1), known.sum(axis=1), np.nan)
-        return np.asarray(np.sqrt(total / count))
-
-    @property
-    def measured(self) -> Bool[np.ndarray, "T 20"]:
-        """Fitted frames with a seen marker beyond the joint; in all others the angle is predicted."""
-        return np.asarray(self.fitted[:, None] & (self.seen @ self.beyond.T))
-
-    def gaps(self, seen: Bool[np.ndarray, "T K"]) -> list[list[int]]:
-        """Lengths of the gaps of each column, from the hand's first pose to its last [frames]."""
-        there = np.flatnonzero(self.status != LOST)
-        hidden = ~seen[there[0] : there[-1] + 1] if len(there) else seen[:0]
-        return [[last - first + 1 for first, last in runs_of(column)] for column in hidden.T]
-
-    def joints(self) -> Float[np.ndarray, "20 9"]:
-        """Each angle's `_RANGE` where measured, median SD [deg], shares at a limit, measured, longest gap."""
-        found, measured = np.full((len(JOINTS), len(_RANGE) + 4), np.nan), self.measured
-        for row, angles, told in zip(found, self.angles.T, measured.T, strict=True):
-            if told.any():
-                row[: len(_RANGE)] = np.percentile(angles[told], list(_RANGE.values()))
-        if self.fitted.any():
-            if self.angle_spread is not None:
-                found[:, -4] = np.median(self.angle_spread[self.fitted], axis=0)
-            low, high = np.array([(joint.low, joint.high) for joint in JOINTS]).T
-            angles = self.angles[self.fitted]
-            found[:, -3] = ((angles < low + AT_LIMIT) | (angles > high - AT_LIMIT)).mean(axis=0)
-        found[:, -2] = measured.mean(axis=0)
-        found[:, -1] = [max(gaps, default=0) for gaps in self.gaps(measured)]
-        return found
-
-    def markers(self) -> Iterator[MarkerFigures]:
-        """Figures of each marker, in the glove's order."""
-        seen = self.seen
-        for marker, (name, gaps) in enumerate(zip(self.marker_names, self.gaps(seen), strict=True)):
-            frames = np.flatnonzero(seen[:, marker])
-            residuals = self.residuals[:, marker]
-            known = residuals[np.isfinite(residuals)]
-            median, high = np.percentile(known, (50.0, 95.0)).tolist() if len(known) else (np.nan, np.nan)
-            confidence = float(np.median(self.confidence[frames, marker])) if len(frames) else np.nan
-            share, longest = float(seen[:, marker].mean()), max(gaps, default=0)
-            yield MarkerFigures(name, share, len(gaps), longest, median, high, confidence)
-
-
-class MarkerFigures(NamedTuple):
-    """Figures of one marker; NaN if it was never seen or there is no pose."""
-
-    name: str
-    seen: float
-    """Share of all frames in which it has a point."""
-    num_gaps: int
-    """Number of gaps between the hand's first and last pose."""
-    longest_gap: int
-    """Length of the longest gap [frames]."""
-    median_residual: float
-    """Median distance from the pose's marker [m]."""
-    high_residual: float
-    """95th percentile of that distance [m]."""
-    median_confidence: float
-    """Median confidence in its labels."""
-
-
-def hand_figures(take: Take, *, guesses: bool = False) -> tuple[HandFigures, ...]:
-    """The figures of each hand of a simulated or tracked take; with guesses for joints that nothing shows."""
-    found = []
-    for number, (hand, labels) in enumerate(zip(take.hands, take.hand_labels, strict=True)):
-        there = take.status[:, number] != LOST
-        shown = take.shown_joints(hand.side)
-        known = there[:, None] & (shown | guesses)
-        angles = np.where(known, np.rad2deg(take.qpos[:, number, 7:]), np.nan)
-        confidence = np.full((take.num_frames, len(labels)), np.nan)
-        points = take.point_list
-        own = (points.labels >= labels.start) & (points.labels < labels.stop)
-        confidence[points.frames[own], points.labels[own] - labels.start] = points.confidence[own]
-        residuals = np.full((take.num_frames, len(labels)), np.nan)
-        observed = take.observed(hand.side)
-        for span, worn in take.worn():
-            posed = span.start + np.flatnonzero(there[span])
-            for first in range(0, len(posed), _CHUNK):
-                part = posed[first : first + _CHUNK]
-                expected, _ = worn[number].markers(take.qpos[part, number])
-                residuals[part] = np.linalg.norm(observed[part] - expected, axis=2)
-        spread = None if take.angle_spread is None else np.rad2deg(take.angle_spread[:, number])
-        status, names = take.status[:, number], hand.layout.names
-        beyond = hand.attachment.beyond & shown[:, None]
-        found.append(HandFigures(hand.side, names, status, angles, spread, residuals, confidence, beyond))
-    return tuple(found)
 
 
 def _lead(take: Take) -> str:
@@ -420,37 +226,9 @@ def _draw_curves(
     panel.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, handlelength=1.2)
 
 
-class _WristFigures(NamedTuple):
-    """Angles of a wrist over the frames of a take, in the order of `WRIST_NAMES`."""
-
-    angles: Float[np.ndarray, "T 2"]
-    """Angles [deg]; NaN where hand or forearm have no pose, or the forearm's axes are unknown."""
-    spread: Float[np.ndarray, "T 2"]
-    """Their standard deviations [deg]; NaN where unknown."""
-    measured: Bool[np.ndarray, "T"]
-    """Frames in which both poses were fitted to points."""
-    constant: Float[np.ndarray, "2"]
-    """Parts of the standard deviations that are the same in all frames [deg]."""
-
-
-def _wrist_figures(take: Take, hand: HandFigures, settings: PageSettings) -> _WristFigures:
-    """The figures of a wrist whose forearm is among the bodies."""
-    angles, number = take.wrist_angles(hand.side, settings.neutral), take.hand_index(hand.side)
-    assert angles is not None
-    measured = hand.fitted & (take.body_status[:, take.forearm_index(hand.side)] >= INITIALIZED)
-    spread = np.full(angles.shape, np.nan) if take.wrist_spread is None else take.wrist_spread[:, number]
-    budget = np.array(
-        take.settings.get("wrist_budget", {}).get(hand.side, np.full((2, len(SOURCES)), np.nan))
-    )
-    constant = np.linalg.norm(budget[:, _CONSTANT], axis=1)
-    return _WristFigures(
-        np.rad2deg(angles), np.rad2deg(spread), measured & np.isfinite(angles[:, 0]), constant
-    )
-
-
 def _wrist_section(take: Take, hand: HandFigures, settings: PageSettings) -> Section:
     """Curves and range of motion of a wrist."""
-    title, wrist = f"{hand.side.capitalize()} wrist", _wrist_figures(take, hand, settings)
+    title, wrist = f"{hand.side.capitalize()} wrist", wrist_figures(take, hand, settings)
     if not wrist.measured.any():
         return Section(
             title,
@@ -463,10 +241,10 @@ def _wrist_section(take: Take, hand: HandFigures, settings: PageSettings) -> Sec
         "deviation (SD) to either side; how well the axes of the forearm are known is not in it. SD constant "
         "is the part of it that is the same in all frames."
     )
-    table = [["angle [deg]", *_RANGE, "median SD", "SD constant", "measured [%]"]]
+    table = [["angle [deg]", *RANGE, "median SD", "SD constant", "measured [%]"]]
     for number, name in enumerate(WRIST_NAMES):
-        of = np.percentile(wrist.angles[wrist.measured, number], list(_RANGE.values()))
-        cells = [*of, _medians(wrist.spread[wrist.measured])[number], wrist.constant[number]]
+        of = np.percentile(wrist.angles[wrist.measured, number], list(RANGE.values()))
+        cells = [*of, medians(wrist.spread[wrist.measured])[number], wrist.constant[number]]
         shown = [NOTHING if np.isnan(cell) else f"{cell:.1f}" for cell in cells]
         table.append([name.replace("_", " "), *shown, percent(float(wrist.measured.mean()))])
     curves = picture((9.6, 2.6), _draw_wrist, take.times, hand, wrist)
@@ -474,7 +252,7 @@ def _wrist_section(take: Take, hand: HandFigures, settings: PageSettings) -> Sec
 
 
 def _draw_wrist(
-    figure: Figure, times: Float[np.ndarray, "T"], hand: HandFigures, wrist: _WristFigures
+    figure: Figure, times: Float[np.ndarray, "T"], hand: HandFigures, wrist: WristFigures
 ) -> None:
     panel = figure.subplots()
     _prepare(panel, times, hand.status)
@@ -487,7 +265,7 @@ def _draw_wrist(
 
 def _range_section(title: str, take: Take, hand: HandFigures) -> Section:
     shares = "at its limits [%]", "measured [%]"
-    table = [["joint [deg]", *_RANGE, "median SD", "model's range", *shares, "longest gap [s]"]]
+    table = [["joint [deg]", *RANGE, "median SD", "model's range", *shares, "longest gap [s]"]]
     for joint, (*first, limits, measured, gap) in zip(JOINTS, hand.joints().tolist(), strict=True):
         cells = [NOTHING if np.isnan(one) else f"{one:.1f}" for one in first]
         cells += [f"{joint.low:g} to {joint.high:g}", percent(limits) if limits > 0.0 else NOTHING]
@@ -506,7 +284,7 @@ def _range_section(title: str, take: Take, hand: HandFigures) -> Section:
 
 def _error_section(title: str, settings: Mapping[str, Any], hand: HandFigures) -> Section:
     """The standard deviation of each angle by its sources, and the cut-off of its filter."""
-    errors = _joint_errors(settings, hand)
+    errors = joint_errors(settings, hand)
     if np.isnan(errors).all():
         return Section(title, "Filter: none, each pose was fitted to the markers of its frame.")
     factors = zip(CHANGING["frame"], SOURCES, strict=True)
@@ -527,18 +305,6 @@ def _error_section(title: str, settings: Mapping[str, Any], hand: HandFigures) -
     for joint, cells in zip(JOINTS, errors.tolist(), strict=True):
         table.append([joint.name.replace("_", " "), *(f"{cell:.1f}" for cell in cells)])
     return Section(title, text, table=table)
-
-
-def _joint_errors(settings: Mapping[str, Any], hand: HandFigures) -> Float[np.ndarray, "20 E"]:
-    """Each angle's SD, its `SOURCES`, SEM, MDD by measure [deg], cut-off [Hz]; NaN if it is not smoothed."""
-    cutoffs, budget = (settings.get(name, {}).get(hand.side) for name in ("filter", "budget"))
-    if cutoffs is None or budget is None:
-        return np.full((len(JOINTS), len(SOURCES) + len(CHANGING) + 3), np.nan)
-    origin = hand_origin(str(settings.get("user", "")), hand.side)
-    errors = np.transpose([measurement_error(np.array(budget), origin, measure) for measure in CHANGING])
-    return np.column_stack(
-        [np.linalg.norm(budget, axis=1), budget, errors[:, 0], DETECTABLE * errors, cutoffs]
-    )
 
 
 def _markers_section(title: str, take: Take, hand: HandFigures) -> Section:
@@ -666,75 +432,6 @@ def _methods_section(take: Take, spans: Sequence[SuspectSpan], settings: PageSet
     return Section("Methods", escape(text), notes=[f"Made of: {made}."] if made else [])
 
 
-_Rows = list[list[object]]
-
-
-def _frame_rows(take: Take, hands: Sequence[HandFigures]) -> _Rows:
-    """One row per frame and hand; header first."""
-    header = ["frame", "time_s", "hand", "status", "markers_seen", "residual_rms_mm"]
-    header += [f"{joint}_deg" for joint in JOINT_NAMES]
-    rows: _Rows = [[*header, *(f"{joint}_spread_deg" for joint in JOINT_NAMES)]]
-    numbers = []
-    for hand in hands:
-        spread = np.full_like(hand.angles, np.nan) if hand.angle_spread is None else hand.angle_spread
-        numbers.append(np.column_stack([1e3 * hand.rms, hand.angles, spread]).tolist())
-    counts = [hand.seen.sum(axis=1).tolist() for hand in hands]
-    for frame, time in enumerate(take.times.tolist()):
-        for hand, count, row in zip(hands, counts, numbers, strict=True):
-            first = [frame, _time(time), hand.side, STATUSES[hand.status[frame]], count[frame]]
-            rows.append([*first, *map(_number, row[frame])])
-    return rows
-
-
-def _joint_rows(take: Take, hands: Sequence[HandFigures]) -> _Rows:
-    """Rows of the table of joints: range of motion, range of the model, errors between sessions."""
-    columns = [f"{name}_deg" for name in (*_RANGE, "model_low", "model_high", "spread")]
-    columns += ["at_limits_share", "measured_share", "longest_gap_s", "sem_deg"]
-    columns += [*(f"mdd_{measure}_deg" for measure in CHANGING), "cutoff_hz"]
-    rows: _Rows = [["hand", "joint", *columns]]
-    for hand in hands:
-        errors = _joint_errors(take.settings, hand)[:, 1 + len(SOURCES) :].tolist()
-        for joint, figures, error in zip(JOINTS, hand.joints().tolist(), errors, strict=True):
-            *row, spread, limits, measured, gap = figures
-            cells = *row, joint.low, joint.high, spread, limits, measured, gap / take.rate, *error
-            rows.append([hand.side, joint.name, *map(_number, cells)])
-    return rows
-
-
-def _marker_rows(take: Take, hands: Sequence[HandFigures]) -> _Rows:
-    """Rows of the figures of each marker."""
-    header = ["hand", "marker", "seen_share", "gaps", "longest_gap_frames", "longest_gap_s"]
-    rows: _Rows = [[*header, "residual_median_mm", "residual_95th_mm", "confidence_median"]]
-    for hand in hands:
-        for marker in hand.markers():
-            gaps = [marker.num_gaps, marker.longest_gap, _number(marker.longest_gap / take.rate)]
-            residuals = (1e3 * marker.median_residual, 1e3 * marker.high_residual)
-            last = map(_number, (*residuals, marker.median_confidence))
-            rows.append([hand.side, marker.name, _number(marker.seen), *gaps, *last])
-    return rows
-
-
-def _span_rows(take: Take, spans: Sequence[SuspectSpan]) -> _Rows:
-    """Rows of doubtful spans, the worst first; `frame` is the one to look at."""
-    rows: _Rows = [["first_frame", "last_frame", "start_s", "end_s", "frame", "of", "why"]]
-    for span in spans:
-        times = [_time(float(take.times[one])) for one in (span.first, span.last)]
-        rows.append([span.first, span.last, *times, span.worst, span.of, span.why])
-    return rows
-
-
-def _cycles(take: Take, hands: Sequence[HandFigures], settings: PageSettings) -> list[Cycles]:
-    """The cycles of each hand, if they are asked for."""
-    joint = settings.cycles
-    if joint is None:
-        return []
-    found = []
-    for hand in hands:
-        angles = take.angles(hand.side, neutral=settings.neutral).values()
-        found.append(cycles_of(np.rad2deg(np.transpose([*angles])), hand.measured, joint, take.rate))
-    return found
-
-
 def _cycles_section(side: Side, cycles: Cycles, settings: PageSettings) -> Section:
     """Mean and standard deviation of the angles over the cycles, as curves and in numbers."""
     title, joint = f"{side.capitalize()} hand: cycles", str(settings.cycles).replace("_", " ")
@@ -753,84 +450,3 @@ def _cycles_section(side: Side, cycles: Cycles, settings: PageSettings) -> Secti
     text += " Each joint counts in the cycles in nine tenths of which it is measured. SD: over the cycles."
     drawn = picture((9.6, 2.6), draw_cycles, cycles, _STROKES)
     return Section(title, text, [(drawn, "Mean over the cycles; the band is one SD to either side.")], table)
-
-
-def _cycle_rows(
-    take: Take, hands: Sequence[HandFigures], cycles: Sequence[Cycles], first: list[object]
-) -> _Rows:
-    """Rows of figures and curves: by hand and joint of each cycle, their mean and standard deviation."""
-    header = [*_WORDS, "side", "joint", "cycle", "start [s]", *FIGURES]
-    rows: _Rows = [[*header, *(f"{percent:g} %" for percent in PERCENTS)]]
-    for hand, found in zip(hands, cycles, strict=True):
-        starts = take.times[[span[0] for span in found.spans]]
-        numbers = np.concatenate([found.figures, found.curves], axis=2)
-        every = [
-            (f"{n + 1}", _time(start), one)
-            for n, (start, one) in enumerate(zip(starts, numbers, strict=True))
-        ]
-        every += [(name, "", one) for name, one in mean_and_spread(numbers)] if every else []
-        for name, start, joints in every:
-            for joint, values in zip(JOINT_NAMES, joints.tolist(), strict=True):
-                rows.append([*first, hand.side, joint, name, start, *map(_number, values)])
-    return rows
-
-
-def _reach_rows(take: Take, hands: Sequence[HandFigures]) -> _Rows:
-    """Rows of how near the thumb came to each target of a test of opposition."""
-    rows: _Rows = [["side", "target", "gap_mm", "spread_mm", "time_s"]]
-    for hand in hands:
-        for name, gap, time, spread in thumb_reach(take, hand.side):
-            rows.append([hand.side, name, _number(1e3 * gap), _number(1e3 * spread), _time(time)])
-    return rows
-
-
-def _angle_rows(
-    take: Take, hands: Sequence[HandFigures], first: list[object], settings: PageSettings
-) -> _Rows:
-    """Rows of the angles of a study: by hand, convention, joint and measure, in measured frames.
-
-    SD and its constant part are those of a single angle, so that a range of motion has none.
-    """
-    rows: _Rows = [[*_ANGLES]]
-    joints = dict(zip(ISB_NAMES, ISB_JOINTS, strict=True)) | {name: n for n, name in enumerate(JOINT_NAMES)}
-    for hand in hands:
-        errors = _joint_errors(take.settings, hand)
-        constant = np.linalg.norm(errors[:, [1 + source for source in _CONSTANT]], axis=1)
-        known = dict(zip(JOINT_NAMES, np.c_[hand.joints()[:, -4], constant, errors[:, -4:-1]], strict=True))
-        measured_of = {name: hand.measured[:, number] for name, number in joints.items()}
-        if take.forearm_index(hand.side) is not None:
-            wrist = _wrist_figures(take, hand, settings)
-            measured_of |= dict.fromkeys(WRIST_NAMES, wrist.measured)
-            of_wrist = zip(WRIST_NAMES, _medians(wrist.spread[wrist.measured]), wrist.constant, strict=True)
-            known |= {name: np.array([spread, same, *[np.nan] * 3]) for name, spread, same in of_wrist}
-        for convention in get_args(Convention) if hand.fitted.any() else ():
-            zero = "" if settings.neutral is None else ", zero in the neutral pose"
-            angles = take.angles(hand.side, convention=convention, neutral=settings.neutral)
-            for name, values in angles.items():
-                measured = measured_of[name]
-                degrees = np.rad2deg(values[measured]) if measured.any() else np.array([np.nan])
-                low, high = np.percentile(degrees, (5.0, 95.0))
-                last = _number(measured.mean()), f"{convention}{zero}", made_of(take.settings)
-                spread, same, mean, peak, moved = known.get(name, [np.nan] * 5)
-                errors_of = [(spread, same, one) for one in (mean, peak, peak)] + [(np.nan, np.nan, moved)]
-                of_measures = (degrees.mean(), low, high, high - low), errors_of
-                for measure, value, error in zip(_MEASURES, *of_measures, strict=True):
-                    numbers = map(_number, (value, *error))
-                    rows.append([*first, hand.side, name, measure, *numbers, *last])
-    return rows
-
-
-def _medians(values: Float[np.ndarray, "F K"]) -> Float[np.ndarray, "K"]:
-    """Medians of the columns, over the rows that are known; NaN if none is."""
-    known = np.isfinite(values).all(axis=1)
-    return np.median(values[known], axis=0) if known.any() else np.full(values.shape[1], np.nan)
-
-
-def _number(value: float) -> str:
-    """A number with six digits; empty for NaN."""
-    return "" if np.isnan(value) else f"{value:.6g}"
-
-
-def _time(seconds: float) -> str:
-    """A time with sixteen digits, which resolve a microsecond of a clock that counts since 1970."""
-    return f"{seconds:.16g}"

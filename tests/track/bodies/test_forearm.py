@@ -23,7 +23,8 @@ from render.user_body import UserBody
 from track import RigidTemplate, track_capture
 from track.bodies.forearm import forearm_of_landmarks
 from track.bodies.rigid_body import learn_body, load_bodies, load_body, save_body
-from track.takes.take_page import PageSettings, write_take_page
+from track.takes.take_figures import PageSettings
+from track.takes.take_page import write_take_page
 from train.simulation.training_frames import wear_gloves
 
 RATE = 120.0

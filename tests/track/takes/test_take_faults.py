@@ -18,7 +18,8 @@ from track import find_suspect_spans, track_capture
 from track.alternatives.alternatives import _mirror_orders
 from track.kinematics.pose_solver import FEWEST_MARKERS, PoseSolver
 from track.takes.take_faults import find_faults
-from track.takes.take_page import PageSettings, hand_figures, write_take_page
+from track.takes.take_figures import PageSettings, hand_figures
+from track.takes.take_page import write_take_page
 from track.takes.take_summary import summarize, suspicions, vouch
 from train import simulate_take
 

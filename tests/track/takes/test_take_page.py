@@ -14,7 +14,9 @@ from gloves import Take
 from gloves.takes.take import COASTING, LOST, STATUSES, TRACKED
 from handsim.hand.shape import JOINT_NAMES, JOINTS
 from track import track_capture
-from track.takes.take_page import decimated, hand_figures, shaded, table_paths, write_take_page
+from track.takes.take_figures import hand_figures
+from track.takes.take_page import decimated, shaded, write_take_page
+from track.takes.take_tables import table_paths
 from train import simulate_take
 
 FRAMES = 60

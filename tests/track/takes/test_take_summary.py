@@ -15,7 +15,8 @@ from handsim.cli.main import main
 from handsim.hand.shape import JOINT_NAMES
 from poses import sample_poses
 from track import find_suspect_spans, track_capture
-from track.takes.take_page import hand_figures, write_take_page
+from track.takes.take_figures import hand_figures
+from track.takes.take_page import write_take_page
 from track.takes.take_summary import frame_confidence, runs_of, summarize, suspicions
 from train import simulate_take
 

@@ -10,7 +10,8 @@ from handsim import HandModel, join_qpos
 from handsim.errors import ArgumentError
 from handsim.hand.shape import JOINT_NAMES
 from poses.touch import touching_angles
-from track.takes.take_page import PageSettings, write_take_page
+from track.takes.take_figures import PageSettings
+from track.takes.take_page import write_take_page
 from track.takes.trials import cycles_of, find_cycles, mean_and_spread, thumb_reach
 
 RATE = 100.0
