@@ -76,7 +76,7 @@ _SHAPE: Final = 2.0
 In six videos of another renderer errors were up to 1.5 times the deviations with it, and 2.9 times without.
 """
 _ZOOMED: Final = 3.0  # Focal lengths of two spans differ by more than this many standard deviations.
-_SAME_CLOCK: Final = 0.05  # [s]
+_SAME_CLOCK, _SAME_WAY = 0.05, 0.1  # [s, rad]
 _STILL: Final = 0.7  # No push is looked for if this share agrees with a camera that stood still.
 _APART: Final = 0.3  # [s] least distance of two shifts for which PnP is tried
 _FOCALS: Final = (0.5, 0.65, 0.85, 1.1, 1.45, 1.9, 2.5, 3.3)  # [picture widths] tried by PnP
@@ -342,11 +342,17 @@ def _agreement(bundle: Bundle, state: State, looks: _Looks) -> tuple[float, Stat
 
 
 def _check_margin(bundle: Bundle, tried: list[_Hypothesis]) -> None:
-    """Raise if another clock or camera explains nearly as much as the best."""
+    """Raise if another clock or camera explains nearly as much as the best.
+
+    Of cameras that look the same way at the same time a longer search would find one.
+    """
     best = tried[0]
     for other in tried[1:]:
-        same = _are_same(bundle, best.state, other.state)
-        if not same and other.agreement > _MARGIN * best.agreement:
+        ways = Rotation.from_rotvec([one.state.pose(0)[:3] for one in (best, other)])
+        alike = _have_one_clock(bundle, best.state, other.state) and (
+            (ways[0].inv() * ways[1]).magnitude() < _SAME_WAY or best.state.starts != other.state.starts
+        )
+        if not alike and other.agreement > _MARGIN * best.agreement:
             (clock, _), (another, _) = bundle.clock(best.state), bundle.clock(other.state)
             raise HandSimError(
                 f"cameras with the clock at {clock:.2f} and at {another:.2f} s explain "
@@ -380,9 +386,13 @@ def _first_guesses(bundle: Bundle) -> list[State]:
 
 def _are_same(bundle: Bundle, one: State, other: State) -> bool:
     """Whether two states have the same clock and, with the same spans, nearly the same place."""
-    clocks = np.abs(bundle.times(one) - bundle.times(other))[[0, -1]]
     near = np.linalg.norm(one.pose(0)[3:] - other.pose(0)[3:]) < _UNKNOWN
-    return bool(clocks.max() < _SAME_CLOCK and (near or one.starts != other.starts))
+    return _have_one_clock(bundle, one, other) and bool(near or one.starts != other.starts)
+
+
+def _have_one_clock(bundle: Bundle, one: State, other: State) -> bool:
+    """Whether two states have the same clock at both ends of the video."""
+    return bool(np.abs(bundle.times(one) - bundle.times(other))[[0, -1]].max() < _SAME_CLOCK)
 
 
 def _shifts(bundle: Bundle) -> list[tuple[float, float]]:
