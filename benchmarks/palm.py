@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from benchmarks.record import number_table, run
 from gloves import read_capture
-from handsim.space.transforms import rigid_fit
+from handsim.space.transforms import rigid_fit, unit
 
 Doubles = NDArray[np.float64]
 _ROUNDS = 4  # of fitting the markers of the back to their median places
@@ -54,16 +54,16 @@ def flexion(back: Doubles, knuckle: Doubles, joint: Doubles, lever: float) -> li
         turns, shifts = rigid_fit(back, np.broadcast_to(places, back.shape))
         own = np.einsum("tij,tmj->tmi", turns, back) + shifts[:, None]
         places = np.median(own, axis=0)
-    ahead = _unit(places[2:].mean(axis=0) - places[:2].mean(axis=0))
-    up = _unit(np.cross(ahead, places[2] - places[3]))
+    ahead = unit(places[2:].mean(axis=0) - places[:2].mean(axis=0))
+    up = unit(np.cross(ahead, places[2] - places[3]))
     knuckle, joint, wrist = (
         np.einsum("tij,tj->ti", turns, one) + shifts for one in (knuckle, joint, back[:, 1])
     )
     bone, before, middle = joint - knuckle, knuckle - wrist, np.median(knuckle, axis=0)
     rigid = np.arctan2(-bone @ up, bone @ ahead)
-    plain = np.arccos(np.einsum("ti,ti->t", _unit(bone), _unit(before)))
+    plain = np.arccos(np.einsum("ti,ti->t", unit(bone), unit(before)))
     signed = rigid - np.arctan2(-before @ up, before @ ahead)
-    along = _unit(middle - places[1])
+    along = unit(middle - places[1])
     moved = knuckle - middle
     across = moved - np.outer(moved @ along, along)
     way = np.linalg.svd(across, full_matrices=False)[2][0]
@@ -71,10 +71,6 @@ def flexion(back: Doubles, knuckle: Doubles, joint: Doubles, lever: float) -> li
     off = moved - np.outer(across @ way, way)
     ranges = [float(np.rad2deg(np.ptp(np.percentile(one, [5, 95])))) for one in (rigid, plain, signed, hinge)]
     return [*ranges, 1e3 * float(np.sqrt((off**2).sum(axis=1).mean()))]
-
-
-def _unit(vectors: Doubles) -> Doubles:
-    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
 
 
 if __name__ == "__main__":

@@ -50,7 +50,6 @@ _UNKNOWN: Final = 0.05  # [m] A camera whose place has a larger deviation is not
 _LEAST_SHARE: Final = 0.5  # This share of the frames with hands must fit; of wrong cameras 40 % did.
 _MOST_SPANS: Final = 4  # largest number of spans in each of which the camera stands still
 _MOVES: Final = 4  # number of times that the beginning of a new span is looked for
-_LIKELY: Final = 1.3  # A camera stood still if its frames are then at most this many times as bad.
 _LOWER: Final = 0.9  # A span is cut in two if the cost is then less than this share of what it was.
 _SHORTEST_SPAN: Final = 20  # smallest number of frames in a span
 _NO_HAND: Final = "the take has no hand then"
@@ -64,7 +63,7 @@ _FIRST_NOISE: Final = 2.0  # [px] standard deviation of edges in the first round
 _STEP: Final = 1.0 / 15.0  # [s] step between the shifts of the clock
 _MOST_MATCHED: Final = 64  # largest number of detections that are matched
 _NOWHERE: Final = 1e3  # [m] where hands are that the take does not have
-_TRIED: Final = 5  # number of best shifts for which PnP is tried
+_TRIED: Final = 5  # PnP solves the camera for this many shifts of the clock, the best ones.
 _SCREENED: Final = 30  # number of frames whose outlines judge a hypothesis
 _NEAR: Final = 0.004  # [widths] An edge this near to an outline agrees.
 _LEAST_AGREEMENT: Final = 0.5  # share of the outlines; of wrong clocks and cameras it was 0.01 to 0.39
@@ -304,9 +303,7 @@ def _hypotheses(bundle: Bundle, looks: _Looks, progress: Progress) -> list[_Hypo
     def judge(start: State, *, splits: bool) -> None:
         with contextlib.suppress(HandSimError):  # the others are tried all the same
             state, covariance, noise = _adjusted(bundle, start, splits=splits)
-            if any(
-                _are_same(bundle, state, one.state) for one, _ in found if one.state.starts == state.starts
-            ):
+            if any(_are_same(bundle, state, one.state) for one, _ in found):
                 return
             agreement, state = _agreement(bundle, state, some)
             found.append((_Hypothesis(agreement, state, covariance, noise), start))
@@ -385,9 +382,9 @@ def _first_guesses(bundle: Bundle) -> list[State]:
 
 
 def _are_same(bundle: Bundle, one: State, other: State) -> bool:
-    """Whether two states have the same clock and, with the same spans, nearly the same place."""
+    """Whether two states have the same clock, the same spans and nearly the same place of the camera."""
     near = np.linalg.norm(one.pose(0)[3:] - other.pose(0)[3:]) < _UNKNOWN
-    return _have_one_clock(bundle, one, other) and bool(near or one.starts != other.starts)
+    return one.starts == other.starts and bool(near) and _have_one_clock(bundle, one, other)
 
 
 def _have_one_clock(bundle: Bundle, one: State, other: State) -> bool:

@@ -1,4 +1,4 @@
-"""Help pages are kept, one file a command: tyro and the command's modules take up to a second to write one.
+"""A cache of help pages, one file per command: tyro and the modules of a command need a second to write one.
 
 A page is kept for what it depends on: the sources of handsim and of tyro, Python, and the terminal. Nothing
 else may stand in a page, such as the names of files that are there.

@@ -43,7 +43,7 @@ class _Tolerances(NamedTuple):
     """Largest distances of points from a body's markers [m]."""
 
     gate: float  # of labeled points
-    tight: float  # of points that determine a pose
+    tight: float  # of the points that a pose is fitted to
     search: float  # in a search
     tightest: float  # in a search that matches three points, maybe by chance
 

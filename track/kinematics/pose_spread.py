@@ -502,7 +502,7 @@ def pose_spreads(
     unseen: Float[np.ndarray, "T M"],
     smoothed: Float[np.ndarray, "S 26 26"],
 ) -> tuple[Float[np.ndarray, "T 26 4"], Float[np.ndarray, "T 21"]]:
-    """Variances of all unknowns by `SOURCES` [rad^2, m^2] and standard deviations of keypoints [m].
+    """Variance of each unknown by `SOURCES` ([rad^2] or [m^2]), and standard deviation of each keypoint [m].
 
     The unknowns are the joint angles, then position and rotation of the wrist along its own axes. `hand` is
     from `with_keypoints`. A marker off its place moves the fit as noise does. Errors of the hand move

@@ -22,7 +22,7 @@ _Content = tuple[str, str, Sequence[Any]]
 
 
 def osc_format(content: Content = Content()) -> MessageFormat:  # noqa: B008 (immutable)
-    """Messages as bundles of Open Sound Control 1.0; docs/live_output.md lists the addresses."""
+    """The format of bundles of Open Sound Control 1.0, whose addresses docs/live_output.md lists."""
     program = content.program
     messages: Any = import_extra("pythonosc.osc_message_builder", "osc://", "send")
     bundles: Any = import_extra("pythonosc.osc_bundle_builder", "osc://", "send")

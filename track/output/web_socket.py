@@ -36,7 +36,7 @@ MOST_CONNECTIONS: Final = 64
 """Largest number of open connections of a server."""
 _FLUSH: Final = 1.0  # [s] time for clients to read waiting frames at the end
 _OWN_PAGES: Final = re.compile(r"https?://(localhost|127\.0\.0\.1|\[::1\])(:\d+)?")
-"""Pages from this machine; the sink refuses other pages in its browsers."""
+"""Origins of web pages that this machine serves; pages of other origins are refused."""
 
 
 class WebSocketSink:
@@ -239,7 +239,7 @@ def _refuse_other_paths(connection: Any, request: Any) -> Any:
 
 
 def _wishes(request: Any) -> tuple[str, bool]:
-    """The path of a client's request, and whether it asks for every frame."""
+    """The path that a client requests, and whether its query asks for every frame."""
     path, _, query = request.path.partition("?")
     return path.rstrip("/"), dict(parse_qsl(query)).get("every") in EVERY[1:]
 

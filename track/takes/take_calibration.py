@@ -58,20 +58,24 @@ def calibrate_take(
         seen = np.where(out[:, None, None], np.nan, markers)
         one = calibrate_hand(seen, hand, take.rate, progress=_steps(hand.side, on_part))
         tried = _tried(markers[out], worn[hand.side], one.hand)
-        if tried is not None and tried.is_better:
-            tried = tried._replace(other_labels=_likelier_labels(take, hand.side))
         done.append(dataclasses.replace(one, held_out=tried))
-    return tuple(done)
+    return _with_likelier_labels(take, done)
 
 
-def _likelier_labels(take: Take, side: Side) -> str:
-    """What the likeliest labels of a hand's points say; empty where these are the take's.
+def _with_likelier_labels(take: Take, done: Sequence[Calibration]) -> tuple[Calibration, ...]:
+    """Calibrations that say which other labels fit the points of a better hand better than the take's.
 
     Shifted places of markers explain labels that are wrong throughout, and held-out frames, labeled alike,
     confirm them.
     """
-    doubt = doubts_of(take).get(side)
-    return doubt.tried[0].words if doubt is not None else ""
+    doubts = doubts_of(take) if any(one.is_better for one in done) else {}  # of all hands, in seconds
+    told = []
+    for one in done:
+        tried, doubt = one.held_out, doubts.get(one.hand.side)
+        if tried is not None and tried.is_better and doubt is not None:
+            tried = tried._replace(other_labels=doubt.tried[0].words)
+        told.append(dataclasses.replace(one, held_out=tried))
+    return tuple(told)
 
 
 def kept_user(

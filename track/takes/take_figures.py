@@ -1,4 +1,4 @@
-"""Figures of the hands of a take, which its page and its tables show."""
+"""Figures of the hands of a take, for its report page and its tables."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class HandFigures:
 
     @property
     def fitted(self) -> Bool[np.ndarray, "T"]:
-        """Frames whose pose was fitted to points, not predicted."""
+        """Whether the pose of each frame was fitted to points; other poses are predicted."""
         return self.status >= INITIALIZED
 
     @property
@@ -172,7 +172,7 @@ class WristFigures(NamedTuple):
     measured: Bool[np.ndarray, "T"]
     """Frames in which both poses were fitted to points."""
     constant: Float[np.ndarray, "2"]
-    """Parts of the standard deviations that are the same in all frames [deg]."""
+    """The part of each standard deviation [deg] whose error stays the same in all frames."""
 
 
 def wrist_figures(take: Take, hand: HandFigures, settings: PageSettings) -> WristFigures:

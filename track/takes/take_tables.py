@@ -107,7 +107,7 @@ def _with_comma(cell: object) -> object:
 
 
 def _frame_rows(take: Take, hands: Sequence[HandFigures]) -> _Rows:
-    """One row per frame and hand; header first."""
+    """Rows of the table of frames: a header, then a row for each frame and hand."""
     header = ["frame", "time_s", "hand", "status", "markers_seen", "residual_rms_mm"]
     header += [f"{joint}_deg" for joint in JOINT_NAMES]
     rows: _Rows = [[*header, *(f"{joint}_spread_deg" for joint in JOINT_NAMES)]]

@@ -1,4 +1,4 @@
-"""Recordings are fetched from a git repository, the right commit of it, and checked by their bytes."""
+"""Recordings are fetched from one commit of a git repository, and their bytes are checked."""
 
 from __future__ import annotations
 

@@ -34,8 +34,9 @@ ELSEWHERE = {
     "generate": "out workers cluster sampler", "train": "out threads", "label": "out threads",
     "export": "out scene", "evaluate": "json threads", "simulate": "out cluster",
     "calibrate": "out live seconds", "track": "out live seconds send labelled", "report": "out",
-    "replay": "host port rate loop", "view": "host port out video live", "body": "out markers forearm landmarks",
-    "doctor": "compile send", "film": "out format workers detector frames-per-shard openxr frames seed",
+    "replay": "host port rate loop", "view": "host port out video live",
+    "body": "out markers forearm landmarks", "doctor": "compile send",
+    "film": "out format workers detector frames-per-shard openxr frames seed",
     "render": "out merge format workers cluster painter frames-per-shard",
 }  # fmt: skip
 """Options that say only where something is or goes, as what, or how quickly."""
