@@ -10,11 +10,13 @@ import multiprocessing
 import os
 import pickle
 import platform
+import queue
 import re
 import signal
 import socket
 import sys
 import threading
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -73,20 +75,53 @@ def check_workers(workers: int | None) -> int:
 def run_jobs(job: Job, todo: Sequence[int], workers: int | Executor | None) -> Iterator[int]:
     """Do jobs in any process and any order, and yield the number of each finished job.
 
-    With a number of processes (by default one per core) this process does the first job before the others
-    start: that fills numba's cache for the workers, and shows mistakes that are common to all jobs.
+    With a number of processes (by default one per core) this process is one of them: it does the first job
+    while the others start, so that a mistake that is common to all jobs is raised here.
     """
     if isinstance(workers, Executor):
-        yield from _share_out(job, todo, workers)
+        with _told_deaths():
+            yield from _share_out(job, todo, workers)
         return
-    count = check_workers(workers)
-    here = len(todo) if count == 1 or len(todo) == 2 else 1
-    needs_main = bool(todo[here:]) and _needs_main(job)
-    for number in todo[:here]:
-        yield job(number)
-    if todo[here:]:
-        with LocalProcesses(min(count, len(todo) - here), needs_main) as processes:
-            yield from _share_out(job, todo[here:], processes)
+    others = min(check_workers(workers), len(todo)) - 1
+    if others < 1:
+        yield from map(job, todo)
+        return
+    with _told_deaths(), LocalProcesses(others, _needs_main(job)) as processes:
+        yield from _share_with(job, todo, processes, others)
+
+
+def _share_with(job: Job, todo: Sequence[int], processes: LocalProcesses, count: int) -> Iterator[int]:
+    """Do jobs here and in other processes, each of which takes its next job when it has finished one."""
+    left, finished = deque(todo), queue.SimpleQueue[Future[int]]()
+
+    def take() -> int | None:
+        try:
+            return left.popleft()  # safe in threads: processes take theirs in a thread of the executor
+        except IndexError:
+            return None
+
+    def begin(submit: Callable[..., Future[int]]) -> None:
+        if (number := take()) is not None:
+            future = submit(_do, job, number)
+            future.add_done_callback(finished.put)
+            future.add_done_callback(go_on)
+
+    def go_on(done: Future[int]) -> None:
+        if not done.cancelled() and done.exception() is None:
+            begin(super(LocalProcesses, processes).submit)  # starts no process, which only this thread may
+
+    mine = take()
+    for _ in range(count):
+        begin(processes.submit)
+    try:
+        for _ in todo:
+            if mine is None or not finished.empty():
+                yield finished.get().result()
+            else:
+                yield _do(job, mine)
+                mine = take()
+    finally:
+        left.clear()
 
 
 def _needs_main(job: Job) -> bool:
@@ -132,17 +167,24 @@ def _share_out(job: Job, todo: Sequence[int], executor: Executor) -> Iterator[in
             done, pending = wait(pending, return_when=FIRST_COMPLETED)
             for future in done:
                 yield future.result()
-    except BrokenProcessPool as error:
-        raise DatasetError(f"a worker died {_FEWER}") from error
-    except CancelledError as error:
-        raise HandSimError(f"the workers are gone; {_AGAIN}") from error
     finally:
         for future in pending:
             future.cancel()
 
 
+@contextmanager
+def _told_deaths() -> Iterator[None]:
+    """Tell in one sentence that a worker died, or that all are gone."""
+    try:
+        yield
+    except BrokenProcessPool as error:
+        raise DatasetError(f"a worker died {_FEWER}") from error
+    except CancelledError as error:
+        raise HandSimError(f"the workers are gone; {_AGAIN}") from error
+
+
 def _do(job: Job, number: int) -> int:
-    """Do a job in a worker; an error that cannot be pickled comes back as text."""
+    """Do a job; an error that cannot be pickled comes back as text, wherever the job was done."""
     try:
         return job(number)
     except Exception as error:

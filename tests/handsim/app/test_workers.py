@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -20,21 +21,22 @@ from handsim.errors import ArgumentError, DatasetError, LayoutError
 
 ROOT = Path(__file__).resolve().parents[3]
 PROGRAM = """
-import os, sys, time
+import multiprocessing, os, sys, time
 sys.path.insert(0, ROOT)
 from handsim.app.workers import run_jobs
 def job(number):
-    if number:
+    if multiprocessing.parent_process():
         os.write(1, f"{os.getpid()} {os.environ['OMP_NUM_THREADS']}\\n".encode())  # in one piece
-        time.sleep(600)
-    return number
+    time.sleep(600)
 if __name__ == "__main__":
-    list(run_jobs(job, range(4), 2))
+    list(run_jobs(job, range(4), 3))
 """
 
 
-def sign(folder: Path, number: int) -> int:
+def sign_and_meet(folder: Path, number: int) -> int:
     (folder / str(number)).write_text(str(os.getpid()))
+    while len(list(folder.iterdir())) < 3:
+        time.sleep(0.02)
     return number
 
 
@@ -64,8 +66,8 @@ def sign_and_wait(folder: Path, number: int) -> None:
     threading.Event().wait()
 
 
-def die_at_two(number: int) -> int:
-    if number == 2:
+def die_in_a_worker(number: int) -> int:
+    if multiprocessing.parent_process() is not None:
         os._exit(3)
     return number
 
@@ -76,10 +78,11 @@ def test_every_job_is_done_once(workers):
     assert list(run_jobs(double, [], workers)) == []
 
 
-def test_the_first_job_is_done_here(tmp_path):
-    assert sorted(run_jobs(functools.partial(sign, tmp_path), range(4), 2)) == list(range(4))
-    signed = [int((tmp_path / str(number)).read_text()) for number in range(4)]
-    assert signed[0] == os.getpid() and os.getpid() not in signed[1:]
+def test_this_process_and_others_do_jobs(tmp_path):
+    job = functools.partial(sign_and_meet, tmp_path)
+    assert sorted(run_jobs(job, range(6), 3)) == list(range(6))
+    signed = [int((tmp_path / str(number)).read_text()) for number in range(6)]
+    assert signed[0] == os.getpid() and len(set(signed)) == 3
 
 
 def test_another_executor_does_all_jobs(monkeypatch):
@@ -100,7 +103,7 @@ def test_a_worker_that_dies_is_told():
     with pytest.raises(
         DatasetError, match=r"a worker died .*; run the same command again to go on, with fewer --workers"
     ):
-        list(run_jobs(die_at_two, range(5), 2))
+        list(run_jobs(die_in_a_worker, range(5), 2))
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="mounts a file system")
@@ -199,7 +202,7 @@ def test_a_script_without_a_main_guard(call, said, piped, tmp_path):
         said = "this session, not a module, defines what the workers use: put the call under"
     if said:
         assert said in done.stderr and "[0" not in done.stdout
-        assert done.stdout.count("begin") == (3 if call.startswith("check") and not piped else 1)
+        assert done.stdout.count("begin") == (2 if call.startswith("check") and not piped else 1)
         return
     assert (done.returncode, done.stdout.splitlines()[-1]) == (0, "[0, 1, 2, 3, 4]"), done.stderr
-    assert done.stdout.count("begin") == (3 if "if" in call[:2] and "(own," in call and not piped else 1)
+    assert done.stdout.count("begin") == (2 if "if" in call[:2] and "(own," in call and not piped else 1)
