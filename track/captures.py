@@ -23,6 +23,7 @@ from gloves.optics.reconstruction import number_runs
 from gloves.takes.corrections import Correction, find_pins, load_corrections, unfitting_sentences
 from gloves.takes.points import PointList
 from gloves.takes.take import Take, label_names
+from handsim.app.workers import LocalProcesses, second_process
 from handsim.callbacks import OnStep, Progress, no_progress, no_step
 from handsim.errors import CalibrationError, CaptureError, HandSimWarning, errors_of
 from handsim.files.inputs import checksum
@@ -51,6 +52,7 @@ _COMPARED: Final = 200  # pairs of successive frames compared to see whether fra
 _CONTINUOUS: Final = 0.005  # [m] A pair is continuous if distances within a hand change less.
 _CORRECTIONS: Final = 2  # times that a take is labeled again because other labels are likelier
 _ANY_RATE: Final = 120.0  # [Hz] Poses and labels do not depend on the rate of a take.
+_WORTH_A_PROCESS: Final = 1500  # frames: labeling them in one direction takes as long as a process starts
 _MOST: Final = 0.5  # Frames are tracked if at least this share of their pairs is continuous.
 
 
@@ -86,8 +88,13 @@ def label_capture(
         HandSimWarning: There is no hand in any frame, another hand or glove fits clearly better, other labels
             fit as well, or a marker is not where the layout has it.
     """
-    source, frames, setup = _opened(capture, LabelSettings.of(settings, options))
-    labeled, setup, _ = _judged(lambda setup: _labeled_take(capture, source, frames, setup, progress), setup)
+    chosen, source = LabelSettings.of(settings, options), capture_of(capture)
+    frames = checked_frames(source)
+    with second_process(len(frames) >= _WORTH_A_PROCESS, label_both_ways.__module__) as other:
+        setup = _setup_of(chosen, frames)
+        labeled, setup, _ = _judged(
+            lambda now: _labeled_take(capture, source, frames, now, progress, other), setup
+        )
     labeled = _with_other_hands(labeled, setup)
     told = [*map(str, other_hands_of(labeled)), *label_faults(labeled)]
     if (labeled.point_list.labels < 0).all():
@@ -103,8 +110,9 @@ def _labeled_take(
     frames: Sequence[StreamedFrame],
     setup: TrackerSetup,
     progress: Progress,
+    other: LocalProcesses | None,
 ) -> Take:
-    """Label all frames of a capture."""
+    """Label all frames of a capture, with the help of another process where there is one."""
     present, glove = np.isfinite(source.positions[..., 0]), setup.settings["glove"]
     take = Take.of_truth(
         setup.user.hands,
@@ -120,7 +128,7 @@ def _labeled_take(
         progress(count, len(frames))
 
     if _is_continuous(frames):
-        return label_both_ways(take, frames, setup.tracker, on_count)
+        return label_both_ways(take, frames, setup.tracker, on_count, other)
     clouds = [frame.points for frame in frames]
     labels, confidence = label_alone(clouds, setup.user.hands, setup.labeler, on_count)
     points = dataclasses.replace(take.point_list, labels=labels, confidence=confidence)
@@ -367,8 +375,14 @@ def _opened(
     """A capture, its frames and the setup that tracks them, with measured hands unless settings give them."""
     source = capture_of(capture)
     frames = checked_frames(source)
-    setup = TrackerSetup.of(settings)  # last, because a glove may have to be learned
-    return source, frames, setup.measured(sample_frames(frames), warns=warns)
+    return source, frames, _setup_of(settings, frames, warns=warns)  # last: a glove may have to be learned
+
+
+def _setup_of(
+    settings: LabelSettings, frames: Sequence[StreamedFrame], *, warns: bool = False
+) -> TrackerSetup:
+    """The setup that labels frames, with measured hands unless settings give them."""
+    return TrackerSetup.of(settings).measured(sample_frames(frames), warns=warns)
 
 
 def _named(capture: AnyCapture, source: Capture) -> dict[str, Any]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import functools
+import importlib
 import math
 import multiprocessing
 import os
@@ -233,6 +234,38 @@ class LocalProcesses(ProcessPoolExecutor):
         """End the processes at once, without waiting for it."""
         self._ours.close()
         self.shutdown(wait=False, cancel_futures=True)
+
+
+@contextmanager
+def second_process(is_wanted: bool, module: str) -> Iterator[LocalProcesses | None]:
+    """A process for half of the work of a block; None without a core for it.
+
+    It starts and imports the module of its work at once, while this process does something else.
+    """
+    if not is_wanted or usable_cores() < 2 or multiprocessing.parent_process() is not None:
+        yield None
+        return
+    try:
+        other = LocalProcesses(1)
+    except HandSimError:  # no process can be started here; this one does all the work
+        yield None
+        return
+    with other:
+        other.submit(_load, module)
+        yield other
+
+
+def can_be_sent(job: Any) -> bool:
+    """Whether a process that does not run the main script can be given a job."""
+    try:
+        return _MAIN.encode() not in pickle.dumps(job)
+    except Exception:  # of any kind, as what the job holds raises it
+        return False
+
+
+def _load(module: str) -> None:
+    """Import a module."""
+    importlib.import_module(module)
 
 
 def _end_with(channel: Connection) -> None:

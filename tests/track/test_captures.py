@@ -196,6 +196,25 @@ def test_progress_is_told_frame_by_frame(capture, user, labeler):
     assert told == [(n, 5) for n in range(1, 6)]
 
 
+def test_another_process_that_labels_backward_changes_nothing(capture, user, labeler, monkeypatch):
+    class Own:
+        """A labeler that no other process can be given."""
+
+        def __getattr__(self, name):
+            return getattr(labeler, name)
+
+    told = []
+    alone = label_capture(capture, hands=user, labeler=labeler)
+    monkeypatch.setattr("track.captures._WORTH_A_PROCESS", 1)
+    monkeypatch.setattr("handsim.app.workers.usable_cores", lambda: 2)
+    for one in (labeler, Own()):
+        shared = label_capture(capture, hands=user, labeler=one, progress=lambda *done: told.append(done))
+        np.testing.assert_array_equal(shared.labels, alone.labels)
+        np.testing.assert_array_equal(shared.confidence, alone.confidence)
+        assert told == sorted(told) and told[-1] == (len(capture.positions), len(capture.positions))
+        told.clear()
+
+
 def test_empty_frames_and_frames_without_hands_are_lost_not_wrong(user, labeler, rng):
     positions = np.full((4, 3, 3), np.nan)
     positions[2] = rng.normal(size=(3, 3))

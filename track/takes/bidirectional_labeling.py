@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from gloves.captures.capture import runs_of
 from gloves.takes.points import PointList
 from gloves.takes.take import LOST, TRACKED, Take
+from handsim.app.workers import LocalProcesses, can_be_sent
 from handsim.hand.shape import NUM_QPOS
 from track.frames import StreamedFrame, TrackedHand
 from track.takes.label_confidence import label_confidence
@@ -52,12 +53,13 @@ def label_both_ways(
     frames: Sequence[StreamedFrame],
     new_tracker: Callable[[], Tracker],
     on_count: Callable[[int], None],
+    other: LocalProcesses | None = None,
 ) -> Take:
-    """Label a take in both directions; `on_count` is called with the number of frames done."""
-    count = len(frames)
-    order = range(count)
-    forward = _track(take, frames, order, new_tracker(), lambda done: on_count(done // 2))
-    backward = _track(take, frames, order[::-1], new_tracker(), lambda done: on_count((count + done) // 2))
+    """Label a take in both directions, in another process in one of them where there is one.
+
+    `on_count` is called with the number of frames done.
+    """
+    forward, backward = _both_ways(take, frames, new_tracker, on_count, other)
     points, one, other = take.point_list, forward.take.point_list.labels, backward.take.point_list.labels
     is_second = np.zeros(one.shape, dtype=bool)
     events = _events_of(points.frames, one, other)
@@ -76,14 +78,37 @@ def label_both_ways(
     )
 
 
+def _both_ways(
+    take: Take,
+    frames: Sequence[StreamedFrame],
+    new_tracker: Callable[[], Tracker],
+    on_count: Callable[[int], None],
+    other: LocalProcesses | None,
+) -> tuple[_Track, _Track]:
+    """Track the hands through all frames forward and backward."""
+    count = len(frames)
+    order = range(count)
+    if other is None or not can_be_sent(new_tracker):
+        forward = _track(take, frames, order, new_tracker, lambda done: on_count(done // 2))
+        return forward, _track(
+            take, frames, order[::-1], new_tracker, lambda done: on_count((count + done) // 2)
+        )
+    backward = other.submit(_track, take, frames, order[::-1], new_tracker)
+    forward = _track(take, frames, order, new_tracker, lambda done: on_count(min(done, count - 1)))
+    found: _Track = backward.result()
+    on_count(count)
+    return forward, found
+
+
 def _track(
     take: Take,
     frames: Sequence[StreamedFrame],
     order: Sequence[int],
-    tracker: Tracker,
-    on_count: Callable[[int], None],
+    new_tracker: Callable[[], Tracker],
+    on_count: Callable[[int], None] = lambda _: None,
 ) -> _Track:
     """Track the hands through frames in the given order."""
+    tracker = new_tracker()
     points, num_hands = take.point_list, len(tracker.hands)
     labels, evidence = points.labels.copy(), np.zeros(len(frames))
     qpos, rms = np.zeros((len(frames), num_hands, NUM_QPOS)), np.zeros((len(frames), num_hands))
