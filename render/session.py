@@ -362,9 +362,10 @@ def _write_sheet(out: Path, drawing: Drawing, shards: list[list[int]]) -> list[P
         return []
     frames: list[RenderedFrame] = []
     filled = [number for number, shard in enumerate(shards) if shard]
-    for shard in np.array(filled)[np.unique(np.linspace(0, len(filled) - 1, _ON_SHEET).round().astype(int))]:
+    each = 1 if len(filled) >= _ON_SHEET else 3  # few shards, because each has a scene of its own to set up
+    spread = np.linspace(0, len(filled) - 1, min(len(filled), _ON_SHEET // each)).round().astype(int)
+    for shard in np.array(filled)[spread]:
         mine = shards[shard]
-        chosen = mine[:1] if len(filled) >= _ON_SHEET else mine[:: max(1, len(mine) // 3)][:3]
-        frames += drawing.frames(int(shard), enumerate(chosen))
+        frames += drawing.frames(int(shard), enumerate(mine[:: max(1, len(mine) // each)][:each]))
     write_png(out / SHEET, contact_sheet(frames[:_ON_SHEET]))
     return [out / SHEET]
