@@ -437,7 +437,8 @@ def _at_walls(
     walls, low = np.empty(len(rays), np.int8), np.array(enclosure.low)
     room = (np.array(enclosure.high) - low).astype(np.float32)
     _find_walls(rays, (eye - low).astype(np.float32), room, distances, walls, places)
-    return _looked_up(_wall_pictures(background, enclosure), places), distances, walls
+    paint = dataclasses.replace(background, blur=0.0, backdrop=_WALL)  # all that the pictures depend on
+    return _looked_up(_wall_pictures(paint, _corner(room)), places), distances, walls
 
 
 def _corner(point: Doubles) -> Corner:
@@ -490,16 +491,13 @@ def _rays(camera: Camera) -> tuple[Floats, Flags]:
 
 
 @functools.lru_cache(maxsize=2)
-def _wall_pictures(background: Background, enclosure: Enclosure) -> UInt8[np.ndarray, "R S 3"]:
-    """Pictures of the six walls in sRGB, one below the other; photographs are of one folder."""
-    walls = [
-        dataclasses.replace(background, seed=(background.seed + wall) % 2**31, blur=0.0) for wall in range(6)
-    ]
+def _wall_pictures(background: Background, room: Corner) -> UInt8[np.ndarray, "R S 3"]:
+    """Pictures of a room's six walls in sRGB, one below the other; photographs are of one folder."""
+    walls = [dataclasses.replace(background, seed=(background.seed + wall) % 2**31) for wall in range(6)]
     pictures = []
     if background.photo is None:
         pictures = [draw_background(wall, (_TEXTURE, _TEXTURE)) for wall in walls]
     else:
-        room = np.array(enclosure.high) - np.array(enclosure.low)
         for number, (wall, photo) in enumerate(
             zip(walls, photos_beside(Path(background.photo), 6), strict=True)
         ):
