@@ -29,7 +29,7 @@ from handsim.space.camera import Camera, camera_matrix
 from render.color_sensor import GAMMA
 from render.frames import Bytes, Doubles, Flags, Floats, Geometry, at_rest
 from render.photographs import PHOTO_SUFFIXES, check_photograph, is_map, read_map, read_photograph
-from render.scenery.rooms import RoomLight, cast_room, draw_room, paint_tints
+from render.scenery.rooms import RoomLight, cast_room, draw_room, paint_tints, smooth_edges
 
 LUMINANCE: Final = np.array([0.2126, 0.7152, 0.0722])
 _MAP_LIGHT: Final = 0.5  # mean luminance of a map, 1 for a white surface in full light
@@ -458,13 +458,20 @@ def _drawn(
     background: Background, enclosure: Enclosure, camera: Camera, pose: bytes, bright: bool
 ) -> Surroundings:
     T_world_camera, (rays, known) = np.frombuffer(pose).reshape(4, 4), _rays(camera)
-    world = rays @ T_world_camera[:3, :3].T.astype(np.float32)
-    world, eye, shape = _sloping(world), T_world_camera[:3, 3], camera.size[::-1]
-    sigma = background.blur * shape[0]
+    eye, shape, turn = T_world_camera[:3, 3], camera.size[::-1], T_world_camera[:3, :3].T.astype(np.float32)
+    world = _sloping(rays @ turn)
+    sigma, most = background.blur * shape[0], np.inf if bright else 1.0
     if background.kind == "room" or background.is_map:
         is_map = background.is_map
         met = _in_map(background, world) if is_map else _in_room(background, enclosure, eye, world)
-        light = np.clip(met.light, 0.0, np.inf if bright else 1.0).reshape(*shape, 3)
+        light = np.clip(met.light, 0.0, most).reshape(*shape, 3)
+        if not is_map:
+
+            def look(edges: Flags, x: float, y: float) -> Floats:
+                aside = _sloping(_rays(_moved(camera, x, y))[0][edges] @ turn)
+                return np.asarray(np.clip(_in_room(background, enclosure, eye, aside).light, 0.0, most))
+
+            smooth_edges(light, look)
         if sigma > _SHARP:
             light = cv2.GaussianBlur(light, (0, 0), sigma)
         light = cv2.pow(light, 1.0 / GAMMA)
@@ -482,7 +489,12 @@ def _drawn(
     return Surroundings(depth, walls.reshape(shape), _both_ways(T_world_camera[:3, :3].T), rgb)
 
 
-@functools.lru_cache(maxsize=4)
+def _moved(camera: Camera, x: float, y: float) -> Camera:
+    """A camera that sees in a pixel's center what this one sees beside and below it [px]."""
+    return dataclasses.replace(camera, K=camera.K - [[0.0, 0.0, x], [0.0, 0.0, y], [0.0, 0.0, 0.0]])
+
+
+@functools.lru_cache(maxsize=8)
 def _rays(camera: Camera) -> tuple[Floats, Flags]:
     """Rays (H W, 3) in a camera's axes, and where (H, W) the lens sees; elsewhere rays are arbitrary."""
     rays = camera.rays()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from typing import Any, Final, NamedTuple
 
 import cv2
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 
 from handsim.kernels import kernel
 from render.fields import normal_numbers
-from render.frames import Doubles, Floats, Integers
+from render.frames import Doubles, Flags, Floats, Integers
 
 _FURNITURE: Final = (4, 14)  # range of the number of boxes
 _PLAIN, _STRIPES, _TILES, _BOARDS = 3, 0, 1, 2  # patterns of walls
@@ -80,10 +81,7 @@ def draw_room(size: tuple[int, int], seed: int) -> RoomPicture:
     down, across = np.mgrid[:height, :width].reshape(2, -1).astype(np.float32) + np.float32(0.5)
     met = seen(across, down)
     picture = met.light.reshape(height, width, 3).copy()
-    roots = cv2.sqrt(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY))
-    edges = cv2.morphologyEx(roots, cv2.MORPH_GRADIENT, _CROSS).ravel() > _STEP
-    parts = [seen(across[edges] + x, down[edges] + y).light for x, y in _QUARTERS]
-    picture.reshape(-1, 3)[edges] = np.mean(parts, axis=0)
+    smooth_edges(picture, lambda edges, x, y: seen(across[edges] + x, down[edges] + y).light)
     grain = normal_numbers((height, width, 1), rng=np.random.default_rng([seed, 1]))
     picture *= np.float32(1.0) + np.float32(0.05) * grain
     aside = ((across - 0.5 * width) ** 2 + (down - 0.5 * height) ** 2) / (scene.focal * height) ** 2
@@ -91,6 +89,16 @@ def draw_room(size: tuple[int, int], seed: int) -> RoomPicture:
     light = cv2.GaussianBlur(picture, (0, 0), 0.9)  # because rays have no width, but pixels do
     shape = height, width
     return RoomPicture(light, depth.reshape(shape), met.walls.reshape(shape), scene.focal, scene.axes)
+
+
+def smooth_edges(picture: Floats, look: Callable[[Flags, float, float], Floats]) -> None:
+    """Give the pixels at edges of a picture (H, W, 3) of linear light the mean of their four quarters.
+
+    `look` has the light (E, 3) of the pixels at edges (H W,), beside and below their centers [px].
+    """
+    roots = cv2.sqrt(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY))
+    edges = cv2.morphologyEx(roots, cv2.MORPH_GRADIENT, _CROSS).ravel() > _STEP
+    picture.reshape(-1, 3)[edges] = np.mean([look(edges, x, y) for x, y in _QUARTERS], axis=0)
 
 
 @kernel

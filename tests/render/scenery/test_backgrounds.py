@@ -197,6 +197,21 @@ def test_two_cameras_see_one_place(kind: str, camera: str) -> None:
     assert np.ptp(moved) > 3.0, "parallax: what is near moves more"
 
 
+@pytest.mark.parametrize("name", ["vga", "headset_fisheye"])
+def test_edges_of_rooms_around_cameras_are_smooth(name: str) -> None:
+    """Nearly as the mean over sixteen rays has them."""
+    box, (fine, _) = enclose(POSITIONS, 5, LAMP), pair(name)
+    small = np.diag([0.25, 0.25, 1.0])
+    coarse = dataclasses.replace(fine, size=(fine.size[0] // 4, fine.size[1] // 4), K=small @ fine.K)
+    one, other = (
+        (draw_surroundings(background("room", 3), box, camera, bright=True).rgb / 255.0) ** 2.2
+        for camera in (coarse, fine)
+    )
+    height, width = one.shape[:2]
+    mean = other[: 4 * height, : 4 * width].reshape(height, 4, width, 4, 3).mean(axis=(1, 3))
+    assert np.quantile(np.abs(mean - one), 0.99) < 0.035  # 0.04 and 0.07 with one ray a pixel
+
+
 def test_a_camera_that_was_changed_in_place_is_drawn_anew() -> None:
     box, (camera, _) = enclose(POSITIONS, 5, LAMP), pair("headset_fisheye")
     before = draw_surroundings(background("gradient"), box, camera, bright=False).depth
