@@ -306,7 +306,3 @@ def _print_overview(commands: Table) -> None:
     console.print("usage: handsim COMMAND [OPTIONS]\n", markup=False)
     console.print(table)
     console.print("\nhandsim COMMAND --help tells a command's options; handsim --version, the version.")
-
-
-if __name__ == "__main__":
-    sys.exit(main())
