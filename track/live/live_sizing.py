@@ -74,6 +74,7 @@ class LiveSizing(Closing):
         self._is_brief, self._is_done = True, False  # is the last measurement brief, the size final?
         self._calm = self._usual = self._newest = 0.0  # [s] since measured; [m] residuals
         self._is_measured, self._reason, self._begun = False, "", 0.0  # [s] `_begun` on the monotonic clock
+        self._is_late = False  # Is the running measurement of hands before a pause or another user?
         self._processes: LocalProcesses | None = None
         if setup.is_auto:
             self._start_process()
@@ -120,11 +121,11 @@ class LiveSizing(Closing):
         if not self._setup.is_auto:
             return False
         is_there = any(hand.has_pose for hand in tracked.hands)
-        came = frame.time > self._seen + _PAUSE and (is_there or self._is_done)
+        came = frame.time > self._seen + _PAUSE and (is_there or self._is_measured)
         if came or self._fit_worse(tracked, min(frame.time - self._seen, _LONGEST_STEP)):
             self._frames.clear()
             self._shown, self._due, self._is_brief, self._is_done = 0.0, _FIRST, True, False
-            self._is_measured, self._reason = False, ""
+            self._is_measured, self._reason, self._is_late = False, "", self._measuring is not None
         self._seen = frame.time if is_there else self._seen
         if not self._is_done and len(frame.points) >= self._setup.fewest_points:
             self._shown += min(frame.time - self._last, _LONGEST_STEP)
@@ -157,7 +158,8 @@ class LiveSizing(Closing):
 
     def _begin_measuring(self, user: User) -> None:
         """Start to measure the hands in the frames so far."""
-        self._is_brief, self._due = self._shown < _ENOUGH, max(_ENOUGH, _LATER * self._shown)
+        self._is_late, self._is_brief = False, self._shown < _ENOUGH
+        self._due = max(_ENOUGH, _LATER * self._shown)
         self._frames, self._begun = sample_frames(self._frames), monotonic()
         processes = self._processes or self._start_process()
         self._measuring = processes.submit(
@@ -184,7 +186,7 @@ class LiveSizing(Closing):
         if not found.users:
             self._reason = "not measured yet: no hand was found"
             return
-        self._is_measured = True
+        self._is_measured = not self._is_late
         self._judges = self._judges or found.is_relabeled
         self._is_done, self._calm, self._usual = not self._is_brief, 0.0, 0.0
         before, after = (one[0].shape.length for one in (tracker.user, found.users[-1]))
