@@ -105,7 +105,11 @@ class LiveSizing(Closing):
             self._processes.end()
 
     def eased(self, tracked: TrackedFrame, tracker: Tracker) -> TrackedFrame:
-        """The frame to show: a new size may find a hand in another pose, to which it goes in small steps."""
+        """The frame to show, with the state of the measurement.
+
+        A new size may find a hand in another pose, to which it goes in small steps.
+        """
+        tracked = dataclasses.replace(tracked, size_state=self.state) if self.state else tracked
         shown, last = tracked, self._before
         if self._is_easing and last is not None:
             span = tracked.time - last[0].time if self._is_resized else None

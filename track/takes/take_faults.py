@@ -93,7 +93,7 @@ def find_faults(take: Take) -> tuple[SuspectSpan, ...]:
     """Find the faults of a tracked take, each from the frame in which it begins."""
     found = list[SuspectSpan]()
     every = [span for span, _ in take.worn()]
-    longest = max(every, key=lambda span: span.stop - span.start)
+    longest = max(every, key=lambda span: np.count_nonzero(take.status[span] == TRACKED))
     for span in every:  # Other hands, or another size of them, have faults of their own.
         first = span.start
         part = take.cut(first, span.stop) if take.former else take
