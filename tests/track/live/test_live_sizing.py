@@ -351,4 +351,4 @@ def test_a_measurement_of_those_who_have_left_does_not_count_for_others(monkeypa
     shown(sizing, tracker, 5.0, 0.5)
     pending.set_result(live_sizing._Measured([dataclasses.replace(setup.user, notes="auto, measured")]))
     shown(sizing, tracker, 5.5, 0.1)
-    assert sizing.is_settled and sizing.state == "not measured yet: seen for 0.6 of 1 s"
+    assert sizing.is_settled and sizing.state == "not measured yet: seen for 0.7 of 1 s"

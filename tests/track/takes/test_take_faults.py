@@ -291,8 +291,6 @@ def test_hands_of_the_wrong_side_are_never_silent(mirror_like, turned):
 
 def test_hands_of_two_users_are_no_fault(truth, tracked, monkeypatch):
     """Poses of each are judged by their own hands, not those of the last frames; labels are judged once."""
-    judged, doubts_of = [], take_faults.doubts_of
-    monkeypatch.setattr(take_faults, "doubts_of", lambda take: judged.append(take) or doubts_of(take))
     larger = tuple(nominal_fit(hand.layout, "XL", hand.side) for hand in truth.hands)
     later = track_capture(
         dataclasses.replace(truth, points=enlarged(truth, larger)), hands=larger, labeler="dense19"
@@ -304,6 +302,8 @@ def test_hands_of_two_users_are_no_fault(truth, tracked, monkeypatch):
         hands=larger,
         former=[FormerHands(HALF, tracked.hands, "M")],
     )  # fmt: skip
+    judged, doubts_of = [], take_faults.doubts_of
+    monkeypatch.setattr(take_faults, "doubts_of", lambda take: judged.append(take) or doubts_of(take))
     assert find_faults(both) == () and len(judged) == 1
     assert find_faults(tracked.cut(0, HALF)) == ()
     mixed = dataclasses.replace(both, former=())
