@@ -112,8 +112,7 @@ class CountedServer(ReplayServer):
 
     def __init__(self, played: Round, first: int, count: int, rate: float, port: int) -> None:
         self._count = count
-        rolled = (np.roll(one, -first, axis=0) for one in (played.points, played.ids))
-        points, ids = rolled
+        points, ids = (np.roll(one, -first, axis=0) for one in (played.points, played.ids))
         super().__init__(SimpleNamespace(points=points, ids=ids, rate=rate), port=port, loop=True)
 
     @property
@@ -207,11 +206,7 @@ def lives(frames: int) -> list[int]:
 def memory_of(process: int) -> tuple[int, int]:
     """Memory of a process and of its children [bytes]."""
     children = Path(f"/proc/{process}/task/{process}/children").read_text().split()
-    found = [0]
-    for child in children:
-        with suppress(OSError):
-            found.append(resident_memory(int(child)))
-    return resident_memory(process), sum(found)
+    return resident_memory(process), sum(resident_memory(int(child)) for child in children)
 
 
 def places(numbers: np.ndarray, frames: int) -> np.ndarray:
@@ -278,12 +273,10 @@ def drift(
     take: Take, played: Round, place: np.ndarray, keypoints: np.ndarray, frames: int
 ) -> Iterator[Check]:
     """The last minute of each person over the second one, in frames that both have."""
-    status, rms = (
-        [getattr(take, name)[:, take.sides.index(side)] for side in SIDES] for name in ("status", "rms")
-    )
+    order = [take.sides.index(side) for side in SIDES]
     off = np.linalg.norm(keypoints - played.keypoints[place % ROUND], axis=-1).mean(axis=-1)
-    values = 1e3 * np.stack([np.stack(rms, axis=1), off])
-    values[:, np.stack(status, axis=1) != Status.TRACKED] = np.nan
+    values = 1e3 * np.stack([take.rms[:, order], off])
+    values[:, take.status[:, order] != Status.TRACKED] = np.nan
     minutes = np.full((2, 2, ROUND, 2), np.nan)  # residual and error, second and last minute, row, hand
     for which, first in enumerate((ROUND, (frames + 1) // ROUND * ROUND - ROUND)):
         some = place // ROUND == first // ROUND
@@ -294,15 +287,11 @@ def drift(
     for person in range(3):
         own = played.person == person
         means = [np.nanmean(minutes[:, :, some], axis=(2, 3)).ravel() for some in (own, own & settled)]
-        print(
-            "{} | {:.3f}, {:.3f} | {:.2f}, {:.2f} | {:.3f}, {:.3f}, {:.2f}, {:.2f}".format(
-                person, *np.concatenate(means)
-            )
-        )
+        words = "{} | {:.3f}, {:.3f} | {:.2f}, {:.2f} | {:.3f}, {:.3f} | {:.2f}, {:.2f}"
+        print(words.format(person, *np.concatenate(means)))
     for some, when in ((settled | True, "minute"), (settled, "20 s of the minute")):
-        for name, (second, last) in zip(
-            ("residual", "keypoints' error"), np.nanmean(minutes[:, :, some], axis=(2, 3)), strict=True
-        ):
+        means = np.nanmean(minutes[:, :, some], axis=(2, 3))
+        for name, (second, last) in zip(("residual", "keypoints' error"), means, strict=True):
             yield f"{name}, last {when} over the second, less 1", abs(last / second - 1.0), SAME
 
 
