@@ -128,7 +128,7 @@ def suspicions(take: Take) -> list[str]:
     faults = find_faults(take)
     told = [f"{fault.words}; {fault.remedy}" for fault in faults if fault.last == take.num_frames - 1]
     if others := len(faults) - len(told):
-        told.append(f"faults of the hands of earlier frames, which handsim report lists: {others}")
+        told.append(f"faults of the hands of earlier frames, which the report lists as doubtful: {others}")
     return misfits(take) + told
 
 

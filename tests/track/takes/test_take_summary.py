@@ -48,7 +48,7 @@ def test_of_the_faults_of_several_people_those_of_the_last_hands_are_told(tracke
     monkeypatch.setattr(take_summary, "find_faults", lambda take: faults)
     assert suspicions(tracked) == [
         "right:B slips; glue it",
-        "faults of the hands of earlier frames, which handsim report lists: 1",
+        "faults of the hands of earlier frames, which the report lists as doubtful: 1",
     ]
 
 
