@@ -170,6 +170,7 @@ def hold(folder: Path, frames: int, rate: float) -> None:
         old.unlink(missing_ok=True)
     program = [sys.executable, "-m", "handsim", "track", "--live", f"natnet://{LOOPBACK}:{command}"]
     program += ["--out", str(out), "--send", f"ws://{LOOPBACK}:{web}"]
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # A shell's background jobs ignore Ctrl-C.
     memory = (folder / "memory.csv").open("w")
     with (folder / "track.log").open("w") as log:
         tracker = subprocess.Popen(program, stdout=log, stderr=subprocess.STDOUT)
