@@ -75,6 +75,7 @@ class LiveSizing(Closing):
         self._calm = self._usual = self._newest = 0.0  # [s] since measured; [m] residuals
         self._is_measured, self._reason, self._begun = False, "", 0.0  # [s] `_begun` on the monotonic clock
         self._is_late = False  # Is the running measurement of hands before a pause or another user?
+        self._is_first = True  # Was no hand measured yet?
         self._processes: LocalProcesses | None = None
         if setup.is_auto:
             self._start_process()
@@ -92,7 +93,8 @@ class LiveSizing(Closing):
     @property
     def state(self) -> str:
         """Why the hands are not measured, or not those of another user yet; empty if they need not be."""
-        if self._is_measured or not self._setup.is_auto:
+        nobody_came = not self._is_first and not self._shown
+        if self._is_measured or nobody_came or not self._setup.is_auto:
             return ""
         if self._measuring is None:
             return self._reason or f"not measured yet: seen for {self._shown:.1f} of {self._due:.0f} s"
@@ -190,7 +192,7 @@ class LiveSizing(Closing):
         if not found.users:
             self._reason = "not measured yet: no hand was found"
             return
-        self._is_measured = not self._is_late
+        self._is_measured, self._is_first = not self._is_late, False
         self._judges = self._judges or found.is_relabeled
         self._is_done, self._calm, self._usual = not self._is_brief, 0.0, 0.0
         before, after = (one[0].shape.length for one in (tracker.user, found.users[-1]))

@@ -291,6 +291,8 @@ def test_why_hands_are_not_measured_is_known(monkeypatch):
     pending.set_result(live_sizing._Measured([dataclasses.replace(setup.user, notes="auto, measured")]))
     shown(sizing, tracker, 11.6, 0.1)
     assert sizing.state == ""
+    shown(sizing, tracker, 11.7, 3.0, there=False, points=3)
+    assert sizing.state == "", "the last hands were measured"
     shown(sizing, tracker, 20.0, 0.5)
     assert sizing.state.startswith("not measured yet: seen for"), "somebody else may have come"
     assert LiveSizing(TrackerSetup.of(TrackSettings(hands="right", size="L"))).state == ""
