@@ -114,10 +114,11 @@ def _listen(
     with connect(url) as server, suppress(ConnectionClosed):
         with ready.get_lock():
             ready.value += 1
-        _note(_messages(server, pause, asks=asks), times, half)
+        _note(messages(server, pause, asks=asks), times, half)
 
 
-def _messages(server: Any, pause: float, *, asks: bool) -> Iterator[tuple[float, dict[str, Any]]]:
+def messages(server: Any, pause: float, *, asks: bool) -> Iterator[tuple[float, dict[str, Any]]]:
+    """Each message of a server after its header, with the time; `asks` for each, pauses after each [s]."""
     json.loads(server.recv())  # the header, for which nobody asks
     while True:
         if asks:
@@ -177,7 +178,7 @@ def measure(take: Take, frames: int, pause: float, names: tuple[str, ...]) -> No
     """Run a session with readers that pause after each frame [s], and print what they got."""
     half = frames // 2
     ready, over = SPAWN.Value("i", 0), SPAWN.Value("i", 0)
-    command, web, bundles, datagrams = _free_ports(
+    command, web, bundles, datagrams = free_ports(
         socket.SOCK_DGRAM, socket.SOCK_STREAM, socket.SOCK_DGRAM, socket.SOCK_DGRAM
     )
     stream = f"handsim-{web}"
@@ -252,7 +253,8 @@ def _tell(sent: np.ndarray, own: np.ndarray, arrived: dict[str, np.ndarray]) -> 
         )
 
 
-def _free_ports(*kinds: int) -> list[int]:
+def free_ports(*kinds: int) -> list[int]:
+    """A free port of this machine for each kind of socket."""
     sockets = [socket.socket(socket.AF_INET, kind) for kind in kinds]
     for one in sockets:
         one.bind((LOOPBACK, 0))

@@ -75,9 +75,10 @@ def timed(job: Callable[[], object], clock: Callable[[], float] = time.perf_coun
     return clock() - start
 
 
-def resident_memory() -> int:
-    """Memory of this process [bytes]."""
-    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+def resident_memory(process: int | None = None) -> int:
+    """Memory of a process [bytes], by its number; this one if not given."""
+    statm = Path("/proc", str(process or "self"), "statm").read_text()
+    return int(statm.split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
 def save_figures(

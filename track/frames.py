@@ -266,6 +266,8 @@ class TrackedFrame:
     """What was wrong with the frame itself, in words; empty for most frames."""
     seconds: float = np.nan
     """Computing time of the tracker [s]; NaN where it was not measured."""
+    size_state: str = ""
+    """Why the hands of a live stream are not measured yet, in words; empty if they are, or need not be."""
 
     def hand(self, side: Side) -> TrackedHand:
         """The hand of a side; an `ArgumentError` if none of that side is tracked."""

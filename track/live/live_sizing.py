@@ -74,6 +74,8 @@ class LiveSizing(Closing):
         self._is_brief, self._is_done = True, False  # is the last measurement brief, the size final?
         self._calm = self._usual = self._newest = 0.0  # [s] since measured; [m] residuals
         self._is_measured, self._reason, self._begun = False, "", 0.0  # [s] `_begun` on the monotonic clock
+        self._is_late = False  # Is the running measurement of hands before a pause or another user?
+        self._is_first = True  # Was no hand measured yet?
         self._processes: LocalProcesses | None = None
         if setup.is_auto:
             self._start_process()
@@ -91,7 +93,8 @@ class LiveSizing(Closing):
     @property
     def state(self) -> str:
         """Why the hands are not measured, or not those of another user yet; empty if they need not be."""
-        if self._is_measured or not self._setup.is_auto:
+        nobody_came = not self._is_first and not self._shown
+        if self._is_measured or nobody_came or not self._setup.is_auto:
             return ""
         if self._measuring is None:
             return self._reason or f"not measured yet: seen for {self._shown:.1f} of {self._due:.0f} s"
@@ -104,7 +107,11 @@ class LiveSizing(Closing):
             self._processes.end()
 
     def eased(self, tracked: TrackedFrame, tracker: Tracker) -> TrackedFrame:
-        """The frame to show: a new size may find a hand in another pose, to which it goes in small steps."""
+        """The frame to show, with the state of the measurement.
+
+        A new size may find a hand in another pose, to which it goes in small steps.
+        """
+        tracked = dataclasses.replace(tracked, size_state=self.state) if self.state else tracked
         shown, last = tracked, self._before
         if self._is_easing and last is not None:
             span = tracked.time - last[0].time if self._is_resized else None
@@ -120,11 +127,11 @@ class LiveSizing(Closing):
         if not self._setup.is_auto:
             return False
         is_there = any(hand.has_pose for hand in tracked.hands)
-        came = frame.time > self._seen + _PAUSE and (is_there or self._is_done)
+        came = frame.time > self._seen + _PAUSE and (is_there or self._is_measured)
         if came or self._fit_worse(tracked, min(frame.time - self._seen, _LONGEST_STEP)):
             self._frames.clear()
             self._shown, self._due, self._is_brief, self._is_done = 0.0, _FIRST, True, False
-            self._is_measured, self._reason = False, ""
+            self._is_measured, self._reason, self._is_late = False, "", self._measuring is not None
         self._seen = frame.time if is_there else self._seen
         if not self._is_done and len(frame.points) >= self._setup.fewest_points:
             self._shown += min(frame.time - self._last, _LONGEST_STEP)
@@ -157,7 +164,8 @@ class LiveSizing(Closing):
 
     def _begin_measuring(self, user: User) -> None:
         """Start to measure the hands in the frames so far."""
-        self._is_brief, self._due = self._shown < _ENOUGH, max(_ENOUGH, _LATER * self._shown)
+        self._is_late, self._is_brief = False, self._shown < _ENOUGH
+        self._due = max(_ENOUGH, _LATER * self._shown)
         self._frames, self._begun = sample_frames(self._frames), monotonic()
         processes = self._processes or self._start_process()
         self._measuring = processes.submit(
@@ -184,7 +192,7 @@ class LiveSizing(Closing):
         if not found.users:
             self._reason = "not measured yet: no hand was found"
             return
-        self._is_measured = True
+        self._is_measured, self._is_first = not self._is_late, False
         self._judges = self._judges or found.is_relabeled
         self._is_done, self._calm, self._usual = not self._is_brief, 0.0, 0.0
         before, after = (one[0].shape.length for one in (tracker.user, found.users[-1]))

@@ -89,6 +89,7 @@ def channels_of(header: LiveHeader) -> Iterator[_Channel]:
         yield from ((f"{side}_{digit}_status", "", "Status") for digit in header.digits)
         yield from ((f"{side}_{joint}_spread", "radians", "Spread") for joint in header.angles)
         yield from ((f"{side}_{place}_spread", "meters", "Spread") for place in header.positions)
+    yield ("measured", "", "Status")
 
 
 def _pose_channels(status: str, name: str) -> Iterator[_Channel]:
@@ -112,4 +113,5 @@ def sample_of(message: LiveMessage) -> np.ndarray:
     for hand in message.hands:
         parts += [[hand.seen if hand.has_pose else math.nan], [STATUSES.index(one) for one in hand.digits]]
         parts += [hand.angle_spread, hand.position_spread]
+    parts.append([not message.size_state])
     return np.concatenate(parts)

@@ -127,6 +127,8 @@ class LiveMessage:
     """Time of the frame [s]; never goes back."""
     silent: bool
     """Whether no frame has arrived for a while; the message then holds the hands' state until now."""
+    size_state: str
+    """Why the hands are not measured yet, in words; empty if they are, or need not be."""
     hands: tuple[LiveHand, ...]
     bodies: tuple[LiveBody, ...]
     points: Float[np.ndarray, "N 3"]
@@ -179,6 +181,7 @@ class MessageEncoder:
             number=frame.number,
             time=frame.time,
             silent=frame.silent,
+            size_state=tracked.size_state,
             hands=tuple(self._hand(number, hand) for number, hand in enumerate(tracked.hands)),
             bodies=tuple(
                 LiveBody(one.name, one.status, one.translation, one.rotation) for one in tracked.bodies
@@ -375,6 +378,7 @@ def frame_document(message: LiveMessage, content: Content = Content()) -> dict[s
         "number": int(message.number),
         "time": float(message.time),
         "silent": message.silent,
+        "size_state": message.size_state,
         "lag": _known(message.lag),
         "latency": _known(message.latency),
         "hands": [_hand_document(hand, content) for hand in message.hands],

@@ -73,6 +73,8 @@ def _osc_frame(message: LiveMessage, content: Content) -> Iterator[_Content]:
     for name, seconds in (("lag", message.lag), ("latency", message.latency)):
         if not math.isnan(seconds):
             yield f"/handsim/{name}", "f", [seconds]
+    if message.size_state:
+        yield _strings("/handsim/size_state", [message.size_state])
     for hand in message.hands:
         address = f"/handsim/{hand.side}"
         yield _strings(f"{address}/status", [str(hand.status)])

@@ -7,6 +7,7 @@ Both were fitted to simulated captures by benchmarks/doubtful_frames at commit 1
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -54,6 +55,7 @@ class Evidence(NamedTuple):
     """Evidence on the unlabeled points."""
 
 
+@lru_cache(maxsize=1)  # Confidences of a take and its doubtful spans are asked for one after the other.
 def evidence_of(take: Take) -> Evidence:
     """Evidence on the labels of a take with poses, except those of rigid bodies."""
     from scipy.spatial import cKDTree
@@ -270,7 +272,7 @@ def _nearest(points: Float[np.ndarray, "N 3"], place: Float[np.ndarray, "3"], mo
     return found
 
 
-def label_confidence(take: Take, evidence: Evidence | None = None) -> Float[np.ndarray, "P"]:
+def label_confidence(take: Take) -> Float[np.ndarray, "P"]:
     """Probability that each point's label is right; for an unlabeled point, that it is no marker.
 
     The confidence of rigid bodies' points does not change, nor that of a take without poses.
@@ -278,7 +280,7 @@ def label_confidence(take: Take, evidence: Evidence | None = None) -> Float[np.n
     confidence = take.point_list.confidence.copy()
     if not np.isfinite(take.qpos).any():
         return confidence
-    told = evidence_of(take) if evidence is None else evidence
+    told = evidence_of(take)
     labeled = told.labels >= 0
     right = np.zeros(len(labeled))
     for which, values, weights in (

@@ -92,19 +92,25 @@ class _Hand(NamedTuple):
 def find_faults(take: Take) -> tuple[SuspectSpan, ...]:
     """Find the faults of a tracked take, each from the frame in which it begins."""
     found = list[SuspectSpan]()
-    for span, _ in take.worn():  # Other hands, or another size of them, have faults of their own.
+    every = [span for span, _ in take.worn()]
+    longest = max(every, key=lambda span: np.count_nonzero(take.status[span] == TRACKED))
+    for span in every:  # Other hands, or another size of them, have faults of their own.
         first = span.start
+        part = take.cut(first, span.stop) if take.former else take
+        # All wear the same glove: to compare its labels with others takes seconds, and is done once.
+        faults = _faults_of_hands(part, is_last=span.stop == take.num_frames, judges=span is longest)
         found += (
             one._replace(first=first + one.first, last=first + one.last, worst=first + one.worst)
-            for one in _faults_of_hands(
-                take.cut(first, span.stop) if take.former else take, is_last=span.stop == take.num_frames
-            )
+            for one in faults
         )
     return tuple(found)
 
 
-def _faults_of_hands(take: Take, *, is_last: bool) -> tuple[SuspectSpan, ...]:
-    """The faults of a take with the same hands in all frames; others follow unless it is the last."""
+def _faults_of_hands(take: Take, *, is_last: bool, judges: bool) -> tuple[SuspectSpan, ...]:
+    """The faults of a take with the same hands in all frames; others follow unless it is the last.
+
+    Its labels are compared with others if it `judges`.
+    """
     found, last = list[SuspectSpan](), take.num_frames - 1
     hands = [
         SuspectSpan(one.first, last, one.first, f"the {one.side} hand", one.why, one.remedy, of_labels=False)
@@ -124,7 +130,7 @@ def _faults_of_hands(take: Take, *, is_last: bool) -> tuple[SuspectSpan, ...]:
         # Hands that are not measured, or of a user whom another follows, do not fit, which looks like a slip.
         is_usual = (take.settings.get("size"), take.settings.get("user")) == ("auto", USUAL_SIZE)
         slips = () if is_usual or not is_last or take.settings.get("size_state") else (_slips,)
-        doubts = doubts or doubts_of(take)  # of all hands at once, which takes seconds
+        doubts = doubts or (doubts_of(take) if judges else {})  # of all hands at once
         found += _alternatives(hand, doubts.get(side))
         for faults in (*slips, _fallen, _at_limits, _still):
             found += faults(hand)

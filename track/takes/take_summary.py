@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from functools import lru_cache
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -14,7 +15,7 @@ from gloves.takes.take import COASTING, LOST, STATUSES, Take
 from handsim.hand.shape import DIGITS, JOINT_NAMES, Side
 from track.association.initialization import distances_to_nearest
 from track.hand_size import AT_HAND
-from track.takes.label_confidence import Evidence, evidence_of, label_confidence
+from track.takes.label_confidence import evidence_of, label_confidence
 from track.takes.take_faults import SuspectSpan, find_faults
 
 _LEAST_SEEN: Final = 0.1  # A hand should have a pose in this share of the frames.
@@ -124,7 +125,11 @@ def suspicions(take: Take) -> list[str]:
     fault = unit_fault(clouds, only_wide=True)
     if fault is not None:
         return [f"{fault.found}, expected meters; set the unit of the stream to meters{fault.hint}"]
-    return misfits(take) + [f"{fault.words}; {fault.remedy}" for fault in find_faults(take)]
+    faults = find_faults(take)
+    told = [f"{fault.words}; {fault.remedy}" for fault in faults if fault.last == take.num_frames - 1]
+    if others := len(faults) - len(told):
+        told.append(f"faults of the hands of earlier frames, which the report lists as doubtful: {others}")
+    return misfits(take) + told
 
 
 def misfits(take: Take, *, calibrates: bool = False) -> list[str]:
@@ -146,6 +151,7 @@ def _unlabeled_share(take: Take) -> float:
     return near / max(1, near + int((take.point_list.labels >= 0).sum()))
 
 
+@lru_cache(maxsize=1)  # The lines of a summary and its warnings ask one after the other.
 def _unlabeled_at_hands(take: Take) -> int:
     """Number of unlabeled points at the hands; those elsewhere are no sign of a mistake."""
     markers = np.concatenate([take.markers(side) for side in take.sides], axis=1)
@@ -209,7 +215,7 @@ def find_suspect_spans(take: Take, most: int | None = _MOST_DOUBTS) -> tuple[Sus
     """
     evidence = evidence_of(take) if np.isfinite(take.qpos).any() and not _is_known(take) else None
     points = take.point_list
-    confidence, markers = _confidence(take, evidence), points.labels.astype(np.int64)
+    confidence, markers = _confidence(take), points.labels.astype(np.int64)
     if evidence is not None:
         markers[evidence.points] = evidence.markers
     least = np.fmin(_least_in_frames(take, confidence), 1.0)
@@ -276,12 +282,12 @@ def _least_in_frames(take: Take, confidence: Float[np.ndarray, "P"]) -> Float[np
     return least
 
 
-def _confidence(take: Take, evidence: Evidence | None = None) -> Float[np.ndarray, "P"]:
+def _confidence(take: Take) -> Float[np.ndarray, "P"]:
     """Confidence from the whole take's evidence; confidences of 1 stay, as those of corrected labels."""
     confidence = take.point_list.confidence
     if _is_known(take):
         return confidence
-    return np.where(confidence == 1.0, 1.0, label_confidence(take, evidence))
+    return np.where(confidence == 1.0, 1.0, label_confidence(take))
 
 
 def _is_known(take: Take) -> bool:

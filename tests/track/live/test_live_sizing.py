@@ -275,6 +275,8 @@ def test_why_hands_are_not_measured_is_known(monkeypatch):
     monkeypatch.setattr(live_sizing, "monotonic", lambda: clock[0])
     shown(sizing, tracker, 0.0, 0.4)
     assert sizing.state == "not measured yet: seen for 0.5 of 1 s"
+    nobody = TrackedFrame(0.4, (), np.zeros(0, dtype=int), np.zeros(0))
+    assert sizing.eased(nobody, tracker).size_state == sizing.state
     pending = Future()
     monkeypatch.setattr(AtOnce, "submit", lambda *given, **options: pending)
     shown(sizing, tracker, 0.5, 1.0)
@@ -289,6 +291,8 @@ def test_why_hands_are_not_measured_is_known(monkeypatch):
     pending.set_result(live_sizing._Measured([dataclasses.replace(setup.user, notes="auto, measured")]))
     shown(sizing, tracker, 11.6, 0.1)
     assert sizing.state == ""
+    shown(sizing, tracker, 11.7, 3.0, there=False, points=3)
+    assert sizing.state == "", "the last hands were measured"
     shown(sizing, tracker, 20.0, 0.5)
     assert sizing.state.startswith("not measured yet: seen for"), "somebody else may have come"
     assert LiveSizing(TrackerSetup.of(TrackSettings(hands="right", size="L"))).state == ""
@@ -321,3 +325,32 @@ def test_a_second_measurement_goes_on_from_the_first(monkeypatch):
     pending[0].set_result(live_sizing._Measured([dataclasses.replace(larger, notes="auto, measured")]))
     shown(sizing, tracker, 12.0, 0.1)
     assert len(asked) == 2 and asked[1].hands == larger.hands
+
+
+def test_hands_that_come_before_the_last_measurement_are_measured_by_themselves(monkeypatch):
+    """They differ so much that the tracker does not find them."""
+    setup = TrackerSetup.of(TrackSettings(hands="right"))
+    sizing, tracker, begins = LiveSizing(setup), FakeTracker(setup.user), []
+    measure, _ = found(0.205)
+
+    def noted(settings, frames, before, *, judges):
+        begins.append(frames[0].time)
+        return measure(settings, frames, before, judges=judges)
+
+    monkeypatch.setattr(live_sizing, "_measure", noted)
+    shown(sizing, tracker, 0.0, 5.0)
+    shown(sizing, tracker, 5.0, 2.0, there=False, points=3)
+    shown(sizing, tracker, 7.0, 1.5, there=False)
+    assert begins == [0.0, 7.0]
+
+
+def test_a_measurement_of_those_who_have_left_does_not_count_for_others(monkeypatch):
+    setup = TrackerSetup.of(TrackSettings(hands="right"))
+    sizing, tracker, pending = LiveSizing(setup), FakeTracker(setup.user), Future()
+    monkeypatch.setattr(AtOnce, "submit", lambda *given, **options: pending)
+    shown(sizing, tracker, 0.0, 3.0)
+    shown(sizing, tracker, 3.0, 2.0, there=False, points=3)
+    shown(sizing, tracker, 5.0, 0.5)
+    pending.set_result(live_sizing._Measured([dataclasses.replace(setup.user, notes="auto, measured")]))
+    shown(sizing, tracker, 5.5, 0.1)
+    assert sizing.is_settled and sizing.state == "not measured yet: seen for 0.7 of 1 s"

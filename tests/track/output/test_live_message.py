@@ -246,6 +246,17 @@ def test_fingers_without_markers_are_told():
     assert sample["right_seen"] == pytest.approx(right["seen"], abs=1e-3)
 
 
+def test_hands_that_are_not_measured_are_told_everywhere(message):
+    for state in ("", "being measured"):
+        one = dataclasses.replace(message(), size_state=state)
+        assert frame_document(one)["size_state"] == state
+        (bundle,) = osc_format().frame(one)
+        told = [list(part.params) for part in OscBundle(bundle) if part.address == "/handsim/size_state"]
+        assert told == [[state]] * bool(state)
+        labels = [label for label, _, _ in channels_of(one.header)]
+        assert sample_of(one)[labels.index("measured")] == (not state)
+
+
 def test_a_lost_hand_has_no_numbers(message):
     one = message(lost=True)
     assert [hand.has_pose for hand in one.hands] == [True, False] and not one.bodies[0].has_pose

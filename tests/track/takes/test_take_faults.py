@@ -17,6 +17,7 @@ from handsim.hand.shape import JOINT_NAMES, JOINTS, PALM
 from track import find_suspect_spans, track_capture
 from track.alternatives.alternatives import _mirror_orders
 from track.kinematics.pose_solver import FEWEST_MARKERS, PoseSolver
+from track.takes import take_faults
 from track.takes.take_faults import find_faults
 from track.takes.take_figures import PageSettings, hand_figures
 from track.takes.take_page import write_take_page
@@ -288,8 +289,8 @@ def test_hands_of_the_wrong_side_are_never_silent(mirror_like, turned):
     assert fault.why.endswith("it is the right hand") and fault.of_labels
 
 
-def test_hands_of_two_users_are_no_fault(truth, tracked):
-    """Poses of each are judged by their own hands, not by those of the last frames."""
+def test_hands_of_two_users_are_no_fault(truth, tracked, monkeypatch):
+    """Poses of each are judged by their own hands, not those of the last frames; labels are judged once."""
     larger = tuple(nominal_fit(hand.layout, "XL", hand.side) for hand in truth.hands)
     later = track_capture(
         dataclasses.replace(truth, points=enlarged(truth, larger)), hands=larger, labeler="dense19"
@@ -301,7 +302,10 @@ def test_hands_of_two_users_are_no_fault(truth, tracked):
         hands=larger,
         former=[FormerHands(HALF, tracked.hands, "M")],
     )  # fmt: skip
-    assert find_faults(both) == find_faults(tracked.cut(0, HALF)) == ()
+    judged, doubts_of = [], take_faults.doubts_of
+    monkeypatch.setattr(take_faults, "doubts_of", lambda take: judged.append(take) or doubts_of(take))
+    assert find_faults(both) == () and len(judged) == 1
+    assert find_faults(tracked.cut(0, HALF)) == ()
     mixed = dataclasses.replace(both, former=())
     assert any("where the layout has it" in one.why or "slips" in one.why for one in find_faults(mixed))
     figures, wrong = hand_figures(both)[0], hand_figures(mixed)[0]

@@ -15,6 +15,8 @@ from handsim.cli.main import main
 from handsim.hand.shape import JOINT_NAMES
 from poses import sample_poses
 from track import find_suspect_spans, track_capture
+from track.takes import take_summary
+from track.takes.take_faults import SuspectSpan
 from track.takes.take_figures import hand_figures
 from track.takes.take_page import write_take_page
 from track.takes.take_summary import frame_confidence, runs_of, summarize, suspicions
@@ -35,6 +37,19 @@ def tracked(truth) -> Take:
 
 def test_a_good_take_tells_nothing(tracked):
     assert suspicions(tracked) == []
+
+
+def test_of_the_faults_of_several_people_those_of_the_last_hands_are_told(tracked, monkeypatch):
+    last = tracked.num_frames - 1
+    faults = [
+        SuspectSpan(*frames, frames[0], of, "slips", "glue it")
+        for frames, of in (((0, 9), "right:A"), ((10, last), "right:B"))
+    ]
+    monkeypatch.setattr(take_summary, "find_faults", lambda take: faults)
+    assert suspicions(tracked) == [
+        "right:B slips; glue it",
+        "faults of the hands of earlier frames, which the report lists as doubtful: 1",
+    ]
 
 
 def test_a_hand_that_is_not_there(tracked):
