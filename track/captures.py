@@ -90,10 +90,10 @@ def label_capture(
     """
     chosen, source = LabelSettings.of(settings, options), capture_of(capture)
     frames = checked_frames(source)
-    with second_process(len(frames) >= _WORTH_A_PROCESS, label_both_ways.__module__) as other:
+    with second_process(len(frames) >= _WORTH_A_PROCESS, label_both_ways.__module__) as helper:
         setup = _setup_of(chosen, frames)
         labeled, setup, _ = _judged(
-            lambda now: _labeled_take(capture, source, frames, now, progress, other), setup
+            lambda now: _labeled_take(capture, source, frames, now, progress, helper), setup
         )
     labeled = _with_other_hands(labeled, setup)
     told = [*map(str, other_hands_of(labeled)), *label_faults(labeled)]
@@ -110,7 +110,7 @@ def _labeled_take(
     frames: Sequence[StreamedFrame],
     setup: TrackerSetup,
     progress: Progress,
-    other: LocalProcesses | None,
+    helper: LocalProcesses | None,
 ) -> Take:
     """Label all frames of a capture, with the help of another process where there is one."""
     present, glove = np.isfinite(source.positions[..., 0]), setup.settings["glove"]
@@ -128,7 +128,7 @@ def _labeled_take(
         progress(count, len(frames))
 
     if _is_continuous(frames):
-        return label_both_ways(take, frames, setup.tracker, on_count, other)
+        return label_both_ways(take, frames, setup.tracker, on_count, helper)
     clouds = [frame.points for frame in frames]
     labels, confidence = label_alone(clouds, setup.user.hands, setup.labeler, on_count)
     points = dataclasses.replace(take.point_list, labels=labels, confidence=confidence)

@@ -53,13 +53,13 @@ def label_both_ways(
     frames: Sequence[StreamedFrame],
     new_tracker: Callable[[], Tracker],
     on_count: Callable[[int], None],
-    other: LocalProcesses | None = None,
+    helper: LocalProcesses | None = None,
 ) -> Take:
-    """Label a take in both directions, in another process in one of them where there is one.
+    """Label a take in both directions, backward in another process where there is one.
 
     `on_count` is called with the number of frames done.
     """
-    forward, backward = _both_ways(take, frames, new_tracker, on_count, other)
+    forward, backward = _both_ways(take, frames, new_tracker, on_count, helper)
     points, one, other = take.point_list, forward.take.point_list.labels, backward.take.point_list.labels
     is_second = np.zeros(one.shape, dtype=bool)
     events = _events_of(points.frames, one, other)
@@ -83,17 +83,17 @@ def _both_ways(
     frames: Sequence[StreamedFrame],
     new_tracker: Callable[[], Tracker],
     on_count: Callable[[int], None],
-    other: LocalProcesses | None,
+    helper: LocalProcesses | None,
 ) -> tuple[_Track, _Track]:
     """Track the hands through all frames forward and backward."""
     count = len(frames)
     order = range(count)
-    if other is None or not can_be_sent(new_tracker):
+    if helper is None or not can_be_sent(new_tracker):
         forward = _track(take, frames, order, new_tracker, lambda done: on_count(done // 2))
         return forward, _track(
             take, frames, order[::-1], new_tracker, lambda done: on_count((count + done) // 2)
         )
-    backward = other.submit(_track, take, frames, order[::-1], new_tracker)
+    backward = helper.submit(_track, take, frames, order[::-1], new_tracker)
     forward = _track(take, frames, order, new_tracker, lambda done: on_count(min(done, count - 1)))
     found: _Track = backward.result()
     on_count(count)
