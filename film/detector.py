@@ -114,7 +114,7 @@ class HandDetector:
             ArgumentError: The picture is no array of bytes with three channels.
         """
         _check_picture(image)
-        squares = [square_around(corners) for corners in self._places(image)]
+        squares = [square_around(corners) for corners in self.places(image)]
         hands = [self._second_look(image, self._look(image, square)) for square in squares]
         boxes, sure = [hand.box.tolist() for hand in hands], [hand.confidence for hand in hands]
         return [hands[number] for number in cv2.dnn.NMSBoxes(boxes, sure, _LEAST_CONFIDENCE, _SAME)]
@@ -151,7 +151,7 @@ class HandDetector:
             found.append(self._second_look(image, first, side=side))
         return found
 
-    def _places(self, picture: Bytes) -> list[Doubles]:
+    def places(self, picture: Bytes) -> list[Doubles]:
         """Corners (2, 2) [px] of squares that look like hands."""
         scale = FINDER_SIZE / max(picture.shape[:2])
         matrix = np.array([[scale, 0.0, 0.0], [0.0, scale, 0.0]])
