@@ -122,7 +122,7 @@ def train_detector(
     import_extra("onnx", "training a detector", "onnx")  # missed before the work, not after it
     torch.manual_seed(seed)
     networks: dict[str, Network] = {FINDER: FinderNetwork(), KEYPOINTS: KeypointNetwork()}
-    places = _nowhere
+    places: Callable[[Bytes], list[Doubles]] = _nowhere
     if start is not None:
         begun = WEIGHTS if start == "shipped" else Path(start)
         places = HandDetector.load(begun).places  # refuses damaged weights
@@ -209,14 +209,12 @@ class Lesson(NamedTuple):
         turn = _turn(rng, 10.0, max(np.array(size) / room.shape[1::-1]) * rng.uniform(0.8, 2.5))
         shift = 0.5 * np.array(size) - turn @ (np.array(room.shape[1::-1]) * rng.uniform(0.3, 0.7, 2))
         behind = cut(room, np.column_stack([turn, shift]), size)
-        share = (
-            cv2.GaussianBlur(cv2.imdecode(self.mask, cv2.IMREAD_GRAYSCALE), (3, 3), 0.7)[..., None] / 255.0
-        )
-        before = picture.astype(np.float64)
+        mask = cv2.imdecode(self.mask, cv2.IMREAD_GRAYSCALE)
+        share, before = cv2.GaussianBlur(mask, (3, 3), 0.7)[..., None] / 255.0, picture.astype(np.float64)
         if rng.random() < _DYED:
             light = before.mean(axis=2, keepdims=True)
             before = light / max(float(np.average(light, weights=share + 1e-6)), 1.0) * rng.uniform(8, 235, 3)
-        return np.clip(share * before + (1.0 - share) * behind, 0.0, 255.0).astype(np.uint8)
+        return np.asarray(np.clip(share * before + (1.0 - share) * behind, 0.0, 255.0), np.uint8)
 
 
 def _nowhere(_: Bytes) -> list[Doubles]:
@@ -286,9 +284,8 @@ def draw_scenes(number: int, *, seed: int) -> Iterator[Scene]:
         seen = visible.reshape(-1, NUM_KEYPOINTS).sum(axis=1) >= _FEWEST_SEEN
         picture = np.ascontiguousarray(one.get("noisy_rgb", one["rgb"]).numpy().transpose(1, 2, 0))
         sides = one["side"].numpy().astype(np.int8).reshape(-1)
-        yield Scene(
-            picture, keypoints[seen], sides[seen], np.where(one["ids"].numpy() > 0, 255, 0).astype(np.uint8)
-        )
+        mask = np.uint8(255) * (one["ids"].numpy() > 0)
+        yield Scene(picture, keypoints[seen], sides[seen], mask)
 
 
 def _two_hands(count: int, rng: np.random.Generator) -> Doubles:
@@ -309,9 +306,8 @@ def read_scenes(file: Path) -> Iterator[Scene]:
     for path in sorted({hand.file for hand in hands} | set(empty)):
         labeled = [hand for hand in hands if hand.file == path]
         keypoints = np.array([hand.keypoints for hand in labeled]).reshape(-1, NUM_KEYPOINTS, 2)
-        yield Scene(
-            read_photograph(path), keypoints, np.array([hand.side for hand in labeled], dtype=np.int8)
-        )
+        sides = np.array([hand.side for hand in labeled], dtype=np.int8)
+        yield Scene(read_photograph(path), keypoints, sides)
 
 
 def fit(

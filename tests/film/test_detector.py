@@ -213,7 +213,7 @@ def test_training_lowers_its_loss(lessons, kind):
         "finder": (FinderNetwork(), training.finder_batch, training.finder_loss, learned[0]),
         "keypoints": (KeypointNetwork(), training.keypoint_batch, training.keypoint_loss, learned[1]),
     }[kind]
-    losses = training.fit(network, functools.partial(make, given), loss, 24, 0)
+    losses = training.fit(network, functools.partial(make, given, []), loss, 24, 0)
     assert np.mean(losses[-6:]) < 0.8 * np.mean(losses[:3])
 
 
