@@ -35,6 +35,7 @@ from film.detector import (
     ROOM,
     WEIGHTS,
     HandDetector,
+    Place,
     cut,
     normalized,
     palm_spread,
@@ -122,7 +123,7 @@ def train_detector(
     import_extra("onnx", "training a detector", "onnx")  # missed before the work, not after it
     torch.manual_seed(seed)
     networks: dict[str, Network] = {FINDER: FinderNetwork(), KEYPOINTS: KeypointNetwork()}
-    places: Callable[[Bytes], list[Doubles]] = _nowhere
+    places: Callable[[Bytes], list[Place]] = _nowhere
     if start is not None:
         begun = WEIGHTS if start == "shipped" else Path(start)
         places = HandDetector.load(begun).places  # refuses damaged weights
@@ -145,6 +146,8 @@ def train_detector(
         (KEYPOINTS, keypoint_batch, keypoint_loss, steps, squares, held[1]),
     )
     for name, batch, loss, count, lessons, unseen in kinds:
+        if start is not None and not any(len(one.sides) for one in mine[0]):
+            networks[name].keep_keypoints()
         network, judged = networks[name], [batch(unseen, [], one) for one in rng.spawn(_JUDGED) if unseen]
         given = {key: value.clone() for key, value in network.state_dict().items()}
         before = _mean_loss(network, judged, loss)
@@ -217,14 +220,14 @@ class Lesson(NamedTuple):
         return np.asarray(np.clip(share * before + (1.0 - share) * behind, 0.0, 255.0), np.uint8)
 
 
-def _nowhere(_: Bytes) -> list[Doubles]:
+def _nowhere(_: Bytes) -> list[Place]:
     """No places: what is found before anything is learned."""
     return []
 
 
 def lessons_of(
     scenes: Iterable[Scene],
-    places: Callable[[Bytes], list[Doubles]] = _nowhere,
+    places: Callable[[Bytes], list[Place]] = _nowhere,
     *,
     rng: np.random.Generator,
 ) -> tuple[list[Lesson], list[Lesson]]:
@@ -240,7 +243,7 @@ def lessons_of(
         views.append(Lesson.of(scene, scale * np.eye(2, 3), size, range(count)))
         for number, points in enumerate(scene.keypoints):
             squares.append(_square(scene, points[np.isfinite(points[:, 0])], [number]))
-        empty = [] if count else places(scene.picture)
+        empty = [] if count else [place.corners for place in places(scene.picture)]
         others = [_empty_place(scene, rng) for _ in range(len(empty) + 1)]
         empty += [one for one in others if one is not None and (not count or rng.random() < _EMPTY)]
         squares += [_square(scene, corners, []) for corners in empty]

@@ -19,6 +19,7 @@ from film.detector import (
     KEYPOINTS,
     MOST_BYTES,
     WEIGHTS,
+    Place,
     cut,
     palm_spread,
     peaks_of,
@@ -231,7 +232,9 @@ def test_drawn_hands_are_laid_over_photographs(lessons):
     mask = np.where(scene.picture.min(axis=2) > 130, 255, 0).astype(np.uint8)
     green = Scene(np.full((240, 320, 3), (20, 200, 30), np.uint8), np.empty((0, 21, 2)), np.empty(0, np.int8))
     (drawn,), _ = lessons_of([scene._replace(mask=mask)], rng=rng)
-    rooms, squares = lessons_of([green], lambda picture: [np.array([[9.0, 9.0], [99.0, 99.0]])], rng=rng)
+    rooms, squares = lessons_of(
+        [green], lambda _: [Place(np.array([[9.0, 9.0], [99.0, 99.0]]), 0.0)], rng=rng
+    )
     assert len(squares) == 3 and not any(len(square.sides) for square in squares)
     seen = [drawn.staged(rooms, rng).astype(int) for _ in range(60)]
     staged = [one for one in seen if abs(one[2, 2] - [20, 200, 30]).max() < 9]
