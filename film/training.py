@@ -108,7 +108,8 @@ def train_detector(
             beside it or in a folder `images` there. Half of the samples are then taken from them. About
             the last fifth by name is held out; a network that did better there before is left as it was.
             Images without an annotation are pictures without hands: what the detector finds there teaches
-            what is none, and half of the drawn hands are laid over them.
+            what is none, and half of the drawn hands are laid over them. If no image has a hand, keypoints
+            stay as they are.
         samples: Number of squares that the keypoint network learns from; the finder learns from a quarter
             as many pictures.
         seed: Seed of pictures, of initial weights and of all random choices.
@@ -146,9 +147,10 @@ def train_detector(
         (KEYPOINTS, keypoint_batch, keypoint_loss, steps, squares, held[1]),
     )
     for name, batch, loss, count, lessons, unseen in kinds:
-        if start is not None and not any(len(one.sides) for one in mine[0]):
-            networks[name].keep_keypoints()
         network, judged = networks[name], [batch(unseen, [], one) for one in rng.spawn(_JUDGED) if unseen]
+        handless = start is not None and rooms and not any(len(one.sides) for one in mine[0])
+        if handless and isinstance(network, KeypointNetwork):
+            network.keep_keypoints()
         given = {key: value.clone() for key, value in network.state_dict().items()}
         before = _mean_loss(network, judged, loss)
         fit(network, functools.partial(batch, lessons, rooms), loss, count, seed, rate)
