@@ -128,7 +128,7 @@ class HandDetector:
         _check_picture(image)
         hands = [
             self._second_look(image, self._look(image, square_around(place.corners)), place.log_odds)
-            for place in self.places(image)
+            for place in self._places(image)
         ]
         boxes, sure = [hand.box.tolist() for hand in hands], [hand.confidence for hand in hands]
         return [hands[number] for number in cv2.dnn.NMSBoxes(boxes, sure, _LEAST_CONFIDENCE, _SAME)]
@@ -165,7 +165,7 @@ class HandDetector:
             found.append(self._second_look(image, first, 0.0, side))
         return found
 
-    def places(self, picture: Bytes) -> list[Place]:
+    def _places(self, picture: Bytes) -> list[Place]:
         """Where it may be worth to look for hands, the likeliest first."""
         scale = FINDER_SIZE / max(picture.shape[:2])
         matrix = np.array([[scale, 0.0, 0.0], [0.0, scale, 0.0]])

@@ -127,7 +127,7 @@ def train_detector(
     places: Callable[[Bytes], list[Place]] = _nowhere
     if start is not None:
         begun = WEIGHTS if start == "shipped" else Path(start)
-        places = HandDetector.load(begun).places  # refuses damaged weights
+        places = HandDetector.load(begun)._places  # refuses damaged weights
         for name, network in networks.items():
             _load_folded(network, begun / name)
     rng = np.random.default_rng(seed)
