@@ -55,9 +55,10 @@ with tempfile.TemporaryDirectory() as temporary:
     content, files = json.loads((photographs / "annotations.json").read_text("utf-8")), []
     middle = content["images"][len(content["images"]) // 2]["id"]
     for late in (False, True):
-        half = [one for one in content["annotations"] if (one["image_id"] >= middle) == late]
+        hands = [one for one in content["annotations"] if (one["image_id"] >= middle) == late]
+        images = [one for one in content["images"] if (one["id"] >= middle) == late]
         files.append(photographs / f"half{late}.json")
-        files[-1].write_text(json.dumps(content | {"annotations": half}))
+        files[-1].write_text(json.dumps(content | {"images": images, "annotations": hands}))
     samples = int(sys.argv[3]) if sys.argv[1:] else 64
     taught = train_detector(folder / "taught", start="shipped", photographs=files[0], samples=samples)
     shares = (share_found(HandDetector.load(one), files[1]) for one in (None, taught))

@@ -1,8 +1,8 @@
 """Videos and photographs of hands: found, registered to tracked takes, and labeled.
 
 `register_camera` finds where the camera of a video of a tracked take stood, its lens and its clock.
-`annotate_film` writes the video's frames as labeled photographs. `HandDetector` finds hands in pictures, and
-`train_detector` makes one from drawn pictures and your own.
+`annotate_film` writes the video's frames as labeled photographs. `detect_hands` writes the hands in pictures
+as COCO keypoints; `HandDetector` finds them, and `train_detector` makes one from drawn pictures and your own.
 """
 
 from typing import TYPE_CHECKING
@@ -13,6 +13,7 @@ from handsim._imports import lazy_exports
 if TYPE_CHECKING:
     from film.annotation import annotate_film as annotate_film
     from film.annotation import register_camera as register_camera
+    from film.detection import detect_hands as detect_hands
     from film.detector import FoundHand as FoundHand
     from film.detector import HandDetector as HandDetector
     from film.registration import Registration as Registration

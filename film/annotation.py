@@ -7,12 +7,12 @@ import os
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
-from film.bundle import FoundFrame
 from film.config import USUAL
+from film.detection import find_hands, resolve_detector
 from film.detector import HandDetector
 from film.outlines import poses_at, shutter_times
 from film.page import write_film_page
@@ -39,7 +39,6 @@ from render.viewpoints import ViewConfig
 
 RECORD, VIDEO, PAGE = "film.json", "film.mp4", "film.html"
 """Files beside the pictures: the registration, the video with the hands drawn over it, and the page."""
-_LOOKS: Final = 10.0  # [Hz] how often the detector runs; the take has the motion between two runs
 
 
 def register_camera(
@@ -47,7 +46,7 @@ def register_camera(
     video: str | Path,
     *,
     camera: Camera | str | Path | None = None,
-    detector: HandDetector | StoredHands | None = None,
+    detector: HandDetector | StoredHands | str | Path | None = None,
     progress: Progress = no_progress,
     on_step: OnStep = no_step,
 ) -> Registration:
@@ -59,8 +58,8 @@ def register_camera(
         camera: A camera with the lens of the video's, or a file of it; its pose does not count. When
             not given, the focal length and two coefficients are found, too, and the center as far as motion
             tells it: otherwise it is near the middle of the picture.
-        detector: Finds the hands in the pictures, or those that another program found; the shipped one when
-            not given.
+        detector: Finds the hands in the pictures: `handsim` for the shipped one, `mediapipe`, a folder of
+            weights, or hands that were found before and their file (.json); the shipped one when not given.
         progress: Called with the numbers of done and of all frames, first of finding hands, then of the fit.
         on_step: Called with the name of each step.
 
@@ -73,7 +72,7 @@ def register_camera(
     taken, film = _taken(take), Film(video)
     given = _given(camera, film.size)
     on_step("finding hands")
-    found = find_hands(film, detector or HandDetector.load(), progress)
+    found = find_hands(film, resolve_detector(detector), progress)
     on_step("fitting the camera")
     return register(
         taken, found, film.size, given, lambda: (picture for _, picture in film.frames()), progress
@@ -104,24 +103,6 @@ def _given(camera: Camera | str | Path | None, size: tuple[int, int]) -> Camera 
     return fitting[0]
 
 
-def find_hands(film: Film, detector: HandDetector | StoredHands, progress: Progress) -> list[FoundFrame]:
-    """The frames of a video, some of them with the hands in them."""
-    found: list[FoundFrame] = []
-    step = max(1, round(film.rate / _LOOKS))
-    for number, (time, picture) in enumerate(film.frames()):
-        progress(number + 1, max(film.num_frames, number + 1))
-        if isinstance(detector, StoredHands):
-            found.append(FoundFrame(time, detector.frames.get(number)))
-        else:
-            found.append(FoundFrame(time, None if number % step else detector.detect(picture)))
-    if not found:
-        raise CaptureError(f"{film.path}: no frame can be read, expected a video")
-    last = max(detector.frames) if isinstance(detector, StoredHands) else 0
-    if last >= len(found):
-        raise CaptureError(f"hands of frame {last} were given, and {film.path} has {len(found)} frames")
-    return found
-
-
 def annotate_film(
     take: Take | str | Path,
     video: str | Path,
@@ -130,7 +111,7 @@ def annotate_film(
     config: FrameConfig | None = None,
     *,
     camera: Camera | str | Path | None = None,
-    detector: HandDetector | StoredHands | None = None,
+    detector: HandDetector | StoredHands | str | Path | None = None,
     workers: int | Executor | None = None,
     progress: Progress = no_progress,
     on_step: OnStep = no_step,

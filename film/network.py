@@ -81,6 +81,11 @@ class KeypointNetwork(nn.Module):
         self.head = nn.Sequential(*convolution(128, 64), Residual(64), nn.Conv2d(64, NUM_KEYPOINTS, 1))
         self.told = nn.Sequential(nn.Flatten(), nn.Linear(16 * 128, 64), nn.ReLU(), nn.Linear(64, 2))
 
+    def keep_keypoints(self) -> None:
+        """Train the head of presence and palm alone: otherwise keypoints got 3 to 5 % worse."""
+        self.backbone.requires_grad_(False)
+        self.head.requires_grad_(False)
+
     def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Squares in, maps and log-odds out."""
         features, coarse = self.backbone(x)

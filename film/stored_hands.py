@@ -10,10 +10,10 @@ from typing import Any, Final
 import numpy as np
 
 from film.detector import FoundHand
-from handsim._checks import check_choice
+from handsim._checks import check_array, check_choice
 from handsim.errors import DatasetError, errors_of
 from handsim.files.inputs import load_json
-from handsim.hand.shape import SIDES
+from handsim.hand.shape import NUM_KEYPOINTS, SIDES
 from render.formats.records import labeled_keypoints
 
 _SEEN: Final = 2.0  # COCO's flag of a keypoint that is seen; 1 is hidden, 0 not found
@@ -31,7 +31,8 @@ class StoredHands:
         """Read COCO keypoints: an image for each frame that was looked at, whose `id` is the frame's number.
 
         An annotation has `image_id`, `side` ("right" or "left"), `keypoints` (u, v [px] from the first
-        pixel's center, and COCO's flag, 21 times in the order of `KEYPOINT_NAMES`), and may have a `score`.
+        pixel's center, and COCO's flag, 21 times in the order of `KEYPOINT_NAMES`), and may have `score`
+        and `keypoint_scores`.
 
         Raises:
             DatasetError: The file is no such file.
@@ -66,6 +67,9 @@ def _hand(label: Mapping[str, Any]) -> FoundHand:
     check_choice(label["side"], SIDES, noun="side")
     sure = float(label.get("score", 1.0))
     scores = sure * np.clip(flags / _SEEN, 0.0, 1.0)
+    if "keypoint_scores" in label:
+        given = np.asarray(label["keypoint_scores"], dtype=np.float64)
+        scores = np.where(flags > 0.0, check_array("keypoint_scores", given, (NUM_KEYPOINTS,)), 0.0)
     known = pixels[scores > 0.0] if (scores > 0.0).any() else pixels
     box = np.concatenate([known.min(axis=0), np.ptp(known, axis=0)])
     return FoundHand(label["side"], box, sure, pixels, scores)

@@ -35,6 +35,7 @@ from film.detector import (
     ROOM,
     WEIGHTS,
     HandDetector,
+    Place,
     cut,
     normalized,
     palm_spread,
@@ -55,12 +56,12 @@ from render.config import RenderConfig
 from render.formats.records import encode_jpeg
 from render.frames import Bytes, Doubles, Floats
 from render.photographs import read_photograph
-from render.stream import PictureStream, load_labeled_hands
+from render.stream import PictureStream, load_labeled_photographs
 
 BATCH: Final = 32
 BF16: Final = any(torch.cpu.get_capabilities().get(name) for name in ("amx_bf16", "avx512_bf16"))
 _SAMPLES_A_SCENE: Final = 18  # squares that the keypoint network sees for each drawn picture
-_FINDER_SHARE: Final = 0.25  # samples of the finder over those of the keypoint network
+_FINDER_SHARE: Final = 0.5  # samples of the finder over those of the keypoint network
 _SPREAD: Final = 0.06  # of the heat around a keypoint [share of the side]
 _RATE, _ADAPTING_RATE = 2e-3, 6e-4  # largest learning rates: from scratch, and from given weights
 _LEARNED: Final = 0.8  # share of the photographs that train a network; the others judge it
@@ -79,6 +80,8 @@ _CAMERAS: Final = ("vga", "vga_wide", "vga", "sr300", "kinect2", "d435")
 _SITTING: Final = 16  # pictures of each person
 _FEWEST_SEEN: Final = 4  # keypoints of a hand that must be seen
 _EMPTY: Final = 0.35  # share of the scenes that also give a square without a hand
+_STAGED: Final = 0.5  # share of the drawn pictures that keep their background beside photographs
+_DYED: Final = 0.6  # share of the other hands whose color is any
 
 Network = FinderNetwork | KeypointNetwork
 Targets = tuple[torch.Tensor, ...]
@@ -104,6 +107,9 @@ def train_detector(
         photographs: File of COCO keypoints [px] of your own photographs (21 a hand, in our order), which are
             beside it or in a folder `images` there. Half of the samples are then taken from them. About
             the last fifth by name is held out; a network that did better there before is left as it was.
+            Images without an annotation are pictures without hands: what the detector finds there teaches
+            what is none, and half of the drawn hands are laid over them. If no image has a hand, keypoints
+            stay as they are.
         samples: Number of squares that the keypoint network learns from; the finder learns from a quarter
             as many pictures.
         seed: Seed of pictures, of initial weights and of all random choices.
@@ -118,13 +124,14 @@ def train_detector(
     import_extra("onnx", "training a detector", "onnx")  # missed before the work, not after it
     torch.manual_seed(seed)
     networks: dict[str, Network] = {FINDER: FinderNetwork(), KEYPOINTS: KeypointNetwork()}
+    places: Callable[[Bytes], list[Place]] = _nowhere
     if start is not None:
         begun = WEIGHTS if start == "shipped" else Path(start)
-        HandDetector.load(begun)  # refuses damaged weights
+        places = HandDetector.load(begun)._places  # refuses damaged weights
         for name, network in networks.items():
             _load_folded(network, begun / name)
     rng = np.random.default_rng(seed)
-    mine = lessons_of([] if photographs is None else read_scenes(Path(photographs)), rng=rng)
+    mine = lessons_of([] if photographs is None else read_scenes(Path(photographs)), places, rng=rng)
     ends = [math.ceil(_LEARNED * len(some)) for some in mine]
     own, held = zip(*((some[:end], some[end:]) for some, end in zip(mine, ends, strict=True)), strict=True)
     drawn = lessons_of(_drawn(max(1, round(samples / _SAMPLES_A_SCENE / SCENES)), seed), rng=rng)
@@ -133,16 +140,20 @@ def train_detector(
         some + max(1, len(some) // max(1, len(others))) * others
         for some, others in zip(drawn, own, strict=True)
     )
+    rooms = [one for one in own[0] if not len(one.sides)]
     rate, steps = _RATE if start is None else _ADAPTING_RATE, max(1, round(samples / BATCH))
     kinds = (
         (FINDER, finder_batch, finder_loss, max(1, round(_FINDER_SHARE * steps)), views, held[0]),
         (KEYPOINTS, keypoint_batch, keypoint_loss, steps, squares, held[1]),
     )
     for name, batch, loss, count, lessons, unseen in kinds:
-        network, judged = networks[name], [batch(unseen, one) for one in rng.spawn(_JUDGED) if unseen]
+        network, judged = networks[name], [batch(unseen, [], one) for one in rng.spawn(_JUDGED) if unseen]
+        handless = start is not None and rooms and not any(len(one.sides) for one in mine[0])
+        if handless and isinstance(network, KeypointNetwork):
+            network.keep_keypoints()
         given = {key: value.clone() for key, value in network.state_dict().items()}
         before = _mean_loss(network, judged, loss)
-        fit(network, functools.partial(batch, lessons), loss, count, seed, rate)
+        fit(network, functools.partial(batch, lessons, rooms), loss, count, seed, rate)
         after = _mean_loss(network, judged, loss)
         if judged:
             _tell(f"{name}: loss {before:.3f} of photographs that are held out, then {after:.3f}\n")
@@ -165,11 +176,12 @@ def _tell(text: str) -> None:
 
 
 class Scene(NamedTuple):
-    """A picture of hands."""
+    """A picture of hands, or of none."""
 
     picture: Bytes  # (H, W, 3) sRGB
     keypoints: Doubles  # (N, 21, 2) [px]; NaN for those without a label
     sides: NDArray[np.int8]  # (N,) 0 left, 1 right, -1 unknown
+    mask: Bytes | None = None  # (H, W) 255 where a drawn picture shows hands and arms
 
 
 class Lesson(NamedTuple):
@@ -178,40 +190,71 @@ class Lesson(NamedTuple):
     file: Bytes  # JPEG
     keypoints: Doubles  # as in `Scene`
     sides: NDArray[np.int8]
+    mask: Bytes | None  # PNG
 
     @classmethod
-    def of(cls, picture: Bytes, keypoints: Doubles, sides: NDArray[np.int8]) -> Lesson:
-        """A scene, compressed."""
-        file = encode_jpeg(picture, quality=88)
-        return cls(np.frombuffer(file, np.uint8), keypoints, sides)
+    def of(cls, scene: Scene, matrix: Doubles, size: tuple[int, int], hands: Sequence[int]) -> Lesson:
+        """What a matrix (2, 3) moves into a picture of a width and height, compressed, with these hands."""
+        file = np.frombuffer(encode_jpeg(cut(scene.picture, matrix, size), quality=88), np.uint8)
+        keypoints = scene.keypoints[hands] @ matrix[:, :2].T + matrix[:, 2]
+        mask = None if scene.mask is None else cv2.imencode(".png", cut(scene.mask, matrix, size))[1]
+        return cls(file, keypoints, scene.sides[hands], None if mask is None else np.asarray(mask, np.uint8))
 
     def picture(self) -> Bytes:
         """The decoded picture (H, W, 3) in sRGB."""
         bgr = cv2.imdecode(self.file, cv2.IMREAD_COLOR)
         return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 
+    def staged(self, rooms: Sequence[Lesson], rng: np.random.Generator) -> Bytes:
+        """The picture; half of the drawn hands are before a photograph, in gloves of any color."""
+        picture = self.picture()
+        if self.mask is None or not rooms or rng.random() < _STAGED:
+            return picture
+        room, size = rooms[int(rng.integers(len(rooms)))].picture(), picture.shape[1::-1]
+        turn = _turn(rng, 10.0, max(np.array(size) / room.shape[1::-1]) * rng.uniform(0.8, 2.5))
+        shift = 0.5 * np.array(size) - turn @ (np.array(room.shape[1::-1]) * rng.uniform(0.3, 0.7, 2))
+        behind = cut(room, np.column_stack([turn, shift]), size)
+        mask = cv2.imdecode(self.mask, cv2.IMREAD_GRAYSCALE)
+        share, before = cv2.GaussianBlur(mask, (3, 3), 0.7)[..., None] / 255.0, picture.astype(np.float64)
+        if rng.random() < _DYED:
+            light = before.mean(axis=2, keepdims=True)
+            before = light / max(float(np.average(light, weights=share + 1e-6)), 1.0) * rng.uniform(8, 235, 3)
+        return np.asarray(np.clip(share * before + (1.0 - share) * behind, 0.0, 255.0), np.uint8)
 
-def lessons_of(scenes: Iterable[Scene], *, rng: np.random.Generator) -> tuple[list[Lesson], list[Lesson]]:
-    """Whole pictures for the finder, and squares with and without a hand for the keypoint network."""
+
+def _nowhere(_: Bytes) -> list[Place]:
+    """No places: what is found before anything is learned."""
+    return []
+
+
+def lessons_of(
+    scenes: Iterable[Scene],
+    places: Callable[[Bytes], list[Place]] = _nowhere,
+    *,
+    rng: np.random.Generator,
+) -> tuple[list[Lesson], list[Lesson]]:
+    """Whole pictures for the finder, and squares with and without a hand for the keypoint network.
+
+    In pictures without hands the squares are the `places` that look like hands, and as many others.
+    """
     views, squares = [], []
     for scene in scenes:
         height, width = scene.picture.shape[:2]
-        scale = VIEW_SIZE / max(height, width)
-        small = cut(scene.picture, scale * np.eye(2, 3), (round(scale * width), round(scale * height)))
-        views.append(Lesson.of(small, scale * scene.keypoints, scene.sides))
+        scale, count = VIEW_SIZE / max(height, width), len(scene.sides)
+        size = round(scale * width), round(scale * height)
+        views.append(Lesson.of(scene, scale * np.eye(2, 3), size, range(count)))
         for number, points in enumerate(scene.keypoints):
             squares.append(_square(scene, points[np.isfinite(points[:, 0])], [number]))
-        empty = _empty_place(scene, rng)
-        if empty is not None and rng.random() < _EMPTY:
-            squares.append(_square(scene, empty, []))
+        empty = [] if count else [place.corners for place in places(scene.picture)]
+        others = [_empty_place(scene, rng) for _ in range(len(empty) + 1)]
+        empty += [one for one in others if one is not None and (not count or rng.random() < _EMPTY)]
+        squares += [_square(scene, corners, []) for corners in empty]
     return views, squares
 
 
 def _square(scene: Scene, points: Doubles, hands: list[int]) -> Lesson:
     """The square around points, with these hands."""
-    matrix = square_around(points, WIDE_ROOM, WIDE)
-    keypoints = scene.keypoints[hands] @ matrix[:, :2].T + matrix[:, 2]
-    return Lesson.of(cut(scene.picture, matrix, (WIDE, WIDE)), keypoints, scene.sides[hands])
+    return Lesson.of(scene, square_around(points, WIDE_ROOM, WIDE), (WIDE, WIDE), hands)
 
 
 def _empty_place(scene: Scene, rng: np.random.Generator) -> Doubles | None:
@@ -245,7 +288,9 @@ def draw_scenes(number: int, *, seed: int) -> Iterator[Scene]:
         keypoints = keypoints.astype(np.float64).reshape(-1, NUM_KEYPOINTS, 2)
         seen = visible.reshape(-1, NUM_KEYPOINTS).sum(axis=1) >= _FEWEST_SEEN
         picture = np.ascontiguousarray(one.get("noisy_rgb", one["rgb"]).numpy().transpose(1, 2, 0))
-        yield Scene(picture, keypoints[seen], one["side"].numpy().astype(np.int8).reshape(-1)[seen])
+        sides = one["side"].numpy().astype(np.int8).reshape(-1)
+        mask = np.uint8(255) * (one["ids"].numpy() > 0)
+        yield Scene(picture, keypoints[seen], sides[seen], mask)
 
 
 def _two_hands(count: int, rng: np.random.Generator) -> Doubles:
@@ -261,12 +306,13 @@ def _two_hands(count: int, rng: np.random.Generator) -> Doubles:
 
 
 def read_scenes(file: Path) -> Iterator[Scene]:
-    """Your own photographs with the hands of a file of COCO keypoints."""
-    hands = sorted(load_labeled_hands(file), key=lambda hand: hand.file)
-    for path, group in itertools.groupby(hands, key=lambda hand: hand.file):
-        labeled = list(group)
+    """Your own photographs with the hands of a file of COCO keypoints, and those without any, by name."""
+    hands, empty = load_labeled_photographs(file)
+    for path in sorted({hand.file for hand in hands} | set(empty)):
+        labeled = [hand for hand in hands if hand.file == path]
+        keypoints = np.array([hand.keypoints for hand in labeled]).reshape(-1, NUM_KEYPOINTS, 2)
         sides = np.array([hand.side for hand in labeled], dtype=np.int8)
-        yield Scene(read_photograph(path), np.stack([hand.keypoints for hand in labeled]), sides)
+        yield Scene(read_photograph(path), keypoints, sides)
 
 
 def fit(
@@ -346,7 +392,7 @@ def _turn(rng: np.random.Generator, deviation: float, scale: float = 1.0) -> Dou
     return np.asarray(turn * [rng.choice((-1.0, 1.0)), 1.0])
 
 
-def keypoint_batch(lessons: Sequence[Lesson], rng: np.random.Generator) -> Batch:
+def keypoint_batch(lessons: Sequence[Lesson], rooms: Sequence[Lesson], rng: np.random.Generator) -> Batch:
     """Pictures of single hands, and some of none. Targets: keypoints [share of the side], presence, palm.
 
     The palm faces the camera (1), or does not (0), or that is not known (-1). Mirrored pictures have the same
@@ -356,7 +402,7 @@ def keypoint_batch(lessons: Sequence[Lesson], rng: np.random.Generator) -> Batch
     presence, palms = np.zeros(BATCH, np.float32), np.full(BATCH, -1.0, np.float32)
     for number in range(BATCH):
         lesson = lessons[int(rng.integers(len(lessons)))]
-        wide, is_hand = lesson.picture(), len(lesson.sides) > 0
+        wide, is_hand = lesson.staged(rooms, rng), len(lesson.sides) > 0
         keypoints = lesson.keypoints[0] if is_hand else np.full((NUM_KEYPOINTS, 2), np.nan)
         labeled = keypoints[np.isfinite(keypoints[:, 0])]
         first_look = rng.random() < _FIRST_LOOK or len(labeled) < len(keypoints)
@@ -400,13 +446,13 @@ def keypoint_loss(found: tuple[torch.Tensor, torch.Tensor], targets: Targets) ->
     return loss + (wrong * known).sum() / known.sum().clamp(min=1)
 
 
-def finder_batch(lessons: Sequence[Lesson], rng: np.random.Generator) -> Batch:
+def finder_batch(lessons: Sequence[Lesson], rooms: Sequence[Lesson], rng: np.random.Generator) -> Batch:
     """Pictures, turned, cut and scaled; targets: cells (4, S/8, S/8) as the network's, and their weight."""
     cells = FINDER_SIZE // CELL
     pictures, targets = [], np.zeros((BATCH, 5, cells, cells), np.float32)
     for target in targets:
         lesson = lessons[int(rng.integers(len(lessons)))]
-        picture = lesson.picture()
+        picture = lesson.staged(rooms, rng)
         long, short = FINDER_SIZE, round(FINDER_SIZE * rng.choice(_ASPECTS))
         width, height = (long, short) if rng.random() < 0.75 else (short, long)
         turn = _turn(rng, 14.0, FINDER_SIZE / VIEW_SIZE * rng.uniform(0.75, 1.7))

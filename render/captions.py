@@ -172,7 +172,11 @@ def contact_sheet(frames: Sequence[RenderedFrame], *, columns: int = 3, width: i
 
     A frame without colors shows its depth alone.
     """
-    cells = [_cell(frame, width) for frame in frames]
+    return in_rows([_cell(frame, width) for frame in frames], columns=columns)
+
+
+def in_rows(cells: Sequence[Picture], *, columns: int = 3) -> Picture:
+    """Pictures of any sizes in rows of `columns`."""
     height = max(cell.shape[0] for cell in cells)
     across = max(cell.shape[1] for cell in cells)
     spare = [(height - cell.shape[0] + _GAP, across - cell.shape[1] + _GAP) for cell in cells]
@@ -231,14 +235,15 @@ def _cell(frame: RenderedFrame, width: int) -> Picture:
     scale = min(1.0, width / frame.camera.size[0])
     parts, hands = [], [(hand.keypoints, hand.visible) for hand in frame.hands]
     if sensed.rgb is not None:
-        parts.append(draw_keypoints(_scaled(sensed.rgb, scale), hands, scale=scale))
+        parts.append(draw_keypoints(scaled(sensed.rgb, scale), hands, scale=scale))
     if sensed.depth is not None:
-        depth = _scaled(colored_depth(sensed.depth), scale)
+        depth = scaled(colored_depth(sensed.depth), scale)
         parts.append(depth if parts else draw_keypoints(depth, hands, scale=scale))
     return side_by_side(parts)
 
 
-def _scaled(picture: Picture, scale: float) -> Picture:
+def scaled(picture: Picture, scale: float) -> Picture:
+    """The picture, smaller by a scale of at most 1."""
     if scale == 1.0:
         return picture
     size = [max(1, round(scale * length)) for length in picture.shape[1::-1]]

@@ -49,8 +49,11 @@ class LabeledHand(NamedTuple):
     side: int  # 0 left, 1 right, -1 unknown
 
 
-def load_labeled_hands(file: str | Path) -> list[LabeledHand]:
-    """The hands of a file of COCO keypoints, 21 each in our order; pictures are beside it or in `images`."""
+def load_labeled_photographs(file: str | Path) -> tuple[list[LabeledHand], list[Path]]:
+    """The hands of a file of COCO keypoints, 21 each in our order, and its pictures without an annotation.
+
+    Pictures are beside the file or in `images`.
+    """
     path = Path(file)
     content = load_json(path)
     try:
@@ -63,21 +66,28 @@ def load_labeled_hands(file: str | Path) -> list[LabeledHand]:
         ) from error
     hands = [_hand(path, name, label) for name, label in labels]
     kept = [hand for hand in hands if np.isfinite(hand.keypoints[:, 0]).sum() >= _FEWEST_KEYPOINTS]
-    if not kept:
+    annotated = {one.get("image_id") for one in content["annotations"]}
+    empty = [_photograph(path, name) for number, name in names.items() if number not in annotated]
+    if not kept and not empty:
         raise DatasetError(f"{path}: no hand with {_FEWEST_KEYPOINTS} labeled keypoints or more")
-    return kept
+    return kept, empty
+
+
+def _photograph(path: Path, name: str) -> Path:
+    """A picture that a file of COCO keypoints names."""
+    places = (path.parent / name, path.parent / "images" / name)
+    photograph = next((one for one in places if one.is_file()), None)
+    if photograph is None:
+        raise DatasetError(f"{path}: no photograph {name} beside it or in its folder images")
+    return photograph
 
 
 def _hand(path: Path, name: str, label: dict[str, Any]) -> LabeledHand:
     with errors_of(path, DatasetError):
         pixels, flags = labeled_keypoints(label)
-    places = (path.parent / name, path.parent / "images" / name)
-    photograph = next((one for one in places if one.is_file()), None)
-    if photograph is None:
-        raise DatasetError(f"{path}: no photograph {name} beside it or in its folder images")
     side = label.get("side")
     return LabeledHand(
-        photograph,
+        _photograph(path, name),
         np.where(flags[:, None] > 0.0, pixels, np.nan),
         flags > 1.0,
         SIDES.index(side) if side in SIDES else -1,
@@ -239,10 +249,12 @@ class PictureStream(SharedStream, IterableDataset[dict[str, torch.Tensor]]):
         if self.config.shutter is not None and not self._takes:
             raise ArgumentError("poses without times have no motion to blur; leave out the shutter")
         check_number("photograph_share", photograph_share, 0.0, 1.0)
-        self._photographs = None if photographs is None else load_labeled_hands(photographs)
+        self._photographs = None if photographs is None else load_labeled_photographs(photographs)[0]
         self._photograph_share = photograph_share
         two = bool(self._takes and len(self._takes[0].take.hands) > 1)
         two |= self._poses is not None and self._poses.ndim == 3
+        if self._photographs == []:
+            raise DatasetError(f"{photographs}: no picture with a hand, expected labeled ones")
         if photographs is not None and (crop is None or two or "rgb" not in self.config.passes):
             raise ArgumentError("photographs go with a crop, colors, and pictures of one hand")
         cv2.setNumThreads(1)  # forked workers would wait for the threads of this process forever

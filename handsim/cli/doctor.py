@@ -50,6 +50,7 @@ _EXTRAS: Final = {
     "send": "--send osc://, ws:// and lsl:",
     "qualisys": "--live qtm://",
     "onnx": ".onnx labelers, training a detector",
+    "mediapipe": "--detector mediapipe",
     "usd": "export to .usdc",
     "cluster": "--cluster",
     "object-stores": "folders in s3://",

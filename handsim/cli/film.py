@@ -21,7 +21,7 @@ def film(
     out: Path,
     options: Annotated[FrameConfig, tyro.conf.arg(name="")] = USUAL,
     camera: Path | None = None,
-    detector: Path | None = None,
+    detector: str = "handsim",
     format: tuple[str, ...] = ("webdataset",),
     workers: int | None = None,
 ) -> None:
@@ -35,19 +35,16 @@ def film(
         out: Folder for the pictures, their annotations, film.json, film.mp4 and film.html.
         options: What to write.
         camera: File with this camera's lens, as of handsim rig import; the lens is fitted when not given.
-        detector: Folder of a hand detector of your own, or a .json file of COCO keypoints that another
-            program found (docs/how_to/film.md); the shipped detector when not given.
+        detector: What finds hands in the video: handsim, mediapipe (for bare hands; pip install
+            'handsim[mediapipe]'), the folder of a detector of your own, or a .json file of handsim detect or
+            of another program (docs/how_to/film.md).
         format: File formats: webdataset, coco, yolo, exr, png; several go into folders.
         workers: Processes that write; all cores when not given.
     """
     from film.annotation import PAGE, annotate_film
-    from film.detector import HandDetector
-    from film.stored_hands import StoredHands
 
     check_outputs((take, video, camera, detector), (out,))
     begin = time.perf_counter()
-    is_file = detector is not None and detector.suffix.lower() == ".json"
-    finder = StoredHands.load(detector) if detector and is_file else HandDetector.load(detector)
     with progress_bar("frames") as bar:
         found = annotate_film(
             take,
@@ -56,7 +53,7 @@ def film(
             format,
             options,
             camera=camera,
-            detector=finder,
+            detector=detector,
             workers=workers,
             progress=bar,
             on_step=bar.step,

@@ -68,6 +68,7 @@ _HELP: Final = {
     "body": "Write a rigid body's markers as a file, to track it with.",
     "render": "Draw the hands of a take, with the truth of each picture.",
     "film": "Register an ordinary video to a tracked take; its frames become labeled photographs.",
+    "detect": "Find hands, gloved or bare, in photographs or a video, as COCO keypoints.",
     "doctor": "Say what is missing on this machine, and how to get it.",
 }
 """Every command with its line of help; `handsim glove list` is `list_glove` in the module `glove`."""

@@ -89,7 +89,7 @@ def numbered(records: Iterable[dict[str, Any]]) -> Iterator[tuple[dict[str, Any]
 
 def _hand_record(frame: RenderedFrame, number: int, hand: HandTruth) -> dict[str, Any]:
     """COCO's annotation of a hand, without ids."""
-    keypoints = _triples(hand.keypoints, hand.visible, frame.camera.size)
+    keypoints = keypoint_triples(hand.keypoints, hand.visible, frame.camera.size)
     record = {
         "category_id": CATEGORY["id"],
         "keypoints": keypoints,
@@ -107,7 +107,7 @@ def _hand_record(frame: RenderedFrame, number: int, hand: HandTruth) -> dict[str
         joints = np.linalg.inv(frame.camera.T_world_camera) @ hand.openxr
         turns = np.roll(rotation_quaternions(joints[:, :3, :3]), -1, axis=1)
         pixels = frame.camera.project(hand.openxr[:, :3, 3])
-        record["openxr_keypoints"] = _triples(pixels, hand.openxr_visible, frame.camera.size)
+        record["openxr_keypoints"] = keypoint_triples(pixels, hand.openxr_visible, frame.camera.size)
         record["openxr_poses"] = rounded(np.concatenate([joints[:, :3, 3], turns], axis=1), 9)
     if hand.mano:
         record["mano"] = hand.mano
@@ -121,7 +121,7 @@ def _hand_record(frame: RenderedFrame, number: int, hand: HandTruth) -> dict[str
     return record
 
 
-def _triples(pixels: Doubles, visible: Flags, size: tuple[int, int]) -> list[Any]:
+def keypoint_triples(pixels: Doubles, visible: Flags, size: tuple[int, int]) -> list[Any]:
     """COCO's list u, v, flag, u, ... of keypoints (K, 2)."""
     flags = keypoint_flags(pixels, visible, size)
     known = rounded(np.where(flags[:, None] > 0, pixels - CENTER, 0.0), 5)

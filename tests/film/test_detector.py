@@ -19,6 +19,7 @@ from film.detector import (
     KEYPOINTS,
     MOST_BYTES,
     WEIGHTS,
+    Place,
     cut,
     palm_spread,
     peaks_of,
@@ -213,7 +214,7 @@ def test_training_lowers_its_loss(lessons, kind):
         "finder": (FinderNetwork(), training.finder_batch, training.finder_loss, learned[0]),
         "keypoints": (KeypointNetwork(), training.keypoint_batch, training.keypoint_loss, learned[1]),
     }[kind]
-    losses = training.fit(network, functools.partial(make, given), loss, 24, 0)
+    losses = training.fit(network, functools.partial(make, given, []), loss, 24, 0)
     assert np.mean(losses[-6:]) < 0.8 * np.mean(losses[:3])
 
 
@@ -223,6 +224,33 @@ def test_lessons_keep_labels_in_their_pictures(lessons):
     for square in squares:
         for x, y in square.keypoints[:, 0]:
             assert square.picture()[int(y), int(x)].min() > 130  # the wrist is on the hand
+
+
+def test_drawn_hands_are_laid_over_photographs(lessons):
+    """Half of the pictures have the photograph's green behind the hand, and some a glove of another color."""
+    rng, scene = np.random.default_rng(0), lessons[0]
+    mask = np.where(scene.picture.min(axis=2) > 130, 255, 0).astype(np.uint8)
+    green = Scene(np.full((240, 320, 3), (20, 200, 30), np.uint8), np.empty((0, 21, 2)), np.empty(0, np.int8))
+    (drawn,), _ = lessons_of([scene._replace(mask=mask)], rng=rng)
+    rooms, squares = lessons_of(
+        [green], lambda _: [Place(np.array([[9.0, 9.0], [99.0, 99.0]]), 0.0)], rng=rng
+    )
+    assert len(squares) == 3 and not any(len(square.sides) for square in squares)
+    seen = [drawn.staged(rooms, rng).astype(int) for _ in range(60)]
+    staged = [one for one in seen if abs(one[2, 2] - [20, 200, 30]).max() < 9]
+    assert 15 < len(staged) < 45 and len({tuple(one[-3, -3]) for one in seen}) > 1
+    x, y = drawn.keypoints[0, 0].astype(int)
+    kept = [abs(one[y, x] - [230, 200, 180]).max() < 40 for one in staged]
+    assert 0 < sum(kept) < len(kept)
+    unmasked = lessons_of([scene], rng=rng)[0][0]
+    np.testing.assert_array_equal(unmasked.staged(rooms, rng), unmasked.picture())
+
+
+def test_pictures_without_hands_are_learned_from(few, tmp_path):
+    cv2.imwrite(str(tmp_path / "room.png"), np.full((90, 120, 3), 90, np.uint8))
+    file = tmp_path / "photographs.json"
+    file.write_text(json.dumps({"images": [{"id": 1, "file_name": "room.png"}], "annotations": []}))
+    HandDetector.load(train_detector(tmp_path / "out", start="shipped", photographs=file, samples=64))
 
 
 @pytest.fixture

@@ -36,6 +36,7 @@ ELSEWHERE = {
     "calibrate": "out live seconds", "track": "out live seconds send labelled", "report": "out",
     "replay": "host port rate loop", "view": "host port out video live",
     "body": "out markers forearm landmarks", "doctor": "compile send",
+    "detect": "out detector",
     "film": "out format workers detector frames-per-shard openxr frames seed",
     "render": "out merge format workers cluster painter frames-per-shard",
 }  # fmt: skip
