@@ -10,7 +10,8 @@
   marker is seen with noise, and tells less the longer it is hidden. The hand model differs from the user's
   hand in the same way in every frame, so that averaging does not help: in its size, marker places, origins
   and directions of digits, and bone lengths. Flesh moves markers slowly, so that averaging over successive
-  frames does not help, either.
+  frames does not help, either. Nor does the palm follow the model, which takes the flexion of the metacarpals
+  of ring and little finger for that of their MCP joints.
 """
 
 from __future__ import annotations
@@ -55,22 +56,28 @@ _DRIFT: Final = 0.014  # [m/sqrt(s)] random walk of a hidden marker
 _ANYWHERE: Final = 0.01  # [1/m^2, 1/rad^2] prior precision of the wrist
 _LEAST_NOISE: Final = 0.0001  # [m] lower bound of a marker's noise
 _LEAST_FREEDOM: Final = 3  # least number of marker coordinates beyond those that a pose needs
-SOURCES: Final = ("noise and gaps", "gluing", "flesh", "person")
+SOURCES: Final = ("noise and gaps", "gluing", "flesh", "person", "palm")
 """Sources of an angle's uncertainty: noisy or unseen markers, their glued places, their motion over the
-bones, and what stays of a person: sizes and directions of bones, gestures unlike other people's."""
+bones, what stays of a person (sizes and directions of bones, gestures unlike other people's), and the arch of
+the palm, which is rigid in the model."""
 Measure = Literal["frame", "mean", "peak", "range"]
 """What of an angle is compared between sessions: its value in a frame, its mean, its 5th or 95th percentile
 in a take, or its range of motion, between these."""
-CHANGING: Final[dict[Measure, tuple[float, float, float, float]]] = {
-    "frame": (0.0, 0.0, 1.39, 0.25),
-    "mean": (0.0, 0.0, 0.73, 0.22),
-    "peak": (0.0, 0.0, 1.56, 0.27),
-    "range": (0.0, 0.0, 2.01, 0.31),
+_ARCH: Final = {"ring": (0.05, 0.13), "little": (0.11, 0.32)}
+"""Motion of the metacarpal that the model takes for abduction and flexion of the MCP, over that flexion: root
+mean square of nine recorded grasps of four people, from the flat hand (benchmarks/palm.py)."""
+CHANGING: Final[dict[Measure, tuple[float, ...]]] = {
+    "frame": (0.0, 0.0, 1.39, 0.25, 0.3),
+    "mean": (0.0, 0.0, 0.73, 0.22, 0.25),
+    "peak": (0.0, 0.0, 1.56, 0.27, 0.5),
+    "range": (0.0, 0.0, 2.01, 0.31, 0.5),
 }
 """Factors by which these parts of an uncalibrated hand's error change between sessions of a person. The rest
 comes from its wrong shape, which stays, and from people's usual gestures, towards which a hand is drawn
 nearly alike; glued places are seen in the part of flesh, as fits make up for most of them. Fitted to two
-sessions of each of 64 simulated people, half in dense19 and half in sparse13 (benchmarks/sessions.py)."""
+sessions of each of 64 simulated people, half in dense19 and half in sparse13 (benchmarks/sessions.py). Those
+of the palm are the standard deviation between a person's grasps over `_ARCH` (0.3), times the ratio of the
+measure to the RMS of usual flexion (0.83, 1.7, 1.7)."""
 DETECTABLE: Final = 1.96 * float(np.sqrt(2.0))
 """Ratio of the minimal detectable difference of two sessions to the standard error of measurement."""
 _OWN: Final = 9  # numbers of a digit: place of its knuckle, its direction, lengths of its bones (3 each)
@@ -441,7 +448,7 @@ class SpreadModel:
         places: Float[np.ndarray, "M 2"] | float = 0.0,
         smoothed: Float[np.ndarray, "S 26 26"] = NOT_SMOOTHED,
         prior: Float[np.ndarray, "20 20"] | None = None,
-    ) -> tuple[Float[np.ndarray, "T 26 4"], Float[np.ndarray, "T 21"]]:
+    ) -> tuple[Float[np.ndarray, "T 26 5"], Float[np.ndarray, "T 21"]]:
         """Variances of all unknowns by `SOURCES` [rad^2, m^2], and standard deviations of keypoints [m].
 
         For smoothed poses are given: flesh motion and RMS errors of marker places, along the skin and off it
@@ -451,22 +458,35 @@ class SpreadModel:
         if self.is_calibrated:
             doubt = doubt._replace(noise=noise)
         prior = resting_prior().precision if prior is None else prior
-        return pose_spreads(self._hand, prior, doubt, qpos, unseen, smoothed)
+        fitted, keypoints = pose_spreads(self._hand, prior, doubt, qpos, unseen, smoothed)
+        palm = np.zeros((len(qpos), NUM_UNKNOWNS, 1))
+        palm[:, :NUM_JOINTS, 0] = palm_spread(qpos[:, 7:]) ** 2
+        return np.concatenate([fitted, palm], axis=-1), keypoints
+
+
+def palm_spread(angles: Float[np.ndarray, "T 20"]) -> Float[np.ndarray, "T 20"]:
+    """Standard deviations of angles [rad] by the arch of the palm, which is nothing in the flat hand."""
+    spread = np.zeros((len(angles), len(DIGITS), 4))
+    for digit, shares in _ARCH.items():
+        number = DIGITS.index(digit)
+        spread[:, number, :2] = np.abs(angles[:, 4 * number + 1, None]) * shares
+    return spread.reshape(angles.shape)
 
 
 def measurement_error(
-    budget: Float[np.ndarray, "*J 4"], origin: HandOrigin, measure: Measure = "frame"
+    budget: Float[np.ndarray, "*J 5"], origin: HandOrigin, measure: Measure = "frame"
 ) -> Float[np.ndarray, "*J"]:
     """Standard error of measurement between sessions of a person, in the unit of deviations by `SOURCES`.
 
     The glove is put on anew for each session. Then a calibrated hand is calibrated anew, too, and all parts
-    of its error change; other measures than a frame keep their ratio to it.
+    of its error but the palm's change; other measures than a frame keep their ratio to it.
     """
-    changing = np.linalg.norm(np.array(CHANGING[measure]) * budget, axis=-1)
+    fitted, palm = budget[..., :-1], CHANGING[measure][-1] * budget[..., -1]
+    changing = np.linalg.norm(np.array(CHANGING[measure][:-1]) * fitted, axis=-1)
     if origin == "calibrated":
-        frame = np.linalg.norm(np.array(CHANGING["frame"]) * budget, axis=-1)
-        return np.asarray(np.linalg.norm(budget, axis=-1) * changing / frame)
-    return np.asarray(changing)
+        frame = np.linalg.norm(np.array(CHANGING["frame"][:-1]) * fitted, axis=-1)
+        changing *= np.linalg.norm(fitted, axis=-1) / frame
+    return np.asarray(np.hypot(changing, palm))
 
 
 def freedom_factor(num_markers: int) -> float:

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from gloves import GloveFit, attach, load_layout
 from gloves.fit import nominal_fit
 from handsim import HandModel
-from handsim.hand.model import hand_keypoints
-from handsim.hand.shape import SIDES
+from handsim.hand.model import hand_keypoints, join_qpos
+from handsim.hand.shape import JOINT_NAMES, SIDES
 from poses import sample_poses
 from track.config import HandOrigin
 from track.kinematics.marker_kinematics import hand_arrays
@@ -23,13 +23,16 @@ from track.kinematics.pose_solver import PoseSolver
 from track.kinematics.pose_spread import (
     NOT_SMOOTHED,
     NUM_NUMBERS,
+    SOURCES,
     HandErrors,
     MarkerPrediction,
+    Measure,
     SpreadModel,
     digit_prior,
     errors_of_motions,
     hand_doubt,
     known_hand,
+    measurement_error,
     pose_spreads,
     predict_joints,
     resting_prior,
@@ -158,6 +161,27 @@ def test_measuring_and_calibration_make_them_narrower_and_noise_wider(rng):
     )
     for wider, narrower in pairwise((widest, wide, middle, narrow)):
         assert all((one < other).all() for one, other in zip(narrower, wider, strict=True))
+
+
+def test_the_arch_of_the_palm_widens_knuckles_of_ring_and_little_finger_with_their_flexion():
+    fit = nominal_fit("dense19", "M", "right")
+    qpos = join_qpos(np.deg2rad(30.0) * np.arange(3.0)[:, None] * np.eye(20)[[13, 17]].sum(axis=0))
+    parts, _ = SpreadModel(fit, "measured").variances(qpos, np.zeros((3, 19)), 0.001)
+    palm = np.sqrt(parts[..., SOURCES.index("palm")])
+    names = [JOINT_NAMES[joint] for joint in np.flatnonzero(palm.any(axis=0))]
+    assert names == [
+        f"{finger}_MCP_{way}" for finger in ("ring", "little") for way in ("abduction", "flexion")
+    ]
+    shares = palm[:, [13, 17]] / qpos[:, [20, 24]].clip(1e-9)
+    np.testing.assert_allclose(shares, [[0.0, 0.0], [0.13, 0.32], [0.13, 0.32]])
+
+
+@pytest.mark.parametrize("origin", get_args(HandOrigin))
+@pytest.mark.parametrize("measure", get_args(Measure))
+def test_the_palm_of_a_person_is_much_the_same_in_each_session(origin, measure):
+    budget = np.array([[1.0, 2.0, 1.0, 2.0, 0.0], [1.0, 2.0, 1.0, 2.0, 10.0]])
+    without, error = measurement_error(budget, origin, measure)
+    assert 2.0 < np.sqrt(error**2 - without**2) <= 5.0
 
 
 def test_a_calibrated_hand_without_stored_errors_is_as_unsure_as_a_measured_one(rng):

@@ -155,6 +155,7 @@ def test_the_page_is_whole_and_leads_to_the_frames_to_look_at(take, report):
     budget = take.settings["budget"]["right"][0]
     # Of hands that are not calibrated flesh and person change: an angle in a frame, its mean, peak and range.
     factors = [(1.39, 0.25), (0.73, 0.22), (1.56, 0.27), (2.01, 0.31)]
+    assert budget[4] == 0.0  # of the palm, which counts at ring and little finger alone
     error, *others = (np.hypot(flesh * budget[2], person * budget[3]) for flesh, person in factors)
     cells = [np.linalg.norm(budget), *budget, error, *(2.772 * one for one in (error, *others))]
     assert "".join(f"<td>{cell:.1f}</td>" for cell in cells) in page
