@@ -14,7 +14,7 @@ is how far the knuckle is from the hinge at the wrist [mm]. A table has, for eac
 
 how far knuckles are from the hinge's path (RMS); and the share of the first bone's flexion by which the
 metacarpal flexes and turns aside, which a rigid palm takes for flexion and abduction of the MCP joint (ratios
-of RMS, counted from the tenth of the frames with the least flexion). The last row has the RMS of all captures.
+of RMS, counted from the tenth of the frames with the least flexion). The last row is the RMS of all captures.
 
 Captures of one person are in one folder. With several people a second table has, for each, the share of the
 flexion by which the metacarpals of the others flex (least squares, all people alike); what it explains of the

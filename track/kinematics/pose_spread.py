@@ -63,9 +63,10 @@ the palm, which is rigid in the model."""
 Measure = Literal["frame", "mean", "peak", "range"]
 """What of an angle is compared between sessions: its value in a frame, its mean, its 5th or 95th percentile
 in a take, or its range of motion, between these."""
-_ARCH: Final = {"ring": (0.05, 0.13), "little": (0.11, 0.32)}
-"""Motion of the metacarpal that the model takes for abduction and flexion of the MCP, over that flexion: root
-mean square of nine recorded grasps of four people, from the flat hand (benchmarks/palm.py)."""
+_ARCH: Final = {"ring": 0.13, "little": 0.32}
+"""Flexion of the metacarpal over that of its finger, from the flat hand: root mean square of nine recorded
+grasps of four people (benchmarks/palm.py). Where one is large the other is, too."""
+_METACARPAL: Final = 0.054  # [m] from its hinge to the knuckle, as in benchmarks/palm.py
 CHANGING: Final[dict[Measure, tuple[float, ...]]] = {
     "frame": (0.0, 0.0, 1.39, 0.25, 0.3),
     "mean": (0.0, 0.0, 0.73, 0.22, 0.25),
@@ -127,6 +128,7 @@ class HandDoubt(NamedTuple):
     noise: float  # marker around its place, independent in each frame [m]
     errors: HandErrors  # alike in all frames
     places: Float[np.ndarray, "M 2"]  # of each marker on its bone: along the skin (each way), off it [m]
+    arch: Float[np.ndarray, "46 1"]  # arch of the palm as an error of the numbers, per flexion of each finger
     flesh: float = 0.0  # marker around its place, alike in successive frames [m]
 
 
@@ -378,7 +380,8 @@ def _complete_digits(
 
 def known_hand(digits: Int[np.ndarray, "M"], noise: float) -> HandDoubt:
     """`HandDoubt` of a perfectly known hand whose markers have some noise [m]."""
-    return HandDoubt(noise, _same_markers(digits, np.zeros((NUM_NUMBERS, 1))), np.zeros((len(digits), 2)))
+    numbers, places = np.zeros((NUM_NUMBERS, 1)), np.zeros((len(digits), 2))
+    return HandDoubt(noise, _same_markers(digits, numbers), places, numbers)
 
 
 def hand_doubt(digits: Int[np.ndarray, "M"], origin: HandOrigin) -> HandDoubt:
@@ -390,7 +393,18 @@ def hand_doubt(digits: Int[np.ndarray, "M"], origin: HandOrigin) -> HandDoubt:
     numbers = np.zeros((NUM_NUMBERS, NUM_NUMBERS + count))
     np.fill_diagonal(numbers, [*np.ravel(own), known.size])
     numbers[:-1, NUM_NUMBERS:] = np.kron(np.eye(count), np.repeat([[0.0], [all_bones]], [6, 3], axis=0))
-    return HandDoubt(MARKER_NOISE, _same_markers(digits, numbers), np.tile(known.place, (len(digits), 1)))
+    return known_hand(digits, MARKER_NOISE)._replace(
+        errors=_same_markers(digits, numbers), places=np.tile(known.place, (len(digits), 1))
+    )
+
+
+def _arch() -> Float[np.ndarray, "46 1"]:
+    """The `HandDoubt.arch` of people: metacarpals that turn about the palm's y axis, each at its hinge."""
+    numbers = np.zeros((NUM_NUMBERS, 1))
+    for digit, share in _ARCH.items():
+        first = _OWN * DIGITS.index(digit)
+        numbers[[first + 2, first + 4], 0] = -_METACARPAL * share, share
+    return numbers
 
 
 def errors_of_motions(
@@ -422,6 +436,7 @@ class SpreadModel:
         self._doubt = hand_doubt(digits, origin)
         if errors is not None:
             self._doubt = known_hand(digits, MARKER_NOISE)._replace(errors=errors)
+        self._doubt = self._doubt._replace(arch=_arch())
 
     def of_pose(
         self, qpos: Float[np.ndarray, "27"], unseen: Float[np.ndarray, "M"], rms: float
@@ -458,19 +473,7 @@ class SpreadModel:
         if self.is_calibrated:
             doubt = doubt._replace(noise=noise)
         prior = resting_prior().precision if prior is None else prior
-        fitted, keypoints = pose_spreads(self._hand, prior, doubt, qpos, unseen, smoothed)
-        palm = np.zeros((len(qpos), NUM_UNKNOWNS, 1))
-        palm[:, :NUM_JOINTS, 0] = palm_spread(qpos[:, 7:]) ** 2
-        return np.concatenate([fitted, palm], axis=-1), keypoints
-
-
-def palm_spread(angles: Float[np.ndarray, "T 20"]) -> Float[np.ndarray, "T 20"]:
-    """Standard deviations of angles [rad] by the arch of the palm, which is nothing in the flat hand."""
-    spread = np.zeros((len(angles), len(DIGITS), 4))
-    for digit, shares in _ARCH.items():
-        number = DIGITS.index(digit)
-        spread[:, number, :2] = np.abs(angles[:, 4 * number + 1, None]) * shares
-    return spread.reshape(angles.shape)
+        return pose_spreads(self._hand, prior, doubt, qpos, unseen, smoothed)
 
 
 def measurement_error(
@@ -521,17 +524,18 @@ def pose_spreads(
     qpos: Float[np.ndarray, "T 27"],
     unseen: Float[np.ndarray, "T M"],
     smoothed: Float[np.ndarray, "S 26 26"],
-) -> tuple[Float[np.ndarray, "T 26 4"], Float[np.ndarray, "T 21"]]:
+) -> tuple[Float[np.ndarray, "T 26 5"], Float[np.ndarray, "T 21"]]:
     """Variance of each unknown by `SOURCES` ([rad^2] or [m^2]), and standard deviation of each keypoint [m].
 
     The unknowns are the joint angles, then position and rotation of the wrist along its own axes. `hand` is
-    from `with_keypoints`. A marker off its place moves the fit as noise does. Errors of the hand move
-    markers, through them the fit, and keypoints also directly.
+    from `with_keypoints`. A marker off its place moves the fit as noise does. Errors of the hand, and the
+    arch of its palm, move markers, through them the fit, and keypoints also directly.
     """
-    found, keypoints = np.empty((len(qpos), NUM_UNKNOWNS, 4)), np.empty((len(qpos), NUM_KEYPOINTS))
+    found, keypoints = np.empty((len(qpos), NUM_UNKNOWNS, 5)), np.empty((len(qpos), NUM_KEYPOINTS))
     count, work, weights = unseen.shape[1], workspace(len(hand.digits)), np.zeros(len(hand.digits))
     ways, posterior = doubt.errors.numbers.shape[1], np.empty((NUM_UNKNOWNS, NUM_UNKNOWNS))
     moved, shifted = np.empty((3 * len(weights), ways)), np.empty((3 * count, ways))
+    arched, arch = np.empty((3 * len(weights), 1)), np.zeros_like(doubt.arch)
     weighted, jacobian = np.empty((3 * count, NUM_UNKNOWNS)), work.jacobian.reshape(-1, NUM_UNKNOWNS)
     work.residuals[:] = 0.0
     for frame in range(len(qpos)):
@@ -547,15 +551,22 @@ def pose_spreads(
         invert_positive(posterior)
         _move_points(hand, doubt.errors.numbers, work, moved)
         _shift_markers(hand, doubt.errors.markers, work, shifted)
+        for number in range(NUM_NUMBERS - 1):
+            arch[number] = doubt.arch[number] * qpos[frame, 8 + 4 * (number // _OWN)]
+        _move_points(hand, arch, work, arched)
         for row in range(3 * count):
             for unknown in range(NUM_UNKNOWNS):
                 weighted[row, unknown] = weights[row // 3] * jacobian[row, unknown]
         off = weighted @ posterior
         by_bones, by_places = off.T @ moved[: 3 * count], off.T @ shifted
+        by_arch = off.T @ arched[: 3 * count]
         noise, answers = smoothed[frame] if len(smoothed) > 0 else posterior, by_bones + by_places
         _write_variances(hand, doubt, work, noise, by_bones, by_places, off, found[frame])
         spread = jacobian[3 * count :] @ (noise + off.T @ off)
+        for unknown in range(NUM_UNKNOWNS):
+            found[frame, unknown, 4] = by_arch[unknown, 0] ** 2
         left = moved[3 * count :] - jacobian[3 * count :] @ answers
+        bent = arched[3 * count :] - jacobian[3 * count :] @ by_arch
         for keypoint in range(NUM_KEYPOINTS):
             total = 0.0
             for row in range(3 * keypoint, 3 * keypoint + 3):
@@ -563,6 +574,7 @@ def pose_spreads(
                     total += spread[row, unknown] * jacobian[3 * count + row, unknown]
                 for way in range(ways):
                     total += left[row, way] ** 2
+                total += bent[row, 0] ** 2
             keypoints[frame, keypoint] = np.sqrt(max(total, 0.0) / 3.0)
     return found, keypoints
 
@@ -576,7 +588,7 @@ def _write_variances(
     by_bones: Float[np.ndarray, "26 C"],
     by_places: Float[np.ndarray, "26 C"],
     off: Float[np.ndarray, "R 26"],
-    variances: Float[np.ndarray, "26 4"],
+    variances: Float[np.ndarray, "26 5"],
 ) -> None:
     """Write the variances of unknowns [rad^2, m^2]; scales `off` from derivatives by [m] to deviations."""
     # A slipped marker keeps its height over the bone, and the height tells most of the bone's flexion. Errors

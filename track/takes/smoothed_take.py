@@ -219,7 +219,6 @@ class _SmoothedHand:
             )
             for other, _ in measured:
                 variances[:, still] = np.maximum(variances, other)[:, still]
-            variances[:, np.flatnonzero(np.isfinite(self._known)), -1] = 0.0  # by a goniometer, not the palm
             self.angles[kept] = np.sqrt(variances[:, :NUM_JOINTS].sum(axis=-1))
             # How far the prior pulls an unknown stays the same, as the person does.
             pulled = same.diagonal(axis1=1, axis2=2)

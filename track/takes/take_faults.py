@@ -20,7 +20,7 @@ from track.alternatives.alternatives import Doubt, doubts_of
 from track.alternatives.hands import other_hands_of
 from track.hand_size import glove_shifts
 from track.kinematics.pose_solver import FEWEST_MARKERS
-from track.kinematics.pose_spread import are_still, palm_spread
+from track.kinematics.pose_spread import are_still
 from track.settings import USUAL_SIZE
 
 _FEWEST: Final = 60  # Faults are looked for from this many tracked frames of a hand on.
@@ -214,9 +214,8 @@ def _still(hand: _Hand) -> Iterator[SuspectSpan]:
     spread, number = hand.take.angle_spread, hand.take.hand_index(hand.side)
     if spread is None:
         return
-    angles = hand.take.qpos[hand.frames, number, 7:]
-    squares = spread[hand.frames, number] ** 2 - palm_spread(angles) ** 2  # of what the markers tell
-    spreads, still = np.rad2deg(np.sqrt(np.median(squares, axis=0).clip(0.0))), are_still(angles)
+    spreads = np.rad2deg(np.median(spread[hand.frames, number], axis=0))
+    still = are_still(hand.take.qpos[hand.frames, number, 7:])
     if np.ptp(hand.take.times[hand.frames]) < _LONG or still.mean() > _RESTS:
         return
     for joint in np.flatnonzero(still & (spreads > _OPEN)):
