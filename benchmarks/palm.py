@@ -1,6 +1,6 @@
 """How far the metacarpals of ring and little finger flex in the palm, by markers of labeled captures.
 
-    python -m benchmarks.palm RH1 RH6 RH2 RH3 RH5 RPF1 CAPTURES [--lever 54]
+    python -m benchmarks.palm RH1 RH6 RH2 RH3 RH5 RPF1 CAPTURES [--lever 54] [--takes FOLDER --finger little]
 
 Six markers are named: four on the back, two of them at the wrist and two at the knuckles of index and middle
 finger, each on the thumb's side first; one on the knuckle of the finger, and one on its middle joint. --lever
@@ -20,6 +20,11 @@ Captures of one person are in one folder. With several people a second table has
 flexion by which the metacarpals of the others flex (least squares, all people alike); what it explains of the
 person's own flexion of the metacarpal, from the flat hand and around its mean; and the median error of the
 range of MCP flexion of a rigid palm, and of a palm with this share.
+
+With a folder of their takes (`handsim track CAPTURES --calibrate --out FOLDER`) a third table has the tracked
+MCP flexion of the finger beside the signed angle of wrist, knuckle and middle joint, both from the flat hand:
+ranges, error (RMS), the same over the bone's flexion (RMS), stated standard deviation (median), and errors
+within one and two of them.
 """
 
 from __future__ import annotations
@@ -34,7 +39,7 @@ from numpy.typing import NDArray
 from rich.table import Table
 
 from benchmarks.record import number_table, run
-from gloves import read_capture
+from gloves import load_take, read_capture
 from handsim.space.transforms import rigid_fit, unit
 
 Doubles = NDArray[np.float64]
@@ -51,6 +56,12 @@ class Motion(NamedTuple):
     """Flexion of the bone against the back, from the flat hand (T,) [rad]."""
     metacarpal: Doubles
     """Flexion of the metacarpal, from the flat hand (T,) [rad]."""
+    signed: Doubles
+    """Angle of the bone with the line from the wrist to the knuckle (T,) [rad]."""
+    flat: NDArray[np.bool_]
+    """Frames that count as the flat hand (T,)."""
+    whole: NDArray[np.bool_]
+    """Which frames of the capture these are: those with all markers."""
 
     def centered(self) -> Motion:
         """The motion around its mean."""
@@ -68,7 +79,13 @@ class Motion(NamedTuple):
 
 
 def main(
-    back: tuple[str, str, str, str], knuckle: str, joint: str, captures: tuple[Path, ...], lever: float = 54.0
+    back: tuple[str, str, str, str],
+    knuckle: str,
+    joint: str,
+    captures: tuple[Path, ...],
+    lever: float = 54.0,
+    takes: Path | None = None,
+    finger: str = "little",
 ) -> None:
     columns = ["rigid palm", "plain angle", "in the plane", "hinge", "off [mm]", "share", "aside"]
     table = number_table(f"Ranges of flexion at {knuckle} [deg]", ["capture"], columns)
@@ -86,6 +103,32 @@ def main(
     rich.print(table)
     if len(people) > 1:
         rich.print(_held_out(people))
+    if takes is not None:
+        motions = dict(zip(names, [one for person in people.values() for one in person], strict=True))
+        rich.print(_tracked(motions, takes, f"{finger}_MCP_flexion"))
+
+
+def _tracked(motions: dict[str, Motion], folder: Path, angle: str) -> Table:
+    """How far off a tracked angle is, and how far it is said to be."""
+    columns = ["tracked", "by markers", "error [deg]", "over flexion", "SD", "1 SD [%]", "2 SD [%]"]
+    table, every = number_table(f"{angle} of takes [deg]", ["capture"], columns), []
+    for name, one in motions.items():
+        take = load_take(folder / f"{name}.npz")
+        (side,) = take.sides
+        found, spread = (values[angle][one.whole] for values in (take.angles(side), take.angle_spreads(side)))
+        known, flat = np.isfinite(found), np.isfinite(found) & one.flat
+        off = np.abs((found - found[flat].mean() - one.signed + one.signed[flat].mean())[known])
+        rms, flexed = np.sqrt((off**2).mean()), np.sqrt((one.bone[known] ** 2).mean())
+        within = [100.0 * (off <= factor * spread[known]).mean() for factor in (1, 2)]
+        degrees = np.rad2deg([rms, np.median(spread[known])])
+        every.append(
+            [_range(found[known]), _range(one.signed[known]), degrees[0], rms / flexed, degrees[1], *within]
+        )
+    every.append(np.mean(every, axis=0).tolist())
+    for name, figures in zip([*motions, "mean"], every, strict=True):
+        cells = [f"{value:.2f}" if number == 3 else f"{value:.1f}" for number, value in enumerate(figures)]
+        table.add_row(name, *cells)
+    return table
 
 
 def _held_out(people: dict[str, list[Motion]]) -> Table:
@@ -158,7 +201,7 @@ def motion(back: Doubles, knuckle: Doubles, joint: Doubles, lever: float) -> Mot
     shares = np.linalg.norm(turned, axis=1) / np.linalg.norm(bent)
     ranges = [_range(one) for one in (rigid, plain, signed, hinge)]
     figures = [*ranges, 1e3 * float(np.sqrt((off**2).sum(axis=1).mean())), *shares.tolist()]
-    return Motion(figures, bent, turned[0])
+    return Motion(figures, bent, turned[0], signed, flat, whole)
 
 
 if __name__ == "__main__":

@@ -66,6 +66,7 @@ in a take, or its range of motion, between these."""
 _ARCH: Final = {"ring": 0.13, "little": 0.32}
 """Flexion of the metacarpal over that of its finger, from the flat hand: root mean square of nine recorded
 grasps of four people (benchmarks/palm.py). Where one is large the other is, too."""
+_BENT: Final = float(np.deg2rad(50.0))  # the greatest flexion in them; beyond it the arch does not grow
 _METACARPAL: Final = 0.054  # [m] from its hinge to the knuckle, as in benchmarks/palm.py
 CHANGING: Final[dict[Measure, tuple[float, ...]]] = {
     "frame": (0.0, 0.0, 1.39, 0.25, 0.3),
@@ -552,7 +553,8 @@ def pose_spreads(
         _move_points(hand, doubt.errors.numbers, work, moved)
         _shift_markers(hand, doubt.errors.markers, work, shifted)
         for number in range(NUM_NUMBERS - 1):
-            arch[number] = doubt.arch[number] * qpos[frame, 8 + 4 * (number // _OWN)]
+            flexion = min(max(qpos[frame, 8 + 4 * (number // _OWN)], -_BENT), _BENT)
+            arch[number] = doubt.arch[number] * flexion
         _move_points(hand, arch, work, arched)
         for row in range(3 * count):
             for unknown in range(NUM_UNKNOWNS):
