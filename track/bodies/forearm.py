@@ -97,7 +97,6 @@ def wrist_variances(
         inertia = squares.trace(axis1=1, axis2=2)[:, None, None] * np.eye(3) - squares
         by_markers = noise * turns.swapaxes(1, 2) @ np.linalg.inv(inertia) @ turns
         is_less = np.isin(SOURCES, ("gluing", "person")) & (not is_calibrated)
-        shares = np.where(is_less, _SHARE**2, np.array(SOURCES) != "palm")  # a third metacarpal does not arch
-        found[shown] = hand[shown, 1:] * shares
+        found[shown] = hand[shown, 1:] * np.where(is_less, _SHARE**2, 1.0)
         found[shown, :, 0] += by_markers.diagonal(axis1=1, axis2=2)[:, 1:]
     return found

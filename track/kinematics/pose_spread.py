@@ -566,7 +566,9 @@ def pose_spreads(
         _write_variances(hand, doubt, work, noise, by_bones, by_places, off, found[frame])
         spread = jacobian[3 * count :] @ (noise + off.T @ off)
         for unknown in range(NUM_UNKNOWNS):
-            found[frame, unknown, 4] = by_arch[unknown, 0] ** 2
+            # Others move half as far in simulated arches, and not at all in recorded grasps.
+            arches = unknown < NUM_JOINTS and doubt.arch[_OWN * (unknown // 4) + 4, 0] != 0.0
+            found[frame, unknown, 4] = by_arch[unknown, 0] ** 2 if arches else 0.0
         left = moved[3 * count :] - jacobian[3 * count :] @ answers
         bent = arched[3 * count :] - jacobian[3 * count :] @ by_arch
         for keypoint in range(NUM_KEYPOINTS):
