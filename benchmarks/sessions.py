@@ -30,7 +30,7 @@ from handsim import HandSimWarning, load_rig
 from handsim.hand.shape import EVERYBODY, JOINT_NAMES, NUM_JOINTS
 from track import track_capture
 from track.config import HandOrigin
-from track.kinematics.pose_spread import CHANGING, DETECTABLE, measurement_error
+from track.kinematics.pose_spread import CHANGING, DETECTABLE, SOURCES, measurement_error
 from train.simulation.room import RoomConfig, record_take
 from train.simulation.scenes import CalibrationTakeConfig, sample_calibration_scene
 from train.simulation.training_frames import sample_hands, wear_gloves
@@ -68,7 +68,9 @@ def sessions_of(user: int, glove: str, seconds: float, calibrate: bool) -> list[
                 "true": np.rad2deg(take.qpos[:, 0, 7:]),
                 "found": np.rad2deg(found.qpos[:, 0, 7:]),
                 "spread": np.rad2deg(found.angle_spread[:, 0]),
-                "budget": np.array(found.settings["budget"].get("right", np.full((NUM_JOINTS, 4), np.nan))),
+                "budget": np.array(
+                    found.settings["budget"].get("right", np.full((NUM_JOINTS, len(SOURCES)), np.nan))
+                ),
             }
         )
     return made

@@ -71,8 +71,8 @@ def forearm_of_landmarks(body: RigidTemplate, capture: Capture, landmarks: Seque
 
 
 def wrist_variances(
-    take: Take, side: Side, body: int, hand: Float[np.ndarray, "T 3 4"], *, is_calibrated: bool
-) -> Float[np.ndarray, "T 2 4"]:
+    take: Take, side: Side, body: int, hand: Float[np.ndarray, "T 3 5"], *, is_calibrated: bool
+) -> Float[np.ndarray, "T 2 5"]:
     """Variances of a wrist's angles [rad^2] by source, for small deviations and known axes of the forearm.
 
     Args:

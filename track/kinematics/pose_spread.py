@@ -10,7 +10,8 @@
   marker is seen with noise, and tells less the longer it is hidden. The hand model differs from the user's
   hand in the same way in every frame, so that averaging does not help: in its size, marker places, origins
   and directions of digits, and bone lengths. Flesh moves markers slowly, so that averaging over successive
-  frames does not help, either.
+  frames does not help, either. Nor does the palm follow the model, which takes the flexion of the metacarpals
+  of ring and little finger for that of their MCP joints.
 """
 
 from __future__ import annotations
@@ -55,22 +56,30 @@ _DRIFT: Final = 0.014  # [m/sqrt(s)] random walk of a hidden marker
 _ANYWHERE: Final = 0.01  # [1/m^2, 1/rad^2] prior precision of the wrist
 _LEAST_NOISE: Final = 0.0001  # [m] lower bound of a marker's noise
 _LEAST_FREEDOM: Final = 3  # least number of marker coordinates beyond those that a pose needs
-SOURCES: Final = ("noise and gaps", "gluing", "flesh", "person")
+SOURCES: Final = ("noise and gaps", "gluing", "flesh", "person", "palm")
 """Sources of an angle's uncertainty: noisy or unseen markers, their glued places, their motion over the
-bones, and what stays of a person: sizes and directions of bones, gestures unlike other people's."""
+bones, what stays of a person (sizes and directions of bones, gestures unlike other people's), and the arch of
+the palm, which is rigid in the model."""
 Measure = Literal["frame", "mean", "peak", "range"]
 """What of an angle is compared between sessions: its value in a frame, its mean, its 5th or 95th percentile
 in a take, or its range of motion, between these."""
-CHANGING: Final[dict[Measure, tuple[float, float, float, float]]] = {
-    "frame": (0.0, 0.0, 1.39, 0.25),
-    "mean": (0.0, 0.0, 0.73, 0.22),
-    "peak": (0.0, 0.0, 1.56, 0.27),
-    "range": (0.0, 0.0, 2.01, 0.31),
+_ARCH: Final = {"ring": 0.13, "little": 0.32}
+"""Flexion of the metacarpal over that of its finger, from the flat hand: root mean square of nine recorded
+grasps of four people (benchmarks/palm.py). Where one is large the other is, too."""
+_BENT: Final = float(np.deg2rad(50.0))  # the greatest flexion in them; beyond it the arch does not grow
+_METACARPAL: Final = 0.054  # [m] from its hinge to the knuckle, as in benchmarks/palm.py
+CHANGING: Final[dict[Measure, tuple[float, ...]]] = {
+    "frame": (0.0, 0.0, 1.39, 0.25, 0.3),
+    "mean": (0.0, 0.0, 0.73, 0.22, 0.25),
+    "peak": (0.0, 0.0, 1.56, 0.27, 0.5),
+    "range": (0.0, 0.0, 2.01, 0.31, 0.5),
 }
 """Factors by which these parts of an uncalibrated hand's error change between sessions of a person. The rest
 comes from its wrong shape, which stays, and from people's usual gestures, towards which a hand is drawn
 nearly alike; glued places are seen in the part of flesh, as fits make up for most of them. Fitted to two
-sessions of each of 64 simulated people, half in dense19 and half in sparse13 (benchmarks/sessions.py)."""
+sessions of each of 64 simulated people, half in dense19 and half in sparse13 (benchmarks/sessions.py). Those
+of the palm are the standard deviation between a person's grasps over `_ARCH` (0.3), times the ratio of the
+measure to the RMS of usual flexion (0.83, 1.7, 1.7)."""
 DETECTABLE: Final = 1.96 * float(np.sqrt(2.0))
 """Ratio of the minimal detectable difference of two sessions to the standard error of measurement."""
 _OWN: Final = 9  # numbers of a digit: place of its knuckle, its direction, lengths of its bones (3 each)
@@ -120,6 +129,7 @@ class HandDoubt(NamedTuple):
     noise: float  # marker around its place, independent in each frame [m]
     errors: HandErrors  # alike in all frames
     places: Float[np.ndarray, "M 2"]  # of each marker on its bone: along the skin (each way), off it [m]
+    arch: Float[np.ndarray, "46 1"]  # arch of the palm as an error of the numbers, per flexion of each finger
     flesh: float = 0.0  # marker around its place, alike in successive frames [m]
 
 
@@ -371,7 +381,8 @@ def _complete_digits(
 
 def known_hand(digits: Int[np.ndarray, "M"], noise: float) -> HandDoubt:
     """`HandDoubt` of a perfectly known hand whose markers have some noise [m]."""
-    return HandDoubt(noise, _same_markers(digits, np.zeros((NUM_NUMBERS, 1))), np.zeros((len(digits), 2)))
+    numbers, places = np.zeros((NUM_NUMBERS, 1)), np.zeros((len(digits), 2))
+    return HandDoubt(noise, _same_markers(digits, numbers), places, numbers)
 
 
 def hand_doubt(digits: Int[np.ndarray, "M"], origin: HandOrigin) -> HandDoubt:
@@ -383,7 +394,18 @@ def hand_doubt(digits: Int[np.ndarray, "M"], origin: HandOrigin) -> HandDoubt:
     numbers = np.zeros((NUM_NUMBERS, NUM_NUMBERS + count))
     np.fill_diagonal(numbers, [*np.ravel(own), known.size])
     numbers[:-1, NUM_NUMBERS:] = np.kron(np.eye(count), np.repeat([[0.0], [all_bones]], [6, 3], axis=0))
-    return HandDoubt(MARKER_NOISE, _same_markers(digits, numbers), np.tile(known.place, (len(digits), 1)))
+    return known_hand(digits, MARKER_NOISE)._replace(
+        errors=_same_markers(digits, numbers), places=np.tile(known.place, (len(digits), 1))
+    )
+
+
+def _arch() -> Float[np.ndarray, "46 1"]:
+    """The `HandDoubt.arch` of people: metacarpals that turn about the palm's y axis, each at its hinge."""
+    numbers = np.zeros((NUM_NUMBERS, 1))
+    for digit, share in _ARCH.items():
+        first = _OWN * DIGITS.index(digit)
+        numbers[[first + 2, first + 4], 0] = -_METACARPAL * share, share
+    return numbers
 
 
 def errors_of_motions(
@@ -415,6 +437,7 @@ class SpreadModel:
         self._doubt = hand_doubt(digits, origin)
         if errors is not None:
             self._doubt = known_hand(digits, MARKER_NOISE)._replace(errors=errors)
+        self._doubt = self._doubt._replace(arch=_arch())
 
     def of_pose(
         self, qpos: Float[np.ndarray, "27"], unseen: Float[np.ndarray, "M"], rms: float
@@ -441,7 +464,7 @@ class SpreadModel:
         places: Float[np.ndarray, "M 2"] | float = 0.0,
         smoothed: Float[np.ndarray, "S 26 26"] = NOT_SMOOTHED,
         prior: Float[np.ndarray, "20 20"] | None = None,
-    ) -> tuple[Float[np.ndarray, "T 26 4"], Float[np.ndarray, "T 21"]]:
+    ) -> tuple[Float[np.ndarray, "T 26 5"], Float[np.ndarray, "T 21"]]:
         """Variances of all unknowns by `SOURCES` [rad^2, m^2], and standard deviations of keypoints [m].
 
         For smoothed poses are given: flesh motion and RMS errors of marker places, along the skin and off it
@@ -455,18 +478,19 @@ class SpreadModel:
 
 
 def measurement_error(
-    budget: Float[np.ndarray, "*J 4"], origin: HandOrigin, measure: Measure = "frame"
+    budget: Float[np.ndarray, "*J 5"], origin: HandOrigin, measure: Measure = "frame"
 ) -> Float[np.ndarray, "*J"]:
     """Standard error of measurement between sessions of a person, in the unit of deviations by `SOURCES`.
 
     The glove is put on anew for each session. Then a calibrated hand is calibrated anew, too, and all parts
-    of its error change; other measures than a frame keep their ratio to it.
+    of its error but the palm's change; other measures than a frame keep their ratio to it.
     """
-    changing = np.linalg.norm(np.array(CHANGING[measure]) * budget, axis=-1)
+    fitted, palm = budget[..., :-1], CHANGING[measure][-1] * budget[..., -1]
+    changing = np.linalg.norm(np.array(CHANGING[measure][:-1]) * fitted, axis=-1)
     if origin == "calibrated":
-        frame = np.linalg.norm(np.array(CHANGING["frame"]) * budget, axis=-1)
-        return np.asarray(np.linalg.norm(budget, axis=-1) * changing / frame)
-    return np.asarray(changing)
+        frame = np.linalg.norm(np.array(CHANGING["frame"][:-1]) * fitted, axis=-1)
+        changing *= np.linalg.norm(fitted, axis=-1) / frame
+    return np.asarray(np.hypot(changing, palm))
 
 
 def freedom_factor(num_markers: int) -> float:
@@ -501,17 +525,18 @@ def pose_spreads(
     qpos: Float[np.ndarray, "T 27"],
     unseen: Float[np.ndarray, "T M"],
     smoothed: Float[np.ndarray, "S 26 26"],
-) -> tuple[Float[np.ndarray, "T 26 4"], Float[np.ndarray, "T 21"]]:
+) -> tuple[Float[np.ndarray, "T 26 5"], Float[np.ndarray, "T 21"]]:
     """Variance of each unknown by `SOURCES` ([rad^2] or [m^2]), and standard deviation of each keypoint [m].
 
     The unknowns are the joint angles, then position and rotation of the wrist along its own axes. `hand` is
-    from `with_keypoints`. A marker off its place moves the fit as noise does. Errors of the hand move
-    markers, through them the fit, and keypoints also directly.
+    from `with_keypoints`. A marker off its place moves the fit as noise does. Errors of the hand, and the
+    arch of its palm, move markers, through them the fit, and keypoints also directly.
     """
-    found, keypoints = np.empty((len(qpos), NUM_UNKNOWNS, 4)), np.empty((len(qpos), NUM_KEYPOINTS))
+    found, keypoints = np.empty((len(qpos), NUM_UNKNOWNS, 5)), np.empty((len(qpos), NUM_KEYPOINTS))
     count, work, weights = unseen.shape[1], workspace(len(hand.digits)), np.zeros(len(hand.digits))
     ways, posterior = doubt.errors.numbers.shape[1], np.empty((NUM_UNKNOWNS, NUM_UNKNOWNS))
     moved, shifted = np.empty((3 * len(weights), ways)), np.empty((3 * count, ways))
+    arched, arch = np.empty((3 * len(weights), 1)), np.zeros_like(doubt.arch)
     weighted, jacobian = np.empty((3 * count, NUM_UNKNOWNS)), work.jacobian.reshape(-1, NUM_UNKNOWNS)
     work.residuals[:] = 0.0
     for frame in range(len(qpos)):
@@ -527,15 +552,25 @@ def pose_spreads(
         invert_positive(posterior)
         _move_points(hand, doubt.errors.numbers, work, moved)
         _shift_markers(hand, doubt.errors.markers, work, shifted)
+        for number in range(NUM_NUMBERS - 1):
+            flexion = min(max(qpos[frame, 8 + 4 * (number // _OWN)], -_BENT), _BENT)
+            arch[number] = doubt.arch[number] * flexion
+        _move_points(hand, arch, work, arched)
         for row in range(3 * count):
             for unknown in range(NUM_UNKNOWNS):
                 weighted[row, unknown] = weights[row // 3] * jacobian[row, unknown]
         off = weighted @ posterior
         by_bones, by_places = off.T @ moved[: 3 * count], off.T @ shifted
+        by_arch = off.T @ arched[: 3 * count]
         noise, answers = smoothed[frame] if len(smoothed) > 0 else posterior, by_bones + by_places
         _write_variances(hand, doubt, work, noise, by_bones, by_places, off, found[frame])
         spread = jacobian[3 * count :] @ (noise + off.T @ off)
+        for unknown in range(NUM_UNKNOWNS):
+            # Others move half as far in simulated arches, and not at all in recorded grasps.
+            arches = unknown < NUM_JOINTS and doubt.arch[_OWN * (unknown // 4) + 4, 0] != 0.0
+            found[frame, unknown, 4] = by_arch[unknown, 0] ** 2 if arches else 0.0
         left = moved[3 * count :] - jacobian[3 * count :] @ answers
+        bent = arched[3 * count :] - jacobian[3 * count :] @ by_arch
         for keypoint in range(NUM_KEYPOINTS):
             total = 0.0
             for row in range(3 * keypoint, 3 * keypoint + 3):
@@ -543,6 +578,7 @@ def pose_spreads(
                     total += spread[row, unknown] * jacobian[3 * count + row, unknown]
                 for way in range(ways):
                     total += left[row, way] ** 2
+                total += bent[row, 0] ** 2
             keypoints[frame, keypoint] = np.sqrt(max(total, 0.0) / 3.0)
     return found, keypoints
 
@@ -556,7 +592,7 @@ def _write_variances(
     by_bones: Float[np.ndarray, "26 C"],
     by_places: Float[np.ndarray, "26 C"],
     off: Float[np.ndarray, "R 26"],
-    variances: Float[np.ndarray, "26 4"],
+    variances: Float[np.ndarray, "26 5"],
 ) -> None:
     """Write the variances of unknowns [rad^2, m^2]; scales `off` from derivatives by [m] to deviations."""
     # A slipped marker keeps its height over the bone, and the height tells most of the bone's flexion. Errors

@@ -117,7 +117,7 @@ def smooth_take(take: Take) -> Take:
     )
 
 
-def _budget(variances: Float[np.ndarray, "T K 4"]) -> list[list[float]]:
+def _budget(variances: Float[np.ndarray, "T K 5"]) -> list[list[float]]:
     """Root mean square over the known frames of standard deviations of angles by `SOURCES` [deg]."""
     found: list[list[float]] = np.rad2deg(np.sqrt(np.nanmean(variances, axis=0))).round(3).tolist()
     return found
@@ -183,7 +183,7 @@ class _SmoothedHand:
 
     def solve(
         self, windows: Sequence[_Window]
-    ) -> tuple[Float[np.ndarray, "20"], Float[np.ndarray, "T 26 4"]]:
+    ) -> tuple[Float[np.ndarray, "20"], Float[np.ndarray, "T 26 5"]]:
         """Solve all poses; return the cut-off of each angle [Hz] and the unknowns' variances by `SOURCES`."""
         for _ in range(_ROUNDS):
             for window in windows:
@@ -222,7 +222,7 @@ class _SmoothedHand:
             self.angles[kept] = np.sqrt(variances[:, :NUM_JOINTS].sum(axis=-1))
             # How far the prior pulls an unknown stays the same, as the person does.
             pulled = same.diagonal(axis1=1, axis2=2)
-            parts[kept] = variances + pulled[..., None] * [-1.0, 0.0, 0.0, 1.0]
+            parts[kept] = variances + pulled[..., None] * [-1.0, 0.0, 0.0, 1.0, 0.0]
             spreads = alone[:, range(NUM_JOINTS), range(NUM_JOINTS)]
             cutoffs.append((_ACCELERATIONS[:NUM_JOINTS] * self._rate / spreads) ** 0.25 / (2.0 * np.pi))
         return np.median(np.concatenate(cutoffs), axis=0), parts

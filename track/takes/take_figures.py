@@ -196,7 +196,8 @@ def joint_errors(settings: Mapping[str, Any], hand: HandFigures) -> Float[np.nda
     if cutoffs is None or budget is None:
         return np.full((len(JOINTS), len(SOURCES) + len(CHANGING) + 3), np.nan)
     origin = hand_origin(str(settings.get("user", "")), hand.side)
-    errors = np.transpose([measurement_error(np.array(budget), origin, measure) for measure in CHANGING])
+    budget = np.pad(budget, ((0, 0), (0, len(SOURCES) - len(budget[0]))))  # Older takes have no palm.
+    errors = np.transpose([measurement_error(budget, origin, measure) for measure in CHANGING])
     return np.column_stack(
         [np.linalg.norm(budget, axis=1), budget, errors[:, 0], DETECTABLE * errors, cutoffs]
     )

@@ -288,16 +288,18 @@ def _error_section(title: str, settings: Mapping[str, Any], hand: HandFigures) -
     if np.isnan(errors).all():
         return Section(title, "Filter: none, each pose was fitted to the markers of its frame.")
     factors = zip(CHANGING["frame"], SOURCES, strict=True)
-    changing = " and ".join(f"{one:g} times {name}" for one, name in factors if one > 0.0)
+    *changing, palm = (f"{one:g} times {name}" for one, name in factors if one > 0.0)
     text = (
         "Filter: all poses were solved together, forward and backward in time, without a delay. It acts as a "
         "Butterworth filter of second order that runs forward and backward: at the cut-off an oscillation "
         "keeps half of its size. SD [deg]: standard deviation of the angle, the root of the sum of the "
-        "squares of its four parts, each as root mean square over all frames. Gluing is a constant error, as "
+        "squares of its five parts, each as root mean square over all frames. Gluing is a constant error, as "
         "is what stays of the person: sizes and directions of bones, and gestures unlike other people's. "
-        "SEM: standard error of measurement of the angle in a frame between sessions of a person, with the "
-        "glove put on anew: the SD of hands that are calibrated in each session; of other hands from "
-        f"{changing}. MDD: minimal detectable difference of two sessions, 1.96 times the root of two times "
+        "Palm: the metacarpals of ring and little finger flex as these bend, which the model takes for "
+        "motion of their MCP joints; none in the flat hand. SEM: standard error of measurement of the angle "
+        "in a frame between sessions of a person, with the glove put on anew: the other four parts of hands "
+        f"that are calibrated in each session, of other hands {' and '.join(changing)}, and {palm}. MDD: "
+        "minimal detectable difference of two sessions, 1.96 times the root of two times "
         "the SEM, of the angle in a frame, of its mean, of its 5th or 95th percentile (peak), and of its "
         "range of motion between these, each with a SEM of its own."
     )

@@ -114,7 +114,7 @@ def test_a_tracked_wrist_bends_as_it_did_and_knows_how_well(side):
     assert np.sqrt((off**2).mean(axis=0)).max() < 1.0
     ratios = np.abs(off) / np.rad2deg(spreads[there])
     assert 0.3 < np.sqrt((ratios**2).mean()) < 1.0, "the hand is known better than the tracker knows"
-    noise, gluing, flesh, person = np.array(take.settings["wrist_budget"][side]).T
+    noise, gluing, flesh, person, _ = np.array(take.settings["wrist_budget"][side]).T
     assert (noise > 0.1).all() and (np.hypot(gluing, person) > noise).all() and (flesh < noise).all()
 
 

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from gloves import GloveFit, attach, load_layout
 from gloves.fit import nominal_fit
 from handsim import HandModel
-from handsim.hand.model import hand_keypoints
-from handsim.hand.shape import SIDES
+from handsim.hand.model import hand_keypoints, join_qpos
+from handsim.hand.shape import DIGIT_OF_BONE, JOINT_NAMES, SIDES
 from poses import sample_poses
 from track.config import HandOrigin
 from track.kinematics.marker_kinematics import hand_arrays
@@ -23,13 +23,16 @@ from track.kinematics.pose_solver import PoseSolver
 from track.kinematics.pose_spread import (
     NOT_SMOOTHED,
     NUM_NUMBERS,
+    SOURCES,
     HandErrors,
     MarkerPrediction,
+    Measure,
     SpreadModel,
     digit_prior,
     errors_of_motions,
     hand_doubt,
     known_hand,
+    measurement_error,
     pose_spreads,
     predict_joints,
     resting_prior,
@@ -145,6 +148,7 @@ def test_a_digit_that_is_hidden_is_wider_the_longer_and_at_last_as_wide_as_its_p
 def test_measuring_and_calibration_make_them_narrower_and_noise_wider(rng):
     fit = nominal_fit("dense19", "M", "right")
     qpos, seen = sample_poses(fit.model, 5, rng=rng), np.zeros((5, 19))
+    qpos[:, [20, 24]] = 0.0  # MCP flexion of ring and little finger, without which the palm does not arch
     measured = hand_doubt(hand_arrays(fit).digits, "measured").errors
     little = HandErrors(*(0.1 * values for values in measured))
     widest, wide, middle, narrow = (
@@ -158,6 +162,44 @@ def test_measuring_and_calibration_make_them_narrower_and_noise_wider(rng):
     )
     for wider, narrower in pairwise((widest, wide, middle, narrow)):
         assert all((one < other).all() for one, other in zip(narrower, wider, strict=True))
+
+
+@pytest.mark.parametrize("side", SIDES)
+def test_they_are_what_an_arch_of_the_palm_makes_of_the_solver(side):
+    """A tenth of the arch, so that it is small: metacarpals of two fingers turn about their hinges."""
+    fit = nominal_fit("starter30", "M", side)
+    qpos = join_qpos(np.deg2rad([[0.0, 30.0, 25.0, 15.0]] * 5).reshape(1, 20))
+    doubt = SpreadModel(fit, "measured")._doubt
+    noise = known_hand(hand_arrays(fit).digits, 0.001)._replace(arch=doubt.arch)
+    parts, _ = pose_spreads(with_keypoints(fit), NOTHING, noise, qpos, np.zeros((1, 30)), NOT_SMOOTHED)
+    markers, _ = fit.markers(qpos)
+    for digit, share in ((3, 0.13), (4, 0.32)):
+        bones = DIGIT_OF_BONE[fit.attachment.bone_indices] == digit
+        lever = markers[0] - fit.model.skeleton.offsets[1 + 3 * digit] + [0.054, 0.0, 0.0]
+        turn = 0.1 * share * np.deg2rad(30.0) * (fit.attachment.bone_weights * bones).sum(axis=1)
+        markers[0] += turn[:, None] * np.cross([0.0, 1.0, 0.0], lever)
+    found = 10.0 * (PoseSolver(fit).solve(markers, qpos).qpos - qpos)[0, 7:]
+    stated = np.sqrt(parts[0, :20, SOURCES.index("palm")])
+    assert (stated[[13, 17]] > np.deg2rad([4.0, 15.0])).all()
+    assert not stated[:12].any()  # of thumb, index and middle finger
+    np.testing.assert_allclose(np.abs(found[12:]), stated[12:], rtol=0.15, atol=np.deg2rad(1.5))
+
+
+def test_the_arch_of_the_palm_is_of_bent_fingers():
+    fit = nominal_fit("dense19", "M", "right")
+    angles = np.zeros((3, 20))
+    angles[1, [5, 9]], angles[2, [13, 17]] = 0.5, 0.5  # MCP flexion of index and middle, of ring and little
+    parts, _ = SpreadModel(fit, "measured").variances(join_qpos(angles), np.zeros((3, 19)), 0.001)
+    palm = parts[..., SOURCES.index("palm")]
+    assert not palm[:2].any() and JOINT_NAMES[palm[2, :20].argmax()] == "little_MCP_flexion"
+
+
+@pytest.mark.parametrize("origin", get_args(HandOrigin))
+@pytest.mark.parametrize("measure", get_args(Measure))
+def test_the_palm_of_a_person_is_much_the_same_in_each_session(origin, measure):
+    budget = np.array([[1.0, 2.0, 1.0, 2.0, 0.0], [1.0, 2.0, 1.0, 2.0, 10.0]])
+    without, error = measurement_error(budget, origin, measure)
+    assert 2.0 < np.sqrt(error**2 - without**2) <= 5.0
 
 
 def test_a_calibrated_hand_without_stored_errors_is_as_unsure_as_a_measured_one(rng):
