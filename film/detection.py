@@ -32,6 +32,7 @@ _LOOKS: Final = 10.0  # [Hz] how often the detector looks at a video; a take has
 _MOST_FOUND: Final = 8  # hands that MediaPipe may find in a picture
 _SHOWN: Final = 24  # pictures on the contact sheet
 _WIDTH: Final = 320  # of a picture on it [px]
+_DETECTORS: Final = "handsim, mediapipe, a folder of weights or a file of keypoints (.json)"
 _IN_A_MIRROR: Final = {"Left": "right", "Right": "left"}
 """MediaPipe names the sides as a mirror shows them."""
 
@@ -62,12 +63,16 @@ def resolve_detector(
     """The detector of this name, folder of weights or file of found keypoints; the shipped one for None."""
     if isinstance(given, HandDetector | StoredHands):
         return given
-    check_type("detector", given or "", (str, os.PathLike), "mediapipe, handsim, a folder, a .json file")
+    check_type("detector", given or "", (str, os.PathLike), _DETECTORS)
     if given is None or str(given) == "handsim":
         return HandDetector.load()
     if str(given) == "mediapipe":
         return MediaPipeHands()
-    return StoredHands.load(given) if str(given).lower().endswith(".json") else HandDetector.load(given)
+    if str(given).lower().endswith(".json"):
+        return StoredHands.load(given)
+    if not Path(given).is_dir():
+        raise ArgumentError(f"detector is '{given}', expected {_DETECTORS}")
+    return HandDetector.load(given)
 
 
 def find_hands(

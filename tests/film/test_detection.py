@@ -96,6 +96,8 @@ def test_hands_of_a_file_are_found_already(tmp_path):
     assert resolve_detector(hands) is hands
     with pytest.raises(ArgumentError, match="expected handsim, mediapipe or a folder"):
         detect_hands(tmp_path / "a.png", tmp_path / "out.json", detector=hands)
+    with pytest.raises(ArgumentError, match="detector is 'mdiapipe', expected handsim, mediapipe, a folder"):
+        resolve_detector("mdiapipe")
 
 
 def test_sides_of_mediapipe_are_those_of_a_mirror(monkeypatch):
