@@ -50,7 +50,7 @@ MINUTE: Final = 7200  # frames of a person
 ROUND: Final = 3 * MINUTE  # frames that are repeated
 SETTLED: Final = 2400  # frames at the end of a minute in which its hands are measured
 PIECES: Final[tuple[tuple[int, Kind, int], ...]] = (
-    # Person, kind of capture, and frames without points after it: more than a second of them is a pause.
+    # Number of the person, kind of capture, and number of empty frames that follow; 120 or more are a pause.
     (0, "hand-hand", 84),
     (0, "single-hand", 0),
     (0, "hand-hand", 96),
@@ -122,7 +122,7 @@ class CountedServer(ReplayServer):
 
 
 def serve(folder: Path, first: int, count: int, rate: float, port: int, sent: Synchronized[int]) -> None:
-    """Send frames, then wait for the end of this process."""
+    """Send frames until this process is killed."""
     with CountedServer(load_round(folder), first, count, rate, port) as server:
         while True:
             sent.value = first + server.sent
@@ -241,7 +241,7 @@ def judge(folder: Path) -> bool:
 def kept_once(
     folder: Path, take: Take, place: np.ndarray, keypoints: np.ndarray, frames: int
 ) -> Iterator[Check]:
-    """Whether each frame is in the take once, was sent once, and is the same there and in an export."""
+    """Count lost and doubled frames, and compare the keypoints of the messages, the take and an export."""
     recorded, dropped = np.bincount(place, minlength=frames), take.settings["stream"]["dropped_frames"]
     yield "served frames neither in the take nor told as dropped", (recorded == 0).sum() - dropped, 0.0
     yield "frames told as dropped, as the tracker did not keep up [%]", 100.0 * dropped / frames, 0.0

@@ -55,7 +55,7 @@ class Motion(NamedTuple):
     bone: Doubles
     """Flexion of the bone against the back, from the flat hand (T,) [rad]."""
     metacarpal: Doubles
-    """Flexion of the metacarpal, from the flat hand (T,) [rad]."""
+    """Flexion of the metacarpal in each frame (T,) [rad]; zero is the flat hand."""
     signed: Doubles
     """Angle of the bone with the line from the wrist to the knuckle (T,) [rad]."""
     flat: NDArray[np.bool_]
@@ -149,7 +149,7 @@ def _held_out(people: dict[str, list[Motion]]) -> Table:
 
 
 def _cells(squares: list[list[float]], errors: list[list[float]]) -> list[str]:
-    """Explained shares of the motion, and median errors of ranges."""
+    """Cells of a row: how much of the motion a share explains [%], and median errors of ranges [deg]."""
     left, whole, around, spread = np.sum(squares, axis=0)
     explained = [f"{100.0 * (1.0 - one):.0f}" for one in (left / whole, around / spread)]
     return [*explained, *map("{:.1f}".format, np.median(errors, axis=0))]

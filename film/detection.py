@@ -34,7 +34,7 @@ _SHOWN: Final = 24  # pictures on the contact sheet
 _WIDTH: Final = 320  # of a picture on it [px]
 _DETECTORS: Final = "handsim, mediapipe, a folder of weights or a file of keypoints (.json)"
 _IN_A_MIRROR: Final = {"Left": "right", "Right": "left"}
-"""MediaPipe names the sides as a mirror shows them."""
+"""Our names for MediaPipe's sides, which are those of a mirrored picture."""
 
 
 class MediaPipeHands:
@@ -186,7 +186,7 @@ def _in_video(path: Path, finder: HandDetector | MediaPipeHands, progress: Progr
 
 
 def _annotation(image: dict[str, Any], hand: FoundHand) -> dict[str, Any]:
-    """COCO's annotation of a hand that was found, without its id."""
+    """The COCO annotation of a found hand; the caller adds the annotation's id."""
     size = image["width"], image["height"]
     keypoints = keypoint_triples(hand.keypoints, np.ones(NUM_KEYPOINTS, bool), size)
     return {

@@ -56,7 +56,7 @@ from render.config import RenderConfig
 from render.formats.records import encode_jpeg
 from render.frames import Bytes, Doubles, Floats
 from render.photographs import read_photograph
-from render.stream import PictureStream, load_labeled_photographs
+from render.stream import LabeledHand, PictureStream, load_labeled_photographs
 
 BATCH: Final = 32
 BF16: Final = any(torch.cpu.get_capabilities().get(name) for name in ("amx_bf16", "avx512_bf16"))
@@ -80,7 +80,9 @@ _CAMERAS: Final = ("vga", "vga_wide", "vga", "sr300", "kinect2", "d435")
 _SITTING: Final = 16  # pictures of each person
 _FEWEST_SEEN: Final = 4  # keypoints of a hand that must be seen
 _EMPTY: Final = 0.35  # share of the scenes that also give a square without a hand
-_STAGED: Final = 0.5  # share of the drawn pictures that keep their background beside photographs
+_STAGED: Final = (
+    0.5  # share of the drawn pictures that keep their own background, where there are photographs for others
+)
 _DYED: Final = 0.6  # share of the other hands whose color is any
 
 Network = FinderNetwork | KeypointNetwork
@@ -110,7 +112,7 @@ def train_detector(
             Images without an annotation are pictures without hands: what the detector finds there teaches
             what is none, and half of the drawn hands are laid over them. If no image has a hand, keypoints
             stay as they are.
-        samples: Number of squares that the keypoint network learns from; the finder learns from a quarter
+        samples: Number of squares that the keypoint network learns from; the finder learns from half
             as many pictures.
         seed: Seed of pictures, of initial weights and of all random choices.
 
@@ -308,8 +310,10 @@ def _two_hands(count: int, rng: np.random.Generator) -> Doubles:
 def read_scenes(file: Path) -> Iterator[Scene]:
     """Your own photographs with the hands of a file of COCO keypoints, and those without any, by name."""
     hands, empty = load_labeled_photographs(file)
-    for path in sorted({hand.file for hand in hands} | set(empty)):
-        labeled = [hand for hand in hands if hand.file == path]
+    by_file: dict[Path, list[LabeledHand]] = {path: [] for path in empty}
+    for hand in hands:
+        by_file.setdefault(hand.file, []).append(hand)
+    for path, labeled in sorted(by_file.items()):
         keypoints = np.array([hand.keypoints for hand in labeled]).reshape(-1, NUM_KEYPOINTS, 2)
         sides = np.array([hand.side for hand in labeled], dtype=np.int8)
         yield Scene(read_photograph(path), keypoints, sides)

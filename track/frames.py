@@ -267,7 +267,7 @@ class TrackedFrame:
     seconds: float = np.nan
     """Computing time of the tracker [s]; NaN where it was not measured."""
     size_state: str = ""
-    """Why the hands of a live stream are not measured yet, in words; empty if they are, or need not be."""
+    """Why the size of a live stream's hands is not known yet; empty when it is known or was given."""
 
     def hand(self, side: Side) -> TrackedHand:
         """The hand of a side; an `ArgumentError` if none of that side is tracked."""

@@ -127,10 +127,8 @@ def _share_with(job: Job, todo: Sequence[int], processes: LocalProcesses, count:
 
 def _needs_main(job: Job) -> bool:
     """Whether workers have to run the main script for a job; refused where they would do the same as it."""
-    try:
-        if _MAIN.encode() not in pickle.dumps(job):
-            return False
-    except Exception:  # the executor tells what cannot be pickled
+    content = _pickled(job)
+    if content is None or _MAIN.encode() not in content:  # the executor tells what cannot be pickled
         return False
     script = main_script()
     if script is None or not _GUARDED.search(script.read_text(encoding="utf-8", errors="replace")):
@@ -175,7 +173,7 @@ def _share_out(job: Job, todo: Sequence[int], executor: Executor) -> Iterator[in
 
 @contextmanager
 def _told_deaths() -> Iterator[None]:
-    """Tell in one sentence that a worker died, or that all are gone."""
+    """Turn the executor's error for a dead worker, or for workers that are gone, into one sentence."""
     try:
         yield
     except BrokenProcessPool as error:
@@ -257,10 +255,16 @@ def second_process(is_wanted: bool, module: str) -> Iterator[LocalProcesses | No
 
 def can_be_sent(job: Any) -> bool:
     """Whether a process that does not run the main script can be given a job."""
+    content = _pickled(job)
+    return content is not None and _MAIN.encode() not in content
+
+
+def _pickled(job: Any) -> bytes | None:
+    """A job as bytes; None for one that cannot be pickled."""
     try:
-        return _MAIN.encode() not in pickle.dumps(job)
+        return pickle.dumps(job)
     except Exception:  # of any kind, as what the job holds raises it
-        return False
+        return None
 
 
 def _load(module: str) -> None:

@@ -490,7 +490,7 @@ def _drawn(
 
 
 def _moved(camera: Camera, x: float, y: float) -> Camera:
-    """A camera that sees in a pixel's center what this one sees beside and below it [px]."""
+    """The camera with its rays shifted to the right and down [px]."""
     return dataclasses.replace(camera, K=camera.K - [[0.0, 0.0, x], [0.0, 0.0, y], [0.0, 0.0, 0.0]])
 
 

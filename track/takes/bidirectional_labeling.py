@@ -85,7 +85,7 @@ def _both_ways(
     on_count: Callable[[int], None],
     helper: LocalProcesses | None,
 ) -> tuple[_Track, _Track]:
-    """Track the hands through all frames forward and backward."""
+    """Track the hands twice: from the first frame to the last, and from the last to the first."""
     count = len(frames)
     order = range(count)
     if helper is None or not can_be_sent(new_tracker):

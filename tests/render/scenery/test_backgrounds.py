@@ -199,7 +199,7 @@ def test_two_cameras_see_one_place(kind: str, camera: str) -> None:
 
 @pytest.mark.parametrize("name", ["vga", "headset_fisheye"])
 def test_edges_of_rooms_around_cameras_are_smooth(name: str) -> None:
-    """Nearly as the mean over sixteen rays has them."""
+    """A pixel is near the mean of the sixteen pixels of a picture of four times the size."""
     box, (fine, _) = enclose(POSITIONS, 5, LAMP), pair(name)
     small = np.diag([0.25, 0.25, 1.0])
     coarse = dataclasses.replace(fine, size=(fine.size[0] // 4, fine.size[1] // 4), K=small @ fine.K)
