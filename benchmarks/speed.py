@@ -11,7 +11,8 @@ tracker: a frame with two hands, for each kind of capture, of the true hands and
     calibrate them; of hand-hand with a new ID for every point in every frame; a frame in which both hands are
     initialized, and the longest of five frames after a second of darkness.
 labels: one hand with drops and ghosts, alone and in batches; of a glove without weights, and learning it.
-commands: `handsim label` and `handsim track` of captures of 24 and 1,200 frames, and `handsim label --help`.
+commands: what users type, with its defaults, from its start to its end; five times each, with the kernels
+    compiled but for the rows that say otherwise. Captures are of two hands, apart or touching.
 pictures: 640 x 480 of two hands, in one process and in one a core, and written; the stream of training
     pictures.
 generation: training frames of single hands and of the default mix.
@@ -30,9 +31,10 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
+from types import MappingProxyType
 from typing import Final, Literal, get_args
 
 import mujoco
@@ -65,7 +67,7 @@ from train import (
 )
 from train.labelers.storage import OnnxLabeler, export_onnx, load_network
 from train.simulation.generation import make_dataset
-from train.simulation.scenes import KINDS
+from train.simulation.scenes import KINDS, Kind
 
 NEW_GLOVE: Final = Path(__file__).parents[1] / "examples" / "ten_markers.toml"
 WARM_UP: Final = 30  # frames of a tracker that do not count
@@ -73,6 +75,28 @@ NOISE: Final = 3e-4  # of markers [m]
 BEFORE, DARK, AFTER = 60, 120, 5  # frames around a second of darkness
 Section = Literal["tracker", "labels", "commands", "pictures", "generation", "solvers", "rays"]
 CORES: Final = os.cpu_count() or 1
+CAPTURES: Final[tuple[tuple[str, Kind, int], ...]] = (
+    ("short", "single-hand", 24),
+    ("hand", "single-hand", 1632),
+    ("touching", "hand-hand", 1200),
+    ("minute", "hand-hand", 7200),
+)
+RENDER: Final = "render touching.npz --out {out} --num-frames"
+COMMANDS: Final = (
+    ("label_help", "label --help", "label --help"),
+    ("label_first", "label of 24 frames from an empty cache", "label short.c3d --out {out}.trc"),
+    ("label_24", "label of 24 frames", "label short.c3d --out {out}.trc"),
+    ("track_24", "track of 24 frames", "track short.c3d --out {out}.npz"),
+    ("label_1200", "label of 10 s of touching hands", "label touching.c3d --out {out}.trc"),
+    ("track_1200", "track of 10 s of touching hands", "track touching.c3d --out {out}.npz"),
+    ("label_7200", "label of a minute of touching hands", "label minute.c3d --out {out}.trc"),
+    ("track_7200", "track of a minute of touching hands", "track minute.c3d --out {out}.npz"),
+    ("track_calibrate", "track --calibrate of 13.6 s", "track hand.c3d --calibrate --out {out}.npz"),
+    ("render_200", "render of 200 pictures, one process", f"{RENDER} 200 --workers 1"),
+    ("render_600", "render of 600 pictures", f"{RENDER} 600"),
+    ("render_depth", "render of 200 pictures, depth alone", f"{RENDER} 200 --passes depth"),
+    ("generate_60000", "generate of 60,000 frames", "generate --num-frames 60000 --out {out}"),
+)  # fmt: skip
 COMMAND: Final = "import sys; from handsim.cli.main import main; sys.exit(main())"
 
 
@@ -243,22 +267,27 @@ def labels(speeds: Speeds) -> None:
 
 def commands(speeds: Speeds) -> None:
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # users have compiled modules after the first run
-    with tempfile.TemporaryDirectory() as folder:
-        runs = [["label", "--help"]]
-        for frames in (24, 1200):
-            capture = f"{folder}/{frames}.c3d"
-            write_capture(capture, simulate_take(num_frames=frames, seed=speeds.seeds[0]).capture())
-            runs += [[name, capture, "--out"] for name in ("label", "track")]
-        for words in runs:
+    os.environ.pop("NUMBA_NUM_THREADS", None)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        for shown, kind, frames in CAPTURES:
+            take = simulate_take(kind=kind, num_frames=speeds.some(frames, 24), seed=speeds.seeds[0])
+            write_capture(folder / f"{shown}.c3d", take.capture())
+            take.save(folder / f"{shown}.npz")
+        type_in("doctor --compile", folder)
+        for key, what, words in COMMANDS:
             times = []
-            for number in range(1 + speeds.some(7, 1)):
-                out = [f"{folder}/{number}{Path(words[1]).stem}{'.trc' if words[0] == 'label' else '.npz'}"]
-                command = [sys.executable, "-c", COMMAND, *words, *(out if words[-1] == "--out" else [])]
-                times.append(timed(lambda: subprocess.run(command, check=True, capture_output=True)))  # noqa: B023
-            frames_said = "" if words[-1] == "--help" else f" of {Path(words[1]).stem} frames"
-            shown = f"handsim {words[0]}{frames_said or ' --help'}"
-            key = "_".join([words[0], Path(words[1]).stem.strip("-")])
-            speeds.times(key, shown, times[1:])  # the first compiles
+            for number in range(speeds.some(5, 1)):
+                cache = {"NUMBA_CACHE_DIR": f"{folder}/cache{number}"} if "empty cache" in what else {}
+                typed = words.format(out=f"{key}{number}")
+                times.append(timed(functools.partial(type_in, typed, folder, cache)))
+            speeds.times(key, f"handsim {what}", times)
+
+
+def type_in(words: str, folder: Path, environment: Mapping[str, str] = MappingProxyType({})) -> None:
+    """Run a command to its end."""
+    command = [sys.executable, "-c", COMMAND, *words.split()]
+    subprocess.run(command, cwd=folder, env={**os.environ, **environment}, check=True, capture_output=True)
 
 
 def pictures(speeds: Speeds) -> None:
