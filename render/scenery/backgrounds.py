@@ -467,8 +467,8 @@ def _drawn(
         light = np.clip(met.light, 0.0, most).reshape(*shape, 3)
         if not is_map:
 
-            def look(edges: Flags, x: float, y: float) -> Floats:
-                aside = _sloping(_rays(_moved(camera, x, y))[0][edges] @ turn)
+            def look(places: Doubles) -> Floats:
+                aside = _sloping(_known_rays(camera.unproject(places))[0] @ turn)
                 return np.asarray(np.clip(_in_room(background, enclosure, eye, aside).light, 0.0, most))
 
             smooth_edges(light, look)
@@ -489,17 +489,17 @@ def _drawn(
     return Surroundings(depth, walls.reshape(shape), _both_ways(T_world_camera[:3, :3].T), rgb)
 
 
-def _moved(camera: Camera, x: float, y: float) -> Camera:
-    """The camera with its rays shifted to the right and down [px]."""
-    return dataclasses.replace(camera, K=camera.K - [[0.0, 0.0, x], [0.0, 0.0, y], [0.0, 0.0, 0.0]])
-
-
 @functools.lru_cache(maxsize=8)
 def _rays(camera: Camera) -> tuple[Floats, Flags]:
     """Rays (H W, 3) in a camera's axes, and where (H, W) the lens sees; elsewhere rays are arbitrary."""
-    rays = camera.rays()
+    rays, known = _known_rays(camera.rays())
+    return rays.reshape(-1, 3), known
+
+
+def _known_rays(rays: Doubles) -> tuple[Floats, Flags]:
+    """Rays (..., 3) of single precision, arbitrary where the lens sees nothing, and where it sees."""
     known = np.isfinite(rays).all(axis=-1)
-    return np.where(known[..., None], rays, 1.0).reshape(-1, 3).astype(np.float32), known
+    return np.where(known[..., None], rays, 1.0).astype(np.float32), known
 
 
 @functools.lru_cache(maxsize=2)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from handsim.kernels import kernel
 from render.fields import normal_numbers
-from render.frames import Doubles, Flags, Floats, Integers
+from render.frames import Doubles, Floats, Integers
 
 _FURNITURE: Final = (4, 14)  # range of the number of boxes
 _PLAIN, _STRIPES, _TILES, _BOARDS = 3, 0, 1, 2  # patterns of walls
@@ -22,7 +22,7 @@ _FLOORS: Final = (0.25, 0.4, 0.35)  # probabilities of tiles, boards and no patt
 _FLOOR: Final = 4  # number of the floor among the six sides
 _CONTRAST: Final = (0.15, 0.7)  # contrast of a pattern over that of any two paints
 _COLORED: Final = 0.4  # share of paints with a strong color
-_QUARTERS: Final = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))  # four rays of a pixel
+_QUARTERS: Final = np.array([(0.25, 0.25), (0.75, 0.25), (0.25, 0.75), (0.75, 0.75)])  # four rays of a pixel
 _CROSS: Final = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
 _STEP: Final = 0.04  # least difference of the root of light around a pixel that makes an edge
 _FRAME: Final = 0.06  # width of the frame of a picture or window, as a share of its sides
@@ -81,7 +81,7 @@ def draw_room(size: tuple[int, int], seed: int) -> RoomPicture:
     down, across = np.mgrid[:height, :width].reshape(2, -1).astype(np.float32) + np.float32(0.5)
     met = seen(across, down)
     picture = met.light.reshape(height, width, 3).copy()
-    smooth_edges(picture, lambda edges, x, y: seen(across[edges] + x, down[edges] + y).light)
+    smooth_edges(picture, lambda places: seen(*places.T.astype(np.float32)).light)
     grain = normal_numbers((height, width, 1), rng=np.random.default_rng([seed, 1]))
     picture *= np.float32(1.0) + np.float32(0.05) * grain
     aside = ((across - 0.5 * width) ** 2 + (down - 0.5 * height) ** 2) / (scene.focal * height) ** 2
@@ -91,14 +91,15 @@ def draw_room(size: tuple[int, int], seed: int) -> RoomPicture:
     return RoomPicture(light, depth.reshape(shape), met.walls.reshape(shape), scene.focal, scene.axes)
 
 
-def smooth_edges(picture: Floats, look: Callable[[Flags, float, float], Floats]) -> None:
+def smooth_edges(picture: Floats, look: Callable[[Doubles], Floats]) -> None:
     """Give the pixels at edges of a picture (H, W, 3) of linear light the mean of their four quarters.
 
-    `look` has the light (E, 3) of the pixels at edges (H W,), beside and below their centers [px].
+    `look` has the light (N, 3) at columns and rows (N, 2) of the picture [px].
     """
     roots = cv2.sqrt(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY))
-    edges = cv2.morphologyEx(roots, cv2.MORPH_GRADIENT, _CROSS).ravel() > _STEP
-    picture.reshape(-1, 3)[edges] = np.mean([look(edges, x, y) for x, y in _QUARTERS], axis=0)
+    edges = cv2.morphologyEx(roots, cv2.MORPH_GRADIENT, _CROSS) > _STEP
+    places = np.argwhere(edges)[:, ::-1] + _QUARTERS[:, None]
+    picture[edges] = look(places.reshape(-1, 2)).reshape(*places.shape[:2], 3).mean(axis=0)
 
 
 @kernel
