@@ -81,7 +81,7 @@ def draw_room(size: tuple[int, int], seed: int) -> RoomPicture:
     down, across = np.mgrid[:height, :width].reshape(2, -1).astype(np.float32) + np.float32(0.5)
     met = seen(across, down)
     picture = met.light.reshape(height, width, 3).copy()
-    smooth_edges(picture, lambda places: seen(*places.T.astype(np.float32)).light)
+    smooth_edges(picture, lambda places: seen(*places.T.astype(np.float32, order="C")).light)
     grain = normal_numbers((height, width, 1), rng=np.random.default_rng([seed, 1]))
     picture *= np.float32(1.0) + np.float32(0.05) * grain
     aside = ((across - 0.5 * width) ** 2 + (down - 0.5 * height) ** 2) / (scene.focal * height) ** 2
