@@ -1,7 +1,7 @@
 """Writes docs/results.md and docs/trust.md from benchmarks/figures: `python -m benchmarks.results`.
 
 The page's text is results_template.md; `{table5.right_size[1]:.2f}` in it is a number of table5.json, and
-`{speed_times}` and `{speed_rates}` are tables of all of speed.json, and `{speed_run}` says how it was made.
+`{speed_rows_of}` are tables of all of speed.json, and `{speed_run_of}` says how it was made.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from benchmarks.trust import trust_page
 
 PAGE: Final = Path(__file__).resolve().parents[1] / "docs" / "results.md"
 TEMPLATE: Final = Path(__file__).with_name("results_template.md")
+SPEEDS: Final = ("speed", "speed_parts")
 README: Final = (
     "{label_clean.row[0]:.2f} {label_both.row[0]:.2f}",
     "{real_motion.mean[1]:.2f} {real_motion.worst[1]:.2f}",
@@ -36,24 +37,21 @@ def filled(text: str) -> str:
         KeyError: A field names a file that is not there.
         AttributeError: A field names a figure that its file lacks.
     """
-    times, rates = speed_tables()
-    return text.format(**load_figures(), speed_times=times, speed_rates=rates, speed_run=speed_run())
+    speeds = {f"{name}_{part.__name__}": part(name) for name in SPEEDS for part in (run_of, rows_of)}
+    return text.format(**load_figures(), **speeds)
 
 
-def speed_run(folder: Path = FOLDER) -> str:
-    """Where the figures of speed.json come from, in sentences; what the file does not tell is not told."""
-    kept = json.loads((folder / "speed.json").read_text("utf-8"))
+def run_of(name: str, folder: Path = FOLDER) -> str:
+    """Where the figures of a file come from, in sentences; what the file does not tell is not told."""
+    kept = json.loads((folder / f"{name}.json").read_text("utf-8"))
     origin = f"Commit {kept['commit']}, {kept['date']}, `{kept['command']}`; {kept['machine']}."
     return f"{kept['conditions']} {origin}" if "conditions" in kept else origin
 
 
-def speed_tables(folder: Path = FOLDER) -> tuple[str, str]:
-    """The rows of speed.json, with times or rates. Each row ends with its unit, which is left out here."""
-    figures = json.loads((folder / "speed.json").read_text("utf-8"))["figures"]
-    times = [
-        "| what | median [ms] | 99th percentile [ms] | longest [ms] |",
-        "|---|---|---|---|",
-    ]
+def rows_of(name: str, folder: Path = FOLDER) -> str:
+    """Tables of a file of speeds: times, then rates. Each row ends with its unit, which is left out here."""
+    figures = json.loads((folder / f"{name}.json").read_text("utf-8"))["figures"]
+    times = ["| what | median [ms] | 99th percentile [ms] | longest [ms] |", "|---|---|---|---|"]
     rates = ["| what | in a second |", "|---|---|"]
     for key, figure in figures.items():
         if key == "unit":
@@ -61,7 +59,7 @@ def speed_tables(folder: Path = FOLDER) -> tuple[str, str]:
         *shown, _ = figure["value"]
         row = f"| {' | '.join([figure['what'].rsplit(': ', 1)[0], *map(_shown, shown)])} |"
         (times if len(shown) == 3 else rates).append(row)
-    return "\n".join(times), "\n".join(rates)
+    return "\n\n".join("\n".join(table) for table in (times, rates) if len(table) > 2)
 
 
 def _shown(value: float) -> str:

@@ -1,7 +1,7 @@
 """`Settings`: the options of a verb, checked by their annotations wherever they come from.
 
-A verb has one frozen dataclass of them. It is the options of its command, the keyword arguments of its
-function, and the JSON beside its output.
+A verb has one frozen dataclass of them: the keyword arguments of its function and the JSON beside its output.
+Its command has the same options, some of them under words that are easier to type.
 """
 
 from __future__ import annotations

@@ -32,7 +32,7 @@ from handsim.app.output import (
 )
 from handsim.app.workers import check_workers, run_jobs
 from handsim.callbacks import Progress, no_progress
-from handsim.errors import HandSimError, HandSimWarning
+from handsim.errors import ArgumentError, HandSimError, HandSimWarning
 from handsim.files.inputs import load_json
 from handsim.files.outputs import check_free, save_json
 from handsim.files.signals import Stopped, interrupts_bare
@@ -275,15 +275,15 @@ def _noted(out: str | Place, name: str, key: str) -> list[Any]:
 def _check_formats(formats: Sequence[str], config: RenderConfig) -> None:
     for name in formats:
         check_type("a format", name, str, "its name", FORMATS)
-        check_choice(name, FORMATS, noun="format", error=HandSimError)
+        check_choice(name, FORMATS, noun="format")
         if name in WITH_COLORS and "rgb" not in config.passes:
-            raise HandSimError(f"the format {name} needs color pictures; add rgb to the passes")
+            raise ArgumentError(f"the format {name} needs color pictures; add rgb to the passes")
     if config.openxr and not set(WITH_COLORS) & set(formats):
-        raise HandSimError(f"formats are {', '.join(formats)}, expected coco or yolo for openxr's joints")
+        raise ArgumentError(f"formats are {', '.join(formats)}, expected coco or yolo for openxr's joints")
     if config.mano is not None and not set(WITH_COLORS) & set(formats):
-        raise HandSimError(f"formats are {', '.join(formats)}, expected coco or yolo for MANO's parameters")
+        raise ArgumentError(f"formats are {', '.join(formats)}, expected coco or yolo for MANO's parameters")
     if not formats or len(set(formats)) < len(formats):
-        raise HandSimError(f"formats are {', '.join(formats) or 'none'}, expected at least one, each once")
+        raise ArgumentError(f"formats are {', '.join(formats) or 'none'}, expected at least one, each once")
 
 
 def _check_space(out: Path, drawn: int, left: int) -> None:

@@ -53,7 +53,7 @@ _CONTINUOUS: Final = 0.005  # [m] A pair is continuous if distances within a han
 _CORRECTIONS: Final = 2  # times that a take is labeled again because other labels are likelier
 _ANY_RATE: Final = 120.0  # [Hz] Poses and labels do not depend on the rate of a take.
 _WORTH_A_PROCESS: Final = 1500  # frames: labeling them in one direction takes as long as a process starts
-_MOST: Final = 0.5  # Frames are tracked if at least this share of their pairs is continuous.
+_LEAST_CONTINUOUS: Final = 0.5  # Frames are tracked if at least this share of their pairs is continuous.
 
 
 def label_capture(
@@ -140,8 +140,8 @@ def _judged(
 ) -> tuple[Take, TrackerSetup, list[str]]:
     """Label a take, and again with markers elsewhere while an alternative to its labels is likelier.
 
-    Hands that were given or calibrated stay as they are, and a `final` take is not labeled again. The last
-    result is what was changed, in words.
+    Hands that were given or calibrated stay as they are, and so does a take that `is_final`. The last result
+    is what was changed, in words.
     """
     take, changes = label(setup), list[str]()
     judged = judge_take(take)
@@ -402,7 +402,7 @@ def _is_continuous(frames: Sequence[StreamedFrame]) -> bool:
     ]
     chosen = np.unique(np.linspace(0, len(pairs) - 1, min(_COMPARED, len(pairs))).astype(int))
     changes = [change_of_distances(*pairs[number]) for number in chosen]
-    return bool(changes and np.mean([change < _CONTINUOUS for change in changes]) >= _MOST)
+    return bool(changes and np.mean([change < _CONTINUOUS for change in changes]) >= _LEAST_CONTINUOUS)
 
 
 def _parts(progress: Progress, on_step: OnStep) -> OnPart:

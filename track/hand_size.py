@@ -59,7 +59,7 @@ _MARKER_SPREAD: Final = 0.002  # [m] standard deviation of glued markers per axi
 _INDEPENDENT: Final = 4.0  # All frames count as this many: errors of glue and flesh repeat.
 _FRAMES: Final = 8  # frames of each hand in the search of length and breadth
 _PROPORTION_FRAMES: Final = 40  # frames of each hand in the fit of proportions
-_MOST_FRAMES: Final = 0.5  # Measured hands must be found in this share of the frames.
+_LEAST_SHARE: Final = 0.5  # Measured hands must be found in this share of the frames.
 _SOME_FRAMES: Final = 0.1  # The same for hands that fit well: touching hands are seldom initialized.
 _FITS_WELL: Final = 0.00175  # [m] median RMS distance of hands that fit well; false hands have a larger one
 _FEWEST: Final = 3  # A size needs this many frames.
@@ -205,7 +205,7 @@ def _is_found(fit: SizeFit, frames: Sequence[StreamedFrame], sides: Sequence[Sid
     tracker, count = Tracker(fit.hands(sides), labeler), fit.hand.layout.num_markers
     enough = [frame for frame in frames if _are_enough(frame, count)]
     tracked = [tracker.step(frame.points, frame.ids, frame.time).hands for frame in enough]
-    if sum(any(hand.has_pose for hand in hands) for hands in tracked) >= max(1.0, _MOST_FRAMES * len(enough)):
+    if sum(any(hand.has_pose for hand in hands) for hands in tracked) >= max(1.0, _LEAST_SHARE * len(enough)):
         return True
     shown = [[hand.rms for hand in hands if _is_shown(hand, count)] for hands in tracked]
     rms = [one for row in shown for one in row]

@@ -28,8 +28,8 @@ def label(
     """Label the hands in every frame of captures: none, one or two; their columns' names are not used.
 
     Where a frame holds two hands, the columns are called right:ThumbTip and so on, as by handsim track. Of
-    several captures one that cannot be labeled is told, and the others are labeled; what OUT has of the same
-    captures and options stays.
+    several captures those that fail are reported and skipped, and what OUT has of the same captures and
+    options stays.
 
     Args:
         captures: .trc, .c3d, .csv (Motive, Vicon) or .tsv (Qualisys) files, folders searched for them, or the

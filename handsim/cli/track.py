@@ -41,8 +41,8 @@ def track(
 ) -> None:
     """Track hands in a marker capture or a live stream; writes motion, labels and status.
 
-    Corrections that handsim view saved beside OUT are applied again. Of several captures one that cannot be
-    tracked is told, and the others are tracked; what OUT has of the same captures and options stays.
+    Corrections that handsim view saved beside OUT are applied again. Of several captures those that fail are
+    reported and skipped, and what OUT has of the same captures and options stays.
 
     Args:
         captures: A .trc, .c3d, .csv (Motive, Vicon) or .tsv (Qualisys) file, whose names are not used;

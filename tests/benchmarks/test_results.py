@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from benchmarks.record import FOLDER, kept, kept_rows, load_figures, save_figures
-from benchmarks.results import PAGE, README, TEMPLATE, filled, speed_run
+from benchmarks.results import PAGE, README, TEMPLATE, filled, run_of
 
 ROOT = Path(__file__).resolve().parents[2]
 NUMBER = re.compile(r"\d+\.\d+")
@@ -58,9 +58,9 @@ def test_the_sentence_on_a_run_comes_from_what_the_run_saved(tmp_path):
     path = save_figures("speed", {}, tmp_path, "Two processors.")
     origin = json.loads(path.read_text("utf-8"))
     said = f"Commit {origin['commit']}, {origin['date']}, `{origin['command']}`; {origin['machine']}."
-    assert speed_run(tmp_path) == f"Two processors. {said}"
+    assert run_of("speed", tmp_path) == f"Two processors. {said}"
     save_figures("speed", {}, tmp_path)
-    assert speed_run(tmp_path) == said
+    assert run_of("speed", tmp_path) == said
 
 
 def test_what_was_made_is_kept(tmp_path):
