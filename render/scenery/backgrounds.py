@@ -498,7 +498,7 @@ def _rays(camera: Camera) -> tuple[Floats, Flags]:
 
 def _known_rays(rays: Doubles) -> tuple[Floats, Flags]:
     """Rays (..., 3) of single precision, arbitrary where the lens sees nothing, and where it sees."""
-    known = np.isfinite(rays).all(axis=-1)
+    known = np.asarray(np.isfinite(rays).all(axis=-1))
     return np.where(known[..., None], rays, 1.0).astype(np.float32), known
 
 
