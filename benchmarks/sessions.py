@@ -1,6 +1,7 @@
 """Whether two sessions of a person differ as much as the report's minimal detectable differences say.
 
-python -m benchmarks.sessions [--glove dense19] [--users 30] [--seconds 4] [--calibrate] [--store FOLDER]
+python -m benchmarks.sessions [--glove dense19] [--users 30] [--seconds 4] [--calibrate] [--change]
+    [--store FOLDER]
 
 Each simulated user makes one motion of the right hand in two sessions. For each session every marker is glued
 on anew, up to 6 mm off along either direction of the skin, and moves with the flesh by 0.5 to 2 mm (RMS, a
@@ -11,6 +12,11 @@ Errors within the 95 % interval are those of at most 1.96 standard deviations. T
 root mean square, over users, of the difference between the sessions of an angle in a frame, of its mean, of
 its 95th percentile and of the range from its 5th; the forecast one is that of the report, from the parts of
 the standard deviations that change between sessions.
+
+With --change one joint of each digit truly differs between the sessions by 5 to 30 degrees: it is fixed at
+another angle, or its range is smaller in one of them. The found changes are regressed on the true ones, with
+standard errors for persons as the independent units, and the share of changes that exceed the forecast MDD
+(the larger one of the pair) is compared with that of normal errors of this size.
 """
 
 from __future__ import annotations
@@ -20,14 +26,14 @@ import warnings
 from pathlib import Path
 
 import numpy as np
-from scipy.stats import spearmanr
+from scipy.stats import norm, spearmanr
 
 from benchmarks.people import flesh_motion
 from benchmarks.record import Figures, describe, report, run
 from gloves import GloveFit, load_layout
 from gloves.fit import GlovedHand, nominal_fit
 from handsim import HandSimWarning, load_rig
-from handsim.hand.shape import EVERYBODY, JOINT_NAMES, NUM_JOINTS
+from handsim.hand.shape import DIGITS, EVERYBODY, JOINT_NAMES, NUM_JOINTS
 from track import track_capture
 from track.config import HandOrigin
 from track.kinematics.pose_spread import CHANGING, DETECTABLE, SOURCES, measurement_error
@@ -36,6 +42,8 @@ from train.simulation.scenes import CalibrationTakeConfig, sample_calibration_sc
 from train.simulation.training_frames import sample_hands, wear_gloves
 
 GLUED, FLESH = 0.006, (0.0005, 0.002)  # [m]
+CHANGE = (5.0, 30.0)  # [deg]
+GROUPS = {"MCP": (5, 9, 13, 17), "PIP": (6, 10, 14, 18), "DIP": (7, 11, 15, 19), "thumb": (2, 3)}
 Session = dict[str, np.ndarray]
 
 
@@ -47,7 +55,23 @@ def glued(fit: GloveFit, rng: np.random.Generator) -> GloveFit:
     return GloveFit(fit.model, dataclasses.replace(worn, points=worn.points + shifts))
 
 
-def sessions_of(user: int, glove: str, seconds: float, calibrate: bool) -> list[Session]:
+def changed(qpos: np.ndarray, rng: np.random.Generator) -> list[np.ndarray]:
+    """Poses (T, 27) of two sessions between which one flexion of each digit changes, other things alike."""
+    motions = [qpos.copy(), qpos.copy()]
+    for digit in range(len(DIGITS)):
+        joint = 7 + 4 * digit + rng.integers(2 if digit == 0 else 1, 4)
+        angles, change = qpos[:, joint], np.deg2rad(rng.uniform(*CHANGE))
+        low, middle, high = np.percentile(angles, (5.0, 50.0, 95.0))
+        if rng.random() < 0.5:
+            pair = [np.full_like(angles, middle), np.full_like(angles, middle + change)]
+        else:
+            pair = [low + (angles - low) * max(1.0 - change / (high - low), 0.0), angles]
+        for motion, order in zip(motions, rng.permutation(2), strict=True):
+            motion[:, joint] = pair[order]
+    return motions
+
+
+def sessions_of(user: int, glove: str, seconds: float, calibrate: bool, change: bool) -> list[Session]:
     """True and found angles, standard deviations (T, 20) and their parts (20, 4) of both sessions [deg]."""
     rng = np.random.default_rng((user, 56))
     layout = load_layout(glove)
@@ -55,9 +79,11 @@ def sessions_of(user: int, glove: str, seconds: float, calibrate: bool) -> list[
     (worn,) = wear_gloves(layout, [model], along=0.0, around=0.0, rng=rng)
     config = CalibrationTakeConfig(free=seconds, rounds=0)
     scene = sample_calibration_scene((worn,), config, rng=rng)
+    moved_by = scene.hands[0].qpos
+    motions = changed(moved_by, np.random.default_rng((user, 57))) if change else [moved_by] * 2
     made: list[Session] = []
-    for _ in range(2):
-        hand = GlovedHand(glued(worn, rng), scene.hands[0].qpos)
+    for qpos in motions:
+        hand = GlovedHand(glued(worn, rng), qpos)
         moved = flesh_motion(hand.fit.attachment, hand.qpos, rng.uniform(*FLESH), rng=rng)
         moving = dataclasses.replace(scene, hands=(hand,), skin=(moved,))
         take = record_take(moving, load_rig("figure5"), RoomConfig(), {}, rng=rng)
@@ -77,14 +103,15 @@ def sessions_of(user: int, glove: str, seconds: float, calibrate: bool) -> list[
 
 
 def kept_sessions(
-    folder: Path | None, user: int, glove: str, seconds: float, calibrate: bool
+    folder: Path | None, user: int, glove: str, seconds: float, calibrate: bool, change: bool
 ) -> list[Session]:
     """The sessions of a user, read from the folder if it has them, otherwise made and kept there."""
     if folder is None:
-        return sessions_of(user, glove, seconds, calibrate)
-    path = folder / f"{glove}_{seconds:g}_{'calibrated' if calibrate else 'measured'}_{user}.npz"
+        return sessions_of(user, glove, seconds, calibrate, change)
+    kind = ("calibrated" if calibrate else "measured") + ("_changed" if change else "")
+    path = folder / f"{glove}_{seconds:g}_{kind}_{user}.npz"
     if not path.exists():
-        made = sessions_of(user, glove, seconds, calibrate)
+        made = sessions_of(user, glove, seconds, calibrate, change)
         folder.mkdir(parents=True, exist_ok=True)
         names = made[0]
         np.savez_compressed(path, **{name: np.stack([one[name] for one in made]) for name in names})
@@ -103,17 +130,92 @@ def measures(angles: np.ndarray) -> dict[str, np.ndarray]:
     }
 
 
+def responses(pairs: list[list[Session]], origin: HandOrigin, told: np.ndarray) -> Figures:
+    """How much of a true change is found, and how often it exceeds the MDD."""
+    figures: Figures = {}
+    for measure in CHANGING:
+        true, found = (
+            [measures(second[angles])[measure] - measures(first[angles])[measure] for first, second in pairs]
+            for angles in ("true", "found")
+        )
+        limit = np.array(
+            [
+                DETECTABLE * np.max([measurement_error(o["budget"], origin, measure) for o in pair], axis=0)
+                for pair in pairs
+            ]
+        )
+        # A joint is one that changed if it moves otherwise, even where this measure of it is the same.
+        differs = np.array([np.abs(one["true"] - other["true"]).max(axis=0) > 0.1 for one, other in pairs])
+        for group, joints in GROUPS.items():
+            parts = [
+                (true[user][:, joint], found[user][:, joint], user)
+                for user in range(len(pairs))
+                for joint in joints
+                if differs[user, joint] and told[joint]
+            ]
+            x, y = (np.concatenate([part[number] for part in parts]) for number in (0, 1))
+            users = np.concatenate([np.full(len(part[0]), part[2]) for part in parts])
+            x, y, users = (values[np.isfinite(y)] for values in (x, y, users))
+            around = x - x.mean()
+            slope = around @ y / (around @ around)
+            rest = y - y.mean() - slope * around
+            scores = np.bincount(users, around * rest)
+            count = len(set(users.tolist()))
+            error = np.sqrt(count / (count - 1) * (scores @ scores)) / (around @ around)
+            figures[f"{measure}_{group}"] = (
+                f"change of the {measure}, {group}, found on true: slope, its standard error, intercept, SD "
+                "of the rest, largest miss [deg]; joints",
+                [
+                    slope,
+                    error,
+                    y.mean() - slope * x.mean(),
+                    rest.std(ddof=2),
+                    np.abs(y - x).max(),
+                    len(parts),
+                ],
+            )
+        size, change, seen = (
+            np.concatenate(values)
+            for values in (
+                true,
+                found,
+                [np.broadcast_to(row, values.shape) for row, values in zip(limit, true, strict=True)],
+            )
+        )
+        which = np.concatenate(
+            [np.broadcast_to(row, values.shape) for row, values in zip(differs, true, strict=True)]
+        )
+        usable = np.isfinite(change) & told
+        size, change, seen, which = (values[usable] for values in (size, change, seen, which))
+        shift = np.abs(size) / seen * 1.96
+        should = norm.cdf(shift - 1.96) + norm.cdf(-shift - 1.96)
+        calls = (np.abs(change) > seen) & ((np.sign(change) == np.sign(size)) | ~which)
+        figures[f"{measure}_false"] = (
+            f"unchanged joints whose {measure} exceeds the MDD [%]",
+            100.0 * calls[~which].mean(),
+        )
+        for low, high in ((5.0, 10.0), (10.0, 20.0), (20.0, 30.0)):
+            band = which & (np.abs(size) >= low) & (np.abs(size) < high)
+            figures[f"{measure}_{low:g}"] = (
+                f"true changes of the {measure} by {low:g} to {high:g} degrees that exceed the MDD [%]: "
+                "found, forecast; changes",
+                [100.0 * calls[band].mean(), 100.0 * should[band].mean(), int(band.sum())],
+            )
+    return figures
+
+
 def main(
     glove: str = "dense19",
     users: int = 30,
     seconds: float = 4.0,
     calibrate: bool = False,
+    change: bool = False,
     store: Path | None = None,
     save: str | None = None,
 ) -> None:
     warnings.simplefilter("ignore", HandSimWarning)
     print(describe("numba"))
-    pairs = [kept_sessions(store, user, glove, seconds, calibrate) for user in range(users)]
+    pairs = [kept_sessions(store, user, glove, seconds, calibrate, change) for user in range(users)]
     every = [one for pair in pairs for one in pair]
     off = np.concatenate([one["found"] - one["true"] for one in every])
     spread = np.concatenate([one["spread"] for one in every])
@@ -137,6 +239,9 @@ def main(
         ),
         "joints": ("joints with 93 to 97 %", int(((within[told] >= 93.0) & (within[told] <= 97.0)).sum())),
     }
+    if change:
+        report(save, figures | responses(pairs, origin, told))
+        return
     for measure in CHANGING:
         changes = np.concatenate([one[measure] - other[measure] for one, other in both])
         found = 1.96 * np.sqrt(np.nanmean(changes**2, axis=0))[told]
