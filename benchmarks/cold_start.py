@@ -34,7 +34,6 @@ COMMANDS: Final = {
     "evaluate": "evaluate hand.truth.npz",
     "calibrate": "calibrate hand.c3d --size M --out user.json",
 }
-RUN: Final = "import sys; from handsim.cli.main import main; sys.exit(main())"
 RECORD: Final = """
 import gc, json, sys, time
 
@@ -120,7 +119,7 @@ def measure(names: list[str], folder: Path) -> None:
     for name in ["simulate", *(name for name in names if name != "simulate")]:
         environment = {**os.environ, "NUMBA_CACHE_DIR": str(folder / f"cache-{name}")}
         before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
-        command = [sys.executable, "-c", RUN, *COMMANDS[name].split()]
+        command = [sys.executable, "-m", "handsim", *COMMANDS[name].split()]
         subprocess.run(command, cwd=folder, env=environment, stdout=subprocess.DEVNULL, check=True)
         after, wall = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter() - began
         busy = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime

@@ -42,14 +42,14 @@ def filled(text: str) -> str:
 
 
 def run_of(name: str, folder: Path = FOLDER) -> str:
-    """Where the figures of a file come from, in sentences; what the file does not tell is not told."""
+    """The conditions, commit, date, command and machine of a file of figures, in sentences."""
     kept = json.loads((folder / f"{name}.json").read_text("utf-8"))
     origin = f"Commit {kept['commit']}, {kept['date']}, `{kept['command']}`; {kept['machine']}."
     return f"{kept['conditions']} {origin}" if "conditions" in kept else origin
 
 
 def rows_of(name: str, folder: Path = FOLDER) -> str:
-    """Tables of a file of speeds: times, then rates. Each row ends with its unit, which is left out here."""
+    """The tables of a file of speeds: one of times, one of rates, each without the figures in units."""
     figures = json.loads((folder / f"{name}.json").read_text("utf-8"))["figures"]
     times = ["| what | median [ms] | 99th percentile [ms] | longest [ms] |", "|---|---|---|---|"]
     rates = ["| what | in a second |", "|---|---|"]

@@ -56,7 +56,7 @@ def glued(fit: GloveFit, rng: np.random.Generator) -> GloveFit:
 
 
 def changed(qpos: np.ndarray, rng: np.random.Generator) -> list[np.ndarray]:
-    """Poses (T, 27) of two sessions between which one flexion of each digit changes, other things alike."""
+    """Poses (T, 27) of two sessions that differ in one flexion of each digit alone."""
     motions = [qpos.copy(), qpos.copy()]
     for digit in range(len(DIGITS)):
         joint = 7 + 4 * digit + rng.integers(2 if digit == 0 else 1, 4)
@@ -131,77 +131,60 @@ def measures(angles: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def responses(pairs: list[list[Session]], origin: HandOrigin, told: np.ndarray) -> Figures:
-    """How much of a true change is found, and how often it exceeds the MDD."""
+    """How much of a true change between sessions is found, and how often a change exceeds the MDD."""
     figures: Figures = {}
+    # The motion decides which joints (U, 20) changed: a joint at another angle has the same range of motion.
+    differs = np.array([np.abs(one["true"] - other["true"]).max(axis=0) > 0.1 for one, other in pairs])
     for measure in CHANGING:
         true, found = (
             [measures(second[angles])[measure] - measures(first[angles])[measure] for first, second in pairs]
             for angles in ("true", "found")
         )
-        limit = np.array(
-            [
-                DETECTABLE * np.max([measurement_error(o["budget"], origin, measure) for o in pair], axis=0)
-                for pair in pairs
-            ]
-        )
-        # A joint is one that changed if it moves otherwise, even where this measure of it is the same.
-        differs = np.array([np.abs(one["true"] - other["true"]).max(axis=0) > 0.1 for one, other in pairs])
+        errors = [[measurement_error(one["budget"], origin, measure) for one in pair] for pair in pairs]
+        users = np.repeat(np.arange(len(pairs)), [len(rows) for rows in true])
+        limits = DETECTABLE * np.max(errors, axis=1)[users]
+        change, seen = np.concatenate(true), np.concatenate(found)
+        usable = np.isfinite(seen) & told
+        is_changed = differs[users] & usable
         for group, joints in GROUPS.items():
-            parts = [
-                (true[user][:, joint], found[user][:, joint], user)
-                for user in range(len(pairs))
-                for joint in joints
-                if differs[user, joint] and told[joint]
-            ]
-            x, y = (np.concatenate([part[number] for part in parts]) for number in (0, 1))
-            users = np.concatenate([np.full(len(part[0]), part[2]) for part in parts])
-            x, y, users = (values[np.isfinite(y)] for values in (x, y, users))
-            around = x - x.mean()
-            slope = around @ y / (around @ around)
-            rest = y - y.mean() - slope * around
-            scores = np.bincount(users, around * rest)
-            count = len(set(users.tolist()))
-            error = np.sqrt(count / (count - 1) * (scores @ scores)) / (around @ around)
+            some = np.zeros_like(usable)
+            some[:, joints] = is_changed[:, joints]
             figures[f"{measure}_{group}"] = (
                 f"change of the {measure}, {group}, found on true: slope, its standard error, intercept, SD "
                 "of the rest, largest miss [deg]; joints",
                 [
-                    slope,
-                    error,
-                    y.mean() - slope * x.mean(),
-                    rest.std(ddof=2),
-                    np.abs(y - x).max(),
-                    len(parts),
+                    *regression(change[some], seen[some], users[np.nonzero(some)[0]]),
+                    np.abs(seen - change)[some].max(),
+                    int((differs & told)[:, joints].sum()),
                 ],
             )
-        size, change, seen = (
-            np.concatenate(values)
-            for values in (
-                true,
-                found,
-                [np.broadcast_to(row, values.shape) for row, values in zip(limit, true, strict=True)],
-            )
-        )
-        which = np.concatenate(
-            [np.broadcast_to(row, values.shape) for row, values in zip(differs, true, strict=True)]
-        )
-        usable = np.isfinite(change) & told
-        size, change, seen, which = (values[usable] for values in (size, change, seen, which))
-        shift = np.abs(size) / seen * 1.96
-        should = norm.cdf(shift - 1.96) + norm.cdf(-shift - 1.96)
-        calls = (np.abs(change) > seen) & ((np.sign(change) == np.sign(size)) | ~which)
+        unchanged = ~differs[users] & usable
         figures[f"{measure}_false"] = (
             f"unchanged joints whose {measure} exceeds the MDD [%]",
-            100.0 * calls[~which].mean(),
+            100.0 * (np.abs(seen) > limits)[unchanged].mean(),
         )
+        shift = 1.96 * np.abs(change) / limits
+        forecast = norm.cdf(shift - 1.96) + norm.cdf(-shift - 1.96)
+        is_called = (np.abs(seen) > limits) & (np.sign(seen) == np.sign(change))
         for low, high in ((5.0, 10.0), (10.0, 20.0), (20.0, 30.0)):
-            band = which & (np.abs(size) >= low) & (np.abs(size) < high)
+            band = is_changed & (np.abs(change) >= low) & (np.abs(change) < high)
             figures[f"{measure}_{low:g}"] = (
                 f"true changes of the {measure} by {low:g} to {high:g} degrees that exceed the MDD [%]: "
                 "found, forecast; changes",
-                [100.0 * calls[band].mean(), 100.0 * should[band].mean(), int(band.sum())],
+                [100.0 * is_called[band].mean(), 100.0 * forecast[band].mean(), int(band.sum())],
             )
     return figures
+
+
+def regression(x: np.ndarray, y: np.ndarray, users: np.ndarray) -> tuple[float, float, float, float]:
+    """Slope of y on x, its standard error with users as independent units, intercept, and SD of the rest."""
+    around = x - x.mean()
+    slope = around @ y / (around @ around)
+    rest = y - y.mean() - slope * around
+    sums, count = np.bincount(users, around * rest), len(set(users.tolist()))
+    with np.errstate(divide="ignore"):  # one user has no standard error
+        error = np.sqrt(np.divide(count, count - 1) * (sums @ sums)) / (around @ around)
+    return slope, error, y.mean() - slope * x.mean(), rest.std(ddof=2)
 
 
 def main(

@@ -97,7 +97,6 @@ COMMANDS: Final = (
     ("render_depth", "render of 200 pictures, depth alone", f"{RENDER} 200 --passes depth"),
     ("generate_60000", "generate of 60,000 frames", "generate --num-frames 60000 --out {out}"),
 )  # fmt: skip
-COMMAND: Final = "import sys; from handsim.cli.main import main; sys.exit(main())"
 
 
 class Speeds:
@@ -285,8 +284,8 @@ def commands(speeds: Speeds) -> None:
 
 
 def type_in(words: str, folder: Path, environment: Mapping[str, str] = MappingProxyType({})) -> None:
-    """Run a command to its end."""
-    command = [sys.executable, "-c", COMMAND, *words.split()]
+    """Run `handsim` with these words in a folder, and wait until it ends."""
+    command = [sys.executable, "-m", "handsim", *words.split()]
     subprocess.run(command, cwd=folder, env={**os.environ, **environment}, check=True, capture_output=True)
 
 

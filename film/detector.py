@@ -44,9 +44,9 @@ In 176 photographs these are 5 places a picture, with all hands that are found f
 0.1 on (3 places) 5 of 26 are missed.
 """
 _HOPELESS: Final = -3.0
-"""Log-odds of a hand after the first look below which there is no second one.
+"""Least log-odds of a hand, after the first look at a place, for a second look.
 
-In the same photographs half of the places are below; the lowest of 86 finds has -1.9.
+In the same 176 photographs half of the places have less, and the hands that are found have -1.9 or more.
 """
 _LEAST_CONFIDENCE: Final = 0.5
 _SAME: Final = 0.6  # Boxes whose intersection is a larger share of their union are of one hand.

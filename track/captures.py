@@ -53,7 +53,7 @@ _CONTINUOUS: Final = 0.005  # [m] A pair is continuous if distances within a han
 _CORRECTIONS: Final = 2  # times that a take is labeled again because other labels are likelier
 _ANY_RATE: Final = 120.0  # [Hz] Poses and labels do not depend on the rate of a take.
 _WORTH_A_PROCESS: Final = 1500  # frames: labeling them in one direction takes as long as a process starts
-_LEAST_CONTINUOUS: Final = 0.5  # Frames are tracked if at least this share of their pairs is continuous.
+_LEAST_CONTINUOUS: Final = 0.5  # least share of continuous pairs for frames to be tracked
 
 
 def label_capture(

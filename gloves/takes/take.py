@@ -487,7 +487,7 @@ class Take:
         return self.sides.index(side)
 
     def worn(self) -> Iterator[tuple[slice, tuple[GloveFit, ...]]]:
-        """Spans of frames, in order, and the hands that are worn in each."""
+        """The spans of frames that have the same hands, in order, each with its hands."""
         first = 0
         for stop, hands in (*(one[:2] for one in self.former), (self.num_frames, self.hands)):
             if stop > first:
@@ -599,7 +599,7 @@ class Take:
         return np.asarray(np.einsum("tmji,tmj->tmi", rotations, worn.markers(qpos)[0] - seen))
 
     def _parts(self, frames: Int[np.ndarray, "F"]) -> Iterator[tuple[Take, Int[np.ndarray, "K"]]]:
-        """Each span of `worn` as a take, and those of the given increasing frames that lie in it."""
+        """Each span of `worn` as a take, with the numbers in it of the given frames, which increase."""
         for span, _ in self.worn():
             some = frames[(frames >= span.start) & (frames < span.stop)] - span.start
             yield self.cut(span.start, span.stop), some

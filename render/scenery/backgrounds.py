@@ -497,7 +497,7 @@ def _rays(camera: Camera) -> tuple[Floats, Flags]:
 
 
 def _known_rays(rays: Doubles) -> tuple[Floats, Flags]:
-    """Rays (..., 3) of single precision, arbitrary where the lens sees nothing, and where it sees."""
+    """Rays (..., 3) with (1, 1, 1) in place of unknown ones, and which rays (...) are known."""
     known = np.asarray(np.isfinite(rays).all(axis=-1))
     return np.where(known[..., None], rays, 1.0).astype(np.float32), known
 
