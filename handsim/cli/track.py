@@ -189,6 +189,7 @@ def _print_take(out: Path, take: Take, tracked: LiveTake, speed: str, *, live: b
     if user.startswith("calibrated on"):
         lines = user.split("; ")
     lines.append(f"{out}: {tracked.num_frames} frames, {tracked.duration:.1f} s at {take.rate:.4g} Hz")
-    print_line(*lines, *tracked.notes, *summarize(take), speed)
+    print_line(*lines, *tracked.notes)  # The take is written; to judge it takes seconds.
+    print_line(*summarize(take), speed)
     for suspicion in suspicions(take) if live else ():
         warnings.warn(suspicion, HandSimWarning, stacklevel=3)

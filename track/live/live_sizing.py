@@ -1,8 +1,9 @@
 """The size of the hands of a live stream, measured in a separate process while tracking goes on.
 
-Tracking begins with hands of the usual size. They are measured after one second of frames with enough points,
-and again after ten seconds. The tracker adopts a new size in small steps, one per frame, so that no joint
-jumps. After a pause, or if the fit suddenly worsens, the hands may be another person's: measure again.
+Tracking begins with hands of the usual size. They are measured after 0.3 seconds of frames with enough
+points, after twice as many while no hand is found, and once more after ten seconds. The tracker adopts a new
+size in small steps, one per frame, so that no joint jumps. After a pause, or if the fit suddenly worsens, the
+hands may be another person's: measure again.
 """
 
 from __future__ import annotations
@@ -32,13 +33,13 @@ from track.settings import TrackerSetup, TrackSettings
 from track.tracker import Tracker
 from track.user import MEASURED, User
 
-_FIRST: Final = 1.0  # [s] duration of frames with enough points before the first measurement
+_FIRST: Final = 0.3  # [s] duration of frames with enough points before the first measurement
 _ENOUGH: Final = 10.0  # [s] the same for the final measurement
 _LATER: Final = 2.0  # If no hand was found, try again after this multiple of that time.
 _LONGEST_STEP: Final = 0.1  # [s] A longer gap between two frames counts as this much time with hands.
 _MOST_FRAMES: Final = 20_000  # largest number of kept frames; a stream may show no hand for hours
 _PAUSE: Final = 1.0  # [s] without a hand, after which the hands may be another person's
-_SAME: Final = 0.006  # [m] Measurements from one second of the same hands differ by less.
+_SAME: Final = 0.006  # [m] Brief measurements of the same hands differ by less.
 _CALM: Final = 5.0  # [s] time after a measurement over which the usual residual is averaged
 _RECENT: Final = 1.0  # [s] time constant of the newest residual's running mean
 _JUMP: Final = 1.5  # ratio to the usual residual beyond which the hands may be another person's
@@ -83,7 +84,7 @@ class LiveSizing(Closing):
         self._steps: deque[User] = deque()
         self._before: tuple[TrackedFrame, TrackedFrame] | None = None  # tracked and shown
         self._is_easing = self._is_resized = False  # Is the next frame the first of another size?
-        self._judges = False  # Are labels judged after one second, too?
+        self._judges = False  # Are labels judged in a brief measurement, too?
 
     @property
     def is_settled(self) -> bool:
@@ -97,7 +98,7 @@ class LiveSizing(Closing):
         if self._is_measured or nobody_came or not self._setup.is_auto:
             return ""
         if self._measuring is None:
-            return self._reason or f"not measured yet: seen for {self._shown:.1f} of {self._due:.0f} s"
+            return self._reason or f"not measured yet: seen for {self._shown:.1f} of {self._due:.1f} s"
         has_time = monotonic() < self._begun + _USUAL_TIME
         return "being measured" if has_time else "not measured yet: no processor time"
 
@@ -165,7 +166,7 @@ class LiveSizing(Closing):
     def _begin_measuring(self, user: User) -> None:
         """Start to measure the hands in the frames so far."""
         self._is_late, self._is_brief = False, self._shown < _ENOUGH
-        self._due = max(_ENOUGH, _LATER * self._shown)
+        self._due = _LATER * self._shown
         self._frames, self._begun = sample_frames(self._frames), monotonic()
         processes = self._processes or self._start_process()
         self._measuring = processes.submit(
@@ -193,6 +194,8 @@ class LiveSizing(Closing):
             self._reason = "not measured yet: no hand was found"
             return
         self._is_measured, self._is_first = not self._is_late, False
+        if self._is_measured:
+            self._due, self._seen = max(self._due, _ENOUGH), max(self._seen, self._last)
         self._judges = self._judges or found.is_relabeled
         self._is_done, self._calm, self._usual = not self._is_brief, 0.0, 0.0
         before, after = (one[0].shape.length for one in (tracker.user, found.users[-1]))
