@@ -46,13 +46,16 @@ class _Tolerances(NamedTuple):
     tight: float  # of the points that a pose is fitted to
     search: float  # in a search
     tightest: float  # in a search that matches three points, maybe by chance
+    kept: float  # of points that keep their IDs, from their place or from each other's distances
 
 
-_RIGID: Final = _Tolerances(0.003, 0.001, 0.001, 0.0005)
+_RIGID: Final = _Tolerances(0.003, 0.001, 0.001, 0.0005, 0.003)
 """Tolerances of objects: ten times the noise of a good system."""
-_SKIN: Final = _Tolerances(0.005, 0.004, 0.002, 0.001)
-"""Tolerances of a forearm, whose skin moves markers by 1 to 2 mm. Five markers of a recorded one, two of them
-at the epicondyles, are labeled in all frames; with 2 mm as `tight` and 3 mm as `gate` in 57 % of them."""
+_SKIN: Final = _Tolerances(0.005, 0.004, 0.002, 0.001, 0.02)
+"""Tolerances of a forearm, whose skin moves markers by 1 to 2 mm, and one amid the muscles by up to 20. Five
+markers of a recorded one, two of them at the epicondyles, are labeled in all frames; with 2 mm as `tight` and
+3 mm as `gate` in 57 % of them. Four markers, one of them amid the muscles, are labeled in all frames; in 75 %
+if no point is `kept`."""
 _LEAST_WIDTH: Final = 0.005  # [m] least RMS distance of the markers from their best line
 _LEAST_MARKER_DISTANCE: Final = 2.0 * _RIGID.gate  # [m] Closer markers could exchange labels.
 _LONGEST_COAST: Final = 0.026  # [s] longest prediction (three frames at 120 Hz) without three markers
@@ -166,7 +169,7 @@ class BodyFrame:
 
     status: Status
     """`found` in the first frame after being lost, then `tracked`; `coasting` for a few frames with fewer
-    than three seen markers and a predicted pose; `lost`."""
+    than three seen markers and a predicted pose; `lost`, where two points may still have labels."""
     T_world_body: Float[np.ndarray, "4 4"] | None  # None when lost; translation in [m]
     labels: Int[np.ndarray, "N"]  # index of each point's marker in the template, -1 for all others
     rms: float  # RMS distance of the labeled points from their markers [m]; NaN without labeled points
@@ -204,16 +207,18 @@ class BodyTracker:
             if frame is not None:
                 return frame
             self._lose()
-        return self._initialize(points, ids, time, elapsed)
+        carried = self._carried(points, ids)
+        return self._initialize(points, ids, time, elapsed, carried)
 
     def _reset(self) -> None:
         self._pose, self._velocity, self._time = np.full(7, np.nan), np.zeros(6), -np.inf  # of the last fit
         self._most_markers, self._fits = 0, 0  # since initialization: most markers in a fit, fits
+        self._last_ids = np.full(len(self._positions), -1)  # IDs of the markers' points in the last frame
+        self._places = self._positions.copy()  # where each marker was when last kept [m]
         self._lose()
 
     def _lose(self) -> None:
         self._status: Status = Status.LOST
-        self._last_ids = np.full(len(self._positions), -1)  # IDs of the markers' points in the last frame
         self._candidate, self._confirmed = np.full(7, np.nan), 0
 
     def _track(
@@ -232,16 +237,14 @@ class BodyTracker:
             # Three points may match three markers by chance: a larger match elsewhere is right.
             other = self._match(points)
             if other.num_points > FEWEST:
-                return self._accept(Status.INITIALIZED, other, ids, time)
-        return self._accept(Status.TRACKED, match, ids, time)
+                return self._accept(Status.INITIALIZED, other, points, ids, time)
+        return self._accept(Status.TRACKED, match, points, ids, time)
 
     def _coast(self, points: NDArray[np.float64], ids: NDArray[np.int64], elapsed: float) -> BodyFrame | None:
         """Predict the body's pose, for at most `_LONGEST_COAST` seconds; None after that."""
         if not 0.0 < elapsed <= _LONGEST_COAST or self._fits < _VELOCITY_FITS:
             return None
-        pose = self._predict(elapsed)
-        there = (self._last_ids[:, None] == ids) & (ids >= 0)
-        assignment, rms = np.where(there.any(axis=1), there.argmax(axis=1) if len(ids) else -1, -1), np.nan
+        pose, assignment, rms = self._predict(elapsed), self._last_points(ids), np.nan
         seen = np.flatnonzero(assignment >= 0)
         if len(seen):  # One or two points shift the body if they agree with its pose.
             off = points[assignment[seen]] - transform_markers(self._positions, pose)[seen]
@@ -253,29 +256,50 @@ class BodyTracker:
             else:
                 assignment[:] = -1
         self._status = Status.COASTING
-        return self._result(_Match(len(seen), rms, pose, assignment), ids)
+        return self._result(_Match(len(seen), rms, pose, assignment), points, ids)
+
+    def _last_points(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Index of the point (Q,) with the ID that each marker's point had in the last frame, -1 for none."""
+        there = (self._last_ids[:, None] == ids) & (ids >= 0)
+        return np.where(there.any(axis=1), there.argmax(axis=1) if len(ids) else -1, -1)
+
+    def _carried(self, points: NDArray[np.float64], ids: NDArray[np.int64]) -> NDArray[np.int64]:
+        """The same for a body without a pose: two or more points that keep their distances, too."""
+        assignment = self._last_points(ids)
+        seen = np.flatnonzero(assignment >= 0)
+        there = points[assignment[seen]]
+        apart = np.linalg.norm(there[:, None] - there, axis=-1) - self._distances[np.ix_(seen, seen)]
+        is_kept = len(seen) > 1 and np.abs(apart).max() <= self._tolerances.kept
+        return assignment if is_kept else np.full(len(assignment), -1)
 
     def _initialize(
-        self, points: NDArray[np.float64], ids: NDArray[np.int64], time: float, elapsed: float
+        self,
+        points: NDArray[np.float64],
+        ids: NDArray[np.int64],
+        time: float,
+        elapsed: float,
+        carried: NDArray[np.int64],
     ) -> BodyFrame:
-        """Search the body near its predicted pose, then anywhere."""
+        """Search the body near its predicted pose, then anywhere; `carried` points need no confirmation."""
         if 0.0 < elapsed <= _LONGEST_PREDICTION:
             radius = self._search_radius(elapsed)
             match = self._match(points, self._predict(elapsed), radius)
             if match.num_points > FEWEST or (match.num_points == FEWEST and radius <= _CONFIDENT_RADIUS):
-                return self._accept(Status.INITIALIZED, match, ids, time)
+                return self._accept(Status.INITIALIZED, match, points, ids, time)
         match = self._match(points)
         if match.num_points >= FEWEST:
+            if ((match.assignment == carried) & (carried >= 0)).sum() > 1:
+                return self._accept(Status.INITIALIZED, match, points, ids, time)
             there = transform_markers(self._positions, match.pose)
             before = transform_markers(self._positions, self._candidate)
             moved = np.linalg.norm(there - before, axis=1).max()
             self._confirmed = self._confirmed + 1 if moved < _MOST_CANDIDATE_MOTION else 1
             self._candidate = match.pose
             if self._confirmed >= _frames_to_confirm(match.num_points, len(self._positions)):
-                return self._accept(Status.INITIALIZED, match, ids, time)
+                return self._accept(Status.INITIALIZED, match, points, ids, time)
         else:
             self._confirmed = 0
-        return BodyFrame(Status.LOST, None, np.full(len(points), -1), np.nan)
+        return BodyFrame(Status.LOST, None, self._labels(carried, ids), np.nan)
 
     def _predict(self, elapsed: float) -> NDArray[np.float64]:
         """Predict the pose after some time [s] with constant velocity."""
@@ -291,7 +315,7 @@ class BodyTracker:
         self, points: NDArray[np.float64], near: NDArray[np.float64] | None = None, radius: float = np.inf
     ) -> _Match:
         """The unique match of the markers, within a radius [m] of a pose or anywhere."""
-        gate, tight, search, tightest = self._tolerances
+        gate, tight, search, tightest, _ = self._tolerances
         pose, assignment = self._no_match
         expected = self._positions if near is None else transform_markers(self._positions, near)
         if len(points) > _MOST_SEARCHED_POINTS:
@@ -311,7 +335,14 @@ class BodyTracker:
         """Buffers for a pose and an assignment."""
         return np.empty(7), np.full(len(self._positions), -1)
 
-    def _accept(self, status: Status, match: _Match, ids: NDArray[np.int64], time: float) -> BodyFrame:
+    def _accept(
+        self,
+        status: Status,
+        match: _Match,
+        points: NDArray[np.float64],
+        ids: NDArray[np.int64],
+        time: float,
+    ) -> BodyFrame:
         """Update pose and velocity from a fit."""
         elapsed = time - self._time
         if status == Status.INITIALIZED:
@@ -322,18 +353,41 @@ class BodyTracker:
         self._fits += 1
         self._pose, self._time, self._status = match.pose, time, status
         self._most_markers = max(self._most_markers, int((match.assignment >= 0).sum()))
-        return self._result(match, ids)
+        return self._result(match, points, ids)
 
-    def _result(self, match: _Match, ids: NDArray[np.int64]) -> BodyFrame:
-        """The result of a fit; stores the IDs for the next frame."""
-        seen, labels = np.flatnonzero(match.assignment >= 0), np.full(len(ids), -1)
-        labels[match.assignment[seen]] = seen
-        self._last_ids[:] = -1
-        self._last_ids[seen] = ids[match.assignment[seen]]
+    def _result(self, match: _Match, points: NDArray[np.float64], ids: NDArray[np.int64]) -> BodyFrame:
+        """The result of a fit; points beside it that keep their IDs, near their places, keep their labels."""
+        self._keep(match, points, ids)
         transform = np.eye(4)
         write_quaternion_matrix(transform, *match.pose[3:])
         transform[:3, 3] = match.pose[:3]
-        return BodyFrame(self._status, transform, labels, match.rms)
+        return BodyFrame(self._status, transform, self._labels(match.assignment, ids), match.rms)
+
+    def _keep(self, match: _Match, points: NDArray[np.float64], ids: NDArray[np.int64]) -> None:
+        """Label points beside a fit that keep their IDs, or are where such a marker was last."""
+        if (match.assignment >= 0).all() or not len(points):
+            return
+        there, last = transform_markers(self._positions, match.pose), self._last_points(ids)
+        before = transform_markers(self._places, match.pose)
+        rotation = np.empty((3, 3))
+        write_quaternion_matrix(rotation, *match.pose[3:])
+        for marker in np.flatnonzero(match.assignment < 0):
+            point = last[marker]
+            if point < 0 and (self._places[marker] != self._positions[marker]).any():
+                off = np.linalg.norm(points - before[marker], axis=1)
+                point = off.argmin() if off.min() <= self._tolerances.gate else -1
+            is_near = np.linalg.norm(points[point] - there[marker]) <= self._tolerances.kept
+            if point >= 0 and is_near and point not in match.assignment:
+                match.assignment[marker] = point
+                self._places[marker] = (points[point] - match.pose[:3]) @ rotation
+
+    def _labels(self, assignment: NDArray[np.int64], ids: NDArray[np.int64]) -> NDArray[np.int64]:
+        """The marker (N,) of each point, -1 for none; stores the IDs for the next frame."""
+        seen, labels = np.flatnonzero(assignment >= 0), np.full(len(ids), -1)
+        labels[assignment[seen]] = seen
+        self._last_ids[:] = -1
+        self._last_ids[seen] = ids[assignment[seen]]
+        return labels
 
 
 def _frames_to_confirm(count: int, markers: int) -> float:

@@ -175,6 +175,44 @@ def test_a_body_coasts_a_little_and_is_found_again_where_it_was(rng):
     assert (words[10].labels >= 0).sum() == 1, "the marker that is left"
 
 
+@pytest.mark.parametrize("has_moved", [False, True])
+def test_two_of_three_markers_keep_labels_and_find_the_body_at_once(rng, has_moved):
+    """The third is away for half a second, in which the body moves too far to be searched near its place."""
+    body = RigidTemplate("three", ("a", "b", "c"), np.array([[0, 0, 0], [0.05, 0, 0], [0, 0.08, 0]]))
+    tracker, pose = BodyTracker(body), transform(rng)
+    for number in range(90):
+        pose[:3, 3] += (0.003, 0.0, 0.0)
+        is_away = 20 <= number < 80
+        points, labels = seen(body, pose, rng, without=(2,) if is_away else (), strays=0)
+        if is_away and has_moved:  # An exchanged ID is no marker of the body.
+            points[labels == 1] += (0.0, 0.2, 0.0)
+        ids = np.where(labels == 2, 2 + number // 50, labels)
+        frame = tracker.step(points, ids, number * STEP)
+        assert not is_away or number < 24 or frame.status == Status.LOST
+        if number >= 10 and not has_moved:
+            np.testing.assert_array_equal(frame.labels, labels)
+        elif number >= 24 and is_away:
+            assert (frame.labels < 0).all()
+        if number == 80:
+            assert (frame.status == Status.INITIALIZED) != has_moved
+
+
+@pytest.mark.parametrize("forearm", ["right", None])
+def test_a_marker_amid_the_muscles_of_a_forearm_keeps_its_label(rng, forearm):
+    places = np.array([[0, 0, 0], [0.06, 0, 0], [0.02, 0.05, 0], [0.15, 0.02, 0.03], [0.1, 0.04, 0.0]])
+    tracker, pose = BodyTracker(RigidTemplate("arm", tuple("abcde"), places, None, forearm)), transform(rng)
+    for number in range(60):
+        away = 0.012 * min(number / 20, 1.0) if number < 50 else 0.03
+        points, labels = seen(tracker.template, pose, rng, strays=0)
+        points[labels == 3] += (0.0, away if number not in {40, 41} else 1.0, 0.0)
+        ids = np.where(labels == 3, 30 + number // 40, labels)  # It is seen again as another point.
+        frame = tracker.step(points, ids, number * STEP)
+        np.testing.assert_array_equal(frame.labels[labels != 3], labels[labels != 3])
+        if number >= 20:
+            is_kept = forearm == "right" and number < 50 and number not in {40, 41}
+            assert (frame.labels[labels == 3] == (3 if is_kept else -1)).all(), number
+
+
 def test_three_markers_near_where_it_was_find_it_again(rng):
     body, pose = template("box"), transform(rng)
     tracker, words = BodyTracker(body), []
