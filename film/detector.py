@@ -38,7 +38,7 @@ _WRIST, _INDEX, _KNUCKLE, _LITTLE = 0, 5, 9, 17  # keypoints: the wrist, and whe
 MOST_BYTES: Final = 1 << 26  # of a file of weights
 _MOST_FOUND: Final = 8  # places in a picture at which hands are looked for
 _LEAST_HEAT: Final = 0.07
-"""Of a place at which a hand is looked for.
+"""Least heat at a place where the keypoint network looks for a hand.
 
 In 176 photographs these are 5 places a picture, with all hands that are found from 0.04 on (7 places); from
 0.1 on (3 places) 5 of 26 are missed.

@@ -85,7 +85,7 @@ class LearnedGlove:
     spreads: Float[np.ndarray, "M"]
     """How far each marker's place differs between the hands and the layout, root mean square [m]."""
     sure: Float[np.ndarray, "M"]
-    """Probability of each marker's place: that no other hand fits as well with it elsewhere."""
+    """Probability that each marker is where the layout has it, not where another hand fits as well."""
     doubt: tuple[str, ...]
     """Sentences on places that are unsure, and on columns that exchange their markers."""
 

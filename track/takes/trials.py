@@ -29,7 +29,7 @@ FIGURES: Final = (
 )
 """What is told of a joint in a cycle; velocities have their signs, so that the least is that of extension."""
 _RISE, _REST = 0.5, 0.2
-"""In a cycle a joint goes up and down by this share of its range; it begins in this lowest part of it."""
+"""In a cycle a joint rises and falls by at least this share of its range, from the lowest part of it on."""
 _LEAST_RANGE: Final = 10.0  # [deg] A joint that moves less has no cycles.
 _MEASURED: Final = 0.9  # share of a cycle's frames in which a joint is measured, so that the cycle counts
 _TARGETS: Final = {

@@ -468,19 +468,15 @@ class SideClassifier:
         vote, most = _vote(markers, self._fours, self._votes)
         return ("left" if vote < 0.0 else "right"), abs(vote) / most if most else 0.0
 
-    def recognized(self, hands: Float[np.ndarray, "T M 3"], side: Side) -> Bool[np.ndarray, "T"]:
-        """Whether the side of each hand is recognized with true labels; NaN for missing markers."""
-        labels = np.arange(self._num_markers)
-        return np.array([self.classify(hand, labels)[0] == side for hand in hands], dtype=np.bool_)
-
 
 def is_mirror_like(layout: MarkerLayout) -> bool:
     """Whether a layout is nearly its own mirror image, so that true labels do not always show the side."""
     if any(one.bone.startswith("thumb") for one in layout.markers):
         return False  # A thumb always shows the side.
     rng = np.random.default_rng(0)
-    classifier = SideClassifier(layout, rng=rng)
-    return bool(classifier.recognized(_right_hands(layout, "M", rng), "right").mean() < _RECOGNIZED)
+    classifier, labels = SideClassifier(layout, rng=rng), np.arange(layout.num_markers)
+    sides = [classifier.classify(hand, labels)[0] for hand in _right_hands(layout, "M", rng)]
+    return sides.count("right") < _RECOGNIZED * len(sides)
 
 
 def _right_hands(layout: MarkerLayout, size: str, rng: np.random.Generator) -> NDArray[np.float64]:

@@ -100,7 +100,7 @@ def setting(settings: Kind, name: str) -> Any:
 
 
 def _free(settings: Kind, values: Mapping[str, Any]) -> dict[str, Any]:
-    """Those values, with four digits, whose settings are the defaults."""
+    """The values, to four digits, of settings that still have their defaults."""
     usual = type(settings)()
     rounded = {
         name: float(f"{value:.4g}") if isinstance(value, float) else value for name, value in values.items()
@@ -113,7 +113,7 @@ def _words(value: Any) -> str:
 
 
 def _ratio(wanted: float | None, made: float | None) -> float:
-    """By what a setting is multiplied to make what is wanted."""
+    """Factor from the figure that was made to the wanted one."""
     if wanted is None or made is None:
         return 1.0
     return float(np.clip(wanted / max(made, 1e-12), 1 / _LARGEST, _LARGEST))
