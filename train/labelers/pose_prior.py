@@ -15,7 +15,7 @@ from itertools import combinations
 from typing import Final, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int
+from jaxtyping import Float, Float32, Int
 from numpy.typing import NDArray
 
 from gloves.layout import MarkerLayout
