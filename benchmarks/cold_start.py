@@ -23,12 +23,16 @@ from typing import Any, Final
 from benchmarks.record import describe
 from handsim.app.compiling import LIST
 
-# In the order of the recording; a later command may read what an earlier one wrote.
+# In the order of the recording; a later command may read what an earlier one wrote. Names begin with the
+# command's.
 COMMANDS: Final = {
     "simulate": "simulate --kind hand-hand --num-frames 240 --seed 3 --out hand.c3d",
+    "simulate calibration": "simulate --kind calibration --num-frames 300 --seed 3 --out minute.c3d",
     "label": "label hand.c3d --out labeled.trc",
     "track": "track hand.c3d --out take.npz",
     "render": "render hand.truth.npz --num-frames 4 --workers 1 --seed 5 --out pictures",
+    "render orbit": "render hand.truth.npz --num-frames 4 --workers 1 --placement orbit --background plain "
+    "--out orbit",
     "generate": "generate --num-frames 500 --workers 1 --seed 1 --out set",
     "demo": "demo --num-frames 500 --out demo",
     "evaluate": "evaluate hand.truth.npz",
@@ -115,7 +119,7 @@ def type_row(kind: Any, table: list[Any]) -> int:
 
 def measure(names: list[str], folder: Path) -> None:
     """Print what each command costs with an empty cache of its own."""
-    print(f"{'command':12}{'wall [s]':>9}{'processor [s]':>15}{'kernels':>9}")
+    print(f"{'command':22}{'wall [s]':>9}{'processor [s]':>15}{'kernels':>9}")
     for name in ["simulate", *(name for name in names if name != "simulate")]:
         environment = {**os.environ, "NUMBA_CACHE_DIR": str(folder / f"cache-{name}")}
         before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
@@ -124,7 +128,7 @@ def measure(names: list[str], folder: Path) -> None:
         after, wall = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter() - began
         busy = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
         kernels = len(list((folder / f"cache-{name}").rglob("*.nbc")))
-        print(f"{name:12}{wall:9.1f}{busy:15.1f}{kernels:9}", flush=True)
+        print(f"{name:22}{wall:9.1f}{busy:15.1f}{kernels:9}", flush=True)
 
 
 def record(names: list[str], folder: Path) -> None:
@@ -143,7 +147,7 @@ def record(names: list[str], folder: Path) -> None:
         called = {place for places in calls.values() for place in places}
         for row in seconds:
             if row in calls or json.loads(row)[0] in called:
-                users.setdefault(row, set()).add(name)
+                users.setdefault(row, set()).add(name.split()[0])
         kernels = [
             [*json.loads(row), round(took, 2), " ".join(sorted(users.get(row, ())))]
             for row, took in sorted(seconds.items())

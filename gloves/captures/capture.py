@@ -31,6 +31,10 @@ _MIN_FRAMES: Final = 10  # Small or wide clouds count in this many frames; fewer
 _SAMPLED: Final = 200  # frames that are looked at, evenly spread
 
 
+OF_ARRAYS: Final = "gloves.Capture(names, positions, rate) makes a capture of arrays (docs/marker_files.md)"
+"""What helps somebody whose positions are arrays."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Capture:
     """Trajectories of a marker file: at least one frame and one trajectory.
@@ -69,6 +73,8 @@ class Capture:
             )
         if np.isinf(positions).any():
             raise CaptureError("positions hold infinite values, expected finite numbers or NaN")
+        if isinstance(self.rate, np.ndarray) and not self.rate.ndim:  # a number in an archive of NumPy
+            object.__setattr__(self, "rate", self.rate.item())
         check_rate(self.rate)
         positions[np.isnan(positions).any(axis=-1)] = np.nan  # two coordinates do not make a point
         object.__setattr__(self, "positions", positions)

@@ -38,6 +38,7 @@ from numpy.typing import NDArray
 from gloves.captures.c3d import read_c3d, write_c3d
 from gloves.captures.capture import (
     AT_ORIGIN,
+    OF_ARRAYS,
     Capture,
     all_at_origin,
     select_hands,
@@ -105,8 +106,10 @@ _UNREAD: Final = {
     ".tak": "a take of Motive, a closed format; export CSV or C3D with unlabeled markers from Motive",
     ".qtm": "a file of Qualisys' own; export C3D, or TSV of 3D data, from QTM",
     **dict.fromkeys((".gz", ".zip", ".7z", ".rar"), "compressed; unpack it"),
-    ".mat": "a file of MATLAB; export C3D, or TSV of 3D data, from the program that wrote it",
-    ".npz": "an archive of NumPy; if it is a take, load_take reads it, and its capture() has the points",
+    ".mat": f"a file of MATLAB; export C3D, or TSV of 3D data, from the program that wrote it; {OF_ARRAYS}",
+    ".npy": f"an array of NumPy; {OF_ARRAYS}",
+    ".npz": "an archive of NumPy; if it is a take, load_take reads it, and its capture() has the points; "
+    f"{OF_ARRAYS}",
     **dict.fromkeys((".x1d", ".x2d", ".v", ".vsk", ".enf", ".system"), _VICON),
     **dict.fromkeys((".trb", ".cap"), _CORTEX),
     **dict.fromkeys((".mot", ".sto", ".osim"), _OPENSIM),

@@ -28,6 +28,7 @@ from typing import Any, Final, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from gloves.captures.capture import OF_ARRAYS
 from gloves.takes.points import POINT_COUNTS, Column
 from gloves.takes.worn import FORMER
 from handsim.callbacks import Closing
@@ -485,6 +486,8 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
                 raise ValueError("the header is not a table")
     except OSError as error:
         raise CaptureError(f"{path}: cannot be read: {error.strerror or error}") from error
+    except KeyError as error:  # no header
+        raise CaptureError(f"{_damaged(path)}; {OF_ARRAYS}") from error
     except DAMAGE as error:
         raise CaptureError(_damaged(path)) from error
     if grown is None:

@@ -311,13 +311,14 @@ def _line(task: Task, unit: str, seconds: float) -> str:
     speed = _speed(task, unit)
     total = 0.0 if task.total is None else task.total
     if total == 1.0 and not task.completed:  # the task does not know its size yet
-        done = "getting ready"
-    else:
-        done = f"{task.completed:,.0f} of {total:,.0f} {unit}".rstrip()
+        done, step = "getting ready", task.description
+    else:  # without a unit the step is what is counted
+        step = task.description if unit else ""
+        done = f"{task.completed:,.0f} of {total:,.0f} {unit or task.description}".rstrip()
     clock = _clock(seconds)
     rest = task.time_remaining
     left = f"{_clock(rest)} left" if rest else ""
-    return ", ".join(part for part in (done, task.description, speed, clock, left) if part)
+    return ", ".join(part for part in (done, step, speed, clock, left) if part)
 
 
 def _clock(seconds: float) -> str:

@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike, NDArray
 
 from handsim._checks import check_array, check_choice, check_type
-from handsim.errors import ArgumentError
+from handsim.errors import ArgumentError, choices
 from handsim.kernels import kernel
 from handsim.space.transforms import are_rigid, rigid, unit
 
@@ -495,5 +495,7 @@ PRESETS: Final = {camera.name: camera for camera in _PRESETS}
 
 def preset(name: str) -> Camera:
     """A copy of one of `PRESETS`."""
-    check_choice(name, PRESETS, noun="camera")
+    if name not in PRESETS:
+        own = "or cameras of your own: --cameras FILE, in Python a Camera"
+        raise ArgumentError(f"{choices(name, PRESETS, noun='camera')}, {own}")
     return copy.deepcopy(PRESETS[name])

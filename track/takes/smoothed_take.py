@@ -54,6 +54,7 @@ _KNOWN: Final = float(np.deg2rad(3.0))
 _WEAK: Final = np.repeat([0.0, 1.0], [NUM_JOINTS, 6])  # [1/m^2, 1/rad^2] keeps an unseen wrist solvable
 _WINDOW, _MARGIN = 2000, 200  # frames solved together, and additional ones at either end
 _ROUNDS: Final = 5  # Gauss-Newton steps
+_QUICKER, _TIMES_QUICKER = 10.0, 4  # factor of the accelerations of quick hands, and how often at most
 _COUNTED: Final = 8  # Every eighth frame tells how many coordinates of markers a pose can follow.
 _LEAST_FREEDOM: Final = 0.1  # lower bound of the share of marker coordinates that a pose cannot follow
 _LONGEST_STEP: Final = 0.5  # [rad], [m] bound of each step
@@ -171,25 +172,26 @@ class _SmoothedHand:
         known = take.settings.get("known", {})
         names = [(f"{worn.side}:{name}", name) for name in JOINT_NAMES]
         self._known = np.deg2rad([known.get(one, known.get(each, np.nan)) for one, each in names])
+        self._accelerations = _ACCELERATIONS
         self._sure = np.diag(np.isfinite(self._known) / _KNOWN**2)  # precision of known angles [1/rad^2]
         # A digit with a known angle is not as digits usually are.
         self._stiff = np.isfinite(self._known).reshape(len(DIGITS), -1).any(axis=1).repeat(4) & self._shown
+        # Coordinates of the markers that are seen in a frame, and how many of them the pose can follow.
+        self._coordinates = np.zeros((take.num_frames, 2))
+        self._begin()
+
+    def _begin(self) -> None:
+        """Know nothing yet of what the residuals show."""
         self._prior = self._prior_of(self._stiff)
         # Standard deviations [m] of noise, of slow motion that residuals show, and of the flesh behind it.
         self._noise, self._slow, self._flesh = _FIRST_NOISE, 0.0, 0.0
         self._places = np.zeros((len(self._hand.digits), 2))  # RMS error along the skin, off it [m]
-        # Coordinates of the markers that are seen in a frame, and how many of them the pose can follow.
-        self._coordinates = np.zeros((take.num_frames, 2))
 
     def solve(
         self, windows: Sequence[_Window]
     ) -> tuple[Float[np.ndarray, "20"], Float[np.ndarray, "T 26 5"]]:
         """Solve all poses; return the cut-off of each angle [Hz] and the unknowns' variances by `SOURCES`."""
-        for _ in range(_ROUNDS):
-            for window in windows:
-                self._step(window, self._equations(window))
-            self._estimate_noise()
-            self._prior = self._prior_of(self._stiff)
+        self._follow(windows)
         cutoffs, wide = [], self._prior_of(self._shown)
         parts = np.full((len(self.qpos), NUM_UNKNOWNS, len(SOURCES)), np.nan)
         # Of a joint that does not move a calibration finds no more than measuring does.
@@ -224,8 +226,32 @@ class _SmoothedHand:
             pulled = same.diagonal(axis1=1, axis2=2)
             parts[kept] = variances + pulled[..., None] * [-1.0, 0.0, 0.0, 1.0, 0.0]
             spreads = alone[:, range(NUM_JOINTS), range(NUM_JOINTS)]
-            cutoffs.append((_ACCELERATIONS[:NUM_JOINTS] * self._rate / spreads) ** 0.25 / (2.0 * np.pi))
+            cutoffs.append((self._accelerations[:NUM_JOINTS] * self._rate / spreads) ** 0.25 / (2.0 * np.pi))
         return np.median(np.concatenate(cutoffs), axis=0), parts
+
+    def _follow(self, windows: Sequence[_Window]) -> None:
+        """Solve the poses, with more acceleration where they do not follow the hand.
+
+        Poses of single frames leave the noise of the markers but for the share that they follow. Smoothed
+        ones that leave more lag behind; what they leave would count as noise, and they would lag the more.
+        """
+        single, left = self.qpos.copy(), np.nanmean(self.rms() ** 2)
+        for turn in range(_TIMES_QUICKER + 1):
+            for _ in range(_ROUNDS):
+                for window in windows:
+                    self._step(window, self._equations(window))
+                self._estimate_noise()
+                self._prior = self._prior_of(self._stiff)
+            if not np.nanmean(self.rms() ** 2) * self._freedom > left or turn == _TIMES_QUICKER:
+                return
+            self.qpos, self._accelerations = single.copy(), _QUICKER * self._accelerations
+            self._begin()
+
+    @property
+    def _freedom(self) -> float:
+        """Share of the markers' coordinates that a pose cannot follow."""
+        shown, followed = self._coordinates.sum(axis=0)
+        return float(max(1.0 - followed / max(shown, 1.0), _LEAST_FREEDOM))
 
     def rms(self) -> Float[np.ndarray, "T"]:
         """RMS distance of the markers from those of the smoothed poses [m]; NaN without markers."""
@@ -297,7 +323,7 @@ class _SmoothedHand:
         turns[:, place, place] = quaternion_matrix(qpos[:, 3:7])
         normal = turns @ normal @ turns.swapaxes(1, 2)
         gradient = np.einsum("tij,tj->ti", turns, gradient)
-        precision = self._rate**3 / _ACCELERATIONS
+        precision = self._rate**3 / self._accelerations
         if len(qpos) > 2:
             velocities = np.array([velocity_of(*pair, 1.0) for pair in pairwise(qpos)])[:, _FROM_MUJOCO]
             pull = precision * np.diff(velocities, axis=0)
@@ -319,9 +345,7 @@ class _SmoothedHand:
         self._noise = max(noise, _LEAST_NOISE)
         self._slow = float(np.sqrt(max(_spread((residuals - bias)[seen]) ** 2 - noise**2, 0.0)))
         # Residuals show flesh only in the coordinates that poses cannot follow.
-        shown, followed = self._coordinates.sum(axis=0)
-        freedom = 1.0 - followed / max(shown, 1.0)
-        self._flesh = self._slow / float(np.sqrt(max(freedom, _LEAST_FREEDOM)))
+        self._flesh = self._slow / float(np.sqrt(self._freedom))
         lifts = (bias * self._hand.normals).sum(axis=1)
         slips = np.sqrt(np.maximum((bias**2).sum(axis=1) - lifts**2, 0.0) / 2.0)
         for part in (self._hand.digits < 0, self._hand.digits >= 0):

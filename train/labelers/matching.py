@@ -230,7 +230,7 @@ def match_scores(
 
     A point may be a `GHOST`, and a label occluded. Without a prior the scores alone decide.
     """
-    scores = point_scores.astype(np.float64), label_scores.astype(np.float64)
+    scores = point_scores.astype(np.float64, "C"), label_scores.astype(np.float64, "C")  # one kernel for all
     probabilities = balance(*scores, _SCORE_WEIGHT, _SINKHORN_ROUNDS)
     _, labels = assign(*assignment_costs(probabilities))
     confidence = probabilities[np.arange(len(labels)), labels]  # GHOST, -1, is the last column

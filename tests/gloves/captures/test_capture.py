@@ -87,6 +87,8 @@ MISTAKES = [
     (lambda at: read_capture(at / "take.tcr"), "folder/take.tcr | '.tcr' | '.trc' | .c3d, .csv, .tsv"),
     (lambda at: read_capture(at / "take"), "folder/take | '' | .trc, .c3d, .csv, .tsv"),
     (lambda at: read_capture(at / "take.trc"), "folder/take.trc | No such file"),
+    (lambda at: read_capture(at / "own.npy"), "own.npy | gloves.Capture(names, positions, rate)"),
+    (lambda at: read_capture(at / "own.npz"), "own.npz | load_take | gloves.Capture(names, positions, rate)"),
     (lambda at: read_capture(at / "folder.trc"), "folder/folder.trc | this is a folder"),
     (lambda at: read_capture(at / "empty.trc"), "folder/empty.trc | empty"),
     (lambda at: write_capture(at / "take.tsv", alone()), "folder/take.tsv | '.tsv' | .trc, .c3d, .csv"),
@@ -100,6 +102,7 @@ MISTAKES = [
     (lambda at: alone(fill=np.inf), "infinite | finite numbers or NaN"),
     (lambda at: alone(rate=0.0), "0 Hz | 1 to 5000"),
     (lambda at: alone(rate=np.nan), "nan Hz | 1 to 5000"),
+    (lambda at: alone(rate=np.full(2, 120.0)), "an array (2,) | 1 to 5000"),
 ]
 
 
@@ -111,6 +114,14 @@ def test_mistakes_are_told(tmp_path, call, words):
         call(tmp_path)
     assert_names(str(caught.value).replace(str(tmp_path), "folder"), words)
     assert sorted(entry.name for entry in tmp_path.iterdir()) == ["empty.trc", "folder.trc"]
+
+
+def test_the_rate_may_come_from_an_archive_of_numpy(tmp_path: Path) -> None:
+    np.savez(tmp_path / "own.npz", names=["a"], positions=np.zeros((2, 1, 3)), rate=120.0)
+    with np.load(tmp_path / "own.npz") as own:
+        rate = Capture(tuple(own["names"].tolist()), own["positions"], own["rate"]).rate
+    assert type(rate) is float
+    assert rate == 120.0
 
 
 def test_every_readable_format_refuses_noise(tmp_path: Path) -> None:

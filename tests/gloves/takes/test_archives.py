@@ -365,6 +365,12 @@ def test_rates(arrays, tmp_path, rate):
     refused_or_exported(tmp_path, arrays)
 
 
+def test_arrays_of_ones_own_are_told_from_a_damaged_take(tmp_path):
+    np.savez(tmp_path / "own.npz", places=np.zeros((2, 1, 3)), names=["a"], rate=120.0)
+    with pytest.raises(CaptureError, match=r"own\.npz: not a take, .*; gloves\.Capture"):
+        load_take(tmp_path / "own.npz")
+
+
 @pytest.mark.parametrize("name", ["qpos", "body_poses"])
 def test_orientations_have_unit_length(arrays, tmp_path, name):
     arrays[name][..., 3:7] *= 1.000001  # as rounded

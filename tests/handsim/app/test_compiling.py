@@ -62,6 +62,13 @@ def test_nearly_everything_on_the_list_is_there():
     assert gone < 0.03 * sum(one.seconds for one in listed)
 
 
+def test_kernels_of_usual_options_are_on_the_list():
+    """A calibration's touches, and the walls of a room around a camera that moves."""
+    users = {one.name: one.commands.split() for one in read_list()}
+    assert "simulate" in users["poses.touch:_overlaps"]
+    assert "render" in users["render.scenery.backgrounds:_find_walls"]
+
+
 def test_a_type_is_written_and_read():
     from track.kinematics.marker_kinematics import HandArrays
 

@@ -96,6 +96,12 @@ def test_a_log_gets_a_line_now_and_then():
     assert re.fullmatch(r"12,800 of 5,000,000 samples, loss 0\.812, 0:\d\d:\d\d", line)
 
 
+def test_without_a_unit_the_step_is_what_is_counted():
+    bar = Progress(disable=True)
+    bar.add_task("frames", total=600, completed=600)
+    assert _line(bar.tasks[0], "", 10.0) == "600 of 600 frames, 0:00:10"
+
+
 def test_a_line_before_anything_is_done():
     bar = Progress(disable=True)
     bar.add_task("", total=1)

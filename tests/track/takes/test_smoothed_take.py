@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from gloves import GloveFit, Take
+from gloves import Capture, GloveFit, Take
 from gloves.takes.take import LOST, TRACKED
 from track.captures import track_capture
 from track.takes.smoothed_take import _SmoothedHand, _solve_in_time, _windows, smooth_take, times_unseen
@@ -41,6 +41,15 @@ def test_poses_are_nearer_to_the_truth_and_labels_stay(truth, fitted, smooth):
     np.testing.assert_array_equal(smooth.status, fitted.status)
     jumps = [np.abs(np.diff(take.qpos[..., 7:], n=2, axis=0)).mean() for take in (fitted, smooth)]
     assert jumps[1] < 0.2 * jumps[0]
+
+
+def test_smoothed_poses_follow_a_hand_that_moves_quickly(truth):
+    """Smoothing that lags took what it left for noise, and lagged by centimeters."""
+    slow = truth.capture()
+    fitted = track_capture(Capture(slow.names, slow.positions, 5.0 * slow.rate), smooth=False)
+    smooth = smooth_take(fitted)
+    assert np.nanmedian(smooth.rms) < 1.3 * np.nanmedian(fitted.rms)
+    assert angle_error(smooth, truth) < 0.7 * angle_error(fitted, truth)
 
 
 def test_the_parts_of_the_deviations_sum_up_to_them(smooth):

@@ -82,6 +82,16 @@ def test_order_of_points_and_labels_does_not_matter(rng):
     np.testing.assert_allclose(turned, straight[np.ix_([*points, 9], [*labels, 7])])
 
 
+def test_transposed_scores_compile_no_kernel_of_their_own(rng):
+    by_point, by_label = rng.normal(size=(5, 8)), rng.normal(size=(7, 6))
+    expected = match_scores(np.zeros((5, 3)), by_point, by_label, None)
+    compiled = len(balance.overloads)
+    found = match_scores(np.zeros((5, 3)), by_point, np.asfortranarray(by_label), None)
+    np.testing.assert_array_equal(found[0], expected[0])
+    np.testing.assert_array_equal(found[1], expected[1])
+    assert len(balance.overloads) == compiled
+
+
 def test_two_points_that_both_look_like_one_marker_share_it():
     """Alone each would be sure; together one of the two must be a ghost, and neither is sure any more."""
     by_point = np.log([[0.98, 0.02], [0.98, 0.02]])
