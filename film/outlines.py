@@ -14,7 +14,6 @@ from typing import Final, NamedTuple
 
 import cv2
 import numpy as np
-from scipy.ndimage import gaussian_filter
 
 from film.bundle import READOUT, Bundle, Samples, State
 from gloves.fit import GloveFit
@@ -32,6 +31,7 @@ _MOST_POINTS: Final = 80  # largest number of outline points of a hand in a pict
 _STEP: Final = 0.004  # [s] step of the central differences that give velocities
 _LEVELS: Final = 32  # of each color channel in the histograms
 _SMOOTH: Final = 1.0  # [levels] standard deviation of the histograms' smoothing
+_REACH: Final = 9  # [levels] width of its kernel
 _SUREST: Final = 3.0  # largest log-odds that one color gives
 _DEPENDENT: Final = 0.5  # Neighboring pixels are alike: this share of their log-odds counts.
 _CONTRAST: Final = 0.6  # An edge has at least these mean log-odds on both sides.
@@ -44,6 +44,7 @@ _FEWEST_PIXELS: Final = 30  # Colors of a region are counted if it has this many
 _AROUND: Final = 14  # [px] width of the ring around the reach whose colors are the background's
 _ARM: Final = 0.02  # [m] The outline this near to the forearm is left out, because the wrist bends there.
 _BALL: Final = 0.004  # [m] The outline this near to a marker is left out, because the glove may carry it.
+_SMALLEST: Final = 8  # [px] smallest side of a part of a picture that is looked at
 _EDGE: Final = 3.0  # [px] The outline this near to the edge of the picture is left out.
 _WITHIN: Final = 0.8  # share of the edges whose largest distance is told
 _OTHER: Final = 4.0  # [px] The outline this near to another hand or thing is left out.
@@ -77,7 +78,7 @@ def shutter_times(take: Take, times: Doubles, cameras: Sequence[Camera], readout
 
 
 class _Look(NamedTuple):
-    """The part of a picture around the hands, as a pinhole camera sees it."""
+    """The part of a picture around a hand, as a pinhole camera sees it."""
 
     corner: Integers  # (2,): of the part [px]
     view: Camera
@@ -125,19 +126,18 @@ class Outlines:
         bodies = between_poses(take.times, times, take.body_poses, take.rate)
         matrix = np.diag([self._scale, self._scale, 1.0])
         views = [dataclasses.replace(one, size=self._size, K=matrix @ one.K) for one in cameras]
-        maps, radius = straightening(views[0]), max(3, round(reach * self._size[0]))
+        maps, flat = straightening(views[0]), [straight(one) for one in views]
+        radius = max(3, round(reach * self._size[0]))
         seen, parts = np.full((5, *moments.shape), np.nan), []
         for frame, picture in looks:
             there = np.flatnonzero(np.isfinite(qpos[frame, :, :, 0]).all(axis=1)).tolist()
             worn = take.hands_at(int(np.searchsorted(take.times, times[frame], "right")) - 1)
             room = 2 * radius + _AROUND
             drawn = [self._hand(hand, worn[hand], qpos[frame, hand, 0]) for hand in there]
-            look = self._look(picture, maps, straight(views[spans[frame]]), drawn, bodies[frame], room)
-            if look is None:
-                continue
-            for hand in there:
-                outline = _outline(look, hand, worn[hand], qpos[frame, hand, 0])
-                if outline is None:
+            looks_at = self._parts(picture, maps, flat[spans[frame]], drawn, bodies[frame], room)
+            for hand, look in zip(there, looks_at, strict=True):
+                outline = _outline(look, hand, worn[hand], qpos[frame, hand, 0]) if look else None
+                if look is None or outline is None:
                     continue
                 chosen, offsets, odds = self._across(look, hand, outline, radius)
                 tried, away = len(outline.pixels), offsets / self._scale
@@ -167,23 +167,33 @@ class Outlines:
         )
         return edges, Seen(*seen)
 
-    def _look(
+    def _parts(
         self, picture: Bytes, maps: Floats, view: Camera, drawn: list[Triangles], bodies: Doubles, room: int
-    ) -> _Look | None:
-        """The part of a picture with drawn hands and room around them; None if they are elsewhere."""
-        vertices = [one.vertices[: skin_atlas().num_hand] for one in drawn]  # without forearms
-        pixels = view.project(np.concatenate([np.empty((0, 3)), *vertices]))
-        ends = [np.fmin.reduce(pixels, initial=np.inf) - room, np.fmax.reduce(pixels, initial=-np.inf) + room]
-        (left, top), (right, bottom) = np.clip(ends, 0, self._size).astype(int).tolist()
-        if min(right - left, bottom - top) < 8:
-            return None
+    ) -> list[_Look | None]:
+        """The part of a picture with each drawn hand and room around it; None if the hand is elsewhere."""
+        ends = np.empty((len(drawn), 2, 2))
+        for number, one in enumerate(drawn):
+            pixels = view.project(one.vertices[: skin_atlas().num_hand])  # without the forearm
+            ends[number] = np.fmin.reduce(pixels) - room, np.fmax.reduce(pixels) + room
+        boxes = np.clip(np.nan_to_num(ends), 0, self._size).astype(int)  # NaN stands for behind the camera
+        there = (boxes[:, 1] - boxes[:, 0]).min(axis=1) >= _SMALLEST
+        if not there.any():
+            return [None] * len(drawn)
+        first, last = boxes[there, 0].min(axis=0), boxes[there, 1].max(axis=0)
         for number, T_world_body in enumerate(pose_matrices(bodies)):
             if np.isfinite(T_world_body).all():
                 instance = 1 + len(self._bundle.take.hands) + number
                 drawn += [one.triangles for one in self._bodies[number].drawn(T_world_body, instance)]
-        colors = cv2.remap(picture, maps[top:bottom, left:right], None, cv2.INTER_LINEAR)
-        part = view.part(left, top, right - left, bottom - top)
-        return _Look(np.array([left, top]), part, np.asarray(colors), see(part, drawn, with_normals=False))
+        colors = cv2.remap(picture, maps[first[1] : last[1], first[0] : last[0]], None, cv2.INTER_LINEAR)
+        truth = see(view.part(*first.tolist(), *(last - first).tolist()), drawn, with_normals=False)
+
+        def part(low: Integers, high: Integers) -> _Look:
+            rows, columns = (slice(*pair) for pair in np.stack([low - first, high - first], axis=1)[::-1])
+            seen = truth._make(one if one is None else one[rows, columns] for one in truth)
+            camera = view.part(*low.tolist(), *(high - low).tolist())
+            return _Look(low, camera, np.asarray(colors)[rows, columns], seen)
+
+        return [part(*box) if inside else None for box, inside in zip(boxes, there, strict=True)]
 
     def _hand(self, hand: int, fit: GloveFit, qpos: Doubles) -> Triangles:
         """A drawn hand, without normals."""
@@ -307,8 +317,10 @@ def _outline(look: _Look, hand: int, fit: GloveFit, qpos: Doubles) -> _Outline |
 
 def _shares(counts: Floats) -> Floats:
     """Shares of colors, smoothed, of their counts."""
-    smooth = gaussian_filter(counts, _SMOOTH, mode="nearest")
-    return np.asarray(smooth / smooth.sum() + np.float32(3e-5))
+    smooth = cv2.GaussianBlur(counts, (_REACH, _REACH), _SMOOTH, borderType=cv2.BORDER_REPLICATE)
+    flat = smooth.reshape(-1, _LEVELS)  # OpenCV does not blur along the last axis, that of its channels
+    smooth = cv2.GaussianBlur(flat, (_REACH, 1), _SMOOTH, borderType=cv2.BORDER_REPLICATE)
+    return np.asarray(smooth.reshape(counts.shape) / smooth.sum() + np.float32(3e-5))
 
 
 def _edge(odds: Floats, in_me: Flags, in_free: Flags, reach: int) -> tuple[Integers, Doubles]:
