@@ -31,7 +31,6 @@ _MOST_POINTS: Final = 80  # largest number of outline points of a hand in a pict
 _STEP: Final = 0.004  # [s] step of the central differences that give velocities
 _LEVELS: Final = 32  # of each color channel in the histograms
 _SMOOTH: Final = 1.0  # [levels] standard deviation of the histograms' smoothing
-_REACH: Final = 9  # [levels] width of its kernel
 _SUREST: Final = 3.0  # largest log-odds that one color gives
 _DEPENDENT: Final = 0.5  # Neighboring pixels are alike: this share of their log-odds counts.
 _CONTRAST: Final = 0.6  # An edge has at least these mean log-odds on both sides.
@@ -44,7 +43,6 @@ _FEWEST_PIXELS: Final = 30  # Colors of a region are counted if it has this many
 _AROUND: Final = 14  # [px] width of the ring around the reach whose colors are the background's
 _ARM: Final = 0.02  # [m] The outline this near to the forearm is left out, because the wrist bends there.
 _BALL: Final = 0.004  # [m] The outline this near to a marker is left out, because the glove may carry it.
-_SMALLEST: Final = 8  # [px] smallest side of a part of a picture that is looked at
 _EDGE: Final = 3.0  # [px] The outline this near to the edge of the picture is left out.
 _WITHIN: Final = 0.8  # share of the edges whose largest distance is told
 _OTHER: Final = 4.0  # [px] The outline this near to another hand or thing is left out.
@@ -81,7 +79,7 @@ class _Look(NamedTuple):
     """The part of a picture around a hand, as a pinhole camera sees it."""
 
     corner: Integers  # (2,): of the part [px]
-    view: Camera
+    view: Camera  # of the whole picture
     colors: Bytes
     truth: Geometry  # what is drawn there
 
@@ -134,10 +132,10 @@ class Outlines:
             worn = take.hands_at(int(np.searchsorted(take.times, times[frame], "right")) - 1)
             room = 2 * radius + _AROUND
             drawn = [self._hand(hand, worn[hand], qpos[frame, hand, 0]) for hand in there]
-            looks_at = self._parts(picture, maps, flat[spans[frame]], drawn, bodies[frame], room)
-            for hand, look in zip(there, looks_at, strict=True):
-                outline = _outline(look, hand, worn[hand], qpos[frame, hand, 0]) if look else None
-                if look is None or outline is None:
+            parts_of = self._looks(picture, maps, flat[spans[frame]], drawn, bodies[frame], room)
+            for hand, look in zip(there, parts_of, strict=False):
+                outline = _outline(look, hand, worn[hand], qpos[frame, hand, 0])
+                if outline is None:
                     continue
                 chosen, offsets, odds = self._across(look, hand, outline, radius)
                 tried, away = len(outline.pixels), offsets / self._scale
@@ -154,46 +152,33 @@ class Outlines:
                 parts.append([values[kept] for values in found])
         if not parts:
             return None, Seen(*seen)
-        frames, pixels, normals, outward, larger, points, velocities, then = map(
-            np.concatenate, zip(*parts, strict=True)
-        )
-        edges = Samples(
-            frames,
-            pixels,
-            normals,
-            outward,
-            larger,
-            lambda times: points + velocities * (times - then)[:, None],
-        )
+        *lines, points, velocities, then = map(np.concatenate, zip(*parts, strict=True))
+        edges = Samples._make([*lines, lambda times: points + velocities * (times - then)[:, None]])
         return edges, Seen(*seen)
 
-    def _parts(
+    def _looks(
         self, picture: Bytes, maps: Floats, view: Camera, drawn: list[Triangles], bodies: Doubles, room: int
-    ) -> list[_Look | None]:
-        """The part of a picture with each drawn hand and room around it; None if the hand is elsewhere."""
-        ends = np.empty((len(drawn), 2, 2))
-        for number, one in enumerate(drawn):
+    ) -> list[_Look]:
+        """The parts of a picture with each drawn hand and room around it; none if all are elsewhere."""
+        boxes, looks = np.empty((len(drawn), 2, 2), np.int64), []
+        for box, one in zip(boxes, drawn, strict=True):
             pixels = view.project(one.vertices[: skin_atlas().num_hand])  # without the forearm
-            ends[number] = np.fmin.reduce(pixels) - room, np.fmax.reduce(pixels) + room
-        boxes = np.clip(np.nan_to_num(ends), 0, self._size).astype(int)  # NaN stands for behind the camera
-        there = (boxes[:, 1] - boxes[:, 0]).min(axis=1) >= _SMALLEST
-        if not there.any():
-            return [None] * len(drawn)
-        first, last = boxes[there, 0].min(axis=0), boxes[there, 1].max(axis=0)
+            ends = [np.fmin.reduce(pixels, initial=np.inf) - room, np.fmax.reduce(pixels, initial=0.0) + room]
+            box[:] = np.maximum.accumulate(np.clip(ends, 0, self._size).astype(int))
+        first, last = boxes.min(axis=(0, 1), initial=max(self._size)), boxes.max(axis=(0, 1), initial=0)
+        if (last - first).min() < 8:
+            return []
         for number, T_world_body in enumerate(pose_matrices(bodies)):
             if np.isfinite(T_world_body).all():
                 instance = 1 + len(self._bundle.take.hands) + number
                 drawn += [one.triangles for one in self._bodies[number].drawn(T_world_body, instance)]
         colors = cv2.remap(picture, maps[first[1] : last[1], first[0] : last[0]], None, cv2.INTER_LINEAR)
         truth = see(view.part(*first.tolist(), *(last - first).tolist()), drawn, with_normals=False)
-
-        def part(low: Integers, high: Integers) -> _Look:
-            rows, columns = (slice(*pair) for pair in np.stack([low - first, high - first], axis=1)[::-1])
-            seen = truth._make(one if one is None else one[rows, columns] for one in truth)
-            camera = view.part(*low.tolist(), *(high - low).tolist())
-            return _Look(low, camera, np.asarray(colors)[rows, columns], seen)
-
-        return [part(*box) if inside else None for box, inside in zip(boxes, there, strict=True)]
+        for corner, box in zip(boxes[:, 0], boxes - first, strict=True):
+            part = tuple(slice(*ends) for ends in box.T[::-1])
+            there = Geometry(truth.depth[part], None, *(one[part] for one in truth[2:]))
+            looks.append(_Look(corner, view, np.asarray(colors)[part], there))
+        return looks
 
     def _hand(self, hand: int, fit: GloveFit, qpos: Doubles) -> Triangles:
         """A drawn hand, without normals."""
@@ -204,9 +189,9 @@ class Outlines:
 
     def _pictured(self, camera: Camera, pixels: Doubles, normals: Doubles) -> tuple[Doubles, Doubles]:
         """Pixels (N, 2) and unit normals of straightened edges, in the video's pictures."""
-        bent = camera.at(np.eye(4))
-        rays = straight(bent).unproject(np.stack([pixels, pixels + normals[:, ::-1] * [-1.0, 1.0]]))
-        points = bent.project(rays)
+        focal, center = camera.focal_lengths, camera.K[:2, 2]
+        flat = (np.stack([pixels, pixels + normals[:, ::-1] * [-1.0, 1.0]]) - center) / focal
+        points = camera.lens.distort(np.insert(flat, 2, 1.0, axis=2)) * focal + center
         along = points[1] - points[0]
         return points[0] / self._scale, unit(along[:, ::-1] * [1.0, -1.0])
 
@@ -280,6 +265,8 @@ def _outline(look: _Look, hand: int, fit: GloveFit, qpos: Doubles) -> _Outline |
     """Points of a drawn hand's outline, without its wrist and what is beside markers and other things."""
     truth, camera = look.truth, look.view
     mine, free = truth.instances == 1 + hand, truth.instances == 0
+    if mine.sum() < _FEWEST_POINTS:
+        return None
     arm = truth.parts == 1 + PARTS_A_HAND * hand + FOREARM
     nearby = cv2.dilate(free.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     rim = mine & nearby & ~arm
@@ -301,14 +288,15 @@ def _outline(look: _Look, hand: int, fit: GloveFit, qpos: Doubles) -> _Outline |
     normals = -gradient / size[:, None]
     beyond = np.clip((soft[rows, columns] - 0.5) / size, -1.0, 1.0)
     pixels = np.stack([columns, rows], axis=1) + 0.5 + beyond[:, None] * normals
-    balls = pixels[:, None] - camera.project(fit.markers(qpos[None])[0][0])
+    places = pixels + look.corner
+    balls = places[:, None] - camera.project(fit.markers(qpos[None])[0][0])
     good = (np.linalg.norm(balls, axis=2) > (fit.layout.radius + _BALL) * scale).all(axis=1) & (size > 0.1)
-    good &= ((pixels > _EDGE) & (pixels < np.array(camera.size) - _EDGE)).all(axis=1)
+    good &= ((places > _EDGE) & (places < np.array(camera.size) - _EDGE)).all(axis=1)
     if good.sum() < _FEWEST_POINTS:
         return None
-    pixels, normals, rows, columns = (one[good] for one in (pixels, normals, rows, columns))
+    pixels, places, normals, rows, columns = (one[good] for one in (pixels, places, normals, rows, columns))
     rotation, place = camera.T_world_camera[:3, :3], camera.T_world_camera[:3, 3]
-    rays, beside = (camera.unproject(one) for one in (pixels, pixels + normals))
+    rays, beside = (camera.unproject(one) for one in (places, places + normals))
     rays, beside = rays / rays[:, 2:], beside / beside[:, 2:]
     points = rays * truth.depth[rows, columns, None].astype(np.float64) @ rotation.T + place
     bones = truth.parts[rows, columns].astype(np.int64) - 1 - PARTS_A_HAND * hand
@@ -317,9 +305,9 @@ def _outline(look: _Look, hand: int, fit: GloveFit, qpos: Doubles) -> _Outline |
 
 def _shares(counts: Floats) -> Floats:
     """Shares of colors, smoothed, of their counts."""
-    smooth = cv2.GaussianBlur(counts, (_REACH, _REACH), _SMOOTH, borderType=cv2.BORDER_REPLICATE)
+    smooth = cv2.GaussianBlur(counts, (0, 0), _SMOOTH, borderType=cv2.BORDER_REPLICATE)
     flat = smooth.reshape(-1, _LEVELS)  # OpenCV does not blur along the last axis, that of its channels
-    smooth = cv2.GaussianBlur(flat, (_REACH, 1), _SMOOTH, borderType=cv2.BORDER_REPLICATE)
+    smooth = cv2.GaussianBlur(flat, (0, 1), _SMOOTH, borderType=cv2.BORDER_REPLICATE)
     return np.asarray(smooth.reshape(counts.shape) / smooth.sum() + np.float32(3e-5))
 
 
