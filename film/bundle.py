@@ -289,10 +289,9 @@ class Bundle:
 
     def _points_of(self, state: State, samples: Samples, late: float = 0.0) -> Doubles:
         """The samples' points (N, 3) [m] when the shutter reads them, or later [s]."""
-        times = self.times(state)[samples.frames] + late
-        times += (samples.pixels / self.size - 0.5) @ state.values[READOUT]
+        times = self.times(state)[samples.frames] + (samples.pixels / self.size - 0.5) @ state.values[READOUT]
         shift = state.values[THICKER] * samples.outward + state.values[LARGER] * samples.larger
-        return np.asarray(samples.points_at(times) + shift)
+        return np.asarray(samples.points_at(times + late) + shift)
 
     def residuals(self, state: State, samples: Samples, noise: float) -> Doubles:
         """Distances (N,) from the lines, over the noise; 0 where the take has no pose."""

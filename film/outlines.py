@@ -124,9 +124,8 @@ class Outlines:
         bodies = between_poses(take.times, times, take.body_poses, take.rate)
         matrix = np.diag([self._scale, self._scale, 1.0])
         views = [dataclasses.replace(one, size=self._size, K=matrix @ one.K) for one in cameras]
-        maps, flat = straightening(views[0]), [straight(one) for one in views]
-        radius = max(3, round(reach * self._size[0]))
-        seen, parts = np.full((5, *moments.shape), np.nan), []
+        maps, flat, parts = straightening(views[0]), [straight(one) for one in views], []
+        radius, seen = max(3, round(reach * self._size[0])), np.full((5, *moments.shape), np.nan)
         for frame, picture in looks:
             there = np.flatnonzero(np.isfinite(qpos[frame, :, :, 0]).all(axis=1)).tolist()
             worn = take.hands_at(int(np.searchsorted(take.times, times[frame], "right")) - 1)
@@ -134,7 +133,7 @@ class Outlines:
             drawn = [self._hand(hand, worn[hand], qpos[frame, hand, 0]) for hand in there]
             parts_of = self._looks(picture, maps, flat[spans[frame]], drawn, bodies[frame], room)
             for hand, look in zip(there, parts_of, strict=False):
-                outline = _outline(look, hand, worn[hand], qpos[frame, hand, 0])
+                outline = _outline(look, hand, worn[hand], qpos[frame, hand, 0]) if look.colors.size else None
                 if outline is None:
                     continue
                 chosen, offsets, odds = self._across(look, hand, outline, radius)
@@ -160,11 +159,11 @@ class Outlines:
         self, picture: Bytes, maps: Floats, view: Camera, drawn: list[Triangles], bodies: Doubles, room: int
     ) -> list[_Look]:
         """The parts of a picture with each drawn hand and room around it; none if all are elsewhere."""
-        boxes, looks = np.empty((len(drawn), 2, 2), np.int64), []
-        for box, one in zip(boxes, drawn, strict=True):
-            pixels = view.project(one.vertices[: skin_atlas().num_hand])  # without the forearm
-            ends = [np.fmin.reduce(pixels, initial=np.inf) - room, np.fmax.reduce(pixels, initial=0.0) + room]
-            box[:] = np.maximum.accumulate(np.clip(ends, 0, self._size).astype(int))
+        pixels = [view.project(one.vertices[: skin_atlas().num_hand]) for one in drawn]  # without forearms
+        low = [np.fmin.reduce(one, initial=np.inf) - room for one in pixels]
+        high = [np.fmax.reduce(one, initial=-np.inf) + room for one in pixels]
+        ends = np.clip(np.reshape([low, high], (2, -1, 2)), 0, self._size)
+        boxes, looks = np.maximum.accumulate(ends).astype(int).swapaxes(0, 1), []
         first, last = boxes.min(axis=(0, 1), initial=max(self._size)), boxes.max(axis=(0, 1), initial=0)
         if (last - first).min() < 8:
             return []
@@ -265,8 +264,6 @@ def _outline(look: _Look, hand: int, fit: GloveFit, qpos: Doubles) -> _Outline |
     """Points of a drawn hand's outline, without its wrist and what is beside markers and other things."""
     truth, camera = look.truth, look.view
     mine, free = truth.instances == 1 + hand, truth.instances == 0
-    if mine.sum() < _FEWEST_POINTS:
-        return None
     arm = truth.parts == 1 + PARTS_A_HAND * hand + FOREARM
     nearby = cv2.dilate(free.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     rim = mine & nearby & ~arm
@@ -289,7 +286,8 @@ def _outline(look: _Look, hand: int, fit: GloveFit, qpos: Doubles) -> _Outline |
     beyond = np.clip((soft[rows, columns] - 0.5) / size, -1.0, 1.0)
     pixels = np.stack([columns, rows], axis=1) + 0.5 + beyond[:, None] * normals
     places = pixels + look.corner
-    balls = places[:, None] - camera.project(fit.markers(qpos[None])[0][0])
+    centers = fit.attachment.centers(fit.model, fit.model.forward_kinematics(qpos[None]))[0]
+    balls = places[:, None] - camera.project(centers)
     good = (np.linalg.norm(balls, axis=2) > (fit.layout.radius + _BALL) * scale).all(axis=1) & (size > 0.1)
     good &= ((places > _EDGE) & (places < np.array(camera.size) - _EDGE)).all(axis=1)
     if good.sum() < _FEWEST_POINTS:
