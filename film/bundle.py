@@ -26,6 +26,7 @@ _MOST_BUNDLED: Final = 5000  # largest number of keypoints in a bundle
 _ROBUST: Final = 2.0  # Residuals beyond this many standard deviations count less.
 _NOTHING: Final = 1e-2  # prior information on free unknowns
 _PARTS: Final = 8  # number of parts of a video that are held out, one after the other
+_TINY: Final = 1e-6  # [s, rad] step of derivatives by time and rotations
 _DEPENDENT: Final = 16.0  # This many samples count as one with an independent error.
 
 # Places of the unknowns in a state's values. From POSES on, each span has six numbers for its camera's pose.
@@ -223,13 +224,18 @@ class Bundle:
             values[free] = part
             return state._replace(values=values)
 
+        known = np.sqrt(_DEPENDENT) / priors
+
         def rows(part: Doubles) -> Doubles:
             now = widened(part)
-            known = np.sqrt(_DEPENDENT) * now.values / priors
-            return np.concatenate([robust * self.residuals(now, samples, noise), known])
+            return np.concatenate([robust * self.residuals(now, samples, noise), known * now.values])
+
+        def jacobian(part: Doubles) -> Doubles:
+            told = robust[:, None] * self.jacobian(widened(part), samples, noise)
+            return np.concatenate([told, np.diag(known)])[:, free]
 
         done = least_squares(
-            rows, state.values[free], x_scale=np.where(np.isfinite(priors), priors, 0.1)[free],
+            rows, state.values[free], jacobian, x_scale=np.where(np.isfinite(priors), priors, 0.1)[free],
             max_nfev=40, xtol=1e-6, ftol=1e-6,
         )  # fmt: skip
         covariance = np.zeros((size, size))
@@ -255,12 +261,42 @@ class Bundle:
             found.append(other.values)
         return np.std(found, axis=0) * np.sqrt(_PARTS - 1), surprise
 
+    def jacobian(self, state: State, samples: Samples, noise: float) -> Doubles:
+        """Derivatives (N, U) of the residuals by all unknowns; those by a given lens do not count."""
+        cameras, spans = self.cameras(state), state.spans(samples.frames)
+        points, later = (self._points_of(state, samples, late) for late in (0.0, _TINY))
+        poses, lens = np.stack([one.T_world_camera for one in cameras])[spans], cameras[0].lens
+        axes, away, across = poses[:, :3, :3], points - poses[:, :3, 3], samples.normals / noise
+        local, focal = np.einsum("nij,ni->nj", axes, away), across * cameras[0].focal_lengths
+        flat = local[:, :2] / local[:, 2:]
+        slopes = np.einsum("ni,nij->nj", focal, lens.jacobian(local)) / local[:, 2:]
+        by_local = np.column_stack([slopes, -(slopes * flat).sum(axis=1)])
+        by_point, pose = np.einsum("nij,nj->ni", axes, by_local), np.zeros((len(points), len(cameras), 6))
+        for span in range(len(cameras)):
+            turn, mine = state.pose(span)[:3], spans == span
+            turned = Rotation.from_rotvec(turn + _TINY * np.eye(3)) * Rotation.from_rotvec(turn).inv()
+            pose[mine, span, :3] = np.cross(by_point[mine], away[mine]) @ turned.as_rotvec().T / _TINY
+            pose[mine, span, 3:] = -by_point[mine]
+        by_time, square = ((later - points) * by_point).sum(axis=1) / _TINY, (flat**2).sum(axis=1)
+        bent, elapsed = (focal * flat).sum(axis=1) * square, self.found.times[samples.frames] - self._middle
+        found = np.column_stack([
+            by_time, by_time * elapsed, (focal * lens.distort(local)).sum(axis=1), self.size[0] * across,
+            bent, bent * square, (by_point * samples.outward).sum(axis=1),
+            (by_point * samples.larger).sum(axis=1), by_time[:, None] * (samples.pixels / self.size - 0.5),
+            pose.reshape(len(points), -1),
+        ])  # fmt: skip
+        return np.where(np.isfinite(found).all(axis=1, keepdims=True), found, 0.0)
+
+    def _points_of(self, state: State, samples: Samples, late: float = 0.0) -> Doubles:
+        """The samples' points (N, 3) [m] when the shutter reads them, or later [s]."""
+        times = self.times(state)[samples.frames] + (samples.pixels / self.size - 0.5) @ state.values[READOUT]
+        shift = state.values[THICKER] * samples.outward + state.values[LARGER] * samples.larger
+        return np.asarray(samples.points_at(times + late) + shift)
+
     def residuals(self, state: State, samples: Samples, noise: float) -> Doubles:
         """Distances (N,) from the lines, over the noise; 0 where the take has no pose."""
-        late = (samples.pixels / self.size - 0.5) @ state.values[READOUT]
-        points = samples.points_at(self.times(state)[samples.frames] + late)
-        shift = state.values[THICKER] * samples.outward + state.values[LARGER] * samples.larger
-        pixels = self.projected(state, samples.frames, points + shift)
+        points = self._points_of(state, samples)
+        pixels = self.projected(state, samples.frames, points)
         away = ((pixels - samples.pixels) * samples.normals).sum(axis=1) / noise
         away = np.nan_to_num(away, nan=self.size[0] / noise)  # behind the camera
         return np.where(np.isfinite(points[:, 0]), away, 0.0)

@@ -14,7 +14,6 @@ from typing import Final, NamedTuple
 
 import cv2
 import numpy as np
-from scipy.ndimage import gaussian_filter
 
 from film.bundle import READOUT, Bundle, Samples, State
 from gloves.fit import GloveFit
@@ -77,10 +76,10 @@ def shutter_times(take: Take, times: Doubles, cameras: Sequence[Camera], readout
 
 
 class _Look(NamedTuple):
-    """The part of a picture around the hands, as a pinhole camera sees it."""
+    """The part of a picture around a hand, as a pinhole camera sees it."""
 
     corner: Integers  # (2,): of the part [px]
-    view: Camera
+    view: Camera  # of the whole picture
     colors: Bytes
     truth: Geometry  # what is drawn there
 
@@ -125,18 +124,16 @@ class Outlines:
         bodies = between_poses(take.times, times, take.body_poses, take.rate)
         matrix = np.diag([self._scale, self._scale, 1.0])
         views = [dataclasses.replace(one, size=self._size, K=matrix @ one.K) for one in cameras]
-        maps, radius = straightening(views[0]), max(3, round(reach * self._size[0]))
-        seen, parts = np.full((5, *moments.shape), np.nan), []
+        maps, flat, parts = straightening(views[0]), [straight(one) for one in views], []
+        radius, seen = max(3, round(reach * self._size[0])), np.full((5, *moments.shape), np.nan)
         for frame, picture in looks:
             there = np.flatnonzero(np.isfinite(qpos[frame, :, :, 0]).all(axis=1)).tolist()
             worn = take.hands_at(int(np.searchsorted(take.times, times[frame], "right")) - 1)
             room = 2 * radius + _AROUND
             drawn = [self._hand(hand, worn[hand], qpos[frame, hand, 0]) for hand in there]
-            look = self._look(picture, maps, straight(views[spans[frame]]), drawn, bodies[frame], room)
-            if look is None:
-                continue
-            for hand in there:
-                outline = _outline(look, hand, worn[hand], qpos[frame, hand, 0])
+            parts_of = self._looks(picture, maps, flat[spans[frame]], drawn, bodies[frame], room)
+            for hand, look in zip(there, parts_of, strict=False):
+                outline = _outline(look, hand, worn[hand], qpos[frame, hand, 0]) if look.colors.size else None
                 if outline is None:
                     continue
                 chosen, offsets, odds = self._across(look, hand, outline, radius)
@@ -154,36 +151,33 @@ class Outlines:
                 parts.append([values[kept] for values in found])
         if not parts:
             return None, Seen(*seen)
-        frames, pixels, normals, outward, larger, points, velocities, then = map(
-            np.concatenate, zip(*parts, strict=True)
-        )
-        edges = Samples(
-            frames,
-            pixels,
-            normals,
-            outward,
-            larger,
-            lambda times: points + velocities * (times - then)[:, None],
-        )
+        *lines, points, velocities, then = map(np.concatenate, zip(*parts, strict=True))
+        edges = Samples._make([*lines, lambda times: points + velocities * (times - then)[:, None]])
         return edges, Seen(*seen)
 
-    def _look(
+    def _looks(
         self, picture: Bytes, maps: Floats, view: Camera, drawn: list[Triangles], bodies: Doubles, room: int
-    ) -> _Look | None:
-        """The part of a picture with drawn hands and room around them; None if they are elsewhere."""
-        vertices = [one.vertices[: skin_atlas().num_hand] for one in drawn]  # without forearms
-        pixels = view.project(np.concatenate([np.empty((0, 3)), *vertices]))
-        ends = [np.fmin.reduce(pixels, initial=np.inf) - room, np.fmax.reduce(pixels, initial=-np.inf) + room]
-        (left, top), (right, bottom) = np.clip(ends, 0, self._size).astype(int).tolist()
-        if min(right - left, bottom - top) < 8:
-            return None
+    ) -> list[_Look]:
+        """The parts of a picture with each drawn hand and room around it; none if all are elsewhere."""
+        pixels = [view.project(one.vertices[: skin_atlas().num_hand]) for one in drawn]  # without forearms
+        low = [np.fmin.reduce(one, initial=np.inf) - room for one in pixels]
+        high = [np.fmax.reduce(one, initial=-np.inf) + room for one in pixels]
+        ends = np.clip(np.reshape([low, high], (2, -1, 2)), 0, self._size)
+        boxes, looks = np.maximum.accumulate(ends).astype(int).swapaxes(0, 1), []
+        first, last = boxes.min(axis=(0, 1), initial=max(self._size)), boxes.max(axis=(0, 1), initial=0)
+        if (last - first).min() < 8:
+            return []
         for number, T_world_body in enumerate(pose_matrices(bodies)):
             if np.isfinite(T_world_body).all():
                 instance = 1 + len(self._bundle.take.hands) + number
                 drawn += [one.triangles for one in self._bodies[number].drawn(T_world_body, instance)]
-        colors = cv2.remap(picture, maps[top:bottom, left:right], None, cv2.INTER_LINEAR)
-        part = view.part(left, top, right - left, bottom - top)
-        return _Look(np.array([left, top]), part, np.asarray(colors), see(part, drawn, with_normals=False))
+        colors = cv2.remap(picture, maps[first[1] : last[1], first[0] : last[0]], None, cv2.INTER_LINEAR)
+        truth = see(view.part(*first.tolist(), *(last - first).tolist()), drawn, with_normals=False)
+        for corner, box in zip(boxes[:, 0], boxes - first, strict=True):
+            part = tuple(slice(*ends) for ends in box.T[::-1])
+            there = Geometry(truth.depth[part], None, *(one[part] for one in truth[2:]))
+            looks.append(_Look(corner, view, np.asarray(colors)[part], there))
+        return looks
 
     def _hand(self, hand: int, fit: GloveFit, qpos: Doubles) -> Triangles:
         """A drawn hand, without normals."""
@@ -194,9 +188,9 @@ class Outlines:
 
     def _pictured(self, camera: Camera, pixels: Doubles, normals: Doubles) -> tuple[Doubles, Doubles]:
         """Pixels (N, 2) and unit normals of straightened edges, in the video's pictures."""
-        bent = camera.at(np.eye(4))
-        rays = straight(bent).unproject(np.stack([pixels, pixels + normals[:, ::-1] * [-1.0, 1.0]]))
-        points = bent.project(rays)
+        focal, center = camera.focal_lengths, camera.K[:2, 2]
+        flat = (np.stack([pixels, pixels + normals[:, ::-1] * [-1.0, 1.0]]) - center) / focal
+        points = camera.lens.distort(np.insert(flat, 2, 1.0, axis=2)) * focal + center
         along = points[1] - points[0]
         return points[0] / self._scale, unit(along[:, ::-1] * [1.0, -1.0])
 
@@ -291,14 +285,16 @@ def _outline(look: _Look, hand: int, fit: GloveFit, qpos: Doubles) -> _Outline |
     normals = -gradient / size[:, None]
     beyond = np.clip((soft[rows, columns] - 0.5) / size, -1.0, 1.0)
     pixels = np.stack([columns, rows], axis=1) + 0.5 + beyond[:, None] * normals
-    balls = pixels[:, None] - camera.project(fit.markers(qpos[None])[0][0])
+    places = pixels + look.corner
+    centers = fit.attachment.centers(fit.model, fit.model.forward_kinematics(qpos[None]))[0]
+    balls = places[:, None] - camera.project(centers)
     good = (np.linalg.norm(balls, axis=2) > (fit.layout.radius + _BALL) * scale).all(axis=1) & (size > 0.1)
-    good &= ((pixels > _EDGE) & (pixels < np.array(camera.size) - _EDGE)).all(axis=1)
+    good &= ((places > _EDGE) & (places < np.array(camera.size) - _EDGE)).all(axis=1)
     if good.sum() < _FEWEST_POINTS:
         return None
-    pixels, normals, rows, columns = (one[good] for one in (pixels, normals, rows, columns))
+    pixels, places, normals, rows, columns = (one[good] for one in (pixels, places, normals, rows, columns))
     rotation, place = camera.T_world_camera[:3, :3], camera.T_world_camera[:3, 3]
-    rays, beside = (camera.unproject(one) for one in (pixels, pixels + normals))
+    rays, beside = (camera.unproject(one) for one in (places, places + normals))
     rays, beside = rays / rays[:, 2:], beside / beside[:, 2:]
     points = rays * truth.depth[rows, columns, None].astype(np.float64) @ rotation.T + place
     bones = truth.parts[rows, columns].astype(np.int64) - 1 - PARTS_A_HAND * hand
@@ -307,8 +303,10 @@ def _outline(look: _Look, hand: int, fit: GloveFit, qpos: Doubles) -> _Outline |
 
 def _shares(counts: Floats) -> Floats:
     """Shares of colors, smoothed, of their counts."""
-    smooth = gaussian_filter(counts, _SMOOTH, mode="nearest")
-    return np.asarray(smooth / smooth.sum() + np.float32(3e-5))
+    smooth = cv2.GaussianBlur(counts, (0, 0), _SMOOTH, borderType=cv2.BORDER_REPLICATE)
+    flat = smooth.reshape(-1, _LEVELS)  # OpenCV does not blur along the last axis, that of its channels
+    smooth = cv2.GaussianBlur(flat, (0, 1), _SMOOTH, borderType=cv2.BORDER_REPLICATE)
+    return np.asarray(smooth.reshape(counts.shape) / smooth.sum() + np.float32(3e-5))
 
 
 def _edge(odds: Floats, in_me: Flags, in_free: Flags, reach: int) -> tuple[Integers, Doubles]:
