@@ -14,15 +14,16 @@ its 95th percentile and of the range from its 5th; the forecast one is that of t
 the standard deviations that change between sessions.
 
 With --change one joint of each digit truly differs between the sessions by 5 to 30 degrees: it is fixed at
-another angle, or its range is smaller in one of them. The found changes are regressed on the true ones, with
-standard errors for persons as the independent units, and the share of changes that exceed the forecast MDD
-(the larger one of the pair) is compared with that of normal errors of this size.
+another angle, or its range is smaller in one of them. The found changes are regressed on the true ones, all
+together and by kind, with standard errors for persons as the independent units, and the share of changes that
+exceed the forecast MDD (the larger one of the pair) is compared with that of normal errors of this size.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import warnings
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -135,6 +136,8 @@ def responses(pairs: list[list[Session]], origin: HandOrigin, told: np.ndarray) 
     figures: Figures = {}
     # The motion decides which joints (U, 20) changed: a joint at another angle has the same range of motion.
     differs = np.array([np.abs(one["true"] - other["true"]).max(axis=0) > 0.1 for one, other in pairs])
+    moves = np.array([np.max([np.ptp(one["true"], axis=0) for one in pair], axis=0) > 0.1 for pair in pairs])
+    kinds = {"": differs, ", fixed": differs & ~moves, ", smaller range": differs & moves}
     for measure in CHANGING:
         true, found = (
             [measures(second[angles])[measure] - measures(first[angles])[measure] for first, second in pairs]
@@ -146,16 +149,18 @@ def responses(pairs: list[list[Session]], origin: HandOrigin, told: np.ndarray) 
         change, seen = np.concatenate(true), np.concatenate(found)
         usable = np.isfinite(seen) & told
         is_changed = differs[users] & usable
-        for group, joints in GROUPS.items():
+        for (kind, which), (group, joints) in product(kinds.items(), GROUPS.items()):
             some = np.zeros_like(usable)
-            some[:, joints] = is_changed[:, joints]
-            figures[f"{measure}_{group}"] = (
-                f"change of the {measure}, {group}, found on true: slope, its standard error, intercept, SD "
-                "of the rest, largest miss [deg]; joints",
+            some[:, joints] = (which[users] & usable)[:, joints]
+            if (measure, kind) == ("range", ", fixed") or not some.any():
+                continue  # The range of a fixed joint does not change.
+            figures[f"{measure}_{group}{kind}"] = (
+                f"change of the {measure}, {group}{kind}, found on true: slope, its standard error, "
+                "intercept, SD of the rest, largest miss [deg]; joints",
                 [
                     *regression(change[some], seen[some], users[np.nonzero(some)[0]]),
                     np.abs(seen - change)[some].max(),
-                    int((differs & told)[:, joints].sum()),
+                    int((which & told)[:, joints].sum()),
                 ],
             )
         unchanged = ~differs[users] & usable

@@ -95,6 +95,11 @@ class Doubt(NamedTuple):
     distances: Float[np.ndarray, "M"]
     """Distance of each marker from its place in the layout [m]."""
 
+    @property
+    def is_wrong(self) -> bool:
+        """Whether other labels are likelier than these, so that places and angles say nothing."""
+        return any(one.words and one.probability > 0.5 for one in self.tried)
+
     def faults(self, side: Side, names: Sequence[str]) -> Iterator[Fault]:
         """Likely other labels, and markers far from their places, in sentences with the markers' names."""
         for one in self.tried:
@@ -102,7 +107,7 @@ class Doubt(NamedTuple):
                 why = f"may be labeled wrong ({100 * one.probability:.0f} %): {one.words}"
                 remedy = "correct the layout, or move a marker to where no other label fits"
                 yield Fault(f"the {side} hand", why, remedy)
-        for marker in np.flatnonzero(self.distances > _OFF_DESIGN):
+        for marker in () if self.is_wrong else np.flatnonzero(self.distances > _OFF_DESIGN):
             why = f"is {1e3 * self.distances[marker]:.0f} mm from where the layout has it"
             yield Fault(f"{side}:{names[int(marker)]}", why, _CORRECTION)
 

@@ -131,8 +131,10 @@ def _faults_of_hands(take: Take, *, is_last: bool, judges: bool) -> tuple[Suspec
         is_usual = (take.settings.get("size"), take.settings.get("user")) == ("auto", USUAL_SIZE)
         slips = () if is_usual or not is_last or take.settings.get("size_state") else (_slips,)
         doubts = doubts or (doubts_of(take) if judges else {})  # of all hands at once
-        found += _alternatives(hand, doubts.get(side))
-        for faults in (*slips, _fallen, _at_limits, _still):
+        doubt = doubts.get(side)
+        found += _alternatives(hand, doubt)
+        angles = () if doubt is not None and doubt.is_wrong else (_at_limits, _still)
+        for faults in (*slips, _fallen, *angles):
             found += faults(hand)
     return (*hands, *tuple({one.of: one for one in reversed(found)}.values())[::-1])
 

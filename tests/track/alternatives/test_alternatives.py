@@ -11,7 +11,15 @@ import pytest
 from gloves import MarkerLayout, MarkerPlace, Take, load_layout
 from gloves.fit import mean_hand
 from track import label_capture
-from track.alternatives.alternatives import ALTERNATIVES, doubts_of, judge_take, label_probability, with_doubt
+from track.alternatives.alternatives import (
+    ALTERNATIVES,
+    Alternative,
+    Doubt,
+    doubts_of,
+    judge_take,
+    label_probability,
+    with_doubt,
+)
 from train import simulate_take
 
 FRAMES = 240
@@ -176,3 +184,11 @@ def test_a_layout_with_two_markers_elsewhere_gives_right_labels(truth, off):
     assert wrong.mean() < 0.005 or not sure[wrong].any()
     if off > 0.15:  # 21 mm
         assert any("mm from where the layout has it" in str(one.message) for one in told)
+
+
+@pytest.mark.parametrize(("probability", "count"), [(0.1, 1), (0.4, 2), (0.9, 1)])
+def test_places_are_no_finding_where_other_labels_are_likelier(probability: float, count: int) -> None:
+    tried = (Alternative((0, 1), "A and B are exchanged", probability),)
+    faults = list(Doubt(tried, np.array([0.02, 0.0])).faults("right", ("A", "B")))
+    assert len(faults) == count
+    assert ("may be labeled wrong" in faults[0].why) == (probability > 0.2)
