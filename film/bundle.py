@@ -283,7 +283,7 @@ class Bundle:
             by_time, by_time * elapsed, (focal * lens.distort(local)).sum(axis=1), self.size[0] * across,
             bent, bent * square, (by_point * samples.outward).sum(axis=1),
             (by_point * samples.larger).sum(axis=1), by_time[:, None] * (samples.pixels / self.size - 0.5),
-            pose.reshape(len(points), -1),
+            pose.reshape(len(points), 6 * len(cameras)),
         ])  # fmt: skip
         return np.where(np.isfinite(found).all(axis=1, keepdims=True), found, 0.0)
 

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from film.bundle import POSES, Bundle, Detections, State
+from film.bundle import OFFSET, POSES, Bundle, Detections, Samples, State
 from handsim import Camera, Lens
 from tests.film.filmed import SIZE, Filming, moving_take
 
@@ -42,6 +42,18 @@ def test_the_jacobian_is_that_of_the_residuals(given):
             bundle.residuals(state._replace(values=values + way * step), samples, 3.0) for way in (1, -1)
         )
         np.testing.assert_allclose(found[:, number], (more - less) / 2e-6, rtol=1e-4, atol=2e-3)
+
+
+def test_a_camera_that_no_edge_agrees_with_stays_where_it_is():
+    take, filming = moving_take(), Filming(seed=1, seconds=6.0)
+    bundle = Bundle(take, Detections.of(filming.found(take)), SIZE, None)
+    values = np.zeros(POSES + 6)
+    values[OFFSET], values[POSES:] = filming.offset, pose_of(filming.cameras()[0])
+    none, flat = np.zeros((0, 3)), np.zeros((0, 2))
+    samples = Samples(np.zeros(0, int), flat, flat, none, none, lambda times: none)
+    state, cost, _ = bundle.solve(State(values, (0,)), samples, 2.0, first=True)
+    np.testing.assert_allclose(state.values[POSES:], values[POSES:])
+    assert cost >= 0.0
 
 
 def pose_of(camera):

@@ -7,7 +7,9 @@ import cv2
 import numpy as np
 import pytest
 
+from film import annotation
 from handsim.cli.main import main
+from handsim.errors import HandSimError
 from render.illustrations import write_video
 from tests.film.filmed import SIZE, Filming, moving_take
 
@@ -61,7 +63,68 @@ def test_a_video_becomes_photographs(files, pictures, tmp_path, capsys):
     record = json.loads((out / "film.json").read_text("utf-8"))
     assert abs(record["offset"] - FILMING.offset) < 0.003
     assert (out / "film.mp4").is_file() and "Camera and clock" in (out / "film.html").read_text("utf-8")
-    assert "frames fit" in capsys.readouterr().out
+    assert "frames fit" in capsys.readouterr().out and not (out / "study.json").exists()
+
+
+def test_several_videos_have_a_folder_each_and_a_bad_one_stops_none(
+    files, pictures, tmp_path, capsys, monkeypatch
+):
+    take, out, later = moving_take(), tmp_path / "out", 8  # the second camera begins eight frames later
+    write_video(tmp_path / "late.mp4", iter(pictures[later:]), rate=FILMING.rate, size=SIZE)
+    (tmp_path / "bad.mp4").write_text("no video")
+
+    def found(film, detector, progress):
+        hands = FILMING.found(take)[len(pictures) - film.num_frames :]
+        return [frame._replace(time=number / FILMING.rate) for number, frame in enumerate(hands)]
+
+    monkeypatch.setattr(annotation, "find_hands", found)
+    videos = [str(files / "video.mp4"), str(tmp_path / "bad.mp4"), str(tmp_path / "late.mp4")]
+    words = ["film", str(files / "take.npz"), *videos, "--out", str(out), "--format", "coco"]
+    words += ["--passes", "rgb", "--num-frames", "2"]
+    assert main([*words, "--workers", "1"]) == 1
+    said = capsys.readouterr()
+    assert f"{videos[1]}: not registered: not a video that can be read" in said.err
+    assert said.err.splitlines()[-1] == f"handsim film: 1 of 3 files were not registered: {videos[1]}"
+    assert {path.name for path in out.iterdir()} == {"video", "late", "study.json"}
+    table = said.out.splitlines()[-3:-1]
+    clocks = (FILMING.offset, FILMING.offset + later / FILMING.rate)
+    for name, clock, line in zip(("video", "late"), clocks, table, strict=True):
+        record = json.loads((out / name / "film.json").read_text("utf-8"))
+        assert len(json.loads((out / name / "annotations.json").read_text("utf-8"))["images"]) == 2
+        assert abs(record["offset"] - clock) < 0.003
+        row = line.split()
+        assert row[0] == name
+        place = np.array(record["cameras"][0]["T_world_camera"])[:3, 3]
+        assert np.allclose(np.array(row[1:4], float), place, atol=6e-4)
+        told = [1e3 * record["deviations"]["position"], record["cameras"][0]["K"][0][0], record["offset"]]
+        assert np.allclose(np.array(row[4:7], float), told, atol=0.06)
+        (counts,) = (line for line in said.out.splitlines() if line.startswith(f"{out / name}: "))
+        counted, frames = int(counts.split()[1]), int(counts.split()[3])
+        assert frames == record["frames"] and row[7] == f"{100 * counted / frames:.0f}"
+
+    def refuse(*given, **settings):
+        raise HandSimError(f"{Path(given[1]).name} again")
+
+    monkeypatch.setattr(annotation, "annotate_film", refuse)
+    assert main([*words, "--workers", "2"]) == 1  # what is there stays, whatever the number of processes is
+    again = capsys.readouterr().out.splitlines()
+    assert again[2:] == [*table, f"{out}: 0 files registered now, 2 before"]
+    next((out / "late").rglob("*.jpg")).unlink()
+    assert main(words) == 1
+    error = capsys.readouterr().err
+    assert "late.mp4 again" in error and "video.mp4 again" not in error
+
+
+def test_several_videos_are_refused_before_work(files, tmp_path, capsys):
+    take, video, out = str(files / "take.npz"), str(files / "video.mp4"), tmp_path / "out"
+    for words, told in (
+        ([], "no video is given"),
+        ([video, str(tmp_path / "video.mov")], f"two outputs are {out / 'video'}, expected two files"),
+        ([video, "b.mp4", "--detector", "found.json"], "found.json and 2 videos, expected the one"),
+    ):
+        assert main(["film", take, *words, "--out", str(out)]) == 1
+        error = capsys.readouterr().err
+        assert told in error and len(error.strip().splitlines()) == 1 and not out.exists()
 
 
 def test_mistakes_are_sentences(files, tmp_path, capsys):
