@@ -165,7 +165,7 @@ def _plain(value: Any) -> Any:
 
 
 def _checksums(files: Sequence[object]) -> list[str]:
-    """The checksums of files, and of the files in folders. and below these."""
+    """The checksums of files, and of the files in folders and below these."""
     paths = [Path(one) for one in files if isinstance(one, str | Path)]
     inside = [one for path in paths for one in (sorted(path.rglob("*")) if path.is_dir() else [path])]
     return [checksum(one) for one in inside if one.is_file() and os.access(one, os.R_OK)]
