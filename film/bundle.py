@@ -26,7 +26,7 @@ _MOST_BUNDLED: Final = 5000  # largest number of keypoints in a bundle
 _ROBUST: Final = 2.0  # Residuals beyond this many standard deviations count less.
 _NOTHING: Final = 1e-2  # prior information on free unknowns
 _PARTS: Final = 8  # number of parts of a video that are held out, one after the other
-_TINY: Final = 1e-6  # [s, rad] step of derivatives by time and rotations
+_TINY: Final = 1e-6  # [s], [rad] step of the finite differences by time and by rotations
 _DEPENDENT: Final = 16.0  # This many samples count as one with an independent error.
 
 # Places of the unknowns in a state's values. From POSES on, each span has six numbers for its camera's pose.

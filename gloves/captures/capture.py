@@ -32,7 +32,7 @@ _SAMPLED: Final = 200  # frames that are looked at, evenly spread
 
 
 OF_ARRAYS: Final = "gloves.Capture(names, positions, rate) makes a capture of arrays (docs/marker_files.md)"
-"""What helps somebody whose positions are arrays."""
+"""End of an error message for people whose positions are arrays."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 _ALWAYS: Final = 1 << 28  # bytes that any archive may hold
-_LEVEL: Final = 1  # of compression: numbers get 3 % smaller with 6, in 2.4 times the time
+_LEVEL: Final = 1  # of compression; level 6 makes takes 3 % smaller and is 2.4 times as slow
 _LARGEST_RATIO: Final = 20  # A larger archive may expand to this many times the size of its file.
 _DAMAGE: Final = (
     AttributeError, EOFError, IndexError, KeyError, OverflowError, RuntimeError, SyntaxError, TypeError,

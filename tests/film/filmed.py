@@ -118,3 +118,9 @@ def found_hand(side: Side, pixels: np.ndarray) -> FoundHand:
     """A hand with these keypoints."""
     low, high = pixels.min(axis=0), pixels.max(axis=0)
     return FoundHand(side, np.concatenate([low, high - low]), 0.9, pixels, np.full(len(pixels), 0.9))
+
+
+def pose_of(camera: Camera) -> np.ndarray:
+    """Rotation vector and place (6,) of a camera, as a state of the bundle has them."""
+    turn = Rotation.from_matrix(camera.T_world_camera[:3, :3]).as_rotvec()
+    return np.concatenate([turn, camera.T_world_camera[:3, 3]])

@@ -7,7 +7,7 @@ import pytest
 
 from film.bundle import OFFSET, POSES, Bundle, Detections, Samples, State
 from handsim import Camera, Lens
-from tests.film.filmed import SIZE, Filming, moving_take
+from tests.film.filmed import SIZE, Filming, moving_take, pose_of
 
 
 @pytest.mark.parametrize("given", [False, True])
@@ -54,10 +54,3 @@ def test_a_camera_that_no_edge_agrees_with_stays_where_it_is():
     state, cost, _ = bundle.solve(State(values, (0,)), samples, 2.0, first=True)
     np.testing.assert_allclose(state.values[POSES:], values[POSES:])
     assert cost >= 0.0
-
-
-def pose_of(camera):
-    from scipy.spatial.transform import Rotation
-
-    turn = Rotation.from_matrix(camera.T_world_camera[:3, :3]).as_rotvec()
-    return np.concatenate([turn, camera.T_world_camera[:3, 3]])

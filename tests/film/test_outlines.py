@@ -2,12 +2,11 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
-from scipy.spatial.transform import Rotation
 
 from film.bundle import POSES, Bundle, Detections, State
 from film.outlines import Outlines, _shares
 from gloves.takes.take import Take
-from tests.film.filmed import SIZE, Filming, moving_take
+from tests.film.filmed import SIZE, Filming, moving_take, pose_of
 
 
 def test_each_hand_is_seen_by_itself():
@@ -19,10 +18,9 @@ def test_each_hand_is_seen_by_itself():
     both = Take.of_poses(both.hands, qpos, rate=both.rate)
     pictures = filming.pictures(moving_take(sides=("right", "left")), "skin")
     camera = filming.cameras()[0]
-    turn = Rotation.from_matrix(camera.T_world_camera[:3, :3]).as_rotvec()
     values = np.zeros(POSES + 6)
     values[[0, 2]] = filming.offset, np.log(camera.focal_length / SIZE[0])
-    values[POSES:] = np.concatenate([turn, camera.T_world_camera[:3, 3]])
+    values[POSES:] = pose_of(camera)
     looks, found = list(enumerate(pictures)), []
     for take in (
         both,

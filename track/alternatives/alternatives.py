@@ -97,7 +97,7 @@ class Doubt(NamedTuple):
 
     @property
     def is_wrong(self) -> bool:
-        """Whether other labels are likelier than these, so that places and angles say nothing."""
+        """Whether other labels are likelier than those of the take; then its poses are wrong, too."""
         return any(one.words and one.probability > 0.5 for one in self.tried)
 
     def faults(self, side: Side, names: Sequence[str]) -> Iterator[Fault]:

@@ -259,12 +259,12 @@ class BodyTracker:
         return self._result(_Match(len(seen), rms, pose, assignment), points, ids)
 
     def _last_points(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Index of the point (Q,) with the ID that each marker's point had in the last frame, -1 for none."""
+        """For each marker the index (Q,) of the point with the ID of its last one; -1 where there is none."""
         there = (self._last_ids[:, None] == ids) & (ids >= 0)
         return np.where(there.any(axis=1), there.argmax(axis=1) if len(ids) else -1, -1)
 
     def _carried(self, points: NDArray[np.float64], ids: NDArray[np.int64]) -> NDArray[np.int64]:
-        """The same for a body without a pose: two or more points that keep their distances, too."""
+        """`_last_points` if these are two or more and keep their distances, otherwise -1 for all."""
         assignment = self._last_points(ids)
         seen = np.flatnonzero(assignment >= 0)
         there = points[assignment[seen]]
@@ -356,21 +356,28 @@ class BodyTracker:
         return self._result(match, points, ids)
 
     def _result(self, match: _Match, points: NDArray[np.float64], ids: NDArray[np.int64]) -> BodyFrame:
-        """The result of a fit; points beside it that keep their IDs, near their places, keep their labels."""
-        self._keep(match, points, ids)
+        """The result of a fit, with the labels of further points that `_keep` finds."""
         transform = np.eye(4)
         write_quaternion_matrix(transform, *match.pose[3:])
         transform[:3, 3] = match.pose[:3]
+        self._keep(match, transform, points, ids)
         return BodyFrame(self._status, transform, self._labels(match.assignment, ids), match.rms)
 
-    def _keep(self, match: _Match, points: NDArray[np.float64], ids: NDArray[np.int64]) -> None:
-        """Label points beside a fit that keep their IDs, or are where such a marker was last."""
+    def _keep(
+        self,
+        match: _Match,
+        transform: NDArray[np.float64],
+        points: NDArray[np.float64],
+        ids: NDArray[np.int64],
+    ) -> None:
+        """Add to a match markers that the fit left out.
+
+        The point of such a marker has the ID of its last one, or is where the marker was when last kept.
+        """
         if (match.assignment >= 0).all() or not len(points):
             return
         there, last = transform_markers(self._positions, match.pose), self._last_points(ids)
         before = transform_markers(self._places, match.pose)
-        rotation = np.empty((3, 3))
-        write_quaternion_matrix(rotation, *match.pose[3:])
         for marker in np.flatnonzero(match.assignment < 0):
             point = last[marker]
             if point < 0 and (self._places[marker] != self._positions[marker]).any():
@@ -379,7 +386,7 @@ class BodyTracker:
             is_near = np.linalg.norm(points[point] - there[marker]) <= self._tolerances.kept
             if point >= 0 and is_near and point not in match.assignment:
                 match.assignment[marker] = point
-                self._places[marker] = (points[point] - match.pose[:3]) @ rotation
+                self._places[marker] = (points[point] - transform[:3, 3]) @ transform[:3, :3]
 
     def _labels(self, assignment: NDArray[np.int64], ids: NDArray[np.int64]) -> NDArray[np.int64]:
         """The marker (N,) of each point, -1 for none; stores the IDs for the next frame."""

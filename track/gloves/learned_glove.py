@@ -85,7 +85,7 @@ class LearnedGlove:
     spreads: Float[np.ndarray, "M"]
     """How far each marker's place differs between the hands and the layout, root mean square [m]."""
     sure: Float[np.ndarray, "M"]
-    """Probability that each marker is where the layout has it, not where another hand fits as well."""
+    """For each marker the probability that no other hand fits as well with the marker elsewhere."""
     doubt: tuple[str, ...]
     """Sentences on places that are unsure, and on columns that exchange their markers."""
 

@@ -40,7 +40,7 @@ from track.frames import FARTHEST, LATEST_TIME, StreamedFrame, TrackedFrame
 from track.tracker import Tracker
 from track.user import stored_errors
 
-_SUMMARIZED: Final = 5_000  # largest number of frames read for a summary, which takes 3 s
+_SUMMARIZED: Final = 5_000  # largest number of frames that a summary reads; 5,000 take 3 s
 _ID_BITS: Final = (1 << 31) - 1  # bits of IDs in takes
 
 

@@ -230,7 +230,7 @@ class _SmoothedHand:
         return np.median(np.concatenate(cutoffs), axis=0), parts
 
     def _follow(self, windows: Sequence[_Window]) -> None:
-        """Solve the poses, with more acceleration where they do not follow the hand.
+        """Solve the poses, and again with larger accelerations while they do not follow the hand.
 
         Poses of single frames leave the noise of the markers but for the share that they follow. Smoothed
         ones that leave more lag behind; what they leave would count as noise, and they would lag the more.

@@ -31,8 +31,8 @@ _A_TRIAL: Final = "a Capture, a Take or the path of a file"
 """A capture; a take, of which only the points are used; or the path of one."""
 _STEP: Final = 4.0  # [m/s] A column whose point moves faster goes on with another one.
 _GATE: Final = 0.02  # [m] A point returns at most this far from where its neighbors predict it.
-_LONG: Final = 1.0  # [s] Ghosts hardly stay this long.
-_STEADY: Final = 0.75  # least share of that time in which the point is seen
+_LONG: Final = 1.0  # [s] A point that stays this long is no ghost.
+_STEADY: Final = 0.75  # share of `_LONG` in which such a point is seen at least
 _BRIEF: Final = 0.1  # [s] Any point may be missing for this long.
 _ANCHORS: Final = 5  # nearest points that predict it
 _MARKER: Final = 0.5  # share of the frames in which a marker is there; a ghost is there in fewer

@@ -113,7 +113,7 @@ def _words(value: Any) -> str:
 
 
 def _ratio(wanted: float | None, made: float | None) -> float:
-    """Factor from the figure that was made to the wanted one."""
+    """Factor by which a setting is multiplied, so that the figure `made` with it becomes the `wanted` one."""
     if wanted is None or made is None:
         return 1.0
     return float(np.clip(wanted / max(made, 1e-12), 1 / _LARGEST, _LARGEST))
