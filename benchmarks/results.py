@@ -1,7 +1,7 @@
 """Writes docs/results.md and docs/trust.md from benchmarks/figures: `python -m benchmarks.results`.
 
 The page's text is results_template.md; `{table5.right_size[1]:.2f}` in it is a number of table5.json, and
-`{speed_rows_of}` are tables of all of speed.json, and `{speed_run_of}` says how it was made.
+`{speed_rows}` are tables of all of speed.json.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ from benchmarks.trust import trust_page
 
 PAGE: Final = Path(__file__).resolve().parents[1] / "docs" / "results.md"
 TEMPLATE: Final = Path(__file__).with_name("results_template.md")
-SPEEDS: Final = ("speed", "speed_parts")
 README: Final = (
     "{label_clean.row[0]:.2f} {label_both.row[0]:.2f}",
     "{real_motion.mean[1]:.2f} {real_motion.worst[1]:.2f}",
@@ -37,20 +36,12 @@ def filled(text: str) -> str:
         KeyError: A field names a file that is not there.
         AttributeError: A field names a figure that its file lacks.
     """
-    speeds = {f"{name}_{part.__name__}": part(name) for name in SPEEDS for part in (run_of, rows_of)}
-    return text.format(**load_figures(), **speeds)
+    return text.format(**load_figures(), speed_rows=_speed_rows())
 
 
-def run_of(name: str, folder: Path = FOLDER) -> str:
-    """The conditions, commit, date, command and machine of a file of figures, in sentences."""
-    kept = json.loads((folder / f"{name}.json").read_text("utf-8"))
-    origin = f"Commit {kept['commit']}, {kept['date']}, `{kept['command']}`; {kept['machine']}."
-    return f"{kept['conditions']} {origin}" if "conditions" in kept else origin
-
-
-def rows_of(name: str, folder: Path = FOLDER) -> str:
-    """The tables of a file of speeds: one of times, one of rates, each without the figures in units."""
-    figures = json.loads((folder / f"{name}.json").read_text("utf-8"))["figures"]
+def _speed_rows() -> str:
+    """The tables of speed.json: one of times, one of rates, each without the figures in units."""
+    figures = json.loads((FOLDER / "speed.json").read_text("utf-8"))["figures"]
     times = ["| what | median [ms] | 99th percentile [ms] | longest [ms] |", "|---|---|---|---|"]
     rates = ["| what | in a second |", "|---|---|"]
     for key, figure in figures.items():
