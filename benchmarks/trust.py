@@ -40,8 +40,8 @@ _METHODS: Final = {
 _BESIDE: Final = """
 ## Other methods
 
-Methods on the same data, with hands whose size was measured (`benchmarks/public/README.md` has more). The loop
-of the paper runs with our labeler there, and its network was counted on every tenth real frame.
+Methods on the same data, with hands whose size was measured (`benchmarks/public/README.md` has more). The
+loop of the paper runs with our labeler there, and its network was counted on every tenth real frame.
 
 """
 
