@@ -1,16 +1,14 @@
 """Writes docs/results.md and docs/trust.md from benchmarks/figures: `python -m benchmarks.results`.
 
-The page's text is results_template.md; `{table5.right_size[1]:.2f}` in it is a number of table5.json, and
-`{speed_rows}` are tables of all of speed.json.
+The page's text is results_template.md; `{table5.right_size[1]:.2f}` in it is a number of table5.json.
 """
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Final
 
-from benchmarks.record import FOLDER, load_figures
+from benchmarks.record import load_figures
 from benchmarks.trust import PAGE as TRUST
 from benchmarks.trust import trust_page
 
@@ -36,26 +34,7 @@ def filled(text: str) -> str:
         KeyError: A field names a file that is not there.
         AttributeError: A field names a figure that its file lacks.
     """
-    return text.format(**load_figures(), speed_rows=_speed_rows())
-
-
-def _speed_rows() -> str:
-    """The tables of speed.json: one of times, one of rates, each without the figures in units."""
-    figures = json.loads((FOLDER / "speed.json").read_text("utf-8"))["figures"]
-    times = ["| what | median [ms] | 99th percentile [ms] | longest [ms] |", "|---|---|---|---|"]
-    rates = ["| what | in a second |", "|---|---|"]
-    for key, figure in figures.items():
-        if key == "unit":
-            continue
-        *shown, _ = figure["value"]
-        row = f"| {' | '.join([figure['what'].rsplit(': ', 1)[0], *map(_shown, shown)])} |"
-        (times if len(shown) == 3 else rates).append(row)
-    return "\n\n".join("\n".join(table) for table in (times, rates) if len(table) > 2)
-
-
-def _shown(value: float) -> str:
-    """A number to three digits."""
-    return f"{float(f'{value:.3g}'):,g}"
+    return text.format(**load_figures())
 
 
 if __name__ == "__main__":
