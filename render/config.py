@@ -201,6 +201,8 @@ def resolve(
     """
     config = RenderConfig() if config is None else config
     check_type("config", config, RenderConfig, "a RenderConfig")
+    if "view" in settings and camera is not None and not isinstance(camera, str):
+        raise ArgumentError("given view and camera, expected one of them")
     config = RenderConfig.of(config, settings)
     view, painter, sensor = _view(config.view, camera), config.painter, config.depth_sensor
     if painter == "auto":  # without colors there is no need to look

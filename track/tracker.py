@@ -142,7 +142,7 @@ class Tracker:
         """
         self.user, self.hands = user, user.hands
         for state, hand in zip(self._states, self.hands, strict=True):
-            state.resize(hand, user.origin(hand.side), keep)
+            state.resize(hand, user.origin(hand.side), user.errors.get(hand.side), keep)
         self._digits = digit_table(self._states, self._numbering)
         if not keep:
             self._initializer = HandInitializer(self._states, self.labeler, self.config)

@@ -175,10 +175,11 @@ def hand_origin(notes: str, side: Side) -> HandOrigin:
 
     Hands that could not be measured have a named size; one that calibration did not improve is measured.
     """
-    if notes.removeprefix(MEASURED) in get_args(Size):
+    first = notes.split("; ", maxsplit=1)[0]
+    if first.removeprefix(MEASURED) in get_args(Size):
         return "named"
     left = any(told.startswith(f"{side} hand: ") for told in _left_as_measured(notes))
-    return "measured" if left or notes.startswith(MEASURED) else "calibrated"
+    return "measured" if left or first.startswith(MEASURED) else "calibrated"
 
 
 def _left_as_measured(notes: str) -> list[str]:
@@ -196,10 +197,16 @@ def nominal_user(layout: MarkerLayout, size: str, sides: str | Sequence[str] | N
 
 
 def as_user(hands: User | Sequence[GloveFit] | str | Path) -> User:
-    """Make a user of hands, a user's file, or a user."""
+    """Make a user of hands, a user's file, or a user.
+
+    The notes of a file's user are its name and where the hands are from.
+    """
     if isinstance(hands, str | Path):
         user = load_user(hands)
-        return dataclasses.replace(user, notes="; ".join([Path(hands).name, *_left_as_measured(user.notes)]))
+        first, *_ = user.notes.split("; ")
+        size = [first] if first.startswith(MEASURED) or first in get_args(Size) else []
+        notes = [*size, Path(hands).name, *_left_as_measured(user.notes)]
+        return dataclasses.replace(user, notes="; ".join(notes))
     if not isinstance(hands, User):
         check_type("hands", hands, Sequence, "a User, hands in their gloves (GloveFit), or a user's file")
         return User(tuple(hands))

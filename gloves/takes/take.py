@@ -180,6 +180,7 @@ class Take:
             check_type("a hand", hand, GloveFit, "a GloveFit, as attach and nominal_fit return it")
         others = dict(rate=rate, hands=tuple(hands), bodies=tuple(bodies), settings=settings,
                       former=tuple(former))  # fmt: skip
+        check_type("the rate [Hz]", rate, (int, float, np.integer, np.floating), "a number")
         for name, value in (*by_frame.items(), *others.items()):
             object.__setattr__(self, name, value)
         try:
@@ -267,7 +268,7 @@ class Take:
         qpos, points = as_numbers("qpos", qpos), as_numbers("points", points)
         nowhere = np.full((len(points), len(bodies), 7), np.nan)
         poses = nowhere if body_poses is None else as_numbers("body_poses", body_poses)
-        check_number("the rate [Hz]", float(rate), 0.0, above=True)
+        check_number("the rate [Hz]", rate, 0.0, above=True)
         return cls(
             rate=rate,
             times=np.arange(len(qpos)) / rate,
@@ -305,6 +306,7 @@ class Take:
         Raises:
             ArgumentError: The arrays do not fit together, or hold what they cannot.
         """
+        qpos = np.atleast_1d(as_numbers("qpos", qpos))
         points, nothing = np.empty((len(qpos), 0, 3)), np.empty((len(qpos), 0), dtype=np.int32)
         take = cls.of_truth(
             hands, qpos, points, nothing, nothing, rate=rate, bodies=bodies, body_poses=body_poses,
@@ -686,16 +688,19 @@ class Take:
             CaptureError: There are no points.
         """
         names, labels = self.label_names, self.point_list.labels.astype(np.int64)
-        num_markers = len(self.hands[0].layout.names)
-        if not sides:
-            names = self.hands[0].layout.names
-            labels = np.where(labels >= 0, labels % num_markers, -1)
-        else:
-            seen = np.isin(np.arange(len(self.hands)), labels[labels >= 0] // num_markers)
+        if sides:
+            seen = [((labels >= hand.start) & (labels < hand.stop)).any() for hand in self.hand_labels]
             kept = np.ones(len(names), dtype=np.bool_)
-            kept[: num_markers * len(seen)] = np.repeat(seen | ~seen.any(), num_markers)
+            for hand, is_seen in zip(self.hand_labels, seen, strict=True):
+                kept[hand.start : hand.stop] = is_seen or not any(seen)
             names = tuple(name for name, keeps in zip(names, kept, strict=True) if keeps)
-            labels = np.where(labels >= 0, (np.cumsum(kept) - 1)[labels], -1)
+            columns = np.cumsum(kept) - 1
+        else:
+            names = self.hands[0].layout.names
+            columns = np.full(len(self.label_names), -1)  # Markers of bodies have no name there.
+            for hand in self.hand_labels:
+                columns[hand.start : hand.stop] = range(len(hand))
+        labels = np.where(labels >= 0, columns[labels], -1)
         begins = self.point_list.starts[1:-1]
         frames, rows = (np.split(values, begins) for values in (self.point_list.points, labels))
         return self._steady(labeled_columns(frames, rows, names, self.rate))
@@ -788,7 +793,7 @@ class Take:
             raise ArgumentError(
                 f"neutral is {neutral} and the file {path}, expected .csv with the ISB's angles"
             )
-        take = poses_for(form, self, None if rate is None else float(rate))
+        take = poses_for(form, self, rate)
         if forward is not None:
             check_choice(forward, FORWARD, noun="axis that points forward")
             take = take.turned(facing(up, forward))

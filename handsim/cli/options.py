@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -48,13 +47,13 @@ class TrackerOptions:
     def settings(self, **others: Any) -> TrackSettings:
         """The settings of `track_capture`, the others by their names."""
         from track.settings import TrackSettings
-        from track.user import load_user
+        from track.user import as_user
 
         if self.shape is not None and self.size is not None:
             raise ArgumentError(f"given --size {self.size} and --shape {self.shape}, expected one of them")
         hands: AnyHands | None = self.shape or self.hands
         if self.shape is not None and self.hands is not None:
-            hands = dataclasses.replace(load_user(self.shape).of_sides(self.hands), notes=self.shape.name)
+            hands = as_user(self.shape).of_sides(self.hands)
         size = self.size or "auto"
         return TrackSettings(self.glove, hands, size, self.labeler, bodies=self.body, **others)
 

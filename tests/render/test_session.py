@@ -261,6 +261,7 @@ def test_a_take_with_y_up_is_drawn_as_the_same_one_with_z_up(camera, tmp_path):
         ({"model": "XXL"}, "unknown size 'XXL'"),
         ({"model": ("M", "L")}, "the models are of 2 hands .right and right. and the poses of 1"),
         ({"camera": 7}, "camera is 7, expected a Camera"),
+        ({"camera": ABOVE, "view": {"share": 0.9}}, "given view and camera, expected one of them"),
         ({"camera": "webcam"}, "unknown camera 'webcam'; .*, or cameras of your own: --cameras FILE"),
         ({"frames": 2.5}, "frames is 2.5, expected numbers of frames"),
         ({"frames": ["a"]}, "a frame is 'a', expected a whole number"),

@@ -19,7 +19,8 @@ from handsim import HandModel, HandSimError
 from handsim.errors import ArgumentError
 from handsim.hand.shape import JOINT_NAMES
 from tests.sentences import error_names
-from track import TrackedFrame, Tracker, TrackerConfig
+from track import TrackedFrame, Tracker, TrackerConfig, User
+from track.kinematics.pose_spread import NUM_NUMBERS, HandErrors
 from train import Labeler, load_labeler, simulate_take
 
 
@@ -629,3 +630,17 @@ def test_the_same_motion_again_and_again_is_tracked_as_before(labeler):
         rms.append([hand.rms for hand in frame.hands])
     by_lap = np.nanmedian(np.reshape(rms, (15, len(there_and_back), -1)), axis=1)
     np.testing.assert_allclose(by_lap[14], by_lap[10], atol=2e-6)  # [m]
+
+
+def test_the_same_hands_again_keep_their_standard_deviations(take, users, labeler):
+    rng = np.random.default_rng(4)
+    errors = HandErrors(0.01 * rng.normal(size=(NUM_NUMBERS, 3)), 0.001 * rng.normal(size=(19, 3, 3)))
+    user = User(tuple(users), errors={hand.side: errors for hand in users})
+    plain_tracker, resized = Tracker(user, labeler), Tracker(user, labeler)
+    resized.resize(user)
+    for number in range(10):
+        fed = plain(take, number)
+        mine, other = (one.step(fed.points, fed.ids, fed.time) for one in (plain_tracker, resized))
+    for first, second in zip(mine.hands, other.hands, strict=True):
+        assert np.isfinite(first.angle_spread).any()
+        np.testing.assert_array_equal(first.angle_spread, second.angle_spread)

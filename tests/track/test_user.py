@@ -86,10 +86,14 @@ def test_a_hand_that_a_calibration_left_as_measured_is_not_calibrated(hands, tmp
     ("notes", "origin"),
     [("", "calibrated"), ("M", "named"), (f"{MEASURED}187 x 83 mm", "measured"), (f"{MEASURED}M", "named")],
 )
-def test_notes_tell_where_hands_are_from(hands, notes, origin):
+def test_notes_tell_where_hands_are_from(hands, notes, origin, tmp_path):
     """A size that could not be measured is the usual one."""
     user = User(hands, notes)
     assert user.origin("left") == origin and user.is_calibrated("left") == (origin == "calibrated")
+    user.save(tmp_path / "user.json")
+    again = as_user(tmp_path / "user.json")
+    assert again.origin("left") == origin and "user.json" in again.notes
+    assert as_user(tmp_path / "user.json").of_sides(["right"]).origin("right") == origin
 
 
 def test_what_cannot_be_saved_is_told(hands, tmp_path):

@@ -276,9 +276,9 @@ class HandState:
         self._bias[:], self._bias_frames[:], self._variance[:], self.variance[:] = biases
         self._shift_markers()
 
-    def resize(self, hand: GloveFit, origin: HandOrigin, keep: float) -> None:
+    def resize(self, hand: GloveFit, origin: HandOrigin, errors: HandErrors | None, keep: float) -> None:
         """Continue with the same hand of another size, and a share of the biases."""
-        self.hand, self.solver, self._spread_model = hand, PoseSolver(hand), SpreadModel(hand, origin)
+        self.hand, self.solver, self._spread_model = hand, PoseSolver(hand), SpreadModel(hand, origin, errors)
         self.digits = hand.attachment.digits
         self._designed = self.solver.hand.positions[:, 0].copy()
         if not keep:

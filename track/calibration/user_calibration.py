@@ -77,7 +77,7 @@ _LEAST_MARKER_SHARE: Final = 0.75  # A usable frame has this share of the marker
 _MOST_RMS_RATIO: Final = 3.0  # A used frame has an RMS of at most this multiple of the median.
 _LOOK_PERIOD: Final = 1.0 / 30.0  # [s] between two poses that a guide examines
 _ASK_PERIOD: Final = 1.0  # [s] least time between two requests of a guide
-_LEAST_MOTION: Final = 30.0  # [s] of hands before a guide asks for touches
+_LEAST_HANDS_TIME: Final = 30.0  # [s] of tracked hands before a guide ends
 _ENOUGH_RANGE: Final = 0.3  # share of its range that each joint should cover
 _LEAST_NOISE, _MOST_NOISE = 0.0001, 0.003  # [m]
 _CHI2_MEDIAN: Final = 2.366  # median of the chi-squared distribution with three degrees of freedom
@@ -189,7 +189,8 @@ class Calibration:
         touched = {touch.finger for touch in self.significant_touches}
         missing = [finger for finger in DIGITS[1:] if finger not in touched]
         if missing:
-            sentences.append(f"touch the thumb to the tip of the {', '.join(missing)} finger and hold still")
+            fingers = ", ".join(missing)
+            sentences.append(f"touch the thumb to the tips of these fingers and hold still: {fingers}")
         return tuple(sentences)
 
 
@@ -198,7 +199,7 @@ def _motions(still: Sequence[str]) -> Iterator[str]:
     for digit in DIGITS:
         own = [name.removeprefix(f"{digit}_").replace("_", " ") for name in still if name.startswith(digit)]
         if own:
-            yield f"move the {digit} more: {', '.join(own)} covered too little of its range"
+            yield f"move the {digit} more, through the whole range of {', '.join(own)}"
 
 
 class MotionGuide:
@@ -212,7 +213,7 @@ class MotionGuide:
         self._looks = 0  # number of examined poses with a tracked hand
 
     def __call__(self, tracked: TrackedFrame) -> str | None:
-        """The request after a frame; None when every joint has covered its range."""
+        """The request after a frame; None when every joint covered its range, and half a minute is over."""
         if tracked.time >= self._looked + _LOOK_PERIOD:
             self._looked = tracked.time
             there = [hand for hand in tracked.hands if hand.status is Status.TRACKED]
@@ -226,7 +227,7 @@ class MotionGuide:
                 )
         if tracked.time >= self._asked + _ASK_PERIOD:
             self._asked, self._wish = tracked.time, next(self._wishes(), "")
-        if not self._wish and self._looks * _LOOK_PERIOD >= _LEAST_MOTION:
+        if not self._wish and self._looks * _LOOK_PERIOD >= _LEAST_HANDS_TIME:
             return None
         return self._wish or "touch the thumb to the tip of each finger and hold still"
 

@@ -15,7 +15,7 @@ from track.user import hand_origin
 
 _HANDS: Final[dict[HandOrigin, str]] = {
     "named": "mean hands of one of five sizes",
-    "measured": "hands whose size and proportions were measured in the capture",
+    "measured": "hands whose size and proportions were measured by their markers",
     "calibrated": "hands calibrated for each person and session from S s of motion",
 }
 

@@ -39,7 +39,7 @@ from track.takes.take_figures import (
 from track.takes.take_summary import find_suspect_spans, summarize, suspicions, vouch
 from track.takes.take_tables import write_tables
 from track.takes.trials import FIGURES, Cycles, draw_cycles, mean_and_spread
-from track.user import MEASURED
+from track.user import MEASURED, hand_origin
 from train.evaluation import percent
 
 if TYPE_CHECKING:
@@ -110,7 +110,7 @@ def _lead(take: Take) -> str:
     parts.append(f"glove {settings.get('glove', take.hands[0].layout.name)}")
     parts.append(f"hands {' and '.join(take.sides)}")
     if user.startswith(MEASURED):
-        parts.append(f"size measured in the capture, {user.removeprefix(MEASURED)}")
+        parts.append(f"measured size {user.removeprefix(MEASURED)}")
     elif user in get_args(Size):
         parts.append(f"size {user}")
     end = f"{take.num_frames:,} frames, {take.duration:.1f} s at {take.rate:.4g} Hz."
@@ -135,9 +135,9 @@ def _calibration_section(take: Take) -> Section:
     notes = str(take.settings.get("user", ""))
     if not take.made_by_tracker:
         text = "The hands are those that the take was made with: there is nothing to calibrate."
-    elif notes.startswith(MEASURED) or notes in get_args(Size):
+    elif notes.startswith(MEASURED) or hand_origin(notes, take.sides[0]) == "named":
         named = f"the mean hands of size {notes}, in a glove as designed"
-        known = "measured in the capture" if notes.startswith(MEASURED) else named
+        known = "of measured size" if notes.startswith(MEASURED) else named
         text = f"The hands are not calibrated but {known}. {_BANDS} {_CALIBRATE}"
     elif notes:
         text = f"The hands are a user's, as calibrated or given: {escape(notes)}."

@@ -203,6 +203,36 @@ def test_labeled_points_become_columns_and_lose_none(take):
     )
 
 
+def test_hands_with_other_gloves_keep_their_own_columns(truth):
+    names = truth.labeled_capture().names
+    assert names[: len(truth.label_names)] == truth.label_names
+    right = truth.hand_labels[1]
+    seen = truth.point_list.without(truth.point_list.labels < right.start)
+    alone = dataclasses.replace(truth, point_list=seen)
+    assert alone.labeled_capture().names[: len(right)] == truth.label_names[right.start : right.stop]
+
+
+def test_points_of_a_body_have_no_names_of_a_hand(take):
+    bodies = take.point_list.without(take.point_list.labels < take.hand_labels[-1].stop)
+    capture = dataclasses.replace(take, point_list=bodies).labeled_capture(sides=False)
+    assert capture.names[:MARKERS] == take.hands[0].layout.names
+    assert np.isnan(capture.positions[:, :MARKERS]).all() and np.isfinite(capture.positions).any()
+
+
+@pytest.mark.parametrize("rate", ["x", None])
+def test_rates_are_numbers(take, truth, rate):
+    poses = truth.qpos
+    for make in (
+        lambda: Take.of_poses(truth.hands, poses, rate=rate),
+        lambda: dataclasses.replace(take, rate=rate),
+        lambda: take.export("never.csv", rate="x"),
+    ):
+        with pytest.raises(ArgumentError, match=r"the rate \[Hz\] is ('x'|None)"):
+            make()
+    with pytest.raises(ArgumentError, match="not a take: qpos"):
+        Take.of_poses(truth.hands, None, rate=60.0)
+
+
 def test_paths_are_paths(take):
     with pytest.raises(ArgumentError, match=r"path is 3, expected the path of a \.npz file"):
         take.save(3)

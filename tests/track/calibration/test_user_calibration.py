@@ -135,7 +135,7 @@ def test_a_finger_that_does_not_move_is_told():
     assert still <= set(result.still_joints)
     assert not {"index_PIP_flexion", "middle_PIP_flexion"} & set(result.still_joints)
     advice = " / ".join(result.suggestions())
-    assert "move the ring more: MCP abduction, MCP flexion, PIP flexion, DIP flexion" in advice
+    assert "move the ring more, through the whole range of MCP abduction, MCP flexion, PIP" in advice
     assert calibrated()["right"][1].length_errors[3, 0] < result.length_errors[3, 0]
 
 
@@ -159,8 +159,8 @@ def test_a_guide_asks_for_what_is_missing_until_every_joint_has_moved():
     still[:, 7 + RING] = np.deg2rad([0.0, 20.0, 25.0, 15.0])
     show(still)
     assert said[-1] == (
-        "right hand: move the ring more: MCP abduction, MCP flexion, PIP flexion, DIP flexion covered too "
-        "little of its range"
+        "right hand: move the ring more, through the whole range of MCP abduction, MCP flexion, PIP flexion, "
+        "DIP flexion"
     )
     ring = [k for k, name in enumerate(LAYOUT.names) if name.startswith("Ring")]
     show(qpos, hidden=ring[-1:])

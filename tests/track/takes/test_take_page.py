@@ -147,7 +147,7 @@ def test_the_page_is_whole_and_leads_to_the_frames_to_look_at(take, report):
     assert "1 rows; 13.3 % of the frames have doubtful labels." in page
     assert "After a look at the first 1, 99" in page
     assert "Capture &lt;b&gt;.c3d, glove dense19, hands right and left" in page
-    assert "size measured in the capture, 180 x 80 mm; 60 frames, 0.5 s at 120 Hz" in page
+    assert "measured size 180 x 80 mm; 60 frames, 0.5 s at 120 Hz" in page
     assert "are not calibrated" in page and "handsim calibrate minute.c3d" in page
     assert not re.search(r"(src|href)=\"(?!data:)", page) and "<script" not in page
     assert "prefers-color-scheme: dark" in page and "@media print" in page
@@ -171,7 +171,7 @@ def test_the_page_ends_with_the_methods_and_what_the_take_was_made_of(take, repo
     assert f"recorded at 120 Hz by N cameras (SYSTEM) with 19 markers of {2e3 * radius:.1f} mm" in text
     assert f"handsim {take.settings['handsim']} labeled the markers" in text
     assert f"(median residual {1e3 * np.nanmedian(take.rms):.1f} mm)" in text
-    assert "measured in the capture" in text and "zero in the flat hand of the model" in text
+    assert "measured by their markers" in text and "zero in the flat hand of the model" in text
     both = np.append(cutoffs, take.settings["filter"]["left"])
     assert f"(-6 dB at {both.min():.1f} to {both.max():.1f} Hz, by joint)" in text
     assert "doubtful (13.3 %) were LEFT OUT" in text
