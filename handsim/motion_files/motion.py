@@ -111,7 +111,7 @@ class PosedHand(NamedTuple):
     """Models of earlier frames, each with the first frame after them; `model` is that of the last frames."""
     shown: Bool[np.ndarray, "20"] | None = None
     """Which joints markers showed; tables leave out the others. None if all are known."""
-    wrist: Float[np.ndarray, "T 2"] | None = None
+    wrist: Float[np.ndarray, "T 3"] | None = None
     """Angles of the wrist in the order of `WRIST_NAMES` [rad], NaN where unknown; None without a forearm."""
 
     @property
