@@ -12,7 +12,7 @@ from gloves.fit import GloveFit
 from handsim.errors import ArgumentError
 from handsim.files.outputs import atomic_write
 from handsim.hand.model import HandModel, build_spec, join_qpos
-from handsim.hand.model_files import hand_osim, hand_urdf
+from handsim.hand.model_files import Forearm, hand_osim, hand_urdf
 from handsim.hand.shape import NUM_JOINTS
 from handsim.motion_files.motion import Motion, PosedHand
 from handsim.motion_files.scenes import write_glb
@@ -31,6 +31,7 @@ def write_hand(
     actuators: bool = False,
     start: Float[np.ndarray, "27"] | None = None,
     up: UpAxis = "z",
+    forearm: Forearm | None = None,
 ) -> None:
     """Write a hand in the flat pose; meters, radians, kilograms.
 
@@ -41,6 +42,7 @@ def write_hand(
         actuators: Whether an .xml has position servos, whose controls are angles within the joints' ranges.
         start: Pose that the .osim begins in [m, rad]; flat when not given.
         up: The axis of that pose's world that points up.
+        forearm: A forearm for the .osim.
 
     Raises:
         ArgumentError: The file has another ending.
@@ -62,7 +64,7 @@ def write_hand(
             return
         sites = hand.attachment.sites(model) if isinstance(hand, GloveFit) else ()
         if suffix == ".osim":
-            temporary.write_text(hand_osim(model, sites, start, up), "utf-8")
+            temporary.write_text(hand_osim(model, sites, start, up, forearm), "utf-8")
             return
         spec = build_spec(model.skeleton, model.capsules, sites=sites, actuators=actuators)
         import mujoco

@@ -76,6 +76,11 @@ class RigidBody:
         parts = {"forearm": self.forearm, "elbow": self.elbow}
         return {part: side for part, side in parts.items() if side is not None}
 
+    @property
+    def markers(self) -> dict[str, Float[np.ndarray, "3"]]:
+        """Each marker's position in the body's frame [m], by its name."""
+        return dict(zip(self.marker_names, self.positions, strict=True))
+
     def record(self) -> dict[str, Any]:
         """The body in the header of a take's file, without its arrays."""
         named: dict[str, Any] = {"name": self.name, "marker_names": list(self.marker_names)}

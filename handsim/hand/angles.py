@@ -77,11 +77,14 @@ def wrist_angles(
         hands: Rotations of the hand in the forearm's frame.
         forearms: Rotations of the forearm in the elbow's frame, whose y axis goes through the epicondyles.
     """
-    found = np.full((len(hands), len(WRIST_NAMES)), np.nan)
-    for turns, columns, signs in ((hands, slice(2), [1.0, -1.0]), (forearms, slice(2, 3), [1.0])):
-        known = np.isfinite(turns[:, 0, 0])
-        turned = MIRROR @ turns[known] @ MIRROR if side == "left" else turns[known]
-        found[known, columns] = _cardan_angles(turned)[:, columns] * signs
+    return np.column_stack([wrist_cardan(side, hands)[:, :2], wrist_cardan(side, forearms)[:, 2]])
+
+
+def wrist_cardan(side: Side, turns: Float[np.ndarray, "T 3 3"]) -> NDArray[np.float64]:
+    """Flexion, radial deviation and pronation (T, 3) [rad] of a hand's rotations; NaN stays NaN."""
+    known, found = np.isfinite(turns[:, 0, 0]), np.full((len(turns), 3), np.nan)
+    turned = MIRROR @ turns[known] @ MIRROR if side == "left" else turns[known]
+    found[known] = _cardan_angles(turned) * [1.0, -1.0, 1.0]
     return found
 
 

@@ -19,8 +19,9 @@ and Kotiuk); the palm joint is the middle of the middle metacarpal.
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Final, NamedTuple, cast
 
 import numpy as np
@@ -32,9 +33,10 @@ from handsim.files.inputs import read_bytes
 from handsim.files.outputs import as_text, atomic_write
 from handsim.hand.angles import ISB_JOINTS, ISB_NAMES, WRIST_NAMES, isb_angles
 from handsim.hand.model import KEYPOINT_NAMES, HandModel, hand_keypoints
-from handsim.hand.model_files import coordinate_names, coordinate_values
+from handsim.hand.model_files import coordinate_names, coordinate_values, forearm_names, forearm_values
 from handsim.hand.shape import BONE_NAMES, BONES, DIGITS, JOINT_NAMES, PALM, SIDES, Side, bones_of
-from handsim.space.objects import RigidObject
+from handsim.hand.skin import load_cage
+from handsim.space.objects import Part, RigidObject
 from handsim.space.transforms import (
     UpAxis,
     euler_angles,
@@ -167,12 +169,37 @@ class PosedBody(NamedTuple):
     """Frames with a pose, at least one."""
     T_world_body: Float[np.ndarray, "T 4 4"]
     """Poses [m]; missing ones repeat the last pose, or else the first."""
+    forearm: Side | None = None
+    """The hand whose forearm it is, in the frame of the straight hand's wrist; None for other bodies."""
+    markers: Mapping[str, Float[np.ndarray, "3"]] = MappingProxyType({})
+    """A forearm's markers by name, in its frame [m]."""
 
     @classmethod
     def of(cls, name: str, shape: RigidObject | None, poses: Float[np.ndarray, "T 7"]) -> PosedBody:
         """A body with its positions [m] and orientations (wxyz), NaN where it has none."""
         present: NDArray[np.bool_] = np.isfinite(poses[:, 0])
         return cls(name, shape, present, pose_matrices(_held(poses, present)))
+
+    def as_forearm(self, hand: HandModel, markers: Mapping[str, Float[np.ndarray, "3"]]) -> PosedBody:
+        """The forearm of a hand: the outline of its skin at the wrist, drawn out to the farthest marker."""
+        loop = hand.surface.vertices[load_cage().wrist_loop]
+        end = loop.copy()
+        end[:, 0] = min(position[0] for position in markers.values())
+        count, middles = len(loop), [loop.mean(axis=0), end.mean(axis=0)]
+        one, other = np.arange(count), np.roll(np.arange(count), -1)
+        sides = (one, other, one + count), (other, other + count, one + count)
+        caps = (other, one, one * 0 + 2 * count), (one + count, other + count, one * 0 + 2 * count + 1)
+        vertices, triangles = np.concatenate([loop, end, middles]), np.concatenate([*sides, *caps], axis=1).T
+        if hand.shape.side == "right":
+            triangles = triangles[:, ::-1]
+        hull = Part("mesh", np.zeros(3), np.eye(4), vertices)
+        shape = RigidObject(self.name, vertices, triangles, (hull,))
+        return self._replace(shape=shape, forearm=hand.shape.side, markers=markers)
+
+    @property
+    def material(self) -> Material:
+        """What its surface is made of."""
+        return THING if self.forearm is None else SKIN
 
 
 class Motion(NamedTuple):
@@ -189,6 +216,10 @@ class Motion(NamedTuple):
     def seconds(self) -> Float[np.ndarray, "T"]:
         """Time since the first frame [s]."""
         return np.asarray(self.times - self.times[0])
+
+    def forearm(self, side: Side) -> PosedBody | None:
+        """The forearm of a hand, None if it has none with axes."""
+        return next((body for body in self.bodies if body.forearm == side), None)
 
 
 def changes(present: Bool[np.ndarray, "T"]) -> Int[np.ndarray, "K"]:
@@ -359,6 +390,11 @@ def write_mot(path: Path, motion: Motion, up: UpAxis = "z") -> None:
         values = coordinate_values(hand.qpos, up)
         columns += [values[:, :3], np.rad2deg(values[:, 3:])]
         names += coordinate_names(hand.side)
+        if (forearm := motion.forearm(hand.side)) is not None:
+            in_hand = np.linalg.inv(pose_matrices(hand.qpos[:, :7])) @ forearm.T_world_body
+            values = forearm_values(hand.side, in_hand)
+            columns += [np.rad2deg(values[:, :3]), values[:, 3:]]
+            names += forearm_names(hand.side)
     table = np.concatenate(columns, axis=1)
     header = [
         as_text(path.stem),

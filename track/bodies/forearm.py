@@ -51,7 +51,8 @@ def limb_of_landmarks(body: RigidTemplate, capture: Capture, landmarks: Sequence
     if len(landmarks) not in needed:
         words = "radial styloid, the ulnar styloid and one or two epicondyles"
         words = words if body.forearm else "lateral and the medial epicondyle"
-        raise ArgumentError(f"landmarks are {', '.join(landmarks)}, expected the columns of the {words}")
+        given = f"landmarks are {', '.join(landmarks)}" if landmarks else f"{body.name} has no landmarks"
+        raise ArgumentError(f"{given}, expected the columns of the {words}")
     lateral, medial, *others = _local_landmarks(body, capture, landmarks)
     (side,), middle = body.limb.values(), 0.5 * (lateral + medial)
     across = lateral - medial if side == "right" else medial - lateral

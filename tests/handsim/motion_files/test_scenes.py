@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import struct
 import sys
@@ -11,7 +12,7 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation, Slerp
 
-from gloves import Take, attach, load_layout
+from gloves import RigidBody, Take, attach, load_layout
 from gloves.takes.take import posed_motion
 from handsim import HandModel, HandSimError, join_qpos
 from handsim.motion_files.scenes import write_glb, write_usd
@@ -138,6 +139,23 @@ def test_things_move_as_ours(glb, motion):
         "mesh" in glb.json["nodes"][glb.named("pen")]
         and "mesh" not in glb.json["nodes"][glb.named("my wand")]
     )
+
+
+@pytest.mark.parametrize("side", ["right", "left"])
+def test_a_forearm_has_skin_from_the_wrist_to_its_farthest_marker(motion, tmp_path, side):
+    places = np.array([[-0.05, 0.0, 0.03], [-0.2, 0.02, 0.03]])
+    body = RigidBody("arm", ("A", "B"), places, None, side, has_axes=True)
+    armed = dataclasses.replace(motion, bodies=[body, motion.bodies[1]])
+    thing = posed_motion(armed).bodies[0]
+    mesh = trimesh.Trimesh(thing.shape.vertices, thing.shape.faces, process=False)
+    assert mesh.is_watertight and mesh.volume > 0 and mesh.bounds[0, 0] == -0.2
+    widest = np.ptp(mesh.vertices, axis=0)[1] / motion.hands[0].shape.breadth
+    assert 0.6 < widest < 1.0 and abs(mesh.bounds[1, 0]) < 0.02, "it ends at the wrist, which is narrower"
+    write_glb(tmp_path / "arm.glb", posed_motion(armed))
+    glb = Glb(tmp_path / "arm.glb")
+    node = glb.json["nodes"][glb.named("arm")]
+    (part,) = glb.json["meshes"][node["mesh"]]["primitives"]
+    assert glb.json["materials"][part["material"]]["name"] == "skin"
 
 
 def test_faces_look_outwards_once_and_normals_are_of_length_one(glb, motion):
