@@ -871,8 +871,7 @@ def posed_motion(
     bodies = [PosedBody.of(one.name, one.shape, take.body_poses[:, n]) for n, one in enumerate(take.bodies)]
     for number, body in enumerate(take.bodies):
         if body.has_axes and body.forearm in take.sides:
-            model = take.hands[take.hand_index(body.forearm)].model
-            bodies[number] = bodies[number].as_forearm(model, body.markers)
+            bodies[number] = bodies[number].as_forearm(hands[take.hand_index(body.forearm)], body.markers)
     return Motion(take.rate, take.times, hands, bodies)
 
 

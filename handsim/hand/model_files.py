@@ -345,16 +345,15 @@ def _add_forearm(
 ) -> None:
     """Add a capsule of flesh from the wrist to the farthest marker, its joint, and its markers."""
     side, radius = model.shape.side, model.shape.palm_thickness
-    name, places = f"{side}_forearm", np.array([*forearm.markers.values()])
-    length = max(-places[:, 0].min(), radius)
+    name, start = f"{side}_forearm", np.linalg.inv(forearm.T_wrist_forearm)[:3, 3]
+    length = max(start[0] - min(place[0] for place in forearm.markers.values()), radius)
     body = ET.SubElement(bodies, "Body", name=name)
-    ends = np.zeros((1, 3)), np.array([[-length, 0.0, 0.0]])
-    _add_osim_capsule(
-        ET.SubElement(body, "components"), name, Capsules(np.zeros(1, int), *ends, np.full(1, radius)), 0
-    )
+    end = start - [length, 0.0, 0.0]
+    flesh = Capsules(np.zeros(1, int), start[None], end[None], np.full(1, radius))
+    _add_osim_capsule(ET.SubElement(body, "components"), name, flesh, 0)
     mass, across = FLESH_DENSITY * np.pi * radius**2 * length, (3.0 * radius**2 + length**2) / 12.0
     _add(body, "mass", number_text(mass))
-    _add(body, "mass_center", vector_text(0.5 * ends[1][0]))
+    _add(body, "mass_center", vector_text(0.5 * (start + end)))
     _add(body, "inertia", vector_text(mass * np.array([0.5 * radius**2, across, across, 0.0, 0.0, 0.0])))
     joint = _add_osim_joint(joints, name, f"/bodyset/{side}_{BONE_NAMES[PALM]}", name, np.eye(4))
     # The palm's angles in the forearm, backwards; a left hand turns the other way about x and z.

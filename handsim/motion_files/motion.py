@@ -180,9 +180,12 @@ class PosedBody(NamedTuple):
         present: NDArray[np.bool_] = np.isfinite(poses[:, 0])
         return cls(name, shape, present, pose_matrices(_held(poses, present)))
 
-    def as_forearm(self, hand: HandModel, markers: Mapping[str, Float[np.ndarray, "3"]]) -> PosedBody:
+    def as_forearm(self, hand: PosedHand, markers: Mapping[str, Float[np.ndarray, "3"]]) -> PosedBody:
         """The forearm of a hand: the outline of its skin at the wrist, drawn out to the farthest marker."""
-        loop = hand.surface.vertices[load_cage().wrist_loop]
+        # Landmarks may be the ends of a bar above the wrist, so the skin begins where the hand mostly is.
+        away = hand.qpos[:, :3] - self.T_world_body[:, :3, 3]
+        wrist = np.median(np.einsum("ti,tij->tj", away, self.T_world_body[:, :3, :3]), axis=0)
+        loop = hand.model.surface.vertices[load_cage().wrist_loop] + wrist
         end = loop.copy()
         end[:, 0] = min(position[0] for position in markers.values())
         count, middles = len(loop), [loop.mean(axis=0), end.mean(axis=0)]
@@ -190,11 +193,11 @@ class PosedBody(NamedTuple):
         sides = (one, other, one + count), (other, other + count, one + count)
         caps = (other, one, one * 0 + 2 * count), (one + count, other + count, one * 0 + 2 * count + 1)
         vertices, triangles = np.concatenate([loop, end, middles]), np.concatenate([*sides, *caps], axis=1).T
-        if hand.shape.side == "right":
+        if hand.side == "right":
             triangles = triangles[:, ::-1]
         hull = Part("mesh", np.zeros(3), np.eye(4), vertices)
         shape = RigidObject(self.name, vertices, triangles, (hull,))
-        return self._replace(shape=shape, forearm=hand.shape.side, markers=markers)
+        return self._replace(shape=shape, forearm=hand.side, markers=markers)
 
     @property
     def material(self) -> Material:

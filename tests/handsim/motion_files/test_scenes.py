@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import struct
 import sys
@@ -16,6 +15,7 @@ from gloves import RigidBody, Take, attach, load_layout
 from gloves.takes.take import posed_motion
 from handsim import HandModel, HandSimError, join_qpos
 from handsim.motion_files.scenes import write_glb, write_usd
+from handsim.space.transforms import quaternion_matrix
 
 TYPES = {5121: "<u1", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
@@ -145,9 +145,14 @@ def test_things_move_as_ours(glb, motion):
 def test_a_forearm_has_skin_from_the_wrist_to_its_farthest_marker(motion, tmp_path, side):
     places = np.array([[-0.05, 0.0, 0.03], [-0.2, 0.02, 0.03]])
     body = RigidBody("arm", ("A", "B"), places, None, side, has_axes=True)
-    armed = dataclasses.replace(motion, bodies=[body, motion.bodies[1]])
+    poses = motion.qpos[:, [motion.hand_index(side)], :7].copy()
+    poses[:, 0, :3] += quaternion_matrix(poses[:, 0, 3:]) @ [0.0, 0.0, 0.03]  # a bar above the wrist
+    armed = Take.of_poses(motion.hands, motion.qpos, rate=60.0, bodies=[body], body_poses=poses)
     thing = posed_motion(armed).bodies[0]
     mesh = trimesh.Trimesh(thing.shape.vertices, thing.shape.faces, process=False)
+    skin = armed.hands[armed.hand_index(side)].model.surface.vertices
+    below = np.linalg.norm(mesh.vertices[:72, None] + [0.0, 0.0, 0.03] - skin, axis=2)
+    assert below.min(axis=1).max() < 1e-9, "the skin is that of the hand, not of the bar"
     assert mesh.is_watertight and mesh.volume > 0 and mesh.bounds[0, 0] == -0.2
     widest = np.ptp(mesh.vertices, axis=0)[1] / motion.hands[0].shape.breadth
     assert 0.6 < widest < 1.0 and abs(mesh.bounds[1, 0]) < 0.02, "it ends at the wrist, which is narrower"
