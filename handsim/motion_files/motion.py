@@ -182,21 +182,21 @@ class PosedBody(NamedTuple):
 
     def as_forearm(self, hand: PosedHand, markers: Mapping[str, Float[np.ndarray, "3"]]) -> PosedBody:
         """The forearm of a hand: the outline of its skin at the wrist, drawn out to the farthest marker."""
+        from scipy.spatial import ConvexHull
+
         # Landmarks may be the ends of a bar above the wrist, so the skin begins where the hand mostly is.
         away = hand.qpos[:, :3] - self.T_world_body[:, :3, 3]
         wrist = np.median(np.einsum("ti,tij->tj", away, self.T_world_body[:, :3, :3]), axis=0)
         loop = hand.model.surface.vertices[load_cage().wrist_loop] + wrist
-        end = loop.copy()
-        end[:, 0] = min(position[0] for position in markers.values())
-        count, middles = len(loop), [loop.mean(axis=0), end.mean(axis=0)]
-        one, other = np.arange(count), np.roll(np.arange(count), -1)
-        sides = (one, other, one + count), (other, other + count, one + count)
-        caps = (other, one, one * 0 + 2 * count), (one + count, other + count, one * 0 + 2 * count + 1)
-        vertices, triangles = np.concatenate([loop, end, middles]), np.concatenate([*sides, *caps], axis=1).T
-        if hand.side == "right":
-            triangles = triangles[:, ::-1]
-        hull = Part("mesh", np.zeros(3), np.eye(4), vertices)
-        shape = RigidObject(self.name, vertices, triangles, (hull,))
+        end = loop * [0.0, 1.0, 1.0] + [min(place[0] for place in markers.values()), 0.0, 0.0]
+        corners = np.concatenate([loop, end])
+        hull = ConvexHull(corners)
+        normals = np.cross(
+            *(corners[hull.simplices[:, side]] - corners[hull.simplices[:, 0]] for side in (1, 2))
+        )
+        is_inward = (normals * hull.equations[:, :3]).sum(axis=1) < 0.0
+        faces = np.where(is_inward[:, None], hull.simplices[:, ::-1], hull.simplices)
+        shape = RigidObject(self.name, corners, faces, (Part("mesh", np.zeros(3), np.eye(4), corners),))
         return self._replace(shape=shape, forearm=hand.side, markers=markers)
 
     @property

@@ -57,12 +57,12 @@ def limb_of_landmarks(body: RigidTemplate, capture: Capture, landmarks: Sequence
     (side,), middle = body.limb.values(), 0.5 * (lateral + medial)
     across = lateral - medial if side == "right" else medial - lateral
     # An elbow's axis along the arm may be any that is not parallel to the epicondyles.
-    x = unit(middle - np.mean(others, axis=0)) if others else np.eye(3)[np.abs(across).argmin()]
+    x = middle - np.mean(others, axis=0) if others else np.eye(3)[np.abs(across).argmin()]
     z = np.cross(x, across)
-    if not np.linalg.norm(z) >= 0.5 * np.linalg.norm(across) > 0.0:
+    if not np.linalg.norm(z) >= 0.5 * np.linalg.norm(x) * np.linalg.norm(across) > 0.0:
         raise CalibrationError("the landmarks are nearly on one line, expected styloids across the forearm")
     z = unit(z)
-    y = np.cross(z, x) if others else unit(across)
+    y = np.cross(z, unit(x)) if others else unit(across)
     positions = (body.positions - middle) @ np.column_stack([np.cross(y, z), y, z])
     return RigidTemplate(
         body.name, body.marker_names, positions, None, body.forearm, body.forearm is not None, body.elbow

@@ -520,11 +520,15 @@ def learn_body(
         CaptureError: A column is missing.
     """
     if markers:
+        if len(markers) < FEWEST:
+            count = f"{len(markers)} marker{'s' * (len(markers) > 1)}"
+            raise CalibrationError(f"{count} of a body, expected at least {FEWEST}, which determine a pose")
         capture = Capture(tuple(markers), select_markers(capture, markers), capture.rate)
         body = learn_body(capture, name, forearm=forearm, elbow=elbow)
         if len(body.positions) < len(markers):
             raise CalibrationError(
-                f"{len(body.positions)} of the markers {', '.join(markers)} are seen mostly, expected all"
+                f"{len(body.positions)} of the markers {', '.join(markers)} are mostly seen and keep their "
+                "distances, expected all"
             )
         return dataclasses.replace(body, marker_names=tuple(markers))
     frames = list(capture_frames(capture))

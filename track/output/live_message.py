@@ -385,15 +385,13 @@ def header_document(header: LiveHeader, content: Content = Content()) -> dict[st
     scale, unit = (1.0, "m") if content.program is None else (content.program.scale, content.program.unit)
     names = dataclasses.asdict(header)
     radii = [[round(scale * radius, _DECIMALS) for radius in hand] for hand in names.pop("radii")]
-    if not header.wrist_angles:
-        del names["wrist_angles"]
     return {
         "type": "header",
         "schema": SCHEMA,
         "source": f"handsim {__version__}",
         "axes": content.axes,
         "units": {"length": unit, "angle": "rad", "time": "s", "quaternion": "wxyz"},
-        **{name: list(values) for name, values in names.items()},
+        **{name: list(values) for name, values in names.items() if values or name != "wrist_angles"},
         **({"joints": list(OPENXR_JOINTS), "radii": radii} if content.joints else {}),
     }
 
@@ -422,9 +420,7 @@ def frame_document(message: LiveMessage, content: Content = Content()) -> dict[s
 
 
 def _hand_document(hand: LiveHand, content: Content) -> dict[str, Any]:
-    more: dict[str, Any] = {}
-    if content.joints:
-        more["joints"] = _rounded(hand.find_joints()) if hand.has_pose else None
+    more = {"joints": _rounded(hand.find_joints()) if hand.has_pose else None} if content.joints else {}
     others = {"angle_spread": hand.angle_spread, "position_spread": hand.position_spread}
     if content.velocities:
         others |= {"angle_velocities": hand.angle_velocities, "velocities": hand.find_velocities()}

@@ -23,6 +23,7 @@ from render.user_body import UserBody
 from track import RigidTemplate, track_capture
 from track.bodies.forearm import limb_of_landmarks
 from track.bodies.rigid_body import learn_body, load_bodies, load_body, save_body
+from track.takes.take_faults import find_faults
 from track.takes.take_figures import PageSettings
 from track.takes.take_page import write_take_page
 from train.simulation.training_frames import wear_gloves
@@ -248,6 +249,25 @@ def test_pronation_is_not_told_without_an_elbow(tmp_path):
     page = (tmp_path / "page.html").read_text()
     assert "not told apart without markers at the elbow" in page and "wrist flexion" in page
     assert "forearm pronation" not in page
+
+
+def test_exchanged_landmarks_and_a_wrong_side_are_told():
+    take = tracked("right")
+
+    def told(take: Take) -> list[str]:
+        return [fault.words for fault in find_faults(take) if "the body" in fault.of]
+
+    assert told(take) == []
+    half = Rotation.from_quat([1.0, 0.0, 0.0, 0.0])
+    for body, landmarks in ((0, "radial and ulnar styloid"), (1, "lateral and medial epicondyle")):
+        poses, there = take.body_poses.copy(), np.isfinite(take.body_poses[:, body, 0])
+        turned = Rotation.from_quat(poses[there, body, 3:], scalar_first=True) * half
+        poses[there, body, 3:] = turned.as_quat(scalar_first=True)
+        (fault,) = told(dataclasses.replace(take, body_poses=poses))
+        assert take.bodies[body].name in fault and landmarks in fault
+    arm = dataclasses.replace(take.bodies[0], forearm="left")
+    (fault,) = told(dataclasses.replace(take, bodies=[arm, take.bodies[1]]))
+    assert "is the forearm of a left hand, which the take does not have" in fault
 
 
 def test_a_file_keeps_whose_forearm_it_is(tmp_path):
