@@ -1,22 +1,19 @@
 """Writes docs/results.md and docs/trust.md from benchmarks/figures: `python -m benchmarks.results`.
 
-The page's text is results_template.md; `{table5.right_size[1]:.2f}` in it is a number of table5.json, and
-`{speed_rows_of}` are tables of all of speed.json, and `{speed_run_of}` says how it was made.
+The page's text is results_template.md; `{table5.right_size[1]:.2f}` in it is a number of table5.json.
 """
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Final
 
-from benchmarks.record import FOLDER, load_figures
+from benchmarks.record import load_figures
 from benchmarks.trust import PAGE as TRUST
 from benchmarks.trust import trust_page
 
 PAGE: Final = Path(__file__).resolve().parents[1] / "docs" / "results.md"
 TEMPLATE: Final = Path(__file__).with_name("results_template.md")
-SPEEDS: Final = ("speed", "speed_parts")
 README: Final = (
     "{label_clean.row[0]:.2f} {label_both.row[0]:.2f}",
     "{real_motion.mean[1]:.2f} {real_motion.worst[1]:.2f}",
@@ -37,34 +34,7 @@ def filled(text: str) -> str:
         KeyError: A field names a file that is not there.
         AttributeError: A field names a figure that its file lacks.
     """
-    speeds = {f"{name}_{part.__name__}": part(name) for name in SPEEDS for part in (run_of, rows_of)}
-    return text.format(**load_figures(), **speeds)
-
-
-def run_of(name: str, folder: Path = FOLDER) -> str:
-    """The conditions, commit, date, command and machine of a file of figures, in sentences."""
-    kept = json.loads((folder / f"{name}.json").read_text("utf-8"))
-    origin = f"Commit {kept['commit']}, {kept['date']}, `{kept['command']}`; {kept['machine']}."
-    return f"{kept['conditions']} {origin}" if "conditions" in kept else origin
-
-
-def rows_of(name: str, folder: Path = FOLDER) -> str:
-    """The tables of a file of speeds: one of times, one of rates, each without the figures in units."""
-    figures = json.loads((folder / f"{name}.json").read_text("utf-8"))["figures"]
-    times = ["| what | median [ms] | 99th percentile [ms] | longest [ms] |", "|---|---|---|---|"]
-    rates = ["| what | in a second |", "|---|---|"]
-    for key, figure in figures.items():
-        if key == "unit":
-            continue
-        *shown, _ = figure["value"]
-        row = f"| {' | '.join([figure['what'].rsplit(': ', 1)[0], *map(_shown, shown)])} |"
-        (times if len(shown) == 3 else rates).append(row)
-    return "\n\n".join("\n".join(table) for table in (times, rates) if len(table) > 2)
-
-
-def _shown(value: float) -> str:
-    """A number to three digits."""
-    return f"{float(f'{value:.3g}'):,g}"
+    return text.format(**load_figures())
 
 
 if __name__ == "__main__":

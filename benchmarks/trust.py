@@ -27,9 +27,8 @@ _LEAD: Final = """# What was judged, and by what
 
 `make results` writes this page. A row is an output of handsim; those with the most kinds of evidence stand
 first, and "-" means that there is none. Real data are those of two people in the public Mocap_SIG18_Data,
-unless a row says otherwise, and a figure on two people says little about a third. They are no part of
-handsim: `python -m benchmarks.real fetch sig18 --out DATA` takes them from their authors, checks their bytes
-and states their license. [Results](results.md) and `benchmarks/figures/quoted.json` have the commands.
+unless a row says otherwise, and say little about a third person. [Results](results.md) and
+`benchmarks/figures/quoted.json` have the commands.
 """
 
 
@@ -41,9 +40,8 @@ _METHODS: Final = {
 _BESIDE: Final = """
 ## Other methods
 
-Three methods on the same data, all with hands whose size was measured; `benchmarks/public/README.md` has more
-figures of them. The loop of the paper runs with our labeler there, and its network was counted on every tenth
-real frame. The last two do not label single frames.
+Methods on the same data, with hands whose size was measured (`benchmarks/public/README.md` has more). The
+loop of the paper runs with our labeler there, and its network was counted on every tenth real frame.
 
 """
 

@@ -181,6 +181,7 @@ class Registration:
             "cameras": [camera.record() for camera in self.cameras],
             **{name: getattr(self, name) for name in ("starts", "offset", "drift", "readout", "deviations")},
             "frames": len(self.reasons),
+            "frames_that_count": self.reasons.count(""),
             "left_out": self.left_out(),
             "doubts": self.doubts(),
         }

@@ -27,7 +27,6 @@ SLOW = {
     "stored_arrays",
     "tracking",
     "formats",
-    "troubleshooting",
     "tutorials/my_captures",
     "tutorials/my_layout",
     "tutorials/my_pictures",

@@ -102,11 +102,11 @@ def _print_cameras(steps: Sequence[Step]) -> None:
     rows = [("video", "place [m]", "SD [mm]", "focal length [px]", "clock [s]", "frames that count [%]")]
     for folder in (step.outputs[0] for step in steps):
         found = load_json(folder / RECORD)
-        camera, frames = Camera(**found["cameras"][0]), found["frames"]
-        counted = frames - sum(int(told.split()[0]) for told in found["left_out"])
+        camera = Camera(**found["cameras"][0])
         place = " ".join(f"{one:.3f}" for one in camera.T_world_camera[:3, 3])
         known = f"{1e3 * found['deviations']['position']:.1f}"
-        clock, share = f"{found['offset']:.4f}", f"{100 * counted / frames:.0f}"
+        clock = f"{found['offset']:.4f}"
+        share = f"{100 * found['frames_that_count'] / found['frames']:.0f}"
         rows.append((folder.name, place, known, f"{camera.focal_length:.1f}", clock, share))
     if len(rows) > 1:
         print_table(rows, left=1)

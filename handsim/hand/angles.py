@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from handsim.hand.shape import DIGITS, JOINT_NAMES, HandShape, Side
+from handsim.hand.shape import DIGITS, JOINT_NAMES, NUM_JOINTS, HandShape, Side
 from handsim.space.transforms import MIRROR, axis_angle_matrix, euler_matrix
 
 Convention = Literal["model", "isb"]
@@ -60,7 +60,7 @@ def isb_angles(
     first = _cardan_angles(turns.reshape(-1, 3, 3)).reshape(-1, len(DIGITS), 3)
     first[:, 0, 1] *= -1.0  # radial abduction of the thumb is the opposite of ulnar deviation
     found = np.full((len(angles), len(ISB_NAMES)), np.nan)
-    both = first, outer.reshape(len(outer), len(DIGITS), -1)[..., 2:]
+    both = first, outer.reshape(-1, len(DIGITS), NUM_JOINTS // len(DIGITS))[..., 2:]
     found[known] = np.concatenate(both, axis=2).reshape(-1, len(ISB_NAMES))
     return found
 
@@ -97,7 +97,7 @@ def _cardan_angles(turns: Float[np.ndarray, "K 3 3"]) -> NDArray[np.float64]:
 
 def _first_bones(shape: HandShape, angles: Float[np.ndarray, "T 20"]) -> NDArray[np.float64]:
     """Orientation (T, 5, 3, 3) of each digit's first bone on the right hand that every shape describes."""
-    by_digit = angles.reshape(len(angles), len(DIGITS), -1)
+    by_digit = angles.reshape(-1, len(DIGITS), NUM_JOINTS // len(DIGITS))
     _, y, z = np.eye(3)
     turns = axis_angle_matrix(z, by_digit[..., 0]) @ axis_angle_matrix(y, by_digit[..., 1])
     turns[:, 0] = euler_matrix(shape.base_angles[0]) @ turns[:, 0]

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from benchmarks.record import FOLDER, kept, kept_rows, load_figures, save_figures
-from benchmarks.results import PAGE, README, TEMPLATE, filled, run_of
+from benchmarks.results import PAGE, README, TEMPLATE, filled
 
 ROOT = Path(__file__).resolve().parents[2]
 NUMBER = re.compile(r"\d+\.\d+")
@@ -52,15 +52,6 @@ def test_figures_are_kept_with_their_origin(tmp_path):
     assert commit.stdout.startswith(content["commit"]) and "cores" in content["machine"]
     assert content["figures"] == {"median": {"what": "of a frame [ms]", "value": [[0.5, None], 0.666667, 7]}}
     assert load_figures(tmp_path)["speed"].median[0][0] == 0.5
-
-
-def test_the_sentence_on_a_run_comes_from_what_the_run_saved(tmp_path):
-    path = save_figures("speed", {}, tmp_path, "Two processors.")
-    origin = json.loads(path.read_text("utf-8"))
-    said = f"Commit {origin['commit']}, {origin['date']}, `{origin['command']}`; {origin['machine']}."
-    assert run_of("speed", tmp_path) == f"Two processors. {said}"
-    save_figures("speed", {}, tmp_path)
-    assert run_of("speed", tmp_path) == said
 
 
 def test_what_was_made_is_kept(tmp_path):

@@ -84,3 +84,9 @@ def test_a_missing_pose_has_no_angles(model, angles):
     angles[3] = np.nan
     found = isb_angles(model.shape, angles)
     assert np.isnan(found[3]).all() and np.isfinite(np.delete(found, 3, axis=0)).all()
+
+
+@pytest.mark.parametrize("frames", [0, 2])
+def test_frames_without_any_pose_have_no_angles(model, frames):
+    found = isb_angles(model.shape, np.full((frames, 20), np.nan))
+    assert found.shape == (frames, 25) and np.isnan(found).all()
