@@ -412,7 +412,7 @@ def _distances(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # columns that are never seen together
         apart = np.linalg.norm(some[:, first] - some[:, second], axis=2)
-        return np.asarray(np.nanquantile(apart, (0.02, 0.98), axis=0))
+        return np.nanquantile(apart, (0.02, 0.98), axis=0) if apart.size else np.empty((2, 0))
 
 
 def _beside(sources: Sequence[Capture], hands: Sequence[TrialHand]) -> Iterator[str]:

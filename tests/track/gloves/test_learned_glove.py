@@ -127,6 +127,8 @@ def test_columns_on_a_forearm_are_offered_as_a_body():
         offered = [sentence for sentence in found.left_out if "--forearm right" in sentence]
         assert len(offered) == (expected is not None)
         assert all(f"--markers {expected} --forearm" in sentence for sentence in offered)
+    own = capture.positions[:, [capture.names.index(name) for name in designed.names]]
+    assert learn_glove(Capture(designed.names, own, 120.0), start=designed).left_out == ()
 
 
 @pytest.mark.parametrize(
