@@ -142,19 +142,16 @@ def test_a_tracked_wrist_bends_as_it_did_and_knows_how_well(side):
 
 @pytest.mark.slow
 def test_stated_deviations_of_measured_hands_hold():
-    offs, ratios = [], []
+    ratios = []
     for person, side in enumerate(("right", "left") * 6, 1):
         one = scene(side, 480, person)
         take = track_capture(one.capture, glove="dense19", hands=(side,), bodies=[one.arm, one.elbow])
         off, spreads = wrist_of(take) - one.angles, take.angle_spreads(side)
         assert np.rad2deg(np.sqrt(np.nanmean(off**2, axis=0))).max() < 3.0
-        offs.append(np.rad2deg(off))
         ratios.append(np.abs(off) / np.transpose([spreads[name] for name in WRIST_NAMES]))
-    print(np.sqrt([np.nanmean(off**2, axis=0) for off in offs]).round(2))
     for columns, once, twice in (slice(2), (0.55, 0.82), (0.89, 0.995)), (2, (0.62, 0.75), (0.92, 0.98)):
         whole = np.concatenate([ratio[:, columns].ravel() for ratio in ratios])
         whole = whole[np.isfinite(whole)]
-        print((whole < 1.0).mean(), (whole < 2.0).mean())
         assert once[0] < (whole < 1.0).mean() < once[1] and twice[0] < (whole < 2.0).mean() < twice[1]
 
 
