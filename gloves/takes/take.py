@@ -63,18 +63,9 @@ from handsim.hand.model import (
     is_steady,
     times_at,
 )
-from handsim.hand.model_files import Forearm
 from handsim.hand.shape import JOINT_NAMES, NUM_JOINTS, NUM_KEYPOINTS, Side
 from handsim.motion_files.motion import Motion, PosedBody, PosedHand
-from handsim.space.transforms import (
-    FORWARD,
-    ForwardAxis,
-    UpAxis,
-    facing,
-    pose_matrices,
-    quaternion_matrix,
-    turned_poses,
-)
+from handsim.space.transforms import FORWARD, ForwardAxis, UpAxis, facing, quaternion_matrix, turned_poses
 
 SUFFIX: Final = ".truth.npz"
 """Ending of the name of a simulated take that lies beside its capture."""
@@ -417,18 +408,6 @@ class Take:
             for body in (self.forearm_index(side), self.elbow_index(side))
         )
         return forearm.swapaxes(1, 2) @ hand, elbow.swapaxes(1, 2) @ forearm
-
-    def first_forearm(self, side: Side) -> Forearm | None:
-        """A hand's forearm for OpenSim, as in the first frame with both; None if its axes are unknown."""
-        body = self.forearm_index(side)
-        if body is None or not self.bodies[body].has_axes:
-            return None
-        both = np.stack([self.qpos[:, self.hand_index(side), :7], self.body_poses[:, body]])
-        there = np.isfinite(both).all(axis=(0, 2))
-        if not there.any():
-            return None
-        wrist, forearm = pose_matrices(both[:, there.argmax()])
-        return Forearm(self.bodies[body].name, self.bodies[body].markers, np.linalg.inv(wrist) @ forearm)
 
     def mean_pose(self, side: Side, between: tuple[float, float] | Take) -> Float[np.ndarray, "20"]:
         """The mean joint angles of a hand between two times, or in another take [rad]; warns if it moves."""

@@ -94,6 +94,7 @@ def _chosen_hand(
 ) -> tuple[HandModel | GloveFit, str, Float[np.ndarray, "27"] | None, Forearm | None]:
     """The hand of the options, in its glove if it has one, its origin, a take's first pose and forearm."""
     from gloves.fit import nominal_fit
+    from gloves.hand_files import first_forearm
     from gloves.takes.take import load_take
     from handsim.hand.model import HandModel
     from track.user import User, load_user
@@ -113,7 +114,7 @@ def _chosen_hand(
         poses = np.empty((0, NUM_QPOS)) if moving is None else moving.qpos[:, moving.hand_index(fit.side)]
         there = np.flatnonzero(np.isfinite(poses).all(axis=1))
         start = poses[there[0]] if len(there) else None
-        forearm = moving.first_forearm(fit.side) if moving is not None and len(there) else None
+        forearm = first_forearm(moving, fit.side) if moving is not None and len(there) else None
         return fit, f"of {source}, {User((fit,))}", start, forearm
     size, side = size or "M", side or "right"
     hand = HandModel.named(size, side=side) if glove is None else nominal_fit(load_layout(glove), size, side)

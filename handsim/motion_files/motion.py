@@ -427,7 +427,10 @@ def write_bvh(path: Path, motion: Motion, up: UpAxis = "z") -> None:
         columns.append(_CENTIMETERS * hand.qpos[:, :3] @ turn.T)
         columns += [_degrees(local[:, bone]) for bone in _order(PALM)]
     for thing in motion.bodies:
-        content = [*_joint(np.zeros(3), moves=True), *_end(np.eye(3)[0])]
+        end = np.eye(3)[0]
+        if thing.forearm is not None:  # its bone goes from the wrist to the farthest marker
+            end = _CENTIMETERS * min(place[0] for place in thing.markers.values()) * turn[:, 0]
+        content = [*_joint(np.zeros(3), moves=True), *_end(end)]
         word = "".join(one if one.isascii() and one.isalnum() else "_" for one in thing.name) or "thing"
         lines += _indented([f"JOINT {word}", "{", *_indented(content), "}"])
         poses = thing.T_world_body

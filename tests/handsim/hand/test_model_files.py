@@ -13,7 +13,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from gloves import RigidBody, Take, attach, read_capture
-from gloves.hand_files import write_hand
+from gloves.hand_files import first_forearm, write_hand
 from handsim import HandModel, join_qpos, sample_shape
 from handsim.hand.model import KEYPOINT_NAMES, hand_keypoints
 from handsim.hand.model_files import (
@@ -186,7 +186,7 @@ def test_a_forearm_has_the_wrists_angles_as_coordinates_and_its_own_markers(fit,
     angles = take.angles(fit.side, convention="isb")
     for name in ("wrist_flexion", "wrist_radial_deviation"):
         np.testing.assert_allclose(columns[f"{fit.side}_{name}"], angles[name], atol=1e-8)
-    root = ET.fromstring(hand_osim(fit.model, (), take.qpos[0, 0], forearm=take.first_forearm(fit.side)))
+    root = ET.fromstring(hand_osim(fit.model, (), take.qpos[0, 0], forearm=first_forearm(take, fit.side)))
     for name in forearm_names(fit.side):
         (coordinate,) = (one for one in root.iter("Coordinate") if one.get("name") == name)
         assert numbers(coordinate, "default_value")[0] == pytest.approx(columns[name][0], abs=1e-8)
@@ -204,7 +204,7 @@ def test_a_forearm_has_the_wrists_angles_as_coordinates_and_its_own_markers(fit,
 def test_a_forearm_without_axes_is_in_no_model(fit, take, tmp_path):
     plain = dataclasses.replace(take, bodies=[dataclasses.replace(take.bodies[0], has_axes=False)])
     plain.export(tmp_path / "angles.mot")
-    assert plain.first_forearm(fit.side) is None
+    assert first_forearm(plain, fit.side) is None
     assert set(read_mot(tmp_path / "angles.mot")) == {"time", *coordinate_names(fit.side)}
 
 
@@ -312,7 +312,7 @@ def test_inverse_kinematics_of_opensim_on_our_trc_finds_our_angles(fit, qpos, ta
     take = Take.of_poses([fit], qpos[:, None], rate=60.0, bodies=take.bodies, body_poses=take.body_poses)
     take.export("joints.trc")
     take.export("angles.mot")
-    write_hand(tmp_path / "hand.osim", fit, start=qpos[0], forearm=take.first_forearm(fit.side))
+    write_hand(tmp_path / "hand.osim", fit, start=qpos[0], forearm=first_forearm(take, fit.side))
     assert opensim.Storage("angles.mot").getSize() == FRAMES
     exec(PAGE.read_text("utf-8").split("```py\n")[1].split("```")[0], {})
     found, exported = (opensim.TimeSeriesTable(f"{name}.mot") for name in ("found", "angles"))

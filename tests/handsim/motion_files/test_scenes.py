@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from gloves import RigidBody, Take, attach, load_layout
 from gloves.takes.take import posed_motion
 from handsim import HandModel, HandSimError, join_qpos
+from handsim.motion_files.motion import write_bvh
 from handsim.motion_files.scenes import write_glb, write_usd
 from handsim.space.transforms import quaternion_matrix
 
@@ -162,6 +163,10 @@ def test_a_forearm_has_skin_from_the_wrist_to_its_farthest_marker(motion, tmp_pa
     node = glb.json["nodes"][glb.named("arm")]
     (part,) = glb.json["meshes"][node["mesh"]]["primitives"]
     assert glb.json["materials"][part["material"]]["name"] == "skin"
+    write_bvh(tmp_path / "arm.bvh", posed_motion(armed))
+    _, _, joint = (tmp_path / "arm.bvh").read_text().partition("JOINT arm")
+    end = np.array(joint.split("End Site")[1].split("OFFSET")[1].split()[:3], dtype=float)
+    np.testing.assert_allclose(end, UP @ [-20.0, 0.0, 0.0], atol=1e-6)
 
 
 def test_faces_look_outwards_once_and_normals_are_of_length_one(glb, motion):
