@@ -58,9 +58,9 @@ _ROUNDING: Final = 1e-6  # [rad] Single precision rounds angles by less.
 _MOST_CROSSED: Final = 0.0045  # [m] Flat fingers that overlap more hide skin that carries markers.
 _THUMB: Final = np.array([joint.name.startswith("thumb") for joint in JOINTS])
 _ABDUCTIONS: Final = np.array([joint.name.endswith("abduction") for joint in JOINTS])
-_FAN: Final = np.deg2rad([1.0, 0.2, -0.6, -1.4])  # one degree of fanning at rest, index to little
-# For fingers that converge beyond their knuckles: the middle finger leans away from the index, too.
-_WIDE_FAN: Final = np.deg2rad([1.0, -0.2, -1.0, -1.8])
+_FAN: Final = np.deg2rad([0.0, 1.0, 0.2, -0.6, -1.4])  # one degree of fanning at rest, thumb to little
+# For digits that converge: the thumb leans away from the index finger, and so does the middle finger.
+_WIDE_FAN: Final = np.deg2rad([1.0, 1.0, -0.2, -1.0, -1.8])
 
 SAMPLERS: Final = "handsim.pose_samplers"
 """Group of entry points of pose samplers."""
@@ -249,14 +249,14 @@ def validate(model: HandModel | HandShape | str, qpos: Float[np.ndarray, "T 27"]
 
 @functools.lru_cache(maxsize=16)
 def resting_angles(model: HandModel) -> Float[np.ndarray, "20"]:
-    """A valid relaxed pose of this hand, with fingers fanned as little as their girth allows; read-only."""
+    """A valid relaxed pose of this hand, with digits fanned as little as their girth allows; read-only."""
     for share, fan in ((0.8, _FAN), (1.0, _FAN), (1.0, _WIDE_FAN)):  # leaves room where the girth allows it
-        tries = _fanned(fan, 20.0)
+        tries = _fanned(fan, 40.0)
         valid = is_valid(model, tries, max_penetration=share * MAX_PENETRATION)
         if valid.any():
             break
     else:
-        raise PoseError("this hand's fingers overlap at rest: its girths are too large for its breadth")
+        raise PoseError("this hand's digits overlap at rest: its girths are too large for its breadth")
     resting: NDArray[np.float64] = tries[valid.argmax()]
     resting.setflags(write=False)
     return resting
@@ -268,12 +268,12 @@ def rests_easily(model: HandModel) -> bool:
     return bool(rests and model.penetration(join_qpos(np.zeros((1, NUM_JOINTS))))[0] <= _MOST_CROSSED)
 
 
-def _fanned(fan: Float[np.ndarray, "4"], most: float) -> Float[np.ndarray, "K 20"]:
-    """The relaxed gesture with fingers fanned by 0 to `most` degrees."""
+def _fanned(fan: Float[np.ndarray, "5"], most: float) -> Float[np.ndarray, "K 20"]:
+    """The relaxed gesture with digits fanned by 0 to `most` degrees, within their ranges."""
     degrees = np.arange(0.0, most + 1.0, 2.0)
     angles = np.tile(gesture("relaxed"), (len(degrees), 1))
-    angles[:, 4::4] += degrees[:, None] * fan
-    return angles
+    angles[:, ::4] += degrees[:, None] * fan
+    return np.asarray(np.clip(angles, LOW, HIGH))
 
 
 def make_valid(model: HandModel, angles: Float[np.ndarray, "T 20"]) -> Float[np.ndarray, "T 20"]:
