@@ -26,7 +26,8 @@ class RigidBody:
     """A rigid body with markers of its own.
 
     Raises:
-        ArgumentError: A name is no text, there is not one position per marker, or the forearm is no side.
+        ArgumentError: A name is no text, there is not one position per marker, a forearm or an elbow is that
+            of no side, or the body is both.
     """
 
     name: str
@@ -39,6 +40,9 @@ class RigidBody:
     """The hand whose forearm it is."""
     has_axes: bool = False
     """Whether its frame is that of a forearm: that of the hand's wrist when the wrist is straight."""
+    elbow: Side | None = None
+    """The hand whose elbow it is; its markers do not turn with the radius. Its y axis goes through the
+    epicondyles, as that of the forearm's frame in full supination."""
 
     @classmethod
     def of(cls, thing: RigidObject) -> RigidBody:
@@ -54,8 +58,10 @@ class RigidBody:
             )
         if not all(isinstance(name, str) for name in (self.name, *self.marker_names)):
             raise ArgumentError(f"{self.name!r}: a name is no text, expected text for body and markers")
-        if self.forearm is not None:
-            check_choice(self.forearm, SIDES, noun="side of a forearm")
+        for part, side in self.limb.items():
+            check_choice(side, SIDES, noun=f"side of a {part}")
+        if len(self.limb) > 1:
+            raise ArgumentError(f"{self.name} is both forearm and elbow, expected a body for each")
 
     @property
     def shape(self) -> RigidObject | None:
@@ -64,11 +70,22 @@ class RigidBody:
             return self.surface
         return named_object(self.name) if self.name in object_names() else None
 
+    @property
+    def limb(self) -> dict[str, Side]:
+        """The hand whose `forearm` or `elbow` it is; empty for other bodies."""
+        parts = {"forearm": self.forearm, "elbow": self.elbow}
+        return {part: side for part, side in parts.items() if side is not None}
+
+    @property
+    def markers(self) -> dict[str, Float[np.ndarray, "3"]]:
+        """Each marker's position in the body's frame [m], by its name."""
+        return dict(zip(self.marker_names, self.positions, strict=True))
+
     def record(self) -> dict[str, Any]:
         """The body in the header of a take's file, without its arrays."""
         named: dict[str, Any] = {"name": self.name, "marker_names": list(self.marker_names)}
         named |= {} if self.surface is None else {"surface": True}
-        return named if self.forearm is None else named | {"forearm": self.forearm, "axes": self.has_axes}
+        return named | self.limb | ({} if self.forearm is None else {"axes": self.has_axes})
 
 
 def body_arrays(bodies: Sequence[RigidBody]) -> dict[str, NDArray[Any]]:
@@ -87,12 +104,12 @@ def stored_body(
 ) -> RigidBody:
     """A body of a file by its record; `RigidObject` checks the arrays of its surface."""
     name, marker_names = stored["name"], names_of(stored["marker_names"])
-    forearm = stored.get("forearm"), bool(stored.get("axes", False))
+    limb = stored.get("forearm"), bool(stored.get("axes", False)), stored.get("elbow")
     positions = arrays[BODY_MARKERS.name][markers.start : markers.stop]
     if not stored.get("surface", False):
-        return RigidBody(name, marker_names, positions, None, *forearm)
+        return RigidBody(name, marker_names, positions, None, *limb)
     vertices, faces = (arrays[key.format(number)] for key in (_VERTICES, _FACES))
     hull = Part("mesh", np.zeros(3), np.eye(4), vertices)
     upright = np.tile([0.0, 0.0, 1.0], (len(positions), 1))  # a file has no normals under markers
     thing = RigidObject(name, vertices, faces, (hull,), marker_names, positions, upright)
-    return RigidBody(name, marker_names, positions, thing, *forearm)
+    return RigidBody(name, marker_names, positions, thing, *limb)

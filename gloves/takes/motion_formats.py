@@ -46,11 +46,16 @@ def motion_format(path: Path) -> MotionFormat:
 
 
 def _write_joint_trc(path: Path, motion: Motion, up: UpAxis) -> None:
-    """Write a .trc file for OpenSim: every keypoint of the hands is a marker, and the y axis points up."""
+    """Write a .trc file for OpenSim, y up: keypoints of the hands and markers of their forearms."""
     turn, positions, names = file_axes(up), [], []
     for hand in motion.hands:
         positions.append(hand.keypoints() @ turn.T)
         names += [f"{hand.side}_{name}" for name in KEYPOINT_NAMES]
+        if (forearm := motion.forearm(hand.side)) is not None:
+            places = np.array([*forearm.markers.values()])
+            pose = forearm.T_world_body
+            positions.append((places @ pose[:, :3, :3].swapaxes(1, 2) + pose[:, None, :3, 3]) @ turn.T)
+            names += [f"{forearm.name}:{name}" for name in forearm.markers]
     write_capture(path, Capture(tuple(names), np.concatenate(positions, axis=1), motion.rate))
 
 

@@ -103,8 +103,8 @@ SPREADS: Final = (
     Column("keypoint_spread", "<f4", ("T", "H", NUM_KEYPOINTS)),
 )
 """Standard deviations of tracked poses; simulated takes and takes of older versions have none."""
-WRIST_SPREAD: Final = Column("wrist_spread", "<f4", ("T", "H", 2))
-"""Standard deviations of the wrists' angles; takes without a forearm have none."""
+WRIST_SPREAD: Final = Column("wrist_spread", "<f4", ("T", "H", 3))
+"""Standard deviations of the angles of wrists and forearms; takes without a forearm have none."""
 OPTIONAL: Final = (NUMBERS, *SPREADS, WRIST_SPREAD)
 """Fields with one row per frame that a take may lack."""
 KEYPOINTS: Final = Column("keypoints", "<f8", ("T", "H", NUM_KEYPOINTS, 3))

@@ -141,8 +141,8 @@ class Take:
     """Standard deviation of each joint angle [rad]; NaN where a hand has no pose, None if unknown."""
     keypoint_spread: Float[np.ndarray, "T H 21"] | None = None
     """Standard deviation of each keypoint per axis [m]; NaN where a hand has no pose, None if unknown."""
-    wrist_spread: Float[np.ndarray, "T H 2"] | None = None
-    """Standard deviation of the angles of each wrist [rad]; NaN without a forearm, None if unknown."""
+    wrist_spread: Float[np.ndarray, "T H 3"] | None = None
+    """Standard deviation of each hand's `WRIST_NAMES` [rad]; NaN where unknown, None without a forearm."""
 
     def __init__(
         self,
@@ -351,8 +351,8 @@ class Take:
         Args:
             side: The hand.
             convention: `model` for the hinges of the model, `isb` for angles as the ISB writes them, with
-                those of the wrist (`WRIST_NAMES`) if the hand's forearm is among the bodies: NaN without a
-                neutral pose and without axes of the forearm.
+                those of wrist and forearm (`WRIST_NAMES`) if the hand's forearm is among the bodies: NaN
+                without a neutral pose and without axes of the forearm; pronation also without an elbow.
             neutral: The first and the last time [s] of a pose of which all angles are taken as zero, such as
                 the flat hand for a second, or the take of a trial that shows this pose; zero of the
                 convention when not given.
@@ -379,38 +379,37 @@ class Take:
         """The index of a hand's forearm among the bodies; None if there is none."""
         return next((number for number, body in enumerate(self.bodies) if body.forearm == side), None)
 
+    def elbow_index(self, side: Side) -> int | None:
+        """The index of a hand's elbow among the bodies; None if there is none."""
+        return next((number for number, body in enumerate(self.bodies) if body.elbow == side), None)
+
     def wrist_angles(
         self, side: Side, neutral: tuple[float, float] | Take | None
-    ) -> Float[np.ndarray, "T 2"] | None:
+    ) -> Float[np.ndarray, "T 3"] | None:
         """The angles `WRIST_NAMES` of a hand [rad]; None if its forearm is not among the bodies.
 
-        They are NaN where hand or forearm have no pose. The axes of the forearm are those of the hand in the
-        neutral pose, else those of the body; if it has none, all are NaN.
+        They are NaN where one of two bodies has no pose. The axes of the forearm are those of the hand in the
+        neutral pose, in which pronation is zero, else those of the body; if it has none, all are NaN.
         """
-        from scipy.spatial.transform import Rotation
-
         if (body := self.forearm_index(side)) is None:
             return None
-        turns = self.turns_on(body, side)
-        if neutral is not None:
-            take, there = self._neutral_frames(side, neutral)
-            other = take.forearm_index(side)
-            straight = turns[:0] if other is None else take.turns_on(other, side)[there]
-            straight = straight[np.isfinite(straight[:, 0, 0])]
-            zero = (
-                Rotation.from_matrix(straight).mean().as_matrix()
-                if len(straight)
-                else np.full((3, 3), np.nan)
-            )
-            turns = zero.T @ turns
-        elif not self.bodies[body].has_axes:
-            turns = np.full_like(turns, np.nan)
-        return wrist_angles(side, turns)
+        hands, forearms = self.arm_turns(side)
+        if neutral is None:
+            axes = np.eye(3) if self.bodies[body].has_axes else np.full((3, 3), np.nan)
+            return wrist_angles(side, hands @ axes, forearms @ axes)
+        take, there = self._neutral_frames(side, neutral)
+        axes, held = (_mean_rotation(turns[there]) for turns in take.arm_turns(side))
+        zero = wrist_angles(side, np.eye(3)[None], (held @ axes)[None])
+        return np.asarray(wrist_angles(side, axes.T @ hands, forearms @ axes) - zero)
 
-    def turns_on(self, body: int, side: Side) -> Float[np.ndarray, "T 3 3"]:
-        """Rotations of a hand in the frame of a body, by the index of this; NaN where one has no pose."""
-        axes = quaternion_matrix(self.body_poses[:, body, 3:])
-        return np.asarray(axes.swapaxes(1, 2) @ quaternion_matrix(self.qpos[:, self.hand_index(side), 3:7]))
+    def arm_turns(self, side: Side) -> tuple[Float[np.ndarray, "T 3 3"], Float[np.ndarray, "T 3 3"]]:
+        """Rotations of a hand in its forearm's frame, and of this in the elbow's; NaN where unknown."""
+        hand = quaternion_matrix(self.qpos[:, self.hand_index(side), 3:7])
+        forearm, elbow = (
+            np.full_like(hand, np.nan) if body is None else quaternion_matrix(self.body_poses[:, body, 3:])
+            for body in (self.forearm_index(side), self.elbow_index(side))
+        )
+        return forearm.swapaxes(1, 2) @ hand, elbow.swapaxes(1, 2) @ forearm
 
     def mean_pose(self, side: Side, between: tuple[float, float] | Take) -> Float[np.ndarray, "20"]:
         """The mean joint angles of a hand between two times, or in another take [rad]; warns if it moves."""
@@ -826,6 +825,14 @@ class Take:
         return tuple(column for column in OPTIONAL if getattr(self, column.name) is not None)
 
 
+def _mean_rotation(turns: Float[np.ndarray, "K 3 3"]) -> Float[np.ndarray, "3 3"]:
+    """The mean of the known rotations; NaN if none is known."""
+    from scipy.spatial.transform import Rotation
+
+    known = turns[np.isfinite(turns[:, 0, 0])]
+    return Rotation.from_matrix(known).mean().as_matrix() if len(known) else np.full((3, 3), np.nan)
+
+
 def poses_for(form: MotionFormat, take: Take, rate: float | None) -> Take:
     """The poses of a take that a format writes, at a rate if given."""
     poses = take.poses_alone(rate)
@@ -846,6 +853,9 @@ def posed_motion(
         for n, hand in enumerate(take.hands)
     ]
     bodies = [PosedBody.of(one.name, one.shape, take.body_poses[:, n]) for n, one in enumerate(take.bodies)]
+    for number, body in enumerate(take.bodies):
+        if body.has_axes and body.forearm in take.sides:
+            bodies[number] = bodies[number].as_forearm(hands[take.hand_index(body.forearm)], body.markers)
     return Motion(take.rate, take.times, hands, bodies)
 
 

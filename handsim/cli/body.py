@@ -21,6 +21,7 @@ def body(
     out: Path,
     markers: tuple[str, ...] = (),
     forearm: Side | None = None,
+    elbow: Side | None = None,
     landmarks: tuple[str, ...] = (),
 ) -> None:
     """Write the markers of a rigid body, from a capture of the moving body and nothing else.
@@ -32,19 +33,22 @@ def body(
             .truth.npz of a simulated capture, for its object.
         out: The body's file, .toml.
         markers: Columns of a labeled capture that are the body's markers; all when none is given.
-        forearm: The hand whose forearm carries the markers.
+        forearm: The hand whose forearm carries the markers, near the wrist.
+        elbow: The hand whose elbow they are at: on the upper arm, where pronation of the forearm does not
+            turn them.
         landmarks: Columns of a labeled capture at the forearm's radial styloid, ulnar styloid and one or two
-            epicondyles, which give its axes; without them a neutral pose does.
+            epicondyles, which give its axes; without them a neutral pose does. An elbow needs those at the
+            lateral and the medial epicondyle.
     """
     from gloves.captures.formats import read_capture
     from gloves.takes.take import SUFFIX, load_take
-    from track.bodies.forearm import forearm_of_landmarks
+    from track.bodies.forearm import limb_of_landmarks
     from track.bodies.rigid_body import SUFFIX as TOML
     from track.bodies.rigid_body import RigidTemplate, learn_body, save_body
 
     check_outputs([source], [out], TOML)
     if source.name.endswith(SUFFIX):
-        if markers or forearm or landmarks:
+        if markers or forearm or elbow or landmarks:
             raise ArgumentError(f"{source}: the object of a take has no columns, expected a labeled capture")
         bodies = load_take(source).bodies
         if not bodies:
@@ -54,9 +58,9 @@ def body(
         found = RigidTemplate.of(named_object(bodies[0].name))
     else:
         capture = read_capture(source)
-        found = learn_body(capture, as_text(out.stem), markers, forearm)
-        if landmarks:
-            found = forearm_of_landmarks(found, capture, landmarks)
+        found = learn_body(capture, as_text(out.stem), markers, forearm=forearm, elbow=elbow)
+        if landmarks or elbow:
+            found = limb_of_landmarks(found, capture, landmarks)
     save_body(out, found)
     widest = 1e3 * np.max(found.distances)
     print_line(f"{out}: {found.name}, {len(found.positions)} markers, at most {widest:.1f} mm apart")

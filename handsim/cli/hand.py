@@ -18,6 +18,7 @@ from handsim.space.transforms import UpAxis
 if TYPE_CHECKING:
     from gloves.fit import GloveFit
     from handsim.hand.model import HandModel
+    from handsim.hand.model_files import Forearm
 
 
 def hand(
@@ -68,17 +69,18 @@ def hand(
             f"given --up {up} and --out {out}, expected --take and an --out that ends in .osim with it"
         )
     check_outputs([glove, shape, take], (out, mesh))
-    chosen, words, start = _chosen_hand(size, side, shape, take, glove)
+    chosen, words, start, forearm = _chosen_hand(size, side, shape, take, glove)
     model = chosen.model if isinstance(chosen, GloveFit) else chosen
     with written_together():
-        write_hand(out, chosen, actuators=actuators, start=start, up=up)
+        write_hand(out, chosen, actuators=actuators, start=start, up=up, forearm=forearm)
         if mesh is not None:
             write_skin(mesh, model)
     markers = chosen.layout.num_markers if isinstance(chosen, GloveFit) else 0
     extras = {
         ".xml": f"{markers} marker sites" + f", {NUM_JOINTS} servos" * actuators,
         ".urdf": f"{NUM_JOINTS} joints",
-        ".osim": f"{markers} markers",
+        ".osim": f"{markers} markers"
+        + ("" if forearm is None else f", and a forearm with {len(forearm.markers)}"),
         ".glb": "rigged skin",
     }
     print_line(f"{out}: {model.shape.side} hand {words}, {extras[suffix]}")
@@ -89,9 +91,10 @@ def hand(
 
 def _chosen_hand(
     size: Size | None, side: Side | None, shape: Path | None, take: Path | None, glove: str | None
-) -> tuple[HandModel | GloveFit, str, Float[np.ndarray, "27"] | None]:
-    """The hand of the options, in its glove if it has one, its origin in words, and a take's first pose."""
+) -> tuple[HandModel | GloveFit, str, Float[np.ndarray, "27"] | None, Forearm | None]:
+    """The hand of the options, in its glove if it has one, its origin, a take's first pose and forearm."""
     from gloves.fit import nominal_fit
+    from gloves.hand_files import first_forearm
     from gloves.takes.take import load_take
     from handsim.hand.model import HandModel
     from track.user import User, load_user
@@ -109,8 +112,10 @@ def _chosen_hand(
         with errors_of(source, ArgumentError):
             fit = user.of_side(side)
         poses = np.empty((0, NUM_QPOS)) if moving is None else moving.qpos[:, moving.hand_index(fit.side)]
-        poses = poses[np.isfinite(poses).all(axis=1)]
-        return fit, f"of {source}, {User((fit,))}", poses[0] if len(poses) else None
+        there = np.flatnonzero(np.isfinite(poses).all(axis=1))
+        start = poses[there[0]] if len(there) else None
+        forearm = first_forearm(moving, fit.side) if moving is not None and len(there) else None
+        return fit, f"of {source}, {User((fit,))}", start, forearm
     size, side = size or "M", side or "right"
     hand = HandModel.named(size, side=side) if glove is None else nominal_fit(load_layout(glove), size, side)
-    return hand, f"of size {size}", None
+    return hand, f"of size {size}", None, None

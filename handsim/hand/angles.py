@@ -9,6 +9,8 @@ metacarpal turns relative to the hand: towards the palm, to the thumb's side, an
 
 The wrist's angles are those of the third metacarpal relative to the forearm; both have the same axes when
 the wrist is straight. The third angle, pronation, is left out: it is mostly skin that slides on the forearm.
+The forearm's own pronation is the turn of the radius about the forearm's length, against the line through the
+epicondyles of the elbow; it is zero where the styloids are parallel to this line, in full supination.
 """
 
 from __future__ import annotations
@@ -36,8 +38,8 @@ ISB_JOINTS: Final = tuple(
     for name in ISB_NAMES
 )
 """Index of a hinge of the model that is of the same joint, for each of these angles."""
-WRIST_NAMES: Final = ("wrist_flexion", "wrist_radial_deviation")
-"""Angles of a wrist whose forearm has markers."""
+WRIST_NAMES: Final = ("wrist_flexion", "wrist_radial_deviation", "forearm_pronation")
+"""Angles of a wrist whose forearm has markers, and of a forearm whose elbow has markers, too."""
 _BONE_ISB: Final = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, 0.0, 0.0]])
 """The ISB's axes X, Y and Z as columns, in our frame of a bone."""
 
@@ -63,15 +65,26 @@ def isb_angles(
     return found
 
 
-def wrist_angles(side: Side, turns: Float[np.ndarray, "T 3 3"]) -> Float[np.ndarray, "T 2"]:
-    """The angles of `WRIST_NAMES` [rad] of a hand with these rotations in the forearm's frame; NaN stays NaN.
+def wrist_angles(
+    side: Side, hands: Float[np.ndarray, "T 3 3"], forearms: Float[np.ndarray, "T 3 3"]
+) -> Float[np.ndarray, "T 3"]:
+    """The angles of `WRIST_NAMES` [rad], NaN where a rotation is.
 
     Radial deviation is minus the ISB's second angle, which counts ulnar deviation positive.
+
+    Args:
+        side: The hand.
+        hands: Rotations of the hand in the forearm's frame.
+        forearms: Rotations of the forearm in the elbow's frame, whose y axis goes through the epicondyles.
     """
-    known, found = np.isfinite(turns[:, 0, 0]), np.full((len(turns), len(WRIST_NAMES)), np.nan)
-    if side == "left":
-        turns = MIRROR @ turns @ MIRROR
-    found[known] = _cardan_angles(turns[known])[:, :2] * [1.0, -1.0]
+    return np.column_stack([wrist_cardan(side, hands)[:, :2], wrist_cardan(side, forearms)[:, 2]])
+
+
+def wrist_cardan(side: Side, turns: Float[np.ndarray, "T 3 3"]) -> NDArray[np.float64]:
+    """Flexion, radial deviation and pronation (T, 3) [rad] of a hand's rotations; NaN stays NaN."""
+    known, found = np.isfinite(turns[:, 0, 0]), np.full((len(turns), 3), np.nan)
+    turned = MIRROR @ turns[known] @ MIRROR if side == "left" else turns[known]
+    found[known] = _cardan_angles(turned) * [1.0, -1.0, 1.0]
     return found
 
 

@@ -10,6 +10,10 @@ OpenSim's model has a body per bone, custom joints, capsules and markers. Its co
 about x, y and z of the body, in this order), then `right_` and the name of each joint. A bone with two joints
 is moved by one custom joint about both axes, the first one first. The ground has y up, as OpenSim's window
 and gravity.
+
+A forearm with markers is one more body. It is tracked by itself, so its joint with the palm has all six
+coordinates: `right_wrist_flexion`, `right_wrist_radial_deviation` and `right_wrist_rotation` turn the palm in
+the forearm's frame, as the ISB's angles do; `right_forearm_tx` to `tz` [m] place the forearm in the palm's.
 """
 
 from __future__ import annotations
@@ -17,14 +21,23 @@ from __future__ import annotations
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
+from handsim.hand.angles import wrist_cardan
 from handsim.hand.capsules import Capsules
-from handsim.hand.model import KEYPOINT_BONES, KEYPOINT_NAMES, HandModel, Site, hand_keypoints, join_qpos
+from handsim.hand.model import (
+    FLESH_DENSITY,
+    KEYPOINT_BONES,
+    KEYPOINT_NAMES,
+    HandModel,
+    Site,
+    hand_keypoints,
+    join_qpos,
+)
 from handsim.hand.shape import BONE_NAMES, BONES, JOINT_NAMES, JOINTS, NUM_JOINTS, PALM, Side
 from handsim.space.transforms import (
     UpAxis,
@@ -44,6 +57,10 @@ _GRAVITY: Final = "0 -9.80665 0"  # OpenSim's world has y up
 _OSIM_COLOR: Final = "0.85 0.65 0.55"
 _FARTHEST: Final = 5.0  # range of the wrist's positions, both ways [m]
 _MOST_TURN: Final = 2.0 * np.pi  # range of the wrist's rotations, both ways [rad]
+_FOREARM: Final = (
+    *("wrist_flexion", "wrist_radial_deviation", "wrist_rotation"),
+    *(f"forearm_t{axis}" for axis in "xyz"),
+)
 _PARALLEL: Final = 0.5  # Axes with a larger cosine between them are too parallel for one joint.
 
 
@@ -138,10 +155,32 @@ def number_text(value: float | np.floating) -> str:
     return f"{float(value) + 0.0:.12g}"
 
 
+class Forearm(NamedTuple):
+    """A forearm beside a hand in OpenSim's model."""
+
+    name: str
+    """The name of its rigid body."""
+    markers: Mapping[str, Float[np.ndarray, "3"]]
+    """Its markers by name, in the frame of the straight hand's wrist [m]."""
+    T_wrist_forearm: Float[np.ndarray, "4 4"]
+    """The pose in which it begins [m]."""
+
+
 def coordinate_names(side: Side) -> tuple[str, ...]:
     """Names of a hand's coordinates, in the order of its 26 degrees of freedom."""
     wrist = (f"wrist_{kind}{axis}" for kind in "tr" for axis in "xyz")
     return tuple(f"{side}_{name}" for name in (*wrist, *JOINT_NAMES))
+
+
+def forearm_names(side: Side) -> tuple[str, ...]:
+    """Names of the six coordinates between palm and forearm, three angles first."""
+    return tuple(f"{side}_{name}" for name in _FOREARM)
+
+
+def forearm_values(side: Side, T_wrist_forearm: Float[np.ndarray, "T 4 4"]) -> NDArray[np.float64]:
+    """Coordinates (T, 6) of a forearm's poses in OpenSim's model [rad, m]."""
+    turns = wrist_cardan(side, np.swapaxes(T_wrist_forearm[:, :3, :3], 1, 2))
+    return np.concatenate([turns, T_wrist_forearm[:, :3, 3]], axis=1)
 
 
 def coordinate_values(qpos: Float[np.ndarray, "T 27"], up: UpAxis) -> NDArray[np.float64]:
@@ -156,8 +195,9 @@ def hand_osim(
     markers: Sequence[Site] = (),
     start: Float[np.ndarray, "27"] | None = None,
     up: UpAxis = "z",
+    forearm: Forearm | None = None,
 ) -> str:
-    """The text of a .osim file: meters, radians, kilograms.
+    """The text of a .osim file of a hand, maybe with a forearm: meters, radians, kilograms.
 
     The hand begins in the pose `start` of a world whose axis `up` points up, or flat with the back up.
     OpenSim's inverse kinematics begins there too, so that the wrist's angles do not differ by full turns from
@@ -187,13 +227,15 @@ def hand_osim(
         _add_knuckle(joints, model, bone, starts)
     for site in markers:
         for name in (site.name, f"{side}:{site.name}"):
-            _add_marker(placed, name, side, site.bone, site.position)
+            _add_marker(placed, name, f"{side}_{BONE_NAMES[site.bone]}", site.position)
+    if forearm is not None:
+        _add_forearm(bodies, joints, placed, model, forearm)
     # Joints and tips, each in the frame of the bone that begins, or ends, there.
     at_rest = hand_keypoints(model, flat)[0]
     frames = np.linalg.inv(model.rest_transforms)[list(KEYPOINT_BONES)]
     local = np.einsum("kij,kj->ki", frames[:, :3, :3], at_rest) + frames[:, :3, 3]
     for name, bone, position in zip(KEYPOINT_NAMES, KEYPOINT_BONES, local, strict=True):
-        _add_marker(placed, f"{side}_{name}", side, bone, position)
+        _add_marker(placed, f"{side}_{name}", f"{side}_{BONE_NAMES[bone]}", position)
     ET.indent(document)
     return '<?xml version="1.0" encoding="UTF-8"?>\n' + ET.tostring(document, encoding="unicode") + "\n"
 
@@ -298,11 +340,35 @@ def _add_motion(
             _add(ET.SubElement(element, "Constant", name="function"), "value", "0")
 
 
-def _add_marker(
-    markers: ET.Element, name: str, side: Side, bone: int, position: Float[np.ndarray, "3"]
+def _add_forearm(
+    bodies: ET.Element, joints: ET.Element, markers: ET.Element, model: HandModel, forearm: Forearm
 ) -> None:
+    """Add a capsule of flesh from the wrist to the farthest marker, its joint, and its markers."""
+    side, radius = model.shape.side, model.shape.palm_thickness
+    name, start = f"{side}_forearm", np.linalg.inv(forearm.T_wrist_forearm)[:3, 3]
+    length = max(start[0] - min(place[0] for place in forearm.markers.values()), radius)
+    body = ET.SubElement(bodies, "Body", name=name)
+    end = start - [length, 0.0, 0.0]
+    flesh = Capsules(np.zeros(1, int), start[None], end[None], np.full(1, radius))
+    _add_osim_capsule(ET.SubElement(body, "components"), name, flesh, 0)
+    mass, across = FLESH_DENSITY * np.pi * radius**2 * length, (3.0 * radius**2 + length**2) / 12.0
+    _add(body, "mass", number_text(mass))
+    _add(body, "mass_center", vector_text(0.5 * (start + end)))
+    _add(body, "inertia", vector_text(mass * np.array([0.5 * radius**2, across, across, 0.0, 0.0, 0.0])))
+    joint = _add_osim_joint(joints, name, f"/bodyset/{side}_{BONE_NAMES[PALM]}", name, np.eye(4))
+    # The palm's angles in the forearm, backwards; a left hand turns the other way about x and z.
+    axes = np.diag([1.0, -1.0, -1.0] if side == "right" else [-1.0, -1.0, 1.0])[[0, 2, 1]]
+    names, values = forearm_names(side), forearm_values(side, forearm.T_wrist_forearm[None])[0]
+    coordinates = [*zip(names[2::-1], axes, strict=True), *zip(names[3:], np.eye(3), strict=True)]
+    _add_motion(joint, coordinates, dict(zip(names, values, strict=True)))
+    for marker, position in forearm.markers.items():
+        for known in (marker, f"{forearm.name}:{marker}"):
+            _add_marker(markers, known, name, position)
+
+
+def _add_marker(markers: ET.Element, name: str, body: str, position: Float[np.ndarray, "3"]) -> None:
     marker = ET.SubElement(markers, "Marker", name=name)
-    _add(marker, "socket_parent_frame", f"/bodyset/{side}_{BONE_NAMES[bone]}")
+    _add(marker, "socket_parent_frame", f"/bodyset/{body}")
     _add(marker, "location", vector_text(position))
     _add(marker, "fixed", "true")
 

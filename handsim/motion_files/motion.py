@@ -19,8 +19,9 @@ and Kotiuk); the palm joint is the middle of the middle metacarpal.
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Final, NamedTuple, cast
 
 import numpy as np
@@ -32,9 +33,10 @@ from handsim.files.inputs import read_bytes
 from handsim.files.outputs import as_text, atomic_write
 from handsim.hand.angles import ISB_JOINTS, ISB_NAMES, WRIST_NAMES, isb_angles
 from handsim.hand.model import KEYPOINT_NAMES, HandModel, hand_keypoints
-from handsim.hand.model_files import coordinate_names, coordinate_values
+from handsim.hand.model_files import coordinate_names, coordinate_values, forearm_names, forearm_values
 from handsim.hand.shape import BONE_NAMES, BONES, DIGITS, JOINT_NAMES, PALM, SIDES, Side, bones_of
-from handsim.space.objects import RigidObject
+from handsim.hand.skin import load_cage
+from handsim.space.objects import Part, RigidObject
 from handsim.space.transforms import (
     UpAxis,
     euler_angles,
@@ -111,7 +113,7 @@ class PosedHand(NamedTuple):
     """Models of earlier frames, each with the first frame after them; `model` is that of the last frames."""
     shown: Bool[np.ndarray, "20"] | None = None
     """Which joints markers showed; tables leave out the others. None if all are known."""
-    wrist: Float[np.ndarray, "T 2"] | None = None
+    wrist: Float[np.ndarray, "T 3"] | None = None
     """Angles of the wrist in the order of `WRIST_NAMES` [rad], NaN where unknown; None without a forearm."""
 
     @property
@@ -167,12 +169,40 @@ class PosedBody(NamedTuple):
     """Frames with a pose, at least one."""
     T_world_body: Float[np.ndarray, "T 4 4"]
     """Poses [m]; missing ones repeat the last pose, or else the first."""
+    forearm: Side | None = None
+    """The hand whose forearm it is, in the frame of the straight hand's wrist; None for other bodies."""
+    markers: Mapping[str, Float[np.ndarray, "3"]] = MappingProxyType({})
+    """A forearm's markers by name, in its frame [m]."""
 
     @classmethod
     def of(cls, name: str, shape: RigidObject | None, poses: Float[np.ndarray, "T 7"]) -> PosedBody:
         """A body with its positions [m] and orientations (wxyz), NaN where it has none."""
         present: NDArray[np.bool_] = np.isfinite(poses[:, 0])
         return cls(name, shape, present, pose_matrices(_held(poses, present)))
+
+    def as_forearm(self, hand: PosedHand, markers: Mapping[str, Float[np.ndarray, "3"]]) -> PosedBody:
+        """The forearm of a hand: the outline of its skin at the wrist, drawn out to the farthest marker."""
+        from scipy.spatial import ConvexHull
+
+        # Landmarks may be the ends of a bar above the wrist, so the skin begins where the hand mostly is.
+        away = hand.qpos[:, :3] - self.T_world_body[:, :3, 3]
+        wrist = np.median(np.einsum("ti,tij->tj", away, self.T_world_body[:, :3, :3]), axis=0)
+        loop = hand.model.surface.vertices[load_cage().wrist_loop] + wrist
+        end = loop * [0.0, 1.0, 1.0] + [min(place[0] for place in markers.values()), 0.0, 0.0]
+        corners = np.concatenate([loop, end])
+        hull = ConvexHull(corners)
+        normals = np.cross(
+            *(corners[hull.simplices[:, side]] - corners[hull.simplices[:, 0]] for side in (1, 2))
+        )
+        is_inward = (normals * hull.equations[:, :3]).sum(axis=1) < 0.0
+        faces = np.where(is_inward[:, None], hull.simplices[:, ::-1], hull.simplices)
+        shape = RigidObject(self.name, corners, faces, (Part("mesh", np.zeros(3), np.eye(4), corners),))
+        return self._replace(shape=shape, forearm=hand.side, markers=markers)
+
+    @property
+    def material(self) -> Material:
+        """What its surface is made of."""
+        return THING if self.forearm is None else SKIN
 
 
 class Motion(NamedTuple):
@@ -189,6 +219,10 @@ class Motion(NamedTuple):
     def seconds(self) -> Float[np.ndarray, "T"]:
         """Time since the first frame [s]."""
         return np.asarray(self.times - self.times[0])
+
+    def forearm(self, side: Side) -> PosedBody | None:
+        """The forearm of a hand, None if it has none with axes."""
+        return next((body for body in self.bodies if body.forearm == side), None)
 
 
 def changes(present: Bool[np.ndarray, "T"]) -> Int[np.ndarray, "K"]:
@@ -359,6 +393,11 @@ def write_mot(path: Path, motion: Motion, up: UpAxis = "z") -> None:
         values = coordinate_values(hand.qpos, up)
         columns += [values[:, :3], np.rad2deg(values[:, 3:])]
         names += coordinate_names(hand.side)
+        if (forearm := motion.forearm(hand.side)) is not None:
+            in_hand = np.linalg.inv(pose_matrices(hand.qpos[:, :7])) @ forearm.T_world_body
+            values = forearm_values(hand.side, in_hand)
+            columns += [np.rad2deg(values[:, :3]), values[:, 3:]]
+            names += forearm_names(hand.side)
     table = np.concatenate(columns, axis=1)
     header = [
         as_text(path.stem),
@@ -388,7 +427,10 @@ def write_bvh(path: Path, motion: Motion, up: UpAxis = "z") -> None:
         columns.append(_CENTIMETERS * hand.qpos[:, :3] @ turn.T)
         columns += [_degrees(local[:, bone]) for bone in _order(PALM)]
     for thing in motion.bodies:
-        content = [*_joint(np.zeros(3), moves=True), *_end(np.eye(3)[0])]
+        end = np.eye(3)[0]
+        if thing.forearm is not None:  # its bone goes from the wrist to the farthest marker
+            end = _CENTIMETERS * min(place[0] for place in thing.markers.values()) * turn[:, 0]
+        content = [*_joint(np.zeros(3), moves=True), *_end(end)]
         word = "".join(one if one.isascii() and one.isalnum() else "_" for one in thing.name) or "thing"
         lines += _indented([f"JOINT {word}", "{", *_indented(content), "}"])
         poses = thing.T_world_body

@@ -184,7 +184,7 @@ class _Scene:
                 ),
                 "NORMAL": self._buffer.add(outward.astype("<f4"), target=_VERTICES),
             }
-            primitive = self._primitive(attributes, faces, THING)
+            primitive = self._primitive(attributes, faces, thing.material)
             self._meshes.append({"name": thing.name, "primitives": [primitive]})
         self._nodes.append(node)
         self._top.append(number)
@@ -385,7 +385,7 @@ def _add_thing(stage: Any, thing: PosedBody, number: int, codes: NDArray[np.floa
         turn.Set(Gf.Quatf(*quaternion), code)
     _set_visibility(body, thing.present, codes)
     if thing.shape is not None:
-        mesh = add_mesh(stage, f"{path}/mesh", thing.shape.vertices, thing.shape.faces, THING)
+        mesh = add_mesh(stage, f"{path}/mesh", thing.shape.vertices, thing.shape.faces, thing.material)
         normals = corner_normals(thing.shape.vertices, thing.shape.faces).reshape(-1, 3)
         mesh.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(normals.astype(np.float32)))
         mesh.SetNormalsInterpolation(UsdGeom.Tokens.faceVarying)

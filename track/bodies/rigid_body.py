@@ -52,10 +52,10 @@ class _Tolerances(NamedTuple):
 _RIGID: Final = _Tolerances(0.003, 0.001, 0.001, 0.0005, 0.003)
 """Tolerances of objects: ten times the noise of a good system."""
 _SKIN: Final = _Tolerances(0.005, 0.004, 0.002, 0.001, 0.02)
-"""Tolerances of a forearm, whose skin moves markers by 1 to 2 mm, and one amid the muscles by up to 20. Five
-markers of a recorded one, two of them at the epicondyles, are labeled in all frames; with 2 mm as `tight` and
-3 mm as `gate` in 57 % of them. Four markers, one of them amid the muscles, are labeled in all frames; in 75 %
-if no point is `kept`."""
+"""Tolerances of a forearm and an elbow, whose skin moves markers by 1 to 2 mm, and one amid the muscles by up
+to 20. Five markers of a recorded arm, two of them at the epicondyles, are labeled in all frames; with 2 mm as
+`tight` and 3 mm as `gate` in 57 % of them. Four markers, one of them amid the muscles, are labeled in all
+frames; in 75 % if no point is `kept`."""
 _LEAST_WIDTH: Final = 0.005  # [m] least RMS distance of the markers from their best line
 _LEAST_MARKER_DISTANCE: Final = 2.0 * _RIGID.gate  # [m] Closer markers could exchange labels.
 _LONGEST_COAST: Final = 0.026  # [s] longest prediction (three frames at 120 Hz) without three markers
@@ -68,8 +68,10 @@ _CONFIDENT_RADIUS: Final = 0.03  # [m] largest search radius in which three mark
 _MOST_CANDIDATE_MOTION: Final = 0.02  # [m] largest motion per frame of an unconfirmed candidate
 _MOST_SEARCHED_POINTS: Final = 250  # largest number of points in a search: 30 ms, cubic in it
 SUFFIX: Final = ".toml"
+_Limb = tuple[Side | None, Side | None]
+"""The hands whose forearm and whose elbow a body is."""
 _EXPECTED: Final = "RigidTemplates, names of handsim's objects, or paths of .toml files"
-_OPTIONAL: Final = ("description", "forearm", "forearm_axes", "marker")
+_OPTIONAL: Final = ("description", "forearm", "forearm_axes", "elbow", "marker")
 _BODY_KEYS: Final = ("name", *_OPTIONAL)
 _MARKER_KEYS: Final = ("name", "place_mm")
 _MOST_LEARNED_MARKERS: Final = 20
@@ -190,7 +192,7 @@ class BodyTracker:
     def __init__(self, template: RigidTemplate) -> None:
         self.template = template
         self._positions, self._distances = template.positions, template.distances
-        self._tolerances = _RIGID if template.forearm is None else _SKIN
+        self._tolerances = _SKIN if template.forearm or template.elbow else _RIGID
         self._reset()
         for number in range(18):  # Compile or load all kernels before the stream's first frame.
             there = self._positions if number < 17 else self._positions[:0]
@@ -447,8 +449,9 @@ def load_bodies(names_or_paths: AnyBody | Iterable[AnyBody]) -> tuple[RigidTempl
                 f"{owner}a body is named '{body.name}', expected a name of its own; taken are "
                 f"{', '.join(taken)}"
             )
-        if body.forearm is not None and body.forearm in (other.forearm for other in bodies):
-            raise ArgumentError(f"'{body.name}' is a second {body.forearm} forearm, expected one at most")
+        for part, side in body.limb.items():
+            if any(other.limb == body.limb for other in bodies):
+                raise ArgumentError(f"'{body.name}' is a second {side} {part}, expected one at most")
         bodies.append(body)
     return tuple(bodies)
 
@@ -456,8 +459,9 @@ def load_bodies(names_or_paths: AnyBody | Iterable[AnyBody]) -> tuple[RigidTempl
 def save_body(path: str | Path, body: RigidTemplate) -> None:
     """Write a body as TOML with nine decimals; `load_body` reads the same body again."""
     lines = [f"name = {quoted(body.name)}"]
+    lines += [f"{part} = {quoted(side)}" for part, side in body.limb.items()]
     if body.forearm is not None:
-        lines += [f"forearm = {quoted(body.forearm)}", f"forearm_axes = {str(body.has_axes).lower()}"]
+        lines.append(f"forearm_axes = {str(body.has_axes).lower()}")
     for name, position in zip(body.marker_names, 1e3 * body.positions, strict=True):
         numbers_mm = ", ".join(written(value) for value in position.tolist())
         lines += ["", "[[marker]]", f"name = {quoted(name)}", f"place_mm = [{numbers_mm}]"]
@@ -471,10 +475,10 @@ def _parse_body(table: Mapping[str, object]) -> RigidTemplate:
     name = _printable("the body's name", text_of(table, "name"))
     markers = [_parse_marker(entry, number) for number, entry in enumerate(tables_of(table, "marker"), 1)]
     positions = np.array([position for _, position in markers]).reshape(-1, 3)
-    forearm = cast("Side", text_of(table, "forearm")) if "forearm" in table else None
+    limb = {part: cast("Side", text_of(table, part)) for part in ("forearm", "elbow") if part in table}
     axes, names = table.get("forearm_axes", False), tuple(marker for marker, _ in markers)
     check_type("forearm_axes", axes, bool, "true or false")
-    return RigidTemplate(name, names, 1e-3 * positions, None, forearm, has_axes=bool(axes))
+    return RigidTemplate(name, names, 1e-3 * positions, None, has_axes=bool(axes), **limb)
 
 
 def _parse_marker(table: Mapping[str, object], number: int) -> tuple[str, list[float]]:
@@ -494,7 +498,12 @@ def _printable(what: str, name: str) -> str:
 
 
 def learn_body(
-    capture: Capture, name: str, markers: Sequence[str] = (), forearm: Side | None = None
+    capture: Capture,
+    name: str,
+    markers: Sequence[str] = (),
+    *,
+    forearm: Side | None = None,
+    elbow: Side | None = None,
 ) -> RigidTemplate:
     """Learn the markers of a body from a capture of it alone; its origin is the mean of its markers.
 
@@ -503,6 +512,7 @@ def learn_body(
         name: The body's name.
         markers: Columns of a labeled capture that are the body's; its markers have their names.
         forearm: The hand whose forearm it is.
+        elbow: The hand whose elbow it is.
 
     Raises:
         ArgumentError: The points have a wrong unit.
@@ -510,17 +520,21 @@ def learn_body(
         CaptureError: A column is missing.
     """
     if markers:
+        if len(markers) < FEWEST:
+            count = f"{len(markers)} marker{'s' * (len(markers) > 1)}"
+            raise CalibrationError(f"{count} of a body, expected at least {FEWEST}, which determine a pose")
         capture = Capture(tuple(markers), select_markers(capture, markers), capture.rate)
-        body = learn_body(capture, name, forearm=forearm)
+        body = learn_body(capture, name, forearm=forearm, elbow=elbow)
         if len(body.positions) < len(markers):
             raise CalibrationError(
-                f"{len(body.positions)} of the markers {', '.join(markers)} are seen mostly, expected all"
+                f"{len(body.positions)} of the markers {', '.join(markers)} are mostly seen and keep their "
+                "distances, expected all"
             )
         return dataclasses.replace(body, marker_names=tuple(markers))
     frames = list(capture_frames(capture))
     check_unit([frame.points for frame in frames])
     counts = np.array([len(frame.points) for frame in frames])
-    body, tracked = _best_template(name, forearm, frames, counts)
+    body, tracked = _best_template(name, (forearm, elbow), frames, counts)
     labeled = _num_labeled(tracked)
     if labeled < _LEAST_LABELED_SHARE * counts.sum():
         raise CalibrationError(
@@ -529,13 +543,13 @@ def learn_body(
         )
     for _ in range(_AVERAGING_ROUNDS):
         positions = _median_positions(body, frames, tracked)
-        body = _template(name, forearm, positions)
+        body = _template(name, (forearm, elbow), positions)
         tracked = _track(body, frames)
     return body
 
 
 def _best_template(
-    name: str, forearm: Side | None, frames: Sequence[StreamedFrame], counts: NDArray[np.int64]
+    name: str, limb: _Limb, frames: Sequence[StreamedFrame], counts: NDArray[np.int64]
 ) -> tuple[RigidTemplate, list[BodyFrame]]:
     """The template, among those of several frames, that labels most points, and its track."""
     count = int(np.quantile(counts, _COUNT_QUANTILE, method="lower"))
@@ -549,7 +563,7 @@ def _best_template(
     candidates, faults = [], []
     for number in np.unique(chosen):
         try:
-            body = _template(name, forearm, frames[number].points)
+            body = _template(name, limb, frames[number].points)
         except CalibrationError as error:
             faults.append(error)
         else:
@@ -559,11 +573,12 @@ def _best_template(
     return max(candidates, key=lambda candidate: _num_labeled(candidate[1]))
 
 
-def _template(name: str, forearm: Side | None, positions: NDArray[np.float64]) -> RigidTemplate:
+def _template(name: str, limb: _Limb, positions: NDArray[np.float64]) -> RigidTemplate:
     """A body with markers at these positions (Q, 3) [m], its origin moved to their mean."""
+    forearm, elbow = limb
     names = tuple(f"Marker{number + 1}" for number in range(len(positions)))
     try:
-        return RigidTemplate(name, names, positions - positions.mean(axis=0), forearm=forearm)
+        return RigidTemplate(name, names, positions - positions.mean(axis=0), None, forearm, elbow=elbow)
     except ArgumentError as error:
         raise CalibrationError(str(error)) from error
 

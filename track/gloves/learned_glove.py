@@ -31,6 +31,7 @@ from handsim.errors import CaptureError, LayoutError
 from handsim.hand.model import HandModel
 from handsim.hand.shape import SIDES, Side
 from handsim.space.transforms import MIRROR
+from track.bodies.constellation import FEWEST
 from track.captures import label_capture
 from track.frames import AnyCapture, capture_of
 from track.gloves.fit import FINE, FLESH, FittedPlaces, fit_places, shown_flesh
@@ -238,7 +239,7 @@ class _Learning:
         for name, marker, share in zip(layout.names, layout.markers, sure, strict=True):
             if share < _SURE:
                 doubt.append(f"{name} may sit elsewhere than on {marker.bone} ({100 * (1 - share):.0f} %)")
-        left_out = tuple(_left_out(self._sources, done))
+        left_out = *_left_out(self._sources, done), *_beside(self._sources, done)
         return LearnedGlove(layout, tuple(done), left_out, _spreads(layout, done), sure, tuple(doubt))
 
     def _fitted(self, one: _Found, layout: MarkerLayout, flesh: float = FLESH) -> FittedPlaces:
@@ -391,12 +392,8 @@ def _together(points: Float[np.ndarray, "T N 3"]) -> Iterator[Int[np.ndarray, "N
     """Groups of columns that are never farther apart than markers of a hand, and move against each other."""
     from scipy.cluster.hierarchy import fcluster, linkage
 
-    some = spread_out(points, _LOOKED_AT)
     first, second = np.triu_indices(points.shape[1], 1)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # columns that are never seen together
-        apart = np.linalg.norm(some[:, first] - some[:, second], axis=2)
-        low, high = np.nanquantile(apart, (0.02, 0.98), axis=0)
+    low, high = _distances(points, first, second)
     high = np.where(np.isfinite(high), high, 1.0)
     groups = fcluster(linkage(high, "complete"), _HAND, "distance")
     for group in np.unique(groups):
@@ -405,6 +402,43 @@ def _together(points: Float[np.ndarray, "T N 3"]) -> Iterator[Int[np.ndarray, "N
         is_rigid = np.nanmax(high[own] - low[own], initial=0.0) < _RIGID
         if FEWEST_MARKERS <= len(columns) <= MOST_MARKERS and not is_rigid:
             yield columns
+
+
+def _distances(
+    points: Float[np.ndarray, "T N 3"], first: Int[np.ndarray, "P"], second: Int[np.ndarray, "P"]
+) -> Float[np.ndarray, "2 P"]:
+    """Low and high distances of pairs of columns over time [m]; NaN of pairs never seen together."""
+    some = spread_out(points, _LOOKED_AT)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # columns that are never seen together
+        apart = np.linalg.norm(some[:, first] - some[:, second], axis=2)
+        return np.nanquantile(apart, (0.02, 0.98), axis=0) if apart.size else np.empty((2, 0))
+
+
+def _beside(sources: Sequence[Capture], hands: Sequence[TrialHand]) -> Iterator[str]:
+    """A sentence on columns beside each hand that keep their distances, as those on its forearm do."""
+    for one in hands:
+        names, points = sources[one.capture].names, sources[one.capture].positions
+        taken = {
+            column for other in hands if other.capture == one.capture for column in other.columns.values()
+        }
+        own = np.array([*one.columns.values()])
+        others = np.array([column for column in range(len(names)) if column not in taken], dtype=int)
+        _, far = _distances(points, np.repeat(others, len(own)), np.tile(own, len(others)))
+        near = others[(far.reshape(len(others), len(own)) < _HAND).any(axis=1)]
+        while len(near):
+            low, high = _distances(points, np.repeat(near, len(near)), np.tile(near, len(near)))
+            moved = np.nan_to_num(high - low, nan=1.0).reshape(len(near), len(near))
+            if moved.max() < _RIGID:
+                break
+            near = np.delete(near, moved.sum(axis=1).argmax())
+        if len(near) >= FEWEST:
+            limb, side = [names[column] for column in near.tolist()], one.hand.side
+            yield (
+                f"{', '.join(limb)} keep their distances beside the {side} hand; if they are on its forearm, "
+                f"handsim body TRIAL --markers {' '.join(limb)} --forearm {side} --out forearm.toml makes a "
+                "body of them for angles of the wrist (docs/angles.md)"
+            )
 
 
 def _paired(layout: MarkerLayout, other: MarkerLayout) -> dict[str, str]:

@@ -90,6 +90,8 @@ def channels_of(header: LiveHeader) -> Iterator[_Channel]:
         yield from ((f"{side}_{joint}_spread", "radians", "Spread") for joint in header.angles)
         yield from ((f"{side}_{place}_spread", "meters", "Spread") for place in header.positions)
     yield ("measured", "", "Status")
+    for side in header.sides:
+        yield from ((f"{side}_{angle}", "radians", "JointAngle") for angle in header.wrist_angles)
 
 
 def _pose_channels(status: str, name: str) -> Iterator[_Channel]:
@@ -113,5 +115,5 @@ def sample_of(message: LiveMessage) -> np.ndarray:
     for hand in message.hands:
         parts += [[hand.seen if hand.has_pose else math.nan], [STATUSES.index(one) for one in hand.digits]]
         parts += [hand.angle_spread, hand.position_spread]
-    parts.append([not message.size_state])
+    parts += [[not message.size_state], *(hand.wrist_angles for hand in message.hands)]
     return np.concatenate(parts)

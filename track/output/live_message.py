@@ -20,13 +20,20 @@ from gloves.takes.points import Status
 from gloves.takes.take import label_names
 from handsim import __version__
 from handsim._plugins import import_extra
+from handsim.hand.angles import WRIST_NAMES, wrist_angles
 from handsim.hand.model import KEYPOINT_NAMES, HandModel, hand_keypoints
 from handsim.hand.shape import DIGITS, JOINT_NAMES, Side
 from handsim.kernels import move
 from handsim.motion_files.motion import OPENXR_JOINTS, joint_poses, joint_radii
-from handsim.space.transforms import ProgramAxes, UpAxis, program_axes, transform_poses
+from handsim.space.transforms import (
+    ProgramAxes,
+    UpAxis,
+    program_axes,
+    quaternion_matrix,
+    transform_poses,
+)
 from track.bodies.rigid_body import RigidTemplate
-from track.frames import StreamedFrame, TrackedFrame, TrackedHand
+from track.frames import StreamedFrame, TrackedBody, TrackedFrame, TrackedHand
 
 SCHEMA: Final = 1
 """Version of the messages; a receiver of one version understands all later messages of it."""
@@ -61,6 +68,8 @@ class LiveHeader:
     """Marker names that labels index: `right:ThumbTip`, ..., first the hands' markers, then the bodies'."""
     radii: tuple[tuple[float, ...], ...]
     """Radius of each hand at each of OpenXR's joints [m]."""
+    wrist_angles: tuple[str, ...] = ()
+    """The angles of wrists and forearms; none without a forearm whose axes are known."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -91,6 +100,8 @@ class LiveHand:
     """Computes the velocity of each joint position in the world [m/s]; NaN where unknown."""
     find_joints: Callable[[], Float[np.ndarray, "26 7"]] = field(repr=False)
     """Computes positions [m] and wxyz quaternions of OpenXR's joints in the world; for a hand with a pose."""
+    wrist_angles: Float[np.ndarray, "W"] = field(default_factory=lambda: np.empty(0))
+    """The header's angles of wrist and forearm [rad]; each NaN while a body that it needs is lost."""
 
     @property
     def has_pose(self) -> bool:
@@ -163,6 +174,9 @@ class MessageEncoder:
     def __init__(self, hands: Sequence[GloveFit], bodies: Sequence[RigidTemplate]) -> None:
         self._models = [hand.model for hand in hands]
         self._digits = [hand.attachment.digits for hand in hands]
+        self._limbs = [body.limb if body.elbow or body.has_axes else {} for body in bodies]
+        parts = {part for limb in self._limbs for part in limb}
+        told = len(WRIST_NAMES) if "elbow" in parts else len(WRIST_NAMES) - 1
         self.header = LiveHeader(
             tuple(hand.side for hand in hands),
             JOINT_NAMES,
@@ -171,6 +185,7 @@ class MessageEncoder:
             DIGITS,
             label_names(hands, bodies),
             tuple(tuple(joint_radii(hand.model).tolist()) for hand in hands),
+            WRIST_NAMES[:told] if "forearm" in parts else (),
         )
 
     def encode(self, frame: StreamedFrame, tracked: TrackedFrame) -> LiveMessage:
@@ -182,7 +197,9 @@ class MessageEncoder:
             time=frame.time,
             silent=frame.silent,
             size_state=tracked.size_state,
-            hands=tuple(self._hand(number, hand) for number, hand in enumerate(tracked.hands)),
+            hands=tuple(
+                self._hand(number, hand, tracked.bodies) for number, hand in enumerate(tracked.hands)
+            ),
             bodies=tuple(
                 LiveBody(one.name, one.status, one.translation, one.rotation) for one in tracked.bodies
             ),
@@ -192,7 +209,7 @@ class MessageEncoder:
             latency=frame.latency + lag,
         )
 
-    def _hand(self, number: int, hand: TrackedHand) -> LiveHand:
+    def _hand(self, number: int, hand: TrackedHand, bodies: Sequence[TrackedBody]) -> LiveHand:
         positions = np.full((len(KEYPOINT_NAMES), 3), np.nan)
         if hand.has_pose:
             positions = hand_keypoints(self._models[number], hand.qpos[None])[0]
@@ -208,9 +225,20 @@ class MessageEncoder:
             for number in range(len(DIGITS))
         )
         doubt = float(seen.mean()), digits
+        wrist = self._wrist_angles(hand, bodies)
         return LiveHand(
-            hand.side, hand.status, *doubt, *pose, *spreads, hand.velocity[6:], velocities, joints
+            hand.side, hand.status, *doubt, *pose, *spreads, hand.velocity[6:], velocities, joints, wrist
         )
+
+    def _wrist_angles(self, hand: TrackedHand, bodies: Sequence[TrackedBody]) -> Float[np.ndarray, "W"]:
+        if not self.header.wrist_angles:
+            return np.empty(0)
+        rotations = {"hand": hand.qpos[3:7], "forearm": np.full(4, np.nan), "elbow": np.full(4, np.nan)}
+        for limb, body in zip(self._limbs, bodies, strict=True):
+            rotations |= {part: body.rotation for part, side in limb.items() if side == hand.side}
+        own, forearm, elbow = quaternion_matrix(np.stack([*rotations.values()]))[:, None]
+        found = wrist_angles(hand.side, forearm.swapaxes(1, 2) @ own, elbow.swapaxes(1, 2) @ forearm)
+        return np.asarray(found[0, : len(self.header.wrist_angles)])
 
 
 def _velocities(model: HandModel, hand: TrackedHand) -> Float[np.ndarray, "21 3"]:
@@ -363,7 +391,7 @@ def header_document(header: LiveHeader, content: Content = Content()) -> dict[st
         "source": f"handsim {__version__}",
         "axes": content.axes,
         "units": {"length": unit, "angle": "rad", "time": "s", "quaternion": "wxyz"},
-        **{name: list(values) for name, values in names.items()},
+        **{name: list(values) for name, values in names.items() if values or name != "wrist_angles"},
         **({"joints": list(OPENXR_JOINTS), "radii": radii} if content.joints else {}),
     }
 
@@ -396,6 +424,8 @@ def _hand_document(hand: LiveHand, content: Content) -> dict[str, Any]:
     others = {"angle_spread": hand.angle_spread, "position_spread": hand.position_spread}
     if content.velocities:
         others |= {"angle_velocities": hand.angle_velocities, "velocities": hand.find_velocities()}
+    if len(hand.wrist_angles):
+        more["wrist_angles"] = [None if np.isnan(one) else _rounded(one) for one in hand.wrist_angles]
     return {
         "side": hand.side,
         "status": str(hand.status),

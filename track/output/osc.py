@@ -64,6 +64,8 @@ def _osc_header(header: LiveHeader) -> Iterator[_Content]:
     yield _strings("/handsim/angles", header.angles)
     yield _strings("/handsim/positions", header.positions)
     yield _strings("/handsim/digits", header.digits)
+    if header.wrist_angles:
+        yield _strings("/handsim/wrist_angles", header.wrist_angles)
     yield _strings("/handsim/bodies", [_part(name) for name in header.bodies])
 
 
@@ -84,6 +86,8 @@ def _osc_frame(message: LiveMessage, content: Content) -> Iterator[_Content]:
             yield _floats(f"{address}/wrist", hand.position, hand.quaternion)
             yield _floats(f"{address}/angles", hand.angles)
             yield _floats(f"{address}/positions", hand.positions.ravel())
+        if not np.isnan(hand.wrist_angles).all():
+            yield _floats(f"{address}/wrist_angles", hand.wrist_angles)
         if not np.isnan(hand.angle_spread).any():
             yield _floats(f"{address}/angle_spread", hand.angle_spread)
             yield _floats(f"{address}/position_spread", hand.position_spread)

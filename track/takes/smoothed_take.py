@@ -100,12 +100,13 @@ def smooth_take(take: Take) -> Take:
             qpos[:, number], fits = hand.qpos, np.isfinite(rms[:, number])
             rms[fits, number] = hand.rms()[fits]
             angles[:, number], keypoints[:, number] = hand.angles, hand.keypoints
-            if (body := take.forearm_index(side)) is not None:
+            if take.forearm_index(side) is not None:
                 calibrated = hand.model.is_calibrated
-                parts = wrist_variances(take, side, body, variances[:, -3:], is_calibrated=calibrated)
-                if np.isfinite(parts).any():
+                parts = wrist_variances(take, side, variances[:, -3:], is_calibrated=calibrated)
+                known = np.isfinite(parts).any(axis=(0, 2))
+                if known.any():
                     wrists[:, number] = np.sqrt(parts.sum(axis=-1))
-                    wrist_budgets[side] = _budget(parts)
+                    wrist_budgets[side] = _budget(parts[:, known])  # Without an elbow pronation is the last.
     settings = {**take.settings, "filter": cutoffs, "budget": budgets}
     return dataclasses.replace(
         take,

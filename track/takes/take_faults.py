@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Int
 
 from gloves.fit import GloveFit
 from gloves.takes.take import HARDLY_SEEN, TRACKED, Take
+from handsim.hand.angles import wrist_cardan
 from handsim.hand.shape import JOINTS, Side
 from track.alternatives.alternatives import Doubt, doubts_of
 from track.alternatives.hands import other_hands_of
@@ -45,6 +46,7 @@ _OFTEN_AT_LIMIT: Final = 0.4  # share of the frames at the limit
 _OPEN: Final = 8.0  # [deg] standard deviation from which on the angle of a still joint is told
 _LONG: Final = 5.0  # [s] A capture that is shorter shows little of what a hand does.
 _RESTS: Final = 0.3  # A hand rests as a whole if this share of its joints hardly moves.
+_MIDDLE: Final = float(np.deg2rad(80.0))  # [rad] of the pronation of forearms, whose range is 160 degrees
 _FITTED_FRAMES: Final = 120  # number of frames in which a slip of the glove is fitted
 
 
@@ -91,7 +93,7 @@ class _Hand(NamedTuple):
 @lru_cache(maxsize=1)  # A summary, its warnings and a report of a take ask one after the other.
 def find_faults(take: Take) -> tuple[SuspectSpan, ...]:
     """Find the faults of a tracked take, each from the frame in which it begins."""
-    found = list[SuspectSpan]()
+    found = [*_limbs(take)] if take.made_by_tracker else []
     every = [span for span, _ in take.worn()]
     longest = max(every, key=lambda span: np.count_nonzero(take.status[span] == TRACKED))
     for span in every:  # Other hands, or another size of them, have faults of their own.
@@ -104,6 +106,34 @@ def find_faults(take: Take) -> tuple[SuspectSpan, ...]:
             for one in faults
         )
     return tuple(found)
+
+
+def _limbs(take: Take) -> Iterator[SuspectSpan]:
+    """Forearms and elbows of hands that are not there, or whose landmarks were exchanged."""
+
+    def fault(name: str, why: str, remedy: str) -> SuspectSpan:
+        return SuspectSpan(0, take.num_frames - 1, 0, f"the body '{name}'", why, remedy, of_labels=False)
+
+    for body in take.bodies:
+        for part, side in body.limb.items():
+            if side not in take.sides:
+                why = f"is the {part} of a {side} hand, which the take does not have"
+                yield fault(body.name, why, "name the side of the hand in its file")
+    for side in take.sides:
+        forearm = take.forearm_index(side)
+        if forearm is None or not take.bodies[forearm].has_axes:
+            continue
+        hands, forearms = take.arm_turns(side)
+        for index, turns, middle, landmarks in (
+            (forearm, hands, 0.0, "radial and ulnar styloid"),
+            (take.elbow_index(side), forearms, _MIDDLE, "lateral and medial epicondyle"),
+        ):
+            turn = wrist_cardan(side, turns)[:, 2]
+            turn = turn[np.isfinite(turn)]
+            if index is not None and len(turn) and np.median(np.cos(turn - middle)) < 0.0:
+                why = f"is turned by half a turn, as if {landmarks} were exchanged"
+                yield fault(take.bodies[index].name, why, "give handsim body its --landmarks in their order")
+                break
 
 
 def _faults_of_hands(take: Take, *, is_last: bool, judges: bool) -> tuple[SuspectSpan, ...]:

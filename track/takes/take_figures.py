@@ -163,31 +163,38 @@ def hand_figures(take: Take, *, guesses: bool = False) -> tuple[HandFigures, ...
 
 
 class WristFigures(NamedTuple):
-    """Angles of a wrist over the frames of a take, in the order of `WRIST_NAMES`."""
+    """Angles of wrist and forearm over the frames of a take, in the order of `WRIST_NAMES`."""
 
-    angles: Float[np.ndarray, "T 2"]
-    """Angles [deg]; NaN where hand or forearm have no pose, or the forearm's axes are unknown."""
-    spread: Float[np.ndarray, "T 2"]
+    angles: Float[np.ndarray, "T 3"]
+    """Angles [deg]; NaN where one of two bodies has no pose, or axes are unknown."""
+    spread: Float[np.ndarray, "T 3"]
     """Their standard deviations [deg]; NaN where unknown."""
-    measured: Bool[np.ndarray, "T"]
-    """Frames in which both poses were fitted to points."""
-    constant: Float[np.ndarray, "2"]
+    measured: Bool[np.ndarray, "T 3"]
+    """Frames in which the poses of both bodies were fitted to points."""
+    constant: Float[np.ndarray, "3"]
     """The part of each standard deviation [deg] whose error stays the same in all frames."""
+
+    def median_spreads(self) -> Float[np.ndarray, "3"]:
+        """The median standard deviation [deg] of each angle over its measured frames; NaN without any."""
+        spreads = zip(self.spread.T, self.measured.T, strict=True)
+        return np.concatenate([medians(spread[measured, None]) for spread, measured in spreads])
 
 
 def wrist_figures(take: Take, hand: HandFigures, settings: PageSettings) -> WristFigures:
     """The figures of a wrist whose forearm is among the bodies."""
     angles, number = take.wrist_angles(hand.side, settings.neutral), take.hand_index(hand.side)
     assert angles is not None
-    measured = hand.fitted & (take.body_status[:, take.forearm_index(hand.side)] >= INITIALIZED)
+    forearm, elbow = (
+        np.zeros(len(angles), bool) if body is None else take.body_status[:, body] >= INITIALIZED
+        for body in (take.forearm_index(hand.side), take.elbow_index(hand.side))
+    )
+    fitted = np.column_stack([hand.fitted & forearm, hand.fitted & forearm, elbow & forearm])
     spread = np.full(angles.shape, np.nan) if take.wrist_spread is None else take.wrist_spread[:, number]
-    budget = np.array(
-        take.settings.get("wrist_budget", {}).get(hand.side, np.full((2, len(SOURCES)), np.nan))
-    )
+    budget = np.full((angles.shape[1], len(SOURCES)), np.nan)
+    for row, known in zip(budget, take.settings.get("wrist_budget", {}).get(hand.side, ()), strict=False):
+        row[:] = known
     constant = np.linalg.norm(budget[:, CONSTANT], axis=1)
-    return WristFigures(
-        np.rad2deg(angles), np.rad2deg(spread), measured & np.isfinite(angles[:, 0]), constant
-    )
+    return WristFigures(np.rad2deg(angles), np.rad2deg(spread), fitted & np.isfinite(angles), constant)
 
 
 def joint_errors(settings: Mapping[str, Any], hand: HandFigures) -> Float[np.ndarray, "20 E"]:

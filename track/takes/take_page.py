@@ -33,7 +33,6 @@ from track.takes.take_figures import (
     cycles_of_hands,
     hand_figures,
     joint_errors,
-    medians,
     wrist_figures,
 )
 from track.takes.take_summary import find_suspect_spans, summarize, suspicions, vouch
@@ -235,18 +234,24 @@ def _wrist_section(take: Take, hand: HandFigures, settings: PageSettings) -> Sec
             "Hand and forearm are never tracked together, or the axes of the forearm are unknown: "
             "<code>--neutral</code> gives them, as do landmarks (docs/angles.md).",
         )
+    told = np.flatnonzero(wrist.measured.any(axis=0))
     text = (
         "Angles of the ISB between forearm and third metacarpal (docs/angles.md): flexion counts positive, "
         "extension negative; radial deviation positive, ulnar deviation negative. The band is one standard "
         "deviation (SD) to either side; how well the axes of the forearm are known is not in it. SD constant "
-        "is the part of it that is the same in all frames."
+        "is the part of it that is the same in all frames. "
+    ) + (
+        "Pronation of the forearm is that of the styloids against the epicondyles."
+        if len(told) == len(WRIST_NAMES)
+        else "Pronation of the forearm is not told apart without markers at the elbow."
     )
     table = [["angle [deg]", *RANGE, "median SD", "SD constant", "measured [%]"]]
-    for number, name in enumerate(WRIST_NAMES):
-        of = np.percentile(wrist.angles[wrist.measured, number], list(RANGE.values()))
-        cells = [*of, medians(wrist.spread[wrist.measured])[number], wrist.constant[number]]
+    for number in told.tolist():
+        of = np.percentile(wrist.angles[wrist.measured[:, number], number], list(RANGE.values()))
+        cells = [*of, wrist.median_spreads()[number], wrist.constant[number]]
         shown = [NOTHING if np.isnan(cell) else f"{cell:.1f}" for cell in cells]
-        table.append([name.replace("_", " "), *shown, percent(float(wrist.measured.mean()))])
+        share = percent(float(wrist.measured[:, number].mean()))
+        table.append([WRIST_NAMES[number].replace("_", " "), *shown, share])
     curves = picture((9.6, 2.6), _draw_wrist, take.times, hand, wrist)
     return Section(title, text, pictures=[(curves, _SHADES)], table=table)
 
@@ -257,8 +262,9 @@ def _draw_wrist(
     panel = figure.subplots()
     _prepare(panel, times, hand.status)
     panel.axhline(0.0, color=Paint.LINE, linewidth=0.8)
-    names = [name.split("_", 1)[1].replace("_", " ") for name in WRIST_NAMES]
-    _draw_curves(panel, times, names, wrist.angles, wrist.spread)
+    told = np.flatnonzero(wrist.measured.any(axis=0))
+    names = [WRIST_NAMES[number].split("_", 1)[1].replace("_", " ") for number in told.tolist()]
+    _draw_curves(panel, times, names, wrist.angles[:, told], wrist.spread[:, told])
     panel.set_ylabel("wrist [deg]")
     panel.set_xlabel("time [s]")
 

@@ -25,7 +25,6 @@ from track.takes.take_figures import (
     HandFigures,
     PageSettings,
     joint_errors,
-    medians,
     wrist_figures,
 )
 from track.takes.trials import FIGURES, PERCENTS, Cycles, mean_and_spread, thumb_reach
@@ -205,8 +204,8 @@ def _angle_rows(
         measured_of = {name: hand.measured[:, number] for name, number in joints.items()}
         if take.forearm_index(hand.side) is not None:
             wrist = wrist_figures(take, hand, settings)
-            measured_of |= dict.fromkeys(WRIST_NAMES, wrist.measured)
-            of_wrist = zip(WRIST_NAMES, medians(wrist.spread[wrist.measured]), wrist.constant, strict=True)
+            measured_of |= dict(zip(WRIST_NAMES, wrist.measured.T, strict=True))
+            of_wrist = zip(WRIST_NAMES, wrist.median_spreads(), wrist.constant, strict=True)
             known |= {name: np.array([spread, same, *[np.nan] * 3]) for name, spread, same in of_wrist}
         for convention in get_args(Convention) if hand.fitted.any() else ():
             zero = "" if settings.neutral is None else ", zero in the neutral pose"

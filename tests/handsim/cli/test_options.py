@@ -35,7 +35,7 @@ ELSEWHERE = {
     "export": "out scene", "evaluate": "json threads", "simulate": "out cluster",
     "calibrate": "out live seconds", "track": "out live seconds send labelled", "report": "out",
     "replay": "host port rate loop", "view": "host port out video live",
-    "body": "out markers forearm landmarks", "doctor": "compile send",
+    "body": "out markers forearm elbow landmarks", "doctor": "compile send",
     "detect": "out detector",
     "film": "out format workers detector frames-per-shard openxr frames seed",
     "render": "out merge format workers cluster painter frames-per-shard",

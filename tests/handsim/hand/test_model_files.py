@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
@@ -11,11 +12,17 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from gloves import Take, attach, read_capture
-from gloves.hand_files import write_hand
+from gloves import RigidBody, Take, attach, read_capture
+from gloves.hand_files import first_forearm, write_hand
 from handsim import HandModel, join_qpos, sample_shape
 from handsim.hand.model import KEYPOINT_NAMES, hand_keypoints
-from handsim.hand.model_files import coordinate_names, coordinate_values, hand_osim, hand_urdf
+from handsim.hand.model_files import (
+    coordinate_names,
+    coordinate_values,
+    forearm_names,
+    hand_osim,
+    hand_urdf,
+)
 from handsim.hand.shape import BONE_NAMES, JOINT_NAMES
 
 
@@ -87,6 +94,18 @@ def qpos(fit, rng):
     return join_qpos((1.0 - share) * ends[0] + share * ends[1], position=places, quaternion=quaternions)
 
 
+@pytest.fixture
+def take(fit, qpos, rng):
+    """The hand and its forearm, which slides by a centimeter against it as skin does."""
+    turns = Rotation.from_euler("YZX", np.linspace([0.4, -0.2, 0.1], [-0.6, 0.3, -0.1], FRAMES))
+    forearm = Rotation.from_quat(qpos[:, 3:7], scalar_first=True) * turns
+    places = qpos[:, :3] + np.linspace([0.01, 0.0, 0.0], [0.0, -0.01, 0.005], FRAMES)
+    poses = np.concatenate([places, forearm.as_quat(scalar_first=True)], axis=1)[:, None]
+    places = np.array([[-0.06, 0.02, 0.03], [-0.10, -0.025, 0.028], [-0.14, 0.022, 0.033]])
+    body = RigidBody("arm", ("A", "B", "C"), places, None, fit.side, has_axes=True)
+    return Take.of_poses([fit], qpos[:, None], rate=60.0, bodies=[body], body_poses=poses)
+
+
 def numbers(element, tag):
     return np.array(element.findtext(tag).split(), dtype=float)
 
@@ -151,10 +170,47 @@ def test_bodies_and_markers_are_where_ours_are(fit, qpos):
             np.testing.assert_allclose(markers[f"{fit.side}_{name}"], expected, atol=1e-6)
 
 
+def read_mot(path):
+    """Columns by name [m, rad]."""
+    lines = path.read_text().splitlines()
+    names, *rows = (line.split("\t") for line in lines[lines.index("endheader") + 1 :])
+    columns = dict(zip(names, np.array(rows, dtype=float).T, strict=True))
+    is_length = {name: name.rpartition("_")[2] in {"tx", "ty", "tz", "time"} for name in names}
+    return {name: column if is_length[name] else np.deg2rad(column) for name, column in columns.items()}
+
+
+def test_a_forearm_has_the_wrists_angles_as_coordinates_and_its_own_markers(fit, take, tmp_path):
+    take.export(tmp_path / "angles.mot")
+    take.export(tmp_path / "joints.trc")
+    columns, trc = read_mot(tmp_path / "angles.mot"), read_capture(tmp_path / "joints.trc")
+    angles = take.angles(fit.side, convention="isb")
+    for name in ("wrist_flexion", "wrist_radial_deviation"):
+        np.testing.assert_allclose(columns[f"{fit.side}_{name}"], angles[name], atol=1e-8)
+    root = ET.fromstring(hand_osim(fit.model, (), take.qpos[0, 0], forearm=first_forearm(take, fit.side)))
+    for name in forearm_names(fit.side):
+        (coordinate,) = (one for one in root.iter("Coordinate") if one.get("name") == name)
+        assert numbers(coordinate, "default_value")[0] == pytest.approx(columns[name][0], abs=1e-8)
+    for frame in (0, FRAMES - 1):
+        values = {name: column[frame] for name, column in columns.items() if name != "time"}
+        markers = markers_of(root, bodies_of(root, values))
+        for name, place in zip(trc.names, trc.positions[frame], strict=True):
+            np.testing.assert_allclose(markers[name], place, atol=2e-6)
+        np.testing.assert_array_equal(markers["A"], markers["arm:A"])
+    body = next(one for one in root.iter("Body") if one.get("name") == f"{fit.side}_forearm")
+    moments = numbers(body, "inertia")[:3]
+    assert 0.1 < numbers(body, "mass")[0] < 2.0 and 0.0 < moments.max() < moments.sum() - moments.max()
+
+
+def test_a_forearm_without_axes_is_in_no_model(fit, take, tmp_path):
+    plain = dataclasses.replace(take, bodies=[dataclasses.replace(take.bodies[0], has_axes=False)])
+    plain.export(tmp_path / "angles.mot")
+    assert first_forearm(plain, fit.side) is None
+    assert set(read_mot(tmp_path / "angles.mot")) == {"time", *coordinate_names(fit.side)}
+
+
 def test_coordinates_are_those_of_the_mot(fit, qpos, tmp_path):
     Take.of_poses([fit], qpos[:, None], rate=60.0).export(tmp_path / "angles.mot")
-    lines = (tmp_path / "angles.mot").read_text().splitlines()
-    named = set(lines[lines.index("endheader") + 1].split("\t")) - {"time"}
+    named = set(read_mot(tmp_path / "angles.mot")) - {"time"}
     root = ET.fromstring(hand_osim(fit.model))
     coordinates = {one.get("name"): one for one in root.iter("Coordinate")}
     assert set(coordinates) == named
@@ -247,20 +303,21 @@ def test_opensim_has_bodies_and_markers_where_mujoco_has_them(fit, qpos, tmp_pat
             np.testing.assert_allclose([at[axis] for axis in range(3)], data.site(name).xpos, atol=1e-5)
 
 
-def test_inverse_kinematics_of_opensim_on_our_trc_finds_our_angles(fit, qpos, tmp_path, monkeypatch):
+def test_inverse_kinematics_of_opensim_on_our_trc_finds_our_angles(fit, qpos, take, tmp_path, monkeypatch):
     """The program of docs/motion_files.md, as it stands there."""
     opensim = pytest.importorskip("opensim")
     monkeypatch.chdir(tmp_path)
     qpos = qpos.copy()
     qpos[3:5] = np.nan  # the hand is lost for a while, in which files hold its pose
-    take = Take.of_poses([fit], qpos[:, None], rate=60.0)
+    take = Take.of_poses([fit], qpos[:, None], rate=60.0, bodies=take.bodies, body_poses=take.body_poses)
     take.export("joints.trc")
     take.export("angles.mot")
-    write_hand(tmp_path / "hand.osim", fit, start=qpos[0])
+    write_hand(tmp_path / "hand.osim", fit, start=qpos[0], forearm=first_forearm(take, fit.side))
     assert opensim.Storage("angles.mot").getSize() == FRAMES
     exec(PAGE.read_text("utf-8").split("```py\n")[1].split("```")[0], {})
     found, exported = (opensim.TimeSeriesTable(f"{name}.mot") for name in ("found", "angles"))
-    for name in coordinate_names(fit.side):
+    for name in (*coordinate_names(fit.side), *forearm_names(fit.side)):
         pair = [np.array(table.getDependentColumn(name).to_numpy()) for table in (found, exported)]
         assert len(pair[0]) == FRAMES
-        np.testing.assert_allclose(*pair, atol=0.05 if "_wrist_t" not in name else 1e-4)  # [deg], [m]
+        is_length = name.rpartition("_")[2] in {"tx", "ty", "tz"}
+        np.testing.assert_allclose(*pair, atol=1e-4 if is_length else 0.05)  # [m], [deg]

@@ -11,10 +11,12 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation, Slerp
 
-from gloves import Take, attach, load_layout
+from gloves import RigidBody, Take, attach, load_layout
 from gloves.takes.take import posed_motion
 from handsim import HandModel, HandSimError, join_qpos
+from handsim.motion_files.motion import write_bvh
 from handsim.motion_files.scenes import write_glb, write_usd
+from handsim.space.transforms import quaternion_matrix
 
 TYPES = {5121: "<u1", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
@@ -138,6 +140,33 @@ def test_things_move_as_ours(glb, motion):
         "mesh" in glb.json["nodes"][glb.named("pen")]
         and "mesh" not in glb.json["nodes"][glb.named("my wand")]
     )
+
+
+@pytest.mark.parametrize("side", ["right", "left"])
+def test_a_forearm_has_skin_from_the_wrist_to_its_farthest_marker(motion, tmp_path, side):
+    places = np.array([[-0.05, 0.0, 0.03], [-0.2, 0.02, 0.03]])
+    body = RigidBody("arm", ("A", "B"), places, None, side, has_axes=True)
+    poses = motion.qpos[:, [motion.hand_index(side)], :7].copy()
+    poses[:, 0, :3] += quaternion_matrix(poses[:, 0, 3:]) @ [0.0, 0.0, 0.03]  # a bar above the wrist
+    armed = Take.of_poses(motion.hands, motion.qpos, rate=60.0, bodies=[body], body_poses=poses)
+    thing = posed_motion(armed).bodies[0]
+    mesh = trimesh.Trimesh(thing.shape.vertices, thing.shape.faces, process=False)
+    skin = armed.hands[armed.hand_index(side)].model.surface.vertices
+    begin = mesh.vertices[mesh.vertices[:, 0] > -0.1]
+    below = np.linalg.norm(begin[:, None] + [0.0, 0.0, 0.03] - skin, axis=2)
+    assert below.min(axis=1).max() < 1e-9, "the skin is that of the hand, not of the bar"
+    assert mesh.is_watertight and mesh.volume > 0 and mesh.bounds[0, 0] == -0.2
+    widest = np.ptp(mesh.vertices, axis=0)[1] / motion.hands[0].shape.breadth
+    assert 0.6 < widest < 1.0 and abs(mesh.bounds[1, 0]) < 0.02, "it ends at the wrist, which is narrower"
+    write_glb(tmp_path / "arm.glb", posed_motion(armed))
+    glb = Glb(tmp_path / "arm.glb")
+    node = glb.json["nodes"][glb.named("arm")]
+    (part,) = glb.json["meshes"][node["mesh"]]["primitives"]
+    assert glb.json["materials"][part["material"]]["name"] == "skin"
+    write_bvh(tmp_path / "arm.bvh", posed_motion(armed))
+    _, _, joint = (tmp_path / "arm.bvh").read_text().partition("JOINT arm")
+    end = np.array(joint.split("End Site")[1].split("OFFSET")[1].split()[:3], dtype=float)
+    np.testing.assert_allclose(end, UP @ [-20.0, 0.0, 0.0], atol=1e-6)
 
 
 def test_faces_look_outwards_once_and_normals_are_of_length_one(glb, motion):

@@ -485,6 +485,8 @@ def test_captures_of_anything_else_are_told(rng):
         learn_body(capture_of(fingers), "wand")
     with pytest.raises(CalibrationError, match="a capture of 0 points per frame"):
         learn_body(Capture(("a",), np.full((5, 1, 3), np.nan), 120.0), "wand")
+    with pytest.raises(CalibrationError, match="2 markers of a body, expected at least 3"):
+        learn_body(capture_of(hands), "wand", ("a", "b"))
     line = np.linspace(0, 0.1, 4)[:, None] * np.array([1.0, 0.0, 0.0]) + rng.normal(0, 1e-5, (9, 4, 3))
     with pytest.raises(CalibrationError, match="wand: its markers lie on one line"):
         learn_body(capture_of(line), "wand")

@@ -113,6 +113,24 @@ def test_a_start_is_corrected_from_a_capture_with_its_names():
     assert off.max() < 0.01, dict(zip(found.names, (1e3 * off).round(1), strict=True))
 
 
+def test_columns_on_a_forearm_are_offered_as_a_body():
+    """The elbow moves against them, and a wand is too far; two columns are no body."""
+    capture, truth = lab_trial("calibration", 400, 3)
+    wrist = np.nanmean(capture.positions[:, [name in truth for name in capture.names]], axis=1)
+    places = np.array([[-0.12, 0.0, 0.03], [-0.15, 0.02, 0.03], [-0.17, -0.02, 0.03]])
+    arm = wrist[:, None] + places
+    designed = in_order_of(truth, truth)
+    for count, expected in ((3, "Arm0 Arm1 Arm2"), (2, None)):
+        names = tuple(f"Arm{number}" for number in range(count))
+        both = np.concatenate([capture.positions, arm[:, :count]], axis=1)
+        found = learn_glove(Capture((*capture.names, *names), both, 120.0), start=designed)
+        offered = [sentence for sentence in found.left_out if "--forearm right" in sentence]
+        assert len(offered) == (expected is not None)
+        assert all(f"--markers {expected} --forearm" in sentence for sentence in offered)
+    own = capture.positions[:, [capture.names.index(name) for name in designed.names]]
+    assert learn_glove(Capture(designed.names, own, 120.0), start=designed).left_out == ()
+
+
 @pytest.mark.parametrize(
     "pair", [("IndexMCP", "MiddlePIP"), ("IndexPIP", "ThumbTip"), ("RingPIP", "PinkyPIP")]
 )

@@ -25,7 +25,7 @@ from handsim.hand.shape import BONE_NAMES, DIGITS, JOINT_NAMES
 from handsim.motion_files.motion import OPENXR_JOINTS
 from handsim.space.transforms import rotation_quaternions
 from tests.sentences import error_names
-from track import Status, StreamedFrame, TrackedFrame, TrackedHand
+from track import RigidTemplate, Status, StreamedFrame, TrackedBody, TrackedFrame, TrackedHand
 from track.output.lab_streaming import channels_of, sample_of
 from track.output.live_message import (
     FORMATS,
@@ -244,6 +244,49 @@ def test_fingers_without_markers_are_told():
     sample = dict(zip(channels, sample_of(message), strict=True))
     assert [sample[f"right_{digit}_status"] for digit in DIGITS] == [2.0, 0.0, 2.0, 2.0, 2.0]
     assert sample["right_seen"] == pytest.approx(right["seen"], abs=1e-3)
+
+
+@pytest.mark.parametrize("lost", [(), ("elbow",), ("arm", "elbow")])
+def test_wrists_with_a_forearm_have_angles(lost):
+    places = np.array([[-0.06, 0.02, 0.03], [-0.10, -0.025, 0.028], [-0.14, 0.022, 0.033]])
+    arm = RigidTemplate("arm", ("A", "B", "C"), places, None, "right", has_axes=True)
+    elbow = RigidTemplate("elbow", ("D", "E", "F"), places, elbow="right")
+    fits = [nominal_fit("dense19", "M", side) for side in ("right", "left")]
+    turn = Rotation.from_euler("YZ", [0.3, -0.2]).as_quat(scalar_first=True)  # flexion, ulnar deviation
+    pronated = Rotation.from_euler("x", 1.1).as_quat(scalar_first=True)
+    qpos = join_qpos(np.zeros((1, 20)), quaternion=turn)[0]
+    nothing = np.zeros((19, 3)), np.zeros(0, dtype=int)
+    hands = tuple(TrackedHand(fit.side, Status.TRACKED, qpos, 0.001, *nothing) for fit in fits)
+    bodies = tuple(
+        TrackedBody(name, Status.TRACKED, np.zeros(3), np.full(4, np.nan) if name in lost else pose, 0.001)
+        for name, pose in (("arm", [1.0, 0.0, 0.0, 0.0]), ("elbow", pronated))
+    )
+    frame, nobody = StreamedFrame(0, 0.0, np.zeros((0, 3)), nothing[1]), nothing[1]
+    tracked = TrackedFrame(0.0, hands, nobody, np.zeros(0), bodies)
+    one = MessageEncoder(fits, [arm, elbow]).encode(frame, tracked)
+    assert one.header.wrist_angles == ("wrist_flexion", "wrist_radial_deviation", "forearm_pronation")
+    expected = np.array([np.nan if "arm" in lost else 0.3, np.nan if "arm" in lost else -0.2, 1.1])
+    expected[2] = np.nan if lost else 1.1
+    np.testing.assert_allclose(one.hands[0].wrist_angles, expected, atol=1e-12)
+    assert np.isnan(one.hands[1].wrist_angles).all(), "the left hand has no forearm"
+    sent = frame_document(one, Content(axes="unity"))["hands"][0]["wrist_angles"]
+    assert sent == [None if np.isnan(angle) else round(angle, 6) for angle in expected]
+    assert header_document(one.header)["wrist_angles"] == list(one.header.wrist_angles)
+    got = {part.address: list(part.params) for part in OscBundle(osc_format().frame(one)[0])}
+    assert ("/handsim/right/wrist_angles" in got) == ("arm" not in lost)
+    np.testing.assert_allclose(got.get("/handsim/right/wrist_angles", expected), expected, atol=1e-6)
+    assert "/handsim/left/wrist_angles" not in got
+    labels = [label for label, _, _ in channels_of(one.header)]
+    sample = dict(zip(labels, sample_of(one), strict=True))
+    np.testing.assert_allclose([sample[f"right_{name}"] for name in one.header.wrist_angles], expected)
+
+
+def test_without_axes_or_an_elbow_fewer_angles_are_named():
+    places = np.array([[-0.06, 0.02, 0.03], [-0.10, -0.025, 0.028], [-0.14, 0.022, 0.033]])
+    arm = RigidTemplate("arm", ("A", "B", "C"), places, None, "right", has_axes=True)
+    assert MessageEncoder([], [arm]).header.wrist_angles == ("wrist_flexion", "wrist_radial_deviation")
+    plain = MessageEncoder([], [dataclasses.replace(arm, has_axes=False)]).header
+    assert plain.wrist_angles == () and "wrist_angles" not in header_document(plain)
 
 
 def test_hands_that_are_not_measured_are_told_everywhere(message):
