@@ -135,9 +135,9 @@ class TrackerSetup:
 
     @property
     def start(self) -> tuple[GloveFit, ...]:
-        """The hands that a calibration begins with, of measured ones those of mean proportions.
+        """The hands that a calibration begins with: in place of measured ones those of mean proportions.
 
-        Their proportions are of the same motion, so that what people are like would count twice.
+        Their proportions were measured in the same motion with the prior of people, which would count twice.
         """
         if not self.is_auto:
             return self.user.hands

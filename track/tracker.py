@@ -115,7 +115,7 @@ class Tracker:
         self._last_sound = np.zeros(len(self.hands))  # [s] time at which each track was last not doubted
 
     def warm_up(self) -> None:
-        """Load all kernels and run the labeler once, so that the first frames of a stream need not wait.
+        """Load all kernels and let the labeler label a few clouds, so that streams need not wait.
 
         The state of this tracker does not change.
         """
@@ -137,8 +137,8 @@ class Tracker:
 
         Args:
             user: The hands, in the same order.
-            keep: Share of the learned marker biases to keep, from 0 to 1. With more than 0 the call is a step
-                towards another size, which takes a tenth of the time.
+            keep: Share of the learned marker biases to keep, from 0 to 1. More than 0 marks a step of a
+                gradual change, which takes a tenth of the time; 0 makes the size final.
         """
         self.user, self.hands = user, user.hands
         for state, hand in zip(self._states, self.hands, strict=True):
@@ -380,6 +380,6 @@ def _tracked_hand(
     markers, filled = np.where(is_missing[:, None], state.positions, seen), np.flatnonzero(is_missing)
     spreads = state.pose_spread(frame.time)
     # A predicted or newly initialized pose has no known velocity.
-    known = 1.0 if outcome.status is Status.TRACKED else np.nan
-    qpos, velocity = state.qpos.copy(), known * state.velocity
+    velocity_factor = 1.0 if outcome.status is Status.TRACKED else np.nan
+    qpos, velocity = state.qpos.copy(), velocity_factor * state.velocity
     return TrackedHand(side, outcome.status, qpos, outcome.rms, markers, filled, spreads, velocity)

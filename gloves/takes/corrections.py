@@ -21,7 +21,7 @@ from handsim.errors import CaptureError, HandSimError, choices, errors_of
 from handsim.files.inputs import check_keys, numbers, quoted, read_toml, shown, tables_of, text_of, written
 from handsim.files.outputs import write_text, writing
 
-SUFFIX: Final = ".corrections.toml"
+CORRECTIONS_SUFFIX: Final = ".corrections.toml"
 """Ending of the names of correction files."""
 NO_MARKER: Final = "none"
 """The label of a point that is no marker; labels of markers contain a colon."""
@@ -66,7 +66,7 @@ class Pins(NamedTuple):
 
 def corrections_path(take: Path) -> Path:
     """The file of a take's corrections: `tracked.corrections.toml` beside `tracked.npz`."""
-    return take.with_name(f"{take.stem}{SUFFIX}")
+    return take.with_name(f"{take.stem}{CORRECTIONS_SUFFIX}")
 
 
 def load_corrections(path: Path) -> tuple[Correction, ...]:

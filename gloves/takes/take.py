@@ -67,7 +67,7 @@ from handsim.hand.shape import JOINT_NAMES, NUM_JOINTS, NUM_KEYPOINTS, Side
 from handsim.motion_files.motion import Motion, PosedBody, PosedHand
 from handsim.space.transforms import FORWARD, ForwardAxis, UpAxis, facing, quaternion_matrix, turned_poses
 
-SUFFIX: Final = ".truth.npz"
+TRUTH_SUFFIX: Final = ".truth.npz"
 """Ending of the name of a simulated take that lies beside its capture."""
 STATUSES: Final = tuple(map(str, Status))
 """Words of the status numbers, as files hold them; only a lost hand has no pose."""
@@ -427,7 +427,7 @@ class Take:
     def _neutral_frames(
         self, side: Side, between: tuple[float, float] | Take
     ) -> tuple[Take, Bool[np.ndarray, "T"]]:
-        """The take of a neutral pose, and its frames in which the hand is tracked then."""
+        """The take that shows the neutral pose, this or the given one, and its frames with a tracked hand."""
         if isinstance(between, Take):
             end = float(np.nextafter(between.times[-1], np.inf))  # after the start also of one frame
             return between._neutral_frames(side, (float(between.times[0]), end))
@@ -500,7 +500,7 @@ class Take:
         return next((one.hands for one in self.former if frame < one.stop), self.hands)
 
     def worn_at(self, times: Float[np.ndarray, "F"]) -> tuple[tuple[GloveFit, ...], list[FormerHands]]:
-        """The last hands at other times [s] than the take's, and the earlier ones, by rows of these times."""
+        """The last hands for other times [s] than the take's, and the former ones, with stops in these."""
         stops = np.searchsorted(times, [self.times[one.stop] for one in self.former]).tolist()
         worn = [one._replace(stop=stop) for one, stop in zip(self.former, stops, strict=True)]
         last = next((one.hands for one in worn if one.stop >= len(times)), self.hands)

@@ -41,13 +41,12 @@ def body(
             lateral and the medial epicondyle.
     """
     from gloves.captures.formats import read_capture
-    from gloves.takes.take import SUFFIX, load_take
+    from gloves.takes.take import TRUTH_SUFFIX, load_take
     from track.bodies.forearm import limb_of_landmarks
-    from track.bodies.rigid_body import SUFFIX as TOML
-    from track.bodies.rigid_body import RigidTemplate, learn_body, save_body
+    from track.bodies.rigid_body import BODY_SUFFIX, RigidTemplate, learn_body, save_body
 
-    check_outputs([source], [out], TOML)
-    if source.name.endswith(SUFFIX):
+    check_outputs([source], [out], BODY_SUFFIX)
+    if source.name.endswith(TRUTH_SUFFIX):
         if markers or forearm or elbow or landmarks:
             raise ArgumentError(f"{source}: the object of a take has no columns, expected a labeled capture")
         bodies = load_take(source).bodies

@@ -95,10 +95,12 @@ def check_live(live: str | None, seconds: float | None) -> None:
 def check_take_file(out: Path, *, live: bool) -> None:
     """Refuse an --out that is no .npz, or with --live one whose take has corrections, which would be lost."""
     from gloves.takes.corrections import corrections_path
-    from gloves.takes.take import SUFFIX
+    from gloves.takes.take import TRUTH_SUFFIX
 
-    if out.suffix.lower() != ".npz" or out.name.endswith(SUFFIX):
-        raise ArgumentError(f"--out is {out}, expected a file name that ends in .npz and not in {SUFFIX}")
+    if out.suffix.lower() != ".npz" or out.name.endswith(TRUTH_SUFFIX):
+        raise ArgumentError(
+            f"--out is {out}, expected a file name that ends in .npz and not in {TRUTH_SUFFIX}"
+        )
     corrections = corrections_path(out)
     if live and corrections.exists():
         raise ArgumentError(

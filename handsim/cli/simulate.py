@@ -10,7 +10,7 @@ import tyro
 
 from gloves.captures.capture import UNLABELED, Capture, run_lengths
 from gloves.captures.formats import WRITABLE, check_suffix, write_capture
-from gloves.takes.take import SUFFIX, load_take
+from gloves.takes.take import TRUTH_SUFFIX, load_take
 from handsim.app.messages import named_steps, print_line, print_table
 from handsim.app.workers import chosen_workers, run_jobs
 from handsim.errors import ArgumentError
@@ -37,7 +37,7 @@ def simulate(
         cluster: Where else to simulate: tcp://host:port of a Dask scheduler, its file (.json), or local;
             docs/cluster.md.
     """
-    truth = out.with_suffix(SUFFIX)
+    truth = out.with_suffix(TRUTH_SUFFIX)
     check_suffix(out, WRITABLE)
     check_outputs((str(settings.glove), str(settings.rig), *like), (out, truth))
     num_frames = settings.num_frames or 0
@@ -74,5 +74,5 @@ def _simulate_into(out: Path, settings: SimulateSettings, number: int) -> int:
     names = tuple(f"{UNLABELED}{column + 1}" for column in range(take.point_list.num_columns))
     with written_together():  # a capture without its truth is no use
         write_capture(out, Capture(names, take.points, take.rate))
-        take.save(out.with_suffix(SUFFIX))
+        take.save(out.with_suffix(TRUTH_SUFFIX))
     return number

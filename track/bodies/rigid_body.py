@@ -67,7 +67,7 @@ _RADIUS, _MOST_ACCELERATION = 0.002, 30.0  # [m], [m/s^2]: search radius with kn
 _CONFIDENT_RADIUS: Final = 0.03  # [m] largest search radius in which three markers suffice
 _MOST_CANDIDATE_MOTION: Final = 0.02  # [m] largest motion per frame of an unconfirmed candidate
 _MOST_SEARCHED_POINTS: Final = 250  # largest number of points in a search: 30 ms, cubic in it
-SUFFIX: Final = ".toml"
+BODY_SUFFIX: Final = ".toml"
 _Limb = tuple[Side | None, Side | None]
 """The hands whose forearm and whose elbow a body is."""
 _EXPECTED: Final = "RigidTemplates, names of handsim's objects, or paths of .toml files"
@@ -425,7 +425,7 @@ def load_body(name_or_path: AnyBody) -> RigidTemplate:
     path = Path(name_or_path)
     if str(name_or_path) in object_names():
         return RigidTemplate.of(named_object(str(name_or_path)))
-    if path.suffix.lower() != SUFFIX:
+    if path.suffix.lower() != BODY_SUFFIX:
         ours = [name for name in object_names() if len(named_object(name).markers) >= FEWEST]
         unknown = choices(str(name_or_path), ours, noun="body")
         raise ArgumentError(f"{unknown}, or the path of a .toml file")

@@ -58,10 +58,14 @@ HEIGHT_SPREAD: Final = 0.0005  # [m] the same of its height over the design's
 CONTACT_SPREAD: Final = 0.0007
 """Standard deviation of a pad's compression around `PAD_COMPRESSION` [m]; (noise / spread)^2 is lambda_2."""
 _LIMIT_SPREAD: Final = np.deg2rad(2.0)  # [rad] standard deviation of an angle beyond its range
-_GESTURES: Final = 4.0  # The pose prior counts this many times per capture, as its frames are much alike.
+# The frames of a capture are much alike: together they count as this many gestures in the pose prior.
+_GESTURES: Final = 4.0
 GESTURES_OF_USER: Final = np.repeat([1.0, _GESTURES], [4, 16])
-"""Number of gestures, by joint angle, whose mean varies from person to person like the mean of a capture."""
-_LEAST_MOTION: Final = np.deg2rad(1.0)  # of a digit that flesh follows
+"""Number of independent gestures, by joint angle, whose mean varies as much as the mean of a capture varies
+between people."""
+_LEAST_MOTION: Final = np.deg2rad(
+    1.0
+)  # least RMS motion of a digit by which its flesh patterns are normalized
 RELINEARIZE: Final = 0.005  # The skin's jacobian is renewed after such a change (log lengths, [rad], [m]).
 _DIFFERENCE_STEP: Final = 1e-5  # of finite differences
 PAD_COMPRESSION: Final = 0.001
@@ -71,7 +75,9 @@ _MOST_TOUCH_SPEED: Final = 0.02  # [m/s] largest speed of the finger relative to
 _SHORTEST_HOLD: Final = 0.06  # [s] shortest touch
 _MOST_TOUCHES_PER_FINGER: Final = 10
 _SPEED_WINDOW: Final = 0.025  # [s] before and after a frame, in which speed is measured
-_GAP_SCALE: Final = 0.002  # [m] from its finger's usual gap a touch has a quarter of its weight
+_GAP_SCALE: Final = (
+    0.002  # [m] A touch whose gap differs this much from the usual has a quarter of the weight.
+)
 _PAD_DEPTH: Final = 0.006  # [m] depth of a pad's middle below the skin
 _SLIDE_ROUNDS: Final = 3
 _GAP_QUANTILE: Final = 0.35  # quantile of a finger's gaps that counts as the usual one
@@ -624,30 +630,32 @@ def error_covariance(problem: Problem, estimate: Estimate, fit: Fit) -> Float[np
     by_pose, by_shared, residuals, _ = jacobians = problem.weighted_jacobians(estimate, fit)
     equations = problem.normal_equations(estimate, fit, jacobians)
     reduced, solved = eliminate_poses(equations, 0.0)
-    inverse, answers = np.linalg.inv(reduced[:, :-1]), solved[..., :-1]
+    inverse, pose_derivatives = np.linalg.inv(reduced[:, :-1]), solved[..., :-1]
     flat = by_shared.reshape(-1, len(reduced))
     share = (problem.data_noise / problem.noise) ** 2
     errors = share * reduced[:, :-1] + (1.0 - share) * (equations.shared - flat.T @ flat)
-    turns = answers[:, 6:].sum(axis=0).T @ problem.pose_precision / np.sqrt(GESTURES_OF_USER)
+    turns = pose_derivatives[:, 6:].sum(axis=0).T @ problem.pose_precision / np.sqrt(GESTURES_OF_USER)
     errors += turns @ resting_prior().covariance @ turns.T
-    # Of flesh of a size, the fit leaves a part in the residuals; by that the size is estimated.
+    # The fit absorbs part of the flesh's motion. What the residuals show of it, over what motion of unit size
+    # would leave in them, is its size squared.
     patterns = _flesh_patterns(problem, estimate, fit)
     bases = np.stack([np.linalg.qr(one.reshape(-1, one.shape[2]))[0] for one in patterns])
-    bases, forces, left = bases.reshape(patterns.shape), [], 0.0
+    bases, forces, unit_residual = bases.reshape(patterns.shape), [], 0.0
     for marker, moved in enumerate(patterns):
         rows = slice(3 * marker, 3 * marker + 3)
         poses = by_pose[:, rows].swapaxes(1, 2) @ moved
         force = np.tensordot(by_shared[:, rows], moved, ((0, 1), (0, 1)))
-        forces.append(force - np.tensordot(answers, poses, ((0, 1), (0, 1))))
+        forces.append(force - np.tensordot(pose_derivatives, poses, ((0, 1), (0, 1))))
         shared = inverse @ forces[-1]
-        rest = by_pose @ (answers @ shared - np.linalg.solve(equations.pose, poses)) - by_shared @ shared
+        moved_poses = pose_derivatives @ shared - np.linalg.solve(equations.pose, poses)
+        rest = by_pose @ moved_poses - by_shared @ shared
         rest[:, rows] += moved
         by_marker = rest[:, :-1].reshape(len(rest), len(patterns), 3, -1)
-        left += np.square(np.einsum("mfkb,fmkc->mbc", bases, by_marker, optimize=True)).sum()
+        unit_residual += np.square(np.einsum("mfkb,fmkc->mbc", bases, by_marker, optimize=True)).sum()
     seen = residuals[:, :-1].reshape(len(residuals), -1, 3)
     found = np.square(np.einsum("mfkb,fmk->mb", bases, seen, optimize=True)).sum()
     of_noise = share * bases[:, 0, 0].size * (1.0 - (by_pose[:, 0].size + len(reduced)) / seen.size)
-    flesh = max(found - of_noise, 0.0) / left
+    flesh = max(found - of_noise, 0.0) / unit_residual
     across = np.concatenate(forces, axis=1)
     return np.asarray(inverse @ (errors + flesh * across @ across.T) @ inverse)
 

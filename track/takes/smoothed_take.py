@@ -233,8 +233,8 @@ class _SmoothedHand:
     def _follow(self, windows: Sequence[_Window]) -> None:
         """Solve the poses, and again with larger accelerations while they do not follow the hand.
 
-        Poses of single frames leave the noise of the markers but for the share that they follow. Smoothed
-        ones that leave more lag behind; what they leave would count as noise, and they would lag the more.
+        Residuals of poses of single frames are the markers' noise, less the share that a pose follows.
+        Smoothed poses with larger residuals lag behind the hand; their lag would count as noise, and grow.
         """
         single, left = self.qpos.copy(), np.nanmean(self.rms() ** 2)
         for turn in range(_TIMES_QUICKER + 1):

@@ -19,7 +19,7 @@ from gloves.fit import nominal_fit
 from gloves.takes.archives import SCHEMA
 from gloves.takes.motion_formats import MOTION_FORMATS
 from gloves.takes.points import FRAMES as COLUMNS_OF_FRAMES
-from gloves.takes.take import INITIALIZED, LOST, STATUSES, SUFFIX, TRACKED, usual_rate
+from gloves.takes.take import INITIALIZED, LOST, STATUSES, TRACKED, TRUTH_SUFFIX, usual_rate
 from handsim import HandModel, join_qpos, sample_shape
 from handsim.errors import ArgumentError, CaptureError, HandSimWarning
 from handsim.hand.model import KEYPOINT_NAMES, hand_keypoints, is_steady
@@ -397,7 +397,7 @@ def test_foreign_files_are_refused_in_a_sentence(tmp_path):
         "zip that is none": b"PK\x03\x04" + 60 * b"\x00",
         "pickle": b"\x80\x04K\x01.",
     }
-    path = tmp_path / f"foreign{SUFFIX}"
+    path = tmp_path / f"foreign{TRUTH_SUFFIX}"
     assert_refused(path, "No such file")
     for content in contents.values():
         path.write_bytes(content)
@@ -415,7 +415,7 @@ def test_foreign_files_are_refused_in_a_sentence(tmp_path):
 
 
 def test_another_schema_is_named(take, tmp_path):
-    path = tmp_path / f"take{SUFFIX}"
+    path = tmp_path / f"take{TRUTH_SUFFIX}"
     take.save(path)
     header = header_of(path)
     altered(path, header=np.array(json.dumps(header | {"schema": SCHEMA + 1})))
@@ -443,7 +443,7 @@ def test_files_of_schema_3_are_read(name, tmp_path, recwarn):
 
 
 def test_damage_is_told_wherever_it_is(take, tmp_path, rng):
-    path = tmp_path / f"take{SUFFIX}"
+    path = tmp_path / f"take{TRUTH_SUFFIX}"
     take.save(path)
     whole = path.read_bytes()
     for place in rng.integers(len(whole) - 1, size=60):  # cut
@@ -512,7 +512,7 @@ class Trap:
 
 
 def test_nothing_is_ever_unpickled(take, tmp_path):
-    path = tmp_path / f"take{SUFFIX}"
+    path = tmp_path / f"take{TRUTH_SUFFIX}"
     take.save(path)
     with np.load(path) as stored:
         arrays = {name: stored[name] for name in stored.files}
