@@ -37,6 +37,8 @@ from render.session import render_take
 from render.subject import subject_of_take
 from render.viewpoints import ViewConfig
 
+_AnyCamera = Camera | str | Path | None
+_AnyDetector = HandDetector | StoredHands | str | Path | None
 RECORD, VIDEO, PAGE = "film.json", "film.mp4", "film.html"
 """Files beside the pictures: the registration, the video with the hands drawn over it, and the page."""
 
@@ -73,12 +75,7 @@ def register_camera(
 
 
 def _registered(
-    take: Take,
-    film: Film,
-    camera: Camera | str | Path | None,
-    detector: HandDetector | StoredHands | str | Path | None,
-    progress: Progress,
-    on_step: OnStep,
+    take: Take, film: Film, camera: _AnyCamera, detector: _AnyDetector, progress: Progress, on_step: OnStep
 ) -> Registration:
     """The registration of a video that is open to a take that has hands."""
     given = _given(camera, film.size)
@@ -98,7 +95,7 @@ def _taken(take: Take | str | Path) -> Take:
     return taken
 
 
-def _given(camera: Camera | str | Path | None, size: tuple[int, int]) -> Camera | None:
+def _given(camera: _AnyCamera, size: tuple[int, int]) -> Camera | None:
     """The camera whose lens the video's has; of the cameras of a file, the one with its size."""
     if camera is None:
         return None

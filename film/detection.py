@@ -95,7 +95,7 @@ def find_hands(
     return found
 
 
-class _SearchedPicture(NamedTuple):
+class _Searched(NamedTuple):
     """A picture that was searched."""
 
     record: dict[str, Any]  # of the image in COCO
@@ -162,7 +162,7 @@ def detect_hands(
 
 def _in_photos(
     paths: Sequence[Path], finder: HandDetector | MediaPipeHands, progress: Progress
-) -> Iterator[_SearchedPicture]:
+) -> Iterator[_Searched]:
     """The photographs of files and folders."""
     files = [file for path in paths for file in (photo_files(path)[0] if path.is_dir() else (path,))]
     files = [file for file in files if not is_map(file)]
@@ -171,20 +171,18 @@ def _in_photos(
     for number, file in enumerate(files):
         picture = read_photograph(file)
         record = {"id": number, "file_name": file, "width": picture.shape[1], "height": picture.shape[0]}
-        yield _SearchedPicture(record, finder.detect(picture), functools.partial(read_photograph, file))
+        yield _Searched(record, finder.detect(picture), functools.partial(read_photograph, file))
         progress(number + 1, len(files))
 
 
-def _in_video(
-    path: Path, finder: HandDetector | MediaPipeHands, progress: Progress
-) -> Iterator[_SearchedPicture]:
+def _in_video(path: Path, finder: HandDetector | MediaPipeHands, progress: Progress) -> Iterator[_Searched]:
     """The frames of a video that were searched."""
     film = Film(path)
     for number, frame in enumerate(find_hands(film, finder, progress)):
         if frame.hands is not None:
             record = {"id": number, "file_name": path, "time": frame.time}
             record |= dict(zip(("width", "height"), film.size, strict=True))
-            yield _SearchedPicture(record, frame.hands, functools.partial(film.picture, number))
+            yield _Searched(record, frame.hands, functools.partial(film.picture, number))
 
 
 def _annotation(image: dict[str, Any], hand: FoundHand) -> dict[str, Any]:

@@ -43,8 +43,6 @@ _STEP: Final = 1e-6  # step of the finite differences [rad]
 class ThumbContact:
     """Relative position of the last bones of thumb and one finger in each frame."""
 
-    finger: str
-    """Which finger."""
     overlap: Float[np.ndarray, "T"]
     """How deep the two capsules overlap [m]; negative: the gap between them."""
     facing: Float[np.ndarray, "T 2"]
@@ -66,7 +64,7 @@ def _contact(capsules: Capsules, frames: NDArray[np.float64], finger: str) -> Th
     distance = np.linalg.norm(direction, axis=1)
     direction /= distance[:, None]
     facing = (frames[:, bones][..., :3, 2] * direction[:, None]).sum(axis=2) * [-1.0, 1.0]
-    return ThumbContact(finger, radii.sum() - distance, facing)
+    return ThumbContact(radii.sum() - distance, facing)
 
 
 def touching_angles(

@@ -92,7 +92,7 @@ def test_a_recording_that_was_cut_off_is_a_capture(tmp_path):
     part = tmp_path / "live.npz.part"
     take().save(tmp_path / "live.npz")
     (tmp_path / "live.npz").rename(part)
-    assert measure_room(part) == measure_room(take())
+    assert repr(measure_room(part)) == repr(unlabeled())
 
 
 def test_what_a_short_labeled_capture_does_not_tell_is_said():
