@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from film.config import USUAL
+from film.config import FILM_DEFAULTS
 from film.detection import find_hands, resolve_detector
 from film.detector import HandDetector
 from film.outlines import poses_at, shutter_times
@@ -37,6 +37,8 @@ from render.session import render_take
 from render.subject import subject_of_take
 from render.viewpoints import ViewConfig
 
+_AnyCamera = Camera | str | Path | None
+_AnyDetector = HandDetector | StoredHands | str | Path | None
 RECORD, VIDEO, PAGE = "film.json", "film.mp4", "film.html"
 """Files beside the pictures: the registration, the video with the hands drawn over it, and the page."""
 
@@ -69,13 +71,19 @@ def register_camera(
     Raises:
         HandSimError: The take or the video cannot be read, or the hands do not move as those of the take.
     """
-    taken, film = _taken(take), Film(video)
+    return _registered(_taken(take), Film(video), camera, detector, progress, on_step)
+
+
+def _registered(
+    take: Take, film: Film, camera: _AnyCamera, detector: _AnyDetector, progress: Progress, on_step: OnStep
+) -> Registration:
+    """The registration of a video that is open to a take that has hands."""
     given = _given(camera, film.size)
     on_step("finding hands")
     found = find_hands(film, resolve_detector(detector), progress)
     on_step("fitting the camera")
     return register(
-        taken, found, film.size, given, lambda: (picture for _, picture in film.frames()), progress
+        take, found, film.size, given, lambda: (picture for _, picture in film.frames()), progress
     )
 
 
@@ -87,7 +95,7 @@ def _taken(take: Take | str | Path) -> Take:
     return taken
 
 
-def _given(camera: Camera | str | Path | None, size: tuple[int, int]) -> Camera | None:
+def _given(camera: _AnyCamera, size: tuple[int, int]) -> Camera | None:
     """The camera whose lens the video's has; of the cameras of a file, the one with its size."""
     if camera is None:
         return None
@@ -141,11 +149,9 @@ def annotate_film(
     Raises:
         HandSimError: As in `register_camera` and `render_take`, or no frame fits.
     """
-    config = FrameConfig.of(USUAL if config is None else config, settings)
+    config = FrameConfig.of(FILM_DEFAULTS if config is None else config, settings)
     taken, film = _taken(take), Film(video)
-    registration = register_camera(
-        taken, video, camera=camera, detector=detector, progress=progress, on_step=on_step
-    )
+    registration = _registered(taken, film, camera, detector, progress, on_step)
     posed = filmed_take(taken, registration)
     if not np.isfinite(posed.qpos[..., 0]).any():
         told = "; ".join(registration.left_out())

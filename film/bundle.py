@@ -24,10 +24,10 @@ FEWEST_KEYPOINTS: Final = 8  # A hand in a frame is judged by this many keypoint
 _SURE: Final = 0.25  # Keypoints with a lower score are not used.
 _MOST_BUNDLED: Final = 5000  # largest number of keypoints in a bundle
 _ROBUST: Final = 2.0  # Residuals beyond this many standard deviations count less.
-_NOTHING: Final = 1e-2  # prior information on free unknowns
+_WEAK_INFORMATION: Final = 1e-2  # prior information on free unknowns
 _PARTS: Final = 8  # number of parts of a video that are held out, one after the other
 _TINY: Final = 1e-6  # [s], [rad] step of the finite differences by time and by rotations
-_DEPENDENT: Final = 16.0  # This many samples count as one with an independent error.
+_SAMPLES_PER_ERROR: Final = 16.0  # This many samples count as one with an independent error.
 
 # Places of the unknowns in a state's values. From POSES on, each span has six numbers for its camera's pose.
 # _PRIORS holds the standard deviation of each unknown before any picture is seen. THICKER says how much
@@ -224,7 +224,7 @@ class Bundle:
             values[free] = part
             return state._replace(values=values)
 
-        known = np.sqrt(_DEPENDENT) / priors
+        known = np.sqrt(_SAMPLES_PER_ERROR) / priors
 
         def rows(part: Doubles) -> Doubles:
             now = widened(part)
@@ -240,8 +240,8 @@ class Bundle:
         )  # fmt: skip
         covariance = np.zeros((size, size))
         # An unknown without any information gets a standard deviation of 40 s, m or rad.
-        inverse = np.linalg.inv(done.jac.T @ done.jac + _NOTHING * np.eye(len(done.x)))
-        covariance[np.ix_(free, free)] = _DEPENDENT * inverse
+        inverse = np.linalg.inv(done.jac.T @ done.jac + _WEAK_INFORMATION * np.eye(len(done.x)))
+        covariance[np.ix_(free, free)] = _SAMPLES_PER_ERROR * inverse
         return widened(done.x), 2.0 * float(done.cost) / max(count, 1), covariance
 
     def held_out(self, state: State, samples: Samples, noise: float) -> tuple[Doubles, float]:

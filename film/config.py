@@ -6,5 +6,5 @@ from typing import Final
 
 from render.config import FrameConfig
 
-USUAL: Final = FrameConfig(dress="glove")
+FILM_DEFAULTS: Final = FrameConfig(dress="glove")
 """All passes of all frames that fit, of hands in gloves."""

@@ -57,9 +57,12 @@ class MediaPipeHands:
         return found
 
 
+_Finder = HandDetector | MediaPipeHands
+
+
 def resolve_detector(
     given: HandDetector | StoredHands | str | Path | None,
-) -> HandDetector | MediaPipeHands | StoredHands:
+) -> _Finder | StoredHands:
     """The detector of this name, folder of weights or file of found keypoints; the shipped one for None."""
     if isinstance(given, HandDetector | StoredHands):
         return given
@@ -75,9 +78,7 @@ def resolve_detector(
     return HandDetector.load(given)
 
 
-def find_hands(
-    film: Film, detector: HandDetector | MediaPipeHands | StoredHands, progress: Progress
-) -> list[FoundFrame]:
+def find_hands(film: Film, detector: _Finder | StoredHands, progress: Progress) -> list[FoundFrame]:
     """The frames of a video, some of them with the hands in them."""
     found: list[FoundFrame] = []
     step = max(1, round(film.rate / _LOOKS))
@@ -95,7 +96,7 @@ def find_hands(
     return found
 
 
-class _Look(NamedTuple):
+class _Searched(NamedTuple):
     """A picture that was searched."""
 
     record: dict[str, Any]  # of the image in COCO
@@ -160,9 +161,7 @@ def detect_hands(
     return StoredHands({look.record["id"]: look.hands for look in looks})
 
 
-def _in_photos(
-    paths: Sequence[Path], finder: HandDetector | MediaPipeHands, progress: Progress
-) -> Iterator[_Look]:
+def _in_photos(paths: Sequence[Path], finder: _Finder, progress: Progress) -> Iterator[_Searched]:
     """The photographs of files and folders."""
     files = [file for path in paths for file in (photo_files(path)[0] if path.is_dir() else (path,))]
     files = [file for file in files if not is_map(file)]
@@ -171,18 +170,18 @@ def _in_photos(
     for number, file in enumerate(files):
         picture = read_photograph(file)
         record = {"id": number, "file_name": file, "width": picture.shape[1], "height": picture.shape[0]}
-        yield _Look(record, finder.detect(picture), functools.partial(read_photograph, file))
+        yield _Searched(record, finder.detect(picture), functools.partial(read_photograph, file))
         progress(number + 1, len(files))
 
 
-def _in_video(path: Path, finder: HandDetector | MediaPipeHands, progress: Progress) -> Iterator[_Look]:
+def _in_video(path: Path, finder: _Finder, progress: Progress) -> Iterator[_Searched]:
     """The frames of a video that were searched."""
     film = Film(path)
     for number, frame in enumerate(find_hands(film, finder, progress)):
         if frame.hands is not None:
             record = {"id": number, "file_name": path, "time": frame.time}
             record |= dict(zip(("width", "height"), film.size, strict=True))
-            yield _Look(record, frame.hands, functools.partial(film.picture, number))
+            yield _Searched(record, frame.hands, functools.partial(film.picture, number))
 
 
 def _annotation(image: dict[str, Any], hand: FoundHand) -> dict[str, Any]:

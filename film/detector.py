@@ -32,7 +32,7 @@ FINDER_SIZE: Final = 256  # side of the square picture that the finder takes [px
 CELL: Final = 8  # side of a cell of the finder's map [px]
 CROP_SIZE: Final = 128  # side of the square picture that the keypoint network takes [px]
 HEAT_SIZE: Final = 16  # cells of a keypoint's map, each way
-NEAR: Final = 0.2  # reach of the heat around its peak that a keypoint is the mean of [share of the side]
+NEAR: Final = 0.2  # A keypoint is the mean of the heat within this distance of its peak [share of the side].
 ROOM: Final = 1.55  # side of the square that is cut out around a hand, over the hand's longer side
 _WRIST, _INDEX, _KNUCKLE, _LITTLE = 0, 5, 9, 17  # keypoints: the wrist, and where three fingers begin
 MOST_BYTES: Final = 1 << 26  # of a file of weights
@@ -67,7 +67,7 @@ class FoundHand:
     """How sure each keypoint is, from 0 to 1."""
 
 
-class _Look(NamedTuple):
+class _SquareResult(NamedTuple):
     """What the keypoint network tells of one square."""
 
     keypoints: Doubles  # (21, 2) [px] of the picture
@@ -193,7 +193,7 @@ class HandDetector:
             places.append(Place(np.array([center - half, center + half]), log_odds))
         return places
 
-    def _look(self, picture: Bytes, matrix: Doubles) -> _Look:
+    def _look(self, picture: Bytes, matrix: Doubles) -> _SquareResult:
         """What the keypoint network tells of the square that a matrix (2, 3) cuts out of a picture."""
         square = cut(picture, matrix, (CROP_SIZE, CROP_SIZE))
         heat, logits = _run(self._keypoints, normalized(square), ("heat", "logits"))
@@ -201,13 +201,16 @@ class HandDetector:
         turn = np.linalg.inv(matrix[:, :2])
         presence, palm = (float(value) for value in logits[0])
         right = palm * float(np.sign(palm_spread(keypoints)))
-        return _Look((CROP_SIZE * keypoints - matrix[:, 2]) @ turn.T, scores, presence, right)
+        return _SquareResult((CROP_SIZE * keypoints - matrix[:, 2]) @ turn.T, scores, presence, right)
 
-    def _second_look(self, picture: Bytes, first: _Look, prior: float, side: Side | None = None) -> FoundHand:
+    def _second_look(
+        self, picture: Bytes, first: _SquareResult, prior: float, side: Side | None = None
+    ) -> FoundHand:
         """The hand, after a look at where the first look saw it, with its fingers up.
 
-        The finder's log-odds are the prior of its confidence. The network, half of whose lessons had hands,
-        adds the mean of both looks, which see the same pixels.
+        The finder's log-odds are the prior. The mean log-odds of both looks is added: half of the training
+        squares had hands, so these carry no prior, and both looks see the same pixels, so they are not
+        summed.
         """
         look = self._look(picture, square_around(first.keypoints, turn=upright(first.keypoints)))
         if side is None:

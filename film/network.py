@@ -79,7 +79,7 @@ class KeypointNetwork(nn.Module):
         super().__init__()
         self.backbone = Backbone((32, 64, 96, 128))
         self.head = nn.Sequential(*convolution(128, 64), Residual(64), nn.Conv2d(64, NUM_KEYPOINTS, 1))
-        self.told = nn.Sequential(nn.Flatten(), nn.Linear(16 * 128, 64), nn.ReLU(), nn.Linear(64, 2))
+        self.presence_head = nn.Sequential(nn.Flatten(), nn.Linear(16 * 128, 64), nn.ReLU(), nn.Linear(64, 2))
 
     def keep_keypoints(self) -> None:
         """Train the head of presence and palm alone: otherwise keypoints got 3 to 5 % worse."""
@@ -89,4 +89,4 @@ class KeypointNetwork(nn.Module):
     def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Squares in, maps and log-odds out."""
         features, coarse = self.backbone(x)
-        return self.head(features), self.told(coarse)
+        return self.head(features), self.presence_head(coarse)

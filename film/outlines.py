@@ -32,7 +32,7 @@ _STEP: Final = 0.004  # [s] step of the central differences that give velocities
 _LEVELS: Final = 32  # of each color channel in the histograms
 _SMOOTH: Final = 1.0  # [levels] standard deviation of the histograms' smoothing
 _SUREST: Final = 3.0  # largest log-odds that one color gives
-_DEPENDENT: Final = 0.5  # Neighboring pixels are alike: this share of their log-odds counts.
+_PIXEL_INDEPENDENCE: Final = 0.5  # Neighboring pixels are alike: this share of their log-odds counts.
 _CONTRAST: Final = 0.6  # An edge has at least these mean log-odds on both sides.
 _BESIDE: Final = 5  # [px] width of each side for this mean
 _FLAT: Final = 3  # number of pixels at each end that show the colors of the two sides
@@ -75,7 +75,7 @@ def shutter_times(take: Take, times: Doubles, cameras: Sequence[Camera], readout
     return np.asarray(times[:, None] + late @ readout)
 
 
-class _Look(NamedTuple):
+class _HandView(NamedTuple):
     """The part of a picture around a hand, as a pinhole camera sees it."""
 
     corner: Integers  # (2,): of the part [px]
@@ -157,7 +157,7 @@ class Outlines:
 
     def _looks(
         self, picture: Bytes, maps: Floats, view: Camera, drawn: list[Triangles], bodies: Doubles, room: int
-    ) -> list[_Look]:
+    ) -> list[_HandView]:
         """The parts of a picture with each drawn hand and room around it; none if all are elsewhere."""
         pixels = [view.project(one.vertices[: skin_atlas().num_hand]) for one in drawn]  # without forearms
         low = [np.fmin.reduce(one, initial=np.inf) - room for one in pixels]
@@ -176,7 +176,7 @@ class Outlines:
         for corner, box in zip(boxes[:, 0], boxes - first, strict=True):
             part = tuple(slice(*ends) for ends in box.T[::-1])
             there = Geometry(truth.depth[part], None, *(one[part] for one in truth[2:]))
-            looks.append(_Look(corner, view, np.asarray(colors)[part], there))
+            looks.append(_HandView(corner, view, np.asarray(colors)[part], there))
         return looks
 
     def _hand(self, hand: int, fit: GloveFit, qpos: Doubles) -> Triangles:
@@ -204,7 +204,9 @@ class Outlines:
         local = np.einsum("nji,nj->ni", now[:, :3, :3], outline.points - now[:, :3, 3])
         return np.asarray(np.einsum("nij,nj->ni", step[:, :3, :3], local) + step[:, :3, 3])
 
-    def _across(self, look: _Look, hand: int, found: _Outline, reach: int) -> tuple[Integers, Doubles, float]:
+    def _across(
+        self, look: _HandView, hand: int, found: _Outline, reach: int
+    ) -> tuple[Integers, Doubles, float]:
         """Points of an outline with an edge, its distance from them [px]; and the least log-odds."""
         mine, free = look.truth.instances == 1 + hand, look.truth.instances == 0
         inside = cv2.distanceTransform(mine.view(np.uint8), cv2.DIST_L2, 3)
@@ -236,7 +238,7 @@ class Outlines:
         sharp, beyond = _sharpened(light)
         return chosen[sharp], (offsets + beyond)[sharp], least
 
-    def _odds(self, look: _Look, hand: int, inside: Floats, reach: int) -> Floats | None:
+    def _odds(self, look: _HandView, hand: int, inside: Floats, reach: int) -> Floats | None:
         """Log-odds (h, w) that colors are the hand's and not those around it; None for a tiny hand."""
         outside = cv2.distanceTransform((inside == 0.0).view(np.uint8), cv2.DIST_L2, 3)
         deep = inside > min(0.7 * reach, 0.5 * float(inside.max()))
@@ -260,7 +262,7 @@ def _along(pixels: Doubles, normals: Doubles, reach: int) -> Floats:
     return np.asarray(pixels[:, None] + steps - 0.5, dtype=np.float32)
 
 
-def _outline(look: _Look, hand: int, fit: GloveFit, qpos: Doubles) -> _Outline | None:
+def _outline(look: _HandView, hand: int, fit: GloveFit, qpos: Doubles) -> _Outline | None:
     """Points of a drawn hand's outline, without its wrist and what is beside markers and other things."""
     truth, camera = look.truth, look.view
     mine, free = truth.instances == 1 + hand, truth.instances == 0
@@ -316,7 +318,7 @@ def _edge(odds: Floats, in_me: Flags, in_free: Flags, reach: int) -> tuple[Integ
     valid[:, reach + 2 :] = np.logical_and.accumulate(in_free[:, reach + 2 :], axis=1)
     sums = np.cumsum(np.where(valid, odds, 0.0), axis=1, dtype=np.float64)
     at = np.arange(-reach, reach) + 0.5  # an edge is half a pixel beyond the last pixel of the hand
-    score = 2.0 * _DEPENDENT * sums[:, :-1] - 0.5 * (at / (0.7 * reach)) ** 2
+    score = 2.0 * _PIXEL_INDEPENDENCE * sums[:, :-1] - 0.5 * (at / (0.7 * reach)) ** 2
     score = np.where(valid[:, :-1] & valid[:, 1:], score, -np.inf)
     padded = np.pad(sums, ((0, 0), (1, 0)))
     best, rows = score.argmax(axis=1) + 1, np.arange(len(odds))

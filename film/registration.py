@@ -69,7 +69,7 @@ _NEAR: Final = 0.004  # [widths] An edge this near to an outline agrees.
 _LEAST_AGREEMENT: Final = 0.5  # share of the outlines; of wrong clocks and cameras it was 0.01 to 0.39
 _MARGIN: Final = 0.8  # Another clock explains at most this share of what the best does.
 _SURPRISE: Final = 0.003  # [widths] Outlines of a part that was held out are at most this far off.
-_SHAPE: Final = 2.0
+_DEVIATION_FACTOR: Final = 2.0
 """Deviations are this many times larger, as errors of a hand's shape are the same in all frames.
 
 In six videos of another renderer errors were up to 1.5 times the deviations with it, and 2.9 times without.
@@ -97,6 +97,10 @@ _RATIOS: Final = (2, 4, 5, 8, 10, 16, 20, 32)
 
 
 _Looks = list[tuple[int, Bytes]]
+
+
+class _UnlikeError(HandSimError):
+    """The hands in the video do not move as those of the take."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -202,8 +206,8 @@ def register(
     """
     try:
         return _register(take, found, size, given, pictures, progress)
-    except HandSimError as error:
-        if str(error) == _UNLIKE and (ratio := _slowed(take, found, size, given)):
+    except _UnlikeError as error:
+        if ratio := _slowed(take, found, size, given):
             raise HandSimError(_SLOW.format(ratio, 1.0 / ratio)) from error
         raise
 
@@ -240,17 +244,17 @@ def _register(
     tried = _hypotheses(bundle, looks, progress)
     best, state, covariance = tried[0], tried[0].state, tried[0].covariance
     if looks and best.agreement < _LEAST_AGREEMENT:
-        raise HandSimError(_UNLIKE)
+        raise _UnlikeError(_UNLIKE)
     _check_margin(bundle, tried)
     outlined = _outlined(bundle, state, looks, pictures, progress) if pictures else None
     if outlined is not None:
         state, covariance, fit = outlined
     elif best.noise > _WORST * width:
-        raise HandSimError(_UNLIKE)
+        raise _UnlikeError(_UNLIKE)
     else:
         fit = _keypoint_fit(bundle, state)
     if fit.reasons.count("") < _LEAST_SHARE * np.isin(bundle.found.looked, bundle.found.frames).sum():
-        raise HandSimError(_UNLIKE)
+        raise _UnlikeError(_UNLIKE)
     (offset, drift), deviations = bundle.clock(state), np.sqrt(np.diag(covariance))
     unknowns: dict[str, int | slice] = {"offset": OFFSET, "drift": DRIFT, "readout": READOUT, "focal": FOCAL}
     known = {name: float(np.max(deviations[numbers])) for name, numbers in unknowns.items()}
@@ -277,11 +281,11 @@ def _adjusted(bundle: Bundle, state: State, *, splits: bool) -> tuple[State, Dou
             state = _split(bundle, state, noise)
         matches = bundle.match(state, max(4.0 * noise, 0.5 * _GATE * bundle.size[0]))
         if (matches.numbers >= 0).sum() < _FEWEST_FRAMES:
-            raise HandSimError(_UNLIKE)
+            raise _UnlikeError(_UNLIKE)
         state, _, covariance = bundle.solve(state, bundle.samples(matches), noise)
         distances = bundle.match(state, np.inf).distances
         if np.isnan(distances).all():  # the camera looks away from the hands
-            raise HandSimError(_UNLIKE)
+            raise _UnlikeError(_UNLIKE)
         noise = max(float(np.nanmedian(distances)) / 1.177, 0.3)
     return state, covariance, noise
 
@@ -316,7 +320,7 @@ def _hypotheses(bundle: Bundle, looks: _Looks, progress: Progress) -> list[_Hypo
     if not found or not looks or found[0][0].agreement < _STILL:
         judge(found[0][1] if found else guesses[0], splits=True)
     if not found:
-        raise HandSimError(_UNLIKE)
+        raise _UnlikeError(_UNLIKE)
     return sorted((one for one, _ in found), key=lambda one: -one.agreement)
 
 
@@ -342,7 +346,7 @@ def _agreement(bundle: Bundle, state: State, looks: _Looks) -> tuple[float, Stat
 def _check_margin(bundle: Bundle, tried: list[_Hypothesis]) -> None:
     """Raise if another clock or camera explains nearly as much as the best.
 
-    Of cameras that look the same way at the same time a longer search would find one.
+    Hypotheses with the same clock and direction count as one: a longer search would make them equal.
     """
     best = tried[0]
     for other in tried[1:]:
@@ -378,7 +382,7 @@ def _first_guesses(bundle: Bundle) -> list[State]:
         if not any(_are_same(bundle, state, other) for other in guesses):
             guesses.append(state)
     if not guesses:
-        raise HandSimError(_UNLIKE)
+        raise _UnlikeError(_UNLIKE)
     return guesses
 
 
@@ -482,7 +486,7 @@ def _outlined(
     deviations, surprise = bundle.held_out(state, samples, noise)
     if surprise > _SURPRISE * bundle.size[0]:
         raise HandSimError(_CHANGED.format("place or zoom"))
-    covariance = _SHAPE**2 * np.diag(np.maximum(np.diag(covariance), deviations**2))
+    covariance = _DEVIATION_FACTOR**2 * np.diag(np.maximum(np.diag(covariance), deviations**2))
     if len(state.starts) > 1 and _zoomed(bundle, state, samples, noise):
         raise HandSimError(_CHANGED.format("focal length"))
     frames = len(bundle.found.times)

@@ -68,7 +68,8 @@ _LEARNED: Final = 0.8  # share of the photographs that train a network; the othe
 _JUDGED: Final = 4  # batches of photographs on which it is judged
 _SMALLEST: Final = 14.0  # longer side of a hand that the finder learns [px of what it sees]
 _ASPECTS: Final = (0.75, 0.75, 0.5625, 1.0)  # shorter side of a picture over the longer one
-_FIRST_LOOK: Final = 0.35  # share of the squares that are turned anyhow; in others fingers are about up
+# share of the squares that imitate the first look, half of them turned at random; in others fingers point up
+_FIRST_LOOK: Final = 0.35
 _OPSET: Final = 17
 _HALF: Final = "_half"  # ending of the names of weights of half precision
 VIEW_SIZE: Final = 320  # longer side of a stored picture [px]
@@ -80,9 +81,8 @@ _CAMERAS: Final = ("vga", "vga_wide", "vga", "sr300", "kinect2", "d435")
 _SITTING: Final = 16  # pictures of each person
 _FEWEST_SEEN: Final = 4  # keypoints of a hand that must be seen
 _EMPTY: Final = 0.35  # share of the scenes that also give a square without a hand
-_STAGED: Final = (
-    0.5  # share of the drawn pictures that keep their own background, where there are photographs for others
-)
+# share of the drawn pictures that keep their own background, where there are photographs for others
+_KEEPS_BACKGROUND: Final = 0.5
 _DYED: Final = 0.6  # share of the other hands whose color is any
 
 Network = FinderNetwork | KeypointNetwork
@@ -142,7 +142,7 @@ def train_detector(
         some + max(1, len(some) // max(1, len(others))) * others
         for some, others in zip(drawn, own, strict=True)
     )
-    rooms = [one for one in own[0] if not len(one.sides)]
+    backgrounds = [one for one in own[0] if not len(one.sides)]
     rate, steps = _RATE if start is None else _ADAPTING_RATE, max(1, round(samples / BATCH))
     kinds = (
         (FINDER, finder_batch, finder_loss, max(1, round(_FINDER_SHARE * steps)), views, held[0]),
@@ -150,12 +150,12 @@ def train_detector(
     )
     for name, batch, loss, count, lessons, unseen in kinds:
         network, judged = networks[name], [batch(unseen, [], one) for one in rng.spawn(_JUDGED) if unseen]
-        handless = start is not None and rooms and not any(len(one.sides) for one in mine[0])
+        handless = start is not None and backgrounds and not any(len(one.sides) for one in mine[0])
         if handless and isinstance(network, KeypointNetwork):
             network.keep_keypoints()
         given = {key: value.clone() for key, value in network.state_dict().items()}
         before = _mean_loss(network, judged, loss)
-        fit(network, functools.partial(batch, lessons, rooms), loss, count, seed, rate)
+        fit(network, functools.partial(batch, lessons, backgrounds), loss, count, seed, rate)
         after = _mean_loss(network, judged, loss)
         if judged:
             _tell(f"{name}: loss {before:.3f} of photographs that are held out, then {after:.3f}\n")
@@ -207,15 +207,15 @@ class Lesson(NamedTuple):
         bgr = cv2.imdecode(self.file, cv2.IMREAD_COLOR)
         return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 
-    def staged(self, rooms: Sequence[Lesson], rng: np.random.Generator) -> Bytes:
+    def staged(self, backgrounds: Sequence[Lesson], rng: np.random.Generator) -> Bytes:
         """The picture; half of the drawn hands are before a photograph, in gloves of any color."""
         picture = self.picture()
-        if self.mask is None or not rooms or rng.random() < _STAGED:
+        if self.mask is None or not backgrounds or rng.random() < _KEEPS_BACKGROUND:
             return picture
-        room, size = rooms[int(rng.integers(len(rooms)))].picture(), picture.shape[1::-1]
-        turn = _turn(rng, 10.0, max(np.array(size) / room.shape[1::-1]) * rng.uniform(0.8, 2.5))
-        shift = 0.5 * np.array(size) - turn @ (np.array(room.shape[1::-1]) * rng.uniform(0.3, 0.7, 2))
-        behind = cut(room, np.column_stack([turn, shift]), size)
+        background, size = backgrounds[int(rng.integers(len(backgrounds)))].picture(), picture.shape[1::-1]
+        turn = _turn(rng, 10.0, max(np.array(size) / background.shape[1::-1]) * rng.uniform(0.8, 2.5))
+        shift = 0.5 * np.array(size) - turn @ (np.array(background.shape[1::-1]) * rng.uniform(0.3, 0.7, 2))
+        behind = cut(background, np.column_stack([turn, shift]), size)
         mask = cv2.imdecode(self.mask, cv2.IMREAD_GRAYSCALE)
         share, before = cv2.GaussianBlur(mask, (3, 3), 0.7)[..., None] / 255.0, picture.astype(np.float64)
         if rng.random() < _DYED:
@@ -396,7 +396,9 @@ def _turn(rng: np.random.Generator, deviation: float, scale: float = 1.0) -> Dou
     return np.asarray(turn * [rng.choice((-1.0, 1.0)), 1.0])
 
 
-def keypoint_batch(lessons: Sequence[Lesson], rooms: Sequence[Lesson], rng: np.random.Generator) -> Batch:
+def keypoint_batch(
+    lessons: Sequence[Lesson], backgrounds: Sequence[Lesson], rng: np.random.Generator
+) -> Batch:
     """Pictures of single hands, and some of none. Targets: keypoints [share of the side], presence, palm.
 
     The palm faces the camera (1), or does not (0), or that is not known (-1). Mirrored pictures have the same
@@ -406,7 +408,7 @@ def keypoint_batch(lessons: Sequence[Lesson], rooms: Sequence[Lesson], rng: np.r
     presence, palms = np.zeros(BATCH, np.float32), np.full(BATCH, -1.0, np.float32)
     for number in range(BATCH):
         lesson = lessons[int(rng.integers(len(lessons)))]
-        wide, is_hand = lesson.staged(rooms, rng), len(lesson.sides) > 0
+        wide, is_hand = lesson.staged(backgrounds, rng), len(lesson.sides) > 0
         keypoints = lesson.keypoints[0] if is_hand else np.full((NUM_KEYPOINTS, 2), np.nan)
         labeled = keypoints[np.isfinite(keypoints[:, 0])]
         first_look = rng.random() < _FIRST_LOOK or len(labeled) < len(keypoints)
@@ -450,13 +452,13 @@ def keypoint_loss(found: tuple[torch.Tensor, torch.Tensor], targets: Targets) ->
     return loss + (wrong * known).sum() / known.sum().clamp(min=1)
 
 
-def finder_batch(lessons: Sequence[Lesson], rooms: Sequence[Lesson], rng: np.random.Generator) -> Batch:
+def finder_batch(lessons: Sequence[Lesson], backgrounds: Sequence[Lesson], rng: np.random.Generator) -> Batch:
     """Pictures, turned, cut and scaled; targets: cells (4, S/8, S/8) as the network's, and their weight."""
     cells = FINDER_SIZE // CELL
     pictures, targets = [], np.zeros((BATCH, 5, cells, cells), np.float32)
     for target in targets:
         lesson = lessons[int(rng.integers(len(lessons)))]
-        picture = lesson.staged(rooms, rng)
+        picture = lesson.staged(backgrounds, rng)
         long, short = FINDER_SIZE, round(FINDER_SIZE * rng.choice(_ASPECTS))
         width, height = (long, short) if rng.random() < 0.75 else (short, long)
         turn = _turn(rng, 14.0, FINDER_SIZE / VIEW_SIZE * rng.uniform(0.75, 1.7))

@@ -40,7 +40,7 @@ _NEEDS: Final = {
 }
 """Packages that each package imports."""
 _REMEDY: Final = "import handsim.{0} before it, rename it, or keep it off the path"
-VARIABLE: Final = "NUMBA_CACHE_DIR"
+CACHE_VARIABLE: Final = "NUMBA_CACHE_DIR"
 _PACKAGE: Final = Path(__file__).parent
 
 
@@ -52,10 +52,10 @@ def lazy_exports(package: str) -> tuple[Callable[[str], Any], Callable[[], list[
     first used, and are ordinary attributes afterwards.
     """
     claim(*_NEEDS.get(package, ()))
-    own = sys.modules[package]
-    lazy, loaded = _public_names(Path(str(own.__file__)))
+    module = sys.modules[package]
+    lazy, loaded = _public_names(Path(str(module.__file__)))
     public = sorted({*lazy, *loaded, "__version__"})
-    vars(own)["__all__"] = public
+    vars(module)["__all__"] = public
 
     def load(name: str) -> Any:
         if package == "handsim" and name in SIBLINGS:
@@ -63,15 +63,15 @@ def lazy_exports(package: str) -> tuple[Callable[[str], Any], Callable[[], list[
         if name not in lazy:
             raise AttributeError(f"module '{package}' has no attribute '{name}'{_elsewhere(name)}")
         with own_numerics():
-            module = importlib.import_module(lazy[name])
-        value = getattr(module, name)
+            origin = importlib.import_module(lazy[name])
+        value = getattr(origin, name)
         if inspect.isfunction(value):
             value = with_own_numerics(value)
-            setattr(module, name, value)
-        setattr(own, name, value)
+            setattr(origin, name, value)
+        setattr(module, name, value)
         return value
 
-    return load, lambda: sorted({*vars(own), *public})
+    return load, lambda: sorted({*vars(module), *public})
 
 
 def _public_names(source: Path) -> tuple[dict[str, str], dict[str, str]]:
@@ -84,7 +84,7 @@ def _public_names(source: Path) -> tuple[dict[str, str], dict[str, str]]:
 def _elsewhere(name: str) -> str:
     """Which of the packages has a public name, as the end of a sentence; empty if none does."""
     for package in () if name.startswith("_") else ("handsim", *SIBLINGS):
-        source = Path(_own(package), "__init__.py")
+        source = Path(_package_folder(package), "__init__.py")
         if source.exists() and name in _public_names(source)[0]:
             return f"; {package}.{name} has this name"
     return ""
@@ -118,7 +118,7 @@ class _OwnPackages(MetaPathFinder, Loader):
     def find_spec(self, fullname: str, path: object = None, target: object = None) -> ModuleSpec | None:
         """The specification of a module, if it is one of these."""
         if fullname in self.claimed:
-            file = os.path.join(_own(fullname), "__init__.py")
+            file = os.path.join(_package_folder(fullname), "__init__.py")
             _check_own(fullname, file)
             return importlib.util.spec_from_file_location(fullname, file)
         first, _, inner = fullname.partition(".")
@@ -140,13 +140,13 @@ class _OwnPackages(MetaPathFinder, Loader):
         module.__spec__ = module.__spec__.loader_state
 
 
-_OWN: Final = _OwnPackages()
+_FINDER: Final = _OwnPackages()
 
 
 def find_own_packages() -> None:
     """Let Python find handsim's packages by their names within `handsim` as well."""
-    if _OWN not in sys.meta_path:
-        sys.meta_path.insert(0, _OWN)
+    if _FINDER not in sys.meta_path:
+        sys.meta_path.insert(0, _FINDER)
 
 
 def claim(*names: str) -> None:
@@ -157,15 +157,15 @@ def claim(*names: str) -> None:
     """
     for name in names:
         place = _location(name) if name in sys.modules else None
-        if place and os.path.realpath(place) != os.path.realpath(_own(name)):
+        if place and os.path.realpath(place) != os.path.realpath(_package_folder(name)):
             raise ShadowedPackageError(
                 f"handsim needs its own package '{name}', but {place} is imported under this name; "
                 + _REMEDY.format(name)
             )
-        _OWN.claimed.add(name)
+        _FINDER.claimed.add(name)
 
 
-def _own(name: str, home: str = _HOME) -> str:
+def _package_folder(name: str, home: str = _HOME) -> str:
     """Folder of one of handsim's packages."""
     return os.path.join(home, name)
 
@@ -177,8 +177,9 @@ def _check_own(name: str, file: str) -> None:
     except OSError:
         text = ""
     if "lazy_exports" not in text:
+        fault = "belongs to another package" if text else "is missing"
         raise ShadowedPackageError(
-            f"handsim needs its own package '{name}', but {file} is {'of another' if text else 'missing'}; "
+            f"handsim needs its own package '{name}', but {file} {fault}; "
             f"run `pip uninstall {name}`, then install handsim anew with pip's --force-reinstall --no-deps"
         )
 
@@ -186,7 +187,7 @@ def _check_own(name: str, file: str) -> None:
 def shadowed_siblings(home: str = _HOME) -> dict[str, str]:
     """Locations of siblings that are found elsewhere than in `home`, the folder that holds `handsim`."""
     found = {name: _location(name) for name in SIBLINGS}
-    own = {name: os.path.realpath(_own(name, home)) for name in SIBLINGS}
+    own = {name: os.path.realpath(_package_folder(name, home)) for name in SIBLINGS}
     return {name: place for name, place in found.items() if place and os.path.realpath(place) != own[name]}
 
 
@@ -209,7 +210,7 @@ def _location(name: str) -> str | None:
         if spec is None:  # a module put into sys.modules by hand
             return getattr(module, "__file__", None) or f"a module made by hand, '{name}'"
     else:
-        finders = (one.find_spec(name, None) for one in sys.meta_path if one is not _OWN)
+        finders = (one.find_spec(name, None) for one in sys.meta_path if one is not _FINDER)
         spec = next(filter(None, finders), None)
     if spec is None:
         return None
@@ -219,13 +220,13 @@ def _location(name: str) -> str | None:
 
 def ensure_kernel_cache() -> None:
     """Name a temporary folder for compiled kernels if numba would find no other; workers inherit it."""
-    if not os.environ.get(VARIABLE) and not is_writable(_PACKAGE) and not is_writable(user_cache()):
-        os.environ[VARIABLE] = str(_own_folder())
+    if not os.environ.get(CACHE_VARIABLE) and not is_writable(_PACKAGE) and not is_writable(user_cache()):
+        os.environ[CACHE_VARIABLE] = str(_own_folder())
 
 
 def kernel_cache() -> tuple[Path, bool]:
     """Where kernels are kept, and whether they stay there."""
-    given = os.environ.get(VARIABLE)
+    given = os.environ.get(CACHE_VARIABLE)
     if given:
         return Path(given), not Path(given).is_relative_to(tempfile.gettempdir())
     return (_PACKAGE, True) if is_writable(_PACKAGE) else (user_cache(), True)

@@ -11,8 +11,8 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import Final
 
-SENTENCE: Final = 500
-"""The most characters of a sentence."""
+MAX_MESSAGE_LENGTH: Final = 500
+"""Largest number of characters of a message."""
 
 
 def shortened(text: str, most: int = 40) -> str:
@@ -27,7 +27,7 @@ class HandSimError(Exception):
     """Root of every error that handsim raises on purpose; its sentence has a bounded length."""
 
     def __str__(self) -> str:
-        return shortened(super().__str__(), SENTENCE)
+        return shortened(super().__str__(), MAX_MESSAGE_LENGTH)
 
 
 DAMAGE: Final = (
@@ -41,7 +41,7 @@ class HandSimWarning(UserWarning):
     """Something in the data that is probably not what the user meant; the work goes on."""
 
     def __str__(self) -> str:
-        return shortened(super().__str__(), SENTENCE)
+        return shortened(super().__str__(), MAX_MESSAGE_LENGTH)
 
 
 class ArgumentError(HandSimError):

@@ -99,6 +99,11 @@ def coordinates(point: Iterable[float], separator: str = " ") -> str:
     return separator.join(f"{round(float(one), 2) + 0.0:.2f}" for one in point)
 
 
+def joint_words(name: str) -> str:
+    """A joint angle's name in words, without its digit: PIP flexion."""
+    return name.split("_", 1)[1].replace("_", " ")
+
+
 @dataclass(frozen=True, slots=True)
 class Section:
     """One heading with the text, pictures and table below it."""

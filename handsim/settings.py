@@ -21,7 +21,8 @@ from handsim._checks import check_choice, check_count, check_number, check_type,
 from handsim._plugins import plugin_name
 from handsim.errors import ArgumentError
 
-_UNIONS: Final = (Union, types.UnionType)
+UNIONS: Final = (Union, types.UnionType)
+"""Origins of annotations of several types."""
 _NO_CHANGE: Final[Mapping[str, Any]] = types.MappingProxyType({})
 
 
@@ -171,7 +172,7 @@ def _checked(name: str, value: Any, hint: Any, field: dataclasses.Field[Any] | N
     if isinstance(value, np.ndarray | np.generic):  # else records would hold their names
         value = value.tolist()
     origin = get_origin(hint)
-    if origin in _UNIONS:
+    if origin in UNIONS:
         return _checked_union(name, value, get_args(hint), limits, expected, field)
     if origin is Literal:
         check_choice(value, get_args(hint), noun=name.replace("_", " "))

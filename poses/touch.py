@@ -43,14 +43,8 @@ _STEP: Final = 1e-6  # step of the finite differences [rad]
 class ThumbContact:
     """Relative position of the last bones of thumb and one finger in each frame."""
 
-    finger: str
-    """Which finger."""
     overlap: Float[np.ndarray, "T"]
     """How deep the two capsules overlap [m]; negative: the gap between them."""
-    thumb_point: Float[np.ndarray, "T 3"]
-    """The thumb's point nearest to the finger, in the frame of the thumb's last bone [m]."""
-    finger_point: Float[np.ndarray, "T 3"]
-    """The finger's point nearest to the thumb, in the frame of the finger's last bone [m]."""
     facing: Float[np.ndarray, "T 2"]
     """Cosine between pad direction and direction to the other bone, for thumb and finger; 1: pad to pad."""
 
@@ -69,13 +63,8 @@ def _contact(capsules: Capsules, frames: NDArray[np.float64], finger: str) -> Th
     direction = ends[:, 1] - ends[:, 0]
     distance = np.linalg.norm(direction, axis=1)
     direction /= distance[:, None]
-    points, facing = [], []
-    for number, sign in enumerate((1.0, -1.0)):
-        frame = frames[:, bones[number]]
-        surface = ends[:, number] + sign * radii[number] * direction - frame[:, :3, 3]
-        points.append(np.einsum("tji,tj->ti", frame[:, :3, :3], surface))
-        facing.append(-sign * (frame[:, :3, 2] * direction).sum(axis=1))
-    return ThumbContact(finger, radii.sum() - distance, points[0], points[1], np.stack(facing, axis=1))
+    facing = (frames[:, bones][..., :3, 2] * direction[:, None]).sum(axis=2) * [-1.0, 1.0]
+    return ThumbContact(radii.sum() - distance, facing)
 
 
 def touching_angles(

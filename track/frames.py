@@ -145,7 +145,7 @@ class FrameValidator:
         with np.errstate(invalid="ignore"):
             usable = np.abs(points).max(axis=1, initial=0.0) < FARTHEST  # NaN compares as false
         if not usable.all():
-            notes.append(f"{np.sum(~usable)} of {len(points)} points are nowhere and left out")
+            notes.append(f"{np.sum(~usable)} of {len(points)} points have no position within 1 km: left out")
         kept = np.flatnonzero(usable)
         num_points, points, ids = len(points), points[kept], ids[kept]
         known = [number for number in ids.tolist() if number >= 0]

@@ -66,7 +66,7 @@ def check_workers(workers: int | None) -> int:
     A worker that runs its parent's script while it starts ends here, before it repeats the parent's work.
     """
     if getattr(multiprocessing.current_process(), "_inheriting", False):
-        raise SystemExit(f"a process that starts runs this script again: {_GUARD}")
+        raise SystemExit(f"a worker process ran this script again while it started; {_GUARD}")
     if workers is None:
         return max(1, min(usable_cores(), available_bytes() // _WORKER))
     check_count("workers", workers, 1)

@@ -18,7 +18,7 @@ from urllib.parse import parse_qsl, urlsplit
 from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 
-from handsim._imports import SIBLINGS, VARIABLE, is_writable, kernel_cache, shadowed_siblings
+from handsim._imports import CACHE_VARIABLE, SIBLINGS, is_writable, kernel_cache, shadowed_siblings
 from handsim._plugins import EGL_PACKAGES
 from handsim.app.workers import usable_cores
 
@@ -253,7 +253,7 @@ def check_kernel_cache() -> Finding:
     """The folder of compiled kernels, which are compiled anew at each start if it does not last."""
     folder, lasts = kernel_cache()
     writable = is_writable(folder)
-    remedy = "" if lasts and writable else f"set {VARIABLE} to a folder of yours that lasts"
+    remedy = "" if lasts and writable else f"set {CACHE_VARIABLE} to a folder of yours that lasts"
     found = str(folder) if writable else f"{folder}, which cannot be written"
     return Finding("compiled kernels", found, "a folder that lasts", remedy, needed=False)
 

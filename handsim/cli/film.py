@@ -10,7 +10,7 @@ from typing import Annotated
 
 import tyro
 
-from film.config import USUAL
+from film.config import FILM_DEFAULTS
 from handsim.app.messages import print_line, print_table, progress_bar
 from handsim.cli.study import Step, StudyFile, run_study
 from handsim.errors import ArgumentError
@@ -25,7 +25,7 @@ def film(
     videos: Annotated[tuple[Path, ...], tyro.conf.Positional],
     *,
     out: Path,
-    options: Annotated[FrameConfig, tyro.conf.arg(name="")] = USUAL,
+    options: Annotated[FrameConfig, tyro.conf.arg(name="")] = FILM_DEFAULTS,
     camera: Path | None = None,
     detector: str = "handsim",
     format: tuple[str, ...] = ("webdataset",),

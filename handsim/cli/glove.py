@@ -159,7 +159,7 @@ def check_glove(
 ) -> None:
     """Check a layout on hands of all five sizes, and draw it from all sides with its slips on 100 people.
 
-    A layout must fit a hand of size M. What does not fit another size is told; there markers give way.
+    A layout must fit a hand of size M. What does not fit another size is reported; there markers give way.
 
     Args:
         glove: A .toml file or a shipped name.

@@ -24,7 +24,7 @@ from handsim._version import full_version
 from handsim.app.messages import told_warnings
 from handsim.callbacks import before_compiling
 from handsim.cli.kept_help import print_help
-from handsim.errors import SENTENCE, HandSimError, choices, shortened
+from handsim.errors import MAX_MESSAGE_LENGTH, HandSimError, choices, shortened
 from handsim.files.signals import Stopped, signals_raise
 
 _BROKEN_PIPE: Final = 141  # 128 and the number of SIGPIPE, as other tools end
@@ -208,8 +208,8 @@ def _unexpected(program: str, error: Exception) -> str:
         ) as log:
             log.write(f"handsim {full_version()}, Python {sys.version}\n{sys.argv}\n\n{trace}")
     except OSError:
-        return f"{what}; this is a mistake in handsim, please report it with this:\n{trace}"
-    return f"{what}; this is a mistake in handsim, please report it with {log.name}"
+        return f"{what}; this is a bug in handsim; please report it and attach this:\n{trace}"
+    return f"{what}; this is a bug in handsim; please report it and attach {log.name}"
 
 
 def _sentence(error: Exception) -> str:
@@ -225,7 +225,7 @@ def _sentence(error: Exception) -> str:
 
 
 def _one_line(error: Exception) -> str:
-    return shortened(" ".join(str(error).splitlines()), SENTENCE) or type(error).__name__
+    return shortened(" ".join(str(error).splitlines()), MAX_MESSAGE_LENGTH) or type(error).__name__
 
 
 def _abandon_stdout() -> None:

@@ -29,10 +29,9 @@ from tyro.constructors import (
 )
 
 from handsim.errors import choices, shortened
-from handsim.settings import Spelled
+from handsim.settings import UNIONS, Spelled
 
 Command = Callable[..., Any]
-_UNIONS: Final = (Union, types.UnionType)
 _SPECIFICATION: Final = "COMPLETION_SPEC = "  # begins the line of a completion script with all help texts
 
 
@@ -148,7 +147,7 @@ def _name_or_nothing(
     info: PrimitiveTypeInfo,
 ) -> PrimitiveConstructorSpec[Any] | UnsupportedTypeAnnotationError | None:
     """Parse `X | None` as an X, and a union of an object with str or Path as the latter."""
-    if get_origin(info.type) not in _UNIONS:
+    if get_origin(info.type) not in UNIONS:
         return None
     given = [one for one in get_args(info.type) if one is not types.NoneType]
     named = next((one for one in (str, Path) if one in given), None)

@@ -27,7 +27,7 @@ def report(
     ranges of motion and errors, .markers.csv what was seen of each marker, .doubts.csv the doubtful frames,
     .reach.csv how near the thumb came to the fingers, .angles.csv a row per joint and measure. Of several
     takes the latter are joined in OUT/study.csv, and with --cycles those of cycles in OUT/cycles.csv; a take
-    that cannot be read is told, and what OUT has of the same takes and options stays.
+    that cannot be read is reported, and what OUT has of the same takes and options stays.
 
     Args:
         takes: A take (.npz, of handsim track or the .truth.npz of handsim simulate); several of them,

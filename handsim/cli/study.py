@@ -60,7 +60,7 @@ class Step(NamedTuple):
 
     outputs: tuple[Path, ...]
     inputs: tuple[object, ...]
-    """Files that it reads beside its source; what is no file counts for nothing."""
+    """Files that it reads beside its source; entries that are not files are ignored."""
     options: dict[str, Any]
     """Keyword arguments of the command beside `out`, the first output."""
 
@@ -101,7 +101,7 @@ def run_study(
     make: Callable[..., object],
     plan: Callable[[StudyFile], Step],
     done: str,
-    last: Callable[[list[Step]], object] = len,
+    on_end: Callable[[list[Step]], object] | None = None,
 ) -> None:
     """Make the outputs of each file that are not there with the same inputs and settings.
 
@@ -111,7 +111,7 @@ def run_study(
         make: The command for one file, `make((source,), out=..., **options)`.
         plan: The work on a file.
         done: The participle of the command, such as "tracked".
-        last: Called with the steps whose outputs are there.
+        on_end: Called with the steps whose outputs are there.
 
     Raises:
         CaptureError: Files were not read or used; the message names them, and the others are done.
@@ -148,7 +148,8 @@ def run_study(
             save_json(out / RECORD, record)
     if there or (out / RECORD).is_file():
         save_json(out / RECORD, record)
-    last(there)
+    if on_end is not None:
+        on_end(there)
     print_line(f"{out}: {made} files {done} now, {len(there) - made} before")
     if bad:
         raise CaptureError(f"{len(bad)} of {len(files)} files were not {done}: {', '.join(bad)}")

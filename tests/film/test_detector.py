@@ -232,18 +232,18 @@ def test_drawn_hands_are_laid_over_photographs(lessons):
     mask = np.where(scene.picture.min(axis=2) > 130, 255, 0).astype(np.uint8)
     green = Scene(np.full((240, 320, 3), (20, 200, 30), np.uint8), np.empty((0, 21, 2)), np.empty(0, np.int8))
     (drawn,), _ = lessons_of([scene._replace(mask=mask)], rng=rng)
-    rooms, squares = lessons_of(
+    backgrounds, squares = lessons_of(
         [green], lambda _: [Place(np.array([[9.0, 9.0], [99.0, 99.0]]), 0.0)], rng=rng
     )
     assert len(squares) == 3 and not any(len(square.sides) for square in squares)
-    seen = [drawn.staged(rooms, rng).astype(int) for _ in range(60)]
+    seen = [drawn.staged(backgrounds, rng).astype(int) for _ in range(60)]
     staged = [one for one in seen if abs(one[2, 2] - [20, 200, 30]).max() < 9]
     assert 15 < len(staged) < 45 and len({tuple(one[-3, -3]) for one in seen}) > 1
     x, y = drawn.keypoints[0, 0].astype(int)
     kept = [abs(one[y, x] - [230, 200, 180]).max() < 40 for one in staged]
     assert 0 < sum(kept) < len(kept)
     unmasked = lessons_of([scene], rng=rng)[0][0]
-    np.testing.assert_array_equal(unmasked.staged(rooms, rng), unmasked.picture())
+    np.testing.assert_array_equal(unmasked.staged(backgrounds, rng), unmasked.picture())
 
 
 def test_pictures_without_hands_are_learned_from(few, tmp_path):

@@ -15,8 +15,8 @@ import pytest
 import handsim
 from handsim import ShadowedPackageWarning, _imports
 from handsim._imports import (
+    CACHE_VARIABLE,
     SIBLINGS,
-    VARIABLE,
     ensure_kernel_cache,
     kernel_cache,
     shadowed_siblings,
@@ -100,7 +100,9 @@ def test_a_script_of_such_a_name_works_by_the_safe_names(tmp_path, name):
     assert done.returncode == 0, done.stderr
 
 
-@pytest.mark.parametrize(("source", "what"), [("x = 1\n", "is of another"), (None, "is missing")])
+@pytest.mark.parametrize(
+    ("source", "what"), [("x = 1\n", "belongs to another package"), (None, "is missing")]
+)
 def test_files_of_another_package_in_place_of_ours_are_told_with_the_remedy(tmp_path, source, what):
     home = tmp_path / "site"
     shutil.copytree(ROOT / "handsim", home / "handsim", ignore=shutil.ignore_patterns("__pycache__", "data"))
@@ -149,23 +151,23 @@ def test_a_module_without_a_spec_is_told(monkeypatch: pytest.MonkeyPatch) -> Non
 @pytest.fixture
 def nowhere(tmp_path, monkeypatch):
     """Neither the installation nor the user's cache can be written; the temporary folder is another."""
-    monkeypatch.delenv(VARIABLE, raising=False)
+    monkeypatch.delenv(CACHE_VARIABLE, raising=False)
     monkeypatch.setattr(_imports, "is_writable", lambda folder: False)
     monkeypatch.setattr(_imports.tempfile, "gettempdir", lambda: str(tmp_path))
     monkeypatch.setattr(_imports.tempfile, "tempdir", str(tmp_path))
     yield tmp_path
-    os.environ.pop(VARIABLE, None)
+    os.environ.pop(CACHE_VARIABLE, None)
 
 
 def test_a_usual_installation_keeps_numbas_choice(monkeypatch):
-    monkeypatch.delenv(VARIABLE, raising=False)
+    monkeypatch.delenv(CACHE_VARIABLE, raising=False)
     ensure_kernel_cache()
-    assert VARIABLE not in os.environ
+    assert CACHE_VARIABLE not in os.environ
 
 
 def test_a_temporary_folder_is_the_last_resort(nowhere):
     ensure_kernel_cache()
-    folder = Path(os.environ[VARIABLE])
+    folder = Path(os.environ[CACHE_VARIABLE])
     assert folder.parent == nowhere and folder.stat().st_mode & 0o777 == 0o700
     assert kernel_cache() == (folder, False), "which the doctor tells"
 
@@ -176,17 +178,17 @@ def test_a_folder_that_others_can_write_is_not_trusted(nowhere):
     bait.mkdir()
     bait.chmod(0o777)
     ensure_kernel_cache()
-    assert os.environ[VARIABLE] != str(bait)
+    assert os.environ[CACHE_VARIABLE] != str(bait)
 
 
 def test_a_kernel_compiles_where_only_the_temporary_folder_is(tmp_path):
     program = (
         "import os; from handsim import _imports as k; k.is_writable = lambda folder: False; "
         "k.ensure_kernel_cache(); import numpy as np; from handsim.kernels import __name__ as n; "
-        "print(os.environ[k.VARIABLE])"
+        "print(os.environ[k.CACHE_VARIABLE])"
     )
     environment = {**os.environ, "TMPDIR": str(tmp_path)}
-    environment.pop(VARIABLE, None)
+    environment.pop(CACHE_VARIABLE, None)
     result = subprocess.run(
         [sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True
     )

@@ -12,9 +12,17 @@ from hypothesis import strategies as st
 
 from handsim import HandModel, join_qpos, sample_shape
 from handsim.errors import ArgumentError, PoseError
-from handsim.hand.shape import DIGITS, SIDES, SIZES
+from handsim.hand.shape import SIDES, SIZES, bones_of
 from poses.shapes import HIGH, LOW, MAX_PENETRATION, is_valid, resting_angles
-from poses.touch import FINGERS, MAX_OVERLAP, MIN_FACING, is_touching, thumb_contact, touching_angles
+from poses.touch import (
+    FINGERS,
+    MAX_OVERLAP,
+    MIN_FACING,
+    _nearest_points,
+    is_touching,
+    thumb_contact,
+    touching_angles,
+)
 from tests.sentences import error_names
 
 
@@ -26,6 +34,20 @@ def _measured(model: HandModel, angles: np.ndarray, finger: str) -> tuple[float,
     geoms = [model.mj_model.geom(f"{digit}_distal_1").id for digit in ("thumb", finger)]
     line = np.zeros(6)
     return mujoco.mj_geomDistance(model.mj_model, data, *geoms, 1.0, line), line.reshape(2, 3)
+
+
+def _surface_points(model: HandModel, angles: np.ndarray, finger: str) -> np.ndarray:
+    """The points (2, 3) [m] of the surfaces of the two last bones that are nearest to the other one."""
+    frames = model.forward_kinematics(join_qpos(angles[None]))
+    capsules = [np.flatnonzero(model.capsules.bones == bone)[0] for bone in bones_of_pads(finger)]
+    ends = _nearest_points(model.capsules.posed(frames)[:, capsules])[0]
+    direction = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
+    return ends + np.outer([1.0, -1.0] * model.capsules.radii[capsules], direction)
+
+
+def bones_of_pads(finger: str) -> tuple[int, int]:
+    """The last bones of the thumb and of a finger."""
+    return bones_of("thumb")[2], bones_of(finger)[2]
 
 
 def _check_touch(model: HandModel, angles: np.ndarray, finger: str) -> None:
@@ -80,22 +102,19 @@ def test_the_nearest_points_are_those_that_mujoco_finds(seed, finger):
     distance, points = _measured(model, angles, finger)
     contact = thumb_contact(model, angles[None], finger)
     assert contact.overlap[0] == pytest.approx(-distance, abs=1e-6)
-    frames = model.forward_kinematics(join_qpos(angles[None]))[0]
-    bones = (3, 3 * DIGITS.index(finger) + 3)
-    for bone, local, point in zip(bones, (contact.thumb_point, contact.finger_point), points, strict=True):
-        ours = frames[bone, :3, :3] @ local[0] + frames[bone, :3, 3]
-        if distance > 1e-4:  # MuJoCo gives the middle of an overlap for both
-            np.testing.assert_allclose(ours, point, atol=1e-5)
+    if distance > 1e-4:  # MuJoCo gives the middle of an overlap for both
+        np.testing.assert_allclose(_surface_points(model, angles, finger), points, atol=1e-5)
 
 
 def test_the_place_of_a_contact_is_on_both_pads():
     model = HandModel.named("L")
     for finger in FINGERS:
-        contact = thumb_contact(model, touching_angles(model, finger)[None], finger)
-        for point in (contact.thumb_point[0], contact.finger_point[0]):
-            assert point[2] < 0.0  # the palm's side of the bone
-            assert point[0] > 0.005  # not at its knuckle
-        assert contact.finger == finger
+        angles = touching_angles(model, finger)
+        frames = model.forward_kinematics(join_qpos(angles[None]))[0]
+        for bone, point in zip(bones_of_pads(finger), _surface_points(model, angles, finger), strict=True):
+            local = frames[bone, :3, :3].T @ (point - frames[bone, :3, 3])
+            assert local[2] < 0.0  # the palm's side of the bone
+            assert local[0] > 0.005  # not at its knuckle
 
 
 def test_both_sides_touch_alike():

@@ -88,7 +88,7 @@ def test_what_is_kept_are_points_of_the_frame_each_with_an_id_of_its_own(points,
     np.testing.assert_array_equal(taken.ids, np.where(alone, ids[taken.kept], -1))
     doubled, nowhere = len(set(ids[usable & (ids >= 0)])) < np.sum(usable & (ids >= 0)), not usable.all()
     assert any("several points" in note for note in taken.notes) == doubled
-    assert any("nowhere" in note for note in taken.notes) == nowhere
+    assert any("left out" in note for note in taken.notes) == nowhere
 
 
 def test_stamps_that_lie_together_are_told_apart():

@@ -34,7 +34,8 @@ from track.kinematics.pose_solver import PoseSolver
 from train.labelers.matching import assign
 
 _FEWEST_FRAMES: Final = 4
-_ALIKE: Final = 0.3  # share of the frames that they are taken from
+# share of the complete frames, the most alike in missing markers or those with most markers, that are judged
+_JUDGED_SHARE: Final = 0.3
 _TRIED: Final = 4  # alternatives that are fitted, the likeliest by a rough cost first
 _ROUGH: Final = 12.0  # log-odds beyond which an alternative is not fitted
 _STRAY: Final = 10.0  # log-odds against a point that moves with the hand and is no marker
@@ -291,11 +292,11 @@ def _columns_of(take: Take, side: Side) -> Columns | None:
     # may be most of the take; elsewhere frames with many markers tell more.
     usual = there[frames].mean(axis=0) > 0.5
     unlike = (there[frames] != usual).sum(axis=1)
-    alike = spread_out(frames[unlike <= np.quantile(unlike, _ALIKE)], FRAMES)
+    alike = spread_out(frames[unlike <= np.quantile(unlike, _JUDGED_SHARE)], FRAMES)
     seen = take.point_list.labeled(part, alike)
     strays = [one[:, None] for one in _steady(take, worn, alike, seen)]
     if not strays:
-        full = counts[frames] >= np.quantile(counts[frames], 1.0 - _ALIKE)
+        full = counts[frames] >= np.quantile(counts[frames], 1.0 - _JUDGED_SHARE)
         seen = take.point_list.labeled(part, spread_out(frames[full], FRAMES))
     shape, layout = worn.shape, worn.layout
     columns = np.concatenate([seen, *strays], axis=1) @ mirror

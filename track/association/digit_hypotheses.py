@@ -31,7 +31,7 @@ from track.kinematics.marker_kinematics import (
 )
 from track.kinematics.pose_spread import JointPrior, MarkerPrediction, digit_prior
 
-IMPOSSIBLE: Final = 1e9  # score of an excluded hypothesis, negated
+EXCLUDED_SCORE: Final = -1e9  # score of an excluded hypothesis
 _ANGLES_PER_HINGE: Final = 5  # grid of each joint angle for the ranges of distances
 _LENGTH_TOLERANCE: Final = 0.003  # [m] tolerance of distances between two markers of a digit
 _PRUNING_MARGIN: Final = 7.0  # A hypothesis with an upper bound this far behind another is not fitted.
@@ -62,7 +62,7 @@ class DigitModel(NamedTuple):
 class DigitHypotheses(NamedTuple):
     """The best assignment of every subset of a digit's candidates, one row per subset (bits)."""
 
-    scores: Float[np.ndarray, "*D S"]  # log-odds against all points being strays; `-IMPOSSIBLE` if excluded
+    scores: Float[np.ndarray, "*D S"]  # log-odds against strays alone; `EXCLUDED_SCORE` if excluded
     runners_up: Float[np.ndarray, "*D S"]  # score of the second best assignment
     assignments: Int[np.ndarray, "*D S K"]  # candidate of each of the digit's markers, -1 for none
 
@@ -93,7 +93,7 @@ def empty_hypotheses(num_digits: int, num_candidates: int, num_markers: int) -> 
     """Buffers of `DigitHypotheses`, for at most this number of candidates and markers per digit."""
     sets = num_digits, 1 << num_candidates
     return DigitHypotheses(
-        np.full(sets, -IMPOSSIBLE), np.full(sets, -IMPOSSIBLE), np.full((*sets, num_markers), -1)
+        np.full(sets, EXCLUDED_SCORE), np.full(sets, EXCLUDED_SCORE), np.full((*sets, num_markers), -1)
     )
 
 
@@ -138,24 +138,24 @@ def _fit_hypotheses(
     starts = 2 if np.abs(own.mean - current).max() > _START_DISTANCE else 1
     total = choices**count
     costs, poses = np.zeros(total), np.empty((total, 4))
-    subset_scores = np.full(len(scores), -IMPOSSIBLE)
+    subset_scores = np.full(len(scores), EXCLUDED_SCORE)
     poses[0] = own.mean
     for number in range(total):
         points_used = _decode(number, choices, hypothesis)
         subset = _costliest_subset(number, choices, hypothesis, costs)
         costs[number], poses[number] = costs[subset], poses[subset]
-        if number > 0 and costs[subset] >= IMPOSSIBLE:
+        if number > 0 and costs[subset] >= -EXCLUDED_SCORE:
             continue
         bound = _upper_bound(own, model, label_log_odds, hypothesis)
-        if bound <= -IMPOSSIBLE:
-            costs[number] = IMPOSSIBLE
+        if bound <= EXCLUDED_SCORE:
+            costs[number] = -EXCLUDED_SCORE
             continue
         subset_score = _best_subset_score(points_used, scores, subset_scores)
         least = max(scores[points_used], subset_score) - _PRUNING_MARGIN
         cutoff = bound - max(runners_up[points_used], least)
         if costs[subset] >= cutoff:
             continue
-        score = -IMPOSSIBLE
+        score = EXCLUDED_SCORE
         for start in range(starts):
             angles[:] = poses[subset] if start == 0 else current
             cost, complexity = fit_hypothesis(own, hypothesis, cutoff, angles, work)
@@ -216,7 +216,7 @@ def _upper_bound(
     label_log_odds: Float[np.ndarray, "C K"],
     hypothesis: Int[np.ndarray, "K"],
 ) -> float:
-    """Score of a hypothesis with every point at its marker; `-IMPOSSIBLE` if the distances exclude it."""
+    """Score of a hypothesis with every point at its marker; `EXCLUDED_SCORE` if the distances exclude it."""
     ranges, slack, total = model.ranges, model.slack, 0.0
     for slot in range(len(own.markers)):
         point, one = hypothesis[slot], own.markers[slot]
@@ -227,13 +227,13 @@ def _upper_bound(
             if hypothesis[other] < 0:
                 continue
             if hypothesis[other] == point:
-                return -IMPOSSIBLE
+                return EXCLUDED_SCORE
             distance = point_distance(own.points[point], own.points[hypothesis[other]])
             two = own.markers[other]
             tolerance = _LENGTH_TOLERANCE + slack[one] + slack[two]
             low, high = ranges.nearest[one, two] - tolerance, ranges.farthest[one, two] + tolerance
             if distance < low or distance > high:
-                return -IMPOSSIBLE
+                return EXCLUDED_SCORE
     return total
 
 

@@ -48,7 +48,7 @@ _LEAST_MARKER_SPREAD: Final = 0.0005  # [m] lower bound of a marker's noise, as 
 _BIAS_VARIATION: Final = 0.3  # variation of a bias with the pose, as share of the hand's typical bias
 _BIAS_DOUBT_TIME: Final = 0.5  # [s] unseen, after which a marker's bias is unknown again
 _LEFT_OUT_SPREAD: Final = 0.004  # [m] doubt of a marker that the first fit left out: it may have slipped
-_LEFT_OUT_TIME: Final = 0.2  # [s] The doubt grows so long: wrong starts are corrected sooner.
+_LEFT_OUT_TIME: Final = 0.2  # [s] time in which it grows to its full size; a wrong start is corrected earlier
 _AVERAGING_FRAMES: Final = 120.0  # averaging window of a bias; one second at 120 Hz
 _FORGETTING_FRAMES: Final = 2400.0  # time constant in which an unconfirmed bias decays
 _FORGOTTEN: Final = 1.7e-7  # [m] additional decay per frame; 0.02 mm in a second at 120 Hz
@@ -61,8 +61,9 @@ _RETURN_TIME: Final = 0.01  # [s] over the hidden time: a marker's probability t
 _RETURN_LEAST, _RETURN_MOST = 0.01, 0.65  # bounds of that probability
 SEEN_ELSEWHERE: Final = -7.0
 """Log probability that a point is a marker that was seen as another point at the same time."""
-# While a point has no label though a marker is seen, each time of this length [s] costs it a log-odds of 1
-# for that marker. The largest loss exceeds a labeler's answer, and shrinks while the marker is hidden.
+# A point that stays unlabeled while a marker is seen elsewhere is hardly that marker: it loses one log-odds
+# per `_BESIDE_TIME` [s] of it, at most `_MOST_BESIDE`, which outweighs the labeler. The loss fades while the
+# marker is hidden.
 _BESIDE_TIME, _MOST_BESIDE = 0.01, 18.0
 STRAY_LIFETIME: Final = 0.1  # [s] mean lifetime of strays
 MOST_AGE_LOG_ODDS: Final = 3.0  # largest log-odds from a point's age
@@ -136,7 +137,7 @@ class HandState:
         self._joint_covariance = resting_prior().covariance  # [rad^2] of the last estimate
         self._bias = np.zeros((count, 3))  # [m] in the frames of the bones
         self._bias_frames = np.zeros(count)  # number of frames in each average
-        self._variance = self.variance.copy()  # [m^2] with certain biases
+        self._learned_variance = self.variance.copy()  # [m^2] with certain biases
         self._typical_bias = 0.0  # [m] RMS over the markers
         self._last_seen = np.full(count, -np.inf)  # [s] of each marker since the hand was initialized
         self._started = 0.0  # [s] when the hand was initialized
@@ -156,7 +157,7 @@ class HandState:
         # The first fit may leave a marker out because it slipped, so that the RMS does not bound its error.
         slip = _LEFT_OUT_SPREAD * min((time - self._started) / _LEFT_OUT_TIME, 1.0)
         doubt[self._left_out & (self._bias_frames == 0.0)] = max(self._typical_bias, slip)
-        self.variance = self._variance + doubt**2
+        self.variance = self._learned_variance + doubt**2
         moved: NDArray[np.float64] = move(
             self.qpos[None], min(span, _LONGEST_EXTRAPOLATION) * self.velocity[None]
         )[0]
@@ -219,7 +220,7 @@ class HandState:
         """Standard deviation of the markers in each direction [m]; None if not yet known."""
         if np.median(self._bias_frames) < _LEARNING_FRAMES:
             return None
-        return max(float(np.sqrt(np.median(self._variance))), self.config.marker_noise)
+        return max(float(np.sqrt(np.median(self._learned_variance))), self.config.marker_noise)
 
     def presence_log_odds(
         self,
@@ -244,11 +245,11 @@ class HandState:
         unknown = self._prediction(qpos, resting_prior(), (1.0, 1.0))
         estimate = self.fit(targets, qpos, unknown)
         if not (self._bias_frames.any() and estimate.rms < _BIAS_REUSE_RMS):
-            self._bias[:], self._bias_frames[:], self._variance[:] = 0.0, 0.0, 0.0
-            self._shift_markers()
+            self._bias[:], self._bias_frames[:], self._learned_variance[:] = 0.0, 0.0, 0.0
+            self._apply_biases()
             estimate = self.fit(targets, qpos, unknown)
             spread = _INITIAL_SPREAD * estimate.rms
-            self._variance[:] = np.clip(spread, _INITIAL_SPREAD_LEAST, _INITIAL_SPREAD_MOST) ** 2
+            self._learned_variance[:] = np.clip(spread, _INITIAL_SPREAD_LEAST, _INITIAL_SPREAD_MOST) ** 2
             self._left_out = np.isnan(targets[:, 0])
         self._started = time
         self._store(estimate, time)
@@ -262,19 +263,19 @@ class HandState:
     @property
     def biases(self) -> Biases:
         """A copy of the learned biases, for `recall`."""
-        known = (self._bias, self._bias_frames, self._variance, self.variance)
+        known = (self._bias, self._bias_frames, self._learned_variance, self.variance)
         return Biases(*(values.copy() for values in known))
 
     def forget(self, markers: Int[np.ndarray, "K"]) -> None:
         """Reset the biases of some markers, with the initial uncertainty."""
         self._bias[markers], self._bias_frames[markers] = 0.0, 0.0
-        self._variance[markers] = self.variance[markers] = _INITIAL_SPREAD_MOST**2
-        self._shift_markers()
+        self._learned_variance[markers] = self.variance[markers] = _INITIAL_SPREAD_MOST**2
+        self._apply_biases()
 
     def recall(self, biases: Biases) -> None:
         """Restore biases that were copied before."""
-        self._bias[:], self._bias_frames[:], self._variance[:], self.variance[:] = biases
-        self._shift_markers()
+        self._bias[:], self._bias_frames[:], self._learned_variance[:], self.variance[:] = biases
+        self._apply_biases()
 
     def resize(self, hand: GloveFit, origin: HandOrigin, errors: HandErrors | None, keep: float) -> None:
         """Continue with the same hand of another size, and a share of the biases."""
@@ -285,8 +286,8 @@ class HandState:
             self._ranges = digit_ranges(hand)
         self._bias *= keep
         self._bias_frames[:] = self._bias_frames if keep else 0.0
-        np.maximum(self._variance, _INITIAL_SPREAD_LEAST**2, out=self._variance)
-        self._shift_markers()
+        np.maximum(self._learned_variance, _INITIAL_SPREAD_LEAST**2, out=self._learned_variance)
+        self._apply_biases()
 
     def rms_without_bias(self, estimate: HandEstimate) -> float:
         """RMS distance of the markers from the hand's own marker positions, biases included [m]."""
@@ -308,9 +309,9 @@ class HandState:
             self.confirmed,
             self._bias_frames,
             self._bias,
-            self._variance,
+            self._learned_variance,
         )
-        self._shift_markers()
+        self._apply_biases()
 
     def _store(self, estimate: HandEstimate, time: float) -> None:
         """Store an estimate as the state at a time [s]."""
@@ -324,14 +325,14 @@ class HandState:
         elif np.isfinite(square):
             self._usual_square += (square - self._usual_square) / _AVERAGING_FRAMES
 
-    def _shift_markers(self) -> None:
+    def _apply_biases(self) -> None:
         """Shift the hand's markers by their learned biases, and update the typical bias and the variances."""
-        self._typical_bias = _shift_markers(
+        self._typical_bias = _apply_biases(
             self._bias_frames,
             self._left_out,
             self._bias,
             self._designed,
-            self._variance,
+            self._learned_variance,
             self.solver.hand.positions,
         )
 
@@ -429,7 +430,7 @@ def _learn_bias(
 
 
 @kernel
-def _shift_markers(
+def _apply_biases(
     bias_frames: Float[np.ndarray, "M"],
     left_out: Bool[np.ndarray, "M"],
     bias: Float[np.ndarray, "M 3"],
@@ -437,7 +438,7 @@ def _shift_markers(
     variance: Float[np.ndarray, "M"],
     positions: Float[np.ndarray, "M 4 3"],
 ) -> float:
-    """Shift the hand's markers by their biases; return the typical bias, the RMS of the known ones [m]."""
+    """Shift markers by their biases, raise low variances, and return the typical bias [m], an RMS."""
     square, count = 0.0, 0
     for marker in range(len(bias_frames)):
         is_known = bias_frames[marker] > 0.0 and not left_out[marker]  # Slips are not typical.

@@ -32,14 +32,15 @@ _LINK_DISTANCE: Final = 0.085  # [m] least linking distance between neighboring 
 _LINKED_GESTURES: Final = 0.99  # share of gestures in which all markers of a hand must be linked
 _LEAST_LABELED_SHARE: Final = 0.45  # least share of a hand's markers with a label
 SPARE_POINTS: Final = 6
-"""A group with this many points more than a hand has markers may be two touching hands, at the latest."""
-_SPARE_SHARE: Final = 0.3  # the same as share of a hand's markers: ghosts resemble few markers
+"""A group is cut, as two touching hands, if its points outnumber a hand's markers by more than this number or
+`_SPARE_SHARE` of the markers, whichever is less."""
+_SPARE_SHARE: Final = 0.3  # of a hand's markers, because ghosts resemble few markers
 _CUTS: Final = 12  # number of directions of cuts, even over half a sphere
 _CUTS_OF_SEARCH: Final = 6  # directions per search in continuous frames; the next search has the others
 _STRIDE: Final = 5  # step between successive directions, so that any few are spread evenly
 _CUTS_AT_FIRST: Final = 3  # directions tried in the first call; mostly one of them suffices
 _LAST_TURN: Final = _CUTS_OF_SEARCH - _CUTS_AT_FIRST  # turn in which a search ends
-_EXCHANGE_DISTANCE: Final = 0.06  # [m] Digits of two hands closer than this may be exchanged.
+_DIGIT_EXCHANGE_DISTANCE: Final = 0.06  # [m] Digits of two hands closer than this may be exchanged.
 _FITS_AT_A_TIME: Final = 3  # number of labeled clouds fitted at once, the most confident first
 # Steps from each starting pose; enough to distinguish a hand from its mirror image.
 _FIRST_FIT_STEPS: Final = 6
@@ -56,7 +57,9 @@ _FREE_COORDINATES: Final = 20.0  # effective degrees of freedom of a pose
 _SPREAD_BEFORE: Final = 0.002  # [m] prior standard deviation of markers around a fitted pose
 _SPREAD_BEFORE_COORDINATES: Final = 6.0  # number of coordinates that this prior counts for
 _MARKERS_OF_EVIDENCE: Final = 10  # Evidence is required for at most this many markers.
-_LEAST_REPEATED: Final = 0.5  # A hand with this share of that evidence waits for other calls to confirm it.
+# Share of the required evidence from which a hand is remembered; it is initialized once enough later calls
+# find it again.
+_LEAST_REPEATED: Final = 0.5
 _REPETITION: Final = 5.0  # log-odds that each earlier call with the same hand adds
 _SAME_RMS: Final = 0.008  # [m] Markers of one hand in two calls differ by less, up to a rigid motion.
 _CERTAIN_SCORE: Final = 5.5  # log-odds per marker from which no further cloud is tried
@@ -135,7 +138,7 @@ class HandInitializer:
         self._spreads = [state.spread for state in self._states]  # medians take as long as a fit
         initialized: list[InitializedHand] = []
         cut = False
-        least = min((self._least(index) for index in hands), default=0)
+        least = min((self._fewest_labeled(index) for index in hands), default=0)
         for group in linked_groups(points, self._link_distance):
             if not least <= len(group) <= MOST_POINTS:
                 continue
@@ -172,8 +175,11 @@ class HandInitializer:
         return self._config.least_evidence * min(_MARKERS_OF_EVIDENCE, self._states[index].num_markers)
 
     def _least_share(self, index: int) -> float:
-        """Share of that evidence from which on repetitions count; 1 where half of the markers have it."""
-        is_enough = self.score(self._least(index), self._config.marker_noise) >= self._needed(index)
+        """Share of the required evidence from which a hand may wait for repetitions.
+
+        It is 1, no waiting, where the fewest allowed markers suffice.
+        """
+        is_enough = self.score(self._fewest_labeled(index), self._config.marker_noise) >= self._needed(index)
         return 1.0 if is_enough else _LEAST_REPEATED
 
     def _is_evident(self, hand: InitializedHand) -> bool:
@@ -217,8 +223,8 @@ class HandInitializer:
         peak = peak_log_odds(np.array([variance]), self._config.stray_density)
         return float(count * peak[0] - 0.5 * (square / variance + taken))
 
-    def _least(self, index: int) -> int:
-        """Least number of labeled points of a hand."""
+    def _fewest_labeled(self, index: int) -> int:
+        """Fewest labeled points of a hand."""
         share = _LEAST_LABELED_SHARE * self._states[index].num_markers
         return max(FEWEST_MARKERS, int(np.ceil(share)))
 
@@ -230,7 +236,7 @@ class HandInitializer:
             return self._better(None, group, [group], hands, may_repeat=True)
         best: InitializedHand | None = None
         for turn in range(len(cuts) - _CUTS_AT_FIRST + 1) if self._at_once else [search.turn]:
-            clouds = self._clouds(group, cuts, turn)
+            clouds = self._clouds_of_turn(group, cuts, turn)
             best = self._better(best, group, clouds, hands, may_repeat=True)
             if best is not None and self._is_certain(best):
                 return best
@@ -242,7 +248,7 @@ class HandInitializer:
             return None
         if search.best_turn == search.turn:
             return best
-        clouds = self._clouds(group, cuts, search.best_turn)
+        clouds = self._clouds_of_turn(group, cuts, search.best_turn)
         return self._better(best, group, clouds, hands, may_repeat=True)
 
     def _labeled(self, clouds: Sequence[NDArray[np.int64]]) -> list[NDArray[np.int64]]:
@@ -292,7 +298,7 @@ class HandInitializer:
         numbers = _STRIDE * (self._first_cut + np.arange(count)) % _CUTS
         return numbers[np.argsort(-(self._points[group] @ self._directions[numbers].T).std(axis=0))]
 
-    def _clouds(
+    def _clouds_of_turn(
         self, group: NDArray[np.int64], cuts: NDArray[np.int64], turn: int
     ) -> list[NDArray[np.int64]]:
         """Clouds of a turn: the whole group and its halves along three cuts, then those of one more cut."""
@@ -346,7 +352,7 @@ class HandInitializer:
             )
             if not len(ours) or not len(theirs):
                 continue
-            if distances_to_nearest(points[ours], points[theirs]).min() > _EXCHANGE_DISTANCE:
+            if distances_to_nearest(points[ours], points[theirs]).min() > _DIGIT_EXCHANGE_DISTANCE:
                 continue
             first, second = one.labels.copy(), two.labels.copy()
             first[ours], second[theirs] = -1, -1
@@ -396,7 +402,7 @@ class HandInitializer:
         """Fit a hand to labeled points, starting from `near` if given; None if there are too few points."""
         # Unusual poses lower the score; a hand seen recently must fit as well as before.
         count, state = int((labels >= 0).sum()), self._states[index]
-        if count < self._least(index):
+        if count < self._fewest_labeled(index):
             return None
         targets = targets_of(self._points, labels, state.num_markers)[None]
         start, steps = (None, _FIRST_FIT_STEPS) if near is None else (near.qpos, _REFIT_STEPS)
@@ -445,7 +451,7 @@ def label_alone(
     frames: Sequence[Float[np.ndarray, "N 3"]],
     hands: Sequence[GloveFit],
     labeler: Labeler,
-    told: Callable[[int], None] = lambda count: None,
+    on_count: Callable[[int], None] = lambda count: None,
 ) -> tuple[Int[np.ndarray, "P"], Float[np.ndarray, "P"]]:
     """Label every frame by itself; a hand is present if a pose fits.
 
@@ -455,8 +461,8 @@ def label_alone(
     found = []
     for points in frames:
         found.append(finder.initialize(points, range(len(hands))))
-        told(len(found))
-    clouds = _clouds(frames, found, hands[0].layout.num_markers)
+        on_count(len(found))
+    clouds = _clouds_to_label(frames, found, hands[0].layout.num_markers)
     labelings = labeler.label_frames([frames[number][cloud] for number, _, cloud in clouds])
     labels = [np.full(len(points), -1) for points in frames]
     confidence = [np.ones(len(points)) for points in frames]
@@ -466,7 +472,7 @@ def label_alone(
     return np.concatenate(labels), np.concatenate(confidence)
 
 
-def _clouds(
+def _clouds_to_label(
     frames: Sequence[Float[np.ndarray, "N 3"]],
     found: Sequence[Sequence[InitializedHand]],
     num_markers: int,
@@ -493,11 +499,20 @@ def _clouds(
 def linked_groups(points: Float[np.ndarray, "N 3"], distance: float) -> list[NDArray[np.int64]]:
     """Indices of points linked by steps of at most `distance` [m], the largest group first."""
     near = ((points[:, None] - points) ** 2).sum(axis=-1) <= distance**2
-    before, number = np.zeros(0, dtype=np.int64), np.arange(len(points))
-    while not np.array_equal(before, number):  # Each point takes the least number of its neighbors.
-        before, number = number, np.where(near, number, len(points)).min(axis=1, initial=len(points))
-    groups = [np.flatnonzero(number == one) for one in dict.fromkeys(number)]
+    numbers = connected_components(np.stack(np.nonzero(near)), len(points))
+    groups = [np.flatnonzero(numbers == one) for one in range(numbers.max(initial=-1) + 1)]
     return sorted(groups, key=len, reverse=True)
+
+
+def connected_components(links: Int[np.ndarray, "2 K"], count: int) -> Int[np.ndarray, "N"]:
+    """Component number of each of N nodes of a graph; importing scipy.sparse.csgraph takes longer."""
+    least, before = np.arange(count), np.full(count, -1)
+    while (least != before).any():
+        before = least.copy()
+        for one, other in (links, links[::-1]):
+            np.minimum.at(least, before[one], before[other])
+        least = least[least]  # halves each node's distance to its component's least node
+    return np.asarray(np.unique(least, return_inverse=True)[1])
 
 
 def distances_to_nearest(

@@ -28,7 +28,7 @@ _GATE: Final = 16.0  # gate of a fitted point, as squared Mahalanobis distance: 
 _PREDICTION_SPREAD: Final = 0.004  # [m] least standard deviation of a prediction
 _PREDICTION_FACTOR: Final = 2.0  # standard deviation of a prediction over that of the other markers
 _MOST_GATED_SHARE: Final = 0.3  # With a larger share outside the gate the prediction is wrong.
-EXCHANGE_DISTANCE: Final = 0.04  # [m] IDs of points closer than this may be exchanged.
+ID_EXCHANGE_DISTANCE: Final = 0.04  # [m] IDs of points closer than this may be exchanged.
 _EXCHANGE_MARGIN: Final = 8.0  # least log-odds for an exchange, as systems rarely exchange IDs
 _EXCHANGE_SPREAD: Final = 0.002  # [m] least standard deviation of the offset between two predicted markers
 _EXCHANGE_CONFIDENCE: Final = 0.5
@@ -92,7 +92,7 @@ def _exchange(
                     apart = seen[i, k] - seen[j, k]
                     gain -= apart * (markers[i, k] - markers[j, k]) / variance
                     square += apart * apart
-                if gain > most and square <= EXCHANGE_DISTANCE**2 and free[i] and free[j]:
+                if gain > most and square <= ID_EXCHANGE_DISTANCE**2 and free[i] and free[j]:
                     most, one, other = gain, i, j
         if one < 0:
             return changed[:count]
@@ -207,8 +207,8 @@ class LabelerReview:
         self._config = config
         self._wait = np.full(num_hands, _FIRST_REVIEW_WAIT)  # [s] between a hand's reviews
         self._last = np.full(num_hands, -np.inf)  # [s] of each hand's last review
+        # Per hand and change: number of successive reviews in which it was better, but not by enough.
         self._earlier: list[dict[tuple[int, int], int]] = [{} for _ in range(num_hands)]
-        # counts successive reviews in which the same new labels were better, but not by enough
         self._open: list[frozenset[int]] = [frozenset()] * num_hands  # IDs near missing markers
 
     def restart(self, index: int, time: float) -> None:
@@ -299,7 +299,8 @@ class LabelerReview:
         gain -= _MOVED_LABEL_LOG_ODDS * (len(named) - len(fresh))
         presence = track.state.presence_log_odds(frame.first_seen, frame.free_since, before)
         presence = presence[fresh, proposed[fresh]]
-        # The review doubts exactly that the marker was seen elsewhere, unless the point was long beside it.
+        # The review questions whether the marker was rightly seen elsewhere, so that penalty becomes a
+        # smaller one, unless the point was beside the marker for long.
         doubted = (presence >= SEEN_ELSEWHERE) & (presence <= SEEN_ELSEWHERE + MOST_AGE_LOG_ODDS)
         return float(gain + presence[~doubted].sum() + _DOUBTED_PRESENCE * doubted.sum())
 

@@ -16,7 +16,12 @@ from numpy.typing import NDArray
 
 from handsim.hand.shape import DIGITS
 from handsim.kernels import kernel, point_distance
-from track.association.digit_hypotheses import IMPOSSIBLE, DigitHypotheses, empty_hypotheses, evaluate_digit
+from track.association.digit_hypotheses import (
+    EXCLUDED_SCORE,
+    DigitHypotheses,
+    empty_hypotheses,
+    evaluate_digit,
+)
 from track.association.frame_state import FrameState, Numbering, match_log_odds, match_points
 from track.association.hand_state import HandState, HandTrack
 
@@ -278,7 +283,7 @@ def _assign_group(
     """`assign_jointly` for a group of digits that share points directly or indirectly."""
     most = hypotheses.scores.shape[1]
     rows, counts = np.zeros((len(group), most), dtype=np.int64), np.zeros(len(group), dtype=np.int64)
-    scores, sets = np.full((len(group), most), -IMPOSSIBLE), np.zeros((len(group), most), dtype=np.int64)
+    scores, sets = np.full((len(group), most), EXCLUDED_SCORE), np.zeros((len(group), most), dtype=np.int64)
     bits = np.full(len(assigned), -1)
     num_bits = 0  # at most 61: ten digits with seven candidates, each sharing one with another
     for index, digit in enumerate(group):
@@ -317,7 +322,7 @@ def _sort_rows(scores: Float[np.ndarray, "S"], rows: Int[np.ndarray, "S"]) -> in
     """Write the possible rows to `rows`, the best first; return their number."""
     count = 0
     for row in range(len(scores)):
-        if scores[row] <= -IMPOSSIBLE:
+        if scores[row] <= EXCLUDED_SCORE:
             continue
         index = count
         while index > 0 and scores[rows[index - 1]] < scores[row]:
@@ -342,7 +347,7 @@ def best_combination(
     for digit in range(digits - 1, -1, -1):
         bound[digit] = bound[digit + 1] + scores[digit, 0]
     row, total, used = np.full(digits, -1), np.zeros(digits + 1), np.zeros(digits + 1, dtype=np.int64)
-    most, digit = -IMPOSSIBLE, 0
+    most, digit = EXCLUDED_SCORE, 0
     while digit >= 0:
         row[digit] += 1
         chosen = row[digit]

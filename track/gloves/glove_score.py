@@ -428,12 +428,6 @@ def _root_mean(squares: Float[np.ndarray, "T 20"]) -> Float[np.ndarray, "20"]:
     return np.sqrt(sums / np.where(known.any(axis=0), known.sum(axis=0), np.nan))
 
 
-def right_shares(truth: Take, take: Take) -> tuple[Float[np.ndarray, "M"], float]:
-    """Share of the frames in which each marker of the true hands is right, and share of right frames."""
-    share, report = _counted(truth, take)
-    return share.mean(axis=0), report.figures["frame_accuracy"]
-
-
 def _counted(truth: Take, take: Take) -> tuple[Float[np.ndarray, "H M"], LabelingReport]:
     """Share of the frames in which each marker of each true hand is right, and the count of the true labels.
 

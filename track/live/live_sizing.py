@@ -55,7 +55,7 @@ class _Measured(NamedTuple):
 
     users: Sequence[User] = ()
     """Hands in small steps towards their measured size; empty if no hand was found."""
-    told: Sequence[str] = ()
+    warnings: Sequence[str] = ()
     """Warnings about glove, hands, labels or scale."""
     is_relabeled: bool = False
     """Whether other labels are likelier than those of hands in the glove as designed."""
@@ -185,10 +185,10 @@ class LiveSizing(Closing):
         try:
             found = measuring.result()
         except (HandSimError, BrokenProcessPool) as error:
-            found = _Measured(told=[str(error)])
+            found = _Measured(warnings=[str(error)])
             if isinstance(error, BrokenProcessPool):
                 self._processes = None
-        for sentence in found.told:
+        for sentence in found.warnings:
             warnings.warn(sentence, HandSimWarning, stacklevel=4)
         if not found.users:
             self._reason = "not measured yet: no hand was found"
@@ -221,7 +221,7 @@ def _measure(
     after = measured = setup.user
     told = [str(one.message) for one in caught if issubclass(one.category, HandSimWarning)]
     if not after.notes.startswith(MEASURED):
-        return _Measured(told=told)
+        return _Measured(warnings=told)
     if judges:
         setup, sentences = judged_setup(frames, setup)
         after, told = setup.user, told + sentences

@@ -19,6 +19,7 @@ from gloves.takes.points import PointList
 from gloves.takes.take import LOST, TRACKED, Take
 from handsim.app.workers import LocalProcesses, can_be_sent
 from handsim.hand.shape import NUM_QPOS
+from track.association.initialization import connected_components
 from track.frames import StreamedFrame, TrackedHand
 from track.takes.label_confidence import label_confidence
 from track.tracker import Tracker
@@ -60,18 +61,20 @@ def label_both_ways(
     `on_count` is called with the number of frames done.
     """
     forward, backward = _both_ways(take, frames, new_tracker, on_count, helper)
-    points, one, other = take.point_list, forward.take.point_list.labels, backward.take.point_list.labels
-    is_second = np.zeros(one.shape, dtype=bool)
-    events = _events_of(points.frames, one, other)
-    is_second[events.points] = _is_likelier(backward.take, forward.take, events)
+    points, forward_labels = take.point_list, forward.take.point_list.labels
+    backward_labels = backward.take.point_list.labels
+    takes_backward = np.zeros(forward_labels.shape, dtype=bool)
+    events = _events_of(points.frames, forward_labels, backward_labels)
+    takes_backward[events.points] = _is_likelier(backward.take, forward.take, events)
     is_better = backward.evidence > forward.evidence
-    for run in _exchanges(points, one, other, len(take.hand_labels[0])):  # Which hand is which
+    # Where the directions exchange the hands, one direction decides for the whole run.
+    for run in _exchanges(points, forward_labels, backward_labels, len(take.hand_labels[0])):
         is_better[run] = backward.evidence[run].sum() > forward.evidence[run].sum()
-        is_second[points.starts[run.start] : points.starts[run.stop]] = is_better[run.start]
-    labels = np.where(is_second, other, one)
+        takes_backward[points.starts[run.start] : points.starts[run.stop]] = is_better[run.start]
+    labels = np.where(takes_backward, backward_labels, forward_labels)
     qpos, rms = _poses(forward.take, backward.take, is_better)
     right = label_confidence(_posed(take, labels, qpos, rms))
-    odds = np.where(one == other, _AGREEMENT_ODDS, 1.0)
+    odds = np.where(forward_labels == backward_labels, _AGREEMENT_ODDS, 1.0)
     confidence = odds * right / (1.0 - right + odds * right)
     return dataclasses.replace(
         take, point_list=dataclasses.replace(points, labels=labels, confidence=confidence)
@@ -168,18 +171,7 @@ def _events_of(
     links = np.concatenate(
         [[order[:-1][follows], order[1:][follows]], [with_first[mine], with_second[others]]], axis=1
     )
-    return _Events(points, _components(links, len(rows)))
-
-
-def _components(links: Int[np.ndarray, "2 K"], count: int) -> Int[np.ndarray, "N"]:
-    """Component number of each of N nodes of a graph; importing scipy.sparse.csgraph takes longer."""
-    least, before = np.arange(count), np.full(count, -1)
-    while (least != before).any():
-        before = least.copy()
-        for one, other in (links, links[::-1]):
-            np.minimum.at(least, before[one], before[other])
-        least = least[least]  # halves each node's distance to its component's least node
-    return np.asarray(np.unique(least, return_inverse=True)[1])
+    return _Events(points, connected_components(links, len(rows)))
 
 
 def _is_likelier(take: Take, other: Take, events: _Events) -> Bool[np.ndarray, "E"]:

@@ -26,7 +26,7 @@ _FEWEST: Final = 10  # frames needed to estimate the usual residual of a marker
 _LINK: Final = 0.015  # [m] largest motion within the hand between frames, without lasting IDs
 _EXCHANGE: Final = 0.005  # [m] smallest jump of points whose IDs were exchanged
 _BESIDE: Final = 0.1  # [m] radius within which points belong to one hand
-_SHORT: Final = 20.0  # Lives of at least this many frames count as long.
+_LONG_LIFE: Final = 20.0  # Lives of at least this many frames count as long.
 _FAR: Final = 1.0  # [m] stands for the distance of a missing neighbor
 _MOST_OFF: Final = 100.0  # upper bound of a residual in the evidence, in usual residuals
 _REPEATED: Final = 0.005  # [m] Points that come and go within this distance in a hand may be one marker.
@@ -71,7 +71,7 @@ def evidence_of(take: Take) -> Evidence:
     starts = np.searchsorted(frames, np.arange(take.num_frames + 1))
     lives = _follow(points, listed.ids[chosen].astype(np.int64), starts, centers, _LINK, _EXCHANGE)
     own, others, length = _lives(lives, labels, count)
-    of_life, short = np.log1p(others / own), np.log(_SHORT / np.minimum(length, _SHORT))
+    of_life, short = np.log1p(others / own), np.log(_LONG_LIFE / np.minimum(length, _LONG_LIFE))
     which, free = np.flatnonzero(labels >= 0), np.flatnonzero(labels < 0)
     seen = take.observed(range(count))
     residuals, markers = np.linalg.norm(seen - expected, axis=-1), labels.copy()
@@ -88,7 +88,7 @@ def evidence_of(take: Take) -> Evidence:
         *of_hand[which].T,
         _improbable(take, owners)[frame, label],
     ]
-    is_brief, repeats = (near[0] < _BESIDE) & (length[free] < _SHORT), np.zeros(len(free))
+    is_brief, repeats = (near[0] < _BESIDE) & (length[free] < _LONG_LIFE), np.zeros(len(free))
     brief = free[is_brief]
     nearest = markers[brief]
     rotations = quaternion_matrix(take.qpos[frames[brief], owners[nearest], 3:7])
@@ -280,14 +280,14 @@ def label_confidence(take: Take) -> Float[np.ndarray, "P"]:
     confidence = take.point_list.confidence.copy()
     if not np.isfinite(take.qpos).any():
         return confidence
-    told = evidence_of(take)
-    labeled = told.labels >= 0
+    evidence = evidence_of(take)
+    labeled = evidence.labels >= 0
     right = np.zeros(len(labeled))
     for which, values, weights in (
-        (labeled, told.labeled, _LABELED),
-        (~labeled, told.unlabeled, _UNLABELED),
+        (labeled, evidence.labeled, _LABELED),
+        (~labeled, evidence.unlabeled, _UNLABELED),
     ):
         right[which] = 1.0 / (1.0 + np.exp(weights[0] + values @ np.array(weights[1:])))
-    right[labeled] *= label_probability(take)[told.labels[labeled]]
-    confidence[told.points] = right
+    right[labeled] *= label_probability(take)[evidence.labels[labeled]]
+    confidence[evidence.points] = right
     return confidence

@@ -17,6 +17,7 @@ from gloves.captures.capture import runs_of
 from gloves.takes.take import Take
 from handsim.hand.capsules import Capsules, overlap_between
 from handsim.hand.shape import DIGITS, JOINT_NAMES, Side, bones_of
+from handsim.pages import joint_words
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -27,7 +28,7 @@ FIGURES: Final = (
     *("duration [s]", "least [deg]", "largest [deg]", "range [deg]"),
     *("least velocity [deg/s]", "largest velocity [deg/s]"),
 )
-"""What is told of a joint in a cycle; velocities have their signs, so that the least is that of extension."""
+"""Figures of a joint in a cycle. Velocities are signed, so the least is the quickest extension."""
 _RISE, _REST = 0.5, 0.2
 """In a cycle a joint rises and falls by at least this share of its range, from the lowest part of it on."""
 _LEAST_RANGE: Final = 10.0  # [deg] A joint that moves less has no cycles.
@@ -124,9 +125,7 @@ def draw_cycles(figure: Figure, cycles: Cycles, colors: tuple[str, ...]) -> None
     for number, (digit, panel) in enumerate(zip(DIGITS, panels, strict=True)):
         own = slice(4 * number, 4 * number + 4)
         for mean, spread, name, color in zip(means[own], spreads[own], JOINT_NAMES[own], colors, strict=True):
-            panel.plot(
-                PERCENTS, mean, color=color, linewidth=1.3, label=name.split("_", 1)[1].replace("_", " ")
-            )
+            panel.plot(PERCENTS, mean, color=color, linewidth=1.3, label=joint_words(name))
             panel.fill_between(PERCENTS, mean - spread, mean + spread, color=color, alpha=0.15, linewidth=0.0)
         panel.set_title(digit, fontsize=9)
         panel.set_xlabel("cycle [%]")

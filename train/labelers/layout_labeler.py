@@ -187,9 +187,9 @@ def sample_worn_markers(
     return np.concatenate(parts)
 
 
-def is_learned(layout: MarkerLayout, rig: CameraRig | str = "figure5") -> bool:
+def is_learned(layout: MarkerLayout) -> bool:
     """Whether the cache has a labeler of a glove."""
-    return _file_of(layout, rig).exists()
+    return _file_of(layout).exists()
 
 
 def learned_labeler(layout: MarkerLayout, rig: CameraRig | str = "figure5") -> LayoutLabeler:
@@ -221,7 +221,7 @@ def _digest(layout: MarkerLayout, rig: CameraRig | str) -> str:
     return hashlib.sha256(json.dumps(dependencies, sort_keys=True).encode()).hexdigest()[:32]
 
 
-def _file_of(layout: MarkerLayout, rig: CameraRig | str) -> Path:
+def _file_of(layout: MarkerLayout, rig: CameraRig | str = "figure5") -> Path:
     """Path of a glove's labeler in the cache."""
     return learned_folder() / f"{_digest(layout, rig)}{LEARNED}"
 

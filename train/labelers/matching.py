@@ -42,16 +42,16 @@ SINKHORN: Final = {
     "least_probability": _MIN_PROBABILITY,
 }
 """Constants of `balance`, for other programs."""
-IMPOSSIBLE: Final = 1e6
+EXCLUDED_COST: Final = 1e6
 """Cost of an excluded pair."""
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 _SURE: Final = 0.95  # Pairs of a higher probability are final.
 _MAX_UNSURE: Final = 8  # number of least certain pairs of a labeling that are excluded in turn
-_ROUNDS: Final = 3  # largest number of pairs excluded from a labeling
-_WIDTH: Final = 3  # number of best labelings with which the next round starts
-_MAX_LABELINGS: Final = 1 + _MAX_UNSURE * (1 + (_ROUNDS - 1) * _WIDTH)
+_MAX_EXCLUDED_PAIRS: Final = 3  # largest number of pairs excluded from a labeling
+_BEAM_WIDTH: Final = 3  # number of best labelings with which the next round starts
+_MAX_LABELINGS: Final = 1 + _MAX_UNSURE * (1 + (_MAX_EXCLUDED_PAIRS - 1) * _BEAM_WIDTH)
 _MAX_EXTRA_COST: Final = 14.0  # [nats, for points plus labels] above the cost of the likeliest labeling
 _PRIOR_WEIGHT: Final = 2.0  # weight of the prior's log-density, chosen on held-out simulated frames
 _GHOST: Final = 4.0  # log-density of a ghost, uniform around the hand [1/m^3]
@@ -205,11 +205,11 @@ def matching_constants() -> dict[str, float]:
     """Constants of `match_scores`, for other programs such as that of docs/how_to/onnx.md."""
     return {
         **SINKHORN,
-        "impossible": IMPOSSIBLE,
+        "impossible": EXCLUDED_COST,
         "sure": _SURE,
         "most_unsure": _MAX_UNSURE,
-        "rounds": _ROUNDS,
-        "width": _WIDTH,
+        "rounds": _MAX_EXCLUDED_PAIRS,
+        "width": _BEAM_WIDTH,
         "farthest": _MAX_EXTRA_COST,
         "prior_weight": _PRIOR_WEIGHT,
         "ghost": _GHOST,
@@ -270,8 +270,8 @@ def _verify(
     near_table = means_by_marker(prior.means, near)
     found = np.empty((_MAX_LABELINGS, len(points)), dtype=np.int64)
     scores, densities = np.empty(_MAX_LABELINGS), np.empty(_MAX_LABELINGS)
-    taken = np.full((_MAX_LABELINGS, _ROUNDS), -1)  # points of excluded pairs
-    columns = np.full((_MAX_LABELINGS, _ROUNDS), -1)  # labels of excluded pairs
+    taken = np.full((_MAX_LABELINGS, _MAX_EXCLUDED_PAIRS), -1)  # points of excluded pairs
+    columns = np.full((_MAX_LABELINGS, _MAX_EXCLUDED_PAIRS), -1)  # labels of excluded pairs
     rank = prior.directions.shape[3]
     kept = _Factors(
         np.empty((_MAX_LABELINGS, len(prior.means[0])), dtype=np.bool_),
@@ -280,9 +280,9 @@ def _verify(
         np.zeros(2, np.int64),
     )
     front, num_front, num_found = np.zeros(_MAX_LABELINGS, dtype=np.int64), 1, 0
-    for step in range(_ROUNDS + 1):
+    for step in range(_MAX_EXCLUDED_PAIRS + 1):
         first = num_found
-        for parent in front[: min(num_front, _WIDTH)]:
+        for parent in front[: min(num_front, _BEAM_WIDTH)]:
             unsure = _least_sure(probabilities, found[parent]) if step else np.zeros(1, np.int64)
             for point in unsure:
                 cost, fresh = least, labels
@@ -388,9 +388,9 @@ def _assign_without(
     rest, without = costs.copy(), reject.copy()
     for number in range(count):
         if labels[number] >= 0:
-            rest[points[number], labels[number]] = IMPOSSIBLE
+            rest[points[number], labels[number]] = EXCLUDED_COST
         else:
-            without[points[number]] = IMPOSSIBLE
+            without[points[number]] = EXCLUDED_COST
     return assign(rest, without)
 
 

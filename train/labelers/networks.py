@@ -28,16 +28,16 @@ from train.data.batches import WHOLE, Batch, Part, Weights, draw_batch
 from train.data.shards import MappedRows
 from train.labelers.cnn_labeler import CNNLabeler, MeanHand
 from train.labelers.cnn_network import DeepLabelCNN, cnn_loss
-from train.labelers.matching import IMPOSSIBLE, SINKHORN
+from train.labelers.matching import EXCLUDED_COST, SINKHORN
 from train.labelers.pose_prior import PosePrior
 from train.labelers.protocol import Labeler, torch_threads
-from train.labelers.set_inference import TrainedSetLabeler
+from train.labelers.set_inference import MESSAGES, TrainedSetLabeler
 from train.settings import CNNConfig, NetworkConfig, SetLabelerConfig, TrainSettings, batch_recipe
 
 _USUAL_POINTS: Final = 20.0  # divisor of the number of points in a cloud
 _MIN_SHARE: Final = 1e-3  # added to shares of poses, so that logarithms are finite
 _EARLY_WEIGHT: Final = 0.3  # weight of the loss of all comparisons but the last
-_IMPOSSIBLE: Final = -1e4  # score of padding
+_PADDING_SCORE: Final = -1e4  # score of padding
 
 _MEAN_HAND_FRAMES: Final = 20_000
 
@@ -80,15 +80,16 @@ class SetLabeler(nn.Module):
         bumps = torch.exp(offsets.square() * (-0.5 / spacing**2))  # (B, K, N, N)
         there = present[..., None].to(points.dtype)  # (B, N, 1)
         profile = (bumps @ there[:, None])[..., 0].transpose(1, 2)  # (B, N, K)
-        about_one = there.sum(1, keepdim=True) / 20.0
+        about_one = there.sum(1, keepdim=True) / _USUAL_POINTS
         features = self.embed(torch.cat([profile, about_one.expand(-1, count, 1)], dim=-1))  # (B, N, W)
         bumps = bumps.reshape(batch, self.config.num_distances, count * count)
         for message_round in self.rounds:
             features = message_round(features, bumps, there)
         features = self.norm(features)
         scores = self.to_scores(features)
-        pooled = (features * there).sum(1) / 20.0
-        by_label = scores[..., :-1].masked_fill(~present[..., None], -1e4).transpose(1, 2)  # (B, M, N)
+        pooled = (features * there).sum(1) / _USUAL_POINTS
+        by_point = scores[..., :-1].masked_fill(~present[..., None], _PADDING_SCORE)
+        by_label = by_point.transpose(1, 2)  # (B, M, N)
         occluded = self.to_occluded(pooled)[..., None]
         return LabelScores(
             torch.log_softmax(scores, dim=-1),
@@ -129,7 +130,7 @@ class PairedScores(nn.Module):
         logs = torch.log(pairs.clamp_min(least))
         costs = torch.log(hidden.clamp_min(least)) - 2.0 * logs[..., :labels]
         numbers = torch.arange(points.shape[1], device=points.device)
-        alone = torch.where(numbers[:, None] == numbers, -logs[..., labels:], IMPOSSIBLE)
+        alone = torch.where(numbers[:, None] == numbers, -logs[..., labels:], EXCLUDED_COST)
         return point_scores, label_scores, pairs, torch.cat([costs, alone], -1)
 
 
@@ -164,7 +165,7 @@ class MessageRound(nn.Module):
         biased = receiver + self.distance_gate.bias[:, None]
         gate = torch.sigmoid(near + biased[..., None] + sender[:, :, None])  # (B, G, N, N)
         values = (self.values(normed) * there).view(batch, count, self.gates, -1).transpose(1, 2)
-        received = (gate @ values).transpose(1, 2).reshape(batch, count, width) / 5.0
+        received = (gate @ values).transpose(1, 2).reshape(batch, count, width) / float(MESSAGES)
         features = features + self.mix(received)
         update: Tensor = self.think(features)
         return features + update
@@ -335,7 +336,7 @@ class Comparison(nn.Module):
         scores = left @ right.transpose(1, 2) / math.sqrt(left.shape[-1])
         if evidence is not None:
             scores = scores + evidence
-        by_label = scores.masked_fill(~present[..., None], _IMPOSSIBLE).transpose(1, 2)
+        by_label = scores.masked_fill(~present[..., None], _PADDING_SCORE).transpose(1, 2)
         points = torch.log_softmax(torch.cat([scores, self.ghost(of_points)], -1), -1)
         labels = torch.log_softmax(torch.cat([by_label, self.occluded(of_markers)], -1), -1)
         soft = torch.exp(0.5 * (points[..., :-1] + labels[..., :-1].transpose(1, 2))) * present[..., None]

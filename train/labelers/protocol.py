@@ -121,9 +121,7 @@ def pad_clouds(
 def check_output(numbers: Float[np.ndarray, "..."]) -> None:
     """Raise a `WeightsError` for NaN in a network's output, which means damaged weights."""
     if np.isnan(numbers).any():
-        raise WeightsError(
-            "the labeler's network gives numbers that are NaN, expected weights that are whole"
-        )
+        raise WeightsError("the labeler's network outputs NaN; its weights are damaged")
 
 
 def label_by_scores(

@@ -27,7 +27,7 @@ Weights = Mapping[str, Floats]
 _EPSILON: Final = np.float32(1e-5)  # that of torch's LayerNorm
 _NEAREST: Final = np.float32(1e-12)  # [m^2] added to squared distances
 _COUNT: Final = np.float32(20.0)  # divisor of sums over the points of a cloud
-_MESSAGES: Final = np.float32(5.0)  # divisor of sums over the senders of messages
+MESSAGES: Final = np.float32(5.0)  # divisor of sums over the senders of messages
 # exp(x) = 2^n exp(r) with r = x - n log(2), and exp(r) a polynomial: accurate to two units in the last place.
 _LIMIT: Final = np.float32(80.0)  # Beyond it the logistic function is 0 or 1 in single precision.
 _LOG2E: Final = np.float32(1.4426950408889634)
@@ -286,7 +286,7 @@ def _exchange(
             for i in range(count):
                 sums[column, i] += gate[g, j * count + i] * value
         for i in range(count):
-            received[i, column] = sums[column, i] / _MESSAGES
+            received[i, column] = sums[column, i] / MESSAGES
     features += _dense(received, rounds.mix, one)
 
 

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int, Shaped
 from gloves.captures.capture import run_lengths
 from handsim.hand.model import HandModel
 from handsim.hand.shape import DIGITS, JOINTS, SIDES
-from handsim.pages import Paint, Section, annotate, color_bar, picture, write_sections
+from handsim.pages import Paint, Section, annotate, color_bar, joint_words, picture, write_sections
 from handsim.space.rig import load_rig
 from train.data.shards import Dataset, hands_name
 from train.reports.hand_plot import slips_picture
@@ -129,9 +129,7 @@ def _draw_angles(
         density = 100.0 * shares[number] / np.diff(edges[number])
         panel.axvspan(joint.low, joint.high, color=Paint.BAND, linewidth=0)
         panel.stairs(density, edges[number], fill=True, color=Paint.BLUE)
-        panel.set_title(
-            joint.name.split("_", 1)[1].replace("_", " "), loc="left", color=Paint.SOFT, fontsize=8.5
-        )
+        panel.set_title(joint_words(joint.name), loc="left", color=Paint.SOFT, fontsize=8.5)
         panel.margins(x=0.03, y=0.08)
         panel.axhline(0.0, color=Paint.LINE, linewidth=0.8)
         panel.plot(

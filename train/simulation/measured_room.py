@@ -27,8 +27,8 @@ from handsim.errors import CaptureError
 from handsim.space.transforms import rigid_fit
 
 AnyTrial = Capture | Take | str | Path
-_A_TRIAL: Final = "a Capture, a Take or the path of a file"
 """A capture; a take, of which only the points are used; or the path of one."""
+_A_TRIAL: Final = "a Capture, a Take or the path of a file"
 _STEP: Final = 4.0  # [m/s] A column whose point moves faster goes on with another one.
 _GATE: Final = 0.02  # [m] A point returns at most this far from where its neighbors predict it.
 _LONG: Final = 1.0  # [s] A point that stays this long is no ghost.
@@ -183,7 +183,8 @@ def _measured(source: AnyTrial) -> _Seen:
     """Figures of one capture."""
     name = f"{source}: " if isinstance(source, str | Path) else ""
     if isinstance(source, str | Path):
-        source = load_take(source) if str(source).lower().endswith(".npz") else read_capture(source)
+        is_take = str(source).lower().endswith((".npz", ".npz.part"))
+        source = load_take(source) if is_take else read_capture(source)
     capture = source.capture() if isinstance(source, Take) else source
     check_unit(unlabeled_frames(capture))
     points = capture.positions[np.isfinite(capture.positions[..., 0]).any(axis=1)]
@@ -257,7 +258,7 @@ def _tracks(points: Float[np.ndarray, "T N 3"], rate: float) -> tuple[Int[np.nda
 
 
 def _chained(tracks: Int[np.ndarray, "T N"], rate: float) -> NDArray[np.int64]:
-    """Tracks as one where a long one follows another: which marker is whose is of no importance here."""
+    """Join long tracks that follow one another, of any markers: only lengths and gaps are measured."""
     numbers, first = np.unique(tracks.ravel(), return_index=True)
     last = tracks.size - 1 - np.unique(tracks.ravel()[::-1], return_index=True)[1]
     counts = np.bincount(tracks[tracks >= 0])

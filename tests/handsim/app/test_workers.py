@@ -187,7 +187,10 @@ GUARDED = 'if __name__ == "__main__":\n    ' + CALL
         (CALL.format(job="own"), "put the call under `if __name__ == "),
         (GUARDED.format(job="own"), ""),
         ('# without if __name__ == "__main__":\n' + CALL.format(job="operator.index"), ""),
-        ("check_workers(2)\n" + GUARDED.format(job="own"), "runs this script again: put the call under "),
+        (
+            "check_workers(2)\n" + GUARDED.format(job="own"),
+            "ran this script again while it started; put the call under ",
+        ),
     ],
 )
 def test_a_script_without_a_main_guard(call, said, piped, tmp_path):

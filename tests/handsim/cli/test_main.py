@@ -159,8 +159,8 @@ def test_errors_name_the_whole_command(capsys):
 def test_our_own_mistakes_are_one_line_and_a_log(invoke, capsys):
     assert invoke(lambda: 1 // 0) == 1
     said = capsys.readouterr().err
-    words = "this is a mistake in handsim, please report it"
-    found = re.fullmatch(rf"handsim fake: unexpected ZeroDivisionError: .*; {words} with (\S+)\n", said)
+    words = "this is a bug in handsim; please report it"
+    found = re.fullmatch(rf"handsim fake: unexpected ZeroDivisionError: .*; {words} and attach (\S+)\n", said)
     assert found is not None, said
     log = Path(found[1])
     assert "Traceback (most recent call last)" in log.read_text() and "test_main.py" in log.read_text()

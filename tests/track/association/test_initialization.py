@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 from scipy.cluster.hierarchy import fclusterdata
-from scipy.sparse.csgraph import minimum_spanning_tree
+from scipy.sparse import coo_array, csgraph
 from scipy.spatial.distance import cdist
 
 from gloves import load_layout
@@ -21,6 +21,7 @@ from track.association.hand_state import HandState
 from track.association.initialization import (
     MOST_POINTS,
     HandInitializer,
+    connected_components,
     distances_to_nearest,
     linked_groups,
     longest_links,
@@ -162,6 +163,14 @@ def test_a_search_goes_on_from_call_to_call_and_no_call_labels_many_clouds(state
     assert labeler.calls[:4] == [7, 2, 2, 2], "the whole group and two halves of it along each direction"
 
 
+def test_connected_parts_are_those_of_scipy(rng):
+    for count in range(60):
+        links = rng.integers(0, max(count, 1), (2, count))
+        graph = coo_array((np.ones(count), links), shape=(count, count))
+        expected = csgraph.connected_components(graph, directed=False)[1] if count else []
+        np.testing.assert_array_equal(connected_components(links, count), expected)
+
+
 @pytest.mark.parametrize("distance", [0.05, 0.1, 0.3])
 def test_groups_are_those_of_single_linkage(rng, distance):
     points = rng.uniform(0.0, 1.0, size=(60, 3))
@@ -175,7 +184,7 @@ def test_groups_are_those_of_single_linkage(rng, distance):
 
 def test_the_longest_link_is_that_of_the_spanning_tree_and_the_nearest_point_is_scipys(rng):
     frames = rng.uniform(0.0, 0.2, size=(20, 13, 3))
-    expected = [minimum_spanning_tree(cdist(points, points)).max() for points in frames]
+    expected = [csgraph.minimum_spanning_tree(cdist(points, points)).max() for points in frames]
     np.testing.assert_allclose(longest_links(frames), expected)
     points, others = rng.normal(size=(7, 3)), rng.normal(size=(4, 3))
     np.testing.assert_allclose(distances_to_nearest(points, others), cdist(points, others).min(axis=1))

@@ -19,7 +19,7 @@ from track import TrackerConfig
 from track.association.frame_state import FrameState, Numbering, targets_of
 from track.association.hand_state import HandState, HandTrack, Prediction
 from track.association.label_consistency import (
-    EXCHANGE_DISTANCE,
+    ID_EXCHANGE_DISTANCE,
     LabelerReview,
     exchange_labels,
     fit_labels,
@@ -141,7 +141,7 @@ def test_exchanged_labels_are_exchanged_back_also_while_the_hand_speeds_up(motio
     points = motion.markers[20] + [0.0, moved, 0.0]
     assigned = np.arange(19)
     assert exchanged(points, assigned, prediction.positions)[0] == []
-    near = np.linalg.norm(points[pair[0]] - points[pair[1]]) < EXCHANGE_DISTANCE
+    near = np.linalg.norm(points[pair[0]] - points[pair[1]]) < ID_EXCHANGE_DISTANCE
     assigned[list(pair)] = pair[::-1]
     changed, labels = exchanged(points, assigned, prediction.positions)
     assert changed == (list(pair) if near else [])

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from handsim.hand.shape import DIGITS
-from track.association.digit_hypotheses import IMPOSSIBLE
+from track.association.digit_hypotheses import EXCLUDED_SCORE
 from track.association.frame_state import Numbering
 from track.association.hand_state import HandState, HandTrack
 from track.association.label_consistency import fit_labels
@@ -181,7 +181,7 @@ def tables(draw: st.DrawFn) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndar
     digits, points = draw(st.integers(1, 5)), draw(st.integers(1, 10))
     counts = np.array(draw(st.lists(st.integers(1, 6), min_size=digits, max_size=digits)))
     scores, sets = (
-        np.full((digits, counts.max()), -IMPOSSIBLE),
+        np.full((digits, counts.max()), EXCLUDED_SCORE),
         np.zeros((digits, counts.max()), dtype=np.int64),
     )
     for digit, count in enumerate(counts.tolist()):
@@ -212,7 +212,7 @@ def test_no_other_choice_is_better(table):
     best = np.full(len(counts), -7)
     total, wanted = best_combination(scores, sets, counts, banned, best), best_of_all(*table)
     if wanted is None:
-        assert total <= -IMPOSSIBLE / 2
+        assert total <= EXCLUDED_SCORE / 2
         return
     assert total == pytest.approx(wanted)
     chosen = np.arange(len(counts)), best

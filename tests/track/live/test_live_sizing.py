@@ -247,7 +247,7 @@ def test_points_that_are_no_hand_are_measured_less_and_less_often(monkeypatch):
         calls.append(len(frames))
         if len(calls) == 1:
             raise ArgumentError("the points fit hands at 0.001 of their size")
-        return live_sizing._Measured(told=["the points fit another glove better"])
+        return live_sizing._Measured(warnings=["the points fit another glove better"])
 
     monkeypatch.setattr(live_sizing, "_measure", measure)
     with pytest.warns(HandSimWarning) as told:

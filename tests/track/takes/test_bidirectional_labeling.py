@@ -5,12 +5,10 @@ from __future__ import annotations
 from types import SimpleNamespace
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from gloves import PointList
 from gloves.takes.take import LOST, TRACKED
-from track.takes.bidirectional_labeling import _components, _events_of, _exchanges, _is_likelier
+from track.takes.bidirectional_labeling import _events_of, _exchanges, _is_likelier
 
 
 def test_runs_of_exchanged_hands_are_found():
@@ -45,11 +43,3 @@ def test_a_direction_that_has_lost_a_hand_does_not_outvote_the_other():
         events = _events_of(frames, labels, none)
         likelier = _is_likelier(take(labels, 0.8, TRACKED), take(none, 0.9, status), events)
         assert (likelier == is_likelier).all()
-
-
-def test_connected_parts_are_those_of_scipy(rng):
-    for count in range(60):
-        links = rng.integers(0, max(count, 1), (2, count))
-        graph = coo_array((np.ones(count), links), shape=(count, count))
-        expected = connected_components(graph, directed=False)[1] if count else []
-        np.testing.assert_array_equal(_components(links, count), expected)

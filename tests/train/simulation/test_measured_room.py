@@ -88,6 +88,13 @@ def test_several_captures_count_together():
     assert both.gaps == labeled().gaps + unlabeled().gaps
 
 
+def test_a_recording_that_was_cut_off_is_a_capture(tmp_path):
+    part = tmp_path / "live.npz.part"
+    take().save(tmp_path / "live.npz")
+    (tmp_path / "live.npz").rename(part)
+    assert repr(measure_room(part)) == repr(unlabeled())
+
+
 def test_what_a_short_labeled_capture_does_not_tell_is_said():
     source = take().labeled_capture()
     markers = Capture(source.names[:5], source.positions[:30, :5], source.rate)
