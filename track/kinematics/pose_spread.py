@@ -59,13 +59,14 @@ _LEAST_FREEDOM: Final = 3  # least number of marker coordinates beyond those tha
 SOURCES: Final = ("noise and gaps", "gluing", "flesh", "person", "palm")
 """Sources of an angle's uncertainty: noisy or unseen markers, their glued places, their motion over the
 bones, what stays of a person (sizes and directions of bones, gestures unlike other people's), and the arch of
-the palm, which is rigid in the model."""
+the palm, of which a model knows a part at most."""
 Measure = Literal["frame", "mean", "peak", "range"]
 """What of an angle is compared between sessions: its value in a frame, its mean, its 5th or 95th percentile
 in a take, or its range of motion, between these."""
 _ARCH: Final = {"ring": 0.13, "little": 0.32}
 """Flexion of the metacarpal over that of its finger, from the flat hand: root mean square of nine recorded
 grasps of four people (benchmarks/palm.py). Where one is large the other is, too."""
+_LEFT_OF_ARCH: Final = 0.5  # What a learned arch leaves of it, in the same grasps.
 _BENT: Final = float(np.deg2rad(50.0))  # the greatest flexion in them; beyond it the arch does not grow
 _METACARPAL: Final = 0.054  # [m] from its hinge to the knuckle, as in benchmarks/palm.py
 CHANGING: Final[dict[Measure, tuple[float, ...]]] = {
@@ -399,11 +400,12 @@ def hand_doubt(digits: Int[np.ndarray, "M"], origin: HandOrigin) -> HandDoubt:
     )
 
 
-def _arch() -> Float[np.ndarray, "46 1"]:
-    """The `HandDoubt.arch` of people: metacarpals that turn about the palm's y axis, each at its hinge."""
-    numbers = np.zeros((NUM_NUMBERS, 1))
-    for digit, share in _ARCH.items():
+def _arch(fit: GloveFit) -> Float[np.ndarray, "46 1"]:
+    """The `HandDoubt.arch` of a hand: metacarpals that turn about the palm's y axis, each at its hinge."""
+    numbers, learned = np.zeros((NUM_NUMBERS, 1)), fit.model.skeleton.arch > 0.0
+    for digit, people in _ARCH.items():
         first = _OWN * DIGITS.index(digit)
+        share = people * (_LEFT_OF_ARCH if learned[DIGITS.index(digit)] else 1.0)
         numbers[[first + 2, first + 4], 0] = -_METACARPAL * share, share
     return numbers
 
@@ -437,7 +439,7 @@ class SpreadModel:
         self._doubt = hand_doubt(digits, origin)
         if errors is not None:
             self._doubt = known_hand(digits, MARKER_NOISE)._replace(errors=errors)
-        self._doubt = self._doubt._replace(arch=_arch())
+        self._doubt = self._doubt._replace(arch=_arch(fit))
 
     def of_pose(
         self, qpos: Float[np.ndarray, "27"], unseen: Float[np.ndarray, "M"], rms: float
