@@ -26,6 +26,8 @@ CARPUS: Final = 0.38
 """Where a finger's carpometacarpal joint lies on the way from the wrist to the knuckle: the carpus of
 Buryanov and Kotiuk. El-shennawy and others (2001, J. Hand Surg. 26A:1030) found the axes of flexion in the
 bases of the metacarpals."""
+MOST_METACARPAL: Final = float(np.deg2rad(27.0))
+"""Largest flexion of a metacarpal [rad]: the range of the fifth that they found; that of the fourth is 20."""
 
 
 @overload
@@ -392,6 +394,17 @@ def _find_velocity(
 
 
 @kernel
+def metacarpal_flexion(arch: float, flexion: float) -> tuple[float, float]:
+    """Flexion of a metacarpal whose MCP joint flexes [rad], and its derivative by that."""
+    angle = arch * flexion
+    if angle > MOST_METACARPAL:
+        return MOST_METACARPAL, 0.0
+    if angle < -MOST_METACARPAL:
+        return -MOST_METACARPAL, 0.0
+    return angle, arch
+
+
+@kernel
 def metacarpal_motion(flexion: float, knuckle: Float[np.ndarray, "3"]) -> tuple[float, float, float, float]:
     """Motion of a metacarpal that flexes about the palm's y axis at its carpometacarpal joint.
 
@@ -440,7 +453,7 @@ def pose_bones(
         for bone in range(1, len(chain)):
             parent, own = pose[chain[bone, 0]], pose[bone]
             if chain[bone, 0] == 0 and arch[bone // 3] != 0.0:
-                flexion = arch[bone // 3] * qpos[frame, 8 + joint]
+                flexion, _ = metacarpal_flexion(arch[bone // 3], qpos[frame, 8 + joint])
                 sine, cosine, x, z = metacarpal_motion(flexion, offsets[bone])
                 for i in range(3):
                     a, c = parent[i, 0], parent[i, 2]
@@ -479,7 +492,8 @@ def pose_digit_axes(wrist: Any, angles: Any, digit: Any, posed: Any, scratch: An
     """
     for joint in range(4):
         scratch[joint, 0], scratch[joint, 1] = np.sin(angles[joint]), np.cos(angles[joint])
-    bent, straight, ahead, above = metacarpal_motion(digit.arch * angles[1], digit.offsets[0])
+    flexion, _ = metacarpal_flexion(digit.arch, angles[1])
+    bent, straight, ahead, above = metacarpal_motion(flexion, digit.offsets[0])
     for row in range(3):  # rows of the frames and of the origins do not depend on each other
         a, b, c, origin = wrist[0][row, 0], wrist[0][row, 1], wrist[0][row, 2], wrist[1][row]
         if digit.arch != 0.0:

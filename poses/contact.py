@@ -14,7 +14,14 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from handsim.hand.capsules import overlap_between
 from handsim.hand.model import HandModel, join_qpos
-from handsim.kernels import CARPUS, kernel, pose_digit_axes, segment_distance_squared, squared_distance
+from handsim.kernels import (
+    CARPUS,
+    MOST_METACARPAL,
+    kernel,
+    pose_digit_axes,
+    segment_distance_squared,
+    squared_distance,
+)
 from handsim.space.transforms import quaternion_matrix, rotation_quaternions
 from poses.motion import PEAK_SPEED, RATE, MotionConfig, minimum_jerk
 from poses.shapes import is_valid, sample_valid_angles
@@ -344,7 +351,7 @@ def digit_parts(model: HandModel, digit: int) -> Digit:
     pairs = capsules.touching_pairs()
     meets[pairs[:, 0], pairs[:, 1]] = meets[pairs[:, 1], pairs[:, 0]] = True
     meets[:, indices] = False
-    bent = skeleton.arch[digit] * np.abs(skeleton.ranges[4 * digit + 1]).max()
+    bent = MOST_METACARPAL if skeleton.arch[digit] > 0.0 else 0.0
     sinks = bent * (1.0 - CARPUS) * np.linalg.norm(skeleton.offsets[first])
     return Digit(
         capsules=indices,

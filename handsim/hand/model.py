@@ -35,7 +35,7 @@ from handsim.hand.shape import (
     named_shape,
 )
 from handsim.hand.skin import HandSurface, build_surface, skin_frames
-from handsim.kernels import CARPUS, pose_bones
+from handsim.kernels import CARPUS, MOST_METACARPAL, pose_bones
 from handsim.space.transforms import MIRROR, are_rigid, axis_angle_matrix, euler_matrix, rigid
 
 if TYPE_CHECKING:
@@ -81,6 +81,7 @@ _PARENT: Final = _CHAIN[_BONE, 0]
 _HINGES: Final = NUM_JOINTS // len(DIGITS)  # joints of a digit
 # A joint moves its own bone and those further out on its digit (J, L).
 _MOVED: Final = (DIGIT_OF_BONE == DIGIT_OF_BONE[_BONE, None]) & (np.arange(NUM_BONES) >= _BONE[:, None])
+_AT_LIMIT: Final = 1e-9  # [rad] A metacarpal that is this near its limit does not flex further.
 _MAX_FRAMES: Final = 1 << 22
 _STEADY: Final = 0.01  # largest deviation of times from a steady rate, in frames
 _MAX_GAP: Final = 0.1  # [s] that interpolation bridges
@@ -134,18 +135,25 @@ def bone_transforms(skeleton: Skeleton, qpos: Float[np.ndarray, "T 27"]) -> Floa
     return np.asarray(pose_bones(np.ascontiguousarray(qpos), *parts))
 
 
-def metacarpal_rotations(
+def metacarpal_flexions(
     skeleton: Skeleton, T_world_bone: Float[np.ndarray, "T L 4 4"]
-) -> Float[np.ndarray, "T 5 3 3"]:
-    """Orientation in the world of the part of the palm that each digit begins at, by where it begins."""
+) -> Float[np.ndarray, "T 5"]:
+    """Flexion of each digit's metacarpal in the palm [rad], by where the digit begins."""
     wrist, rest = T_world_bone[:, PALM, :3, :3], (1.0 - CARPUS) * skeleton.offsets[1::3]
-    if not skeleton.arch.any():
-        return np.repeat(wrist[:, None], len(DIGITS), axis=1)
     begins = T_world_bone[:, 1::3, :3, 3] - T_world_bone[:, None, PALM, :3, 3]
     now = begins @ wrist - CARPUS * skeleton.offsets[1::3]
     across = rest[:, 2] * now[..., 0] - rest[:, 0] * now[..., 2]
-    turns = np.arctan2(across, rest[:, 0] * now[..., 0] + rest[:, 2] * now[..., 2])
-    return wrist[:, None] @ axis_angle_matrix(np.array([0.0, 1.0, 0.0]), turns)
+    return np.asarray(np.arctan2(across, rest[:, 0] * now[..., 0] + rest[:, 2] * now[..., 2]))
+
+
+def metacarpal_rotations(
+    skeleton: Skeleton, T_world_bone: Float[np.ndarray, "T L 4 4"]
+) -> Float[np.ndarray, "T 5 3 3"]:
+    """Orientation in the world of each digit's metacarpal, which is the palm's where it does not flex."""
+    wrist = T_world_bone[:, PALM, None, :3, :3]
+    if not skeleton.arch.any():
+        return np.repeat(wrist, len(DIGITS), axis=1)
+    return wrist @ axis_angle_matrix(np.eye(3)[1], metacarpal_flexions(skeleton, T_world_bone))
 
 
 class Site(NamedTuple):
@@ -393,13 +401,12 @@ def skinned_jacobian(
     lever -= shares.sum(-1).T[..., None] * anchors[:, None]
     jacobian[..., 6:] = np.cross(axes[:, None], lever).swapaxes(-1, -2)
     if model.skeleton.arch.any():  # The flexion of an MCP joint turns its metacarpal, too.
-        flexing = slice(1, None, _HINGES)
-        bases = CARPUS * model.skeleton.offsets[1::3] @ turning + wrist[:, None, :3, 3]
-        lever = (
-            shares[flexing].swapaxes(0, 1) @ carried - shares[flexing].sum(-1).T[..., None] * bases[:, None]
-        )
-        turned = np.cross((model.skeleton.arch[:, None] * wrist[:, None, :3, 1])[:, None], lever)
-        jacobian[..., 6:][..., flexing] += turned.swapaxes(-1, -2)
+        flexing, skeleton = slice(1, None, _HINGES), model.skeleton
+        is_free = np.abs(metacarpal_flexions(skeleton, T_world_bone)) < MOST_METACARPAL - _AT_LIMIT
+        bases, shares = CARPUS * skeleton.offsets[1::3] @ turning + wrist[:, None, :3, 3], shares[flexing]
+        lever = shares.swapaxes(0, 1) @ carried - shares.sum(-1).T[..., None] * bases[:, None]
+        rates = (skeleton.arch * is_free)[..., None] * wrist[:, None, :3, 1]
+        jacobian[..., 6:][..., flexing] += np.cross(rates[:, None], lever).swapaxes(-1, -2)
     return jacobian
 
 

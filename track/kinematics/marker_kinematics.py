@@ -20,6 +20,7 @@ from handsim.hand.shape import DIGIT_OF_BONE, NUM_BONES, NUM_JOINTS
 from handsim.kernels import (
     CARPUS,
     kernel,
+    metacarpal_flexion,
     metacarpal_motion,
     multiply_rotations,
     quaternion_product,
@@ -71,6 +72,7 @@ class Workspace(NamedTuple):
     gradient: Float[np.ndarray, "26"]  # half the gradient of the cost
     factor: Float[np.ndarray, "26 26"]  # buffer for a factor of the normal matrix
     step: Float[np.ndarray, "26"]  # step of the unknowns [rad, m]
+    arch_rates: Float[np.ndarray, "5"]  # derivatives of the metacarpals' flexions by those of the MCP joints
 
 
 class PoseEnergy(NamedTuple):
@@ -137,6 +139,7 @@ def workspace(num_markers: int) -> Workspace:
         np.empty(NUM_UNKNOWNS),
         np.empty((NUM_UNKNOWNS, NUM_UNKNOWNS)),
         np.empty(NUM_UNKNOWNS),
+        np.zeros(NUM_JOINTS // 4),
     )
 
 
@@ -159,7 +162,8 @@ def compute_digit(hand: HandArrays, digit: int, angles: Float[np.ndarray, "4"], 
         for i in range(3):
             work.origins[bone, i] = work.origins[parent, i]
         if link == 0 and hand.arch[digit] != 0.0:  # The metacarpal is the parent.
-            sine, cosine, ahead, above = metacarpal_motion(hand.arch[digit] * angles[1], hand.offsets[bone])
+            flexion, work.arch_rates[digit] = metacarpal_flexion(hand.arch[digit], angles[1])
+            sine, cosine, ahead, above = metacarpal_motion(flexion, hand.offsets[bone])
             work.origins[bone, 0], work.origins[bone, 2] = ahead, above
             own[0, 0], own[0, 1], own[0, 2] = cosine, 0.0, sine
             own[1, 0], own[1, 1], own[1, 2] = 0.0, 1.0, 0.0
@@ -230,9 +234,9 @@ def marker_jacobian(hand: HandArrays, marker: int, work: Workspace) -> None:
                 jacobian[1, hinge] = c * p - a * r
                 jacobian[2, hinge] = a * q - b * p
         if hand.arch[digit] != 0.0:  # The flexion of an MCP joint turns its metacarpal, too.
-            knuckle, flexion = hand.offsets[1 + 3 * digit], 4 * digit + 1
-            jacobian[0, flexion] += hand.arch[digit] * (z - share * CARPUS * knuckle[2])
-            jacobian[2, flexion] -= hand.arch[digit] * (x - share * CARPUS * knuckle[0])
+            rate, knuckle, flexion = work.arch_rates[digit], hand.offsets[1 + 3 * digit], 4 * digit + 1
+            jacobian[0, flexion] += rate * (z - share * CARPUS * knuckle[2])
+            jacobian[2, flexion] -= rate * (x - share * CARPUS * knuckle[0])
     x, y, z = work.markers[marker, 0], work.markers[marker, 1], work.markers[marker, 2]
     jacobian[1, _ROTATION], jacobian[2, _ROTATION] = -z, y
     jacobian[0, _ROTATION + 1], jacobian[2, _ROTATION + 1] = z, -x

@@ -66,7 +66,6 @@ in a take, or its range of motion, between these."""
 _ARCH: Final = {"ring": 0.13, "little": 0.32}
 """Flexion of the metacarpal over that of its finger, from the flat hand: root mean square of nine recorded
 grasps of four people (benchmarks/palm.py). Where one is large the other is, too."""
-_LEFT_OF_ARCH: Final = 0.5  # What a learned arch leaves of it, in the same grasps.
 _BENT: Final = float(np.deg2rad(50.0))  # the greatest flexion in them; beyond it the arch does not grow
 _METACARPAL: Final = 0.054  # [m] from its hinge to the knuckle, as in benchmarks/palm.py
 CHANGING: Final[dict[Measure, tuple[float, ...]]] = {
@@ -400,12 +399,15 @@ def hand_doubt(digits: Int[np.ndarray, "M"], origin: HandOrigin) -> HandDoubt:
     )
 
 
-def _arch(fit: GloveFit) -> Float[np.ndarray, "46 1"]:
-    """The `HandDoubt.arch` of a hand: metacarpals that turn about the palm's y axis, each at its hinge."""
-    numbers, learned = np.zeros((NUM_NUMBERS, 1)), fit.model.skeleton.arch > 0.0
-    for digit, people in _ARCH.items():
+def _arch() -> Float[np.ndarray, "46 1"]:
+    """The `HandDoubt.arch` of people: metacarpals that turn about the palm's y axis, each at its hinge.
+
+    It is that of hands whose arch is known, too: they answer to it with less, and their people keep to it no
+    better in the grasps.
+    """
+    numbers = np.zeros((NUM_NUMBERS, 1))
+    for digit, share in _ARCH.items():
         first = _OWN * DIGITS.index(digit)
-        share = people * (_LEFT_OF_ARCH if learned[DIGITS.index(digit)] else 1.0)
         numbers[[first + 2, first + 4], 0] = -_METACARPAL * share, share
     return numbers
 
@@ -439,7 +441,7 @@ class SpreadModel:
         self._doubt = hand_doubt(digits, origin)
         if errors is not None:
             self._doubt = known_hand(digits, MARKER_NOISE)._replace(errors=errors)
-        self._doubt = self._doubt._replace(arch=_arch(fit))
+        self._doubt = self._doubt._replace(arch=_arch())
 
     def of_pose(
         self, qpos: Float[np.ndarray, "27"], unseen: Float[np.ndarray, "M"], rms: float

@@ -14,7 +14,7 @@ from gloves import load_layout
 from gloves.fit import attach_markers
 from handsim import HandModel, join_qpos, sample_shape
 from handsim.errors import ArgumentError
-from handsim.hand.model import NUM_VELOCITIES, skinned_jacobian
+from handsim.hand.model import NUM_VELOCITIES, metacarpal_flexions, skinned_jacobian
 from handsim.hand.shape import EVERYBODY, JOINT_NAMES, NUM_JOINTS, SIDES, SIZES, named_shape
 from handsim.space.transforms import MIRROR, axis_angle_matrix, random_quaternions
 
@@ -180,6 +180,16 @@ def test_a_metacarpal_flexes_with_its_finger_about_its_base(side):
     base = 0.38 * flat[:3, 3]
     np.testing.assert_allclose(bent[:3, 3], base + palm @ (flat[:3, 3] - base), atol=1e-12)
     assert bent[2, 3] < flat[2, 3] - 0.015  # towards the palm
+
+
+def test_a_metacarpal_flexes_within_its_range():
+    model = HandModel(dataclasses.replace(named_shape("L"), arch=[0.0, 0.5]))
+    angles = np.zeros((3, NUM_JOINTS))
+    angles[:, JOINT_NAMES.index("little_MCP_flexion")] = np.deg2rad([40.0, 60.0, 90.0])
+    bones = model.forward_kinematics(join_qpos(angles))
+    found = np.rad2deg(metacarpal_flexions(model.skeleton, bones))
+    np.testing.assert_allclose(found[:, 4], [20.0, 27.0, 27.0], atol=1e-9)
+    np.testing.assert_allclose(found[:, :4], 0.0, atol=1e-9)
 
 
 @pytest.mark.parametrize("arch", [[-0.1, 0.2], [0.1, 5.0], [0.1, np.nan], [0.1]])
