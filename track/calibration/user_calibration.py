@@ -90,7 +90,7 @@ _ARCHES: Final = {"ring": (0.09, 0.06), "little": (0.25, 0.14)}
 """Share of the first bone's flexion by which the metacarpal flexes: mean and standard deviation among four
 people (benchmarks/palm.py)."""
 _INDEPENDENT_ARCHES: Final = 4.0  # number of frames whose palms leave the usual arch independently, at most
-_ON_KNUCKLE: Final = 0.25  # Palm and first bone each carry more than this of a marker on a knuckle.
+_ON_KNUCKLE: Final = 0.4  # Palm and first bone each carry more than this of a marker on a knuckle.
 _MOST_SHARE: Final = 0.75  # of the flexion of a first bone that its metacarpal has
 _LEAST_TURN: Final = np.deg2rad(0.1)  # [rad] least scatter of a metacarpal around its arch
 _INDEPENDENT_POSES: Final = 14.0  # number of frames with independent deformation of the flesh, at most

@@ -275,5 +275,12 @@ def test_knuckles_show_how_far_metacarpals_flex(arch, rng):
     np.testing.assert_allclose(learned_arch(knuckle_layout(), arch, rng), arch, rtol=0.2, atol=0.03)
 
 
+def test_markers_further_out_do_not_show_it(rng):
+    layout = knuckle_layout()
+    places = [dataclasses.replace(one, along=max(one.along, 0.12)) for one in layout.markers]
+    layout = dataclasses.replace(layout, markers=tuple(places))
+    np.testing.assert_array_equal(learned_arch(layout, [0.1, 0.4], rng), 0.0)
+
+
 def test_a_glove_without_markers_on_knuckles_does_not_show_it(rng):
     np.testing.assert_array_equal(learned_arch(LAYOUT, [0.1, 0.4], rng), 0.0)
