@@ -167,7 +167,7 @@ class Calibration:
         return float(np.sqrt((self.position_errors**2).mean()))
 
     def __str__(self) -> str:
-        """Residuals on held-out frames and error of marker places, in a line [mm]."""
+        """Residuals on held-out frames and error of marker places [mm], and a found arch, in a line."""
         if self.held_out is None:
             return "too few frames to try a calibration on, so that it stays as it was"
         before, after, frames, other_labels = self.held_out
@@ -177,7 +177,13 @@ class Calibration:
             return f"{line}, but it is likelier that {other_labels}, so that it stays as it was"
         if not self.is_better:
             return f"{line}: no better, so that it stays as it was"
-        return f"{line}, their places known to {1e3 * self.place_error:.1f} mm"
+        line += f", their places known to {1e3 * self.place_error:.1f} mm"
+        if (arch := self.hand.shape.arch).any():
+            line += (
+                f", metacarpals of ring and little finger flex {arch[0]:.2f} and {arch[1]:.2f} times as far"
+            )
+            line += " as the MCP joints"
+        return line
 
     @property
     def significant_touches(self) -> tuple[Touch, ...]:

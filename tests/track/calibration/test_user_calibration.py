@@ -212,6 +212,10 @@ def test_what_is_told_is_of_held_out_frames():
     places = f"their places known to {1e3 * better.place_error:.1f} mm"
     off = "markers 4.00 mm off before and 0.20 mm after calibration, on 80 frames held out"
     assert str(better) == f"{off}, {places}"
+    shape = dataclasses.replace(result.hand.shape, arch=[0.05, 0.3])
+    arched = dataclasses.replace(better, hand=GloveFit(HandModel(shape), result.hand.attachment))
+    arch = "metacarpals of ring and little finger flex 0.05 and 0.30 times as far as the MCP joints"
+    assert str(arched) == f"{off}, {places}, {arch}"
     alike = dataclasses.replace(result, held_out=HeldOut(0.004, 0.00395, 80))
     assert not alike.is_better and "no better, so that it stays as it was" in str(alike)
 
