@@ -11,7 +11,7 @@ import hashlib
 import logging
 import multiprocessing
 from collections.abc import Callable
-from typing import Any, ParamSpec, TypeVar, overload
+from typing import Any, Final, ParamSpec, TypeVar, overload
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -22,6 +22,12 @@ from handsim.callbacks import before_compiling
 
 P = ParamSpec("P")
 R = TypeVar("R")
+CARPUS: Final = 0.38
+"""Where a finger's carpometacarpal joint lies on the way from the wrist to the knuckle: the carpus of
+Buryanov and Kotiuk. El-shennawy and others (2001, J. Hand Surg. 26A:1030) found the axes of flexion in the
+bases of the metacarpals."""
+MOST_METACARPAL: Final = float(np.deg2rad(27.0))
+"""Largest flexion of a metacarpal [rad]: the range of the fifth that they found; that of the fourth is 20."""
 
 
 @overload
@@ -388,12 +394,40 @@ def _find_velocity(
 
 
 @kernel
+def metacarpal_flexion(arch: float, flexion: float) -> tuple[float, float]:
+    """Flexion of a metacarpal whose MCP joint flexes [rad], and its derivative by that."""
+    angle = arch * flexion
+    if angle > MOST_METACARPAL:
+        return MOST_METACARPAL, 0.0
+    if angle < -MOST_METACARPAL:
+        return -MOST_METACARPAL, 0.0
+    return angle, arch
+
+
+@kernel
+def metacarpal_motion(flexion: float, knuckle: Float[np.ndarray, "3"]) -> tuple[float, float, float, float]:
+    """Motion of a metacarpal that flexes about the palm's y axis at its carpometacarpal joint.
+
+    Args:
+        flexion: Angle [rad], positive towards the palm.
+        knuckle: Where its head is in the palm at zero [m].
+
+    Returns:
+        Sine and cosine of the angle, and x and z of the point to which the palm's origin moves [m].
+    """
+    sine, cosine = np.sin(flexion), np.cos(flexion)
+    x, z = CARPUS * knuckle[0], CARPUS * knuckle[2]
+    return sine, cosine, x - cosine * x - sine * z, z + sine * x - cosine * z
+
+
+@kernel
 def pose_bones(
     qpos: Float[np.ndarray, "T 27"],
     offsets: Float[np.ndarray, "L 3"],
     rotations: Float[np.ndarray, "L 3 3"],
     axes: Float[np.ndarray, "J 3"],
     chain: Int[np.ndarray, "L 2"],
+    arch: Float[np.ndarray, "5"],
 ) -> Any:
     """`T_world_bone` (T, L, 4, 4) of every bone in every frame, in one pass down the chain.
 
@@ -403,9 +437,10 @@ def pose_bones(
         rotations: Orientation of each bone in its parent's frame at zero angles.
         axes: Unit axis of each joint in the frame of the bone that it moves.
         chain: Parent of each bone, and how many joints move it; parents come first, joints go by bones.
+        arch: Flexion of each digit's metacarpal in the palm over that of its second joint.
     """
     transforms = np.zeros((len(qpos), len(chain), 4, 4))
-    rotation = np.empty((3, 3))
+    rotation, base = np.empty((3, 3)), np.empty((4, 4))
     for frame in range(len(qpos)):
         pose = transforms[frame]
         w, x, y, z = qpos[frame, 3], qpos[frame, 4], qpos[frame, 5], qpos[frame, 6]
@@ -417,6 +452,18 @@ def pose_bones(
         joint = 0
         for bone in range(1, len(chain)):
             parent, own = pose[chain[bone, 0]], pose[bone]
+            if chain[bone, 0] == 0 and arch[bone // 3] != 0.0:
+                flexion, _ = metacarpal_flexion(arch[bone // 3], qpos[frame, 8 + joint])
+                sine, cosine, x, z = metacarpal_motion(flexion, offsets[bone])
+                for i in range(3):
+                    a, c = parent[i, 0], parent[i, 2]
+                    base[i, 0], base[i, 1], base[i, 2] = (
+                        cosine * a - sine * c,
+                        parent[i, 1],
+                        sine * a + cosine * c,
+                    )
+                    base[i, 3] = parent[i, 3] + a * x + c * z
+                parent = base
             for i in range(3):
                 own[i, 3] = parent[i, 3]
                 for j in range(3):
@@ -437,16 +484,21 @@ def pose_digit_axes(wrist: Any, angles: Any, digit: Any, posed: Any, scratch: An
     Args:
         wrist: The wrist's orientation (3, 3) and position (3,) [m] in the world.
         angles: The digit's joint angles (4,) [rad]: two at its first bone, one at each further one.
-        digit: A tuple with the fields `offsets` (3, 3) [m], `rotations` (3, 3, 3) and `axes` (4, 3) of the
-            digit's bones and joints as `pose_bones` takes them, and `ends` (3, 2, 3), both ends of each
-            bone's capsule in the bone's frame [m].
+        digit: A tuple with the fields `offsets` (3, 3) [m], `rotations` (3, 3, 3), `axes` (4, 3) and `arch`
+            of the digit's bones and joints as `pose_bones` takes them, and `ends` (3, 2, 3), both ends of
+            each bone's capsule in the bone's frame [m].
         posed: Where the axes' ends in the world go (3, 2, 3) [m].
         scratch: Room for the arithmetic (4, 3).
     """
     for joint in range(4):
         scratch[joint, 0], scratch[joint, 1] = np.sin(angles[joint]), np.cos(angles[joint])
+    flexion, _ = metacarpal_flexion(digit.arch, angles[1])
+    bent, straight, ahead, above = metacarpal_motion(flexion, digit.offsets[0])
     for row in range(3):  # rows of the frames and of the origins do not depend on each other
         a, b, c, origin = wrist[0][row, 0], wrist[0][row, 1], wrist[0][row, 2], wrist[1][row]
+        if digit.arch != 0.0:
+            origin = origin + a * ahead + c * above
+            a, c = straight * a - bent * c, bent * a + straight * c
         joint = 0
         for bone in range(3):
             offset, local, ends = digit.offsets, digit.rotations, digit.ends

@@ -14,7 +14,14 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from handsim.hand.capsules import overlap_between
 from handsim.hand.model import HandModel, join_qpos
-from handsim.kernels import kernel, pose_digit_axes, segment_distance_squared, squared_distance
+from handsim.kernels import (
+    CARPUS,
+    MOST_METACARPAL,
+    kernel,
+    pose_digit_axes,
+    segment_distance_squared,
+    squared_distance,
+)
 from handsim.space.transforms import quaternion_matrix, rotation_quaternions
 from poses.motion import PEAK_SPEED, RATE, MotionConfig, minimum_jerk
 from poses.shapes import is_valid, sample_valid_angles
@@ -64,8 +71,10 @@ class Digit(NamedTuple):
     """Radii of the digit's capsules (3,) [m]."""
     meets: NDArray[np.bool_]
     """Capsules of the hand's other parts that each capsule of the digit may collide with (3, K)."""
+    arch: float
+    """Flexion of the metacarpal over that of the second joint."""
     reach: float
-    """Largest distance of the digit's skin from its first joint [m]."""
+    """Largest distance of the digit's skin from where its first joint is at zero angles [m]."""
 
 
 class DigitPaths(NamedTuple):
@@ -342,6 +351,8 @@ def digit_parts(model: HandModel, digit: int) -> Digit:
     pairs = capsules.touching_pairs()
     meets[pairs[:, 0], pairs[:, 1]] = meets[pairs[:, 1], pairs[:, 0]] = True
     meets[:, indices] = False
+    bent = MOST_METACARPAL if skeleton.arch[digit] > 0.0 else 0.0
+    sinks = bent * (1.0 - CARPUS) * np.linalg.norm(skeleton.offsets[first])
     return Digit(
         capsules=indices,
         offsets=skeleton.offsets[first : first + 3],
@@ -350,7 +361,8 @@ def digit_parts(model: HandModel, digit: int) -> Digit:
         ends=np.stack([capsules.starts[indices], capsules.ends[indices]], axis=1),
         radii=capsules.radii[indices],
         meets=meets[indices],
-        reach=float(skeleton.lengths[first : first + 3].sum() + capsules.radii[indices].max()),
+        arch=float(skeleton.arch[digit]),
+        reach=float(skeleton.lengths[first : first + 3].sum() + capsules.radii[indices].max() + sinks),
     )
 
 

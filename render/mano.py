@@ -8,6 +8,7 @@ the first rotations.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from pathlib import Path
 from typing import Any, Final
@@ -283,9 +284,10 @@ class ManoFit:
 
 def mano_fit(path: str, shape: HandShape) -> ManoFit:
     """The fit of a file's hand to a person's; cached, because it takes a second or two."""
-    return _fit(path, np.array([pack_hand(shape)], HAND_DTYPE).tobytes())
+    return _fit(path, np.array([pack_hand(shape)], HAND_DTYPE).tobytes(), tuple(shape.arch.tolist()))
 
 
 @functools.lru_cache(maxsize=64)
-def _fit(path: str, packed: bytes) -> ManoFit:
-    return ManoFit(load_mano(path), HandModel(unpack_hand(np.frombuffer(packed, HAND_DTYPE)[0])))
+def _fit(path: str, packed: bytes, arch: tuple[float, float]) -> ManoFit:
+    shape = unpack_hand(np.frombuffer(packed, HAND_DTYPE)[0])
+    return ManoFit(load_mano(path), HandModel(dataclasses.replace(shape, arch=np.array(arch))))

@@ -280,6 +280,8 @@ def _reason(error: Exception) -> str:
 def _to_json(hand: GloveFit) -> dict[str, Any]:
     shape = dataclasses.asdict(hand.model.shape)
     values = {name: np.asarray(value).tolist() for name, value in shape.items()}
+    if not hand.model.shape.arch.any():  # as files without an arch have it
+        del values["arch"]
     markers = {name: np.asarray(getattr(hand.attachment, name)).tolist() for name in _ARRAYS}
     return {"shape": values, "markers": markers}
 
@@ -287,7 +289,7 @@ def _to_json(hand: GloveFit) -> dict[str, Any]:
 def _from_json(stored: dict[str, Any], layout: MarkerLayout) -> GloveFit:
     fields = {field.name for field in dataclasses.fields(HandShape)}
     shape: dict[str, Any] = stored["shape"]
-    if set(shape) != fields:
+    if set(shape) | {"arch"} != fields:
         raise ValueError(f"a hand's shape has the keys {', '.join(map(str, shape))}")
     values: dict[str, Any] = {
         name: np.asarray(value, dtype=np.float64) if isinstance(value, list) else value

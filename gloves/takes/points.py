@@ -116,6 +116,8 @@ ATTACHMENT: Final = (
     Column("attachment_bone_weights", "<f8", ("M", 4)),
 )
 """Attachments of the gloves, one glove after another."""
+ARCH: Final = Column("arch", "<f8", ("H", 2))
+"""`HandShape.arch` of each hand; files of hands without one lack it."""
 BODY_MARKERS: Final = Column("body_markers", "<f8", ("Q", 3))
 STORED: Final = (*FRAMES, POINT_COUNTS, *POINTS, KEYPOINTS, *ATTACHMENT, BODY_MARKERS)
 """The arrays that every file holds, besides the records of the hands."""
@@ -145,7 +147,7 @@ def check_stored(arrays: Mapping[str, NDArray[Any]], sizes: Mapping[str, int]) -
     """Raise a `ValueError` unless a file's arrays have the types and shapes of the table."""
     if arrays["hands"].dtype != HAND_DTYPE or arrays["hands"].shape != (sizes["H"],):
         raise ValueError("the hands are of another type")
-    for column in (*STORED, *(one for one in (*OPTIONAL, POINT_COLUMNS) if one.name in arrays)):
+    for column in (*STORED, *(one for one in (*OPTIONAL, ARCH, POINT_COLUMNS) if one.name in arrays)):
         array = arrays[column.name]
         if array.dtype != column.dtype or array.shape != column.sized(sizes).shape:
             raise ValueError(f"{column.name} is of type {array.dtype} and shape {array.shape}")

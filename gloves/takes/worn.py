@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 
 from gloves.fit import Attachment, GloveFit
 from gloves.layout import MarkerLayout
-from gloves.takes.points import ATTACHMENT, spans
+from gloves.takes.points import ARCH, ATTACHMENT, spans
 from handsim.hand.model import HandModel
 from handsim.hand.shape import HAND_DTYPE, pack_hand, unpack_hand
 
@@ -48,6 +49,8 @@ def hand_arrays(hands: Sequence[GloveFit]) -> dict[str, NDArray[Any]]:
     for column in ATTACHMENT:
         parts = [getattr(hand.attachment, column.name.removeprefix("attachment_")) for hand in hands]
         arrays[column.name] = np.concatenate(parts).astype(column.dtype)
+    if any(hand.shape.arch.any() for hand in hands):
+        arrays[ARCH.name] = np.array([hand.shape.arch for hand in hands])
     return arrays
 
 
@@ -57,15 +60,19 @@ def unpack_hands(
     """The hands of a file's arrays, one for each layout."""
     fits = []
     parts = spans([layout.num_markers for layout in layouts])
-    for record, layout, span in zip(arrays["hands"], layouts, parts, strict=True):
+    stored = arrays.dtype.names or () if isinstance(arrays, np.void) else arrays
+    arches = arrays[ARCH.name] if ARCH.name in stored else np.zeros((len(layouts), 2))
+    for record, arch, layout, span in zip(arrays["hands"], arches, layouts, parts, strict=True):
         attached = (arrays[column.name][span.start : span.stop] for column in ATTACHMENT)
-        fits.append(GloveFit(HandModel(unpack_hand(record)), Attachment(layout, *attached)))
+        shape = dataclasses.replace(unpack_hand(record), arch=arch)
+        fits.append(GloveFit(HandModel(shape), Attachment(layout, *attached)))
     return tuple(fits)
 
 
 def former_array(former: Sequence[FormerHands], layouts: Sequence[MarkerLayout]) -> NDArray[Any]:
     """The array of a file for earlier hands in gloves of these layouts."""
-    records = np.empty(len(former), _dtype(layouts))
+    arched = any(hand.shape.arch.any() for one in former for hand in one.hands)
+    records = np.zeros(len(former), _dtype(layouts, arched=arched))
     for record, one in zip(records, former, strict=True):
         record["stop"], record["notes"] = one.stop, one.notes.encode()[: records.dtype["notes"].itemsize]
         for name, array in hand_arrays(one.hands).items():
@@ -75,7 +82,7 @@ def former_array(former: Sequence[FormerHands], layouts: Sequence[MarkerLayout])
 
 def unpack_former(records: NDArray[Any], layouts: Sequence[MarkerLayout]) -> tuple[FormerHands, ...]:
     """The earlier hands of a file's array; raises a `ValueError` if it is of another type."""
-    if records.dtype != _dtype(layouts) or records.ndim != 1:
+    if records.dtype not in [_dtype(layouts, arched=arched) for arched in (False, True)] or records.ndim != 1:
         raise ValueError("former hands of another type")
     return tuple(
         FormerHands(int(one["stop"]), unpack_hands(one, layouts), one["notes"].decode(errors="ignore"))
@@ -83,7 +90,8 @@ def unpack_former(records: NDArray[Any], layouts: Sequence[MarkerLayout]) -> tup
     )
 
 
-def _dtype(layouts: Sequence[MarkerLayout]) -> np.dtype[Any]:
+def _dtype(layouts: Sequence[MarkerLayout], *, arched: bool) -> np.dtype[Any]:
     num_markers = sum(layout.num_markers for layout in layouts)
     columns = [(column.name, column.dtype, (num_markers, *column.entry)) for column in ATTACHMENT]
+    columns += [(ARCH.name, ARCH.dtype, (len(layouts), *ARCH.entry))] if arched else []
     return np.dtype([("stop", "<i8"), ("notes", _NOTES), ("hands", HAND_DTYPE, (len(layouts),)), *columns])

@@ -35,8 +35,8 @@ from handsim.hand.shape import (
     named_shape,
 )
 from handsim.hand.skin import HandSurface, build_surface, skin_frames
-from handsim.kernels import pose_bones
-from handsim.space.transforms import MIRROR, are_rigid, euler_matrix, rigid
+from handsim.kernels import CARPUS, MOST_METACARPAL, pose_bones
+from handsim.space.transforms import MIRROR, are_rigid, axis_angle_matrix, euler_matrix, rigid
 
 if TYPE_CHECKING:
     import mujoco
@@ -78,8 +78,10 @@ NUM_VELOCITIES: Final = 6 + NUM_JOINTS
 # The first joint of a bone rotates about an axis of the parent, the second about one of the bone.
 _FIRST: Final = np.diff(_BONE, prepend=-1) != 0
 _PARENT: Final = _CHAIN[_BONE, 0]
+_HINGES: Final = NUM_JOINTS // len(DIGITS)  # joints of a digit
 # A joint moves its own bone and those further out on its digit (J, L).
 _MOVED: Final = (DIGIT_OF_BONE == DIGIT_OF_BONE[_BONE, None]) & (np.arange(NUM_BONES) >= _BONE[:, None])
+_AT_LIMIT: Final = 1e-9  # [rad] A metacarpal that is this near its limit does not flex further.
 _MAX_FRAMES: Final = 1 << 22
 _STEADY: Final = 0.01  # largest deviation of times from a steady rate, in frames
 _MAX_GAP: Final = 0.1  # [s] that interpolation bridges
@@ -100,6 +102,8 @@ class Skeleton:
     """Lowest and highest angle of each joint [rad]."""
     lengths: Float[np.ndarray, "L"]
     """Length of each bone along its x axis [m]; for the palm, wrist to the middle knuckle."""
+    arch: Float[np.ndarray, "5"]
+    """Flexion of each digit's metacarpal in the palm over that of its MCP joint."""
 
     def rest_transforms(self) -> Float[np.ndarray, "L 4 4"]:
         """`T_wrist_bone` of every bone at zero angles."""
@@ -121,14 +125,35 @@ def build_skeleton(shape: HandShape) -> Skeleton:
     if shape.side == "left":
         offsets, rotations = offsets @ MIRROR, MIRROR @ rotations @ MIRROR
         axes = -axes @ MIRROR  # a mirrored rotation has the opposite sense
-    return Skeleton(offsets, rotations, axes, _RANGES.copy(), lengths)
+    arch = np.append(np.zeros(3), shape.arch)
+    return Skeleton(offsets, rotations, axes, _RANGES.copy(), lengths, arch)
 
 
 def bone_transforms(skeleton: Skeleton, qpos: Float[np.ndarray, "T 27"]) -> Float[np.ndarray, "T L 4 4"]:
     """`T_world_bone` of every bone in every frame."""
-    return np.asarray(
-        pose_bones(np.ascontiguousarray(qpos), skeleton.offsets, skeleton.rotations, skeleton.axes, _CHAIN)
-    )
+    parts = skeleton.offsets, skeleton.rotations, skeleton.axes, _CHAIN, skeleton.arch
+    return np.asarray(pose_bones(np.ascontiguousarray(qpos), *parts))
+
+
+def metacarpal_flexions(
+    skeleton: Skeleton, T_world_bone: Float[np.ndarray, "T L 4 4"]
+) -> Float[np.ndarray, "T 5"]:
+    """Flexion of each digit's metacarpal in the palm [rad], by where the digit begins."""
+    wrist, rest = T_world_bone[:, PALM, :3, :3], (1.0 - CARPUS) * skeleton.offsets[1::3]
+    begins = T_world_bone[:, 1::3, :3, 3] - T_world_bone[:, None, PALM, :3, 3]
+    now = begins @ wrist - CARPUS * skeleton.offsets[1::3]
+    across = rest[:, 2] * now[..., 0] - rest[:, 0] * now[..., 2]
+    return np.asarray(np.arctan2(across, rest[:, 0] * now[..., 0] + rest[:, 2] * now[..., 2]))
+
+
+def metacarpal_rotations(
+    skeleton: Skeleton, T_world_bone: Float[np.ndarray, "T L 4 4"]
+) -> Float[np.ndarray, "T 5 3 3"]:
+    """Orientation in the world of each digit's metacarpal, which is the palm's where it does not flex."""
+    wrist = T_world_bone[:, PALM, None, :3, :3]
+    if not skeleton.arch.any():
+        return np.repeat(wrist, len(DIGITS), axis=1)
+    return wrist @ axis_angle_matrix(np.eye(3)[1], metacarpal_flexions(skeleton, T_world_bone))
 
 
 class Site(NamedTuple):
@@ -145,8 +170,8 @@ def build_spec(
 ) -> mujoco.MjSpec:
     """Editable MuJoCo specification of a hand.
 
-    With `actuators` each joint has a position servo of its name: a control is an angle [rad] within the
-    joint's range.
+    Its palm is rigid: the arch of a shape is left out. With `actuators` each joint has a position servo of
+    its name: a control is an angle [rad] within the joint's range.
     """
     import mujoco
 
@@ -342,7 +367,9 @@ def joint_axes(
 ) -> tuple[Float[np.ndarray, "T J 3"], Float[np.ndarray, "T J 3"]]:
     """Unit axes and anchors [m] of all joints in the world."""
     skeleton = model.skeleton
-    parent = T_world_bone[:, _PARENT, :3, :3] @ skeleton.rotations[_BONE]
+    parent = T_world_bone[:, _PARENT, :3, :3]
+    parent[:, ::_HINGES] = metacarpal_rotations(skeleton, T_world_bone)
+    parent = parent @ skeleton.rotations[_BONE]
     own = T_world_bone[:, _BONE, :3, :3]
     frames = np.where(_FIRST[:, None, None], parent, own)
     return np.einsum("tjab,jb->tja", frames, skeleton.axes), T_world_bone[:, _BONE][..., :3, 3]
@@ -373,6 +400,13 @@ def skinned_jacobian(
     lever = shares.swapaxes(0, 1) @ carried
     lever -= shares.sum(-1).T[..., None] * anchors[:, None]
     jacobian[..., 6:] = np.cross(axes[:, None], lever).swapaxes(-1, -2)
+    if model.skeleton.arch.any():  # The flexion of an MCP joint turns its metacarpal, too.
+        flexing, skeleton = slice(1, None, _HINGES), model.skeleton
+        is_free = np.abs(metacarpal_flexions(skeleton, T_world_bone)) < MOST_METACARPAL - _AT_LIMIT
+        bases, shares = CARPUS * skeleton.offsets[1::3] @ turning + wrist[:, None, :3, 3], shares[flexing]
+        lever = shares.swapaxes(0, 1) @ carried - shares.sum(-1).T[..., None] * bases[:, None]
+        rates = (skeleton.arch * is_free)[..., None] * wrist[:, None, :3, 1]
+        jacobian[..., 6:][..., flexing] += np.cross(rates[:, None], lever).swapaxes(-1, -2)
     return jacobian
 
 

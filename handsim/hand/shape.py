@@ -90,6 +90,7 @@ ADULT_LENGTH: Final = (0.187, 0.012)
 FIRMNESS: Final = 0.8
 """Radius of the capsule that stands for a bone's flesh in collisions, over the skin's radius."""
 _PRESSED: Final = 0.00079  # [m] largest overlap of digits at knuckles and across phalanges, in every pose
+_MOST_ARCH: Final = 4.0  # A metacarpal flexes less than four times as far as its finger.
 _SHORTEST, _LONGEST = 1e-4, 1.0  # bounds of every length in a hand [m], far beyond those of people
 HAND_DTYPE: Final = np.dtype(
     [
@@ -184,6 +185,8 @@ class HandShape:
     """Skin radius [m] at each digit's three joints and behind its tip."""
     palm_thickness: float
     """Thickness [m] of the palm at the metacarpals."""
+    arch: Float[np.ndarray, "2"] = dataclasses.field(default_factory=lambda: np.zeros(2))
+    """Flexion of the metacarpals of ring and little finger over that of their MCP joints; 0 where unknown."""
 
     def __post_init__(self) -> None:
         check_type("side", self.side, str, "the name of one", SIDES)
@@ -191,6 +194,9 @@ class HandShape:
         for name in ("bone_lengths", "knuckles", "base_angles", "radii"):
             measures = check_array(name, getattr(self, name), HAND_DTYPE[name].shape)
             object.__setattr__(self, name, measures)
+        object.__setattr__(self, "arch", check_array("arch", self.arch, (2,)))
+        if not ((self.arch >= 0.0) & (self.arch <= _MOST_ARCH)).all():
+            raise ArgumentError(f"arch of a hand is {self.arch}, expected ratios from 0 to {_MOST_ARCH:g}")
         _check_measure("length", self.length, 0.05, 0.35)
         for name in ("breadth", "palm_thickness", "bone_lengths", "radii"):
             _check_measure(name, getattr(self, name), _SHORTEST, _LONGEST)

@@ -11,9 +11,12 @@ without a pose keeps its last one.
 
 A joint of OpenXR's hand tracking (XR_EXT_hand_tracking) is the near end of the bone with its name. Its -z
 axis points along that bone to the fingertip, its +y axis out of the back (nail) side: OpenXR's x, y and z are
-our -y, z and -x. Tips have the axes of their last bone. The near ends of the four finger metacarpals, which
-do not move in our hand, lie at 38 percent of the way from the wrist to the knuckle (the carpus of Buryanov
-and Kotiuk); the palm joint is the middle of the middle metacarpal.
+our -y, z and -x. Tips have the axes of their last bone. The near ends of the four finger metacarpals do not
+move in our hand; the palm joint is the middle of the middle metacarpal.
+
+Metacarpals are no bones of their own. Where those of ring and little finger flex (`HandShape.arch`), the
+first bones of these fingers move in the palm, and BVH has their positions, too. An OpenSim model has a rigid
+palm, so that its coordinates lack that motion.
 """
 
 from __future__ import annotations
@@ -32,10 +35,11 @@ from handsim.errors import CaptureError, choices
 from handsim.files.inputs import read_bytes
 from handsim.files.outputs import as_text, atomic_write
 from handsim.hand.angles import ISB_JOINTS, ISB_NAMES, WRIST_NAMES, isb_angles
-from handsim.hand.model import KEYPOINT_NAMES, HandModel, hand_keypoints
+from handsim.hand.model import KEYPOINT_NAMES, HandModel, hand_keypoints, metacarpal_rotations
 from handsim.hand.model_files import coordinate_names, coordinate_values, forearm_names, forearm_values
 from handsim.hand.shape import BONE_NAMES, BONES, DIGITS, JOINT_NAMES, PALM, SIDES, Side, bones_of
 from handsim.hand.skin import load_cage
+from handsim.kernels import CARPUS
 from handsim.space.objects import Part, RigidObject
 from handsim.space.transforms import (
     UpAxis,
@@ -81,7 +85,6 @@ OPENXR_JOINTS: Final[tuple[str, ...]] = (
     ),
 )
 """The names of XrHandJointEXT, without XR_HAND_JOINT_ and _EXT, in its order."""
-_CARPUS: Final = 0.38  # share of the way from wrist to knuckle where a finger's metacarpal begins
 _AXES: Final = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 """OpenXR's axes as columns in a frame with x along the bone and z out of the back."""
 
@@ -150,7 +153,7 @@ class PosedHand(NamedTuple):
 
     def offsets(self) -> Float[np.ndarray, "T L 3"]:
         """The position of each bone in its parent's frame, and the palm's in the world [m]."""
-        offsets = self.by_frame(lambda model, qpos: np.tile(model.skeleton.offsets, (len(qpos), 1, 1)))
+        offsets = self.by_frame(_offsets)
         offsets[:, PALM] = self.qpos[:, :3]
         return offsets
 
@@ -223,6 +226,23 @@ class Motion(NamedTuple):
     def forearm(self, side: Side) -> PosedBody | None:
         """The forearm of a hand, None if it has none with axes."""
         return next((body for body in self.bodies if body.forearm == side), None)
+
+
+def are_moved(model: HandModel) -> Bool[np.ndarray, "L"]:
+    """Whether each bone moves in its parent's frame: the palm, and fingers whose metacarpals flex."""
+    moved: NDArray[np.bool_] = np.arange(len(BONES)) == PALM
+    moved[1::3] = model.skeleton.arch > 0.0
+    return moved
+
+
+def _offsets(model: HandModel, qpos: Float[np.ndarray, "T 27"]) -> Float[np.ndarray, "T L 3"]:
+    """The position of each bone in its parent's frame [m]; zero for the palm."""
+    offsets = np.tile(model.skeleton.offsets, (len(qpos), 1, 1))
+    for digit in np.flatnonzero(model.skeleton.arch):
+        bones, first = model.forward_kinematics(qpos), 1 + 3 * digit
+        begins = bones[:, first, :3, 3] - bones[:, PALM, :3, 3]
+        offsets[:, first] = np.einsum("tji,tj->ti", bones[:, PALM, :3, :3], begins)
+    return offsets
 
 
 def changes(present: Bool[np.ndarray, "T"]) -> Int[np.ndarray, "K"]:
@@ -424,8 +444,10 @@ def write_bvh(path: Path, motion: Motion, up: UpAxis = "z") -> None:
         # In BVH all joints have the axes of the file at rest.
         rotations = turn @ hand.by_frame(_from_rest) @ turn.T
         local = local_rotations(rotations)
-        columns.append(_CENTIMETERS * hand.qpos[:, :3] @ turn.T)
-        columns += [_degrees(local[:, bone]) for bone in _order(PALM)]
+        places, moved = _CENTIMETERS * hand.offsets() @ turn.T, are_moved(hand.model)
+        for bone in _order(PALM):
+            columns += [places[:, bone]] if moved[bone] else []
+            columns.append(_degrees(local[:, bone]))
     for thing in motion.bodies:
         end = np.eye(3)[0]
         if thing.forearm is not None:  # its bone goes from the wrist to the farthest marker
@@ -465,7 +487,8 @@ def _bone_lines(model: HandModel, side: str, bone: int, lay: Float[np.ndarray, "
     """A bone and its children; `lay` maps the wrist's frame [m] to the file's [cm]."""
     rest = model.rest_transforms
     offset = np.zeros(3) if bone == PALM else rest[bone, :3, 3] - rest[BONES[bone].parent, :3, 3]
-    lines = [f"JOINT {side}_{BONE_NAMES[bone]}", "{", *_indented(_joint(lay @ offset, moves=bone == PALM))]
+    joint = _joint(lay @ offset, moves=bool(are_moved(model)[bone]))
+    lines = [f"JOINT {side}_{BONE_NAMES[bone]}", "{", *_indented(joint)]
     for child in CHILDREN[bone]:
         lines += _indented(_bone_lines(model, side, child, lay))
     if not CHILDREN[bone]:
@@ -501,6 +524,9 @@ def joint_poses(model: HandModel, qpos: Float[np.ndarray, "T 27"]) -> Float[np.n
         first, second, third = bones_of(name)
         if digit:
             poses[:, number] = bones[:, PALM] @ in_palm[1 + digit]
+            if model.skeleton.arch[digit] > 0.0:
+                turned = metacarpal_rotations(model.skeleton, bones)[:, digit]
+                poses[:, number, :3, :3] = turned @ in_palm[1 + digit, :3, :3]
             number += 1
         tip = np.eye(4)
         tip[0, 3] = model.skeleton.lengths[third]
@@ -522,7 +548,7 @@ def joint_radii(model: HandModel) -> Float[np.ndarray, "26"]:
 def _palm_joints(model: HandModel) -> Float[np.ndarray, "6 4 4"]:
     """`T_wrist_joint` of palm, wrist and the four finger metacarpals."""
     knuckles = np.array([model.skeleton.offsets[bones_of(digit)[0]] for digit in DIGITS[1:]])
-    bases = _CARPUS * knuckles
+    bases = CARPUS * knuckles
     middle = 1  # among the four fingers
     starts = [0.5 * (bases[middle] + knuckles[middle]), np.zeros(3), *bases]
     ways = [knuckles[middle] - bases[middle], bases[middle], *(knuckles - bases)]

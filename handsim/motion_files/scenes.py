@@ -39,6 +39,7 @@ from handsim.motion_files.motion import (
     Motion,
     PosedBody,
     PosedHand,
+    are_moved,
     changes,
     corner_normals,
     local_rotations,
@@ -114,7 +115,7 @@ class _Scene:
         return self._buffer.pack(document)
 
     def _add_hand(self, hand: PosedHand) -> None:
-        offsets, rotations = hand.offsets(), hand.bones()[..., :3, :3]
+        offsets, rotations, moved = hand.offsets(), hand.bones()[..., :3, :3], are_moved(hand.model)
         positions = offsets[:, PALM] @ self._turn.T
         quaternions = smooth_quaternions(local_rotations(self._turn @ rotations))
         root, first = len(self._nodes), len(self._nodes) + 1
@@ -129,7 +130,7 @@ class _Scene:
                 node["children"] = [first + child for child in CHILDREN[bone]]
             self._nodes.append(node)
             self._animate(first + bone, "rotation", _xyzw(quaternions[:, bone]))
-            if hand.former and bone != PALM:
+            if bone != PALM and (hand.former or moved[bone]):
                 self._animate(first + bone, "translation", offsets[:, bone])
         self._animate(first, "translation", positions)
         self._hide(first, hand.present)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import pickle
 
@@ -17,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from handsim import HandModel, join_qpos
 from handsim.callbacks import before_compiling
-from handsim.hand.shape import DIGITS, SIDES, bones_of
+from handsim.hand.shape import DIGITS, SIDES, bones_of, named_shape
 from handsim.kernels import (
     align_rigid,
     kernel,
@@ -177,8 +178,9 @@ def test_a_step_takes_back_what_a_velocity_said(poses):
 
 @pytest.mark.parametrize("side", SIDES)
 @pytest.mark.parametrize("digit", range(5))
-def test_a_digit_is_where_the_hand_has_it(side, digit, rng):
-    model = HandModel.named("L", side=side)
+@pytest.mark.parametrize("arch", [0.0, 0.6])
+def test_a_digit_is_where_the_hand_has_it(side, digit, arch, rng):
+    model = HandModel(dataclasses.replace(named_shape("L", side=side), arch=[0.5 * arch, arch]))
     qpos = join_qpos(
         rng.uniform(LOW, HIGH, size=(20, 20)),
         position=rng.normal(size=(20, 3)),

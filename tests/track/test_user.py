@@ -51,6 +51,15 @@ def test_errors_of_calibrated_hands_come_back(hands, tmp_path):
         np.testing.assert_allclose(one, other, atol=1e-6)
 
 
+def test_an_arch_comes_back_and_older_files_have_none(hands, tmp_path):
+    arched = GloveFit(HandModel(dataclasses.replace(hands[1].shape, arch=[0.1, 0.4])), hands[1].attachment)
+    User((hands[0], arched)).save(tmp_path / "user.json")
+    first, second = json.loads((tmp_path / "user.json").read_text("utf-8"))["hands"]
+    assert "arch" not in first["shape"] and second["shape"]["arch"] == [0.1, 0.4]
+    for hand, arch in zip(load_user(tmp_path / "user.json"), ([0.0, 0.0], [0.1, 0.4]), strict=True):
+        np.testing.assert_array_equal(hand.shape.arch, arch)
+
+
 def test_older_files_have_no_such_errors(hands, tmp_path):
     User(hands).save(tmp_path / "user.json")
     content = json.loads((tmp_path / "user.json").read_text("utf-8"))

@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 
 from gloves.fit import Attachment
 from gloves.layout import MarkerLayout
-from handsim.hand.model import HandModel
+from handsim.hand.model import HandModel, metacarpal_rotations
 from handsim.hand.shape import ADULTS, DIGIT_OF_BONE, DIGITS, HandShape, named_shape
 from handsim.hand.skin import all_weights, build_surface, catmull_clark, strongest_weights, vertex_normals
+from handsim.kernels import CARPUS
 from handsim.space.transforms import euler_axes
 
 if TYPE_CHECKING:
@@ -115,12 +116,16 @@ def skinned_shape_jacobian(
     along = (turns[:, :, :, 1:] @ rest[:, :2, :3, :1])[..., 0]
     by_length[:, :, :, :2] = after[:, :, 1:] * digits[:, None, :, :2, :3, 0] - along
     by_length *= shape.bone_lengths[..., None]
-    moved = after[:, :, 0, None] * wrist[:, None, None] - turns[:, :, :, 0]
+    metacarpals = metacarpal_rotations(model.skeleton, T_world_bone)
+    carried = metacarpals + CARPUS * (
+        wrist[:, None] - metacarpals
+    )  # a knuckle moves the base of its metacarpal
+    moved = after[:, :, 0, None] * carried[:, None] - turns[:, :, :, 0]
     by_knuckle[:] = moved.swapaxes(-1, -2)
     axes, arms = euler_axes(shape.base_angles), points[:, None] - rest[:, 0, :3, 3]
     placed = np.einsum("mdb,tmdbi->tmdi", shares, by_bone[:, :, 1:].reshape(frames, count, 5, 3, 3))
     placed -= after[:, :, 0] * digits[:, None, :, 0, :3, 3]
-    swept = np.cross((axes @ wrist[:, None].swapaxes(-1, -2))[:, None], placed[..., None, :])
+    swept = np.cross((axes @ metacarpals.swapaxes(-1, -2))[:, None], placed[..., None, :])
     by_direction[:] = swept - np.cross(axes, arms[:, :, None]) @ turns[:, :, :, 0].swapaxes(-1, -2)
     scaled = shape.knuckles - parameters[KNUCKLES].reshape(5, 3)
     across = scaled[..., None] * by_knuckle

@@ -25,8 +25,9 @@ from gloves.fit import Attachment, GloveFit
 from gloves.takes.points import Status, far_apart
 from handsim.errors import CalibrationError
 from handsim.hand.model import HandModel, build_skeleton
-from handsim.hand.shape import DIGITS, JOINT_NAMES, NUM_JOINTS, PALM, HandShape, Side
+from handsim.hand.shape import DIGITS, JOINT_NAMES, NUM_JOINTS, PALM, HandShape, Side, bones_of
 from handsim.hand.skin import rest_vertices
+from handsim.kernels import CARPUS
 from handsim.space.transforms import MIRROR, euler_matrix, quaternion_matrix, rigid_fit
 from track.calibration.energy import (
     GESTURES_OF_USER,
@@ -58,7 +59,7 @@ from track.calibration.hand_parameters import (
     skin_weights,
 )
 from track.frames import TrackedFrame
-from track.kinematics.pose_solver import PoseFit, PoseSolver
+from track.kinematics.pose_solver import FEWEST_ON_PART, PoseFit, PoseSolver
 from track.kinematics.pose_spread import HandErrors, errors_of_motions
 
 _WIDE_STEPS: Final = 6  # steps with the first robust scale, which includes distant markers
@@ -85,6 +86,13 @@ _USUAL_SPREAD_COORDINATES: Final = 12.0  # coordinates of markers that the usual
 _MOST_ERRORS: Final = 64  # independent errors that are kept of a hand: 99.9 % of its variances
 # How far a turn and a log length move a fingertip or its marker, roughly [m]: the largest errors are kept.
 _ARM, _BONE = 0.05, 0.03
+_ARCHES: Final = {"ring": (0.09, 0.06), "little": (0.25, 0.14)}
+"""Share of the first bone's flexion by which the metacarpal flexes: mean and standard deviation among four
+people (benchmarks/palm.py)."""
+_INDEPENDENT_ARCHES: Final = 4.0  # number of frames whose palms leave the usual arch independently, at most
+_ON_KNUCKLE: Final = 0.4  # Palm and first bone each carry more than this of a marker on a knuckle.
+_MOST_SHARE: Final = 0.75  # of the flexion of a first bone that its metacarpal has
+_LEAST_TURN: Final = np.deg2rad(0.1)  # [rad] least scatter of a metacarpal around its arch
 _INDEPENDENT_POSES: Final = 14.0  # number of frames with independent deformation of the flesh, at most
 
 
@@ -159,7 +167,7 @@ class Calibration:
         return float(np.sqrt((self.position_errors**2).mean()))
 
     def __str__(self) -> str:
-        """Residuals on held-out frames and error of marker places, in a line [mm]."""
+        """Residuals on held-out frames and error of marker places [mm], and a found arch, in a line."""
         if self.held_out is None:
             return "too few frames to try a calibration on, so that it stays as it was"
         before, after, frames, other_labels = self.held_out
@@ -169,7 +177,13 @@ class Calibration:
             return f"{line}, but it is likelier that {other_labels}, so that it stays as it was"
         if not self.is_better:
             return f"{line}: no better, so that it stays as it was"
-        return f"{line}, their places known to {1e3 * self.place_error:.1f} mm"
+        line += f", their places known to {1e3 * self.place_error:.1f} mm"
+        if (arch := self.hand.shape.arch).any():
+            line += (
+                f", metacarpals of ring and little finger flex {arch[0]:.2f} and {arch[1]:.2f} times as far"
+            )
+            line += " as the MCP joints"
+        return line
 
     @property
     def significant_touches(self) -> tuple[Touch, ...]:
@@ -265,6 +279,7 @@ def calibrate_hand(
     # Distant markers are down-weighted only after the hand nearly fits.
     estimate, fit, steps = levenberg_marquardt(problem, estimate, 0, _WIDE_STEPS, progress)
     problem.robust_scale = _SCALE_IN_NOISES * marker_noise(problem, fit)
+    learn_arch(problem, estimate)
     estimate, fit, steps = levenberg_marquardt(problem, estimate, steps, _STEPS_WITHOUT_CONTACTS, progress)
     rough = user_hand(right, problem, estimate)
     rough_track = PoseSolver(rough).solve(seen, track.qpos[np.arange(len(seen)) // every])
@@ -272,6 +287,7 @@ def calibrate_hand(
     problem, estimate, touches = _with_touches(problem, estimate, fit, seen, rough_track, touches)
     for last in np.linspace(steps, MOST_STEPS, 1 + _SPREAD_ROUNDS).astype(int)[1:]:
         learn_spreads(problem, estimate, problem.fit(estimate))
+        learn_arch(problem, estimate)
         estimate, fit, steps = levenberg_marquardt(problem, estimate, steps, int(last), progress)
     done = user_hand(right, problem, estimate)
     before = np.empty(0)
@@ -430,6 +446,42 @@ def learn_spreads(problem: Problem, estimate: Estimate, fit: Fit) -> None:
     lifts = (estimate.coordinates.heights - problem.heights) ** 2
     problem.position_spread = _learned(slips, along, 2, problem.position_spread, POSITION_SPREAD)
     problem.height_spread = _learned(lifts, across, 1, problem.height_spread, HEIGHT_SPREAD)
+
+
+def learn_arch(problem: Problem, estimate: Estimate) -> None:
+    """Estimate how far this user's metacarpals flex, by the paths of markers on knuckles across the palm.
+
+    The fit of all markers hardly tells, because a knuckle's marker that sinks may as well lie further out on
+    a bending finger. The arch of a finger stays as it is without markers on its knuckle and its first bone,
+    or with less than three on the rest of the palm.
+    """
+    weights, arch = skin_weights(problem.design), problem.shape.arch.copy()
+    arched = [bone for digit in _ARCHES for bone in bones_of(digit)]
+    back = (weights[:, PALM] > _ON_KNUCKLE) & (weights[:, arched].sum(axis=1) < _ON_KNUCKLE)
+    if back.sum() < FEWEST_ON_PART:
+        return
+    on_back = np.broadcast_to(estimate.points[back], (len(estimate.qpos), int(back.sum()), 3))
+    turns, shifts = rigid_fit(problem.targets[:, back], on_back)
+    for number, (digit, (mean, spread)) in enumerate(_ARCHES.items()):
+        first, base = bones_of(digit)[0], CARPUS * problem.shape.knuckles[DIGITS.index(digit)]
+        on_bone = weights[:, first].copy()
+        knuckle = int(np.minimum(weights[:, PALM], on_bone).argmax())
+        on_bone[knuckle] = 0.0
+        outer = int(on_bone.argmax())
+        seen = problem.present[:, [knuckle, outer]].all(axis=1) & problem.present[:, back].all(axis=1)
+        if min(weights[knuckle, [PALM, first]]) <= _ON_KNUCKLE or on_bone[outer] < 0.5 or not seen.any():
+            continue
+        ends = np.einsum("tij,tmj->tmi", turns, problem.targets[:, [knuckle, outer]]) + shifts[:, None]
+        flexions = [
+            np.arctan2(-way[:, 2], way[:, 0])[seen] for way in (ends[:, 0] - base, ends[:, 1] - ends[:, 0])
+        ]
+        metacarpal, bone = (one - one.mean() for one in flexions)
+        slope = (bone @ metacarpal) / max(float(bone @ bone), 1e-12)
+        scatter = (metacarpal - slope * bone).var() + _LEAST_TURN**2
+        precision = min(_INDEPENDENT_ARCHES, len(bone)) * bone.var() / scatter
+        share = np.clip((precision * slope + mean / spread**2) / (precision + spread**-2), 0.0, _MOST_SHARE)
+        arch[number] = share / (1.0 - share)
+    problem.shape = dataclasses.replace(problem.shape, arch=arch)
 
 
 def _learned(

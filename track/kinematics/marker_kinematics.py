@@ -17,7 +17,15 @@ from jaxtyping import Float, Int
 
 from gloves.fit import GloveFit
 from handsim.hand.shape import DIGIT_OF_BONE, NUM_BONES, NUM_JOINTS
-from handsim.kernels import kernel, multiply_rotations, quaternion_product, rotate_quaternion
+from handsim.kernels import (
+    CARPUS,
+    kernel,
+    metacarpal_flexion,
+    metacarpal_motion,
+    multiply_rotations,
+    quaternion_product,
+    rotate_quaternion,
+)
 
 NUM_UNKNOWNS: Final = NUM_JOINTS + 6
 """Unknowns of a step: 20 joint angles, 3 translations and 3 rotations of the wrist."""
@@ -47,6 +55,7 @@ class HandArrays(NamedTuple):
     digits: Int[np.ndarray, "M"]  # digit of the bone with the largest weight; -1 for the palm
     hinge_span: Int[np.ndarray, "M 2"]  # first joint that may move each marker, and the one after the last
     skyline: Int[np.ndarray, "26"]  # first nonzero column of each row of the normal matrix
+    arch: Float[np.ndarray, "5"]  # flexion of each digit's metacarpal over that of its MCP joint
 
 
 class Workspace(NamedTuple):
@@ -63,6 +72,7 @@ class Workspace(NamedTuple):
     gradient: Float[np.ndarray, "26"]  # half the gradient of the cost
     factor: Float[np.ndarray, "26 26"]  # buffer for a factor of the normal matrix
     step: Float[np.ndarray, "26"]  # step of the unknowns [rad, m]
+    arch_rates: Float[np.ndarray, "5"]  # derivatives of the metacarpals' flexions by those of the MCP joints
 
 
 class PoseEnergy(NamedTuple):
@@ -106,6 +116,7 @@ def hand_arrays(fit: GloveFit) -> HandArrays:
         DIGIT_OF_BONE[bones[:, 0]],
         hinge_span,
         skyline,
+        np.array(skeleton.arch, order="C"),
     )
 
 
@@ -128,6 +139,7 @@ def workspace(num_markers: int) -> Workspace:
         np.empty(NUM_UNKNOWNS),
         np.empty((NUM_UNKNOWNS, NUM_UNKNOWNS)),
         np.empty(NUM_UNKNOWNS),
+        np.zeros(NUM_JOINTS // 4),
     )
 
 
@@ -149,6 +161,15 @@ def compute_digit(hand: HandArrays, digit: int, angles: Float[np.ndarray, "4"], 
         parent_rotation, own = work.rotations[parent], work.rotations[bone]
         for i in range(3):
             work.origins[bone, i] = work.origins[parent, i]
+        if link == 0 and hand.arch[digit] != 0.0:  # The metacarpal is the parent.
+            flexion, work.arch_rates[digit] = metacarpal_flexion(hand.arch[digit], angles[1])
+            sine, cosine, ahead, above = metacarpal_motion(flexion, hand.offsets[bone])
+            work.origins[bone, 0], work.origins[bone, 2] = ahead, above
+            own[0, 0], own[0, 1], own[0, 2] = cosine, 0.0, sine
+            own[1, 0], own[1, 1], own[1, 2] = 0.0, 1.0, 0.0
+            own[2, 0], own[2, 1], own[2, 2] = -sine, 0.0, cosine
+            parent_rotation = own
+        for i in range(3):
             for j in range(3):
                 work.origins[bone, i] += parent_rotation[i, j] * hand.offsets[bone, j]
         multiply_rotations(parent_rotation, hand.rotations[bone], own)
@@ -212,6 +233,10 @@ def marker_jacobian(hand: HandArrays, marker: int, work: Workspace) -> None:
                 jacobian[0, hinge] = b * r - c * q
                 jacobian[1, hinge] = c * p - a * r
                 jacobian[2, hinge] = a * q - b * p
+        if hand.arch[digit] != 0.0:  # The flexion of an MCP joint turns its metacarpal, too.
+            rate, knuckle, flexion = work.arch_rates[digit], hand.offsets[1 + 3 * digit], 4 * digit + 1
+            jacobian[0, flexion] += rate * (z - share * CARPUS * knuckle[2])
+            jacobian[2, flexion] -= rate * (x - share * CARPUS * knuckle[0])
     x, y, z = work.markers[marker, 0], work.markers[marker, 1], work.markers[marker, 2]
     jacobian[1, _ROTATION], jacobian[2, _ROTATION] = -z, y
     jacobian[0, _ROTATION + 1], jacobian[2, _ROTATION + 1] = z, -x

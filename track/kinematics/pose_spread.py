@@ -59,7 +59,7 @@ _LEAST_FREEDOM: Final = 3  # least number of marker coordinates beyond those tha
 SOURCES: Final = ("noise and gaps", "gluing", "flesh", "person", "palm")
 """Sources of an angle's uncertainty: noisy or unseen markers, their glued places, their motion over the
 bones, what stays of a person (sizes and directions of bones, gestures unlike other people's), and the arch of
-the palm, which is rigid in the model."""
+the palm, of which a model knows a part at most."""
 Measure = Literal["frame", "mean", "peak", "range"]
 """What of an angle is compared between sessions: its value in a frame, its mean, its 5th or 95th percentile
 in a take, or its range of motion, between these."""
@@ -400,7 +400,11 @@ def hand_doubt(digits: Int[np.ndarray, "M"], origin: HandOrigin) -> HandDoubt:
 
 
 def _arch() -> Float[np.ndarray, "46 1"]:
-    """The `HandDoubt.arch` of people: metacarpals that turn about the palm's y axis, each at its hinge."""
+    """The `HandDoubt.arch` of people: metacarpals that turn about the palm's y axis, each at its hinge.
+
+    It is that of hands whose arch is known, too: they answer to it with less, and their people keep to it no
+    better in the grasps.
+    """
     numbers = np.zeros((NUM_NUMBERS, 1))
     for digit, share in _ARCH.items():
         first = _OWN * DIGITS.index(digit)

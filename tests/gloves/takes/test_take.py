@@ -14,12 +14,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from gloves import RigidBody, Take, attach, load_layout, load_take
+from gloves import GloveFit, RigidBody, Take, attach, load_layout, load_take
 from gloves.fit import nominal_fit
 from gloves.takes.archives import SCHEMA
 from gloves.takes.motion_formats import MOTION_FORMATS
 from gloves.takes.points import FRAMES as COLUMNS_OF_FRAMES
 from gloves.takes.take import INITIALIZED, LOST, STATUSES, TRACKED, TRUTH_SUFFIX, usual_rate
+from gloves.takes.worn import FormerHands
 from handsim import HandModel, join_qpos, sample_shape
 from handsim.errors import ArgumentError, CaptureError, HandSimWarning
 from handsim.hand.model import KEYPOINT_NAMES, hand_keypoints, is_steady
@@ -176,6 +177,21 @@ def test_rates_may_be_whole_numbers_and_numpys(take, rng, tmp_path, rate):
     for wrong in (0.0, -1.0, 1e-15, np.nan, np.inf):
         with pytest.raises(ArgumentError, match="number is not from 1e-12"):
             dataclasses.replace(mine, rate=wrong)
+
+
+def test_an_arch_comes_back_and_a_file_without_one_lacks_it(take, rng, tmp_path):
+    hand = take.hands[0]
+    arched = GloveFit(HandModel(dataclasses.replace(hand.shape, arch=[0.1, 0.4])), hand.attachment)
+    poses = join_qpos(rng.random((4, 20)))[:, None]
+    for first, last in ((hand, hand), (hand, arched), (arched, hand)):
+        mine = Take.of_poses([last], poses, rate=30.0)
+        dataclasses.replace(mine, former=(FormerHands(2, (first,), "M"),)).save(tmp_path / "mine.npz")
+        again = load_take(tmp_path / "mine.npz")
+        np.testing.assert_array_equal(again.hands[0].shape.arch, last.shape.arch)
+        np.testing.assert_array_equal(again.former[0].hands[0].shape.arch, first.shape.arch)
+        with np.load(tmp_path / "mine.npz") as file:
+            assert ("arch" in file) == (last is arched)
+            assert ("arch" in file["former_hands"].dtype.names) == (first is arched)
 
 
 def test_labels_count_through_hands_and_bodies(take):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import mujoco
 import numpy as np
 import pytest
@@ -12,9 +14,9 @@ from gloves import load_layout
 from gloves.fit import attach_markers
 from handsim import HandModel, join_qpos, sample_shape
 from handsim.errors import ArgumentError
-from handsim.hand.model import NUM_VELOCITIES, skinned_jacobian
+from handsim.hand.model import NUM_VELOCITIES, metacarpal_flexions, skinned_jacobian
 from handsim.hand.shape import EVERYBODY, JOINT_NAMES, NUM_JOINTS, SIDES, SIZES, named_shape
-from handsim.space.transforms import MIRROR, random_quaternions
+from handsim.space.transforms import MIRROR, axis_angle_matrix, random_quaternions
 
 
 def random_qpos(model: HandModel, count: int, rng: np.random.Generator) -> np.ndarray:
@@ -159,6 +161,41 @@ def test_skinned_points_move_as_the_jacobian_says(posed):
             ends.append(glove.markers(model, model.forward_kinematics(moved))[0])
         slope = (ends[0] - ends[1]) / (2 * step)
         np.testing.assert_allclose(jacobian[..., velocity], slope, atol=1e-8)
+
+
+@pytest.mark.parametrize("side", SIDES)
+def test_skinned_points_of_an_arch_move_as_the_jacobian_says(side, rng):
+    model = HandModel(dataclasses.replace(sample_shape(side=side, rng=rng), arch=[0.2, 0.6]))
+    test_skinned_points_move_as_the_jacobian_says((model, random_qpos(model, 4, rng)))
+
+
+@pytest.mark.parametrize("side", SIDES)
+def test_a_metacarpal_flexes_with_its_finger_about_its_base(side):
+    shape = dataclasses.replace(named_shape("L", side=side), arch=[0.0, 0.5])
+    qpos = join_qpos(np.deg2rad(40.0 * (np.array(JOINT_NAMES) == "little_MCP_flexion"))[None])
+    both = named_shape("L", side=side), shape
+    flat, bent = (HandModel(one).forward_kinematics(qpos)[0, 13] for one in both)
+    palm = axis_angle_matrix(np.array([0.0, 1.0, 0.0]), np.deg2rad(20.0))
+    np.testing.assert_allclose(bent[:3, :3], palm @ flat[:3, :3], atol=1e-12)
+    base = 0.38 * flat[:3, 3]
+    np.testing.assert_allclose(bent[:3, 3], base + palm @ (flat[:3, 3] - base), atol=1e-12)
+    assert bent[2, 3] < flat[2, 3] - 0.015  # towards the palm
+
+
+def test_a_metacarpal_flexes_within_its_range():
+    model = HandModel(dataclasses.replace(named_shape("L"), arch=[0.0, 0.5]))
+    angles = np.zeros((3, NUM_JOINTS))
+    angles[:, JOINT_NAMES.index("little_MCP_flexion")] = np.deg2rad([40.0, 60.0, 90.0])
+    bones = model.forward_kinematics(join_qpos(angles))
+    found = np.rad2deg(metacarpal_flexions(model.skeleton, bones))
+    np.testing.assert_allclose(found[:, 4], [20.0, 27.0, 27.0], atol=1e-9)
+    np.testing.assert_allclose(found[:, :4], 0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize("arch", [[-0.1, 0.2], [0.1, 5.0], [0.1, np.nan], [0.1]])
+def test_a_wrong_arch_is_told(arch):
+    with pytest.raises(ArgumentError, match="arch"):
+        dataclasses.replace(named_shape("M"), arch=arch)
 
 
 def test_points_on_one_bone_agree_with_mujoco(posed, rng):

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -15,7 +17,8 @@ def motion(rng: np.random.Generator) -> Take:
     """Two hands and a pen at 60 Hz that turn through all directions; the left hand and the pen have gaps."""
     hands, poses = [], []
     for side in ("right", "left"):
-        model = HandModel(sample_shape(side=side, rng=rng))
+        shape = sample_shape(side=side, rng=rng)
+        model = HandModel(dataclasses.replace(shape, arch=[0.1, 0.5]) if side == "right" else shape)
         ranges = model.skeleton.ranges
         angles = ranges[:, 0] + rng.random((FRAMES, 20)) * np.ptp(ranges, axis=1)
         steps = Rotation.from_rotvec(rng.normal(scale=0.6, size=(FRAMES, 3)))

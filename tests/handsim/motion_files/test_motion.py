@@ -12,11 +12,12 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from gloves.fit import nominal_fit
 from gloves.takes.take import posed_motion
 from handsim import HandModel, HandSimWarning, join_qpos
 from handsim.errors import CaptureError
 from handsim.hand.model import KEYPOINT_NAMES, hand_keypoints
-from handsim.hand.shape import BONE_NAMES, DIGITS, JOINT_NAMES
+from handsim.hand.shape import BONE_NAMES, DIGITS, JOINT_NAMES, named_shape
 from handsim.motion_files.motion import (
     OPENXR_JOINTS,
     changes,
@@ -222,8 +223,8 @@ def read_bvh(path):
             channels += names
             if "Xposition" in values:
                 shift = np.stack([values[f"{axis}position"] for axis in "XYZ"], axis=1)
-                base = rotations[trail[-2]].apply(shift) if len(trail) > 1 else shift
-                positions[trail[-1]] = positions[trail[-1]] + base
+                above = trail[-2] if len(trail) > 1 else None  # a position stands for the offset
+                positions[trail[-1]] = shift if above is None else place + rotations[above].apply(shift)
             angles = np.stack([values[name] for name in names if name.endswith("rotation")], axis=1)
             order = "".join(name[0] for name in names if name.endswith("rotation"))
             own = Rotation.from_euler(order, angles, degrees=True)
@@ -255,6 +256,8 @@ def test_joints_and_things_are_where_ours_are(motion, tmp_path):
 
 
 def test_zero_rotations_are_the_flat_hand(motion, tmp_path):
+    rigid = [nominal_fit("dense19", "M", side) for side in motion.sides]  # an arch has positions, too
+    motion = dataclasses.replace(motion, hands=rigid)
     write_bvh(tmp_path / "hands.bvh", posed_motion(motion))
     path = tmp_path / "rest.bvh"
     head, _ = (tmp_path / "hands.bvh").read_text().split("MOTION\n")
@@ -288,8 +291,10 @@ CHAINS = [[f"{digit.upper()}_{part}" for part in PARTS] for digit in DIGITS]
 CHAINS[0].remove("THUMB_INTERMEDIATE")
 
 
-@pytest.fixture(params=["right", "left"])
+@pytest.fixture(params=["right", "left", "arched"])
 def hand(request):
+    if request.param == "arched":
+        return HandModel(dataclasses.replace(named_shape("M"), arch=[0.1, 0.5]))
     return HandModel.named("M", side=request.param)
 
 

@@ -56,10 +56,11 @@ def test_jacobian_of_a_linear_function(rng):
     np.testing.assert_allclose(jacobian[::3, 0], shape.knuckles[:, 0], rtol=1e-4)
 
 
-def test_skinned_points_follow_the_parameters(rng):
+@pytest.mark.parametrize("arch", [[0.0, 0.0], [0.2, 0.6]])
+def test_skinned_points_follow_the_parameters(arch, rng):
     covariance = np.linalg.inv(shape_precision())
     parameters = rng.multivariate_normal(np.zeros(NUM_PARAMETERS), covariance)
-    start = sample_shape(rng=rng)
+    start = dataclasses.replace(sample_shape(rng=rng), arch=arch)
     qpos = join_qpos(rng.uniform(-0.3, 1.2, (3, 20)), quaternion=random_quaternions(3, rng=rng))
     points, weights = rng.uniform(-0.1, 0.1, (5, 3)), rng.dirichlet(np.ones(16), 5)
 

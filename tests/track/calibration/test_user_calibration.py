@@ -10,14 +10,15 @@ import pytest
 
 from benchmarks.paper.hand_errors import hand_errors
 from benchmarks.people import displace_markers
-from gloves import GloveFit, attach, load_layout
+from gloves import GloveFit, MarkerLayout, MarkerPlace, attach, load_layout
 from gloves.fit import attach_markers, nominal_fit
 from handsim import HandModel, HandSimError, join_qpos
-from handsim.hand.shape import JOINT_NAMES, SIDES, named_shape
-from handsim.space.transforms import MIRROR
+from handsim.hand.shape import DIGITS, JOINT_NAMES, SIDES, named_shape
+from handsim.space.transforms import MIRROR, axis_angle_matrix
 from poses.motion import wrist_path
 from track import Calibration, HeldOut, Status, TrackedFrame, TrackedHand, User, load_user
-from track.calibration.user_calibration import MotionGuide, calibrate_hand, independent_count
+from track.calibration.energy import first_estimate
+from track.calibration.user_calibration import MotionGuide, calibrate_hand, independent_count, learn_arch
 from train.simulation.scenes import CalibrationTakeConfig, calibration_angles
 
 LAYOUT = load_layout("dense19")
@@ -211,6 +212,10 @@ def test_what_is_told_is_of_held_out_frames():
     places = f"their places known to {1e3 * better.place_error:.1f} mm"
     off = "markers 4.00 mm off before and 0.20 mm after calibration, on 80 frames held out"
     assert str(better) == f"{off}, {places}"
+    shape = dataclasses.replace(result.hand.shape, arch=[0.05, 0.3])
+    arched = dataclasses.replace(better, hand=GloveFit(HandModel(shape), result.hand.attachment))
+    arch = "metacarpals of ring and little finger flex 0.05 and 0.30 times as far as the MCP joints"
+    assert str(arched) == f"{off}, {places}, {arch}"
     alike = dataclasses.replace(result, held_out=HeldOut(0.004, 0.00395, 80))
     assert not alike.is_better and "no better, so that it stays as it was" in str(alike)
 
@@ -229,3 +234,57 @@ def test_what_is_told_is_of_held_out_frames():
 def test_what_cannot_be_calibrated_is_told(markers, rate, told):
     with pytest.raises(HandSimError, match=told):
         calibrate_hand(markers, nominal_fit(LAYOUT, "M", "right"), rate)
+
+
+def knuckle_layout():
+    """A glove with markers on the back and on the knuckles, and one on each middle joint."""
+    fingers = ("index", "middle", "ring", "little")
+    back = [MarkerPlace("B1", "palm", 0.3, 0.0, 0.15), MarkerPlace("B2", "palm", 0.3, 0.0, -0.2)]
+    rest = [
+        MarkerPlace(f"{finger}{along}", f"{finger}_proximal", along, 0.0)
+        for finger in fingers
+        for along in (0.02, 0.95)
+    ]
+    return MarkerLayout("knuckles", (*back, *rest), 0.002)
+
+
+def arched_capture(layout, arch, rng):
+    """Markers of a hand whose metacarpals flex by these ratios and carry the knuckles' markers, and poses."""
+    shape = dataclasses.replace(named_shape("M"), arch=arch)
+    fit = attach(layout, shape)
+    angles = np.zeros((120, 20))
+    angles[:, 1::4] = np.deg2rad(rng.uniform(0.0, 50.0, size=(120, 5)))
+    qpos = join_qpos(angles)
+    markers = markers_of(fit, qpos)
+    for digit, ratio in zip((3, 4), arch, strict=True):
+        name = f"{DIGITS[digit]}0.02"
+        if name in layout.names:
+            marker, base = layout.names.index(name), 0.38 * shape.knuckles[digit]
+            turns = axis_angle_matrix(np.array([0.0, 1.0, 0.0]), ratio * angles[:, 4 * digit + 1])
+            markers[:, marker] = base + turns @ (fit.attachment.points[marker] - base)
+    return markers + rng.normal(scale=0.0002, size=markers.shape), qpos
+
+
+def learned_arch(layout, arch, rng):
+    markers, qpos = arched_capture(layout, arch, rng)
+    start = nominal_fit(layout, "M", "right")
+    problem, estimate = first_estimate(start, markers, qpos, noise=0.001, robust_scale=0.03)
+    learn_arch(problem, estimate)
+    return problem.shape.arch
+
+
+@pytest.mark.parametrize("arch", [[0.1, 0.4], [0.0, 0.8]])
+def test_knuckles_show_how_far_metacarpals_flex(arch, rng):
+    """A bone between markers on skin turns by a tenth less than the joint, so that ratios are too large."""
+    np.testing.assert_allclose(learned_arch(knuckle_layout(), arch, rng), arch, rtol=0.2, atol=0.03)
+
+
+def test_markers_further_out_do_not_show_it(rng):
+    layout = knuckle_layout()
+    places = [dataclasses.replace(one, along=max(one.along, 0.12)) for one in layout.markers]
+    layout = dataclasses.replace(layout, markers=tuple(places))
+    np.testing.assert_array_equal(learned_arch(layout, [0.1, 0.4], rng), 0.0)
+
+
+def test_a_glove_without_markers_on_knuckles_does_not_show_it(rng):
+    np.testing.assert_array_equal(learned_arch(LAYOUT, [0.1, 0.4], rng), 0.0)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import mujoco
 import numpy as np
 import pytest
@@ -31,11 +33,13 @@ from track.kinematics.marker_kinematics import (
     workspace,
 )
 
+GLOVES = (("dense19", 0.0), ("sparse13", 0.0), ("dense19", 0.6))  # with the arch of the hand
 
-@pytest.fixture(params=[(side, name) for side in SIDES for name in ("dense19", "sparse13")])
+
+@pytest.fixture(params=[(side, *glove) for side in SIDES for glove in GLOVES])
 def posed(request, rng):
-    side, name = request.param
-    model = HandModel(sample_shape(side=side, rng=rng))
+    side, name, arch = request.param
+    model = HandModel(dataclasses.replace(sample_shape(side=side, rng=rng), arch=[0.3 * arch, arch]))
     glove = attach_markers(load_layout(name), model)
     angles = rng.uniform(*model.skeleton.ranges.T)
     hand, work = hand_arrays(GloveFit(model, glove)), workspace(len(glove.points))

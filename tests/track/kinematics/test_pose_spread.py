@@ -48,6 +48,18 @@ def spreads_of(fit, doubt, qpos, unseen, prior=NOTHING):
     return np.sqrt(variances[:, :20].sum(axis=-1)), keypoints
 
 
+def test_a_learned_arch_leaves_less_of_its_part(rng):
+    fit = nominal_fit("dense19", "M", "right")
+    arched = GloveFit(HandModel(dataclasses.replace(fit.model.shape, arch=[0.0, 0.4])), fit.attachment)
+    qpos, little = sample_poses(fit.model, 5, rng=rng), JOINT_NAMES.index("little_MCP_flexion")
+    whole, left = (
+        np.sqrt(SpreadModel(one, "measured").variances(qpos, np.zeros((5, 19)), 0.001)[0][..., 4])
+        for one in (fit, arched)
+    )
+    assert (whole[:, little] > 0.0).all()
+    assert np.mean(left[:, little] / whole[:, little]) < 0.9
+
+
 @pytest.mark.parametrize("side", SIDES)
 def test_they_are_what_noise_makes_of_the_solver(side, rng):
     """Markers of a known hand with noise, in one pose, solved again and again."""
