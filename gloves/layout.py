@@ -27,11 +27,11 @@ from handsim.files.inputs import (
     check_keys,
     checksum,
     number_of,
-    quoted,
     read_toml,
     tables_of,
     text_of,
-    written,
+    toml_number,
+    toml_string,
 )
 from handsim.files.outputs import write_text, writing
 from handsim.hand.shape import BONE_NAMES, BONES, PALM, SIDES, Side
@@ -217,7 +217,7 @@ class MarkerLayout:
             LayoutError: The file cannot be written.
         """
         told = [
-            f"{key} = {quoted(text)}"
+            f"{key} = {toml_string(text)}"
             for key, text in (("description", description), ("source", source))
             if text
         ]
@@ -309,9 +309,9 @@ def starter_layout() -> str:
 
 def layout_lines(layout: MarkerLayout) -> list[str]:
     """The lines of a layout's file."""
-    lines = [f"name = {quoted(layout.name)}", f"radius_mm = {written(layout.radius * 1e3)}"]
+    lines = [f"name = {toml_string(layout.name)}", f"radius_mm = {toml_number(layout.radius * 1e3)}"]
     if set(layout.sides) != set(SIDES):
-        lines.append(f"sides = [{', '.join(map(quoted, layout.sides))}]")
+        lines.append(f"sides = [{', '.join(map(toml_string, layout.sides))}]")
     for marker in layout.markers:
         lines += ["", "[[marker]]", *(f"{key} = {text}" for key, text in _marker_texts(marker).items())]
     return lines
@@ -319,9 +319,13 @@ def layout_lines(layout: MarkerLayout) -> list[str]:
 
 def _marker_texts(marker: MarkerPlace) -> dict[str, str]:
     """The values of a marker's table as TOML, without optional ones that are zero."""
-    texts = {"name": quoted(marker.name), "bone": quoted(marker.bone), "along": written(marker.along)}
-    texts |= {"around": written(math.degrees(marker.around)), "across": written(marker.across)}
-    texts |= {"height_mm": written(1e3 * marker.height)}
+    texts = {
+        "name": toml_string(marker.name),
+        "bone": toml_string(marker.bone),
+        "along": toml_number(marker.along),
+    }
+    texts |= {"around": toml_number(math.degrees(marker.around)), "across": toml_number(marker.across)}
+    texts |= {"height_mm": toml_number(1e3 * marker.height)}
     return {key: text for key, text in texts.items() if key not in _OPTIONAL or text != "0.0"}
 
 
@@ -387,7 +391,7 @@ def _moved_table(lines: list[str], marker: MarkerPlace) -> list[str]:
             continue
         same = False
         with contextlib.suppress(ValueError):  # the bone is no number
-            same = written(float(match[3])) == texts[key]
+            same = toml_number(float(match[3])) == texts[key]
         result.append(line if same else f"{match[1]}{texts[key]}{match[4]}")
         last = len(result)
     result[last:last] = [f"{key} = {texts[key]}" for key in _OPTIONAL if key in texts and key not in met]

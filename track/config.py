@@ -11,7 +11,7 @@ from typing import Annotated, ClassVar, Literal
 
 from handsim.settings import Limits, Settings
 
-Size = Literal["auto", "XS", "S", "M", "L", "XL"]
+SizeChoice = Literal["auto", "XS", "S", "M", "L", "XL"]
 """Size of hands; `auto` measures them."""
 HandOrigin = Literal["named", "measured", "calibrated"]
 """Where a hand is from: of a named size, with size and proportions measured, or calibrated."""

@@ -16,7 +16,7 @@ from handsim.errors import ArgumentError
 from handsim.hand.shape import JOINT_NAMES, SIDES, Side
 from handsim.settings import Expected, Settings
 from track.bodies.rigid_body import AnyBody, RigidTemplate, load_bodies
-from track.config import Size, TrackerConfig
+from track.config import SizeChoice, TrackerConfig
 from track.frames import StreamedFrame
 from track.hand_size import check_hands, check_scale, measured_user
 from track.tracker import Tracker
@@ -44,7 +44,7 @@ class LabelSettings(Settings):
     for hands that are measured."""
     hands: AnyHands | None = None
     """A user, hands in their gloves or the path of a user's file; or sides, those of the glove when None."""
-    size: Size = "auto"
+    size: SizeChoice = "auto"
     """Size of hands given by sides alone: XS, S, M, L, XL, or auto, which measures size and proportions in
     the capture."""
     labeler: AnyLabeler = None
@@ -149,7 +149,7 @@ class TrackerSetup:
     def measured(self, frames: Sequence[StreamedFrame], *, warns: bool = True) -> TrackerSetup:
         """Measure the hands in some frames, if their size is automatic, and check that they fit."""
         check_scale(frames, self.user, self.labeler)
-        user, is_named = self.user, self.user.notes in get_args(Size)
+        user, is_named = self.user, self.user.notes in get_args(SizeChoice)
         if self.is_auto:
             user = measured_user(frames, user, self.labeler, warns=warns)
         check_hands(frames, user, self.labeler, options=("--hands", "--glove") if is_named else ())

@@ -21,7 +21,7 @@ from handsim.files.outputs import write_text, writing
 from handsim.hand.model import HandModel
 from handsim.hand.shape import SIDES, HandShape, Side
 from track.calibration.user_calibration import Calibration
-from track.config import HandOrigin, Size
+from track.config import HandOrigin, SizeChoice
 from track.kinematics.pose_spread import NUM_NUMBERS, HandErrors
 from train.labelers.protocol import Labeler
 from train.labelers.storage import load_labeler
@@ -176,7 +176,7 @@ def hand_origin(notes: str, side: Side) -> HandOrigin:
     Hands that could not be measured have a named size; one that calibration did not improve is measured.
     """
     first = notes.split("; ", maxsplit=1)[0]
-    if first.removeprefix(MEASURED) in get_args(Size):
+    if first.removeprefix(MEASURED) in get_args(SizeChoice):
         return "named"
     left = any(told.startswith(f"{side} hand: ") for told in _left_as_measured(notes))
     return "measured" if left or first.startswith(MEASURED) else "calibrated"
@@ -204,7 +204,7 @@ def as_user(hands: User | Sequence[GloveFit] | str | Path) -> User:
     if isinstance(hands, str | Path):
         user = load_user(hands)
         first, *_ = user.notes.split("; ")
-        size = [first] if first.startswith(MEASURED) or first in get_args(Size) else []
+        size = [first] if first.startswith(MEASURED) or first in get_args(SizeChoice) else []
         notes = [*size, Path(hands).name, *_left_as_measured(user.notes)]
         return dataclasses.replace(user, notes="; ".join(notes))
     if not isinstance(hands, User):

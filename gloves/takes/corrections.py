@@ -18,7 +18,16 @@ from numpy.typing import NDArray
 from gloves.takes.points import PointList
 from gloves.takes.take import Take
 from handsim.errors import CaptureError, HandSimError, choices, errors_of
-from handsim.files.inputs import check_keys, numbers, quoted, read_toml, shown, tables_of, text_of, written
+from handsim.files.inputs import (
+    check_keys,
+    numbers,
+    read_toml,
+    shown,
+    tables_of,
+    text_of,
+    toml_number,
+    toml_string,
+)
 from handsim.files.outputs import write_text, writing
 
 CORRECTIONS_SUFFIX: Final = ".corrections.toml"
@@ -89,9 +98,9 @@ def save_corrections(path: Path, corrections: Iterable[Correction]) -> None:
     lines = [_COMMENT]
     for correction in corrections:
         record = correction.record()
-        place = ", ".join(written(value) for value in record["place_mm"])
+        place = ", ".join(toml_number(value) for value in record["place_mm"])
         lines += ["", "[[correction]]", f"frames = {record['frames']}", f"place_mm = [{place}]"]
-        lines += [f"label = {quoted(correction.label)}"]
+        lines += [f"label = {toml_string(correction.label)}"]
     with writing(path, CaptureError):
         write_text(path, "\n".join(lines) + "\n")
 

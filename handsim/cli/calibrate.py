@@ -14,7 +14,7 @@ from handsim.cli.options import TrackerOptions, check_live, check_source, check_
 from handsim.cli.study import Step, StudyFile, is_study, run_study, study_files
 from handsim.files.outputs import check_outputs
 from handsim.hand.shape import Side
-from track.config import Size
+from track.config import SizeChoice
 
 if TYPE_CHECKING:
     from track.calibration.user_calibration import Calibration
@@ -29,7 +29,7 @@ def calibrate(
     live: str | None = None,
     seconds: float | None = None,
     glove: str = "dense19",
-    size: Size = "auto",
+    size: SizeChoice = "auto",
     hands: tuple[Side, ...] | None = None,
     labeler: str | None = None,
 ) -> None:

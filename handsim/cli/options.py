@@ -13,7 +13,7 @@ from handsim._checks import check_number
 from handsim.errors import ArgumentError
 from handsim.files.inputs import words_numbers
 from handsim.hand.shape import Side
-from track.config import Size
+from track.config import SizeChoice
 
 if TYPE_CHECKING:
     from gloves.takes.take import Take
@@ -27,7 +27,7 @@ class TrackerOptions:
     glove: str | None = None
     """Marker layout: a shipped name or the path of a .toml file; that of --shape, or dense19, when not
     given."""
-    size: Size | None = None
+    size: SizeChoice | None = None
     """Size of the hands; auto, which is the default, measures it in the capture, or beside the tracking of a
     stream."""
     shape: Path | None = None

@@ -203,11 +203,11 @@ def shown(value: object) -> str:
     return shortened(json.dumps(value, default=str, ensure_ascii=False))
 
 
-def quoted(text: str) -> str:
+def toml_string(text: str) -> str:
     """A TOML basic string, which escapes as JSON does, and the delete character too."""
     return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007F")
 
 
-def written(value: float) -> str:
+def toml_number(value: float) -> str:
     """A TOML float without the noise of unit conversion; never '-0.0'."""
     return repr(round(value, 9) + 0.0)

@@ -27,11 +27,11 @@ from handsim.files.inputs import (
     number_list,
     number_of,
     numbers,
-    quoted,
     read_toml,
     shown,
     tables_of,
     text_of,
+    toml_string,
 )
 from handsim.files.outputs import as_text, write_text
 from handsim.settings import Expected, Limits
@@ -148,10 +148,10 @@ def rig_lines(name: str, cameras: Sequence[Camera]) -> list[str]:
     """The lines of a file, with exact numbers; picture keys that all cameras share stand at the top."""
     pictures = [list(_picture_lines(one)) for one in cameras]
     shared = all(one == pictures[0] for one in pictures)
-    lines = [f"name = {quoted(name)}", *(pictures[0] if shared else ())]
+    lines = [f"name = {toml_string(name)}", *(pictures[0] if shared else ())]
     for camera, picture in zip(cameras, pictures, strict=True):
         rows = [f"    {_written(row)}," for row in camera.T_world_camera.tolist()]
-        lines += ["", "[[camera]]", f"name = {quoted(camera.name)}", *(() if shared else picture)]
+        lines += ["", "[[camera]]", f"name = {toml_string(camera.name)}", *(() if shared else picture)]
         lines += ["T_world_camera = [", *rows, "]"]
     return lines
 
@@ -163,7 +163,7 @@ def _picture_lines(camera: Camera) -> Iterator[str]:
     if center != [length / 2 for length in camera.size]:
         yield f"center = {_written(center)}"
     if camera.lens.kind != "pinhole":
-        yield f"lens = {quoted(camera.lens.kind)}"
+        yield f"lens = {toml_string(camera.lens.kind)}"
         yield f"coefficients = {_written(camera.lens.coefficients)}"
 
 

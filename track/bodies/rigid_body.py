@@ -23,7 +23,7 @@ from gloves.takes.bodies import RigidBody
 from gloves.takes.points import Status
 from handsim._checks import check_array, check_type
 from handsim.errors import ArgumentError, CalibrationError, HandSimError, choices, errors_of
-from handsim.files.inputs import check_keys, numbers, quoted, read_toml, tables_of, text_of, written
+from handsim.files.inputs import check_keys, numbers, read_toml, tables_of, text_of, toml_number, toml_string
 from handsim.files.outputs import write_text, writing
 from handsim.hand.shape import SIDES, Side
 from handsim.kernels import move, velocity_of, write_quaternion_matrix
@@ -458,13 +458,13 @@ def load_bodies(names_or_paths: AnyBody | Iterable[AnyBody]) -> tuple[RigidTempl
 
 def save_body(path: str | Path, body: RigidTemplate) -> None:
     """Write a body as TOML with nine decimals; `load_body` reads the same body again."""
-    lines = [f"name = {quoted(body.name)}"]
-    lines += [f"{part} = {quoted(side)}" for part, side in body.limb.items()]
+    lines = [f"name = {toml_string(body.name)}"]
+    lines += [f"{part} = {toml_string(side)}" for part, side in body.limb.items()]
     if body.forearm is not None:
         lines.append(f"forearm_axes = {str(body.has_axes).lower()}")
     for name, position in zip(body.marker_names, 1e3 * body.positions, strict=True):
-        numbers_mm = ", ".join(written(value) for value in position.tolist())
-        lines += ["", "[[marker]]", f"name = {quoted(name)}", f"place_mm = [{numbers_mm}]"]
+        numbers_mm = ", ".join(toml_number(value) for value in position.tolist())
+        lines += ["", "[[marker]]", f"name = {toml_string(name)}", f"place_mm = [{numbers_mm}]"]
     with writing(path, BodyError):
         write_text(path, "\n".join(lines) + "\n")
 

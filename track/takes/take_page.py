@@ -21,7 +21,7 @@ from handsim.files.outputs import check_ending, written_together
 from handsim.hand.angles import WRIST_NAMES
 from handsim.hand.shape import DIGITS, JOINT_NAMES, JOINTS, Side
 from handsim.pages import NOTHING, Paint, Section, html_list, picture, write_sections
-from track.config import Size
+from track.config import SizeChoice
 from track.kinematics.pose_spread import CHANGING, SOURCES
 from track.takes.methods import made_of, methods_paragraph
 from track.takes.take_faults import SuspectSpan
@@ -110,7 +110,7 @@ def _lead(take: Take) -> str:
     parts.append(f"hands {' and '.join(take.sides)}")
     if user.startswith(MEASURED):
         parts.append(f"measured size {user.removeprefix(MEASURED)}")
-    elif user in get_args(Size):
+    elif user in get_args(SizeChoice):
         parts.append(f"size {user}")
     end = f"{take.num_frames:,} frames, {take.duration:.1f} s at {take.rate:.4g} Hz."
     first = ", ".join(parts)

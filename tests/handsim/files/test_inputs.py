@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from gloves import load_layout, load_take, read_capture
 from handsim.errors import CaptureError, LayoutError
 from handsim.files.arrays import read_npz
-from handsim.files.inputs import quoted, read_bytes
+from handsim.files.inputs import read_bytes, toml_string
 
 
 @pytest.mark.parametrize("name", ["take.trc", "take.truth.npz", "glove.toml"])
@@ -97,8 +97,8 @@ def test_more_cells_than_a_text_file_can_hold_are_refused(tmp_path):
 
 @given(st.text(st.characters(exclude_categories=["Cs"])))
 def test_any_text_comes_back(text):
-    assert tomllib.loads(f"name = {quoted(text)}")["name"] == text
+    assert tomllib.loads(f"name = {toml_string(text)}")["name"] == text
 
 
 def test_the_delete_character_is_escaped():
-    assert quoted("a\x7fb") == '"a\\u007Fb"'
+    assert toml_string("a\x7fb") == '"a\\u007Fb"'
