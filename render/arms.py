@@ -23,7 +23,8 @@ from render.skin.look import REACH
 _BARE: Final = 0.15  # share of a forearm, from the wrist on, that may be before its own hand
 _INNER: Final = 0.035  # distance of an arm's axis from a line of sight that it hides whole [m]
 _OUTER: Final = 0.075  # least distance of one that it leaves free [m]
-_HIDING: Final = 15.0  # cost of an arm that hides all keypoints from a camera
+HIDING: Final = 15.0
+"""Cost of an arm that hides all keypoints from a camera."""
 _COMPARED: Final = 10  # forearms whose upper arms are tried
 _STEADY: Final = 2.0  # cost of an arm that turns by 60 degrees between two choices
 _TURNS: Final = np.deg2rad([0, 20, -20, 40, -40, 60, -60, 90, -90, 120, -120, 150, -150, 180])
@@ -119,7 +120,7 @@ def hiding_costs(
                 covers = _is_close(eye, start, end)
                 for point in points[one]:
                     hidden += 1.0 if covers else _hidden(eye, point, start, end)
-            costs[one, arm] = _HIDING * hidden / points.shape[1]
+            costs[one, arm] = HIDING * hidden / points.shape[1]
     return costs
 
 

@@ -17,7 +17,7 @@ from gloves import Take
 from handsim.hand.model import hand_keypoints
 from handsim.space.camera import Camera
 from handsim.space.transforms import quaternion_matrix
-from render.arms import Arms, bend_arms, forearm_axes, hiding_costs, turning
+from render.arms import HIDING, Arms, bend_arms, forearm_axes, hiding_costs, most_hidden, turning
 from render.frames import Doubles
 from render.skin.look import ELBOW
 
@@ -25,6 +25,17 @@ _HAND: Final = 0.108  # length of a hand, as a share of the stature
 _UPPER_ARM: Final = 0.186 / _HAND  # in hand lengths, as the next two
 _SHOULDER: Final = 0.129 / _HAND  # distance of a shoulder from the neck's axis
 _EYES: Final = (0.5, 0.118 / _HAND)  # before and above the shoulders; a head that looks down leans forward
+_TRUNK: Final = (
+    *([[side, 0.0, -0.03], [side, 0.0, -0.288]] for side in (-0.06, -0.02, 0.02, 0.06)),
+    [[-0.129, 0.0, -0.01], [0.129, 0.0, -0.01]],
+)
+"""Axes (5, 2, 3) that fill a trunk from the shoulders to the hips if they are as thick as arms, to the right,
+ahead and upwards from the neck, as shares of the stature."""
+_HEAD: Final = (
+    [[0.0, 0.0, 0.0], [0.0, 0.0, 0.09]],
+    *([[side, 0.005, 0.09], [side, 0.005, 0.155]] for side in (-0.018, 0.018)),
+)
+"""Axes (3, 2, 3) of the neck and the head, as in `_TRUNK`."""
 _WRIST: Final = np.deg2rad([[54.0, 60.0], [40.0, 17.0]])
 """Largest flexion and extension, ulnar and radial deviation of a wrist [rad]: those of daily work (Ryu et al.
 1991, J. Hand Surg. 16A:409), about three quarters of what wrists can."""
@@ -66,38 +77,47 @@ class UserBody:
     """Position of each hand's shoulder (H, 3) [m]."""
     right: Doubles
     """Level unit direction (3,) to the person's right."""
+    trunk: Doubles
+    """Axes (B, 2, 3) of the trunk, the neck and the head [m]; see `_TRUNK`."""
     forearms: Doubles
     """Unit directions from wrists to elbows in all frames (T, H, 3); NaN where there is no hand."""
 
     def __init__(self, take: Take, cameras: Float[np.ndarray, "C 3"] | None = None) -> None:
-        """Place the person where arms hide no hand from the eyes, nor from cameras at these positions [m]."""
+        """Place the person where no hand is hidden from the eyes, nor from cameras at these positions [m]."""
         self._cameras: Doubles = np.empty((0, 3)) if cameras is None else cameras
         self._lengths = np.array([hand.shape.length for hand in take.hands])
         self._mirrors = np.array([-1.0 if hand.side == "left" else 1.0 for hand in take.hands])
         there = np.flatnonzero(np.isfinite(take.qpos[..., 0]).any(axis=1))
         frames = there[np.linspace(0, len(there) - 1, min(_FRAMES, len(there))).astype(int)]
         wrists, axes = take.qpos[frames, :, :3], quaternion_matrix(take.qpos[frames, :, 3:7])
-        middle = _middle(self._palms(wrists, axes).reshape(-1, 3))
+        palms = self._palms(wrists, axes)
+        middle = _middle(palms.reshape(-1, 3))
+        outlines = np.stack([wrists, palms, 2.0 * palms - wrists], axis=2)
         best, azimuth = np.inf, 0.0
         for azimuths, distances, downs, facings in (_COARSE, _FINE):
             grids = np.meshgrid(azimuth + azimuths, distances, downs, facings)
             tried = np.stack([grid.ravel() for grid in grids], axis=1)
-            eyes, shoulders, right = self._stand(middle, *tried.T)
+            eyes, neck, right = self._stand(middle, *tried.T)
+            shoulders, trunk = self._shoulders(neck, right), self._trunk(neck, right)
             _, costs = self._elbows(wrists, axes, shoulders[:, None], eyes[:, None])
             means = np.nanmean(np.minimum(costs.min(axis=-1), _WORST), axis=(1, 2))
+            means += _blocking(trunk[:, : len(_TRUNK)], eyes[:, None], outlines)
+            means += _blocking(trunk, self._cameras[None], outlines)
             means += _UNUSUAL * np.square((tried[:, 1:] - _NATURAL) / _SPREADS).sum(axis=1)
             first = int(means.argmin())
             if means[first] < best:
                 best, azimuth = float(means[first]), float(tried[first, 0])
                 self.eyes, self.shoulders, self.right = eyes[first], shoulders[first], right[first]
+                self.trunk = trunk[first]
         self._tracked = _tracked_forearms(take)
         self.forearms = _where_known(self._tracked, self._forearms(take.qpos))
 
     def axes(self, wrists: Float[np.ndarray, "T H 3"], forearms: Float[np.ndarray, "T H 3"]) -> Doubles:
-        """Axes (T, 2 H, 2, 3) of forearms in these directions, and of upper arms to the shoulders [m]."""
+        """Axes (T, 2 H + B, 2, 3) of forearms in these directions, of upper arms, and of the trunk [m]."""
         elbows = wrists + (ELBOW * self._lengths)[:, None] * forearms
         upper = np.stack(np.broadcast_arrays(elbows, self.shoulders), axis=-2)
-        return np.concatenate([forearm_axes(wrists, elbows), upper], axis=1)
+        trunk = np.broadcast_to(self.trunk, (len(wrists), *self.trunk.shape))
+        return np.concatenate([forearm_axes(wrists, elbows), upper, trunk], axis=1)
 
     def arms(
         self, qpos: Float[np.ndarray, "K H 27"], hands: Sequence[int], frames: Int[np.ndarray, "K"]
@@ -144,15 +164,25 @@ class UserBody:
     def _stand(
         self, middle: Doubles, azimuth: Doubles, distance: Doubles, down: Doubles, facing: Doubles
     ) -> tuple[Doubles, Doubles, Doubles]:
-        """Eyes (K, 3), shoulders (K, H, 3) and right (K, 3) of people who look at a point from these."""
+        """Eyes, neck and right, (K, 3) each, of people who look at a point from these."""
         flat, length = np.cos(down), float(self._lengths.mean())
         sight = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), -np.sin(down)], axis=1)
         ahead = np.stack([np.cos(azimuth + facing), np.sin(azimuth + facing), 0.0 * facing], axis=1)
         right = np.stack([ahead[:, 1], -ahead[:, 0], ahead[:, 2]], axis=1)
         eyes = middle - distance[:, None] * sight
-        neck = eyes - length * (_EYES[0] * ahead + [0.0, 0.0, _EYES[1]])
+        return eyes, eyes - length * (_EYES[0] * ahead + [0.0, 0.0, _EYES[1]]), right
+
+    def _shoulders(self, neck: Doubles, right: Doubles) -> Doubles:
+        """Shoulders (K, H, 3) of people with these necks."""
         aside = (_SHOULDER * self._lengths * self._mirrors)[:, None]
-        return eyes, neck[:, None] + aside * right[:, None], right
+        return np.asarray(neck[:, None] + aside * right[:, None])
+
+    def _trunk(self, neck: Doubles, right: Doubles) -> Doubles:
+        """Axes (K, B, 2, 3) of trunks, necks and heads of people with these necks."""
+        up = np.broadcast_to(np.eye(3)[2], right.shape)
+        directions = np.stack([right, np.cross(up, right), up], axis=1)
+        places = float(self._lengths.mean()) / _HAND * np.array([*_TRUNK, *_HEAD])
+        return np.asarray(neck[:, None, None] + np.einsum("bei,kij->kbej", places, directions))
 
     def _palms(self, wrists: Doubles, axes: Doubles) -> Doubles:
         return np.asarray(wrists + 0.5 * self._lengths[:, None] * axes[..., 0])
@@ -227,6 +257,15 @@ class UserBody:
         others = np.broadcast_to(self._cameras, (len(eyes), *self._cameras.shape))
         eyes = np.ascontiguousarray(np.concatenate([eyes, others], axis=1))  # one type for the compiler
         return np.asarray(hiding_costs(axes, eyes, points).reshape(*batch, hands, tried))
+
+
+def _blocking(trunks: Doubles, eyes: Doubles, points: Doubles) -> Doubles:
+    """Costs (K,) of trunks (K, B, 2, 3) that hide points (F, H, P, 3) of hands from eyes (K or 1, C, 3)."""
+    shape = (len(trunks), len(points), eyes.shape[1])
+    views = (trunks[:, None, None], eyes[:, None], points[None, :, None])
+    each = [np.broadcast_to(one, (*shape, *one.shape[3:])) for one in views]
+    hidden = most_hidden(*(np.array(one).reshape(-1, *one.shape[3:]) for one in each))
+    return np.asarray(HIDING * hidden.reshape(shape).sum(axis=2).mean(axis=1))
 
 
 def _tracked_forearms(take: Take) -> Doubles:

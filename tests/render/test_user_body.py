@@ -5,9 +5,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from gloves import Take
+from handsim.space.rig import load_rig
 from render import draw
+from render.arms import most_hidden
 from render.frames import FOREARM, PARTS_A_HAND
 from render.user_body import UserBody
+from render.viewpoints import Framing
 from train import simulate_take
 
 
@@ -46,6 +49,27 @@ def test_the_person_turns_and_moves_with_the_hands(take):
     here, there = UserBody(take), UserBody(Take.of_poses(take.hands, moved, rate=take.rate))
     np.testing.assert_allclose(there.eyes, turn.apply(here.eyes) + shift, atol=1e-9)
     np.testing.assert_allclose(there.shoulders, turn.apply(here.shoulders) + shift, atol=1e-9)
+
+
+def test_trunks_and_heads_are_no_obstacle_between_hands_and_the_cameras_of_a_rig(take):
+    cameras, points = load_rig("six").T_world_camera[:, :3, 3], Framing(take).points.astype(float)
+    user = UserBody(take, cameras)
+    trunk = np.tile(user.trunk, (len(points), 1, 1, 1))
+    free = [most_hidden(trunk, np.tile(eye, (len(points), 1)), points) < 0.5 for eye in cameras]
+    assert np.mean(free) >= 0.95
+
+
+def test_a_camera_behind_or_in_the_person_sees_no_hand_and_one_before_the_person_does(take):
+    user = UserBody(take)
+    framing, frames = Framing(take, user), np.arange(0, take.num_frames, 10)
+    middle = framing.middle()
+    back = (user.eyes - middle) * (1.0, 1.0, 0.0)
+
+    def free(eye: np.ndarray) -> float:
+        return framing.free(np.tile(eye, (len(frames), 1)), frames)
+
+    assert free(middle + 2.0 * back) == free(middle + back) == 0.0
+    assert free(middle - 1.5 * back + (0.0, 0.0, 0.3)) > 0.5
 
 
 def test_a_hand_that_is_not_there_has_no_arm():
