@@ -85,6 +85,8 @@ class Framing:
                 rows = there[first : first + _CHUNK]
                 self.points[rows, number] = hand_keypoints(hand.model, take.qpos[rows, number])[:, _OUTLINE]
         self._there = np.isfinite(self.points[..., 0, 0])
+        self.trunk: Doubles = np.empty((0, 3)) if user is None else user.trunk.reshape(-1, 3)
+        """Positions (N, 3) of the person's trunk and head [m]; none of nobody."""
         self._arms = None if user is None else user.axes(take.qpos[..., :3], user.forearms)
         known = np.flatnonzero(self._there.any(axis=1))
         flat = self.points[known].reshape(len(known), -1, 3).astype(np.float64)
@@ -352,13 +354,19 @@ class Viewpoints:
         hands, camera = self._framing.points, self.cameras(0)[0]
         along = hands[:, :, :1] + self._framing.forearms[:, :, None] * _ALONG_ARM[:, None]
         points = (along if arms else hands).reshape(-1, 3)
+        if arms:
+            points = np.concatenate([points, self._framing.trunk])
         seen = (np.abs(camera.project(points) / camera.size - 0.5) < 0.5 + _BESIDE).all(axis=1) | (not arms)
         places = camera.local(points[seen]) @ normal
         return float(np.nanmin(places, initial=0.0)) - (_SLEEVE if arms else _SKIN)
 
     def positions(self) -> Float[np.ndarray, "P 3"]:
-        """Positions of the cameras and of the hands' centers in all frames [m]."""
-        return np.concatenate([self._framing.centers, *(path.poses[:, :3, 3] for path in self._paths)])
+        """Positions of the cameras, of the hands' centers in all frames, and of the person [m]."""
+        return np.concatenate([self._framing.centers, self._framing.trunk, self.eyes()])
+
+    def eyes(self) -> Float[np.ndarray, "P 3"]:
+        """Positions of the cameras in all frames [m]."""
+        return np.concatenate([path.poses[:, :3, 3] for path in self._paths])
 
     def cameras(self, frame: int) -> list[Camera]:
         """The cameras of one frame: `view0`, `view1`, ..., or those of the file with their own names."""

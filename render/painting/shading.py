@@ -156,6 +156,7 @@ def light_behind(
     camera: Camera, drawn: Sequence[Drawn], lighting: Lighting, backdrop: Backdrop
 ) -> Float32[np.ndarray, "H W"] | None:
     """Light on a backdrop with the first lamp's shadows over that without them; None without shadows."""
+    drawn = [one for one in drawn if len(one.casting)]
     if not drawn or not lighting.lamps:
         return None
     normal = backdrop.normal

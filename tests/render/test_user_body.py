@@ -9,7 +9,8 @@ from handsim.space.rig import load_rig
 from render import draw
 from render.arms import most_hidden
 from render.frames import FOREARM, PARTS_A_HAND
-from render.user_body import UserBody
+from render.skin.look import ELBOW
+from render.user_body import UPPER_ARM, UserBody
 from render.viewpoints import Framing
 from train import simulate_take
 
@@ -32,6 +33,14 @@ def test_wrists_bend_no_farther_than_wrists_do(take):
         radial = np.rad2deg(np.arcsin(y if hand.side == "right" else -y))
         assert flexion.min() >= -60.1 and flexion.max() <= 54.1
         assert radial.min() >= -40.1 and radial.max() <= 17.1
+
+
+def test_upper_arms_are_about_as_long_as_those_of_people(take):
+    user = UserBody(take)
+    lengths = np.array([hand.shape.length for hand in take.hands])
+    elbows = take.qpos[..., :3] + ELBOW * lengths[:, None] * user.forearms
+    stretch = np.linalg.norm(user.shoulders - elbows, axis=-1) / (UPPER_ARM * lengths)
+    assert np.exp(np.abs(np.log(stretch)).mean()) < 1.25
 
 
 def test_elbows_do_not_jump(take):
