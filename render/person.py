@@ -19,6 +19,7 @@ from render.fields import bump, noise, smooth
 from render.frames import Doubles, Floats, Integers
 from render.painting.figures import SCATTER, Appearance, Drawn, Material, linear
 from render.painting.rasterizer import Triangles
+from render.painting.shading import MIRRORED
 from render.skin.look import SkinLook
 from render.user_body import UserBody
 
@@ -34,8 +35,8 @@ _HEIGHTS: Final = np.concatenate(
 """Heights of rings above the neck."""
 _TRUNK: Final = np.array(
     [
-        [-0.82, 0.07, 0.055],
-        [-0.5, 0.092, 0.064],
+        [-0.82, 0.086, 0.055],
+        [-0.5, 0.099, 0.068],
         [-0.4, 0.102, 0.07],
         [-0.29, 0.1, 0.068],
         [-0.21, 0.092, 0.065],
@@ -100,6 +101,7 @@ def person_figure(user: UserBody, look: Appearance) -> Drawn:
     vertices = user.neck + user.stature * shape @ user.directions
     ids = (np.zeros(len(faces), dtype=np.uint8) for _ in range(3))
     triangles = Triangles(vertices, faces, vertex_normals(vertices, faces), *ids)
+    colors[:, :3] += 0.4 * MIRRORED  # of chalk; these factors dim mirrored light, too
     return Drawn(triangles, colors, None, _material, faces[:0], out_of_focus=True)
 
 

@@ -161,7 +161,7 @@ class Moment:
     person: Int[np.ndarray, "T"] | None = None
     """Number of the person in each frame; motion is not interpolated from one person to another."""
     upper_arms: Float[np.ndarray, "H 3"] | None = None
-    """Unit direction of each hand's upper arm; see `Studio.reaching`."""
+    """Each hand's upper arm from the elbow [m]; see `Studio.reaching`."""
     forearms: Float[np.ndarray, "H 3"] | None = None
     """Unit direction of each hand's forearm; None for wrists at rest."""
 
