@@ -25,7 +25,7 @@ from render.mano import load_mano
 from render.studio import Moment, Studio
 from render.subject import Model, Subject, subject_of
 from render.user_body import UserBody
-from render.viewpoints import Viewpoints, rig_positions
+from render.viewpoints import Viewpoints, known_positions
 
 
 def draw(
@@ -125,8 +125,7 @@ class Drawing:
         self.take, rng = self.subject.take, SpawnKey.VIEWPOINTS.rng(config.seed)
         # Poses that are no motion may be of many people, but cameras at the eyes need one person.
         has_user = subject.is_motion or config.view.placement == "head"
-        known = rig_positions(config.view) if config.view.placement == "rig" else None
-        self._user = UserBody(self.take, known) if has_user else None
+        self._user = UserBody(self.take, known_positions(config.view, config.up)) if has_user else None
         poses = None if subject.footage is None else subject.footage.poses
         self.viewpoints = Viewpoints(
             config.view, self.take, rng=rng, up=config.up, user=self._user, poses=poses

@@ -299,9 +299,7 @@ class Viewpoints:
         """Place the cameras; `poses` move the first of the user's own cameras."""
         framing = Framing(take, user)
         if config.cameras is not None:
-            cameras, turn = list(config.own_cameras()), rigid(upright(up), np.zeros(3))
-            if up != "z":
-                cameras = [one.at(turn @ one.T_world_camera) for one in cameras]
+            cameras, turn = _own_cameras(config, up), rigid(upright(up), np.zeros(3))
             stay = (take.num_frames, 4, 4)
             self._paths = [_Path(one, np.broadcast_to(one.T_world_camera, stay)) for one in cameras]
             if poses is not None:
@@ -510,9 +508,19 @@ def _head(config: ViewConfig, take: Take, framing: Framing, rng: np.random.Gener
     return paths
 
 
-def rig_positions(config: ViewConfig) -> Float[np.ndarray, "C 3"]:
-    """Positions of the rig's cameras [m], which are known before all others."""
-    return np.asarray(load_rig(config.rig).T_world_camera[:, :3, 3])
+def known_positions(config: ViewConfig, up: UpAxis) -> Float[np.ndarray, "C 3"]:
+    """Positions [m] of a rig's and of the user's own cameras, which are known before the person's place."""
+    if config.cameras is not None:
+        return np.array([one.T_world_camera[:3, 3] for one in _own_cameras(config, up)])
+    if config.placement == "rig":
+        return np.asarray(load_rig(config.rig).T_world_camera[:, :3, 3])
+    return np.empty((0, 3))
+
+
+def _own_cameras(config: ViewConfig, up: UpAxis) -> list[Camera]:
+    """The user's own cameras in a world with z up."""
+    turn = rigid(upright(up), np.zeros(3))
+    return [one if up == "z" else one.at(turn @ one.T_world_camera) for one in config.own_cameras()]
 
 
 def _rig(config: ViewConfig, take: Take, framing: Framing, rng: np.random.Generator) -> list[_Path]:

@@ -5,6 +5,8 @@ import pytest
 import trimesh
 
 from gloves import Take
+from handsim import look_at
+from handsim.space.camera import pinhole
 from render import draw
 from render.painting.figures import sample_appearance
 from render.painting.painter import paint, paint_blurred
@@ -67,3 +69,12 @@ def test_what_is_out_of_focus_is_painted_alone_and_blurred(take, user):
     sharp, soft = paint(frame.camera, drawn, lighting), paint_blurred(frame.camera, drawn, lighting)
     assert not sharp.any() and (soft[..., 3] == 255).any()
     assert len(np.unique(soft[..., 3])) > 50, "edges are soft"
+
+
+def test_people_stand_where_they_hide_no_hand_from_cameras_of_ones_own(take, user):
+    palms = np.nanmean(take.qpos[..., :3], axis=(0, 1))
+    back = (user.eyes - palms) * (1.0, 1.0, 0.0)
+    behind = pinhole("behind", (320, 240), 300.0).at(look_at(palms + 3.0 * back, palms))
+    for frame in draw(take, camera=behind, passes=("depth", "ids"), num_frames=2):
+        assert np.mean([hand.visible.any() for hand in frame.hands]) == 1.0
+        assert (frame.ids > 0).mean() > 0.02
