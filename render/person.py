@@ -23,13 +23,15 @@ from render.painting.shading import MIRRORED
 from render.skin.look import SkinLook
 from render.user_body import UserBody
 
-_AROUND: Final = 72  # vertices of a ring
-_HEIGHTS: Final = np.concatenate(
+_AROUND: Final = 56  # vertices of a ring
+_HEIGHTS: Final = np.array(
     [
-        np.linspace(-0.82, -0.06, 28),
-        np.linspace(-0.05, 0.055, 26),
-        np.linspace(0.058, 0.184, 44),
-        [0.1855, 0.186],
+        *np.linspace(-0.82, -0.33, 6),
+        *(-0.303, -0.299),  # the hem
+        *np.linspace(-0.27, -0.06, 8),
+        *np.linspace(-0.05, 0.055, 18),
+        *np.linspace(0.058, 0.184, 36),
+        *(0.1855, 0.186),
     ]
 )
 """Heights of rings above the neck."""
@@ -70,7 +72,7 @@ _ARM: Final = np.array(
     ]
 )
 """Course and radii of a right arm whose hand is behind the back, as are those that a take does not have."""
-_ARM_RINGS: Final = 40
+_ARM_RINGS: Final = 24
 _TO_ELBOW: Final = 0.15  # length of a forearm; longer sleeves cover it
 _EYES: Final = 0.117  # height of the eyes
 _HAIR: Final = ((18.0, 1.0, 2.0), (22.0, 6.0, 8.0), (32.0, 10.0, 16.0), (55.0, 8.0, 26.0), (62.0, 0.0, 3.0))

@@ -70,12 +70,13 @@ def paint_compiled(
     The cameras have one shadow map, so that shadows go on from one face of a lens to the next. Only what is
     in focus is painted, where nothing else hides it, or what is not, `blurred` as if it were alone.
     """
-    views = [_meshes(camera, drawn) for camera in cameras]
+    shown = [one for one in drawn if one.out_of_focus or not blurred]
+    views = [_meshes(camera, shown) for camera in cameras]
     points = np.concatenate([one.triangles.vertices for one in drawn]).astype(np.float32, copy=False)
     counts = np.cumsum([0, *(len(one.triangles.vertices) for one in drawn)])
     casting = np.concatenate([one.casting + first for one, first in zip(drawn, counts, strict=False)])
-    seen = np.zeros(len(points), dtype=np.bool_)
-    for camera, meshes in zip(cameras, views, strict=True):
+    seen = np.full(len(points), blurred)  # soft shadows do with room for all that casts any
+    for camera, meshes in () if blurred else zip(cameras, views, strict=True):
         given = [mesh.corners[: len(one.triangles.vertices)] for mesh, one in zip(meshes, drawn, strict=True)]
         sides = 2.0 * np.array(camera.size)
         with np.errstate(invalid="ignore"):  # NaN behind the camera
@@ -94,18 +95,14 @@ def paint_compiled(
         ambient = turned_irradiance(around, rotation.T)
         own = shadows._replace(to_map=shadows.to_map @ camera.T_world_camera)
         width, height = camera.size
-        shown = [mesh for mesh, one in zip(meshes, drawn, strict=True) if one.out_of_focus or not blurred]
-        surfaces = [(mesh.corners, mesh.faces) for mesh in shown]
+        surfaces = [(mesh.corners, mesh.faces) for mesh in meshes]
         nearness, first = nearest_faces(surfaces, (2 * width, 2 * height), farthest=0.0)
         covered = _covered(first)
         sums = np.zeros((len(covered), 4), dtype=np.float32)  # sums over the four samples of a pixel
         table = TO_DISPLAY[:0] if bright else TO_DISPLAY
-        for mesh, one in zip(meshes, drawn, strict=True):
+        for mesh, one in zip(meshes, shown, strict=True):
             if one.out_of_focus == blurred:
-                numbered = mesh._replace(begin=mesh.begin - shown[0].begin)
-                _add_surface(
-                    nearness, first, covered, *numbered, TO_LINEAR, turned, ambient, *own, table, sums
-                )
+                _add_surface(nearness, first, covered, *mesh, TO_LINEAR, turned, ambient, *own, table, sums)
         painted = np.zeros((height * width, 4), dtype=np.float32 if bright else np.uint8)
         if bright:
             painted[covered] = np.float32(63.75) * sums
