@@ -23,7 +23,8 @@ from render.skin.look import REACH
 _BARE: Final = 0.15  # share of a forearm, from the wrist on, that may be before its own hand
 _INNER: Final = 0.035  # distance of an arm's axis from a line of sight that it hides whole [m]
 _OUTER: Final = 0.075  # least distance of one that it leaves free [m]
-_HIDING: Final = 15.0  # cost of an arm that hides all keypoints from a camera
+HIDING: Final = 15.0
+"""Cost of an arm that hides all keypoints from a camera."""
 _COMPARED: Final = 10  # forearms whose upper arms are tried
 _STEADY: Final = 2.0  # cost of an arm that turns by 60 degrees between two choices
 _TURNS: Final = np.deg2rad([0, 20, -20, 40, -40, 60, -60, 90, -90, 120, -120, 150, -150, 180])
@@ -47,15 +48,17 @@ class Arms(NamedTuple):
     """Costs of their bends."""
     shoulders: Float[np.ndarray, "H 3"] | None = None
     """Positions [m]; None for people whose place is not known."""
+    whole: bool = False
+    """Whether upper arms end at the shoulders; otherwise they reach on and may turn aside."""
 
 
 def bend_arms(
     arms: Arms, points: Float[np.ndarray, "K N 3"], cameras: Sequence[Sequence[Camera]]
 ) -> tuple[Doubles, Doubles]:
-    """Unit directions (K, H, 3) of forearms from wrists, and of upper arms from elbows.
+    """Unit directions (K, H, 3) of forearms from wrists, and upper arms from elbows (K, H, 3) [m].
 
-    Arms hide as few of the hands' points [m] from each frame's cameras as they can, end in no picture, and
-    turn little from one of the frames to the next.
+    Arms hide as few of the hands' points [m] from each frame's cameras as they can, and turn little from one
+    of the frames to the next. Those that do not end at shoulders end in no picture.
     """
     eyes = np.array([[one.T_world_camera[:3, 3] for one in viewing] for viewing in cameras])
     axes = np.array([_common_axis(viewing) for viewing in cameras])
@@ -67,7 +70,10 @@ def bend_arms(
         best = bad.argsort(axis=1, kind="stable")[:, :_COMPARED, None]
         fore, elbows = (np.take_along_axis(one, best, axis=1) for one in (fore, elbows))
         ways = np.array(behind)[:, hand, None] if arms.shoulders is None else arms.shoulders[hand] - elbows
-        upper, worse = _upper_arms(elbows, fore, ways, axes, cameras)
+        if arms.whole:
+            upper, worse = ways[:, :, None], np.zeros((*ways.shape[:2], 1))
+        else:
+            upper, worse = _upper_arms(elbows, fore, ways, axes, cameras)
         worse += hiding_costs(_upper_axes(elbows, upper), eyes, points).reshape(worse.shape)
         bad = np.take_along_axis(bad, best[..., 0], axis=1) + worse.min(axis=2)
         rows, chosen = np.arange(len(fore)), _steadiest(bad, fore)
@@ -100,6 +106,12 @@ def turning(ways: Float[np.ndarray, "K H 3"], step: int, num_frames: int) -> Flo
     return np.asarray(mean / np.linalg.norm(mean, axis=-1, keepdims=True))
 
 
+def bending_costs(forearms: Doubles, upper_arms: Doubles) -> Doubles:
+    """Costs (...) of elbows between unit directions (..., 3) of forearms and upper arms."""
+    angles = np.arccos(np.clip((forearms * upper_arms).sum(axis=-1), -1.0, 1.0))
+    return np.asarray(3.0 * np.square(np.maximum(angles - _BENT[0], 0.0) / (_BENT[1] - _BENT[0])))
+
+
 def forearm_axes(wrists: Doubles, elbows: Doubles) -> Doubles:
     """Axes (..., 2, 3) of forearms that may hide hands [m], without what is close behind the wrist."""
     return np.stack(np.broadcast_arrays(wrists + _BARE * (elbows - wrists), elbows), axis=-2)
@@ -119,7 +131,7 @@ def hiding_costs(
                 covers = _is_close(eye, start, end)
                 for point in points[one]:
                     hidden += 1.0 if covers else _hidden(eye, point, start, end)
-            costs[one, arm] = _HIDING * hidden / points.shape[1]
+            costs[one, arm] = HIDING * hidden / points.shape[1]
     return costs
 
 
@@ -180,16 +192,16 @@ def _towards_body(forearms: Doubles, axis: Doubles, cameras: Sequence[Camera]) -
 def _upper_arms(
     elbows: Doubles, forearms: Doubles, ways: Doubles, axes: Doubles, cameras: Sequence[Sequence[Camera]]
 ) -> tuple[Doubles, Doubles]:
-    """Upper arms (K, S, U, 3) near these ways (K, S, 3), turned about `axes` (K, 3), and costs (K, S, U)."""
+    """Upper arms (K, S, U, 3) [m] near these ways (K, S, 3), turned about `axes` (K, 3), and their costs."""
     ways, axis = ways / np.linalg.norm(ways, axis=-1, keepdims=True), axes[:, None]
     aside, tilt = np.cross(axis, ways)[:, :, None], np.array(_TILTS)[:, None, None] * axes[:, None, None]
     turns = np.cos(_TURNS)[:, None] * ways[:, :, None] + np.sin(_TURNS)[:, None] * aside
     tried = (turns[:, :, None] - tilt[:, None]).reshape(*turns.shape[:2], -1, 3)
     tried /= np.linalg.norm(tried, axis=-1, keepdims=True)
     bad = np.tile(np.abs(_TURNS), len(_TILTS)) / np.pi + np.repeat(_TILTS, len(_TURNS))
-    angles = np.arccos(np.clip(np.einsum("ksui,ksi->ksu", tried, forearms), -1.0, 1.0))
-    bad = bad + 3.0 * np.square(np.maximum(angles - _BENT[0], 0.0) / (_BENT[1] - _BENT[0]))
-    for number, (ends, viewing) in enumerate(zip(elbows[:, :, None] + REACH * tried, cameras, strict=True)):
+    bad = bad + bending_costs(forearms[:, :, None], tried)
+    tried *= REACH
+    for number, (ends, viewing) in enumerate(zip(elbows[:, :, None] + tried, cameras, strict=True)):
         for camera in viewing:
             with np.errstate(invalid="ignore"):
                 pixels = camera.project(ends) / np.array(camera.size, dtype=np.float64)
@@ -200,5 +212,5 @@ def _upper_arms(
 
 def _upper_axes(elbows: Doubles, upper_arms: Doubles) -> Doubles:
     """Axes (K, S U, 2, 3) of upper arms (K, S, U, 3) from elbows (K, S, 3) [m]."""
-    starts, ends = np.broadcast_arrays(elbows[:, :, None], elbows[:, :, None] + REACH * upper_arms)
+    starts, ends = np.broadcast_arrays(elbows[:, :, None], elbows[:, :, None] + upper_arms)
     return np.stack([starts, ends], axis=3).reshape(len(elbows), -1, 2, 3)

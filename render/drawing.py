@@ -7,7 +7,7 @@ import functools
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -25,7 +25,7 @@ from render.mano import load_mano
 from render.studio import Moment, Studio
 from render.subject import Model, Subject, subject_of
 from render.user_body import UserBody
-from render.viewpoints import Viewpoints, rig_positions
+from render.viewpoints import Viewpoints, known_positions
 
 
 def draw(
@@ -68,6 +68,9 @@ def draw(
     subject = subject_of(source, model=model, glove=glove, seed=config.seed)
     asked = asked_pictures(subject, config, frames, record)
     return asked.drawing.frames(asked.shard, asked.numbered)
+
+
+_HEAD: Final = 0.35  # least distance of cameras from the ends of the axis of a head that is drawn [m]
 
 
 class Asked(NamedTuple):
@@ -122,8 +125,7 @@ class Drawing:
         self.take, rng = self.subject.take, SpawnKey.VIEWPOINTS.rng(config.seed)
         # Poses that are no motion may be of many people, but cameras at the eyes need one person.
         has_user = subject.is_motion or config.view.placement == "head"
-        known = rig_positions(config.view) if config.view.placement == "rig" else None
-        self._user = UserBody(self.take, known) if has_user else None
+        self._user = UserBody(self.take, known_positions(config.view, config.up)) if has_user else None
         poses = None if subject.footage is None else subject.footage.poses
         self.viewpoints = Viewpoints(
             config.view, self.take, rng=rng, up=config.up, user=self._user, poses=poses
@@ -213,7 +215,7 @@ class Drawing:
         """Directions (T, H, 3) of forearms and upper arms in a motion of somebody; None for single poses."""
         if self._user is None or not self.subject.is_motion:
             return None
-        return self._user.moving_arms(self.take, self.viewpoints.cameras)
+        return self._user.moving_arms(self.take, self.viewpoints.cameras, whole=self._shows_person)
 
     def _enclosed(self) -> Doubles | None:
         """Places (N, 3) of cameras and hands that share a background [m]; None for one camera."""
@@ -237,5 +239,14 @@ class Drawing:
 
     def _studio(self, hands: Sequence[GloveFit], rng: np.random.Generator) -> Studio:
         """The studio of somebody with these hands."""
-        about = {"has_user": self._user is not None, "light": self._light}
-        return Studio(hands, self.config, self.take.bodies, rng=rng, footage=self.subject.footage, **about)
+        about: dict[str, Any] = {"footage": self.subject.footage, "light": self._light}
+        about |= {"user": self._user, "shows_person": self._shows_person}
+        return Studio(hands, self.config, self.take.bodies, rng=rng, **about)
+
+    @functools.cached_property
+    def _shows_person(self) -> bool:
+        """Whether pictures show somebody: a motion's, unless a camera is ever in or close to the head."""
+        if self._user is None or not self.subject.is_motion or self.subject.footage is not None:
+            return False
+        ways = self.viewpoints.eyes()[:, None] - self._user.trunk[-1]
+        return bool(np.linalg.norm(ways, axis=-1).min() > _HEAD)

@@ -103,9 +103,9 @@ def _write(path: Path, scene: Scene) -> None:
     stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, "/scene").GetPrim())
     surfaces, moment = scene.studio.surfaces(scene.moment), scene.moment
     sides = [moment.take.hands[number].side for number in moment.hands()]
-    owners = sides + [moment.take.bodies[number].name for number in moment.bodies()]
+    owners = ["person", *sides, *(moment.take.bodies[number].name for number in moment.bodies())]
     for number, one in enumerate(surfaces):
-        _add_surface(stage, path, owners[int(one.triangles.instances[0]) - 1], number, one)
+        _add_surface(stage, path, owners[int(one.triangles.instances[0])], number, one)
     for side, keypoints in zip(sides, scene.studio.keypoints(moment), strict=True):
         points = UsdGeom.Points.Define(stage, f"/scene/{side}/keypoints")
         points.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(keypoints.astype(np.float32)))
@@ -131,6 +131,8 @@ def _add_surface(stage: Any, path: Path, owner: str, number: int, one: Drawn) ->
     mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
     shader = f"/scene/{owner}/{plain.name}/surface"
     if material.texels is None or one.uv is None:
+        if np.ptp(one.colors, axis=0).any():
+            _add_colors(stage, mesh, shader, one.colors[:, :3])
         return
     _shader(stage, shader).CreateInput("ior", Sdf.ValueTypeNames.Float).Set(_INDEX)
     _set_uv(mesh, one.uv)
@@ -144,6 +146,18 @@ def _add_surface(stage: Any, path: Path, owner: str, number: int, one: Drawn) ->
         ("relief", relief),
     ):
         _add_texture(stage, path, shader, name, picture, f"{owner}_{name}")
+
+
+def _add_colors(stage: Any, mesh: Any, surface: str, colors: NDArray[Any]) -> None:
+    """Give vertices colors (V, 3), and connect them to the surface's shader."""
+    from pxr import Sdf, UsdGeom, Vt
+
+    kinds, reader = Sdf.ValueTypeNames, _shader(stage, f"{surface}/colors")
+    UsdGeom.Mesh(mesh).CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex).Set(Vt.Vec3fArray.FromNumpy(colors))
+    reader.CreateIdAttr("UsdPrimvarReader_float3")
+    reader.CreateInput("varname", kinds.String).Set("displayColor")
+    color = _shader(stage, surface).CreateInput("diffuseColor", kinds.Color3f)
+    color.ConnectToSource(reader.CreateOutput("result", kinds.Float3))
 
 
 def _set_uv(mesh: Any, uv: NDArray[Any]) -> None:

@@ -45,9 +45,10 @@ from render.frames import (
 )
 from render.mano import mano_fit
 from render.painting.figures import BodyFigure, Drawn, HandFigure, sample_appearance
-from render.painting.painter import paint, put_before
+from render.painting.painter import paint, paint_blurred, put_before
 from render.painting.rasterizer import NEAR, see
 from render.painting.shading import level_behind, light_behind
+from render.person import person_figure
 from render.scenery.backgrounds import (
     Background,
     Surroundings,
@@ -160,7 +161,7 @@ class Moment:
     person: Int[np.ndarray, "T"] | None = None
     """Number of the person in each frame; motion is not interpolated from one person to another."""
     upper_arms: Float[np.ndarray, "H 3"] | None = None
-    """Unit direction of each hand's upper arm; see `Studio.reaching`."""
+    """Each hand's upper arm from the elbow [m]; see `Studio.reaching`."""
     forearms: Float[np.ndarray, "H 3"] | None = None
     """Unit direction of each hand's forearm; None for wrists at rest."""
 
@@ -220,23 +221,23 @@ class Studio:
         bodies: Sequence[RigidBody] = (),
         *,
         rng: np.random.Generator,
-        has_user: bool = False,
+        user: UserBody | None = None,
+        shows_person: bool = False,
         light: bool = False,
         footage: Footage | None = None,
     ) -> None:
         """Choose looks at random; the configuration is resolved.
 
-        A `UserBody` bends the wrists of those who have one. `light` asks for that of colors, which our own
-        painter has.
+        A `UserBody` bends the wrists of those who have one, and is drawn if `shows_person`. `light` asks for
+        that of colors, which our own painter has.
         """
         assert config.painter != "auto"
         self._config, self._passes, self._painter = config, set(config.passes), config.painter
         self._footage = footage
         self._light = light and footage is None and config.painter == "compiled"
         look = sample_appearance(config.dress == "glove", tones=config.tones, rng=rng)
-        if has_user:
-            straight = dataclasses.replace(look.forearm, flexion=0.0, deviation=0.0)
-            look = dataclasses.replace(look, forearm=straight)
+        if user is not None:
+            look = dataclasses.replace(look, forearm=user.dressed(look.forearm))
         self._look, self._people = look, [dataclasses.asdict(look)] * len(hands)
         first = np.cumsum([0, *(len(fit.attachment.points) for fit in hands)])
         self._hands = [
@@ -244,6 +245,7 @@ class Studio:
         ]
         self._colors = tuple(tuple(rng.uniform(0.05, 0.9, 3).tolist()) for _ in bodies)
         self._bodies = [BodyFigure(body, color) for body, color in zip(bodies, self._colors, strict=True)]
+        self._person = [person_figure(user, look)] if user is not None and shows_person else []
         self._posed: tuple[Moment, list[Drawn]] | None = None  # surfaces of the last moment
 
     @property
@@ -281,6 +283,10 @@ class Studio:
                 light = light_of(levels).astype(np.float16)
         if self._config.room_depth and footage is None and {"depth", "normals"} & self._passes:
             _walls(camera, drawn, conditions).put_behind(truth)
+        elif self._person:
+            for picture in truth[:2]:  # only hands and objects have depth and normals
+                if picture is not None:
+                    picture[truth.instances == 0] = 0.0
         if sensor is not None:
             noisy_depth = self._noisy_depth(truth, rgb, len(present), camera, sensor, rng)
         hands = tuple(
@@ -366,7 +372,7 @@ class Studio:
             drawn += self._hands[index].drawn(pose, number, upper, fore, others)
         for number, (index, T_world_body) in enumerate(moment.bodies(shift).items(), 1 + len(poses)):
             drawn += self._bodies[index].drawn(T_world_body, number)
-        return drawn
+        return drawn + self._person
 
     def _noisy_depth(
         self,
@@ -393,7 +399,8 @@ class Studio:
     ) -> NDArray[Any]:
         """The perfect color picture as bytes, or bright: as levels that do not end at 255."""
         background = conditions.background
-        whole = paint(camera, drawn, conditions.lighting, "bright" if bright else self._painter)
+        lighting, painter = conditions.lighting, "bright" if bright else self._painter
+        whole = paint(camera, drawn, lighting, painter)
         plain, light = picture_behind(camera, conditions, bright=bright), None
         shadows = background.backdrop.shadows and conditions.enclosure is None
         if shadows and camera.lens.kind == "pinhole":
@@ -401,6 +408,8 @@ class Studio:
         if light is not None:
             shade = cv2.cvtColor(cv2.pow(light, 1.0 / GAMMA), cv2.COLOR_GRAY2RGB)
             plain = np.asarray(cv2.multiply(plain, shade, dst=shade))
+        if self._person and painter != "opengl":
+            plain = put_before(paint_blurred(camera, drawn, lighting, painter), plain)
         return put_before(whole, plain)
 
     def _exposed(

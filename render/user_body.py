@@ -7,6 +7,7 @@ Drillis and Contini (1966), Body segment parameters, over that of the hand.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Final
 
@@ -17,17 +18,40 @@ from gloves import Take
 from handsim.hand.model import hand_keypoints
 from handsim.space.camera import Camera
 from handsim.space.transforms import quaternion_matrix
-from render.arms import Arms, bend_arms, forearm_axes, hiding_costs, turning
+from render.arms import (
+    HIDING,
+    Arms,
+    bend_arms,
+    bending_costs,
+    forearm_axes,
+    hiding_costs,
+    most_hidden,
+    turning,
+)
 from render.frames import Doubles
-from render.skin.look import ELBOW
+from render.skin.look import ELBOW, REACH, Forearm
 
 _HAND: Final = 0.108  # length of a hand, as a share of the stature
-_UPPER_ARM: Final = 0.186 / _HAND  # in hand lengths, as the next two
+UPPER_ARM: Final = 0.186 / _HAND
+"""Length of an upper arm in hand lengths, as the next two."""
 _SHOULDER: Final = 0.129 / _HAND  # distance of a shoulder from the neck's axis
 _EYES: Final = (0.5, 0.118 / _HAND)  # before and above the shoulders; a head that looks down leans forward
+_TRUNK: Final = (
+    *([[side, 0.0, -0.03], [side, 0.0, -0.288]] for side in (-0.06, -0.02, 0.02, 0.06)),
+    [[-0.129, 0.0, -0.01], [0.129, 0.0, -0.01]],
+)
+"""Axes (5, 2, 3) that fill a trunk from the shoulders to the hips if they are as thick as arms, to the right,
+ahead and upwards from the neck, as shares of the stature."""
+_HEAD: Final = (
+    [[0.0, 0.0, 0.0], [0.0, 0.0, 0.09]],
+    *([[side, 0.005, 0.09], [side, 0.005, 0.155]] for side in (-0.018, 0.018)),
+)
+"""Axes (3, 2, 3) of the neck and the head, as in `_TRUNK`."""
 _WRIST: Final = np.deg2rad([[54.0, 60.0], [40.0, 17.0]])
 """Largest flexion and extension, ulnar and radial deviation of a wrist [rad]: those of daily work (Ryu et al.
 1991, J. Hand Surg. 16A:409), about three quarters of what wrists can."""
+
+_SHORT: Final = 0.35  # length of an upper arm before a short sleeve, as a share for the tightest one
 
 _FRAMES: Final = 8  # frames that places of the person are compared in
 _COARSE: Final = (np.deg2rad(np.arange(0.0, 360.0, 20.0)), [0.5, 0.65], np.deg2rad([35.0]), [0.0])
@@ -49,7 +73,7 @@ _OUTWARD: Final = 0.4  # spread of these angles [rad]
 _SOFTNESS: Final = 0.3  # difference of costs within which elbows are averaged for placing cameras
 _CHOSEN: Final = 0.2  # time between frames of a motion whose arms are chosen [s]
 _CHUNK: Final = 512  # such frames that are chosen at once
-_OVERREACH: Final = 0.05  # distance beyond an arm's length whose cost is 1 [m]
+_STRETCH: Final = 0.05  # difference between an upper arm's length and the drawn one whose cost is 1 [m]
 _NEAR: Final = (0.36, 0.06)  # distance of an arm before the eyes that takes up the view, and its spread [m]
 _RISE: Final = 0.1  # spread of the tangent by which elbows are seen above the middle of the view
 _VIEW: Final = np.cos(np.deg2rad(40.0))  # cosine of half the angle of the view that arms take up
@@ -66,41 +90,59 @@ class UserBody:
     """Position of each hand's shoulder (H, 3) [m]."""
     right: Doubles
     """Level unit direction (3,) to the person's right."""
+    neck: Doubles
+    """Position (3,) of the neck between the shoulders [m]."""
+    mirrors: Doubles
+    """1 for each right hand, -1 for each left one (H,)."""
+    trunk: Doubles
+    """Axes (B, 2, 3) of the trunk, the neck and the head [m]; see `_TRUNK`."""
     forearms: Doubles
     """Unit directions from wrists to elbows in all frames (T, H, 3); NaN where there is no hand."""
 
     def __init__(self, take: Take, cameras: Float[np.ndarray, "C 3"] | None = None) -> None:
-        """Place the person where arms hide no hand from the eyes, nor from cameras at these positions [m]."""
+        """Place the person where no hand is hidden from the eyes, nor from cameras at these positions [m]."""
         self._cameras: Doubles = np.empty((0, 3)) if cameras is None else cameras
         self._lengths = np.array([hand.shape.length for hand in take.hands])
-        self._mirrors = np.array([-1.0 if hand.side == "left" else 1.0 for hand in take.hands])
+        self.mirrors = np.array([-1.0 if hand.side == "left" else 1.0 for hand in take.hands])
         there = np.flatnonzero(np.isfinite(take.qpos[..., 0]).any(axis=1))
         frames = there[np.linspace(0, len(there) - 1, min(_FRAMES, len(there))).astype(int)]
         wrists, axes = take.qpos[frames, :, :3], quaternion_matrix(take.qpos[frames, :, 3:7])
-        middle = _middle(self._palms(wrists, axes).reshape(-1, 3))
+        palms = self._palms(wrists, axes)
+        middle = _middle(palms.reshape(-1, 3))
+        outlines = np.stack([wrists, palms, 2.0 * palms - wrists], axis=2)
         best, azimuth = np.inf, 0.0
         for azimuths, distances, downs, facings in (_COARSE, _FINE):
             grids = np.meshgrid(azimuth + azimuths, distances, downs, facings)
             tried = np.stack([grid.ravel() for grid in grids], axis=1)
-            eyes, shoulders, right = self._stand(middle, *tried.T)
+            eyes, neck, right = self._stand(middle, *tried.T)
+            shoulders, trunk = self._shoulders(neck, right), self._trunk(neck, right)
             _, costs = self._elbows(wrists, axes, shoulders[:, None], eyes[:, None])
-            means = np.nanmean(np.minimum(costs.min(axis=-1), _WORST), axis=(1, 2))
+            means = np.nanmean(np.minimum(costs.min(axis=-1), _WORST * (1 + len(self._cameras))), axis=(1, 2))
+            means += _blocking(trunk[:, : len(_TRUNK)], eyes[:, None], outlines)
+            means += _blocking(trunk, self._cameras[None], outlines)
             means += _UNUSUAL * np.square((tried[:, 1:] - _NATURAL) / _SPREADS).sum(axis=1)
             first = int(means.argmin())
             if means[first] < best:
                 best, azimuth = float(means[first]), float(tried[first, 0])
                 self.eyes, self.shoulders, self.right = eyes[first], shoulders[first], right[first]
+                self.trunk, self.neck = trunk[first], neck[first]
         self._tracked = _tracked_forearms(take)
         self.forearms = _where_known(self._tracked, self._forearms(take.qpos))
 
     def axes(self, wrists: Float[np.ndarray, "T H 3"], forearms: Float[np.ndarray, "T H 3"]) -> Doubles:
-        """Axes (T, 2 H, 2, 3) of forearms in these directions, and of upper arms to the shoulders [m]."""
-        elbows = wrists + (ELBOW * self._lengths)[:, None] * forearms
+        """Axes (T, 2 H + B, 2, 3) of forearms in these directions, of upper arms, and of the trunk [m]."""
+        elbows = self._elbows_of(wrists, forearms)
         upper = np.stack(np.broadcast_arrays(elbows, self.shoulders), axis=-2)
-        return np.concatenate([forearm_axes(wrists, elbows), upper], axis=1)
+        trunk = np.broadcast_to(self.trunk, (len(wrists), *self.trunk.shape))
+        return np.concatenate([forearm_axes(wrists, elbows), upper, trunk], axis=1)
 
     def arms(
-        self, qpos: Float[np.ndarray, "K H 27"], hands: Sequence[int], frames: Int[np.ndarray, "K"]
+        self,
+        qpos: Float[np.ndarray, "K H 27"],
+        hands: Sequence[int],
+        frames: Int[np.ndarray, "K"],
+        *,
+        whole: bool = False,
     ) -> Arms:
         """Where the arms can be of the hands with these numbers, in these poses of all in these frames."""
         wrists, axes = qpos[..., :3], quaternion_matrix(qpos[..., 3:7])
@@ -109,14 +151,16 @@ class UserBody:
         costs += np.repeat(np.square(np.array(_OUTWARDS) / _OUTWARD), len(_SWIVELS))
         ways = _where_known(self._tracked[frames, :, None], ways)
         elbows = wrists[..., None, :] + (ELBOW * self._lengths)[:, None, None] * ways
-        return Arms(
-            wrists[:, hands], ways[:, hands], elbows[:, hands], costs[:, hands], self.shoulders[hands]
-        )
+        near = (wrists[:, hands], ways[:, hands], elbows[:, hands], costs[:, hands])
+        return Arms(*near, self.shoulders[hands], whole)
 
-    def moving_arms(self, take: Take, cameras: Callable[[int], Sequence[Camera]]) -> tuple[Doubles, Doubles]:
-        """Unit directions (T, H, 3) of forearms and upper arms in all frames of a motion, before cameras.
+    def moving_arms(
+        self, take: Take, cameras: Callable[[int], Sequence[Camera]], *, whole: bool
+    ) -> tuple[Doubles, Doubles]:
+        """Unit directions of forearms, and upper arms [m], (T, H, 3) each, in all frames of a motion.
 
-        Hands that are away wait at the nearest place where they are.
+        They are bent for cameras, and end at the shoulders if they are whole. Hands that are away wait at the
+        nearest place where they are.
         """
         step = max(1, round(_CHOSEN * take.rate))
         frames, hands = np.arange(0, take.num_frames, step), range(len(take.hands))
@@ -130,29 +174,56 @@ class UserBody:
         for first in range(0, len(frames), _CHUNK):
             some = slice(first, first + _CHUNK)
             seen = np.concatenate([one[some] for one in points], axis=1)
-            chosen.append(
-                bend_arms(
-                    self.arms(qpos[some], hands, frames[some]), seen, [*map(cameras, frames[some].tolist())]
-                )
-            )
+            arms = self.arms(qpos[some], hands, frames[some], whole=whole)
+            chosen.append(bend_arms(arms, seen, [*map(cameras, frames[some].tolist())]))
         fore, upper = (
             turning(np.concatenate(ways), step, take.num_frames) for ways in zip(*chosen, strict=True)
         )
-        fore, _ = _bent_wrists(fore, quaternion_matrix(take.qpos[..., 3:7]), self._mirrors)
-        return _where_known(self._tracked, fore), upper
+        fore, _ = _bent_wrists(fore, quaternion_matrix(take.qpos[..., 3:7]), self.mirrors)
+        fore = _where_known(self._tracked, fore)
+        return fore, self.shoulders - self._elbows_of(take.qpos[..., :3], fore) if whole else REACH * upper
+
+    def _elbows_of(self, wrists: Doubles, forearms: Doubles) -> Doubles:
+        """Elbows (..., H, 3) of forearms in these directions [m]."""
+        return np.asarray(wrists + (ELBOW * self._lengths)[:, None] * forearms)
 
     def _stand(
         self, middle: Doubles, azimuth: Doubles, distance: Doubles, down: Doubles, facing: Doubles
     ) -> tuple[Doubles, Doubles, Doubles]:
-        """Eyes (K, 3), shoulders (K, H, 3) and right (K, 3) of people who look at a point from these."""
+        """Eyes, neck and right, (K, 3) each, of people who look at a point from these."""
         flat, length = np.cos(down), float(self._lengths.mean())
         sight = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), -np.sin(down)], axis=1)
         ahead = np.stack([np.cos(azimuth + facing), np.sin(azimuth + facing), 0.0 * facing], axis=1)
         right = np.stack([ahead[:, 1], -ahead[:, 0], ahead[:, 2]], axis=1)
         eyes = middle - distance[:, None] * sight
-        neck = eyes - length * (_EYES[0] * ahead + [0.0, 0.0, _EYES[1]])
-        aside = (_SHOULDER * self._lengths * self._mirrors)[:, None]
-        return eyes, neck[:, None] + aside * right[:, None], right
+        return eyes, eyes - length * (_EYES[0] * ahead + [0.0, 0.0, _EYES[1]]), right
+
+    def _shoulders(self, neck: Doubles, right: Doubles) -> Doubles:
+        """Shoulders (K, H, 3) of people with these necks."""
+        aside = (_SHOULDER * self._lengths * self.mirrors)[:, None]
+        return np.asarray(neck[:, None] + aside * right[:, None])
+
+    def _trunk(self, neck: Doubles, right: Doubles) -> Doubles:
+        """Axes (K, B, 2, 3) of trunks, necks and heads of people with these necks."""
+        places = self.stature * np.array([*_TRUNK, *_HEAD])
+        return np.asarray(neck[:, None, None] + np.einsum("bei,kij->kbej", places, _directions(right)))
+
+    @property
+    def stature(self) -> float:
+        """Height of the person [m]."""
+        return float(self._lengths.mean()) / _HAND
+
+    def dressed(self, arm: Forearm) -> Forearm:
+        """The arm up to the shoulder, with a wrist that `axes` bend; a bare one has a short sleeve."""
+        elbow, shoulder = float(self._lengths.mean()) * np.cumsum([ELBOW, UPPER_ARM])
+        short = elbow + (shoulder - elbow) * _SHORT * arm.looseness
+        sleeve = arm.sleeve if arm.sleeve < arm.length else float(short)
+        return dataclasses.replace(arm, length=float(shoulder), sleeve=sleeve, flexion=0.0, deviation=0.0)
+
+    @property
+    def directions(self) -> Doubles:
+        """Unit directions (3, 3) to the person's right, ahead and upwards, as rows."""
+        return _directions(self.right)
 
     def _palms(self, wrists: Doubles, axes: Doubles) -> Doubles:
         return np.asarray(wrists + 0.5 * self._lengths[:, None] * axes[..., 0])
@@ -172,7 +243,7 @@ class UserBody:
 
         Forearms are turned outwards [rad] from where they reach shoulders that do not move.
         """
-        fore, upper = ELBOW * self._lengths, _UPPER_ARM * self._lengths
+        fore, upper = ELBOW * self._lengths, UPPER_ARM * self._lengths
         line = shoulders - wrists
         distance = np.linalg.norm(line, axis=-1)
         line /= distance[..., None]
@@ -187,13 +258,18 @@ class UserBody:
             angle = np.arctan2(radius, along) + outwards
             along, radius = np.cos(angle), np.sin(angle)
         ways = (along[..., None] * line)[..., None, :] + radius[..., None, None] * circle
-        ways, load = _bent_wrists(ways, axes[..., None, :, :], self._mirrors[:, None])
+        ways, load = _bent_wrists(ways, axes[..., None, :, :], self.mirrors[:, None])
         costs = load**2 + np.square(_SWIVELS / _SWIVEL)
-        costs += np.square(np.maximum(distance - span, 0.0) / _OVERREACH)[..., None]
-        return ways, costs + self._in_view(ways, wrists, self._palms(wrists, axes), eyes)
+        lines = shoulders[..., None, :] - wrists[..., None, :] - fore[:, None, None] * ways
+        lengths = np.linalg.norm(lines, axis=-1)
+        costs += np.abs(lengths - upper[:, None]) / _STRETCH
+        costs += bending_costs(ways, lines / lengths[..., None])
+        return ways, costs + self._in_view(ways, wrists, self._palms(wrists, axes), eyes, shoulders)
 
-    def _in_view(self, ways: Doubles, wrists: Doubles, palms: Doubles, eyes: Doubles) -> Doubles:
-        """Costs (..., H, S) of forearms that hide a hand from the eyes or take up much of their view."""
+    def _in_view(
+        self, ways: Doubles, wrists: Doubles, palms: Doubles, eyes: Doubles, shoulders: Doubles
+    ) -> Doubles:
+        """Costs (..., H, S) of arms that hide a hand from the eyes or take up much of their view."""
         reach = (ELBOW * self._lengths)[:, None, None, None] * _ALONG[:, None]
         places = wrists[..., None, None, :] + reach * ways[..., None, :] - eyes[..., None, None, None, :]
         far = np.linalg.norm(places, axis=-1)
@@ -211,22 +287,41 @@ class UserBody:
             sight = np.nan_to_num(sight / np.linalg.norm(sight, axis=-1, keepdims=True))
             depth = (places * sight[..., None, None, None, :]).sum(axis=-1)
             costs += np.square(np.where(depth > _VIEW * far, near, 0.0)).max(axis=-1)
-        return np.asarray(costs) + self._hiding(ways, wrists, wrists + 2.0 * (palms - wrists), eyes)
+        return np.asarray(costs) + self._hiding(ways, wrists, 2.0 * palms - wrists, eyes, shoulders)
 
-    def _hiding(self, ways: Doubles, wrists: Doubles, tips: Doubles, eyes: Doubles) -> Doubles:
-        """Costs (..., H, S) of forearms that hide hands, from wrists to tips of flat ones."""
+    def _hiding(
+        self, ways: Doubles, wrists: Doubles, tips: Doubles, eyes: Doubles, shoulders: Doubles
+    ) -> Doubles:
+        """Costs (..., H, S) of arms that hide hands, from wrists to tips of flat ones."""
         elbows = wrists[..., None, :] + (ELBOW * self._lengths)[:, None, None] * ways
         batch, (hands, tried) = ways.shape[:-3], ways.shape[-3:-1]
         along = (wrists[..., None, :] + _ALONG[:, None] * (tips - wrists)[..., None, :]).reshape(
             *wrists.shape[:-2], -1, 3
         )
-        axes = forearm_axes(wrists[..., None, :], elbows).reshape(-1, hands * tried, 2, 3)
+        upper = np.stack(np.broadcast_arrays(elbows, shoulders[..., None, :]), axis=-2)
+        axes = np.concatenate([forearm_axes(wrists[..., None, :], elbows), upper], axis=-3)
+        axes = axes.reshape(-1, hands * 2 * tried, 2, 3)
         points = np.array(np.broadcast_to(along, (*batch, *along.shape[-2:])), order="C")
         points = points.reshape(-1, *along.shape[-2:])
         eyes = np.array(np.broadcast_to(eyes, (*batch, 3)), order="C").reshape(-1, 1, 3)
         others = np.broadcast_to(self._cameras, (len(eyes), *self._cameras.shape))
         eyes = np.ascontiguousarray(np.concatenate([eyes, others], axis=1))  # one type for the compiler
-        return np.asarray(hiding_costs(axes, eyes, points).reshape(*batch, hands, tried))
+        return np.asarray(hiding_costs(axes, eyes, points).reshape(*batch, hands, 2, tried).sum(axis=-2))
+
+
+def _directions(right: Doubles) -> Doubles:
+    """Unit directions (..., 3, 3) to the right (..., 3), ahead and upwards, as rows."""
+    up = np.broadcast_to(np.eye(3)[2], right.shape)
+    return np.stack([right, np.cross(up, right), up], axis=-2)
+
+
+def _blocking(trunks: Doubles, eyes: Doubles, points: Doubles) -> Doubles:
+    """Costs (K,) of trunks (K, B, 2, 3) that hide points (F, H, P, 3) of hands from eyes (K or 1, C, 3)."""
+    shape = (len(trunks), len(points), eyes.shape[1])
+    views = (trunks[:, None, None], eyes[:, None], points[None, :, None])
+    each = [np.broadcast_to(one, (*shape, *one.shape[3:])) for one in views]
+    hidden = most_hidden(*(np.array(one, order="C").reshape(-1, *one.shape[3:]) for one in each))
+    return np.asarray(HIDING * hidden.reshape(shape).sum(axis=2).mean(axis=1))
 
 
 def _tracked_forearms(take: Take) -> Doubles:

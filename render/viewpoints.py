@@ -85,6 +85,8 @@ class Framing:
                 rows = there[first : first + _CHUNK]
                 self.points[rows, number] = hand_keypoints(hand.model, take.qpos[rows, number])[:, _OUTLINE]
         self._there = np.isfinite(self.points[..., 0, 0])
+        self.trunk: Doubles = np.empty((0, 3)) if user is None else user.trunk.reshape(-1, 3)
+        """Positions (N, 3) of the person's trunk and head [m]; none of nobody."""
         self._arms = None if user is None else user.axes(take.qpos[..., :3], user.forearms)
         known = np.flatnonzero(self._there.any(axis=1))
         flat = self.points[known].reshape(len(known), -1, 3).astype(np.float64)
@@ -297,9 +299,7 @@ class Viewpoints:
         """Place the cameras; `poses` move the first of the user's own cameras."""
         framing = Framing(take, user)
         if config.cameras is not None:
-            cameras, turn = list(config.own_cameras()), rigid(upright(up), np.zeros(3))
-            if up != "z":
-                cameras = [one.at(turn @ one.T_world_camera) for one in cameras]
+            cameras, turn = _own_cameras(config, up), rigid(upright(up), np.zeros(3))
             stay = (take.num_frames, 4, 4)
             self._paths = [_Path(one, np.broadcast_to(one.T_world_camera, stay)) for one in cameras]
             if poses is not None:
@@ -352,13 +352,19 @@ class Viewpoints:
         hands, camera = self._framing.points, self.cameras(0)[0]
         along = hands[:, :, :1] + self._framing.forearms[:, :, None] * _ALONG_ARM[:, None]
         points = (along if arms else hands).reshape(-1, 3)
+        if arms:
+            points = np.concatenate([points, self._framing.trunk])
         seen = (np.abs(camera.project(points) / camera.size - 0.5) < 0.5 + _BESIDE).all(axis=1) | (not arms)
         places = camera.local(points[seen]) @ normal
         return float(np.nanmin(places, initial=0.0)) - (_SLEEVE if arms else _SKIN)
 
     def positions(self) -> Float[np.ndarray, "P 3"]:
-        """Positions of the cameras and of the hands' centers in all frames [m]."""
-        return np.concatenate([self._framing.centers, *(path.poses[:, :3, 3] for path in self._paths)])
+        """Positions of the cameras, of the hands' centers in all frames, and of the person [m]."""
+        return np.concatenate([self._framing.centers, self._framing.trunk, self.eyes()])
+
+    def eyes(self) -> Float[np.ndarray, "P 3"]:
+        """Positions of the cameras in all frames [m]."""
+        return np.concatenate([path.poses[:, :3, 3] for path in self._paths])
 
     def cameras(self, frame: int) -> list[Camera]:
         """The cameras of one frame: `view0`, `view1`, ..., or those of the file with their own names."""
@@ -502,9 +508,19 @@ def _head(config: ViewConfig, take: Take, framing: Framing, rng: np.random.Gener
     return paths
 
 
-def rig_positions(config: ViewConfig) -> Float[np.ndarray, "C 3"]:
-    """Positions of the rig's cameras [m], which are known before all others."""
-    return np.asarray(load_rig(config.rig).T_world_camera[:, :3, 3])
+def known_positions(config: ViewConfig, up: UpAxis) -> Float[np.ndarray, "C 3"]:
+    """Positions [m] of a rig's and of the user's own cameras, which are known before the person's place."""
+    if config.cameras is not None:
+        return np.array([one.T_world_camera[:3, 3] for one in _own_cameras(config, up)])
+    if config.placement == "rig":
+        return np.asarray(load_rig(config.rig).T_world_camera[:, :3, 3])
+    return np.empty((0, 3))
+
+
+def _own_cameras(config: ViewConfig, up: UpAxis) -> list[Camera]:
+    """The user's own cameras in a world with z up."""
+    turn = rigid(upright(up), np.zeros(3))
+    return [one if up == "z" else one.at(turn @ one.T_world_camera) for one in config.own_cameras()]
 
 
 def _rig(config: ViewConfig, take: Take, framing: Framing, rng: np.random.Generator) -> list[_Path]:

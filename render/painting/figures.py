@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from render.skin.texture import SkinTexture
 
 MARKER_COLOR: Final = (0.98, 0.98, 1.0)
-_SCATTER: Final = (0.30, 0.13, 0.08)
+SCATTER: Final = (0.30, 0.13, 0.08)
 """Scatter of skin; red light travels farthest (Jensen et al. 2001: free paths of 3.7, 1.4 and 0.7 mm)."""
 _FOLDS: Final = 0.85  # strength of ambient shade; below 1, because lamps light folds in part
 _BASE: Final = (0.85, 0.4)  # radius of a marker's base on the glove and in the marker [marker radii]
@@ -67,7 +67,7 @@ def skin_material(texture: SkinTexture) -> Material:
     """Painted skin, for meshes with `DrawnSkin.uv`."""
     nothing = np.zeros_like(texture.roughness)
     texels = np.dstack([texture.color, texture.roughness, texture.normals, nothing])
-    return Material(np.ones(3), 1.0, scatter=np.array(_SCATTER), texels=texels)
+    return Material(np.ones(3), 1.0, scatter=np.array(SCATTER), texels=texels)
 
 
 def shade_colors(shade: Float32[np.ndarray, "D"]) -> Float32[np.ndarray, "D 4"]:
@@ -117,6 +117,8 @@ class Drawn:
     """Returns the same material every time; only called for colors, because textures take time."""
     coarse_faces: Int[np.ndarray, "G 3"] | None = None
     """Triangles of the same vertices that cast its shadow; None: all of its own."""
+    out_of_focus: bool = False
+    """Whether our own painter blurs it; such surfaces come last, and hands hide them sharply."""
 
     @property
     def casting(self) -> Int[np.ndarray, "G 3"]:

@@ -6,6 +6,7 @@ painter shades each pixel once, after its nearest face is known, and four times 
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Sequence
 from typing import Any, Final, Literal, NamedTuple
@@ -57,23 +58,33 @@ class _Mesh(NamedTuple):
 
 
 def paint_compiled(
-    cameras: Sequence[Camera], drawn: Sequence[Drawn], lighting: Lighting, *, bright: bool = False
+    cameras: Sequence[Camera],
+    drawn: Sequence[Drawn],
+    lighting: Lighting,
+    *,
+    bright: bool = False,
+    blurred: bool = False,
 ) -> list[NDArray[Any]]:
     """Colors and coverage, as `paint` has them, by our own code; machines differ by rounding alone.
 
-    The cameras have one shadow map, so that shadows go on from one face of a lens to the next.
+    The cameras have one shadow map, so that shadows go on from one face of a lens to the next. Only what is
+    in focus is painted, where nothing else hides it, or what is not, `blurred` as if it were alone.
     """
-    views = [_meshes(camera, drawn) for camera in cameras]
+    shown = [one for one in drawn if one.out_of_focus or not blurred]
+    views = [_meshes(camera, shown) for camera in cameras]
     points = np.concatenate([one.triangles.vertices for one in drawn]).astype(np.float32, copy=False)
     counts = np.cumsum([0, *(len(one.triangles.vertices) for one in drawn)])
     casting = np.concatenate([one.casting + first for one, first in zip(drawn, counts, strict=False)])
-    seen = np.zeros(len(points), dtype=np.bool_)
-    for camera, meshes in zip(cameras, views, strict=True):
+    seen = np.full(len(points), blurred)  # soft shadows do with room for all that casts any
+    for camera, meshes in () if blurred else zip(cameras, views, strict=True):
         given = [mesh.corners[: len(one.triangles.vertices)] for mesh, one in zip(meshes, drawn, strict=True)]
         sides = 2.0 * np.array(camera.size)
         with np.errstate(invalid="ignore"):  # NaN behind the camera
             inside = np.abs(np.concatenate(given)[:, :2] - 0.5 * sides) < (0.5 + _SHADED_AROUND) * sides
         seen |= inside[:, 0] & inside[:, 1]
+    for one, first in zip(drawn, counts, strict=False):
+        if not len(one.casting):  # what casts no shadow leaves the map to what does
+            seen[first : first + len(one.triangles.vertices)] = False
     lamps, around = _lamp_table(lighting), np.zeros((9, 3))
     around[: max(1, len(lighting.surroundings))] = lighting.surroundings or lighting.ambient
     shadows = shadow_map(points, casting, lamps[0, :3], seen)
@@ -89,8 +100,9 @@ def paint_compiled(
         covered = _covered(first)
         sums = np.zeros((len(covered), 4), dtype=np.float32)  # sums over the four samples of a pixel
         table = TO_DISPLAY[:0] if bright else TO_DISPLAY
-        for mesh in meshes:
-            _add_surface(nearness, first, covered, *mesh, TO_LINEAR, turned, ambient, *own, table, sums)
+        for mesh, one in zip(meshes, shown, strict=True):
+            if one.out_of_focus == blurred:
+                _add_surface(nearness, first, covered, *mesh, TO_LINEAR, turned, ambient, *own, table, sums)
         painted = np.zeros((height * width, 4), dtype=np.float32 if bright else np.uint8)
         if bright:
             painted[covered] = np.float32(63.75) * sums
@@ -287,6 +299,7 @@ def _write_spot(
 
 
 Painter = Literal["compiled", "bright", "opengl"]
+_BLUR: Final = 0.006  # spread of what is out of focus, as a share of the picture's height
 
 
 def choose_painter() -> Literal["compiled", "opengl"]:
@@ -295,27 +308,46 @@ def choose_painter() -> Literal["compiled", "opengl"]:
 
 
 def paint(
-    camera: Camera, drawn: Sequence[Drawn], lighting: Lighting, painter: Painter = "compiled"
+    camera: Camera,
+    drawn: Sequence[Drawn],
+    lighting: Lighting,
+    painter: Painter = "compiled",
+    *,
+    blurred: bool = False,
 ) -> NDArray[Any]:
     """Colors over black (sRGB), and as fourth channel the covered share of each pixel, through any lens.
 
-    The picture (H, W, 4) has bytes; that of the painter "bright" has floats, which may exceed 255.
+    The picture (H, W, 4) has bytes; that of the painter "bright" has floats, which may exceed 255. It shows
+    what is in focus or what is to be `blurred`; OpenGL has everything in focus.
     """
     bright = painter == "bright"
     faces, parts, inner = faces_for(camera), [], []
     pictures = [np.zeros((*face.size[::-1], 4), np.float32 if bright else np.uint8) for face in faces]
     for face, picture in zip(faces, pictures, strict=True):
-        left, top, right, bottom = _window(face, drawn)
+        left, top, right, bottom = _window(face, [one for one in drawn if one.out_of_focus or not blurred])
         if left < right and top < bottom:
             inner.append(face.part(left, top, right - left, bottom - top))
             parts.append(picture[top:bottom, left:right])
     if painter == "opengl":
         painted = [paint_opengl(one, drawn, lighting) for one in inner]
     else:
-        painted = paint_compiled(inner, drawn, lighting, bright=bright) if inner else []
+        painted = paint_compiled(inner, drawn, lighting, bright=bright, blurred=blurred) if inner else []
     for part, colors in zip(parts, painted, strict=True):
         part[:] = colors
     return np.asarray(warp(camera, pictures, cv2.INTER_LINEAR))
+
+
+def paint_blurred(
+    camera: Camera, drawn: Sequence[Drawn], lighting: Lighting, painter: Painter = "compiled"
+) -> NDArray[Any]:
+    """What is out of focus, as `paint` has the rest; it is painted at half of the size."""
+    width, height = camera.size
+    half = dataclasses.replace(
+        camera, size=(-(-width // 2), -(-height // 2)), K=np.diag([0.5, 0.5, 1.0]) @ camera.K
+    )
+    soft = cv2.GaussianBlur(paint(half, drawn, lighting, painter, blurred=True), (0, 0), _BLUR * half.size[1])
+    whole = cv2.resize(soft, (2 * half.size[0], 2 * half.size[1]), interpolation=cv2.INTER_LINEAR)
+    return np.asarray(whole[:height, :width])
 
 
 def _window(camera: Camera, drawn: Sequence[Drawn]) -> tuple[int, int, int, int]:

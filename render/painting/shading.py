@@ -35,7 +35,8 @@ _COARSE: Final = 4  # size of a pixel of the shadow's mask, whose edges are soft
 _MARGIN: Final = 0.15  # border around a picture where a hand still counts as in it, as a share of its size
 _FLATTEST: Final = 0.15  # cosine between a lamp and a backdrop's normal below which there is no shadow
 _SHADED: Final = 0.9  # share of a lamp's light that a shadow takes; the rest is reflected into it
-_FACING: Final = np.float32(0.028)  # specular reflectance at normal incidence, of skin (index 1.4)
+MIRRORED: Final = np.float32(0.028)
+"""Specular reflectance at normal incidence, of skin (index 1.4)."""
 _LIFT: Final = 1.7  # distance from a slanted surface at which shadows are looked up [biases]
 _UNDER: Final = 0.012  # thickness of skin that light passes at a scatter of 1 [m]
 _PI: Final = np.float32(np.pi)
@@ -156,6 +157,7 @@ def light_behind(
     camera: Camera, drawn: Sequence[Drawn], lighting: Lighting, backdrop: Backdrop
 ) -> Float32[np.ndarray, "H W"] | None:
     """Light on a backdrop with the first lamp's shadows over that without them; None without shadows."""
+    drawn = [one for one in drawn if len(one.casting)]
     if not drawn or not lighting.lamps:
         return None
     normal = backdrop.normal
@@ -451,7 +453,7 @@ def _reflect(
     for n in range(len(cosine)):
         square = two + two * (vx[n] * x + vy[n] * y + vz[n] * z)  # of the half vector's length
         grazing = _ONE - _HALF * np.sqrt(square if square > _TINY else _TINY)  # the length is twice a cosine
-        fresnel[n] = _FACING + (_ONE - _FACING) * grazing * grazing * grazing * grazing * grazing
+        fresnel[n] = MIRRORED + (_ONE - MIRRORED) * grazing * grazing * grazing * grazing * grazing
     for n in range(len(cosine)):
         hx, hy, hz = x + vx[n], y + vy[n], z + vz[n]
         length = hx * hx + hy * hy + hz * hz
@@ -459,7 +461,7 @@ def _reflect(
         half = (nx[n] * hx + ny[n] * hy + nz[n] * hz) / length
         half = half if half > _ZERO else _ZERO
         grazing = _ONE - _HALF * length
-        schlick = _FACING + (_ONE - _FACING) * grazing * grazing * grazing * grazing * grazing
+        schlick = MIRRORED + (_ONE - MIRRORED) * grazing * grazing * grazing * grazing * grazing
         towards = nx[n] * x + ny[n] * y + nz[n] * z
         towards = towards if towards > _ZERO else _ZERO
         rough = roughness[n]
@@ -513,7 +515,7 @@ def _add_lamp(
     The `hard` light reaches the share `lit` of each point, the `soft` light all of it. `scatter` is the
     cosine beyond grazing at which the lamp still lights a point.
     """
-    diffuse = (_ONE - _FACING) / (_PI * (_ONE + scatter))
+    diffuse = (_ONE - MIRRORED) / (_PI * (_ONE + scatter))
     for n in range(len(light)):
         wrapped = cosine[n] + scatter  # light reaches around the edge of the lit side
         wrapped = (wrapped if wrapped > _ZERO else _ZERO) * (_ONE - fresnel[n]) * diffuse

@@ -382,10 +382,10 @@ def surroundings_of_picture(background: Background, camera: Camera, level: float
 def _put_behind(
     instances: Bytes, behind: Floats, walls: NDArray[np.int8], facing: Floats, depth: Floats, normals: Floats
 ) -> None:
-    """Write depth (H, W) and normals (H, W, 3 or 0) of the walls where there is no instance."""
+    """Write depth (H, W) and normals (H, W, 3 or 0) of the walls where there is neither."""
     for row in range(depth.shape[0]):
         for column in range(depth.shape[1]):
-            if instances[row, column] == 0 and behind[row, column] > 0.0:
+            if instances[row, column] == 0 and depth[row, column] == 0.0 and behind[row, column] > 0.0:
                 depth[row, column] = behind[row, column]
                 if normals.shape[2]:
                     for axis in range(3):

@@ -287,6 +287,7 @@ def bent_rings(
     turned = np.flatnonzero(beyond > -half)
     start = middles[turned[0]] - (beyond[turned[0]] + half) * ahead
     if reach is not None:
+        beyond = np.minimum(beyond, reach)
         beyond[-1] = reach
     axis = cross(ahead, towards)
     sine = float(np.linalg.norm(axis))

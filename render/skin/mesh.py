@@ -37,7 +37,7 @@ from handsim.kernels import kernel
 from handsim.space.transforms import MIRROR, quaternion_matrix
 from render.fields import along_segment, bump, smooth
 from render.frames import FOREARM, Bytes, Doubles, Floats, Integers
-from render.skin.look import BEND, ELBOW, ELBOW_BEND, REACH, Forearm, bent_rings, forearm_rings
+from render.skin.look import BEND, ELBOW, ELBOW_BEND, Forearm, bent_rings, forearm_rings
 
 TILE: Final = 16
 """Texels along a tile's side."""
@@ -406,8 +406,8 @@ class PosableSkin:
     ) -> DrawnSkin:
         """The skin in one pose, in the ambient light that the `flesh` of others leaves.
 
-        Without the upper arm's direction (3,) the arm is straight and short, and without the forearm's the
-        wrist is at rest.
+        Without the upper arm (3,) from the elbow [m] the arm is straight and short, and without the forearm's
+        direction (3,) the wrist is at rest.
         """
         atlas = skin_atlas()
         transforms = self.model.forward_kinematics(qpos[None])
@@ -418,7 +418,8 @@ class PosableSkin:
             if forearm is not None:
                 half = 0.5 * BEND * self.model.shape.length
                 rings = bent_rings(rings, half, half, forearm @ rotation)
-            rings = bent_rings(rings, self._elbow, ELBOW_BEND, upper_arm @ rotation, REACH)
+            reach = float(np.linalg.norm(upper_arm))
+            rings = bent_rings(rings, self._elbow, ELBOW_BEND, upper_arm @ rotation, reach)
             shaped = np.concatenate([shaped[: atlas.num_hand], rings.reshape(-1, 3), rings[-1:].mean(axis=1)])
         points = self.merged(transforms, shaped)
         normals = vertex_normals(points, self.faces)

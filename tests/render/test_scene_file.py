@@ -32,13 +32,13 @@ def opened(path) -> tuple[Usd.Stage, np.ndarray, np.ndarray]:
 
 def seen_ids(stage: Usd.Stage, film: np.ndarray, eye: np.ndarray, frame: RenderedFrame) -> np.ndarray:
     """Number of the hand or body in each pixel, by embree."""
-    owners = [hand.shape.side for hand in frame.hands] + [body.name for body in frame.bodies]
+    owners = ["person", *(hand.shape.side for hand in frame.hands), *(body.name for body in frame.bodies)]
     vertices, faces, ids, count = [], [], [], 0
     for prim in filter(lambda one: one.IsA(UsdGeom.Mesh) and one.GetName() != "behind", stage.Traverse()):
         mesh = UsdGeom.Mesh(prim)
         vertices.append(np.array(mesh.GetPointsAttr().Get()))
         faces.append(np.array(mesh.GetFaceVertexIndicesAttr().Get()).reshape(-1, 3) + count)
-        ids += len(faces[-1]) * [1 + owners.index(prim.GetParent().GetName())]
+        ids += len(faces[-1]) * [owners.index(prim.GetParent().GetName())]
         count += len(vertices[-1])
     width, height = frame.camera.size
     rows, columns = np.mgrid[:height, :width].reshape(2, -1) + 0.5

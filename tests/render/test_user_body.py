@@ -5,9 +5,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from gloves import Take
+from handsim.space.rig import load_rig
 from render import draw
+from render.arms import most_hidden
 from render.frames import FOREARM, PARTS_A_HAND
-from render.user_body import UserBody
+from render.skin.look import ELBOW
+from render.user_body import UPPER_ARM, UserBody
+from render.viewpoints import Framing
 from train import simulate_take
 
 
@@ -31,6 +35,14 @@ def test_wrists_bend_no_farther_than_wrists_do(take):
         assert radial.min() >= -40.1 and radial.max() <= 17.1
 
 
+def test_upper_arms_are_about_as_long_as_those_of_people(take):
+    user = UserBody(take)
+    lengths = np.array([hand.shape.length for hand in take.hands])
+    elbows = take.qpos[..., :3] + ELBOW * lengths[:, None] * user.forearms
+    stretch = np.linalg.norm(user.shoulders - elbows, axis=-1) / (UPPER_ARM * lengths)
+    assert np.exp(np.abs(np.log(stretch)).mean()) < 1.25
+
+
 def test_elbows_do_not_jump(take):
     forearms = UserBody(take).forearms
     steps = np.rad2deg(np.arccos(np.clip((forearms[1:] * forearms[:-1]).sum(axis=-1), -1.0, 1.0)))
@@ -46,6 +58,27 @@ def test_the_person_turns_and_moves_with_the_hands(take):
     here, there = UserBody(take), UserBody(Take.of_poses(take.hands, moved, rate=take.rate))
     np.testing.assert_allclose(there.eyes, turn.apply(here.eyes) + shift, atol=1e-9)
     np.testing.assert_allclose(there.shoulders, turn.apply(here.shoulders) + shift, atol=1e-9)
+
+
+def test_trunks_and_heads_are_no_obstacle_between_hands_and_the_cameras_of_a_rig(take):
+    cameras, points = load_rig("six").T_world_camera[:, :3, 3], Framing(take).points.astype(float)
+    user = UserBody(take, cameras)
+    trunk = np.tile(user.trunk, (len(points), 1, 1, 1))
+    free = [most_hidden(trunk, np.tile(eye, (len(points), 1)), points) < 0.5 for eye in cameras]
+    assert np.mean(free) >= 0.95
+
+
+def test_a_camera_behind_or_in_the_person_sees_no_hand_and_one_before_the_person_does(take):
+    user = UserBody(take)
+    framing, frames = Framing(take, user), np.arange(0, take.num_frames, 10)
+    middle = framing.middle()
+    back = (user.eyes - middle) * (1.0, 1.0, 0.0)
+
+    def free(eye: np.ndarray) -> float:
+        return framing.free(np.tile(eye, (len(frames), 1)), frames)
+
+    assert free(middle + 2.0 * back) == free(middle + back) == 0.0
+    assert free(middle - 1.5 * back + (0.0, 0.0, 0.3)) > 0.5
 
 
 def test_a_hand_that_is_not_there_has_no_arm():

@@ -155,7 +155,7 @@ def test_an_arm_bends_at_its_elbow_and_stays_one_surface(side: Side, rng: np.ran
     elbow, ahead = mesh.forearm_line(qpos)
     for way in (ahead, np.cross(ahead, [0.6, 0.0, 0.8]), np.array([0.0, -0.6, 0.8])):
         towards = way / np.linalg.norm(way)
-        bent = mesh.posed(qpos, towards).vertices
+        bent = mesh.posed(qpos, REACH * towards).vertices
         solid = trimesh.Trimesh(bent[np.unique(skin_atlas().corners, return_index=True)[1]], mesh.faces)
         assert solid.is_watertight and solid.volume > 2e-3
         end = bent[-1] - elbow
