@@ -160,25 +160,25 @@ class UserBody:
         """Unit directions of forearms, and upper arms [m], (T, H, 3) each, in all frames of a motion.
 
         They are bent for cameras, and end at the shoulders if they are whole. Hands that are away wait at the
-        nearest place where they are.
+        nearest place where they are; those that never come have NaN.
         """
         step = max(1, round(_CHOSEN * take.rate))
-        frames, hands = np.arange(0, take.num_frames, step), range(len(take.hands))
-        qpos, points = take.qpos[frames], list[Doubles]()
-        for number, hand in enumerate(take.hands):
-            there = np.flatnonzero(np.isfinite(take.qpos[:, number]).all(axis=1))
+        frames, present = np.arange(0, take.num_frames, step), np.isfinite(take.qpos).all(axis=2)
+        qpos, points, hands = take.qpos[frames], list[Doubles](), np.flatnonzero(present.any(axis=0)).tolist()
+        for number in hands:
+            there = np.flatnonzero(present[:, number])
             nearest = np.rint(np.interp(frames, there, np.arange(len(there)))).astype(int)
             qpos[:, number] = take.qpos[there[nearest], number]
-            points.append(hand_keypoints(hand.model, qpos[:, number]))
+            points.append(hand_keypoints(take.hands[number].model, qpos[:, number]))
         chosen = []
         for first in range(0, len(frames), _CHUNK):
             some = slice(first, first + _CHUNK)
             seen = np.concatenate([one[some] for one in points], axis=1)
             arms = self.arms(qpos[some], hands, frames[some], whole=whole)
             chosen.append(bend_arms(arms, seen, [*map(cameras, frames[some].tolist())]))
-        fore, upper = (
-            turning(np.concatenate(ways), step, take.num_frames) for ways in zip(*chosen, strict=True)
-        )
+        fore, upper = np.full((2, take.num_frames, len(take.hands), 3), np.nan)
+        for directions, ways in zip((fore, upper), zip(*chosen, strict=True), strict=True):
+            directions[:, hands] = turning(np.concatenate(ways), step, take.num_frames)
         fore, _ = _bent_wrists(fore, quaternion_matrix(take.qpos[..., 3:7]), self.mirrors)
         fore = _where_known(self._tracked, fore)
         return fore, self.shoulders - self._elbows_of(take.qpos[..., :3], fore) if whole else REACH * upper

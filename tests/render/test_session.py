@@ -274,6 +274,14 @@ def test_what_cannot_be_drawn_is_told(qpos, arguments, message):
         list(draw(qpos, config=BARE, **arguments))
 
 
+def test_a_hand_that_never_comes_leaves_the_other_one():
+    take = simulate_take(kind="hand-hand", num_frames=12, seed=2)
+    qpos, status = take.qpos.copy(), take.status.copy()
+    qpos[:, 0], status[:, 0] = np.nan, 0
+    (frame,) = draw(dataclasses.replace(take, qpos=qpos, status=status), config=BARE, frames=(5,))
+    assert [hand.shape.side for hand in frame.hands] == [take.sides[1]]
+
+
 def test_a_take_has_its_own_hands():
     with pytest.raises(ArgumentError, match="model belongs to poses of your own"):
         draw(simulate_take(num_frames=2), model="M")
