@@ -466,7 +466,7 @@ def test_a_user_is_calibrated_from_a_stream(enough, capture, tmp_path, monkeypat
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setattr("track.calibration.user_calibration._LOOK_PERIOD", 0.0)
     monkeypatch.setattr("track.calibration.user_calibration._ASK_PERIOD", 0.0)
-    monkeypatch.setattr("track.calibration.user_calibration._LEAST_MOTION", -1.0)
+    monkeypatch.setattr("track.calibration.user_calibration._LEAST_HANDS_TIME", -1.0)
     monkeypatch.setattr(messages.LiveStatus, "due", True)
     if enough:
         monkeypatch.setattr("track.calibration.user_calibration.still_joints", lambda *seen: ())
