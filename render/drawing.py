@@ -27,6 +27,8 @@ from render.subject import Model, Subject, subject_of
 from render.user_body import UserBody
 from render.viewpoints import Viewpoints, known_positions
 
+_HEAD: Final = 0.35  # least distance of cameras from the ends of the axis of a head that is drawn [m]
+
 
 def draw(
     source: Take | str | Path | ArrayLike,
@@ -68,9 +70,6 @@ def draw(
     subject = subject_of(source, model=model, glove=glove, seed=config.seed)
     asked = asked_pictures(subject, config, frames, record)
     return asked.drawing.frames(asked.shard, asked.numbered)
-
-
-_HEAD: Final = 0.35  # least distance of cameras from the ends of the axis of a head that is drawn [m]
 
 
 class Asked(NamedTuple):

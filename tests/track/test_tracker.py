@@ -339,7 +339,10 @@ def strays(spread: float, *, lasting: bool) -> Change:
 SPOILT: dict[str, tuple[Change, float, str]] = {
     "two points with one ID": (with_one_id, 0.95, "several points"),
     **{f"{share:.0%} of the IDs shuffled": (shuffled(share), 0.8, "") for share in (0.1, 0.3, 1.0)},
-    **{f"points at {place}": (nowhere(place), 0.9, "no position") for place in (np.nan, np.inf, -np.inf, 1e30)},
+    **{
+        f"points at {place}": (nowhere(place), 0.9, "no position")
+        for place in (np.nan, np.inf, -np.inf, 1e30)
+    },
     **{f"lasting strays within {far} m": (strays(far, lasting=True), 0.95, "") for far in (0.1, 0.5, 2.0)},
     **{f"new strays within {far} m": (strays(far, lasting=False), 0.95, "") for far in (0.1, 0.5, 2.0)},
 }
