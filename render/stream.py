@@ -31,7 +31,7 @@ from render.frames import Doubles, HandTruth, Integers, RenderedFrame
 from render.photographs import read_photograph
 from render.studio import Moment, Studio
 from render.subject import Model, Subject, models_of, subject_of, subject_of_poses
-from render.viewpoints import FREE, around_hands, crop_around
+from render.viewpoints import SHIFT_SHARE, around_hands, crop_around
 
 _FEWEST_KEYPOINTS: Final = 3  # least number of labeled keypoints of a hand that can be cut out
 _PICTURE, _PERSON, _PHOTOGRAPH = 0, 1, 2  # second number of a stream's spawn keys
@@ -104,7 +104,7 @@ def cut_out(
     photograph = read_photograph(hand.file)
     low, high = np.nanmin(hand.keypoints, axis=0), np.nanmax(hand.keypoints, axis=0)
     side = max(float((high - low).max()), 1.0) / share
-    corner = 0.5 * (low + high - side) + FREE * rng.uniform(-0.5, 0.5, 2) * (side - (high - low))
+    corner = 0.5 * (low + high - side) + SHIFT_SHARE * rng.uniform(-0.5, 0.5, 2) * (side - (high - low))
     scale = size / side
     shift = -scale * corner + 0.5 * (scale - 1.0)  # OpenCV counts from the centers of pixels
     matrix = np.array([[scale, 0.0, shift[0]], [0.0, scale, shift[1]]])

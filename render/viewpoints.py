@@ -37,23 +37,25 @@ _BORDER: Final = 0.04  # border of a picture that hands keep free, as a share of
 _NEAREST_KEYPOINT: Final = 0.15  # least depth of a keypoint before a camera [m]
 _WIDEST_TANGENT: Final = 2.0  # largest tangent of half an angle of view that hands may fill
 _MOUNTED: Final = 0.03  # largest distance of a head's camera from the eyes along each axis [m]
-_MOSTLY: Final = 0.92  # share of the frames in which a head that leans back sees all hands
+_HEAD_SEEN_SHARE: Final = 0.92  # share of the frames in which a head that leans back sees all hands
 _LEAN: Final = 0.3  # largest distance by which a head leans back [m]
 _ORBIT_PERIOD: Final = 12.0  # time of one revolution of a camera in orbit [s]
 _TRIES: Final = 60  # random directions that are tried for one camera
 _CLOSER: Final = 1.35  # largest ratio between a hand's share and `ViewConfig.share`
 _ENOUGH: Final = 1.05  # ratio of the wanted share to the hands' up to which no other place is tried
 _SKIN_CLEARANCE: Final = 0.08  # least depth of a keypoint before a camera around hands [m]
-FREE: Final = 0.8  # share of the room around hands in a picture that they are shifted within
-_NEARLY_ALL: Final = 0.97  # share of the frames that a lens without zoom shows whole
+SHIFT_SHARE: Final = 0.8  # share of the room around hands in a picture that they are shifted within
+_LENS_SEEN_SHARE: Final = 0.97  # share of the frames that a lens without zoom shows whole
 _PLACES: Final = 16  # places, or orbits, that are tried for hands that are far apart
 _AZIMUTHS: Final = 36  # azimuths of an orbit whose views are compared
 _SAMPLES: Final = 48  # frames in which they are compared
 _CENTERINGS: Final = 2  # times that a camera is turned to the middle of what it sees
 _LINGER: Final = 20.0  # exponent of the hands' share in the time that an orbit spends on a view
 _QUICKEST: Final = 0.02  # shortest time at an azimuth of an orbit, as a share of the longest
-_FREE: Final = 0.4  # largest share of a hand's keypoints that arms hide in a picture that shows it
-_USUALLY: Final = 0.97  # Other places are tried until this share of the pictures shows all hands.
+_MOST_HIDDEN_SHARE: Final = (
+    0.4  # largest share of a hand's keypoints that arms hide in a picture that shows it
+)
+_CLEAR_SHARE: Final = 0.97  # Other places are tried until this share of the pictures shows all hands.
 _GIVES_WAY: Final = 3.0  # power of that share that outweighs the size of the hands
 _ASIDE: Final = np.deg2rad(90.0)  # largest angle that is added to the usual one from the front
 _ARM_CLEARANCE: Final = np.deg2rad(35.0)  # least angle between a view and a forearm
@@ -113,7 +115,7 @@ class Framing:
         longest = maximum_filter1d(distances, 2 * (self._window // 2) + 1, mode="nearest")
         return np.asarray(uniform_filter1d(longest, 2 * (self._window // 2) + 1, mode="nearest"))
 
-    def sides(self, rotations: Doubles) -> Doubles:
+    def longer_sides(self, rotations: Doubles) -> Doubles:
         """Longer side of the hands seen from far away, the mean of each frame (T,) [m]; NaN without hands."""
         there = self._there
         longer = np.ptp(self._rotated(self.points, rotations)[..., :2], axis=2).max(axis=-1)
@@ -139,8 +141,8 @@ class Framing:
             total = total * (1.0 - np.nan_to_num(covered))
         return np.where(there.any(axis=1), total, np.nan)
 
-    def free(self, positions: Doubles, frames: Integers) -> float:
-        """Share of these frames with half of each hand's keypoints, and more, that arms leave free.
+    def clear_share(self, positions: Doubles, frames: Integers) -> float:
+        """Share of these frames in which arms hide less than `_MOST_HIDDEN_SHARE` of each hand's keypoints.
 
         The cameras are at these positions (F, 3) [m]. Nobody has arms if their user is not known.
         """
@@ -148,7 +150,7 @@ class Framing:
             return 1.0
         points = self.points[frames].astype(np.float64)
         hidden = most_hidden(self._arms[frames], np.ascontiguousarray(positions), points)
-        return float((hidden < _FREE).mean())
+        return float((hidden < _MOST_HIDDEN_SHARE).mean())
 
     def sampled(self) -> Integers:
         """Some frames, in which views are compared."""
@@ -426,12 +428,12 @@ def _largest(
     best, chosen, frames = np.inf, None, framing.sampled()
     for directions in ways:
         farther, path = _followed(config, framing, directions, rng)
-        free = framing.free(path.poses[frames, :3, 3], frames)
-        if chosen is None and (config.distance or farther <= _ENOUGH) and free >= _USUALLY:
+        free = framing.clear_share(path.poses[frames, :3, 3], frames)
+        if chosen is None and (config.distance or farther <= _ENOUGH) and free >= _CLEAR_SHARE:
             return path
         shares = framing.shares(path.camera, path.poses, _CLOSER * config.share)
         smaller = 1.0 if config.distance else config.share / max(float(np.nanmedian(shares)), 1e-6)
-        smaller /= max(min(free / _USUALLY, 1.0), 1e-6) ** _GIVES_WAY
+        smaller /= max(min(free / _CLEAR_SHARE, 1.0), 1e-6) ** _GIVES_WAY
         if smaller < best:
             best, chosen = smaller, path
         if best <= _ENOUGH:
@@ -450,7 +452,7 @@ def _lingering(config: ViewConfig, framing: Framing, turned: Doubles, elevation:
         away = framing.shortest(camera, centers, rotations, frames)[:, None] * directions
         poses = rigid(rotations, centers + away)
         share = np.nanmedian(framing.shares(camera, poses, _CLOSER * config.share, frames))
-        shares.append(min(share, config.share) * framing.free(poses[:, :3, 3], frames))
+        shares.append(min(share, config.share) * framing.clear_share(poses[:, :3, 3], frames))
     time = (np.array(shares) / config.share) ** _LINGER
     time = np.maximum(time, _QUICKEST * time.max())
     passed = np.concatenate([[0.0], np.cumsum(time)]) / time.sum() * 2.0 * np.pi
@@ -469,7 +471,7 @@ def _followed(
     kept = np.broadcast_to(framing.middle(), directions.shape)
     enough = framing.shortest(camera, kept, rotations).max()
     if config.distance is None:
-        side = float(np.nanmedian(framing.sides(rotations)))
+        side = float(np.nanmedian(framing.longer_sides(rotations)))
         farthest = _distance_of(camera, side, config.share)
         usual = farthest / float(rng.uniform(1.0, _CLOSER))
     else:
@@ -498,7 +500,9 @@ def _head(config: ViewConfig, take: Take, framing: Framing, rng: np.random.Gener
     user = UserBody(take) if framing.user is None else framing.user
     camera, eyes = preset(config.camera), user.eyes + rng.uniform(-_MOUNTED, _MOUNTED, 3)
     distances, rotations = _turned_to(eyes, framing.followed())
-    lacking = np.quantile(framing.shortest(camera, framing.followed(), rotations) - distances, _MOSTLY)
+    lacking = np.quantile(
+        framing.shortest(camera, framing.followed(), rotations) - distances, _HEAD_SEEN_SHARE
+    )
     eyes -= np.clip(lacking, 0.0, _LEAN) * rotations[..., 2].mean(axis=0)
     paths = []
     for number in range(config.views):
@@ -540,10 +544,10 @@ def _rig(config: ViewConfig, take: Take, framing: Framing, rng: np.random.Genera
             if camera.lens.kind != "pinhole":
                 break
             share = config.share * rng.uniform(1.0, _CLOSER)
-            side = float(np.nanmedian(framing.sides(rotations) / distances))
+            side = float(np.nanmedian(framing.longer_sides(rotations) / distances))
             wanted = 1.0 / _distance_of(camera, side, share)
             longest = distances / framing.shortest(camera, centers, rotations).clip(1e-6)
-            lens = min(wanted, float(np.quantile(longest, 1.0 - _NEARLY_ALL)))
+            lens = min(wanted, float(np.quantile(longest, 1.0 - _LENS_SEEN_SHARE)))
             if lens >= wanted / _ENOUGH:
                 break
         else:
@@ -607,7 +611,7 @@ def around_hands(
     focal, size = camera.K[[0, 1], [0, 1]], np.array(camera.size, dtype=np.float64)
     nearest = _SKIN_CLEARANCE - float(local[:, 2].min())
     shift = np.array([0.0, 0.0, 4.0 * nearest])  # position of the hands in the camera's axes
-    room = rng.uniform(-0.5, 0.5, 2) * FREE
+    room = rng.uniform(-0.5, 0.5, 2) * SHIFT_SHARE
     for _ in range(8):  # several times, because perspective widens what is near
         pixels = focal * (local + shift)[:, :2] / (local + shift)[:, 2:]
         low, high = pixels.min(axis=0), pixels.max(axis=0)
@@ -628,7 +632,7 @@ def crop_around(
     pixels = camera.project(keypoints)
     low, high = pixels.min(axis=0), pixels.max(axis=0)
     side = float((high - low).max()) / share
-    corner = 0.5 * (low + high - side) + FREE * rng.uniform(-0.5, 0.5, 2) * (side - (high - low))
+    corner = 0.5 * (low + high - side) + SHIFT_SHARE * rng.uniform(-0.5, 0.5, 2) * (side - (high - low))
     K = camera.K.copy()
     K[:2, 2] -= corner
     K[:2] *= size / side

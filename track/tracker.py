@@ -266,7 +266,7 @@ class Tracker:
             labeled = np.count_nonzero(markers >= 0)
             enough = labeled >= self.config.fewest_labels
             if estimate is not None and enough and estimate.rms <= self.config.most_rms:
-                rms = state.rms_without_bias(estimate)  # with the biases used by the fit
+                rms = state.rms_from_design(estimate)  # with the biases used by the fit
                 settled = _weigh_labels(frame.points, markers, estimate.positions, state.variance, evidence)
                 state.update(estimate, settled, frame.time)
                 outcomes.append(_Outcome(Status.TRACKED, rms))
@@ -342,7 +342,7 @@ class Tracker:
         targets = targets_of(frame.points, markers, state.num_markers)
         estimate = state.initialize(found.fit.qpos[0], targets, frame.time)
         self._review.restart(found.index, frame.time)
-        started = _Outcome(Status.INITIALIZED, state.rms_without_bias(estimate))
+        started = _Outcome(Status.INITIALIZED, state.rms_from_design(estimate))
         others = outcomes[: found.index], outcomes[found.index + 1 :]
         return frame.with_markers(found.index, markers), (*others[0], started, *others[1])
 

@@ -75,7 +75,7 @@ def test_a_camera_behind_or_in_the_person_sees_no_hand_and_one_before_the_person
     back = (user.eyes - middle) * (1.0, 1.0, 0.0)
 
     def free(eye: np.ndarray) -> float:
-        return framing.free(np.tile(eye, (len(frames), 1)), frames)
+        return framing.clear_share(np.tile(eye, (len(frames), 1)), frames)
 
     assert free(middle + 2.0 * back) == free(middle + back) == 0.0
     assert free(middle - 1.5 * back + (0.0, 0.0, 0.3)) > 0.5

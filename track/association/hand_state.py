@@ -289,9 +289,9 @@ class HandState:
         np.maximum(self._learned_variance, _INITIAL_SPREAD_LEAST**2, out=self._learned_variance)
         self._apply_biases()
 
-    def rms_without_bias(self, estimate: HandEstimate) -> float:
+    def rms_from_design(self, estimate: HandEstimate) -> float:
         """RMS distance of the markers from the hand's own marker positions, biases included [m]."""
-        return float(_rms_without_bias(estimate.residuals, estimate.predicted.rotations, self._bias))
+        return float(_rms_from_design(estimate.residuals, estimate.predicted.rotations, self._bias))
 
     def update(self, estimate: HandEstimate, settled: Bool[np.ndarray, "M"], time: float) -> None:
         """Accept the pose of the next frame, and learn biases of markers with settled labels."""
@@ -319,7 +319,7 @@ class HandState:
         self.rms = estimate.rms
         self._joint_covariance = estimate.predicted.joint_covariance
         _note_markers(estimate.residuals, self.digits, time, self._last_seen, self.velocity)
-        square = self.rms_without_bias(estimate) ** 2
+        square = self.rms_from_design(estimate) ** 2
         if np.isnan(self._usual_square):
             self._usual_square = square
         elif np.isfinite(square):
@@ -453,7 +453,7 @@ def _apply_biases(
 
 
 @kernel
-def _rms_without_bias(
+def _rms_from_design(
     residuals: Float[np.ndarray, "M 3"], rotations: Float[np.ndarray, "M 3 3"], bias: Float[np.ndarray, "M 3"]
 ) -> float:
     """RMS of the residuals with the biases added back [m]; for the arguments see `_learn_bias`."""

@@ -106,7 +106,7 @@ def test_the_bias_of_a_marker_is_learned_and_its_designed_position_is_known(foll
     estimate = state.fit(prediction.positions, prediction.qpos, prediction)
     designed = HandState(state.hand).solver.marker_positions(estimate.qpos)
     np.testing.assert_allclose(state.unbiased_positions(estimate), designed, atol=1e-6)
-    assert state.rms_without_bias(estimate) > 3.0 * estimate.rms
+    assert state.rms_from_design(estimate) > 3.0 * estimate.rms
 
 
 def test_a_small_bias_is_forgotten_and_a_large_one_stays(followed):
