@@ -23,8 +23,8 @@ from handsim.callbacks import before_compiling
 P = ParamSpec("P")
 R = TypeVar("R")
 CARPUS: Final = 0.38
-"""Where a finger's carpometacarpal joint lies on the way from the wrist to the knuckle: the carpus of
-Buryanov and Kotiuk. El-shennawy and others (2001, J. Hand Surg. 26A:1030) found the axes of flexion in the
+"""Distance of a carpometacarpal joint from the wrist, as a share of the knuckle's: the length of the carpus
+by Buryanov and Kotiuk. El-shennawy and others (2001, J. Hand Surg. 26A:1030) found the axes of flexion in the
 bases of the metacarpals."""
 MOST_METACARPAL: Final = float(np.deg2rad(27.0))
 """Largest flexion of a metacarpal [rad]: the range of the fifth that they found; that of the fourth is 20."""

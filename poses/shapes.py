@@ -59,7 +59,7 @@ _MOST_CROSSED: Final = 0.0045  # [m] Flat fingers that overlap more hide skin th
 _THUMB: Final = np.array([joint.name.startswith("thumb") for joint in JOINTS])
 _ABDUCTIONS: Final = np.array([joint.name.endswith("abduction") for joint in JOINTS])
 _FAN: Final = np.deg2rad([0.0, 1.0, 0.2, -0.6, -1.4])  # one degree of fanning at rest, thumb to little
-# For digits that converge: the thumb leans away from the index finger, and so does the middle finger.
+# The same for digits that converge: thumb and middle finger lean away from the index finger.
 _WIDE_FAN: Final = np.deg2rad([1.0, 1.0, -0.2, -1.0, -1.8])
 
 SAMPLERS: Final = "handsim.pose_samplers"

@@ -48,9 +48,9 @@ _TRUNK: Final = np.array(
         [0.015, 0.06, 0.03],
     ]
 )
-"""Heights of sections of the trunk, and their half breadths and half depths."""
+"""Sections of the trunk: height above the neck, half of the breadth, half of the depth."""
 _SHOULDERS: Final = (np.array([[-0.118, -0.004, -0.014], [0.118, -0.004, -0.014]]), 0.032)
-"""Axis and radius of the shoulders, as of the next."""
+"""Axis and radius of a capsule through both shoulders."""
 _NECK: Final = (np.array([[0.0, -0.014, -0.02], [0.0, -0.002, 0.1]]), 0.034)
 _HEADS: Final = (
     ((0.0, 0.002, 0.126), (0.043, 0.055, 0.06)),
@@ -181,7 +181,7 @@ def _distance(points: Doubles) -> Doubles:
 
 
 def _capsule(points: Doubles, axis: Doubles, radius: float) -> Doubles:
-    """Distance of points (..., 3) from a capsule."""
+    """Distances (...) of points (..., 3) from the surface of a capsule, negative inside."""
     way = axis[1] - axis[0]
     along = np.clip((points - axis[0]) @ way / (way @ way), 0.0, 1.0)
     return np.asarray(np.linalg.norm(points - axis[0] - along[..., None] * way, axis=-1) - radius)

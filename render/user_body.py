@@ -184,7 +184,7 @@ class UserBody:
         return fore, self.shoulders - self._elbows_of(take.qpos[..., :3], fore) if whole else REACH * upper
 
     def _elbows_of(self, wrists: Doubles, forearms: Doubles) -> Doubles:
-        """Elbows (..., H, 3) of forearms in these directions [m]."""
+        """Positions (..., H, 3) of the elbows [m], from wrists [m] and unit directions of forearms."""
         return np.asarray(wrists + (ELBOW * self._lengths)[:, None] * forearms)
 
     def _stand(

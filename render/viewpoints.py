@@ -52,9 +52,8 @@ _SAMPLES: Final = 48  # frames in which they are compared
 _CENTERINGS: Final = 2  # times that a camera is turned to the middle of what it sees
 _LINGER: Final = 20.0  # exponent of the hands' share in the time that an orbit spends on a view
 _QUICKEST: Final = 0.02  # shortest time at an azimuth of an orbit, as a share of the longest
-_MOST_HIDDEN_SHARE: Final = (
-    0.4  # largest share of a hand's keypoints that arms hide in a picture that shows it
-)
+_MOST_HIDDEN_SHARE: Final = 0.4
+"""A picture shows a hand if arms hide less than this share of its keypoints."""
 _CLEAR_SHARE: Final = 0.97  # Other places are tried until this share of the pictures shows all hands.
 _GIVES_WAY: Final = 3.0  # power of that share that outweighs the size of the hands
 _ASIDE: Final = np.deg2rad(90.0)  # largest angle that is added to the usual one from the front
@@ -361,7 +360,7 @@ class Viewpoints:
         return float(np.nanmin(places, initial=0.0)) - (_SLEEVE if arms else _SKIN)
 
     def positions(self) -> Float[np.ndarray, "P 3"]:
-        """Positions of the cameras, of the hands' centers in all frames, and of the person [m]."""
+        """Positions [m] that a room must hold: hands and cameras in all frames, and the person's trunk."""
         return np.concatenate([self._framing.centers, self._framing.trunk, self.eyes()])
 
     def eyes(self) -> Float[np.ndarray, "P 3"]:

@@ -175,11 +175,17 @@ def hand_origin(notes: str, side: Side) -> HandOrigin:
 
     Hands that could not be measured have a named size; one that calibration did not improve is measured.
     """
-    first = notes.split("; ", maxsplit=1)[0]
-    if first.removeprefix(MEASURED) in get_args(SizeChoice):
+    size = _size_of(notes)
+    if size.removeprefix(MEASURED) in get_args(SizeChoice):
         return "named"
     left = any(told.startswith(f"{side} hand: ") for told in _left_as_measured(notes))
-    return "measured" if left or first.startswith(MEASURED) else "calibrated"
+    return "measured" if left or size else "calibrated"
+
+
+def _size_of(notes: str) -> str:
+    """What the notes begin with if it is the size of hands, named or measured; otherwise empty."""
+    first = notes.split("; ", maxsplit=1)[0]
+    return first if first.startswith(MEASURED) or first in get_args(SizeChoice) else ""
 
 
 def _left_as_measured(notes: str) -> list[str]:
@@ -203,10 +209,8 @@ def as_user(hands: User | Sequence[GloveFit] | str | Path) -> User:
     """
     if isinstance(hands, str | Path):
         user = load_user(hands)
-        first, *_ = user.notes.split("; ")
-        size = [first] if first.startswith(MEASURED) or first in get_args(SizeChoice) else []
-        notes = [*size, Path(hands).name, *_left_as_measured(user.notes)]
-        return dataclasses.replace(user, notes="; ".join(notes))
+        notes = [_size_of(user.notes), Path(hands).name, *_left_as_measured(user.notes)]
+        return dataclasses.replace(user, notes="; ".join(filter(None, notes)))
     if not isinstance(hands, User):
         check_type("hands", hands, Sequence, "a User, hands in their gloves (GloveFit), or a user's file")
         return User(tuple(hands))

@@ -41,8 +41,8 @@ class RigidBody:
     has_axes: bool = False
     """Whether its frame is that of a forearm: that of the hand's wrist when the wrist is straight."""
     elbow: Side | None = None
-    """The hand whose elbow it is; its markers do not turn with the radius. Its y axis goes through the
-    epicondyles, as that of the forearm's frame in full supination."""
+    """The hand whose elbow it is. An elbow does not turn when the forearm pronates. Its y axis goes through
+    the epicondyles, and is parallel to the forearm's y axis in full supination."""
 
     @classmethod
     def of(cls, thing: RigidObject) -> RigidBody:

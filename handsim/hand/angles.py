@@ -81,7 +81,7 @@ def wrist_angles(
 
 
 def wrist_cardan(side: Side, turns: Float[np.ndarray, "T 3 3"]) -> NDArray[np.float64]:
-    """Flexion, radial deviation and pronation (T, 3) [rad] of a hand's rotations; NaN stays NaN."""
+    """Flexion, radial deviation and pronation (T, 3) [rad] of rotations; NaN where a rotation is NaN."""
     known, found = np.isfinite(turns[:, 0, 0]), np.full((len(turns), 3), np.nan)
     turned = MIRROR @ turns[known] @ MIRROR if side == "left" else turns[known]
     found[known] = _cardan_angles(turned) * [1.0, -1.0, 1.0]

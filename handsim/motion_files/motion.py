@@ -185,20 +185,15 @@ class PosedBody(NamedTuple):
 
     def as_forearm(self, hand: PosedHand, markers: Mapping[str, Float[np.ndarray, "3"]]) -> PosedBody:
         """The forearm of a hand: the outline of its skin at the wrist, drawn out to the farthest marker."""
-        from scipy.spatial import ConvexHull
+        import trimesh
 
         # Landmarks may be the ends of a bar above the wrist, so the skin begins where the hand mostly is.
         away = hand.qpos[:, :3] - self.T_world_body[:, :3, 3]
         wrist = np.median(np.einsum("ti,tij->tj", away, self.T_world_body[:, :3, :3]), axis=0)
         loop = hand.model.surface.vertices[load_cage().wrist_loop] + wrist
         end = loop * [0.0, 1.0, 1.0] + [min(place[0] for place in markers.values()), 0.0, 0.0]
-        corners = np.concatenate([loop, end])
-        hull = ConvexHull(corners)
-        normals = np.cross(
-            *(corners[hull.simplices[:, side]] - corners[hull.simplices[:, 0]] for side in (1, 2))
-        )
-        is_inward = (normals * hull.equations[:, :3]).sum(axis=1) < 0.0
-        faces = np.where(is_inward[:, None], hull.simplices[:, ::-1], hull.simplices)
+        hull = trimesh.convex.convex_hull(np.concatenate([loop, end]))
+        corners, faces = np.array(hull.vertices), np.array(hull.faces)
         shape = RigidObject(self.name, corners, faces, (Part("mesh", np.zeros(3), np.eye(4), corners),))
         return self._replace(shape=shape, forearm=hand.side, markers=markers)
 
@@ -238,10 +233,11 @@ def are_moved(model: HandModel) -> Bool[np.ndarray, "L"]:
 def _offsets(model: HandModel, qpos: Float[np.ndarray, "T 27"]) -> Float[np.ndarray, "T L 3"]:
     """The position of each bone in its parent's frame [m]; zero for the palm."""
     offsets = np.tile(model.skeleton.offsets, (len(qpos), 1, 1))
-    for digit in np.flatnonzero(model.skeleton.arch):
-        bones, first = model.forward_kinematics(qpos), 1 + 3 * digit
-        begins = bones[:, first, :3, 3] - bones[:, PALM, :3, 3]
-        offsets[:, first] = np.einsum("tji,tj->ti", bones[:, PALM, :3, :3], begins)
+    arched = 1 + 3 * np.flatnonzero(model.skeleton.arch)
+    if len(arched):
+        bones = model.forward_kinematics(qpos)
+        begins = bones[:, arched][..., :3, 3] - bones[:, PALM, None, :3, 3]
+        offsets[:, arched] = begins @ bones[:, PALM, :3, :3]
     return offsets
 
 

@@ -32,8 +32,8 @@ _LINK_DISTANCE: Final = 0.085  # [m] least linking distance between neighboring 
 _LINKED_GESTURES: Final = 0.99  # share of gestures in which all markers of a hand must be linked
 _LEAST_LABELED_SHARE: Final = 0.45  # least share of a hand's markers with a label
 SPARE_POINTS: Final = 6
-"""A group is cut, as two touching hands, if its points outnumber a hand's markers by more than this number or
-`_SPARE_SHARE` of the markers, whichever is less."""
+"""A group of points may be two touching hands, and is cut, if it has this many points more than a hand has
+markers. `_SPARE_SHARE` of the markers counts instead if that is less."""
 _SPARE_SHARE: Final = 0.3  # of a hand's markers, because ghosts resemble few markers
 _CUTS: Final = 12  # number of directions of cuts, even over half a sphere
 _CUTS_OF_SEARCH: Final = 6  # directions per search in continuous frames; the next search has the others

@@ -104,7 +104,7 @@ def wrist_variances(
     found[:, :2, 0] += (hands.swapaxes(1, 2) @ noise @ hands).diagonal(axis1=1, axis2=2)[:, 1:]
     found[np.isnan(found[:, 0, 0])] = np.nan
     if elbow is not None and take.bodies[forearm].has_axes:
-        # Pronation follows the part of a turn along the forearm that is perpendicular to the epicondyles.
+        # Pronation is a turn about the forearm, seen perpendicular to the line through the epicondyles (y).
         length = forearms[:, :, 0]
         way = length * [1.0, 0.0, 1.0] / (1.0 - length[:, 1:2] ** 2)
         both = forearms @ noise @ forearms.swapaxes(1, 2) + _turn_noise(take, elbow)

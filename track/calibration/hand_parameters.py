@@ -117,9 +117,8 @@ def skinned_shape_jacobian(
     by_length[:, :, :, :2] = after[:, :, 1:] * digits[:, None, :, :2, :3, 0] - along
     by_length *= shape.bone_lengths[..., None]
     metacarpals = metacarpal_rotations(model.skeleton, T_world_bone)
-    carried = metacarpals + CARPUS * (
-        wrist[:, None] - metacarpals
-    )  # a knuckle moves the base of its metacarpal
+    # The base of a metacarpal is a share of the knuckle's position, so a knuckle moves it, too.
+    carried = metacarpals + CARPUS * (wrist[:, None] - metacarpals)
     moved = after[:, :, 0, None] * carried[:, None] - turns[:, :, :, 0]
     by_knuckle[:] = moved.swapaxes(-1, -2)
     axes, arms = euler_axes(shape.base_angles), points[:, None] - rest[:, 0, :3, 3]

@@ -92,7 +92,7 @@ people (benchmarks/palm.py)."""
 _INDEPENDENT_ARCHES: Final = 4.0  # number of frames whose palms leave the usual arch independently, at most
 _ON_KNUCKLE: Final = 0.4  # Palm and first bone each carry more than this of a marker on a knuckle.
 _MOST_SHARE: Final = 0.75  # of the flexion of a first bone that its metacarpal has
-_LEAST_TURN: Final = np.deg2rad(0.1)  # [rad] least scatter of a metacarpal around its arch
+_LEAST_TURN: Final = np.deg2rad(0.1)  # [rad] lower bound of the noise of a metacarpal's flexion
 _INDEPENDENT_POSES: Final = 14.0  # number of frames with independent deformation of the flesh, at most
 
 

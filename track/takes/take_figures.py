@@ -163,7 +163,7 @@ def hand_figures(take: Take, *, guesses: bool = False) -> tuple[HandFigures, ...
 
 
 class WristFigures(NamedTuple):
-    """Angles of wrist and forearm over the frames of a take, in the order of `WRIST_NAMES`."""
+    """The angles `WRIST_NAMES` of one arm in all frames of a take."""
 
     angles: Float[np.ndarray, "T 3"]
     """Angles [deg]; NaN where one of two bodies has no pose, or axes are unknown."""

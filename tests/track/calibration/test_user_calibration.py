@@ -249,7 +249,7 @@ def knuckle_layout():
 
 
 def arched_capture(layout, arch, rng):
-    """Markers of a hand whose metacarpals flex by these ratios and carry the knuckles' markers, and poses."""
+    """Noisy markers and poses of a closing hand with this arch; metacarpals carry the knuckles' markers."""
     shape = dataclasses.replace(named_shape("M"), arch=arch)
     fit = attach(layout, shape)
     angles = np.zeros((120, 20))
