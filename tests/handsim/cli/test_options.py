@@ -102,7 +102,7 @@ SLOW = [
     ("calibrate", "long.c3d --out u.json", "glove sparse13|size XL|hands right|labeler run"),
     ("demo", "--out d --num-frames 200", "seed 3|num-frames 300"),
     ("film", "moving.npz video.mp4 --out f --format png --num-frames 2 --workers 1",
-     "camera lens.toml|passes rgb depth|dress skin|every 2|num-frames 3|up y"),
+     "camera lens.toml|passes rgb depth|dress skin|every 90|num-frames 3|up y"),
     ("glove score", "starter6 --out s.html --num-frames 100 --captures 0",
      "rig six|motion twins|num-frames 140|captures 1|seed 3"),
     ("glove learn", "labeled.trc --out g.toml --radius-mm 3.2 --no-prove", "radius-mm 4"),
