@@ -1,7 +1,7 @@
 """Every speed that pages quote, in one run, each also in a unit that the machine gave a moment before.
 
-    OPENBLAS_NUM_THREADS=1 MUJOCO_GL=egl python -m benchmarks.speed
-        [--only tracker labels ...] [--seeds 0 1 2 3 4] [--quick] [--save speed]
+    OPENBLAS_NUM_THREADS=1 python -m benchmarks.speed
+        [--only tracker labels commands] [--seeds 0 1 2 3 4] [--quick] [--save speed]
 
 The unit is the time of 1,000 calls of MuJoCo's `mj_kinematics` on our hand, measured anew before each
 section: where another machine or another hour has another unit, compare figures in units. Times are the
@@ -13,11 +13,6 @@ tracker: a frame with two hands, for each kind of capture, of the true hands and
 labels: one hand with drops and ghosts, alone and in batches; of a glove without weights, and learning it.
 commands: what users type, with its defaults, from its start to its end; five times each, with the kernels
     compiled but for the rows that say otherwise. Captures are of two hands, apart or touching.
-pictures: 640 x 480 of two hands, in one process and in one a core, and written; the stream of training
-    pictures.
-generation: training frames of single hands and of the default mix.
-solvers: a pose from the frame before, from nothing, and from eight starts.
-rays: lines of sight past a hand.
 
 Run it where nothing else runs. --quick tries every part with a few frames and one seed. The conditions of the
 run are printed and saved with its figures: seeds, what was left out, processors, threads and load.
@@ -41,40 +36,21 @@ import mujoco
 import numpy as np
 import torch
 
-from benchmarks import rendering
 from benchmarks.held_out import held_out_markers
 from benchmarks.paper.take_evaluation import hide_points, nominal_users, seen_frame, true_users
 from benchmarks.paper.tracking_tables import calibrated_users
 from benchmarks.record import Figures, describe, run, save_figures, timed
-from gloves import GloveFit, Take, load_layout, write_capture
-from gloves.fit import attach_markers
-from gloves.optics.visibility import free_rays
-from handsim import HandModel, join_qpos, load_rig
-from handsim.kernels import move
-from handsim.space.transforms import random_quaternions
-from poses import sample_motion
-from poses.shapes import sample_valid_angles
+from gloves import GloveFit, Take, write_capture
+from handsim import HandModel
 from track import Tracker
-from track.kinematics.pose_solver import PoseSolver
-from train import (
-    Corruption,
-    GenerateSettings,
-    Labeler,
-    SceneMix,
-    corrupt,
-    load_labeler,
-    simulate_take,
-)
+from train import Corruption, Labeler, corrupt, load_labeler, simulate_take
 from train.labelers.storage import OnnxLabeler, export_onnx, load_network
-from train.simulation.generation import make_dataset
 from train.simulation.scenes import KINDS, Kind
 
 NEW_GLOVE: Final = Path(__file__).parents[1] / "examples" / "ten_markers.toml"
 WARM_UP: Final = 30  # frames of a tracker that do not count
-NOISE: Final = 3e-4  # of markers [m]
 BEFORE, DARK, AFTER = 60, 120, 5  # frames around a second of darkness
-Section = Literal["tracker", "labels", "commands", "pictures", "generation", "solvers", "rays"]
-CORES: Final = os.cpu_count() or 1
+Section = Literal["tracker", "labels", "commands"]
 CAPTURES: Final[tuple[tuple[str, Kind, int], ...]] = (
     ("short", "single-hand", 24),
     ("hand", "single-hand", 1632),
@@ -128,12 +104,6 @@ class Speeds:
         self.figures[key] = (f"{what}: median, 99th percentile, longest [ms]; median in units", row)
         shown = "{:9.3f} {:9.3f} {:9.3f} ms {:9.4f} units".format(*row)
         print(f"  {what:66s} {shown}", flush=True)
-
-    def rate(self, key: str, what: str, per_second: float) -> None:
-        """Keep how many of something are made in a second."""
-        row = [per_second, per_second * self._unit]
-        self.figures[key] = (f"{what}: in a second; in a unit", row)
-        print(f"  {what:66s} {row[0]:12.1f} /s {row[1]:9.4f} /unit", flush=True)
 
 
 def unit() -> float:
@@ -287,84 +257,6 @@ def type_in(words: str, folder: Path, environment: Mapping[str, str] = MappingPr
     """Run `handsim` with these words in a folder, and wait until it ends."""
     command = [sys.executable, "-m", "handsim", *words.split()]
     subprocess.run(command, cwd=folder, env={**os.environ, **environment}, check=True, capture_output=True)
-
-
-def pictures(speeds: Speeds) -> None:
-    frames = speeds.some(200, 8)
-    with tempfile.TemporaryDirectory() as folder:
-        for key, (name, job) in rendering.jobs(frames, Path(folder)).items():
-            speeds.rate(key, f"pictures, {name}", rendering.rate(functools.partial(job, 0), frames))
-            if not speeds.some(0, 1):
-                many = rendering.rate_in_processes(job, CORES, frames)
-                speeds.rate(f"{key}_all", f"pictures, {name}, {CORES} processes", many)
-    stream = iter(rendering.a_stream())
-    drawing = lambda: [next(stream) for _ in range(frames)]  # noqa: E731
-    size = f"{rendering.CROP} x {rendering.CROP}"
-    speeds.rate("stream", f"pictures of the stream, one hand, {size}", rendering.rate(drawing, frames))
-    batches, count = rendering.stream_batches(), -(-4 * frames // rendering.BATCH)
-    seconds = timed(lambda: [next(batches) for _ in range(count)])
-    many = count * rendering.BATCH / seconds
-    speeds.rate("stream_all", f"pictures of the stream, {CORES} workers of a DataLoader", many)
-
-
-def generation(speeds: Speeds) -> None:
-    for key, name, scenes, workers in (
-        ("frames_single", "single hands", SceneMix(alone=1.0, together=0.0, holding=0.0), CORES),
-        ("frames_mix", "the default mix", SceneMix(), CORES),
-        ("frames_mix_one", "the default mix", SceneMix(), 1),
-    ):
-        with tempfile.TemporaryDirectory() as folder:
-            config = GenerateSettings(num_frames=speeds.some(100_000, 3000), scenes=scenes)
-            seconds = timed(lambda: make_dataset(config, Path(folder) / "set", workers=workers))  # noqa: B023
-        speeds.rate(key, f"training frames of {name}, workers: {workers}", config.num_frames / seconds)
-
-
-def solvers(speeds: Speeds) -> None:
-    model, frames = HandModel.named("M"), speeds.some(300, 20)
-    worn = attach_markers(load_layout("dense19"), model)
-    solver, followed, eight, cold = PoseSolver(GloveFit(model, worn)), [], [], []
-    for seed in speeds.seeds:
-        rng = np.random.default_rng(seed)
-
-        def seen(qpos: np.ndarray) -> np.ndarray:
-            """The markers of poses, with noise."""
-            points = worn.centers(model, model.forward_kinematics(qpos))
-            noisy: np.ndarray = points + NOISE * rng.standard_normal(points.shape)  # noqa: B023
-            return noisy
-
-        qpos = sample_motion(model, frames / 120.0, rng=rng).qpos
-        solver.solve(seen(qpos[:1]))  # to warm up
-        pose = solver.solve(seen(qpos[:1]), qpos[:1]).qpos
-        for target in seen(qpos)[1:]:
-            start = time.perf_counter()
-            pose = solver.solve(target[None], pose).qpos
-            followed.append(time.perf_counter() - start)
-        starts = move(np.repeat(qpos, 8, axis=0), 0.03 * rng.standard_normal((8 * len(qpos), 26)))
-        pairs = zip(np.repeat(seen(qpos), 8, axis=0).reshape(-1, 8, *worn.points.shape),
-                    starts.reshape(-1, 8, starts.shape[-1]), strict=True)  # fmt: skip
-        eight += [timed(functools.partial(solver.solve, *pair)) for pair in pairs]
-        anywhere = join_qpos(
-            sample_valid_angles(model, frames, rng=rng),
-            position=rng.normal(size=(frames, 3)),
-            quaternion=random_quaternions(frames, rng=rng),
-        )
-        cold += [timed(functools.partial(solver.solve, target[None])) for target in seen(anywhere)]
-    speeds.times("solver_ours_skin", "a pose from the frame before", followed)
-    speeds.times("solver_eight", "a pose, eight starts", eight)
-    speeds.times("solver_cold", "a pose from nothing", cold)
-
-
-def rays(speeds: Speeds) -> None:
-    rng, model = np.random.default_rng(0), HandModel.named("M")
-    cameras, count = load_rig("figure5").positions, speeds.some(2000, 100)
-    qpos = join_qpos(sample_valid_angles(model, count, rng=rng), position=[0.0, 0.0, 1.1])
-    bones = model.forward_kinematics(qpos)
-    markers, _ = attach_markers(load_layout("dense19"), model).markers(model, bones)
-    segments, radii = model.capsules.posed(bones), model.capsules.radii
-    free_rays(markers, cameras, segments, radii)
-    lines = markers.shape[1] * len(cameras)
-    ours = np.median([timed(lambda: free_rays(markers, cameras, segments, radii)) for _ in range(5)])
-    speeds.rate("rays", "lines of sight past a hand", count * lines / float(ours))
 
 
 def main(
