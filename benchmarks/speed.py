@@ -7,10 +7,9 @@ The unit is the time of 1,000 calls of MuJoCo's `mj_kinematics` on our hand, mea
 section: where another machine or another hour has another unit, compare figures in units. Times are the
 median, the 99th percentile and the longest over all seeds.
 
-tracker: a frame with two hands, for each kind of capture, of the true hands and of hands calibrated as users
-    calibrate them; of hand-hand with a new ID for every point in every frame; a frame in which both hands are
-    initialized, and the longest of five frames after a second of darkness.
-labels: one hand with drops and ghosts, alone and in batches; of a glove without weights, and learning it.
+tracker: a frame with two hands, for each kind of capture, of the true hands; of hand-hand with a new ID for
+    every point in every frame; a frame in which both hands are initialized.
+labels: one hand with drops and ghosts; of a glove without weights, and learning it.
 commands: what users type, with its defaults, from its start to its end; five times each, with the kernels
     compiled but for the rows that say otherwise. Captures are of two hands, apart or touching.
 
@@ -26,30 +25,28 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from types import MappingProxyType
 from typing import Final, Literal, get_args
+from unittest import mock
 
 import mujoco
 import numpy as np
 import torch
 
 from benchmarks.held_out import held_out_markers
-from benchmarks.paper.take_evaluation import hide_points, nominal_users, seen_frame, true_users
-from benchmarks.paper.tracking_tables import calibrated_users
+from benchmarks.paper.take_evaluation import nominal_users, seen_frame, true_users
 from benchmarks.record import Figures, describe, run, save_figures, timed
 from gloves import GloveFit, Take, write_capture
 from handsim import HandModel
 from track import Tracker
 from train import Corruption, Labeler, corrupt, load_labeler, simulate_take
-from train.labelers.storage import OnnxLabeler, export_onnx, load_network
 from train.simulation.scenes import KINDS, Kind
 
 NEW_GLOVE: Final = Path(__file__).parents[1] / "examples" / "ten_markers.toml"
 WARM_UP: Final = 30  # frames of a tracker that do not count
-BEFORE, DARK, AFTER = 60, 120, 5  # frames around a second of darkness
 Section = Literal["tracker", "labels", "commands"]
 CAPTURES: Final[tuple[tuple[str, Kind, int], ...]] = (
     ("short", "single-hand", 24),
@@ -59,16 +56,11 @@ CAPTURES: Final[tuple[tuple[str, Kind, int], ...]] = (
 )
 RENDER: Final = "render touching.npz --out {out} --num-frames"
 COMMANDS: Final = (
-    ("label_help", "label --help", "label --help"),
     ("label_first", "label of 24 frames from an empty cache", "label short.c3d --out {out}.trc"),
     ("label_24", "label of 24 frames", "label short.c3d --out {out}.trc"),
-    ("track_24", "track of 24 frames", "track short.c3d --out {out}.npz"),
-    ("label_1200", "label of 10 s of touching hands", "label touching.c3d --out {out}.trc"),
-    ("track_1200", "track of 10 s of touching hands", "track touching.c3d --out {out}.npz"),
     ("label_7200", "label of a minute of touching hands", "label minute.c3d --out {out}.trc"),
     ("track_7200", "track of a minute of touching hands", "track minute.c3d --out {out}.npz"),
     ("track_calibrate", "track --calibrate of 13.6 s", "track hand.c3d --calibrate --out {out}.npz"),
-    ("render_200", "render of 200 pictures, one process", f"{RENDER} 200 --workers 1"),
     ("render_600", "render of 600 pictures", f"{RENDER} 600"),
     ("render_depth", "render of 200 pictures, depth alone", f"{RENDER} 200 --passes depth"),
     ("generate_60000", "generate of 60,000 frames", "generate --num-frames 60000 --out {out}"),
@@ -115,11 +107,11 @@ def unit() -> float:
                             for _ in range(15)]))  # fmt: skip
 
 
-def each_time(job: Callable[[np.ndarray], object], inputs: Sequence[np.ndarray]) -> list[float]:
-    """Time of a job on each input [s], after a tenth of them to warm up."""
-    for one in inputs[: len(inputs) // 10 + 1]:
-        job(one)
-    return [timed(functools.partial(job, one)) for one in inputs]
+def each_hand(some: Labeler, hands: list[np.ndarray]) -> list[float]:
+    """Time of each hand's labels [s], after a tenth of them to warm up."""
+    for hand in hands[: len(hands) // 10 + 1]:
+        some.label_frames([hand])
+    return [timed(functools.partial(some.label_frames, [hand])) for hand in hands]
 
 
 @cache
@@ -139,26 +131,12 @@ def tracker(speeds: Speeds) -> None:
         key = kind.replace("-", "_")
         true = [follow(take, true_users(take)) for take in some]
         speeds.times(f"{key}_true", f"a frame of {kind}, two true hands", np.concatenate(true))
-        calibrated = [
-            follow(take, calibrated_users(take, seed, speeds.some(40, 12)))
-            for seed, take in zip(speeds.seeds, some, strict=True)
-        ]
-        what = f"a frame of {kind}, two calibrated hands"
-        speeds.times(f"{key}_calibrated", what, np.concatenate(calibrated))
     fresh = [follow(take, true_users(take), fresh=True) for take in takes["hand-hand"]]
     speeds.times("fresh_ids", "a frame of hand-hand, every ID new in every frame", np.concatenate(fresh))
     every = [take for some in takes.values() for take in some]
     count = speeds.some(25, 5)
     starts = [first_frame(take, at) for take in every for at in spread(take.num_frames, count)]
     speeds.times("initialization", "a frame in which both hands are initialized", starts)
-    after = [
-        longest_after_darkness(take, at)
-        for take in every
-        if take.num_frames >= BEFORE + DARK + AFTER
-        for at in spread(take.num_frames - BEFORE - DARK - AFTER + 1, speeds.some(10, 2))
-    ]
-    if after:
-        speeds.times("recovery", f"the longest of {AFTER} frames after a second of darkness", after)
 
 
 def spread(end: int, count: int) -> list[int]:
@@ -182,17 +160,6 @@ def first_frame(take: Take, at: int) -> float:
     return timed(lambda: tracking.step(seen.points, seen.ids, 0.0))
 
 
-def longest_after_darkness(take: Take, at: int) -> float:
-    """The longest time of a frame [s] after a second without points."""
-    part = hide_points(take.cut(at, at + BEFORE + DARK + AFTER), BEFORE, DARK)
-    tracking, times = Tracker(true_users(take), labeler()), []
-    for number in range(part.num_frames):
-        seen = seen_frame(part, number)
-        times.append(timed(functools.partial(tracking.step, seen.points, seen.ids, number / take.rate)))
-    return max(times[-AFTER:])
-
-
-@cache
 def clouds(glove: str, count: int, seeds: tuple[int, ...]) -> list[np.ndarray]:
     """Held-out hands [m] with the paper's drops and ghosts."""
     found: list[np.ndarray] = []
@@ -203,35 +170,16 @@ def clouds(glove: str, count: int, seeds: tuple[int, ...]) -> list[np.ndarray]:
     return found
 
 
-def label(speeds: Speeds, key: str, what: str, some: Labeler, hands: list[np.ndarray]) -> None:
-    """How long a labeler takes for a hand, alone and in batches."""
-    speeds.times(key, f"one hand, {what}", each_time(lambda hand: some.label_frames([hand]), hands))
-    batches = [hands[first : first + 500] for first in range(0, len(hands), 500)]
-    per_hand = [timed(functools.partial(some.label_frames, batch)) / len(batch) for batch in batches]
-    speeds.times(f"{key}_batch", f"one hand of many, {what}", per_hand)
-
-
 def labels(speeds: Speeds) -> None:
     hands = clouds("dense19", speeds.some(1000, 50), tuple(speeds.seeds))
-    label(speeds, "set", "set labeler", load_labeler("dense19"), hands)
-    network, card = load_network("dense19")
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "labeler.onnx"
-        export_onnx(network, tuple(card["marker_names"]), path)
-        label(speeds, "set_onnx", "set labeler, onnxruntime", OnnxLabeler(path), hands)
-        before = os.environ.get("XDG_CACHE_HOME")
-        os.environ["XDG_CACHE_HOME"] = folder  # where nothing was learned before
-        try:
-            start = time.perf_counter()
-            learned = load_labeler(NEW_GLOVE, "any-layout")
-            took = time.perf_counter() - start
-            speeds.times("new_glove_learned", "learning a glove without weights", [took])
-        finally:
-            os.environ.pop("XDG_CACHE_HOME")
-            if before is not None:
-                os.environ["XDG_CACHE_HOME"] = before
+    speeds.times("set", "one hand, set labeler", each_hand(labeler(), hands))
+    with tempfile.TemporaryDirectory() as empty, mock.patch.dict(os.environ, XDG_CACHE_HOME=empty):
+        start = time.perf_counter()
+        learned = load_labeler(NEW_GLOVE, "any-layout")
+        took = time.perf_counter() - start
+    speeds.times("new_glove_learned", "learning a glove without weights", [took])
     hands = clouds(str(NEW_GLOVE), speeds.some(300, 20), tuple(speeds.seeds))
-    label(speeds, "new_glove", "a glove without weights", learned, hands)
+    speeds.times("new_glove", "one hand, a glove without weights", each_hand(learned, hands))
 
 
 def commands(speeds: Speeds) -> None:
