@@ -27,6 +27,8 @@ from track.association.label_consistency import (
 )
 
 RATE = 120.0
+TIP, OTHER_TIP = 6, 9  # of the index and the middle finger
+KNUCKLE = 4  # of the index finger
 
 
 def frame_of(points: np.ndarray, labels: np.ndarray) -> FrameState:
@@ -214,10 +216,6 @@ def test_with_a_sure_prediction_most_labels_being_wrong_is_told_by_one_fit(motio
     one_off = planted(motion.markers[20], 6, 0.1, 0)
     sure = fit_labels(frame_of(one_off, np.arange(19)), 0, state, prediction, is_sure=True)
     assert sure[0].labels[6] == -1 and sure[1].rms < 0.001
-
-
-TIP, OTHER_TIP = 6, 9  # of the index and the middle finger
-KNUCKLE = 4  # of the index finger
 
 
 @pytest.fixture

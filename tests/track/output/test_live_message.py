@@ -41,6 +41,14 @@ from track.output.osc import osc_format
 from track.output.sinks import open_sink
 
 DECODE = {"json": json.loads, "msgpack": msgpack.unpackb}
+# In words: what a receiver of each program takes for forward, left and up, and its unit [m].
+BY_WORDS = {
+    "ros": ((1, 0, 0), (0, 1, 0), (0, 0, 1), 1.0),
+    "openxr": ((0, 0, -1), (-1, 0, 0), (0, 1, 0), 1.0),
+    "opengl": ((0, 0, -1), (-1, 0, 0), (0, 1, 0), 1.0),
+    "unity": ((0, 0, 1), (-1, 0, 0), (0, 1, 0), 1.0),
+    "unreal": ((1, 0, 0), (0, -1, 0), (0, 0, 1), 0.01),
+}
 
 
 @pytest.mark.parametrize("name", FORMATS)
@@ -366,16 +374,6 @@ def test_poses_are_those_of_each_program(program, up, message):
     header = header_document(one.header, Content(joints=True, axes=program, up=up))
     assert header["axes"] == program and header["units"]["length"] == unit
     assert 0.003 < header["radii"][0][9] / (100.0 if unit == "cm" else 1.0) < 0.02
-
-
-# In words: what a receiver of each program takes for forward, left and up, and its unit [m].
-BY_WORDS = {
-    "ros": ((1, 0, 0), (0, 1, 0), (0, 0, 1), 1.0),
-    "openxr": ((0, 0, -1), (-1, 0, 0), (0, 1, 0), 1.0),
-    "opengl": ((0, 0, -1), (-1, 0, 0), (0, 1, 0), 1.0),
-    "unity": ((0, 0, 1), (-1, 0, 0), (0, 1, 0), 1.0),
-    "unreal": ((1, 0, 0), (0, -1, 0), (0, 0, 1), 0.01),
-}
 
 
 @pytest.mark.parametrize("up", ["z", "y"])

@@ -57,11 +57,20 @@ class Failing(Counter):
     def send(self, message):
         raise ValueError("not today")
 """
-
-
 NO_ADDRESSES = ("", "osc", "http://localhost:80", "wss://localhost:1", "lsl:", "lsl://name",
                 "localhost:9000", "a b:c", "ws:8765", "9module:name",
                 "tcp://localhost:9000", "tcp://:0?axes=unity")  # fmt: skip
+ENCODER = osc_format()
+FEW_FILES = """
+import resource, socket, sys, time
+from track.output.sinks import open_sink
+resource.setrlimit(resource.RLIMIT_NOFILE, (40, 40))
+sink = open_sink(sys.argv[1])
+print(sink.port, flush=True)
+sys.stdin.readline()
+time.sleep(0.5)
+sink.close()
+"""
 
 
 @pytest.mark.parametrize(
@@ -195,9 +204,6 @@ def test_nothing_is_sent_before_the_tracker_is_there():
         sinks.send(*frame(0))
         assert sinks and not sinks.notes()
     assert not keeper.got and not SinkGroup({})
-
-
-ENCODER = osc_format()
 
 
 @pytest.fixture
@@ -645,18 +651,6 @@ def test_connections_that_stay_are_counted_and_bounded(call, message, capfd, cap
 
         wait_for(is_let_in)
     assert capfd.readouterr() == ("", "") and "Traceback" not in caplog.text
-
-
-FEW_FILES = """
-import resource, socket, sys, time
-from track.output.sinks import open_sink
-resource.setrlimit(resource.RLIMIT_NOFILE, (40, 40))
-sink = open_sink(sys.argv[1])
-print(sink.port, flush=True)
-sys.stdin.readline()
-time.sleep(0.5)
-sink.close()
-"""
 
 
 @pytest.mark.parametrize("pause", [0.0, 0.005])

@@ -61,6 +61,16 @@ CARDS = {
     "a list for a kind": SHIPPED | {"labeler": []},
     "nested without end": "[" * 200_000,
 }
+NO_TORCH = """
+import sys
+
+class NoTorch:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] == "torch":
+            raise ModuleNotFoundError("torch is not installed")
+
+sys.meta_path.insert(0, NoTorch())
+"""
 
 
 def write(folder, card, tensors=None):
@@ -149,16 +159,6 @@ def test_names_beyond_ascii_and_cards_that_say_little(tmp_path):
 
 
 EXAMPLE = Path(__file__).parents[3] / "examples" / "17_label_with_onnxruntime.py"
-NO_TORCH = """
-import sys
-
-class NoTorch:
-    def find_spec(self, name, path=None, target=None):
-        if name.split(".")[0] == "torch":
-            raise ModuleNotFoundError("torch is not installed")
-
-sys.meta_path.insert(0, NoTorch())
-"""
 
 
 @pytest.fixture(scope="module")
