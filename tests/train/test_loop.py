@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
-import resource
 import shutil
 import signal
 
@@ -18,6 +17,7 @@ from gloves import load_layout
 from handsim.cli.main import main
 from handsim.errors import WeightsError
 from handsim.files.signals import Stopped
+from tests.limits import file_size_limit
 from tests.sentences import assert_names
 from train import (
     CNNConfig,
@@ -226,12 +226,8 @@ def test_a_full_disk_is_one_sentence_and_the_checkpoint_stays(dataset, tmp_path,
     assert main([*options, "--samples", "320"]) == 0
     kept = (tmp_path / "run" / CHECKPOINT).read_bytes()
     capsys.readouterr()
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, hard))
-    try:
+    with file_size_limit(10_000):
         assert main([*options, "--samples", "640"]) == 1
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     said = capsys.readouterr().err
     assert said.count("\n") == 1 and "file too large" in said
     assert (tmp_path / "run" / CHECKPOINT).read_bytes() == kept

@@ -2,8 +2,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import resource
-import signal
 import tarfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,6 +18,7 @@ from handsim.files.outputs import save_json
 from render import Pictures, RenderedFrame, merge_renderings
 from render.formats.shards import BESIDE
 from render.formats.writer import CONFIG, FORMATS, open_writer
+from tests.limits import file_size_limit
 from tests.programs import ROOT, run_python
 from tests.render.formats.reading import depth_of, exr_content
 
@@ -99,15 +98,8 @@ def test_a_full_disk_is_told_and_finished_shards_stay(name, make_frame, tmp_path
     writer = open_writer(name, tmp_path)
     writer.write(0, [make_frame(0)])
     before = files(tmp_path)
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    try:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (300, hard))
-        with pytest.raises(HandSimError, match="writing shard 1 failed"):
-            writer.write(1, [make_frame(1)])
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-        signal.signal(signal.SIGXFSZ, handler)
+    with file_size_limit(300), pytest.raises(HandSimError, match="writing shard 1 failed"):
+        writer.write(1, [make_frame(1)])
     assert files(tmp_path) == before
     assert writer.done() == {0}
 
