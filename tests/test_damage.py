@@ -19,6 +19,7 @@ from handsim.errors import DatasetError, HandSimError, WeightsError
 from handsim.files.signals import Stopped
 from handsim.space.camera import pinhole
 from render import RenderConfig, merge_renderings, render_take
+from tests.folders import contents
 from train import (
     GenerateSettings,
     SetLabelerConfig,
@@ -44,11 +45,6 @@ PICTURES = RenderConfig(
     passes=("rgb", "depth"), every=12, frames_per_shard=1, depth_sensor=None, color_sensor=None,
     background={"plain": 1.0}, painter="compiled",
 )  # fmt: skip
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    files = (path for path in folder.rglob("*") if path.is_file())
-    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
 
 
 def flip(path: Path, place: float, mask: int) -> None:

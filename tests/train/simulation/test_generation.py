@@ -26,8 +26,8 @@ from handsim.space.rig import ROOM_CENTER, CameraRig
 from handsim.space.transforms import rigid
 from poses import sample_poses
 from poses.shapes import HIGH, LOW
+from tests.folders import contents
 from tests.rigs import mixed_rig
-from tests.sentences import assert_names
 from tests.waiting import wait_for
 from track.viewer.recordings import DatasetRecording
 from train import Dataset, GenerateSettings, SceneMix, generate_dataset, simulate_take
@@ -74,15 +74,6 @@ MANIFESTS = {
     "config": (None, "config is not a table"),
     "redrawn": ([1], "redrawn is not a table of counts"),
 }
-OPTION_ERRORS = {
-    "--workers -3": "workers is -3, expected at least 1",
-    "--volume nan": "volume is nan, expected a number from 0 to 10",
-    "--min-cameras 17": "min_cameras is 17, but rig 'figure5' has 16",
-    "--slip-around nan": "slip_around is nan, expected a number from 0 to 90",
-    "--population.children 5": "children is 5, expected a number from 0 to 1",
-    "--blob-loss 0 1.5": "blob_loss is 1.5, expected a number from 0 to 1",
-    "--seed -1": "seed is -1, expected 0 or more",
-}
 DIGITS = ("thumb", "index", "middle", "ring", "little")
 LAYOUT = MarkerLayout(
     "mine",
@@ -107,10 +98,6 @@ def finished(tmp_path_factory):
         patch.setattr(generation, "ROWS_PER_SHARD", 200)
         make_dataset(CONFIG, out, workers=1)
     return out
-
-
-def contents(folder: Path) -> dict[str, str]:
-    return {path.name: checksum(path) for path in folder.iterdir()}
 
 
 def test_rows_are_what_they_say(finished):
@@ -521,13 +508,6 @@ def test_a_shard_of_other_records_is_told(finished, tmp_path, kind):
         DatasetError, match=r"holds other records|is damaged: it is no .npy file|shards hold 507"
     ):
         Dataset(copy)
-
-
-@pytest.mark.parametrize("options", OPTION_ERRORS)
-def test_options_without_sense_are_told(tmp_path, capsys, options):
-    assert main(["generate", "--out", str(tmp_path / "set"), *options.split()]) == 1
-    assert_names(capsys.readouterr().err.strip(), f"handsim generate: {OPTION_ERRORS[options]}")
-    assert not (tmp_path / "set").exists()
 
 
 def fists(model, num_poses, *, rng):
