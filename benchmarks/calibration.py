@@ -1,7 +1,6 @@
 """How near a calibration comes to the truth, on simulated users.
 
-    python -m benchmarks.calibration [--users 6 --seed 0 --layout dense19 --free 40 --rounds 3]
-        [--captures FOLDER]
+    python -m benchmarks.calibration [--users 6] [--captures FOLDER]
 
 Each user is one hand, right and left in turn: a size's mean hand made 8 % larger or smaller, with the
 individual spreads of `handsim.hand.shape.sample_shape`, in a glove whose markers sit 5 mm from where they
@@ -76,12 +75,10 @@ def tell(name: str, hand: GloveFit, true: GloveFit) -> list[float]:
             tips.mean()]  # fmt: skip
 
 
-def run_user(
-    rng: np.random.Generator, number: int, layout: MarkerLayout, made: CalibrationTakeConfig
-) -> dict[str, list[float]]:
+def run_user(rng: np.random.Generator, number: int, layout: MarkerLayout) -> dict[str, list[float]]:
     """Simulate a user, calibrate in every way, print; what is averaged over users, by the way."""
     true, start = draw_user(number, layout, rng)
-    take = simulate_calibration((true,), made, rng=rng)
+    take = simulate_calibration((true,), CalibrationTakeConfig(), rng=rng)
     markers = take.observed(true.side)
     ways = {
         "after": markers,
@@ -114,18 +111,10 @@ def tell_people(captures: Path, layout: MarkerLayout) -> list[list[float]]:
     return medians
 
 
-def main(
-    users: int = 6,
-    seed: int = 0,
-    layout: str = "dense19",
-    free: float = 40.0,
-    rounds: int = 3,
-    captures: Path | None = None,
-    save: str | None = None,
-) -> None:
+def main(users: int = 6, captures: Path | None = None, save: str | None = None) -> None:
     print(describe("scipy", "numba"))
-    glove, made = load_layout(layout), CalibrationTakeConfig(free=free, rounds=rounds)
-    told = [run_user(np.random.default_rng((seed, number)), number, glove, made) for number in range(users)]
+    glove = load_layout("dense19")
+    told = [run_user(np.random.default_rng((0, number)), number, glove) for number in range(users)]
     figures: Figures = {}
     within = [user["after within"][0] for user in told]
     figures["within"] = "marker positions within two standard errors, by user [%]", [min(within), max(within)]

@@ -29,13 +29,8 @@ DATA: Final = Path(handsim.__file__).parent / "data" / "hand_cage.json"
 _WRIST, _CARPUS, _THENAR, _METACARPUS, _KNUCKLES, _PAST_KNUCKLES, _WEB = range(1, 8)  # rows of the palm
 # The thumb has all of these rings, and a finger all but the first. The last two form the tip.
 _RING_NAMES: Final = ("metacarpal", "before 1", "at 1", "after 1", "before 2", "after 2", "pad", "tip")
-
-
-def _palmar(column: int) -> int:
-    """Index of a palm column in a palm row; that of a back column is its number."""
-    return AROUND - 1 - column
-
-
+# Indices of the palm columns in a palm row; those of the back columns are their numbers.
+_PALMAR: Final = range(AROUND)[::-1]
 # Height of the back above, and depth of the palm under, the metacarpals, in palm thicknesses, by column.
 _HEIGHTS: Final = np.array(
     [
@@ -78,9 +73,7 @@ _WEB_DISTANCES: Final = np.array(
 # Targets of the palm's vertices around the thumb's metacarpal: position along it in its lengths, sideways and
 # upwards in its radii, and the share of the way that each vertex moves to its target.
 _THUMB_BASE_ROWS: Final = np.repeat([_CARPUS, _THENAR, _METACARPUS], [4, 5, 3])
-_THUMB_BASE_COLUMNS: Final = np.array(
-    [0, *map(_palmar, range(3)), 0, *map(_palmar, range(4)), *map(_palmar, range(3))]
-)
+_THUMB_BASE_COLUMNS: Final = np.array([0, *_PALMAR[:3], 0, *_PALMAR[:4], *_PALMAR[:3]])
 _THUMB_BASE: Final = np.array(
     [
         [-0.1, -0.9, 0.9, 0.5],
@@ -121,17 +114,17 @@ _BONE_OF_RINGS: Final = ((1, 0.0), (1, 0.5), (1, 1.0), (2, 0.0), (2, 1.0), (2, 1
 # Share of the thumb's metacarpal on the palm's rows around it: (row, index, share).
 _THENAR_SHARES: Final = (
     (_CARPUS, 0, 0.25),
-    (_CARPUS, _palmar(0), 0.35),
-    (_CARPUS, _palmar(1), 0.15),
+    (_CARPUS, _PALMAR[0], 0.35),
+    (_CARPUS, _PALMAR[1], 0.15),
     (_THENAR, 0, 0.5),
     (_THENAR, 1, 0.05),
-    (_THENAR, _palmar(0), 0.8),
-    (_THENAR, _palmar(1), 0.6),
-    (_THENAR, _palmar(2), 0.3),
-    (_THENAR, _palmar(3), 0.05),
+    (_THENAR, _PALMAR[0], 0.8),
+    (_THENAR, _PALMAR[1], 0.6),
+    (_THENAR, _PALMAR[2], 0.3),
+    (_THENAR, _PALMAR[3], 0.05),
     (_METACARPUS, 0, 0.15),
-    (_METACARPUS, _palmar(0), 0.4),
-    (_METACARPUS, _palmar(1), 0.25),
+    (_METACARPUS, _PALMAR[0], 0.4),
+    (_METACARPUS, _PALMAR[1], 0.25),
 )
 # Share of the fingers' first bones on the palm's rows, on a finger's column and on a web's.
 _KNUCKLE_SHARES: Final = {_KNUCKLES: (0.35, 0.25), _PAST_KNUCKLES: (0.9, 0.7), _WEB: (1.0, 0.9)}
@@ -150,7 +143,7 @@ def cage() -> dict[str, Any]:
         "knuckle_loop": loops[-2],
         "wrist_loop": loops[-1],
         "tips": tip_vertices,
-        "back_and_palm": PALM_VERTICES[_METACARPUS, [3, _palmar(3)]],
+        "back_and_palm": PALM_VERTICES[_METACARPUS, [3, _PALMAR[3]]],
         "finger_slots": np.array(_finger_slots()),
         "row_positions": _ROW_POSITIONS,
         "heights": _HEIGHTS + _ARCH[:, None],
@@ -171,13 +164,13 @@ def cage() -> dict[str, Any]:
 def _finger_slots() -> list[list[int]]:
     """Indices in a palm row of the six vertices around each finger, in a ring's order."""
     columns = [range(2 * finger, 2 * finger + 3) for finger in range(4)]
-    return [[*one, *map(_palmar, reversed(one))] for one in columns]
+    return [[*one, *(_PALMAR[column] for column in reversed(one))] for one in columns]
 
 
 def _faces() -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """The cage's faces (Q, 4), counter-clockwise from outside, and the two (5, 2) that close each digit."""
     palm = PALM_VERTICES
-    front, three = _palmar(0), (_CARPUS, _THENAR, _METACARPUS)
+    front, three = _PALMAR[0], (_CARPUS, _THENAR, _METACARPUS)
     hole = {(row, front) for row in three[:2]}
     quads = [
         [palm[row, index], palm[row, next_index], palm[row + 1, next_index], palm[row + 1, index]]
@@ -187,7 +180,7 @@ def _faces() -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         if (row, index) not in hole
     ]
     quads += [
-        [palm[0, c], palm[0, _palmar(c)], palm[0, _palmar(c + 1)], palm[0, c + 1]]
+        [palm[0, c], palm[0, _PALMAR[c]], palm[0, _PALMAR[c + 1]], palm[0, c + 1]]
         for c in range(AROUND // 2 - 1)
     ]
     a, b, c = (palm[row] for row in three)
@@ -244,7 +237,7 @@ def _weights() -> NDArray[np.float64]:
             beside = (column // 2,) if column % 2 else (column // 2 - 1, column // 2)
             fingers = [finger for finger in beside if 0 <= finger < 4]
             share = on_finger if column % 2 or len(fingers) == 1 else on_web
-            for index in (column, _palmar(column)):
+            for index in (column, _PALMAR[column]):
                 weights[PALM_VERTICES[row, index], [4 + 3 * f for f in fingers]] = share / len(fingers)
     for row, index, share in _THENAR_SHARES:
         weights[PALM_VERTICES[row, index], 1] = share

@@ -1,30 +1,27 @@
 """Gloves learned from simulated labeled captures: bones and places of markers against those that are worn.
 
-python -m benchmarks.learned_gloves --gloves 40 --seed 9100 --out FILE.json [--first N]
+python -m benchmarks.learned_gloves [--gloves 40] [--seed 9100]
 
 Each glove has 6 to 30 markers at random places. Two people wear it for 20 s each. Columns have numbers for
-names. A marker counts if it is farther than 5 mm from the bounds of its bone. FILE.json has one JSON line a
-glove; gloves that it has are not made again.
+names. A marker counts if it is farther than 5 mm from the bounds of its bone.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import warnings
-from functools import partial
-from pathlib import Path
 from time import process_time
 from typing import Any
 
 import numpy as np
 import torch
 
-from benchmarks.record import describe, kept_rows, run
+from benchmarks.record import describe, run
 from gloves import Capture, MarkerLayout
 from gloves.fit import attach, settle_glove
 from handsim import HandModel
 from handsim.errors import HandSimError
-from handsim.hand.shape import BONE_NAMES, DIGIT_OF_BONE, PALM, SIDES
+from handsim.hand.shape import BONE_NAMES, PALM, SIDES
 from track import learn_glove
 from track.gloves.glove_improvement import sample_places
 from train import simulate_take
@@ -69,33 +66,30 @@ def compared(layout: MarkerLayout, found: MarkerLayout) -> dict[str, Any]:
         inner = along * length > CLEAR and ((1.0 - along) * length > CLEAR or bone % 3 == 0)
         clear.append(bool(inner or bone == PALM))
     right = [one == other for one, other in zip(bones, learned, strict=True)]
-    digits = [DIGIT_OF_BONE[one] == DIGIT_OF_BONE[other] for one, other in zip(bones, learned, strict=True)]
-    return {"off": off.tolist(), "right": right, "digits": list(map(bool, digits)), "clear": clear}
+    return {"off": off, "right": right, "clear": clear}
 
 
 def outcome(number: int, seed: int) -> dict[str, Any]:
     """What was learned of one glove: see `compared`; or why it was refused."""
     layout, kind, side = random_glove(number, seed), KINDS[number % 2], SIDES[number // 2 % 2]
     captures = [labeled_capture(layout, kind, side, seed + 2 * number + person) for person in (0, 1)]
-    began, row = process_time(), {"number": number, "markers": layout.num_markers, "kind": kind}
+    began, row = process_time(), dict[str, Any]()
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             learned = learn_glove(captures, radius_mm=1e3 * RADIUS)
-        row |= {"side": learned.layout.sides == (side,), "told": learned.doubt}
-        row |= compared(layout, learned.layout)
+        row = {"side": learned.layout.sides == (side,)} | compared(layout, learned.layout)
         share = 100 * np.mean(np.array(row["right"])[np.array(row["clear"])])
         print(f"glove {number}: bones {share:.0f} %, off {np.median(row['off']):.1f} mm", flush=True)
     except HandSimError as error:
-        row |= {"refused": str(error)}
         print(f"glove {number}: {error}", flush=True)
     return row | {"seconds": process_time() - began}
 
 
-def main(out: Path = Path("learned.json"), gloves: int = 40, seed: int = 9100, first: int = 0) -> None:
+def main(gloves: int = 40, seed: int = 9100) -> None:
     torch.set_num_threads(1)
     print(describe("torch", "numba"))
-    summary(kept_rows(out, range(first, first + gloves), partial(outcome, seed=seed)))
+    summary([outcome(number, seed) for number in range(gloves)])
 
 
 def summary(rows: list[dict[str, Any]]) -> None:

@@ -5,7 +5,7 @@ readers, which are processes of their own. They read as fast as they can, at hal
 second. In the middle the server is restarted. The latency that is added to the tracker's own time is from
 when the server takes up a frame to when the reader has it.
 
-python -m benchmarks.live_output [--seconds 600] [--pauses 0 0.0167 0.2] [--readers ws:// lsl:]
+python -m benchmarks.live_output [--seconds 600]
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ import json
 import multiprocessing
 import socket
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from multiprocessing.sharedctypes import Synchronized
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from pythonosc.osc_bundle import OscBundle
@@ -33,9 +33,26 @@ from track.streams import LOOPBACK
 from train import load_labeler, simulate_take
 
 RATE = 120.0
-READERS = ("ws://?every=1", "ws://", "/newest", "osc://", "udp://", "lsl:")
+PAUSES: Final = (0.0, 2.0 / RATE, 0.2)  # [s]
 SPAWN = multiprocessing.get_context("spawn")
 Times = Any  # a shared array of monotonic times [s] by frame
+
+
+def osc_document(datagram: bytes) -> dict[str, Any]:
+    """The frame of a bundle of OSC."""
+    contents = {message.address: list(message.params) for message in OscBundle(datagram)}
+    number, _, silent = contents.get("/handsim/frame", (0, 0.0, 1))
+    return {"type": "frame", "number": number, "silent": silent}
+
+
+READERS: Final[dict[str, str | Callable[[bytes], dict[str, Any]]]] = {
+    "ws://?every=1": "?every=1",
+    "ws://": "",
+    "/newest": "newest",
+    "osc://": osc_document,
+    "udp://": json.loads,
+}
+"""The end of a WebSocket's address, or what decodes a datagram."""
 
 
 class StampedServer(ReplayServer):
@@ -65,56 +82,29 @@ def serve(
     over.value = 1
 
 
-def listen_websocket(port: int, times: Times, ready: Synchronized[int], half: int, pause: float) -> None:
-    """Note when which frame arrives at a client that asks for every one."""
-    _listen(f"ws://{LOOPBACK}:{port}/?every=1", times, ready, half, pause)
+def listen(reader: str, port: int, times: Times, ready: Synchronized[int], half: int, pause: float) -> None:
+    """Note when which frame arrives at a reader; numbers begin anew at the restart."""
+    first, last = 0, -1
+    with suppress(ConnectionClosed):
+        for now, document in _documents(reader, port, ready, pause):
+            if document["type"] == "frame" and not document["silent"]:
+                first = half if document["number"] < last else first
+                last = document["number"]
+                times[first + last] = now
 
 
-def listen_plain(port: int, times: Times, ready: Synchronized[int], half: int, pause: float) -> None:
-    """The same of a client that asks for nothing."""
-    _listen(f"ws://{LOOPBACK}:{port}", times, ready, half, pause)
-
-
-def listen_newest(port: int, times: Times, ready: Synchronized[int], half: int, pause: float) -> None:
-    """The same of a client that asks for one frame after the other."""
-    _listen(f"ws://{LOOPBACK}:{port}/newest", times, ready, half, pause, asks=True)
-
-
-def listen_osc(port: int, times: Times, ready: Synchronized[int], half: int, pause: float) -> None:
-    """The same of the newest waiting datagram of OSC."""
-    _note(_datagrams(port, ready, pause, _osc_document), times, half)
-
-
-def listen_udp(port: int, times: Times, ready: Synchronized[int], half: int, pause: float) -> None:
-    """The same of the newest waiting datagram of JSON."""
-    _note(_datagrams(port, ready, pause, json.loads), times, half)
-
-
-def listen_lsl(name: str, times: Times, ready: Synchronized[int], half: int, pause: float) -> None:
-    """The same of the newest waiting sample of LSL, whose stream opens with the first frame."""
-    import pylsl
-
-    def samples() -> Iterator[tuple[float, dict[str, Any]]]:
-        inlet = pylsl.StreamInlet(pylsl.resolve_byprop("name", name, timeout=60.0)[0])
-        while True:
-            waiting = [inlet.pull_sample()[0]]
-            waiting += inlet.pull_chunk()[0]
-            for sample in waiting[-1:] if pause else waiting:
-                yield time.monotonic(), {"type": "frame", "number": int(sample[0]), "silent": False}
-            time.sleep(pause)
-
-    with ready.get_lock():
-        ready.value += 1
-    _note(samples(), times, half)
-
-
-def _listen(
-    url: str, times: Times, ready: Synchronized[int], half: int, pause: float, *, asks: bool = False
-) -> None:
-    with connect(url) as server, suppress(ConnectionClosed):
+def _documents(
+    reader: str, port: int, ready: Synchronized[int], pause: float
+) -> Iterator[tuple[float, dict[str, Any]]]:
+    """What a reader gets, with the time; it pauses after each [s]."""
+    way = READERS[reader]
+    if callable(way):
+        yield from _datagrams(port, ready, pause, way)
+        return
+    with connect(f"ws://{LOOPBACK}:{port}/{way}") as server:
         with ready.get_lock():
             ready.value += 1
-        _note(messages(server, pause, asks=asks), times, half)
+        yield from messages(server, pause, asks=reader == "/newest")
 
 
 def messages(server: Any, pause: float, *, asks: bool) -> Iterator[tuple[float, dict[str, Any]]]:
@@ -131,6 +121,7 @@ def messages(server: Any, pause: float, *, asks: bool) -> Iterator[tuple[float, 
 def _datagrams(
     port: int, ready: Synchronized[int], pause: float, decode: Callable[[bytes], dict[str, Any]]
 ) -> Iterator[tuple[float, dict[str, Any]]]:
+    """Each datagram, or after a pause the newest one that waits."""
     one = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     one.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
     one.bind((LOOPBACK, port))
@@ -146,72 +137,37 @@ def _datagrams(
         time.sleep(pause)
 
 
-def _osc_document(datagram: bytes) -> dict[str, Any]:
-    contents = {message.address: list(message.params) for message in OscBundle(datagram)}
-    number, _, silent = contents.get("/handsim/frame", (0, 0.0, 1))
-    return {"type": "frame", "number": number, "silent": silent}
-
-
-def _note(documents: Iterable[tuple[float, dict[str, Any]]], times: Times, half: int) -> None:
-    """Numbers begin anew at the restart."""
-    first, last = 0, -1
-    for now, document in documents:
-        if document["type"] == "frame" and not document["silent"]:
-            first = half if document["number"] < last else first
-            last = document["number"]
-            times[first + last] = now
-
-
-def main(
-    seconds: float = 600.0,
-    pauses: tuple[float, ...] = (0.0, 2.0 / RATE, 0.2),
-    readers: tuple[str, ...] = READERS,
-) -> None:
-    print(describe("numba", "torch", "websockets", "python-osc", "pylsl"))
+def main(seconds: float = 600.0) -> None:
+    print(describe("numba", "torch", "websockets", "python-osc"))
     take = simulate_take(kind="hand-hand", num_frames=1200)
-    for pause in pauses:
+    for pause in PAUSES:
         print(f"readers that pause for {1e3 * pause:.0f} ms after each frame")
-        measure(take, round(seconds * RATE), pause, readers)
+        measure(take, round(seconds * RATE), pause)
 
 
-def measure(take: Take, frames: int, pause: float, names: tuple[str, ...]) -> None:
+def measure(take: Take, frames: int, pause: float) -> None:
     """Run a session with readers that pause after each frame [s], and print what they got."""
     half = frames // 2
     ready, over = SPAWN.Value("i", 0), SPAWN.Value("i", 0)
     command, web, bundles, datagrams = free_ports(
         socket.SOCK_DGRAM, socket.SOCK_STREAM, socket.SOCK_DGRAM, socket.SOCK_DGRAM
     )
-    stream = f"handsim-{web}"
-    every = (
-        (listen_websocket, web),
-        (listen_plain, web),
-        (listen_newest, web),
-        (listen_osc, bundles),
-        (listen_udp, datagrams),
-        (listen_lsl, stream),
-    )
-    readers: dict[str, tuple[Any, int | str]] = {
-        name: reader for name, reader in zip(READERS, every, strict=True) if name in names
-    }
+    ports = {"osc": bundles, "udp": datagrams}
     sent = SPAWN.Array("d", frames, lock=False)
-    arrived = {name: SPAWN.Array("d", frames, lock=False) for name in readers}
+    arrived = {name: SPAWN.Array("d", frames, lock=False) for name in READERS}
     tracker = Tracker(true_users(take), load_labeler("dense19"))
     tracker.warm_up()
     ranges = [(0, half), (half, frames - half)]
-    addresses = [
-        f"{one}://{LOOPBACK}:{port}"
-        for one, port in zip(("ws", "osc", "udp"), (web, bundles, datagrams), strict=True)
-    ]
-    addresses += [f"lsl:{stream}"] * ("lsl:" in names)
+    addresses = [f"{one}://{LOOPBACK}:{port}" for one, port in {"ws": web, **ports}.items()]
     with open_sinks(addresses) as sinks:
         sinks.start(tracker.hands, tracker.bodies)
         jobs: list[tuple[Any, tuple[Any, ...]]] = [(serve, (take, command, ranges, sent, over))]
-        for name, (target, port) in readers.items():
-            jobs.append((target, (port, arrived[name], ready, half, pause)))
+        for name, times in arrived.items():
+            jobs.append((listen, (name, ports.get(name[:3], web), times, ready, half, pause)))
         processes = [SPAWN.Process(target=target, args=given, daemon=True) for target, given in jobs]
         for process in processes:
             process.start()
-        while ready.value < len(readers):
+        while ready.value < len(READERS):
             time.sleep(0.1)
         own, counts = _track(f"natnet://{LOOPBACK}:{command}", tracker, sinks, half, frames, over)
         print(f"{frames} frames at {RATE:g} Hz; {counts}; dropped {sinks.counts}")

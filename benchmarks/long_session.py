@@ -1,12 +1,12 @@
 """An hour of `handsim track --live`: people come, leave and change, hands hide, and the server dies twice.
 
-python -m benchmarks.long_session FOLDER [--seconds 3600] [--rate 120] [--judge-only]
+python -m benchmarks.long_session FOLDER [--seconds 3600]
 
 Three minutes, one of each of three simulated people, are played again and again by a NatNet server in a
 process of its own, which is killed and started again twice. The command line tracks and records the stream,
-and sends it to a reader, which is a process of its own. Ctrl-C ends it. Then its take, what was sent, and an
-export are compared with each other and with the truth, the last minute of each person with the second one.
-FOLDER keeps all of it; --judge-only compares again what is there. Exit code 1 tells that a bound is missed.
+and sends it to a reader, which is a process of its own. Ctrl-C ends it. Then its take and what was sent are
+compared with each other and with the truth, the last minute of each person with the second one. FOLDER keeps
+all of it. Exit code 1 tells that a bound is missed.
 """
 
 from __future__ import annotations
@@ -48,7 +48,6 @@ SIDES: Final = ("right", "left")
 PIECE: Final = 2340  # frames of a piece
 MINUTE: Final = 7200  # frames of a person
 ROUND: Final = 3 * MINUTE  # frames that are repeated
-SETTLED: Final = 2400  # frames at the end of a minute in which its hands are measured
 PIECES: Final[tuple[tuple[int, Kind, int], ...]] = (
     # Number of the person, kind of capture, and number of empty frames that follow; 120 or more are a pause.
     (0, "hand-hand", 84),
@@ -74,8 +73,6 @@ class Round(NamedTuple):
     points: np.ndarray  # (T, N, 3) [m]
     ids: np.ndarray  # (T, N)
     keypoints: np.ndarray  # (T, 2, 21, 3) of the right and the left hand [m]; NaN where they are away
-    person: np.ndarray  # (T,)
-    lengths: np.ndarray  # (3,) of the hands [m]
 
 
 def make_round() -> Round:
@@ -87,7 +84,7 @@ def make_round() -> Round:
         models = sample_adult_hands(rng=rng)
         people.append(wear_gloves(layout, models, along=0.05, around=np.deg2rad(5.0), rng=rng))
     points, ids = np.full((ROUND, 80, 3), np.nan), np.full((ROUND, 80), -1)
-    keypoints, person = np.full((ROUND, 2, NUM_KEYPOINTS, 3), np.nan), np.zeros(ROUND, dtype=int)
+    keypoints = np.full((ROUND, 2, NUM_KEYPOINTS, 3), np.nan)
     first = 0
     for place, (number, kind, away) in enumerate(PIECES):
         rng = np.random.default_rng((place, 77))
@@ -102,18 +99,17 @@ def make_round() -> Round:
             ids[rows, :width][stop:][own[stop:]] += 10_000  # seen again, they have new IDs
         for hand in range(2):
             keypoints[rows, hand] = hand_keypoints(take.hands[hand].model, take.qpos[:, hand])
-        person[first : first + PIECE + away] = number
         first += PIECE + away
-    return Round(points, ids, keypoints, person, np.array([hands[0].shape.length for hands in people]))
+    return Round(points, ids, keypoints)
 
 
 class CountedServer(ReplayServer):
     """A server that repeats the round from a frame on, until `count` frames are sent."""
 
-    def __init__(self, played: Round, first: int, count: int, rate: float, port: int) -> None:
+    def __init__(self, played: Round, first: int, count: int, port: int) -> None:
         self._count = count
         points, ids = (np.roll(one, -first, axis=0) for one in (played.points, played.ids))
-        super().__init__(SimpleNamespace(points=points, ids=ids, rate=rate), port=port, loop=True)
+        super().__init__(SimpleNamespace(points=points, ids=ids, rate=RATE), port=port, loop=True)
 
     @property
     def finished(self) -> bool:
@@ -121,9 +117,9 @@ class CountedServer(ReplayServer):
         return self.sent >= self._count
 
 
-def serve(folder: Path, first: int, count: int, rate: float, port: int, sent: Synchronized[int]) -> None:
+def serve(folder: Path, first: int, count: int, port: int, sent: Synchronized[int]) -> None:
     """Send frames until this process is killed."""
-    with CountedServer(load_round(folder), first, count, rate, port) as server:
+    with CountedServer(load_round(folder), first, count, port) as server:
         while True:
             sent.value = first + server.sent
             time.sleep(0.02)
@@ -160,7 +156,7 @@ def listen(folder: Path, port: int, most: int) -> None:
             count += 1
 
 
-def hold(folder: Path, frames: int, rate: float) -> None:
+def hold(folder: Path, frames: int) -> None:
     """Run the session."""
     folder.mkdir(parents=True, exist_ok=True)
     load_round(folder)
@@ -178,7 +174,7 @@ def hold(folder: Path, frames: int, rate: float) -> None:
     reader.start()
     ends = [*lives(frames)[1:], frames]
     for first, last in zip(lives(frames), ends, strict=True):
-        given = (folder, first, last - first, rate, command, sent)
+        given = (folder, first, last - first, command, sent)
         server = SPAWN.Process(target=serve, args=given, daemon=True)
         server.start()
         while sent.value < last and tracker.poll() is None:
@@ -195,7 +191,7 @@ def hold(folder: Path, frames: int, rate: float) -> None:
     tracker.send_signal(signal.SIGINT)
     code = tracker.wait()
     reader.join(30.0)
-    told = {"frames": frames, "rate": rate, "exit code": code, "end [s]": time.monotonic() - at}
+    told = {"frames": frames, "exit code": code, "end [s]": time.monotonic() - at}
     (folder / "session.json").write_text(json.dumps(told))
 
 
@@ -228,7 +224,6 @@ def judge(folder: Path) -> bool:
     place = places(take.numbers, told["frames"])
     keypoints = take.keypoints()[:, [take.sides.index(side) for side in SIDES]]
     print(f"{told}; {take.settings['stream']}; {len(take.former)} former hands")
-    tell_sizes(take, played, place)
     checks = [("exit code", float(told["exit code"]), 0.0)]
     checks += kept_once(folder, take, place, keypoints, told["frames"])
     checks += memory_checks(folder)
@@ -241,7 +236,7 @@ def judge(folder: Path) -> bool:
 def kept_once(
     folder: Path, take: Take, place: np.ndarray, keypoints: np.ndarray, frames: int
 ) -> Iterator[Check]:
-    """Count lost and doubled frames, and compare the keypoints of the messages, the take and an export."""
+    """Count lost and doubled frames, and compare the keypoints of the messages and the take."""
     recorded, dropped = np.bincount(place, minlength=frames), take.settings["stream"]["dropped_frames"]
     yield "served frames neither in the take nor told as dropped", (recorded == 0).sum() - dropped, 0.0
     yield "frames told as dropped, as the tracker did not keep up [%]", 100.0 * dropped / frames, 0.0
@@ -256,8 +251,6 @@ def kept_once(
     rows[place] = np.arange(len(place))
     both = rows[at] >= 0
     yield "sent keypoints off those of the take [mm]", farthest(sent[both], keypoints[rows[at[both]]]), AWAY
-    exported = exported_keypoints(folder, len(place))[rows[at[both]]]
-    yield "sent keypoints off those of an export [mm]", farthest(sent[both], exported), AWAY
 
 
 def memory_checks(folder: Path) -> Iterator[Check]:
@@ -283,17 +276,10 @@ def drift(
         some = place // ROUND == first // ROUND
         minutes[:, which, place[some] % ROUND] = values[:, some]
     minutes[:, :, np.isnan(minutes).any(axis=(0, 1))] = np.nan
-    settled = np.arange(ROUND) % MINUTE >= MINUTE - SETTLED
-    print("person | residual, second and last minute [mm] | keypoints off [mm] | the same of the last 20 s")
-    for person in range(3):
-        own = played.person == person
-        means = [np.nanmean(minutes[:, :, some], axis=(2, 3)).ravel() for some in (own, own & settled)]
-        words = "{} | {:.3f}, {:.3f} | {:.2f}, {:.2f} | {:.3f}, {:.3f} | {:.2f}, {:.2f}"
-        print(words.format(person, *np.concatenate(means)))
-    for some, when in ((settled | True, "minute"), (settled, "20 s of the minute")):
-        means = np.nanmean(minutes[:, :, some], axis=(2, 3))
-        for name, (second, last) in zip(("residual", "keypoints' error"), means, strict=True):
-            yield f"{name}, last {when} over the second, less 1", abs(last / second - 1.0), SAME
+    means = np.nanmean(minutes, axis=(2, 3))
+    for name, (second, last) in zip(("residual", "keypoints' error"), means, strict=True):
+        words = f"{name}, from {second:.3f} to {last:.3f} mm in the last minute over the second, less 1"
+        yield words, abs(last / second - 1.0), SAME
 
 
 def farthest(sent: np.ndarray, others: np.ndarray) -> float:
@@ -304,48 +290,9 @@ def farthest(sent: np.ndarray, others: np.ndarray) -> float:
     return float(np.nanmax(distances))
 
 
-def exported_keypoints(folder: Path, frames: int) -> np.ndarray:
-    """Keypoints (T, 2, 21, 3) that `handsim export` writes of the take [m]."""
-    out = folder / "take.csv"
-    if not out.exists():
-        program = [sys.executable, "-m", "handsim", "export", str(folder / "take.npz"), "--out", str(out)]
-        subprocess.run([*program, "--guesses"], check=True)
-    found = np.full((frames, 2, NUM_KEYPOINTS, 3), np.nan, dtype=np.float32)
-    with out.open() as file:
-        titles = next(file).strip().split(",")
-        first = titles.index(next(title for title in titles if title.startswith("thumb_") and "_x" in title))
-        for line in file:
-            words = line.split(",")
-            numbers = [float(word) if word else np.nan for word in (*words[3:6], *words[first : first + 60])]
-            found[int(words[0]), SIDES.index(words[2])] = np.reshape(numbers, (NUM_KEYPOINTS, 3))
-    return found
-
-
-def tell_sizes(take: Take, played: Round, place: np.ndarray) -> None:
-    """Print how far hands of each person are from their true length when the next one comes."""
-    person = played.person[place % ROUND]
-    length = np.empty(len(place))
-    for span, hands in take.worn():
-        length[span] = hands[0].shape.length
-    begins = np.flatnonzero(np.diff(person, prepend=-1))
-    for number, true in enumerate(played.lengths):
-        offs, waits = [], []
-        for first, last in zip(begins, [*begins[1:], len(place)], strict=True):
-            if person[first] == number:
-                offs.append(1e3 * (length[last - 1] - true))
-                is_last = np.abs(length[first:last] - length[last - 1]) < 0.003
-                waits.append(take.times[first + int(is_last.argmax())] - take.times[first])
-        print(
-            f"person {number}, {1e3 * true:.0f} mm: measured off by {np.median(offs):.1f} mm (median), "
-            f"{np.abs(offs).max():.1f} at most; within 3 mm of it after {np.median(waits):.1f} s, "
-            f"{np.max(waits):.1f} at most"
-        )
-
-
-def main(folder: Path, seconds: float = 3600.0, rate: float = RATE, judge_only: bool = False) -> None:
+def main(folder: Path, seconds: float = 3600.0) -> None:
     print(describe("numba", "torch", "websockets"))
-    if not judge_only:
-        hold(folder, round(seconds * RATE) - 1, rate)
+    hold(folder, round(seconds * RATE) - 1)
     if not judge(folder):
         sys.exit(1)
 

@@ -9,7 +9,7 @@ import shlex
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from datetime import date
 from importlib import metadata
 from pathlib import Path
@@ -21,7 +21,9 @@ import tyro
 from rich.markup import escape
 from rich.table import Table
 
-from handsim import __version__
+from handsim import HandSimError, __version__
+from handsim.app.messages import told_warnings
+from handsim.cli.parsing import run_command
 
 FOLDER: Final = Path(__file__).with_name("figures")
 Figures = dict[str, tuple[str, Any]]
@@ -51,6 +53,23 @@ def run(main: Callable[..., None], description: str | None) -> None:
     )
 
 
+def run_commands(
+    module: str,
+    description: str | None,
+    commands: Mapping[str, Callable[..., Any]],
+    args: Sequence[str] | None = None,
+) -> int:
+    """Run one function of a table, and return the exit code: 1, and one sentence, for a user's mistake."""
+    program = f"python -m {module}"
+    try:
+        with told_warnings(program):
+            run_command(dict(commands), prog=program, help_line=description or "", args=args)
+    except HandSimError as error:
+        print(f"{program}: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
 def report(save: str | None, figures: Figures) -> None:
     """Print the figures of a benchmark and keep them, see `save_figures`."""
     for what, value in figures.values():
@@ -68,16 +87,16 @@ def number_table(title: str, first: Iterable[str], columns: Iterable[str]) -> Ta
     return table
 
 
-def timed(job: Callable[[], object], clock: Callable[[], float] = time.perf_counter) -> float:
+def timed(job: Callable[[], object]) -> float:
     """Time of a job [s]."""
-    start = clock()
+    start = time.perf_counter()
     job()
-    return clock() - start
+    return time.perf_counter() - start
 
 
-def resident_memory(process: int | None = None) -> int:
-    """Memory of a process [bytes], by its number; this one if not given."""
-    statm = Path("/proc", str(process or "self"), "statm").read_text()
+def resident_memory(process: int) -> int:
+    """Memory of a process [bytes], by its number."""
+    statm = Path("/proc", str(process), "statm").read_text()
     return int(statm.split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
@@ -137,28 +156,13 @@ def _rounded(value: Any) -> Any:
     return int(number) if number.is_integer() else number
 
 
-def kept(path: Path | None, make: Callable[[], Any]) -> Any:
-    """What a JSON file holds; where it is missing, it is made and kept there. Without a path it is made."""
-    if path is None:
-        return make()
+def kept(path: Path, make: Callable[[], Any]) -> Any:
+    """What a JSON file holds; where it is missing, it is made and kept there."""
     if not path.exists():
         made = json.dumps(make())
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(made)
     return json.loads(path.read_text())
-
-
-def kept_rows(
-    path: Path, numbers: Iterable[int], make: Callable[[int], dict[str, Any]]
-) -> list[dict[str, Any]]:
-    """Rows by their key `number`, a JSON line each; those that the file lacks are made and added to it."""
-    rows = [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
-    done = {row["number"] for row in rows}
-    for number in (one for one in numbers if one not in done):
-        rows.append(make(number))
-        with path.open("a") as file:
-            file.write(json.dumps(rows[-1]) + "\n")
-    return rows
 
 
 def load_figures(folder: Path = FOLDER) -> dict[str, SimpleNamespace]:

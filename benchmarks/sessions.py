@@ -1,12 +1,11 @@
 """Whether two sessions of a person differ as much as the report's minimal detectable differences say.
 
 python -m benchmarks.sessions [--glove dense19] [--users 30] [--seconds 4] [--calibrate] [--change]
-    [--store FOLDER]
 
 Each simulated user makes one motion of the right hand in two sessions. For each session every marker is glued
 on anew, up to 6 mm off along either direction of the skin, and moves with the flesh by 0.5 to 2 mm (RMS, a
 figure per session, by linear functions of the digit's angles). Sessions are tracked as `handsim track` does,
-with measured hands or --calibrate. --store keeps each session in a folder, so that a stopped run continues.
+with measured hands or --calibrate.
 
 Errors within the 95 % interval are those of at most 1.96 standard deviations. The found MDD is 1.96 times the
 root mean square, over users, of the difference between the sessions of an angle in a frame, of its mean, of
@@ -24,7 +23,6 @@ from __future__ import annotations
 import dataclasses
 import warnings
 from itertools import product
-from pathlib import Path
 
 import numpy as np
 from scipy.stats import norm, spearmanr
@@ -101,23 +99,6 @@ def sessions_of(user: int, glove: str, seconds: float, calibrate: bool, change: 
             }
         )
     return made
-
-
-def kept_sessions(
-    folder: Path | None, user: int, glove: str, seconds: float, calibrate: bool, change: bool
-) -> list[Session]:
-    """The sessions of a user, read from the folder if it has them, otherwise made and kept there."""
-    if folder is None:
-        return sessions_of(user, glove, seconds, calibrate, change)
-    kind = ("calibrated" if calibrate else "measured") + ("_changed" if change else "")
-    path = folder / f"{glove}_{seconds:g}_{kind}_{user}.npz"
-    if not path.exists():
-        made = sessions_of(user, glove, seconds, calibrate, change)
-        folder.mkdir(parents=True, exist_ok=True)
-        names = made[0]
-        np.savez_compressed(path, **{name: np.stack([one[name] for one in made]) for name in names})
-    with np.load(path) as stored:
-        return [{name: stored[name][number] for name in stored.files} for number in range(2)]
 
 
 def measures(angles: np.ndarray) -> dict[str, np.ndarray]:
@@ -198,12 +179,11 @@ def main(
     seconds: float = 4.0,
     calibrate: bool = False,
     change: bool = False,
-    store: Path | None = None,
     save: str | None = None,
 ) -> None:
     warnings.simplefilter("ignore", HandSimWarning)
     print(describe("numba"))
-    pairs = [kept_sessions(store, user, glove, seconds, calibrate, change) for user in range(users)]
+    pairs = [sessions_of(user, glove, seconds, calibrate, change) for user in range(users)]
     every = [one for pair in pairs for one in pair]
     off = np.concatenate([one["found"] - one["true"] for one in every])
     spread = np.concatenate([one["spread"] for one in every])

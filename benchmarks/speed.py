@@ -1,23 +1,17 @@
 """Every speed that pages quote, in one run, each also in a unit that the machine gave a moment before.
 
-    OPENBLAS_NUM_THREADS=1 MUJOCO_GL=egl python -m benchmarks.speed
-        [--only tracker labels ...] [--seeds 0 1 2 3 4] [--quick] [--save speed]
+    OPENBLAS_NUM_THREADS=1 python -m benchmarks.speed
+        [--only tracker labels commands] [--seeds 0 1 2 3 4] [--quick] [--save speed]
 
 The unit is the time of 1,000 calls of MuJoCo's `mj_kinematics` on our hand, measured anew before each
 section: where another machine or another hour has another unit, compare figures in units. Times are the
 median, the 99th percentile and the longest over all seeds.
 
-tracker: a frame with two hands, for each kind of capture, of the true hands and of hands calibrated as users
-    calibrate them; of hand-hand with a new ID for every point in every frame; a frame in which both hands are
-    initialized, and the longest of five frames after a second of darkness.
-labels: one hand with drops and ghosts, alone and in batches; of a glove without weights, and learning it.
+tracker: a frame with two hands, for each kind of capture, of the true hands; of hand-hand with a new ID for
+    every point in every frame; a frame in which both hands are initialized.
+labels: one hand with drops and ghosts; of a glove without weights, and learning it.
 commands: what users type, with its defaults, from its start to its end; five times each, with the kernels
     compiled but for the rows that say otherwise. Captures are of two hands, apart or touching.
-pictures: 640 x 480 of two hands, in one process and in one a core, and written; the stream of training
-    pictures.
-generation: training frames of single hands and of the default mix.
-solvers: a pose from the frame before, from nothing, and from eight starts.
-rays: lines of sight past a hand.
 
 Run it where nothing else runs. --quick tries every part with a few frames and one seed. The conditions of the
 run are printed and saved with its figures: seeds, what was left out, processors, threads and load.
@@ -31,50 +25,29 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from types import MappingProxyType
 from typing import Final, Literal, get_args
+from unittest import mock
 
 import mujoco
 import numpy as np
 import torch
 
-from benchmarks import rendering
 from benchmarks.held_out import held_out_markers
-from benchmarks.paper.take_evaluation import hide_points, nominal_users, seen_frame, true_users
-from benchmarks.paper.tracking_tables import calibrated_users
+from benchmarks.paper.take_evaluation import nominal_users, seen_frame, true_users
 from benchmarks.record import Figures, describe, run, save_figures, timed
-from gloves import GloveFit, Take, load_layout, write_capture
-from gloves.fit import attach_markers
-from gloves.optics.visibility import free_rays
-from handsim import HandModel, join_qpos, load_rig
-from handsim.kernels import move
-from handsim.space.transforms import random_quaternions
-from poses import sample_motion
-from poses.shapes import sample_valid_angles
+from gloves import GloveFit, Take, write_capture
+from handsim import HandModel
 from track import Tracker
-from track.kinematics.pose_solver import PoseSolver
-from train import (
-    Corruption,
-    GenerateSettings,
-    Labeler,
-    SceneMix,
-    corrupt,
-    load_labeler,
-    simulate_take,
-)
-from train.labelers.storage import OnnxLabeler, export_onnx, load_network
-from train.simulation.generation import make_dataset
+from train import Corruption, Labeler, corrupt, load_labeler, simulate_take
 from train.simulation.scenes import KINDS, Kind
 
 NEW_GLOVE: Final = Path(__file__).parents[1] / "examples" / "ten_markers.toml"
 WARM_UP: Final = 30  # frames of a tracker that do not count
-NOISE: Final = 3e-4  # of markers [m]
-BEFORE, DARK, AFTER = 60, 120, 5  # frames around a second of darkness
-Section = Literal["tracker", "labels", "commands", "pictures", "generation", "solvers", "rays"]
-CORES: Final = os.cpu_count() or 1
+Section = Literal["tracker", "labels", "commands"]
 CAPTURES: Final[tuple[tuple[str, Kind, int], ...]] = (
     ("short", "single-hand", 24),
     ("hand", "single-hand", 1632),
@@ -83,16 +56,11 @@ CAPTURES: Final[tuple[tuple[str, Kind, int], ...]] = (
 )
 RENDER: Final = "render touching.npz --out {out} --num-frames"
 COMMANDS: Final = (
-    ("label_help", "label --help", "label --help"),
     ("label_first", "label of 24 frames from an empty cache", "label short.c3d --out {out}.trc"),
     ("label_24", "label of 24 frames", "label short.c3d --out {out}.trc"),
-    ("track_24", "track of 24 frames", "track short.c3d --out {out}.npz"),
-    ("label_1200", "label of 10 s of touching hands", "label touching.c3d --out {out}.trc"),
-    ("track_1200", "track of 10 s of touching hands", "track touching.c3d --out {out}.npz"),
     ("label_7200", "label of a minute of touching hands", "label minute.c3d --out {out}.trc"),
     ("track_7200", "track of a minute of touching hands", "track minute.c3d --out {out}.npz"),
     ("track_calibrate", "track --calibrate of 13.6 s", "track hand.c3d --calibrate --out {out}.npz"),
-    ("render_200", "render of 200 pictures, one process", f"{RENDER} 200 --workers 1"),
     ("render_600", "render of 600 pictures", f"{RENDER} 600"),
     ("render_depth", "render of 200 pictures, depth alone", f"{RENDER} 200 --passes depth"),
     ("generate_60000", "generate of 60,000 frames", "generate --num-frames 60000 --out {out}"),
@@ -129,12 +97,6 @@ class Speeds:
         shown = "{:9.3f} {:9.3f} {:9.3f} ms {:9.4f} units".format(*row)
         print(f"  {what:66s} {shown}", flush=True)
 
-    def rate(self, key: str, what: str, per_second: float) -> None:
-        """Keep how many of something are made in a second."""
-        row = [per_second, per_second * self._unit]
-        self.figures[key] = (f"{what}: in a second; in a unit", row)
-        print(f"  {what:66s} {row[0]:12.1f} /s {row[1]:9.4f} /unit", flush=True)
-
 
 def unit() -> float:
     """Time of 1,000 calls of `mj_kinematics` on our hand [s]."""
@@ -145,11 +107,11 @@ def unit() -> float:
                             for _ in range(15)]))  # fmt: skip
 
 
-def each_time(job: Callable[[np.ndarray], object], inputs: Sequence[np.ndarray]) -> list[float]:
-    """Time of a job on each input [s], after a tenth of them to warm up."""
-    for one in inputs[: len(inputs) // 10 + 1]:
-        job(one)
-    return [timed(functools.partial(job, one)) for one in inputs]
+def each_hand(some: Labeler, hands: list[np.ndarray]) -> list[float]:
+    """Time of each hand's labels [s], after a tenth of them to warm up."""
+    for hand in hands[: len(hands) // 10 + 1]:
+        some.label_frames([hand])
+    return [timed(functools.partial(some.label_frames, [hand])) for hand in hands]
 
 
 @cache
@@ -169,26 +131,12 @@ def tracker(speeds: Speeds) -> None:
         key = kind.replace("-", "_")
         true = [follow(take, true_users(take)) for take in some]
         speeds.times(f"{key}_true", f"a frame of {kind}, two true hands", np.concatenate(true))
-        calibrated = [
-            follow(take, calibrated_users(take, seed, speeds.some(40, 12)))
-            for seed, take in zip(speeds.seeds, some, strict=True)
-        ]
-        what = f"a frame of {kind}, two calibrated hands"
-        speeds.times(f"{key}_calibrated", what, np.concatenate(calibrated))
     fresh = [follow(take, true_users(take), fresh=True) for take in takes["hand-hand"]]
     speeds.times("fresh_ids", "a frame of hand-hand, every ID new in every frame", np.concatenate(fresh))
     every = [take for some in takes.values() for take in some]
     count = speeds.some(25, 5)
     starts = [first_frame(take, at) for take in every for at in spread(take.num_frames, count)]
     speeds.times("initialization", "a frame in which both hands are initialized", starts)
-    after = [
-        longest_after_darkness(take, at)
-        for take in every
-        if take.num_frames >= BEFORE + DARK + AFTER
-        for at in spread(take.num_frames - BEFORE - DARK - AFTER + 1, speeds.some(10, 2))
-    ]
-    if after:
-        speeds.times("recovery", f"the longest of {AFTER} frames after a second of darkness", after)
 
 
 def spread(end: int, count: int) -> list[int]:
@@ -212,17 +160,6 @@ def first_frame(take: Take, at: int) -> float:
     return timed(lambda: tracking.step(seen.points, seen.ids, 0.0))
 
 
-def longest_after_darkness(take: Take, at: int) -> float:
-    """The longest time of a frame [s] after a second without points."""
-    part = hide_points(take.cut(at, at + BEFORE + DARK + AFTER), BEFORE, DARK)
-    tracking, times = Tracker(true_users(take), labeler()), []
-    for number in range(part.num_frames):
-        seen = seen_frame(part, number)
-        times.append(timed(functools.partial(tracking.step, seen.points, seen.ids, number / take.rate)))
-    return max(times[-AFTER:])
-
-
-@cache
 def clouds(glove: str, count: int, seeds: tuple[int, ...]) -> list[np.ndarray]:
     """Held-out hands [m] with the paper's drops and ghosts."""
     found: list[np.ndarray] = []
@@ -233,35 +170,16 @@ def clouds(glove: str, count: int, seeds: tuple[int, ...]) -> list[np.ndarray]:
     return found
 
 
-def label(speeds: Speeds, key: str, what: str, some: Labeler, hands: list[np.ndarray]) -> None:
-    """How long a labeler takes for a hand, alone and in batches."""
-    speeds.times(key, f"one hand, {what}", each_time(lambda hand: some.label_frames([hand]), hands))
-    batches = [hands[first : first + 500] for first in range(0, len(hands), 500)]
-    per_hand = [timed(functools.partial(some.label_frames, batch)) / len(batch) for batch in batches]
-    speeds.times(f"{key}_batch", f"one hand of many, {what}", per_hand)
-
-
 def labels(speeds: Speeds) -> None:
     hands = clouds("dense19", speeds.some(1000, 50), tuple(speeds.seeds))
-    label(speeds, "set", "set labeler", load_labeler("dense19"), hands)
-    network, card = load_network("dense19")
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "labeler.onnx"
-        export_onnx(network, tuple(card["marker_names"]), path)
-        label(speeds, "set_onnx", "set labeler, onnxruntime", OnnxLabeler(path), hands)
-        before = os.environ.get("XDG_CACHE_HOME")
-        os.environ["XDG_CACHE_HOME"] = folder  # where nothing was learned before
-        try:
-            start = time.perf_counter()
-            learned = load_labeler(NEW_GLOVE, "any-layout")
-            took = time.perf_counter() - start
-            speeds.times("new_glove_learned", "learning a glove without weights", [took])
-        finally:
-            os.environ.pop("XDG_CACHE_HOME")
-            if before is not None:
-                os.environ["XDG_CACHE_HOME"] = before
+    speeds.times("set", "one hand, set labeler", each_hand(labeler(), hands))
+    with tempfile.TemporaryDirectory() as empty, mock.patch.dict(os.environ, XDG_CACHE_HOME=empty):
+        start = time.perf_counter()
+        learned = load_labeler(NEW_GLOVE, "any-layout")
+        took = time.perf_counter() - start
+    speeds.times("new_glove_learned", "learning a glove without weights", [took])
     hands = clouds(str(NEW_GLOVE), speeds.some(300, 20), tuple(speeds.seeds))
-    label(speeds, "new_glove", "a glove without weights", learned, hands)
+    speeds.times("new_glove", "one hand, a glove without weights", each_hand(learned, hands))
 
 
 def commands(speeds: Speeds) -> None:
@@ -287,84 +205,6 @@ def type_in(words: str, folder: Path, environment: Mapping[str, str] = MappingPr
     """Run `handsim` with these words in a folder, and wait until it ends."""
     command = [sys.executable, "-m", "handsim", *words.split()]
     subprocess.run(command, cwd=folder, env={**os.environ, **environment}, check=True, capture_output=True)
-
-
-def pictures(speeds: Speeds) -> None:
-    frames = speeds.some(200, 8)
-    with tempfile.TemporaryDirectory() as folder:
-        for key, (name, job) in rendering.jobs(frames, Path(folder)).items():
-            speeds.rate(key, f"pictures, {name}", rendering.rate(functools.partial(job, 0), frames))
-            if not speeds.some(0, 1):
-                many = rendering.rate_in_processes(job, CORES, frames)
-                speeds.rate(f"{key}_all", f"pictures, {name}, {CORES} processes", many)
-    stream = iter(rendering.a_stream())
-    drawing = lambda: [next(stream) for _ in range(frames)]  # noqa: E731
-    size = f"{rendering.CROP} x {rendering.CROP}"
-    speeds.rate("stream", f"pictures of the stream, one hand, {size}", rendering.rate(drawing, frames))
-    batches, count = rendering.stream_batches(), -(-4 * frames // rendering.BATCH)
-    seconds = timed(lambda: [next(batches) for _ in range(count)])
-    many = count * rendering.BATCH / seconds
-    speeds.rate("stream_all", f"pictures of the stream, {CORES} workers of a DataLoader", many)
-
-
-def generation(speeds: Speeds) -> None:
-    for key, name, scenes, workers in (
-        ("frames_single", "single hands", SceneMix(alone=1.0, together=0.0, holding=0.0), CORES),
-        ("frames_mix", "the default mix", SceneMix(), CORES),
-        ("frames_mix_one", "the default mix", SceneMix(), 1),
-    ):
-        with tempfile.TemporaryDirectory() as folder:
-            config = GenerateSettings(num_frames=speeds.some(100_000, 3000), scenes=scenes)
-            seconds = timed(lambda: make_dataset(config, Path(folder) / "set", workers=workers))  # noqa: B023
-        speeds.rate(key, f"training frames of {name}, workers: {workers}", config.num_frames / seconds)
-
-
-def solvers(speeds: Speeds) -> None:
-    model, frames = HandModel.named("M"), speeds.some(300, 20)
-    worn = attach_markers(load_layout("dense19"), model)
-    solver, followed, eight, cold = PoseSolver(GloveFit(model, worn)), [], [], []
-    for seed in speeds.seeds:
-        rng = np.random.default_rng(seed)
-
-        def seen(qpos: np.ndarray) -> np.ndarray:
-            """The markers of poses, with noise."""
-            points = worn.centers(model, model.forward_kinematics(qpos))
-            noisy: np.ndarray = points + NOISE * rng.standard_normal(points.shape)  # noqa: B023
-            return noisy
-
-        qpos = sample_motion(model, frames / 120.0, rng=rng).qpos
-        solver.solve(seen(qpos[:1]))  # to warm up
-        pose = solver.solve(seen(qpos[:1]), qpos[:1]).qpos
-        for target in seen(qpos)[1:]:
-            start = time.perf_counter()
-            pose = solver.solve(target[None], pose).qpos
-            followed.append(time.perf_counter() - start)
-        starts = move(np.repeat(qpos, 8, axis=0), 0.03 * rng.standard_normal((8 * len(qpos), 26)))
-        pairs = zip(np.repeat(seen(qpos), 8, axis=0).reshape(-1, 8, *worn.points.shape),
-                    starts.reshape(-1, 8, starts.shape[-1]), strict=True)  # fmt: skip
-        eight += [timed(functools.partial(solver.solve, *pair)) for pair in pairs]
-        anywhere = join_qpos(
-            sample_valid_angles(model, frames, rng=rng),
-            position=rng.normal(size=(frames, 3)),
-            quaternion=random_quaternions(frames, rng=rng),
-        )
-        cold += [timed(functools.partial(solver.solve, target[None])) for target in seen(anywhere)]
-    speeds.times("solver_ours_skin", "a pose from the frame before", followed)
-    speeds.times("solver_eight", "a pose, eight starts", eight)
-    speeds.times("solver_cold", "a pose from nothing", cold)
-
-
-def rays(speeds: Speeds) -> None:
-    rng, model = np.random.default_rng(0), HandModel.named("M")
-    cameras, count = load_rig("figure5").positions, speeds.some(2000, 100)
-    qpos = join_qpos(sample_valid_angles(model, count, rng=rng), position=[0.0, 0.0, 1.1])
-    bones = model.forward_kinematics(qpos)
-    markers, _ = attach_markers(load_layout("dense19"), model).markers(model, bones)
-    segments, radii = model.capsules.posed(bones), model.capsules.radii
-    free_rays(markers, cameras, segments, radii)
-    lines = markers.shape[1] * len(cameras)
-    ours = np.median([timed(lambda: free_rays(markers, cameras, segments, radii)) for _ in range(5)])
-    speeds.rate("rays", "lines of sight past a hand", count * lines / float(ours))
 
 
 def main(

@@ -93,8 +93,6 @@ CASES = {
     "improve": Case(("glove", "improve", "sparse13", "--minutes", "0", "--out", "OUT/better.toml")),
     "plan": Case(("rig", "plan", "--cameras", "3", "--room", "3", "3", "2.5", "--out", "OUT/rig.toml")),
 }
-
-
 Command = Literal[
     "generate", "grow-set", "train", "grow-run", "render", "simulate", "track", "calibrate", "label",
     "folder", "report", "export", "film", "cnn", "improve", "plan",
@@ -117,6 +115,9 @@ class Counts:
     def failed(self) -> bool:
         """Whether a count is not zero."""
         return bool(self.differing or self.orphans or self.temporary or self.segments or self.untold)
+
+
+QUIET = {"stdout": subprocess.DEVNULL, "stdin": subprocess.DEVNULL, "cwd": ROOT}
 
 
 def main(commands: tyro.conf.Positional[tuple[Command, ...]] = ALL, kills: int = 20, seed: int = 0) -> None:
@@ -218,9 +219,6 @@ def members(session: int) -> list[int]:
         if entry.name.isdecimal() and int(of) == session and state not in "ZX":
             found.append(int(entry.name))
     return found
-
-
-QUIET = {"stdout": subprocess.DEVNULL, "stdin": subprocess.DEVNULL, "cwd": ROOT}
 
 
 def finish(args: tuple[str, ...]) -> None:

@@ -27,82 +27,6 @@ TOP = 'name = "mine"\nradius_mm = 3.2\n'
 RIG = 'name = "mine"\nfield_of_view = 60.0\n'
 CAMERA = "[[camera]]\nposition = {}\ntarget = [0.0, 0.0, 1.1]\n"
 FIVE = [("a", "index_distal"), ("b", "ring_distal"), ("c", "thumb_distal"), ("d", "little_distal")]
-
-
-def layout(*markers: tuple[str, str]) -> str:
-    return TOP + "\n".join(MARKER.format(*marker) for marker in markers)
-
-
-def body(*places: str) -> str:
-    markers = (f'[[marker]]\nname = "m{n}"\nplace_mm = {place}\n' for n, place in enumerate(places))
-    return 'name = "wand"\n' + "".join(markers)
-
-
-def rig(*positions: list[float]) -> str:
-    return RIG + "\n".join(CAMERA.format(position) for position in positions)
-
-
-def good_capture(folder: Path) -> str:
-    path = folder / "good.trc"
-    markers = np.random.default_rng(0).uniform(0, 0.1, size=(5, 19, 3))
-    write_capture(path, Capture(load_layout("dense19").names, markers, 120.0))
-    return path.read_text()
-
-
-@pytest.fixture(scope="module")
-def files(tmp_path_factory):
-    """What users may name, made once."""
-    made = tmp_path_factory.mktemp("files")
-    text = good_capture(made)
-    texts = {
-        "unknown_bone.toml": layout(*FIVE, ("e", "indx_middle")),
-        "twice.toml": layout(*FIVE, ("a", "index_middle")),
-        "two_markers.toml": layout(*FIVE[:2]),
-        "one_camera.toml": rig([1.5, 0.0, 2.0]),
-        "in_the_way.toml": rig([1.5, 0.0, 2.0], [-1.5, 0.0, 2.0], [0.1, 0.0, 1.3]),
-        "at_the_hands.toml": rig([1.5, 0.0, 2.0], [-1.5, 0.0, 2.0], [0.0, 0.65, 1.1]),
-        "damaged.truth.npz": "PK",
-        "furlongs.trc": text.replace("\tmm\t", "\tfurlongs\t"),
-        "millimeters.trc": text.replace("\tmm\t", "\tm\t"),
-        "damaged.onnx": "onnx",
-        "empty.trc": "\n".join(text.split("\n")[:5]) + "\n",
-        "nothing.trc": "",
-        "truncated.trc": text[: int(0.9 * len(text))],
-        "words.trc": text.replace("\t1\t", "\tone\t", 1) if "\t1\t" in text else text,
-        "renamed.trc": text.replace("ThumbIP", "Thumb_IP"),
-        "takes.docx": "x",
-        "wand.toml": body("[0, 0, 0]", "[50, 0, 0]", "[0, 80, 0]"),
-        "in_meters.toml": body("[0, 0, 0]", "[0.05, 0, 0]", "[0, 0.08, 0]"),
-        "flat_marker.toml": body("[0, 0]", "[50, 0]", "[0, 80]"),
-        "lab.cal": "closed",
-        "page.xml": "<html/>",
-        "bomb.xcp": '<!DOCTYPE c [<!ENTITY a "b">]><Cameras>&a;</Cameras>',
-    }
-    for name, content in texts.items():
-        (made / name).write_text(content)
-    write_archive(made / "older.npz", {"kind": "tracked take", "schema": 2}, {})
-    write_archive(made / "newer.npz", {"kind": "take", "schema": 99}, {})
-    take = simulate_take(num_frames=2)
-    take.save(made / "good.truth.npz")
-    dataclasses.replace(take, settings={"tracker": {}}).save(made / "tracked.npz")
-    left = nominal_fit(load_layout("dense19"), "M", "left")
-    Take.of_poses([left], join_qpos(np.zeros((3, 20)))[:, None], rate=120.0).save(made / "left.npz")
-    User((left,)).save(made / "user.json")
-    (made / "mine.toml").write_text(starter_layout())
-    (made / "photos").mkdir()
-    (made / "photos" / "broken.jpg").write_text("no picture")
-    load_layout("dense19").save(made / "copy.toml")
-    return made
-
-
-@pytest.fixture
-def folder(files, tmp_path, monkeypatch):
-    """A folder of its own with copies of the files."""
-    shutil.copytree(files, tmp_path, dirs_exist_ok=True)
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
 CASES = {
     "generate --glove dense91 --out out": "'dense91' | 'dense19' | tips8 | path of a .toml file",
     "glove check unknown_bone.toml": "unknown_bone.toml | 'e' | 'indx_middle' | 'index_middle' | palm",
@@ -120,6 +44,13 @@ CASES = {
     "label missing.c3d --out out.trc": "missing.c3d | No such file",
     "label good.trc --labeler sparse13 --out out.trc": "ThumbIP, ThumbTip | 'dense19' | ThumbCMC | --glove",
     "generate --num-frames 0 --out out": "num_frames is 0 | at least 1",
+    "generate --workers -3 --out out": "workers is -3 | at least 1",
+    "generate --volume nan --out out": "volume is nan | a number from 0 to 10",
+    "generate --min-cameras 17 --out out": "min_cameras is 17 | rig 'figure5' has 16",
+    "generate --slip-around nan --out out": "slip_around is nan | a number from 0 to 90",
+    "generate --population.children 5 --out out": "children is 5 | a number from 0 to 1",
+    "generate --blob-loss 0 1.5 --out out": "blob_loss is 1.5 | a number from 0 to 1",
+    "generate --seed -1 --out out": "seed is -1 | 0 or more",
     "glove new copy.toml": "copy.toml | exists already | new file",
     "generate --rig one_camera.toml --out out": "one_camera.toml | 'mine' | 1 cameras | 2 to 32",
     "simulate --rig one_camera.toml --out out.c3d": "one_camera.toml | 'mine' | 1 cameras | 2 to 32",
@@ -280,6 +211,80 @@ CASES = {
     "evaluate good.truth.npz good.trc": ".npz",
     "simulate --optics.noise -1 --out out.c3d": "noise is -1 | at least 0",
 }
+
+
+def layout(*markers: tuple[str, str]) -> str:
+    return TOP + "\n".join(MARKER.format(*marker) for marker in markers)
+
+
+def body(*places: str) -> str:
+    markers = (f'[[marker]]\nname = "m{n}"\nplace_mm = {place}\n' for n, place in enumerate(places))
+    return 'name = "wand"\n' + "".join(markers)
+
+
+def rig(*positions: list[float]) -> str:
+    return RIG + "\n".join(CAMERA.format(position) for position in positions)
+
+
+def good_capture(folder: Path) -> str:
+    path = folder / "good.trc"
+    markers = np.random.default_rng(0).uniform(0, 0.1, size=(5, 19, 3))
+    write_capture(path, Capture(load_layout("dense19").names, markers, 120.0))
+    return path.read_text()
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    """What users may name, made once."""
+    made = tmp_path_factory.mktemp("files")
+    text = good_capture(made)
+    texts = {
+        "unknown_bone.toml": layout(*FIVE, ("e", "indx_middle")),
+        "twice.toml": layout(*FIVE, ("a", "index_middle")),
+        "two_markers.toml": layout(*FIVE[:2]),
+        "one_camera.toml": rig([1.5, 0.0, 2.0]),
+        "in_the_way.toml": rig([1.5, 0.0, 2.0], [-1.5, 0.0, 2.0], [0.1, 0.0, 1.3]),
+        "at_the_hands.toml": rig([1.5, 0.0, 2.0], [-1.5, 0.0, 2.0], [0.0, 0.65, 1.1]),
+        "damaged.truth.npz": "PK",
+        "furlongs.trc": text.replace("\tmm\t", "\tfurlongs\t"),
+        "millimeters.trc": text.replace("\tmm\t", "\tm\t"),
+        "damaged.onnx": "onnx",
+        "empty.trc": "\n".join(text.split("\n")[:5]) + "\n",
+        "nothing.trc": "",
+        "truncated.trc": text[: int(0.9 * len(text))],
+        "words.trc": text.replace("\t1\t", "\tone\t", 1) if "\t1\t" in text else text,
+        "renamed.trc": text.replace("ThumbIP", "Thumb_IP"),
+        "takes.docx": "x",
+        "wand.toml": body("[0, 0, 0]", "[50, 0, 0]", "[0, 80, 0]"),
+        "in_meters.toml": body("[0, 0, 0]", "[0.05, 0, 0]", "[0, 0.08, 0]"),
+        "flat_marker.toml": body("[0, 0]", "[50, 0]", "[0, 80]"),
+        "lab.cal": "closed",
+        "page.xml": "<html/>",
+        "bomb.xcp": '<!DOCTYPE c [<!ENTITY a "b">]><Cameras>&a;</Cameras>',
+    }
+    for name, content in texts.items():
+        (made / name).write_text(content)
+    write_archive(made / "older.npz", {"kind": "tracked take", "schema": 2}, {})
+    write_archive(made / "newer.npz", {"kind": "take", "schema": 99}, {})
+    take = simulate_take(num_frames=2)
+    take.save(made / "good.truth.npz")
+    dataclasses.replace(take, settings={"tracker": {}}).save(made / "tracked.npz")
+    left = nominal_fit(load_layout("dense19"), "M", "left")
+    Take.of_poses([left], join_qpos(np.zeros((3, 20)))[:, None], rate=120.0).save(made / "left.npz")
+    User((left,)).save(made / "user.json")
+    (made / "mine.toml").write_text(starter_layout())
+    (made / "photos").mkdir()
+    (made / "photos" / "broken.jpg").write_text("no picture")
+    load_layout("dense19").save(made / "copy.toml")
+    return made
+
+
+@pytest.fixture
+def folder(files, tmp_path, monkeypatch):
+    """A folder of its own with copies of the files."""
+    shutil.copytree(files, tmp_path, dirs_exist_ok=True)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
 
 
 @pytest.mark.parametrize("command", CASES)

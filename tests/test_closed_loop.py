@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks.paper.take_evaluation import true_users
-from gloves import load_take, read_capture, write_capture
+from gloves import load_take, read_capture
 from handsim import HandModel
 from handsim.cli.simulate import simulate
 from handsim.hand.model import hand_keypoints
@@ -62,11 +62,3 @@ def test_pictures_of_tracked_hands_have_their_keypoints_where_the_truth_is(truth
             points = hand_keypoints(HandModel(true.shape), true.qpos[frame.number : frame.number + 1])[0]
             off.append(np.linalg.norm(frame.camera.project(points) - hand.keypoints, axis=-1))
     assert np.mean(off) <= MOST_PIXELS
-
-
-def test_what_is_written_is_read_back(tracked, tmp_path):
-    result, folder = tracked
-    again = read_capture(folder / "take.c3d")
-    write_capture(tmp_path / "again.trc", again)
-    np.testing.assert_allclose(read_capture(tmp_path / "again.trc").positions, again.positions, atol=1e-6)
-    assert result.num_frames == FRAMES

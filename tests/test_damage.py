@@ -13,12 +13,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gloves import Take, load_take
+from gloves import Take
 from handsim import look_at
-from handsim.errors import CaptureError, DatasetError, HandSimError, WeightsError
+from handsim.errors import DatasetError, HandSimError, WeightsError
 from handsim.files.signals import Stopped
 from handsim.space.camera import pinhole
 from render import RenderConfig, merge_renderings, render_take
+from tests.folders import contents
 from train import (
     GenerateSettings,
     SetLabelerConfig,
@@ -37,11 +38,13 @@ FLIPS = tuple((place, mask) for place in (0.0, 0.3, 0.7, 1.0) for mask in (0x01,
 
 EXTENT = pytest.mark.parametrize("flips", [1, pytest.param(len(FLIPS), marks=pytest.mark.slow)])
 """Flips of each file, and of one file of each kind where there is one flip; all take twenty times as long."""
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    files = (path for path in folder.rglob("*") if path.is_file())
-    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
+NETWORK = SetLabelerConfig(width=8, gates=2, depth=1)
+RUN = TrainSettings(samples=96, batch=32, network=NETWORK)
+FORMATS = [("webdataset",), ("coco",), ("yolo", "exr")]
+PICTURES = RenderConfig(
+    passes=("rgb", "depth"), every=12, frames_per_shard=1, depth_sensor=None, color_sensor=None,
+    background={"plain": 1.0}, painter="compiled",
+)  # fmt: skip
 
 
 def flip(path: Path, place: float, mask: int) -> None:
@@ -95,10 +98,6 @@ def test_a_training_set(tmp_path, monkeypatch, state, flips):
     assert_never_truth(tmp_path / "set", again, expected, flips=flips)
 
 
-NETWORK = SetLabelerConfig(width=8, gates=2, depth=1)
-RUN = TrainSettings(samples=96, batch=32, network=NETWORK)
-
-
 @pytest.fixture
 def small_run(tmp_path, monkeypatch) -> Callable[..., object]:
     """Training of a tiny network, with a page that lacks its pictures."""
@@ -139,28 +138,6 @@ def test_damaged_weights_are_no_labeler(tmp_path, small_run, name):
             assert name in str(error)
         else:
             assert name == CARD and labeler.marker_names == names
-
-
-def test_a_take(tmp_path, take):
-    path = tmp_path / "take.npz"
-    take.save(path)
-    whole = path.read_bytes()
-    for place in np.linspace(0.0, 1.0, 150):
-        path.write_bytes(whole)
-        flip(path, place, 0x01)
-        try:
-            load_take(path).save(tmp_path / "copy.npz")
-        except CaptureError as error:
-            assert "take.npz" in str(error)
-        else:
-            assert (tmp_path / "copy.npz").read_bytes() == whole
-
-
-FORMATS = [("webdataset",), ("coco",), ("yolo", "exr")]
-PICTURES = RenderConfig(
-    passes=("rgb", "depth"), every=12, frames_per_shard=1, depth_sensor=None, color_sensor=None,
-    background={"plain": 1.0}, painter="compiled",
-)  # fmt: skip
 
 
 @pytest.fixture(scope="module")

@@ -33,6 +33,7 @@ SLOW = {
     "tutorials/my_trial",
 }
 RUN = [page for page in PAGES if blocks_of(page)]
+GROUPS = {CORRUPTIONS, LABELERS, SAMPLERS, SINKS, SOURCES}  # of entry points
 
 
 @pytest.fixture
@@ -101,9 +102,6 @@ def test_a_line_of_the_shell_that_fails_is_named(tmp_path, commands):
     assert run_blocks([right], tmp_path, commands) == ["handsim\n"]
     with pytest.raises(AssertionError, match=r"page\.md:8: exit code 2(.|\n)*did you mean 'train'"):
         run_blocks([wrong], tmp_path, commands)
-
-
-GROUPS = {CORRUPTIONS, LABELERS, SAMPLERS, SINKS, SOURCES}  # of entry points
 
 
 def test_every_module_that_a_page_names_exists():

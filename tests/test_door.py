@@ -24,6 +24,12 @@ NO_QUANTITY = {
     "load_labeler",
 }  # fmt: skip
 """Public names without a physical quantity of their own, or whose quantities are in the types they return."""
+ROOMS = {
+    package: (f"{package}.",) if package != "handsim" else ("handsim.hand", "handsim.space")
+    for package in PACKAGES
+}
+INNER = {"ArrivingFrames", "FormerHands", "Part", "Site"}
+"""Types of what `open_source`, a take, a rigid object and a glove are made of, which no user makes."""
 
 
 def exported() -> list[object]:
@@ -33,12 +39,6 @@ def exported() -> list[object]:
         for name in importlib.import_module(package).__all__
         if name not in BOOKKEEPING
     ]
-
-
-ROOMS = {
-    package: (f"{package}.",) if package != "handsim" else ("handsim.hand", "handsim.space")
-    for package in PACKAGES
-}
 
 
 def source_of(value: object) -> str:
@@ -103,10 +103,6 @@ def called() -> list[tuple[str, str]]:
     values = [getattr(importlib.import_module(package), name) for package, name in names]
     given = {one for value in values for one in types_of(value) if one is not value}
     return [one for one, value in zip(names, values, strict=True) if value not in given]
-
-
-INNER = {"ArrivingFrames", "FormerHands", "Part", "Site"}
-"""Types of what `open_source`, a take, a rigid object and a glove are made of, which no user makes."""
 
 
 @pytest.mark.parametrize(("package", "name"), exported())

@@ -6,11 +6,11 @@ import sys
 from collections.abc import Callable
 from typing import Final
 
-from benchmarks.command_line import run
 from benchmarks.paper.labeling_tables import LABELING_TABLES
 from benchmarks.paper.tracking_tables import TRACKING_TABLES
+from benchmarks.record import run_commands
 
 TABLES: Final[dict[str, Callable[..., None]]] = {**LABELING_TABLES, **TRACKING_TABLES}
 
 if __name__ == "__main__":
-    sys.exit(run("benchmarks.paper", __doc__, TABLES))
+    sys.exit(run_commands("benchmarks.paper", __doc__, TABLES))

@@ -32,11 +32,11 @@ FIGURES: Final = {
     "g_recall": "ghost_recall",
 }
 """Rows of Tables 4 and 6, the paper's and ours."""
-_Labeler = Annotated[Path | None, tyro.conf.arg(help="Folder of a trained labeler, or an .onnx file.")]
-_Save = Annotated[str | None, tyro.conf.arg(help="Name of the file in benchmarks/figures.")]
+LabelerFile = Annotated[Path | None, tyro.conf.arg(help="Folder of a trained labeler, or an .onnx file.")]
+SaveName = Annotated[str | None, tyro.conf.arg(help="Name of the file in benchmarks/figures.")]
 
 
-def table3(glove: str = "dense19", seed: int = 0, save: _Save = None) -> None:
+def table3(glove: str = "dense19", seed: int = 0, save: SaveName = None) -> None:
     """Frames, gaps and ghosts of the simulated twins of the paper's captures.
 
     Args:
@@ -50,12 +50,12 @@ def table3(glove: str = "dense19", seed: int = 0, save: _Save = None) -> None:
     report(save, figures)
 
 
-def table4(labeler: _Labeler = None, num_frames: int = 5000, seed: int = 0, save: _Save = None) -> None:
+def table4(labeler: LabelerFile = None, num_frames: int = 5000, seed: int = 0, save: SaveName = None) -> None:
     """A labeler of the dense layout on simulated test frames and on the twins of the paper's captures."""
     report(save, figures_of_tests("dense19", TABLE4, labeler, num_frames, seed))
 
 
-def table6(labeler: _Labeler = None, num_frames: int = 5000, seed: int = 0, save: _Save = None) -> None:
+def table6(labeler: LabelerFile = None, num_frames: int = 5000, seed: int = 0, save: SaveName = None) -> None:
     """A labeler of the sparse layout on simulated test frames and on the twins of the paper's captures."""
     report(save, figures_of_tests("sparse13", TABLE6, labeler, num_frames, seed))
 

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Final, NamedTuple, Protocol
+from typing import Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -15,7 +14,7 @@ from gloves import GloveFit, Take, load_layout
 from gloves.fit import nominal_fit
 from handsim import HandModel
 from handsim.hand.shape import NUM_QPOS, SIZES
-from track import StreamedFrame, TrackedFrame
+from track import StreamedFrame, TrackedFrame, Tracker
 from track.hand_size import fit_size, sample_frames
 from train import Labeler
 
@@ -23,14 +22,6 @@ MOST_RMS: Final = 0.008
 """RMS distance [m] above which a pose is rejected; Han et al. 2018, section 4.4."""
 OCCLUSIONS: Final = ((0, 0), (1, 2), (3, 5), (6, 99))
 """Classes of a hand's number of missing markers, from and to, for pose errors."""
-
-
-class FrameTracker(Protocol):
-    """Anything that tracks a capture frame by frame."""
-
-    def step(self, points: Float[np.ndarray, "N 3"], ids: Int[np.ndarray, "N"], time: float) -> TrackedFrame:
-        """Track the next frame: points [m], their IDs, and the time [s]."""
-        ...
 
 
 class SeenFrame(NamedTuple):
@@ -95,15 +86,6 @@ def seen_frame(take: Take, frame: int) -> SeenFrame:
     return SeenFrame(take.points[frame, here], take.ids[frame, here].astype(np.int64), labels)
 
 
-def hide_points(take: Take, first: int, frames: int) -> Take:
-    """A take with all points of some frames hidden, from `first` on; later points have new IDs."""
-    points = take.point_list
-    is_later = (points.frames >= first) & (points.ids >= 0)
-    ids = points.ids + np.where(is_later, points.ids.max(initial=-1) + 1, 0)
-    hidden = (points.frames >= first) & (points.frames < first + frames)
-    return dataclasses.replace(take, point_list=dataclasses.replace(points, ids=ids).without(hidden))
-
-
 def true_users(take: Take) -> list[GloveFit]:
     """The hands of a take with their true shapes and gloves: the result of a perfect calibration."""
     return list(take.hands)
@@ -123,10 +105,6 @@ def measured_users(take: Take, labeler: Labeler) -> list[GloveFit]:
     """The hands of a take without calibration: of the size that is measured in it, gloves as designed.
 
     Hands whose size cannot be measured have the nearest of the five sizes.
-
-    Args:
-        take: The take.
-        labeler: Labeler of its glove.
 
     Raises:
         LayoutError: The take's glove is not found.
@@ -149,17 +127,13 @@ def nearest_size(length: float) -> str:
 def evaluate_tracker(
     take: Take,
     users: Sequence[GloveFit],
-    tracker: FrameTracker,
+    tracker: Tracker,
     *,
     done: Callable[[], None] | None = None,
 ) -> TrackingReport:
-    """Run a tracker over a take and compare it with the truth.
+    """Run a tracker, which has not seen a frame, over a simulated take and compare it with the truth.
 
-    Args:
-        take: A simulated take.
-        users: The tracker's hands, in the take's order.
-        tracker: A tracker that has not seen a frame.
-        done: Called after each frame.
+    `users` are the tracker's hands in the take's order; `done` is called after each frame.
     """
     frames = range(take.num_frames)
     right, valid = np.zeros(len(frames), dtype=bool), np.zeros(len(frames), dtype=bool)
@@ -184,11 +158,6 @@ def is_right(take: Take, tracked: TrackedFrame, seen: SeenFrame) -> bool:
     """Whether every point of a frame has its true label: a marker its own, all others none.
 
     The markers of a body must have their labels if the body is tracked, and no label of a hand otherwise.
-
-    Args:
-        take: The take.
-        tracked: Result of the tracker.
-        seen: Points and true labels of the frame.
     """
     if tracked.bodies:
         return np.array_equal(tracked.labels, seen.labels)

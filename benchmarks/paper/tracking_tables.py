@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
 from typing import Annotated, Final
 
 import numpy as np
 import tyro
 
+from benchmarks.paper.labeling_tables import LabelerFile, SaveName
 from benchmarks.paper.printed import CAMERAS, CAMERAS_FRAMES, TABLE5, TABLE7
 from benchmarks.paper.take_evaluation import (
     OCCLUSIONS,
@@ -36,13 +36,13 @@ _KEYS: Final = {"calibrated": "true", "uncalibrated": "size"}
 _ERRORS: Final = "errors of joints [mm], angles [deg], by markers missing: none, 1-2, 3-5, 6 or more"
 Measured = dict[str, dict[str, TrackingReport]]
 """Reports by users, then by capture."""
-_Labeler = Annotated[Path | None, tyro.conf.arg(help="Folder of a trained labeler, or an .onnx file.")]
 _Frames = Annotated[int | None, tyro.conf.arg(help="Frames of each capture; the paper's when not given.")]
 _Seed = Annotated[int, tyro.conf.arg(help="Seed of the captures; 0 gives the twins.")]
-_Save = Annotated[str | None, tyro.conf.arg(help="Name of the file in benchmarks/figures.")]
 
 
-def table5(labeler: _Labeler = None, num_frames: _Frames = None, seed: _Seed = 0, save: _Save = None) -> None:
+def table5(
+    labeler: LabelerFile = None, num_frames: _Frames = None, seed: _Seed = 0, save: SaveName = None
+) -> None:
     """Tables 5 and 7: frames all of whose labels are right, frames whose poses fit, and errors."""
     network = load_labeler(GLOVE, labeler)
     takes = {kind: simulate_take(kind=kind, num_frames=num_frames, seed=seed) for kind in KINDS}
@@ -57,10 +57,10 @@ def table5(labeler: _Labeler = None, num_frames: _Frames = None, seed: _Seed = 0
 
 def cameras(
     rig: str = "six",
-    labeler: _Labeler = None,
+    labeler: LabelerFile = None,
     num_frames: int = CAMERAS_FRAMES,
     seed: _Seed = 0,
-    save: _Save = None,
+    save: SaveName = None,
 ) -> None:
     """Hands in the air before fewer cameras: the paper switches off more than half of its 16."""
     take = simulate_take(settings=SimulateSettings("single-hand", num_frames, GLOVE, rig, seed))
@@ -77,7 +77,9 @@ def cameras(
     report(save, figures)
 
 
-def calibrated(num_frames: _Frames = None, seed: _Seed = 0, free: float = 40.0, save: _Save = None) -> None:
+def calibrated(
+    num_frames: _Frames = None, seed: _Seed = 0, free: float = 40.0, save: SaveName = None
+) -> None:
     """Our tracker with hands that `handsim calibrate` finds in a capture of the same people.
 
     Args:

@@ -11,11 +11,11 @@ from typing import Annotated, Final, Literal
 import tyro
 from rich.console import Console
 
-from benchmarks.command_line import run as run_commands
 from benchmarks.public.difficulties import BENCHMARK, SIZES
 from benchmarks.public.making import make_benchmark
 from benchmarks.public.manifest import differing_files, load_benchmark
 from benchmarks.public.scoring import score_record, score_results, score_table
+from benchmarks.record import run_commands
 from handsim import HandSimWarning
 from handsim.app.messages import print_line, progress_bar
 from handsim.files.outputs import check_outputs, save_json

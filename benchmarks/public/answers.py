@@ -70,12 +70,7 @@ class Answers:
 def check_labels(
     labels: Int[np.ndarray, "T N"], present: Bool[np.ndarray, "T N"], names: tuple[str, ...]
 ) -> None:
-    """Refuse labels that name no marker, of points that are not there, or given twice in a frame.
-
-    Args:
-        labels: Label of each point.
-        present: Where there are points.
-        names: Names of the labels.
+    """Refuse labels that name no marker, of points that are not there (`present`), or given twice in a frame.
 
     Raises:
         BenchmarkError: The first frame in which a label is wrong, counted from 1, and how.
@@ -130,15 +125,6 @@ def save_answers(path: Path, answers: Answers) -> None:
             arrays[name] = getattr(answers, name).astype(np.float32)
     with atomic_write(path) as temporary, temporary.open("wb") as file:
         np.savez(file, allow_pickle=False, **arrays)
-
-
-def load_answers(path: Path) -> Answers:
-    """Read an `.npz` with the array `labels` and perhaps `joints` [m] and `angles` [rad].
-
-    Raises:
-        BenchmarkError: It cannot be read, or the arrays are not as stated in `Answers`.
-    """
-    return unpack_answers(load_arrays(path))
 
 
 def load_arrays(path: Path) -> dict[str, np.ndarray[Any, Any]]:

@@ -12,7 +12,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from benchmarks.public.answers import SIDES, Answers, BenchmarkError, load_answers
+from benchmarks.public.answers import SIDES, Answers, BenchmarkError, load_arrays, unpack_answers
 from benchmarks.public.difficulties import BENCHMARK, DIFFICULTIES, GLOVE, Plan
 from gloves import Capture, load_layout, read_capture
 from handsim import __version__
@@ -96,7 +96,7 @@ class Benchmark:
         """
         path = self._checked(truth_path(name))
         try:
-            return load_answers(path)
+            return unpack_answers(load_arrays(path))
         except BenchmarkError as error:
             raise BenchmarkError(f"{path}: {error}") from error
 
@@ -110,13 +110,7 @@ class Benchmark:
 
 
 def write_manifest(out: Path, plan: Plan, files: list[str]) -> Benchmark:
-    """Write the manifest, which makes the benchmark complete.
-
-    Args:
-        out: The benchmark's folder.
-        plan: Its captures.
-        files: Paths of all other files in it.
-    """
+    """Write the manifest of a benchmark's folder and its files, which makes it complete."""
     sums = {file: checksum(out / file) for file in sorted(files)}
     captures = [
         {

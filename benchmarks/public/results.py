@@ -70,10 +70,7 @@ def find_results(folder: Path, names: Sequence[str]) -> tuple[dict[str, Path], l
 def read_result(path: Path, capture: Capture, label_names: tuple[str, ...]) -> Answers:
     """Labels, and joints [m] and joint angles [rad] if there are any, of one capture.
 
-    Args:
-        path: The file; its ending and its content decide the form.
-        capture: The capture's points.
-        label_names: Names of the labels.
+    The ending and the content of the file decide its form.
 
     Raises:
         BenchmarkError: It cannot be read, or does not fit the capture: one sentence with the first fault.

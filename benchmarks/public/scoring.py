@@ -89,12 +89,7 @@ class Score:
 
 
 def score_results(benchmark: Benchmark, results: Path, *, done: Callable[[], None] | None = None) -> Score:
-    """Compare results with the truth.
-
-    Args:
-        benchmark: The benchmark.
-        results: Folder of results, see `benchmarks.public.results`.
-        done: Called after each capture.
+    """Compare a folder of results with the truth; `done` is called after each capture.
 
     Raises:
         BenchmarkError: A file is damaged or does not fit its capture.
@@ -130,15 +125,7 @@ def score_capture(
     present: Bool[np.ndarray, "T N"],
     num_labels: int,
 ) -> CaptureScore:
-    """Compare a result with the truth of its capture.
-
-    Args:
-        capture: The capture.
-        result: Labels, joints and angles that were given, of as many frames and columns.
-        truth: The true ones.
-        present: Where the capture has points.
-        num_labels: Number of labels.
-    """
+    """Compare a result with the truth of its capture; `present` is where it has points."""
     frames = (
         (given[here].astype(np.int64), np.full(here.sum(), np.nan), true[here].astype(np.int64))
         for given, true, here in zip(result.labels, truth.labels, present, strict=True)
@@ -184,12 +171,7 @@ def difficulties_of(score: Score) -> tuple[str, ...]:
 
 
 def score_record(score: Score, results: str) -> dict[str, Any]:
-    """All figures for JSON: shares in [0, 1], errors in mm and degrees; None where nothing was counted.
-
-    Args:
-        score: The score.
-        results: What was scored.
-    """
+    """All figures for JSON: shares in [0, 1], errors in mm and degrees; None where nothing was counted."""
     return {
         "benchmark": BENCHMARK,
         "size": score.benchmark.size,
@@ -220,13 +202,7 @@ def _errors(errors: np.ndarray) -> dict[str, float | None]:
 
 
 def _completed(capture: BenchmarkCapture, score: CaptureScore | None, posed: bool) -> CaptureScore:
-    """A score with zeros for what these results lack.
-
-    Args:
-        capture: The capture.
-        score: Its score; None if it has no results.
-        posed: Whether the results of any capture have joints.
-    """
+    """A score with zeros for what these results lack; `posed` if those of any capture have joints."""
     zeros = dict.fromkeys(POSE_SHARES, 0.0) if posed else {}
     if score is None:
         shares = dict.fromkeys(LABEL_SHARES, 0.0)

@@ -14,7 +14,7 @@ from typing import Annotated, Any, Final
 
 import tyro
 
-from benchmarks.command_line import run as run_commands
+from benchmarks.record import run_commands
 from handsim.app.messages import print_line
 from handsim.errors import FileError, HandSimError, choices
 from handsim.files.inputs import checksum

@@ -1,7 +1,7 @@
 """Kernels that a command needs are compiled ahead, by as many processes as there are cores.
 
 data/kernels.json lists the kernels of every command: the types of their arguments, by rows of a table in
-which rows refer to earlier ones, and the time to compile each. `python -m benchmarks.cold_start --record`
+which rows refer to earlier ones, and the time to compile each. `python -m benchmarks.kernel_list`
 writes it. A kernel that the list lacks is compiled when it is called; one out of use only costs time.
 """
 

@@ -15,6 +15,15 @@ from gloves.takes.worn import FormerHands
 from handsim import Camera, HandModel, HandSimError, Lens, write_page
 from tests.film.filmed import SIZE, Filming, moving_take
 
+CASES = {
+    "plain": (Filming(seed=1), ("right",)),
+    "two hands": (Filming(seed=2, swapped=0.15), ("left", "right")),
+    "sides are always wrong": (Filming(seed=3, swapped=1.0), ("right",)),
+    "a phone that is held upright": (Filming(seed=1, readout=(0.02, 0.0)), ("right",)),
+    "many misses": (Filming(seed=4, missing=0.5, outliers=0.2), ("left",)),
+    "a stranger's hand": (Filming(seed=5, stranger=True), ("right",)),
+}
+
 
 def errors(found: Camera, true: Camera) -> tuple[float, float, float]:
     """Degrees, millimeters and percent of the focal length."""
@@ -26,16 +35,6 @@ def errors(found: Camera, true: Camera) -> tuple[float, float, float]:
 def clock_error(found: Registration, filming: Filming) -> float:
     """[ms] in the middle of the video."""
     return 1e3 * abs(found.offset + found.drift * filming.seconds / 2.0 - filming.offset)
-
-
-CASES = {
-    "plain": (Filming(seed=1), ("right",)),
-    "two hands": (Filming(seed=2, swapped=0.15), ("left", "right")),
-    "sides are always wrong": (Filming(seed=3, swapped=1.0), ("right",)),
-    "a phone that is held upright": (Filming(seed=1, readout=(0.02, 0.0)), ("right",)),
-    "many misses": (Filming(seed=4, missing=0.5, outliers=0.2), ("left",)),
-    "a stranger's hand": (Filming(seed=5, stranger=True), ("right",)),
-}
 
 
 @pytest.mark.parametrize("case", CASES)

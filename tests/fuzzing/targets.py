@@ -64,7 +64,8 @@ def _read_packet(path: Path) -> None:
     if kind == Kind.SERVER_INFO or path.name == "info":
         parse_server_info(payload)
     else:
-        parse_frame(payload, (4, 1) if path.name.endswith("4.1") else (3, 0))
+        frame = parse_frame(payload, (4, 1) if path.name.endswith("4.1") else (3, 0))
+        assert np.isfinite(frame.points).all() and len(frame.points) == len(frame.ids)
 
 
 def _read_photo(path: Path) -> None:

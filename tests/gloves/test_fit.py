@@ -28,6 +28,10 @@ from handsim.hand.skin import vertex_normals
 from tests.meshes import blend_skin
 
 MODELS = {side: HandModel.named("M", side=side) for side in ("left", "right")}
+LAYOUT = load_layout("dense19")
+STALKS = dataclasses.replace(
+    LAYOUT, markers=tuple(dataclasses.replace(marker, height=0.01) for marker in LAYOUT.markers)
+)
 
 
 def test_no_poses_have_no_markers():
@@ -140,14 +144,6 @@ def test_the_nearest_markers_are_named() -> None:
     )
     assert (first, second) == (fit.layout.names[2], fit.layout.names[7])
     assert distance == pytest.approx(0.005)
-
-
-LAYOUT = load_layout("dense19")
-
-
-STALKS = dataclasses.replace(
-    LAYOUT, markers=tuple(dataclasses.replace(marker, height=0.01) for marker in LAYOUT.markers)
-)
 
 
 @pytest.mark.parametrize("layout", [LAYOUT, STALKS])

@@ -25,6 +25,28 @@ DENSE19 = (
     "ThumbCMC ThumbMCP ThumbIP ThumbTip IndexMCP IndexPIP IndexTip MiddleMCP MiddlePIP MiddleTip "
     "RingMCP RingPIP RingTip PinkyMCP PinkyPIP PinkyTip BackHand1 BackHand2 BackHand3"
 ).split()
+NAMES = st.text(st.characters(exclude_categories=["C", "Z"]), min_size=1, max_size=8)
+NUMBERS = {
+    "along": st.floats(-0.3, 1.3),
+    "around": st.floats(-180.0, 180.0).map(math.radians),
+    "height": st.just(0.0) | st.floats(0.0, 0.05),
+}
+PLACES = st.one_of(
+    st.builds(MarkerPlace, NAMES, st.sampled_from(BONE_NAMES), **NUMBERS),
+    st.builds(MarkerPlace, NAMES, st.just("palm"), across=st.floats(-1.0, 1.0), **NUMBERS),
+)
+LAYOUTS = st.builds(
+    MarkerLayout,
+    NAMES,
+    st.lists(PLACES, min_size=5, max_size=60, unique_by=lambda place: place.name).map(tuple),
+    st.floats(0.0005, 0.015),
+    st.sampled_from([("left", "right"), ("right",), ("left",)]),
+)
+TOP = 'name = "g"\nradius_mm = 3.2'
+DENSE = (Path(gloves.layout.__file__).parent / "layouts" / "dense19.toml").read_text("utf-8")
+REMARKED = DENSE.replace("along = 0.32\naround = -40.0\n", "along = 0.32 # a third\naround = -40.0# side\n")
+STALKED = DENSE.replace("across = 0.225", "across = 0.225\nheight_mm = 12 # a stalk")
+ONE_SIDED = DENSE.replace("radius_mm", 'sides = ["left"] # the other hand wears none\nradius_mm')
 
 
 def test_shipped_layouts() -> None:
@@ -117,25 +139,6 @@ def test_starter_loads(tmp_path: Path) -> None:
     assert max(map(len, starter_layout().splitlines())) <= 110
 
 
-NAMES = st.text(st.characters(exclude_categories=["C", "Z"]), min_size=1, max_size=8)
-NUMBERS = {
-    "along": st.floats(-0.3, 1.3),
-    "around": st.floats(-180.0, 180.0).map(math.radians),
-    "height": st.just(0.0) | st.floats(0.0, 0.05),
-}
-PLACES = st.one_of(
-    st.builds(MarkerPlace, NAMES, st.sampled_from(BONE_NAMES), **NUMBERS),
-    st.builds(MarkerPlace, NAMES, st.just("palm"), across=st.floats(-1.0, 1.0), **NUMBERS),
-)
-LAYOUTS = st.builds(
-    MarkerLayout,
-    NAMES,
-    st.lists(PLACES, min_size=5, max_size=60, unique_by=lambda place: place.name).map(tuple),
-    st.floats(0.0005, 0.015),
-    st.sampled_from([("left", "right"), ("right",), ("left",)]),
-)
-
-
 @given(layout=LAYOUTS)
 def test_round_trip(tmp_path_factory: pytest.TempPathFactory, layout: MarkerLayout) -> None:
     path = tmp_path_factory.mktemp("layout") / "glove.toml"
@@ -163,7 +166,6 @@ def text(*, count: int = 5, radius_mm: str = "3.2", top: str = "", **keys: str) 
     return "\n".join(parts)
 
 
-TOP = 'name = "g"\nradius_mm = 3.2'
 BAD = {
     "unknown bone": (
         text(bone='"index_proximl"'),
@@ -255,13 +257,6 @@ def test_pinky_is_another_name_of_the_little_finger(tmp_path: Path) -> None:
     (tmp_path / "glove.toml").write_text(text.replace('"little_', '"pinky_'))
     (tmp_path / "same.toml").write_text(text)
     assert load_layout(tmp_path / "glove.toml") == load_layout(tmp_path / "same.toml")
-
-
-DENSE = (Path(gloves.layout.__file__).parent / "layouts" / "dense19.toml").read_text("utf-8")
-
-REMARKED = DENSE.replace("along = 0.32\naround = -40.0\n", "along = 0.32 # a third\naround = -40.0# side\n")
-STALKED = DENSE.replace("across = 0.225", "across = 0.225\nheight_mm = 12 # a stalk")
-ONE_SIDED = DENSE.replace("radius_mm", 'sides = ["left"] # the other hand wears none\nradius_mm')
 
 
 @pytest.mark.parametrize("text", [DENSE, starter_layout(), REMARKED, STALKED, ONE_SIDED])

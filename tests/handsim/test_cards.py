@@ -14,6 +14,15 @@ from handsim import HandModel, load_rig
 from handsim.cards import card, map_drawing, share_drawing, span_drawing
 from tests.programs import run_python
 
+THINGS = {
+    "take": lambda: take_of("right"),
+    "take of two hands": lambda: take_of("right", "left"),
+    "layout": lambda: load_layout("dense19"),
+    "layout of six": lambda: load_layout("starter6"),
+    "rig": lambda: load_rig("figure5"),
+    "rig of six": lambda: load_rig("six"),
+}
+
 
 @pytest.fixture(scope="module")
 def training_set(tmp_path_factory):
@@ -23,16 +32,6 @@ def training_set(tmp_path_factory):
 def take_of(*sides: str) -> Take:
     hands = [attach(load_layout("sparse13"), HandModel.named("M", side=side)) for side in sides]
     return Take.of_poses(hands, np.tile(np.eye(1, 27, 3)[:, None], (6, len(hands), 1)), rate=100.0)
-
-
-THINGS = {
-    "take": lambda: take_of("right"),
-    "take of two hands": lambda: take_of("right", "left"),
-    "layout": lambda: load_layout("dense19"),
-    "layout of six": lambda: load_layout("starter6"),
-    "rig": lambda: load_rig("figure5"),
-    "rig of six": lambda: load_rig("six"),
-}
 
 
 def checked(html: str) -> ET.Element:

@@ -24,6 +24,10 @@ from handsim._imports import (
 )
 from tests.programs import ROOT, run_python
 
+FOREIGN = pytest.mark.parametrize(
+    ("name", "package"), [("train", False), ("render", True), ("poses", False), ("gloves", True)]
+)
+
 
 def import_in(folder: Path, code: str, *flags: str) -> subprocess.CompletedProcess[str]:
     """Run `code` as a script's neighbor would, with handsim on the path after the script's own folder."""
@@ -53,11 +57,6 @@ def lay(folder: Path, name: str, *, package: bool) -> Path:
     (folder / name).mkdir()
     (folder / name / "__init__.py").write_text("x = 1")
     return folder / name
-
-
-FOREIGN = pytest.mark.parametrize(
-    ("name", "package"), [("train", False), ("render", True), ("poses", False), ("gloves", True)]
-)
 
 
 @FOREIGN

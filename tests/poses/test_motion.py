@@ -39,6 +39,8 @@ from poses.shapes import (
 from poses.touch import FINGERS, is_touching
 from tests.sentences import error_names
 
+RATE = 120.0
+
 
 @given(seed=st.integers(0, 1000), side=st.sampled_from(["left", "right"]))
 @settings(max_examples=5, deadline=None)
@@ -189,9 +191,6 @@ def test_bad_motions_are_told(rng):
         HandMotion(np.zeros((0, 27)), 120.0)
     with pytest.raises(ArgumentError, match=r"the rate \[Hz\] is 0"):
         HandMotion(np.zeros((1, 27)), 0.0)
-
-
-RATE = 120.0
 
 
 @settings(max_examples=30, deadline=None)

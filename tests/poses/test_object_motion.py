@@ -47,6 +47,8 @@ from poses.shapes import MAX_PENETRATION, is_valid, resting_angles
 from tests.meshes import hands_overlap, winding
 
 FACETS = 0.0008  # a mesh of few triangles lies inside the round part it stands for [m]
+RATE = 120.0
+FRAMES = 600
 
 
 @pytest.fixture(scope="module")
@@ -249,10 +251,6 @@ def test_what_no_hand_can_hold_is_told(tmp_path, rng):
     globe = load_object(tmp_path / "globe.stl", mass=5.0)
     with pytest.raises(PoseError, match=r"this hand does not get hold of the globe.stl in \d+ tries"):
         settle_hold(HandModel.named("XS"), globe, rng=rng)
-
-
-RATE = 120.0
-FRAMES = 600
 
 
 @functools.cache

@@ -14,6 +14,9 @@ from handsim.space.camera import pinhole
 from render import BodyTruth, HandTruth, Pictures, RenderedFrame
 from render.frames import PARTS_A_HAND
 
+SIZE = (96, 72)
+EYE = np.array([0.2, -0.55, 0.35])
+
 
 @pytest.fixture(scope="session")
 def model() -> HandModel:
@@ -26,8 +29,6 @@ def attachment(model: HandModel) -> Attachment:
 
 
 MakeFrame = Callable[..., RenderedFrame]
-SIZE = (96, 72)
-EYE = np.array([0.2, -0.55, 0.35])
 
 
 @pytest.fixture

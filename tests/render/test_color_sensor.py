@@ -21,6 +21,8 @@ from render.color_sensor import (
     shutter_times,
 )
 
+HEIGHT, WIDTH = 60, 200
+
 
 def every_value() -> np.ndarray:
     """All 256 values in all three colors."""
@@ -124,9 +126,6 @@ def test_blur_spreads_light_and_loses_none() -> None:
     assert 0.3 < seen[4, 4, 0] < 0.7 and seen[4, 5, 0] > 0.05
     assert seen[2].max() == 0.0
     assert np.abs(seen.sum(axis=(0, 1)) - 1.0).max() < 0.03
-
-
-HEIGHT, WIDTH = 60, 200
 
 
 def bar(left: float, width: float = 20.0) -> np.ndarray:

@@ -18,6 +18,7 @@ from render.scenery.backgrounds import photo_files, pick_photo
 
 RAMP = np.tile(np.linspace(0, 255, 40).round().astype(np.uint8), (30, 1))
 COLORS = np.stack([RAMP, RAMP[:, ::-1], np.full_like(RAMP, 90)], axis=-1)
+LIGHT = np.linspace(0.1, 30.0, 24 * 48 * 3, dtype=np.float32).reshape(24, 48, 3)
 
 
 def gray_16(path):
@@ -128,9 +129,6 @@ def test_what_is_no_photograph_is_told_by_name(tmp_path, name, make, why, capfd)
     with pytest.raises(FileError, match=rf"{name}: .*{why}"):
         read_photograph(tmp_path / name)
     assert capfd.readouterr().err == ""
-
-
-LIGHT = np.linspace(0.1, 30.0, 24 * 48 * 3, dtype=np.float32).reshape(24, 48, 3)
 
 
 def exr(path, light=LIGHT, **header):

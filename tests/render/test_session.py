@@ -47,6 +47,13 @@ ABOVE = Camera(
 )
 BARE = RenderConfig(passes=("depth", "ids"), depth_sensor=None)
 MODEL = HandModel.named("S", side="left")
+_OF_PASSES = {
+    "depth_file", "depth_ideal_file", "ids_file", "normals_file", "depth_sensor", "depth_noise", "seed",
+}  # fmt: skip
+MAIN = "import sys; from handsim.cli.main import main; sys.exit(main())"
+PLAIN = RenderConfig(
+    view=ViewConfig(camera="vga", views=2), depth_sensor=None, color_sensor=None, every=12, frames_per_shard=2
+)
 
 
 @pytest.fixture(scope="module")
@@ -83,11 +90,6 @@ def test_frames_are_spread_over_the_poses():
     assert numbers == [1, 4, 7]
     config = dataclasses.replace(BARE, frames=(0, 8, 2, 4), every=2)
     assert [frame.number for frame in draw(qpos, model=MODEL, camera=ABOVE, config=config)] == [2]
-
-
-_OF_PASSES = {
-    "depth_file", "depth_ideal_file", "ids_file", "normals_file", "depth_sensor", "depth_noise", "seed",
-}  # fmt: skip
 
 
 def _annotations(folder):
@@ -312,12 +314,6 @@ def path(tmp_path_factory):
     file = tmp_path_factory.mktemp("take") / "take.truth.npz"
     simulate_take(kind="hand-controller", num_frames=48).save(file)
     return file
-
-
-MAIN = "import sys; from handsim.cli.main import main; sys.exit(main())"
-PLAIN = RenderConfig(
-    view=ViewConfig(camera="vga", views=2), depth_sensor=None, color_sensor=None, every=12, frames_per_shard=2
-)
 
 
 def drawn(path, config):

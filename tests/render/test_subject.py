@@ -25,6 +25,7 @@ from render.subject import subject_of
 K = np.array([[300.0, 0, 161.5], [0, 302.0, 118.25], [0, 0, 1]])
 D = np.array([[-0.2, 0.06, 0.001, -0.0015, 0.01]])
 R, T = cv2.Rodrigues(np.array([0.02, -0.08, 0.03]))[0], np.array([[-0.06], [0.003], [0.01]])
+BASE = join_qpos(np.zeros((2, 20)))
 
 
 @pytest.fixture
@@ -183,9 +184,6 @@ def test_blur_keeps_to_one_person(tmp_path, qpos):
     assert frame.noisy.rgb is not None and frame.time == times[1]
     with pytest.raises(HandSimError, match="poses without times have no motion to blur"):
         render_take(PoseFile(saved(tmp_path, qpos=qpos)), tmp_path / "out", ("png",), config)
-
-
-BASE = join_qpos(np.zeros((2, 20)))
 
 
 def changed(index, value):

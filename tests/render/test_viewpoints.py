@@ -19,6 +19,12 @@ from render.viewpoints import Framing, Placement, Viewpoints
 from train import simulate_take
 from train.simulation.takes import SimulatedKind
 
+FRAMES, STEP = 480, 16
+WHOLE, SIDE = 0.95, 0.30  # of pictures with all hands; a hand's longer side, of the height
+APART = ("single-hand", "calibration", "free")  # kinds of takes with hands half a meter from each other
+LEAST = {"rig": 0.2, "orbit": 0.25}  # of those, where cameras cannot stay where both are large
+PLACED = [name for name in get_args(Placement) if name != "head"]
+
 
 @pytest.fixture(scope="module")
 def take() -> Take:
@@ -69,13 +75,6 @@ def test_cameras_must_look_at_the_hands():
         check(seeing, blind)
     with pytest.raises(RigError, match="no camera has a hand in its picture in any of 3 frames"):
         check(blind)
-
-
-FRAMES, STEP = 480, 16
-WHOLE, SIDE = 0.95, 0.30  # of pictures with all hands; a hand's longer side, of the height
-APART = ("single-hand", "calibration", "free")  # kinds of takes with hands half a meter from each other
-LEAST = {"rig": 0.2, "orbit": 0.25}  # of those, where cameras cannot stay where both are large
-PLACED = [name for name in get_args(Placement) if name != "head"]
 
 
 @functools.cache

@@ -27,6 +27,7 @@ from track.output.recorder import Recorder
 from train import evaluate_labeler, load_labeler, simulate_take
 
 FRAMES, RATE = 60, 120.0
+TRACKED_FRAMES = 60
 
 
 def capture_of(frames):
@@ -120,9 +121,6 @@ def test_a_mirrored_capture_has_the_other_sides():
     count = straight.hands[0].layout.num_markers
     swapped = np.where(mirrored.labels >= 0, (mirrored.labels + count) % (2 * count), -1)
     assert (straight.labels == swapped).mean() > 0.99
-
-
-TRACKED_FRAMES = 60
 
 
 @pytest.fixture(scope="module")

@@ -27,6 +27,7 @@ from track.user import nominal_user
 from train import load_labeler, simulate_take
 
 RATE = 120.0
+FRAMES = 60
 
 
 def frames_of(shapes, *, seed: int, noise: float = 0.0015, seconds: float = 1.0) -> list[StreamedFrame]:
@@ -159,9 +160,6 @@ def test_measured_hands_are_found_in_most_frames_or_in_some_that_fit_well(share,
     measured = shape_from_measures(0.187 + off, 0.085)
     fit = SizeFit(attach(load_layout("dense19"), HandModel(measured)), 0.001, 0.003)
     assert _is_found(fit, shown, ("right",), load_labeler("dense19")) is is_found
-
-
-FRAMES = 60
 
 
 @pytest.fixture(scope="module")

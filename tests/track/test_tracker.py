@@ -23,6 +23,50 @@ from track import TrackedFrame, Tracker, TrackerConfig, User
 from track.kinematics.pose_spread import NUM_NUMBERS, HandErrors
 from train import Labeler, load_labeler, simulate_take
 
+NUM_MARKERS = 38
+SURE = Status.TRACKED, Status.INITIALIZED
+LIMITS = TrackerConfig()
+FARTHEST = 0.004
+"""[m] that joints may be off on average wherever a hand is said to be tracked."""
+USELESS_IDS: dict[str, Change] = {
+    "none": lambda number, fed: fed._replace(ids=None),
+    "-1": lambda number, fed: fed._replace(ids=0 * fed.ids - 1),
+    "the least number": lambda number, fed: fed._replace(ids=0 * fed.ids + np.iinfo(np.int64).min),
+    "one for all points": lambda number, fed: fed._replace(ids=0 * fed.ids + 7),
+    "new in every frame": lambda number, fed: fed._replace(
+        ids=2**62 - 1000 * number - np.arange(len(fed.ids))
+    ),
+    "in another order": lambda number, fed: only(
+        fed, np.random.default_rng(number).permutation(len(fed.ids))
+    ),
+}
+JITTER = np.random.default_rng(0).normal(size=120)
+CLOCKS: dict[str, tuple[Sequence[int], Callable[[int], float], float]] = {
+    "frames that come twice": ([frame for frame in range(60) for _ in range(2)], float, 1.0),
+    **{
+        f"every tenth frame {apart:g} s after the one before": (
+            range(60), lambda n, apart=apart: n - 1 + 120 * apart if n % 10 == 5 else n, 0.95
+        )
+        for apart in (3e-3, 1e-4, 1e-6)
+    },
+    **{
+        f"stamps that shake by {wide:g} frames": (
+            range(120), np.sort(np.arange(120) + wide * JITTER).__getitem__, 0.95
+        )
+        for wide in (0.24, 0.48)
+    },
+    "30 Hz": (range(0, 240, 4), float, 0.9),
+    "15 Hz": (range(0, 240, 8), float, 0.9),
+}  # fmt: skip
+"""Frames, the time of each in frames of the take, and the least share of them that is right."""
+COORDINATES = st.one_of(
+    st.floats(-0.3, 0.3),
+    st.floats(allow_nan=True, allow_infinity=True),
+    st.sampled_from([0.0, np.nan, 1e300]),
+)
+IDS = st.one_of(st.integers(-2, 12), st.integers(-(2**63), 2**63 - 1))
+TIMES = st.one_of(st.floats(0.0, 1.0), st.floats(-1e9, 1e9), st.just(np.nan))
+
 
 @pytest.fixture(scope="session")
 def labeler():
@@ -42,13 +86,6 @@ def users(take) -> list[GloveFit]:
 @pytest.fixture
 def tracker(users, labeler) -> Tracker:
     return Tracker(users, labeler)
-
-
-NUM_MARKERS = 38
-SURE = Status.TRACKED, Status.INITIALIZED
-LIMITS = TrackerConfig()
-FARTHEST = 0.004
-"""[m] that joints may be off on average wherever a hand is said to be tracked."""
 
 
 class Fed(NamedTuple):
@@ -249,20 +286,6 @@ def test_a_labeler_may_be_named_or_left_to_the_glove(take, users):
     assert np.array_equal(Tracker(users, "dense19").step(points, ids, 0.0).labels, labels)
     named, left = (Tracker(designed, *name).step(points, ids, 0.0) for name in (("dense19",), ()))
     np.testing.assert_array_equal(named.labels, left.labels)
-
-
-USELESS_IDS: dict[str, Change] = {
-    "none": lambda number, fed: fed._replace(ids=None),
-    "-1": lambda number, fed: fed._replace(ids=0 * fed.ids - 1),
-    "the least number": lambda number, fed: fed._replace(ids=0 * fed.ids + np.iinfo(np.int64).min),
-    "one for all points": lambda number, fed: fed._replace(ids=0 * fed.ids + 7),
-    "new in every frame": lambda number, fed: fed._replace(
-        ids=2**62 - 1000 * number - np.arange(len(fed.ids))
-    ),
-    "in another order": lambda number, fed: only(
-        fed, np.random.default_rng(number).permutation(len(fed.ids))
-    ),
-}
 
 
 @pytest.mark.parametrize("kind", USELESS_IDS)
@@ -477,27 +500,6 @@ def test_times_that_are_none_do_not_stop_a_hand(tracker, take, told, note):
     assert not any(frame.notes for frame in tracked[1:])
 
 
-JITTER = np.random.default_rng(0).normal(size=120)
-CLOCKS: dict[str, tuple[Sequence[int], Callable[[int], float], float]] = {
-    "frames that come twice": ([frame for frame in range(60) for _ in range(2)], float, 1.0),
-    **{
-        f"every tenth frame {apart:g} s after the one before": (
-            range(60), lambda n, apart=apart: n - 1 + 120 * apart if n % 10 == 5 else n, 0.95
-        )
-        for apart in (3e-3, 1e-4, 1e-6)
-    },
-    **{
-        f"stamps that shake by {wide:g} frames": (
-            range(120), np.sort(np.arange(120) + wide * JITTER).__getitem__, 0.95
-        )
-        for wide in (0.24, 0.48)
-    },
-    "30 Hz": (range(0, 240, 4), float, 0.9),
-    "15 Hz": (range(0, 240, 8), float, 0.9),
-}  # fmt: skip
-"""Frames, the time of each in frames of the take, and the least share of them that is right."""
-
-
 @pytest.mark.parametrize("kind", CLOCKS)
 def test_hands_are_followed_by_other_clocks(tracker, take, kind):
     frames, clock, least = CLOCKS[kind]
@@ -571,15 +573,6 @@ class Bench:
 @pytest.fixture(scope="module")
 def bench(users, labeler, take) -> Bench:
     return Bench(users, labeler, take)
-
-
-COORDINATES = st.one_of(
-    st.floats(-0.3, 0.3),
-    st.floats(allow_nan=True, allow_infinity=True),
-    st.sampled_from([0.0, np.nan, 1e300]),
-)
-IDS = st.one_of(st.integers(-2, 12), st.integers(-(2**63), 2**63 - 1))
-TIMES = st.one_of(st.floats(0.0, 1.0), st.floats(-1e9, 1e9), st.just(np.nan))
 
 
 @st.composite

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
-import resource
 import shutil
 import signal
 
@@ -18,6 +17,7 @@ from gloves import load_layout
 from handsim.cli.main import main
 from handsim.errors import WeightsError
 from handsim.files.signals import Stopped
+from tests.limits import file_size_limit
 from tests.sentences import assert_names
 from train import (
     CNNConfig,
@@ -42,6 +42,21 @@ from train.simulation.generation import make_dataset
 SMALL = SetLabelerConfig(width=8, gates=2, depth=1)
 CONFIG = TrainSettings(samples=640, batch=32, network=SMALL)
 OPTIONS = ["--batch", "32", "--network.width", "8", "--network.gates", "2", "--network.depth", "1"]
+OPTION_ERRORS = {
+    "--learning-rate nan": "learning_rate is nan, expected a number above 0, at most 10",
+    "--learning-rate 1e9": "learning_rate is 1e+09, expected a number above 0, at most 10",
+    "--seed -1": "seed is -1, expected 0 or more",
+    "--network.width 0": "width is 0, expected 1 to 4096",
+    "--network.gates 7": "gates is 7, expected a divisor of width, 64",
+    "--batch 0": "batch is 0, expected 1 to 1000000",
+    "--average nan": "average is nan, expected a number from 0 to 1",
+    "--cnn.reject nan": "reject is nan, expected a number above 0",
+    "--threads 0": "threads is 0, expected 1 to 1024",
+}
+CNN = dataclasses.replace(usual_settings("cnn"), samples=48, batch=16, average_every=2, precision="32")
+FIXED_CNN = dataclasses.replace(CNN, cnn=CNNConfig(reject=0.04, spread=0.005))
+"""Without the choice of these two, which takes as long as many steps."""
+NAMES = tuple(f"marker{label}" for label in range(19))
 
 
 @pytest.mark.usefixtures("quickly_learned")
@@ -211,12 +226,8 @@ def test_a_full_disk_is_one_sentence_and_the_checkpoint_stays(dataset, tmp_path,
     assert main([*options, "--samples", "320"]) == 0
     kept = (tmp_path / "run" / CHECKPOINT).read_bytes()
     capsys.readouterr()
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, hard))
-    try:
+    with file_size_limit(10_000):
         assert main([*options, "--samples", "640"]) == 1
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     said = capsys.readouterr().err
     assert said.count("\n") == 1 and "file too large" in said
     assert (tmp_path / "run" / CHECKPOINT).read_bytes() == kept
@@ -224,30 +235,11 @@ def test_a_full_disk_is_one_sentence_and_the_checkpoint_stays(dataset, tmp_path,
     load_labeler(tmp_path / "run")
 
 
-OPTION_ERRORS = {
-    "--learning-rate nan": "learning_rate is nan, expected a number above 0, at most 10",
-    "--learning-rate 1e9": "learning_rate is 1e+09, expected a number above 0, at most 10",
-    "--seed -1": "seed is -1, expected 0 or more",
-    "--network.width 0": "width is 0, expected 1 to 4096",
-    "--network.gates 7": "gates is 7, expected a divisor of width, 64",
-    "--batch 0": "batch is 0, expected 1 to 1000000",
-    "--average nan": "average is nan, expected a number from 0 to 1",
-    "--cnn.reject nan": "reject is nan, expected a number above 0",
-    "--threads 0": "threads is 0, expected 1 to 1024",
-}
-
-
 @pytest.mark.parametrize("options", OPTION_ERRORS)
 def test_options_without_sense_are_told(dataset, tmp_path, capsys, options):
     assert main(["train", str(dataset.path), "--out", str(tmp_path / "run"), *options.split()]) == 1
     assert_names(capsys.readouterr().err.strip(), f"handsim train: {OPTION_ERRORS[options]}")
     assert not (tmp_path / "run").exists()
-
-
-CNN = dataclasses.replace(usual_settings("cnn"), samples=48, batch=16, average_every=2, precision="32")
-
-FIXED_CNN = dataclasses.replace(CNN, cnn=CNNConfig(reject=0.04, spread=0.005))
-"""Without the choice of these two, which takes as long as many steps."""
 
 
 @pytest.mark.slow
@@ -290,9 +282,6 @@ def test_a_minute_of_training_labels_three_times_as_much_as_chance(dataset, tmp_
     markers = dataset.rows()[:24]["markers"].astype(np.float64)
     report = evaluate_labeler(load_labeler(tmp_path), markers, Corruption(0, 0), rng=np.random.default_rng(0))
     assert report.figures["slot_accuracy"] > 3.0 / markers.shape[1]
-
-
-NAMES = tuple(f"marker{label}" for label in range(19))
 
 
 @pytest.fixture(scope="module")

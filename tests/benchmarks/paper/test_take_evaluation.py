@@ -22,6 +22,8 @@ from track import TrackedFrame, TrackedHand
 from track.kinematics.pose_solver import PoseSolver
 from train import simulate_take
 
+SHIFT = np.concatenate([[0.003, 0.0, 0.004], np.zeros(24)])
+
 
 @pytest.fixture(scope="module")
 def take() -> Take:
@@ -143,9 +145,6 @@ def test_pose_errors_are_means_over_joints_and_hinges(take):
         if count:
             assert joint == pytest.approx(0.005 * lacking[:, 1].sum() / count)
             assert angle == 0.0
-
-
-SHIFT = np.concatenate([[0.003, 0.0, 0.004], np.zeros(24)])
 
 
 def test_nothing_counted_is_nan_and_no_warning(take):

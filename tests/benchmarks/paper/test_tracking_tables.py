@@ -7,7 +7,6 @@ import dataclasses
 import numpy as np
 import pytest
 
-from benchmarks.command_line import run
 from benchmarks.paper.printed import CAMERAS, HAN, TABLE3, TABLE5, TABLE7
 from benchmarks.paper.take_evaluation import TrackingReport
 from benchmarks.paper.tracking_tables import (
@@ -18,6 +17,7 @@ from benchmarks.paper.tracking_tables import (
     measure_with_body,
     table_figures,
 )
+from benchmarks.record import run_commands
 from train import load_labeler, simulate_take
 from train.simulation.room import TWINS
 from train.simulation.scenes import KINDS
@@ -59,7 +59,7 @@ def test_errors_are_means_over_poses():
 
 @pytest.mark.slow
 def test_few_cameras(capsys):
-    assert run("benchmarks.paper", "", TRACKING_TABLES, ["cameras", "--num-frames", "8"]) == 0
+    assert run_commands("benchmarks.paper", "", TRACKING_TABLES, ["cameras", "--num-frames", "8"]) == 0
     said = capsys.readouterr().out
     take = simulate_take(kind="single-hand", num_frames=8, rig="six")
     missing = 100 * (1.0 - take.markers_present().mean())

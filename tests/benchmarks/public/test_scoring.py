@@ -10,11 +10,11 @@ import warnings
 import numpy as np
 import pytest
 
-from benchmarks.command_line import run
 from benchmarks.public.__main__ import COMMANDS
 from benchmarks.public.answers import Answers, BenchmarkError, save_answers
 from benchmarks.public.manifest import MANIFEST, load_benchmark, truth_path
 from benchmarks.public.scoring import score_results
+from benchmarks.record import run_commands
 from handsim import HandSimWarning
 from handsim.hand.model import KEYPOINT_NAMES
 
@@ -22,7 +22,7 @@ PERFECT = ("frame_accuracy", "slot_accuracy", "point_accuracy", "macro_f1", "pos
 
 
 def command(words):
-    return run("benchmarks.public", "", COMMANDS, words)
+    return run_commands("benchmarks.public", "", COMMANDS, words)
 
 
 @pytest.fixture(autouse=True)

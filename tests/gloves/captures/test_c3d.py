@@ -15,6 +15,9 @@ from tests.sentences import error_names
 INTEL, DEC, SGI = 84, 85, 86
 ORDER = {INTEL: "<", DEC: "<", SGI: ">"}
 POINTS = np.array([[[1.5, -2.0, 3.0], [40.0, 50.5, -60.0]], [[7.0, 8.0, 9.0], [0.5, 0.25, 0.125]]])
+MM = dict.fromkeys(("mm", "Mill", " mm.", "mm\0inch"), 1e-3)
+METERS = dict.fromkeys(("M", "Mete", "METERS", "metre"), 1.0)
+BIG = np.tile(POINTS, (40, 1, 1))  # more than what may fill a file
 
 
 def floats(values: np.ndarray, processor: int) -> bytes:
@@ -120,10 +123,6 @@ def test_every_number_format_reads_as_ezc3d_reads_it(tmp_path, processor, scale,
         np.testing.assert_allclose(capture.positions.transpose(2, 1, 0) * 1e3, other["data"]["points"][:3])
 
 
-MM = dict.fromkeys(("mm", "Mill", " mm.", "mm\0inch"), 1e-3)
-METERS = dict.fromkeys(("M", "Mete", "METERS", "metre"), 1.0)
-
-
 @pytest.mark.parametrize(("unit", "meters"), [*MM.items(), ("cm ", 1e-2), *METERS.items()])
 def test_units(unit, meters):
     np.testing.assert_allclose(read_c3d(c3d(units=unit)).positions, POINTS * meters)
@@ -146,9 +145,6 @@ def test_a_parameter_that_the_header_has_may_be_absent(recwarn: pytest.WarningsR
             np.testing.assert_allclose(capture.positions, POINTS * 1e-3)
             assert capture.rate == 120.0
     assert not recwarn
-
-
-BIG = np.tile(POINTS, (40, 1, 1))  # more than what may fill a file
 
 
 @pytest.mark.parametrize("processor", [INTEL, DEC, SGI])

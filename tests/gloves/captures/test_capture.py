@@ -21,6 +21,28 @@ from tests.sentences import assert_names
 
 WORDS = st.text(st.characters(exclude_categories=["C", "Z"]), min_size=1, max_size=12)
 NAMES = st.one_of(WORDS, st.builds("{} {}".format, WORDS, WORDS), st.just("*12"), st.just("Unlabeled 2379"))
+MISTAKES = [
+    (lambda at: read_capture(at / "take.tcr"), "folder/take.tcr | '.tcr' | '.trc' | .c3d, .csv, .tsv"),
+    (lambda at: read_capture(at / "take"), "folder/take | '' | .trc, .c3d, .csv, .tsv"),
+    (lambda at: read_capture(at / "take.trc"), "folder/take.trc | No such file"),
+    (lambda at: read_capture(at / "own.npy"), "own.npy | gloves.Capture(names, positions, rate)"),
+    (lambda at: read_capture(at / "own.npz"), "own.npz | load_take | gloves.Capture(names, positions, rate)"),
+    (lambda at: read_capture(at / "folder.trc"), "folder/folder.trc | this is a folder"),
+    (lambda at: read_capture(at / "empty.trc"), "folder/empty.trc | empty"),
+    (lambda at: write_capture(at / "take.tsv", alone()), "folder/take.tsv | '.tsv' | .trc, .c3d, .csv"),
+    (lambda at: write_capture(at / "folder.trc", alone()), "folder/folder.trc | this is a folder"),
+    (lambda at: write_capture(at / "x.trc", alone("a\tb")), "folder/x.trc | 'a\\tb' | printable"),
+    (lambda at: write_capture(at / "x.trc", alone("")), "folder/x.trc | '' | printable"),
+    (lambda at: write_capture(at / "x.c3d", alone("a" * 300)), "folder/x.c3d | aaaa...aaaa | 255 bytes"),
+    (lambda at: alone(shape=(2, 2, 3)), "(2, 2, 3) | (T, 1, 3) | 1 names"),
+    (lambda at: alone(shape=(0, 1, 3)), "at least one frame | 0 frames of 1"),
+    (lambda at: Capture((), np.zeros((2, 0, 3)), 120.0), "at least one frame | 2 frames of 0"),
+    (lambda at: alone(fill=np.inf), "infinite | finite numbers or NaN"),
+    (lambda at: alone(rate=0.0), "0 Hz | 1 to 5000"),
+    (lambda at: alone(rate=np.nan), "nan Hz | 1 to 5000"),
+    (lambda at: alone(rate=np.full(2, 120.0)), "an array (2,) | 1 to 5000"),
+]
+NAMES_PLAUSIBILITY = tuple(f"marker{number}" for number in range(19))
 
 
 @st.composite
@@ -83,29 +105,6 @@ def alone(
     return Capture((name,), np.full(shape, fill), rate)
 
 
-MISTAKES = [
-    (lambda at: read_capture(at / "take.tcr"), "folder/take.tcr | '.tcr' | '.trc' | .c3d, .csv, .tsv"),
-    (lambda at: read_capture(at / "take"), "folder/take | '' | .trc, .c3d, .csv, .tsv"),
-    (lambda at: read_capture(at / "take.trc"), "folder/take.trc | No such file"),
-    (lambda at: read_capture(at / "own.npy"), "own.npy | gloves.Capture(names, positions, rate)"),
-    (lambda at: read_capture(at / "own.npz"), "own.npz | load_take | gloves.Capture(names, positions, rate)"),
-    (lambda at: read_capture(at / "folder.trc"), "folder/folder.trc | this is a folder"),
-    (lambda at: read_capture(at / "empty.trc"), "folder/empty.trc | empty"),
-    (lambda at: write_capture(at / "take.tsv", alone()), "folder/take.tsv | '.tsv' | .trc, .c3d, .csv"),
-    (lambda at: write_capture(at / "folder.trc", alone()), "folder/folder.trc | this is a folder"),
-    (lambda at: write_capture(at / "x.trc", alone("a\tb")), "folder/x.trc | 'a\\tb' | printable"),
-    (lambda at: write_capture(at / "x.trc", alone("")), "folder/x.trc | '' | printable"),
-    (lambda at: write_capture(at / "x.c3d", alone("a" * 300)), "folder/x.c3d | aaaa...aaaa | 255 bytes"),
-    (lambda at: alone(shape=(2, 2, 3)), "(2, 2, 3) | (T, 1, 3) | 1 names"),
-    (lambda at: alone(shape=(0, 1, 3)), "at least one frame | 0 frames of 1"),
-    (lambda at: Capture((), np.zeros((2, 0, 3)), 120.0), "at least one frame | 2 frames of 0"),
-    (lambda at: alone(fill=np.inf), "infinite | finite numbers or NaN"),
-    (lambda at: alone(rate=0.0), "0 Hz | 1 to 5000"),
-    (lambda at: alone(rate=np.nan), "nan Hz | 1 to 5000"),
-    (lambda at: alone(rate=np.full(2, 120.0)), "an array (2,) | 1 to 5000"),
-]
-
-
 @pytest.mark.parametrize(("call", "words"), MISTAKES)
 def test_mistakes_are_told(tmp_path, call, words):
     (tmp_path / "empty.trc").write_bytes(b"")
@@ -139,9 +138,6 @@ def test_gaps_that_begin_and_end_inside_are_measured():
     present = np.array([[letter == "1" for letter in column] for column in columns]).T
     assert run_lengths(~present, inside=True).tolist() == [2, 1] + [3, 1] + [1, 1, 1, 1]
     assert run_lengths(np.zeros((5, 2), bool), inside=True).tolist() == []
-
-
-NAMES_PLAUSIBILITY = tuple(f"marker{number}" for number in range(19))
 
 
 @pytest.fixture

@@ -22,6 +22,53 @@ ALIGNED = "\n".join("  " + "   ".join(line.split()) for line in TRC.split("\n"))
 ONLY_ROWS = "\n".join([*TRC.split("\n")[:5], *SPACED.split("\n")[5:]])
 MOTIVE = motive(LABELED, UNLABELED)
 KEYS = MOTIVE.split("\n")[0]
+VALUES = {
+    **{
+        f"C3D of {kind} {numbers}": (".c3d", c3d(processor=number, scale=scale), (0.0015, -0.002, 0.003))
+        for kind, number in (("Intel", INTEL), ("DEC", DEC), ("SGI", SGI))
+        for numbers, scale in (("floats", -1.0), ("integers", 0.125))
+    },
+    "C3D in centimeters": (".c3d", c3d(units="cm"), (0.015, -0.02, 0.03)),
+    "TRC in meters": (".trc", TRC.replace("mm", "m"), (0.25, -0.05, 3.0)),
+    "Motive": (".csv", MOTIVE, None),
+    "Vicon": (".csv", nexus(), (0.0005, 0.0015, 0.0025)),
+    "Qualisys": (".tsv", qtm(), None),
+}  # fmt: skip
+REFUSED = {
+    "blank cells between spaces": (
+        ".trc",
+        SPACED.replace("0.25 -0.05 3.00 ", "", 1),
+        "line 7 has 8 cells and line 6 5 | spaces | nan in blank cells",
+    ),
+    "Motive's own": (".tak", b"x", "Motive | closed format | CSV or C3D"),
+    "Vicon's own": (".x2d", b"x", "Vicon | export C3D"),
+    "Cortex' own": (".trb", b"x", "Cortex | TRC or C3D"),
+    "Qualisys' own": (".qtm", b"x", "Qualisys | C3D, or TSV"),
+    "OpenSim's angles": (".mot", b"x", "OpenSim | TRC"),
+    "a skeleton": (".bvh", b"x", "skeleton | export the markers | .c3d"),
+    "a TRC by another ending": (".csv", TRC, "not a table of markers | the content of a TRC; name it .trc"),
+    "Motive's by another ending": (".tsv", MOTIVE, "Motive's CSV; name it .csv"),
+    "DeepLabCut": (".csv", "scorer,a,a,a\nbodyparts,x,x,x\n", "DeepLabCut | write a TRC"),
+    "bodies of Vicon Tracker": (".csv", "Objects\n100\n,,A\nFrame,Sub Frame,RX\n", "Vicon Tracker | bodies"),
+    "ROS": (".csv", "%time,field.header.seq\n", "a topic of ROS | gloves.Capture"),
+    "D-Flow": (".tsv", "TimeStamp\tFrameNumber\tA.PosX\n", "D-Flow | C3D or TRC"),
+    **{
+        f"a pointer in place of a {suffix}": (
+            suffix,
+            "version https://git-lfs.github.com/spec/v1\n",
+            "git lfs pull",
+        )
+        for suffix in (".c3d", ".csv", ".trc")
+    },
+    "compressed": (".gz", b"\x1f\x8b", "compressed; unpack it"),
+    "a date of a spreadsheet": (
+        ".trc",
+        TRC.replace("1.25", "25. Jan", 1),
+        "'25. Jan' | a date | spreadsheet",
+    ),
+    "a date in English": (".csv", MOTIVE.replace("1.010000", "25-Jan", 1), "'25-Jan' | a date | spreadsheet"),
+    "a workbook": (".csv", b"PK\3\4" + bytes(40), "workbook of Excel | save it as text"),
+}
 
 
 def noted(name: str = "take", notes: str = "") -> str:
@@ -101,20 +148,6 @@ def test_blanks_between_spaces(tmp_path):
     np.testing.assert_array_equal(np.argwhere(np.isnan(capture.positions[..., 0])), [[0, 0], [1, 1]])
 
 
-VALUES = {
-    **{
-        f"C3D of {kind} {numbers}": (".c3d", c3d(processor=number, scale=scale), (0.0015, -0.002, 0.003))
-        for kind, number in (("Intel", INTEL), ("DEC", DEC), ("SGI", SGI))
-        for numbers, scale in (("floats", -1.0), ("integers", 0.125))
-    },
-    "C3D in centimeters": (".c3d", c3d(units="cm"), (0.015, -0.02, 0.03)),
-    "TRC in meters": (".trc", TRC.replace("mm", "m"), (0.25, -0.05, 3.0)),
-    "Motive": (".csv", MOTIVE, None),
-    "Vicon": (".csv", nexus(), (0.0005, 0.0015, 0.0025)),
-    "Qualisys": (".tsv", qtm(), None),
-}  # fmt: skip
-
-
 @pytest.mark.parametrize("kind", VALUES)
 def test_first_point(tmp_path, kind):
     suffix, content, point = VALUES[kind]
@@ -122,43 +155,6 @@ def test_first_point(tmp_path, kind):
     assert not told and not capture.findings
     if point is not None:
         np.testing.assert_allclose(capture.positions[0, 0], point)
-
-
-REFUSED = {
-    "blank cells between spaces": (
-        ".trc",
-        SPACED.replace("0.25 -0.05 3.00 ", "", 1),
-        "line 7 has 8 cells and line 6 5 | spaces | nan in blank cells",
-    ),
-    "Motive's own": (".tak", b"x", "Motive | closed format | CSV or C3D"),
-    "Vicon's own": (".x2d", b"x", "Vicon | export C3D"),
-    "Cortex' own": (".trb", b"x", "Cortex | TRC or C3D"),
-    "Qualisys' own": (".qtm", b"x", "Qualisys | C3D, or TSV"),
-    "OpenSim's angles": (".mot", b"x", "OpenSim | TRC"),
-    "a skeleton": (".bvh", b"x", "skeleton | export the markers | .c3d"),
-    "a TRC by another ending": (".csv", TRC, "not a table of markers | the content of a TRC; name it .trc"),
-    "Motive's by another ending": (".tsv", MOTIVE, "Motive's CSV; name it .csv"),
-    "DeepLabCut": (".csv", "scorer,a,a,a\nbodyparts,x,x,x\n", "DeepLabCut | write a TRC"),
-    "bodies of Vicon Tracker": (".csv", "Objects\n100\n,,A\nFrame,Sub Frame,RX\n", "Vicon Tracker | bodies"),
-    "ROS": (".csv", "%time,field.header.seq\n", "a topic of ROS | gloves.Capture"),
-    "D-Flow": (".tsv", "TimeStamp\tFrameNumber\tA.PosX\n", "D-Flow | C3D or TRC"),
-    **{
-        f"a pointer in place of a {suffix}": (
-            suffix,
-            "version https://git-lfs.github.com/spec/v1\n",
-            "git lfs pull",
-        )
-        for suffix in (".c3d", ".csv", ".trc")
-    },
-    "compressed": (".gz", b"\x1f\x8b", "compressed; unpack it"),
-    "a date of a spreadsheet": (
-        ".trc",
-        TRC.replace("1.25", "25. Jan", 1),
-        "'25. Jan' | a date | spreadsheet",
-    ),
-    "a date in English": (".csv", MOTIVE.replace("1.010000", "25-Jan", 1), "'25-Jan' | a date | spreadsheet"),
-    "a workbook": (".csv", b"PK\3\4" + bytes(40), "workbook of Excel | save it as text"),
-}
 
 
 @pytest.mark.parametrize("kind", REFUSED)

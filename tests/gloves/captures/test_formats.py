@@ -14,6 +14,42 @@ from gloves.captures.formats import read_hands, read_motive_csv, read_qtm_tsv, r
 from handsim.errors import CaptureError, HandSimWarning
 from tests.sentences import error_names
 
+ROW = "0\t0\t1\t2\t3\t4\t5\t6"
+POINTS = np.array([[[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]])
+# Type, name, quantities and axes of each asset; a number a column counts up from the left.
+BODY = ("Rigid Body", "Cube", ["Rotation"] * 4 + ["Position"] * 3 + ["Mean Marker Error"], [*"XYZWXYZ", ""])
+BODY_MARKER = ("Rigid Body Marker", "Cube:Marker1", ["Position"] * 3 + ["Marker Quality"], [*"XYZ", ""])
+LABELED = ("Marker", "Glove:ThumbTip", ["Position"] * 3, [*"XYZ"])
+UNLABELED = ("Marker", "Unlabeled 2379", ["Position"] * 3, [*"XYZ"])
+QUOTED = ("Marker", "Glove, left:1", ["Position"] * 3, [*"XYZ"])
+OF_TRC = {"mm": 1e-3, "MM": 1e-3, "cm": 1e-2, "m": 1.0, "Meters": 1.0, " Millimeters ": 1e-3}
+OF_MOTIVE = {"Meters": 1.0, "Centimeters": 1e-2, "Millimeters": 1e-3, None: 1.0, "": 1.0}
+UNITS = [("trc", *one) for one in OF_TRC.items()] + [("motive", *one) for one in OF_MOTIVE.items()]
+DEVICES = """\
+Devices
+1000
+,,Force Plate - Force,,
+Frame,Sub Frame,Fx,Fy,Fz
+,,N,N,N
+1,0,1,2,3
+1,1,Trajectories,5,6
+
+"""
+OUTPUTS = """\
+Model Outputs
+100
+,,Anna:Angles,,
+Frame,Sub Frame,X,Y,Z
+,,deg,deg,deg
+1,0,90,91,92
+2,0,93,94,95
+
+"""
+WANTED = (10 * np.arange(3)[:, None] + np.arange(9) + 0.5).reshape(3, 3, 3) * 1e-3
+NAMES = ("Anna:ThumbTip", "*2", "*12")
+HAND = np.array([[12.5, 34.25, 56], [40, 30, 20], [60.5, 10, 15], [75, 0.5, 5], [90, 8, 1]])
+MARKERS = ("ThumbTip", "IndexTip", "PinkyTip")
+
 
 def trc(
     *rows: str,
@@ -27,10 +63,6 @@ def trc(
     keys = "DataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits"
     values = f"{rate}\t120\t{len(rows)}\t7\t{units}"
     return ("\n".join(["PathFileType\t4\t(X/Y/Z)\tx.trc", keys, values, names, axes, *rows]) + end).encode()
-
-
-ROW = "0\t0\t1\t2\t3\t4\t5\t6"
-POINTS = np.array([[[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]])
 
 
 def row(number: int, cells: str = ROW) -> str:
@@ -221,14 +253,6 @@ def test_all_published_captures_read(sig18):
     assert num_frames == 61_941
 
 
-# Type, name, quantities and axes of each asset; a number a column counts up from the left.
-BODY = ("Rigid Body", "Cube", ["Rotation"] * 4 + ["Position"] * 3 + ["Mean Marker Error"], [*"XYZWXYZ", ""])
-BODY_MARKER = ("Rigid Body Marker", "Cube:Marker1", ["Position"] * 3 + ["Marker Quality"], [*"XYZ", ""])
-LABELED = ("Marker", "Glove:ThumbTip", ["Position"] * 3, [*"XYZ"])
-UNLABELED = ("Marker", "Unlabeled 2379", ["Position"] * 3, [*"XYZ"])
-QUOTED = ("Marker", "Glove, left:1", ["Position"] * 3, [*"XYZ"])
-
-
 def motive(
     *assets: tuple[str, str, list[str], list[str]],
     parent: bool = False,
@@ -269,11 +293,6 @@ def test_markers_are_found_by_type_and_label(parent: bool, timecode: bool) -> No
     starts = np.array([12, 23, 26])
     wanted = np.arange(3)[:, None, None] + (starts[:, None] + np.arange(3)) / 100
     np.testing.assert_allclose(capture.positions, wanted)
-
-
-OF_TRC = {"mm": 1e-3, "MM": 1e-3, "cm": 1e-2, "m": 1.0, "Meters": 1.0, " Millimeters ": 1e-3}
-OF_MOTIVE = {"Meters": 1.0, "Centimeters": 1e-2, "Millimeters": 1e-3, None: 1.0, "": 1.0}
-UNITS = [("trc", *one) for one in OF_TRC.items()] + [("motive", *one) for one in OF_MOTIVE.items()]
 
 
 @pytest.mark.parametrize(("kind", "unit", "meters"), [*UNITS, ("vicon", "cm", 1e-2), ("vicon", "m", 1.0)])
@@ -368,28 +387,6 @@ BAD_MOTIVE = {
 }
 
 
-DEVICES = """\
-Devices
-1000
-,,Force Plate - Force,,
-Frame,Sub Frame,Fx,Fy,Fz
-,,N,N,N
-1,0,1,2,3
-1,1,Trajectories,5,6
-
-"""
-OUTPUTS = """\
-Model Outputs
-100
-,,Anna:Angles,,
-Frame,Sub Frame,X,Y,Z
-,,deg,deg,deg
-1,0,90,91,92
-2,0,93,94,95
-
-"""
-
-
 def nexus(
     *,
     names: tuple[str, ...] = ("Anna:ThumbTip", "", "*12"),
@@ -409,10 +406,6 @@ def nexus(
         start = [str(row + 71), "0"][: len(first)]
         lines.append(",".join(start + [f"{10 * row + column + 0.5}" for column in range(3 * len(names))]))
     return "\n".join(lines) + "\n"
-
-
-WANTED = (10 * np.arange(3)[:, None] + np.arange(9) + 0.5).reshape(3, 3, 3) * 1e-3
-NAMES = ("Anna:ThumbTip", "*2", "*12")
 
 
 @pytest.mark.parametrize("before", ["", "\n\n", DEVICES, OUTPUTS, DEVICES + OUTPUTS])
@@ -555,9 +548,6 @@ def test_more_frames_than_stated_are_told() -> None:
     assert told == ["NO_OF_FRAMES is 2, and 3 frames are there; all are read"]
 
 
-HAND = np.array([[12.5, 34.25, 56], [40, 30, 20], [60.5, 10, 15], [75, 0.5, 5], [90, 8, 1]])
-
-
 def table(titles: Sequence[str], behind: str = "", scale: float = 1.0, separator: str = ",") -> str:
     """A hand that moves along x in a table with this line of names, and another line behind it."""
     rows = [[0.01 * n, *(scale * (HAND + [n, 0.0, 0.0])).ravel()] for n in range(20)]
@@ -627,8 +617,6 @@ BAD_QTM = {
         "MARKER_NAMES holds 2 | NO_OF_MARKERS states 999999999",
     ),
 }
-
-
 DAMAGED = [
     pytest.param(suffix, content, words, id=f"{kind}, {case}")
     for kind, suffix, cases in (
@@ -648,9 +636,6 @@ def test_damage_is_told(tmp_path: Path, suffix: str, content: bytes | str, words
     path.write_bytes(content.encode() if isinstance(content, str) else content)
     with error_names(CaptureError, f"{path} | {words}"):
         read_capture(path)
-
-
-MARKERS = ("ThumbTip", "IndexTip", "PinkyTip")
 
 
 @pytest.fixture

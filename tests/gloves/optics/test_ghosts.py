@@ -19,6 +19,8 @@ from handsim import load_rig
 
 RIG = load_rig("figure5")
 NOTHING = (np.zeros((200, 0, 2, 3)), np.zeros(0))
+PATCH, UP = np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, 1.0])
+MIRRORS_NOTHING = np.zeros((1, 0, 2, 3)), np.zeros(0)
 
 
 def hand_sized_cloud(rng):
@@ -64,10 +66,6 @@ def test_mirror_ghosts_lie_behind_the_surface_and_need_cameras(rng):
 def test_strays_follow_their_rate(rng):
     ghosts = ghosts_of(GhostConfig(mirror_rate=0.0, stray_rate=0.5), rng)
     assert 0.35 < np.isfinite(ghosts[..., 0]).sum(axis=1).mean() < 0.65
-
-
-PATCH, UP = np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, 1.0])
-MIRRORS_NOTHING = np.zeros((1, 0, 2, 3)), np.zeros(0)
 
 
 def _seen(marker: np.ndarray, radius: float, segments: np.ndarray, radii: np.ndarray) -> np.ndarray:

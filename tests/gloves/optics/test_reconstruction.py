@@ -17,6 +17,7 @@ from tests.rigs import square_rig
 STILL = OpticsConfig(noise=0.0, blob_loss=0.0, dropout=0.0)
 RIG = load_rig("figure5")
 MIDDLE = np.array([0.0, 0.0, 1.1])
+PRESENT = arrays(np.bool_, st.tuples(st.integers(1, 25), st.integers(1, 8)))
 
 
 def _all_seen(sources: np.ndarray, rig: CameraRig = RIG) -> np.ndarray:
@@ -155,9 +156,6 @@ def test_the_same_seed_gives_the_same_points() -> None:
 def test_nonsense_is_refused(field: str, value: float, sentence: str) -> None:
     with pytest.raises(ArgumentError, match=sentence):
         OpticsConfig(**{field: value})
-
-
-PRESENT = arrays(np.bool_, st.tuples(st.integers(1, 25), st.integers(1, 8)))
 
 
 @given(PRESENT)

@@ -39,6 +39,9 @@ COLUMNS = (
 )
 EMPTY = {"times": 0.0, "nothing": np.zeros((0, 7)), "points": np.zeros((0, 3)), "ids": np.zeros(0)}
 FIXED = {"places": np.arange(12.0).reshape(4, 3), "none": np.zeros((0, 3))}
+VALUES = (np.nan, np.inf, 0.0, 1e-200, 1e200, -1.0, 100.0)
+FRAMES = ("qpos", "body_poses", "points", "times", "body_markers", "attachment_normals")
+SHAPES = [name for name in HAND_DTYPE.names if name != "left"]
 
 
 def record(path, rng, counts, *, every: int = 4) -> list[dict]:
@@ -319,11 +322,6 @@ def test_what_cannot_be_read_back_is_not_written(rng, tmp_path, monkeypatch):
     with pytest.raises(OSError, match="read back"):
         finish_archive(GrownArchive(tmp_path / "x.part"), tmp_path / "x.npz", {})
     assert [path.name for path in tmp_path.iterdir()] == ["x.part"]
-
-
-VALUES = (np.nan, np.inf, 0.0, 1e-200, 1e200, -1.0, 100.0)
-FRAMES = ("qpos", "body_poses", "points", "times", "body_markers", "attachment_normals")
-SHAPES = [name for name in HAND_DTYPE.names if name != "left"]
 
 
 def refused_or_exported(folder, arrays) -> None:

@@ -24,7 +24,8 @@ from handsim.app.workers import ClusterExecutor, _Task, _versions, check_worker,
 from handsim.cli.main import main
 from handsim.errors import ArgumentError, LayoutError
 from render import RenderConfig, render_take
-from tests.handsim.app.object_stores.stored_set import CONFIG, ROWS, contents, two_workers
+from tests.folders import contents
+from tests.handsim.app.object_stores.stored_set import CONFIG, ROWS, two_workers
 from tests.programs import ROOT, run_python
 from tests.sentences import error_names
 from tests.waiting import LONG

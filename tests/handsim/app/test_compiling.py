@@ -14,7 +14,7 @@ import pytest
 from numba import types
 from numba.core.registry import CPUDispatcher
 
-from benchmarks.cold_start import type_row
+from benchmarks.kernel_list import type_row
 from handsim.app import compiling
 from handsim.app.compiling import ListedKernel, compile_kernels, known_types, read_list
 from handsim.callbacks import before_compiling
@@ -48,7 +48,7 @@ def no_leftovers():
 
 
 def test_nearly_everything_on_the_list_is_there():
-    """`python -m benchmarks.cold_start --record` writes it anew; few that are gone cost next to nothing."""
+    """`python -m benchmarks.kernel_list` writes it anew; few that are gone cost next to nothing."""
     known, listed, gone = known_types(), read_list(), 0.0
     for one in listed:
         try:

@@ -31,6 +31,16 @@ def job(number):
 if __name__ == "__main__":
     list(run_jobs(job, range(4), 3))
 """
+SCRIPT = """
+import operator, sys
+sys.path.insert(0, ROOT)
+print("begin", flush=True)
+from handsim.app.workers import check_workers, run_jobs
+def own(number):
+    return number
+"""
+CALL = "print(sorted(run_jobs({job}, range(5), 2)))\n"
+GUARDED = 'if __name__ == "__main__":\n    ' + CALL
 
 
 def sign_and_meet(folder: Path, number: int) -> int:
@@ -164,18 +174,6 @@ def test_workers_end_with_their_parent(number, tmp_path):
         parent.send_signal(number)
         parent.stdout.read()  # until the last process that could write is gone
     assert not any(running(int(line[0])) for line in lines)
-
-
-SCRIPT = """
-import operator, sys
-sys.path.insert(0, ROOT)
-print("begin", flush=True)
-from handsim.app.workers import check_workers, run_jobs
-def own(number):
-    return number
-"""
-CALL = "print(sorted(run_jobs({job}, range(5), 2)))\n"
-GUARDED = 'if __name__ == "__main__":\n    ' + CALL
 
 
 @pytest.mark.parametrize("piped", [False, True])

@@ -18,6 +18,17 @@ from track import load_user
 from train import Labeling
 from train.labelers.storage import shipped_labelers
 
+LEARNED = {
+    "trial.c3d --out mine.toml": "the radius of the markers is unknown; give radius_mm",
+    "missing.c3d --radius-mm 3 --out mine.toml": "missing.c3d: cannot be read: No such file",
+    "trial.c3d --start missing.toml --out mine.toml": "missing.toml: cannot be read",
+    "trial.c3d --radius-mm 40 --out mine.toml": "radius_mm is 40, expected a number from 0.5 to 15",
+    "trial.c3d --radius-mm 3 --out mine.json": "expected a file name that ends in .toml",
+    "trial.c3d --start guess.toml --out guess.toml": "is the input",
+    "--radius-mm 3 --out mine.toml": "no capture was given, expected one labeled marker file or more",
+    "three.trc --radius-mm 3 --out mine.toml": "no hand is in the captures",
+}
+
 
 def test_list_and_show_name_every_layout_marker_and_labeler(capsys):
     assert main(["glove", "list"]) == 0
@@ -159,18 +170,6 @@ def test_a_glove_is_learned_from_a_labs_own_names(tmp_path, capsys):
     assert main(["glove", "learn", str(tmp_path / "trial.c3d"), "--radius-mm", "3.2", "--out", str(out)]) == 0
     assert load_layout(out).num_markers == 19 and load_layout(out).radius == pytest.approx(0.0032)
     assert "mine: 19 markers" in capsys.readouterr().out
-
-
-LEARNED = {
-    "trial.c3d --out mine.toml": "the radius of the markers is unknown; give radius_mm",
-    "missing.c3d --radius-mm 3 --out mine.toml": "missing.c3d: cannot be read: No such file",
-    "trial.c3d --start missing.toml --out mine.toml": "missing.toml: cannot be read",
-    "trial.c3d --radius-mm 40 --out mine.toml": "radius_mm is 40, expected a number from 0.5 to 15",
-    "trial.c3d --radius-mm 3 --out mine.json": "expected a file name that ends in .toml",
-    "trial.c3d --start guess.toml --out guess.toml": "is the input",
-    "--radius-mm 3 --out mine.toml": "no capture was given, expected one labeled marker file or more",
-    "three.trc --radius-mm 3 --out mine.toml": "no hand is in the captures",
-}
 
 
 @pytest.mark.parametrize("words", LEARNED)

@@ -18,6 +18,13 @@ from handsim.errors import LayoutError
 from handsim.files.signals import Stopped
 from tests.programs import ROOT, run_python
 
+FULL = "handsim: the disk is full; free some space and run the same command again\n"
+NO_FULL = pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
+LIGHT = (
+    "body", "calibrate", "demo", "doctor", "evaluate", "export", "glove", "hand", "label", "replay", "report",
+    "rig", "track", "view",
+)  # fmt: skip
+
 
 @pytest.fixture
 def invoke(monkeypatch):
@@ -185,10 +192,6 @@ def shell(line: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(["bash", "-c", line], capture_output=True, text=True, cwd=ROOT, check=False)
 
 
-FULL = "handsim: the disk is full; free some space and run the same command again\n"
-NO_FULL = pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
-
-
 @pytest.mark.parametrize(
     ("line", "code", "said"),
     [
@@ -240,12 +243,6 @@ def test_help_shows_no_types_and_no_empty_defaults(words, capsys, monkeypatch):
     assert f"usage: handsim {words[0]}" in said
     for odd in ("{None}", "None|", "(default: )", "(default: None)", "(fixed", "~T", "<class"):
         assert odd not in said, odd
-
-
-LIGHT = (
-    "body", "calibrate", "demo", "doctor", "evaluate", "export", "glove", "hand", "label", "replay", "report",
-    "rig", "track", "view",
-)  # fmt: skip
 
 
 def test_help_loads_nothing_heavy():

@@ -115,6 +115,39 @@ SLOW = [
      "size 640 480|field-of-view 80|glove sparse13|seed 3"),
 ]  # fmt: skip
 """Commands that take minutes, how they are run, and other values of their options."""
+COMMANDS = [name for name in _HELP if isinstance(_target(name), str)]
+REFUSED = {
+    "evaluate labeled.trc --truth single.truth.npz --glove dense19": "--truth is given with 1 captures",
+    "evaluate labeled.trc --truth single.truth.npz --threads 2": "none of --glove, --labeler, --threads",
+    "export user.json --out x.glb --fps 30": "given --fps 30 and user.json, expected a take",
+    "export dense19 --out x.onnx --up y": "given --up y and dense19, expected a take",
+    "export user.json --out x.glb --neutral 0 1": "given --neutral 0 1 and user.json, expected a take",
+    "export take.npz --out x.mot --neutral 0 1": "neutral is (0.0, 1.0) and the file x.mot, expected .csv",
+    "export take.npz --out x.csv --neutral 7 9": "neutral is 7 to 9 s, where the ",
+    "export take.npz --out x.csv --up y": "up is y and the file x.csv, expected a format",
+    "export dense19 --out x.onnx --forward x": "given --forward x and dense19, expected a take",
+    "render take.npz --out p --passes depth --tones dark": "given tones and the passes depth, expected rgb",
+    "render take.npz --out p --passes depth --motion-blur": "given shutter and the passes depth",
+    "render take.npz --out p --passes rgb --depth-sensor d435": "given depth_sensor and the passes rgb",
+    "render take.npz --out p --background plain --photos photos": "expected the background photo",
+    "render take.npz --out p --format exr --openxr": "formats are exr, expected coco or yolo",
+    "render take.npz --out p --placement head --share 0.5": "given share and the placement head",
+    "render take.npz --out p --placement rig --views 2": "given views and the placement rig",
+    "render take.npz --out p --share 0.5 --distance 1 2": "given share 0.5 and distance (1.0, 2.0)",
+    "render take.npz --out p --cameras own.toml --share 0.5": "leave out the placement",
+    "render take.npz --out p --glove dense19": "--hands, --people and --glove belong to --poses",
+    "render --merge a b --out p --glove dense19": "leave out the options of drawing",
+    "render --merge a b --out p --people 3": "leave out the options of drawing",
+    "view take.npz --glove dense19": "given --glove and the file take.npz, expected --live",
+    "view take.npz --size XL": "--size is XL, but take.npz is no marker layout",
+    "view user.json --rig six": "--rig is six, but user.json is a user",
+    "view dense19 --up y": "--up is y, but dense19 is a layout, in which z points up",
+    "view take.npz --video v.mp4 --time 0": "given --time 0 and --video v.mp4",
+    "train set --out r --labeler cnn --network.width 32": "given network with the labeler cnn",
+    "train set --out r --knee 0.5": "given knee with the labeler set",
+    "train set --out r --ghosts 1 --corruption m:f": "given occlude or ghosts beside a corruption",
+    "rig plan --out p.toml --cameras 9 --room 4 4 3 --keep six --size 9 9": "given keep six, and size",
+}
 
 
 def unchanged(markers, *, rng):
@@ -132,9 +165,6 @@ def options_of(name: str) -> set[str]:
     names = {one.option_strings[0] for one in parser._actions if one.option_strings} - {"-h"}
     also = "--frames" in names and "--num-frames" not in names
     return {"num-frames" if name == "--frames" and also else name[2:] for name in names}
-
-
-COMMANDS = [name for name in _HELP if isinstance(_target(name), str)]
 
 
 @pytest.mark.parametrize("name", COMMANDS)
@@ -238,40 +268,6 @@ def usual(files, tmp_path_factory):
 @pytest.mark.parametrize(("command", "line", "other"), [*cases(QUICK), *cases(SLOW)])
 def test_every_option_acts(command, line, other, usual, files, tmp_path):
     assert written(command, f"{line} --{other}", files, tmp_path / "work") != usual(command, line)
-
-
-REFUSED = {
-    "evaluate labeled.trc --truth single.truth.npz --glove dense19": "--truth is given with 1 captures",
-    "evaluate labeled.trc --truth single.truth.npz --threads 2": "none of --glove, --labeler, --threads",
-    "export user.json --out x.glb --fps 30": "given --fps 30 and user.json, expected a take",
-    "export dense19 --out x.onnx --up y": "given --up y and dense19, expected a take",
-    "export user.json --out x.glb --neutral 0 1": "given --neutral 0 1 and user.json, expected a take",
-    "export take.npz --out x.mot --neutral 0 1": "neutral is (0.0, 1.0) and the file x.mot, expected .csv",
-    "export take.npz --out x.csv --neutral 7 9": "neutral is 7 to 9 s, where the ",
-    "export take.npz --out x.csv --up y": "up is y and the file x.csv, expected a format",
-    "export dense19 --out x.onnx --forward x": "given --forward x and dense19, expected a take",
-    "render take.npz --out p --passes depth --tones dark": "given tones and the passes depth, expected rgb",
-    "render take.npz --out p --passes depth --motion-blur": "given shutter and the passes depth",
-    "render take.npz --out p --passes rgb --depth-sensor d435": "given depth_sensor and the passes rgb",
-    "render take.npz --out p --background plain --photos photos": "expected the background photo",
-    "render take.npz --out p --format exr --openxr": "formats are exr, expected coco or yolo",
-    "render take.npz --out p --placement head --share 0.5": "given share and the placement head",
-    "render take.npz --out p --placement rig --views 2": "given views and the placement rig",
-    "render take.npz --out p --share 0.5 --distance 1 2": "given share 0.5 and distance (1.0, 2.0)",
-    "render take.npz --out p --cameras own.toml --share 0.5": "leave out the placement",
-    "render take.npz --out p --glove dense19": "--hands, --people and --glove belong to --poses",
-    "render --merge a b --out p --glove dense19": "leave out the options of drawing",
-    "render --merge a b --out p --people 3": "leave out the options of drawing",
-    "view take.npz --glove dense19": "given --glove and the file take.npz, expected --live",
-    "view take.npz --size XL": "--size is XL, but take.npz is no marker layout",
-    "view user.json --rig six": "--rig is six, but user.json is a user",
-    "view dense19 --up y": "--up is y, but dense19 is a layout, in which z points up",
-    "view take.npz --video v.mp4 --time 0": "given --time 0 and --video v.mp4",
-    "train set --out r --labeler cnn --network.width 32": "given network with the labeler cnn",
-    "train set --out r --knee 0.5": "given knee with the labeler set",
-    "train set --out r --ghosts 1 --corruption m:f": "given occlude or ghosts beside a corruption",
-    "rig plan --out p.toml --cameras 9 --room 4 4 3 --keep six --size 9 9": "given keep six, and size",
-}
 
 
 @pytest.mark.parametrize("line", REFUSED)

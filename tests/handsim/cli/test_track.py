@@ -41,6 +41,68 @@ from train.simulation.scenes import CalibrationTakeConfig
 from train.simulation.takes import simulate_calibration
 
 FRAMES = 60
+SIZED = """
+import time
+from gloves import load_take
+from track import frames
+
+class Sized:
+    def __init__(self, file):
+        self.frames, self.closed = list(frames.capture_frames(load_take(file).capture())), False
+
+    def __iter__(self):
+        number = 0
+        while not self.closed:
+            frame = self.frames[number % len(self.frames)]
+            yield frames.StreamedFrame(number, number / 120.0, frame.points, frame.ids)
+            number += 1
+            time.sleep(0.01)
+
+    def close(self):
+        self.closed = True
+"""
+LATE = """
+import time
+import numpy as np
+from track import StreamedFrame
+
+class Late:
+    def __iter__(self):
+        time.sleep(1.0)
+        for number in range(30):
+            yield StreamedFrame(number, number / 100, np.full((6, 3), 0.1 * number), np.arange(6))
+
+    def close(self):
+        pass
+"""
+REFUSED = LATE.replace(
+    "class Late:",
+    """class Late:
+    tries = []
+
+    def __init__(self):
+        self.tries.append(0)
+        if len(self.tries) < 3:
+            raise ConnectionRefusedError("not yet")
+""",
+)
+PLAYED = """
+import numpy as np
+from gloves import read_capture
+from track import StreamedFrame
+
+class Played:
+    def __init__(self, file):
+        self.capture = read_capture(file)
+
+    def __iter__(self):
+        for number, points in enumerate(self.capture.positions):
+            seen = np.isfinite(points[:, 0])
+            yield StreamedFrame(number, number / self.capture.rate, points[seen], np.flatnonzero(seen))
+
+    def close(self):
+        pass
+"""
 
 
 @pytest.fixture(scope="module")
@@ -314,28 +376,6 @@ def test_a_stream_is_tracked_for_some_seconds(capture, tmp_path, capsys, monkeyp
     assert lines[0] == f"recording to {out}.part, which becomes {out} at the end; Ctrl-C ends it"
 
 
-SIZED = """
-import time
-from gloves import load_take
-from track import frames
-
-class Sized:
-    def __init__(self, file):
-        self.frames, self.closed = list(frames.capture_frames(load_take(file).capture())), False
-
-    def __iter__(self):
-        number = 0
-        while not self.closed:
-            frame = self.frames[number % len(self.frames)]
-            yield frames.StreamedFrame(number, number / 120.0, frame.points, frame.ids)
-            number += 1
-            time.sleep(0.01)
-
-    def close(self):
-        self.closed = True
-"""
-
-
 def test_hands_of_a_stream_are_measured_beside_the_tracker(capture, tmp_path, capsys, monkeypatch):
     """The first frame is recorded at once; the recording knows both sizes, also while it grows."""
     (tmp_path / "sized_source.py").write_text(SIZED)
@@ -392,22 +432,6 @@ def test_a_server_may_start_after_the_tracker(capture, tmp_path, capsys, monkeyp
     assert load_take(out).num_frames > 1
 
 
-LATE = """
-import time
-import numpy as np
-from track import StreamedFrame
-
-class Late:
-    def __iter__(self):
-        time.sleep(1.0)
-        for number in range(30):
-            yield StreamedFrame(number, number / 100, np.full((6, 3), 0.1 * number), np.arange(6))
-
-    def close(self):
-        pass
-"""
-
-
 def test_seconds_count_from_the_first_frame(tmp_path, monkeypatch):
     (tmp_path / "late_source.py").write_text(LATE)
     monkeypatch.syspath_prepend(tmp_path)
@@ -418,19 +442,6 @@ def test_seconds_count_from_the_first_frame(tmp_path, monkeypatch):
     assert load_take(out).num_frames == 30, "not from the first silence"
 
 
-REFUSED = LATE.replace(
-    "class Late:",
-    """class Late:
-    tries = []
-
-    def __init__(self):
-        self.tries.append(0)
-        if len(self.tries) < 3:
-            raise ConnectionRefusedError("not yet")
-""",
-)
-
-
 def test_a_source_of_the_user_s_own_that_is_refused_is_tried_again(tmp_path, monkeypatch, capsys):
     (tmp_path / "refused.py").write_text(REFUSED)
     monkeypatch.syspath_prepend(tmp_path)
@@ -439,25 +450,6 @@ def test_a_source_of_the_user_s_own_that_is_refused_is_tried_again(tmp_path, mon
     assert main(["track", "--live", "refused:Late", "--size", "M", "--out", str(out)]) == 0
     assert load_take(out).num_frames == 30
     assert "not yet (" in capsys.readouterr().err
-
-
-PLAYED = """
-import numpy as np
-from gloves import read_capture
-from track import StreamedFrame
-
-class Played:
-    def __init__(self, file):
-        self.capture = read_capture(file)
-
-    def __iter__(self):
-        for number, points in enumerate(self.capture.positions):
-            seen = np.isfinite(points[:, 0])
-            yield StreamedFrame(number, number / self.capture.rate, points[seen], np.flatnonzero(seen))
-
-    def close(self):
-        pass
-"""
 
 
 @pytest.mark.parametrize("enough", [False, True])

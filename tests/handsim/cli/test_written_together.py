@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import shutil
 import signal
-from pathlib import Path
 
 import pytest
 
 from handsim.cli.main import main
+from tests.folders import contents
 from tests.renames import fails_at
 
 COMMANDS = {
@@ -55,7 +55,3 @@ def test_all_new_or_all_old(name, work, monkeypatch):
             fails_at(patch, place)
             assert main(command) == 1
         assert contents(out) == old
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    return {file.name: file.read_bytes() for file in folder.iterdir()}

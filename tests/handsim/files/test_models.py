@@ -20,6 +20,7 @@ helper, from_array = onnx.helper, onnx.numpy_helper.from_array
 FLOAT = onnx.TensorProto.FLOAT
 MOST_MEGABYTES = 1500.0
 ONE = np.ones(1, np.float32)
+SIDES = {"column": (60_000, 1), "row": (1, 60_000)}
 
 
 def node(kind, inputs, outputs, **attributes):
@@ -49,7 +50,6 @@ def loop():
     return node("Loop", ["size", "", "points"], ["out"], body=body)
 
 
-SIDES = {"column": (60_000, 1), "row": (1, 60_000)}
 BOMBS = {
     "constant": ([node("ConstantOfShape", ["size"], ["out"], value=from_array(ONE))], [sized(1 << 31)]),
     "expand": ([node("Expand", ["points", "size"], ["out"])], [sized(1 << 26, 1, 5, 3)]),

@@ -43,6 +43,12 @@ from tests.sentences import error_names
 from track import load_user
 from track.user import nominal_user
 
+NAME = os.fsdecode(b"t\xe4ke")  # of an old Windows system
+SHOWN = "t\N{REPLACEMENT CHARACTER}ke"
+SAID = {".mot": f"{SHOWN}\n", ".html": "<title>Take t?ke.truth.npz</title>"}
+"""What files say of names, by their endings."""
+SETTINGS = {"train": {"samples": 100, "seed": 3, "network": {"width": 64}}, "names": ["a", "b"]}
+
 
 def entries(folder: Path) -> list[str]:
     return sorted(entry.name for entry in folder.iterdir())
@@ -352,11 +358,6 @@ def test_memory_that_is_not_there_is_refused_with_both_sizes():
 
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="names are text")
-NAME = os.fsdecode(b"t\xe4ke")  # of an old Windows system
-SHOWN = "t\N{REPLACEMENT CHARACTER}ke"
-
-SAID = {".mot": f"{SHOWN}\n", ".html": "<title>Take t?ke.truth.npz</title>"}
-"""What files say of names, by their endings."""
 
 
 def test_what_is_not_printable_is_replaced():
@@ -420,9 +421,6 @@ def test_a_user_calibrated_from_such_a_capture_is_kept(tmp_path):
     user = nominal_user(load_layout("dense19"), "M", ["right"])
     dataclasses.replace(user, notes=f"calibrated from {NAME}.c3d").save(tmp_path / "user.json")
     assert load_user(tmp_path / "user.json").notes == "calibrated from t?ke.c3d"
-
-
-SETTINGS = {"train": {"samples": 100, "seed": 3, "network": {"width": 64}}, "names": ["a", "b"]}
 
 
 def claim_again(folder, *, grows="train.samples", **train):

@@ -25,6 +25,8 @@ from handsim.hand.model_files import (
 )
 from handsim.hand.shape import BONE_NAMES, JOINT_NAMES
 
+FRAMES = 12
+
 
 def test_mujoco_reads_it_and_bones_are_where_ours_are(model, rng):
     opened = mujoco.MjModel.from_xml_string(hand_urdf(model))
@@ -69,7 +71,6 @@ def test_cylinders_lie_along_the_capsules(model):
                 np.testing.assert_allclose(center + sign * length * axis, at, atol=1e-9)
 
 
-FRAMES = 12
 PAGE = Path(__file__).parents[3] / "docs" / "motion_files.md"
 
 

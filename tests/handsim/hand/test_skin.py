@@ -37,6 +37,14 @@ from tests.meshes import blend_skin, winding
 
 CUBE = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
 CORNERS = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
+FIST = [[20, 25, 40, 50]] + [[0, 90, 105, 65]] * 4
+SPREAD = [[30, -30, -10, -10], [20, 0, 0, 0], [0, 0, 0, 0], [-14, 0, 0, 0], [-30, 0, 0, 0]]
+OPPOSITION = [[10, 35, 35, 35], [0, 45, 45, 20], [0, 40, 45, 25], [-5, 30, 40, 20], [-10, 65, 50, 30]]
+EXTREME_SHAPES = [
+    *(named_shape(size) for size in SIZES),
+    shape_from_measures(0.112, 0.054),
+    *(sample_shape(EVERYBODY, rng=np.random.default_rng(seed)) for seed in range(12)),
+]
 
 
 def test_first_step_on_a_cube_has_the_known_points():
@@ -67,16 +75,6 @@ def test_affine_maps_commute_with_subdivision():
     matrix, _ = catmull_clark(CUBE, 8)
     linear, shift = rng.standard_normal((3, 3)), rng.standard_normal(3)
     assert_allclose(matrix @ (CORNERS @ linear + shift), (matrix @ CORNERS) @ linear + shift, atol=1e-12)
-
-
-FIST = [[20, 25, 40, 50]] + [[0, 90, 105, 65]] * 4
-SPREAD = [[30, -30, -10, -10], [20, 0, 0, 0], [0, 0, 0, 0], [-14, 0, 0, 0], [-30, 0, 0, 0]]
-OPPOSITION = [[10, 35, 35, 35], [0, 45, 45, 20], [0, 40, 45, 25], [-5, 30, 40, 20], [-10, 65, 50, 30]]
-EXTREME_SHAPES = [
-    *(named_shape(size) for size in SIZES),
-    shape_from_measures(0.112, 0.054),
-    *(sample_shape(EVERYBODY, rng=np.random.default_rng(seed)) for seed in range(12)),
-]
 
 
 def forward(shape: HandShape, degrees: list[list[float]]) -> np.ndarray:

@@ -33,6 +33,13 @@ from handsim.motion_files.motion import (
 from handsim.space.transforms import MIRROR
 from tests.sentences import error_names
 
+Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+"""Our world with z up in axes with y up."""
+BACK = 0.01 * Y_UP.T
+"""The file's centimeters with y up to our meters with z up."""
+PARTS = ("METACARPAL", "PROXIMAL", "INTERMEDIATE", "DISTAL", "TIP")
+CHAINS = [[f"{digit.upper()}_{part}" for part in PARTS] for digit in DIGITS]
+
 
 def test_the_last_pose_is_held(motion):
     left = posed_motion(motion).hands[1]
@@ -160,10 +167,6 @@ def test_what_cannot_be_read_is_told(motion, tmp_path, old, new, words):
         read_joint_csv(path)
 
 
-Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
-"""Our world with z up in axes with y up."""
-
-
 def test_header_and_angles(motion, tmp_path):
     path = tmp_path / "hands.mot"
     write_mot(path, posed_motion(motion))
@@ -190,10 +193,6 @@ def test_header_and_angles(motion, tmp_path):
         expected = Rotation.from_matrix(Y_UP) * Rotation.from_quat(qpos[:, 3:7], scalar_first=True)
         error = Rotation.from_euler("XYZ", turns, degrees=True).inv() * expected
         assert error.magnitude().max() < 1e-8
-
-
-BACK = 0.01 * Y_UP.T
-"""The file's centimeters with y up to our meters with z up."""
 
 
 def read_bvh(path):
@@ -286,8 +285,6 @@ NUMBERS = {
     "INDEX_TIP": 10,
 }
 NUMBERS |= {"MIDDLE_PROXIMAL": 12, "RING_DISTAL": 19, "LITTLE_METACARPAL": 21, "LITTLE_TIP": 25}
-PARTS = ("METACARPAL", "PROXIMAL", "INTERMEDIATE", "DISTAL", "TIP")
-CHAINS = [[f"{digit.upper()}_{part}" for part in PARTS] for digit in DIGITS]
 CHAINS[0].remove("THUMB_INTERMEDIATE")
 
 

@@ -20,19 +20,6 @@ SIZE = (1000, 800)
 POSITIONS = np.array([[0.0, -3.0, 1.0], [4.0, 1.0, 2.0]])
 AHEAD = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
 RIGHT = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-
-
-def check(cameras, *, point=POINT, pixels=PIXELS):
-    assert [camera.size for camera in cameras] == [SIZE, SIZE]
-    for camera, expected in zip(cameras, pixels, strict=True):
-        np.testing.assert_allclose(camera.project(point), expected, atol=1e-3)
-    axes = np.array([camera.T_world_camera[:3, :3] for camera in cameras])
-    np.testing.assert_allclose(axes[:, :, 0], RIGHT, atol=1e-6)
-    np.testing.assert_allclose(axes[:, :, 1], [[0, 0, -1], [0, 0, -1]], atol=1e-6)
-    np.testing.assert_allclose(axes[:, :, 2], AHEAD, atol=1e-6)
-    np.testing.assert_allclose([camera.T_world_camera[:3, 3] for camera in cameras], POSITIONS, atol=1e-9)
-
-
 # Vicon: the quaternion xyzw turns the world into x right, y down, z ahead. For A that is a turn about x by
 # +90 degrees (z up becomes -y, y ahead becomes z). B is A's after a turn of the world about z that takes
 # -x to +y, by -90 degrees: (1, 0, 0, 1)/sqrt2 * (0, 0, -1, 1)/sqrt2 = (1, 1, -1, 1)/2 as xyzw.
@@ -56,7 +43,6 @@ XCP = f"""<?xml version="1.0" encoding="UTF-8" standalone="no" ?>
   </Camera>
 </Cameras>
 """
-
 # Qualisys: rows of the matrix are right, up, backward. 64ths: 1250 * 64 = 80000, 1200 * 64 = 76800,
 # 510 * 64 = 32640, 390 * 64 = 24960. B uses a part of its sensor that begins at column 20 and row 10, and its
 # principal point on the sensor is (530, 400): 33920 and 25600.
@@ -88,42 +74,12 @@ QUALISYS = f"""<?xml version="1.0" encoding="ISO-8859-1"?>
 </cameras>
 </calibration>
 """
-
 # Motive: y up. What is x right, y ahead, z up here is x right, -z ahead, y up there: (x, y, z) becomes
 # (x, z, -y). Columns of the matrix are right, up, backward.
 _LENS = (
     'LensCenterX="510" LensCenterY="390" HorizontalFocalLength="1250" VerticalFocalLength="1200" '
     'k1="0" k2="0" k3="0" TangentialX="0" TangentialY="0"/>'
 )
-
-
-def _extrinsic(position, columns):
-    matrix = np.array(columns).T.ravel()
-    numbers = " ".join(f'OrientMatrix{n}="{value}"' for n, value in enumerate(matrix))
-    return '<Extrinsic X="{}" Y="{}" Z="{}" '.format(*position) + numbers + "/>"
-
-
-MCAL = f"""<?xml version="1.0" encoding="UTF-16LE"?>
-<calibrationProfile version="1">
-<MotiveBuildInfo AppVersion="3.4.0.2"/>
-<Calibration><Cameras Count="2">
-<Camera Serial="M21614">
-<Properties CameraID="1" ImagerIndex="00"/>
-<Attributes ImagerPixelWidth="1000" ImagerPixelHeight="800"/>
-<Intrinsic {_LENS.replace('k1="0"', 'k1="0.3"')}
-<IntrinsicStandardCameraModel {_LENS}
-{_extrinsic((0, 1, 3), [(1, 0, 0), (0, 1, 0), (0, 0, 1)])}
-</Camera>
-<Camera Serial="M21615">
-<Properties CameraID="2" ImagerIndex="00"/>
-<Attributes ImagerPixelWidth="1000" ImagerPixelHeight="800"/>
-<IntrinsicStandardCameraModel {_LENS}
-{_extrinsic((4, 2, -1), [(0, 0, -1), (0, 1, 0), (1, 0, 0)])}
-</Camera>
-</Cameras></Calibration>
-</calibrationProfile>
-"""
-
 # OpenCV: rows of R are right, down, ahead, and T = -R position. Its pixels count from the first one's center.
 # A: T = -(0, -1, -3) = (0, 1, 3). B: rows y, -z, -x: T = -(1, -2, -4) = (-1, 2, 4).
 MATRIX = "{}: !!opencv-matrix\n   rows: {}\n   cols: {}\n   dt: d\n   data: [ {} ]\n"
@@ -158,6 +114,47 @@ OPENCV_NESTED = "%YAML:1.0\n---\nnb_camera: 2\nimage_width: 1000\nimage_height: 
         (1, "0., 1., 0., 0., 0., -1.,\n          -1., 0., 0.", "-1., 2., 4."),
     )
 )
+K = np.array([[610.0, 0, 321.5], [0, 612.0, 238.25], [0, 0, 1]])
+POINTS = np.random.default_rng(3).uniform([-0.15, -0.1, 0.4], [0.15, 0.1, 0.9], (40, 3))
+
+
+def check(cameras, *, point=POINT, pixels=PIXELS):
+    assert [camera.size for camera in cameras] == [SIZE, SIZE]
+    for camera, expected in zip(cameras, pixels, strict=True):
+        np.testing.assert_allclose(camera.project(point), expected, atol=1e-3)
+    axes = np.array([camera.T_world_camera[:3, :3] for camera in cameras])
+    np.testing.assert_allclose(axes[:, :, 0], RIGHT, atol=1e-6)
+    np.testing.assert_allclose(axes[:, :, 1], [[0, 0, -1], [0, 0, -1]], atol=1e-6)
+    np.testing.assert_allclose(axes[:, :, 2], AHEAD, atol=1e-6)
+    np.testing.assert_allclose([camera.T_world_camera[:3, 3] for camera in cameras], POSITIONS, atol=1e-9)
+
+
+def _extrinsic(position, columns):
+    matrix = np.array(columns).T.ravel()
+    numbers = " ".join(f'OrientMatrix{n}="{value}"' for n, value in enumerate(matrix))
+    return '<Extrinsic X="{}" Y="{}" Z="{}" '.format(*position) + numbers + "/>"
+
+
+MCAL = f"""<?xml version="1.0" encoding="UTF-16LE"?>
+<calibrationProfile version="1">
+<MotiveBuildInfo AppVersion="3.4.0.2"/>
+<Calibration><Cameras Count="2">
+<Camera Serial="M21614">
+<Properties CameraID="1" ImagerIndex="00"/>
+<Attributes ImagerPixelWidth="1000" ImagerPixelHeight="800"/>
+<Intrinsic {_LENS.replace('k1="0"', 'k1="0.3"')}
+<IntrinsicStandardCameraModel {_LENS}
+{_extrinsic((0, 1, 3), [(1, 0, 0), (0, 1, 0), (0, 0, 1)])}
+</Camera>
+<Camera Serial="M21615">
+<Properties CameraID="2" ImagerIndex="00"/>
+<Attributes ImagerPixelWidth="1000" ImagerPixelHeight="800"/>
+<IntrinsicStandardCameraModel {_LENS}
+{_extrinsic((4, 2, -1), [(0, 0, -1), (0, 1, 0), (1, 0, 0)])}
+</Camera>
+</Cameras></Calibration>
+</calibrationProfile>
+"""
 
 
 def written(folder):
@@ -177,9 +174,7 @@ def written(folder):
     return {kind: folder / name for kind, (name, _) in files.items()}
 
 
-K = np.array([[610.0, 0, 321.5], [0, 612.0, 238.25], [0, 0, 1]])
 R, T = cv2.Rodrigues(np.array([0.02, -0.08, 0.03]))[0], np.array([[-0.12], [0.003], [0.01]])
-POINTS = np.random.default_rng(3).uniform([-0.15, -0.1, 0.4], [0.15, 0.1, 0.9], (40, 3))
 
 
 def projected(rotation, translation, matrix, coefficients):

@@ -14,6 +14,13 @@ from handsim.space.rig_formats import load_cameras
 from tests.handsim.space.known_rig import POINTS, K, R, T, projected
 
 D = np.array([[-0.2, 0.06, 0.001, -0.0015, 0.01]])
+SIZE = {"image_width": 640, "image_height": 480}
+FISH = np.array([-0.012, 0.004, -0.006, 0.001])
+POSE = np.vstack([np.c_[R, T], [[0.0, 0.0, 0.0, 1.0]]])
+VECTOR = cv2.Rodrigues(R)[0]
+LISTED = {"camera_matrix": K.tolist(), "dist_coeffs": D.ravel().tolist(), **SIZE}
+ONE = {"K": K.tolist(), "dist": [D.ravel().tolist()], "image_size": [640, 480]}
+PLACED = {"R": R.tolist(), "T": T.ravel().tolist()}
 
 
 def stored(path, values):
@@ -22,9 +29,6 @@ def stored(path, values):
         file.write(name, value)
     file.release()
     return path
-
-
-SIZE = {"image_width": 640, "image_height": 480}
 
 
 @pytest.mark.parametrize("ending", ["yml", "json"])
@@ -69,9 +73,6 @@ def test_fisheyes(tmp_path):
     (camera,) = load_cameras(stored(tmp_path / "fish.yml", values))
     expected = cv2.fisheye.projectPoints(POINTS[:, None], np.zeros(3), np.zeros(3), K, k)[0][:, 0]
     np.testing.assert_allclose(camera.project(POINTS), expected + 0.5, atol=1e-6)
-
-
-FISH = np.array([-0.012, 0.004, -0.006, 0.001])
 
 
 def calibrated(path, lines):
@@ -299,11 +300,6 @@ def test_half_of_a_calibration_asks_for_the_other(tmp_path, name, other):
         load_cameras(stored(tmp_path / f"{name}.yml", values))
 
 
-POSE = np.vstack([np.c_[R, T], [[0.0, 0.0, 0.0, 1.0]]])
-VECTOR = cv2.Rodrigues(R)[0]
-LISTED = {"camera_matrix": K.tolist(), "dist_coeffs": D.ravel().tolist(), **SIZE}
-
-
 def dumped(path, values):
     """A file as json, yaml.dump or OpenCV writes it."""
     if path.suffix == ".yml":
@@ -408,10 +404,6 @@ def test_a_size_under_an_unknown_name_is_told(tmp_path, size):
         RigError, match=f"no size .* among 'camera_matrix', '{next(iter(size))}'.*image_width"
     ):
         load_cameras(dumped(tmp_path / "c.json", values))
-
-
-ONE = {"K": K.tolist(), "dist": [D.ravel().tolist()], "image_size": [640, 480]}
-PLACED = {"R": R.tolist(), "T": T.ravel().tolist()}
 
 
 @pytest.mark.parametrize(

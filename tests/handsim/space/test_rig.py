@@ -25,6 +25,60 @@ CENTER = np.array([0.0, 0.0, 1.1])
 TOP = 'name = "mine"\nfield_of_view = 50.0\n'
 FIRST = "[[camera]]\nposition = [1.0, 0.0, 2.0]\ntarget = [0.0, 0.0, 1.0]\n"
 SECOND = "[[camera]]\nposition = [-1.0, 0.5, 2.0]\ntarget = [0.0, 0.0, 1.0]\n"
+FILE = TOP + FIRST + SECOND
+CROWD = "".join(FIRST.replace("1.0, 0.0, 2.0", f"1.0, {n}.0, 2.0") for n in range(1, 33))
+POSE = "position = [-1.0, 0.5, 2.0]\ntarget = [0.0, 0.0, 1.0]\n"
+MISTAKES = [  # what is exchanged for what, at its last place, and what is told
+    (SECOND, "", "rig 'mine' | 1 cameras | 2 to 32"),
+    (FIRST + SECOND, "", "rig 'mine' | 0 cameras | 2 to 32"),
+    (SECOND, CROWD, "rig 'mine' | 33 cameras | 2 to 32"),
+    (SECOND, SECOND + FIRST, "cameras 1 and 3 | 'mine' | one position"),
+    ("0.5", '"half"', 'camera 2 | position is [-1.0, "half", 2.0] | three numbers'),
+    ("0.5", "nan", "camera 2 | position is [-1.0, NaN, 2.0] | three numbers"),
+    ("0.5, 2.0", "0.5", "camera 2 | position is [-1.0, 0.5] | three numbers"),
+    ("-1.0, 0.5, 2.0", "0.0, 0.0, 1.0", "camera 2 | its own position | target"),
+    ("-1.0, 0.5, 2.0", "-1000, 500, 2000", "camera 2 | 'mine' | 2291 m | at most 50 m | millimeters"),
+    (SECOND, SECOND + "target = [0.0,", "not a TOML file | end of document"),
+    ('"mine"', "3", "name is 3 | text in quotes"),
+    ("field_of_view = 50.0\n", "", "camera 1 | focal, K, field_of_view, horizontal_field_of_view"),
+    ("target", "targets", "camera 2 | 'targets' | 'target' | T_world_camera"),
+    ("target = [0.0, 0.0, 1.0]\n", "", "camera 2 has position | position and target, or T_world_camera"),
+    (POSE, POSE + "T_world_camera = [[1.0]]\n", "camera 2 has position and target and T_world_camera"),
+    (POSE, "T_world_camera = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]\n", "camera 2 | four rows"),
+    (POSE, "T_world_camera = [[1, 0, 0, 0], [0, 1]]\n", "camera 2 | [[1, 0, 0, 0], [0, 1]] | four rows"),
+    ("50.0", "0.87", "camera 1 | field_of_view is 0.87 degrees | 1 to 170"),
+    (TOP, TOP + "resolution = 640.5\n", "camera 1 | resolution is 640.5 | whole number of pixels"),
+    (TOP, TOP + "resolution = 0\n", "'camera1' | size is (0, 0) | 1 to 8192"),
+    (FIRST + SECOND, "camera = 3\n", "camera | [[camera]] table"),
+]  # fmt: skip
+TWO = """
+name = "desk"
+
+[[camera]]
+name = "left"
+size = [640, 480]
+focal = [610.5, 611.0]
+center = [322.0, 238.5]
+lens = "brown"
+coefficients = [-0.2, 0.05, 0.001, -0.002, 0.01]
+position = [0.5, -0.1, 0.4]
+target = [0.0, 0.0, 0.1]
+
+[[camera]]
+name = "above"
+size = [800, 600]
+focal = [500, 500]
+T_world_camera = [[1, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 1], [0, 0, 0, 1]]
+"""
+SHARED = """
+name = "lab"
+size = [1280, 1024]
+focal = 1100.0
+center = [640.5, 511.0]
+lens = "brown"
+coefficients = [-0.2, 0.05, 0.0, 0.0, 0.0]
+"""
+PLACES = [f"[[camera]]\nposition = [{x}, 0, 2.2]\ntarget = [0, 0, 1.1]\n" for x in (1.2, -1.2, 0.3)]
 
 
 def test_shipped_rigs_hold_what_their_names_say():
@@ -157,34 +211,6 @@ def test_points_behind_a_camera_have_no_pixel():
     assert np.isnan(pixels[1, 1, 0]).all()
 
 
-FILE = TOP + FIRST + SECOND
-CROWD = "".join(FIRST.replace("1.0, 0.0, 2.0", f"1.0, {n}.0, 2.0") for n in range(1, 33))
-POSE = "position = [-1.0, 0.5, 2.0]\ntarget = [0.0, 0.0, 1.0]\n"
-MISTAKES = [  # what is exchanged for what, at its last place, and what is told
-    (SECOND, "", "rig 'mine' | 1 cameras | 2 to 32"),
-    (FIRST + SECOND, "", "rig 'mine' | 0 cameras | 2 to 32"),
-    (SECOND, CROWD, "rig 'mine' | 33 cameras | 2 to 32"),
-    (SECOND, SECOND + FIRST, "cameras 1 and 3 | 'mine' | one position"),
-    ("0.5", '"half"', 'camera 2 | position is [-1.0, "half", 2.0] | three numbers'),
-    ("0.5", "nan", "camera 2 | position is [-1.0, NaN, 2.0] | three numbers"),
-    ("0.5, 2.0", "0.5", "camera 2 | position is [-1.0, 0.5] | three numbers"),
-    ("-1.0, 0.5, 2.0", "0.0, 0.0, 1.0", "camera 2 | its own position | target"),
-    ("-1.0, 0.5, 2.0", "-1000, 500, 2000", "camera 2 | 'mine' | 2291 m | at most 50 m | millimeters"),
-    (SECOND, SECOND + "target = [0.0,", "not a TOML file | end of document"),
-    ('"mine"', "3", "name is 3 | text in quotes"),
-    ("field_of_view = 50.0\n", "", "camera 1 | focal, K, field_of_view, horizontal_field_of_view"),
-    ("target", "targets", "camera 2 | 'targets' | 'target' | T_world_camera"),
-    ("target = [0.0, 0.0, 1.0]\n", "", "camera 2 has position | position and target, or T_world_camera"),
-    (POSE, POSE + "T_world_camera = [[1.0]]\n", "camera 2 has position and target and T_world_camera"),
-    (POSE, "T_world_camera = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]\n", "camera 2 | four rows"),
-    (POSE, "T_world_camera = [[1, 0, 0, 0], [0, 1]]\n", "camera 2 | [[1, 0, 0, 0], [0, 1]] | four rows"),
-    ("50.0", "0.87", "camera 1 | field_of_view is 0.87 degrees | 1 to 170"),
-    (TOP, TOP + "resolution = 640.5\n", "camera 1 | resolution is 640.5 | whole number of pixels"),
-    (TOP, TOP + "resolution = 0\n", "'camera1' | size is (0, 0) | 1 to 8192"),
-    (FIRST + SECOND, "camera = 3\n", "camera | [[camera]] table"),
-]  # fmt: skip
-
-
 @pytest.mark.parametrize(("old", "new", "words"), MISTAKES)
 def test_mistakes_in_a_file_are_told(tmp_path, old, new, words):
     path = tmp_path / "rig.toml"
@@ -240,27 +266,6 @@ def test_no_hand_reaches_beyond_its_reach(rng):
     assert np.linalg.norm(HandModel.named("XL").skin(flat), axis=-1).max() < HAND_REACH
 
 
-TWO = """
-name = "desk"
-
-[[camera]]
-name = "left"
-size = [640, 480]
-focal = [610.5, 611.0]
-center = [322.0, 238.5]
-lens = "brown"
-coefficients = [-0.2, 0.05, 0.001, -0.002, 0.01]
-position = [0.5, -0.1, 0.4]
-target = [0.0, 0.0, 0.1]
-
-[[camera]]
-name = "above"
-size = [800, 600]
-focal = [500, 500]
-T_world_camera = [[1, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 1], [0, 0, 0, 1]]
-"""
-
-
 def written(folder, text=TWO):
     path = folder / "cameras.toml"
     path.write_text(text)
@@ -275,17 +280,6 @@ def test_a_file_of_two_cameras(tmp_path):
     np.testing.assert_allclose(left.project(np.array([0.0, 0.0, 0.1])), [322.0, 238.5], atol=1e-9)
     np.testing.assert_array_equal(above.K[:2, 2], [400, 300])
     np.testing.assert_allclose(above.local(np.array([0.0, 0.0, 0.2])), [0, 0, 0.8])
-
-
-SHARED = """
-name = "lab"
-size = [1280, 1024]
-focal = 1100.0
-center = [640.5, 511.0]
-lens = "brown"
-coefficients = [-0.2, 0.05, 0.0, 0.0, 0.0]
-"""
-PLACES = [f"[[camera]]\nposition = [{x}, 0, 2.2]\ntarget = [0, 0, 1.1]\n" for x in (1.2, -1.2, 0.3)]
 
 
 def test_what_stands_at_the_top_holds_unless_a_camera_says_otherwise(tmp_path):

@@ -44,27 +44,6 @@ NAMES = {
     "json": ("left_one", "right"),
     "nested": ("camera_0", "camera_1"),
 }
-
-
-@pytest.mark.parametrize("kind", [*KINDS, "motive"])
-def test_the_known_rig(tmp_path, kind):
-    path = written(tmp_path)[kind]
-    if kind != "motive":  # whose y is up
-        cameras = load_cameras(path)
-        check(cameras)
-        assert tuple(camera.name for camera in cameras) == NAMES[kind]
-        assert {camera.lens.kind for camera in cameras} == {"pinhole"}
-    rig = CameraRig("lab", import_cameras(path))
-    np.testing.assert_allclose(rig.positions, POSITIONS, atol=1e-6)
-    np.testing.assert_allclose(rig.project(POINT), PIXELS, atol=1e-3)
-
-
-def damaged(path, text, old, new, encoding="utf-8"):
-    assert text.count(old) >= 1, old
-    path.write_bytes(text.replace(old, new, 1).encode(encoding))
-    return path
-
-
 BAD = [
     ("a.xcp", XCP, '"0.5 0.5 -0.5 0.5"', '"0 0 0 0"', "quaternion of length 0, expected 1"),
     ("a.xcp", XCP, "4000 1000 2000", "nan 1000 2000", "POSITION is .*, expected 3 finite numbers"),
@@ -91,6 +70,33 @@ BAD = [
     ("a.mcal", MCAL, 'PixelWidth="1000"', 'PixelWidth="inf"', "ImagerPixelWidth is .inf., expected"),
     ("a.mcal", MCAL, "<Attributes", "<Attribute", "lacks <Attributes>"),
 ]
+CAMERAS = mixed_rig().cameras
+POINTS_LENSES = np.random.default_rng(5).uniform([-1.2, 1.0, 0.3], [1.2, 2.0, 1.9], (50, 3))
+BOMB = """<?xml version="1.0"?>
+<!DOCTYPE lolz [<!ENTITY a "lol">{}]>
+<Cameras>&j;</Cameras>""".format(
+    "".join(f'<!ENTITY {chr(98 + n)} "{f"&{chr(97 + n)};" * 10}">' for n in range(9))
+)
+LOCAL = np.random.default_rng(2).uniform([-0.3, -0.3, 1.0], [0.3, 0.3, 4.0], (20, 3))
+
+
+@pytest.mark.parametrize("kind", [*KINDS, "motive"])
+def test_the_known_rig(tmp_path, kind):
+    path = written(tmp_path)[kind]
+    if kind != "motive":  # whose y is up
+        cameras = load_cameras(path)
+        check(cameras)
+        assert tuple(camera.name for camera in cameras) == NAMES[kind]
+        assert {camera.lens.kind for camera in cameras} == {"pinhole"}
+    rig = CameraRig("lab", import_cameras(path))
+    np.testing.assert_allclose(rig.positions, POSITIONS, atol=1e-6)
+    np.testing.assert_allclose(rig.project(POINT), PIXELS, atol=1e-3)
+
+
+def damaged(path, text, old, new, encoding="utf-8"):
+    assert text.count(old) >= 1, old
+    path.write_bytes(text.replace(old, new, 1).encode(encoding))
+    return path
 
 
 @pytest.mark.parametrize(("name", "text", "old", "new", "message"), BAD)
@@ -233,9 +239,6 @@ def test_a_file_that_is_not_there_is_told(tmp_path):
         load_cameras(tmp_path / "nothing.yml")
 
 
-CAMERAS = mixed_rig().cameras
-
-
 @pytest.fixture
 def told(monkeypatch):
     """`import_cameras` of these cameras, and the warnings."""
@@ -278,9 +281,6 @@ def test_video_cameras_see_no_markers(told):
     cameras, (sentence,) = told(found)
     assert cameras == CAMERAS[:2] and "are left out: c2" in sentence
     assert len(told([one._replace(video=True) for one in found])[0]) == 3
-
-
-POINTS_LENSES = np.random.default_rng(5).uniform([-1.2, 1.0, 0.3], [1.2, 2.0, 1.9], (50, 3))
 
 
 @pytest.mark.parametrize(
@@ -352,13 +352,6 @@ def test_lenses_as_opencv_projects(tmp_path, name, text):
     np.testing.assert_allclose(camera.project(points), expected, atol=1e-6)
 
 
-BOMB = """<?xml version="1.0"?>
-<!DOCTYPE lolz [<!ENTITY a "lol">{}]>
-<Cameras>&j;</Cameras>""".format(
-    "".join(f'<!ENTITY {chr(98 + n)} "{f"&{chr(97 + n)};" * 10}">' for n in range(9))
-)
-
-
 @pytest.mark.parametrize(
     ("content", "message"),
     [
@@ -403,9 +396,6 @@ def test_encodings(tmp_path, encoding):
     path = tmp_path / "lab.xcp"
     path.write_bytes(XCP.encode(encoding))
     check(load_cameras(path))
-
-
-LOCAL = np.random.default_rng(2).uniform([-0.3, -0.3, 1.0], [0.3, 0.3, 4.0], (20, 3))
 
 
 def vicon(R, position):

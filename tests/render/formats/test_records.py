@@ -29,6 +29,9 @@ from render.formats.records import (
 )
 from tests.render.formats.reading import depth_of, exr_content
 
+# Names as the formats' own documents list them, in our words.
+THUMB = ("thumb_CMC", "thumb_MCP", "thumb_IP", "thumb_tip")
+
 
 @given(hnp.arrays(bool, st.tuples(st.integers(1, 12), st.integers(1, 12))))
 def test_pycocotools_reads_run_lengths(mask):
@@ -41,10 +44,6 @@ def test_pycocotools_reads_run_lengths(mask):
 def test_nan_becomes_null() -> None:
     text = to_json({"a": np.array([1.5, np.nan]), 3: (np.int64(2), float("inf")), "t": np.bool_(True)})
     assert json.loads(text) == {"a": [1.5, None], "3": [2, None], "t": True}
-
-
-# Names as the formats' own documents list them, in our words.
-THUMB = ("thumb_CMC", "thumb_MCP", "thumb_IP", "thumb_tip")
 
 
 def finger(name: str) -> tuple[str, ...]:

@@ -25,6 +25,8 @@ from render.formats.webdataset import (
     umetrack_wrist,
 )
 
+PIXELS = 128
+
 
 def polynomial(kind: str, flat: np.ndarray, k: list[float]) -> np.ndarray:
     """The distortions that UmeTrack's tools publish, in their order of coefficients."""
@@ -155,9 +157,6 @@ def test_both_sides_have_one_model() -> None:
     assert len(right["joint_limits"]) == len(right["joint_parent"]) == 20
     assert right["joint_parent"][:5] == [-1, 0, 1, 2, -1]
     assert right["joint_next_sibling"][::4] == [4, 8, 12, 16, -1]
-
-
-PIXELS = 128
 
 
 def pixels_in_crop(entry: dict, points: np.ndarray) -> np.ndarray:

@@ -2,8 +2,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import resource
-import signal
 import tarfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,13 +18,10 @@ from handsim.files.outputs import save_json
 from render import Pictures, RenderedFrame, merge_renderings
 from render.formats.shards import BESIDE
 from render.formats.writer import CONFIG, FORMATS, open_writer
+from tests.folders import contents
+from tests.limits import file_size_limit
 from tests.programs import ROOT, run_python
 from tests.render.formats.reading import depth_of, exr_content
-
-
-def files(folder: Path) -> dict[str, bytes]:
-    found = [path for path in folder.rglob("*") if path.is_file()]
-    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in found}
 
 
 def broken(frame: RenderedFrame) -> Iterator[RenderedFrame]:
@@ -39,11 +34,11 @@ def test_a_shard_is_there_whole_or_not_at_all(name: str, make_frame, tmp_path: P
     writer = open_writer(name, tmp_path / "set")
     assert writer.done() == frozenset()
     writer.write(3, [make_frame(0), make_frame(1)])
-    whole = files(tmp_path)
+    whole = contents(tmp_path)
     with pytest.raises(KeyboardInterrupt):
         writer.write(12, broken(make_frame(2)))
     assert writer.done() == {3}
-    assert files(tmp_path) == whole
+    assert contents(tmp_path) == whole
     assert open_writer(name, tmp_path / "set").done() == {3}
 
 
@@ -55,7 +50,7 @@ def test_the_same_frames_give_the_same_bytes_in_any_order(name: str, make_frame,
             writer.write(shard, [make_frame(2 * shard, ("right", "left")), make_frame(2 * shard + 1)])
         writer.finish()
         writer.finish()
-    assert files(tmp_path / "a") == files(tmp_path / "b")
+    assert contents(tmp_path / "a") == contents(tmp_path / "b")
 
 
 @pytest.mark.parametrize("name", FORMATS)
@@ -65,7 +60,7 @@ def test_a_shard_may_be_written_anew(name: str, make_frame, tmp_path: Path) -> N
     writer.write(0, [make_frame(4)])
     other = open_writer(name, tmp_path / "b")
     other.write(0, [make_frame(4)])
-    assert files(tmp_path / "a") == files(tmp_path / "b")
+    assert contents(tmp_path / "a") == contents(tmp_path / "b")
 
 
 @pytest.mark.parametrize("name", FORMATS)
@@ -98,17 +93,10 @@ def test_a_full_disk_is_told_and_finished_shards_stay(name, make_frame, tmp_path
     """The file system's own limit on a file's size stands for a full disk; both are an OSError."""
     writer = open_writer(name, tmp_path)
     writer.write(0, [make_frame(0)])
-    before = files(tmp_path)
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    try:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (300, hard))
-        with pytest.raises(HandSimError, match="writing shard 1 failed"):
-            writer.write(1, [make_frame(1)])
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-        signal.signal(signal.SIGXFSZ, handler)
-    assert files(tmp_path) == before
+    before = contents(tmp_path)
+    with file_size_limit(300), pytest.raises(HandSimError, match="writing shard 1 failed"):
+        writer.write(1, [make_frame(1)])
+    assert contents(tmp_path) == before
     assert writer.done() == {0}
 
 

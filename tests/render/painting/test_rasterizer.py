@@ -28,6 +28,24 @@ from render.painting.rasterizer import (
 from render.scenery.lights import Lighting
 
 NO_EMBREE = pytest.mark.skipif(importlib.util.find_spec("embreex") is None, reason="embreex is not installed")
+SPHERES = (
+    ((0.0, 0.0, 0.6), 0.1),
+    ((0.35, 0.1, 0.3), 0.12),
+    ((-0.5, 0.05, 0.05), 0.15),
+    ((0.1, -0.4, 0.2), 0.1),
+)
+WALL = 1.5
+POSE = np.eye(4)
+K = np.array([[200.0, 0.0, 163.0], [0.0, 204.0, 116.0], [0.0, 0.0, 1.0]])
+WIDE = np.array([[110.0, 0.0, 161.5], [0.0, 112.0, 118.0], [0.0, 0.0, 1.0]])  # corners see past 90 degrees
+CAMERAS = {
+    "brown": Camera("brown", (320, 240), K, POSE, Lens("brown", (-0.30, 0.11, -0.001, 0.0015, -0.02))),
+    "pincushion": Camera("pincushion", (320, 240), K, POSE, Lens("brown", (0.2, 0.05, 0.0, 0.0, 0.0))),
+    "fisheye": Camera("fisheye", (320, 240), WIDE, POSE, Lens("fisheye", (0.02, -0.006, 0.0, 0.0))),
+    "narrow fisheye": Camera(
+        "narrow fisheye", (320, 240), K, POSE, Lens("fisheye", (0.02, -0.006, 0.0, 0.0))
+    ),
+}
 
 
 def surface(vertices: np.ndarray, faces: np.ndarray, part: int = 1) -> Triangles:
@@ -130,26 +148,8 @@ def test_what_reaches_behind_the_camera_is_cut_off_and_not_left_out(away):
     assert np.allclose(np.linalg.norm(pictures.normals[inside], axis=-1), 1.0, atol=1e-5)
 
 
-SPHERES = (
-    ((0.0, 0.0, 0.6), 0.1),
-    ((0.35, 0.1, 0.3), 0.12),
-    ((-0.5, 0.05, 0.05), 0.15),
-    ((0.1, -0.4, 0.2), 0.1),
-)
-WALL = 1.5
-POSE = np.eye(4)
 POSE[:3, :3] = euler_matrix(np.array([0.3, -0.2, 0.1]))
 POSE[:3, 3] = 0.02, -0.01, 0.03
-K = np.array([[200.0, 0.0, 163.0], [0.0, 204.0, 116.0], [0.0, 0.0, 1.0]])
-WIDE = np.array([[110.0, 0.0, 161.5], [0.0, 112.0, 118.0], [0.0, 0.0, 1.0]])  # corners see past 90 degrees
-CAMERAS = {
-    "brown": Camera("brown", (320, 240), K, POSE, Lens("brown", (-0.30, 0.11, -0.001, 0.0015, -0.02))),
-    "pincushion": Camera("pincushion", (320, 240), K, POSE, Lens("brown", (0.2, 0.05, 0.0, 0.0, 0.0))),
-    "fisheye": Camera("fisheye", (320, 240), WIDE, POSE, Lens("fisheye", (0.02, -0.006, 0.0, 0.0))),
-    "narrow fisheye": Camera(
-        "narrow fisheye", (320, 240), K, POSE, Lens("fisheye", (0.02, -0.006, 0.0, 0.0))
-    ),
-}
 
 
 def cast(camera: Camera) -> dict[str, np.ndarray]:

@@ -26,6 +26,10 @@ from render.scenery.backgrounds import SHARE, Backdrop, sample_backdrop
 from render.scenery.lights import Lamp, Lighting
 from tests.render.scenes import plain, thing
 
+CAMERA = pinhole("small", (160, 120), 150.0)
+CENTER, RADIUS = (0.0, 0.0, 1.0), 0.15
+SHARP = 1e-3
+
 
 def test_texels_are_mixed_from_the_four_around_a_point(rng):
     rows, columns, count = 7, 5, 300
@@ -55,11 +59,6 @@ def test_display_values_follow_the_curve_and_are_clipped():
     shown = light.copy()
     shading.display(shown, tint, TO_DISPLAY)
     np.testing.assert_allclose(shown, np.clip(0.8 * light, 0.0, 1.0) ** (1.0 / shading.GAMMA), atol=1e-4)
-
-
-CAMERA = pinhole("small", (160, 120), 150.0)
-CENTER, RADIUS = (0.0, 0.0, 1.0), 0.15
-SHARP = 1e-3
 
 
 def ball(place: tuple[float, float, float] = CENTER) -> tuple[trimesh.Trimesh, Drawn]:

@@ -29,6 +29,10 @@ from render.scenery.rooms import draw_room
 from train import simulate_take
 
 SIZE = (160, 120)
+DRAWN = [kind for kind in KINDS if kind != "photo"]
+MIDDLE = np.array([0.1, -0.2, 1.1])
+POSITIONS = MIDDLE + np.array([[0.0, 0.0, 0.0], [0.5, -0.6, 0.3], [0.56, -0.55, 0.3], [-1.0, 0.3, 0.9]])
+LAMP = np.array([0.3, -0.2, 0.9])
 
 
 @pytest.fixture
@@ -147,14 +151,6 @@ def test_edges_of_rooms_are_smooth() -> None:
         mean = fine.reshape(60, 4, 80, 4, 3).mean(axis=(1, 3))
         off = np.abs(cv2.GaussianBlur(mean, (0, 0), 0.9) - coarse)
         assert np.quantile(off, 0.99) < 0.06
-
-
-DRAWN = [kind for kind in KINDS if kind != "photo"]
-MIDDLE = np.array([0.1, -0.2, 1.1])
-POSITIONS = MIDDLE + np.array([[0.0, 0.0, 0.0], [0.5, -0.6, 0.3], [0.56, -0.55, 0.3], [-1.0, 0.3, 0.9]])
-
-
-LAMP = np.array([0.3, -0.2, 0.9])
 
 
 def pair(name: str = "vga") -> list[Camera]:

@@ -30,6 +30,8 @@ INDEX = 1
 MARKERS = np.array([4, 5, 6])
 SPREAD = 0.001
 STRAYS = TrackerConfig.stray_density
+OWN = slice(4 * INDEX, 4 * INDEX + 4)
+MEAN, PRECISION = RESTING[OWN].copy(), np.diag(np.deg2rad([5.0, 15.0, 15.0, 10.0]) ** -2)
 
 
 @pytest.fixture(scope="module")
@@ -156,10 +158,6 @@ def test_ranges_hold_the_poses_of_the_hand(hand):
         assert (apart >= ranges.nearest[block] - 0.003).all() and (
             apart <= ranges.farthest[block] + 0.003
         ).all()
-
-
-OWN = slice(4 * INDEX, 4 * INDEX + 4)
-MEAN, PRECISION = RESTING[OWN].copy(), np.diag(np.deg2rad([5.0, 15.0, 15.0, 10.0]) ** -2)
 
 
 @pytest.fixture(scope="module")

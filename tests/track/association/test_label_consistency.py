@@ -27,6 +27,8 @@ from track.association.label_consistency import (
 )
 
 RATE = 120.0
+TIP, OTHER_TIP = 6, 9  # of the index and the middle finger
+KNUCKLE = 4  # of the index finger
 
 
 def frame_of(points: np.ndarray, labels: np.ndarray) -> FrameState:
@@ -81,8 +83,7 @@ def motion() -> Motion:
 @pytest.mark.parametrize("frames", [1, 20, 150])
 def test_right_labels_stay_and_give_the_pose(motion, frames):
     state, prediction = motion.followed(frames)
-    labels = np.arange(19)
-    labels = gated(state, motion.markers[frames], labels, prediction)
+    labels = gated(state, motion.markers[frames], np.arange(19), prediction)
     labels, estimate = fitted(state, motion.markers[frames], labels, prediction)
     np.testing.assert_array_equal(labels, np.arange(19))
     assert estimate.rms < 1e-4
@@ -93,10 +94,7 @@ def test_right_labels_stay_and_give_the_pose(motion, frames):
 @given(st.integers(0, 18), st.integers(0, 500), st.floats(0.025, 0.2), st.sampled_from([1, 20]))
 def test_a_label_far_from_its_predicted_marker_is_dropped(motion, wrong, seed, off, frames):
     state, prediction = motion.followed(frames)
-    way = np.random.default_rng(seed).normal(size=3)
-    points, labels = motion.markers[frames].copy(), np.arange(19)
-    points[wrong] += off * way / np.linalg.norm(way)
-    labels = gated(state, points, labels, prediction)
+    labels = gated(state, planted(motion.markers[frames], wrong, off, seed), np.arange(19), prediction)
     assert np.flatnonzero(labels < 0).tolist() == [wrong]
     assert np.flatnonzero(labels != np.arange(19)).tolist() == [wrong]
 
@@ -104,8 +102,8 @@ def test_a_label_far_from_its_predicted_marker_is_dropped(motion, wrong, seed, o
 def test_a_hand_that_is_elsewhere_keeps_its_labels(motion):
     """Then the prediction is wrong."""
     state, prediction = motion.followed(20)
-    labels, points = np.arange(19), motion.markers[20] + [0.05, 0.0, 0.0]
-    labels = gated(state, points, labels, prediction)
+    points = motion.markers[20] + [0.05, 0.0, 0.0]
+    labels = gated(state, points, np.arange(19), prediction)
     np.testing.assert_array_equal(labels, np.arange(19))
     labels, estimate = fitted(state, points, labels, prediction)
     np.testing.assert_array_equal(labels, np.arange(19))
@@ -115,9 +113,9 @@ def test_a_hand_that_is_elsewhere_keeps_its_labels(motion):
 def test_few_labels_may_be_dropped_at_once(motion):
     state, prediction = motion.followed(20)
     for many, gone in ((5, 5), (6, 0)):  # of 19 labels, at most 30 %
-        labels, points = np.arange(19), motion.markers[20].copy()
+        points = motion.markers[20].copy()
         points[:many] += [0.0, 0.0, 0.06]
-        labels = gated(state, points, labels, prediction)
+        labels = gated(state, points, np.arange(19), prediction)
         assert (labels < 0).sum() == gone
 
 
@@ -126,8 +124,7 @@ def test_the_gate_is_as_wide_as_the_whole_hand_is_off(motion):
     state, prediction = motion.followed(20)
     points = motion.markers[20] + [0.012, 0.0, 0.0]
     points[[4, 5, 6]] += [0.02, 0.0, 0.0]  # and a finger with it
-    labels = np.arange(19)
-    labels = gated(state, points, labels, prediction)
+    labels = gated(state, points, np.arange(19), prediction)
     np.testing.assert_array_equal(labels, np.arange(19))
     points[6] += [0.15, 0.0, 0.0]
     labels = gated(state, points, labels, prediction)
@@ -167,8 +164,8 @@ def planted(points: np.ndarray, wrong: int, off: float, seed: int) -> np.ndarray
 def test_a_planted_wrong_label_is_dropped_and_the_right_ones_stay(motion, wrong, seed, off):
     """On the palm and at the knuckles, where no bent finger explains it."""
     state, prediction = motion.followed(20)
-    labels = np.arange(19)
-    labels, estimate = fitted(state, planted(motion.markers[20], wrong, off, seed), labels, prediction)
+    points = planted(motion.markers[20], wrong, off, seed)
+    labels, estimate = fitted(state, points, np.arange(19), prediction)
     assert np.flatnonzero(labels < 0).tolist() == [wrong]
     np.testing.assert_allclose(estimate.positions, motion.markers[20], atol=0.004)
 
@@ -178,9 +175,8 @@ def test_a_wrong_label_on_a_finger_seldom_drops_others(motion):
     state, prediction = motion.followed(20)
     found = []
     for number, wrong in enumerate([*range(1, 16)] * 20):
-        labels = np.arange(19)
         points = planted(motion.markers[20], wrong, (0.03, 0.05, 0.09)[number % 3], number)
-        labels, _ = fitted(state, points, labels, prediction)
+        labels, _ = fitted(state, points, np.arange(19), prediction)
         found.append(np.flatnonzero(labels < 0).tolist() == [wrong])
     assert np.mean(found) >= 0.95
 
@@ -197,8 +193,7 @@ def test_of_two_swapped_labels_both_are_dropped(motion, pair):
 
 def test_without_labels_the_pose_is_the_predicted_one(motion):
     state, prediction = motion.followed(20)
-    labels = np.full(19, -1)
-    labels, estimate = fitted(state, motion.markers[20], labels, prediction)
+    labels, estimate = fitted(state, motion.markers[20], np.full(19, -1), prediction)
     assert np.isnan(estimate.rms) and (labels == -1).all()
     np.testing.assert_array_equal(estimate.qpos[:7], prediction.qpos[:7])
     np.testing.assert_allclose(estimate.qpos[7:], prediction.joint_prior.angles, atol=1e-9)
@@ -216,13 +211,13 @@ def test_with_a_sure_prediction_most_labels_being_wrong_is_told_by_one_fit(motio
     assert sure[0].labels[6] == -1 and sure[1].rms < 0.001
 
 
-TIP, OTHER_TIP = 6, 9  # of the index and the middle finger
-KNUCKLE = 4  # of the index finger
-
-
 @pytest.fixture
 def state(followed) -> HandState:
     return followed()
+
+
+def a_review(labeler: CountingLabeler | None = None) -> LabelerReview:
+    return LabelerReview(labeler or CountingLabeler(), 1, TrackerConfig())
 
 
 def reviewed(review: LabelerReview, state: HandState, frame: FrameState):
@@ -236,8 +231,7 @@ def reviewed(review: LabelerReview, state: HandState, frame: FrameState):
 
 def test_exchanged_labels_are_found_and_right_ones_stay(state, frame_of):
     points = state.solver.marker_positions(state.qpos)
-    labeler = CountingLabeler()
-    review = LabelerReview(labeler, 1, TrackerConfig())
+    review = a_review(labeler := CountingLabeler())
     assert reviewed(review, state, frame_of(points, np.arange(19), 0.5)) is None
     assert len(labeler.calls) == 1
     wrong = np.arange(19)
@@ -252,12 +246,12 @@ def test_a_marker_that_waits_gets_its_label_and_a_ghost_does_not(state, frame_of
     points = state.solver.marker_positions(state.qpos)
     labels = np.arange(19)
     labels[TIP] = -1
-    review = LabelerReview(CountingLabeler(), 1, TrackerConfig())
+    review = a_review()
     frame, _ = reviewed(review, state, frame_of(points, labels, 0.5))
     np.testing.assert_array_equal(frame.labels, np.arange(19))
     ghost = points.copy()
     ghost[TIP] += [0.0, 0.0, 0.03]
-    again = LabelerReview(CountingLabeler(), 1, TrackerConfig())
+    again = a_review()
     assert reviewed(again, state, frame_of(ghost, labels, 0.5, first_seen=0.5)) is None
 
 
@@ -266,15 +260,14 @@ def test_a_point_that_was_long_beside_a_marker_does_not_replace_it(state, frame_
     labels = np.arange(19)
     labels[TIP] = -1
     for free_since, replaces in ((0.45, True), (0.2, False)):
-        review = LabelerReview(CountingLabeler(), 1, TrackerConfig())
+        review = a_review()
         after = reviewed(review, state, frame_of(points, labels, 0.5, free_since=free_since))
         assert (after is not None) == replaces
 
 
 def test_reviews_become_rarer_until_a_new_point_comes(state, frame_of):
     points = state.solver.marker_positions(state.qpos)
-    labeler = CountingLabeler()
-    review = LabelerReview(labeler, 1, TrackerConfig())
+    review = a_review(labeler := CountingLabeler())
     for frame in range(240):
         reviewed(review, state, frame_of(points, np.arange(19), 0.5 + frame / RATE))
     assert 8 <= len(labeler.calls) <= 20
@@ -296,13 +289,13 @@ def test_a_hand_in_a_crowd_of_strays_is_not_reviewed(state, frame_of):
     labels[TIP] = -1
     crowd = np.concatenate([points, points[TIP] + rng.uniform(-0.03, 0.03, (700, 3))])
     labeler = CountingLabeler()
-    assert reviewed(LabelerReview(labeler, 1, TrackerConfig()), state, frame_of(crowd, labels, 0.5)) is None
+    assert reviewed(a_review(labeler), state, frame_of(crowd, labels, 0.5)) is None
     assert labeler.calls == []
 
 
 def test_a_hand_that_was_initialized_is_reviewed_in_the_next_frame(state, frame_of):
     points, labeler = state.solver.marker_positions(state.qpos), CountingLabeler()
-    review = LabelerReview(labeler, 1, TrackerConfig())
+    review = a_review(labeler)
     for frame in range(120):
         reviewed(review, state, frame_of(points, np.arange(19), 0.5 + frame / RATE))
     before = len(labeler.calls)
@@ -324,7 +317,7 @@ def test_a_bias_that_was_learned_from_a_ghost_yields_to_a_point_that_lasts(age, 
     labels = np.arange(19)
     labels[KNUCKLE] = -1
     frame = frame_of(points, labels, 1.0, first_seen=1.0 - age)
-    found = reviewed(LabelerReview(CountingLabeler(), 1, TrackerConfig()), state, frame)
+    found = reviewed(a_review(), state, frame)
     if age == 0.0:
         assert found is None
     else:

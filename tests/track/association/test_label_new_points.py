@@ -25,6 +25,11 @@ from track.association.label_new_points import (
 
 RATE, SETTLED = 120.0, 12.0
 PALM, KNUCKLE, MIDDLE, TIP, OTHER_TIP = 17, 4, 5, 6, 9
+# Two digits of three markers each and a palm of one; the digits lie 30 mm apart.
+PLACES = np.array(
+    [*[[0.03 * n, 0.0, 0.0] for n in range(3)], *[[0.03 * n, 0.03, 0.0] for n in range(3)], [-0.1, 0, 0]]
+)
+PARTS = np.array([0, 0, 0, 1, 1, 1, -1])
 
 
 def labeled(frame, states: list[HandState]):
@@ -132,13 +137,6 @@ def test_a_hand_without_a_pose_gets_no_labels(followed, frame_of):
     after = label_new_points(frame, [HandTrack(0, right, prediction, estimate)], table)
     np.testing.assert_array_equal(after.labels, [*range(19), *[-1] * 19])
     assert label_new_points(frame, [], table) is frame
-
-
-# Two digits of three markers each and a palm of one; the digits lie 30 mm apart.
-PLACES = np.array(
-    [*[[0.03 * n, 0.0, 0.0] for n in range(3)], *[[0.03 * n, 0.03, 0.0] for n in range(3)], [-0.1, 0, 0]]
-)
-PARTS = np.array([0, 0, 0, 1, 1, 1, -1])
 
 
 def candidates_of(points, assigned, evidence=12.0):

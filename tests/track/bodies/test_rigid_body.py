@@ -32,6 +32,9 @@ NAMES = ("controller", "ball", "box", "mug")
 STEP = 1.0 / 120.0
 NOISE = 0.0002  # [m]
 FRAMES = 240
+NUMBERS = st.sampled_from([0.0, 0.01, -0.02, 0.05, 1e-300, 999.0]) | st.floats(-1.0, 1.0)
+TIMES = st.sampled_from([0.0, STEP, 2 * STEP, -1.0, 1e9, np.nan, np.inf])
+FILE_NAMES = st.text(st.characters(exclude_categories=["C", "Z"]), min_size=1, max_size=8)
 
 
 @functools.cache
@@ -305,10 +308,6 @@ def test_a_mirrored_constellation_is_another_one(rng):
     assert BodyTracker(body).step(points, np.arange(4), 0.0).status == Status.LOST
 
 
-NUMBERS = st.sampled_from([0.0, 0.01, -0.02, 0.05, 1e-300, 999.0]) | st.floats(-1.0, 1.0)
-TIMES = st.sampled_from([0.0, STEP, 2 * STEP, -1.0, 1e9, np.nan, np.inf])
-
-
 @settings(max_examples=60, deadline=None)
 @given(st.data())
 def test_no_stream_content_raises(data):
@@ -343,9 +342,6 @@ def test_a_crowd_of_points_is_not_searched_but_a_body_in_it_is_followed(rng):
     assert tracker.step(points, labels, STEP).status == Status.INITIALIZED
     points, labels = seen(body, pose, rng, strays=2000)
     assert tracker.step(points, labels, 2 * STEP).status == Status.TRACKED
-
-
-FILE_NAMES = st.text(st.characters(exclude_categories=["C", "Z"]), min_size=1, max_size=8)
 
 
 @st.composite

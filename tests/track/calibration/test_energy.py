@@ -35,6 +35,7 @@ from track.calibration.hand_parameters import NUM_PARAMETERS, SkinPatch, nearest
 
 FRAMES = 12
 SHARED = NUM_PARAMETERS + 57
+RATE = 60.0
 
 
 @pytest.fixture(scope="module")
@@ -201,9 +202,6 @@ def test_steps_go_down_and_are_told(problem_and_estimate):
     assert fit.cost < 0.2 * problem.fit(estimate).cost
     assert told == list(range(11, steps + 1))
     assert np.sqrt(np.median((fit.residuals**2).sum(axis=(1, 2)) / problem.present.sum(axis=1))) < 0.0015
-
-
-RATE = 60.0
 
 
 @pytest.fixture(scope="module")

@@ -35,6 +35,8 @@ from train.forecast.rig_forecast import observe_motion, observe_poses
 from train.labelers.layout_labeler import LayoutLabeler
 from train.labelers.storage import shipped_labelers
 
+SHIFT = ((1, 2), (2, 5), (5, 1))
+
 
 def test_seen_markers_are_counted(tips, tips_hands, tips_score):
     observed = np.concatenate([hand.frames.observed for hand in tips_hands])
@@ -263,9 +265,6 @@ def exchanged(take, pairs, *, share=1.0):
     for before, after in pairs.items():
         labels[:until][take.labels[:until] == before] = after
     return dataclasses.replace(take, labels=labels)
-
-
-SHIFT = ((1, 2), (2, 5), (5, 1))
 
 
 @pytest.mark.parametrize(

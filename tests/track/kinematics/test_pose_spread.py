@@ -41,6 +41,9 @@ from track.kinematics.pose_spread import (
 
 NOTHING = 1e-9 * np.eye(20)  # precision of hinges of which nothing is known
 INDEX = slice(4, 8)
+SEEDS = st.integers(0, 1000)
+SPANS = st.floats(0.0, 5.0)
+LEAST = np.deg2rad(0.5) ** 2 * np.eye(20)
 
 
 def spreads_of(fit, doubt, qpos, unseen, prior=NOTHING):
@@ -252,11 +255,6 @@ def test_errors_of_a_hand_move_its_points_as_another_hand_does(part, side, rng):
     found = np.sqrt((off**2).mean(axis=2)), np.abs(solved - qpos)[:, 7:]
     for one, stated in zip(found, (keypoints, angles), strict=True):
         assert np.abs(one - stated).mean() < 0.15 * stated.mean()
-
-
-SEEDS = st.integers(0, 1000)
-SPANS = st.floats(0.0, 5.0)
-LEAST = np.deg2rad(0.5) ** 2 * np.eye(20)
 
 
 def draw_prior(seed: int) -> tuple[np.ndarray, np.ndarray]:

@@ -109,17 +109,24 @@ def test_labels_of_a_glove_with_markers_elsewhere_change_when_it_is_known(tmp_pa
     assert np.mean(wrong[:1200]) > 0.05 and np.mean(wrong[-60:]) < 0.002
 
 
-def found(length):
-    """What a measurement gives that found a hand of a length [m]."""
+def live(**size):
+    """What measures a right hand beside its tracker, and a tracker that notes its sizes."""
+    setup = TrackerSetup.of(TrackSettings(hands="right", **size))
+    return LiveSizing(setup), FakeTracker(setup.user)
+
+
+def found(monkeypatch, length):
+    """Let measurements find a hand of a length [m]; the frame in which each one begins [s]."""
 
     def measure(settings, frames, before, *, judges):
-        calls.append(len(frames))
+        calls.append(frames[0].time)
         user = TrackerSetup.of(TrackSettings(hands="right", size="M" if length < 0.19 else "XL")).user
         user = dataclasses.replace(user, notes="auto, measured")
         return live_sizing._Measured([user])
 
     calls = []
-    return measure, calls
+    monkeypatch.setattr(live_sizing, "_measure", measure)
+    return calls
 
 
 class FakeTracker:
@@ -145,10 +152,8 @@ def shown(sizing, tracker, begin, seconds, *, there=True, points=20, rms=0.001):
 
 
 def test_hands_are_measured_again_after_a_pause_and_another_user_is_taken_over_at_once(monkeypatch):
-    setup = TrackerSetup.of(TrackSettings(hands="right"))
-    sizing, tracker = LiveSizing(setup), FakeTracker(setup.user)
-    measure, calls = found(0.187)
-    monkeypatch.setattr(live_sizing, "_measure", measure)
+    sizing, tracker = live()
+    calls = found(monkeypatch, 0.187)
     shown(sizing, tracker, 0.0, 5.0, there=False, points=3)
     assert not calls, "nothing can be measured"
     shown(sizing, tracker, 5.0, 30.0)
@@ -161,8 +166,7 @@ def test_hands_are_measured_again_after_a_pause_and_another_user_is_taken_over_a
     assert len(calls) == 3 and len(tracker.sizes) == 2, "a brief look shows the same hand"
     shown(sizing, tracker, 63.5, 10.0)
     assert len(calls) == 4 and len(tracker.sizes) == 3
-    measure, calls = found(0.205)
-    monkeypatch.setattr(live_sizing, "_measure", measure)
+    calls = found(monkeypatch, 0.205)
     shown(sizing, tracker, 73.5, 3.0, there=False, points=3)
     shown(sizing, tracker, 76.5, 1.5)
     assert len(calls) == 1 and tracker.user[0].shape.length > 0.19, "another hand"
@@ -170,9 +174,8 @@ def test_hands_are_measured_again_after_a_pause_and_another_user_is_taken_over_a
 
 def test_a_hand_that_jumps_while_a_size_is_taken_over_is_shown_on_its_way(monkeypatch):
     """The wrist moves at 0.5 m/s; from the take-over on the pose is 20 mm and 0.2 rad away from it."""
-    setup = TrackerSetup.of(TrackSettings(hands="right"))
-    sizing, tracker = LiveSizing(setup), FakeTracker(setup.user)
-    monkeypatch.setattr(live_sizing, "_measure", found(0.187)[0])
+    sizing, tracker = live()
+    found(monkeypatch, 0.187)
     velocity, nobody = np.zeros(26), np.zeros((20, 3))
     velocity[0] = 0.5
     places, jumped = [], None
@@ -194,45 +197,34 @@ def test_a_hand_that_jumps_while_a_size_is_taken_over_is_shown_on_its_way(monkey
 
 def test_a_hand_that_turns_back_while_a_size_is_taken_over_is_not_lost(monkeypatch):
     """It swings at up to 1.3 m/s, faster than the shown hand may come nearer."""
-    setup = TrackerSetup.of(TrackSettings(hands="right"))
-    sizing, tracker = LiveSizing(setup), FakeTracker(setup.user)
-    monkeypatch.setattr(live_sizing, "_measure", found(0.187)[0])
-    resized, away = [], []
+    sizing, tracker = live()
+    found(monkeypatch, 0.187)
+    nobody, resized, away = np.zeros((20, 3)), [], []
     for number in range(round(2.0 * RATE)):
         time = number / RATE
         swing = 4.0 * np.pi * (time - 0.9)  # [rad] fastest about when the size is taken over
         place, speed = 0.1 * np.sin(swing), 0.4 * np.pi * np.cos(swing)
         qpos = join_qpos(np.zeros((1, 20)), position=np.array([place, 0.02 * bool(resized), 0.0]))[0]
-        hand = TrackedHand(
-            "right",
-            Status.TRACKED,
-            qpos,
-            0.001,
-            np.zeros((20, 3)),
-            np.arange(0),
-            velocity=np.eye(26)[0] * speed,
-        )
+        velocity = speed * np.eye(26)[0]
+        hand = TrackedHand("right", Status.TRACKED, qpos, 0.001, nobody, np.arange(0), velocity=velocity)
         tracked = TrackedFrame(time, (hand,), np.full(20, -1), np.ones(20))
         shown = sizing.eased(tracked, tracker)
         away.append(np.linalg.norm(shown.hands[0].qpos[:3] - qpos[:3]))
-        if sizing.step(StreamedFrame(number, time, np.zeros((20, 3)), np.arange(20)), tracked, tracker):
+        if sizing.step(StreamedFrame(number, time, nobody, np.arange(20)), tracked, tracker):
             resized.append(number)
     assert 0.015 < max(away) < 0.021 and not any(away[resized[-1] + 30 :])
 
 
 def test_another_user_is_noticed_by_the_residual_without_a_pause(monkeypatch):
-    setup = TrackerSetup.of(TrackSettings(hands="right"))
-    sizing, tracker = LiveSizing(setup), FakeTracker(setup.user)
-    measure, calls = found(0.187)
-    monkeypatch.setattr(live_sizing, "_measure", measure)
+    sizing, tracker = live()
+    calls = found(monkeypatch, 0.187)
     shown(sizing, tracker, 0.0, 30.0)
     shown(sizing, tracker, 30.0, 20.0, rms=0.0013)
     assert len(calls) == 2, "poses differ by so much"
     shown(sizing, tracker, 50.0, 0.1, rms=0.003)
     shown(sizing, tracker, 50.1, 5.0)
     assert len(calls) == 2, "some wrong labels"
-    measure, calls = found(0.205)
-    monkeypatch.setattr(live_sizing, "_measure", measure)
+    calls = found(monkeypatch, 0.205)
     shown(sizing, tracker, 55.1, 3.0, rms=0.003)
     assert len(calls) == 1 and tracker.user[0].shape.length > 0.19
     shown(sizing, tracker, 58.1, 30.0, rms=0.003)
@@ -240,8 +232,7 @@ def test_another_user_is_noticed_by_the_residual_without_a_pause(monkeypatch):
 
 
 def test_points_that_are_no_hand_are_measured_less_and_less_often(monkeypatch):
-    setup = TrackerSetup.of(TrackSettings(hands="right"))
-    sizing, tracker, calls = LiveSizing(setup), FakeTracker(setup.user), []
+    sizing, tracker, calls = *live(), []
 
     def measure(settings, frames, before, *, judges):
         calls.append(len(frames))
@@ -261,17 +252,14 @@ def test_points_that_are_no_hand_are_measured_less_and_less_often(monkeypatch):
 
 
 def test_hands_of_a_known_size_are_not_measured(monkeypatch):
-    setup = TrackerSetup.of(TrackSettings(hands="right", size="L"))
-    sizing, tracker = LiveSizing(setup), FakeTracker(setup.user)
-    measure, calls = found(0.187)
-    monkeypatch.setattr(live_sizing, "_measure", measure)
+    sizing, tracker = live(size="L")
+    calls = found(monkeypatch, 0.187)
     shown(sizing, tracker, 0.0, 15.0)
     assert not calls and sizing.is_settled
 
 
 def test_why_hands_are_not_measured_is_known(monkeypatch):
-    setup = TrackerSetup.of(TrackSettings(hands="right"))
-    sizing, tracker, clock = LiveSizing(setup), FakeTracker(setup.user), [0.0]
+    sizing, tracker, clock = *live(), [0.0]
     monkeypatch.setattr(live_sizing, "monotonic", lambda: clock[0])
     shown(sizing, tracker, 0.0, 0.1)
     assert sizing.state == "not measured yet: seen for 0.2 of 0.3 s"
@@ -288,7 +276,7 @@ def test_why_hands_are_not_measured_is_known(monkeypatch):
     assert sizing.state == "not measured yet: no hand was found"
     pending = Future()
     shown(sizing, tracker, 1.6, 10.0)
-    pending.set_result(live_sizing._Measured([dataclasses.replace(setup.user, notes="auto, measured")]))
+    pending.set_result(live_sizing._Measured([dataclasses.replace(tracker.user, notes="auto, measured")]))
     shown(sizing, tracker, 11.6, 0.1)
     assert sizing.state == ""
     shown(sizing, tracker, 11.7, 3.0, there=False, points=3)
@@ -299,20 +287,17 @@ def test_why_hands_are_not_measured_is_known(monkeypatch):
 
 
 def test_another_user_without_a_pause_is_noticed_before_the_last_measurement(monkeypatch):
-    setup = TrackerSetup.of(TrackSettings(hands="right"))
-    sizing, tracker = LiveSizing(setup), FakeTracker(setup.user)
-    monkeypatch.setattr(live_sizing, "_measure", found(0.187)[0])
+    sizing, tracker = live()
+    found(monkeypatch, 0.187)
     shown(sizing, tracker, 0.0, 7.0)
-    measure, calls = found(0.205)
-    monkeypatch.setattr(live_sizing, "_measure", measure)
+    calls = found(monkeypatch, 0.205)
     shown(sizing, tracker, 7.0, 3.0, rms=0.003)
     assert len(calls) == 1 and tracker.user[0].shape.length > 0.19
 
 
 def test_a_second_measurement_goes_on_from_the_first(monkeypatch):
     """The first one has so little processor time that the second follows at once."""
-    setup = TrackerSetup.of(TrackSettings(hands="right"))
-    sizing, tracker, asked, pending = LiveSizing(setup), FakeTracker(setup.user), [], [Future(), Future()]
+    sizing, tracker, asked, pending = *live(), [], [Future(), Future()]
     larger = TrackerSetup.of(TrackSettings(hands="right", size="XL")).user
 
     def submit(self, function, settings, frames, before, **options):
@@ -321,7 +306,7 @@ def test_a_second_measurement_goes_on_from_the_first(monkeypatch):
 
     monkeypatch.setattr(AtOnce, "submit", submit)
     shown(sizing, tracker, 0.0, 12.0)
-    assert asked == [setup.user]
+    assert asked == [tracker.user]
     pending[0].set_result(live_sizing._Measured([dataclasses.replace(larger, notes="auto, measured")]))
     shown(sizing, tracker, 12.0, 0.1)
     assert len(asked) == 2 and asked[1].hands == larger.hands
@@ -329,15 +314,8 @@ def test_a_second_measurement_goes_on_from_the_first(monkeypatch):
 
 def test_hands_that_come_before_the_last_measurement_are_measured_by_themselves(monkeypatch):
     """They differ so much that the tracker does not find them."""
-    setup = TrackerSetup.of(TrackSettings(hands="right"))
-    sizing, tracker, begins = LiveSizing(setup), FakeTracker(setup.user), []
-    measure, _ = found(0.205)
-
-    def noted(settings, frames, before, *, judges):
-        begins.append(frames[0].time)
-        return measure(settings, frames, before, judges=judges)
-
-    monkeypatch.setattr(live_sizing, "_measure", noted)
+    sizing, tracker = live()
+    begins = found(monkeypatch, 0.205)
     shown(sizing, tracker, 0.0, 5.0)
     shown(sizing, tracker, 5.0, 2.0, there=False, points=3)
     shown(sizing, tracker, 7.0, 0.8, there=False)
@@ -345,12 +323,11 @@ def test_hands_that_come_before_the_last_measurement_are_measured_by_themselves(
 
 
 def test_a_measurement_of_those_who_have_left_does_not_count_for_others(monkeypatch):
-    setup = TrackerSetup.of(TrackSettings(hands="right"))
-    sizing, tracker, pending = LiveSizing(setup), FakeTracker(setup.user), Future()
+    sizing, tracker, pending = *live(), Future()
     monkeypatch.setattr(AtOnce, "submit", lambda *given, **options: pending)
     shown(sizing, tracker, 0.0, 3.0)
     shown(sizing, tracker, 3.0, 2.0, there=False, points=3)
     shown(sizing, tracker, 5.0, 0.05)
-    pending.set_result(live_sizing._Measured([dataclasses.replace(setup.user, notes="auto, measured")]))
+    pending.set_result(live_sizing._Measured([dataclasses.replace(tracker.user, notes="auto, measured")]))
     shown(sizing, tracker, 5.05, 0.05)
     assert sizing.is_settled and sizing.state == "not measured yet: seen for 0.2 of 0.3 s"

@@ -41,6 +41,14 @@ from track.output.osc import osc_format
 from track.output.sinks import open_sink
 
 DECODE = {"json": json.loads, "msgpack": msgpack.unpackb}
+# In words: what a receiver of each program takes for forward, left and up, and its unit [m].
+BY_WORDS = {
+    "ros": ((1, 0, 0), (0, 1, 0), (0, 0, 1), 1.0),
+    "openxr": ((0, 0, -1), (-1, 0, 0), (0, 1, 0), 1.0),
+    "opengl": ((0, 0, -1), (-1, 0, 0), (0, 1, 0), 1.0),
+    "unity": ((0, 0, 1), (-1, 0, 0), (0, 1, 0), 1.0),
+    "unreal": ((1, 0, 0), (0, -1, 0), (0, 0, 1), 0.01),
+}
 
 
 @pytest.mark.parametrize("name", FORMATS)
@@ -300,14 +308,6 @@ def test_hands_that_are_not_measured_are_told_everywhere(message):
         assert sample_of(one)[labels.index("measured")] == (not state)
 
 
-def test_a_lost_hand_has_no_numbers(message):
-    one = message(lost=True)
-    assert [hand.has_pose for hand in one.hands] == [True, False] and not one.bodies[0].has_pose
-    lost = one.hands[1]
-    for values in (lost.position, lost.quaternion, lost.angles, lost.positions):
-        assert np.isnan(values).all()
-
-
 def as_openxr(position, rotation):
     """A pose in OpenXR's axes (x right, y up, z backward), of a world whose x is forward and z up."""
     turn = Rotation.from_matrix([[0, -1, 0], [0, 0, 1], [-1, 0, 0]])
@@ -368,16 +368,6 @@ def test_poses_are_those_of_each_program(program, up, message):
     assert 0.003 < header["radii"][0][9] / (100.0 if unit == "cm" else 1.0) < 0.02
 
 
-# In words: what a receiver of each program takes for forward, left and up, and its unit [m].
-BY_WORDS = {
-    "ros": ((1, 0, 0), (0, 1, 0), (0, 0, 1), 1.0),
-    "openxr": ((0, 0, -1), (-1, 0, 0), (0, 1, 0), 1.0),
-    "opengl": ((0, 0, -1), (-1, 0, 0), (0, 1, 0), 1.0),
-    "unity": ((0, 0, 1), (-1, 0, 0), (0, 1, 0), 1.0),
-    "unreal": ((1, 0, 0), (0, -1, 0), (0, 0, 1), 0.01),
-}
-
-
 @pytest.mark.parametrize("up", ["z", "y"])
 @pytest.mark.parametrize("forward", ["x", "-x", "y", "-y", "z", "-z"])
 def test_a_hand_that_points_to_the_door_does_so_in_all_worlds(forward, up, message):
@@ -412,6 +402,10 @@ def test_a_hand_that_points_to_the_door_does_so_in_all_worlds(forward, up, messa
 def test_what_is_lost_has_no_pose_in_any_axes(message):
     one = in_axes(message(lost=True), Content(axes="unity").program)
     document = frame_document(message(lost=True), Content(joints=True, axes="unity"))
-    assert np.isnan(one.hands[1].position).all() and one.hands[0].has_pose
+    assert [hand.has_pose for hand in one.hands] == [True, False] and not one.bodies[0].has_pose
+    lost = one.hands[1]
+    assert all(
+        np.isnan(array).all() for array in (lost.position, lost.quaternion, lost.angles, lost.positions)
+    )
     assert document["hands"][1]["wrist"] is document["hands"][1]["joints"] is None
     assert document["bodies"][0]["pose"] is None

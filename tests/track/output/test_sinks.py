@@ -15,7 +15,6 @@ import sys
 import threading
 import time
 import warnings
-from pathlib import Path
 from types import SimpleNamespace
 
 import msgpack
@@ -31,6 +30,7 @@ from gloves import Status, load_layout
 from gloves.fit import nominal_fit
 from handsim import HandSimError, HandSimWarning
 from handsim.errors import ArgumentError
+from tests.programs import ROOT, run_python
 from tests.sentences import error_names
 from tests.waiting import LONG, wait_for
 from track import SinkGroup, StreamedFrame, TrackedFrame, TrackedHand, open_sinks
@@ -57,11 +57,20 @@ class Failing(Counter):
     def send(self, message):
         raise ValueError("not today")
 """
-
-
 NO_ADDRESSES = ("", "osc", "http://localhost:80", "wss://localhost:1", "lsl:", "lsl://name",
                 "localhost:9000", "a b:c", "ws:8765", "9module:name",
                 "tcp://localhost:9000", "tcp://:0?axes=unity")  # fmt: skip
+ENCODER = osc_format()
+FEW_FILES = """
+import resource, socket, sys, time
+from track.output.sinks import open_sink
+resource.setrlimit(resource.RLIMIT_NOFILE, (40, 40))
+sink = open_sink(sys.argv[1])
+print(sink.port, flush=True)
+sys.stdin.readline()
+time.sleep(0.5)
+sink.close()
+"""
 
 
 @pytest.mark.parametrize(
@@ -195,9 +204,6 @@ def test_nothing_is_sent_before_the_tracker_is_there():
         sinks.send(*frame(0))
         assert sinks and not sinks.notes()
     assert not keeper.got and not SinkGroup({})
-
-
-ENCODER = osc_format()
 
 
 @pytest.fixture
@@ -379,7 +385,6 @@ def test_an_inlet_gets_samples_and_the_description(message, tmp_path):
     settings.write_text(
         "[multicast]\nResolveScope = machine\n[lab]\nKnownPeers = {127.0.0.1}\n[log]\nlevel = -3\n"
     )
-    root = Path(__file__).resolve().parents[3]
     code = """
 import json
 import pylsl
@@ -398,10 +403,7 @@ labels, units = described.get_channel_labels(), described.get_channel_units()
 print(json.dumps([samples, labels, units, described.type(), described.desc().child_value("schema")]))
 sink.close()
 """
-    environment = {**os.environ, "LSLAPICFG": str(settings), "PYTHONPATH": str(root), "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(
-        [sys.executable, "-c", code], cwd=root, env=environment, capture_output=True, text=True, check=False
-    )
+    done = run_python(code, check=False, LSLAPICFG=str(settings), PYTHONPATH=str(ROOT), OMP_NUM_THREADS="1")
     assert done.returncode == 0, done.stderr
     samples, labels, units, kind, schema = json.loads(done.stdout.splitlines()[-1])
     assert [sample[0] for sample in samples] == [1, 2, 3, 4, 5] and (kind, schema) == ("MoCap", "1")
@@ -411,8 +413,9 @@ sink.close()
     np.testing.assert_array_equal(samples[-1], sample_of(message(5)))
 
 
-def test_lsl_writes_nothing_between_our_lines(tmp_path):
+def test_lsl_writes_nothing_between_our_lines(tmp_path, monkeypatch):
     pytest.importorskip("pylsl")
+    monkeypatch.delenv("LSLAPICFG", raising=False)
     code = """
 from tests.track.conftest import make_message
 from track.output.sinks import open_sink
@@ -420,11 +423,8 @@ sink = open_sink("lsl:quiet")
 sink.send(make_message(0))
 sink.close()
 """
-    root = Path(__file__).resolve().parents[3]
-    environment = {key: value for key, value in os.environ.items() if key != "LSLAPICFG"}
-    environment |= {"PYTHONPATH": str(root), "HOME": str(tmp_path)}
-    command = [sys.executable, "-W", "ignore", "-c", code]
-    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True)
+    own = {"PYTHONPATH": str(ROOT), "PYTHONWARNINGS": "ignore", "HOME": str(tmp_path)}
+    done = run_python(code, folder=tmp_path, **own)
     assert (done.stdout, done.stderr) == ("", "")
 
 
@@ -647,18 +647,6 @@ def test_connections_that_stay_are_counted_and_bounded(call, message, capfd, cap
     assert capfd.readouterr() == ("", "") and "Traceback" not in caplog.text
 
 
-FEW_FILES = """
-import resource, socket, sys, time
-from track.output.sinks import open_sink
-resource.setrlimit(resource.RLIMIT_NOFILE, (40, 40))
-sink = open_sink(sys.argv[1])
-print(sink.port, flush=True)
-sys.stdin.readline()
-time.sleep(0.5)
-sink.close()
-"""
-
-
 @pytest.mark.parametrize("pause", [0.0, 0.005])
 def test_a_process_without_free_files_prints_no_traceback(pause):
     """The system allows fewer files than connections, which come at once or one after the other."""
@@ -785,7 +773,7 @@ def test_a_client_may_ask_for_the_newest_frame(path, message):
 
 
 def test_the_client_of_the_page_runs_as_it_stands_until_the_end(message, capsys):
-    page = (Path(__file__).parents[3] / "docs" / "live_output.md").read_text()
+    page = (ROOT / "docs" / "live_output.md").read_text()
     (code,) = re.findall(
         r"^import json\nimport time\nfrom websockets.*?(?=^```)", page, re.DOTALL | re.MULTILINE
     )

@@ -37,6 +37,10 @@ class Counting:
 class NoSource:
     pass
 """
+RATE = 120.0
+INTERVAL = 1.0 / RATE
+FATES = st.sampled_from(["good"] * 15 + ["drop", "double", "swap", "wild"])
+FRAMES = 120
 
 
 @pytest.mark.parametrize("address", ["own_code:Counting", "own_code:Counting?frames=5"])
@@ -76,10 +80,6 @@ def test_a_source_may_be_an_object():
 def test_a_wrong_one_is_one_sentence(own, address, words):
     with error_names(HandSimError, words):
         open_source(address)
-
-
-RATE = 120.0
-INTERVAL = 1.0 / RATE
 
 
 def frame(number: int, time: float, at: float, points: object = ((0.0, 0.0, 0.0),)) -> StreamedFrame:
@@ -209,9 +209,6 @@ def test_servers_without_frame_numbers_are_heard():
     assert order.missed == 0
 
 
-FATES = st.sampled_from(["good"] * 15 + ["drop", "double", "swap", "wild"])
-
-
 @settings(deadline=None, max_examples=200)
 @given(st.lists(FATES, min_size=3, max_size=300), st.randoms(use_true_random=False))
 def test_whatever_happens_to_some_packets_the_others_go_on(fates, random):
@@ -238,7 +235,6 @@ def test_whatever_happens_to_some_packets_the_others_go_on(fates, random):
     assert gone == expected
 
 
-FRAMES = 120
 PAGE = Path(__file__).parents[3] / "docs" / "marker_files.md"
 
 

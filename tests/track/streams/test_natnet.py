@@ -14,7 +14,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
@@ -26,7 +26,6 @@ from tests.waiting import LONG, wait_for
 from track import LiveStream, ReplayServer, StreamedFrame
 from track.streams import LOOPBACK, natnet
 from track.streams.natnet import (
-    NEWEST,
     DamagedPacket,
     Kind,
     PointStream,
@@ -44,6 +43,7 @@ from train import simulate_take
 
 VERSIONS = [(3, 0), (3, 1), (4, 0), (4, 1)]
 COUNTS = st.integers(0, 60)
+SILENT = "the server answers, but "
 
 
 @st.composite
@@ -170,24 +170,6 @@ def test_every_cut_is_noticed(sized):
     for length in range(0, len(packet), 7):
         with pytest.raises(DamagedPacket):
             unpack(packet[:length])
-
-
-@settings(max_examples=300)
-@given(st.data(), st.booleans())
-def test_damaged_bytes_are_read_or_refused(data, sized):
-    payload = bytearray(
-        full_frame([(5, 0.1, 0.2, 0.3, 2), (6, 1.0, 1.0, 1.0, 2)], [(1.0, 1.0, 1.0)], sized=sized)
-    )
-    for _ in range(data.draw(st.integers(1, 6))):
-        at = data.draw(st.integers(0, len(payload) - 4))
-        payload[at : at + 4] = data.draw(
-            st.sampled_from([b"\xff\xff\xff\x7f", b"\xff\xff\xff\xff", b"\0\0\0\x80"])
-        )
-    try:
-        frame = parse_frame(bytes(payload), NEWEST if sized else (3, 0))
-    except DamagedPacket:
-        return
-    assert np.isfinite(frame.points).all() and len(frame.points) == len(frame.ids) <= 3
 
 
 def test_a_count_takes_no_memory():
@@ -418,16 +400,9 @@ def test_only_bad_packets_are_silence():
         thread.join()
 
 
-def test_frames_out_of_order_are_left_out_but_a_take_may_start_again():
-    with Puppet(unicast((4, 1))) as server, opened(server.url, silence=LONG) as stream:
-        for number in (500, 501, 501, 500, 502, 503, 504, 0, 1, 2, 3, 4):
-            server.say(frame(number, (4, 1)))
-        got = list(itertools.islice(stream, 10))
-    assert [one.number for one in got] == [500, 501, 502, 503, 504, 0, 1, 2, 3, 4]
-    assert stream.counts["doubled_frames"] == 2
-
-
-@pytest.mark.parametrize(("said", "spoken"), [((4, 1), (3, 1)), ((3, 1), (4, 1)), ((4, 7), (4, 1))])
+@pytest.mark.parametrize(
+    ("said", "spoken"), [((4, 1), (3, 1)), ((3, 1), (4, 1)), ((4, 7), (4, 1)), ((255, 255), (4, 1))]
+)
 def test_a_server_that_speaks_another_layout_than_it_says_is_understood(said, spoken):
     with Puppet(unicast(said)) as server, opened(server.url, silence=LONG) as stream:
         for number in range(3):
@@ -529,32 +504,15 @@ def test_a_server_that_comes_back_with_another_group_and_port_is_heard(monkeypat
             assert frames(stream) == [9]
 
 
-def test_servers_that_cannot_be_used_are_told(monkeypatch):
-    with monkeypatch.context() as patch:
-        patch.setattr(natnet, "_PATIENCE", 0.2)
-        patch.setattr(natnet, "_RETRY", 0.1)
-        with Puppet() as server, pytest.raises(CaptureError, match="no NatNet server answers at port"):
-            opened(server.url)
-        with (
-            Puppet(b"", b"nonsense", natnet.pack(Kind.SERVER_INFO)) as server,
-            pytest.raises(CaptureError, match="no Nat"),
-        ):
-            opened(server.url)
-    with (
-        Puppet(unicast((2, 10))) as server,
-        pytest.raises(CaptureError, match=r"speaks NatNet 2\.10, expected 3\.0"),
+def test_servers_that_cannot_be_used_are_told():
+    for info, words in (
+        (unicast((2, 10)), r"speaks NatNet 2\.10, expected 3\.0 or newer"),
+        (ServerInfo("x", (4, 1), 1511, "10.0.0.1"), r"10\.0\.0\.1"),
     ):
-        opened(server.url)
-    with (
-        Puppet(ServerInfo("x", (4, 1), 1511, "10.0.0.1")) as server,
-        pytest.raises(CaptureError, match=r"10\.0\.0\.1"),
-    ):
-        opened(server.url)
+        with Puppet(info) as server, pytest.raises(CaptureError, match=words):
+            opened(server.url)
     with pytest.raises(CaptureError, match="cannot be reached"):
         open_stream("natnet://no-such-host.invalid")
-
-
-SILENT = "the server answers, but "
 
 
 @pytest.mark.parametrize("group", ["239.255.42.99", "239.1.2.3", "224.0.0.77"])
@@ -592,7 +550,7 @@ def test_why_no_frame_comes_is_told(monkeypatch):
         )
 
 
-@pytest.mark.parametrize("answer", [b"", b"HTTP/1.1 400 Bad Request", pack(Kind.SERVER_INFO, bytes(10))])
+@pytest.mark.parametrize("answer", [b"", b"HTTP/1.1 400 Bad Request", pack(Kind.SERVER_INFO)])
 def test_another_program_at_the_port_is_told(answer, monkeypatch):
     monkeypatch.setattr(natnet, "_PATIENCE", 0.2)
     monkeypatch.setattr(natnet, "_RETRY", 0.1)
@@ -611,19 +569,6 @@ def test_a_port_at_which_no_program_listens_is_told(monkeypatch):
             open_stream(url)
     with pytest.raises(natnet.NoServerError, match=f"at port {port}: no program of {LOOPBACK} listens there"):
         open_stream(url)
-
-
-@pytest.mark.parametrize("version", [(0, 0), (5, 0), (99, 0), (255, 255)])
-def test_versions_that_no_server_has_are_read_as_the_nearest_or_refused(version):
-    with Puppet(unicast(version)) as server:
-        if version < natnet.OLDEST:
-            with pytest.raises(CaptureError, match=r"speaks NatNet 0\.0, expected 3\.0 or newer"):
-                open_stream(server.url)
-            return
-        with opened(server.url, silence=LONG) as stream:
-            for number in range(3):
-                server.say(frame(number, (4, 1)))
-            assert [one.number for one in itertools.islice(stream, 3)] == [0, 1, 2]
 
 
 @pytest.mark.parametrize(

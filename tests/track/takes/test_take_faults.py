@@ -26,6 +26,8 @@ from train import simulate_take
 
 FRAMES, RATE = 240, 60.0
 HALF = FRAMES // 2
+FINGERTIPS = ("index_distal", "middle_distal", "ring_distal", "little_distal")
+WITH_THUMB = ("thumb_distal", "little_distal", "index_proximal", "ring_proximal", "middle_distal")
 
 
 def at_rate(take: Take) -> Take:
@@ -247,10 +249,6 @@ def test_a_joint_at_its_limit_is_named(tracked, beyond):
     assert hand_figures(take)[0].joints()[joint, -3] >= 0.49
     (fault,) = (one for one in find_faults(take) if "limit" in one.why)
     assert fault.of == "right:ring_MCP_flexion" and fault.first == HALF and not fault.of_labels
-
-
-FINGERTIPS = ("index_distal", "middle_distal", "ring_distal", "little_distal")
-WITH_THUMB = ("thumb_distal", "little_distal", "index_proximal", "ring_proximal", "middle_distal")
 
 
 @pytest.fixture(scope="module", params=[FINGERTIPS, WITH_THUMB])

@@ -23,6 +23,7 @@ from track.takes.take_summary import frame_confidence, runs_of, summarize, suspi
 from train import simulate_take
 
 FRAMES = 40
+LITTLE = "no marker is on the little finger: its angles are guesses"
 
 
 @pytest.fixture(scope="module")
@@ -171,7 +172,6 @@ def without(*bones: str, sides: tuple[str, ...] = ("left", "right")) -> MarkerLa
     return dataclasses.replace(dense, name="part", markers=kept, sides=sides)
 
 
-LITTLE = "no marker is on the little finger: its angles are guesses"
 GLOVES = {
     "no little finger": (without("little"), [16, 17, 18, 19], LITTLE),
     "no index tip": (

@@ -17,6 +17,8 @@ from train.forecast.rig_forecast import light_work
 from train.forecast.rig_plan import Planning, places, view_candidates
 from train.forecast.settings import MOUNTS
 
+CENTER, SIDES = np.array([0.3, -0.2, 1.1]), np.full(3, 0.6)
+
 
 @pytest.fixture(scope="module")
 def candidates(work):
@@ -98,9 +100,6 @@ def test_a_plan_beats_cameras_in_a_row():
     ]
     assert len(found.rig.positions) == len(found.targets) == 4
     assert found.after.seen_by_two > found.before.seen_by_two + 0.1
-
-
-CENTER, SIDES = np.array([0.3, -0.2, 1.1]), np.full(3, 0.6)
 
 
 @given(st.sampled_from(MOUNTS), st.floats(2.2, 9.0), st.floats(2.2, 9.0), st.floats(2.0, 4.0))

@@ -21,6 +21,7 @@ from train.labelers.cnn_labeler import (
 )
 
 NUM_MARKERS = 12
+STRAIGHT = np.eye(3)[None]
 
 
 @pytest.fixture(scope="module")
@@ -135,7 +136,6 @@ def test_training_views_are_near_the_mean_hand_or_along_the_axes(hands, mean_han
     assert 8.0 < np.sqrt((turned[~along] ** 2).mean()) < 16.0
 
 
-STRAIGHT = np.eye(3)[None]
 seeds = st.integers(0, 100_000)
 
 

@@ -29,6 +29,8 @@ from train.labelers.networks import LayoutNetworkConfig as Config
 from train.labelers.networks import distance_features
 from train.labelers.protocol import learned_folder, learned_gloves
 
+CLOUD = np.random.default_rng(0).normal(0, 0.05, (8, 3))
+
 
 @pytest.fixture(scope="module")
 def labeler():
@@ -120,7 +122,6 @@ def test_the_same_seed_gives_the_same_markers():
 
 
 pytestmark = pytest.mark.usefixtures("own_cache")
-CLOUD = np.random.default_rng(0).normal(0, 0.05, (8, 3))
 
 
 def never(*_args, **_options):

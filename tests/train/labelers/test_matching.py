@@ -16,6 +16,9 @@ from poses import sample_poses
 from train import load_labeler
 from train.labelers.matching import GHOST, SINKHORN, assign, assignment_costs, balance, match_scores
 
+LAYOUT = load_layout("dense19")
+TIP, PIP = LAYOUT.names.index("RingTip"), LAYOUT.names.index("PinkyTip")
+
 
 def log_softmax(raw):
     return raw - np.log(np.exp(raw).sum(axis=1, keepdims=True))
@@ -121,10 +124,6 @@ def test_an_assignment_is_that_of_scipy(seed, count, num_labels):
     total, labels = assign(costs, reject)
     assert np.isclose(total, table[rows, columns].sum())
     assert labels.tolist() == np.where(columns < num_labels, columns, GHOST).tolist()
-
-
-LAYOUT = load_layout("dense19")
-TIP, PIP = LAYOUT.names.index("RingTip"), LAYOUT.names.index("PinkyTip")
 
 
 @pytest.fixture(scope="module")

@@ -24,6 +24,7 @@ from train.labelers.networks import (
 )
 
 CONFIG = LayoutNetworkConfig(width=32, gates=8, first_rounds=1, match_rounds=2)
+NAMES = tuple(f"m{number}" for number in range(19))
 
 
 @pytest.fixture(scope="module", params=["one layout", "any layout"])
@@ -130,9 +131,6 @@ def test_the_loss_of_any_layout_falls_with_the_truth(run):
     likely = torch.where(best == 5, -1, best)
     worst = found.points[..., :-1].argmin(-1)
     assert layout_loss([found], likely, present) < layout_loss([found], worst, present)
-
-
-NAMES = tuple(f"m{number}" for number in range(19))
 
 
 @pytest.fixture(scope="module")

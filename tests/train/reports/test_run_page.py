@@ -52,6 +52,7 @@ from train.reports.run_page import (
 
 pytestmark = pytest.mark.filterwarnings("error::UserWarning")  # matplotlib's, for a figure that does not fit
 SMALL = TrainSettings(samples=2560, batch=128, network=SetLabelerConfig(width=16, gates=4, depth=1))
+SHIPPED = json.loads(resources.files("train").joinpath("weights/dense19.json").read_text())
 
 
 @pytest.fixture(scope="module")
@@ -264,9 +265,6 @@ def test_reliability_of_few_and_many_points(rng, count):
 def test_long_names_are_cut():
     assert short("IndexTip") == "IndexTip"
     assert len(short("x" * 60)) == MAX_LETTERS and short("x" * 60).endswith("…")
-
-
-SHIPPED = json.loads(resources.files("train").joinpath("weights/dense19.json").read_text())
 
 
 def head(text: str) -> dict[str, str | list[str]]:

@@ -26,8 +26,8 @@ from handsim.space.rig import ROOM_CENTER, CameraRig
 from handsim.space.transforms import rigid
 from poses import sample_poses
 from poses.shapes import HIGH, LOW
+from tests.folders import contents
 from tests.rigs import mixed_rig
-from tests.sentences import assert_names
 from tests.waiting import wait_for
 from track.viewer.recordings import DatasetRecording
 from train import Dataset, GenerateSettings, SceneMix, generate_dataset, simulate_take
@@ -67,6 +67,23 @@ def make_two(config, out, shard):
     return make_shard(config, out, shard)
 generation.make_shard = make_two
 """
+MANIFESTS = {
+    "marker_names": (5, "marker_names is 5, expected a tuple"),
+    "num_frames": (float("nan"), "num_frames is nan, expected a whole number"),
+    "files": ({"../../etc/passwd": "0"}, "files is not a table of names of files in this folder"),
+    "config": (None, "config is not a table"),
+    "redrawn": ([1], "redrawn is not a table of counts"),
+}
+DIGITS = ("thumb", "index", "middle", "ring", "little")
+LAYOUT = MarkerLayout(
+    "mine",
+    (
+        *(MarkerPlace(f"{digit}_tip", f"{digit}_distal", 0.5, 0.0) for digit in DIGITS),
+        MarkerPlace("back", "palm", 0.5, 0, 0.2),
+    ),
+    radius=0.004,
+)
+ALONE = {"together": 0, "holding": 0}
 
 
 @pytest.fixture(autouse=True)
@@ -81,10 +98,6 @@ def finished(tmp_path_factory):
         patch.setattr(generation, "ROWS_PER_SHARD", 200)
         make_dataset(CONFIG, out, workers=1)
     return out
-
-
-def contents(folder: Path) -> dict[str, str]:
-    return {path.name: checksum(path) for path in folder.iterdir()}
 
 
 def test_rows_are_what_they_say(finished):
@@ -380,24 +393,6 @@ def test_a_set_without_counts_of_redraws_is_read(finished, tmp_path):
     assert make_dataset(CONFIG, copy, workers=1).redrawn is None, "an older version made one of the shards"
 
 
-def test_other_settings_in_the_same_folder_are_told(finished):
-    with pytest.raises(DatasetError, match=r"\(num_frames: 700 there, 9 here; seed: 3 there, 9 here\)"):
-        make_dataset(dataclasses.replace(CONFIG, seed=9, num_frames=9), finished)
-
-
-def test_a_damaged_shard_is_named(finished, tmp_path):
-    copy = tmp_path / "copy"
-    shutil.copytree(finished, copy)
-    with (copy / rows_name(2)).open("r+b") as file:
-        file.seek(5000)
-        file.write(b"\x00\xff\x00\xff")
-    with pytest.raises(DatasetError, match=r"rows-00002\.npy is damaged"):
-        Dataset(copy)
-    (copy / hands_name(1)).unlink()
-    with pytest.raises(DatasetError, match=r"(rows-00002|hands-00001)\.npy is (damaged|missing)"):
-        Dataset(copy)
-
-
 def test_a_set_of_a_rig_of_ones_own_holds_its_cameras_and_is_drawn(tmp_path):
     rig = mixed_rig()
     config = GenerateSettings(num_frames=40, frames_per_hand=20, rig=rig, seed=3)
@@ -451,6 +446,8 @@ def test_a_set_grows_to_the_bytes_of_one_made_at_once(finished, tmp_path):
     assert (out / rows_name(0)).stat().st_mtime_ns == kept
     with pytest.raises(DatasetError, match=r"num_frames: 700 there, 300 here\).*num_frames may only grow"):
         make_dataset(dataclasses.replace(CONFIG, num_frames=300), out, workers=1)
+    with pytest.raises(DatasetError, match=r"\(num_frames: 700 there, 9 here; seed: 3 there, 9 here\)"):
+        make_dataset(dataclasses.replace(CONFIG, seed=9, num_frames=9), out, workers=1)
 
 
 def test_a_growth_that_was_killed_is_unfinished_and_goes_on(finished, tmp_path, monkeypatch):
@@ -476,15 +473,6 @@ def test_a_set_that_the_disk_has_no_space_for_is_refused(tmp_path):
     with pytest.raises(DatasetError, match=r"10{18} frames need 7\d\d EB, but the disk of .* has .* free"):
         make_dataset(config, tmp_path / "set")
     assert not (tmp_path / "set").exists()
-
-
-MANIFESTS = {
-    "marker_names": (5, "marker_names is 5, expected a tuple"),
-    "num_frames": (float("nan"), "num_frames is nan, expected a whole number"),
-    "files": ({"../../etc/passwd": "0"}, "files is not a table of names of files in this folder"),
-    "config": (None, "config is not a table"),
-    "redrawn": ([1], "redrawn is not a table of counts"),
-}
 
 
 @pytest.mark.parametrize("field", MANIFESTS)
@@ -520,36 +508,6 @@ def test_a_shard_of_other_records_is_told(finished, tmp_path, kind):
         DatasetError, match=r"holds other records|is damaged: it is no .npy file|shards hold 507"
     ):
         Dataset(copy)
-
-
-OPTION_ERRORS = {
-    "--workers -3": "workers is -3, expected at least 1",
-    "--volume nan": "volume is nan, expected a number from 0 to 10",
-    "--min-cameras 17": "min_cameras is 17, but rig 'figure5' has 16",
-    "--slip-around nan": "slip_around is nan, expected a number from 0 to 90",
-    "--population.children 5": "children is 5, expected a number from 0 to 1",
-    "--blob-loss 0 1.5": "blob_loss is 1.5, expected a number from 0 to 1",
-    "--seed -1": "seed is -1, expected 0 or more",
-}
-
-
-@pytest.mark.parametrize("options", OPTION_ERRORS)
-def test_options_without_sense_are_told(tmp_path, capsys, options):
-    assert main(["generate", "--out", str(tmp_path / "set"), *options.split()]) == 1
-    assert_names(capsys.readouterr().err.strip(), f"handsim generate: {OPTION_ERRORS[options]}")
-    assert not (tmp_path / "set").exists()
-
-
-DIGITS = ("thumb", "index", "middle", "ring", "little")
-LAYOUT = MarkerLayout(
-    "mine",
-    (
-        *(MarkerPlace(f"{digit}_tip", f"{digit}_distal", 0.5, 0.0) for digit in DIGITS),
-        MarkerPlace("back", "palm", 0.5, 0, 0.2),
-    ),
-    radius=0.004,
-)
-ALONE = {"together": 0, "holding": 0}
 
 
 def fists(model, num_poses, *, rng):

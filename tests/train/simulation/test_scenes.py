@@ -26,6 +26,9 @@ from train.simulation.scenes import (
 from train.simulation.takes import sample_scene, simulate_calibration
 from train.simulation.training_frames import FLESH, NOISE, move_skin
 
+SHORT = CalibrationTakeConfig(free=1.0, rounds=1)
+FRAMES = 240
+
 
 @pytest.mark.parametrize("times", [1, 2, 3])
 def test_a_faster_scene_passes_through_the_same_poses(times, rng):
@@ -38,9 +41,6 @@ def test_a_faster_scene_passes_through_the_same_poses(times, rng):
         np.testing.assert_array_equal(hand.qpos, before.qpos[::times])
     held, before = fast.moving_object, scene.moving_object
     np.testing.assert_array_equal(held.T_world_body, before.T_world_body[::times])
-
-
-SHORT = CalibrationTakeConfig(free=1.0, rounds=1)
 
 
 def test_the_thumb_touches_every_finger(rng):
@@ -92,9 +92,6 @@ def test_bad_values_are_told(rng):
         CalibrationTakeConfig(rounds=-1)
     with pytest.raises(ArgumentError, match="0 hands, expected one or two"):
         simulate_calibration((), SHORT, rng=rng)
-
-
-FRAMES = 240
 
 
 @functools.cache

@@ -8,7 +8,8 @@ import pytest
 from fsspec.implementations.memory import MemoryFileSystem
 from upath import UPath
 
-from tests.handsim.app.object_stores.stored_set import CONFIG, ROWS, contents
+from tests.folders import contents
+from tests.handsim.app.object_stores.stored_set import CONFIG, ROWS
 from train import simulate_take
 from train.simulation import generation
 from train.simulation.generation import make_dataset

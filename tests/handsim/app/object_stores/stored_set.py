@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from upath import UPath
 
-from handsim.files.inputs import checksum
+from tests.folders import contents
 from train import GenerateSettings, SceneMix
 
 ROWS = 100
@@ -18,18 +18,12 @@ ALONE = SceneMix(alone=1.0, together=0.0, holding=0.0)
 CONFIG = GenerateSettings(num_frames=4 * ROWS - 30, seed=5, frames_per_hand=50, scenes=ALONE)
 
 
-def contents(folder: Path) -> dict[str, str]:
-    """Checksums of all files, hidden ones too."""
-    files = {path.relative_to(folder).as_posix(): path for path in folder.rglob("*") if path.is_file()}
-    return {name: checksum(path) for name, path in files.items()}
-
-
 def names(store: UPath) -> set[str]:
     """Names of all that a store's folder holds."""
     return {path.path.removeprefix(store.path + "/") for path in store.rglob("*") if path.is_file()}
 
 
-def copied(store: UPath, folder: Path) -> dict[str, str]:
+def copied(store: UPath, folder: Path) -> dict[str, bytes]:
     """The same as `contents` of what a store holds, copied into a folder."""
     for name in names(store):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)

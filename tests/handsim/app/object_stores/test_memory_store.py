@@ -23,7 +23,8 @@ from handsim.errors import ArgumentError, DatasetError
 from handsim.files.signals import Stopped
 from render import RenderConfig, render_take
 from render.session import left_out_frames
-from tests.handsim.app.object_stores.stored_set import CONFIG, contents, copied, names, write_three
+from tests.folders import contents
+from tests.handsim.app.object_stores.stored_set import CONFIG, copied, names, write_three
 from track.viewer.contents import open_content
 from train import Dataset
 from train.data.shards import MANIFEST, array_bytes, row_dtype, rows_name, save_array

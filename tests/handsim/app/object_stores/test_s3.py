@@ -26,14 +26,8 @@ from handsim import HandSimError
 from handsim.app.output import open_output
 from handsim.app.workers import chosen_workers, run_jobs
 from handsim.cli.main import main
-from tests.handsim.app.object_stores.stored_set import (
-    ALONE,
-    CONFIG,
-    PRELOAD,
-    contents,
-    two_workers,
-    write_three,
-)
+from tests.folders import contents
+from tests.handsim.app.object_stores.stored_set import ALONE, CONFIG, PRELOAD, two_workers, write_three
 from tests.waiting import wait_for
 from train.data.shards import MANIFEST
 from train.simulation import generation

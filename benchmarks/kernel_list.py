@@ -1,30 +1,23 @@
-"""What the first run of each command costs, while the cache of kernels is empty, and the list of kernels.
+"""The list of kernels that commands compile ahead: `python -m benchmarks.kernel_list`.
 
-The clock runs from the start of a command to its end, and processor time is that of all its processes.
-With --record the commands run without the list and with one cache, the dearest kernels are printed, and the
-list is written anew: after a change to a kernel's arguments or to what calls it.
-
-python -m benchmarks.cold_start [--only label track ...] [--record]
+The commands run without the list and with one cache, the dearest kernels are printed, and the list is written
+anew: after a change to a kernel's arguments or to what calls it.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
-import resource
 import subprocess
 import sys
 import tempfile
-import time
 from pathlib import Path
 from typing import Any, Final
 
 from benchmarks.record import describe
 from handsim.app.compiling import LIST
 
-# In the order of the recording; a later command may read what an earlier one wrote. Names begin with the
-# command's.
+# A later command may read what an earlier one wrote. Names begin with the command's.
 COMMANDS: Final = {
     "simulate": "simulate --kind hand-hand --num-frames 240 --seed 3 --out hand.c3d",
     "simulate calibration": "simulate --kind calibration --num-frames 300 --seed 3 --out minute.c3d",
@@ -44,7 +37,7 @@ import gc, json, sys, time
 from numba.core import event
 from numba.core.registry import CPUDispatcher
 
-from benchmarks.cold_start import type_row
+from benchmarks.kernel_list import type_row
 from handsim.app import compiling
 from handsim.cli.main import main
 
@@ -117,59 +110,33 @@ def type_row(kind: Any, table: list[Any]) -> int:
     return table.index(row)
 
 
-def measure(names: list[str], folder: Path) -> None:
-    """Print what each command costs with an empty cache of its own."""
-    print(f"{'command':22}{'wall [s]':>9}{'processor [s]':>15}{'kernels':>9}")
-    for name in ["simulate", *(name for name in names if name != "simulate")]:
-        environment = {**os.environ, "NUMBA_CACHE_DIR": str(folder / f"cache-{name}")}
-        before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
-        command = [sys.executable, "-m", "handsim", *COMMANDS[name].split()]
-        subprocess.run(command, cwd=folder, env=environment, stdout=subprocess.DEVNULL, check=True)
-        after, wall = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter() - began
-        busy = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-        kernels = len(list((folder / f"cache-{name}").rglob("*.nbc")))
-        print(f"{name:22}{wall:9.1f}{busy:15.1f}{kernels:9}", flush=True)
-
-
-def record(names: list[str], folder: Path) -> None:
-    """Write the list, and print its dearest kernels."""
-    ours = str(Path(__file__).parents[1])  # for `type_row`
-    environment = {**os.environ, "NUMBA_CACHE_DIR": str(folder / "cache"), "PYTHONPATH": ours}
-    table: list[Any] = []
-    seconds: dict[str, float] = {}
-    users: dict[str, set[str]] = {}
-    for name in names:
-        command = [sys.executable, "-c", RECORD, "recorded.json", *COMMANDS[name].split()]
-        given = json.dumps(table) + "\n"
-        subprocess.run(command, cwd=folder, env=environment, input=given, text=True, check=True)
-        table, compiled, calls = json.loads((folder / "recorded.json").read_text())
-        seconds |= compiled
-        called = {place for places in calls.values() for place in places}
-        for row in seconds:
-            if row in calls or json.loads(row)[0] in called:
-                users.setdefault(row, set()).add(name.split()[0])
-        kernels = [
-            [*json.loads(row), round(took, 2), " ".join(sorted(users.get(row, ())))]
-            for row, took in sorted(seconds.items())
-        ]
-        lines = (",\n  ".join(json.dumps(one) for one in rows) for rows in (table, kernels))
-        LIST.write_text('{{"types": [\n  {}\n], "kernels": [\n  {}\n]}}\n'.format(*lines), encoding="utf-8")
-        print(f"after {name}: {len(kernels)} kernels in {sum(seconds.values()):.0f} s", flush=True)
+def main() -> None:
+    print(describe("numba"))
+    with tempfile.TemporaryDirectory() as made:
+        folder, ours = Path(made), str(Path(__file__).parents[1])  # for `type_row`
+        environment = {**os.environ, "NUMBA_CACHE_DIR": str(folder / "cache"), "PYTHONPATH": ours}
+        table: list[Any] = []
+        seconds: dict[str, float] = {}
+        users: dict[str, set[str]] = {}
+        for name, words in COMMANDS.items():
+            command = [sys.executable, "-c", RECORD, "recorded.json", *words.split()]
+            given = json.dumps(table) + "\n"
+            subprocess.run(command, cwd=folder, env=environment, input=given, text=True, check=True)
+            table, compiled, calls = json.loads((folder / "recorded.json").read_text())
+            seconds |= compiled
+            called = {place for places in calls.values() for place in places}
+            for row in seconds:
+                if row in calls or json.loads(row)[0] in called:
+                    users.setdefault(row, set()).add(name.split()[0])
+            print(f"after {name}: {len(seconds)} kernels in {sum(seconds.values()):.0f} s", flush=True)
+    kernels = [
+        [*json.loads(row), round(took, 2), " ".join(sorted(users.get(row, ())))]
+        for row, took in sorted(seconds.items())
+    ]
+    lines = (",\n  ".join(json.dumps(one) for one in rows) for rows in (table, kernels))
+    LIST.write_text('{{"types": [\n  {}\n], "kernels": [\n  {}\n]}}\n'.format(*lines), encoding="utf-8")
     for place, _, took, commands in sorted(kernels, key=lambda one: -one[2])[:25]:
         print(f"{took:7.2f} s  {place}  ({commands})")
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--only", nargs="+", choices=COMMANDS, default=list(COMMANDS))
-    parser.add_argument("--record", action="store_true")
-    options = parser.parse_args()
-    print(describe("numba"))
-    with tempfile.TemporaryDirectory() as folder:
-        if options.record:
-            record(options.only, Path(folder))
-        else:
-            measure(options.only, Path(folder))
 
 
 if __name__ == "__main__":
