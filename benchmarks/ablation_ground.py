@@ -13,9 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from benchmarks.mirror_like import mirror_like
 from benchmarks.real_scenes import make_scene, sample_gaps, sample_ghosts
-from gloves import Capture, MarkerLayout, load_layout
+from gloves import Capture, MarkerLayout, MarkerPlace, load_layout
 from gloves.layout import layout_lines
 from gloves.optics.reconstruction import pack_columns
 from gloves.takes.take import Take
@@ -25,6 +24,8 @@ from train import load_labeler, simulate_take
 VERBS: dict[str, Callable[..., Take]] = {"label": label_capture, "track": track_capture}
 
 SIDES = ("right", "left")
+_TIPS = ("index_distal", "middle_distal", "ring_distal", "little_distal")
+_BACK = ((0.3, 0.2), (0.3, -0.2), (0.7, 0.2), (0.7, -0.2))  # along and across the palm
 
 
 class Truth(NamedTuple):
@@ -78,7 +79,7 @@ def _makers(data: Path | None, level: int) -> Iterator[tuple[str, Callable[[], T
     if level == 1:
         yield "own12", lambda: _simulated(own, "free", frames, ("label", "track"), seed=10, hands=("right",))
         yield "dense19", lambda: _simulated(dense, "real-like", frames, ("track",), seed=10 * level)
-        mirror = mirror_like(0)
+        mirror = _mirror_like()
         yield "mirror", lambda: _simulated(mirror, "hand-hand", frames, ("label", "track"), seed=51)
     else:
         yield "own12", lambda: _simulated(own, "real-like", frames, ("label",), seed=10 * level)
@@ -92,6 +93,14 @@ def _makers(data: Path | None, level: int) -> Iterator[tuple[str, Callable[[], T
         yield "close", lambda: _sig18(people / "User2/capture4", "close", frames, "label", level)
         yield "fresh", lambda: _sig18(people / "User1/capture2", "new-ids", frames, "track", level)
         yield "c009", lambda: _grasp(data / "real", "c009", slice(100, 100 + frames), level)
+
+
+def _mirror_like() -> MarkerLayout:
+    """A glove like its own mirror image: markers on the finger tips, and four that are symmetric on the back."""
+    places = [MarkerPlace(bone, bone, along=0.7, around=0.0) for bone in _TIPS]
+    for number, (along, across) in enumerate(_BACK):
+        places.append(MarkerPlace(f"Back{number}", "palm", along=along, around=0.0, across=across))
+    return MarkerLayout("mirror0", tuple(places), load_layout("dense19").radius)
 
 
 def _corrupted(markers: np.ndarray, seed: int) -> np.ndarray:

@@ -25,49 +25,26 @@ _COLUMNS: Final = {
 _EVIDENCE: Final = ("real", "others", "simulated", "deviation")
 _LEAD: Final = """# What was judged, and by what
 
-`make results` writes this page. A row is an output of handsim; those with the most kinds of evidence stand
-first, and "-" means that there is none. Real data are those of two people in the public Mocap_SIG18_Data,
-unless a row says otherwise, and say little about a third person. [Results](results.md) and
-`benchmarks/figures/quoted.json` have the commands.
-"""
-
-
-_METHODS: Final = {
-    "method": "method",
-    "benchmark": "frames with every label right, public benchmark: easy, medium, hard [%]",
-    "real": "slots right, single frames of real hands: as captured; drops and ghosts [%]",
-}
-_BESIDE: Final = """
-## Other methods
-
-Methods on the same data, with hands whose size was measured (`benchmarks/public/README.md` has more). The
-loop of the paper runs with our labeler there, and its network was counted on every tenth real frame.
-
+For those who must decide what to rely on: each row is an output of handsim, those with the most kinds of evidence
+first; "-" means that there is none. Real data are those of two people in the public Mocap_SIG18_Data, unless a row
+says otherwise, and say little about a third person. `make results` writes this page; [results](results.md) and
+`benchmarks/figures/quoted.json` have the commands, `benchmarks/public/README.md` other
+methods on the same data.
 """
 
 
 def trust_rows() -> list[dict[str, str]]:
     """The rows with their figures, the one with the most kinds of evidence first."""
-    return sorted(_filled("row", _COLUMNS), key=lambda row: sum(row[key] == "-" for key in _EVIDENCE))
-
-
-def _filled(table: str, columns: dict[str, str]) -> list[dict[str, str]]:
-    """The rows of a table of the file with their figures."""
     figures = load_figures()
-    rows = tomllib.loads(ROWS.read_text("utf-8"))[table]
-    return [{key: row.get(key, "-").format(**figures) for key in columns} for row in rows]
-
-
-def _table(columns: dict[str, str], rows: list[dict[str, str]]) -> str:
-    """A table of Markdown."""
-    lines = [list(columns.values()), ["---"] * len(columns), *(list(row.values()) for row in rows)]
-    return "".join(f"| {' | '.join(cells)} |\n" for cells in lines)
+    rows = tomllib.loads(ROWS.read_text("utf-8"))["row"]
+    filled = [{key: row.get(key, "-").format(**figures) for key in _COLUMNS} for row in rows]
+    return sorted(filled, key=lambda row: sum(row[key] == "-" for key in _EVIDENCE))
 
 
 def trust_page() -> str:
     """The page."""
-    outputs, methods = _table(_COLUMNS, trust_rows()), _table(_METHODS, _filled("method", _METHODS))
-    return f"{_LEAD}\n{outputs}{_BESIDE}{methods}"
+    lines = [list(_COLUMNS.values()), ["---"] * len(_COLUMNS), *(list(row.values()) for row in trust_rows())]
+    return _LEAD + "\n" + "".join(f"| {' | '.join(cells)} |\n" for cells in lines)
 
 
 def readme_rows() -> list[str]:

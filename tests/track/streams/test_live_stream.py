@@ -425,21 +425,14 @@ def not_kept_up_with() -> None:
 
 CASES: dict[str, tuple[Callable[..., None], ...]] = {
     "a gap in the numbers of the frames, or in their times where numbers go on": (gaps,),
-    "fewer frames than the header of a .csv or .tsv states, beside such gaps": (cut,),
-    "fewer frames than the header of a .trc states": (shortened,),
-    "more frames than the header states": (more_than_stated,),
-    "a stated rate that is not that of the times, or two rates in a C3D that differ": (
-        another_rate,
-        two_rates,
-    ),
+    "more frames than the header states, or fewer in a .trc": (more_than_stated, shortened),
     "no stated rate, but evenly spaced times": (no_rate,),
-    "a stated rate below 1 or above 5,000 Hz": (wild_rate,),
-    "times or numbers that go back; times that are all the same; numbers that come twice": (
-        times_back,
-        numbers_back,
-    ),
-    "numbers that go on by more frames than the times": (numbers_ahead,),
-    "more than ten times as many missing frames as frames": (far_jump,),
+    "a stated rate that is not that of the times, two rates in a C3D that differ, "
+    "a rate below 1 or above 5,000 Hz": (another_rate, two_rates, wild_rate),
+    "times or numbers that go back or come twice; times that are all the same; "
+    "numbers that go on by more frames than the times": (times_back, numbers_back, numbers_ahead),
+    "more than ten times as many missing frames as frames; "
+    "gaps, and fewer frames than the header of a .csv or .tsv states": (far_jump, cut),
     "in a stream: a number or a time that jumps in fewer than five frames in a row": (short_jump,),
     "in a stream: a jump that lasts for five frames in a row": (lasting_jump,),
     "in a stream: frames out of order by up to eight, or that come twice": (out_of_order, twice),
