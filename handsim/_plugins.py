@@ -20,15 +20,15 @@ from urllib.parse import parse_qsl
 
 from handsim.errors import ArgumentError, HandSimError, choices, shortened
 
-_NAME: Final = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_][\w.]*")
-_ADDRESS: Final = re.compile(r" at 0x[0-9a-f]+")
+_QUALIFIED_NAME: Final = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_][\w.]*")
+_MEMORY_ADDRESS: Final = re.compile(r" at 0x[0-9a-f]+")
 EGL_PACKAGES: Final = "libegl1 libegl-mesa0 libgl1-mesa-dri libgl1 libopengl0"
 """Packages of Debian and Ubuntu, which pip cannot install, for OpenGL without a screen."""
 
 
 def is_plugin(name: str) -> bool:
     """Whether a name is written like `module:name`."""
-    return _NAME.fullmatch(name) is not None
+    return _QUALIFIED_NAME.fullmatch(name) is not None
 
 
 @functools.cache
@@ -40,7 +40,7 @@ def list_plugins(group: str) -> tuple[str, ...]:
 @functools.lru_cache(maxsize=64)
 def load_plugin(name: str, *, group: str, noun: str) -> Any:
     """Import the object of a name; a class is called without arguments, once."""
-    found = _find(name, group, noun)
+    found = _import_object(name, group, noun)
     try:
         return found() if inspect.isclass(found) else found
     except Exception as error:
@@ -55,7 +55,7 @@ def make_plugin(address: str, *, group: str, noun: str) -> Any:
     """
     name, _, options = address.partition("?")
     given = dict(parse_qsl(options, keep_blank_values=True))
-    return call_plugin(_find(name, group, noun), name, noun, **given)
+    return call_plugin(_import_object(name, group, noun), name, noun, **given)
 
 
 def plugin_name(value: Any) -> str:
@@ -69,10 +69,10 @@ def plugin_name(value: Any) -> str:
         return f"{value.__module__}:{value.__qualname__}"
     shown = repr(value)
     kind = type(value)
-    return f"{kind.__module__}:{kind.__qualname__}" if _ADDRESS.search(shown) else shown
+    return f"{kind.__module__}:{kind.__qualname__}" if _MEMORY_ADDRESS.search(shown) else shown
 
 
-def _find(name: str, group: str, noun: str) -> Any:
+def _import_object(name: str, group: str, noun: str) -> Any:
     """Import the object of a name: `module:name`, or an entry point of the group."""
     target = name
     if not is_plugin(name):

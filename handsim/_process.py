@@ -17,11 +17,11 @@ from typing import Any, Final, ParamSpec, TypeVar, cast
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
-_GROUPS: Final = Path("/sys/fs/cgroup")
-_MOUNTS: Final = ("", "unified", "cpu", "cpu,cpuacct", "memory")  # of version 2, and of version 1
-_OWN_GROUPS: Final = Path("/proc/self/cgroup")
-_END: Final = object()
-_LAUNCHERS: Final = (
+_CGROUP_ROOT: Final = Path("/sys/fs/cgroup")
+_CGROUP_MOUNTS: Final = ("", "unified", "cpu", "cpu,cpuacct", "memory")  # of version 2, and of version 1
+_OWN_CGROUPS: Final = Path("/proc/self/cgroup")
+_EXHAUSTED: Final = object()
+_RANK_VARIABLES: Final = (
     ("RANK", "WORLD_SIZE"),
     ("SLURM_PROCID", "SLURM_STEP_NUM_TASKS"),
     ("OMPI_COMM_WORLD_RANK", "OMPI_COMM_WORLD_SIZE"),
@@ -54,7 +54,7 @@ def rank_and_size() -> tuple[int, int]:
     torch = sys.modules.get("torch")
     if torch is not None and torch.distributed.is_available() and torch.distributed.is_initialized():
         return torch.distributed.get_rank(), torch.distributed.get_world_size()
-    for names in _LAUNCHERS:
+    for names in _RANK_VARIABLES:
         stated = [os.environ.get(name, "") for name in names]
         if all(map(is_number, stated)) and int(stated[0]) < int(stated[1]):
             return int(stated[0]), int(stated[1])
@@ -81,23 +81,23 @@ class SharedStream:
 
 def core_quota() -> float:
     """Cores that the quotas of this process's control groups allow; infinite without a quota."""
-    found = [*_group_files(2, "cpu.max"), *_group_files(2, "cpu.cfs_quota_us", "cpu.cfs_period_us")]
+    found = [*_cgroup_numbers(2, "cpu.max"), *_cgroup_numbers(2, "cpu.cfs_quota_us", "cpu.cfs_period_us")]
     return min((quota / period for quota, period in found if period), default=math.inf)
 
 
 def memory_limit() -> float:
     """Memory that this process's control groups allow [bytes]; infinite without a limit."""
-    found = [*_group_files(1, "memory.max"), *_group_files(1, "memory.limit_in_bytes")]
+    found = [*_cgroup_numbers(1, "memory.max"), *_cgroup_numbers(1, "memory.limit_in_bytes")]
     return min((limit for (limit,) in found), default=math.inf)
 
 
-def _group_files(count: int, *names: str) -> Iterator[list[int]]:
+def _cgroup_numbers(count: int, *names: str) -> Iterator[list[int]]:
     """The numbers, so many, in these files of each control group of this process and of those above it.
 
     In a container the groups may be stated as on its host; then the groups that the container sees count.
     """
-    own = {"", *(line.split(":", 2)[-1].strip("/") for line in text_of_system(_OWN_GROUPS).splitlines())}
-    for root in (_GROUPS / mount for mount in _MOUNTS):
+    own = {"", *(line.split(":", 2)[-1].strip("/") for line in text_of_system(_OWN_CGROUPS).splitlines())}
+    for root in (_CGROUP_ROOT / mount for mount in _CGROUP_MOUNTS):
         folders = {parent for path in own for parent in (root / path, *(root / path).parents)}
         for folder in [one for one in folders if one.is_relative_to(root)]:
             words = " ".join(text_of_system(folder / name) for name in names).split()
@@ -166,13 +166,13 @@ def with_own_numerics(function: Callable[_P, _R]) -> Callable[_P, _R]:
     def call(*args: _P.args, **options: _P.kwargs) -> _R:
         with own_numerics():
             result = function(*args, **options)
-        return cast("_R", _stepped(result)) if inspect.isgenerator(result) else result
+        return cast("_R", _with_own_steps(result)) if inspect.isgenerator(result) else result
 
     return call
 
 
-def _stepped(items: Iterator[Any]) -> Iterator[Any]:
+def _with_own_steps(items: Iterator[Any]) -> Iterator[Any]:
     """The items of an iterator; only it, and not who uses the items, computes in `own_numerics`."""
     take_next = own_numerics()(next)
-    while (item := take_next(items, _END)) is not _END:
+    while (item := take_next(items, _EXHAUSTED)) is not _EXHAUSTED:
         yield item

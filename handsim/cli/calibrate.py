@@ -19,7 +19,7 @@ from track.config import SizeChoice
 if TYPE_CHECKING:
     from track.calibration.user_calibration import Calibration
 
-_LONGEST: Final = 180.0  # longest recording of a stream by default [s]
+_MAX_SECONDS: Final = 180.0  # longest recording of a stream by default [s]
 
 
 def calibrate(
@@ -72,7 +72,7 @@ def calibrate(
         capture = out.with_suffix(".calibration.npz")
         check_take_file(capture, live=True)
         options = TrackerOptions(glove, size, hands=hands, labeler=labeler)
-        _record(live, options, capture, _LONGEST if seconds is None else seconds)
+        _record(live, options, capture, _MAX_SECONDS if seconds is None else seconds)
     assert capture is not None  # `check_source` refused a call with neither source
     with progress_bar("") as bar:
         settings = CalibrateSettings(glove=glove, hands=hands, size=size, labeler=labeler)

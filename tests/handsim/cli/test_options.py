@@ -15,7 +15,7 @@ import tyro
 from gloves import write_capture
 from gloves.layout import load_layout
 from handsim import look_at
-from handsim.cli.main import _HELP, _target, load, main
+from handsim.cli.main import _HELP, _target_of, load, main
 from handsim.cli.parsing import PresetCommand, _with_hints, registry
 from handsim.space.camera import pinhole
 from handsim.space.rig import CameraRig
@@ -124,7 +124,7 @@ def unchanged(markers, *, rng):
 
 def options_of(name: str) -> set[str]:
     """The options of a command as they are typed, without the dashes."""
-    command = load(_target(name))
+    command = load(_target_of(name))
     if isinstance(command, PresetCommand):
         command = command.choose((), name)
     with pytest.warns(DeprecationWarning):
@@ -134,7 +134,7 @@ def options_of(name: str) -> set[str]:
     return {"num-frames" if name == "--frames" and also else name[2:] for name in names}
 
 
-COMMANDS = [name for name in _HELP if isinstance(_target(name), str)]
+COMMANDS = [name for name in _HELP if isinstance(_target_of(name), str)]
 
 
 @pytest.mark.parametrize("name", COMMANDS)
