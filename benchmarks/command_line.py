@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from handsim import HandSimError
-from handsim.app.messages import told_warnings
+from handsim.app.messages import warnings_as_lines
 from handsim.cli.parsing import run_command
 
 
@@ -30,7 +30,7 @@ def run(
     """
     program = f"python -m {module}"
     try:
-        with told_warnings(program):
+        with warnings_as_lines(program):
             run_command(dict(commands), prog=program, help_line=description or "", args=args)
     except HandSimError as error:
         print(f"{program}: {error}", file=sys.stderr)

@@ -1,6 +1,6 @@
-"""Code that comes from elsewhere: optional packages, and functions and classes of users' own.
+"""Loading of foreign code: optional packages, and functions and classes of users.
 
-Users name theirs as `module:name`, or by the name of an entry point.
+Users name their code as `module:name`, or by the name of an entry point.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def list_plugins(group: str) -> tuple[str, ...]:
 
 @functools.lru_cache(maxsize=64)
 def load_plugin(name: str, *, group: str, noun: str) -> Any:
-    """Import the object of a name; a class is called without arguments, once."""
+    """Import the object of a name; a class is instantiated once, without arguments."""
     found = _import_object(name, group, noun)
     try:
         return found() if inspect.isclass(found) else found
@@ -48,10 +48,10 @@ def load_plugin(name: str, *, group: str, noun: str) -> Any:
 
 
 def make_plugin(address: str, *, group: str, noun: str) -> Any:
-    """Import the object of an address and call it with the options there, which are strings.
+    """Import the class or function of an address, and call it with the options in the address.
 
-    The address is `module:name` or the name of an entry point, of a class or a function; perhaps followed by
-    `?option=value&option=value`.
+    The address is `module:name` or the name of an entry point. Options may follow it, as
+    `?option=value&option=value`; their values are strings.
     """
     name, _, options = address.partition("?")
     given = dict(parse_qsl(options, keep_blank_values=True))
@@ -97,7 +97,7 @@ def _import_object(name: str, group: str, noun: str) -> Any:
 
 
 def call_plugin(function: Callable[..., Any], name: str, noun: str, /, *args: Any, **options: Any) -> Any:
-    """Call what a user wrote, and tell in one sentence what went wrong."""
+    """Call a function of the user's; an error becomes one sentence."""
     if not callable(function):
         raise ArgumentError(f"{noun} '{name}' is {type(function).__name__}, expected a function or a class")
     try:
@@ -125,7 +125,7 @@ def _error_text(error: Exception) -> str:
 
 
 def import_extra(module: str, what: str, extra: str) -> Any:
-    """A module of an optional package, for something (`what`, in messages) that needs it."""
+    """Import a module of an optional package; `what` names in messages the feature that needs it."""
     try:
         return importlib.import_module(module)
     except (ImportError, RuntimeError) as error:  # pylsl raises the latter without its library

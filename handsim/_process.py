@@ -1,6 +1,6 @@
-"""What a process inherits: variables, control groups, its rank, and numpy's and torch's global settings.
+"""State that a process inherits: variables, control groups, rank, and global settings of numpy and torch.
 
-handsim neither trusts these settings in its own work nor leaves them changed.
+handsim computes with its own settings, and restores those of the caller.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _RANK_VARIABLES: Final = (
     ("OMPI_COMM_WORLD_RANK", "OMPI_COMM_WORLD_SIZE"),
     ("PMI_RANK", "PMI_SIZE"),
 )
-"""Variables of torchrun, srun and mpirun, which only the processes have that these start."""
+"""Variables for rank and size that torchrun, srun and mpirun set in the processes that they start."""
 
 
 @contextmanager
@@ -46,9 +46,9 @@ def environment(**variables: str) -> Iterator[None]:
 
 
 def rank_and_size() -> tuple[int, int]:
-    """Number of this process among those of a distributed program, and how many these are.
+    """Rank of this process in a distributed program, and the number of processes.
 
-    They are those of torch.distributed where it is initialized, else those that the launcher states. A plain
+    They come from torch.distributed if it is initialized, else from the variables of the launcher. A plain
     `python` in a job of Slurm is one process, however many tasks the job may start.
     """
     torch = sys.modules.get("torch")
@@ -62,16 +62,16 @@ def rank_and_size() -> tuple[int, int]:
 
 
 class SharedStream:
-    """A base of endless streams for torch's `DataLoader`, which each process of it pickles or copies."""
+    """A base of endless streams for torch's `DataLoader`, whose processes each get a copy."""
 
     _rank_and_size: tuple[int, int] | None = None
 
     def __getstate__(self) -> dict[str, Any]:
-        """The stream as a worker gets it, which is of its parent's rank."""
+        """The state that a worker gets, with the rank of its parent process."""
         return {**self.__dict__, "_rank_and_size": rank_and_size()}
 
     def share(self) -> tuple[int, int]:
-        """Number of the first batch of this rank and worker, and from each of its batches to the next."""
+        """Number of the first batch of this rank and worker, and the step to its next batch."""
         worker = sys.modules["torch"].utils.data.get_worker_info()
         if worker is None:
             return rank_and_size()
@@ -92,9 +92,9 @@ def memory_limit() -> float:
 
 
 def _cgroup_numbers(count: int, *names: str) -> Iterator[list[int]]:
-    """The numbers, so many, in these files of each control group of this process and of those above it.
+    """The `count` numbers in these files of each control group of this process and of its parent groups.
 
-    In a container the groups may be stated as on its host; then the groups that the container sees count.
+    A container may state the paths of its host; then the groups that are visible in the container count.
     """
     own = {"", *(line.split(":", 2)[-1].strip("/") for line in text_of_system(_OWN_CGROUPS).splitlines())}
     for root in (_CGROUP_ROOT / mount for mount in _CGROUP_MOUNTS):
@@ -120,7 +120,7 @@ def is_number(word: str) -> bool:
 
 @contextmanager
 def own_numerics() -> Iterator[None]:
-    """Compute within the block with numpy's and torch's usual settings, whatever the caller's are."""
+    """Use the default settings of numpy and torch within the block, whatever the caller's are."""
     import numpy as np
 
     with np.errstate(divide="warn", over="warn", under="ignore", invalid="warn"), ExitStack() as stack:
@@ -150,7 +150,7 @@ def _use_own_torch(torch: Any, stack: ExitStack) -> None:
 
 @contextmanager
 def torch_kept() -> Iterator[None]:
-    """Leave torch's random state and its denormal numbers after the block as they were before it."""
+    """Restore torch's random state and its handling of denormal numbers after the block."""
     torch, flushes = sys.modules["torch"], sys.float_info.min * 0.5 == 0.0
     try:
         with torch.random.fork_rng(range(torch.cuda.device_count())):
@@ -160,7 +160,7 @@ def torch_kept() -> Iterator[None]:
 
 
 def with_own_numerics(function: Callable[_P, _R]) -> Callable[_P, _R]:
-    """A function that computes in `own_numerics`, like each step of a generator that it returns."""
+    """Wrap a function to compute in `own_numerics`; so does each step of a generator that it returns."""
 
     @functools.wraps(function)
     def call(*args: _P.args, **options: _P.kwargs) -> _R:
@@ -172,7 +172,7 @@ def with_own_numerics(function: Callable[_P, _R]) -> Callable[_P, _R]:
 
 
 def _with_own_steps(items: Iterator[Any]) -> Iterator[Any]:
-    """The items of an iterator; only it, and not who uses the items, computes in `own_numerics`."""
+    """Yield the items of an iterator, each of which is computed in `own_numerics`."""
     take_next = own_numerics()(next)
     while (item := take_next(items, _EXHAUSTED)) is not _EXHAUSTED:
         yield item

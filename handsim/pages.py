@@ -100,7 +100,7 @@ def coordinates(point: Iterable[float], separator: str = " ") -> str:
 
 
 def joint_words(name: str) -> str:
-    """A joint angle's name in words, without its digit: PIP flexion."""
+    """The name of a joint angle in words, without its digit, such as "PIP flexion"."""
     return name.split("_", 1)[1].replace("_", " ")
 
 
@@ -131,6 +131,7 @@ def html_list(sentences: Sequence[str], kind: str = "ol") -> str:
 
 
 def _section_html(section: Section) -> str:
+    """The HTML of a section."""
     parts = [f"<h2>{escape(section.title)}</h2>", f"<p>{section.text}</p>"]
     for file, caption in section.pictures:
         name, text = escape(file), escape(caption)
@@ -165,12 +166,12 @@ def own_figures(settings: dict[str, Any]) -> Iterator[type[Figure]]:
 
 
 def _import_matplotlib() -> None:
-    """Import matplotlib; without the user's backend and settings file if it cannot be imported with them."""
+    """Import matplotlib; if the user's backend or settings file prevents that, import it without them."""
     try:
         importlib.import_module("matplotlib")
     except (ValueError, OSError):
         for name in [name for name in sys.modules if name.startswith("matplotlib.")]:
-            del sys.modules[name]  # half of a package cannot be imported again
+            del sys.modules[name]  # a package that is half imported cannot be imported again
         found = importlib.util.find_spec("matplotlib")
         usual = Path(str(found and found.origin)).with_name("mpl-data")
         # A file in the current folder is read before the one that the variable names.

@@ -49,15 +49,15 @@ class Expected:
 
 @dataclass(frozen=True, slots=True)
 class Spelled:
-    """How the command line spells a field that has no words: `Annotated[A | None, Spelled(bool, True)]`.
+    """The form of a field on the command line, if its own type has none.
 
-    The class of the field takes such values in Python, too.
+    An example is `Annotated[A | None, Spelled(bool, True)]`. In Python the field takes such values, too.
     """
 
     kind: Any = None
-    """The type whose words are given; the field's own when None."""
+    """Type of the option; the field's own type when None."""
     default: Any = None
-    """What an option of that type is when it is not given."""
+    """Default of the option."""
     name: str | None = None
     """The option's name; empty for a group whose fields stand among the others."""
 
@@ -117,7 +117,7 @@ class Settings:
         return {field.name: _as_json(getattr(self, field.name)) for field in fields}
 
     def changed(self, *names: str) -> list[str]:
-        """Those of some fields whose values are not their defaults."""
+        """The names among these of fields whose values differ from their defaults."""
         defaults = {field.name: field.default for field in dataclasses.fields(self)}  # type: ignore[arg-type]
         return [name for name in names if getattr(self, name) != defaults[name]]
 
@@ -163,7 +163,7 @@ def _annotations(kind: type) -> dict[str, Any]:
 
 
 def _checked_value(name: str, value: Any, hint: Any, field: dataclasses.Field[Any] | None = None) -> Any:
-    """A value converted to its annotation, or an error."""
+    """A value, converted to the type of its annotation; an `ArgumentError` if it does not fit."""
     limits, expected = None, None
     while get_origin(hint) is Annotated:
         hint, *extras = get_args(hint)
@@ -222,7 +222,7 @@ def _checked_union(
 
 
 def _is_of_type(value: Any, hint: Any) -> bool:
-    """Whether a value is of one of a field's types, whatever its numbers are."""
+    """Whether a value is of a type, without a check of the range of its numbers."""
     origin = get_origin(hint)
     if origin is Annotated:
         return _is_of_type(value, get_args(hint)[0])
@@ -245,7 +245,7 @@ def _members(protocol: Any) -> list[str]:
 
 
 def _checked_tuple(name: str, value: Any, arms: tuple[Any, ...], limits: Limits | None) -> tuple[Any, ...]:
-    """A tuple of any length, or of a set one; a single string is a tuple of it."""
+    """A tuple of any or of a fixed length; a single string becomes a tuple of one."""
     any_length = len(arms) == 2 and arms[1] is Ellipsis
     items = (value,) if isinstance(value, str) and any_length else value
     check_type(name, items, (tuple, list), "a tuple" if any_length else f"{len(arms)} values")

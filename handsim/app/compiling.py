@@ -20,7 +20,7 @@ from pathlib import Path
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
-from handsim.app.messages import tell_state
+from handsim.app.messages import show_state
 from handsim.app.workers import LocalProcesses, usable_cores
 from handsim.callbacks import before_compiling
 from handsim.errors import HandSimError
@@ -62,7 +62,7 @@ def compile_kernels(command: str | None = None) -> tuple[int, int]:
     listed = {row: one for row, one in enumerate(read_list()) if command in (None, *one.commands.split())}
     missing = missing_kernels(listed)
     if command is not None:  # kernels that are missing afterwards are compiled when they are called
-        before_compiling.append(functools.partial(tell_state, "compiling what is new, once on this machine"))
+        before_compiling.append(functools.partial(show_state, "compiling what is new, once on this machine"))
     if sum(one.seconds for one in missing.values()) <= (0.0 if command is None else _MIN_SECONDS):
         return 0, len(missing)
     _compile_all(missing)
@@ -174,8 +174,8 @@ def _compile_all(listed: Mapping[int, ListedKernel]) -> None:
     """Compile kernels in processes that end afterwards, and show the progress."""
     what = f"compiling {len(listed)} kernels, once on this machine"
     queue, total, done = _Queue(listed), sum(one.seconds for one in listed.values()), 0.0
-    told, first = time.monotonic(), (0.0, 0.0)  # speed counts from the first kernel, when processes run
-    tell_state(what)
+    last, first = time.monotonic(), (0.0, 0.0)  # speed counts from the first kernel, when processes run
+    show_state(what)
     with ExitStack() as stack:
         try:
             processes = [LocalProcesses(1) for _ in range(min(usable_cores(), len(listed), _MAX_PROCESSES))]
@@ -203,13 +203,13 @@ def _compile_all(listed: Mapping[int, ListedKernel]) -> None:
             now = time.monotonic()
             if done and not first[0]:
                 first = now, done
-            if now >= told + _STATE_INTERVAL:
-                told = now
+            if now >= last + _STATE_INTERVAL:
+                last = now
                 speed = (done - first[1]) / (now - first[0]) if now > first[0] else 0.0
                 rest = f", about {(total - done) / speed:.0f} s left" if speed else ""
                 count = len(listed) - len(queue.waiting) - len(queue.running)
-                tell_state(f"{what}: {count} done{rest}")
-    tell_state("")
+                show_state(f"{what}: {count} done{rest}")
+    show_state("")
 
 
 def plain_shape_errors() -> None:

@@ -306,7 +306,7 @@ def without_signals() -> Iterator[None]:
 
 @contextmanager
 def chosen_workers(
-    cluster: str | None, workers: int | None, tell: Callable[[str], None]
+    cluster: str | None, workers: int | None, report: Callable[[str], None]
 ) -> Iterator[int | Executor]:
     """The workers of the options --cluster and --workers: a number of processes, or a cluster's executor."""
     if cluster is None:
@@ -319,7 +319,7 @@ def chosen_workers(
         count = len(client.nthreads())
         there = f"{count} workers" if count else "no workers yet; waiting for the first"
         link = f"; dashboard of the cluster: {client.dashboard_link}" if client.dashboard_link else ""
-        tell(f"{cluster}: {there}{link}")
+        report(f"{cluster}: {there}{link}")
         try:
             yield ClusterExecutor(client)
         except distributed.KilledWorker as error:

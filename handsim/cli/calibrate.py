@@ -82,8 +82,8 @@ def calibrate(
     print_line(f"{out}: {sides} hand in glove {glove}")
     found = {one.hand.side: _report(one) for one in user.calibrations}
     for side in hands or load_layout(glove).sides[::-1]:
-        told = found.get(side, ["it is not in the capture and was left out"])
-        print_line(*(f"{side} hand: {line}" for line in told))
+        lines = found.get(side, ["it is not in the capture and was left out"])
+        print_line(*(f"{side} hand: {line}" for line in lines))
 
 
 def _record(live: str, options: TrackerOptions, out: Path, seconds: float) -> None:

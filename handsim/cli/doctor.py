@@ -105,7 +105,7 @@ def doctor(compile: bool = False, send: str | None = None) -> int:
     return int(any(finding.needed and finding.remedy for finding in findings))
 
 
-def send_pointing_hand(address: str, ended: Callable[[], bool], tell: Callable[[str], None]) -> None:
+def send_pointing_hand(address: str, ended: Callable[[], bool], report: Callable[[str], None]) -> None:
     """Send a right hand whose index finger points along the room's axes in turn, until it is ended."""
     import numpy as np
 
@@ -141,7 +141,7 @@ def send_pointing_hand(address: str, ended: Callable[[], bool], tell: Callable[[
                 seen = axes.turn @ pointing
                 axis = f"{'-' if seen.sum() < 0 else '+'}{'xyz'[np.abs(seen).argmax()]}"
                 where = f"{DIRECTIONS[along]}, along {axis}"
-                tell(f"the index finger points {where}, its tip is at {place} {axes.unit}")
+                report(f"the index finger points {where}, its tip is at {place} {axes.unit}")
             nobody = np.empty((0, 3)), np.empty(0, dtype=np.int64)
             frame = StreamedFrame(number, number / _HAND_RATE, *nobody, arrived=time.monotonic())
             shown = TrackedHand("right", Status.TRACKED, qpos[0], np.nan, *nobody)

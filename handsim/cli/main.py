@@ -21,7 +21,7 @@ from typing import Any, Final
 
 from handsim import callbacks
 from handsim._version import full_version
-from handsim.app.messages import told_warnings
+from handsim.app.messages import warnings_as_lines
 from handsim.callbacks import before_compiling
 from handsim.cli.kept_help import print_help
 from handsim.errors import MAX_MESSAGE_LENGTH, HandSimError, choices, shortened
@@ -121,7 +121,7 @@ def run(commands: Table, args: Sequence[str]) -> int:
     # One core solves our small systems faster than several, and each worker has one core.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
-        with told_warnings(program), signals_raise():
+        with warnings_as_lines(program), signals_raise():
             code = _dispatch(commands, args)
         sys.stdout.flush()  # a full disk or a closed pipe must fail here, not while Python shuts down
         return code

@@ -20,7 +20,7 @@ from typing import Any, Final, NamedTuple
 from gloves.captures.formats import READABLE, find_captures
 from handsim._checks import check_choice
 from handsim._version import provenance
-from handsim.app.messages import print_line, tell_state
+from handsim.app.messages import print_line, show_state
 from handsim.errors import ArgumentError, CaptureError, HandSimError, errors_of
 from handsim.files.inputs import check_regular, checksum, load_json, read_bytes, text_encoding
 from handsim.files.outputs import check_outputs, save_json
@@ -135,7 +135,7 @@ def run_study(
         made_of = {"settings": settings, "inputs": _checksums(read)}
         try:
             if {**entry, **made_of} != entry or entry["sums"] != _checksums(step.outputs):
-                tell_state(str(file.source))  # whose the next warnings are
+                show_state(str(file.source))  # whose the next warnings are
                 make((file.source,), out=step.outputs[0], **step.options)
                 made += 1
                 names = [one.relative_to(out).as_posix() for one in step.outputs]
@@ -144,7 +144,7 @@ def run_study(
             there.append(step)
         except HandSimError as error:
             bad.append(str(file.source))
-            tell_state(f"{file.source}: not {done}: {str(error).removeprefix(f'{file.source}: ')}")
+            show_state(f"{file.source}: not {done}: {str(error).removeprefix(f'{file.source}: ')}")
         if entries.get(key, {}) != old:
             save_json(out / RECORD, record)
     if there or (out / RECORD).is_file():
@@ -215,7 +215,7 @@ def _separator(line: str) -> str:
 
 def _table_files(table: Path) -> Iterator[StudyFile]:
     """The files in a study's table; paths start at its folder."""
-    data = read_bytes(table, error=CaptureError, most=_MAX_TABLE_BYTES)
+    data = read_bytes(table, error=CaptureError, max_bytes=_MAX_TABLE_BYTES)
     lines = data.decode(text_encoding(data), "replace").splitlines()
     header = _header(lines[0])
     for name in filter(None, header):

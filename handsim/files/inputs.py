@@ -43,8 +43,8 @@ _MAX_NUMBER: Final = 1e9
 """Largest number, in any unit; it excludes NaN, infinity and integers beyond float."""
 
 
-def check_regular(path: Path, *, error: type[HandSimError], most: int | None = None) -> None:
-    """Refuse a pipe, a socket or a device, which may never end, and a file of more than `most` bytes."""
+def check_regular(path: Path, *, error: type[HandSimError], max_bytes: int | None = None) -> None:
+    """Refuse a pipe, a socket or a device, which may never end, and a file of more than `max_bytes`."""
     try:
         found = path.stat()
     except OSError:
@@ -54,8 +54,8 @@ def check_regular(path: Path, *, error: type[HandSimError], most: int | None = N
     for is_kind, kind in _SPECIAL_FILES:
         if is_kind(found.st_mode):
             raise error(f"{path}: this is {kind}, expected a regular file; write it to a file first")
-    if most is not None and found.st_size > most and stat.S_ISREG(found.st_mode):
-        raise error(f"{path}: the file is {found.st_size} bytes long, expected at most {most}")
+    if max_bytes is not None and found.st_size > max_bytes and stat.S_ISREG(found.st_mode):
+        raise error(f"{path}: the file is {found.st_size} bytes long, expected at most {max_bytes}")
 
 
 def check_there(path: Path, *, error: type[HandSimError]) -> None:
@@ -64,13 +64,13 @@ def check_there(path: Path, *, error: type[HandSimError]) -> None:
         raise error(f"{path}: cannot be read: {os.strerror(errno.ENOENT)}")
 
 
-def read_bytes(path: Path, *, error: type[HandSimError], most: int | None = None) -> bytes:
-    """The bytes of a regular file of at most `most` bytes."""
-    check_regular(path, error=error, most=most)
+def read_bytes(path: Path, *, error: type[HandSimError], max_bytes: int | None = None) -> bytes:
+    """The bytes of a regular file of at most `max_bytes`."""
+    check_regular(path, error=error, max_bytes=max_bytes)
     try:
         # Without waiting: the path may have become a pipe since it was checked.
         with open(path, "rb", opener=lambda name, flags: os.open(name, flags | _NONBLOCKING)) as file:
-            return file.read() if most is None else file.read(most)
+            return file.read(max_bytes)
     except OSError as cause:
         raise error(f"{path}: cannot be read: {cause.strerror or cause}") from cause
 
@@ -90,7 +90,7 @@ def checksum(path: Path | UPath) -> str:
 
 def read_toml(path: Path, *, error: type[HandSimError]) -> dict[str, Any]:
     """The tables of a TOML file."""
-    data = read_bytes(path, error=error, most=_MAX_TOML_BYTES)
+    data = read_bytes(path, error=error, max_bytes=_MAX_TOML_BYTES)
     try:
         text = data.decode(text_encoding(data))
         deep = _LONG_KEY.search(text)
@@ -120,7 +120,7 @@ def _has_long_integer(value: object) -> bool:
 def load_json(path: Path) -> dict[str, Any]:
     """Read a JSON object."""
     try:
-        content = json.loads(read_bytes(path, error=DatasetError, most=_MAX_JSON_BYTES))
+        content = json.loads(read_bytes(path, error=DatasetError, max_bytes=_MAX_JSON_BYTES))
     except (ValueError, RecursionError) as error:
         raise DatasetError(f"{path} is damaged: it does not hold JSON") from error
     if not isinstance(content, dict):

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 DIGEST: Final = "handsim.sha256"
 """Key of a model's own SHA-256, which is taken with 64 zeros in its place."""
-MOST_MODEL_BYTES: Final = 1 << 27
+MAX_MODEL_BYTES: Final = 1 << 27
 """Largest file of a model that is read; the paper's network has 87 MB."""
 _MAX_PARTS: Final = 200_000  # fields of a model and its parts; that of dense19 has 11,000
 _MAX_SESSION_BYTES: Final = 1 << 30  # bytes of weights and results of all sessions
@@ -45,7 +45,7 @@ def stamp_model(content: bytes) -> bytes:
 
 def check_model(content: bytes) -> None:
     """Raise a `ValueError` unless a model has the right checksum, and one bounded graph alone."""
-    if len(content) > MOST_MODEL_BYTES or stamp_model(content) != content:
+    if len(content) > MAX_MODEL_BYTES or stamp_model(content) != content:
         raise ValueError("the SHA-256 is another one")
     parts, waiting = 0, [(_MODEL, memoryview(content))]
     while waiting:

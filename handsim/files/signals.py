@@ -38,7 +38,7 @@ class Stopped(KeyboardInterrupt):
 
 
 class InterruptFlag:
-    """A flag that a signal to end sets; a call tells whether it is set."""
+    """A flag that a signal to end sets; a call returns whether it is set."""
 
     def __init__(self) -> None:
         self.number = 0
@@ -155,11 +155,11 @@ def _lost_stops_hidden() -> Iterator[None]:
     """Print no traceback of a lost `Stopped`, whose signal is sent again."""
     others = sys.unraisablehook
 
-    def tell(lost: sys.UnraisableHookArgs) -> None:
+    def hook(lost: sys.UnraisableHookArgs) -> None:
         if not isinstance(lost.exc_value, Stopped):
             others(lost)
 
-    sys.unraisablehook = tell
+    sys.unraisablehook = hook
     try:
         yield
     finally:

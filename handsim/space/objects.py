@@ -128,7 +128,7 @@ def load_object(path: str | Path, *, mass: float = 0.1) -> RigidObject:
 def _read_mesh(path: Path) -> Any:
     if path.suffix.lower() not in MESH_SUFFIXES:
         raise ObjectError(f"{path}: expected a mesh file that ends in {', '.join(MESH_SUFFIXES)}")
-    check_regular(path, error=ObjectError, most=1 << 26)
+    check_regular(path, error=ObjectError, max_bytes=1 << 26)
     if not path.is_file():
         raise ObjectError(f"{path}: no such file")
     import trimesh

@@ -165,8 +165,8 @@ def _without_rectification(path: Path, values: Values) -> Values:
         values = {key.upper() if key in ("k", "d", "r", "p") else key: value for key, value in values.items()}
     if not {"K", "P", "R"} <= values.keys() or _find_key(values, (*_T_KEYS, _POSE_KEY)) is not None:
         return values
-    told = f"{path}: R beside P is ROS' rectification and no pose; the camera's axes are the world"
-    warnings.warn(told, HandSimWarning, stacklevel=3)
+    message = f"{path}: R beside P is ROS' rectification and no pose; the camera's axes are the world"
+    warnings.warn(message, HandSimWarning, stacklevel=3)
     return {key: value for key, value in values.items() if key != "R"}
 
 
@@ -446,7 +446,7 @@ def _read_file(path: Path) -> tuple[Values, Sections]:
     if path.suffix.lower() == ".toml":
         tables = foreign_cameras(read_toml(path, error=RigError))
         return {}, dict(_sections({name: one | {"K": one[TOML_MATRIX]} for name, one in tables.items()}))
-    data = read_bytes(path, error=RigError, most=_MAX_BYTES)
+    data = read_bytes(path, error=RigError, max_bytes=_MAX_BYTES)
     try:
         text = _LONG_LIST.sub('"long"', data.decode(text_encoding(data)))
     except UnicodeDecodeError as error:

@@ -60,16 +60,16 @@ _MAX_FILE_CAMERAS: Final = 256
 _MAX_DISTANCE: Final = 50.0  # largest distance of a camera from the origin [m]
 _MIN_DISTANCE: Final = 1e-3  # least distance of a camera from its target or another camera [m]
 _VALID_NAME: Final = re.compile(r"[A-Za-z0-9_-]{1,64}")
-NAMELESS: Final = re.compile(r"[^A-Za-z0-9_-]+")
+NOT_IN_NAMES: Final = re.compile(r"[^A-Za-z0-9_-]+")
 """Characters that a camera's name cannot have."""
 TOML_MATRIX: Final = "matrix"
 """The key of a camera's K in the TOML files of Pose2Sim and anipose."""
-FEWEST_CAMERAS: Final = 2
+MIN_CAMERAS: Final = 2
 MAX_CAMERAS: Final = 32
 """A marker's visibility is one bit per camera in 32 bits."""
 ROOM_CENTER: Final = (0.0, 0.0, 1.1)
 """Middle of the space that hands move in, in front of a seated user [m]."""
-LONGEST_SIDE: Final = 50.0
+MAX_SIDE: Final = 50.0
 """Largest side of a volume or room, and largest coordinate of its middle [m]."""
 HAND_REACH: Final = 0.25
 """Longest reach of a hand from its wrist [m], and the least distance of a camera from the wrists' volume."""
@@ -120,7 +120,7 @@ def camera_names(given: Sequence[str]) -> list[str]:
     names: list[str] = []
     for number, text in enumerate(given, 1):
         # A number may follow the name.
-        plain = NAMELESS.sub("_", text).strip("_")[:56] or f"camera{number}"
+        plain = NOT_IN_NAMES.sub("_", text).strip("_")[:56] or f"camera{number}"
         names.append(plain if plain not in names else f"{plain}_{number}")
     return names
 
@@ -266,8 +266,8 @@ def _pose(table: Mapping[str, Any], owner: str) -> NDArray[np.float64]:
             f"{owner}: T_world_camera", place["T_world_camera"], (4, 4), "four rows of four numbers"
         )
     if set(place) != {"position", "target"}:
-        told = " and ".join(place) or "no place"
-        raise RigError(f"{owner} has {told}, expected position and target, or T_world_camera alone")
+        given = " and ".join(place) or "no place"
+        raise RigError(f"{owner} has {given}, expected position and target, or T_world_camera alone")
     position, target = (
         numbers(f"{owner}: {key}", place[key], (3,), "three numbers [x, y, z] in meters")
         for key in ("position", "target")
@@ -277,7 +277,7 @@ def _pose(table: Mapping[str, Any], owner: str) -> NDArray[np.float64]:
     return look_at(position, target)
 
 
-Center = Annotated[tuple[float, float, float], Limits(-LONGEST_SIDE, LONGEST_SIDE)]
+Center = Annotated[tuple[float, float, float], Limits(-MAX_SIDE, MAX_SIDE)]
 """The middle of a volume or room [m]."""
 
 
@@ -303,10 +303,9 @@ class CameraRig:
                 "expected a sequence of Camera"
             )
         object.__setattr__(self, "cameras", tuple(self.cameras))
-        if not FEWEST_CAMERAS <= len(self.cameras) <= MAX_CAMERAS:
+        if not MIN_CAMERAS <= len(self.cameras) <= MAX_CAMERAS:
             raise RigError(
-                f"rig '{self.name}' has {len(self.cameras)} cameras, "
-                f"expected {FEWEST_CAMERAS} to {MAX_CAMERAS}"
+                f"rig '{self.name}' has {len(self.cameras)} cameras, expected {MIN_CAMERAS} to {MAX_CAMERAS}"
             )
         check_names(f"rig '{self.name}'", self.cameras)
         for number, camera in enumerate(self.cameras, 1):

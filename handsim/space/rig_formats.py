@@ -25,7 +25,7 @@ from handsim.files.inputs import read_bytes, read_toml, shown, text_encoding, wo
 from handsim.space.camera import Camera, Lens, brown_lens, camera_matrix
 from handsim.space.opencv_cameras import read_opencv_cameras
 from handsim.space.rig import (
-    NAMELESS,
+    NOT_IN_NAMES,
     camera_names,
     checked_cameras,
     foreign_cameras,
@@ -135,7 +135,7 @@ def picture_size(owner: str, width: float, height: float) -> tuple[int, int]:
 
 def read_xml(path: Path) -> ET.Element:
     """The root of an XML file in UTF-8, UTF-16 or Latin-1."""
-    text = _decoded(path, read_bytes(path, error=RigError, most=_MAX_XML_BYTES))
+    text = _decoded(path, read_bytes(path, error=RigError, max_bytes=_MAX_XML_BYTES))
     if "<!DOCTYPE" in text:
         raise RigError(f"{path}: the XML has a document type, which no calibration has; it is not read")
     root, depth = ET.Element(""), 0
@@ -311,7 +311,7 @@ def read_colmap_cameras(path: Path) -> tuple[Camera, ...]:
 
 def _binary_lines(path: Path, read: Callable[[bytes, int], tuple[int, str]]) -> list[str]:
     """The records of a binary file of COLMAP, as lines of its text."""
-    data, at, lines = read_bytes(path, error=RigError, most=_MAX_COLMAP_BYTES), 8, []
+    data, at, lines = read_bytes(path, error=RigError, max_bytes=_MAX_COLMAP_BYTES), 8, []
     try:
         for _ in range(*struct.unpack_from("<Q", data)):
             at, line = read(data, at)
@@ -346,7 +346,7 @@ def _binary_image(data: bytes, at: int) -> tuple[int, str]:
 def _colmap_lines(path: Path, *, keep_empty: bool = False) -> list[str]:
     """Lines without comments; an image without points has an empty line of points."""
     try:
-        text = read_bytes(path, error=RigError, most=_MAX_COLMAP_BYTES).decode("utf-8-sig")
+        text = read_bytes(path, error=RigError, max_bytes=_MAX_COLMAP_BYTES).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise RigError(
             f"{path}: not COLMAP's text: it is not UTF-8; colmap model_converter writes it"
@@ -408,7 +408,7 @@ def _colmap_image(path: Path, line: str, lenses: dict[str, Camera]) -> Camera:
         raise RigError(f"{owner}: {choices(words[8], lenses, noun='camera')}")
     R_world_camera = quaternion_matrix(pose[:4] / length).T
     lens = lenses[words[8]]
-    name = NAMELESS.sub("_", words[9].rpartition(".")[0] or words[9])[-64:]
+    name = NOT_IN_NAMES.sub("_", words[9].rpartition(".")[0] or words[9])[-64:]
     return Camera(name, lens.size, lens.K, rigid(R_world_camera, -R_world_camera @ pose[4:]), lens.lens)
 
 
