@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from benchmarks.record import describe
-from handsim.app.compiling import LIST
+from handsim.app.compiling import KERNELS_FILE
 
 # A later command may read what an earlier one wrote. Names begin with the command's.
 COMMANDS: Final = {
@@ -134,7 +134,8 @@ def main() -> None:
         for row, took in sorted(seconds.items())
     ]
     lines = (",\n  ".join(json.dumps(one) for one in rows) for rows in (table, kernels))
-    LIST.write_text('{{"types": [\n  {}\n], "kernels": [\n  {}\n]}}\n'.format(*lines), encoding="utf-8")
+    text = '{{"types": [\n  {}\n], "kernels": [\n  {}\n]}}\n'.format(*lines)
+    KERNELS_FILE.write_text(text, encoding="utf-8")
     for place, _, took, commands in sorted(kernels, key=lambda one: -one[2])[:25]:
         print(f"{took:7.2f} s  {place}  ({commands})")
 

@@ -22,7 +22,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from handsim import HandSimError, __version__
-from handsim.app.messages import told_warnings
+from handsim.app.messages import warnings_as_lines
 from handsim.cli.parsing import run_command
 
 FOLDER: Final = Path(__file__).with_name("figures")
@@ -62,7 +62,7 @@ def run_commands(
     """Run one function of a table, and return the exit code: 1, and one sentence, for a user's mistake."""
     program = f"python -m {module}"
     try:
-        with told_warnings(program):
+        with warnings_as_lines(program):
             run_command(dict(commands), prog=program, help_line=description or "", args=args)
     except HandSimError as error:
         print(f"{program}: {error}", file=sys.stderr)

@@ -112,9 +112,8 @@ class HandDetector:
             WeightsError: A file is missing, larger than 64 MiB, or not one of a detector.
         """
         folder = WEIGHTS if path is None else Path(path)
-        contents = [
-            read_bytes(folder / name, error=WeightsError, most=MOST_BYTES) for name in (FINDER, KEYPOINTS)
-        ]
+        files = (folder / FINDER, folder / KEYPOINTS)
+        contents = [read_bytes(file, error=WeightsError, max_bytes=MOST_BYTES) for file in files]
         try:
             return cls(*contents)
         except Exception as error:  # OpenCV's errors of damaged files have no class of their own

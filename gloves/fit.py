@@ -34,21 +34,21 @@ from handsim.kernels import kernel
 from handsim.space.rig import CameraRig
 from handsim.space.transforms import MIRROR, unit
 
-_WIDTHS: Final = {"points": 3, "normals": 3, "bone_indices": 4, "bone_weights": 4}
-_MAX_NUMBER: Final = 100.0  # Larger positions [m], directions or bone indices are refused.
-# The digit of each palm capsule: a metacarpal counts to its finger, the wrist to the thumb.
+_ARRAY_WIDTHS: Final = {"points": 3, "normals": 3, "bone_indices": 4, "bone_weights": 4}
+_MAX_NUMBER: Final = 100.0  # largest position [m], direction or bone index
+# The digit of each capsule of the palm: a metacarpal belongs to its finger, the wrist to the thumb.
 _PALM_DIGITS: Final = np.array([1, 2, 3, 4, 0, 0])
-# From the wanted place of a marker (1) back to where it was designed (0), to the middle of its bone's back
-# (-1), and to the near end (-2), where fingers that overlap at zero angles have skin of their own.
-_WAY_BACK: Final = (
+# Places that are tried for a marker, one after another: the wanted place (1), the designed place (0), the
+# middle of the bone's back (-1), and its near end (-2), where even fingers that overlap have free skin.
+_FALLBACKS: Final = (
     *(1.0, 0.75, 0.5, 0.25, 0.0, -0.125, -0.25, -0.375, -0.5, -0.625, -0.75, -0.875, -1.0),
     *(-1.25, -1.5, -1.75, -2.0),
 )
 _NEAR_END: Final = 0.1  # along the bone
-_LONGEST_SLIP: Final = 0.025  # A random shift moves a marker at most this far [m].
+_MAX_SLIP: Final = 0.025  # largest random shift of a marker [m]
 _CONVERGED: Final = 1e-5  # [m] distance of a marker from its target
 _STALK_CONVERGED: Final = 2e-4  # [m] distance of a stalk's axis from its target
-_ACCEPTED: Final = 5e-4  # A marker keeps its bone if it comes this near to its target [m].
+_MAX_BONE_ERROR: Final = 5e-4  # largest distance from its target at which a marker keeps its bone [m]
 _CURVATURE_RADIUS: Final = 0.006  # radius of curvature of a fingertip's skin [m]
 _SPACING: Final = 4e-3  # rough distance between neighboring skin vertices [m]
 
@@ -72,7 +72,7 @@ class Attachment:
     """Shares of these bones, summing to one."""
 
     def __post_init__(self) -> None:
-        for name, width in _WIDTHS.items():
+        for name, width in _ARRAY_WIDTHS.items():
             shape, expected = getattr(self, name).shape, (self.layout.num_markers, width)
             if shape != expected:
                 raise ArgumentError(f"{name} has shape {shape}, expected {expected}")
@@ -195,10 +195,10 @@ def _refusal(marker: MarkerPlace, other: str) -> str:
 def _put_on(
     markers: Sequence[MarkerPlace], layout: MarkerLayout, model: HandModel
 ) -> tuple[Attachment, list[int], list[str]]:
-    """The layout's glove with its markers at these places of a hand, and the markers that miss their digit.
+    """Put the glove on a hand with its markers at these places, and find markers that miss their digit.
 
-    These are indices, and for every marker the bone of another digit that it would lie on, "" for none. The
-    points of markers that meet no skin mean nothing.
+    Returns the attachment, the indices of markers that miss, and for each marker the bone of another digit
+    that it would lie on ("" for none). Points of markers that meet no skin are meaningless.
     """
     surface = model.surface
     rays = np.array([_ray(marker, model) for marker in markers])
@@ -221,13 +221,13 @@ def _put_on(
     shares = all_weights(surface.bone_indices[vertices], bary.reshape(-1, 1) * surface.bone_weights[vertices])
     indices, weights = strongest_weights(shares.reshape(*corners.shape, -1).sum(axis=1))
     bones = np.array([BONE_NAMES.index(marker.bone) for marker in markers])
-    others = _other_digits(feet, points, bones, indices[:, 0], model)
+    others = _wrong_bones(feet, points, bones, indices[:, 0], model)
     others = ["" if gone else other for gone, other in zip(missed, others, strict=True)]
     astray = np.flatnonzero(missed | (np.array(others) != "")).tolist()
     return Attachment(layout, points, normals, indices, weights), astray, others
 
 
-def _other_digits(
+def _wrong_bones(
     feet: NDArray[np.float64],
     points: NDArray[np.float64],
     bones: NDArray[np.int64],
@@ -298,7 +298,7 @@ def wear(
 ) -> Attachment:
     """Put on a glove with random shifts (`vary_layout`).
 
-    A shift is shortened until its marker is on the skin of its digit and within `_LONGEST_SLIP` of its
+    A shift is shortened until its marker is on the skin of its digit and within `_MAX_SLIP` of its
     designed point.
 
     Raises:
@@ -332,25 +332,25 @@ def _settled(
     model: HandModel,
     designed: Float[np.ndarray, "M 3"] | None = None,
 ) -> Attachment:
-    """The glove with each marker at the first place of `_WAY_BACK` that is on the skin of its digit.
+    """Put on a glove with each marker at the first place of `_FALLBACKS` on the skin of its own digit.
 
-    Markers are within `_LONGEST_SLIP` of the `designed` points [m], if these are given.
+    If `designed` points [m] are given, each marker is within `_MAX_SLIP` of its point.
     """
     markers, missed = list(wanted.markers), list(range(layout.num_markers))
-    for share in _WAY_BACK:
+    for share in _FALLBACKS:
         for index in missed:
-            markers[index] = _on_the_way(layout.markers[index], wanted.markers[index], share)
+            markers[index] = _fallback_place(layout.markers[index], wanted.markers[index], share)
         worn, missed, _ = _put_on(markers, wanted, model)
         if designed is not None:
             slips = np.linalg.norm(worn.points - designed, axis=1)
-            missed = sorted({*missed, *np.flatnonzero(slips > _LONGEST_SLIP).tolist()})
+            missed = sorted({*missed, *np.flatnonzero(slips > _MAX_SLIP).tolist()})
         if not missed:
             return dataclasses.replace(worn, layout=dataclasses.replace(wanted, markers=tuple(markers)))
     return attach_markers(layout, model)
 
 
-def _on_the_way(designed: MarkerPlace, wanted: MarkerPlace, share: float) -> MarkerPlace:
-    """A place of `_WAY_BACK` between the wanted one and the near end of the bone's back."""
+def _fallback_place(designed: MarkerPlace, wanted: MarkerPlace, share: float) -> MarkerPlace:
+    """The place at one of the shares of `_FALLBACKS`."""
     if share == 1.0:
         return wanted
     if share < -1.0:
@@ -588,17 +588,17 @@ def place_marker(
     bones = (BONE_NAMES.index(layout.markers[index].bone), int(surface.bone_indices[nearest, 0]))
     best, least = layout, math.inf
     for bone in dict.fromkeys(bones if stays else bones[::-1]):
-        candidate, missed = _place_on(layout, index, bone, model, center, point)
+        candidate, missed = _search_place(layout, index, bone, model, center, point)
         if missed < least:
             best, least = candidate, missed
-        if least < _ACCEPTED:
+        if least < _MAX_BONE_ERROR:
             break
     if math.isinf(least):
         raise LayoutError(f"marker '{layout.names[index]}' meets no skin there; move it nearer to the hand")
     return best
 
 
-def _place_on(
+def _search_place(
     layout: MarkerLayout,
     index: int,
     bone: int,
@@ -614,7 +614,7 @@ def _place_on(
     middle = start[:3, 3] + 0.5 * model.skeleton.lengths[bone] * start[:3, 0]
     best, least = layout, math.inf
     for _ in range(12):  # the center lies on the skin's normal, not on the ray that finds the skin
-        moved = dataclasses.replace(_place(layout.markers[index], bone, model, wanted), height=height)
+        moved = dataclasses.replace(_bone_place(layout.markers[index], bone, model, wanted), height=height)
         markers = (*layout.markers[:index], moved, *layout.markers[index + 1 :])
         candidate = dataclasses.replace(layout, markers=markers)
         try:
@@ -635,7 +635,7 @@ def _place_on(
     return best, least
 
 
-def _place(marker: MarkerPlace, bone: int, model: HandModel, point: NDArray[np.float64]) -> MarkerPlace:
+def _bone_place(marker: MarkerPlace, bone: int, model: HandModel, point: NDArray[np.float64]) -> MarkerPlace:
     """The place on a bone whose ray passes through a point."""
     T_wrist_bone = model.rest_transforms[bone]
     x, y, z = T_wrist_bone[:3, :3].T @ (point - T_wrist_bone[:3, 3])

@@ -37,8 +37,8 @@ from handsim.files.outputs import write_text, writing
 from handsim.hand.shape import BONE_NAMES, BONES, PALM, SIDES, Side
 from handsim.settings import Expected
 
-FEWEST_MARKERS: Final = 5
-MOST_MARKERS: Final = 60
+MIN_MARKERS: Final = 5
+MAX_MARKERS: Final = 60
 _RADIUS_RANGE: Final = (0.0005, 0.015)  # [m]
 ALONG_RANGE: Final = (-0.3, 1.3)
 """Range of `MarkerPlace.along`."""
@@ -47,18 +47,19 @@ ACROSS_RANGE: Final = (-1.0, 1.0)
 """Range of `MarkerPlace.across`."""
 HEIGHT_RANGE: Final = (0.0, 0.05)
 """Range of `MarkerPlace.height` [m]."""
-_ARM: Final = {
+_ARM_HINTS: Final = {
     "wrist": "for a marker that moves with the hand write palm, with along from -0.15 to 0",
     "forearm": "markers beyond the wrist's joint are a rigid body of their own (handsim body --forearm)",
 }
 _ALIASES: Final = {name.replace("little", "pinky"): name for name in BONE_NAMES if name.startswith("little")}
-_SHIPPED: Final = Path(__file__).parent / "layouts"
+"""Other names of bones."""
+_LAYOUTS_FOLDER: Final = Path(__file__).parent / "layouts"
 _LAYOUT_KEYS: Final = ("name", "description", "source", "sides", "radius_mm", "marker")
 _MARKER_KEYS: Final = ("name", "bone", "along", "around", "across", "height_mm")
-_OPTIONAL: Final = ("across", "height_mm")
-_STARTER: Final = Path(__file__).parent / "data" / "starter_layout.toml"
-_TABLE: Final = re.compile(r"\s*\[\[\s*marker\s*\]\]\s*(?:#.*)?$")
-_ENTRY: Final = re.compile(r"(\s*(\w+)\s*=\s*)(\"[^\"\\]*\"|'[^']*'|[^\s#\"']+)(\s*(?:#.*)?)$")
+_OPTIONAL_KEYS: Final = ("across", "height_mm")
+_STARTER_FILE: Final = Path(__file__).parent / "data" / "starter_layout.toml"
+_TABLE_LINE: Final = re.compile(r"\s*\[\[\s*marker\s*\]\]\s*(?:#.*)?$")
+_ENTRY_LINE: Final = re.compile(r"(\s*(\w+)\s*=\s*)(\"[^\"\\]*\"|'[^']*'|[^\s#\"']+)(\s*(?:#.*)?)$")
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,9 +93,9 @@ class MarkerPlace:
             raise LayoutError(
                 f"marker name {self.name!r}: expected printable characters without outer blanks"
             )
-        if self.bone in _ARM:
+        if self.bone in _ARM_HINTS:
             raise LayoutError(
-                f"marker '{self.name}': {self.bone} is not a bone of the hand; {_ARM[self.bone]}"
+                f"marker '{self.name}': {self.bone} is not a bone of the hand; {_ARM_HINTS[self.bone]}"
             )
         if self.bone not in BONE_NAMES:
             raise LayoutError(f"marker '{self.name}': {choices(self.bone, BONE_NAMES, noun='bone')}")
@@ -151,9 +152,9 @@ class MarkerLayout:
         object.__setattr__(self, "markers", tuple(self.markers))
         if not self.name or not self.name.isprintable():
             raise LayoutError(f"layout name {self.name!r}: expected printable characters")
-        if not FEWEST_MARKERS <= self.num_markers <= MOST_MARKERS:
+        if not MIN_MARKERS <= self.num_markers <= MAX_MARKERS:
             raise LayoutError(
-                f"a layout needs {FEWEST_MARKERS} to {MOST_MARKERS} markers, got {self.num_markers}"
+                f"a layout needs {MIN_MARKERS} to {MAX_MARKERS} markers, got {self.num_markers}"
             )
         names = self.names
         for index, name in enumerate(names):
@@ -216,14 +217,14 @@ class MarkerLayout:
         Raises:
             LayoutError: The file cannot be written.
         """
-        told = [
+        texts = [
             f"{key} = {toml_string(text)}"
             for key, text in (("description", description), ("source", source))
             if text
         ]
         name, *others = layout_lines(self)
         with writing(path, LayoutError):
-            write_text(path, "\n".join([name, *told, *others]) + "\n")
+            write_text(path, "\n".join([name, *texts, *others]) + "\n")
 
 
 @dataclass(frozen=True, slots=True)
@@ -239,7 +240,7 @@ class ShippedLayout:
 
 def list_layouts() -> tuple[str, ...]:
     """Names of the layouts that come with the package."""
-    return tuple(sorted(path.stem for path in _SHIPPED.glob("*.toml")))
+    return tuple(sorted(path.stem for path in _LAYOUTS_FOLDER.glob("*.toml")))
 
 
 AnyLayout = Annotated[
@@ -278,7 +279,7 @@ def load_layout(glove: MarkerLayout | str | Path) -> MarkerLayout:
 
 def _layout_path(glove: str | Path) -> Path:
     """The file of a layout that is given by its shipped name or by its path."""
-    return _SHIPPED / f"{glove}.toml" if str(glove) in list_layouts() else Path(glove)
+    return _LAYOUTS_FOLDER / f"{glove}.toml" if str(glove) in list_layouts() else Path(glove)
 
 
 def layout_checksum(glove: str | Path) -> str:
@@ -290,7 +291,7 @@ def layout_checksum(glove: str | Path) -> str:
 def shipped_layout(name: str) -> ShippedLayout:
     """A shipped layout with its description and its source; a `LayoutError` if there is none of this name."""
     check_choice(name, list_layouts(), noun="glove", error=LayoutError)
-    table = read_toml(_SHIPPED / f"{name}.toml", error=LayoutError)
+    table = read_toml(_LAYOUTS_FOLDER / f"{name}.toml", error=LayoutError)
     return ShippedLayout(
         parse_layout(table), text_of(table, "description", default=""), text_of(table, "source", default="")
     )
@@ -304,7 +305,7 @@ def stored_layout(stored: Mapping[str, Any]) -> MarkerLayout:
 
 def starter_layout() -> str:
     """A commented layout file to start your own glove from; it loads as it is."""
-    return _STARTER.read_text("utf-8")
+    return _STARTER_FILE.read_text("utf-8")
 
 
 def layout_lines(layout: MarkerLayout) -> list[str]:
@@ -326,7 +327,7 @@ def _marker_texts(marker: MarkerPlace) -> dict[str, str]:
     }
     texts |= {"around": toml_number(math.degrees(marker.around)), "across": toml_number(marker.across)}
     texts |= {"height_mm": toml_number(1e3 * marker.height)}
-    return {key: text for key, text in texts.items() if key not in _OPTIONAL or text != "0.0"}
+    return {key: text for key, text in texts.items() if key not in _OPTIONAL_KEYS or text != "0.0"}
 
 
 def parse_layout(table: Mapping[str, object]) -> MarkerLayout:
@@ -347,7 +348,7 @@ def parse_layout(table: Mapping[str, object]) -> MarkerLayout:
 def _parse_marker(table: Mapping[str, object], number: int) -> MarkerPlace:
     name = table.get("name")
     owner = f"marker '{name}'" if isinstance(name, str) else f"marker number {number}"
-    check_keys(table, owner, _MARKER_KEYS, optional=_OPTIONAL)
+    check_keys(table, owner, _MARKER_KEYS, optional=_OPTIONAL_KEYS)
     return MarkerPlace(
         text_of(table, "name", f"{owner}: "),
         text_of(table, "bone", f"{owner}: "),
@@ -364,13 +365,13 @@ def moved_text(text: str, layout: MarkerLayout) -> tuple[str, bool]:
     A text that cannot be changed line by line is written anew, without comments.
     """
     lines = text.splitlines()
-    starts = [number for number, line in enumerate(lines) if _TABLE.match(line)]
+    starts = [number for number, line in enumerate(lines) if _TABLE_LINE.match(line)]
     if len(starts) == layout.num_markers:
         ends = [*starts[1:], len(lines)]
         for start, end, marker in reversed(list(zip(starts, ends, layout.markers, strict=True))):
             lines[start + 1 : end] = _moved_table(lines[start + 1 : end], marker)
         changed = "\n".join(lines) + "\n"
-        if _describes(changed, layout):
+        if _is_text_of(changed, layout):
             return changed, True
     return "\n".join(layout_lines(layout)) + "\n", False
 
@@ -380,7 +381,7 @@ def _moved_table(lines: list[str], marker: MarkerPlace) -> list[str]:
     texts = _marker_texts(marker)
     result, met, last = [], set(), 0
     for line in lines:
-        match = _ENTRY.match(line)
+        match = _ENTRY_LINE.match(line)
         if match is None or match[2] not in _MARKER_KEYS[1:]:
             result.append(line)
             last = len(result) if match is not None else last
@@ -394,11 +395,11 @@ def _moved_table(lines: list[str], marker: MarkerPlace) -> list[str]:
             same = toml_number(float(match[3])) == texts[key]
         result.append(line if same else f"{match[1]}{texts[key]}{match[4]}")
         last = len(result)
-    result[last:last] = [f"{key} = {texts[key]}" for key in _OPTIONAL if key in texts and key not in met]
+    result[last:last] = [f"{key} = {texts[key]}" for key in _OPTIONAL_KEYS if key in texts and key not in met]
     return result
 
 
-def _describes(text: str, layout: MarkerLayout) -> bool:
+def _is_text_of(text: str, layout: MarkerLayout) -> bool:
     """Whether a text describes this layout, up to the decimals of a file."""
     try:
         read = parse_layout(tomllib.loads(text))

@@ -28,7 +28,7 @@ def check_type(
 def check_choice(
     given: object, valid: Collection[str], *, noun: str, error: type[HandSimError] = ArgumentError
 ) -> None:
-    """Refuse a name that is none of the valid ones, as `choices` tells it."""
+    """Refuse a name that is not valid, with the sentence of `choices`."""
     if given not in valid:
         raise error(choices(str(given), valid, noun=noun))
 
@@ -39,20 +39,20 @@ def check_rng(rng: object) -> None:
 
 
 def check_callable(name: str, value: object, expected: str) -> None:
-    """Refuse what cannot be called."""
+    """Refuse an object that cannot be called."""
     if not callable(value):
         raise ArgumentError(f"{name} is {shown_value(value)}, expected {expected}")
 
 
 def check_methods(name: str, value: object, methods: Iterable[str], expected: str) -> None:
-    """Refuse an object of the user's own that lacks one of the methods of its kind."""
+    """Refuse an object that lacks one of these methods."""
     for method in methods:
         if not callable(getattr(value, method, None)):
             raise ArgumentError(f"{name} has no method {method}, expected {expected}")
 
 
 def shown_value(value: Any) -> str:
-    """A value for a sentence: short ones as Python writes them, arrays and objects by their type."""
+    """A value for a sentence: its `repr` if that is short, arrays and objects by their type."""
     if isinstance(value, np.ndarray):
         return f"an array {value.shape}"
     if value is None or isinstance(value, str | bytes | bool | int | float | list | tuple | dict | set):
@@ -73,10 +73,10 @@ def as_numbers(name: str, values: ArrayLike, kind: DTypeLike | None = np.float64
 
 
 def as_array(values: ArrayLike, kind: DTypeLike | None) -> NDArray[Any]:
-    """`values` as an array of their own type, a tensor of torch without its gradient.
+    """`values` as an array of their own type; a tensor of torch loses its gradient.
 
-    What is masked, in an array or a list of arrays, becomes the missing value of `kind` (None: their own):
-    NaN, or -1 in whole numbers. NumPy alone would bring back the numbers below the mask.
+    Masked entries of an array, or of a list of arrays, become the missing value of `kind` (None: their own
+    type): NaN, or -1 in whole numbers. NumPy alone would return the numbers below the mask.
     """
     items = values if isinstance(values, list | tuple) else [values]
     if any(isinstance(item, np.ma.MaskedArray) for item in items):
@@ -113,7 +113,7 @@ def check_number(name: str, value: float, low: float, high: float = np.inf, *, a
 
 
 def check_count(name: str, value: Any, low: int, high: float = np.inf) -> None:
-    """Refuse what is not a whole number from `low` to `high`."""
+    """Refuse anything but a whole number from `low` to `high`."""
     check_type(name, value, (int, np.integer), "a whole number")
     if not low <= value <= high:
         least = f"at least {low}" if low else "0 or more"

@@ -1,11 +1,11 @@
-"""What happens when a package is imported: lazy public names (PEP 562), name conflicts, a place for kernels.
+"""Imports of the packages: lazy public names (PEP 562), name conflicts, and the folder of compiled kernels.
 
-A user may well call a script `train.py` or `render.py`. handsim finds its own packages nevertheless, under
-`handsim.train` too, and warns that `import train` finds the other. It refuses to work on another `train` that
-is imported already, because Python has one module of a name.
+A user may call a script `train.py` or `render.py`. handsim still finds its own packages, also as
+`handsim.train`, and warns that `import train` finds the user's file. If the user's `train` is already
+imported, handsim raises an error, because Python holds only one module of each name.
 
-Compiled kernels are kept beside their files, else in the user's cache, else in a temporary folder: numba
-refuses to import a kernel that it can keep nowhere, as in a read-only installation without a home.
+Compiled kernels are stored beside their source files, or in the user's cache, or in a temporary folder. numba
+cannot import a kernel without a writable cache folder, as in a read-only installation without a home.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ from handsim._process import own_numerics, with_own_numerics
 from handsim.errors import HandSimError
 
 SIBLINGS: Final = ("poses", "gloves", "render", "train", "track", "film")
-_HOME: Final = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
-_NEEDS: Final = {
+_ROOT: Final = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
+_IMPORTED_SIBLINGS: Final = {
     "render": ("poses", "gloves"),
     "train": ("poses", "gloves"),
     "track": ("poses", "gloves", "train"),
     "film": ("poses", "gloves", "render"),
 }
-"""Packages that each package imports."""
+"""The sibling packages that each package imports."""
 _REMEDY: Final = "import handsim.{0} before it, rename it, or keep it off the path"
 CACHE_VARIABLE: Final = "NUMBA_CACHE_DIR"
 _PACKAGE: Final = Path(__file__).parent
@@ -51,7 +51,7 @@ def lazy_exports(package: str) -> tuple[Callable[[str], Any], Callable[[], list[
     name`), which type checkers take as public too. Those under `if TYPE_CHECKING` are imported when they are
     first used, and are ordinary attributes afterwards.
     """
-    claim(*_NEEDS.get(package, ()))
+    claim(*_IMPORTED_SIBLINGS.get(package, ()))
     module = sys.modules[package]
     lazy, loaded = _public_names(Path(str(module.__file__)))
     public = sorted({*lazy, *loaded, "__version__"})
@@ -61,7 +61,7 @@ def lazy_exports(package: str) -> tuple[Callable[[str], Any], Callable[[], list[
         if package == "handsim" and name in SIBLINGS:
             return importlib.import_module(f"handsim.{name}")
         if name not in lazy:
-            raise AttributeError(f"module '{package}' has no attribute '{name}'{_elsewhere(name)}")
+            raise AttributeError(f"module '{package}' has no attribute '{name}'{_owner_hint(name)}")
         with own_numerics():
             origin = importlib.import_module(lazy[name])
         value = getattr(origin, name)
@@ -75,14 +75,14 @@ def lazy_exports(package: str) -> tuple[Callable[[str], Any], Callable[[], list[
 
 
 def _public_names(source: Path) -> tuple[dict[str, str], dict[str, str]]:
-    """Public names of a package with their modules: those that are imported at first use, and the others."""
+    """Modules of a package's public names: names that are imported at first use, and the others."""
     body = ast.parse(source.read_text(encoding="utf-8")).body
-    lazy = {name: module for one in body if isinstance(one, ast.If) for name, module in _exports(one.body)}
-    return lazy, dict(_exports(body))
+    typed = [statement for block in body if isinstance(block, ast.If) for statement in block.body]
+    return _exported_names(typed), _exported_names(body)
 
 
-def _elsewhere(name: str) -> str:
-    """Which of the packages has a public name, as the end of a sentence; empty if none does."""
+def _owner_hint(name: str) -> str:
+    """The end of a sentence that names the package with this public name; empty if there is none."""
     for package in () if name.startswith("_") else ("handsim", *SIBLINGS):
         source = Path(_package_folder(package), "__init__.py")
         if source.exists() and name in _public_names(source)[0]:
@@ -90,15 +90,12 @@ def _elsewhere(name: str) -> str:
     return ""
 
 
-def _exports(body: list[ast.stmt]) -> list[tuple[str, str]]:
-    """Each name that is imported as itself, and its module."""
-    return [
-        (alias.name, str(one.module))
-        for one in body
-        if isinstance(one, ast.ImportFrom)
-        for alias in one.names
-        if alias.name == alias.asname
-    ]
+def _exported_names(body: list[ast.stmt]) -> dict[str, str]:
+    """The module of each name that is imported as itself."""
+    imports = [one for one in body if isinstance(one, ast.ImportFrom)]
+    return {
+        alias.name: str(one.module) for one in imports for alias in one.names if alias.name == alias.asname
+    }
 
 
 class ShadowedPackageWarning(UserWarning):
@@ -156,7 +153,7 @@ def claim(*names: str) -> None:
         ShadowedPackageError: Another module of such a name is imported already.
     """
     for name in names:
-        place = _location(name) if name in sys.modules else None
+        place = _found_location(name) if name in sys.modules else None
         if place and os.path.realpath(place) != os.path.realpath(_package_folder(name)):
             raise ShadowedPackageError(
                 f"handsim needs its own package '{name}', but {place} is imported under this name; "
@@ -165,7 +162,7 @@ def claim(*names: str) -> None:
         _FINDER.claimed.add(name)
 
 
-def _package_folder(name: str, home: str = _HOME) -> str:
+def _package_folder(name: str, home: str = _ROOT) -> str:
     """Folder of one of handsim's packages."""
     return os.path.join(home, name)
 
@@ -184,9 +181,9 @@ def _check_own(name: str, file: str) -> None:
         )
 
 
-def shadowed_siblings(home: str = _HOME) -> dict[str, str]:
+def shadowed_siblings(home: str = _ROOT) -> dict[str, str]:
     """Locations of siblings that are found elsewhere than in `home`, the folder that holds `handsim`."""
-    found = {name: _location(name) for name in SIBLINGS}
+    found = {name: _found_location(name) for name in SIBLINGS}
     own = {name: os.path.realpath(_package_folder(name, home)) for name in SIBLINGS}
     return {name: place for name, place in found.items() if place and os.path.realpath(place) != own[name]}
 
@@ -202,7 +199,7 @@ def warn_if_shadowed() -> None:
         )
 
 
-def _location(name: str) -> str | None:
+def _found_location(name: str) -> str | None:
     """Folder of a package or file of a module, as Python finds it without our help; None if there is none."""
     if name in sys.modules:
         module = sys.modules[name]
@@ -221,7 +218,7 @@ def _location(name: str) -> str | None:
 def ensure_kernel_cache() -> None:
     """Name a temporary folder for compiled kernels if numba would find no other; workers inherit it."""
     if not os.environ.get(CACHE_VARIABLE) and not is_writable(_PACKAGE) and not is_writable(user_cache()):
-        os.environ[CACHE_VARIABLE] = str(_own_folder())
+        os.environ[CACHE_VARIABLE] = str(_private_folder())
 
 
 def kernel_cache() -> tuple[Path, bool]:
@@ -252,7 +249,7 @@ def is_writable(folder: Path) -> bool:
         return False
 
 
-def _own_folder() -> Path:
+def _private_folder() -> Path:
     """A temporary folder that nobody else can write to: numba unpickles what it finds there."""
     user = os.getuid() if hasattr(os, "getuid") else 0
     folder = Path(tempfile.gettempdir()) / f"handsim-kernels-{user}"

@@ -1,6 +1,6 @@
-"""Code that comes from elsewhere: optional packages, and functions and classes of users' own.
+"""Loading of foreign code: optional packages, and functions and classes of users.
 
-Users name theirs as `module:name`, or by the name of an entry point.
+Users name their code as `module:name`, or by the name of an entry point.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from urllib.parse import parse_qsl
 
 from handsim.errors import ArgumentError, HandSimError, choices, shortened
 
-_NAME: Final = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_][\w.]*")
-_ADDRESS: Final = re.compile(r" at 0x[0-9a-f]+")
+_QUALIFIED_NAME: Final = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_][\w.]*")
+_MEMORY_ADDRESS: Final = re.compile(r" at 0x[0-9a-f]+")
 EGL_PACKAGES: Final = "libegl1 libegl-mesa0 libgl1-mesa-dri libgl1 libopengl0"
 """Packages of Debian and Ubuntu, which pip cannot install, for OpenGL without a screen."""
 
 
 def is_plugin(name: str) -> bool:
     """Whether a name is written like `module:name`."""
-    return _NAME.fullmatch(name) is not None
+    return _QUALIFIED_NAME.fullmatch(name) is not None
 
 
 @functools.cache
@@ -39,8 +39,8 @@ def list_plugins(group: str) -> tuple[str, ...]:
 
 @functools.lru_cache(maxsize=64)
 def load_plugin(name: str, *, group: str, noun: str) -> Any:
-    """Import the object of a name; a class is called without arguments, once."""
-    found = _find(name, group, noun)
+    """Import the object of a name; a class is instantiated once, without arguments."""
+    found = _import_object(name, group, noun)
     try:
         return found() if inspect.isclass(found) else found
     except Exception as error:
@@ -48,14 +48,14 @@ def load_plugin(name: str, *, group: str, noun: str) -> Any:
 
 
 def make_plugin(address: str, *, group: str, noun: str) -> Any:
-    """Import the object of an address and call it with the options there, which are strings.
+    """Import the class or function of an address, and call it with the options in the address.
 
-    The address is `module:name` or the name of an entry point, of a class or a function; perhaps followed by
-    `?option=value&option=value`.
+    The address is `module:name` or the name of an entry point. Options may follow it, as
+    `?option=value&option=value`; their values are strings.
     """
     name, _, options = address.partition("?")
     given = dict(parse_qsl(options, keep_blank_values=True))
-    return call_plugin(_find(name, group, noun), name, noun, **given)
+    return call_plugin(_import_object(name, group, noun), name, noun, **given)
 
 
 def plugin_name(value: Any) -> str:
@@ -69,10 +69,10 @@ def plugin_name(value: Any) -> str:
         return f"{value.__module__}:{value.__qualname__}"
     shown = repr(value)
     kind = type(value)
-    return f"{kind.__module__}:{kind.__qualname__}" if _ADDRESS.search(shown) else shown
+    return f"{kind.__module__}:{kind.__qualname__}" if _MEMORY_ADDRESS.search(shown) else shown
 
 
-def _find(name: str, group: str, noun: str) -> Any:
+def _import_object(name: str, group: str, noun: str) -> Any:
     """Import the object of a name: `module:name`, or an entry point of the group."""
     target = name
     if not is_plugin(name):
@@ -97,7 +97,7 @@ def _find(name: str, group: str, noun: str) -> Any:
 
 
 def call_plugin(function: Callable[..., Any], name: str, noun: str, /, *args: Any, **options: Any) -> Any:
-    """Call what a user wrote, and tell in one sentence what went wrong."""
+    """Call a function of the user's; an error becomes one sentence."""
     if not callable(function):
         raise ArgumentError(f"{noun} '{name}' is {type(function).__name__}, expected a function or a class")
     try:
@@ -125,7 +125,7 @@ def _error_text(error: Exception) -> str:
 
 
 def import_extra(module: str, what: str, extra: str) -> Any:
-    """A module of an optional package, for something (`what`, in messages) that needs it."""
+    """Import a module of an optional package; `what` names in messages the feature that needs it."""
     try:
         return importlib.import_module(module)
     except (ImportError, RuntimeError) as error:  # pylsl raises the latter without its library

@@ -1,6 +1,6 @@
-"""What a process inherits: variables, control groups, its rank, and numpy's and torch's global settings.
+"""State that a process inherits: variables, control groups, rank, and global settings of numpy and torch.
 
-handsim neither trusts these settings in its own work nor leaves them changed.
+handsim computes with its own settings, and restores those of the caller.
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ from typing import Any, Final, ParamSpec, TypeVar, cast
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
-_GROUPS: Final = Path("/sys/fs/cgroup")
-_MOUNTS: Final = ("", "unified", "cpu", "cpu,cpuacct", "memory")  # of version 2, and of version 1
-_OWN_GROUPS: Final = Path("/proc/self/cgroup")
-_END: Final = object()
-_LAUNCHERS: Final = (
+_CGROUP_ROOT: Final = Path("/sys/fs/cgroup")
+_CGROUP_MOUNTS: Final = ("", "unified", "cpu", "cpu,cpuacct", "memory")  # of version 2, and of version 1
+_OWN_CGROUPS: Final = Path("/proc/self/cgroup")
+_EXHAUSTED: Final = object()
+_RANK_VARIABLES: Final = (
     ("RANK", "WORLD_SIZE"),
     ("SLURM_PROCID", "SLURM_STEP_NUM_TASKS"),
     ("OMPI_COMM_WORLD_RANK", "OMPI_COMM_WORLD_SIZE"),
     ("PMI_RANK", "PMI_SIZE"),
 )
-"""Variables of torchrun, srun and mpirun, which only the processes have that these start."""
+"""Variables for rank and size that torchrun, srun and mpirun set in the processes that they start."""
 
 
 @contextmanager
@@ -46,15 +46,15 @@ def environment(**variables: str) -> Iterator[None]:
 
 
 def rank_and_size() -> tuple[int, int]:
-    """Number of this process among those of a distributed program, and how many these are.
+    """Rank of this process in a distributed program, and the number of processes.
 
-    They are those of torch.distributed where it is initialized, else those that the launcher states. A plain
+    They come from torch.distributed if it is initialized, else from the variables of the launcher. A plain
     `python` in a job of Slurm is one process, however many tasks the job may start.
     """
     torch = sys.modules.get("torch")
     if torch is not None and torch.distributed.is_available() and torch.distributed.is_initialized():
         return torch.distributed.get_rank(), torch.distributed.get_world_size()
-    for names in _LAUNCHERS:
+    for names in _RANK_VARIABLES:
         stated = [os.environ.get(name, "") for name in names]
         if all(map(is_number, stated)) and int(stated[0]) < int(stated[1]):
             return int(stated[0]), int(stated[1])
@@ -62,16 +62,16 @@ def rank_and_size() -> tuple[int, int]:
 
 
 class SharedStream:
-    """A base of endless streams for torch's `DataLoader`, which each process of it pickles or copies."""
+    """A base of endless streams for torch's `DataLoader`, whose processes each get a copy."""
 
     _rank_and_size: tuple[int, int] | None = None
 
     def __getstate__(self) -> dict[str, Any]:
-        """The stream as a worker gets it, which is of its parent's rank."""
+        """The state that a worker gets, with the rank of its parent process."""
         return {**self.__dict__, "_rank_and_size": rank_and_size()}
 
     def share(self) -> tuple[int, int]:
-        """Number of the first batch of this rank and worker, and from each of its batches to the next."""
+        """Number of the first batch of this rank and worker, and the step to its next batch."""
         worker = sys.modules["torch"].utils.data.get_worker_info()
         if worker is None:
             return rank_and_size()
@@ -81,23 +81,23 @@ class SharedStream:
 
 def core_quota() -> float:
     """Cores that the quotas of this process's control groups allow; infinite without a quota."""
-    found = [*_group_files(2, "cpu.max"), *_group_files(2, "cpu.cfs_quota_us", "cpu.cfs_period_us")]
+    found = [*_cgroup_numbers(2, "cpu.max"), *_cgroup_numbers(2, "cpu.cfs_quota_us", "cpu.cfs_period_us")]
     return min((quota / period for quota, period in found if period), default=math.inf)
 
 
 def memory_limit() -> float:
     """Memory that this process's control groups allow [bytes]; infinite without a limit."""
-    found = [*_group_files(1, "memory.max"), *_group_files(1, "memory.limit_in_bytes")]
+    found = [*_cgroup_numbers(1, "memory.max"), *_cgroup_numbers(1, "memory.limit_in_bytes")]
     return min((limit for (limit,) in found), default=math.inf)
 
 
-def _group_files(count: int, *names: str) -> Iterator[list[int]]:
-    """The numbers, so many, in these files of each control group of this process and of those above it.
+def _cgroup_numbers(count: int, *names: str) -> Iterator[list[int]]:
+    """The `count` numbers in these files of each control group of this process and of its parent groups.
 
-    In a container the groups may be stated as on its host; then the groups that the container sees count.
+    A container may state the paths of its host; then the groups that are visible in the container count.
     """
-    own = {"", *(line.split(":", 2)[-1].strip("/") for line in text_of_system(_OWN_GROUPS).splitlines())}
-    for root in (_GROUPS / mount for mount in _MOUNTS):
+    own = {"", *(line.split(":", 2)[-1].strip("/") for line in text_of_system(_OWN_CGROUPS).splitlines())}
+    for root in (_CGROUP_ROOT / mount for mount in _CGROUP_MOUNTS):
         folders = {parent for path in own for parent in (root / path, *(root / path).parents)}
         for folder in [one for one in folders if one.is_relative_to(root)]:
             words = " ".join(text_of_system(folder / name) for name in names).split()
@@ -120,7 +120,7 @@ def is_number(word: str) -> bool:
 
 @contextmanager
 def own_numerics() -> Iterator[None]:
-    """Compute within the block with numpy's and torch's usual settings, whatever the caller's are."""
+    """Use the default settings of numpy and torch within the block, whatever the caller's are."""
     import numpy as np
 
     with np.errstate(divide="warn", over="warn", under="ignore", invalid="warn"), ExitStack() as stack:
@@ -150,7 +150,7 @@ def _use_own_torch(torch: Any, stack: ExitStack) -> None:
 
 @contextmanager
 def torch_kept() -> Iterator[None]:
-    """Leave torch's random state and its denormal numbers after the block as they were before it."""
+    """Restore torch's random state and its handling of denormal numbers after the block."""
     torch, flushes = sys.modules["torch"], sys.float_info.min * 0.5 == 0.0
     try:
         with torch.random.fork_rng(range(torch.cuda.device_count())):
@@ -160,19 +160,19 @@ def torch_kept() -> Iterator[None]:
 
 
 def with_own_numerics(function: Callable[_P, _R]) -> Callable[_P, _R]:
-    """A function that computes in `own_numerics`, like each step of a generator that it returns."""
+    """Wrap a function to compute in `own_numerics`; so does each step of a generator that it returns."""
 
     @functools.wraps(function)
     def call(*args: _P.args, **options: _P.kwargs) -> _R:
         with own_numerics():
             result = function(*args, **options)
-        return cast("_R", _stepped(result)) if inspect.isgenerator(result) else result
+        return cast("_R", _with_own_steps(result)) if inspect.isgenerator(result) else result
 
     return call
 
 
-def _stepped(items: Iterator[Any]) -> Iterator[Any]:
-    """The items of an iterator; only it, and not who uses the items, computes in `own_numerics`."""
+def _with_own_steps(items: Iterator[Any]) -> Iterator[Any]:
+    """Yield the items of an iterator, each of which is computed in `own_numerics`."""
     take_next = own_numerics()(next)
-    while (item := take_next(items, _END)) is not _END:
+    while (item := take_next(items, _EXHAUSTED)) is not _EXHAUSTED:
         yield item

@@ -40,24 +40,15 @@ def describe(package: Path, release: str) -> str:
     if not (checkout / ".git").exists():  # as in site-packages, even within a repository of the user's
         return release
     tag = f"v{release}"
-    command = [
-        "git",
-        "-C",
-        str(checkout),
-        "describe",
-        "--always",
-        "--tags",
-        "--long",
-        "--dirty",
-        "--match",
-        tag,
-    ]
+    options = ("--always", "--tags", "--long", "--dirty", "--match", tag)
+    command = ["git", "-C", str(checkout), "describe", *options]
     own = {name: value for name, value in os.environ.items() if not name.startswith("GIT_")}
     try:
-        told = subprocess.run(command, capture_output=True, text=True, env=own, check=True).stdout.strip()
+        output = subprocess.run(command, capture_output=True, text=True, env=own, check=True).stdout
     except (OSError, subprocess.CalledProcessError):
         return release
+    described = output.strip()
     # If no ancestor has the tag, git prints the hash of the commit alone.
-    local = told.removeprefix(f"{tag}-") if told.startswith(tag) else f"g{told}"
+    local = described.removeprefix(f"{tag}-") if described.startswith(tag) else f"g{described}"
     is_release = local.startswith("0-") and not local.endswith("-dirty")
     return release if is_release else f"{release}+{local.replace('-', '.')}"

@@ -7,7 +7,7 @@ from types import TracebackType
 from typing import Self
 
 Progress = Callable[[int, int], None]
-"""Called with what is done and all there is to do: frames, samples, pictures or steps."""
+"""Called with the amount done and the total amount: frames, samples, pictures or steps."""
 OnStep = Callable[[str], None]
 """Called with the name of each step of the work when it begins."""
 
@@ -21,15 +21,15 @@ def no_step(name: str) -> None:
 
 
 runs_kernels = True
-"""Whether this process may call kernels; one that prints help leaves them as they are, and numba out."""
+"""Whether this process may call kernels; a process that only prints help does not import numba."""
 is_command = False
-"""Whether this process is a command, which tells that it compiles by itself."""
+"""Whether this process is a command, which reports by itself that it compiles."""
 before_compiling: list[Callable[[], None]] = []
-"""Callbacks; the last one is removed and called before a kernel that the cache lacks is compiled."""
+"""Callbacks; before a missing kernel is compiled, the last one is removed and called."""
 
 
 class Closing:
-    """A base of classes with `close`: the end of a `with` block closes them, whatever ended it."""
+    """A base of context managers that call `close` at the end of a `with` block, also after an error."""
 
     def close(self) -> None:
         """Release what the object holds; to be overridden."""

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 # By names, because the packages that make pages lie above this one.
-_WRITERS: Final = {
+_PAGE_WRITERS: Final = {
     "gloves.takes.take.Take": "track.takes.take_page:write_take_page",
     "train.data.shards.Dataset": "train.reports.dataset_page:write_dataset_page",
     "film.registration.Registration": "film.page:write_film_page",
@@ -39,7 +39,7 @@ _WRITERS: Final = {
 }
 NOTHING: Final = "-"
 """The cell of a table where there is no number."""
-_PAGE: Final = Path(__file__).parent / "data" / "page.html"
+_PAGE_TEMPLATE: Final = Path(__file__).parent / "data" / "page.html"
 
 
 class Paint:
@@ -49,7 +49,7 @@ class Paint:
     BLUE, PALE, AMBER, WARM, GREEN, VIOLET = "#3f7396", "#a9c3d4", "#d9a441", "#b8572b", "#5b8c5a", "#7a5ba0"
 
 
-_PICTURES: Final[dict[str, Any]] = {
+_PICTURE_SETTINGS: Final[dict[str, Any]] = {
     "font.size": 9.0,
     "text.color": Paint.INK,
     "axes.labelcolor": Paint.SOFT,
@@ -67,7 +67,7 @@ _PICTURES: Final[dict[str, Any]] = {
     "savefig.facecolor": Paint.CARD,
     "svg.hashsalt": "handsim",  # ids that do not change from one run to the next
 }
-_Drawn = ParamSpec("_Drawn")
+_DrawArguments = ParamSpec("_DrawArguments")
 
 
 def write_page(path: str | Path, thing: Any) -> None:
@@ -85,7 +85,7 @@ def write_page(path: str | Path, thing: Any) -> None:
     check_type("path", path, (str, os.PathLike), "the path of an .html file")
     check_ending(Path(path), ".html", option="path")
     kinds = (f"{kind.__module__}.{kind.__qualname__}" for kind in type(thing).__mro__)
-    target = next((_WRITERS[kind] for kind in kinds if kind in _WRITERS), None)
+    target = next((_PAGE_WRITERS[kind] for kind in kinds if kind in _PAGE_WRITERS), None)
     if target is None:
         raise ArgumentError(
             f"thing is {shown_value(thing)}, expected a Take, a Dataset, a Registration, a LearnedGlove, or "
@@ -100,7 +100,7 @@ def coordinates(point: Iterable[float], separator: str = " ") -> str:
 
 
 def joint_words(name: str) -> str:
-    """A joint angle's name in words, without its digit: PIP flexion."""
+    """The name of a joint angle in words, without its digit, such as "PIP flexion"."""
     return name.split("_", 1)[1].replace("_", " ")
 
 
@@ -121,8 +121,8 @@ class Section:
 def write_sections(path: Path, sections: Sequence[Section], *, title: str, lead: str) -> None:
     """Write a page of sections, with a title and the lead below it; it loads nothing from the network."""
     words = {"title": escape(title), "lead": escape(lead), "version": f"handsim {full_version()}"}
-    body = "\n".join(_html(section) for section in sections)
-    write_text(path, Template(_PAGE.read_text("utf-8")).substitute(words, body=body))
+    body = "\n".join(_section_html(section) for section in sections)
+    write_text(path, Template(_PAGE_TEMPLATE.read_text("utf-8")).substitute(words, body=body))
 
 
 def html_list(sentences: Sequence[str], kind: str = "ol") -> str:
@@ -130,7 +130,8 @@ def html_list(sentences: Sequence[str], kind: str = "ol") -> str:
     return f"<{kind}>{''.join(f'<li>{escape(one)}</li>' for one in sentences)}</{kind}>"
 
 
-def _html(section: Section) -> str:
+def _section_html(section: Section) -> str:
+    """The HTML of a section."""
     parts = [f"<h2>{escape(section.title)}</h2>", f"<p>{section.text}</p>"]
     for file, caption in section.pictures:
         name, text = escape(file), escape(caption)
@@ -165,12 +166,12 @@ def own_figures(settings: dict[str, Any]) -> Iterator[type[Figure]]:
 
 
 def _import_matplotlib() -> None:
-    """Import matplotlib; without the user's backend and settings file if it cannot be imported with them."""
+    """Import matplotlib; if the user's backend or settings file prevents that, import it without them."""
     try:
         importlib.import_module("matplotlib")
     except (ValueError, OSError):
         for name in [name for name in sys.modules if name.startswith("matplotlib.")]:
-            del sys.modules[name]  # half of a package cannot be imported again
+            del sys.modules[name]  # a package that is half imported cannot be imported again
         found = importlib.util.find_spec("matplotlib")
         usual = Path(str(found and found.origin)).with_name("mpl-data")
         # A file in the current folder is read before the one that the variable names.
@@ -181,16 +182,16 @@ def _import_matplotlib() -> None:
 
 def picture(
     size: tuple[float, float],
-    draw: Callable[Concatenate[Figure, _Drawn], None],
-    *args: _Drawn.args,
-    **options: _Drawn.kwargs,
+    draw: Callable[Concatenate[Figure, _DrawArguments], None],
+    *args: _DrawArguments.args,
+    **options: _DrawArguments.kwargs,
 ) -> str:
     """A figure of this size [inch], drawn by a function, as SVG in a `data:` URI.
 
     The same numbers give the same bytes.
     """
     drawn = io.BytesIO()
-    with own_figures(_PICTURES) as new_figure:
+    with own_figures(_PICTURE_SETTINGS) as new_figure:
         figure = new_figure(figsize=size, layout="constrained")
         draw(figure, *args, **options)
         figure.savefig(drawn, format="svg", metadata={"Date": None, "Creator": None})

@@ -49,15 +49,15 @@ class Expected:
 
 @dataclass(frozen=True, slots=True)
 class Spelled:
-    """How the command line spells a field that has no words: `Annotated[A | None, Spelled(bool, True)]`.
+    """The form of a field on the command line, if its own type has none.
 
-    The class of the field takes such values in Python, too.
+    An example is `Annotated[A | None, Spelled(bool, True)]`. In Python the field takes such values, too.
     """
 
     kind: Any = None
-    """The type whose words are given; the field's own when None."""
+    """Type of the option; the field's own type when None."""
     default: Any = None
-    """What an option of that type is when it is not given."""
+    """Default of the option."""
     name: str | None = None
     """The option's name; empty for a group whose fields stand among the others."""
 
@@ -79,10 +79,10 @@ class Settings:
     """The noun for an unknown field in errors."""
 
     def __post_init__(self) -> None:
-        hints = _hints(type(self))  # type: ignore[arg-type]  # a class is hashable
+        hints = _annotations(type(self))  # type: ignore[arg-type]  # a class is hashable
         for field in dataclasses.fields(self):  # type: ignore[arg-type]  # every subclass is a dataclass
             value = getattr(self, field.name)
-            checked = _checked(field.name, value, hints[field.name], field)
+            checked = _checked_value(field.name, value, hints[field.name], field)
             if checked is not value:
                 object.__setattr__(self, field.name, checked)
         self.check()
@@ -114,10 +114,10 @@ class Settings:
     def record(self) -> dict[str, Any]:
         """The settings as JSON, objects by their names."""
         fields = dataclasses.fields(self)  # type: ignore[arg-type]
-        return {field.name: _json_of(getattr(self, field.name)) for field in fields}
+        return {field.name: _as_json(getattr(self, field.name)) for field in fields}
 
     def changed(self, *names: str) -> list[str]:
-        """Those of some fields whose values are not their defaults."""
+        """The names among these of fields whose values differ from their defaults."""
         defaults = {field.name: field.default for field in dataclasses.fields(self)}  # type: ignore[arg-type]
         return [name for name in names if getattr(self, name) != defaults[name]]
 
@@ -141,7 +141,7 @@ class Mixture(Settings):
         check_number(f"the sum of {', '.join(shares)}", sum(shares.values()), 0.0, above=True)
 
 
-def _json_of(value: Any) -> Any:
+def _as_json(value: Any) -> Any:
     """A field's value as JSON; an object by its name."""
     if value is None or isinstance(value, str | bool | int | float):
         return value
@@ -150,20 +150,20 @@ def _json_of(value: Any) -> Any:
     if isinstance(value, Settings):
         return value.record()
     if isinstance(value, Mapping):
-        return {key: _json_of(item) for key, item in value.items()}
+        return {key: _as_json(item) for key, item in value.items()}
     if isinstance(value, tuple | list):
-        return [_json_of(item) for item in value]
+        return [_as_json(item) for item in value]
     name = getattr(value, "name", None)
     return name if isinstance(name, str) else plugin_name(value)
 
 
 @functools.cache
-def _hints(kind: type) -> dict[str, Any]:
+def _annotations(kind: type) -> dict[str, Any]:
     return get_type_hints(kind, include_extras=True)
 
 
-def _checked(name: str, value: Any, hint: Any, field: dataclasses.Field[Any] | None = None) -> Any:
-    """A value converted to its annotation, or an error."""
+def _checked_value(name: str, value: Any, hint: Any, field: dataclasses.Field[Any] | None = None) -> Any:
+    """A value, converted to the type of its annotation; an `ArgumentError` if it does not fit."""
     limits, expected = None, None
     while get_origin(hint) is Annotated:
         hint, *extras = get_args(hint)
@@ -182,7 +182,7 @@ def _checked(name: str, value: Any, hint: Any, field: dataclasses.Field[Any] | N
     if hint in (int, float):
         return _checked_number(name, value, hint, limits)
     if dataclasses.is_dataclass(hint) and isinstance(value, Mapping):
-        return _group_of(name, value, hint, field)
+        return _from_map(name, value, hint, field)
     return _checked_object(name, value, hint, expected)
 
 
@@ -192,9 +192,9 @@ def _checked_object(name: str, value: Any, kind: Any, expected: Expected | None)
         return Path(value)
     if getattr(kind, "_is_protocol", False):
         if not all(hasattr(value, member) for member in _members(kind)):
-            raise ArgumentError(f"{name} is {shown_value(value)}, expected {_words(kind, expected)}")
+            raise ArgumentError(f"{name} is {shown_value(value)}, expected {_type_words(kind, expected)}")
     elif isinstance(kind, type) and get_origin(kind) is None:
-        check_type(name, value, kind, _words(kind, expected), () if expected is None else expected.names())
+        check_type(name, value, kind, _type_words(kind, expected), expected.names() if expected else ())
     return value  # values of a generic type are left to `check`
 
 
@@ -211,26 +211,26 @@ def _checked_union(
         return None
     others = [arm for arm in arms if arm is not types.NoneType]
     if len(others) == 1:
-        return _checked(name, value, Annotated[others[0], limits, expected], field)
+        return _checked_value(name, value, Annotated[others[0], limits, expected], field)
     for arm in others:
-        if _suits(value, arm):
-            return _checked(name, value, Annotated[arm, limits], field)
-    words = " or ".join(_words(arm, None) for arm in others) if expected is None else expected.words
+        if _is_of_type(value, arm):
+            return _checked_value(name, value, Annotated[arm, limits], field)
+    words = " or ".join(_type_words(arm, None) for arm in others) if expected is None else expected.words
     names = ", ".join(() if expected is None else expected.names())
     told = f"{name} is {shown_value(value)}, expected {words}"
     raise ArgumentError(f"{told}; valid names: {names}" if names else told)
 
 
-def _suits(value: Any, hint: Any) -> bool:
-    """Whether a value is of one of a field's types, whatever its numbers are."""
+def _is_of_type(value: Any, hint: Any) -> bool:
+    """Whether a value is of a type, without a check of the range of its numbers."""
     origin = get_origin(hint)
     if origin is Annotated:
-        return _suits(value, get_args(hint)[0])
+        return _is_of_type(value, get_args(hint)[0])
     if origin is Literal:
         return value in get_args(hint)
     if origin in (tuple, Sequence):
         kinds = get_args(hint)[:1] if origin is tuple else (object,)
-        return isinstance(value, tuple | list) and all(_suits(item, *kinds) for item in value)
+        return isinstance(value, tuple | list) and all(_is_of_type(item, *kinds) for item in value)
     if hint in (int, float):
         return isinstance(value, int | float) and not isinstance(value, bool)
     if getattr(hint, "_is_protocol", False):
@@ -245,7 +245,7 @@ def _members(protocol: Any) -> list[str]:
 
 
 def _checked_tuple(name: str, value: Any, arms: tuple[Any, ...], limits: Limits | None) -> tuple[Any, ...]:
-    """A tuple of any length, or of a set one; a single string is a tuple of it."""
+    """A tuple of any or of a fixed length; a single string becomes a tuple of one."""
     any_length = len(arms) == 2 and arms[1] is Ellipsis
     items = (value,) if isinstance(value, str) and any_length else value
     check_type(name, items, (tuple, list), "a tuple" if any_length else f"{len(arms)} values")
@@ -253,7 +253,7 @@ def _checked_tuple(name: str, value: Any, arms: tuple[Any, ...], limits: Limits 
         raise ArgumentError(f"{name} is {shown_value(value)}, expected {len(arms)} values")
     kinds = arms[:1] * len(items) if any_length else arms
     found = tuple(
-        _checked(name, item, Annotated[kind, limits]) for item, kind in zip(items, kinds, strict=True)
+        _checked_value(name, item, Annotated[kind, limits]) for item, kind in zip(items, kinds, strict=True)
     )
     if limits is not None and limits.ascends and list(found) != sorted(found):
         raise ArgumentError(f"{name} is {shown_value(value)}, expected the smaller number first")
@@ -272,8 +272,8 @@ def _checked_number(name: str, value: Any, kind: type, limits: Limits | None) ->
     return value
 
 
-def _group_of(name: str, changes: Mapping[str, Any], kind: Any, field: dataclasses.Field[Any] | None) -> Any:
-    """A group of settings from the fields that differ from its default."""
+def _from_map(name: str, changes: Mapping[str, Any], kind: Any, field: dataclasses.Field[Any] | None) -> Any:
+    """A group of settings from a mapping of the fields that differ from its default."""
     usual = None
     if field is not None and field.default_factory is not dataclasses.MISSING:
         usual = field.default_factory()
@@ -289,7 +289,7 @@ def _changed(kind: Any, usual: Any, changes: Mapping[str, Any], noun: str) -> An
     return kind(**changes) if usual is None else dataclasses.replace(usual, **changes)
 
 
-def _words(kind: Any, expected: Expected | None) -> str:
+def _type_words(kind: Any, expected: Expected | None) -> str:
     """How errors describe a type."""
     if expected is not None:
         return expected.words

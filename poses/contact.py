@@ -37,21 +37,21 @@ _PRECISION: Final = 0.003  # change at which bisection stops, summed over joints
 
 # Fingers close in two stages: all joints, then the two outer ones. Each stage has the depth [m] that a finger
 # may press into a hand, and its joints.
-_STAGES: Final = ((0.0006, slice(0, 4)), (0.0008, slice(2, 4)))
-_ORDER: Final = (1, 2, 3, 4, 0)  # the thumb closes last, over what the fingers hold
+_CLOSING_STAGES: Final = ((0.0006, slice(0, 4)), (0.0008, slice(2, 4)))
+_CLOSING_ORDER: Final = (1, 2, 3, 4, 0)  # the thumb closes last, over what the fingers hold
 
 MAX_OVERLAP: Final = 0.001
 """Largest overlap of two hands [m]."""
 WRIST_SPEED: Final = 1.0
 """Highest speed of the pair of hands, and of a hand relative to the pair between meetings [m/s]."""
-APPROACH: Final = (0.4, 0.8)
+APPROACH_TIMES: Final = (0.4, 0.8)
 """Shortest and longest time of an approach or a release [s]."""
-VOLUME: Final = 0.2
+PAIR_VOLUME: Final = 0.2
 """Half side of the cube in which the middle of the wrists travels [m], around 1.1 m above the floor."""
-PAUSE: Final = (2.0, 4.0)
+PAUSE_TIMES: Final = (2.0, 4.0)
 """Shortest and longest rest of hands apart, between two meetings [s]."""
-_TURNING: Final = 8.0  # fastest rotation of one hand relative to the other [rad/s]
-_DISTANCE: Final = (0.25, 0.45)  # distance of the wrists while hands rest apart [m]
+_MAX_TURN_SPEED: Final = 8.0  # fastest rotation of one hand relative to the other [rad/s]
+_REST_DISTANCES: Final = (0.25, 0.45)  # distance of the wrists while hands rest apart [m]
 
 
 class Digit(NamedTuple):
@@ -308,8 +308,8 @@ def close_fingers(
     segments = np.concatenate([others, own], axis=1)
     radii = np.concatenate([other.capsules.radii, model.capsules.radii])
     all_of_other = np.ones((3, len(other.capsules.radii)), dtype=bool)
-    for press, joints in _STAGES:
-        for digit in _ORDER:
+    for press, joints in _CLOSING_STAGES:
+        for digit in _CLOSING_ORDER:
             parts = digit_parts(model, digit)
             columns = slice(4 * digit, 4 * digit + 4)
             goal = angles[:, columns].copy()
@@ -341,7 +341,7 @@ def smooth_below(values: Float[np.ndarray, "T"], window: int) -> Float[np.ndarra
     return -smooth_above(-values, window)
 
 
-@lru_cache(maxsize=4 * len(_ORDER))
+@lru_cache(maxsize=4 * len(_CLOSING_ORDER))
 def digit_parts(model: HandModel, digit: int) -> Digit:
     """A digit of a hand (0: thumb) as the compiled searches need it."""
     capsules, skeleton = model.capsules, model.skeleton
@@ -405,10 +405,10 @@ def path_between(
     roll = rng.uniform(0.0, np.pi)  # from hands side by side to palms that face each other
     rotation = Rotation.from_rotvec(rng.normal(scale=0.4, size=3)) * Rotation.from_rotvec([-roll, 0.0, 0.0])
     direction = np.array([rng.uniform(-0.3, 0.3), np.cos(roll / 2), -np.sin(roll / 2)])
-    position = rng.uniform(*_DISTANCE) * direction[None] / np.linalg.norm(direction)
+    position = rng.uniform(*_REST_DISTANCES) * direction[None] / np.linalg.norm(direction)
     angles = [sample_valid_angles(model, 1, rng=rng) for model in (right, left)]
     apart = Passage(rotation.as_matrix()[None], position, *angles)
-    rest = apart.at(np.zeros(int(rng.uniform(*PAUSE) * RATE), dtype=int))
+    rest = apart.at(np.zeros(int(rng.uniform(*PAUSE_TIMES) * RATE), dtype=int))
     path = join_passages([_straight(start, apart, rng), rest, _straight(apart, end, rng)])
     return path if valid_frames(right, left, path).all() else None
 
@@ -440,9 +440,9 @@ def _straight(start: Passage, end: Passage, rng: np.random.Generator) -> Passage
     rotations = Rotation.from_matrix(np.concatenate([start.rotation, end.rotation]))
     bend = max(np.abs(end.right - start.right).max(), np.abs(end.left - start.left).max())
     seconds = max(
-        rng.uniform(*APPROACH),
+        rng.uniform(*APPROACH_TIMES),
         MotionConfig().least_time(bend),
-        PEAK_SPEED * (rotations[0].inv() * rotations[1]).magnitude() / _TURNING,
+        PEAK_SPEED * (rotations[0].inv() * rotations[1]).magnitude() / _MAX_TURN_SPEED,
         PEAK_SPEED * 0.5 * float(np.linalg.norm(end.position - start.position)) / WRIST_SPEED,
     )
     share = minimum_jerk(int(np.ceil(seconds * RATE)) + 1)

@@ -54,21 +54,21 @@ _CONTACT_TIME: Final = (0.005, 1.0)  # MuJoCo's solref of contacts: time constan
 _GUIDE_TIME: Final = (0.03, 1.0)  # solref of the soft constraint that holds the object while fingers close
 _MAX_DISTANCE: Final = 0.5  # distances of capsules from the object are measured up to this one [m]
 
-_GAP: Final = 0.0005  # [m] between palm and object before the fingers close
-_SLIDE: Final = 0.15  # an object is raised to the palm from this far below it [m]
-_ANY: Final = "any"  # library entry of objects that have none of their own
-_STIFFNESS: Final = 0.006  # [m/rad] weight of joint deviations against residuals of the tips
+_PALM_GAP: Final = 0.0005  # gap between palm and object before the fingers close [m]
+_MAX_RAISE: Final = 0.15  # an object is raised to the palm from this far below it [m]
+_ANY_OBJECT: Final = "any"  # library entry of objects that have none of their own
+_ANGLE_WEIGHT: Final = 0.006  # [m/rad] weight of joint deviations against residuals of the tips
 _MAX_STEP: Final = 0.2  # largest change of an angle in a round [rad]
 
 _MAX_TRIES: Final = 40
 _TRY_SPREADS: Final = np.deg2rad([1.0, 2.0, 3.0, 4.0, 5.0])  # deviation of angles in tries 1, 2, 3, 4, later
-_RAMP: Final = 10  # steps of the motors' targets from open to closed
-_CLOSE, _SETTLE, _SHAKE, _REST = 400, 200, 60, 60  # steps of 2 ms
+_RAMP_STEPS: Final = 10  # steps of the motors' targets from open to closed
+_CLOSE_STEPS, _SETTLE_STEPS, _SHAKE_STEPS, _REST_STEPS = 400, 200, 60, 60  # steps of 2 ms
 _GRAVITY: Final = 9.81
 _TETRAHEDRON: Final = np.array([(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)]) / np.sqrt(3.0)
 _MAX_DRIFT: Final = 0.004  # largest displacement of the shaken object [m]
 _MAX_ROTATION: Final = np.deg2rad(8.0)  # largest rotation of the shaken object
-_TOUCHING: Final = 0.0005  # [m] largest distance of a contact
+_MAX_CONTACT_GAP: Final = 0.0005  # [m] largest distance of a contact
 _MAX_SETTLED_DEPTH: Final = MAX_OBJECT_PENETRATION - 1e-5  # [m]
 _MAX_FINAL_SPEED: Final = 0.5  # [rad/s] of the hinges
 
@@ -77,10 +77,10 @@ _LIFT_CHANCE: Final = 0.55  # chance that a free digit lifts off the object
 _TAP_CHANCE: Final = 0.3  # chance that a digit that may tap does
 _STILL_CHANCE: Final = 0.3  # chance that the object does not move in the hand
 # Largest opening of a lifted or tapping thumb (first row) and finger: abduction (both ways), MCP, PIP, DIP.
-_LIFT: Final = np.deg2rad([[14.0, 30.0, 20.0, 25.0], [5.0, 45.0, 45.0, 30.0]])
-_TAP: Final = np.deg2rad([[4.0, 10.0, 6.0, 8.0], [1.0, 14.0, 10.0, 6.0]])
-_TREMBLE: Final = np.deg2rad([0.5, 1.2, 1.8, 1.8])  # standard deviations of joints of digits that hold
-_WOBBLE: Final = (0.0006, np.deg2rad(1.2))  # standard deviations of the object in the hand: [m], [rad]
+_MAX_LIFT: Final = np.deg2rad([[14.0, 30.0, 20.0, 25.0], [5.0, 45.0, 45.0, 30.0]])
+_MAX_TAP: Final = np.deg2rad([[4.0, 10.0, 6.0, 8.0], [1.0, 14.0, 10.0, 6.0]])
+_JOINT_TREMBLE: Final = np.deg2rad([0.5, 1.2, 1.8, 1.8])  # standard deviations of joints of digits that hold
+_OBJECT_WOBBLE: Final = (0.0006, np.deg2rad(1.2))  # standard deviations of the object in the hand: [m], [rad]
 
 
 class GraspScene:
@@ -285,7 +285,7 @@ def hold_style(model: HandModel, obj: RigidObject, name: str) -> HoldStyle:
 
 def _holds(obj: RigidObject) -> dict[str, Any]:
     library = package_data("poses", "holds")["objects"]
-    holds: dict[str, Any] = library.get(obj.name, library[_ANY])
+    holds: dict[str, Any] = library.get(obj.name, library[_ANY_OBJECT])
     return holds
 
 
@@ -329,7 +329,7 @@ def place_object(scene: GraspScene, style: HoldStyle, *, rng: np.random.Generato
     position = mirror @ (at - rotation @ point)
     rotation = mirror @ rotation @ MIRROR if model.shape.side == "left" else rotation
     pose = rigid(rotation, position) @ np.linalg.inv(frame)
-    return pose if "between" in placement else _slid_to_palm(scene, style, pose)
+    return pose if "between" in placement else _raised_to_palm(scene, style, pose)
 
 
 def _box_frame(obj: RigidObject) -> NDArray[np.float64]:
@@ -352,17 +352,17 @@ def _landmark(
     return np.asarray(bones[number, :3, :3] @ local + bones[number, :3, 3])
 
 
-def _slid_to_palm(scene: GraspScene, style: HoldStyle, pose: NDArray[np.float64]) -> NDArray[np.float64]:
+def _raised_to_palm(scene: GraspScene, style: HoldStyle, pose: NDArray[np.float64]) -> NDArray[np.float64]:
     """`T_wrist_object` (4, 4) of the object raised from below until it almost touches the palm."""
     palm = [geom for geom in scene.hand_geoms if scene.mj_model.geom(geom).name.startswith("palm")]
     data = scene.new_data(style.open, pose)
     lowest = data.qpos[NUM_JOINTS + 2]
-    low, high = -_SLIDE, 0.0  # heights at which the object is free, and too high
+    low, high = -_MAX_RAISE, 0.0  # heights at which the object is free, and too high
     for _ in range(12):
         middle = (low + high) / 2
         data.qpos[NUM_JOINTS + 2] = lowest + middle
         mujoco.mj_kinematics(scene.mj_model, data)
-        is_free = scene.distances(data, palm).min() > _GAP
+        is_free = scene.distances(data, palm).min() > _PALM_GAP
         low, high = (middle, high) if is_free else (low, middle)
     pose[2, 3] += low
     return pose
@@ -377,12 +377,12 @@ def retarget_angles(model: HandModel, angles: Float[np.ndarray, "P 20"]) -> Floa
     mean = HandModel(shape_from_measures(shape.length, shape.breadth, side=shape.side))
     targets = _marks(mean, angles)[0]
     solutions = angles.copy()
-    stiff = _STIFFNESS * np.eye(NUM_JOINTS)
+    stiff = _ANGLE_WEIGHT * np.eye(NUM_JOINTS)
     for _ in range(12):
         placed, jacobians = _marks(model, solutions)
         for number, jacobian in enumerate(jacobians):
             away = (targets - placed)[number].ravel()
-            residuals = np.concatenate([away, _STIFFNESS * (angles - solutions)[number]])
+            residuals = np.concatenate([away, _ANGLE_WEIGHT * (angles - solutions)[number]])
             system = np.concatenate([jacobian.reshape(-1, NUM_JOINTS), stiff])
             step = np.linalg.lstsq(system, residuals, rcond=None)[0]
             solutions[number] += np.clip(step, -_MAX_STEP, _MAX_STEP)
@@ -446,10 +446,10 @@ def try_hold(scene: GraspScene, style: HoldStyle, *, rng: np.random.Generator) -
     """One try: a hold, or the reason why there is none."""
     start = place_object(scene, style, rng=rng)
     data = scene.new_data(style.open, start)
-    _close(scene, data, style, start)
-    _shake(scene, data)  # a first shake lets the object settle
+    _close_hand(scene, data, style, start)
+    _shake_object(scene, data)  # a first shake lets the object settle
     before = scene.object_pose(data)
-    _shake(scene, data)
+    _shake_object(scene, data)
     pose = scene.object_pose(data)
     drift = np.linalg.norm(pose[:3, 3] - before[:3, 3])
     rotation = np.arccos(np.clip((np.trace(pose[:3, :3].T @ before[:3, :3]) - 1) / 2, -1.0, 1.0))
@@ -462,7 +462,7 @@ def try_hold(scene: GraspScene, style: HoldStyle, *, rng: np.random.Generator) -
         return "the fingers penetrate each other"
     if scene.depth(angles[None], pose[None])[0] > _MAX_SETTLED_DEPTH:
         return "the fingers penetrate it"
-    contacts = scene.touching(angles, pose, _TOUCHING)
+    contacts = scene.touching(angles, pose, _MAX_CONTACT_GAP)
     return why_not_held(style, contacts) or Hold(style.name, angles, pose, contacts)
 
 
@@ -475,7 +475,7 @@ def why_not_held(style: HoldStyle, touching: Sequence[str]) -> str:
     return "" if fingers >= style.fingers else "too few fingers touch it"
 
 
-def _close(scene: GraspScene, data: mujoco.MjData, style: HoldStyle, start: NDArray[np.float64]) -> None:
+def _close_hand(scene: GraspScene, data: mujoco.MjData, style: HoldStyle, start: NDArray[np.float64]) -> None:
     """Close the fingers around the object, which a soft spring guides at first."""
     model = scene.mj_model
     guide = transform_poses(start[None])[0]
@@ -483,11 +483,11 @@ def _close(scene: GraspScene, data: mujoco.MjData, style: HoldStyle, start: NDAr
     data.eq_active[:] = 1
     body = model.body("object").id
     data.xfrc_applied[body, 2] = style.palm_up * scene.obj.mass * _GRAVITY
-    for share in np.arange(1, _RAMP + 1) / _RAMP:
+    for share in np.arange(1, _RAMP_STEPS + 1) / _RAMP_STEPS:
         _set_targets(scene, data, style, style.open + share * (style.closed - style.open))
-        mujoco.mj_step(model, data, nstep=_CLOSE // _RAMP)
+        mujoco.mj_step(model, data, nstep=_CLOSE_STEPS // _RAMP_STEPS)
     data.eq_active[:] = 0
-    for _ in range(_SETTLE // 25):
+    for _ in range(_SETTLE_STEPS // 25):
         _set_targets(scene, data, style, style.closed)
         mujoco.mj_step(model, data, nstep=25)
     data.xfrc_applied[body] = 0.0
@@ -505,14 +505,14 @@ def _set_targets(
     data.ctrl[:] = here + np.clip(target - here, -limit, limit)
 
 
-def _shake(scene: GraspScene, data: mujoco.MjData) -> None:
+def _shake_object(scene: GraspScene, data: mujoco.MjData) -> None:
     """Pull the object with its own weight in the four directions of a tetrahedron, then let it rest."""
     body = scene.mj_model.body("object").id
     for corner in _TETRAHEDRON:
         data.xfrc_applied[body, :3] = scene.obj.mass * _GRAVITY * corner
-        mujoco.mj_step(scene.mj_model, data, nstep=_SHAKE)
+        mujoco.mj_step(scene.mj_model, data, nstep=_SHAKE_STEPS)
     data.xfrc_applied[body] = 0.0
-    mujoco.mj_step(scene.mj_model, data, nstep=_REST)
+    mujoco.mj_step(scene.mj_model, data, nstep=_REST_STEPS)
 
 
 class Held(NamedTuple):
@@ -534,7 +534,7 @@ def sample_held_poses(
         raise PoseError(f"the hold '{hold.name}' is not valid for this hand and the {obj.name}")
     angles = np.clip(hold.angles + _deviations(style, count, rng), LOW, HIGH)
     poses = np.tile(hold.T_wrist_object, (count, 1, 1))
-    shift, rotation = (scale * rng.standard_normal((count, 3)).clip(-2.0, 2.0) for scale in _WOBBLE)
+    shift, rotation = (scale * rng.standard_normal((count, 3)).clip(-2.0, 2.0) for scale in _OBJECT_WOBBLE)
     still = rng.random(count) < _STILL_CHANCE
     shift[still], rotation[still] = 0.0, 0.0
     poses[:, :3, 3] += shift
@@ -546,12 +546,12 @@ def sample_held_poses(
     todo = np.flatnonzero(share == 0.0)
     for _ in range(4 if len(todo) else 0):
         step /= 2
-        nearer = between(start, Held(*(part[todo] for part in target)), share[todo] + step)
+        nearer = interpolate_held(start, Held(*(part[todo] for part in target)), share[todo] + step)
         share[todo] += np.where(is_held_valid(scene, nearer), step, 0.0)
-    return between(start, target, share)
+    return interpolate_held(start, target, share)
 
 
-def between(start: Held, end: Held, share: NDArray[np.float64]) -> Held:
+def interpolate_held(start: Held, end: Held, share: NDArray[np.float64]) -> Held:
     """Poses at shares (B,) of the paths from one start to one end or B ends."""
     angles = start.angles + share[:, None] * (end.angles - start.angles)
     positions = start.poses[:, :3, 3] + share[:, None] * (end.poses - start.poses)[:, :3, 3]
@@ -561,8 +561,8 @@ def between(start: Held, end: Held, share: NDArray[np.float64]) -> Held:
 
 def rotation_between(start: Held, end: Held) -> NDArray[np.float64]:
     """Rotation vectors (B, 3) [rad] from the start to the end, in the object's frame."""
-    between = np.swapaxes(start.poses[:, :3, :3], 1, 2) @ end.poses[:, :3, :3]
-    return np.asarray(Rotation.from_matrix(between).as_rotvec())
+    relative = np.swapaxes(start.poses[:, :3, :3], 1, 2) @ end.poses[:, :3, :3]
+    return np.asarray(Rotation.from_matrix(relative).as_rotvec())
 
 
 def is_held_valid(scene: GraspScene, held: Held) -> Bool[np.ndarray, "B"]:
@@ -574,13 +574,14 @@ def is_held_valid(scene: GraspScene, held: Held) -> Bool[np.ndarray, "B"]:
 
 def _deviations(style: HoldStyle, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
     """Deviation (count, 20) [rad] of every joint from the hold: positive is flexion and abduction."""
-    deviations = _TREMBLE * rng.standard_normal((count, len(DIGITS), 4)).clip(-2.0, 2.0)
+    deviations = _JOINT_TREMBLE * rng.standard_normal((count, len(DIGITS), 4)).clip(-2.0, 2.0)
     for index, digit in enumerate(DIGITS):
         kind = min(index, 1)
-        for digits, most, often in ((style.press, _TAP, _TAP_CHANCE), (style.free, _LIFT, _LIFT_CHANCE)):
+        kinds = (style.press, _MAX_TAP, _TAP_CHANCE), (style.free, _MAX_LIFT, _LIFT_CHANCE)
+        for digits, most, chance in kinds:
             if digit not in digits:
                 continue
-            lifts = rng.random(count) < often
+            lifts = rng.random(count) < chance
             opening = -most[kind] * rng.uniform(0.0, 1.0, (count, 4)) ** np.array([1.0, 0.7, 0.7, 1.0])
             opening[:, 0] = most[kind, 0] * rng.uniform(-1.0, 1.0, count)
             deviations[lifts, index] = opening[lifts]

@@ -44,21 +44,21 @@ PEAK_SPEED: Final = 1.875
 PEAK_ACCELERATION: Final = 5.7735
 """Peak acceleration of the minimum-jerk profile, in distances per duration squared."""
 # Joints that move first on a path to rest: all, those of one digit, those of all other digits.
-_AHEAD: Final = [np.ones(NUM_JOINTS, dtype=bool)] + [
+_MOVES_FIRST: Final = [np.ones(NUM_JOINTS, dtype=bool)] + [
     np.repeat((np.arange(len(DIGITS)) == digit) == first, 4)
     for first in (True, False)
     for digit in range(len(DIGITS))
 ]
-_WRIST_TIME: Final = (0.6, 2.0)
-_FANS: Final = (0.0, 0.3, 0.6, 1.0, 1.6)  # finger spread at the first stop, relative to "spread"
+_WRIST_TIMES: Final = (0.6, 2.0)
+_FAN_SHARES: Final = (0.0, 0.3, 0.6, 1.0, 1.6)  # finger spread at the first stop, relative to "spread"
 
 _FREE_ROTATION: Final = 0.6  # standard deviation about each axis between two positions [rad]
-_FORWARD: Final = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+_FORWARD_WRIST: Final = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 """Orientation of a wrist with fingers along +y and the back of the hand up."""
 
 FREE: Final = "free"
 """The name of a motion without a script: what `sample_motion` makes."""
-_POSES_AT_ONCE: Final = 16
+_POSES_PER_DRAW: Final = 16
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +77,7 @@ class MotionConfig(Settings):
     """Longest rest at a pose [s]."""
     volume: Annotated[float, Limits(0.0)] = 0.3
     """Half side of the cube the wrist moves in [m], around 1.1 m above the floor."""
-    wrist_time: Annotated[tuple[float, float], Limits(0.0, ascends=True)] = _WRIST_TIME
+    wrist_time: Annotated[tuple[float, float], Limits(0.0, ascends=True)] = _WRIST_TIMES
     """Shortest and longest time between two positions of the wrist [s]."""
 
     def least_time(self, bend: float, share: float = 1.0) -> float:
@@ -129,9 +129,9 @@ def _via_paths(
     fan[:4] = 0.0
     hubs = [np.concatenate([thumb[:4], resting[4:]]) for thumb in (resting, spread, gesture("claw"))]
     for hub in hubs:
-        for share in _FANS:
+        for share in _FAN_SHARES:
             parted, opened = (np.clip(pose + share * fan, LOW, HIGH) for pose in (start, hub))
-            for ahead in _AHEAD:
+            for ahead in _MOVES_FIRST:
                 stops = [parted, np.where(ahead, opened, parted), opened, resting]
                 legs = pairwise([start, *stops])
                 yield [stop for before, stop in legs if not np.array_equal(before, stop)] or [resting]
@@ -168,7 +168,7 @@ def free_wrist_path(
         steps = int(rng.uniform(*config.wrist_time) * config.rate) + 1
         shares.append(len(positions) - 2 + minimum_jerk(steps))
     rotated = Rotation.from_quat(np.array(orientations), scalar_first=True)
-    path, turned = along(np.array(positions), rotated, np.concatenate(shares)[:frames])
+    path, turned = interpolate_path(np.array(positions), rotated, np.concatenate(shares)[:frames])
     return path, turned.as_quat(scalar_first=True)
 
 
@@ -188,17 +188,17 @@ def wrist_path(
     """
     shares = [np.zeros(1)]
     while sum(map(len, shares)) < max(frames, 2):  # Slerp needs two keys
-        steps = int(rng.uniform(*_WRIST_TIME) * rate) + 1
+        steps = int(rng.uniform(*_WRIST_TIMES) * rate) + 1
         shares.append(len(shares) - 1 + minimum_jerk(steps))
     count = len(shares)
     positions = np.asarray(center) + rng.uniform(-volume, volume, size=(count, 3))
     away = Rotation.from_rotvec(rng.normal(scale=turning, size=(count, 3)))
-    orientations = away * Rotation.from_matrix(_FORWARD)
-    path, turned = along(positions, orientations, np.concatenate(shares)[:frames])
+    orientations = away * Rotation.from_matrix(_FORWARD_WRIST)
+    path, turned = interpolate_path(positions, orientations, np.concatenate(shares)[:frames])
     return path, turned.as_quat(scalar_first=True)
 
 
-def along(
+def interpolate_path(
     positions: Float[np.ndarray, "K 3"], orientations: Rotation, progress: Float[np.ndarray, "T"]
 ) -> tuple[Float[np.ndarray, "T 3"], Rotation]:
     """Interpolated positions [m] and orientations; `progress` goes from 0 to K - 1."""
@@ -309,9 +309,9 @@ def scripted_motion(
     at = int(rng.integers(len(poses)))
     parts, count = [poses[at : at + 1]], 1
     while count < frames:
-        steps = np.ones(_POSES_AT_ONCE, dtype=np.int64)
+        steps = np.ones(_POSES_PER_DRAW, dtype=np.int64)
         if entry["order"] != "in turn":
-            steps = rng.integers(1, len(poses), size=_POSES_AT_ONCE)
+            steps = rng.integers(1, len(poses), size=_POSES_PER_DRAW)
         indices = (at + np.concatenate([[0], np.cumsum(steps)])) % len(poses)
         parts.append(angles_through(model, poses[indices], config, rng=rng))
         count, at = count + len(parts[-1]), int(indices[-1])

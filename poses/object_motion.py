@@ -20,10 +20,10 @@ from poses.grasps import (
     Held,
     Hold,
     HoldStyle,
-    between,
     grasp_scene,
     hold_names,
     hold_style,
+    interpolate_held,
     is_held_valid,
     object_penetration,
     rotation_between,
@@ -36,34 +36,34 @@ from poses.shapes import MAX_PENETRATION
 
 _VARIANTS: Final = 12  # held poses of one draw
 _MAX_DRAWS: Final = 20
-_HOLDS: Final = 3  # grasps of one style in a motion
+_NUM_HOLDS: Final = 3  # grasps of one style in a motion
 _SHIFT_CHANCE: Final = 0.15  # chance to change to another grasp
 _MAX_GAP: Final = 0.003  # [m] between a shifting object and the digits that hold it
-_SLIDING, _ROLLING = 0.15, 4.0  # fastest shift of the object in the hand [m/s], [rad/s]
-_MARGIN: Final = 0.9  # share of the limits of speed and acceleration that paths use
+_MAX_SLIDE_SPEED, _MAX_ROLL_SPEED = 0.15, 4.0  # fastest shift of the object in the hand [m/s], [rad/s]
+_LIMIT_SHARE: Final = 0.9  # share of the limits of speed and acceleration that paths use
 
 _RETREAT_STEP: Final = 0.003  # [m] added to the overlap in each retreat
-_SMOOTHING: Final = 0.25  # [s] window of a retreat
+_RETREAT_WINDOW: Final = 0.25  # [s] window of a retreat
 
-DISTANCE: Final = (0.006, 0.02)
+TIP_DISTANCE: Final = (0.006, 0.02)
 """Smallest and largest distance of the tip from its target [m]."""
-SPEED: Final = 0.6
+TIP_SPEED: Final = 0.6
 """Highest speed of the tip between still targets, without the retreat [m/s]."""
-TURNING: Final = 3.0
+PEN_TURN_SPEED: Final = 3.0
 """Highest rotation speed of the pen between still targets [rad/s]."""
-RETREAT: Final = 0.05
+RETREAT_DISTANCE: Final = 0.05
 """Distance that the tip draws back between two targets [m]."""
-_STAY: Final = (0.15, 0.6)  # shortest and longest time at a target [s]
-PATH: Final = (0.4, 0.9)
+_STAY_TIMES: Final = (0.15, 0.6)  # shortest and longest time at a target [s]
+PATH_TIMES: Final = (0.4, 0.9)
 """Shortest and longest time from target to target [s]."""
-_TILT: Final = 0.6  # standard deviation of the pen's lean from the outward direction, as a tangent
-_UPRIGHT: Final = np.array([0.36, -0.26, 0.9]) / np.linalg.norm([0.36, -0.26, 0.9])
+_LEAN_SPREAD: Final = 0.6  # standard deviation of the pen's lean from the outward direction, as a tangent
+_UPRIGHT_PEN: Final = np.array([0.36, -0.26, 0.9]) / np.linalg.norm([0.36, -0.26, 0.9])
 """Direction of a pen in the right hand of a person at -y, over a palm that faces down."""
-_ARM: Final = np.array([0.8, -0.6, 0.0])  # direction from the pen to the writing arm
-_CONE: Final = 1.2  # largest angle of the pen from upright [rad]
+_ARM_DIRECTION: Final = np.array([0.8, -0.6, 0.0])  # direction from the pen to the writing arm
+_MAX_PEN_ANGLE: Final = 1.2  # largest angle of the pen from upright [rad]
 _MAX_LEAN: Final = 1.0  # largest lean of the pen from the outward direction, as a tangent
 _MIN_FACING: Final = -0.2  # smallest cosine of a target's outward direction and the upright pen
-_STEADY: Final = 0.15  # [s] standard deviation of the smoothing of outward directions
+_DIRECTION_SMOOTHING: Final = 0.15  # [s] standard deviation of the smoothing of outward directions
 
 
 def sample_object_motion(
@@ -74,8 +74,8 @@ def sample_object_motion(
     frames = round(duration * config.rate) + 1
     names = hold_names(obj)
     name = names[rng.integers(len(names))]
-    holds = [settle_hold(model, obj, hold=name, rng=rng) for _ in range(_HOLDS)]
-    player = _Player(grasp_scene(model, obj), hold_style(model, obj, name), holds, config, rng)
+    holds = [settle_hold(model, obj, hold=name, rng=rng) for _ in range(_NUM_HOLDS)]
+    player = _HoldPlayer(grasp_scene(model, obj), hold_style(model, obj, name), holds, config, rng)
     parts = [Held(holds[0].angles[None], holds[0].T_wrist_object[None])]
     count, current = 1, 0
     while count < frames:
@@ -90,7 +90,7 @@ def sample_object_motion(
 
 
 @dataclass(frozen=True, slots=True)
-class _Player:
+class _HoldPlayer:
     """Moves a hand from one variant of its holds to the next."""
 
     scene: GraspScene
@@ -122,12 +122,12 @@ class _Player:
     def _path(self, start: Held, target: Held) -> Held:
         config = self.config
         quickest = max(
-            config.least_time(np.abs(target.angles - start.angles).max(), _MARGIN),
-            PEAK_SPEED * float(np.linalg.norm((target.poses - start.poses)[0, :3, 3])) / _SLIDING,
-            PEAK_SPEED * float(np.linalg.norm(rotation_between(start, target)[0])) / _ROLLING,
+            config.least_time(np.abs(target.angles - start.angles).max(), _LIMIT_SHARE),
+            PEAK_SPEED * float(np.linalg.norm((target.poses - start.poses)[0, :3, 3])) / _MAX_SLIDE_SPEED,
+            PEAK_SPEED * float(np.linalg.norm(rotation_between(start, target)[0])) / _MAX_ROLL_SPEED,
         )
         frames = int(np.ceil(max(quickest, self.rng.uniform(*config.durations)) * config.rate)) + 1
-        return between(start, target, minimum_jerk(frames))
+        return interpolate_held(start, target, minimum_jerk(frames))
 
     def _rested(self, path: Held) -> Held:
         pause = int(self.rng.uniform(0.0, self.config.hold) * self.config.rate)
@@ -200,7 +200,7 @@ def keep_apart(
         if deep.max() <= MAX_PENETRATION:
             return HandMotion(qpos, motion.rate), BodyMotion(poses, motion.rate)
         needed = np.where(deep > 0.5 * MAX_PENETRATION, back + deep + _RETREAT_STEP, back)
-        window = 2 * int(_SMOOTHING * motion.rate / 2) + 1
+        window = 2 * int(_RETREAT_WINDOW * motion.rate / 2) + 1
         back = uniform_filter1d(maximum_filter1d(needed, window), window)
     raise PoseError("the hands touch, however far one of them draws back")
 
@@ -214,24 +214,24 @@ def pointing_path(
 ) -> Float[np.ndarray, "T 4 4"]:
     """Poses of a pen (tip at the origin, body along +z) that visits moving targets at random.
 
-    Targets [m] are reached from their outward unit directions, by a tip no faster than `SPEED`.
+    Targets [m] are reached from their outward unit directions, by a tip no faster than `TIP_SPEED`.
     """
-    outward = gaussian_filter1d(outward, _STEADY * rate, axis=0, mode="nearest")
+    outward = gaussian_filter1d(outward, _DIRECTION_SMOOTHING * rate, axis=0, mode="nearest")
     outward = outward / np.maximum(np.linalg.norm(outward, axis=-1, keepdims=True), 1e-9)
-    targets, distances, leans, shares = zip(*_plan(positions, outward, rate, rng), strict=True)
+    targets, distances, leans, shares = zip(*_plan_visits(positions, outward, rate, rng), strict=True)
     now = np.arange(len(positions))
     blend = np.concatenate(shares)[now, None]
     number = np.repeat(np.arange(len(shares)), [len(share) for share in shares])[now]
 
     def at(which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         target = np.array(targets)[which]
-        axis = _axes(outward[now, target], np.stack(leans)[which])
+        axis = _pen_axes(outward[now, target], np.stack(leans)[which])
         return positions[now, target] + np.array(distances)[which, None] * axis, axis
 
     (here, axis_here), (there, axis_there) = at(number), at(number + 1)
-    axis = _between(axis_here, axis_there, blend)
-    lift = RETREAT * np.sin(np.pi * blend) ** 2
-    return _frames((1.0 - blend) * here + blend * there + lift * axis, axis)
+    axis = _slerp(axis_here, axis_there, blend)
+    lift = RETREAT_DISTANCE * np.sin(np.pi * blend) ** 2
+    return _to_poses((1.0 - blend) * here + blend * there + lift * axis, axis)
 
 
 class _Visit(NamedTuple):
@@ -244,7 +244,7 @@ class _Visit(NamedTuple):
     """Share of the path after each frame."""
 
 
-def _plan(
+def _plan_visits(
     positions: Float[np.ndarray, "T M 3"],
     outward: Float[np.ndarray, "T M 3"],
     rate: float,
@@ -253,59 +253,63 @@ def _plan(
     """Visits for all frames, and one more at the end of the last path."""
     visits: list[_Visit] = []
     frame = 0
-    target, lean = _draw(outward[0], rng)
+    target, lean = _draw_target(outward[0], rng)
     while frame < len(positions):
-        here, axis = positions[frame], _axes(outward[frame, target], lean)
-        following, next_lean = _draw(outward[frame], rng)
-        next_axis = _axes(outward[frame, following], next_lean)
+        here, axis = positions[frame], _pen_axes(outward[frame, target], lean)
+        following, next_lean = _draw_target(outward[frame], rng)
+        next_axis = _pen_axes(outward[frame, following], next_lean)
         turn = float(np.arccos(np.clip(axis @ next_axis, -1.0, 1.0)))
         seconds = max(
-            rng.uniform(*PATH),
-            PEAK_SPEED * float(np.linalg.norm(here[following] - here[target])) / SPEED,
-            PEAK_SPEED * turn / TURNING,
+            rng.uniform(*PATH_TIMES),
+            PEAK_SPEED * float(np.linalg.norm(here[following] - here[target])) / TIP_SPEED,
+            PEAK_SPEED * turn / PEN_TURN_SPEED,
         )
-        stay = np.zeros(max(1, round(rng.uniform(*_STAY) * rate)))
+        stay = np.zeros(max(1, round(rng.uniform(*_STAY_TIMES) * rate)))
         share = np.concatenate([stay, minimum_jerk(max(2, int(np.ceil(seconds * rate))))])
-        visits.append(_Visit(target, rng.uniform(*DISTANCE), lean, share))
+        visits.append(_Visit(target, rng.uniform(*TIP_DISTANCE), lean, share))
         frame, target, lean = frame + len(share), following, next_lean
-    return [*visits, _Visit(target, rng.uniform(*DISTANCE), lean, np.zeros(0))]
+    return [*visits, _Visit(target, rng.uniform(*TIP_DISTANCE), lean, np.zeros(0))]
 
 
-def _draw(outward: Float[np.ndarray, "M 3"], rng: np.random.Generator) -> tuple[int, Float[np.ndarray, "3"]]:
+def _draw_target(
+    outward: Float[np.ndarray, "M 3"], rng: np.random.Generator
+) -> tuple[int, Float[np.ndarray, "3"]]:
     """A target that can be reached now, and the lean of the pen there."""
-    open_to_pen = np.flatnonzero(outward @ _UPRIGHT > _MIN_FACING)
+    open_to_pen = np.flatnonzero(outward @ _UPRIGHT_PEN > _MIN_FACING)
     target = int(rng.choice(open_to_pen if len(open_to_pen) else len(outward)))
-    lean = _TILT * rng.standard_normal(3)
+    lean = _LEAN_SPREAD * rng.standard_normal(3)
     # A pen that leans sideways does not swing when the target rotates.
     lean -= (lean @ outward[target]) * outward[target]
     return target, lean * min(1.0, _MAX_LEAN / max(float(np.linalg.norm(lean)), 1e-9))
 
 
-def _axes(outward: Float[np.ndarray, "*T 3"], lean: Float[np.ndarray, "*T 3"]) -> Float[np.ndarray, "*T 3"]:
-    """Directions of the pen at targets: off the skin, near upright, and smooth in both arguments."""
+def _pen_axes(
+    outward: Float[np.ndarray, "*T 3"], lean: Float[np.ndarray, "*T 3"]
+) -> Float[np.ndarray, "*T 3"]:
+    """Unit directions of a pen at targets: away from the skin, near upright, smooth in both arguments."""
     axis = outward + lean
     facing = np.einsum("...i,...i->...", axis, outward)[..., None]
     axis = unit(axis + np.clip(0.5 - facing, 0.0, None) * outward)
-    upright = np.broadcast_to(_UPRIGHT, axis.shape)
-    angle = np.arccos(np.clip(axis @ _UPRIGHT, -1.0, 1.0))[..., None]
-    return _between(upright, axis, _CONE * np.tanh(angle / _CONE) / np.maximum(angle, 1e-9))
+    upright = np.broadcast_to(_UPRIGHT_PEN, axis.shape)
+    angle = np.arccos(np.clip(axis @ _UPRIGHT_PEN, -1.0, 1.0))[..., None]
+    return _slerp(upright, axis, _MAX_PEN_ANGLE * np.tanh(angle / _MAX_PEN_ANGLE) / np.maximum(angle, 1e-9))
 
 
-def _between(
+def _slerp(
     start: Float[np.ndarray, "*T 3"], end: Float[np.ndarray, "*T 3"], share: Float[np.ndarray, "*T 1"]
 ) -> Float[np.ndarray, "*T 3"]:
-    """Directions after a share of the shortest rotation from one to another."""
+    """Interpolate unit directions spherically, from `start` (share 0) to `end` (share 1)."""
     angle = np.arccos(np.clip(np.einsum("...i,...i->...", start, end), -1.0, 1.0))[..., None]
     mixed = np.sin((1.0 - share) * angle) * start + np.sin(share * angle) * end
     mixed = np.where(angle > 1e-6, mixed, start)
     return np.asarray(mixed / np.maximum(np.linalg.norm(mixed, axis=-1, keepdims=True), 1e-12))
 
 
-def _frames(origin: Float[np.ndarray, "T 3"], axis: Float[np.ndarray, "T 3"]) -> Float[np.ndarray, "T 4 4"]:
+def _to_poses(origin: Float[np.ndarray, "T 3"], axis: Float[np.ndarray, "T 3"]) -> Float[np.ndarray, "T 4 4"]:
     """Poses with +z along `axis`, by the shortest rotation from upright, where +x points to the arm."""
-    x = _ARM - (_ARM @ _UPRIGHT) * _UPRIGHT
+    x = _ARM_DIRECTION - (_ARM_DIRECTION @ _UPRIGHT_PEN) * _UPRIGHT_PEN
     x /= np.linalg.norm(x)
     # The shortest rotation from u to a moves v to v - (v . (u + a)) / (1 + u . a) (u + a) + 2 (v . u) a.
-    middle = axis + _UPRIGHT
-    x = x - (middle @ x / (1.0 + axis @ _UPRIGHT))[:, None] * middle
+    middle = axis + _UPRIGHT_PEN
+    x = x - (middle @ x / (1.0 + axis @ _UPRIGHT_PEN))[:, None] * middle
     return rigid(np.stack([x, np.cross(axis, x), axis], axis=2), origin)

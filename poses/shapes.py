@@ -30,21 +30,21 @@ LOW: Final = np.deg2rad([joint.low for joint in JOINTS])
 HIGH: Final = np.deg2rad([joint.high for joint in JOINTS])
 
 _TIGHT_FLEXION: Final = np.deg2rad(85.0)  # MCP flexion from which abduction has its smallest range
-_TIGHT_ABDUCTION: Final = 0.25  # share of the abduction range that remains there
+_TIGHT_SHARE: Final = 0.25  # share of the abduction range that remains there
 _DIP_SHARE: Final = 2.0 / 3.0  # DIP flexion as a share of the PIP's
-_DIP_BELOW: Final = np.deg2rad(32.0)  # largest deviation of the DIP below its share of the PIP
-_DIP_ABOVE: Final = np.deg2rad(28.0)  # largest deviation of the DIP above its share of the PIP
+_MAX_DIP_BELOW: Final = np.deg2rad(32.0)  # largest deviation of the DIP below its share of the PIP
+_MAX_DIP_ABOVE: Final = np.deg2rad(28.0)  # largest deviation of the DIP above its share of the PIP
 # Largest difference of MCP flexion between neighbors [rad]: index-middle, middle-ring, ring-little.
-_MCP_APART: Final = np.deg2rad([85.0, 70.0, 75.0])
+_MAX_MCP_DIFFERENCE: Final = np.deg2rad([85.0, 70.0, 75.0])
 
 _FLEXION_NOISE: Final = np.deg2rad(6.0)
 _ABDUCTION_NOISE: Final = np.deg2rad(2.0)
 _SWAY: Final = np.deg2rad(3.0)  # standard deviation of all fingers leaning to one side
 # Chance that neighbors curl independently: index-middle, middle-ring, ring-little.
-_SPLIT: Final = np.array([0.3, 0.2, 0.25])
+_SPLIT_CHANCE: Final = np.array([0.3, 0.2, 0.25])
 _NEIGHBOR_CORRELATION: Final = 0.993
 # One standard deviation of a curl that grows from index to little finger, in units of the normals.
-_SLOPE: Final = 0.15 * np.array([-1.5, -0.5, 0.5, 1.5])
+_CURL_SLOPE: Final = 0.15 * np.array([-1.5, -0.5, 0.5, 1.5])
 _CURL_DIP_SHARE: Final = 0.68
 _DIP_LAG: Final = np.deg2rad(6.0)
 _DIP_NOISE: Final = np.deg2rad(9.0)
@@ -54,13 +54,13 @@ _FAN_SPREAD: Final = np.deg2rad([7.0, 1.5, -5.0, -11.0])  # one standard deviati
 
 MAX_PENETRATION: Final = 0.001
 """Deepest self-penetration [m] of a valid pose: skin yields by about this much."""
-_ROUNDING: Final = 1e-6  # [rad] Single precision rounds angles by less.
-_MOST_CROSSED: Final = 0.0045  # [m] Flat fingers that overlap more hide skin that carries markers.
-_THUMB: Final = np.array([joint.name.startswith("thumb") for joint in JOINTS])
-_ABDUCTIONS: Final = np.array([joint.name.endswith("abduction") for joint in JOINTS])
-_FAN: Final = np.deg2rad([0.0, 1.0, 0.2, -0.6, -1.4])  # one degree of fanning at rest, thumb to little
+_ANGLE_ROUNDING: Final = 1e-6  # [rad] Single precision rounds angles by less.
+_MAX_FLAT_OVERLAP: Final = 0.0045  # [m] Flat fingers that overlap more hide skin that carries markers.
+_IS_THUMB: Final = np.array([joint.name.startswith("thumb") for joint in JOINTS])
+_IS_ABDUCTION: Final = np.array([joint.name.endswith("abduction") for joint in JOINTS])
+_REST_FAN: Final = np.deg2rad([0.0, 1.0, 0.2, -0.6, -1.4])  # one degree of fanning at rest, thumb to little
 # The same for digits that converge: thumb and middle finger lean away from the index finger.
-_WIDE_FAN: Final = np.deg2rad([1.0, 1.0, -0.2, -1.0, -1.8])
+_WIDE_REST_FAN: Final = np.deg2rad([1.0, 1.0, -0.2, -1.0, -1.8])
 
 SAMPLERS: Final = "handsim.pose_samplers"
 """Group of entry points of pose samplers."""
@@ -124,13 +124,13 @@ def apply_couplings(angles: Float[np.ndarray, "T 20"]) -> Float[np.ndarray, "T 2
     fingers = coupled.reshape(-1, 5, 4)[:, 1:]  # a view
     flexion = fingers[..., 1]
     for near, far, apart in ((1, 0, 0), (1, 2, 1), (2, 3, 2)):
-        limit = _MCP_APART[apart]
+        limit = _MAX_MCP_DIFFERENCE[apart]
         flexion[:, far] = np.clip(flexion[:, far], flexion[:, near] - limit, flexion[:, near] + limit)
-    left = 1.0 - (1.0 - _TIGHT_ABDUCTION) * np.clip(flexion / _TIGHT_FLEXION, 0.0, 1.0)
+    left = 1.0 - (1.0 - _TIGHT_SHARE) * np.clip(flexion / _TIGHT_FLEXION, 0.0, 1.0)
     low, high = LOW.reshape(5, 4)[1:, 0], HIGH.reshape(5, 4)[1:, 0]
     fingers[..., 0] = np.clip(fingers[..., 0], low * left, high * left)
     follow = _DIP_SHARE * np.maximum(fingers[..., 2], 0.0)
-    fingers[..., 3] = np.clip(fingers[..., 3], follow - _DIP_BELOW, follow + _DIP_ABOVE)
+    fingers[..., 3] = np.clip(fingers[..., 3], follow - _MAX_DIP_BELOW, follow + _MAX_DIP_ABOVE)
     return np.asarray(np.clip(coupled, LOW, HIGH))
 
 
@@ -155,7 +155,7 @@ def sample_angles(
     """Random joint angles [rad] inside ranges and couplings; digits may still touch."""
     source = rng.choice(3, size=count, p=mix.shares)
     angles = np.empty((count, len(LOW)))
-    for number, draw in enumerate((_blend_gestures, _curl_fingers, _anywhere)):
+    for number, draw in enumerate((_blend_gestures, _curl_fingers, _uniform_angles)):
         chosen = source == number
         angles[chosen] = draw(int(chosen.sum()), rng)
     return apply_couplings(angles)
@@ -174,14 +174,14 @@ def _blend_gestures(count: int, rng: np.random.Generator) -> NDArray[np.float64]
 def _curl_fingers(count: int, rng: np.random.Generator) -> NDArray[np.float64]:
     from scipy.special import ndtr
 
-    angles = _thumbs(count, rng)
+    angles = _oppose_thumbs(count, rng)
     digits = angles.reshape(count, 5, 4)  # a view
     within = rng.uniform(0.3, 1.0, size=(count, 1))  # correlation of the joints of one finger
-    splits = rng.random((count, 3)) < _SPLIT
-    knuckles = _grouped(splits, rng.standard_normal((count, 4)))
-    middles = within * knuckles + np.sqrt(1 - within**2) * _grouped(splits, rng.standard_normal((count, 4)))
-    knuckles += _SLOPE * rng.standard_normal((count, 1))
-    middles += _SLOPE * rng.standard_normal((count, 1))
+    splits = rng.random((count, 3)) < _SPLIT_CHANCE
+    knuckles, others = (_neighbor_normals(splits, rng.standard_normal((count, 4))) for _ in range(2))
+    middles = within * knuckles + np.sqrt(1 - within**2) * others
+    knuckles += _CURL_SLOPE * rng.standard_normal((count, 1))
+    middles += _CURL_SLOPE * rng.standard_normal((count, 1))
     digits[:, 1:, 1] = _MCP_OPEN + (_MCP_CLOSED - _MCP_OPEN) * ndtr(1.15 * knuckles)
     digits[:, 1:, 2] = _PIP_OPEN + (_PIP_CLOSED - _PIP_OPEN) * ndtr(1.3 * middles)
     digits[:, 1:, 3] = (
@@ -198,7 +198,7 @@ def _shared_normals(count: int, rng: np.random.Generator, *, digits: int = 4) ->
     return np.asarray(np.sqrt(0.75) * common + np.sqrt(0.25) * own)
 
 
-def _grouped(splits: NDArray[np.bool_], normals: NDArray[np.float64]) -> NDArray[np.float64]:
+def _neighbor_normals(splits: NDArray[np.bool_], normals: NDArray[np.float64]) -> NDArray[np.float64]:
     """Standard normals (T, 4), nearly equal for neighboring fingers without a split between them."""
     grouped = normals.copy()
     for finger in range(1, 4):
@@ -210,7 +210,7 @@ def _grouped(splits: NDArray[np.bool_], normals: NDArray[np.float64]) -> NDArray
     return grouped
 
 
-def _thumbs(count: int, rng: np.random.Generator) -> NDArray[np.float64]:
+def _oppose_thumbs(count: int, rng: np.random.Generator) -> NDArray[np.float64]:
     """Thumbs that oppose (abduction with flexion) and fold (MCP with IP); fingers are zero."""
     angles = np.zeros((count, 20))
     reach, sweep, fold, tip = rng.standard_normal((4, count))
@@ -221,7 +221,7 @@ def _thumbs(count: int, rng: np.random.Generator) -> NDArray[np.float64]:
     return angles
 
 
-def _anywhere(count: int, rng: np.random.Generator) -> NDArray[np.float64]:
+def _uniform_angles(count: int, rng: np.random.Generator) -> NDArray[np.float64]:
     return rng.uniform(LOW, HIGH, size=(count, len(LOW)))
 
 
@@ -229,7 +229,7 @@ def is_valid(
     model: HandModel, angles: Float[np.ndarray, "T 20"], *, max_penetration: float = MAX_PENETRATION
 ) -> Bool[np.ndarray, "T"]:
     """Whether each pose is in range, with a self-penetration of at most `max_penetration` [m]."""
-    inside = ((angles >= LOW - _ROUNDING) & (angles <= HIGH + _ROUNDING)).all(axis=1)
+    inside = ((angles >= LOW - _ANGLE_ROUNDING) & (angles <= HIGH + _ANGLE_ROUNDING)).all(axis=1)
     free: NDArray[np.bool_] = model.penetration(join_qpos(angles)) <= max_penetration
     return inside & free
 
@@ -250,7 +250,8 @@ def validate(model: HandModel | HandShape | str, qpos: Float[np.ndarray, "T 27"]
 @functools.lru_cache(maxsize=16)
 def resting_angles(model: HandModel) -> Float[np.ndarray, "20"]:
     """A valid relaxed pose of this hand, with digits fanned as little as their girth allows; read-only."""
-    for share, fan in ((0.8, _FAN), (1.0, _FAN), (1.0, _WIDE_FAN)):  # leaves room where the girth allows it
+    # The first try leaves room between the digits, which thick digits lack.
+    for share, fan in ((0.8, _REST_FAN), (1.0, _REST_FAN), (1.0, _WIDE_REST_FAN)):
         tries = _fanned(fan, 40.0)
         valid = is_valid(model, tries, max_penetration=share * MAX_PENETRATION)
         if valid.any():
@@ -264,8 +265,8 @@ def resting_angles(model: HandModel) -> Float[np.ndarray, "20"]:
 
 def rests_easily(model: HandModel) -> bool:
     """Whether fingers have room at rest with at most 12 degrees of fanning, and do not cross when flat."""
-    rests = is_valid(model, _fanned(_FAN, 12.0), max_penetration=0.8 * MAX_PENETRATION).any()
-    return bool(rests and model.penetration(join_qpos(np.zeros((1, NUM_JOINTS))))[0] <= _MOST_CROSSED)
+    rests = is_valid(model, _fanned(_REST_FAN, 12.0), max_penetration=0.8 * MAX_PENETRATION).any()
+    return bool(rests and model.penetration(join_qpos(np.zeros((1, NUM_JOINTS))))[0] <= _MAX_FLAT_OVERLAP)
 
 
 def _fanned(fan: Float[np.ndarray, "5"], most: float) -> Float[np.ndarray, "K 20"]:
@@ -284,7 +285,7 @@ def make_valid(model: HandModel, angles: Float[np.ndarray, "T 20"]) -> Float[np.
     resting = resting_angles(model)
     result = np.array(angles, dtype=np.float64)
     todo = np.flatnonzero(~is_valid(model, result))
-    for moving in (_THUMB, _THUMB | _ABDUCTIONS, np.ones_like(_THUMB)):
+    for moving in (_IS_THUMB, _IS_THUMB | _IS_ABDUCTION, np.ones_like(_IS_THUMB)):
         if not len(todo):
             break
         end = np.where(moving, resting, result[todo])
@@ -373,13 +374,13 @@ def load_sampler(sampler: PoseSampler | str, *, is_tried: bool = True) -> PoseSa
     if not isinstance(sampler, str):
         names = ", ".join(SAMPLER.names())
         check_callable("sampler", sampler, SAMPLER.words + (f"; valid names: {names}" if names else ""))
-    checked = functools.partial(_drawn, sampler)
+    checked = functools.partial(_checked_draw, sampler)
     if is_tried:
         checked(HandModel.named("M"), 2, rng=np.random.default_rng(0))
     return checked
 
 
-def _drawn(
+def _checked_draw(
     sampler: PoseSampler | str, model: HandModel, num_poses: int, *, rng: np.random.Generator
 ) -> NDArray[np.float64]:
     name = plugin_name(sampler)

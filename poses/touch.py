@@ -27,7 +27,7 @@ MAX_OVERLAP: Final = 0.0006
 """Deepest overlap [m] of the two last bones of a solved touch; the least is 0."""
 MIN_FACING: Final = 0.5
 """Smallest cosine between a pad's direction and the direction to the other bone in a solved touch."""
-_PAD: Final = 0.6  # where the pad is, as a share of the last bone's capsule
+_PAD_SHARE: Final = 0.6  # where the pad is, as a share of the last bone's capsule
 # Residuals are divided by these scales [m]: overlap of the last bones, other penetration, pad distance.
 _OVERLAP_SCALE: Final = 5e-5
 _PENETRATION_SCALE: Final = 1e-4
@@ -35,8 +35,8 @@ _PAD_SCALE: Final = 3e-2
 _FACING_WEIGHT: Final = 5.0
 _ANGLE_WEIGHTS: Final = 2.0 * np.array([1.0, 1.0, 1.0, 1.0, 2.0, 1.0, 1.0, 1.0])
 _TARGET_FACING: Final = 0.55
-_MOST_ROUNDS: Final = 4
-_STEP: Final = 1e-6  # step of the finite differences [rad]
+_MAX_ROUNDS: Final = 4
+_ANGLE_STEP: Final = 1e-6  # step of the finite differences [rad]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,10 +52,10 @@ class ThumbContact:
 def thumb_contact(model: HandModel, angles: Float[np.ndarray, "T 20"], finger: str) -> ThumbContact:
     """The nearest points of thumb and finger ("index", "middle", "ring" or "little"), touching or not."""
     check_choice(finger, FINGERS, noun="finger")
-    return _contact(model.capsules, model.forward_kinematics(join_qpos(angles)), finger)
+    return _bones_contact(model.capsules, model.forward_kinematics(join_qpos(angles)), finger)
 
 
-def _contact(capsules: Capsules, frames: NDArray[np.float64], finger: str) -> ThumbContact:
+def _bones_contact(capsules: Capsules, frames: NDArray[np.float64], finger: str) -> ThumbContact:
     bones = bones_of("thumb")[2], bones_of(finger)[2]
     indices = [int(np.flatnonzero(capsules.bones == bone)[0]) for bone in bones]
     segments, radii = capsules.posed(frames)[:, indices], capsules.radii[indices]
@@ -84,8 +84,8 @@ def touching_angles(
         starts = check_array("start", start, (NUM_JOINTS,)).reshape(-1, NUM_JOINTS)
     for begin in np.clip(starts, LOW, HIGH):
         angles = begin
-        for _ in range(_MOST_ROUNDS):  # a solution stays near its start, so a far touch takes several rounds
-            angles = _solve(model, finger, angles)
+        for _ in range(_MAX_ROUNDS):  # a solution stays near its start, so a far touch takes several rounds
+            angles = _solve_touch(model, finger, angles)
             if is_touching(model, angles[None], finger)[0]:
                 return angles
     raise PoseError(
@@ -102,7 +102,7 @@ def is_touching(model: HandModel, angles: Float[np.ndarray, "T 20"], finger: str
     return np.asarray(touching & facing & is_valid(model, angles))
 
 
-def _solve(model: HandModel, finger: str, start: NDArray[np.float64]) -> NDArray[np.float64]:
+def _solve_touch(model: HandModel, finger: str, start: NDArray[np.float64]) -> NDArray[np.float64]:
     from scipy.optimize import least_squares
 
     number = DIGITS.index(finger)
@@ -111,7 +111,7 @@ def _solve(model: HandModel, finger: str, start: NDArray[np.float64]) -> NDArray
     residuals = _residuals(model, finger, start, moving)
 
     def jacobian(x: NDArray[np.float64]) -> NDArray[np.float64]:
-        steps = np.where(x + _STEP > high, -_STEP, _STEP)
+        steps = np.where(x + _ANGLE_STEP > high, -_ANGLE_STEP, _ANGLE_STEP)
         moved = residuals(np.vstack([x, x + np.diag(steps)]))
         return np.asarray((moved[1:] - moved[0]).T / steps)
 
@@ -134,7 +134,7 @@ def _residuals(
     pads = []  # the middle of each last bone's pad, in the bone's frame [m]
     for bone in bones:
         index = int(np.flatnonzero(capsules.bones == bone)[0])
-        pads.append(capsules.starts[index] + _PAD * (capsules.ends[index] - capsules.starts[index]))
+        pads.append(capsules.starts[index] + _PAD_SHARE * (capsules.ends[index] - capsules.starts[index]))
         pads[-1][2] -= capsules.radii[index]
     pairs = capsules.touching_pairs()
     pairs = pairs[~np.isin(capsules.bones[pairs], bones).all(axis=1)]
@@ -144,7 +144,7 @@ def _residuals(
         angles[:, moving] = x
         frames = model.forward_kinematics(join_qpos(angles))
         overlaps = _overlaps(capsules.posed(frames), capsules.radii, pairs)
-        contact = _contact(capsules, frames, finger)
+        contact = _bones_contact(capsules, frames, finger)
         positions = [
             np.einsum("tij,j->ti", frames[:, bone, :3, :3], pad) + frames[:, bone, :3, 3]
             for bone, pad in zip(bones, pads, strict=True)

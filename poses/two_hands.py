@@ -18,9 +18,9 @@ from handsim.hand.shape import DIGITS, bones_of
 from handsim.space.rig import ROOM_CENTER
 from handsim.space.transforms import MIRROR, euler_matrix, random_quaternions, rotation_quaternions, unit
 from poses.contact import (
-    APPROACH,
+    APPROACH_TIMES,
     NEAREST,
-    VOLUME,
+    PAIR_VOLUME,
     WRIST_SPEED,
     Passage,
     close_fingers,
@@ -31,25 +31,25 @@ from poses.contact import (
     smooth_above,
     valid_frames,
 )
-from poses.motion import MAX_ACCELERATION, MAX_SPEED, PEAK_SPEED, RATE, along, minimum_jerk
+from poses.motion import MAX_ACCELERATION, MAX_SPEED, PEAK_SPEED, RATE, interpolate_path, minimum_jerk
 from poses.shapes import HIGH, LOW, gesture, gesture_names, is_valid, make_valid, resting_angles
 
 _FLEXION_NOISE: Final = np.deg2rad(4.0)
 _ABDUCTION_NOISE: Final = np.deg2rad(1.5)
 _NOISE: Final = np.tile([_ABDUCTION_NOISE, _FLEXION_NOISE, _FLEXION_NOISE, _FLEXION_NOISE], len(DIGITS))
-_SNUG: Final = 0.0007  # self-penetration [m] up to which fingers may wander
-_WANDER: Final = 0.4  # noise from beat to beat, relative to the noise of the whole interaction
+_SNUG_DEPTH: Final = 0.0007  # self-penetration [m] up to which fingers may wander
+_WANDER_SHARE: Final = 0.4  # noise from beat to beat, relative to the noise of the whole interaction
 
 INTERACTIONS: Final[tuple[str, ...]] = tuple(package_data("poses", "interactions")["interactions"])
 """Names of all interactions."""
 
 _CONTACT_WINDOW: Final = 0.12  # over which backing off is smoothed [s]
 _FINGER_WINDOW: Final = 0.35  # over which closing fingers are smoothed [s]
-_PARTED: Final = (0.08, 0.16)  # distance of the hands before and after an interaction [m]
+_PARTED_DISTANCES: Final = (0.08, 0.16)  # distance of the hands before and after an interaction [m]
 # Single poses: share of touching ones, largest distance of the others [m], share with half-closed fingers.
-_TOUCHING, _GAP, _HALF_CLOSED = 0.7, 0.06, 0.3
+_TOUCHING_SHARE, _MAX_GAP, _HALF_CLOSED_SHARE = 0.7, 0.06, 0.3
 
-_TRAVEL_TIME: Final = (0.8, 2.5)  # between two positions of the pair [s]
+_TRAVEL_TIMES: Final = (0.8, 2.5)  # between two positions of the pair [s]
 _ROTATION: Final = 0.5  # standard deviation of the rotation between two positions [rad]
 _MAX_DRAWS: Final = 60
 
@@ -139,7 +139,7 @@ def sketch_meeting(
     variant: dict[str, Any], count: int, *, together: bool, rng: np.random.Generator
 ) -> Sketch:
     """Random positions, orientations and fingers for beats; `together` makes the beats similar."""
-    noise = _Noise(count, together, rng)
+    noise = _BeatNoise(count, together, rng)
     still, moving = (
         _sketch_fingers(variant[role], variant["relaxing"], noise, rng) for role in ("still", "moving")
     )
@@ -180,7 +180,7 @@ def meet(sketches: Sequence[Sketch], still: HandModel, moving: HandModel) -> Mee
     )
 
 
-class _Noise:
+class _BeatNoise:
     """Gaussian noise with a part common to all beats, clipped at two standard deviations."""
 
     def __init__(self, count: int, together: bool, rng: np.random.Generator) -> None:
@@ -197,13 +197,13 @@ class _Noise:
 
 
 def _sketch_fingers(
-    role: dict[str, str], relaxing: float, noise: _Noise, rng: np.random.Generator
+    role: dict[str, str], relaxing: float, noise: _BeatNoise, rng: np.random.Generator
 ) -> _FingerSketch:
     weaker = rng.random((noise.count, len(DIGITS))) < relaxing
     strength = np.where(weaker, rng.uniform(0.4, 1.0, size=weaker.shape), 1.0)
     opened = _angles(role["open"]) + noise.around(_NOISE, 0.0)
     closed = _angles(role["closed"]) + noise.around(_NOISE, 0.0)
-    return _FingerSketch(opened, closed, _WANDER * noise.around(_NOISE, 1.0, common=0.0), strength)
+    return _FingerSketch(opened, closed, _WANDER_SHARE * noise.around(_NOISE, 1.0, common=0.0), strength)
 
 
 def _valid_fingers(model: HandModel, sketches: Sequence[_FingerSketch]) -> Fingers:
@@ -211,10 +211,10 @@ def _valid_fingers(model: HandModel, sketches: Sequence[_FingerSketch]) -> Finge
     opened, closed, wander, strength = (np.concatenate(parts) for parts in zip(*sketches, strict=True))
     # poses with deep contact move towards rest, because fingers need room to wander
     lasting = make_valid(model, np.clip(opened, LOW, HIGH))
-    hard = ~is_valid(model, lasting, max_penetration=_SNUG)
+    hard = ~is_valid(model, lasting, max_penetration=_SNUG_DEPTH)
     lasting[hard] += 0.1 * (resting_angles(model) - lasting[hard])
     wandering = np.clip(lasting + wander, LOW, HIGH)
-    valid = is_valid(model, wandering, max_penetration=_SNUG)
+    valid = is_valid(model, wandering, max_penetration=_SNUG_DEPTH)
     return Fingers(np.where(valid[:, None], wandering, lasting), np.clip(closed, LOW, HIGH), strength)
 
 
@@ -258,7 +258,7 @@ def play_meeting(right: HandModel, left: HandModel, name: str, *, rng: np.random
     ]
     draws = [meet([sketch], still, moving) for sketch in sketches]
     meeting = min(draws, key=lambda draw: float(_contact_distance(still, moving, draw, np.zeros(1))[0]))
-    course = _course(variant, count, rng)
+    course = _meeting_course(variant, count, rng)
     distance = _contact_distance(still, moving, meeting, course.beats)
     if (distance <= NEAREST).any():
         return None
@@ -273,7 +273,7 @@ def draw_poses(
     right: HandModel, left: HandModel, counts: Sequence[tuple[str, int]], *, rng: np.random.Generator
 ) -> Passage:
     """Valid poses among `counts` single poses of interactions; roles are drawn once per interaction."""
-    draws = [_draw(name, count, rng) for name, count in counts]
+    draws = [_draw_single(name, count, rng) for name, count in counts]
     order = np.argsort([draw.left_still for draw in draws], kind="stable")
     passages, valid = [], []
     for left_still, still, moving in ((False, right, left), (True, left, right)):
@@ -300,7 +300,7 @@ def draw_poses(
     return join_passages(passages).at(as_drawn[np.concatenate(valid)[as_drawn]])
 
 
-class _Draw(NamedTuple):
+class _PoseDraw(NamedTuple):
     """Single poses of one interaction, for hands of any size."""
 
     left_still: bool
@@ -313,13 +313,13 @@ class _Draw(NamedTuple):
     """Factor on the strength of closing fingers (N,)."""
 
 
-def _draw(name: str, count: int, rng: np.random.Generator) -> _Draw:
+def _draw_single(name: str, count: int, rng: np.random.Generator) -> _PoseDraw:
     left_still = not rng.random() < 0.5
     variant = draw_variant(name, rng=rng)
     sketch = sketch_meeting(variant, count * variant.get("tries", 1), together=False, rng=rng)
-    lift = np.where(rng.random(count) < _TOUCHING, 0.0, _GAP * rng.random(count))
-    grip = np.where(rng.random(count) < _HALF_CLOSED, rng.random(count), 1.0)
-    return _Draw(left_still, sketch, lift, grip)
+    lift = np.where(rng.random(count) < _TOUCHING_SHARE, 0.0, _MAX_GAP * rng.random(count))
+    grip = np.where(rng.random(count) < _HALF_CLOSED_SHARE, rng.random(count), 1.0)
+    return _PoseDraw(left_still, sketch, lift, grip)
 
 
 def _contact_distance(
@@ -371,14 +371,14 @@ def _close_contact(
     return Passage(back, -np.einsum("tij,tj->ti", back, position), *angles[::-1])
 
 
-def _course(variant: dict[str, Any], count: int, rng: np.random.Generator) -> _Course:
+def _meeting_course(variant: dict[str, Any], count: int, rng: np.random.Generator) -> _Course:
     """The course of a meeting: approach, stay and move `count` times, release."""
-    ends = [int(rng.uniform(*APPROACH) * RATE) + 1 for _ in range(2)]
+    ends = [int(rng.uniform(*APPROACH_TIMES) * RATE) + 1 for _ in range(2)]
     # fingers close after the hands meet, and open before they part
-    grips = [int(rng.uniform(*APPROACH) * RATE) + 1 for _ in range(2)]
+    grips = [int(rng.uniform(*APPROACH_TIMES) * RATE) + 1 for _ in range(2)]
     tempo = rng.random(2)
     beats, lift = [np.zeros(ends[0] + grips[0])], [1.0 - minimum_jerk(ends[0]), np.zeros(grips[0])]
-    lift[0] = rng.uniform(*_PARTED) * lift[0]
+    lift[0] = rng.uniform(*_PARTED_DISTANCES) * lift[0]
     for beat in range(count):
         stay, move = (
             int((low + share * (high - low)) * rng.uniform(0.9, 1.1) * RATE) + 1
@@ -392,7 +392,7 @@ def _course(variant: dict[str, Any], count: int, rng: np.random.Generator) -> _C
             beats.append(beat + minimum_jerk(move))
             lift.append(height * 64.0 * (time * (1.0 - time)) ** 3)
     beats.append(np.full(ends[1] + grips[1], count - 1.0))
-    lift += [np.zeros(grips[1]), rng.uniform(*_PARTED) * minimum_jerk(ends[1])]
+    lift += [np.zeros(grips[1]), rng.uniform(*_PARTED_DISTANCES) * minimum_jerk(ends[1])]
     grip = np.ones(sum(map(len, beats)))
     grip[: sum(map(len, lift[:2]))] = np.concatenate([np.zeros(ends[0]), minimum_jerk(grips[0])])
     grip[len(grip) - ends[1] - grips[1] :] = np.concatenate([1.0 - minimum_jerk(grips[1]), np.zeros(ends[1])])
@@ -411,7 +411,7 @@ def sample_two_hand_motion(
     while sum(map(len, passages)) < frames:
         passages += _next_passages(right, left, passages[-1].at([-1]), rng=rng)
     whole = join_passages(passages).at(slice(frames))
-    right_qpos, left_qpos = _in_world(whole, *_travel(frames, rng))
+    right_qpos, left_qpos = _in_world(whole, *_travel_path(frames, rng))
     return HandMotion(right_qpos, RATE), HandMotion(left_qpos, RATE)
 
 
@@ -432,7 +432,7 @@ def sample_two_hand_poses(
         if missing <= 0:
             whole = join_passages(passages)
             whole = whole.at(rng.permutation(len(whole))[:count])
-            positions = ROOM_CENTER + rng.uniform(-VOLUME, VOLUME, size=(count, 3))
+            positions = ROOM_CENTER + rng.uniform(-PAIR_VOLUME, PAIR_VOLUME, size=(count, 3))
             return _in_world(whole, positions, Rotation.from_quat(random_quaternions(count, rng=rng)))
     raise PoseError(f"no valid pose of these two hands was found in {_MAX_DRAWS} tries")
 
@@ -455,17 +455,18 @@ def _next_passages(
     raise PoseError(f"no valid path was found in {_MAX_DRAWS} tries to bring these hands to '{name}'")
 
 
-def _travel(frames: int, rng: np.random.Generator) -> tuple[NDArray[np.float64], Rotation]:
+def _travel_path(frames: int, rng: np.random.Generator) -> tuple[NDArray[np.float64], Rotation]:
     """Positions (T, 3) and orientations of a traveling pair of hands."""
-    positions = [ROOM_CENTER + rng.uniform(-VOLUME, VOLUME, size=3)]
+    positions = [ROOM_CENTER + rng.uniform(-PAIR_VOLUME, PAIR_VOLUME, size=3)]
     orientations, shares = [Rotation.from_quat(random_quaternions(1, rng=rng)[0])], [np.zeros(1)]
     while sum(map(len, shares)) < frames:
-        positions.append(ROOM_CENTER + rng.uniform(-VOLUME, VOLUME, size=3))
+        positions.append(ROOM_CENTER + rng.uniform(-PAIR_VOLUME, PAIR_VOLUME, size=3))
         orientations.append(orientations[-1] * Rotation.from_rotvec(rng.normal(scale=_ROTATION, size=3)))
         distance = float(np.linalg.norm(positions[-1] - positions[-2]))
-        seconds = max(rng.uniform(*_TRAVEL_TIME), PEAK_SPEED * distance / WRIST_SPEED)
+        seconds = max(rng.uniform(*_TRAVEL_TIMES), PEAK_SPEED * distance / WRIST_SPEED)
         shares.append(len(positions) - 2 + minimum_jerk(int(np.ceil(seconds * RATE))))
-    return along(np.array(positions), Rotation.concatenate(orientations), np.concatenate(shares)[:frames])
+    keys = np.array(positions), Rotation.concatenate(orientations)
+    return interpolate_path(*keys, np.concatenate(shares)[:frames])
 
 
 def _in_world(

@@ -48,7 +48,7 @@ def check_photograph(file: Path) -> None:
         FileError: The sentence names the file and the reason.
     """
     if is_map(file):
-        check_regular(file, error=FileError, most=_MOST_BYTES)
+        check_regular(file, error=FileError, max_bytes=_MOST_BYTES)
     else:
         with _opened(file):
             pass
@@ -99,7 +99,7 @@ def read_map(file: Path) -> Float32[np.ndarray, "H W 3"]:
 @contextmanager
 def _opened(file: Path) -> Iterator[Image.Image]:
     """A photograph, whose beginning is read; its levels are read in the block."""
-    check_regular(file, error=FileError, most=_MOST_BYTES)
+    check_regular(file, error=FileError, max_bytes=_MOST_BYTES)
     Image.init()  # so that all formats are known by name
     with _damage_told(file):
         try:
@@ -142,7 +142,7 @@ def _eight_bits(file: Path, levels: NDArray[Any]) -> Bytes:
 
 
 def _read_hdr(file: Path) -> Floats:
-    content = read_bytes(file, error=FileError, most=_MOST_BYTES)
+    content = read_bytes(file, error=FileError, max_bytes=_MOST_BYTES)
     size = _HDR_SIZE.search(content)
     if not content.startswith(b"#?") or size is None:
         raise FileError(f"{file}: not a readable environment map: no header of Radiance's with -Y and +X")

@@ -290,7 +290,7 @@ def folder(files, tmp_path, monkeypatch):
 @pytest.mark.parametrize("command", CASES)
 def test_a_mistake_is_one_sentence(command, folder, capsys, monkeypatch):
     # However slow the machine is, no line of progress comes before the sentence.
-    monkeypatch.setattr(messages, "_lines", lambda *_: contextlib.nullcontext())
+    monkeypatch.setattr(messages, "_logged_progress", lambda *_: contextlib.nullcontext())
     before = {path.name for path in folder.iterdir()}
     assert main(command.split()) == 1
     *announced, said = capsys.readouterr().err.splitlines()

@@ -233,7 +233,7 @@ def load_user(path: str | Path) -> User:
     path = Path(path)
     try:
         # A user of two hands takes 40,000 bytes.
-        content = json.loads(read_bytes(path, error=UserError, most=1 << 24))
+        content = json.loads(read_bytes(path, error=UserError, max_bytes=1 << 24))
     except (ValueError, RecursionError) as error:
         raise UserError(f"{path}: not a user's file of handsim calibrate (.json): no JSON text") from error
     if not isinstance(content, dict) or "schema" not in content:

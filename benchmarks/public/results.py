@@ -87,7 +87,7 @@ def read_result(path: Path, capture: Capture, label_names: tuple[str, ...]) -> A
 
 def _read(path: Path, capture: Capture, label_names: tuple[str, ...]) -> Answers:
     if path.suffix.lower() == ".csv":
-        data = read_bytes(path, error=BenchmarkError, most=_MOST_CSV)
+        data = read_bytes(path, error=BenchmarkError, max_bytes=_MOST_CSV)
         return Answers(_labels_of_table(data, capture, label_names))
     arrays = load_arrays(path)
     return _of_tracked_take(path, capture, label_names) if "header" in arrays else unpack_answers(arrays)

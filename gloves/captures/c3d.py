@@ -1,13 +1,12 @@
-"""C3D, the binary format of motion capture.
+"""Reader and writer of C3D, the binary format of motion capture.
 
-A library is not used because ezc3d (1.7) can end the whole process on a damaged file, silently pads a file
-that was cut, and stops at 65,535 frames. Only the points, their labels, units and rate are read. Analog
-channels, events, force plates and all other parameters are copied from the file that a capture was read from
-to the file of its labeled points.
+No library is used, because ezc3d 1.7 can crash the process on a damaged file, silently pads a file that was
+cut, and stops at 65,535 frames. The reader reads only the points, their labels, units and rate. The writer
+copies analog channels, events, force plates and all other parameters from the source file.
 
-Header and parameters both state where the frames lie and how numbers are written, and some programs get one
-of them wrong. Where they contradict each other, the size of the data decides, with a warning; where it does
-not decide, the file is refused.
+Header and parameters both state where the frames lie and how numbers are encoded, and some programs write one
+of them wrong. If they contradict each other, the reader takes the one that fits the size of the data, with a
+warning; if neither or both fit, it refuses the file.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ from numpy.typing import NDArray
 
 from gloves.captures.capture import Capture
 from gloves.captures.coordinates import LEFT_OUT, UNMARKED, without_outputs
-from gloves.captures.text import StatedTimes, Tell, check_same_rate, meters_per, timed_positions, warn
+from gloves.captures.text import StatedTimes, Warn, check_same_rate, emit_warning, meters_per, timed_positions
 from handsim.errors import CaptureError, shortened
 
 _INTEL, _DEC, _SGI = 84, 85, 86
@@ -34,21 +33,25 @@ INTEGER_DTYPES: Final = {_INTEL: "<i2", _DEC: "<i2", _SGI: ">i2"}
 FLOAT_DTYPES: Final = {_INTEL: "<f4", _DEC: "<u4", _SGI: ">f4"}  # DEC floats are bits until `to_native`
 BLOCK: Final = 512
 _CHARACTER, _BYTE, _INTEGER, _FLOAT = -1, 1, 2, 4
-_GROUPS: Final = {"POINT", "ANALOG", "TRIAL"}  # groups that locate the points; damage to others is ignored
-_MAX_BYTES: Final = 1 << 22  # All values fit into this; damaged records may overlap and state far more.
-MOST_FRAMES: Final = 65535  # largest 16-bit count; longer takes state their length in ACTUAL_END_FIELD
+_READ_GROUPS: Final = {"POINT", "ANALOG", "TRIAL"}
+"""Groups of parameters that locate the points; damage to other groups is ignored."""
+_MAX_BYTES: Final = 1 << 22
+"""Largest size of all parameter values; damaged records may overlap and state far more."""
+MAX_FRAMES: Final = 65535  # largest 16-bit count; longer takes state their length in ACTUAL_END_FIELD
 _MAX_PADDING: Final = 2 * BLOCK  # bytes after the last frame
 _SCALE_TOLERANCE: Final = 1e-3  # relative difference of the two scales of a file
-_BYTE_COUNT: Final = 255  # as many labels are in a parameter; more follow in LABELS2, LABELS3, ...
-_EVENTS_AT: Final = slice(304, 376)  # bytes of the header with times of events; flags and labels follow
-_OF_POINTS: Final = ("USED", "SCALE", "RATE", "FRAMES", "LONG_FRAMES", "UNITS", "LABELS", "DESCRIPTIONS")
+_MAX_COUNT: Final = 255
+"""Largest number of labels in a parameter; more labels follow in LABELS2, LABELS3, ..."""
+_EVENT_TIMES: Final = slice(304, 376)
+"""Bytes of the header with the times of events; their flags and labels follow."""
+_POINT_PREFIXES: Final = ("USED", "SCALE", "RATE", "FRAMES", "LONG_FRAMES", "UNITS", "LABELS", "DESCRIPTIONS")
 """Prefixes of the parameters in group POINT that describe the points."""
 _OUTPUTS: Final = ("ANGLES", "MOMENTS", "FORCES", "POWERS", "SCALARS", "REACTIONS", "MODELED_MARKERS")
 """Parameters of the group POINT that name columns which are no markers."""
 
 
 def to_native(values: NDArray[np.generic], processor: int) -> NDArray[np.float64]:
-    """Floats of a file as doubles; DEC floats have swapped halves and are four times too large."""
+    """Convert floats of a file to doubles; DEC floats have swapped halves and are four times too large."""
     if processor != _DEC:
         with np.errstate(invalid="ignore"):  # a damaged file may hold signaling NaNs
             return values.astype(np.float64)
@@ -66,15 +69,15 @@ class Parameters:
     values: dict[tuple[str, str], list[float] | list[str]]
 
     @staticmethod
-    def parse(data: bytes, start: int, tell: Tell) -> Parameters:
+    def parse(data: bytes, start: int, warn: Warn) -> Parameters:
         """Read the records from byte `start` of a file of at least one block."""
         if not 0 < start <= len(data) - 4 or data[start + 3] not in INTEGER_DTYPES:
             raise CaptureError("damaged: the parameter section is missing or in an unknown number format")
         processor = data[start + 3]
         try:
-            found = list(_records(data, start + 4, processor, tell))
+            found = list(_records(data, start + 4, processor, warn))
             groups = {-group: name for group, name, _ in found if group < 0}
-            read = [(groups[group], name, raw) for group, name, raw in found if groups.get(group) in _GROUPS]
+            read = [(groups[one], name, raw) for one, name, raw in found if groups.get(one) in _READ_GROUPS]
             sizes = (
                 64 + math.prod(raw[2 : 2 + raw[1]]) * abs(int.from_bytes(raw[:1], "little", signed=True))
                 for _, _, raw in read
@@ -108,7 +111,7 @@ class Parameters:
         return [value for value in self.values.get((group, name), []) if isinstance(value, str)]
 
 
-def _records(data: bytes, at: int, processor: int, tell: Tell) -> Iterator[tuple[int, str, memoryview]]:
+def _records(data: bytes, at: int, processor: int, warn: Warn) -> Iterator[tuple[int, str, memoryview]]:
     """Number of its group (negative for the group itself), name, and content of each record."""
     order: Literal["little", "big"] = "big" if processor == _SGI else "little"
     view = memoryview(data)
@@ -128,7 +131,7 @@ def _records(data: bytes, at: int, processor: int, tell: Tell) -> Iterator[tuple
             break
         at = offset_at + offset
         if at > end:
-            tell(f"the parameter section ends with {shortened(name)!r}, which points behind it")
+            warn(f"the parameter section ends with {shortened(name)!r}, which points behind it")
             break
 
 
@@ -147,7 +150,7 @@ def _read_values(raw: bytes, processor: int) -> list[float] | list[str]:
         raise ValueError("not a parameter")
     if kind == _CHARACTER:
         width = dimensions[0] if dimensions else 1
-        return [_text(body[at : at + width]) for at in range(0, count, width)] if count else []
+        return [_decoded_text(body[at : at + width]) for at in range(0, count, width)] if count else []
     if kind == _BYTE:
         return [float(value) for value in body]
     if kind == _INTEGER:
@@ -155,7 +158,7 @@ def _read_values(raw: bytes, processor: int) -> list[float] | list[str]:
     return [float(value) for value in to_native(np.frombuffer(body, FLOAT_DTYPES[processor]), processor)]
 
 
-def _text(raw: bytes) -> str:
+def _decoded_text(raw: bytes) -> str:
     raw = raw.partition(b"\0")[0].strip(b" ")  # bytes after a zero are garbage
     try:
         return raw.decode("utf-8")
@@ -210,10 +213,10 @@ class _Extent:
 
 
 def read_points(
-    data: bytes, parameters: Parameters, header: Header, tell: Tell
+    data: bytes, parameters: Parameters, header: Header, warn: Warn
 ) -> Float[np.ndarray, "T N 4"]:
     """Coordinates in the file's unit, and residuals."""
-    frames, num_points, scale = _read_frames(data, parameters, header, tell)
+    frames, num_points, scale = _read_frames(data, parameters, header, warn)
     points = frames[:, : 4 * num_points].reshape(-1, num_points, 4)
     if scale < 0.0:
         return to_native(points, parameters.processor)
@@ -221,7 +224,7 @@ def read_points(
 
 
 def _read_frames(
-    data: bytes, parameters: Parameters, header: Header, tell: Tell
+    data: bytes, parameters: Parameters, header: Header, warn: Warn
 ) -> tuple[NDArray[np.generic], int, float]:
     """Numbers of frames as stored (T, K), those of points first; the number of points; `Header.scale`."""
     processor = parameters.processor
@@ -233,22 +236,22 @@ def _read_frames(
     parameters_at = (data[0] - 1) * BLOCK
     end = parameters_at if parameters_at > header.start else len(data)
     extent = _Extent(max(0, end - header.start), _stated_frames(parameters, header.num_frames))
-    scale = _scale(parameters, header, extent, num_points, tell)
+    scale = _scale_of(parameters, header, extent, num_points, warn)
     dtype = FLOAT_DTYPES[processor] if scale < 0.0 else INTEGER_DTYPES[processor]
     size = np.dtype(dtype).itemsize
-    analog = _analog_numbers(parameters, header, extent, size, num_points, tell)
+    analog = _analog_numbers(parameters, header, extent, size, num_points, warn)
     words = 4 * num_points + analog
-    count = _num_frames(data, header, extent, words, size, num_points == header.num_points, tell)
+    count = _num_frames(data, header, extent, words, size, num_points == header.num_points, warn)
     frames = np.frombuffer(data, dtype, count=count * words, offset=header.start).reshape(-1, words)
     if extent.stated is None:  # zeros may pad the last block
         end, most = len(frames), BLOCK // frames[:1].nbytes
-        while end > max(MOST_FRAMES, len(frames) - most) and not frames[end - 1].any():
+        while end > max(MAX_FRAMES, len(frames) - most) and not frames[end - 1].any():
             end -= 1
         frames = frames[:end]
     return frames, num_points, scale
 
 
-def _scale(parameters: Parameters, header: Header, extent: _Extent, num_points: int, tell: Tell) -> float:
+def _scale_of(parameters: Parameters, header: Header, extent: _Extent, num_points: int, warn: Warn) -> float:
     """POINT:SCALE, or the header's scale without it; see `Header.scale`."""
     scale = parameters.number("POINT", "SCALE", default=header.scale)
     if scale == 0.0 or not np.isfinite(scale):
@@ -264,7 +267,7 @@ def _scale(parameters: Parameters, header: Header, extent: _Extent, num_points: 
             raise CaptureError(
                 f"{text}: one says integers, the other floats, and the file's size does not decide"
             )
-        tell(f"{text}; by the file's size its numbers are {'floats' if as_floats else 'integers'}")
+        warn(f"{text}; by the file's size its numbers are {'floats' if as_floats else 'integers'}")
         return scale if (scale < 0.0) == as_floats else other
     if scale > 0.0 and abs(scale - other) > _SCALE_TOLERANCE * scale:
         raise CaptureError(f"{text}: the size of the positions is not known; export the file again")
@@ -272,7 +275,7 @@ def _scale(parameters: Parameters, header: Header, extent: _Extent, num_points: 
 
 
 def _analog_numbers(
-    parameters: Parameters, header: Header, extent: _Extent, size: int, num_points: int, tell: Tell
+    parameters: Parameters, header: Header, extent: _Extent, size: int, num_points: int, warn: Warn
 ) -> int:
     """Analog numbers per frame, which follow the points of each frame."""
     channels = int(parameters.number("ANALOG", "USED", default=0.0 if header.per_frame == 0 else -1.0))
@@ -291,7 +294,7 @@ def _analog_numbers(
     )
     if len(fitting) != 1:
         raise CaptureError(f"damaged: {text}; export the file again, without analog data")
-    tell(f"{text}; by the file's size they are {fitting[0]}")
+    warn(f"{text}; by the file's size they are {fitting[0]}")
     return fitting[0]
 
 
@@ -302,7 +305,7 @@ def _stated_frames(parameters: Parameters, in_header: int) -> int | None:
     """
     frames = int(parameters.number("POINT", "FRAMES", default=in_header))
     frames = frames & 0xFFFF if frames < 0 else frames
-    if frames != MOST_FRAMES:
+    if frames != MAX_FRAMES:
         return frames
     first = parameters.words("TRIAL", "ACTUAL_START_FIELD")
     last = parameters.words("TRIAL", "ACTUAL_END_FIELD")
@@ -312,7 +315,7 @@ def _stated_frames(parameters: Parameters, in_header: int) -> int | None:
 
 
 def _num_frames(
-    data: bytes, header: Header, extent: _Extent, words: int, size: int, agreed: bool, tell: Tell
+    data: bytes, header: Header, extent: _Extent, words: int, size: int, agreed: bool, warn: Warn
 ) -> int:
     """Number of frames to read, each of `words` numbers of `size` bytes."""
     present, stated = extent.room // (words * size), extent.stated
@@ -323,7 +326,7 @@ def _num_frames(
     if present < stated:
         if not 0 < header.num_frames == present:
             raise CaptureError(f"truncated: the file states {stated} frames and has room for {present}")
-        tell(f"POINT:FRAMES is {stated}, and header and data have {present} frames; these are read")
+        warn(f"POINT:FRAMES is {stated}, and header and data have {present} frames; these are read")
         return present
     used = stated * words * size
     behind = data[header.start + used + _MAX_PADDING : header.start + extent.room]
@@ -332,22 +335,22 @@ def _num_frames(
         text = f"the file states {frames}, which are {used} bytes, and has {extent.room}"
         if not agreed or stated != header.num_frames:
             raise CaptureError(f"damaged: {text}")
-        tell(f"{text}; what follows them is not read")
+        warn(f"{text}; what follows them is not read")
     return stated
 
 
-def read_c3d(data: bytes, tell: Tell = warn) -> Capture:
+def read_c3d(data: bytes, warn: Warn = emit_warning) -> Capture:
     """Read the bytes of a C3D file; points with a negative residual are missing, unless all are."""
     if len(data) < BLOCK or data[1] != 0x50:
         raise CaptureError("not a C3D file: it does not begin with a C3D header block")
-    parameters = Parameters.parse(data, (data[0] - 1) * BLOCK, tell)
+    parameters = Parameters.parse(data, (data[0] - 1) * BLOCK, warn)
     header = Header.parse(data, parameters.processor)
-    points = read_points(data, parameters, header, tell)
+    points = read_points(data, parameters, header, warn)
     rate = parameters.number("POINT", "RATE", default=header.rate)
     check_same_rate("POINT:RATE", rate, "the header's rate", header.rate)
     units = next(iter(parameters.strings("POINT", "UNITS")), "")
     if not units:
-        tell("the file states no POINT:UNITS, read as millimeters, which most programs write")
+        warn("the file states no POINT:UNITS, read as millimeters, which most programs write")
     missing = points[..., 3] < 0.0
     positions = points[..., :3] * meters_per(units or "mm")
     located = np.isfinite(positions).all(axis=-1) & (positions != 0.0).any(axis=-1)
@@ -356,9 +359,10 @@ def read_c3d(data: bytes, tell: Tell = warn) -> Capture:
     if left_out and not (located & ~missing).any():
         missing, findings = ~located, {UNMARKED: left_out}
     positions[missing] = np.nan
-    timed = timed_positions(positions, StatedTimes(repr(rate), "POINT:RATE"), tell)
+    timed = timed_positions(positions, StatedTimes(repr(rate), "POINT:RATE"), warn)
     capture = Capture(_labels(parameters, points.shape[1]), *timed, findings=findings)
-    return without_outputs(capture, [name for group in _OUTPUTS for name in _list(parameters, group)])
+    listed = [name for group in _OUTPUTS for name in _point_strings(parameters, group)]
+    return without_outputs(capture, listed)
 
 
 def write_c3d(path: Path, capture: Capture, source: bytes | None = None) -> None:
@@ -370,12 +374,12 @@ def write_c3d(path: Path, capture: Capture, source: bytes | None = None) -> None
     this field, such as ezc3d 1.7, see the first 65,535 frames.
     """
     for name in capture.names:
-        if len(name.encode()) > _BYTE_COUNT:
+        if len(name.encode()) > _MAX_COUNT:
             raise CaptureError(
-                f"marker name '{shortened(name)}' is longer than the {_BYTE_COUNT} bytes of a label"
+                f"marker name '{shortened(name)}' is longer than the {_MAX_COUNT} bytes of a label"
             )
     num_frames, num_points = capture.positions.shape[:2]
-    kept = _nothing_kept(num_frames) if source is None else _kept_of(source)
+    kept = _empty_kept(num_frames) if source is None else _read_kept(source)
     if len(kept.analogs) != num_frames:
         raise CaptureError(f"the source has {len(kept.analogs)} frames and the capture {num_frames}")
     records = _point_records(kept.group, capture, kept.unit) + kept.records
@@ -385,7 +389,7 @@ def write_c3d(path: Path, capture: Capture, source: bytes | None = None) -> None
     section = bytes([1, 0x50, blocks, _INTEL]) + records + _data_start(kept.group, 2 + blocks)
     head, num_analogs = bytearray(kept.head), kept.analogs.shape[1]
     first = int.from_bytes(head[6:8], "little")
-    last = min(first + num_frames - 1, MOST_FRAMES)
+    last = min(first + num_frames - 1, MAX_FRAMES)
     struct.pack_into("<2B4H", head, 0, 2, 0x50, num_points, num_analogs, first, last)
     struct.pack_into("<f2Hf", head, 12, -1.0, 2 + blocks, kept.samples, capture.rate)
     points = np.zeros((num_frames, num_points, 4), dtype="<f4")
@@ -395,8 +399,8 @@ def write_c3d(path: Path, capture: Capture, source: bytes | None = None) -> None
     path.write_bytes(bytes(head) + section.ljust(blocks * BLOCK, b"\0") + data + bytes(-len(data) % BLOCK))
 
 
-class _Kept(NamedTuple):
-    """What a file of points keeps of another one."""
+class _KeptContent(NamedTuple):
+    """The content of a source file that is copied beside new points."""
 
     unit: str
     """The unit of length."""
@@ -411,8 +415,8 @@ class _Kept(NamedTuple):
     """All parameters that do not describe the points."""
 
 
-def _nothing_kept(num_frames: int) -> _Kept:
-    """What a file without a source states of other things than points."""
+def _empty_kept(num_frames: int) -> _KeptContent:
+    """The content beside the points of a file that has no source."""
     head = bytearray(BLOCK)
     struct.pack_into("<H", head, 6, 1)
     struct.pack_into("<H", head, 298, 12345)  # labels of events have four characters
@@ -424,11 +428,11 @@ def _nothing_kept(num_frames: int) -> _Kept:
         _parameter(3, "ACTUAL_START_FIELD", _INTEGER, struct.pack("<2H", 1, 0), 2),
         _parameter(3, "ACTUAL_END_FIELD", _INTEGER, struct.pack("<I", num_frames), 2),
     ]
-    return _Kept("mm", bytes(head), np.empty((num_frames, 0), dtype="<f4"), 0, 1, b"".join(records))
+    return _KeptContent("mm", bytes(head), np.empty((num_frames, 0), dtype="<f4"), 0, 1, b"".join(records))
 
 
-def _kept_of(source: bytes) -> _Kept:
-    """What is kept of a C3D: analogs, events, parameters, first frame and unit."""
+def _read_kept(source: bytes) -> _KeptContent:
+    """Read the content of a C3D that is kept: analogs, events, parameters, first frame and unit."""
     parameters = Parameters.parse(source, (source[0] - 1) * BLOCK, _silent)
     header = Header.parse(source, processor := parameters.processor)
     frames, num_points, scale = _read_frames(source, parameters, header, _silent)
@@ -439,14 +443,14 @@ def _kept_of(source: bytes) -> _Kept:
         analogs = analogs.view(analogs.dtype.str.replace("i", "u"))
     words = np.frombuffer(source[:BLOCK], INTEGER_DTYPES[processor]).astype("<u2")
     head = bytearray(words.tobytes())
-    times = np.frombuffer(source[_EVENTS_AT], FLOAT_DTYPES[processor])
-    head[_EVENTS_AT] = to_native(times, processor).astype("<f4").tobytes()
-    head[_EVENTS_AT.stop :] = source[_EVENTS_AT.stop : BLOCK]
+    times = np.frombuffer(source[_EVENT_TIMES], FLOAT_DTYPES[processor])
+    head[_EVENT_TIMES] = to_native(times, processor).astype("<f4").tobytes()
+    head[_EVENT_TIMES.stop :] = source[_EVENT_TIMES.stop : BLOCK]
     channels = int(parameters.number("ANALOG", "USED", default=0.0))
     samples = analogs.shape[1] // channels if channels > 0 else header.samples
     unit = next(iter(parameters.strings("POINT", "UNITS")), "") or "mm"
     kept = _kept_records(source, processor)
-    return _Kept(unit, bytes(head), analogs.astype("<f4"), samples, *kept)
+    return _KeptContent(unit, bytes(head), analogs.astype("<f4"), samples, *kept)
 
 
 def _silent(text: str) -> None:
@@ -462,10 +466,10 @@ def _point_records(group: int, capture: Capture, unit: str) -> bytes:
             _parameter(group, "USED", _INTEGER, struct.pack("<H", num_points)),
             _parameter(group, "SCALE", _FLOAT, struct.pack("<f", -1.0)),
             _parameter(group, "RATE", _FLOAT, struct.pack("<f", capture.rate)),
-            _parameter(group, "FRAMES", _INTEGER, struct.pack("<H", min(num_frames, MOST_FRAMES))),
+            _parameter(group, "FRAMES", _INTEGER, struct.pack("<H", min(num_frames, MAX_FRAMES))),
             _parameter(group, "UNITS", _CHARACTER, unit.encode(), len(unit.encode())),
-            *_texts(group, "LABELS", capture.names),
-            *_texts(group, "DESCRIPTIONS", [""] * num_points),
+            *_text_parameters(group, "LABELS", capture.names),
+            *_text_parameters(group, "DESCRIPTIONS", [""] * num_points),
         ]
     )
 
@@ -475,10 +479,10 @@ def _data_start(group: int, block: int) -> bytes:
     return _parameter(group, "DATA_START", _INTEGER, struct.pack("<H", block))
 
 
-def _texts(group: int, name: str, texts: Sequence[str]) -> Iterator[bytes]:
+def _text_parameters(group: int, name: str, texts: Sequence[str]) -> Iterator[bytes]:
     """A parameter of texts, and its continuations."""
-    for part, start in enumerate(range(0, len(texts), _BYTE_COUNT), 1):
-        words = [text.encode() for text in texts[start : start + _BYTE_COUNT]]
+    for part, start in enumerate(range(0, len(texts), _MAX_COUNT), 1):
+        words = [text.encode() for text in texts[start : start + _MAX_COUNT]]
         width = max(map(len, words))
         content = b"".join(word.ljust(width) for word in words)
         yield _parameter(group, name + str(part) * (part > 1), _CHARACTER, content, width, len(words))
@@ -508,13 +512,13 @@ def _kept_records(source: bytes, processor: int) -> tuple[int, bytes]:
         owner = groups.get(abs(group))
         if owner == "ROTATION" and rotated:  # rotations follow the frames: dropped
             continue
-        if owner == "POINT" and (group < 0 or name == "DATA_START" or name.startswith(_OF_POINTS)):
+        if owner == "POINT" and (group < 0 or name == "DATA_START" or name.startswith(_POINT_PREFIXES)):
             continue
         try:
             own = bytes(content[: 1 + content[0]]) if group < 0 else _in_intel(content, processor)
             kept.append(_record(group, name, own))
         except (ValueError, IndexError, struct.error):
-            warn(f"the source's parameter {shortened(name)!r} is damaged, and left out")
+            emit_warning(f"the source's parameter {shortened(name)!r} is damaged, and left out")
     point = next((number for number, name in groups.items() if name == "POINT"), max(groups, default=0) + 1)
     return point, b"".join(kept)
 
@@ -534,12 +538,12 @@ def _in_intel(content: memoryview, processor: int) -> bytes:
 
 def _labels(parameters: Parameters, num_points: int) -> tuple[str, ...]:
     """The names of all points; a point without one becomes '*n'."""
-    labels = _list(parameters, "LABELS")[:num_points]
+    labels = _point_strings(parameters, "LABELS")[:num_points]
     labels += [""] * (num_points - len(labels))
     return tuple(label or f"*{number}" for number, label in enumerate(labels, 1))
 
 
-def _list(parameters: Parameters, name: str) -> list[str]:
+def _point_strings(parameters: Parameters, name: str) -> list[str]:
     """The strings of a parameter of the group POINT and its continuations (LABELS, LABELS2, LABELS3, ...)."""
     names = itertools.chain([name], (f"{name}{number}" for number in itertools.count(2)))
     parts = (parameters.strings("POINT", one) for one in names)

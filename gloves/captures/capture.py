@@ -28,7 +28,7 @@ _MIN_CENTIMETERS: Final = 0.002  # [m]: smallest span of hands in centimeters th
 _MAX_SPACING: Final = 1.5  # [m]: largest median distance of a point from the nearest other one
 _MIN_POINTS: Final = 5  # A cloud needs this many points to show its unit; fewer may all be strays.
 _MIN_FRAMES: Final = 10  # Small or wide clouds count in this many frames; fewer may show strays alone.
-_SAMPLED: Final = 200  # frames that are looked at, evenly spread
+_MAX_SAMPLES: Final = 200  # frames that are looked at, evenly spread
 
 
 OF_ARRAYS: Final = "gloves.Capture(names, positions, rate) makes a capture of arrays (docs/marker_files.md)"
@@ -193,7 +193,7 @@ def spacing(cloud: Float[np.ndarray, "N 3"]) -> float:
 def unit_fault(clouds: Sequence[Float[np.ndarray, "N 3"]], *, only_wide: bool = False) -> UnitFault | None:
     """The sign that clouds are not in meters, None without one."""
     shown = [cloud for cloud in clouds if len(cloud) >= _MIN_POINTS]
-    step = -(-len(shown) // _SAMPLED) or 1
+    step = -(-len(shown) // _MAX_SAMPLES) or 1
     shown = shown[::step]
     if not shown:
         return None

@@ -1,8 +1,8 @@
-"""Keep the measured points of a file, and drop missing, held and doubled ones and outputs of models.
+"""Cleaning of captures: measured points stay; missing, held and doubled points and model outputs are dropped.
 
-Programs write more than was measured. Gaps hold zeros or the last position, a marker of two subjects comes
-twice, outputs of models lie between the markers, and unlabeled points get a column for each piece of their
-path. `settled` cleans a capture of any format, and `findings_sentence` counts what was found.
+Programs write more than was measured: zeros or the last position in gaps, a marker once for each of two
+subjects, model outputs among the markers, and a column for each piece of an unlabeled path. `settled` cleans
+a capture of any format. `findings_sentence` describes what was dropped.
 """
 
 from __future__ import annotations
@@ -43,28 +43,31 @@ _SENTENCES: Final = {
     _REPEATED: "{} frames repeat the one before, as where frames were lost or the rate was raised; motion "
     "jumps after them",
 }
-"""The kinds of findings, the keys of `Capture.findings`, in the order in which they are told."""
-_MODELED: Final = re.compile(
+"""The kinds of findings, the keys of `Capture.findings`, in the order of `findings_sentence`."""
+_OUTPUT_NAME: Final = re.compile(
     r".(?:Angle|Force|Moment|Power|Scalar)s?$|[_. -](?:angle|force|moment|power|scalar)s?$|"
     r"[_. -](?:ANGLE|FORCE|MOMENT|POWER|SCALAR)S?$"
 )
 """Names that models give their outputs: RThumbAngles, LWristMoment, R_WRIST_ANGLE."""
-_SAME_PLACE: Final = 1e-3  # Markers this near [m] are one: the smallest markers are 1.5 mm wide.
-_SAME_SHARE: Final = 5e-3  # The same as a share of the extent of all points, for files with a wrong unit.
-_JUMP: Final = 0.02  # Points that move farther than this in a frame [m] jump; three jumps show a stand-in.
-_NEIGHBORS: Final = 8  # A point is compared with this many points that follow it along a line.
-_MIN_FRAMES: Final = 10  # Repetitions count in this many frames; in fewer they may be chance.
-_NEVER_STILL: Final = 2e-5  # A marker that moves more than this in a frame [m] was not at rest before it.
-_NO_BEND: Final = 3e-7  # Steps that differ by less than this [m] are equal up to rounding.
-_FINE: Final = 1e-7  # On a grid finer than this [m], measured steps are never equal.
-_COARSE: Final = 5e-6  # On a grid coarser than this [m], markers at rest repeat their positions.
-_GRID_STEPS: Final = 20.0  # A marker at rest moves by fewer grid steps than this in a frame.
-_GRID_COUNT: Final = 10  # This many smallest steps of equal size show a grid.
-_AT_REST: Final = 0.4  # A marker starts abruptly if its first step is more than this share of the second one.
+_SAME_PLACE: Final = 1e-3  # distance within which two points are one [m]; the smallest markers are 1.5 mm
+_SAME_PLACE_SHARE: Final = 5e-3
+"""The same limit as a share of the extent of all points, for files that state a wrong unit."""
+_JUMP_LENGTH: Final = 0.02
+"""Least motion in a frame that counts as a jump [m]; three jumps to one place show a stand-in."""
+_NEIGHBORS: Final = 8  # number of following points along a line that a point is compared with
+_MIN_FRAMES: Final = 10  # Repetitions in fewer frames may be chance.
+_MOVING_STEP: Final = 2e-5  # A marker that moves farther in a frame [m] was not at rest before it.
+_MAX_BEND: Final = 3e-7  # Steps that differ by less than this [m] are equal up to rounding.
+_FINE_GRID: Final = 1e-7  # Measured steps on a finer grid [m] are never equal.
+_COARSE_GRID: Final = 5e-6  # Markers at rest repeat their positions on a coarser grid [m].
+_GRID_STEPS: Final = 20.0  # A marker at rest moves by fewer grid steps in a frame.
+_GRID_COUNT: Final = 10  # number of equal smallest steps that show a grid
+_REST_RATIO: Final = 0.4
+"""A marker starts abruptly if its first step is longer than this share of the second one."""
 
 
 def findings_sentence(findings: Mapping[str, int]) -> str:
-    """What was found in a file, in words; blank if nothing was."""
+    """A sentence on the findings in a file; empty if there are none."""
     return "; ".join(text.format(findings[kind]) for kind, text in _SENTENCES.items() if findings.get(kind))
 
 
@@ -75,15 +78,15 @@ def settled(capture: Capture) -> Capture:
     capture, counts[_ZEROS], counts[_STAND_INS] = _without_stand_ins(capture)
     if capture.num_frames >= _MIN_FRAMES:
         capture, counts[_DOUBLED] = _without_doubles(capture)
-        for kind, found in ((_HELD, _held), (_STRAIGHT, _interpolated)):
+        for kind, found in ((_HELD, _held_points), (_STRAIGHT, _interpolated_points)):
             filled = found(capture.positions)
             counts[kind] = int(filled.sum())
             if filled.any():
                 positions = np.where(filled[..., None], np.nan, capture.positions)
                 capture = dataclasses.replace(capture, positions=positions)
         counts[_REPEATED] = _repeated_frames(capture.positions)
-    told = Counter(capture.findings) + Counter(counts)  # the sum drops counts of zero
-    return dataclasses.replace(capture, findings=dict(told))
+    findings = Counter(capture.findings) + Counter(counts)  # the sum drops counts of zero
+    return dataclasses.replace(capture, findings=dict(findings))
 
 
 def without_outputs(capture: Capture, listed: Sequence[str] = ()) -> Capture:
@@ -98,7 +101,7 @@ def without_outputs(capture: Capture, listed: Sequence[str] = ()) -> Capture:
         if not (
             name in whole
             or (name in bare if ":" not in name else name.rpartition(":")[2] in whole)
-            or _MODELED.search(name)
+            or _OUTPUT_NAME.search(name)
         )
     ]
     count = len(capture.names) - len(kept)
@@ -117,11 +120,11 @@ def without_outputs(capture: Capture, listed: Sequence[str] = ()) -> Capture:
 
 
 def _without_stand_ins(capture: Capture) -> tuple[Capture, int, int]:
-    """A capture without points that stand for none; how many were at (0, 0, 0), and how many elsewhere.
+    """Drop stand-ins for missing points; also count those at (0, 0, 0), and those elsewhere.
 
-    Some programs write zeros for what was not seen, -1 or 9999 three times, or (0, 0, -1). A measured point
-    never has one number in all coordinates twice, and markers do not jump again and again to one place that
-    none moves to; a capture in which nothing moves is left as it is.
+    Some programs write (0, 0, 0), (-1, -1, -1), (9999, 9999, 9999) or (0, 0, -1) for a missing point. A
+    measured point never repeats a position with three equal coordinates, and markers do not jump again and
+    again to a place that none moves to. A capture in which nothing moves stays unchanged.
     """
     positions = capture.positions
     equal = (positions == positions[..., :1]).all(axis=-1)
@@ -129,8 +132,8 @@ def _without_stand_ins(capture: Capture) -> tuple[Capture, int, int]:
     repeats = (counts > 1) & ((values == 0.0) | (capture.num_frames >= _MIN_FRAMES))
     keys = (positions * [1.0, np.pi, np.e]).sum(axis=-1)  # different positions have different ones
     steps = np.linalg.norm(np.diff(positions, axis=0), axis=-1)
-    near = keys[1:][(steps > 0.0) & (steps <= _JUMP)]
-    frames, columns = np.nonzero(steps > _JUMP)
+    near = keys[1:][(steps > 0.0) & (steps <= _JUMP_LENGTH)]
+    frames, columns = np.nonzero(steps > _JUMP_LENGTH)
     aims = np.unique(np.stack([keys[frames + 1, columns], frames]), axis=1)
     aims, counts = np.unique(aims[0], return_counts=True)
     equal &= np.isin(positions[..., 0], values[repeats])
@@ -146,9 +149,9 @@ def _without_stand_ins(capture: Capture) -> tuple[Capture, int, int]:
 
 
 def _without_doubles(capture: Capture) -> tuple[Capture, int]:
-    """The capture without points that double another of their frame, and the number of doubles.
+    """Drop points that repeat another point of their frame, and count them.
 
-    Two columns that always agree where both have a point become one, with the points of both.
+    Two columns that agree in every frame in which both have a point are merged.
     """
     positions = capture.positions
     there = np.isfinite(positions[..., 0]) & (positions != 0.0).any(axis=-1)  # zeros: nothing moves
@@ -157,7 +160,7 @@ def _without_doubles(capture: Capture) -> tuple[Capture, int]:
     ranked = np.take_along_axis(key, order, axis=1)
     if not there.any():
         return capture, 0
-    near = min(_SAME_PLACE, _SAME_SHARE * float(np.ptp(positions[there], axis=0).max(initial=0.0)))
+    near = min(_SAME_PLACE, _SAME_PLACE_SHARE * float(np.ptp(positions[there], axis=0).max(initial=0.0)))
     found = []
     for lag in range(1, min(_NEIGHBORS, len(capture.names) - 1) + 1):
         frames, ranks = np.nonzero(ranked[:, lag:] - ranked[:, :-lag] <= near)
@@ -183,7 +186,7 @@ def _without_doubles(capture: Capture) -> tuple[Capture, int]:
     return dataclasses.replace(capture, names=names, positions=positions[:, left]), doubled
 
 
-def _held(positions: Float[np.ndarray, "T N 3"]) -> Bool[np.ndarray, "T N"]:
+def _held_points(positions: Float[np.ndarray, "T N 3"]) -> Bool[np.ndarray, "T N"]:
     """Points that repeat the last position in a gap, or the first one before the marker appeared.
 
     Such a marker stops and starts abruptly. One that rests slows down and speeds up, and does not repeat its
@@ -196,19 +199,19 @@ def _held(positions: Float[np.ndarray, "T N 3"]) -> Bool[np.ndarray, "T N"]:
         return np.zeros((num_frames, num_columns), dtype=np.bool_)
     steps = np.full((num_frames + 3, num_columns), np.nan)  # two frames without a step at each end
     steps[2:-2] = np.linalg.norm(moves, axis=-1)
-    grid = _grid(moves)
-    abrupt = max(_NEVER_STILL, _GRID_STEPS * grid)
+    grid = _grid_step(moves)
+    abrupt = max(_MOVING_STEP, _GRID_STEPS * grid)
 
     columns, first, last = column_runs(repeated)
     last += 1  # the last frame of a run of equal positions
     ends = [
-        np.where(step > _AT_REST * np.nan_to_num(steps[beyond, columns]), step, 0.0)
+        np.where(step > _REST_RATIO * np.nan_to_num(steps[beyond, columns]), step, 0.0)
         for at, beyond in ((first + 1, first), (last + 2, last + 3))
         for step in (steps[at, columns],)
     ]
     known = [np.isfinite(steps[at, columns]) for at in (first + 1, last + 2)]
     abruptly = [end > abrupt for end in ends]
-    if grid > _COARSE:  # a marker at rest repeats its position, and may be stopped abruptly by an object
+    if grid > _COARSE_GRID:  # a marker at rest repeats its position, and may be stopped abruptly by an object
         held = (known[0] | known[1]) & (abruptly[0] | ~known[0]) & (abruptly[1] | ~known[1])
         held &= last > first + 1
     else:
@@ -234,27 +237,27 @@ def _repeated_frames(positions: Float[np.ndarray, "T N 3"]) -> int:
     return int((repeats & there).sum()) if (there & ~repeats).any() else 0
 
 
-def _interpolated(positions: Float[np.ndarray, "T N 3"]) -> Bool[np.ndarray, "T N"]:
+def _interpolated_points(positions: Float[np.ndarray, "T N 3"]) -> Bool[np.ndarray, "T N"]:
     """Points of gaps of three frames or more that were filled along a line, by equal steps.
 
     Measured steps are never equal, but rounded ones are, and those of simulated motion without noise.
     """
     missing = np.zeros(positions.shape[:2], dtype=np.bool_)
     moves = np.diff(positions, axis=0)
-    if _grid(moves) > _FINE:
+    if _grid_step(moves) > _FINE_GRID:
         return missing
     # differences of the second to the fourth order, NaN beside a gap; only those of noise grow with the order
     bend, third, fourth = (np.linalg.norm(np.diff(moves, order, axis=0), axis=-1) for order in (1, 2, 3))
-    measured = bend[2:] > _NO_BEND
+    measured = bend[2:] > _MAX_BEND
     noisy = (measured & (fourth > third[1:])).sum(axis=0) > (measured & (fourth <= third[1:])).sum(axis=0)
-    straight = noisy & (bend < _NO_BEND) & (np.linalg.norm(moves[1:], axis=-1) > _NEVER_STILL)
+    straight = noisy & (bend < _MAX_BEND) & (np.linalg.norm(moves[1:], axis=-1) > _MOVING_STEP)
     three = straight[2:] & straight[1:-1] & straight[:-2]
     for begin in range(3):
         missing[1 + begin : len(three) + 1 + begin] |= three
     return missing
 
 
-def _grid(moves: Float[np.ndarray, "T-1 N 3"]) -> float:
+def _grid_step(moves: Float[np.ndarray, "T-1 N 3"]) -> float:
     """The step [m] of the grid that coordinates are rounded to; 0 if none shows."""
     sizes = np.abs(moves[np.isfinite(moves) & (moves != 0.0)])
     smallest = float(sizes.min(initial=np.inf))

@@ -49,14 +49,15 @@ from gloves.captures.coordinates import OUTPUTS, PIECES, findings_sentence, sett
 from gloves.captures.pieces import Trajectories
 from gloves.captures.text import (
     LEADING,
+    MAX_CELLS,
     MAX_DIGITS,
-    MOST_CELLS,
     TAB,
     StatedTimes,
     TableColumns,
-    Tell,
+    Warn,
     cell_number,
     check_width,
+    emit_warning,
     header_cells,
     meters_per,
     parse_table,
@@ -64,45 +65,47 @@ from gloves.captures.text import (
     separator_behind,
     split_lines,
     timed_positions,
-    warn,
 )
 from handsim._checks import check_type
 from handsim.errors import CaptureError, HandSimWarning, choices, errors_of, shortened
 from handsim.files.inputs import read_bytes
 from handsim.files.outputs import as_text, atomic_write, writing
 
-_BEGIN: Final = b"PathFileType"
+_TRC_BEGIN: Final = b"PathFileType"
 _HEADER_LINES: Final = 5
 _NO_MARKERS: Final = "no markers: line 4 should read 'Frame#', 'Time', then the marker names"
-_KEYS: Final = "DataRate CameraRate NumFrames NumMarkers Units OrigDataRate OrigDataStartFrame OrigNumFrames"
+_TRC_KEYS: Final = (
+    "DataRate CameraRate NumFrames NumMarkers Units OrigDataRate OrigDataStartFrame OrigNumFrames"
+)
 MOTIVE_BEGIN: Final = b"Format Version"
-_COUNT: Final = "Total Exported Frames"
-_UNIT: Final = "Length Units"
-_SPACE: Final = "Coordinate Space"
-_RATES: Final = ("Export Frame Rate", "Capture Frame Rate")
+_COUNT_KEY: Final = "Total Exported Frames"
+_UNIT_KEY: Final = "Length Units"
+_SPACE_KEY: Final = "Coordinate Space"
+_RATE_KEYS: Final = ("Export Frame Rate", "Capture Frame Rate")
 _MOTIVE_KEYS: Final = {
-    key.lower(): key for key in ("Format Version", "Take Name", "Take Notes", *_RATES, _COUNT, _UNIT, _SPACE)
+    key.lower(): key
+    for key in ("Format Version", "Take Name", "Take Notes", *_RATE_KEYS, _COUNT_KEY, _UNIT_KEY, _SPACE_KEY)
 }
-_AXES: Final = ["X", "Y", "Z"]
-_TYPES: Final = {"Marker", "Rigid Body", "Rigid Body Marker", "Bone", "Bone Marker"}
-_TITLE: Final = "Trajectories"
-_SECTIONS: Final = (_TITLE, "Devices", "Model Outputs", "Joints", "Segments")
-_FIRST_CELLS: Final = ("frame", "field #")
+_XYZ: Final = ["X", "Y", "Z"]
+_MOTIVE_TYPES: Final = {"Marker", "Rigid Body", "Rigid Body Marker", "Bone", "Bone Marker"}
+_TRAJECTORIES: Final = "Trajectories"
+_SECTIONS: Final = (_TRAJECTORIES, "Devices", "Model Outputs", "Joints", "Segments")
+_FRAME_TITLES: Final = ("frame", "field #")
 _OUTPUT_UNITS: Final = {"deg", "rad", "n", "nmm", "n.mm", "nm", "n.m", "w", "kg", "v", "mv"}
 """Units of angles, forces, moments, powers and signals, in lower case."""
-_BLANKS: Final = b' \t",;'
-_BEGINS: Final = (b"NO_OF_FRAMES", b"FILE_VERSION")
-_KEY: Final = re.compile(rb"(?!NULL\t)[A-Z][A-Z0-9_]*(\t|$)")
+_BLANK_BYTES: Final = b' \t",;'
+_QTM_BEGINS: Final = (b"NO_OF_FRAMES", b"FILE_VERSION")
+_QTM_KEY: Final = re.compile(rb"(?!NULL\t)[A-Z][A-Z0-9_]*(\t|$)")
 _QTM_LEADING: Final = ("frame", "time")
 _LEADING_TITLE: Final = re.compile(r"frame|time|#|$", re.I)
-_AXIS: Final = re.compile(r"(.+?)[ ._:-]?([xyz])", re.I)
-_COPY: Final = re.compile(r"(.+)\.[12]")  # pandas numbers columns of the same name
+_AXIS_TITLE: Final = re.compile(r"(.+?)[ ._:-]?([xyz])", re.I)
+_COPY_TITLE: Final = re.compile(r"(.+)\.[12]")  # pandas numbers columns of the same name
 _FIRST_BYTES: Final = 200  # bytes that show which program wrote a CSV
-_SKELETON: Final = "the motion of a skeleton without its markers; export the markers where it was made"
-_VICON: Final = "a file of Vicon's own; export C3D or ASCII with trajectories from Nexus"
-_CORTEX: Final = "a binary file of Cortex; export TRC or C3D from there"
-_OPENSIM: Final = "angles or forces of OpenSim and no markers; give the TRC that they were made of"
-_UNREAD: Final = {
+_SKELETON_HINT: Final = "the motion of a skeleton without its markers; export the markers where it was made"
+_VICON_HINT: Final = "a file of Vicon's own; export C3D or ASCII with trajectories from Nexus"
+_CORTEX_HINT: Final = "a binary file of Cortex; export TRC or C3D from there"
+_OPENSIM_HINT: Final = "angles or forces of OpenSim and no markers; give the TRC that they were made of"
+_FOREIGN_ENDINGS: Final = {
     ".tak": "a take of Motive, a closed format; export CSV or C3D with unlabeled markers from Motive",
     ".qtm": "a file of Qualisys' own; export C3D, or TSV of 3D data, from QTM",
     **dict.fromkeys((".gz", ".zip", ".7z", ".rar"), "compressed; unpack it"),
@@ -110,16 +113,16 @@ _UNREAD: Final = {
     ".npy": f"an array of NumPy; {OF_ARRAYS}",
     ".npz": "an archive of NumPy; if it is a take, load_take reads it, and its capture() has the points; "
     f"{OF_ARRAYS}",
-    **dict.fromkeys((".x1d", ".x2d", ".v", ".vsk", ".enf", ".system"), _VICON),
-    **dict.fromkeys((".trb", ".cap"), _CORTEX),
-    **dict.fromkeys((".mot", ".sto", ".osim"), _OPENSIM),
-    **dict.fromkeys((".bvh", ".fbx", ".amc", ".asf", ".htr", ".mvnx", ".glb"), _SKELETON),
+    **dict.fromkeys((".x1d", ".x2d", ".v", ".vsk", ".enf", ".system"), _VICON_HINT),
+    **dict.fromkeys((".trb", ".cap"), _CORTEX_HINT),
+    **dict.fromkeys((".mot", ".sto", ".osim"), _OPENSIM_HINT),
+    **dict.fromkeys((".bvh", ".fbx", ".amc", ".asf", ".htr", ".mvnx", ".glb"), _SKELETON_HINT),
 }
 """Descriptions of other programs' files and what to export instead, by ending."""
-_FOREIGN: Final = {
-    _BEGIN.lower(): "the content of a TRC; name it .trc",
+_FOREIGN_BEGINS: Final = {
+    _TRC_BEGIN.lower(): "the content of a TRC; name it .trc",
     MOTIVE_BEGIN.lower(): "the content of Motive's CSV; name it .csv",
-    **{word.lower(): "the content of a TSV of Qualisys; name it .tsv" for word in _BEGINS},
+    **{word.lower(): "the content of a TSV of Qualisys; name it .tsv" for word in _QTM_BEGINS},
     b"comment,this file was exported from": "a CSV of Tracking Tools; export its take from Motive",
     b"objects": "a CSV of Vicon Tracker with bodies and no markers",
     b"%time,": "a topic of ROS",
@@ -134,12 +137,12 @@ _FOREIGN: Final = {
 WRITABLE: Final = (".trc", ".c3d", ".csv")
 
 
-def read_trc(data: bytes, tell: Tell = warn) -> Capture:
+def read_trc(data: bytes, warn: Warn = emit_warning) -> Capture:
     """Read the bytes of a TRC file."""
     lines, ended = split_lines(data)
-    if not lines[0].lstrip(b' \t"').lower().startswith(_BEGIN.lower()):
+    if not lines[0].lstrip(b' \t"').lower().startswith(_TRC_BEGIN.lower()):
         raise CaptureError("not a TRC file: line 1 does not begin with 'PathFileType'")
-    lines = plain_lines(lines, separator_behind([_BEGIN], lines[0]) or TAB, wider=True)
+    lines = plain_lines(lines, separator_behind([_TRC_BEGIN], lines[0]) or TAB, wider=True)
     lines = _tabs_for_spaces(lines)
     # a header line without a line end may be cut
     whole = len(lines) if ended else len(lines) - 1
@@ -155,20 +158,20 @@ def read_trc(data: bytes, tell: Tell = warn) -> Capture:
         raise CaptureError("the header (lines 2 and 3) states no Units")
     scale = meters_per(stated["units"])
     names = _marker_names(titles, sum(bool(cell) for cell in axes))
-    names += _unnamed(lines[_HEADER_LINES:], len(names))
+    names += _unnamed_names(lines[_HEADER_LINES:], len(names))
 
     columns = TableColumns.of_triples(("frame number", "time"), names, scale)
     leading, read = parse_table(lines, columns, start=_HEADER_LINES, ended=ended)
     stated |= {key: stated.get(key.lower(), "") for key in ("DataRate", "NumFrames")}
-    return _timed(read, leading, stated, ("DataRate", "NumFrames"), tell, count_is_reliable=False)
+    return _timed_capture(read, leading, stated, ("DataRate", "NumFrames"), warn, count_is_reliable=False)
 
 
-def _timed(
+def _timed_capture(
     read: Trajectories,
     leading: Float[np.ndarray, "T 2"],
     stated: Mapping[str, str],
     keys: tuple[str, str],
-    tell: Tell,
+    warn: Warn,
     *,
     count_is_reliable: bool = True,
     outputs: int = 0,
@@ -176,7 +179,7 @@ def _timed(
     """The capture of trajectories with the numbers and times of its rows, and the keys of rate and count."""
     (rate, count), (numbers, times) = keys, leading.T
     values = stated.get(rate, ""), rate, numbers, times, stated.get(count, ""), count, count_is_reliable
-    timed = timed_positions(read.positions, StatedTimes(*values), tell)
+    timed = timed_positions(read.positions, StatedTimes(*values), warn)
     return Capture(read.names, *timed, findings={PIECES: read.pieces, OUTPUTS: outputs})
 
 
@@ -210,7 +213,7 @@ def write_trc(path: Path, capture: Capture, *, title: str) -> None:
     values = (rate, rate, str(num_frames), str(num_markers), "mm", rate, "1", str(num_frames))
     header = (
         f"PathFileType\t4\t(X/Y/Z)\t{title}",
-        _KEYS.replace(" ", "\t"),
+        _TRC_KEYS.replace(" ", "\t"),
         "\t".join(values),
         "\t".join(["Frame#", "Time", *(cell for name in capture.names for cell in (name, "", "")), ""]),
         "\t\t" + "".join(f"X{number}\tY{number}\tZ{number}\t" for number in range(1, num_markers + 1)),
@@ -245,7 +248,7 @@ def _marker_names(titles: list[str], num_axes: int) -> tuple[str, ...]:
     return names
 
 
-def _unnamed(rows: list[bytes], num_named: int) -> tuple[str, ...]:
+def _unnamed_names(rows: list[bytes], num_named: int) -> tuple[str, ...]:
     """Names '*n' for trajectories that line 4 does not name, as Cortex writes them at the ends of rows."""
     expected = LEADING + 3 * num_named
     widths = [row.rstrip(b" \t").count(TAB) + 1 for row in rows]
@@ -262,7 +265,7 @@ def _unnamed(rows: list[bytes], num_named: int) -> tuple[str, ...]:
     return tuple(f"*{num_named + number}" for number in range(1, extra // 3 + 1))
 
 
-def read_motive_csv(data: bytes, tell: Tell = warn) -> Capture:
+def read_motive_csv(data: bytes, warn: Warn = emit_warning) -> Capture:
     """Read the markers, labeled or not, in the bytes of a Motive CSV; rigid bodies and bones are ignored."""
     lines, ended = split_lines(data)
     separator = separator_behind([MOTIVE_BEGIN], lines[0])
@@ -282,16 +285,16 @@ def read_motive_csv(data: bytes, tell: Tell = warn) -> Capture:
         for key, value in itertools.pairwise(row)
         if key.lower() in _MOTIVE_KEYS
     }
-    rate_key = next((key for key in _RATES if stated.get(key)), _RATES[-1])
-    if not stated.get(_UNIT):
-        tell("line 1 states no Length Units, read as meters, which Motive writes unless told otherwise")
-    scale = meters_per(stated.get(_UNIT) or "Meters")
-    if stated.get(_SPACE) == "Local":
-        tell("Coordinate Space is Local: markers stand still in their bodies; export world coordinates")
+    rate_key = next((key for key in _RATE_KEYS if stated.get(key)), _RATE_KEYS[-1])
+    if not stated.get(_UNIT_KEY):
+        warn("line 1 states no Length Units, read as meters, which Motive writes unless told otherwise")
+    scale = meters_per(stated.get(_UNIT_KEY) or "Meters")
+    if stated.get(_SPACE_KEY) == "Local":
+        warn("Coordinate Space is Local: markers stand still in their bodies; export world coordinates")
     axes = rows[end]
     header = [row for row in rows[keyed[-1] + 1 : end] if any(row)]
     # files without labels begin with the types, behind two blank cells
-    if len(header) > 2 and not any(header[0][:2]) and set(header[0]) & _TYPES:
+    if len(header) > 2 and not any(header[0][:2]) and set(header[0]) & _MOTIVE_TYPES:
         types, names = header[:2]
     else:
         types, names = (_labeled_row(header, label) for label in ("Type", "Name"))
@@ -308,7 +311,7 @@ def read_motive_csv(data: bytes, tell: Tell = warn) -> Capture:
     leading, read = parse_table(lines, table, start=end + 1, ended=ended)
     if not re.match(r"time( \(|$)", axes[1], re.I):
         leading[:, 1] = np.nan
-    return _timed(read, leading, stated, (rate_key, _COUNT), tell)
+    return _timed_capture(read, leading, stated, (rate_key, _COUNT_KEY), warn)
 
 
 def write_motive_csv(path: Path, capture: Capture, *, title: str) -> None:
@@ -335,9 +338,9 @@ def write_motive_csv(path: Path, capture: Capture, *, title: str) -> None:
         writer.writerow([])
         writer.writerow(["", "Type", *["Marker"] * (3 * num_markers)])
         for label, values in (("Name", capture.names), ("ID", ids)):
-            writer.writerow(["", label, *(value for value in values for _ in _AXES)])
+            writer.writerow(["", label, *(value for value in values for _ in _XYZ)])
         writer.writerow(["", "", *["Position"] * (3 * num_markers)])
-        writer.writerow(["Frame", "Time (Seconds)", *_AXES * num_markers])
+        writer.writerow(["Frame", "Time (Seconds)", *_XYZ * num_markers])
         _write_rows(file, capture, "%d,%.6f" + ",%.6f" * (3 * num_markers), first=0)
 
 
@@ -363,7 +366,7 @@ def _marker_columns(types: list[str], quantities: list[str], axes: list[str]) ->
             f"{', '.join(kinds) or 'none'} (export it with markers and unlabeled markers)"
         )
     for index in columns:
-        if axes[index : index + 3] != _AXES:
+        if axes[index : index + 3] != _XYZ:
             raise CaptureError(
                 f"column {index + 1}: expected the axes X, Y, Z, got {', '.join(axes[index : index + 3])}"
             )
@@ -376,36 +379,36 @@ def vicon_sections(lines: list[bytes]) -> dict[str, int]:
     found: dict[str, int] = {}
     for index, line in enumerate(lines):
         if line[:1].isalpha() or line[:1] == b'"':
-            title = titles.get(line.strip(_BLANKS).lower())
+            title = titles.get(line.strip(_BLANK_BYTES).lower())
             # the word is a title only if the next line is a rate
-            if title and index + 1 < len(lines) and lines[index + 1].lstrip(_BLANKS)[:1].isdigit():
+            if title and index + 1 < len(lines) and lines[index + 1].lstrip(_BLANK_BYTES)[:1].isdigit():
                 found.setdefault(title, index)
     return found
 
 
-def read_vicon_csv(data: bytes, tell: Tell = warn) -> Capture:
+def read_vicon_csv(data: bytes, warn: Warn = emit_warning) -> Capture:
     """Read the trajectories, labeled or not, in the bytes of a Vicon CSV."""
     lines, ended = split_lines(data)
     sections = vicon_sections(lines)
-    if _TITLE not in sections:
+    if _TRAJECTORIES not in sections:
         raise CaptureError(
             "not a Vicon CSV export with trajectories: no line reads 'Trajectories'; sections in the file: "
             f"{', '.join(sections) or 'none'}"
         )
-    at = sections[_TITLE]
-    end = next((row for row in range(at, len(lines)) if not lines[row].strip(_BLANKS)), len(lines))
+    at = sections[_TRAJECTORIES]
+    end = next((row for row in range(at, len(lines)) if not lines[row].strip(_BLANK_BYTES)), len(lines))
     if end < at + 4 or (end == at + 4 == len(lines) and not ended):
         raise CaptureError("the header is cut: expected rate, names and axes behind the line 'Trajectories'")
     separator = max(b",", b";", b"\t", key=lines[at + 3].count)
     lines = [*lines[:at], *plain_lines(lines[at:end], separator, first=at + 1), *lines[end:]]
     rates, names, axes = (header_cells(lines[row], row + 1) for row in range(at + 1, at + 4))
-    if axes[0].lower() not in _FIRST_CELLS:
+    if axes[0].lower() not in _FRAME_TITLES:
         raise CaptureError(f"line {at + 4} begins with '{shortened(axes[0])}', expected 'Frame'")
-    columns = np.array([index for index in range(len(axes) - 2) if axes[index : index + 3] == _AXES])
+    columns = np.array([index for index in range(len(axes) - 2) if axes[index : index + 3] == _XYZ])
     if not len(columns):
         raise CaptureError(f"no markers: line {at + 4} has no axes X, Y, Z")
     num_columns = len(columns)
-    start, columns, scales = _scales(lines[:end], at + 4, columns, tell)
+    start, columns, scales = _vicon_units(lines[:end], at + 4, columns, warn)
     names += [""] * (len(axes) - len(names))
     # A name stands above the first of its three columns.
     above = [next(filter(None, names[max(0, n - 2) : n + 1][::-1]), "") for n in range(len(axes))]
@@ -418,16 +421,16 @@ def read_vicon_csv(data: bytes, tell: Tell = warn) -> Capture:
     leading, read = parse_table(lines[:end], table, start=start, ended=ended or end < len(lines))
     leading[:, 1] = np.nan  # sub-frames are no times
     key = "the rate of the trajectories"
-    return _timed(read, leading, {key: rates[0]}, (key, ""), tell, outputs=num_columns - len(columns))
+    return _timed_capture(read, leading, {key: rates[0]}, (key, ""), warn, outputs=num_columns - len(columns))
 
 
-def _scales(
-    lines: list[bytes], row: int, columns: Int[np.ndarray, "N"], tell: Tell
+def _vicon_units(
+    lines: list[bytes], row: int, columns: Int[np.ndarray, "N"], warn: Warn
 ) -> tuple[int, NDArray[np.int64], NDArray[np.float64]]:
     """Index of the first row of numbers, the trajectories in units of length, and meters per unit of each."""
     cells = header_cells(lines[row], row + 1) if row < len(lines) else []
     if cells and cells[0]:  # a frame number: there is no row of units
-        tell("the file states no unit of length, read as millimeters, which Vicon's programs write")
+        warn("the file states no unit of length, read as millimeters, which Vicon's programs write")
         return row, columns, np.full(len(columns), meters_per("mm"))
     units = np.array([cells[column] if column < len(cells) else "" for column in columns])
     lengths = np.array([unit.lower() not in _OUTPUT_UNITS for unit in units])
@@ -437,16 +440,16 @@ def _scales(
     return row + 1, columns, np.array([scales[unit] for unit in units])
 
 
-def read_qtm_tsv(data: bytes, tell: Tell = warn) -> Capture:
+def read_qtm_tsv(data: bytes, warn: Warn = emit_warning) -> Capture:
     """Read the markers in the bytes of a Qualisys TSV with 3D data."""
     lines, ended = split_lines(data)
-    separator = separator_behind(_BEGINS, lines[0])
+    separator = separator_behind(_QTM_BEGINS, lines[0])
     if separator is None:
         raise CaptureError(
             "not a Qualisys TSV export: line 1 does not begin with 'NO_OF_FRAMES' or 'FILE_VERSION'"
         )
     lines = plain_lines(lines, separator, wider=True)
-    start = next((index for index, line in enumerate(lines) if not _KEY.match(line)), len(lines))
+    start = next((index for index, line in enumerate(lines) if not _QTM_KEY.match(line)), len(lines))
     if start == len(lines) and not ended:
         raise CaptureError("the header is cut: no line of column names or numbers follows it")
     stated = {
@@ -460,21 +463,21 @@ def read_qtm_tsv(data: bytes, tell: Tell = warn) -> Capture:
         raise CaptureError(f"DATA_INCLUDED is '{shortened(included)}', expected '3D'; export the 3D data")
     if "MARKER_NAMES" not in stated:
         raise CaptureError("the header states no MARKER_NAMES")
-    names = _names(stated["MARKER_NAMES"], firsts.get("NO_OF_MARKERS", ""))
+    names = _qtm_names(stated["MARKER_NAMES"], firsts.get("NO_OF_MARKERS", ""))
     start, num_leading = _begin_of_rows(lines, start, 3 * len(names))
 
     columns = TableColumns.of_triples(_QTM_LEADING[:num_leading], names, meters_per("mm"))
     leading, read = parse_table(lines, columns, start=start, ended=ended)
     leading[:, num_leading:] = np.nan
-    return _timed(read, leading, firsts, ("FREQUENCY", "NO_OF_FRAMES"), tell)
+    return _timed_capture(read, leading, firsts, ("FREQUENCY", "NO_OF_FRAMES"), warn)
 
 
-def _names(names: list[str], text: str) -> tuple[str, ...]:
+def _qtm_names(names: list[str], text: str) -> tuple[str, ...]:
     """The names of all markers, of which a text states the number; a missing name becomes '*n'."""
     while names and not names[-1]:
         names = names[:-1]
     count = int(text[:MAX_DIGITS]) if text.isdecimal() else len(names)
-    if count < len(names) or count > MOST_CELLS // 3:
+    if count < len(names) or count > MAX_CELLS // 3:
         raise CaptureError(f"MARKER_NAMES holds {len(names)} names, and NO_OF_MARKERS states {count}")
     if not count:
         raise CaptureError("no markers: MARKER_NAMES holds no name")
@@ -505,7 +508,7 @@ def _begin_of_rows(lines: list[bytes], start: int, width: int) -> tuple[int, int
     return start, leading
 
 
-def read_table(data: bytes, tell: Tell = warn) -> Capture:
+def read_table(data: bytes, warn: Warn = emit_warning) -> Capture:
     """Read the markers in the bytes of a table with times [s] and three columns for each marker.
 
     The three have one name, or end with x, y and z. The unit is that in which a frame's points span what
@@ -529,35 +532,35 @@ def read_table(data: bytes, tell: Tell = warn) -> Capture:
     columns = TableColumns(titles, names, first, np.ones(len(names)))
     rows, read = parse_table(lines, columns, start=1 + axes, ended=ended)
     leading = np.stack([np.full(len(rows), np.nan), rows[:, timed]], axis=1)
-    capture = _timed(read, leading, {}, ("the rate", "the number of frames"), tell)
+    capture = _timed_capture(read, leading, {}, ("the rate", "the number of frames"), warn)
     fault = unit_fault(unlabeled_frames(capture))
     unit = "meters" if fault is None else fault.guess
-    tell(f"the table states no unit of length, read as {unit}")
+    warn(f"the table states no unit of length, read as {unit}")
     return replace(capture, positions=capture.positions * meters_per(unit))
 
 
 def _marker_name(titles: list[str]) -> str:
     """Name of the marker whose coordinates have these titles; empty if it is not one marker."""
-    axes = [found for title in titles if (found := _AXIS.fullmatch(title))]
+    axes = [found for title in titles if (found := _AXIS_TITLE.fullmatch(title))]
     if [axis[2].lower() for axis in axes] == ["x", "y", "z"]:
         titles = [axis[1] for axis in axes]
-    titles = [copy[1] if (copy := _COPY.fullmatch(title)) else title for title in titles]
+    titles = [copy[1] if (copy := _COPY_TITLE.fullmatch(title)) else title for title in titles]
     return titles[0] if len(titles) == 3 and len(set(titles)) == 1 else ""
 
 
-def _read_tsv(data: bytes, tell: Tell) -> Capture:
+def _read_tsv(data: bytes, warn: Warn) -> Capture:
     """Read a TSV of Qualisys or another table, told apart by their content."""
-    qualisys = separator_behind(_BEGINS, split_lines(data[:_FIRST_BYTES])[0][0]) is not None
-    return read_qtm_tsv(data, tell) if qualisys else read_table(data, tell)
+    qualisys = separator_behind(_QTM_BEGINS, split_lines(data[:_FIRST_BYTES])[0][0]) is not None
+    return read_qtm_tsv(data, warn) if qualisys else read_table(data, warn)
 
 
-def _read_csv(data: bytes, tell: Tell) -> Capture:
+def _read_csv(data: bytes, warn: Warn) -> Capture:
     """Read a CSV of Motive or of Vicon, or another table, told apart by their content."""
     if separator_behind([MOTIVE_BEGIN], split_lines(data[:_FIRST_BYTES])[0][0]) is not None:
-        return read_motive_csv(data, tell)
+        return read_motive_csv(data, warn)
     if vicon_sections(split_lines(data)[0]):
-        return read_vicon_csv(data, tell)
-    return read_table(data, tell)
+        return read_vicon_csv(data, warn)
+    return read_table(data, warn)
 
 
 _READERS: Final = {".trc": read_trc, ".c3d": read_c3d, ".csv": _read_csv, ".tsv": _read_tsv}
@@ -588,18 +591,18 @@ def read_capture(capture: Capture | str | Path) -> Capture:
         return capture
     check_type("capture", capture, (str, Path), "a Capture or the path of a file", READABLE)
     path = Path(capture)
-    if path.suffix.lower() in _UNREAD:
-        raise CaptureError(f"{path}: {_UNREAD[path.suffix.lower()]}; expected {', '.join(READABLE)}")
+    if path.suffix.lower() in _FOREIGN_ENDINGS:
+        raise CaptureError(f"{path}: {_FOREIGN_ENDINGS[path.suffix.lower()]}; expected {', '.join(READABLE)}")
     check_suffix(path, READABLE)
     data = read_bytes(path, error=CaptureError)
     if not data:
         raise CaptureError(f"{path}: the file is empty")
 
-    def tell(text: str) -> None:
+    def warn(text: str) -> None:
         warnings.warn(f"{path}: {text}", HandSimWarning, stacklevel=3)
 
     try:
-        return _checked(path, _READERS[path.suffix.lower()](data, tell))
+        return _checked_capture(path, _READERS[path.suffix.lower()](data, warn))
     except CaptureError as error:
         raise CaptureError(f"{path}: {error}{_content_hint(data, str(error))}") from error
     except MemoryError as error:
@@ -611,12 +614,12 @@ def read_capture(capture: Capture | str | Path) -> Capture:
 
 def _content_hint(data: bytes, error: str) -> str:
     """If an error says that the content is of another format: a clause that names that format."""
-    begin = data[:_FIRST_BYTES].removeprefix(codecs.BOM_UTF8).lstrip(_BLANKS).lower()
-    found = next((text for word, text in _FOREIGN.items() if begin.startswith(word)), None)
+    begin = data[:_FIRST_BYTES].removeprefix(codecs.BOM_UTF8).lstrip(_BLANK_BYTES).lower()
+    found = next((text for word, text in _FOREIGN_BEGINS.items() if begin.startswith(word)), None)
     return f"; this is {found}" if found and error.startswith("not a ") else ""
 
 
-def _checked(path: Path, capture: Capture) -> Capture:
+def _checked_capture(path: Path, capture: Capture) -> Capture:
     """The measured points of the capture; refuse positions that cannot be in the unit of the file."""
     capture = settled(capture)
     if capture.findings:

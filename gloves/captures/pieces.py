@@ -1,7 +1,7 @@
 """Trajectories of a wide table, in memory proportional to its number of points.
 
-An optical system gives an unlabeled marker another number whenever it comes back, and its export another
-column. Such columns hold a piece of a path each, thousands a minute, and are packed into a few.
+An optical system gives an unlabeled marker a new number whenever it reappears, and the export gives it a new
+column. Each such column holds one piece of a path; a minute may have thousands, which are packed into a few.
 """
 
 from __future__ import annotations
@@ -15,16 +15,17 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
-_FAMILY: Final = 100  # More columns than this, with names that differ by a number alone, may be pieces.
-_LITTLE: Final = 0.5  # A piece has points in less than this share of the frames.
+_MANY_COLUMNS: Final = 100
+"""More columns than this whose names differ only by a number may be pieces."""
+_MAX_SHARE: Final = 0.5  # A piece has points in a smaller share of the frames.
 
 
-def _pieces_of(names: Sequence[str], present: Float[np.ndarray, "N"]) -> Bool[np.ndarray, "N"]:
+def _are_pieces(names: Sequence[str], present: Float[np.ndarray, "N"]) -> Bool[np.ndarray, "N"]:
     """Which columns, with points in this share of the frames, hold pieces of unlabeled paths."""
     stems = [name.rstrip("0123456789") for name in names]
     counts = Counter(stems)
-    many = np.array([counts[stem] > _FAMILY for stem in stems])
-    return many & (present < _LITTLE)
+    many = np.array([counts[stem] > _MANY_COLUMNS for stem in stems])
+    return many & (present < _MAX_SHARE)
 
 
 def shared_columns(
@@ -49,7 +50,7 @@ def shared_columns(
     return columns, count
 
 
-def _packed(frames: Int[np.ndarray, "P"], columns: Int[np.ndarray, "P"]) -> tuple[NDArray[np.int64], int]:
+def _pack_runs(frames: Int[np.ndarray, "P"], columns: Int[np.ndarray, "P"]) -> tuple[NDArray[np.int64], int]:
     """Give each run of points in a column a shared column.
 
     Returns the shared column of each point (P,), and how many shared columns there are.
@@ -85,11 +86,11 @@ def packed_trajectories(
 ) -> Trajectories:
     """Trajectories of a list of points; columns packed from pieces come last."""
     share = np.bincount(columns, minlength=len(names)) / num_frames
-    in_pieces = _pieces_of(names, share)
+    in_pieces = _are_pieces(names, share)
     whole = np.flatnonzero(~in_pieces)
     packed = in_pieces[columns]
     places = np.searchsorted(whole, columns)
-    more, number = _packed(frames[packed], columns[packed])
+    more, number = _pack_runs(frames[packed], columns[packed])
     places[packed] = len(whole) + more
     positions = np.full((num_frames, len(whole) + number, 3), np.nan)
     positions[frames, places] = points

@@ -31,36 +31,36 @@ from handsim.errors import CaptureError, HandSimWarning, shortened
 from handsim.files.inputs import text_encoding
 
 METERS: Final = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
-_WORDS: Final = {
+_UNIT_WORDS: Final = {
     f"{prefix}{word}": METERS[unit]
     for prefix, unit in (("milli", "mm"), ("centi", "cm"), ("", "m"))
     for word in ("meters", "metres")
 }
-_MIN_WORD: Final = 4  # letters of a unit that is cut off; 'mil' may also be a thousandth of an inch
-MOST_CELLS: Final = 400_000
+_MIN_UNIT_LETTERS: Final = 4  # letters of a unit that is cut off; 'mil' may also be a thousandth of an inch
+MAX_CELLS: Final = 400_000
 """Largest number of cells in a row: twice as many as the largest C3D would need."""
 TAB: Final = b"\t"
 _BLANK: Final = math.nan
 _BLANK_CELL: Final = re.compile(r"(null|none|na|n/a|#n/a|<na>|--?|-?nan\(\w+\)|-?1\.#([qs]nan|ind)0*)?", re.I)
 """What programs write for no number: Qualisys NULL, older programs of Windows -1.#IND00."""
-_MISWRITTEN: Final = {  # forms of cells that are no numbers, and why
+_MISWRITTEN_CELLS: Final = {  # forms of cells that are no numbers, and why
     r"[^.,]*,[^.,]*": ", since others have decimal points",
     r"\d+[-. ]+[A-Z]\w\w\.?|[A-Z]\w\w[- ]\d+": ", but a date that a spreadsheet made of one; export it again",
 }
-_SEPARATOR: Final = re.compile(rb'"?sep=.?"?', re.I)  # Excel's first line
+_SEPARATOR_LINE: Final = re.compile(rb'"?sep=.?"?', re.I)  # Excel's first line
 _TIME_CODE: Final = re.compile(rb"\d+:[\d:.;]+")
-_DECIMALS: Final = re.compile(rb",0\d")  # This comma is decimal: no whole number begins with a zero.
-_NUMBERS: Final = re.compile(rb"\d[-+\d.,eE \t]*")
+_DECIMAL_COMMA: Final = re.compile(rb",0\d")  # This comma is decimal: no whole number begins with a zero.
+_NUMBERS_ONLY: Final = re.compile(rb"\d[-+\d.,eE \t]*")
 _SAMPLED_ROWS: Final = 50  # rows that show how a writer formats numbers
 _MANY_NUMBERS: Final = 60  # numbers that show whether a writer drops zeros at the end
 LEADING: Final = 2  # cells of a row before its positions: frame and time, or frame and sub-frame
-_MOST_BLANKS: Final = 4_000_000  # cells of a table that may be absent from its rows
-_MOST_DENSE: Final = 8_000_000  # A table with more cells than this is read sparsely.
+_MAX_BLANK_CELLS: Final = 4_000_000  # cells of a table that may be absent from its rows
+_MAX_DENSE_CELLS: Final = 8_000_000  # A table with more cells than this is read sparsely.
 
-Tell = Callable[[str], None]
-"""Called with a sentence about something suspicious in a file that is read nevertheless."""
-LOWEST_RATE: Final = 1.0
-HIGHEST_RATE: Final = 5000.0
+Warn = Callable[[str], None]
+"""Called with a sentence on something suspicious in a file that is read nevertheless."""
+MIN_RATE: Final = 1.0
+MAX_RATE: Final = 5000.0
 """Highest frame rate of an optical system [Hz]."""
 _RATE_TOLERANCE: Final = 0.02  # relative difference of equal rates: 119.88 is called 120, 29.97 is called 30
 _MIN_DECIMALS: Final = 1  # Times have at least this many decimals: no frame is timed in whole seconds.
@@ -72,8 +72,8 @@ MAX_DIGITS: Final = 12  # Counts are cut to this many digits.
 _SHOWN_GAPS: Final = 3  # gaps that a warning lists
 
 
-def warn(text: str) -> None:
-    """Warn of something suspicious, without the name of the file."""
+def emit_warning(text: str) -> None:
+    """Emit a `HandSimWarning`, without the name of the file."""
     warnings.warn(text, HandSimWarning, stacklevel=3)
 
 
@@ -81,8 +81,8 @@ def meters_per(unit: str) -> float:
     """Meters per unit of length; the unit may be upper-case, cut off ("Mete") or in the singular."""
     word = unit.strip(" .\t\0()[]").lower()
     scale = METERS.get(word)
-    if scale is None and len(word) >= _MIN_WORD:
-        scale = next((scale for name, scale in _WORDS.items() if name.startswith(word)), None)
+    if scale is None and len(word) >= _MIN_UNIT_LETTERS:
+        scale = next((scale for name, scale in _UNIT_WORDS.items() if name.startswith(word)), None)
     if scale is None:
         raise CaptureError(f"unknown unit of length {shortened(unit.strip())!r}; valid units: mm, cm, m")
     return scale
@@ -100,8 +100,8 @@ def header_cells(line: bytes, number: int) -> list[str]:
 
 def check_width(num_cells: int, number: int) -> None:
     """Refuse a line with more cells than a marker file has, before it is split."""
-    if num_cells > MOST_CELLS:
-        raise CaptureError(f"damaged: line {number} has {num_cells} cells, expected at most {MOST_CELLS}")
+    if num_cells > MAX_CELLS:
+        raise CaptureError(f"damaged: line {number} has {num_cells} cells, expected at most {MAX_CELLS}")
 
 
 def cell_number(text: str) -> float:
@@ -118,7 +118,7 @@ def split_lines(data: bytes) -> tuple[list[bytes], bool]:
     if b"\r" in data:
         data = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     lines = data.split(b"\n")
-    if len(lines) > 1 and _SEPARATOR.fullmatch(lines[0]):
+    if len(lines) > 1 and _SEPARATOR_LINE.fullmatch(lines[0]):
         del lines[0]
     ended = not lines[-1].strip(b" ")
     return (lines[:-1] if ended and len(lines) > 1 else lines), ended
@@ -163,11 +163,11 @@ def _check_decimals(lines: list[bytes], first: int, wider: bool) -> None:
     for index, line in enumerate(lines):
         numbers = _TIME_CODE.sub(b"", line)
         # a row of numbers without quotes
-        if numbers.count(b",") > LEADING and _NUMBERS.fullmatch(numbers) is not None:
+        if numbers.count(b",") > LEADING and _NUMBERS_ONLY.fullmatch(numbers) is not None:
             if b"." in numbers:
                 return
             rows.append(index)
-            decimals = decimals or _DECIMALS.search(numbers) is not None
+            decimals = decimals or _DECIMAL_COMMA.search(numbers) is not None
         if len(rows) == _SAMPLED_ROWS:
             break
     if not rows or (wider and not decimals):
@@ -224,11 +224,11 @@ def parse_table(
     if not ended and rows[-1] == len(lines) - 1:
         _check_last_line([lines[index] for index in rows], len(lines), num_columns)
     written = sum(map(len, lines))  # a cell takes at least one byte, its separator
-    if len(rows) * num_columns > written + _MOST_BLANKS:  # before the table is allocated
+    if len(rows) * num_columns > written + _MAX_BLANK_CELLS:  # before the table is allocated
         raise CaptureError(
             f"damaged: {len(rows)} rows of {num_columns} columns are more than {written} bytes can hold"
         )
-    if len(rows) * num_columns > _MOST_DENSE:
+    if len(rows) * num_columns > _MAX_DENSE_CELLS:
         return _parse_wide([lines[index] for index in rows], columns, [index + 1 for index in rows])
     table = np.full((len(rows), num_columns), np.nan)
     for row, index in enumerate(rows):
@@ -344,7 +344,7 @@ def _cell_value(cell: bytes, number: int, titles: Sequence[str], column: int) ->
         value = _BLANK if _BLANK_CELL.fullmatch(text) else float(text.replace("_", "x"))  # Python reads 1_000
         fault = "infinite, expected a finite number or a blank cell" if math.isinf(value) else ""
     except ValueError:
-        reason = next((why for form, why in _MISWRITTEN.items() if re.fullmatch(form, text)), "")
+        reason = next((why for form, why in _MISWRITTEN_CELLS.items() if re.fullmatch(form, text)), "")
         fault = f"'{shortened(text)}' is not a number{reason}"
     if fault:
         raise CaptureError(f"line {number}, column {column + 1} ({titles[column]}): {fault}")
@@ -373,11 +373,9 @@ class StatedTimes:
 
 def check_rate(rate: float, name: str = "the rate") -> None:
     """Raise a `CaptureError` unless a frame rate [Hz] is that of an optical system."""
-    if not isinstance(rate, Real) or not LOWEST_RATE <= rate <= HIGHEST_RATE:
+    if not isinstance(rate, Real) or not MIN_RATE <= rate <= MAX_RATE:
         given = f"{rate:g} Hz" if isinstance(rate, Real) else shown_value(rate)
-        raise CaptureError(
-            f"{name} is {given}, expected {LOWEST_RATE:g} to {HIGHEST_RATE:g} frames per second"
-        )
+        raise CaptureError(f"{name} is {given}, expected {MIN_RATE:g} to {MAX_RATE:g} frames per second")
 
 
 def check_same_rate(name: str, rate: float, other_name: str, other: float) -> None:
@@ -389,7 +387,7 @@ def check_same_rate(name: str, rate: float, other_name: str, other: float) -> No
 
 
 def timed_positions(
-    positions: Float[np.ndarray, "R N 3"], stated: StatedTimes, tell: Callable[[str], None]
+    positions: Float[np.ndarray, "R N 3"], stated: StatedTimes, warn: Warn
 ) -> tuple[Float[np.ndarray, "T N 3"], float]:
     """Positions of all frames from the first to the last [m], NaN in gaps, and their rate [Hz]."""
     numbers, times = _increasing_numbers(stated.numbers), _increasing_times(stated)
@@ -403,7 +401,7 @@ def timed_positions(
     except ValueError:
         rate = math.nan
     if not 0.0 < rate < np.inf:
-        rate = _rate_of_times(stated, steps, times, tell)
+        rate = _rate_of_times(stated, steps, times, warn)
     check_rate(rate, stated.rate_name)
     if times is not None and len(times) > 1:
         ticks = _Ticks.of(times, rate)
@@ -434,10 +432,10 @@ def timed_positions(
                 "file again, or correct that number if they are all"
             )
         if count < there or count > num_frames:
-            tell(f"{stated.count_name} is {count}, and {there} frames are there; all are read")
+            warn(f"{stated.count_name} is {count}, and {there} frames are there; all are read")
     if num_frames == there:
         return positions, rate
-    tell(_missing_sentence(steps, places, stride, num_frames))
+    warn(_missing_sentence(steps, places, stride, num_frames))
     filled = np.full((num_frames, *positions.shape[1:]), np.nan)
     filled[frames] = positions
     return filled, rate
@@ -514,7 +512,7 @@ def _rate_of_times(
     stated: StatedTimes,
     steps: Int[np.ndarray, "T-1"],
     times: Float[np.ndarray, "T"] | None,
-    tell: Callable[[str], None],
+    warn: Warn,
 ) -> float:
     """The rate of evenly spaced times [Hz], for a file without a stated rate."""
     value = stated.rate.strip()[:40]
@@ -523,7 +521,7 @@ def _rate_of_times(
     if len(intervals) < 2 or np.ptp(intervals) > _INTERVAL_TOLERANCE * intervals.mean():
         raise CaptureError(f"{text}, expected a positive number of frames per second")
     rate = float(1.0 / intervals.mean())
-    tell(f"{text}; by the column of times it is {rate:.6g} Hz")
+    warn(f"{text}; by the column of times it is {rate:.6g} Hz")
     return rate
 
 

@@ -41,20 +41,24 @@ from handsim.files.signals import signals_wait
 GROWING_SUFFIX: Final = ".part"
 """Suffix that is added to the name of the archive."""
 _MAGIC: Final = b"handsim recording 1\n"
-_SIZE: Final = struct.Struct("<I")
-_BLOCK: Final = struct.Struct("<4s4I")  # mark, number of the block, frames, points, CRC-32 of its columns
-_MARK: Final = b"blk\n"
-_ENTRY_MARK: Final = b"one\n"  # of a block with former hands, whose size stands in place of points
+_PART_SIZE: Final = struct.Struct("<I")
+_BLOCK_HEAD: Final = struct.Struct("<4s4I")
+"""Mark, number of the block, frames, points, and CRC-32 of the block's columns."""
+_FRAMES_MARK: Final = b"blk\n"
+_FORMER_MARK: Final = b"one\n"
+"""Mark of a block with former hands; it states their size in place of the number of points."""
 _CHECKSUM: Final = "checksum"
-_INTERVAL: Final = 0.5  # [s] between two blocks
-_SPARE: Final = 4096  # bytes by which the header may grow while blocks follow
+_BLOCK_INTERVAL: Final = 0.5  # time between two blocks [s]
+_SPARE_BYTES: Final = 4096  # room in which the header may grow
 _MAX_HEADER: Final = 1 << 26  # bytes
-_FULL_FRAMES: Final = 1 << 16  # frames after which a block is written early; half a second has far fewer
-_FULL_POINTS: Final = 1 << 21  # points after which a block is written early
+_MAX_WAITING_FRAMES: Final = 1 << 16
+"""Number of frames after which a block is written early; half a second has far fewer."""
+_MAX_WAITING_POINTS: Final = 1 << 21
+"""Number of points after which a block is written early."""
 SCHEMA: Final = 4
 """Version of the files of takes. Points are tables up to 3; up to 2 simulated and tracked takes differ."""
-_READABLE: Final = (3, SCHEMA)
-_KINDS: Final = ("take", "tracked take")
+_READABLE_SCHEMAS: Final = (3, SCHEMA)
+_HEADER_KINDS: Final = ("take", "tracked take")
 """Kinds in headers; trackers wrote the second one before schema 3."""
 
 
@@ -118,7 +122,7 @@ class GrowingArchive(Closing):
             packed.append(row.tobytes())
         self._waiting.append(packed)  # in a single step, so that an interrupt leaves no partial frame
         self._points += num_points
-        self._due = min(self._due, time.monotonic() + _INTERVAL)
+        self._due = min(self._due, time.monotonic() + _BLOCK_INTERVAL)
         self.flush_due()
 
     def replace_head(self, header: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> None:
@@ -136,11 +140,11 @@ class GrowingArchive(Closing):
         self.flush()
         with signals_wait():
             self._restore()
-            self._write_block(_ENTRY_MARK, 0, entry.nbytes, entry.tobytes())
+            self._write_block(_FORMER_MARK, 0, entry.nbytes, entry.tobytes())
 
     def flush_due(self) -> None:
         """Write the waiting frames if they are many, or half a second old."""
-        is_full = len(self._waiting) >= _FULL_FRAMES or self._points >= _FULL_POINTS
+        is_full = len(self._waiting) >= _MAX_WAITING_FRAMES or self._points >= _MAX_WAITING_POINTS
         if is_full or time.monotonic() >= self._due:
             self.flush()
 
@@ -154,10 +158,10 @@ class GrowingArchive(Closing):
             counts, *others = (b"".join(column) for column in zip(*rows, strict=True))
             points = int(np.frombuffer(counts, POINT_COUNTS.dtype).sum(dtype=np.int64))
             content = b"".join((counts, *others))
-            self._write_block(_MARK, len(rows), points, content)
+            self._write_block(_FRAMES_MARK, len(rows), points, content)
 
     def _write_block(self, mark: bytes, frames: int, count: int, content: bytes) -> None:
-        head = _BLOCK.pack(mark, len(self._blocks) - 1, frames, count, zlib.crc32(content))
+        head = _BLOCK_HEAD.pack(mark, len(self._blocks) - 1, frames, count, zlib.crc32(content))
         _write_all(self._file, head + content)
         self._blocks.append((self._file.tell(), self._blocks[-1][1] + frames))
 
@@ -184,10 +188,10 @@ class GrowingArchive(Closing):
                 self._file.seek(0)
                 self._write_head()
             if lost := frames - self._blocks[-1][1]:
-                told = f"{self.path} was cut by another program: {lost} of its {frames} frames are lost"
-                warnings.warn(told, HandSimWarning, stacklevel=2)
+                message = f"{self.path} was cut by another program: {lost} of its {frames} frames are lost"
+                warnings.warn(message, HandSimWarning, stacklevel=2)
         self._file.seek(0, os.SEEK_END)
-        if not _is_at(self._place, there):
+        if not _leads_to(self._place, there):
             self._write_again()
 
     def _write_again(self) -> None:
@@ -200,26 +204,26 @@ class GrowingArchive(Closing):
             _write_all(file, content)
         self._file.close()
         self._file = file
-        told = (
+        message = (
             f"{gone} was removed or replaced by another program: it is written again, whole, to {self.path}"
         )
-        warnings.warn(told, HandSimWarning, stacklevel=2)
+        warnings.warn(message, HandSimWarning, stacklevel=2)
 
     def _packed_head(
         self, header: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], size: int = 0
     ) -> list[bytes]:
-        """The header, padded to `size` bytes or else by `_SPARE` bytes, and the arrays."""
+        """The header, padded to `size` bytes or else by `_SPARE_BYTES` bytes, and the arrays."""
         text = {**header, "arrays": list(arrays), "columns": [one._asdict() for one in self._columns[1:]]}
         parts = list[bytes]()
         for array in arrays.values():
             buffer = io.BytesIO()
             np.lib.format.write_array(buffer, np.ascontiguousarray(array), version=(1, 0), allow_pickle=False)
             parts.append(buffer.getvalue())
-        told = json.dumps(text | {_CHECKSUM: _head_checksum(text, parts)}).encode()
-        return [told.ljust(size or len(told) + _SPARE), *parts]
+        content = json.dumps(text | {_CHECKSUM: _head_checksum(text, parts)}).encode()
+        return [content.ljust(size or len(content) + _SPARE_BYTES), *parts]
 
     def _write_head(self) -> None:
-        _write_all(self._file, _MAGIC + b"".join(_SIZE.pack(len(part)) + part for part in self._head))
+        _write_all(self._file, _MAGIC + b"".join(_PART_SIZE.pack(len(part)) + part for part in self._head))
 
 
 def _write_all(file: io.FileIO, content: bytes) -> None:
@@ -229,7 +233,7 @@ def _write_all(file: io.FileIO, content: bytes) -> None:
         rest = rest[file.write(rest) :]
 
 
-def _is_at(path: Path, there: os.stat_result) -> bool:
+def _leads_to(path: Path, there: os.stat_result) -> bool:
     """Whether a path leads to the file with this status."""
     try:
         return os.path.samestat(path.stat(), there)
@@ -268,13 +272,13 @@ class GrownArchive:
         with path.open("rb") as file:
             if file.read(len(_MAGIC)) != _MAGIC:
                 raise ValueError("not a recording")
-            self.header: dict[str, Any] = json.loads(_take_part(file))
-            parts = [_take_part(file) for _ in self.header["arrays"]]
+            self.header: dict[str, Any] = json.loads(_read_part(file))
+            parts = [_read_part(file) for _ in self.header["arrays"]]
             known = self.header.pop(_CHECKSUM, None)  # None in files of earlier versions
             if known not in (None, _head_checksum(self.header, parts)):
                 raise ValueError("a header with another checksum")
             names = map(str, self.header.pop("arrays"))
-            self._arrays = dict(zip(names, map(_array_of, parts), strict=True))
+            self._arrays = dict(zip(names, map(_read_array, parts), strict=True))
             self._columns = (POINT_COUNTS, *map(_column, self.header.pop("columns")))
             self._end = file.tell()
             self._former = list[tuple[int, bytes]]()  # entries with the number of blocks of frames before
@@ -294,13 +298,13 @@ class GrownArchive:
         before = np.cumsum([0, *(block.frames for block in self._blocks)])[:-1]
         return self._joined(column, self._blocks[: int((before < most).sum())])
 
-    def members(self, told: Callable[[], None]) -> Iterator[Member]:
-        """Every array, read block by block, with a call of `told` after each block."""
+    def members(self, on_block: Callable[[], None]) -> Iterator[Member]:
+        """Every array, read block by block, with a call of `on_block` after each block."""
         yield from (Member.of(name, array) for name, array in self._fixed().items())
         num_points = sum(block.points for block in self._blocks)
         for column in self._columns:
             shape = (num_points if column.of_points else self.num_frames, *column.entry)
-            yield Member(column.name, np.dtype(column.dtype), shape, partial(self._parts, column, told))
+            yield Member(column.name, np.dtype(column.dtype), shape, partial(self._parts, column, on_block))
 
     def _fixed(self, step: int = 1) -> dict[str, NDArray[Any]]:
         """The arrays that have no frames; former hands end after every `step`-th block of those before."""
@@ -315,16 +319,16 @@ class GrownArchive:
     def _scan(self, file: io.BufferedReader, check: bool) -> Iterator[_Block]:
         """The blocks before the first one that is cut off or damaged."""
         number = count = 0
-        while len(head := file.read(_BLOCK.size)) == _BLOCK.size:
-            mark, index, frames, points, checksum = _BLOCK.unpack(head)
-            if mark == _ENTRY_MARK and index == number:
+        while len(head := file.read(_BLOCK_HEAD.size)) == _BLOCK_HEAD.size:
+            mark, index, frames, points, checksum = _BLOCK_HEAD.unpack(head)
+            if mark == _FORMER_MARK and index == number:
                 entry = file.read(min(points, self._size))
                 if len(entry) < points or zlib.crc32(entry) != checksum:
                     return
                 self._former.append((count, entry))
                 self._end, number = file.tell(), number + 1
                 continue
-            if mark != _MARK or index != number:
+            if mark != _FRAMES_MARK or index != number:
                 return
             block = _Block(file.tell(), frames, points)
             size = sum(column.size * (points if column.of_points else frames) for column in self._columns)
@@ -344,11 +348,11 @@ class GrownArchive:
         none = np.empty((0, *column.entry), column.dtype)
         return np.concatenate([none, *(self._column(column, block) for block in blocks)])
 
-    def _parts(self, column: Column, told: Callable[[], None]) -> Iterator[NDArray[Any]]:
-        """Blocks of a column, with a call of `told` after each."""
+    def _parts(self, column: Column, on_block: Callable[[], None]) -> Iterator[NDArray[Any]]:
+        """Blocks of a column, with a call of `on_block` after each."""
         for block in self._blocks:
             yield self._column(column, block)
-            told()
+            on_block()
 
     def _column(self, column: Column, block: _Block) -> NDArray[Any]:
         """The values of one field in one block of an archive."""
@@ -374,19 +378,19 @@ def is_growing(path: Path) -> bool:
 
 
 def finish_archive(
-    grown: GrownArchive, path: Path, header: Mapping[str, Any], *, told: Callable[[], None] = lambda: None
+    grown: GrownArchive, path: Path, header: Mapping[str, Any], *, on_block: Callable[[], None] = lambda: None
 ) -> None:
     """Write a growing archive as an .npz, whole or not at all, and read it back as a check."""
     with atomic_write(path) as temporary:
-        write_npz(temporary, (Member.of("header", np.array(json.dumps(header))), *grown.members(told)))
+        write_npz(temporary, (Member.of("header", np.array(json.dumps(header))), *grown.members(on_block)))
         try:
             check_npz(temporary)
         except ValueError as error:
             raise OSError(errno.EIO, f"read back, it is {error}", str(path)) from error
 
 
-def _take_part(file: io.BufferedReader) -> bytes:
-    (size,) = _SIZE.unpack(file.read(_SIZE.size).ljust(_SIZE.size, b"\xff"))
+def _read_part(file: io.BufferedReader) -> bytes:
+    (size,) = _PART_SIZE.unpack(file.read(_PART_SIZE.size).ljust(_PART_SIZE.size, b"\xff"))
     if size > _MAX_HEADER:
         raise ValueError("a header that is too large")
     content = file.read(size)
@@ -400,7 +404,7 @@ def _head_checksum(header: Mapping[str, Any], parts: Sequence[bytes]) -> int:
     return zlib.crc32(b"".join((json.dumps(header).encode(), *parts)))
 
 
-def _array_of(content: bytes) -> NDArray[Any]:
+def _read_array(content: bytes) -> NDArray[Any]:
     """An array from its .npy format; a `ValueError` unless the sizes agree."""
     buffer = io.BytesIO(content)
     check_npy_header(buffer, len(content))
@@ -443,12 +447,12 @@ def read_archive(
     """Read an archive, finished or growing; an exception of `unpack` means that it is damaged."""
     path = Path(path)
     header, arrays = _read(path)
-    kind, schema = header.get("kind", _KINDS[0]), header.get("schema")
+    kind, schema = header.get("kind", _HEADER_KINDS[0]), header.get("schema")
     if not isinstance(kind, str) or not isinstance(schema, int):
         raise CaptureError(_damaged(path))
-    if kind not in _KINDS:
+    if kind not in _HEADER_KINDS:
         raise CaptureError(f"{path}: a {shortened(kind)}, expected a take")
-    if schema not in _READABLE or kind != _KINDS[0]:
+    if schema not in _READABLE_SCHEMAS or kind != _HEADER_KINDS[0]:
         raise CaptureError(
             f"{path}: a {kind} of schema {shortened(str(schema))}, expected a take of schema {SCHEMA}; "
             "simulate or track it again with this version of handsim"
@@ -496,10 +500,10 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         raise CaptureError(
             f"{path}: a recording that was cut off with {grown.num_frames} frames, expected two or more"
         )
-    told = f"{path}: a recording that was cut off or is still running; it has {grown.num_frames} frames"
+    message = f"{path}: a recording that was cut off or is still running; it has {grown.num_frames} frames"
     if grown.num_lost_bytes:
-        told += f"; {grown.num_lost_bytes} bytes after them, an incomplete half second, are left out"
-    warnings.warn(told, CutOffWarning, stacklevel=4)
+        message += f"; {grown.num_lost_bytes} bytes after them, an incomplete half second, are left out"
+    warnings.warn(message, CutOffWarning, stacklevel=4)
     return header, arrays
 
 

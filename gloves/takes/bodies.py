@@ -17,8 +17,8 @@ from handsim.errors import ArgumentError
 from handsim.hand.shape import SIDES, Side
 from handsim.space.objects import Part, RigidObject, named_object, object_names
 
-_VERTICES: Final = "body_vertices_{}"
-_FACES: Final = "body_faces_{}"  # arrays of the surface of a body, by its number
+_VERTICES_ARRAY: Final = "body_vertices_{}"
+_FACES_ARRAY: Final = "body_faces_{}"  # arrays of the surface of a body, by its number
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,8 +94,8 @@ def body_arrays(bodies: Sequence[RigidBody]) -> dict[str, NDArray[Any]]:
     arrays: dict[str, NDArray[Any]] = {BODY_MARKERS.name: np.concatenate(markers)}
     for number, body in enumerate(bodies):
         if body.surface is not None:
-            arrays[_VERTICES.format(number)] = body.surface.vertices
-            arrays[_FACES.format(number)] = body.surface.faces.astype(np.int64)
+            arrays[_VERTICES_ARRAY.format(number)] = body.surface.vertices
+            arrays[_FACES_ARRAY.format(number)] = body.surface.faces.astype(np.int64)
     return arrays
 
 
@@ -108,7 +108,7 @@ def stored_body(
     positions = arrays[BODY_MARKERS.name][markers.start : markers.stop]
     if not stored.get("surface", False):
         return RigidBody(name, marker_names, positions, None, *limb)
-    vertices, faces = (arrays[key.format(number)] for key in (_VERTICES, _FACES))
+    vertices, faces = (arrays[key.format(number)] for key in (_VERTICES_ARRAY, _FACES_ARRAY))
     hull = Part("mesh", np.zeros(3), np.eye(4), vertices)
     upright = np.tile([0.0, 0.0, 1.0], (len(positions), 1))  # a file has no normals under markers
     thing = RigidObject(name, vertices, faces, (hull,), marker_names, positions, upright)

@@ -36,10 +36,10 @@ NO_MARKER: Final = "none"
 """The label of a point that is no marker; labels of markers contain a colon."""
 FREE: Final = -2
 """The label of a point without a correction."""
-_KEYS: Final = ("frames", "place_mm", "label")
+_CORRECTION_KEYS: Final = ("frames", "place_mm", "label")
 _SAME_PLACE: Final = 0.002  # largest distance of a point from its place in the file [m]; formats round it
 _LONGEST_STEP: Final = 0.02  # largest distance of a point without an ID from its prediction [m]
-_COMMENT: Final = "# Corrected labels; `handsim track` applies them again, `handsim view` adds to them."
+_FILE_COMMENT: Final = "# Corrected labels; `handsim track` applies them again, `handsim view` adds to them."
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +84,7 @@ def load_corrections(path: Path) -> tuple[Correction, ...]:
     with errors_of(path, CaptureError):
         check_keys(table, "the file", ("correction",), optional=("correction",))
         entries = enumerate(tables_of(table, "correction"), start=1)
-        return tuple(_parse(entry, f"correction {number}") for number, entry in entries)
+        return tuple(_read_correction(entry, f"correction {number}") for number, entry in entries)
 
 
 def corrections_of(take: Path) -> tuple[Correction, ...]:
@@ -95,7 +95,7 @@ def corrections_of(take: Path) -> tuple[Correction, ...]:
 
 def save_corrections(path: Path, corrections: Iterable[Correction]) -> None:
     """Write corrections; `load_corrections` gives the same again."""
-    lines = [_COMMENT]
+    lines = [_FILE_COMMENT]
     for correction in corrections:
         record = correction.record()
         place = ", ".join(toml_number(value) for value in record["place_mm"])
@@ -193,8 +193,8 @@ def _label_of(correction: Correction, number: int, frames: int, names: Sequence[
     return list(names).index(correction.label)
 
 
-def _parse(table: Mapping[str, object], owner: str) -> Correction:
-    check_keys(table, owner, _KEYS)
+def _read_correction(table: Mapping[str, object], owner: str) -> Correction:
+    check_keys(table, owner, _CORRECTION_KEYS)
     span = numbers(f"{owner}: frames", table["frames"], (2,), "the first and the last frame")
     first, last = (int(value) for value in span)
     if not 0 <= first <= last or (span != [first, last]).any():

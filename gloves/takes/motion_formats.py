@@ -21,7 +21,7 @@ from handsim.motion_files.motion import (
 from handsim.motion_files.scenes import write_glb, write_usd
 from handsim.space.transforms import UpAxis, file_axes
 
-HELD: Final = "held at its last pose"
+HELD_POSE: Final = "held at its last pose"
 
 
 class MotionFormat(NamedTuple):
@@ -61,11 +61,11 @@ def _write_joint_trc(path: Path, motion: Motion, up: UpAxis) -> None:
 
 MOTION_FORMATS: Final[dict[str, MotionFormat]] = {
     ".glb": MotionFormat(write_glb, "hidden (scale 0)"),
-    ".bvh": MotionFormat(write_bvh, HELD, steady=True),
+    ".bvh": MotionFormat(write_bvh, HELD_POSE, steady=True),
     ".usda": MotionFormat(write_usd, "invisible"),
     ".usdc": MotionFormat(write_usd, "invisible"),
     ".csv": MotionFormat(write_joint_csv, "blank", keeps_axes=True),
-    ".trc": MotionFormat(_write_joint_trc, HELD, steady=True),
-    ".mot": MotionFormat(write_mot, HELD),
+    ".trc": MotionFormat(_write_joint_trc, HELD_POSE, steady=True),
+    ".mot": MotionFormat(write_mot, HELD_POSE),
 }
 """The formats, by the endings of file names."""

@@ -309,13 +309,13 @@ class PointList:
     def cut(self, first: int, last: int) -> PointList:
         """The points of the frames from `first` up to, not including, `last`."""
         part = slice(int(self.starts[first]), int(self.starts[last]))
-        entries = {name: getattr(self, name)[part] for name in _PER_POINT}
+        entries = {name: getattr(self, name)[part] for name in _POINT_FIELDS}
         return dataclasses.replace(self, counts=self.counts[first:last], **entries)
 
     def without(self, gone: NDArray[np.bool_]) -> PointList:
         """The points without those that are `gone` (P,); the others keep their columns."""
         counts = np.bincount(self.frames[~gone], minlength=len(self.counts))
-        entries = {name: getattr(self, name)[~gone] for name in _PER_POINT}
+        entries = {name: getattr(self, name)[~gone] for name in _POINT_FIELDS}
         return dataclasses.replace(self, counts=counts, **entries)
 
     def stored(self) -> tuple[dict[str, NDArray[Any]], int | None]:
@@ -327,7 +327,7 @@ class PointList:
         return {**arrays, POINT_COLUMNS.name: self.columns}, self.num_columns
 
 
-_PER_POINT = (*(column.name for column in POINTS), "columns")
+_POINT_FIELDS = (*(column.name for column in POINTS), "columns")
 
 
 def _arrival_order(counts: Int[np.ndarray, "T"]) -> NDArray[np.int64]:

@@ -79,13 +79,13 @@ HARDLY_SEEN: Final = 0.05
 _MAX_LENGTH: Final = 1e9  # [m]
 _MAX_TIME: Final = 1e12  # [s], and the largest rate [Hz]; clocks of computers count 2e9 s
 _QUATERNION_TOLERANCE: Final = 1e-2  # Quaternions have unit length within this; our own within 1e-6.
-_CHUNK: Final = 4096  # frames whose markers are filled in at once
+_CHUNK_FRAMES: Final = 4096  # frames whose markers are filled in at once
 _MAX_BIAS_FRAMES: Final = 2000  # frames that marker biases are learned from
-_STILL: Final = 3.0  # [deg], largest standard deviation of an angle of a hand that holds still
+_MAX_STILL_SPREAD: Final = 3.0  # [deg], largest standard deviation of an angle of a hand that holds still
 _MIN_BIAS_FRAMES: Final = 30  # frames with a marker from which its bias is learned
 
 
-class _Angles(dict[str, Float[np.ndarray, "T"]]):
+class _NamedAngles(dict[str, Float[np.ndarray, "T"]]):
     """Values of angles by their names; an unknown name is an error in one sentence."""
 
     def __missing__(self, name: str) -> NoReturn:
@@ -191,7 +191,7 @@ class Take:
             sizes = {"T": len(self.times), "H": len(self.hands), "B": len(self.bodies)}
             for column in (*FRAMES, *self._known()):
                 object.__setattr__(self, column.name, fitted(column, getattr(self, column.name), sizes))
-            _check(self)
+            _check_take(self)
         except ValueError as error:
             raise ArgumentError(f"not a take: {error}") from error
 
@@ -274,7 +274,7 @@ class Take:
             times=np.arange(len(qpos)) / rate,
             hands=hands,
             qpos=qpos,
-            status=_status_of(qpos),
+            status=_true_status(qpos),
             rms=np.full(qpos.shape[:2], np.nan),
             points=points,
             ids=ids,
@@ -282,7 +282,7 @@ class Take:
             confidence=np.where(np.isfinite(points[..., 0]), 1.0, np.nan),
             bodies=bodies,
             body_poses=poses,
-            body_status=_status_of(poses),
+            body_status=_true_status(poses),
             body_rms=np.full(poses.shape[:2], np.nan),
             settings=dict(settings or {}),
         )
@@ -369,11 +369,11 @@ class Take:
         zero = None if neutral is None else self.mean_pose(side, neutral)
         if convention == "isb":
             parts = [isb_angles(hands[number].shape, angles[one], zero) for one, hands in self.worn()]
-            found = _Angles(zip(ISB_NAMES, np.concatenate(parts).T, strict=True))
+            found = _NamedAngles(zip(ISB_NAMES, np.concatenate(parts).T, strict=True))
             if (wrist := self.wrist_angles(side, neutral)) is not None:
                 found.update(zip(WRIST_NAMES, wrist.T, strict=True))
             return found
-        return _Angles(zip(JOINT_NAMES, (angles if zero is None else angles - zero).T, strict=True))
+        return _NamedAngles(zip(JOINT_NAMES, (angles if zero is None else angles - zero).T, strict=True))
 
     def forearm_index(self, side: Side) -> int | None:
         """The index of a hand's forearm among the bodies; None if there is none."""
@@ -416,7 +416,7 @@ class Take:
         take, there = self._neutral_frames(side, between)
         angles, times = take.qpos[there, take.hand_index(side), 7:], take.times[there]
         spread = np.rad2deg(angles.std(axis=0))
-        if spread.max() > _STILL:
+        if spread.max() > _MAX_STILL_SPREAD:
             moving = f"{JOINT_NAMES[spread.argmax()]} by {spread.max():.1f} degrees (standard deviation)"
             text = (
                 f"the {side} hand moves from {times[0]:g} to {times[-1]:g} s, {moving}; expected a still pose"
@@ -447,7 +447,7 @@ class Take:
         spread = self.angle_spread
         if spread is None:
             spread = np.full((*self.status.shape, NUM_JOINTS), np.nan, dtype=np.float32)
-        found = _Angles(zip(JOINT_NAMES, spread[:, self.hand_index(side)].T, strict=True))
+        found = _NamedAngles(zip(JOINT_NAMES, spread[:, self.hand_index(side)].T, strict=True))
         if self.wrist_spread is not None and self.forearm_index(side) is not None:
             found.update(zip(WRIST_NAMES, self.wrist_spread[:, self.hand_index(side)].T, strict=True))
         return found
@@ -561,8 +561,8 @@ class Take:
         qpos = qpos if frames is None else qpos[frames]
         markers = np.full((len(qpos), worn.layout.num_markers, 3), np.nan)
         there = np.flatnonzero(np.isfinite(qpos[:, 0]))
-        for first in range(0, len(there), _CHUNK):
-            some = there[first : first + _CHUNK]
+        for first in range(0, len(there), _CHUNK_FRAMES):
+            some = there[first : first + _CHUNK_FRAMES]
             bones = worn.model.forward_kinematics(qpos[some])
             rotations = bones[:, worn.attachment.main_bones, :3, :3]
             shifts = np.einsum("tmij,mj->tmi", rotations, bias)
@@ -962,12 +962,12 @@ def unpack_take(header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Take
     )
 
 
-def _status_of(poses: NDArray[np.float64]) -> NDArray[np.int8]:
+def _true_status(poses: NDArray[np.float64]) -> NDArray[np.int8]:
     """Status of true poses: tracked where there is a pose, else lost."""
     return np.where(np.isfinite(poses[..., 0]), TRACKED, LOST).astype(np.int8)
 
 
-def _check(take: Take) -> None:
+def _check_take(take: Take) -> None:
     """Raise a `ValueError` unless the arrays of a take fit together and are within their ranges."""
     frames = take.num_frames
     if not frames or not take.hands or len(set(take.sides)) < len(take.hands):
@@ -978,7 +978,7 @@ def _check(take: Take) -> None:
         raise ValueError("times do not increase")
     for status, poses in ((take.status, take.qpos), (take.body_status, take.body_poses)):
         is_lost = (status == LOST)[..., None]
-        if not _within(status, 0, len(STATUSES) - 1) or (np.isnan(poses) != is_lost).any():
+        if not _are_within(status, 0, len(STATUSES) - 1) or (np.isnan(poses) != is_lost).any():
             raise ValueError("a status is unknown, or does not fit its pose")
         _check_range(poses, -_MAX_LENGTH, _MAX_LENGTH)
         if (np.abs(np.linalg.norm(poses[..., 3:7], axis=-1) - 1.0) > _QUATERNION_TOLERANCE).any():
@@ -996,10 +996,10 @@ def _check(take: Take) -> None:
             _check_range(distances, 0.0, _MAX_LENGTH)
     _check_range(take.times, -_MAX_TIME, _MAX_TIME)
     _check_range(np.nan_to_num(take.rate), 1.0 / _MAX_TIME, _MAX_TIME)
-    if not _within(points.points, -_MAX_LENGTH, _MAX_LENGTH):
+    if not _are_within(points.points, -_MAX_LENGTH, _MAX_LENGTH):
         raise ValueError(f"a position is not from {-_MAX_LENGTH:g} to {_MAX_LENGTH:g}")
     _check_range(points.confidence, 0.0, 1.0)
-    if not _within(points.labels, -1, len(take.label_names) - 1):
+    if not _are_within(points.labels, -1, len(take.label_names) - 1):
         raise ValueError("a label names no marker")
 
 
@@ -1012,5 +1012,5 @@ def _check_range(values: NDArray[np.float64], low: float, high: float) -> None:
         raise ValueError(f"a number is not from {low:g} to {high:g}")
 
 
-def _within(values: NDArray[Any], low: float, high: float) -> bool:
+def _are_within(values: NDArray[Any], low: float, high: float) -> bool:
     return bool(((values >= low) & (values <= high)).all())

@@ -72,7 +72,7 @@ def unpack_hands(
 def former_array(former: Sequence[FormerHands], layouts: Sequence[MarkerLayout]) -> NDArray[Any]:
     """The array of a file for earlier hands in gloves of these layouts."""
     arched = any(hand.shape.arch.any() for one in former for hand in one.hands)
-    records = np.zeros(len(former), _dtype(layouts, arched=arched))
+    records = np.zeros(len(former), _former_dtype(layouts, arched=arched))
     for record, one in zip(records, former, strict=True):
         record["stop"], record["notes"] = one.stop, one.notes.encode()[: records.dtype["notes"].itemsize]
         for name, array in hand_arrays(one.hands).items():
@@ -82,7 +82,8 @@ def former_array(former: Sequence[FormerHands], layouts: Sequence[MarkerLayout])
 
 def unpack_former(records: NDArray[Any], layouts: Sequence[MarkerLayout]) -> tuple[FormerHands, ...]:
     """The earlier hands of a file's array; raises a `ValueError` if it is of another type."""
-    if records.dtype not in [_dtype(layouts, arched=arched) for arched in (False, True)] or records.ndim != 1:
+    valid = [_former_dtype(layouts, arched=arched) for arched in (False, True)]
+    if records.ndim != 1 or records.dtype not in valid:
         raise ValueError("former hands of another type")
     return tuple(
         FormerHands(int(one["stop"]), unpack_hands(one, layouts), one["notes"].decode(errors="ignore"))
@@ -90,7 +91,9 @@ def unpack_former(records: NDArray[Any], layouts: Sequence[MarkerLayout]) -> tup
     )
 
 
-def _dtype(layouts: Sequence[MarkerLayout], *, arched: bool) -> np.dtype[Any]:
+def _former_dtype(layouts: Sequence[MarkerLayout], *, arched: bool) -> np.dtype[Any]:
+    """The type of the array of earlier hands; with `arched`, of hands with a `HandShape.arch`."""
+    """The type of the array of earlier hands; with `arched`, of hands with a `HandShape.arch`."""
     num_markers = sum(layout.num_markers for layout in layouts)
     columns = [(column.name, column.dtype, (num_markers, *column.entry)) for column in ATTACHMENT]
     columns += [(ARCH.name, ARCH.dtype, (len(layouts), *ARCH.entry))] if arched else []

@@ -1,8 +1,8 @@
-"""Kernels that a command needs are compiled ahead, by as many processes as there are cores.
+"""Compiling of the kernels that a command needs, before it runs, with one process per core.
 
-data/kernels.json lists the kernels of every command: the types of their arguments, by rows of a table in
-which rows refer to earlier ones, and the time to compile each. `python -m benchmarks.kernel_list`
-writes it. A kernel that the list lacks is compiled when it is called; one out of use only costs time.
+data/kernels.json lists the kernels of every command with the types of their arguments and the time to compile
+them. Types are row numbers in a table, whose rows may refer to earlier ones. `python -m
+benchmarks.kernel_list` writes the file. A kernel that is not listed is compiled at its first call.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from pathlib import Path
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
-from handsim.app.messages import tell_state
+from handsim.app.messages import show_state
 from handsim.app.workers import LocalProcesses, usable_cores
 from handsim.callbacks import before_compiling
 from handsim.errors import HandSimError
@@ -28,11 +28,11 @@ from handsim.errors import HandSimError
 if TYPE_CHECKING:
     from numba.core.registry import CPUDispatcher
 
-LIST: Final = Path(__file__).parents[1] / "data" / "kernels.json"
-_FEW: Final = 4.0  # Processes are started only if there is more than this to compile [s].
-_TOLD: Final = 2.0  # [s] between two lines
-_MOST: Final = 8  # processes; more would wait for one another
-_KNOWN: Final = 3.0  # A process ranks a kernel so much higher if it has compiled others of its package.
+KERNELS_FILE: Final = Path(__file__).parents[1] / "data" / "kernels.json"
+_MIN_SECONDS: Final = 4.0  # least compile time for which processes are started [s]
+_STATE_INTERVAL: Final = 2.0  # time between two lines of progress [s]
+_MAX_PROCESSES: Final = 8  # More processes would wait for one another.
+_KNOWN_FACTOR: Final = 3.0  # factor on the rank of a kernel whose package the process has compiled before
 
 
 class ListedKernel(NamedTuple):
@@ -62,8 +62,8 @@ def compile_kernels(command: str | None = None) -> tuple[int, int]:
     listed = {row: one for row, one in enumerate(read_list()) if command in (None, *one.commands.split())}
     missing = missing_kernels(listed)
     if command is not None:  # kernels that are missing afterwards are compiled when they are called
-        before_compiling.append(functools.partial(tell_state, "compiling what is new, once on this machine"))
-    if sum(one.seconds for one in missing.values()) <= (0.0 if command is None else _FEW):
+        before_compiling.append(functools.partial(show_state, "compiling what is new, once on this machine"))
+    if sum(one.seconds for one in missing.values()) <= (0.0 if command is None else _MIN_SECONDS):
         return 0, len(missing)
     _compile_all(missing)
     rest = len(missing_kernels(missing))
@@ -72,14 +72,14 @@ def compile_kernels(command: str | None = None) -> tuple[int, int]:
 
 def read_list() -> list[ListedKernel]:
     """All kernels on the list."""
-    return [ListedKernel(*row) for row in json.loads(LIST.read_text(encoding="utf-8"))["kernels"]]
+    return [ListedKernel(*row) for row in json.loads(KERNELS_FILE.read_text(encoding="utf-8"))["kernels"]]
 
 
 @functools.cache
 def known_types() -> list[Any]:
     """The types of the list's table, as numba has them; None where a type is gone."""
     known: list[Any] = []
-    for row in json.loads(LIST.read_text(encoding="utf-8"))["types"]:
+    for row in json.loads(KERNELS_FILE.read_text(encoding="utf-8"))["types"]:
         try:
             known.append(_type_of(row, known))
         except (AttributeError, ImportError, ValueError):
@@ -125,14 +125,14 @@ def needed_kernels(kernel: CPUDispatcher) -> set[str]:
     """All kernels that a kernel calls, directly or through others, as module:name."""
     from numba.core.registry import CPUDispatcher
 
-    names, open_ones, seen = set(), [kernel], {kernel}
-    while open_ones:
-        function = open_ones.pop().py_func
+    names, unread, seen = set(), [kernel], {kernel}
+    while unread:
+        function = unread.pop().py_func
         for name in function.__code__.co_names:
             one = function.__globals__.get(name)
             if isinstance(one, CPUDispatcher) and one not in seen:
                 seen.add(one)
-                open_ones.append(one)
+                unread.append(one)
                 names.add(f"{one.py_func.__module__}:{one.py_func.__qualname__}")
     return names
 
@@ -158,7 +158,7 @@ class _Queue:
         busy = {one.name for one in self.running.values()}
         waited_for = busy | {one.name for one in self.waiting.values()}
         ranks = {
-            row: self._rank[one.name] * (_KNOWN if one.package in known else 1.0)
+            row: self._rank[one.name] * (_KNOWN_FACTOR if one.package in known else 1.0)
             for row, one in self.waiting.items()
             if one.name not in busy and not self._needs[one.name] & waited_for - {one.name}
         }
@@ -174,11 +174,11 @@ def _compile_all(listed: Mapping[int, ListedKernel]) -> None:
     """Compile kernels in processes that end afterwards, and show the progress."""
     what = f"compiling {len(listed)} kernels, once on this machine"
     queue, total, done = _Queue(listed), sum(one.seconds for one in listed.values()), 0.0
-    told, first = time.monotonic(), (0.0, 0.0)  # speed counts from the first kernel, when processes run
-    tell_state(what)
+    last, first = time.monotonic(), (0.0, 0.0)  # speed counts from the first kernel, when processes run
+    show_state(what)
     with ExitStack() as stack:
         try:
-            processes = [LocalProcesses(1) for _ in range(min(usable_cores(), len(listed), _MOST))]
+            processes = [LocalProcesses(1) for _ in range(min(usable_cores(), len(listed), _MAX_PROCESSES))]
         except HandSimError:  # each kernel is then compiled where it is called
             return
         for one in processes:
@@ -195,7 +195,7 @@ def _compile_all(listed: Mapping[int, ListedKernel]) -> None:
                         queue.waiting[row] = queue.running.pop(row)
             if not jobs:  # the remaining kernels call one another, or all processes died
                 break
-            for job in wait(jobs, _TOLD, FIRST_COMPLETED).done:
+            for job in wait(jobs, _STATE_INTERVAL, FIRST_COMPLETED).done:
                 process, row = jobs.pop(job)
                 done += queue.running.pop(row).seconds
                 if job.exception() is None:  # else the process died
@@ -203,20 +203,20 @@ def _compile_all(listed: Mapping[int, ListedKernel]) -> None:
             now = time.monotonic()
             if done and not first[0]:
                 first = now, done
-            if now >= told + _TOLD:
-                told = now
+            if now >= last + _STATE_INTERVAL:
+                last = now
                 speed = (done - first[1]) / (now - first[0]) if now > first[0] else 0.0
                 rest = f", about {(total - done) / speed:.0f} s left" if speed else ""
                 count = len(listed) - len(queue.waiting) - len(queue.running)
-                tell_state(f"{what}: {count} done{rest}")
-    tell_state("")
+                show_state(f"{what}: {count} done{rest}")
+    show_state("")
 
 
 def plain_shape_errors() -> None:
-    """Let a kernel that sets a slice to another shape raise an error that does not tell the shapes.
+    """Make numba compile a shorter error for assignments to a slice of another shape.
 
-    Our kernels set no slice to another shape, and numba's error with the shapes is up to half of the code of
-    each kernel with a slice.
+    Our kernels never make such an assignment. numba's own error, which states both shapes, takes up to half
+    of the machine code of each kernel with a slice.
     """
     from numba.core.extending import overload
     from numba.np import arrayobj

@@ -1,7 +1,7 @@
-"""Messages of a command: lines as they are, warnings as lines, progress bars, and a live line of status.
+"""Messages of a command: plain lines, warnings as lines, progress bars, and a live line of status.
 
-In a batch job's log a progress bar is a line every ten seconds. rich takes long to import, and is imported
-where it is needed.
+In the log of a batch job, a progress bar is a line every ten seconds. rich is imported inside functions,
+because its import takes long.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ if TYPE_CHECKING:
     from rich.progress import Progress, Task, TaskID
     from rich.text import Text
 
-_RENEWED: Final = 0.2  # [s] between two lines on a terminal
-EVERY: Final = 10.0  # [s] between two lines elsewhere, as in the log of a batch job
-_WIDTH: Final = 80  # columns of a terminal whose width is unknown
-_COUNTS: Final = re.compile(r"[\d.,]+")
+_TERMINAL_INTERVAL: Final = 0.2  # time between two lines on a terminal [s]
+LOG_INTERVAL: Final = 10.0  # time between two lines elsewhere, as in the log of a batch job [s]
+_DEFAULT_COLUMNS: Final = 80  # width of a terminal that does not state it
+_NUMBERS: Final = re.compile(r"[\d.,]+")
 
 
 def print_line(*lines: str) -> None:
-    """Print lines as they are: no markup in brackets, no colors, no breaks; odd bytes of names as escapes."""
+    """Print lines without markup, colors and line breaks; invalid bytes of file names become escapes."""
     from rich.console import Console
 
     for line in lines:
@@ -42,9 +42,10 @@ def print_line(*lines: str) -> None:
 def print_table(
     rows: Sequence[Sequence[str | Text]], *, left: int = 1, wraps: bool = False, title: str | None = None
 ) -> None:
-    """Print rows of cells, the header first; the first columns, `left` of them, are words, others numbers.
+    """Print rows of cells, the header first; the first `left` columns are words, the others numbers.
 
-    Cells keep to one line unless the table `wraps`; units stand below titles then, for eighty columns.
+    Unless the table `wraps`, each cell keeps to one line, and units stand below the titles, for eighty
+    columns.
     """
     from rich.console import Console
     from rich.table import Table
@@ -62,7 +63,7 @@ def print_table(
 
 
 @contextmanager
-def told_warnings(program: str) -> Iterator[None]:
+def warnings_as_lines(program: str) -> Iterator[None]:
     """Within the block every `HandSimWarning` is one line on the error stream, `program: warning: ...`."""
     with warnings.catch_warnings():
         warnings.simplefilter("always", HandSimWarning)
@@ -86,7 +87,7 @@ def told_warnings(program: str) -> Iterator[None]:
 
 
 class LiveStatus(Closing):
-    """Shows a line on standard error until the end of a `with` block."""
+    """A line of status on standard error, shown until the end of a `with` block."""
 
     def __init__(self) -> None:
         self._terminal = sys.stderr.isatty()
@@ -102,7 +103,7 @@ class LiveStatus(Closing):
         """Show a line if it is time for one, or `now`."""
         if not (now or self.due):
             return
-        self._due = time.monotonic() + (_RENEWED if self._terminal else EVERY)
+        self._due = time.monotonic() + (_TERMINAL_INTERVAL if self._terminal else LOG_INTERVAL)
         if self._terminal:
             self._write(f"\r{line[: _columns() - 1]}\x1b[K")
             self._shown = True
@@ -130,48 +131,50 @@ class LiveStatus(Closing):
 
 def _columns() -> int:
     try:
-        return max(os.get_terminal_size(sys.stderr.fileno()).columns or _WIDTH, 2)
+        return max(os.get_terminal_size(sys.stderr.fileno()).columns or _DEFAULT_COLUMNS, 2)
     except (OSError, ValueError):
-        return _WIDTH
+        return _DEFAULT_COLUMNS
 
 
-_tellers: list[Callable[[str], None]] = []  # show a line in a bar or step; the innermost is last
+_state_displays: list[Callable[[str], None]] = []
+"""Functions that show a line in a progress bar or step; the innermost is last."""
 
 
-def tell_state(line: str) -> None:
-    """Show a line where the running command shows its state, else on standard error.
+def show_state(line: str) -> None:
+    """Show a line in the progress bar or step of the running command, or without one on standard error.
 
     On a terminal an empty line shows the state again; elsewhere it is not printed.
     """
-    if _tellers and (line or sys.stderr.isatty()):
-        _tellers[-1](line)
+    if _state_displays and (line or sys.stderr.isatty()):
+        _state_displays[-1](line)
     elif line:
         print(line, file=sys.stderr, flush=True)
 
 
-def told_share(what: str) -> Callable[[int, int], None]:
-    """A `Progress` that shows the share done and the time left where a running command shows its state."""
-    began = told = time.monotonic()
+def share_of(what: str) -> Callable[[int, int], None]:
+    """A `Progress` that passes the share done and the time left to `show_state`."""
+    began = last = time.monotonic()
 
     def show(done: int, total: int) -> None:
-        nonlocal told
+        nonlocal last
         now = time.monotonic()
-        if _tellers and done and now >= told + (_RENEWED if sys.stderr.isatty() else EVERY):
-            told = now
+        interval = _TERMINAL_INTERVAL if sys.stderr.isatty() else LOG_INTERVAL
+        if _state_displays and done and now >= last + interval:
+            last = now
             left = (now - began) * (total - done) / done
-            tell_state(f"{what}: {100.0 * done / total:.0f} %, about {left:.0f} s left")
+            show_state(f"{what}: {100.0 * done / total:.0f} %, about {left:.0f} s left")
 
     return show
 
 
 @contextmanager
-def _telling(tell: Callable[[str], None]) -> Iterator[None]:
-    """Within the block `tell_state` passes its lines to `tell`."""
-    _tellers.append(tell)
+def _state_shown_by(display: Callable[[str], None]) -> Iterator[None]:
+    """Within the block `show_state` passes its lines to `display`."""
+    _state_displays.append(display)
     try:
         yield
     finally:
-        _tellers.remove(tell)
+        _state_displays.remove(display)
 
 
 class ProgressBar:
@@ -242,10 +245,10 @@ def progress_bar(unit: str) -> Iterator[ProgressBar]:
         task = bar.add_task("", total=1)
         shown = ProgressBar(bar, task)
         if console.is_terminal:
-            with _telling(shown.tell):
+            with _state_shown_by(shown.tell):
                 yield shown
         else:
-            with _lines(console, bar.tasks[0], unit), _telling(shown.say):
+            with _logged_progress(console, bar.tasks[0], unit), _state_shown_by(shown.say):
                 yield shown
 
 
@@ -253,7 +256,7 @@ def progress_bar(unit: str) -> Iterator[ProgressBar]:
 def named_steps(first: str) -> Iterator[Callable[[str], None]]:
     """Show names of steps of unknown length on standard error: the current one on a terminal, else all.
 
-    Without a `first` one, only what `tell_state` tells is shown.
+    If `first` is empty, nothing is shown until the first step or line of `show_state`.
     """
     from rich.console import Console
 
@@ -266,33 +269,33 @@ def named_steps(first: str) -> Iterator[Callable[[str], None]]:
             step = line
             status.update(line)
 
-        with console.status(first) as status, _telling(lambda line: status.update(line or step)):
+        with console.status(first) as status, _state_shown_by(lambda line: status.update(line or step)):
             yield show
         return
     last, due = "", 0.0
 
     def tell(step: str, *, always: bool = False) -> None:
         nonlocal last, due
-        name, now = _COUNTS.sub("", step), time.monotonic()
+        name, now = _NUMBERS.sub("", step), time.monotonic()
         if always or name != last or now >= due:
-            last, due = name, now + EVERY
+            last, due = name, now + LOG_INTERVAL
             console.print(step, soft_wrap=True, markup=False, highlight=False)
 
     if first:
         tell(first)
-    with _telling(lambda line: tell(line, always=True)):
+    with _state_shown_by(lambda line: tell(line, always=True)):
         yield tell
 
 
 @contextmanager
-def _lines(console: Console, task: Task, unit: str, every: float = EVERY) -> Iterator[None]:
-    """Print the state of a task now and then, so that a log shows its progress."""
+def _logged_progress(console: Console, task: Task, unit: str) -> Iterator[None]:
+    """Print the progress of a task at intervals, for a log."""
     ended = threading.Event()
     start = time.monotonic()
 
     def report() -> None:
-        while not ended.wait(every):
-            line = _line(task, unit, time.monotonic() - start)
+        while not ended.wait(LOG_INTERVAL):
+            line = _progress_line(task, unit, time.monotonic() - start)
             try:
                 console.print(line, soft_wrap=True, markup=False, highlight=False)
             except (OSError, SystemExit):  # the stream was closed
@@ -306,8 +309,8 @@ def _lines(console: Console, task: Task, unit: str, every: float = EVERY) -> Ite
         ended.set()
 
 
-def _line(task: Task, unit: str, seconds: float) -> str:
-    """How far a task is: the share done, its speed and the time that it has taken."""
+def _progress_line(task: Task, unit: str, seconds: float) -> str:
+    """A line on a task: the amount done, its speed, the elapsed time and the time left."""
     speed = _speed(task, unit)
     total = 0.0 if task.total is None else task.total
     if total == 1.0 and not task.completed:  # the task does not know its size yet
@@ -315,13 +318,13 @@ def _line(task: Task, unit: str, seconds: float) -> str:
     else:  # without a unit the step is what is counted
         step = task.description if unit else ""
         done = f"{task.completed:,.0f} of {total:,.0f} {unit or task.description}".rstrip()
-    clock = _clock(seconds)
+    clock = _clock_time(seconds)
     rest = task.time_remaining
-    left = f"{_clock(rest)} left" if rest else ""
+    left = f"{_clock_time(rest)} left" if rest else ""
     return ", ".join(part for part in (done, step, speed, clock, left) if part)
 
 
-def _clock(seconds: float) -> str:
+def _clock_time(seconds: float) -> str:
     whole = round(seconds)
     return f"{whole // 3600}:{whole % 3600 // 60:02}:{whole % 60:02}"
 

@@ -32,8 +32,8 @@ Make = Callable[[Path, int], int]
 """Writes the files of a number to a folder, and returns the number."""
 Place = Path | UPath
 """A folder of this machine, or of an object store."""
-_PASSWORD: Final = re.compile(r"[^/@]*:[^/]*@")
-_HERE: Final = ("", "file", "local")
+_PASSWORD_PATTERN: Final = re.compile(r"[^/@]*:[^/]*@")
+_LOCAL_PROTOCOLS: Final = ("", "file", "local")
 CHECKSUMS: Final = "checksums-*.json"
 """Files that jobs write last, each with the SHA-256 of all the files that its job has made."""
 
@@ -86,7 +86,7 @@ def place_of(out: str | Place) -> Place:
     if not isinstance(out, str | UPath):
         raise ArgumentError(f"{wrong} a folder, or one like s3://bucket/prefix")
     protocol, _, path = str(out).partition("://")
-    if _PASSWORD.match(path):  # it would be in messages, and be sent to workers
+    if _PASSWORD_PATTERN.match(path):  # it would be in messages, and be sent to workers
         raise ArgumentError(
             f"the {protocol}:// address holds a password; credentials come from the environment"
         )
@@ -94,7 +94,7 @@ def place_of(out: str | Place) -> Place:
         place = UPath(out)
     except ValueError as error:
         raise ArgumentError(f"{wrong} one like s3://bucket/prefix: {error}") from error
-    if place.protocol in _HERE and not isinstance(place, Path):
+    if place.protocol in _LOCAL_PROTOCOLS and not isinstance(place, Path):
         return Path(place.path)
     if isinstance(place, Path) or not path.strip("/"):
         raise ArgumentError(f"{wrong} one like s3://bucket/prefix")
@@ -145,9 +145,9 @@ class Output:
         claim(path, settings, noun=noun, error=error, grows=grows, result=old, shown=str(self))
         if not self.is_here and path.read_bytes() != before:
             if result in found:
-                with _one_sentence(self.place, "removing"):
+                with _store_errors(self.place, "removing"):
                     (self.place / str(result)).unlink()
-            _put(self.place, self.folder, [name])
+            _upload(self.place, self.folder, [name])
         self._claimed.append(name)
         self._fetched.add(name)
 
@@ -164,7 +164,7 @@ class Output:
         if self.is_here:
             return {name: (self.folder / name).stat().st_size for name in _files_in(self.folder)}
         start = self.place.path.rstrip("/") + "/"  # type: ignore[union-attr]
-        with _one_sentence(self.place, "listing") as files:
+        with _store_errors(self.place, "listing") as files:
             files.invalidate_cache()  # other machines write there too
             try:
                 found = files.find(start, detail=True)
@@ -186,12 +186,12 @@ class Output:
                 self._fetched.add(name)
         self._fetched.update(wanted)
         if wanted:
-            with _one_sentence(self.place, "reading") as files:
+            with _store_errors(self.place, "reading") as files:
                 files.get(*([str(side / name) for name in wanted] for side in (self.place, self.folder)))
 
     def checksum(self, name: str) -> str:
         """SHA-256 of a file in the output."""
-        with _one_sentence(self.place, f"reading {name}"):
+        with _store_errors(self.place, f"reading {name}"):
             return checksum(self.place / name)
 
     def warn_of(self, files: Collection[str], what: str) -> None:
@@ -203,7 +203,7 @@ class Output:
         """Put all files that were made in the local folder, `last` after all others."""
         if not self.is_here:
             made = [name for name in _files_in(self.folder) if name not in self._fetched]
-            _put(self.place, self.folder, made, [last])
+            _upload(self.place, self.folder, made, [last])
 
 
 @contextmanager
@@ -254,14 +254,14 @@ class _Job:
         near = self.folder.parent  # removed at the end of the run, if this machine has it
         with tempfile.TemporaryDirectory(prefix="handsim-", dir=near if near.is_dir() else None) as name:
             self.make(Path(name), number)
-            _put(self.place, Path(name), _files_in(Path(name)), self.last)
+            _upload(self.place, Path(name), _files_in(Path(name)), self.last)
         return number
 
 
 def check_store(store: UPath) -> None:
     """Import the packages that a store needs."""
     try:
-        with _one_sentence(store, "opening"):
+        with _store_errors(store, "opening"):
             pass
     except ImportError as error:
         raise ArgumentError(
@@ -270,17 +270,17 @@ def check_store(store: UPath) -> None:
         ) from error
 
 
-def _put(store: Place, folder: Path, names: Collection[str], last: Sequence[str] = ()) -> None:
+def _upload(store: Place, folder: Path, names: Collection[str], last: Sequence[str] = ()) -> None:
     """Put files of a folder into a store, those that match `last` after the others."""
     for late in (False, True):
         chosen = [name for name in names if _matches(name, last) == late]
         if chosen:
-            with _one_sentence(store, "writing") as files:
+            with _store_errors(store, "writing") as files:
                 files.put(*([str(side / name) for name in chosen] for side in (folder, store)))
 
 
 @contextmanager
-def _one_sentence(place: Place, doing: str) -> Iterator[Any]:
+def _store_errors(place: Place, doing: str) -> Iterator[Any]:
     """The file system of a store; any error, of whatever protocol, becomes a `HandSimError`."""
     try:
         yield None if isinstance(place, Path) else place.fs

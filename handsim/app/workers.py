@@ -38,23 +38,23 @@ from handsim.files.outputs import available_bytes
 
 Job = Callable[[int], int]
 """Writes files that depend on the number alone, and returns the number; it can be pickled."""
-_THREADS: Final = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+_THREAD_VARIABLES: Final = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 _MAX_PENDING: Final = 1000  # jobs that an executor holds: enough for hundreds of workers
-_WORKER: Final = 710_000_000  # bytes that a process holds at most, docs/cluster.md
-_AGAIN: Final = "run the same command again to go on"
-_FEWER: Final = f"(out of memory?); {_AGAIN}, with fewer --workers if they need too much memory"
-_GUARD: Final = 'put the call under `if __name__ == "__main__":`, or give workers=1'
-_GUARDED: Final = re.compile(r"^if\b.*\b__name__\b", re.M)
-_MAIN: Final = "__main__"
+_WORKER_BYTES: Final = 710_000_000  # largest memory of a worker, docs/cluster.md
+_RERUN_HINT: Final = "run the same command again to go on"
+_FEWER_HINT: Final = f"(out of memory?); {_RERUN_HINT}, with fewer --workers if they need too much memory"
+_GUARD_HINT: Final = 'put the call under `if __name__ == "__main__":`, or give workers=1'
+_GUARD_PATTERN: Final = re.compile(r"^if\b.*\b__name__\b", re.M)
+_MAIN_MODULE: Final = "__main__"
 LOCAL: Final = "local"
 """Name of a scheduler and workers on this machine that end with the command."""
-_COMPARED: Final = ("handsim", "numpy", "scipy", "mujoco", "numba", "opencv-python-headless")
+_COMPARED_PACKAGES: Final = ("handsim", "numpy", "scipy", "mujoco", "numba", "opencv-python-headless")
 """Packages that the bytes of results depend on."""
-_TIMEOUT: Final = 5.0  # [s] for the answer of a scheduler
+_TIMEOUT: Final = 5.0  # longest wait for the answer of a scheduler [s]
 
 
 def usable_cores() -> int:
-    """Cores that this process may use: by its affinity, its task of Slurm and its quota, rounded up."""
+    """Number of cores that affinity, Slurm and control groups allow this process, rounded up."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     task = os.environ.get("SLURM_CPUS_PER_TASK", "")
     return max(1, math.ceil(min(cores, core_quota(), int(task) if is_number(task) else cores)))
@@ -66,33 +66,33 @@ def check_workers(workers: int | None) -> int:
     A worker that runs its parent's script while it starts ends here, before it repeats the parent's work.
     """
     if getattr(multiprocessing.current_process(), "_inheriting", False):
-        raise SystemExit(f"a worker process ran this script again while it started; {_GUARD}")
+        raise SystemExit(f"a worker process ran this script again while it started; {_GUARD_HINT}")
     if workers is None:
-        return max(1, min(usable_cores(), available_bytes() // _WORKER))
+        return max(1, min(usable_cores(), available_bytes() // _WORKER_BYTES))
     check_count("workers", workers, 1)
     return workers
 
 
 def run_jobs(job: Job, todo: Sequence[int], workers: int | Executor | None) -> Iterator[int]:
-    """Do jobs in any process and any order, and yield the number of each finished job.
+    """Run jobs in any process and any order, and yield the number of each finished job.
 
-    With a number of processes (by default one per core) this process is one of them: it does the first job
-    while the others start, so that a mistake that is common to all jobs is raised here.
+    `workers` is an executor or a number of processes (by default one per core), of which this process is one.
+    It runs the first job while the others start, so an error that all jobs share is raised here.
     """
     if isinstance(workers, Executor):
-        with _told_deaths():
-            yield from _share_out(job, todo, workers)
+        with _death_sentences():
+            yield from _run_on_executor(job, todo, workers)
         return
     others = min(check_workers(workers), len(todo)) - 1
     if others < 1:
         yield from map(job, todo)
         return
-    with _told_deaths(), LocalProcesses(others, _needs_main(job)) as processes:
-        yield from _share_with(job, todo, processes, others)
+    with _death_sentences(), LocalProcesses(others, _needs_main(job)) as processes:
+        yield from _run_here_too(job, todo, processes, others)
 
 
-def _share_with(job: Job, todo: Sequence[int], processes: LocalProcesses, count: int) -> Iterator[int]:
-    """Do jobs here and in other processes, each of which takes its next job when it has finished one."""
+def _run_here_too(job: Job, todo: Sequence[int], processes: LocalProcesses, count: int) -> Iterator[int]:
+    """Run jobs in this process and in others; each takes its next job when it has finished one."""
     left, finished = deque(todo), queue.SimpleQueue[Future[int]]()
 
     def take() -> int | None:
@@ -103,7 +103,7 @@ def _share_with(job: Job, todo: Sequence[int], processes: LocalProcesses, count:
 
     def begin(submit: Callable[..., Future[int]]) -> None:
         if (number := take()) is not None:
-            future = submit(_do, job, number)
+            future = submit(_do_job, job, number)
             future.add_done_callback(finished.put)
             future.add_done_callback(go_on)
 
@@ -119,48 +119,51 @@ def _share_with(job: Job, todo: Sequence[int], processes: LocalProcesses, count:
             if mine is None or not finished.empty():
                 yield finished.get().result()
             else:
-                yield _do(job, mine)
+                yield _do_job(job, mine)
                 mine = take()
     finally:
         left.clear()
 
 
 def _needs_main(job: Job) -> bool:
-    """Whether workers have to run the main script for a job; refused where they would do the same as it."""
+    """Whether workers must run the main script to unpickle a job.
+
+    A script without a guard is refused, because each worker would run its work again.
+    """
     content = _pickled(job)
-    if content is None or _MAIN.encode() not in content:  # the executor tells what cannot be pickled
+    if content is None or _MAIN_MODULE.encode() not in content:  # the executor raises the error of pickling
         return False
     script = main_script()
-    if script is None or not _GUARDED.search(script.read_text(encoding="utf-8", errors="replace")):
+    if script is None or not _GUARD_PATTERN.search(script.read_text(encoding="utf-8", errors="replace")):
         defined = f"{script} defines" if script else "this session, not a module, defines"
-        raise ArgumentError(f"{defined} what the workers use: {_GUARD}")
+        raise ArgumentError(f"{defined} what the workers use: {_GUARD_HINT}")
     return True
 
 
 def main_script() -> Path | None:
     """The file that Python runs; None in a notebook, at a prompt, or where it reads standard input."""
-    script = Path(getattr(sys.modules[_MAIN], "__file__", None) or "")
+    script = Path(getattr(sys.modules[_MAIN_MODULE], "__file__", None) or "")
     return script if script.is_file() else None
 
 
 @contextmanager
 def _main_left_out() -> Iterator[None]:
-    """Keep processes started in the block from running the main script, as they usually do."""
-    main, sys.modules[_MAIN] = sys.modules[_MAIN], ModuleType(_MAIN)
+    """Start processes in the block that do not run the main script, as multiprocessing's usually do."""
+    main, sys.modules[_MAIN_MODULE] = sys.modules[_MAIN_MODULE], ModuleType(_MAIN_MODULE)
     try:
         yield
     finally:
-        sys.modules[_MAIN] = main
+        sys.modules[_MAIN_MODULE] = main
 
 
-def _share_out(job: Job, todo: Sequence[int], executor: Executor) -> Iterator[int]:
+def _run_on_executor(job: Job, todo: Sequence[int], executor: Executor) -> Iterator[int]:
     """Keep an executor supplied with jobs, and yield the numbers of finished ones."""
     waiting = iter(todo)
     pending: set[Future[int]] = set()
     try:
         while True:
             more = islice(waiting, _MAX_PENDING - len(pending))
-            pending.update([executor.submit(_do, job, number) for number in more])
+            pending.update([executor.submit(_do_job, job, number) for number in more])
             if not pending:
                 return
             done, pending = wait(pending, return_when=FIRST_COMPLETED)
@@ -172,34 +175,33 @@ def _share_out(job: Job, todo: Sequence[int], executor: Executor) -> Iterator[in
 
 
 @contextmanager
-def _told_deaths() -> Iterator[None]:
-    """Turn the executor's error for a dead worker, or for workers that are gone, into one sentence."""
+def _death_sentences() -> Iterator[None]:
+    """Raise one sentence in place of the executor's errors for dead and for vanished workers."""
     try:
         yield
     except BrokenProcessPool as error:
-        raise DatasetError(f"a worker died {_FEWER}") from error
+        raise DatasetError(f"a worker died {_FEWER_HINT}") from error
     except CancelledError as error:
-        raise HandSimError(f"the workers are gone; {_AGAIN}") from error
+        raise HandSimError(f"the workers are gone; {_RERUN_HINT}") from error
 
 
-def _do(job: Job, number: int) -> int:
-    """Do a job; an error that cannot be pickled comes back as text, wherever the job was done."""
+def _do_job(job: Job, number: int) -> int:
+    """Run a job; an error that cannot be pickled is raised as a `HandSimError` with its text."""
     try:
         return job(number)
     except Exception as error:
-        told = f"{type(error).__name__}: {error}"
         try:
             same = pickle.loads(pickle.dumps(error))
         except Exception:
-            raise HandSimError(told) from None
+            raise HandSimError(f"{type(error).__name__}: {error}") from None
         raise (same if isinstance(same, type(error)) else HandSimError(str(error))) from None
 
 
 class LocalProcesses(ProcessPoolExecutor):
-    """Processes of this machine, spawned when they are needed, with one thread each unless the user chose.
+    """Processes of this machine, spawned on demand, with one thread each unless the user set another number.
 
-    They end with the block, at once if it raises, and with this process, however it ends. They ignore Ctrl-C
-    and hang-ups, and do not run the main script, unless they need what it defines.
+    They end with the block (immediately if it raises) and with this process, even if it is killed. They
+    ignore Ctrl-C and hang-ups. They run the main script only if jobs need its definitions.
     """
 
     def __init__(self, workers: int, needs_main: bool = False) -> None:
@@ -207,7 +209,7 @@ class LocalProcesses(ProcessPoolExecutor):
         context = multiprocessing.get_context("spawn")
         theirs, self._ours = context.Pipe(duplex=False)
         try:
-            super().__init__(workers, mp_context=context, initializer=_end_with, initargs=(theirs,))
+            super().__init__(workers, mp_context=context, initializer=_end_with_parent, initargs=(theirs,))
         except (ImportError, OSError) as error:
             raise HandSimError(
                 f"no other processes can be started here ({error}): they need /dev/shm that can be written; "
@@ -236,10 +238,7 @@ class LocalProcesses(ProcessPoolExecutor):
 
 @contextmanager
 def second_process(is_wanted: bool, module: str) -> Iterator[LocalProcesses | None]:
-    """A process for half of the work of a block; None without a core for it.
-
-    It starts and imports the module of its work at once, while this process does something else.
-    """
+    """A second process for a block, which imports a module in the background; None without a free core."""
     if not is_wanted or usable_cores() < 2 or multiprocessing.parent_process() is not None:
         yield None
         return
@@ -254,9 +253,9 @@ def second_process(is_wanted: bool, module: str) -> Iterator[LocalProcesses | No
 
 
 def can_be_sent(job: Any) -> bool:
-    """Whether a process that does not run the main script can be given a job."""
+    """Whether a process that does not run the main script can unpickle a job."""
     content = _pickled(job)
-    return content is not None and _MAIN.encode() not in content
+    return content is not None and _MAIN_MODULE.encode() not in content
 
 
 def _pickled(job: Any) -> bytes | None:
@@ -272,7 +271,7 @@ def _load(module: str) -> None:
     importlib.import_module(module)
 
 
-def _end_with(channel: Connection) -> None:
+def _end_with_parent(channel: Connection) -> None:
     """End this process when the process at the other end of a pipe ends."""
 
     def watch() -> None:
@@ -288,7 +287,7 @@ def _end_with(channel: Connection) -> None:
 @contextmanager
 def one_thread() -> Iterator[None]:
     """Let processes started in the block use one thread each, unless the user chose otherwise."""
-    with environment(**{name: "1" for name in _THREADS if name not in os.environ}):
+    with environment(**{name: "1" for name in _THREAD_VARIABLES if name not in os.environ}):
         yield
 
 
@@ -307,7 +306,7 @@ def without_signals() -> Iterator[None]:
 
 @contextmanager
 def chosen_workers(
-    cluster: str | None, workers: int | None, tell: Callable[[str], None]
+    cluster: str | None, workers: int | None, report: Callable[[str], None]
 ) -> Iterator[int | Executor]:
     """The workers of the options --cluster and --workers: a number of processes, or a cluster's executor."""
     if cluster is None:
@@ -316,21 +315,21 @@ def chosen_workers(
     if workers is not None and cluster != LOCAL:
         raise ArgumentError(f"--workers counts processes of this machine, but {cluster} has its own workers")
     distributed = import_extra("distributed", f"the cluster {cluster}", "cluster")
-    with _client(distributed, cluster, check_workers(workers)) as client:
+    with _open_client(distributed, cluster, check_workers(workers)) as client:
         count = len(client.nthreads())
         there = f"{count} workers" if count else "no workers yet; waiting for the first"
         link = f"; dashboard of the cluster: {client.dashboard_link}" if client.dashboard_link else ""
-        tell(f"{cluster}: {there}{link}")
+        report(f"{cluster}: {there}{link}")
         try:
             yield ClusterExecutor(client)
         except distributed.KilledWorker as error:
             raise HandSimError(
-                f"a job was begun {error.allowed_failures + 1} times, and its worker died each time {_FEWER}"
+                f"a job was begun {error.allowed_failures + 1} times; its worker died each time {_FEWER_HINT}"
             ) from error
 
 
 @contextmanager
-def _client(distributed: Any, address: str, workers: int) -> Iterator[Any]:
+def _open_client(distributed: Any, address: str, workers: int) -> Iterator[Any]:
     """A client of a scheduler, which is started if the address is `LOCAL`."""
     if address == LOCAL:
         with without_signals():  # Ctrl-C is for this process, which ends the others
@@ -349,7 +348,7 @@ def _client(distributed: Any, address: str, workers: int) -> Iterator[Any]:
         if not address:
             raise HandSimError(f"{file}: no address, expected what `dask scheduler --scheduler-file` writes")
     try:
-        _greet(distributed, address)
+        _test_connection(distributed, address)
         client = distributed.Client(address, timeout=_TIMEOUT, set_as_default=False)
     except (OSError, RuntimeError, TypeError, ValueError) as error:
         reason = str(error.__cause__ or error).rpartition("] ")[2] or f"none within {_TIMEOUT:g} s"
@@ -361,12 +360,8 @@ def _client(distributed: Any, address: str, workers: int) -> Iterator[Any]:
         yield client
 
 
-def _greet(distributed: Any, address: str) -> None:
-    """Connect to a scheduler once as a test.
-
-    A `distributed.Client` that cannot connect keeps trying, and blocks for ten seconds or longer when it is
-    collected.
-    """
+def _test_connection(distributed: Any, address: str) -> None:
+    """Connect to a scheduler once, because a failed `distributed.Client` blocks for ten seconds or longer."""
 
     async def connect_and_close() -> None:
         async with asyncio.timeout(_TIMEOUT):
@@ -387,10 +382,10 @@ def _greet(distributed: Any, address: str) -> None:
 
 
 class ClusterExecutor(Executor):
-    """Dask's executor, whose workers check that they have the versions of this machine and one thread.
+    """Dask's executor. Each worker checks that it has one thread and this machine's package versions.
 
-    The job of a worker that dies is done again by another. Workers may join later. Jobs are done in the
-    working directory of this process, if the worker has it.
+    If a worker dies, another one repeats its job. Workers may join later. Jobs run in the working directory
+    of this process if the worker has such a folder.
     """
 
     def __init__(self, client: Any) -> None:
@@ -447,5 +442,5 @@ def check_worker(worker: str, threads: int, found: dict[str, str], expected: dic
 def _versions() -> dict[str, str]:
     """Versions of the compared packages in this process."""
     about = import_extra("distributed.versions", "a cluster", "cluster")
-    found = about.get_package_info(_COMPARED)
-    return {name: found.get(name) or "none" for name in _COMPARED}
+    found = about.get_package_info(_COMPARED_PACKAGES)
+    return {name: found.get(name) or "none" for name in _COMPARED_PACKAGES}

@@ -19,7 +19,7 @@ from track.config import SizeChoice
 if TYPE_CHECKING:
     from track.calibration.user_calibration import Calibration
 
-_LONGEST: Final = 180.0  # longest recording of a stream by default [s]
+_MAX_SECONDS: Final = 180.0  # longest recording of a stream by default [s]
 
 
 def calibrate(
@@ -72,7 +72,7 @@ def calibrate(
         capture = out.with_suffix(".calibration.npz")
         check_take_file(capture, live=True)
         options = TrackerOptions(glove, size, hands=hands, labeler=labeler)
-        _record(live, options, capture, _LONGEST if seconds is None else seconds)
+        _record(live, options, capture, _MAX_SECONDS if seconds is None else seconds)
     assert capture is not None  # `check_source` refused a call with neither source
     with progress_bar("") as bar:
         settings = CalibrateSettings(glove=glove, hands=hands, size=size, labeler=labeler)
@@ -82,8 +82,8 @@ def calibrate(
     print_line(f"{out}: {sides} hand in glove {glove}")
     found = {one.hand.side: _report(one) for one in user.calibrations}
     for side in hands or load_layout(glove).sides[::-1]:
-        told = found.get(side, ["it is not in the capture and was left out"])
-        print_line(*(f"{side} hand: {line}" for line in told))
+        lines = found.get(side, ["it is not in the capture and was left out"])
+        print_line(*(f"{side} hand: {line}" for line in lines))
 
 
 def _record(live: str, options: TrackerOptions, out: Path, seconds: float) -> None:

@@ -35,12 +35,12 @@ from train.simulation.takes import simulate_take
 GLOVE: Final = "dense19"
 GESTURES: Final = ("fist", "spread", "pinch_index", "relaxed", "pinch_little")
 """Gestures in the picture; the last one is the thumb's opposition to the little finger."""
-_RAISED: Final = np.deg2rad(35.0)  # pitch of the hand in front of the camera
+_RAISED_PITCH: Final = np.deg2rad(35.0)  # pitch of the hand in front of the camera
 _CAMERA: Final = 4
 _TRACKED: Final = 120  # frames of the capture
 _PAPER: Final = Corruption(occlude=5, ghosts=2)  # Han et al. 2018, section 5
 
-_FIGURES: Final = (
+_SHOWN_FIGURES: Final = (
     "slot_accuracy",
     "point_accuracy",
     "occlusion_precision",
@@ -102,7 +102,8 @@ def _draw_worn_glove(out: Path) -> Section:
 def _draw_camera_view(out: Path) -> Section:
     """Draw a raised hand as one camera of the rig sees it."""
     fit, rig = nominal_fit(load_layout(GLOVE), "M", "right"), load_rig("figure5")
-    raised = np.array([np.cos(_RAISED / 2), 0.0, -np.sin(_RAISED / 2), 0.0])  # about y: fingers up
+    half = _RAISED_PITCH / 2
+    raised = np.array([np.cos(half), 0.0, -np.sin(half), 0.0])  # about y: fingers up
     qpos = join_qpos(gesture("ok")[None], position=np.array([0.0, 0.0, 1.1]), quaternion=raised)[0]
     picture, seen = draw_camera(fit, qpos, rig, _CAMERA)
     write_png(out / "camera.png", picture)
@@ -153,7 +154,7 @@ def _generate_and_label(
             ["", *(f"{title} [%]" for title in columns)],
             *(
                 [name.replace("_", " ").capitalize(), *(percent(one[name]) for one in columns.values())]
-                for name in _FIGURES
+                for name in _SHOWN_FIGURES
             ),
         ],
         notes=[

@@ -23,12 +23,12 @@ from handsim._plugins import EGL_PACKAGES
 from handsim.app.workers import usable_cores
 
 _PROBE_SECONDS: Final = 120.0
-_RATE: Final = 60.0  # frame rate of the pointing hand [Hz]
-_POINTING: Final = 120  # frames for which the hand points in each direction
+_HAND_RATE: Final = 60.0  # frame rate of the pointing hand [Hz]
+_POINTING_FRAMES: Final = 120  # frames for which the hand points in each direction
 _WRIST: Final = (0.1, 0.2, 0.3)  # wrist of the pointing hand in the room: forward, left, up [m]
-_BENT: Final = 1.2  # flexion of the fingers that do not point [rad]
+_FLEXION: Final = 1.2  # flexion of the fingers that do not point [rad]
 # These programs run in processes of their own, because a broken driver kills its process.
-_DRAW: Final = """
+_DRAW_PROGRAM: Final = """
 import os
 os.environ["PYOPENGL_PLATFORM"] = "egl"
 import numpy, pyrender
@@ -39,13 +39,13 @@ renderer = pyrender.OffscreenRenderer(16, 16)
 renderer.render(scene, flags=pyrender.RenderFlags.DEPTH_ONLY)
 print(glGetString(GL_RENDERER).decode())
 """
-_FIND_GPU: Final = """
+_GPU_PROGRAM: Final = """
 import torch
 print(torch.cuda.get_device_name(0) if torch.cuda.is_available() else "none; the CPU does it, slower")
 """
 
 
-_EXTRAS: Final = {
+_EXTRA_PURPOSES: Final = {
     "view": "handsim view",
     "send": "--send osc://, ws:// and lsl:",
     "qualisys": "--live qtm://",
@@ -105,7 +105,7 @@ def doctor(compile: bool = False, send: str | None = None) -> int:
     return int(any(finding.needed and finding.remedy for finding in findings))
 
 
-def send_pointing_hand(address: str, ended: Callable[[], bool], tell: Callable[[str], None]) -> None:
+def send_pointing_hand(address: str, ended: Callable[[], bool], report: Callable[[str], None]) -> None:
     """Send a right hand whose index finger points along the room's axes in turn, until it is ended."""
     import numpy as np
 
@@ -129,30 +129,30 @@ def send_pointing_hand(address: str, ended: Callable[[], bool], tell: Callable[[
         sinks.start([hand], [])
         number = 0
         while not ended():
-            along = number // _POINTING % 3
+            along = number // _POINTING_FRAMES % 3
             pointing, back = room[along], room[(along + 1) % 3]
             turn = np.stack([pointing, np.cross(back, pointing), back], axis=1)[None]
             qpos = join_qpos(
-                _BENT * np.array([bent]), position=_WRIST @ room, quaternion=rotation_quaternions(turn)
+                _FLEXION * np.array([bent]), position=_WRIST @ room, quaternion=rotation_quaternions(turn)
             )
-            if number % _POINTING == 0:
+            if number % _POINTING_FRAMES == 0:
                 tip = axes.positions(hand_keypoints(hand.model, qpos)[0, KEYPOINT_NAMES.index("index_tip")])
                 place = " ".join(f"{value:.3f}" for value in tip)
                 seen = axes.turn @ pointing
                 axis = f"{'-' if seen.sum() < 0 else '+'}{'xyz'[np.abs(seen).argmax()]}"
                 where = f"{DIRECTIONS[along]}, along {axis}"
-                tell(f"the index finger points {where}, its tip is at {place} {axes.unit}")
+                report(f"the index finger points {where}, its tip is at {place} {axes.unit}")
             nobody = np.empty((0, 3)), np.empty(0, dtype=np.int64)
-            frame = StreamedFrame(number, number / _RATE, *nobody, arrived=time.monotonic())
+            frame = StreamedFrame(number, number / _HAND_RATE, *nobody, arrived=time.monotonic())
             shown = TrackedHand("right", Status.TRACKED, qpos[0], np.nan, *nobody)
             sinks.send(frame, TrackedFrame(frame.time, (shown,), nobody[1], np.empty(0)))
-            time.sleep(1.0 / _RATE)
+            time.sleep(1.0 / _HAND_RATE)
             number += 1
 
 
 def examine() -> list[Finding]:
     """All findings about this machine, in the order of the report; this takes a few seconds."""
-    drawing, gpu = _start(_DRAW), _start(_FIND_GPU)
+    drawing, gpu = _start(_DRAW_PROGRAM), _start(_GPU_PROGRAM)
     return [
         *check_requirements(),
         *check_names(metadata.packages_distributions(), shadowed_siblings()),
@@ -177,7 +177,7 @@ def check_requirements() -> Iterator[Finding]:
     yield Finding("Python", python, limits, remedy)
     stated = [Requirement(requirement) for requirement in metadata.requires("handsim") or ()]
     yield from (check_requirement(str(one)) for one in stated if one.marker is None)
-    for extra, purpose in _EXTRAS.items():
+    for extra, purpose in _EXTRA_PURPOSES.items():
         needed = [one for one in stated if one.marker is not None and one.marker.evaluate({"extra": extra})]
         yield check_extra(extra, purpose, [f"{one.name}{one.specifier}" for one in needed])
 

@@ -86,7 +86,7 @@ def film(
             on_step=bar.step,
         )
     print_table(found.figures(), left=1)
-    print_line(*found.doubts(), *(f"Left out: {told}." for told in found.left_out()))
+    print_line(*found.doubts(), *(f"Left out: {what}." for what in found.left_out()))
     counted, seconds = found.reasons.count(""), time.perf_counter() - begin
     print_line(
         f"{out}: {counted} of {len(found.reasons)} frames fit, {found.residual():.1f} px off in the median; "

@@ -184,14 +184,14 @@ def check_glove(
             one.name for one, place in zip(layout.markers, worn.layout.markers, strict=True) if one != place
         ]
         if moved:
-            told = f"off its digit on size {name}, where it is worn nearer to the middle of its bone's back"
-            warnings.warn(f"{glove}: {', '.join(moved)} would be {told}", HandSimWarning, stacklevel=2)
+            where = f"off its digit on size {name}, where it is worn nearer to the middle of its bone's back"
+            warnings.warn(f"{glove}: {', '.join(moved)} would be {where}", HandSimWarning, stacklevel=2)
     print_table(rows, left=2, title=f"{layout.name}: {layout.num_markers} markers")
     if overlaps:
-        told = f"{glove}: markers of {2e3 * layout.radius:.1f} mm overlap: {', '.join(overlaps.values())}"
+        overlap = f"{glove}: markers of {2e3 * layout.radius:.1f} mm overlap: {', '.join(overlaps.values())}"
         if "M" in overlaps:
-            raise LayoutError(f"{told}; move them apart")
-        warnings.warn(told, HandSimWarning, stacklevel=2)
+            raise LayoutError(f"{overlap}; move them apart")
+        warnings.warn(overlap, HandSimWarning, stacklevel=2)
     from render.captions import write_png
     from render.illustrations import draw_glove
     from train.simulation.training_frames import GenerateSettings, slipped_gloves

@@ -19,7 +19,7 @@ from typing import Final
 
 from handsim._imports import SIBLINGS, user_cache
 
-_VARIABLES: Final = ("FORCE_COLOR", "NO_COLOR", "TERM")
+_TERMINAL_VARIABLES: Final = ("FORCE_COLOR", "NO_COLOR", "TERM")
 
 
 class _Page(io.StringIO):
@@ -39,7 +39,7 @@ def print_help(prog: str, make: Callable[[], object]) -> None:
         SystemExit: After a page that `make` has printed, with its exit code.
     """
     page = _Page()
-    key = hashlib.sha256(repr(_state(page)).encode()).hexdigest()
+    key = hashlib.sha256(repr(_page_inputs(page)).encode()).hexdigest()
     path = user_cache() / "handsim" / "help" / f"{prog.replace(' ', '-')}.txt"
     with contextlib.suppress(OSError, ValueError):
         found, _, text = path.read_text("utf-8").partition("\n")
@@ -57,7 +57,7 @@ def print_help(prog: str, make: Callable[[], object]) -> None:
         print(page.getvalue(), end="")
 
 
-def _state(page: _Page) -> list[object]:
+def _page_inputs(page: _Page) -> list[object]:
     """What a page depends on."""
     home = Path(__file__).parents[2]
     tyro = importlib.util.find_spec("tyro")
@@ -67,7 +67,7 @@ def _state(page: _Page) -> list[object]:
             files += [os.path.join(folder, name) for name in names if name.endswith(".py")]
     times = sorted((file, os.stat(file).st_mtime_ns) for file in files)
     shown = (page.isatty(), page.encoding, shutil.get_terminal_size().columns)
-    return [times, sys.version, shown, [os.environ.get(name) for name in _VARIABLES]]
+    return [times, sys.version, shown, [os.environ.get(name) for name in _TERMINAL_VARIABLES]]
 
 
 def _keep(path: Path, text: str) -> None:

@@ -21,7 +21,7 @@ from typing import Any, Final
 
 from handsim import callbacks
 from handsim._version import full_version
-from handsim.app.messages import told_warnings
+from handsim.app.messages import warnings_as_lines
 from handsim.callbacks import before_compiling
 from handsim.cli.kept_help import print_help
 from handsim.errors import MAX_MESSAGE_LENGTH, HandSimError, choices, shortened
@@ -72,7 +72,7 @@ _HELP: Final = {
     "doctor": "Say what is missing on this machine, and how to get it.",
 }
 """Every command with its line of help; `handsim glove list` is `list_glove` in the module `glove`."""
-_EMPTY: Final = re.compile(r"(--[\w-]+=)?")
+_EMPTY_ARGUMENT: Final = re.compile(r"(--[\w-]+=)?")
 _SHELLS: Final = ("bash", "fish", "zsh")
 _SYSTEM_SENTENCES: Final = {
     errno.ENOSPC: "the disk is full; free some space and run the same command again",
@@ -84,17 +84,17 @@ _SYSTEM_SENTENCES: Final = {
 }
 
 
-def _target(command: str) -> str | Table:
+def _target_of(command: str) -> str | Table:
     """Where a command's function is, or the table of its sub-commands."""
     inner = [name for name in _HELP if name.startswith(f"{command} ")]
     if inner:
-        return {name.split()[1]: (_target(name), _HELP[name]) for name in inner}
+        return {name.split()[1]: (_target_of(name), _HELP[name]) for name in inner}
     words = command.split()
     return f"handsim.cli.{words[0]}:{'_'.join(reversed(words))}"
 
 
 # Modules are imported when their command runs, and not for the help of a table.
-COMMANDS: Final[Table] = {name: (_target(name), line) for name, line in _HELP.items() if " " not in name}
+COMMANDS: Final[Table] = {name: (_target_of(name), text) for name, text in _HELP.items() if " " not in name}
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -113,7 +113,7 @@ def main(args: Sequence[str] | None = None) -> int:
 
 def run(commands: Table, args: Sequence[str]) -> int:
     """Run a command of a table and return its exit code."""
-    args = list(map(_at_home, args))
+    args = list(map(_with_home, args))
     _, program, _ = _chosen(commands, args)
     _prepare_streams()
     if not os.environ.get("COLUMNS", "").strip("0"):  # rich would print nothing into a width of 0
@@ -121,7 +121,7 @@ def run(commands: Table, args: Sequence[str]) -> int:
     # One core solves our small systems faster than several, and each worker has one core.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
-        with told_warnings(program), signals_raise():
+        with warnings_as_lines(program), signals_raise():
             code = _dispatch(commands, args)
         sys.stdout.flush()  # a full disk or a closed pipe must fail here, not while Python shuts down
         return code
@@ -129,19 +129,19 @@ def run(commands: Table, args: Sequence[str]) -> int:
         _abandon_stdout()
         return _BROKEN_PIPE
     except SystemExit as end:
-        return _leave(end)
+        return _exit_with_help(end)
     except KeyboardInterrupt as stop:
         number, kept = (stop.number, stop.kept) if isinstance(stop, Stopped) else (signal.SIGINT, "")
         how = "interrupted" if number == signal.SIGINT else f"ended by {signal.Signals(number).name}"
-        _complain(f"{program}: {'; '.join(filter(None, (how, kept)))}")
+        _print_error(f"{program}: {'; '.join(filter(None, (how, kept)))}")
         return 128 + number
     except Exception as error:
         expected = isinstance(error, HandSimError | OSError | MemoryError | ImportError)
-        _complain(f"{program}: {_sentence(error) if expected else _unexpected(program, error)}")
+        _print_error(f"{program}: {_error_sentence(error) if expected else _bug_sentence(program, error)}")
         return 1
 
 
-def _at_home(arg: str) -> str:
+def _with_home(arg: str) -> str:
     """An argument with the home folder for ~, which shells leave alone in quotes and behind `=`."""
     option, equals, value = arg.partition("=") if arg.startswith("--") else ("", "", arg)
     return f"{option}{equals}{os.path.expanduser(value)}"
@@ -173,7 +173,7 @@ def _prepare_streams() -> None:
             stream.reconfigure(errors="backslashreplace")  # names of files may be invalid text
 
 
-def _leave(end: SystemExit) -> int:
+def _exit_with_help(end: SystemExit) -> int:
     """Flush the output of help or usage and exit; rich would exit with code 1 after a closed pipe."""
     pipe: BaseException | None = end
     while pipe is not None and not isinstance(pipe, BrokenPipeError):
@@ -188,7 +188,7 @@ def _leave(end: SystemExit) -> int:
     return _BROKEN_PIPE
 
 
-def _complain(line: str) -> None:
+def _print_error(line: str) -> None:
     """Print a line on standard error, which may be closed."""
     try:
         print(line, file=sys.stderr, flush=True)
@@ -197,7 +197,7 @@ def _complain(line: str) -> None:
         _abandon_stdout()
 
 
-def _unexpected(program: str, error: Exception) -> str:
+def _bug_sentence(program: str, error: Exception) -> str:
     """A sentence on an unexpected error, with the file of its traceback."""
     what = f"unexpected {type(error).__name__}: {shortened(_one_line(error), 200)}"
     trace = traceback.format_exc()
@@ -212,7 +212,7 @@ def _unexpected(program: str, error: Exception) -> str:
     return f"{what}; this is a bug in handsim; please report it and attach {log.name}"
 
 
-def _sentence(error: Exception) -> str:
+def _error_sentence(error: Exception) -> str:
     """A sentence on an error that the user can correct."""
     if isinstance(error, MemoryError):
         return "out of memory; ask for fewer frames, a smaller batch or fewer workers"
@@ -253,7 +253,7 @@ def _dispatch(commands: Table, args: Sequence[str]) -> int:
         print(completion_script({name: load(target) for name, (target, _) in commands.items()}, args[1]))
     elif name in commands:
         (target, help_line), prog, args = _chosen(commands, args)
-        if any(map(_EMPTY.fullmatch, args)):  # the path "" would be the current folder
+        if any(map(_EMPTY_ARGUMENT.fullmatch, args)):  # the path "" would be the current folder
             print(
                 f"{prog}: an argument is empty, expected a value; is a shell's variable unset?",
                 file=sys.stderr,

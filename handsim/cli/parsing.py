@@ -173,9 +173,9 @@ def _settings(info: StructTypeInfo) -> StructConstructorSpec | None:
     """
     if not dataclasses.is_dataclass(info.type) or info.type.__module__.startswith("tyro"):
         return None
-    hints, told = get_type_hints(info.type, include_extras=True), dict[str, str]()
+    hints, docstrings = get_type_hints(info.type, include_extras=True), dict[str, str]()
     for kind in reversed(info.type.__mro__[:-1]):
-        told |= _field_docstrings(kind)
+        docstrings |= _field_docstrings(kind)
     fields = []
     for one in dataclasses.fields(info.type):
         if "follows" in one.metadata:
@@ -195,7 +195,7 @@ def _settings(info: StructTypeInfo) -> StructConstructorSpec | None:
                     kind, default = spelled.kind, spelled.default
         is_count = one.name == "num_frames" and "frames" not in hints
         kind = _hinted(kind, aliases=["--frames"] if is_count else None, name=name)
-        fields.append(StructFieldSpec(one.name, kind, default, told.get(one.name)))
+        fields.append(StructFieldSpec(one.name, kind, default, docstrings.get(one.name)))
     return StructConstructorSpec(instantiate=info.type, fields=tuple(fields))
 
 
@@ -204,13 +204,13 @@ def _field_docstrings(kind: type) -> dict[str, str]:
     """The docstring below each field of a class."""
     (body,) = ast.parse(textwrap.dedent(inspect.getsource(kind))).body
     assert isinstance(body, ast.ClassDef)
-    told = {}
+    docstrings = {}
     for field, text in zip(body.body, body.body[1:], strict=False):
         if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr):
             value = text.value
             if isinstance(value, ast.Constant) and isinstance(field.target, ast.Name):
-                told[field.target.id] = " ".join(inspect.cleandoc(str(value.value)).split())
-    return told
+                docstrings[field.target.id] = " ".join(inspect.cleandoc(str(value.value)).split())
+    return docstrings
 
 
 def _hint(default: str) -> str:

@@ -15,12 +15,12 @@ from track.streams import COMMAND_PORT, ReplaySettings
 if TYPE_CHECKING:
     from track.streams.natnet import ReplayServer
 
-_USUAL: Final = ReplaySettings(port=COMMAND_PORT)
+_DEFAULT_SETTINGS: Final = ReplaySettings(port=COMMAND_PORT)
 
 
 def replay(
     capture: Annotated[Path, tyro.conf.Positional],
-    settings: Annotated[ReplaySettings, tyro.conf.arg(name="")] = _USUAL,
+    settings: Annotated[ReplaySettings, tyro.conf.arg(name="")] = _DEFAULT_SETTINGS,
 ) -> None:
     """Play a capture as a NatNet server, for handsim track --live; Ctrl-C ends it.
 

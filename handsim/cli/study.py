@@ -20,7 +20,7 @@ from typing import Any, Final, NamedTuple
 from gloves.captures.formats import READABLE, find_captures
 from handsim._checks import check_choice
 from handsim._version import provenance
-from handsim.app.messages import print_line, tell_state
+from handsim.app.messages import print_line, show_state
 from handsim.errors import ArgumentError, CaptureError, HandSimError, errors_of
 from handsim.files.inputs import check_regular, checksum, load_json, read_bytes, text_encoding
 from handsim.files.outputs import check_outputs, save_json
@@ -29,10 +29,10 @@ from handsim.hand.shape import SIDES
 RECORD: Final = "study.json"
 COLUMNS: Final = ("capture", "person", "session", "side", "glove", "neutral", "shape")
 """Columns of a study's table; all but the first may be missing or blank."""
-_PATHS: Final = ("capture", "glove", "neutral", "shape")
-_TABLES: Final = (".csv", ".tsv")
-_LONGEST_HEADER: Final = 4096  # bytes
-_MOST_TABLE: Final = 1 << 24  # largest size of a study's table [bytes]
+_PATH_COLUMNS: Final = ("capture", "glove", "neutral", "shape")
+_TABLE_ENDINGS: Final = (".csv", ".tsv")
+_MAX_HEADER_BYTES: Final = 4096  # bytes
+_MAX_TABLE_BYTES: Final = 1 << 24  # largest size of a study's table [bytes]
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,28 +122,29 @@ def run_study(
     check_outputs([one for read in inputs for one in read], outputs)
     record = load_json(out / RECORD) if (out / RECORD).is_file() else {"outputs": {}}
     entries: dict[str, Any] = record["outputs"]
-    own = {file.source.resolve(): _key(out, step) for file, step in zip(files, steps, strict=True)}
-    record["study"] = [_key(out, step) for step in steps]
+    own = {file.source.resolve(): _step_key(out, step) for file, step in zip(files, steps, strict=True)}
+    record["study"] = [_step_key(out, step) for step in steps]
     there, bad, made = list[Step](), list[str](), 0
     for file, step, read in zip(files, steps, inputs, strict=True):
         cells = {**file.cells}
         if "neutral" in cells:
             cells["neutral"] = own.get(Path(cells["neutral"]).resolve(), cells["neutral"])
-        key = _key(out, step)
+        key = _step_key(out, step)
         old = entry = entries.pop(key, {})
-        of = {"settings": json.loads(json.dumps(step.options, default=_plain)), "inputs": _checksums(read)}
+        settings = json.loads(json.dumps(step.options, default=_plain_option))
+        made_of = {"settings": settings, "inputs": _checksums(read)}
         try:
-            if {**entry, **of} != entry or entry["sums"] != _checksums(step.outputs):
-                tell_state(str(file.source))  # whose the next warnings are
+            if {**entry, **made_of} != entry or entry["sums"] != _checksums(step.outputs):
+                show_state(str(file.source))  # whose the next warnings are
                 make((file.source,), out=step.outputs[0], **step.options)
                 made += 1
                 names = [one.relative_to(out).as_posix() for one in step.outputs]
-                entry = {**of, **provenance(), "names": names, "sums": _checksums(step.outputs)}
+                entry = {**made_of, **provenance(), "names": names, "sums": _checksums(step.outputs)}
             entries[key] = {**entry, "cells": cells}
             there.append(step)
         except HandSimError as error:
             bad.append(str(file.source))
-            tell_state(f"{file.source}: not {done}: {str(error).removeprefix(f'{file.source}: ')}")
+            show_state(f"{file.source}: not {done}: {str(error).removeprefix(f'{file.source}: ')}")
         if entries.get(key, {}) != old:
             save_json(out / RECORD, record)
     if there or (out / RECORD).is_file():
@@ -155,12 +156,12 @@ def run_study(
         raise CaptureError(f"{len(bad)} of {len(files)} files were not {done}: {', '.join(bad)}")
 
 
-def _key(out: Path, step: Step) -> str:
+def _step_key(out: Path, step: Step) -> str:
     """The name of a step in the record."""
     return step.outputs[0].relative_to(out).as_posix()
 
 
-def _plain(value: Any) -> Any:
+def _plain_option(value: Any) -> Any:
     """Options as JSON."""
     return dataclasses.asdict(value) if dataclasses.is_dataclass(value) else str(value)  # type: ignore[arg-type]
 
@@ -194,11 +195,11 @@ def _recorded_files(folder: Path, endings: Sequence[str]) -> Iterator[StudyFile]
 
 def _is_table(path: Path) -> bool:
     """Whether a file is the table of a study, whose first line names a column `capture`."""
-    if path.suffix.lower() not in _TABLES or not path.is_file():
+    if path.suffix.lower() not in _TABLE_ENDINGS or not path.is_file():
         return False
     check_regular(path, error=CaptureError)
     with path.open("rb") as file:
-        line = file.readline(_LONGEST_HEADER)
+        line = file.readline(_MAX_HEADER_BYTES)
     return COLUMNS[0] in _header(line.decode(text_encoding(line), "ignore"))
 
 
@@ -214,7 +215,7 @@ def _separator(line: str) -> str:
 
 def _table_files(table: Path) -> Iterator[StudyFile]:
     """The files in a study's table; paths start at its folder."""
-    data = read_bytes(table, error=CaptureError, most=_MOST_TABLE)
+    data = read_bytes(table, error=CaptureError, max_bytes=_MAX_TABLE_BYTES)
     lines = data.decode(text_encoding(data), "replace").splitlines()
     header = _header(lines[0])
     for name in filter(None, header):
@@ -232,7 +233,7 @@ def _table_files(table: Path) -> Iterator[StudyFile]:
                 check_choice(cells["side"], SIDES, noun="side")
         own = Path(cells["capture"])
         inside = not own.is_absolute() and ".." not in own.parts
-        for column in _PATHS:
+        for column in _PATH_COLUMNS:
             beside = table.parent.resolve() / cells.get(column, "")
             if column in cells and (column != "glove" or beside.is_file()):  # or it is a shipped one
                 cells[column] = str(beside)

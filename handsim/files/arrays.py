@@ -19,10 +19,10 @@ from typing import IO, Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-_ALWAYS: Final = 1 << 28  # bytes that any archive may hold
-_LEVEL: Final = 1  # of compression; level 6 makes takes 3 % smaller and is 2.4 times as slow
-_LARGEST_RATIO: Final = 20  # A larger archive may expand to this many times the size of its file.
-_DAMAGE: Final = (
+_ALWAYS_ALLOWED: Final = 1 << 28  # bytes that any archive may hold
+_COMPRESSION_LEVEL: Final = 1  # of compression; level 6 makes takes 3 % smaller and is 2.4 times as slow
+_MAX_RATIO: Final = 20  # A larger archive may expand to this many times the size of its file.
+_DAMAGE_ERRORS: Final = (
     AttributeError, EOFError, IndexError, KeyError, OverflowError, RuntimeError, SyntaxError, TypeError,
     tokenize.TokenError, lzma.LZMAError, zipfile.BadZipFile, zlib.error,
 )  # fmt: skip
@@ -52,7 +52,7 @@ def write_npz(path: Path, members: Iterable[Member]) -> None:
     """
     members = list(members)
     for method in (zipfile.ZIP_DEFLATED, zipfile.ZIP_STORED):
-        with zipfile.ZipFile(path, "w", method, compresslevel=_LEVEL) as archive:
+        with zipfile.ZipFile(path, "w", method, compresslevel=_COMPRESSION_LEVEL) as archive:
             for name, dtype, shape, parts in members:
                 with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
                     form = {
@@ -63,14 +63,14 @@ def write_npz(path: Path, members: Iterable[Member]) -> None:
                     np.lib.format.write_array_header_1_0(file, form)
                     for part in parts():
                         file.write(part.reshape(-1).view(np.uint8))
-            held = _held(archive)
-        if held <= _most_held(path.stat().st_size):
+            held = _unpacked_bytes(archive)
+        if held <= _max_unpacked(path.stat().st_size):
             return
 
 
 def check_npz(path: Path) -> None:
     """Read an `.npz` to its end without keeping its arrays."""
-    with _damage_named(), path.open("rb") as file, zipfile.ZipFile(file) as archive:
+    with _damage_as_value_error(), path.open("rb") as file, zipfile.ZipFile(file) as archive:
         _check_archive(archive, file)
         if archive.testzip() is not None:
             raise ValueError("damaged")
@@ -79,7 +79,7 @@ def check_npz(path: Path) -> None:
 def read_npz(source: Path | bytes) -> dict[str, np.ndarray[Any, Any]]:
     """All arrays of an `.npz`, given by its path or as its content, by name."""
     with (
-        _damage_named(),
+        _damage_as_value_error(),
         io.BytesIO(source) if isinstance(source, bytes) else source.open("rb") as file,
         zipfile.ZipFile(file) as archive,
     ):
@@ -90,7 +90,7 @@ def read_npz(source: Path | bytes) -> dict[str, np.ndarray[Any, Any]]:
 
 
 @contextmanager
-def _damage_named() -> Iterator[None]:
+def _damage_as_value_error() -> Iterator[None]:
     """Turn what the libraries raise for a damaged archive into a ValueError."""
     try:
         yield
@@ -98,7 +98,7 @@ def _damage_named() -> Iterator[None]:
         if error.errno is None:  # raised by a decompressor
             raise ValueError("damaged") from error
         raise
-    except _DAMAGE as error:
+    except _DAMAGE_ERRORS as error:
         raise ValueError("damaged") from error
 
 
@@ -112,19 +112,19 @@ def _check_archive(archive: zipfile.ZipFile, file: IO[bytes]) -> None:
 
 def check_members(archive: zipfile.ZipFile, size: int) -> None:
     """Raise a ValueError if an archive holds far more than a file of its size [bytes] may."""
-    members, held, most = archive.infolist(), _held(archive), _most_held(size)
+    members, held, most = archive.infolist(), _unpacked_bytes(archive), _max_unpacked(size)
     if len(members) > 10_000 or held > most:
         raise ValueError(f"{len(members)} members of {held} bytes, expected at most {most} bytes")
 
 
-def _held(archive: zipfile.ZipFile) -> int:
+def _unpacked_bytes(archive: zipfile.ZipFile) -> int:
     """Bytes of an archive's members in memory."""
     return sum(member.file_size for member in archive.infolist())
 
 
-def _most_held(size: int) -> int:
+def _max_unpacked(size: int) -> int:
     """Bytes that a file of a size may hold in memory."""
-    return max(_ALWAYS, _LARGEST_RATIO * size)
+    return max(_ALWAYS_ALLOWED, _MAX_RATIO * size)
 
 
 def check_npy_header(file: IO[bytes], size: int) -> tuple[tuple[int, ...], np.dtype[Any]]:

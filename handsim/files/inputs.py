@@ -1,6 +1,6 @@
-"""Files that somebody else wrote: regular files of a bounded size, and values of TOML files.
+"""Readers of files that somebody else wrote: regular files of a bounded size, and values of TOML files.
 
-A wrong value raises a `HandSimError` that names the key; the caller, which knows the file, adds its name.
+A wrong value raises a `HandSimError` that names the key; the caller adds the name of the file.
 """
 
 from __future__ import annotations
@@ -28,32 +28,34 @@ if TYPE_CHECKING:
     from upath import UPath
 
 
-_NO_WAITING: Final = getattr(os, "O_NONBLOCK", 0)
-_MOST_TOML: Final = 1 << 18  # bytes; a layout of 60 markers has 6000
-_MOST_JSON: Final = 1 << 26  # bytes
-_DOTTED: Final = re.compile(r"""(?:\.\s{0,9}[\w"'-]+\s{0,9}){20}""")  # tomllib takes hours for very long ones
-_KINDS: Final = (
+_NONBLOCKING: Final = getattr(os, "O_NONBLOCK", 0)
+_MAX_TOML_BYTES: Final = 1 << 18  # bytes; a layout of 60 markers has 6000
+_MAX_JSON_BYTES: Final = 1 << 26  # bytes
+_LONG_KEY: Final = re.compile(r"""(?:\.\s{0,9}[\w"'-]+\s{0,9}){20}""")
+"""A dotted key of twenty parts; tomllib takes hours for very long ones."""
+_SPECIAL_FILES: Final = (
     (stat.S_ISFIFO, "a pipe"),
     (stat.S_ISSOCK, "a socket"),
     (stat.S_ISCHR, "a device"),
     (stat.S_ISBLK, "a device"),
 )
-_LARGEST: Final = 1e9  # in any unit; keeps out NaN, infinity and integers beyond float
+_MAX_NUMBER: Final = 1e9
+"""Largest number, in any unit; it excludes NaN, infinity and integers beyond float."""
 
 
-def check_regular(path: Path, *, error: type[HandSimError], most: int | None = None) -> None:
-    """Refuse a pipe, a socket or a device, which may never end, and a file of more than `most` bytes."""
+def check_regular(path: Path, *, error: type[HandSimError], max_bytes: int | None = None) -> None:
+    """Refuse a pipe, a socket or a device, which may never end, and a file of more than `max_bytes`."""
     try:
         found = path.stat()
     except OSError:
         return
     except ValueError as cause:  # a zero byte in the name
         raise error(f"{str(path)!r}: not the name of a file") from cause
-    for is_kind, kind in _KINDS:
+    for is_kind, kind in _SPECIAL_FILES:
         if is_kind(found.st_mode):
             raise error(f"{path}: this is {kind}, expected a regular file; write it to a file first")
-    if most is not None and found.st_size > most and stat.S_ISREG(found.st_mode):
-        raise error(f"{path}: the file is {found.st_size} bytes long, expected at most {most}")
+    if max_bytes is not None and found.st_size > max_bytes and stat.S_ISREG(found.st_mode):
+        raise error(f"{path}: the file is {found.st_size} bytes long, expected at most {max_bytes}")
 
 
 def check_there(path: Path, *, error: type[HandSimError]) -> None:
@@ -62,19 +64,19 @@ def check_there(path: Path, *, error: type[HandSimError]) -> None:
         raise error(f"{path}: cannot be read: {os.strerror(errno.ENOENT)}")
 
 
-def read_bytes(path: Path, *, error: type[HandSimError], most: int | None = None) -> bytes:
-    """The bytes of a regular file of at most `most` bytes."""
-    check_regular(path, error=error, most=most)
+def read_bytes(path: Path, *, error: type[HandSimError], max_bytes: int | None = None) -> bytes:
+    """The bytes of a regular file of at most `max_bytes`."""
+    check_regular(path, error=error, max_bytes=max_bytes)
     try:
         # Without waiting: the path may have become a pipe since it was checked.
-        with open(path, "rb", opener=lambda name, flags: os.open(name, flags | _NO_WAITING)) as file:
-            return file.read() if most is None else file.read(most)
+        with open(path, "rb", opener=lambda name, flags: os.open(name, flags | _NONBLOCKING)) as file:
+            return file.read(max_bytes)
     except OSError as cause:
         raise error(f"{path}: cannot be read: {cause.strerror or cause}") from cause
 
 
 def text_encoding(data: bytes) -> str:
-    """The encoding of a text: UTF-8, or UTF-16 as programs of Windows write it, with or without its mark."""
+    """The encoding of a text: UTF-8, or UTF-16 (which programs of Windows write) with or without its mark."""
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return "utf-16"
     return {0: "utf-16-be", 1: "utf-16-le"}.get(data[:2].find(b"\0"), "utf-8-sig")
@@ -88,10 +90,10 @@ def checksum(path: Path | UPath) -> str:
 
 def read_toml(path: Path, *, error: type[HandSimError]) -> dict[str, Any]:
     """The tables of a TOML file."""
-    data = read_bytes(path, error=error, most=_MOST_TOML)
+    data = read_bytes(path, error=error, max_bytes=_MAX_TOML_BYTES)
     try:
         text = data.decode(text_encoding(data))
-        deep = _DOTTED.search(text)
+        deep = _LONG_KEY.search(text)
         if deep is not None:
             raise tomllib.TOMLDecodeError(f"the key {shortened(deep[0])!r} has too many parts")
         table = tomllib.loads(text)
@@ -118,7 +120,7 @@ def _has_long_integer(value: object) -> bool:
 def load_json(path: Path) -> dict[str, Any]:
     """Read a JSON object."""
     try:
-        content = json.loads(read_bytes(path, error=DatasetError, most=_MOST_JSON))
+        content = json.loads(read_bytes(path, error=DatasetError, max_bytes=_MAX_JSON_BYTES))
     except (ValueError, RecursionError) as error:
         raise DatasetError(f"{path} is damaged: it does not hold JSON") from error
     if not isinstance(content, dict):
@@ -177,7 +179,7 @@ def numbers(owner: str, value: object, shape: tuple[int, ...], expected: str) ->
         array = np.array(None)
     flat = array.ravel().tolist()
     if array.shape != shape or not all(
-        isinstance(entry, int | float) and not isinstance(entry, bool) and abs(entry) < _LARGEST
+        isinstance(entry, int | float) and not isinstance(entry, bool) and abs(entry) < _MAX_NUMBER
         for entry in flat
     ):
         raise HandSimError(f"{owner} is {shown(value)}, expected {expected}")
@@ -199,7 +201,7 @@ def number_list(owner: str, value: object) -> tuple[float, ...]:
 
 
 def shown(value: object) -> str:
-    """A value as a sentence shows it, cut where it is long."""
+    """A value for a sentence, shortened where it is long."""
     return shortened(json.dumps(value, default=str, ensure_ascii=False))
 
 

@@ -18,10 +18,10 @@ if TYPE_CHECKING:
 
 DIGEST: Final = "handsim.sha256"
 """Key of a model's own SHA-256, which is taken with 64 zeros in its place."""
-MOST_MODEL_BYTES: Final = 1 << 27
+MAX_MODEL_BYTES: Final = 1 << 27
 """Largest file of a model that is read; the paper's network has 87 MB."""
-_MOST_PARTS: Final = 200_000  # fields of a model and its parts; that of dense19 has 11,000
-_MOST_COMPUTED: Final = 1 << 30  # bytes of weights and results of all sessions
+_MAX_PARTS: Final = 200_000  # fields of a model and its parts; that of dense19 has 11,000
+_MAX_SESSION_BYTES: Final = 1 << 30  # bytes of weights and results of all sessions
 
 # The fields of onnx.proto that a model may have, by number, and the message that each holds, if it is one.
 _Message = Mapping[int, "_Message | None"]
@@ -45,15 +45,15 @@ def stamp_model(content: bytes) -> bytes:
 
 def check_model(content: bytes) -> None:
     """Raise a `ValueError` unless a model has the right checksum, and one bounded graph alone."""
-    if len(content) > MOST_MODEL_BYTES or stamp_model(content) != content:
+    if len(content) > MAX_MODEL_BYTES or stamp_model(content) != content:
         raise ValueError("the SHA-256 is another one")
     parts, waiting = 0, [(_MODEL, memoryview(content))]
     while waiting:
         message, part = waiting.pop()
         for field, value in _fields(part):
             parts += 1
-            if field not in message or parts > _MOST_PARTS:
-                raise ValueError(f"a model with the field {field}, or with more than {_MOST_PARTS} parts")
+            if field not in message or parts > _MAX_PARTS:
+                raise ValueError(f"a model with the field {field}, or with more than {_MAX_PARTS} parts")
             inner = message[field]
             if inner is not None:
                 waiting.append((inner, value))
@@ -118,6 +118,6 @@ def _bound_memory() -> None:
 
     kind = onnxruntime.OrtAllocatorType.ORT_ARENA_ALLOCATOR
     cpu = onnxruntime.OrtMemoryInfo("Cpu", kind, 0, onnxruntime.OrtMemType.DEFAULT)
-    settings = {"max_mem": _MOST_COMPUTED, "arena_extend_strategy": 1, "initial_chunk_size_bytes": -1}
+    settings = {"max_mem": _MAX_SESSION_BYTES, "arena_extend_strategy": 1, "initial_chunk_size_bytes": -1}
     settings["max_dead_bytes_per_chunk"] = -1
     onnxruntime.create_and_register_allocator(cpu, onnxruntime.OrtArenaCfg(settings))

@@ -30,12 +30,12 @@ from handsim.files.inputs import load_json
 from handsim.files.signals import signals_wait
 
 _REPLACEMENT: Final = "\N{REPLACEMENT CHARACTER}"
-_OLDER: Final = "-older"  # marks the second name of a file that is being replaced
-_SHOWN_STEM: Final = 32  # characters of a name that its temporary name shows
-_TOGETHER: Final[ContextVar[dict[Path, Path] | None]] = ContextVar("together", default=None)
+_OLDER_MARK: Final = "-older"  # marks the second name of a file that is being replaced
+_MAX_STEM: Final = 32  # characters of a name that its temporary name shows
+_WAITING_FILES: Final[ContextVar[dict[Path, Path] | None]] = ContextVar("together", default=None)
 """Temporary files that wait for the end of a block of `written_together`, by their final names."""
-_UNITS: Final = ("bytes", "kB", "MB", "GB", "TB", "PB", "EB")
-_MOST_SHOWN: Final = 4  # settings that a message lists
+_BYTE_UNITS: Final = ("bytes", "kB", "MB", "GB", "TB", "PB", "EB")
+_MAX_SHOWN: Final = 4  # settings that a message lists
 
 
 def as_text(name: str) -> str:
@@ -76,13 +76,13 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
     remove_abandoned(final)
     temporary = temporary_beside(final)
     with _naming_final(final, temporary):
-        mode = _usual_mode(temporary)
+        mode = _default_mode(temporary)
         try:
             yield temporary
             with suppress(OSError):  # network drives and memory cards may keep no modes
                 os.chmod(temporary, mode)
             _flush(temporary)
-            together = _TOGETHER.get()
+            together = _WAITING_FILES.get()
             if together is None:
                 _rename_all({final: temporary})
             else:
@@ -109,16 +109,16 @@ def written_together() -> Iterator[None]:
 
     Only a process that is killed between two of the renames leaves new files beside older ones.
     """
-    if _TOGETHER.get() is not None:
+    if _WAITING_FILES.get() is not None:
         yield
         return
     files: dict[Path, Path] = {}
-    token = _TOGETHER.set(files)
+    token = _WAITING_FILES.set(files)
     try:
         yield
         _rename_all(files)
     finally:
-        _TOGETHER.reset(token)
+        _WAITING_FILES.reset(token)
         for temporary in files.values():
             temporary.unlink(missing_ok=True)
 
@@ -131,8 +131,8 @@ def _rename_all(files: Mapping[Path, Path]) -> None:
         try:
             if len(files) > 1:  # a single rename is atomic
                 for final in filter(Path.exists, files):
-                    older[final] = temporary_beside(final, _OLDER)
-                    _keep(final, older[final])
+                    older[final] = temporary_beside(final, _OLDER_MARK)
+                    _keep_older(final, older[final])
             for final, temporary in files.items():
                 with _naming_final(final, temporary):
                     os.replace(temporary, final)
@@ -151,7 +151,7 @@ def _rename_all(files: Mapping[Path, Path]) -> None:
                 kept.unlink(missing_ok=True)
 
 
-def _keep(final: Path, older: Path) -> None:
+def _keep_older(final: Path, older: Path) -> None:
     """Keep a file under a second name."""
     older.unlink(missing_ok=True)
     try:
@@ -198,21 +198,21 @@ def make_folder_of(path: Path) -> None:
 
 def temporary_beside(path: Path, mark: str = "") -> Path:
     """The hidden name under which this process writes `path`; `remove_leftovers` knows such names."""
-    return path.with_name(f"{_prefix(path)}{os.getpid()}{mark}{path.suffix}")
+    return path.with_name(f"{_temporary_prefix(path)}{os.getpid()}{mark}{path.suffix}")
 
 
-def _prefix(path: Path) -> str:
+def _temporary_prefix(path: Path) -> str:
     """The beginning of temporary names, with a hash of this machine, since only there IDs are unique.
 
     It has a hash in place of the end of a long name, as a name may have 255 bytes.
     """
     stem = path.stem
-    if len(stem) > _SHOWN_STEM:
-        stem = f"{stem[:_SHOWN_STEM]}-{zlib.crc32(os.fsencode(stem)):08x}"
-    return f".{stem}.tmp-{_machine()}-"
+    if len(stem) > _MAX_STEM:
+        stem = f"{stem[:_MAX_STEM]}-{zlib.crc32(os.fsencode(stem)):08x}"
+    return f".{stem}.tmp-{_machine_hash()}-"
 
 
-def _machine() -> str:
+def _machine_hash() -> str:
     """A hash of this machine's name."""
     return f"{zlib.crc32(platform.node().encode()):08x}"
 
@@ -223,7 +223,7 @@ def remove_leftovers(folder: Path, names: str = "**/.*.tmp-*") -> None:
     What another running process of this machine writes there stays.
     """
     for leftover in folder.glob(names):
-        writer = re.search(rf"\.tmp-{_machine()}-(\d{{1,9}})", leftover.name)
+        writer = re.search(rf"\.tmp-{_machine_hash()}-(\d{{1,9}})", leftover.name)
         if writer and int(writer[1]) != os.getpid() and _is_running(int(writer[1])):
             continue
         if leftover.is_dir() and not leftover.is_symlink():
@@ -234,9 +234,9 @@ def remove_leftovers(folder: Path, names: str = "**/.*.tmp-*") -> None:
 
 def remove_abandoned(final: Path) -> None:
     """Remove temporary files of `final`, its new or its older content, whose process has ended."""
-    prefix = _prefix(final)
+    prefix = _temporary_prefix(final)
     for leftover in final.parent.glob(f"{glob.escape(prefix)}*{glob.escape(final.suffix)}"):
-        number = leftover.name.removeprefix(prefix).removesuffix(final.suffix).removesuffix(_OLDER)
+        number = leftover.name.removeprefix(prefix).removesuffix(final.suffix).removesuffix(_OLDER_MARK)
         if number.isdecimal() and int(number) != os.getpid():
             remove_leftovers(final.parent, glob.escape(leftover.name))
 
@@ -253,7 +253,7 @@ def _is_running(process: int) -> bool:
     return True
 
 
-def _usual_mode(temporary: Path) -> int:
+def _default_mode(temporary: Path) -> int:
     """The mode of a new file here; some writers make theirs readable by the owner alone."""
     descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT, 0o666)
     try:
@@ -367,9 +367,9 @@ def available_bytes() -> int:
 def shown_bytes(count: float) -> str:
     """A number of bytes with a unit that suits it."""
     unit = 0
-    while count >= 1000.0 and unit < len(_UNITS) - 1:
+    while count >= 1000.0 and unit < len(_BYTE_UNITS) - 1:
         count, unit = count / 1000.0, unit + 1
-    return f"{count:.3g} {_UNITS[unit]}"
+    return f"{count:.3g} {_BYTE_UNITS[unit]}"
 
 
 def save_json(path: Path, content: dict[str, Any]) -> None:
@@ -412,7 +412,7 @@ def claim(
     out, shown = path.parent, shown or str(path.parent)
     if path.is_file():
         stored = load_json(path)
-        found, expected = _flat(stored), _flat(json.loads(json.dumps(settings)))
+        found, expected = _flat_settings(stored), _flat_settings(json.loads(json.dumps(settings)))
         keys = sorted((found.keys() | expected) - set(free))
         differing = [key for key in keys if key not in found.keys() & expected or found[key] != expected[key]]
         new, old = expected.get(grows), found.get(grows)
@@ -438,12 +438,12 @@ def claim(
         save_json(path, settings)
 
 
-def _flat(table: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+def _flat_settings(table: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     """Settings by their path of names, `train.network.width`; lists are values."""
     flat: dict[str, Any] = {}
     for key, value in table.items():
         if isinstance(value, dict) and value:
-            flat |= _flat(value, f"{prefix}{key}.")
+            flat |= _flat_settings(value, f"{prefix}{key}.")
         else:
             flat[f"{prefix}{key}"] = value
     return flat
@@ -452,12 +452,12 @@ def _flat(table: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 def _differences(differing: Collection[str], found: dict[str, Any], expected: dict[str, Any]) -> str:
     """The settings that differ, with both values."""
     pairs = [
-        f"{key}: {_shown(found, key)} there, {_shown(expected, key)} here"
-        for key in list(differing)[:_MOST_SHOWN]
+        f"{key}: {_shown_setting(found, key)} there, {_shown_setting(expected, key)} here"
+        for key in list(differing)[:_MAX_SHOWN]
     ]
-    more = len(differing) - _MOST_SHOWN
+    more = len(differing) - _MAX_SHOWN
     return "; ".join(pairs) + (f"; and {more} more" if more > 0 else "")
 
 
-def _shown(settings: dict[str, Any], key: str) -> str:
+def _shown_setting(settings: dict[str, Any], key: str) -> str:
     return shortened(json.dumps(settings[key], ensure_ascii=False)) if key in settings else "nothing"

@@ -38,7 +38,7 @@ class Stopped(KeyboardInterrupt):
 
 
 class InterruptFlag:
-    """A flag that a signal to end sets; a call tells whether it is set."""
+    """A flag that a signal to end sets; a call returns whether it is set."""
 
     def __init__(self) -> None:
         self.number = 0
@@ -54,7 +54,7 @@ def signals_wait() -> Iterator[None]:
     """Delay signals to end that come within the block until after it."""
     came: list[int] = []
     try:
-        with _handled(lambda number, _frame: came.append(number)):
+        with _signal_handler(lambda number, _frame: came.append(number)):
             yield
     finally:
         for number in dict.fromkeys(came):
@@ -68,10 +68,10 @@ def interrupt_flag(flag: InterruptFlag | None = None, *, again: bool = True) -> 
 
     def note(number: int, _frame: FrameType | None) -> None:
         if flag() and again:
-            raise _Persistent(number, block)
+            raise _PersistentStop(number, block)
         flag.number = flag.number or number
 
-    with _handled(note), block:
+    with _signal_handler(note), block:
         yield flag
 
 
@@ -90,7 +90,7 @@ class _Block(Closing):
             os.kill(os.getpid(), number)
 
 
-class _Persistent(Stopped):
+class _PersistentStop(Stopped):
     """A `Stopped` that is raised again when it is lost, until a block is left."""
 
     def __init__(self, number: int, block: _Block) -> None:
@@ -114,9 +114,9 @@ def signals_raise() -> Iterator[None]:
 
     def stop(number: int, _frame: FrameType | None) -> None:
         block.number = number
-        raise _Persistent(number, block)
+        raise _PersistentStop(number, block)
 
-    with _handled(stop), _lost_silently(), block:
+    with _signal_handler(stop), _lost_stops_hidden(), block:
         try:
             with interrupts_bare():
                 yield
@@ -151,15 +151,15 @@ def interrupt_behind(error: BaseException) -> KeyboardInterrupt | None:
 
 
 @contextmanager
-def _lost_silently() -> Iterator[None]:
+def _lost_stops_hidden() -> Iterator[None]:
     """Print no traceback of a lost `Stopped`, whose signal is sent again."""
     others = sys.unraisablehook
 
-    def tell(lost: sys.UnraisableHookArgs) -> None:
+    def hook(lost: sys.UnraisableHookArgs) -> None:
         if not isinstance(lost.exc_value, Stopped):
             others(lost)
 
-    sys.unraisablehook = tell
+    sys.unraisablehook = hook
     try:
         yield
     finally:
@@ -167,7 +167,7 @@ def _lost_silently() -> Iterator[None]:
 
 
 @contextmanager
-def _handled(handler: Callable[[int, FrameType | None], None]) -> Iterator[None]:
+def _signal_handler(handler: Callable[[int, FrameType | None], None]) -> Iterator[None]:
     """Give signals to end to a handler; only the main thread gets any, and ignored ones stay ignored."""
     with ExitStack() as stack:  # it restores every handler, even where one that is restored raises at once
         if threading.current_thread() is threading.main_thread():

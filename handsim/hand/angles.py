@@ -26,13 +26,13 @@ from handsim.space.transforms import MIRROR, axis_angle_matrix, euler_matrix
 
 Convention = Literal["model", "isb"]
 """Convention of joint angles: `model` has those of the model's hinges, `isb` those of Wu and others 2005."""
-_THUMB: Final = (
+_THUMB_ANGLES: Final = (
     *(f"thumb_metacarpal_{name}" for name in ("palmar_abduction", "radial_abduction", "pronation")),
     "thumb_MCP_flexion",
     "thumb_IP_flexion",
 )
-_FINGER: Final = ("MCP_flexion", "MCP_ulnar_deviation", "MCP_pronation", "PIP_flexion", "DIP_flexion")
-ISB_NAMES: Final = (*_THUMB, *(f"{digit}_{name}" for digit in DIGITS[1:] for name in _FINGER))
+_FINGER_ANGLES: Final = ("MCP_flexion", "MCP_ulnar_deviation", "MCP_pronation", "PIP_flexion", "DIP_flexion")
+ISB_NAMES: Final = (*_THUMB_ANGLES, *(f"{digit}_{name}" for digit in DIGITS[1:] for name in _FINGER_ANGLES))
 ISB_JOINTS: Final = tuple(
     next(number for number, joint in enumerate(JOINT_NAMES) if joint.split("_")[:2] == name.split("_")[:2])
     for name in ISB_NAMES
@@ -40,7 +40,7 @@ ISB_JOINTS: Final = tuple(
 """Index of a hinge of the model that is of the same joint, for each of these angles."""
 WRIST_NAMES: Final = ("wrist_flexion", "wrist_radial_deviation", "forearm_pronation")
 """Angles of a wrist whose forearm has markers, and of a forearm whose elbow has markers, too."""
-_BONE_ISB: Final = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, 0.0, 0.0]])
+_ISB_AXES: Final = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, 0.0, 0.0]])
 """The ISB's axes X, Y and Z as columns, in our frame of a bone."""
 
 
@@ -53,10 +53,10 @@ def isb_angles(
     and those of the first metacarpal where it points along the hand.
     """
     known = np.isfinite(angles[:, 0])
-    outer, turns = angles[known], _first_bones(shape, angles[known])
+    outer, turns = angles[known], _first_bone_rotations(shape, angles[known])
     if neutral is not None:
         outer = outer - neutral
-        turns = turns @ np.swapaxes(_first_bones(shape, neutral[None]), -1, -2)
+        turns = turns @ np.swapaxes(_first_bone_rotations(shape, neutral[None]), -1, -2)
     first = _cardan_angles(turns.reshape(-1, 3, 3)).reshape(-1, len(DIGITS), 3)
     first[:, 0, 1] *= -1.0  # radial abduction of the thumb is the opposite of ulnar deviation
     found = np.full((len(angles), len(ISB_NAMES)), np.nan)
@@ -92,10 +92,10 @@ def _cardan_angles(turns: Float[np.ndarray, "K 3 3"]) -> NDArray[np.float64]:
     """Flexion, ulnar deviation and pronation (K, 3) [rad] of rotations in our frame of the inner bone."""
     from scipy.spatial.transform import Rotation
 
-    return np.asarray(Rotation.from_matrix(_BONE_ISB.T @ turns @ _BONE_ISB).as_euler("ZXY"))
+    return np.asarray(Rotation.from_matrix(_ISB_AXES.T @ turns @ _ISB_AXES).as_euler("ZXY"))
 
 
-def _first_bones(shape: HandShape, angles: Float[np.ndarray, "T 20"]) -> NDArray[np.float64]:
+def _first_bone_rotations(shape: HandShape, angles: Float[np.ndarray, "T 20"]) -> NDArray[np.float64]:
     """Orientation (T, 5, 3, 3) of each digit's first bone on the right hand that every shape describes."""
     by_digit = angles.reshape(-1, len(DIGITS), NUM_JOINTS // len(DIGITS))
     _, y, z = np.eye(3)

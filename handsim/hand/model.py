@@ -42,11 +42,13 @@ if TYPE_CHECKING:
     import mujoco
 
 
-_BONE: Final = np.array([joint.bone for joint in JOINTS])  # joints are in the order of their bones
-_CHAIN: Final = np.array([(bone.parent, (_BONE == number).sum()) for number, bone in enumerate(BONES)])
+_JOINT_BONES: Final = np.array([joint.bone for joint in JOINTS])
+"""The bone that each joint moves; joints are in the order of their bones."""
+_JOINT_COUNTS: Final = np.bincount(_JOINT_BONES, minlength=NUM_BONES)
+_BONE_CHAIN: Final = np.stack([[bone.parent for bone in BONES], _JOINT_COUNTS], axis=1)
 """Parent of each bone, and the number of its joints."""
-_AXES: Final = np.array([joint.axis for joint in JOINTS])
-_RANGES: Final = np.deg2rad([(joint.low, joint.high) for joint in JOINTS])
+_JOINT_AXES: Final = np.array([joint.axis for joint in JOINTS])
+_JOINT_RANGES: Final = np.deg2rad([(joint.low, joint.high) for joint in JOINTS])
 FLESH_DENSITY: Final = 1100.0
 """Density of the hand [kg/m^3], soft tissue and bone together."""
 CAPSULE_GROUP: Final = 0
@@ -54,10 +56,10 @@ SERVO_STIFFNESS: Final = 1.0
 """Torque of a servo per angle off its control [N m/rad]."""
 SERVO_DAMPING: Final = 0.03
 """Torque of a servo against the speed of its joint [N m s/rad]."""
-_PARTS: Final = (("CMC", "MCP", "IP", "tip"), *[("MCP", "PIP", "DIP", "tip")] * 4)
+_KEYPOINT_PARTS: Final = (("CMC", "MCP", "IP", "tip"), *[("MCP", "PIP", "DIP", "tip")] * 4)
 KEYPOINT_NAMES: Final[tuple[str, ...]] = (
     "wrist",
-    *(f"{digit}_{part}" for digit, parts in zip(DIGITS, _PARTS, strict=True) for part in parts),
+    *(f"{digit}_{part}" for digit, parts in zip(DIGITS, _KEYPOINT_PARTS, strict=True) for part in parts),
 )
 KEYPOINT_BONES: Final[tuple[int, ...]] = (
     PALM,
@@ -76,14 +78,15 @@ _WRIST_THICKNESS: Final = 1.3  # thickness of the wrist over that of the palm
 NUM_VELOCITIES: Final = 6 + NUM_JOINTS
 """MuJoCo's nv: wrist velocity in the world, wrist angular velocity in its own frame, joint rates."""
 # The first joint of a bone rotates about an axis of the parent, the second about one of the bone.
-_FIRST: Final = np.diff(_BONE, prepend=-1) != 0
-_PARENT: Final = _CHAIN[_BONE, 0]
+_IS_FIRST_JOINT: Final = np.diff(_JOINT_BONES, prepend=-1) != 0
+_JOINT_PARENTS: Final = _BONE_CHAIN[_JOINT_BONES, 0]
 _HINGES: Final = NUM_JOINTS // len(DIGITS)  # joints of a digit
-# A joint moves its own bone and those further out on its digit (J, L).
-_MOVED: Final = (DIGIT_OF_BONE == DIGIT_OF_BONE[_BONE, None]) & (np.arange(NUM_BONES) >= _BONE[:, None])
-_AT_LIMIT: Final = 1e-9  # [rad] A metacarpal that is this near its limit does not flex further.
+_IS_BEYOND: Final = np.arange(NUM_BONES) >= _JOINT_BONES[:, None]
+_IS_MOVED: Final = _IS_BEYOND & (DIGIT_OF_BONE == DIGIT_OF_BONE[_JOINT_BONES, None])
+"""Whether each joint moves each bone: its own, and those further out on its digit (J, L)."""
+_LIMIT_TOLERANCE: Final = 1e-9  # [rad] A metacarpal that is this near its limit does not flex further.
 _MAX_FRAMES: Final = 1 << 22
-_STEADY: Final = 0.01  # largest deviation of times from a steady rate, in frames
+_MAX_DRIFT: Final = 0.01  # largest deviation of times from a steady rate, in frames
 _MAX_GAP: Final = 0.1  # [s] that interpolation bridges
 _MAX_GAP_FRAMES: Final = 2.5  # old frames that interpolation bridges, if that is longer
 
@@ -110,7 +113,7 @@ class Skeleton:
         transforms = rigid(self.rotations, self.offsets)
         for first in range(1, 4):  # the first bones of all digits, the second, and the third
             bones = slice(first, None, 3)
-            transforms[bones] = transforms[_CHAIN[bones, 0]] @ transforms[bones]
+            transforms[bones] = transforms[_BONE_CHAIN[bones, 0]] @ transforms[bones]
         return transforms
 
 
@@ -121,17 +124,17 @@ def build_skeleton(shape: HandShape) -> Skeleton:
     offsets[1::3], rotations[1::3] = shape.knuckles, euler_matrix(shape.base_angles)
     offsets[2::3, 0], offsets[3::3, 0] = shape.bone_lengths[:, 0], shape.bone_lengths[:, 1]
     lengths = np.concatenate([shape.knuckles[2, :1], shape.bone_lengths.ravel()])
-    axes = _AXES.copy()
+    axes = _JOINT_AXES.copy()
     if shape.side == "left":
         offsets, rotations = offsets @ MIRROR, MIRROR @ rotations @ MIRROR
         axes = -axes @ MIRROR  # a mirrored rotation has the opposite sense
     arch = np.append(np.zeros(3), shape.arch)
-    return Skeleton(offsets, rotations, axes, _RANGES.copy(), lengths, arch)
+    return Skeleton(offsets, rotations, axes, _JOINT_RANGES.copy(), lengths, arch)
 
 
 def bone_transforms(skeleton: Skeleton, qpos: Float[np.ndarray, "T 27"]) -> Float[np.ndarray, "T L 4 4"]:
     """`T_world_bone` of every bone in every frame."""
-    parts = skeleton.offsets, skeleton.rotations, skeleton.axes, _CHAIN, skeleton.arch
+    parts = skeleton.offsets, skeleton.rotations, skeleton.axes, _BONE_CHAIN, skeleton.arch
     return np.asarray(pose_bones(np.ascontiguousarray(qpos), *parts))
 
 
@@ -367,12 +370,12 @@ def joint_axes(
 ) -> tuple[Float[np.ndarray, "T J 3"], Float[np.ndarray, "T J 3"]]:
     """Unit axes and anchors [m] of all joints in the world."""
     skeleton = model.skeleton
-    parent = T_world_bone[:, _PARENT, :3, :3]
+    parent = T_world_bone[:, _JOINT_PARENTS, :3, :3]
     parent[:, ::_HINGES] = metacarpal_rotations(skeleton, T_world_bone)
-    parent = parent @ skeleton.rotations[_BONE]
-    own = T_world_bone[:, _BONE, :3, :3]
-    frames = np.where(_FIRST[:, None, None], parent, own)
-    return np.einsum("tjab,jb->tja", frames, skeleton.axes), T_world_bone[:, _BONE][..., :3, 3]
+    parent = parent @ skeleton.rotations[_JOINT_BONES]
+    own = T_world_bone[:, _JOINT_BONES, :3, :3]
+    frames = np.where(_IS_FIRST_JOINT[:, None, None], parent, own)
+    return np.einsum("tjab,jb->tja", frames, skeleton.axes), T_world_bone[:, _JOINT_BONES][..., :3, 3]
 
 
 def skinned_jacobian(
@@ -396,13 +399,13 @@ def skinned_jacobian(
     jacobian[..., 3:6] = np.cross(turning[:, None], arms[:, :, None]).swapaxes(-1, -2)
     axes, anchors = joint_axes(model, T_world_bone)
     # derivative by a joint, over the bones that it moves: axis x (sum of w (p - anchor))
-    shares = bone_weights * _MOVED[:, bone_indices]  # (J, M, 4)
+    shares = bone_weights * _IS_MOVED[:, bone_indices]  # (J, M, 4)
     lever = shares.swapaxes(0, 1) @ carried
     lever -= shares.sum(-1).T[..., None] * anchors[:, None]
     jacobian[..., 6:] = np.cross(axes[:, None], lever).swapaxes(-1, -2)
     if model.skeleton.arch.any():  # The flexion of an MCP joint turns its metacarpal, too.
         flexing, skeleton = slice(1, None, _HINGES), model.skeleton
-        is_free = np.abs(metacarpal_flexions(skeleton, T_world_bone)) < MOST_METACARPAL - _AT_LIMIT
+        is_free = np.abs(metacarpal_flexions(skeleton, T_world_bone)) < MOST_METACARPAL - _LIMIT_TOLERANCE
         bases, shares = CARPUS * skeleton.offsets[1::3] @ turning + wrist[:, None, :3, 3], shares[flexing]
         lever = shares.swapaxes(0, 1) @ carried - shares.sum(-1).T[..., None] * bases[:, None]
         rates = (skeleton.arch * is_free)[..., None] * wrist[:, None, :3, 1]
@@ -469,8 +472,8 @@ class BodyMotion:
 def bridge_gaps(times: Float[np.ndarray, "T"], qpos: Float[np.ndarray, "T 27"], rate: float) -> HandMotion:
     """A motion with linear interpolation over missing poses (NaN); at least one is present."""
     there = np.flatnonzero(np.isfinite(qpos[:, 0]))
-    before, share, _ = _neighbors(times[there], times)
-    bridged = _between(qpos[there], before, share)
+    before, share, _ = _neighboring_frames(times[there], times)
+    bridged = _interpolated_rows(qpos[there], before, share)
     bridged[there] = qpos[there]
     return HandMotion(bridged, rate)
 
@@ -478,13 +481,13 @@ def bridge_gaps(times: Float[np.ndarray, "T"], qpos: Float[np.ndarray, "T 27"], 
 def is_steady(times: Float[np.ndarray, "T"], rate: float) -> bool:
     """Whether frames come at a steady rate [Hz]."""
     drift = np.abs((times - times[0]) * rate - np.arange(len(times)))
-    return bool((drift < _STEADY).all())
+    return bool((drift < _MAX_DRIFT).all())
 
 
 def times_at(times: Float[np.ndarray, "T"], rate: float) -> Float[np.ndarray, "K"]:
     """The times [s] of frames at another rate, from the first to the last."""
     check_number("the rate [Hz]", rate, 0.0, above=True)
-    last = (times[-1] - times[0]) * rate + _STEADY
+    last = (times[-1] - times[0]) * rate + _MAX_DRIFT
     if last >= _MAX_FRAMES:
         raise ArgumentError(f"{last:.3g} frames at {rate:g} Hz, expected at most {_MAX_FRAMES}")
     return np.asarray(times[0] + np.arange(int(last) + 1) / rate)
@@ -497,17 +500,17 @@ def between_poses(
 
     They are NaN beside a missing old pose, and between old frames more than 0.1 s and 2.5 frames apart.
     """
-    before, share, step = _neighbors(times, new)
+    before, share, step = _neighboring_frames(times, new)
     exact = (share < 1e-6) | (share > 1.0 - 1e-6)
     is_gap = step > max(_MAX_GAP, _MAX_GAP_FRAMES / rate)
     share = np.where(exact, np.round(share), np.where(is_gap, np.nan, share))
     between = np.empty((len(new), *poses.shape[1:]))
     for number in range(poses.shape[1]):
-        between[:, number] = _between(poses[:, number], before, share)
+        between[:, number] = _interpolated_rows(poses[:, number], before, share)
     return between
 
 
-def _neighbors(
+def _neighboring_frames(
     times: Float[np.ndarray, "T"], new: Float[np.ndarray, "K"]
 ) -> tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.float64]]:
     """The old frame before each new time, the weight of the next one, and the time between them [s]."""
@@ -519,7 +522,7 @@ def _neighbors(
     return before, np.clip((new - old[before]) / step, 0.0, 1.0), step
 
 
-def _between(
+def _interpolated_rows(
     rows: NDArray[np.float64], before: NDArray[np.intp], share: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Rows interpolated between old frames; NaN where one with weight is NaN."""

@@ -48,31 +48,31 @@ from handsim.space.transforms import (
     rigid,
 )
 
-_SMALL_SHARE: Final = 0.01  # share of a bone's mass for the link between its two joints
-_MOST_TORQUE: Final = 2.0  # [N m], about that of a strong finger's first joint
-_MOST_SPEED: Final = 40.0  # [rad/s], above that of the fastest fingers
-_COLOR: Final = "0.85 0.65 0.55 1"
-_VERSION: Final = "40000"  # document version that OpenSim 4.0 and later read
+_BETWEEN_SHARE: Final = 0.01  # share of a bone's mass for the link between its two joints
+_MAX_TORQUE: Final = 2.0  # [N m], about that of a strong finger's first joint
+_MAX_SPEED: Final = 40.0  # [rad/s], above that of the fastest fingers
+_URDF_COLOR: Final = "0.85 0.65 0.55 1"
+_OSIM_VERSION: Final = "40000"  # document version that OpenSim 4.0 and later read
 _GRAVITY: Final = "0 -9.80665 0"  # OpenSim's world has y up
 _OSIM_COLOR: Final = "0.85 0.65 0.55"
-_FARTHEST: Final = 5.0  # range of the wrist's positions, both ways [m]
-_MOST_TURN: Final = 2.0 * np.pi  # range of the wrist's rotations, both ways [rad]
-_FOREARM: Final = (
+_MAX_POSITION: Final = 5.0  # range of the wrist's positions, both ways [m]
+_MAX_ROTATION: Final = 2.0 * np.pi  # range of the wrist's rotations, both ways [rad]
+_FOREARM_COORDINATES: Final = (
     *("wrist_flexion", "wrist_radial_deviation", "wrist_rotation"),
     *(f"forearm_t{axis}" for axis in "xyz"),
 )
-_PARALLEL: Final = 0.5  # Axes with a larger cosine between them are too parallel for one joint.
+_MAX_COSINE: Final = 0.5  # largest cosine between two axes of one joint
 
 
 def hand_urdf(model: HandModel) -> str:
     """The text of a .urdf file: meters, radians, kilograms."""
     root = ET.Element("robot", name="hand")
-    ET.SubElement(ET.SubElement(root, "material", name="skin"), "color", rgba=_COLOR)
+    ET.SubElement(ET.SubElement(root, "material", name="skin"), "color", rgba=_URDF_COLOR)
     for number, bone in enumerate(BONES):
         hinges = [index for index, joint in enumerate(JOINTS) if joint.bone == number]
         kinds = [JOINTS[index].name.rpartition("_")[2] for index in hinges[:-1]]
         links = [*(f"{bone.name}_{kind}" for kind in kinds), bone.name]
-        shares = [_SMALL_SHARE] * (len(links) - 1) + [1.0 - _SMALL_SHARE * (len(links) - 1)]
+        shares = [_BETWEEN_SHARE] * (len(links) - 1) + [1.0 - _BETWEEN_SHARE * (len(links) - 1)]
         for link, share in zip(links, shares, strict=True):
             _add_link(root, model, number, link, share)
         for step, index in enumerate(hinges):
@@ -140,7 +140,7 @@ def _add_joint(
     ET.SubElement(element, "origin", xyz=vector_text(place), rpy=vector_text(turn))
     ET.SubElement(element, "axis", xyz=vector_text(skeleton.axes[joint]))
     low, high = skeleton.ranges[joint]
-    limits = {"lower": low, "upper": high, "effort": _MOST_TORQUE, "velocity": _MOST_SPEED}
+    limits = {"lower": low, "upper": high, "effort": _MAX_TORQUE, "velocity": _MAX_SPEED}
     ET.SubElement(element, "limit", {key: number_text(value) for key, value in limits.items()})
     ET.SubElement(element, "dynamics", damping="0.01", friction="0")
 
@@ -174,7 +174,7 @@ def coordinate_names(side: Side) -> tuple[str, ...]:
 
 def forearm_names(side: Side) -> tuple[str, ...]:
     """Names of the six coordinates between palm and forearm, three angles first."""
-    return tuple(f"{side}_{name}" for name in _FOREARM)
+    return tuple(f"{side}_{name}" for name in _FOREARM_COORDINATES)
 
 
 def forearm_values(side: Side, T_wrist_forearm: Float[np.ndarray, "T 4 4"]) -> NDArray[np.float64]:
@@ -204,11 +204,11 @@ def hand_osim(
     a .mot that begins in this pose.
     """
     side = model.shape.side
-    document = ET.Element("OpenSimDocument", Version=_VERSION)
+    document = ET.Element("OpenSimDocument", Version=_OSIM_VERSION)
     root = ET.SubElement(document, "Model", name=f"{side}_hand")
-    _add(root, "gravity", _GRAVITY)
-    _add(root, "length_units", "meters")
-    _add(root, "force_units", "N")
+    _add_text(root, "gravity", _GRAVITY)
+    _add_text(root, "length_units", "meters")
+    _add_text(root, "force_units", "N")
     ET.SubElement(root, "Ground", name="ground")
     bodies, joints, placed = (
         ET.SubElement(ET.SubElement(root, kind), "objects") for kind in ("BodySet", "JointSet", "MarkerSet")
@@ -248,9 +248,9 @@ def _add_body(bodies: ET.Element, model: HandModel, bone: int) -> None:
     shapes = ET.SubElement(body, "components")
     for index in np.flatnonzero(model.capsules.bones == bone).tolist():
         _add_osim_capsule(shapes, f"{name}_{index}", model.capsules, index)
-    _add(body, "mass", number_text(mass))
-    _add(body, "mass_center", vector_text(center))
-    _add(body, "inertia", vector_text(moments[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]))
+    _add_text(body, "mass", number_text(mass))
+    _add_text(body, "mass_center", vector_text(center))
+    _add_text(body, "inertia", vector_text(moments[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]))
 
 
 def _add_osim_capsule(shapes: ET.Element, name: str, capsules: Capsules, index: int) -> None:
@@ -266,14 +266,14 @@ def _add_osim_capsule(shapes: ET.Element, name: str, capsules: Capsules, index: 
         frame = ET.SubElement(shapes, "PhysicalOffsetFrame", name=f"{name}_{place}")
         kind = "Cylinder" if place == "middle" else "Sphere"
         shape = ET.SubElement(ET.SubElement(frame, "attached_geometry"), kind, name=f"{name}_{place}_shape")
-        _add(shape, "socket_frame", "..")
-        _add(ET.SubElement(shape, "Appearance"), "color", _OSIM_COLOR)
-        _add(shape, "radius", number_text(radius))
+        _add_text(shape, "socket_frame", "..")
+        _add_text(ET.SubElement(shape, "Appearance"), "color", _OSIM_COLOR)
+        _add_text(shape, "radius", number_text(radius))
         if kind == "Cylinder":
-            _add(shape, "half_height", half_height)
-        _add(frame, "socket_parent", "..")
-        _add(frame, "translation", vector_text(center))
-        _add(frame, "orientation", vector_text(body_fixed_angles(turn.as_matrix()[None])[0]))
+            _add_text(shape, "half_height", half_height)
+        _add_text(frame, "socket_parent", "..")
+        _add_text(frame, "translation", vector_text(center))
+        _add_text(frame, "orientation", vector_text(body_fixed_angles(turn.as_matrix()[None])[0]))
 
 
 def _add_knuckle(joints: ET.Element, model: HandModel, bone: int, starts: Mapping[str, float]) -> None:
@@ -286,7 +286,8 @@ def _add_knuckle(joints: ET.Element, model: HandModel, bone: int, starts: Mappin
     joint = _add_osim_joint(joints, names[0], parent, f"{side}_{BONE_NAMES[bone]}", T_parent_bone)
     axes = [skeleton.axes[index] for index in hinges]
     # A custom joint needs three different axes, even if fewer of them turn.
-    axes += [axis for axis in np.eye(3) if all(abs(axis @ one) < _PARALLEL for one in axes)][: 3 - len(axes)]
+    others = [axis for axis in np.eye(3) if all(abs(axis @ one) < _MAX_COSINE for one in axes)]
+    axes += others[: 3 - len(axes)]
     _add_motion(
         joint,
         [*zip([*names, "", ""][:3], axes, strict=True), *(("", axis) for axis in np.eye(3))],
@@ -300,12 +301,12 @@ def _add_osim_joint(
 ) -> ET.Element:
     """Add a custom joint whose child has this pose in its parent when all coordinates are zero."""
     joint = ET.SubElement(joints, "CustomJoint", name=name)
-    _add(joint, "socket_parent_frame", "at_rest")
-    _add(joint, "socket_child_frame", f"/bodyset/{child}")
+    _add_text(joint, "socket_parent_frame", "at_rest")
+    _add_text(joint, "socket_child_frame", f"/bodyset/{child}")
     frame = ET.SubElement(ET.SubElement(joint, "frames"), "PhysicalOffsetFrame", name="at_rest")
-    _add(frame, "socket_parent", parent)
-    _add(frame, "translation", vector_text(T_parent_child[:3, 3]))
-    _add(frame, "orientation", vector_text(body_fixed_angles(T_parent_child[None, :3, :3])[0]))
+    _add_text(frame, "socket_parent", parent)
+    _add_text(frame, "translation", vector_text(T_parent_child[:3, 3]))
+    _add_text(frame, "orientation", vector_text(body_fixed_angles(T_parent_child[None, :3, :3])[0]))
     return joint
 
 
@@ -327,17 +328,17 @@ def _add_motion(
         element = ET.SubElement(transform, "TransformAxis", name=kind)
         if name:
             coordinate = ET.SubElement(coordinates, "Coordinate", name=name)
-            widest = (-_MOST_TURN, _MOST_TURN) if number < 3 else (-_FARTHEST, _FARTHEST)
-            _add(coordinate, "range", " ".join(map(number_text, ranges.get(name, widest))))
-            _add(coordinate, "clamped", "false")
-            _add(coordinate, "default_value", number_text(starts[name]))
-            _add(element, "coordinates", name)
-        _add(element, "axis", vector_text(axis))
+            widest = (-_MAX_ROTATION, _MAX_ROTATION) if number < 3 else (-_MAX_POSITION, _MAX_POSITION)
+            _add_text(coordinate, "range", " ".join(map(number_text, ranges.get(name, widest))))
+            _add_text(coordinate, "clamped", "false")
+            _add_text(coordinate, "default_value", number_text(starts[name]))
+            _add_text(element, "coordinates", name)
+        _add_text(element, "axis", vector_text(axis))
         if name:
             function = ET.SubElement(element, "LinearFunction", name="function")
-            _add(function, "coefficients", "1 0")
+            _add_text(function, "coefficients", "1 0")
         else:
-            _add(ET.SubElement(element, "Constant", name="function"), "value", "0")
+            _add_text(ET.SubElement(element, "Constant", name="function"), "value", "0")
 
 
 def _add_forearm(
@@ -352,9 +353,9 @@ def _add_forearm(
     flesh = Capsules(np.zeros(1, int), start[None], end[None], np.full(1, radius))
     _add_osim_capsule(ET.SubElement(body, "components"), name, flesh, 0)
     mass, across = FLESH_DENSITY * np.pi * radius**2 * length, (3.0 * radius**2 + length**2) / 12.0
-    _add(body, "mass", number_text(mass))
-    _add(body, "mass_center", vector_text(0.5 * (start + end)))
-    _add(body, "inertia", vector_text(mass * np.array([0.5 * radius**2, across, across, 0.0, 0.0, 0.0])))
+    _add_text(body, "mass", number_text(mass))
+    _add_text(body, "mass_center", vector_text(0.5 * (start + end)))
+    _add_text(body, "inertia", vector_text(mass * np.array([0.5 * radius**2, across, across, 0.0, 0.0, 0.0])))
     joint = _add_osim_joint(joints, name, f"/bodyset/{side}_{BONE_NAMES[PALM]}", name, np.eye(4))
     # The palm's angles in the forearm, backwards; a left hand turns the other way about x and z.
     axes = np.diag([1.0, -1.0, -1.0] if side == "right" else [-1.0, -1.0, 1.0])[[0, 2, 1]]
@@ -368,10 +369,10 @@ def _add_forearm(
 
 def _add_marker(markers: ET.Element, name: str, body: str, position: Float[np.ndarray, "3"]) -> None:
     marker = ET.SubElement(markers, "Marker", name=name)
-    _add(marker, "socket_parent_frame", f"/bodyset/{body}")
-    _add(marker, "location", vector_text(position))
-    _add(marker, "fixed", "true")
+    _add_text(marker, "socket_parent_frame", f"/bodyset/{body}")
+    _add_text(marker, "location", vector_text(position))
+    _add_text(marker, "fixed", "true")
 
 
-def _add(parent: ET.Element, tag: str, text: str) -> None:
+def _add_text(parent: ET.Element, tag: str, text: str) -> None:
     ET.SubElement(parent, tag).text = text

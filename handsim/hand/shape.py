@@ -26,19 +26,21 @@ Side = Literal["left", "right"]
 Size = Literal["XS", "S", "M", "L", "XL"]
 SIDES: Final[tuple[Side, Side]] = ("left", "right")
 DIGITS: Final = ("thumb", "index", "middle", "ring", "little")
-_ABDUCTION: Final = (0.0, 0.0, 1.0)  # positive: towards the thumb; for the thumb itself: away from the palm
-_FLEXION: Final = (0.0, 1.0, 0.0)  # positive: towards the palm
+_ABDUCTION_AXIS: Final = (0.0, 0.0, 1.0)
+"""Positive abduction moves a finger towards the thumb, and the thumb away from the palm."""
+_FLEXION_AXIS: Final = (0.0, 1.0, 0.0)
+"""Positive flexion moves a digit towards the palm."""
 PALM: Final = 0
 # Ranges [deg]: active ranges of the AAOS and e-hand tables, MCP extension and PIP flexion as in the wider of
 # the published sets (docs/angles.md lists them side by side). The thumb's first two count from its rest.
-_RANGES: Final = {
+_JOINT_RANGES: Final = {
     "thumb": ((-33.0, 35.0), (-42.0, 45.0), (-15.0, 65.0), (-20.0, 85.0)),
     "index": ((-22.0, 22.0), (-25.0, 95.0), (-8.0, 112.0), (-12.0, 85.0)),
     "middle": ((-16.0, 16.0), (-25.0, 95.0), (-8.0, 112.0), (-12.0, 85.0)),
     "ring": ((-16.0, 16.0), (-25.0, 98.0), (-8.0, 115.0), (-12.0, 85.0)),
     "little": ((-32.0, 22.0), (-25.0, 100.0), (-8.0, 115.0), (-12.0, 85.0)),
 }
-_SUFFIXES: Final = {
+_JOINT_SUFFIXES: Final = {
     "thumb": ("metacarpal_abduction", "metacarpal_flexion", "MCP_flexion", "IP_flexion"),
     "finger": ("MCP_abduction", "MCP_flexion", "PIP_flexion", "DIP_flexion"),
 }
@@ -89,9 +91,9 @@ ADULT_LENGTH: Final = (0.187, 0.012)
 """Mean and standard deviation of the length of adults' hands, ANSUR II [m]."""
 FIRMNESS: Final = 0.8
 """Radius of the capsule that stands for a bone's flesh in collisions, over the skin's radius."""
-_PRESSED: Final = 0.00079  # [m] largest overlap of digits at knuckles and across phalanges, in every pose
-_MOST_ARCH: Final = 4.0  # A metacarpal flexes less than four times as far as its finger.
-_SHORTEST, _LONGEST = 1e-4, 1.0  # bounds of every length in a hand [m], far beyond those of people
+_MAX_DIGIT_OVERLAP: Final = 0.00079  # largest overlap at knuckles and across phalanges in every pose [m]
+_MAX_ARCH: Final = 4.0  # A metacarpal flexes less than four times as far as its finger.
+_MIN_LENGTH, _MAX_LENGTH = 1e-4, 1.0  # bounds of every length in a hand [m], far beyond those of people
 HAND_DTYPE: Final = np.dtype(
     [
         ("left", "?"),
@@ -124,12 +126,12 @@ class Joint(NamedTuple):
     high: float
 
 
-_PARTS: Final = (("metacarpal", "proximal", "distal"), *[("proximal", "middle", "distal")] * 4)
+_BONE_PARTS: Final = (("metacarpal", "proximal", "distal"), *[("proximal", "middle", "distal")] * 4)
 BONES: Final[tuple[Bone, ...]] = (
     Bone("palm", -1, -1),
     *(
         Bone(f"{DIGITS[digit]}_{part}", 3 * digit + step if step else PALM, digit)
-        for digit, parts in enumerate(_PARTS)
+        for digit, parts in enumerate(_BONE_PARTS)
         for step, part in enumerate(parts)
     ),
 )
@@ -143,11 +145,11 @@ JOINTS: Final[tuple[Joint, ...]] = tuple(
     Joint(
         f"{digit}_{suffix}",
         1 + 3 * number + max(0, index - 1),
-        _ABDUCTION if index == 0 else _FLEXION,
-        *_RANGES[digit][index],
+        _ABDUCTION_AXIS if index == 0 else _FLEXION_AXIS,
+        *_JOINT_RANGES[digit][index],
     )
     for number, digit in enumerate(DIGITS)
-    for index, suffix in enumerate(_SUFFIXES["thumb" if number == 0 else "finger"])
+    for index, suffix in enumerate(_JOINT_SUFFIXES["thumb" if number == 0 else "finger"])
 )
 JOINT_NAMES: Final[tuple[str, ...]] = tuple(joint.name for joint in JOINTS)
 NUM_JOINTS: Final = len(JOINTS)
@@ -195,13 +197,13 @@ class HandShape:
             measures = check_array(name, getattr(self, name), HAND_DTYPE[name].shape)
             object.__setattr__(self, name, measures)
         object.__setattr__(self, "arch", check_array("arch", self.arch, (2,)))
-        if not ((self.arch >= 0.0) & (self.arch <= _MOST_ARCH)).all():
-            raise ArgumentError(f"arch of a hand is {self.arch}, expected ratios from 0 to {_MOST_ARCH:g}")
+        if not ((self.arch >= 0.0) & (self.arch <= _MAX_ARCH)).all():
+            raise ArgumentError(f"arch of a hand is {self.arch}, expected ratios from 0 to {_MAX_ARCH:g}")
         _check_measure("length", self.length, 0.05, 0.35)
         for name in ("breadth", "palm_thickness", "bone_lengths", "radii"):
-            _check_measure(name, getattr(self, name), _SHORTEST, _LONGEST)
-        _check_measure("knuckles", self.knuckles, -_LONGEST, _LONGEST)
-        _check_measure("knuckles along the hand", self.knuckles[1:, 0], _SHORTEST, _LONGEST)
+            _check_measure(name, getattr(self, name), _MIN_LENGTH, _MAX_LENGTH)
+        _check_measure("knuckles", self.knuckles, -_MAX_LENGTH, _MAX_LENGTH)
+        _check_measure("knuckles along the hand", self.knuckles[1:, 0], _MIN_LENGTH, _MAX_LENGTH)
         if np.abs(self.base_angles).max() > 2.0 * np.pi:
             raise ArgumentError("base_angles of a hand are more than a turn, expected radians")
 
@@ -299,7 +301,7 @@ def sample_shape(
     knuckles = mean.knuckles + youth * spread(population.knuckle_spread, (5, 3))
     radii = mean.radii * np.exp(spread(population.girth_spread, (5, 1)))
     lengths = mean.bone_lengths * bones
-    _make_room(knuckles, lengths, radii)
+    _slim_digits(knuckles, lengths, radii)
     return dataclasses.replace(
         mean,
         bone_lengths=lengths,
@@ -310,16 +312,16 @@ def sample_shape(
     )
 
 
-def _make_room(
+def _slim_digits(
     knuckles: Float[np.ndarray, "5 3"], lengths: Float[np.ndarray, "5 3"], radii: Float[np.ndarray, "5 4"]
 ) -> None:
     """Slim digits that would overlap whatever their pose [m]: at knuckles, and across a short phalanx."""
     for finger in range(2, len(DIGITS)):
         pair = slice(finger - 1, finger + 1)
-        room = np.linalg.norm(knuckles[finger] - knuckles[finger - 1]) + _PRESSED
+        room = np.linalg.norm(knuckles[finger] - knuckles[finger - 1]) + _MAX_DIGIT_OVERLAP
         radii[pair] *= min(1.0, room / (FIRMNESS * radii[pair, :2].mean(axis=1).sum()))
     across = FIRMNESS * 0.5 * radii.sum(axis=1)  # of the bones before and behind the middle one
-    radii *= np.minimum(1.0, (lengths[:, 1] + _PRESSED) / across)[:, None]
+    radii *= np.minimum(1.0, (lengths[:, 1] + _MAX_DIGIT_OVERLAP) / across)[:, None]
 
 
 def pack_hand(shape: HandShape) -> tuple[Any, ...]:

@@ -56,19 +56,19 @@ CHILDREN: Final = tuple(
 )
 """Indices of the children of each bone."""
 _PARENTS: Final = np.array([bone.parent for bone in BONES])
-_SMOOTH_EDGE: Final = np.cos(np.deg2rad(40.0))
-_FIRST: Final = ("frame", "time_s", "hand")
-_QPOS: Final = (
+_MIN_EDGE_COSINE: Final = np.cos(np.deg2rad(40.0))
+_KEY_NAMES: Final = ("frame", "time_s", "hand")
+_QPOS_NAMES: Final = (
     *(f"wrist_{axis}_m" for axis in "xyz"),
     *(f"wrist_q{part}" for part in "wxyz"),
     *(f"{joint}_rad" for joint in JOINT_NAMES),
 )
 NUMBERS: Final[tuple[str, ...]] = (
-    *_QPOS,
+    *_QPOS_NAMES,
     *(f"{keypoint}_{axis}_m" for keypoint in KEYPOINT_NAMES[1:] for axis in "xyz"),
 )
 """Columns after `frame`, `time_s` and `hand`, with positions in the world."""
-_FORMER: Final = {f"thumb_CMC_{n}_rad": f"thumb_metacarpal_{n}_rad" for n in ("abduction", "flexion")}
+_FORMER_NAMES: Final = {f"thumb_CMC_{n}_rad": f"thumb_metacarpal_{n}_rad" for n in ("abduction", "flexion")}
 """Columns of earlier versions: markers on skin do not measure the carpometacarpal joint."""
 _BVH_ROOT: Final = "world_cm"
 _CENTIMETERS: Final = 100.0
@@ -85,7 +85,7 @@ OPENXR_JOINTS: Final[tuple[str, ...]] = (
     ),
 )
 """The names of XrHandJointEXT, without XR_HAND_JOINT_ and _EXT, in its order."""
-_AXES: Final = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+_OPENXR_AXES: Final = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 """OpenXR's axes as columns in a frame with x along the bone and z out of the back."""
 
 
@@ -134,7 +134,7 @@ class PosedHand(NamedTuple):
     ) -> PosedHand:
         """A hand with its poses, NaN where it has none."""
         present: NDArray[np.bool_] = np.isfinite(qpos[:, 0])
-        return cls(model, present, _held(qpos, present), neutral, former)
+        return cls(model, present, _filled_rows(qpos, present), neutral, former)
 
     def by_frame(
         self, compute: Callable[[HandModel, Float[np.ndarray, "K 27"]], NDArray[np.float64]]
@@ -181,7 +181,7 @@ class PosedBody(NamedTuple):
     def of(cls, name: str, shape: RigidObject | None, poses: Float[np.ndarray, "T 7"]) -> PosedBody:
         """A body with its positions [m] and orientations (wxyz), NaN where it has none."""
         present: NDArray[np.bool_] = np.isfinite(poses[:, 0])
-        return cls(name, shape, present, pose_matrices(_held(poses, present)))
+        return cls(name, shape, present, pose_matrices(_filled_rows(poses, present)))
 
     def as_forearm(self, hand: PosedHand, markers: Mapping[str, Float[np.ndarray, "3"]]) -> PosedBody:
         """The forearm of a hand: the outline of its skin at the wrist, drawn out to the farthest marker."""
@@ -246,7 +246,7 @@ def changes(present: Bool[np.ndarray, "T"]) -> Int[np.ndarray, "K"]:
     return np.flatnonzero(np.diff(present, prepend=not present[0]))
 
 
-def _held(values: NDArray[np.float64], present: NDArray[np.bool_]) -> NDArray[np.float64]:
+def _filled_rows(values: NDArray[np.float64], present: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Rows, with each missing row replaced by the last present one, or else by the first."""
     last = np.maximum.accumulate(np.where(present, np.arange(len(present)), -1))
     return values[np.where(last < 0, np.argmax(present), last)]
@@ -280,7 +280,7 @@ def corner_normals(
     count = faces.size
     at = sparse.csr_array((np.ones(count), (np.arange(count), faces.ravel())), shape=(count, len(vertices)))
     one, other = (at @ at.T).nonzero()  # pairs of corners at one vertex
-    near = (units[one // 3] * units[other // 3]).sum(axis=1) > _SMOOTH_EDGE
+    near = (units[one // 3] * units[other // 3]).sum(axis=1) > _MIN_EDGE_COSINE
     near |= one == other  # also on a face without an area
     sums = np.zeros((count, 3))
     np.add.at(sums, one[near], areas[other[near] // 3])
@@ -319,13 +319,14 @@ def read_joint_csv(path: Path) -> JointTable:
     text = read_bytes(path, error=CaptureError).decode("utf-8-sig", "replace")
     lines = csv.reader(text.splitlines())
     try:
-        titles = [_FORMER.get(title.strip(), title.strip()) for title in next(lines, [])]
-        wanted = [*_FIRST, *_QPOS]
+        titles = [_FORMER_NAMES.get(title.strip(), title.strip()) for title in next(lines, [])]
+        wanted = [*_KEY_NAMES, *_QPOS_NAMES]
         missing = [name for name in wanted if name not in titles]
         if missing:
             raise CaptureError(
-                f"{path}: no column '{missing[0]}'; of a .csv are read {', '.join(_FIRST)}, {_QPOS[0]} to "
-                f"{_QPOS[6]} and the joint angles {_QPOS[7]} to {_QPOS[-1]}, as handsim export writes them"
+                f"{path}: no column '{missing[0]}'; of a .csv are read {', '.join(_KEY_NAMES)}, "
+                f"{_QPOS_NAMES[0]} to {_QPOS_NAMES[6]} and the joint angles {_QPOS_NAMES[7]} to "
+                f"{_QPOS_NAMES[-1]}, as handsim export writes them"
             )
         columns = [titles.index(name) for name in wanted]
         rows = [(lines.line_num, [row[column].strip() for column in columns]) for row in lines if any(row)]
@@ -333,11 +334,11 @@ def read_joint_csv(path: Path) -> JointTable:
         raise CaptureError(f"{path}: line {lines.line_num} cannot be read: {error}") from error
     if not rows:
         raise CaptureError(f"{path}: no frames: nothing follows the line of titles")
-    return _table(path, rows)
+    return _posed_table(path, rows)
 
 
-def _table(path: Path, rows: list[tuple[int, list[str]]]) -> JointTable:
-    """Poses by frame and hand, from the columns `_FIRST` and `_QPOS` of numbered lines."""
+def _posed_table(path: Path, rows: list[tuple[int, list[str]]]) -> JointTable:
+    """Poses by frame and hand, from the columns `_KEY_NAMES` and `_QPOS_NAMES` of numbered lines."""
     frames: dict[str, int] = {}
     sides: dict[str, int] = {}
     for number, (frame, _, side, *_) in rows:
@@ -346,7 +347,7 @@ def _table(path: Path, rows: list[tuple[int, list[str]]]) -> JointTable:
         frames.setdefault(frame, len(frames))
         sides.setdefault(side, len(sides))
     times = np.full(len(frames), np.nan)
-    qpos = np.full((len(frames), len(sides), len(_QPOS)), np.nan)
+    qpos = np.full((len(frames), len(sides), len(_QPOS_NAMES)), np.nan)
     filled = np.zeros(qpos.shape[:2], dtype=np.bool_)
     for number, (frame, time, side, *cells) in rows:
         place = frames[frame], sides[side]
@@ -367,7 +368,7 @@ def write_joint_csv(path: Path, motion: Motion, up: UpAxis = "z") -> None:
     tables = [_numbers(hand, len(titles)) for hand in hands]
     row_format = ",%.9g" * len(titles)
     with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8", newline="\n") as file:
-        file.write(",".join([*_FIRST, *titles]) + "\n")
+        file.write(",".join([*_KEY_NAMES, *titles]) + "\n")
         for frame, time in enumerate(motion.times.tolist()):
             for hand, table in zip(hands, tables, strict=True):
                 row = table[frame]
@@ -434,25 +435,25 @@ def write_bvh(path: Path, motion: Motion, up: UpAxis = "z") -> None:
     """Write hands and things of a motion at a steady rate."""
     turn = file_axes(up)
     columns = [np.zeros((len(motion.times), 6))]
-    lines = [f"ROOT {_BVH_ROOT}", "{", *_indented(_joint(np.zeros(3), moves=True))]
+    lines = [f"ROOT {_BVH_ROOT}", "{", *_indented(_joint_lines(np.zeros(3), moves=True))]
     for hand in motion.hands:
         lines += _indented(_bone_lines(hand.model, hand.side, PALM, _CENTIMETERS * turn))
         # In BVH all joints have the axes of the file at rest.
         rotations = turn @ hand.by_frame(_from_rest) @ turn.T
         local = local_rotations(rotations)
         places, moved = _CENTIMETERS * hand.offsets() @ turn.T, are_moved(hand.model)
-        for bone in _order(PALM):
+        for bone in _bone_order(PALM):
             columns += [places[:, bone]] if moved[bone] else []
-            columns.append(_degrees(local[:, bone]))
+            columns.append(_euler_degrees(local[:, bone]))
     for thing in motion.bodies:
         end = np.eye(3)[0]
         if thing.forearm is not None:  # its bone goes from the wrist to the farthest marker
             end = _CENTIMETERS * min(place[0] for place in thing.markers.values()) * turn[:, 0]
-        content = [*_joint(np.zeros(3), moves=True), *_end(end)]
+        content = [*_joint_lines(np.zeros(3), moves=True), *_end_lines(end)]
         word = "".join(one if one.isascii() and one.isalnum() else "_" for one in thing.name) or "thing"
         lines += _indented([f"JOINT {word}", "{", *_indented(content), "}"])
         poses = thing.T_world_body
-        angles = _degrees(turn @ poses[:, :3, :3] @ turn.T)
+        angles = _euler_degrees(turn @ poses[:, :3, :3] @ turn.T)
         columns.append(np.concatenate([_CENTIMETERS * poses[:, :3, 3] @ turn.T, angles], axis=1))
     with atomic_write(path) as temporary, temporary.open("w", encoding="ascii", newline="\n") as file:
         file.write("HIERARCHY\n" + "\n".join([*lines, "}"]) + "\n")
@@ -467,41 +468,41 @@ def _from_rest(model: HandModel, qpos: Float[np.ndarray, "T 27"]) -> Float[np.nd
     return np.asarray(model.forward_kinematics(qpos)[..., :3, :3] @ rest)
 
 
-def _degrees(rotations: Float[np.ndarray, "T 3 3"]) -> NDArray[np.float64]:
+def _euler_degrees(rotations: Float[np.ndarray, "T 3 3"]) -> NDArray[np.float64]:
     """Unwrapped angles (T, 3) about z, y and x [deg]."""
     return np.rad2deg(np.unwrap(euler_angles(rotations), axis=0))
 
 
-def _order(bone: int) -> Iterator[int]:
+def _bone_order(bone: int) -> Iterator[int]:
     """Bones in the order of the file, each before its children."""
     yield bone
     for child in CHILDREN[bone]:
-        yield from _order(child)
+        yield from _bone_order(child)
 
 
 def _bone_lines(model: HandModel, side: str, bone: int, lay: Float[np.ndarray, "3 3"]) -> list[str]:
     """A bone and its children; `lay` maps the wrist's frame [m] to the file's [cm]."""
     rest = model.rest_transforms
     offset = np.zeros(3) if bone == PALM else rest[bone, :3, 3] - rest[BONES[bone].parent, :3, 3]
-    joint = _joint(lay @ offset, moves=bool(are_moved(model)[bone]))
+    joint = _joint_lines(lay @ offset, moves=bool(are_moved(model)[bone]))
     lines = [f"JOINT {side}_{BONE_NAMES[bone]}", "{", *_indented(joint)]
     for child in CHILDREN[bone]:
         lines += _indented(_bone_lines(model, side, child, lay))
     if not CHILDREN[bone]:
-        lines += _indented(_end(lay @ (model.skeleton.lengths[bone] * rest[bone, :3, 0])))
+        lines += _indented(_end_lines(lay @ (model.skeleton.lengths[bone] * rest[bone, :3, 0])))
     return [*lines, "}"]
 
 
-def _joint(offset: Float[np.ndarray, "3"], *, moves: bool) -> list[str]:
+def _joint_lines(offset: Float[np.ndarray, "3"], *, moves: bool) -> list[str]:
     channels = f"CHANNELS 6 {_POSITIONS} {_ROTATIONS}" if moves else f"CHANNELS 3 {_ROTATIONS}"
-    return [_offset(offset), channels]
+    return [_offset_line(offset), channels]
 
 
-def _end(offset: Float[np.ndarray, "3"]) -> list[str]:
-    return ["End Site", "{", f"\t{_offset(offset)}", "}"]
+def _end_lines(offset: Float[np.ndarray, "3"]) -> list[str]:
+    return ["End Site", "{", f"\t{_offset_line(offset)}", "}"]
 
 
-def _offset(offset: Float[np.ndarray, "3"]) -> str:
+def _offset_line(offset: Float[np.ndarray, "3"]) -> str:
     return "OFFSET " + " ".join(f"{value:.6f}" for value in offset.tolist())
 
 
@@ -529,7 +530,7 @@ def joint_poses(model: HandModel, qpos: Float[np.ndarray, "T 27"]) -> Float[np.n
         ends = (bones[:, first], bones[:, second], bones[:, third], bones[:, third] @ tip)
         for offset, end in enumerate(ends):
             poses[:, number + offset] = end
-            poses[:, number + offset, :3, :3] = end[:, :3, :3] @ _AXES
+            poses[:, number + offset, :3, :3] = end[:, :3, :3] @ _OPENXR_AXES
         number += 4
     return poses
 
@@ -553,5 +554,5 @@ def _palm_joints(model: HandModel) -> Float[np.ndarray, "6 4 4"]:
         along = way / np.linalg.norm(way)
         back = np.array([0.0, 0.0, 1.0]) - along[2] * along
         back /= np.linalg.norm(back)
-        joints.append(rigid(np.stack([along, np.cross(back, along), back], axis=1) @ _AXES, start))
+        joints.append(rigid(np.stack([along, np.cross(back, along), back], axis=1) @ _OPENXR_AXES, start))
     return np.array(joints)

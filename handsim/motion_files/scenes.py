@@ -49,13 +49,13 @@ from handsim.motion_files.motion import (
 from handsim.space.transforms import UpAxis, file_axes, rigid
 
 _MATERIALS: Final = (SKIN, THING)
-_COMPONENTS: Final = {"|u1": 5121, "<u2": 5123, "<u4": 5125, "<f4": 5126}
-_TYPES: Final = {(): "SCALAR", (2,): "VEC2", (3,): "VEC3", (4,): "VEC4", (4, 4): "MAT4"}
-_VERTICES, _INDICES = 34962, 34963  # targets of buffer views in glTF
+_COMPONENT_TYPES: Final = {"|u1": 5121, "<u2": 5123, "<u4": 5125, "<f4": 5126}
+_ELEMENT_TYPES: Final = {(): "SCALAR", (2,): "VEC2", (3,): "VEC3", (4,): "VEC4", (4, 4): "MAT4"}
+_VERTEX, _INDEX = 34962, 34963  # targets of buffer views in glTF
 _HEADER: Final = struct.Struct("<4sII")
 _CHUNK: Final = struct.Struct("<I4s")
-_MOST: Final = (1 << 32) - 1  # bytes that the header can state
-_AROUND: Final = 0.03  # thickness of skin around keypoints in a hand's extent [m]
+_MAX_SIZE: Final = (1 << 32) - 1  # bytes that the header can state
+_MARGIN: Final = 0.03  # thickness of skin around keypoints in a hand's extent [m]
 
 
 def write_glb(path: Path, motion: Motion, up: UpAxis = "z") -> None:
@@ -155,13 +155,13 @@ class _Scene:
         """The skin at rest, in the wrist's frame."""
         surface, add = model.surface, self._buffer.add
         attributes = {
-            "POSITION": add(surface.vertices.astype("<f4"), target=_VERTICES, bounds=True),
-            "NORMAL": add(vertex_normals(surface.vertices, surface.faces).astype("<f4"), target=_VERTICES),
+            "POSITION": add(surface.vertices.astype("<f4"), target=_VERTEX, bounds=True),
+            "NORMAL": add(vertex_normals(surface.vertices, surface.faces).astype("<f4"), target=_VERTEX),
             # A bone without a share must be 0, or validators complain.
             "JOINTS_0": add(
-                np.where(surface.bone_weights > 0.0, surface.bone_indices, 0).astype("u1"), target=_VERTICES
+                np.where(surface.bone_weights > 0.0, surface.bone_indices, 0).astype("u1"), target=_VERTEX
             ),
-            "WEIGHTS_0": add(surface.bone_weights.astype("<f4"), target=_VERTICES),
+            "WEIGHTS_0": add(surface.bone_weights.astype("<f4"), target=_VERTEX),
         }
         return {"name": name, "primitives": [self._primitive(attributes, surface.faces, SKIN)]}
 
@@ -181,9 +181,9 @@ class _Scene:
             vertices, outward, faces = split_vertices(thing.shape.faces, normals)
             attributes = {
                 "POSITION": self._buffer.add(
-                    thing.shape.vertices[vertices].astype("<f4"), target=_VERTICES, bounds=True
+                    thing.shape.vertices[vertices].astype("<f4"), target=_VERTEX, bounds=True
                 ),
-                "NORMAL": self._buffer.add(outward.astype("<f4"), target=_VERTICES),
+                "NORMAL": self._buffer.add(outward.astype("<f4"), target=_VERTEX),
             }
             primitive = self._primitive(attributes, faces, thing.material)
             self._meshes.append({"name": thing.name, "primitives": [primitive]})
@@ -196,7 +196,7 @@ class _Scene:
     def _primitive(
         self, attributes: dict[str, int], faces: NDArray[Any], material: Material
     ) -> dict[str, Any]:
-        indices = self._buffer.add(faces.ravel().astype("<u4"), target=_INDICES)
+        indices = self._buffer.add(faces.ravel().astype("<u4"), target=_INDEX)
         return {"attributes": attributes, "indices": indices, "material": _MATERIALS.index(material)}
 
     def _animate(self, node: int, path: str, values: NDArray[np.float64]) -> None:
@@ -243,9 +243,9 @@ class GlbBuffer:
             view["target"] = target
         accessor: dict[str, Any] = {
             "bufferView": len(self._views),
-            "componentType": _COMPONENTS[content.dtype.str],
+            "componentType": _COMPONENT_TYPES[content.dtype.str],
             "count": len(content),
-            "type": _TYPES[content.shape[1:]],
+            "type": _ELEMENT_TYPES[content.shape[1:]],
         }
         if bounds:
             for name, values in (("min", content.min(axis=0)), ("max", content.max(axis=0))):
@@ -264,8 +264,10 @@ class GlbBuffer:
         ).encode()
         text += b" " * (-len(text) % 4)
         size = _HEADER.size + 2 * _CHUNK.size + len(text) + self._size
-        if size > _MOST:
-            raise ArgumentError(f"a .glb of {size} bytes, expected at most {_MOST}; export at a lower rate")
+        if size > _MAX_SIZE:
+            raise ArgumentError(
+                f"a .glb of {size} bytes, expected at most {_MAX_SIZE}; export at a lower rate"
+            )
         head = _HEADER.pack(b"glTF", 2, size) + _CHUNK.pack(len(text), b"JSON")
         return b"".join([head, text, _CHUNK.pack(self._size, b"BIN\0"), *self._parts])
 
@@ -328,7 +330,7 @@ def _add_hand(stage: Any, hand: PosedHand, codes: NDArray[np.float64]) -> None:
     _set_visibility(root, hand.present, codes)
     keypoints = hand.keypoints()
     extent = root.CreateExtentAttr()
-    corners = np.stack([keypoints.min(axis=1) - _AROUND, keypoints.max(axis=1) + _AROUND], axis=1)
+    corners = np.stack([keypoints.min(axis=1) - _MARGIN, keypoints.max(axis=1) + _MARGIN], axis=1)
     for code, box in zip(codes.tolist(), corners.astype(np.float32), strict=True):
         extent.Set(Vt.Vec3fArray.FromNumpy(box), code)
 

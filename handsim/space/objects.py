@@ -21,14 +21,14 @@ from handsim.files.arrays import read_npz
 from handsim.files.inputs import check_regular
 
 PartKind = Literal["sphere", "capsule", "cylinder", "box", "ellipsoid", "mesh"]
-_NAMES: Final = ("pen", "controller", "ball", "box", "mug")
-_DATA: Final = Path(__file__).parents[1] / "data" / "objects.npz"
+_SHIPPED_OBJECTS: Final = ("pen", "controller", "ball", "box", "mug")
+_OBJECTS_FILE: Final = Path(__file__).parents[1] / "data" / "objects.npz"
 MARKER_RADIUS: Final = 0.0032
 """Radius of the spheres of Han et al. 2018 (section 3) [m]: of strays, and of an object's own markers; their
 centers lie this far above the surface."""
 MESH_SUFFIXES: Final = (".stl", ".obj", ".ply", ".glb")
-_LARGEST: Final = 1.0  # [m]
-_SMALLEST: Final = 0.002
+_MAX_SIZE: Final = 1.0  # [m]
+_MIN_SIZE: Final = 0.002
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,13 +93,13 @@ class RigidObject:
 
 def object_names() -> tuple[str, ...]:
     """Names of the objects that come with handsim."""
-    return _NAMES
+    return _SHIPPED_OBJECTS
 
 
 def named_object(name: str) -> RigidObject:
     """One of the objects that come with handsim."""
-    check_choice(name, _NAMES, noun="object")
-    return _build(name)
+    check_choice(name, _SHIPPED_OBJECTS, noun="object")
+    return _shipped_object(name)
 
 
 def load_object(path: str | Path, *, mass: float = 0.1) -> RigidObject:
@@ -115,11 +115,11 @@ def load_object(path: str | Path, *, mass: float = 0.1) -> RigidObject:
     if not np.isfinite(mesh.vertices).all():
         raise ObjectError(f"{path}: the mesh has vertices that are NaN or infinite, expected finite meters")
     size = float(np.ptp(mesh.vertices, axis=0).max())
-    if size > _LARGEST:
+    if size > _MAX_SIZE:
         raise ObjectError(
             f"{path}: the mesh is {size:.3g} m large, expected at most 1 m; is it in millimeters?"
         )
-    if size < _SMALLEST:
+    if size < _MIN_SIZE:
         raise ObjectError(f"{path}: the mesh is {size:.3g} m large, expected at least 2 mm, in meters")
     hull = _convex_hull(mesh, path)
     return RigidObject(path.name, np.asarray(mesh.vertices), np.asarray(mesh.faces), (hull,), mass=mass)
@@ -128,7 +128,7 @@ def load_object(path: str | Path, *, mass: float = 0.1) -> RigidObject:
 def _read_mesh(path: Path) -> Any:
     if path.suffix.lower() not in MESH_SUFFIXES:
         raise ObjectError(f"{path}: expected a mesh file that ends in {', '.join(MESH_SUFFIXES)}")
-    check_regular(path, error=ObjectError, most=1 << 26)
+    check_regular(path, error=ObjectError, max_bytes=1 << 26)
     if not path.is_file():
         raise ObjectError(f"{path}: no such file")
     import trimesh
@@ -161,16 +161,15 @@ def _convex_hull(mesh: Any, path: Path) -> Part:
 
 
 @functools.cache
-def _library() -> dict[str, NDArray[Any]]:
+def _object_arrays() -> dict[str, NDArray[Any]]:
     """The arrays of all objects that come with handsim, by `object.array`."""
-    return read_npz(_DATA)
+    return read_npz(_OBJECTS_FILE)
 
 
 @functools.cache
-def _build(name: str) -> RigidObject:
-    own = {
-        key.removeprefix(f"{name}."): array for key, array in _library().items() if key.startswith(f"{name}.")
-    }
+def _shipped_object(name: str) -> RigidObject:
+    arrays, prefix = _object_arrays(), f"{name}."
+    own = {key.removeprefix(prefix): arrays[key] for key in arrays if key.startswith(prefix)}
     parts = zip(own.pop("kinds").tolist(), own.pop("sizes"), own.pop("poses"), strict=True)
     mass, marker_names = float(own.pop("mass")), tuple(own.pop("marker_names").tolist())
     return RigidObject(

@@ -25,28 +25,30 @@ from handsim.space.rig import TOML_MATRIX, camera_names, checked_cameras, foreig
 from handsim.space.transforms import quaternion_matrix, rigid, vector_quaternions
 
 _MAX_NUMBERS: Final = 16  # Longer lists of numbers, such as corners of a board, are ignored.
-_CENTER: Final = 0.5  # OpenCV measures pixels from the center of the first one, we from the picture's corner
-_LEAST_FOCAL: Final = 0.02  # of the width; in shares of the picture's size a focal length is about 1
+_PIXEL_CENTER: Final = 0.5
+"""Center of the first pixel [px], from which OpenCV counts; ours count from the picture's corner."""
+_MIN_FOCAL: Final = 0.02  # of the width; in shares of the picture's size a focal length is about 1
 _MAX_TURN: Final = 6.4  # longest rotation vector [rad]; longer ones are angles in degrees
 _MAX_BASELINE: Final = 5.0  # largest distance of the cameras of a pair [m]
-_LONG: Final = re.compile(r"\[[^\[\]]{2000,}\]")  # lists of numbers of no camera, which take long to parse
-_VERSION: Final = re.compile(r"^%YAML.*$", re.M)  # OpenCV writes it as no other program reads it
-_K: Final = ("camera_matrix", "cameraMatrix", "K", "mtx", "M")
-_D: Final = ("distortion_coefficients", "dist_coeffs", "distCoef", "D", "dist", "distortions")
-_WIDTH: Final = ("image_width", "img_width", "width")
-_HEIGHT: Final = ("image_height", "img_height", "height")
-_SIZE: Final = ("image_size", "img_size", "size", "resolution")
-_BROWN: Final = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-_FISHEYE: Final = re.compile(r"(is|use)?fisheye(model|lens)?")
-_MODEL: Final = re.compile(
+_LONG_LIST: Final = re.compile(r"\[[^\[\]]{2000,}\]")
+"""A list of numbers that is too long for a camera, and takes long to parse."""
+_YAML_VERSION: Final = re.compile(r"^%YAML.*$", re.M)  # OpenCV writes it as no other program reads it
+_K_KEYS: Final = ("camera_matrix", "cameraMatrix", "K", "mtx", "M")
+_D_KEYS: Final = ("distortion_coefficients", "dist_coeffs", "distCoef", "D", "dist", "distortions")
+_WIDTH_KEYS: Final = ("image_width", "img_width", "width")
+_HEIGHT_KEYS: Final = ("image_height", "img_height", "height")
+_SIZE_KEYS: Final = ("image_size", "img_size", "size", "resolution")
+_BROWN_KEYS: Final = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+_FISHEYE_KEY: Final = re.compile(r"(is|use)?fisheye(model|lens)?")
+_MODEL_KEY: Final = re.compile(
     r"(distortion|lens|projection|calibration)(model|type|name)|distortion|projection|cameramodel|modeltype"
 )
 """Keys of the name of a lens, without signs and capital letters."""
-_LOOSE_MODEL: Final = re.compile(r"model|modelname|cameratype|lens|type")
+_LOOSE_MODEL_KEY: Final = re.compile(r"model|modelname|cameratype|lens|type")
 """Keys of the name of a lens, or of the camera's maker."""
-_WORDS: Final = {"true": True, "yes": True, "on": True, "false": False, "no": False, "off": False}
-_NOTHING: Final = ("[]", "", "~", "null", "None")
-_LENSES: Final[dict[str, LensKind]] = {
+_BOOLEANS: Final = {"true": True, "yes": True, "on": True, "false": False, "no": False, "off": False}
+_EMPTY_TEXTS: Final = ("[]", "", "~", "null", "None")
+_LENS_KINDS: Final[dict[str, LensKind]] = {
     **dict.fromkeys(("none", "pinhole", "perspective"), "pinhole"),
     **dict.fromkeys(("plumbbob", "radtan", "radialtangential", "brown", "brownconrady"), "brown"),
     **dict.fromkeys(("opencv", "standard", "rational", "rationalpolynomial"), "brown"),
@@ -62,48 +64,49 @@ _OTHER_LENSES: Final = {
     "mei", "omni", "omnidirectional", "ucm", "eucm", "ds", "doublesphere", "fov", "ftheta", "unified", "ocam",
     "scaramuzza", "equisolid", "stereographic", "orthographic",
 }  # fmt: skip
-_R: Final = ("R", "Rot", "rvec", "rotation", "rotation_matrix", "rotation_vector")
-_T: Final = ("T", "t", "tvec", "translation", "translation_vector")
-_OURS: Final = "T_world_camera"
-_READ_POSES: Final = (
-    f"{_OURS}, or R (rotation_matrix, rotation_vector, rvec) and T (translation_vector, tvec), which take "
-    "the world to the camera"
+_R_KEYS: Final = ("R", "Rot", "rvec", "rotation", "rotation_matrix", "rotation_vector")
+_T_KEYS: Final = ("T", "t", "tvec", "translation", "translation_vector")
+_POSE_KEY: Final = "T_world_camera"
+_VALID_POSES: Final = (
+    f"{_POSE_KEY}, or R (rotation_matrix, rotation_vector, rvec) and T (translation_vector, tvec), which "
+    "take the world to the camera"
 )
-_READ_LENSES: Final = "distortion_coefficients, dist_coeffs or D, or k1, k2, p1, p2, k3"
-_KNOWN: Final = (*_K, *_D, *_WIDTH, *_HEIGHT, *_SIZE, *_BROWN, *_R, *_T, _OURS, TOML_MATRIX)
+_VALID_LENSES: Final = "distortion_coefficients, dist_coeffs or D, or k1, k2, p1, p2, k3"
+_PICTURE_KEYS: Final = (*_K_KEYS, *_D_KEYS, *_WIDTH_KEYS, *_HEIGHT_KEYS, *_SIZE_KEYS, *_BROWN_KEYS)
+_KNOWN_KEYS: Final = (*_PICTURE_KEYS, *_R_KEYS, *_T_KEYS, _POSE_KEY, TOML_MATRIX)
 """Keys with a meaning; single letters count as they are written, other names in any spelling."""
-_HARMLESS: Final = re.compile(
+_HARMLESS_KEY: Final = re.compile(
     "error|std|deviation|covariance|count|points|rectif|projection|new|optimal|essential|fundamental|homography"
     "|^[pqefh]$"
 )
 """Keys, without signs and capital letters, of what is neither a pose nor a lens."""
-_OF_BOARDS: Final = ("rvecs", "tvecs", "extrinsic_parameters")
+_BOARD_KEYS: Final = ("rvecs", "tvecs", "extrinsic_parameters")
 """Keys of the poses of OpenCV's board, one for each of its pictures."""
-_POSE: Final = re.compile(
+_MAYBE_POSE: Final = re.compile(
     "extr|pose|rot|transl|transf|[rt]vec|^rt$|world|[cw]2[cw]|position|location|orient|quat|euler"
     "|^t(cw|wc)$|^(yaw|pitch|roll)$"
 )
 """Keys, without signs and capital letters, that may mean a pose; so may any of 9, 12 or 16 numbers."""
 _POSE_COUNTS: Final = (9, 12, 16)
 _SHOWN_KEYS: Final = 8  # keys that a sentence names
-_COEFFICIENTS: Final = re.compile("distor|radial|tangential|coef|fisheye|^kc?[1-6]?$")
+_MAYBE_LENS: Final = re.compile("distor|radial|tangential|coef|fisheye|^kc?[1-6]?$")
 """Keys, without signs and capital letters, that may mean a lens."""
 _PAIRS: Final = {"intrinsics": "extrinsics", "intri": "extri"}
 """Files that belong together: of OpenCV's stereo sample, and of EasyMocap."""
-_OTHERS: Final = _PAIRS | {second: first for first, second in _PAIRS.items()}
-_FIELD: Final = "in units of their own; give the COLMAP reconstruction in meters that they were made of"
-_ANEW: Final = "write its numbers as OpenCV's camera_matrix and distortion_coefficients"
-_UNREAD: Final = {
-    "transform_matrix": f"the JSON of NeRF and nerfstudio, with poses {_FIELD}",
-    "img_name": f"the JSON of Gaussian Splatting, with poses {_FIELD}",
-    "cam0": f"a chain of Kalibr; {_ANEW}, with R and T of each camera",
-    "ppx": f"a RealSense's intrinsics; {_ANEW}",
-    "projection_parameters": f"a camera of VINS; {_ANEW}",
-    "Camera.fx": f"a settings file of ORB-SLAM; {_ANEW}",
-    "Camera1.fx": f"a settings file of ORB-SLAM; {_ANEW}",
+_PARTNER_STEMS: Final = _PAIRS | {second: first for first, second in _PAIRS.items()}
+_UNITS_HINT: Final = "in units of their own; give the COLMAP reconstruction in meters that they were made of"
+_REWRITE_HINT: Final = "write its numbers as OpenCV's camera_matrix and distortion_coefficients"
+_FOREIGN_FILES: Final = {
+    "transform_matrix": f"the JSON of NeRF and nerfstudio, with poses {_UNITS_HINT}",
+    "img_name": f"the JSON of Gaussian Splatting, with poses {_UNITS_HINT}",
+    "cam0": f"a chain of Kalibr; {_REWRITE_HINT}, with R and T of each camera",
+    "ppx": f"a RealSense's intrinsics; {_REWRITE_HINT}",
+    "projection_parameters": f"a camera of VINS; {_REWRITE_HINT}",
+    "Camera.fx": f"a settings file of ORB-SLAM; {_REWRITE_HINT}",
+    "Camera1.fx": f"a settings file of ORB-SLAM; {_REWRITE_HINT}",
 }
 """Descriptions of other programs' files, by a key that these contain."""
-_KEY: Final = r"(?:^|[{{,])[ \t\n]{{0,99}}[\"']?{}[\"']?[ \t]*:"
+_KEY_PATTERN: Final = r"(?:^|[{{,])[ \t\n]{{0,99}}[\"']?{}[\"']?[ \t]*:"
 _MAX_CAMERAS: Final = 256
 _MAX_BYTES: Final = 1 << 22
 _MAX_DEPTH: Final = 64
@@ -116,22 +119,22 @@ Sections = dict[str, Values]
 
 def read_opencv_cameras(path: Path) -> tuple[Camera, ...]:
     """All cameras of a `.yml`, `.yaml`, `.json` or `.toml`, or of a pair of files (docs/rendering.md)."""
-    values, sections = _read(path)
+    values, sections = _read_file(path)
     values = _without_rectification(path, values)
-    other = path.with_stem(_OTHERS.get(path.stem, path.stem))
+    other = path.with_stem(_PARTNER_STEMS.get(path.stem, path.stem))
     if other != path and other.is_file():
-        more, others = _read(other)
+        more, others = _read_file(other)
         values, sections = more | values, others | sections
     try:
         sections = sections or _numbered_sections(values)
         if sections:
-            cameras = _many(values, sections)
-        elif _find(values, _numbered(_K, 1)) is not None:
-            cameras = _stereo(values)
-        elif _find(values, ("P1",)) is not None:
-            cameras = _rectified(values)
+            cameras = _several_cameras(values, sections)
+        elif _find_key(values, _numbered(_K_KEYS, 1)) is not None:
+            cameras = _stereo_pair(values)
+        elif _find_key(values, ("P1",)) is not None:
+            cameras = _rectified_pair(values)
         else:
-            cameras = [_camera(values, "camera", _K, _D, _pose(values))]
+            cameras = [_camera(values, "camera", _K_KEYS, _D_KEYS, _pose(values))]
     except HandSimError as error:
         alone = other != path and not other.is_file()
         hint = f"; {other.name}, which belongs to it, is not beside it" if alone else ""
@@ -141,18 +144,18 @@ def read_opencv_cameras(path: Path) -> tuple[Camera, ...]:
     return checked_cameras(path, cameras)
 
 
-def _many(values: Values, sections: Sections) -> list[Camera]:
+def _several_cameras(values: Values, sections: Sections) -> list[Camera]:
     """Cameras in one world; a size or a lens's name outside their sections holds for all."""
     if len(sections) > _MAX_CAMERAS:
         raise RigError(f"{len(sections)} cameras, expected at most {_MAX_CAMERAS}")
     cameras = []
-    alone = {key for names in (_K, _D, _R, _T) if (key := _find(values, names)) is not None}
-    common = {key: value for key, value in values.items() if key not in alone}
+    single = [_find_key(values, names) for names in (_K_KEYS, _D_KEYS, _R_KEYS, _T_KEYS)]
+    common = {key: value for key, value in values.items() if key not in single}
     for name, (given, own) in zip(camera_names(list(sections)), sections.items(), strict=True):
         with errors_of(f"camera '{shortened(given)}'", RigError):
-            if _OURS not in own and (_find(own, _R) is None or _find(own, _T) is None):
+            if _POSE_KEY not in own and (_find_key(own, _R_KEYS) is None or _find_key(own, _T_KEYS) is None):
                 raise _no_pose(_unread_poses(common | own))
-            cameras.append(_camera(common | own, name, _K, _D, _pose(own)))
+            cameras.append(_camera(common | own, name, _K_KEYS, _D_KEYS, _pose(own)))
     return cameras
 
 
@@ -160,10 +163,10 @@ def _without_rectification(path: Path, values: Values) -> Values:
     """Values of ROS' CameraInfo as OpenCV's; in ROS 2 the keys K, D, R and P are in lower case."""
     if {"k", "p", "distortion_model"} <= values.keys():
         values = {key.upper() if key in ("k", "d", "r", "p") else key: value for key, value in values.items()}
-    if not {"K", "P", "R"} <= values.keys() or _find(values, (*_T, _OURS)) is not None:
+    if not {"K", "P", "R"} <= values.keys() or _find_key(values, (*_T_KEYS, _POSE_KEY)) is not None:
         return values
-    told = f"{path}: R beside P is ROS' rectification and no pose; the camera's axes are the world"
-    warnings.warn(told, HandSimWarning, stacklevel=3)
+    message = f"{path}: R beside P is ROS' rectification and no pose; the camera's axes are the world"
+    warnings.warn(message, HandSimWarning, stacklevel=3)
     return {key: value for key, value in values.items() if key != "R"}
 
 
@@ -171,15 +174,16 @@ def _numbered_sections(values: Values) -> Sections:
     """A table for each camera with a translation among K_1, dist_1, R_1, T_1, K_2, ..."""
     found: Sections = {}
     for key, separator in itertools.product(list(values), ("_", "")):
-        base = next((one for one in _K if key.startswith(one + separator) and key != one + separator), None)
+        starts = (one for one in _K_KEYS if key.startswith(one + separator) and key != one + separator)
+        base = next(starts, None)
         if base is None:
             continue
         ending = key[len(base) :]
         own = {one.removesuffix(ending): value for one, value in values.items() if one.endswith(ending)}
-        for short, name in (("W", _WIDTH[0]), ("H", _HEIGHT[0])):
+        for short, name in (("W", _WIDTH_KEYS[0]), ("H", _HEIGHT_KEYS[0])):
             if short in own:
                 own[name] = own.pop(short)
-        if _find(own, _T) is not None:
+        if _find_key(own, _T_KEYS) is not None:
             found[ending.removeprefix("_")] = own
     return found
 
@@ -189,7 +193,7 @@ def _camera(
 ) -> Camera:
     matrix, size = _matrix(values, K, (3, 3)), _size(values)
     off, other = (np.abs(2.0 * matrix[:2, 2] / sides - 1.0).max() for sides in (size, size[::-1]))
-    if matrix[0, 0] < _LEAST_FOCAL * size[0] or (off > 0.3 and other < 0.1):
+    if matrix[0, 0] < _MIN_FOCAL * size[0] or (off > 0.3 and other < 0.1):
         raise RigError(
             f"K has the focal length {matrix[0, 0]:.4g} and center {matrix[0, 2]:.4g}, {matrix[1, 2]:.4g} "
             f"for pictures of {size[0]} x {size[1]}; expected pixels, and the width before the height"
@@ -197,18 +201,18 @@ def _camera(
     return Camera(name, size, _from_corner(matrix), pose, _lens(values, D))
 
 
-def _stereo(values: Values) -> list[Camera]:
+def _stereo_pair(values: Values) -> list[Camera]:
     """A stereo pair, whose R and T map coordinates of the first camera to the second."""
-    first, outer = _own_pose(values), _outer(values)
+    first, outer = _own_pose(values), _extrinsics(values)
     _check_baseline(outer[:3, 3])
     second = first @ np.linalg.inv(outer)
     return [
-        _camera(values, name, _numbered(_K, number), _numbered(_D, number), pose)
+        _camera(values, name, _numbered(_K_KEYS, number), _numbered(_D_KEYS, number), pose)
         for name, number, pose in (("left", 1, first), ("right", 2, second))
     ]
 
 
-def _rectified(values: Values) -> list[Camera]:
+def _rectified_pair(values: Values) -> list[Camera]:
     """A rectified pair: P2 is K2 (I | t), with the baseline in t."""
     first, cameras = _own_pose(values), []
     for name, key in (("left", "P1"), ("right", "P2")):
@@ -224,28 +228,28 @@ def _rectified(values: Values) -> list[Camera]:
 
 def _from_corner(K: NDArray[np.float64]) -> NDArray[np.float64]:
     moved: NDArray[np.float64] = K.astype(np.float64)
-    moved[:2, 2] += _CENTER
+    moved[:2, 2] += _PIXEL_CENTER
     return moved
 
 
 def _lens(values: Values, names: tuple[str, ...]) -> Lens:
-    found, plain = _find(values, names), {key: _plain(key) for key in values}
-    if found is None and names is _D:
+    found, plain = _find_key(values, names), {key: _bare_key(key) for key in values}
+    if found is None and names is _D_KEYS:
         lists = (key for key, value in values.items() if isinstance(value, tuple) and len(value) > 3)
         found = next((key for key in lists if plain[key].startswith("dist")), None)
     given = () if found is None else _value_numbers(values, found, None)
     single = {
         re.sub(r"^dist[a-z]*?(?=[kp]\d)", "", plain[key]): key
         for key, value in values.items()
-        if found is None and names is _D and len(value) == 1 and not isinstance(value, str)
+        if found is None and names is _D_KEYS and len(value) == 1 and not isinstance(value, str)
     }
-    kinds = _lens_kinds(values, any(given) or not single.keys().isdisjoint(_BROWN))
-    if not single.keys().isdisjoint(_BROWN):
-        found, order = "k1", ("k1", "k2", "k3", "k4") if "fisheye" in kinds else _BROWN
+    kinds = _named_lenses(values, any(given) or not single.keys().isdisjoint(_BROWN_KEYS))
+    if not single.keys().isdisjoint(_BROWN_KEYS):
+        found, order = "k1", ("k1", "k2", "k3", "k4") if "fisheye" in kinds else _BROWN_KEYS
         given = tuple(_value_numbers(values, single[key], (1,))[0] if key in single else 0.0 for key in order)
     unread = [] if found else [key for key, value in values.items() if _may_be_lens(key, value)]
     if unread:
-        raise RigError(f"unknown keys of a lens: {_listed(unread)}; valid names: {_READ_LENSES}")
+        raise RigError(f"unknown keys of a lens: {_listed(unread)}; valid names: {_VALID_LENSES}")
     if "fisheye" in kinds:
         if len(given) < 4 or any(given[4:]):
             raise RigError(f"a fisheye lens with {len(given)} coefficients, expected 4")
@@ -261,35 +265,36 @@ def _lens(values: Values, names: tuple[str, ...]) -> Lens:
     return brown_lens(*(*given, *[0.0] * 5)[:5])
 
 
-def _plain(key: str) -> str:
+def _bare_key(key: str) -> str:
     """A key without signs and capital letters."""
     return re.sub("[^a-z0-9]", "", key.lower())
 
 
-def _lens_kinds(values: Values, bent: bool) -> set[LensKind]:
+def _named_lenses(values: Values, bent: bool) -> set[LensKind]:
     """The kinds of lens that the values name; names that are not known are refused."""
     kinds: set[LensKind] = set()
     for key, value in values.items():
-        plain = _plain(key)
-        is_flag, is_model = _FISHEYE.fullmatch(plain), _FISHEYE.fullmatch(plain) or _MODEL.fullmatch(plain)
-        if not (is_model or _LOOSE_MODEL.fullmatch(plain)) or (len(value) > 1 and not isinstance(value, str)):
+        plain = _bare_key(key)
+        is_flag, is_list = _FISHEYE_KEY.fullmatch(plain), len(value) > 1 and not isinstance(value, str)
+        is_model = is_flag or _MODEL_KEY.fullmatch(plain)
+        if is_list or not (is_model or _LOOSE_MODEL_KEY.fullmatch(plain)):
             continue
         text = value if isinstance(value, str) else f"{value[0]:g}"
         text = text.partition("\n")[0].partition("#")[0].strip("\"' \t")
-        is_on = _WORDS.get(text.lower(), bool(value[0]) if value and not isinstance(value, str) else None)
+        is_on = _BOOLEANS.get(text.lower(), bool(value[0]) if value and not isinstance(value, str) else None)
         words = re.findall("[a-z]+", text.lower())
         name = "".join(words).removeprefix("distortion")
         if is_flag and is_on is not None:
             kinds |= {"fisheye"} if is_on else set()
-        elif name in _LENSES:
-            kinds.add(_LENSES[name])
-        elif words and all(word in _LENSES for word in words):
-            kinds.update(_LENSES[word] for word in words)
+        elif name in _LENS_KINDS:
+            kinds.add(_LENS_KINDS[name])
+        elif words and all(word in _LENS_KINDS for word in words):
+            kinds.update(_LENS_KINDS[word] for word in words)
         elif name.endswith("brownconrady") and not bent:  # RealSense's variants
             kinds.add("pinhole")
         elif not is_model and re.search("fisheye|equidistant|kannalabrandt", name):
             kinds.add("fisheye")
-        elif text not in _NOTHING and (is_model or name in _OTHER_LENSES):
+        elif text not in _EMPTY_TEXTS and (is_model or name in _OTHER_LENSES):
             raise RigError(f"{key}: {choices(text, _SHOWN_LENSES, noun='lens')}")
     if len(kinds - {"pinhole"}) > 1:
         raise RigError("the lens is named both as Brown's and as a fisheye, expected one of them")
@@ -297,7 +302,7 @@ def _lens_kinds(values: Values, bent: bool) -> set[LensKind]:
 
 
 def _size(values: Values) -> tuple[int, int]:
-    width, height, both = (_find(values, names) for names in (_WIDTH, _HEIGHT, _SIZE))
+    width, height, both = (_find_key(values, names) for names in (_WIDTH_KEYS, _HEIGHT_KEYS, _SIZE_KEYS))
     if width is not None and height is not None:
         size = _value_numbers(values, width, (1,)) + _value_numbers(values, height, (1,))
     elif both is not None:
@@ -313,68 +318,68 @@ def _size(values: Values) -> tuple[int, int]:
 
 def _pose(values: Values) -> NDArray[np.float64]:
     """`T_world_camera`, or the inverse of R and T; without them the identity, where nothing may be a pose."""
-    R, T, unread = _find(values, _R), _find(values, _T), _unread_poses(values)
-    if _OURS in values or not (R or T or unread):
+    R, T, unread = _find_key(values, _R_KEYS), _find_key(values, _T_KEYS), _unread_poses(values)
+    if _POSE_KEY in values or not (R or T or unread):
         return _own_pose(values)
     if unread and not (R and T):
         raise _no_pose(unread)
-    return np.linalg.inv(_outer(values)).astype(np.float64)
+    return np.linalg.inv(_extrinsics(values)).astype(np.float64)
 
 
 def _no_pose(unread: list[str]) -> RigError:
     """The error for a camera whose pose is missing, or under keys that are not read."""
     found = f"; unknown keys of a pose: {_listed(unread)}" if unread else ""
-    return RigError(f"no R and T{found}; valid names: {_READ_POSES}")
+    return RigError(f"no R and T{found}; valid names: {_VALID_POSES}")
 
 
 def _warn_of_unread(path: Path, values: Values) -> None:
     """Name keys that may mean a pose beside the one that was read, and poses of the calibration's board."""
-    boards = [key for key in values if _find({key: key}, _OF_BOARDS)]
+    boards = [key for key in values if _find_key({key: key}, _BOARD_KEYS)]
+    boards = [] if _POSE_KEY in values or _find_key(values, _T_KEYS) else boards
     for keys, why in (
         (_unread_poses(values), "not read beside the pose"),
-        ([] if _OURS in values or _find(values, _T) else boards, "poses of the board, not of the camera"),
+        (boards, "poses of the board, not of the camera"),
     ):
         if keys:
             warnings.warn(f"{path}: {why}: {_listed(keys)}", HandSimWarning, stacklevel=4)
 
 
-def _outer(values: Values) -> NDArray[np.float64]:
+def _extrinsics(values: Values) -> NDArray[np.float64]:
     """R and T as one transform (4, 4)."""
-    R, T = _find(values, _R), _find(values, _T)
+    R, T = _find_key(values, _R_KEYS), _find_key(values, _T_KEYS)
     return rigid(_rotation(values, R or "R"), _value_numbers(values, T or "T", (3,)))
 
 
 def _own_pose(values: Values) -> NDArray[np.float64]:
     """`T_world_camera`, or the identity."""
-    return _matrix(values, (_OURS,), (4, 4)) if _OURS in values else np.eye(4)
+    return _matrix(values, (_POSE_KEY,), (4, 4)) if _POSE_KEY in values else np.eye(4)
 
 
 def _unread_poses(values: Values) -> list[str]:
     """Keys that may mean a pose, and that are not read."""
-    return [
-        key
-        for key, value in values.items()
-        if not _is_known(key)
-        and (
-            (_POSE.search(_plain(key)) and (not isinstance(value, str) or re.match(r"[{\[]|.*\n", value)))
-            or (not isinstance(value, str) and len(value) in _POSE_COUNTS)
-        )
-    ]
+
+    def may_be_pose(key: str, value: tuple[float, ...] | str) -> bool:
+        named = _MAYBE_POSE.search(_bare_key(key)) is not None
+        if isinstance(value, str):
+            return named and re.match(r"[{\[]|.*\n", value) is not None
+        return named or len(value) in _POSE_COUNTS
+
+    return [key for key, value in values.items() if not _is_known(key) and may_be_pose(key, value)]
 
 
 def _may_be_lens(key: str, value: tuple[float, ...] | str) -> bool:
     """Whether a key that is not read may hold coefficients of a lens."""
-    plain = _plain(key)
-    is_name = len(value) == 1 and (_FISHEYE.fullmatch(plain) or _MODEL.fullmatch(plain))
+    plain = _bare_key(key)
+    is_name = len(value) == 1 and (_FISHEYE_KEY.fullmatch(plain) or _MODEL_KEY.fullmatch(plain))
     known = _is_known(key) or is_name or isinstance(value, str)
-    return not known and _COEFFICIENTS.search(plain) is not None and any(value)
+    return not known and _MAYBE_LENS.search(plain) is not None and any(value)
 
 
 def _is_known(key: str) -> bool:
     """Whether a key, with or without a number at its end, has a meaning or needs none."""
     bases = (key, re.sub(r"_?\d+$", "", key))
-    read = any(_find({base: base}, (*_KNOWN, *_OF_BOARDS)) for base in bases)
-    return read or any(_HARMLESS.search(_plain(base)) for base in bases)
+    read = any(_find_key({base: base}, (*_KNOWN_KEYS, *_BOARD_KEYS)) for base in bases)
+    return read or any(_HARMLESS_KEY.search(_bare_key(base)) for base in bases)
 
 
 def _listed(keys: Iterable[str]) -> str:
@@ -405,7 +410,7 @@ def _check_baseline(vector: NDArray[np.float64]) -> None:
 
 
 def _matrix(values: Values, names: tuple[str, ...], shape: tuple[int, int]) -> NDArray[np.float64]:
-    found = _find(values, names)
+    found = _find_key(values, names)
     if found is None:
         raise RigError(
             f"no '{names[0]}' at the top level or in a table of each camera, expected OpenCV's calibration; "
@@ -418,17 +423,17 @@ def _numbered(names: tuple[str, ...], number: int) -> tuple[str, ...]:
     return tuple(name + separator + str(number) for name in names for separator in ("", "_"))
 
 
-def _find(values: Mapping[str, object], names: tuple[str, ...]) -> str | None:
+def _find_key(values: Mapping[str, object], names: tuple[str, ...]) -> str | None:
     """The key of a name; if it is no single letter, signs and capital letters do not count."""
-    plain = {word for word in map(_plain, names) if len(word) > 2}
+    plain = {word for word in map(_bare_key, names) if len(word) > 2}
     exact = next((name for name in names if name in values), None)
-    return exact or next((key for key in values if _plain(key) in plain), None)
+    return exact or next((key for key in values if _bare_key(key) in plain), None)
 
 
 def _value_numbers(values: Values, key: str, shape: tuple[int, ...] | None) -> tuple[float, ...]:
     if key not in values:
         raise RigError(f"no '{key}'")
-    given = () if values[key] in _NOTHING else values[key]
+    given = () if values[key] in _EMPTY_TEXTS else values[key]
     if isinstance(given, str) or not np.isfinite(given).all():
         raise RigError(f"{key} is no list of at most {_MAX_NUMBERS} finite numbers")
     if shape is not None and len(given) != np.prod(shape):
@@ -437,13 +442,13 @@ def _value_numbers(values: Values, key: str, shape: tuple[int, ...] | None) -> t
     return given
 
 
-def _read(path: Path) -> tuple[Values, Sections]:
+def _read_file(path: Path) -> tuple[Values, Sections]:
     if path.suffix.lower() == ".toml":
         tables = foreign_cameras(read_toml(path, error=RigError))
         return {}, dict(_sections({name: one | {"K": one[TOML_MATRIX]} for name, one in tables.items()}))
-    data = read_bytes(path, error=RigError, most=_MAX_BYTES)
+    data = read_bytes(path, error=RigError, max_bytes=_MAX_BYTES)
     try:
-        text = _LONG.sub('"long"', data.decode(text_encoding(data)))
+        text = _LONG_LIST.sub('"long"', data.decode(text_encoding(data)))
     except UnicodeDecodeError as error:
         raise RigError(f"{path}: not a calibration: it is not UTF-8 text") from error
     if text.lstrip().startswith("<"):
@@ -452,9 +457,9 @@ def _read(path: Path) -> tuple[Values, Sections]:
     sections = dict(_sections(content))
     inner = {"cameras", *sections} if sections else set()
     values = _values({key: value for key, value in content.items() if key not in inner})
-    known = next((what for key, what in _UNREAD.items() if re.search(_KEY.format(key), text, re.M)), None)
-    if known is not None and not sections and _find(values, _K) is None:
-        raise RigError(f"{path}: this is {known}")
+    for key, kind in _FOREIGN_FILES.items():
+        if not (sections or _find_key(values, _K_KEYS)) and re.search(_KEY_PATTERN.format(key), text, re.M):
+            raise RigError(f"{path}: this is {kind}")
     return values, sections
 
 
@@ -469,7 +474,7 @@ def _tables(path: Path, text: str) -> dict[str, Any]:
         if text.lstrip().startswith(("{", "[")):
             parts = [json.loads(text)]
         else:
-            parts = list(yaml.load_all(_VERSION.sub("", text), yaml.BaseLoader))
+            parts = list(yaml.load_all(_YAML_VERSION.sub("", text), yaml.BaseLoader))
     except (ValueError, RecursionError, yaml.YAMLError) as error:
         raise RigError(f"{path}: not a calibration: it is neither JSON nor YAML") from error
     parts = [{"cameras": part} if isinstance(part, list) else part for part in parts]
@@ -488,7 +493,7 @@ def _sections(content: Mapping[str, object]) -> Iterator[tuple[str, Values]]:
     else:
         named = list(cameras.items()) if isinstance(cameras, dict) else []
     for name, one in named[: _MAX_CAMERAS + 1]:
-        if isinstance(one, dict) and _find(one, _K) is not None:
+        if isinstance(one, dict) and _find_key(one, _K_KEYS) is not None:
             yield name, _values(one)
 
 

@@ -47,34 +47,34 @@ from handsim.space.camera import (
     points_in_view,
 )
 
-_SIZES: Final = ("size", "resolution")
-_FOCALS: Final = ("focal", "K", "field_of_view", "horizontal_field_of_view")
-_LENS: Final = ("lens", "coefficients")
-_PICTURE: Final = (*_SIZES, *_FOCALS, "center", *_LENS)
+_SIZE_KEYS: Final = ("size", "resolution")
+_FOCAL_KEYS: Final = ("focal", "K", "field_of_view", "horizontal_field_of_view")
+_LENS_KEYS: Final = ("lens", "coefficients")
+_PICTURE_KEYS: Final = (*_SIZE_KEYS, *_FOCAL_KEYS, "center", *_LENS_KEYS)
 """Keys of a camera's picture: at the top for all cameras, or in a camera's own table."""
-_PLACE: Final = ("position", "target", "T_world_camera")
-_TOP: Final = ("name", "description", *_PICTURE, "camera")
-_CAMERA: Final = ("name", *_PICTURE, *_PLACE)
+_POSE_KEYS: Final = ("position", "target", "T_world_camera")
+_FILE_KEYS: Final = ("name", "description", *_PICTURE_KEYS, "camera")
+_CAMERA_KEYS: Final = ("name", *_PICTURE_KEYS, *_POSE_KEYS)
 _MAX_FIELD_OF_VIEW: Final = 170.0  # [deg]
 _MAX_FILE_CAMERAS: Final = 256
 _MAX_DISTANCE: Final = 50.0  # largest distance of a camera from the origin [m]
-_CLOSEST: Final = 1e-3  # least distance of a camera from its target or another camera [m]
-_NAME: Final = re.compile(r"[A-Za-z0-9_-]{1,64}")
-NAMELESS: Final = re.compile(r"[^A-Za-z0-9_-]+")
+_MIN_DISTANCE: Final = 1e-3  # least distance of a camera from its target or another camera [m]
+_VALID_NAME: Final = re.compile(r"[A-Za-z0-9_-]{1,64}")
+NOT_IN_NAMES: Final = re.compile(r"[^A-Za-z0-9_-]+")
 """Characters that a camera's name cannot have."""
 TOML_MATRIX: Final = "matrix"
 """The key of a camera's K in the TOML files of Pose2Sim and anipose."""
-FEWEST_CAMERAS: Final = 2
+MIN_CAMERAS: Final = 2
 MAX_CAMERAS: Final = 32
 """A marker's visibility is one bit per camera in 32 bits."""
 ROOM_CENTER: Final = (0.0, 0.0, 1.1)
 """Middle of the space that hands move in, in front of a seated user [m]."""
-LONGEST_SIDE: Final = 50.0
+MAX_SIDE: Final = 50.0
 """Largest side of a volume or room, and largest coordinate of its middle [m]."""
 HAND_REACH: Final = 0.25
 """Longest reach of a hand from its wrist [m], and the least distance of a camera from the wrists' volume."""
 _CLEARANCE: Final = 0.05  # [m] least distance of a camera from a hand
-_SHIPPED: Final = Path(__file__).parents[1] / "rigs"
+_RIGS_FOLDER: Final = Path(__file__).parents[1] / "rigs"
 
 
 class RigFile(NamedTuple):
@@ -89,7 +89,7 @@ def read_rig_file(path: Path) -> RigFile:
     """Read a file of cameras."""
     table = read_toml(path, error=RigError)
     with errors_of(path, RigError):
-        return _parse(table, as_text(path.stem))
+        return _parse_rig(table, as_text(path.stem))
 
 
 def checked_cameras(path: Path, cameras: Sequence[Camera]) -> tuple[Camera, ...]:
@@ -107,7 +107,7 @@ def check_names(owner: str, cameras: Sequence[Camera]) -> None:
     """Refuse two cameras of one name, and names that cannot be part of a file's."""
     names = [camera.name for camera in cameras]
     for name in names:
-        if not _NAME.fullmatch(name):
+        if not _VALID_NAME.fullmatch(name):
             raise RigError(
                 f"{owner}: a camera is called {shown(name)}, expected up to 64 letters, digits, - and _"
             )
@@ -120,7 +120,7 @@ def camera_names(given: Sequence[str]) -> list[str]:
     names: list[str] = []
     for number, text in enumerate(given, 1):
         # A number may follow the name.
-        plain = NAMELESS.sub("_", text).strip("_")[:56] or f"camera{number}"
+        plain = NOT_IN_NAMES.sub("_", text).strip("_")[:56] or f"camera{number}"
         names.append(plain if plain not in names else f"{plain}_{number}")
     return names
 
@@ -150,7 +150,7 @@ def rig_lines(name: str, cameras: Sequence[Camera]) -> list[str]:
     shared = all(one == pictures[0] for one in pictures)
     lines = [f"name = {toml_string(name)}", *(pictures[0] if shared else ())]
     for camera, picture in zip(cameras, pictures, strict=True):
-        rows = [f"    {_written(row)}," for row in camera.T_world_camera.tolist()]
+        rows = [f"    {_toml_list(row)}," for row in camera.T_world_camera.tolist()]
         lines += ["", "[[camera]]", f"name = {toml_string(camera.name)}", *(() if shared else picture)]
         lines += ["T_world_camera = [", *rows, "]"]
     return lines
@@ -158,16 +158,16 @@ def rig_lines(name: str, cameras: Sequence[Camera]) -> list[str]:
 
 def _picture_lines(camera: Camera) -> Iterator[str]:
     yield f"size = {list(camera.size)}"
-    yield f"focal = {_written(camera.focal_lengths)}"
+    yield f"focal = {_toml_list(camera.focal_lengths)}"
     center = camera.K[:2, 2].tolist()
     if center != [length / 2 for length in camera.size]:
-        yield f"center = {_written(center)}"
+        yield f"center = {_toml_list(center)}"
     if camera.lens.kind != "pinhole":
         yield f"lens = {toml_string(camera.lens.kind)}"
-        yield f"coefficients = {_written(camera.lens.coefficients)}"
+        yield f"coefficients = {_toml_list(camera.lens.coefficients)}"
 
 
-def _written(values: Sequence[float]) -> str:
+def _toml_list(values: Sequence[float]) -> str:
     """A list of TOML floats, to the last digit."""
     return f"[{', '.join(repr(float(value) + 0.0) for value in values)}]"
 
@@ -179,40 +179,41 @@ def foreign_cameras(table: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     return {key: one for key, one in named.items() if isinstance(one, dict) and TOML_MATRIX in one}
 
 
-def _parse(table: Mapping[str, Any], stem: str) -> RigFile:
+def _parse_rig(table: Mapping[str, Any], stem: str) -> RigFile:
     for foreign in foreign_cameras(table):
         raise RigError(
             f"[{shortened(foreign)}] with a {TOML_MATRIX} is a camera of Pose2Sim or anipose, expected "
             "[[camera]]; handsim rig import makes a rig of such a file"
         )
-    check_keys(table, "the file", _TOP, optional=_TOP)
+    check_keys(table, "the file", _FILE_KEYS, optional=_FILE_KEYS)
     name = table.get("name", stem)
     if not isinstance(name, str) or not name or not name.isprintable():
         raise RigError(f"name is {shown(name)}, expected printable text in quotes")
-    top = {key: value for key, value in table.items() if key in _PICTURE}
-    cameras = [_camera(top, entry, number) for number, entry in enumerate(tables_of(table, "camera"), 1)]
+    top = {key: value for key, value in table.items() if key in _PICTURE_KEYS}
+    cameras = [_read_camera(top, entry, number) for number, entry in enumerate(tables_of(table, "camera"), 1)]
     return RigFile(name, text_of(table, "description", default=""), tuple(cameras))
 
 
-def _camera(top: Mapping[str, Any], own: Mapping[str, Any], number: int) -> Camera:
+def _read_camera(top: Mapping[str, Any], own: Mapping[str, Any], number: int) -> Camera:
     """A camera, whose own keys replace those at the top."""
     owner = f"camera {number}"
-    check_keys(own, owner, _CAMERA, optional=_CAMERA)
+    check_keys(own, owner, _CAMERA_KEYS, optional=_CAMERA_KEYS)
     pose = _pose(own, owner)
-    given = {key: value for key, value in top.items() if not _replaced(key, own)} | dict(own)
+    given = {key: value for key, value in top.items() if not _is_replaced(key, own)} | dict(own)
     size = _size(given, f"{owner}: ")
-    K = _matrix(given, size, owner)
+    K = _camera_matrix(given, size, owner)
     kind = text_of(given, "lens", f"{owner}: ", default="pinhole")
     coefficients = number_list(f"{owner}: coefficients", given.get("coefficients", []))
     lens = Lens(cast("LensKind", kind), coefficients)  # `Lens` refuses unknown kinds
     return Camera(text_of(own, "name", f"{owner}: ", default=f"camera{number}"), size, K, pose, lens)
 
 
-def _replaced(key: str, own: Mapping[str, Any]) -> bool:
+def _is_replaced(key: str, own: Mapping[str, Any]) -> bool:
     """Whether a camera's own keys replace a key at the top."""
     if key == "center":
-        return any(name in own for name in (*_SIZES, "K", "center"))
-    return any(key in alike and name in own for alike in (_SIZES, _FOCALS, _LENS) for name in alike)
+        return any(name in own for name in (*_SIZE_KEYS, "K", "center"))
+    groups = (_SIZE_KEYS, _FOCAL_KEYS, _LENS_KEYS)
+    return any(key in group and any(name in own for name in group) for group in groups)
 
 
 def _size(given: Mapping[str, Any], prefix: str) -> tuple[int, int]:
@@ -230,13 +231,12 @@ def _size(given: Mapping[str, Any], prefix: str) -> tuple[int, int]:
     return int(sides[0]), int(sides[1])
 
 
-def _matrix(given: Mapping[str, Any], size: tuple[int, int], owner: str) -> NDArray[np.float64]:
-    """K of the one key among `_FOCALS` that is given."""
-    named = [key for key in _FOCALS if key in given]
+def _camera_matrix(given: Mapping[str, Any], size: tuple[int, int], owner: str) -> NDArray[np.float64]:
+    """K of the one key among `_FOCAL_KEYS` that is given."""
+    named = [key for key in _FOCAL_KEYS if key in given]
     if len(named) != 1:
-        raise RigError(
-            f"{owner} has {' and '.join(named) or 'no focal length'}, expected one of {', '.join(_FOCALS)}"
-        )
+        found = " and ".join(named) or "no focal length"
+        raise RigError(f"{owner} has {found}, expected one of {', '.join(_FOCAL_KEYS)}")
     key, prefix = named[0], f"{owner}: "
     if key == "K":
         if "center" in given:
@@ -260,24 +260,24 @@ def _matrix(given: Mapping[str, Any], size: tuple[int, int], owner: str) -> NDAr
 
 def _pose(table: Mapping[str, Any], owner: str) -> NDArray[np.float64]:
     """T_world_camera of a camera's table."""
-    place = {key: table[key] for key in _PLACE if key in table}
+    place = {key: table[key] for key in _POSE_KEYS if key in table}
     if set(place) == {"T_world_camera"}:
         return numbers(
             f"{owner}: T_world_camera", place["T_world_camera"], (4, 4), "four rows of four numbers"
         )
     if set(place) != {"position", "target"}:
-        told = " and ".join(place) or "no place"
-        raise RigError(f"{owner} has {told}, expected position and target, or T_world_camera alone")
+        given = " and ".join(place) or "no place"
+        raise RigError(f"{owner} has {given}, expected position and target, or T_world_camera alone")
     position, target = (
         numbers(f"{owner}: {key}", place[key], (3,), "three numbers [x, y, z] in meters")
         for key in ("position", "target")
     )
-    if np.linalg.norm(target - position) < _CLOSEST:
+    if np.linalg.norm(target - position) < _MIN_DISTANCE:
         raise RigError(f"{owner} looks at its own position; expected a target in front of it")
     return look_at(position, target)
 
 
-Center = Annotated[tuple[float, float, float], Limits(-LONGEST_SIDE, LONGEST_SIDE)]
+Center = Annotated[tuple[float, float, float], Limits(-MAX_SIDE, MAX_SIDE)]
 """The middle of a volume or room [m]."""
 
 
@@ -303,10 +303,9 @@ class CameraRig:
                 "expected a sequence of Camera"
             )
         object.__setattr__(self, "cameras", tuple(self.cameras))
-        if not FEWEST_CAMERAS <= len(self.cameras) <= MAX_CAMERAS:
+        if not MIN_CAMERAS <= len(self.cameras) <= MAX_CAMERAS:
             raise RigError(
-                f"rig '{self.name}' has {len(self.cameras)} cameras, "
-                f"expected {FEWEST_CAMERAS} to {MAX_CAMERAS}"
+                f"rig '{self.name}' has {len(self.cameras)} cameras, expected {MIN_CAMERAS} to {MAX_CAMERAS}"
             )
         check_names(f"rig '{self.name}'", self.cameras)
         for number, camera in enumerate(self.cameras, 1):
@@ -314,7 +313,7 @@ class CameraRig:
         gaps = np.linalg.norm(self.positions[:, None] - self.positions, axis=-1)
         gaps[np.tril_indices(len(gaps))] = np.inf
         first, second = np.unravel_index(gaps.argmin(), gaps.shape)
-        if gaps[first, second] < _CLOSEST:
+        if gaps[first, second] < _MIN_DISTANCE:
             raise RigError(
                 f"cameras {first + 1} and {second + 1} of rig '{self.name}' stand at one position, "
                 "expected different ones"
@@ -390,7 +389,7 @@ class CameraRig:
 
 def list_rigs() -> tuple[str, ...]:
     """Names of the rigs that come with the package."""
-    return tuple(sorted(path.stem for path in _SHIPPED.glob("*.toml")))
+    return tuple(sorted(path.stem for path in _RIGS_FOLDER.glob("*.toml")))
 
 
 AnyRig = Annotated[CameraRig | str | Path, Expected("a CameraRig, or the name or path of one", list_rigs)]
@@ -399,7 +398,7 @@ AnyRig = Annotated[CameraRig | str | Path, Expected("a CameraRig, or the name or
 
 def rig_description(name: str) -> str:
     """One sentence on a rig that comes with the package."""
-    return read_rig_file(_SHIPPED / f"{name}.toml").description
+    return read_rig_file(_RIGS_FOLDER / f"{name}.toml").description
 
 
 def load_rig(rig: CameraRig | str | Path | Mapping[str, Any]) -> CameraRig:
@@ -429,7 +428,7 @@ def load_rig(rig: CameraRig | str | Path | Mapping[str, Any]) -> CameraRig:
             raise RigError(
                 f"a damaged record of a rig ({error!r}), expected what CameraRig.record() gives"
             ) from error
-    path = _SHIPPED / f"{rig}.toml" if str(rig) in list_rigs() else Path(rig)
+    path = _RIGS_FOLDER / f"{rig}.toml" if str(rig) in list_rigs() else Path(rig)
     if path.suffix.lower() != ".toml":
         unknown = choices(str(rig), list_rigs(), noun="camera rig")
         raise RigError(f"{unknown}, or the path of a .toml file")

@@ -25,7 +25,7 @@ from handsim.files.inputs import read_bytes, read_toml, shown, text_encoding, wo
 from handsim.space.camera import Camera, Lens, brown_lens, camera_matrix
 from handsim.space.opencv_cameras import read_opencv_cameras
 from handsim.space.rig import (
-    NAMELESS,
+    NOT_IN_NAMES,
     camera_names,
     checked_cameras,
     foreign_cameras,
@@ -38,18 +38,18 @@ _MAX_VALUE: Final = 1e9  # largest number in a calibration, in any unit
 _MAX_XML_BYTES: Final = 1 << 25  # masks and thresholds of cameras lie in these files too
 _MAX_ELEMENTS: Final = 200_000
 _MAX_DEPTH: Final = 64
-_DECLARATION: Final = re.compile(r"^\s*<\?xml[^>]*\?>")
+_XML_DECLARATION: Final = re.compile(r"^\s*<\?xml[^>]*\?>")
 _MILLIMETER: Final = 1e-3
 _MAX_DISTORTION: Final = 0.5  # shift of a picture's corner, as a share of its distance from the center
-_VIDEO: Final = ("vue", "videoinputdevice")
+_VIDEO_TYPES: Final = ("vue", "videoinputdevice")
 _SUBPIXELS: Final = 64.0  # Qualisys' units per pixel
 _TO_OPENCV: Final = np.diag([1.0, -1.0, -1.0])
-_MOTIVE_LENS: Final = ("k1", "k2", "TangentialX", "TangentialY", "k3")
-_COLOR: Final = "30"  # `ImagerIndex` of Motive's color cameras
+_MOTIVE_LENS_KEYS: Final = ("k1", "k2", "TangentialX", "TangentialY", "k3")
+_COLOR_IMAGER: Final = "30"  # `ImagerIndex` of Motive's color cameras
 CAMERAS: Final = "cameras.txt"
 IMAGES: Final = "images.txt"
 _MAX_COLMAP_BYTES: Final = 1 << 28  # images.txt lists all points of each image
-_MODELS: Final = {
+_COLMAP_MODELS: Final = {
     "SIMPLE_PINHOLE": 3,
     "PINHOLE": 4,
     "SIMPLE_RADIAL": 4,
@@ -61,15 +61,15 @@ _MODELS: Final = {
     "OPENCV_FISHEYE": 8,
 }
 """Known camera models, and their numbers of parameters."""
-_BINARY_MODELS: Final = (
+_COLMAP_MODEL_IDS: Final = (
     "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV",
     "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE",
 )  # fmt: skip
 _ONE_FOCAL: Final = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 _MIN_UPRIGHT: Final = 0.3  # mean component of the cameras' upward axes along the axis that points up
-_OPENCV: Final = (".yml", ".yaml", ".json")
-_XML: Final = (".xcp", ".xml", ".txt", ".mcal")
-_CLOSED: Final = {
+_OPENCV_ENDINGS: Final = (".yml", ".yaml", ".json")
+_XML_ENDINGS: Final = (".xcp", ".xml", ".txt", ".mcal")
+_CLOSED_FORMATS: Final = {
     ".cal": "Motive's .cal is a closed format; load it in Motive 3.2 or newer and export the calibration "
     "from there as .mcal",
     ".qca": "QTM's .qca is a closed format; export the calibration from QTM as .txt or .xml",
@@ -135,7 +135,7 @@ def picture_size(owner: str, width: float, height: float) -> tuple[int, int]:
 
 def read_xml(path: Path) -> ET.Element:
     """The root of an XML file in UTF-8, UTF-16 or Latin-1."""
-    text = _decoded(path, read_bytes(path, error=RigError, most=_MAX_XML_BYTES))
+    text = _decoded(path, read_bytes(path, error=RigError, max_bytes=_MAX_XML_BYTES))
     if "<!DOCTYPE" in text:
         raise RigError(f"{path}: the XML has a document type, which no calibration has; it is not read")
     root, depth = ET.Element(""), 0
@@ -164,7 +164,7 @@ def _decoded(path: Path, data: bytes) -> str:
         if not re.match(rb"\s*<\?xml[^>]*(8859-1|1252)", data[:200], re.I):
             raise RigError(f"{path}: not a calibration: it is no XML text") from error
         text = data.decode("latin-1")
-    return _DECLARATION.sub("", text, count=1)
+    return _XML_DECLARATION.sub("", text, count=1)
 
 
 def _vicon_camera(entry: ET.Element, number: int) -> LabCamera | Skipped:
@@ -188,7 +188,7 @@ def _vicon_camera(entry: ET.Element, number: int) -> LabCamera | Skipped:
         raise RigError(f"{owner}: ORIENTATION is a quaternion of length {length:.4g}, expected 1")
     pose = rigid(quaternion_matrix(quaternion).T, _MILLIMETER * np.array(frame.numbers("POSITION", 3)))
     kind = (entry.get("DISPLAY_TYPE") or entry.get("TYPE") or "").lower()
-    video = entry.get("SYSTEM") == "DV" or entry.get("ISDV") == "1" or kind.startswith(_VIDEO)
+    video = entry.get("SYSTEM") == "DV" or entry.get("ISDV") == "1" or kind.startswith(_VIDEO_TYPES)
     camera = Camera(device, size, K, pose)
     return LabCamera(dataclasses.replace(camera, lens=_vicon_lens(frame, camera)), video=video)
 
@@ -283,8 +283,8 @@ def _motive_camera(entry: ET.Element, number: int) -> LabCamera | Skipped:
     matrix = np.array([outer.number(f"OrientMatrix{n}") for n in range(9)]).reshape(3, 3)
     axes = nearest_rotation(f"{camera.owner}: OrientMatrix", matrix)
     position = np.array([outer.number(axis) for axis in "XYZ"])
-    bends = [inner.number(key, 0.0) for key in _MOTIVE_LENS] if standard else []
-    video = serial.startswith("C") or own.get("ImagerIndex") == _COLOR
+    bends = [inner.number(key, 0.0) for key in _MOTIVE_LENS_KEYS] if standard else []
+    video = serial.startswith("C") or own.get("ImagerIndex") == _COLOR_IMAGER
     pose = rigid(axes @ _TO_OPENCV, position)
     return LabCamera(Camera(serial, size, K, pose, brown_lens(*bends)), video=video, y_up=True)
 
@@ -311,7 +311,7 @@ def read_colmap_cameras(path: Path) -> tuple[Camera, ...]:
 
 def _binary_lines(path: Path, read: Callable[[bytes, int], tuple[int, str]]) -> list[str]:
     """The records of a binary file of COLMAP, as lines of its text."""
-    data, at, lines = read_bytes(path, error=RigError, most=_MAX_COLMAP_BYTES), 8, []
+    data, at, lines = read_bytes(path, error=RigError, max_bytes=_MAX_COLMAP_BYTES), 8, []
     try:
         for _ in range(*struct.unpack_from("<Q", data)):
             at, line = read(data, at)
@@ -328,8 +328,8 @@ def _binary_lines(path: Path, read: Callable[[bytes, int], tuple[int, str]]) -> 
 def _binary_lens(data: bytes, at: int) -> tuple[int, str]:
     """The end of a record of a camera, and its line."""
     number, model, width, height = struct.unpack_from("<iiQQ", data, at)
-    name = _BINARY_MODELS[model] if model >= 0 else ""
-    count = {**_MODELS, "FOV": 5, "THIN_PRISM_FISHEYE": 12, "RAD_TAN_THIN_PRISM_FISHEYE": 16}[name]
+    name = _COLMAP_MODEL_IDS[model] if model >= 0 else ""
+    count = {**_COLMAP_MODELS, "FOV": 5, "THIN_PRISM_FISHEYE": 12, "RAD_TAN_THIN_PRISM_FISHEYE": 16}[name]
     parameters = struct.unpack_from(f"<{count}d", data, at + 24)
     return at + 24 + 8 * count, " ".join(map(str, (number, name, width, height, *parameters)))
 
@@ -346,7 +346,7 @@ def _binary_image(data: bytes, at: int) -> tuple[int, str]:
 def _colmap_lines(path: Path, *, keep_empty: bool = False) -> list[str]:
     """Lines without comments; an image without points has an empty line of points."""
     try:
-        text = read_bytes(path, error=RigError, most=_MAX_COLMAP_BYTES).decode("utf-8-sig")
+        text = read_bytes(path, error=RigError, max_bytes=_MAX_COLMAP_BYTES).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise RigError(
             f"{path}: not COLMAP's text: it is not UTF-8; colmap model_converter writes it"
@@ -366,22 +366,22 @@ def _colmap_lens(path: Path, line: str) -> tuple[str, Camera]:
     if len(rest) < 3:
         raise RigError(f"{owner} has {1 + len(rest)} values, expected CAMERA_ID MODEL WIDTH HEIGHT PARAMS")
     model = rest[0]
-    if model not in _MODELS:
-        raise RigError(f"{owner}: {choices(model, _MODELS, noun='model')}")
+    if model not in _COLMAP_MODELS:
+        raise RigError(f"{owner}: {choices(model, _COLMAP_MODELS, noun='model')}")
     width, height, *parameters = _numbers(owner, rest[1:])
-    if len(parameters) != _MODELS[model] or not (width.is_integer() and height.is_integer()):
+    if len(parameters) != _COLMAP_MODELS[model] or not (width.is_integer() and height.is_integer()):
         raise RigError(
             f"{owner}: {width:g} x {height:g} pixels and {len(parameters)} parameters, expected whole "
-            f"numbers and {_MODELS[model]} parameters of {model}"
+            f"numbers and {_COLMAP_MODELS[model]} parameters of {model}"
         )
     if model in _ONE_FOCAL:
         parameters.insert(0, parameters[0])
     with errors_of(owner, RigError):
-        K, lens = camera_matrix(*parameters[:4]), _bent_lens(model, parameters[4:])
+        K, lens = camera_matrix(*parameters[:4]), _colmap_distortion(model, parameters[4:])
         return number, Camera(number, (int(width), int(height)), K, lens=lens)
 
 
-def _bent_lens(model: str, bent: list[float]) -> Lens:
+def _colmap_distortion(model: str, bent: list[float]) -> Lens:
     if model.endswith("FISHEYE"):
         return Lens("fisheye", (*bent, 0.0, 0.0, 0.0)[:4])
     if model.endswith("RADIAL"):
@@ -408,7 +408,7 @@ def _colmap_image(path: Path, line: str, lenses: dict[str, Camera]) -> Camera:
         raise RigError(f"{owner}: {choices(words[8], lenses, noun='camera')}")
     R_world_camera = quaternion_matrix(pose[:4] / length).T
     lens = lenses[words[8]]
-    name = NAMELESS.sub("_", words[9].rpartition(".")[0] or words[9])[-64:]
+    name = NOT_IN_NAMES.sub("_", words[9].rpartition(".")[0] or words[9])[-64:]
     return Camera(name, lens.size, lens.K, rigid(R_world_camera, -R_world_camera @ pose[4:]), lens.lens)
 
 
@@ -420,7 +420,7 @@ def _numbers(owner: str, words: list[str]) -> list[float]:
     return list(words_numbers(words))
 
 
-_READERS: Final[dict[str, tuple[str, Callable[[ET.Element, int], LabCamera | Skipped]]]] = {
+_XML_READERS: Final[dict[str, tuple[str, Callable[[ET.Element, int], LabCamera | Skipped]]]] = {
     "Cameras": ("Camera", _vicon_camera),
     "calibration": ("camera", _qualisys_camera),
     "calibrationProfile": ("Camera", _motive_camera),
@@ -458,14 +458,14 @@ def load_lab_cameras(path: str | Path) -> tuple[LabCamera, ...]:
     path, ending = Path(path), Path(path).suffix.lower()
     if ending == ".toml" and not foreign_cameras(read_toml(path, error=RigError)):
         return tuple(map(LabCamera, checked_cameras(path, read_rig_file(path).cameras)))
-    if ending in (*_OPENCV, ".toml"):
+    if ending in (*_OPENCV_ENDINGS, ".toml"):
         return tuple(map(LabCamera, read_opencv_cameras(path)))
     if path.is_dir() or (path.stem in ("cameras", "images") and ending in (".txt", ".bin")):
         return tuple(map(LabCamera, read_colmap_cameras(path)))
-    if ending in _CLOSED:
-        raise RigError(f"{path}: {_CLOSED[ending]}")
-    if ending in _XML:
-        return _of_xml(path)
+    if ending in _CLOSED_FORMATS:
+        raise RigError(f"{path}: {_CLOSED_FORMATS[ending]}")
+    if ending in _XML_ENDINGS:
+        return _xml_cameras(path)
     hint = "; colmap model_converter writes text" if ending == ".bin" else ""
     raise RigError(
         f"{path}: unknown kind of camera file, expected .toml, Vicon's .xcp, Qualisys' .xml or .txt, "
@@ -473,17 +473,17 @@ def load_lab_cameras(path: str | Path) -> tuple[LabCamera, ...]:
     )
 
 
-def _of_xml(path: Path) -> tuple[LabCamera, ...]:
+def _xml_cameras(path: Path) -> tuple[LabCamera, ...]:
     root = read_xml(path)
     tags = [root.tag, *(entry.tag for entry in root)]  # QTM's server wraps its answer
-    known = next((tag for tag in tags if tag in _READERS), None)
+    known = next((tag for tag in tags if tag in _XML_READERS), None)
     if known is None:
         raise RigError(
-            f"{path}: its XML begins with <{shortened(root.tag)}>, expected <{'>, <'.join(_READERS)}>: "
+            f"{path}: its XML begins with <{shortened(root.tag)}>, expected <{'>, <'.join(_XML_READERS)}>: "
             "Vicon's, Qualisys' or Motive's calibration; OpenCV's is read as .yml"
         )
     with errors_of(path, RigError):
-        tag, read_camera = _READERS[known]
+        tag, read_camera = _XML_READERS[known]
         read = [read_camera(entry, number) for number, entry in enumerate(root.iter(tag), 1)]
     skipped = [one for one in read if isinstance(one, Skipped)]
     if skipped:

@@ -27,14 +27,14 @@ FORWARD: Final = get_args(ForwardAxis)
 """Axes of the camera system that may be forward."""
 _OPPOSITES: Final = {"backward": "forward", "right": "left"}
 # Of each program: where its x, y and z point, the signs of a thing's own axes, and its unit of length.
-_PROGRAMS: Final = {
+_PROGRAM_AXES: Final = {
     "ros": (("forward", "left", "up"), (1, 1, 1), "m"),
     "openxr": (("right", "up", "backward"), (1, 1, 1), "m"),
     "opengl": (("right", "up", "backward"), (1, 1, 1), "m"),
     "unity": (("right", "up", "forward"), (1, 1, -1), "m"),
     "unreal": (("forward", "right", "up"), (1, -1, 1), "cm"),
 }
-PROGRAMS: Final = tuple(_PROGRAMS)
+PROGRAMS: Final = tuple(_PROGRAM_AXES)
 """Names of the programs whose axes are known."""
 
 
@@ -70,17 +70,17 @@ class ProgramAxes(NamedTuple):
 @functools.cache
 def program_axes(name: str, up: UpAxis, unit: str = "auto", *, forward: str = "x") -> ProgramAxes:
     """The axes of one of `PROGRAMS` in its own unit or another, from a world with axes up and forward."""
-    directions, mirror, own_unit = _PROGRAMS[name]
+    directions, mirror, own_unit = _PROGRAM_AXES[name]
     room = dict(zip(DIRECTIONS, room_axes(up, forward), strict=True))
     turn = np.array([-room[_OPPOSITES[one]] if one in _OPPOSITES else room[one] for one in directions])
     # A mirrored rotation keeps the part of its axis along the mirrored direction, and turns the other way.
     mirrored = np.diag([1.0, *np.prod(mirror) * np.array(mirror)])
     return ProgramAxes(
-        turn, _turning(turn @ np.diag(mirror)) @ mirrored, own_unit if unit == "auto" else unit
+        turn, _left_multiplication(turn @ np.diag(mirror)) @ mirrored, own_unit if unit == "auto" else unit
     )
 
 
-def _turning(turn: Float[np.ndarray, "3 3"]) -> NDArray[np.float64]:
+def _left_multiplication(turn: Float[np.ndarray, "3 3"]) -> NDArray[np.float64]:
     """The matrix (4, 4) that turns an orientation, as a wxyz quaternion, by a rotation of the world."""
     w, x, y, z = rotation_quaternions(turn[None])[0]
     return np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
@@ -114,7 +114,8 @@ def facing(up: UpAxis, forward: str) -> Float[np.ndarray, "3 3"]:
 def turned_poses(poses: Float[np.ndarray, "*batch K"], turn: Float[np.ndarray, "3 3"]) -> NDArray[np.float64]:
     """Rotate the world of poses: positions and orientations (wxyz) change, later numbers and NaN stay."""
     turned = np.array(poses, dtype=np.float64)
-    turned[..., :3], turned[..., 3:7] = poses[..., :3] @ turn.T, poses[..., 3:7] @ _turning(turn).T
+    turned[..., :3] = poses[..., :3] @ turn.T
+    turned[..., 3:7] = poses[..., 3:7] @ _left_multiplication(turn).T
     return turned
 
 

@@ -30,7 +30,7 @@ from handsim.app.workers import check_workers, usable_cores
 from handsim.files.outputs import available_bytes
 
 ROOT = Path(__file__).resolve().parents[2]
-LAUNCHED = [name for names in _process._LAUNCHERS for name in names]
+LAUNCHED = [name for names in _process._RANK_VARIABLES for name in names]
 PACKAGES = ("handsim", "poses", "gloves", "render", "train", "track", "film")
 
 
@@ -111,8 +111,8 @@ def test_quotas_of_control_groups(own, files, cores, memory, alone, tmp_path):
         (tmp_path / "groups" / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / "groups" / name).write_text(text, "latin-1")
     (tmp_path / "own").write_text(own)
-    alone.setattr(_process, "_GROUPS", tmp_path / "groups")
-    alone.setattr(_process, "_OWN_GROUPS", tmp_path / "own")
+    alone.setattr(_process, "_CGROUP_ROOT", tmp_path / "groups")
+    alone.setattr(_process, "_OWN_CGROUPS", tmp_path / "own")
     assert (core_quota(), memory_limit()) == (cores, memory)
     here = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     assert usable_cores() == min(here, math.ceil(min(cores, here)))

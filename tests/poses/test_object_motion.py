@@ -33,11 +33,11 @@ from poses.grasps import (
     settle_hold,
 )
 from poses.object_motion import (
-    DISTANCE,
-    PATH,
-    RETREAT,
-    SPEED,
-    TURNING,
+    PATH_TIMES,
+    PEN_TURN_SPEED,
+    RETREAT_DISTANCE,
+    TIP_DISTANCE,
+    TIP_SPEED,
     keep_apart,
     point_pen,
     pointing_path,
@@ -293,7 +293,7 @@ def test_the_tip_visits_its_places_at_its_distance(rng):
     assert aimed[still].any(axis=1).all()
     target = aimed.argmax(axis=1)
     off = distances[np.arange(len(tip)), target][still]
-    low, high = DISTANCE
+    low, high = TIP_DISTANCE
     assert off.min() >= low - 1e-9 and off.max() <= high + 1e-9
     facing = np.einsum("ti,ti->t", axis, outward[np.arange(len(tip)), target])[still]
     assert facing.min() > 0.0, "the pen comes from outside"
@@ -312,13 +312,13 @@ def test_whatever_it_points_at_the_pen_never_jumps(seed):
     square = path[:, :3, :3] @ np.swapaxes(path[:, :3, :3], 1, 2)
     np.testing.assert_allclose(square, np.tile(np.eye(3), (FRAMES, 1, 1)), atol=1e-9)
     assert (np.linalg.det(path[:, :3, :3]) > 0.0).all()
-    lifting = 2.6 * RETREAT / PATH[0] * 1.875
-    assert speeds(path[:, :3, 3]).max() < SPEED + lifting + 0.1
-    assert turns(path).max() < 2.0 * TURNING
+    lifting = 2.6 * RETREAT_DISTANCE / PATH_TIMES[0] * 1.875
+    assert speeds(path[:, :3, 3]).max() < TIP_SPEED + lifting + 0.1
+    assert turns(path).max() < 2.0 * PEN_TURN_SPEED
 
 
 def test_it_follows_places_that_move(rng, monkeypatch):
-    monkeypatch.setattr("poses.object_motion.SPEED", 50.0)
+    monkeypatch.setattr("poses.object_motion.TIP_SPEED", 50.0)
     hand = hands()[1]
     motion = resting(hand, FRAMES)
     places, outward = markers_of(hand, motion)

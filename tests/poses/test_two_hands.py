@@ -82,7 +82,7 @@ def test_overlap_of_two_hands_is_mujocos(rng):
 
 @pytest.fixture(autouse=True)
 def short_rests(monkeypatch):
-    monkeypatch.setattr("poses.contact.PAUSE", (0.0, 0.6))
+    monkeypatch.setattr("poses.contact.PAUSE_TIMES", (0.0, 0.6))
 
 
 @pytest.mark.parametrize("name", INTERACTIONS)

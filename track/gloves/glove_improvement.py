@@ -21,7 +21,7 @@ from gloves.fit import Attachment, GloveFit, attach_markers, wear
 from gloves.layout import (
     ACROSS_RANGE,
     ALONG_RANGE,
-    FEWEST_MARKERS,
+    MIN_MARKERS,
     MarkerLayout,
     MarkerPlace,
     load_layout,
@@ -152,7 +152,7 @@ def improve_glove(
     search.resize(count)
     search.search(60.0 * chosen.minutes, lambda worth: on_step(str(worth)))
     on_step("dropping one marker at a time, to compare")
-    fewer = search.smaller(max(FEWEST_MARKERS, len(chosen.keep), count - _FEWER))
+    fewer = search.smaller(max(MIN_MARKERS, len(chosen.keep), count - _FEWER))
     found = dataclasses.replace(search.layout, name=name)
 
     def trials_of(when: str, tried: MarkerLayout) -> dict[str, Trial]:

@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float
 from scipy.stats import beta
 
 from gloves.fit import GloveFit, attach_markers
-from gloves.layout import FEWEST_MARKERS, MarkerLayout, MarkerPlace, load_layout
+from gloves.layout import MIN_MARKERS, MarkerLayout, MarkerPlace, load_layout
 from gloves.takes.take import Take, load_take
 from handsim.callbacks import OnStep, no_step
 from handsim.errors import HandSimWarning
@@ -277,7 +277,7 @@ def layout_spreads(
     squares, count = np.zeros(NUM_JOINTS), 0
     limits = np.diag(free_spreads() ** -2.0)
     for fit, qpos, seen in poses:
-        good = seen.sum(axis=1) >= pose_solver.FEWEST_MARKERS
+        good = seen.sum(axis=1) >= pose_solver.MIN_MARKERS
         unseen, known = np.where(seen[good], 0.0, np.inf), known_hand(hand_arrays(fit).digits, NOISE)
         variances, _ = pose_spreads(with_keypoints(fit), limits, known, qpos[good], unseen, NOT_SMOOTHED)
         squares += variances[:, :NUM_JOINTS].sum(axis=(0, 2))
@@ -309,7 +309,7 @@ def palm_spread(places: Sequence[MarkerPlace], model: HandModel) -> float:
 
 def layout_of(places: Sequence[MarkerPlace], radius: float) -> MarkerLayout:
     """A layout of any places, numbered; the first is repeated up to the least number of a glove's markers."""
-    copies = (*places, *[places[0]] * (FEWEST_MARKERS - len(places)))
+    copies = (*places, *[places[0]] * (MIN_MARKERS - len(places)))
     named = [dataclasses.replace(place, name=str(number)) for number, place in enumerate(copies)]
     return MarkerLayout("places", tuple(named), radius)
 

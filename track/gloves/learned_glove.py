@@ -23,7 +23,7 @@ from jaxtyping import Float, Int
 
 from gloves.captures.capture import Capture
 from gloves.fit import Attachment, GloveFit, attach, place_marker, settle_glove
-from gloves.layout import FEWEST_MARKERS, MOST_MARKERS, MarkerLayout, MarkerPlace, load_layout
+from gloves.layout import MAX_MARKERS, MIN_MARKERS, MarkerLayout, MarkerPlace, load_layout
 from gloves.takes.points import spread_out
 from gloves.takes.take import Take
 from handsim.callbacks import OnStep, no_step
@@ -180,7 +180,7 @@ class _Learning:
         parts = [part for number, source in enumerate(self._sources) for part in _parts(number, source)]
         for part in sorted(parts, key=lambda one: one.points.shape[:2][::-1], reverse=True):
             known = () if layout is None else tuple(one for one in layout.names if one in part.names)
-            if layout is not None and len(known) >= FEWEST_MARKERS:
+            if layout is not None and len(known) >= MIN_MARKERS:
                 columns = {one: part.names.index(one) for one in known}
                 fits = {side: self._fitted(_Found(part, side, columns), layout) for side in self._sides}
                 hands.append(_Found(part, min(fits, key=lambda side: fits[side].cost), columns))
@@ -206,7 +206,7 @@ class _Learning:
         found = search_places(part.points, part.names, self._radius, on_step=self._on_step)
         asked = [one for one in found if one.side in self._sides]
         best, likeliest = (asked or found)[0], found[0]
-        if np.median(best.residuals) > _FITS or len(best.columns) < FEWEST_MARKERS:
+        if np.median(best.residuals) > _FITS or len(best.columns) < MIN_MARKERS:
             return None
         if best.side not in self._sides:
             raise CaptureError(f"the columns fit a {best.side} hand and none that is asked for; give hands")
@@ -255,7 +255,7 @@ class _Learning:
 
 def _labeled(source: Capture, layout: MarkerLayout) -> Capture:
     """A capture with columns of a layout's names: as it is, or labeled with the layout if it has none."""
-    if len(set(layout.names) & {_bare(name) for name in source.names}) >= FEWEST_MARKERS:
+    if len(set(layout.names) & {_bare(name) for name in source.names}) >= MIN_MARKERS:
         return source
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of markers that are elsewhere, which are corrected here
@@ -325,7 +325,7 @@ def _exchanges(one: _Found, hand: GloveFit, source: Capture) -> Iterator[str]:
     """
     names = hand.layout.names
     points = _canonical(one, names)
-    seen = np.isfinite(points[..., 0]).sum(axis=1) >= FEWEST_MARKERS
+    seen = np.isfinite(points[..., 0]).sum(axis=1) >= MIN_MARKERS
     rows = spread_out(np.flatnonzero(seen), _LOOKED_AT)
     squares = _squares(hand, points[rows])
     bad = squares.max(axis=1) > _BENT**2
@@ -400,7 +400,7 @@ def _together(points: Float[np.ndarray, "T N 3"]) -> Iterator[Int[np.ndarray, "N
         columns = np.flatnonzero(groups == group)
         own = np.isin(first, columns) & np.isin(second, columns)
         is_rigid = np.nanmax(high[own] - low[own], initial=0.0) < _RIGID
-        if FEWEST_MARKERS <= len(columns) <= MOST_MARKERS and not is_rigid:
+        if MIN_MARKERS <= len(columns) <= MAX_MARKERS and not is_rigid:
             yield columns
 
 
@@ -449,7 +449,7 @@ def _paired(layout: MarkerLayout, other: MarkerLayout) -> dict[str, str]:
     apart = np.linalg.norm(points[0][:, None] - points[1], axis=2)
     rows, columns = linear_sum_assignment(apart)
     near = apart[rows, columns] < _PAIRED
-    if near.sum() < FEWEST_MARKERS:
+    if near.sum() < MIN_MARKERS:
         return {}
     return {
         layout.names[row]: other.names[column] for row, column in zip(rows[near], columns[near], strict=True)

@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
 from gloves.fit import Attachment, GloveFit, carried
-from gloves.layout import FEWEST_MARKERS, MarkerLayout, MarkerPlace
+from gloves.layout import MIN_MARKERS, MarkerLayout, MarkerPlace
 from gloves.takes.points import far_apart, spread_out
 from handsim.callbacks import OnStep, no_step
 from handsim.hand.model import HandModel, join_qpos
@@ -328,7 +328,7 @@ class _Search:
             pose = 0.25 * float(np.einsum("fi,ij,fj->f", off, resting_prior().precision, off).mean())
             before, energy = energy, float(costs.sum()) + pose
             on_hand = costs < _LEFT_OUT
-            on_hand[np.argsort(costs)[:FEWEST_MARKERS]] = True
+            on_hand[np.argsort(costs)[:MIN_MARKERS]] = True
             if number == rounds or energy > before - _CONVERGED:
                 break
             shown = np.where(on_hand[:, None], points, np.nan)

@@ -260,7 +260,7 @@ class Recorder(Closing):
             header = self._header(usual_rate(*first))
             step = max(1, -(-grown.num_frames // _SUMMARIZED))
             take = unpack_take(dict(header), grown.read(step))
-            finish_archive(grown, self.out, header, told=told)
+            finish_archive(grown, self.out, header, on_block=told)
         except Exception as error:  # keep the recording after any error
             reason = (error.strerror if isinstance(error, OSError) else None) or error
             raise CaptureError(f"{self.out}: cannot be written ({reason}); {self.kept()}") from error

@@ -19,7 +19,7 @@ from typing import Final
 
 import numpy as np
 
-from gloves.captures.text import HIGHEST_RATE
+from gloves.captures.text import MAX_RATE
 from handsim._checks import check_number, check_type
 from handsim._plugins import is_plugin, list_plugins, make_plugin
 from handsim.callbacks import Closing
@@ -525,7 +525,7 @@ class FrameOrder:
         span, steps = second.time - first.time, second.number - first.number
         if not 0.0 < span <= self._reach(abs(one.arrived - other.arrived)):
             return False
-        rate = HIGHEST_RATE if self._interval is None else 1.5 / self._interval
+        rate = MAX_RATE if self._interval is None else 1.5 / self._interval
         return 0 <= steps <= rate * (span + _SLACK) + 1.0
 
     def _reach(self, waited: float) -> float:
@@ -538,7 +538,7 @@ class FrameOrder:
         span, waited = new.time - last.time, new.arrived - last.arrived
         steps = new.number - last.number
         if self._interval is None:
-            return 0.0 < span <= waited + _FIRST_SLACK and 0 <= steps <= HIGHEST_RATE * span + 1.0
+            return 0.0 < span <= waited + _FIRST_SLACK and 0 <= steps <= MAX_RATE * span + 1.0
         longest = max(waited, max(steps, 1) * self._interval) + 0.5 * self._interval + _SLACK
         return 0.0 < span <= longest and 0 <= steps <= 1.5 * (span + _SLACK) / self._interval + 1.0
 

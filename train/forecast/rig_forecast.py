@@ -21,7 +21,7 @@ from gloves.optics.reconstruction import OpticsConfig, reconstruct
 from gloves.takes.take import Take
 from handsim.errors import CaptureError
 from handsim.space.objects import MARKER_RADIUS
-from handsim.space.rig import FEWEST_CAMERAS, ROOM_CENTER, CameraRig
+from handsim.space.rig import MIN_CAMERAS, ROOM_CENTER, CameraRig
 from handsim.space.transforms import pose_matrices
 from train.simulation.room import (
     LightSources,
@@ -298,7 +298,7 @@ def _count(
     present[frame, false_labels[frame, column]] = True
     false = np.isfinite(found.false_points[..., 0]) & (false_labels < 0)
     views = one.seen.sum(axis=-1)
-    rows, columns = np.nonzero(triangulated[:, :markers] & (views >= FEWEST_CAMERAS))
+    rows, columns = np.nonzero(triangulated[:, :markers] & (views >= MIN_CAMERAS))
     step = max(1, len(rows) // _ERROR_SAMPLES)
     rows, columns = rows[::step], columns[::step]
     noise = optics.noise * np.sqrt(MARKER_RADIUS / sources.radii[columns])
@@ -306,8 +306,8 @@ def _count(
         present.size,
         len(present),
         present.size / rate / 60.0,
-        int((views >= FEWEST_CAMERAS).sum()),
-        int((views > FEWEST_CAMERAS).sum()),
+        int((views >= MIN_CAMERAS).sum()),
+        int((views > MIN_CAMERAS).sum()),
         int((~present).sum()),
         int(triangulated[:, sources.labels < 0].sum() + false.sum()),
     )
@@ -335,9 +335,9 @@ def camera_losses(lit: Sequence[LitScene], rig: CameraRig, *, seed: int = 0) -> 
     views, losses = seen.sum(axis=1), []
     for camera in range(len(rig.positions)):
         mine, without = seen[:, camera], None
-        if len(rig.positions) > FEWEST_CAMERAS:
+        if len(rig.positions) > MIN_CAMERAS:
             without = forecast([one.without(camera) for one in lit], rig.without(camera), seed=seed)
-        needed = mine & (views <= FEWEST_CAMERAS)
+        needed = mine & (views <= MIN_CAMERAS)
         losses.append(CameraLoss(int(mine.sum()) / len(seen), int(needed.sum()) / len(seen), without))
     return losses
 

@@ -21,10 +21,10 @@ from handsim.errors import ArgumentError
 from handsim.space.camera import Camera, focal_of_angle, look_at, pinhole
 from handsim.space.objects import MARKER_RADIUS
 from handsim.space.rig import (
-    FEWEST_CAMERAS,
     HAND_REACH,
-    LONGEST_SIDE,
     MAX_CAMERAS,
+    MAX_SIDE,
+    MIN_CAMERAS,
     CameraRig,
     load_rig,
 )
@@ -100,11 +100,11 @@ def plan_rig(
     layout, seed = load_layout(chosen.glove), chosen.seed
     kept = None if chosen.keep is None else load_rig(chosen.keep)
     old = () if kept is None else tuple(kept.cameras)
-    check_count("cameras", cameras, len(old) + 1 if old else FEWEST_CAMERAS, MAX_CAMERAS)
+    check_count("cameras", cameras, len(old) + 1 if old else MIN_CAMERAS, MAX_CAMERAS)
     lengths = check_array("room", room, (3,))
-    if not ((lengths > 0.0) & (lengths < LONGEST_SIDE)).all():
+    if not ((lengths > 0.0) & (lengths < MAX_SIDE)).all():
         raise ArgumentError(
-            f"room is {_lengths(lengths)}, expected three lengths, each above 0 and below {LONGEST_SIDE:g} m"
+            f"room is {_lengths(lengths)}, expected three lengths, each above 0 and below {MAX_SIDE:g} m"
         )
     sides, center = np.array(chosen.volume, dtype=np.float64), np.array(chosen.center, dtype=np.float64)
     focal = focal_of_angle(min(chosen.size), np.deg2rad(chosen.field_of_view))
@@ -258,7 +258,7 @@ def _free_views(
     for begin in range(0, len(positions), MAX_CAMERAS):
         few = positions[begin : begin + MAX_CAMERAS]
         # A rig needs two cameras: a single one gets a companion, whose view is dropped.
-        some = few if len(few) >= FEWEST_CAMERAS else np.concatenate([few, few + np.array([0.0, 0.0, 1.0])])
+        some = few if len(few) >= MIN_CAMERAS else np.concatenate([few, few + np.array([0.0, 0.0, 1.0])])
         middle = scene.hands[0].qpos[:, :3].mean(axis=0)
         cameras = [
             dataclasses.replace(_WIDE.at(look_at(one, middle)), name=f"{number}")

@@ -32,7 +32,7 @@ from handsim.pages import (
     write_sections,
 )
 from handsim.space.objects import MARKER_RADIUS
-from handsim.space.rig import FEWEST_CAMERAS, HAND_REACH, ROOM_CENTER, CameraRig, load_rig
+from handsim.space.rig import HAND_REACH, MIN_CAMERAS, ROOM_CENTER, CameraRig, load_rig
 from train.forecast.rig_forecast import (
     HALF_SIDE,
     OPTICS,
@@ -235,9 +235,9 @@ def map_volume(
         sight, radii = SceneSight(placed, rig), marker_radii(placed, OPTICS)
         seen = sight.visible_markers(OPTICS.partial * radii, rng=rng)
         views = seen.sum(axis=-1)
-        two.append((views >= FEWEST_CAMERAS).mean(axis=1))
-        three.append((views > FEWEST_CAMERAS).mean(axis=1))
-        rows, columns = np.nonzero(views >= FEWEST_CAMERAS)
+        two.append((views >= MIN_CAMERAS).mean(axis=1))
+        three.append((views > MIN_CAMERAS).mean(axis=1))
+        rows, columns = np.nonzero(views >= MIN_CAMERAS)
         noise = OPTICS.noise * np.sqrt(MARKER_RADIUS / radii[columns])
         spread = covariances(sight.markers[0][rows, columns], seen[rows, columns], rig, noise)
         lengths = np.sqrt(np.trace(spread, axis1=1, axis2=2))
@@ -301,7 +301,7 @@ def _sentences(score: RigScore) -> Iterator[str]:
 
 def _camera_sentences(score: RigScore) -> Iterator[str]:
     """Sentences on the camera that matters most, and on dispensable cameras."""
-    if len(score.losses) == FEWEST_CAMERAS:
+    if len(score.losses) == MIN_CAMERAS:
         yield "Without either camera there are no points at all: a third would forgive a loss."
         return
     missing = [0.0 if one.without is None else one.without.missing for one in score.losses]

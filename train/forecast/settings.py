@@ -6,18 +6,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Final, Literal, get_args
 
-from gloves.layout import FEWEST_MARKERS, MOST_MARKERS, AnyLayout
+from gloves.layout import MAX_MARKERS, MIN_MARKERS, AnyLayout
 from gloves.takes.take import Take
 from handsim.errors import ArgumentError
 from handsim.settings import Expected, Limits, Settings
-from handsim.space.rig import LONGEST_SIDE, ROOM_CENTER, AnyRig, Center
+from handsim.space.rig import MAX_SIDE, ROOM_CENTER, AnyRig, Center
 from train.labelers.protocol import Labeler
 
 Mount = Literal["walls", "truss", "tripods"]
 MOUNTS: Final[tuple[Mount, ...]] = get_args(Mount)
 POSES: Final = "poses"
 TWINS: Final = "twins"
-_Sides = Annotated[tuple[float, float, float], Limits(0.0, LONGEST_SIDE, above=True)]
+_Sides = Annotated[tuple[float, float, float], Limits(0.0, MAX_SIDE, above=True)]
 _Seed = Annotated[int, Limits(0)]
 
 
@@ -107,7 +107,7 @@ class ScoreGloveSettings(Settings):
 class ImproveGloveSettings(Settings):
     """How a better layout is searched: options of `handsim glove improve`, arguments of `improve_glove`."""
 
-    markers: Annotated[int | None, Limits(FEWEST_MARKERS, MOST_MARKERS)] = None
+    markers: Annotated[int | None, Limits(MIN_MARKERS, MAX_MARKERS)] = None
     """Number of markers of the new layout; as many as before when not given."""
     keep: tuple[str, ...] = ()
     """Names of markers that stay where they are."""

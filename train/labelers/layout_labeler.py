@@ -30,7 +30,7 @@ from torch import Tensor
 
 from gloves.layout import MarkerLayout, layout_lines, parse_layout
 from handsim import __version__
-from handsim.app.messages import tell_state, told_share
+from handsim.app.messages import share_of, show_state
 from handsim.errors import HandSimWarning, WeightsError
 from handsim.files.inputs import checksum
 from handsim.files.outputs import atomic_write
@@ -176,7 +176,7 @@ def sample_worn_markers(
 ) -> Float[np.ndarray, "T M 3"]:
     """Markers [m] of right hands in valid poses, with a new person and glove fit every hundred frames."""
     config = GenerateSettings()
-    parts, show = [], told_share(f"learning glove '{layout.name}', once: its poses")
+    parts, show = [], share_of(f"learning glove '{layout.name}', once: its poses")
     for first in range(0, num_frames, _POSES_PER_PERSON):
         show(first, num_frames)
         count = min(_POSES_PER_PERSON, num_frames - first)
@@ -272,7 +272,7 @@ def fine_tuned_labeler(
     labeler = LayoutLabeler.at_once(layout, seed=seed)
     source = FrameSource(GenerateSettings(), layout, load_rig(rig))
     rows = np.zeros(2 * num_clouds // 3, dtype=row_dtype(layout.num_markers))
-    show = told_share(f"learning glove '{layout.name}', once: its simulation")
+    show = share_of(f"learning glove '{layout.name}', once: its simulation")
     for first in range(0, len(rows), _POSES_PER_PERSON):
         show(first, len(rows))
         models = sample_hands(source.settings.population, rng=rng)
@@ -281,13 +281,13 @@ def fine_tuned_labeler(
     recipe = batch_recipe(TrainSettings(batch=batch), layout.num_markers)
     optimizer = new_optimizer(network)
     steps = -(-num_clouds // batch)
-    show = told_share(f"learning glove '{layout.name}', once: its training")
+    show = share_of(f"learning glove '{layout.name}', once: its training")
     with torch_threads(1):
         for step in range(steps):
             show(step, steps)
             rate = min(1.0, (step + 1) / _WARM_UP) * 0.5 * (1.0 + np.cos(np.pi * step / steps))
             layout_step(network, optimizer, rate, draw_batch(rows, recipe, rng=rng).cloud, labeler.distances)
-    tell_state("")
+    show_state("")
     labeler.network = network.eval()
     return labeler
 

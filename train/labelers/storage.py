@@ -31,7 +31,7 @@ from handsim._version import full_version
 from handsim.errors import DAMAGE, ArgumentError, HandSimWarning, WeightsError, choices
 from handsim.files.arrays import read_npz
 from handsim.files.inputs import read_bytes
-from handsim.files.models import DIGEST, MOST_MODEL_BYTES, bounded_session, stamp_model
+from handsim.files.models import DIGEST, MAX_MODEL_BYTES, bounded_session, stamp_model
 from handsim.files.outputs import atomic_write, plain_path, save_json, written_together
 from train.labelers.cnn_labeler import CNNLabeler, MeanHand
 from train.labelers.matching import matching_constants
@@ -297,7 +297,7 @@ def _read(weights: Path, card: Path) -> _Stored:
     from safetensors.numpy import load_file
 
     try:
-        content = json.loads(read_bytes(card, error=WeightsError, most=1 << 24))
+        content = json.loads(read_bytes(card, error=WeightsError, max_bytes=1 << 24))
     except (ValueError, RecursionError) as error:
         raise WeightsError(f"{card} is damaged or not a labeler's: it holds no JSON") from error
     try:
@@ -400,7 +400,7 @@ class OnnxLabeler:
         onnxruntime = import_extra("onnxruntime", "an .onnx labeler", "onnx")
         if not path.is_file():
             raise WeightsError(f"{path} is missing, expected an .onnx file that handsim export wrote")
-        content = read_bytes(path, error=WeightsError, most=MOST_MODEL_BYTES)
+        content = read_bytes(path, error=WeightsError, max_bytes=MAX_MODEL_BYTES)
         try:
             self._session = bounded_session(content)
             metadata = self._session.get_modelmeta().custom_metadata_map

@@ -249,13 +249,13 @@ def test_a_path_with_brackets_is_told_as_it_is(hand, tmp_path, capsys):
 
 
 def test_warnings_of_a_capture_are_lines_of_the_command(hand, tmp_path, capsys):
-    from handsim.app.messages import told_warnings
+    from handsim.app.messages import warnings_as_lines
 
     positions = hand.positions.copy()
     positions[2:5, 0] = 0.0
     path = Path(tmp_path / "take.trc")
     write_capture(path, Capture(NAMES_PLAUSIBILITY, positions, 120.0))
-    with told_warnings("handsim label"):
+    with warnings_as_lines("handsim label"):
         read_capture(path)
     expected = f"handsim label: warning: {path}: 3 points at exactly (0, 0, 0) are read as missing"
     said = capsys.readouterr().err

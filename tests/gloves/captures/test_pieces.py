@@ -42,7 +42,7 @@ def test_pieces_share_columns(scattered, tmp_path, monkeypatch, suffix):
     write_capture(path, scattered)
     plain = read_capture(path)
     assert plain.names == scattered.names and not plain.findings
-    monkeypatch.setattr(text, "_MOST_DENSE", 1000)
+    monkeypatch.setattr(text, "_MAX_DENSE_CELLS", 1000)
     pieces = len(scattered.names) - 2
     with pytest.warns(HandSimWarning, match=f"{pieces} columns hold pieces of unlabeled paths"):
         packed = read_capture(path)
@@ -64,7 +64,7 @@ def test_a_wide_table_is_read_as_a_narrow_one(scattered, tmp_path, monkeypatch):
     few = Capture(scattered.names[:20], scattered.positions[:, :20], 120.0)
     write_capture(path, few)
     plain = read_capture(path)
-    monkeypatch.setattr(text, "_MOST_DENSE", 1000)
+    monkeypatch.setattr(text, "_MAX_DENSE_CELLS", 1000)
     wide = read_capture(path)
     assert wide.names == plain.names
     np.testing.assert_array_equal(wide.positions, plain.positions)

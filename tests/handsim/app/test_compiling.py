@@ -135,7 +135,7 @@ def test_processes_that_die_break_nothing(monkeypatch, capsys):
 
 def test_a_few_kernels_are_compiled_where_they_are_called(monkeypatch, capsys):
     monkeypatch.setattr(compiling, "missing_kernels", lambda listed: dict(list(listed.items())[:1]))
-    monkeypatch.setattr(compiling, "_FEW", 100.0)
+    monkeypatch.setattr(compiling, "_MIN_SECONDS", 100.0)
     monkeypatch.setattr(compiling, "_compile_all", None)
     assert compile_kernels("label") == (0, 1)
     (tell,) = before_compiling

@@ -19,12 +19,12 @@ from handsim.app import messages
 from handsim.app.messages import (
     LiveStatus,
     ProgressBar,
-    _line,
-    _lines,
+    _logged_progress,
+    _progress_line,
     _speed,
     named_steps,
     progress_bar,
-    tell_state,
+    show_state,
 )
 from tests.waiting import wait_for
 
@@ -85,12 +85,13 @@ def test_speed_is_of_this_run_alone(steps, text):
     assert _speed(bar.tasks[0], "frames") == text
 
 
-def test_a_log_gets_a_line_now_and_then():
+def test_a_log_gets_a_line_now_and_then(monkeypatch):
     log = io.StringIO()
     bar = Progress(disable=True)
     task = bar.add_task("loss 0.812", total=1)
     bar.update(task, completed=12800, total=5_000_000)
-    with _lines(Console(file=log, width=20), bar.tasks[0], "samples", every=0.05):
+    monkeypatch.setattr(messages, "LOG_INTERVAL", 0.05)
+    with _logged_progress(Console(file=log, width=20), bar.tasks[0], "samples"):
         wait_for(lambda: log.getvalue().count("\n") >= 2)
     line = log.getvalue().splitlines()[0]
     assert re.fullmatch(r"12,800 of 5,000,000 samples, loss 0\.812, 0:\d\d:\d\d", line)
@@ -99,14 +100,14 @@ def test_a_log_gets_a_line_now_and_then():
 def test_without_a_unit_the_step_is_what_is_counted():
     bar = Progress(disable=True)
     bar.add_task("frames", total=600, completed=600)
-    assert _line(bar.tasks[0], "", 10.0) == "600 of 600 frames, 0:00:10"
+    assert _progress_line(bar.tasks[0], "", 10.0) == "600 of 600 frames, 0:00:10"
 
 
 def test_a_line_before_anything_is_done():
     bar = Progress(disable=True)
     bar.add_task("", total=1)
-    assert _line(bar.tasks[0], "frames", 3661.2) == "getting ready, 1:01:01"
-    assert _line(bar.tasks[0], "frames", 59.7) == "getting ready, 0:01:00"
+    assert _progress_line(bar.tasks[0], "frames", 3661.2) == "getting ready, 1:01:01"
+    assert _progress_line(bar.tasks[0], "frames", 59.7) == "getting ready, 0:01:00"
 
 
 def test_a_short_command_writes_no_line(capsys):
@@ -126,24 +127,24 @@ def test_a_log_gets_a_line_a_step_and_not_one_a_count(capsys):
 
 
 def test_a_line_of_state_goes_where_the_command_shows_its_own(capsys):
-    tell_state("alone")
+    show_state("alone")
     with progress_bar("frames") as bar:
-        tell_state("compiling")
-        tell_state("")
+        show_state("compiling")
+        show_state("")
         bar(1, 2)
     with named_steps("first"):
-        tell_state("compiling 2 kernels: 1 done")
-        tell_state("compiling 2 kernels: 2 done")
+        show_state("compiling 2 kernels: 1 done")
+        show_state("compiling 2 kernels: 2 done")
     lines = ["alone", "compiling", "first", "compiling 2 kernels: 1 done", "compiling 2 kernels: 2 done"]
     assert capsys.readouterr().err.splitlines() == lines
 
 
 def test_a_share_is_told_where_a_command_shows_its_state(capsys, monkeypatch):
-    monkeypatch.setattr(messages, "EVERY", 0.0)
-    messages.told_share("learning")(1, 2)
+    monkeypatch.setattr(messages, "LOG_INTERVAL", 0.0)
+    messages.share_of("learning")(1, 2)
     assert capsys.readouterr().err == "", "no command runs"
     with named_steps(""):
-        show = messages.told_share("learning")
+        show = messages.share_of("learning")
         for done in range(3):
             show(done, 4)
     lines = capsys.readouterr().err.splitlines()

@@ -89,9 +89,9 @@ def test_an_extra_is_told_with_what_it_is_for(requirements, found):
 
 def test_every_extra_of_users_is_listed():
     stated = metadata.metadata("handsim").get_all("Provides-Extra")
-    assert {*stated} - {"dev", "docs"} == {*doctor._EXTRAS}
+    assert {*stated} - {"dev", "docs"} == {*doctor._EXTRA_PURPOSES}
     told = {finding.expected: finding for finding in doctor.check_requirements()}
-    assert all(told[f"handsim[{extra}]"].found for extra in doctor._EXTRAS)
+    assert all(told[f"handsim[{extra}]"].found for extra in doctor._EXTRA_PURPOSES)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="needs /proc")
@@ -149,8 +149,8 @@ def test_a_hand_points_along_the_axes_of_the_room_in_turn(axes, forward, monkeyp
         "unreal": ["+x", "-y", "+z"],
         "world": ["+x", "-z", "+y"] if forward == "x" else ["-z", "-x", "+y"],
     }[axes]
-    monkeypatch.setattr(doctor, "_POINTING", 3)
-    monkeypatch.setattr(doctor, "_RATE", 1e3)
+    monkeypatch.setattr(doctor, "_POINTING_FRAMES", 3)
+    monkeypatch.setattr(doctor, "_HAND_RATE", 1e3)
     told, frames = [], []
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
         receiver.bind(("127.0.0.1", 0))

@@ -15,7 +15,7 @@ import tyro
 from gloves import write_capture
 from gloves.layout import load_layout
 from handsim import look_at
-from handsim.cli.main import _HELP, _target, load, main
+from handsim.cli.main import _HELP, _target_of, load, main
 from handsim.cli.parsing import PresetCommand, _with_hints, registry
 from handsim.space.camera import pinhole
 from handsim.space.rig import CameraRig
@@ -115,7 +115,7 @@ SLOW = [
      "size 640 480|field-of-view 80|glove sparse13|seed 3"),
 ]  # fmt: skip
 """Commands that take minutes, how they are run, and other values of their options."""
-COMMANDS = [name for name in _HELP if isinstance(_target(name), str)]
+COMMANDS = [name for name in _HELP if isinstance(_target_of(name), str)]
 REFUSED = {
     "evaluate labeled.trc --truth single.truth.npz --glove dense19": "--truth is given with 1 captures",
     "evaluate labeled.trc --truth single.truth.npz --threads 2": "none of --glove, --labeler, --threads",
@@ -157,7 +157,7 @@ def unchanged(markers, *, rng):
 
 def options_of(name: str) -> set[str]:
     """The options of a command as they are typed, without the dashes."""
-    command = load(_target(name))
+    command = load(_target_of(name))
     if isinstance(command, PresetCommand):
         command = command.choose((), name)
     with pytest.warns(DeprecationWarning):

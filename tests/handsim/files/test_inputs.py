@@ -38,9 +38,9 @@ def test_a_device_through_a_link_is_refused(tmp_path):
 
 def test_a_file_that_is_too_long_is_not_read(tmp_path):
     (tmp_path / "long").write_bytes(bytes(11))
-    assert len(read_bytes(tmp_path / "long", error=CaptureError, most=11)) == 11
+    assert len(read_bytes(tmp_path / "long", error=CaptureError, max_bytes=11)) == 11
     with pytest.raises(CaptureError, match="the file is 11 bytes long, expected at most 10"):
-        read_bytes(tmp_path / "long", error=CaptureError, most=10)
+        read_bytes(tmp_path / "long", error=CaptureError, max_bytes=10)
 
 
 def member(shape: tuple[int, ...], descr: str, content: bytes) -> bytes:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from gloves import MarkerLayout, MarkerPlace, attach, load_layout
-from gloves.layout import FEWEST_MARKERS, MOST_MARKERS
+from gloves.layout import MAX_MARKERS, MIN_MARKERS
 from handsim import HandModel
 from handsim.hand.shape import BONES, bones_of
 from train import GenerateSettings
@@ -67,8 +67,8 @@ def test_the_outline_goes_around_the_whole_hand():
 
 
 def test_markers_of_the_palm_side_are_told():
-    hand = flat_hand(any_layout(MOST_MARKERS))
-    layout = any_layout(MOST_MARKERS)
+    hand = flat_hand(any_layout(MAX_MARKERS))
+    layout = any_layout(MAX_MARKERS)
     for marker, below in zip(layout.markers, hand.below, strict=True):
         if "palm" not in marker.bone and "thumb" not in marker.bone:
             assert below == (marker.around > 2.0)
@@ -84,7 +84,7 @@ def test_mistakes_are_the_most_frequent_pairs():
     assert mistakes(np.diag([3, 0, 1, 5])) == []
 
 
-@pytest.mark.parametrize("count", [FEWEST_MARKERS, 19, MOST_MARKERS])
+@pytest.mark.parametrize("count", [MIN_MARKERS, 19, MAX_MARKERS])
 def test_names_do_not_lie_on_one_another(count):
     layout = load_layout("dense19") if count == 19 else any_layout(count)
     size = (72.0 * HAND_SIZE[0], 72.0 * HAND_SIZE[1])

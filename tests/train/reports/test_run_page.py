@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from gloves import MarkerLayout, MarkerPlace, load_layout
-from gloves.layout import FEWEST_MARKERS, MOST_MARKERS
+from gloves.layout import MAX_MARKERS, MIN_MARKERS
 from handsim.hand.shape import BONES
 from handsim.pages import picture
 from tests.renames import fails_at
@@ -210,7 +210,7 @@ def made_up(count: int, rng: np.random.Generator, *, perfect: bool = False) -> t
     return card, LabelingReport(figures, accuracy, 500, confusion, confidences, right)
 
 
-@pytest.mark.parametrize("count", [FEWEST_MARKERS, MOST_MARKERS])
+@pytest.mark.parametrize("count", [MIN_MARKERS, MAX_MARKERS])
 def test_any_glove_and_either_network_have_a_page(tmp_path, rng, count):
     card, report = made_up(count, rng)
     history = History([(256, 3.0, 0.6), (512, 2.0, 0.6)], [(512, 0.1, 0.4)])
@@ -220,7 +220,7 @@ def test_any_glove_and_either_network_have_a_page(tmp_path, rng, count):
     assert "<b>" not in text and "<i>" not in text
     assert len([ElementTree.fromstring(picture) for picture in pictures(page)]) == 4
     assert text.count("<td>&lt;b&gt;$") > 0
-    if count == FEWEST_MARKERS:
+    if count == MIN_MARKERS:
         first = page.read_bytes()
         assert write_run_page(tmp_path, card, history, report).read_bytes() == first
 

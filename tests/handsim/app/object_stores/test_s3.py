@@ -190,8 +190,8 @@ def test_an_object_whose_sender_is_killed_is_not_there(s3, size, tmp_path):
     code = f"""
 import sys
 from pathlib import Path
-from handsim.app.output import _put, place_of
-_put(place_of(sys.argv[1]), Path({str(tmp_path)!r}), ["big"])
+from handsim.app.output import _upload, place_of
+_upload(place_of(sys.argv[1]), Path({str(tmp_path)!r}), ["big"])
 """
     run_until(s3, code, f"s3://bucket/{size}", size // 2)
     time.sleep(0.5)  # the server notices
