@@ -31,7 +31,7 @@ from handsim.hand.shape import BONES, PALM, SIDES
 from track import label_capture
 from track.alternatives.alternatives import ALTERNATIVES, label_probability
 from track.gloves.glove_improvement import sample_places
-from track.gloves.glove_score import layout_of as markers_alone
+from track.gloves.glove_score import layout_at as markers_alone
 from train import simulate_take
 from train.evaluation import BINS, expected_calibration_error, reliability
 from train.labelers.layout_labeler import LayoutLabeler

@@ -226,6 +226,13 @@ class TrackedHand:
         return self.status is not Status.LOST
 
     @property
+    def seen_markers(self) -> Float[np.ndarray, "M 3"]:
+        """The labeled markers [m]; NaN where a marker has no point."""
+        markers = self.markers.copy()
+        markers[self.filled] = np.nan
+        return markers
+
+    @property
     def angles(self) -> dict[str, float]:
         """The angle of each joint by its name [rad]; NaN where the hand is lost."""
         return dict(zip(JOINT_NAMES, self.qpos[7:].tolist(), strict=True))

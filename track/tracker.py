@@ -14,12 +14,12 @@ from typing import Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from numpy.typing import NDArray
 
 from gloves.fit import GloveFit
 from gloves.takes.points import Status
 from handsim._checks import shown_value
 from handsim._process import with_own_numerics
+from handsim.arrays import Integers
 from handsim.errors import ArgumentError
 from handsim.hand.shape import NUM_QPOS
 from handsim.kernels import kernel, squared_distance
@@ -97,10 +97,7 @@ class Tracker:
         self._bodies = [BodyTracker(body) for body in self.bodies]
         self._states = [
             HandState(
-                hand,
-                config,
-                origin=self.user.origin(hand.side),
-                errors=self.user.errors.get(hand.side),
+                hand, config, origin=self.user.origin(hand.side), errors=self.user.errors.get(hand.side)
             )
             for hand in self.hands
         ]
@@ -197,7 +194,7 @@ class Tracker:
             float(incoming.stamp), hands, all_labels, all_confidence, bodies, incoming.notes, seconds
         )
 
-    def _track_bodies(self, incoming: IncomingFrame) -> tuple[tuple[TrackedBody, ...], NDArray[np.int64]]:
+    def _track_bodies(self, incoming: IncomingFrame) -> tuple[tuple[TrackedBody, ...], Integers]:
         """Track every body; return also the labels (P,) of their points."""
         labels, bodies = np.full(len(incoming.points), -1), []
         for owner, tracker in enumerate(self._bodies, start=len(self._states)):
@@ -330,11 +327,7 @@ class Tracker:
         return frame, outcomes
 
     def _start(
-        self,
-        frame: FrameState,
-        outcomes: tuple[_Outcome, ...],
-        found: InitializedHand,
-        among: NDArray[np.int64],
+        self, frame: FrameState, outcomes: tuple[_Outcome, ...], found: InitializedHand, among: Integers
     ) -> tuple[FrameState, tuple[_Outcome, ...]]:
         """Start a track from an initialized hand."""
         state, markers = self._states[found.index], np.full(len(frame.points), -1)
@@ -367,9 +360,7 @@ def _weigh_labels(
     return settled
 
 
-def _tracked_hand(
-    state: HandState, outcome: _Outcome, frame: FrameState, own: NDArray[np.int64]
-) -> TrackedHand:
+def _tracked_hand(state: HandState, outcome: _Outcome, frame: FrameState, own: Integers) -> TrackedHand:
     """Output for a hand: its labeled points, and the pose's markers where points are missing."""
     count, side = state.num_markers, state.hand.side
     if state.qpos is None:
