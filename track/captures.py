@@ -91,7 +91,7 @@ def label_capture(
     chosen, source = LabelSettings.of(settings, options), capture_of(capture)
     frames = checked_frames(source)
     with second_process(len(frames) >= _WORTH_A_PROCESS, label_both_ways.__module__) as helper:
-        setup = _setup_of(chosen, frames)
+        setup = _setup(chosen, frames)
         labeled, setup, _ = _judged(
             lambda now: _labeled_take(capture, source, frames, now, progress, helper), setup
         )
@@ -296,15 +296,13 @@ def calibrate(
     """
     on_part = _step_progress(progress, on_step)
     source, frames, setup = _open_capture(capture, CalibrateSettings.of(settings, options))
-    on_label = partial(on_part, "frames")
-    take, setup, _ = _judged(
-        lambda now: tracked_take(source, frames, now.tracker(), progress=on_label), setup
-    )
+    report = partial(on_part, "frames")
+    take, setup, _ = _judged(lambda now: tracked_take(source, frames, now.tracker(), progress=report), setup)
     _warn(map(str, other_hands_of(_with_other_hands(take, setup))))
     done = calibrate_take(take, setup.start, setup.user, on_part)
     if leaves_markers(take, done):
         tracker = Tracker([one.hand for one in done], setup.labeler)
-        take = tracked_take(source, frames, tracker, progress=on_label)
+        take = tracked_take(source, frames, tracker, progress=report)
         done = calibrate_take(take, setup.start, setup.user, on_part)
     _warn(misfits(take, calibrates=True))
     name = _capture_record(capture, source).get("capture", "a capture")
@@ -374,12 +372,10 @@ def _open_capture(
     """A capture, its frames, and the setup that tracks them; hands are measured unless settings give them."""
     source = capture_of(capture)
     frames = checked_frames(source)
-    return source, frames, _setup_of(settings, frames, warns=warns)  # last: a glove may have to be learned
+    return source, frames, _setup(settings, frames, warns=warns)  # last: a glove may have to be learned
 
 
-def _setup_of(
-    settings: LabelSettings, frames: Sequence[StreamedFrame], *, warns: bool = False
-) -> TrackerSetup:
+def _setup(settings: LabelSettings, frames: Sequence[StreamedFrame], *, warns: bool = False) -> TrackerSetup:
     """The setup that labels frames; hands are measured unless settings give them."""
     return TrackerSetup.of(settings).measured(sample_frames(frames), warns=warns)
 

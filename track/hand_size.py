@@ -142,7 +142,7 @@ def fit_size(
             if any(length > fit.hand.shape.length for _, fit in rated):
                 continue
             fit = _fit_from(length, frames, layout, sides, labeler, config)
-            if fit is None or not (config is _USUAL_CONFIG or _are_found(fit, frames, sides, labeler)):
+            if fit is None or not (config is _USUAL_CONFIG or _is_found(fit, frames, sides, labeler)):
                 continue
             if not some:
                 return fit
@@ -203,9 +203,7 @@ def _fit_from(
     return _fit_proportions(np.concatenate(markers), mean_hand(*search.measures(length), layout))
 
 
-def _are_found(
-    fit: SizeFit, frames: Sequence[StreamedFrame], sides: Sequence[Side], labeler: Labeler
-) -> bool:
+def _is_found(fit: SizeFit, frames: Sequence[StreamedFrame], sides: Sequence[Side], labeler: Labeler) -> bool:
     """Whether measured hands are found in most frames, or in some where most markers fit well."""
     tracker, count = Tracker(fit.hands(sides), labeler), fit.hand.layout.num_markers
     enough = [frame for frame in frames if _are_enough(frame, count)]

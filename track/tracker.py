@@ -62,6 +62,9 @@ class _Outcome(NamedTuple):
     """RMS distance of the labeled markers from the pose's, biases included [m]; NaN without a fit."""
 
 
+_Outcomes = tuple[_Outcome, ...]
+
+
 class Tracker:
     """Tracks the user's hands, and rigid bodies with markers, from frame to frame.
 
@@ -166,11 +169,8 @@ class Tracker:
         incoming = self._intake.check_frame(points, ids, time)
         bodies, labels = self._track_bodies(incoming)
         free = labels < 0
-        predictions = {
-            hand: state.predict(incoming.time)
-            for hand, state in enumerate(self._states)
-            if state.qpos is not None
-        }
+        posed = ((hand, state) for hand, state in enumerate(self._states) if state.qpos is not None)
+        predictions = {hand: state.predict(incoming.time) for hand, state in posed}
         expected = self._marker_positions(predictions)
         carried = self._history.carry(incoming.points[free], incoming.ids[free], incoming.time, expected)
         followed = self._give_up_old_poses(carried)
@@ -252,9 +252,7 @@ class Tracker:
         """Whether a pose is too old for further prediction."""
         return time - state.time > self.config.longest_coast
 
-    def _update(
-        self, frame: FrameState, tracks: Sequence[HandTrack]
-    ) -> tuple[FrameState, tuple[_Outcome, ...]]:
+    def _update(self, frame: FrameState, tracks: Sequence[HandTrack]) -> tuple[FrameState, _Outcomes]:
         """Accept or reject the hands' estimates, and update the evidence of their labels."""
         estimates, outcomes = {track.hand: track.estimate for track in tracks}, []
         evidence = frame.evidence.copy()
@@ -275,13 +273,9 @@ class Tracker:
             outcomes.append(_Outcome(Status.LOST if state.qpos is None else Status.COASTING))
         return frame._replace(evidence=evidence), tuple(outcomes)
 
-    def _initialize_lost(
-        self, frame: FrameState, outcomes: tuple[_Outcome, ...]
-    ) -> tuple[FrameState, tuple[_Outcome, ...]]:
+    def _initialize_lost(self, frame: FrameState, outcomes: _Outcomes) -> tuple[FrameState, _Outcomes]:
         """Initialize hands without a pose from the points left by the others."""
-        lost = tuple(
-            hand for hand, one in enumerate(outcomes) if one.status in (Status.LOST, Status.COASTING)
-        )
+        lost = tuple(hand for hand, one in enumerate(outcomes) if one.status < Status.INITIALIZED)
         if not lost:
             return frame, outcomes
         free = frame.free_for(lost)
@@ -298,9 +292,7 @@ class Tracker:
         self._last_attempt, self._attempt_points = frame.time, len(free)
         return frame, outcomes
 
-    def _replace_doubted(
-        self, frame: FrameState, outcomes: tuple[_Outcome, ...]
-    ) -> tuple[FrameState, tuple[_Outcome, ...]]:
+    def _replace_doubted(self, frame: FrameState, outcomes: _Outcomes) -> tuple[FrameState, _Outcomes]:
         """Initialize a hand again if it lacks most labels, or fits badly, and has unlabeled points around it.
 
         Otherwise a track could hold on to a wrong pose by a few points.
@@ -327,8 +319,8 @@ class Tracker:
         return frame, outcomes
 
     def _start(
-        self, frame: FrameState, outcomes: tuple[_Outcome, ...], found: InitializedHand, among: Integers
-    ) -> tuple[FrameState, tuple[_Outcome, ...]]:
+        self, frame: FrameState, outcomes: _Outcomes, found: InitializedHand, among: Integers
+    ) -> tuple[FrameState, _Outcomes]:
         """Start a track from an initialized hand."""
         state, markers = self._states[found.index], np.full(len(frame.points), -1)
         markers[among] = found.labels

@@ -53,7 +53,7 @@ _TEMPERATURE: Final = 1.5  # Log-odds are divided by this, because no fit models
 _REPORTED_PROBABILITY: Final = 0.2  # An alternative is reported from this probability on.
 # [m] least reported distance of a marker from its place; right ones reach 13 mm
 _REPORTED_OFFSET: Final = 0.014
-_LEAST_KEPT: Final = 0.01  # Alternatives are kept from this probability on.
+_LIKELY: Final = 0.01  # Alternatives are kept from this probability on.
 _REMEDY: Final = "`handsim glove learn CAPTURE --start FILE.toml --out NEW.toml` corrects it"
 
 
@@ -264,9 +264,7 @@ class _TriedHand:
         shares = np.exp(log_odds - log_odds.max())
         shares /= shares.sum()
         ranked = np.argsort(-shares, kind="stable")
-        found = [
-            tried[n][1]._replace(probability=float(shares[n])) for n in ranked if shares[n] >= _LEAST_KEPT
-        ]
+        found = [tried[n][1]._replace(probability=float(shares[n])) for n in ranked if shares[n] >= _LIKELY]
         _, _, fit, of = tried[ranked[0]]
         return JudgedHand(side, tuple(found), fit.hand.with_side(of), fit.offsets)
 

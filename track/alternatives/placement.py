@@ -119,10 +119,8 @@ def offset_cost(off: Float[np.ndarray, "*B 3"]) -> Float[np.ndarray, "*B"]:
     return np.asarray(0.5 * (_FREEDOM + 3.0) * np.log1p(squares))
 
 
-def _shared_offsets(
-    off: Doubles, covariance: Doubles
-) -> tuple[Float[np.ndarray, "M 3"], Float[np.ndarray, "M"]]:
-    """The part of offsets that neighbors share, given their covariance, and the weights of the rest."""
+def _shared_offsets(off: Doubles, covariance: Doubles) -> tuple[Doubles, Doubles]:
+    """The part (M, 3) of offsets that neighbors share, by its covariance, and the rest's weights (M,)."""
     shared = np.zeros_like(off)
     for _ in range(_REWEIGHTING_ROUNDS):
         weights = (_FREEDOM + 3.0) / (_FREEDOM + ((off - shared) ** 2).sum(axis=1) / _OFFSET_SCALE**2)

@@ -12,7 +12,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from handsim.arrays import Doubles, Integers
+from handsim.arrays import Doubles, Flags, Integers
 from handsim.kernels import kernel
 from handsim.space.transforms import rigid_fit
 from train.labelers.matching import assign
@@ -77,9 +77,7 @@ class FrameState(NamedTuple):
         """Replace a hand's labels."""
         return self._replace(labels=self.numbering.with_markers(hand, markers, self.labels))
 
-    def with_confidence(
-        self, changed: Bool[np.ndarray, "P"], confidence: Float[np.ndarray, "C"]
-    ) -> FrameState:
+    def with_confidence(self, changed: Flags | Integers, confidence: Doubles) -> FrameState:
         """Give C changed labels no evidence, and a confidence from 0 to 1."""
         evidence, all_confidence = self.evidence.copy(), self.confidence.copy()
         evidence[changed], all_confidence[changed] = 0.0, confidence

@@ -408,11 +408,9 @@ class HandInitializer:
         return InitializedHand(index, fit, labels, self.score(count, float(fit.rms[0]), spread) - penalty)
 
 
-def _likelier(
-    changed: Sequence[InitializedHand | None], hands: list[InitializedHand]
-) -> list[InitializedHand]:
-    """The changed hands if all of them exist and have a higher total score; otherwise the hands before."""
-    found = [hand for hand in changed if hand is not None]
+def _likelier(new: Sequence[InitializedHand | None], hands: list[InitializedHand]) -> list[InitializedHand]:
+    """The new hands if all of them exist and have a higher total score; otherwise the hands before."""
+    found = [hand for hand in new if hand is not None]
     better = sum(hand.score for hand in found) > sum(hand.score for hand in hands)
     return found if better and len(found) == len(hands) else hands
 

@@ -210,9 +210,8 @@ class LabelerReview:
     def review(self, frame: FrameState, track: HandTrack) -> tuple[FrameState, HandTrack]:
         """If a review is due, compare a hand's labels with the labeler's, and adopt the likelier ones."""
         markers = frame.markers(track.hand)
-        near = _near_missing(
-            frame.points, frame.labels, markers, track.state.digits, track.estimate.positions
-        )
+        digits, positions = track.state.digits, track.estimate.positions
+        near = _near_missing(frame.points, frame.labels, markers, digits, positions)
         if not self._is_due(track.hand, frame, near):
             return frame, track
         cloud = np.flatnonzero((markers >= 0) | near)
@@ -244,10 +243,8 @@ class LabelerReview:
         self, frame: FrameState, track: HandTrack, named: Integers, confidence: Doubles
     ) -> _Proposal | None:
         """Fit the labeler's labels; None if the current ones are likelier or equal."""
-        named_frame, is_sure = frame.with_markers(track.hand, named), track.estimate.rms < _RESTART_RMS
-        proposed, estimate = fit_labels(
-            named_frame, track.hand, track.state, track.prediction, is_sure=is_sure
-        )
+        labeled, is_sure = frame.with_markers(track.hand, named), track.estimate.rms < _RESTART_RMS
+        proposed, estimate = fit_labels(labeled, track.hand, track.state, track.prediction, is_sure=is_sure)
         before, after = frame.markers(track.hand), proposed.markers(track.hand)
         if (after == before).all() or np.isnan(estimate.rms):
             return None
@@ -292,14 +289,12 @@ class LabelerReview:
         doubted = (presence >= SEEN_ELSEWHERE) & (presence <= SEEN_ELSEWHERE + MOST_AGE_LOG_ODDS)
         return float(gain + presence[~doubted].sum() + _DOUBTED_PRESENCE * doubted.sum())
 
-    def _log_odds(
-        self, frame: FrameState, track: HandTrack, markers: Integers, estimate: HandEstimate
-    ) -> float:
+    def _log_odds(self, frame: FrameState, track: HandTrack, markers: Integers, fit: HandEstimate) -> float:
         """Log-odds of labeled points being markers of the fitted hand and not strays."""
         labeled = np.flatnonzero(markers >= 0)
         variance = track.state.variance[markers[labeled]]
         peak = peak_log_odds(variance, self._config.stray_density)
-        squares = ((frame.points[labeled] - estimate.positions[markers[labeled]]) ** 2).sum(axis=1)
+        squares = ((frame.points[labeled] - fit.positions[markers[labeled]]) ** 2).sum(axis=1)
         return float((peak - 0.5 * squares / variance).sum())
 
 

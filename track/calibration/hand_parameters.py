@@ -276,13 +276,11 @@ def _point_jacobian(coordinates: SkinCoordinates, corners: Corners) -> Doubles:
     blended = np.einsum("pc,pci->pi", coordinates.bary, corners.normals)
     length = np.linalg.norm(blended, axis=1)[:, None]
     normal = blended / length
-    columns = []
+    columns, points = [], corners.points
     for corner in (1, 2):
         change = corners.normals[:, corner] - corners.normals[:, 0]
         change = (change - (change * normal).sum(axis=1, keepdims=True) * normal) / length
-        columns.append(
-            corners.points[:, corner] - corners.points[:, 0] + coordinates.heights[:, None] * change
-        )
+        columns.append(points[:, corner] - points[:, 0] + coordinates.heights[:, None] * change)
     return np.stack([*columns, normal], axis=-1)
 
 

@@ -369,9 +369,8 @@ class Improvement:
         others = places[:number] + places[number + 1 :]
         near = (self._near_place(places[number], others) for _ in range(_NEARBY))
         found = [place for place in near if place is not None]
-        return self._wearable(
-            self._with_marker_at(number, found + self._sampled(_CANDIDATES - _NEARBY, others))
-        )
+        found += self._sampled(_CANDIDATES - _NEARBY, others)
+        return self._wearable(self._with_marker_at(number, found))
 
     def _with_marker_at(self, number: int, places: Sequence[MarkerPlace]) -> list[Columns]:
         """The layout with marker `number`, perhaps a new one, at each of some places."""

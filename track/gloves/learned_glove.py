@@ -224,10 +224,8 @@ class _Learning:
         for _ in range(_ROUNDS):
             fitted = [self._fitted(one, layout, flesh) for one in hands]
             flesh = shown_flesh(np.concatenate([one.residuals for one in fitted]))
-            places = [
-                {place.name: place for place in hand_layout(one.hand, layout).markers} for one in fitted
-            ]
-            layout = _mean_layout(layout, places)
+            found = [{place.name: place for place in hand_layout(one.hand, layout).markers} for one in fitted]
+            layout = _mean_layout(layout, found)
         wearable = settle_glove(_with_markers(layout, layout.names), HandModel.named("M")).layout
         layout = dataclasses.replace(wearable, sides=tuple(sorted({one.side for one in hands})))
         done, doubt = list[TrialHand](), list(self._doubt)
@@ -455,9 +453,8 @@ def _paired(layout: MarkerLayout, other: MarkerLayout) -> dict[str, str]:
     near = apart[rows, columns] < _PAIR_DISTANCE
     if near.sum() < FEWEST_MARKERS:
         return {}
-    return {
-        layout.names[row]: other.names[column] for row, column in zip(rows[near], columns[near], strict=True)
-    }
+    pairs = zip(rows[near], columns[near], strict=True)
+    return {layout.names[row]: other.names[column] for row, column in pairs}
 
 
 def _mean_layout(layout: MarkerLayout, places: Sequence[Mapping[str, MarkerPlace]]) -> MarkerLayout:

@@ -29,9 +29,7 @@ _HANDS_TEXT = (
 def write_learned_page(path: Path, learned: LearnedGlove, captures: Sequence[str] = ()) -> None:
     """Write the page on a learned glove; the captures have numbers unless their names are given."""
     layout = learned.layout
-    caption = (
-        f"{HAND_CAPTION}Colors: distance of the points of each marker from its place on the fitted hands."
-    )
+    caption = f"{HAND_CAPTION}Colors: distance of a marker's points from its place on the fitted hands."
     drawn = residual_picture(layout, np.nan_to_num(marker_residuals(learned)))
     left = html_list(learned.left_out, "ul") if learned.left_out else "Every column belongs to a hand."
     sections = [

@@ -108,9 +108,7 @@ class PlaceTable:
         self.radius, self.normals = radius, normals[rows]
         self.points = surface.vertices[rows] + radius * self.normals
         self.bone_indices, self.bone_weights = surface.bone_indices[rows], surface.bone_weights[rows]
-        self.bones: Int[np.ndarray, "P"] = self.bone_indices[
-            np.arange(len(rows)), self.bone_weights.argmax(1)
-        ]
+        self.bones: Integers = self.bone_indices[np.arange(len(rows)), self.bone_weights.argmax(1)]
         rest = self.model.rest_transforms[self.bones]
         local = np.einsum("pji,pj->pi", rest[:, :3, :3], self.points - rest[:, :3, 3])
         outward = np.einsum("pji,pj->pi", rest[:, :3, :3], self.normals)

@@ -196,10 +196,8 @@ class Recorder(Closing):
         self._archive.replace_head(self._header(None), self._worn_arrays())
 
     def _worn_arrays(self) -> dict[str, NDArray[Any]]:
-        return {
-            **worn_arrays(self._tracker.hands, self._tracker.bodies),
-            FORMER: former_array((), self._layouts),
-        }
+        worn = worn_arrays(self._tracker.hands, self._tracker.bodies)
+        return {**worn, FORMER: former_array((), self._layouts)}
 
     @property
     def _layouts(self) -> list[MarkerLayout]:

@@ -118,10 +118,8 @@ def unpack(packet: bytes) -> tuple[int, bytes]:
 
 def pack_connect() -> bytes:
     """A client's first packet: its name and versions, and a request for all data in the newest layout."""
-    name = b"handsim".ljust(_NAME_SIZE, b"\0")
-    return pack(
-        Kind.CONNECT, name + bytes((1, 0, 0, 0)) + bytes((*NEWEST, 0, 0)) + bytes((0, *NEWEST, 0, 0, 0))
-    )
+    versions = bytes((1, 0, 0, 0, *NEWEST, 0, 0, 0, *NEWEST, 0, 0, 0))
+    return pack(Kind.CONNECT, b"handsim".ljust(_NAME_SIZE, b"\0") + versions)
 
 
 def pack_server_info(info: ServerInfo) -> bytes:

@@ -88,11 +88,9 @@ class QualisysSource:
             raise CaptureError(f"{url}: QTM refuses version {_VERSION} of its protocol ({error})") from error
         except OSError as error:  # TimeoutError is one
             refused = f"no program of {machine} listens at port {self._port}"
-            reason = (
-                refused if isinstance(error, ConnectionRefusedError) else error.strerror or "it is silent"
-            )
+            cause = refused if isinstance(error, ConnectionRefusedError) else error.strerror or "it is silent"
             raise NoServerError(
-                f"{url}: no QTM answers, expected one that runs there: {reason}; start QTM, or compare the "
+                f"{url}: no QTM answers, expected one that runs there: {cause}; start QTM, or compare the "
                 "port with that of its real-time output"
             ) from error
         return self._qtm.QRTConnection(protocol, timeout=_PATIENCE)

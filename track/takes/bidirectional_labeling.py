@@ -18,7 +18,7 @@ from gloves.captures.capture import runs_of
 from gloves.takes.points import PointList
 from gloves.takes.take import LOST, TRACKED, Take
 from handsim.app.workers import LocalProcesses, can_be_sent
-from handsim.arrays import Flags
+from handsim.arrays import Flags, Integers
 from handsim.hand.shape import NUM_QPOS
 from track.association.initialization import connected_components
 from track.frames import StreamedFrame, TrackedHand
@@ -77,9 +77,8 @@ def label_both_ways(
     right = label_confidence(_with_poses(take, labels, qpos, rms))
     odds = np.where(forward_labels == backward_labels, _AGREEMENT_ODDS, 1.0)
     confidence = odds * right / (1.0 - right + odds * right)
-    return dataclasses.replace(
-        take, point_list=dataclasses.replace(points, labels=labels, confidence=confidence)
-    )
+    points = dataclasses.replace(points, labels=labels, confidence=confidence)
+    return dataclasses.replace(take, point_list=points)
 
 
 def _track_both_ways(
@@ -144,10 +143,8 @@ def _hand_evidence(hand: TrackedHand) -> float:
     return (len(hand.markers) - len(hand.filled)) * (_EXACT_LOG_ODDS - 0.5 * (hand.rms / _RMS_SPREAD) ** 2)
 
 
-def _events_of(
-    frames: Int[np.ndarray, "P"], one: Int[np.ndarray, "P"], other: Int[np.ndarray, "P"]
-) -> _Events:
-    """Group the points whose two labels differ into events.
+def _events_of(frames: Integers, one: Integers, other: Integers) -> _Events:
+    """Group the points (P,) whose two labels differ into events.
 
     Two points belong to one event if they exchange a label between the directions in a frame, or if they have
     the same two labels in successive frames.

@@ -193,10 +193,8 @@ class _SmoothedHand:
         self._noise, self._drift, self._flesh = _FIRST_NOISE, 0.0, 0.0
         self._places = np.zeros((len(self._hand.digits), 2))  # RMS error along the skin, off it [m]
 
-    def solve(
-        self, windows: Sequence[_Window]
-    ) -> tuple[Float[np.ndarray, "20"], Float[np.ndarray, "T 26 5"]]:
-        """Solve all poses; return the cut-off of each angle [Hz] and the unknowns' variances by `SOURCES`."""
+    def solve(self, windows: Sequence[_Window]) -> tuple[Doubles, Doubles]:
+        """Solve all poses; return the angles' cut-offs (20,) [Hz], and all variances (T, 26, 5) by source."""
         self._solve_poses(windows)
         cutoffs, wide = [], self._prior_of(self._moves_seen)
         parts = np.full((len(self.qpos), NUM_UNKNOWNS, len(SOURCES)), np.nan)

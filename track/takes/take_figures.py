@@ -205,9 +205,8 @@ def joint_errors(settings: Mapping[str, Any], hand: HandFigures) -> Float[np.nda
     origin = hand_origin(str(settings.get("user", "")), hand.side)
     budget = np.pad(budget, ((0, 0), (0, len(SOURCES) - len(budget[0]))))  # Older takes have no palm.
     errors = np.transpose([measurement_error(budget, origin, measure) for measure in CHANGING])
-    return np.column_stack(
-        [np.linalg.norm(budget, axis=1), budget, errors[:, 0], DETECTABLE * errors, cutoffs]
-    )
+    spreads = np.linalg.norm(budget, axis=1)
+    return np.column_stack([spreads, budget, errors[:, 0], DETECTABLE * errors, cutoffs])
 
 
 def cycles_of_hands(take: Take, hands: Sequence[HandFigures], settings: PageSettings) -> list[Cycles]:

@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float, Int
 from gloves.captures.capture import runs_of
 from gloves.takes.take import COASTING, LOST, Take
 from handsim._checks import check_choice
+from handsim.arrays import Doubles
 from handsim.files.outputs import check_ending, written_together
 from handsim.hand.angles import WRIST_NAMES
 from handsim.hand.shape import DIGITS, JOINT_NAMES, JOINTS, Side
@@ -256,9 +257,7 @@ def _wrist_section(take: Take, hand: HandFigures, settings: PageSettings) -> Sec
     return Section(title, text, pictures=[(curves, _SHADES)], table=table)
 
 
-def _draw_wrist(
-    figure: Figure, times: Float[np.ndarray, "T"], hand: HandFigures, wrist: WristFigures
-) -> None:
+def _draw_wrist(figure: Figure, times: Doubles, hand: HandFigures, wrist: WristFigures) -> None:
     panel = figure.subplots()
     _prepare_panel(panel, times, hand.status)
     panel.axhline(0.0, color=Paint.LINE, linewidth=0.8)
@@ -443,9 +442,7 @@ def _methods_section(take: Take, spans: Sequence[SuspectSpan], settings: PageSet
 def _cycles_section(side: Side, cycles: Cycles, settings: PageSettings) -> Section:
     """Mean and standard deviation of the angles over the cycles, as curves and in numbers."""
     title, joint = f"{side.capitalize()} hand: cycles", str(settings.cycles).replace("_", " ")
-    text = (
-        f"A cycle is from one least angle of {joint} to the next, if it bends by half of its range between."
-    )
+    text = f"A cycle lasts from one least angle of {joint} to the next, if it bends by half its range."
     if not cycles.spans:
         return Section(title, f"{text} There is none.")
     table = [["joint", "cycles", *(f"{name}: mean, SD" for name in FIGURES)]]

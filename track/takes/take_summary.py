@@ -99,10 +99,8 @@ def _guesses(worn: Attachment, shown: Bool[np.ndarray, "20"]) -> Iterator[str]:
     """One sentence for each digit with joints beyond which the glove has no marker, or none was seen."""
     worn_beyond, lacking = (each.reshape(len(DIGITS), -1) for each in (worn.beyond.any(axis=1), ~shown))
     for number, (digit, has, lacks) in enumerate(zip(DIGITS, worn_beyond, lacking, strict=True)):
-        owner, verb = (
-            digit if digit == "thumb" else f"{digit} finger",
-            "was seen" if has[lacks].any() else "is",
-        )
+        owner = digit if digit == "thumb" else f"{digit} finger"
+        verb = "was seen" if has[lacks].any() else "is"
         if lacks.all():
             yield f"no marker {verb} on the {owner}: its angles are guesses"
         elif lacks.any():

@@ -33,7 +33,8 @@ _ANGLES: Final = (*_WORDS, "side", "joint", "measure", "value [deg]", "SD", "SD 
                   "share measured", "convention", _RECORD_COLUMN)  # fmt: skip
 _MEASURES: Final = "mean", "5th percentile", "95th percentile", "range of motion"
 
-_Rows = list[list[object]]
+_Row = list[object]
+_Rows = list[_Row]
 
 
 def table_paths(page: Path, settings: PageSettings = PageSettings()) -> tuple[Path, ...]:  # noqa: B008
@@ -153,9 +154,7 @@ def _span_rows(take: Take, spans: Sequence[SuspectSpan]) -> _Rows:
     return rows
 
 
-def _cycle_rows(
-    take: Take, hands: Sequence[HandFigures], cycles: Sequence[Cycles], first: list[object]
-) -> _Rows:
+def _cycle_rows(take: Take, hands: Sequence[HandFigures], cycles: Sequence[Cycles], first: _Row) -> _Rows:
     """Rows of figures and curves: by hand and joint of each cycle, their mean and standard deviation."""
     header = [*_WORDS, "side", "joint", "cycle", "start [s]", *FIGURES]
     rows: _Rows = [[*header, *(f"{percent:g} %" for percent in PERCENTS)]]
@@ -182,9 +181,7 @@ def _reach_rows(take: Take, hands: Sequence[HandFigures]) -> _Rows:
     return rows
 
 
-def _angle_rows(
-    take: Take, hands: Sequence[HandFigures], first: list[object], settings: PageSettings
-) -> _Rows:
+def _angle_rows(take: Take, hands: Sequence[HandFigures], first: _Row, settings: PageSettings) -> _Rows:
     """Rows of the angles of a study: by hand, convention, joint and measure, in measured frames.
 
     SD and its constant part are those of a single angle, so that a range of motion has none.

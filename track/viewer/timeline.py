@@ -8,7 +8,6 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
-from jaxtyping import Float
 
 from gloves.fit import GloveFit
 from handsim.arrays import Doubles
@@ -39,9 +38,7 @@ Key = Literal["space", "arrowleft", "arrowright", "home", "end", "pageup", "page
 class Timeline:
     """Selects frames: `run` calls `show` with their indices; all other methods only request a frame."""
 
-    def __init__(
-        self, server: ViserServer, times: Float[np.ndarray, "T"], show: Callable[[int], None]
-    ) -> None:
+    def __init__(self, server: ViserServer, times: Doubles, show: Callable[[int], None]) -> None:
         self._times, self._show = times, show
         self._wake = threading.Event()
         self.index, self.playing = 0, False
