@@ -1,7 +1,7 @@
 """Label, track, measure and calibrate the hands of a capture.
 
-Each function turns its capture into frames and its settings into hands and a labeler, measures the hands in
-some of the frames if nobody has measured them, and then labels or tracks all frames.
+Each function reads frames from its capture, and hands and a labeler from its settings. It measures the hands
+in some of the frames unless the settings give them, and then labels or tracks all frames.
 """
 
 from __future__ import annotations
@@ -48,12 +48,12 @@ from track.tracker import Tracker
 from track.user import AnyGlove, AnyLabeler, User, labeler_of, nominal_user
 
 OnFrame = Callable[[StreamedFrame, TrackedFrame], None]
-_COMPARED: Final = 200  # pairs of successive frames compared to see whether frames are continuous
-_CONTINUOUS: Final = 0.005  # [m] A pair is continuous if distances within a hand change less.
-_CORRECTIONS: Final = 2  # times that a take is labeled again because other labels are likelier
+_COMPARED_PAIRS: Final = 200  # pairs of successive frames compared to see whether frames are continuous
+_MOST_CHANGE: Final = 0.005  # [m] A pair is continuous if distances within a hand change less.
+_MOST_CORRECTIONS: Final = 2  # A take is labeled again this often at most, because other labels are likelier.
 _ANY_RATE: Final = 120.0  # [Hz] Poses and labels do not depend on the rate of a take.
-_WORTH_A_PROCESS: Final = 1500  # frames: labeling them in one direction takes as long as a process starts
-_LEAST_CONTINUOUS: Final = 0.5  # least share of continuous pairs for frames to be tracked
+_WORTH_A_PROCESS: Final = 1500  # Labeling this many frames one way takes as long as starting a process.
+_LEAST_CONTINUOUS_SHARE: Final = 0.5  # least share of continuous pairs for frames to be tracked
 
 
 def label_capture(
@@ -91,16 +91,16 @@ def label_capture(
     chosen, source = LabelSettings.of(settings, options), capture_of(capture)
     frames = checked_frames(source)
     with second_process(len(frames) >= _WORTH_A_PROCESS, label_both_ways.__module__) as helper:
-        setup = _setup_of(chosen, frames)
+        setup = _setup(chosen, frames)
         labeled, setup, _ = _judged(
             lambda now: _labeled_take(capture, source, frames, now, progress, helper), setup
         )
     labeled = _with_other_hands(labeled, setup)
-    told = [*map(str, other_hands_of(labeled)), *label_faults(labeled)]
+    warned = [*map(str, other_hands_of(labeled)), *label_faults(labeled)]
     if (labeled.point_list.labels < 0).all():
         none = f"no hand found, expected hands in glove '{labeled.settings['glove']}' (--glove names another)"
-        told.append(none if len(labeled.point_list.points) else no_points(labeled))
-    _warn(told)
+        warned.append(none if len(labeled.point_list.points) else no_points(labeled))
+    _warn(warned)
     return labeled
 
 
@@ -112,7 +112,7 @@ def _labeled_take(
     progress: Progress,
     helper: LocalProcesses | None,
 ) -> Take:
-    """Label all frames of a capture, with the help of another process where there is one."""
+    """Label all frames of a capture, in part in a helper process if there is one."""
     present, glove = np.isfinite(source.positions[..., 0]), setup.settings["glove"]
     take = Take.of_truth(
         setup.user.hands,
@@ -121,7 +121,7 @@ def _labeled_take(
         number_runs(present),
         np.full(present.shape, -1, dtype=np.int16),
         rate=source.rate,
-        settings={**_named(capture, source), "glove": glove},
+        settings={**_capture_record(capture, source), "glove": glove},
     )
 
     def on_count(count: int) -> None:
@@ -138,29 +138,28 @@ def _labeled_take(
 def _judged(
     label: Callable[[TrackerSetup], Take], setup: TrackerSetup, *, is_final: bool = False
 ) -> tuple[Take, TrackerSetup, list[str]]:
-    """Label a take, and again with markers elsewhere while an alternative to its labels is likelier.
+    """Label a take, and label it again with other marker places while an alternative is likelier.
 
-    Hands that were given or calibrated stay as they are, and so does a take that `is_final`. The last result
-    is what was changed, in words.
+    Given and calibrated hands stay as they are, as does a take that `is_final`. The last result lists the
+    changes in words.
     """
     take, changes = label(setup), list[str]()
     judged = judge_take(take)
-    for _ in range(_CORRECTIONS if setup.is_auto and not is_final else 0):
-        placed = {one.hand.side: one.hand for one in judged if one.is_changed}
-        if not placed:
+    for _ in range(_MOST_CORRECTIONS if setup.is_auto and not is_final else 0):
+        changed = [one for one in judged if one.is_changed]
+        if not changed:
             break
-        changes += [f"the {one.side} hand: {one.alternatives[0].words}" for one in judged if one.is_changed]
-        hands = tuple(placed.get(hand.side, hand) for hand in setup.user)
-        setup = setup.with_user(dataclasses.replace(setup.user, hands=hands))
+        changes += [f"the {one.side} hand: {one.alternatives[0].words}" for one in changed]
+        setup = setup.with_user(setup.user, [one.hand for one in changed])
         take = label(setup)
         judged = judge_take(take)
     return with_doubt(take, judged), setup, changes
 
 
 def judged_setup(frames: Sequence[StreamedFrame], setup: TrackerSetup) -> tuple[TrackerSetup, list[str]]:
-    """Judge the labels of some frames of a stream: hands with markers where they are, and sentences.
+    """Judge the labels of some frames of a stream.
 
-    These say which labels change, and what is open of the others.
+    Returns the setup with the likeliest marker places, and sentences on labels that change or may be wrong.
     """
     positions = np.full((len(frames), max(len(frame.points) for frame in frames), 3), np.nan)
     for row, frame in zip(positions, frames, strict=True):
@@ -171,7 +170,7 @@ def judged_setup(frames: Sequence[StreamedFrame], setup: TrackerSetup) -> tuple[
 
 
 def label_faults(take: Take) -> list[str]:
-    """What is open of the labels of a whole take, in sentences with their remedies."""
+    """What may be wrong with the labels of a whole take, in sentences with their remedies."""
     names = take.hands[0].layout.names
     found = [one for side, doubt in doubts_of(take).items() for one in doubt.faults(side, names)]
     return [f"{one.of} {one.why}; {one.remedy}" for one in found]
@@ -231,14 +230,14 @@ def track_capture(
             never seen, joints at their limits, frames that repeat.
     """
     chosen = TrackSettings.of(settings, options)
-    source, frames, setup = _opened(capture, chosen, warns=True)
+    source, frames, setup = _open_capture(capture, chosen, warns=True)
     pins = () if corrections is None else _checked_corrections(Path(corrections), source, setup)
     on_step("frames")
     if chosen.calibrate:
         first, setup, _ = _judged(
             lambda now: tracked_take(source, frames, now.tracker(), progress=progress), setup
         )
-        setup = _calibrated(first, setup, _parts(progress, on_step))
+        setup = _calibrate_setup(first, setup, _step_progress(progress, on_step))
         on_step("frames")
     take, setup, _ = _judged(
         lambda now: tracked_take(source, frames, now.tracker(), sinks, on_frame, progress),
@@ -247,7 +246,7 @@ def track_capture(
     )
     take = _with_other_hands(take, setup)
     points = dataclasses.replace(take.point_list, confidence=label_confidence(take))
-    record = {**take.settings, **_named(capture, source), **setup.settings}
+    record = {**take.settings, **_capture_record(capture, source), **setup.settings}
     take = dataclasses.replace(take, point_list=points, settings=record)
     if corrections is None and chosen.smooth:
         on_step("smoothing")
@@ -295,20 +294,18 @@ def calibrate(
     Warns:
         HandSimWarning: The points do not fit the hands or the glove, or a hand is kept as it was.
     """
-    on_part = _parts(progress, on_step)
-    source, frames, setup = _opened(capture, CalibrateSettings.of(settings, options))
-    on_label = partial(on_part, "frames")
-    take, setup, _ = _judged(
-        lambda now: tracked_take(source, frames, now.tracker(), progress=on_label), setup
-    )
+    on_part = _step_progress(progress, on_step)
+    source, frames, setup = _open_capture(capture, CalibrateSettings.of(settings, options))
+    report = partial(on_part, "frames")
+    take, setup, _ = _judged(lambda now: tracked_take(source, frames, now.tracker(), progress=report), setup)
     _warn(map(str, other_hands_of(_with_other_hands(take, setup))))
     done = calibrate_take(take, setup.start, setup.user, on_part)
     if leaves_markers(take, done):
         tracker = Tracker([one.hand for one in done], setup.labeler)
-        take = tracked_take(source, frames, tracker, progress=on_label)
+        take = tracked_take(source, frames, tracker, progress=report)
         done = calibrate_take(take, setup.start, setup.user, on_part)
     _warn(misfits(take, calibrates=True))
-    name = _named(capture, source).get("capture", "a capture")
+    name = _capture_record(capture, source).get("capture", "a capture")
     found = kept_user(take, done, setup.user, f"from {name}", on_part)
     _warn(f"{one.hand.side} hand: {one}" for one in found.calibrations if not one.is_better)
     return found
@@ -369,23 +366,21 @@ def tracked_take(
     return take_of_rows(rows, tracker, source)
 
 
-def _opened(
+def _open_capture(
     capture: AnyCapture, settings: LabelSettings, *, warns: bool = False
 ) -> tuple[Capture, list[StreamedFrame], TrackerSetup]:
-    """A capture, its frames and the setup that tracks them, with measured hands unless settings give them."""
+    """A capture, its frames, and the setup that tracks them; hands are measured unless settings give them."""
     source = capture_of(capture)
     frames = checked_frames(source)
-    return source, frames, _setup_of(settings, frames, warns=warns)  # last: a glove may have to be learned
+    return source, frames, _setup(settings, frames, warns=warns)  # last: a glove may have to be learned
 
 
-def _setup_of(
-    settings: LabelSettings, frames: Sequence[StreamedFrame], *, warns: bool = False
-) -> TrackerSetup:
-    """The setup that labels frames, with measured hands unless settings give them."""
+def _setup(settings: LabelSettings, frames: Sequence[StreamedFrame], *, warns: bool = False) -> TrackerSetup:
+    """The setup that labels frames; hands are measured unless settings give them."""
     return TrackerSetup.of(settings).measured(sample_frames(frames), warns=warns)
 
 
-def _named(capture: AnyCapture, source: Capture) -> dict[str, Any]:
+def _capture_record(capture: AnyCapture, source: Capture) -> dict[str, Any]:
     """Entries of a take's settings: name and checksum of the capture's file, and the reader's findings."""
     name: dict[str, Any] = {}
     if isinstance(capture, str | Path):
@@ -400,13 +395,13 @@ def _is_continuous(frames: Sequence[StreamedFrame]) -> bool:
         for one, other in pairwise(frames)
         if min(len(one.points), len(other.points)) >= MIN_MARKERS
     ]
-    chosen = np.unique(np.linspace(0, len(pairs) - 1, min(_COMPARED, len(pairs))).astype(int))
+    chosen = np.unique(np.linspace(0, len(pairs) - 1, min(_COMPARED_PAIRS, len(pairs))).astype(int))
     changes = [change_of_distances(*pairs[number]) for number in chosen]
-    return bool(changes and np.mean([change < _CONTINUOUS for change in changes]) >= _LEAST_CONTINUOUS)
+    return bool(changes and np.mean([change < _MOST_CHANGE for change in changes]) >= _LEAST_CONTINUOUS_SHARE)
 
 
-def _parts(progress: Progress, on_step: OnStep) -> OnPart:
-    """A callback of a step's name with what is done of it."""
+def _step_progress(progress: Progress, on_step: OnStep) -> OnPart:
+    """Combine the callbacks of steps and progress."""
 
     def on_part(step: str, done: int, total: int) -> None:
         on_step(step)
@@ -415,7 +410,7 @@ def _parts(progress: Progress, on_step: OnStep) -> OnPart:
     return on_part
 
 
-def _calibrated(take: Take, setup: TrackerSetup, on_part: OnPart) -> TrackerSetup:
+def _calibrate_setup(take: Take, setup: TrackerSetup, on_part: OnPart) -> TrackerSetup:
     """Replace the hands of a setup by hands calibrated on a take, where these fit held-out frames better."""
     try:
         done = calibrate_take(take, setup.start, setup.user, on_part)
@@ -423,9 +418,7 @@ def _calibrated(take: Take, setup: TrackerSetup, on_part: OnPart) -> TrackerSetu
         warnings.warn(f"not calibrated: {error}", HandSimWarning, stacklevel=4)
         return setup
     found = kept_user(take, done, setup.user, "on the take itself", on_part)
-    better = {hand.side: hand for hand in found}
-    hands = tuple(better.get(hand.side, hand) for hand in setup.user)
-    return setup.with_user(dataclasses.replace(found, hands=hands))
+    return setup.with_user(found, found)
 
 
 def _checked_corrections(path: Path, source: Capture, setup: TrackerSetup) -> tuple[Correction, ...]:

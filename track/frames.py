@@ -157,18 +157,15 @@ class FrameValidator:
 
     def _tick(self, time: float) -> list[str]:
         """Advance the clock; return notes on what was wrong with the time stamp."""
-        span = time - self._last
-        if abs(time) < LATEST_TIME:
+        span, is_usable = time - self._last, abs(time) < LATEST_TIME
+        if is_usable:
             self._last = time
-        else:
+        if not is_usable or not span > 0.0:  # NaN for the first frame
             self._clock += self._interval
-            return [f"the time is {time:g} s" if np.isfinite(time) else "the time is not a number"]
-        if np.isnan(span):  # the first frame
-            self._clock += self._interval
-            return []
-        if span <= 0.0:
-            self._clock += self._interval
-            return [f"the time went back by {-span:.3g} s" if span else "the time stood still"]
+            if not is_usable:
+                return [f"the time is {time:g} s" if np.isfinite(time) else "the time is not a number"]
+            back = f"the time went back by {-span:.3g} s" if span else "the time stood still"
+            return [] if np.isnan(span) else [back]
         # Time stamps jitter, and velocities are divided by their differences.
         self._clock += max(span, _SHORTEST_INTERVAL * self._interval)
         if span > self._silence:
@@ -224,6 +221,13 @@ class TrackedHand:
     def has_pose(self) -> bool:
         """Whether there is a pose."""
         return self.status is not Status.LOST
+
+    @property
+    def seen_markers(self) -> Float[np.ndarray, "M 3"]:
+        """The labeled markers [m]; NaN where a marker has no point."""
+        markers = self.markers.copy()
+        markers[self.filled] = np.nan
+        return markers
 
     @property
     def angles(self) -> dict[str, float]:

@@ -1,9 +1,9 @@
 """Size and proportions of a user's hands from some frames, and a check whether hands fit these frames.
 
-Length and breadth of hands of mean proportions are searched first; then proportions and marker positions are
-fitted as far as the frames determine them. `calibrate` fits the rest on a longer capture. Where hands fit
-badly, other gloves, sides and scales are measured in the same frames, and the likeliest of them is suggested
-if it is clearly likelier.
+The module first searches length and breadth of hands of mean proportions; then it fits proportions and marker
+positions as far as the frames determine them. `calibrate` fits the rest on a longer capture. Where hands fit
+badly, other gloves, sides and scales are measured in the same frames, and one that is clearly likelier is
+suggested.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from numpy.typing import NDArray
 
 from gloves.captures.capture import spacing
 from gloves.fit import GloveFit, check_layout, mean_hand
 from gloves.layout import MarkerLayout, list_layouts, load_layout
 from gloves.takes.points import Status, spread_out
+from handsim.arrays import Doubles
 from handsim.errors import ArgumentError, HandSimError, HandSimWarning
 from handsim.hand.model import HandModel
 from handsim.hand.shape import ADULT_LENGTH, DIGITS, SIZES, HandShape, Side
@@ -45,66 +45,69 @@ from track.config import TrackerConfig
 from track.frames import StreamedFrame, TrackedHand
 from track.kinematics.pose_solver import MIN_MARKERS, PoseSolver
 from track.tracker import Tracker
-from track.user import MEASURED, User, designed_glove
+from track.user import MEASURED, User, designed_glove, size_words
 from train.labelers.protocol import Labeler, Labeling
 from train.labelers.storage import labeler_at_once
 
-_LENGTHS: Final = (0.187, 0.205, 0.168, 0.150, 0.125)  # [m] tried for the first labels, the likeliest first
+# [m] hand lengths of the first labels, likeliest first
+_TRIED_LENGTHS: Final = (0.187, 0.205, 0.168, 0.150, 0.125)
 _SHORTEST, _LONGEST = 0.125, 0.225  # [m] hand lengths: 0.6 of an adult's to beyond ANSUR II's longest
-_BREADTHS: Final = (0.88, 1.12)  # breadth over the usual one of a length: three standard deviations
-_FAR: Final = 0.012  # [m] Hands are labeled again after a larger change of length.
-_PRECISION: Final = 0.001  # [m] precision of length and breadth
+_BREADTH_RANGE: Final = (0.88, 1.12)  # bounds of breadth over usual breadth: three standard deviations
+_RELABELED_CHANGE: Final = 0.012  # [m] A larger change of length requires new labels.
+_SIZE_PRECISION: Final = 0.001  # [m] precision of length and breadth
 _BREADTH_SPREAD: Final = 0.04  # standard deviation of the breadth over the usual one of a length
 _MARKER_SPREAD: Final = 0.002  # [m] standard deviation of glued markers per axis
-_INDEPENDENT: Final = 4.0  # All frames count as this many: errors of glue and flesh repeat.
-_FRAMES: Final = 8  # frames of each hand in the search of length and breadth
+_INDEPENDENT_FRAMES: Final = 4.0  # All frames count as this many, because errors of glue and flesh repeat.
+_SEARCH_FRAMES: Final = 8  # frames of each hand in the search of length and breadth
 _PROPORTION_FRAMES: Final = 40  # frames of each hand in the fit of proportions
-_LEAST_SHARE: Final = 0.5  # A measured size is kept if its hands are found in this share of the frames.
-_SOME_FRAMES: Final = 0.1  # The same for hands that fit well: touching hands are seldom initialized.
-_FITS_WELL: Final = 0.00175  # [m] median RMS distance of hands that fit well; false hands have a larger one
-_FEWEST: Final = 3  # A size needs this many frames.
-_MISSING: Final = 0.2  # A frame shows a hand if at most this share of its markers is missing.
+_FOUND_SHARE: Final = 0.5  # A measured size is kept if its hands are found in this share of the frames,
+# or in this share if they fit well, because touching hands are seldom initialized.
+_LEAST_WELL_FITTED_SHARE: Final = 0.1
+# [m] largest median RMS distance of hands that fit well; false hands exceed it
+_WELL_FITTED_RMS: Final = 0.00175
+_FEWEST_FRAMES: Final = 3  # A size needs this many frames.
+_MISSING_SHARE: Final = 0.2  # A frame shows a hand if at most this share of its markers is missing.
 _FITTED: Final = (Status.TRACKED, Status.INITIALIZED)
-_PATIENCE: Final = 20  # frames with enough points but no hand, after which another size is tried
-_WINDOWS: Final = 8  # parts of a capture that are used
-_WINDOW: Final = 16  # frames of each part
-_SURE: Final = 2.0  # standard deviations of a 95 % interval
-_USUAL: Final = TrackerConfig()
-_LENIENT: Final = TrackerConfig(least_evidence=2.0)  # for hands of few markers before they are measured
-_FIT_STEPS, _FEW_STEPS = 15, 2
-_LEAST_PRECISION: Final = 1.0  # [1/m^2] smallest precision of a shift, so that none is divided by zero
-_PART: Final = 30  # Hands are compared in two parts of this many frames.
-_LEAST_FRAMES: Final = 10  # Hands are not compared in fewer frames.
+_PATIENCE: Final = 20  # After this many frames with enough points but no hand, another size is tried.
+_NUM_WINDOWS: Final = 8  # parts of a capture that are used
+_WINDOW_FRAMES: Final = 16  # frames of each part
+_INTERVAL_95: Final = 2.0  # standard deviations of a 95 % interval
+_USUAL_CONFIG: Final = TrackerConfig()
+# finds hands of few markers before they are measured
+_LENIENT_CONFIG: Final = TrackerConfig(least_evidence=2.0)
+_FIT_STEPS, _FEW_STEPS = 15, 2  # steps to fit proportions, and to follow a slip from a tracked hand
+_LEAST_PRECISION: Final = 1.0  # [1/m^2] lower bound of a shift's precision; avoids a division by zero
+_COMPARED_PART: Final = 30  # Hands are compared in two parts of this many frames,
+_FEWEST_COMPARED: Final = 10  # and not at all in fewer frames than this.
 AT_HAND: Final = 0.04
 """Distance from a hand's markers within which a point counts as its own [m]."""
-_PENALTY: Final = 3.0  # log-odds lost for such a point without a label, and for a missing marker
-_FOUND: Final = 0.6  # share of the frames in which a good fit finds hands
+_UNEXPLAINED_PENALTY: Final = 3.0  # log-odds lost per unlabeled point at a hand, and per missing marker
+_GOOD_FOUND_SHARE: Final = 0.6  # share of the frames in which a good fit finds hands
 _MOST_MISSING, _MOST_NEAR = 0.15, 0.2  # missing markers and nearby points of a good fit, per marker
-_MOST_HIDDEN: Final = 0.35  # the same for missing markers if every marker is seen at times
-_FEW_NEAR: Final = 2.5  # number of nearby points that may be ghosts
+_MOST_HIDDEN: Final = 0.35  # missing markers of a good fit, per marker, if every marker is seen at times
+_FEW_NEAR_POINTS: Final = 2.5  # number of nearby points that may be ghosts
 _MOST_RMS: Final = 0.004  # [m] median RMS distance of a good fit
-_LEAST_FOUND: Final = 0.5  # Suggested hands must be found in at least this share of the frames.
-_BETTER: Final = 1.15  # Suggest another glove only if its log-odds are 1.15 times ours.
-_MUCH_BETTER: Final = 2.0  # the same for another scale
+_SUGGESTED_SHARE: Final = 0.5  # Suggested hands must be found in this share of the frames.
+_GLOVE_RATIO: Final = 1.15  # Another glove is suggested if its log-odds are this many times ours,
+_SCALE_RATIO: Final = 2.0  # another scale if they are this many times ours.
 _UNITS: Final = {"millimeters": 1e-3, "centimeters": 1e-2, "meters": 1.0, "inches": 0.0254, "feet": 0.3048}
-_READ: Final = ("millimeters", "centimeters", "meters")  # units that files state
-_WANDS: Final = (2.0, 0.5)  # scales if the calibration wand's length was entered wrongly
-_FAR_OFF: Final = 4.0  # ratio of spacings beyond which points cannot be a hand at this scale
+_STATED_UNITS: Final = ("millimeters", "centimeters", "meters")  # units that files can state
+_WAND_SCALES: Final = (2.0, 0.5)  # scales if the calibration wand's length was entered wrongly
+_MOST_SPACING_RATIO: Final = 4.0  # ratio of spacings beyond which points cannot be a hand at this scale
 _LEAST_SPACING: Final = 1e-9  # [m] avoids a division by zero
-_MOST_OWN: Final = 16  # largest number of tried gloves of the working folder
+_MOST_FOLDER_GLOVES: Final = 16  # largest number of tried gloves of the working folder
 
 
 class SizeFit(NamedTuple):
     """Measured hands."""
 
-    hand: GloveFit  # the right one; a left hand is its mirror image
+    hand: GloveFit  # the right hand; a left hand is its mirror image
     rms: float  # median RMS distance of the markers from this hand [m]
     spread: float  # standard deviation of its length [m]
 
     def __str__(self) -> str:
         """Length and breadth, and the 95 % uncertainty of the length [mm]."""
-        shape, unsure = self.hand.shape, _SURE * self.spread
-        return f"{1e3 * shape.length:.0f} x {1e3 * shape.breadth:.0f} mm, unsure by {1e3 * unsure:.0f} mm"
+        return f"{size_words(self.hand)}, unsure by {1e3 * _INTERVAL_95 * self.spread:.0f} mm"
 
     def hands(self, sides: Sequence[Side]) -> tuple[GloveFit, ...]:
         """The measured hands of the given sides."""
@@ -113,10 +116,10 @@ class SizeFit(NamedTuple):
 
 def sample_frames(frames: Sequence[StreamedFrame]) -> list[StreamedFrame]:
     """Parts of a capture for `fit_size`, each of consecutive frames: beginning, end and six between."""
-    if len(frames) <= _WINDOWS * _WINDOW:
+    if len(frames) <= _NUM_WINDOWS * _WINDOW_FRAMES:
         return list(frames)
-    starts = np.linspace(0, len(frames) - _WINDOW, _WINDOWS).astype(int)
-    return [frame for start in starts for frame in frames[start : start + _WINDOW]]
+    starts = np.linspace(0, len(frames) - _WINDOW_FRAMES, _NUM_WINDOWS).astype(int)
+    return [frame for start in starts for frame in frames[start : start + _WINDOW_FRAMES]]
 
 
 def fit_size(
@@ -129,21 +132,21 @@ def fit_size(
 ) -> SizeFit | None:
     """Measure size and proportions of the hands in some frames; None if no hand is found.
 
-    A child's hand, some markers of which get no label or a wrong one, may pass for a larger hand. So a hand
-    beside which points have no label, or of which a marker is never seen, is compared with smaller ones.
+    A child's hand may pass for a larger hand, some markers of which then get no label or a wrong one. A hand
+    is therefore compared with smaller ones if points beside it have no label, or if a marker is never seen.
     """
-    some = [] if is_quick else _compared(frames)
-    for config in (_LENIENT,) if is_quick else (_USUAL, _LENIENT):
+    some = [] if is_quick else _compared_frames(frames)
+    for config in (_LENIENT_CONFIG,) if is_quick else (_USUAL_CONFIG, _LENIENT_CONFIG):
         rated: list[tuple[float, SizeFit]] = []
-        for length in _LENGTHS[:2] if is_quick else _LENGTHS:
+        for length in _TRIED_LENGTHS[:2] if is_quick else _TRIED_LENGTHS:
             if any(length > fit.hand.shape.length for _, fit in rated):
                 continue
             fit = _fit_from(length, frames, layout, sides, labeler, config)
-            if fit is None or not (config is _USUAL or _is_found(fit, frames, sides, labeler)):
+            if fit is None or not (config is _USUAL_CONFIG or _is_found(fit, frames, sides, labeler)):
                 continue
             if not some:
                 return fit
-            match = _fit(some, fit.hands(sides), labeler)
+            match = _rate(some, fit.hands(sides), labeler)
             if match.is_good and match.is_whole:
                 return fit
             rated.append((match.log_odds, fit))
@@ -168,12 +171,12 @@ def measured_user(
 def hand_between(one: GloveFit, other: GloveFit, share: float) -> GloveFit:
     """Interpolate linearly between two sizes of a hand in its glove."""
 
-    def mixed(first: Any, last: Any, *names: str) -> dict[str, Any]:
+    def blend(first: Any, last: Any, *names: str) -> dict[str, Any]:
         return {name: (1.0 - share) * getattr(first, name) + share * getattr(last, name) for name in names}
 
     measures = [field.name for field in dataclasses.fields(HandShape) if field.name != "side"]
-    shape = dataclasses.replace(other.shape, **mixed(one.shape, other.shape, *measures))
-    worn = mixed(one.attachment, other.attachment, "points", "normals")
+    shape = dataclasses.replace(other.shape, **blend(one.shape, other.shape, *measures))
+    worn = blend(one.attachment, other.attachment, "points", "normals")
     worn["normals"] /= np.linalg.norm(worn["normals"], axis=1, keepdims=True)
     return GloveFit(HandModel(shape), dataclasses.replace(other.attachment, **worn))
 
@@ -187,15 +190,15 @@ def _fit_from(
     config: TrackerConfig,
 ) -> SizeFit | None:
     """Measure hands that are first labeled as hands of a given length [m]."""
-    markers: list[NDArray[np.float64]] = []
-    for _ in range(2):  # Labels improve with hands of about their own size.
+    markers: list[Doubles] = []
+    for _ in range(2):  # Labels improve once the hands are of about the right size.
         start = mean_hand(length, usual_breadth(length), layout)
-        markers = _label(frames, start, sides, labeler, config) or markers
+        markers = _labeled_markers(frames, start, sides, labeler, config) or markers
         if not markers:
             return None
         search, before = _Search(markers, start), length
         length = search.length(usual_breadth, _SHORTEST, _LONGEST)
-        if abs(length - before) <= _FAR:
+        if abs(length - before) <= _RELABELED_CHANGE:
             break
     return _fit_proportions(np.concatenate(markers), mean_hand(*search.measures(length), layout))
 
@@ -205,22 +208,23 @@ def _is_found(fit: SizeFit, frames: Sequence[StreamedFrame], sides: Sequence[Sid
     tracker, count = Tracker(fit.hands(sides), labeler), fit.hand.layout.num_markers
     enough = [frame for frame in frames if _are_enough(frame, count)]
     tracked = [tracker.step(frame.points, frame.ids, frame.time).hands for frame in enough]
-    if sum(any(hand.has_pose for hand in hands) for hands in tracked) >= max(1.0, _LEAST_SHARE * len(enough)):
+    num_found = sum(any(hand.has_pose for hand in hands) for hands in tracked)
+    if num_found >= max(1.0, _FOUND_SHARE * len(enough)):
         return True
     shown = [[hand.rms for hand in hands if _is_shown(hand, count)] for hands in tracked]
     rms = [one for row in shown for one in row]
-    some = sum(map(bool, shown)) >= max(1.0, _SOME_FRAMES * len(enough))
-    return some and float(np.median(rms)) <= _FITS_WELL
+    is_enough = sum(map(bool, shown)) >= max(1.0, _LEAST_WELL_FITTED_SHARE * len(enough))
+    return is_enough and float(np.median(rms)) <= _WELL_FITTED_RMS
 
 
 def _are_enough(frame: StreamedFrame, count: int) -> bool:
     """Whether a frame has points for most of the markers of a hand."""
-    return len(frame.points) >= (1.0 - _MISSING) * count
+    return len(frame.points) >= (1.0 - _MISSING_SHARE) * count
 
 
 def _is_shown(hand: TrackedHand, count: int) -> bool:
     """Whether a hand is fitted with most of its markers."""
-    return hand.status in _FITTED and len(hand.filled) <= _MISSING * count
+    return hand.status in _FITTED and len(hand.filled) <= _MISSING_SHARE * count
 
 
 def usual_breadth(length: float) -> float:
@@ -230,7 +234,7 @@ def usual_breadth(length: float) -> float:
     return float(np.interp(inside, lengths, breadths)) * length / inside
 
 
-def _label(
+def _labeled_markers(
     frames: Sequence[StreamedFrame],
     hand: GloveFit,
     sides: Sequence[Side],
@@ -240,7 +244,7 @@ def _label(
     """Labeled markers [m] of each hand shown often enough, mirrored to a right hand, NaN where missing."""
     tracker = Tracker([hand.with_side(side) for side in sides], labeler, config=config)
     count = hand.layout.num_markers
-    found: list[list[NDArray[np.float64]]] = [[] for _ in sides]
+    found: list[list[Doubles]] = [[] for _ in sides]
     in_vain = 0
     for frame in frames:
         if in_vain == _PATIENCE and not any(found):
@@ -248,37 +252,35 @@ def _label(
         in_vain += _are_enough(frame, count)
         for seen, some in zip(tracker.step(frame.points, frame.ids, frame.time).hands, found, strict=True):
             if _is_shown(seen, count):
-                markers = seen.markers.copy()
-                markers[seen.filled] = np.nan
-                some.append(markers)
+                some.append(seen.seen_markers)
     return [
         spread_out(np.array(some), _PROPORTION_FRAMES) @ (MIRROR if side == "left" else np.eye(3))
         for side, some in zip(sides, found, strict=True)
-        if len(some) >= _FEWEST
+        if len(some) >= _FEWEST_FRAMES
     ]
 
 
 class _Search:
     """Search of the likeliest length and breadth of hands of mean proportions, given labeled markers."""
 
-    # Few markers fit hands of many sizes, so the distribution of people's sizes counts, too.
+    # The distribution of people's sizes counts, too, because few markers fit hands of many sizes.
 
     def __init__(self, markers: Sequence[Float[np.ndarray, "F M 3"]], start: GloveFit) -> None:
-        few = [spread_out(some, _FRAMES) for some in markers]
+        few = [spread_out(some, _SEARCH_FRAMES) for some in markers]
         seen = np.mean([np.isfinite(some[..., 0]).sum(axis=1).mean() for some in few])
-        self._evidence = _INDEPENDENT * float(seen) / _MARKER_SPREAD**2  # [1/m^2]
+        self._evidence = _INDEPENDENT_FRAMES * float(seen) / _MARKER_SPREAD**2  # [1/m^2]
         self._markers, self._layout = np.concatenate(few), start.layout
         self._poses = PoseSolver(start).solve(self._markers).qpos
 
     def length(self, breadth: Callable[[float], float], shortest: float, longest: float) -> float:
         """The likeliest length [m] in a range; `breadth` maps a length to a breadth [m]."""
-        return _least(lambda tried: self._cost(tried, breadth(tried)), shortest, longest)
+        return _minimize(lambda tried: self._cost(tried, breadth(tried)), shortest, longest)
 
     def measures(self, length: float) -> tuple[float, float]:
         """The likeliest length and breadth [m]."""
         usual = usual_breadth(length)
-        low, high = (factor * usual for factor in _BREADTHS)
-        breadth = _least(lambda tried: self._cost(length, tried), low, high)
+        low, high = (factor * usual for factor in _BREADTH_RANGE)
+        breadth = _minimize(lambda tried: self._cost(length, tried), low, high)
         return self.length(lambda tried: breadth, 0.95 * length, 1.05 * length), breadth
 
     def _cost(self, length: float, breadth: float) -> float:
@@ -289,11 +291,11 @@ class _Search:
         return 0.5 * (self._evidence * square + beyond**2 + broad**2)
 
 
-def _least(function: Callable[[float], float], low: float, high: float) -> float:
+def _minimize(function: Callable[[float], float], low: float, high: float) -> float:
     """The argument between two bounds [m] with the least value of a function."""
     from scipy.optimize import minimize_scalar
 
-    options = {"xatol": _PRECISION}
+    options = {"xatol": _SIZE_PRECISION}
     return float(minimize_scalar(function, bounds=(low, high), method="bounded", options=options).x)
 
 
@@ -315,10 +317,10 @@ def _first_proportions(seen: Float[np.ndarray, "F M 3"], start: GloveFit) -> tup
 def glove_shifts(
     seen: Float[np.ndarray, "F M 3"], worn: GloveFit
 ) -> tuple[Float[np.ndarray, "F"], Float[np.ndarray, "F"]]:
-    """How far a whole glove is along the bones from each frame on [m], and the same in standard deviations.
+    """Shift of a whole glove along the bones from each frame on, in [m] and in standard deviations.
 
-    Poses, proportions and places are fitted along with each shift, to first order: wrist and fingers follow a
-    glove that slips, but not where joints turn.
+    Poses, proportions and marker places are fitted with each shift, to first order, because wrist and fingers
+    follow a slipping glove except at their joints.
 
     Args:
         seen: Markers in some frames [m], NaN where missing.
@@ -331,13 +333,14 @@ def glove_shifts(
     equations = problem.normal_equations(estimate, fit, jacobians)
     reduced, solved = eliminate_poses(equations, 0.0)
     along = right.model.rest_transforms[right.attachment.main_bones, :3, 0]
-    way = np.concatenate([np.zeros(NUM_PARAMETERS), along.ravel()])
-    of_frames = np.einsum("fr,frs->fs", by_shared @ way, np.dstack([by_shared, residuals]))
-    of_frames -= np.einsum("fp,fps->fs", equations.mixed @ way, solved)
+    unit_shift = np.concatenate([np.zeros(NUM_PARAMETERS), along.ravel()])
+    of_frames = np.einsum("fr,frs->fs", by_shared @ unit_shift, np.dstack([by_shared, residuals]))
+    of_frames -= np.einsum("fp,fps->fs", equations.mixed @ unit_shift, solved)
     late = of_frames[::-1].cumsum(axis=0)[::-1]
-    left = late[:, :-1] @ np.linalg.inv(reduced[:, :-1])  # what the shared unknowns take of each shift
-    precision = np.maximum(late[:, :-1] @ way - (left * late[:, :-1]).sum(axis=1), _LEAST_PRECISION)
-    shifts = (left @ reduced[:, -1] - late[:, -1]) / precision
+    absorbed = late[:, :-1] @ np.linalg.inv(reduced[:, :-1])  # by the shared unknowns, of each shift
+    precision = late[:, :-1] @ unit_shift - (absorbed * late[:, :-1]).sum(axis=1)
+    precision = np.maximum(precision, _LEAST_PRECISION)
+    shifts = (absorbed @ reduced[:, -1] - late[:, -1]) / precision
     return shifts, shifts * np.sqrt(precision)
 
 
@@ -348,11 +351,12 @@ class _Fit(NamedTuple):
     found: dict[Side, int] = {}  # noqa: RUF012
     """Number of frames in which each hand is found."""
     shown: int = 0  # number of frames in which at least one hand is found
-    is_good: bool = False  # whether the fit is so good that no others are tried
-    is_whole: bool = False  # whether every marker is seen at times; otherwise the glove may have fewer
+    is_good: bool = False  # whether the fit is so good that no other glove is tried
+    # whether every marker is seen at times; otherwise the glove may have fewer markers
+    is_whole: bool = False
 
 
-class _Other(NamedTuple):
+class _RatedGlove(NamedTuple):
     """A glove or scale that may fit better."""
 
     name: str  # name of the glove, or path of its file
@@ -361,8 +365,8 @@ class _Other(NamedTuple):
     fit: _Fit
 
 
-class _AtOnce:
-    """`labeler_at_once`, made at the first use: rigid bodies alone never need it."""
+class _LazyLabeler:
+    """`labeler_at_once`, built at its first use, because rigid bodies alone never need it."""
 
     def __init__(self, layout: MarkerLayout) -> None:
         self._layout, self.marker_names = layout, layout.names
@@ -374,45 +378,44 @@ class _AtOnce:
 
 def check_scale(frames: Sequence[StreamedFrame], hands: Sequence[GloveFit], labeler: Labeler) -> None:
     """Refuse points at a wrong scale, recognized by the distances between neighbors."""
-    some = _compared(frames)
+    some = _compared_frames(frames)
     if not some:
         return
     found = float(np.median([spacing(frame.points) for frame in some]))
     factor = spacing(hands[0].attachment.points) / max(found, _LEAST_SPACING)
-    if 1.0 / _FAR_OFF < factor < _FAR_OFF:
+    if 1.0 / _MOST_SPACING_RATIO < factor < _MOST_SPACING_RATIO:
         return
     scale = min(_scales(), key=lambda one: abs(np.log(one / factor)))
     scaled = [dataclasses.replace(frame, points=scale * frame.points) for frame in some]
     fit = _measured_fit(scaled, designed_glove(hands[0].layout), labeler)
-    if fit.is_good and fit.log_odds > _MUCH_BETTER * _fit(some, hands, labeler).log_odds:
-        raise ArgumentError(_of_scale(1.0 / scale))
+    if fit.is_good and fit.log_odds > _SCALE_RATIO * _rate(some, hands, labeler).log_odds:
+        raise ArgumentError(_scale_message(1.0 / scale))
 
 
 def check_hands(
-    frames: Sequence[StreamedFrame],
-    hands: Sequence[GloveFit],
-    labeler: Labeler,
-    *,
-    options: Collection[str] = ("--hands", "--glove"),
+    frames: Sequence[StreamedFrame], hands: Sequence[GloveFit], labeler: Labeler, *, options: Collection[str]
 ) -> None:
-    """Warn of hands that fit badly if other hands fit clearly better; refuse a wrong unit."""
-    # Takes seconds if the fit is bad. Gloves of .toml files in the working folder are tried, too.
-    some = _compared(frames)
+    """Warn of hands that fit badly if other hands fit clearly better; refuse a wrong unit.
+
+    The warning names those remedies that are among the command's `options`.
+    """
+    # A bad fit takes seconds. Gloves of .toml files in the working folder are tried, too.
+    some = _compared_frames(frames)
     if not some:
         return
-    asked = _fit(some, hands, labeler)
+    asked = _rate(some, hands, labeler)
     if asked.is_good:
         return
     glove = designed_glove(hands[0].layout)
-    others = _others(some, glove, labeler)  # A glove of few markers fits anything somehow.
+    others = _rate_gloves(some, glove, labeler)  # A glove of few markers fits anything somehow.
     likely = [other for other in others if other.layout == glove or other.fit.is_good]
     best = max(likely, key=lambda other: other.fit.log_odds)
-    fit, factor = best.fit, _BETTER if best.scale == 1.0 else _MUCH_BETTER
-    if fit.shown < _LEAST_FOUND * len(some) or fit.log_odds <= factor * asked.log_odds:
+    fit, factor = best.fit, _GLOVE_RATIO if best.scale == 1.0 else _SCALE_RATIO
+    if fit.shown < _SUGGESTED_SHARE * len(some) or fit.log_odds <= factor * asked.log_odds:
         return
     if best.scale != 1.0:
-        raise ArgumentError(_of_scale(1.0 / best.scale))
-    there = [side for side, count in fit.found.items() if count >= _LEAST_FOUND * fit.shown]
+        raise ArgumentError(_scale_message(1.0 / best.scale))
+    there = [side for side, count in fit.found.items() if count >= _SUGGESTED_SHARE * fit.shown]
     remedy = [] if set(there) <= {hand.side for hand in hands} else [f"--hands {' '.join(there)}"]
     named = "two hands" if len(there) == 2 else f"a {there[0]} hand"
     if best.layout != glove:
@@ -426,38 +429,38 @@ def check_hands(
         warnings.warn(f"the points fit {named} better ({shares}); {how}", HandSimWarning, stacklevel=3)
 
 
-def _compared(frames: Sequence[StreamedFrame]) -> list[StreamedFrame]:
+def _compared_frames(frames: Sequence[StreamedFrame]) -> list[StreamedFrame]:
     """Frames in which hands are compared; none if there are too few."""
     shown = [frame for frame in frames if len(frame.points) >= MIN_MARKERS]
-    half = max(_PART, len(shown) // (2 * _PART) * _PART)
-    some = [*shown[:_PART], *shown[half : half + _PART]]
-    return some if len(some) >= _LEAST_FRAMES else []
+    half = max(_COMPARED_PART, len(shown) // (2 * _COMPARED_PART) * _COMPARED_PART)
+    some = [*shown[:_COMPARED_PART], *shown[half : half + _COMPARED_PART]]
+    return some if len(some) >= _FEWEST_COMPARED else []
 
 
-def _others(frames: Sequence[StreamedFrame], glove: MarkerLayout, labeler: Labeler) -> list[_Other]:
+def _rate_gloves(frames: Sequence[StreamedFrame], glove: MarkerLayout, labeler: Labeler) -> list[_RatedGlove]:
     """Fits of both hands in the given glove, in other gloves, and at other scales."""
-    others = [_Other(glove.name, glove, 1.0, _measured_fit(frames, glove, labeler))]
+    others = [_RatedGlove(glove.name, glove, 1.0, _measured_fit(frames, glove, labeler))]
     if others[0].fit.is_good:
         return others
-    for name, layout in _gloves():
+    for name, layout in _known_gloves():
         if layout != glove:
-            others.append(_Other(name, layout, 1.0, _measured_fit(frames, layout, _AtOnce(layout))))
+            others.append(_RatedGlove(name, layout, 1.0, _measured_fit(frames, layout, _LazyLabeler(layout))))
         if others[-1].fit.is_good and others[-1].fit.is_whole:
             return others
-    if max(other.fit.shown for other in others) < _LEAST_FOUND * len(frames):
+    if max(other.fit.shown for other in others) < _SUGGESTED_SHARE * len(frames):
         for scale in _scales():
             scaled = [dataclasses.replace(frame, points=scale * frame.points) for frame in frames]
-            others.append(_Other(glove.name, glove, scale, _measured_fit(scaled, glove, labeler)))
+            others.append(_RatedGlove(glove.name, glove, scale, _measured_fit(scaled, glove, labeler)))
     return others
 
 
 def _measured_fit(frames: Sequence[StreamedFrame], layout: MarkerLayout, labeler: Labeler) -> _Fit:
     """Measure the hands of a glove in some frames, and rate their fit."""
     size = fit_size(frames, layout, layout.sides, labeler, is_quick=True)
-    return _Fit() if size is None else _fit(frames, size.hands(layout.sides), labeler)
+    return _Fit() if size is None else _rate(frames, size.hands(layout.sides), labeler)
 
 
-def _fit(frames: Sequence[StreamedFrame], hands: Sequence[GloveFit], labeler: Labeler) -> _Fit:
+def _rate(frames: Sequence[StreamedFrame], hands: Sequence[GloveFit], labeler: Labeler) -> _Fit:
     """Rate the fit of hands to some frames."""
     tracker, markers = Tracker(hands, labeler), hands[0].layout.num_markers
     score = HandInitializer([HandState(hands[0])], labeler).score
@@ -476,31 +479,31 @@ def _fit(frames: Sequence[StreamedFrame], hands: Sequence[GloveFit], labeler: La
             unseen[hand.side] &= {int(marker) for marker in hand.filled}
             near.append(int((distances_to_nearest(free, hand.markers) < AT_HAND).sum()))
             odds = score(markers - missing[-1], hand.rms)
-            log_odds += max(0.0, odds - _PENALTY * (missing[-1] + near[-1]))
+            log_odds += max(0.0, odds - _UNEXPLAINED_PENALTY * (missing[-1] + near[-1]))
     gone = [unseen[side] for side, times in found.items() if times]
     lost = max((_lost_digit(hands[0], one) for one in gone), key=len, default=set[int]())
     is_whole = not any(one - lost for one in gone)
     is_good = (
-        count >= _FOUND * len(frames)
+        count >= _GOOD_FOUND_SHARE * len(frames)
         and float(np.median(rms)) <= _MOST_RMS
         and float(np.mean(missing)) - len(lost) <= (_MOST_HIDDEN if is_whole else _MOST_MISSING) * markers
-        and float(np.mean(near)) <= max(_MOST_NEAR * markers, _FEW_NEAR)
+        and float(np.mean(near)) <= max(_MOST_NEAR * markers, _FEW_NEAR_POINTS)
     )
     return _Fit(log_odds / len(frames), found, count, is_good, is_whole)
 
 
 def _lost_digit(hand: GloveFit, unseen: set[int]) -> set[int]:
-    """The markers of a digit if none of them is ever seen, as of a finger that is missing; empty else."""
+    """The markers of a digit of which none is ever seen, as of a missing finger; empty if there is none."""
     digits = hand.attachment.digits
     own = [set(np.flatnonzero(digits == digit).tolist()) for digit in range(len(DIGITS))]
     lost = [markers for markers in own if markers and markers <= unseen]
     return lost[0] if len(lost) == 1 else set()
 
 
-def _gloves() -> list[tuple[str, MarkerLayout]]:
+def _known_gloves() -> list[tuple[str, MarkerLayout]]:
     """Shipped gloves and those of the working folder with their names or paths, most markers first."""
     found = [(name, load_layout(name)) for name in list_layouts()]
-    for path in sorted(Path().glob("*.toml"))[:_MOST_OWN]:
+    for path in sorted(Path().glob("*.toml"))[:_MOST_FOLDER_GLOVES]:
         with contextlib.suppress(HandSimError):  # a file of another kind, or a glove that no hand wears
             layout = load_layout(path)
             check_layout(layout)
@@ -510,18 +513,14 @@ def _gloves() -> list[tuple[str, MarkerLayout]]:
 
 def _scales() -> list[float]:
     """Factors that correct a mistaken unit of length or wand length."""
-    pairs = {_UNITS[true] / _UNITS[read] for read in _READ for true in _UNITS if true != read}
-    return [*sorted(pairs), *_WANDS]
+    pairs = {_UNITS[true] / _UNITS[read] for read in _STATED_UNITS for true in _UNITS if true != read}
+    return [*sorted(pairs), *_WAND_SCALES]
 
 
-def _of_scale(times: float) -> str:
+def _scale_message(times: float) -> str:
     """The message that points fit hands at `times` their size."""
-    units = [
-        f"in {true}, read as {read}"
-        for read in _READ
-        for true in _UNITS
-        if np.isclose(_UNITS[true] / _UNITS[read] * times, 1.0)
-    ]
+    pairs = ((true, read) for read in _STATED_UNITS for true in _UNITS)
+    units = [f"in {t}, read as {r}" for t, r in pairs if np.isclose(_UNITS[t] / _UNITS[r] * times, 1.0)]
     cause = f"the file is probably {' or '.join(units)}" if units else "had the calibration wand its length?"
     return (
         f"the points fit hands at {times:.3g} of their size: {cause}; correct the unit that the file states, "

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Final, Self, get_args
 
-from gloves.fit import GloveFit, mean_hand
+from gloves.fit import GloveFit
 from gloves.layout import layout_checksum, list_layouts, load_layout
 from handsim._checks import check_choice, check_number, check_type, shown_value
 from handsim._version import provenance
@@ -20,7 +20,7 @@ from track.config import SizeChoice, TrackerConfig
 from track.frames import StreamedFrame
 from track.hand_size import check_hands, check_scale, measured_user
 from track.tracker import Tracker
-from track.user import AnyGlove, AnyLabeler, User, as_user, labeler_of, nominal_user
+from track.user import AnyGlove, AnyLabeler, User, as_user, hand_like, labeler_of, nominal_user
 from train.labelers.protocol import Labeler
 
 AnyHands = User | Sequence[GloveFit] | Sequence[Side] | str | Path
@@ -28,8 +28,9 @@ AnyHands = User | Sequence[GloveFit] | Sequence[Side] | str | Path
 USUAL_GLOVE: Final = "dense19"
 USUAL_SIZE: Final = "M"
 """Size of hands that could not be measured."""
-_HANDS: Final = "a User, GloveFits, the path of a user's file, or sides"
-_SHOWN: Final = 0.8  # A frame can measure a hand if it has points for this share of its markers.
+_ANY_HANDS: Final = "a User, GloveFits, the path of a user's file, or sides"
+# A frame is used to measure hands if it has points for this share of a hand's markers.
+_LEAST_POINT_SHARE: Final = 0.8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -99,12 +100,12 @@ class TrackSettings(LabelSettings):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrackerSetup:
-    """Everything that a tracker needs, as objects."""
+    """All that a tracker needs, as objects."""
 
     user: User
     """The hands; of the usual size until they are measured."""
     is_auto: bool
-    """Whether the hands are to be measured in the capture or stream."""
+    """Whether the hands must be measured in the capture or stream."""
     labeler: Labeler
     """Labeler of their glove."""
     bodies: tuple[RigidTemplate, ...]
@@ -118,33 +119,30 @@ class TrackerSetup:
         user, is_auto = _chosen_user(settings)
         tracking = settings if isinstance(settings, TrackSettings) else TrackSettings()
         bodies, config = load_bodies(tracking.bodies), tracking.tracker
-        # The layout of given hands may have slipped, and then has no labeler. That of a named glove has one.
+        # Given hands may wear a slipped layout, which has no labeler; a named glove has one.
         glove = user.layout if settings.glove is None else load_layout(settings.glove)
         labeler, record = labeler_of(glove, settings.labeler), settings.record()
         record |= {"glove": record["glove"] or user.layout.name, "user": user.notes or str(user)}
         record["hands"] = record["hands"] or list(user.sides)
-        named = record["glove"]  # that of hands or a layout given as objects may have no file
-        sums = {"user_sha256": user.checksum, "glove_sha256": layout_checksum(named)}
+        # The glove of objects may have no file, and then it has no checksum.
+        sums = {"user_sha256": user.checksum, "glove_sha256": layout_checksum(record["glove"])}
         record |= provenance() | {key: value for key, value in sums.items() if value}
         return cls(user, is_auto, labeler, bodies, config, record)
 
     @property
     def fewest_points(self) -> float:
         """Number of points of a frame from which hands can be measured."""
-        return _SHOWN * self.user.layout.num_markers
+        return _LEAST_POINT_SHARE * self.user.layout.num_markers
 
     @property
     def start(self) -> tuple[GloveFit, ...]:
-        """The hands that a calibration begins with: in place of measured ones those of mean proportions.
+        """The hands that a calibration begins with: measured ones are replaced by hands of mean proportions.
 
-        Their proportions were measured in the same motion with the prior of people, which would count twice.
+        Their measured proportions contain the prior of people, which would count twice.
         """
         if not self.is_auto:
             return self.user.hands
-        shapes = ((hand.shape.length, hand.shape.breadth, hand.layout) for hand in self.user)
-        return tuple(
-            mean_hand(*shape).with_side(side) for shape, side in zip(shapes, self.user.sides, strict=True)
-        )
+        return tuple(hand_like(hand).with_side(hand.side) for hand in self.user)
 
     def measured(self, frames: Sequence[StreamedFrame], *, warns: bool = True) -> TrackerSetup:
         """Measure the hands in some frames, if their size is automatic, and check that they fit."""
@@ -153,10 +151,12 @@ class TrackerSetup:
         if self.is_auto:
             user = measured_user(frames, user, self.labeler, warns=warns)
         check_hands(frames, user, self.labeler, options=("--hands", "--glove") if is_named else ())
-        return self.with_user(user) if self.is_auto else self
+        return self.with_user(user, user) if self.is_auto else self
 
-    def with_user(self, user: User) -> TrackerSetup:
-        """The setup with other hands."""
+    def with_user(self, user: User, hands: Iterable[GloveFit]) -> TrackerSetup:
+        """The setup with another user: with these hands, and its own hands of other sides."""
+        by_side = {hand.side: hand for hand in (*self.user, *hands)}
+        user = dataclasses.replace(user, hands=tuple(by_side.values()))
         return dataclasses.replace(self, user=user, settings={**self.settings, "user": user.notes})
 
     def tracker(self) -> Tracker:
@@ -165,15 +165,15 @@ class TrackerSetup:
 
 
 def _chosen_user(settings: LabelSettings) -> tuple[User, bool]:
-    """The hands that the settings describe, and whether they are to be measured."""
+    """The hands that the settings describe, and whether they must be measured."""
     hands = settings.hands
     layout = None if settings.glove is None else load_layout(settings.glove)
-    check_type("hands", hands, (Sequence, Path, type(None)), _HANDS)
+    check_type("hands", hands, (Sequence, Path, type(None)), _ANY_HANDS)
     if isinstance(hands, str) and hands in SIDES:
         hands = (hands,)
     if isinstance(hands, str) and not hands.endswith(".json") and not Path(hands).is_file():
         names = ", ".join(SIDES)
-        raise ArgumentError(f"hands is {shown_value(hands)}, expected {_HANDS}; valid names: {names}")
+        raise ArgumentError(f"hands is {shown_value(hands)}, expected {_ANY_HANDS}; valid names: {names}")
     if isinstance(hands, str | Path | User) or any(isinstance(hand, GloveFit) for hand in hands or ()):
         user = as_user(hands)  # type: ignore[arg-type]  # no sides are left
         if settings.size != "auto":

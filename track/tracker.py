@@ -14,12 +14,12 @@ from typing import Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from numpy.typing import NDArray
 
 from gloves.fit import GloveFit
 from gloves.takes.points import Status
 from handsim._checks import shown_value
 from handsim._process import with_own_numerics
+from handsim.arrays import Integers
 from handsim.errors import ArgumentError
 from handsim.hand.shape import NUM_QPOS
 from handsim.kernels import kernel, squared_distance
@@ -62,6 +62,9 @@ class _Outcome(NamedTuple):
     """RMS distance of the labeled markers from the pose's, biases included [m]; NaN without a fit."""
 
 
+_Outcomes = tuple[_Outcome, ...]
+
+
 class Tracker:
     """Tracks the user's hands, and rigid bodies with markers, from frame to frame.
 
@@ -97,10 +100,7 @@ class Tracker:
         self._bodies = [BodyTracker(body) for body in self.bodies]
         self._states = [
             HandState(
-                hand,
-                config,
-                origin=self.user.origin(hand.side),
-                errors=self.user.errors.get(hand.side),
+                hand, config, origin=self.user.origin(hand.side), errors=self.user.errors.get(hand.side)
             )
             for hand in self.hands
         ]
@@ -169,11 +169,8 @@ class Tracker:
         incoming = self._intake.check_frame(points, ids, time)
         bodies, labels = self._track_bodies(incoming)
         free = labels < 0
-        predictions = {
-            hand: state.predict(incoming.time)
-            for hand, state in enumerate(self._states)
-            if state.qpos is not None
-        }
+        posed = ((hand, state) for hand, state in enumerate(self._states) if state.qpos is not None)
+        predictions = {hand: state.predict(incoming.time) for hand, state in posed}
         expected = self._marker_positions(predictions)
         carried = self._history.carry(incoming.points[free], incoming.ids[free], incoming.time, expected)
         followed = self._give_up_old_poses(carried)
@@ -197,7 +194,7 @@ class Tracker:
             float(incoming.stamp), hands, all_labels, all_confidence, bodies, incoming.notes, seconds
         )
 
-    def _track_bodies(self, incoming: IncomingFrame) -> tuple[tuple[TrackedBody, ...], NDArray[np.int64]]:
+    def _track_bodies(self, incoming: IncomingFrame) -> tuple[tuple[TrackedBody, ...], Integers]:
         """Track every body; return also the labels (P,) of their points."""
         labels, bodies = np.full(len(incoming.points), -1), []
         for owner, tracker in enumerate(self._bodies, start=len(self._states)):
@@ -255,9 +252,7 @@ class Tracker:
         """Whether a pose is too old for further prediction."""
         return time - state.time > self.config.longest_coast
 
-    def _update(
-        self, frame: FrameState, tracks: Sequence[HandTrack]
-    ) -> tuple[FrameState, tuple[_Outcome, ...]]:
+    def _update(self, frame: FrameState, tracks: Sequence[HandTrack]) -> tuple[FrameState, _Outcomes]:
         """Accept or reject the hands' estimates, and update the evidence of their labels."""
         estimates, outcomes = {track.hand: track.estimate for track in tracks}, []
         evidence = frame.evidence.copy()
@@ -278,13 +273,9 @@ class Tracker:
             outcomes.append(_Outcome(Status.LOST if state.qpos is None else Status.COASTING))
         return frame._replace(evidence=evidence), tuple(outcomes)
 
-    def _initialize_lost(
-        self, frame: FrameState, outcomes: tuple[_Outcome, ...]
-    ) -> tuple[FrameState, tuple[_Outcome, ...]]:
+    def _initialize_lost(self, frame: FrameState, outcomes: _Outcomes) -> tuple[FrameState, _Outcomes]:
         """Initialize hands without a pose from the points left by the others."""
-        lost = tuple(
-            hand for hand, one in enumerate(outcomes) if one.status in (Status.LOST, Status.COASTING)
-        )
+        lost = tuple(hand for hand, one in enumerate(outcomes) if one.status < Status.INITIALIZED)
         if not lost:
             return frame, outcomes
         free = frame.free_for(lost)
@@ -301,9 +292,7 @@ class Tracker:
         self._last_attempt, self._attempt_points = frame.time, len(free)
         return frame, outcomes
 
-    def _replace_doubted(
-        self, frame: FrameState, outcomes: tuple[_Outcome, ...]
-    ) -> tuple[FrameState, tuple[_Outcome, ...]]:
+    def _replace_doubted(self, frame: FrameState, outcomes: _Outcomes) -> tuple[FrameState, _Outcomes]:
         """Initialize a hand again if it lacks most labels, or fits badly, and has unlabeled points around it.
 
         Otherwise a track could hold on to a wrong pose by a few points.
@@ -330,12 +319,8 @@ class Tracker:
         return frame, outcomes
 
     def _start(
-        self,
-        frame: FrameState,
-        outcomes: tuple[_Outcome, ...],
-        found: InitializedHand,
-        among: NDArray[np.int64],
-    ) -> tuple[FrameState, tuple[_Outcome, ...]]:
+        self, frame: FrameState, outcomes: _Outcomes, found: InitializedHand, among: Integers
+    ) -> tuple[FrameState, _Outcomes]:
         """Start a track from an initialized hand."""
         state, markers = self._states[found.index], np.full(len(frame.points), -1)
         markers[among] = found.labels
@@ -367,9 +352,7 @@ def _weigh_labels(
     return settled
 
 
-def _tracked_hand(
-    state: HandState, outcome: _Outcome, frame: FrameState, own: NDArray[np.int64]
-) -> TrackedHand:
+def _tracked_hand(state: HandState, outcome: _Outcome, frame: FrameState, own: Integers) -> TrackedHand:
     """Output for a hand: its labeled points, and the pose's markers where points are missing."""
     count, side = state.num_markers, state.hand.side
     if state.qpos is None:

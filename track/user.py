@@ -11,7 +11,7 @@ from typing import Any, Final, cast, get_args, overload
 
 import numpy as np
 
-from gloves.fit import Attachment, GloveFit, nominal_fit
+from gloves.fit import Attachment, GloveFit, mean_hand, nominal_fit
 from gloves.hand_files import write_hand
 from gloves.layout import MarkerLayout, list_layouts, load_layout, stored_layout
 from handsim._checks import check_choice, check_type, shown_value
@@ -22,7 +22,7 @@ from handsim.hand.model import HandModel
 from handsim.hand.shape import SIDES, HandShape, Side
 from track.calibration.user_calibration import Calibration
 from track.config import HandOrigin, SizeChoice
-from track.kinematics.pose_spread import NUM_NUMBERS, HandErrors
+from track.kinematics.pose_spread import SKELETON_NUMBERS, HandErrors
 from train.labelers.protocol import Labeler
 from train.labelers.storage import load_labeler
 
@@ -34,7 +34,7 @@ MEASURED: Final = "auto, "
 """Prefix of the notes on measured hands; the size follows."""
 AS_MEASURED: Final = ", as measured"
 """Suffix of a calibration's sentence on a hand that stayed as measured."""
-_ARRAYS: Final = {"points": "f8", "normals": "f8", "bone_indices": None, "bone_weights": "f8"}
+ATTACHMENT_ARRAYS: Final = {"points": "f8", "normals": "f8", "bone_indices": None, "bone_weights": "f8"}
 """Stored arrays of an attachment and their types; None keeps the type, so that fractional indices fail."""
 
 
@@ -95,8 +95,7 @@ class User(Sequence[GloveFit]):
 
     def __str__(self) -> str:
         """Length and breadth of the hands [mm]; one pair if both are alike."""
-        sizes = [f"{1e3 * one.shape.length:.0f} x {1e3 * one.shape.breadth:.0f} mm" for one in self.hands]
-        return " and ".join(dict.fromkeys(sizes))
+        return " and ".join(dict.fromkeys(map(size_words, self.hands)))
 
     @overload
     def __getitem__(self, index: int) -> GloveFit: ...
@@ -170,6 +169,16 @@ class User(Sequence[GloveFit]):
             write_text(path, json.dumps(content, indent=1, ensure_ascii=False) + "\n")
 
 
+def size_words(hand: GloveFit) -> str:
+    """Length and breadth of a hand in millimeters, in words."""
+    return f"{1e3 * hand.shape.length:.0f} x {1e3 * hand.shape.breadth:.0f} mm"
+
+
+def hand_like(hand: GloveFit) -> GloveFit:
+    """A right hand of the same length and breadth, of mean proportions in the glove as designed."""
+    return mean_hand(hand.shape.length, hand.shape.breadth, hand.layout)
+
+
 def hand_origin(notes: str, side: Side) -> HandOrigin:
     """Origin of the hand of a side, from the notes of its user.
 
@@ -178,19 +187,19 @@ def hand_origin(notes: str, side: Side) -> HandOrigin:
     size = _size_of(notes)
     if size.removeprefix(MEASURED) in get_args(SizeChoice):
         return "named"
-    left = any(told.startswith(f"{side} hand: ") for told in _left_as_measured(notes))
+    left = any(sentence.startswith(f"{side} hand: ") for sentence in _left_as_measured(notes))
     return "measured" if left or size else "calibrated"
 
 
 def _size_of(notes: str) -> str:
-    """What the notes begin with if it is the size of hands, named or measured; otherwise empty."""
+    """The size with which the notes begin, named or measured; empty if they begin with something else."""
     first = notes.split("; ", maxsplit=1)[0]
     return first if first.startswith(MEASURED) or first in get_args(SizeChoice) else ""
 
 
 def _left_as_measured(notes: str) -> list[str]:
     """Sentences of the notes on hands that stayed as measured."""
-    return [told for told in notes.split("; ") if told.endswith(AS_MEASURED)]
+    return [sentence for sentence in notes.split("; ") if sentence.endswith(AS_MEASURED)]
 
 
 def nominal_user(layout: MarkerLayout, size: str, sides: str | Sequence[str] | None) -> User:
@@ -203,9 +212,9 @@ def nominal_user(layout: MarkerLayout, size: str, sides: str | Sequence[str] | N
 
 
 def as_user(hands: User | Sequence[GloveFit] | str | Path) -> User:
-    """Make a user of hands, a user's file, or a user.
+    """Make a user of hands or of a user's file; return a user as it is.
 
-    The notes of a file's user are its name and where the hands are from.
+    The notes of a file's user are the file's name and the origin of the hands.
     """
     if isinstance(hands, str | Path):
         user = load_user(hands)
@@ -246,7 +255,7 @@ def load_user(path: str | Path) -> User:
         errors = read_errors(content.get("errors", {}), hands)
         return User(hands, str(content.get("notes", "")), errors=errors, checksum=checksum(path))
     except DAMAGE as error:
-        raise UserError(f"{path}: a damaged user's file: {_reason(error)}") from error
+        raise UserError(f"{path}: a damaged user's file: {_damage_words(error)}") from error
 
 
 def stored_errors(user: User) -> dict[Side, dict[str, Any]]:
@@ -265,15 +274,15 @@ def read_errors(stored: Any, hands: Sequence[GloveFit]) -> dict[Side, HandErrors
         if hand.side in stored:
             mine = stored[hand.side]
             values = [1e-6 * np.array(mine[name], dtype=np.float64) for name in HandErrors._fields]
-            count = max(values[0].size // NUM_NUMBERS, 1)
-            shapes = [(NUM_NUMBERS, count), (hand.layout.num_markers, 3, count)]
+            count = max(values[0].size // SKELETON_NUMBERS, 1)
+            shapes = [(SKELETON_NUMBERS, count), (hand.layout.num_markers, 3, count)]
             if [one.shape for one in values] != shapes or not all((abs(one) <= 1.0).all() for one in values):
                 raise ValueError(f"errors of the {hand.side} hand are not small numbers")
             errors[hand.side] = HandErrors(*values)
     return errors
 
 
-def _reason(error: Exception) -> str:
+def _damage_words(error: Exception) -> str:
     if isinstance(error, KeyError):
         return f"the key {error} is missing"
     if isinstance(error, TypeError | AttributeError | OverflowError):  # rather than Python's message
@@ -286,7 +295,7 @@ def _to_json(hand: GloveFit) -> dict[str, Any]:
     values = {name: np.asarray(value).tolist() for name, value in shape.items()}
     if not hand.model.shape.arch.any():  # as files without an arch have it
         del values["arch"]
-    markers = {name: np.asarray(getattr(hand.attachment, name)).tolist() for name in _ARRAYS}
+    markers = {name: np.asarray(getattr(hand.attachment, name)).tolist() for name in ATTACHMENT_ARRAYS}
     return {"shape": values, "markers": markers}
 
 
@@ -299,7 +308,7 @@ def _from_json(stored: dict[str, Any], layout: MarkerLayout) -> GloveFit:
         name: np.asarray(value, dtype=np.float64) if isinstance(value, list) else value
         for name, value in shape.items()
     }
-    markers = {name: np.asarray(stored["markers"][name], dtype) for name, dtype in _ARRAYS.items()}
+    markers = {name: np.asarray(stored["markers"][name], dtype) for name, dtype in ATTACHMENT_ARRAYS.items()}
     return GloveFit(HandModel(HandShape(**values)), Attachment(layout, **markers))
 
 
@@ -309,9 +318,9 @@ def labeler_of(worn: MarkerLayout, labeler: AnyLabeler) -> Labeler:
 
 
 def designed_glove(worn: MarkerLayout) -> MarkerLayout:
-    """The shipped layout of a worn glove, whose markers may have slipped: labelers know the shipped one."""
+    """The shipped layout of a worn, perhaps slipped glove, because labelers know that layout."""
     if worn.name not in list_layouts():
         return worn
     designed = load_layout(worn.name)
-    places, own = ([(one.name, one.bone) for one in glove.markers] for glove in (designed, worn))
-    return designed if places == own else worn
+    bones = [[(marker.name, marker.bone) for marker in glove.markers] for glove in (designed, worn)]
+    return designed if bones[0] == bones[1] else worn

@@ -130,9 +130,8 @@ def learn_glove(
     source = f"handsim glove learn, {date.today()}, from {', '.join(names[number] for number in used)}"
     layout.save(out, description=origin(learned), source=source)
     print_table(marker_rows(learned), left=2, title=f"{layout.name}: {layout.num_markers} markers")
-    for hand in hand_rows(learned, names):
-        size = f"{hand.length} x {hand.breadth} mm"
-        print_line(f"{hand.capture}: a {hand.side} hand of {size} with {hand.markers} markers")
+    for name, side, count, length, breadth in hand_rows(learned, names)[1:]:
+        print_line(f"{name}: a {side} hand of {length} x {breadth} mm with {count} markers")
     print_line(*learned.left_out, *learned.doubt)
     write_learned_page(page, learned, names)
     print_line(f"{page}: the markers on the hand")

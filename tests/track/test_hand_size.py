@@ -214,7 +214,7 @@ def test_an_own_glove_in_the_working_folder_is_named(capture, tmp_path, monkeypa
 )
 def test_another_unit_is_named(scale, said, monkeypatch):
     few = [(name, load_layout(name)) for name in ("sparse13", "tips8")]  # of all that are shipped
-    monkeypatch.setattr(hand_size, "_gloves", lambda: few)
+    monkeypatch.setattr(hand_size, "_known_gloves", lambda: few)
     both = simulate_take("single-hand", num_frames=20).capture()
     with pytest.raises(ArgumentError, match=said):
         track_capture(dataclasses.replace(both, positions=scale * both.positions))

@@ -20,7 +20,7 @@ from handsim.errors import ArgumentError
 from handsim.hand.shape import JOINT_NAMES
 from tests.sentences import error_names
 from track import TrackedFrame, Tracker, TrackerConfig, User
-from track.kinematics.pose_spread import NUM_NUMBERS, HandErrors
+from track.kinematics.pose_spread import SKELETON_NUMBERS, HandErrors
 from train import Labeler, load_labeler, simulate_take
 
 NUM_MARKERS = 38
@@ -630,7 +630,7 @@ def test_the_same_motion_again_and_again_is_tracked_as_before(labeler):
 
 def test_the_same_hands_again_keep_their_standard_deviations(take, users, labeler):
     rng = np.random.default_rng(4)
-    errors = HandErrors(0.01 * rng.normal(size=(NUM_NUMBERS, 3)), 0.001 * rng.normal(size=(19, 3, 3)))
+    errors = HandErrors(0.01 * rng.normal(size=(SKELETON_NUMBERS, 3)), 0.001 * rng.normal(size=(19, 3, 3)))
     user = User(tuple(users), errors={hand.side: errors for hand in users})
     plain_tracker, resized = Tracker(user, labeler), Tracker(user, labeler)
     resized.resize(user)

@@ -20,7 +20,7 @@ from handsim.errors import ArgumentError
 from handsim.hand.shape import SIDES
 from tests.sentences import error_names
 from track import User, load_user
-from track.kinematics.pose_spread import NUM_NUMBERS, HandErrors
+from track.kinematics.pose_spread import SKELETON_NUMBERS, HandErrors
 from track.user import AS_MEASURED, MEASURED, UserError, as_user
 
 
@@ -39,7 +39,7 @@ def hands(rng):
 def errors_of_somebody():
     """Three independent errors of a hand of a millimeter or a degree."""
     rng = np.random.default_rng(3)
-    return HandErrors(0.01 * rng.normal(size=(NUM_NUMBERS, 3)), 0.001 * rng.normal(size=(19, 3, 3)))
+    return HandErrors(0.01 * rng.normal(size=(SKELETON_NUMBERS, 3)), 0.001 * rng.normal(size=(19, 3, 3)))
 
 
 def test_errors_of_calibrated_hands_come_back(hands, tmp_path):

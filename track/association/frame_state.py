@@ -11,8 +11,8 @@ from typing import Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from numpy.typing import NDArray
 
+from handsim.arrays import Doubles, Flags, Integers
 from handsim.kernels import kernel
 from handsim.space.transforms import rigid_fit
 from train.labelers.matching import assign
@@ -77,9 +77,7 @@ class FrameState(NamedTuple):
         """Replace a hand's labels."""
         return self._replace(labels=self.numbering.with_markers(hand, markers, self.labels))
 
-    def with_confidence(
-        self, changed: Bool[np.ndarray, "P"], confidence: Float[np.ndarray, "C"]
-    ) -> FrameState:
+    def with_confidence(self, changed: Flags | Integers, confidence: Doubles) -> FrameState:
         """Give C changed labels no evidence, and a confidence from 0 to 1."""
         evidence, all_confidence = self.evidence.copy(), self.confidence.copy()
         evidence[changed], all_confidence[changed] = 0.0, confidence
@@ -142,7 +140,7 @@ class PointHistory:
         self._evidence: dict[int, float] = {}  # log-odds of these labels
         self._first_seen: dict[int, float] = {}  # [s] by point number
         # Points without a label, by number: the time since which each has none [s], and its place [m].
-        self._free: dict[int, tuple[float, NDArray[np.float64]]] = {}
+        self._free: dict[int, tuple[float, Doubles]] = {}
         self._last_time = -np.inf  # [s] of the last frame
 
     def carry(
@@ -216,9 +214,7 @@ class PointLinker:
         self._last, self._points = known, points
         return known
 
-    def _link(
-        self, points: NDArray[np.float64], labels: Mapping[int, int], expected: NDArray[np.float64]
-    ) -> NDArray[np.int64]:
+    def _link(self, points: Doubles, labels: Mapping[int, int], expected: Doubles) -> Integers:
         """Match points with those of the last frame by position; their numbers, -1 for new points."""
         predicted, hands = self._points.copy(), np.full(len(self._last), -1)
         for row, number in enumerate(self._last.tolist()):
@@ -239,7 +235,7 @@ class PointLinker:
         found[rows] = self._last[columns]
         return found
 
-    def _beside(self, hands: NDArray[np.int64]) -> Int[np.ndarray, "Q"]:
+    def _beside(self, hands: Integers) -> Int[np.ndarray, "Q"]:
         """The hand that each unlabeled point of the last frame is near, and moves with; -1 for none."""
         beside, loose, held = np.full(len(hands), -1), np.flatnonzero(hands < 0), np.flatnonzero(hands >= 0)
         if len(loose) and len(held):
@@ -249,9 +245,7 @@ class PointLinker:
         return beside
 
 
-def _assign(
-    points: NDArray[np.float64], predicted: NDArray[np.float64], distance: float
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _assign(points: Doubles, predicted: Doubles, distance: float) -> tuple[Integers, Integers]:
     """Match points with predicted points within a distance [m]; indices of both."""
     squares = ((points[:, None] - predicted) ** 2).sum(axis=-1)
     _, labels = assign(squares, np.full(len(points), distance**2))
@@ -291,9 +285,7 @@ def peak_log_odds(variances: Float[np.ndarray, "K"], stray_density: float) -> Fl
     return np.asarray(-1.5 * np.log(variances) - _stray_log_density(stray_density))
 
 
-def match_points(
-    log_odds: Float[np.ndarray, "P K"],
-) -> tuple[Int[np.ndarray, "P"], Float[np.ndarray, "P"]]:
+def match_points(log_odds: Float[np.ndarray, "P K"]) -> tuple[Int[np.ndarray, "P"], Float[np.ndarray, "P"]]:
     """The likeliest one-to-one assignment of points to markers, -1 for none, and its confidence (0 to 1)."""
     _, labels = assign(-log_odds, np.zeros(len(log_odds)))
     if 0 in log_odds.shape:

@@ -13,9 +13,9 @@ from typing import Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from numpy.typing import NDArray
 
 from gloves.fit import GloveFit
+from handsim.arrays import Doubles
 from handsim.hand.shape import DIGITS, NUM_JOINTS
 from handsim.kernels import kernel, move, velocity_of
 from track.association.digit_hypotheses import DigitModel, digit_ranges
@@ -117,7 +117,7 @@ class HandState:
         self.config = config
         self.solver = PoseSolver(hand)
         """Solver of its poses, whose markers are shifted by their biases."""
-        self.qpos: NDArray[np.float64] | None = None
+        self.qpos: Doubles | None = None
         """Pose of the last frame with one; None if the hand is lost."""
         self.time = 0.0
         """Time of that pose [s]."""
@@ -158,9 +158,7 @@ class HandState:
         slip = _LEFT_OUT_SPREAD * min((time - self._started) / _LEFT_OUT_TIME, 1.0)
         doubt[self._left_out & (self._bias_frames == 0.0)] = max(self._typical_bias, slip)
         self.variance = self._learned_variance + doubt**2
-        moved: NDArray[np.float64] = move(
-            self.qpos[None], min(span, _LONGEST_EXTRAPOLATION) * self.velocity[None]
-        )[0]
+        moved: Doubles = move(self.qpos[None], min(span, _LONGEST_EXTRAPOLATION) * self.velocity[None])[0]
         wrist_spread = (
             _WRIST_SPREAD + 0.5 * _WRIST_ACCELERATION * span**2,
             _WRIST_ROTATION_SPREAD + 0.5 * _WRIST_ANGULAR_ACCELERATION * span**2,
@@ -168,7 +166,7 @@ class HandState:
         return self._prediction(moved, predict_joints(moved[7:], self._joint_covariance, span), wrist_spread)
 
     def _prediction(
-        self, qpos: NDArray[np.float64], joint_prior: JointPrior, wrist_spread: tuple[float, float]
+        self, qpos: Doubles, joint_prior: JointPrior, wrist_spread: tuple[float, float]
     ) -> Prediction:
         """Make a prediction from a pose with these uncertainties."""
         priors = priors_of_frame(joint_prior.angles, joint_prior.spread, qpos[:7], wrist_spread)
@@ -257,7 +255,7 @@ class HandState:
 
     def unbiased_positions(self, estimate: HandEstimate) -> Float[np.ndarray, "M 3"]:
         """Positions of a pose's markers in the world without any bias [m]."""
-        offsets: NDArray[np.float64] = np.einsum("mij,mj->mi", estimate.predicted.rotations, self._bias)
+        offsets: Doubles = np.einsum("mij,mj->mi", estimate.predicted.rotations, self._bias)
         return estimate.positions + offsets
 
     @property

@@ -13,9 +13,9 @@ from typing import Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
-from numpy.typing import NDArray
 
 from gloves.fit import GloveFit
+from handsim.arrays import Doubles, Integers
 from handsim.hand.model import join_qpos
 from handsim.hand.shape import DIGITS, NUM_JOINTS
 from handsim.space.transforms import rigid_fit
@@ -126,7 +126,7 @@ class HandInitializer:
         self._robust = [PoseSolver(one.hand, outlier_distance=_OUTLIER_DISTANCE) for one in states]
         self._attempts = np.zeros(len(states), dtype=np.int64)
         self._spreads: list[float | None] = [None] * len(states)
-        self._points: NDArray[np.float64] = np.empty((0, 3))  # of the current frame
+        self._points: Doubles = np.empty((0, 3))  # of the current frame
         spread = np.arange(_CUTS) + 0.5
         height, azimuth = 1.0 - spread / _CUTS, np.pi * (1.0 + 5.0**0.5) * spread  # even over half a sphere
         flat = np.sqrt(1.0 - height**2)
@@ -229,7 +229,7 @@ class HandInitializer:
         return max(MIN_MARKERS, int(np.ceil(share)))
 
     def _best(
-        self, group: NDArray[np.int64], hands: Sequence[int], cuts: NDArray[np.int64], search: _Search
+        self, group: Integers, hands: Sequence[int], cuts: Integers, search: _Search
     ) -> InitializedHand | None:
         """The first certain hand of a group, or after the last cut the best one."""
         if not len(cuts):
@@ -251,7 +251,7 @@ class HandInitializer:
         clouds = self._clouds_of_turn(group, cuts, search.best_turn)
         return self._better(best, group, clouds, hands, may_repeat=True)
 
-    def _labeled(self, clouds: Sequence[NDArray[np.int64]]) -> list[NDArray[np.int64]]:
+    def _labeled(self, clouds: Sequence[Integers]) -> list[Integers]:
         """Label each cloud; return labels of all points per cloud, the most confident cloud first."""
         labelings = self._labeler.label_frames([self._points[cloud] for cloud in clouds])
         confidence = [float(one.confidence[one.labels >= 0].sum()) for one in labelings]
@@ -263,8 +263,8 @@ class HandInitializer:
     def _better(
         self,
         best: InitializedHand | None,
-        group: NDArray[np.int64],
-        clouds: Sequence[NDArray[np.int64]],
+        group: Integers,
+        clouds: Sequence[Integers],
         hands: Sequence[int],
         may_repeat: bool = False,
     ) -> InitializedHand | None:
@@ -289,7 +289,7 @@ class HandInitializer:
         """Whether a hand fits so well that no other cloud is tried."""
         return hand.score > _CERTAIN_SCORE * self._states[hand.index].num_markers
 
-    def _cuts_of(self, group: NDArray[np.int64], hands: Sequence[int]) -> NDArray[np.int64]:
+    def _cuts_of(self, group: Integers, hands: Sequence[int]) -> Integers:
         """Directions in which a group is cut, the longest extent first; none if it may be a single hand."""
         most = max(self._states[index].num_markers for index in hands)
         if len(group) <= most + min(SPARE_POINTS, _SPARE_SHARE * most):
@@ -298,9 +298,7 @@ class HandInitializer:
         numbers = _STRIDE * (self._first_cut + np.arange(count)) % _CUTS
         return numbers[np.argsort(-(self._points[group] @ self._directions[numbers].T).std(axis=0))]
 
-    def _clouds_of_turn(
-        self, group: NDArray[np.int64], cuts: NDArray[np.int64], turn: int
-    ) -> list[NDArray[np.int64]]:
+    def _clouds_of_turn(self, group: Integers, cuts: Integers, turn: int) -> list[Integers]:
         """Clouds of a turn: the whole group and its halves along three cuts, then those of one more cut."""
         clouds, last = [group] if turn == 0 else [], turn + _CUTS_AT_FIRST
         for cut in cuts[0 if turn == 0 else last - 1 : last]:
@@ -308,9 +306,7 @@ class HandInitializer:
             clouds += [order[: len(group) // 2], order[len(group) // 2 :]]
         return clouds
 
-    def _improve(
-        self, first: InitializedHand, group: NDArray[np.int64], share: float
-    ) -> InitializedHand | None:
+    def _improve(self, first: InitializedHand, group: Integers, share: float) -> InitializedHand | None:
         """Remove labels that do not fit, then match and fit all points of the group again."""
         index, state = first.index, self._states[first.index]
         hand = self._trim(first) or self._trim(self._without_outliers(first))
@@ -331,7 +327,7 @@ class HandInitializer:
             hand = self._trim(self._fit(index, labels, hand.fit), share)
         return hand
 
-    def _divided(self, hands: list[InitializedHand], group: NDArray[np.int64]) -> list[InitializedHand]:
+    def _divided(self, hands: list[InitializedHand], group: Integers) -> list[InitializedHand]:
         """Label each of several hands of a group again, without the points of the others."""
         for number, hand in enumerate(hands if len(hands) > 1 else ()):
             others = [other.labels[group] >= 0 for other in hands if other is not hand]
@@ -396,9 +392,7 @@ class HandInitializer:
             return None
         return self._fit(first.index, np.where(kept, first.labels, -1), fit)
 
-    def _fit(
-        self, index: int, labels: NDArray[np.int64], near: PoseFit | None = None
-    ) -> InitializedHand | None:
+    def _fit(self, index: int, labels: Integers, near: PoseFit | None = None) -> InitializedHand | None:
         """Fit a hand to labeled points, starting from `near` if given; None if there are too few points."""
         # Unusual poses lower the score; a hand seen recently must fit as well as before.
         count, state = int((labels >= 0).sum()), self._states[index]
@@ -414,11 +408,9 @@ class HandInitializer:
         return InitializedHand(index, fit, labels, self.score(count, float(fit.rms[0]), spread) - penalty)
 
 
-def _likelier(
-    changed: Sequence[InitializedHand | None], hands: list[InitializedHand]
-) -> list[InitializedHand]:
-    """The changed hands if all of them exist and have a higher total score; otherwise the hands before."""
-    found = [hand for hand in changed if hand is not None]
+def _likelier(new: Sequence[InitializedHand | None], hands: list[InitializedHand]) -> list[InitializedHand]:
+    """The new hands if all of them exist and have a higher total score; otherwise the hands before."""
+    found = [hand for hand in new if hand is not None]
     better = sum(hand.score for hand in found) > sum(hand.score for hand in hands)
     return found if better and len(found) == len(hands) else hands
 
@@ -473,9 +465,7 @@ def label_alone(
 
 
 def _clouds_to_label(
-    frames: Sequence[Float[np.ndarray, "N 3"]],
-    found: Sequence[Sequence[InitializedHand]],
-    num_markers: int,
+    frames: Sequence[Float[np.ndarray, "N 3"]], found: Sequence[Sequence[InitializedHand]], num_markers: int
 ) -> list[tuple[int, int, Int[np.ndarray, "C"]]]:
     """Points given to the labeler as one hand: frame, hand, and indices of the points."""
     most = num_markers + SPARE_POINTS
@@ -496,7 +486,7 @@ def _clouds_to_label(
     return clouds
 
 
-def linked_groups(points: Float[np.ndarray, "N 3"], distance: float) -> list[NDArray[np.int64]]:
+def linked_groups(points: Float[np.ndarray, "N 3"], distance: float) -> list[Integers]:
     """Indices of points linked by steps of at most `distance` [m], the largest group first."""
     near = ((points[:, None] - points) ** 2).sum(axis=-1) <= distance**2
     numbers = connected_components(np.stack(np.nonzero(near)), len(points))

@@ -1,4 +1,4 @@
-"""Tests of labels carried over by IDs: exchange of IDs, gate at the predicted pose, fit, labeler's review."""
+"""Tests of the labels that IDs carry over: exchange of IDs, gate around the prediction, fit, and review."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from typing import Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from numpy.typing import NDArray
 
+from handsim.arrays import Doubles, Flags, Integers
 from handsim.hand.shape import DIGITS
 from handsim.kernels import kernel, point_distance, squared_distance
 from track.association.frame_state import FrameState, peak_log_odds, targets_of
@@ -22,9 +22,11 @@ from track.association.hand_state import (
 )
 from track.association.initialization import CLOUD_RADIUS, MOST_POINTS
 from track.config import TrackerConfig
+from track.kinematics.pose_spread import MEDIAN_SQUARE
 from train.labelers.protocol import Labeler
 
-_GATE: Final = 16.0  # gate of a fitted point, as squared Mahalanobis distance: four standard deviations
+# gate of a fitted point, as squared Mahalanobis distance: four standard deviations
+_GATE_SQUARE: Final = 16.0
 _PREDICTION_SPREAD: Final = 0.004  # [m] least standard deviation of a prediction
 _PREDICTION_FACTOR: Final = 2.0  # standard deviation of a prediction over that of the other markers
 _MOST_GATED_SHARE: Final = 0.3  # With a larger share outside the gate the prediction is wrong.
@@ -35,14 +37,13 @@ _EXCHANGE_CONFIDENCE: Final = 0.5
 _FIT_SPREAD: Final = 0.0015  # [m] standard deviation of a fitted marker, added to its own
 _RESTART_RMS: Final = 0.004  # [m] A worse fit is tried again from general poses instead of the prediction.
 _RESTART_STEPS: Final = 8  # steps from each of these poses; the best result is fitted further
-_MEDIAN_SQUARE: Final = 2.366  # median of the squared length of a standard normal vector
-# [m] as `CLOUD_RADIUS`, around a missing marker of a digit without labels, which may be bent or straight
+# [m] `CLOUD_RADIUS` for missing markers of a digit without labels, which may be bent or straight
 _DIGIT_CLOUD_RADIUS: Final = 0.13
 _FIRST_REVIEW_WAIT: Final = 0.01  # [s] from a review with changes to the next one
 _REVIEW_WAIT_FACTOR: Final = 1.6  # factor of that time after each review without changes
 _DOUBTED_PRESENCE: Final = -2.0  # log probability of a marker that the track saw elsewhere at the same time
 _REVIEW_MARGIN: Final = 8.0  # log-odds by which the labeler's labels must be better than those of the track
-# A bias is doubted if a point is this much closer to the marker without it.
+# A bias is doubted if a point's distance without it is less than this share of that with it.
 _DOUBTED_BIAS_SHARE: Final = 0.85
 _MOVED_LABEL_LOG_ODDS: Final = 2.0  # log-odds that a point keeps its label
 _REPEATED_REVIEW_LOG_ODDS: Final = 1.0  # log-odds gained by each earlier review with the same result
@@ -51,9 +52,9 @@ _MOST_ANSWER_LOG_ODDS: Final = 7.0  # bound of the log-odds from the labeler's c
 
 def exchange_labels(frame: FrameState, positions: Float[np.ndarray, "K 3"]) -> FrameState:
     """Exchange the labels of two points if that explains both much better, as if IDs were exchanged."""
-    # An error of the prediction moves both points alike, and cancels in the comparison.
+    # An error of the prediction moves both points alike, so it cancels in the comparison.
     labels = frame.labels.copy()
-    points = _exchange(frame.points, labels, positions)
+    points = _exchange_in_place(frame.points, labels, positions)
     if len(points) == 0:
         return frame
     changed = np.zeros(len(labels), dtype=bool)
@@ -63,11 +64,7 @@ def exchange_labels(frame: FrameState, positions: Float[np.ndarray, "K 3"]) -> F
 
 
 @kernel
-def _exchange(
-    points: NDArray[np.float64],
-    labels: NDArray[np.int64],
-    positions: NDArray[np.float64],
-) -> NDArray[np.int64]:
+def _exchange_in_place(points: Doubles, labels: Integers, positions: Doubles) -> Integers:
     """Kernel of `exchange_labels`: changes labels in place, returns the points with changed labels."""
     # The gain of exchanging the labels of points p_i and p_j with predicted markers m_i and m_j,
     # (|p_i-m_i|^2 + |p_j-m_j|^2 - |p_i-m_j|^2 - |p_j-m_i|^2) / (2 s^2), is -(p_i-p_j).(m_i-m_j) / s^2.
@@ -81,7 +78,7 @@ def _exchange(
     offsets = seen - markers
     middle = np.array([np.median(offsets[:, 0]), np.median(offsets[:, 1]), np.median(offsets[:, 2])])
     squares = ((offsets - middle) ** 2).sum(axis=1)
-    variance = max(_EXCHANGE_SPREAD**2, _PREDICTION_FACTOR**2 * np.median(squares) / _MEDIAN_SQUARE)
+    variance = max(_EXCHANGE_SPREAD**2, _PREDICTION_FACTOR**2 * np.median(squares) / MEDIAN_SQUARE)
     free = np.ones(len(labeled), dtype=np.bool_)
     while True:
         most, one, other = _EXCHANGE_MARGIN, -1, -1
@@ -107,17 +104,12 @@ def gate_labels(frame: FrameState, hand: int, state: HandState, prediction: Pred
     """Drop labels of points outside a gate as wide as the innovations of the hand's markers."""
     # If too many labels are outside, the prediction is wrong, and all labels stay.
     markers = frame.markers(hand)
-    _gate(frame.points, markers, prediction.positions, state.variance)
+    _gate_in_place(frame.points, markers, prediction.positions, state.variance)
     return frame.with_markers(hand, markers)
 
 
 @kernel
-def _gate(
-    points: NDArray[np.float64],
-    markers: NDArray[np.int64],
-    positions: NDArray[np.float64],
-    variance: NDArray[np.float64],
-) -> None:
+def _gate_in_place(points: Doubles, markers: Integers, positions: Doubles, variance: Doubles) -> None:
     """Kernel of `gate_labels` for one hand; changes `markers` (P,) in place."""
     labeled = np.flatnonzero(markers >= 0)
     if len(labeled) == 0:
@@ -125,8 +117,8 @@ def _gate(
     squares = np.empty(len(labeled))
     for row, point in enumerate(labeled):
         squares[row] = ((points[point] - positions[markers[point]]) ** 2).sum()
-    shown = max(_PREDICTION_SPREAD**2, _PREDICTION_FACTOR**2 * np.median(squares) / _MEDIAN_SQUARE)
-    outside = squares > _GATE * (variance[markers[labeled]] + shown)
+    shown = max(_PREDICTION_SPREAD**2, _PREDICTION_FACTOR**2 * np.median(squares) / MEDIAN_SQUARE)
+    outside = squares > _GATE_SQUARE * (variance[markers[labeled]] + shown)
     if outside.sum() <= _MOST_GATED_SHARE * len(labeled):
         markers[labeled[outside]] = -1
 
@@ -179,7 +171,7 @@ def _worst_label(
         square /= variance[marker] + _FIT_SPREAD**2
         if square > most:
             worst, most = point, square
-    return worst if most >= _GATE else -1
+    return worst if most >= _GATE_SQUARE else -1
 
 
 def refit_labels(before: FrameState, frame: FrameState, track: HandTrack) -> tuple[FrameState, HandTrack]:
@@ -218,9 +210,8 @@ class LabelerReview:
     def review(self, frame: FrameState, track: HandTrack) -> tuple[FrameState, HandTrack]:
         """If a review is due, compare a hand's labels with the labeler's, and adopt the likelier ones."""
         markers = frame.markers(track.hand)
-        near = _near_missing(
-            frame.points, frame.labels, markers, track.state.digits, track.estimate.positions
-        )
+        digits, positions = track.state.digits, track.estimate.positions
+        near = _near_missing(frame.points, frame.labels, markers, digits, positions)
         if not self._is_due(track.hand, frame, near):
             return frame, track
         cloud = np.flatnonzero((markers >= 0) | near)
@@ -249,17 +240,11 @@ class LabelerReview:
         return reviewed, track._replace(estimate=proposal.estimate)
 
     def _compare(
-        self,
-        frame: FrameState,
-        track: HandTrack,
-        named: NDArray[np.int64],
-        confidence: NDArray[np.float64],
+        self, frame: FrameState, track: HandTrack, named: Integers, confidence: Doubles
     ) -> _Proposal | None:
         """Fit the labeler's labels; None if the current ones are likelier or equal."""
-        named_frame, is_sure = frame.with_markers(track.hand, named), track.estimate.rms < _RESTART_RMS
-        proposed, estimate = fit_labels(
-            named_frame, track.hand, track.state, track.prediction, is_sure=is_sure
-        )
+        labeled, is_sure = frame.with_markers(track.hand, named), track.estimate.rms < _RESTART_RMS
+        proposed, estimate = fit_labels(labeled, track.hand, track.state, track.prediction, is_sure=is_sure)
         before, after = frame.markers(track.hand), proposed.markers(track.hand)
         if (after == before).all() or np.isnan(estimate.rms):
             return None
@@ -276,7 +261,7 @@ class LabelerReview:
             self._earlier[track.hand] = {change: earlier.get(change, 0) + 1 for change in changes}
         return None
 
-    def _is_due(self, index: int, frame: FrameState, near: NDArray[np.bool_]) -> bool:
+    def _is_due(self, index: int, frame: FrameState, near: Flags) -> bool:
         """Whether a review is due; if so, the next one is scheduled."""
         points = frozenset(frame.ids[near].tolist())
         new = bool(points - self._open[index])
@@ -304,14 +289,12 @@ class LabelerReview:
         doubted = (presence >= SEEN_ELSEWHERE) & (presence <= SEEN_ELSEWHERE + MOST_AGE_LOG_ODDS)
         return float(gain + presence[~doubted].sum() + _DOUBTED_PRESENCE * doubted.sum())
 
-    def _log_odds(
-        self, frame: FrameState, track: HandTrack, markers: NDArray[np.int64], estimate: HandEstimate
-    ) -> float:
+    def _log_odds(self, frame: FrameState, track: HandTrack, markers: Integers, fit: HandEstimate) -> float:
         """Log-odds of labeled points being markers of the fitted hand and not strays."""
         labeled = np.flatnonzero(markers >= 0)
         variance = track.state.variance[markers[labeled]]
         peak = peak_log_odds(variance, self._config.stray_density)
-        squares = ((frame.points[labeled] - estimate.positions[markers[labeled]]) ** 2).sum(axis=1)
+        squares = ((frame.points[labeled] - fit.positions[markers[labeled]]) ** 2).sum(axis=1)
         return float((peak - 0.5 * squares / variance).sum())
 
 
@@ -338,7 +321,7 @@ def _near_missing(
     return near
 
 
-def _doubted_biases(frame: FrameState, track: HandTrack, named: NDArray[np.int64]) -> Int[np.ndarray, "K"]:
+def _doubted_biases(frame: FrameState, track: HandTrack, named: Integers) -> Int[np.ndarray, "K"]:
     """Missing markers with a probably wrong bias: the labeler assigns them points that have persisted."""
     # Such a bias was learned from other points if the point is much closer without it.
     old = frame.time - frame.first_seen >= STRAY_LIFETIME

@@ -10,8 +10,8 @@ from __future__ import annotations
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from handsim.arrays import Doubles, Flags, Integers
 from handsim.kernels import align_rigid, kernel, squared_distance, write_quaternion_matrix
 
 FEWEST: Final = 3
@@ -20,27 +20,24 @@ _NEW_ID_FACTOR: Final = 1.5  # gate of a point with a new ID, as a multiple of t
 # A triangle whose height is less than this share of its longest side determines no rotation.
 _LEAST_TRIANGLE_HEIGHT: Final = 0.1
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-
 
 class _Search(NamedTuple):
     """Input arrays of a search, and the best match so far."""
 
-    positions: Floats  # markers in the body's frame (Q, 3) [m]
-    distances: Floats  # between markers (Q, Q) [m]
-    points: Floats  # points in the world (N, 3) [m]
-    apart: Floats  # distances between points (N, N) [m]
-    near: NDArray[np.bool_]  # whether a point is near enough to a marker's expected position (Q, N)
+    positions: Doubles  # markers in the body's frame (Q, 3) [m]
+    distances: Doubles  # between markers (Q, Q) [m]
+    points: Doubles  # points in the world (N, 3) [m]
+    apart: Doubles  # distances between points (N, N) [m]
+    near: Flags  # whether a point is near enough to a marker's expected position (Q, N)
     gate: float  # largest residual of a point after the fit [m]
-    assignment: Ints  # best assignment so far (Q,)
-    pose: Floats  # its pose (7,)
-    score: Floats  # its number of markers and RMS distance [m]; number of markers of the runner-up
+    assignment: Integers  # best assignment so far (Q,)
+    pose: Doubles  # its pose (7,)
+    score: Doubles  # its number of markers and RMS distance [m]; number of markers of the runner-up
 
 
 @kernel
 def fit_inliers(
-    positions: Floats, points: Floats, assignment: Ints, pose: Floats, tight: float, gate: float
+    positions: Doubles, points: Doubles, assignment: Integers, pose: Doubles, tight: float, gate: float
 ) -> tuple[int, float]:
     """Fit the pose to the assigned points that agree tightly, and keep those within the gate of it."""
     # Several wrong points together can bias a fit until the right ones look like outliers. Therefore the
@@ -70,7 +67,9 @@ def fit_inliers(
 
 
 @kernel
-def _fit_pose(positions: Floats, points: Floats, assignment: Ints, pose: Floats) -> tuple[int, float, float]:
+def _fit_pose(
+    positions: Doubles, points: Doubles, assignment: Integers, pose: Doubles
+) -> tuple[int, float, float]:
     """Fit the pose to all assigned points; return their number, sum and largest of squares [m^2]."""
     target, count = np.full_like(positions, np.nan), 0
     for marker in range(len(positions)):
@@ -89,7 +88,7 @@ def _fit_pose(positions: Floats, points: Floats, assignment: Ints, pose: Floats)
 
 
 @kernel
-def _worst_outlier(positions: Floats, points: Floats, assignment: Ints) -> tuple[int, bool]:
+def _worst_outlier(positions: Doubles, points: Doubles, assignment: Integers) -> tuple[int, bool]:
     """The marker without which the others fit best, and whether that is ten times better than any other."""
     outlier, least, second, pose = -1, np.inf, np.inf, np.empty(7)
     for marker in range(len(positions)):
@@ -106,7 +105,7 @@ def _worst_outlier(positions: Floats, points: Floats, assignment: Ints) -> tuple
 
 @kernel
 def assign_remaining(
-    positions: Floats, points: Floats, assignment: Ints, pose: Floats, tight: float, gate: float
+    positions: Doubles, points: Doubles, assignment: Integers, pose: Doubles, tight: float, gate: float
 ) -> tuple[int, float]:
     """Assign free points near the predicted markers to the markers without a point, and fit again."""
     predicted = transform_markers(positions, pose)
@@ -117,7 +116,7 @@ def assign_remaining(
 
 
 @kernel
-def _nearest_free(points: Floats, center: Floats, radius: float, assignment: Ints) -> int:
+def _nearest_free(points: Doubles, center: Doubles, radius: float, assignment: Integers) -> int:
     """Nearest unassigned point within a radius [m] of a center (3,), or -1."""
     nearest, least = -1, radius * radius
     for point in range(len(points)):
@@ -129,14 +128,14 @@ def _nearest_free(points: Floats, center: Floats, radius: float, assignment: Int
 
 @kernel
 def track_by_ids(
-    positions: Floats,
-    points: Floats,
-    ids: Ints,
-    last_ids: Ints,
-    pose: Floats,
+    positions: Doubles,
+    points: Doubles,
+    ids: Integers,
+    last_ids: Integers,
+    pose: Doubles,
     tight: float,
     gate: float,
-    assignment: Ints,
+    assignment: Integers,
 ) -> tuple[int, float]:
     """Assign points by the IDs of the last frame (-1: none), fit as `fit_inliers`, and assign the rest."""
     found = 0
@@ -156,7 +155,7 @@ def track_by_ids(
 
 
 @kernel
-def transform_markers(positions: Floats, pose: Floats) -> Floats:
+def transform_markers(positions: Doubles, pose: Doubles) -> Doubles:
     """Transform markers from the body's frame to the world (Q, 3) [m]."""
     rotation, moved = np.empty((3, 3)), np.empty_like(positions)
     write_quaternion_matrix(rotation, pose[3], pose[4], pose[5], pose[6])
@@ -170,14 +169,14 @@ def transform_markers(positions: Floats, pose: Floats) -> Floats:
 
 @kernel
 def search_constellation(
-    positions: Floats,
-    distances: Floats,
-    points: Floats,
-    expected: Floats,
+    positions: Doubles,
+    distances: Doubles,
+    points: Doubles,
+    expected: Doubles,
     radius: float,
     gate: float,
-    assignment: Ints,
-    pose: Floats,
+    assignment: Integers,
+    pose: Doubles,
 ) -> tuple[int, float, int]:
     """Find the largest set of points in the markers' constellation, starting from every matching triangle."""
     apart = np.empty((len(points), len(points)))
@@ -221,7 +220,7 @@ def _try_triangles(search: _Search, a: int, b: int, i: int, j: int) -> None:
 
 
 @kernel
-def _keep_better(search: _Search, trial: Ints) -> None:
+def _keep_better(search: _Search, trial: Integers) -> None:
     """Keep a trial with more markers than the best, or as many and a better fit, without its outliers."""
     # A trial that shares three pairs with the best assignment is the same match, not a runner-up.
     pose, score = np.empty(7), search.score
@@ -240,7 +239,7 @@ def _keep_better(search: _Search, trial: Ints) -> None:
 
 @kernel
 def _extend_triangle(
-    positions: Floats, points: Floats, slack: float, assignment: Ints, a: int, b: int, c: int
+    positions: Doubles, points: Doubles, slack: float, assignment: Integers, a: int, b: int, c: int
 ) -> int:
     """Assign free points where a triangle predicts other markers; return how many, 0 if it is flat."""
     model, seen = np.empty((3, 3)), np.empty((3, 3))
@@ -258,7 +257,7 @@ def _extend_triangle(
 
 
 @kernel
-def _triangle_axes(first: Floats, second: Floats, third: Floats, axes: Floats) -> bool:
+def _triangle_axes(first: Doubles, second: Doubles, third: Doubles, axes: Doubles) -> bool:
     """Write a triangle's axes as rows (first side, in-plane, normal); return False if it is too flat."""
     along, across = second - first, third - first
     length = np.sqrt((along**2).sum())

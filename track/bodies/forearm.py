@@ -1,11 +1,11 @@
 """The limbs beside a hand as rigid bodies: axes by landmarks, and the variances of the wrist's angles.
 
-The forearm's frame is that of the hand's wrist when the wrist is straight. Its plane is that of Wu and others
-2005: through both styloids and the elbow, midway between the epicondyles. The origin is midway between the
-styloids, not at the ulnar one, so that the long axis ends in the middle of the wrist.
+The forearm's frame equals that of the hand's wrist while the wrist is straight. Its plane is that of Wu and
+others 2005: through both styloids and the elbow, which is midway between the epicondyles. Its origin is
+midway between the styloids, not at the ulnar one, so that the long axis ends in the middle of the wrist.
 
-An elbow is markers on the upper arm, or beyond it where the radius does not turn them. The forearm's
-pronation needs nothing of it but the y axis, through the epicondyles, however the elbow is bent.
+The markers of an elbow are on the upper arm, or beyond it where the radius does not turn them. The forearm's
+pronation needs only the elbow's y axis, through the epicondyles, however the elbow is bent.
 """
 
 from __future__ import annotations
@@ -15,20 +15,21 @@ from typing import Final
 
 import numpy as np
 from jaxtyping import Float
-from numpy.typing import NDArray
 
 from gloves.captures.capture import Capture, select_markers
 from gloves.takes.take import Take
+from handsim.arrays import Doubles
 from handsim.errors import ArgumentError, CalibrationError
 from handsim.hand.shape import Side
 from handsim.space.transforms import unit
 from track.bodies.constellation import FEWEST
 from track.bodies.rigid_body import RigidTemplate, track_body
+from track.frames import capture_frames
 from track.kinematics.pose_spread import SOURCES
 
-_SHARE: Final = 0.6
-"""Factor of gluing and person in the turn of an uncalibrated palm, whose many markers make up for each other:
-constant errors found are 0.43 to 0.70 of those stated, in either angle of 60 simulated hands."""
+_CONSTANT_FACTOR: Final = 0.6
+"""Factor of gluing and person in the rotation of an uncalibrated palm, whose many markers average their
+errors: the constant errors of 60 simulated hands are 0.43 to 0.70 of those stated, in either angle."""
 
 
 def limb_of_landmarks(body: RigidTemplate, capture: Capture, landmarks: Sequence[str]) -> RigidTemplate:
@@ -69,11 +70,12 @@ def limb_of_landmarks(body: RigidTemplate, capture: Capture, landmarks: Sequence
     )
 
 
-def _local_landmarks(body: RigidTemplate, capture: Capture, landmarks: Sequence[str]) -> NDArray[np.float64]:
+def _local_landmarks(body: RigidTemplate, capture: Capture, landmarks: Sequence[str]) -> Doubles:
     """Median places of landmarks (K, 3) in the body's frame [m]."""
     points, markers = (select_markers(capture, names) for names in (landmarks, body.marker_names))
     local = np.full_like(points, np.nan)
-    for frame, tracked in enumerate(track_body(body, Capture(body.marker_names, markers, capture.rate))):
+    frames = capture_frames(Capture(body.marker_names, markers, capture.rate))
+    for frame, tracked in enumerate(track_body(body, frames)):
         if tracked.T_world_body is not None:
             local[frame] = (points[frame] - tracked.T_world_body[:3, 3]) @ tracked.T_world_body[:3, :3]
     for name, seen in zip(landmarks, np.isfinite(local[..., 0]).any(axis=0), strict=True):
@@ -97,24 +99,25 @@ def wrist_variances(
     hands, forearms = take.arm_turns(side)
     forearm, elbow = take.forearm_index(side), take.elbow_index(side)
     assert forearm is not None
-    noise = _turn_noise(take, forearm)
+    noise = _rotation_noise(take, forearm)
     is_less = np.isin(SOURCES, ("gluing", "person")) & (not is_calibrated)
     found = np.full_like(hand, np.nan)
-    found[:, :2] = hand[:, 1:] * np.where(is_less, _SHARE**2, 1.0)
+    found[:, :2] = hand[:, 1:] * np.where(is_less, _CONSTANT_FACTOR**2, 1.0)
     found[:, :2, 0] += (hands.swapaxes(1, 2) @ noise @ hands).diagonal(axis1=1, axis2=2)[:, 1:]
     found[np.isnan(found[:, 0, 0])] = np.nan
     if elbow is not None and take.bodies[forearm].has_axes:
-        # Pronation is a turn about the forearm, seen perpendicular to the line through the epicondyles (y).
+        # Pronation is a rotation about the forearm, measured perpendicular to the line of the epicondyles
+        # (y).
         length = forearms[:, :, 0]
-        way = length * [1.0, 0.0, 1.0] / (1.0 - length[:, 1:2] ** 2)
-        both = forearms @ noise @ forearms.swapaxes(1, 2) + _turn_noise(take, elbow)
+        axis = length * [1.0, 0.0, 1.0] / (1.0 - length[:, 1:2] ** 2)
+        both = forearms @ noise @ forearms.swapaxes(1, 2) + _rotation_noise(take, elbow)
         found[:, 2] = 0.0
-        found[:, 2, 0] = np.einsum("ti,tij,tj->t", way, both, way)
+        found[:, 2, 0] = np.einsum("ti,tij,tj->t", axis, both, axis)
         found[np.isnan(found[:, 2, 0]), 2] = np.nan
     return found
 
 
-def _turn_noise(take: Take, body: int) -> Float[np.ndarray, "T 3 3"]:
+def _rotation_noise(take: Take, body: int) -> Float[np.ndarray, "T 3 3"]:
     """Covariances of a body's rotation about its own axes [rad^2], by its residuals; NaN of a lost body."""
     markers = take.bodies[body].positions
     seen = np.isfinite(take.observed(take.bodies[body].name)[..., 0])

@@ -1,7 +1,7 @@
 """Rigid bodies with markers, tracked beside the hands: labels of their points, and their poses.
 
-Labels continue from frame to frame by ID. A point with a new ID is assigned if it is where the pose predicts
-a missing marker. A lost body is searched among all points by the distances between its markers. A body with
+IDs carry labels from frame to frame. A point with a new ID is assigned if it is where the pose predicts a
+missing marker. A lost body is searched among all points by the distances between its markers. A body with
 more than three markers is initialized with four or more, and tracked with three or more; near its last pose
 three suffice for both.
 """
@@ -16,12 +16,12 @@ from typing import Final, NamedTuple, cast
 
 import numpy as np
 from jaxtyping import Float, Int
-from numpy.typing import NDArray
 
 from gloves.captures.capture import Capture, check_unit, select_markers
 from gloves.takes.bodies import RigidBody
 from gloves.takes.points import Status
 from handsim._checks import check_array, check_type
+from handsim.arrays import Doubles, Integers
 from handsim.errors import ArgumentError, CalibrationError, HandSimError, choices, errors_of
 from handsim.files.inputs import check_keys, numbers, read_toml, tables_of, text_of, toml_number, toml_string
 from handsim.files.outputs import write_text, writing
@@ -38,6 +38,31 @@ from track.bodies.constellation import (
 )
 from track.frames import StreamedFrame, capture_frames
 
+_LEAST_WIDTH: Final = 0.005  # [m] least RMS distance of the markers from their best line
+_LONGEST_COAST: Final = 0.026  # [s] longest prediction (three frames at 120 Hz) without three markers
+_VELOCITY_FITS: Final = 5  # The velocity is known after this many consecutive fits.
+_VELOCITY_SMOOTHING: Final = 0.4  # weight of the newest velocity; fits to three markers are noisy
+_LONGEST_PREDICTION: Final = 0.25  # [s] A body without a fit for longer may be anywhere.
+_FIRST_SEARCH_RADIUS, _MOST_SPEED = 0.005, 1.5  # [m], [m/s] search radius and its growth at unknown velocity
+# [m], [m/s^2] search radius and its growth at known velocity
+_SEARCH_RADIUS, _MOST_ACCELERATION = 0.002, 30.0
+_CONFIDENT_RADIUS: Final = 0.03  # [m] largest search radius in which three markers suffice
+_MOST_CANDIDATE_MOTION: Final = 0.02  # [m] largest motion per frame of an unconfirmed candidate
+_MOST_SEARCHED_POINTS: Final = 250  # largest number of points in a search: 30 ms, cubic in it
+BODY_SUFFIX: Final = ".toml"
+_LimbSides = tuple[Side | None, Side | None]
+"""The hands whose forearm and whose elbow a body is."""
+_ANY_BODY: Final = "RigidTemplates, names of handsim's objects, or paths of .toml files"
+_OPTIONAL: Final = ("description", "forearm", "forearm_axes", "elbow", "marker")
+_BODY_KEYS: Final = ("name", *_OPTIONAL)
+_MARKER_KEYS: Final = ("name", "place_mm")
+_MOST_LEARNED_MARKERS: Final = 20
+_COUNT_QUANTILE: Final = 0.9  # This quantile of the frames' numbers of points is the number of markers.
+_TEMPLATE_CANDIDATES: Final = 5  # number of frames tried as first template
+_AVERAGING_ROUNDS: Final = 3  # rounds of averaging the markers over all frames
+_LEAST_SEEN_SHARE: Final = 0.5  # A marker must be seen in this share of the body's frames.
+_LEAST_LABELED_SHARE: Final = 0.8  # This share of all points must be the body's.
+
 
 class _Tolerances(NamedTuple):
     """Largest distances of points from a body's markers [m]."""
@@ -49,37 +74,14 @@ class _Tolerances(NamedTuple):
     kept: float  # of points that keep their IDs, from their place or from each other's distances
 
 
-_RIGID: Final = _Tolerances(0.003, 0.001, 0.001, 0.0005, 0.003)
+_RIGID_TOLERANCES: Final = _Tolerances(0.003, 0.001, 0.001, 0.0005, 0.003)
 """Tolerances of objects: ten times the noise of a good system."""
-_SKIN: Final = _Tolerances(0.005, 0.004, 0.002, 0.001, 0.02)
-"""Tolerances of a forearm and an elbow, whose skin moves markers by 1 to 2 mm, and one amid the muscles by up
-to 20. Five markers of a recorded arm, two of them at the epicondyles, are labeled in all frames; with 2 mm as
-`tight` and 3 mm as `gate` in 57 % of them. Four markers, one of them amid the muscles, are labeled in all
+_SKIN_TOLERANCES: Final = _Tolerances(0.005, 0.004, 0.002, 0.001, 0.02)
+"""Tolerances of forearms and elbows, whose skin moves markers by 1 to 2 mm, and over muscles by up to 20 mm.
+Five markers of a recorded arm, two of them at the epicondyles, are labeled in all frames; with 2 mm as
+`tight` and 3 mm as `gate` in 57 % of them. Four markers, one of them over a muscle, are labeled in all
 frames; in 75 % if no point is `kept`."""
-_LEAST_WIDTH: Final = 0.005  # [m] least RMS distance of the markers from their best line
-_LEAST_MARKER_DISTANCE: Final = 2.0 * _RIGID.gate  # [m] Closer markers could exchange labels.
-_LONGEST_COAST: Final = 0.026  # [s] longest prediction (three frames at 120 Hz) without three markers
-_VELOCITY_FITS: Final = 5  # The velocity is known after this many consecutive fits.
-_VELOCITY_SMOOTHING: Final = 0.4  # weight of the newest velocity; fits to three markers are noisy
-_LONGEST_PREDICTION: Final = 0.25  # [s] A body without a fit for longer may be anywhere.
-_FIRST_RADIUS, _MOST_SPEED = 0.005, 1.5  # [m], [m/s]: search radius with unknown velocity
-_RADIUS, _MOST_ACCELERATION = 0.002, 30.0  # [m], [m/s^2]: search radius with known velocity
-_CONFIDENT_RADIUS: Final = 0.03  # [m] largest search radius in which three markers suffice
-_MOST_CANDIDATE_MOTION: Final = 0.02  # [m] largest motion per frame of an unconfirmed candidate
-_MOST_SEARCHED_POINTS: Final = 250  # largest number of points in a search: 30 ms, cubic in it
-BODY_SUFFIX: Final = ".toml"
-_Limb = tuple[Side | None, Side | None]
-"""The hands whose forearm and whose elbow a body is."""
-_EXPECTED: Final = "RigidTemplates, names of handsim's objects, or paths of .toml files"
-_OPTIONAL: Final = ("description", "forearm", "forearm_axes", "elbow", "marker")
-_BODY_KEYS: Final = ("name", *_OPTIONAL)
-_MARKER_KEYS: Final = ("name", "place_mm")
-_MOST_LEARNED_MARKERS: Final = 20
-_COUNT_QUANTILE: Final = 0.9  # quantile of the frames' numbers of points that gives the number of markers
-_TEMPLATE_CANDIDATES: Final = 5  # number of frames tried as first template
-_AVERAGING_ROUNDS: Final = 3  # rounds of averaging the markers over all frames
-_LEAST_SEEN_SHARE: Final = 0.5  # A marker must be seen in this share of the body's frames.
-_LEAST_LABELED_SHARE: Final = 0.8  # This share of all points must be the body's.
+_LEAST_MARKER_DISTANCE: Final = 2.0 * _RIGID_TOLERANCES.gate  # [m] Closer markers could exchange labels.
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -140,7 +142,7 @@ class RigidTemplate(RigidBody):
         return None
 
 
-def _symmetry(positions: NDArray[np.float64], distances: NDArray[np.float64]) -> tuple[int, ...] | None:
+def _symmetry(positions: Doubles, distances: Doubles) -> tuple[int, ...] | None:
     """Another order of all markers that fits the body after a rotation; None if there is none."""
     count = len(positions)
     orders: list[tuple[int, ...]] = [()]
@@ -151,15 +153,14 @@ def _symmetry(positions: NDArray[np.float64], distances: NDArray[np.float64]) ->
             for to in range(count)
             if to not in order
             and all(
-                abs(distances[marker, k] - distances[to, order[k]]) < 2.0 * _RIGID.tight
+                abs(distances[marker, k] - distances[to, order[k]]) < 2.0 * _RIGID_TOLERANCES.tight
                 for k in range(marker)
             )
         ]
     for order in orders:
         if order != tuple(range(count)):
-            agree, _ = fit_inliers(
-                positions, positions, np.array(order), np.empty(7), _RIGID.tight, _RIGID.tight
-            )
+            tight = _RIGID_TOLERANCES.tight
+            agree, _ = fit_inliers(positions, positions, np.array(order), np.empty(7), tight, tight)
             if agree == count:  # a rotation, not a reflection
                 return order
     return None
@@ -182,8 +183,17 @@ class _Match(NamedTuple):
 
     num_points: int  # 0 if there is no unique match
     rms: float  # their RMS distance from the markers [m]
-    pose: NDArray[np.float64]  # pose of the body (7,)
-    assignment: NDArray[np.int64]  # index of each marker's point, -1 for none
+    pose: Doubles  # pose of the body (7,)
+    assignment: Integers  # index of each marker's point, -1 for none
+
+
+class _Cloud(NamedTuple):
+    """The points of a frame."""
+
+    points: Doubles  # positions (N, 3) [m]
+    ids: Integers  # the IDs of the camera system (N,)
+    time: float  # [s]
+    elapsed: float  # time since the last fit [s]
 
 
 class BodyTracker:
@@ -192,7 +202,7 @@ class BodyTracker:
     def __init__(self, template: RigidTemplate) -> None:
         self.template = template
         self._positions, self._distances = template.positions, template.distances
-        self._tolerances = _SKIN if template.forearm or template.elbow else _RIGID
+        self._tolerances = _SKIN_TOLERANCES if template.forearm or template.elbow else _RIGID_TOLERANCES
         self._reset()
         for number in range(18):  # Compile or load all kernels before the stream's first frame.
             there = self._positions if number < 17 else self._positions[:0]
@@ -203,18 +213,18 @@ class BodyTracker:
         """Track the body among the finite points of the next frame."""
         # Copy, because read-only or non-contiguous arrays would compile a kernel anew.
         points, ids = np.array(points, dtype=np.float64, order="C"), np.array(ids, dtype=np.int64)
-        elapsed = time - self._time
+        cloud = _Cloud(points, ids, time, time - self._time)
         if self._status != Status.LOST:
-            frame = self._track(points, ids, time, elapsed) or self._coast(points, ids, elapsed)
+            frame = self._track(cloud) or self._coast(cloud)
             if frame is not None:
                 return frame
             self._lose()
-        carried = self._carried(points, ids)
-        return self._initialize(points, ids, time, elapsed, carried)
+        return self._initialize(cloud, self._carried(cloud))
 
     def _reset(self) -> None:
         self._pose, self._velocity, self._time = np.full(7, np.nan), np.zeros(6), -np.inf  # of the last fit
-        self._most_markers, self._fits = 0, 0  # since initialization: most markers in a fit, fits
+        # largest number of markers in a fit, and of fits, since the start
+        self._most_markers, self._fits = 0, 0
         self._last_ids = np.full(len(self._positions), -1)  # IDs of the markers' points in the last frame
         self._places = self._positions.copy()  # where each marker was when last kept [m]
         self._lose()
@@ -223,11 +233,9 @@ class BodyTracker:
         self._status: Status = Status.LOST
         self._candidate, self._confirmed = np.full(7, np.nan), 0
 
-    def _track(
-        self, points: NDArray[np.float64], ids: NDArray[np.int64], time: float, elapsed: float
-    ) -> BodyFrame | None:
+    def _track(self, cloud: _Cloud) -> BodyFrame | None:
         """Track the body by the IDs of its points, or near its predicted pose; None if that fails."""
-        gate, tight, *_ = self._tolerances
+        (points, ids, _, elapsed), (gate, tight, *_) = cloud, self._tolerances
         pose, assignment = self._no_match
         count, rms = track_by_ids(self._positions, points, ids, self._last_ids, pose, tight, gate, assignment)
         match = _Match(count, rms, pose, assignment)
@@ -239,17 +247,17 @@ class BodyTracker:
             # Three points may match three markers by chance: a larger match elsewhere is right.
             other = self._match(points)
             if other.num_points > FEWEST:
-                return self._accept(Status.INITIALIZED, other, points, ids, time)
-        return self._accept(Status.TRACKED, match, points, ids, time)
+                return self._accept(Status.INITIALIZED, other, cloud)
+        return self._accept(Status.TRACKED, match, cloud)
 
-    def _coast(self, points: NDArray[np.float64], ids: NDArray[np.int64], elapsed: float) -> BodyFrame | None:
+    def _coast(self, cloud: _Cloud) -> BodyFrame | None:
         """Predict the body's pose, for at most `_LONGEST_COAST` seconds; None after that."""
-        if not 0.0 < elapsed <= _LONGEST_COAST or self._fits < _VELOCITY_FITS:
+        if not 0.0 < cloud.elapsed <= _LONGEST_COAST or self._fits < _VELOCITY_FITS:
             return None
-        pose, assignment, rms = self._predict(elapsed), self._last_points(ids), np.nan
+        pose, assignment, rms = self._predict(cloud.elapsed), self._last_points(cloud.ids), np.nan
         seen = np.flatnonzero(assignment >= 0)
         if len(seen):  # One or two points shift the body if they agree with its pose.
-            off = points[assignment[seen]] - transform_markers(self._positions, pose)[seen]
+            off = cloud.points[assignment[seen]] - transform_markers(self._positions, pose)[seen]
             shift = off.mean(axis=0)
             distances = np.linalg.norm(off - shift, axis=1)
             if max(distances.max(), np.linalg.norm(shift)) <= self._tolerances.gate:
@@ -258,64 +266,55 @@ class BodyTracker:
             else:
                 assignment[:] = -1
         self._status = Status.COASTING
-        return self._result(_Match(len(seen), rms, pose, assignment), points, ids)
+        return self._result(_Match(len(seen), rms, pose, assignment), cloud)
 
-    def _last_points(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
+    def _last_points(self, ids: Integers) -> Integers:
         """For each marker the index (Q,) of the point with the ID of its last one; -1 where there is none."""
         there = (self._last_ids[:, None] == ids) & (ids >= 0)
         return np.where(there.any(axis=1), there.argmax(axis=1) if len(ids) else -1, -1)
 
-    def _carried(self, points: NDArray[np.float64], ids: NDArray[np.int64]) -> NDArray[np.int64]:
-        """`_last_points` if these are two or more and keep their distances, otherwise -1 for all."""
-        assignment = self._last_points(ids)
+    def _carried(self, cloud: _Cloud) -> Integers:
+        """`_last_points` if two or more of them keep their distances, otherwise -1 for all."""
+        assignment = self._last_points(cloud.ids)
         seen = np.flatnonzero(assignment >= 0)
-        there = points[assignment[seen]]
+        there = cloud.points[assignment[seen]]
         apart = np.linalg.norm(there[:, None] - there, axis=-1) - self._distances[np.ix_(seen, seen)]
         is_kept = len(seen) > 1 and np.abs(apart).max() <= self._tolerances.kept
         return assignment if is_kept else np.full(len(assignment), -1)
 
-    def _initialize(
-        self,
-        points: NDArray[np.float64],
-        ids: NDArray[np.int64],
-        time: float,
-        elapsed: float,
-        carried: NDArray[np.int64],
-    ) -> BodyFrame:
-        """Search the body near its predicted pose, then anywhere; `carried` points need no confirmation."""
-        if 0.0 < elapsed <= _LONGEST_PREDICTION:
-            radius = self._search_radius(elapsed)
-            match = self._match(points, self._predict(elapsed), radius)
+    def _initialize(self, cloud: _Cloud, carried: Integers) -> BodyFrame:
+        """Search the body near its predicted pose, then anywhere; a match of `carried` points is sure."""
+        if 0.0 < cloud.elapsed <= _LONGEST_PREDICTION:
+            radius = self._search_radius(cloud.elapsed)
+            match = self._match(cloud.points, self._predict(cloud.elapsed), radius)
             if match.num_points > FEWEST or (match.num_points == FEWEST and radius <= _CONFIDENT_RADIUS):
-                return self._accept(Status.INITIALIZED, match, points, ids, time)
-        match = self._match(points)
+                return self._accept(Status.INITIALIZED, match, cloud)
+        match = self._match(cloud.points)
         if match.num_points >= FEWEST:
             if ((match.assignment == carried) & (carried >= 0)).sum() > 1:
-                return self._accept(Status.INITIALIZED, match, points, ids, time)
+                return self._accept(Status.INITIALIZED, match, cloud)
             there = transform_markers(self._positions, match.pose)
             before = transform_markers(self._positions, self._candidate)
             moved = np.linalg.norm(there - before, axis=1).max()
             self._confirmed = self._confirmed + 1 if moved < _MOST_CANDIDATE_MOTION else 1
             self._candidate = match.pose
             if self._confirmed >= _frames_to_confirm(match.num_points, len(self._positions)):
-                return self._accept(Status.INITIALIZED, match, points, ids, time)
+                return self._accept(Status.INITIALIZED, match, cloud)
         else:
             self._confirmed = 0
-        return BodyFrame(Status.LOST, None, self._labels(carried, ids), np.nan)
+        return BodyFrame(Status.LOST, None, self._labels(carried, cloud.ids), np.nan)
 
-    def _predict(self, elapsed: float) -> NDArray[np.float64]:
+    def _predict(self, elapsed: float) -> Doubles:
         """Predict the pose after some time [s] with constant velocity."""
         return move(self._pose[None], elapsed * self._velocity[None])[0]  # type: ignore[no-any-return]
 
     def _search_radius(self, elapsed: float) -> float:
         """Largest expected distance of a marker from its predicted position [m]."""
         if self._fits < _VELOCITY_FITS:
-            return _FIRST_RADIUS + _MOST_SPEED * elapsed
-        return _RADIUS + 0.5 * _MOST_ACCELERATION * elapsed**2
+            return _FIRST_SEARCH_RADIUS + _MOST_SPEED * elapsed
+        return _SEARCH_RADIUS + 0.5 * _MOST_ACCELERATION * elapsed**2
 
-    def _match(
-        self, points: NDArray[np.float64], near: NDArray[np.float64] | None = None, radius: float = np.inf
-    ) -> _Match:
+    def _match(self, points: Doubles, near: Doubles | None = None, radius: float = np.inf) -> _Match:
         """The unique match of the markers, within a radius [m] of a pose or anywhere."""
         gate, tight, search, tightest, _ = self._tolerances
         pose, assignment = self._no_match
@@ -333,52 +332,39 @@ class BodyTracker:
         return _Match(*fit, pose, assignment)
 
     @property
-    def _no_match(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    def _no_match(self) -> tuple[Doubles, Integers]:
         """Buffers for a pose and an assignment."""
         return np.empty(7), np.full(len(self._positions), -1)
 
-    def _accept(
-        self,
-        status: Status,
-        match: _Match,
-        points: NDArray[np.float64],
-        ids: NDArray[np.int64],
-        time: float,
-    ) -> BodyFrame:
+    def _accept(self, status: Status, match: _Match, cloud: _Cloud) -> BodyFrame:
         """Update pose and velocity from a fit."""
-        elapsed = time - self._time
         if status == Status.INITIALIZED:
             self._velocity, self._most_markers, self._fits = np.zeros(6), 0, 0
-        elif 0.0 < elapsed <= _LONGEST_PREDICTION:
+        elif 0.0 < cloud.elapsed <= _LONGEST_PREDICTION:
             weight = _VELOCITY_SMOOTHING if self._fits > 1 else 1.0
-            self._velocity += weight * (velocity_of(self._pose, match.pose, elapsed) - self._velocity)
+            self._velocity += weight * (velocity_of(self._pose, match.pose, cloud.elapsed) - self._velocity)
         self._fits += 1
-        self._pose, self._time, self._status = match.pose, time, status
+        self._pose, self._time, self._status = match.pose, cloud.time, status
         self._most_markers = max(self._most_markers, int((match.assignment >= 0).sum()))
-        return self._result(match, points, ids)
+        return self._result(match, cloud)
 
-    def _result(self, match: _Match, points: NDArray[np.float64], ids: NDArray[np.int64]) -> BodyFrame:
+    def _result(self, match: _Match, cloud: _Cloud) -> BodyFrame:
         """The result of a fit, with the labels of further points that `_keep` finds."""
         transform = np.eye(4)
         write_quaternion_matrix(transform, *match.pose[3:])
         transform[:3, 3] = match.pose[:3]
-        self._keep(match, transform, points, ids)
-        return BodyFrame(self._status, transform, self._labels(match.assignment, ids), match.rms)
+        self._keep(match, transform, cloud)
+        return BodyFrame(self._status, transform, self._labels(match.assignment, cloud.ids), match.rms)
 
-    def _keep(
-        self,
-        match: _Match,
-        transform: NDArray[np.float64],
-        points: NDArray[np.float64],
-        ids: NDArray[np.int64],
-    ) -> None:
+    def _keep(self, match: _Match, transform: Doubles, cloud: _Cloud) -> None:
         """Add to a match markers that the fit left out.
 
         The point of such a marker has the ID of its last one, or is where the marker was when last kept.
         """
+        points = cloud.points
         if (match.assignment >= 0).all() or not len(points):
             return
-        there, last = transform_markers(self._positions, match.pose), self._last_points(ids)
+        there, last = transform_markers(self._positions, match.pose), self._last_points(cloud.ids)
         before = transform_markers(self._places, match.pose)
         for marker in np.flatnonzero(match.assignment < 0):
             point = last[marker]
@@ -390,7 +376,7 @@ class BodyTracker:
                 match.assignment[marker] = point
                 self._places[marker] = (points[point] - transform[:3, 3]) @ transform[:3, :3]
 
-    def _labels(self, assignment: NDArray[np.int64], ids: NDArray[np.int64]) -> NDArray[np.int64]:
+    def _labels(self, assignment: Integers, ids: Integers) -> Integers:
         """The marker (N,) of each point, -1 for none; stores the IDs for the next frame."""
         seen, labels = np.flatnonzero(assignment >= 0), np.full(len(ids), -1)
         labels[assignment[seen]] = seen
@@ -419,7 +405,7 @@ class BodyError(HandSimError):
 
 def load_body(name_or_path: AnyBody) -> RigidTemplate:
     """Return a body as it is, or load handsim's object or the `.toml` file of this name."""
-    check_type("body", name_or_path, (RigidTemplate, str, Path), _EXPECTED)
+    check_type("body", name_or_path, (RigidTemplate, str, Path), _ANY_BODY)
     if isinstance(name_or_path, RigidTemplate):
         return name_or_path
     path = Path(name_or_path)
@@ -438,7 +424,7 @@ def load_bodies(names_or_paths: AnyBody | Iterable[AnyBody]) -> tuple[RigidTempl
     """Load one or several bodies with different names."""
     if isinstance(names_or_paths, AnyBody):
         names_or_paths = (names_or_paths,)
-    check_type("bodies", names_or_paths, Iterable, _EXPECTED)
+    check_type("bodies", names_or_paths, Iterable, _ANY_BODY)
     bodies: list[RigidTemplate] = []
     for name_or_path in names_or_paths:
         body = load_body(name_or_path)
@@ -535,7 +521,7 @@ def learn_body(
     check_unit([frame.points for frame in frames])
     counts = np.array([len(frame.points) for frame in frames])
     body, tracked = _best_template(name, (forearm, elbow), frames, counts)
-    labeled = _num_labeled(tracked)
+    labeled = _count_labeled(tracked)
     if labeled < _LEAST_LABELED_SHARE * counts.sum():
         raise CalibrationError(
             f"{100.0 * labeled / counts.sum():.0f} % of the points keep their positions on one rigid body, "
@@ -544,12 +530,12 @@ def learn_body(
     for _ in range(_AVERAGING_ROUNDS):
         positions = _median_positions(body, frames, tracked)
         body = _template(name, (forearm, elbow), positions)
-        tracked = _track(body, frames)
+        tracked = track_body(body, frames)
     return body
 
 
 def _best_template(
-    name: str, limb: _Limb, frames: Sequence[StreamedFrame], counts: NDArray[np.int64]
+    name: str, limb: _LimbSides, frames: Sequence[StreamedFrame], counts: Integers
 ) -> tuple[RigidTemplate, list[BodyFrame]]:
     """The template, among those of several frames, that labels most points, and its track."""
     count = int(np.quantile(counts, _COUNT_QUANTILE, method="lower"))
@@ -567,13 +553,13 @@ def _best_template(
         except CalibrationError as error:
             faults.append(error)
         else:
-            candidates.append((body, _track(body, frames)))
+            candidates.append((body, track_body(body, frames)))
     if not candidates:
         raise faults[-1]
-    return max(candidates, key=lambda candidate: _num_labeled(candidate[1]))
+    return max(candidates, key=lambda candidate: _count_labeled(candidate[1]))
 
 
-def _template(name: str, limb: _Limb, positions: NDArray[np.float64]) -> RigidTemplate:
+def _template(name: str, limb: _LimbSides, positions: Doubles) -> RigidTemplate:
     """A body with markers at these positions (Q, 3) [m], its origin moved to their mean."""
     forearm, elbow = limb
     names = tuple(f"Marker{number + 1}" for number in range(len(positions)))
@@ -583,23 +569,19 @@ def _template(name: str, limb: _Limb, positions: NDArray[np.float64]) -> RigidTe
         raise CalibrationError(str(error)) from error
 
 
-def track_body(body: RigidTemplate, capture: Capture) -> list[BodyFrame]:
-    """Track a body through a capture."""
-    return _track(body, list(capture_frames(capture)))
-
-
-def _track(body: RigidTemplate, frames: Sequence[StreamedFrame]) -> list[BodyFrame]:
+def track_body(body: RigidTemplate, frames: Iterable[StreamedFrame]) -> list[BodyFrame]:
+    """Track a body through some frames."""
     tracker = BodyTracker(body)
     return [tracker.step(frame.points, frame.ids, frame.time) for frame in frames]
 
 
-def _num_labeled(tracked: Sequence[BodyFrame]) -> int:
+def _count_labeled(tracked: Sequence[BodyFrame]) -> int:
     return sum(int((frame.labels >= 0).sum()) for frame in tracked)
 
 
 def _median_positions(
     body: RigidTemplate, frames: Sequence[StreamedFrame], tracked: Sequence[BodyFrame]
-) -> NDArray[np.float64]:
+) -> Doubles:
     """Median position (Q, 3) of each marker in the body's frame [m]; rarely seen markers are dropped."""
     seen = np.full((len(frames), len(body.positions), 3), np.nan)
     for number, (frame, one) in enumerate(zip(frames, tracked, strict=True)):

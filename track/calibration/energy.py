@@ -14,15 +14,15 @@ from __future__ import annotations
 import copy
 import dataclasses
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from numpy.typing import NDArray
 
 from gloves.captures.capture import runs_of
 from gloves.fit import GloveFit
+from handsim.arrays import Doubles, Integers
 from handsim.hand.model import NUM_VELOCITIES, HandModel, join_qpos, skinned_jacobian
 from handsim.hand.shape import BONES, DIGITS, NUM_BONES, NUM_JOINTS, HandShape, bones_of
 from handsim.hand.skin import rest_vertices
@@ -30,6 +30,7 @@ from handsim.kernels import move
 from handsim.space.transforms import quaternion_matrix
 from poses.touch import FINGERS, thumb_contact
 from track.calibration.hand_parameters import (
+    DIFFERENCE_STEP,
     NUM_PARAMETERS,
     Corners,
     SkinCoordinates,
@@ -54,20 +55,18 @@ ALPHA_NORMAL, ALPHA_ALONG = 2.0, 1.0
 POSITION_SPREAD: Final = 0.002
 """Initial standard deviation of a marker's slip along the skin [m]; (noise / spread)^2 is the paper's
 lambda_1."""
-HEIGHT_SPREAD: Final = 0.0005  # [m] the same of its height over the design's
+HEIGHT_SPREAD: Final = 0.0005  # [m] initial standard deviation of a marker's height over the design's
 CONTACT_SPREAD: Final = 0.0007
 """Standard deviation of a pad's compression around `PAD_COMPRESSION` [m]; (noise / spread)^2 is lambda_2."""
 _LIMIT_SPREAD: Final = np.deg2rad(2.0)  # [rad] standard deviation of an angle beyond its range
-# The frames of a capture are much alike: together they count as this many gestures in the pose prior.
-_GESTURES: Final = 4.0
-GESTURES_OF_USER: Final = np.repeat([1.0, _GESTURES], [4, 16])
+# The frames of a capture are similar: together they count as this many gestures in the pose prior.
+_GESTURES_OF_CAPTURE: Final = 4.0
+GESTURES_OF_USER: Final = np.repeat([1.0, _GESTURES_OF_CAPTURE], [4, 16])
 """Number of independent gestures, by joint angle, whose mean varies as much as the mean of a capture varies
 between people."""
-_LEAST_MOTION: Final = np.deg2rad(
-    1.0
-)  # least RMS motion of a digit by which its flesh patterns are normalized
+# [rad] A digit's flesh patterns are normalized by its RMS motion, at least this.
+_LEAST_DIGIT_MOTION: Final = np.deg2rad(1.0)
 RELINEARIZE: Final = 0.005  # The skin's jacobian is renewed after such a change (log lengths, [rad], [m]).
-_DIFFERENCE_STEP: Final = 1e-5  # of finite differences
 PAD_COMPRESSION: Final = 0.001
 """Compression of each pad in a touch [m]: simulated pads overlap by 1.6 to 2.4 mm together."""
 _MOST_TOUCH_GAP: Final = 0.012  # [m] largest gap between the pads of a touch
@@ -75,12 +74,10 @@ _MOST_TOUCH_SPEED: Final = 0.02  # [m/s] largest speed of the finger relative to
 _SHORTEST_HOLD: Final = 0.06  # [s] shortest touch
 _MOST_TOUCHES_PER_FINGER: Final = 10
 _SPEED_WINDOW: Final = 0.025  # [s] before and after a frame, in which speed is measured
-_GAP_SCALE: Final = (
-    0.002  # [m] A touch whose gap differs this much from the usual has a quarter of the weight.
-)
-_PAD_DEPTH: Final = 0.006  # [m] depth of a pad's middle below the skin
+_GAP_SCALE: Final = 0.002  # [m] A touch whose gap differs this much from the usual has a quarter weight.
+_PAD_CENTER_DEPTH: Final = 0.006  # [m] depth of a pad's middle below the skin
 _SLIDE_ROUNDS: Final = 3
-_GAP_QUANTILE: Final = 0.35  # quantile of a finger's gaps that counts as the usual one
+_GAP_QUANTILE: Final = 0.35  # quantile of a finger's gaps that counts as its usual gap
 _FACING_COSINE: Final = -0.8  # Normals of facing pads have a smaller cosine.
 _MOST_PAD_OFFSET: Final = 0.002  # [m] largest offset of the contact points across their direction
 Progress = Callable[[int], None]
@@ -91,26 +88,23 @@ _LEAST_RAISED_DAMPING: Final = 1e-6
 _MOST_DAMPING_TRIALS: Final = 8
 SMALL_GAIN: Final = 1e-4  # A step that gains a smaller share of the energy is the last one.
 QUICK_OPTIONS: Final = {"noise": 0.003, "robust_scale": 0.015, "relinearize": 0.05}
-"""Options of a `Problem` with few frames [m]: the noise is that of flesh, which repeats in similar frames."""
+"""Options of a `Problem` with few frames [m]; the noise is that of flesh, which repeats in similar frames."""
 QUICK_GAIN: Final = 1e-3
-"""`SMALL_GAIN` of such a problem; a hand's length may be off by 0.2 mm."""
+"""`SMALL_GAIN` of a problem with `QUICK_OPTIONS`; it may leave a hand's length off by 0.2 mm."""
 
 
 class Contacts(NamedTuple):
-    """K contacts of the thumb, each in one frame and with a point on either pad."""
+    """K contacts of the thumb, each in one frame and with a point on either pad; none by default."""
 
-    frames: Int[np.ndarray, "K"]
-    fingers: Int[np.ndarray, "K"]  # indices into `DIGITS`
-    pads: SkinCoordinates  # points on the thumb, then those on the fingers
+    frames: Int[np.ndarray, "K"] = np.empty(0, dtype=np.int64)
+    fingers: Int[np.ndarray, "K"] = np.empty(0, dtype=np.int64)  # indices into `DIGITS`
+    pads: SkinCoordinates = SkinCoordinates(np.empty(0, dtype=np.int64), np.empty((0, 3)), np.empty(0))
+    """Points on the thumb, then those on the fingers."""
 
     def part(self, some: Bool[np.ndarray, "K"]) -> Contacts:
         """Some of the contacts."""
         pads = SkinCoordinates(*(values[np.tile(some, 2)] for values in self.pads))
         return Contacts(self.frames[some], self.fingers[some], pads)
-
-
-_NO_COORDINATES: Final = SkinCoordinates(np.empty(0, dtype=np.int64), np.empty((0, 3)), np.empty(0))
-_NO_CONTACTS: Final = Contacts(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), _NO_COORDINATES)
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,7 +115,7 @@ class Estimate:
     points: Float[np.ndarray, "M 3"]  # marker centers on the rest hand, in the wrist's frame [m]
     coordinates: SkinCoordinates  # skin coordinates of these points
     qpos: Float[np.ndarray, "F 27"]
-    contacts: Contacts = _NO_CONTACTS  # with indices into `qpos` as frames
+    contacts: Contacts = field(default_factory=Contacts)  # with indices into `qpos` as frames
 
 
 class Fit(NamedTuple):
@@ -146,7 +140,7 @@ class NormalEquations(NamedTuple):
     shared_gradient: Float[np.ndarray, "S"]
 
 
-WeightedJacobians = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
+WeightedJacobians = tuple[Doubles, Doubles, Doubles, Doubles]
 
 
 class Problem:
@@ -162,13 +156,11 @@ class Problem:
         noise: float,  # standard deviation of marker coordinates [m]
         robust_scale: float,  # [m] scale of the robust loss, which halves a square there (Geman, McClure)
         relinearize: float = RELINEARIZE,
-        gestures: Float[np.ndarray, "20"] | float = _GESTURES,  # that the capture counts as
+        gestures: Float[np.ndarray, "20"] | float = _GESTURES_OF_CAPTURE,  # that the capture counts as
     ) -> None:
         self._relinearize = relinearize
         self.shape, self.design, self.heights = shape, design, heights
-        self.present: Bool[np.ndarray, "F M"] = np.isfinite(targets).all(axis=2)
-        """Whether each marker is present."""
-        self.targets = np.where(self.present[..., None], targets, 0.0)
+        self._set_targets(targets)
         self.noise, self.robust_scale = noise, robust_scale
         roots = np.sqrt(np.minimum(1.0, gestures / np.full(NUM_JOINTS, len(targets))))
         self.pose_precision = np.outer(roots, roots) * resting_prior().precision
@@ -181,18 +173,22 @@ class Problem:
         """Standard deviation of a marker's coordinates [m] without the flesh, for which `noise` is larger."""
         self.precision = shape_precision()
         self._ranges = HandModel(shape).skeleton.ranges
-        self._surface_jacobian: NDArray[np.float64] | None = None
+        self._surface_jacobian: Doubles | None = None
         self._linearized_at = np.zeros(NUM_PARAMETERS)
 
     def with_targets(self, targets: Float[np.ndarray, "F M 3"]) -> Problem:
         """The same problem for other labeled markers [m], NaN where missing."""
         other = copy.copy(self)
-        other.present = np.isfinite(targets).all(axis=2)
-        other.targets = np.where(other.present[..., None], targets, 0.0)
+        other._set_targets(targets)
         return other
 
+    def _set_targets(self, targets: Float[np.ndarray, "F M 3"]) -> None:
+        self.present: Bool[np.ndarray, "F M"] = np.isfinite(targets).all(axis=2)
+        """Whether each marker is present."""
+        self.targets = np.where(self.present[..., None], targets, 0.0)
+
     def fit(self, estimate: Estimate) -> Fit:
-        """Residuals and energy of an estimate."""
+        """Compute residuals and energy of an estimate."""
         model = HandModel(shape_at(self.shape, estimate.parameters))
         bones = model.forward_kinematics(estimate.qpos)
         weights = skin_weights(estimate.coordinates)
@@ -223,13 +219,13 @@ class Problem:
         cost += (weights * fit.geometry.gaps**2).sum() / CONTACT_SPREAD**2
         return float(cost)
 
-    def position_precision(self, fit: Fit) -> NDArray[np.float64]:
+    def position_precision(self, fit: Fit) -> Doubles:
         """Precision matrix of E_prior for each marker (M, 3, 3) [1/m^2]."""
         normal = fit.normals[:, :, None] * fit.normals[:, None]
-        precision: NDArray[np.float64] = ALPHA_ALONG * np.eye(3) + (ALPHA_NORMAL - ALPHA_ALONG) * normal
+        precision: Doubles = ALPHA_ALONG * np.eye(3) + (ALPHA_NORMAL - ALPHA_ALONG) * normal
         return precision * self.place_weights[:, None, None] / self.position_spread**2
 
-    def _joint_angle_residuals(self, estimate: Estimate) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _joint_angle_residuals(self, estimate: Estimate) -> tuple[Doubles, Doubles]:
         """Joint angles (F, 20) [rad] beyond their limits, and relative to the mean of the gestures."""
         angles = estimate.qpos[:, 7:]
         low, high = self._ranges.T
@@ -294,12 +290,10 @@ class Problem:
         self._add_priors(estimate, fit, moved, result)
         return result
 
-    def _rest_jacobian(
-        self, estimate: Estimate, patch: SkinPatch, skin: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
+    def _rest_jacobian(self, estimate: Estimate, patch: SkinPatch, skin: Doubles) -> Doubles:
         """Derivatives of points at fixed skin coordinates of the rest hand by the parameters (P, 3, 53)."""
-        # The skin's derivative is renewed when a parameter has changed by 0.005. This affects the result by
-        # less than a micrometer; four times as much would be noticeable.
+        # The default of `relinearize` affects the result by less than a micrometer; four times as much would
+        # be noticeable.
         if (
             self._surface_jacobian is None
             or np.abs(estimate.parameters - self._linearized_at).max() > self._relinearize
@@ -310,19 +304,19 @@ class Problem:
         here, _ = skin_points(coordinates, patch.corners(skin))
         columns = []
         for number in range(NUM_PARAMETERS):
-            grown = skin + _DIFFERENCE_STEP * self._surface_jacobian[..., number]
-            columns.append((skin_points(coordinates, patch.corners(grown))[0] - here) / _DIFFERENCE_STEP)
+            grown = skin + DIFFERENCE_STEP * self._surface_jacobian[..., number]
+            columns.append((skin_points(coordinates, patch.corners(grown))[0] - here) / DIFFERENCE_STEP)
         return np.stack(columns, axis=-1)
 
     def _all_coordinates(self, estimate: Estimate) -> SkinCoordinates:
-        """Skin coordinates of the markers, of their design, and of the compressed pads at the contacts."""
+        """Skin coordinates of the markers, the designed markers, and the compressed pads at the contacts."""
         pads = estimate.contacts.pads
         pads = pads._replace(heights=np.full(len(pads.faces), -PAD_COMPRESSION))
         parts = zip(estimate.coordinates, self.design, pads, strict=True)
         return SkinCoordinates(*map(np.concatenate, parts))
 
     def _add_priors(
-        self, estimate: Estimate, fit: Fit, design_jacobian: NDArray[np.float64], result: NormalEquations
+        self, estimate: Estimate, fit: Fit, design_jacobian: Doubles, result: NormalEquations
     ) -> None:
         """Add the priors; `design_jacobian` (M, 3, 53) is of marker minus design at fixed coordinates."""
         first, count = NUM_PARAMETERS, len(estimate.points)
@@ -344,7 +338,7 @@ class Problem:
 
     def gap_spreads(self, estimate: Estimate, fit: Fit) -> Float[np.ndarray, "K"]:
         """Standard deviations of the contacts' gaps [m] that markers and priors leave open."""
-        alone = dataclasses.replace(estimate, contacts=_NO_CONTACTS)
+        alone = dataclasses.replace(estimate, contacts=Contacts())
         covariance, answers = shared_covariance(self, alone, self.fit(alone))
         patch = SkinPatch(self._all_coordinates(estimate).faces)
         rest = self._rest_jacobian(estimate, patch, fit.model.surface.vertices)
@@ -353,9 +347,7 @@ class Problem:
         moved[:, :NUM_PARAMETERS] += by_shape
         return np.asarray(np.sqrt(np.einsum("ks,st,kt->k", moved, covariance, moved)))
 
-    def _gap_jacobians(
-        self, estimate: Estimate, fit: Fit, rest: NDArray[np.float64]
-    ) -> list[NDArray[np.float64]]:
+    def _gap_jacobians(self, estimate: Estimate, fit: Fit, rest: Doubles) -> list[Doubles]:
         """Jacobians of the gaps by poses (K, 26) and parameters (K, 53); `rest` is that of rest points."""
         frames, count = estimate.contacts.frames, len(estimate.contacts.frames)
         rows, pads = np.arange(count), self._all_coordinates(estimate).part(-2 * count, None)
@@ -370,11 +362,11 @@ class Problem:
         self,
         fit: Fit,
         estimate: Estimate,
-        frames: NDArray[np.int64] | slice,
-        points: NDArray[np.float64],
-        weights: NDArray[np.float64],
-        rest: NDArray[np.float64],
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        frames: Integers | slice,
+        points: Doubles,
+        weights: Doubles,
+        rest: Doubles,
+    ) -> tuple[Doubles, Doubles, Doubles, Doubles]:
         """Jacobians of skinned points by poses, parameters and rest points; points moved by each bone."""
         bones = fit.bones[frames]
         by_point, by_bone = skinning_terms(fit.model, bones, points, weights)
@@ -402,7 +394,7 @@ class Problem:
 def first_estimate(
     hand: GloveFit, targets: Float[np.ndarray, "F M 3"], qpos: Float[np.ndarray, "F 27"], **options: Any
 ) -> tuple[Problem, Estimate]:
-    """The problem of a right hand's labeled markers [m] with its options, and the hand as first estimate."""
+    """The problem of a right hand's labeled markers [m], and that hand as the first estimate."""
     worn = hand.attachment
     coordinates = nearest_coordinates(worn.points, worn.feet, worn.main_bones, hand.shape)
     problem = Problem(hand.shape, coordinates, worn.layout.heights, targets, **options)
@@ -418,10 +410,7 @@ class ContactGeometry(NamedTuple):
 
 
 def find_touches(
-    model: HandModel,
-    angles: Float[np.ndarray, "T 20"],
-    complete: Bool[np.ndarray, "T 5"],
-    rate: float,
+    model: HandModel, angles: Float[np.ndarray, "T 20"], complete: Bool[np.ndarray, "T 5"], rate: float
 ) -> list[tuple[int, str]]:
     """Find frames and fingers of possible touches."""
     by_finger = [thumb_contact(model, angles, finger) for finger in FINGERS]
@@ -429,7 +418,7 @@ def find_touches(
     window = max(1, round(_SPEED_WINDOW * rate))
     touches: list[tuple[int, str]] = []
     for number, finger in enumerate(FINGERS):
-        speed = _speed(model, angles, finger, window, rate)
+        speed = _finger_speed(model, angles, finger, window, rate)
         good = (speed < _MOST_TOUCH_SPEED) & (gaps[:, number] < _MOST_TOUCH_GAP)
         good &= (gaps.argmin(axis=1) == number) & complete[:, 0] & complete[:, number + 1]
         shortest = max(2, round(_SHORTEST_HOLD * rate))
@@ -443,9 +432,7 @@ def find_touches(
     return sorted(touches)
 
 
-def _speed(
-    model: HandModel, angles: NDArray[np.float64], finger: str, window: int, rate: float
-) -> NDArray[np.float64]:
+def _finger_speed(model: HandModel, angles: Doubles, finger: str, window: int, rate: float) -> Doubles:
     """Speed (T,) of the finger's tip relative to the thumb's last bone [m/s]."""
     bones = model.forward_kinematics(join_qpos(angles))
     thumb, other = bones_of("thumb")[2], bones_of(finger)[2]
@@ -479,13 +466,14 @@ def initialize_contacts(
 
 def are_touches(gaps: Float[np.ndarray, "K"], spreads: Float[np.ndarray, "K"]) -> Bool[np.ndarray, "K"]:
     """Whether pads touch rather than rest anywhere near each other, by gaps without contacts [m]."""
-    # Gaps of touching pads are normally distributed around zero; those of others are uniform up to a largest.
+    # Gaps of touching pads are normally distributed around zero; gaps of others are uniform up to a largest
+    # one.
     spreads = np.hypot(spreads, CONTACT_SPREAD)
     odds = _MOST_TOUCH_GAP / (np.sqrt(2.0 * np.pi) * spreads) * np.exp(-0.5 * (gaps / spreads) ** 2)
     return np.asarray((gaps < 0.0) | (odds > 1.0))
 
 
-def _nearest_skin_points(model: HandModel, bones: NDArray[np.float64], finger: str) -> NDArray[np.float64]:
+def _nearest_skin_points(model: HandModel, bones: Doubles, finger: str) -> Doubles:
     """Points (2, 3) [m] on the skins of the two last bones, each where the other bone is nearest."""
     pads = []
     for digit in ("thumb", finger):
@@ -505,13 +493,13 @@ def slide_contacts(
     contacts: Contacts, model: HandModel, T_world_bone: Float[np.ndarray, "K L 4 4"]
 ) -> Contacts:
     """Slide the contact points on the skin to where thumb and finger are nearest."""
-    # Each moves to where its skin is nearest to a target inside the other pad. A target on the other skin
-    # would fail if the skins overlap.
+    # Each point moves to where its skin is nearest to a target inside the other pad. A target on the surface
+    # of the other pad would fail if the pads overlap.
     skin, count = build_skin(model.shape), len(contacts.frames)
     sides = [contacts.pads.part(0, count), contacts.pads.part(count, None)]
     for _ in range(_SLIDE_ROUNDS):
         for own, other in ((0, 1), (1, 0)):
-            inner = sides[other]._replace(heights=np.full(count, -_PAD_DEPTH))
+            inner = sides[other]._replace(heights=np.full(count, -_PAD_CENTER_DEPTH))
             points, _ = skin_points(inner, skin.corners(inner.faces))
             blend = _blend_transforms(inner, model, T_world_bone)
             target = np.einsum("kij,kj->ki", blend[:, :, :3], points) + blend[:, :, 3]
@@ -523,7 +511,7 @@ def slide_contacts(
 
 
 def contact_geometry(
-    contacts: Contacts, corners: Corners, model: HandModel, T_world_bone: NDArray[np.float64]
+    contacts: Contacts, corners: Corners, model: HandModel, T_world_bone: Doubles
 ) -> ContactGeometry:
     """Directions and gaps of contacts, and whether their pads face each other."""
     rest, rest_normals = skin_points(contacts.pads, corners)
@@ -547,7 +535,7 @@ def contact_geometry(
 
 def contact_weights(geometry: ContactGeometry, fingers: Int[np.ndarray, "K"]) -> Float[np.ndarray, "K"]:
     """Weight of each contact from 0 to 1, small if its gap differs from the others of its finger."""
-    # Geman and McClure's weights (1987) around a low quantile, as in a touch the gap is smallest.
+    # Geman and McClure's weights (1987) are centered on a low quantile, because a touch has the smallest gap.
     weights = np.zeros(len(geometry.gaps))
     for finger in np.unique(fingers[geometry.facing]):
         mine = (fingers == finger) & geometry.facing
@@ -556,9 +544,7 @@ def contact_weights(geometry: ContactGeometry, fingers: Int[np.ndarray, "K"]) ->
     return weights
 
 
-def _blend_transforms(
-    coordinates: SkinCoordinates, model: HandModel, T_world_bone: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _blend_transforms(coordinates: SkinCoordinates, model: HandModel, T_world_bone: Doubles) -> Doubles:
     """Blended transforms (K, 3, 4) from the rest hand to the world, for each point in its frame."""
     motion = (T_world_bone @ np.linalg.inv(model.rest_transforms))[:, :, :3]
     return np.asarray(np.einsum("kl,klij->kij", skin_weights(coordinates), motion))
@@ -572,7 +558,7 @@ def levenberg_marquardt(
     progress: Progress | None,
     small_gain: float = SMALL_GAIN,
 ) -> tuple[Estimate, Fit, int]:
-    """Minimize until a step gains too small a share, or step `most`; return the last step's number, too."""
+    """Minimize until a step gains too small a share, or step `most`; also return the number of steps."""
     fit, damping = problem.fit(estimate), _FIRST_DAMPING
     while steps < most:
         before, equations = fit.cost, problem.normal_equations(estimate, fit)
@@ -598,9 +584,7 @@ def user_hand(right: GloveFit, problem: Problem, estimate: Estimate) -> GloveFit
     return GloveFit(HandModel(shape), attachment_at(right.attachment.layout, estimate.coordinates, shape))
 
 
-def eliminate_poses(
-    equations: NormalEquations, damping: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def eliminate_poses(equations: NormalEquations, damping: float) -> tuple[Doubles, Doubles]:
     """Schur complement of the damped poses (S, S + 1), gradient last, and their solution (F, 26, S + 1)."""
     pose = equations.pose.copy()
     diagonal = np.arange(pose.shape[1])
@@ -624,8 +608,8 @@ def shared_covariance(
 def error_covariance(problem: Problem, estimate: Estimate, fit: Fit) -> Float[np.ndarray, "S S"]:
     """Covariance of the errors of the shared unknowns.
 
-    Unlike noise, flesh that follows the angles of its digit is not averaged out by many frames, nor are the
-    gestures of a user that differ from people's.
+    Many frames average noise, but neither flesh that follows the angles of its digit, nor the difference
+    between a user's gestures and those of other people.
     """
     by_pose, by_shared, residuals, _ = jacobians = problem.weighted_jacobians(estimate, fit)
     equations = problem.normal_equations(estimate, fit, jacobians)
@@ -636,8 +620,8 @@ def error_covariance(problem: Problem, estimate: Estimate, fit: Fit) -> Float[np
     errors = share * reduced[:, :-1] + (1.0 - share) * (equations.shared - flat.T @ flat)
     turns = pose_derivatives[:, 6:].sum(axis=0).T @ problem.pose_precision / np.sqrt(GESTURES_OF_USER)
     errors += turns @ resting_prior().covariance @ turns.T
-    # The fit absorbs part of the flesh's motion. What the residuals show of it, over what motion of unit size
-    # would leave in them, is its size squared.
+    # The fit absorbs part of the flesh's motion. The squared size of that motion is its part of the
+    # residuals, divided by what motion of unit size would leave in them.
     patterns = _flesh_patterns(problem, estimate, fit)
     bases = np.stack([np.linalg.qr(one.reshape(-1, one.shape[2]))[0] for one in patterns])
     bases, forces, unit_residual = bases.reshape(patterns.shape), [], 0.0
@@ -661,10 +645,10 @@ def error_covariance(problem: Problem, estimate: Estimate, fit: Fit) -> Float[np
 
 
 def _flesh_patterns(problem: Problem, estimate: Estimate, fit: Fit) -> Float[np.ndarray, "M F 3 12"]:
-    """Ways in which flesh moves each marker, in the wrist's frame, with the angles of its digit.
+    """Patterns in which flesh moves each marker, in the wrist's frame, with the angles of its digit.
 
-    They are weighted as residuals are, each with a mean square of a quarter over the frames before. Flesh on
-    the palm follows the flexions of the MCPs.
+    They are weighted as residuals are; before weighting, each has a mean square of a quarter over the frames.
+    Flesh on the palm follows the flexions of the MCP joints.
     """
     patterns, turned = [], quaternion_matrix(estimate.qpos[:, 3:7])
     roots = problem.roots(fit)
@@ -672,7 +656,7 @@ def _flesh_patterns(problem: Problem, estimate: Estimate, fit: Fit) -> Float[np.
         digit = BONES[bone].digit
         angles = estimate.qpos[:, 12::4] if digit < 0 else estimate.qpos[:, 7 + 4 * digit : 11 + 4 * digit]
         off = problem.present[:, marker, None] * (angles - angles.mean(axis=0))
-        off *= roots[:, marker, None] / max(float(np.sqrt((off**2).sum(axis=1).mean())), _LEAST_MOTION)
+        off *= roots[:, marker, None] / max(float(np.sqrt((off**2).sum(axis=1).mean())), _LEAST_DIGIT_MOTION)
         patterns.append(np.einsum("fki,fj->fkij", turned, off).reshape(len(off), 3, -1))
     return np.stack(patterns)
 

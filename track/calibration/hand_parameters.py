@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
-from numpy.typing import NDArray
 
 from gloves.fit import Attachment
 from gloves.layout import MarkerLayout
+from handsim.arrays import Doubles, Integers
 from handsim.hand.model import HandModel, metacarpal_rotations
 from handsim.hand.shape import ADULTS, DIGIT_OF_BONE, DIGITS, HandShape, named_shape
 from handsim.hand.skin import all_weights, build_surface, catmull_clark, strongest_weights, vertex_normals
@@ -33,14 +33,14 @@ DIRECTIONS: Final = slice(32, 47)  # base angles [rad], three per digit
 GIRTHS: Final = slice(47, 52)  # log factors, one per digit
 THICKNESS: Final = 52  # log factor
 NUM_PARAMETERS: Final = 53
-# Standard deviations. The nearest of the five sizes may be wrong by more than a size; length and breadth are
-# correlated (ANSUR II). Real knuckles are assumed to vary twice as much as in the simulated population.
+# The nearest of the five sizes may be wrong by more than a size; length and breadth are correlated (ANSUR
+# II). Real knuckles are assumed to vary twice as much as in the simulated population.
 _SIZE_SPREAD: Final = 0.09
 _SIZE_CORRELATION: Final = 0.6
 _KNUCKLE_SPREAD: Final = 2.0 * ADULTS.knuckle_spread
-_DIFFERENCE_STEP: Final = 1e-5  # step of finite differences
+DIFFERENCE_STEP: Final = 1e-5  # step of finite differences
 _MOST_PROJECTION_STEPS: Final = 40
-_OUTSIDE_COORDINATE: Final = -1e-9  # barycentric coordinate below which a point is outside its triangle
+_OUTSIDE_BARYCENTRIC: Final = -1e-9  # barycentric coordinate below which a point is outside its triangle
 _PROJECTION_TOLERANCE: Final = 1e-8  # [m] A projection ends closer to its target than this.
 
 
@@ -80,10 +80,10 @@ def shape_jacobian(
     function: Callable[[list[HandShape]], Float[np.ndarray, "B *shape"]],
 ) -> Float[np.ndarray, "*shape 53"]:
     """Derivative of a function of the shape by its parameters, by finite differences."""
-    nudged = parameters + _DIFFERENCE_STEP * np.eye(1 + NUM_PARAMETERS, NUM_PARAMETERS, -1)
+    nudged = parameters + DIFFERENCE_STEP * np.eye(1 + NUM_PARAMETERS, NUM_PARAMETERS, -1)
     values = function([shape_at(start, one) for one in nudged])  # The first one is unchanged.
     # Derivatives by one parameter are contiguous.
-    return np.moveaxis((values[1:] - values[0]) / _DIFFERENCE_STEP, 0, -1)
+    return np.moveaxis((values[1:] - values[0]) / DIFFERENCE_STEP, 0, -1)
 
 
 def skinned_shape_jacobian(
@@ -102,7 +102,7 @@ def skinned_shape_jacobian(
     shape, frames, count = model.shape, len(T_world_bone), len(points)
     wrist, digits = T_world_bone[:, 0, :3, :3], T_world_bone[:, 1:].reshape(-1, len(DIGITS), 3, 4, 4)
     rest, shares = model.rest_transforms[1:].reshape(len(DIGITS), 3, 4, 4), weights[:, 1:].reshape(-1, 5, 3)
-    # The shares of each bone with the bones after it, and their turns.
+    # Sum the weights of each bone and the bones after it, and their weighted rotations.
     turns = digits[..., :3, :3] @ rest[..., :3, :3].swapaxes(-1, -2)
     turns = shares[:, :, ::-1, None, None] * turns[:, None, :, ::-1]
     turns = turns.cumsum(axis=3)[:, :, :, ::-1]
@@ -197,16 +197,15 @@ def skin_mesh() -> SkinTopology:
     """Triangles and weights of the skin, subdivided once; cached."""
     coarse = build_surface(named_shape("M"))
     half = len(coarse.faces) // 2
-    step, quads = catmull_clark(
-        np.column_stack([coarse.faces[:half], coarse.faces[half:, 2]]), len(coarse.vertices)
-    )
+    coarse_quads = np.column_stack([coarse.faces[:half], coarse.faces[half:, 2]])
+    step, quads = catmull_clark(coarse_quads, len(coarse.vertices))
     faces = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
     weights = step @ all_weights(coarse.bone_indices, coarse.bone_weights)
     digits = DIGIT_OF_BONE[weights[faces].sum(axis=1).argmax(axis=1)]
     return SkinTopology(step, faces, _adjacent_faces(faces), weights, digits)
 
 
-def _adjacent_faces(faces: NDArray[np.int64]) -> NDArray[np.int64]:
+def _adjacent_faces(faces: Integers) -> Integers:
     """Neighbors (F, 3) of each triangle of a closed mesh, opposite to its corners."""
     ends = np.stack([np.roll(faces, -1, axis=1), np.roll(faces, -2, axis=1)], axis=-1).reshape(-1, 2)
     order = np.argsort(ends.min(axis=1) * (int(faces.max()) + 1) + ends.max(axis=1)).reshape(-1, 2)
@@ -272,18 +271,16 @@ def skin_weight_jacobian(coordinates: SkinCoordinates, corners: Corners) -> Floa
     return np.asarray(np.einsum("pcb,pci->pbi", shares[:, 1:] - shares[:, :1], jacobian))
 
 
-def _point_jacobian(coordinates: SkinCoordinates, corners: Corners) -> NDArray[np.float64]:
+def _point_jacobian(coordinates: SkinCoordinates, corners: Corners) -> Doubles:
     """Derivatives (P, 3, 3) of each point [m] by two barycentric coordinates (the last two) and height."""
     blended = np.einsum("pc,pci->pi", coordinates.bary, corners.normals)
     length = np.linalg.norm(blended, axis=1)[:, None]
     normal = blended / length
-    columns = []
+    columns, points = [], corners.points
     for corner in (1, 2):
         change = corners.normals[:, corner] - corners.normals[:, 0]
         change = (change - (change * normal).sum(axis=1, keepdims=True) * normal) / length
-        columns.append(
-            corners.points[:, corner] - corners.points[:, 0] + coordinates.heights[:, None] * change
-        )
+        columns.append(points[:, corner] - points[:, 0] + coordinates.heights[:, None] * change)
     return np.stack([*columns, normal], axis=-1)
 
 
@@ -291,7 +288,7 @@ def project_onto_skin(
     coordinates: SkinCoordinates, targets: Float[np.ndarray, "P 3"], skin: Skin
 ) -> SkinCoordinates:
     """Coordinates of points [m], by Newton steps that walk between adjacent triangles."""
-    # Where the skin folds and the walk does not converge, the foot point stays on the last edge.
+    # Where the skin folds, the walk may not converge: the foot point then stays on the last edge.
     mesh = skin_mesh()
     faces, bary, heights = (values.copy() for values in coordinates)
     active = np.arange(len(faces))
@@ -303,10 +300,10 @@ def project_onto_skin(
         moved = here.bary + np.column_stack([-step[:, 0] - step[:, 1], step[:, :2]])
         heights[active] = here.heights + step[:, 2]
         lowest = moved.argmin(axis=1)
-        out = moved[np.arange(len(active)), lowest] < _OUTSIDE_COORDINATE
+        out = moved[np.arange(len(active)), lowest] < _OUTSIDE_BARYCENTRIC
         # A foot point outside its triangle is clipped to the border.
         inside = np.clip(moved, 0.0, None)
-        edge: NDArray[np.float64] = inside / inside.sum(axis=1, keepdims=True)
+        edge: Doubles = inside / inside.sum(axis=1, keepdims=True)
         bary[active] = np.where(out[:, None], np.where(np.isfinite(edge), edge, here.bary), moved)
         done = ~out & (np.linalg.norm(residual, axis=1) < _PROJECTION_TOLERANCE)
         _cross_edges(mesh, faces, bary, active[out], lowest[out])
@@ -317,11 +314,7 @@ def project_onto_skin(
 
 
 def _cross_edges(
-    mesh: SkinTopology,
-    faces: NDArray[np.int64],
-    bary: NDArray[np.float64],
-    crossing: NDArray[np.int64],
-    corner: NDArray[np.int64],
+    mesh: SkinTopology, faces: Integers, bary: Doubles, crossing: Integers, corner: Integers
 ) -> None:
     """Move the points `crossing` over the edges opposite to `corner`; changes `faces` and `bary`."""
     old = faces[crossing]

@@ -13,15 +13,14 @@ from track.kinematics.pose_solver import PoseSolver
 
 FLESH: Final = 0.003
 """Standard deviation of a marker against its bone [m] in a first fit, before residuals are known."""
-# [m] A smaller one is not believed: errors that repeat in many frames are fitted, and leave small residuals.
-_LEAST_FLESH: Final = 0.001
+_LEAST_FLESH: Final = 0.001  # [m] lower bound: a fit absorbs errors that repeat, so residuals are too small
 _PLACE_SPREAD: Final = 0.02  # [m] standard deviation of a marker along the skin from a roughly known place
-_HEIGHT_SPREAD: Final = 0.0015  # [m] the same of its height over the skin
-_SCALE, _OUTLIER = 0.02, 0.03  # [m] robust scales of markers and poses
+_HEIGHT_SPREAD: Final = 0.0015  # [m] standard deviation of a marker's height over the skin
+_ROBUST_SCALE, _OUTLIER_DISTANCE = 0.02, 0.03  # [m] robust scales of markers and poses
 _RELINEARIZE: Final = 0.2  # The skin's jacobian is renewed after such a change, see `Problem`.
 _MOST_STEPS: Final = 20
 ROUGH, FINE = 3e-2, 1e-3
-"""A fit ends with a step that gains a smaller share of its energy."""
+"""A fit ends once a step gains a smaller share of its energy."""
 
 
 class FittedPlaces(NamedTuple):
@@ -45,8 +44,8 @@ def fit_places(
         flesh: Standard deviation of a marker against its bone [m].
         gain: Share of the energy that a step must gain; with less the fit ends.
     """
-    poses = PoseSolver(glove, outlier_distance=_OUTLIER).solve(points).qpos
-    options = {"noise": flesh, "robust_scale": _SCALE, "relinearize": _RELINEARIZE}
+    poses = PoseSolver(glove, outlier_distance=_OUTLIER_DISTANCE).solve(points).qpos
+    options = {"noise": flesh, "robust_scale": _ROBUST_SCALE, "relinearize": _RELINEARIZE}
     problem, estimate = first_estimate(glove, points, poses, gestures=GESTURES_OF_USER, **options)
     problem.position_spread, problem.height_spread = _PLACE_SPREAD, _HEIGHT_SPREAD
     estimate, fit, _ = levenberg_marquardt(problem, estimate, 0, _MOST_STEPS, None, gain)

@@ -18,14 +18,7 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
 from gloves.fit import Attachment, GloveFit, attach_markers, wear
-from gloves.layout import (
-    ACROSS_RANGE,
-    ALONG_RANGE,
-    MIN_MARKERS,
-    MarkerLayout,
-    MarkerPlace,
-    load_layout,
-)
+from gloves.layout import ACROSS_RANGE, ALONG_RANGE, MIN_MARKERS, MarkerLayout, MarkerPlace, load_layout
 from gloves.optics.visibility import visible_cameras
 from handsim.callbacks import OnStep, no_step
 from handsim.errors import LayoutError
@@ -33,15 +26,8 @@ from handsim.hand.model import HandModel
 from handsim.hand.shape import BONE_NAMES, PALM, SIDES
 from handsim.space.objects import MARKER_RADIUS
 from handsim.space.rig import CameraRig, load_rig
-from track.gloves.glove_score import (
-    Trial,
-    digit_of,
-    layout_of,
-    layout_spreads,
-    palm_spread,
-    try_layout,
-)
-from track.user import AnyGlove
+from track.gloves.glove_score import Trial, digit_of, layout_at, layout_spreads, palm_spread, try_layout
+from track.user import ATTACHMENT_ARRAYS, AnyGlove
 from train.data.batches import Corruption, corrupt
 from train.evaluation import cloud_frames, evaluate_frames
 from train.forecast.settings import ImproveGloveSettings
@@ -50,36 +36,35 @@ from train.simulation.training_frames import GenerateSettings, sample_hands, sam
 
 _PEOPLE, _POSES_EACH = 40, 40
 _JOINT_POSES: Final = 6  # poses per person for the spread of the joints
-_TABLES: Final = ("points", "normals", "bone_indices", "bone_weights")
 _CANDIDATES: Final = 10  # places tried at once
-_LOCAL: Final = 6  # of these, places near the marker's own
-_ADDED: Final = 24  # tried places of a new marker
+_NEARBY: Final = 6  # number of these that are near the marker's own place
+_TRIED_PLACES: Final = 24  # number of tried places of a new marker
 _STEP: Final = (0.15, float(np.deg2rad(20.0)), 0.1)  # standard deviations: along, around, across
 _GRID: Final = (0.05, float(np.deg2rad(15.0)), 0.05)  # rounding of places: along, around, across
-_CLEAR: Final = 0.006  # [m] least gap between two markers' surfaces on the flat hand
-_CREASE: Final = 0.005  # [m] distance from a joint within which the skin folds and stretches
-_TIP: Final = 0.9  # [bone lengths] limit of places on a last bone; beyond is the nail's edge
-_ON_BACK: Final = 3  # The palm's bone keeps this many markers, which determine its pose.
-_PALM_SURE: Final = float(np.deg2rad(2.0))  # [rad] spread of the palm's pose that suffices
+_LEAST_GAP: Final = 0.006  # [m] least gap between two markers' surfaces on the flat hand
+_CREASE_MARGIN: Final = 0.005  # [m] distance from a joint within which the skin folds and stretches
+_MOST_ALONG_TIP: Final = 0.9  # [bone lengths] farthest place on a last bone, where the nail's edge begins
+_FEWEST_ON_PALM: Final = 3  # The palm's bone keeps this many markers, which determine its pose.
+_SURE_PALM_SPREAD: Final = float(np.deg2rad(2.0))  # [rad] spread of the palm's pose that suffices
 _PALM_ALONG, _PALM_ACROSS = (-0.1, 0.95), 0.36  # [bone lengths] along and across the palm
 _FINGER_ALONG, _TIP_ALONG = (0.1, 1.05), (0.1, 0.9)  # [bone lengths] along a bone, a last bone
 _PALM_SHARE: Final = 5.0  # random places on the palm for each one on a finger's bone
-_AROUND: Final = 35.0  # [deg] standard deviation about a finger's bone
-_MAX_AROUND: Final = 100.0  # [deg] largest angle about a finger's bone
-_APART: Final = 0.0025  # [m] least distance between two random places
-_MISSED: Final = 500  # draws in a row without a free place, after which sampling ends
-_PADS: Final = float(np.deg2rad(80.0))  # [rad] Beyond this angle a finger's marker touches what is held.
-_GAIN: Final = 0.05  # A better layout costs less by at least this much.
-_TRIES: Final = 20  # attempts to draw a place
-_TESTED: Final = 240  # frames whose labels are counted
+_SPREAD_DEG: Final = 35.0  # [deg] standard deviation about a finger's bone
+_MOST_DEG: Final = 100.0  # [deg] largest angle about a finger's bone
+_LEAST_DISTANCE: Final = 0.0025  # [m] least distance between two random places
+_MOST_MISSES: Final = 500  # draws in a row without a free place, after which sampling ends
+_PADS: Final = float(np.deg2rad(80.0))  # [rad] Farther around a finger a marker touches held objects.
+_LEAST_GAIN: Final = 0.05  # A better layout costs less by at least this much.
+_MOST_DRAWS: Final = 20  # attempts to draw a place
+_TESTED_FRAMES: Final = 240  # frames whose labels are counted
 _GHOSTS: Final = 2  # largest number of ghosts in a frame
-_OF_JOINTS: Final = 3.0  # cost of one degree of joint spread, in percent of slots
-_FEWER: Final = 3  # Smaller layouts with up to this many markers fewer are compared, too.
-_SAME_SLOTS: Final = 0.002  # difference in share of right slots that may be chance
+_JOINT_COST: Final = 3.0  # cost of one degree of joint spread, in percent of slots
+_MOST_DROPPED: Final = 3  # Layouts with up to this many markers less are compared, too.
+_CHANCE: Final = 0.002  # difference in share of right slots that may be chance
 
 
 class Worth(NamedTuple):
-    """How good a layout is."""
+    """Figures of merit of a layout."""
 
     slots: float
     """Share of right slots, as a rig sees them and with ghosts."""
@@ -91,7 +76,7 @@ class Worth(NamedTuple):
     @property
     def cost(self) -> float:
         """Cost to be minimized: wrong slots [%] and, weighted, the spread of the joints [deg]."""
-        return 100.0 * (1.0 - self.slots) + _OF_JOINTS * float(np.rad2deg(self.joints))
+        return 100.0 * (1.0 - self.slots) + _JOINT_COST * float(np.rad2deg(self.joints))
 
     def __str__(self) -> str:
         """Share of right slots and spread of the joints in words."""
@@ -111,9 +96,9 @@ class ImprovedGlove:
     before: Worth
     after: Worth
     fewer: Sequence[tuple[int, Worth]]
-    """Worth without the least useful markers: number of markers left, and worth."""
+    """Number of remaining markers, and worth, as the least useful markers are dropped."""
     trials: Mapping[str, Mapping[str, Trial]]
-    """Results on captures, `before` and `after`, by kind of work; empty if none was tried."""
+    """Results on captures by kind of work, under `before` and `after`; empty if none was tried."""
 
     @property
     def verdict(self) -> str | None:
@@ -152,7 +137,7 @@ def improve_glove(
     search.resize(count)
     search.search(60.0 * chosen.minutes, lambda worth: on_step(str(worth)))
     on_step("dropping one marker at a time, to compare")
-    fewer = search.smaller(max(MIN_MARKERS, len(chosen.keep), count - _FEWER))
+    fewer = search.smaller(max(MIN_MARKERS, len(chosen.keep), count - _MOST_DROPPED))
     found = dataclasses.replace(search.layout, name=name)
 
     def trials_of(when: str, tried: MarkerLayout) -> dict[str, Trial]:
@@ -175,7 +160,7 @@ def verdict(before: Mapping[str, Trial], after: Mapping[str, Trial]) -> str:
         f"{100 * slots[0]:.2f} % of the slots were right before and {100 * slots[1]:.2f} % after, joints "
         f"{joints[0]:.1f} and {joints[1]:.1f} deg off"
     )
-    if slots[1] < slots[0] - _SAME_SLOTS or (slots[1] < slots[0] + _SAME_SLOTS and not joints[1] < joints[0]):
+    if slots[1] < slots[0] - _CHANCE or (slots[1] < slots[0] + _CHANCE and not joints[1] < joints[0]):
         return f"Not better in captures: {told}. Keep the layout that you have, or search longer."
     return f"Better in captures: {told}."
 
@@ -214,7 +199,7 @@ class Columns(NamedTuple):
             np.concatenate([self.positions, other.positions], axis=1),
             np.concatenate([self.seen, other.seen], axis=1),
             tuple(
-                {name: np.concatenate([one[name], two[name]]) for name in _TABLES}
+                {name: np.concatenate([one[name], two[name]]) for name in ATTACHMENT_ARRAYS}
                 for one, two in zip(self.worn, other.worn, strict=True)
             ),
         )
@@ -236,8 +221,8 @@ class WornPlaces:
             self._people.append((model, qpos, model.forward_kinematics(qpos)))
 
     def put_on(self, places: Sequence[MarkerPlace]) -> Columns:
-        """Attach markers to all hands, each slipped a little; raises a `LayoutError` off a hand's skin."""
-        glove, (along, around) = layout_of(places, self.radius), self._slip
+        """Attach slightly slipped markers to all hands; raise a `LayoutError` if one is off a hand's skin."""
+        glove, (along, around) = layout_at(places, self.radius), self._slip
         positions, seen, worn = [], [], []
         for model, qpos, bones in self._people:
             one = wear(glove, model, along=along, around=around, rng=self._rng)
@@ -246,7 +231,7 @@ class WornPlaces:
             visible = visible_cameras(markers, normals, self._rig, capsules.posed(bones), capsules.radii)
             seen.append(visible.sum(axis=-1) >= 2)
             positions.append(markers - qpos[:, None, :3])
-            worn.append({name: getattr(one, name) for name in _TABLES})
+            worn.append({name: getattr(one, name) for name in ATTACHMENT_ARRAYS})
         copies = (*places, *[places[0]] * (glove.num_markers - len(places)))
         columns = Columns(copies, np.concatenate(positions), np.concatenate(seen), tuple(worn))
         return columns.chosen(range(len(places)))
@@ -271,10 +256,10 @@ def judge(people: WornPlaces, layout: Columns, *, seed: int) -> Worth:
     network = shipped_network()
     features = mean_features(layout.positions, network.config)[None]
     rng = np.random.default_rng(seed)
-    step = max(1, len(layout.positions) // _TESTED)
+    step = max(1, len(layout.positions) // _TESTED_FRAMES)
     points = layout.positions[::step] - layout.positions[::step].mean(axis=1, keepdims=True)
     observed = np.where(layout.seen[::step, :, None], points, np.nan)
-    half = len(layout.places) // 8  # The rig loses few: add half of the paper's occlusions.
+    half = len(layout.places) // 8  # half of the paper's occlusions, because the rig loses few markers
     cloud = corrupt(observed, Corruption(occlude=half, ghosts=_GHOSTS), rng=rng)
     worn = MarkerLayout("places", layout.places, people.radius)
     report = evaluate_frames(LayoutLabeler(worn, network, features, None), [cloud_frames(cloud)])
@@ -311,9 +296,9 @@ class Improvement:
     def resize(self, num_markers: int) -> None:
         """Add the best of some places, or drop the least useful marker, until the number is right."""
         while len(self._columns.places) < num_markers:
-            self._take(self._grown())
+            self._adopt_best(self._grown_layouts())
         while len(self._columns.places) > num_markers:
-            self._take(self._shrunk())
+            self._adopt_best(self._shrunk_layouts())
 
     def search(self, seconds: float, told: Callable[[Worth], None]) -> None:
         """Move one marker at a time until the time is over."""
@@ -321,8 +306,8 @@ class Improvement:
         free = [number for number, place in enumerate(places) if place.name not in self._keep]
         while free and time.monotonic() < until:
             wrong = 1.02 - self.worth.by_marker[free]
-            worth, columns = self._best(self._moved(int(self._rng.choice(free, p=wrong / wrong.sum()))))
-            if columns is not None and worth.cost < self.worth.cost - _GAIN:
+            worth, columns = self._best(self._moves(int(self._rng.choice(free, p=wrong / wrong.sum()))))
+            if columns is not None and worth.cost < self.worth.cost - _LEAST_GAIN:
                 self.worth, self._columns = worth, columns
             told(self.worth)
 
@@ -330,7 +315,7 @@ class Improvement:
         """Worth without the least useful markers, dropped one by one; the layout itself is unchanged."""
         kept, found = (self.worth, self._columns), []
         while len(self._columns.places) > fewest:
-            self._take(self._shrunk())
+            self._adopt_best(self._shrunk_layouts())
             found.append((len(self._columns.places), self.worth))
         self.worth, self._columns = kept
         return found
@@ -338,7 +323,7 @@ class Improvement:
     def _judge(self, columns: Columns) -> Worth:
         return judge(self._people, columns, seed=self._seed)
 
-    def _take(self, layouts: Sequence[Columns]) -> None:
+    def _adopt_best(self, layouts: Sequence[Columns]) -> None:
         """Continue with the best of some layouts."""
         worth, columns = self._best(layouts)
         if columns is None:
@@ -353,16 +338,16 @@ class Improvement:
         return [layout for layout in layouts if self.is_wearable(layout.places)]
 
     def is_wearable(self, places: Sequence[MarkerPlace]) -> bool:
-        """Whether places may replace the current ones: digits kept, bones not crowded, palm determined."""
+        """Whether places keep all digits, crowd no bone and determine the palm, so that they may be used."""
         now, palm = self._columns.places, BONE_NAMES[PALM]
         bones, before = (Counter(place.bone for place in some) for some in (places, now))
         crowded = any(count > max(1, before[bone]) for bone, count in bones.items() if bone != palm)
         if crowded or not set(map(digit_of, now)) <= set(map(digit_of, places)):
             return False
-        least = max(palm_spread(now, self._model), _PALM_SURE)
-        return bones[palm] >= min(_ON_BACK, before[palm]) and palm_spread(places, self._model) <= least
+        least = max(palm_spread(now, self._model), _SURE_PALM_SPREAD)
+        return bones[palm] >= min(_FEWEST_ON_PALM, before[palm]) and palm_spread(places, self._model) <= least
 
-    def _shrunk(self) -> list[Columns]:
+    def _shrunk_layouts(self) -> list[Columns]:
         """The layout with one marker dropped, for each marker."""
         places = self._columns.places
         free = [number for number, place in enumerate(places) if place.name not in self._keep]
@@ -372,21 +357,22 @@ class Improvement:
         fewer = [self._columns.chosen([one for one in everything if one != number]) for number in free]
         return self._wearable(fewer) or fewer  # with too few markers no layout is wearable
 
-    def _grown(self) -> list[Columns]:
+    def _grown_layouts(self) -> list[Columns]:
         """The layout with a marker added, for some places."""
         count = len(self._columns.places)
-        added = self._changed(count, self._anywhere(_ADDED, self._columns.places))
+        added = self._with_marker_at(count, self._sampled(_TRIED_PLACES, self._columns.places))
         return self._wearable(added) or added
 
-    def _moved(self, number: int) -> list[Columns]:
+    def _moves(self, number: int) -> list[Columns]:
         """The layout with one marker moved to some other places."""
         places = self._columns.places
         others = places[:number] + places[number + 1 :]
-        near = (self._near(places[number], others) for _ in range(_LOCAL))
+        near = (self._near_place(places[number], others) for _ in range(_NEARBY))
         found = [place for place in near if place is not None]
-        return self._wearable(self._changed(number, found + self._anywhere(_CANDIDATES - _LOCAL, others)))
+        found += self._sampled(_CANDIDATES - _NEARBY, others)
+        return self._wearable(self._with_marker_at(number, found))
 
-    def _changed(self, number: int, places: Sequence[MarkerPlace]) -> list[Columns]:
+    def _with_marker_at(self, number: int, places: Sequence[MarkerPlace]) -> list[Columns]:
         """The layout with marker `number`, perhaps a new one, at each of some places."""
         try:
             fresh = self._people.put_on(places) if places else None
@@ -402,9 +388,9 @@ class Improvement:
             changed.append(columns.renamed(number, now[number].name if stays else self._new_name(place.bone)))
         return changed
 
-    def _near(self, place: MarkerPlace, others: Sequence[MarkerPlace]) -> MarkerPlace | None:
+    def _near_place(self, place: MarkerPlace, others: Sequence[MarkerPlace]) -> MarkerPlace | None:
         """A free place near another one, or None."""
-        for _ in range(_TRIES):
+        for _ in range(_MOST_DRAWS):
             along, around, across = self._rng.standard_normal(3) * _STEP
             palm = place.bone == BONE_NAMES[PALM]
             moved = self._on_grid(
@@ -424,8 +410,8 @@ class Improvement:
         bone = BONE_NAMES.index(place.bone)
         low, high = _PALM_ALONG
         if bone != PALM:
-            margin = _CREASE / float(self._model.skeleton.lengths[bone])
-            low, high = margin, _TIP if place.bone.endswith("distal") else 1.0 - margin
+            margin = _CREASE_MARGIN / float(self._model.skeleton.lengths[bone])
+            low, high = margin, _MOST_ALONG_TIP if place.bone.endswith("distal") else 1.0 - margin
         along, around, across = (
             round(step * round(value / step), 6)
             for value, step in zip((place.along, place.around, place.across), _GRID, strict=True)
@@ -433,10 +419,10 @@ class Improvement:
         fits = low <= along <= high and abs(around) <= _PADS and abs(across) <= _PALM_ACROSS
         return dataclasses.replace(place, along=along, around=around, across=across) if fits else None
 
-    def _anywhere(self, count: int, others: Sequence[MarkerPlace]) -> list[MarkerPlace]:
+    def _sampled(self, count: int, others: Sequence[MarkerPlace]) -> list[MarkerPlace]:
         """Random places on the back and sides of the hand, away from creases and other markers."""
         found: list[MarkerPlace] = []
-        for place in map(self._on_grid, sample_places(_TRIES + 4 * count, rng=self._rng)):
+        for place in map(self._on_grid, sample_places(_MOST_DRAWS + 4 * count, rng=self._rng)):
             if place is not None and len(found) < count and self._is_clear(place, others):
                 found.append(place)
         return found
@@ -444,11 +430,11 @@ class Improvement:
     def _is_clear(self, place: MarkerPlace, others: Sequence[MarkerPlace]) -> bool:
         """Whether a place is on the skin and away from the other markers of the flat hand."""
         try:
-            points = attach_markers(layout_of((*others, place), self._start.radius), self._model).points
+            points = attach_markers(layout_at((*others, place), self._start.radius), self._model).points
         except LayoutError:
             return False
         apart = np.linalg.norm(points[:-1] - points[-1], axis=1).min()
-        return bool(apart > 2.0 * self._start.radius + _CLEAR)
+        return bool(apart > 2.0 * self._start.radius + _LEAST_GAP)
 
     def _new_name(self, bone: str) -> str:
         """A new name for a marker on a bone, such as IndexMiddle2."""
@@ -458,7 +444,7 @@ class Improvement:
 
 
 def sample_places(
-    num_places: int, *, rng: np.random.Generator, apart: float = _APART
+    num_places: int, *, rng: np.random.Generator, apart: float = _LEAST_DISTANCE
 ) -> tuple[MarkerPlace, ...]:
     """Random places on the back and sides of the flat hand; fewer if no more fit."""
     model = HandModel.named("M")
@@ -466,7 +452,7 @@ def sample_places(
     places: list[MarkerPlace] = []
     points: list[Float[np.ndarray, "3"]] = []
     missed = 0
-    while len(places) < num_places and missed < _MISSED:
+    while len(places) < num_places and missed < _MOST_MISSES:
         bone = int(rng.choice(len(BONE_NAMES), p=share / share.sum()))
         name = BONE_NAMES[bone]
         if bone == PALM:
@@ -474,11 +460,11 @@ def sample_places(
             across = rng.uniform(-_PALM_ACROSS, _PALM_ACROSS)
         else:
             along = rng.uniform(*(_TIP_ALONG if name.endswith("distal") else _FINGER_ALONG))
-            around, across = np.clip(_AROUND * rng.standard_normal(), -_MAX_AROUND, _MAX_AROUND), 0.0
+            around, across = (np.clip(_SPREAD_DEG * rng.standard_normal(), -_MOST_DEG, _MOST_DEG), 0.0)
         place = MarkerPlace(f"place{len(places)}", name, along, float(np.deg2rad(around)), across)
         missed += 1
         try:
-            point = np.asarray(attach_markers(layout_of([place], MARKER_RADIUS), model).points[0])
+            point = np.asarray(attach_markers(layout_at([place], MARKER_RADIUS), model).points[0])
         except LayoutError:
             continue  # the place is off the skin
         if all(np.linalg.norm(point - other) > apart for other in points):

@@ -21,8 +21,8 @@ from train.reports.hand_plot import HAND_CAPTION, FlatHand, Mistake, flat_hand, 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_MOST: Final = 15.0  # end of the color scale [deg]
-_TRIALS: Final = (
+_SCALE_END_DEG: Final = 15.0  # [deg] end of the color scale
+_TRIALS_TEXT: Final = (
     "A capture is wrong throughout if some marker is right in fewer than half of its frames; other captures "
     "count with the probability of other labels that the take itself states. Shares of right slots "
     "(mean, worst capture) and of completely right frames in short simulated captures of several people, "
@@ -30,7 +30,7 @@ _TRIALS: Final = (
     "Joints: root mean square error over all joints, of uncalibrated hands; the section on joints is on "
     "calibrated ones."
 )
-_PAIRS: Final = 5  # number of listed similar labels
+_MOST_PAIRS: Final = 5  # number of listed pairs of similar labels
 
 
 def write_glove_page(path: Path, score: LayoutScore) -> None:
@@ -85,7 +85,7 @@ def wrong_line(score: LayoutScore) -> str:
     share, ends = score.wrong
     between = " to ".join(f"{100 * end:.0f}" for end in ends)
     count = sum(len(trial.captures) for trial in score.trials.values())
-    likeliest = [f"{one.words} ({100 * one.probability:.1f} %)" for one in score.alternatives[:_PAIRS]]
+    likeliest = [f"{one.words} ({100 * one.probability:.1f} %)" for one in score.alternatives[:_MOST_PAIRS]]
     return (
         f"labels are wrong throughout a capture with a probability of {100 * share:.0f} % ({between}), "
         f"from {count} captures; most similar: {', '.join(likeliest) or 'no other labels fit nearly as well'}"
@@ -105,7 +105,7 @@ def _captures_section(score: LayoutScore) -> Section:
     caption = f"{HAND_CAPTION}Arrows join markers whose labels may be exchanged, wider for the likelier ones."
     drawn = [(hand_picture(score.layout, right, arrows), caption)] if arrows else []
     table = trial_rows(score.trials, score.layout)
-    return Section("Captures", f"{text[0].upper()}{text[1:]}. {_TRIALS}", table=table, pictures=drawn)
+    return Section("Captures", f"{text[0].upper()}{text[1:]}. {_TRIALS_TEXT}", table=table, pictures=drawn)
 
 
 def _labels_section(score: LayoutScore) -> Section:
@@ -161,7 +161,7 @@ def _draw_joints(figure: Figure, hand: FlatHand, degrees: Float[np.ndarray, "20"
     panel.set_aspect("equal")
     hand.draw(panel, bone_width=2.5, zorder=1)
     panel.plot(*hand.markers.T, "o", color=Paint.SOFT, markersize=5.0, markerfacecolor=Paint.CARD, zorder=2)
-    colors = color_scale(_MOST, 0.0)
+    colors = color_scale(_SCALE_END_DEG, 0.0)
     for bone in sorted({joint.bone for joint in JOINTS}):
         worst = max(degrees[number] for number, joint in enumerate(JOINTS) if joint.bone == bone)
         place, color = hand.bones[bone - 1][0], colors.to_rgba(worst)

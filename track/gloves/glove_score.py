@@ -46,7 +46,8 @@ from train.simulation.takes import simulate_take
 
 METHODS: Final = {"label": label_capture, "track": track_capture}
 CAPTURES: Final = 3
-"""Captures of each kind of work. Equal numbers mean equal people and motions for every layout."""
+"""Number of captures of each kind of work; the same number means the same people and motions for every
+layout."""
 FRAMES: Final = 240
 """Frames of a capture: two seconds."""
 WORK: Final[Mapping[str, SimulatedKind]] = {
@@ -59,20 +60,20 @@ SIDES_EXCHANGED: Final = "left and right are exchanged"
 NOISE: Final = 0.0015
 """Standard deviation of markers around a calibrated hand [m], from optics and moving skin."""
 _TWIN_FRAMES: Final = 600  # frames of each simulated motion
-_SOME_FRAMES: Final = 600  # frames from which joints and sides are judged
-_IN_LINE: Final = 1e-8  # [m^2] Markers with less information about a rotation are in a line.
+_JUDGED_FRAMES: Final = 600  # frames from which joints and sides are judged
+_LINE_INFORMATION: Final = 1e-8  # [m^2] Markers with less information about a rotation are in a line.
 
 # Figures beyond these thresholds get a sentence of advice.
-_UNINFORMED: Final = 0.6  # ratio of a joint's spread to that of an unseen joint
-_SELDOM: Final = 0.02  # share of points, frames or captures in which labels are wrong or markers touch
-_OFTEN: Final = 0.1  # share of frames in which a marker is hidden, or too few markers are seen
-_AT_ONCE: Final = 0.75  # With a smaller share of its markers a hand is seldom found at once.
-_MOST_OF_A_KIND: Final = 4  # sentences of one kind
+_POOR_RATIO: Final = 0.6  # ratio of a joint's spread to that of an unseen joint
+_MISTAKE_SHARE: Final = 0.02  # share of points or captures with a wrong label
+_HIDDEN_SHARE: Final = 0.1  # share of frames in which a marker is hidden, or too few markers are seen
+_AT_ONCE: Final = 0.75  # With a smaller share of its markers a hand is seldom found in the first frame.
+_MOST_SENTENCES: Final = 4  # largest number of sentences of one kind
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trial:
-    """Results on one simulated capture, or their means over the captures of one kind of work."""
+    """Results on one simulated capture, or their means over the captures of a kind of work."""
 
     slots: dict[str, Float[np.ndarray, "M"]]
     """Share of the frames in which each marker is labeled right, by method: `label` and `track`."""
@@ -83,8 +84,9 @@ class Trial:
     size_error: float
     """Mean absolute error of the measured length of the hands [m]."""
     wrong: float = 0.0
-    """Probability that some labels are wrong throughout a capture. It is 1 for labels that are wrong in most
-    frames, otherwise the probability of other labels that the take itself states; mean of both methods."""
+    """Probability that some labels are wrong throughout a capture, as mean of both methods. It is 1 for
+    labels that are wrong in most frames, otherwise the probability of other labels that the take itself
+    states."""
     alternatives: tuple[Alternative, ...] = ()
     """What is wrong throughout a capture, each with its probability, the likeliest first."""
     captures: tuple[Trial, ...] = ()
@@ -110,7 +112,7 @@ class Trial:
         return float(self.slots[method].mean())
 
     def least(self, method: str) -> float:
-        """The same of the worst capture."""
+        """Share of right slots of the worst capture."""
         return min(one.share(method) for one in self.captures or (self,))
 
 
@@ -156,19 +158,15 @@ class LayoutScore:
     @property
     def advice(self) -> tuple[str, ...]:
         """Sentences on what to move, add or drop, the most important first."""
-        kinds = (_alternatives, _captures, _confusions, _joints, _hidden)
+        kinds = (_alternative_advice, _capture_advice, _confusion_advice, _joint_advice, _visibility_advice)
         found: list[_Advice] = []
         for kind in kinds:
-            found += sorted(kind(self), key=lambda advice: -advice[0])[:_MOST_OF_A_KIND]
+            found += sorted(kind(self), key=lambda advice: -advice[0])[:_MOST_SENTENCES]
         return tuple(sentence for _, sentence in sorted(found, key=lambda advice: -advice[0]))
 
 
 def score_glove(
-    glove: AnyGlove,
-    settings: ScoreGloveSettings | None = None,
-    *,
-    on_step: OnStep = no_step,
-    **options: Any,
+    glove: AnyGlove, settings: ScoreGloveSettings | None = None, *, on_step: OnStep = no_step, **options: Any
 ) -> LayoutScore:
     """Score a layout as `handsim glove score` does, with a given labeler or that of the glove.
 
@@ -191,7 +189,7 @@ def score_glove(
     layout, rig = load_layout(glove), load_rig(chosen.rig)
     rng = np.random.default_rng(chosen.seed)
     on_step("simulating hands")
-    hands, seen = _hands(chosen, layout, rig, rng)
+    hands, seen = _observed_hands(chosen, layout, rig, rng)
     on_step("learning the layout, about a minute the first time")
     given = chosen.labeler
     labeler = untrained_labeler(layout) if given is None else load_labeler(layout, given)
@@ -205,7 +203,7 @@ def score_glove(
     return dataclasses.replace(score, trials=trials, is_trained=is_trained, seen_by=seen_by)
 
 
-def _hands(
+def _observed_hands(
     settings: ScoreGloveSettings, layout: MarkerLayout, rig: CameraRig, rng: np.random.Generator
 ) -> tuple[list[ObservedHand], str]:
     """Hands in the requested motion, and a description of it."""
@@ -225,7 +223,7 @@ def _hands(
 def score_layout(
     layout: MarkerLayout, hands: Sequence[ObservedHand], labeler: Labeler, *, rng: np.random.Generator
 ) -> LayoutScore:
-    """Label what a rig sees of gloved hands with a labeler of this layout; without captures."""
+    """Label what a rig sees of gloved hands with a labeler of this layout; no captures are tried."""
     observed = np.concatenate([hand.frames.observed for hand in hands])
     ghosts = np.concatenate([hand.frames.ghosts for hand in hands])
     markers = np.concatenate([hand.frames.markers for hand in hands])
@@ -247,13 +245,13 @@ def score_layout(
     is_seen = np.isfinite(observed[..., 0])
     few_seen = float((is_seen.mean(axis=1) < _AT_ONCE).mean())
     return LayoutScore(
-        layout, seen, clean, corrupted, is_seen.mean(axis=0), few_seen, joint_spreads(_some(hands))
+        layout, seen, clean, corrupted, is_seen.mean(axis=0), few_seen, joint_spreads(_judged_frames(hands))
     )
 
 
-def _some(hands: Sequence[ObservedHand]) -> list[ObservedHand]:
+def _judged_frames(hands: Sequence[ObservedHand]) -> list[ObservedHand]:
     """Some of the frames, evenly spaced."""
-    step = max(1, sum(len(hand.qpos) for hand in hands) // _SOME_FRAMES)
+    step = max(1, sum(len(hand.qpos) for hand in hands) // _JUDGED_FRAMES)
     return [
         ObservedHand(hand.fit, hand.qpos[::step], type(hand.frames)(*(part[::step] for part in hand.frames)))
         for hand in hands
@@ -271,8 +269,8 @@ def layout_spreads(
     """Standard deviation of each joint's error [rad], as root mean square over the frames.
 
     It follows from the information of the seen markers and the limits of the joints, as in the solver. Frames
-    with fewer than four markers give no information. A tracked hand does better, thanks to its motion and the
-    pose prior.
+    with fewer than four markers give no information. Tracking is more accurate, thanks to motion and the pose
+    prior.
     """
     squares, count = np.zeros(NUM_JOINTS), 0
     limits = np.diag(free_spreads() ** -2.0)
@@ -300,14 +298,14 @@ def palm_spread(places: Sequence[MarkerPlace], model: HandModel) -> float:
     palm = [place for place in places if place.bone == BONE_NAMES[PALM]]
     if len(palm) < pose_solver.FEWEST_ON_PART:
         return float("inf")
-    points = attach_markers(layout_of(palm, 0.003), model).points[: len(palm)]
+    points = attach_markers(layout_at(palm, 0.003), model).points[: len(palm)]
     arms = points - points.mean(axis=0)
     information = (arms**2).sum() * np.eye(3) - arms.T @ arms
     least = float(np.linalg.eigvalsh(information)[0])
-    return float(NOISE / np.sqrt(least)) if least > _IN_LINE else float("inf")
+    return float(NOISE / np.sqrt(least)) if least > _LINE_INFORMATION else float("inf")
 
 
-def layout_of(places: Sequence[MarkerPlace], radius: float) -> MarkerLayout:
+def layout_at(places: Sequence[MarkerPlace], radius: float) -> MarkerLayout:
     """A layout of any places, numbered; the first is repeated up to the least number of a glove's markers."""
     copies = (*places, *[places[0]] * (MIN_MARKERS - len(places)))
     named = [dataclasses.replace(place, name=str(number)) for number, place in enumerate(copies)]
@@ -346,9 +344,9 @@ def try_take(truth: Take, layout: MarkerLayout, labeler: Labeler) -> Trial:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", HandSimWarning)
             take = make(capture, glove=layout, labeler=labeler)
-        share, report = _counted(truth, take)
+        share, report = _count_right(truth, take)
         slots[name], frames[name] = share.mean(axis=0), report.figures["frame_accuracy"]
-        wrong.append(_wrong_throughout(layout.names, share, report) or _doubtful(take))
+        wrong.append(_wrong_throughout(layout.names, share, report) or _stated_alternatives(take))
     tracked = take  # by the last method
     errors = [
         (tracked.qpos[:, tracked.hand_index(hand.side), 7:] - truth.qpos[:, number, 7:]) ** 2
@@ -357,7 +355,7 @@ def try_take(truth: Take, layout: MarkerLayout, labeler: Labeler) -> Trial:
     size_error = abs(tracked.hands[0].shape.length - truth.hands[0].shape.length)
     of_methods = [min(1.0, sum(one.probability for one in every)) for every in wrong]
     return Trial(
-        slots, frames, _root_mean(np.concatenate(errors)), size_error, float(np.mean(of_methods)),
+        slots, frames, _root_mean_square(np.concatenate(errors)), size_error, float(np.mean(of_methods)),
         _merged(wrong),
     )  # fmt: skip
 
@@ -367,7 +365,7 @@ def mean_trial(trials: Sequence[Trial]) -> Trial:
     return Trial(
         {name: np.mean([one.slots[name] for one in trials], axis=0) for name in METHODS},
         {name: float(np.mean([one.frames[name] for one in trials])) for name in METHODS},
-        _root_mean(np.array([one.joints**2 for one in trials])),
+        _root_mean_square(np.array([one.joints**2 for one in trials])),
         float(np.mean([one.size_error for one in trials])),
         float(np.mean([one.wrong for one in trials])),
         _merged([one.alternatives for one in trials]),
@@ -387,7 +385,7 @@ def _merged(parts: Sequence[Iterable[Alternative]]) -> tuple[Alternative, ...]:
 def _wrong_throughout(
     names: Sequence[str], share: Float[np.ndarray, "H M"], report: LabelingReport
 ) -> tuple[Alternative, ...]:
-    """What is wrong with the labels of a take in most frames, in the words of its alternatives."""
+    """Labels that are wrong in most frames of a take, as alternatives."""
     found, count = {}, len(names)
     called = report.confusion.argmax(axis=1)
     for slot in np.flatnonzero(share < 0.5):
@@ -409,7 +407,7 @@ def _wrong_throughout(
     return tuple(found.values())
 
 
-def _doubtful(take: Take) -> tuple[Alternative, ...]:
+def _stated_alternatives(take: Take) -> tuple[Alternative, ...]:
     """Alternatives that a take itself states, each with its larger probability of both hands."""
     found: dict[str, Alternative] = {}
     for doubt in doubts_of(take).values():
@@ -421,14 +419,14 @@ def _doubtful(take: Take) -> tuple[Alternative, ...]:
     return tuple(found.values())
 
 
-def _root_mean(squares: Float[np.ndarray, "T 20"]) -> Float[np.ndarray, "20"]:
+def _root_mean_square(squares: Float[np.ndarray, "T 20"]) -> Float[np.ndarray, "20"]:
     """Root mean square over the known values; NaN where none is known."""
     known = np.isfinite(squares)
     sums: Float[np.ndarray, "20"] = np.where(known, squares, 0.0).sum(axis=0)
     return np.sqrt(sums / np.where(known.any(axis=0), known.sum(axis=0), np.nan))
 
 
-def _counted(truth: Take, take: Take) -> tuple[Float[np.ndarray, "H M"], LabelingReport]:
+def _count_right(truth: Take, take: Take) -> tuple[Float[np.ndarray, "H M"], LabelingReport]:
     """Share of the frames in which each marker of each true hand is right, and the count of the true labels.
 
     One more label stands for all labels of hands that the truth does not have.
@@ -448,10 +446,10 @@ _Advice = tuple[float, str]
 """Weight of a sentence (the share of points, frames or joints that it concerns), and the sentence."""
 
 
-def _alternatives(score: LayoutScore) -> Iterator[_Advice]:
+def _alternative_advice(score: LayoutScore) -> Iterator[_Advice]:
     """Advice on markers whose labels are wrong throughout a capture."""
     for one in score.alternatives:
-        if one.probability >= _SELDOM:
+        if one.probability >= _MISTAKE_SHARE:
             yield (
                 one.probability,
                 f"{one.words[0].upper()}{one.words[1:]} in whole captures with a probability of "
@@ -459,11 +457,11 @@ def _alternatives(score: LayoutScore) -> Iterator[_Advice]:
             )
 
 
-def _captures(score: LayoutScore) -> Iterator[_Advice]:
+def _capture_advice(score: LayoutScore) -> Iterator[_Advice]:
     """Advice on the worst marker of the simulated captures."""
     for work, trial in score.trials.items():
         shares = {method: float(trial.slots[method][trial.worst]) for method in METHODS}
-        if min(shares.values()) < 1.0 - _SELDOM:
+        if min(shares.values()) < 1.0 - _MISTAKE_SHARE:
             told = ", ".join(f"{100 * share:.0f} % with {method}" for method, share in shares.items())
             yield (
                 1.0 - min(shares.values()),
@@ -472,11 +470,12 @@ def _captures(score: LayoutScore) -> Iterator[_Advice]:
             )
 
 
-def _confusions(score: LayoutScore) -> Iterator[_Advice]:
+def _confusion_advice(score: LayoutScore) -> Iterator[_Advice]:
+    """Advice on pairs of markers whose labels are confused."""
     names, told = score.layout.names, set()
-    for mistake in mistakes(score.observed.confusion, most=2 * _MOST_OF_A_KIND):
+    for mistake in mistakes(score.observed.confusion, most=2 * _MOST_SENTENCES):
         pair = frozenset((mistake.truth, mistake.called))
-        if mistake.share < _SELDOM or pair in told:
+        if mistake.share < _MISTAKE_SHARE or pair in told:
             continue
         told.add(pair)
         first, second = names[mistake.truth], names[mistake.called]
@@ -487,13 +486,13 @@ def _confusions(score: LayoutScore) -> Iterator[_Advice]:
         )
 
 
-def _joints(score: LayoutScore) -> Iterator[_Advice]:
+def _joint_advice(score: LayoutScore) -> Iterator[_Advice]:
     """Digits with poorly observed joints, and the bone to add a marker to."""
     share = score.joints / free_spreads()
     carried = {marker.bone for marker in score.layout.markers}
     for digit, name in enumerate(DIGITS):
         joints = [number for number, joint in enumerate(JOINTS) if BONES[joint.bone].digit == digit]
-        poor = [number for number in joints if share[number] > _UNINFORMED]
+        poor = [number for number in joints if share[number] > _POOR_RATIO]
         bones = [BONES[JOINTS[number].bone].name for number in (*joints, *poor)]
         bone = next((one for one in reversed(bones) if one not in carried), None)
         if not poor or bone is None:
@@ -509,9 +508,9 @@ def _joints(score: LayoutScore) -> Iterator[_Advice]:
         )
 
 
-def _hidden(score: LayoutScore) -> Iterator[_Advice]:
+def _visibility_advice(score: LayoutScore) -> Iterator[_Advice]:
     """Advice where frames show too few of a hand's markers, and on each marker that is seldom seen."""
-    if score.few_seen > _OFTEN:
+    if score.few_seen > _HIDDEN_SHARE:
         count = score.layout.num_markers
         yield (
             score.few_seen,
@@ -519,7 +518,7 @@ def _hidden(score: LayoutScore) -> Iterator[_Advice]:
             f"fewer than {math.ceil(_AT_ONCE * count)} of {count} are seen, too few to find a hand at once.",
         )
     for name, seen in zip(score.layout.names, score.seen, strict=True):
-        if seen < 1.0 - _OFTEN:
+        if seen < 1.0 - _HIDDEN_SHARE:
             yield (
                 1.0 - float(seen),
                 f"Move {name} towards the back of the hand: it is a point in {100 * seen:.0f} % of the "

@@ -1,9 +1,9 @@
-"""A glove that labeled captures show: where each marker sits, on whose hands, and how well that labels.
+"""A glove learned from labeled captures: where each marker sits, on whose hands, and how well that labels.
 
-Nobody has to say which column is which marker. Columns that stay near each other may be a hand; a search
+The user need not say which column is which marker. Columns that stay near each other may be a hand. A search
 finds the bone that carries each of them (`marker_search`), hands and places are fitted together (`fit`), and
-the places of all hands make one layout. The last third of each capture is kept for the proof: it is labeled
-with the layout, from points without names.
+the places of all hands make one layout. The last third of each capture is kept for the proof, which labels
+its points with the layout.
 """
 
 from __future__ import annotations
@@ -38,28 +38,30 @@ from track.gloves.fit import FINE, FLESH, FittedPlaces, fit_places, shown_flesh
 from track.gloves.marker_search import FittedHand, diverse_frames, search_places
 from track.gloves.settings import LearnSettings
 from track.kinematics.pose_solver import PoseSolver
-from track.user import User
+from track.user import ATTACHMENT_ARRAYS, User
 
-_FRAMES: Final = 60  # of each capture, in which hands and places are fitted
-_HAND: Final = 0.26  # [m] largest distance between two markers of a hand
-_RIGID: Final = 0.004  # [m] Columns whose distances change less belong to a rigid object.
-_LEARNED: Final = 2 / 3  # share of each capture that is learned from
-_ROUNDS: Final = 3  # of fits of all hands to a common layout
+_FIT_FRAMES: Final = 60  # number of frames of each capture to which hands and places are fitted
+_MOST_EXTENT: Final = 0.26  # [m] largest distance between two markers of a hand
+_RIGID_CHANGE: Final = 0.004  # [m] Columns whose distances change less belong to a rigid object.
+_LEARNED_SHARE: Final = 2 / 3  # share of each capture that is learned from
+_ROUNDS: Final = 3  # rounds of fitting all hands to a common layout
 _STARTS: Final = ("S", "L")  # sizes of the hands that a fit begins with
-_FITS: Final = 0.003  # [m] A hand whose markers are farther from their places in the median is none.
-_TEMPERATURE: Final = 2.0  # by which differences in energy are divided: errors of hands repeat
-_SAME: Final = 0.015  # [m] A marker that is nearer to a place is there.
-_SURE: Final = 0.9  # A marker is told as doubtful if its place has a smaller probability.
-_LOOKED_AT: Final = 300  # frames in which exchanged columns are looked for
-_OUTLIER: Final = 0.01  # [m] robust scale of poses then
-_BENT: Final = 0.008  # [m] In frames where a marker is farther from its place, columns may be exchanged.
-_SUSPECTS: Final = 4  # The markers with the largest distances there are tried.
-_FITS_AGAIN: Final = 0.5  # An exchange leaves a smaller share of the squared distances.
-_EXCHANGED: Final = 0.02  # Exchanges in a larger share of the frames are told.
-_SHOWN: Final = 8  # names in a sentence
-# A point beyond every skin moves toward the middle of its bone, by these shares of the way.
+_MOST_RESIDUAL: Final = 0.003  # [m] largest median distance of a hand's markers from their places
+_TEMPERATURE: Final = 2.0  # Differences in energy are divided by this, because errors of hands repeat.
+_SAME_PLACE: Final = 0.015  # [m] A marker nearer to a place counts as there.
+_SURE_PROBABILITY: Final = 0.9  # A marker's place with a smaller probability is reported as doubtful.
+_EXAMINED_FRAMES: Final = 300  # number of frames in which exchanged columns are searched
+_OUTLIER_DISTANCE: Final = 0.01  # [m] robust scale of poses in that search
+# [m] In frames where a marker is farther from its place, columns may be exchanged.
+_BENT_DISTANCE: Final = 0.008
+_MOST_SUSPECTS: Final = 4  # number of tried markers, those with the largest distances in these frames
+_MOST_RATIO: Final = 0.5  # An exchange leaves a smaller share of the squared distances.
+_EXCHANGED_SHARE: Final = 0.02  # An exchange in a larger share of the frames is reported.
+_MOST_NAMES: Final = 8  # largest number of names in a sentence
+# A point off the skin is moved toward the middle of its bone by these shares of the way.
 _INWARDS: Final = (0.0, 0.2, 0.4, 0.6)
-_PAIRED: Final = 0.02  # [m] Markers of the other hand at most this far from a place are the same marker.
+# [m] Markers of the other hand at most this far from a place are the same marker.
+_PAIR_DISTANCE: Final = 0.02
 
 
 class TrialHand(NamedTuple):
@@ -77,16 +79,16 @@ class TrialHand(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LearnedGlove:
-    """A layout that captures show, and the hands in them."""
+    """A layout learned from captures, and the hands in them."""
 
     layout: MarkerLayout
     hands: tuple[TrialHand, ...]
     left_out: tuple[str, ...]
     """Sentences on columns that do not belong to a hand, or not to the glove."""
     spreads: Float[np.ndarray, "M"]
-    """How far each marker's place differs between the hands and the layout, root mean square [m]."""
+    """Root mean square distance of each marker's places on the hands from its place in the layout [m]."""
     sure: Float[np.ndarray, "M"]
-    """For each marker the probability that no other hand fits as well with the marker elsewhere."""
+    """For each marker the probability of its place, against the best hand that has it elsewhere."""
     doubt: tuple[str, ...]
     """Sentences on places that are unsure, and on columns that exchange their markers."""
 
@@ -101,7 +103,7 @@ class LearnedGlove:
         )
 
 
-class _Part(NamedTuple):
+class _ColumnGroup(NamedTuple):
     """Columns of a capture that stay together like a hand."""
 
     capture: int
@@ -157,10 +159,10 @@ def captures_of(captures: AnyCapture | Sequence[AnyCapture]) -> list[Capture]:
     return [capture_of(one) for one in captures]
 
 
-class _Found(NamedTuple):
+class _HandColumns(NamedTuple):
     """A hand in some columns: the number of each marker's column in its part."""
 
-    part: _Part
+    part: _ColumnGroup
     side: Side
     columns: Mapping[str, int]
 
@@ -176,16 +178,16 @@ class _Learning:
 
     def learned(self, name: str, start: MarkerLayout | None) -> LearnedGlove:
         """Find the hands in all parts, and fit one layout to them."""
-        layout, hands = start, list[_Found]()
-        parts = [part for number, source in enumerate(self._sources) for part in _parts(number, source)]
+        layout, hands = start, list[_HandColumns]()
+        parts = [part for number, source in enumerate(self._sources) for part in _groups(number, source)]
         for part in sorted(parts, key=lambda one: one.points.shape[:2][::-1], reverse=True):
             known = () if layout is None else tuple(one for one in layout.names if one in part.names)
             if layout is not None and len(known) >= MIN_MARKERS:
                 columns = {one: part.names.index(one) for one in known}
-                fits = {side: self._fitted(_Found(part, side, columns), layout) for side in self._sides}
-                hands.append(_Found(part, min(fits, key=lambda side: fits[side].cost), columns))
+                fits = {side: self._fitted(_HandColumns(part, side, columns), layout) for side in self._sides}
+                hands.append(_HandColumns(part, min(fits, key=lambda side: fits[side].cost), columns))
             elif (found := self._searched(part)) is not None:
-                shown = layout_of(found.hand, found.hand.layout)
+                shown = hand_layout(found.hand, found.hand.layout)
                 columns = {part.names[column]: int(column) for column in found.columns}
                 if layout is None:
                     layout = dataclasses.replace(shown, name=name)
@@ -193,12 +195,12 @@ class _Learning:
                     pairs = _paired(layout, shown)
                     columns = {one: columns[other] for one, other in pairs.items()}
                 if columns:
-                    hands.append(_Found(part, found.side, columns))
+                    hands.append(_HandColumns(part, found.side, columns))
         if layout is None or not hands:
             raise CaptureError("no hand is in the captures, expected columns of 5 or more markers of one")
         return self._common(dataclasses.replace(layout, name=name), hands)
 
-    def _searched(self, part: _Part) -> FittedHand | None:
+    def _searched(self, part: _ColumnGroup) -> FittedHand | None:
         """The likeliest hand in the columns of a part; None if none fits.
 
         Both sides are tried whatever was asked for, because a hand of the wrong side fits nearly as well.
@@ -206,7 +208,7 @@ class _Learning:
         found = search_places(part.points, part.names, self._radius, on_step=self._on_step)
         asked = [one for one in found if one.side in self._sides]
         best, likeliest = (asked or found)[0], found[0]
-        if np.median(best.residuals) > _FITS or len(best.columns) < MIN_MARKERS:
+        if np.median(best.residuals) > _MOST_RESIDUAL or len(best.columns) < MIN_MARKERS:
             return None
         if best.side not in self._sides:
             raise CaptureError(f"the columns fit a {best.side} hand and none that is asked for; give hands")
@@ -215,16 +217,16 @@ class _Learning:
         self._sure |= _probabilities(asked)
         return best
 
-    def _common(self, layout: MarkerLayout, hands: Sequence[_Found]) -> LearnedGlove:
+    def _common(self, layout: MarkerLayout, hands: Sequence[_HandColumns]) -> LearnedGlove:
         """Fit all hands to one layout, and the layout to all hands, by turns."""
         self._on_step("fitting hands and places together")
         flesh = FLESH
         for _ in range(_ROUNDS):
             fitted = [self._fitted(one, layout, flesh) for one in hands]
             flesh = shown_flesh(np.concatenate([one.residuals for one in fitted]))
-            places = [{place.name: place for place in layout_of(one.hand, layout).markers} for one in fitted]
-            layout = _mean_layout(layout, places)
-        wearable = settle_glove(_only(layout, layout.names), HandModel.named("M")).layout
+            found = [{place.name: place for place in hand_layout(one.hand, layout).markers} for one in fitted]
+            layout = _mean_layout(layout, found)
+        wearable = settle_glove(_with_markers(layout, layout.names), HandModel.named("M")).layout
         layout = dataclasses.replace(wearable, sides=tuple(sorted({one.side for one in hands})))
         done, doubt = list[TrialHand](), list(self._doubt)
         for one, fit in zip(hands, fitted, strict=True):
@@ -237,16 +239,16 @@ class _Learning:
             doubt += _exchanges(one, fit.hand, self._sources[one.part.capture])
         sure = np.array([self._sure.get(name, 1.0) for name in layout.names])
         for name, marker, share in zip(layout.names, layout.markers, sure, strict=True):
-            if share < _SURE:
+            if share < _SURE_PROBABILITY:
                 doubt.append(f"{name} may sit elsewhere than on {marker.bone} ({100 * (1 - share):.0f} %)")
-        left_out = *_left_out(self._sources, done), *_beside(self._sources, done)
+        left_out = *_left_out(self._sources, done), *_forearm_hints(self._sources, done)
         return LearnedGlove(layout, tuple(done), left_out, _spreads(layout, done), sure, tuple(doubt))
 
-    def _fitted(self, one: _Found, layout: MarkerLayout, flesh: float = FLESH) -> FittedPlaces:
+    def _fitted(self, one: _HandColumns, layout: MarkerLayout, flesh: float = FLESH) -> FittedPlaces:
         """A hand in the markers of a layout that it has, begun from a small and from a large hand."""
-        own = _only(layout, one.columns)
-        points = _canonical(one, own.names)
-        points = points[diverse_frames(points, _FRAMES)]
+        own = _with_markers(layout, one.columns)
+        points = _right_points(one, own.names)
+        points = points[diverse_frames(points, _FIT_FRAMES)]
         starts = [settle_glove(own, HandModel.named(size)) for size in _STARTS]
         return min(
             (fit_places(points, start, gain=FINE, flesh=flesh) for start in starts), key=lambda fit: fit.cost
@@ -255,7 +257,7 @@ class _Learning:
 
 def _labeled(source: Capture, layout: MarkerLayout) -> Capture:
     """A capture with columns of a layout's names: as it is, or labeled with the layout if it has none."""
-    if len(set(layout.names) & {_bare(name) for name in source.names}) >= MIN_MARKERS:
+    if len(set(layout.names) & {_bare_name(name) for name in source.names}) >= MIN_MARKERS:
         return source
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of markers that are elsewhere, which are corrected here
@@ -264,22 +266,22 @@ def _labeled(source: Capture, layout: MarkerLayout) -> Capture:
     return Capture(names, np.concatenate([take.observed(side) for side in take.sides], axis=1), source.rate)
 
 
-def _bare(name: str) -> str:
+def _bare_name(name: str) -> str:
     """The name of a column without its subject."""
     return name.rsplit(":", 1)[-1].strip()
 
 
-def _parts(number: int, source: Capture) -> Iterator[_Part]:
+def _groups(number: int, source: Capture) -> Iterator[_ColumnGroup]:
     """The groups of a capture's columns that may be hands, in the frames that are learned from."""
     learned = source.positions[: _num_learned(source)]
-    for columns in _together(learned):
-        names = tuple(_bare(source.names[column]) for column in columns)
-        yield _Part(number, columns, names, learned[:, columns])
+    for columns in _hand_groups(learned):
+        names = tuple(_bare_name(source.names[column]) for column in columns)
+        yield _ColumnGroup(number, columns, names, learned[:, columns])
 
 
 def _num_learned(source: Capture) -> int:
     """Number of a capture's first frames that are learned from."""
-    return max(1, round(_LEARNED * source.num_frames))
+    return max(1, round(_LEARNED_SHARE * source.num_frames))
 
 
 def held_out(source: Capture) -> Capture:
@@ -288,14 +290,14 @@ def held_out(source: Capture) -> Capture:
     return dataclasses.replace(source, positions=source.positions[first:])
 
 
-def _only(layout: MarkerLayout, names: Collection[str]) -> MarkerLayout:
+def _with_markers(layout: MarkerLayout, names: Collection[str]) -> MarkerLayout:
     """The layout with some of its markers, for both hands."""
     return dataclasses.replace(
         layout, markers=tuple(one for one in layout.markers if one.name in names), sides=SIDES
     )
 
 
-def _canonical(one: _Found, names: Sequence[str]) -> Float[np.ndarray, "T M 3"]:
+def _right_points(one: _HandColumns, names: Sequence[str]) -> Float[np.ndarray, "T M 3"]:
     """The markers of a hand in some order [m], as those of a right one."""
     points = one.part.points[:, [one.columns[name] for name in names]]
     return points @ MIRROR if one.side == "left" else points
@@ -312,54 +314,54 @@ def _probabilities(found: Sequence[FittedHand]) -> dict[str, float]:
         far = np.full(3, np.inf)
         shown = np.array([own.get(column, far) for column in best.columns.tolist()])
         off = np.linalg.norm(shown - best.hand.attachment.points, axis=1)
-        elsewhere = (off > _SAME) | (one.side != best.side)
+        elsewhere = (off > _SAME_PLACE) | (one.side != best.side)
         rival[elsewhere] = np.minimum(rival[elsewhere], one.cost - best.cost)
     shares = 1.0 / (1.0 + np.exp(-0.5 * rival / _TEMPERATURE))
     return dict(zip(best.hand.layout.names, shares.tolist(), strict=True))
 
 
-def _exchanges(one: _Found, hand: GloveFit, source: Capture) -> Iterator[str]:
-    """Sentences on columns that have another marker's points in a part of the capture.
+def _exchanges(one: _HandColumns, hand: GloveFit, source: Capture) -> Iterator[str]:
+    """Sentences on columns that hold another marker's points in a part of the capture.
 
-    The hand bends to such points; if they are exchanged back, it fits again.
+    Such points bend the hand; exchanging them back makes it fit again.
     """
     names = hand.layout.names
-    points = _canonical(one, names)
+    points = _right_points(one, names)
     seen = np.isfinite(points[..., 0]).sum(axis=1) >= MIN_MARKERS
-    rows = spread_out(np.flatnonzero(seen), _LOOKED_AT)
+    rows = spread_out(np.flatnonzero(seen), _EXAMINED_FRAMES)
     squares = _squares(hand, points[rows])
-    bad = squares.max(axis=1) > _BENT**2
-    worst = sorted(np.argsort(squares[bad].sum(axis=0))[-_SUSPECTS:].tolist())
+    bad = squares.max(axis=1) > _BENT_DISTANCE**2
+    worst = sorted(np.argsort(squares[bad].sum(axis=0))[-_MOST_SUSPECTS:].tolist())
     for first, second in itertools.combinations(worst if bad.any() else (), 2):
         changed = points[rows[bad]]
         changed[:, [first, second]] = changed[:, [second, first]]
-        wrong = _squares(hand, changed).sum(axis=1) < _FITS_AGAIN * squares[bad].sum(axis=1)
-        if wrong.sum() > _EXCHANGED * len(rows):
+        wrong = _squares(hand, changed).sum(axis=1) < _MOST_RATIO * squares[bad].sum(axis=1)
+        if wrong.sum() > _EXCHANGED_SHARE * len(rows):
             time = rows[bad][wrong.argmax()] / source.rate
             yield f"{names[first]} and {names[second]} are exchanged from {time:.1f} s on, or for a time"
 
 
 def _squares(hand: GloveFit, points: Float[np.ndarray, "F M 3"]) -> Float[np.ndarray, "F M"]:
     """Squared distance of each point from its marker on the posed hand [m^2]; zero where missing."""
-    poses = PoseSolver(hand, outlier_distance=_OUTLIER).solve(points)
+    poses = PoseSolver(hand, outlier_distance=_OUTLIER_DISTANCE).solve(points)
     squares = ((points - hand.markers(poses.qpos)[0]) ** 2).sum(axis=2)
     return np.where(np.isfinite(squares), squares, 0.0)
 
 
 def _left_out(sources: Sequence[Capture], hands: Sequence[TrialHand]) -> Iterator[str]:
-    """A sentence on the columns of each capture that are no marker of the glove."""
+    """A sentence for each capture on its columns that are no marker of the glove."""
     for number, source in enumerate(sources):
         own = {column for one in hands if one.capture == number for column in one.columns.values()}
         others = [name for column, name in enumerate(source.names) if column not in own]
         if others:
-            shown = ", ".join(others[:_SHOWN]) + (", ..." if len(others) > _SHOWN else "")
+            shown = ", ".join(others[:_MOST_NAMES]) + (", ..." if len(others) > _MOST_NAMES else "")
             where = f"capture {number + 1}: " if len(sources) > 1 else ""
             count = f"{len(others)} of {len(source.names)} columns"
             yield f"{where}{count} are on no bone of the hand: {shown}"
 
 
-def layout_of(hand: GloveFit, like: MarkerLayout) -> MarkerLayout:
-    """The layout with the places of a hand's markers, which stay on the bones of a layout where they can."""
+def hand_layout(hand: GloveFit, like: MarkerLayout) -> MarkerLayout:
+    """The layout with the places of a hand's markers, on the same bones as in another layout if possible."""
     known = {one.name: one for one in like.markers}
     layout = dataclasses.replace(hand.layout, markers=tuple(known[one] for one in hand.layout.names))
     for index, point in enumerate(hand.attachment.points):
@@ -382,24 +384,24 @@ def _in_whole_glove(hand: GloveFit, layout: MarkerLayout) -> GloveFit:
     """A hand in all markers of a layout: its own stay where they are."""
     worn = settle_glove(layout, hand.model).attachment
     rows = [layout.names.index(name) for name in hand.layout.names]
-    parts = {key: getattr(worn, key).copy() for key in ("points", "normals", "bone_indices", "bone_weights")}
+    parts = {key: getattr(worn, key).copy() for key in ATTACHMENT_ARRAYS}
     for key, values in parts.items():
         values[rows] = getattr(hand.attachment, key)
     return GloveFit(hand.model, Attachment(layout, **parts))
 
 
-def _together(points: Float[np.ndarray, "T N 3"]) -> Iterator[Int[np.ndarray, "N"]]:
-    """Groups of columns that are never farther apart than markers of a hand, and move against each other."""
+def _hand_groups(points: Float[np.ndarray, "T N 3"]) -> Iterator[Int[np.ndarray, "N"]]:
+    """Groups of columns that are never farther apart than a hand's markers, and move against each other."""
     from scipy.cluster.hierarchy import fcluster, linkage
 
     first, second = np.triu_indices(points.shape[1], 1)
     low, high = _distances(points, first, second)
     high = np.where(np.isfinite(high), high, 1.0)
-    groups = fcluster(linkage(high, "complete"), _HAND, "distance")
+    groups = fcluster(linkage(high, "complete"), _MOST_EXTENT, "distance")
     for group in np.unique(groups):
         columns = np.flatnonzero(groups == group)
         own = np.isin(first, columns) & np.isin(second, columns)
-        is_rigid = np.nanmax(high[own] - low[own], initial=0.0) < _RIGID
+        is_rigid = np.nanmax(high[own] - low[own], initial=0.0) < _RIGID_CHANGE
         if MIN_MARKERS <= len(columns) <= MAX_MARKERS and not is_rigid:
             yield columns
 
@@ -408,15 +410,15 @@ def _distances(
     points: Float[np.ndarray, "T N 3"], first: Int[np.ndarray, "P"], second: Int[np.ndarray, "P"]
 ) -> Float[np.ndarray, "2 P"]:
     """Low and high distances of pairs of columns over time [m]; NaN of pairs never seen together."""
-    some = spread_out(points, _LOOKED_AT)
+    some = spread_out(points, _EXAMINED_FRAMES)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # columns that are never seen together
         apart = np.linalg.norm(some[:, first] - some[:, second], axis=2)
         return np.nanquantile(apart, (0.02, 0.98), axis=0) if apart.size else np.empty((2, 0))
 
 
-def _beside(sources: Sequence[Capture], hands: Sequence[TrialHand]) -> Iterator[str]:
-    """A sentence on columns beside each hand that keep their distances, as those on its forearm do."""
+def _forearm_hints(sources: Sequence[Capture], hands: Sequence[TrialHand]) -> Iterator[str]:
+    """A sentence for each hand on columns beside it that keep their distances, as on a forearm."""
     for one in hands:
         names, points = sources[one.capture].names, sources[one.capture].positions
         taken = {
@@ -425,11 +427,11 @@ def _beside(sources: Sequence[Capture], hands: Sequence[TrialHand]) -> Iterator[
         own = np.array([*one.columns.values()])
         others = np.array([column for column in range(len(names)) if column not in taken], dtype=int)
         _, far = _distances(points, np.repeat(others, len(own)), np.tile(own, len(others)))
-        near = others[(far.reshape(len(others), len(own)) < _HAND).any(axis=1)]
+        near = others[(far.reshape(len(others), len(own)) < _MOST_EXTENT).any(axis=1)]
         while len(near):
             low, high = _distances(points, np.repeat(near, len(near)), np.tile(near, len(near)))
             moved = np.nan_to_num(high - low, nan=1.0).reshape(len(near), len(near))
-            if moved.max() < _RIGID:
+            if moved.max() < _RIGID_CHANGE:
                 break
             near = np.delete(near, moved.sum(axis=1).argmax())
         if len(near) >= FEWEST:
@@ -442,18 +444,17 @@ def _beside(sources: Sequence[Capture], hands: Sequence[TrialHand]) -> Iterator[
 
 
 def _paired(layout: MarkerLayout, other: MarkerLayout) -> dict[str, str]:
-    """The markers of another layout at the places of a layout's; none if fewer than five are the same."""
+    """The markers of another layout at the places of a layout's; none if fewer than five agree."""
     from scipy.optimize import linear_sum_assignment
 
     points = [attach(one, "M").attachment.points for one in (layout, other)]
     apart = np.linalg.norm(points[0][:, None] - points[1], axis=2)
     rows, columns = linear_sum_assignment(apart)
-    near = apart[rows, columns] < _PAIRED
+    near = apart[rows, columns] < _PAIR_DISTANCE
     if near.sum() < MIN_MARKERS:
         return {}
-    return {
-        layout.names[row]: other.names[column] for row, column in zip(rows[near], columns[near], strict=True)
-    }
+    pairs = zip(rows[near], columns[near], strict=True)
+    return {layout.names[row]: other.names[column] for row, column in pairs}
 
 
 def _mean_layout(layout: MarkerLayout, places: Sequence[Mapping[str, MarkerPlace]]) -> MarkerLayout:

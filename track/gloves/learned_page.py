@@ -1,11 +1,10 @@
-"""The page on a learned glove: its markers on the hand and how well they fit, the hands, what is left out."""
+"""The page on a learned glove: its markers and how well they fit, the hands, and columns left out."""
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -15,40 +14,27 @@ from handsim.pages import NOTHING, Section, html_list, write_sections
 from track.gloves.learned_glove import LearnedGlove
 from train.reports.hand_plot import HAND_CAPTION, residual_picture
 
-_MARKERS = (
+_MARKERS_TEXT = (
     "Along: 0 at the bone's near end, 1 at its far end. Around: 0 on the back, 90 on the thumb's side. "
     "Across: hand breadths from the palm's middle towards the thumb. Residual: root mean square distance of "
     "the marker from its place on the fitted hands. Between hands: root mean square distance of the hands' "
     "own places from the layout's."
 )
-_HANDS = (
+_HANDS_TEXT = (
     "Lengths and breadths are those of the fitted hands. Markers on a bone show its direction well and its "
     "length poorly, so that these are rough until <code>handsim calibrate</code>."
 )
 
 
-class HandRow(NamedTuple):
-    """A hand of a capture, in words."""
-
-    capture: str
-    side: str
-    markers: str
-    length: str
-    breadth: str
-
-
 def write_learned_page(path: Path, learned: LearnedGlove, captures: Sequence[str] = ()) -> None:
     """Write the page on a learned glove; the captures have numbers unless their names are given."""
     layout = learned.layout
-    caption = (
-        f"{HAND_CAPTION}Colors: distance of the points of each marker from its place on the fitted hands."
-    )
+    caption = f"{HAND_CAPTION}Colors: distance of a marker's points from its place on the fitted hands."
     drawn = residual_picture(layout, np.nan_to_num(marker_residuals(learned)))
-    hands = [["capture", "hand", "markers", "length [mm]", "breadth [mm]"], *hand_rows(learned, captures)]
     left = html_list(learned.left_out, "ul") if learned.left_out else "Every column belongs to a hand."
     sections = [
-        Section("Markers", _MARKERS, pictures=[(drawn, caption)], table=marker_rows(learned)),
-        Section("Hands", _HANDS, table=hands),
+        Section("Markers", _MARKERS_TEXT, pictures=[(drawn, caption)], table=marker_rows(learned)),
+        Section("Hands", _HANDS_TEXT, table=hand_rows(learned, captures)),
         Section("Columns left out", left),
     ]
     lead = f"{origin(learned)}. The markers have a radius of {1e3 * layout.radius:.1f} mm."
@@ -56,7 +42,7 @@ def write_learned_page(path: Path, learned: LearnedGlove, captures: Sequence[str
 
 
 def origin(learned: LearnedGlove) -> str:
-    """How many markers were learned from how many hands, in words."""
+    """Number of markers, and of the hands from which they were learned, in words."""
     count = len(learned.hands)
     hands = "one hand" if count == 1 else f"{count} hands"
     return f"{learned.layout.num_markers} markers, learned from {hands} in labeled captures"
@@ -70,24 +56,20 @@ def marker_rows(learned: LearnedGlove) -> list[list[str]]:
     worn = [name for one in learned.hands for name in one.columns]
     figures = zip(learned.layout.markers, marker_residuals(learned), learned.spreads, strict=True)
     for marker, residual, spread in figures:
-        # One hand does not differ from itself, beyond what the layout's rounding does to its places.
+        # The places of a single hand differ from the layout by rounding alone.
         differs = _millimeters(spread if worn.count(marker.name) > 1 else np.nan)
-        rows.append([marker.name, marker.bone, *_place(marker), _millimeters(residual), differs])
+        rows.append([marker.name, marker.bone, *_place_cells(marker), _millimeters(residual), differs])
     return rows
 
 
-def hand_rows(learned: LearnedGlove, captures: Sequence[str] = ()) -> list[HandRow]:
-    """The hands of each capture: its name or number, side, number of markers, length and breadth [mm]."""
-    return [
-        HandRow(
-            captures[one.capture] if captures else str(one.capture + 1),
-            one.hand.side,
-            str(len(one.columns)),
-            f"{1e3 * one.hand.model.shape.length:.0f}",
-            f"{1e3 * one.hand.model.shape.breadth:.0f}",
-        )
-        for one in learned.hands
-    ]
+def hand_rows(learned: LearnedGlove, captures: Sequence[str] = ()) -> list[list[str]]:
+    """Table of the hands of each capture, header first; a capture has its name or number."""
+    rows = [["capture", "hand", "markers", "length [mm]", "breadth [mm]"]]
+    for one in learned.hands:
+        capture, shape = captures[one.capture] if captures else str(one.capture + 1), one.hand.shape
+        size = [f"{1e3 * measure:.0f}" for measure in (shape.length, shape.breadth)]
+        rows.append([capture, one.hand.side, str(len(one.columns)), *size])
+    return rows
 
 
 def marker_residuals(learned: LearnedGlove) -> Float[np.ndarray, "M"]:
@@ -98,7 +80,7 @@ def marker_residuals(learned: LearnedGlove) -> Float[np.ndarray, "M"]:
         return np.asarray(np.sqrt(np.nanmean(residuals**2, axis=0)))
 
 
-def _place(marker: MarkerPlace) -> list[str]:
+def _place_cells(marker: MarkerPlace) -> list[str]:
     """The numbers of a place, as in a layout's file."""
     across = f"{marker.across:.2f}" if marker.bone == "palm" else ""
     around = np.rad2deg(marker.around).round() + 0.0  # never -0

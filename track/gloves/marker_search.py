@@ -1,10 +1,10 @@
-"""A search for the places of markers that nobody described: which bone carries each column of a recording.
+"""A search for the places of unknown markers: which bone carries each column of a recording.
 
-The points of a column belong to one marker, all the time. A hand of mean proportions is laid into a few
-frames in many orientations and gestures. Each column then takes the place on the skin that is nearest to its
-points over all these frames, and poses are solved for these places, by turns, until no place changes. A
-column that is near no place does not belong to the hand. A hand may slide along its own fingers, and fingers
-are alike: the best hands are tried again slid, in other sizes, and with their fingers exchanged.
+The points of a column belong to one marker throughout. A hand of mean proportions is laid into a few frames
+in many orientations and gestures. Two steps alternate until no place changes: each column takes the place on
+the skin that is nearest to its points over all these frames, and poses are solved for these places. A column
+that is near no place does not belong to the hand. Because a hand may slide along its own fingers, and fingers
+are alike, the best hands are tried again slid, in other sizes, and with their fingers exchanged.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from typing import Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from numpy.typing import NDArray
 
 from gloves.fit import Attachment, GloveFit, carried
 from gloves.layout import MIN_MARKERS, MarkerLayout, MarkerPlace
 from gloves.takes.points import far_apart, spread_out
+from handsim.arrays import Doubles, Integers
 from handsim.callbacks import OnStep, no_step
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import BONE_NAMES, DIGIT_OF_BONE, DIGITS, PALM, SIDES, SIZES, Side
@@ -32,44 +32,46 @@ from track.kinematics.pose_solver import RESTING, PoseSolver
 from track.kinematics.pose_spread import resting_prior
 
 _FRAMES, _FIRST_FRAMES = 12, 6  # frames in which hands are compared, and those of the first poses
-_POOL: Final = 600  # frames that these are chosen from
-_PLACES: Final = 500  # places on the skin, 6 mm apart
-_MOVES: Final = 0.003  # [m] standard deviation of a marker against its bone
-_NEAR: Final = 0.005  # [m] standard deviation of its distance from the nearest place
-_OWN: Final = 0.6  # share of this distance that its own place has
-_LEFT_OUT: Final = 25.0  # cost of a column that does not belong to the hand
-_FARTHEST: Final = 0.02  # [m] Larger distances cost no more.
+_POOL_FRAMES: Final = 600  # number of frames from which these are chosen
+_NUM_PLACES: Final = 500  # places on the skin, 6 mm apart
+_BONE_SPREAD: Final = 0.003  # [m] standard deviation of a marker against its bone
+_PLACE_SPREAD: Final = 0.005  # [m] standard deviation of its distance from the nearest place
+_PLACE_WEIGHT: Final = 0.6  # A marker lies at this share of the way from the nearest place to its mean point.
+_LEFT_OUT_COST: Final = 25.0  # cost of a column that does not belong to the hand
+_MOST_DISTANCE: Final = 0.02  # [m] Larger distances cost no more.
 _CONVERGED: Final = 0.1  # smallest gain in energy of a round
-_PALMAR: Final = 2.0  # cost of a place on a bone's side; on the palm's side it is twice as high
-_BEHIND: Final = -0.1  # [palm lengths] Places behind the wrist's joint are of the arm.
-_ROTATIONS, _GESTURES = 120, 10  # of the hand that is laid into a frame
-_DRAWN: Final = 400  # poses from which these gestures are chosen
-_REFERENCES: Final = 3  # frames that it is laid into
-_RIGID_ROUNDS: Final = (4, 8)  # of all such hands, and of the better quarter
+_PALMAR_COST: Final = 2.0  # cost of a place on a bone's side; places on the palm's side cost twice as much
+_WRIST_END: Final = -0.1  # [palm lengths] Places behind the wrist's joint belong to the arm.
+_ROTATIONS, _GESTURES = 120, 10  # numbers of orientations and gestures of the hand that is laid into a frame
+_DRAWN_POSES: Final = 400  # poses from which these gestures are chosen
+_REFERENCE_FRAMES: Final = 3  # number of frames into which it is laid
+_RIGID_ROUNDS: Final = (4, 8)  # rounds of alignment of all such hands, and of the better quarter
 _RIGID_SCALE: Final = 0.015  # [m] robust scale of their alignment
-_ARTICULATED, _TRIED = 150, 8  # numbers of solutions in each step
-# Numbers of hands that are fitted, more for few columns, which more hands fit; and of those fitted again.
-_STARTS, _FEWEST_STARTS, _FINER = 560, 14, 8
+# largest numbers of solutions with joint angles, and of new ones in each step
+_MOST_ARTICULATED, _MOST_TRIED = 150, 8
+# Numbers of fitted hands, more for few columns because more hands fit these; and of hands that are fitted
+# again.
+_STARTS, _FEWEST_STARTS, _MOST_REFITTED = 560, 14, 8
 # A search ends when moving three hands gained nothing, or when it has fitted a hundred moved hands.
 _PATIENCE, _MOST_FITS = 3, 100
-_OUTLIER: Final = 0.03  # [m] robust scale of poses
-_STEPS: Final = 5  # of poses, at each robust scale
-_ASIDE: Final = 0.1  # [rad] Markers farther around a finger may belong to the next one.
-_GAIN: Final = 0.98  # Another hand must cost less by this factor.
+_OUTLIER_SCALE: Final = 0.03  # [m] robust scale of poses
+_POSE_STEPS: Final = 5  # steps of a pose at each robust scale
+_ASIDE_ANGLE: Final = 0.1  # [rad] Markers farther around a finger may belong to the next one.
+_GAIN_RATIO: Final = 0.98  # Another hand must cost less by this factor.
 _SLIDES: Final = (
     *((0.01, 0.0), (-0.01, 0.0), (0.02, 0.0), (-0.02, 0.0), (0.03, 0.0), (-0.03, 0.0)),
     *((0.0, 0.02), (0.0, -0.02)),
 )
 """Slides of markers along and across the hand [m]: of all markers, or of those of a digit or the palm."""
-_TURN: Final = 0.01  # [m] distance that counts like a difference of one between unit normals
-_USUAL: Final = list(SIZES).index("M")
+_NORMAL_SCALE: Final = 0.01  # [m] distance that counts like a difference of one between unit normals
+_USUAL_SIZE: Final = list(SIZES).index("M")
 
 
 class Solution(NamedTuple):
     """Places of N columns on a hand, and the poses that go with them."""
 
     energy: float
-    """Squared distances in variances, with the costs of unlikely places and poses."""
+    """Squared distances in variances, plus the costs of unlikely places and poses."""
     side: Side
     size: int
     """Number of the hand's size, XS to XL."""
@@ -97,7 +99,7 @@ class FittedHand(NamedTuple):
 
 
 class PlaceTable:
-    """P places for markers, evenly on the skin of a right hand of some size; alike on hands of all sizes."""
+    """P places for markers, even on the skin of a right hand of some size; the same on hands of all sizes."""
 
     def __init__(self, size: str, radius: float) -> None:
         self.model = HandModel.named(size)
@@ -106,15 +108,13 @@ class PlaceTable:
         self.radius, self.normals = radius, normals[rows]
         self.points = surface.vertices[rows] + radius * self.normals
         self.bone_indices, self.bone_weights = surface.bone_indices[rows], surface.bone_weights[rows]
-        self.bones: Int[np.ndarray, "P"] = self.bone_indices[
-            np.arange(len(rows)), self.bone_weights.argmax(1)
-        ]
+        self.bones: Integers = self.bone_indices[np.arange(len(rows)), self.bone_weights.argmax(1)]
         rest = self.model.rest_transforms[self.bones]
         local = np.einsum("pji,pj->pi", rest[:, :3, :3], self.points - rest[:, :3, 3])
         outward = np.einsum("pji,pj->pi", rest[:, :3, :3], self.normals)
         self.along = local[:, 0] / self.model.skeleton.lengths[self.bones]
         self.around = np.arctan2(outward[:, 1], outward[:, 2])
-        self.cost: Float[np.ndarray, "P"] = _PALMAR * (1.0 - np.cos(self.around))
+        self.cost: Float[np.ndarray, "P"] = _PALMAR_COST * (1.0 - np.cos(self.around))
         """Cost of each place: markers are seldom on the palm's side."""
 
     def centers(self, qpos: Float[np.ndarray, "F 27"]) -> Float[np.ndarray, "F P 3"]:
@@ -123,10 +123,7 @@ class PlaceTable:
         return carried(self.model, bones, self.points, self.bone_indices, self.bone_weights)
 
     def glove(
-        self,
-        places: Int[np.ndarray, "N"],
-        names: Iterable[str],
-        at: Float[np.ndarray, "N 3"] | None = None,
+        self, places: Int[np.ndarray, "N"], names: Iterable[str], at: Float[np.ndarray, "N 3"] | None = None
     ) -> GloveFit:
         """A hand with markers at some places, or carried like these and `at` other points [m]."""
         markers = tuple(
@@ -140,29 +137,29 @@ class PlaceTable:
 
     def nearest(
         self, points: Float[np.ndarray, "F N 3"], T_world_bone: Float[np.ndarray, "F L 4 4"]
-    ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+    ) -> tuple[Integers, Doubles, Doubles]:
         """The likeliest place of each column: row, a point [m] between it and the column's mean, and cost."""
         turned = T_world_bone[:, None, :, :3, :3].swapaxes(-1, -2)
         local = (turned @ (points[:, :, None] - T_world_bone[:, None, :, :3, 3])[..., None])[..., 0]
         seen = np.isfinite(points[:, :, :1])
         count = np.maximum(seen.sum(axis=0), 1)
         mean = np.where(seen[..., None], local, 0.0).sum(axis=0) / count[..., None]
-        square = np.minimum(((local - mean) ** 2).sum(axis=-1), _FARTHEST**2)
+        square = np.minimum(((local - mean) ** 2).sum(axis=-1), _MOST_DISTANCE**2)
         varied = np.where(seen, square, 0.0).sum(axis=0) / count
         rest = self.model.rest_transforms
         mean = (rest[:, :3, :3] @ mean[..., None])[..., 0] + rest[:, :3, 3]
         off = mean[:, self.bones] - self.points
-        costs = varied[:, self.bones] / _MOVES**2 + (off**2).sum(axis=-1) / _NEAR**2 + self.cost
+        costs = varied[:, self.bones] / _BONE_SPREAD**2 + (off**2).sum(axis=-1) / _PLACE_SPREAD**2 + self.cost
         rows, columns = costs.argmin(axis=1), np.arange(len(costs))
-        at = self.points[rows] + _OWN * off[columns, rows]
-        return rows, at, np.minimum(costs[columns, rows], _LEFT_OUT)
+        at = self.points[rows] + _PLACE_WEIGHT * off[columns, rows]
+        return rows, at, np.minimum(costs[columns, rows], _LEFT_OUT_COST)
 
     def slid(self, places: Int[np.ndarray, "N"], along: float, across: float) -> Int[np.ndarray, "N"]:
-        """The places nearest to others that were moved [m] toward the fingertips and toward the thumb."""
+        """The places nearest to some places after a slide [m] toward the fingertips and toward the thumb."""
         ahead = self.model.rest_transforms[self.bones[places], :3, :2] @ np.array([along, across])
         off = ((self.points[places] + ahead)[:, None] - self.points) ** 2
         turned = ((self.normals[places][:, None] - self.normals) ** 2).sum(axis=2)
-        return np.asarray((off.sum(axis=2) + _TURN**2 * turned).argmin(axis=1))
+        return np.asarray((off.sum(axis=2) + _NORMAL_SCALE**2 * turned).argmin(axis=1))
 
     def like(self, place: int, bone: int) -> int:
         """The place on another bone that is most like a place."""
@@ -172,11 +169,7 @@ class PlaceTable:
 
 
 def search_places(
-    points: Float[np.ndarray, "T N 3"],
-    names: Iterable[str],
-    radius: float,
-    *,
-    on_step: OnStep = no_step,
+    points: Float[np.ndarray, "T N 3"], names: Iterable[str], radius: float, *, on_step: OnStep = no_step
 ) -> list[FittedHand]:
     """Look for the places of 5 to 60 columns [m] of one hand, NaN where missing; likely hands, best first."""
     search, found = _Search(points, tuple(names), radius), list[Solution]()
@@ -191,10 +184,10 @@ def search_places(
     return search.improved(fitted)
 
 
-def diverse_frames(points: Float[np.ndarray, "T N 3"], count: int) -> NDArray[np.int64]:
+def diverse_frames(points: Float[np.ndarray, "T N 3"], count: int) -> Integers:
     """Frames that show many columns [m], as different in their distances as possible; the widest first."""
     seen = np.isfinite(points[..., 0]).mean(axis=1)
-    pool = spread_out(np.flatnonzero(seen >= min(0.9, np.quantile(seen, 0.7))), _POOL)
+    pool = spread_out(np.flatnonzero(seen >= min(0.9, np.quantile(seen, 0.7))), _POOL_FRAMES)
     first, second = np.triu_indices(points.shape[1], 1)
     apart = np.linalg.norm(points[pool][:, first] - points[pool][:, second], axis=2)
     usual = np.nan_to_num(np.nanmedian(apart, axis=0))
@@ -203,30 +196,30 @@ def diverse_frames(points: Float[np.ndarray, "T N 3"], count: int) -> NDArray[np
 
 
 @functools.cache
-def _spread_vertices() -> NDArray[np.int64]:
-    """Vertices of the skin that are as far from each other as possible, but not in the palm or on the arm."""
+def _spread_vertices() -> Integers:
+    """Vertices of the skin that are as far apart as possible, without those in the palm or on the arm."""
     model = HandModel.named("M")
     surface, main = model.surface, model.surface.bone_indices[:, 0]
     normals = vertex_normals(surface.vertices, surface.faces)
     is_palm = main == PALM
-    behind = surface.vertices[:, 0] < _BEHIND * model.skeleton.lengths[PALM]
+    behind = surface.vertices[:, 0] < _WRIST_END * model.skeleton.lengths[PALM]
     kept = np.flatnonzero(~is_palm | ((normals[:, 2] > 0.0) & ~behind))
-    return np.asarray(kept[far_apart(surface.vertices[kept], 0, _PLACES)])
+    return np.asarray(kept[far_apart(surface.vertices[kept], 0, _NUM_PLACES)])
 
 
 class _Search:
     """Columns of a recording in a few frames, and the places that they may have."""
 
-    def __init__(self, points: NDArray[np.float64], names: tuple[str, ...], radius: float) -> None:
+    def __init__(self, points: Doubles, names: tuple[str, ...], radius: float) -> None:
         self.tables, self._names = [PlaceTable(size, radius) for size in SIZES], names
         some = points[diverse_frames(points, _FRAMES)]
         self._fitted = set[tuple[object, ...]]()
-        self._points: dict[Side, NDArray[np.float64]] = {"right": some, "left": some @ MIRROR}
-        self._gestures = _gestures(self.tables[_USUAL].model)
+        self._points: dict[Side, Doubles] = {"right": some, "left": some @ MIRROR}
+        self._gestures = _gestures(self.tables[_USUAL_SIZE].model)
 
     def distinct(self, found: list[Solution]) -> list[Solution]:
         """The solutions with different bones, best first."""
-        kept, bones = dict[tuple[object, ...], Solution](), self.tables[_USUAL].bones
+        kept, bones = dict[tuple[object, ...], Solution](), self.tables[_USUAL_SIZE].bones
         for one in sorted(found, key=lambda solution: solution.energy):
             kept.setdefault((one.side, *bones[one.places].tolist()), one)
         return list(kept.values())
@@ -234,28 +227,28 @@ class _Search:
     def first_solutions(self, side: Side) -> list[Solution]:
         """Solutions in the first frames, each from a rigid hand in one of them."""
         points, found = self._points[side][:_FIRST_FRAMES], list[Solution]()
-        for reference in range(min(_REFERENCES, len(points))):
+        for reference in range(min(_REFERENCE_FRAMES, len(points))):
             motions = _relative_motions(points, reference)
             tried = set[tuple[int, ...]]()
             for angles, rotation, position, places in self._rigid_hands(points[reference]):
-                bones = tuple(self.tables[_USUAL].bones[places].tolist())
+                bones = tuple(self.tables[_USUAL_SIZE].bones[places].tolist())
                 if bones in tried:
                     continue
                 tried.add(bones)
-                if len(tried) > _ARTICULATED // _REFERENCES // 2:
+                if len(tried) > _MOST_ARTICULATED // _REFERENCE_FRAMES // 2:
                     break
                 turned, moved = (np.stack(part) for part in zip(*motions, strict=True))
                 qpos = join_qpos(np.tile(angles, (len(points), 1)))
                 qpos[:, :3] = turned @ position + moved
                 qpos[:, 3:7] = rotation_quaternions(turned @ rotation)
-                found.append(self._alternated(side, _USUAL, points, qpos, 6))
+                found.append(self._alternate(side, _USUAL_SIZE, points, qpos, 6))
         return found
 
     def solved(self, start: Solution) -> Solution:
-        """The solution in all frames that one in the first frames leads to."""
+        """Solve all frames, starting from a solution in the first frames."""
         points = self._points[start.side]
         qpos = self._poses(start.size, points, start.places, None)
-        return self._alternated(start.side, start.size, points, qpos, 6)
+        return self._alternate(start.side, start.size, points, qpos, 6)
 
     def fitted(self, solution: Solution, flesh: float) -> FittedHand:
         """A solution with the hand's shape and the places of markers fitted, see `fit_places`."""
@@ -263,7 +256,7 @@ class _Search:
         glove = self.tables[solution.size].glove(solution.places[own], [self._names[row] for row in own])
         hand, cost, residuals = fit_places(self._points[solution.side][:, own], glove, flesh=flesh)
         cost += self.tables[solution.size].cost[solution.places[own]].sum()
-        cost += _LEFT_OUT * float((~solution.on_hand).sum())
+        cost += _LEFT_OUT_COST * float((~solution.on_hand).sum())
         return FittedHand(cost, solution.side, hand, own, residuals, solution)
 
     def improved(self, fitted: list[FittedHand]) -> list[FittedHand]:
@@ -274,25 +267,25 @@ class _Search:
         """
         ranked = sorted(fitted, key=lambda one: one.cost)
         fit = functools.partial(self.fitted, flesh=shown_flesh(ranked[0].residuals))
-        waiting, done, failed = [fit(one.solution) for one in ranked[:_FINER]], list[FittedHand](), 0
+        waiting, done, failed = [fit(one.solution) for one in ranked[:_MOST_REFITTED]], list[FittedHand](), 0
         while waiting and failed < _PATIENCE and len(self._fitted) < _MOST_FITS:
             best = min(one.cost for one in (*done, *waiting))
             start = min(waiting, key=lambda one: one.cost)
-            tried = [self._settled(start), *self.distinct(self._moved(start.solution))]
-            new = list(map(fit, itertools.islice(filter(self._is_new, tried), _TRIED)))
+            tried = [self._snapped(start), *self.distinct(self._moved(start.solution))]
+            new = list(map(fit, itertools.islice(filter(self._is_new, tried), _MOST_TRIED)))
             waiting = [one for one in (*waiting, *new) if one is not start]
             done.append(start)
-            failed = 0 if min((one.cost for one in new), default=np.inf) < _GAIN * best else failed + 1
+            failed = 0 if min((one.cost for one in new), default=np.inf) < _GAIN_RATIO * best else failed + 1
         return sorted((*done, *waiting), key=lambda one: one.cost)
 
     def _is_new(self, one: Solution) -> bool:
         """Whether no hand with these bones was fitted; it counts as fitted from now on."""
-        key = (one.side, one.size, *self.tables[_USUAL].bones[one.places].tolist())
+        key = (one.side, one.size, *self.tables[_USUAL_SIZE].bones[one.places].tolist())
         is_new = key not in self._fitted
         self._fitted.add(key)
         return is_new
 
-    def _settled(self, fitted: FittedHand) -> Solution:
+    def _snapped(self, fitted: FittedHand) -> Solution:
         """The solution of a fitted hand with each marker at the place of the table that is nearest to it."""
         start, table = fitted.solution, self.tables[fitted.solution.size]
         points, bones = fitted.hand.attachment.points, fitted.hand.attachment.main_bones
@@ -309,17 +302,15 @@ class _Search:
         points, found = self._points[start.side], list[Solution]()
         relaxed = start.qpos.copy()
         relaxed[:, 7:] = RESTING
-        tried = [(start.size, places) for places in self._moves(start.places)]
+        tried = [(start.size, places) for places in self._moved_places(start.places)]
         sizes = (start.size - 1, start.size + 1)
         tried += [(size, start.places) for size in sizes if 0 <= size < len(self.tables)]
         for size, places in tried:
             qpos = self._poses(size, points, places, relaxed)
-            found.append(self._alternated(start.side, size, points, qpos, 3))
+            found.append(self._alternate(start.side, size, points, qpos, 3))
         return found
 
-    def _alternated(
-        self, side: Side, size: int, points: NDArray[np.float64], qpos: NDArray[np.float64], rounds: int
-    ) -> Solution:
+    def _alternate(self, side: Side, size: int, points: Doubles, qpos: Doubles, rounds: int) -> Solution:
         """Choose places and solve poses by turns."""
         table, energy = self.tables[size], np.inf
         for number in range(rounds + 1):
@@ -327,7 +318,7 @@ class _Search:
             off = qpos[:, 7:] - resting_prior().angles
             pose = 0.25 * float(np.einsum("fi,ij,fj->f", off, resting_prior().precision, off).mean())
             before, energy = energy, float(costs.sum()) + pose
-            on_hand = costs < _LEFT_OUT
+            on_hand = costs < _LEFT_OUT_COST
             on_hand[np.argsort(costs)[:MIN_MARKERS]] = True
             if number == rounds or energy > before - _CONVERGED:
                 break
@@ -336,27 +327,22 @@ class _Search:
         return Solution(energy, side, size, places, on_hand, qpos)
 
     def _poses(
-        self,
-        size: int,
-        points: NDArray[np.float64],
-        places: NDArray[np.int64],
-        starts: NDArray[np.float64] | None,
-        at: NDArray[np.float64] | None = None,
-    ) -> NDArray[np.float64]:
+        self, size: int, points: Doubles, places: Integers, starts: Doubles | None, at: Doubles | None = None
+    ) -> Doubles:
         """Poses (F, 27) with markers at these places."""
-        solver = PoseSolver(self.tables[size].glove(places, self._names, at), outlier_distance=_OUTLIER)
+        solver = PoseSolver(self.tables[size].glove(places, self._names, at), outlier_distance=_OUTLIER_SCALE)
         usual = np.tile(RESTING, (len(points), 1)), 0.5
-        return solver.solve(points, starts, prior=usual, iterations=_STEPS).qpos
+        return solver.solve(points, starts, prior=usual, iterations=_POSE_STEPS).qpos
 
     def _rigid_hands(
         self, points: Float[np.ndarray, "N 3"]
-    ) -> list[tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]]:
+    ) -> list[tuple[Doubles, Doubles, Doubles, Integers]]:
         """Joint angles, rotation, position and nearest places of hands laid into a frame, best first."""
-        table, hands, seen = self.tables[_USUAL], [], points[np.isfinite(points[:, 0])]
+        table, hands, seen = self.tables[_USUAL_SIZE], [], points[np.isfinite(points[:, 0])]
         shown, even = np.flatnonzero(np.isfinite(points[:, 0])), _even_rotations(_ROTATIONS)
         for angles, centers in zip(self._gestures, table.centers(join_qpos(self._gestures)), strict=True):
             rotations = even
-            middle = centers[table.cost < _PALMAR].mean(axis=0)
+            middle = centers[table.cost < _PALMAR_COST].mean(axis=0)
             positions = seen.mean(axis=0) - rotations @ middle
             for rounds in _RIGID_ROUNDS:
                 fitted = self._aligned(seen, centers, rotations, positions, rounds)
@@ -376,13 +362,13 @@ class _Search:
         rotations: Float[np.ndarray, "R 3 3"],
         positions: Float[np.ndarray, "R 3"],
         rounds: int,
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
+    ) -> tuple[Doubles, Doubles, Doubles, Integers]:
         """Rotations, positions, energies (R,) and nearest places (R, S) of rigid hands, aligned by turns."""
         size = (centers**2).sum(axis=1)
         for number in range(rounds + 1):
             local = (points - positions[:, None]) @ rotations
             square = (local**2).sum(axis=2)[..., None] + size - 2.0 * local @ centers.T
-            costs = np.minimum(square, _FARTHEST**2) / _NEAR**2 + self.tables[_USUAL].cost
+            costs = np.minimum(square, _MOST_DISTANCE**2) / _PLACE_SPREAD**2 + self.tables[_USUAL_SIZE].cost
             places = costs.argmin(axis=2)
             if number == rounds:
                 break
@@ -390,9 +376,9 @@ class _Search:
             rotations, positions = _robust_alignment(points, centers[places], off)
         return rotations, positions, costs.min(axis=2).sum(axis=1), places
 
-    def _moves(self, places: Int[np.ndarray, "N"]) -> Iterator[Int[np.ndarray, "N"]]:
+    def _moved_places(self, places: Int[np.ndarray, "N"]) -> Iterator[Int[np.ndarray, "N"]]:
         """Places near these: markers slide, digits are exchanged or divided, or a digit moves by a bone."""
-        table, count = self.tables[_USUAL], len(DIGITS)
+        table, count = self.tables[_USUAL_SIZE], len(DIGITS)
         digits = DIGIT_OF_BONE[table.bones[places]]
         orders = list[list[int]]()
         for one, other in itertools.combinations(range(count), 2):
@@ -415,7 +401,7 @@ class _Search:
         ]
         for digit, sign in itertools.product(range(count), (1, -1)):
             own = digits == digit
-            aside = own & (sign * table.around[places] > _ASIDE)
+            aside = own & (sign * table.around[places] > _ASIDE_ANGLE)
             if aside.any() and not aside[own].all():
                 beside = [other for other in range(count) if 0 < abs(other - digit) <= 2]
                 targets += [np.where(aside, bones + 3 * (other - digit), bones) for other in beside]
@@ -429,7 +415,7 @@ class _Search:
 
 def _gestures(model: HandModel) -> Float[np.ndarray, "K 20"]:
     """Joint angles [rad] of usual gestures: an almost flat and a relaxed hand, and others far from these."""
-    drawn = sample_poses(model, _DRAWN, rng=np.random.default_rng(1))[:, 7:]
+    drawn = sample_poses(model, _DRAWN_POSES, rng=np.random.default_rng(1))[:, 7:]
     chosen, far = [RESTING * 0.3, RESTING], np.full(len(drawn), np.inf)
     for _ in range(_GESTURES):
         far = np.minimum(far, ((drawn - chosen[-1]) ** 2).sum(axis=1))
@@ -452,7 +438,7 @@ def _even_rotations(count: int) -> Float[np.ndarray, "R 3 3"]:
 
 def _robust_alignment(
     points: Float[np.ndarray, "S 3"], targets: Float[np.ndarray, "R S 3"], off: Float[np.ndarray, "R S"]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[Doubles, Doubles]:
     """Rotations and positions of hands whose places `targets` are nearest to the points; `off` is squared."""
     weights = 1.0 / (1.0 + np.maximum(off, 0.0) / _RIGID_SCALE**2)
     weights /= weights.sum(axis=1, keepdims=True)
@@ -464,9 +450,7 @@ def _robust_alignment(
     return rotations, wanted - np.einsum("rij,rj->ri", rotations, middle)
 
 
-def _relative_motions(
-    points: Float[np.ndarray, "F N 3"], reference: int
-) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+def _relative_motions(points: Float[np.ndarray, "F N 3"], reference: int) -> list[tuple[Doubles, Doubles]]:
     """Rotation and translation of each frame from a reference, by the columns that move least."""
     motions = []
     for frame in points:

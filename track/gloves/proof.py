@@ -1,4 +1,4 @@
-"""The proof of a learned glove: frames that it was not learned from are labeled from points without names."""
+"""The proof of a learned glove: it labels the points of frames from which it was not learned."""
 
 from __future__ import annotations
 
@@ -8,26 +8,26 @@ from typing import Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from numpy.typing import NDArray
 
 from gloves.captures.capture import Capture, run_lengths
+from handsim.arrays import Doubles
 from track.captures import label_capture
 from track.frames import AnyCapture
 from track.gloves.learned_glove import LearnedGlove, captures_of, held_out
 
-_BLOCK: Final = 1.0  # [s] Frames of a block are alike and count once.
-_FEWEST_GAPS: Final = 10  # Captures with fewer gaps are given gaps of these numbers.
-_GAP, _MISSING = 0.05, 0.04  # mean length [s] and share of the markers, as optical systems have them
-_LEVEL: Final = 0.95
+_BLOCK_TIME: Final = 1.0  # [s] The frames of a block are similar and count once.
+_FEWEST_GAPS: Final = 10  # A capture with fewer gaps gets gaps like those of optical systems:
+_MEAN_GAP, _MISSING_SHARE = 0.05, 0.04  # their mean length [s], and the share of missing markers
+_CONFIDENCE_LEVEL: Final = 0.95
 
 
 class Proof(NamedTuple):
-    """How the frames of some captures are labeled that a glove was not learned from."""
+    """How well a glove labels the frames of captures from which it was not learned."""
 
     frames: float
     """Share of the frames in which every label is right."""
     interval: tuple[float, float]
-    """95 % interval of this share, in which frames of one second [s] count once."""
+    """95 % interval of this share; the frames of a second count once."""
     slots: float
     """Share of the markers in all frames that are right."""
     by_capture: tuple[float, ...]
@@ -39,8 +39,8 @@ def prove_glove(
 ) -> Proof:
     """Label the last thirds of labeled captures with a glove that was learned from the rest.
 
-    Points lose their names. Markers are left out at random where a capture has hardly any gaps, because
-    somebody filled them.
+    Points lose their names. If a capture has hardly any gaps, because somebody filled them, markers are left
+    out at random.
 
     Args:
         learned: What `learn_glove` returned for the captures.
@@ -54,7 +54,7 @@ def prove_glove(
         CaptureError: A capture cannot be read.
     """
     sources = captures_of(captures)
-    frames, slots, by_capture = list[NDArray[np.float64]](), list[float](), list[float]()
+    frames, slots, by_capture = list[Doubles](), list[float](), list[float]()
     for number, source in enumerate(sources):
         columns = {
             f"{one.hand.side}:{name}": column
@@ -68,14 +68,14 @@ def prove_glove(
         positions = _with_gaps(tried.positions, list(columns.values()), source.rate, rng)
         unnamed = Capture(tuple(f"Unlabeled{n}" for n in range(len(source.names))), positions, source.rate)
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # what is open of the labels is counted here
+            warnings.simplefilter("ignore")  # Wrong labels are counted below.
             take = label_capture(unnamed, glove=learned.layout)
         true = np.full(positions.shape[:2], -1)
         for name, column in columns.items():
             true[:, column] = take.label_names.index(name)
         wrong = (take.labels != true) & np.isfinite(positions[..., 0])
         right = ~wrong.any(axis=1)
-        block = max(1, round(_BLOCK * source.rate))
+        block = max(1, round(_BLOCK_TIME * source.rate))
         frames += [right[first : first + block] for first in range(0, len(right), block)]
         by_capture.append(float(right.mean()))
         slots.append(1.0 - float(wrong[:, list(columns.values())].mean()))
@@ -93,17 +93,17 @@ def _with_gaps(
     if len(run_lengths(np.isnan(own), inside=True)) >= _FEWEST_GAPS:
         return positions
     changed = positions.copy()
-    count, gap = len(positions), max(1.0, _GAP * rate)
+    count, gap = len(positions), max(1.0, _MEAN_GAP * rate)
     for column in columns:
-        for first in rng.integers(0, count, rng.poisson(_MISSING * count / gap)):
+        for first in rng.integers(0, count, rng.poisson(_MISSING_SHARE * count / gap)):
             changed[first : first + rng.geometric(1.0 / gap), column] = np.nan
     return changed
 
 
 def _interval(shares: Float[np.ndarray, "B"]) -> tuple[float, float]:
-    """Interval of a mean share of B blocks: Wilson's, as if each block were right or wrong."""
+    """Wilson's interval of a mean share of B blocks, as if each block were right or wrong."""
     from scipy.stats import binomtest
 
     count = len(shares)
-    found = binomtest(int(np.floor(shares.sum())), count).proportion_ci(_LEVEL, "wilson")
+    found = binomtest(int(np.floor(shares.sum())), count).proportion_ci(_CONFIDENCE_LEVEL, "wilson")
     return float(found.low), float(found.high)

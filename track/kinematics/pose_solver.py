@@ -1,8 +1,9 @@
 """Inverse kinematics from labeled markers: the paper's E_IK (Han et al. 2018, section 4.3) for one hand.
 
-Frames are solved one by one, each from its own start; a missing marker is NaN. Two terms determine what the
-markers do not: soft limits of the joints' ranges, and a prior on digits with a missing marker or fewer than
-three. The prior is weak around the resting angles, or that of predicted angles if given.
+Frames are solved one by one, each from its own start; a missing marker is NaN. Where markers leave angles
+open, the soft limits of the joints' ranges and a prior determine them. The prior acts on digits with a
+missing marker or fewer than three; it is weak around the resting angles, or that of predicted angles if
+given.
 """
 
 from __future__ import annotations
@@ -12,10 +13,10 @@ from typing import Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
-from numpy.typing import NDArray
 
 from gloves.fit import GloveFit
 from handsim._checks import as_numbers, check_array
+from handsim.arrays import Doubles, Integers
 from handsim.errors import ArgumentError
 from handsim.hand.model import join_qpos
 from handsim.hand.shape import DIGITS, NUM_JOINTS, NUM_QPOS
@@ -40,7 +41,7 @@ RESTING: Final = np.tile(np.deg2rad([0.0, 25.0, 35.0, 20.0]), 5)  # joint angles
 # Six shapes of a digit [deg], in the order of its joints: relaxed, straight, half closed, bent in the knuckle
 # only, bent in all other joints, closed; for the thumb: relaxed, away from the palm, beside the index finger,
 # opposed, opposed and bent, across the palm.
-_FINGER: Final = (
+_FINGERS_DEG: Final = (
     (0, 25, 35, 20),
     (0, 0, 5, 5),
     (0, 45, 60, 35),
@@ -48,7 +49,7 @@ _FINGER: Final = (
     (0, 10, 95, 55),
     (0, 80, 100, 55),
 )
-_THUMB: Final = (
+_THUMBS_DEG: Final = (
     (0, 25, 35, 20),
     (25, -25, 0, 0),
     (-20, -20, 10, 10),
@@ -56,17 +57,18 @@ _THUMB: Final = (
     (20, 25, 45, 60),
     (-20, 35, 50, 40),
 )
-# Rounds of choosing digits and aligning, after which the choice no longer changes.
-_ALIGNMENT_ROUNDS: Final = 3
+_ALIGNMENT_ROUNDS: Final = 3  # After these rounds of choosing digits and aligning, the choice is stable.
 _LEAST_SHAPE_SPREAD: Final = 0.005  # [m] least standard deviation of a marker over the shapes
 _ROBUST_SCALES: Final = (1 / 64, 1 / 8, 1.0)  # factors of the robust scale, wide first for poor starts
 _STEPS_AT_WIDE_SCALES: Final = 8  # most steps at each wide scale
 _REST_PRECISION: Final = float(np.deg2rad(90.0)) ** -2  # [1/rad^2] weak prior around resting angles
-_COMPLETE_DIGIT: Final = 1e-4  # factor of that precision for digits with all markers
+_COMPLETE_DIGIT_FACTOR: Final = 1e-4  # factor of that precision for digits with all markers
 _RMS_OF_LAST_START: Final = 0.0005  # [m] A start with a smaller RMS, limits and prior included, is the last.
 _MOST_STEPS: Final = 30  # largest number of steps from each start
-_CONVERGED: Final = (1e-6 / MARKER_NOISE) ** 2  # gain in cost: one marker 1 um closer
-_ACCURATE: Final = (3e-5 / MARKER_NOISE) ** 2  # gain in cost, in real time: all markers 30 um closer
+_CONVERGED_GAIN: Final = (1e-6 / MARKER_NOISE) ** 2  # gain in cost: one marker 1 um closer
+_REAL_TIME_GAIN: Final = (3e-5 / MARKER_NOISE) ** 2  # gain in cost, in real time: all markers 30 um closer
+_NO_ROWS: Final = np.empty((0, NUM_JOINTS))
+_NO_WRIST: Final = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0])  # no rotation, and zero precisions
 
 
 class _StartingShapes(NamedTuple):
@@ -83,10 +85,6 @@ class FramePriors(NamedTuple):
     angles: Float[np.ndarray, "P 20"]  # mean joint angles [rad], one row per frame, or no row
     precision: Float[np.ndarray, "P 20"]  # their precision [1/rad^2]
     wrist: Float[np.ndarray, "9"]  # position [m] and orientation of the wrist, then both precisions
-
-
-_NO_ROWS: Final = np.empty((0, NUM_JOINTS))
-_NO_WRIST: Final = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0])  # no rotation, and zero precisions
 
 
 def priors_of_frame(
@@ -117,13 +115,14 @@ class PoseFit:
 class PoseSolver:
     """Solves poses of one hand in one glove; precomputes all that is equal for all frames."""
 
-    # `outlier_distance` [m] is the scale of a robust loss (Geman and McClure 1987), so that a wrong label
-    # does not bend the hand; it needs a good start. Without it a fit is plain least squares.
+    # `outlier_distance` [m] is the scale of a robust loss (Geman and McClure 1987), which keeps a wrong label
+    # from bending the hand but needs a good start. Without it a fit is plain least squares.
 
     def __init__(self, fit: GloveFit, *, outlier_distance: float | None = None) -> None:
         self.hand: HandArrays = hand_arrays(fit)
         """The hand and its glove; changed marker positions take effect in the next solution."""
-        angles = np.deg2rad([[*thumb, *finger * 4] for thumb, finger in zip(_THUMB, _FINGER, strict=True)])
+        pairs = zip(_THUMBS_DEG, _FINGERS_DEG, strict=True)
+        angles = np.deg2rad([[*thumb, *finger * 4] for thumb, finger in pairs])
         markers = fit.markers(join_qpos(angles))[0]
         weights = 1.0 / (_LEAST_SHAPE_SPREAD**2 + markers.var(axis=0).sum(axis=1))
         self._shapes = _StartingShapes(angles, markers, weights)
@@ -142,8 +141,8 @@ class PoseSolver:
         iterations: int = _MOST_STEPS,
     ) -> PoseFit:
         """Solve poses of frames with at least four markers, each by itself; see `solve_pose`."""
-        # The prior is for digits with a missing marker or fewer than three: mean angles, deviation [rad].
-        # Copies are made because a kernel is compiled anew for read-only or non-contiguous arrays.
+        # `prior` holds mean angles and their standard deviation [rad], for digits with too few markers.
+        # Arrays are copied because a kernel is compiled anew for read-only or non-contiguous ones.
         targets = np.array(targets, dtype=np.float64, order="C")
         targets[~np.isfinite(targets).all(axis=-1)] = np.nan
         starts = np.array(np.empty((0, NUM_QPOS)) if initial is None else initial, np.float64, order="C")
@@ -151,14 +150,14 @@ class PoseSolver:
         if prior is not None:
             precision = np.full(prior[0].shape, np.asarray(prior[1]) ** -2)
             known = FramePriors(np.array(prior[0], order="C"), precision, _NO_WRIST)
-        steps = self._robust_scale, iterations, _CONVERGED
+        steps = self._robust_scale, iterations, _CONVERGED_GAIN
         return PoseFit(*_fit_frames(self.hand, self._shapes, self.on_part, targets, starts, known, *steps))
 
     def solve_frame(
         self, target: Float[np.ndarray, "M 3"], start: Float[np.ndarray, "27"], prior: FramePriors
     ) -> PoseFit:
         """Solve one frame in real time from a close start; a marker [m] is complete or NaN."""
-        steps = self._robust_scale, _MOST_STEPS, _ACCURATE
+        steps = self._robust_scale, _MOST_STEPS, _REAL_TIME_GAIN
         return PoseFit(
             *_fit_frames(self.hand, self._shapes, self.on_part, target[None], start[None], prior, *steps)
         )
@@ -221,7 +220,7 @@ def _fit_frames(
     robust_scale: float,
     iterations: int,
     small_gain: float,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
+) -> tuple[Doubles, Doubles, Doubles, Integers]:
     """Solve frames one by one; returns the fields of a `PoseFit`."""
     frames, count = targets.shape[:2]
     qpos, residuals = np.empty((frames, NUM_QPOS)), np.empty((frames, count, 3))
@@ -279,7 +278,7 @@ def _set_prior(
     for hinge in range(NUM_JOINTS):
         digit = hinge // 4
         complete = seen[digit] == on_part[digit] and seen[digit] >= FEWEST_ON_PART
-        rest, weight = RESTING[hinge], _REST_PRECISION * (_COMPLETE_DIGIT if complete else 1.0)
+        rest, weight = RESTING[hinge], _REST_PRECISION * (_COMPLETE_DIGIT_FACTOR if complete else 1.0)
         if len(prior.angles) > frame and not complete:
             both = weight + prior.precision[frame, hinge]
             rest += (prior.angles[frame, hinge] - rest) * prior.precision[frame, hinge] / both

@@ -8,7 +8,7 @@
   joint. Its covariance follows from the normal matrix of the fit and the prior of the joint angles.
 - Standard deviations of joint angles and keypoints come from a linear normal model around the pose. Each
   marker is seen with noise, and tells less the longer it is hidden. The hand model differs from the user's
-  hand in the same way in every frame, so that averaging does not help: in its size, marker places, origins
+  hand in the same error in every frame, so that averaging does not help: in its size, marker places, origins
   and directions of digits, and bone lengths. Flesh moves markers slowly, so that averaging over successive
   frames does not help, either. Nor does the palm follow the model, which takes the flexion of the metacarpals
   of ring and little finger for that of their MCP joints.
@@ -43,50 +43,55 @@ from track.kinematics.marker_kinematics import (
 )
 from track.kinematics.pose_solver import FEWEST_ON_PART
 
-# Short, so that a digit with one marker recovers from a wrong, unusual pose.
+# The time constant is short, so that a digit with one marker recovers from a wrong, unusual pose.
 _JOINT_MEMORY: Final = 0.3  # [s] time constant of the process of joint angles
 _JOINT_SPREAD: Final = float(np.deg2rad(0.5))  # [rad] least standard deviation of a predicted angle
-_GESTURE_MARGIN: Final = float(np.deg2rad(6.0))  # [rad] added to that of the gestures, for other poses
-_STILL: Final = 0.25  # share of its usual standard deviation, below which a joint does not move
-_OWN_ANGLE: Final = float(np.deg2rad(40.0))  # [rad] standard deviation of the angle of a still joint
-_STILL_SHARE: Final = 0.5  # From this share of `_OWN_ANGLE` on a joint hardly moves.
-_ARC: Final = 0.04  # [m] usual radius of the arcs of markers: the length of a finger's bones
+_GESTURE_MARGIN: Final = float(np.deg2rad(6.0))  # [rad] standard deviation of other poses from the gestures
+_STILL_RATIO: Final = 0.25  # A still joint varies by less than this share of its usual standard deviation.
+# [rad] standard deviation of a still joint's angle among people
+_STILL_ANGLE_SPREAD: Final = float(np.deg2rad(40.0))
+_STILL_SHARE: Final = 0.5  # A joint counts as still above this share of `_STILL_ANGLE_SPREAD`.
+_ARC_RADIUS: Final = 0.04  # [m] usual radius of the arcs of markers: the length of a finger's bones
 _LEAST_INFORMATION: Final = 1e-9  # share of a marker's precision, added for an inverse
 _DRIFT: Final = 0.014  # [m/sqrt(s)] random walk of a hidden marker
-_ANYWHERE: Final = 0.01  # [1/m^2, 1/rad^2] prior precision of the wrist
+_WRIST_PRECISION: Final = 0.01  # [1/m^2, 1/rad^2] prior precision of the wrist
 _LEAST_NOISE: Final = 0.0001  # [m] lower bound of a marker's noise
 _LEAST_FREEDOM: Final = 3  # least number of marker coordinates beyond those that a pose needs
 SOURCES: Final = ("noise and gaps", "gluing", "flesh", "person", "palm")
-"""Sources of an angle's uncertainty: noisy or unseen markers, their glued places, their motion over the
-bones, what stays of a person (sizes and directions of bones, gestures unlike other people's), and the arch of
-the palm, of which a model knows a part at most."""
+"""Sources of an angle's uncertainty: noisy or unseen markers, where markers are glued, how flesh moves them
+over the bones, the person (sizes and directions of bones, gestures unlike other people's), and the arch of
+the palm, which a model knows in part at most."""
 Measure = Literal["frame", "mean", "peak", "range"]
-"""What of an angle is compared between sessions: its value in a frame, its mean, its 5th or 95th percentile
-in a take, or its range of motion, between these."""
-_ARCH: Final = {"ring": 0.13, "little": 0.32}
+"""Figure of an angle that sessions compare: its value in a frame, its mean in a take, its peak (5th or 95th
+percentile), or its range of motion between these percentiles."""
+_ARCH_RATIOS: Final = {"ring": 0.13, "little": 0.32}
 """Flexion of the metacarpal over that of its finger, from the flat hand: root mean square of nine recorded
-grasps of four people (benchmarks/palm.py). Where one is large the other is, too."""
-_BENT: Final = float(np.deg2rad(50.0))  # the greatest flexion in them; beyond it the arch does not grow
-_METACARPAL: Final = 0.054  # [m] from its hinge to the knuckle, as in benchmarks/palm.py
+grasps of four people (benchmarks/palm.py). Both are large in the same people."""
+# [rad] largest flexion in these grasps; the arch stops growing there
+_MOST_FLEXION: Final = float(np.deg2rad(50.0))
+_METACARPAL_LENGTH: Final = 0.054  # [m] from the metacarpal's hinge to the knuckle, as in benchmarks/palm.py
 CHANGING: Final[dict[Measure, tuple[float, ...]]] = {
     "frame": (0.0, 0.0, 1.39, 0.25, 0.3),
     "mean": (0.0, 0.0, 0.73, 0.22, 0.25),
     "peak": (0.0, 0.0, 1.56, 0.27, 0.5),
     "range": (0.0, 0.0, 2.01, 0.31, 0.5),
 }
-"""Factors by which these parts of an uncalibrated hand's error change between sessions of a person. The rest
-comes from its wrong shape, which stays, and from people's usual gestures, towards which a hand is drawn
-nearly alike; glued places are seen in the part of flesh, as fits make up for most of them. Fitted to two
-sessions of each of 64 simulated people, half in dense19 and half in sparse13 (benchmarks/sessions.py). Those
-of the palm are the standard deviation between a person's grasps over `_ARCH` (0.3), times the ratio of the
-measure to the RMS of usual flexion (0.83, 1.7, 1.7)."""
+"""Factors of the `SOURCES` of an uncalibrated hand's error that change between sessions of a person. The rest
+of the error repeats: it comes from the wrong shape, and from people's usual gestures, towards which the prior
+pulls each session alike. The factor of flesh includes glued places, most of whose effect a fit absorbs. The
+factors were fitted to two sessions of each of 64 simulated people, half in dense19 and half in sparse13
+(benchmarks/sessions.py). Those of the palm are the standard deviation between a person's grasps over
+`_ARCH_RATIOS` (0.3), times the ratio of the measure to the RMS of usual flexion (0.83, 1.7, 1.7)."""
 DETECTABLE: Final = 1.96 * float(np.sqrt(2.0))
 """Ratio of the minimal detectable difference of two sessions to the standard error of measurement."""
-_OWN: Final = 9  # numbers of a digit: place of its knuckle, its direction, lengths of its bones (3 each)
-NUM_NUMBERS: Final = len(DIGITS) * _OWN + 1
-"""Numbers of a skeleton: those of its digits, and its size."""
+# numbers per digit: position of its knuckle, its direction, lengths of its bones (3 each)
+_DIGIT_NUMBERS: Final = 9
+SKELETON_NUMBERS: Final = len(DIGITS) * _DIGIT_NUMBERS + 1
+"""How many numbers describe a skeleton: those of its digits, and its size."""
 NOT_SMOOTHED: Final = np.empty((0, NUM_UNKNOWNS, NUM_UNKNOWNS))
-"""No covariances: the poses were fitted frame by frame."""
+"""No covariances, for poses that were fitted frame by frame."""
+MEDIAN_SQUARE: Final = 2.366
+"""Median of the squared length of a standard normal vector in space."""
 
 
 class JointPrior(NamedTuple):
@@ -107,7 +112,7 @@ class MarkerPrediction(NamedTuple):
 
     qpos: Float[np.ndarray, "27"]  # the pose; digits with missing markers at the optimum of markers and prior
     positions: Float[np.ndarray, "M 3"]  # markers in the world [m]
-    covariances: Float[np.ndarray, "M 3 3"]  # of each marker in the world [m^2]: from the pose, and its own
+    covariances: Float[np.ndarray, "M 3 3"]  # covariance of each marker in the world [m^2], its own included
     rotations: Float[np.ndarray, "M 3 3"]  # rotation in the world of each marker's main bone
     joint_covariance: Float[np.ndarray, "20 20"]  # covariance of the joint angles [rad^2]
     information_matrix: Float[np.ndarray, "20 20"]  # of the markers alone on angles, palm fixed [1/rad^2]
@@ -118,7 +123,8 @@ class HandErrors(NamedTuple):
     """C independent errors of a hand model against its user's hand, each of one standard deviation."""
 
     numbers: Float[np.ndarray, "46 C"]
-    """By digit: its knuckle [m], its turn about the palm's axes [rad], log lengths of its bones; log size."""
+    """By digit: its knuckle [m], its rotation about the palm's axes [rad], log lengths of its bones; log
+    size."""
     markers: Float[np.ndarray, "M 3 C"]
     """Shift of each marker in the frame of its main bone [m], beyond its motion with the bones."""
 
@@ -126,11 +132,11 @@ class HandErrors(NamedTuple):
 class HandDoubt(NamedTuple):
     """Standard deviations of the difference between a hand model and its user's hand."""
 
-    noise: float  # marker around its place, independent in each frame [m]
-    errors: HandErrors  # alike in all frames
-    places: Float[np.ndarray, "M 2"]  # of each marker on its bone: along the skin (each way), off it [m]
+    noise: float  # of a marker around its place, independent in each frame [m]
+    errors: HandErrors  # equal in all frames
+    places: Float[np.ndarray, "M 2"]  # of each marker on its bone: along the skin (each error), off it [m]
     arch: Float[np.ndarray, "46 1"]  # arch of the palm as an error of the numbers, per flexion of each finger
-    flesh: float = 0.0  # marker around its place, alike in successive frames [m]
+    flesh: float = 0.0  # of a marker around its place, equal in successive frames [m]
 
 
 class _Proportions(NamedTuple):
@@ -139,24 +145,20 @@ class _Proportions(NamedTuple):
     size: float  # log size
     place: tuple[float, float]  # marker place along the skin, off it [m]
     knuckle: float  # knuckle position [m]
-    turn: float  # direction of a finger [deg]
+    direction_deg: float  # direction of a finger [deg]
     thumb: float  # factor for the thumb's direction
     bones: tuple[float, float]  # log lengths: each bone, all of a digit
 
 
-# Chosen on simulated people, not those of docs/tracking.md. Smaller than differences between people, as
-# the fit of proportions makes up for part of them.
-_MEASURED: Final = _Proportions(0.001, (0.0014, 0.0005), 0.0003, 1.8, 4.0, (0.01, 0.02))
-# Nearest of five sizes: differences between people, and half a step between sizes. Marker places include
-# slips, and shifts by wrong girths and bone lengths.
-_NAMED: Final = _Proportions(
-    0.02,
-    (0.003, 0.003),
-    ADULTS.knuckle_spread,
-    ADULTS.angle_spread,
-    3.0,
+# These were chosen on simulated people other than those of docs/tracking.md. They are smaller than the
+# differences between people, because the fit of proportions absorbs a part.
+_MEASURED_PROPORTIONS: Final = _Proportions(0.001, (0.0014, 0.0005), 0.0003, 1.8, 4.0, (0.01, 0.02))
+# For the nearest of five sizes they are the differences between people, and half a step between sizes. Marker
+# places include slips, and shifts by wrong girths and bone lengths.
+_NAMED_PROPORTIONS: Final = _Proportions(
+    0.02, (0.003, 0.003), ADULTS.knuckle_spread, ADULTS.angle_spread, 3.0,
     (ADULTS.bone_spread, ADULTS.digit_spread),
-)
+)  # fmt: skip
 
 
 @cache
@@ -167,19 +169,19 @@ def resting_prior() -> JointPrior:
     return JointPrior(gestures.mean(axis=0), covariance, np.linalg.inv(covariance))
 
 
-def own_variances(angles: Float[np.ndarray, "F 20"]) -> Float[np.ndarray, "20"]:
+def usual_angle_variances(angles: Float[np.ndarray, "F 20"]) -> Float[np.ndarray, "20"]:
     """Variances of a person's usual angles around people's [rad^2], given the angles of a capture.
 
-    A joint that does not move shows one angle, however many frames repeat it, and perhaps never moves: how
-    far it is from what is usual, people's gestures do not tell.
+    A joint that does not move in the capture may never move. Its one angle may then be far from the gestures
+    of other people, however many frames repeat it.
     """
-    moved = angles.std(axis=0) / (_STILL * resting_prior().spread)
-    return np.asarray((_OWN_ANGLE / (1.0 + moved**4)) ** 2)
+    moved = angles.std(axis=0) / (_STILL_RATIO * resting_prior().spread)
+    return np.asarray((_STILL_ANGLE_SPREAD / (1.0 + moved**4)) ** 2)
 
 
 def are_still(angles: Float[np.ndarray, "F 20"]) -> Bool[np.ndarray, "20"]:
-    """Whether each joint hardly moves in a capture: its own usual angle may be any one."""
-    return np.asarray(own_variances(angles) > (_STILL_SHARE * _OWN_ANGLE) ** 2)
+    """Whether each joint hardly moves in a capture, so that the prior knows nothing of its usual angle."""
+    return np.asarray(usual_angle_variances(angles) > (_STILL_SHARE * _STILL_ANGLE_SPREAD) ** 2)
 
 
 def predict_joints(
@@ -220,7 +222,7 @@ def digit_prior(
     count = len(prior.angles)
     order, system, right_side = np.empty(count, dtype=np.int64), np.empty((count, count)), np.zeros(count)
     index = 0
-    for hinge in range(count):  # The digit's own joints come last, so that the others are eliminated.
+    for hinge in range(count):  # The digit's joints come last, so that the others can be eliminated first.
         own = hinge // 4 == digit
         order[count - 4 + hinge % 4 if own else index] = hinge
         index += not own
@@ -255,15 +257,10 @@ def predict_markers(
     """Positions and covariances of a fitted pose's markers."""
     count = len(target)
     work, wrist, weights = workspace(count), np.empty((3, 3)), np.zeros(count)
-    out = MarkerPrediction(
-        pose.copy(),
-        np.empty((count, 3)),
-        np.empty((count, 3, 3)),
-        np.empty((count, 3, 3)),
-        np.empty((NUM_JOINTS, NUM_JOINTS)),
-        np.empty((NUM_JOINTS, NUM_JOINTS)),
-        np.empty(NUM_JOINTS),
-    )
+    positions, covariances, rotations = np.empty((count, 3)), np.empty((count, 3, 3)), np.empty((count, 3, 3))
+    joints, matrix = np.empty((NUM_JOINTS, NUM_JOINTS)), np.empty((NUM_JOINTS, NUM_JOINTS))
+    vector = np.empty(NUM_JOINTS)
+    out = MarkerPrediction(pose.copy(), positions, covariances, rotations, joints, matrix, vector)
     write_quaternion_matrix(wrist, pose[3], pose[4], pose[5], pose[6])
     marker_residuals(hand, target, pose, work)
     seen = np.zeros(len(on_part), dtype=np.int64)
@@ -313,7 +310,7 @@ def _marker_covariance(
     work: Workspace,
     covariance: Float[np.ndarray, "3 3"],
 ) -> None:
-    """Write the covariance of a marker in the world [m^2], from that of the unknowns and its own variance."""
+    """Write the covariance of a marker in the world [m^2]: that of the pose, and its own variance."""
     first, last = hand.hinge_span[marker, 0], hand.hinge_span[marker, 1]
     count = last - first + 6
     jacobian, in_world = work.jacobian[marker], np.zeros((3, count))
@@ -335,9 +332,9 @@ def _marker_covariance(
             covariance[i, 0] += in_world[i, one] * x
             covariance[i, 1] += in_world[i, one] * y
             covariance[i, 2] += in_world[i, one] * z
-    # A marker moves on an arc, not on its tangent: motion along the tangent implies a deviation across
-    # it, the square over twice the radius.
-    bend = (covariance[0, 0] + covariance[1, 1] + covariance[2, 2]) / (2.0 * _ARC)
+    # A marker moves on an arc. Motion along the tangent deviates across it by its square over twice the
+    # radius.
+    bend = (covariance[0, 0] + covariance[1, 1] + covariance[2, 2]) / (2.0 * _ARC_RADIUS)
     for i in range(3):
         covariance[i, i] += variance + bend**2
 
@@ -351,7 +348,7 @@ def _complete_digits(
     work: Workspace,
     qpos: Float[np.ndarray, "27"],
 ) -> bool:
-    """Move joints of digits with missing markers to the optimum of prior and markers, others fixed."""
+    """Move the joints of digits with missing markers to the optimum of prior and markers; fix all others."""
     weak = np.zeros(NUM_JOINTS, dtype=np.int64)
     count = 0
     for hinge in range(NUM_JOINTS):
@@ -381,50 +378,50 @@ def _complete_digits(
 
 def known_hand(digits: Int[np.ndarray, "M"], noise: float) -> HandDoubt:
     """`HandDoubt` of a perfectly known hand whose markers have some noise [m]."""
-    numbers, places = np.zeros((NUM_NUMBERS, 1)), np.zeros((len(digits), 2))
-    return HandDoubt(noise, _same_markers(digits, numbers), places, numbers)
+    numbers, places = np.zeros((SKELETON_NUMBERS, 1)), np.zeros((len(digits), 2))
+    return HandDoubt(noise, _with_fixed_markers(digits, numbers), places, numbers)
 
 
 def hand_doubt(digits: Int[np.ndarray, "M"], origin: HandOrigin) -> HandDoubt:
-    """`HandDoubt` of a user's hand that was not calibrated, for people and gloves like the simulated ones."""
-    known, count = _NAMED if origin == "named" else _MEASURED, len(DIGITS)
-    turns = np.deg2rad(known.turn) * np.repeat([known.thumb, 1.0], [1, count - 1])
+    """`HandDoubt` of an uncalibrated hand, for people and gloves like the simulated ones."""
+    known, count = _NAMED_PROPORTIONS if origin == "named" else _MEASURED_PROPORTIONS, len(DIGITS)
+    turns = np.deg2rad(known.direction_deg) * np.repeat([known.thumb, 1.0], [1, count - 1])
     each, all_bones = known.bones
     own = [np.repeat([known.knuckle, turn, each], 3) for turn in turns]
-    numbers = np.zeros((NUM_NUMBERS, NUM_NUMBERS + count))
+    numbers = np.zeros((SKELETON_NUMBERS, SKELETON_NUMBERS + count))
     np.fill_diagonal(numbers, [*np.ravel(own), known.size])
-    numbers[:-1, NUM_NUMBERS:] = np.kron(np.eye(count), np.repeat([[0.0], [all_bones]], [6, 3], axis=0))
+    numbers[:-1, SKELETON_NUMBERS:] = np.kron(np.eye(count), np.repeat([[0.0], [all_bones]], [6, 3], axis=0))
     return known_hand(digits, MARKER_NOISE)._replace(
-        errors=_same_markers(digits, numbers), places=np.tile(known.place, (len(digits), 1))
+        errors=_with_fixed_markers(digits, numbers), places=np.tile(known.place, (len(digits), 1))
     )
 
 
-def _arch() -> Float[np.ndarray, "46 1"]:
-    """The `HandDoubt.arch` of people: metacarpals that turn about the palm's y axis, each at its hinge.
+def _usual_arch() -> Float[np.ndarray, "46 1"]:
+    """The `HandDoubt.arch` of people: metacarpals that rotate about the palm's y axis, each at its hinge.
 
-    Hands with an arch of their own have it, too. Their angles follow it less, and with half of it 81 % of the
-    little finger's errors in the grasps were within two deviations, in place of 94 %.
+    Hands whose shape has an arch get it, too. With half of it 81 % of the little finger's errors in the
+    grasps were within two standard deviations, instead of 94 %.
     """
-    numbers = np.zeros((NUM_NUMBERS, 1))
-    for digit, share in _ARCH.items():
-        first = _OWN * DIGITS.index(digit)
-        numbers[[first + 2, first + 4], 0] = -_METACARPAL * share, share
+    numbers = np.zeros((SKELETON_NUMBERS, 1))
+    for digit, share in _ARCH_RATIOS.items():
+        first = _DIGIT_NUMBERS * DIGITS.index(digit)
+        numbers[[first + 2, first + 4], 0] = -_METACARPAL_LENGTH * share, share
     return numbers
 
 
 def errors_of_motions(
     fit: GloveFit, numbers: Float[np.ndarray, "46 C"], motions: Float[np.ndarray, "M 3 C"]
 ) -> HandErrors:
-    """Errors of a hand, given by how they move the markers of the flat hand in the wrist's frame [m]."""
+    """Errors of a hand that move the markers of the flat hand by `motions` in the wrist's frame [m]."""
     hand, work = hand_arrays(fit), workspace(len(motions))
     compute_markers(hand, np.zeros(NUM_JOINTS), work)
     moved = np.empty((3 * len(motions), numbers.shape[1]))
-    _move_points(hand, numbers, work, moved)
+    _write_point_motions(hand, numbers, work, moved)
     turns = work.rotations[hand.bones[:, 0]].swapaxes(1, 2)
     return HandErrors(numbers, np.ascontiguousarray(turns @ (motions - moved.reshape(motions.shape))))
 
 
-def _same_markers(digits: Int[np.ndarray, "M"], numbers: Float[np.ndarray, "46 C"]) -> HandErrors:
+def _with_fixed_markers(digits: Int[np.ndarray, "M"], numbers: Float[np.ndarray, "46 C"]) -> HandErrors:
     """Errors of a skeleton whose markers keep their places on the bones."""
     return HandErrors(numbers, np.zeros((len(digits), 3, numbers.shape[1])))
 
@@ -432,7 +429,7 @@ def _same_markers(digits: Int[np.ndarray, "M"], numbers: Float[np.ndarray, "46 C
 class SpreadModel:
     """Standard deviations of the poses of one hand.
 
-    They follow from the errors that its calibration left, or from its origin if these are not known.
+    They follow from the errors that its calibration left; if these are unknown, from the hand's origin.
     """
 
     def __init__(self, fit: GloveFit, origin: HandOrigin, errors: HandErrors | None = None) -> None:
@@ -441,7 +438,7 @@ class SpreadModel:
         self._doubt = hand_doubt(digits, origin)
         if errors is not None:
             self._doubt = known_hand(digits, MARKER_NOISE)._replace(errors=errors)
-        self._doubt = self._doubt._replace(arch=_arch())
+        self._doubt = self._doubt._replace(arch=_usual_arch())
 
     def of_pose(
         self, qpos: Float[np.ndarray, "27"], unseen: Float[np.ndarray, "M"], rms: float
@@ -471,8 +468,9 @@ class SpreadModel:
     ) -> tuple[Float[np.ndarray, "T 26 5"], Float[np.ndarray, "T 21"]]:
         """Variances of all unknowns by `SOURCES` [rad^2, m^2], and standard deviations of keypoints [m].
 
-        For smoothed poses are given: flesh motion and RMS errors of marker places, along the skin and off it
-        [m], the covariances of the unknowns from noise and gaps, and the precision of the prior in one frame.
+        Callers with smoothed poses pass the motion of flesh and the RMS errors of marker places, along the
+        skin and off it [m], the covariances of the unknowns from noise and gaps, and the prior's precision in
+        a frame.
         """
         doubt = self._doubt._replace(flesh=flesh, places=np.maximum(self._doubt.places, places))
         if self.is_calibrated:
@@ -486,8 +484,8 @@ def measurement_error(
 ) -> Float[np.ndarray, "*J"]:
     """Standard error of measurement between sessions of a person, in the unit of deviations by `SOURCES`.
 
-    The glove is put on anew for each session. Then a calibrated hand is calibrated anew, too, and all parts
-    of its error but the palm's change; other measures than a frame keep their ratio to it.
+    The glove is put on again for each session, and a calibrated hand is calibrated again, so that all parts
+    of its error except the palm's change. The other measures keep their ratio to that of a frame.
     """
     fitted, palm = budget[..., :-1], CHANGING[measure][-1] * budget[..., -1]
     changing = np.linalg.norm(np.array(CHANGING[measure][:-1]) * fitted, axis=-1)
@@ -503,7 +501,7 @@ def freedom_factor(num_markers: int) -> float:
 
 
 def with_keypoints(fit: GloveFit) -> HandArrays:
-    """Arrays of a hand with its keypoints as further markers, each on the bone that ends there."""
+    """Arrays of a hand with its keypoints as additional markers, each on the bone that ends there."""
     hand, count = hand_arrays(fit), NUM_KEYPOINTS
     digits = np.repeat(np.arange(len(DIGITS)), 4)
     ends = 1 + 3 * digits + np.tile([0, 0, 1, 2], len(DIGITS))  # A knuckle is where the first bone begins.
@@ -532,14 +530,14 @@ def pose_spreads(
 ) -> tuple[Float[np.ndarray, "T 26 5"], Float[np.ndarray, "T 21"]]:
     """Variance of each unknown by `SOURCES` ([rad^2] or [m^2]), and standard deviation of each keypoint [m].
 
-    The unknowns are the joint angles, then position and rotation of the wrist along its own axes. `hand` is
-    from `with_keypoints`. A marker off its place moves the fit as noise does. Errors of the hand, and the
-    arch of its palm, move markers, through them the fit, and keypoints also directly.
+    The unknowns are the joint angles, then position and rotation of the wrist along its own axes. `hand`
+    comes from `with_keypoints`. A misplaced marker moves the fit as noise does. Errors of the hand and the
+    arch of its palm move the markers, hence the fit, and they also move the keypoints directly.
     """
     found, keypoints = np.empty((len(qpos), NUM_UNKNOWNS, 5)), np.empty((len(qpos), NUM_KEYPOINTS))
     count, work, weights = unseen.shape[1], workspace(len(hand.digits)), np.zeros(len(hand.digits))
-    ways, posterior = doubt.errors.numbers.shape[1], np.empty((NUM_UNKNOWNS, NUM_UNKNOWNS))
-    moved, shifted = np.empty((3 * len(weights), ways)), np.empty((3 * count, ways))
+    num_errors, posterior = doubt.errors.numbers.shape[1], np.empty((NUM_UNKNOWNS, NUM_UNKNOWNS))
+    moved, shifted = np.empty((3 * len(weights), num_errors)), np.empty((3 * count, num_errors))
     arched, arch = np.empty((3 * len(weights), 1)), np.zeros_like(doubt.arch)
     weighted, jacobian = np.empty((3 * count, NUM_UNKNOWNS)), work.jacobian.reshape(-1, NUM_UNKNOWNS)
     work.residuals[:] = 0.0
@@ -551,15 +549,16 @@ def pose_spreads(
         for row in range(NUM_UNKNOWNS):
             for column in range(row + 1):
                 posterior[row, column] = work.normal[column, row]
-            posterior[row, row] += _ANYWHERE if row >= NUM_JOINTS else 0.0
+            posterior[row, row] += _WRIST_PRECISION if row >= NUM_JOINTS else 0.0
         posterior[:NUM_JOINTS, :NUM_JOINTS] += prior
         invert_positive(posterior)
-        _move_points(hand, doubt.errors.numbers, work, moved)
-        _shift_markers(hand, doubt.errors.markers, work, shifted)
-        for number in range(NUM_NUMBERS - 1):
-            flexion = min(max(qpos[frame, 8 + 4 * (number // _OWN)], -_BENT), _BENT)
+        _write_point_motions(hand, doubt.errors.numbers, work, moved)
+        _write_marker_shifts(hand, doubt.errors.markers, work, shifted)
+        for number in range(SKELETON_NUMBERS - 1):
+            flexion = qpos[frame, 8 + 4 * (number // _DIGIT_NUMBERS)]
+            flexion = min(max(flexion, -_MOST_FLEXION), _MOST_FLEXION)
             arch[number] = doubt.arch[number] * flexion
-        _move_points(hand, arch, work, arched)
+        _write_point_motions(hand, arch, work, arched)
         for row in range(3 * count):
             for unknown in range(NUM_UNKNOWNS):
                 weighted[row, unknown] = weights[row // 3] * jacobian[row, unknown]
@@ -570,8 +569,9 @@ def pose_spreads(
         _write_variances(hand, doubt, work, noise, by_bones, by_places, off, found[frame])
         spread = jacobian[3 * count :] @ (noise + off.T @ off)
         for unknown in range(NUM_UNKNOWNS):
-            # Others move half as far in simulated arches, and not at all in recorded grasps.
-            arches = unknown < NUM_JOINTS and doubt.arch[_OWN * (unknown // 4) + 4, 0] != 0.0
+            # Only arched digits have this error: others move half as far in simulated arches, and not at all
+            # in recorded grasps.
+            arches = unknown < NUM_JOINTS and doubt.arch[_DIGIT_NUMBERS * (unknown // 4) + 4, 0] != 0.0
             found[frame, unknown, 4] = by_arch[unknown, 0] ** 2 if arches else 0.0
         left = moved[3 * count :] - jacobian[3 * count :] @ answers
         bent = arched[3 * count :] - jacobian[3 * count :] @ by_arch
@@ -580,8 +580,8 @@ def pose_spreads(
             for row in range(3 * keypoint, 3 * keypoint + 3):
                 for unknown in range(NUM_UNKNOWNS):
                     total += spread[row, unknown] * jacobian[3 * count + row, unknown]
-                for way in range(ways):
-                    total += left[row, way] ** 2
+                for error in range(num_errors):
+                    total += left[row, error] ** 2
                 total += bent[row, 0] ** 2
             keypoints[frame, keypoint] = np.sqrt(max(total, 0.0) / 3.0)
     return found, keypoints
@@ -598,14 +598,15 @@ def _write_variances(
     off: Float[np.ndarray, "R 26"],
     variances: Float[np.ndarray, "26 5"],
 ) -> None:
-    """Write the variances of unknowns [rad^2, m^2]; scales `off` from derivatives by [m] to deviations."""
-    # A slipped marker keeps its height over the bone, and the height tells most of the bone's flexion. Errors
-    # of bones and places are correlated: their variance is divided in the ratio of the separate variances.
+    """Write the variances of unknowns [rad^2, m^2]; scale `off` from derivatives to standard deviations."""
+    # A slipped marker keeps its height over the bone, and that height determines most of the bone's flexion.
+    # Errors of bones and places are correlated, so their variance is divided in proportion to the separate
+    # ones.
     variances[:] = 0.0
     for unknown in range(NUM_UNKNOWNS):
         bones, places, both = 0.0, 0.0, 0.0
-        for way in range(by_bones.shape[1]):
-            bone, place = by_bones[unknown, way], by_places[unknown, way]
+        for error in range(by_bones.shape[1]):
+            bone, place = by_bones[unknown, error], by_places[unknown, error]
             bones, places, both = bones + bone**2, places + place**2, both + (bone + place) ** 2
         both /= max(bones + places, 1e-30)
         variances[unknown, 0] = noise[unknown, unknown]
@@ -627,11 +628,8 @@ def _write_variances(
 
 
 @kernel
-def _shift_markers(
-    hand: HandArrays,
-    shifts: Float[np.ndarray, "M 3 C"],
-    work: Workspace,
-    shifted: Float[np.ndarray, "R C"],
+def _write_marker_shifts(
+    hand: HandArrays, shifts: Float[np.ndarray, "M 3 C"], work: Workspace, shifted: Float[np.ndarray, "R C"]
 ) -> None:
     """Write the shifts of markers in the wrist's frame [m]."""
     shifted[:] = 0.0
@@ -641,18 +639,15 @@ def _shift_markers(
 
 
 @kernel
-def _move_points(
-    hand: HandArrays,
-    numbers: Float[np.ndarray, "46 C"],
-    work: Workspace,
-    moved: Float[np.ndarray, "R C"],
+def _write_point_motions(
+    hand: HandArrays, numbers: Float[np.ndarray, "46 C"], work: Workspace, moved: Float[np.ndarray, "R C"]
 ) -> None:
     """Write the motion of points with the bones by each error of a skeleton's numbers [m]."""
-    ways, lever, own = numbers.shape[1], np.empty(3), np.empty((3, _OWN))
+    num_errors, lever, own = numbers.shape[1], np.empty(3), np.empty((3, _DIGIT_NUMBERS))
     for point in range(len(moved) // 3):
         for i in range(3):
-            for way in range(ways):
-                moved[3 * point + i, way] = work.markers[point, i] * numbers[NUM_NUMBERS - 1, way]
+            for error in range(num_errors):
+                moved[3 * point + i, error] = work.markers[point, i] * numbers[SKELETON_NUMBERS - 1, error]
         for digit in range(hand.hinge_span[point, 0] // 4, hand.hinge_span[point, 1] // 4):
             share, lever[:], own[:] = 0.0, 0.0, 0.0
             for link in range(2, -1, -1):
@@ -672,7 +667,8 @@ def _move_points(
             own[1, 3], own[2, 3] = -lever[2], lever[1]
             own[0, 4], own[2, 4] = lever[2], -lever[0]
             own[0, 5], own[1, 5] = -lever[1], lever[0]
-            _add_product(own, numbers[_OWN * digit : _OWN * (digit + 1)], moved[3 * point : 3 * point + 3])
+            first = _DIGIT_NUMBERS * digit
+            _add_product(own, numbers[first : first + _DIGIT_NUMBERS], moved[3 * point : 3 * point + 3])
 
 
 @kernel
@@ -683,5 +679,5 @@ def _add_product(
     for row in range(3):
         for number in range(len(right)):
             if left[row, number] != 0.0:
-                for way in range(right.shape[1]):
-                    total[row, way] += left[row, number] * right[number, way]
+                for error in range(right.shape[1]):
+                    total[row, error] += left[row, number] * right[number, error]

@@ -33,21 +33,21 @@ from track.settings import TrackerSetup, TrackSettings
 from track.tracker import Tracker
 from track.user import MEASURED, User
 
-_FIRST: Final = 0.3  # [s] duration of frames with enough points before the first measurement
-_ENOUGH: Final = 10.0  # [s] the same for the final measurement
-_LATER: Final = 2.0  # If no hand was found, try again after this multiple of that time.
+_FIRST_DURATION: Final = 0.3  # [s] duration of frames with enough points before the first measurement,
+_FINAL_DURATION: Final = 10.0  # [s] and before the final measurement
+_LATER_FACTOR: Final = 2.0  # If no hand was found, the next measurement waits this many times as long.
 _LONGEST_STEP: Final = 0.1  # [s] A longer gap between two frames counts as this much time with hands.
 _MOST_FRAMES: Final = 20_000  # largest number of kept frames; a stream may show no hand for hours
 _PAUSE: Final = 1.0  # [s] without a hand, after which the hands may be another person's
-_SAME: Final = 0.006  # [m] Brief measurements of the same hands differ by less.
-_CALM: Final = 5.0  # [s] time after a measurement over which the usual residual is averaged
-_RECENT: Final = 1.0  # [s] time constant of the newest residual's running mean
-_JUMP: Final = 1.5  # ratio to the usual residual beyond which the hands may be another person's
-_STEP: Final = 0.002  # [m] motion of the markers of a hand at rest per step to a new size
+_SAME_LENGTH: Final = 0.006  # [m] Lengths of the same hands from brief measurements differ by less.
+_CALM_TIME: Final = 5.0  # [s] time after a measurement over which the usual residual is averaged
+_RECENT_TIME: Final = 1.0  # [s] time constant of the newest residual's running mean
+_RESIDUAL_RATIO: Final = 1.5  # ratio to the usual residual beyond which the hands may be another person's
+_STEP_MOTION: Final = 0.002  # [m] motion of the markers of a hand at rest per step to a new size
 _FEWEST_STEPS: Final = 4  # Learned marker biases fade out in at least this many steps.
-_EASE: Final = 0.0025  # [m] most by which a keypoint leaves its motion per frame while a size is taken over
+_MOST_EASING: Final = 0.0025  # [m] largest deviation of a keypoint from its motion per frame, at a new size
 _USUAL_TIME: Final = 3.0  # [s] A measurement that takes longer lacks processor time.
-_NICE: Final = 5  # The measuring process has a lower priority than the tracker's.
+_NICENESS: Final = 5  # The measuring process has a lower priority than the tracker's.
 
 
 class _Measured(NamedTuple):
@@ -70,10 +70,10 @@ class LiveSizing(Closing):
 
     def __init__(self, setup: TrackerSetup) -> None:
         self._setup, self._frames = setup, list[StreamedFrame]()
-        self._shown, self._due = 0.0, _FIRST  # [s] frames with enough points: so far, needed
+        self._seen_time, self._due = 0.0, _FIRST_DURATION  # [s] frames with enough points: so far, needed
         self._last = self._seen = -np.inf  # [s] times of the last such frame and hand
         self._is_brief, self._is_done = True, False  # is the last measurement brief, the size final?
-        self._calm = self._usual = self._newest = 0.0  # [s] since measured; [m] residuals
+        self._time_since = self._usual = self._newest = 0.0  # [s] since measured; [m] residuals
         self._is_measured, self._reason, self._begun = False, "", 0.0  # [s] `_begun` on the monotonic clock
         self._is_late = False  # Is the running measurement of hands before a pause or another user?
         self._is_first = True  # Was no hand measured yet?
@@ -94,11 +94,11 @@ class LiveSizing(Closing):
     @property
     def state(self) -> str:
         """Why the hands are not measured, or not those of another user yet; empty if they need not be."""
-        nobody_came = not self._is_first and not self._shown
+        nobody_came = not self._is_first and not self._seen_time
         if self._is_measured or nobody_came or not self._setup.is_auto:
             return ""
         if self._measuring is None:
-            return self._reason or f"not measured yet: seen for {self._shown:.1f} of {self._due:.1f} s"
+            return self._reason or f"not measured yet: seen for {self._seen_time:.1f} of {self._due:.1f} s"
         has_time = monotonic() < self._begun + _USUAL_TIME
         return "being measured" if has_time else "not measured yet: no processor time"
 
@@ -117,7 +117,7 @@ class LiveSizing(Closing):
         if self._is_easing and last is not None:
             span = tracked.time - last[0].time if self._is_resized else None
             each = zip(last[0].hands, last[1].hands, tracked.hands, tracker.hands, strict=True)
-            hands = tuple(_eased(was, seen, hand, fit.model, span) for was, seen, hand, fit in each)
+            hands = tuple(_ease_hand(was, seen, hand, fit.model, span) for was, seen, hand, fit in each)
             self._is_easing = hands != tracked.hands or not self.is_settled
             shown = dataclasses.replace(tracked, hands=hands)
         self._before, self._is_resized = (tracked, shown), False
@@ -131,18 +131,18 @@ class LiveSizing(Closing):
         came = frame.time > self._seen + _PAUSE and (is_there or self._is_measured)
         if came or self._fit_worse(tracked, min(frame.time - self._seen, _LONGEST_STEP)):
             self._frames.clear()
-            self._shown, self._due, self._is_brief, self._is_done = 0.0, _FIRST, True, False
+            self._seen_time, self._due, self._is_brief, self._is_done = 0.0, _FIRST_DURATION, True, False
             self._is_measured, self._reason, self._is_late = False, "", self._measuring is not None
         self._seen = frame.time if is_there else self._seen
         if not self._is_done and len(frame.points) >= self._setup.fewest_points:
-            self._shown += min(frame.time - self._last, _LONGEST_STEP)
+            self._seen_time += min(frame.time - self._last, _LONGEST_STEP)
             self._last = frame.time
             self._frames.append(frame)
             if len(self._frames) > _MOST_FRAMES:
                 self._frames = sample_frames(self._frames)
         if self._measuring is not None and self._measuring.done():
             self._end_measuring(self._measuring, tracker)
-        if self._measuring is None and self._shown >= self._due and not self._is_done:
+        if self._measuring is None and self._seen_time >= self._due and not self._is_done:
             self._begin_measuring(self._steps[-1] if self._steps else tracker.user)
         if not self._steps:
             return False
@@ -156,17 +156,17 @@ class LiveSizing(Closing):
         if self._steps or not self._is_measured or not rms:
             return False
         mean = sum(rms) / len(rms)
-        self._calm += span
-        if self._calm < _CALM:
-            self._usual += (mean - self._usual) * span / self._calm
+        self._time_since += span
+        if self._time_since < _CALM_TIME:
+            self._usual += (mean - self._usual) * span / self._time_since
             self._newest = self._usual
-        self._newest += (mean - self._newest) * span / _RECENT
-        return self._newest > _JUMP * self._usual
+        self._newest += (mean - self._newest) * span / _RECENT_TIME
+        return self._newest > _RESIDUAL_RATIO * self._usual
 
     def _begin_measuring(self, user: User) -> None:
         """Start to measure the hands in the frames so far."""
-        self._is_late, self._is_brief = False, self._shown < _ENOUGH
-        self._due = _LATER * self._shown
+        self._is_late, self._is_brief = False, self._seen_time < _FINAL_DURATION
+        self._due = _LATER_FACTOR * self._seen_time
         self._frames, self._begun = sample_frames(self._frames), monotonic()
         processes = self._processes or self._start_process()
         self._measuring = processes.submit(
@@ -176,7 +176,7 @@ class LiveSizing(Closing):
     def _start_process(self) -> LocalProcesses:
         """Start the process that measures, which takes as long to load as to measure."""
         self._processes = LocalProcesses(1)
-        self._processes.submit(_give_way)
+        self._processes.submit(_lower_priority)
         return self._processes
 
     def _end_measuring(self, measuring: Future[_Measured], tracker: Tracker) -> None:
@@ -195,19 +195,19 @@ class LiveSizing(Closing):
             return
         self._is_measured, self._is_first = not self._is_late, False
         if self._is_measured:
-            self._due, self._seen = max(self._due, _ENOUGH), max(self._seen, self._last)
+            self._due, self._seen = max(self._due, _FINAL_DURATION), max(self._seen, self._last)
         self._judges = self._judges or found.is_relabeled
-        self._is_done, self._calm, self._usual = not self._is_brief, 0.0, 0.0
+        self._is_done, self._time_since, self._usual = not self._is_brief, 0.0, 0.0
         before, after = (one[0].shape.length for one in (tracker.user, found.users[-1]))
-        is_same = tracker.user.notes.startswith(MEASURED) and abs(after - before) < _SAME
+        is_same = tracker.user.notes.startswith(MEASURED) and abs(after - before) < _SAME_LENGTH
         if not (self._is_brief and is_same):
             self._steps = deque(found.users)
 
 
-def _give_way() -> None:
+def _lower_priority() -> None:
     """Lower the priority of this process."""
     if hasattr(os, "nice"):
-        os.nice(_NICE)
+        os.nice(_NICENESS)
 
 
 def _measure(
@@ -228,7 +228,7 @@ def _measure(
     is_relabeled = setup.user is not measured
     places = [np.concatenate([hand.attachment.points for hand in user]) for user in (before, after)]
     farthest = float(np.linalg.norm(places[1] - places[0], axis=1).max())
-    count = max(_FEWEST_STEPS, int(np.ceil(farthest / _STEP)))
+    count = max(_FEWEST_STEPS, int(np.ceil(farthest / _STEP_MOTION)))
     users = []
     for share in np.arange(1, count) / count:
         hands = tuple(hand_between(*pair, float(share)) for pair in zip(before, after, strict=True))
@@ -236,13 +236,13 @@ def _measure(
     return _Measured([*users, after], told, is_relabeled)
 
 
-def _eased(
+def _ease_hand(
     tracked: TrackedHand, shown: TrackedHand, hand: TrackedHand, model: HandModel, span: float | None
 ) -> TrackedHand:
-    """A hand's pose, or one on the way to it from the shown one of the frame before.
+    """A hand in its tracked pose, or in one on the way from the pose shown before.
 
-    The shown hand moves as the tracked one does, or for `span` seconds as before if another size has moved
-    that, too.
+    The shown hand moves as the tracked one does. If another size has moved the tracked one, it continues its
+    own motion for `span` seconds.
     """
     if not shown.has_pose or hand.status not in (Status.TRACKED, Status.COASTING):
         return hand
@@ -251,7 +251,7 @@ def _eased(
         motion = velocity_of(tracked.qpos, hand.qpos, 1.0)
     due = move(shown.qpos[None], motion[None])[0]
     ways = np.diff(hand_keypoints(model, np.stack([due, hand.qpos])), axis=0)
-    share = _EASE / max(float(np.linalg.norm(ways, axis=-1).max()), _EASE)
+    share = _MOST_EASING / max(float(np.linalg.norm(ways, axis=-1).max()), _MOST_EASING)
     if share == 1.0:
         return hand
     qpos = move(due[None], share * velocity_of(due, hand.qpos, 1.0)[None])[0]

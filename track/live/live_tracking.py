@@ -30,11 +30,11 @@ from track.streams.live_stream import LiveStream, open_source
 from track.tracker import Tracker
 
 _PACE_PERIOD: Final = 1.0  # [s] between two reports on dropped frames
-_RETRY: Final = 0.5  # [s] between two attempts to reach a server
-_FIRST_FRAME: Final = 10.0  # [s] A first frame is awaited at least this long if the session has a length.
-_PACKETS: Final = {"damaged_packets": "damaged", "foreign_packets": "of other senders"}
+_RETRY_PERIOD: Final = 0.5  # [s] between two attempts to reach a server
+_FIRST_FRAME_WAIT: Final = 10.0  # [s] least wait for the first frame of a session with a length
+_PACKET_WORDS: Final = {"damaged_packets": "damaged", "foreign_packets": "of other senders"}
 """Words for the counts of ignored packets."""
-_FRAMES: Final = {
+_FRAME_WORDS: Final = {
     "frames_in_order": "in order",
     "reordered_frames": "put in order",
     "doubled_frames": "doubled",
@@ -42,7 +42,7 @@ _FRAMES: Final = {
     "frames_with_wild_times": "with a wild time",
 }
 """Words for the counts that add up to all received frames."""
-_OF_THEM: Final = {
+_PART_WORDS: Final = {
     "dropped_frames": "of them dropped, as they were not kept up with",
     "frames_after_end": "of them after the end",
 }
@@ -96,10 +96,10 @@ def track_live(
 ) -> LiveTake:
     """Track a stream, into `out` if given, until `seconds` are over, the stream ends or a signal comes.
 
-    The `seconds` count from the first frame, which is awaited as long, at least ten seconds; without
-    `seconds` it is awaited until a signal comes. After each frame the text of `guide` is shown; if it is
-    None, tracking ends. The first signal writes the take without the waiting frames; a second one keeps the
-    recording as it is. If the recording fails, outputs still get all frames.
+    The `seconds` count from the first frame. That frame is awaited for `seconds`, at least ten, and without
+    `seconds` until a signal comes. After each frame the text of `guide` is shown; if it is None, tracking
+    ends. The first signal writes the take without the waiting frames; a second one keeps the recording as it
+    is. If the recording fails, outputs still get all frames.
 
     Raises:
         CaptureError: No server answered or no frame came in time, or the recording failed.
@@ -107,12 +107,12 @@ def track_live(
     if out is not None:
         check_unused(growing_path(out))
     tracker = _ready_tracker(setup, outputs)
-    patience = math.inf if seconds is None else max(seconds, _FIRST_FRAME)
+    patience = math.inf if seconds is None else max(seconds, _FIRST_FRAME_WAIT)
     until = monotonic() + patience  # [s] end of tracking on the monotonic clock
     interrupted = InterruptFlag()
     with (
         LiveStatus() as status,
-        _open_answering(address, lambda: interrupted() or monotonic() >= until, until, status) as stream,
+        _open_answered(address, lambda: interrupted() or monotonic() >= until, until, status) as stream,
         ExitStack() as stack,
     ):
         stack.enter_context(interrupt_flag(interrupted))  # From here on a signal keeps the frames so far.
@@ -163,7 +163,7 @@ def track_live(
 
 
 def _ready_tracker(setup: TrackerSetup, outputs: Sequence[FrameOutput]) -> Tracker:
-    """The tracker of a session, after all that would hold up its first frames."""
+    """The tracker of a session, after all work that would delay its first frames."""
     with named_steps("getting ready"):
         tracker = setup.tracker()
         tracker.warm_up()
@@ -178,7 +178,7 @@ def _start(outputs: Sequence[FrameOutput], tracker: Tracker) -> None:
         output.start(tracker.hands, tracker.bodies)
 
 
-def _open_answering(address: str, ended: Callable[[], bool], until: float, status: LiveStatus) -> LiveStream:
+def _open_answered(address: str, ended: Callable[[], bool], until: float, status: LiveStatus) -> LiveStream:
     """Open a stream as soon as its server answers, by a monotonic time `until` [s]."""
     while True:
         try:
@@ -187,11 +187,11 @@ def _open_answering(address: str, ended: Callable[[], bool], until: float, statu
             if monotonic() >= until:
                 raise
             status.show(f"{error}; it is waited for, Ctrl-C ends it")
-            sleep(_RETRY)  # a refused connection returns at once
+            sleep(_RETRY_PERIOD)  # a refused connection returns at once
 
 
 class _Recording:
-    """The recording of a session, which may fail while outputs still get frames."""
+    """The recording of a session; if it fails, outputs still get frames."""
 
     def __init__(
         self,
@@ -207,7 +207,7 @@ class _Recording:
         self._failure: CaptureError | None = None
         if out is not None:
             recorder = self._recorder = stack.enter_context(Recorder(out, tracker, settings))
-            stack.enter_context(_recording_kept(recorder))
+            stack.enter_context(_kept_on_interrupt(recorder))
             status.say(f"recording to {recorder.part}, which becomes {out} at the end; Ctrl-C ends it")
 
     def add(self, frame: StreamedFrame, tracked: TrackedFrame) -> None:
@@ -243,7 +243,7 @@ class _Recording:
 
 
 @contextmanager
-def _recording_kept(recorder: Recorder) -> Iterator[None]:
+def _kept_on_interrupt(recorder: Recorder) -> Iterator[None]:
     """On an interrupt, close the recording and say where it is kept."""
     try:
         with interrupts_bare():
@@ -298,8 +298,8 @@ class _Pace:
 
 def _notes(counts: dict[str, int], step: int, pace: _Pace, interval: float) -> Iterator[str]:
     """Lines to print at the end of a stream; `interval` is the time between frames [s]."""
-    told = ", ".join(f"{counts[name]} {what}" for name, what in _FRAMES.items())
-    others = ", ".join(f"{counts[name]} {what}" for name, what in _OF_THEM.items() if counts[name])
+    told = ", ".join(f"{counts[name]} {what}" for name, what in _FRAME_WORDS.items())
+    others = ", ".join(f"{counts[name]} {what}" for name, what in _PART_WORDS.items() if counts[name])
     others = f" ({others})" if others else ""
     yield f"{counts['received_frames']} frames received: {told}{others}; {counts['missing_frames']} missing"
     if pace.lags:
@@ -311,7 +311,7 @@ def _notes(counts: dict[str, int], step: int, pace: _Pace, interval: float) -> I
     if lacking := counts["missing_at_end"]:
         quiet = f"no frame came in the last {lacking * interval:.2f} s"
         yield f"{quiet}, in which {lacking} could have been sent"
-    packets = [f"{counts[name]} {what}" for name, what in _PACKETS.items() if counts.get(name)]
+    packets = [f"{counts[name]} {what}" for name, what in _PACKET_WORDS.items() if counts.get(name)]
     if packets:
         yield f"packets left out: {', '.join(packets)}"
     if counts["restarts"]:

@@ -15,8 +15,8 @@ from gloves.takes.points import Status
 from handsim._plugins import import_extra
 from track.output.live_message import SCHEMA, LiveHeader, LiveMessage
 
-_LSL_FILES: Final = ("lsl_api.cfg", "~/lsl_api/lsl_api.cfg", "/etc/lsl_api/lsl_api.cfg")
-_LSL_QUIET: Final = "[log]\nlevel = -1\n"  # LSL writes warnings alone, where the user has not configured it.
+_CONFIGS: Final = ("lsl_api.cfg", "~/lsl_api/lsl_api.cfg", "/etc/lsl_api/lsl_api.cfg")
+_QUIET_CONFIG: Final = "[log]\nlevel = -1\n"  # makes LSL write warnings only, unless the user configured it
 STATUSES: Final = tuple(reversed(Status))
 """A status channel of LSL holds an index into these."""
 _XYZ: Final = ("x", "y", "z")
@@ -31,10 +31,10 @@ class LabStreamingSink:
 
     def __init__(self, name: str) -> None:
         self._lsl: Any = import_extra("pylsl", "lsl:", "send")
-        configured = "LSLAPICFG" in os.environ or any(Path(one).expanduser().exists() for one in _LSL_FILES)
+        configured = "LSLAPICFG" in os.environ or any(Path(one).expanduser().exists() for one in _CONFIGS)
         if not configured:
             with suppress(AttributeError, NotImplementedError):  # old versions cannot be told
-                self._lsl.set_config_content(_LSL_QUIET)
+                self._lsl.set_config_content(_QUIET_CONFIG)
         self._name = name
         self._outlet: Any = None
 

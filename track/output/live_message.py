@@ -13,40 +13,34 @@ from typing import Any, Final, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 from jaxtyping import Float, Int
-from numpy.typing import NDArray
 
 from gloves.fit import GloveFit
 from gloves.takes.points import Status
 from gloves.takes.take import label_names
 from handsim import __version__
 from handsim._plugins import import_extra
+from handsim.arrays import Doubles
 from handsim.hand.angles import WRIST_NAMES, wrist_angles
 from handsim.hand.model import KEYPOINT_NAMES, HandModel, hand_keypoints
 from handsim.hand.shape import DIGITS, JOINT_NAMES, Side
 from handsim.kernels import move
 from handsim.motion_files.motion import OPENXR_JOINTS, joint_poses, joint_radii
-from handsim.space.transforms import (
-    ProgramAxes,
-    UpAxis,
-    program_axes,
-    quaternion_matrix,
-    transform_poses,
-)
+from handsim.space.transforms import ProgramAxes, UpAxis, program_axes, quaternion_matrix, transform_poses
 from track.bodies.rigid_body import RigidTemplate
 from track.frames import StreamedFrame, TrackedBody, TrackedFrame, TrackedHand
 
 SCHEMA: Final = 1
-"""Version of the messages; a receiver of one version understands all later messages of it."""
+"""Version of the messages; a receiver of a version understands all later messages of that version."""
 FORMATS: Final = ("json", "msgpack")
 WORLD: Final = "world"
 """The axes of the camera system."""
 LARGEST_DATAGRAM: Final = 1400
 """Largest size of a datagram that usual networks carry in one packet [bytes]."""
-_DECIMALS: Final = 6  # resolution of micrometers and microradians
-_STEP: Final = 1e-3  # [s] Velocities are differences of poses this far apart in time.
-# Entries of a hand that share one part.
-_POSE: Final = ("side", "status", "seen", "digits", "wrist", "angles", "positions")
-_HALF: Final = len(OPENXR_JOINTS) // 2
+_DECIMALS: Final = 6  # decimals of numbers, which resolve micrometers and microradians
+_VELOCITY_STEP: Final = 1e-3  # [s] Velocities are differences of poses this far apart in time.
+# These entries of a hand are sent in the same part.
+_POSE_ENTRIES: Final = ("side", "status", "seen", "digits", "wrist", "angles", "positions")
+_HALF_JOINTS: Final = len(OPENXR_JOINTS) // 2
 _HINT: Final = "a client of the path /newest gets the newest frame for each message that it sends"
 
 
@@ -169,14 +163,14 @@ class LiveSink(Protocol):
 
 
 class MessageEncoder:
-    """Makes the messages on the frames of one tracker."""
+    """Encodes the frames of one tracker as messages."""
 
     def __init__(self, hands: Sequence[GloveFit], bodies: Sequence[RigidTemplate]) -> None:
         self._models = [hand.model for hand in hands]
         self._digits = [hand.attachment.digits for hand in hands]
         self._limbs = [body.limb if body.elbow or body.has_axes else {} for body in bodies]
         parts = {part for limb in self._limbs for part in limb}
-        told = len(WRIST_NAMES) if "elbow" in parts else len(WRIST_NAMES) - 1
+        num_angles = len(WRIST_NAMES) if "elbow" in parts else len(WRIST_NAMES) - 1
         self.header = LiveHeader(
             tuple(hand.side for hand in hands),
             JOINT_NAMES,
@@ -185,7 +179,7 @@ class MessageEncoder:
             DIGITS,
             label_names(hands, bodies),
             tuple(tuple(joint_radii(hand.model).tolist()) for hand in hands),
-            WRIST_NAMES[:told] if "forearm" in parts else (),
+            WRIST_NAMES[:num_angles] if "forearm" in parts else (),
         )
 
     def encode(self, frame: StreamedFrame, tracked: TrackedFrame) -> LiveMessage:
@@ -219,11 +213,8 @@ class MessageEncoder:
         joints = functools.partial(_openxr_joints, self._models[number], hand.qpos)
         seen = np.full(len(self._digits[number]), hand.has_pose)
         seen[hand.filled] = False
-        told = set(self._digits[number][seen].tolist())
-        digits = tuple(
-            hand.status if number in told else min(hand.status, Status.COASTING)
-            for number in range(len(DIGITS))
-        )
+        shown, unseen = set(self._digits[number][seen].tolist()), min(hand.status, Status.COASTING)
+        digits = tuple(hand.status if digit in shown else unseen for digit in range(len(DIGITS)))
         doubt = float(seen.mean()), digits
         wrist = self._wrist_angles(hand, bodies)
         return LiveHand(
@@ -244,9 +235,9 @@ class MessageEncoder:
 def _velocities(model: HandModel, hand: TrackedHand) -> Float[np.ndarray, "21 3"]:
     if np.isnan(hand.velocity).any():
         return np.full((len(KEYPOINT_NAMES), 3), np.nan)
-    steps = np.outer([-0.5 * _STEP, 0.5 * _STEP], hand.velocity)
+    steps = np.outer([-0.5 * _VELOCITY_STEP, 0.5 * _VELOCITY_STEP], hand.velocity)
     before, after = hand_keypoints(model, move(np.stack([hand.qpos] * 2), steps))
-    return np.asarray((after - before) / _STEP)
+    return np.asarray((after - before) / _VELOCITY_STEP)
 
 
 def _openxr_joints(model: HandModel, qpos: Float[np.ndarray, "27"]) -> Float[np.ndarray, "26 7"]:
@@ -259,7 +250,7 @@ _Placed = TypeVar("_Placed", LiveHand, LiveBody)
 def in_axes(message: LiveMessage, axes: ProgramAxes) -> LiveMessage:
     """Convert positions, orientations and points of a message to a program's axes and unit."""
 
-    def turned(poses: Float[np.ndarray, "K 7"]) -> NDArray[np.float64]:
+    def turned(poses: Float[np.ndarray, "K 7"]) -> Doubles:
         return np.concatenate([axes.positions(poses[:, :3]), axes.quaternions(poses[:, 3:])], axis=1)
 
     def placed(thing: _Placed) -> _Placed:
@@ -291,7 +282,7 @@ class MessageFormat(NamedTuple):
     frame: Callable[[LiveMessage], list[bytes]]
     end: Callable[[], list[bytes]]
     lag: Callable[[float, int], bytes] = lambda lag, dropped: b""
-    """Encodes for a client its lag [s] and the number of frames that it missed."""
+    """Encodes a client's lag [s] and the number of frames that it missed."""
     is_text: bool = False
 
 
@@ -338,18 +329,18 @@ def document_format(
             return as_text(document).encode()
 
     return MessageFormat(
-        lambda header: _divided(header_document(header, content), encode, largest),
-        lambda message: _divided(frame_document(message, content), encode, largest),
+        lambda header: _encode_parts(header_document(header, content), encode, largest),
+        lambda message: _encode_parts(frame_document(message, content), encode, largest),
         lambda: [encode({"type": "end", "schema": SCHEMA})],
         lambda lag, count: encode(
-            {"type": "lag", "schema": SCHEMA, "lag": _known(lag), "dropped": count, "hint": _HINT}
+            {"type": "lag", "schema": SCHEMA, "lag": _seconds(lag), "dropped": count, "hint": _HINT}
         ),
         is_text=name == "json",
     )
 
 
-def _divided(document: dict[str, Any], encode: Callable[[Any], bytes], largest: float) -> list[bytes]:
-    """Encode a document, in parts with a share of its lists if it is too large; see docs/live_output.md."""
+def _encode_parts(document: dict[str, Any], encode: Callable[[Any], bytes], largest: float) -> list[bytes]:
+    """Encode a document; split its lists among several parts if it is too large, see docs/live_output.md."""
     whole = encode(document)
     if len(whole) <= largest:
         return [whole]
@@ -357,7 +348,7 @@ def _divided(document: dict[str, Any], encode: Callable[[Any], bytes], largest: 
     parts: list[dict[str, Any]] = [{}]
     room = 0.0
     for name in (name for name in document if name not in alike):
-        for item in _hand_parts(document[name]) if name == "hands" else document[name]:
+        for item in _split_hands(document[name]) if name == "hands" else document[name]:
             needed = len(encode({name: [item]} if name not in parts[-1] else [item]))
             if needed > room:
                 parts.append({**alike, "part": len(parts), "parts": len("???")})
@@ -368,15 +359,15 @@ def _divided(document: dict[str, Any], encode: Callable[[Any], bytes], largest: 
     return [encode({**part, "parts": len(parts) - 1}) for part in parts[1:]]
 
 
-def _hand_parts(hands: list[dict[str, Any]]) -> Iterator[dict[str, Any]]:
-    """The poses of hands, then each other entry by itself, OpenXR's joints in two halves."""
+def _split_hands(hands: list[dict[str, Any]]) -> Iterator[dict[str, Any]]:
+    """Yield the poses of hands, then each other entry by itself, with OpenXR's joints in two halves."""
     for hand in hands:
-        yield {name: hand[name] for name in _POSE}
+        yield {name: hand[name] for name in _POSE_ENTRIES}
     for hand in hands:
-        whose = {name: hand[name] for name in _POSE[:2]}
-        for name in [name for name in hand if name not in _POSE]:
+        whose = {name: hand[name] for name in _POSE_ENTRIES[:2]}
+        for name in [name for name in hand if name not in _POSE_ENTRIES]:
             halves = name == "joints" and hand[name] is not None
-            for value in (hand[name][:_HALF], hand[name][_HALF:]) if halves else (hand[name],):
+            for value in (hand[name][:_HALF_JOINTS], hand[name][_HALF_JOINTS:]) if halves else (hand[name],):
                 yield {**whose, name: value}
 
 
@@ -407,8 +398,8 @@ def frame_document(message: LiveMessage, content: Content = Content()) -> dict[s
         "time": float(message.time),
         "silent": message.silent,
         "size_state": message.size_state,
-        "lag": _known(message.lag),
-        "latency": _known(message.latency),
+        "lag": _seconds(message.lag),
+        "latency": _seconds(message.latency),
         "hands": [_hand_document(hand, content) for hand in message.hands],
         "bodies": [
             {"name": body.name, "status": str(body.status), "pose": _pose(body)} for body in message.bodies
@@ -444,7 +435,7 @@ def _pose(thing: LiveHand | LiveBody) -> dict[str, Any] | None:
     return pose if thing.has_pose else None
 
 
-def _known(seconds: float) -> float | None:
+def _seconds(seconds: float) -> float | None:
     return None if math.isnan(seconds) else round(seconds, _DECIMALS)
 
 

@@ -13,11 +13,11 @@ from handsim._plugins import import_extra
 from track.output.live_message import SCHEMA, Content, LiveHeader, LiveMessage, MessageFormat, in_axes
 
 _RESERVED: Final = re.compile(r"[^!-~]|[#*,/?\[\]{}]")  # not allowed in a part of an OSC address
-_LARGEST_BUNDLE: Final = 8000  # [bytes] A frame is one bundle, which networks carry in several packets.
+_LARGEST_BUNDLE: Final = 8000  # [bytes] Networks carry a larger bundle than a packet in several packets.
 _BUNDLE_HEAD, _BUNDLE_ENTRY = 16, 4  # [bytes] overhead of an OSC bundle and of each message in it
 _LARGEST_INTEGER: Final = 0x7FFFFFFF  # largest integer of an OSC message
 
-_Content = tuple[str, str, Sequence[Any]]
+_Message = tuple[str, str, Sequence[Any]]
 """Address, types and values of an OSC message."""
 
 
@@ -27,14 +27,14 @@ def osc_format(content: Content = Content()) -> MessageFormat:  # noqa: B008 (im
     messages: Any = import_extra("pythonosc.osc_message_builder", "osc://", "send")
     bundles: Any = import_extra("pythonosc.osc_bundle_builder", "osc://", "send")
 
-    def built(content: _Content) -> Any:
+    def built(content: _Message) -> Any:
         address, types, values = content
         message = messages.OscMessageBuilder(address)
         for kind, value in zip(types, values, strict=True):
             message.add_arg(value, kind)
         return message.build()
 
-    def divided(contents: Iterable[_Content]) -> list[bytes]:
+    def divided(contents: Iterable[_Message]) -> list[bytes]:
         """Bundles that fit into packets; each begins with the first message."""
         first, *others = map(built, contents)
         made, room = [], 0
@@ -57,19 +57,17 @@ def osc_format(content: Content = Content()) -> MessageFormat:  # noqa: B008 (im
     )
 
 
-def _osc_header(header: LiveHeader) -> Iterator[_Content]:
+def _osc_header(header: LiveHeader) -> Iterator[_Message]:
     """Messages of the header: names in the order of the numbers in frames."""
     yield "/handsim/schema", "i", [SCHEMA]
-    yield _strings("/handsim/sides", header.sides)
-    yield _strings("/handsim/angles", header.angles)
-    yield _strings("/handsim/positions", header.positions)
-    yield _strings("/handsim/digits", header.digits)
+    for name in ("sides", "angles", "positions", "digits"):
+        yield _strings(f"/handsim/{name}", getattr(header, name))
     if header.wrist_angles:
         yield _strings("/handsim/wrist_angles", header.wrist_angles)
-    yield _strings("/handsim/bodies", [_part(name) for name in header.bodies])
+    yield _strings("/handsim/bodies", [_address_part(name) for name in header.bodies])
 
 
-def _osc_frame(message: LiveMessage, content: Content) -> Iterator[_Content]:
+def _osc_frame(message: LiveMessage, content: Content) -> Iterator[_Message]:
     """Messages of a frame; a hand or body without a pose has only a status."""
     yield "/handsim/frame", "idi", [message.number & _LARGEST_INTEGER, message.time, int(message.silent)]
     for name, seconds in (("lag", message.lag), ("latency", message.latency)):
@@ -95,21 +93,21 @@ def _osc_frame(message: LiveMessage, content: Content) -> Iterator[_Content]:
             yield _floats(f"{address}/angle_velocities", hand.angle_velocities)
             yield _floats(f"{address}/velocities", hand.find_velocities().ravel())
     for body in message.bodies:
-        address = f"/handsim/body/{_part(body.name)}"
+        address = f"/handsim/body/{_address_part(body.name)}"
         yield _strings(f"{address}/status", [str(body.status)])
         if body.has_pose:
             yield _floats(f"{address}/pose", body.position, body.quaternion)
 
 
-def _part(name: str) -> str:
+def _address_part(name: str) -> str:
     """Make a name valid as a part of an OSC address."""
     return _RESERVED.sub("_", name)
 
 
-def _floats(address: str, *values: np.ndarray) -> _Content:
+def _floats(address: str, *values: np.ndarray) -> _Message:
     numbers = np.concatenate(values).tolist()
     return address, "f" * len(numbers), numbers
 
 
-def _strings(address: str, values: Sequence[str]) -> _Content:
+def _strings(address: str, values: Sequence[str]) -> _Message:
     return address, "s" * len(values), values

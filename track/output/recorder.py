@@ -40,7 +40,7 @@ from track.frames import FARTHEST, LATEST_TIME, StreamedFrame, TrackedFrame
 from track.tracker import Tracker
 from track.user import stored_errors
 
-_SUMMARIZED: Final = 5_000  # largest number of frames that a summary reads; 5,000 take 3 s
+_MOST_SUMMARIZED: Final = 5_000  # largest number of frames that a summary reads; it takes 3 s
 _ID_BITS: Final = (1 << 31) - 1  # bits of IDs in takes
 
 
@@ -142,7 +142,7 @@ class Recorder(Closing):
         return self._archive.num_frames
 
     def kept(self, what: str = "the recording is") -> str:
-        """Say where the recording is kept, and how much of it, after a look at its file."""
+        """Say where the recording is kept, and how much of it, by reading its file."""
         try:
             kept = GrownArchive(self.part, check=False).num_frames
         except (OSError, *DAMAGE):
@@ -187,7 +187,7 @@ class Recorder(Closing):
         self._times = (self._times[0] if self._times else frame.time, frame.time)
 
     def _end_hands(self) -> None:
-        """Record that the frames until now are of other hands, or of another size, than the tracker's now."""
+        """Record that the frames so far are of other hands, or of another size, than the tracker's now."""
         before, self._user = self._user, self._tracker.user
         self._settings["user"] = self._user.notes
         if self.num_frames:
@@ -196,10 +196,8 @@ class Recorder(Closing):
         self._archive.replace_head(self._header(None), self._worn_arrays())
 
     def _worn_arrays(self) -> dict[str, NDArray[Any]]:
-        return {
-            **worn_arrays(self._tracker.hands, self._tracker.bodies),
-            FORMER: former_array((), self._layouts),
-        }
+        worn = worn_arrays(self._tracker.hands, self._tracker.bodies)
+        return {**worn, FORMER: former_array((), self._layouts)}
 
     @property
     def _layouts(self) -> list[MarkerLayout]:
@@ -258,7 +256,7 @@ class Recorder(Closing):
             grown = GrownArchive(self.part)
             first = (grown.first(name, RATED_FRAMES) for name in ("times", NUMBERS.name))
             header = self._header(usual_rate(*first))
-            step = max(1, -(-grown.num_frames // _SUMMARIZED))
+            step = max(1, -(-grown.num_frames // _MOST_SUMMARIZED))
             take = unpack_take(dict(header), grown.read(step))
             finish_archive(grown, self.out, header, on_block=told)
         except Exception as error:  # keep the recording after any error

@@ -42,19 +42,19 @@ VALID: Final = (*(f"{one}://host:port" for one in ("osc", "udp", "ws")), "lsl:NA
 GROUP: Final = "handsim.sinks"
 """Entry points of packages that provide sinks."""
 _METHODS: Final = (("send", "close"), "the methods send and close of a sink")
-_YES: Final = ("no", "yes")  # valid values of an option
-_AXES: Final = {
+_NO_YES: Final = ("no", "yes")  # valid values of an option
+_AXES_OPTIONS: Final = {
     "axes": (WORLD, *PROGRAMS),
     "up": ("z", "y"),
     "forward": FORWARD,
     "unit": ("auto", "m", "cm"),
-    "velocities": _YES,
+    "velocities": _NO_YES,
 }
-_DOCUMENTS: Final = {"format": FORMATS, "points": _YES, "joints": ("no", "openxr"), **_AXES}
+_DOCUMENT_OPTIONS: Final = {"format": FORMATS, "points": _NO_YES, "joints": ("no", "openxr"), **_AXES_OPTIONS}
 _OPTIONS: Final[Mapping[str, Mapping[str, tuple[str, ...]]]] = {
-    "osc": _AXES,
-    "udp": _DOCUMENTS,
-    "ws": {**_DOCUMENTS, "every": EVERY, "pages": ("own", "all")},
+    "osc": _AXES_OPTIONS,
+    "udp": _DOCUMENT_OPTIONS,
+    "ws": {**_DOCUMENT_OPTIONS, "every": EVERY, "pages": ("own", "all")},
 }
 _HEADER_PERIOD: Final = 1.0  # [s] The header is repeated after this time for receivers that came late.
 
@@ -101,8 +101,8 @@ class SinkGroup(Closing):
         """Lines to print at the end."""
         sent = [f"{self._sent} frames sent to {', '.join(self._sinks)}"] if self._sinks and self._sent else []
         dropped = [f"{address}: {count} frames dropped" for address, count in self.counts.items() if count]
-        told = [f"{at}: {note}" for at, sink in self._all.items() if (note := getattr(sink, "note", ""))]
-        return (*sent, *dropped, *told)
+        noted = [f"{at}: {note}" for at, sink in self._all.items() if (note := getattr(sink, "note", ""))]
+        return (*sent, *dropped, *noted)
 
     def close(self) -> None:
         """Close all sinks."""

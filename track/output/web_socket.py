@@ -23,18 +23,18 @@ from handsim.errors import ArgumentError, HandSimWarning
 from track.output.live_message import LiveHeader, LiveMessage, MessageFormat
 
 EVERY: Final = ("no", "yes", "1")
-"""Valid values of `every`, for which clients ask, too."""
-_WAITING: Final = 256  # largest number of frames waiting for a client that wants every frame
-_BEHIND: Final = 0.05  # [s] A client that wants every frame is told of a longer lag.
-_TELL: Final = 1.0  # [s] least time between two reports of a client's lag, or two headers
-_ON_REQUEST: Final = "/newest"  # path for clients that request each frame
-_QUEUEING: Final = "websockets/"  # user agent of Python's websockets, which holds 16 parts of messages
-_SLOW: Final = 0.01  # [s] A program that reads its frame later than this is waited for.
-_PARTS: Final = 17  # With this many it reads no further, nor answers a ping, until its program reads.
+"""Valid values of the option `every`, which clients may also request."""
+_MOST_WAITING: Final = 256  # largest number of frames waiting for a client that wants every frame
+_REPORTED_LAG: Final = 0.05  # [s] A longer lag is reported to a client that wants every frame.
+_REPORT_PERIOD: Final = 1.0  # [s] least time between two reports of a client's lag, or two headers
+_REQUEST_PATH: Final = "/newest"  # path for clients that request each frame
+_QUEUEING_AGENT: Final = "websockets/"  # user agent of Python's websockets, which queues 16 parts of messages
+_SLOW_READ: Final = 0.01  # [s] The server waits for a program that reads its frame later than this.
+_BLOCKING_PARTS: Final = 17  # websockets stops reading after these parts until its program reads them.
 _SEND_BUFFER: Final = 1 << 17  # [bytes] size of the system's send buffer for each client
 MOST_CONNECTIONS: Final = 64
 """Largest number of open connections of a server."""
-_FLUSH: Final = 1.0  # [s] time for clients to read waiting frames at the end
+_FLUSH_TIME: Final = 1.0  # [s] time for clients to read waiting frames at the end
 _OWN_PAGES: Final = re.compile(r"https?://(localhost|127\.0\.0\.1|\[::1\])(:\d+)?")
 """Origins of web pages that this machine serves; pages of other origins are refused."""
 
@@ -95,7 +95,7 @@ class WebSocketSink:
             self._described, (self._header,) = message.header, self._format.header(message.header)
         if self._clients:
             (frame,) = self._format.frame(message)
-            self._loop.call_soon_threadsafe(self._spread, frame)
+            self._loop.call_soon_threadsafe(self._queue_for_all, frame)
 
     def close(self) -> None:
         """Give clients a second to read what waits for them and the end message, then disconnect them."""
@@ -106,11 +106,11 @@ class WebSocketSink:
     def _end(self) -> None:
         """Queue the end message, which clients get also if they do not ask for it."""
         self._ending.set()
-        self._spread(*self._format.end())
+        self._queue_for_all(*self._format.end())
         for client in self._clients:
             client.ask()
 
-    def _spread(self, message: bytes) -> None:
+    def _queue_for_all(self, message: bytes) -> None:
         """Queue a message for every client; a full queue drops its oldest message."""
         for client in self._clients:
             full = len(client.waiting) == client.waiting.maxlen
@@ -130,14 +130,14 @@ class WebSocketSink:
         quiet = logging.getLogger("handsim.websocket")  # Invalid requests are not the user's mistakes.
         quiet.setLevel(logging.CRITICAL + 1)
         server = await self._serve(
-            self._talk,
+            self._serve_client,
             sock=self._socket,
             origins=self._origins,
             process_request=_refuse_other_paths,
             compression=None,  # takes longer than a local network does
             # The content of clients' messages is ignored.
             max_size=1 << 10,
-            close_timeout=_FLUSH,
+            close_timeout=_FLUSH_TIME,
             logger=quiet,
         )
         self._ready.set()
@@ -154,17 +154,17 @@ class WebSocketSink:
 
     async def _wait_while(self, there_is: Callable[[], bool]) -> None:
         """Wait while a condition holds, at most one second."""
-        until = self._loop.time() + _FLUSH
+        until = self._loop.time() + _FLUSH_TIME
         while there_is() and self._loop.time() < until:
             await asyncio.sleep(0.01)
 
-    async def _talk(self, connection: Any) -> None:
+    async def _serve_client(self, connection: Any) -> None:
         """Send messages to a client until it disconnects."""
-        path, every = _wishes(connection.request)
-        requests = path == _ON_REQUEST
+        path, every = _requested(connection.request)
+        requests = path == _REQUEST_PATH
         client = _Client(every=(every or self._every) and not requests, requests=requests)
         self._clients[client] = connection
-        sending = asyncio.ensure_future(self._deliver(connection, client))
+        sending = asyncio.ensure_future(self._send_messages(connection, client))
         try:
             with suppress(self._closed_error):
                 while True:
@@ -175,11 +175,11 @@ class WebSocketSink:
             del self._clients[client]
             sending.cancel()
 
-    async def _deliver(self, connection: Any, client: _Client) -> None:
+    async def _send_messages(self, connection: Any, client: _Client) -> None:
         """Send a client the header, then message after message."""
         told, sent, is_text = -math.inf, math.inf, self._format.is_text
         is_plain, is_slow = not (client.every or client.requests), False
-        queues = is_plain and _QUEUEING in connection.request.headers.get("User-Agent", "")
+        queues = is_plain and _QUEUEING_AGENT in connection.request.headers.get("User-Agent", "")
         with suppress(self._closed_error, self._state_error, OSError):
             await client.woken.wait()
             if header := self._header:
@@ -195,7 +195,7 @@ class WebSocketSink:
                 await client.next()
                 now = time.monotonic()
                 behind = now - client.waiting[0][0]
-                if client.every and behind > _BEHIND and now > told + _TELL:
+                if client.every and behind > _REPORTED_LAG and now > told + _REPORT_PERIOD:
                     told = now
                     await connection.send(self._format.lag(behind, client.dropped), text=is_text)
                 message = self._take(client)
@@ -205,12 +205,12 @@ class WebSocketSink:
                     _end_message(connection, message)
                 else:
                     await connection.send(message, text=is_text)
-                is_slow, sent = queues and client.asked > sent + _SLOW, now
+                is_slow, sent = queues and client.asked > sent + _SLOW_READ, now
 
     def _take(self, client: _Client) -> bytes:
         """The message for a client: a changed header, once a second at most, or the oldest that waits."""
         now = time.monotonic()
-        is_other = self._header != client.header and now > client.described + _TELL
+        is_other = self._header != client.header and now > client.described + _REPORT_PERIOD
         if is_other and not self._ending.is_set():
             client.header, client.described = self._header, now
             return self._header
@@ -221,7 +221,7 @@ def _begin_message(connection: Any, *, is_text: bool) -> None:
     """Send the first parts of a message, which are empty, at once."""
     protocol = connection.protocol
     (protocol.send_text if is_text else protocol.send_binary)(b"", fin=False)
-    for _ in range(_PARTS - 1):
+    for _ in range(_BLOCKING_PARTS - 1):
         protocol.send_continuation(b"", fin=False)
     connection.transport.write(b"".join(protocol.data_to_send()))
 
@@ -233,13 +233,13 @@ def _end_message(connection: Any, message: bytes) -> None:
 
 
 def _refuse_other_paths(connection: Any, request: Any) -> Any:
-    """Refuse a misspelled /newest: its client expects to ask, and would get a stream."""
-    known = _wishes(request)[0] in ("", _ON_REQUEST)
-    return None if known else connection.respond(HTTPStatus.NOT_FOUND, f"expected / or {_ON_REQUEST}\n")
+    """Refuse a misspelled /newest, whose client expects one frame per request and would get a stream."""
+    known = _requested(request)[0] in ("", _REQUEST_PATH)
+    return None if known else connection.respond(HTTPStatus.NOT_FOUND, f"expected / or {_REQUEST_PATH}\n")
 
 
-def _wishes(request: Any) -> tuple[str, bool]:
-    """The path that a client requests, and whether its query asks for every frame."""
+def _requested(request: Any) -> tuple[str, bool]:
+    """The path that a client requests, and whether its query requests every frame."""
     path, _, query = request.path.partition("?")
     return path.rstrip("/"), dict(parse_qsl(query)).get("every") in EVERY[1:]
 
@@ -248,13 +248,13 @@ class _Client:
     """Queue and requests of one WebSocket client."""
 
     def __init__(self, *, every: bool, requests: bool) -> None:
-        self.waiting: deque[tuple[float, bytes]] = deque(maxlen=_WAITING if every else 1)
+        self.waiting: deque[tuple[float, bytes]] = deque(maxlen=_MOST_WAITING if every else 1)
         """Messages with the times at which they were queued [s]."""
         self.every, self.requests = every, requests
         self.woken = asyncio.Event()
         self.dropped = 0
         self.header = b""
-        """The last header that was sent, and in `described` when a changed one was [s]."""
+        """The last header that was sent; `described` is when a changed one was sent [s]."""
         self.described = -math.inf
         self.asked = -math.inf
         """When it asked for a message, by a message or a pong [s]."""
@@ -310,7 +310,7 @@ class _Listener(socket.socket):
         self._spare.close()
         try:
             super().accept()[0].close()
-        except OSError as error:  # Without free files, the system tells of them before it looks for one.
+        except OSError as error:  # The system reports missing files before it looks for a connection.
             raise BlockingIOError(*error.args) from error
         else:
             self.refused += 1

@@ -18,16 +18,17 @@ from handsim._checks import as_numbers, check_methods
 from handsim.errors import ArgumentError, CaptureError, HandSimWarning
 from track.frames import LATEST_TIME, StreamedFrame
 
-LEAVE: Final = 1.0
+END_TIME: Final = 1.0
 """Time for a source to end after `close` [s]."""
-_MOST_WAITING: Final = 1 << 14  # largest number of frames that wait for a reader
-_WAITING: Final = 256  # A source that is not live has to wait when this many frames wait.
+_QUEUE_SIZE: Final = 1 << 14  # largest number of frames that wait for a reader
+_MOST_WAITING: Final = 256  # A source that is not live has to wait when this many frames wait.
 _PACE_FRAMES: Final = 64  # newest frames that show the pace of a source
 _FEWEST_PACE: Final = 5  # The pace is known from this many frames on.
 _SAME_PACE: Final = 1.0  # longest step in time within one pace [s]
-_FASTER: Final = 1.5  # A source whose frames come this many times faster than their time stamps is not live.
-_SHORT: Final = 0.01  # [s] Any source may be ahead by this.
-_MOST_ID: Final = 1 << 31  # IDs of takes are smaller
+# A source whose frames come this many times faster than their time stamps is not live.
+_PACE_RATIO: Final = 1.5
+_PACE_SLACK: Final = 0.01  # [s] Any source may be ahead of its time stamps by this.
+_ID_LIMIT: Final = 1 << 31  # IDs of takes are smaller
 
 
 class FrameSource(Protocol):
@@ -63,7 +64,7 @@ class ArrivingFrames(ABC):
     def __init__(self) -> None:
         self.lost = 0
         """Number of dropped frames."""
-        self._arrived: deque[StreamedFrame] = deque(maxlen=_MOST_WAITING)
+        self._arrived: deque[StreamedFrame] = deque(maxlen=_QUEUE_SIZE)
 
     @property
     def counts(self) -> dict[str, int]:
@@ -93,11 +94,11 @@ class ArrivingFrames(ABC):
         """End the source, and drop waiting frames."""
 
     def _add(self, frame: StreamedFrame) -> None:
-        self.lost += len(self._arrived) == _MOST_WAITING  # drops the oldest frame
+        self.lost += len(self._arrived) == _QUEUE_SIZE  # drops the oldest frame
         self._arrived.append(frame)
 
     def _take_all(self) -> list[StreamedFrame]:
-        arrived, self._arrived = list(self._arrived), deque[StreamedFrame](maxlen=_MOST_WAITING)
+        arrived, self._arrived = list(self._arrived), deque[StreamedFrame](maxlen=_QUEUE_SIZE)
         return arrived
 
 
@@ -161,7 +162,7 @@ class SourceStream(ArrivingFrames):
         with self._changed:
             self._closed = True
             self._changed.notify_all()
-        self._thread.join(LEAVE)  # A source that does not return now ends with the process.
+        self._thread.join(END_TIME)  # A source that does not return now ends with the process.
 
     def _read(self) -> None:
         """Take frames from the source until it ends or is closed."""
@@ -182,7 +183,7 @@ class SourceStream(ArrivingFrames):
     def _put(self, frame: StreamedFrame) -> bool:
         """Queue a frame for the reader; return whether the reader is still there."""
         with self._changed:
-            while len(self._arrived) >= _WAITING and not self.is_live and not self._closed:
+            while len(self._arrived) >= _MOST_WAITING and not self.is_live and not self._closed:
                 self._changed.wait()
             if math.isnan(frame.arrived):
                 frame = dataclasses.replace(frame, arrived=time.monotonic())
@@ -192,7 +193,7 @@ class SourceStream(ArrivingFrames):
             if self._waits and len(self._pace) >= _FEWEST_PACE:
                 first, last = self._pace[0], self._pace[-1]
                 span = last.arrived - first.arrived
-                self.is_live = last.time - first.time <= _FASTER * span + _SHORT
+                self.is_live = last.time - first.time <= _PACE_RATIO * span + _PACE_SLACK
             self._add(frame)
             self._changed.notify_all()
             return not self._closed
@@ -207,7 +208,7 @@ def _checked(frame: StreamedFrame) -> StreamedFrame:
         raise ArgumentError(f"points have shape {points.shape} and IDs {ids.shape}, expected (N, 3) and (N,)")
     if not abs(frame.time) < LATEST_TIME:
         raise ArgumentError(f"the time of frame {frame.number} is {frame.time}, expected seconds")
-    if ids.size and not -1 <= ids.min() <= ids.max() < _MOST_ID:
-        raise ArgumentError(f"IDs are from {ids.min()} to {ids.max()}, expected -1 to {_MOST_ID - 1}")
+    if ids.size and not -1 <= ids.min() <= ids.max() < _ID_LIMIT:
+        raise ArgumentError(f"IDs are from {ids.min()} to {ids.max()}, expected -1 to {_ID_LIMIT - 1}")
     there = np.isfinite(points).all(axis=1)
     return dataclasses.replace(frame, points=points[there], ids=ids[there])

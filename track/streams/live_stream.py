@@ -1,9 +1,9 @@
 """Live streams for a tracker: in order, on a clock that never goes back, without outdated frames.
 
-Each arriving frame is passed on once, in order, or counted; docs/tracking.md says how long frames
-wait behind a gap. A frame continues the stream if its steps in time and number agree, and its time is at most
-sixteen frames ahead of its arrival. Any other frame is a jump. A jump is accepted only when five successive
-frames fit together, as after a restart of a recording or server. Frames of shorter jumps are dropped as wild.
+Each arriving frame is passed on once, in order, or counted; docs/tracking.md says how long frames wait behind
+a gap. A frame continues the stream if its steps in time and number agree, and its time is at most sixteen
+frames ahead of its arrival. Any other frame is a jump. A jump is accepted only when five successive frames
+fit together, as after a restart of a recording or server. Frames of shorter jumps are dropped as wild.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from handsim.callbacks import Closing
 from handsim.errors import ArgumentError, HandSimError
 from track.frames import FARTHEST, LATEST_TIME, StreamedFrame
 from track.streams import NoServerError, split_address
-from track.streams.frame_source import LEAVE, ArrivingFrames, FrameSource, SourceStream
+from track.streams.frame_source import END_TIME, ArrivingFrames, FrameSource, SourceStream
 
 VALID: Final = ("natnet://host", "natnet://host:port", "qtm://host", "qtm://host:port", "module:name")
 """Valid forms of an address."""
@@ -34,34 +34,34 @@ GROUP: Final = "handsim.frame_sources"
 """Entry points of packages that provide frame sources."""
 MOST_LAG: Final = 0.03
 """Longest time that a frame waits for a reader that was briefly busy [s]."""
-_EMPTY: Final = 2.0  # [s] Frames without any point are reported after this time.
-_MANY_FAR: Final = 0.5  # The unit is questioned if a larger share of points is out of range.
+_EMPTY_TIME: Final = 2.0  # [s] Frames without any point are reported after this time.
+_FAR_SHARE: Final = 0.5  # A larger share of points out of range suggests a wrong unit.
 _SILENCE: Final = 2.0  # [s] A silent frame is produced after this time without a frame.
 _LEAST_LAG: Final = 0.01  # [s] longest time that a frame waits for a reader that is always too slow
-_TOO_SLOW: Final = 0.1  # [s] A reader is too slow if frames have waited without a break for this time.
-_FORGIVEN: Final = 2.0  # [s] longest lag that is forgiven
-_CATCHING_UP: Final = 1.0  # [s/s] rate at which a forgiven lag must shrink
+_TOO_SLOW_TIME: Final = 0.1  # [s] A reader is too slow if frames have waited without a break for this time.
+_MOST_FORGIVEN: Final = 2.0  # [s] longest lag that is forgiven
+_CATCH_UP_RATE: Final = 1.0  # [s/s] rate at which a forgiven lag must shrink
 _LOOP_GAP: Final = 0.01  # [s] between the last frame of a recording and its first one when repeated
-_STOP: Final = 0.1  # [s] longest interval between calls of `ended`
-_WINDOW: Final = 8  # largest number of frames held behind a gap
-_REACH: Final = 16  # largest lead of a frame's time over its arrival [frames]
-_LASTING: Final = 5  # A jump is accepted after this many successive frames.
-_WAIT: Final = 0.03  # [s] longest time that a frame is held behind a gap
-_WAIT_FRAMES: Final = 5  # the same in frame intervals, for slower streams
-_LONGEST_WAIT: Final = 0.1  # [s] the same for any stream; used for disordered ones
-_REMEMBERED: Final = 10.0  # [s] A stream counts as disordered for this time.
-_OLD: Final = 1.0  # [s] A frame older than the last by more is from a restarted recording.
-_BURST: Final = 0.5  # [s] Late frames of a recording may arrive for this time after the last.
-_GOES_ON: Final = 1.0  # [s] longest jump in time within one recording
+_POLL_PERIOD: Final = 0.1  # [s] longest time between calls of `ended`
+_MOST_HELD: Final = 8  # largest number of frames held behind a gap
+_MOST_LEAD: Final = 16  # largest lead of a frame's time over its arrival [frames]
+_FEWEST_IN_A_ROW: Final = 5  # A jump is accepted after this many successive frames.
+_GAP_WAIT: Final = 0.03  # [s] longest time that a frame is held behind a gap
+_GAP_WAIT_FRAMES: Final = 5  # that time in frame intervals, for slower streams
+_LONGEST_WAIT: Final = 0.1  # [s] that time for disordered streams, and its bound for all
+_DISORDER_TIME: Final = 10.0  # [s] A stream counts as disordered for this time.
+_RESTART_AGE: Final = 1.0  # [s] A frame older than the last by more is from a restarted recording.
+_BURST_TIME: Final = 0.5  # [s] Late frames of a recording may arrive this long after the last one.
+_MOST_JUMP: Final = 1.0  # [s] longest jump in time within one recording
 _FIRST_SLACK: Final = 0.05  # [s] tolerance of a frame's time before the interval is known
 _FIRST_WAIT: Final = 0.1  # [s] time that the first frame is held
-_SLACK: Final = 0.001  # [s] tolerance of time stamps, added to half an interval
-_DRIFT: Final = 0.01  # largest relative difference between two clocks' rates
-_SMOOTHING: Final = 0.1  # weight of the newest interval in the mean
+_TIME_SLACK: Final = 0.001  # [s] tolerance of time stamps, added to half an interval
+_CLOCK_DRIFT: Final = 0.01  # largest relative difference between two clocks' rates
+_INTERVAL_WEIGHT: Final = 0.1  # weight of the newest interval in the mean
 _MOST_CHANGE: Final = 2.0  # Intervals enter the mean with at most this ratio to it.
-_MOST_JUMPING: Final = 4 * _WINDOW  # largest number of held frames of jumps
-_RECENT: Final = 256  # number of newest frames searched for duplicates
-_STRIDES: Final = 16  # number of frames that determine the server's step
+_MOST_JUMPING: Final = 4 * _MOST_HELD  # largest number of held frames of jumps
+_MOST_RECENT: Final = 256  # number of newest frames searched for duplicates
+_NUM_STRIDES: Final = 16  # number of frames that determine the server's step
 
 
 def check_address(address: str) -> str:
@@ -75,10 +75,7 @@ def check_address(address: str) -> str:
 
 
 def open_source(
-    address: str | FrameSource,
-    *,
-    silence: float = _SILENCE,
-    ended: Callable[[], bool] = lambda: False,
+    address: str | FrameSource, *, silence: float = _SILENCE, ended: Callable[[], bool] = lambda: False
 ) -> LiveStream:
     """Open a live stream; its frames are iterated in a `with` block.
 
@@ -138,11 +135,7 @@ class LiveStream(Closing, Iterator[StreamedFrame]):
     """
 
     def __init__(
-        self,
-        frames: ArrivingFrames,
-        *,
-        silence: float = _SILENCE,
-        ended: Callable[[], bool] = lambda: False,
+        self, frames: ArrivingFrames, *, silence: float = _SILENCE, ended: Callable[[], bool] = lambda: False
     ) -> None:
         self.order = FrameOrder()
         """Puts the frames in order."""
@@ -186,10 +179,10 @@ class LiveStream(Closing, Iterator[StreamedFrame]):
 
     @property
     def point_doubt(self) -> str:
-        """A sentence if the stream has no points or too distant ones; otherwise empty."""
-        if not self.points and time.monotonic() > self._began + _EMPTY:
+        """A sentence if the stream has no points or too distant ones; otherwise an empty one."""
+        if not self.points and time.monotonic() > self._began + _EMPTY_TIME:
             return f"frames arrive, but no point was in any of them; {self._frames.without_points}"
-        if self.far_points <= _MANY_FAR * self.points:
+        if self.far_points <= _FAR_SHARE * self.points:
             return ""
         return (
             f"{self.far_points} of {self.points} points lie {FARTHEST:.0f} m or more from the origin and are "
@@ -235,7 +228,7 @@ class LiveStream(Closing, Iterator[StreamedFrame]):
         self._line_up(0.0)
         now = time.monotonic()
         oldest = min((since for _, since in self._ready), default=now)
-        self.forgiven_until = now + min(now - oldest, _FORGIVEN) / _CATCHING_UP
+        self.forgiven_until = now + min(now - oldest, _MOST_FORGIVEN) / _CATCH_UP_RATE
 
     def end(self, at: float = math.inf) -> None:
         """End the stream after what has arrived, or earlier at a monotonic time `at` [s]."""
@@ -254,11 +247,11 @@ class LiveStream(Closing, Iterator[StreamedFrame]):
         """Put the frames that have arrived in order; wait up to `seconds` for one."""
         if self._over or (self._ready and not self._frames.is_live):
             return
-        for frame in self._frames.poll(min(max(seconds, 0.0), _STOP)):
+        for frame in self._frames.poll(min(max(seconds, 0.0), _POLL_PERIOD)):
             passed = (*self.order.expire(frame.arrived), *self.order.add(frame))
             self._ready.extend((one, frame.arrived) for one in passed)
         now = time.monotonic()
-        self._over = self._frames.is_over or now > self._end_at + LEAVE
+        self._over = self._frames.is_over or now > self._end_at + END_TIME
         waited = self.order.end() if self._over else self.order.expire(now)
         self._ready.extend((one, now) for one in waited)
 
@@ -267,8 +260,8 @@ class LiveStream(Closing, Iterator[StreamedFrame]):
         if self._over or not self._frames.is_live:
             return
         now = time.monotonic()
-        most = MOST_LAG if now < self._kept_up + _TOO_SLOW else _LEAST_LAG
-        most += max(0.0, _CATCHING_UP * (self.forgiven_until - now))
+        most = MOST_LAG if now < self._kept_up + _TOO_SLOW_TIME else _LEAST_LAG
+        most += max(0.0, _CATCH_UP_RATE * (self.forgiven_until - now))
         while len(self._ready) > 1 and now - self._ready[0][1] > most:
             dropped, _ = self._ready.popleft()
             self.dropped += 1
@@ -318,7 +311,7 @@ class FrameOrder:
         self._jumping: dict[StreamedFrame, int] = {}  # frames of jumps by arrival, with `passed`
         self._in_a_row = 0  # number of successive frames of a jump
         self._recent: dict[tuple[int, float], float] = {}  # arrival by number and time
-        self._strides: deque[int] = deque(maxlen=_STRIDES)
+        self._strides: deque[int] = deque(maxlen=_NUM_STRIDES)
         self._interval: float | None = None  # [s] per frame number
         self._disordered = -math.inf  # [s] when a frame was last out of order
 
@@ -361,11 +354,11 @@ class FrameOrder:
             self._remember(frame)
             self._disordered = frame.arrived
         elif last is not None and self._is_next(last, frame):
-            self._settle(last, frame)
+            self._hold_confirmed(last, frame)
             self._hold(frame)
             yield from self._release()
         else:
-            yield from self._doubt(frame)
+            yield from self._hold_jump(frame)
 
     def expire(self, now: float) -> Iterator[StreamedFrame]:
         """Yield held frames that have waited long enough for missing ones."""
@@ -389,14 +382,14 @@ class FrameOrder:
     def _wait(self) -> float:
         """Time for which frames are held behind a gap [s]."""
         newest = max(frame.arrived for frame in self._held)
-        if newest - self._disordered < _REMEMBERED or self._interval is None:
+        if newest - self._disordered < _DISORDER_TIME or self._interval is None:
             return _LONGEST_WAIT
-        return min(max(_WAIT, _WAIT_FRAMES * self.interval), _LONGEST_WAIT)
+        return min(max(_GAP_WAIT, _GAP_WAIT_FRAMES * self.interval), _LONGEST_WAIT)
 
     @property
     def _stride(self) -> int:
         """Step of the frame numbers; some servers send only every other frame."""
-        return max(1, min(self._strides)) if len(self._strides) == _STRIDES else 1
+        return max(1, min(self._strides)) if len(self._strides) == _NUM_STRIDES else 1
 
     def _hold(self, frame: StreamedFrame) -> None:
         """Insert a frame into the held ones."""
@@ -407,7 +400,7 @@ class FrameOrder:
 
     def _release(self, *, every: bool = False) -> Iterator[StreamedFrame]:
         """Pass held frames on, up to the next gap unless too many are held; all with `every`."""
-        while self._held and (every or len(self._held) > _WINDOW or not self._is_behind_gap()):
+        while self._held and (every or len(self._held) > _MOST_HELD or not self._is_behind_gap()):
             yield self._pass(self._held.pop(0))
 
     def _is_behind_gap(self) -> bool:
@@ -432,20 +425,20 @@ class FrameOrder:
             newest = span / steps
             usual = newest if self._interval is None else self._interval
             newest = min(max(newest, usual / _MOST_CHANGE), usual * _MOST_CHANGE)
-            self._interval = usual + _SMOOTHING * (newest - usual)
+            self._interval = usual + _INTERVAL_WEIGHT * (newest - usual)
         return frame
 
-    def _doubt(self, frame: StreamedFrame) -> Iterator[StreamedFrame]:
+    def _hold_jump(self, frame: StreamedFrame) -> Iterator[StreamedFrame]:
         """Hold a frame that jumps, or accept the jump if it has lasted."""
         self._jumping[frame] = self.passed
         group = self._group_of(frame)
         self._in_a_row = min(self._in_a_row + 1, len(group))
-        if self._in_a_row >= _LASTING:
+        if self._in_a_row >= _FEWEST_IN_A_ROW:
             yield from self._begin(group)
         elif len(self._jumping) > _MOST_JUMPING:
             self._leave_out_jumping(1)
 
-    def _settle(self, last: StreamedFrame, frame: StreamedFrame) -> None:
+    def _hold_confirmed(self, last: StreamedFrame, frame: StreamedFrame) -> None:
         """Hold frames of jumps that the stream's next frame confirms; drop old ones."""
         self._in_a_row = 0
         right = [
@@ -454,7 +447,7 @@ class FrameOrder:
         for one in right:
             del self._jumping[one]
             self._hold(one)
-        self._leave_out_jumping(sum(self.passed - passed > _WINDOW for passed in self._jumping.values()))
+        self._leave_out_jumping(sum(self.passed - passed > _MOST_HELD for passed in self._jumping.values()))
 
     def _leave_out_jumping(self, count: int) -> None:
         """Drop the `count` oldest frames of jumps, and count them as `wild`."""
@@ -464,7 +457,7 @@ class FrameOrder:
 
     def _group_of(self, frame: StreamedFrame) -> list[StreamedFrame]:
         """Frames of jumps in the same recording as one of them, in order of arrival."""
-        group = [one for one in self._jumping if one is frame or self._fit(one, frame)]
+        group = [one for one in self._jumping if one is frame or self._fits(one, frame)]
         ordered = _increasing(sorted(group, key=lambda one: one.time))
         return [one for one in group if one in ordered]
 
@@ -478,7 +471,7 @@ class FrameOrder:
         ordered = sorted(group, key=lambda one: one.time)
         last = self._last
         if restarted is None:
-            restarted = last is not None and not self._goes_on(ordered[0])
+            restarted = last is not None and not self._is_same_recording(ordered[0])
         if last is None or restarted:
             self.restarts += restarted
             self._first = ordered[0]
@@ -497,40 +490,40 @@ class FrameOrder:
         key = new.number, new.time
         came = [one.arrived for one in (*self._held, *self._jumping) if (one.number, one.time) == key]
         came.append(self._recent.get(key, -math.inf))
-        return any(abs(arrived - new.arrived) < _BURST for arrived in came)
+        return any(abs(arrived - new.arrived) < _BURST_TIME for arrived in came)
 
     def _remember(self, frame: StreamedFrame) -> None:
         """Store a frame that was passed on or too late, to recognize it when it comes again."""
         self._recent[frame.number, frame.time] = frame.arrived
-        if len(self._recent) > _RECENT:
+        if len(self._recent) > _MOST_RECENT:
             del self._recent[next(iter(self._recent))]
 
     def _is_late(self, last: StreamedFrame, new: StreamedFrame) -> bool:
         """Whether a frame precedes one that was passed on."""
-        return -_OLD < new.time - last.time <= 0.0 and new.arrived - last.arrived < _BURST
+        return -_RESTART_AGE < new.time - last.time <= 0.0 and new.arrived - last.arrived < _BURST_TIME
 
     def _is_next(self, last: StreamedFrame, new: StreamedFrame) -> bool:
         """Whether a frame follows the last one, or fits the frames held behind a gap."""
         if new.time <= last.time:
             return False
-        return self._continues(last, new) or bool(self._held and self._fit(self._held[-1], new))
+        return self._continues(last, new) or bool(self._held and self._fits(self._held[-1], new))
 
     def _continues(self, last: StreamedFrame, new: StreamedFrame) -> bool:
         """Whether a frame follows another one: its steps in time and number agree and are short."""
         return new.time - last.time <= self._reach(new.arrived - last.arrived) and self._agrees(last, new)
 
-    def _fit(self, one: StreamedFrame, other: StreamedFrame) -> bool:
+    def _fits(self, one: StreamedFrame, other: StreamedFrame) -> bool:
         """Whether two frames, in any order, may be of the same recording."""
         first, second = sorted((one, other), key=lambda frame: frame.time)
         span, steps = second.time - first.time, second.number - first.number
         if not 0.0 < span <= self._reach(abs(one.arrived - other.arrived)):
             return False
         rate = MAX_RATE if self._interval is None else 1.5 / self._interval
-        return 0 <= steps <= rate * (span + _SLACK) + 1.0
+        return 0 <= steps <= rate * (span + _TIME_SLACK) + 1.0
 
     def _reach(self, waited: float) -> float:
         """Largest step in time of a frame that arrived `waited` seconds after another [s]."""
-        ahead = _FIRST_SLACK if self._interval is None else (_REACH + 0.5) * self.interval + _SLACK
+        ahead = _FIRST_SLACK if self._interval is None else (_MOST_LEAD + 0.5) * self.interval + _TIME_SLACK
         return waited + ahead
 
     def _agrees(self, last: StreamedFrame, new: StreamedFrame) -> bool:
@@ -539,18 +532,18 @@ class FrameOrder:
         steps = new.number - last.number
         if self._interval is None:
             return 0.0 < span <= waited + _FIRST_SLACK and 0 <= steps <= MAX_RATE * span + 1.0
-        longest = max(waited, max(steps, 1) * self._interval) + 0.5 * self._interval + _SLACK
-        return 0.0 < span <= longest and 0 <= steps <= 1.5 * (span + _SLACK) / self._interval + 1.0
+        longest = max(waited, max(steps, 1) * self._interval) + 0.5 * self._interval + _TIME_SLACK
+        return 0.0 < span <= longest and 0 <= steps <= 1.5 * (span + _TIME_SLACK) / self._interval + 1.0
 
-    def _goes_on(self, new: StreamedFrame) -> bool:
+    def _is_same_recording(self, new: StreamedFrame) -> bool:
         """Whether an accepted jump continues the recording, judged by the time since its start."""
         last, first = self._last, self._first
         if last is None or first is None:
             return True
-        possible = (1.0 + _DRIFT) * (new.arrived - first.arrived) + _GOES_ON
+        possible = (1.0 + _CLOCK_DRIFT) * (new.arrived - first.arrived) + _MOST_JUMP
         if new.time - first.time > possible:
             return False
-        return 0.0 < new.time - last.time <= _GOES_ON or self._agrees(last, new)
+        return 0.0 < new.time - last.time <= _MOST_JUMP or self._agrees(last, new)
 
     def _missing(self, last: StreamedFrame, new: StreamedFrame) -> int:
         """Number of frames missing between two, by their numbers if these agree with their times."""

@@ -28,6 +28,7 @@ from gloves.captures.capture import Capture
 from gloves.optics.reconstruction import number_runs
 from gloves.takes.take import Take
 from handsim._checks import check_type
+from handsim.arrays import Doubles, Integers
 from handsim.callbacks import Closing
 from handsim.errors import ArgumentError, CaptureError, choices
 from track.frames import StreamedFrame, read_points
@@ -39,13 +40,13 @@ LARGEST: Final = 65507  # largest UDP datagram [bytes]
 OLDEST: Final[Version] = (3, 0)
 NEWEST: Final[Version] = (4, 1)
 """Newest known layout, which servers are asked to send."""
-_SIZED: Final[Version] = (4, 1)
+_FIRST_SIZED: Final[Version] = (4, 1)
 """First version with section sizes, assets and a finer clock."""
-_LOST: Final = 9e6  # [m] Motive places lost markers farther away.
+_LOST_DISTANCE: Final = 9e6  # [m] Motive puts lost markers farther away.
 _OCCLUDED, _SEEN, _FILLED, _UNLABELED = 1, 2, 4, 16  # flags of a marker
-_NAME: Final = 256  # size of a program's name [bytes]
-_BODY: Final = 38  # size of a rigid body: ID, position, orientation, error, flags [bytes]
-_MARKER: Final = np.dtype(
+_NAME_SIZE: Final = 256  # size of a program's name [bytes]
+_BODY_SIZE: Final = 38  # size of a rigid body: ID, position, orientation, error, flags [bytes]
+_MARKER_TYPE: Final = np.dtype(
     {
         "names": ["id", "position", "size", "flags", "residual"],
         "formats": ["<i4", ("<f4", 3), "<f4", "<i2", "<f4"],
@@ -56,20 +57,20 @@ _MARKER: Final = np.dtype(
 _PATIENCE: Final = 3.0  # longest wait for a server [s]
 _RETRY: Final = 0.5  # time between requests to a server that does not answer [s]
 _KEEP_ALIVE: Final = 2.0  # time between keep-alive packets [s]
-_UNANSWERED: Final = 7.0  # [s] A server that left three calls unanswered is away.
-_ATTENDED: Final = 0.1  # [s] Without a read for this time the thread empties the socket.
-_BUFFER: Final = 1 << 22  # size of the socket's receive buffer [bytes]
-_STAMPS: Final = 35 if sys.platform == "linux" else None  # SO_TIMESTAMPNS, which Python does not name
+_AWAY_TIME: Final = 7.0  # [s] A server that has been silent for this time is away: it missed three calls.
+_ATTEND_PERIOD: Final = 0.1  # [s] The thread empties a socket that nobody has read for this time.
+_BUFFER_SIZE: Final = 1 << 22  # size of the socket's receive buffer [bytes]
+_STAMP_OPTION: Final = 35 if sys.platform == "linux" else None  # SO_TIMESTAMPNS, which Python does not name
 _STAMP: Final = struct.Struct("@ll")  # seconds and nanoseconds
-_TICKS: Final = 1_000_000  # ticks of our clock in a second
-_LONGEST_LATENCY: Final = 10.0  # [s] With a longer latency the server's times are of another clock.
-_LONGEST_STAY: Final = 60.0  # [s] After a longer time in the socket our clock was set.
+_TICK_RATE: Final = 1_000_000  # ticks of our clock in a second
+_LONGEST_LATENCY: Final = 10.0  # [s] A longer latency means that the server's times are of different clocks.
+_LONGEST_IN_SOCKET: Final = 60.0  # [s] A longer time in the socket means that our clock was set meanwhile.
 VERSIONS: Final[tuple[Version, ...]] = ((3, 0), (3, 1), (4, 0), (4, 1))
 _MOST_POINTS: Final = 1500  # largest number of points that fit into a datagram
 _MOST_CLIENTS: Final = 8
 _CLIENT_TIMEOUT: Final = 10.0  # [s] A client without a packet for this time is gone.
-_WAIT: Final = 0.05  # [s] longest wait of the server for a client's packet
-_NUMBERS: Final = 1 << 31  # frame numbers and IDs wrap around here
+_LONGEST_WAIT: Final = 0.05  # [s] longest wait of the server for a client's packet
+_NUMBER_LIMIT: Final = 1 << 31  # frame numbers and IDs wrap around here
 
 
 class Kind(IntEnum):
@@ -96,7 +97,7 @@ class ServerInfo:
     data_port: int
     group: str | None
     """Multicast address of its frames; None with unicast."""
-    clock: int = _TICKS
+    clock: int = _TICK_RATE
     """Ticks of its clock in a second."""
 
 
@@ -117,16 +118,14 @@ def unpack(packet: bytes) -> tuple[int, bytes]:
 
 def pack_connect() -> bytes:
     """A client's first packet: its name and versions, and a request for all data in the newest layout."""
-    name = b"handsim".ljust(_NAME, b"\0")
-    return pack(
-        Kind.CONNECT, name + bytes((1, 0, 0, 0)) + bytes((*NEWEST, 0, 0)) + bytes((0, *NEWEST, 0, 0, 0))
-    )
+    versions = bytes((1, 0, 0, 0, *NEWEST, 0, 0, 0, *NEWEST, 0, 0, 0))
+    return pack(Kind.CONNECT, b"handsim".ljust(_NAME_SIZE, b"\0") + versions)
 
 
 def pack_server_info(info: ServerInfo) -> bytes:
     """Packet of a server's description of itself."""
     group = bytes(int(part) for part in info.group.split(".")) if info.group else bytes(4)
-    name = info.application.encode()[: _NAME - 1].ljust(_NAME, b"\0")
+    name = info.application.encode()[: _NAME_SIZE - 1].ljust(_NAME_SIZE, b"\0")
     versions = bytes((1, 0, 0, 0, *info.version, 0, 0))
     ending = struct.pack("<QH?", info.clock, info.data_port, info.group is not None) + group
     return pack(Kind.SERVER_INFO, name + versions + ending)
@@ -135,7 +134,7 @@ def pack_server_info(info: ServerInfo) -> bytes:
 def parse_server_info(payload: bytes) -> ServerInfo:
     """Read a server's description of itself."""
     reader = _Reader(payload)
-    application = reader.take(_NAME).split(b"\0")[0].decode(errors="replace")
+    application = reader.take(_NAME_SIZE).split(b"\0")[0].decode(errors="replace")
     reader.take(4)
     major, minor = reader.take(4)[:2]
     clock, data_port, multicast = struct.unpack("<QH?", reader.take(11))
@@ -146,16 +145,16 @@ def parse_server_info(payload: bytes) -> ServerInfo:
 def pack_frame(frame: StreamedFrame, version: Version) -> bytes:
     """Pack a frame: markers with IDs into the list of labeled markers, all points into the older list."""
     known = frame.ids >= 0
-    markers = np.zeros(int(known.sum()), dtype=_MARKER)
+    markers = np.zeros(int(known.sum()), dtype=_MARKER_TYPE)
     markers["id"], markers["position"] = frame.ids[known], frame.points[known]
     markers["flags"] = _SEEN | _UNLABELED
     older = frame.points.astype("<f4").tobytes()
-    sized = version >= _SIZED
+    sized = version >= _FIRST_SIZED
     parts = [struct.pack("<i", frame.number), _section(0, b"", sized), _section(len(known), older, sized)]
     parts += [_section(0, b"", sized)] * (3 if sized else 2)  # rigid bodies, skeletons, assets
     parts += [_section(len(markers), markers.tobytes(), sized)]
     parts += [_section(0, b"", sized)] * 2  # force plates, other devices
-    ticks = (1, 1, 1 + round(_TICKS * frame.latency)) if np.isfinite(frame.latency) else (0, 0, 0)
+    ticks = (1, 1, 1 + round(_TICK_RATE * frame.latency)) if np.isfinite(frame.latency) else (0, 0, 0)
     parts += [struct.pack("<IId3Q", 0, 0, frame.time, *ticks), bytes(8 if sized else 0), bytes(2 + 4)]
     return pack(Kind.FRAME, b"".join(parts))
 
@@ -165,32 +164,28 @@ def _section(count: int, content: bytes, sized: bool) -> bytes:
 
 
 def parse_frame(
-    payload: bytes,
-    version: Version,
-    arrived: float = np.nan,
-    *,
-    clock: int = _TICKS,
+    payload: bytes, version: Version, arrived: float = np.nan, *, clock: int = _TICK_RATE
 ) -> StreamedFrame:
     """Read the observed markers of a frame, without what the server filled in.
 
     Those of marker sets and assets count if no labeled marker is in the list of markers.
     """
-    reader, extra, size = _Reader(payload), 4 if version >= _SIZED else 0, _MARKER.itemsize
+    reader, extra, size = _Reader(payload), 4 if version >= _FIRST_SIZED else 0, _MARKER_TYPE.itemsize
     number = reader.integer()
     in_sets, in_assets = b"", b""
     for _ in range(reader.count(5, extra)):  # marker sets: names, and markers again
         reader.skip_text()
         in_sets += reader.items(12)
     older = np.frombuffer(reader.items(12, extra), dtype="<f4").reshape(-1, 3)
-    reader.items(_BODY, extra)
+    reader.items(_BODY_SIZE, extra)
     for _ in range(reader.count(8, extra)):  # skeletons
         reader.integer()
-        reader.items(_BODY)
+        reader.items(_BODY_SIZE)
     for _ in range(reader.count(12, extra) if extra else 0):  # assets
         reader.integer()
-        reader.items(_BODY)
+        reader.items(_BODY_SIZE)
         in_assets += reader.items(size)
-    markers = np.frombuffer(reader.items(size, extra), dtype=_MARKER)
+    markers = np.frombuffer(reader.items(size, extra), dtype=_MARKER_TYPE)
     for _ in range(2):  # force plates, other devices
         for _ in range(reader.count(8, extra)):
             reader.integer()
@@ -202,18 +197,16 @@ def parse_frame(
     if reader.integer() != 0 or reader.left > 4 or not np.isfinite(time):
         raise DamagedPacket("no end where it should be")
     if (markers["flags"] & _UNLABELED != 0).all():
-        markers = np.concatenate([markers, np.frombuffer(in_assets, dtype=_MARKER)])
+        markers = np.concatenate([markers, np.frombuffer(in_assets, dtype=_MARKER_TYPE)])
         sets = np.frombuffer(in_sets, dtype="<f4").reshape(-1, 3)
         older = np.concatenate([older, sets[sets.any(axis=1)]])  # A marker that is not seen has zeros.
-    points, ids = _seen(markers, older)
+    points, ids = _observed_points(markers, older)
     latency = (sent - exposed) / clock if clock and exposed else np.nan
     known = 0.0 <= latency < _LONGEST_LATENCY
     return StreamedFrame(number, time, points, ids, arrived=arrived, latency=latency if known else np.nan)
 
 
-def _seen(
-    markers: NDArray[np.void], older: NDArray[np.float32]
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def _observed_points(markers: NDArray[np.void], older: NDArray[np.float32]) -> tuple[Doubles, Integers]:
     """Points (N, 3) [m] and IDs (N,), each point once although both lists and two assets may contain it."""
     filled_in = (markers["flags"] & _OCCLUDED != 0) | (markers["flags"] & (_SEEN | _FILLED) == _FILLED)
     points = np.concatenate([markers["position"], older])
@@ -223,7 +216,7 @@ def _seen(
     once[first] = True
     once[: len(markers)] &= ~filled_in
     with np.errstate(invalid="ignore"):
-        once &= (np.abs(points) < _LOST).all(axis=1)
+        once &= (np.abs(points) < _LOST_DISTANCE).all(axis=1)
     return points[once].astype(np.float64), ids[once]
 
 
@@ -308,7 +301,7 @@ class PointStream(ArrivingFrames):
         self._has_frames = False
         self._listen()
         self._version = min(server.version, NEWEST)
-        self._asked = self._kept_alive = self._heard = self._answered = time.monotonic()
+        self._polled_at = self._kept_alive_at = self._framed_at = self._answered_at = time.monotonic()
         self._reading = threading.Lock()
         self._ending = False
         self._closed = threading.Event()
@@ -324,7 +317,7 @@ class PointStream(ArrivingFrames):
     def without_frames(self) -> str:
         """Why no frame comes, as far as the packets of the server and of others tell."""
         server = self.server
-        if time.monotonic() > self._answered + _UNANSWERED:
+        if time.monotonic() > self._answered_at + _AWAY_TIME:
             return f"the server at {self._address[0]} no longer answers; it is called again and again"
         if self._has_frames:
             return super().without_frames
@@ -358,7 +351,7 @@ class PointStream(ArrivingFrames):
         if seconds > 0.0 and not (self._arrived or self._ending):
             select.select(self._sockets, [], [], seconds)
         with self._reading:
-            self._asked = time.monotonic()
+            self._polled_at = time.monotonic()
             self._drain()
             return self._take_all()
 
@@ -389,14 +382,14 @@ class PointStream(ArrivingFrames):
 
     def _attend(self) -> None:
         """Send keep-alive packets, and empty the socket while the reader is busy."""
-        while not self._closed.wait(_ATTENDED):
+        while not self._closed.wait(_ATTEND_PERIOD):
             now = time.monotonic()
-            if now >= self._kept_alive + _KEEP_ALIVE:
+            if now >= self._kept_alive_at + _KEEP_ALIVE:
                 _send(self._sockets[0], pack(Kind.KEEP_ALIVE), self._address)
-                if now >= self._heard + _KEEP_ALIVE:  # A restarted server does not know this client.
+                if now >= self._framed_at + _KEEP_ALIVE:  # A restarted server does not know this client.
                     _send(self._sockets[0], pack_connect(), self._address)
-                self._kept_alive = now
-            if time.monotonic() > self._asked + _ATTENDED:
+                self._kept_alive_at = now
+            if time.monotonic() > self._polled_at + _ATTEND_PERIOD:
                 with self._reading:
                     self._drain()
 
@@ -417,7 +410,7 @@ class PointStream(ArrivingFrames):
             self.foreign += 1
             self._stranger = f"{sender[0]}:{sender[1]}"
             return None
-        self._answered = time.monotonic()
+        self._answered_at = time.monotonic()
         try:
             kind, payload = unpack(packet)
             if kind == Kind.SERVER_INFO and sender == self._address:
@@ -435,18 +428,18 @@ class PointStream(ArrivingFrames):
         except DamagedPacket:
             self.damaged += 1
             return None
-        self._heard, self._has_frames = self._answered, True
+        self._framed_at, self._has_frames = self._answered_at, True
         return frame
 
 
 def _bind(address: str, port: int) -> socket.socket:
     one = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
-        one.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)
+        one.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER_SIZE)
         if port:  # Other programs on this machine may listen to the same group.
             one.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        if _STAMPS is not None:
-            one.setsockopt(socket.SOL_SOCKET, _STAMPS, 1)
+        if _STAMP_OPTION is not None:
+            one.setsockopt(socket.SOL_SOCKET, _STAMP_OPTION, 1)
         one.bind((address, port))
         one.setblocking(False)
     except OSError:
@@ -537,7 +530,7 @@ class _Received(NamedTuple):
 def _receive(one: socket.socket) -> _Received | None:
     """Next packet in a socket; None if there is none."""
     try:
-        if _STAMPS is None:
+        if _STAMP_OPTION is None:
             packet, (host, port) = one.recvfrom(LARGEST)
             return _Received(packet, (host, port), time.monotonic())
         packet, told, _, (host, port) = one.recvmsg(LARGEST, socket.CMSG_SPACE(_STAMP.size))
@@ -545,10 +538,10 @@ def _receive(one: socket.socket) -> _Received | None:
         return None
     arrived = time.monotonic()
     for level, kind, data in told:
-        if (level, kind, len(data)) == (socket.SOL_SOCKET, _STAMPS, _STAMP.size):
+        if (level, kind, len(data)) == (socket.SOL_SOCKET, _STAMP_OPTION, _STAMP.size):
             seconds, nanoseconds = _STAMP.unpack(data)
             stayed = time.time() - seconds - 1e-9 * nanoseconds
-            arrived -= stayed if 0.0 < stayed < _LONGEST_STAY else 0.0
+            arrived -= stayed if 0.0 < stayed < _LONGEST_IN_SOCKET else 0.0
     return _Received(packet, (host, port), arrived)
 
 
@@ -654,11 +647,11 @@ class ReplayServer(Closing):
         while not self._ended.is_set():
             number = self.sent
             if not self._clients:
-                self._answer(_WAIT)
+                self._answer(_LONGEST_WAIT)
                 start = time.monotonic() - number / self.rate  # continue at this frame
                 continue
             due = np.inf if self.finished else start + number / self.rate
-            self._answer(min(_WAIT, max(0.0, due - time.monotonic())))
+            self._answer(min(_LONGEST_WAIT, max(0.0, due - time.monotonic())))
             if self._clients and time.monotonic() >= due:
                 packet, now = pack_frame(self._frame(number), self._version), time.monotonic()
                 self._clients = {
@@ -672,8 +665,8 @@ class ReplayServer(Closing):
         played, row = divmod(number, len(self._points))
         there = np.isfinite(self._points[row]).all(axis=1)
         ids = self._ids[row, there].astype(np.int64)
-        ids[ids >= 0] = (ids[ids >= 0] + played * self._ids_of_round) % _NUMBERS
-        return StreamedFrame(number % _NUMBERS, number / self.rate, self._points[row, there], ids)
+        ids[ids >= 0] = (ids[ids >= 0] + played * self._ids_of_round) % _NUMBER_LIMIT
+        return StreamedFrame(number % _NUMBER_LIMIT, number / self.rate, self._points[row, there], ids)
 
     def _answer(self, seconds: float) -> None:
         """Wait for a client's packet and answer it."""

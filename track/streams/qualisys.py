@@ -25,8 +25,8 @@ _RETRY: Final = 1.0  # time between attempts to reach a QTM that went away [s]
 _COMPONENTS: Final = ["3d", "3dnolabels"]
 _STARTS: Final = ("EventConnected", "EventCaptureStarted", "EventRTfromFileStarted")
 _FIRST_ID: Final = 1 << 16  # first ID of unidentified markers; smaller ones are identified
-_IDS: Final = 1 << 30
-_HEAD: Final = struct.Struct("<2I")  # size and kind of a packet
+_ID_LIMIT: Final = 1 << 30
+_PACKET_HEAD: Final = struct.Struct("<2I")  # size and kind of a packet
 _DAMAGED: Final = "damaged_packets"
 _LOST, _CLOSED = "lost", "closed"  # queued after the last frame of a connection, or of the source
 
@@ -88,11 +88,9 @@ class QualisysSource:
             raise CaptureError(f"{url}: QTM refuses version {_VERSION} of its protocol ({error})") from error
         except OSError as error:  # TimeoutError is one
             refused = f"no program of {machine} listens at port {self._port}"
-            reason = (
-                refused if isinstance(error, ConnectionRefusedError) else error.strerror or "it is silent"
-            )
+            cause = refused if isinstance(error, ConnectionRefusedError) else error.strerror or "it is silent"
             raise NoServerError(
-                f"{url}: no QTM answers, expected one that runs there: {reason}; start QTM, or compare the "
+                f"{url}: no QTM answers, expected one that runs there: {cause}; start QTM, or compare the "
                 "port with that of its real-time output"
             ) from error
         return self._qtm.QRTConnection(protocol, timeout=_PATIENCE)
@@ -154,16 +152,16 @@ class _Packets:
     def data_received(self, data: bytes) -> None:
         """Pass whole packets on; end the connection at a size that no packet has."""
         self._rest += data
-        while len(self._rest) >= _HEAD.size:
-            size, kind = _HEAD.unpack_from(self._rest)
+        while len(self._rest) >= _PACKET_HEAD.size:
+            size, kind = _PACKET_HEAD.unpack_from(self._rest)
             # This is far more than a packet of markers has.
-            if not _HEAD.size <= size <= 1 << 24:
+            if not _PACKET_HEAD.size <= size <= 1 << 24:
                 self._counts[_DAMAGED] += 1
                 self._rest.clear()
                 self._protocol.transport.abort()
-            if not _HEAD.size <= size <= len(self._rest):
+            if not _PACKET_HEAD.size <= size <= len(self._rest):
                 return
-            packet = bytes(self._rest[_HEAD.size : size])
+            packet = bytes(self._rest[_PACKET_HEAD.size : size])
             del self._rest[:size]
             try:
                 self._receiver._parse_received(packet, kind)
@@ -177,7 +175,7 @@ def frame_of(packet: Any) -> StreamedFrame:
     _, others = packet.get_3d_markers_no_label() or (None, [])
     positions = [(one.x, one.y, one.z) for one in identified + others]  # [mm], NaN if not seen
     points = 1e-3 * np.array(positions, dtype=np.float64).reshape(-1, 3)
-    ids = [*range(len(identified)), *(_FIRST_ID + other.id % _IDS for other in others)]
+    ids = [*range(len(identified)), *(_FIRST_ID + other.id % _ID_LIMIT for other in others)]
     there, time = np.isfinite(points).all(axis=1), 1e-6 * packet.timestamp
     if not abs(time) < LATEST_TIME:
         raise ValueError(f"a time of {time} s")

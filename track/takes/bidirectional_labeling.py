@@ -1,7 +1,8 @@
-"""Labels of continuous frames: hands are tracked forward and backward, and the better labels kept.
+"""Labels of continuous frames: hands are tracked forward and backward, and the better labels are kept.
 
-A tracker that fails at an event is wrong after it when tracking forward, and before it when going backward.
-Where the directions differ, each event takes the labels of the direction in which they are likelier.
+A tracker that fails at an event is wrong after it when tracking forward, and before it when tracking
+backward. Where the directions differ, each event takes the labels of the direction in which they are
+likelier.
 """
 
 from __future__ import annotations
@@ -12,12 +13,12 @@ from typing import Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from numpy.typing import NDArray
 
 from gloves.captures.capture import runs_of
 from gloves.takes.points import PointList
 from gloves.takes.take import LOST, TRACKED, Take
 from handsim.app.workers import LocalProcesses, can_be_sent
+from handsim.arrays import Flags, Integers
 from handsim.hand.shape import NUM_QPOS
 from track.association.initialization import connected_components
 from track.frames import StreamedFrame, TrackedHand
@@ -31,7 +32,7 @@ _LEAST_CONFIDENCE: Final = 1e-4  # Confidences are clipped to between this and o
 _AGREEMENT_ODDS: Final = 5.0  # factor of a label's odds where both directions agree, on simulated captures
 
 
-class _Track(NamedTuple):
+class _TrackedCapture(NamedTuple):
     """Result of tracking a capture in one direction."""
 
     take: Take
@@ -56,11 +57,11 @@ def label_both_ways(
     on_count: Callable[[int], None],
     helper: LocalProcesses | None = None,
 ) -> Take:
-    """Label a take in both directions, backward in another process where there is one.
+    """Label a take in both directions, backward in a helper process if there is one.
 
     `on_count` is called with the number of frames done.
     """
-    forward, backward = _both_ways(take, frames, new_tracker, on_count, helper)
+    forward, backward = _track_both_ways(take, frames, new_tracker, on_count, helper)
     points, forward_labels = take.point_list, forward.take.point_list.labels
     backward_labels = backward.take.point_list.labels
     takes_backward = np.zeros(forward_labels.shape, dtype=bool)
@@ -68,26 +69,25 @@ def label_both_ways(
     takes_backward[events.points] = _is_likelier(backward.take, forward.take, events)
     is_better = backward.evidence > forward.evidence
     # Where the directions exchange the hands, one direction decides for the whole run.
-    for run in _exchanges(points, forward_labels, backward_labels, len(take.hand_labels[0])):
+    for run in _exchanged_runs(points, forward_labels, backward_labels, len(take.hand_labels[0])):
         is_better[run] = backward.evidence[run].sum() > forward.evidence[run].sum()
         takes_backward[points.starts[run.start] : points.starts[run.stop]] = is_better[run.start]
     labels = np.where(takes_backward, backward_labels, forward_labels)
-    qpos, rms = _poses(forward.take, backward.take, is_better)
-    right = label_confidence(_posed(take, labels, qpos, rms))
+    qpos, rms = _better_poses(forward.take, backward.take, is_better)
+    right = label_confidence(_with_poses(take, labels, qpos, rms))
     odds = np.where(forward_labels == backward_labels, _AGREEMENT_ODDS, 1.0)
     confidence = odds * right / (1.0 - right + odds * right)
-    return dataclasses.replace(
-        take, point_list=dataclasses.replace(points, labels=labels, confidence=confidence)
-    )
+    points = dataclasses.replace(points, labels=labels, confidence=confidence)
+    return dataclasses.replace(take, point_list=points)
 
 
-def _both_ways(
+def _track_both_ways(
     take: Take,
     frames: Sequence[StreamedFrame],
     new_tracker: Callable[[], Tracker],
     on_count: Callable[[int], None],
     helper: LocalProcesses | None,
-) -> tuple[_Track, _Track]:
+) -> tuple[_TrackedCapture, _TrackedCapture]:
     """Track the hands twice: from the first frame to the last, and from the last to the first."""
     count = len(frames)
     order = range(count)
@@ -98,7 +98,7 @@ def _both_ways(
         )
     backward = helper.submit(_track, take, frames, order[::-1], new_tracker)
     forward = _track(take, frames, order, new_tracker, lambda done: on_count(min(done, count - 1)))
-    found: _Track = backward.result()
+    found: _TrackedCapture = backward.result()
     on_count(count)
     return forward, found
 
@@ -109,7 +109,7 @@ def _track(
     order: Sequence[int],
     new_tracker: Callable[[], Tracker],
     on_count: Callable[[int], None] = lambda _: None,
-) -> _Track:
+) -> _TrackedCapture:
     """Track the hands through frames in the given order."""
     tracker = new_tracker()
     points, num_hands = take.point_list, len(tracker.hands)
@@ -120,18 +120,15 @@ def _track(
         one = tracker.step(frame.points, frame.ids, abs(frame.time - frames[order[0]].time))
         labels[points.of(row)] = one.labels
         qpos[row], rms[row] = [hand.qpos for hand in one.hands], [hand.rms for hand in one.hands]
-        evidence[row] = sum(map(_evidence, one.hands))
+        evidence[row] = sum(map(_hand_evidence, one.hands))
         on_count(count)
-    posed = _posed(take, labels, qpos, rms)
+    posed = _with_poses(take, labels, qpos, rms)
     sure = dataclasses.replace(posed.point_list, confidence=label_confidence(posed))
-    return _Track(dataclasses.replace(posed, point_list=sure), evidence)
+    return _TrackedCapture(dataclasses.replace(posed, point_list=sure), evidence)
 
 
-def _posed(
-    take: Take,
-    labels: Int[np.ndarray, "P"],
-    qpos: Float[np.ndarray, "T H 27"],
-    rms: Float[np.ndarray, "T H"],
+def _with_poses(
+    take: Take, labels: Int[np.ndarray, "P"], qpos: Float[np.ndarray, "T H 27"], rms: Float[np.ndarray, "T H"]
 ) -> Take:
     """The take with labels and the poses [m, rad] that gave them, NaN for lost hands."""
     status = np.where(np.isfinite(qpos[..., 0]), TRACKED, LOST)
@@ -139,17 +136,15 @@ def _posed(
     return dataclasses.replace(take, point_list=points, qpos=qpos, status=status, rms=rms)
 
 
-def _evidence(hand: TrackedHand) -> float:
+def _hand_evidence(hand: TrackedHand) -> float:
     """Log-odds of a hand's labels, from the number and RMS distance of its points."""
     if not np.isfinite(hand.rms):
         return 0.0
     return (len(hand.markers) - len(hand.filled)) * (_EXACT_LOG_ODDS - 0.5 * (hand.rms / _RMS_SPREAD) ** 2)
 
 
-def _events_of(
-    frames: Int[np.ndarray, "P"], one: Int[np.ndarray, "P"], other: Int[np.ndarray, "P"]
-) -> _Events:
-    """Group the points whose two labels differ into events.
+def _events_of(frames: Integers, one: Integers, other: Integers) -> _Events:
+    """Group the points (P,) whose two labels differ into events.
 
     Two points belong to one event if they exchange a label between the directions in a frame, or if they have
     the same two labels in successive frames.
@@ -191,7 +186,7 @@ def _is_likelier(take: Take, other: Take, events: _Events) -> Bool[np.ndarray, "
     return np.asarray(gain[events.numbers] > 0.0)
 
 
-def _exchanges(
+def _exchanged_runs(
     points: PointList, one: Int[np.ndarray, "P"], other: Int[np.ndarray, "P"], num_markers: int
 ) -> Iterator[slice]:
     """Runs of frames in which the directions give most points of a hand to different hands."""
@@ -203,10 +198,10 @@ def _exchanges(
     yield from (slice(first, last + 1) for first, last in runs_of(wrong))
 
 
-def _poses(
+def _better_poses(
     one: Take, other: Take, is_better: Bool[np.ndarray, "T"]
 ) -> tuple[Float[np.ndarray, "T H 27"], Float[np.ndarray, "T H"]]:
-    """Poses and RMS of the better take, or of the other one for hands that the better one has lost."""
+    """Poses and RMS of the better take; for hands that it has lost, those of the other take."""
     there = [np.isfinite(take.qpos[..., 0]) for take in (one, other)]
-    chosen: NDArray[np.bool_] = np.where(is_better[:, None], there[1], there[1] & ~there[0])
+    chosen: Flags = np.where(is_better[:, None], there[1], there[1] & ~there[0])
     return np.where(chosen[..., None], other.qpos, one.qpos), np.where(chosen, other.rms, one.rms)

@@ -8,19 +8,19 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Int
-from numpy.typing import NDArray
 
 from gloves.fit import GloveFit
 from gloves.takes.corrections import FREE, Correction, applied_corrections, find_pins, pin_labels
 from gloves.takes.points import PointList
 from gloves.takes.take import LOST, Take
+from handsim.arrays import Doubles, Integers
 from handsim.hand.shape import NUM_JOINTS, NUM_KEYPOINTS
 from track.kinematics.pose_solver import MIN_MARKERS, PoseSolver
 from track.takes.smoothed_take import smooth_take, spread_model
 
 _ANGLE_SPREAD: Final = 0.3  # [rad] prior standard deviation of joint angles around the tracked ones
 BAD_RMS: Final = 0.006
-"""A fit that is worse is tried again from general poses [m]."""
+"""A fit with a larger RMS distance is tried again from general poses [m]."""
 
 
 class CorrectedTake(NamedTuple):
@@ -34,8 +34,8 @@ class CorrectedTake(NamedTuple):
 def correct_take(take: Take, corrections: Sequence[Correction]) -> CorrectedTake:
     """Correct the labels of points, and fit the poses of those frames to them.
 
-    A corrected label has a confidence of 1. A hand with at least four labeled markers is fitted again; with
-    fewer, and where the hand is lost, its pose stays. Poses of rigid bodies stay.
+    A corrected label has a confidence of 1. A hand is fitted again where it has at least four labeled markers
+    and is not lost; other poses, and those of rigid bodies, stay.
     """
     before = take.point_list
     pins = find_pins(corrections, before, take.label_names)
@@ -45,7 +45,7 @@ def correct_take(take: Take, corrections: Sequence[Correction]) -> CorrectedTake
     )
     qpos, rms = take.qpos.copy(), take.rms.copy()
     for number, span in enumerate(take.hand_labels):
-        changed = before.frames[_of_hand(points.labels, span) != _of_hand(before.labels, span)]
+        changed = before.frames[_hand_labels(points.labels, span) != _hand_labels(before.labels, span)]
         frames = np.unique(changed)
         frames = frames[take.status[frames, number] != LOST]
         if len(frames):
@@ -62,7 +62,7 @@ def correct_take(take: Take, corrections: Sequence[Correction]) -> CorrectedTake
     return CorrectedTake(corrected, pins.unfitting)
 
 
-def _spreads(take: Take, points: PointList, qpos: NDArray[np.float64]) -> dict[str, Any]:
+def _spreads(take: Take, points: PointList, qpos: Doubles) -> dict[str, Any]:
     """Standard deviations of all poses given these labels, by the names of a take's fields."""
     angles = np.full((*qpos.shape[:2], NUM_JOINTS), np.nan)
     keypoints = np.full((*qpos.shape[:2], NUM_KEYPOINTS), np.nan)
@@ -80,24 +80,20 @@ def _spreads(take: Take, points: PointList, qpos: NDArray[np.float64]) -> dict[s
     return {"angle_spread": angles, "keypoint_spread": keypoints}
 
 
-def _fit_again(
-    take: Take, hand: int, frames: NDArray[np.int64], targets: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _fit_again(take: Take, hand: int, frames: Integers, targets: Doubles) -> tuple[Doubles, Doubles]:
     """Fit a hand that is not lost to labeled markers in some frames; poses and RMS [m]."""
     worn, qpos = take.hands_at(int(frames[0]))[hand], take.qpos[frames, hand]
     enough = np.isfinite(targets[..., 0]).sum(axis=1) >= MIN_MARKERS
     rms = np.full(len(frames), np.nan)
     if enough.any():
         bias = take.marker_bias(worn.side)
-        qpos[enough] = _solved(worn, bias, targets[enough], qpos[enough])
+        qpos[enough] = _fit_poses(worn, bias, targets[enough], qpos[enough])
         squares = ((worn.markers(qpos[enough])[0] - targets[enough]) ** 2).sum(axis=-1)
         rms[enough] = np.sqrt(np.nanmean(squares, axis=1))
     return qpos, rms
 
 
-def _solved(
-    worn: GloveFit, bias: NDArray[np.float64], targets: NDArray[np.float64], near: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _fit_poses(worn: GloveFit, bias: Doubles, targets: Doubles, near: Doubles) -> Doubles:
     """Fit poses (T, 27) of a hand with biased markers, each starting from a given pose."""
     solver = PoseSolver(worn)
     solver.hand.positions[:, 0] -= bias
@@ -110,7 +106,7 @@ def _solved(
     return qpos
 
 
-def _of_hand(labels: Int[np.ndarray, "P"], span: range) -> NDArray[np.int64]:
+def _hand_labels(labels: Int[np.ndarray, "P"], span: range) -> Integers:
     """Labels of one hand, -1 for all others."""
     return np.where((labels >= span.start) & (labels < span.stop), labels, -1)
 

@@ -1,8 +1,8 @@
 """Calibrated confidence in the labels of a whole take: of labels with confidence 0.9, 90 % are right.
 
-Points are followed from frame to frame, by their IDs if these persist; the frames of one point are its life.
-Two logistic models weigh the evidence of each life: one for points with a label, one for points without.
-Both were fitted to simulated captures by benchmarks/doubtful_frames at commit 1f52414.
+A life is the frames through which one point is followed, by its ID if IDs persist, otherwise by position. Two
+logistic models weigh the evidence on each point: one for points with a label, one for points without. Both
+were fitted to simulated captures by benchmarks/doubtful_frames at commit 1f52414.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ from typing import Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from numpy.typing import NDArray
 
 from gloves.takes.take import LOST, Take
+from handsim.arrays import Integers
 from handsim.hand.shape import DIGITS, NUM_JOINTS
 from handsim.kernels import kernel, point_distance
 from handsim.space.transforms import quaternion_matrix
@@ -22,21 +22,21 @@ from track.alternatives.alternatives import label_probability
 from track.kinematics.pose_spread import resting_prior
 
 _LEAST_RESIDUAL: Final = 0.0003  # [m] lower bound of a marker's usual residual: the noise of optical systems
-_FEWEST: Final = 10  # frames needed to estimate the usual residual of a marker
-_LINK: Final = 0.015  # [m] largest motion within the hand between frames, without lasting IDs
-_EXCHANGE: Final = 0.005  # [m] smallest jump of points whose IDs were exchanged
-_BESIDE: Final = 0.1  # [m] radius within which points belong to one hand
+_FEWEST_FRAMES: Final = 10  # frames needed to estimate the usual residual of a marker
+_LINK_DISTANCE: Final = 0.015  # [m] largest motion within the hand between frames, without lasting IDs
+_EXCHANGE_JUMP: Final = 0.005  # [m] smallest jump of points whose IDs were exchanged
+_BESIDE_DISTANCE: Final = 0.1  # [m] radius within which points belong to one hand
 _LONG_LIFE: Final = 20.0  # Lives of at least this many frames count as long.
-_FAR: Final = 1.0  # [m] stands for the distance of a missing neighbor
-_MOST_OFF: Final = 100.0  # upper bound of a residual in the evidence, in usual residuals
-_REPEATED: Final = 0.005  # [m] Points that come and go within this distance in a hand may be one marker.
-_LABELED: Final = (-8.11, 0.72, 3.08, 0.08, 0.68, 1.49, 2.49, 0.78)
+_NO_NEIGHBOR: Final = 1.0  # [m] distance that stands for a missing neighbor
+_MOST_RESIDUAL_RATIO: Final = 100.0  # upper bound of a residual in the evidence, in usual residuals
+_REPEAT_DISTANCE: Final = 0.005  # [m] Brief points this close to each other on a hand may be one marker.
+_LABELED_WEIGHTS: Final = (-8.11, 0.72, 3.08, 0.08, 0.68, 1.49, 2.49, 0.78)
 """Log-odds of a wrong label: bias, and weight of each piece of evidence."""
-_UNLABELED: Final = (-9.44, 3.91, 3.13, 6.01, -0.76, 3.30, 1.62, 0.76, 1.35, 2.0)
+_UNLABELED_WEIGHTS: Final = (-9.44, 3.91, 3.13, 6.01, -0.76, 3.30, 1.62, 0.76, 1.35, 2.0)
 """Log-odds that an unlabeled point is a marker: bias, and weight of each piece of evidence.
 
-The last weight is not fitted, as markers that are hardly ever seen are rare in the captures: from 1.7 on it
-lists a fingertip that is seen in nine of 600 frames, 24 mm from where the pose has it.
+The last weight is not fitted, because markers that are hardly ever seen are rare in those captures. From 1.7
+on it reports a fingertip that is seen in nine of 600 frames, 24 mm from its place on the pose.
 """
 
 
@@ -69,32 +69,32 @@ def evidence_of(take: Take) -> Evidence:
     expected = np.concatenate([take.pose_markers(side) for side in take.sides], axis=1)
     centers = np.stack([expected[:, owners == hand].mean(axis=1) for hand in range(len(take.hands))], axis=1)
     starts = np.searchsorted(frames, np.arange(take.num_frames + 1))
-    lives = _follow(points, listed.ids[chosen].astype(np.int64), starts, centers, _LINK, _EXCHANGE)
-    own, others, length = _lives(lives, labels, count)
+    lives = _number_lives(points, listed.ids[chosen].astype(np.int64), starts, centers)
+    own, others, length = _frames_of_lives(lives, labels, count)
     of_life, short = np.log1p(others / own), np.log(_LONG_LIFE / np.minimum(length, _LONG_LIFE))
     which, free = np.flatnonzero(labels >= 0), np.flatnonzero(labels < 0)
     seen = take.observed(range(count))
     residuals, markers = np.linalg.norm(seen - expected, axis=-1), labels.copy()
-    markers[free], near = _surroundings(points, labels, starts, expected, _BESIDE, _FAR)
-    of_hand = _of_hands(take, np.isfinite(seen[..., 0]), owners)[frames, owners[markers]]
+    markers[free], near = _surroundings(points, labels, starts, expected)
+    of_hand = _hand_evidence(take, np.isfinite(seen[..., 0]), owners)[frames, owners[markers]]
     label, frame = labels[which], frames[which]
-    off = np.fmax(residuals[frame, label] / _usual(residuals)[label], 1.0)
-    off = np.minimum(np.nan_to_num(off, nan=3.0), _MOST_OFF)
+    off = np.fmax(residuals[frame, label] / _usual_residuals(residuals)[label], 1.0)
+    off = np.minimum(np.nan_to_num(off, nan=3.0), _MOST_RESIDUAL_RATIO)
     labeled = [
         of_life[which],  # other labels in its life
         np.log1p((length - own - others) / own)[which],  # frames without a label in its life
         off - 1.0,  # residual
         np.log(off) * short[which],  # residual in a short life
         *of_hand[which].T,
-        _improbable(take, owners)[frame, label],
+        _digit_improbability(take, owners)[frame, label],
     ]
-    is_brief, repeats = (near[0] < _BESIDE) & (length[free] < _LONG_LIFE), np.zeros(len(free))
+    is_brief, repeats = (near[0] < _BESIDE_DISTANCE) & (length[free] < _LONG_LIFE), np.zeros(len(free))
     brief = free[is_brief]
     nearest = markers[brief]
     rotations = quaternion_matrix(take.qpos[frames[brief], owners[nearest], 3:7])
     shifts = np.einsum("bji,bj->bi", rotations, points[brief] - expected[frames[brief], nearest])
     places = np.column_stack([shifts, nearest])  # The marker keeps offsets from different markers apart.
-    again = cKDTree(places).query_ball_point(places, _REPEATED, return_length=True) - length[brief]
+    again = cKDTree(places).query_ball_point(places, _REPEAT_DISTANCE, return_length=True) - length[brief]
     repeats[is_brief] = np.maximum(again, 0) / (1.0 + np.isfinite(residuals).sum(axis=0)[nearest])
     is_lost = (take.status == LOST).any(axis=1)[frames[free]]
     unlabeled = [
@@ -110,19 +110,19 @@ def evidence_of(take: Take) -> Evidence:
     return Evidence(chosen, labels, markers, np.stack(labeled, axis=1), np.stack(unlabeled, axis=1))
 
 
-def _usual(residuals: Float[np.ndarray, "T K"]) -> Float[np.ndarray, "K"]:
-    """Usual residual of each marker [m]: the median, or that of the others if it has too few frames."""
-    known = np.isfinite(residuals).sum(axis=0) >= _FEWEST
+def _usual_residuals(residuals: Float[np.ndarray, "T K"]) -> Float[np.ndarray, "K"]:
+    """Usual residual of each marker [m]: its median, or that of the others if it has too few frames."""
+    known = np.isfinite(residuals).sum(axis=0) >= _FEWEST_FRAMES
     usual = np.full(residuals.shape[1], np.nan)
     usual[known] = np.nanmedian(residuals[:, known], axis=0)
     usual[~known] = np.median(usual[known]) if known.any() else _LEAST_RESIDUAL
     return np.asarray(np.maximum(usual, _LEAST_RESIDUAL))
 
 
-def _lives(
+def _frames_of_lives(
     lives: Int[np.ndarray, "P"], labels: Int[np.ndarray, "P"], count: int
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Frames in each point's life: with the point's label, with another label, and in total."""
+) -> tuple[Integers, Integers, Integers]:
+    """Number of frames in each point's life: with the point's label, with another label, and in total."""
     pairs = lives * (count + 1) + labels + 1
     _, inverse, counts = np.unique(pairs, return_inverse=True, return_counts=True)
     own, with_label, length = counts[inverse], np.bincount(lives, labels >= 0), np.bincount(lives)
@@ -130,7 +130,7 @@ def _lives(
     return own, others, length[lives]
 
 
-def _of_hands(
+def _hand_evidence(
     take: Take, seen: Bool[np.ndarray, "T K"], owners: Int[np.ndarray, "K"]
 ) -> Float[np.ndarray, "T H 2"]:
     """Evidence on each hand: its share of hidden markers, and the size of its marker biases."""
@@ -141,7 +141,7 @@ def _of_hands(
     return values
 
 
-def _improbable(take: Take, owners: Int[np.ndarray, "K"]) -> Float[np.ndarray, "T K"]:
+def _digit_improbability(take: Take, owners: Int[np.ndarray, "K"]) -> Float[np.ndarray, "T K"]:
     """How improbable the angles of each marker's digit are under the resting prior; 0 for the palm."""
     prior, n = resting_prior(), NUM_JOINTS // len(DIGITS)
     digits = np.concatenate([hand.attachment.digits for hand in take.hands])
@@ -162,8 +162,6 @@ def _surroundings(
     labels: Int[np.ndarray, "P"],
     starts: Int[np.ndarray, "T+1"],
     expected: Float[np.ndarray, "T K 3"],
-    beside: float,
-    far: float,
 ) -> tuple[Int[np.ndarray, "U"], Float[np.ndarray, "3 U"]]:
     """Surroundings of the unlabeled points.
 
@@ -171,7 +169,7 @@ def _surroundings(
     unlabeled points nearby.
     """
     count = (labels < 0).sum()
-    marker, near = np.zeros(count, dtype=np.int64), np.full((3, count), far)
+    marker, near = np.zeros(count, dtype=np.int64), np.full((3, count), _NO_NEIGHBOR)
     near[2], u = 0.0, 0
     for frame in range(len(starts) - 1):
         first, last = starts[frame], starts[frame + 1]
@@ -191,19 +189,17 @@ def _surroundings(
                 if i != j:
                     distance = point_distance(points[i], points[j])
                     near[1, u] = min(near[1, u], distance)
-                    near[2, u] += labels[j] < 0 and distance < beside
+                    near[2, u] += labels[j] < 0 and distance < _BESIDE_DISTANCE
             u += 1
     return marker, near
 
 
 @kernel
-def _follow(
+def _number_lives(
     points: Float[np.ndarray, "P 3"],
     ids: Int[np.ndarray, "P"],
     starts: Int[np.ndarray, "T+1"],
     centers: Float[np.ndarray, "T H 3"],
-    link: float,
-    exchange: float,
 ) -> Int[np.ndarray, "P"]:
     """The life of each point, followed by IDs if they persist, else by position; exchanged IDs are undone."""
     lives, number = np.full(len(points), -1), 0
@@ -212,7 +208,7 @@ def _follow(
         before = starts[frame - 1] if frame else first
         predicted, current = points[before:first].copy(), points[first:last]
         if frame:
-            _move(predicted, centers[frame - 1], centers[frame])
+            _move_with_hands(predicted, centers[frame - 1], centers[frame])
         source = np.full(last - first, -1)
         for j in range(len(source)):
             for i in range(len(predicted)):
@@ -220,10 +216,10 @@ def _follow(
                     source[j] = i
         if 2 * (source >= 0).sum() < min(len(source), len(predicted)):
             for j in range(len(source)):
-                i = _nearest(predicted, current[j], link)
-                source[j] = i if i >= 0 and _nearest(current, predicted[i], link) == j else -1
+                i = _nearest(predicted, current[j], _LINK_DISTANCE)
+                source[j] = i if i >= 0 and _nearest(current, predicted[i], _LINK_DISTANCE) == j else -1
         else:
-            _undo_exchanges(predicted, current, source, exchange)
+            _undo_exchanges(predicted, current, source)
         for j in range(len(source)):
             lives[first + j] = lives[before + source[j]] if source[j] >= 0 else number
             number += source[j] < 0
@@ -231,7 +227,7 @@ def _follow(
 
 
 @kernel
-def _move(
+def _move_with_hands(
     points: Float[np.ndarray, "N 3"], old: Float[np.ndarray, "H 3"], new: Float[np.ndarray, "H 3"]
 ) -> None:
     """Move points near a hand along with the hand's center [m]."""
@@ -243,10 +239,7 @@ def _move(
 
 @kernel
 def _undo_exchanges(
-    predicted: Float[np.ndarray, "Q 3"],
-    points: Float[np.ndarray, "N 3"],
-    source: Int[np.ndarray, "N"],
-    exchange: float,
+    predicted: Float[np.ndarray, "Q 3"], points: Float[np.ndarray, "N 3"], source: Int[np.ndarray, "N"]
 ) -> None:
     """Exchange the sources of two points that jump, if each is where the other was predicted."""
     for j in range(len(source)):
@@ -257,7 +250,7 @@ def _undo_exchanges(
             kept = point_distance(predicted[one], points[j])
             also = point_distance(predicted[other], points[m])
             changed = point_distance(predicted[one], points[m]) + point_distance(predicted[other], points[j])
-            if min(kept, also) >= exchange and changed < 0.5 * (kept + also):
+            if min(kept, also) >= _EXCHANGE_JUMP and changed < 0.5 * (kept + also):
                 source[j], source[m] = other, one
 
 
@@ -283,11 +276,10 @@ def label_confidence(take: Take) -> Float[np.ndarray, "P"]:
     evidence = evidence_of(take)
     labeled = evidence.labels >= 0
     right = np.zeros(len(labeled))
-    for which, values, weights in (
-        (labeled, evidence.labeled, _LABELED),
-        (~labeled, evidence.unlabeled, _UNLABELED),
-    ):
-        right[which] = 1.0 / (1.0 + np.exp(weights[0] + values @ np.array(weights[1:])))
+    of_labels = labeled, evidence.labeled, _LABELED_WEIGHTS
+    of_others = ~labeled, evidence.unlabeled, _UNLABELED_WEIGHTS
+    for which, values, (bias, *weights) in (of_labels, of_others):
+        right[which] = 1.0 / (1.0 + np.exp(bias + values @ np.array(weights)))
     right[labeled] *= label_probability(take)[evidence.labels[labeled]]
     confidence[evidence.points] = right
     return confidence

@@ -1,4 +1,4 @@
-"""What the methods section of a paper says of a take, and the record of what the take was made of.
+"""The paragraph on a take for the methods section of a paper, and the record of the take's origin.
 
 Words in capitals are for the author to fill in.
 """
@@ -13,7 +13,7 @@ from gloves.takes.take import Take
 from track.config import HandOrigin
 from track.user import hand_origin
 
-_HANDS: Final[dict[HandOrigin, str]] = {
+_ORIGIN_WORDS: Final[dict[HandOrigin, str]] = {
     "named": "mean hands of one of five sizes",
     "measured": "hands whose size and proportions were measured by their markers",
     "calibrated": "hands calibrated for each person and session from S s of motion",
@@ -30,7 +30,7 @@ def methods_paragraph(take: Take, doubtful: float, *, has_neutral: bool) -> str:
     """
     settings, layout = take.settings, take.hands[0].layout
     origins = [hand_origin(str(settings.get("user", "")), side) for side in take.sides]
-    hands = " and ".join(_HANDS[origin] for origin in dict.fromkeys(origins))
+    hands = " and ".join(_ORIGIN_WORDS[origin] for origin in dict.fromkeys(origins))
     known = take.rms[np.isfinite(take.rms)]
     residual = f" (median residual {1e3 * np.median(known):.1f} mm)" if len(known) else ""
     cutoffs = [one for side in take.sides for one in settings.get("filter", {}).get(side, ())]
@@ -54,7 +54,7 @@ def methods_paragraph(take: Take, doubtful: float, *, has_neutral: bool) -> str:
 
 
 def made_of(settings: dict[str, Any]) -> str:
-    """The version that made a take, the date, and names and checksums of capture, glove and user."""
+    """The version that made a take, its date, and the names and checksums of capture, glove and user."""
     parts = [f"handsim {settings['handsim']}", settings["date"]] if "handsim" in settings else []
     for name in ("capture", "glove", "user"):
         if f"{name}_sha256" in settings:

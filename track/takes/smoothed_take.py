@@ -15,11 +15,11 @@ from typing import Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from numpy.typing import NDArray
 
 from gloves.captures.capture import runs_of
 from gloves.fit import GloveFit
 from gloves.takes.take import INITIALIZED, LOST, Take
+from handsim.arrays import Doubles
 from handsim.hand.angles import WRIST_NAMES
 from handsim.hand.shape import DIGITS, JOINT_NAMES, NUM_JOINTS, NUM_KEYPOINTS
 from handsim.kernels import kernel, move, velocity_of
@@ -39,28 +39,30 @@ from track.kinematics.pose_spread import (
     SpreadModel,
     are_still,
     freedom_factor,
-    own_variances,
     resting_prior,
+    usual_angle_variances,
 )
 from track.user import hand_origin, read_errors
 
 # Chosen on realistic simulated hands; the error hardly changes within a factor of ten.
-_ACCELERATIONS: Final = np.repeat([10.0, 0.5, 10.0], [NUM_JOINTS, 3, 3])
+_ACCELERATION_DENSITY: Final = np.repeat([10.0, 0.5, 10.0], [NUM_JOINTS, 3, 3])
 """Power spectral density of acceleration: joints [rad^2/s^3], wrist [m^2/s^3], [rad^2/s^3]."""
-_GESTURES: Final = 30.0  # [1/s] how often the prior counts: errors of markers last this long
-_KNOWN: Final = float(np.deg2rad(3.0))
-"""Standard deviation of an angle that a goniometer found [rad]: a therapist's finger angles repeat within
-5 degrees in 95 % (Ellis and Bruton 2002), and joints are bent a little on the way."""
-_WEAK: Final = np.repeat([0.0, 1.0], [NUM_JOINTS, 6])  # [1/m^2, 1/rad^2] keeps an unseen wrist solvable
-_WINDOW, _MARGIN = 2000, 200  # frames solved together, and additional ones at either end
+_PRIOR_RATE: Final = 30.0  # [1/s] The prior counts this often, because errors of markers last that long.
+_KNOWN_ANGLE_SPREAD: Final = float(np.deg2rad(3.0))
+"""Standard deviation of an angle measured by goniometer [rad]: 95 % of a therapist's finger angles repeat
+within 5 degrees (Ellis and Bruton 2002), and a joint bends a little between the measurements."""
+# [1/m^2, 1/rad^2] makes an unseen wrist solvable
+_WRIST_PRECISION: Final = np.repeat([0.0, 1.0], [NUM_JOINTS, 6])
+_WINDOW_FRAMES, _MARGIN_FRAMES = 2000, 200  # frames solved together, and additional ones at either end
 _ROUNDS: Final = 5  # Gauss-Newton steps
-_QUICKER, _TIMES_QUICKER = 10.0, 4  # factor of the accelerations of quick hands, and how often at most
-_COUNTED: Final = 8  # Every eighth frame tells how many coordinates of markers a pose can follow.
+# Quick hands raise the acceleration by this factor, this often at most.
+_ACCELERATION_FACTOR, _MOST_RAISES = 10.0, 4
+_COUNTED_STRIDE: Final = 8  # One frame in eight shows how many coordinates of markers a pose can follow.
 _LEAST_FREEDOM: Final = 0.1  # lower bound of the share of marker coordinates that a pose cannot follow
 _LONGEST_STEP: Final = 0.5  # [rad], [m] bound of each step
 _FIRST_NOISE, _LEAST_NOISE = 0.0015, 0.0001  # [m] standard deviation of markers: first value, lower bound
-_FROM_BIAS: Final = 1.4  # ratio of a marker's place error to its mean residual: poses absorb half of it
-_OUTLIER: Final = 0.01  # [m] scale of the robust loss (Geman and McClure 1987)
+_ERROR_PER_BIAS: Final = 1.4  # ratio of a marker's place error to its mean residual, as poses absorb a part
+_OUTLIER_DISTANCE: Final = 0.01  # [m] scale of the robust loss (Geman and McClure 1987)
 # Permutations between a step's unknowns (joints, wrist position and rotation) and MuJoCo's order.
 _TO_MUJOCO: Final = np.r_[NUM_JOINTS:NUM_UNKNOWNS, 0:NUM_JOINTS]
 _FROM_MUJOCO: Final = np.argsort(_TO_MUJOCO)
@@ -126,7 +128,7 @@ def _budget(variances: Float[np.ndarray, "T K 5"]) -> list[list[float]]:
 
 
 def spread_model(take: Take, hand: GloveFit) -> SpreadModel:
-    """Model of the standard deviations of a take's hand, given what the settings record of the user."""
+    """Model of the standard deviations of a take's hand, from the user that the settings record."""
     errors = read_errors(take.settings.get("errors", {}), take.hands)
     origin = hand_origin(str(take.settings.get("user", "")), hand.side)
     return SpreadModel(hand, origin, errors.get(hand.side))
@@ -140,15 +142,15 @@ def times_unseen(times: Float[np.ndarray, "T"], seen: Bool[np.ndarray, "T M"]) -
 
 
 def _windows(status: Int[np.ndarray, "T"]) -> list[_Window]:
-    """The windows of a hand; none spans a frame in which the hand is initialized."""
+    """The windows of a hand; a window starts anew where the hand is initialized."""
     windows = []
     for first, last in runs_of(status != LOST):
         begins = first + np.flatnonzero(status[first : last + 1] == INITIALIZED)
         bounds = np.unique([first, *begins, last + 1])
         for start, stop in pairwise(bounds.tolist()):
-            for kept in range(start, stop, _WINDOW):
-                end = min(kept + _WINDOW, stop)
-                frames = slice(max(kept - _MARGIN, start), min(end + _MARGIN, stop))
+            for kept in range(start, stop, _WINDOW_FRAMES):
+                end = min(kept + _WINDOW_FRAMES, stop)
+                frames = slice(max(kept - _MARGIN_FRAMES, start), min(end + _MARGIN_FRAMES, stop))
                 windows.append(_Window(frames, slice(kept, end)))
     return windows
 
@@ -169,34 +171,35 @@ class _SmoothedHand:
         spans, seen = self._hand.hinge_span, np.isfinite(self._targets[..., 0]).any(axis=0)
         joints = np.arange(NUM_JOINTS)[:, None]
         # Whether each joint moves a marker that is seen.
-        self._shown = ((spans[:, 0] <= joints) & (joints < spans[:, 1]) & seen).any(axis=1)
+        self._moves_seen = ((spans[:, 0] <= joints) & (joints < spans[:, 1]) & seen).any(axis=1)
         known = take.settings.get("known", {})
         names = [(f"{worn.side}:{name}", name) for name in JOINT_NAMES]
         self._known = np.deg2rad([known.get(one, known.get(each, np.nan)) for one, each in names])
-        self._accelerations = _ACCELERATIONS
-        self._sure = np.diag(np.isfinite(self._known) / _KNOWN**2)  # precision of known angles [1/rad^2]
-        # A digit with a known angle is not as digits usually are.
-        self._stiff = np.isfinite(self._known).reshape(len(DIGITS), -1).any(axis=1).repeat(4) & self._shown
-        # Coordinates of the markers that are seen in a frame, and how many of them the pose can follow.
+        self._accelerations = _ACCELERATION_DENSITY
+        # precision of known angles [1/rad^2]
+        self._known_precision = np.diag(np.isfinite(self._known) / _KNOWN_ANGLE_SPREAD**2)
+        # The prior of usual angles does not hold for a digit with a known angle.
+        has_known = np.isfinite(self._known).reshape(len(DIGITS), -1).any(axis=1).repeat(4)
+        self._unusual = has_known & self._moves_seen
+        # Number of seen marker coordinates of each frame, and how many of them the pose can follow.
         self._coordinates = np.zeros((take.num_frames, 2))
-        self._begin()
+        self._reset_noise()
 
-    def _begin(self) -> None:
-        """Know nothing yet of what the residuals show."""
-        self._prior = self._prior_of(self._stiff)
-        # Standard deviations [m] of noise, of slow motion that residuals show, and of the flesh behind it.
-        self._noise, self._slow, self._flesh = _FIRST_NOISE, 0.0, 0.0
+    def _reset_noise(self) -> None:
+        """Forget all that residuals have shown."""
+        self._prior = self._prior_of(self._unusual)
+        # Standard deviations [m] of noise, of the slow motion in the residuals, and of the flesh that causes
+        # it.
+        self._noise, self._drift, self._flesh = _FIRST_NOISE, 0.0, 0.0
         self._places = np.zeros((len(self._hand.digits), 2))  # RMS error along the skin, off it [m]
 
-    def solve(
-        self, windows: Sequence[_Window]
-    ) -> tuple[Float[np.ndarray, "20"], Float[np.ndarray, "T 26 5"]]:
-        """Solve all poses; return the cut-off of each angle [Hz] and the unknowns' variances by `SOURCES`."""
-        self._follow(windows)
-        cutoffs, wide = [], self._prior_of(self._shown)
+    def solve(self, windows: Sequence[_Window]) -> tuple[Doubles, Doubles]:
+        """Solve all poses; return the angles' cut-offs (20,) [Hz], and all variances (T, 26, 5) by source."""
+        self._solve_poses(windows)
+        cutoffs, wide = [], self._prior_of(self._moves_seen)
         parts = np.full((len(self.qpos), NUM_UNKNOWNS, len(SOURCES)), np.nan)
-        # Of a joint that does not move a calibration finds no more than measuring does.
-        still, models = np.flatnonzero(are_still(self._angles()) & self._shown), [self.model]
+        # A calibration knows no more of a joint that does not move than a measurement does.
+        still, models = np.flatnonzero(are_still(self._angles()) & self._moves_seen), [self.model]
         if len(still) and self.model.is_calibrated:
             models.append(SpreadModel(self._worn, "measured"))
         for window in windows:
@@ -205,9 +208,9 @@ class _SmoothedHand:
             kept, inner = window.kept, window.inner
             equations[0][:, :NUM_JOINTS, :NUM_JOINTS] += wide - self._prior
             alone = np.linalg.inv(equations[0])[inner]
-            # Errors of the prior and of known angles are alike in successive frames.
+            # Errors of the prior and of known angles are equal in successive frames.
             by_hinges = alone[:, :, :NUM_JOINTS]
-            same = by_hinges @ (self._share * wide + self._sure) @ by_hinges.swapaxes(1, 2)
+            same = by_hinges @ (self._prior_weight * wide + self._known_precision) @ by_hinges.swapaxes(1, 2)
             (variances, self.keypoints[kept]), *measured = (
                 model.variances(
                     self.qpos[kept],
@@ -216,37 +219,37 @@ class _SmoothedHand:
                     self._flesh,
                     self._places,
                     covariances[inner] + same,
-                    wide + self._sure,
+                    wide + self._known_precision,
                 )
                 for model in models
             )
             for other, _ in measured:
                 variances[:, still] = np.maximum(variances, other)[:, still]
             self.angles[kept] = np.sqrt(variances[:, :NUM_JOINTS].sum(axis=-1))
-            # How far the prior pulls an unknown stays the same, as the person does.
+            # The error by the prior belongs to the person, so it moves from noise to that source.
             pulled = same.diagonal(axis1=1, axis2=2)
             parts[kept] = variances + pulled[..., None] * [-1.0, 0.0, 0.0, 1.0, 0.0]
             spreads = alone[:, range(NUM_JOINTS), range(NUM_JOINTS)]
             cutoffs.append((self._accelerations[:NUM_JOINTS] * self._rate / spreads) ** 0.25 / (2.0 * np.pi))
         return np.median(np.concatenate(cutoffs), axis=0), parts
 
-    def _follow(self, windows: Sequence[_Window]) -> None:
-        """Solve the poses, and again with larger accelerations while they do not follow the hand.
+    def _solve_poses(self, windows: Sequence[_Window]) -> None:
+        """Solve the poses, and again with larger accelerations while they lag behind the hand.
 
-        Residuals of poses of single frames are the markers' noise, less the share that a pose follows.
-        Smoothed poses with larger residuals lag behind the hand; their lag would count as noise, and grow.
+        Residuals of single-frame poses are the markers' noise, less the share that a pose follows. Smoothed
+        poses with larger residuals lag behind the hand; their lag would count as noise, and grow.
         """
         single, left = self.qpos.copy(), np.nanmean(self.rms() ** 2)
-        for turn in range(_TIMES_QUICKER + 1):
+        for turn in range(_MOST_RAISES + 1):
             for _ in range(_ROUNDS):
                 for window in windows:
                     self._step(window, self._equations(window))
                 self._estimate_noise()
-                self._prior = self._prior_of(self._stiff)
-            if not np.nanmean(self.rms() ** 2) * self._freedom > left or turn == _TIMES_QUICKER:
+                self._prior = self._prior_of(self._unusual)
+            if not np.nanmean(self.rms() ** 2) * self._freedom > left or turn == _MOST_RAISES:
                 return
-            self.qpos, self._accelerations = single.copy(), _QUICKER * self._accelerations
-            self._begin()
+            self.qpos, self._accelerations = single.copy(), _ACCELERATION_FACTOR * self._accelerations
+            self._reset_noise()
 
     @property
     def _freedom(self) -> float:
@@ -264,9 +267,9 @@ class _SmoothedHand:
         return np.asarray(np.sqrt(squares.sum(axis=1, where=seen) / count))
 
     @property
-    def _share(self) -> float:
+    def _prior_weight(self) -> float:
         """Weight of the prior of joint angles in one frame."""
-        return min(1.0, _GESTURES / self._rate)
+        return min(1.0, _PRIOR_RATE / self._rate)
 
     def _angles(self) -> Float[np.ndarray, "F 20"]:
         """The joint angles of the frames with a pose [rad]."""
@@ -275,48 +278,47 @@ class _SmoothedHand:
     def _prior_of(self, joints: Bool[np.ndarray, "20"]) -> Float[np.ndarray, "20 20"]:
         """Precision of the prior of the joint angles in one frame [1/rad^2].
 
-        The prior says nothing of those of the given joints that do not move.
+        It is weak for those of the given joints that do not move.
         """
-        own = own_variances(self._angles()) * joints
-        return np.asarray(self._share * np.linalg.inv(resting_prior().covariance + np.diag(own)))
+        own = usual_angle_variances(self._angles()) * joints
+        return np.asarray(self._prior_weight * np.linalg.inv(resting_prior().covariance + np.diag(own)))
 
     @property
     def _weight_noise(self) -> float:
-        """Noise and slow motion together [m], which weight a marker.
+        """Standard deviation that weights a marker [m]: noise and slow motion together.
 
-        Of gloves with few markers this is more than noise and flesh: the wrong place of a marker misleads a
-        pose most there, and the prior makes up for that.
+        For gloves with few markers it is larger than noise and flesh. There a misplaced marker misleads a
+        pose most, so the prior counts more.
         """
-        slow = np.sqrt(3.0) * self._slow * freedom_factor(len(self._places))
+        slow = np.sqrt(3.0) * self._drift * freedom_factor(len(self._places))
         return float(np.hypot(self._noise, slow))
 
-    def _equations(self, window: _Window) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _equations(self, window: _Window) -> tuple[Doubles, Doubles]:
         """Normal matrices (F, 26, 26) and gradients (F, 26) of single frames."""
         qpos, prior = self.qpos[window.frames], self._prior
         normal, gradient, self._residuals[window.frames] = _frame_equations(
-            self._hand, self._targets[window.frames], qpos, self._weight_noise**-2, _OUTLIER**-2
+            self._hand, self._targets[window.frames], qpos, self._weight_noise**-2, _OUTLIER_DISTANCE**-2
         )
-        markers = normal[::_COUNTED].copy()
-        normal[:, :NUM_JOINTS, :NUM_JOINTS] += prior + self._sure
-        normal += np.diag(_WEAK)
-        self._count(slice(window.frames.start, window.frames.stop, _COUNTED), markers, normal[::_COUNTED])
+        markers = normal[::_COUNTED_STRIDE].copy()
+        normal[:, :NUM_JOINTS, :NUM_JOINTS] += prior + self._known_precision
+        normal += np.diag(_WRIST_PRECISION)
+        counted = slice(window.frames.start, window.frames.stop, _COUNTED_STRIDE)
+        self._count_fit(counted, markers, normal[::_COUNTED_STRIDE])
         gradient[:, :NUM_JOINTS] += (qpos[:, 7:] - resting_prior().angles) @ prior
-        gradient[:, :NUM_JOINTS] += np.nan_to_num(qpos[:, 7:] - self._known) @ self._sure
+        gradient[:, :NUM_JOINTS] += np.nan_to_num(qpos[:, 7:] - self._known) @ self._known_precision
         return normal, gradient
 
-    def _count(self, frames: slice, markers: NDArray[np.float64], whole: NDArray[np.float64]) -> None:
-        """Count coordinates; normal matrices are given by markers and limits alone, and with the prior."""
+    def _count_fit(self, frames: slice, markers: Doubles, whole: Doubles) -> None:
+        """Count coordinates, from the normal matrices by markers and limits alone, and with the prior."""
         angles, (low, high) = self.qpos[frames, 7:], self._hand.ranges.T
         hinges = np.arange(NUM_JOINTS)
         markers[:, hinges, hinges] -= LIMIT_PRECISION * ((angles < low) | (angles > high))
         self._coordinates[frames, 0] = 3 * np.isfinite(self._targets[frames, :, 0]).sum(axis=1)
         self._coordinates[frames, 1] = np.linalg.solve(whole, markers).trace(axis1=1, axis2=2)
 
-    def _step(
-        self, window: _Window, equations: tuple[NDArray[np.float64], NDArray[np.float64]]
-    ) -> NDArray[np.float64]:
+    def _step(self, window: _Window, equations: tuple[Doubles, Doubles]) -> Doubles:
         """Move the poses of a window by a Gauss-Newton step; return the covariances of its unknowns."""
-        # The wrist's position is solved in world axes, in which its acceleration is penalized.
+        # The wrist's position is solved in world axes, because its acceleration is penalized there.
         normal, gradient = equations[0].copy(), equations[1].copy()
         qpos = self.qpos[window.frames]
         turns = np.tile(np.eye(NUM_UNKNOWNS), (len(qpos), 1, 1))
@@ -344,19 +346,19 @@ class _SmoothedHand:
         changes = np.diff(residuals, axis=0)
         noise = _spread(changes[seen[1:] & seen[:-1]]) / np.sqrt(2.0)
         self._noise = max(noise, _LEAST_NOISE)
-        self._slow = float(np.sqrt(max(_spread((residuals - bias)[seen]) ** 2 - noise**2, 0.0)))
-        # Residuals show flesh only in the coordinates that poses cannot follow.
-        self._flesh = self._slow / float(np.sqrt(self._freedom))
+        self._drift = float(np.sqrt(max(_spread((residuals - bias)[seen]) ** 2 - noise**2, 0.0)))
+        # Residuals contain flesh only in the coordinates that poses cannot follow.
+        self._flesh = self._drift / float(np.sqrt(self._freedom))
         lifts = (bias * self._hand.normals).sum(axis=1)
         slips = np.sqrt(np.maximum((bias**2).sum(axis=1) - lifts**2, 0.0) / 2.0)
         for part in (self._hand.digits < 0, self._hand.digits >= 0):
             shown = part & seen.any(axis=0)
-            self._places[part] = [_FROM_BIAS * _spread(of[shown]) for of in (slips, lifts)]
+            self._places[part] = [_ERROR_PER_BIAS * _spread(of[shown]) for of in (slips, lifts)]
 
 
-def _spread(values: NDArray[np.float64]) -> float:
+def _spread(values: Doubles) -> float:
     """Standard deviation of values around zero [m], without outliers."""
-    near = values[np.abs(values) < _OUTLIER]
+    near = values[np.abs(values) < _OUTLIER_DISTANCE]
     return float(np.sqrt(np.mean(near**2))) if len(near) else 0.0
 
 
@@ -367,7 +369,7 @@ def _frame_equations(
     qpos: Float[np.ndarray, "T 27"],
     precision: float,
     robust_scale: float,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[Doubles, Doubles, Doubles]:
     """Normal matrices, gradients and residuals (in the bones' frames) of each frame."""
     frames, count = targets.shape[:2]
     normal, gradient = np.zeros((frames, NUM_UNKNOWNS, NUM_UNKNOWNS)), np.zeros((frames, NUM_UNKNOWNS))
@@ -401,7 +403,7 @@ def _solve_in_time(
     normal: Float[np.ndarray, "T U U"], gradient: Float[np.ndarray, "T U"], precision: Float[np.ndarray, "U"]
 ) -> tuple[Float[np.ndarray, "T U"], Float[np.ndarray, "T U U"]]:
     """Solve frames coupled by second differences of a given precision; also return their covariances."""
-    # Pairs of frames form the blocks of a block tridiagonal system: eliminate forward, then substitute.
+    # Pairs of frames are the blocks of a block tridiagonal system: eliminate forward, then substitute.
     count, size = gradient.shape
     pairs = (count + 1) // 2
     connected = np.zeros((3, 2 * pairs))  # coefficient of two frames by their distance, stored at the first

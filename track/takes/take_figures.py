@@ -13,20 +13,20 @@ from gloves.captures.capture import runs_of
 from gloves.takes.take import INITIALIZED, LOST, Take
 from handsim.hand.shape import JOINTS, Side
 from track.kinematics.pose_spread import CHANGING, DETECTABLE, SOURCES, measurement_error
-from track.takes.take_faults import AT_LIMIT
+from track.takes.take_faults import AT_LIMIT_DEG
 from track.takes.trials import Cycles, cycles_of
 from track.user import hand_origin
 
 CONSTANT: Final = [SOURCES.index("gluing"), SOURCES.index("person")]
-"""Sources of an error that is the same in all frames of a session."""
+"""Sources whose error is equal in all frames of a session."""
 RANGE: Final = {"least": 0.0, "5th": 5.0, "median": 50.0, "95th": 95.0, "largest": 100.0}
 """Columns of a range of motion, and the percentile of each."""
-_CHUNK: Final = 4096  # frames per call of forward kinematics
+_FRAMES_PER_CALL: Final = 4096  # frames per call of forward kinematics
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PageSettings:
-    """What a page and its tables are to show of a take."""
+    """What a page and its tables show of a take."""
 
     person: str = ""
     session: str = ""
@@ -89,17 +89,17 @@ class HandFigures:
         return [[last - first + 1 for first, last in runs_of(column)] for column in hidden.T]
 
     def joints(self) -> Float[np.ndarray, "20 9"]:
-        """Each angle's `RANGE` where measured, median SD [deg], shares at a limit, measured, longest gap."""
+        """Each angle's measured `RANGE`, median SD [deg], shares at a limit and measured, longest gap."""
         found, measured = np.full((len(JOINTS), len(RANGE) + 4), np.nan), self.measured
-        for row, angles, told in zip(found, self.angles.T, measured.T, strict=True):
-            if told.any():
-                row[: len(RANGE)] = np.percentile(angles[told], list(RANGE.values()))
+        for row, angles, frames in zip(found, self.angles.T, measured.T, strict=True):
+            if frames.any():
+                row[: len(RANGE)] = np.percentile(angles[frames], list(RANGE.values()))
         if self.fitted.any():
             if self.angle_spread is not None:
                 found[:, -4] = np.median(self.angle_spread[self.fitted], axis=0)
             low, high = np.array([(joint.low, joint.high) for joint in JOINTS]).T
             angles = self.angles[self.fitted]
-            found[:, -3] = ((angles < low + AT_LIMIT) | (angles > high - AT_LIMIT)).mean(axis=0)
+            found[:, -3] = ((angles < low + AT_LIMIT_DEG) | (angles > high - AT_LIMIT_DEG)).mean(axis=0)
         found[:, -2] = measured.mean(axis=0)
         found[:, -1] = [max(gaps, default=0) for gaps in self.gaps(measured)]
         return found
@@ -151,8 +151,8 @@ def hand_figures(take: Take, *, guesses: bool = False) -> tuple[HandFigures, ...
         observed = take.observed(hand.side)
         for span, worn in take.worn():
             posed = span.start + np.flatnonzero(there[span])
-            for first in range(0, len(posed), _CHUNK):
-                part = posed[first : first + _CHUNK]
+            for first in range(0, len(posed), _FRAMES_PER_CALL):
+                part = posed[first : first + _FRAMES_PER_CALL]
                 expected, _ = worn[number].markers(take.qpos[part, number])
                 residuals[part] = np.linalg.norm(observed[part] - expected, axis=2)
         spread = None if take.angle_spread is None else np.rad2deg(take.angle_spread[:, number])
@@ -205,13 +205,12 @@ def joint_errors(settings: Mapping[str, Any], hand: HandFigures) -> Float[np.nda
     origin = hand_origin(str(settings.get("user", "")), hand.side)
     budget = np.pad(budget, ((0, 0), (0, len(SOURCES) - len(budget[0]))))  # Older takes have no palm.
     errors = np.transpose([measurement_error(budget, origin, measure) for measure in CHANGING])
-    return np.column_stack(
-        [np.linalg.norm(budget, axis=1), budget, errors[:, 0], DETECTABLE * errors, cutoffs]
-    )
+    spreads = np.linalg.norm(budget, axis=1)
+    return np.column_stack([spreads, budget, errors[:, 0], DETECTABLE * errors, cutoffs])
 
 
 def cycles_of_hands(take: Take, hands: Sequence[HandFigures], settings: PageSettings) -> list[Cycles]:
-    """The cycles of each hand, if they are asked for."""
+    """The cycles of each hand; none if the settings ask for none."""
     joint = settings.cycles
     if joint is None:
         return []

@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float, Int
 from gloves.captures.capture import runs_of
 from gloves.takes.take import COASTING, LOST, Take
 from handsim._checks import check_choice
+from handsim.arrays import Doubles
 from handsim.files.outputs import check_ending, written_together
 from handsim.hand.angles import WRIST_NAMES
 from handsim.hand.shape import DIGITS, JOINT_NAMES, JOINTS, Side
@@ -45,13 +46,13 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_WANTED: Final = 0.99  # share of right frames for which the page gives a number of looks
+_WANTED: Final = 0.99  # share of right frames for which the page gives a number of spans to look at
 _MOST_SPANS: Final = 100  # rows of the page's table of doubtful spans
-_BINS: Final = 750  # bins of a long take's curve, which shows the extremes of each
-_SHOWN_SPAN: Final = 0.5  # [s] Hands of fewer frames are steps from one size to another.
+_MOST_BINS: Final = 750  # largest number of bins of a curve, which shows the extremes of each bin
+_SHOWN_SPAN: Final = 0.5  # [s] Hands worn for a shorter time are steps from one size to another.
 _STROKES: Final = (Paint.VIOLET, Paint.BLUE, Paint.WARM, Paint.GREEN)
 """Colors of a digit's joints, from proximal to distal."""
-_COASTING: Final = "#efd9c9"
+_COASTING_COLOR: Final = "#efd9c9"
 _SHADES: Final = "Gray: the hand is lost and has no pose. Orange: it coasts, its pose is predicted."
 _BANDS: Final = "The bands say how far off each joint angle may be; with a calibrated hand they are narrower."
 _CALIBRATE: Final = (
@@ -118,7 +119,7 @@ def _lead(take: Take) -> str:
 
 
 def _summary_section(take: Take) -> Section:
-    told = suspicions(take) if take.made_by_tracker else []
+    warnings = suspicions(take) if take.made_by_tracker else []
     items = html_list([line[0].upper() + line[1:] for line in summarize(take)], "ul")
     kind = (
         "Found: the frame in which a hand is initialized. Tracked: its pose follows from the frame before. "
@@ -126,11 +127,11 @@ def _summary_section(take: Take) -> Section:
         if take.made_by_tracker
         else "The take is not of a tracker: its poses and labels are what was simulated or given."
     )
-    return Section("The take", f"{kind}{items}", notes=told)
+    return Section("The take", f"{kind}{items}", notes=warnings)
 
 
 def _calibration_section(take: Take) -> Section:
-    """Whether the hands are calibrated, and what that means for the angles, as HTML."""
+    """Say as HTML whether the hands are calibrated, and what that means for the angles."""
     notes = str(take.settings.get("user", ""))
     if not take.made_by_tracker:
         text = "The hands are those that the take was made with: there is nothing to calibrate."
@@ -144,12 +145,12 @@ def _calibration_section(take: Take) -> Section:
         text = "The hands were given, and the take does not say whether they are calibrated. "
         text += _BANDS
     if take.former:
-        text += f" They changed while the take was recorded:{html_list(_changes(take), 'ul')}"
+        text += f" They changed while the take was recorded:{html_list(_changes_of_hands(take), 'ul')}"
     return Section("Calibration", text)
 
 
-def _changes(take: Take) -> list[str]:
-    """From when to when which hands were tracked, without steps from one size to the next."""
+def _changes_of_hands(take: Take) -> list[str]:
+    """The hands that were tracked and their times, without steps from one size to the next."""
     notes = [*(one.notes for one in take.former), str(take.settings.get("user", ""))]
     stops = [*(one.stop for one in take.former), take.num_frames]
     firsts = [0, *stops[:-1]]
@@ -197,7 +198,7 @@ def _draw_angles(figure: Figure, times: Float[np.ndarray, "T"], hand: HandFigure
     spread = None if hand.angle_spread is None else hand.angle_spread.reshape(shape)
     names = np.reshape([joint.split("_", 1)[1].replace("_", " ") for joint in JOINT_NAMES], angles.shape[1:])
     for number, (digit, panel) in enumerate(zip(DIGITS, panels, strict=True)):
-        _prepare(panel, times, hand.status)
+        _prepare_panel(panel, times, hand.status)
         panel.axhline(0.0, color=Paint.LINE, linewidth=0.8)
         bands = None if spread is None else spread[:, number]
         _draw_curves(panel, times, names[number], angles[:, number], bands)
@@ -256,11 +257,9 @@ def _wrist_section(take: Take, hand: HandFigures, settings: PageSettings) -> Sec
     return Section(title, text, pictures=[(curves, _SHADES)], table=table)
 
 
-def _draw_wrist(
-    figure: Figure, times: Float[np.ndarray, "T"], hand: HandFigures, wrist: WristFigures
-) -> None:
+def _draw_wrist(figure: Figure, times: Doubles, hand: HandFigures, wrist: WristFigures) -> None:
     panel = figure.subplots()
-    _prepare(panel, times, hand.status)
+    _prepare_panel(panel, times, hand.status)
     panel.axhline(0.0, color=Paint.LINE, linewidth=0.8)
     told = np.flatnonzero(wrist.measured.any(axis=0))
     names = [WRIST_NAMES[number].split("_", 1)[1].replace("_", " ") for number in told.tolist()]
@@ -344,7 +343,7 @@ def _draw_presence(figure: Figure, times: Float[np.ndarray, "T"], hand: HandFigu
     starts, ends = _bins(len(times))
     share = np.add.reduceat(hand.seen, starts, axis=0, dtype=np.float64) / (ends - starts)[:, None]
     colors = LinearSegmentedColormap.from_list("seen", (Paint.CARD, Paint.BLUE))
-    edges = np.append(times[starts], _end(times))
+    edges = np.append(times[starts], _end_time(times))
     rows = np.arange(share.shape[1] + 1)
     panel.pcolormesh(edges, rows, share.T, cmap=colors, vmin=0.0, vmax=1.0, rasterized=True)
     panel.hlines(rows[1:-1], edges[0], edges[-1], color=Paint.CARD, linewidth=1.5)
@@ -357,18 +356,18 @@ def _draw_presence(figure: Figure, times: Float[np.ndarray, "T"], hand: HandFigu
 
 def _draw_residuals(figure: Figure, times: Float[np.ndarray, "T"], hand: HandFigures) -> None:
     panel = figure.subplots()
-    _prepare(panel, times, hand.status)
+    _prepare_panel(panel, times, hand.status)
     panel.plot(*decimated(times, 1e3 * hand.rms), color=Paint.BLUE, linewidth=1.1)
     panel.set_ylim(bottom=0.0)
     panel.set_ylabel("RMS [mm]")
     panel.set_xlabel("time [s]")
 
 
-def _prepare(panel: Axes, times: Float[np.ndarray, "T"], status: Int[np.ndarray, "T"]) -> None:
+def _prepare_panel(panel: Axes, times: Float[np.ndarray, "T"], status: Int[np.ndarray, "T"]) -> None:
     """Set grid and limits of a panel, and shade the frames in which the hand is lost or coasts."""
     panel.grid(axis="y", color=Paint.BAND, linewidth=0.8)
-    panel.set_xlim(times[0], _end(times))
-    for state, color in ((COASTING, _COASTING), (LOST, Paint.LINE)):
+    panel.set_xlim(times[0], _end_time(times))
+    for state, color in ((COASTING, _COASTING_COLOR), (LOST, Paint.LINE)):
         spans, across = shaded(times, status == state), panel.get_xaxis_transform()
         panel.broken_barh(spans, (0.0, 1.0), transform=across, facecolors=color, linewidth=0.0)
     panel.tick_params(labelcolor=Paint.SOFT)
@@ -389,19 +388,19 @@ def decimated(
 def shaded(times: Float[np.ndarray, "T"], flags: Bool[np.ndarray, "T"]) -> list[tuple[float, float]]:
     """Begin and length of the runs of flagged frames [s], rounded up to whole bins."""
     starts, ends = _bins(len(times))
-    edges = np.append(times, _end(times))
+    edges = np.append(times, _end_time(times))
     runs = runs_of(np.logical_or.reduceat(flags, starts))
     return [(float(edges[starts[a]]), float(edges[ends[b]] - edges[starts[a]])) for a, b in runs]
 
 
 def _bins(num_frames: int) -> tuple[Int[np.ndarray, "K"], Int[np.ndarray, "K"]]:
     """First frame of each bin, and the frame after its last; one bin per frame of a short take."""
-    width = 1 if num_frames <= 2 * _BINS else -(-num_frames // _BINS)
+    width = 1 if num_frames <= 2 * _MOST_BINS else -(-num_frames // _MOST_BINS)
     starts = np.arange(0, num_frames, width)
     return starts, np.append(starts[1:], num_frames)
 
 
-def _end(times: Float[np.ndarray, "T"]) -> float:
+def _end_time(times: Float[np.ndarray, "T"]) -> float:
     """End of the last frame [s], which lasts as long as the one before."""
     return float(2.0 * times[-1] - times[-2]) if len(times) > 1 else float(times[-1]) + 1.0
 
@@ -443,9 +442,7 @@ def _methods_section(take: Take, spans: Sequence[SuspectSpan], settings: PageSet
 def _cycles_section(side: Side, cycles: Cycles, settings: PageSettings) -> Section:
     """Mean and standard deviation of the angles over the cycles, as curves and in numbers."""
     title, joint = f"{side.capitalize()} hand: cycles", str(settings.cycles).replace("_", " ")
-    text = (
-        f"A cycle is from one least angle of {joint} to the next, if it bends by half of its range between."
-    )
+    text = f"A cycle lasts from one least angle of {joint} to the next, if it bends by half its range."
     if not cycles.spans:
         return Section(title, f"{text} There is none.")
     table = [["joint", "cycles", *(f"{name}: mean, SD" for name in FIGURES)]]

@@ -18,24 +18,25 @@ from track.hand_size import AT_HAND
 from track.takes.label_confidence import evidence_of, label_confidence
 from track.takes.take_faults import SuspectSpan, find_faults
 
-_LEAST_SEEN: Final = 0.1  # A hand should have a pose in this share of the frames.
-_MOST_FILLED: Final = 0.35  # share of filled-in markers; two hands that hide each other reach 0.31
+_LEAST_POSE_SHARE: Final = 0.1  # A hand should have a pose in this share of the frames.
+_MOST_FILLED_SHARE: Final = 0.35  # share of filled-in markers; two hands that hide each other reach 0.31
 _MOST_RMS: Final = 0.005  # [m]; hands of the nearest size reach 0.004
-_MOST_UNLABELED: Final = 0.25  # share of the points at the hands
-_MANY_FAR: Final = 0.05  # Unlabeled points away from the hands are mentioned from this share on.
-# Frames whose points all have at least this confidence need no look. A limit of 0.87 would list a third more
-# frames and hardly cover more errors. A limit of 0.7, or leaving out short spans, would miss more errors.
-_CERTAIN: Final = 0.8
-_APART: Final = 0.05  # [s] Spans closer together are joined.
-_MOST_DOUBTS: Final = 12  # rows of a list to be read at a glance
-# Of 44 takes of other people, rigs, gloves and noise, two had more wrong frames among those not listed than
-# this factor times the sum of their mean doubt and a minimum: a 95 % bound for the next take (split conformal
-# prediction). With few markers, many listed frames or many unlabeled points there is no useful bound.
-_VOUCH_FACTOR: Final = 2.8
-_VOUCH_LEAST: Final = 0.002
-_VOUCH_LISTED: Final = 0.25  # largest share of listed frames
-_VOUCH_MARKERS: Final = 12  # least number of the glove's markers
-_VOUCH_UNLABELED: Final = 0.15  # largest share of unlabeled points at the hands
+_MOST_UNLABELED_SHARE: Final = 0.25  # share of the points at the hands
+_FAR_SHARE: Final = 0.05  # Unlabeled points away from the hands are mentioned from this share on.
+# Frames whose points all have at least this confidence are not listed. A limit of 0.87 would list a third
+# more frames and find hardly more errors. A limit of 0.7, or leaving out short spans, would miss more errors.
+_CERTAIN_CONFIDENCE: Final = 0.8
+_JOINING_GAP: Final = 0.05  # [s] Spans closer together are joined.
+_MOST_SPANS: Final = 12  # number of listed spans, few enough to read at a glance
+# A bound of the wrong frames among those not listed is this factor times the sum of their mean doubt and a
+# minimum. Two of 44 takes of other people, rigs, gloves and noise exceeded it, so it holds for the next take
+# with 95 % (split conformal prediction). With few markers, many listed frames or many unlabeled points it is
+# useless.
+_WRONG_FACTOR: Final = 2.8
+_LEAST_DOUBT: Final = 0.002
+_MOST_LISTED: Final = 0.25  # largest share of listed frames
+_FEWEST_MARKERS: Final = 12  # least number of the glove's markers
+_MOST_VOUCHED_UNLABELED: Final = 0.15  # largest share of unlabeled points at the hands
 
 
 class Vouch(NamedTuple):
@@ -49,7 +50,7 @@ class Vouch(NamedTuple):
     """Expected share of right frames after looking at the first 0, 1, 2, ... listed spans."""
 
     def looks(self, share: float) -> int | None:
-        """Number of spans to look at, in order, for a share of right frames; None if all are too few."""
+        """Number of first spans to look at for a share of right frames; None if looking at all is too few."""
         return next((count for count, one in enumerate(self.after) if one >= share), None)
 
     def __str__(self) -> str:
@@ -89,19 +90,17 @@ def summarize(take: Take) -> list[str]:
     count, foreign = len(take.point_list.labels), int((take.point_list.labels < 0).sum())
     line = f"{foreign} of {count} points are not markers"
     near = _unlabeled_at_hands(take)
-    if foreign - near > _MANY_FAR * count:
+    if foreign - near > _FAR_SHARE * count:
         line += f", {near} of them at the hands"
     return [*lines, line]
 
 
 def _guesses(worn: Attachment, shown: Bool[np.ndarray, "20"]) -> Iterator[str]:
-    """One sentence for each digit that has joints beyond which the glove has no marker, or none was seen."""
+    """One sentence for each digit with joints beyond which the glove has no marker, or none was seen."""
     worn_beyond, lacking = (each.reshape(len(DIGITS), -1) for each in (worn.beyond.any(axis=1), ~shown))
     for number, (digit, has, lacks) in enumerate(zip(DIGITS, worn_beyond, lacking, strict=True)):
-        owner, verb = (
-            digit if digit == "thumb" else f"{digit} finger",
-            "was seen" if has[lacks].any() else "is",
-        )
+        owner = digit if digit == "thumb" else f"{digit} finger"
+        verb = "was seen" if has[lacks].any() else "is"
         if lacks.all():
             yield f"no marker {verb} on the {owner}: its angles are guesses"
         elif lacks.any():
@@ -126,17 +125,17 @@ def suspicions(take: Take) -> list[str]:
     if fault is not None:
         return [f"{fault.found}, expected meters; set the unit of the stream to meters{fault.hint}"]
     faults = find_faults(take)
-    told = [f"{fault.words}; {fault.remedy}" for fault in faults if fault.last == take.num_frames - 1]
-    if others := len(faults) - len(told):
-        told.append(f"faults of the hands of earlier frames, which the report lists as doubtful: {others}")
-    return misfits(take) + told
+    lasting = [f"{fault.words}; {fault.remedy}" for fault in faults if fault.last == take.num_frames - 1]
+    if others := len(faults) - len(lasting):
+        lasting.append(f"faults of the hands of earlier frames, which the report lists as doubtful: {others}")
+    return misfits(take) + lasting
 
 
 def misfits(take: Take, *, calibrates: bool = False) -> list[str]:
     """Find signs that the tracked hands or their glove are not those of the capture."""
-    found = [sentence for side in take.sides for sentence in _suspicions_of(take, side, calibrates)]
+    found = [sentence for side in take.sides for sentence in _misfits_of(take, side, calibrates)]
     share = _unlabeled_share(take)
-    if share > _MOST_UNLABELED:
+    if share > _MOST_UNLABELED_SHARE:
         found.append(
             f"{100 * share:.1f} % of the points at the hands are not markers of what was tracked; name the "
             f"glove worn (--glove){'' if calibrates else ', rigid bodies (--body)'} and the hands (--hands) "
@@ -151,9 +150,9 @@ def _unlabeled_share(take: Take) -> float:
     return near / max(1, near + int((take.point_list.labels >= 0).sum()))
 
 
-@lru_cache(maxsize=1)  # The lines of a summary and its warnings ask one after the other.
+@lru_cache(maxsize=1)  # A summary and its warnings need the same number.
 def _unlabeled_at_hands(take: Take) -> int:
-    """Number of unlabeled points at the hands; those elsewhere are no sign of a mistake."""
+    """Number of unlabeled points at the hands; points elsewhere do not indicate a mistake."""
     markers = np.concatenate([take.markers(side) for side in take.sides], axis=1)
     points, near = take.point_list.without(take.point_list.labels >= 0), 0
     for frame in np.flatnonzero(points.counts):
@@ -164,12 +163,12 @@ def _unlabeled_at_hands(take: Take) -> int:
     return near
 
 
-def _suspicions_of(take: Take, side: Side, calibrates: bool) -> list[str]:
-    """Signs of a wrong setup of one hand."""
+def _misfits_of(take: Take, side: Side, calibrates: bool) -> list[str]:
+    """Signs that one hand or its glove is not that of the capture."""
     hand = take.hand_index(side)
     shown = take.status[:, hand] != LOST
-    if shown.mean() < _LEAST_SEEN:
-        if ((take.status != LOST).mean(axis=0) >= _LEAST_SEEN).any():
+    if shown.mean() < _LEAST_POSE_SHARE:
+        if ((take.status != LOST).mean(axis=0) >= _LEAST_POSE_SHARE).any():
             return []  # the other hand is there
         return [
             f"the {side} hand was seen in {100 * shown.mean():.1f} % of the frames; name the glove worn "
@@ -177,7 +176,7 @@ def _suspicions_of(take: Take, side: Side, calibrates: bool) -> list[str]:
         ]
     found = []
     filled, rms = float(take.filled(side)[shown].mean()), float(np.nanmedian(take.rms[:, hand]))
-    if filled > _MOST_FILLED:
+    if filled > _MOST_FILLED_SHARE:
         found.append(
             f"{100 * filled:.1f} % of the {side} hand's markers were not seen and are filled in from its "
             "pose; name the glove worn (--glove) and the hands that are in the capture (--hands)"
@@ -199,11 +198,11 @@ def _status_shares(status: Int[np.ndarray, "T"]) -> str:
 
 
 def _median_rms(rms: Float[np.ndarray, "T"]) -> list[str]:
-    """A part of a line; empty if no pose was fitted, as in simulated takes."""
+    """The median RMS for a line; empty if no pose was fitted, as in simulated takes."""
     return [f"median RMS {1e3 * np.nanmedian(rms):.2f} mm"] if np.isfinite(rms).any() else []
 
 
-def find_suspect_spans(take: Take, most: int | None = _MOST_DOUBTS) -> tuple[SuspectSpan, ...]:
+def find_suspect_spans(take: Take, most: int | None = _MOST_SPANS) -> tuple[SuspectSpan, ...]:
     """Faults of the take, then spans with probably wrong or missing labels, the most doubtful first.
 
     Args:
@@ -213,17 +212,17 @@ def find_suspect_spans(take: Take, most: int | None = _MOST_DOUBTS) -> tuple[Sus
     Returns:
         Spans of frames `first` to `last`, with the `worst` frame, what they concern, and why.
     """
-    evidence = evidence_of(take) if np.isfinite(take.qpos).any() and not _is_known(take) else None
+    evidence = evidence_of(take) if np.isfinite(take.qpos).any() and not _is_certain(take) else None
     points = take.point_list
-    confidence, markers = _confidence(take), points.labels.astype(np.int64)
+    confidence, markers = _known_confidence(take), points.labels.astype(np.int64)
     if evidence is not None:
         markers[evidence.points] = evidence.markers
     least = np.fmin(_least_in_frames(take, confidence), 1.0)
     found: list[tuple[float, SuspectSpan]] = []
-    for first, last in _joined(runs_of(least < _CERTAIN), _APART * take.rate):
+    for first, last in _join_runs(runs_of(least < _CERTAIN_CONFIDENCE), _JOINING_GAP * take.rate):
         worst = first + int(least[first : last + 1].argmin())
         point = points.of(worst).start + int(np.nanargmin(confidence[points.of(worst)]))
-        of, why = _words(take, worst, int(points.labels[point]), int(markers[point]))
+        of, why = _reason_for_doubt(take, worst, int(points.labels[point]), int(markers[point]))
         why += f", {100 * least[worst]:.0f} %"
         found.append((float((1.0 - least[first : last + 1]).sum()), SuspectSpan(first, last, worst, of, why)))
     found.sort(key=lambda entry: (-entry[0], entry[1].first))
@@ -238,15 +237,15 @@ def vouch(take: Take, spans: Sequence[SuspectSpan] | None = None) -> Vouch:
         part = slice(span.first, span.last + 1 if span.of_labels else span.first)
         masses.append(float(doubt[part][~listed[part]].sum()))
         listed[part] = True
-    few = take.hands[0].layout.num_markers < _VOUCH_MARKERS
-    if few or listed.mean() > _VOUCH_LISTED or _unlabeled_share(take) > _VOUCH_UNLABELED:
+    few = take.hands[0].layout.num_markers < _FEWEST_MARKERS
+    if few or listed.mean() > _MOST_LISTED or _unlabeled_share(take) > _MOST_VOUCHED_UNLABELED:
         return Vouch(float(listed.mean()), 0.0, ())
-    wrong = min(1.0, _VOUCH_FACTOR * (float(doubt[~listed].mean()) + _VOUCH_LEAST))
+    wrong = min(1.0, _WRONG_FACTOR * (float(doubt[~listed].mean()) + _LEAST_DOUBT))
     left = wrong * (~listed).sum() + sum(masses) - np.cumsum([0.0, *masses])
     return Vouch(float(listed.mean()), 1.0 - wrong, tuple((1.0 - left / take.num_frames).tolist()))
 
 
-def _joined(runs: Sequence[tuple[int, int]], apart: float) -> list[tuple[int, int]]:
+def _join_runs(runs: Sequence[tuple[int, int]], apart: float) -> list[tuple[int, int]]:
     """Join runs of frames that are less than `apart` frames from each other."""
     joined: list[tuple[int, int]] = []
     for first, last in runs:
@@ -257,8 +256,8 @@ def _joined(runs: Sequence[tuple[int, int]], apart: float) -> list[tuple[int, in
     return joined
 
 
-def _words(take: Take, frame: int, label: int, marker: int) -> tuple[str, str]:
-    """What a doubt concerns (a label, a marker that may lack it, or its hand), and why."""
+def _reason_for_doubt(take: Take, frame: int, label: int, marker: int) -> tuple[str, str]:
+    """Subject of a doubt (a label, a marker that may lack it, or its hand), and the reason."""
     if marker < 0:
         return "a point", "without a label"
     if label >= 0:
@@ -272,7 +271,7 @@ def _words(take: Take, frame: int, label: int, marker: int) -> tuple[str, str]:
 
 def frame_confidence(take: Take) -> Float[np.ndarray, "T"]:
     """The least confidence of each frame's points, labeled or not; NaN in frames without points."""
-    return _least_in_frames(take, _confidence(take))
+    return _least_in_frames(take, _known_confidence(take))
 
 
 def _least_in_frames(take: Take, confidence: Float[np.ndarray, "P"]) -> Float[np.ndarray, "T"]:
@@ -282,14 +281,14 @@ def _least_in_frames(take: Take, confidence: Float[np.ndarray, "P"]) -> Float[np
     return least
 
 
-def _confidence(take: Take) -> Float[np.ndarray, "P"]:
-    """Confidence from the whole take's evidence; confidences of 1 stay, as those of corrected labels."""
+def _known_confidence(take: Take) -> Float[np.ndarray, "P"]:
+    """Confidence by the whole take's evidence; a confidence of 1, as of a corrected label, stays."""
     confidence = take.point_list.confidence
-    if _is_known(take):
+    if _is_certain(take):
         return confidence
     return np.where(confidence == 1.0, 1.0, label_confidence(take))
 
 
-def _is_known(take: Take) -> bool:
+def _is_certain(take: Take) -> bool:
     """Whether every label is certain, as in a simulated take."""
     return bool((take.point_list.confidence == 1.0).all())

@@ -19,33 +19,28 @@ from handsim.hand.shape import JOINT_NAMES, JOINTS
 from track.kinematics.pose_spread import CHANGING, SOURCES
 from track.takes.methods import made_of
 from track.takes.take_faults import SuspectSpan
-from track.takes.take_figures import (
-    CONSTANT,
-    RANGE,
-    HandFigures,
-    PageSettings,
-    joint_errors,
-    wrist_figures,
-)
+from track.takes.take_figures import CONSTANT, RANGE, HandFigures, PageSettings, joint_errors, wrist_figures
 from track.takes.trials import FIGURES, PERCENTS, Cycles, mean_and_spread, thumb_reach
 
-_TABLES: Final = (".frames.csv", ".joints.csv", ".markers.csv", ".doubts.csv", ".reach.csv", ".angles.csv")
-_CYCLES: Final = ".cycles.csv"
-_RECORD: Final = "made of"
-"""Last column of all tables: version, date and checksums of the take; in its first row, in a study in all."""
+_ENDINGS: Final = (".frames.csv", ".joints.csv", ".markers.csv", ".doubts.csv", ".reach.csv", ".angles.csv")
+_CYCLE_ENDING: Final = ".cycles.csv"
+_RECORD_COLUMN: Final = "made of"
+"""Last column of all tables: version, date and checksums of the take, in the first row or in all of a
+study."""
 _WORDS: Final = ("capture", "person", "session")
-"""Columns of words, which may look like numbers."""
+"""Columns of words, which keep points that look like decimal points."""
 _ANGLES: Final = (*_WORDS, "side", "joint", "measure", "value [deg]", "SD", "SD constant", "MDD",
-                  "share measured", "convention", _RECORD)  # fmt: skip
+                  "share measured", "convention", _RECORD_COLUMN)  # fmt: skip
 _MEASURES: Final = "mean", "5th percentile", "95th percentile", "range of motion"
 
-_Rows = list[list[object]]
+_Row = list[object]
+_Rows = list[_Row]
 
 
 def table_paths(page: Path, settings: PageSettings = PageSettings()) -> tuple[Path, ...]:  # noqa: B008
-    """Paths of a page's tables; the last is that of the angles of a study, before it that of cycles."""
-    *endings, last = _TABLES
-    cycles = [] if settings.cycles is None else [_CYCLES]
+    """Paths of a page's tables: the last is that of a study's angles, preceded by that of cycles."""
+    *endings, last = _ENDINGS
+    cycles = [] if settings.cycles is None else [_CYCLE_ENDING]
     return tuple(page.with_suffix(ending) for ending in (*endings, *cycles, last))
 
 
@@ -75,7 +70,7 @@ def write_tables(
 
 def _with_record(rows: _Rows, take: Take) -> _Rows:
     """A table with a last column that says in the first row what the take was made of."""
-    cells = [_RECORD, made_of(take.settings), *[""] * (len(rows) - 2)]
+    cells = [_RECORD_COLUMN, made_of(take.settings), *[""] * (len(rows) - 2)]
     return [[*row, cell] for row, cell in zip(rows, cells, strict=False)]
 
 
@@ -159,9 +154,7 @@ def _span_rows(take: Take, spans: Sequence[SuspectSpan]) -> _Rows:
     return rows
 
 
-def _cycle_rows(
-    take: Take, hands: Sequence[HandFigures], cycles: Sequence[Cycles], first: list[object]
-) -> _Rows:
+def _cycle_rows(take: Take, hands: Sequence[HandFigures], cycles: Sequence[Cycles], first: _Row) -> _Rows:
     """Rows of figures and curves: by hand and joint of each cycle, their mean and standard deviation."""
     header = [*_WORDS, "side", "joint", "cycle", "start [s]", *FIGURES]
     rows: _Rows = [[*header, *(f"{percent:g} %" for percent in PERCENTS)]]
@@ -188,9 +181,7 @@ def _reach_rows(take: Take, hands: Sequence[HandFigures]) -> _Rows:
     return rows
 
 
-def _angle_rows(
-    take: Take, hands: Sequence[HandFigures], first: list[object], settings: PageSettings
-) -> _Rows:
+def _angle_rows(take: Take, hands: Sequence[HandFigures], first: _Row, settings: PageSettings) -> _Rows:
     """Rows of the angles of a study: by hand, convention, joint and measure, in measured frames.
 
     SD and its constant part are those of a single angle, so that a range of motion has none.

@@ -1,4 +1,4 @@
-"""What papers tell of trials: the cycles of a movement, and how near the thumb comes to the fingers.
+"""Figures that papers give of trials: cycles of a movement, and how near the thumb comes to the fingers.
 
 Angles are in degrees, times in seconds, gaps in millimeters.
 """
@@ -23,16 +23,16 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 PERCENTS: Final = np.arange(101.0)
-"""The times of a cycle at which its angles are told [%]."""
+"""Times of a cycle at which its curves have values [%]."""
 FIGURES: Final = (
     *("duration [s]", "least [deg]", "largest [deg]", "range [deg]"),
     *("least velocity [deg/s]", "largest velocity [deg/s]"),
 )
 """Figures of a joint in a cycle. Velocities are signed, so the least is the quickest extension."""
-_RISE, _REST = 0.5, 0.2
-"""In a cycle a joint rises and falls by at least this share of its range, from the lowest part of it on."""
-_LEAST_RANGE: Final = 10.0  # [deg] A joint that moves less has no cycles.
-_MEASURED: Final = 0.9  # share of a cycle's frames in which a joint is measured, so that the cycle counts
+_RISE_SHARE, _LOWEST_SHARE = 0.5, 0.2
+"""A cycle begins in the lowest share of the joint's range, and rises and falls by at least a share of it."""
+_LEAST_RANGE_DEG: Final = 10.0  # [deg] A joint that moves less has no cycles.
+_MEASURED_SHARE: Final = 0.9  # A cycle counts for a joint that is measured in this share of its frames.
 _TARGETS: Final = {
     "1, index proximal phalanx": ("index", 0, 0.0, 1.0),
     "2, index middle phalanx": ("index", 1, 0.0, 1.0),
@@ -46,7 +46,7 @@ _TARGETS: Final = {
     "10, palm below the little finger": ("little", 0, 0.0, 0.0),
 }
 """Targets of the thumb's tip (Kapandji 1986, Annales de chirurgie de la main 5:67): digit, phalanx, and the
-part of its length. The creases of skin are where these joints are, within some millimeters."""
+part of its length. The creases of the skin lie at these joints, within some millimeters."""
 
 
 class Cycles(NamedTuple):
@@ -64,13 +64,13 @@ def find_cycles(angles: Float[np.ndarray, "T"]) -> list[tuple[int, int]]:
     """Cycles of a movement, from one least angle of a joint to the next [deg]; NaN where it is not known."""
     known = np.isfinite(angles)
     low, high = np.percentile(angles[known], (5.0, 95.0)) if known.any() else (0.0, 0.0)
-    if high - low < _LEAST_RANGE:
+    if high - low < _LEAST_RANGE_DEG:
         return []
     spans, moved = list[tuple[int, int]](), high - low
     for first, last in runs_of(known):
-        # A movement may begin and end at rest: beyond its ends the angle counts as large.
+        # A movement may begin and end at rest, so the angle counts as large beyond its ends.
         run = np.concatenate([[high], angles[first : last + 1], [high]])
-        lowest, _ = find_peaks(-run, height=-low - _REST * moved, prominence=_RISE * moved)
+        lowest, _ = find_peaks(-run, height=-low - _LOWEST_SHARE * moved, prominence=_RISE_SHARE * moved)
         spans += pairwise((first + lowest - 1).tolist())
     return spans
 
@@ -86,17 +86,17 @@ def cycles_of(
         joint: The joint between whose least angles a cycle is.
         rate: Frames a second [Hz].
     """
-    told = np.where(measured, angles, np.nan)
-    spans = find_cycles(told[:, JOINT_NAMES.index(joint)])
+    shown = np.where(measured, angles, np.nan)
+    spans = find_cycles(shown[:, JOINT_NAMES.index(joint)])
     figures = np.full((len(spans), len(JOINT_NAMES), len(FIGURES)), np.nan)
     curves = np.full((len(spans), len(JOINT_NAMES), len(PERCENTS)), np.nan)
-    speeds = np.gradient(told, axis=0) * rate if len(told) > 1 else np.zeros_like(told)
+    speeds = np.gradient(shown, axis=0) * rate if len(shown) > 1 else np.zeros_like(shown)
     for number, (first, last) in enumerate(spans):
         part = slice(first, last + 1)
-        for column in np.flatnonzero(measured[part].mean(axis=0) >= _MEASURED).tolist():
-            known = np.isfinite(told[part, column])
+        for column in np.flatnonzero(measured[part].mean(axis=0) >= _MEASURED_SHARE).tolist():
+            known = np.isfinite(shown[part, column])
             places = np.linspace(0.0, 100.0, last + 1 - first)[known]
-            values = told[part, column][known]
+            values = shown[part, column][known]
             curves[number, column] = np.interp(PERCENTS, places, values)
             low, high, speed = values.min(), values.max(), speeds[part, column]
             figures[number, column] = [(last - first) / rate, low, high, high - low, *_extremes(speed)]
@@ -139,7 +139,7 @@ def thumb_reach(take: Take, side: Side) -> list[tuple[str, float, float, float]]
 
     Returns:
         By target its name, the least gap between the surfaces [m] (0 and less where flesh touches), the time
-        [s], and the gap's standard deviation there [m], from those of the keypoints; NaN if nobody knows.
+        [s], and the gap's standard deviation there [m], from those of the keypoints; NaN if it is unknown.
     """
     number, there = take.hand_index(side), take.is_tracked(side)
     gaps = np.full((len(_TARGETS), take.num_frames), np.nan)

@@ -20,12 +20,12 @@ from gloves.takes.take import load_take
 from handsim.errors import ArgumentError, FileError, HandSimWarning
 from handsim.files.inputs import read_toml
 from handsim.files.outputs import check_outputs
-from handsim.hand.model import HandModel
-from handsim.hand.shape import NUM_QPOS, SIZES
+from handsim.hand.model import HandModel, join_qpos
+from handsim.hand.shape import NUM_JOINTS, SIZES
 from handsim.space.rig import CameraRig, list_rigs, load_rig
 from handsim.space.transforms import UpAxis
 from track.settings import USUAL_SIZE
-from track.user import load_user
+from track.user import load_user, size_words
 from track.viewer.editors import HEIGHT, Corrector, LabelEditor, LayoutEditor, edited_path
 from track.viewer.recordings import CaptureRecording, DatasetRecording, Recording, TakeRecording
 from track.viewer.stage import FrameView, HandSkin, PointBalls, set_stage, show_rig, show_volume, switch
@@ -40,12 +40,12 @@ ACCEPTED: Final = (
     f"({', '.join(READABLE)}), a tracked take or a simulated take's truth (.npz), or a user's file (.json)"
 )
 """The kinds of files that can be viewed."""
-_ROUNDED: Final = 0.01  # [s] --time may be outside of a recording by this
-_LOOKED_AT: Final = 30  # number of frames that determine the first look
+_TIME_TOLERANCE: Final = 0.01  # [s] --time may lie outside of a recording by this.
+_FIRST_LOOK_FRAMES: Final = 30  # number of frames that determine the first look
 
 Run = Callable[[Callable[[], bool]], None]
 """Serves a page until the given function returns True."""
-_SPACING: Final = 0.14  # distance between the centers of two hands [m]
+_HAND_SPACING: Final = 0.14  # distance between the centers of two hands [m]
 _BEFORE_COLOR: Final = (150, 150, 150)
 
 
@@ -82,16 +82,16 @@ def open_content(
     if size is not None and (not keys or keys & {"camera", "field_of_view"}):
         raise ArgumentError(f"--size is {size}, but {name} is no marker layout, which a hand would wear")
     if keys & {"camera", "field_of_view"}:
-        content = _rig(load_rig(given))
+        content = _rig_content(load_rig(given))
     elif keys:
-        content = _layout(given, out, USUAL_SIZE if size in (None, "auto") else str(size))
+        content = _layout_content(given, out, USUAL_SIZE if size in (None, "auto") else str(size))
     elif out is not None:
         raise ArgumentError(f"--out is {out}, but {name} is no marker layout: nothing would be saved")
     elif suffix == ".json":
         hands = load_user(path)
         content = Content("user", lambda server: _show_user(server, hands))
     else:
-        return _moving(path, name, None if rig is None else load_rig(rig), time, up)
+        return _recorded(path, name, None if rig is None else load_rig(rig), time, up)
     for option, value, why in (
         ("--time", None if time is None else f"{time:g}", ": nothing in it moves"),
         ("--rig", rig, ", which no cameras are shown with"),
@@ -102,7 +102,7 @@ def open_content(
     return content
 
 
-def _moving(path: Path, name: str, rig: CameraRig | None, time: float | None, up: UpAxis) -> Content:
+def _recorded(path: Path, name: str, rig: CameraRig | None, time: float | None, up: UpAxis) -> Content:
     """Frames of a file or folder, and a corrector for a tracked take."""
     recording: Recording
     corrector: Corrector | None = None
@@ -122,14 +122,14 @@ def _moving(path: Path, name: str, rig: CameraRig | None, time: float | None, up
     first = 0
     if time is not None:
         begin, end = float(recording.times[0]), float(recording.times[-1])
-        if not begin - _ROUNDED <= time <= end + _ROUNDED:
+        if not begin - _TIME_TOLERANCE <= time <= end + _TIME_TOLERANCE:
             raise ArgumentError(f"--time is {time:g} s, but {name} lasts from {begin:g} to {end:.3f} s")
         first = int(np.argmin(np.abs(recording.times - time)))
     kind = type(recording).__name__.removesuffix("Recording").lower()
     return Content(kind, lambda server: show_recording(server, recording, corrector, first, up), recording)
 
 
-def _layout(given: str | Path, out: Path | None, size: str) -> Content:
+def _layout_content(given: str | Path, out: Path | None, size: str) -> Content:
     layout = load_layout(given)
     model = HandModel.named(size, side=layout.sides[-1])
     shipped = Path(gloves.layout.__file__).parent / "layouts" / f"{given}.toml"
@@ -139,10 +139,10 @@ def _layout(given: str | Path, out: Path | None, size: str) -> Content:
         if out.exists():
             raise ArgumentError(f"--out is {out}, which exists already, expected a new name")
     target = out or edited_path(Path(f"{layout.name}.toml") if isinstance(given, str) else given)
-    return Content("layout", lambda server: _still(LayoutEditor(server, path, layout, model, target)))
+    return Content("layout", lambda server: _wait_only(LayoutEditor(server, path, layout, model, target)))
 
 
-def _rig(rig: CameraRig) -> Content:
+def _rig_content(rig: CameraRig) -> Content:
     def show(server: ViserServer) -> Run:
         show_rig(server, rig)
         show_volume(server, rig)
@@ -152,7 +152,7 @@ def _rig(rig: CameraRig) -> Content:
             "training sets."
         )
         set_stage(server, rig.positions, ground=0.0)
-        return _still()
+        return _wait_only()
 
     return Content("rig", show)
 
@@ -201,7 +201,7 @@ def show_recording(
 
 def first_look(recording: Recording) -> np.ndarray:
     """Points [m] for the first look: wrists and labeled points of some frames, or else all their points."""
-    indices = np.unique(np.linspace(0, recording.num_frames - 1, _LOOKED_AT).astype(int))
+    indices = np.unique(np.linspace(0, recording.num_frames - 1, _FIRST_LOOK_FRAMES).astype(int))
     frames = [recording.frame(int(index)) for index in indices]
     wrists = [frame.qpos[:, :3] for frame in frames]
     labeled = [frame.points[frame.labels >= 0] for frame in frames]
@@ -211,7 +211,7 @@ def first_look(recording: Recording) -> np.ndarray:
     return np.concatenate([frame.points for frame in frames])
 
 
-def _still(_shown: object = None) -> Run:
+def _wait_only(_shown: object = None) -> Run:
     """Serve a page that only reacts; `_shown` is kept alive with its handlers."""
 
     def run(ended: Callable[[], bool]) -> None:
@@ -229,7 +229,7 @@ def _show_user(server: ViserServer, hands: Sequence[GloveFit]) -> Run:
     for number, hand in enumerate(hands):
         nominal = [nominal_fit(hand.layout, size, hand.side) for size in SIZES]
         before = min(nominal, key=lambda fit: abs(fit.shape.length - hand.shape.length))
-        shift = np.array([0.0, _SPACING * (number - (len(hands) - 1) / 2), HEIGHT])
+        shift = np.array([0.0, _HAND_SPACING * (number - (len(hands) - 1) / 2), HEIGHT])
         _add_hand(server, f"/after/{hand.side}", hand, shift)
         _add_hand(server, f"/before/{hand.side}", before, shift, _BEFORE_COLOR, 0.35, 0.5)
         points = np.stack([before.attachment.points, hand.attachment.points], axis=1)
@@ -239,12 +239,11 @@ def _show_user(server: ViserServer, hands: Sequence[GloveFit]) -> Run:
         corners.append(hand.model.surface.vertices + shift)
         moved = 1e3 * np.linalg.norm(points[:, 1] - points[:, 0], axis=1)
         server.gui.add_markdown(
-            f"**{hand.side}**: {1e3 * hand.shape.length:.0f} x {1e3 * hand.shape.breadth:.0f} mm, "
-            f"nearest size {1e3 * before.shape.length:.0f} x {1e3 * before.shape.breadth:.0f} mm; "
-            f"markers differ by {np.median(moved):.1f} mm (median), {moved.max():.1f} mm at most"
+            f"**{hand.side}**: {size_words(hand)}, nearest size {size_words(before)}; markers differ by "
+            f"{np.median(moved):.1f} mm (median), {moved.max():.1f} mm at most"
         )
     set_stage(server, np.concatenate(corners), ground=0.0)
-    return _still()
+    return _wait_only()
 
 
 def _add_hand(
@@ -257,8 +256,7 @@ def _add_hand(
     size: float = 1.0,
 ) -> None:
     """Show a flat hand with markers of `size` times their radius."""
-    qpos = np.zeros(NUM_QPOS)
-    qpos[:3], qpos[3] = shift, 1.0
+    qpos = join_qpos(np.zeros((1, NUM_JOINTS)), position=shift)[0]
     HandSkin(server, f"{node}/skin", color=color, opacity=opacity).show(hand.model, qpos)
     count, radius = hand.layout.num_markers, size * hand.layout.radius
     balls = PointBalls(server, f"{node}/markers", hand.layout.names, most=count, radius=radius)

@@ -27,8 +27,8 @@ from gloves.takes.take import Take
 from handsim.errors import CaptureError, LayoutError, errors_of
 from handsim.files.inputs import read_bytes
 from handsim.files.outputs import write_text, writing
-from handsim.hand.model import HandModel
-from handsim.hand.shape import NUM_QPOS
+from handsim.hand.model import HandModel, join_qpos
+from handsim.hand.shape import NUM_JOINTS
 from track.takes.corrected_take import BAD_RMS, correct_take
 from track.viewer.recordings import TakeRecording
 from track.viewer.stage import HandSkin, PointBalls, set_stage
@@ -36,11 +36,11 @@ from track.viewer.stage import HandSkin, PointBalls, set_stage
 if TYPE_CHECKING:
     from viser import SceneNodePointerEvent, ViserServer
 
-_NOTHING: Final = "choose"
+_NO_POINT: Final = "choose"
 _HALO: Final = 2.5  # radius of the halo around the chosen point, in radii of a marker
 _HALO_COLOR: Final = (255, 190, 0)
-_LISTED: Final = 12  # largest number of corrections in the list
-HEIGHT: Final = 0.06  # height of the wrist above the ground [m]
+_MOST_LISTED: Final = 12  # largest number of corrections in the list
+HEIGHT: Final = 0.06  # [m] height of the wrist above the ground
 _GIZMO: Final = 0.03  # size of the handle that moves a marker [m]
 
 
@@ -56,7 +56,7 @@ class Corrector:
         """Corrections that are not saved yet."""
         self.unfitting: tuple[Correction, ...] = ()
         """Saved corrections that match no point."""
-        self._state = _state_of(path)
+        self._state = _file_state(path)
         records = applied_corrections(take)
         if any(correction.record() not in records for correction in self.saved):
             with errors_of(corrections_path(path), CaptureError):
@@ -110,7 +110,7 @@ class Corrector:
     def save(self) -> str:
         """Write the corrections and the take; returns a message."""
         with self._lock:
-            if _state_of(self.path) != self._state or corrections_of(self.path) != self.saved:
+            if _file_state(self.path) != self._state or corrections_of(self.path) != self.saved:
                 raise CaptureError(
                     f"{self.path} or its corrections have changed since they were opened, expected the same "
                     "files; open it again"
@@ -120,7 +120,7 @@ class Corrector:
             self.saved, self.added = corrections_of(self.path), ()
             with writing(self.path, CaptureError):
                 self.take.save(self.path)
-            self._base, self._state = self.take, _state_of(self.path)
+            self._base, self._state = self.take, _file_state(self.path)
         return f"saved {self.path} and {beside}"
 
     def _make(self, added: Sequence[Correction]) -> None:
@@ -138,7 +138,7 @@ def label_of(take: Take, frame: int, column: int) -> str:
 
 
 def doubt_of(before: Take, after: Take, correction: Correction) -> str:
-    """What speaks against a correction: a hand that fits its markers no longer; or nothing."""
+    """A sentence on hands that no longer fit their markers after a correction; empty if all fit."""
     frames = slice(correction.first, correction.last + 1)
     rms = np.array([np.fmax.reduce(take.rms[frames], axis=0) for take in (before, after)])
     worse = np.flatnonzero((rms[0] < BAD_RMS) & (rms[1] > BAD_RMS))
@@ -146,7 +146,7 @@ def doubt_of(before: Take, after: Take, correction: Correction) -> str:
     return f"; **{', '.join(told)}; Undo takes it back**" if told else ""
 
 
-def _state_of(path: Path) -> tuple[int, int] | None:
+def _file_state(path: Path) -> tuple[int, int] | None:
     """Time and size of a file, to notice changes; None if it is gone."""
     try:
         found = path.stat()
@@ -159,11 +159,7 @@ class LabelEditor:
     """Panel folder in which labels are corrected, and a halo around the chosen point."""
 
     def __init__(
-        self,
-        server: ViserServer,
-        recording: TakeRecording,
-        corrector: Corrector,
-        changed: Callable[[], None],
+        self, server: ViserServer, recording: TakeRecording, corrector: Corrector, changed: Callable[[], None]
     ) -> None:
         self._recording, self._corrector, self._changed = recording, corrector, changed
         self._frame, self._rows = 0, dict[str, int]()
@@ -194,8 +190,8 @@ class LabelEditor:
         """Choose a point by its column in a frame, and the span in which it has its label."""
         points = self._corrector.take.point_list
         self.chosen = (frame, column)
-        _set(self.span, self._corrector.span_of(frame, column))
-        _set(self.label, label_of(self._corrector.take, frame, column))
+        _set_value(self.span, self._corrector.span_of(frame, column))
+        _set_value(self.label, label_of(self._corrector.take, frame, column))
         self._show_halo()
         self._show_points()
         first, last = self.span.value
@@ -234,7 +230,7 @@ class LabelEditor:
         gui, last = server.gui, self._recording.num_frames - 1
         with gui.add_folder("Correct labels"):
             self.state = gui.add_markdown("Click on a point whose label is wrong, or take it from the list.")
-            self.points = gui.add_dropdown("point", (_NOTHING,), hint="ID and label of each point")
+            self.points = gui.add_dropdown("point", (_NO_POINT,), hint="ID and label of each point")
             self.span = gui.add_multi_slider(
                 "frames", 0, max(last, 1), 1, (0, last), disabled=last == 0, hint="First and last frame"
             )
@@ -255,7 +251,7 @@ class LabelEditor:
         def _(event: Any) -> None:
             (first, last), frame = self.span.value, self._frame
             is_first = event.target.value == "first"
-            _set(self.span, (frame, max(frame, last)) if is_first else (min(first, frame), frame))
+            _set_value(self.span, (frame, max(frame, last)) if is_first else (min(first, frame), frame))
 
     def _undo(self) -> None:
         self._corrector.undo()
@@ -282,10 +278,10 @@ class LabelEditor:
     def _show_points(self) -> None:
         """List the points of the shown frame, with the chosen one selected."""
         self._rows = {self._name(self._frame, int(column)): int(column) for column in self._columns()}
-        if (rows := (_NOTHING, *self._rows)) != self.points.options:
+        if (rows := (_NO_POINT, *self._rows)) != self.points.options:
             self.points.options = rows
         column = self._chosen_column()
-        _set(self.points, _NOTHING if column is None else self._name(self._frame, column))
+        _set_value(self.points, _NO_POINT if column is None else self._name(self._frame, column))
 
     def _chosen_column(self) -> int | None:
         """The column of the chosen point in the shown frame."""
@@ -311,11 +307,11 @@ class LabelEditor:
         lines = [f"{correction}: no longer fits" for correction in corrector.unfitting]
         lines += [f"{correction}, not saved" for correction in reversed(corrector.added)]
         lines += [str(correction) for correction in reversed(corrector.saved)]
-        more = [f"and {len(lines) - _LISTED} more"] if len(lines) > _LISTED else []
-        self.list.content = "\n\n".join((*lines[:_LISTED], *more))
+        more = [f"and {len(lines) - _MOST_LISTED} more"] if len(lines) > _MOST_LISTED else []
+        self.list.content = "\n\n".join((*lines[:_MOST_LISTED], *more))
 
 
-def _set(handle: Any, value: object) -> None:
+def _set_value(handle: Any, value: object) -> None:
     """Set the value of a GUI element, whose viser handle hides its setter from type checkers."""
     handle.value = value
 
@@ -332,10 +328,8 @@ class LayoutEditor:
         self.fit: GloveFit = attach(layout, model)
         """The hand in the glove with all changes."""
         self._chosen: int | None = None
-        qpos = np.zeros(NUM_QPOS)
-        qpos[2], qpos[3] = HEIGHT, 1.0
         self.skin = HandSkin(server, "/hand")
-        self.skin.show(model, qpos)
+        self.skin.show(model, join_qpos(np.zeros((1, NUM_JOINTS)), position=self.shift)[0])
         count = layout.num_markers
         self.balls = PointBalls(server, "/markers", layout.names, most=count, radius=layout.radius)
         self.gizmo = server.scene.add_transform_controls(
@@ -372,7 +366,7 @@ class LayoutEditor:
             self._chosen = index
             self.gizmo.position = self.fit.attachment.points[index] + self.shift
             self.gizmo.visible = True
-            _set(self.names, self.fit.layout.names[index])
+            _set_value(self.names, self.fit.layout.names[index])
             self._describe_chosen()
 
     def move(self, index: int, point: np.ndarray) -> None:

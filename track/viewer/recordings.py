@@ -33,7 +33,7 @@ GHOST_COLOR: Final = (128, 128, 128)
 """Color of unlabeled points."""
 _NO_NAME: Final = re.compile(r"(?:.*:)?\s*(?:\*|_?unlabell?ed|uname)", re.I)
 """Names that optical systems give to unnamed trajectories."""
-_ROWS_PER_SECOND: Final = 4.0  # [Hz] played rows of a training set
+_ROW_RATE: Final = 4.0  # [Hz] played rows of a training set
 _MOST_LIVE_POINTS: Final = 400  # largest number of shown points of a live frame
 _VIDEO_RATE: Final = 30.0  # highest rate of a video [Hz]
 
@@ -222,7 +222,7 @@ class DatasetRecording(Recording):
         self._dataset = dataset
         self._starts = np.cumsum([0, *map(len, dataset.shards)])
         self._model: tuple[tuple[int, int], HandModel] | None = None
-        self.times = np.arange(self._starts[-1]) / _ROWS_PER_SECOND
+        self.times = np.arange(self._starts[-1]) / _ROW_RATE
         self.label_names = dataset.marker_names
         self.most_points = len(dataset.marker_names) + dataset.shards[0].dtype["ghosts"].shape[0]
         self.rig = rig_of_settings(dataset.manifest.config.get("rig")) if rig is None else rig

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import trimesh
 from jaxtyping import Bool, Float, Int
-from numpy.typing import NDArray
 
+from handsim.arrays import Doubles, Integers
 from handsim.hand.model import HandModel
 from handsim.hand.shape import NUM_QPOS
 from handsim.hand.skin import all_weights
@@ -32,25 +32,21 @@ if TYPE_CHECKING:
 
     from handsim.hand.shape import Side
 
-_FROM: Final = np.array([0.62, -0.62, 0.48])  # direction from the target of the first look to the eye
-_NEAREST: Final = 0.22  # smallest distance between the eye and its target [m]
-_HALF_SIDE: Final = 0.3  # [m] half side of the cube in which wrists move in training sets
-_SPACING: Final = 0.2  # [m] spacing of grid points at which cameras are counted
+_FIRST_DIRECTION: Final = np.array([0.62, -0.62, 0.48])  # from the target of the first look to the eye
+_LEAST_DISTANCE: Final = 0.22  # [m] least distance between the eye and its target
+_HALF_CUBE: Final = 0.3  # [m] half side of the cube in which wrists move in training sets
+_GRID_SPACING: Final = 0.2  # [m] spacing of grid points at which cameras are counted
 _MOST_POINTS: Final = 40_000  # largest number of grid points
-_FRUSTUM: Final = 0.12  # size of a camera's frustum [m]
+_FRUSTUM_SIZE: Final = 0.12  # [m] size of a camera's frustum
 _FEW_CAMERAS_COLOR, _ALL_CAMERAS_COLOR = np.array([214, 96, 60]), np.array([40, 120, 180])
 _SKIN_COLORS: Final[dict[Side, tuple[int, int, int]]] = {"right": (214, 170, 140), "left": (150, 172, 200)}
-_FILLED: Final = 0.45  # relative size of an unseen marker
+_UNSEEN_SCALE: Final = 0.45  # relative size of an unseen marker
 _BODY_COLOR: Final = (120, 124, 132)
 _RAY_COLOR: Final = (235, 170, 60)
 
 
 def set_stage(
-    server: ViserServer,
-    points: Float[np.ndarray, "N 3"],
-    *,
-    ground: float | None = None,
-    up: UpAxis = "z",
+    server: ViserServer, points: Float[np.ndarray, "N 3"], *, ground: float | None = None, up: UpAxis = "z"
 ) -> None:
     """Set light, ground and a first look at points [m]; the ground is at a height or below the points."""
     turn = upright(up).T  # from the axes of the stage to those of the points
@@ -85,9 +81,9 @@ def set_stage(
         position=turn @ (round(float(middle[0]), 1), round(float(middle[1]), 1), height),
         wxyz=rotation_quaternions(turn[None])[0],
     )
-    away = max(size, _NEAREST)
+    away = max(size, _LEAST_DISTANCE)
     camera = server.initial_camera
-    camera.position = turn @ (middle + away * _FROM / np.linalg.norm(_FROM))
+    camera.position = turn @ (middle + away * _FIRST_DIRECTION / np.linalg.norm(_FIRST_DIRECTION))
     camera.look_at, camera.up = turn @ middle, turn[:, 2]
     camera.near, camera.far = 0.005, 100.0
 
@@ -101,7 +97,7 @@ def show_rig(server: ViserServer, rig: CameraRig) -> None:
             f"/cameras/{number}",
             fov=height,
             aspect=float(np.tan(width / 2) / np.tan(height / 2)),
-            scale=_FRUSTUM,
+            scale=_FRUSTUM_SIZE,
             thickness=0.004,
             color=(60, 66, 76),
             position=camera.T_world_camera[:3, 3],
@@ -114,7 +110,7 @@ def show_rig(server: ViserServer, rig: CameraRig) -> None:
 
 def show_volume(server: ViserServer, rig: CameraRig) -> None:
     """Show the cube in which wrists move, and dots colored by the number of cameras that see them."""
-    side = 2 * _HALF_SIDE
+    side = 2 * _HALF_CUBE
     server.scene.add_box("/volume", (40, 120, 60), (side, side, side), wireframe=True, position=ROOM_CENTER)
     places, counts = camera_counts(rig)
     share = (counts / len(rig.positions))[:, None]
@@ -127,11 +123,11 @@ def show_volume(server: ViserServer, rig: CameraRig) -> None:
     )
 
 
-def camera_counts(rig: CameraRig) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def camera_counts(rig: CameraRig) -> tuple[Doubles, Integers]:
     """Grid points (N, 3) [m] seen by at least two cameras, and their numbers of cameras (N,)."""
     low, high = rig.positions.min(axis=0), rig.positions.max(axis=0)
     low[2] = min(0.0, low[2])
-    spacing = max(_SPACING, float((np.prod(high - low + _SPACING) / _MOST_POINTS) ** (1 / 3)))
+    spacing = max(_GRID_SPACING, float((np.prod(high - low + _GRID_SPACING) / _MOST_POINTS) ** (1 / 3)))
     axes = [np.arange(low[axis], high[axis] + spacing / 2, spacing) for axis in range(3)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     counts = rig.in_view(grid).sum(axis=1)
@@ -171,7 +167,7 @@ class HandSkin:
                 self.mesh, self._model = self._send(model), model
             local = np.zeros((1, NUM_QPOS))
             local[0, 3], local[0, 7:] = 1.0, qpos[7:]
-            positions, quaternions = _poses(model.forward_kinematics(local)[0])
+            positions, quaternions = _split_poses(model.forward_kinematics(local)[0])
             for bone, position, quaternion in zip(self.mesh.bones, positions, quaternions, strict=True):
                 bone.position, bone.wxyz = position, quaternion
             self.mesh.position, self.mesh.wxyz = qpos[:3], qpos[3:7] / np.linalg.norm(qpos[3:7])
@@ -180,7 +176,7 @@ class HandSkin:
 
     def _send(self, model: HandModel) -> MeshSkinnedHandle:
         surface = model.surface
-        positions, quaternions = _poses(model.rest_transforms)
+        positions, quaternions = _split_poses(model.rest_transforms)
         return self._server.scene.add_mesh_skinned(
             self._name,
             surface.vertices,
@@ -193,7 +189,7 @@ class HandSkin:
         )
 
 
-def _poses(transforms: Float[np.ndarray, "L 4 4"]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _split_poses(transforms: Float[np.ndarray, "L 4 4"]) -> tuple[Doubles, Doubles]:
     """Positions (L, 3) and quaternions (L, 4), wxyz."""
     return transforms[:, :3, 3], rotation_quaternions(transforms[:, :3, :3])
 
@@ -233,7 +229,7 @@ class PointBalls:
         positions, colors = self.balls.batched_positions.copy(), self.balls.batched_colors.copy()
         scales = np.zeros(self._most, dtype=np.float32)
         positions[:count] = self._points
-        scales[:count] = np.where(seen[:count], 1.0, _FILLED)
+        scales[:count] = np.where(seen[:count], 1.0, _UNSEEN_SCALE)
         colors[:count] = self._palette[self._labels]
         self.balls.batched_positions, self.balls.batched_scales = positions, scales
         self.balls.batched_colors = colors
@@ -275,11 +271,7 @@ class FrameView:
         self._server, self._recording = server, recording
         self.skins: list[HandSkin] = []
         self.balls = PointBalls(
-            server,
-            "/points",
-            recording.label_names,
-            most=recording.most_points,
-            radius=recording.radius,
+            server, "/points", recording.label_names, most=recording.most_points, radius=recording.radius
         )
         self.bodies: list[MeshHandle | FrameHandle] = []
         for body in recording.bodies:

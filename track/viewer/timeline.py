@@ -1,4 +1,4 @@
-"""Time in the page: playing of a recording, with texts and plots, or a live tracker."""
+"""Time in the page: playback of a recording, with texts and plots, or a live tracker."""
 
 from __future__ import annotations
 
@@ -8,10 +8,9 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
-from jaxtyping import Float
-from numpy.typing import NDArray
 
 from gloves.fit import GloveFit
+from handsim.arrays import Doubles
 from handsim.callbacks import Closing
 from handsim.space.transforms import UpAxis
 from track.bodies.rigid_body import RigidTemplate
@@ -26,9 +25,9 @@ if TYPE_CHECKING:
 
 PICTURES: Final = 60.0
 """Highest rate of shown frames [Hz]."""
-_SPEEDS: Final = {"0.1 x": 0.1, "0.25 x": 0.25, "0.5 x": 0.5, "1 x": 1.0, "2 x": 2.0, "4 x": 4.0}
+_SPEED_FACTORS: Final = {"0.1 x": 0.1, "0.25 x": 0.25, "0.5 x": 0.5, "1 x": 1.0, "2 x": 2.0, "4 x": 4.0}
 _SLIDER_PERIOD: Final = 0.1  # [s] least time between moves of the slider while playing
-_IDLE: Final = 0.2  # [s] longest interval between calls of `ended`
+_LONGEST_IDLE: Final = 0.2  # [s] longest interval between calls of `ended`
 _TEXT_PERIOD: Final = 0.1  # [s] least time between texts while playing
 _LIVE_TEXT_PERIOD: Final = 0.2  # [s] least time between texts of a live view
 _STROKES: Final = ("#b8572b", "#3f7396", "#5b8c5a", "#7a5ba0")
@@ -37,11 +36,9 @@ Key = Literal["space", "arrowleft", "arrowright", "home", "end", "pageup", "page
 
 
 class Timeline:
-    """Selects frames: `run` calls `show` with their indices, all other methods only request a frame."""
+    """Selects frames: `run` calls `show` with their indices; all other methods only request a frame."""
 
-    def __init__(
-        self, server: ViserServer, times: Float[np.ndarray, "T"], show: Callable[[int], None]
-    ) -> None:
+    def __init__(self, server: ViserServer, times: Doubles, show: Callable[[int], None]) -> None:
         self._times, self._show = times, show
         self._wake = threading.Event()
         self.index, self.playing = 0, False
@@ -55,7 +52,7 @@ class Timeline:
             self._slider = gui.add_slider("frame", 0, last, 1, 0, disabled=len(times) < 2)
             self._button = gui.add_button("Play", hint="Space")
             self._step = gui.add_button_group("step", ("-10", "-1", "+1", "+10"))
-            self._speed = gui.add_dropdown("speed", tuple(_SPEEDS), initial_value="1 x")
+            self._speed = gui.add_dropdown("speed", tuple(_SPEED_FACTORS), initial_value="1 x")
         self._button.on_click(lambda _: self.toggle())
         self._step.on_click(lambda event: self.step(int(event.target.value)))
         self._speed.on_update(lambda _: self._set_anchor())
@@ -115,7 +112,7 @@ class Timeline:
             self.update()
             now = time.perf_counter()
             due = max(due + 1.0 / PICTURES, now)
-            self._wake.wait(due - now if self.playing else _IDLE)
+            self._wake.wait(due - now if self.playing else _LONGEST_IDLE)
             self._wake.clear()
 
     def refresh(self) -> None:
@@ -137,7 +134,7 @@ class Timeline:
 
     def _advance(self) -> None:
         clock, begin = self._anchor
-        now = begin + (time.perf_counter() - clock) * _SPEEDS[self._speed.value]
+        now = begin + (time.perf_counter() - clock) * _SPEED_FACTORS[self._speed.value]
         if now >= 2.0 * self._times[-1] - self._times[-2]:  # The last frame is shown for one interval.
             self.index = 0
             self._set_anchor()
@@ -154,14 +151,14 @@ class StatusPanel:
     def __init__(self, server: ViserServer, recording: Recording) -> None:
         self._server, self._recording, self._due = server, recording, 0.0
         self.text = server.gui.add_markdown("")
-        self._go_to: Callable[[int], None] = lambda frame: None
+        self._jump_to: Callable[[int], None] = lambda frame: None
         self._rows: GuiFolderHandle | None = None
         self._buttons: list[GuiButtonHandle] = []
         self._plots: list[tuple[GuiUplotHandle, list[str]]] = []
 
     def add_doubts(self, go_to: Callable[[int], None]) -> None:
         """Add buttons that call `go_to` with a doubtful frame, if there are any."""
-        self._go_to = go_to
+        self._jump_to = go_to
         if self._recording.suspects:
             self._rows = self._server.gui.add_folder("Doubtful frames")
             self._add_rows()
@@ -203,7 +200,7 @@ class StatusPanel:
 
             @row.on_click
             def _(_event: object, frame: int = doubt.worst) -> None:
-                self._go_to(frame)
+                self._jump_to(frame)
 
     def show(self, index: int, frame: ShownFrame, *, hurried: bool) -> None:
         """Show the state of a frame; with `hurried`, at most ten times a second."""
@@ -221,7 +218,7 @@ def _columns(recording: Recording, names: list[str]) -> tuple[np.ndarray, ...]:
     return (columns[0][0], *(values for _, values in columns))
 
 
-def thinned(times: NDArray[np.float64], values: NDArray[np.float64]) -> tuple[np.ndarray, np.ndarray]:
+def thinned(times: Doubles, values: Doubles) -> tuple[np.ndarray, np.ndarray]:
     """Reduce a curve (T,), which may hold NaN, to the columns of a plot: their times and largest values."""
     step = -(-len(times) // 600)
     starts = np.arange(0, len(times), step)

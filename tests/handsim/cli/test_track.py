@@ -445,7 +445,7 @@ def test_seconds_count_from_the_first_frame(tmp_path, monkeypatch):
 def test_a_source_of_the_user_s_own_that_is_refused_is_tried_again(tmp_path, monkeypatch, capsys):
     (tmp_path / "refused.py").write_text(REFUSED)
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr("track.live.live_tracking._RETRY", 0.01)
+    monkeypatch.setattr("track.live.live_tracking._RETRY_PERIOD", 0.01)
     out = tmp_path / "live.npz"
     assert main(["track", "--live", "refused:Late", "--size", "M", "--out", str(out)]) == 0
     assert load_take(out).num_frames == 30
@@ -456,9 +456,9 @@ def test_a_source_of_the_user_s_own_that_is_refused_is_tried_again(tmp_path, mon
 def test_a_user_is_calibrated_from_a_stream(enough, capture, tmp_path, monkeypatch, capsys):
     (tmp_path / "played.py").write_text(PLAYED)
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr("track.calibration.user_calibration._LOOK_PERIOD", 0.0)
-    monkeypatch.setattr("track.calibration.user_calibration._ASK_PERIOD", 0.0)
-    monkeypatch.setattr("track.calibration.user_calibration._LEAST_HANDS_TIME", -1.0)
+    monkeypatch.setattr("track.calibration.user_calibration._EXAMINATION_PERIOD", 0.0)
+    monkeypatch.setattr("track.calibration.user_calibration._REQUEST_PERIOD", 0.0)
+    monkeypatch.setattr("track.calibration.user_calibration._LEAST_TRACKED_TIME", -1.0)
     monkeypatch.setattr(messages.LiveStatus, "due", True)
     if enough:
         monkeypatch.setattr("track.calibration.user_calibration.still_joints", lambda *seen: ())
@@ -498,7 +498,7 @@ class Late:
 def test_a_stream_whose_frames_have_no_points_is_told_at_once(size, tmp_path, monkeypatch, capsys):
     (tmp_path / f"empty_{size}.py").write_text(EMPTY)
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr("track.streams.live_stream._EMPTY", -1.0)
+    monkeypatch.setattr("track.streams.live_stream._EMPTY_TIME", -1.0)
     main(["track", "--live", f"empty_{size}:Late", "--size", size, "--out", str(tmp_path / "live.npz")])
     said = "frames arrive, but no point was in any of them; is the cover off?"
     assert capsys.readouterr().err.splitlines().count(said) == 1
@@ -677,7 +677,7 @@ def test_a_session_without_any_output_is_refused(arguments, words, capsys):
 def test_a_server_without_frames_ends_a_session_of_a_given_length(
     seconds, output, tmp_path, capsys, monkeypatch, interrupt
 ):
-    monkeypatch.setattr("track.live.live_tracking._FIRST_FRAME", 0.5)
+    monkeypatch.setattr("track.live.live_tracking._FIRST_FRAME_WAIT", 0.5)
     monkeypatch.setattr("track.live.live_tracking.open_source", functools.partial(open_source, silence=0.1))
     (tmp_path / "waits.py").write_text(LATE.replace("time.sleep(1.0)", "time.sleep(1e6)"))
     monkeypatch.syspath_prepend(tmp_path)
@@ -699,7 +699,7 @@ def test_a_server_without_frames_ends_a_session_of_a_given_length(
 
 @pytest.mark.parametrize("scheme", ["natnet", "qtm"])
 def test_a_server_that_never_answers_ends_a_session_of_a_given_length(scheme, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("track.live.live_tracking._FIRST_FRAME", 0.5)
+    monkeypatch.setattr("track.live.live_tracking._FIRST_FRAME_WAIT", 0.5)
     monkeypatch.setattr(f"track.streams.{'natnet' if scheme == 'natnet' else 'qualisys'}._PATIENCE", 0.2)
     with socket.socket(
         socket.AF_INET, socket.SOCK_DGRAM if scheme == "natnet" else socket.SOCK_STREAM

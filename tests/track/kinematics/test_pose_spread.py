@@ -22,7 +22,7 @@ from track.kinematics.marker_kinematics import hand_arrays
 from track.kinematics.pose_solver import PoseSolver
 from track.kinematics.pose_spread import (
     NOT_SMOOTHED,
-    NUM_NUMBERS,
+    SKELETON_NUMBERS,
     SOURCES,
     HandErrors,
     MarkerPrediction,
@@ -86,7 +86,7 @@ def test_they_are_what_other_bones_directions_and_places_make_of_the_solver(rng)
     digits, shape = hand_arrays(fit).digits, fit.shape
     qpos, solver = sample_poses(fit.model, 1, rng=rng), PoseSolver(fit)
     usual = known_hand(digits, 0.0002)
-    numbers = np.zeros((NUM_NUMBERS, 50))
+    numbers = np.zeros((SKELETON_NUMBERS, 50))
     np.fill_diagonal(numbers, np.tile(np.repeat([0.0004, np.deg2rad(0.8), 0.01], 3), 5))
     numbers[:45, 45:] = np.kron(np.eye(5), np.repeat([0.0, 0.01], [6, 3])[:, None])
     errors = HandErrors(numbers, np.zeros((30, 3, 50)))

@@ -47,7 +47,7 @@ class AtOnce:
 @pytest.fixture(autouse=True)
 def _here(monkeypatch):
     monkeypatch.setattr(live_sizing, "LocalProcesses", AtOnce)
-    monkeypatch.setattr(live_sizing, "_NICE", 0)
+    monkeypatch.setattr(live_sizing, "_NICENESS", 0)
 
 
 @cache

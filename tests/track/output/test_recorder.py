@@ -256,7 +256,7 @@ def test_too_few_frames_leave_nothing(frames, tmp_path):
 
 
 def test_of_a_long_take_parts_are_read_for_its_summary(tmp_path, monkeypatch):
-    monkeypatch.setattr(module, "_SUMMARIZED", 10)
+    monkeypatch.setattr(module, "_MOST_SUMMARIZED", 10)
     tracker, pairs = tracked()
     recorder = Recorder(tmp_path / "take.npz", tracker)
     for number, (frame, one) in enumerate(pairs):

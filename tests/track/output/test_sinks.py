@@ -477,7 +477,7 @@ def test_a_slow_client_loses_frames_and_delays_nobody(message):
         while sink.dropped < 50 and sent < 5000:
             sink.send(frame)
             sent += 1
-            wait_for(lambda least=sent - web_socket._WAITING // 2: len(got) > least)
+            wait_for(lambda least=sent - web_socket._MOST_WAITING // 2: len(got) > least)
         assert sink.dropped >= 50, "the slow client lost frames"
         wait_for(lambda: len(got) == sent + 1)
         slow.close()
@@ -670,7 +670,7 @@ def test_a_process_without_free_files_prints_no_traceback(pause):
 
 
 def test_the_last_frames_are_sent_before_it_closes(message, monkeypatch):
-    monkeypatch.setattr(web_socket, "_FLUSH", LONG)
+    monkeypatch.setattr(web_socket, "_FLUSH_TIME", LONG)
     sink = open_sink("ws://:0?format=msgpack&every=yes")
     got: list[bytes] = []
     with connect(url(sink)) as client:
@@ -689,7 +689,7 @@ def test_the_last_frames_are_sent_before_it_closes(message, monkeypatch):
 @pytest.mark.parametrize("format", ["json", "msgpack"])
 def test_a_slow_client_gets_the_newest_frame_whenever_it_reads(format, message, monkeypatch):
     """Whatever its library reads ahead: what comes while its program does other things is dropped."""
-    monkeypatch.setattr(web_socket, "_FLUSH", LONG)
+    monkeypatch.setattr(web_socket, "_FLUSH_TIME", LONG)
     sink = open_sink(f"ws://:0?format={format}")
     decode = json.loads if format == "json" else msgpack.unpackb
     for options in ({}, {"max_queue": 1}):
@@ -698,7 +698,7 @@ def test_a_slow_client_gets_the_newest_frame_whenever_it_reads(format, message, 
             sink.send(message(0))
             assert decode(client.recv(timeout=LONG))["type"] == "header"
             for number in (1, 2):  # by which the sink knows that it is slow
-                time.sleep(5.0 * web_socket._SLOW)
+                time.sleep(5.0 * web_socket._SLOW_READ)
                 assert decode(client.recv(timeout=LONG))["type"] == "frame"
                 sink.send(message(number))
             for last in range(10, 60, 10):
@@ -706,7 +706,7 @@ def test_a_slow_client_gets_the_newest_frame_whenever_it_reads(format, message, 
                 for number in range(last - 9, last + 1):
                     sink.send(message(number))
                 wait_for(lambda dropped=dropped: sink.dropped >= dropped + 9)
-                time.sleep(5.0 * web_socket._SLOW)
+                time.sleep(5.0 * web_socket._SLOW_READ)
                 assert decode(client.recv(timeout=LONG))["number"] == last
         wait_for(lambda: sink.num_clients == 0)
     sink.close()
@@ -714,7 +714,7 @@ def test_a_slow_client_gets_the_newest_frame_whenever_it_reads(format, message, 
 
 @pytest.mark.parametrize("agent", ["Python websockets/16.1.1", "other"])
 def test_clients_that_read_at_once_get_frames_until_the_end(agent, message, monkeypatch):
-    monkeypatch.setattr(web_socket, "_FLUSH", LONG)
+    monkeypatch.setattr(web_socket, "_FLUSH_TIME", LONG)
     sink, got = open_sink("ws://:0"), []
     with connect(url(sink), user_agent_header=agent) as client:
         wait_for(lambda: sink.num_clients == 1)
@@ -729,7 +729,7 @@ def test_clients_that_read_at_once_get_frames_until_the_end(agent, message, monk
 
 
 def test_a_client_that_does_not_read_gets_one_old_frame_and_the_end(message, monkeypatch):
-    monkeypatch.setattr(web_socket, "_FLUSH", LONG)
+    monkeypatch.setattr(web_socket, "_FLUSH_TIME", LONG)
     sink = open_sink("ws://:0")
     with connect(url(sink)) as client:
         wait_for(lambda: sink.num_clients == 1)

@@ -303,7 +303,7 @@ def say_frames(puppet: Puppet, version: tuple[int, int], frames: list[np.ndarray
 
 @pytest.mark.parametrize("version", VERSIONS)
 def test_points_of_marker_sets_are_used_beside_unlabeled_ones(version, monkeypatch):
-    monkeypatch.setattr("track.streams.live_stream._EMPTY", -1.0)
+    monkeypatch.setattr("track.streams.live_stream._EMPTY_TIME", -1.0)
     points = np.array([[0.25, 0.5, 0.75], [0.0, 0.0, 0.0], [0.5, 0.5, 1.0]])
     with Puppet(unicast(version)) as puppet, opened(puppet.url) as stream:
         say_frames(puppet, version, [points, points[:0], points])
@@ -316,7 +316,7 @@ def test_points_of_marker_sets_are_used_beside_unlabeled_ones(version, monkeypat
 
 @pytest.mark.parametrize("version", VERSIONS)
 def test_frames_without_points_name_the_switch(version, monkeypatch):
-    monkeypatch.setattr("track.streams.live_stream._EMPTY", -1.0)
+    monkeypatch.setattr("track.streams.live_stream._EMPTY_TIME", -1.0)
     with Puppet(unicast(version)) as puppet, opened(puppet.url) as stream:
         assert not stream.point_doubt, "no frame came"
         say_frames(puppet, version, [np.empty((0, 3))] * 3)
@@ -432,7 +432,7 @@ def frames(stream: PointStream) -> list[int]:
 def test_a_quiet_server_is_greeted_anew(monkeypatch):
     now = [50.0]
     monkeypatch.setattr(natnet, "_KEEP_ALIVE", 0.1)
-    monkeypatch.setattr(natnet, "_ATTENDED", 0.01)
+    monkeypatch.setattr(natnet, "_ATTEND_PERIOD", 0.01)
     monkeypatch.setattr(natnet, "time", SimpleNamespace(monotonic=lambda: now[0], time=time.time))
     with Puppet(unicast((4, 1))) as server:
         stream = open_stream(server.url)
@@ -474,7 +474,7 @@ def test_multicast_is_heard_on_loopback():
 
 def test_a_server_that_comes_back_with_another_group_and_port_is_heard(monkeypatch):
     monkeypatch.setattr(natnet, "_KEEP_ALIVE", 0.1)
-    monkeypatch.setattr(natnet, "_ATTENDED", 0.01)
+    monkeypatch.setattr(natnet, "_ATTEND_PERIOD", 0.01)
     with contextlib.ExitStack() as stack:
         senders = [stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) for _ in range(2)]
         infos = []
@@ -543,7 +543,7 @@ def test_why_no_frame_comes_is_told(monkeypatch):
         server.say(frame(1, (4, 1)))
         assert not next(one for one in stream if not one.silent).silent
         assert stream.silence_doubt == "is the server playing?"
-        monkeypatch.setattr(natnet, "_UNANSWERED", -1.0)
+        monkeypatch.setattr(natnet, "_AWAY_TIME", -1.0)
         assert (
             stream.silence_doubt
             == f"the server at {LOOPBACK} no longer answers; it is called again and again"
