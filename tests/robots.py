@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -48,3 +50,33 @@ def turn_to_dex_retargeting(keypoints: np.ndarray) -> float:
         side, normal = -side, -normal
     to_mano = np.array([[0, 0, -1], [-1, 0, 0], [0, 1, 0]])  # OPERATOR2MANO_RIGHT
     return float(Rotation.from_matrix(np.stack([back, normal, side], axis=1) @ to_mano).magnitude())
+
+
+def check_angles(page: dict[str, Any]) -> None:
+    """Check that the page's angles of the robot are in its ranges, one for each joint."""
+    model, robot = page["model"], page["robot"]
+    low, high = model.jnt_range.T
+    assert np.isfinite(robot).all() and (robot >= low).all() and (robot <= high).all()
+    middle = page["angles"]["middle_MCP_flexion"][page["there"]]
+    assert np.allclose(robot[:, model.joint("mfj1").qposadr[0]], middle)
+    assert set(page["FOLLOWS"]) == {model.joint(n).name for n in range(model.njnt)}
+
+
+def check_targets(page: dict[str, Any]) -> None:
+    """Check that live hands give the targets that the take gives, and lost hands none."""
+    model, angles, targets = page["model"], page["angles"], page["targets"]
+    assert set(page["MOTORS"]) == set(page["FOLLOWS"])
+    assert model.actuator(page["MOTORS"]["mfj1"]).name == "mfa1"
+    header = {"angles": list(angles)}
+    sent = targets(header, {"angles": [float(angles[name][page["there"]][5]) for name in angles]})
+    for joint in page["FOLLOWS"]:
+        assert abs(sent[joint] - page["robot"][5, model.joint(joint).qposadr[0]]) < 1e-9
+    assert targets(header, {"angles": None}) is None
+
+
+def check_rows(page: dict[str, Any]) -> None:
+    """Check that there is a row for each moment at a steady rate, of the stated shapes and types."""
+    rows, times = page["rows"], page["steady"].times
+    assert len(rows) == len(times) and np.allclose(np.diff(times), 1 / page["FPS"])
+    for key, feature in page["features"].items():
+        assert all(row[key].shape == feature["shape"] and row[key].dtype == feature["dtype"] for row in rows)

@@ -202,7 +202,7 @@ def balance(
 
 
 def matching_constants() -> dict[str, float]:
-    """Constants of `match_scores`, for other programs such as that of docs/how_to/onnx.md."""
+    """Constants of `match_scores`, for other programs such as that of docs/own_labelers.md."""
     return {
         **SINKHORN,
         "impossible": EXCLUDED_COST,

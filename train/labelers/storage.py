@@ -95,7 +95,7 @@ _MEANINGS: Final = {
     "pairs": "Probability for each point of each marker, no two points of one marker; the last column is a "
     "ghost.",
     "costs": "What each marker costs each point, then each point as a ghost, in its own column: labels are "
-    "the assignment of least cost, verified by a prior of hands (docs/how_to/onnx.md).",
+    "the assignment of least cost, verified by a prior of hands (docs/own_labelers.md).",
     "images": "Depth images of Han et al. 2018: 52 x 52, a pixel a point, brightness its depth; 0 where "
     "there is none.",
     "positions": "Predicted position of each marker in the view: x right, y down, z away; 1 is half an "

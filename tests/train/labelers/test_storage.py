@@ -193,7 +193,7 @@ def test_a_capture_is_labeled_without_torch(exported, tmp_path, rng):
 
 @pytest.fixture(scope="module")
 def program():
-    """The example that needs no handsim, of which docs/how_to/onnx.md tells."""
+    """The example that needs no handsim, of which docs/own_labelers.md tells."""
     return EXAMPLE.read_text("utf-8")
 
 
