@@ -96,7 +96,7 @@ def _makers(data: Path | None, level: int) -> Iterator[tuple[str, Callable[[], T
 
 
 def _mirror_like() -> MarkerLayout:
-    """A glove like its own mirror image: markers on the finger tips, and four that are symmetric on the back."""
+    """A glove like its mirror image: markers on the finger tips, and four that are symmetric on the back."""
     places = [MarkerPlace(bone, bone, along=0.7, around=0.0) for bone in _TIPS]
     for number, (along, across) in enumerate(_BACK):
         places.append(MarkerPlace(f"Back{number}", "palm", along=along, around=0.0, across=across))
