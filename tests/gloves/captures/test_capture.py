@@ -185,31 +185,13 @@ def test_recurring_zeros_are_missing_and_counted(hand, tmp_path, suffix):
     positions[3:9, 4] = 0.0
     positions[:, 7] = 0.0  # a marker that was never seen
     path = tmp_path / f"take{suffix}"
-    if suffix == ".csv":
-        path.write_text(motive(positions))
-    else:
-        write_capture(path, Capture(NAMES_PLAUSIBILITY, positions, 120.0))
+    write_capture(path, Capture(NAMES_PLAUSIBILITY, positions, 120.0))
     with pytest.warns(HandSimWarning, match=r"36 points at exactly \(0, 0, 0\) are read as missing"):
         capture = read_capture(path)
     missing = np.isnan(capture.positions[..., 0])
     expected = np.zeros_like(missing)
     expected[3:9, 4] = expected[:, 7] = True
     np.testing.assert_array_equal(missing, expected)
-
-
-def motive(positions: np.ndarray) -> str:
-    """A Motive export in meters."""
-    columns = [name for name in NAMES_PLAUSIBILITY for _ in "XYZ"]
-    rows = [
-        "Format Version,1.23,Export Frame Rate,120,Length Units,Meters",
-        ",,Type" + ",Marker" * len(columns),
-        ",,Name," + ",".join(columns),
-        ",,," + ",".join(["Position"] * len(columns)),
-        "Frame,Time (Seconds),," + ",".join("XYZ" * len(NAMES_PLAUSIBILITY)),
-    ]
-    for number, row in enumerate(positions.reshape(len(positions), -1)):
-        rows.append(f"{number},{number / 120.0},," + ",".join(f"{value:.6f}" for value in row))
-    return "\n".join(rows) + "\n"
 
 
 def test_a_single_zero_and_what_stands_still_stay(hand):

@@ -163,15 +163,6 @@ def test_a_guess_is_corrected_and_written_with_page_and_users(trial, tmp_path, c
     assert f"a right hand of {1e3 * hand.model.shape.length:.0f} x" in told
 
 
-@pytest.mark.slow
-def test_a_glove_is_learned_from_a_labs_own_names(tmp_path, capsys):
-    write_capture(tmp_path / "trial.c3d", lab_trial("calibration", 1200, 2)[0])
-    out = tmp_path / "mine.toml"
-    assert main(["glove", "learn", str(tmp_path / "trial.c3d"), "--radius-mm", "3.2", "--out", str(out)]) == 0
-    assert load_layout(out).num_markers == 19 and load_layout(out).radius == pytest.approx(0.0032)
-    assert "mine: 19 markers" in capsys.readouterr().out
-
-
 @pytest.mark.parametrize("words", LEARNED)
 def test_what_cannot_be_learned_from_is_refused(words, trial, capsys):
     points = np.random.default_rng(0).uniform(0.0, 0.1, (12, 3, 3))
