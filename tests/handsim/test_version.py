@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +15,7 @@ from gloves.takes.take import Take
 from handsim import HandModel, __version__
 from handsim._version import BAKED, describe, full_version
 from handsim.pages import write_sections
-from tests.programs import ROOT
+from tests.programs import ROOT, run_python
 
 RELEASE = "1.2.0"
 
@@ -103,5 +102,4 @@ def test_takes_and_pages_state_the_version(tmp_path):
 
 def test_the_command_states_it():
     code = "import sys; from handsim.cli.main import main; sys.exit(main(['--version']))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
-    assert done.stdout == f"handsim {full_version()}\n"
+    assert run_python(code).stdout == f"handsim {full_version()}\n"

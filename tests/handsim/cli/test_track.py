@@ -75,6 +75,15 @@ class Late:
     def close(self):
         pass
 """
+EMPTY = LATE.replace("time.sleep(1.0)", "").replace("np.full((6, 3), 0.1 * number), np.arange(6)", "*NOTHING")
+EMPTY = EMPTY.replace(
+    "class Late:",
+    """NOTHING = np.empty((0, 3)), np.empty(0, dtype=int)
+
+class Late:
+    without_points = "is the cover off?"
+""",
+)
 REFUSED = LATE.replace(
     "class Late:",
     """class Late:
@@ -103,15 +112,6 @@ class Played:
     def close(self):
         pass
 """
-
-
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory):
-    out = tmp_path_factory.mktemp("take") / "take.c3d"
-    assert (
-        main(["simulate", "--kind", "hand-controller", "--num-frames", str(FRAMES), "--out", str(out)]) == 0
-    )
-    return out
 
 
 @pytest.fixture(scope="module")
@@ -481,17 +481,6 @@ def test_a_user_is_calibrated_from_a_stream(enough, capture, tmp_path, monkeypat
     assert main(["calibrate", "--seconds", "9", str(capture), "--out", str(out)]) == 1
     assert main(["calibrate", "--out", str(out)]) == 1
     assert "neither a capture nor --live" in capsys.readouterr().err
-
-
-EMPTY = LATE.replace("time.sleep(1.0)", "").replace("np.full((6, 3), 0.1 * number), np.arange(6)", "*NOTHING")
-EMPTY = EMPTY.replace(
-    "class Late:",
-    """NOTHING = np.empty((0, 3)), np.empty(0, dtype=int)
-
-class Late:
-    without_points = "is the cover off?"
-""",
-)
 
 
 @pytest.mark.parametrize("size", ["auto", "M"])

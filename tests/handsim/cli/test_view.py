@@ -24,13 +24,6 @@ from track.viewer.timeline import LiveView
 FRAMES = 60
 
 
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory):
-    out = tmp_path_factory.mktemp("take") / "take.c3d"
-    assert main(["simulate", "--kind", "hand-pen", "--num-frames", str(FRAMES), "--out", str(out)]) == 0
-    return out
-
-
 def test_a_file_is_served_until_ctrl_c(capture, capfd):
     said: list[str] = []
     pages: list[bytes] = []
