@@ -21,16 +21,8 @@ RELEASE = "1.2.0"
 
 
 def git(folder: Path, *arguments: str) -> str:
-    own = [
-        "-c",
-        "user.name=a",
-        "-c",
-        "user.email=a@b",
-        "-c",
-        "commit.gpgsign=false",
-        "-c",
-        "tag.gpgsign=false",
-    ]
+    stated = ("user.name=a", "user.email=a@b", "commit.gpgsign=false", "tag.gpgsign=false")
+    own = [word for one in stated for word in ("-c", one)]
     command = ["git", "-C", str(folder), *own, *arguments]
     return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
 
