@@ -15,7 +15,7 @@ from gloves.takes.take import Take
 from handsim import HandModel, __version__
 from handsim._version import BAKED, describe, full_version
 from handsim.pages import write_sections
-from tests.programs import ROOT, run_python
+from tests.programs import ROOT
 
 RELEASE = "1.2.0"
 
@@ -90,8 +90,3 @@ def test_takes_and_pages_state_the_version(tmp_path):
         assert json.loads(str(stored["header"]))["handsim"] == full_version()
     write_sections(tmp_path / "page.html", [], title="a", lead="b")
     assert f"Made by handsim {full_version()}." in (tmp_path / "page.html").read_text()
-
-
-def test_the_command_states_it():
-    code = "import sys; from handsim.cli.main import main; sys.exit(main(['--version']))"
-    assert run_python(code).stdout == f"handsim {full_version()}\n"

@@ -30,7 +30,6 @@ from handsim.app import messages
 from handsim.cli.main import main
 from handsim.space.objects import named_object
 from tests.limits import file_size_limit
-from tests.sentences import assert_names
 from tests.waiting import LONG, signal_once, wait_for
 from track import Recorder, ReplayServer, User, captures, load_user, open_source, track_capture
 from track.bodies.rigid_body import load_body
@@ -624,31 +623,6 @@ def test_hands_are_sent_without_a_recording(capture, tmp_path, capsys, monkeypat
     heard, said = numbers_heard(listener), capsys.readouterr()
     assert len(heard) > 1 and not list(tmp_path.iterdir()) and "recording" not in said.err
     assert re.match(r"\d+ frames, \d\.\d s\n", said.out) and "frames sent to udp" in said.out
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (
-            "--live natnet://host",
-            "given --live natnet://host without --out | --out FILE.npz, --send ADDRESS or",
-        ),
-        ("take.c3d", "given the capture take.c3d without --out, expected --out FILE.npz"),
-        ("take.c3d --send udp://:9", "given the capture take.c3d without --out, expected --out FILE.npz"),
-        (
-            "--live natnet://host --send udp://:9 --labeled l.trc",
-            "and --labeled l.trc without --out, expected",
-        ),
-        (
-            "--live natnet://host --seconds 5",
-            "without --out, expected --out FILE.npz, --send ADDRESS or both",
-        ),
-        ("", "given neither a capture nor --live"),
-    ],
-)
-def test_a_session_without_any_output_is_refused(arguments, words, capsys):
-    assert main(["track", *arguments.split()]) == 1
-    assert_names(capsys.readouterr().err.strip(), words)
 
 
 @pytest.mark.parametrize("seconds", [["--seconds", "0.2"], []])
