@@ -223,7 +223,7 @@ CASES = {
     "track --live natnet://host": "--live natnet://host without --out | --out FILE.npz, --send ADDRESS or",
     "track --live qtm://h --seconds 5": "without --out, expected --out FILE.npz, --send ADDRESS or both",
     "track --live qtm://h --send udp://:9 --labeled l.trc": "and --labeled l.trc without --out, expected",
-    "track --live qtm://h --known index_PIP_flexion=6 --out o.npz": "--known and --live qtm://h | all of which",
+    "track --live qtm://h --known index_PIP_flexion=6 --out o.npz": "--known and --live qtm://h | a capture",
     "track good.trc empty.trc --out out.npz": "out.npz for several captures, expected a folder",
     "track good.trc new.npz": "expected a folder; did you mean --out new.npz?",
     "track good.trc empty.trc --out out --labeled out.trc": "expected one capture",
