@@ -40,6 +40,9 @@ from tests.programs import run_python
 SEEDS = st.integers(0, 100_000)
 
 
+points = arrays(np.float64, (4, 3), elements=st.floats(-1, 1, width=32))
+
+
 def _quaternion(rotation: Rotation) -> np.ndarray:
     return np.ascontiguousarray(rotation.as_quat(scalar_first=True))
 
@@ -111,9 +114,6 @@ def test_rigid_fits_are_the_best_ones():
 
 def segment_distance(p, q, a, b):
     return np.sqrt(segment_distance_squared(p, q, a, b))
-
-
-points = arrays(np.float64, (4, 3), elements=st.floats(-1, 1, width=32))
 
 
 @given(points)

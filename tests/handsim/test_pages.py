@@ -2,11 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -15,8 +10,8 @@ from gloves.fit import nominal_fit
 from handsim import join_qpos, write_page
 from handsim.errors import ArgumentError
 from handsim.pages import Section, write_sections
+from tests.programs import run_python
 
-ROOT = Path(__file__).resolve().parents[2]
 BROKEN = "font.size: 3\n# \xe9\n"
 ODD = "font.size: 30\nlines.linewidth: 9\ntext.usetex: True\nsvg.fonttype: none\nbackend: nonsense\n"
 
@@ -84,10 +79,8 @@ def test_pictures_are_the_same_whatever_the_users_matplotlib_is(files, variables
     for name, text in files.items():
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(text, "latin-1")
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), **variables}
-    command = [sys.executable, "-c", f"{DRAWN}print(drawn())"]
-    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
-    assert done.stdout.strip() == drawn_here(), done.stderr
+    done = run_python(f"{DRAWN}print(drawn())", folder=tmp_path, **variables)
+    assert done.stdout.strip() == drawn_here()
 
 
 def test_the_users_own_settings_stay(monkeypatch):

@@ -7,9 +7,7 @@ import inspect
 import math
 import os
 import pickle
-import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -28,8 +26,8 @@ from handsim._process import (
 )
 from handsim.app.workers import check_workers, usable_cores
 from handsim.files.outputs import available_bytes
+from tests.programs import run_python
 
-ROOT = Path(__file__).resolve().parents[2]
 LAUNCHED = [name for names in _process._RANK_VARIABLES for name in names]
 PACKAGES = ("handsim", "poses", "gloves", "render", "train", "track", "film")
 
@@ -205,7 +203,7 @@ def test_every_public_function_computes_with_our_own_settings(package):
 
 
 @pytest.mark.slow
-def test_a_take_is_tracked_and_drawn_where_numpy_raises(tmp_path):
+def test_a_take_is_tracked_and_drawn_where_numpy_raises():
     """From the first import on, in a process of its own."""
     script = """
 import numpy as np, warnings
@@ -221,12 +219,4 @@ assert (tracker.step(take.points[0][np.isfinite(take.points[0, :, 0])], time=0.0
 (frame,) = draw(tracked, frames=[30], seed=1, passes=("rgb",), painter="compiled")
 assert np.geterr() == dict.fromkeys(("divide", "over", "under", "invalid"), "raise")
 """
-    (tmp_path / "script.py").write_text(script)
-    done = subprocess.run(
-        [sys.executable, tmp_path / "script.py"],
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
+    run_python(script)

@@ -12,6 +12,7 @@ import tyro
 
 from handsim.errors import ArgumentError
 from handsim.settings import Expected, Limits, Mixture, Settings
+from tests.sentences import error_names
 
 
 class Thing:
@@ -53,28 +54,27 @@ class Options(Settings):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"num_frames": 0}, ("num_frames", "0", "at least 1")),
-        ({"num_frames": 1.5}, ("num_frames", "1.5", "whole number")),
-        ({"num_frames": True}, ("num_frames", "True", "whole number")),
-        ({"kind": "tow"}, ("kind", "tow", "two", "one")),
-        ({"kind": "two"}, ("two frames",)),
-        ({"hands": ("up",)}, ("hands", "up", "right", "left")),
-        ({"hands": 5}, ("hands", "5", "tuple")),
-        ({"chances": (0.5, 0.25)}, ("chances", "0.5", "smaller")),
-        ({"chances": (0.5,)}, ("chances", "2 values")),
-        ({"chances": (0.5, np.nan)}, ("chances", "nan", "0 to 1")),
-        ({"thing": 5}, ("thing", "5", "a Thing, or its name", "dense19")),
-        ({"out": 5}, ("out", "5", "path")),
-        ({"group": 5}, ("group", "5", "Group")),
-        ({"group": {"nose": 5}}, ("group", "nose", "noise")),
-        ({"group": {"noise": 0.0}}, ("noise", "0", "above 0")),
-        ({"frames": 5}, ("frames", "num_frames")),
+        ({"num_frames": 0}, "num_frames | 0 | at least 1"),
+        ({"num_frames": 1.5}, "num_frames | 1.5 | whole number"),
+        ({"num_frames": True}, "num_frames | True | whole number"),
+        ({"kind": "tow"}, "kind | tow | two | one"),
+        ({"kind": "two"}, "two frames"),
+        ({"hands": ("up",)}, "hands | up | right | left"),
+        ({"hands": 5}, "hands | 5 | tuple"),
+        ({"chances": (0.5, 0.25)}, "chances | 0.5 | smaller"),
+        ({"chances": (0.5,)}, "chances | 2 values"),
+        ({"chances": (0.5, np.nan)}, "chances | nan | 0 to 1"),
+        ({"thing": 5}, "thing | 5 | a Thing, or its name | dense19"),
+        ({"out": 5}, "out | 5 | path"),
+        ({"group": 5}, "group | 5 | Group"),
+        ({"group": {"nose": 5}}, "group | nose | noise"),
+        ({"group": {"noise": 0.0}}, "noise | 0 | above 0"),
+        ({"frames": 5}, "frames | num_frames"),
     ],
 )
 def test_a_mistake_ends_in_a_sentence_that_names_it(options, words):
-    with pytest.raises(ArgumentError) as told:
+    with error_names(ArgumentError, words):
         Options.of(None, options)
-    assert all(word in str(told.value) for word in words), str(told.value)
 
 
 def test_what_is_given_simply_becomes_what_the_annotation_says():

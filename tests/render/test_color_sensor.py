@@ -24,6 +24,9 @@ from render.color_sensor import (
 HEIGHT, WIDTH = 60, 200
 
 
+seconds = st.just(0.0) | st.floats(1e-6, 0.05)
+
+
 def every_value() -> np.ndarray:
     """All 256 values in all three colors."""
     return np.arange(256, dtype=np.uint8).repeat(3).reshape(16, 16, 3)
@@ -139,9 +142,6 @@ def middle(picture: np.ndarray) -> np.ndarray:
     """Center of light of each row [px]."""
     light = picture[..., 0].astype(np.float64)
     return light @ (np.arange(WIDTH) + 0.5) / light.sum(axis=1)
-
-
-seconds = st.just(0.0) | st.floats(1e-6, 0.05)
 
 
 @settings(max_examples=80, deadline=None)

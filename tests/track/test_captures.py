@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -14,6 +12,7 @@ from gloves import Capture, GloveFit, Status, Take, load_take, read_capture, wri
 from gloves.takes.take import LOST, STATUSES, TRACKED
 from handsim.space.objects import named_object
 from handsim.space.transforms import quaternion_matrix
+from tests.programs import run_python
 from track import (
     ReplayServer,
     RigidTemplate,
@@ -301,4 +300,4 @@ for cloud in np.random.default_rng(1).uniform(0.0, 0.1, (20, 19, 3)):
     labeler.label_frames([cloud])
 assert before and ready() == before, ready() - before
 """
-    subprocess.run([sys.executable, "-c", run], check=True)
+    run_python(run)

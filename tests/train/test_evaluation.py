@@ -23,6 +23,13 @@ from train.evaluation import (
     reliability,
 )
 
+points = st.integers(1, 60).flatmap(
+    lambda count: st.tuples(
+        arrays.arrays(float, count, elements=st.floats(0.0, 1.0, allow_subnormal=False)),
+        arrays.arrays(bool, count),
+    )
+)
+
 
 def _one_each(pairs):
     """Labels and truth of a frame in which no marker is there, or said, twice."""
@@ -152,14 +159,6 @@ def test_no_frames_and_no_points(rng):
         assert report.right.size == report.confidences.size == report.confusion.sum() == 0
         for figure in ("point_accuracy", "macro_f1", "calibration_error", "error_without_least_sure"):
             assert np.isnan(report.figures[figure])
-
-
-points = st.integers(1, 60).flatmap(
-    lambda count: st.tuples(
-        arrays.arrays(float, count, elements=st.floats(0.0, 1.0, allow_subnormal=False)),
-        arrays.arrays(bool, count),
-    )
-)
 
 
 def test_a_calibrated_source_has_no_error(rng):

@@ -32,6 +32,10 @@ from tests.rigs import mixed_rig
 FRAMES = 40
 
 
+coordinate = st.floats(-1.0, 1.0, width=32)
+corner = st.tuples(coordinate, coordinate, coordinate)
+
+
 @pytest.fixture(params=["right", "left"])
 def scene(request, rng):
     model = HandModel(sample_shape(side=request.param, rng=rng))
@@ -234,10 +238,6 @@ def test_unwanted_and_missing_are_never_clear(mesh_scene, rng):
     np.testing.assert_array_equal(some, everything & wanted & ~missing[..., None])
     bodies = np.tile(np.eye(4), (FRAMES, 1, 1))
     assert not clear_of_body(hand_tree(), bodies, holes, cameras, wanted)[missing].any()
-
-
-coordinate = st.floats(-1.0, 1.0, width=32)
-corner = st.tuples(coordinate, coordinate, coordinate)
 
 
 @settings(max_examples=60, deadline=None)

@@ -25,6 +25,7 @@ from handsim import HandModel, join_qpos, sample_shape
 from handsim.errors import ArgumentError, CaptureError, HandSimWarning
 from handsim.hand.model import KEYPOINT_NAMES, hand_keypoints, is_steady
 from handsim.space.transforms import random_quaternions
+from tests.sentences import error_names
 
 FRAMES, COLUMNS, MARKERS = 9, 47, 19
 PEN = RigidBody("pen", ("Pen1", "Pen2", "Pen3"), 0.05 * np.eye(3))
@@ -98,12 +99,8 @@ def header_of(path) -> dict:
 
 
 def assert_refused(path, *words: str) -> None:
-    with pytest.raises(CaptureError) as caught:
+    with error_names(CaptureError, " | ".join([f"{path}: ", *words])):
         load_take(path)
-    sentence = str(caught.value)
-    assert sentence.startswith(f"{path}: ") and "\n" not in sentence
-    for word in words:
-        assert word in sentence
 
 
 def test_what_is_saved_is_what_is_read(take, truth, tmp_path):
@@ -647,9 +644,8 @@ def test_a_rate_may_be_a_whole_number_and_an_axis_is_y_or_z(moving, tmp_path):
 
 
 def test_other_endings_are_refused_with_the_valid_ones(moving, tmp_path):
-    with pytest.raises(ArgumentError) as caught:
+    with error_names(ArgumentError, " | ".join(MOTION_FORMATS)):
         moving.export(tmp_path / "hands.fbx")
-    assert all(ending in str(caught.value) for ending in MOTION_FORMATS)
     assert not list(tmp_path.iterdir())
 
 

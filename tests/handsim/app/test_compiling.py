@@ -19,6 +19,7 @@ from handsim.app import compiling
 from handsim.app.compiling import ListedKernel, compile_kernels, known_types, read_list
 from handsim.callbacks import before_compiling
 from handsim.kernels import align_rigid, horn_matrix
+from tests.programs import run_python
 
 # Only rotations and the like, which take some seconds.
 SOME = """
@@ -167,7 +168,7 @@ except ValueError as error:
 (code,) = fill.inspect_llvm().values()
 assert "unicode" not in code
 """
-    subprocess.run([sys.executable, "-c", program], check=True)
+    run_python(program)
 
 
 @pytest.mark.slow

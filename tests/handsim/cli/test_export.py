@@ -104,21 +104,6 @@ def test_fps_resamples(folder, tmp_path):
     np.testing.assert_allclose([float(row["wrist_x_m"]) for row in rows], qpos[::2, 0], atol=1e-9)
 
 
-def test_options_of_motion_are_refused_for_a_scene(folder, tmp_path, capsys):
-    command = ["export", str(folder / "tracked.npz"), "--scene", str(tmp_path / "scene.usdc")]
-    for options in (["--forward=x"], ["--fps", "60"], ["--neutral", "0"], ["--guesses"]):
-        assert main([*command, *options]) == 1
-        assert "and --scene, expected --out with them" in capsys.readouterr().err
-    assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize("name", ["hands.parquet", "hands.openxr.json", "hands.fbx"])
-def test_unknown_endings_are_told_with_the_known_ones(folder, name, tmp_path, capsys):
-    assert main(["export", str(folder / "tracked.npz"), "--out", str(tmp_path / name)]) == 1
-    assert f"{name}', expected a name that ends in {', '.join(ENDINGS)}" in capsys.readouterr().err
-    assert not list(tmp_path.iterdir())
-
-
 def test_a_take_without_a_hand_is_refused(folder, tmp_path, capsys):
     take = load_take(folder / "tracked.npz")
     take.qpos[:], take.status[:] = np.nan, LOST

@@ -114,14 +114,6 @@ def test_an_opensim_model_begins_in_the_first_pose_of_a_take_with_any_axis_up(
     assert begins == pytest.approx(expected, abs=1e-9)
 
 
-def test_an_axis_that_points_up_needs_a_pose_in_an_opensim_model(
-    files: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    for given in (["hand.osim"], ["hand.glb", "--take", str(files / "one.truth.npz")]):
-        assert main(["hand", "--up", "y", "--out", str(tmp_path / given[0]), *given[1:]]) == 1
-        assert "expected --take and an --out that ends in .osim" in capsys.readouterr().err
-
-
 def test_servos_go_where_they_are_told(tmp_path: Path, rng: np.random.Generator) -> None:
     out = tmp_path / "hand.xml"
     assert main(["hand", "--out", str(out), "--size", "XS", "--actuators"]) == 0

@@ -98,27 +98,6 @@ def test_a_folder_is_labeled_by_one_labeler_past_a_capture_that_cannot_be_read(
     assert read_capture(out / "day" / "a.c3d").names[0] == f"right:{NAMES[0]}"
 
 
-@pytest.mark.parametrize(
-    ("captures", "out", "words"),
-    [
-        ("a.c3d b.c3d", "labeled.c3d", "labeled.c3d for several captures, expected a folder"),
-        ("a.c3d a.tsv", "labeled", "two outputs are labeled/a.c3d, expected two files"),
-        ("a.c3d b.c3d", ".", "is the input"),
-        ("", "labeled", "no capture outside of labeled is given"),
-        ("a.c3d", "labeled.txt", "labeled.txt: unknown file type"),
-        ("empty", "labeled", "empty holds no capture"),
-    ],
-)
-def test_outputs_of_several_captures_are_checked_first(captures, out, words, tmp_path, capsys, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "empty").mkdir()
-    for name in captures.split():
-        if name != "empty":
-            (tmp_path / name).write_text("not read")
-    assert main(["label", *captures.split(), "--out", out]) == 1
-    assert words in capsys.readouterr().err
-
-
 @pytest.mark.parametrize("side", ["right", "left"])
 def test_one_of_two_hands_is_labeled_where_it_is_named(side, take, tmp_path, capsys):
     write_capture(tmp_path / "in.c3d", take.capture())

@@ -24,13 +24,6 @@ RUN = "import sys; from handsim.cli.main import main; sys.exit(main(sys.argv[1:]
 FRAMES = 60
 
 
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory):
-    out = tmp_path_factory.mktemp("take") / "take.c3d"
-    assert main(["simulate", "--kind", "hand-hand", "--num-frames", str(FRAMES), "--out", str(out)]) == 0
-    return out
-
-
 @pytest.fixture
 def replay():
     """The command in a process of its own, ended with the test."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 
 import numpy as np
-import pytest
 
 from benchmarks.held_out import held_out_markers
 from gloves import Capture, load_layout, load_take, read_capture, write_capture
@@ -14,36 +13,26 @@ from handsim.cli.main import main
 FRAMES = 60
 
 
-@pytest.fixture(scope="module")
-def taken(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("take")
-    out = folder / "take.c3d"
-    assert (
-        main(["simulate", "--kind", "hand-controller", "--num-frames", str(FRAMES), "--out", str(out)]) == 0
-    )
-    return out
-
-
-def test_the_capture_and_its_truth_agree(taken):
-    assert sorted(path.name for path in taken.parent.iterdir()) == ["take.c3d", "take.truth.npz"]
-    capture, truth = read_capture(taken), load_take(taken.with_suffix(".truth.npz"))
-    assert capture.positions.shape == truth.points.shape == (FRAMES, truth.points.shape[1], 3)
-    assert capture.rate == truth.rate == 120.0
-    np.testing.assert_array_equal(np.isnan(capture.positions), np.isnan(truth.points))
-    np.testing.assert_allclose(capture.positions, truth.points, rtol=2e-7, atol=2e-7)
-    assert all(name.startswith("Unlabeled") for name in capture.names), "no name tells a marker"
+def test_the_capture_and_its_truth_agree(capture):
+    assert sorted(path.name for path in capture.parent.iterdir()) == ["take.c3d", "take.truth.npz"]
+    written, truth = read_capture(capture), load_take(capture.with_suffix(".truth.npz"))
+    assert written.positions.shape == truth.points.shape == (FRAMES, truth.points.shape[1], 3)
+    assert written.rate == truth.rate == 120.0
+    np.testing.assert_array_equal(np.isnan(written.positions), np.isnan(truth.points))
+    np.testing.assert_allclose(written.positions, truth.points, rtol=2e-7, atol=2e-7)
+    assert all(name.startswith("Unlabeled") for name in written.names), "no name tells a marker"
     assert truth.settings["kind"] == "hand-controller" and truth.settings["seed"] == 0
     json.dumps(truth.settings)
 
 
-def test_the_same_command_writes_the_same_bytes_and_tells_what(taken, tmp_path, capsys):
+def test_the_same_command_writes_the_same_bytes_and_tells_what(capture, tmp_path, capsys):
     out = tmp_path / "again" / "take.c3d"
     assert (
         main(["simulate", "--kind", "hand-controller", "--num-frames", str(FRAMES), "--out", str(out)]) == 0
     )
     said = capsys.readouterr().out
     assert f"{out}: {FRAMES} frames, " in said and str(out.with_suffix(".truth.npz")) in said
-    assert out.read_bytes() == taken.read_bytes()
+    assert out.read_bytes() == capture.read_bytes()
     assert main(["simulate", "--num-frames", "20", "--out", str(tmp_path / "text.trc"), "--seed", "4"]) == 0
     trc, truth = read_capture(tmp_path / "text.trc"), load_take(tmp_path / "text.truth.npz")
     np.testing.assert_allclose(trc.positions, truth.points, atol=1e-6)
@@ -65,8 +54,8 @@ def test_the_optics_are_options_of_the_command(tmp_path):
     assert truth.markers_present().mean() < 0.8
 
 
-def test_a_take_is_evaluated_with_its_own_gaps_and_ghosts(taken, tmp_path, capsys):
-    truth, figures = taken.with_suffix(".truth.npz"), tmp_path / "figures.json"
+def test_a_take_is_evaluated_with_its_own_gaps_and_ghosts(capture, tmp_path, capsys):
+    truth, figures = capture.with_suffix(".truth.npz"), tmp_path / "figures.json"
     assert main(["evaluate", str(truth), "--json", str(figures)]) == 0
     assert "120 hands in frames" in capsys.readouterr().out
     found = json.loads(figures.read_text())
@@ -102,9 +91,9 @@ def test_a_glove_that_the_labeler_does_not_know_is_told(tmp_path, capsys):
     assert said.count("\n") == 1 and "the labeler knows" in said
 
 
-def test_a_capture_like_a_trial_says_what_came_from_it(taken, tmp_path, capsys):
+def test_a_capture_like_a_trial_says_what_came_from_it(capture, tmp_path, capsys):
     out = tmp_path / "like.c3d"
-    command = ["simulate", "--kind", "free", "--num-frames", "60", "--like", str(taken), "--out", str(out)]
+    command = ["simulate", "--kind", "free", "--num-frames", "60", "--like", str(capture), "--out", str(out)]
     assert main([*command, "--optics.noise", "0.3"]) == 0
     said = capsys.readouterr().out
     assert "found" in said and "markers missing [%]" in said
@@ -124,9 +113,9 @@ def test_a_trial_with_one_marker_is_refused_in_one_sentence(tmp_path, capsys):
     assert not (tmp_path / "out.c3d").exists()
 
 
-def test_a_training_set_like_a_trial_keeps_the_options_that_are_given(taken, tmp_path, capsys):
+def test_a_training_set_like_a_trial_keeps_the_options_that_are_given(capture, tmp_path, capsys):
     out = tmp_path / "set"
-    command = ["generate", "--like", str(taken), "--num-frames", "64", "--workers", "1", "--out", str(out)]
+    command = ["generate", "--like", str(capture), "--num-frames", "64", "--workers", "1", "--out", str(out)]
     assert main([*command, "--blob-loss", "0.0", "0.15"]) == 0  # the default, but given
     said = capsys.readouterr().out
     config = json.loads((out / "config.json").read_text())

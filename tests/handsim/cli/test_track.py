@@ -30,8 +30,7 @@ from handsim.app import messages
 from handsim.cli.main import main
 from handsim.space.objects import named_object
 from tests.limits import file_size_limit
-from tests.sentences import assert_names
-from tests.waiting import LONG, wait_for
+from tests.waiting import LONG, signal_once, wait_for
 from track import Recorder, ReplayServer, User, captures, load_user, open_source, track_capture
 from track.bodies.rigid_body import load_body
 from track.streams import natnet
@@ -75,6 +74,15 @@ class Late:
     def close(self):
         pass
 """
+EMPTY = LATE.replace("time.sleep(1.0)", "").replace("np.full((6, 3), 0.1 * number), np.arange(6)", "*NOTHING")
+EMPTY = EMPTY.replace(
+    "class Late:",
+    """NOTHING = np.empty((0, 3)), np.empty(0, dtype=int)
+
+class Late:
+    without_points = "is the cover off?"
+""",
+)
 REFUSED = LATE.replace(
     "class Late:",
     """class Late:
@@ -103,15 +111,6 @@ class Played:
     def close(self):
         pass
 """
-
-
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory):
-    out = tmp_path_factory.mktemp("take") / "take.c3d"
-    assert (
-        main(["simulate", "--kind", "hand-controller", "--num-frames", str(FRAMES), "--out", str(out)]) == 0
-    )
-    return out
 
 
 @pytest.fixture(scope="module")
@@ -483,17 +482,6 @@ def test_a_user_is_calibrated_from_a_stream(enough, capture, tmp_path, monkeypat
     assert "neither a capture nor --live" in capsys.readouterr().err
 
 
-EMPTY = LATE.replace("time.sleep(1.0)", "").replace("np.full((6, 3), 0.1 * number), np.arange(6)", "*NOTHING")
-EMPTY = EMPTY.replace(
-    "class Late:",
-    """NOTHING = np.empty((0, 3)), np.empty(0, dtype=int)
-
-class Late:
-    without_points = "is the cover off?"
-""",
-)
-
-
 @pytest.mark.parametrize("size", ["auto", "M"])
 def test_a_stream_whose_frames_have_no_points_is_told_at_once(size, tmp_path, monkeypatch, capsys):
     (tmp_path / f"empty_{size}.py").write_text(EMPTY)
@@ -555,20 +543,7 @@ def test_a_kill_leaves_all_that_was_written(capture, tmp_path):
 def interrupt():
     """Sends a signal to this process once a condition holds and the command handles signals."""
     threads = []
-
-    def send(number, condition):
-        before = signal.getsignal(number)
-
-        def when_it_holds():
-            try:
-                wait_for(lambda: condition() and signal.getsignal(number) is not before)
-            finally:
-                os.kill(os.getpid(), number)
-
-        threads.append(threading.Thread(target=when_it_holds, daemon=True))
-        threads[-1].start()
-
-    yield send
+    yield lambda number, condition: threads.append(signal_once(condition, number))
     for thread in threads:
         thread.join()
 
@@ -626,15 +601,18 @@ def address_of(listener) -> str:
     return f"udp://127.0.0.1:{listener.getsockname()[1]}"
 
 
-def numbers_heard(listener) -> set[int]:
-    """The numbers of all frames that a listener was sent."""
-    heard = set()
+def heard(listener) -> list[dict]:
+    """All messages that a listener was sent."""
+    messages = []
     with contextlib.suppress(BlockingIOError):
         while True:
-            message = json.loads(listener.recv(1 << 16))
-            if message["type"] == "frame":
-                heard.add(message["number"])
-    return heard
+            messages.append(json.loads(listener.recv(1 << 16)))
+    return messages
+
+
+def numbers_heard(listener) -> set[int]:
+    """The numbers of all frames that a listener was sent."""
+    return {message["number"] for message in heard(listener) if message["type"] == "frame"}
 
 
 def test_hands_are_sent_without_a_recording(capture, tmp_path, capsys, monkeypatch, listener):
@@ -645,31 +623,6 @@ def test_hands_are_sent_without_a_recording(capture, tmp_path, capsys, monkeypat
     heard, said = numbers_heard(listener), capsys.readouterr()
     assert len(heard) > 1 and not list(tmp_path.iterdir()) and "recording" not in said.err
     assert re.match(r"\d+ frames, \d\.\d s\n", said.out) and "frames sent to udp" in said.out
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (
-            "--live natnet://host",
-            "given --live natnet://host without --out | --out FILE.npz, --send ADDRESS or",
-        ),
-        ("take.c3d", "given the capture take.c3d without --out, expected --out FILE.npz"),
-        ("take.c3d --send udp://:9", "given the capture take.c3d without --out, expected --out FILE.npz"),
-        (
-            "--live natnet://host --send udp://:9 --labeled l.trc",
-            "and --labeled l.trc without --out, expected",
-        ),
-        (
-            "--live natnet://host --seconds 5",
-            "without --out, expected --out FILE.npz, --send ADDRESS or both",
-        ),
-        ("", "given neither a capture nor --live"),
-    ],
-)
-def test_a_session_without_any_output_is_refused(arguments, words, capsys):
-    assert main(["track", *arguments.split()]) == 1
-    assert_names(capsys.readouterr().err.strip(), words)
 
 
 @pytest.mark.parametrize("seconds", [["--seconds", "0.2"], []])
@@ -777,27 +730,19 @@ def test_a_recording_folder_that_changes_meanwhile_costs_nothing_that_is_not_tol
     assert os.listdir(folder) == ["live.npz"]
 
 
-def test_hands_are_sent_as_they_are_tracked(capture, tmp_path, capsys, monkeypatch):
+def test_hands_are_sent_as_they_are_tracked(capture, tmp_path, capsys, monkeypatch, listener):
     """A capture is played at its own rate; every frame reaches a UDP listener."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
-        one.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 22)
-        one.bind(("127.0.0.1", 0))
-        address = f"udp://127.0.0.1:{one.getsockname()[1]}"
-        out, now = tmp_path / "take.npz", [50.0]
-        monkeypatch.setattr(captures, "monotonic", lambda: now[0])
-        monkeypatch.setattr(captures, "sleep", lambda seconds: now.append(now.pop() + seconds))
-        sent = ["--size", "M", "--send", address, "--no-smooth"]
-        assert main(["track", str(capture), "--out", str(out), *sent]) == 0
-        assert now[0] - 50.0 == pytest.approx((FRAMES - 1) / 120), "it waited until each frame's time"
-        one.setblocking(False)
-        heard = []
-        with contextlib.suppress(BlockingIOError):
-            while True:
-                heard.append(json.loads(one.recv(1 << 16)))
+    out, now = tmp_path / "take.npz", [50.0]
+    monkeypatch.setattr(captures, "monotonic", lambda: now[0])
+    monkeypatch.setattr(captures, "sleep", lambda seconds: now.append(now.pop() + seconds))
+    sent = ["--size", "M", "--send", address_of(listener), "--no-smooth"]
+    assert main(["track", str(capture), "--out", str(out), *sent]) == 0
+    assert now[0] - 50.0 == pytest.approx((FRAMES - 1) / 120), "it waited until each frame's time"
+    messages = heard(listener)
     take = load_take(out)
-    assert heard[0]["type"] == "header" and heard[0]["sides"] == ["right", "left"]
+    assert messages[0]["type"] == "header" and messages[0]["sides"] == ["right", "left"]
     poses = {}  # a message that is too long for a datagram has its hands in several parts
-    for one in heard:
+    for one in messages:
         for hand in one["hands"] if one["type"] == "frame" and "hands" in one else ():
             if "wrist" in hand:
                 poses[one["number"], hand["side"]] = hand
@@ -808,4 +753,4 @@ def test_hands_are_sent_as_they_are_tracked(capture, tmp_path, capsys, monkeypat
             if hand["wrist"] is not None and np.isfinite(pose).all():
                 np.testing.assert_allclose(hand["wrist"]["position"], pose[:3], atol=2e-6)
                 np.testing.assert_allclose(hand["angles"], pose[7:], atol=2e-6)
-    assert f"{FRAMES} frames sent to {address}" in capsys.readouterr().out
+    assert f"{FRAMES} frames sent to {address_of(listener)}" in capsys.readouterr().out

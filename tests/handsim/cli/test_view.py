@@ -6,8 +6,6 @@ import contextlib
 import os
 import re
 import signal
-import threading
-import time
 import urllib.request
 
 import cv2
@@ -18,35 +16,12 @@ from gloves import load_take
 from handsim.app import messages
 from handsim.cli.main import main
 from tests.limits import file_size_limit
+from tests.waiting import signal_once
 from track import ReplayServer
 from track.viewer.recordings import chosen_frames
 from track.viewer.timeline import LiveView
 
 FRAMES = 60
-
-
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory):
-    out = tmp_path_factory.mktemp("take") / "take.c3d"
-    assert main(["simulate", "--kind", "hand-pen", "--num-frames", str(FRAMES), "--out", str(out)]) == 0
-    return out
-
-
-def ended_after(condition, number: int = signal.SIGINT) -> threading.Thread:
-    """Sends a signal, Ctrl-C by default, once a condition holds."""
-    before = signal.getsignal(signal.SIGINT)
-
-    def interrupt() -> None:
-        end = time.monotonic() + 120.0
-        while not (condition() and signal.getsignal(signal.SIGINT) is not before):
-            if time.monotonic() > end:
-                break
-            time.sleep(0.05)
-        os.kill(os.getpid(), number)
-
-    thread = threading.Thread(target=interrupt, daemon=True)
-    thread.start()
-    return thread
 
 
 def test_a_file_is_served_until_ctrl_c(capture, capfd):
@@ -61,7 +36,7 @@ def test_a_file_is_served_until_ctrl_c(capture, capfd):
         pages.append(urllib.request.urlopen(found[0]).read())
         return True
 
-    thread = ended_after(served)
+    thread = signal_once(served)
     assert main(["view", str(capture), "--port", "0"]) == 0
     thread.join()
     assert "".join(said).startswith(f"{capture} (capture): http://127.0.0.1:")
@@ -83,7 +58,7 @@ def test_a_live_tracker_is_shown_and_recorded_and_frames_are_never_dropped(
 
     monkeypatch.setattr(LiveView, "send", send)
     with ReplayServer(capture.with_suffix(".truth.npz"), loop=True) as server:
-        thread = ended_after(lambda: len(offered) > 60 and shown[-1].pictures > 5)
+        thread = signal_once(lambda: len(offered) > 60 and shown[-1].pictures > 5)
         out = tmp_path / "take.npz"
         assert main(["view", "--live", server.url, "--size", "L", "--port", "0", "--out", str(out)]) == 0
         thread.join()
@@ -120,7 +95,7 @@ def test_a_live_view_ends_by_any_signal_and_goes_on_without_its_recording(
         number, limit = signal.SIGINT, file_size_limit(300_000)
     out = tmp_path / "take.npz"
     with ReplayServer(capture.with_suffix(".truth.npz"), loop=True) as server, limit:
-        thread = ended_after(is_enough, number)
+        thread = signal_once(is_enough, number)
         code = main(["view", "--live", server.url, "--size", "L", "--port", "0", "--out", str(out)])
         thread.join()
     assert code == (fault == "full disk")

@@ -38,6 +38,7 @@ from handsim.files.outputs import (
     written_together,
 )
 from handsim.files.signals import ENDING, Stopped, signals_raise
+from tests.programs import run_python
 from tests.renames import fails_at
 from tests.sentences import error_names
 from track import load_user
@@ -47,6 +48,7 @@ NAME = os.fsdecode(b"t\xe4ke")  # of an old Windows system
 SHOWN = "t\N{REPLACEMENT CHARACTER}ke"
 SAID = {".mot": f"{SHOWN}\n", ".html": "<title>Take t?ke.truth.npz</title>"}
 """What files say of names, by their endings."""
+names_are_bytes = pytest.mark.skipif(sys.platform != "linux", reason="names are text")
 SETTINGS = {"train": {"samples": 100, "seed": 3, "network": {"width": 64}}, "names": ["a", "b"]}
 
 
@@ -184,8 +186,7 @@ def test_what_a_process_that_was_killed_between_renames_left_is_removed(tmp_path
     files = [tmp_path / "take.c3d", tmp_path / "take.truth.npz"]
     for file in files:
         write(file, "old")
-    done = subprocess.run([sys.executable, "-c", script, *map(str, files)], check=False)
-    assert done.returncode == -signal.SIGKILL
+    assert run_python(script, *map(str, files), check=False).returncode == -signal.SIGKILL
     assert [file.read_text() for file in files] == ["newer", "old"]
     assert len(entries(tmp_path)) == 5, "a temporary file and two older ones"
     with written_together():
@@ -357,13 +358,12 @@ def test_memory_that_is_not_there_is_refused_with_both_sizes():
         check_memory(10**21, "5 frames", "ask for fewer frames")
 
 
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="names are text")
-
-
+@names_are_bytes
 def test_what_is_not_printable_is_replaced():
     assert as_text(NAME) == SHOWN and as_text("a\tb\n") == as_text("a\nb\t") and as_text("täke 1") == "täke 1"
 
 
+@names_are_bytes
 def test_a_path_that_is_no_text_has_a_link_that_is(tmp_path):
     (tmp_path / NAME).mkdir()
     path = tmp_path / NAME / f"{NAME}.c3d"
@@ -388,6 +388,7 @@ def folder(tmp_path_factory):
     return folder
 
 
+@names_are_bytes
 @pytest.mark.parametrize(
     ("command", "ending"),
     [
@@ -417,6 +418,7 @@ def test_commands_write_under_such_a_name(command, ending, folder, monkeypatch):
     assert not [one for one in os.listdir(out.parent) if one.startswith(".")]
 
 
+@names_are_bytes
 def test_a_user_calibrated_from_such_a_capture_is_kept(tmp_path):
     user = nominal_user(load_layout("dense19"), "M", ["right"])
     dataclasses.replace(user, notes=f"calibrated from {NAME}.c3d").save(tmp_path / "user.json")

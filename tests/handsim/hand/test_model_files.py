@@ -28,6 +28,9 @@ from handsim.hand.shape import BONE_NAMES, JOINT_NAMES
 FRAMES = 12
 
 
+PAGE = Path(__file__).parents[3] / "docs" / "motion_files.md"
+
+
 def test_mujoco_reads_it_and_bones_are_where_ours_are(model, rng):
     opened = mujoco.MjModel.from_xml_string(hand_urdf(model))
     data = mujoco.MjData(opened)
@@ -69,9 +72,6 @@ def test_cylinders_lie_along_the_capsules(model):
             for sphere, sign in ((start, -0.5), (end, 0.5)):
                 at = np.array(sphere.find("origin").get("xyz").split(), float)
                 np.testing.assert_allclose(center + sign * length * axis, at, atol=1e-9)
-
-
-PAGE = Path(__file__).parents[3] / "docs" / "motion_files.md"
 
 
 @pytest.fixture(params=["right", "left"])

@@ -21,6 +21,10 @@ BROWN = (
 FISHEYE = ((0.02, -0.006, 0.0, 0.0), (-0.013, 0.021, -0.02, 0.005))
 
 
+small = st.floats(-0.3, 0.3)
+tiny = st.floats(-0.01, 0.01)
+
+
 def directions(lens: Lens, count: int, *, most: float) -> np.ndarray:
     """Rays at most so far from the axis [rad], and before the lens's fold."""
     rng = np.random.default_rng(0)
@@ -55,10 +59,6 @@ def test_fisheye_is_opencvs(coefficients):
     np.testing.assert_allclose(ours, rays, atol=1e-9)
     back = cv2.fisheye.undistortPoints(lens.distort(rays)[:, None], np.eye(3), np.array(coefficients))[:, 0]
     np.testing.assert_allclose(ours[:, :2] / ours[:, 2:], back, atol=1e-5)
-
-
-small = st.floats(-0.3, 0.3)
-tiny = st.floats(-0.01, 0.01)
 
 
 @settings(max_examples=60, deadline=None)

@@ -81,6 +81,9 @@ coefficients = [-0.2, 0.05, 0.0, 0.0, 0.0]
 PLACES = [f"[[camera]]\nposition = [{x}, 0, 2.2]\ntarget = [0, 0, 1.1]\n" for x in (1.2, -1.2, 0.3)]
 
 
+distance = st.floats(-2.0, 2.0)
+
+
 def test_shipped_rigs_hold_what_their_names_say():
     counts = {name: len(load_rig(name).positions) for name in list_rigs()}
     assert counts == {"eight": 8, "figure5": 16, "six": 6}
@@ -142,9 +145,6 @@ def test_whatever_stands_for_a_rig_gives_it(tmp_path):
 def test_what_are_no_cameras_is_told(given):
     with pytest.raises(ArgumentError, match=r"rig 'mine' has .* as cameras, expected a sequence of Camera"):
         CameraRig("mine", given)
-
-
-distance = st.floats(-2.0, 2.0)
 
 
 @given(st.tuples(distance, distance, distance), st.tuples(distance, distance, distance))

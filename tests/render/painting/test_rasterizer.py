@@ -36,6 +36,8 @@ SPHERES = (
 )
 WALL = 1.5
 POSE = np.eye(4)
+POSE[:3, :3] = euler_matrix(np.array([0.3, -0.2, 0.1]))
+POSE[:3, 3] = 0.02, -0.01, 0.03
 K = np.array([[200.0, 0.0, 163.0], [0.0, 204.0, 116.0], [0.0, 0.0, 1.0]])
 WIDE = np.array([[110.0, 0.0, 161.5], [0.0, 112.0, 118.0], [0.0, 0.0, 1.0]])  # corners see past 90 degrees
 CAMERAS = {
@@ -146,10 +148,6 @@ def test_what_reaches_behind_the_camera_is_cut_off_and_not_left_out(away):
     inside = cv2.erode((theirs > 0).astype(np.uint8), np.ones((3, 3))) > 0
     assert (painted[..., 3][inside] == 255).all() and (pictures.parts[inside] == 1).all()
     assert np.allclose(np.linalg.norm(pictures.normals[inside], axis=-1), 1.0, atol=1e-5)
-
-
-POSE[:3, :3] = euler_matrix(np.array([0.3, -0.2, 0.1]))
-POSE[:3, 3] = 0.02, -0.01, 0.03
 
 
 def cast(camera: Camera) -> dict[str, np.ndarray]:

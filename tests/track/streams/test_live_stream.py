@@ -43,6 +43,9 @@ FATES = st.sampled_from(["good"] * 15 + ["drop", "double", "swap", "wild"])
 FRAMES = 120
 
 
+PAGE = Path(__file__).parents[3] / "docs" / "marker_files.md"
+
+
 @pytest.mark.parametrize("address", ["own_code:Counting", "own_code:Counting?frames=5"])
 def test_a_class_of_the_user_s_own(own, address):
     count = 5 if "frames" in address else 2
@@ -233,9 +236,6 @@ def test_whatever_happens_to_some_packets_the_others_go_on(fates, random):
     timed = [(number, time, at * INTERVAL) for (number, time, _), at in zip(packets, arrivals, strict=True)]
     gone = [number for number, _ in passed(order, timed)]
     assert gone == expected
-
-
-PAGE = Path(__file__).parents[3] / "docs" / "marker_files.md"
 
 
 class Trc:

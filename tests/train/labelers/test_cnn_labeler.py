@@ -24,6 +24,9 @@ NUM_MARKERS = 12
 STRAIGHT = np.eye(3)[None]
 
 
+seeds = st.integers(0, 100_000)
+
+
 @pytest.fixture(scope="module")
 def shape():
     """A cloud without symmetry, 12 markers [m]."""
@@ -134,9 +137,6 @@ def test_training_views_are_near_the_mean_hand_or_along_the_axes(hands, mean_han
     along = (cosines > 1.0 - 1e-9).all(axis=1)
     assert 0.3 < along.mean() < 0.5
     assert 8.0 < np.sqrt((turned[~along] ** 2).mean()) < 16.0
-
-
-seeds = st.integers(0, 100_000)
 
 
 def cloud(rng, batch=3, count=19):

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import shutil
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -14,6 +12,7 @@ import torch
 from gloves import load_layout
 from handsim.cli.doctor import check_learned_gloves
 from handsim.errors import HandSimWarning, WeightsError
+from tests.programs import run_python
 from train import Corruption, evaluate_labeler
 from train.labelers import layout_labeler
 from train.labelers.layout_labeler import (
@@ -29,6 +28,7 @@ from train.labelers.networks import LayoutNetworkConfig as Config
 from train.labelers.networks import distance_features
 from train.labelers.protocol import learned_folder, learned_gloves
 
+pytestmark = pytest.mark.usefixtures("own_cache")
 CLOUD = np.random.default_rng(0).normal(0, 0.05, (8, 3))
 
 
@@ -67,8 +67,7 @@ before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 mean_features(markers, LayoutNetworkConfig())
 print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
 """
-    told = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    assert int(told.stdout) < 600_000  # kilobytes
+    assert int(run_python(program).stdout) < 600_000  # kilobytes
 
 
 def test_labels_follow_the_order_of_the_layout(labeler):
@@ -119,9 +118,6 @@ def test_the_same_seed_gives_the_same_markers():
     layout = load_layout("tips8")
     one, two = (sample_worn_markers(layout, 30, rng=np.random.default_rng(3)) for _ in range(2))
     assert np.array_equal(one, two)
-
-
-pytestmark = pytest.mark.usefixtures("own_cache")
 
 
 def never(*_args, **_options):

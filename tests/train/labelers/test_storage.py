@@ -6,7 +6,6 @@ import ast
 import dataclasses
 import itertools
 import json
-import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -24,6 +23,7 @@ from handsim.errors import ArgumentError, WeightsError
 from handsim.files.models import stamp_model
 from handsim.hand.shape import DIGITS
 from poses import sample_poses
+from tests.programs import run_python
 from tests.sentences import error_names
 from train import CNNConfig, Corruption, SetLabelerConfig, corrupt, evaluate_labeler, load_labeler
 from train.labelers.cnn_labeler import MeanHand
@@ -70,6 +70,9 @@ class NoTorch:
 
 sys.meta_path.insert(0, NoTorch())
 """
+
+
+EXAMPLE = Path(__file__).parents[3] / "examples" / "17_label_with_onnxruntime.py"
 
 
 def write(folder, card, tensors=None):
@@ -159,9 +162,6 @@ def test_names_beyond_ascii_and_cards_that_say_little(tmp_path):
     assert load_labeler(tmp_path).marker_names == tuple(names)
 
 
-EXAMPLE = Path(__file__).parents[3] / "examples" / "17_label_with_onnxruntime.py"
-
-
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory):
     path = tmp_path_factory.mktemp("onnx") / "dense19.onnx"
@@ -187,7 +187,7 @@ def test_a_capture_is_labeled_without_torch(exported, tmp_path, rng):
     arguments = ["label", str(tmp_path / "take.trc"), "--labeler", str(exported)]
     arguments += ["--out", str(tmp_path / "out.trc")]
     program = NO_TORCH + f"from handsim.cli.main import main\nraise SystemExit(main({arguments!r}))"
-    subprocess.run([sys.executable, "-c", program], check=True, timeout=120)
+    run_python(program)
     assert read_capture(tmp_path / "out.trc").names[:19] == names
 
 

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import re
-import subprocess
-import sys
-from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
@@ -14,12 +11,12 @@ import pytest
 from handsim.cli.main import main
 from handsim.hand.shape import JOINT_NAMES, JOINTS
 from handsim.space.rig import CameraRig, load_rig
+from tests.programs import run_python
 from tests.train.reports.conftest import pictures
 from train import Dataset, generate_dataset
 from train.data.shards import row_dtype
 from train.reports import dataset_page as report
 
-ROOT = Path(__file__).resolve().parents[3]
 pytestmark = pytest.mark.filterwarnings("error::UserWarning")  # matplotlib's, for a figure that does not fit
 
 
@@ -145,4 +142,4 @@ assert not [name for name in sys.modules if name.startswith("matplotlib")]
 handsim.pages.picture((1, 1), lambda figure: figure.subplots())
 assert "matplotlib.figure" in sys.modules and "matplotlib.pyplot" not in sys.modules
 """
-    subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)
+    run_python(code)

@@ -50,7 +50,7 @@ from train.reports.run_page import (
     write_run_page,
 )
 
-pytestmark = pytest.mark.filterwarnings("error::UserWarning")  # matplotlib's, for a figure that does not fit
+pytestmark = pytest.mark.filterwarnings("error")  # matplotlib's, for a figure that does not fit
 SMALL = TrainSettings(samples=2560, batch=128, network=SetLabelerConfig(width=16, gates=4, depth=1))
 SHIPPED = json.loads(resources.files("train").joinpath("weights/dense19.json").read_text())
 
@@ -229,9 +229,6 @@ def test_a_labeler_without_mistakes_has_a_page(tmp_path, rng, without_pictures):
     card, report = made_up(19, rng, perfect=True)
     page = write_run_page(tmp_path, card, History([(256, 0.1, 0.6)], [(256, 0.1, 1.0)]), report)
     assert "No marker was taken for another" in page.read_text("utf-8")
-
-
-pytestmark = pytest.mark.filterwarnings("error")
 
 
 @pytest.mark.parametrize(
