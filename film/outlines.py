@@ -102,7 +102,8 @@ class Outlines:
         self._bundle, (width, height), take = bundle, bundle.size, bundle.take
         self._scale = min(1.0, _WIDEST / max(width, height))
         self._size = round(self._scale * width), max(1, round(self._scale * height))
-        self._skin_of = functools.lru_cache(2 * len(take.hands))(lambda fit: PosableSkin(fit.model, bony=0.5))
+        cached = functools.lru_cache(2 * len(take.hands))
+        self._skin_of = cached(lambda fit: PosableSkin(fit.model, bone_relief=0.5))
         self._bodies = [BodyFigure(body, (0.5, 0.5, 0.5)) for body in take.bodies]
         self._seen = np.zeros((len(take.hands), *3 * [_LEVELS]), np.float32)  # counts of the hands' colors
 
