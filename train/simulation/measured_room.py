@@ -141,9 +141,8 @@ def measure_simulated(take: Take) -> MeasuredRoom:
     labels, ids = take.labels.astype(np.int64), take.ids.astype(np.int64)
     count = len(take.label_names)
     tracks = np.where(labels >= 0, labels, np.where(ids >= 0, ids + count, -1))
-    return _combine(
-        [_figures_of_tracks(take.points, tracks, np.arange(count), take.rate, [False] * _FEWEST_EVENTS)]
-    )
+    changed = [False] * _FEWEST_EVENTS
+    return _combine([_figures_of_tracks(take.points, tracks, np.arange(count), take.rate, changed)])
 
 
 def _combine(seen: Sequence[_CaptureFigures]) -> MeasuredRoom:
@@ -153,17 +152,16 @@ def _combine(seen: Sequence[_CaptureFigures]) -> MeasuredRoom:
     flashes = np.concatenate([run_lengths(one.ghosts) / one.rate for one in seen])
     slots, points = sum(one.markers.size for one in seen), sum(int(one.markers.sum()) for one in seen)
     old_columns = [old for one in seen for old in one.old_columns]
-    lasting = (
-        bool(np.mean(old_columns) >= _LEAST_LASTING_SHARE) if len(old_columns) >= _FEWEST_EVENTS else None
-    )
+    enough_gaps, enough_ghosts = (len(one) >= _FEWEST_EVENTS for one in (gaps, flashes))
+    known = len(old_columns) >= _FEWEST_EVENTS
+    lasting = bool(np.mean(old_columns) >= _LEAST_LASTING_SHARE) if known else None
     noise = [value for one in seen for value in one.noise]
     has_ghosts = len(flashes) > 0 or lasting is False
     longest = max(len(one.markers) / one.rate for one in seen) / _CAPTURE_TO_GAP_RATIO
     untold = {
         "ghosts: every point is a marker's, as where a capture was labeled": not has_ghosts,
-        f"how long ghosts stay: only {len(flashes)} were seen": has_ghosts and len(flashes) < _FEWEST_EVENTS,
-        f"how long gaps last, or whether they were filled: only {len(gaps)} were seen": len(gaps)
-        < _FEWEST_EVENTS,
+        f"how long ghosts stay: only {len(flashes)} were seen": has_ghosts and not enough_ghosts,
+        f"how long gaps last, or whether they were filled: only {len(gaps)} were seen": not enough_gaps,
         f"gaps of more than {longest:.2g} s: the captures are short": longest < _LONG_TRACK,
         "whether IDs last over gaps: few markers returned": lasting is None,
         "noise: no marker is seen in six frames in a row": not noise,
@@ -176,7 +174,7 @@ def _combine(seen: Sequence[_CaptureFigures]) -> MeasuredRoom:
         missing=float(1.0 - points / slots),
         gaps=tuple(gaps.tolist()),
         ghosts=sum(int(one.ghosts.sum()) for one in seen) / num_frames if has_ghosts else None,
-        ghost_time=float(flashes.mean()) if len(flashes) >= _FEWEST_EVENTS else None,
+        ghost_time=float(flashes.mean()) if enough_ghosts else None,
         nearest_pairs=np.concatenate([one.nearest_pairs for one in seen]),
         id_time=sum(one.markers.sum() / one.rate for one in seen) / sum(one.stretches for one in seen),
         lasting_ids=lasting,
@@ -240,9 +238,8 @@ def _follow_points(
     """The track of each point, -1 without a point; and of each return, whether it was into the old column."""
     present = np.isfinite(points[..., 0])
     goes_on = np.zeros_like(present)
-    goes_on[1:] = (
-        np.linalg.norm(np.diff(points, axis=0), axis=2) < _FASTEST_POINT / rate
-    )  # false where one is missing
+    steps = np.linalg.norm(np.diff(points, axis=0), axis=2)  # NaN where one is missing
+    goes_on[1:] = steps < _FASTEST_POINT / rate
     tracks, begun, old_columns = np.full(present.shape, -1), list[int](), list[bool]()
     lost = dict[int, tuple[int, int]]()  # last frame and column of each track that may return
     for t, now in enumerate(tracks):

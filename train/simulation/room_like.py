@@ -31,9 +31,7 @@ _MOST_CORRECTION: Final = 4.0  # largest ratio of a correction
 _LOST_CAMERAS: Final = 0.375  # share of the cameras that lose pictures together: 6 of the 16 of figure5
 _SPOTS_A_HAND: Final = 30.0  # number of reflecting spots on a hand, which flash as often as ghosts require
 _MOST_LIT_SHARE: Final = 0.95  # largest share of the time that a spot reflects
-_FEWEST_EXPECTED_PAIRS: Final = (
-    30.0  # Points merge if the lab lacks this many nearer pairs that are simulated.
-)
+_FEWEST_EXPECTED_PAIRS: Final = 30.0  # Points merge if the lab lacks this many nearer, simulated pairs.
 
 
 @dataclass(frozen=True, slots=True)

@@ -79,12 +79,7 @@ _SHOULDER_OFFSET: Final = (0.45, 0.18, 0.25)  # [m] behind the hands, beside and
 _WRIST_MARKERS: Final = ((0.03, 0.028, 0.02), (0.035, -0.028, 0.02))  # [m] behind the wrist, across, above
 _ELBOW_MARKER: Final = (0.26, 0.03, 0.02)
 _FOREARM_MARKERS: Final = ((0.12, 0.0, 0.03), (0.2, -0.03, 0.02))
-_THING_MARKERS: Final = (
-    (0.10, 0.0, -0.06),
-    (0.14, 0.03, -0.09),
-    (0.17, -0.02, -0.07),
-    (0.21, 0.01, -0.12),
-)  # [m]
+_THING: Final = ((0.10, 0.0, -0.06), (0.14, 0.03, -0.09), (0.17, -0.02, -0.07), (0.21, 0.01, -0.12))  # [m]
 _HEAD_MARKERS: Final = ((0.09, 0.0, 0.25), (-0.09, 0.0, 0.25), (0.0, 0.08, 0.27), (0.0, -0.08, 0.2))  # [m]
 _BACK_MARKERS: Final = ((-0.12, 0.05, -0.1), (-0.12, -0.05, -0.25))
 _OTHER_PERSON_DISTANCE: Final = 1.2  # [m] distance of the other person
@@ -265,14 +260,10 @@ def other_markers(scene: SceneMotion, count: int, *, rng: np.random.Generator) -
         shoulder = middle + trunk @ [-back, lateral, above] + sway
         arms.append(_arm(wrists[:, number], ahead[:, number], shoulder))
         bodies.append(shoulder[:, None])
-    places = np.array(_THING_MARKERS) + rng.normal(0.0, 0.01, (4, 3))
+    places = np.array(_THING) + rng.normal(0.0, 0.01, (4, 3))
     thing = wrists[:, :1] + np.einsum("tij,kj->tki", ahead[:, 0], places)
-    torso = (
-        middle
-        + np.array([*_HEAD_MARKERS, *_BACK_MARKERS]) @ trunk.T
-        + trunk @ [-back, 0.0, above]
-        + sway[:, None]
-    )
+    body = np.array([*_HEAD_MARKERS, *_BACK_MARKERS]) @ trunk.T
+    torso = middle + body + trunk @ [-back, 0.0, above] + sway[:, None]
     own = [*[part[:, :3] for part in arms], *bodies, *[part[:, 3:] for part in arms], thing, torso]
     markers = np.concatenate(own, axis=1)
     left = max(0, count - markers.shape[1])
