@@ -277,9 +277,6 @@ class _ViewFit(NamedTuple):
     """Whether the fit is so good that no other view is tried."""
 
 
-_NO_VIEW: Final = _ViewFit(np.zeros((0, 0)), np.inf, False)
-
-
 class CNNLabeler:
     """The paper's network, which maps images (B, 1, 52, 52) to positions (B, M, 3) in view units.
 
@@ -318,7 +315,7 @@ class CNNLabeler:
         else:  # A fixed seed gives equal clouds equal labels.
             shown = spread_views(points, present, rng=np.random.default_rng(0))
             views = np.stack([shown, MIRROR_IMAGE[:, None] * shown], axis=1)
-        best = [_NO_VIEW] * len(clouds)
+        best = [_ViewFit(np.zeros((0, 0)), np.inf, False)] * len(clouds)  # worse than any view
         pending = np.arange(len(clouds))
         for tried in np.split(np.arange(views.shape[1]), np.cumsum(_FIRST_GROUPS)):
             rows = np.repeat(pending, len(tried))
