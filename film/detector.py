@@ -132,7 +132,7 @@ class HandDetector:
         """
         _check_picture(image)
         hands = []
-        for candidate in self.candidates(image):
+        for candidate in self._candidates(image):
             first = self._look(image, square_around(candidate.corners))
             if candidate.log_odds + first.presence > _LEAST_FIRST_LOG_ODDS:
                 hands.append(self._second_look(image, first, candidate.log_odds))
@@ -170,7 +170,7 @@ class HandDetector:
             hands.append(self._second_look(image, first, 0.0, side))
         return hands
 
-    def candidates(self, picture: Bytes) -> list[Candidate]:
+    def _candidates(self, picture: Bytes) -> list[Candidate]:
         """Places where the finder sees hands in an sRGB picture, the most probable first."""
         scale = FINDER_SIZE / max(picture.shape[:2])
         height, width = (round(scale * side) for side in picture.shape[:2])

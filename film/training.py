@@ -130,7 +130,7 @@ def train_detector(
     candidates: Callable[[Bytes], list[Candidate]] = _no_candidates
     if start is not None:
         folder = WEIGHTS if start == "shipped" else Path(start)
-        candidates = HandDetector.load(folder).candidates  # refuses damaged weights
+        candidates = HandDetector.load(folder)._candidates  # refuses damaged weights
         for name, network in networks.items():
             _load_folded(network, folder / name)
     rng = np.random.default_rng(seed)

@@ -103,6 +103,10 @@ class OpticsOptions(Settings):
     min_rays_to_start: int | None = None
     """Number of rays that must meet for a point that was not there in the frame before."""
 
+    def applied(self, optics: OpticsConfig) -> OpticsConfig:
+        """Replace settings of the optics by these options, and validate them."""
+        return with_given(optics, self)
+
 
 class Twin(NamedTuple):
     """Settings of a simulated capture that make it similar to one of the paper's."""

@@ -96,7 +96,7 @@ class SimulateSettings(Settings):
 def room_of(settings: SimulateSettings) -> RoomConfig:
     """The room of this kind of capture with these optics and strays."""
     usual = usual_room(settings.kind)
-    optics, strays = with_given(usual.optics, settings.optics), with_given(usual.strays, settings.strays)
+    optics, strays = settings.optics.applied(usual.optics), with_given(usual.strays, settings.strays)
     return dataclasses.replace(usual, optics=optics, strays=strays)
 
 
