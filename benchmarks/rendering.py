@@ -24,7 +24,7 @@ def accuracy() -> Figures:
     off, agree = [], []
     for frame in np.linspace(0, take.num_frames - 1, 8).astype(int):
         camera = view.cameras(frame)[0]
-        surface = join([one.triangles for one in studio._drawn(Moment(take, int(frame)), 0.0)])
+        surface = join([one.triangles for one in studio.surfaces(Moment(take, int(frame)))])
         mine = rasterize(camera, surface)
         vertices = np.asarray(surface.vertices, dtype=np.float64)
         caster = RayMeshIntersector(trimesh.Trimesh(vertices, surface.faces, process=False))

@@ -57,58 +57,61 @@ def register_camera(
     Args:
         take: A tracked take or its path.
         video: The video: of one camera that stood still, and of one shot.
-        camera: A camera with the lens of the video's, or a file of it; its pose does not count. When
-            not given, the focal length and two coefficients are found, too, and the center as far as motion
-            tells it: otherwise it is near the middle of the picture.
+        camera: A camera with the lens of the video's, or a file of it; its pose is not used. When not given,
+            the focal length and two coefficients are estimated, too, and the center as far as the motion
+            determines it: otherwise it stays near the middle of the picture.
         detector: Finds the hands in the pictures: `handsim` for the shipped one, `mediapipe`, a folder of
             weights, or hands that were found before and their file (.json); the shipped one when not given.
         progress: Called with the numbers of done and of all frames, first of finding hands, then of the fit.
         on_step: Called with the name of each step.
 
     Returns:
-        Pose [m], lens [px] and clock [s], with standard deviations, and what fits where.
+        Pose [m], lens [px] and clock [s], with standard deviations, and which frames fit.
 
     Raises:
         HandSimError: The take or the video cannot be read, or the hands do not move as those of the take.
     """
-    return _registered(_taken(take), Film(video), camera, detector, progress, on_step)
+    return _register(_load_take_with_hands(take), Film(video), camera, detector, progress, on_step)
 
 
-def _registered(
+def _register(
     take: Take, film: Film, camera: _AnyCamera, detector: _AnyDetector, progress: Progress, on_step: OnStep
 ) -> Registration:
-    """The registration of a video that is open to a take that has hands."""
-    given = _given(camera, film.size)
+    """Find the hands in a video, and register it to a take."""
+    known_camera = _resolve_camera(camera, film.size)
     on_step("finding hands")
-    found = find_hands(film, resolve_detector(detector), progress)
+    frames = find_hands(film, resolve_detector(detector), progress)
     on_step("fitting the camera")
-    return register(
-        take, found, film.size, given, lambda: (picture for _, picture in film.frames()), progress
-    )
+
+    def pictures() -> Iterator[Bytes]:
+        return (picture for _, picture in film.frames())
+
+    return register(take, frames, film.size, known_camera, pictures, progress)
 
 
-def _taken(take: Take | str | Path) -> Take:
+def _load_take_with_hands(take: Take | str | Path) -> Take:
+    """Load a take unless it is given as an object, and refuse one without hands."""
     check_type("take", take, (Take, str, os.PathLike), "a Take or its path")
-    taken = take if isinstance(take, Take) else load_take(take)
-    if not np.isfinite(taken.qpos[..., 0]).any():
+    loaded = take if isinstance(take, Take) else load_take(take)
+    if not np.isfinite(loaded.qpos[..., 0]).any():
         raise CaptureError("the take has no hand in any frame, expected hands that the video shows")
-    return taken
+    return loaded
 
 
-def _given(camera: _AnyCamera, size: tuple[int, int]) -> Camera | None:
-    """The camera whose lens the video's has; of the cameras of a file, the one with its size."""
+def _resolve_camera(camera: _AnyCamera, size: tuple[int, int]) -> Camera | None:
+    """The camera with the lens of the video's: of the cameras in a file, the one with the video's size."""
     if camera is None:
         return None
     check_type("camera", camera, (Camera, str, os.PathLike), "a Camera or a file of one")
     cameras = (camera,) if isinstance(camera, Camera) else load_cameras(camera)
-    fitting = [one for one in cameras if one.size == size]
-    if len(fitting) != 1:
+    of_size = [one for one in cameras if one.size == size]
+    if len(of_size) != 1:
         sizes = ", ".join(f"{one.name} {one.size[0]} x {one.size[1]}" for one in cameras)
         raise HandSimError(
             f"the video's pictures have {size[0]} x {size[1]} pixels and the cameras are {sizes}; expected "
             "one of this size, and no other"
         )
-    return fitting[0]
+    return of_size[0]
 
 
 def annotate_film(
@@ -125,7 +128,7 @@ def annotate_film(
     on_step: OnStep = no_step,
     **settings: Any,
 ) -> Registration:
-    """Register a video to a take, and write its frames as photographs with the truth of the take's hands.
+    """Register a video to a take, and write its frames as photographs labeled with the take's hands.
 
     The folder has the files of `render_take`, and beside them `film.json` (the registration), `film.mp4` (the
     hands' skeletons over the video) and the page `film.html`. Frames that do not fit are left out.
@@ -150,37 +153,33 @@ def annotate_film(
         HandSimError: As in `register_camera` and `render_take`, or no frame fits.
     """
     config = FrameConfig.of(FILM_DEFAULTS if config is None else config, settings)
-    taken, film = _taken(take), Film(video)
-    registration = _registered(taken, film, camera, detector, progress, on_step)
-    posed = filmed_take(taken, registration)
+    loaded, film = _load_take_with_hands(take), Film(video)
+    registration = _register(loaded, film, camera, detector, progress, on_step)
+    posed = filmed_take(loaded, registration)
     if not np.isfinite(posed.qpos[..., 0]).any():
-        told = "; ".join(registration.left_out())
-        raise HandSimError(f"{film.path}: no frame can be told: {told}")
+        raise HandSimError(f"{film.path}: no frame can be labeled: {'; '.join(registration.left_out())}")
     poses = np.stack([registration.camera_of(n).T_world_camera for n in range(posed.num_frames)])
     record = {"film": {"sha256": checksum(film.path), **registration.record()}}
-    drawn = RenderConfig(
-        **{one.name: getattr(config, one.name) for one in dataclasses.fields(FrameConfig)},
-        view=ViewConfig(cameras=(registration.cameras[0],)),
-        depth_sensor=None,
-        color_sensor=None,
-        painter="compiled",
-    )
+    shared = {one.name: getattr(config, one.name) for one in dataclasses.fields(FrameConfig)}
+    view = ViewConfig(cameras=(registration.cameras[0],))
+    drawn = RenderConfig(**shared, view=view, depth_sensor=None, color_sensor=None, painter="compiled")
     footage = FilmFootage(film, poses)
-    source: Any = dataclasses.replace(subject_of_take(posed), footage=footage, poses=record)  # not public
+    # `render_take` accepts a Subject, but its public signature does not name this type.
+    source: Any = dataclasses.replace(subject_of_take(posed), footage=footage, poses=record)
     on_step("writing pictures")
     render_take(source, out, formats, drawn, workers=workers, progress=progress)
     on_step(f"writing {VIDEO} and {PAGE}")
     folder = Path(out)
     save_json(folder / RECORD, registration.record())
-    write_video(folder / VIDEO, _drawn_over(film, taken, registration), rate=film.rate, size=film.size)
+    write_video(folder / VIDEO, _with_skeletons(film, loaded, registration), rate=film.rate, size=film.size)
     write_film_page(folder / PAGE, registration)
     return registration
 
 
 def filmed_take(take: Take, registration: Registration, *, every: bool = False) -> Take:
-    """A take with a frame for each of the video; poses of those that do not fit are NaN, unless `every`.
+    """Resample a take at the frames of the video; poses in frames that do not fit are NaN, unless `every`.
 
-    A hand has the pose of the time at which a rolling shutter reads the rows that it is in.
+    Each hand has its pose at the time when a rolling shutter reads the rows that show it.
     """
     times = registration.offset + (1.0 + registration.drift) * registration.times
     cameras = [registration.camera_of(number) for number in range(len(times))]
@@ -196,8 +195,8 @@ def filmed_take(take: Take, registration: Registration, *, every: bool = False) 
     return dataclasses.replace(filmed, former=tuple(former))
 
 
-def _drawn_over(film: Film, take: Take, registration: Registration) -> Iterator[Bytes]:
-    """The frames of a video with the skeletons of the take's hands, hollow where the frame does not count."""
+def _with_skeletons(film: Film, take: Take, registration: Registration) -> Iterator[Bytes]:
+    """The frames of a video with the skeletons of the take's hands, hollow in frames that do not fit."""
     whole = filmed_take(take, registration, every=True).keypoints()
     for number, (_, picture) in zip(range(len(whole)), film.frames(), strict=False):
         fits = np.full(NUM_KEYPOINTS, not registration.reasons[number])

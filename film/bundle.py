@@ -19,21 +19,21 @@ from render.frames import Doubles, Integers
 if TYPE_CHECKING:
     from film.detector import FoundHand
 
-_MAX_GAP: Final = 0.1  # [s] Poses are interpolated over gaps up to this length.
-FEWEST_KEYPOINTS: Final = 8  # A hand in a frame is judged by this many keypoints.
-_SURE: Final = 0.25  # Keypoints with a lower score are not used.
-_MOST_BUNDLED: Final = 5000  # largest number of keypoints in a bundle
-_ROBUST: Final = 2.0  # Residuals beyond this many standard deviations count less.
+_MAX_GAP: Final = 0.1  # [s] longest gap of a take over which poses are interpolated
+FEWEST_KEYPOINTS: Final = 8  # least number of keypoints of a detected hand
+_LEAST_SCORE: Final = 0.25  # least score of a keypoint that is used
+_MOST_KEYPOINTS: Final = 5000  # largest number of keypoints in a bundle
+_ROBUST_SCALE: Final = 2.0  # [standard deviations] scale of the Cauchy weights of residuals
 _WEAK_INFORMATION: Final = 1e-2  # prior information on free unknowns
-_PARTS: Final = 8  # number of parts of a video that are held out, one after the other
-_TINY: Final = 1e-6  # [s], [rad] step of the finite differences by time and by rotations
-_SAMPLES_PER_ERROR: Final = 16.0  # This many samples count as one with an independent error.
+_JACKKNIFE_PARTS: Final = 8  # number of parts of a video, each of which is held out once
+_DIFFERENCE_STEP: Final = 1e-6  # [s], [rad] step of the finite differences by time and by rotations
+_SAMPLES_PER_ERROR: Final = 16.0  # number of samples that share one independent error
 
-# Places of the unknowns in a state's values. From POSES on, each span has six numbers for its camera's pose.
-# _PRIORS holds the standard deviation of each unknown before any picture is seen. THICKER says how much
+# Indices of the unknowns in a state's values. From POSES on, each span has six numbers for its camera's pose.
+# _PRIORS holds the standard deviation of each unknown before any picture is seen. THICKNESS is how much
 # thicker the filmed hands are than the tracked ones [m], because of cloth or an error of a measured hand, and
-# LARGER by which share they are larger.
-OFFSET, DRIFT, FOCAL, THICKER, LARGER, POSES = 0, 1, 2, 7, 8, 11
+# SIZE is the share by which they are larger.
+OFFSET, DRIFT, FOCAL, THICKNESS, SIZE, POSES = 0, 1, 2, 7, 8, 11
 CENTER, _LENS, READOUT = slice(3, 5), slice(5, 7), slice(9, 11)
 USUAL_CENTER: Final = 0.01  # [widths] standard deviation of lens centers from the middle of the picture
 _PRIORS: Final = np.array(
@@ -44,46 +44,46 @@ _PRIORS: Final = np.array(
 class FoundFrame(NamedTuple):
     """A frame of a video, and the hands that a detector found in it."""
 
-    time: float  # in the video [s]
-    hands: Sequence[FoundHand] | None  # None where the detector did not look
+    time: float  # time in the video [s]
+    hands: Sequence[FoundHand] | None  # None where the detector did not run
 
 
 class Detections(NamedTuple):
-    """The detections of a video with enough keypoints: D hands in F frames."""
+    """The detections of a video that have enough keypoints: D hands in F frames."""
 
-    times: Doubles  # (F,)
-    looked: Integers  # (F,): the nearest frame in which hands were looked for
-    frames: Integers  # (D,)
-    sides: Integers  # (D,), as in `SIDES`
-    pixels: Doubles  # (D, 21, 2)
-    weights: Doubles  # (D, 21): 0 for keypoints that are not sure
+    times: Doubles  # times (F,) of the frames in the video [s]
+    searched: Integers  # nearest frame (F,) that the detector searched
+    frames: Integers  # frame (D,) of each hand
+    sides: Integers  # side (D,) of each hand, an index of `SIDES`
+    pixels: Doubles  # keypoints (D, 21, 2) [px]
+    weights: Doubles  # weights (D, 21) of the keypoints; 0 where the score is low
 
     @classmethod
-    def of(cls, found: Sequence[FoundFrame]) -> Detections:
-        """Those in the frames of a video."""
-        looked = np.array([index for index, frame in enumerate(found) if frame.hands is not None])
-        between = np.searchsorted(0.5 * (looked[1:] + looked[:-1]), np.arange(len(found)))
+    def of(cls, searched_frames: Sequence[FoundFrame]) -> Detections:
+        """Collect the detections in all frames of a video."""
+        searched = np.array([index for index, frame in enumerate(searched_frames) if frame.hands is not None])
+        between = np.searchsorted(0.5 * (searched[1:] + searched[:-1]), np.arange(len(searched_frames)))
         hands = [
             (index, hand)
-            for index, frame in enumerate(found)
+            for index, frame in enumerate(searched_frames)
             for hand in frame.hands or ()
-            if (hand.scores >= _SURE).sum() >= FEWEST_KEYPOINTS
+            if (hand.scores >= _LEAST_SCORE).sum() >= FEWEST_KEYPOINTS
         ]
         scores = np.array([hand.scores for _, hand in hands], dtype=np.float64).reshape(-1, NUM_KEYPOINTS)
         return cls(
-            np.array([frame.time for frame in found]),
-            looked[between],
+            np.array([frame.time for frame in searched_frames]),
+            searched[between],
             np.array([index for index, _ in hands], dtype=np.int64),
             np.array([SIDES.index(hand.side) for _, hand in hands], dtype=np.int64),
             np.array([hand.keypoints for _, hand in hands], dtype=np.float64).reshape(-1, NUM_KEYPOINTS, 2),
-            np.where(scores >= _SURE, np.sqrt(np.clip(scores, 0.0, 1.0)), 0.0),
+            np.where(scores >= _LEAST_SCORE, np.sqrt(np.clip(scores, 0.0, 1.0)), 0.0),
         )
 
 
 class State(NamedTuple):
-    """What a bundle knows of a camera and its clock."""
+    """An estimate of a camera and its clock."""
 
-    values: Doubles  # of the unknowns
+    values: Doubles  # values of the unknowns
     starts: tuple[int, ...] = (0,)  # first frame of each span in which the camera did not move
 
     def spans(self, frames: Integers) -> Integers:
@@ -91,41 +91,46 @@ class State(NamedTuple):
         return np.searchsorted(self.starts, frames, side="right") - 1
 
     def pose(self, span: int) -> Doubles:
-        """The camera's rotation vector and place (6,) in a span."""
+        """The camera's rotation vector [rad] and position [m] in a span, (6,)."""
         return self.values[POSES + 6 * span :][:6]
 
 
 class Matches(NamedTuple):
     """Which detection shows each hand of the take in each frame."""
 
-    numbers: Integers  # (F, H), -1 for none
-    distances: Doubles  # (F, H): median distance of its keypoints from the take's [px]
-    errors: Doubles  # (F, H, 21, 2): its keypoints less the take's [px]; NaN for those that are not sure
+    numbers: Integers  # index (F, H) of the detection, -1 for none
+    distances: Doubles  # median distance (F, H) of its keypoints from the take's [px]
+    errors: Doubles  # its keypoints minus the take's (F, H, 21, 2) [px]; NaN where the score is low
 
 
 class Samples(NamedTuple):
-    """Points of hands, and lines in pictures on which they are: two for a keypoint, one for an outline."""
+    """Points of hands, and the picture lines that show them: two lines for a keypoint, one for an outline."""
 
-    frames: Integers  # (N,)
-    pixels: Doubles  # (N, 2): a point of the line
-    normals: Doubles  # (N, 2): normal of the line, as long as its weight
-    outward: Doubles  # (N, 3): the way in which a thicker hand moves the point
-    larger: Doubles  # (N, 3): from the hand's middle to the point [m]
+    frames: Integers  # frame (N,) of each line
+    pixels: Doubles  # a point (N, 2) of each line [px]
+    normals: Doubles  # normals (N, 2) of the lines, whose lengths are their weights
+    outward: Doubles  # unit directions (N, 3) in which a thicker hand moves the points
+    from_middle: Doubles  # offsets (N, 3) of the points from the hand's middle [m]
     points_at: Callable[[Doubles], Doubles]
-    """Points (N, 3) [m] at their times (N,) in the take."""
+    """Returns the points (N, 3) [m] at given times (N,) of the take [s]."""
 
 
 class Bundle:
-    """Clock, lens and poses of a camera, from keypoints and outlines in its pictures."""
+    """Bundle adjustment of a camera's clock, lens and poses to keypoints and outlines in its pictures.
 
-    def __init__(self, take: Take, found: Detections, size: tuple[int, int], given: Camera | None) -> None:
-        self.take, self.found, self.size, self.given = take, found, size, given
-        self._points, self._middle = take.keypoints(), float(np.median(found.times))
+    The lens is fixed if a camera with the lens of the video's is known.
+    """
+
+    def __init__(
+        self, take: Take, detections: Detections, size: tuple[int, int], known_camera: Camera | None
+    ) -> None:
+        self.take, self.detections, self.size, self.known_camera = take, detections, size, known_camera
+        self._points, self._middle = take.keypoints(), float(np.median(detections.times))
 
     def keypoints(self, times: Doubles, *which: Integers) -> Doubles:
-        """Keypoints (N, H, 21, 3) [m] at times in the take; NaN where it has none.
+        """Keypoints (N, H, 21, 3) [m] at times of the take; NaN where it has none.
 
-        With numbers (N,) of hands and of keypoints, they are only those: (N, 3).
+        Given indices (N,) of hands and of keypoints, the result has only these keypoints: (N, 3).
         """
         known = self.take.times
         index = np.interp(times, known, np.arange(len(known)), np.nan, np.nan)
@@ -136,53 +141,53 @@ class Bundle:
         return np.asarray(first + share.reshape(-1, *(first.ndim - 1) * [1]) * (second - first))
 
     def clock(self, state: State) -> tuple[float, float]:
-        """Offset [s] and drift of the take's time over the video's."""
+        """Offset [s] and drift of the take's clock relative to the video's."""
         offset, drift = state.values[[OFFSET, DRIFT]].tolist()
         return offset - drift * self._middle, drift
 
     def times(self, state: State) -> Doubles:
-        """Times of the frames in the take [s]."""
+        """Times (F,) of the frames by the take's clock [s]."""
         offset, drift = self.clock(state)
-        return offset + (1.0 + drift) * self.found.times
+        return offset + (1.0 + drift) * self.detections.times
 
     def cameras(self, state: State) -> list[Camera]:
-        """The cameras of all spans."""
-        camera, cameras = self.given, []
+        """The camera of each span."""
+        camera, cameras = self.known_camera, []
         if camera is None:
             focal = self.size[0] * np.exp(state.values[FOCAL])
             center = 0.5 * np.array(self.size) + self.size[0] * state.values[CENTER]
             lens = brown_lens(*state.values[_LENS], 0.0, 0.0, 0.0)
             camera = Camera("film", self.size, camera_matrix(focal, focal, *center), lens=lens)
         for span in range(len(state.starts)):
-            pose, name = state.pose(span), f"film{span + 1}" if span else "film"
-            place = rigid(Rotation.from_rotvec(pose[:3]).as_matrix(), pose[3:])
-            cameras.append(dataclasses.replace(camera, name=name, T_world_camera=place))
+            vector, name = state.pose(span), f"film{span + 1}" if span else "film"
+            pose = rigid(Rotation.from_rotvec(vector[:3]).as_matrix(), vector[3:])
+            cameras.append(dataclasses.replace(camera, name=name, T_world_camera=pose))
         return cameras
 
-    def projected(self, state: State, frames: Integers, points: Doubles) -> Doubles:
-        """Pixels (N, ..., 2) of points (N, ..., 3) [m] in frames (N,); NaN where there are none."""
+    def project(self, state: State, frames: Integers, points: Doubles) -> Doubles:
+        """Project points (N, ..., 3) [m] in frames (N,) to pixels (N, ..., 2); NaN stays NaN."""
         pixels, spans = np.empty((*points.shape[:-1], 2)), state.spans(frames)
         for span, camera in enumerate(self.cameras(state)):
             pixels[spans == span] = camera.project(points[spans == span])
         return pixels
 
-    def pictured(self, state: State) -> Doubles:
-        """Where the camera sees the take's keypoints in each frame (F, H, 21, 2) [px]; NaN without a hand."""
+    def projected_keypoints(self, state: State) -> Doubles:
+        """Project the take's keypoints in each frame to pixels (F, H, 21, 2); NaN without a hand."""
         times = self.times(state)
-        return self.projected(state, np.arange(len(times)), self.keypoints(times))
+        return self.project(state, np.arange(len(times)), self.keypoints(times))
 
     def match(self, state: State, gate: float) -> Matches:
-        """The detections nearest to the hands of the take, within a median distance [px]."""
-        found, pixels = self.found, self.pictured(state)
-        errors = found.pixels[:, None] - pixels[found.frames]  # (D, H, 21, 2)
-        away = np.nan_to_num(np.linalg.norm(errors, axis=-1), nan=np.inf)
-        unsure = np.broadcast_to((found.weights == 0.0)[:, None], away.shape)
-        errors[unsure] = away[unsure] = np.nan
-        away = np.nanmedian(away, axis=-1)  # (D, H)
-        hand, nearest = away.argmin(axis=1), away.min(axis=1)
+        """Match each hand of the take to the nearest detection within a median distance [px]."""
+        detections, pixels = self.detections, self.projected_keypoints(state)
+        errors = detections.pixels[:, None] - pixels[detections.frames]  # (D, H, 21, 2)
+        distances = np.nan_to_num(np.linalg.norm(errors, axis=-1), nan=np.inf)
+        unsure = np.broadcast_to((detections.weights == 0.0)[:, None], distances.shape)
+        errors[unsure] = distances[unsure] = np.nan
+        distances = np.nanmedian(distances, axis=-1)  # (D, H)
+        hand, nearest = distances.argmin(axis=1), distances.min(axis=1)
         order = np.argsort(-nearest, kind="stable")
         order = order[nearest[order] < gate]
-        at = found.frames[order], hand[order]  # where the nearest comes last
+        at = detections.frames[order], hand[order]  # the nearest comes last and overwrites the others
         matches = Matches(
             np.full(pixels.shape[:2], -1), np.full(pixels.shape[:2], np.nan), np.full(pixels.shape, np.nan)
         )
@@ -191,112 +196,116 @@ class Bundle:
         return matches
 
     def samples(self, matches: Matches) -> Samples:
-        """The keypoints of matched hands, thinned out to about `_MOST_BUNDLED`."""
+        """Sample the keypoints of matched hands, at most about `_MOST_KEYPOINTS` of them."""
         frames, hands, keypoints = np.nonzero(np.isfinite(matches.errors[..., 0]))
-        kept = matches.numbers[frames, hands] % (1 + len(frames) // _MOST_BUNDLED) == 0
+        kept = matches.numbers[frames, hands] % (1 + len(frames) // _MOST_KEYPOINTS) == 0
         frames, hands, keypoints = (np.repeat(one[kept], 2) for one in (frames, hands, keypoints))
         which = matches.numbers[frames, hands], keypoints
-        normals = np.tile(np.eye(2), (len(frames) // 2, 1)) * self.found.weights[which][:, None]
-        still = np.zeros((len(frames), 3))
+        normals = np.tile(np.eye(2), (len(frames) // 2, 1)) * self.detections.weights[which][:, None]
+        zeros, pixels = np.zeros((len(frames), 3)), self.detections.pixels[which]
         return Samples(
-            frames, self.found.pixels[which], normals, still, still,
-            lambda times: self.keypoints(times, hands, keypoints),
-        )  # fmt: skip
+            frames, pixels, normals, zeros, zeros, lambda times: self.keypoints(times, hands, keypoints)
+        )
 
     def solve(
         self, state: State, samples: Samples, noise: float, *, first: bool = False
     ) -> tuple[State, float, Doubles]:
         """Adjust a state to samples; return it with its cost per sample and its covariance.
 
-        Samples of weight 1 have the standard deviation `noise` [px]. Samples that are far off in the given
-        state count less. With `first`, the lens and the size of the hands stay as they are.
+        Samples of weight 1 have the standard deviation `noise` [px]. Samples with large residuals at the
+        start have less weight. If `first`, the lens and the size of the hands are kept.
         """
         size, count = len(state.values), len(samples.frames)
         free = np.ones(size, dtype=bool)
-        free[FOCAL:THICKER] = self.given is None
+        free[FOCAL:THICKNESS] = self.known_camera is None
         if first:
-            free[DRIFT] = free[CENTER] = free[_LENS] = free[THICKER] = free[LARGER] = free[READOUT] = False
+            free[DRIFT] = free[CENTER] = free[_LENS] = free[THICKNESS] = free[SIZE] = free[READOUT] = False
         priors = np.concatenate([_PRIORS, np.full(size - POSES, np.inf)])
-        robust = 1.0 / np.sqrt(1.0 + (self.residuals(state, samples, noise) / _ROBUST) ** 2)
+        robust = 1.0 / np.sqrt(1.0 + (self.residuals(state, samples, noise) / _ROBUST_SCALE) ** 2)
 
-        def widened(part: Doubles) -> State:
+        def with_free(part: Doubles) -> State:
             values = state.values.copy()
             values[free] = part
             return state._replace(values=values)
 
-        known = np.sqrt(_SAMPLES_PER_ERROR) / priors
+        prior_weights = np.sqrt(_SAMPLES_PER_ERROR) / priors
 
-        def rows(part: Doubles) -> Doubles:
-            now = widened(part)
-            return np.concatenate([robust * self.residuals(now, samples, noise), known * now.values])
+        def weighted_residuals(part: Doubles) -> Doubles:
+            now = with_free(part)
+            return np.concatenate([robust * self.residuals(now, samples, noise), prior_weights * now.values])
 
-        def jacobian(part: Doubles) -> Doubles:
-            told = robust[:, None] * self.jacobian(widened(part), samples, noise)
-            return np.concatenate([told, np.diag(known)])[:, free]
+        def weighted_jacobian(part: Doubles) -> Doubles:
+            weighted = robust[:, None] * self.jacobian(with_free(part), samples, noise)
+            return np.concatenate([weighted, np.diag(prior_weights)])[:, free]
 
-        done = least_squares(
-            rows, state.values[free], jacobian, x_scale=np.where(np.isfinite(priors), priors, 0.1)[free],
-            max_nfev=40, xtol=1e-6, ftol=1e-6,
-        )  # fmt: skip
+        scales = np.where(np.isfinite(priors), priors, 0.1)[free]
+        limits = {"max_nfev": 40, "xtol": 1e-6, "ftol": 1e-6}
+        solved = least_squares(
+            weighted_residuals, state.values[free], weighted_jacobian, x_scale=scales, **limits
+        )
         covariance = np.zeros((size, size))
         # An unknown without any information gets a standard deviation of 40 s, m or rad.
-        inverse = np.linalg.inv(done.jac.T @ done.jac + _WEAK_INFORMATION * np.eye(len(done.x)))
+        inverse = np.linalg.inv(solved.jac.T @ solved.jac + _WEAK_INFORMATION * np.eye(len(solved.x)))
         covariance[np.ix_(free, free)] = _SAMPLES_PER_ERROR * inverse
-        return widened(done.x), 2.0 * float(done.cost) / max(count, 1), covariance
+        return with_free(solved.x), 2.0 * float(solved.cost) / max(count, 1), covariance
 
-    def held_out(self, state: State, samples: Samples, noise: float) -> tuple[Doubles, float]:
-        """Standard deviations of the unknowns from solutions that each leave out a part of the time.
+    def jackknife(self, state: State, samples: Samples, noise: float) -> tuple[Doubles, float]:
+        """Standard deviations of the unknowns from solutions that each leave out one part of the video.
 
-        In this jackknife errors that last count as what they are. The second value is the median residual
-        [px] of the part that the solution without it fits least.
+        Unlike the covariance, this jackknife notices errors that are correlated over time. The second value
+        is the largest median residual [px] of a part in the solution without it.
         """
-        ends = np.quantile(samples.frames, np.linspace(0.0, 1.0, _PARTS + 1)[1:-1])
-        parts, surprise, found = np.searchsorted(ends, samples.frames), 0.0, []
-        for part in range(_PARTS):
+        ends = np.quantile(samples.frames, np.linspace(0.0, 1.0, _JACKKNIFE_PARTS + 1)[1:-1])
+        parts, worst_residual, solutions = np.searchsorted(ends, samples.frames), 0.0, []
+        for part in range(_JACKKNIFE_PARTS):
             out = parts == part
             kept = samples._replace(normals=np.where(out[:, None], 0.0, samples.normals))
-            other = self.solve(state, kept, noise)[0]
-            away = np.abs(self.residuals(other, samples, 1.0)[out])
-            surprise = max(surprise, float(np.median(away))) if out.any() else surprise
-            found.append(other.values)
-        return np.std(found, axis=0) * np.sqrt(_PARTS - 1), surprise
+            solution = self.solve(state, kept, noise)[0]
+            if out.any():
+                residual = float(np.median(np.abs(self.residuals(solution, samples, 1.0)[out])))
+                worst_residual = max(worst_residual, residual)
+            solutions.append(solution.values)
+        return np.std(solutions, axis=0) * np.sqrt(_JACKKNIFE_PARTS - 1), worst_residual
 
     def jacobian(self, state: State, samples: Samples, noise: float) -> Doubles:
-        """Derivatives (N, U) of the residuals by all unknowns; those by a given lens do not count."""
+        """Derivatives (N, U) of the residuals by all unknowns; those by a known lens are not used."""
         cameras, spans = self.cameras(state), state.spans(samples.frames)
-        points, later = (self._points_of(state, samples, late) for late in (0.0, _TINY))
+        points, later = (self._points_of(state, samples, late) for late in (0.0, _DIFFERENCE_STEP))
         poses, lens = np.stack([one.T_world_camera for one in cameras])[spans], cameras[0].lens
-        axes, away, across = poses[:, :3, :3], points - poses[:, :3, 3], samples.normals / noise
-        local, focal = np.einsum("nij,ni->nj", axes, away), across * cameras[0].focal_lengths
+        axes, offsets, across = poses[:, :3, :3], points - poses[:, :3, 3], samples.normals / noise
+        local, focal = np.einsum("nij,ni->nj", axes, offsets), across * cameras[0].focal_lengths
         flat = local[:, :2] / local[:, 2:]
-        slopes = np.einsum("ni,nij->nj", focal, lens.jacobian(local)) / local[:, 2:]
-        by_local = np.column_stack([slopes, -(slopes * flat).sum(axis=1)])
-        by_point, pose = np.einsum("nij,nj->ni", axes, by_local), np.zeros((len(points), len(cameras), 6))
+        by_aside = np.einsum("ni,nij->nj", focal, lens.jacobian(local)) / local[:, 2:]
+        by_local = np.column_stack([by_aside, -(by_aside * flat).sum(axis=1)])
+        by_point, by_pose = np.einsum("nij,nj->ni", axes, by_local), np.zeros((len(points), len(cameras), 6))
         for span in range(len(cameras)):
-            turn, mine = state.pose(span)[:3], spans == span
-            turned = Rotation.from_rotvec(turn + _TINY * np.eye(3)) * Rotation.from_rotvec(turn).inv()
-            pose[mine, span, :3] = np.cross(by_point[mine], away[mine]) @ turned.as_rotvec().T / _TINY
-            pose[mine, span, 3:] = -by_point[mine]
-        by_time, square = ((later - points) * by_point).sum(axis=1) / _TINY, (flat**2).sum(axis=1)
-        bent, elapsed = (focal * flat).sum(axis=1) * square, self.found.times[samples.frames] - self._middle
-        found = np.column_stack([
+            vector, rows = state.pose(span)[:3], spans == span
+            moved = Rotation.from_rotvec(vector + _DIFFERENCE_STEP * np.eye(3))
+            rotated = (moved * Rotation.from_rotvec(vector).inv()).as_rotvec().T
+            by_pose[rows, span, :3] = np.cross(by_point[rows], offsets[rows]) @ rotated / _DIFFERENCE_STEP
+            by_pose[rows, span, 3:] = -by_point[rows]
+        by_time, square = ((later - points) * by_point).sum(axis=1) / _DIFFERENCE_STEP, (flat**2).sum(axis=1)
+        by_first_coefficient = (focal * flat).sum(axis=1) * square
+        elapsed = self.detections.times[samples.frames] - self._middle
+        derivatives = np.column_stack([
             by_time, by_time * elapsed, (focal * lens.distort(local)).sum(axis=1), self.size[0] * across,
-            bent, bent * square, (by_point * samples.outward).sum(axis=1),
-            (by_point * samples.larger).sum(axis=1), by_time[:, None] * (samples.pixels / self.size - 0.5),
-            pose.reshape(len(points), 6 * len(cameras)),
+            by_first_coefficient, by_first_coefficient * square, (by_point * samples.outward).sum(axis=1),
+            (by_point * samples.from_middle).sum(axis=1),
+            by_time[:, None] * (samples.pixels / self.size - 0.5),
+            by_pose.reshape(len(points), 6 * len(cameras)),
         ])  # fmt: skip
-        return np.where(np.isfinite(found).all(axis=1, keepdims=True), found, 0.0)
+        return np.where(np.isfinite(derivatives).all(axis=1, keepdims=True), derivatives, 0.0)
 
     def _points_of(self, state: State, samples: Samples, late: float = 0.0) -> Doubles:
-        """The samples' points (N, 3) [m] when the shutter reads them, or later [s]."""
+        """The samples' points (N, 3) [m] at the times when the shutter reads them, plus `late` [s]."""
         times = self.times(state)[samples.frames] + (samples.pixels / self.size - 0.5) @ state.values[READOUT]
-        shift = state.values[THICKER] * samples.outward + state.values[LARGER] * samples.larger
+        shift = state.values[THICKNESS] * samples.outward + state.values[SIZE] * samples.from_middle
         return np.asarray(samples.points_at(times + late) + shift)
 
     def residuals(self, state: State, samples: Samples, noise: float) -> Doubles:
-        """Distances (N,) from the lines, over the noise; 0 where the take has no pose."""
+        """Distances (N,) of the points from their lines, over the noise; 0 where the take has no pose."""
         points = self._points_of(state, samples)
-        pixels = self.projected(state, samples.frames, points)
-        away = ((pixels - samples.pixels) * samples.normals).sum(axis=1) / noise
-        away = np.nan_to_num(away, nan=self.size[0] / noise)  # behind the camera
-        return np.where(np.isfinite(points[:, 0]), away, 0.0)
+        pixels = self.project(state, samples.frames, points)
+        residuals = ((pixels - samples.pixels) * samples.normals).sum(axis=1) / noise
+        residuals = np.nan_to_num(residuals, nan=self.size[0] / noise)  # behind the camera
+        return np.where(np.isfinite(points[:, 0]), residuals, 0.0)

@@ -1,4 +1,4 @@
-"""What is written of a video when nothing else is said."""
+"""Default settings of the photographs that are made of a video."""
 
 from __future__ import annotations
 
@@ -7,4 +7,4 @@ from typing import Final
 from render.config import FrameConfig
 
 FILM_DEFAULTS: Final = FrameConfig(dress="glove")
-"""All passes of all frames that fit, of hands in gloves."""
+"""All passes of all frames that fit, with hands in gloves."""

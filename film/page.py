@@ -15,30 +15,33 @@ if TYPE_CHECKING:
     from film.registration import Registration
 
 
-def write_film_page(path: Path, found: Registration) -> None:
+def write_film_page(path: Path, registration: Registration) -> None:
     """Write the page: camera and clock, residuals over time, frames left out."""
-    counted = found.reasons.count("")
-    doubts = found.doubts() or ["The hands tell the clock, the lens and the camera's place well."]
+    used = registration.reasons.count("")
+    usual = ["The hands determine the clock, the lens and the camera's position well."]
+    text = (
+        "Median distance, in each frame, between the hands' outlines in the picture and those of the take, "
+        "or between keypoints where outlines are not seen; a line marks each move of the camera."
+    )
+    drawn = picture((9.0, 2.6), _draw_residuals, registration), "Residuals over time"
     sections = [
-        Section("Camera and clock", html_list(doubts, "ul"), table=found.figures()),
         Section(
-            "Residuals over time",
-            "Distance of the hands' outlines in the picture from the take's, or of keypoints where outlines "
-            "are not seen, the median of each frame; a line for each move of the camera.",
-            [(picture((9.0, 2.6), _over_time, found), "Residuals over time")],
-            notes=found.left_out(),
+            "Camera and clock", html_list(registration.doubts() or usual, "ul"), table=registration.figures()
         ),
+        Section("Residuals over time", text, [drawn], notes=registration.left_out()),
     ]
-    lead = f"{counted} of {len(found.reasons)} frames count, {found.residual():.1f} px off in the median."
+    of_all = f"{used} of {len(registration.reasons)} frames"
+    lead = f"{of_all} fit, with a median residual of {registration.residual():.1f} px."
     write_sections(path, sections, title="A video, registered to a take", lead=lead)
 
 
-def _over_time(figure: Figure, found: Registration) -> None:
+def _draw_residuals(figure: Figure, registration: Registration) -> None:
     panel = figure.subplots()
-    fits = np.array([not reason for reason in found.reasons])
-    for kept, color, name in ((fits, Paint.BLUE, "counts"), (~fits, Paint.WARM, "does not")):
-        panel.plot(found.times[kept], found.distances[kept], ".", ms=2.5, color=color, label=name)
-    for start in found.starts[1:]:
-        panel.axvline(float(found.times[start]), color=Paint.INK, lw=1.0)
+    fits = np.array([not reason for reason in registration.reasons])
+    for kept, color, name in ((fits, Paint.BLUE, "fits"), (~fits, Paint.WARM, "does not fit")):
+        times, distances = registration.times[kept], registration.distances[kept]
+        panel.plot(times, distances, ".", ms=2.5, color=color, label=name)
+    for start in registration.starts[1:]:
+        panel.axvline(float(registration.times[start]), color=Paint.INK, lw=1.0)
     panel.set(xlabel="time in the video [s]", ylabel="residual [px]", ylim=(0.0, None))
     panel.legend(frameon=False, ncols=2)

@@ -1,4 +1,4 @@
-"""`Film`, a video file, and `FilmFootage`, its pictures in the place of drawn ones."""
+"""`Film` reads a video file; `FilmFootage` gives its pictures to `render` in place of drawn ones."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from handsim.space.camera import Camera
 from render.frames import Bytes
 from render.photographs import quiet_decoder
 
-_USUAL_RATE: Final = 30.0  # [Hz] of a video that does not tell its own
+_USUAL_RATE: Final = 30.0  # [Hz] frame rate of a video whose file states none
 _MOST_FRAMES: Final = 1 << 20
 
 
@@ -44,7 +44,7 @@ class Film:
         self.size = int(width), int(height)
         self.rate = rate if 0.0 < rate < 1e4 else _USUAL_RATE
         self.num_frames = int(min(max(count, 0), _MOST_FRAMES))
-        """As the file tells it, which may be wrong."""
+        """Number of frames that the file states, which may be wrong."""
         Camera("film", self.size, np.diag([1.0, 1.0, 1.0]))  # refuses pictures that are too large
 
     def __reduce__(self) -> tuple[type[Film], tuple[Path]]:
@@ -91,7 +91,7 @@ class Film:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FilmFootage:
-    """The pictures of a video as `render` takes them in the place of drawn ones."""
+    """The pictures of a video, which replace drawn colors; see `render.frames.Footage`."""
 
     film: Film
     poses: Float[np.ndarray, "T 4 4"]
@@ -99,7 +99,7 @@ class FilmFootage:
 
     @property
     def record(self) -> dict[str, Any]:
-        """What pictures tell of their origin, as JSON."""
+        """The origin of the pictures, as JSON."""
         return {"film": self.film.path.name}
 
     def picture(self, frame: int) -> Bytes:

@@ -1,4 +1,4 @@
-"""Names, titles, colors and sheets of pictures for people, and PNG files."""
+"""Adds names, titles and colors to pictures for people, arranges them in sheets, and writes PNG files."""
 
 from __future__ import annotations
 
@@ -172,7 +172,7 @@ def contact_sheet(frames: Sequence[RenderedFrame], *, columns: int = 3, width: i
 
     A frame without colors shows its depth alone.
     """
-    return in_rows([_cell(frame, width) for frame in frames], columns=columns)
+    return in_rows([_sheet_cell(frame, width) for frame in frames], columns=columns)
 
 
 def in_rows(cells: Sequence[Picture], *, columns: int = 3) -> Picture:
@@ -230,7 +230,7 @@ def colored_depth(depth: Float32[np.ndarray, "H W"]) -> Picture:
     return picture
 
 
-def _cell(frame: RenderedFrame, width: int) -> Picture:
+def _sheet_cell(frame: RenderedFrame, width: int) -> Picture:
     sensed = as_sensed(frame)
     scale = min(1.0, width / frame.camera.size[0])
     parts, hands = [], [(hand.keypoints, hand.visible) for hand in frame.hands]

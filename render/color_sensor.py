@@ -1,7 +1,7 @@
-"""Color sensors: exposure and noise of a picture, motion blur and rolling shutter.
+"""Simulates color sensors: exposure and noise of a picture, motion blur and rolling shutter.
 
-The noise is EMVA 1288's (release 4.0) linear camera: shot noise of the electrons and the noise of reading
-them out, here as one normal number per pixel and channel with the variance of both.
+The noise is that of the linear camera of EMVA 1288 (release 4.0): shot noise of the electrons and noise of
+their readout, drawn as one normal number per pixel and channel with the variance of both.
 
 A row of a picture is open for `exposure` seconds; the rows open one after the other, `readout` seconds from
 the first to the last. Time 0 is the middle of the middle row's exposure: the time of a frame's ground
@@ -26,11 +26,11 @@ from render.frames import Bytes, Floats
 
 GAMMA: Final = 2.2
 """Exponent that makes linear light of the painters' display values."""
-_ROOTS: Final = 4096  # of light in the same table by its root, which stays in the processor's cache
-_SPREAD: Final = (3, 3)  # [px] that a point of light is spread over
-_GRAY: Final = 0.25  # mean light of pictures that keep the nominal exposure
-_METERED: Final = (0.25, 4.0)  # range of the ratio of light that is made up for
-_LEVELS: Final = 65536  # of light in the table of the sRGB curve: twenty to its narrowest step
+_ROOT_STEPS: Final = 4096  # entries of a table of the sRGB curve by the root of light, which fits in a cache
+_BLUR_KERNEL: Final = (3, 3)  # pixels over which a point of light is spread
+_MIDDLE_GRAY: Final = 0.25  # mean light of pictures that keep the nominal exposure
+_METERING_LIMITS: Final = (0.25, 4.0)  # range of the ratio of light that metering corrects
+_LIGHT_STEPS: Final = 65536  # entries of the table of the sRGB curve: twenty for its narrowest step
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,10 +50,10 @@ class Exposure:
     jpeg_quality: int | None = None
     """Quality of JPEG compression, 1 to 100; None without it."""
     blur: float = 0.0
-    """Standard deviation of what lens and color filters spread a point of light by [px]."""
+    """Standard deviation of the spread of a point of light by lens and color filters [px]."""
     metering: float = 0.0
-    """Share of the difference between a picture's mean light and middle gray that the camera makes up for, a
-    stop at most."""
+    """Share of the difference between a picture's mean light and middle gray that the camera corrects, a stop
+    at most."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +62,7 @@ class ExposureConfig:
 
     stops: tuple[float, float] = (-0.5, 0.4)
     metering: float = 0.12
-    """Share of the difference between a picture's mean light and middle gray that cameras make up for."""
+    """Share of the difference between a picture's mean light and middle gray that cameras correct."""
     balance: float = 0.05
     """Standard deviation of the logarithms of the factors of red and blue."""
     white_electrons: tuple[float, float] = (1000.0, 10000.0)
@@ -77,7 +77,7 @@ class ExposureConfig:
 
 
 def sample_exposure(config: ExposureConfig, *, rng: np.random.Generator) -> Exposure:
-    """A random exposure."""
+    """Draw a random exposure."""
     red, blue = np.exp(config.balance * rng.standard_normal(2))
     least, most = np.log(config.white_electrons)
     is_jpeg = bool(rng.random() < config.jpeg_share)
@@ -95,12 +95,12 @@ def sample_exposure(config: ExposureConfig, *, rng: np.random.Generator) -> Expo
 
 
 def linear_of(rgb: UInt8[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "H W 3"]:
-    """Light of sRGB colors, 1 for white. What was clipped at white stays there."""
+    """Light of sRGB colors, 1 for white; clipped colors stay at white."""
     return np.asarray(cv2.LUT(rgb, light_of(np.arange(256)).astype(np.float32)))
 
 
 def light_of(levels: NDArray[Any]) -> NDArray[Any]:
-    """Light of sRGB levels (...,), IEC 61966-2-1, 1 for 255; beyond, that of the painters."""
+    """Light of sRGB levels (...,) by IEC 61966-2-1, 1 for 255, and by the painters' `GAMMA` beyond."""
     value = levels / 255.0
     light = np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
     return np.where(value > 1.0, value**GAMMA, light)
@@ -109,23 +109,23 @@ def light_of(levels: NDArray[Any]) -> NDArray[Any]:
 def expose(
     linear: Float32[np.ndarray, "H W 3"], exposure: Exposure, *, rng: np.random.Generator
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """The picture that a sensor takes of light (1 is white, more is as white), sRGB."""
+    """Simulate the sRGB picture that a sensor takes of light, which is 1 for white and may exceed it."""
     height, width = linear.shape[:2]
     rgb = np.empty((height, 3 * width), np.uint8)
     white = exposure.white_electrons
     words = random_words(linear.shape if white > 0.0 else (0, 0, 0), rng=rng)
     away = np.repeat((np.arange(width) + 0.5 - 0.5 * width) ** 2, 3).astype(np.float32)
-    gain = np.float32(2.0**exposure.stops * _metered(linear) ** exposure.metering)
-    lost = np.float32(exposure.vignetting)
+    gain = np.float32(2.0**exposure.stops * _metering_gain(linear) ** exposure.metering)
+    vignetting = np.float32(exposure.vignetting)
     shot = np.float32(1.0 / white if white > 0.0 else 0.0)
     dark = np.float32((exposure.read_noise / white) ** 2 if white > 0.0 else 0.0)
     balance = np.tile(np.array(exposure.balance, dtype=np.float32), width)
     light = np.ascontiguousarray(linear, dtype=np.float32)
     if exposure.blur > 0.0:
-        light = cv2.GaussianBlur(light, _SPREAD, exposure.blur)
+        light = cv2.GaussianBlur(light, _BLUR_KERNEL, exposure.blur)
     light = light.reshape(height, 3 * width)
     words, curve = words.reshape(-1, 3 * width), _root_curve()
-    _expose(light, gain, lost, shot, dark, words, quantiles(), away, balance, curve, rgb)
+    _expose(light, gain, vignetting, shot, dark, words, quantiles(), away, balance, curve, rgb)
     rgb = rgb.reshape(linear.shape)
     if exposure.jpeg_quality is None:
         return rgb
@@ -135,18 +135,18 @@ def expose(
     return np.asarray(cv2.cvtColor(cv2.imdecode(file, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB))
 
 
-def _metered(linear: Floats) -> float:
-    """Middle gray over the mean of the light that the lens lets in."""
+def _metering_gain(linear: Floats) -> float:
+    """Ratio of middle gray to the mean of the light that the lens lets in."""
     values = linear.reshape(len(linear), -1)
     mean = cv2.sumElems(values)[0] / max(cv2.countNonZero(values), 1)
-    return float(np.clip(_GRAY / max(mean, 1e-6), *_METERED))
+    return float(np.clip(_MIDDLE_GRAY / max(mean, 1e-6), *_METERING_LIMITS))
 
 
 @kernel
 def _expose(
     linear: Floats,
     gain: np.float32,
-    lost: np.float32,
+    vignetting: np.float32,
     shot: np.float32,
     dark: np.float32,
     words: NDArray[np.uint16],
@@ -158,20 +158,20 @@ def _expose(
 ) -> None:
     """Write what a sensor makes of light (H, 3 W), row by row, in loops that compile to vector instructions.
 
-    `gain` is a factor on the light in the middle, `lost` the share that is missing in the corners, `shot` one
-    over the electrons of white, `dark` the variance of the noise in the dark; `words` are random, and empty
-    for no noise; `away` is the squared distance of a row's values from the middle column [px^2], `balance` a
-    factor on each.
+    `gain` is a factor on the light in the middle, `vignetting` the share that is missing in the corners,
+    `shot` one over the electrons of white, `dark` the variance of the noise in the dark; `words` are random,
+    and empty for no noise; `away` is the squared distance of a row's values from the middle column [px^2],
+    `balance` a factor on each.
     """
     height, width = linear.shape
     corner = np.float32(1.0 / (0.25 * (height * height + width * width / 9.0)))
-    zero, one, half, top = np.float32(0.0), np.float32(1.0), np.float32(0.5), np.float32(_ROOTS - 1)
+    zero, one, half, top = np.float32(0.0), np.float32(1.0), np.float32(0.5), np.float32(_ROOT_STEPS - 1)
     light, noise = np.empty(width, np.float32), np.zeros(width, np.float32)
     level = np.empty(width, np.int32)
     for row in range(height):
         down = np.float32((row + 0.5 - 0.5 * height) ** 2)
         for n in range(width):
-            light[n] = linear[row, n] * (gain * (one - lost * (down + away[n]) * corner))
+            light[n] = linear[row, n] * (gain * (one - vignetting * (down + away[n]) * corner))
         if len(words):
             for n in range(width):
                 noise[n] = normal[words[row, n]]
@@ -188,12 +188,12 @@ def _expose(
 
 @functools.cache
 def _root_curve() -> Bytes:
-    """The sRGB values of light in even steps of its root: sixteen or more to each."""
-    light = np.arange(_LEVELS) / (_LEVELS - 1)
+    """Table of the sRGB values of light, in even steps of its root: sixteen or more for each value."""
+    light = np.arange(_LIGHT_STEPS) / (_LIGHT_STEPS - 1)
     value = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1.0 / 2.4) - 0.055)
-    roots = ((np.arange(_ROOTS) / (_ROOTS - 1)) ** 2).astype(np.float32)
+    roots = ((np.arange(_ROOT_STEPS) / (_ROOT_STEPS - 1)) ** 2).astype(np.float32)
     return np.rint(255.0 * value).astype(np.uint8)[
-        (roots * np.float32(_LEVELS - 1) + np.float32(0.5)).astype(np.uint16)
+        (roots * np.float32(_LIGHT_STEPS - 1) + np.float32(0.5)).astype(np.uint16)
     ]
 
 
@@ -223,7 +223,7 @@ class ShutterConfig:
 
 
 def sample_shutter(config: ShutterConfig, *, rng: np.random.Generator) -> Shutter:
-    """A random shutter."""
+    """Draw a random shutter."""
     exposure = float(np.exp(rng.uniform(*np.log(config.exposure))))
     rolls, readout = bool(rng.random() < config.rolling_share), float(rng.uniform(*config.readout))
     return Shutter(exposure, readout if rolls else 0.0, config.sub_frames)
@@ -232,7 +232,7 @@ def sample_shutter(config: ShutterConfig, *, rng: np.random.Generator) -> Shutte
 def shutter_times(
     exposure: float, readout: float, sub_frames: int, height: int
 ) -> tuple[Float[np.ndarray, "S"], Float[np.ndarray, "H S"]]:
-    """Moments to draw, and how much each row of the picture has of each.
+    """Moments to draw, and the weight of each in each row of the picture.
 
     The time in which any row is open is cut into as many equal pieces; a moment is a piece's middle, and a
     row's weights are the shares of its exposure that fall into the pieces.
@@ -241,7 +241,7 @@ def shutter_times(
     cuts = total * (np.arange(sub_frames + 1) / sub_frames - 0.5)
     times = 0.5 * (cuts[:-1] + cuts[1:])
     middles = readout * (np.arange(height) / max(height - 1, 1) - 0.5) if height > 1 else np.zeros(1)
-    if exposure < 1e-9:  # rows are moments: each has the piece that it falls into
+    if exposure < 1e-9:  # each row is a moment, and has the piece that it falls into
         nearest = np.abs(middles[:, None] - times).argmin(axis=1)
         return times, np.eye(sub_frames)[nearest]
     opened, closed = middles[:, None] - 0.5 * exposure, middles[:, None] + 0.5 * exposure
@@ -255,7 +255,7 @@ def combine(
     sub_frames: Iterable[UInt8[np.ndarray, "H W 3"] | Float32[np.ndarray, "H W 3"]],
     weights: Float[np.ndarray, "H S"],
 ) -> Float32[np.ndarray, "H W 3"]:
-    """Light of the picture that a shutter makes of moments, for `render.color_sensor.expose`.
+    """Combine moments to the light of a shutter's picture, for `render.color_sensor.expose`.
 
     Moments come in their order, as sRGB bytes or as light; one is held at a time. Weights are those of
     `shutter_times`.

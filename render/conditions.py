@@ -31,7 +31,7 @@ class Conditions:
     """Box whose walls show the background to several cameras; None for the picture of one camera."""
 
     def reseeded(self, rng: np.random.Generator) -> Conditions:
-        """The same with other noise of the sensors."""
+        """A copy with other noise of the sensors."""
         return dataclasses.replace(self, seed=int(rng.integers(2**31)))
 
     def record(self) -> dict[str, Any]:
@@ -49,7 +49,7 @@ def sample_conditions(
 ) -> Conditions:
     """Random choices of a picture, with light for a viewer with these axes (3, 3).
 
-    Several places `around` (N, 3) of cameras and hands share an enclosure.
+    Cameras and hands at positions `around` (N, 3) [m] share an enclosure.
     """
     background, lighting, enclosure = sample_surroundings(config.background, viewer, size, around, rng=rng)
     sensor = config.depth_sensor
@@ -66,7 +66,7 @@ def sample_conditions(
 
 @functools.lru_cache(maxsize=64)
 def _as_record(conditions: Conditions) -> dict[str, Any]:
-    """Choices as JSON; cached, because pictures of a shard have all but their seed in common."""
+    """The choices as JSON, cached, because pictures of a shard differ in their seeds only."""
     noise = conditions.depth_noise
     kind = {} if noise is None else {"depth_sensor": type(noise).__name__}
     record = kind | dataclasses.asdict(conditions)

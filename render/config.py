@@ -1,4 +1,4 @@
-"""`RenderConfig`: everything that decides the bytes of a rendering."""
+"""`RenderConfig`: everything that determines the bytes of a rendering."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ NEAR_SENSOR: Final = "d435"
 """Depth sensor of cameras that may be as near as 0.3 m to the hands: it measures from 0.2 m on."""
 FAR_SENSOR: Final = "kinect2"
 """Depth sensor of rigs, and of others at a set distance of 0.6 m or more; it measures from 0.5 m on."""
-_FAR: Final = 0.6  # [m]
+_FAR_DISTANCE: Final = 0.6  # [m]
 
 
 class SpawnKey(enum.IntEnum):
-    """What a child of a seed draws: the first number of its spawn key."""
+    """First number of the spawn key of a child of a seed, by what the child draws."""
 
     VIEWPOINTS = 1
     SHARD = 2
@@ -51,7 +51,7 @@ class SpawnKey(enum.IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class FrameConfig(Settings):
-    """What drawn pictures and those of a video have in common.
+    """Settings that drawn pictures and those of a video have in common.
 
     Raises:
         ArgumentError: A pass is unknown, or a number is out of range.
@@ -89,7 +89,7 @@ class FrameConfig(Settings):
 
 @dataclass(frozen=True, slots=True)
 class RenderConfig(FrameConfig):
-    """Everything that decides the bytes of a rendering; it is saved beside the pictures.
+    """Everything that determines the bytes of a rendering; it is saved beside the pictures.
 
     Raises:
         ArgumentError: A pass is unknown, or a number is out of range.
@@ -195,16 +195,17 @@ def resolve(
     *,
     near: bool = False,
 ) -> RenderConfig:
-    """The configuration with what a call gives beside it, and without auto.
+    """Apply the settings and the camera of a call, and replace "auto".
 
-    Auto is the painter of this machine, and the depth sensor of the placement, or of cameras `near` hands.
+    "auto" becomes the best painter of this machine, and the depth sensor for the placement of the cameras, or
+    for cameras `near` the hands.
     """
     config = RenderConfig() if config is None else config
     check_type("config", config, RenderConfig, "a RenderConfig")
     if "view" in settings and camera is not None and not isinstance(camera, str):
         raise ArgumentError("given view and camera, expected one of them")
     config = RenderConfig.of(config, settings)
-    view, painter, sensor = _view(config.view, camera), config.painter, config.depth_sensor
+    view, painter, sensor = _resolve_view(config.view, camera), config.painter, config.depth_sensor
     if painter == "auto":  # without colors there is no need to look
         from render.painting.painter import choose_painter  # not for the help of commands
 
@@ -212,14 +213,14 @@ def resolve(
     if sensor == "auto" and "depth" not in config.passes:
         sensor = None
     elif sensor == "auto":
-        set_far = view.distance is not None and view.distance[0] >= _FAR
+        set_far = view.distance is not None and view.distance[0] >= _FAR_DISTANCE
         far = not near and view.cameras is None and (view.placement == "rig" or set_far)
         sensor = DepthSensor((FAR_SENSOR if far else NEAR_SENSOR,))
     return dataclasses.replace(config, view=view, painter=painter, depth_sensor=sensor)
 
 
-def _view(view: ViewConfig, camera: Cameras | None) -> ViewConfig:
-    """The cameras that a call gives, or those of the configuration."""
+def _resolve_view(view: ViewConfig, camera: Cameras | None) -> ViewConfig:
+    """Replace the cameras of the configuration by those of a call, if there are any."""
     if camera is None:
         return view
     if isinstance(camera, str):

@@ -1,4 +1,4 @@
-"""Noise of depth sensors: disparity (structured light, stereo) and time of flight.
+"""Simulates depth sensors: noise of disparity (structured light, stereo) and of time of flight.
 
 Disparities follow Barron and Malik (CVPR 2013), who shift pixels, add noise and round to eighths of a
 pixel, and Bohg, Romero, Herzog and Schaal (ICRA 2014), whose matching windows fail at edges. Noise of time
@@ -26,12 +26,12 @@ from render.fields import normal_numbers, quantiles, random_words
 from render.frames import Flags, Floats, Integers, at_rest
 
 _DOTS: Final = (-3, 0, 3)  # one pixel in nine is a dot, so that a window of 9 x 9 holds these
-_BYTES: Final = np.arange(256)
-_SHADOW_SLACK: Final = 2.0  # [px] of disparity that a surface may differ from itself
-_WALL: Final = 0.8  # reflectance of the white walls that noise was published for
-_BANDS: Final = 1024  # of cosines in the tables below
-_FADING: Final = 0.09  # [rad] over which surfaces go before the steepest
-_NOTHING: Final = np.float32(1e6)
+_BYTE_VALUES: Final = np.arange(256)
+_SHADOW_SLACK: Final = 2.0  # disparity by which a surface may shadow itself [px]
+_WALL_REFLECTANCE: Final = 0.8  # reflectance of the white walls for which noise was published
+_ANGLE_BINS: Final = 1024  # number of cosines in the table of `_angle_terms`
+_FADING_ANGLE: Final = 0.09  # range of angles before the steepest where pixels are lost at random [rad]
+_NO_DEPTH: Final = np.float32(1e6)  # stands for the depth of pixels without a surface
 OTHER_NAMES: Final = {"realsense_d435": "d435"}
 
 
@@ -41,35 +41,36 @@ class StructuredLight(Settings):
 
     sensor: str = "kinect1"
     baseline: Annotated[float, Limits(0.0, above=True)] = 0.075
-    """From the camera to the projector or second camera, to its right [m]."""
+    """Distance of the projector or second camera, which is to the right of the camera [m]."""
     step: Annotated[float, Limits(0.0)] = 0.125
-    """What disparities are rounded to [px]; 0: not at all."""
+    """Step to which disparities are rounded [px]; 0 for no rounding."""
     disparity_noise: Annotated[float, Limits(0.0)] = 0.125 / 6
     """Standard deviation before rounding [px]."""
     window: Annotated[int, Limits(1)] = 9
     """Width of the window that is matched [px]: windows that overlap have noise in common. 9 is BlenSor's
     for a Kinect (Gschwandtner et al., ISVC 2011), 7 Keselman et al.'s (CVPR workshops 2017) for a D435."""
     shift: Annotated[float, Limits(0.0, 10.0)] = 0.5
-    """Standard deviation of where a pixel's depth is taken, each way [px]; rounded to whole pixels."""
+    """Standard deviation of the shift of pixels, along columns and rows [px], rounded to whole pixels."""
     support: float = 0.6
-    """Share of a window's other dots that must agree with its middle, give or take `wavering`."""
+    """Mean share of a window's other dots that must agree with its middle."""
     wavering: float = 0.15
-    """Standard deviation of that share, alike in patches of 3 x 3 pixels."""
+    """Standard deviation of the share of `support`, which is equal in patches of 3 x 3 pixels."""
     agreement: float = 1.0
     """Largest difference of disparity inside a window [px]."""
     steepest: float = 1.4
     """Largest angle between a surface's normal and the ray that comes back [rad]."""
     shadow: bool = True
-    """Whether the projector must see a surface too."""
+    """Whether surfaces that the projector does not see are not measured."""
     nearest: float = 0.4
+    """Least depth that is measured [m]."""
     farthest: float = 4.0
-    """What is measured at all [m]."""
+    """Largest depth that is measured [m]."""
 
 
 def _measure_disparity(
     depth: Floats, cosines: Floats, noise: StructuredLight, focal: float, *, rng: np.random.Generator
 ) -> Floats:
-    """Depth (H, W) as the sensor has it [m], 0 where it has none; `focal` is horizontal [px]."""
+    """Measured depth (H, W) [m], 0 where there is none; `focal` is the horizontal focal length [px]."""
     scale, height, width = np.float32(noise.baseline * focal), *depth.shape
     ideal, kept = np.zeros_like(depth), np.zeros(depth.shape, np.bool_)
     nearest, farthest = np.float32(noise.nearest), np.float32(noise.farthest)
@@ -92,15 +93,15 @@ def _measure_disparity(
 
 
 def _blobs(shape: tuple[int, int], window: int, sigma: float, *, rng: np.random.Generator) -> Floats:
-    """Noise (H, W), each pixel the sum of random bytes in a window [px] around it: as good as normal.
+    """Nearly normal noise (H, W), for each pixel the sum of random bytes in a window [px] around it.
 
     Two pixels that are k apart along a row or column have a correlation of 1 - k / window.
     """
     (rows, columns), half = (side + window for side in shape), window // 2
     numbers = random_words((rows, (columns + 1) // 2), rng=rng).view(np.uint8)
     sums = cv2.boxFilter(numbers, cv2.CV_32F, (window, window), normalize=False)
-    sums -= np.float32(window**2 * _BYTES.mean())
-    sums *= np.float32(sigma / (window * _BYTES.std()))
+    sums -= np.float32(window**2 * _BYTE_VALUES.mean())
+    sums *= np.float32(sigma / (window * _BYTE_VALUES.std()))
     return np.asarray(sums[half : half + shape[0], half : half + shape[1]])
 
 
@@ -216,14 +217,14 @@ class TimeOfFlight(Settings):
 
     sensor: str = "kinect2"
     sigma: tuple[float, float, float] = (1.5e-3, -0.5e-3, 0.3e-3)
-    """Standard deviation c0 + c1 z + c2 z^2 of a white wall that faces, depth z in meters [m]."""
+    """Standard deviation of a white wall that faces the camera at depth z: c0 + c1 z + c2 z^2 [m]."""
     angle_sigma: float = 0.1e-3
-    """What is added at an angle a, times z^1.5 (a / (pi/2 - a))^2 [m]."""
+    """Factor of what an angle a adds to it at depth z, z^1.5 (a / (pi/2 - a))^2 [m]."""
     window: Annotated[int, Limits(1)] = 3
-    """Width of the square of pixels whose light the depth of one is of [px]: the filter of Kinect v2's phases
-    in libfreenect2 has nearly even weights in 3 x 3 pixels."""
+    """Width of the square of pixels whose light gives one pixel its depth [px]: the filter of Kinect
+    v2's phases in libfreenect2 has nearly even weights in 3 x 3 pixels."""
     offset: float = 0.0
-    """Added to every depth [m]."""
+    """Error of every depth [m]."""
     edge: float = 0.03
     """Step between neighboring pixels that makes an edge, as a share of the depth."""
     flying: float = 0.5
@@ -231,60 +232,61 @@ class TimeOfFlight(Settings):
     dropped: float = 0.15
     """Share of pixels along edges that are not measured."""
     weakest: float = 0.0074
-    """Least light: reflectance times the angle's cosine over the squared depth [1/m^2]."""
+    """Least light that is measured: reflectance times the angle's cosine over the squared depth [1/m^2]."""
     steepest: float = 1.48
     """Largest angle between a surface's normal and the ray that comes back [rad]."""
     step: float = 0.001
-    """What depths are rounded to [m]; 0: not at all."""
+    """Step to which depths are rounded [m]; 0 for no rounding."""
     nearest: float = 0.5
+    """Least depth that is measured [m]."""
     farthest: float = 4.5
-    """What is measured at all [m]."""
+    """Largest depth that is measured [m]."""
 
 
 def _measure_flight(
     depth: Floats, cosines: Floats, reflectance: Floats, noise: TimeOfFlight, *, rng: np.random.Generator
 ) -> Floats:
-    """Depth (H, W) as the sensor has it [m], 0 where it has none."""
+    """Measured depth (H, W) [m], 0 where there is none."""
     there = depth > 0.0
-    measured = _mixed(depth, noise, rng=rng)
+    measured = _with_flying_pixels(depth, noise, rng=rng)
     c0, c1, c2 = (np.float32(c) for c in noise.sigma)
     if any(noise.sigma) or noise.angle_sigma:
         sigma = (c2 * depth + c1) * depth + c0
         if noise.angle_sigma > 0.0:
-            bands = (cosines * np.float32(_BANDS - 1) + np.float32(0.5)).astype(np.uint16)
+            bands = (cosines * np.float32(_ANGLE_BINS - 1) + np.float32(0.5)).astype(np.uint16)
             sigma += depth * np.sqrt(depth) * _angle_terms(noise.angle_sigma).take(bands, mode="clip")
         # Shot noise goes with the root of the light.
-        sigma *= np.sqrt(np.float32(_WALL) / np.maximum(reflectance, np.float32(0.02)))
+        sigma *= np.sqrt(np.float32(_WALL_REFLECTANCE) / np.maximum(reflectance, np.float32(0.02)))
         measured += sigma * _blobs(depth.shape, noise.window, 1.0, rng=rng)
     measured += np.float32(noise.offset)
     if noise.step > 0.0:
         measured = np.rint(measured * np.float32(1.0 / noise.step)) / np.float32(1.0 / noise.step)
     there &= (measured >= noise.nearest) & (measured <= noise.farthest)
-    _drop_weak(there, depth, cosines, reflectance, noise, rng=rng)
+    _drop_unmeasured(there, depth, cosines, reflectance, noise, rng=rng)
     return np.where(there, measured, np.float32(0.0))
 
 
-def _mixed(depth: Floats, noise: TimeOfFlight, *, rng: np.random.Generator) -> Floats:
-    """Depth with flying pixels along edges, and 0 where an edge is not measured."""
+def _with_flying_pixels(depth: Floats, noise: TimeOfFlight, *, rng: np.random.Generator) -> Floats:
+    """Add flying pixels along edges to depth, and 0 where an edge is not measured."""
     mixed = depth.copy()
     around = np.ones((3, 3), np.uint8)
     far = cv2.dilate(depth, around)
-    near = cv2.erode(np.where(depth > 0.0, depth, _NOTHING), around)
+    near = cv2.erode(np.where(depth > 0.0, depth, _NO_DEPTH), around)
     bare = cv2.erode(depth, around) <= 0.0
     pixels = np.flatnonzero((depth > 0.0) & (bare | (far - near > np.float32(noise.edge) * depth)))
     here, near, far = depth.ravel()[pixels], near.ravel()[pixels], far.ravel()[pixels]
     fate, share = rng.random((2, len(pixels)), dtype=np.float32)
     other = np.where(here - near < far - here, far, near)
     # Light goes with the squared distance, and the phase follows the brighter part.
-    mine, theirs = (1.0 - share) / here**2, share / other**2
-    flown = (mine * here + theirs * other) / (mine + theirs)
+    own_light, other_light = (1.0 - share) / here**2, share / other**2
+    flying_depth = (own_light * here + other_light * other) / (own_light + other_light)
     flies = (fate < noise.flying) & (far - near > noise.edge * here)
-    value = np.where(flies, flown, here)
+    value = np.where(flies, flying_depth, here)
     mixed.ravel()[pixels] = np.where(fate >= 1.0 - noise.dropped, np.float32(0.0), value)
     return mixed
 
 
-def _drop_weak(
+def _drop_unmeasured(
     there: Flags,
     depth: Floats,
     cosines: Floats,
@@ -293,8 +295,8 @@ def _drop_weak(
     *,
     rng: np.random.Generator,
 ) -> None:
-    """Take out what is too steep and, within half of the least light above and below it, too dark."""
-    last = np.cos(noise.steepest - _FADING)
+    """Drop pixels that are too steep, and at random those whose light is within half of the least light."""
+    last = np.cos(noise.steepest - _FADING_ANGLE)
     steep = np.flatnonzero(there & (cosines < last))
     chance = (last - cosines.ravel()[steep]) / max(last - np.cos(noise.steepest), 1e-9)
     there.ravel()[steep] = rng.random(len(steep), dtype=np.float32) > chance
@@ -308,8 +310,8 @@ def _drop_weak(
 
 @functools.lru_cache(maxsize=16)
 def _angle_terms(angle_sigma: float) -> Floats:
-    angles = np.arccos(np.linspace(0.0, 1.0, _BANDS))
-    angles = np.minimum(angles, np.deg2rad(85.0))  # the formula has no end, but noise has
+    angles = np.arccos(np.linspace(0.0, 1.0, _ANGLE_BINS))
+    angles = np.minimum(angles, np.deg2rad(85.0))  # the formula grows without a limit, which noise does not
     return (angle_sigma * (angles / (np.pi / 2 - angles)) ** 2).astype(np.float32)
 
 
@@ -352,11 +354,11 @@ class DepthSensor(Settings):
     sensors: tuple[str, ...] = ("kinect2",)
     """Some of `SENSORS`; a name stands for itself alone."""
     noise: Annotated[float, Limits(0.0)] = 1.0
-    """Factor of the noise that was published of it."""
+    """Factor on the sensor's published noise."""
     spread: Annotated[float, Limits(0.0)] = 0.2
-    """Standard deviation of the logarithm of a copy's noise."""
+    """Standard deviation of the logarithm of the noise of copies of a sensor."""
     offset: Annotated[float, Limits(0.0)] = 0.0035
-    """Standard deviation of a time-of-flight camera's own offset [m]."""
+    """Standard deviation of the offset of copies of a time-of-flight camera [m]."""
 
     def check(self) -> None:
         """Refuse names of sensors that are unknown."""
@@ -367,16 +369,16 @@ class DepthSensor(Settings):
 
 
 def sample_depth_noise(config: DepthSensor, *, rng: np.random.Generator) -> DepthNoise | None:
-    """One copy of one of the sensors; None if there are none."""
+    """Draw a copy of one of the sensors; None if there are none."""
     sensors = [DEPTH_NOISES[name] for name in config.sensors]
     if not sensors:
         return None
     noise = sensors[int(rng.integers(len(sensors)))]
-    louder = config.noise * float(np.exp(config.spread * rng.standard_normal()))
+    factor = config.noise * float(np.exp(config.spread * rng.standard_normal()))
     offset = float(rng.standard_normal())
     if isinstance(noise, StructuredLight):
-        return dataclasses.replace(noise, disparity_noise=louder * noise.disparity_noise)
-    c0, c1, c2 = (louder * c for c in noise.sigma)
+        return dataclasses.replace(noise, disparity_noise=factor * noise.disparity_noise)
+    c0, c1, c2 = (factor * c for c in noise.sigma)
     return dataclasses.replace(noise, sigma=(c0, c1, c2), offset=config.offset * offset)
 
 
@@ -389,9 +391,9 @@ def apply_depth_noise(
     reflectance: Float32[np.ndarray, "H W"] | None,
     rng: np.random.Generator,
 ) -> Float32[np.ndarray, "H W"]:
-    """Depth along the camera's axis as a sensor has it [m], 0 where there is nothing or it has none.
+    """Simulate the depth along the camera's axis that a sensor measures [m], 0 where there is none.
 
-    Normals are in the camera's axes. The reflectance for infrared light counts for time of flight alone.
+    Normals are in the camera's axes. Only time of flight depends on the reflectance for infrared light.
     """
     cosines = _facing(normals, camera)
     if isinstance(noise, StructuredLight):
@@ -401,11 +403,11 @@ def apply_depth_noise(
 
 
 def _facing(normals: Floats, camera: Camera) -> Floats:
-    """Cosines between normals and the rays that come back."""
+    """Cosines (H, W) between normals and the rays back to the camera."""
     if camera.lens.kind == "pinhole":
         (fx, _, cx), (_, fy, cy) = camera.K[:2].tolist()
         return np.asarray(_facing_pinhole(normals, fx, fy, cx, cy))
-    rays = _back(at_rest(camera))
+    rays = _directions_to_camera(at_rest(camera))
     cosines: Floats = rays[0] * normals[..., 0]
     cosines += rays[1] * normals[..., 1]
     cosines += rays[2] * normals[..., 2]
@@ -428,12 +430,12 @@ def _facing_pinhole(normals: Floats, fx: float, fy: float, cx: float, cy: float)
 
 
 @functools.lru_cache(maxsize=16)
-def _back(camera: Camera) -> Floats:
-    """Directions (3, H, W) from what is seen to the camera."""
+def _directions_to_camera(camera: Camera) -> Floats:
+    """Directions (3, H, W) from the pixels' surfaces to the camera."""
     return np.ascontiguousarray(-np.moveaxis(np.nan_to_num(camera.rays()), -1, 0), dtype=np.float32)
 
 
 def reflectance_of(rgb: UInt8[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "H W"]:
     """Infrared reflectance of surfaces, estimated from their brightness in sRGB."""
-    luminance = ((_BYTES / 255.0) ** 2.2).astype(np.float32)
+    luminance = ((_BYTE_VALUES / 255.0) ** 2.2).astype(np.float32)
     return np.asarray(cv2.LUT(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), luminance))

@@ -1,4 +1,4 @@
-"""`draw`, pictures in memory; and `Drawing`, which draws any frame of a subject before its cameras."""
+"""`draw` yields pictures in memory; `Drawing` draws any frame of a subject as its cameras see it."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from render.subject import Model, Subject, subject_of
 from render.user_body import UserBody
 from render.viewpoints import Viewpoints, known_positions
 
-_HEAD: Final = 0.35  # least distance of cameras from the ends of the axis of a head that is drawn [m]
+_LEAST_HEAD_DISTANCE: Final = 0.35  # [m] least distance of cameras from the axis ends of a head that is drawn
 
 
 def draw(
@@ -43,7 +43,7 @@ def draw(
 ) -> Iterator[RenderedFrame]:
     """Draw frames of a take or poses of your own, in memory.
 
-    A frame's picture is the same whatever other frames are asked for.
+    A frame's picture is the same whatever other frames are requested.
 
     Args:
         source: A take or its path; the path of a .csv of `handsim export`; or poses (T, 27), joint angles
@@ -68,31 +68,32 @@ def draw(
     """
     config = resolve(config, settings, camera)
     subject = subject_of(source, model=model, glove=glove, seed=config.seed)
-    asked = asked_pictures(subject, config, frames, record)
-    return asked.drawing.frames(asked.shard, asked.numbered)
+    requested = requested_pictures(subject, config, frames, record)
+    return requested.drawing.frames(requested.shard, requested.numbered)
 
 
-class Asked(NamedTuple):
-    """Pictures that a call asks for."""
+class RequestedPictures(NamedTuple):
+    """Pictures that a call requests."""
 
     drawing: Drawing
     shard: int
-    numbered: Iterable[tuple[int, int]]  # frames with their places in the shard
+    numbered: Iterable[tuple[int, int]]  # positions in the shard, and frames
 
 
-def asked_pictures(
+def requested_pictures(
     subject: Subject, config: RenderConfig, frames: Iterable[int] | None, record: Mapping[str, Any] | None
-) -> Asked:
+) -> RequestedPictures:
     """The pictures of some frames of a subject, or the one of a picture's record; see `draw`."""
     drawing = Drawing(subject, config)
     drawing.viewpoints.check_hands_in_view()
     if record is None:
-        return Asked(drawing, 0, ((n, n) for n in drawing.chosen_frames(frames)))
+        return RequestedPictures(drawing, 0, ((n, n) for n in drawing.chosen_frames(frames)))
     check_type("record", record, Mapping, "a picture's record, as formats of files have it")
     number, choices = record.get("number", record.get("frame")), record.get("choices", {})
     if frames is not None or number is None or not {"shard", "place"} <= set(choices):
         raise ArgumentError("expected frames or a picture's record, with shard and place in its choices")
-    return Asked(drawing, choices["shard"], [(choices["place"], *drawing.chosen_frames([number]))])
+    numbered = [(choices["place"], *drawing.chosen_frames([number]))]
+    return RequestedPictures(drawing, choices["shard"], numbered)
 
 
 class Scene(NamedTuple):
@@ -115,14 +116,12 @@ class Drawing:
             load_mano(config.mano)  # a file that is none is refused before anything is drawn
         for body in subject.take.bodies:
             if body.shape is None and not len(body.positions):
-                told = (
-                    f"{body.name} has neither a surface nor markers and is not drawn; "
-                    "RigidBody.of gives a body the surface of its object"
-                )
-                warnings.warn(told, HandSimWarning, stacklevel=3)
+                nothing = f"{body.name} has neither a surface nor markers and is not drawn"
+                remedy = "RigidBody.of gives a body the surface of its object"
+                warnings.warn(f"{nothing}; {remedy}", HandSimWarning, stacklevel=3)
         self.subject, self.config, self._light = subject.upright(config.up), config, light
         self.take, rng = self.subject.take, SpawnKey.VIEWPOINTS.rng(config.seed)
-        # Poses that are no motion may be of many people, but cameras at the eyes need one person.
+        # Single poses may be of many people; only cameras at the eyes need one person nevertheless.
         has_user = subject.is_motion or config.view.placement == "head"
         self._user = UserBody(self.take, known_positions(config.view, config.up)) if has_user else None
         poses = None if subject.footage is None else subject.footage.poses
@@ -165,7 +164,7 @@ class Drawing:
         *,
         leave_out: Callable[[int], None] | None = None,
     ) -> Iterator[RenderedFrame]:
-        """Pictures of frames by all cameras; the frames are given with their places in the shard."""
+        """Draw frames for all cameras; the frames are given with their positions in the shard."""
         for studio, moment, camera, conditions, about in self.scenes(shard, numbered, leave_out=leave_out):
             drawn = studio.photograph(moment, camera, conditions)
             yield dataclasses.replace(drawn, choices=about | dict(drawn.choices))
@@ -177,16 +176,16 @@ class Drawing:
         *,
         leave_out: Callable[[int], None] | None = None,
     ) -> Iterator[Scene]:
-        """What these pictures show."""
+        """Set up what these pictures show."""
         config, cast, viewpoints = self.config, self.subject.cast, self.viewpoints
         rng = SpawnKey.SHARD.rng(config.seed, shard, 0)
         if cast is None:  # a take has its own hands, whose looks change with the shard
             worn = self.take.hands
             studio = self._studio(worn, rng)
         sample = functools.partial(
-            sample_conditions, config, viewpoints.viewer, viewpoints.size, self._enclosed()
+            sample_conditions, config, viewpoints.viewer, viewpoints.size, self._enclosed_positions()
         )
-        common = self._held(sample(rng=rng)) if config.vary == "shard" else None
+        common = self._with_fixed_backdrop(sample(rng=rng)) if config.vary == "shard" else None
         for place, frame in numbered:
             person = shard if cast is None or cast.person is None else int(cast.person[frame])
             if cast is not None:
@@ -198,7 +197,7 @@ class Drawing:
             cameras = viewpoints.cameras(frame)
             moment = Moment(self.take, frame, None if cast is None else cast.person)
             if self._arms is None:
-                moment = studio.reaching(moment, cameras, self._user)
+                moment = studio.with_arms(moment, cameras, self._user)
             else:
                 fore, upper = (ways[frame] for ways in self._arms)
                 moment = dataclasses.replace(moment, forearms=fore, upper_arms=upper)
@@ -216,15 +215,15 @@ class Drawing:
             return None
         return self._user.moving_arms(self.take, self.viewpoints.cameras, whole=self._shows_person)
 
-    def _enclosed(self) -> Doubles | None:
-        """Places (N, 3) of cameras and hands that share a background [m]; None for one camera."""
+    def _enclosed_positions(self) -> Doubles | None:
+        """Positions (N, 3) of cameras and hands that share a background [m]; None for one camera."""
         viewpoints = self.viewpoints
         enclosed = viewpoints.num_cameras > 1 or (viewpoints.moves and self.config.vary == "shard")
         enclosed |= viewpoints.cameras(0)[0].lens.kind != "pinhole"  # which bends what is behind the hands
         return viewpoints.positions() if enclosed and self.subject.footage is None else None
 
-    def _held(self, scene: Conditions) -> Conditions:
-        """The conditions with a backdrop that stays where it is, behind the hands of all frames."""
+    def _with_fixed_backdrop(self, scene: Conditions) -> Conditions:
+        """Fix the backdrop behind the hands of all frames, so that it does not move with them."""
         backdrop = scene.background.backdrop
         level, arms = (self.viewpoints.nearest(backdrop.normal, arms=arms) for arms in (False, True))
         held = dataclasses.replace(backdrop, level=level - backdrop.gap, arms=arms)
@@ -238,14 +237,15 @@ class Drawing:
 
     def _studio(self, hands: Sequence[GloveFit], rng: np.random.Generator) -> Studio:
         """The studio of somebody with these hands."""
-        about: dict[str, Any] = {"footage": self.subject.footage, "light": self._light}
-        about |= {"user": self._user, "shows_person": self._shows_person}
-        return Studio(hands, self.config, self.take.bodies, rng=rng, **about)
+        return Studio(
+            hands, self.config, self.take.bodies, rng=rng, user=self._user, shows_person=self._shows_person,
+            light=self._light, footage=self.subject.footage,
+        )  # fmt: skip
 
     @functools.cached_property
     def _shows_person(self) -> bool:
-        """Whether pictures show somebody: a motion's, unless a camera is ever in or close to the head."""
+        """Whether pictures show the person of a motion; not if a camera is ever in or close to the head."""
         if self._user is None or not self.subject.is_motion or self.subject.footage is not None:
             return False
-        ways = self.viewpoints.eyes()[:, None] - self._user.trunk[-1]
-        return bool(np.linalg.norm(ways, axis=-1).min() > _HEAD)
+        offsets = self.viewpoints.eyes()[:, None] - self._user.trunk[-1]
+        return bool(np.linalg.norm(offsets, axis=-1).min() > _LEAST_HEAD_DISTANCE)

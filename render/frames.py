@@ -28,8 +28,14 @@ PARTS_A_HAND: Final = 32
 """Part numbers per hand: a pixel of bone b of hand h has part 1 + b + 32 h; 0 is no hand."""
 
 
+def triple(values: NDArray[np.floating]) -> tuple[float, float, float]:
+    """The three numbers of an array (3,), such as a color or a direction, as plain values."""
+    first, second, third = values.tolist()
+    return first, second, third
+
+
 def at_rest(camera: Camera) -> Camera:
-    """A copy in the origin and without a name: equal for all cameras that share size, matrix and lens."""
+    """A copy at the origin without a name, which is equal for cameras of the same size, matrix and lens."""
     return dataclasses.replace(camera, name="", K=camera.K.copy(), T_world_camera=np.eye(4))
 
 
@@ -67,7 +73,7 @@ class Geometry(NamedTuple):
 
 
 class Footage(Protocol):
-    """Pictures that a real camera took of a take's hands, in the place of drawn colors; it can be pickled."""
+    """Pictures that a real camera took of a take's hands; they replace drawn colors. It can be pickled."""
 
     @property
     def poses(self) -> Float[np.ndarray, "T 4 4"]:
@@ -75,7 +81,7 @@ class Footage(Protocol):
 
     @property
     def record(self) -> dict[str, Any]:
-        """What pictures tell of their origin, as JSON."""
+        """The origin of the pictures, as JSON."""
 
     def picture(self, frame: int) -> Bytes:
         """The picture (sRGB) of a frame."""

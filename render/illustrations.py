@@ -47,10 +47,10 @@ from render.painting.rasterizer import NEAR, Triangles, see
 from render.scenery.lights import STUDIO
 
 _OVERSAMPLING: Final = 2  # colors are painted this much larger and scaled down, for smooth outlines
-_SIZE: Final = (800, 600)  # [px]
+_SIZE: Final = (800, 600)  # size of videos [px]
 _CODEC: Final = "mp4v"  # part of every build of OpenCV
-_AHEAD: Final = (-0.62, 0.62, -0.48)  # direction of view, as the viewer's first look
-_TEXT: Final = (60, 60, 60)
+_VIEW_DIRECTION: Final = (-0.62, 0.62, -0.48)  # direction of videos, that of a new window of the viewer
+_TEXT_COLOR: Final = (60, 60, 60)
 FINGERS_UP: Final = np.array([1.0, 0.0, 0.0])
 # Directions of view in the wrist frame of a right hand; mirrored for a left hand.
 SIDES_OF_HAND: Final[Mapping[str, tuple[float, float, float]]] = {
@@ -59,10 +59,10 @@ SIDES_OF_HAND: Final[Mapping[str, tuple[float, float, float]]] = {
     "thumb side": (0.0, -1.0, -0.25),
     "little finger side": (0.0, 1.0, -0.25),
 }
-_GAP: Final = 0.025  # between hands in a row [m]
+_HAND_GAP: Final = 0.025  # between hands in a row [m]
 _WIDTH, _COLUMNS = 2000, 4  # width of a picture of rows [px]; number of gloves in a row
-_CAMERA_SIZE: Final = (1100, 900)  # [px], without names
-_LABELS_SIZE: Final = (640, 800)  # of one side without names [px]
+_CAMERA_SIZE: Final = (1100, 900)  # size of a camera's view without the names beside it [px]
+_LABELS_SIZE: Final = (640, 800)  # size of a labeled frame without the names beside it [px]
 
 
 class Balls(NamedTuple):
@@ -100,11 +100,11 @@ class PosedHand(NamedTuple):
         return self.hand.model if isinstance(self.hand, GloveFit) else self.hand
 
     def vertices(self) -> Float[np.ndarray, "V 3"]:
-        """Skin in the world [m]."""
+        """Vertices of the skin in the world [m]."""
         return np.asarray(self.model.skin(self.qpos[None])[0])
 
     def surfaces(self) -> list[Drawn]:
-        """Skin with smooth normals, and the glove's markers."""
+        """Surfaces of the skin, with smooth normals, and of the glove's markers."""
         vertices, faces = self.vertices(), self.model.surface.faces
         colors = skin_tint(self.model) if self.covering == "skin" else np.ones((len(vertices), 3))
         normals = vertex_normals(vertices, faces)
@@ -118,7 +118,7 @@ class PosedHand(NamedTuple):
 def _surface(
     vertices: Doubles, normals: Doubles, faces: Integers, colors: Doubles, material: Material
 ) -> Drawn:
-    """A surface without ids, its colors (V, 3) linear factors on the material's."""
+    """A surface without ids; its colors (V, 3) are linear factors on the material's."""
     ids = np.zeros(len(faces), dtype=np.uint8)
     factors = np.ones((len(vertices), 4), dtype=np.float32)
     factors[:, :3] = colors
@@ -197,14 +197,14 @@ def write_clip(
     (N, 3) in the world [m], of this radius [m]; their colors (N, 3), sRGB in [0, 1]; and a line of text.
     """
     check_ending(path, ".mp4", option="--video")
-    view = view_along(np.array(_AHEAD), np.array([0.0, 0.0, 1.0]), shown, _SIZE)
+    view = view_along(np.array(_VIEW_DIRECTION), np.array([0.0, 0.0, 1.0]), shown, _SIZE)
 
     def pictures() -> Iterator[Picture]:
         for hands, points, colors, caption in frames:
             posed = [PosedHand(model, qpos) for model, qpos in hands if np.isfinite(qpos).all()]
             picture = draw_things(view, *posed, Balls(points, radius, colors))
             place = (16, _SIZE[1] - 18)
-            cv2.putText(picture, caption, place, cv2.FONT_HERSHEY_SIMPLEX, 0.55, _TEXT, 1, cv2.LINE_AA)
+            cv2.putText(picture, caption, place, cv2.FONT_HERSHEY_SIMPLEX, 0.55, _TEXT_COLOR, 1, cv2.LINE_AA)
             yield picture
 
     write_video(path, pictures(), rate=rate, size=_SIZE)
@@ -253,10 +253,10 @@ def draw_row(
         at_origin[:3] = right * (extent - across.min())
         at_origin[0] -= vertices[:, 0].min()
         centers.append(at_origin[:3] + right * (across.min() + across.max()) / 2)
-        extent += float(np.ptp(across)) + _GAP
+        extent += float(np.ptp(across)) + _HAND_GAP
         posed.append(PosedHand(hand, at_origin, covering=covering))
     points = np.concatenate([hand.vertices() for hand in posed])
-    tall = float(np.ptp(points[:, 0])) / (extent - _GAP)
+    tall = float(np.ptp(points[:, 0])) / (extent - _HAND_GAP)
     size = (width, round(width * min(1.0, tall) * 1.04))
     # A narrow view from far away shows all hands at one scale, and not the sides of the outer ones.
     view = view_along(ahead, FINGERS_UP, points, size, field_of_view=np.deg2rad(4.0), margin=0.015)
@@ -359,7 +359,7 @@ def draw_camera(
 def zoom(towards: Doubles, points: Doubles, up: Doubles, size: tuple[int, int]) -> float:
     """Vertical opening angle [rad] at which a camera `towards` away from the points just holds them."""
     angle = 0.2
-    for _ in range(20):  # iterates until the place computed from the angle is the camera's
+    for _ in range(20):  # the angle and the distance that it gives converge
         view = view_along(towards, up, points, size, field_of_view=angle)
         distance = float(np.linalg.norm(points.mean(axis=0) - view.T_world_camera[:3, 3]))
         angle = 2 * np.arctan(np.tan(angle / 2) * distance / float(np.linalg.norm(towards)))

@@ -44,12 +44,14 @@ _CONVERT: Final = (
 _BONES: Final = np.array([0, 4, 5, 6, 7, 8, 9, 13, 14, 15, 10, 11, 12, 1, 2, 3])  # our bone of each joint
 _DIGITS: Final = (13, 1, 4, 10, 7)  # first joint of each digit in our order
 _ROUGH, _CLOSE = 12, 20  # steps of the first pose, by keypoints and by the surface
-_SHARED, _STEPS = 12, 3  # steps of the poses that tell the shape, and of any pose
-_KEYPOINT: Final = 0.3  # weight of a keypoint over that of a vertex: MANO has its joints a little elsewhere
-_SLIDE: Final = 0.05  # weight of distances along our skin over those across it, where vertices may slide
-_ALIKE: Final = 0.02  # distance that stands for vertices whose bones have nothing in common [m]
+_SHAPE_STEPS, _POSE_STEPS = 12, 3  # steps of the poses that tell the shape, and of any pose
+_KEYPOINT_WEIGHT: Final = 0.3  # weight of a keypoint over that of a vertex, as MANO's joints lie elsewhere
+_SLIDING_WEIGHT: Final = (
+    0.05  # weight of distances along our skin, where vertices may slide, over those across
+)
+_BONE_DISTANCE: Final = 0.02  # distance that stands for vertices whose bones have nothing in common [m]
 _FARTHEST: Final = 0.012  # distance from our skin of vertices that are left out, as behind the wrist [m]
-_USUAL: Final = 0.0005  # cost of a shape of one standard deviation, as a distance of vertices [m]
+_SHAPE_COST: Final = 0.0005  # cost of a shape of one standard deviation, as a distance of vertices [m]
 _DAMPING: Final = 1e-7  # of rotations that vertices hardly show [m^2]
 
 
@@ -134,26 +136,27 @@ class Mano:
         With `shapes`, also of the shape that all poses have.
         """
         points, levers = self._points(turns, shape, move)
-        slopes = np.zeros((*points.shape, 61 if shapes else 51))
+        jacobian = np.zeros((*points.shape, 61 if shapes else 51))
         for row, after, last in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):  # a turn moves points by its cross product
-            slopes[:, :, row, after:48:3] = np.swapaxes(levers[..., last], 1, 2)
-            slopes[:, :, row, last:48:3] = -np.swapaxes(levers[..., after], 1, 2)
-            slopes[:, :, row, 48 + row] = 1.0
+            jacobian[:, :, row, after:48:3] = np.swapaxes(levers[..., last], 1, 2)
+            jacobian[:, :, row, last:48:3] = -np.swapaxes(levers[..., after], 1, 2)
+            jacobian[:, :, row, 48 + row] = 1.0
         if shapes:
             for number, one in enumerate(np.eye(10)):
-                slopes[..., 51 + number] = self._points(turns, shape + one, move)[0] - points
-        pulled = (weights @ slopes).reshape(len(points), -1, slopes.shape[-1])
-        square = np.swapaxes(slopes.reshape(pulled.shape), 1, 2) @ pulled
-        pull = ((targets - points).reshape(len(points), 1, -1) @ pulled)[:, 0]
-        square[:, range(51), range(51)] += _DAMPING * len(points[0])
+                jacobian[..., 51 + number] = self._points(turns, shape + one, move)[0] - points
+        weighted = (weights @ jacobian).reshape(len(points), -1, jacobian.shape[-1])
+        normal_matrix = np.swapaxes(jacobian.reshape(weighted.shape), 1, 2) @ weighted
+        gradient = ((targets - points).reshape(len(points), 1, -1) @ weighted)[:, 0]
+        normal_matrix[:, range(51), range(51)] += _DAMPING * len(points[0])
         if not shapes:
-            found = np.linalg.solve(square, pull[..., None])[..., 0]
+            found = np.linalg.solve(normal_matrix, gradient[..., None])[..., 0]
         else:  # poses are eliminated, each by itself, and the shape is common
-            to_shape = np.linalg.solve(square[:, :51, :51], square[:, :51, 51:])
-            own = np.linalg.solve(square[:, :51, :51], pull[:, :51, None])[..., 0]
-            usual = _USUAL**2 * len(points[0]) * len(points)
-            left = (square[:, 51:, 51:] - square[:, 51:, :51] @ to_shape).sum(axis=0) + usual * np.eye(10)
-            right = (pull[:, 51:] - np.einsum("bsp,bp->bs", square[:, 51:, :51], own)).sum(axis=0)
+            to_shape = np.linalg.solve(normal_matrix[:, :51, :51], normal_matrix[:, :51, 51:])
+            own = np.linalg.solve(normal_matrix[:, :51, :51], gradient[:, :51, None])[..., 0]
+            usual = _SHAPE_COST**2 * len(points[0]) * len(points)
+            coupling = normal_matrix[:, 51:, :51]
+            left = (normal_matrix[:, 51:, 51:] - coupling @ to_shape).sum(axis=0) + usual * np.eye(10)
+            right = (gradient[:, 51:] - np.einsum("bsp,bp->bs", coupling, own)).sum(axis=0)
             change = np.linalg.solve(left, right - usual * shape)
             shape, found = shape + change, own - to_shape @ change
         by = np.asarray(found[:, :48].reshape(-1, 16, 3), dtype=np.float64)
@@ -199,18 +202,19 @@ class ManoFit:
         targets[:, 778:], weights[:, 778:] = hand_keypoints(model, flat), np.eye(3)
         for _ in range(_ROUGH):
             turns, self.shape, move = mano.step(turns, self.shape, move, targets, weights, shapes=True)
-        weights[:, 778:] *= _KEYPOINT
+        weights[:, 778:] *= _KEYPOINT_WEIGHT
         for _ in range(_CLOSE):
             self._attach(mano.posed(turns, self.shape, move)[0][0], normals)
             across = normals[self._nearest][:, :, None] * normals[self._nearest][:, None]
             targets[0, :778] = self._rest
-            weights[0, :778] = self._known[:, None, None] * ((1.0 - _SLIDE) * across + _SLIDE * np.eye(3))
+            directions = (1.0 - _SLIDING_WEIGHT) * across + _SLIDING_WEIGHT * np.eye(3)
+            weights[0, :778] = self._known[:, None, None] * directions
             turns, self.shape, move = mano.step(turns, self.shape, move, targets, weights, shapes=True)
         self._attach(mano.posed(turns, self.shape, move)[0][0], normals)
         self._flat, self._move = self._worlds(turns), move
         poses = join_qpos(np.stack([np.zeros(20), *(load_gestures()[name] for name in ("relaxed", "fist"))]))
         starts = self._start(poses), self.shape, np.repeat(move, len(poses), axis=0)
-        self.shape = self._steps(poses, *starts, _SHARED, shapes=True)[1]
+        self.shape = self._steps(poses, *starts, _SHAPE_STEPS, shapes=True)[1]
 
     def _attach(self, vertices: Doubles, normals: Doubles) -> None:
         """Attach MANO's vertices (778, 3) to the skin at rest, where they are nearest."""
@@ -218,7 +222,8 @@ class ManoFit:
 
         surface = self._model.surface
         skin, shares = surface.vertices, all_weights(surface.bone_indices, surface.bone_weights)[:, _BONES]
-        ours, theirs = np.hstack([skin, _ALIKE * shares]), np.hstack([vertices, _ALIKE * self._mano._weights])
+        ours = np.hstack([skin, _BONE_DISTANCE * shares])
+        theirs = np.hstack([vertices, _BONE_DISTANCE * self._mano._weights])
         self._nearest = KDTree(ours).query(theirs)[1]
         far = np.linalg.norm(vertices - skin[self._nearest], axis=1)
         here = normals[self._nearest]
@@ -245,7 +250,7 @@ class ManoFit:
         bones, shares = surface.bone_indices[self._nearest], surface.bone_weights[self._nearest]
         skin = skin_frames(self._rest, bones, shares, model.rest_transforms, model.forward_kinematics(qpos))
         targets = np.concatenate([skin, hand_keypoints(model, qpos)], axis=1)
-        known = np.append(self._known, np.full(21, _KEYPOINT))
+        known = np.append(self._known, np.full(21, _KEYPOINT_WEIGHT))
         weights = np.broadcast_to(known[:, None, None] * np.eye(3), (len(qpos), 799, 3, 3))
         for _ in range(count):
             turns, shape, move = self._mano.step(turns, shape, move, targets, weights, shapes=shapes)
@@ -260,7 +265,8 @@ class ManoFit:
 
         local = join_qpos(qpos[:, 7:])
         move = np.repeat(self._move, len(qpos), axis=0)
-        turns, _, move, off = self._steps(local, self._start(local), self.shape, move, _STEPS, shapes=False)
+        start = self._start(local)
+        turns, _, move, off = self._steps(local, start, self.shape, move, _POSE_STEPS, shapes=False)
         into = T_camera_world[:3, :3] @ quaternion_matrix(qpos[:, 3:7])
         at = qpos[:, :3] @ T_camera_world[:3, :3].T + T_camera_world[:3, 3]
         if self._mirrored:  # the skin of a right hand, in a picture that is mirrored left to right

@@ -1,4 +1,4 @@
-"""Photographs and environment maps of users: the one place where their files are checked and read.
+"""Checks and reads the files of users' photographs and environment maps; no other module does.
 
 A photograph has levels of sRGB, an environment map the linear light of all directions.
 """
@@ -31,8 +31,8 @@ PHOTO_SUFFIXES: Final = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tif
 _FORMATS: Final = ("JPEG", "PNG", "WEBP", "BMP", "TIFF", "PPM", "GIF", "JPEG2000")
 _MOST_PIXELS: Final = 100_000_000  # largest number of pixels of a photograph
 _MOST_BYTES: Final = 1 << 29  # largest file of a photograph or map, of about four bytes a pixel
-_MOST_LEVEL: Final = 65535  # of 16 bits
-_DARK: Final = 17  # [levels of 255] least brightest level; 10 and 12 bits in a file of 16 do not reach it
+_MOST_LEVEL: Final = 65535  # highest level of 16 bits
+_LEAST_PEAK: Final = 17  # least brightest level, of 255; files of 16 bits with only 10 or 12 do not reach it
 _HDR_SIZE: Final = re.compile(rb"\n-Y ([0-9]{1,9}) \+X ([0-9]{1,9})\n")
 
 
@@ -50,7 +50,7 @@ def check_photograph(file: Path) -> None:
     if is_map(file):
         check_regular(file, error=FileError, max_bytes=_MOST_BYTES)
     else:
-        with _opened(file):
+        with _open_photograph(file):
             pass
 
 
@@ -62,7 +62,7 @@ def read_photograph(file: Path) -> UInt8[np.ndarray, "H W 3"]:
     Raises:
         FileError: The file is no regular file, damaged, too large, black, or of floating-point levels.
     """
-    with _opened(file) as picture:
+    with _open_photograph(file) as picture:
         upright = ImageOps.exif_transpose(picture)
         if upright.mode.startswith("I"):
             upright = Image.fromarray(_eight_bits(file, np.asarray(upright)))
@@ -71,9 +71,9 @@ def read_photograph(file: Path) -> UInt8[np.ndarray, "H W 3"]:
             over.alpha_composite(upright.convert("RGBA"))
             upright = over
         levels = np.asarray(upright.convert("RGB"))
-        if levels.max() < _DARK:
+        if levels.max() < _LEAST_PEAK:
             raise FileError(
-                f"{file}: its brightest level is {levels.max()} of 255, expected {_DARK} or more; "
+                f"{file}: its brightest level is {levels.max()} of 255, expected {_LEAST_PEAK} or more; "
                 "are these 10 or 12 bits in a file of 16?"
             )
         return levels
@@ -97,11 +97,11 @@ def read_map(file: Path) -> Float32[np.ndarray, "H W 3"]:
 
 
 @contextmanager
-def _opened(file: Path) -> Iterator[Image.Image]:
-    """A photograph, whose beginning is read; its levels are read in the block."""
+def _open_photograph(file: Path) -> Iterator[Image.Image]:
+    """Open a photograph and read its header; its levels are read in the block."""
     check_regular(file, error=FileError, max_bytes=_MOST_BYTES)
     Image.init()  # so that all formats are known by name
-    with _damage_told(file):
+    with _decoder_errors(file):
         try:
             with warnings.catch_warnings(action="ignore"), Image.open(file, formats=_FORMATS) as picture:
                 _check_size(file, picture.width, picture.height)
@@ -116,8 +116,8 @@ def _opened(file: Path) -> Iterator[Image.Image]:
 
 
 @contextmanager
-def _damage_told(file: Path) -> Iterator[None]:
-    """Within the block any exception of a decoder becomes a sentence."""
+def _decoder_errors(file: Path) -> Iterator[None]:
+    """Turn any exception of a decoder in the block into a sentence that names the file."""
     try:
         yield
     except HandSimError:
@@ -134,7 +134,7 @@ def _check_size(file: Path, width: int, height: int) -> None:
 
 
 def _eight_bits(file: Path, levels: NDArray[Any]) -> Bytes:
-    """Levels of 16 bits as 8 bits."""
+    """Convert levels of 16 bits to 8 bits."""
     low, high = int(levels.min()), int(levels.max())
     if low < 0 or high > _MOST_LEVEL:
         raise FileError(f"{file}: levels from {low} to {high}, expected 0 to {_MOST_LEVEL}")
@@ -147,7 +147,7 @@ def _read_hdr(file: Path) -> Floats:
     if not content.startswith(b"#?") or size is None:
         raise FileError(f"{file}: not a readable environment map: no header of Radiance's with -Y and +X")
     _check_size(file, int(size[2]), int(size[1]))
-    with _damage_told(file), quiet_decoder():
+    with _decoder_errors(file), quiet_decoder():
         bgr = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
     if bgr is None:
         raise FileError(f"{file}: not a readable environment map: cut or damaged")
@@ -157,7 +157,7 @@ def _read_hdr(file: Path) -> Floats:
 def _read_exr(file: Path) -> Floats:
     import OpenEXR
 
-    with _damage_told(file), quiet_decoder():
+    with _decoder_errors(file), quiet_decoder():
         shown, stored = _exr_windows(file)
         with plain_path(file) as plain, OpenEXR.File(str(plain)) as opened:
             channels = {name: one.pixels for name, one in opened.channels().items()}
@@ -174,7 +174,7 @@ def _read_exr(file: Path) -> Floats:
 
 
 def _exr_windows(file: Path) -> NDArray[np.int64]:
-    """The first and the end of the columns and rows that an .exr shows, and of those that it stores."""
+    """First and end (2, 2, 2) of the columns and rows that an .exr displays, and of those that it stores."""
     import OpenEXR
 
     with plain_path(file) as plain, OpenEXR.File(str(plain), header_only=True) as opened:
@@ -187,15 +187,15 @@ def _exr_windows(file: Path) -> NDArray[np.int64]:
 
 @contextmanager
 def quiet_decoder() -> Iterator[None]:
-    """Within the block nothing reaches stderr, where OpenCV and OpenEXR write on damaged files."""
-    if sys.stderr is None:  # a daemon's is closed
+    """Silence stderr in the block, because OpenCV and OpenEXR write there on damaged files."""
+    if sys.stderr is None:  # a daemon has no stderr
         yield
         return
-    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    stderr, devnull = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     try:
-        os.dup2(nowhere, 2)
+        os.dup2(devnull, 2)
         yield
     finally:
-        os.dup2(kept, 2)
-        os.close(kept)
-        os.close(nowhere)
+        os.dup2(stderr, 2)
+        os.close(stderr)
+        os.close(devnull)

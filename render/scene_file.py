@@ -23,12 +23,12 @@ from handsim.files.outputs import atomic_write, check_ending
 from handsim.motion_files.motion import Material
 from handsim.motion_files.scenes import add_mesh, save_stage
 from handsim.space.camera import Camera
-from handsim.space.transforms import cross
+from handsim.space.transforms import frame_with_z, rigid
 from render.config import Cameras, RenderConfig, resolve
-from render.drawing import Scene, asked_pictures
+from render.drawing import Scene, requested_pictures
 from render.frames import Doubles
 from render.painting.figures import Drawn
-from render.scenery.lights import Lamp
+from render.painting.opengl import OPENGL_FROM_OPENCV
 from render.studio import picture_behind
 from render.subject import Model, subject_of
 
@@ -82,9 +82,9 @@ def write_scene(
     check_ending(path, *ENDINGS, option="path")
     config = resolve(config, settings, camera)
     subject = subject_of(source, model=model, glove=glove, seed=config.seed)
-    asked = asked_pictures(subject, config, frames, record)
+    requested = requested_pictures(subject, config, frames, record)
     name = None if record is None else record.get("camera")
-    shown = asked.drawing.scenes(asked.shard, asked.numbered)
+    shown = requested.drawing.scenes(requested.shard, requested.numbered)
     scene = next(one for one in shown if name in (None, one.camera.name))
     if scene.camera.lens.kind != "pinhole":
         raise ArgumentError(
@@ -205,17 +205,17 @@ def _add_camera(stage: Any, camera: Camera) -> None:
 
     (width, height), K = camera.size, camera.K
     unit, made = _FILM / width, UsdGeom.Camera.Define(stage, "/scene/camera")
-    tall = unit * K[0, 0] / K[1, 1]  # of a pixel
+    tall = unit * K[0, 0] / K[1, 1]  # height of a pixel on the film
     made.CreateFocalLengthAttr(float(unit * K[0, 0]))
     made.CreateHorizontalApertureAttr(float(unit * width))
     made.CreateVerticalApertureAttr(float(tall * height))
     made.CreateHorizontalApertureOffsetAttr(float(unit * (0.5 * width - K[0, 2])))
     made.CreateVerticalApertureOffsetAttr(float(tall * (K[1, 2] - 0.5 * height)))
     made.CreateClippingRangeAttr(Gf.Vec2f(0.01, 100.0))
-    _place(made, camera.T_world_camera @ np.diag([1.0, -1.0, -1.0, 1.0]))
+    _set_pose(made, camera.T_world_camera @ OPENGL_FROM_OPENCV)
 
 
-def _place(prim: Any, pose: Doubles) -> None:
+def _set_pose(prim: Any, pose: Doubles) -> None:
     from pxr import Gf
 
     prim.AddTransformOp().Set(Gf.Matrix4d(pose.T.tolist()))
@@ -232,20 +232,10 @@ def _add_light(stage: Any, scene: Scene) -> None:
         made.CreateIntensityAttr(float(np.pi * lamp.strength))
         made.CreateColorAttr(Gf.Vec3f(*lamp.color))
         UsdLux.ShadowAPI.Apply(made.GetPrim()).CreateShadowEnableAttr(number == 0)
-        _place(made, _towards(lamp))
+        _set_pose(made, rigid(frame_with_z(np.array(lamp.direction)), np.zeros(3)))
     sky = UsdLux.DomeLight.Define(stage, "/scene/sky")
     sky.CreateIntensityAttr(1.0)
     sky.CreateColorAttr(Gf.Vec3f(*lighting.ambient))
-
-
-def _towards(lamp: Lamp) -> Doubles:
-    """A pose (4, 4) whose z axis points towards a lamp."""
-    z = np.array(lamp.direction) / np.linalg.norm(lamp.direction)
-    x = cross(np.eye(3)[np.abs(z).argmin()], z)
-    pose = np.eye(4)
-    pose[:3, 0] = x / np.linalg.norm(x)
-    pose[:3, 1], pose[:3, 2] = cross(z, pose[:3, 0]), z
-    return pose
 
 
 def _add_behind(stage: Any, path: Path, scene: Scene, surfaces: list[Drawn]) -> None:

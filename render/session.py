@@ -1,4 +1,4 @@
-"""`render_take`: pictures in files, resumable."""
+"""`render_take` writes pictures into files, and resumes a rendering that was stopped."""
 
 from __future__ import annotations
 
@@ -54,8 +54,8 @@ _CUT_OFF: Final = "cut_off-{}.json"
 _HIDDEN: Final = "hidden-{}.json"
 _VISIBLE: Final = "visible-{}.json"
 _DRAWN: Final = ".drawn-{}"  # file of a shard in progress, which has one byte for each of its pictures
-_SHOWN: Final = 0.5  # least share of a hand's keypoints in a picture that does not cut off the hand
-_ON_SHEET: Final = 9  # pictures on a contact sheet
+_LEAST_SHOWN_SHARE: Final = 0.5  # of a hand's keypoints in a picture that does not cut off the hand
+_MOST_ON_SHEET: Final = 9  # pictures on a contact sheet
 
 
 def render_take(
@@ -119,11 +119,11 @@ def render_take(
     drawing.viewpoints.check_hands_in_view()
     absent = drawing.frames_without_hands()
     if absent and subject.footage is None:  # frames of a video are left out for reasons that are told
-        told = f"frames without a hand are not drawn: {len(absent)} of {drawing.take.num_frames}"
-        warnings.warn(f"{told} (the first: {absent[0]})", HandSimWarning, stacklevel=3)
+        message = f"frames without a hand are not drawn: {len(absent)} of {drawing.take.num_frames}"
+        warnings.warn(f"{message} (the first: {absent[0]})", HandSimWarning, stacklevel=3)
     shards, views = drawing.shards(), drawing.viewpoints.num_cameras
     make = functools.partial(_render_shard, subject, formats, config)
-    record = _settings(drawing) | {"formats": list(formats)}
+    record = _record(drawing) | {"formats": list(formats)}
     with open_output(place) as output:
         output.claim(CONFIG, record, noun="rendering", error=HandSimError)
         counts = [views * len(shard) for shard in shards]
@@ -164,13 +164,13 @@ def _draw_shards(
     total = sum(counts)
     count = sum(counts[number] for number in done if number < len(counts))
     todo = [number for number in range(len(counts)) if number not in done]
-    tell = _Counter(output.folder, count, total, progress)
+    counter = _Counter(output.folder, count, total, progress)
     try:
         job = output.job(make, last=[INDEX, f"*{TAR}", CHECKSUMS])
-        with tell, interrupts_bare():
+        with counter, interrupts_bare():
             for drawn, number in enumerate(run_jobs(job, todo, workers)):
                 count += counts[number]
-                tell.finished(number, counts[number])
+                counter.finished(number, counts[number])
                 if drawn == 0 and output.is_here:
                     _check_space(output.folder, len(done) + 1, len(todo) - 1)
     except KeyboardInterrupt as stop:
@@ -184,13 +184,13 @@ class _Counter:
 
     def __init__(self, folder: Path, count: int, total: int, progress: Progress) -> None:
         self._folder, self._count, self._total, self._progress = folder, count, total, progress
-        self._told = -1
+        self._reported = -1
         self._lock, self._ended = threading.Lock(), threading.Event()
         self._thread = threading.Thread(target=self._watch, daemon=True)
 
     def __enter__(self) -> None:
         self._clear()
-        self._tell()
+        self._report()
         self._thread.start()
 
     def __exit__(self, *_: object) -> None:
@@ -207,23 +207,23 @@ class _Counter:
         with self._lock:
             (self._folder / _DRAWN.format(shard)).unlink(missing_ok=True)
             self._count += count
-        self._tell()
+        self._report()
 
     def _watch(self) -> None:
         while not self._ended.wait(1.0):
-            self._tell()
+            self._report()
 
-    def _tell(self) -> None:
+    def _report(self) -> None:
         with self._lock:
             parts = [file.stat().st_size for file in self._folder.glob(_DRAWN.format("*")) if file.is_file()]
             count = min(self._count + sum(parts), self._total)
-            if count > self._told:
-                self._told = count
+            if count > self._reported:
+                self._reported = count
                 self._progress(count, self._total)
 
 
-def _settings(drawing: Drawing) -> dict[str, Any]:
-    """What decides the pictures, as JSON: digests of files, and of the names and sizes of photographs."""
+def _record(drawing: Drawing) -> dict[str, Any]:
+    """Everything that determines the pictures, as JSON, with digests of files and of photograph lists."""
     subject = drawing.subject
     settings: dict[str, Any] = {"take": subject.name, "take_frames": subject.take.num_frames}
     settings |= dataclasses.asdict(drawing.config)
@@ -231,41 +231,40 @@ def _settings(drawing: Drawing) -> dict[str, Any]:
         files, broken = photo_files(Path(str(drawing.config.background.photos)))
         if broken:
             more = f" and {len(broken) - 1} more" if len(broken) > 1 else ""
-            told = f"left out: {broken[0]}{more}"
-            warnings.warn(told, HandSimWarning, stacklevel=3)
+            warnings.warn(f"left out: {broken[0]}{more}", HandSimWarning, stacklevel=3)
         listed = "\n".join(f"{file} {file.stat().st_size}" for file in files)
         names = listed.encode("utf-8", "surrogateescape")  # names of files need not be valid text
         settings["photos"] = f"sha256:{hashlib.sha256(names).hexdigest()}"
     if drawing.config.view.cameras is None:
         del settings["view"]["cameras"]
     else:
-        # as given: `up` turns them when they are drawn again, too
+        # The cameras are recorded as given, because `up` rotates them when they are drawn again.
         settings["view"]["cameras"] = [one.record() for one in drawing.config.view.own_cameras()]
     return settings if subject.poses is None else settings | {"poses": subject.poses}
 
 
 def left_out_frames(out: str | Place) -> list[int]:
     """Numbers of the frames that a rendering left out: a camera would be inside a hand or an object."""
-    return _noted(out, _LEFT_OUT, "frames")
+    return _notes_of_shards(out, _LEFT_OUT, "frames")
 
 
 def cut_off_pictures(out: str | Place) -> list[str]:
     """Pictures of a rendering that show less than half of a hand's keypoints."""
-    return _noted(out, _CUT_OFF, "pictures")
+    return _notes_of_shards(out, _CUT_OFF, "pictures")
 
 
 def hidden_pictures(out: str | Place) -> list[str]:
     """Pictures that a rendering left out: no keypoint of a hand would be visible."""
-    return _noted(out, _HIDDEN, "pictures")
+    return _notes_of_shards(out, _HIDDEN, "pictures")
 
 
 def visible_hands(out: str | Place) -> list[int]:
     """How many hands each picture of a rendering shows by a visible keypoint, in ascending order."""
-    return _noted(out, _VISIBLE, "hands")
+    return _notes_of_shards(out, _VISIBLE, "hands")
 
 
-def _noted(out: str | Place, name: str, key: str) -> list[Any]:
-    """What the workers wrote about all shards."""
+def _notes_of_shards(out: str | Place, name: str, key: str) -> list[Any]:
+    """Collect the notes that workers wrote about all shards."""
     with open_output(out) as output:
         output.fetch(name.format("*"))
         files = sorted(output.folder.glob(name.format("*")))
@@ -302,7 +301,7 @@ def _is_complete(output: Output) -> bool:
 
 
 @functools.lru_cache(maxsize=1)
-def _opened(subject: Subject, config: RenderConfig, light: bool) -> Drawing:
+def _cached_drawing(subject: Subject, config: RenderConfig, light: bool) -> Drawing:
     """The drawing of a subject; cached, because a worker draws many of its shards."""
     cv2.setNumThreads(1)  # there is one process per core
     with warnings.catch_warnings():
@@ -313,47 +312,52 @@ def _opened(subject: Subject, config: RenderConfig, light: bool) -> Drawing:
 def _render_shard(
     subject: Subject, formats: tuple[str, ...], config: RenderConfig, out: Path, shard: int
 ) -> int:
-    drawing = _opened(subject, config, "exr" in formats)
-    lost: list[int] = []
+    """Draw and write one shard, with notes on its pictures and a dot for each that is drawn."""
+    drawing, dots = _cached_drawing(subject, config, "exr" in formats), out / _DRAWN.format(shard)
+    notes = {name: out / name.format(f"{shard:05d}") for name in (_LEFT_OUT, _CUT_OFF, _HIDDEN, _VISIBLE)}
+    lost, cut, hidden, visible = list[int](), list[str](), list[str](), list[int]()
+    is_placed = config.view.cameras is None and subject.footage is None
 
     def leave_out(frame: int) -> None:
         lost.append(frame)  # written before the shard, so that no kill loses it
-        save_json(out / _LEFT_OUT.format(f"{shard:05d}"), {"frames": lost})
-
-    cut, hidden, visible = list[str](), list[str](), list[int]()
-    is_placed = config.view.cameras is None and subject.footage is None
+        save_json(notes[_LEFT_OUT], {"frames": lost})
 
     def counted() -> Iterator[RenderedFrame]:
-        with (out / _DRAWN.format(shard)).open("ab", buffering=0) as drawn:
+        with dots.open("ab", buffering=0) as drawn:
             for frame in drawing.frames(shard, enumerate(drawing.shards()[shard]), leave_out=leave_out):
-                inside = [
-                    ((hand.keypoints >= 0.0) & (hand.keypoints < frame.camera.size)).all(axis=1)
-                    for hand in frame.hands
-                ]
                 count = sum(bool(hand.visible.any()) for hand in frame.hands)
                 if is_placed and not count:
                     hidden.append(frame.key)
                 else:
                     visible.append(count)
-                    if any(float(shown.mean()) < _SHOWN for shown in inside):
+                    if _is_cut_off(frame):
                         cut.append(frame.key)
                     yield frame
                 drawn.write(b".")
-        (out / _DRAWN.format(shard)).unlink(missing_ok=True)
-        notes = (_CUT_OFF, "pictures", cut), (_HIDDEN, "pictures", hidden), (_VISIBLE, "hands", visible)
-        for name, key, noted in notes:
-            if noted:
-                save_json(out / name.format(f"{shard:05d}"), {key: noted})
+        dots.unlink(missing_ok=True)
+        contents: dict[str, dict[str, list[Any]]] = {
+            _CUT_OFF: {"pictures": cut},
+            _HIDDEN: {"pictures": hidden},
+            _VISIBLE: {"hands": visible},
+        }
+        for name, content in contents.items():
+            if any(content.values()):
+                save_json(notes[name], content)
 
     kept = list(counted()) if len(formats) > 1 else counted()
     record = out / checksums_name(shard)
     record.unlink(missing_ok=True)
     for writer in open_writers(out, formats):
         writer.write(shard, kept)
-    notes = [out / name.format(f"{shard:05d}") for name in (_LEFT_OUT, _CUT_OFF, _HIDDEN, _VISIBLE)]
-    there = {path.name: path for path in notes if path.is_file()}
+    there = {path.name: path for path in notes.values() if path.is_file()}
     save_checksums(record, shard_files(out, formats, shard) | there)
     return shard
+
+
+def _is_cut_off(frame: RenderedFrame) -> bool:
+    """Whether a picture cuts off a hand: too few of its keypoints are inside."""
+    inside = (((hand.keypoints >= 0.0) & (hand.keypoints < frame.camera.size)).all(1) for hand in frame.hands)
+    return any(float(shown.mean()) < _LEAST_SHOWN_SHARE for shown in inside)
 
 
 def _write_sheet(out: Path, drawing: Drawing, shards: list[list[int]]) -> list[Path]:
@@ -362,10 +366,11 @@ def _write_sheet(out: Path, drawing: Drawing, shards: list[list[int]]) -> list[P
         return []
     frames: list[RenderedFrame] = []
     filled = [number for number, shard in enumerate(shards) if shard]
-    each = 1 if len(filled) >= _ON_SHEET else 3  # few shards, because each has a scene of its own to set up
-    spread = np.linspace(0, len(filled) - 1, min(len(filled), _ON_SHEET // each)).round().astype(int)
+    # Few shards are read, because each has a scene of its own to set up.
+    each = 1 if len(filled) >= _MOST_ON_SHEET else 3
+    spread = np.linspace(0, len(filled) - 1, min(len(filled), _MOST_ON_SHEET // each)).round().astype(int)
     for shard in np.array(filled)[spread]:
         mine = shards[shard]
         frames += drawing.frames(int(shard), enumerate(mine[:: max(1, len(mine) // each)][:each]))
-    write_png(out / SHEET, contact_sheet(frames[:_ON_SHEET]))
+    write_png(out / SHEET, contact_sheet(frames[:_MOST_ON_SHEET]))
     return [out / SHEET]

@@ -64,7 +64,7 @@ def load_labeled_photographs(file: str | Path) -> tuple[list[LabeledHand], list[
             f"{path}: not COCO keypoints ({error}), expected images with `file_name` and annotations with "
             "`image_id` and `keypoints`"
         ) from error
-    hands = [_hand(path, name, label) for name, label in labels]
+    hands = [_labeled_hand(path, name, label) for name, label in labels]
     kept = [hand for hand in hands if np.isfinite(hand.keypoints[:, 0]).sum() >= _FEWEST_KEYPOINTS]
     annotated = {one.get("image_id") for one in content["annotations"]}
     empty = [_photograph(path, name) for number, name in names.items() if number not in annotated]
@@ -82,7 +82,7 @@ def _photograph(path: Path, name: str) -> Path:
     return photograph
 
 
-def _hand(path: Path, name: str, label: dict[str, Any]) -> LabeledHand:
+def _labeled_hand(path: Path, name: str, label: dict[str, Any]) -> LabeledHand:
     with errors_of(path, DatasetError):
         pixels, flags = labeled_keypoints(label)
     side = label.get("side")
@@ -232,12 +232,12 @@ class PictureStream(SharedStream, IterableDataset[dict[str, torch.Tensor]]):
             raise ArgumentError(f"fill is {fill}, expected two numbers from 0.05 to 1, the smaller first")
         self.config = resolve(config, {} if seed is None else {"seed": seed}, near=True)
         self.seed = self.config.seed
-        self._camera = _camera(self.config.view.camera if camera is None else camera, crop)
+        self._camera = _checked_camera(self.config.view.camera if camera is None else camera, crop)
         self._crop, self._fill = crop, fill
         self._people, self._sitting, self._batch, self._start = people, sitting, batch, start
         self._model, self._side, self._glove = model, side, glove
         self._sampler = mixed_angles if sampler is None else load_sampler(sampler)
-        self._poses = None if poses is None else _rows(poses)
+        self._poses = None if poses is None else _checked_poses(poses)
         if takes is not None:
             check_type("takes", takes, (Take, str, Path, list, tuple), "a Take or its path, or several")
         given = (takes,) if isinstance(takes, Take | str | Path) else takes or ()
@@ -292,13 +292,13 @@ class PictureStream(SharedStream, IterableDataset[dict[str, torch.Tensor]]):
             frames = np.flatnonzero(np.isfinite(subject.take.qpos[..., 0]).any(axis=1))
             frames = rng.choice(frames, self._sitting)
         else:
-            subject, frames = self._posed(rng), np.arange(self._sitting)
+            subject, frames = self._sample_subject(rng), np.arange(self._sitting)
         hands = subject.take.hands_at(int(frames[0]))  # A person has one pair of hands.
         frames = np.resize([n for n in frames if subject.take.hands_at(int(n)) is hands], len(frames))
         studio = Studio(hands, self.config, subject.take.bodies, rng=rng)
         return _Sitting(studio, subject, frames, person)
 
-    def _posed(self, rng: np.random.Generator) -> Subject:
+    def _sample_subject(self, rng: np.random.Generator) -> Subject:
         """Poses for all pictures of a new person."""
         side: Side = SIDES[rng.integers(2)] if self._side == "either" else self._side
         while True:
@@ -331,14 +331,14 @@ class PictureStream(SharedStream, IterableDataset[dict[str, torch.Tensor]]):
             else:
                 wide = around_hands(self._camera, points, wrists, share * _CROPPED, rng=rng)
                 camera = crop_around(wide, points, share, self._crop, rng=rng)
-            reaching = sitting.studio.reaching(moment, [camera])
-            if sitting.studio.is_clear(reaching, [camera]):
+            with_arms = sitting.studio.with_arms(moment, [camera])
+            if sitting.studio.is_clear(with_arms, [camera]):
                 break
         skin = sitting.studio.skin
         eye = camera.T_world_camera[:3, 3]
         around = None if camera.lens.kind == "pinhole" else np.stack([eye, points.mean(axis=0)])
         chosen = sample_conditions(self.config, camera.T_world_camera[:3, :3], camera.size, around, rng=rng)
-        frame = sitting.studio.photograph(reaching, camera, chosen.reseeded(rng), recorded=False)
+        frame = sitting.studio.photograph(with_arms, camera, chosen.reseeded(rng), recorded=False)
         truth = dict(zip(there, frame.hands, strict=True))
         hands = [_hand_arrays(truth.get(n), camera, fit.shape) for n, fit in enumerate(worn)]
         merged = {name: np.stack([hand[name] for hand in hands]) for name in hands[0]}
@@ -357,7 +357,7 @@ def _as_photographs(picture: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]
     return {"rgb": picture.get("noisy_rgb", picture["rgb"])} | kept
 
 
-def _camera(camera: Camera | str, crop: int | None) -> Camera:
+def _checked_camera(camera: Camera | str, crop: int | None) -> Camera:
     """The camera that is placed around hands."""
     check_type("camera", camera, (Camera, str), "a Camera or the name of a preset", PRESETS)
     found = preset(camera) if isinstance(camera, str) else camera
@@ -371,7 +371,7 @@ def _camera(camera: Camera | str, crop: int | None) -> Camera:
     return found
 
 
-def _rows(poses: ArrayLike) -> Doubles:
+def _checked_poses(poses: ArrayLike) -> Doubles:
     """A user's poses, one in each row."""
     rows = as_numbers("poses", poses)
     if rows.ndim not in {2, 3} or not len(rows):

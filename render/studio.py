@@ -61,20 +61,18 @@ from render.skin.look import SkinLook
 from render.user_body import UserBody
 
 _PALM_JOINTS: Final = {0: (0, 0), **{first: (0, first) for first in range(5, 21, 4)}}
-_OPENXR: Final = np.array([n for keypoint in range(21) for n in _PALM_JOINTS.get(keypoint, (keypoint,))])
+_OPENXR_KEYPOINTS: Final = np.array([n for point in range(21) for n in _PALM_JOINTS.get(point, (point,))])
 """Keypoint at each of `OPENXR_JOINTS`; the wrist for those in the palm."""
 
 
+@functools.cache
 def _allowed_parts() -> Flags:
-    """Which parts of the hand may show each keypoint (21, 32): its digit's; palm or forearm for the wrist."""
+    """Parts (21, 32) whose pixels may show each keypoint: its digit's; palm or forearm for the wrist."""
     allowed = np.zeros((len(KEYPOINT_NAMES), PARTS_A_HAND), dtype=bool)
     for keypoint, (name, digit) in enumerate(zip(KEYPOINT_NAMES, KEYPOINT_DIGITS, strict=True)):
         allowed[keypoint, list(bones_of(DIGITS[digit])) if digit >= 0 else [FOREARM]] = True
         allowed[keypoint, PALM] = name == "wrist" or name.endswith(("CMC", "MCP"))
     return allowed
-
-
-_ALLOWED: Final = _allowed_parts()
 
 
 def hand_truth(
@@ -89,14 +87,15 @@ def hand_truth(
     openxr: bool = False,
     mano: str | None = None,
 ) -> HandTruth:
-    """Ground truth of a hand, by its number among those in the picture; mask, vertices where `recorded`."""
+    """Ground truth of a hand with this number in the picture; mask and vertices only where `recorded`."""
     model = figure.fit.model
     keypoints = hand_keypoints(model, qpos[None])[0]
     poses = joint_poses(model, qpos[None])[0] if openxr else np.empty((0, 4, 4))
     points = np.concatenate([keypoints, poses[:, :3, 3]])
     pixels = camera.project(points)
-    rules = np.append(np.arange(len(keypoints)), _OPENXR[: len(poses)])
-    visible = _visible(points, rules, figure.thickness[rules], number, camera, pictures)
+    keypoint_numbers = np.append(np.arange(len(keypoints)), _OPENXR_KEYPOINTS[: len(poses)])
+    thickness = figure.thickness[keypoint_numbers]
+    visible = _are_visible(points, keypoint_numbers, thickness, number, camera, pictures)
     worn = figure.look.glove is not None
     seen_from = np.linalg.inv(camera.T_world_camera)
     return HandTruth(
@@ -117,10 +116,15 @@ def hand_truth(
     )
 
 
-def _visible(
-    points: Doubles, rules: Integers, thickness: Doubles, number: int, camera: Camera, pictures: Geometry
+def _are_visible(
+    points: Doubles,
+    keypoint_numbers: Integers,
+    thickness: Doubles,
+    number: int,
+    camera: Camera,
+    pictures: Geometry,
 ) -> Flags:
-    """Points (K,) whose pixel shows the finger of a keypoint, or the palm for those at its edge.
+    """Tell which points (K, 3) [m] are visible: their pixels show their digit, or the palm at its edge.
 
     A visible point is no deeper under the surface at its pixel than the finger is thick.
     """
@@ -129,20 +133,19 @@ def _visible(
     columns, rows = np.where(inside[:, None], pixels, 0.0).astype(np.int64).T
     bones = pictures.parts[rows, columns].astype(np.int64) - 1 - PARTS_A_HAND * number
     own = inside & (pictures.instances[rows, columns] == 1 + number) & (bones >= 0) & (bones < PARTS_A_HAND)
-    own &= _ALLOWED[rules, np.where(own, bones, 0)]
+    own &= _allowed_parts()[keypoint_numbers, np.where(own, bones, 0)]
     local = camera.local(points)
     ahead = local[:, 2] > 0.0
     slant = np.linalg.norm(local, axis=1) / np.where(ahead, local[:, 2], np.inf)
     under = slant * (local[:, 2] - pictures.depth[rows, columns])
-    # A fisheye sees sideways and back, where pictures have no depth: there, only the part is compared.
+    # Pictures have no depth where a fisheye sees sideways and back: only the part is compared there.
     return np.asarray(own & np.where(ahead, under <= thickness, True))
 
 
 def _box(parts: Bytes, number: int) -> Doubles:
     """Left, top, width, height [px] of the visible hand without its forearm; NaN where none is visible."""
     first = 1 + PARTS_A_HAND * number
-    mine = cv2.inRange(parts, first, first + FOREARM - 1)
-    left, top, width, height = cv2.boundingRect(mine)
+    left, top, width, height = cv2.boundingRect(cv2.inRange(parts, first, first + FOREARM - 1))
     return np.array([left, top, width, height], np.float64) if width else np.full(4, np.nan)
 
 
@@ -154,27 +157,27 @@ def _mask(pictures: Geometry, number: int) -> Flags:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Moment:
-    """One frame of a take, and the motion around it, which shutters blur."""
+    """One frame of a take, with the motion before and after it for shutters that blur."""
 
     take: Take
     frame: int
     person: Int[np.ndarray, "T"] | None = None
     """Number of the person in each frame; motion is not interpolated from one person to another."""
     upper_arms: Float[np.ndarray, "H 3"] | None = None
-    """Each hand's upper arm from the elbow [m]; see `Studio.reaching`."""
+    """Vector from each elbow to the end of the upper arm [m]; see `Studio.with_arms`."""
     forearms: Float[np.ndarray, "H 3"] | None = None
     """Unit direction of each hand's forearm; None for wrists at rest."""
 
     def hands(self, shift: float = 0.0) -> dict[int, Doubles]:
-        """Poses (27,) of the hands that the frame has by their numbers, `shift` seconds after it."""
+        """Poses (27,), `shift` seconds after the frame, of the hands that the frame has, by their numbers."""
         there = np.flatnonzero(np.isfinite(self.take.qpos[self.frame]).all(axis=1))
-        return {int(number): self._hand(self.take.qpos[:, number], shift) for number in there}
+        return {int(number): self._hand_pose(self.take.qpos[:, number], shift) for number in there}
 
-    def _hand(self, rows: Doubles, shift: float) -> Doubles:
-        """The pose (27,) of a hand that has these rows (T, 27)."""
+    def _hand_pose(self, rows: Doubles, shift: float) -> Doubles:
+        """Interpolate the pose (27,) of a hand, from its poses in all frames (T, 27)."""
         pose: Doubles = rows[self.frame].copy()
         if shift != 0.0:
-            (before, after), share = self._around(rows, shift)
+            (before, after), share = self._neighbors(rows, shift)
             if before[3:7] @ after[3:7] < 0.0:
                 after = np.concatenate([after[:3], -after[3:7], after[7:]])
             pose = before + share * (after - before)
@@ -182,20 +185,20 @@ class Moment:
         return pose
 
     def bodies(self, shift: float = 0.0) -> dict[int, Doubles]:
-        """Poses (4, 4) of the rigid bodies that the frame has by their numbers, `shift` seconds after it."""
+        """Poses (4, 4) of the frame's rigid bodies by their numbers, `shift` seconds after the frame."""
         there = np.flatnonzero(np.isfinite(self.take.body_poses[self.frame]).all(axis=1))
-        return {int(number): self._body(self.take.body_poses[:, number], shift) for number in there}
+        return {int(number): self._body_pose(self.take.body_poses[:, number], shift) for number in there}
 
-    def _body(self, rows: Doubles, shift: float) -> Doubles:
-        """The pose (4, 4) of a rigid body that has these rows (T, 7)."""
-        poses, share = self._around(rows, shift)
+    def _body_pose(self, rows: Doubles, shift: float) -> Doubles:
+        """Interpolate the pose (4, 4) of a rigid body, from its poses in all frames (T, 7)."""
+        poses, share = self._neighbors(rows, shift)
         before, after = pose_matrices(poses)
         T_world_body: Doubles = before + share * (after - before)
         left, _, right = np.linalg.svd(T_world_body[:3, :3])
         T_world_body[:3, :3] = left @ right
         return T_world_body
 
-    def _around(self, rows: Doubles, shift: float) -> tuple[Doubles, float]:
+    def _neighbors(self, rows: Doubles, shift: float) -> tuple[Doubles, float]:
         """The rows before and after a time, and the time's position between them, from 0 to 1.
 
         The frame's own row replaces rows with NaN and rows of other people.
@@ -203,12 +206,10 @@ class Moment:
         frames = shift * self.take.rate
         step = int(np.floor(frames))
         indices = np.clip([self.frame + step, self.frame + step + 1], 0, len(rows) - 1)
-        others = [self.person is not None and self.person[i] != self.person[self.frame] for i in indices]
-        kept = [
-            self.frame if other or not np.isfinite(rows[index]).all() else index
-            for index, other in zip(indices, others, strict=True)
-        ]
-        return rows[kept], frames - step
+        usable = np.isfinite(rows[indices]).all(axis=1)
+        if self.person is not None:
+            usable &= self.person[indices] == self.person[self.frame]
+        return rows[np.where(usable, indices, self.frame)], frames - step
 
 
 class Studio:
@@ -226,10 +227,10 @@ class Studio:
         light: bool = False,
         footage: Footage | None = None,
     ) -> None:
-        """Choose looks at random; the configuration is resolved.
+        """Choose looks at random; the configuration must be resolved.
 
-        A `UserBody` bends the wrists of those who have one, and is drawn if `shows_person`. `light` asks for
-        that of colors, which our own painter has.
+        A `UserBody` bends the wrists, and is drawn if `shows_person`. With `light`, frames have the linear
+        light of their colors, which only our own painter computes.
         """
         assert config.painter != "auto"
         self._config, self._passes, self._painter = config, set(config.passes), config.painter
@@ -246,7 +247,7 @@ class Studio:
         self._colors = tuple(tuple(rng.uniform(0.05, 0.9, 3).tolist()) for _ in bodies)
         self._bodies = [BodyFigure(body, color) for body, color in zip(bodies, self._colors, strict=True)]
         self._person = [person_figure(user, look)] if user is not None and shows_person else []
-        self._posed: tuple[Moment, list[Drawn]] | None = None  # surfaces of the last moment
+        self._last_surfaces: tuple[Moment, list[Drawn]] | None = None
 
     @property
     def skin(self) -> SkinLook | None:
@@ -258,7 +259,7 @@ class Studio:
     ) -> RenderedFrame:
         """Draw one moment of the hands and bodies.
 
-        The frame has its choices as JSON, and the hands' vertices, only where `recorded`: both take time.
+        Only where `recorded`, the frame has its choices as JSON and the hands' vertices: both take time.
         """
         take, frame, rng = moment.take, moment.frame, np.random.default_rng(conditions.seed)
         drawn = self.surfaces(moment)
@@ -268,54 +269,31 @@ class Studio:
                 f"camera '{camera.name}' is {1e3 * nearest:.0f} mm from a hand or object in frame {frame}, "
                 f"expected {2e3 * NEAR:.0f} mm or more; place it elsewhere"
             )
-        present = [*moment.hands()]
         sensor = conditions.depth_noise if "depth" in self._passes else None
         surfaces = [one.triangles for one in drawn]
         truth = see(camera, surfaces, with_normals=sensor is not None or "normals" in self._passes)
         footage = self._footage
-        rgb = light = noisy_rgb = noisy_depth = None
+        rgb = noisy_rgb = noisy_depth = None
         if "rgb" in self._passes:
-            rgb = self._colors_of(camera, drawn, conditions) if footage is None else footage.picture(frame)
-            noisy_rgb = self._exposed(moment, camera, rgb, conditions, rng)
-            if self._light:
-                most = np.where(rgb < 255, rgb + 1.0, np.inf)  # parts of a pixel are cut at white one by one
-                levels = np.clip(self._colors_of(camera, drawn, conditions, bright=True), rgb - 1.0, most)
-                light = light_of(levels).astype(np.float16)
+            rgb = self._paint(camera, drawn, conditions) if footage is None else footage.picture(frame)
+            noisy_rgb = self._sensor_picture(moment, camera, rgb, conditions, rng)
+        light = None if rgb is None or not self._light else self._light_of(rgb, camera, drawn, conditions)
         if self._config.room_depth and footage is None and {"depth", "normals"} & self._passes:
-            _walls(camera, drawn, conditions).put_behind(truth)
+            _surroundings_of(camera, drawn, conditions).put_behind(truth)
         elif self._person:
             for picture in truth[:2]:  # only hands and objects have depth and normals
                 if picture is not None:
                     picture[truth.instances == 0] = 0.0
         if sensor is not None:
-            noisy_depth = self._noisy_depth(truth, rgb, len(present), camera, sensor, rng)
-        hands = tuple(
-            hand_truth(
-                self._hands[n],
-                take.qpos[frame, n],
-                index,
-                camera,
-                truth,
-                _tracking(take, frame, n),
-                recorded=recorded,
-                openxr=self._config.openxr,
-                mano=self._config.mano,
-            )
-            for index, n in enumerate(present)
-        )
-        bodies = tuple(
-            BodyTruth(body.name, T_world_body)
-            for body, T_world_body in zip(take.bodies, pose_matrices(take.body_poses[frame]), strict=True)
-            if np.isfinite(T_world_body).all()
-        )
+            noisy_depth = self._noisy_depth(truth, rgb, len(moment.hands()), camera, sensor, rng)
         seen_points = take.point_list.of(frame)
         return RenderedFrame(
             number=frame,
             time=float(take.times[frame]),
             camera=camera,
-            hands=hands,
-            bodies=bodies,
-            ideal=self._requested(truth, rgb, light),
+            hands=self._hand_truths(moment, camera, truth, recorded),
+            bodies=_body_truths(take, frame),
+            ideal=self._requested_pictures(truth, rgb, light),
             noisy=Pictures(rgb=noisy_rgb, depth=noisy_depth),
             points=take.point_list.points[seen_points],
             labels=take.point_list.labels[seen_points],
@@ -323,10 +301,10 @@ class Studio:
             choices=self._record(conditions) if recorded else {},
         )
 
-    def reaching(self, moment: Moment, cameras: Sequence[Camera], user: UserBody | None = None) -> Moment:
-        """The moment with arms, the user's or others, that leave hands free and the cameras' pictures.
+    def with_arms(self, moment: Moment, cameras: Sequence[Camera], user: UserBody | None = None) -> Moment:
+        """Add arms to a moment, the user's if known, that hide little of the hands and leave the pictures.
 
-        It is no part of a motion, whose arms are `UserBody.moving_arms`.
+        This is for single poses; `UserBody.moving_arms` has the arms of a motion.
         """
         there = moment.hands()
         if not there:
@@ -344,35 +322,55 @@ class Studio:
         return dataclasses.replace(moment, upper_arms=found[1], forearms=None if user is None else found[0])
 
     def keypoints(self, moment: Moment) -> list[Doubles]:
-        """Keypoints (21, 3) in the world [m] of each hand that the frame has."""
+        """Keypoints (21, 3) in the world [m] of each hand in the frame."""
         hands = moment.hands().items()
         return [hand_keypoints(self._hands[number].fit.model, pose[None])[0] for number, pose in hands]
 
     def is_clear(self, moment: Moment, cameras: Sequence[Camera]) -> bool:
         """Whether all cameras are outside of hands and objects, so that the moment can be drawn."""
-        drawn = self.surfaces(moment)
-        return all(_clearance(camera, drawn) >= 2.0 * NEAR for camera in cameras)
+        return all(_clearance(camera, self.surfaces(moment)) >= 2.0 * NEAR for camera in cameras)
 
     def surfaces(self, moment: Moment) -> list[Drawn]:
         """Surfaces of a moment: those of its hands, then of its bodies."""
-        if self._posed is None or self._posed[0] is not moment:
-            self._posed = moment, self._drawn(moment, 0.0)
-        return self._posed[1]
+        if self._last_surfaces is None or self._last_surfaces[0] is not moment:
+            self._last_surfaces = moment, self._surfaces_at(moment, 0.0)
+        return self._last_surfaces[1]
 
-    def _drawn(self, moment: Moment, shift: float) -> list[Drawn]:
-        """Surfaces of the hands and bodies that the frame has, `shift` seconds later."""
+    def _surfaces_at(self, moment: Moment, shift: float) -> list[Drawn]:
+        """Surfaces of the hands and bodies that the frame has, at their poses `shift` seconds later."""
         drawn, poses = list[Drawn](), moment.hands(shift)
         several = poses if len(poses) > 1 else {}
         flesh = {index: self._hands[index].skin.flesh(pose) for index, pose in several.items()}
         for number, (index, pose) in enumerate(poses.items()):
-            upper, fore = (
-                None if ways is None else ways[index] for ways in (moment.upper_arms, moment.forearms)
-            )
+            upper_arm = None if moment.upper_arms is None else moment.upper_arms[index]
+            forearm = None if moment.forearms is None else moment.forearms[index]
             others = [one for other, one in flesh.items() if other != index]
-            drawn += self._hands[index].drawn(pose, number, upper, fore, others)
+            drawn += self._hands[index].drawn(pose, number, upper_arm, forearm, others)
         for number, (index, T_world_body) in enumerate(moment.bodies(shift).items(), 1 + len(poses)):
             drawn += self._bodies[index].drawn(T_world_body, number)
         return drawn + self._person
+
+    def _hand_truths(
+        self, moment: Moment, camera: Camera, pictures: Geometry, recorded: bool
+    ) -> tuple[HandTruth, ...]:
+        """Ground truth of the hands that the frame has."""
+        take, frame, config = moment.take, moment.frame, self._config
+        return tuple(
+            hand_truth(
+                self._hands[index], take.qpos[frame, index], number, camera, pictures,
+                _tracking(take, frame, index), recorded=recorded, openxr=config.openxr, mano=config.mano,
+            )
+            for number, index in enumerate(moment.hands())
+        )  # fmt: skip
+
+    def _light_of(
+        self, rgb: Bytes, camera: Camera, drawn: Sequence[Drawn], conditions: Conditions
+    ) -> NDArray[np.float16]:
+        """Linear light of a color picture, with highlights beyond white."""
+        # `rgb` clips each part of a pixel at white before it mixes them; the light must agree.
+        most = np.where(rgb < 255, rgb + 1.0, np.inf)
+        levels = np.clip(self._paint(camera, drawn, conditions, bright=True), rgb - 1.0, most)
+        return light_of(levels).astype(np.float16)
 
     def _noisy_depth(
         self,
@@ -383,7 +381,7 @@ class Studio:
         sensor: DepthNoise,
         rng: np.random.Generator,
     ) -> Floats:
-        """Depth that the sensor measures."""
+        """Simulate the depth that a sensor measures."""
         assert truth.normals is not None
         light = None
         if isinstance(sensor, TimeOfFlight):
@@ -394,10 +392,10 @@ class Studio:
             truth.depth, truth.normals, sensor, camera=camera, reflectance=light, rng=rng
         )
 
-    def _colors_of(
+    def _paint(
         self, camera: Camera, drawn: Sequence[Drawn], conditions: Conditions, *, bright: bool = False
     ) -> NDArray[Any]:
-        """The perfect color picture as bytes, or bright: as levels that do not end at 255."""
+        """Paint the perfect color picture as bytes or, if `bright`, as levels that may exceed 255."""
         background = conditions.background
         lighting, painter = conditions.lighting, "bright" if bright else self._painter
         whole = paint(camera, drawn, lighting, painter)
@@ -412,10 +410,10 @@ class Studio:
             plain = put_before(paint_blurred(camera, drawn, lighting, painter), plain)
         return put_before(whole, plain)
 
-    def _exposed(
+    def _sensor_picture(
         self, moment: Moment, camera: Camera, rgb: Bytes, conditions: Conditions, rng: np.random.Generator
     ) -> Bytes | None:
-        """The color picture of shutter and sensor; None if they change nothing."""
+        """Simulate the color picture of shutter and sensor; None if both are perfect."""
         if conditions.exposure is None and conditions.shutter is None:
             return None
         if conditions.shutter is None:
@@ -423,11 +421,11 @@ class Studio:
         else:
             one = conditions.shutter
             times, weights = shutter_times(one.exposure, one.readout, one.sub_frames, camera.size[1])
-            moments = (self._colors_of(camera, self._drawn(moment, time), conditions) for time in times)
+            moments = (self._paint(camera, self._surfaces_at(moment, time), conditions) for time in times)
             light = combine(moments, weights)
         return expose(light, conditions.exposure or Exposure(), rng=rng)
 
-    def _requested(self, truth: Geometry, rgb: Bytes | None, light: NDArray[Any] | None) -> Pictures:
+    def _requested_pictures(self, truth: Geometry, rgb: Bytes | None, light: NDArray[Any] | None) -> Pictures:
         """The pictures of the requested passes."""
         kinds = {"depth": ("depth",), "normals": ("normals",), "ids": ("parts", "instances", "markers")}
         names = [name for kind in kinds if kind in self._passes for name in kinds[kind]]
@@ -443,7 +441,7 @@ def picture_behind(camera: Camera, conditions: Conditions, *, bright: bool = Fal
     """Levels (H, W, 3) of sRGB behind hands and objects, from 0 to 255, without their shadows."""
     if conditions.enclosure is not None:
         return draw_surroundings(conditions.background, conditions.enclosure, camera, bright=bright).rgb
-    return _background(conditions.background, camera.size)
+    return _background_levels(conditions.background, camera.size)
 
 
 def _clearance(camera: Camera, drawn: Sequence[Drawn]) -> float:
@@ -462,8 +460,14 @@ def _distance(vertices: NDArray[Any], x: float, y: float, z: float) -> float:
     return float(np.sqrt(least))
 
 
+def _body_truths(take: Take, frame: int) -> tuple[BodyTruth, ...]:
+    """Ground truth of the rigid bodies that the frame has."""
+    poses = zip(take.bodies, pose_matrices(take.body_poses[frame]), strict=True)
+    return tuple(BodyTruth(body.name, pose) for body, pose in poses if np.isfinite(pose).all())
+
+
 def _tracking(take: Take, frame: int, number: int) -> dict[str, Any] | None:
-    """How sure a tracked pose is; None for poses that are true or a user's own."""
+    """Status and uncertainty of a tracked pose; None for true poses and a user's own."""
     spreads = {"angle_spread": take.angle_spread, "keypoint_spread": take.keypoint_spread}
     known = {name: spread[frame, number] for name, spread in spreads.items() if spread is not None}
     if not known and np.isnan(take.rms[:, number]).all():
@@ -471,8 +475,8 @@ def _tracking(take: Take, frame: int, number: int) -> dict[str, Any] | None:
     return {"status": STATUSES[take.status[frame, number]], "rms": float(take.rms[frame, number]), **known}
 
 
-def _walls(camera: Camera, drawn: Sequence[Drawn], conditions: Conditions) -> Surroundings:
-    """What is behind the hands and bodies."""
+def _surroundings_of(camera: Camera, drawn: Sequence[Drawn], conditions: Conditions) -> Surroundings:
+    """Picture, depth and normals of what is behind the hands and bodies."""
     background = conditions.background
     if conditions.enclosure is not None:
         return draw_surroundings(background, conditions.enclosure, camera, bright=False)
@@ -480,7 +484,7 @@ def _walls(camera: Camera, drawn: Sequence[Drawn], conditions: Conditions) -> Su
 
 
 @functools.lru_cache(maxsize=2)
-def _background(background: Background, size: tuple[int, int]) -> Floats:
+def _background_levels(background: Background, size: tuple[int, int]) -> Floats:
     """A background (H, W, 3) in sRGB, from 0 to 255."""
     display = cv2.pow(kept_background(background, size), 1.0 / GAMMA)
     return enlarged(np.multiply(display, np.float32(255.0), out=display), size)

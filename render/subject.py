@@ -1,4 +1,4 @@
-"""`Subject`: the poses that pictures show, from a take or of a user's own, and who strikes them."""
+"""`Subject`: the poses that pictures show, of a take or a user's own, and the people in these poses."""
 
 from __future__ import annotations
 
@@ -45,9 +45,9 @@ KEYS: Final = ("qpos", "angles", "T_world_wrist", "times", "person", "hands", "h
 CSV: Final = ".csv"
 MOST_PEOPLE: Final = 1_000_000
 _MOST_FRAMES: Final = 10_000_000
-_FARTHEST: Final = 50.0  # largest coordinate of a wrist [m]
-_BEYOND: Final = np.deg2rad(10.0)  # angle beyond a joint's range from which on users are warned
-_SECOND: Final = 1.0  # time between frames without times, which are poses without a motion [s]
+_FARTHEST_WRIST: Final = 50.0  # largest coordinate of a wrist [m]
+_RANGE_TOLERANCE: Final = np.deg2rad(10.0)  # angle beyond a joint's range from which on users are warned
+_POSE_INTERVAL: Final = 1.0  # time between frames without times, which are poses without a motion [s]
 
 
 class OwnPoses(NamedTuple):
@@ -67,7 +67,7 @@ def _own_poses(
     return OwnPoses(qpos, _times(arrays, len(qpos)), _person(arrays, len(qpos), shapes), shapes)
 
 
-def _arrays(path: Path) -> dict[str, NDArray[Any]]:
+def _read_arrays(path: Path) -> dict[str, NDArray[Any]]:
     check_regular(path, error=CaptureError)
     try:
         arrays = read_npz(path)
@@ -87,7 +87,7 @@ def _stored_qpos(arrays: Mapping[str, NDArray[Any]], count: int) -> Float[np.nda
             f"it holds {', '.join(arrays) or 'nothing'}, expected qpos, or angles and T_world_wrist"
         )
     if "qpos" in arrays:
-        qpos = _floats(arrays, "qpos", (count, NUM_QPOS))
+        qpos = _checked_floats(arrays, "qpos", (count, NUM_QPOS))
         lost = np.asarray(np.isnan(qpos).any(axis=-1))
         lengths = np.where(lost, 1.0, np.linalg.norm(qpos[..., 3:7], axis=-1))
         worst = np.abs(lengths - 1.0).argmax()
@@ -97,7 +97,7 @@ def _stored_qpos(arrays: Mapping[str, NDArray[Any]], count: int) -> Float[np.nda
                 f"{worst // lengths.shape[1]}, expected 1"
             )
     else:
-        angles, wrist = _floats(arrays, "angles", (count, NUM_JOINTS)), _wrists(arrays, count)
+        angles, wrist = _checked_floats(arrays, "angles", (count, NUM_JOINTS)), _checked_wrists(arrays, count)
         if len(angles) != len(wrist):
             raise ArgumentError(f"angles has {len(angles)} frames and T_world_wrist {len(wrist)}")
         lost = np.asarray(np.isnan(angles).any(axis=-1) | np.isnan(wrist).any(axis=(-2, -1)))
@@ -112,7 +112,7 @@ def _stored_qpos(arrays: Mapping[str, NDArray[Any]], count: int) -> Float[np.nda
     return qpos
 
 
-def _floats(arrays: Mapping[str, NDArray[Any]], name: str, shape: tuple[int, ...]) -> Doubles:
+def _checked_floats(arrays: Mapping[str, NDArray[Any]], name: str, shape: tuple[int, ...]) -> Doubles:
     """An array (T, *shape), NaN allowed; for one hand, its axis of hands may be missing."""
     given = values = as_numbers(name, arrays[name]).copy()  # orientations are normalized in place
     if shape[0] == 1 and values.ndim == len(shape):
@@ -126,8 +126,8 @@ def _floats(arrays: Mapping[str, NDArray[Any]], name: str, shape: tuple[int, ...
     return values
 
 
-def _wrists(arrays: Mapping[str, NDArray[Any]], count: int) -> Doubles:
-    poses = _floats(arrays, "T_world_wrist", (count, 4, 4))
+def _checked_wrists(arrays: Mapping[str, NDArray[Any]], count: int) -> Doubles:
+    poses = _checked_floats(arrays, "T_world_wrist", (count, 4, 4))
     rotations = poses[..., :3, :3]
     off = np.abs(rotations @ np.swapaxes(rotations, -1, -2) - np.eye(3)).max(axis=(-2, -1))
     bad = (
@@ -143,10 +143,10 @@ def _wrists(arrays: Mapping[str, NDArray[Any]], count: int) -> Doubles:
 
 def _check_bounds(qpos: Doubles) -> None:
     farthest, widest = np.nanmax(np.abs(qpos[..., :3])), np.nanmax(np.abs(qpos[..., 7:]))
-    if farthest > _FARTHEST:
+    if farthest > _FARTHEST_WRIST:
         raise ArgumentError(
-            f"a wrist is {farthest:.4g} m from the origin along an axis, expected at most {_FARTHEST:g}; are "
-            "these millimeters?"
+            f"a wrist is {farthest:.4g} m from the origin along an axis, expected at most "
+            f"{_FARTHEST_WRIST:g}; are these millimeters?"
         )
     if widest > np.pi:
         raise ArgumentError(
@@ -154,15 +154,13 @@ def _check_bounds(qpos: Doubles) -> None:
         )
 
 
-def _tell_beyond(name: str, qpos: Doubles) -> None:
+def _warn_of_ranges(name: str, qpos: Doubles) -> None:
     angles = qpos[..., 7:]
-    beyond = ((angles < LOW - _BEYOND) | (angles > HIGH + _BEYOND)).any(axis=(1, 2))
+    beyond = ((angles < LOW - _RANGE_TOLERANCE) | (angles > HIGH + _RANGE_TOLERANCE)).any(axis=(1, 2))
     if beyond.any():
-        told = (
-            f"{name}: in {beyond.sum()} of {len(beyond)} frames (the first: {beyond.argmax()}) a joint is "
-            "more than 10 degrees beyond its range; they are drawn as they are"
-        )
-        warnings.warn(told, HandSimWarning, stacklevel=3)
+        frames = f"{name}: in {beyond.sum()} of {len(beyond)} frames (the first: {beyond.argmax()})"
+        range_text = "a joint is more than 10 degrees beyond its range; they are drawn as they are"
+        warnings.warn(f"{frames} {range_text}", HandSimWarning, stacklevel=3)
 
 
 def _times(arrays: Mapping[str, NDArray[Any]], frames: int) -> Doubles | None:
@@ -225,7 +223,7 @@ Model = HandModel | HandShape | str
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cast:
-    """People who strike poses in the place of those whose hands a take has."""
+    """People who are drawn in a take's poses instead of its own hands."""
 
     seed: int  # seed of random hands and skins
     person: Int[np.ndarray, "T"] | None = None
@@ -265,7 +263,7 @@ class Subject:
     def __reduce_ex__(self, protocol: SupportsIndex) -> Any:
         if self.origin is None:
             return object.__reduce_ex__(self, protocol)
-        return _read_again, (*self.origin, self.name)
+        return _read_in_worker, (*self.origin, self.name)
 
     def upright(self, up: UpAxis) -> Subject:
         """This subject in a world with z up, if `up` is the axis that points up in the take's own world."""
@@ -335,8 +333,8 @@ def _read(source: str | Path | PoseFile, seed: int) -> Subject:
 
 
 @functools.lru_cache(maxsize=1)
-def _read_again(source: Path | PoseFile, seed: int, name: str) -> Subject:
-    """The same in another process, which draws several parts of it; its name tells whether it changed."""
+def _read_in_worker(source: Path | PoseFile, seed: int, name: str) -> Subject:
+    """Read a subject again in a worker process; its name tells the cache whether the file changed."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", HandSimWarning)  # the main process has warned already
         return _read(source, seed)
@@ -345,7 +343,7 @@ def _read_again(source: Path | PoseFile, seed: int, name: str) -> Subject:
 def _holds_poses(path: Path) -> bool:
     """Whether the names of a file's arrays are those of hand poses that a user made."""
     try:
-        return bool({"qpos", "angles"} & set(_arrays(path)))
+        return bool({"qpos", "angles"} & set(_read_arrays(path)))
     except HandSimError:
         return False
 
@@ -382,14 +380,12 @@ def subject_of_poses(
     given = {"qpos": array, "times": times, "person": person}
     arrays = {name: as_array(value, None) for name, value in given.items() if value is not None}
     poses = _own_poses(arrays, len(models), shapes)
-    _tell_beyond("poses", poses.qpos)
+    _warn_of_ranges("poses", poses.qpos)
     cast = _cast(poses, count, seed) if model is None or people is not None else None
     hands = [pack_hand(shape) for shape in (*(one.shape for one in models), *(shapes or ()))]
-    told = (array for array in (poses.qpos, poses.times, poses.person) if array is not None)
-    name = _digest(*told, np.array(hands, dtype=HAND_DTYPE))
-    layout = load_layout(glove)
-    record = {"people": count, "glove": layout.name}
-    return _posed(name, poses, models, layout, cast, record)
+    own = (array for array in (poses.qpos, poses.times, poses.person) if array is not None)
+    name, layout = _digest(*own, np.array(hands, dtype=HAND_DTYPE)), load_layout(glove)
+    return _posed_subject(name, poses, models, layout, cast, {"people": count, "glove": layout.name})
 
 
 def _load_poses(file: PoseFile, seed: int) -> Subject:
@@ -404,17 +400,17 @@ def _load_poses(file: PoseFile, seed: int) -> Subject:
         qpos = table.qpos[:, [table.sides.index(side) for side in sides]]
         arrays: dict[str, NDArray[Any]] = {"qpos": qpos, "times": table.times}
     else:
-        arrays, sides = _arrays(path), file.sides or ("right",)
+        arrays, sides = _read_arrays(path), file.sides or ("right",)
     with errors_of(path, CaptureError):
         poses = _own_poses(arrays, len(sides), _stored_shapes(arrays))
-    _tell_beyond(str(path), poses.qpos)
+    _warn_of_ranges(str(path), poses.qpos)
     if poses.person is not None and file.people is not None:
         whose = "the hand of one person" if len(poses.shapes or ()) == 1 else "who is in each frame"
         raise CaptureError(f"{path}: the file has {whose}; leave out --people")
     record = {"sha256": checksum(path), "sides": list(sides), "people": file.people, "glove": file.glove}
     models = tuple(HandModel.named("M", side=side) for side in sides)
     cast = _cast(poses, file.people, seed)
-    return _posed(path.name, poses, models, load_layout(file.glove), cast, record, (file, seed))
+    return _posed_subject(path.name, poses, models, load_layout(file.glove), cast, record, (file, seed))
 
 
 def _cast(poses: OwnPoses, people: int | None, seed: int) -> Cast:
@@ -424,7 +420,7 @@ def _cast(poses: OwnPoses, people: int | None, seed: int) -> Cast:
     return Cast(seed, SpawnKey.PEOPLE_OF_FRAMES.rng(seed).integers(people, size=len(poses.qpos)))
 
 
-def _posed(
+def _posed_subject(
     name: str,
     poses: OwnPoses,
     models: Sequence[HandModel],
@@ -433,14 +429,12 @@ def _posed(
     record: dict[str, Any],
     origin: tuple[PoseFile, int] | None = None,
 ) -> Subject:
-    """The subject of poses on these hands in gloves."""
+    """The subject with these hands, in gloves, in these poses."""
     check_layout(layout)
-    hands = [
-        settle_glove(layout, HandModel(shape.with_side("right"))).with_side(shape.side)
-        for shape in (model.shape for model in models)
-    ]
-    times = _SECOND * np.arange(len(poses.qpos)) if poses.times is None else poses.times
-    rate = _SECOND if poses.times is None else 1.0 / max(float(np.median(np.diff(times))), 1e-6)
+    shapes = [model.shape for model in models]
+    hands = [settle_glove(layout, HandModel(one.with_side("right"))).with_side(one.side) for one in shapes]
+    times = _POSE_INTERVAL * np.arange(len(poses.qpos)) if poses.times is None else poses.times
+    rate = 1.0 / _POSE_INTERVAL if poses.times is None else 1.0 / max(float(np.median(np.diff(times))), 1e-6)
     take = Take.of_poses(hands, poses.qpos, rate=rate, times=times)
     return Subject(take, name, cast, poses.times is not None, record, origin=origin)
 

@@ -1,4 +1,4 @@
-"""Accuracy of labelers: known markers are corrupted as in the paper, labeled, and errors are counted.
+"""Evaluates labelers: corrupts known markers as in the paper, labels them, and counts errors.
 
 docs/results.md defines the figures, which are those of Han et al. 2018. Macro F1 is the mean F1, over points,
 of the markers and of "ghost", the null class, as in SOMA (Ghorbani and Black 2021).
@@ -37,10 +37,9 @@ from train.settings import EvaluateSettings
 BINS: Final = 15
 """Number of equally wide bins of confidence."""
 LEAST_SURE: Final = 0.02
-"""Share of the points that a person might check by hand."""
-
-_CHUNK: Final = 4096
-_BOOTSTRAPS: Final = 1000  # draws of people for a confidence interval
+"""Share of the least confident points, which a person might check by hand."""
+_FRAMES_A_CHUNK: Final = 4096
+_BOOTSTRAPS: Final = 1000  # number of bootstrap samples for a confidence interval
 ACCURACIES: Final = ("slot_accuracy", "point_accuracy", "frame_accuracy")
 """The figures that have intervals."""
 CLEAN: Final = Corruption(occlude=0, ghosts=0)
@@ -48,15 +47,15 @@ CLEAN: Final = Corruption(occlude=0, ghosts=0)
 SEEN: Final = "as the rig sees them"
 """Name of the figures for markers and ghosts as seen by a rig."""
 
-_SAME_POINT: Final = 1e-3  # [m] distance of a point between two files of a capture
-_SAME_CAPTURE: Final = 0.5  # The truth must have this share of a labeled capture's points.
+_SAME_POINT_DISTANCE: Final = 1e-3  # [m] largest distance of one point between two files of a capture
+_LEAST_SHARED_POINTS: Final = 0.5  # least share of a labeled capture's points that its truth has
 
 
 def macro_f1(confusion: Int[np.ndarray, "K K"]) -> float:
     """Mean F1 of the classes that occur as true (rows) or given labels; NaN if none does."""
-    occurs = confusion.sum(axis=0) + confusion.sum(axis=1)
-    there = occurs > 0
-    return float((2.0 * confusion.diagonal()[there] / occurs[there]).mean()) if there.any() else float("nan")
+    counts = confusion.sum(axis=0) + confusion.sum(axis=1)
+    occurs = counts > 0
+    return float((2.0 * confusion.diagonal()[occurs] / counts[occurs]).mean()) if occurs.any() else np.nan
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,7 +81,7 @@ def reliability(confidence: Float[np.ndarray, "N"], right: Bool[np.ndarray, "N"]
 def expected_calibration_error(confidence: Float[np.ndarray, "N"], right: Bool[np.ndarray, "N"]) -> float:
     """Mean difference between a bin's confidence and its share of right labels, weighted by points."""
     if not len(confidence):
-        return float("nan")
+        return np.nan
     bins = reliability(confidence, right)
     return float(np.nansum(np.abs(bins.confidence - bins.right) * bins.count) / len(confidence))
 
@@ -90,14 +89,14 @@ def expected_calibration_error(confidence: Float[np.ndarray, "N"], right: Bool[n
 def error_without(
     confidence: Float[np.ndarray, "N"], right: Bool[np.ndarray, "N"], share: float = LEAST_SURE
 ) -> float:
-    """Share of wrong labels without the given share of least confident points; NaN if no point is left.
+    """Share of wrong labels after the least confident points are left out; NaN if no point is left.
 
-    If points of equal confidence are left out in part, the mean over all choices counts.
+    Where only some of several equally confident points are left out, the result is the mean over all choices.
     """
     kept = len(confidence) - round(share * len(confidence))
     if not kept:
-        return float("nan")
-    least = np.partition(confidence, -kept)[-kept]  # the least kept confidence
+        return np.nan
+    least = np.partition(confidence, -kept)[-kept]  # least confidence that is kept
     above, tied = confidence > least, confidence == least
     from_tied = (kept - above.sum()) * (~right[tied]).mean()
     return float(((~right[above]).sum() + from_tied) / kept)
@@ -137,30 +136,28 @@ def percent(share: float) -> str:
     return "-" if np.isnan(share) else f"{100 * share:.2f}"
 
 
-def _slots(labels: Int[np.ndarray, "N"], num_labels: int) -> Int[np.ndarray, "M"]:
-    """Point in each label slot, -1 for none."""
+def _point_of_label(labels: Int[np.ndarray, "N"], num_labels: int) -> Int[np.ndarray, "M"]:
+    """Index (M,) of the point with each label, -1 for none."""
     slots = np.full(num_labels, -1)
     labeled = np.flatnonzero(labels >= 0)
     slots[labels[labeled]] = labeled
     return slots
 
 
-def _share(part: int, whole: int) -> float:
-    return part / whole if whole else float("nan")
+def _ratio(part: int, whole: int) -> float:
+    """A share; NaN of nothing."""
+    return part / whole if whole else np.nan
 
 
 def print_figures(
     columns: dict[str, dict[str, float]], intervals: Mapping[str, Sequence[float]] = {}, *, title: str
 ) -> None:
-    """Print figures in percent as a table, a column for each set of them, with intervals."""
-    shares = [
-        [
-            name.replace("_", " "),
-            *(percent_between(one[name], intervals.get(name)) for one in columns.values()),
-        ]
-        for name in next(iter(columns.values()))
-    ]
-    print_table([["figure", *(f"{name} [%]" for name in columns)], *shares], title=title)
+    """Print a table with a column for each set of figures, in percent with intervals."""
+    rows = [["figure", *(f"{name} [%]" for name in columns)]]
+    for name in next(iter(columns.values())):
+        texts = (percent_between(one[name], intervals.get(name)) for one in columns.values())
+        rows.append([name.replace("_", " "), *texts])
+    print_table(rows, title=title)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -187,9 +184,9 @@ class LabelingReport:
     num_points: Int[np.ndarray, "T"] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     """Number of points of each frame."""
     groups: Int[np.ndarray, "T"] | None = None
-    """A number for the person of each frame; where people are unknown, for its capture or its second."""
+    """Number of the person of each frame; if people are unknown, of its capture or its second."""
     grouped_by: str = "people"
-    """What these numbers are of: people, captures or seconds."""
+    """Kind of these groups: people, captures or seconds."""
 
     @property
     def num_groups(self) -> int:
@@ -199,22 +196,21 @@ class LabelingReport:
     def interval(
         self, figure: str = "slot_accuracy", marker: int | None = None
     ) -> tuple[float, float] | None:
-        """The 95 % interval of a share, by a bootstrap over groups of frames; None of fewer than two.
+        """The 95 % interval of a share, by a bootstrap over groups of frames; None for fewer than two groups.
 
         Args:
             figure: One of `ACCURACIES`.
-            marker: The index of the one marker whose slots count; all when not given.
+            marker: Index of the only marker whose slots count; all markers when not given.
         """
         if self.groups is None or self.num_groups < 2:
             return None
         _, group = np.unique(self.groups, return_inverse=True)
-        frames = np.arange(len(group))
-        rights = np.bincount(np.repeat(frames, self.num_points), self.right, len(group))
+        right_points = np.bincount(np.repeat(np.arange(len(group)), self.num_points), self.right, len(group))
         slots = self.right_slots if marker is None else self.right_slots[:, [marker]]
         right, count = {
             "slot_accuracy": (slots.sum(axis=1), np.full(len(group), slots.shape[1])),
-            "point_accuracy": (rights, self.num_points),
-            "frame_accuracy": (slots.all(axis=1) & (rights == self.num_points), np.ones(len(group))),
+            "point_accuracy": (right_points, self.num_points),
+            "frame_accuracy": (slots.all(axis=1) & (right_points == self.num_points), np.ones(len(group))),
         }[figure]
         sums = np.stack([np.bincount(group, one) for one in (right, count)])
         drawn = np.random.default_rng(0).integers(self.num_groups, size=(_BOOTSTRAPS, self.num_groups))
@@ -224,8 +220,7 @@ class LabelingReport:
 
     def intervals(self) -> dict[str, tuple[float, float]]:
         """The intervals of all accuracies; empty with fewer than two people, captures or seconds."""
-        found = {name: self.interval(name) for name in ACCURACIES}
-        return {name: one for name, one in found.items() if one is not None}
+        return {name: one for name in ACCURACIES if (one := self.interval(name)) is not None}
 
 
 def percent_between(share: float, interval: Sequence[float] | None) -> str:
@@ -239,14 +234,12 @@ Frames = tuple[list[Float[np.ndarray, "N 3"]], list[Int[np.ndarray, "N"]]]
 
 def evaluate_frames(labeler: Labeler, parts: Iterable[Frames]) -> LabelingReport:
     """Label points with known truth, and count errors."""
-    return count_labels(
-        labeler.marker_names,
-        (
-            (labeling.labels, labeling.confidence, truth)
-            for clouds, truths in parts
-            for labeling, truth in zip(labeler.label_frames(clouds), truths, strict=True)
-        ),
+    labeled = (
+        (labeling.labels, labeling.confidence, truth)
+        for clouds, truths in parts
+        for labeling, truth in zip(labeler.label_frames(clouds), truths, strict=True)
     )
+    return count_labels(labeler.marker_names, labeled)
 
 
 def count_labels(
@@ -263,7 +256,7 @@ def count_labels(
     confidences: list[NDArray[np.float64]] = [np.zeros(0)]
     right: list[NDArray[np.bool_]] = [np.zeros(0, dtype=np.bool_)]
     for labels, confidence_of, truth in frames:
-        slots.append((_slots(labels, num_labels), _slots(truth, num_labels)))
+        slots.append((_point_of_label(labels, num_labels), _point_of_label(truth, num_labels)))
         np.add.at(confusion, (truth, labels), 1)  # -1, a ghost, is the last row and column
         confidences.append(confidence_of)
         right.append(labels == truth)
@@ -281,38 +274,28 @@ def count_labels(
         "ghosts_given": int(confusion[:, -1].sum()),
         "ghosts_right": int(confusion[-1, -1]),
     }
-    occluded, found = numbers["occluded"], numbers["occluded_right"]
-    ghosts, nan = numbers["ghosts"], float("nan")
+    occluded, ghosts = numbers["occluded"], numbers["ghosts"]
+    given_occluded, given_ghosts = (
+        numbers[f"{kind}_given"] if numbers[kind] else 0 for kind in ("occluded", "ghosts")
+    )
     figures = {
-        "slot_accuracy": _share(int(right_slots.sum()), true.size),
-        "point_accuracy": _share(int(np.trace(confusion)), numbers["points"]),
-        "frame_accuracy": _share(sum(bool(one.all()) for one in right[1:]), len(true)),
-        "occlusion_ratio": _share(occluded, true.size),
-        "occlusion_precision": _share(numbers["occluded_right"], numbers["occluded_given"])
-        if occluded
-        else nan,
-        "occlusion_recall": _share(found, occluded),
-        "ghost_ratio": _share(ghosts, true.size),
-        "ghost_precision": _share(numbers["ghosts_right"], numbers["ghosts_given"]) if ghosts else nan,
-        "ghost_recall": _share(numbers["ghosts_right"], ghosts),
+        "slot_accuracy": _ratio(int(right_slots.sum()), true.size),
+        "point_accuracy": _ratio(int(np.trace(confusion)), numbers["points"]),
+        "frame_accuracy": _ratio(sum(bool(one.all()) for one in right[1:]), len(true)),
+        "occlusion_ratio": _ratio(occluded, true.size),
+        "occlusion_precision": _ratio(numbers["occluded_right"], given_occluded),
+        "occlusion_recall": _ratio(numbers["occluded_right"], occluded),
+        "ghost_ratio": _ratio(ghosts, true.size),
+        "ghost_precision": _ratio(numbers["ghosts_right"], given_ghosts),
+        "ghost_recall": _ratio(numbers["ghosts_right"], ghosts),
         "macro_f1": macro_f1(confusion),
         "calibration_error": expected_calibration_error(confidence[known], is_right[known]),
         "error_without_least_sure": error_without(confidence[known], is_right[known]),
     }
     num_points = np.array([len(one) for one in right[1:]], dtype=np.int64)
     by_marker = right_slots.sum(axis=0) / max(1, len(true))
-    return LabelingReport(
-        figures,
-        by_marker,
-        len(true),
-        confusion,
-        confidence,
-        is_right,
-        numbers,
-        right_slots,
-        names,
-        num_points,
-    )
+    counted = figures, by_marker, len(true), confusion
+    return LabelingReport(*counted, confidence, is_right, numbers, right_slots, names, num_points)
 
 
 def evaluate_markers(
@@ -323,24 +306,27 @@ def evaluate_markers(
     rng: np.random.Generator,
 ) -> LabelingReport:
     """Corrupt known markers [m], NaN where missing, label them and count errors."""
-    firsts = range(0, len(markers), _CHUNK)
-    clouds = (draw_cloud(corruption, markers[first : first + _CHUNK], rng=rng) for first in firsts)
+    clouds = (draw_cloud(corruption, part, rng=rng) for part in _chunks(markers))
     return evaluate_frames(labeler, map(cloud_frames, clouds))
 
 
+def _chunks(rows: NDArray[Any]) -> Iterator[NDArray[Any]]:
+    """Parts of rows that are labeled together."""
+    return (rows[first : first + _FRAMES_A_CHUNK] for first in range(0, len(rows), _FRAMES_A_CHUNK))
+
+
 def paper_report(labeler: Labeler, rows: NDArray[np.void]) -> LabelingReport:
-    """Evaluate a labeler on rows with the paper's corruption, which is the same each time."""
+    """Evaluate a labeler on rows with the paper's corruption, which is the same in each call."""
     markers = rows["markers"].astype(np.float64)
     corruption = paper_corruption(markers.shape[1])
     return evaluate_markers(labeler, markers, corruption, rng=np.random.default_rng(0))
 
 
 def rig_report(labeler: Labeler, rows: NDArray[np.void], *, rng: np.random.Generator) -> LabelingReport:
-    """Evaluate a labeler on the points and ghosts of rows as their rig saw them."""
-    parts = (rows[first : first + _CHUNK] for first in range(0, len(rows), _CHUNK))
+    """Evaluate a labeler on the points and ghosts that the rig observed in these rows."""
     clouds = (
         corrupt(part["observed"].astype(np.float64), CLEAN, ghosts=part["ghosts"].astype(np.float64), rng=rng)
-        for part in parts
+        for part in _chunks(rows)
     )
     return evaluate_frames(labeler, map(cloud_frames, clouds))
 
@@ -354,31 +340,31 @@ def cloud_frames(cloud: Cloud) -> Frames:
 
 
 def _take_frames(take: Take) -> Iterator[Frames]:
-    """Points of every hand in every frame of a take, separated by the truth.
+    """Points of each hand in each frame of a take, assigned to hands by the truth.
 
-    A ghost is assigned to the hand with the nearest marker, if within `GHOST_REACH`. Markers of tracked
-    bodies are assigned to no hand.
+    A ghost belongs to the hand with the nearest marker, if that is within `GHOST_REACH`. Markers of tracked
+    bodies belong to no hand.
     """
     labels = take.point_list.labels
     nearest = np.stack([_nearest_marker(take, label) for label in take.hand_labels])
-    for hand, mine in enumerate(take.hand_labels):
-        own = (labels >= mine.start) & (labels < mine.stop)
+    for hand, of_hand in enumerate(take.hand_labels):
+        own = (labels >= of_hand.start) & (labels < of_hand.stop)
         ghost = (labels < 0) & (nearest.argmin(axis=0) == hand) & (nearest[hand] <= GHOST_REACH)
         here = take.point_list.without(~(own | ghost))
-        truth = np.where(here.labels >= 0, here.labels - mine.start, -1)
+        truth = np.where(here.labels >= 0, here.labels - of_hand.start, -1)
         clouds, truths = (np.split(values, here.starts[1:-1]) for values in (here.points, truth))
-        for first in range(0, len(clouds), _CHUNK):
-            yield clouds[first : first + _CHUNK], truths[first : first + _CHUNK]
+        for first in range(0, len(clouds), _FRAMES_A_CHUNK):
+            yield clouds[first : first + _FRAMES_A_CHUNK], truths[first : first + _FRAMES_A_CHUNK]
 
 
 def _nearest_marker(take: Take, label: range) -> Float[np.ndarray, "P"]:
     """Distance from every point to the nearest visible marker of one hand [m]; inf if none is visible."""
-    markers, points = take.observed(label), take.point_list
+    points = take.point_list
     distance = np.full(len(points.labels), np.inf)
-    for frame, every in enumerate(markers):
-        there, seen = points.of(frame), every[np.isfinite(every[:, 0])]
-        if len(seen) and there.stop > there.start:
-            distance[there] = cKDTree(seen).query(points.points[there])[0]
+    for frame, markers in enumerate(take.observed(label)):
+        of_frame, visible = points.of(frame), markers[np.isfinite(markers[:, 0])]
+        if len(visible) and of_frame.stop > of_frame.start:
+            distance[of_frame] = cKDTree(visible).query(points.points[of_frame])[0]
     return distance
 
 
@@ -432,42 +418,55 @@ def evaluate_labeler(
     if takes:
         if len(takes) < len(given):
             raise CaptureError(
-                f"given {_shown(takes[0])} and other kinds of truth, expected one kind; evaluate each alone"
+                f"given {_name_of(takes[0])} and other kinds of truth, expected one kind; evaluate each alone"
             )
         if corruption != CLEAN or settings.every > 1:
             raise CaptureError(
                 "a simulated take is counted whole, with its own gaps and ghosts: leave out the corruption "
                 "(--occlude, --ghosts) and every (--every), which labeled captures take"
             )
-        simulated = list(map(_simulated_take, takes))
-        for hand in (hand for take in simulated for hand in take.hands):
-            _check_markers("the take's glove", hand.layout.names, network.marker_names)
-        report = evaluate_frames(network, chain.from_iterable(map(_take_frames, simulated)))
-        seconds = [np.tile(take.times.astype(np.int64), len(take.hands)) for take in simulated]
-        report = _grouped(report, seconds, "seconds")
+        report = _report_of_takes(network, takes)
     elif given and all(map(is_dataset, given)):
-        sets = [load_dataset(one) for one in given]
-        rows = np.concatenate([_rows(one, network.marker_names) for one in sets])[:: settings.every]
-        if corruption == CLEAN:
-            report = rig_report(network, rows, rng=rng)
-        else:
-            report = evaluate_markers(network, rows["markers"].astype(np.float64), corruption, rng=rng)
-        report = _grouped(report, [one.people() for one in sets], "people", settings.every)
+        report = _report_of_sets(network, list(map(load_dataset, given)), corruption, settings.every, rng)
     else:
-        parts = _markers(given, network.marker_names)
+        parts = _true_markers(given, network.marker_names)
         markers = np.concatenate([one for one, _ in parts])[:: settings.every]
         report = evaluate_markers(network, markers, corruption, rng=rng)
-        report = _grouped(report, [seconds for _, seconds in parts], "seconds", settings.every)
+        report = _with_groups(report, [seconds for _, seconds in parts], "seconds", settings.every)
     if not report.confusion[:-1].any() and not all(isinstance(one, np.ndarray) for one in given):
-        raise CaptureError(
-            f"nothing to count: no frame holds any of {', '.join(network.marker_names)}, expected labeled "
-            "captures"
-        )
+        names = ", ".join(network.marker_names)
+        raise CaptureError(f"nothing to count: no frame holds any of {names}, expected labeled captures")
     return report
 
 
-def _shown(given: Any) -> str:
-    """A take or capture in an error message: its path, if it was given by one."""
+def _report_of_takes(network: Labeler, takes: Sequence[Take | str | Path]) -> LabelingReport:
+    """Evaluate all frames of simulated takes, with the gaps and ghosts that their cameras recorded."""
+    simulated = list(map(_simulated_take, takes))
+    for hand in chain.from_iterable(take.hands for take in simulated):
+        _check_markers("the take's glove", hand.layout.names, network.marker_names)
+    report = evaluate_frames(network, chain.from_iterable(map(_take_frames, simulated)))
+    seconds = [np.tile(take.times.astype(np.int64), len(take.hands)) for take in simulated]
+    return _with_groups(report, seconds, "seconds")
+
+
+def _report_of_sets(
+    network: Labeler,
+    sets: Sequence[Dataset],
+    corruption: Corruption | OwnCorruption | str,
+    every: int,
+    rng: np.random.Generator,
+) -> LabelingReport:
+    """Evaluate every n-th row of training sets, as their rig saw it or corrupted."""
+    rows = np.concatenate([_checked_rows(one, network.marker_names) for one in sets])[::every]
+    if corruption == CLEAN:
+        report = rig_report(network, rows, rng=rng)
+    else:
+        report = evaluate_markers(network, rows["markers"].astype(np.float64), corruption, rng=rng)
+    return _with_groups(report, [one.people() for one in sets], "people", every)
+
+
+def _name_of(given: Any) -> str:
+    """Name of a take or capture in an error message: its path, if it is given by one."""
     return str(given) if isinstance(given, str | Path) else f"the {type(given).__name__.lower()}"
 
 
@@ -475,11 +474,11 @@ def _simulated_take(given: Take | str | Path) -> Take:
     """A take with its truth; a `CaptureError` if it is a tracked one."""
     take = given if isinstance(given, Take) else load_take(given)
     if take.made_by_tracker:
-        raise CaptureError(f"{_shown(given)}: a tracked take, expected the truth of a simulated capture")
+        raise CaptureError(f"{_name_of(given)}: a tracked take, expected the truth of a simulated capture")
     return take
 
 
-def _markers(
+def _true_markers(
     truth: Sequence[Any], names: tuple[str, ...]
 ) -> list[tuple[Float[np.ndarray, "T M 3"], Int[np.ndarray, "T"] | None]]:
     """True markers of captures, sets and arrays [m], in the labeler's order, and seconds of captures."""
@@ -490,27 +489,27 @@ def _markers(
                 raise ArgumentError(f"markers have shape {one.shape}, expected (T, {len(names)}, 3) [m]")
             parts.append((as_numbers("truth", one), None))
         elif isinstance(one, Capture):
-            parts.append(_of_hands(select_hands(one, names), one.rate))
+            parts.append(_joined_hands(select_hands(one, names), one.rate))
         elif is_dataset(one):
-            parts.append((_rows(load_dataset(one), names)["markers"].astype(np.float64), None))
+            parts.append((_checked_rows(load_dataset(one), names)["markers"].astype(np.float64), None))
         else:
             expected = "markers (T, M, 3) [m], a Dataset, Capture or Take, or the path of one"
             check_type("truth", one, (str, Path), expected)
-            parts += [_of_hands(*read_hands(file, names)) for file in find_captures([Path(one)])]
+            parts += [_joined_hands(*read_hands(file, names)) for file in find_captures([Path(one)])]
     if not parts:
         raise CaptureError("no capture was given, expected labeled captures, folders, training sets or takes")
     return parts
 
 
-def _of_hands(
+def _joined_hands(
     hands: Sequence[Float[np.ndarray, "T M 3"]], rate: float
 ) -> tuple[Float[np.ndarray, "T M 3"], Int[np.ndarray, "T"]]:
-    """The markers of a capture's hands [m], and the second that each frame is of."""
+    """Markers of all hands of a capture [m], one hand after the other, and the second of each frame."""
     seconds = [(np.arange(len(hand)) / rate).astype(np.int64) for hand in hands]
     return np.concatenate(hands), np.concatenate(seconds)
 
 
-def _grouped(
+def _with_groups(
     report: LabelingReport, parts: Sequence[Int[np.ndarray, "T"] | None], grouped_by: str, every: int = 1
 ) -> LabelingReport:
     """The report with the person, capture or second of each of its frames, if they are known of all parts."""
@@ -524,8 +523,8 @@ def _grouped(
     return dataclasses.replace(report, groups=numbers[::every], grouped_by=grouped_by)
 
 
-def _rows(dataset: Dataset, names: tuple[str, ...]) -> NDArray[np.void]:
-    """Rows of a set, whose markers must be those of the labeler."""
+def _checked_rows(dataset: Dataset, names: tuple[str, ...]) -> NDArray[np.void]:
+    """Read the rows of a set, and refuse one with other markers than the labeler's."""
     _check_markers(f"the set {dataset.path}", dataset.marker_names, names)
     return np.asarray(dataset.rows())
 
@@ -561,10 +560,10 @@ def evaluate_labels(labeled: Take | Capture | str | Path, truth: Take | str | Pa
     actual, given = _simulated_take(truth), labeled
     if not isinstance(given, Take | Capture):
         given = load_take(given) if Path(given).suffix == ".npz" else read_capture(given)
-    what, expected = _shown(labeled), "expected the labels and the truth of one capture"
+    what, expected = _name_of(labeled), "expected the labels and the truth of one capture"
     if given.num_frames != actual.num_frames:
         raise CaptureError(
-            f"{what} has {given.num_frames} frames and {_shown(truth)} {actual.num_frames}, {expected}"
+            f"{what} has {given.num_frames} frames and {_name_of(truth)} {actual.num_frames}, {expected}"
         )
     if isinstance(given, Take):
         points, columns = given.point_list, given.label_names
@@ -573,11 +572,11 @@ def evaluate_labels(labeled: Take | Capture | str | Path, truth: Take | str | Pa
         numbers, nothing = np.broadcast_to(np.arange(shape[1]), shape), np.full(shape, np.nan)
         points = PointList.of_tables(given.positions, np.full(shape, -1), numbers, nothing)
     true_points, names = actual.point_list, actual.label_names[: actual.hand_labels[-1].stop]
-    partner = _partners(points, true_points)
+    partner = _matched_points(points, true_points)
     alone = partner < 0
-    if alone.sum() > (1.0 - _SAME_CAPTURE) * len(alone):
+    if alone.sum() > (1.0 - _LEAST_SHARED_POINTS) * len(alone):
         raise CaptureError(
-            f"{what} shares {(~alone).sum()} of its {len(alone)} points with {_shown(truth)}, {expected}"
+            f"{what} shares {(~alone).sum()} of its {len(alone)} points with {_name_of(truth)}, {expected}"
         )
     # The points of the truth, and after them those that only the capture has.
     count = len(true_points.labels)
@@ -597,10 +596,10 @@ def evaluate_labels(labeled: Take | Capture | str | Path, truth: Take | str | Pa
     return dataclasses.replace(report, groups=actual.times.astype(np.int64), grouped_by="seconds")
 
 
-def _partners(points: PointList, others: PointList) -> Int[np.ndarray, "P"]:
+def _matched_points(points: PointList, others: PointList) -> Int[np.ndarray, "P"]:
     """Index of each point's partner among the others, one to one by frame and position; -1 for none."""
     mine, theirs = (np.column_stack([one.points, one.frames]) for one in (points, others))
-    distance, nearest = cKDTree(theirs).query(mine, distance_upper_bound=_SAME_POINT)
+    distance, nearest = cKDTree(theirs).query(mine, distance_upper_bound=_SAME_POINT_DISTANCE)
     order = np.argsort(distance, kind="stable")
     taken, first = np.unique(nearest[order], return_index=True)
     there = taken < len(theirs)

@@ -1,4 +1,4 @@
-"""Devices of a training run, by Fabric: that of this process, and of others started by torchrun or srun."""
+"""Starts Fabric for a training run in one process, or in several that torchrun or srun started."""
 
 from __future__ import annotations
 
@@ -45,9 +45,8 @@ def start_fabric(settings: TrainSettings, out: Path) -> Fabric:
     torch.set_flush_denormal(True)  # Features underflow, and denormal numbers slow a core down.
     logging.getLogger("lightning_fabric").setLevel(logging.WARNING)  # Its messages do not concern users.
     warnings.filterwarnings("ignore", module="lightning_fabric")
-    if (
-        here > 1 and nodes == 1 and sys.platform in _LOOPBACK
-    ):  # Connections within one machine stay off the network.
+    if here > 1 and nodes == 1 and sys.platform in _LOOPBACK:
+        # Connections within one machine stay off the network.
         os.environ.setdefault("GLOO_SOCKET_IFNAME", _LOOPBACK[sys.platform])
     fabric = Fabric(
         accelerator="cuda" if has_gpu else "cpu",
@@ -59,7 +58,7 @@ def start_fabric(settings: TrainSettings, out: Path) -> Fabric:
         loggers=TensorBoardLogger(out, name="tensorboard", version=""),
     )
     fabric.launch()
-    atexit.register(_leave)
+    atexit.register(_end_process_group)
     return fabric
 
 
@@ -83,14 +82,14 @@ def _processes() -> tuple[ClusterEnvironment, int, int]:
     return SLURMEnvironment(auto_requeue=False), tasks // nodes, nodes
 
 
-def _leave() -> None:
-    """End gloo's threads before the interpreter; one that frees a tensor later would abort the process."""
+def _end_process_group() -> None:
+    """End gloo's threads before the interpreter ends: a thread that frees a tensor later would abort it."""
     if torch.distributed.is_initialized():
         torch.distributed.destroy_process_group()
 
 
 @contextmanager
-def lost_peers_told() -> Iterator[None]:
+def lost_peers_reported() -> Iterator[None]:
     """Turn a broken connection within the block into a `HandSimError`."""
     try:
         yield
@@ -98,7 +97,7 @@ def lost_peers_told() -> Iterator[None]:
         # gloo has no error class for a lost process.
         if not (isinstance(error, torch.distributed.DistError) or "gloo" in str(error)):
             raise
-        raise HandSimError("another process of this run ended, and tells why") from error
+        raise HandSimError("another process of this run ended, and reports why") from error
 
 
 def _takes_bf16(precision: str) -> bool:

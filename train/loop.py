@@ -1,4 +1,4 @@
-"""Training of a labeler: steps and checkpoints, and at the end weights, card and page."""
+"""Trains a labeler: makes steps and checkpoints, and at the end writes weights, card and page."""
 
 from __future__ import annotations
 
@@ -30,25 +30,10 @@ from handsim.errors import DatasetError, HandSimError, WeightsError
 from handsim.files.arrays import check_members
 from handsim.files.outputs import atomic_write, claim, written_together
 from handsim.files.signals import InterruptFlag, Stopped, interrupt_flag, interrupts_bare
-from train.data.batches import (
-    Batch,
-    Part,
-    check_corruption,
-    draw_batch,
-    paper_corruption,
-    right_hands,
-)
+from train.data.batches import Batch, Part, check_corruption, draw_batch, paper_corruption, right_hands
 from train.data.shards import Dataset, Manifest, MappedRows, load_dataset
-from train.evaluation import (
-    CLEAN,
-    SEEN,
-    History,
-    LabelingReport,
-    evaluate_markers,
-    paper_report,
-    rig_report,
-)
-from train.fabric import lost_peers_told, start_fabric
+from train.evaluation import CLEAN, SEEN, History, LabelingReport, evaluate_markers, paper_report, rig_report
+from train.fabric import lost_peers_reported, start_fabric
 from train.labelers.cnn_labeler import label_by_distance
 from train.labelers.cnn_network import DeepLabelCNN
 from train.labelers.networks import (
@@ -66,17 +51,24 @@ from train.reports.run_page import UNKNOWN_LICENSE, write_model_card, write_run_
 from train.settings import CNNConfig, Kind, TrainSettings, batch_recipe, train_settings
 
 CHECKPOINT: Final = "checkpoint.pt"
-_HELD_OUT: Final = 0.02  # share of people, from the end, held out from training
-_LEAST_PEOPLE: Final = 20  # held-out people of a set of at least two hundred
+_HELD_OUT_SHARE: Final = 0.02  # share of the people, from the end of the set, that is held out from training
+_FEWEST_HELD_OUT_PEOPLE: Final = 20  # least number of held-out people of a set of two hundred or more
 _NUM_EVALUATIONS: Final = 10  # number of evaluations on held-out frames during a run
 _CURVE_FRAMES: Final[dict[Kind, int]] = {"set": 512, "cnn": 160}  # held-out frames of each such evaluation
 _CARD_FRAMES: Final[dict[Kind, int]] = {"set": 8192, "cnn": 1024}  # held-out frames of the model card
-_FEWEST_SHOWN, _SAMPLES_A_FRAME = 64, 8  # least held-out frames; samples of a run for each
+_FEWEST_EVALUATED, _SAMPLES_PER_EVALUATED_ROW = 64, 8  # least held-out frames; samples of a run for each
 _CURVE_POINTS: Final = 200  # number of entries of the loss curve
 _PRIOR_STRETCH: Final = 0.03  # anisotropy of the prior's hands: real people differ more
 _COST_FRAMES: Final = 400  # held-out frames for choosing the costs of the paper's network
-_REJECTS: Final = (0.015, 0.02, 0.03, 0.04, 0.06, 0.08)  # [m] tried costs of a ghost
-_SPREADS: Final = (0.002, 0.003, 0.004, 0.006, 0.008, 0.012)  # [m] confidence scales tried after training
+_TRIED_REJECTS: Final = (0.015, 0.02, 0.03, 0.04, 0.06, 0.08)  # [m] tried costs of a ghost
+_TRIED_SPREADS: Final = (
+    0.002,
+    0.003,
+    0.004,
+    0.006,
+    0.008,
+    0.012,
+)  # [m] confidence scales tried after training
 
 
 class TrainingError(HandSimError):
@@ -138,17 +130,17 @@ def train_labeler(
         alone_on_cpu = fabric.device.type == "cpu" and fabric.world_size == 1
         many = settings.labeler == "cnn" and alone_on_cpu
         threads = min(torch.get_num_threads(), usable_cores()) if many else 1
-    with ExitStack() as stack, lost_peers_told(), torch_threads(threads):
-        # The thread that writes curves complains if its process ends before the writer is closed.
+    with ExitStack() as stack, lost_peers_reported(), torch_threads(threads):
+        # Close the writer of curves: its thread would report an error if the process ended before.
         stack.callback(fabric.logger.finalize, "")
         on_step("training set")
         flag = InterruptFlag()
-        # A process ended immediately by a signal would make the others wait for it.
+        # Delay signals if there are other processes: they would wait for one that ends at once.
         with nullcontext() if fabric.world_size == 1 else interrupt_flag(flag, again=False):
             run = _prepare(load_dataset(dataset), settings, out, fabric)
-            with run.kept():
+            with run.checkpointed_if_interrupted():
                 run.do_steps(flag, progress, on_step, save_every)
-        with run.kept():
+        with run.checkpointed_if_interrupted():
             return fabric.broadcast(run.finish(on_step) if fabric.is_global_zero else {})
 
 
@@ -190,13 +182,13 @@ def untrained_report(dataset: Dataset | str | Path, settings: TrainSettings) -> 
     rows = dataset.mapped_rows()
     settings = settings.for_set(len(dataset.marker_names), len(rows))
     held_out = rows.span(_first_held_out(dataset.people()), len(rows))
-    shown = held_out[_shown(held_out, settings.samples, _CARD_FRAMES[settings.labeler])]
+    shown = held_out[_evaluation_rows(held_out, settings.samples, _CARD_FRAMES[settings.labeler])]
     return rig_report(untrained_labeler(dataset.layout), shown, rng=np.random.default_rng(0))
 
 
-def _shown(held_out: MappedRows, samples: int, count: int) -> Int[np.ndarray, "R"]:
-    """At most `count` held-out rows, evenly spread; fewer for a short run, which they would outlast."""
-    count = min(count, max(_FEWEST_SHOWN, samples // _SAMPLES_A_FRAME))
+def _evaluation_rows(held_out: MappedRows, samples: int, count: int) -> Int[np.ndarray, "R"]:
+    """Indices of at most `count` held-out rows, evenly spread; fewer if evaluation would outlast training."""
+    count = min(count, max(_FEWEST_EVALUATED, samples // _SAMPLES_PER_EVALUATED_ROW))
     return np.arange(0, len(held_out), -(-len(held_out) // count))
 
 
@@ -208,14 +200,14 @@ def _first_held_out(people: Int[np.ndarray, "T"]) -> int:
     """
     firsts = np.flatnonzero(np.diff(people, prepend=-1))
     if len(firsts) == 1:
-        return len(people) - max(1, int(_HELD_OUT * len(people)))
-    count = max(int(_HELD_OUT * len(firsts)), min(_LEAST_PEOPLE, len(firsts) // 10), 1)
+        return len(people) - max(1, int(_HELD_OUT_SHARE * len(people)))
+    count = max(int(_HELD_OUT_SHARE * len(firsts)), min(_FEWEST_HELD_OUT_PEOPLE, len(firsts) // 10), 1)
     return int(firsts[-count])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Run:
-    """A run: its state, its training set and its folder."""
+    """A training run: its state, its training set and its folder."""
 
     state: TrainingState
     manifest: Manifest
@@ -232,11 +224,11 @@ class _Run:
         """
         state, settings, alone = self.state, self.state.settings, self.state.fabric.world_size == 1
         recipe, names = batch_recipe(settings, len(self.manifest.marker_names)), self.manifest.marker_names
-        shown, saved = self.held_out[self._shown(_CURVE_FRAMES[settings.labeler])], time.monotonic()
+        shown, saved = self.held_out[self._evaluation_rows(_CURVE_FRAMES[settings.labeler])], time.monotonic()
         evaluated = state.history.accuracies[-1][0] if state.history.accuracies else 0
         while True:
-            if state.done > evaluated and _passed(
-                state.done, settings, _NUM_EVALUATIONS, _SAMPLES_A_FRAME * len(shown)
+            if state.done > evaluated and _ends_interval(
+                state.done, settings, _NUM_EVALUATIONS, _SAMPLES_PER_EVALUATED_ROW * len(shown)
             ):
                 evaluated = state.done
                 if state.fabric.is_global_zero:
@@ -245,8 +237,7 @@ class _Run:
             if state.done >= settings.samples:
                 break
             with interrupt_flag(flag, again=alone):
-                # One generator per step, so that a resumed run makes the same draws; all devices use the
-                # same one.
+                # A generator per step makes the draws of a resumed run the same; all devices share it.
                 rng = np.random.default_rng((settings.seed, state.done, 0))
                 loss = state.step(draw_batch(self.rows, recipe, rng=rng), rng=rng)
             ended = torch.tensor(float(flag()), device=state.fabric.device)
@@ -261,11 +252,12 @@ class _Run:
         on_step("checkpoint")
         state.save(self.out / CHECKPOINT)
 
-    def _shown(self, count: int) -> Int[np.ndarray, "R"]:
-        return _shown(self.held_out, self.state.settings.samples, count)
+    def _evaluation_rows(self, count: int) -> Int[np.ndarray, "R"]:
+        """At most `count` of the held-out rows, as indices."""
+        return _evaluation_rows(self.held_out, self.state.settings.samples, count)
 
     @contextmanager
-    def kept(self) -> Iterator[None]:
+    def checkpointed_if_interrupted(self) -> Iterator[None]:
         """Write a checkpoint if a signal ends the block."""
         try:
             with interrupts_bare():
@@ -286,14 +278,14 @@ class _Run:
         network = self.state.averaged()
         if isinstance(network, DeepLabelCNN):
             on_step("costs of the paper's labeler")
-            choose_costs(network, names, self.held_out[self._shown(_COST_FRAMES)])
+            choose_costs(network, names, self.held_out[self._evaluation_rows(_COST_FRAMES)])
         else:
             assert isinstance(network, SetLabeler)
             on_step("pose prior")
             rng = np.random.default_rng(settings.seed)
             network.prior = learn_pose_prior(right_hands(self.rows, _PRIOR_STRETCH, rng=rng), rng=rng)
         on_step("held-out frames")
-        card, report = self._card(network, self._shown(_CARD_FRAMES[settings.labeler]))
+        card, report = self._card(network, self._evaluation_rows(_CARD_FRAMES[settings.labeler]))
         on_step("weights and report")
         with written_together():
             save_network(self.out, network, card)
@@ -308,12 +300,11 @@ class _Run:
         labeler, paper = labeler_of(network, names), paper_corruption(len(names))
         rows, people = self.held_out[shown], self.people[shown] if len(self.people) else self.people
         corrupted = f"occlude {paper.occlude}, ghosts {paper.ghosts}"
+        markers, rng = rows["markers"].astype(np.float64), np.random.default_rng
         reports = {
-            SEEN: rig_report(labeler, rows, rng=np.random.default_rng(0)),
+            SEEN: rig_report(labeler, rows, rng=rng(0)),
             corrupted: paper_report(labeler, rows),
-            "clean": evaluate_markers(
-                labeler, rows["markers"].astype(np.float64), CLEAN, rng=np.random.default_rng(0)
-            ),
+            "clean": evaluate_markers(labeler, markers, CLEAN, rng=rng(0)),
         }
         if len(people):
             reports = {name: dataclasses.replace(one, groups=people) for name, one in reports.items()}
@@ -359,7 +350,7 @@ class TrainingState:
         Each device learns from its part of the batch; `rng` is the same on all.
         """
         began = time.perf_counter()
-        rate = self.settings.learning_rate * _rate(self.settings, self.done / self.settings.samples)
+        rate = self.settings.learning_rate * _scheduled_rate(self.settings, self.done / self.settings.samples)
         for group in self.optimizer.param_groups:
             group["lr"] = rate
         loss = batch_loss(self.settings, self.network, batch, self.fabric.device, rng=rng, part=self.part)
@@ -378,7 +369,7 @@ class TrainingState:
             )
         self.history.add(value)
         self.history.minutes += (time.perf_counter() - began) / 60.0
-        if _passed(self.done, self.settings, _CURVE_POINTS):
+        if _ends_interval(self.done, self.settings, _CURVE_POINTS):
             (since, done), self.began = self.began, (time.monotonic(), self.done)
             speed = (self.done - done) / (self.began[0] - since)
             mean = self.history.close(self.done, rate)
@@ -424,8 +415,8 @@ class TrainingState:
             "done": self.done,
             "history": dataclasses.asdict(self.history),
         }
-        # Through memory, as torch writes the temporary name into a file that it opens itself, and does not
-        # report a full disk.
+        # Write through memory: torch stores the temporary name in a file that it opens itself, and it does
+        # not report a full disk.
         buffer = io.BytesIO()
         torch.save(content, buffer)
         with atomic_write(path) as temporary:
@@ -437,7 +428,7 @@ class TrainingState:
         found = self.fabric.broadcast(found)
         if found is None:
             return
-        stored = io.BytesIO(found)  # torch calls some damage an OSError
+        stored = io.BytesIO(found)  # in memory, because torch reports some damage as an OSError
         try:
             with zipfile.ZipFile(stored) as archive:
                 check_members(archive, len(found))
@@ -470,7 +461,7 @@ class TrainingState:
                     raise ValueError(f"{name} is not finite")
 
 
-def _rate(settings: TrainSettings, progress: float) -> float:
+def _scheduled_rate(settings: TrainSettings, progress: float) -> float:
     """Learning rate at a share of the run, as a share of the peak rate."""
     if settings.schedule == "steps":
         return float(0.1 ** ((progress >= 50 / 75) + (progress >= 70 / 75)))
@@ -491,8 +482,8 @@ def _check_stored(content: object, seen: set[int] | None = None) -> None:
             _check_stored(entry, seen)
 
 
-def _passed(done: int, settings: TrainSettings, parts: int, least: int = 1) -> bool:
-    """Whether the last step ended the run, or one of `parts` equal parts of at least `least` samples."""
+def _ends_interval(done: int, settings: TrainSettings, parts: int, least: int = 1) -> bool:
+    """Whether the last step ended the run or one of `parts` equal intervals of at least `least` samples."""
     part = max(settings.batch, settings.samples // parts, least)
     return (done - settings.batch) // part != done // part or done >= settings.samples
 
@@ -502,25 +493,26 @@ def choose_costs(network: DeepLabelCNN, marker_names: tuple[str, ...], rows: NDA
 
     A given reject or spread is kept.
     """
-    labeler = _Recalling(network, marker_names)
+    labeler = _CachedLabeler(network, marker_names)
 
     def report(reject: float, spread: float) -> LabelingReport:
         labeler.reject, labeler.spread = reject, spread
         return paper_report(labeler, rows)
 
+    def accuracy(tried: float) -> float:
+        return report(tried, _TRIED_SPREADS[0]).figures["slot_accuracy"]
+
     config = network.config
-    reject = config.reject or max(
-        _REJECTS, key=lambda tried: report(tried, _SPREADS[0]).figures["slot_accuracy"]
-    )
+    reject = config.reject or max(_TRIED_REJECTS, key=accuracy)
     spread = config.spread or min(
-        _SPREADS, key=lambda tried: report(reject, tried).figures["calibration_error"]
+        _TRIED_SPREADS, key=lambda tried: report(reject, tried).figures["calibration_error"]
     )
     network.config = dataclasses.replace(config, reject=reject, spread=spread)
     return network.config
 
 
-class _Recalling:
-    """Labeler that runs its network once, and labels the same frames again with other costs."""
+class _CachedLabeler:
+    """Labeler that runs its network once, and then labels the same frames with other costs."""
 
     def __init__(self, network: DeepLabelCNN, marker_names: tuple[str, ...]) -> None:
         self.marker_names = marker_names

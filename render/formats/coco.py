@@ -30,7 +30,7 @@ from render.formats.records import (
     shifted_K,
     to_json,
 )
-from render.formats.shards import _LABELS, FolderWriter, _write, json_list, one_sentence, save_text
+from render.formats.shards import LABELS, FolderWriter, json_list, one_sentence, save_text, write_file
 from render.frames import Doubles, Flags, HandTruth, RenderedFrame
 from render.skin.look import tone_name, typology_angle
 
@@ -162,7 +162,7 @@ class YoloWriter(CocoWriter):
 
     def _add(self, folder: Path, frame: RenderedFrame, name: str) -> dict[str, Any]:
         record = super()._add(folder, frame, name)
-        _write(folder / _LABELS / f"{frame.key}.txt", label_lines(frame).encode())
+        write_file(folder / LABELS / f"{frame.key}.txt", label_lines(frame).encode())
         return record
 
     def finish(self) -> list[Path]:

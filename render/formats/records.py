@@ -1,4 +1,4 @@
-"""What the file formats share: encoded pictures, masks, JSON, and the joint order of UmeTrack.
+"""Encodes pictures, masks and JSON for all file formats, and has the joint order of UmeTrack.
 
 We count pixels from the picture's corner, so that the first center is at 0.5. OpenCV, UmeTrack and COCO's
 keypoints count from the first center: `CENTER` is subtracted for them.
@@ -47,12 +47,12 @@ They have five tips, the wrist, the thumb without its base, and three joints per
 """
 METERS_PER_UNIT: Final = 1e-4
 """Unit of a depth picture [m]."""
-_KEYWORD: Final = "metres_per_unit"
+_UNIT_KEYWORD: Final = "metres_per_unit"
 _NORMAL_ZERO, _NORMAL_SCALE = 128, 127
 _RGB: Final = ("R", "G", "B")
 _NORMALS: Final = ("N.X", "N.Y", "N.Z")
 _IDS: Final = {"parts": "id.part", "instances": "id.instance", "markers": "id.marker"}
-_SENSOR: Final = "sensor."
+_SENSOR_PREFIX: Final = "sensor."
 
 
 def labeled_keypoints(label: Mapping[str, Any]) -> tuple[Doubles, Doubles]:
@@ -78,13 +78,13 @@ def shifted_K(camera: Camera) -> Doubles:
 
 
 def as_sensed(frame: RenderedFrame) -> Pictures:
-    """The frame's pictures as its camera has them: noisy ones in the place of ideal ones."""
+    """The frame's pictures as its camera takes them: noisy ones instead of ideal ones."""
     noisy = {name: getattr(frame.noisy, name) for name in ("rgb", "depth")}
     return dataclasses.replace(frame.ideal, **{name: one for name, one in noisy.items() if one is not None})
 
 
 def is_seen(hand: HandTruth) -> bool:
-    """Whether any of the hand is in the picture."""
+    """Whether any part of the hand is in the picture."""
     return bool(np.isfinite(hand.box).all())
 
 
@@ -147,19 +147,19 @@ def rounded(values: NDArray[np.floating], decimals: int) -> Any:
 def to_json(content: Any) -> str:
     """JSON of plain values and arrays; null for NaN, which strict readers refuse."""
     try:
-        return json.dumps(content, default=_listed, allow_nan=False, separators=(",", ":"))
-    except (TypeError, ValueError):  # NaN, or a type that only the slow way knows
+        return json.dumps(content, default=_as_plain, allow_nan=False, separators=(",", ":"))
+    except (TypeError, ValueError):  # `plain_json` is slower, but knows NaN and more types
         return json.dumps(plain_json(content), allow_nan=False, separators=(",", ":"))
 
 
-def _listed(content: Any) -> Any:
+def _as_plain(content: Any) -> Any:
     if isinstance(content, np.ndarray | np.generic):
         return content.tolist()
     raise TypeError
 
 
 def encode_jpeg(picture: UInt8[np.ndarray, "H W 3"], *, quality: int = 95) -> bytes:
-    """An sRGB picture as JPEG."""
+    """Encode an sRGB picture as JPEG."""
     ordered = cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)
     done, data = cv2.imencode(".jpg", ordered, [cv2.IMWRITE_JPEG_QUALITY, quality])
     assert done, "JPEG holds any picture"
@@ -167,8 +167,8 @@ def encode_jpeg(picture: UInt8[np.ndarray, "H W 3"], *, quality: int = 95) -> by
 
 
 def encode_depth(depth: Float32[np.ndarray, "H W"]) -> bytes:
-    """Depth [m] as 16-bit gray PNG, whose text chunk `metres_per_unit` has the unit; 0 if it does not fit."""
-    return encode_png(_depth_steps(np.ascontiguousarray(depth)), text={_KEYWORD: repr(METERS_PER_UNIT)})
+    """Encode depth [m] as 16-bit gray PNG, with the unit as text `metres_per_unit`; 0 for too large depth."""
+    return encode_png(_depth_steps(np.ascontiguousarray(depth)), text={_UNIT_KEYWORD: repr(METERS_PER_UNIT)})
 
 
 @kernel
@@ -184,14 +184,14 @@ def _depth_steps(depth: Floats) -> Any:
 
 
 def encode_ids(pictures: Pictures) -> bytes | None:
-    """Parts, instances and markers as red, green and blue of one PNG; None for pictures without ids."""
+    """Encode parts, instances and markers as red, green and blue of one PNG; None for no ids."""
     if pictures.parts is None or pictures.instances is None or pictures.markers is None:
         return None
     return encode_png(cv2.merge([pictures.parts, pictures.instances, pictures.markers]))
 
 
 def encode_normals(normals: Float32[np.ndarray, "H W 3"]) -> bytes:
-    """Unit normals as 8-bit PNG: x, y, z are (red, green, blue - 128) / 127; black without a surface."""
+    """Encode unit normals as 8-bit PNG: x, y, z are (red, green, blue - 128) / 127; black for no surface."""
     return encode_png(_normal_levels(np.ascontiguousarray(normals)))
 
 
@@ -230,7 +230,7 @@ def write_exr(path: str | Path, frame: RenderedFrame) -> None:
     """Write all pictures of a frame and its camera."""
     import OpenEXR
 
-    noisy = {_SENSOR + name: values for name, values in _channels(frame.noisy).items()}
+    noisy = {_SENSOR_PREFIX + name: values for name, values in _channels(frame.noisy).items()}
     channels = _channels(frame.ideal) | noisy
     record = frame.camera.record()
     header = {

@@ -27,8 +27,8 @@ _NAME: Final = re.compile(r"shard-(\d{5,})(\.tar)?")
 _IMAGES: Final = "images"
 PICTURES: Final = ("depth", "depth_ideal", "normals", "ids")
 """Kinds of pictures beside the photographs, each of which has a folder."""
-_LABELS: Final = "labels"
-BESIDE: Final = (*PICTURES, _LABELS)
+LABELS: Final = "labels"
+BESIDE: Final = (*PICTURES, LABELS)
 """Folders that may stand beside that of the photographs."""
 
 
@@ -185,7 +185,7 @@ class FolderWriter:
         files = {}
         for suffix, content in encode_pictures(frame, lossless=lossless).items():
             kind, _, ending = suffix.strip(".").rpartition(".")
-            _write(folder / kind / f"{frame.key}.{ending}", content)
+            write_file(folder / kind / f"{frame.key}.{ending}", content)
             if kind:
                 files[f"{kind}_file"] = f"{kind}/{name}/{frame.key}.{ending}"
         return files
@@ -195,7 +195,7 @@ class FolderWriter:
             yield from load_index(self.pictures / shard_name(shard))
 
 
-def _write(path: Path, content: bytes) -> None:
+def write_file(path: Path, content: bytes) -> None:
     """Write a file into a folder, which is made for its first file."""
     try:
         path.write_bytes(content)

@@ -1,8 +1,9 @@
-"""Clips in webdataset tars as UmeTrack and HOT3D have them, and the ground truth of a frame: docs/formats.md.
+"""Writes clips in webdataset tars, as UmeTrack and HOT3D have them, and records a frame's ground truth.
 
-Our hand as a UmeTrack hand model: UmeTrack describes left hands and mirrors them in its x axis for right
-ones; ours are mirrored in y. Its wrist frame is therefore ours rotated by 90 degrees about z. Like ours it
-has four joint angles per digit and equal angles for mirrored poses, so that our angles are its angles.
+docs/formats.md defines the records. A clip holds our hand as a hand model of UmeTrack, which describes left
+hands and mirrors them in its x axis for right ones; ours are mirrored in y. UmeTrack's wrist frame is
+therefore ours rotated by 90 degrees about z. Its model has four joint angles per digit, and equal angles for
+mirrored poses, as ours has, so that its angles are our angles.
 """
 
 from __future__ import annotations
@@ -40,21 +41,21 @@ from render.frames import Doubles, HandTruth, RenderedFrame
 
 HAND_SHAPES: Final = "__hand_shapes.json__"
 """File of a clip with the hand model; webdataset skips names of this form."""
-_MODELS: Final = {"pinhole": "PinholePlane", "brown": "OpenCV", "fisheye": "OculusVisionFishEye"}
+_PROJECTION_MODELS: Final = {"pinhole": "PinholePlane", "brown": "OpenCV", "fisheye": "OculusVisionFishEye"}
 # Rotation from our wrist frame to UmeTrack's.
 _UMETRACK_FROM_OURS: Final = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 _JOINTS_PER_DIGIT: Final = 4
-_ROOT_FRAMES: Final = 1  # a root that moves with the wrist comes before our bones
-_STREAM: Final = re.compile(r"[A-Za-z0-9_-]+")
+_ROOT_FRAMES: Final = 1  # number of frames before those of our bones: a root that moves with the wrist
+_STREAM_NAME: Final = re.compile(r"[A-Za-z0-9_-]+")
 TAR: Final = ".tar"
-_FILLED: Final = 0.8  # distance of the outermost keypoint from a crop's middle over half the crop's width
-_WIDEST: Final = np.deg2rad(120.0)  # largest angle of view of a crop
-_ROUNDS: Final = 5  # times that a crop's camera is turned to the keypoints' middle, which then moves a little
-_NEAREST: Final = 1e-3  # least depth of a keypoint in a crop [m]
+_FILLED_SHARE: Final = 0.8  # distance of the outermost keypoint from a crop's middle [half widths]
+_WIDEST_CROP: Final = np.deg2rad(120.0)  # largest angle of view of a crop
+_CROP_ROUNDS: Final = 5  # rotations of a crop's camera to the keypoints' middle, which moves each time
+_NEAREST_KEYPOINT: Final = 1e-3  # least depth of a keypoint in a crop [m]
 
 
 def camera_record(camera: Camera, T_world_device: Float[np.ndarray, "4 4"]) -> dict[str, Any]:
-    """One stream of a `cameras.json`: calibration and pose; our own record of the camera beside them."""
+    """Record of one stream in `cameras.json`: calibration, pose, and our own record of the camera."""
     K, lens = camera.K, camera.lens
     coefficients = list(lens.coefficients)
     if lens.kind == "brown":
@@ -70,7 +71,7 @@ def camera_record(camera: Camera, T_world_device: Float[np.ndarray, "4 4"]) -> d
             "serial_number": camera.name,
             "image_width": camera.size[0],
             "image_height": camera.size[1],
-            "projection_model_type": _MODELS[lens.kind],
+            "projection_model_type": _PROJECTION_MODELS[lens.kind],
             "projection_params": [*focal_center, *coefficients],
             "T_device_from_camera": rigid_record(np.linalg.inv(T_world_device) @ camera.T_world_camera),
         },
@@ -93,7 +94,7 @@ def hands_record(frames: Sequence[RenderedFrame]) -> dict[str, Any]:
                 "T_world_from_wrist": rigid_record(wrist),
             },
             "landmarks": rounded(hand.keypoints_world[UMETRACK_JOINTS], 9),
-            **_truth(hand),
+            **_pose_record(hand),
             "pixels": {name: rounded(hands[side].keypoints - CENTER, 5) for name, hands in streams},
             "visible": {name: hands[side].visible for name, hands in streams},
             "boxes": {name: rounded(hands[side].box, 3) for name, hands in streams},
@@ -133,7 +134,7 @@ def frame_record(frame: RenderedFrame) -> dict[str, Any]:
         "hands": [
             {
                 "side": hand.shape.side,
-                **_truth(hand),
+                **_pose_record(hand),
                 "pixels": rounded(hand.keypoints, 5),
                 "visible": hand.visible,
                 "box": rounded(hand.box, 3),
@@ -146,7 +147,7 @@ def frame_record(frame: RenderedFrame) -> dict[str, Any]:
     }
 
 
-def _truth(hand: HandTruth) -> dict[str, Any]:
+def _pose_record(hand: HandTruth) -> dict[str, Any]:
     return {
         "keypoints": rounded(hand.keypoints_world, 9),
         "qpos": hand.qpos.tolist(),
@@ -189,7 +190,7 @@ def umetrack_hand(shape: HandShape) -> dict[str, Any]:
 
 
 class WebdatasetWriter:
-    """`shard-00000.tar`: clips as UmeTrack and HOT3D have them, a sample a time, a stream a camera."""
+    """Writes `shard-00000.tar`: clips as UmeTrack and HOT3D have them, with a stream for each camera."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -205,7 +206,7 @@ class WebdatasetWriter:
 
     def write(self, shard: int, frames: Iterable[RenderedFrame]) -> None:
         """Write a shard, or write it anew; frames of one number follow one another."""
-        persons, numbers = dict[str, HandShape](), set[int]()
+        shapes, numbers = dict[str, HandShape](), set[int]()
         (path,) = self.files(shard).values()
         with one_sentence(self.folder, f"writing shard {shard}"), new_tar(path) as add:
             for number, group in itertools.groupby(frames, key=lambda frame: frame.number):
@@ -217,9 +218,9 @@ class WebdatasetWriter:
                     add(f"{number:06d}.{name}", content)
                 for hand in views[0].hands:
                     shape = dataclasses.asdict(hand.shape) | {"side": None}
-                    persons.setdefault(to_json(shape), hand.shape)
-            if len(persons) == 1:  # a clip has room for one person
-                record = {"mano": [], "umetrack": umetrack_hand(*persons.values())}
+                    shapes.setdefault(to_json(shape), hand.shape)
+            if len(shapes) == 1:  # a clip has room for one person
+                record = {"mano": [], "umetrack": umetrack_hand(*shapes.values())}
                 add(HAND_SHAPES, to_json(record).encode())
 
     def finish(self) -> list[Path]:
@@ -228,10 +229,10 @@ class WebdatasetWriter:
 
 
 def _sample(views: list[RenderedFrame]) -> Iterator[tuple[str, bytes]]:
-    """Files of one time: the ends of their names, and their bytes."""
+    """Yield the files of one time: the ends of their names, and their bytes."""
     names = [view.camera.name for view in views]
     for name in names:
-        if not _STREAM.fullmatch(name):
+        if not _STREAM_NAME.fullmatch(name):
             raise HandSimError(f"camera '{name}': a stream's name has letters, digits, - and _ only")
     if len(set(names)) < len(names):
         raise HandSimError(f"frame {views[0].number} has two pictures of one camera: {', '.join(names)}")
@@ -240,7 +241,7 @@ def _sample(views: list[RenderedFrame]) -> Iterator[tuple[str, bytes]]:
             kind, _, ending = suffix.rpartition(".")
             yield f"{kind.strip('.') or 'image'}_{view.camera.name}.{ending}", content
     first = views[0]
-    device = first.camera.T_world_camera  # the first camera is the device
+    device = first.camera.T_world_camera  # poses are relative to a device, which is the first camera here
     records = {
         "cameras": {view.camera.name: camera_record(view.camera, device) for view in views},
         "hands": hands_record(views),
@@ -276,17 +277,17 @@ def crop_camera(camera: Camera, keypoints: Doubles) -> tuple[Doubles, float] | N
     """
     local = camera.local(keypoints)
     target = local.mean(axis=0)
-    if target[2] < _NEAREST:
+    if target[2] < _NEAREST_KEYPOINT:
         return None
-    for _ in range(_ROUNDS + 1):
+    for _ in range(_CROP_ROUNDS + 1):
         rotation = frame_with_z(target, down=np.array([0.0, 1.0, 0.0]))
         rotated = local @ rotation
-        if rotated[:, 2].min() < _NEAREST:
+        if rotated[:, 2].min() < _NEAREST_KEYPOINT:
             return None
         flat = rotated[:, :2] / rotated[:, 2:]
         target = rotation @ np.append((flat.min(axis=0) + flat.max(axis=0)) / 2.0, 1.0)
-    angle = 2.0 * float(np.arctan(float(np.abs(flat).max()) / _FILLED))
-    if angle > _WIDEST:
+    angle = 2.0 * float(np.arctan(float(np.abs(flat).max()) / _FILLED_SHARE))
+    if angle > _WIDEST_CROP:
         return None
     T_world_crop: Doubles = camera.T_world_camera.copy()
     T_world_crop[:3, :3] = T_world_crop[:3, :3] @ rotation

@@ -37,8 +37,10 @@ from render.frames import RenderedFrame
 
 CONFIG: Final = "render.json"
 """Settings of a rendering, in its folder."""
-_LARGEST: Final = 1 << 30  # largest file of a picture [bytes]
-_SAMPLE: Final = re.compile(r"(\d+)(\..+)")
+WITH_COLORS: Final = ("coco", "yolo")
+"""Formats that need color pictures."""
+_MOST_BYTES: Final = 1 << 30  # size of the largest file of a picture
+_SAMPLE_NAME: Final = re.compile(r"(\d+)(\..+)")
 
 
 class PngWriter(FolderWriter):
@@ -79,8 +81,6 @@ _WRITERS: Final[dict[str, Callable[[Path], FrameWriter]]] = {
     "png": PngWriter,
 }
 FORMATS: Final = tuple(_WRITERS)
-WITH_COLORS: Final = ("coco", "yolo")
-"""Formats that need color pictures."""
 
 
 def open_writer(name: str, folder: str | Path) -> FrameWriter:
@@ -90,12 +90,12 @@ def open_writer(name: str, folder: str | Path) -> FrameWriter:
 
 
 def open_writers(folder: Path, formats: Sequence[str]) -> list[FrameWriter]:
-    """The writers of a rendering's formats, each of several into a folder of its own."""
+    """The writers of a rendering's formats; if there are several, each writes into a folder of its own."""
     return [open_writer(name, folder if len(formats) == 1 else folder / name) for name in formats]
 
 
 def shard_files(folder: Path, formats: Sequence[str], shard: int) -> dict[str, Path]:
-    """The files of a shard in all formats of a rendering by their names in its folder."""
+    """The files of a shard in all formats of a rendering, by their names relative to its folder."""
     return {
         (writer.folder / name).relative_to(folder).as_posix(): path
         for writer in open_writers(folder, formats)
@@ -140,7 +140,7 @@ def merge_renderings(folders: Sequence[str | Path], out: str | Path) -> int:
     """
     check_type("folders", folders, (list, tuple), "paths of folders")
     parts, out = [Path(folder) for folder in folders], Path(out)
-    settings = [_settings(folder) for folder in parts]
+    settings = [_read_settings(folder) for folder in parts]
     formats = settings[0]["formats"]
     for folder, one in zip(parts, settings, strict=True):
         if one["formats"] != formats:
@@ -179,7 +179,7 @@ def merge_renderings(folders: Sequence[str | Path], out: str | Path) -> int:
     return count
 
 
-def _settings(folder: Path) -> dict[str, Any]:
+def _read_settings(folder: Path) -> dict[str, Any]:
     if not (folder / CONFIG).is_file():
         raise HandSimError(f"{folder} holds no {CONFIG}, expected a folder that handsim render wrote")
     settings = load_json(folder / CONFIG)
@@ -202,28 +202,29 @@ def _merge_format(
                 if isinstance(source, FolderWriter) and isinstance(target, FolderWriter):
                     _copy_folder(source, shard, target, number, offset)
                 else:
-                    (start,), (end,) = source.files(shard).values(), target.files(number).values()
-                    _copy_tar(start, end, offset)
+                    (tar,), (copy,) = source.files(shard).values(), target.files(number).values()
+                    _copy_tar(tar, copy, offset)
             number += 1
         offset += count
 
 
-def _copy_tar(start: Path, end: Path, offset: int) -> None:
+def _copy_tar(tar: Path, copy: Path, offset: int) -> None:
+    """Copy a shard's tar; its frames' numbers grow by an offset."""
     try:
-        with tarfile.open(start, "r:") as source, new_tar(end) as add:
+        with tarfile.open(tar, "r:") as source, new_tar(copy) as add:
             for entry in source:
-                file = source.extractfile(entry) if entry.isfile() and entry.size <= _LARGEST else None
+                file = source.extractfile(entry) if entry.isfile() and entry.size <= _MOST_BYTES else None
                 if file is None:
-                    raise DatasetError(f"{start}: '{entry.name}' is not a file that handsim render writes")
+                    raise DatasetError(f"{tar}: '{entry.name}' is not a file that handsim render writes")
                 add(*_renumbered(entry.name, file.read(), offset))
     except (tarfile.TarError, ValueError, KeyError, TypeError, EOFError) as error:
-        raise DatasetError(f"{start}: a damaged tar; delete it and render again") from error
+        raise DatasetError(f"{tar}: a damaged tar; delete it and render again") from error
 
 
 def _renumbered(name: str, content: bytes, offset: int) -> tuple[str, bytes]:
-    """A file of a tar with its frame's number plus an offset."""
-    sample = _SAMPLE.fullmatch(name)
-    if sample is None:  # it is the file of hand shapes
+    """Name and content of a file in a tar, after the offset is added to its frame's number."""
+    sample = _SAMPLE_NAME.fullmatch(name)
+    if sample is None:  # the file of hand shapes belongs to no frame
         return name, content
     if sample[2] == ".info.json":
         info = json.loads(content)
@@ -233,10 +234,10 @@ def _renumbered(name: str, content: bytes, offset: int) -> tuple[str, bytes]:
 
 def _copy_folder(source: FolderWriter, shard: int, target: FolderWriter, number: int, offset: int) -> None:
     """Copy a shard of a format with folders; its frames' numbers grow by an offset."""
-    start, places = source.pictures / shard_name(shard), source.beside(shard)
+    pictures, folders_beside = source.pictures / shard_name(shard), source.beside(shard)
     records = []
     with target.new_shard(number) as temporary:
-        for record, files in _keyed(start, places):
+        for record, files in _records_with_files(pictures, folders_beside):
             image = record.get("image", record)  # some formats have the frame's number in a record `image`
             field = "frame" if "image" in record else "number"
             frame = int(image[field]) + offset
@@ -262,18 +263,18 @@ def _copy_folder(source: FolderWriter, shard: int, target: FolderWriter, number:
         save_index(temporary, records)
 
 
-def _keyed(
-    start: Path, places: Mapping[str, Path]
+def _records_with_files(
+    pictures: Path, folders_beside: Mapping[str, Path]
 ) -> Iterator[tuple[dict[str, Any], dict[tuple[str, str], Path]]]:
     """Records of a shard, and the files of each by folder and ending."""
     files: dict[str, dict[tuple[str, str], Path]] = {}
-    for kind, place in {"": start, **places}.items():
-        for path in sorted(place.iterdir()) if place.is_dir() else ():
+    for kind, folder in {"": pictures, **folders_beside}.items():
+        for path in sorted(folder.iterdir()) if folder.is_dir() else ():
             if path.is_file() and path.name != INDEX:
                 files.setdefault(path.stem, {})[kind, path.suffix] = path
-    for record in load_index(start):
+    for record in load_index(pictures):
         try:
             key = Path(record["image"]["file_name"]).stem if "image" in record else str(record["key"])
             yield record, files[key]
         except (KeyError, TypeError, ValueError) as error:
-            raise DatasetError(f"{start}: its index does not fit its files; render it again") from error
+            raise DatasetError(f"{pictures}: its index does not fit its files; render it again") from error

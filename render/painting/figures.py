@@ -30,11 +30,11 @@ if TYPE_CHECKING:
 MARKER_COLOR: Final = (0.98, 0.98, 1.0)
 SCATTER: Final = (0.30, 0.13, 0.08)
 """Scatter of skin; red light travels farthest (Jensen et al. 2001: free paths of 3.7, 1.4 and 0.7 mm)."""
-_FOLDS: Final = 0.85  # strength of ambient shade; below 1, because lamps light folds in part
-_BASE: Final = (0.85, 0.4)  # radius of a marker's base on the glove and in the marker [marker radii]
+_FOLD_SHADE: Final = 0.85  # strength of ambient shade in folds; below 1, because lamps light them in part
+_BASE_RADII: Final = (0.85, 0.4)  # radius of a marker's base on the glove and in the marker [marker radii]
 _BASE_SIDES: Final = 12
-_EDGE: Final = np.deg2rad(60.0)  # [rad] An edge is drawn sharp where two faces meet at a larger angle.
-_BODY_BALLS: Final = 0.0032  # [m] radius of the markers of rigid bodies, 6.4 mm in diameter (Han et al. 2018)
+_SHARP_EDGE: Final = np.deg2rad(60.0)  # least angle between two faces whose edge is drawn sharp [rad]
+_BODY_MARKER_RADIUS: Final = 0.0032  # radius of the markers of rigid bodies (Han et al. 2018) [m]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,12 +59,12 @@ def linear(color: Float[np.ndarray, "*batch 3"] | tuple[float, float, float]) ->
 
 @functools.cache
 def ball_material() -> Material:
-    """Markers, colored by vertex; they glow a little, to stay visible in shadows."""
+    """The material of markers, which have colors by vertex and glow a little, to stay visible in shadows."""
     return Material(np.ones(3), 0.45, glow=0.2)
 
 
 def skin_material(texture: SkinTexture) -> Material:
-    """Painted skin, for meshes with `DrawnSkin.uv`."""
+    """The material of painted skin, for meshes with `DrawnSkin.uv`."""
     nothing = np.zeros_like(texture.roughness)
     texels = np.dstack([texture.color, texture.roughness, texture.normals, nothing])
     return Material(np.ones(3), 1.0, scatter=np.array(SCATTER), texels=texels)
@@ -73,7 +73,7 @@ def skin_material(texture: SkinTexture) -> Material:
 def shade_colors(shade: Float32[np.ndarray, "D"]) -> Float32[np.ndarray, "D 4"]:
     """Vertex colors for `DrawnSkin.shade`: red light passes through flesh into the folds."""
     colors = np.ones((len(shade), 4), dtype=np.float32)
-    lit = 1.0 - _FOLDS * (1.0 - shade)
+    lit = 1.0 - _FOLD_SHADE * (1.0 - shade)
     for channel, power in enumerate((0.8, 1.0, 1.05)):
         colors[:, channel] = cv2.pow(lit, power).reshape(-1)
     return colors
@@ -82,11 +82,11 @@ def shade_colors(shade: Float32[np.ndarray, "D"]) -> Float32[np.ndarray, "D 4"]:
 def sphere_surface(
     centers: Float[np.ndarray, "N 3"], radius: float, *, level: int
 ) -> tuple[Doubles, Doubles, Integers]:
-    """Vertices [m], normals and faces of balls, one after the other; each ball has the same number."""
+    """Vertices [m], normals and faces of balls, ball after ball, the same number for each."""
     ball = _unit_ball(level)
-    count, each = len(centers), len(ball.vertices)
+    count, stride = len(centers), len(ball.vertices)
     vertices = (centers[:, None] + radius * ball.vertices).reshape(-1, 3)
-    faces = (ball.faces + each * np.arange(count)[:, None, None]).reshape(-1, 3)
+    faces = (ball.faces + stride * np.arange(count)[:, None, None]).reshape(-1, 3)
     return vertices, np.tile(ball.vertices, (count, 1)), faces
 
 
@@ -140,8 +140,8 @@ class HandFigure:
 
     def __init__(self, fit: GloveFit, look: Appearance, *, first_marker: int) -> None:
         self.fit, self.look = fit, look
-        bony = look.skin.relief if look.glove is None else 0.0  # cloth hides bones
-        self.skin = PosableSkin(fit.model, look.forearm, bony)
+        bone_relief = look.skin.relief if look.glove is None else 0.0  # cloth hides bones
+        self.skin = PosableSkin(fit.model, look.forearm, bone_relief)
         self._material = functools.cache(self._paint)
         self._marker_bones = bones = fit.attachment.main_bones
         self._marker_numbers = (1 + first_marker + np.arange(len(bones))).astype(np.uint8)
@@ -158,7 +158,7 @@ class HandFigure:
         forearm: Float[np.ndarray, "3"] | None = None,
         others: Sequence[tuple[Doubles, Doubles]] = (),
     ) -> list[Drawn]:
-        """Skin, and markers on their bases where a glove is worn, beside the flesh of others."""
+        """Surfaces of the skin, which the flesh of `others` shades, and of a glove's markers and bases."""
         skin, first_part = self.skin.posed(qpos, upper_arm, forearm, others), 1 + PARTS_A_HAND * number
         count = len(skin.faces)
         triangles = Triangles(
@@ -192,47 +192,47 @@ class BodyFigure:
     """One rigid body to draw."""
 
     def __init__(self, body: RigidBody, color: tuple[float, float, float]) -> None:
-        self._thing = body.shape
-        self._markers = body.positions if self._thing is None else self._thing.markers
-        self._material = functools.cache(lambda: Material(linear(color), 0.5))  # such as plastic
-        if self._thing is not None:
+        self._object = body.shape
+        self._markers = body.positions if self._object is None else self._object.markers
+        self._material = functools.cache(lambda: Material(linear(color), 0.5))  # looks like plastic
+        if self._object is not None:
             import trimesh
 
-            vertices, faces = self._thing.vertices, self._thing.faces
+            vertices, faces = self._object.vertices, self._object.faces
             solid = trimesh.Trimesh(vertices, faces, process=False)
-            smooth = solid.face_adjacency[solid.face_adjacency_angles < _EDGE]
+            smooth = solid.face_adjacency[solid.face_adjacency_angles < _SHARP_EDGE]
             patches = np.repeat(trimesh.graph.connected_component_labels(smooth, node_count=len(faces)), 3)
             corners, rows = np.unique(np.stack([faces.ravel(), patches]), axis=1, return_inverse=True)
             self._vertices, self._faces = vertices[corners[0]], rows.reshape(-1, 3)
             self._normals = vertex_normals(self._vertices, self._faces)
 
     def drawn(self, T_world_body: Float[np.ndarray, "4 4"], instance: int) -> list[Drawn]:
-        """Its surface, where that is known, and its markers."""
+        """Surfaces of the body, if its shape is known, and of its markers."""
         rotation, position, drawn = T_world_body[:3, :3], T_world_body[:3, 3], []
-        if self._thing is not None:
+        if self._object is not None:
             ids = [np.full(len(self._faces), number, dtype=np.uint8) for number in (0, instance, 0)]
             vertices = self._vertices @ rotation.T + position
             triangles = Triangles(vertices, self._faces, self._normals @ rotation.T, *ids)
             drawn.append(Drawn(triangles, np.ones((len(vertices), 4), np.float32), None, self._material))
         if len(self._markers):
             centers, zeros = self._markers @ rotation.T + position, np.zeros(len(self._markers), np.uint8)
-            drawn.append(_drawn_balls(centers, _BODY_BALLS, zeros, zeros + np.uint8(instance), zeros))
+            drawn.append(_drawn_balls(centers, _BODY_MARKER_RADIUS, zeros, zeros + np.uint8(instance), zeros))
         return drawn
 
 
 def _drawn_bases(feet: Doubles, tops: Doubles, axes: Doubles, radius: float, *ids: Bytes) -> Drawn:
-    """Cones from the skin into markers of this radius, with a part, an instance and a marker (N,) each."""
-    turns = np.arange(_BASE_SIDES) * (2.0 * np.pi / _BASE_SIDES)
+    """Surface of cones from the skin into markers, with a part, an instance and a marker (N,) for each."""
+    angles = np.arange(_BASE_SIDES) * (2.0 * np.pi / _BASE_SIDES)
     aside = np.cross(axes, np.eye(3)[np.abs(axes).argmin(axis=1)])
     aside /= np.linalg.norm(aside, axis=1, keepdims=True)
-    around = np.cos(turns)[:, None] * aside[:, None] + np.sin(turns)[:, None] * np.cross(axes, aside)[:, None]
-    ends = zip((feet, tops), _BASE, strict=True)
+    other = np.cross(axes, aside)
+    around = np.cos(angles)[:, None] * aside[:, None] + np.sin(angles)[:, None] * other[:, None]
+    ends = zip((feet, tops), _BASE_RADII, strict=True)
     vertices = np.stack([end[:, None] + wide * radius * around for end, wide in ends], axis=1)
     low = np.arange(_BASE_SIDES)
-    high, on = low + _BASE_SIDES, np.roll(low, -1)
-    sides = np.concatenate(
-        [np.stack([low, on, high], axis=1), np.stack([on, on + _BASE_SIDES, high], axis=1)]
-    )
+    high, following = low + _BASE_SIDES, np.roll(low, -1)
+    halves = (low, following, high), (following, following + _BASE_SIDES, high)
+    sides = np.concatenate([np.stack(half, axis=1) for half in halves])
     faces = (sides + 2 * _BASE_SIDES * np.arange(len(feet))[:, None, None]).reshape(-1, 3)
     normals = np.repeat(around[:, None], 2, axis=1).reshape(-1, 3)
     triangles = Triangles(
@@ -247,9 +247,9 @@ def _base_material() -> Material:
 
 
 def _drawn_balls(centers: Doubles, radius: float, *ids: Bytes) -> Drawn:
-    """Balls with a part, an instance and a marker (N,) each."""
+    """Surface of balls, with a part, an instance and a marker (N,) for each."""
     vertices, normals, faces = sphere_surface(centers, radius, level=2)
-    each = len(faces) // len(centers)
-    triangles = Triangles(vertices, faces, normals, *(np.repeat(one, each) for one in ids))
+    faces_per_ball = len(faces) // len(centers)
+    triangles = Triangles(vertices, faces, normals, *(np.repeat(one, faces_per_ball) for one in ids))
     colors = np.tile(np.array([*linear(MARKER_COLOR), 1.0], np.float32), (len(vertices), 1))
     return Drawn(triangles, colors, None, ball_material)

@@ -1,4 +1,4 @@
-"""Colors by OpenGL through pyrender and EGL, with one off-screen renderer per process."""
+"""Paints colors with OpenGL through pyrender and EGL, with one off-screen renderer per process."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ if TYPE_CHECKING:
     from render.painting.figures import Drawn, Material
     from render.scenery.lights import Lighting
 
-_BROKEN_PYRENDER = "0.1.45"  # cannot draw beside NumPy 2 on Python 3.12 and later
-_DEVICES: Final = ("dri/renderD*", "nvidia[0-9]*", "dxg")  # files of Mesa's, NVIDIA's and WSL's devices
-_SOFTWARE: Final = ("llvmpipe", "softpipe", "swrast", "software", "swiftshader")
-_NAME_OF_RENDERER: Final = (
+_BROKEN_PYRENDER: Final = "0.1.45"  # version that cannot draw beside NumPy 2 on Python 3.12 and later
+_DEVICE_FILES: Final = ("dri/renderD*", "nvidia[0-9]*", "dxg")  # files of Mesa's, NVIDIA's and WSL's devices
+_SOFTWARE_RENDERERS: Final = ("llvmpipe", "softpipe", "swrast", "software", "swiftshader")
+_RENDERER_PROGRAM: Final = (
     "from render.painting.opengl import offscreen_renderer\n"
     "offscreen_renderer(16, 16)\n"
     "from OpenGL.GL import GL_RENDERER, glGetString\n"
@@ -35,7 +35,7 @@ OPENGL_FROM_OPENCV: Final = np.diag([1.0, -1.0, -1.0, 1.0])
 """Turns a camera's axes: OpenCV's x right, y down, z ahead into OpenGL's x right, y up, z back."""
 _NEAR, _FAR = 0.01, 30.0  # least and largest depth that is drawn [m]
 _GL_LINEAR: Final = 0x2601
-_DISTANCE: Final = 300.0  # [m], so far that a lamp's rays are as good as parallel
+_LAMP_DISTANCE: Final = 300.0  # distance at which a lamp's rays are nearly parallel [m]
 _SHADOW_DEPTH: Final = 60.0  # depth of the camera that sees the shadows [scene diagonals]
 
 
@@ -49,7 +49,7 @@ def load_pyrender() -> Any:
             f"drawing needs pyrender, and {error}; run `pip install pyrender-maintained`"
         ) from error
     except Exception as error:  # PyOpenGL raises errors of many types
-        raise _no_driver(error) from error
+        raise _driver_error(error) from error
     if pyrender.__version__ == _BROKEN_PYRENDER:
         raise HandSimError(
             f"pyrender {_BROKEN_PYRENDER} cannot draw beside today's NumPy; run "
@@ -59,27 +59,27 @@ def load_pyrender() -> Any:
 
 
 def offscreen_renderer(width: int, height: int) -> Any:
-    """This process's renderer, set to a picture size [px].
+    """The renderer of this process, set to a picture's size [px].
 
-    EGL contexts fail when they are made again and again, so there is one, kept until the process ends.
+    There is one, kept until the process ends, because EGL contexts that are made again and again fail.
     """
     if not (1 <= width <= 8192 and 1 <= height <= 8192):
         raise HandSimError(f"picture size is {width} x {height}, expected 1 to 8192 pixels each way")
-    renderer = _renderer_of(os.getpid())  # a context does not survive a fork
+    renderer = _renderer_of_process(os.getpid())  # a context does not survive a fork
     renderer.viewport_width, renderer.viewport_height = width, height
     return renderer
 
 
 @functools.cache
-def _renderer_of(_process: int) -> Any:
+def _renderer_of_process(_process: int) -> Any:
     pyrender = load_pyrender()
     try:
         return pyrender.OffscreenRenderer(64, 64)
     except Exception as error:  # PyOpenGL raises errors of many types
-        raise _no_driver(error) from error
+        raise _driver_error(error) from error
 
 
-def _no_driver(error: Exception) -> HandSimError:
+def _driver_error(error: Exception) -> HandSimError:
     reason = " ".join(str(error).split())[:120] or type(error).__name__
     platform = os.environ["PYOPENGL_PLATFORM"]
     return HandSimError(
@@ -104,19 +104,19 @@ def opengl_has_hardware() -> bool:
 def is_hardware(renderer: str) -> bool:
     """Whether a string of `GL_RENDERER` names hardware; an empty one does not."""
     name = renderer.lower()
-    return bool(name) and not any(software in name for software in _SOFTWARE)
+    return bool(name) and not any(software in name for software in _SOFTWARE_RENDERERS)
 
 
 def _some_hardware_device() -> bool:
     """Whether Linux lists a graphics device, or the user asks for another platform than EGL."""
-    asked = os.environ.get("PYOPENGL_PLATFORM", "egl") != "egl"
-    return asked or any(path for pattern in _DEVICES for path in Path("/dev").glob(pattern))
+    other_platform = os.environ.get("PYOPENGL_PLATFORM", "egl") != "egl"
+    return other_platform or any(path for pattern in _DEVICE_FILES for path in Path("/dev").glob(pattern))
 
 
 def _renderer_name() -> str:
     """`GL_RENDERER` of a new process, empty where OpenGL does not start."""
     done = subprocess.run(
-        [sys.executable, "-c", _NAME_OF_RENDERER],
+        [sys.executable, "-c", _RENDERER_PROGRAM],
         capture_output=True,
         text=True,
         # A first start of pyrender from a slow disk takes some seconds.
@@ -128,7 +128,7 @@ def _renderer_name() -> str:
 
 
 def paint_opengl(camera: Camera, drawn: Sequence[Drawn], lighting: Lighting) -> UInt8[np.ndarray, "H W 4"]:
-    """See `render.painting.painter.paint`."""
+    """Paint surfaces as `render.painting.painter.paint` does."""
     pyrender = load_pyrender()
     renderer = offscreen_renderer(*camera.size)
     scene = pyrender.Scene(bg_color=[0.0, 0.0, 0.0, 0.0])
@@ -157,7 +157,7 @@ def pyrender_material(material: Material) -> Any:
         # No smaller copies of the texture: they would mix tiles that are no neighbors on the hand.
         sampler = pyrender.Sampler(magFilter=_GL_LINEAR, minFilter=_GL_LINEAR)
         rough = np.zeros((*material.texels.shape[:2], 3), dtype=np.uint8)
-        rough[..., 0] = material.texels[..., 3]  # its shader reads roughness from red and metal from green
+        rough[..., 0] = material.texels[..., 3]  # the shader reads roughness from red, metal from green
         sources = {
             "baseColorTexture": np.ascontiguousarray(material.texels[..., :3]),
             "normalTexture": np.ascontiguousarray(material.texels[..., 4:7]),
@@ -171,7 +171,7 @@ def pyrender_material(material: Material) -> Any:
         baseColorFactor=[*material.color, 1.0],
         metallicFactor=0.0,
         roughnessFactor=material.roughness,
-        emissiveFactor=np.sqrt(material.glow * material.color),  # its shader squares it
+        emissiveFactor=np.sqrt(material.glow * material.color),  # pyrender's shader squares it
         **textures,
     )
 
@@ -188,8 +188,8 @@ def add_lights(pyrender: Any, scene: Any, lighting: Lighting) -> None:
             light = pyrender.DirectionalLight(color=color, intensity=intensity)
             _cast_shadows(pyrender, light, float(scene.scale))
         else:
-            pose[:3, 3] = scene.centroid + towards * _DISTANCE
-            light = pyrender.PointLight(color=color, intensity=intensity * _DISTANCE**2)
+            pose[:3, 3] = scene.centroid + towards * _LAMP_DISTANCE
+            light = pyrender.PointLight(color=color, intensity=intensity * _LAMP_DISTANCE**2)
         scene.add(light, pose=pose)
 
 

@@ -18,7 +18,7 @@ from jaxtyping import Float
 
 from handsim._checks import check_count, check_type
 from handsim.files.outputs import atomic_write, check_ending
-from render.frames import Doubles, Integers
+from render.frames import Doubles, Integers, triple
 from render.photographs import MAP_SUFFIXES
 from render.scenery.backgrounds import (
     LUMINANCE,
@@ -33,15 +33,15 @@ from render.scenery.backgrounds import (
 
 _SIZE: Final = (64, 48)  # size of the picture that gives light [px]
 _DIRECTIONS: Final = 1024  # directions in which the picture's light is sampled
-_SHARE: Final = (0.1, 0.5)  # range of the share of ambient light that has the picture's colors
-_LEVEL: Final = 1.44  # usual light of a white surface before all lamps, 1 for the picture's full white
+_PICTURE_SHARE: Final = (0.1, 0.5)  # range of the share of ambient light that has the picture's colors
+_USUAL_LIGHT: Final = 1.44  # usual light of a white surface before all lamps, 1 for the picture's full white
 _MAP_SIZE: Final = (1024, 512)  # size of a written map [px]
-_LOBE: Final = 300.0  # sharpness of a lamp in it, a spot with a standard deviation of 3.3 degrees
-_AHEAD: Final = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # axes of who looks along y
-_BRIGHT: Final = 3.0  # ratio to the mean luminance from which on light of a map is a lamp's
-# For each function of `_sphere`, how much of it a matt surface keeps, and the integral of its square.
-_MATT: Final = np.array([1.0, *[2.0 / 3.0] * 3, *[0.25] * 5])
-_SQUARES: Final = np.pi * np.array([4.0, *[4.0 / 3.0] * 3, *[4.0 / 15.0] * 3, 16.0 / 15.0, 16.0 / 5.0])
+_LAMP_SHARPNESS: Final = 300.0  # sharpness of a lamp in it, a spot with a standard deviation of 3.3 degrees
+_ALONG_Y: Final = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # axes of a viewer along y
+_LAMP_RATIO: Final = 3.0  # ratio to the mean luminance from which on light of a map is a lamp's
+# For each function of `_sphere`, the share that a matt surface keeps, and the integral of its square.
+_MATT_SHARES: Final = np.array([1.0, *[2.0 / 3.0] * 3, *[0.25] * 5])
+_SQUARE_NORMS: Final = np.pi * np.array([4.0, *[4.0 / 3.0] * 3, *[4.0 / 15.0] * 3, 16.0 / 15.0, 16.0 / 5.0])
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,10 +67,10 @@ class Lighting:
     def turned(self, rotation: Float[np.ndarray, "3 3"]) -> Lighting:
         """This light seen from other axes, to which the rotation turns vectors."""
         lamps = (
-            dataclasses.replace(lamp, direction=_triple(rotation @ lamp.direction)) for lamp in self.lamps
+            dataclasses.replace(lamp, direction=triple(rotation @ lamp.direction)) for lamp in self.lamps
         )
         rows = turned_irradiance(np.reshape(self.surroundings, (-1, 3)), rotation)
-        return Lighting(tuple(lamps), self.ambient, tuple(map(_triple, rows)))
+        return Lighting(tuple(lamps), self.ambient, tuple(map(triple, rows)))
 
 
 STUDIO: Final = Lighting(
@@ -87,7 +87,7 @@ STUDIO: Final = Lighting(
 def sample_lighting(*, rng: np.random.Generator) -> Lighting:
     """Random light: a key lamp from in front or above, fill, sky and ground, each with its color."""
     # At this level the back of a hand has the brightness of its own color in the median of views.
-    exposure = _LEVEL * float(np.exp(np.clip(rng.normal(0.0, 0.18), -0.4, 0.4)))
+    exposure = _USUAL_LIGHT * float(np.exp(np.clip(rng.normal(0.0, 0.18), -0.4, 0.4)))
     warmth = rng.normal(0.0, 0.06)  # lamps are warm or cold, and white balances keep some of it
     # These shares give an open palm the standard deviation of lightness that photographs have, 3.6.
     key_share, ambient_share = rng.uniform(0.5, 0.8), rng.uniform(0.09, 0.19)
@@ -101,23 +101,18 @@ def sample_lighting(*, rng: np.random.Generator) -> Lighting:
     lamps = []
     for number, (direction, share) in enumerate(zip((key, fill, sky, ground), shares, strict=True)):
         own = rng.normal(0.0, 0.03 if number == 0 else 0.08)
-        lamps.append(Lamp(_triple(direction), float(exposure * share), _tint(warmth + own, rng)))
+        lamps.append(Lamp(triple(direction), float(exposure * share), _tint(warmth + own, rng)))
     # Lamps in rooms are wide and their shadows faint: part of the key light comes without any.
     hard, key_lamp = rng.uniform(0.25, 0.75), lamps[0]
     lamps[0] = dataclasses.replace(key_lamp, strength=hard * key_lamp.strength)
     lamps.append(dataclasses.replace(key_lamp, strength=(1.0 - hard) * key_lamp.strength))
     ambient = exposure * ambient_share * np.array(_tint(warmth + rng.normal(0.0, 0.06), rng))
-    return Lighting(tuple(lamps), _triple(ambient))
+    return Lighting(tuple(lamps), triple(ambient))
 
 
 def _tint(warmth: float, rng: np.random.Generator) -> tuple[float, float, float]:
     """A lamp's color after white balance: warm or cool, and a little green or magenta."""
-    return _triple(np.exp([warmth, rng.normal(0.0, 0.015), -1.2 * warmth]))
-
-
-def _triple(values: Doubles) -> tuple[float, float, float]:
-    first, second, third = values
-    return float(first), float(second), float(third)
+    return triple(np.exp([warmth, rng.normal(0.0, 0.015), -1.2 * warmth]))
 
 
 def sample_surroundings(
@@ -134,7 +129,7 @@ def sample_surroundings(
     which is painted once if `size` is that of the camera's [px].
     """
     background, lighting = sample_background(config, rng=rng), sample_lighting(rng=rng).turned(viewer)
-    share = float(rng.uniform(*_SHARE))
+    share = float(rng.uniform(*_PICTURE_SHARE))
     if background.is_map:
         enclosure = enclose(np.zeros((1, 3)) if around is None else around, background.seed, viewer[:, 2])
         return background, _light_of_map(light_in(background, enclosure, _sphere()[0])), enclosure
@@ -143,7 +138,7 @@ def sample_surroundings(
         return background, surround(lighting, turned_irradiance(irradiance(picture), viewer), share), None
     enclosure = enclose(around, background.seed, np.array(lighting.lamps[0].direction))
     light = light_in(background, enclosure, _sphere()[0])
-    return background, surround(lighting, _projected(light), share), enclosure
+    return background, surround(lighting, _to_irradiance(light), share), enclosure
 
 
 def write_environment_map(file: str | Path, *, seed: int = 0) -> None:
@@ -160,7 +155,8 @@ def write_environment_map(file: str | Path, *, seed: int = 0) -> None:
     check_count("seed", seed, 0)
     check_ending(Path(file), MAP_SUFFIXES[0], option="file")
     rng, here = np.random.default_rng(seed), np.zeros((1, 3))
-    background, lighting, room = sample_surroundings(Backgrounds({"room": 1.0}), _AHEAD, around=here, rng=rng)
+    room_config = Backgrounds({"room": 1.0})
+    background, lighting, room = sample_surroundings(room_config, _ALONG_Y, around=here, rng=rng)
     assert room is not None
     (width, height), sides = _MAP_SIZE, [np.pi * (np.arange(side) + 0.5) / side for side in _MAP_SIZE]
     azimuth, polar = np.pi - 2.0 * sides[0], sides[1][:, None]
@@ -169,7 +165,8 @@ def write_environment_map(file: str | Path, *, seed: int = 0) -> None:
     light = light_in(background, room, rays)
     for lamp in lighting.lamps:
         beside = rays @ np.array(lamp.direction) / np.linalg.norm(lamp.direction) - 1.0
-        light = light + 0.5 * _LOBE * lamp.strength * np.exp(_LOBE * beside)[:, None] * lamp.color
+        spot = np.exp(_LAMP_SHARPNESS * beside)[:, None]
+        light = light + 0.5 * _LAMP_SHARPNESS * lamp.strength * spot * lamp.color
     written = light.reshape(height, width, 3)[..., ::-1].astype(np.float32)
     with atomic_write(file) as temporary:
         temporary.write_bytes(cv2.imencode(MAP_SUFFIXES[0], written)[1].tobytes())
@@ -178,12 +175,12 @@ def write_environment_map(file: str | Path, *, seed: int = 0) -> None:
 def _light_of_map(light: Doubles) -> Lighting:
     """A lamp where the light (D, 3) from the directions of `_sphere` is strongest, and ambient light."""
     luminance = np.maximum(light @ LUMINANCE, 1e-6)
-    beyond = light * np.maximum(1.0 - _BRIGHT * luminance.mean() / luminance, 0.0)[:, None]
+    beyond = light * np.maximum(1.0 - _LAMP_RATIO * luminance.mean() / luminance, 0.0)[:, None]
     lamp = 4.0 / len(light) * beyond.sum(axis=0) + 1e-6  # what a white surface that faces it reflects
-    rows = _projected(light - beyond)
+    rows = _to_irradiance(light - beyond)
     towards = (beyond @ LUMINANCE) @ _sphere()[0] + [0.0, 0.0, 1e-6]
-    key = Lamp(_triple(towards), float(lamp.mean()), _triple(lamp / lamp.mean()))
-    return Lighting((key,), _triple(rows[0]), tuple(map(_triple, rows)))
+    key = Lamp(triple(towards), float(lamp.mean()), triple(lamp / lamp.mean()))
+    return Lighting((key,), triple(rows[0]), tuple(map(triple, rows)))
 
 
 def surround(lighting: Lighting, rows: Float[np.ndarray, "9 3"], share: float) -> Lighting:
@@ -191,7 +188,7 @@ def surround(lighting: Lighting, rows: Float[np.ndarray, "9 3"], share: float) -
     ambient = np.array(lighting.ambient)
     rows = rows * share * (ambient @ LUMINANCE) / max(float(rows[0] @ LUMINANCE), 1e-4)
     rows[0] += (1.0 - share) * ambient
-    table = tuple(map(_triple, rows))
+    table = tuple(map(triple, rows))
     return dataclasses.replace(lighting, ambient=table[0], surroundings=table)
 
 
@@ -201,13 +198,15 @@ def irradiance(picture: Float[np.ndarray, "H W 3"]) -> Float[np.ndarray, "9 3"]:
     Rows are factors of 1, x, y, z, xy, yz, xz, x^2 - y^2 and 3 z^2 - 1.
     """
     height, width = picture.shape[:2]
-    return _projected(picture.reshape(-1, 3).take(_looked_up(width, height), axis=0).astype(np.float64))
+    light = picture.reshape(-1, 3).take(_pixels_of_directions(width, height), axis=0)
+    return _to_irradiance(light.astype(np.float64))
 
 
-def _projected(light: Doubles) -> Doubles:
+def _to_irradiance(light: Doubles) -> Doubles:
     """What `irradiance` returns (9, 3), of light (D, 3) from the directions of `_sphere`."""
     functions = _sphere()[1]
-    return np.asarray((_MATT / _SQUARES)[:, None] * (functions.T @ light) * (4.0 * np.pi / len(functions)))
+    factors = (_MATT_SHARES / _SQUARE_NORMS)[:, None]
+    return np.asarray(factors * (functions.T @ light) * (4.0 * np.pi / len(functions)))
 
 
 def turned_irradiance(rows: Float[np.ndarray, "N 3"], rotation: Float[np.ndarray, "3 3"]) -> Doubles:
@@ -224,7 +223,7 @@ def turned_irradiance(rows: Float[np.ndarray, "N 3"], rotation: Float[np.ndarray
 
 
 @functools.lru_cache(maxsize=4)
-def _looked_up(width: int, height: int) -> Integers:
+def _pixels_of_directions(width: int, height: int) -> Integers:
     """Pixel of a picture for each direction of `_sphere` (D,)."""
     directions, _ = _sphere()
     away = np.arccos(np.abs(directions[:, 2])) / (np.pi / 2)

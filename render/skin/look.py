@@ -25,7 +25,7 @@ from handsim.hand.shape import HandShape
 from handsim.settings import Limits, Settings
 from handsim.space.transforms import MIRROR, cross
 from render.fields import smooth
-from render.frames import Doubles
+from render.frames import Doubles, triple
 
 TONES: Final[dict[str, tuple[float, float]]] = {
     "very light": (55.0, 64.0),
@@ -37,23 +37,23 @@ TONES: Final[dict[str, tuple[float, float]]] = {
 }
 """Individual typology angles [deg] of the classes; the outer two end at the limits of measured skin."""
 ALL_TONES: Final = (TONES["dark"][0], TONES["very light"][1])
-_ANGLES: Final = (-52.0, -30.0, 0.0, 20.0, 35.0, 50.0, 64.0)
+_TABLE_ANGLES: Final = (-52.0, -30.0, 0.0, 20.0, 35.0, 50.0, 64.0)
 _YELLOWNESS: Final = (12.0, 15.5, 18.5, 18.5, 17.5, 15.5, 12.5)  # CIELAB b* of the back of the hand
 _REDNESS: Final = (8.8, 10.5, 12.0, 11.5, 10.5, 9.5, 8.5)  # CIELAB a*
-_PLACES: Final = (0.0, 0.28, 0.62, 1.0, 1.42, 1.9, 2.6, 6.0)
+_ARM_PLACES: Final = (0.0, 0.28, 0.62, 1.0, 1.42, 1.9, 2.6, 6.0)
 """Places behind the wrist [hand lengths]; the fifth is the elbow."""
-_GIRTHS: Final = (1.92, 2.1, 2.7, 3.0, 2.85, 3.2, 3.6, 3.8)
+_ARM_GIRTHS: Final = (1.92, 2.1, 2.7, 3.0, 2.85, 3.2, 3.6, 3.8)
 """Girths of the arm at these places [hand breadths]."""
 CUFF: Final = 0.0004
 """Length of the step from an arm to its sleeve, between two rings [m]."""
-_THICK: Final = 0.0012  # thickness of a glove's hem [m]
-_HEM: Final = 0.004  # distance of this step from the next rings, so that shading does not round it [m]
-_SQUARE: Final = 0.8  # power of cosine and sine in an arm's section, which is squarer than an ellipse (1)
-_LONGER: Final = 1.04  # girth of this section over that of the ellipse with the same axes
-_BLEND: Final = 0.22  # length of the blend from the hand's section to the arm's [hand lengths]
+_HEM_THICKNESS: Final = 0.0012  # thickness of a glove's hem [m]
+_HEM_MARGIN: Final = 0.004  # distance of a hem from the next rings, so that shading does not round it [m]
+_SECTION_POWER: Final = 0.8  # power of cosine and sine in an arm's section; 1 for an ellipse
+_SECTION_GIRTH: Final = 1.04  # girth of an arm's section over that of the ellipse with the same axes
+_BLEND_LENGTH: Final = 0.22  # length of the blend from the hand's section to the arm's [hand lengths]
 BEND: Final = 0.32
 """Length of the bend of the wrist [hand lengths]."""
-ELBOW: Final = _PLACES[4]
+ELBOW: Final = _ARM_PLACES[4]
 """Place of the elbow behind the wrist [hand lengths]."""
 ELBOW_BEND: Final = 0.05
 """Length on either side of the elbow that bends with it [m]."""
@@ -154,10 +154,11 @@ def named_tones(names: Sequence[str]) -> tuple[float, ...]:
 
 
 def sample_skin_look(tones: Sequence[float] = ALL_TONES, *, rng: np.random.Generator) -> SkinLook:
-    """A random person's skin."""
+    """Draw a random person's skin."""
     angle = _draw_angle(tones, rng)
-    yellowness = float(np.interp(angle, _ANGLES, _YELLOWNESS)) * float(np.exp(rng.normal(0.0, 0.06)))
-    redness = float(np.interp(angle, _ANGLES, _REDNESS)) + float(np.clip(rng.normal(0.0, 1.0), -2.0, 2.0))
+    yellowness = float(np.interp(angle, _TABLE_ANGLES, _YELLOWNESS)) * float(np.exp(rng.normal(0.0, 0.06)))
+    redness = float(np.interp(angle, _TABLE_ANGLES, _REDNESS))
+    redness += float(np.clip(rng.normal(0.0, 1.0), -2.0, 2.0))
     lightness = 50.0 + yellowness * float(np.tan(np.deg2rad(angle)))
     # The colors of all people's palms are alike, near the color of light skin on the back of the hand.
     paleness = rng.uniform(0.52, 0.68)
@@ -176,16 +177,16 @@ def sample_skin_look(tones: Sequence[float] = ALL_TONES, *, rng: np.random.Gener
         creases=float(strengths[2]),
         veins=float(strengths[3]),
         relief=float(strengths[4]),
-        nail=(float(nail[0]), float(nail[1]), float(nail[2])),
+        nail=triple(nail),
         polish=float(polish),
-        polish_color=(float(color[0]), float(color[1]), float(color[2])),
+        polish_color=triple(color),
         roughness=float(rng.uniform(0.5, 0.68)),
         seed=int(rng.integers(2**31)),
     )
 
 
 def _draw_angle(tones: Sequence[float], rng: np.random.Generator) -> float:
-    """A typology angle [deg], uniform over all ranges."""
+    """Draw a typology angle [deg], uniformly over all ranges."""
     widths = np.diff(tones)[::2]
     ends = np.cumsum(widths)
     along = rng.uniform(0.0, ends[-1])
@@ -208,7 +209,7 @@ class Forearm:
 
 
 def sample_forearm(*, rng: np.random.Generator) -> Forearm:
-    """A random forearm: wrists within half their range, a sleeve on one in three.
+    """Draw a random forearm, its wrist bent within half the range; one in three has a sleeve.
 
     The arm reaches beyond the elbow, where `bent_rings` makes it leave the picture.
     """
@@ -216,8 +217,8 @@ def sample_forearm(*, rng: np.random.Generator) -> Forearm:
     flexion, deviation = np.clip(rng.normal(0.0, np.deg2rad((12.0, 6.0))), -0.5, 0.5)
     girth = float(np.exp(np.clip(rng.normal(0.0, 0.06), -0.15, 0.15)))
     sleeve = rng.uniform(0.035, 0.12) if rng.random() < 1 / 3 else 1.0
-    red, green, blue = np.clip(rng.uniform(0.05, 0.85) + rng.normal(0.0, 0.08, 3), 0.02, 0.95)
-    color, loose = (float(red), float(green), float(blue)), float(rng.uniform(1.1, 1.45))
+    color = triple(np.clip(rng.uniform(0.05, 0.85) + rng.normal(0.0, 0.08, 3), 0.02, 0.95))
+    loose = float(rng.uniform(1.1, 1.45))
     return Forearm(float(length), float(flexion), float(deviation), girth, float(sleeve), color, loose)
 
 
@@ -227,7 +228,7 @@ def forearm_rings(shape: HandShape, forearm: Forearm, wrist: Doubles, rings: int
     right = wrist @ mirror
     center = right.mean(axis=0)
     section = (right - center)[:, 1:]
-    lean = right[:, 0] - center[0]  # the wrist's ring is not quite planar
+    lean = right[:, 0] - center[0]  # distance of the wrist's ring from its mean plane
     behind = arm_places(forearm, rings)[1:]
     width, depth = _half_axes(shape, forearm, behind)
     extent = np.abs(section).max(axis=0)
@@ -236,12 +237,13 @@ def forearm_rings(shape: HandShape, forearm: Forearm, wrist: Doubles, rings: int
     if forearm.sleeve < forearm.length:
         loose = np.where(behind > forearm.sleeve + 0.5 * CUFF, forearm.looseness, 1.0)
         width, depth = loose * width, loose * depth
-    round_section = np.stack([width, depth], axis=-1)[:, None] * np.sign(axes_of) * np.abs(axes_of) ** _SQUARE
-    share = smooth(behind, 0.0, _BLEND * shape.length)[:, None, None]
+    half_axes = np.stack([width, depth], axis=-1)[:, None]
+    round_section = half_axes * np.sign(axes_of) * np.abs(axes_of) ** _SECTION_POWER
+    share = smooth(behind, 0.0, _BLEND_LENGTH * shape.length)[:, None, None]
     sections = (1.0 - share) * section + share * round_section
-    thick = np.where(np.abs(behind - forearm.cuff) < 0.5 * CUFF, _THICK, 0.0)[:, None, None]
+    thick = np.where(np.abs(behind - forearm.cuff) < 0.5 * CUFF, _HEM_THICKNESS, 0.0)[:, None, None]
     sections *= 1.0 + thick / np.linalg.norm(sections, axis=-1, keepdims=True)
-    axes, middles = _course(shape, forearm, behind)
+    axes, middles = _arm_course(shape, forearm, behind)
     local = np.concatenate([((1.0 - share) * lean[None, :, None]), sections], axis=-1)
     points: Doubles = center + middles[:, None] + np.einsum("kij,krj->kri", axes, local)
     return points @ mirror
@@ -254,17 +256,17 @@ def arm_places(forearm: Forearm, rings: int) -> Doubles:
     sleeve covers, and at the edge of a sleeve.
     """
     places: Doubles = forearm.length * np.linspace(0.0, 1.0, rings + 1) ** 1.7
-    covered = min(forearm.sleeve, forearm.length) - 3.0 * _HEM
+    covered = min(forearm.sleeve, forearm.length) - 3.0 * _HEM_MARGIN
     steps = [forearm.cuff] * (0.0 < forearm.cuff < covered)
     steps += [forearm.sleeve] * (forearm.sleeve < forearm.length)
     start = 0
     for step in steps:
-        edge = step + np.array([-_HEM, 0.0, CUFF, CUFF + _HEM])
+        edge = step + np.array([-_HEM_MARGIN, 0.0, CUFF, CUFF + _HEM_MARGIN])
         first = int(np.clip(np.abs(places - step).argmin() - 1, start + 1, rings - 4))
         before = places[start : first + 1] - places[start]
         places[start : first + 1] = places[start] + before * ((edge[0] - places[start]) / before[-1])
         last = first + len(edge) - 1
-        ends = [edge[-1], max(forearm.length, edge[-1] + _HEM)]
+        ends = [edge[-1], max(forearm.length, edge[-1] + _HEM_MARGIN)]
         places[last:] = np.interp(places[last:], [places[last], places[-1]], ends)
         places[first : last + 1] = edge
         start = last
@@ -313,16 +315,16 @@ def _half_axes(shape: HandShape, forearm: Forearm, behind: Doubles) -> tuple[Dou
     """Half width and half depth of the arm's sections [m]: flat at the wrist, rounder and thicker behind."""
     from scipy.interpolate import PchipInterpolator
 
-    girth = forearm.girth * shape.breadth * PchipInterpolator(_PLACES, _GIRTHS)(behind / shape.length)
+    girth = forearm.girth * shape.breadth * PchipInterpolator(_ARM_PLACES, _ARM_GIRTHS)(behind / shape.length)
     flatness = 0.70 + 0.18 * smooth(behind, 0.0, shape.length)
-    # Ramanujan's formula for the girth of an ellipse over its half width
+    # Ramanujan's formula gives the girth of an ellipse over its half width.
     h = ((1.0 - flatness) / (1.0 + flatness)) ** 2
     around = np.pi * (1.0 + flatness) * (1.0 + 3.0 * h / (10.0 + np.sqrt(4.0 - 3.0 * h)))
-    around *= _LONGER
+    around *= _SECTION_GIRTH
     return girth / around, flatness * girth / around
 
 
-def _course(shape: HandShape, forearm: Forearm, behind: Doubles) -> tuple[Doubles, Doubles]:
+def _arm_course(shape: HandShape, forearm: Forearm, behind: Doubles) -> tuple[Doubles, Doubles]:
     """Axes (K, 3, 3) and middles (K, 3) of the sections of an arm that bends at the wrist alone."""
     fine = np.linspace(0.0, behind[-1], 200)
     share = smooth(fine, 0.0, BEND * shape.length)

@@ -1,4 +1,4 @@
-"""The drawn skin: the hand's surface on a forearm, shaped by its joints, with texture coordinates.
+"""Meshes of drawn skin: the hand's surface on a forearm, shaped by its joints, with texture coordinates.
 
 The hand's vertices are `HandModel.skin`'s, so that pictures show the surface behind all occlusion; a
 forearm replaces the short stump behind the wrist.
@@ -41,20 +41,20 @@ from render.skin.look import BEND, ELBOW, ELBOW_BEND, Forearm, bent_rings, forea
 
 TILE: Final = 16
 """Texels along a tile's side."""
-COLUMNS: Final = 20  # tiles in a row of the texture
+COLUMNS: Final = 20  # number of tiles in a row of the texture
 ARM_ROWS: Final = 48
 """Texels along the forearm."""
 RINGS: Final = 20
 """Rings of the forearm beyond the wrist's."""
-_LEVELS: Final = 2  # number of times that the cage is subdivided
-_SIDE: Final = 2**_LEVELS  # faces of the skin along a tile
-_REFERENCE: Final = 0.0118  # radius of the finger at its knuckle that the lengths below are made for [m]
+_SUBDIVISIONS: Final = 2  # number of times that the cage is subdivided
+_TILE_FACES: Final = 2**_SUBDIVISIONS  # faces of the skin along a tile
+_REFERENCE_RADIUS: Final = 0.0118  # radius at the knuckle of the finger for which hills have their sizes [m]
 _THUMB_RADIUS: Final = 0.018  # distance from the thumb's axis within which the skin is the thumb's [m]
 _FINGERS: Final = ("index", "middle", "ring", "little")
-_LEAST_SHARE: Final = 0.04  # Vertices bend where twice the product of two bones' weights is larger.
-_FLESH: Final = 1.2  # radius of the flesh around a capsule over the capsule's radius
-_PALE: Final = 35.0  # logarithm of the light of skin that bones stretch, over how far they raise it [1/m]
-_DARKEST: Final = 0.12  # share of the ambient light that the deepest folds receive
+_LEAST_BEND_SHARE: Final = 0.04  # Vertices bend where twice the product of two bones' weights is larger.
+_FLESH_RATIO: Final = 1.2  # radius of the flesh around a capsule over the capsule's radius
+_PALENESS: Final = 35.0  # logarithm of the light of skin over the height to which bones raise it [1/m]
+_LEAST_AMBIENT: Final = 0.12  # share of the ambient light that the deepest folds receive
 
 
 class Atlas(NamedTuple):
@@ -86,21 +86,21 @@ class Atlas(NamedTuple):
 
 @functools.cache
 def skin_atlas() -> Atlas:
-    """The atlas of all hands; cached."""
+    """The atlas, which all hands share; cached."""
     cage = load_cage()
     quads, count = cage.quads, len(cage.weights)
     coordinates = np.broadcast_to(
         np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]), (len(quads), 4, 2)
     )
-    for _ in range(_LEVELS):
+    for _ in range(_SUBDIVISIONS):
         step, quads = catmull_clark(quads, count)
         count = step.shape[0]
         coordinates = _child_coordinates(coordinates)
-    # Left out are the stump behind the wrist, that is a strip of the palm, and the faces that close it.
+    # The stump behind the wrist, which is a strip of the palm, and the faces that close it are left out.
     kept = ~np.isin(cage.quads, PALM_VERTICES[0]).any(axis=1)
-    grids = _grids(quads, coordinates, len(cage.quads))[kept]
+    grids = _tile_grids(quads, coordinates, len(cage.quads))[kept]
     used = np.unique(grids)
-    return _assemble(used, np.searchsorted(used, grids), np.searchsorted(used, cage.wrist_loop))
+    return _build_atlas(used, np.searchsorted(used, grids), np.searchsorted(used, cage.wrist_loop))
 
 
 def _child_coordinates(coordinates: Doubles) -> Doubles:
@@ -113,10 +113,10 @@ def _child_coordinates(coordinates: Doubles) -> Doubles:
     return children.reshape(-1, 4, 2)
 
 
-def _grids(quads: Integers, coordinates: Doubles, count: int) -> Integers:
+def _tile_grids(quads: Integers, coordinates: Doubles, count: int) -> Integers:
     """Vertices (K, 5, 5) of each cage face's grid: rows go along its second axis."""
-    grids = np.zeros((count, _SIDE + 1, _SIDE + 1), dtype=np.int64)
-    column, row = np.rint(coordinates * _SIDE).astype(int).transpose(2, 0, 1)
+    grids = np.zeros((count, _TILE_FACES + 1, _TILE_FACES + 1), dtype=np.int64)
+    column, row = np.rint(coordinates * _TILE_FACES).astype(int).transpose(2, 0, 1)
     owner = np.repeat(np.arange(count), len(quads) // count)[:, None]
     grids[np.broadcast_to(owner, row.shape), row, column] = quads
     return grids
@@ -129,26 +129,26 @@ def ring_vertices(wrist: Integers, num_hand: int) -> Integers:
     return np.concatenate([rings, rings[:, :1]], axis=1)
 
 
-def _assemble(used: Integers, tiles: Integers, wrist: Integers) -> Atlas:
+def _build_atlas(used: Integers, tiles: Integers, wrist: Integers) -> Atlas:
     """The atlas of the hand's tiles (K, 5, 5) and of a forearm behind the wrist."""
     tile_rows = -(-len(tiles) // COLUMNS)
     width, height = COLUMNS * TILE, tile_rows * TILE + ARM_ROWS
     # Each node of a tile lies on the center of a texel, the outer nodes on those of the tile's border.
-    step = np.linspace(0.5, TILE - 0.5, _SIDE + 1)
+    step = np.linspace(0.5, TILE - 0.5, _TILE_FACES + 1)
     number = np.arange(len(tiles))
     across = (number % COLUMNS * TILE)[:, None, None] + step[None, None, :]
     up = (number // COLUMNS * TILE)[:, None, None] + step[None, :, None]
     across, up = np.broadcast_arrays(across, up)
     uv = [np.stack([across / width, 1.0 - up / height], axis=-1).reshape(-1, 2)]
     nodes = np.arange(tiles.size).reshape(tiles.shape)
-    faces, coarse = [_squares(nodes)], [_squares(nodes[:, ::2, ::2])]
+    faces, coarse = [_triangles_of_grids(nodes)], [_triangles_of_grids(nodes[:, ::2, ::2])]
     corners = [tiles.ravel()]
     around, rings = len(wrist), ring_vertices(wrist, len(used))
     end = len(used) + RINGS * around
     node = tiles.size + np.arange(rings.size).reshape(rings.shape)
     # Rings run from the index side over the back, so rows go towards the wrist for faces to look outwards.
-    faces.append(_squares(node[None, ::-1]))
-    coarse.append(_squares(node[None, ::-2, ::2]))
+    faces.append(_triangles_of_grids(node[None, ::-1]))
+    coarse.append(_triangles_of_grids(node[None, ::-2, ::2]))
     corners += [rings.ravel(), np.array([end])]
     middle = tiles.size + rings.size
     cap = np.stack([np.full(around, middle), node[-1, 1:], node[-1, :-1]], axis=1)
@@ -165,7 +165,7 @@ def _assemble(used: Integers, tiles: Integers, wrist: Integers) -> Atlas:
     return atlas
 
 
-def _squares(nodes: Integers) -> Integers:
+def _triangles_of_grids(nodes: Integers) -> Integers:
     """Two triangles of each square of grids (K, R, C)."""
     a, b, c, d = nodes[:, :-1, :-1], nodes[:, :-1, 1:], nodes[:, 1:, 1:], nodes[:, 1:, :-1]
     first = np.stack([a, b, c], axis=-1).reshape(-1, 3)
@@ -174,7 +174,7 @@ def _squares(nodes: Integers) -> Integers:
 
 
 class _Hill(NamedTuple):
-    """A shape of the skin."""
+    """A smooth hill on the skin at rest."""
 
     joint: str | None  # joint whose angle raises the hill; None for a hill that is always there
     start: float  # angle without height [deg]
@@ -183,19 +183,19 @@ class _Hill(NamedTuple):
 
 
 class Flexion:
-    """What the joints of one hand do to its skin: they raise hills, and bent ones keep their thickness."""
+    """Shapes the skin of a hand by its joints, which raise hills and keep their thickness when bent."""
 
-    def __init__(self, model: HandModel, rest: Doubles, normals: Doubles, bony: float) -> None:
+    def __init__(self, model: HandModel, rest: Doubles, normals: Doubles, bone_relief: float) -> None:
         hills = list(_hills(model, rest, normals))
         self._joints = np.array(
             [-1 if hill.joint is None else JOINT_NAMES.index(hill.joint) for hill in hills]
         )
         self._start = np.deg2rad([hill.start for hill in hills])
         self._full = np.deg2rad([hill.full for hill in hills])
-        heights = bony * np.stack([hill.heights for hill in hills], axis=1)
+        heights = bone_relief * np.stack([hill.heights for hill in hills], axis=1)
         self._rows = np.flatnonzero(np.abs(heights).max(axis=1) > 1e-6)
         self._heights, self._normals = heights[self._rows], normals[self._rows]
-        self._bends = _bends(model, rest) if bony else None
+        self._bends = _bends(model, rest) if bone_relief else None
 
     def shaped(self, rest: Doubles, angles: Doubles) -> Doubles:
         """Vertices (U, 3) at rest with the hills of joint angles (20,) [m, rad]."""
@@ -222,7 +222,7 @@ def _bends(model: HandModel, rest: Doubles) -> tuple[sparse.csr_array, Doubles, 
     parts = []
     for bone in range(2, NUM_BONES):  # the thumb's first joint lies deep in the flesh
         shares = 2.0 * weights[:, bone] * weights[:, BONES[bone].parent]
-        rows = np.flatnonzero(shares > _LEAST_SHARE)
+        rows = np.flatnonzero(shares > _LEAST_BEND_SHARE)
         axes = frames[bone, :3, :3]
         offsets = (rest[rows] - frames[bone, :3, 3]) @ axes * [1.0, 0.0, 1.0] @ axes.T
         parts.append((rows, offsets, shares[rows], np.full(len(rows), joint_of[bone])))
@@ -232,15 +232,15 @@ def _bends(model: HandModel, rest: Doubles) -> tuple[sparse.csr_array, Doubles, 
 
 
 def _hills(model: HandModel, rest: Doubles, normals: Doubles) -> Iterator[_Hill]:
-    """All hills of a hand, computed on a right hand."""
+    """Yield all hills of a hand, computed on a right hand."""
     mirror = MIRROR if model.shape.side == "left" else np.eye(3)
     frames = model.rest_transforms.copy()
     frames[:, :3, :3] = mirror @ frames[:, :3, :3] @ mirror
     frames[:, :3, 3] = frames[:, :3, 3] @ mirror
-    scale = model.shape.radii[1:, 0].mean() / _REFERENCE
-    skin = _Skin(rest @ mirror, normals @ mirror, frames, scale)
+    scale = model.shape.radii[1:, 0].mean() / _REFERENCE_RADIUS
+    skin = _RestingHand(rest @ mirror, normals @ mirror, frames, scale)
     for number, digit in enumerate(_FINGERS, 1):
-        yield from _finger(skin, number, digit, model.shape.radii[number, 0] / _REFERENCE)
+        yield from _finger(skin, number, digit, model.shape.radii[number, 0] / _REFERENCE_RADIUS)
     for number in (1, 2, 3):  # hollows between the knuckles of a fist, down to where the fingers part
         first, second = 1 + 3 * number, 4 + 3 * number
         here = 0.5 * (frames[first, :2, 3] + frames[second, :2, 3])
@@ -267,7 +267,7 @@ def _hills(model: HandModel, rest: Doubles, normals: Doubles) -> Iterator[_Hill]
     yield _Hill(None, 0.0, 1.0, skin.ball((-0.016, -0.021), 0.0040, 0.0085, back=True))
 
 
-class _Skin(NamedTuple):
+class _RestingHand(NamedTuple):
     """A right hand at rest."""
 
     points: Doubles
@@ -305,8 +305,8 @@ class _Skin(NamedTuple):
         return np.asarray(size * height * bump(distance, size * width) * smooth(facing, 0.0, 0.6))
 
 
-def _finger(skin: _Skin, number: int, digit: str, wide: float) -> Iterator[_Hill]:
-    """Hills of a finger's knuckles, tendon, neck and sides, and the pads that bending pushes out."""
+def _finger(skin: _RestingHand, number: int, digit: str, wide: float) -> Iterator[_Hill]:
+    """Yield hills of a finger's knuckles, tendon, neck and sides, and of the pads that bending pushes out."""
     first, size, bent = 1 + 3 * number, skin.scale, f"{digit}_MCP_flexion"
     middle = 0.5 * float(np.linalg.norm(skin.frames[first + 1, :3, 3] - skin.frames[first, :3, 3])) / size
     for bone, joint, start, full, height, long, broad, at in (
@@ -338,11 +338,11 @@ class DrawnSkin:
     """One hand in one pose, with the vertices that textures and OpenGL need."""
 
     vertices: Float32[np.ndarray, "D 3"]
-    """In the world [m]; vertices on borders of texture tiles are repeated for each tile."""
+    """Positions in the world [m]; vertices on borders of texture tiles are repeated for each tile."""
     normals: Float32[np.ndarray, "D 3"]  # outward unit normals
     uv: Float32[np.ndarray, "D 2"]  # texture coordinates, the origin at the bottom left
     shade: Float32[np.ndarray, "D"]
-    """Factor on the ambient light: the share that the hand leaves, more where bones stretch the skin."""
+    """Factor on ambient light: the share that the hand lets through, more where bones stretch the skin."""
     faces: Int[np.ndarray, "F 3"]  # triangles, counter-clockwise from outside
     parts: UInt8[np.ndarray, "F"]  # bone of each triangle, an index of `shape.BONES` or `FOREARM`
     coarse_faces: Int[np.ndarray, "G 3"]
@@ -352,7 +352,7 @@ class DrawnSkin:
 class PosableSkin:
     """The drawn skin of one person's hand."""
 
-    def __init__(self, model: HandModel, forearm: Forearm | None = None, bony: float = 0.0) -> None:
+    def __init__(self, model: HandModel, forearm: Forearm | None = None, bone_relief: float = 0.0) -> None:
         self.model = model
         self.forearm = Forearm() if forearm is None else forearm
         atlas, surface = skin_atlas(), model.surface
@@ -374,7 +374,7 @@ class PosableSkin:
             for faces in (atlas.corner_faces, atlas.coarse_faces)
         )
         self._normals: Doubles = vertex_normals(self.rest, self.faces)
-        self._flexion = Flexion(model, self.rest, self._normals, bony)
+        self._flexion = Flexion(model, self.rest, self._normals, bone_relief)
         self._straight = self._flexion.shaped(self.rest, np.zeros(NUM_JOINTS))
         self._rest_occluded = self._rest_occlusion()
         middles = self._rings(self.rest).mean(axis=1)
@@ -395,7 +395,7 @@ class PosableSkin:
     def flesh(self, qpos: Doubles) -> tuple[Doubles, Doubles]:
         """Axes (K, 2, 3) and radii (K,) of the flesh around this hand's bones in one pose [m]."""
         capsules = self.model.capsules
-        return capsules.posed(self.model.forward_kinematics(qpos[None]))[0], capsules.radii * _FLESH
+        return capsules.posed(self.model.forward_kinematics(qpos[None]))[0], capsules.radii * _FLESH_RATIO
 
     def posed(
         self,
@@ -404,7 +404,7 @@ class PosableSkin:
         forearm: Doubles | None = None,
         others: Sequence[tuple[Doubles, Doubles]] = (),
     ) -> DrawnSkin:
-        """The skin in one pose, in the ambient light that the `flesh` of others leaves.
+        """Pose the skin, and shade it by the hand and by the `flesh` of `others`.
 
         Without the upper arm (3,) from the elbow [m] the arm is straight and short, and without the forearm's
         direction (3,) the wrist is at rest.
@@ -427,8 +427,8 @@ class PosableSkin:
         shade = 1.0 - np.maximum(occluded - self._rest_occluded, 0.0)
         for axes, radii in others:
             shade *= 1.0 - _occluded_share(points, normals, axes, radii)
-        shade = np.clip(shade, _DARKEST, 1.0)
-        shade *= np.exp(_PALE * raised)
+        shade = np.clip(shade, _LEAST_AMBIENT, 1.0)
+        shade *= np.exp(_PALENESS * raised)
         corners = atlas.corners
         return DrawnSkin(
             points.astype(np.float32).take(corners, axis=0),
@@ -459,18 +459,18 @@ class PosableSkin:
         of_digit = DIGIT_OF_BONE[self._bones]
         for digit in range(len(DIGITS)):
             share = (self._weights * (of_digit == digit)).sum(axis=1)
-            mine = np.flatnonzero(share > 0.0)
+            own_vertices = np.flatnonzero(share > 0.0)
             near = np.isin(DIGIT_OF_BONE[capsules.bones], (digit, DIGIT_OF_BONE[PALM]))
-            radii = capsules.radii[near] * _FLESH
-            own = _occluded_share(self.rest[mine], normals[mine], segments[near], radii)
-            occluded[mine] += share[mine].astype(np.float32) * (own - occluded[mine])
+            radii = capsules.radii[near] * _FLESH_RATIO
+            own = _occluded_share(self.rest[own_vertices], normals[own_vertices], segments[near], radii)
+            occluded[own_vertices] += share[own_vertices].astype(np.float32) * (own - occluded[own_vertices])
         return occluded
 
     def _occluded(self, transforms: Doubles, points: Doubles, normals: Doubles) -> Floats:
         """Share (U,) of each vertex's hemisphere that the hand's capsules hide."""
         capsules = self.model.capsules
         segments = capsules.posed(transforms)[0]
-        return np.asarray(_occluded_share(points, normals, segments, capsules.radii * _FLESH))
+        return np.asarray(_occluded_share(points, normals, segments, capsules.radii * _FLESH_RATIO))
 
 
 @functools.cache

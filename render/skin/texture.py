@@ -1,4 +1,4 @@
-"""Textures of skin and glove: colors, roughness and a fine relief, painted on a map of the anatomy.
+"""Paints textures of skin and glove: colors, roughness and a fine relief, on a map of the anatomy.
 
 The anatomy at each texel is computed once per process, on a right hand of size M with its fingers straight.
 The relief is a normal map of nails, tendons, knuckles, creases and grain; it changes neither depth nor
@@ -23,7 +23,7 @@ from handsim.hand.shape import DIGITS, NUM_BONES, named_shape
 from handsim.hand.skin import all_weights, vertex_normals
 from handsim.kernels import kernel
 from render.fields import along_segment, bump, noise, smooth
-from render.frames import Bytes, Doubles, Floats, Integers
+from render.frames import Bytes, Doubles, Floats, Integers, triple
 from render.skin.look import CUFF, Forearm, SkinLook, arm_places
 from render.skin.mesh import ARM_ROWS, COLUMNS, RINGS, TILE, PosableSkin, ring_vertices, skin_atlas
 
@@ -38,20 +38,20 @@ _PALM_LINES: Final = (
     ((72.0, 31.0), (71.0, 20.0), (65.0, 5.0), (56.0, -10.0), (46.0, -24.0)),
     ((71.0, 31.0), (66.0, 18.0), (54.0, 8.0), (38.0, 2.0), (20.0, 1.0), (8.0, 5.0)),
 )
-_WRIST_LINES: Final = (-0.001, -0.009)  # across the palm's side of the wrist [m]
-_STEEPEST: Final = 0.9  # largest slope of the relief
-_SHADED: Final = 0.006  # length of skin in the shadow of a sleeve [m]
-_SHADE: Final = 0.4  # share of the lightness that this shadow takes
-_FOLD: Final = 0.001  # height of a sleeve's folds [m]
-_STITCH: Final = 0.0034  # period of a glove's knit [m]
-_CREASE: Final = (-0.012, 0.035)  # distances behind the wrist between which the palm's skin ends [m]
-_VEIN: Final = 0.0017  # half width of a vein [m]
-_UNEVEN: Final = np.float32(0.03)  # unevenness of the palm's end over that of the pigment's edge [m]
-_GRAIN: Final = 4.5e-5  # height of the relief that breaks gloss [m]: furrows are 20 to 100 um deep
-_GRAIN_SIZES: Final = (0.0032, 0.0016, 0.0009)  # lengths of its waves [m]
-_GRAINED: Final = (-0.035, 0.005)  # places along the wrist between which it fades in [m]
-_MATT_GRAIN: Final = np.float32(0.05)  # additional roughness of its ridges, which are drier than furrows
-_INNER_ARM: Final = 0.8  # pigment of the inner forearm; that of the back of the hand is 1
+_WRIST_LINES: Final = (-0.001, -0.009)  # x of the lines across the palm's side of the wrist [m]
+_MAX_SLOPE: Final = 0.9  # largest slope of the relief
+_SHADOW_LENGTH: Final = 0.006  # length of skin in the shadow of a sleeve [m]
+_SHADOW_STRENGTH: Final = 0.4  # share of the lightness that a sleeve's shadow takes
+_FOLD_HEIGHT: Final = 0.001  # height of a sleeve's folds [m]
+_KNIT_PERIOD: Final = 0.0034  # period of a glove's knit [m]
+_WRIST_CREASE: Final = (-0.012, 0.035)  # distances behind the wrist between which the palm's skin ends [m]
+_VEIN_WIDTH: Final = 0.0017  # half width of a vein [m]
+_CREASE_UNEVENNESS: Final = np.float32(0.03)  # that of the palm's end over that of the pigment's edge [m]
+_GRAIN_HEIGHT: Final = 4.5e-5  # height of the relief that breaks gloss [m]: furrows are 20 to 100 um deep
+_GRAIN_SIZES: Final = (0.0032, 0.0016, 0.0009)  # wavelengths of this grain [m]
+_GRAIN_FADE: Final = (-0.035, 0.005)  # x between which the grain fades in at the wrist [m]
+_GRAIN_ROUGHNESS: Final = np.float32(0.05)  # additional roughness of ridges, which are drier than furrows
+_INNER_ARM_PIGMENT: Final = 0.8  # pigment of the inner forearm; that of the back of the hand is 1
 GLOVE_COLOR: Final = (0.235, 0.25, 0.29)
 """Color of an average glove, sRGB in [0, 1]."""
 
@@ -80,7 +80,7 @@ class Texels(NamedTuple):
 
 @functools.cache
 def skin_texels() -> Texels:
-    """The texels; cached."""
+    """The anatomy at all texels; cached."""
     model, atlas = HandModel.named("M"), skin_atlas()
     mesh = PosableSkin(model, REFERENCE)
     normals = vertex_normals(mesh.rest, mesh.faces)
@@ -90,42 +90,43 @@ def skin_texels() -> Texels:
     weights[atlas.num_hand :, 0] = 1.0
     dorsal = np.einsum("vi,vi->v", normals, weights @ model.rest_transforms[:, :3, 2])
     values = np.concatenate([mesh.rest, normals, dorsal[:, None], weights], axis=1)
-    grid = _spread(values)
+    grid = _interpolate_to_texels(values)
     positions, normals, dorsal, weights = grid[:, :3], grid[:, 3:6], grid[:, 6], grid[:, 7:]
     normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
     digits = []
     for digit in range(len(DIGITS)):
         first = 1 + 3 * digit
         share = weights[:, first : first + 3].sum(axis=1)
-        mine = np.flatnonzero(share > 0.02)
+        digit_texels = np.flatnonzero(share > 0.02)
         frame = model.rest_transforms[first]
-        local = (positions[mine] - frame[:3, 3]) @ frame[:3, :3]
+        local = (positions[digit_texels] - frame[:3, 3]) @ frame[:3, :3]
         angle, joints = np.arctan2(local[:, 1], local[:, 2]), np.cumsum(model.shape.bone_lengths[digit])
-        digits.append(DigitTexels(mine, local[:, 0], angle, share[mine], joints))
+        digits.append(DigitTexels(digit_texels, local[:, 0], angle, share[digit_texels], joints))
     # The thumb's back faces sideways, but the part of it on the hand's back does not have the palm's skin.
     facing = np.maximum(dorsal, normals[:, 2])
     back, palm = smooth(facing, -0.25, 0.35), weights[:, 0]
     return Texels(positions, normals, dorsal, back, facing, palm, tuple(digits))
 
 
-def _spread(values: Doubles) -> Doubles:
-    """Values (U, C) of the drawn vertices at every texel (N, C), interpolated linearly."""
+def _interpolate_to_texels(values: Doubles) -> Doubles:
+    """Interpolate values (U, C) of the drawn vertices linearly to every texel (N, C)."""
     atlas = skin_atlas()
     width, height = atlas.size
     nodes = atlas.tiles.shape[1]
-    across = _between(nodes, TILE)
+    across = _interpolation_matrix(nodes, TILE)
     tiles = np.einsum("ri,cj,kijn->krcn", across, across, values[atlas.tiles], optimize=True)
     rows = -(-len(tiles) // COLUMNS)
     filler = np.repeat(tiles[-1:], rows * COLUMNS - len(tiles), axis=0)
     tiles = np.concatenate([tiles, filler]).reshape(rows, COLUMNS, TILE, TILE, -1)
     hand = tiles.swapaxes(1, 2).reshape(rows * TILE, width, -1)
-    along, about = _between(RINGS + 1, ARM_ROWS), _between(len(atlas.wrist) + 1, width)
+    along = _interpolation_matrix(RINGS + 1, ARM_ROWS)
+    about = _interpolation_matrix(len(atlas.wrist) + 1, width)
     rings = ring_vertices(atlas.wrist, atlas.num_hand)
     arm = np.einsum("ri,cj,ijn->rcn", along, about, values[rings], optimize=True)
     return np.concatenate([hand, arm]).reshape(width * height, -1)
 
 
-def _between(nodes: int, texels: int) -> Doubles:
+def _interpolation_matrix(nodes: int, texels: int) -> Doubles:
     """Matrix (texels, nodes) that interpolates linearly between nodes; the first and last are texels, too."""
     position = np.linspace(0.0, nodes - 1.0, texels)
     low = np.minimum(position.astype(int), nodes - 2)
@@ -139,14 +140,14 @@ def behind_wrist(forearm: Forearm) -> Doubles:
     """Distance (N,) of each texel behind the wrist along this forearm [m]; negative on the hand."""
     width, _ = skin_atlas().size
     behind = -skin_texels().positions[:, 0]
-    along = _between(RINGS + 1, ARM_ROWS) @ arm_places(forearm, RINGS)
+    along = _interpolation_matrix(RINGS + 1, ARM_ROWS) @ arm_places(forearm, RINGS)
     behind[-ARM_ROWS * width :] = np.repeat(along, width)
     return behind
 
 
 def line_depth(rng: np.random.Generator) -> Floats:
     """Depth (N,) of palm lines, finger creases and knuckle wrinkles at each texel; 1 for a deep line."""
-    near, palm_lines, wrist_lines = _lines_of_all()
+    near, palm_lines, wrist_lines = _palm_and_wrist_lines()
     depth = wrist_lines.copy()
     for line in palm_lines:
         depth[near] = np.maximum(depth[near], np.float32(rng.uniform(0.7, 1.05)) * line)
@@ -219,7 +220,7 @@ def _digit_lines() -> tuple[_DigitLines, ...]:
 
 
 @functools.cache
-def _lines_of_all() -> tuple[Integers, tuple[Floats, ...], Floats]:
+def _palm_and_wrist_lines() -> tuple[Integers, tuple[Floats, ...], Floats]:
     """Texels of the palm (K,), its lines' depths (K,) there, and the depth (N,) of the wrist's lines."""
     texels = skin_texels()
     back = texels.back
@@ -253,7 +254,7 @@ def normal_map(height: NDArray[Any], side: Side) -> UInt8[np.ndarray, "H W 3"]:
     second = column_scale * down.ravel() - skew * first
     tilt = np.stack([-first, second if side == "left" else -second], axis=1)
     slope = np.linalg.norm(tilt, axis=1, keepdims=True)
-    tilt *= np.minimum(1.0, _STEEPEST / np.maximum(slope, 1e-12))
+    tilt *= np.minimum(1.0, _MAX_SLOPE / np.maximum(slope, 1e-12))
     normals = np.concatenate([tilt, np.ones((len(tilt), 1))], axis=1)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     encoded: Bytes = np.rint(127.5 * (normals + 1.0)).astype(np.uint8)
@@ -328,7 +329,7 @@ class SkinTexture(NamedTuple):
 
 
 class _Paint(NamedTuple):
-    """Color, roughness and height of each texel, to be painted on."""
+    """Color, roughness and height of each texel, which painting changes in place."""
 
     lab: Floats  # CIELAB (N, 3)
     roughness: Floats
@@ -337,81 +338,82 @@ class _Paint(NamedTuple):
 
 def skin_texture(look: SkinLook, forearm: Forearm | None = None, *, side: Side = "right") -> SkinTexture:
     """Paint a skin; equal looks give equal texels."""
-    color, roughness, height = _painted(look, forearm)
+    color, roughness, height = _paint_skin(look, forearm)
     return SkinTexture(color, roughness, normal_map(height, side))
 
 
-@functools.lru_cache(maxsize=2)  # both hands of a person share it
-def _painted(
+@functools.lru_cache(maxsize=2)  # both hands of a person share the painted skin
+def _paint_skin(
     look: SkinLook, forearm: Forearm | None
 ) -> tuple[UInt8[np.ndarray, "H W 3"], UInt8[np.ndarray, "H W"], Floats]:
-    """Color, roughness and height of the relief."""
+    """Paint the color, the roughness and the height of the relief of a skin."""
     texels, rng = skin_texels(), np.random.default_rng(look.seed)
     # Pigment fades over the sides of fingers and hand, unevenly; relief ends sooner.
     edge = 0.10 * noise(texels.positions, (0.02, 0.006), rng=rng)
     pigment = smooth(texels.facing.astype(np.float32) + edge, -0.8, 0.55)
     # A palm's skin ends at the wrist's crease: the inner forearm is nearly as dark as the outer.
-    behind = smooth(edge * _UNEVEN - texels.positions[:, 0].astype(np.float32), *_CREASE)
-    pigment = np.maximum(pigment, np.float32(_INNER_ARM) * behind)
+    behind = smooth(edge * _CREASE_UNEVENNESS - texels.positions[:, 0].astype(np.float32), *_WRIST_CREASE)
+    pigment = np.maximum(pigment, np.float32(_INNER_ARM_PIGMENT) * behind)
     # The palm of a dark hand is not redder or yellower than other palms: chroma depends on the pigment.
     bare = np.array([look.palm_lightness, 13.0, 16.5])
     whole = np.array([look.lightness, look.redness, look.yellowness])
     lab = bare.astype(np.float32) + pigment[:, None] * (whole - bare).astype(np.float32)
-    blood, knuckles = _blood()
+    blood, knuckles = _blood_color()
     lab += np.float32(look.flush) * blood
     lab[:, 0] += np.float32(look.flush * (-1.5 - 0.06 * max(0.0, 60.0 - look.lightness))) * knuckles
     veins = _veins(rng)
-    _add(lab, look.veins * veins, (-1.6, -1.6, -2.2))
+    _add_color(lab, look.veins * veins, (-1.6, -1.6, -2.2))
     blotches = noise(texels.positions, (0.05, 0.018, 0.007, 0.003), rng=rng)
-    _add(lab, look.blotches * blotches, (1.0, -0.6, 0.2))
+    _add_color(lab, look.blotches * blotches, (1.0, -0.6, 0.2))
     weight = 0.8 + 0.4 * noise(texels.positions, (0.014, 0.005), rng=rng)
     lines = np.clip(line_depth(rng) * np.clip(weight, 0.1, 1.2), 0.0, 1.0)
     # Pigment collects in the lines; their darkness depends on the contrast that the skin allows.
-    _add(lab, look.creases * lines, (-8.5, 4.5, 0.5))
+    _add_color(lab, look.creases * lines, (-8.5, 4.5, 0.5))
     height = look.relief * relief() - 0.0003 * look.creases * lines + 0.00008 * look.veins * veins
     grain = noise(texels.positions, _GRAIN_SIZES, rng=rng)
-    grain *= smooth(texels.positions[:, 0].astype(np.float32), *_GRAINED)  # it would be streaks on the arm
-    height += look.relief * _GRAIN * grain
+    # The stretched texels of the arm would make streaks of the grain.
+    grain *= smooth(texels.positions[:, 0].astype(np.float32), *_GRAIN_FADE)
+    height += look.relief * _GRAIN_HEIGHT * grain
     rough = np.minimum(look.roughness + 0.1 * (1.0 - texels.back), 1.0).astype(np.float32)
-    rough += _MATT_GRAIN * np.clip(grain, -1.5, 1.5)
+    rough += _GRAIN_ROUGHNESS * np.clip(grain, -1.5, 1.5)
     paint = _Paint(lab, rough, height.astype(np.float32))
     _paint_nails(paint, look)
     if forearm is not None and forearm.sleeve < forearm.length:
-        _sleeve(paint, forearm, rng)
+        _paint_sleeve(paint, forearm, rng)
     width, rows = skin_atlas().size
     roughness = np.rint(np.float32(255.0) * paint.roughness).astype(np.uint8).reshape(rows, width)
     return lab_to_srgb(paint.lab.reshape(rows, width, 3)), roughness, paint.height
 
 
-def _add(lab: Floats, share: NDArray[Any], color: tuple[float, float, float]) -> None:
+def _add_color(lab: Floats, share: NDArray[Any], color: tuple[float, float, float]) -> None:
     """Add a color to that of each texel (N, 3), times a factor (N,)."""
     for channel, value in enumerate(color):
         lab[:, channel] += np.float32(value) * share
 
 
 def lab_to_srgb(lab: NDArray[Any]) -> UInt8[np.ndarray, "H W 3"]:
-    """SRGB of CIELAB colors (D65), clipped to the gamut of sRGB."""
+    """Convert CIELAB colors (D65) to sRGB, clipped to its gamut."""
     rgb = cv2.cvtColor(np.asarray(lab, dtype=np.float32), cv2.COLOR_Lab2RGB)
     return np.asarray(np.rint(255.0 * np.clip(rgb, 0.0, 1.0)).astype(np.uint8))
 
 
 @functools.cache
-def _blood() -> tuple[Floats, Floats]:
-    """The color that blood adds to CIELAB (N, 3) at a flush of 1, and the darkness of knuckles (N,)."""
+def _blood_color() -> tuple[Floats, Floats]:
+    """Color that blood adds to CIELAB (N, 3) at a flush of 1, and darkness of knuckles (N,)."""
     texels = skin_texels()
     back = texels.back
     lab, knuckles = np.zeros((len(back), 3)), np.zeros(len(back))
     for number, digit in enumerate(texels.digits):
         first, middle, end = digit.joints
-        mine = digit.texels
+        digit_texels = digit.texels
         tips = smooth(digit.along, middle, end) * digit.share
-        lab[mine] += tips[:, None] * [-1.0, 4.0, 0.0]
+        lab[digit_texels] += tips[:, None] * [-1.0, 4.0, 0.0]
         for joint, width in ((0.0, 0.010), (first, 0.0075), (middle, 0.006)):
             if number == 0 and joint == 0.0:
                 continue  # the thumb's first joint lies deep under the skin
-            knuckle = bump(digit.along - joint, width) * back[mine] * np.abs(np.cos(digit.angle / 2))
-            lab[mine] += knuckle[:, None] * [0.0, 1.8, 0.3]
-            knuckles[mine] += knuckle
+            knuckle = bump(digit.along - joint, width) * back[digit_texels] * np.abs(np.cos(digit.angle / 2))
+            lab[digit_texels] += knuckle[:, None] * [0.0, 1.8, 0.3]
+            knuckles[digit_texels] += knuckle
     x, y = 1e3 * texels.positions[:, 0], 1e3 * texels.positions[:, 1]
     palm = 1.0 - back
     hollow = np.exp(-(((x - 50.0) / 22.0) ** 2) - (((y + 2.0) / 14.0) ** 2)) * palm
@@ -423,17 +425,17 @@ def _blood() -> tuple[Floats, Floats]:
 
 
 def _veins(rng: np.random.Generator) -> Floats:
-    """Visibility (N,) of three veins that wind along the back of hand and forearm, and fade in places."""
+    """Draw the visibility (N,) of three veins, which wind along the backs of hand and forearm and fade."""
     near, x, y, back = _vein_texels()
     veins = np.zeros(len(skin_texels().back), dtype=np.float32)
     for start in (0.016, -0.004, -0.022):
         knots = np.linspace(-0.17, 0.09, 9)
         course = start + np.cumsum(rng.normal(0.0, 0.0035, 9)) - 0.006
         away = y - np.interp(x, knots, course).astype(np.float32)
-        (close,) = np.nonzero(np.abs(away) < 4.0 * _VEIN)
+        (close,) = np.nonzero(np.abs(away) < 4.0 * _VEIN_WIDTH)
         rows = near[close]
         shown = back[close] * np.interp(x[close], knots, rng.uniform(-0.4, 1.0, 9)).clip(0.0)
-        veins[rows] = np.maximum(veins[rows], shown * bump(away[close], np.float32(_VEIN)))
+        veins[rows] = np.maximum(veins[rows], shown * bump(away[close], np.float32(_VEIN_WIDTH)))
     return veins
 
 
@@ -448,9 +450,9 @@ def _vein_texels() -> tuple[Integers, Floats, Floats, Floats]:
 
 @functools.cache
 def _nails() -> tuple[tuple[Integers, Floats, Floats, Floats], ...]:
-    """The texels (K,) of each nail, and there its plate (K,), its fold (K,), and its moon's color (K, 3).
+    """Texels (K,) of each nail, and their shares of plate (K,) and fold (K,) and the moon's color (K, 3).
 
-    Plate and fold are from 0 to 1. The color is added to CIELAB and includes that of the free edge.
+    Shares are from 0 to 1. The color is added to CIELAB and includes that of the free edge.
     """
     nails = []
     for number, digit in enumerate(skin_texels().digits):
@@ -463,7 +465,7 @@ def _nails() -> tuple[tuple[Integers, Floats, Floats, Floats], ...]:
         where = np.abs(b) < 1.6
         shape = (np.abs(a) ** 3.2 + np.abs(b) ** 3.2) ** (1 / 3.2)
         plate = (1.0 - smooth(shape, 0.88, 1.04)) * where
-        fold = bump(shape - 1.07, 0.10) * where * smooth(-a, -0.7, 0.5)  # the tip has none
+        fold = bump(shape - 1.07, 0.10) * where * smooth(-a, -0.7, 0.5)  # there is no fold at the tip
         moon = (bump(a + 1.0, 0.42) * bump(b, 0.55))[:, None] * [4.0, -4.0, -1.0]
         moon += smooth(a, 0.72, 0.86)[:, None] * [8.0, -7.0, 1.0]
         near = np.flatnonzero((plate > 0.0) | (fold > 1e-4))
@@ -476,19 +478,19 @@ def _paint_nails(paint: _Paint, look: SkinLook) -> None:
     """Paint nails: plates pinker and smoother than the skin, pale moons, whiter free edges, dark folds."""
     bed = np.array([look.lightness, look.redness, look.yellowness]) * [0.7, 0.5, 0.6]
     bed += np.array([68.0, 12.0, 13.0]) * [0.3, 0.5, 0.4]  # beds hold little pigment, as palms do
-    for mine, plate, fold, moon in _nails():
+    for nail_texels, plate, fold, moon in _nails():
         color = (bed + look.nail).astype(np.float32) + moon
         color += np.float32(look.polish) * (np.array(look.polish_color, dtype=np.float32) - color)
-        lab = paint.lab[mine]
+        lab = paint.lab[nail_texels]
         lab += plate[:, None] * (color - lab)
-        _add(lab, look.creases * fold, (-4.5, 3.0, 0.0))
-        paint.lab[mine] = lab
-        paint.roughness[mine] += plate * (np.float32(0.28) - paint.roughness[mine])
-        paint.height[mine] *= 1.0 - plate
-        paint.height[mine] += 0.00016 * plate - 0.0002 * fold
+        _add_color(lab, look.creases * fold, (-4.5, 3.0, 0.0))
+        paint.lab[nail_texels] = lab
+        paint.roughness[nail_texels] += plate * (np.float32(0.28) - paint.roughness[nail_texels])
+        paint.height[nail_texels] *= 1.0 - plate
+        paint.height[nail_texels] += 0.00016 * plate - 0.0002 * fold
 
 
-def _sleeve(paint: _Paint, forearm: Forearm, rng: np.random.Generator) -> None:
+def _paint_sleeve(paint: _Paint, forearm: Forearm, rng: np.random.Generator) -> None:
     """Paint a sleeve over the forearm, with folds as darker and lighter bands."""
     behind = behind_wrist(forearm).astype(np.float32) - np.float32(forearm.sleeve)
     cloth = smooth(behind, 0.0, CUFF)
@@ -497,10 +499,10 @@ def _sleeve(paint: _Paint, forearm: Forearm, rng: np.random.Generator) -> None:
     for channel in range(3):
         painted = color[channel] + (4.0 * folds if channel == 0 else 0.0)
         paint.lab[:, channel] += cloth * (painted - paint.lab[:, channel])
-    inside = smooth(behind, -_SHADED, 0.0) * (1.0 - smooth(behind, 0.5 * CUFF, CUFF))
-    paint.lab[:, 0] *= 1.0 - np.float32(_SHADE) * inside
+    inside = smooth(behind, -_SHADOW_LENGTH, 0.0) * (1.0 - smooth(behind, 0.5 * CUFF, CUFF))
+    paint.lab[:, 0] *= 1.0 - np.float32(_SHADOW_STRENGTH) * inside
     paint.roughness[:] += cloth * (1.0 - paint.roughness)
-    paint.height[:] += cloth * (np.float32(_FOLD) * folds - paint.height)
+    paint.height[:] += cloth * (np.float32(_FOLD_HEIGHT) * folds - paint.height)
 
 
 @dataclass(frozen=True, slots=True)
@@ -515,11 +517,10 @@ class GloveLook:
 
 
 def sample_glove_look(*, rng: np.random.Generator) -> GloveLook:
-    """A random glove: dark, as marker gloves are, so that the markers stand out."""
+    """Draw a random glove, dark as marker gloves are, so that the markers stand out."""
     gray = rng.uniform(0.05, 0.32)
-    red, green, blue = np.clip(gray * np.exp(rng.normal(0.0, 0.12, 3)), 0.02, 0.4)
     return GloveLook(
-        (float(red), float(green), float(blue)),
+        triple(np.clip(gray * np.exp(rng.normal(0.0, 0.12, 3)), 0.02, 0.4)),
         float(rng.uniform(0.015, 0.07)),
         float(rng.uniform(0.7, 0.95)),
         float(rng.uniform(0.4, 1.4)),
@@ -530,14 +531,14 @@ def sample_glove_look(*, rng: np.random.Generator) -> GloveLook:
 def glove_texture(
     look: GloveLook, skin: SkinTexture, forearm: Forearm | None = None, *, side: Side = "right"
 ) -> SkinTexture:
-    """The texture of a glove over painted skin; only the forearm behind the cuff stays visible."""
+    """Paint a glove over painted skin; only the forearm behind the cuff stays visible."""
     texels, rng = skin_texels(), np.random.default_rng(look.seed)
     width, rows = skin_atlas().size
     arm = REFERENCE if forearm is None else forearm
     behind = behind_wrist(arm)
     lab = cv2.cvtColor(np.array([[look.color]], dtype=np.float32), cv2.COLOR_RGB2Lab)[0, 0]
     cloth = noise(texels.positions, (0.02, 0.006, 0.0025), rng=rng)
-    knit = np.sin((2.0 * np.pi / _STITCH) * texels.positions).sum(axis=1)
+    knit = np.sin((2.0 * np.pi / _KNIT_PERIOD) * texels.positions).sum(axis=1)
     hem = bump(behind - look.cuff + 0.004, 0.0015)
     painted = lab + (look.wear * 2.0 * cloth + 1.2 * knit - 5.0 * hem)[:, None] * [1.0, 0.0, 0.0]
     height = look.wear * 1.2e-4 * cloth + 6e-5 * knit - 4e-4 * hem

@@ -29,7 +29,9 @@ def test_the_jacobian_is_that_of_the_residuals(given):
         values[POSES + 6 * span :][:6] = pose_of(camera)
     samples = bundle.samples(bundle.match(state, np.inf))
     size = len(samples.frames)
-    samples = samples._replace(outward=rng.normal(size=(size, 3)), larger=rng.normal(0.0, 0.03, (size, 3)))
+    samples = samples._replace(
+        outward=rng.normal(size=(size, 3)), from_middle=rng.normal(0.0, 0.03, (size, 3))
+    )
     found = bundle.jacobian(state, samples, 3.0)
     behind = state.spans(samples.frames) == 1
     assert (found[behind] == 0.0).all() or given

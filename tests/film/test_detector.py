@@ -19,7 +19,7 @@ from film.detector import (
     KEYPOINTS,
     MOST_BYTES,
     WEIGHTS,
-    Place,
+    Candidate,
     cut,
     palm_spread,
     peaks_of,
@@ -233,7 +233,7 @@ def test_drawn_hands_are_laid_over_photographs(lessons):
     green = Scene(np.full((240, 320, 3), (20, 200, 30), np.uint8), np.empty((0, 21, 2)), np.empty(0, np.int8))
     (drawn,), _ = lessons_of([scene._replace(mask=mask)], rng=rng)
     backgrounds, squares = lessons_of(
-        [green], lambda _: [Place(np.array([[9.0, 9.0], [99.0, 99.0]]), 0.0)], rng=rng
+        [green], lambda _: [Candidate(np.array([[9.0, 9.0], [99.0, 99.0]]), 0.0)], rng=rng
     )
     assert len(squares) == 3 and not any(len(square.sides) for square in squares)
     seen = [drawn.staged(backgrounds, rng).astype(int) for _ in range(60)]

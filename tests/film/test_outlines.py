@@ -4,7 +4,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from film.bundle import POSES, Bundle, Detections, State
-from film.outlines import Outlines, _shares
+from film.outlines import Outlines, _color_shares
 from gloves.takes.take import Take
 from tests.film.filmed import SIZE, Filming, moving_take, pose_of
 
@@ -40,4 +40,4 @@ def test_colors_are_smoothed_in_all_channels():
     rng = np.random.default_rng(0)
     counts = (rng.integers(0, 50, (32, 32, 32)) * (rng.random((32, 32, 32)) > 0.95)).astype(np.float32)
     smooth = gaussian_filter(counts, 1.0, mode="nearest")
-    np.testing.assert_allclose(_shares(counts), smooth / smooth.sum() + 3e-5, rtol=1e-5)
+    np.testing.assert_allclose(_color_shares(counts), smooth / smooth.sum() + 3e-5, rtol=1e-5)

@@ -299,8 +299,8 @@ def test_no_arm_ends_in_a_picture(kind):
         viewpoints = Viewpoints(ViewConfig(placement, "vga_wide"), take, rng=rng, user=user)
         for frame in range(0, 120, 20):
             cameras = viewpoints.cameras(frame)
-            moment = studio.reaching(Moment(take, frame), cameras, user)
-            ends = np.array([one.triangles.vertices[-1] for one in studio._drawn(moment, 0.0)])
+            moment = studio.with_arms(Moment(take, frame), cameras, user)
+            ends = np.array([one.triangles.vertices[-1] for one in studio.surfaces(moment)])
             for camera in cameras:
                 pixels, ahead = camera.project(ends), camera.local(ends)[:, 2] > 0.0
                 inside = ((pixels >= 0.0) & (pixels <= camera.size)).all(axis=1) & ahead

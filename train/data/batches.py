@@ -1,4 +1,4 @@
-"""Batches for training: random rows, stretched and corrupted anew by the paper's or a user's corruption."""
+"""Draws batches for training: random rows, stretched, and corrupted by the paper's or a user's corruption."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ def shuffled(
     *,
     rng: np.random.Generator,
 ) -> Cloud:
-    """Clouds of the present points [m] in random order, padded to the length of the fullest cloud."""
+    """Shuffle the present points [m] into clouds, padded to the length of the fullest cloud."""
     order = rng.random(present.shape).argsort(axis=1)
     order = np.take_along_axis(
         order, np.take_along_axis(~present, order, 1).argsort(axis=1, kind="stable"), 1
@@ -121,15 +121,15 @@ def shuffled(
 def _draw_ghosts(
     positions: NDArray[np.float64], known: NDArray[np.bool_], corruption: Corruption, rng: np.random.Generator
 ) -> NDArray[np.float64]:
-    """Zero to `ghosts` points, uniform in each cloud's box [m]; NaN for points that are not drawn."""
-    batch, most = len(positions), corruption.ghosts
+    """Draw zero to `ghosts` points [m], uniformly in each cloud's box; NaN for those that are not drawn."""
+    batch, max_ghosts = len(positions), corruption.ghosts
     low = np.where(known[..., None], positions, np.inf).min(1)
     high = np.where(known[..., None], positions, -np.inf).max(1)
     side = np.where(np.isfinite(high - low), high - low, np.nan)
-    uniform = rng.uniform(-corruption.margin / 2, 1 + corruption.margin / 2, size=(batch, most, 3))
+    uniform = rng.uniform(-corruption.margin / 2, 1 + corruption.margin / 2, size=(batch, max_ghosts, 3))
     ghosts: NDArray[np.float64] = low[:, None] + uniform * side[:, None]
-    num_ghosts = rng.integers(0, most + 1, size=batch)
-    ghosts[np.arange(most) >= num_ghosts[:, None]] = np.nan
+    num_ghosts = rng.integers(0, max_ghosts + 1, size=batch)
+    ghosts[np.arange(max_ghosts) >= num_ghosts[:, None]] = np.nan
     return ghosts
 
 
@@ -156,7 +156,7 @@ def draw_cloud(
     *,
     rng: np.random.Generator,
 ) -> Cloud:
-    """Shuffled clouds (B, N) of clean markers [m], by the paper's or a user's corruption."""
+    """Draw shuffled clouds (B, N) of clean markers [m], by the paper's or a user's corruption."""
     if isinstance(corruption, Corruption):
         return corrupt(markers, corruption, rng=rng)
     if isinstance(corruption, str):
@@ -169,11 +169,9 @@ def draw_cloud(
     owner = f"{_NOUN} '{name}'"
     if not isinstance(returned, tuple) or len(returned) != 2:
         raise ArgumentError(f"{owner} returns {type(returned).__name__}, expected the pair points, labels")
-    points, labels = (
-        as_numbers(f"points of {owner}", returned[0]),
-        as_numbers(f"labels of {owner}", returned[1], None),
-    )
-    _check(owner, points, labels, *markers.shape[:2])
+    points = as_numbers(f"points of {owner}", returned[0])
+    labels = as_numbers(f"labels of {owner}", returned[1], None)
+    _check_result(owner, points, labels, *markers.shape[:2])
     present = np.asarray(np.isfinite(points).all(axis=-1))
     return shuffled(points, present, labels.astype(np.int64), rng=rng)
 
@@ -184,7 +182,7 @@ def check_corruption(corruption: OwnCorruption | str, num_markers: int) -> None:
     draw_cloud(corruption, rng.uniform(-0.1, 0.1, (2, num_markers, 3)), rng=rng)
 
 
-def _check(
+def _check_result(
     owner: str, points: NDArray[np.float64], labels: NDArray[np.generic], batch: int, count: int
 ) -> None:
     """Refuse an invalid result of a user's corruption for `count` markers."""
@@ -204,8 +202,7 @@ def _check(
             f"{owner} returns points of which some coordinates are NaN or beyond {_MAX_COORDINATE:g} m, "
             "expected meters, and NaN for whole points that are missing"
         )
-    there = ~missing.any(axis=-1)
-    known = np.where(there, labels, -1).astype(np.int64)
+    known = np.where(missing.any(axis=-1), -1, labels).astype(np.int64)
     if known.min(initial=-1) < -1 or known.max(initial=-1) >= count:
         raise ArgumentError(
             f"{owner} returns labels from {known.min()} to {known.max()}, expected -1 to {count - 1}"
@@ -248,17 +245,17 @@ class Part:
         """This part of a batch."""
         if self.count == 1:
             return batch
-        mine = slice(self.first, None, self.count)
+        chosen = slice(self.first, None, self.count)
         cloud, total = batch.cloud, batch.cloud.present.sum()
-        width = max(1, int(cloud.present[mine].sum(axis=1).max()))  # points come before padding
-        part = Cloud(*(entry[mine, :width] for entry in cloud))
+        width = max(1, int(cloud.present[chosen].sum(axis=1).max()))  # points come before padding
+        part = Cloud(*(entry[chosen, :width] for entry in cloud))
         share = len(part.present) / len(cloud.present)
         weights = Weights(self.count * float(part.present.sum() / total), self.count * share)
-        return Batch(part, batch.markers[mine], weights)
+        return Batch(part, batch.markers[chosen], weights)
 
 
 def paper_corruption(num_markers: int) -> Corruption:
-    """The paper's recipe for a layout: up to 5 draws of 19 markers, up to 3 of 13, up to two ghosts."""
+    """The paper's corruption of a layout: up to 5 draws of 19 markers, or 3 of 13, and up to 2 ghosts."""
     return Corruption(occlude=round(num_markers / 4), ghosts=2)
 
 
@@ -281,7 +278,7 @@ class BatchRecipe:
 def draw_batch(
     rows: NDArray[np.void] | MappedRows, recipe: BatchRecipe, *, rng: np.random.Generator
 ) -> Batch:
-    """Corrupted, centered clouds of random rows [m]; left hands are mirrored to right ones."""
+    """Draw corrupted, centered clouds of random rows [m]; left hands are mirrored to right ones."""
     chosen = rows[rng.integers(len(rows), size=recipe.batch)]
     markers = chosen["markers"].astype(np.float64)
     center = markers.mean(axis=1, keepdims=True)
@@ -302,7 +299,7 @@ def draw_batch(
 def right_hands(
     rows: NDArray[np.void] | MappedRows, anisotropy: float, *, rng: np.random.Generator
 ) -> Float[np.ndarray, "B M 3"]:
-    """Centered markers of all rows [m], left hands mirrored, each hand stretched at random."""
+    """Center the markers of all rows [m], mirror left hands, and stretch each hand at random."""
     markers = rows["markers"]
     centered = markers - markers.mean(axis=1, keepdims=True)
     return stretched(centered @ _mirrors(rows["hand"]), anisotropy, rng=rng)
@@ -311,7 +308,7 @@ def right_hands(
 def stretched(
     markers: Float[np.ndarray, "B M 3"], anisotropy: float, *, rng: np.random.Generator
 ) -> Float[np.ndarray, "B M 3"]:
-    """Hands [m] stretched at random around the origin; anisotropy is the log standard deviation."""
+    """Stretch hands [m] at random around the origin; anisotropy is the log standard deviation."""
     return markers @ _stretches(len(markers), anisotropy, rng)
 
 

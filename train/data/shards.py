@@ -1,4 +1,4 @@
-"""Training sets on disk: `.npy` shards of rows and hands, and a manifest that lists and checks them.
+"""Reads and writes training sets: `.npy` shards of rows and hands, and a manifest that lists and checks them.
 
 A row is clean: the pose of the hand and what the rig sees of it. Jitter, drops and a shuffled order are added
 during training (`train.data.batches`). Rows stay in their files (`MappedRows`), so that the operating system
@@ -93,11 +93,11 @@ class Manifest(Settings):
             raise ArgumentError("config is not a table")
         if not 0 < len(set(self.marker_names)) == len(self.marker_names):
             raise ArgumentError("marker_names is not a list of different names")
-        here = _is_table_of(self.files, str) and all(
+        names_are_local = _is_table_of(self.files, str) and all(
             Path(name).name == name and len(name.encode(errors="replace")) <= _MAX_NAME_BYTES
             for name in self.files
         )
-        if not here:
+        if not names_are_local:
             raise ArgumentError("files is not a table of names of files in this folder and their SHA-256")
         if not (self.redrawn is None or _is_table_of(self.redrawn, int)):
             raise ArgumentError("redrawn is not a table of counts")
@@ -137,8 +137,8 @@ def load_redrawn(path: Path, num_shards: int) -> dict[str, int] | None:
 def array_bytes(dtype: np.dtype[np.void], count: int) -> int:
     """Length of the `.npy` file of `count` records [bytes]."""
     header = io.BytesIO()
-    about = np.lib.format.header_data_from_array_1_0(np.empty(0, dtype=dtype)) | {"shape": (count,)}
-    np.lib.format.write_array_header_1_0(header, about)
+    content = np.lib.format.header_data_from_array_1_0(np.empty(0, dtype=dtype)) | {"shape": (count,)}
+    np.lib.format.write_array_header_1_0(header, content)
     return len(header.getvalue()) + count * dtype.itemsize
 
 
@@ -156,8 +156,8 @@ def load_manifest(path: Path) -> Manifest:
     if path.is_file():
         raise DatasetError(f"{path} is a file, expected the folder of a training set")
     if not file.is_file():
-        again = "is unfinished; run handsim generate again"
-        hint = again if (path / CONFIG).is_file() else "holds none; handsim generate makes one"
+        unfinished = "is unfinished; run handsim generate again"
+        hint = unfinished if (path / CONFIG).is_file() else "holds none; handsim generate makes one"
         raise DatasetError(f"expected a training set with a {MANIFEST}, but {path} {hint}")
     content = load_json(file)
     if content.get("schema") != SCHEMA:
@@ -260,8 +260,8 @@ class Dataset:
 
     def _repr_html_(self) -> str:
         """The card that notebooks show: how often the rig sees each marker, in frames from all of the set."""
-        some = self.mapped_rows()[np.linspace(0, len(self) - 1, min(len(self), 1000)).astype(np.int64)]
-        seen = np.isfinite(some["observed"]).all(axis=-1).mean(axis=0)
+        sample = self.mapped_rows()[np.linspace(0, len(self) - 1, min(len(self), 1000)).astype(np.int64)]
+        seen = np.isfinite(sample["observed"]).all(axis=-1).mean(axis=0)
         facts = {
             "frames": str(len(self)),
             "folder": str(self.path),
@@ -280,10 +280,10 @@ class Dataset:
 
     def people(self) -> Int[np.ndarray, "T"]:
         """Person of each row, numbered from 0 through the set; rows of a person are contiguous."""
-        parts, known = [], 0
+        parts, first = [], 0
         for number, shard in enumerate(self.shards):
-            parts.append(known + shard["hand"].astype(np.int64) // len(SIDES))
-            known += len(self._hand_records(number)) // len(SIDES)
+            parts.append(first + shard["hand"].astype(np.int64) // len(SIDES))
+            first += len(self._hand_records(number)) // len(SIDES)
         return np.concatenate(parts)
 
     def hands(self, shard: int) -> list[HandShape]:
@@ -335,7 +335,7 @@ def load_dataset(dataset: Dataset | str | Place) -> Dataset:
 
 
 def _load_records(file: Path, *dtypes: np.dtype[np.void]) -> NDArray[np.void]:
-    """Memory-map records of one of these types; a `DatasetError` if the file holds other data."""
+    """Memory-map records of one of these types; raise a `DatasetError` if the file holds other data."""
     try:
         with file.open("rb") as content:
             check_npy_header(content, file.stat().st_size)

@@ -31,7 +31,7 @@ from train.simulation.room import (
     usual_room,
 )
 from train.simulation.scenes import KINDS, SIMULATED_KINDS, Kind, SceneMotion, sample_real_like_scene
-from train.simulation.takes import by_somebody, sample_scene
+from train.simulation.takes import first_capable_person, sample_scene
 from train.simulation.training_frames import (
     FrameScene,
     GenerateSettings,
@@ -72,7 +72,9 @@ def sample_work(
         work[kind] = []
         for _ in range(people):
             if kind == "real-like":
-                scene = by_somebody(kind, lambda: sample_real_like_scene(layout, num_frames, rng=rng))
+                scene = first_capable_person(
+                    kind, lambda: sample_real_like_scene(layout, num_frames, rng=rng)
+                )
             else:
                 scene = sample_scene(kind, layout, num_frames, rng=rng)
             walk = _walk(scene.num_frames / scene.rate, scene.num_frames, sides, rng)
@@ -135,7 +137,7 @@ def observe_poses(
         models = sample_hands(config.population, rng=rng)
         scene = sample_frame_scene(models, _POSES_PER_PERSON, config, rng=rng)
         fits = wear_gloves(layout, scene.hands, **config.slips, rng=rng)
-        hands = list(_observe(scene, fits, rig, rng))
+        hands = list(_observe_hands(scene, fits, rig, rng))
         observed += hands
         done += sum(len(hand.qpos) for hand in hands)
     return observed
@@ -154,10 +156,10 @@ def observe_motion(
     models = tuple(hand.model for hand in take.hands)
     fits = tuple(settle_glove(layout, model) for model in models)
     qpos = tuple(np.ascontiguousarray(poses[:, number]) for number in range(len(models)))
-    return list(_observe(FrameScene(models, qpos), fits, rig, rng))
+    return list(_observe_hands(FrameScene(models, qpos), fits, rig, rng))
 
 
-def _observe(
+def _observe_hands(
     scene: FrameScene, fits: tuple[GloveFit, ...], rig: CameraRig, rng: np.random.Generator
 ) -> Iterator[ObservedHand]:
     """What the rig captures of each hand in unrelated frames."""
@@ -260,7 +262,7 @@ class CameraLoss(NamedTuple):
 def forecast(lit: Sequence[LitScene], rig: CameraRig, *, seed: int = 0) -> Forecast:
     """Forecast of scenes seen by a rig, with noise and losses from a seed."""
     rng = np.random.default_rng(seed)
-    counts, gaps, spreads = zip(*(_count(one, rig, rng) for one in lit), strict=True)
+    counts, gaps, spreads = zip(*(_count_scene(one, rig, rng) for one in lit), strict=True)
     frames, scene_frames, minutes, two, three, missing, ghosts = map(sum, zip(*counts, strict=True))
     runs = np.concatenate(gaps, axis=1)
     begun = runs[:, runs[1] > 0.0]
@@ -277,7 +279,7 @@ def forecast(lit: Sequence[LitScene], rig: CameraRig, *, seed: int = 0) -> Forec
     )
 
 
-def _count(
+def _count_scene(
     one: LitScene, rig: CameraRig, rng: np.random.Generator
 ) -> tuple[tuple[int, int, float, int, int, int, int], Float[np.ndarray, "3 G"], Float[np.ndarray, "N 3 3"]]:
     """Counts of a scene, its gaps, and covariances of some points [m^2].

@@ -20,14 +20,7 @@ from handsim.callbacks import OnStep, no_step
 from handsim.errors import ArgumentError
 from handsim.space.camera import Camera, focal_of_angle, look_at, pinhole
 from handsim.space.objects import MARKER_RADIUS
-from handsim.space.rig import (
-    HAND_REACH,
-    MAX_CAMERAS,
-    MAX_SIDE,
-    MIN_CAMERAS,
-    CameraRig,
-    load_rig,
-)
+from handsim.space.rig import HAND_REACH, MAX_CAMERAS, MAX_SIDE, MIN_CAMERAS, CameraRig, load_rig
 from train.forecast.rig_forecast import OPTICS, Forecast, forecast, light_work, sample_work
 from train.forecast.settings import Mount, PlanRigSettings
 from train.simulation.room import SceneSight, marker_radii
@@ -104,7 +97,7 @@ def plan_rig(
     lengths = check_array("room", room, (3,))
     if not ((lengths > 0.0) & (lengths < MAX_SIDE)).all():
         raise ArgumentError(
-            f"room is {_lengths(lengths)}, expected three lengths, each above 0 and below {MAX_SIDE:g} m"
+            f"room is {_meters(lengths)}, expected three lengths, each above 0 and below {MAX_SIDE:g} m"
         )
     sides, center = np.array(chosen.volume, dtype=np.float64), np.array(chosen.center, dtype=np.float64)
     focal = focal_of_angle(min(chosen.size), np.deg2rad(chosen.field_of_view))
@@ -144,8 +137,10 @@ def places(
     sides: Float[np.ndarray, "3"],
 ) -> tuple[Float[np.ndarray, "K 4 4"], Float[np.ndarray, "K 3"]]:
     """Poses `T_world_camera` of all candidates on the mounts of a room, and their targets in a volume [m]."""
+    positions_on = {"walls": _wall_positions, "truss": _truss_positions, "tripods": _tripod_positions}
     for step in _STEPS:
-        found = np.unique(np.concatenate([_ON[mount](room, step) for mount in mounts]).round(6), axis=0)
+        positions = np.concatenate([positions_on[mount](room, step) for mount in mounts])
+        found = np.unique(positions.round(6), axis=0)
         found[:, :2] += center[:2]
         nearest = np.clip(found, center - sides / 2, center + sides / 2)
         found = found[np.linalg.norm(found - nearest, axis=1) >= HAND_REACH]
@@ -153,8 +148,8 @@ def places(
             break
     if not len(found):
         raise ArgumentError(
-            f"in a room of {_lengths(room)} no place on {' and '.join(mounts)} is {HAND_REACH:g} m or more "
-            f"from the volume of {_lengths(sides)}; expected a larger room"
+            f"in a room of {_meters(room)} no place on {' and '.join(mounts)} is {HAND_REACH:g} m or more "
+            f"from the volume of {_meters(sides)}; expected a larger room"
         )
     aims = [center]
     for axis in range(3):
@@ -165,51 +160,50 @@ def places(
     return np.stack([look_at(position, aim) for position, aim in pairs]), np.stack([aim for _, aim in pairs])
 
 
-def _on_walls(room: NDArray[np.float64], step: float) -> NDArray[np.float64]:
+def _wall_positions(room: NDArray[np.float64], step: float) -> NDArray[np.float64]:
     """Positions (N, 3) on the four walls [m]."""
     width, depth = room[:2] / 2 - _CLEARANCE
-    return _product(_outline(width, depth, step), _line(_MIN_HEIGHT, room[2] - _CLEARANCE, step))
+    return _at_heights(_outline(width, depth, step), _spaced(_MIN_HEIGHT, room[2] - _CLEARANCE, step))
 
 
-def _on_truss(room: NDArray[np.float64], step: float) -> NDArray[np.float64]:
+def _truss_positions(room: NDArray[np.float64], step: float) -> NDArray[np.float64]:
     """Positions (N, 3) on the beams along all four upper edges, and on the posts below their ends [m]."""
     width, depth = room[:2] / 2
-    beams = _product(_outline(width, depth, step), np.array([room[2] - _CLEARANCE]))
+    beams = _at_heights(_outline(width, depth, step), np.array([room[2] - _CLEARANCE]))
     corners = np.array([[x, y] for x in (-width, width) for y in (-depth, depth)])
-    return np.concatenate([beams, _product(corners, _line(_MIN_HEIGHT, room[2] - _CLEARANCE, step))])
+    return np.concatenate([beams, _at_heights(corners, _spaced(_MIN_HEIGHT, room[2] - _CLEARANCE, step))])
 
 
-def _on_tripods(room: NDArray[np.float64], step: float) -> NDArray[np.float64]:
+def _tripod_positions(room: NDArray[np.float64], step: float) -> NDArray[np.float64]:
     """Positions (N, 3) of tripods all over the floor [m]."""
     width, depth = room[:2] / 2 - 3 * _CLEARANCE
-    along, across = _line(-width, width, step), _line(-depth, depth, step)
+    along, across = _spaced(-width, width, step), _spaced(-depth, depth, step)
     floor = np.stack(np.meshgrid(along, across, indexing="ij"), axis=-1).reshape(-1, 2)
-    return _product(floor, np.array([height for height in _TRIPOD_HEIGHTS if height < room[2] - _CLEARANCE]))
-
-
-_ON: Final = {"walls": _on_walls, "truss": _on_truss, "tripods": _on_tripods}
+    return _at_heights(
+        floor, np.array([height for height in _TRIPOD_HEIGHTS if height < room[2] - _CLEARANCE])
+    )
 
 
 def _outline(width: float, depth: float, step: float) -> NDArray[np.float64]:
     """Points (N, 2) on a rectangle with these half sides, about one step apart [m]."""
-    along, across = _line(-width, width, step), _line(-depth, depth, step)
+    along, across = _spaced(-width, width, step), _spaced(-depth, depth, step)
     sides = [np.stack([along, np.full(len(along), end)], axis=1) for end in (-depth, depth)]
     sides += [np.stack([np.full(len(across), end), across], axis=1) for end in (-width, width)]
     return np.concatenate(sides)
 
 
-def _line(low: float, high: float, step: float) -> NDArray[np.float64]:
+def _spaced(low: float, high: float, step: float) -> NDArray[np.float64]:
     """Evenly spaced numbers from end to end, about one step apart."""
     return np.linspace(low, high, max(1, round((high - low) / step)) + 1)
 
 
-def _product(floor: NDArray[np.float64], heights: NDArray[np.float64]) -> NDArray[np.float64]:
+def _at_heights(floor: NDArray[np.float64], heights: NDArray[np.float64]) -> NDArray[np.float64]:
     """Points (N, 3) [m]: each floor point (N, 2) at each height."""
     above = np.repeat(floor, len(heights), axis=0)
     return np.column_stack([above, np.tile(heights, len(floor))])
 
 
-def _lengths(sides: NDArray[np.float64]) -> str:
+def _meters(sides: NDArray[np.float64]) -> str:
     return " x ".join(f"{one:g}" for one in sides) + " m"
 
 
@@ -294,7 +288,7 @@ class Planning:
 
     def value_of(self, chosen: Sequence[int]) -> float:
         """Value of a set of cameras."""
-        seen = [int(np.bitwise_count(plane).sum()) for plane in self._planes(chosen)]
+        seen = [int(np.bitwise_count(plane).sum()) for plane in self._coverage_bits(chosen)]
         shares = np.array(seen) / self._views.num_marker_frames
         error = _mean_error(self._views.information[:, list(chosen)].sum(axis=1)[:, None])
         return float(shares @ _WEIGHTS - _ERROR_COST * error[0])
@@ -310,8 +304,8 @@ class Planning:
                 )
             self.chosen.append(int(values.argmax()))
 
-    def exchange(self, told: Callable[[float], None] = lambda value: None) -> None:
-        """Move one camera at a time to the best candidate while that helps; `told` gets each new value."""
+    def exchange(self, on_value: Callable[[float], None] = lambda value: None) -> None:
+        """Move one camera at a time to the best candidate while the value rises; report it to `on_value`."""
         value, idle, number = self.value_of(self.chosen), 0, len(self._kept)
         free = len(self.chosen) - len(self._kept)
         for _ in range(200):
@@ -323,13 +317,13 @@ class Planning:
             idle += 1
             if values[best] > value + _MIN_GAIN:
                 self.chosen[number], value, idle = best, float(values[best]), 0
-                told(value)
+                on_value(value)
             number = number + 1 if number + 1 < len(self.chosen) else len(self._kept)
 
     def _values_with(self, chosen: Sequence[int]) -> NDArray[np.float64]:
         """Values (K,) of the chosen cameras plus each candidate; -inf if it is too close to another."""
         views = self._views
-        planes = self._planes(chosen)
+        planes = self._coverage_bits(chosen)
         values = np.zeros(len(views.bits))
         before = [~np.zeros_like(planes[0]), *planes[:-1]]
         for weight, plane, fewer in zip(_WEIGHTS, planes, before, strict=True):
@@ -339,12 +333,11 @@ class Planning:
         information = views.information[:, list(chosen)].sum(axis=1)[:, None]
         values -= _ERROR_COST * _mean_error(information + views.information)
         for camera in chosen:
-            values[
-                np.linalg.norm(views.positions - views.positions[camera], axis=1) < _MIN_DISTANCE
-            ] = -np.inf
+            distances = np.linalg.norm(views.positions - views.positions[camera], axis=1)
+            values[distances < _MIN_DISTANCE] = -np.inf
         return values
 
-    def _planes(self, chosen: Sequence[int]) -> list[NDArray[np.uint64]]:
+    def _coverage_bits(self, chosen: Sequence[int]) -> list[NDArray[np.uint64]]:
         """Bits of the marker-frames seen by at least one, two, ... of the chosen cameras."""
         planes = [np.zeros_like(self._views.bits[0]) for _ in _WEIGHTS]
         for camera in chosen:

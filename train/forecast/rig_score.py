@@ -126,7 +126,7 @@ class RigScore:
         suspicious = [f"Suspicious: {fault}." for fault in self.faults]
         if self.whole.missing >= 1.0:
             return [*suspicious, "No point is seen: hands work where no two cameras look."]
-        return [*suspicious, *_sentences(self)]
+        return [*suspicious, *_advice_sentences(self)]
 
     def record(self) -> dict[str, Any]:
         """All figures as JSON, in meters and seconds; unknown ones are null."""
@@ -135,11 +135,11 @@ class RigScore:
             "seed": self.seed,
             "rig": self.rig.name,
             "cameras": len(self.rig.cameras),
-            "all": _figures(self.whole),
-            "kinds": {kind: _figures(one) for kind, one in self.kinds.items()},
+            "all": _forecast_record(self.whole),
+            "kinds": {kind: _forecast_record(one) for kind, one in self.kinds.items()},
             "without_camera": [
                 {"seen": one.seen, "needed": one.needed}
-                | ({} if one.without is None else _figures(one.without))
+                | ({} if one.without is None else _forecast_record(one.without))
                 for one in self.losses
             ],
             "volume": plain_json(self.volume._asdict()),
@@ -179,15 +179,15 @@ def score_rig(
         layout = load_layout(_GLOVE if glove is None else glove)
         rng = np.random.default_rng(chosen.seed)
         work = sample_work(layout, center, sides, chosen.num_frames, _PEOPLE, rng=rng)
-        told = f"simulated people in the glove {layout.name}"
+        text = f"simulated people in the glove {layout.name}"
     else:
-        told = "a take" if isinstance(take, Take) else f"the take {Path(take).name}"
+        text = "a take" if isinstance(take, Take) else f"the take {Path(take).name}"
         given = take if isinstance(take, Take) else load_take(take)
         work = work_of_take(given, None if glove is None else load_layout(glove), chosen.num_frames)
         wrists = [hand.qpos[:, :3] for scenes in work.values() for one in scenes for hand in one.hands]
         center = np.concatenate(wrists).mean(axis=0) if chosen.center is None else np.array(chosen.center)
     on_step("forecasting")
-    return score_work(cameras, work, center, sides, told=told, seed=chosen.seed)
+    return score_work(cameras, work, center, sides, described_as=text, seed=chosen.seed)
 
 
 def score_work(
@@ -196,10 +196,10 @@ def score_work(
     center: Float[np.ndarray, "3"],
     sides: Float[np.ndarray, "3"],
     *,
-    told: str,
+    described_as: str,
     seed: int = 0,
 ) -> RigScore:
-    """Score for scenes of each kind of work, described by `told`, and for a volume that is mapped [m]."""
+    """Score a rig on scenes of each kind of work, and map a volume [m]; `described_as` is shown to users."""
     rng = np.random.default_rng(seed)
     lit = light_work(work, rig, rng=rng)
     everything = [one for scenes in lit.values() for one in scenes]
@@ -210,7 +210,7 @@ def score_work(
         camera_losses(everything, rig, seed=seed),
         map_volume([one.scene for one in everything], rig, center, sides, rng=rng),
         faults(rig),
-        told,
+        described_as,
         seed,
     )
 
@@ -258,14 +258,14 @@ def cube_points(
     return np.asarray(center + grid * sides)
 
 
-def _figures(one: Forecast) -> dict[str, Any]:
+def _forecast_record(one: Forecast) -> dict[str, Any]:
     axes, directions, mean = one.error
     figures: dict[str, Any] = {field.name: getattr(one, field.name) for field in dataclasses.fields(one)}
     figures |= {"error": mean, "error_axes": axes, "error_directions": directions}
     return {name: plain_json(value) for name, value in figures.items()}
 
 
-def _sentences(score: RigScore) -> Iterator[str]:
+def _advice_sentences(score: RigScore) -> Iterator[str]:
     """Sentences on the figures of a rig, the worst problem first."""
     whole, (axes, directions, _) = score.whole, score.whole.error
     if whole.missing > _MANY_MISSING:
@@ -277,8 +277,8 @@ def _sentences(score: RigScore) -> Iterator[str]:
     worst = int(seen.argmin())
     if seen[worst] < _POOR_CORNER * seen.max():
         yield (
-            f"At {_place(score.volume.points[worst])} two cameras see {100 * seen[worst]:.0f} % of a hand's "
-            f"markers, {100 * seen.max():.0f} % at the best place: keep hands away or aim a camera "
+            f"At {_position(score.volume.points[worst])} two cameras see {100 * seen[worst]:.0f} % of a "
+            f"hand's markers, {100 * seen.max():.0f} % at the best place: keep hands away or aim a camera "
             "at it."
         )
     yield from _camera_sentences(score)
@@ -290,9 +290,8 @@ def _sentences(score: RigScore) -> Iterator[str]:
         )
     if whole.ghosts > _MANY_GHOSTS:
         worst_kind = max(score.kinds, key=lambda kind: score.kinds[kind].ghosts)
-        most = (
-            f", most with {worst_kind} ({score.kinds[worst_kind].ghosts:.1f})" if len(score.kinds) > 1 else ""
-        )
+        count = f"{score.kinds[worst_kind].ghosts:.1f}"
+        most = f", most with {worst_kind} ({count})" if len(score.kinds) > 1 else ""
         yield (
             f"{whole.ghosts:.1f} points a frame will be no marker{most}: reflections that cameras see, "
             "mirror images, and rays that meet by chance where few cameras see a marker."
@@ -319,13 +318,13 @@ def _camera_sentences(score: RigScore) -> Iterator[str]:
     if not idle:
         return
     least = min(idle, key=lambda number: idle[number])
-    told = (
+    reason = (
         f"it sees {100 * score.losses[least - 1].needed:.1f} % of the marker-frames that no two others see, "
         f"and without it {100 * idle[least]:.1f} % are missing, not {100 * score.whole.missing:.1f} %"
     )
     others = ", ".join(str(number) for number in idle if number != least)
     also = f". So can any one of {others}; score the rig again after each" if others else ""
-    yield f"Camera {least} can go: {told}{also}."
+    yield f"Camera {least} can go: {reason}{also}."
 
 
 def faults(rig: CameraRig) -> list[str]:
@@ -355,7 +354,7 @@ def _axes_faults(rig: CameraRig, point: NDArray[np.float64]) -> Iterator[str]:
         )
         return
     for number in np.flatnonzero(~rig.in_view(point)) + 1:
-        yield f"camera {number} looks away: {_place(point)}, where the others look, is not in its picture"
+        yield f"camera {number} looks away: {_position(point)}, where the others look, is not in its picture"
     for number in np.flatnonzero(-rig.T_world_camera[:, 2, 1] < _UPSIDE_DOWN) + 1:
         yield f"camera {number} is upside down: y of its picture points up in the world, expected down"
 
@@ -373,8 +372,8 @@ def _place_faults(rig: CameraRig, point: NDArray[np.float64]) -> Iterator[str]:
         )
     if np.linalg.norm(point - ROOM_CENTER) > _OFF_CENTER:
         yield (
-            f"the cameras look at {_place(point)}; simulated hands move around "
-            f"{_place(np.array(ROOM_CENTER))}, so give generate, simulate and rig score --center, or move "
+            f"the cameras look at {_position(point)}; simulated hands move around "
+            f"{_position(np.array(ROOM_CENTER))}, so give generate, simulate and rig score --center, or move "
             "the rig's origin"
         )
     gaps = np.linalg.norm(positions - np.clip(positions, point - HALF_SIDE, point + HALF_SIDE), axis=1)
@@ -400,7 +399,7 @@ def _place_faults(rig: CameraRig, point: NDArray[np.float64]) -> Iterator[str]:
     if covered < _COVERED:
         yield (
             f"two cameras see only {100 * covered:.0f} % of the cube of {2 * HALF_SIDE:g} m around "
-            f"{_place(point)}, expected all of it"
+            f"{_position(point)}, expected all of it"
         )
 
 
@@ -411,7 +410,7 @@ def pixels_of_a_marker(rig: CameraRig, point: Float[np.ndarray, "3"]) -> NDArray
     return np.asarray(2 * MARKER_RADIUS * focals / np.maximum(distances, 1e-9))
 
 
-def _place(point: Float[np.ndarray, "3"]) -> str:
+def _position(point: Float[np.ndarray, "3"]) -> str:
     return f"({coordinates(point, ', ')}) m"
 
 
@@ -447,15 +446,17 @@ def write_rig_page(path: Path, score: RigScore) -> None:
 
 def work_table(score: RigScore) -> list[list[str]]:
     """Figures of each kind of work and of all work, header first."""
-    rows = [[kind, *_cells(one)] for kind, one in score.kinds.items()] if len(score.kinds) > 1 else []
-    return [["work", *_COLUMNS], *rows, ["all", *_cells(score.whole)]]
+    rows = (
+        [[kind, *_forecast_cells(one)] for kind, one in score.kinds.items()] if len(score.kinds) > 1 else []
+    )
+    return [["work", *_COLUMNS], *rows, ["all", *_forecast_cells(score.whole)]]
 
 
 def camera_table(score: RigScore) -> list[list[str]]:
     """Figures without each camera, header first."""
     rows = []
     for number, one in enumerate(score.losses, 1):
-        left = [NOTHING] * len(_COLUMNS) if one.without is None else _cells(one.without)
+        left = [NOTHING] * len(_COLUMNS) if one.without is None else _forecast_cells(one.without)
         rows.append([str(number), f"{100 * one.seen:.1f}", f"{100 * one.needed:.1f}", *left])
     return [["without camera", "sees [%]", "needed [%]", *_COLUMNS], *rows]
 
@@ -474,7 +475,7 @@ def volume_table(volume: VolumeMap) -> list[list[str]]:
     return rows
 
 
-def _cells(one: Forecast) -> list[str]:
+def _forecast_cells(one: Forecast) -> list[str]:
     return [
         f"{100 * one.seen_by_two:.1f}",
         f"{100 * one.seen_by_three:.1f}",

@@ -31,7 +31,7 @@ SIGNS: Final = np.array(list(product((1.0, -1.0), repeat=3)))
 """Signs (8, 3) of the principal axes: four rotations for each side of the body."""
 MIRROR_IMAGE: Final = np.array([-1.0, 1.0, 1.0])
 """Signs of the camera's axes in a mirrored view."""
-_CANDIDATES: Final = 10  # views of which the best is chosen (Han et al., section 3.1)
+_NUM_VIEWS: Final = 10  # views of which the best is chosen (Han et al., section 3.1)
 _MOMENTS: Final = tuple(
     powers for order in (3, 5) for powers in combinations_with_replacement(range(3), order)
 )
@@ -55,9 +55,9 @@ _SEARCH_REJECT: Final = 0.04  # [m] default cost of a point without a label
 _SPREAD: Final = 0.005  # [m] default scale of the confidence
 _ACCEPTED_DISTANCE: Final = 0.01  # [m] A view with a smaller mean distance of labeled points is accepted.
 _ACCEPTED_GHOSTS: Final = 2  # largest number of unlabeled points in an accepted view
-_TOGETHER: Final = (1, 2)  # numbers of first views tried together, before all others
-_TURNS: Final = 2  # number of times that each first view is aligned by the predictions
-_IMAGES: Final = 128  # largest number of images in one call of the network
+_FIRST_GROUPS: Final = (1, 2)  # numbers of first views tried together, before all others
+_ALIGNMENTS: Final = 2  # number of times that each first view is aligned by the predictions
+_MOST_IMAGES: Final = 128  # largest number of images in one call of the network
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -153,7 +153,7 @@ def spread_views(
     The ten views are equal for all clouds. The extent is the smaller eigenvalue of the projection's
     covariance; the larger one decides between equals.
     """
-    candidates = random_views(_CANDIDATES, rng=rng)  # (V, 3, 3)
+    candidates = random_views(_NUM_VIEWS, rng=rng)  # (V, 3, 3)
     offsets, _ = centered(points, present)
     covariance = offsets.swapaxes(1, 2) @ offsets / np.maximum(present.sum(1), 1)[:, None, None]  # (B, 3, 3)
     image_axes = candidates[:, :2]  # (V, 2, 3)
@@ -266,7 +266,7 @@ def _view_frames(
     )
 
 
-class _View(NamedTuple):
+class _ViewFit(NamedTuple):
     """Fit of the markers predicted from one view to a cloud."""
 
     distances: Float[np.ndarray, "N M"]
@@ -275,9 +275,6 @@ class _View(NamedTuple):
     """Mean cost of a point in equation 1 [m]."""
     accepted: bool
     """Whether the fit is so good that no other view is tried."""
-
-
-_NONE: Final = _View(np.zeros((0, 0)), np.inf, False)
 
 
 class CNNLabeler:
@@ -318,13 +315,13 @@ class CNNLabeler:
         else:  # A fixed seed gives equal clouds equal labels.
             shown = spread_views(points, present, rng=np.random.default_rng(0))
             views = np.stack([shown, MIRROR_IMAGE[:, None] * shown], axis=1)
-        best = [_NONE] * len(clouds)
+        best = [_ViewFit(np.zeros((0, 0)), np.inf, False)] * len(clouds)  # worse than any view
         pending = np.arange(len(clouds))
-        for tried in np.split(np.arange(views.shape[1]), np.cumsum(_TOGETHER)):
+        for tried in np.split(np.arange(views.shape[1]), np.cumsum(_FIRST_GROUPS)):
             rows = np.repeat(pending, len(tried))
             predicted = self.predict(points[rows], present[rows], views[pending][:, tried].reshape(-1, 3, 3))
             for row, markers in zip(rows, predicted, strict=True):
-                view = _compare(points[row, present[row]], markers)
+                view = _fit_view(points[row, present[row]], markers)
                 best[row] = min(best[row], view, key=lambda each: each.cost)
             pending = pending[[not best[row].accepted for row in pending]]
             if not len(pending):
@@ -341,7 +338,7 @@ class CNNLabeler:
         predicted = self._predict_once(points, present, views)
         if self._aligned:
             sides = np.sign(np.linalg.det(views))
-            for _ in range(_TURNS):
+            for _ in range(_ALIGNMENTS):
                 views = self._hand.align(predicted, sides)
                 predicted = self._predict_once(points, present, views)
         return predicted
@@ -351,8 +348,8 @@ class CNNLabeler:
     ) -> NDArray[np.float64]:
         """Markers (B, M, 3) [m] predicted from these views."""
         parts = [np.zeros((0, len(self.marker_names), 3))]
-        for first in range(0, len(points), _IMAGES):
-            part = slice(first, first + _IMAGES)
+        for first in range(0, len(points), _MOST_IMAGES):
+            part = slice(first, first + _MOST_IMAGES)
             images, frames = depth_images(points[part], present[part], views[part])
             normalized = self._positions(images[:, None]).astype(np.float64)
             check_output(normalized)
@@ -360,7 +357,7 @@ class CNNLabeler:
         return np.concatenate(parts)
 
 
-def _compare(points: NDArray[np.float64], markers: NDArray[np.float64]) -> _View:
+def _fit_view(points: NDArray[np.float64], markers: NDArray[np.float64]) -> _ViewFit:
     """Compare predicted markers (M, 3) [m] with points (N, 3) [m]."""
     distances = np.linalg.norm(points[:, None] - markers, axis=-1)
     labels = match_distances(distances, _SEARCH_REJECT)
@@ -368,7 +365,7 @@ def _compare(points: NDArray[np.float64], markers: NDArray[np.float64]) -> _View
     costs = np.where(labeled, distances[np.arange(len(points)), labels], _SEARCH_REJECT)
     near = len(points) == 0 or (labeled.any() and float(costs[labeled].mean()) <= _ACCEPTED_DISTANCE)
     accepted = bool(near and (~labeled).sum() <= _ACCEPTED_GHOSTS)
-    return _View(distances, float(costs.mean()) if len(costs) else 0.0, accepted)
+    return _ViewFit(distances, float(costs.mean()) if len(costs) else 0.0, accepted)
 
 
 def label_by_distance(distances: Float[np.ndarray, "N M"], reject: float, spread: float) -> Labeling:

@@ -189,23 +189,23 @@ def sample_worn_markers(
 
 def is_learned(layout: MarkerLayout) -> bool:
     """Whether the cache has a labeler of a glove."""
-    return _file_of(layout).exists()
+    return _cache_file(layout).exists()
 
 
 def learned_labeler(layout: MarkerLayout, rig: CameraRig | str = "figure5") -> LayoutLabeler:
     """The labeler of a glove: learned in some minutes the first time, later read from the cache."""
-    file = _file_of(layout, rig)
-    found = _read(file, layout)
+    file = _cache_file(layout, rig)
+    found = _read_cached(file, layout)
     if found is not None:
         return found
     learned = fine_tuned_labeler(layout, rig)
     try:
-        _write(file, learned)
+        _write_cached(file, learned)
     except OSError as error:
         kept = f"the labeler of glove '{layout.name}' cannot be kept in {file.parent} ({error.strerror})"
         warnings.warn(f"{kept}; set XDG_CACHE_HOME to a folder of yours", HandSimWarning, stacklevel=2)
         return learned
-    return _read(file, layout) or learned
+    return _read_cached(file, layout) or learned
 
 
 @functools.lru_cache(maxsize=MAX_KEPT)
@@ -221,12 +221,12 @@ def _digest(layout: MarkerLayout, rig: CameraRig | str) -> str:
     return hashlib.sha256(json.dumps(dependencies, sort_keys=True).encode()).hexdigest()[:32]
 
 
-def _file_of(layout: MarkerLayout, rig: CameraRig | str = "figure5") -> Path:
+def _cache_file(layout: MarkerLayout, rig: CameraRig | str = "figure5") -> Path:
     """Path of a glove's labeler in the cache."""
     return learned_folder() / f"{_digest(layout, rig)}{LEARNED}"
 
 
-def _read(file: Path, layout: MarkerLayout) -> LayoutLabeler | None:
+def _read_cached(file: Path, layout: MarkerLayout) -> LayoutLabeler | None:
     """A labeler from the cache; None if it is missing or damaged. A damaged file is removed."""
     from safetensors import SafetensorError
     from safetensors.numpy import load
@@ -244,7 +244,7 @@ def _read(file: Path, layout: MarkerLayout) -> LayoutLabeler | None:
     return labeler
 
 
-def _write(file: Path, labeler: LayoutLabeler) -> None:
+def _write_cached(file: Path, labeler: LayoutLabeler) -> None:
     """Write a labeler into the cache, and remove the least recently used ones."""
     from safetensors.numpy import save
 
@@ -256,11 +256,7 @@ def _write(file: Path, labeler: LayoutLabeler) -> None:
 
 
 def fine_tuned_labeler(
-    layout: MarkerLayout,
-    rig: CameraRig | str = "figure5",
-    *,
-    num_clouds: int = NUM_CLOUDS,
-    seed: int = 0,
+    layout: MarkerLayout, rig: CameraRig | str = "figure5", *, num_clouds: int = NUM_CLOUDS, seed: int = 0
 ) -> LayoutLabeler:
     """Train the labeler for any layout on clouds of one layout, as seen by a rig.
 

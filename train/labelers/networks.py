@@ -151,10 +151,7 @@ class MessageRound(nn.Module):
         )
 
     def forward(
-        self,
-        features: Float[Tensor, "B N W"],
-        bumps: Float[Tensor, "B K N*N"],
-        there: Float[Tensor, "B N 1"],
+        self, features: Float[Tensor, "B N W"], bumps: Float[Tensor, "B K N*N"], there: Float[Tensor, "B N 1"]
     ) -> Float[Tensor, "B N W"]:
         """Features after one exchange; `there` is 0 for padding, which sends no message."""
         batch, count, width = features.shape
@@ -230,10 +227,7 @@ class LayoutNetwork(nn.Module):
         self.exchanges = nn.ModuleList(MatchExchange(config) for _ in range(config.match_rounds))
 
     def forward(
-        self,
-        points: Float[Tensor, "B N 3"],
-        present: Bool[Tensor, "B N"],
-        layouts: Float[Tensor, "G M M K"],
+        self, points: Float[Tensor, "B N 3"], present: Bool[Tensor, "B N"], layouts: Float[Tensor, "G M M K"]
     ) -> list[LabelScores]:
         """Scores after each comparison, the best last.
 

@@ -74,8 +74,7 @@ def checked_names(names: object) -> tuple[str, ...]:
 
 @with_own_numerics
 def label_in_batches(
-    frames: Sequence[Float[np.ndarray, "N 3"]],
-    label: Callable[[list[NDArray[np.float64]]], list[Labeling]],
+    frames: Sequence[Float[np.ndarray, "N 3"]], label: Callable[[list[NDArray[np.float64]]], list[Labeling]]
 ) -> list[Labeling]:
     """Validate frames, and label them in batches of similar size, so that padding stays small."""
     clouds = check_clouds(frames)

@@ -85,7 +85,7 @@ _DESCRIPTION: Final = (
     "Labels the reflective markers of one hand in one frame. Compute in float32: runtimes that choose "
     "bfloat16 by themselves change labels (OpenVINO: INFERENCE_PRECISION_HINT f32)."
 )
-_MEANINGS: Final = {
+_DESCRIPTIONS: Final = {
     "points": "Points of each frame in meters, less their mean; axes of any direction. Zeros where there is "
     "none.",
     "present": "Whether a row of points is one.",
@@ -187,13 +187,13 @@ def _resolved(labeler: Any) -> Labeler:
         return OnnxLabeler(path)
     if not path.exists() and (is_plugin(name) or name in list_plugins(LABELERS)):
         return OwnLabeler(name)
-    return _read(*_files(name)).labeler()
+    return _read_labeler(*_files_of_labeler(name)).labeler()
 
 
 def _shipped_labeler(layout: MarkerLayout) -> Labeler | None:
     """The shipped labeler of a layout, if there is one."""
     found = (name for name in shipped_labelers() if load_layout(name) == layout)
-    return next((_read(*_files(name)).labeler() for name in found), None)
+    return next((_read_labeler(*_files_of_labeler(name)).labeler() for name in found), None)
 
 
 def untrained_labeler(layout: MarkerLayout) -> Labeler:
@@ -237,11 +237,11 @@ def shipped_labelers() -> tuple[str, ...]:
 
 def load_network(name_or_path: str | Path) -> tuple[nn.Module, dict[str, Any]]:
     """A trained network and its model card."""
-    stored = _read(*_files(str(name_or_path)))
+    stored = _read_labeler(*_files_of_labeler(str(name_or_path)))
     return stored.network(), stored.card
 
 
-def _files(name: str) -> tuple[Path, Path]:
+def _files_of_labeler(name: str) -> tuple[Path, Path]:
     """Paths of weights and card, of a shipped labeler or in a folder."""
     if name in shipped_labelers():
         return _SHIPPED / f"{name}.safetensors", _SHIPPED / f"{name}.json"
@@ -291,7 +291,7 @@ class _Stored:
         return network
 
 
-def _read(weights: Path, card: Path) -> _Stored:
+def _read_labeler(weights: Path, card: Path) -> _Stored:
     """Read and validate weights and card."""
     from safetensors import SafetensorError
     from safetensors.numpy import load_file
@@ -412,13 +412,13 @@ class OnnxLabeler:
                 stored = base64.b64decode(metadata[_ONNX_PRIOR], validate=True)
                 self.prior = PosePrior.of_tensors(read_npz(stored), len(self.marker_names))
             self._label = self._label_by_images(metadata[_CNN]) if _CNN in metadata else self._label_by_scores
-            self._try(_IMAGES if _CNN in metadata else _INPUTS[0])
+            self._check_outputs(_IMAGES if _CNN in metadata else _INPUTS[0])
         except Exception as error:  # onnxruntime's errors have no common class.
             raise WeightsError(
                 f"{path} is damaged or not a labeler's: expected what handsim export wrote"
             ) from error
 
-    def _try(self, given: str) -> None:
+    def _check_outputs(self, given: str) -> None:
         """Raise a ValueError unless the outputs are finite and have a labeler's shapes."""
         count = len(self.marker_names)
         if given == _IMAGES:
@@ -501,7 +501,7 @@ def export_onnx(network: nn.Module, marker_names: Sequence[str], path: Path) -> 
         model.producer_name, model.producer_version = "handsim", full_version()
         model.doc_string = model.graph.doc_string = _DESCRIPTION
         for value in (*model.graph.input, *model.graph.output):
-            value.doc_string = properties[f"handsim.{value.name}"] = _MEANINGS[value.name]
+            value.doc_string = properties[f"handsim.{value.name}"] = _DESCRIPTIONS[value.name]
         onnx.helper.set_model_props(model, properties)
         onnx.checker.check_model(model, full_check=True)
         temporary.write_bytes(stamp_model(model.SerializeToString()))

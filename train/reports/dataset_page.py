@@ -242,12 +242,12 @@ def _draw_ghosts(figure: Figure, counts: Int[np.ndarray, "G+1"], distances: Floa
         annotate(left, f"{share:.1f}", (count, share), (0, 3), ha="center", color=Paint.SOFT, fontsize=8.0)
     left.set(xlabel="ghosts in a frame", ylabel="share of frames [%]")
     left.locator_params(axis="x", integer=True)
-    right.stairs(*_histogram(distances, _bins(distances)), fill=True, color=Paint.BLUE)
+    right.stairs(*_histogram(distances, _bin_edges(distances)), fill=True, color=Paint.BLUE)
     right.set(xlabel="from a ghost to the nearest marker [mm]", ylabel="share of ghosts [% per mm]")
     right.set_xlim(left=0.0)
     right.margins(y=0.12)
     if len(distances):
-        _mark(right, 1e3 * float(np.median(distances)), "median {:.0f} mm", Paint.INK)
+        _mark_value(right, 1e3 * float(np.median(distances)), "median {:.0f} mm", Paint.INK)
     else:
         right.set_ylim(0.0, 1.0)
         right.annotate("no ghosts", (0.5, 0.5), xycoords="axes fraction", ha="center", color=Paint.SOFT)
@@ -298,7 +298,7 @@ def neighbor_distances(rows: Shaped[np.ndarray, "T"]) -> Float[np.ndarray, "T M"
 def _draw_neighbors(figure: Figure, distances: Float[np.ndarray, "T M"], diameter: float) -> None:
     """Draw the distances of each marker's nearest neighbor, and of each frame's closest pair [m]."""
     panel = figure.subplots()
-    nearest, bins = distances.min(axis=1), _bins(distances)
+    nearest, bins = distances.min(axis=1), _bin_edges(distances)
     panel.stairs(*_histogram(distances.ravel(), bins), fill=True, color=Paint.PALE)
     panel.stairs(*_histogram(nearest, bins), color=Paint.BLUE, linewidth=1.6)
     panel.margins(y=0.12)
@@ -311,10 +311,10 @@ def _draw_neighbors(figure: Figure, distances: Float[np.ndarray, "T M"], diamete
         peak = int(shares.argmax())
         annotate(panel, name, (bins[peak], shares[peak]), (10, 4), color=color, annotation_clip=False)
     panel.set_xlim(left=0.0)
-    _mark(panel, 1e3 * diameter, "marker diameter\n{:.1f} mm", Paint.WARM)
+    _mark_value(panel, 1e3 * diameter, "marker diameter\n{:.1f} mm", Paint.WARM)
 
 
-def _bins(distances: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "B"]:
+def _bin_edges(distances: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "B"]:
     """Edges [mm] of at most 80 bins, of whole millimeters, from 0 to the 99.9th percentile."""
     longest = 1e3 * float(np.percentile(distances, 99.9)) if distances.size else 1.0
     width = max(1.0, np.ceil(longest / 80.0))
@@ -329,7 +329,7 @@ def _histogram(
     return 100.0 * counts / (max(1, len(distances)) * np.diff(bins)), bins
 
 
-def _mark(panel: Axes, value: float, text: str, color: str) -> None:
+def _mark_value(panel: Axes, value: float, text: str, color: str) -> None:
     """Draw a vertical line with a text beside its top."""
     panel.axvline(value, color=color, linewidth=1.4)
     panel.annotate(
@@ -378,8 +378,8 @@ def _draw_gaps(figure: Figure, lengths: Int[np.ndarray, "G"], rate: float) -> No
         panel.plot(
             published, (height, height), color=Paint.WARM, linewidth=5.0, solid_capstyle="butt", alpha=0.85
         )
-        told = f"real finger markers: {name} {published[0]} to {published[1]}"
-        annotate(panel, told, (published[1], height), (8, -11), color=Paint.WARM)
+        text = f"real finger markers: {name} {published[0]} to {published[1]}"
+        annotate(panel, text, (published[1], height), (8, -11), color=Paint.WARM)
         panel.plot(mine, height, "o", color=Paint.BLUE, markersize=6.0, markeredgecolor=Paint.CARD)
         annotate(
             panel, f"{name} {mine}", (mine, height), (-8, 5), color=Paint.BLUE, ha="right", weight="bold"

@@ -26,13 +26,13 @@ HAND_CAPTION: Final = (
 )
 MAX_LETTERS: Final = 20
 """Longest marker name drawn in full."""
-_SLIPS_SIZE: Final = (10.8, 6.6)  # [inch]
-_MARGIN: Final = 34.0  # [points] around the hand
+_SLIPS_SIZE: Final = (10.8, 6.6)  # size of the picture of slips [inch]
+_MARGIN: Final = 34.0  # margin around the hand [points]
 _BEND: Final = 0.22  # curvature of the arrows, so that two between a pair of markers lie side by side
 _BAR: Final = (0.90, 0.2, 0.016, 0.6)  # position of the color bar, as shares of the picture
-_FONT_SIZE: Final = 7.5  # [points] of names
-_DOT_RADIUS: Final = 4.2  # [points] of a marker's dot
-_DISTANCES: Final = (7.0, 11.0, 16.0, 23.0, 32.0, 43.0, 56.0, 72.0, 92.0)  # [points] from dot to name
+_FONT_SIZE: Final = 7.5  # font size of names [points]
+_DOT_RADIUS: Final = 4.2  # radius of a marker's dot [points]
+_DISTANCES: Final = (7.0, 11.0, 16.0, 23.0, 32.0, 43.0, 56.0, 72.0, 92.0)  # from dot to name [points]
 
 
 class FlatHand(NamedTuple):
@@ -148,7 +148,7 @@ def _draw_hand(
     scale_of: tuple[float, float, str],
     arrows: list[Mistake],
 ) -> None:
-    """Draw hand, markers, arrows, names and color bar; its worst and best value and title are `scale_of`."""
+    """Draw hand, markers, arrows, names and a color bar, with `scale_of` its ends and its title."""
     panel, (width, height), middle, scale = _canvas(figure, hand, hand.markers, 0.86)
     shift = np.array([0.46 * width, 0.5 * height]) - scale * middle
     hand.draw(panel, scale=scale, shift=shift, bone_width=3.0)
@@ -171,7 +171,7 @@ def _draw_hand(
 def _canvas(
     figure: Figure, hand: FlatHand, dots: Float[np.ndarray, "K 2"], share: float
 ) -> tuple[Axes, tuple[float, float], Float[np.ndarray, "2"], float]:
-    """A panel in points, its size, the middle of hand and dots [m], and the scale that fits a share of it."""
+    """A panel, its size [points], the middle of hand and dots [m], and the scale that fits a share of it."""
     # Constrained layout would move things after the names are placed.
     figure.set_layout_engine("none")
     panel: Axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))

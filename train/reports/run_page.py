@@ -35,8 +35,8 @@ PAGE: Final = "report.html"
 MODEL_CARD: Final = "README.md"
 UNKNOWN_LICENSE: Final = "unknown"
 """License in the card of weights whose owner has named none, as hubs of models call it."""
-_IN_WORDS: Final = {SEEN: SEEN, "clean": "where every marker is seen"}
-_KINDS: Final = {"set": "A set labeler", "cnn": "The network of Han et al. 2018"}
+_COLUMN_WORDS: Final = {SEEN: SEEN, "clean": "where every marker is seen"}
+_KIND_WORDS: Final = {"set": "A set labeler", "cnn": "The network of Han et al. 2018"}
 _MIN_SHARE: Final = 0.01  # [%] lower end of the confusions' color scale
 _MAX_WRITTEN: Final = 30  # largest number of classes for which cells have room for numbers
 
@@ -86,13 +86,13 @@ def _lead(card: dict[str, Any], layout: MarkerLayout) -> str:
     """Settings of the run and its main figures, in words."""
     train = card["train"]
     shown = [
-        f"{_shown(card, name, 'slot_accuracy')} % of the slots are right "
-        f"{_IN_WORDS.get(name, f'with the paper recipe ({name})')}"
+        f"{_figure_text(card, name, 'slot_accuracy')} % of the slots are right "
+        f"{_COLUMN_WORDS.get(name, f'with the paper recipe ({name})')}"
         for name, column in card["held_out_simulated"].items()
     ]
     average = f", weights averaged with decay {train['average']:g}" if train["average"] else ""
     return (
-        f"{_KINDS[train['labeler']]} for glove {layout.name} ({layout.num_markers} markers), trained on "
+        f"{_KIND_WORDS[train['labeler']]} for glove {layout.name} ({layout.num_markers} markers), trained on "
         f"{train['samples']:,} clouds of a set of {card['dataset']['num_frames']:,} simulated frames, in "
         f"batches of {train['batch']}: {100 * train['rig_share']:g} % of them as the simulated rig saw them, "
         f"the others through random drops and ghosts. Optimizer {train['optimizer']}, learning rate from "
@@ -111,7 +111,7 @@ def held_out_people(card: dict[str, Any]) -> str:
     return f"frames of {count} {'person' if count == 1 else 'people'} whom training did not see"
 
 
-def _shown(card: dict[str, Any], column: str, name: str) -> str:
+def _figure_text(card: dict[str, Any], column: str, name: str) -> str:
     """A figure of a column in percent, with its interval over people if there is one."""
     interval = card.get("held_out_intervals", {}).get(column, {}).get(name)
     return percent_between(card["held_out_simulated"][column][name], interval)
@@ -123,7 +123,7 @@ def _figures_section(card: dict[str, Any], report: LabelingReport) -> Section:
     (recipe,) = set(columns) - {SEEN, "clean"}
     table = [["figure [%]", *columns]]
     table += [
-        [name.replace("_", " "), *(_shown(card, column, name) for column in columns)]
+        [name.replace("_", " "), *(_figure_text(card, column, name) for column in columns)]
         for name in columns[recipe]
     ]
     text = (
@@ -212,16 +212,16 @@ def _hand_section(layout: MarkerLayout, report: LabelingReport) -> Section:
     """Accuracies and confusions on a drawing of the hand."""
     arrows, names = mistakes(report.confusion), layout.names
     drawn = hand_picture(layout, report.slot_accuracy_by_marker, arrows)
-    told, table = "No marker was taken for another.", []
+    caption, table = "No marker was taken for another.", []
     if arrows:
-        told = f"Arrows lead from true to given labels: the {len(arrows)} most frequent "
-        told += "confusions, wider for more points."
+        caption = f"Arrows lead from true to given labels: the {len(arrows)} most frequent "
+        caption += "confusions, wider for more points."
         table = [["marker", "taken for", "points", "of its points [%]"]]
     for arrow in arrows:
         pair = names[arrow.truth], names[arrow.called]
         table.append([*pair, f"{arrow.points:,}", percent(arrow.share)])
     text = _hand_text(layout, report)
-    return Section("On the hand", text, pictures=[(drawn, HAND_CAPTION + told)], table=table)
+    return Section("On the hand", text, pictures=[(drawn, HAND_CAPTION + caption)], table=table)
 
 
 def _hand_text(layout: MarkerLayout, report: LabelingReport) -> str:
@@ -274,7 +274,7 @@ def model_card(card: dict[str, Any]) -> str:
     dataset, columns = card["dataset"], card["held_out_simulated"]
     figures = [f"| | {' | '.join(columns)} |", f"|---|{'---|' * len(columns)}"]
     figures += [
-        f"| {words} | {' | '.join(_shown(card, column, name) for column in columns)} |"
+        f"| {words} | {' | '.join(_figure_text(card, column, name) for column in columns)} |"
         for name, words in _CARD_FIGURES.items()
     ]
     template = Path(__file__).with_name("model_card.md").read_text("utf-8")
@@ -282,7 +282,7 @@ def model_card(card: dict[str, Any]) -> str:
         license=card["license"],
         layout=dataset["layout"]["name"],
         glove=GLOVE,
-        kind=_KINDS[card["train"]["labeler"]],
+        kind=_KIND_WORDS[card["train"]["labeler"]],
         version=card["handsim"],
         count=len(card["marker_names"]),
         markers=", ".join(card["marker_names"]),

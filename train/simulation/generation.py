@@ -104,25 +104,19 @@ def make_dataset(
 ) -> Manifest:
     """Generate a training set like `generate_dataset`, without reading it; return its manifest."""
     place, workers = place_of(out), _allowed_workers(workers, settings.sampler)
-    source = _resolved(settings)
+    source = _resolve_source(settings)
     if isinstance(place, Path):
         _check_space(source, place)
     with open_output(place) as output:
         whole = _whole_files(output)
         _restore_config(output)
-        output.claim(
-            CONFIG,
-            _record(source),
-            noun="training set",
-            error=DatasetError,
-            grows="num_frames",
-            result=MANIFEST,
-        )
+        about = {"noun": "training set", "grows": "num_frames", "result": MANIFEST}
+        output.claim(CONFIG, _record(source), error=DatasetError, **about)
         _make_shards(source, output, whole, workers, progress)
-        return _complete(source, output, whole)
+        return _write_manifest(source, output, whole)
 
 
-def _resolved(settings: GenerateSettings) -> FrameSource:
+def _resolve_source(settings: GenerateSettings) -> FrameSource:
     """Load the glove, rig and sampler named by the settings, and check them against each other."""
     layout, rig = load_layout(settings.glove), load_rig(settings.rig)
     check_outside_volume(rig, np.array(settings.center), settings.volume)
@@ -131,9 +125,8 @@ def _resolved(settings: GenerateSettings) -> FrameSource:
             f"min_cameras is {settings.min_cameras}, but rig '{rig.name}' has {len(rig.positions)}"
         )
     check_layout(layout)
-    return FrameSource(
-        settings, layout, rig, None if settings.sampler is None else load_sampler(settings.sampler)
-    )
+    sampler = None if settings.sampler is None else load_sampler(settings.sampler)
+    return FrameSource(settings, layout, rig, sampler)
 
 
 def _allowed_workers(workers: int | Executor | None, sampler: PoseSampler | str | None) -> int | Executor:
@@ -148,8 +141,8 @@ def _allowed_workers(workers: int | Executor | None, sampler: PoseSampler | str 
         alone = True
     if alone and workers is not None:
         what = f"sampler {plugin_name(sampler)} cannot be imported by other processes"
-        told = f"{what}, so that this one does all; a function at the top of a module can"
-        warnings.warn(told, HandSimWarning, stacklevel=4)
+        message = f"{what}, so that this one does all; a function at the top of a module can"
+        warnings.warn(message, HandSimWarning, stacklevel=4)
     return 1 if alone else allowed
 
 
@@ -172,8 +165,8 @@ def _recorded_files(output: Output, own: Mapping[str, Mapping[str, str]]) -> dic
         recorded = load_manifest(output.folder).files
     except DatasetError:  # unfinished, damaged, or of another version
         recorded = {}
-    numbers = set(map(_number, own))
-    recorded = {name: one for name, one in recorded.items() if _number(name) not in numbers}
+    numbers = set(map(_shard_of_file, own))
+    recorded = {name: one for name, one in recorded.items() if _shard_of_file(name) not in numbers}
     return recorded | {name: one for table in own.values() for name, one in table.items()}
 
 
@@ -182,7 +175,8 @@ def _shard_records(output: Output) -> dict[str, dict[str, str]]:
     output.fetch(CHECKSUMS)
     records = {path.name: load_checksums(path) for path in output.folder.glob(CHECKSUMS)}
     return {
-        name: table if table.keys() == set(_names(_number(name))) else {} for name, table in records.items()
+        name: table if table.keys() == set(_files_of_shard(_shard_of_file(name))) else {}
+        for name, table in records.items()
     }
 
 
@@ -196,8 +190,8 @@ def _whole_files(output: Output) -> dict[str, str]:
     lists = MANIFEST if (output.folder / MANIFEST).is_file() else CHECKSUMS
     output.warn_of(damaged, f"are not what {lists} lists (other checksums), and are made again")
     output.warn_of([name for name in own if not own[name]], "are damaged, and are made again")
-    numbers = {_number(name) for name in damaged}
-    return {name: one for name, one in recorded.items() if _number(name) not in numbers}
+    numbers = {_shard_of_file(name) for name in damaged}
+    return {name: one for name, one in recorded.items() if _shard_of_file(name) not in numbers}
 
 
 def _restore_config(output: Output) -> None:
@@ -209,13 +203,13 @@ def _restore_config(output: Output) -> None:
             output.warn_of([CONFIG], f"is missing, and is made again from {MANIFEST}")
 
 
-def _number(name: str) -> int:
+def _shard_of_file(name: str) -> int:
     """Number of a shard from the name of one of its files; -1 for other names."""
     number = Path(name).stem.rpartition("-")[2]
     return int(number) if number.isdecimal() else -1
 
 
-def _names(shard: int) -> tuple[str, str, str]:
+def _files_of_shard(shard: int) -> tuple[str, str, str]:
     """Names of the files of a shard."""
     return hands_name(shard), redrawn_name(shard), rows_name(shard)
 
@@ -226,7 +220,7 @@ def _make_shards(
     """Make the shards that are missing or damaged."""
     total = source.settings.num_frames
     there = {name: size for name, size in output.sizes().items() if name in whole}
-    todo = [shard for shard in _shards(total) if not _is_finished(source, there, shard)]
+    todo = [shard for shard in _shard_numbers(total) if not _is_finished(source, there, shard)]
     for shard in todo:
         (output.folder / checksums_name(shard)).unlink(missing_ok=True)
     done = total - sum(_shard_size(total, shard) for shard in todo)
@@ -241,9 +235,9 @@ def _make_shards(
         raise Stopped.again(stop, f"{kept}, and the same command goes on after them") from stop
 
 
-def _complete(source: FrameSource, output: Output, whole: dict[str, str]) -> Manifest:
+def _write_manifest(source: FrameSource, output: Output, whole: dict[str, str]) -> Manifest:
     """Write the manifest of a set with all shards."""
-    shards = _shards(source.settings.num_frames)
+    shards = _shard_numbers(source.settings.num_frames)
     output.fetch("redrawn-*.json")
     recorded = whole | _recorded_files(output, _shard_records(output))
     names = sorted(name(shard) for shard in shards for name in (rows_name, hands_name))
@@ -262,8 +256,8 @@ def _complete(source: FrameSource, output: Output, whole: dict[str, str]) -> Man
     manifest = dataclasses.replace(manifest, handsim=version)
     content = dataclasses.asdict(manifest)
     if found and found != json_text(content):
-        told = f"{output}: {MANIFEST} is not what the shards give, and is written anew"
-        warnings.warn(told, HandSimWarning, stacklevel=4)
+        message = f"{output}: {MANIFEST} is not what the shards give, and is written anew"
+        warnings.warn(message, HandSimWarning, stacklevel=4)
     save_json(path, content)
     output.publish(MANIFEST)
     return manifest
@@ -279,7 +273,7 @@ def _check_space(source: FrameSource, out: Path) -> None:
         check_free(out, needed - there, f"{frames} frames", "ask for fewer frames", error=DatasetError)
 
 
-def _shards(num_frames: int) -> range:
+def _shard_numbers(num_frames: int) -> range:
     """Numbers of the shards of a set."""
     return range(-(-num_frames // ROWS_PER_SHARD))
 
@@ -318,5 +312,5 @@ def make_shard(source: FrameSource, out: Path, shard: int) -> int:
     save_array(out / hands_name(shard), hands)
     save_json(out / redrawn_name(shard), dict(sorted(redrawn.items())))
     save_array(out / rows_name(shard), rows)
-    save_checksums(out / checksums_name(shard), {name: out / name for name in _names(shard)})
+    save_checksums(out / checksums_name(shard), {name: out / name for name in _files_of_shard(shard)})
     return shard

@@ -1,7 +1,7 @@
-"""What the optical system of a lab does, measured in its captures: noise, gaps, ghosts, merging and IDs.
+"""Measures the optical system of a lab in its captures: noise, gaps, ghosts, merging and IDs.
 
 Captures may be labeled or not. Points are followed by their columns and, over gaps, by the points around
-them; what is there most of the time is a marker.
+them. A track that is present most of the time is a marker.
 """
 
 from __future__ import annotations
@@ -29,26 +29,26 @@ from handsim.space.transforms import rigid_fit
 AnyTrial = Capture | Take | str | Path
 """A capture; a take, of which only the points are used; or the path of one."""
 _A_TRIAL: Final = "a Capture, a Take or the path of a file"
-_STEP: Final = 4.0  # [m/s] A column whose point moves faster goes on with another one.
-_GATE: Final = 0.02  # [m] A point returns at most this far from where its neighbors predict it.
-_LONG: Final = 1.0  # [s] A point that stays this long is no ghost.
-_STEADY: Final = 0.75  # share of `_LONG` in which such a point is seen at least
-_BRIEF: Final = 0.1  # [s] Any point may be missing for this long.
-_ANCHORS: Final = 5  # nearest points that predict it
-_MARKER: Final = 0.5  # share of the frames in which a marker is there; a ghost is there in fewer
+_FASTEST_POINT: Final = 4.0  # [m/s] A column whose point moves faster has changed to another point.
+_RETURN_DISTANCE: Final = 0.02  # [m] largest distance of a returning point from its prediction
+_LONG_TRACK: Final = 1.0  # [s] shortest duration of a track that is no ghost
+_LEAST_PRESENCE: Final = 0.75  # least share of its duration in which such a track has a point
+_BRIEF_GAP: Final = 0.1  # [s] gap that any track may have
+_ANCHORS: Final = 5  # number of neighbors that predict a returning point
+_LEAST_MARKER_SHARE: Final = 0.5  # least share of the frames in which a marker is present
 _NAMELESS: Final = ("*", "unlabel")
-"""How names of columns begin that hold no one marker."""
-_LASTING: Final = 0.75  # share of returns into the old column from which IDs last over gaps
-_ENOUGH: Final = 10  # gaps, or ghosts, whose mean length is a figure
-_RARE: Final = 0.002  # share of the frames in which nearer pairs are rays that met by chance
-_LONGEST: Final = 10.0  # A capture must be this many times as long as the gaps that it tells of.
-# Fifth differences take steady motion out; of noise their variance is the sum of their squares.
+"""Prefixes of the names of columns that hold various points."""
+_LEAST_LASTING_SHARE: Final = 0.75  # least share of returns into the old column if IDs last over gaps
+_FEWEST_EVENTS: Final = 10  # least number of gaps, or ghosts, whose mean length is a figure
+_RARE_SHARE: Final = 0.002  # share of the frames in which nearer pairs are intersections of rays by chance
+_CAPTURE_TO_GAP_RATIO: Final = 10.0  # least duration of a capture over that of gaps that it can show
+# Fifth differences remove steady motion; the variance of noise in them is multiplied by the sum of squares.
 _DIFFERENCE: Final = np.array([1.0, -5.0, 10.0, -10.0, 5.0, -1.0])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MeasuredRoom:
-    """Figures of an optical system, as captures show them; None where they do not tell."""
+    """Figures of an optical system that were measured in captures; None where captures do not show them."""
 
     num_frames: int
     """Number of frames that hold points."""
@@ -63,7 +63,7 @@ class MeasuredRoom:
     gaps: tuple[float, ...] = field(repr=False)
     """Lengths of the gaps that begin and end in a capture [s]."""
     ghosts: float | None
-    """Points in a frame that are no marker's, within 100 mm of one."""
+    """Mean number of points in a frame that are no markers, within 100 mm of a marker."""
     ghost_time: float | None
     """Mean time that such a point stays without a break [s]."""
     nearest_pairs: Float[np.ndarray, "T"] = field(repr=False)
@@ -73,12 +73,12 @@ class MeasuredRoom:
     lasting_ids: bool | None
     """Whether a marker that returns has its old column."""
     untold: tuple[str, ...] = ()
-    """Sentences on what the captures do not tell."""
+    """Sentences on what the captures do not show."""
 
     @property
     def nearest(self) -> float:
-        """Distance of the nearest two points that are seen together, but for rare chance meetings [m]."""
-        return float(np.quantile(self.nearest_pairs, _RARE))
+        """Distance of the nearest two points in a frame, except in rare frames [m]."""
+        return float(np.quantile(self.nearest_pairs, _RARE_SHARE))
 
     @property
     def is_labeled(self) -> bool:
@@ -86,17 +86,17 @@ class MeasuredRoom:
         return bool(self.lasting_ids) or self.ghosts is None
 
     @property
-    def tells_losses(self) -> bool:
-        """Whether gaps are those of the optics: a labeled capture with hardly any may have been filled."""
-        return not self.is_labeled or len(self.gaps) >= _ENOUGH
+    def shows_losses(self) -> bool:
+        """Whether gaps are those of the optics: in a labeled capture with few gaps, others may be filled."""
+        return not self.is_labeled or len(self.gaps) >= _FEWEST_EVENTS
 
     @property
     def gap_time(self) -> float | None:
         """Mean length of a gap [s]; None if there are too few."""
-        return float(np.mean(self.gaps)) if len(self.gaps) >= _ENOUGH else None
+        return float(np.mean(self.gaps)) if len(self.gaps) >= _FEWEST_EVENTS else None
 
 
-class _Seen(NamedTuple):
+class _CaptureFigures(NamedTuple):
     """Figures of one capture, to be averaged over several."""
 
     rate: float
@@ -115,7 +115,7 @@ class _Seen(NamedTuple):
 
 
 def measure_room(captures: AnyTrial | Sequence[AnyTrial]) -> MeasuredRoom:
-    """Measure what the optics of captures do, as `handsim simulate --like` uses it.
+    """Measure the optics of captures, for `handsim simulate --like`.
 
     Args:
         captures: Captures, takes or their paths, labeled or not: of one optical system and one glove.
@@ -133,33 +133,36 @@ def measure_room(captures: AnyTrial | Sequence[AnyTrial]) -> MeasuredRoom:
         check_type("a capture", trial, (Capture, Take, str, Path), _A_TRIAL)
     if not given:
         raise CaptureError("no capture was given, expected one or more")
-    return _averaged([_measured(one) for one in given])
+    return _combine([_figures_of_capture(one) for one in given])
 
 
 def measure_simulated(take: Take) -> MeasuredRoom:
-    """The same figures of a simulated take, by its true labels."""
+    """Measure the same figures of a simulated take by its true labels."""
     labels, ids = take.labels.astype(np.int64), take.ids.astype(np.int64)
     count = len(take.label_names)
     tracks = np.where(labels >= 0, labels, np.where(ids >= 0, ids + count, -1))
-    return _averaged([_seen(take.points, tracks, np.arange(count), take.rate, [False] * _ENOUGH)])
+    changed = [False] * _FEWEST_EVENTS
+    return _combine([_figures_of_tracks(take.points, tracks, np.arange(count), take.rate, changed)])
 
 
-def _averaged(seen: Sequence[_Seen]) -> MeasuredRoom:
+def _combine(seen: Sequence[_CaptureFigures]) -> MeasuredRoom:
     """Figures of several captures together."""
     num_frames = sum(len(one.markers) for one in seen)
     gaps = np.concatenate([run_lengths(~one.markers, inside=True) / one.rate for one in seen])
     flashes = np.concatenate([run_lengths(one.ghosts) / one.rate for one in seen])
     slots, points = sum(one.markers.size for one in seen), sum(int(one.markers.sum()) for one in seen)
     old_columns = [old for one in seen for old in one.old_columns]
-    lasting = bool(np.mean(old_columns) >= _LASTING) if len(old_columns) >= _ENOUGH else None
+    enough_gaps, enough_ghosts = (len(one) >= _FEWEST_EVENTS for one in (gaps, flashes))
+    known = len(old_columns) >= _FEWEST_EVENTS
+    lasting = bool(np.mean(old_columns) >= _LEAST_LASTING_SHARE) if known else None
     noise = [value for one in seen for value in one.noise]
-    told = len(flashes) > 0 or lasting is False
-    longest = max(len(one.markers) / one.rate for one in seen) / _LONGEST
+    has_ghosts = len(flashes) > 0 or lasting is False
+    longest = max(len(one.markers) / one.rate for one in seen) / _CAPTURE_TO_GAP_RATIO
     untold = {
-        "ghosts: every point is a marker's, as where a capture was labeled": not told,
-        f"how long ghosts stay: only {len(flashes)} were seen": told and len(flashes) < _ENOUGH,
-        f"how long gaps last, or whether they were filled: only {len(gaps)} were seen": len(gaps) < _ENOUGH,
-        f"gaps of more than {longest:.2g} s: the captures are short": longest < _LONG,
+        "ghosts: every point is a marker's, as where a capture was labeled": not has_ghosts,
+        f"how long ghosts stay: only {len(flashes)} were seen": has_ghosts and not enough_ghosts,
+        f"how long gaps last, or whether they were filled: only {len(gaps)} were seen": not enough_gaps,
+        f"gaps of more than {longest:.2g} s: the captures are short": longest < _LONG_TRACK,
         "whether IDs last over gaps: few markers returned": lasting is None,
         "noise: no marker is seen in six frames in a row": not noise,
     }
@@ -170,8 +173,8 @@ def _averaged(seen: Sequence[_Seen]) -> MeasuredRoom:
         noise=float(np.median(noise)) if noise else None,
         missing=float(1.0 - points / slots),
         gaps=tuple(gaps.tolist()),
-        ghosts=sum(int(one.ghosts.sum()) for one in seen) / num_frames if told else None,
-        ghost_time=float(flashes.mean()) if len(flashes) >= _ENOUGH else None,
+        ghosts=sum(int(one.ghosts.sum()) for one in seen) / num_frames if has_ghosts else None,
+        ghost_time=float(flashes.mean()) if enough_ghosts else None,
         nearest_pairs=np.concatenate([one.nearest_pairs for one in seen]),
         id_time=sum(one.markers.sum() / one.rate for one in seen) / sum(one.stretches for one in seen),
         lasting_ids=lasting,
@@ -179,7 +182,7 @@ def _averaged(seen: Sequence[_Seen]) -> MeasuredRoom:
     )
 
 
-def _measured(source: AnyTrial) -> _Seen:
+def _figures_of_capture(source: AnyTrial) -> _CaptureFigures:
     """Figures of one capture."""
     name = f"{source}: " if isinstance(source, str | Path) else ""
     if isinstance(source, str | Path):
@@ -188,29 +191,29 @@ def _measured(source: AnyTrial) -> _Seen:
     capture = source.capture() if isinstance(source, Take) else source
     check_unit(unlabeled_frames(capture))
     points = capture.positions[np.isfinite(capture.positions[..., 0]).any(axis=1)]
-    tracks, old_columns = _tracks(points, capture.rate)
+    tracks, old_columns = _follow_points(points, capture.rate)
     present, labeled = tracks >= 0, np.empty(0, dtype=np.int64)
-    if len(old_columns) < _ENOUGH or np.mean(old_columns) >= _LASTING:
+    if len(old_columns) < _FEWEST_EVENTS or np.mean(old_columns) >= _LEAST_LASTING_SHARE:
         names = [name.rpartition(":")[2].strip().lower() for name in capture.names]
         whole = np.array([not name.startswith(_NAMELESS) for name in names])
         tracks[present] += len(whole)
         tracks[:, whole] = np.where(present[:, whole], np.flatnonzero(whole), -1)
         labeled = np.flatnonzero(whole & (present.sum(axis=0) > 0))
-    lasts = np.flatnonzero(np.bincount(tracks[present]) >= _MARKER * len(points))
+    lasts = np.flatnonzero(np.bincount(tracks[present]) >= _LEAST_MARKER_SHARE * len(points))
     markers = np.union1d(labeled, lasts)
     if len(markers) < 2:
         count = "only one marker stays" if len(markers) else "no marker stays"
         raise CaptureError(f"{name}{count} for half of the frames, expected the markers of a hand")
-    return _seen(points, tracks, markers, capture.rate, old_columns)
+    return _figures_of_tracks(points, tracks, markers, capture.rate, old_columns)
 
 
-def _seen(
+def _figures_of_tracks(
     points: Float[np.ndarray, "T N 3"],
     tracks: Int[np.ndarray, "T N"],
     markers: Int[np.ndarray, "M"],
     rate: float,
     old_columns: list[bool],
-) -> _Seen:
+) -> _CaptureFigures:
     """Figures of points whose tracks are known, and which of these are markers."""
     paths = np.full((len(points), len(markers), 3), np.nan)
     for number, marker in enumerate(markers):
@@ -218,22 +221,25 @@ def _seen(
         paths[frame, number] = points[frame, column]
     present, is_marker = tracks >= 0, np.isin(tracks, markers)
     noise = [_noise(paths[:, number]) for number in range(len(markers))]
-    return _Seen(
+    return _CaptureFigures(
         rate,
         np.isfinite(paths[..., 0]),
         [one for one in noise if np.isfinite(one)],
         _near_markers(points, present & ~is_marker, is_marker),
-        [_nearest(one[seen]) for one, seen in zip(points, present, strict=True) if seen.sum() > 1],
+        [_nearest_pair(one[seen]) for one, seen in zip(points, present, strict=True) if seen.sum() > 1],
         len(run_lengths(is_marker)),
         old_columns,
     )
 
 
-def _tracks(points: Float[np.ndarray, "T N 3"], rate: float) -> tuple[Int[np.ndarray, "T N"], list[bool]]:
+def _follow_points(
+    points: Float[np.ndarray, "T N 3"], rate: float
+) -> tuple[Int[np.ndarray, "T N"], list[bool]]:
     """The track of each point, -1 without a point; and of each return, whether it was into the old column."""
     present = np.isfinite(points[..., 0])
     goes_on = np.zeros_like(present)
-    goes_on[1:] = np.linalg.norm(np.diff(points, axis=0), axis=2) < _STEP / rate  # false where one is missing
+    steps = np.linalg.norm(np.diff(points, axis=0), axis=2)  # NaN where one is missing
+    goes_on[1:] = steps < _FASTEST_POINT / rate
     tracks, begun, old_columns = np.full(present.shape, -1), list[int](), list[bool]()
     lost = dict[int, tuple[int, int]]()  # last frame and column of each track that may return
     for t, now in enumerate(tracks):
@@ -242,10 +248,10 @@ def _tracks(points: Float[np.ndarray, "T N 3"], rate: float) -> tuple[Int[np.nda
             ended = np.flatnonzero(present[t - 1] & ~goes_on[t])
             lost |= {int(tracks[t - 1, column]): (t - 1, int(column)) for column in ended}
         # A point may be missing for as long as it was there.
-        patience = {one: max(end[0] - begun[one], _BRIEF * rate) for one, end in lost.items()}
+        patience = {one: max(end[0] - begun[one], _BRIEF_GAP * rate) for one, end in lost.items()}
         lost = {one: end for one, end in lost.items() if t - 1 - end[0] <= patience[one]}
         new = np.flatnonzero(present[t] & ~goes_on[t])
-        while found := _returned(points, tracks, t, new[now[new] < 0], lost):
+        while found := _match_lost_tracks(points, tracks, t, new[now[new] < 0], lost):
             for column, track in found.items():  # those that returned predict others better
                 end, old = lost.pop(track)
                 now[column] = track
@@ -254,24 +260,24 @@ def _tracks(points: Float[np.ndarray, "T N 3"], rate: float) -> tuple[Int[np.nda
         for column in new[now[new] < 0]:
             now[column] = len(begun)
             begun.append(t)
-    return _chained(tracks, rate), old_columns
+    return _join_tracks(tracks, rate), old_columns
 
 
-def _chained(tracks: Int[np.ndarray, "T N"], rate: float) -> NDArray[np.int64]:
+def _join_tracks(tracks: Int[np.ndarray, "T N"], rate: float) -> NDArray[np.int64]:
     """Join long tracks that follow one another, of any markers: only lengths and gaps are measured."""
     numbers, first = np.unique(tracks.ravel(), return_index=True)
     last = tracks.size - 1 - np.unique(tracks.ravel()[::-1], return_index=True)[1]
     counts = np.bincount(tracks[tracks >= 0])
     begins, ends = (one[numbers >= 0] // tracks.shape[1] for one in (first, last))
-    long = np.flatnonzero((counts >= _LONG * rate) & (counts >= _STEADY * (ends - begins + 1)))
+    long = np.flatnonzero((counts >= _LONG_TRACK * rate) & (counts >= _LEAST_PRESENCE * (ends - begins + 1)))
     long = long[np.argsort(begins[long], kind="stable")]
-    brief = int(_BRIEF * rate)
+    brief = int(_BRIEF_GAP * rate)
     chain = np.arange(len(counts)) + len(long)
     chain[long], _ = shared_columns(begins[long], np.maximum(ends[long] - brief, begins[long]))
     return np.asarray(np.append(chain, -1)[tracks])
 
 
-def _returned(
+def _match_lost_tracks(
     points: Float[np.ndarray, "T N 3"],
     tracks: Int[np.ndarray, "T N"],
     t: int,
@@ -282,13 +288,13 @@ def _returned(
     if not len(new) or not lost:
         return {}
     names = list(lost)
-    ahead = np.stack([_predicted(points, tracks, t, *lost[name]) for name in names])
+    ahead = np.stack([_predict_point(points, tracks, t, *lost[name]) for name in names])
     distance = np.linalg.norm(ahead[:, None] - points[t, new], axis=2)
-    pairs = zip(*linear_sum_assignment(np.minimum(distance, _GATE)), strict=True)
-    return {int(new[column]): names[row] for row, column in pairs if distance[row, column] < _GATE}
+    pairs = zip(*linear_sum_assignment(np.minimum(distance, _RETURN_DISTANCE)), strict=True)
+    return {int(new[column]): names[row] for row, column in pairs if distance[row, column] < _RETURN_DISTANCE}
 
 
-def _predicted(
+def _predict_point(
     points: Float[np.ndarray, "T N 3"], tracks: Int[np.ndarray, "T N"], t: int, last: int, column: int
 ) -> Float[np.ndarray, "3"]:
     """Where the point of a column and of its last frame is at `t` [m], if it moves with those around it."""
@@ -324,6 +330,6 @@ def _near_markers(
     return near
 
 
-def _nearest(cloud: Float[np.ndarray, "N 3"]) -> float:
+def _nearest_pair(cloud: Float[np.ndarray, "N 3"]) -> float:
     """Smallest distance of two points [m]."""
     return float(cKDTree(cloud).query(cloud, k=2)[0][:, 1].min())

@@ -1,4 +1,4 @@
-"""The simulated capture room: light sources, the cameras that see them, and the recorded take.
+"""Simulates a capture room: light sources, the cameras that see them, and the recorded take.
 
 The frequencies of camera dropouts and reflections are fitted to the four test captures of Han et al. 2018: to
 Table 3 and to the ghost ratios of Table 4 (docs/room.md has the numbers).
@@ -39,7 +39,7 @@ _CHUNK: Final = 256  # number of frames whose lines of sight are in memory toget
 Group = TypeVar("Group", OpticsConfig, StrayConfig)
 _MIN_BODY_MARKERS: Final = 3  # An object needs this many markers to be tracked as a rigid body.
 
-_SAME_ROOM: Final[dict[str, str]] = {"real-like": "hand-hand", "free": "single-hand"}
+_SIMILAR_KIND: Final[dict[str, str]] = {"real-like": "hand-hand", "free": "single-hand"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +55,7 @@ class RoomConfig(Settings):
 
 
 def with_given(group: Group, options: StrayOptions | OpticsOptions) -> Group:
-    """A group with the settings of these options that are not None, validated."""
+    """Replace the settings of a group by those options that are not None, and validate them."""
     given = {name: value for name, value in dataclasses.asdict(options).items() if value is not None}
     return dataclasses.replace(group, **given)
 
@@ -135,7 +135,7 @@ TWINS: Final[dict[str, Twin]] = {
 
 def usual_room(kind: SimulatedKind) -> RoomConfig:
     """The room of the paper's capture of this kind, or of the most similar kind."""
-    return RoomConfig() if kind == "calibration" else TWINS[_SAME_ROOM.get(kind, kind)].room
+    return RoomConfig() if kind == "calibration" else TWINS[_SIMILAR_KIND.get(kind, kind)].room
 
 
 class SceneSight:
@@ -239,15 +239,13 @@ class LightSources(NamedTuple):
 
 
 def sample_light_sources(sight: SceneSight, config: RoomConfig, *, rng: np.random.Generator) -> LightSources:
-    """Light sources of a scene, and the cameras that see them."""
+    """Collect the light sources of a scene, and find the cameras that see them."""
     markers, _ = sight.markers
     check_outside(sight.rig, markers)
-    labels = np.arange(markers.shape[1])
-    moving_object = sight.scene.moving_object
-    if moving_object is not None:
-        count = len(moving_object.rigid_object.markers)
-        if count < _MIN_BODY_MARKERS:
-            labels[len(labels) - count :] = -1  # too few for a rigid body: ghosts
+    labels, held = np.arange(markers.shape[1]), sight.scene.moving_object
+    count = 0 if held is None else len(held.rigid_object.markers)
+    if count < _MIN_BODY_MARKERS:
+        labels[len(labels) - count :] = -1  # Too few markers for a rigid body are ghosts.
     radii = marker_radii(sight.scene, config.optics)
     visible = sight.visible_markers(config.optics.partial * radii, rng=rng)
     parts = [
@@ -256,13 +254,15 @@ def sample_light_sources(sight: SceneSight, config: RoomConfig, *, rng: np.rando
         *stray_reflections(sight, config, rng=rng),
     ]
     if sight.scene.others is not None:
-        parts.append(_without_label(sight.scene.others, sight.free_of_hands(sight.scene.others)))
+        parts.append(_unlabeled_sources(sight.scene.others, sight.free_of_hands(sight.scene.others)))
     joined = (np.concatenate(one, axis=1 if one[0].ndim > 1 else 0) for one in zip(*parts, strict=True))
     return LightSources(*joined)
 
 
-def _without_label(positions: Float[np.ndarray, "T S 3"], visible: Bool[np.ndarray, "T S C"]) -> LightSources:
-    """Sources of the usual size that are not markers of a hand."""
+def _unlabeled_sources(
+    positions: Float[np.ndarray, "T S 3"], visible: Bool[np.ndarray, "T S C"]
+) -> LightSources:
+    """Light sources of the usual size that are no markers of a hand."""
     count = positions.shape[1]
     return LightSources(positions, visible, np.full(count, -1), np.full(count, MARKER_RADIUS))
 
@@ -313,7 +313,7 @@ def stray_reflections(
         positions, visible = sample_strays(
             pose, middle, config.strays, rate=scene.rate, num_cameras=len(sight.rig.positions), rng=rng
         )
-        parts.append(_without_label(positions, visible & sight.free_of_hands(positions)))
+        parts.append(_unlabeled_sources(positions, visible & sight.free_of_hands(positions)))
     return parts
 
 

@@ -1,7 +1,7 @@
-"""Settings of simulated captures and training sets whose optics do what those of a lab do.
+"""Fits settings of simulated captures and training sets to the optics of a lab's captures.
 
-What noise, losses and strays make of a rig's views has no closed form: captures are simulated, measured like
-the lab's, and the settings are corrected by the ratios, some times.
+The effect of noise, losses and stray reflections on a rig's views has no closed form. Therefore captures are
+simulated and measured like the lab's, and the settings are multiplied by the ratios, several times.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from train.simulation.takes import SimulateSettings, room_of, simulate_take
 from train.simulation.training_frames import GenerateSettings
 
 Kind = TypeVar("Kind", SimulateSettings, GenerateSettings)
-_FRAMES: Final = 1200  # frames of a simulated capture that is measured
-_ROWS, _ROWS_PER_PERSON = 1024, 32  # of a training set that is measured
-_ROUNDS: Final = 8  # of corrections
-_LARGEST: Final = 4.0  # ratio of a correction
+_CAPTURE_FRAMES: Final = 1200  # number of frames of a simulated capture that is measured
+_ROWS, _ROWS_PER_PERSON = 1024, 32  # number of rows of a training set that is measured, and of each person
+_ROUNDS: Final = 8  # number of corrections
+_MOST_CORRECTION: Final = 4.0  # largest ratio of a correction
 _LOST_CAMERAS: Final = 0.375  # share of the cameras that lose pictures together: 6 of the 16 of figure5
-_SPOTS: Final = 30.0  # reflecting spots on a hand; many that flash rarely make any number of ghosts
-_LIT: Final = 0.95  # largest share of the time that a spot reflects
-_EXPECTED: Final = 30.0  # Points merge if simulated pairs are nearer than any found in so many frames.
+_SPOTS_A_HAND: Final = 30.0  # number of reflecting spots on a hand, which flash as often as ghosts require
+_MOST_LIT_SHARE: Final = 0.95  # largest share of the time that a spot reflects
+_FEWEST_EXPECTED_PAIRS: Final = 30.0  # Points merge if the lab lacks this many nearer, simulated pairs.
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +49,7 @@ class RoomLike(Generic[Kind]):
     def sentences(self, settings: Kind) -> list[str]:
         """Which values of the settings in use are from the captures, and what these do not tell."""
         kept = [
-            f"{name} {_words(value)}"
+            f"{name} {_as_words(value)}"
             for name, value in self.values.items()
             if setting(settings, name) == value
         ]
@@ -79,8 +79,8 @@ def room_like(
     found = measure_room(captures)
     on_step("simulating captures like it")
     if isinstance(settings, GenerateSettings):
-        return _training_like(found, settings)
-    return _capture_like(found, settings)
+        return _fit_training_set(found, settings)
+    return _fit_capture(found, settings)
 
 
 def filled(settings: Kind, values: Mapping[str, Any]) -> Kind:
@@ -99,7 +99,7 @@ def setting(settings: Kind, name: str) -> Any:
     return getattr(getattr(settings, group) if group else settings, field)
 
 
-def _free(settings: Kind, values: Mapping[str, Any]) -> dict[str, Any]:
+def _of_default_settings(settings: Kind, values: Mapping[str, Any]) -> dict[str, Any]:
     """The values, to four digits, of settings that still have their defaults."""
     usual = type(settings)()
     rounded = {
@@ -108,32 +108,32 @@ def _free(settings: Kind, values: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in rounded.items() if setting(settings, name) == setting(usual, name)}
 
 
-def _words(value: Any) -> str:
+def _as_words(value: Any) -> str:
     return " ".join(f"{one:g}" for one in (value if isinstance(value, tuple) else (value,)))
 
 
-def _ratio(wanted: float | None, made: float | None) -> float:
-    """Factor by which a setting is multiplied, so that the figure `made` with it becomes the `wanted` one."""
-    if wanted is None or made is None:
+def _ratio(wanted: float | None, simulated: float | None) -> float:
+    """Factor of a setting that turns the `simulated` figure into the `wanted` one, within limits."""
+    if wanted is None or simulated is None:
         return 1.0
-    return float(np.clip(wanted / max(made, 1e-12), 1 / _LARGEST, _LARGEST))
+    return float(np.clip(wanted / max(simulated, 1e-12), 1 / _MOST_CORRECTION, _MOST_CORRECTION))
 
 
-def _capture_like(found: MeasuredRoom, settings: SimulateSettings) -> RoomLike[SimulateSettings]:
-    """Settings of a simulated capture like those that were measured."""
+def _fit_capture(found: MeasuredRoom, settings: SimulateSettings) -> RoomLike[SimulateSettings]:
+    """Fit the settings of a simulated capture to measured captures."""
     room, rig = room_of(settings), load_rig(settings.rig)
     found = _per_hand(found, max(1, round(found.num_markers / load_layout(settings.glove).num_markers)))
-    noise, shown, lit = room.optics.noise, found.ghost_time or room.strays.shown, 0.02
+    noise, shown, lit_share = room.optics.noise, found.ghost_time or room.strays.shown, 0.02
     length = max(1.0, RATE * found.gap_time) if found.gap_time else room.optics.dropout_length
     values = dict[str, Any]()
-    if found.tells_losses:
+    if found.shows_losses:
         lost = max(1, round(_LOST_CAMERAS * len(rig.positions)))
         values |= {"optics.blob_loss": 0.0, "optics.dropout": 0.0, "optics.dropout_cameras": lost}
     if found.ghosts is not None:
-        values["strays.number"] = _SPOTS if found.ghosts else 0.0
-    least = _simulated(settings, values)
+        values["strays.number"] = _SPOTS_A_HAND if found.ghosts else 0.0
+    least = _capture_figures(settings, values)
     untold, merging = list(found.untold), (least.nearest_pairs < found.nearest).mean() * found.num_frames
-    if found.nearest < room.optics.min_distance or merging >= _EXPECTED:
+    if found.nearest < room.optics.min_distance or merging >= _FEWEST_EXPECTED_PAIRS:
         values["optics.min_distance"] = found.nearest
     else:
         untold.append("at which distance points merge: no markers came near enough")
@@ -141,87 +141,87 @@ def _capture_like(found: MeasuredRoom, settings: SimulateSettings) -> RoomLike[S
     dropout = above / length
     for _ in range(_ROUNDS):
         values["optics.noise"] = noise
-        if found.tells_losses:
+        if found.shows_losses:
             values["optics.dropout"] = dropout
         if found.gap_time is not None:
             values["optics.dropout_length"] = length
         if found.ghosts:
-            values["strays.hidden"] = shown * (1.0 / lit - 1.0)
+            values["strays.hidden"] = shown * (1.0 / lit_share - 1.0)
         if found.ghost_time is not None:
             values["strays.shown"] = shown
-        made = _simulated(settings, values)
-        noise *= _ratio(found.noise, made.noise)
-        shown *= _ratio(found.ghost_time, made.ghost_time) ** 0.5
-        lit = min(_LIT, lit * _ratio(found.ghosts, made.ghosts))
+        simulated = _capture_figures(settings, values)
+        noise *= _ratio(found.noise, simulated.noise)
+        shown *= _ratio(found.ghost_time, simulated.ghost_time) ** 0.5
+        lit_share = min(_MOST_LIT_SHARE, lit_share * _ratio(found.ghosts, simulated.ghosts))
         if above:
-            dropout = min(1.0, dropout * _ratio(above, made.missing - least.missing) ** 0.5)
-            length = max(1.0, length * _ratio(found.gap_time, made.gap_time) ** 0.5)
-    values = _free(settings, values)
+            dropout = min(1.0, dropout * _ratio(above, simulated.missing - least.missing) ** 0.5)
+            length = max(1.0, length * _ratio(found.gap_time, simulated.gap_time) ** 0.5)
+    values = _of_default_settings(settings, values)
     rows = _table(
-        ("noise per axis [mm]", found.noise, made.noise, 1e3),
-        ("markers missing [%]", found.missing, made.missing, 1e2),
-        ("mean gap [ms]", found.gap_time, made.gap_time, 1e3),
-        ("ghosts per frame and hand", found.ghosts, made.ghosts, 1.0),
-        ("mean time of a ghost [ms]", found.ghost_time, made.ghost_time, 1e3),
-        ("nearest pair [mm]", found.nearest, made.nearest, 1e3),
-        ("mean time of an ID [s]", found.id_time, made.id_time, 1.0),
-        ("frames per second", found.rate, made.rate, 1.0),
+        ("noise per axis [mm]", found.noise, simulated.noise, 1e3),
+        ("markers missing [%]", found.missing, simulated.missing, 1e2),
+        ("mean gap [ms]", found.gap_time, simulated.gap_time, 1e3),
+        ("ghosts per frame and hand", found.ghosts, simulated.ghosts, 1.0),
+        ("mean time of a ghost [ms]", found.ghost_time, simulated.ghost_time, 1e3),
+        ("nearest pair [mm]", found.nearest, simulated.nearest, 1e3),
+        ("mean time of an ID [s]", found.id_time, simulated.id_time, 1.0),
+        ("frames per second", found.rate, simulated.rate, 1.0),
     )
     return RoomLike(filled(settings, values), values, rows, tuple(untold))
 
 
-def _simulated(settings: SimulateSettings, values: Mapping[str, Any]) -> MeasuredRoom:
-    """What a simulated capture with these values shows."""
-    chosen = filled(settings, _free(settings, values))
-    take = simulate_take(settings=dataclasses.replace(chosen, num_frames=_FRAMES))
+def _capture_figures(settings: SimulateSettings, values: Mapping[str, Any]) -> MeasuredRoom:
+    """Simulate a capture with these values, and measure it."""
+    chosen = filled(settings, _of_default_settings(settings, values))
+    take = simulate_take(settings=dataclasses.replace(chosen, num_frames=_CAPTURE_FRAMES))
     return _per_hand(measure_simulated(take), len(take.hands))
 
 
 def _per_hand(room: MeasuredRoom, hands: int) -> MeasuredRoom:
-    """Figures with ghosts per hand."""
+    """Divide the number of ghosts by that of the hands."""
     return room if room.ghosts is None else dataclasses.replace(room, ghosts=room.ghosts / hands)
 
 
-def _training_like(found: MeasuredRoom, settings: GenerateSettings) -> RoomLike[GenerateSettings]:
-    """Settings of a training set like the captures that were measured."""
+def _fit_training_set(found: MeasuredRoom, settings: GenerateSettings) -> RoomLike[GenerateSettings]:
+    """Fit the settings of a training set to measured captures."""
     free = SimulateSettings("free", glove=settings.glove, rig=settings.rig, center=settings.center)
-    capture = _capture_like(found, free)
+    capture = _fit_capture(found, free)
     found = _per_hand(found, max(1, round(found.num_markers / load_layout(settings.glove).num_markers)))
     shared = {"optics.noise", "optics.min_distance"} & set(capture.values)
     values = {name: capture.values[name] for name in sorted(shared)}
-    least, _ = _rows_of(settings, values | _losses(settings, 0.0))
+    least, _ = _training_figures(settings, values | _scaled_losses(settings, 0.0))
     losses, ghosts, above = 1.0, 1.0, max(0.0, found.missing - least)
     for _ in range(_ROUNDS):
-        if found.tells_losses:
-            values |= _losses(settings, losses if above else 0.0)
+        if found.shows_losses:
+            values |= _scaled_losses(settings, losses if above else 0.0)
         if found.ghosts is not None:
             values |= {
                 "ghosts.stray_rate": settings.ghosts.stray_rate * ghosts,
                 "ghosts.mirror_rate": min(1.0, settings.ghosts.mirror_rate * ghosts),
             }
-        missing, made = _rows_of(settings, values)
+        missing, simulated = _training_figures(settings, values)
         losses *= _ratio(above, missing - least) ** 0.5  # several cameras lose a marker together
-        ghosts *= _ratio(found.ghosts, made)
-    values = _free(settings, values)
+        ghosts *= _ratio(found.ghosts, simulated)
+    values = _of_default_settings(settings, values)
     rows = _table(
         ("markers missing [%]", found.missing, missing, 1e2),
-        ("ghosts per frame and hand", found.ghosts, made, 1.0),
+        ("ghosts per frame and hand", found.ghosts, simulated, 1.0),
     )
     optical = [row for row in capture.table if row[0] in ("noise per axis [mm]", "nearest pair [mm]")]
     return RoomLike(filled(settings, values), values, (*optical, *rows), capture.untold)
 
 
-def _losses(settings: GenerateSettings, times: float) -> dict[str, Any]:
-    """The ranges of losses, times a number."""
+def _scaled_losses(settings: GenerateSettings, times: float) -> dict[str, Any]:
+    """The ranges of losses, scaled by a factor."""
     return {
         name: tuple(min(1.0, float(f"{times * end:.4g}")) for end in setting(settings, name))
         for name in ("blob_loss", "dropout")
     }
 
 
-def _rows_of(settings: GenerateSettings, values: Mapping[str, Any]) -> tuple[float, float]:
+def _training_figures(settings: GenerateSettings, values: Mapping[str, Any]) -> tuple[float, float]:
     """Share of markers missing, and ghosts per row, of a small training set with these values."""
-    chosen = filled(settings, _free(settings, values))
+    chosen = filled(settings, _of_default_settings(settings, values))
     with tempfile.TemporaryDirectory() as folder:
         rows = generate_dataset(
             folder, chosen, num_frames=_ROWS, frames_per_hand=_ROWS_PER_PERSON, workers=1
@@ -231,8 +231,10 @@ def _rows_of(settings: GenerateSettings, values: Mapping[str, Any]) -> tuple[flo
 
 
 def _table(*rows: tuple[str, float | None, float | None, float]) -> tuple[tuple[str, str, str], ...]:
-    """Rows of a table, from names, figures found and simulated, and the number of units in one."""
-    return tuple((name, _cell(found, scale), _cell(made, scale)) for name, found, made, scale in rows)
+    """Format rows of names, figures found and simulated, and factors from SI to the units shown."""
+    return tuple(
+        (name, _cell(found, scale), _cell(simulated, scale)) for name, found, simulated, scale in rows
+    )
 
 
 def _cell(figure: float | None, scale: float) -> str:

@@ -57,8 +57,8 @@ _FREE_SCRIPT, _RESTING_SCRIPT = "piano", "typing"
 
 # A calibration capture.
 _MAX_DRAWS: Final = 20
-_STARTS: Final = ("pinch_pad", "pinch_tip")  # gestures before touches
-_TURNING: Final = 0.7  # [rad] standard deviation of a calibrated wrist's turns about each axis
+_TOUCH_GESTURES: Final = ("pinch_pad", "pinch_tip")  # gestures before touches
+_WRIST_TURNING: Final = 0.7  # [rad] standard deviation of a calibrated wrist's turns about each axis
 _JITTER: Final = np.deg2rad(8.0)  # [rad] standard deviation of these gestures' joint angles
 _TOUCHING: Final = MotionConfig(durations=(0.4, 0.8), hold=0.8)
 _FREE: Final = MotionConfig(durations=(0.3, 0.9), hold=0.2)
@@ -74,15 +74,15 @@ SPEED: Final = 2
 # Markers of others move rigidly with an arm, a thing or a person.
 MAX_OTHERS: Final = 60
 """Largest number of markers of others."""
-_STRAIGHT: Final = 0.6  # weight of the hand's direction in that of the forearm
-_SHOULDER: Final = (0.45, 0.18, 0.25)  # [m] behind the hands, beside and above them
-_WRIST: Final = ((0.03, 0.028, 0.02), (0.035, -0.028, 0.02))  # [m] behind the wrist, across, above
-_ELBOW: Final = (0.26, 0.03, 0.02)
-_FOREARM: Final = ((0.12, 0.0, 0.03), (0.2, -0.03, 0.02))
+_HAND_WEIGHT: Final = 0.6  # weight of the hand's direction in that of the forearm
+_SHOULDER_OFFSET: Final = (0.45, 0.18, 0.25)  # [m] behind the hands, beside and above them
+_WRIST_MARKERS: Final = ((0.03, 0.028, 0.02), (0.035, -0.028, 0.02))  # [m] behind the wrist, across, above
+_ELBOW_MARKER: Final = (0.26, 0.03, 0.02)
+_FOREARM_MARKERS: Final = ((0.12, 0.0, 0.03), (0.2, -0.03, 0.02))
 _THING: Final = ((0.10, 0.0, -0.06), (0.14, 0.03, -0.09), (0.17, -0.02, -0.07), (0.21, 0.01, -0.12))  # [m]
-_HEAD: Final = ((0.09, 0.0, 0.25), (-0.09, 0.0, 0.25), (0.0, 0.08, 0.27), (0.0, -0.08, 0.2))  # [m]
-_BACK: Final = ((-0.12, 0.05, -0.1), (-0.12, -0.05, -0.25))
-_PERSON: Final = 1.2  # [m] distance of the other person
+_HEAD_MARKERS: Final = ((0.09, 0.0, 0.25), (-0.09, 0.0, 0.25), (0.0, 0.08, 0.27), (0.0, -0.08, 0.2))  # [m]
+_BACK_MARKERS: Final = ((-0.12, 0.05, -0.1), (-0.12, -0.05, -0.25))
+_OTHER_PERSON_DISTANCE: Final = 1.2  # [m] distance of the other person
 _SWAY: Final = 0.03  # [m] half side of the cube in which a swaying body stays
 _BODY_SIZE: Final = (0.3, 0.3, 0.7)  # [m] half sides of the box of the other person's markers
 
@@ -109,9 +109,8 @@ class SceneMotion:
         """The same motion at `times` the speed, without displacements by the skin and markers of others."""
         hands = tuple(GlovedHand(hand.fit, hand.qpos[::times]) for hand in self.hands)
         held = self.moving_object
-        if held is not None:
-            held = MovingObject(held.rigid_object, held.T_world_body[::times])
-        return SceneMotion(hands, held, self.rate)
+        moving = held and MovingObject(held.rigid_object, held.T_world_body[::times])
+        return SceneMotion(hands, moving, self.rate)
 
     def moved(self, offsets: Float[np.ndarray, "*T 3"]) -> SceneMotion:
         """The scene moved by one offset [m], or by one per frame; without markers of others."""
@@ -134,26 +133,26 @@ def sample_scene_motion(
     right, left = fits
     if kind == "hand-hand":
         both = sample_two_hand_motion(right.model, left.model, num_frames / RATE, rng=rng)
-        return SceneMotion(_gloved(fits, both, num_frames))
+        return SceneMotion(_wear_motions(fits, both, num_frames))
     if kind == "single-hand":
         sides = zip(fits, (_HAND_OFFSET, -_HAND_OFFSET), strict=True)
-        free = [_free_hand(fit.model, _FREE_SCRIPT, offset, num_frames, rng) for fit, offset in sides]
-        return SceneMotion(_gloved(fits, free, num_frames))
+        free = [_hand_in_air(fit.model, _FREE_SCRIPT, offset, num_frames, rng) for fit, offset in sides]
+        return SceneMotion(_wear_motions(fits, free, num_frames))
     rigid_object = named_object("pen" if kind == "hand-pen" else "controller")
     holding, body = sample_object_motion(right.model, rigid_object, num_frames / RATE, rng=rng)
     held = HandMotion(holding.qpos[:num_frames], RATE), BodyMotion(body.T_world_body[:num_frames], RATE)
-    other = _free_hand(left.model, _RESTING_SCRIPT, -_HAND_OFFSET, num_frames, rng)
+    other = _hand_in_air(left.model, _RESTING_SCRIPT, -_HAND_OFFSET, num_frames, rng)
     if kind == "hand-pen":
         path = pointing_path(*left.markers(other.qpos), RATE, rng=rng)
         holding, body = point_pen(right.model, left.model, rigid_object, held, other, path)
     else:
         direction = np.tile(_RETREAT_DIRECTION, (num_frames, 1))
         holding, body = keep_apart(right.model, left.model, rigid_object, held, other, direction)
-    hands = _gloved(fits, (holding, other), num_frames)
+    hands = _wear_motions(fits, (holding, other), num_frames)
     return SceneMotion(hands, MovingObject(rigid_object, body.T_world_body))
 
 
-def _free_hand(
+def _hand_in_air(
     model: HandModel, script: str, offset: float, num_frames: int, rng: np.random.Generator
 ) -> HandMotion:
     """Motion of a hand in the air, palm mostly down, at `offset` from the center of the room [m]."""
@@ -164,7 +163,7 @@ def _free_hand(
     return HandMotion(qpos, RATE)
 
 
-def _gloved(
+def _wear_motions(
     fits: Sequence[GloveFit], motions: Sequence[HandMotion], num_frames: int
 ) -> tuple[GlovedHand, ...]:
     """Hands in their gloves with the first frames of their motions."""
@@ -192,7 +191,7 @@ def sample_calibration_scene(
     moving = []
     for fit, part, offset in zip(hands, angles, (_HAND_OFFSET, -_HAND_OFFSET), strict=False):
         position, quaternion = wrist_path(
-            frames, _FREE.rate, center=(offset, 0.0, 1.1), volume=_VOLUME, turning=_TURNING, rng=rng
+            frames, _FREE.rate, center=(offset, 0.0, 1.1), volume=_VOLUME, turning=_WRIST_TURNING, rng=rng
         )
         qpos = join_qpos(part[:frames], position=position, quaternion=quaternion)
         moving.append(GlovedHand(fit, qpos))
@@ -224,7 +223,7 @@ def _touch_fingers(model: HandModel, rng: np.random.Generator) -> list[NDArray[n
     """Poses (20,) [rad] in which the thumb touches each reachable fingertip, from random starts."""
     poses = []
     for finger in FINGERS:
-        pinch = gesture(f"{_STARTS[rng.integers(len(_STARTS))]}_{finger}")
+        pinch = gesture(f"{_TOUCH_GESTURES[rng.integers(len(_TOUCH_GESTURES))]}_{finger}")
         start = make_valid(model, (pinch + rng.normal(scale=_JITTER, size=NUM_JOINTS))[None])
         try:
             touch = touching_angles(model, finger, start)
@@ -253,8 +252,8 @@ def other_markers(scene: SceneMotion, count: int, *, rng: np.random.Generator) -
     front = ahead[..., 0].mean(axis=(0, 1)) * [1.0, 1.0, 0.0] + [1e-6, 0.0, 0.0]
     front /= np.linalg.norm(front)
     trunk = np.stack([front, [-front[1], front[0], 0.0], [0.0, 0.0, 1.0]], axis=1)
-    sway = _path(scene, middle, _SWAY, rng) - middle
-    back, side, above = _SHOULDER
+    sway = _slow_path(scene, middle, _SWAY, rng) - middle
+    back, side, above = _SHOULDER_OFFSET
     arms, bodies = [], []
     for number, hand in enumerate(scene.hands):
         lateral = -side if hand.fit.side == "right" else side
@@ -263,13 +262,14 @@ def other_markers(scene: SceneMotion, count: int, *, rng: np.random.Generator) -
         bodies.append(shoulder[:, None])
     places = np.array(_THING) + rng.normal(0.0, 0.01, (4, 3))
     thing = wrists[:, :1] + np.einsum("tij,kj->tki", ahead[:, 0], places)
-    torso = middle + np.array([*_HEAD, *_BACK]) @ trunk.T + trunk @ [-back, 0.0, above] + sway[:, None]
+    body = np.array([*_HEAD_MARKERS, *_BACK_MARKERS]) @ trunk.T
+    torso = middle + body + trunk @ [-back, 0.0, above] + sway[:, None]
     own = [*[part[:, :3] for part in arms], *bodies, *[part[:, 3:] for part in arms], thing, torso]
     markers = np.concatenate(own, axis=1)
     left = max(0, count - markers.shape[1])
     angle = rng.uniform(0.0, 2.0 * np.pi)
-    place = middle + _PERSON * (trunk @ [np.cos(angle), np.sin(angle), 0.0])
-    person = _path(scene, place, 0.1, rng)[:, None] + rng.uniform(-1.0, 1.0, (left, 3)) * _BODY_SIZE
+    place = middle + _OTHER_PERSON_DISTANCE * (trunk @ [np.cos(angle), np.sin(angle), 0.0])
+    person = _slow_path(scene, place, 0.1, rng)[:, None] + rng.uniform(-1.0, 1.0, (left, 3)) * _BODY_SIZE
     return np.concatenate([markers, person], axis=1)[:, :count]
 
 
@@ -279,16 +279,16 @@ def _arm(
     """Markers of an arm [m]: two at the wrist, one on the elbow, two on the forearm."""
     reach = wrist - shoulder
     reach /= np.linalg.norm(reach, axis=1, keepdims=True)
-    along = _STRAIGHT * ahead[..., 0] + (1.0 - _STRAIGHT) * reach
+    along = _HAND_WEIGHT * ahead[..., 0] + (1.0 - _HAND_WEIGHT) * reach
     along /= np.linalg.norm(along, axis=1, keepdims=True)
     across = np.cross(ahead[..., 2], along)
     across /= np.linalg.norm(across, axis=1, keepdims=True)
     frame = np.stack([-along, across, np.cross(along, across)], axis=2)
-    places = np.array([*_WRIST, _ELBOW, *_FOREARM])
+    places = np.array([*_WRIST_MARKERS, _ELBOW_MARKER, *_FOREARM_MARKERS])
     return np.asarray(wrist[:, None] + np.einsum("tij,kj->tki", frame, places))
 
 
-def _path(
+def _slow_path(
     scene: SceneMotion, center: Float[np.ndarray, "3"], volume: float, rng: np.random.Generator
 ) -> Float[np.ndarray, "T 3"]:
     """Slow motion in a cube of half side `volume` around a center [m]."""

@@ -46,8 +46,8 @@ from train.simulation.training_frames import sample_adult_hands, wear_gloves
 
 WRIST_VOLUME: Final = 0.5
 """Half side of the cube in which wrists stay [m]; no camera may be there."""
-BOTH: Final[tuple[Side, Side]] = ("right", "left")
-APART: Final = ("single-hand", "calibration", "free")
+BOTH_SIDES: Final[tuple[Side, Side]] = ("right", "left")
+ONE_HAND_KINDS: Final = ("single-hand", "calibration", "free")
 """Kinds of capture that one hand alone can do."""
 _MAX_PEOPLE: Final = 10
 _SLIP_ALONG, _SLIP_AROUND = 0.05, np.deg2rad(5.0)  # slip of a glove [bone lengths, rad]
@@ -76,7 +76,7 @@ class SimulateSettings(Settings):
     """Settings of the optical system that differ from those fitted to this kind of capture."""
     strays: StrayOptions = field(default_factory=StrayOptions)
     """Stray reflections, where they differ from those fitted to this kind of capture."""
-    hands: tuple[Side, ...] = BOTH
+    hands: tuple[Side, ...] = BOTH_SIDES
     """Hands to simulate: right, left, or both, which meet or hold an object together in the kinds hand-hand,
     hand-pen, hand-controller and real-like. A glove for one hand simulates that hand alone."""
     others: Annotated[int, Limits(0, MAX_OTHERS)] = 0
@@ -85,10 +85,10 @@ class SimulateSettings(Settings):
 
     def check(self) -> None:
         """Refuse one hand where two are needed, and optics out of range."""
-        if set(self.hands) != set(BOTH) and (self.kind not in APART or len(self.hands) != 1):
+        if set(self.hands) != set(BOTH_SIDES) and (self.kind not in ONE_HAND_KINDS or len(self.hands) != 1):
             raise ArgumentError(
                 f"hands are {' '.join(self.hands) or 'none'}, expected right and left, or one of them for "
-                f"the kinds {', '.join(APART)}"
+                f"the kinds {', '.join(ONE_HAND_KINDS)}"
             )
         room_of(self)
 
@@ -122,12 +122,12 @@ def simulate_take(
     """
     given = SimulateSettings.of(settings, options if kind is None else {"kind": kind, **options})
     rig, layout = load_rig(given.rig), load_layout(given.glove)
-    given = dataclasses.replace(given, hands=_worn_hands(given, layout))
+    given = dataclasses.replace(given, hands=_simulated_sides(given, layout))
     check_outside_volume(rig, np.array(given.center), WRIST_VOLUME)
     draw = TWINS[given.kind].draw if given.kind in TWINS else 0
     seeds = np.random.SeedSequence(given.seed, spawn_key=(SIMULATED_KINDS.index(given.kind), draw))
     rng = np.random.default_rng(seeds)
-    scene = _sample_scene(given, layout, rng)
+    scene = _scene_of_take(given, layout, rng)
     if given.center != ROOM_CENTER:
         scene = scene.moved(np.subtract(given.center, ROOM_CENTER))
     if given.others:
@@ -136,13 +136,13 @@ def simulate_take(
     room = dataclasses.replace(room, optics=room.optics.worn(layout.radius))
     record = given.record() | {"rig": rig_setting(rig), "room": room.record()}
     del record["optics"], record["strays"]  # the room has all of them
-    if given.center == ROOM_CENTER:
-        del record["center"]
-    if set(given.hands) == set(BOTH):
-        del record["hands"]
-    if not given.others:
-        del record["others"]
-    return record_take(scene, rig, room, record, rng=rng)
+    usual = {
+        "center": given.center == ROOM_CENTER,
+        "hands": set(given.hands) == set(BOTH_SIDES),
+        "others": not given.others,
+    }
+    kept = {name: value for name, value in record.items() if not usual.get(name, False)}
+    return record_take(scene, rig, room, kept, rng=rng)
 
 
 def simulate_calibration(
@@ -158,18 +158,18 @@ def sample_scene(
     kind: Kind, layout: MarkerLayout, num_frames: int, *, rng: np.random.Generator
 ) -> SceneMotion:
     """A random person in gloves, with the motion of a kind of capture, at `RATE` frames per second."""
-    return by_somebody(
-        kind, lambda: sample_scene_motion(kind, _worn_gloves(layout, rng), num_frames, rng=rng)
+    return first_capable_person(
+        kind, lambda: sample_scene_motion(kind, _sample_gloves(layout, rng), num_frames, rng=rng)
     )
 
 
-def _worn_hands(settings: SimulateSettings, layout: MarkerLayout) -> tuple[Side, ...]:
+def _simulated_sides(settings: SimulateSettings, layout: MarkerLayout) -> tuple[Side, ...]:
     """The hands to simulate; a `LayoutError` if the glove is not for them."""
-    if len(layout.sides) == 1 and set(settings.hands) == set(BOTH):
-        if settings.kind not in APART:
+    if len(layout.sides) == 1 and set(settings.hands) == set(BOTH_SIDES):
+        if settings.kind not in ONE_HAND_KINDS:
             raise LayoutError(
                 f"glove '{layout.name}' is for a {layout.sides[0]} hand only (its file's `sides`), and "
-                f"{settings.kind} needs both; kinds of capture for one hand: {', '.join(APART)}"
+                f"{settings.kind} needs both; kinds of capture for one hand: {', '.join(ONE_HAND_KINDS)}"
             )
         return layout.sides
     for side in settings.hands:
@@ -177,7 +177,7 @@ def _worn_hands(settings: SimulateSettings, layout: MarkerLayout) -> tuple[Side,
     return settings.hands
 
 
-def _sample_scene(settings: SimulateSettings, layout: MarkerLayout, rng: np.random.Generator) -> SceneMotion:
+def _scene_of_take(settings: SimulateSettings, layout: MarkerLayout, rng: np.random.Generator) -> SceneMotion:
     """Scene of a take with these settings, without markers of others."""
     kind, count = settings.kind, settings.num_frames
     if kind == "real-like":
@@ -193,22 +193,22 @@ def _sample_scene(settings: SimulateSettings, layout: MarkerLayout, rng: np.rand
         made = dataclasses.replace(made, free=(count + 1) / RATE)
 
     def exercise() -> SceneMotion:
-        worn = tuple(fit for fit in _worn_gloves(layout, rng) if fit.side in settings.hands)
+        worn = tuple(fit for fit in _sample_gloves(layout, rng) if fit.side in settings.hands)
         scene = sample_calibration_scene(worn, made, rng=rng)
         hands = tuple(GlovedHand(hand.fit, hand.qpos[:count]) for hand in scene.hands)
         return dataclasses.replace(scene, hands=hands)
 
-    return by_somebody(kind, exercise)
+    return first_capable_person(kind, exercise)
 
 
-def _worn_gloves(layout: MarkerLayout, rng: np.random.Generator) -> Sequence[GloveFit]:
+def _sample_gloves(layout: MarkerLayout, rng: np.random.Generator) -> Sequence[GloveFit]:
     """A random adult's hands in gloves."""
     models = sample_adult_hands(rng=rng)
     return wear_gloves(layout, models, along=_SLIP_ALONG, around=_SLIP_AROUND, rng=rng)
 
 
-def by_somebody(kind: SimulatedKind, act: Callable[[], SceneMotion]) -> SceneMotion:
-    """Scene of the first person who can do this kind of capture; `act` draws one and raises if not."""
+def first_capable_person(kind: SimulatedKind, act: Callable[[], SceneMotion]) -> SceneMotion:
+    """Scene of the first person who can do this kind of capture; `act` draws a person, and may raise."""
     reason: PoseError | None = None
     for _ in range(_MAX_PEOPLE):
         try:

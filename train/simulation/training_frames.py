@@ -358,13 +358,15 @@ def observe_scene(
     for number, (centers, _) in enumerate(worn):
         columns = slice(number * centers.shape[1], (number + 1) * centers.shape[1])
         strays = sample_ghosts(centers, rig, segments, radii, ghosts, min_cameras=optics.min_rays, rng=rng)
-        near = np.where(_near(found.false_points, centers)[..., None], found.false_points, np.nan)
+        near = np.where(_near_markers(found.false_points, centers)[..., None], found.false_points, np.nan)
         kept = keep_some(np.concatenate([strays, near], axis=1), rng=rng)
         hands.append(HandFrames(centers, cameras[:, columns], found.positions[:, columns], kept))
     return tuple(hands)
 
 
-def _near(points: Float[np.ndarray, "T P 3"], centers: Float[np.ndarray, "T M 3"]) -> Bool[np.ndarray, "T P"]:
+def _near_markers(
+    points: Float[np.ndarray, "T P 3"], centers: Float[np.ndarray, "T M 3"]
+) -> Bool[np.ndarray, "T P"]:
     """Which points, most of them NaN, are within `GHOST_REACH` of a marker center of their frame."""
     near: NDArray[np.bool_] = np.isfinite(points[..., 0])
     distance = np.linalg.norm(points[near][:, None] - centers[near.nonzero()[0]], axis=-1)

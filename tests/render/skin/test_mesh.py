@@ -89,7 +89,9 @@ def test_parts_follow_the_weights(model: HandModel) -> None:
 
 def test_left_hand_is_the_mirror_image(rng):
     forearm = Forearm(flexion=0.2)
-    right, left = (PosableSkin(HandModel.named("M", side=side), forearm, bony=1.3) for side in SIDES[::-1])
+    right, left = (
+        PosableSkin(HandModel.named("M", side=side), forearm, bone_relief=1.3) for side in SIDES[::-1]
+    )
     np.testing.assert_allclose(left.rest, right.rest @ MIRROR, atol=1e-9)
     qpos = join_qpos(rng.uniform(0.0, 1.2, (1, 20)))[0]  # whose knuckles and tendons stand out
     ours, mirrored = left.posed(qpos), right.posed(qpos)

@@ -26,7 +26,7 @@ from train.forecast.rig_score import (
 @pytest.fixture(scope="module")
 def score(work):
     middle, sides = np.array(ROOM_CENTER), np.full(3, 0.6)
-    return score_work(load_rig("six"), {"all kinds": work}, middle, sides, told="a <test>")
+    return score_work(load_rig("six"), {"all kinds": work}, middle, sides, described_as="a <test>")
 
 
 def with_missing(one, missing, **more):
@@ -64,24 +64,24 @@ def test_missing_markers_bad_corners_and_ghosts_are_told(good):
     shares[7] = 0.3
     volume = good.volume._replace(seen_by_two=shares)
     kinds = {"a": good.whole, "b": whole}
-    told = dataclasses.replace(good, whole=whole, volume=volume, kinds=kinds).advice
-    assert told[0].startswith("20.0 % of the marker-frames will be missing, most with b (20 %)")
-    assert "two cameras see 30 % of a hand's markers, 98 % at the best place" in told[1]
-    assert told[-1].startswith("1.5 points a frame will be no marker, most with b (1.5)")
+    advice = dataclasses.replace(good, whole=whole, volume=volume, kinds=kinds).advice
+    assert advice[0].startswith("20.0 % of the marker-frames will be missing, most with b (20 %)")
+    assert "two cameras see 30 % of a hand's markers, 98 % at the best place" in advice[1]
+    assert advice[-1].startswith("1.5 points a frame will be no marker, most with b (1.5)")
 
 
 def test_a_long_error_names_its_axis(good):
     error = good.whole.error._replace(
         axes=np.array([0.002, 0.0005, 0.0004]), directions=np.array([[0.1, 0.99, 0.0], [1, 0, 0], [0, 0, 1]])
     )
-    told = dataclasses.replace(good, whole=dataclasses.replace(good.whole, error=error)).advice
-    assert told[-1].startswith("Points are least certain along y, 2.00 mm against 0.40 mm")
+    advice = dataclasses.replace(good, whole=dataclasses.replace(good.whole, error=error)).advice
+    assert advice[-1].startswith("Points are least certain along y, 2.00 mm against 0.40 mm")
 
 
 def test_two_cameras_are_both_needed(good):
     losses = [CameraLoss(0.9, 0.9, None)] * 2
-    told = dataclasses.replace(good, losses=losses).advice
-    assert told == ["Without either camera there are no points at all: a third would forgive a loss."]
+    advice = dataclasses.replace(good, losses=losses).advice
+    assert advice == ["Without either camera there are no points at all: a third would forgive a loss."]
     assert camera_table(dataclasses.replace(good, losses=losses))[1][3] == "-"
 
 
@@ -142,16 +142,16 @@ def test_close_low_and_near_cameras_are_told():
         poses[2] = look_at(np.array([1.0, -1.0, -0.2]), np.array([0.0, 0.0, 1.1]))
         poses[3] = look_at(np.array([0.4, 0.0, 1.1]), np.array([0.0, 0.0, 1.1]))
 
-    told = faults(with_cameras(move))
-    assert any(one.startswith("cameras 1 and 2 are 3 cm apart") for one in told)
-    assert any(one.startswith("camera 3 is 0.20 m below the floor") for one in told)
-    assert any(one.startswith("camera 4 is 0.10 m from the cube") for one in told)
+    found = faults(with_cameras(move))
+    assert any(one.startswith("cameras 1 and 2 are 3 cm apart") for one in found)
+    assert any(one.startswith("camera 3 is 0.20 m below the floor") for one in found)
+    assert any(one.startswith("camera 4 is 0.10 m from the cube") for one in found)
 
 
 def test_a_narrow_far_and_shifted_rig_is_told():
     middle = np.array([4.0, 0.0, 1.1])
     poses = np.stack([look_at(middle + [9.0, side, 0.0], middle) for side in (-0.5, 0.5)])
-    told = faults(square_rig("narrow", poses, resolution=320))
-    assert any("no two cameras see the middle at more than 6 deg" in one for one in told)
-    assert any("the cameras look at (4.00, 0.00, 1.10) m" in one for one in told)
-    assert any(one.startswith("camera 1 sees a marker of 6.4 mm as 0.2 px") for one in told)
+    found = faults(square_rig("narrow", poses, resolution=320))
+    assert any("no two cameras see the middle at more than 6 deg" in one for one in found)
+    assert any("the cameras look at (4.00, 0.00, 1.10) m" in one for one in found)
+    assert any(one.startswith("camera 1 sees a marker of 6.4 mm as 0.2 px") for one in found)
