@@ -26,8 +26,8 @@ _GESTURE_SPREAD: Final = np.array([12.0, 2.0, -8.0, -18.0])  # [deg] index to li
 # Couplings between joints, as of a relaxed hand. Sources (docs/angles.md): DIP follows PIP (two thirds on
 # average; Lin, Wu and Huang 2000), abduction dies away as the MCP flexes (collateral ligaments tighten), and
 # neighbors share tendons, so that one finger's flexion drags the next.
-LOW: Final = np.deg2rad([joint.low for joint in JOINTS])
-HIGH: Final = np.deg2rad([joint.high for joint in JOINTS])
+LOW: Final = np.deg2rad([joint.low_deg for joint in JOINTS])
+HIGH: Final = np.deg2rad([joint.high_deg for joint in JOINTS])
 
 _TIGHT_FLEXION: Final = np.deg2rad(85.0)  # MCP flexion from which abduction has its smallest range
 _TIGHT_SHARE: Final = 0.25  # share of the abduction range that remains there

@@ -225,7 +225,7 @@ def _is_shown(hand: TrackedHand, count: int) -> bool:
 
 def usual_breadth(length: float) -> float:
     """The usual breadth of a hand of some length [m]: interpolated in the five sizes, proportional beyond."""
-    lengths, breadths = 1e-3 * np.array(sorted(SIZES.values())).T
+    lengths, breadths = np.array(sorted(SIZES.values())).T
     inside = float(np.clip(length, lengths[0], lengths[-1]))
     return float(np.interp(inside, lengths, breadths)) * length / inside
 

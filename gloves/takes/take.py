@@ -65,7 +65,7 @@ from handsim.hand.model import (
 )
 from handsim.hand.shape import JOINT_NAMES, NUM_JOINTS, NUM_KEYPOINTS, Side
 from handsim.motion_files.motion import Motion, PosedBody, PosedHand
-from handsim.space.transforms import FORWARD, ForwardAxis, UpAxis, facing, quaternion_matrix, turned_poses
+from handsim.space.transforms import FORWARD, ForwardAxis, UpAxis, facing, quaternion_matrix, rotated_poses
 
 TRUTH_SUFFIX: Final = ".truth.npz"
 """Ending of the name of a simulated take that lies beside its capture."""
@@ -730,7 +730,7 @@ class Take:
     def turned(self, turn: Float[np.ndarray, "3 3"]) -> Take:
         """This take after a rotation of its world."""
         points = dataclasses.replace(self.point_list, points=self.point_list.points @ turn.T)
-        qpos, poses = turned_poses(self.qpos, turn), turned_poses(self.body_poses, turn)
+        qpos, poses = rotated_poses(self.qpos, turn), rotated_poses(self.body_poses, turn)
         return dataclasses.replace(self, qpos=qpos, body_poses=poses, point_list=points)
 
     def cut(self, first: int, last: int) -> Take:

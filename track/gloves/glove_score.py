@@ -288,7 +288,7 @@ def layout_spreads(
 
 def free_spreads() -> Float[np.ndarray, "20"]:
     """Standard deviation of each joint without any marker: uniform in its range [rad]."""
-    ranges = np.deg2rad([joint.high - joint.low for joint in JOINTS])
+    ranges = np.deg2rad([joint.high_deg - joint.low_deg for joint in JOINTS])
     return np.asarray(ranges / np.sqrt(12.0))
 
 

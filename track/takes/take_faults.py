@@ -237,8 +237,8 @@ def _at_limits(hand: _Hand) -> Iterator[SuspectSpan]:
     """Joints at the limit of the model's range in many frames, which may have gone beyond."""
     angles = np.rad2deg(hand.take.qpos[hand.frames, hand.take.hand_index(hand.side), 7:])
     for joint, values in zip(JOINTS, angles.T, strict=True):
-        low, high = values < joint.low + AT_LIMIT, values > joint.high - AT_LIMIT
-        for limit, there in ((joint.low, low), (joint.high, high)):
+        low, high = values < joint.low_deg + AT_LIMIT, values > joint.high_deg - AT_LIMIT
+        for limit, there in ((joint.low_deg, low), (joint.high_deg, high)):
             if there.mean() > _OFTEN_AT_LIMIT:
                 first = int(hand.frames[there.argmax()])
                 share, start = 100 * there.mean(), hand.take.times[first]

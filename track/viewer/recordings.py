@@ -22,7 +22,7 @@ from handsim.hand.model import HandModel
 from handsim.hand.shape import NUM_QPOS
 from handsim.pages import distinct_colors
 from handsim.space.rig import CameraRig, list_rigs, load_rig
-from handsim.space.transforms import UpAxis, turned_poses, upright
+from handsim.space.transforms import UpAxis, rotated_poses, upright
 from track.bodies.rigid_body import RigidTemplate
 from track.frames import StreamedFrame, TrackedFrame
 from track.takes.take_faults import SuspectSpan
@@ -293,7 +293,7 @@ def write_video(
     def pictures() -> Iterator[tuple[Any, ...]]:
         for number, index in enumerate(frames, start=1):
             frame = recording.frame(index)
-            hands = list(zip(frame.hands, turned_poses(frame.qpos, turn), strict=True))
+            hands = list(zip(frame.hands, rotated_poses(frame.qpos, turn), strict=True))
             points, labels = frame.points[frame.seen] @ turn.T, frame.labels[frame.seen]
             yield hands, points, palette[labels], f"frame {index}, {frame.time:.2f} s"
             progress(number, len(frames))

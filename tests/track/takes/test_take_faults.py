@@ -242,7 +242,7 @@ def test_places_that_are_off_are_named(truth, across):
 def test_a_joint_at_its_limit_is_named(tracked, beyond):
     qpos = tracked.qpos.copy()
     joint = tracked.joint_names.index("ring_MCP_flexion")
-    qpos[HALF:, 0, 7 + joint] = np.deg2rad(JOINTS[joint].low - beyond)
+    qpos[HALF:, 0, 7 + joint] = np.deg2rad(JOINTS[joint].low_deg - beyond)
     take = dataclasses.replace(tracked, qpos=qpos)
     assert hand_figures(take)[0].joints()[joint, -3] >= 0.49
     (fault,) = (one for one in find_faults(take) if "limit" in one.why)

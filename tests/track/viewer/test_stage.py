@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from handsim.space.transforms import quaternion_matrix, turned_poses, upright
+from handsim.space.transforms import quaternion_matrix, rotated_poses, upright
 from track.viewer.contents import first_look, show_recording
 from track.viewer.recordings import TakeRecording, write_video
 from track.viewer.stage import FrameView
@@ -124,8 +124,8 @@ def test_a_take_with_y_up_stands_as_the_same_take_with_z_up(server, page_of, tra
     points = dataclasses.replace(tracked.point_list, points=tracked.point_list.points @ back.T)
     lying = dataclasses.replace(
         tracked,
-        qpos=turned_poses(tracked.qpos, back),
-        body_poses=turned_poses(tracked.body_poses, back),
+        qpos=rotated_poses(tracked.qpos, back),
+        body_poses=rotated_poses(tracked.body_poses, back),
         point_list=points,
     )
     looks, clips = [], []
