@@ -32,7 +32,7 @@ from handsim.space.rig import (
     nearest_rotation,
     read_rig_file,
 )
-from handsim.space.transforms import UpAxis, quaternion_matrix, rigid, upright
+from handsim.space.transforms import UpAxis, quaternion_matrix, rigid, room_axes
 
 _MAX_VALUE: Final = 1e9  # largest number in a calibration, in any unit
 _MAX_XML_BYTES: Final = 1 << 25  # These files also hold masks and thresholds of cameras.
@@ -441,7 +441,7 @@ def import_cameras(path: str | Path, up: UpAxis | None = None) -> tuple[Camera, 
         named = ", ".join(one.camera.name for one in found if one.video)
         _warn(f"{path}: video cameras see no markers and are left out: {named}")
     axis: UpAxis = up or ("y" if all(one.y_up for one in seeing) else "z")
-    turn = rigid(upright(axis), np.zeros(3))
+    turn = rigid(room_axes(axis), np.zeros(3))
     cameras = tuple(one.camera.at(turn @ one.camera.T_world_camera) for one in seeing)
     # Labs may turn cameras on their sides, and a single camera often has no pose.
     guessed = len(seeing) > 1 and not (seeing[0].y_up and axis == "y")

@@ -90,6 +90,8 @@ def _left_multiplication(rotation: Float[np.ndarray, "3 3"]) -> NDArray[np.float
 def room_axes(up: UpAxis, forward: str = "x") -> Float[np.ndarray, "3 3"]:
     """The directions `DIRECTIONS` of a room in the axes of its camera system, as rows.
 
+    As a matrix they rotate a world in which the axis `up` points up to ours, in which z does.
+
     Raises:
         ArgumentError: The same axis points up and forward.
     """
@@ -101,13 +103,8 @@ def room_axes(up: UpAxis, forward: str = "x") -> Float[np.ndarray, "3 3"]:
     return np.stack([ahead, np.cross(upward, ahead), upward])
 
 
-def upright(up: UpAxis) -> Float[np.ndarray, "3 3"]:
-    """Rotation of a world in which an axis points up to ours, with z up."""
-    return room_axes(up)
-
-
 def facing(up: UpAxis, forward: str) -> Float[np.ndarray, "3 3"]:
-    """Rotation about the axis `up` that lets `file_axes` turn the axis `forward` to -z, as in OpenXR."""
+    """Rotation about the axis `up`, after which `file_axes` maps the axis `forward` to -z, as in OpenXR."""
     return np.asarray(file_axes(up).T @ program_axes("openxr", up, forward=forward).turn)
 
 
