@@ -43,7 +43,7 @@ from track.calibration.energy import (
 from track.calibration.hand_parameters import LENGTH, NUM_PARAMETERS
 from track.config import TrackerConfig
 from track.frames import StreamedFrame, TrackedHand
-from track.kinematics.pose_solver import MIN_MARKERS, PoseSolver
+from track.kinematics.pose_solver import FEWEST_MARKERS, PoseSolver
 from track.tracker import Tracker
 from track.user import MEASURED, User, designed_glove
 from train.labelers.protocol import Labeler, Labeling
@@ -428,7 +428,7 @@ def check_hands(
 
 def _compared(frames: Sequence[StreamedFrame]) -> list[StreamedFrame]:
     """Frames in which hands are compared; none if there are too few."""
-    shown = [frame for frame in frames if len(frame.points) >= MIN_MARKERS]
+    shown = [frame for frame in frames if len(frame.points) >= FEWEST_MARKERS]
     half = max(_PART, len(shown) // (2 * _PART) * _PART)
     some = [*shown[:_PART], *shown[half : half + _PART]]
     return some if len(some) >= _LEAST_FRAMES else []

@@ -20,7 +20,7 @@ from handsim.hand.shape import JOINTS, Side
 from track.alternatives.alternatives import Doubt, doubts_of
 from track.alternatives.hands import other_hands_of
 from track.hand_size import glove_shifts
-from track.kinematics.pose_solver import MIN_MARKERS
+from track.kinematics.pose_solver import FEWEST_MARKERS
 from track.kinematics.pose_spread import are_still
 from track.settings import USUAL_SIZE
 
@@ -154,7 +154,7 @@ def _faults_of_hands(take: Take, *, is_last: bool, judges: bool) -> tuple[Suspec
         frames = frames[:: -(-len(frames) // _MOST_FRAMES)]
         some = frames[:: -(-len(frames) // _FITTED_FRAMES)]
         seen = take.point_list.labeled(take.hand_labels[number], some)
-        enough = np.isfinite(seen[..., 0]).sum(axis=1) >= MIN_MARKERS
+        enough = np.isfinite(seen[..., 0]).sum(axis=1) >= FEWEST_MARKERS
         offsets = take.marker_offsets(side, frames)
         hand = _Hand(take, side, take.hands[number], frames, offsets, some[enough], seen[enough])
         # Hands that are not measured, or of a user whom another follows, do not fit, which looks like a slip.

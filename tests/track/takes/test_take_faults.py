@@ -16,7 +16,7 @@ from handsim import HandSimWarning
 from handsim.hand.shape import JOINT_NAMES, JOINTS, PALM
 from track import find_suspect_spans, track_capture
 from track.alternatives.alternatives import _mirror_orders
-from track.kinematics.pose_solver import MIN_MARKERS, PoseSolver
+from track.kinematics.pose_solver import FEWEST_MARKERS, PoseSolver
 from track.takes import take_faults
 from track.takes.take_faults import find_faults
 from track.takes.take_figures import PageSettings, hand_figures
@@ -214,7 +214,7 @@ def test_a_slip_of_the_whole_glove_is_told_on_moving_skin(shift):
     between = GloveFit(hand.model, dataclasses.replace(worn, points=worn.points + moved))
     bones = hand.model.forward_kinematics(made.qpos[half:, made.hand_index("right")])
     seen[half:] += shift * bones[:, own][..., :3, 0]
-    seen = seen[np.isfinite(seen[..., 0]).sum(axis=1) >= MIN_MARKERS]
+    seen = seen[np.isfinite(seen[..., 0]).sum(axis=1) >= FEWEST_MARKERS]
     take = as_tracked([between], PoseSolver(between).solve(seen).qpos[:, None], seen)
     found = [fault for fault in find_faults(take) if "slips by" in fault.why]
     assert [fault.of for fault in found] == ["the right glove"] * (shift > 0.0)
