@@ -42,7 +42,7 @@ def draw_shape(size: str, factor: float, rng: np.random.Generator) -> HandShape:
     """A size's mean hand, scaled, with one person's own proportions."""
     person = sample_shape(rng=rng)
     mean = shape_from_measures(person.length, person.breadth)
-    hand = shape_from_measures(*(1e-3 * factor * measure for measure in SIZES[size]))
+    hand = shape_from_measures(*(factor * measure for measure in SIZES[size]))
     return dataclasses.replace(
         hand,
         bone_lengths=hand.bone_lengths * person.bone_lengths / mean.bone_lengths,

@@ -1,8 +1,7 @@
-"""Marker layouts: the place of each marker on a bone's skin, read from a TOML file.
+"""Marker layouts: the place of each marker on the skin over a bone, read from a TOML file.
 
-A layout does not depend on the size of a hand: places are fractions of the bone they are on, so that the same
-glove fits every hand. Angles are degrees in the file and radians in memory, the marker radius millimeters in
-the file and meters in memory.
+A layout does not depend on the size of a hand: places are fractions of bones, so that a glove fits every
+hand. The file has angles in degrees and lengths in millimeters; in memory they are radians and meters.
 """
 
 from __future__ import annotations
@@ -119,7 +118,7 @@ class MarkerPlace:
 
 
 def _flat_position(marker: MarkerPlace) -> tuple[float, float]:
-    """Where a drawing has a marker: across the digits from the thumb, and along the palm and three bones."""
+    """Position of a marker in a drawing: across the digits from the thumb, and along palm and three bones."""
     bone = BONE_NAMES.index(marker.bone)
     if bone == PALM:
         return 2.5 + 3.0 * marker.across, marker.along
@@ -360,9 +359,9 @@ def _parse_marker(table: Mapping[str, object], number: int) -> MarkerPlace:
 
 
 def moved_text(text: str, layout: MarkerLayout) -> tuple[str, bool]:
-    """The text of a layout file with its markers moved as in `layout`, and whether its comments stay.
+    """Move the markers in the text of a layout file as in `layout`; also returns whether comments are kept.
 
-    A text that cannot be changed line by line is written anew, without comments.
+    A text that cannot be edited line by line is rewritten without comments.
     """
     lines = text.splitlines()
     starts = [number for number, line in enumerate(lines) if _TABLE_LINE.match(line)]
@@ -377,9 +376,9 @@ def moved_text(text: str, layout: MarkerLayout) -> tuple[str, bool]:
 
 
 def _moved_table(lines: list[str], marker: MarkerPlace) -> list[str]:
-    """The lines of one table with the values of a marker; equal values keep their text."""
+    """Replace the values in the lines of a marker's table; equal values keep their text."""
     texts = _marker_texts(marker)
-    result, met, last = [], set(), 0
+    result, present, last = [], set(), 0
     for line in lines:
         match = _ENTRY_LINE.match(line)
         if match is None or match[2] not in _MARKER_KEYS[1:]:
@@ -387,7 +386,7 @@ def _moved_table(lines: list[str], marker: MarkerPlace) -> list[str]:
             last = len(result) if match is not None else last
             continue
         key = match[2]
-        met.add(key)
+        present.add(key)
         if key not in texts:
             continue
         same = False
@@ -395,12 +394,13 @@ def _moved_table(lines: list[str], marker: MarkerPlace) -> list[str]:
             same = toml_number(float(match[3])) == texts[key]
         result.append(line if same else f"{match[1]}{texts[key]}{match[4]}")
         last = len(result)
-    result[last:last] = [f"{key} = {texts[key]}" for key in _OPTIONAL_KEYS if key in texts and key not in met]
+    missing = [key for key in _OPTIONAL_KEYS if key in texts and key not in present]
+    result[last:last] = [f"{key} = {texts[key]}" for key in missing]
     return result
 
 
 def _is_text_of(text: str, layout: MarkerLayout) -> bool:
-    """Whether a text describes this layout, up to the decimals of a file."""
+    """Whether a text describes this layout, to the precision of a file."""
     try:
         read = parse_layout(tomllib.loads(text))
     except (HandSimError, ValueError):

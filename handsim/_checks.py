@@ -16,13 +16,16 @@ def check_type(
     name: str, value: object, kinds: type | tuple[type, ...], expected: str, valid: Iterable[str] = ()
 ) -> None:
     """Refuse an argument of another type than `kinds`; True and False are no numbers."""
-    named = kinds if isinstance(kinds, tuple) else (kinds,)
-    if isinstance(value, kinds) and (not isinstance(value, bool) or bool in named):
-        return
+    accepted = kinds if isinstance(kinds, tuple) else (kinds,)
+    if not isinstance(value, kinds) or (isinstance(value, bool) and bool not in accepted):
+        raise unexpected(name, value, expected, valid)
+
+
+def unexpected(name: str, value: object, expected: str, valid: Iterable[str] = ()) -> ArgumentError:
+    """The error for an argument that is not as expected, with the valid names if there are any."""
     names = ", ".join(valid)
-    raise ArgumentError(
-        f"{name} is {shown_value(value)}, expected {expected}" + (f"; valid names: {names}" if names else "")
-    )
+    hint = f"; valid names: {names}" if names else ""
+    return ArgumentError(f"{name} is {shown_value(value)}, expected {expected}{hint}")
 
 
 def check_choice(
@@ -38,10 +41,10 @@ def check_rng(rng: object) -> None:
     check_type("rng", rng, np.random.Generator, "a numpy.random.Generator, such as default_rng(0)")
 
 
-def check_callable(name: str, value: object, expected: str) -> None:
+def check_callable(name: str, value: object, expected: str, valid: Iterable[str] = ()) -> None:
     """Refuse an object that cannot be called."""
     if not callable(value):
-        raise ArgumentError(f"{name} is {shown_value(value)}, expected {expected}")
+        raise unexpected(name, value, expected, valid)
 
 
 def check_methods(name: str, value: object, methods: Iterable[str], expected: str) -> None:
@@ -69,7 +72,7 @@ def as_numbers(name: str, values: ArrayLike, kind: DTypeLike | None = np.float64
             raise TypeError("complex numbers or texts")
         return np.asarray(array, dtype=kind)
     except (TypeError, ValueError, OverflowError, RuntimeError) as error:  # torch raises the last one
-        raise ArgumentError(f"{name} is {shown_value(values)}, expected an array of numbers") from error
+        raise unexpected(name, values, "an array of numbers") from error
 
 
 def as_array(values: ArrayLike, kind: DTypeLike | None) -> NDArray[Any]:
@@ -90,10 +93,8 @@ def as_array(values: ArrayLike, kind: DTypeLike | None) -> NDArray[Any]:
 def check_array(name: str, array: ArrayLike, shape: tuple[int | None, ...]) -> NDArray[np.float64]:
     """`array` as finite float64 whose last dimensions are `shape` (None: any length)."""
     values = as_numbers(name, array)
-    tail = values.shape[values.ndim - len(shape) :] if values.ndim >= len(shape) else ()
-    if len(tail) != len(shape) or any(
-        expected is not None and expected != got for expected, got in zip(shape, tail, strict=True)
-    ):
+    tail = values.shape[max(0, values.ndim - len(shape)) :]
+    if len(tail) != len(shape) or any(want not in (None, got) for want, got in zip(shape, tail, strict=True)):
         dimensions = ", ".join("any" if length is None else str(length) for length in shape)
         raise ArgumentError(f"{name} has shape {values.shape}, expected (..., {dimensions})")
     if not np.isfinite(values).all():
@@ -104,8 +105,7 @@ def check_array(name: str, array: ArrayLike, shape: tuple[int | None, ...]) -> N
 def check_number(name: str, value: float, low: float, high: float = np.inf, *, above: bool = False) -> None:
     """Refuse a number outside `low` to `high`, NaN or infinity; with `above`, `low` itself too."""
     check_type(name, value, (int, float, np.integer, np.floating), "a number")
-    inside = low <= value <= high and value < np.inf and not (above and value == low)
-    if not inside:
+    if not (low <= value <= high and value < np.inf) or (above and value == low):
         least = f"a number above {low:g}" if above else f"a number of at least {low:g}"
         both = f"{least}, at most {high:g}" if above else f"a number from {low:g} to {high:g}"
         expected = least if high == np.inf else both

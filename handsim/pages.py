@@ -17,10 +17,9 @@ from pkgutil import resolve_name
 from string import Template
 from typing import TYPE_CHECKING, Any, Concatenate, Final, ParamSpec
 
-from handsim._checks import check_type, shown_value
+from handsim._checks import check_type, unexpected
 from handsim._process import environment
 from handsim._version import full_version
-from handsim.errors import ArgumentError
 from handsim.files.outputs import check_ending, write_text
 
 if TYPE_CHECKING:
@@ -87,10 +86,8 @@ def write_page(path: str | Path, thing: Any) -> None:
     kinds = (f"{kind.__module__}.{kind.__qualname__}" for kind in type(thing).__mro__)
     target = next((_PAGE_WRITERS[kind] for kind in kinds if kind in _PAGE_WRITERS), None)
     if target is None:
-        raise ArgumentError(
-            f"thing is {shown_value(thing)}, expected a Take, a Dataset, a Registration, a LearnedGlove, or "
-            "a score of a glove or a rig"
-        )
+        things = "a Take, a Dataset, a Registration, a LearnedGlove, or a score of a glove or a rig"
+        raise unexpected("thing", thing, things)
     resolve_name(target)(Path(path), thing)
 
 

@@ -17,9 +17,8 @@ from typing import Annotated, Any, ClassVar, Final, Literal, Self, Union, get_ar
 import numpy as np
 from numpy.typing import NDArray
 
-from handsim._checks import check_choice, check_count, check_number, check_type, shown_value
+from handsim._checks import check_choice, check_count, check_number, check_type, unexpected
 from handsim._plugins import plugin_name
-from handsim.errors import ArgumentError
 
 UNIONS: Final = (Union, types.UnionType)
 """Origins of annotations of several types."""
@@ -192,7 +191,7 @@ def _checked_object(name: str, value: Any, kind: Any, expected: Expected | None)
         return Path(value)
     if getattr(kind, "_is_protocol", False):
         if not all(hasattr(value, member) for member in _members(kind)):
-            raise ArgumentError(f"{name} is {shown_value(value)}, expected {_type_words(kind, expected)}")
+            raise unexpected(name, value, _type_words(kind, expected))
     elif isinstance(kind, type) and get_origin(kind) is None:
         check_type(name, value, kind, _type_words(kind, expected), expected.names() if expected else ())
     return value  # values of a generic type are left to `check`
@@ -216,9 +215,7 @@ def _checked_union(
         if _is_of_type(value, arm):
             return _checked_value(name, value, Annotated[arm, limits], field)
     words = " or ".join(_type_words(arm, None) for arm in others) if expected is None else expected.words
-    names = ", ".join(() if expected is None else expected.names())
-    told = f"{name} is {shown_value(value)}, expected {words}"
-    raise ArgumentError(f"{told}; valid names: {names}" if names else told)
+    raise unexpected(name, value, words, () if expected is None else expected.names())
 
 
 def _is_of_type(value: Any, hint: Any) -> bool:
@@ -250,13 +247,13 @@ def _checked_tuple(name: str, value: Any, arms: tuple[Any, ...], limits: Limits 
     items = (value,) if isinstance(value, str) and any_length else value
     check_type(name, items, (tuple, list), "a tuple" if any_length else f"{len(arms)} values")
     if not any_length and len(items) != len(arms):
-        raise ArgumentError(f"{name} is {shown_value(value)}, expected {len(arms)} values")
+        raise unexpected(name, value, f"{len(arms)} values")
     kinds = arms[:1] * len(items) if any_length else arms
     found = tuple(
         _checked_value(name, item, Annotated[kind, limits]) for item, kind in zip(items, kinds, strict=True)
     )
     if limits is not None and limits.ascends and list(found) != sorted(found):
-        raise ArgumentError(f"{name} is {shown_value(value)}, expected the smaller number first")
+        raise unexpected(name, value, "the smaller number first")
     return found
 
 

@@ -32,7 +32,7 @@ NEAREST: Final = -0.15
 """Distance at which the search ends without a contact [m]."""
 _PRESS: Final = 0.0005  # depth of the contact [m]
 _STEP: Final = 0.15  # step of closing fingers, summed over joints [rad]
-_HALVINGS: Final = 6  # bisections of the first blocked step, at most
+_HALVINGS: Final = 6  # largest number of bisections of the first blocked step
 _PRECISION: Final = 0.003  # change at which bisection stops, summed over joints [rad]
 
 # Fingers close in two stages: all joints, then the two outer ones. Each stage has the depth [m] that a finger

@@ -45,36 +45,36 @@ MAX_OBJECT_PENETRATION: Final = 0.0015
 """Deepest overlap [m] of a hand and the object it holds that counts as valid."""
 _MOTOR_STIFFNESS: Final = 2.0  # [N m/rad]
 _DAMPING: Final = 0.04  # [N m s/rad]
-_ARMATURE: Final = 1e-4  # [kg m^2], inertia of tendons and muscles
+_ARMATURE: Final = 1e-4  # inertia of tendons and muscles [kg m^2]
 # Largest torques [N m] of a finger's abduction, MCP, PIP and DIP, and of the thumb's four hinges.
 _FINGER_TORQUES: Final = (0.20, 0.30, 0.16, 0.06)
 _THUMB_TORQUES: Final = (0.40, 0.40, 0.25, 0.10)
 _FRICTION: Final = (1.2, 0.01, 0.001)  # palm on plastic: sliding, twisting (by the pad's size), rolling
 _CONTACT_TIME: Final = (0.005, 1.0)  # MuJoCo's solref of contacts: time constant [s], damping ratio
 _GUIDE_TIME: Final = (0.03, 1.0)  # solref of the soft constraint that holds the object while fingers close
-_MAX_DISTANCE: Final = 0.5  # distances of capsules from the object are measured up to this one [m]
+_MAX_DISTANCE: Final = 0.5  # largest distance of a capsule from the object that is measured [m]
 
 _PALM_GAP: Final = 0.0005  # gap between palm and object before the fingers close [m]
-_MAX_RAISE: Final = 0.15  # an object is raised to the palm from this far below it [m]
-_ANY_OBJECT: Final = "any"  # library entry of objects that have none of their own
-_ANGLE_WEIGHT: Final = 0.006  # [m/rad] weight of joint deviations against residuals of the tips
-_MAX_STEP: Final = 0.2  # largest change of an angle in a round [rad]
+_MAX_RAISE: Final = 0.15  # distance below the palm from which an object is raised [m]
+_ANY_OBJECT: Final = "any"  # library entry for objects without an entry of their own
+_ANGLE_WEIGHT: Final = 0.006  # weight of joint deviations against residuals of the tips [m/rad]
+_MAX_STEP: Final = 0.2  # largest change of an angle in an iteration [rad]
 
 _MAX_TRIES: Final = 40
 _TRY_SPREADS: Final = np.deg2rad([1.0, 2.0, 3.0, 4.0, 5.0])  # deviation of angles in tries 1, 2, 3, 4, later
-_RAMP_STEPS: Final = 10  # steps of the motors' targets from open to closed
+_RAMP_STEPS: Final = 10  # number of steps of the motors' targets from open to closed
 _CLOSE_STEPS, _SETTLE_STEPS, _SHAKE_STEPS, _REST_STEPS = 400, 200, 60, 60  # steps of 2 ms
 _GRAVITY: Final = 9.81
 _TETRAHEDRON: Final = np.array([(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)]) / np.sqrt(3.0)
 _MAX_DRIFT: Final = 0.004  # largest displacement of the shaken object [m]
 _MAX_ROTATION: Final = np.deg2rad(8.0)  # largest rotation of the shaken object
-_MAX_CONTACT_GAP: Final = 0.0005  # [m] largest distance of a contact
+_MAX_CONTACT_GAP: Final = 0.0005  # largest distance of two bodies in contact [m]
 _MAX_SETTLED_DEPTH: Final = MAX_OBJECT_PENETRATION - 1e-5  # [m]
 _MAX_FINAL_SPEED: Final = 0.5  # [rad/s] of the hinges
 
 _MAX_HELD_DEPTH: Final = MAX_OBJECT_PENETRATION - 1e-6  # [m], with a margin for rounding in the world's frame
 _LIFT_CHANCE: Final = 0.55  # chance that a free digit lifts off the object
-_TAP_CHANCE: Final = 0.3  # chance that a digit that may tap does
+_TAP_CHANCE: Final = 0.3  # chance that a digit that may tap taps
 _STILL_CHANCE: Final = 0.3  # chance that the object does not move in the hand
 # Largest opening of a lifted or tapping thumb (first row) and finger: abduction (both ways), MCP, PIP, DIP.
 _MAX_LIFT: Final = np.deg2rad([[14.0, 30.0, 20.0, 25.0], [5.0, 45.0, 45.0, 30.0]])
@@ -84,7 +84,7 @@ _OBJECT_WOBBLE: Final = (0.0006, np.deg2rad(1.2))  # standard deviations of the 
 
 
 class GraspScene:
-    """A compiled model of one hand and one object, without a state. Poses are in the wrist's frame."""
+    """A compiled model of one hand and one object, without a state; poses are in the wrist's frame."""
 
     def __init__(self, model: HandModel, obj: RigidObject) -> None:
         self.hand = model
@@ -423,7 +423,7 @@ class Hold:
 def settle_hold(
     model: HandModel, obj: RigidObject, *, rng: np.random.Generator, hold: str | None = None
 ) -> Hold:
-    """Simulate a grasp until one is valid: place the object, close the fingers with limited torque, shake it.
+    """Simulate grasps until one is valid: place the object, close the fingers with limited torque, shake it.
 
     The hold is one of `hold_names`, by default a random one.
     """
@@ -443,7 +443,7 @@ def settle_hold(
 
 
 def try_hold(scene: GraspScene, style: HoldStyle, *, rng: np.random.Generator) -> Hold | str:
-    """One try: a hold, or the reason why there is none."""
+    """Try to settle a hold; returns it, or the reason why there is none."""
     start = place_object(scene, style, rng=rng)
     data = scene.new_data(style.open, start)
     _close_hand(scene, data, style, start)
@@ -467,7 +467,7 @@ def try_hold(scene: GraspScene, style: HoldStyle, *, rng: np.random.Generator) -
 
 
 def why_not_held(style: HoldStyle, touching: Sequence[str]) -> str:
-    """Why these touching capsules do not hold the object; an empty string if they do."""
+    """The reason why these touching capsules do not hold the object; empty if they hold it."""
     for need in style.needs:
         if not any(name.startswith(need) for name in touching):
             return f"the {need} does not touch it"
@@ -496,13 +496,13 @@ def _close_hand(scene: GraspScene, data: mujoco.MjData, style: HoldStyle, start:
 def _set_targets(
     scene: GraspScene, data: mujoco.MjData, style: HoldStyle, target: NDArray[np.float64]
 ) -> None:
-    """Set the motors' targets so near to the joint angles that torques stay within the style's strength.
+    """Set the motors' targets near the joint angles, so that torques stay within the style's strength.
 
     Unlike a motor at its torque limit, such a motor stays stiff in both directions.
     """
-    here = data.qpos[:NUM_JOINTS]
+    angles = data.qpos[:NUM_JOINTS]
     limit = style.strength * scene.mj_model.actuator_forcerange[:, 1] / scene.mj_model.actuator_gainprm[:, 0]
-    data.ctrl[:] = here + np.clip(target - here, -limit, limit)
+    data.ctrl[:] = angles + np.clip(target - angles, -limit, limit)
 
 
 def _shake_object(scene: GraspScene, data: mujoco.MjData) -> None:
@@ -540,7 +540,7 @@ def sample_held_poses(
     poses[:, :3, 3] += shift
     poses[:, :3, :3] = poses[:, :3, :3] @ Rotation.from_rotvec(rotation).as_matrix()
     target = Held(angles, poses)
-    # bisect the paths from the hold to poses that penetrate, so that they end at the contact
+    # Bisect the paths from the hold to poses that penetrate, so that they end at the contact.
     share = np.where(is_held_valid(scene, target), 1.0, 0.0)
     step = 1.0
     todo = np.flatnonzero(share == 0.0)
@@ -552,7 +552,7 @@ def sample_held_poses(
 
 
 def interpolate_held(start: Held, end: Held, share: NDArray[np.float64]) -> Held:
-    """Poses at shares (B,) of the paths from one start to one end or B ends."""
+    """Interpolate held poses at shares (B,) of the paths from one start to one end or B ends."""
     angles = start.angles + share[:, None] * (end.angles - start.angles)
     positions = start.poses[:, :3, 3] + share[:, None] * (end.poses - start.poses)[:, :3, 3]
     rotations = Rotation.from_rotvec(share[:, None] * rotation_between(start, end)).as_matrix()

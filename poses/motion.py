@@ -43,7 +43,7 @@ PEAK_SPEED: Final = 1.875
 """Peak speed of the minimum-jerk profile, in distances per duration."""
 PEAK_ACCELERATION: Final = 5.7735
 """Peak acceleration of the minimum-jerk profile, in distances per duration squared."""
-# Joints that move first on a path to rest: all, those of one digit, those of all other digits.
+# Joints that move first on a path to rest: all, those of one digit, or those of all digits but one.
 _MOVES_FIRST: Final = [np.ones(NUM_JOINTS, dtype=bool)] + [
     np.repeat((np.arange(len(DIGITS)) == digit) == first, 4)
     for first in (True, False)
@@ -81,7 +81,7 @@ class MotionConfig(Settings):
     """Shortest and longest time between two positions of the wrist [s]."""
 
     def least_time(self, bend: float, share: float = 1.0) -> float:
-        """Shortest time [s] of a minimum-jerk path that bends a joint so far [rad]."""
+        """Shortest time [s] of a minimum-jerk path that moves a joint by an angle [rad]."""
         speed, acceleration = share * self.max_speed, share * self.max_acceleration
         return max(PEAK_SPEED * bend / speed, float(np.sqrt(PEAK_ACCELERATION * bend / acceleration)))
 
@@ -102,7 +102,7 @@ def straight_path(
 
 
 def _rested(path: NDArray[np.float64], config: MotionConfig, rng: np.random.Generator) -> NDArray[np.float64]:
-    """The path with a random rest at its end."""
+    """Extend a path by a random rest at its end."""
     pause = int(rng.uniform(0.0, config.hold) * config.rate)
     return np.concatenate([path, np.repeat(path[-1:], pause, axis=0)])
 
@@ -111,8 +111,7 @@ def path_to_rest(
     model: HandModel, start: NDArray[np.float64], config: MotionConfig, rng: np.random.Generator
 ) -> NDArray[np.float64]:
     """Valid frames (T, 20) [rad] from a pose to rest: the straight path, or the first valid detour."""
-    # Each round draws new durations: other frames of the same path may all be valid.
-    # Each path is tried with two random durations.
+    # Each path is tried with two random durations: the frames of one may avoid invalid poses of the other.
     for stops in chain(*(_via_paths(start, resting_angles(model)) for _ in range(2))):
         path = np.concatenate([straight_path(*pair, config, rng) for pair in pairwise([start, *stops])])
         if is_valid(model, path).all():
@@ -123,7 +122,7 @@ def path_to_rest(
 def _via_paths(
     start: NDArray[np.float64], resting: NDArray[np.float64]
 ) -> Iterator[list[NDArray[np.float64]]]:
-    """Stops on paths to rest that differ in spread fingers, the thumb, and the digit that moves first."""
+    """Yield stops of paths to rest with different spreads of fingers, thumbs, and digits that move first."""
     spread = gesture("spread")
     fan = np.where(np.arange(NUM_JOINTS) % 4 == 0, spread - gesture("flat"), 0.0)
     fan[:4] = 0.0
@@ -143,10 +142,10 @@ def can_be_left(model: HandModel, poses: Float[np.ndarray, "K 20"]) -> Bool[np.n
     paths = poses[:, None] + shares * (resting_angles(model) - poses[:, None])
     valid: NDArray[np.bool_] = is_valid(model, paths.reshape(-1, NUM_JOINTS))
     free: NDArray[np.bool_] = np.all(valid.reshape(-1, len(shares)), axis=1)
-    one_duration, unused = MotionConfig(durations=(0.4, 0.4)), np.random.default_rng(0)
+    config, rng = MotionConfig(durations=(0.4, 0.4)), np.random.default_rng(0)  # the same result each time
     for number in np.flatnonzero(~free):
         with contextlib.suppress(PoseError):
-            path_to_rest(model, poses[number], one_duration, unused)
+            path_to_rest(model, poses[number], config, rng)
             free[number] = True
     return free
 
@@ -154,7 +153,7 @@ def can_be_left(model: HandModel, poses: Float[np.ndarray, "K 20"]) -> Bool[np.n
 def free_wrist_path(
     frames: int, config: MotionConfig, *, rng: np.random.Generator
 ) -> tuple[Float[np.ndarray, "T 3"], Float[np.ndarray, "T 4"]]:
-    """Positions [m] and orientations (wxyz) of a wrist that takes any orientation."""
+    """Sample positions [m] and orientations (wxyz) of a wrist in any orientation."""
     positions = [ROOM_CENTER + rng.uniform(-config.volume, config.volume, size=3)]
     orientations = [random_quaternions(1, rng=rng)[0]]
     shares = [np.zeros(1)]
@@ -167,9 +166,9 @@ def free_wrist_path(
         )
         steps = int(rng.uniform(*config.wrist_time) * config.rate) + 1
         shares.append(len(positions) - 2 + minimum_jerk(steps))
-    rotated = Rotation.from_quat(np.array(orientations), scalar_first=True)
-    path, turned = interpolate_path(np.array(positions), rotated, np.concatenate(shares)[:frames])
-    return path, turned.as_quat(scalar_first=True)
+    keys = Rotation.from_quat(np.array(orientations), scalar_first=True)
+    path, rotations = interpolate_path(np.array(positions), keys, np.concatenate(shares)[:frames])
+    return path, rotations.as_quat(scalar_first=True)
 
 
 def wrist_path(
@@ -181,10 +180,10 @@ def wrist_path(
     turning: float = 0.5,
     rng: np.random.Generator,
 ) -> tuple[Float[np.ndarray, "T 3"], Float[np.ndarray, "T 4"]]:
-    """Sample how a wrist moves over a table, as positions [m] and orientations (wxyz).
+    """Sample positions [m] and orientations (wxyz) of a wrist over a table.
 
-    It stays in a cube of half side `volume` around a center [m], and turns from fingers ahead and palm down
-    by the standard deviation `turning` about each axis [rad].
+    The wrist stays in a cube of half side `volume` around a center [m]. Its orientation deviates from fingers
+    ahead and palm down by the standard deviation `turning` about each axis [rad].
     """
     shares = [np.zeros(1)]
     while sum(map(len, shares)) < max(frames, 2):  # Slerp needs two keys
@@ -192,10 +191,10 @@ def wrist_path(
         shares.append(len(shares) - 1 + minimum_jerk(steps))
     count = len(shares)
     positions = np.asarray(center) + rng.uniform(-volume, volume, size=(count, 3))
-    away = Rotation.from_rotvec(rng.normal(scale=turning, size=(count, 3)))
-    orientations = away * Rotation.from_matrix(_FORWARD_WRIST)
-    path, turned = interpolate_path(positions, orientations, np.concatenate(shares)[:frames])
-    return path, turned.as_quat(scalar_first=True)
+    deviations = Rotation.from_rotvec(rng.normal(scale=turning, size=(count, 3)))
+    keys = deviations * Rotation.from_matrix(_FORWARD_WRIST)
+    path, orientations = interpolate_path(positions, keys, np.concatenate(shares)[:frames])
+    return path, orientations.as_quat(scalar_first=True)
 
 
 def interpolate_path(
@@ -306,15 +305,15 @@ def scripted_motion(
     config = MotionConfig(durations=tuple(entry["durations"]), hold=entry["hold"])
     frames = count_frames(duration, config)
     poses = script_poses(model, script)
-    at = int(rng.integers(len(poses)))
-    parts, count = [poses[at : at + 1]], 1
+    current = int(rng.integers(len(poses)))
+    parts, count = [poses[current : current + 1]], 1
     while count < frames:
         steps = np.ones(_POSES_PER_DRAW, dtype=np.int64)
         if entry["order"] != "in turn":
             steps = rng.integers(1, len(poses), size=_POSES_PER_DRAW)
-        indices = (at + np.concatenate([[0], np.cumsum(steps)])) % len(poses)
+        indices = (current + np.concatenate([[0], np.cumsum(steps)])) % len(poses)
         parts.append(angles_through(model, poses[indices], config, rng=rng))
-        count, at = count + len(parts[-1]), int(indices[-1])
+        count, current = count + len(parts[-1]), int(indices[-1])
     return with_wrist(np.concatenate(parts)[:frames], config, rng=rng)
 
 

@@ -1,4 +1,4 @@
-"""Motion of a hand that holds an object: it plays, points, and keeps clear of the other hand."""
+"""Motion of a hand that holds an object: it plays with it, points, and keeps clear of the other hand."""
 
 from __future__ import annotations
 
@@ -34,16 +34,16 @@ from poses.grasps import (
 from poses.motion import PEAK_SPEED, MotionConfig, free_wrist_path, minimum_jerk
 from poses.shapes import MAX_PENETRATION
 
-_VARIANTS: Final = 12  # held poses of one draw
+_VARIANTS: Final = 12  # number of held poses in a draw
 _MAX_DRAWS: Final = 20
-_NUM_HOLDS: Final = 3  # grasps of one style in a motion
-_SHIFT_CHANCE: Final = 0.15  # chance to change to another grasp
-_MAX_GAP: Final = 0.003  # [m] between a shifting object and the digits that hold it
+_NUM_HOLDS: Final = 3  # number of grasps of one style in a motion
+_SHIFT_CHANCE: Final = 0.15  # chance of a change to another grasp
+_MAX_GAP: Final = 0.003  # largest gap between a shifting object and the digits that hold it [m]
 _MAX_SLIDE_SPEED, _MAX_ROLL_SPEED = 0.15, 4.0  # fastest shift of the object in the hand [m/s], [rad/s]
 _LIMIT_SHARE: Final = 0.9  # share of the limits of speed and acceleration that paths use
 
-_RETREAT_STEP: Final = 0.003  # [m] added to the overlap in each retreat
-_RETREAT_WINDOW: Final = 0.25  # [s] window of a retreat
+_RETREAT_STEP: Final = 0.003  # distance that is added to the overlap in each retreat [m]
+_RETREAT_WINDOW: Final = 0.25  # time over which a retreat is smoothed [s]
 
 TIP_DISTANCE: Final = (0.006, 0.02)
 """Smallest and largest distance of the tip from its target [m]."""
@@ -52,7 +52,7 @@ TIP_SPEED: Final = 0.6
 PEN_TURN_SPEED: Final = 3.0
 """Highest rotation speed of the pen between still targets [rad/s]."""
 RETREAT_DISTANCE: Final = 0.05
-"""Distance that the tip draws back between two targets [m]."""
+"""Distance that the tip retreats between two targets [m]."""
 _STAY_TIMES: Final = (0.15, 0.6)  # shortest and longest time at a target [s]
 PATH_TIMES: Final = (0.4, 0.9)
 """Shortest and longest time from target to target [s]."""
@@ -63,7 +63,7 @@ _ARM_DIRECTION: Final = np.array([0.8, -0.6, 0.0])  # direction from the pen to 
 _MAX_PEN_ANGLE: Final = 1.2  # largest angle of the pen from upright [rad]
 _MAX_LEAN: Final = 1.0  # largest lean of the pen from the outward direction, as a tangent
 _MIN_FACING: Final = -0.2  # smallest cosine of a target's outward direction and the upright pen
-_DIRECTION_SMOOTHING: Final = 0.15  # [s] standard deviation of the smoothing of outward directions
+_DIRECTION_SMOOTHING: Final = 0.15  # standard deviation of the smoothing of outward directions [s]
 
 
 def sample_object_motion(
@@ -91,7 +91,7 @@ def sample_object_motion(
 
 @dataclass(frozen=True, slots=True)
 class _HoldPlayer:
-    """Moves a hand from one variant of its holds to the next."""
+    """A player that moves a hand from one variant of its holds to the next."""
 
     scene: GraspScene
     style: HoldStyle
@@ -100,7 +100,7 @@ class _HoldPlayer:
     rng: np.random.Generator
 
     def next_part(self, last: Held, current: int) -> tuple[Held, int]:
-        """Valid frames to a variant of the current hold, or to another hold, and the index of that hold."""
+        """Valid frames to a variant of the current hold or to another hold, and the index of the hold."""
         start = Held(last.angles[-1:], last.poses[-1:])
         if self.rng.random() < _SHIFT_CHANCE:
             other = int(self.rng.integers(len(self.holds)))
@@ -141,7 +141,7 @@ class _HoldPlayer:
 
 
 def _scribble(frames: int, size: float, rate: float, *, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Small loops of a writing wrist (T, 3) [m], of varying size."""
+    """Sample small loops of a writing wrist (T, 3) [m], of varying size."""
     time = np.arange(frames) / rate
     loops = np.zeros((frames, 3))
     for axis in range(3):
@@ -159,7 +159,7 @@ def point_pen(
     other_motion: HandMotion,
     path: Float[np.ndarray, "T 4 4"],
 ) -> tuple[HandMotion, BodyMotion]:
-    """Lead a held pen along a path, and draw it back wherever hands or pen would touch.
+    """Move a held pen along a path, and draw it back wherever hands or pen would touch.
 
     Fingers and pen keep their motion in the wrist's frame. The pen's tip is its first marker.
     """
@@ -250,7 +250,7 @@ def _plan_visits(
     rate: float,
     rng: np.random.Generator,
 ) -> list[_Visit]:
-    """Visits for all frames, and one more at the end of the last path."""
+    """Draw visits for all frames, and one more at the end of the last path."""
     visits: list[_Visit] = []
     frame = 0
     target, lean = _draw_target(outward[0], rng)
@@ -274,7 +274,7 @@ def _plan_visits(
 def _draw_target(
     outward: Float[np.ndarray, "M 3"], rng: np.random.Generator
 ) -> tuple[int, Float[np.ndarray, "3"]]:
-    """A target that can be reached now, and the lean of the pen there."""
+    """Draw a target that the pen can reach in this frame, and the lean of the pen there."""
     open_to_pen = np.flatnonzero(outward @ _UPRIGHT_PEN > _MIN_FACING)
     target = int(rng.choice(open_to_pen if len(open_to_pen) else len(outward)))
     lean = _LEAN_SPREAD * rng.standard_normal(3)

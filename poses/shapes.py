@@ -21,16 +21,16 @@ from handsim.settings import Expected, Mixture
 
 LIBRARIES: Final = ("gestures", "fingerspelling", "numbers", "counting", "grasps", "pinches", "keys")
 """Names of all libraries; no two libraries share a name of a gesture."""
-_GESTURE_SPREAD: Final = np.array([12.0, 2.0, -8.0, -18.0])  # [deg] index to little, positive to the thumb
+_GESTURE_SPREAD_DEG: Final = np.array([12.0, 2.0, -8.0, -18.0])  # index to little, positive to the thumb
 
-# Couplings between joints, as of a relaxed hand. Sources (docs/angles.md): DIP follows PIP (two thirds on
-# average; Lin, Wu and Huang 2000), abduction dies away as the MCP flexes (collateral ligaments tighten), and
-# neighbors share tendons, so that one finger's flexion drags the next.
-LOW: Final = np.deg2rad([joint.low for joint in JOINTS])
-HIGH: Final = np.deg2rad([joint.high for joint in JOINTS])
+LOW: Final = np.deg2rad([joint.low_deg for joint in JOINTS])
+HIGH: Final = np.deg2rad([joint.high_deg for joint in JOINTS])
 
-_TIGHT_FLEXION: Final = np.deg2rad(85.0)  # MCP flexion from which abduction has its smallest range
-_TIGHT_SHARE: Final = 0.25  # share of the abduction range that remains there
+# Couplings of joints in a relaxed hand, with sources in docs/angles.md: the DIP flexes two thirds as far as
+# the PIP on average (Lin, Wu and Huang 2000); abduction decreases as the MCP flexes and its collateral
+# ligaments tighten; a finger pulls its neighbors along, because they share tendons.
+_TIGHT_FLEXION: Final = np.deg2rad(85.0)  # MCP flexion beyond which abduction has its smallest range
+_TIGHT_SHARE: Final = 0.25  # share of the abduction range that remains beyond this flexion
 _DIP_SHARE: Final = 2.0 / 3.0  # DIP flexion as a share of the PIP's
 _MAX_DIP_BELOW: Final = np.deg2rad(32.0)  # largest deviation of the DIP below its share of the PIP
 _MAX_DIP_ABOVE: Final = np.deg2rad(28.0)  # largest deviation of the DIP above its share of the PIP
@@ -39,11 +39,11 @@ _MAX_MCP_DIFFERENCE: Final = np.deg2rad([85.0, 70.0, 75.0])
 
 _FLEXION_NOISE: Final = np.deg2rad(6.0)
 _ABDUCTION_NOISE: Final = np.deg2rad(2.0)
-_SWAY: Final = np.deg2rad(3.0)  # standard deviation of all fingers leaning to one side
-# Chance that neighbors curl independently: index-middle, middle-ring, ring-little.
+_SWAY: Final = np.deg2rad(3.0)  # standard deviation of an abduction that all fingers share
+# Chance that two neighbors curl independently: index-middle, middle-ring, ring-little.
 _SPLIT_CHANCE: Final = np.array([0.3, 0.2, 0.25])
 _NEIGHBOR_CORRELATION: Final = 0.993
-# One standard deviation of a curl that grows from index to little finger, in units of the normals.
+# One standard deviation of the increase of curl from index to little finger, in units of the normals.
 _CURL_SLOPE: Final = 0.15 * np.array([-1.5, -0.5, 0.5, 1.5])
 _CURL_DIP_SHARE: Final = 0.68
 _DIP_LAG: Final = np.deg2rad(6.0)
@@ -54,12 +54,12 @@ _FAN_SPREAD: Final = np.deg2rad([7.0, 1.5, -5.0, -11.0])  # one standard deviati
 
 MAX_PENETRATION: Final = 0.001
 """Deepest self-penetration [m] of a valid pose: skin yields by about this much."""
-_ANGLE_ROUNDING: Final = 1e-6  # [rad] Single precision rounds angles by less.
-_MAX_FLAT_OVERLAP: Final = 0.0045  # [m] Flat fingers that overlap more hide skin that carries markers.
+_ANGLE_ROUNDING: Final = 1e-6  # larger than the rounding of angles in single precision [rad]
+_MAX_FLAT_OVERLAP: Final = 0.0045  # Flat fingers with more overlap [m] hide skin that carries markers.
 _IS_THUMB: Final = np.array([joint.name.startswith("thumb") for joint in JOINTS])
 _IS_ABDUCTION: Final = np.array([joint.name.endswith("abduction") for joint in JOINTS])
 _REST_FAN: Final = np.deg2rad([0.0, 1.0, 0.2, -0.6, -1.4])  # one degree of fanning at rest, thumb to little
-# The same for digits that converge: thumb and middle finger lean away from the index finger.
+# One degree of fanning for digits that converge: thumb and middle finger lean away from the index finger.
 _WIDE_REST_FAN: Final = np.deg2rad([1.0, 1.0, -0.2, -1.0, -1.8])
 
 SAMPLERS: Final = "handsim.pose_samplers"
@@ -81,7 +81,7 @@ def _library(library: str) -> dict[str, NDArray[np.float64]]:
     gestures: dict[str, NDArray[np.float64]] = {}
     for name, entry in package_data("poses", library)["gestures"].items():
         fingers = np.array([_angles_of(finger, digits["fingers"]) for finger in entry["fingers"]])
-        fingers[:, 0] += entry.get("spread", 0.0) * _GESTURE_SPREAD
+        fingers[:, 0] += entry.get("spread", 0.0) * _GESTURE_SPREAD_DEG
         thumb = _angles_of(entry["thumb"], digits["thumbs"])
         gestures[name] = np.deg2rad(np.concatenate([thumb, fingers.ravel()]))
     return gestures
@@ -136,7 +136,7 @@ def apply_couplings(angles: Float[np.ndarray, "T 20"]) -> Float[np.ndarray, "T 2
 
 @dataclass(frozen=True, slots=True)
 class PoseMix(Mixture):
-    """Shares of the sources of poses, which are normalized; no recorded motion is used."""
+    """Shares of the sources of poses; they are normalized. No recorded motion is used."""
 
     gestures: float = 0.45
     """Blends of two named gestures, each digit a little ahead or behind."""
@@ -264,7 +264,7 @@ def resting_angles(model: HandModel) -> Float[np.ndarray, "20"]:
 
 
 def rests_easily(model: HandModel) -> bool:
-    """Whether fingers have room at rest with at most 12 degrees of fanning, and do not cross when flat."""
+    """Whether fingers fit at rest with at most 12 degrees of fanning, and do not cross when flat."""
     rests = is_valid(model, _fanned(_REST_FAN, 12.0), max_penetration=0.8 * MAX_PENETRATION).any()
     return bool(rests and model.penetration(join_qpos(np.zeros((1, NUM_JOINTS))))[0] <= _MAX_FLAT_OVERLAP)
 
@@ -278,9 +278,9 @@ def _fanned(fan: Float[np.ndarray, "5"], most: float) -> Float[np.ndarray, "K 20
 
 
 def make_valid(model: HandModel, angles: Float[np.ndarray, "T 20"]) -> Float[np.ndarray, "T 20"]:
-    """Poses [rad] moved towards rest until they are valid; valid ones stay unchanged.
+    """Move invalid poses [rad] towards rest until they are valid; valid poses stay unchanged.
 
-    The thumb moves first, then thumb and abductions; the whole hand opens only if that is not enough.
+    First the thumb moves, then the thumb and all abductions; the whole hand opens only if that is not enough.
     """
     resting = resting_angles(model)
     result = np.array(angles, dtype=np.float64)
@@ -370,10 +370,9 @@ def sample_poses(
 
 
 def load_sampler(sampler: PoseSampler | str, *, is_tried: bool = True) -> PoseSampler:
-    """A sampler, or that of a name, with checks of its output; if `is_tried`, it draws two poses first."""
+    """Load a sampler and add checks of its output; if `is_tried`, draw two poses to test it."""
     if not isinstance(sampler, str):
-        names = ", ".join(SAMPLER.names())
-        check_callable("sampler", sampler, SAMPLER.words + (f"; valid names: {names}" if names else ""))
+        check_callable("sampler", sampler, SAMPLER.words, SAMPLER.names())
     checked = functools.partial(_checked_draw, sampler)
     if is_tried:
         checked(HandModel.named("M"), 2, rng=np.random.default_rng(0))

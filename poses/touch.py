@@ -1,7 +1,7 @@
-"""Poses in which thumb and finger touch, solved for one person's hand, and where they touch.
+"""Poses of one person's hand in which the thumb touches a finger.
 
-A touch is two capsules that meet: those of the thumb's and the finger's last bones, pads facing each other.
-A real hand gives this kind of ground truth without any instrument.
+In a touch, the capsules of the last bones of thumb and finger meet, and their pads face each other. A real
+hand gives this kind of ground truth without any instrument.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class ThumbContact:
 
 
 def thumb_contact(model: HandModel, angles: Float[np.ndarray, "T 20"], finger: str) -> ThumbContact:
-    """The nearest points of thumb and finger ("index", "middle", "ring" or "little"), touching or not."""
+    """Overlap and facing of the last bones of thumb and finger ("index", "middle", "ring" or "little")."""
     check_choice(finger, FINGERS, noun="finger")
     return _bones_contact(model.capsules, model.forward_kinematics(join_qpos(angles)), finger)
 
@@ -84,7 +84,7 @@ def touching_angles(
         starts = check_array("start", start, (NUM_JOINTS,)).reshape(-1, NUM_JOINTS)
     for begin in np.clip(starts, LOW, HIGH):
         angles = begin
-        for _ in range(_MAX_ROUNDS):  # a solution stays near its start, so a far touch takes several rounds
+        for _ in range(_MAX_ROUNDS):  # A solution stays near its start, so a far touch needs several rounds.
             angles = _solve_touch(model, finger, angles)
             if is_touching(model, angles[None], finger)[0]:
                 return angles

@@ -1,4 +1,4 @@
-"""Two hands that meet, clasp, rub, point and part, in motion and in single poses; a beat is a key pose."""
+"""Motions and poses of two hands that meet, clasp, rub, point and part; a beat is a key pose."""
 
 from __future__ import annotations
 
@@ -37,19 +37,19 @@ from poses.shapes import HIGH, LOW, gesture, gesture_names, is_valid, make_valid
 _FLEXION_NOISE: Final = np.deg2rad(4.0)
 _ABDUCTION_NOISE: Final = np.deg2rad(1.5)
 _NOISE: Final = np.tile([_ABDUCTION_NOISE, _FLEXION_NOISE, _FLEXION_NOISE, _FLEXION_NOISE], len(DIGITS))
-_SNUG_DEPTH: Final = 0.0007  # self-penetration [m] up to which fingers may wander
-_WANDER_SHARE: Final = 0.4  # noise from beat to beat, relative to the noise of the whole interaction
+_SNUG_DEPTH: Final = 0.0007  # largest self-penetration of wandering fingers [m]
+_WANDER_SHARE: Final = 0.4  # ratio of the noise from beat to beat to that of the whole interaction
 
 INTERACTIONS: Final[tuple[str, ...]] = tuple(package_data("poses", "interactions")["interactions"])
 """Names of all interactions."""
 
-_CONTACT_WINDOW: Final = 0.12  # over which backing off is smoothed [s]
-_FINGER_WINDOW: Final = 0.35  # over which closing fingers are smoothed [s]
+_CONTACT_WINDOW: Final = 0.12  # time over which backing off is smoothed [s]
+_FINGER_WINDOW: Final = 0.35  # time over which closing fingers are smoothed [s]
 _PARTED_DISTANCES: Final = (0.08, 0.16)  # distance of the hands before and after an interaction [m]
 # Single poses: share of touching ones, largest distance of the others [m], share with half-closed fingers.
 _TOUCHING_SHARE, _MAX_GAP, _HALF_CLOSED_SHARE = 0.7, 0.06, 0.3
 
-_TRAVEL_TIMES: Final = (0.8, 2.5)  # between two positions of the pair [s]
+_TRAVEL_TIMES: Final = (0.8, 2.5)  # shortest and longest time between two positions of the pair [s]
 _ROTATION: Final = 0.5  # standard deviation of the rotation between two positions [rad]
 _MAX_DRAWS: Final = 60
 
@@ -209,7 +209,7 @@ def _sketch_fingers(
 def _valid_fingers(model: HandModel, sketches: Sequence[_FingerSketch]) -> Fingers:
     """Valid fingers of all sketches, one after another."""
     opened, closed, wander, strength = (np.concatenate(parts) for parts in zip(*sketches, strict=True))
-    # poses with deep contact move towards rest, because fingers need room to wander
+    # Poses with deep contact move towards rest, because fingers need room to wander.
     lasting = make_valid(model, np.clip(opened, LOW, HIGH))
     hard = ~is_valid(model, lasting, max_penetration=_SNUG_DEPTH)
     lasting[hard] += 0.1 * (resting_angles(model) - lasting[hard])
@@ -249,7 +249,7 @@ class _Course(NamedTuple):
 
 
 def play_meeting(right: HandModel, left: HandModel, name: str, *, rng: np.random.Generator) -> Passage | None:
-    """One interaction, from approach to release; None if this draw is not valid."""
+    """Draw one interaction, from approach to release; None if the draw is not valid."""
     still, moving = (right, left) if rng.random() < 0.5 else (left, right)
     variant = draw_variant(name, rng=rng)
     count = int(rng.integers(variant["beats"][0], variant["beats"][1] + 1))
@@ -272,7 +272,7 @@ def play_meeting(right: HandModel, left: HandModel, name: str, *, rng: np.random
 def draw_poses(
     right: HandModel, left: HandModel, counts: Sequence[tuple[str, int]], *, rng: np.random.Generator
 ) -> Passage:
-    """Valid poses among `counts` single poses of interactions; roles are drawn once per interaction."""
+    """Draw single poses of interactions and keep the valid ones; roles are drawn once per interaction."""
     draws = [_draw_single(name, count, rng) for name, count in counts]
     order = np.argsort([draw.left_still for draw in draws], kind="stable")
     passages, valid = [], []
@@ -374,7 +374,7 @@ def _close_contact(
 def _meeting_course(variant: dict[str, Any], count: int, rng: np.random.Generator) -> _Course:
     """The course of a meeting: approach, stay and move `count` times, release."""
     ends = [int(rng.uniform(*APPROACH_TIMES) * RATE) + 1 for _ in range(2)]
-    # fingers close after the hands meet, and open before they part
+    # Fingers close after the hands meet, and open before the hands part.
     grips = [int(rng.uniform(*APPROACH_TIMES) * RATE) + 1 for _ in range(2)]
     tempo = rng.random(2)
     beats, lift = [np.zeros(ends[0] + grips[0])], [1.0 - minimum_jerk(ends[0]), np.zeros(grips[0])]
@@ -422,7 +422,7 @@ def sample_two_hand_poses(
     passages: list[Passage] = []
     missing = count
     for _ in range(_MAX_DRAWS):
-        # each name twice, since roles are drawn once per batch; extra poses, since some will be invalid
+        # Each name occurs twice, because roles are drawn once per batch; extra poses replace invalid ones.
         batches = rng.multinomial(
             missing + missing // 8 + 2, np.full(2 * len(INTERACTIONS), 0.5 / len(INTERACTIONS))
         )

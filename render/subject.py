@@ -36,7 +36,7 @@ from handsim.hand.shape import (
     unpack_hand,
 )
 from handsim.motion_files.motion import read_joint_csv
-from handsim.space.transforms import UpAxis, rotation_quaternions, upright
+from handsim.space.transforms import UpAxis, room_axes, rotation_quaternions
 from poses.shapes import HIGH, LOW
 from render.config import SpawnKey
 from render.frames import Doubles, Footage
@@ -269,7 +269,7 @@ class Subject:
         """This subject in a world with z up, if `up` is the axis that points up in the take's own world."""
         if up == "z":
             return self
-        return dataclasses.replace(self, take=self.take.turned(upright(up)), origin=None)
+        return dataclasses.replace(self, take=self.take.turned(room_axes(up)), origin=None)
 
 
 @dataclass(frozen=True, slots=True)

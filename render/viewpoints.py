@@ -22,7 +22,7 @@ from handsim.settings import Limits, Settings
 from handsim.space.camera import Camera, look_at, preset
 from handsim.space.rig import load_rig
 from handsim.space.rig_formats import load_cameras
-from handsim.space.transforms import UpAxis, quaternion_matrix, rigid, upright
+from handsim.space.transforms import UpAxis, quaternion_matrix, rigid, room_axes
 from render.arms import most_hidden
 from render.frames import Doubles, Flags, Floats, Integers
 from render.user_body import UserBody
@@ -300,7 +300,7 @@ class Viewpoints:
         """Place the cameras; `poses` move the first of the user's own cameras."""
         framing = Framing(take, user)
         if config.cameras is not None:
-            cameras, turn = _own_cameras(config, up), rigid(upright(up), np.zeros(3))
+            cameras, turn = _own_cameras(config, up), rigid(room_axes(up), np.zeros(3))
             stay = (take.num_frames, 4, 4)
             self._paths = [_Path(one, np.broadcast_to(one.T_world_camera, stay)) for one in cameras]
             if poses is not None:
@@ -522,7 +522,7 @@ def known_positions(config: ViewConfig, up: UpAxis) -> Float[np.ndarray, "C 3"]:
 
 def _own_cameras(config: ViewConfig, up: UpAxis) -> list[Camera]:
     """The user's own cameras in a world with z up."""
-    turn = rigid(upright(up), np.zeros(3))
+    turn = rigid(room_axes(up), np.zeros(3))
     return [one if up == "z" else one.at(turn @ one.T_world_camera) for one in config.own_cameras()]
 
 

@@ -34,7 +34,7 @@ from track.association.frame_state import change_of_distances
 from track.association.initialization import label_alone
 from track.frames import AnyCapture, StreamedFrame, TrackedFrame, capture_of, checked_frames
 from track.hand_size import measured_user, sample_frames
-from track.kinematics.pose_solver import MIN_MARKERS
+from track.kinematics.pose_solver import FEWEST_MARKERS
 from track.output.recorder import frame_values, take_of_rows
 from track.output.sinks import SinkGroup
 from track.settings import USUAL_SIZE, CalibrateSettings, LabelSettings, TrackerSetup, TrackSettings
@@ -393,7 +393,7 @@ def _is_continuous(frames: Sequence[StreamedFrame]) -> bool:
     pairs = [
         (one.points, other.points)
         for one, other in pairwise(frames)
-        if min(len(one.points), len(other.points)) >= MIN_MARKERS
+        if min(len(one.points), len(other.points)) >= FEWEST_MARKERS
     ]
     chosen = np.unique(np.linspace(0, len(pairs) - 1, min(_COMPARED_PAIRS, len(pairs))).astype(int))
     changes = [change_of_distances(*pairs[number]) for number in chosen]

@@ -43,7 +43,7 @@ from track.calibration.energy import (
 from track.calibration.hand_parameters import LENGTH, NUM_PARAMETERS
 from track.config import TrackerConfig
 from track.frames import StreamedFrame, TrackedHand
-from track.kinematics.pose_solver import MIN_MARKERS, PoseSolver
+from track.kinematics.pose_solver import FEWEST_MARKERS, PoseSolver
 from track.tracker import Tracker
 from track.user import MEASURED, User, designed_glove, size_words
 from train.labelers.protocol import Labeler, Labeling
@@ -229,7 +229,7 @@ def _is_shown(hand: TrackedHand, count: int) -> bool:
 
 def usual_breadth(length: float) -> float:
     """The usual breadth of a hand of some length [m]: interpolated in the five sizes, proportional beyond."""
-    lengths, breadths = 1e-3 * np.array(sorted(SIZES.values())).T
+    lengths, breadths = np.array(sorted(SIZES.values())).T
     inside = float(np.clip(length, lengths[0], lengths[-1]))
     return float(np.interp(inside, lengths, breadths)) * length / inside
 
@@ -431,7 +431,7 @@ def check_hands(
 
 def _compared_frames(frames: Sequence[StreamedFrame]) -> list[StreamedFrame]:
     """Frames in which hands are compared; none if there are too few."""
-    shown = [frame for frame in frames if len(frame.points) >= MIN_MARKERS]
+    shown = [frame for frame in frames if len(frame.points) >= FEWEST_MARKERS]
     half = max(_COMPARED_PART, len(shown) // (2 * _COMPARED_PART) * _COMPARED_PART)
     some = [*shown[:_COMPARED_PART], *shown[half : half + _COMPARED_PART]]
     return some if len(some) >= _FEWEST_COMPARED else []

@@ -121,7 +121,7 @@ def measured_users(take: Take, labeler: Labeler) -> list[GloveFit]:
 
 def nearest_size(length: float) -> str:
     """Name of the size whose hand length is nearest to a length [m]."""
-    return min(SIZES, key=lambda size: abs(1e-3 * SIZES[size][0] - length))
+    return min(SIZES, key=lambda size: abs(SIZES[size][0] - length))
 
 
 def evaluate_tracker(

@@ -1,4 +1,4 @@
-"""Trajectories of a marker file at a frame rate, their gaps and labels, and checks of unit and place.
+"""Trajectories of a marker file at a frame rate, their gaps and labels, and checks of unit and position.
 
 Table 3 of Han et al. 2018 counts the gaps that `run_lengths` measures.
 """
@@ -22,13 +22,13 @@ UNLABELED: Final = "Unlabeled"
 MAX_SPAN: Final = 30.0
 """Largest median span of clouds that are in meters [m]; a hand in millimeters would span more."""
 AT_ORIGIN: Final = "all points are at the origin, (0, 0, 0)"
-"""What errors say of clouds for which `all_at_origin` is true."""
-_MIN_SPAN: Final = 0.02  # [m]: smallest median span; a fist with five markers spans three times as much
-_MIN_CENTIMETERS: Final = 0.002  # [m]: smallest span of hands in centimeters that were read as millimeters
-_MAX_SPACING: Final = 1.5  # [m]: largest median distance of a point from the nearest other one
-_MIN_POINTS: Final = 5  # A cloud needs this many points to show its unit; fewer may all be strays.
-_MIN_FRAMES: Final = 10  # Small or wide clouds count in this many frames; fewer may show strays alone.
-_MAX_SAMPLES: Final = 200  # frames that are looked at, evenly spread
+"""Text of errors on clouds for which `all_at_origin` is true."""
+_MIN_SPAN: Final = 0.02  # smallest median span [m]; a fist with five markers spans three times as much
+_MIN_CENTIMETERS: Final = 0.002  # smallest span of hands in centimeters that were read as millimeters [m]
+_MAX_SPACING: Final = 1.5  # largest median distance of a point from its nearest neighbor [m]
+_MIN_POINTS: Final = 5  # least number of points of a cloud that shows its unit; fewer may all be strays
+_MIN_FRAMES: Final = 10  # least number of small or wide clouds; fewer may show only strays
+_MAX_SAMPLES: Final = 200  # largest number of examined frames, evenly spaced
 
 
 OF_ARRAYS: Final = "gloves.Capture(names, positions, rate) makes a capture of arrays (docs/marker_files.md)"
@@ -95,7 +95,7 @@ def column_runs(flags: Bool[np.ndarray, "T M"]) -> Int[np.ndarray, "3 G"]:
 
 
 def run_lengths(flags: Bool[np.ndarray, "T M"], *, inside: bool = False) -> Int[np.ndarray, "G"]:
-    """Lengths of all unbroken stretches of True, column by column [frames]."""
+    """Lengths [frames] of all stretches of True, column by column; `inside` leaves out those at the ends."""
     _, first, last = column_runs(flags)
     lengths: np.ndarray = last - first + 1
     return lengths[(first > 0) & (last < len(flags) - 1)] if inside else lengths
@@ -172,7 +172,7 @@ class UnitFault(NamedTuple):
     """Clouds in a wrong unit."""
 
     found: str
-    """What shows, in words, that the clouds are not in meters."""
+    """The evidence in words that the clouds are not in meters."""
     guess: str
     """The unit of length that they probably had before they were scaled."""
 
@@ -191,7 +191,7 @@ def spacing(cloud: Float[np.ndarray, "N 3"]) -> float:
 
 
 def unit_fault(clouds: Sequence[Float[np.ndarray, "N 3"]], *, only_wide: bool = False) -> UnitFault | None:
-    """The sign that clouds are not in meters, None without one."""
+    """The evidence that clouds are not in meters; None if there is none."""
     shown = [cloud for cloud in clouds if len(cloud) >= _MIN_POINTS]
     step = -(-len(shown) // _MAX_SAMPLES) or 1
     shown = shown[::step]
@@ -221,7 +221,7 @@ def all_at_origin(clouds: Sequence[Float[np.ndarray, "N 3"]]) -> bool:
 
 
 def check_unit(clouds: Sequence[Float[np.ndarray, "N 3"]], *, only_wide: bool = False) -> None:
-    """Refuse clouds that are not in meters, see `unit_fault`."""
+    """Refuse clouds that are not in meters by `unit_fault`."""
     if not only_wide and all_at_origin(clouds):
         raise ArgumentError(f"{AT_ORIGIN}, expected positions in meters")
     fault = unit_fault(clouds, only_wide=only_wide)
@@ -230,7 +230,7 @@ def check_unit(clouds: Sequence[Float[np.ndarray, "N 3"]], *, only_wide: bool = 
 
 
 def check_place(capture: Capture, farthest: float) -> None:
-    """Warn of points that will be left out, farther than this from the origin in a coordinate [m]."""
+    """Warn of points that will be left out, because a coordinate exceeds `farthest` [m]."""
     there = np.isfinite(capture.positions[..., 0])
     far = int((np.abs(capture.positions[there]).max(axis=-1, initial=0.0) >= farthest).sum())
     points = int(there.sum())

@@ -1,4 +1,4 @@
-"""Marker files by their suffix: TRC, C3D and Motive CSV both ways, Vicon CSV, Qualisys TSV and tables in.
+"""Marker files by suffix: TRC, C3D and Motive CSV (read and written); Vicon CSV, Qualisys TSV, tables (read).
 
 A TRC is tab-separated, with five header lines (file type, keys, their values, marker names, axes) and one
 line per frame: number, time, and three cells per marker. Rows may hold more trajectories than line 4 names.
@@ -100,7 +100,7 @@ _QTM_LEADING: Final = ("frame", "time")
 _LEADING_TITLE: Final = re.compile(r"frame|time|#|$", re.I)
 _AXIS_TITLE: Final = re.compile(r"(.+?)[ ._:-]?([xyz])", re.I)
 _COPY_TITLE: Final = re.compile(r"(.+)\.[12]")  # pandas numbers columns of the same name
-_FIRST_BYTES: Final = 200  # bytes that show which program wrote a CSV
+_FIRST_BYTES: Final = 200  # number of bytes that show which program wrote a CSV
 _SKELETON_HINT: Final = "the motion of a skeleton without its markers; export the markers where it was made"
 _VICON_HINT: Final = "a file of Vicon's own; export C3D or ASCII with trajectories from Nexus"
 _CORTEX_HINT: Final = "a binary file of Cortex; export TRC or C3D from there"
@@ -118,7 +118,7 @@ _FOREIGN_ENDINGS: Final = {
     **dict.fromkeys((".mot", ".sto", ".osim"), _OPENSIM_HINT),
     **dict.fromkeys((".bvh", ".fbx", ".amc", ".asf", ".htr", ".mvnx", ".glb"), _SKELETON_HINT),
 }
-"""Descriptions of other programs' files and what to export instead, by ending."""
+"""Descriptions of other programs' files and their replacements, by ending."""
 _FOREIGN_BEGINS: Final = {
     _TRC_BEGIN.lower(): "the content of a TRC; name it .trc",
     MOTIVE_BEGIN.lower(): "the content of Motive's CSV; name it .csv",
@@ -144,7 +144,7 @@ def read_trc(data: bytes, warn: Warn = emit_warning) -> Capture:
         raise CaptureError("not a TRC file: line 1 does not begin with 'PathFileType'")
     lines = plain_lines(lines, separator_behind([_TRC_BEGIN], lines[0]) or TAB, wider=True)
     lines = _tabs_for_spaces(lines)
-    # a header line without a line end may be cut
+    # A header line without a line end may be truncated.
     whole = len(lines) if ended else len(lines) - 1
     if whole < _HEADER_LINES:
         raise CaptureError(f"the header is cut: expected {_HEADER_LINES} whole lines, got {whole}")
@@ -176,7 +176,7 @@ def _timed_capture(
     count_is_reliable: bool = True,
     outputs: int = 0,
 ) -> Capture:
-    """The capture of trajectories with the numbers and times of its rows, and the keys of rate and count."""
+    """Make a capture of trajectories, the numbers and times of its rows, and the stated rate and count."""
     (rate, count), (numbers, times) = keys, leading.T
     values = stated.get(rate, ""), rate, numbers, times, stated.get(count, ""), count, count_is_reliable
     timed = timed_positions(read.positions, StatedTimes(*values), warn)
@@ -184,7 +184,7 @@ def _timed_capture(
 
 
 def _tabs_for_spaces(lines: list[bytes]) -> list[bytes]:
-    """Put tabs in place of spaces between cells; refuse rows whose blank cells spaces may hide."""
+    """Replace spaces between cells by tabs; refuse rows in which spaces may hide blank cells."""
     spaced = [index for index, line in enumerate(lines) if TAB not in line and b" " in line.strip()]
     lines = list(lines)
     for index in spaced:
@@ -198,7 +198,7 @@ def _tabs_for_spaces(lines: list[bytes]) -> list[bytes]:
                 f"line {rows[other] + 1} has {widths[other]} cells and line {rows[0] + 1} {widths[0]}, all "
                 "parted by spaces, so that blank cells do not show; write tabs, or nan in blank cells"
             )
-    # the blank line behind the header may hold a missing number, too
+    # The blank line after the header may also hold nan.
     return [b"" if line.strip().lower() == b"nan" else line for line in lines]
 
 
@@ -249,7 +249,7 @@ def _marker_names(titles: list[str], num_axes: int) -> tuple[str, ...]:
 
 
 def _unnamed_names(rows: list[bytes], num_named: int) -> tuple[str, ...]:
-    """Names '*n' for trajectories that line 4 does not name, as Cortex writes them at the ends of rows."""
+    """Names '*n' for trajectories without a name in line 4, which Cortex writes at the ends of rows."""
     expected = LEADING + 3 * num_named
     widths = [row.rstrip(b" \t").count(TAB) + 1 for row in rows]
     width = max(widths, default=0)
@@ -276,7 +276,7 @@ def read_motive_csv(data: bytes, warn: Warn = emit_warning) -> Capture:
     end = next((index for index, row in enumerate(rows) if row and row[0] == "Frame"), None)
     if end is None or (end == len(lines) - 1 and not ended):
         raise CaptureError("the header is cut: no whole row begins with 'Frame'")
-    # a comma or a line break in the take's name or notes moves the keys behind them
+    # A comma or a line break in the take's name or notes moves the keys after it.
     keyed = [index for index, row in enumerate(rows[:end]) for cell in row if cell.lower() in _MOTIVE_KEYS]
     keyed = keyed or [0]
     stated = {
@@ -293,7 +293,7 @@ def read_motive_csv(data: bytes, warn: Warn = emit_warning) -> Capture:
         warn("Coordinate Space is Local: markers stand still in their bodies; export world coordinates")
     axes = rows[end]
     header = [row for row in rows[keyed[-1] + 1 : end] if any(row)]
-    # files without labels begin with the types, behind two blank cells
+    # Files without labels begin with the types, after two blank cells.
     if len(header) > 2 and not any(header[0][:2]) and set(header[0]) & _MOTIVE_TYPES:
         types, names = header[:2]
     else:
@@ -380,7 +380,7 @@ def vicon_sections(lines: list[bytes]) -> dict[str, int]:
     for index, line in enumerate(lines):
         if line[:1].isalpha() or line[:1] == b'"':
             title = titles.get(line.strip(_BLANK_BYTES).lower())
-            # the word is a title only if the next line is a rate
+            # The word is a title only if the next line is a rate.
             if title and index + 1 < len(lines) and lines[index + 1].lstrip(_BLANK_BYTES)[:1].isdigit():
                 found.setdefault(title, index)
     return found
@@ -473,7 +473,7 @@ def read_qtm_tsv(data: bytes, warn: Warn = emit_warning) -> Capture:
 
 
 def _qtm_names(names: list[str], text: str) -> tuple[str, ...]:
-    """The names of all markers, of which a text states the number; a missing name becomes '*n'."""
+    """The names of all markers, whose number a text states; a missing name becomes '*n'."""
     while names and not names[-1]:
         names = names[:-1]
     count = int(text[:MAX_DIGITS]) if text.isdecimal() else len(names)
@@ -511,8 +511,8 @@ def _begin_of_rows(lines: list[bytes], start: int, width: int) -> tuple[int, int
 def read_table(data: bytes, warn: Warn = emit_warning) -> Capture:
     """Read the markers in the bytes of a table with times [s] and three columns for each marker.
 
-    The three have one name, or end with x, y and z. The unit is that in which a frame's points span what
-    markers do.
+    The three columns have one name, or names that end with x, y and z. The unit of length is inferred from
+    the extent of the points of a frame.
     """
     lines, ended = split_lines(data)
     lines = plain_lines(lines, max(b",", b";", TAB, key=lines[0].count))
@@ -549,13 +549,13 @@ def _marker_name(titles: list[str]) -> str:
 
 
 def _read_tsv(data: bytes, warn: Warn) -> Capture:
-    """Read a TSV of Qualisys or another table, told apart by their content."""
+    """Read a TSV of Qualisys or another table, depending on its content."""
     qualisys = separator_behind(_QTM_BEGINS, split_lines(data[:_FIRST_BYTES])[0][0]) is not None
     return read_qtm_tsv(data, warn) if qualisys else read_table(data, warn)
 
 
 def _read_csv(data: bytes, warn: Warn) -> Capture:
-    """Read a CSV of Motive or of Vicon, or another table, told apart by their content."""
+    """Read a CSV of Motive or of Vicon, or another table, depending on its content."""
     if separator_behind([MOTIVE_BEGIN], split_lines(data[:_FIRST_BYTES])[0][0]) is not None:
         return read_motive_csv(data, warn)
     if vicon_sections(split_lines(data)[0]):
@@ -613,14 +613,14 @@ def read_capture(capture: Capture | str | Path) -> Capture:
 
 
 def _content_hint(data: bytes, error: str) -> str:
-    """If an error says that the content is of another format: a clause that names that format."""
+    """A clause that names the format of the content, if an error states that it is another one."""
     begin = data[:_FIRST_BYTES].removeprefix(codecs.BOM_UTF8).lstrip(_BLANK_BYTES).lower()
     found = next((text for word, text in _FOREIGN_BEGINS.items() if begin.startswith(word)), None)
     return f"; this is {found}" if found and error.startswith("not a ") else ""
 
 
 def _checked_capture(path: Path, capture: Capture) -> Capture:
-    """The measured points of the capture; refuse positions that cannot be in the unit of the file."""
+    """Keep the measured points of a capture; refuse positions that cannot be in the unit of the file."""
     capture = settled(capture)
     if capture.findings:
         warnings.warn(f"{path}: {findings_sentence(capture.findings)}", HandSimWarning, stacklevel=3)

@@ -1,10 +1,11 @@
-"""Parsing shared by the formats: lines, cells, units of length, tables of numbers, times of frames.
+"""Parsing of text formats: lines, cells, units of length, tables of numbers, times of frames.
 
-Every text is turned into lines of UTF-8 with tabs between cells: `split_lines` reads UTF-16, `plain_lines`
-other separators and quotes, and `parse_table` decimal commas.
+Every text is converted to lines of UTF-8 with tabs between cells: `split_lines` decodes UTF-16, `plain_lines`
+replaces other separators and quotes, and `parse_table` reads decimal commas.
 
-Rate, times and numbers of the frames have to agree. A gap in the numbers or the times is filled with frames
-without points, with a warning. Values that contradict each other are refused by a sentence with both.
+Rate, times and numbers of the frames must agree. A gap in the numbers or the times is filled with frames
+without points, with a warning. If two values contradict each other, the file is refused, and the error names
+both.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ _UNIT_WORDS: Final = {
     for prefix, unit in (("milli", "mm"), ("centi", "cm"), ("", "m"))
     for word in ("meters", "metres")
 }
-_MIN_UNIT_LETTERS: Final = 4  # letters of a unit that is cut off; 'mil' may also be a thousandth of an inch
+_MIN_UNIT_LETTERS: Final = 4  # least length of a truncated unit; 'mil' may also be a thousandth of an inch
 MAX_CELLS: Final = 400_000
 """Largest number of cells in a row: twice as many as the largest C3D would need."""
 TAB: Final = b"\t"
@@ -51,11 +52,11 @@ _SEPARATOR_LINE: Final = re.compile(rb'"?sep=.?"?', re.I)  # Excel's first line
 _TIME_CODE: Final = re.compile(rb"\d+:[\d:.;]+")
 _DECIMAL_COMMA: Final = re.compile(rb",0\d")  # This comma is decimal: no whole number begins with a zero.
 _NUMBERS_ONLY: Final = re.compile(rb"\d[-+\d.,eE \t]*")
-_SAMPLED_ROWS: Final = 50  # rows that show how a writer formats numbers
-_MANY_NUMBERS: Final = 60  # numbers that show whether a writer drops zeros at the end
-LEADING: Final = 2  # cells of a row before its positions: frame and time, or frame and sub-frame
-_MAX_BLANK_CELLS: Final = 4_000_000  # cells of a table that may be absent from its rows
-_MAX_DENSE_CELLS: Final = 8_000_000  # A table with more cells than this is read sparsely.
+_SAMPLED_ROWS: Final = 50  # number of rows from which the format of numbers is inferred
+_MANY_NUMBERS: Final = 60  # least count of numbers that shows whether a writer drops trailing zeros
+LEADING: Final = 2  # number of cells before the positions of a row: frame and time, or frame and sub-frame
+_MAX_BLANK_CELLS: Final = 4_000_000  # largest number of cells that may be absent from the rows of a table
+_MAX_DENSE_CELLS: Final = 8_000_000  # A larger table is read sparsely.
 
 Warn = Callable[[str], None]
 """Called with a sentence on something suspicious in a file that is read nevertheless."""
@@ -63,13 +64,13 @@ MIN_RATE: Final = 1.0
 MAX_RATE: Final = 5000.0
 """Highest frame rate of an optical system [Hz]."""
 _RATE_TOLERANCE: Final = 0.02  # relative difference of equal rates: 119.88 is called 120, 29.97 is called 30
-_MIN_DECIMALS: Final = 1  # Times have at least this many decimals: no frame is timed in whole seconds.
-_MAX_DECIMALS: Final = 9  # Times have at most this many decimals.
-_INTERVAL_TOLERANCE: Final = 0.1  # relative spread of the intervals when no rate is stated
-_JITTER: Final = 0.25  # A time that is late by less than this share of a frame shows no gap.
-_MAX_MISSING: Final = 10  # missing frames for each frame that is present
-MAX_DIGITS: Final = 12  # Counts are cut to this many digits.
-_SHOWN_GAPS: Final = 3  # gaps that a warning lists
+_MIN_DECIMALS: Final = 1  # least number of decimals of times; no frame is timed in whole seconds
+_MAX_DECIMALS: Final = 9  # largest number of decimals of times
+_INTERVAL_TOLERANCE: Final = 0.1  # largest relative spread of the intervals when no rate is stated
+_JITTER: Final = 0.25  # A frame that is late by a smaller share of the interval shows no gap.
+_MAX_MISSING: Final = 10  # largest number of missing frames for each frame that is present
+MAX_DIGITS: Final = 12  # number of digits to which counts are cut
+_SHOWN_GAPS: Final = 3  # number of gaps that a warning lists
 
 
 def emit_warning(text: str) -> None:

@@ -1,10 +1,10 @@
-"""Takes as files: arrays and a JSON header in one .npz, written at once, or growing while recorded.
+"""Takes as files: arrays and a JSON header in one .npz, or in an archive that grows while it is recorded.
 
-A growing archive is on disk up to the last half second, however the recording ends. It begins with a JSON
-header and the arrays that do not grow. Blocks follow, each with some frames, their number and a checksum; a
-block that was cut off is ignored. A block may instead hold the hands of the frames before it, where other
-hands follow. `finish_archive` turns a growing archive into an .npz block by block, so that memory does not
-grow with the recording.
+A growing archive holds all frames but those of the last half second, however the recording ends. It begins
+with a JSON header and the arrays that do not grow. Each of the following blocks has some frames, their number
+and a checksum; an incomplete block is ignored. If other hands follow, a block holds the hands of the frames
+before it. `finish_archive` converts a growing archive to an .npz block by block, so that its memory does not
+grow.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ class GrowingArchive(Closing):
         columns: Sequence[Column],
     ) -> None:
         self.path, self._place = path, path.absolute()
-        """Where the file is, as it was given; another path after another program took its place."""
+        """Path of the file as given, or a new path after another program has replaced the file."""
         self._columns = (POINT_COUNTS, *columns)
         self._waiting: list[list[bytes]] = []  # each frame's entry of every column
         self._points = 0
@@ -120,7 +120,7 @@ class GrowingArchive(Closing):
             if row.shape != ((num_points,) if column.of_points else ()) + column.entry:
                 raise ValueError(f"{column.name} has shape {row.shape}")
             packed.append(row.tobytes())
-        self._waiting.append(packed)  # in a single step, so that an interrupt leaves no partial frame
+        self._waiting.append(packed)  # one step, so that an interrupt leaves no partial frame
         self._points += num_points
         self._due = min(self._due, time.monotonic() + _BLOCK_INTERVAL)
         self.flush_due()
@@ -136,14 +136,14 @@ class GrowingArchive(Closing):
                 self._file.seek(0, os.SEEK_END)
 
     def add_former(self, entry: NDArray[Any]) -> None:
-        """Write the hands of the frames until now (1,), which have ended; the archive knows their `stop`."""
+        """Write the hands (1,) of the frames until now, because other hands follow."""
         self.flush()
         with signals_wait():
             self._restore()
             self._write_block(_FORMER_MARK, 0, entry.nbytes, entry.tobytes())
 
     def flush_due(self) -> None:
-        """Write the waiting frames if they are many, or half a second old."""
+        """Write the waiting frames if there are many, or if they are half a second old."""
         is_full = len(self._waiting) >= _MAX_WAITING_FRAMES or self._points >= _MAX_WAITING_POINTS
         if is_full or time.monotonic() >= self._due:
             self.flush()
@@ -177,7 +177,7 @@ class GrowingArchive(Closing):
             self._file.close()
 
     def _restore(self) -> None:
-        """Undo what another program did to the file: a change of its length, or its removal."""
+        """Repair the file if another program has changed its length or removed it."""
         there = os.fstat(self._file.fileno())
         end, frames = self._blocks[-1]
         if there.st_size != end:
@@ -195,7 +195,7 @@ class GrowingArchive(Closing):
             self._write_again()
 
     def _write_again(self) -> None:
-        """Write the whole file again at its path or, where that is taken or cannot be written, near it."""
+        """Write the whole file again at its path, or near it if the path is taken or cannot be written."""
         gone = self.path
         self._place, file = _open_near(self._place)
         self.path = self._place
@@ -242,7 +242,7 @@ def _leads_to(path: Path, there: os.stat_result) -> bool:
 
 
 def _open_near(path: Path) -> tuple[Path, io.FileIO]:
-    """Open a new file at a path, else under a similar name in its folder or that of temporary files."""
+    """Open a new file at a path, or with a similar name in its folder or in that of temporary files."""
     try:
         make_folder_of(path)
         return path, open(path, "x+b", buffering=0)
@@ -307,7 +307,7 @@ class GrownArchive:
             yield Member(column.name, np.dtype(column.dtype), shape, partial(self._parts, column, on_block))
 
     def _fixed(self, step: int = 1) -> dict[str, NDArray[Any]]:
-        """The arrays that have no frames; former hands end after every `step`-th block of those before."""
+        """The arrays without frames; stops of former hands count the frames of every `step`-th block."""
         arrays = dict(self._arrays)
         if (empty := arrays.pop(FORMER, None)) is not None and self._former:
             entries = np.frombuffer(b"".join(entry for _, entry in self._former), empty.dtype).copy()

@@ -1,4 +1,4 @@
-"""The rigid bodies of takes: markers of their own and perhaps a surface, and their form in files."""
+"""The rigid bodies of takes, with their own markers and maybe a surface, and their form in files."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ from handsim.hand.shape import SIDES, Side
 from handsim.space.objects import Part, RigidObject, named_object, object_names
 
 _VERTICES_ARRAY: Final = "body_vertices_{}"
-_FACES_ARRAY: Final = "body_faces_{}"  # arrays of the surface of a body, by its number
+_FACES_ARRAY: Final = "body_faces_{}"
+"""Names of the arrays of a body's surface, with the number of the body."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,7 +40,7 @@ class RigidBody:
     forearm: Side | None = None
     """The hand whose forearm it is."""
     has_axes: bool = False
-    """Whether its frame is that of a forearm: that of the hand's wrist when the wrist is straight."""
+    """Whether its frame is that of a forearm: the frame of the hand's wrist when the wrist is straight."""
     elbow: Side | None = None
     """The hand whose elbow it is. An elbow does not turn when the forearm pronates. Its y axis goes through
     the epicondyles, and is parallel to the forearm's y axis in full supination."""

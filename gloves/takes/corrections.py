@@ -1,7 +1,8 @@
-"""Labels of a tracked take that a person corrected, as a TOML file beside the take.
+"""Corrected labels of a tracked take, in a TOML file beside the take.
 
-A correction names a point by its place in the first frame of a span, so that it also fits a new tracking of
-the same capture. Within the span the point is followed by its ID, or without one from position to position.
+A correction identifies a point by its position in the first frame of a span, so that it also fits a new
+tracking of the same capture. Within the span the point is followed by its ID, or without an ID from position
+to position.
 """
 
 from __future__ import annotations
@@ -37,8 +38,8 @@ NO_MARKER: Final = "none"
 FREE: Final = -2
 """The label of a point without a correction."""
 _CORRECTION_KEYS: Final = ("frames", "place_mm", "label")
-_SAME_PLACE: Final = 0.002  # largest distance of a point from its place in the file [m]; formats round it
-_LONGEST_STEP: Final = 0.02  # largest distance of a point without an ID from its prediction [m]
+_SAME_PLACE: Final = 0.002  # largest distance of a point from its position in the file [m]; formats round it
+_MAX_STEP: Final = 0.02  # largest distance of a point without an ID from its prediction [m]
 _FILE_COMMENT: Final = "# Corrected labels; `handsim track` applies them again, `handsim view` adds to them."
 
 
@@ -51,7 +52,7 @@ class Correction:
     last: int
     """The last frame of the span, inclusive."""
     place: tuple[float, float, float]
-    """Where the point is in the first frame [m]."""
+    """Position of the point in the first frame [m]."""
     label: str
     """Name of its marker (`right:ThumbTip`), or `NO_MARKER`."""
 
@@ -106,7 +107,7 @@ def save_corrections(path: Path, corrections: Iterable[Correction]) -> None:
 
 
 def find_pins(corrections: Sequence[Correction], points: PointList, label_names: Sequence[str]) -> Pins:
-    """Find the points that corrections name; of two corrections of one point the later counts."""
+    """Find the points of corrections; of two corrections of one point the later one holds."""
     pinned = np.full(len(points.ids), FREE, dtype=np.int64)
     unfitting = []
     for number, correction in enumerate(corrections, start=1):
@@ -127,8 +128,8 @@ def find_pins(corrections: Sequence[Correction], points: PointList, label_names:
 def follow_point(points: PointList, correction: Correction) -> NDArray[np.int64]:
     """Indices (K,) of a corrected point, one for each frame that holds it; none without a point at its place.
 
-    A point is followed by its ID, across gaps too. A point without an ID is followed to the point nearest to
-    its position extrapolated from the last two, until none is within `_LONGEST_STEP`.
+    A point is followed by its ID, also across gaps. A point without an ID is followed to the nearest point to
+    the extrapolation of its last two positions, until none is within `_MAX_STEP`.
     """
     first, last = correction.first, correction.last
     start = _nearest(points, first, np.array(correction.place), _SAME_PLACE)
@@ -141,7 +142,7 @@ def follow_point(points: PointList, correction: Correction) -> NDArray[np.int64]
     found, step = [start], np.zeros(3)
     for frame in range(first + 1, last + 1):
         place = points.points[found[-1]]
-        nearest = _nearest(points, frame, place + step, _LONGEST_STEP, only_free=True)
+        nearest = _nearest(points, frame, place + step, _MAX_STEP, only_free=True)
         if nearest is None:
             break
         found.append(nearest)
@@ -163,7 +164,7 @@ def _nearest(
 
 
 def pin_labels(points: PointList, pinned: Int[np.ndarray, "P"]) -> NDArray[np.int16]:
-    """Labels with the pinned ones; another point of the same frame that has such a label loses it."""
+    """Labels after corrections; another point of the same frame that has a corrected label loses it."""
     result: NDArray[np.int16] = np.where(pinned != FREE, pinned, points.labels).astype(np.int16)
     for frame in np.unique(points.frames[pinned >= 0]):
         part = points.of(frame)
@@ -179,7 +180,7 @@ def applied_corrections(take: Take) -> tuple[dict[str, Any], ...]:
 
 
 def _label_of(correction: Correction, number: int, frames: int, names: Sequence[str]) -> int:
-    """The label that a correction gives, if its span and its name are those of a take."""
+    """The label of a correction; a `CaptureError` if the take lacks its frames or its name."""
     if correction.last >= frames:
         raise CaptureError(
             f"correction {number} is for frames {correction.first} to {correction.last}, expected frames "

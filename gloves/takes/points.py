@@ -1,11 +1,11 @@
-"""The arrays of a take: one table of their names, types and shapes, the list of points, and the statuses.
+"""The arrays of a take: their names, types and shapes, the list of points, and the statuses.
 
 A shape is letters and numbers: T frames, P points of all frames, H hands, B bodies, M markers of all hands, Q
 markers of all bodies. An array that begins with T or P grows with each frame while a take is recorded.
 
-The points are one list over all frames, so memory is proportional to their number. A table with a row per
-frame is as wide as its fullest frame, so a single crowded frame, as when a camera sees the sun, can make it
-larger than memory.
+The points of all frames are one list, so memory is proportional to their number. A table with a row per frame
+would be as wide as its fullest frame: one crowded frame, as when a camera sees the sun, could exceed the
+memory.
 """
 
 from __future__ import annotations
@@ -124,7 +124,7 @@ STORED: Final = (*FRAMES, POINT_COUNTS, *POINTS, KEYPOINTS, *ATTACHMENT, BODY_MA
 
 
 def fitted(column: Column, values: ArrayLike, sizes: Mapping[str, int]) -> NDArray[Any]:
-    """Values as an array of a column's type, after a check of its shape (`sizes` by letter) and range."""
+    """Convert values to an array of a column's type, and check its shape (`sizes` by letter) and range."""
     array, dtype = as_array(values, column.dtype), np.dtype(column.dtype)
     expected = column.sized(sizes).shape
     if array.shape != expected:
@@ -154,13 +154,13 @@ def check_stored(arrays: Mapping[str, NDArray[Any]], sizes: Mapping[str, int]) -
 
 
 def spread_out(frames: NDArray[Any], most: int) -> NDArray[Any]:
-    """At most `most` of an array's frames (F, ...), evenly spaced."""
+    """At most `most` evenly spaced frames of an array (F, ...)."""
     rows = np.linspace(0, len(frames) - 1, min(most, len(frames))).astype(int)
     return np.asarray(frames[rows])
 
 
 def far_apart(rows: Float[np.ndarray, "R K"], first: int, count: int) -> list[int]:
-    """At most `count` rows, each as far as possible from those before it, from the row `first` on."""
+    """At most `count` rows, starting with `first`, each as far as possible from the rows chosen before."""
     chosen, far = [first], np.full(len(rows), np.inf)
     while len(chosen) < min(count, len(rows)):
         far = np.minimum(far, ((rows - rows[chosen[-1]]) ** 2).sum(axis=1))
@@ -218,7 +218,7 @@ class PointList:
         labels: Int[np.ndarray, "P"],
         confidence: Float[np.ndarray, "P"],
     ) -> Self:
-        """The points of a stream, which fill the first columns of their frame in the order of arrival."""
+        """The points of a stream, which occupy the first columns of their frame in the order of arrival."""
         if counts.sum(dtype=np.int64) != len(ids):  # before anything of that size is allocated
             raise ValueError("the counts of frames do not sum to the number of points")
         order, num_columns = _arrival_order(counts), int(counts.max(initial=0))
@@ -255,7 +255,7 @@ class PointList:
 
     @property
     def is_in_order(self) -> bool:
-        """Whether the columns follow from the counts, as those of a stream do."""
+        """Whether the columns follow from the counts, as in a stream."""
         widest = int(self.counts.max(initial=0))
         return self.num_columns == widest and np.array_equal(self.columns, _arrival_order(self.counts))
 

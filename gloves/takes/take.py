@@ -1,4 +1,4 @@
-"""A take: hands in gloves over time, what an optical system saw of them, and which point is which marker.
+"""A take: hands in gloves over time, the points that an optical system saw, and the marker of each point.
 
 Simulated captures with their truth, the output of a tracker, and poses of a user's own are all takes.
 """
@@ -65,24 +65,24 @@ from handsim.hand.model import (
 )
 from handsim.hand.shape import JOINT_NAMES, NUM_JOINTS, NUM_KEYPOINTS, Side
 from handsim.motion_files.motion import Motion, PosedBody, PosedHand
-from handsim.space.transforms import FORWARD, ForwardAxis, UpAxis, facing, quaternion_matrix, turned_poses
+from handsim.space.transforms import FORWARD, ForwardAxis, UpAxis, facing, quaternion_matrix, rotated_poses
 
 TRUTH_SUFFIX: Final = ".truth.npz"
 """Ending of the name of a simulated take that lies beside its capture."""
 STATUSES: Final = tuple(map(str, Status))
-"""Words of the status numbers, as files hold them; only a lost hand has no pose."""
+"""Words for the status numbers in files; only a lost hand has no pose."""
 LOST, COASTING, INITIALIZED, TRACKED = Status
 RATED_FRAMES: Final = 100_000
-"""Number of frames of a stream that its rate is measured on."""
+"""Number of frames of a stream from which its rate is measured."""
 HARDLY_SEEN: Final = 0.05
 """A marker that is seen in a smaller share of its hand's frames shows no joint."""
 _MAX_LENGTH: Final = 1e9  # [m]
-_MAX_TIME: Final = 1e12  # [s], and the largest rate [Hz]; clocks of computers count 2e9 s
-_QUATERNION_TOLERANCE: Final = 1e-2  # Quaternions have unit length within this; our own within 1e-6.
-_CHUNK_FRAMES: Final = 4096  # frames whose markers are filled in at once
-_MAX_BIAS_FRAMES: Final = 2000  # frames that marker biases are learned from
-_MAX_STILL_SPREAD: Final = 3.0  # [deg], largest standard deviation of an angle of a hand that holds still
-_MIN_BIAS_FRAMES: Final = 30  # frames with a marker from which its bias is learned
+_MAX_TIME: Final = 1e12  # largest time [s] and rate [Hz]; clocks of computers count 2e9 s
+_QUATERNION_TOLERANCE: Final = 1e-2  # largest deviation of a quaternion's length from 1; ours deviate by 1e-6
+_CHUNK_FRAMES: Final = 4096  # number of frames whose markers are filled in at once
+_MAX_BIAS_FRAMES: Final = 2000  # largest number of frames from which marker biases are learned
+_MAX_STILL_SPREAD_DEG: Final = 3.0  # largest standard deviation of an angle of a still hand
+_MIN_BIAS_FRAMES: Final = 30  # least number of frames with a marker from which its bias is learned
 
 
 class _NamedAngles(dict[str, Float[np.ndarray, "T"]]):
@@ -196,7 +196,7 @@ class Take:
             raise ArgumentError(f"not a take: {error}") from error
 
     def __repr__(self) -> str:
-        """What the take holds, without its arrays."""
+        """A summary of the take without its arrays."""
         bodies = "".join(f", {body.name}" for body in self.bodies)
         return (
             f"Take({self.num_frames} frames at {self.rate:g} Hz of {', '.join(self.sides)}{bodies}; "
@@ -204,7 +204,7 @@ class Take:
         )
 
     def _repr_html_(self) -> str:
-        """The card that notebooks show: what the take holds, and when each hand is tracked."""
+        """The card that notebooks show: facts on the take, and the frames in which each hand is tracked."""
         facts = {
             "frames": f"{self.num_frames} at {self.rate:g} Hz, {self.duration:.1f} s",
             "gloves": ", ".join(f"{hand.side} {hand.layout.name}" for hand in self.hands),
@@ -416,12 +416,10 @@ class Take:
         take, there = self._neutral_frames(side, between)
         angles, times = take.qpos[there, take.hand_index(side), 7:], take.times[there]
         spread = np.rad2deg(angles.std(axis=0))
-        if spread.max() > _MAX_STILL_SPREAD:
-            moving = f"{JOINT_NAMES[spread.argmax()]} by {spread.max():.1f} degrees (standard deviation)"
-            text = (
-                f"the {side} hand moves from {times[0]:g} to {times[-1]:g} s, {moving}; expected a still pose"
-            )
-            warnings.warn(text, HandSimWarning, stacklevel=3)
+        if spread.max() > _MAX_STILL_SPREAD_DEG:
+            joint = f"{JOINT_NAMES[spread.argmax()]} by {spread.max():.1f} degrees (standard deviation)"
+            moves = f"the {side} hand moves from {times[0]:g} to {times[-1]:g} s, {joint}"
+            warnings.warn(f"{moves}; expected a still pose", HandSimWarning, stacklevel=3)
         return np.asarray(angles.mean(axis=0))
 
     def _neutral_frames(
@@ -457,9 +455,9 @@ class Take:
         return np.asarray(self.status[:, self.hand_index(side)] >= INITIALIZED)
 
     def shown_joints(self, side: Side) -> Bool[np.ndarray, "20"]:
-        """Joints of a hand beyond which a marker was seen in some of its frames; others are guesses.
+        """Joints of a hand beyond which a marker was seen in some frames; the other angles are guesses.
 
-        All joints of a take that no tracker made, or that never shows the hand, count as shown.
+        All joints count as shown if no tracker made the take, or if the take never shows the hand.
         """
         number, there = self.hand_index(side), np.flatnonzero(self.is_tracked(side))
         if not self.made_by_tracker or not len(there) or not len(self.point_list.points):
@@ -488,7 +486,7 @@ class Take:
         return self.sides.index(side)
 
     def worn(self) -> Iterator[tuple[slice, tuple[GloveFit, ...]]]:
-        """The spans of frames that have the same hands, in order, each with its hands."""
+        """Yield the spans of frames with the same hands, in order, each with its hands."""
         first = 0
         for stop, hands in (*(one[:2] for one in self.former), (self.num_frames, self.hands)):
             if stop > first:
@@ -500,7 +498,7 @@ class Take:
         return next((one.hands for one in self.former if frame < one.stop), self.hands)
 
     def worn_at(self, times: Float[np.ndarray, "F"]) -> tuple[tuple[GloveFit, ...], list[FormerHands]]:
-        """The last hands for other times [s] than the take's, and the former ones, with stops in these."""
+        """The last and the former hands of frames at other times [s]; stops count these frames."""
         stops = np.searchsorted(times, [self.times[one.stop] for one in self.former]).tolist()
         worn = [one._replace(stop=stop) for one, stop in zip(self.former, stops, strict=True)]
         last = next((one.hands for one in worn if one.stop >= len(times)), self.hands)
@@ -527,14 +525,14 @@ class Take:
         return self.point_list.labeled(of)
 
     def filled(self, side: Side) -> Bool[np.ndarray, "T M"]:
-        """Markers of a hand that were not seen in a frame with a pose, which `markers` fills in."""
+        """Markers of a hand that were not seen in a frame with a pose, so that `markers` computes them."""
         missing = np.isnan(self.observed(side)[..., 0])
         return np.asarray(missing & (self.status[:, self.hand_index(side)] != LOST)[:, None])
 
     def markers(self, side: Side) -> Float[np.ndarray, "T M 3"]:
-        """The markers of a hand [m]: seen, or else computed from the pose; NaN where the hand has no pose.
+        """The markers of a hand [m]: observed or computed from the pose; NaN where the hand has no pose.
 
-        Gloves slip, so the `marker_bias` is subtracted from a marker that is computed from the pose.
+        Gloves slip, so the `marker_bias` is subtracted from computed markers.
         """
         number, markers = self.hand_index(side), self.observed(side)
         there = self.status[:, number] != LOST
@@ -572,8 +570,8 @@ class Take:
     def marker_bias(self, side: Side) -> Float[np.ndarray, "M 3"]:
         """Median of `marker_offsets` of each marker of a hand, in the frame of its bone [m].
 
-        It is learned from the frames whose pose was fitted to points; 0 where these are few. A tracker
-        fits poses to markers with these offsets, so markers computed from its poses need them too.
+        It is learned from frames whose pose was fitted to points, and is 0 if these are few. A tracker fits
+        poses to markers with these offsets, so markers that are computed from its poses need them too.
         """
         number = self.hand_index(side)
         fits = np.flatnonzero((self.status[:, number] == TRACKED) & np.isfinite(self.rms[:, number]))
@@ -600,7 +598,7 @@ class Take:
         return np.asarray(np.einsum("tmji,tmj->tmi", rotations, worn.markers(qpos)[0] - seen))
 
     def _parts(self, frames: Int[np.ndarray, "F"]) -> Iterator[tuple[Take, Int[np.ndarray, "K"]]]:
-        """Each span of `worn` as a take, with the numbers in it of the given frames, which increase."""
+        """Yield each span of `worn` as a take, with the given frames (in increasing order) that it holds."""
         for span, _ in self.worn():
             some = frames[(frames >= span.start) & (frames < span.stop)] - span.start
             yield self.cut(span.start, span.stop), some
@@ -705,13 +703,13 @@ class Take:
         return self._steady(labeled_columns(frames, rows, names, self.rate))
 
     def _steady(self, capture: Capture) -> Capture:
-        """Insert empty frames where a stream lacks some, because marker files have no times."""
+        """Insert empty frames where a stream lacks frames, because marker files have no times."""
         if self.numbers is None:
             return capture
         times_at(self.times, self.rate)  # refuses too many frames
         order = np.arange(self.num_frames)
         places = np.rint((self.times - self.times[0]) * self.rate).astype(np.intp) - order
-        places = np.maximum.accumulate(places) + order  # two late frames must not share a place
+        places = np.maximum.accumulate(places) + order  # Two late frames must not share a place.
         positions = np.full((places[-1] + 1, *capture.positions.shape[1:]), np.nan)
         positions[places] = capture.positions
         return dataclasses.replace(capture, positions=positions)
@@ -728,9 +726,9 @@ class Take:
         )
 
     def turned(self, turn: Float[np.ndarray, "3 3"]) -> Take:
-        """This take after a rotation of its world."""
+        """The take after a rotation of its world."""
         points = dataclasses.replace(self.point_list, points=self.point_list.points @ turn.T)
-        qpos, poses = turned_poses(self.qpos, turn), turned_poses(self.body_poses, turn)
+        qpos, poses = rotated_poses(self.qpos, turn), rotated_poses(self.body_poses, turn)
         return dataclasses.replace(self, qpos=qpos, body_poses=poses, point_list=points)
 
     def cut(self, first: int, last: int) -> Take:
@@ -844,7 +842,7 @@ def posed_motion(
     neutral: tuple[float, float] | Take | None = None,
     shown: Mapping[Side, Bool[np.ndarray, "20"]] = MappingProxyType({}),
 ) -> Motion:
-    """The hands and bodies of a take as the writers of motion files need them; each has a pose somewhere."""
+    """The hands and bodies of a take for writers of motion files; each has a pose in some frame."""
     zeros = [None if neutral is None else take.mean_pose(side, neutral) for side in take.sides]
     hands = [
         PosedHand.of(

@@ -1,4 +1,4 @@
-"""The hands of a take's frames, as files hold them: those of the last frames, and earlier ones."""
+"""The hands of a take in files: those of the last frames, and those of earlier frames."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class FormerHands(NamedTuple):
     hands: tuple[GloveFit, ...]
     """The hands with their gloves as worn, in the order of the take's."""
     notes: str
-    """Where these hands are from, in words, such as their size and how it was measured."""
+    """The origin of these hands in words, such as their size and how it was measured."""
 
 
 def check_former(former: Sequence[FormerHands], hands: Sequence[GloveFit], num_frames: int) -> None:

@@ -1,4 +1,4 @@
-"""Output folders of jobs: on this machine, or in an object store, with a local folder that stands for it."""
+"""Output folders of jobs: on this machine, or in an object store that a local folder stands for."""
 
 from __future__ import annotations
 
@@ -58,9 +58,9 @@ def load_checksums(path: Path) -> dict[str, str]:
 
 
 def checked_list(path: Path, files: Mapping[str, Path]) -> tuple[dict[str, str], list[str]]:
-    """The checksums of a list, and the names of missing and changed files; a damaged list names itself.
+    """The checksums in a list, and the names of missing and changed files (of a damaged list its own name).
 
-    Files are beside the list, unless `files` says where they are.
+    Files are beside the list, unless `files` has their paths.
     """
     record = load_checksums(path)
     if not record and path.exists():
@@ -107,8 +107,8 @@ def place_of(out: str | Place) -> Place:
 class Output:
     """A folder that all jobs write to.
 
-    For an object store, each job writes to a temporary folder on its own machine and puts the files into the
-    store. Files on all jobs are made in `folder`, from files that `fetch` copies, and put by `publish`.
+    For an object store, each job writes to a temporary folder on its own machine and uploads the files. Files
+    on all jobs together are made in `folder` from files that `fetch` downloads; `publish` uploads them.
     """
 
     place: Place
@@ -154,7 +154,7 @@ class Output:
     def job(self, make: Make, *, last: Sequence[str] = ()) -> Job:
         """A job that writes to the claimed folder.
 
-        Files that match the patterns `last` mark a finished job, so they are put after all others.
+        Files that match the patterns `last` mark a finished job, so they are uploaded after all others.
         """
         name = self._claimed[0]
         return _Job(make, self.place, self.folder, name, checksum(self.folder / name), tuple(last))
@@ -195,7 +195,7 @@ class Output:
             return checksum(self.place / name)
 
     def warn_of(self, files: Collection[str], what: str) -> None:
-        """Warn of damaged files; `what` ends the sentence: what is wrong, and what becomes of them."""
+        """Warn of damaged files; `what` ends the sentence with the damage and its consequence."""
         if files:
             warnings.warn(f"{self}: {', '.join(sorted(files))} {what}", HandSimWarning, stacklevel=5)
 
@@ -231,7 +231,7 @@ def open_output(out: str | Place) -> Iterator[Output]:
 
 @dataclass(frozen=True, slots=True)
 class _Job:
-    """A job that writes to a folder which all workers share, or puts its files into a store."""
+    """A job that writes to a folder that all workers share, or uploads its files to a store."""
 
     make: Make
     place: Place
@@ -281,7 +281,7 @@ def _upload(store: Place, folder: Path, names: Collection[str], last: Sequence[s
 
 @contextmanager
 def _store_errors(place: Place, doing: str) -> Iterator[Any]:
-    """The file system of a store; any error, of whatever protocol, becomes a `HandSimError`."""
+    """Yield the file system of a store, and raise a `HandSimError` for any of its errors."""
     try:
         yield None if isinstance(place, Path) else place.fs
     except ImportError:

@@ -1,7 +1,7 @@
-"""A cache of help pages, one file per command: tyro and the modules of a command need a second to write one.
+"""A cache of help pages, one file per command, because tyro needs a second to make a page.
 
-A page is kept for what it depends on: the sources of handsim and of tyro, Python, and the terminal. Nothing
-else may stand in a page, such as the names of files that are there.
+The key of a page is a hash of the sources of handsim and of tyro, Python's version, and the terminal. A page
+must not depend on anything else, such as the names of existing files.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _TERMINAL_VARIABLES: Final = ("FORCE_COLOR", "NO_COLOR", "TERM")
 
 
 class _Page(io.StringIO):
-    """A page that takes itself for the standard output, whose terminal may have colors and boxes."""
+    """A text stream with the encoding and terminal of the standard output, for colors and boxes."""
 
     encoding = getattr(sys.__stdout__, "encoding", "utf-8")
 
@@ -58,7 +58,7 @@ def print_help(prog: str, make: Callable[[], object]) -> None:
 
 
 def _page_inputs(page: _Page) -> list[object]:
-    """What a page depends on."""
+    """The inputs that a page depends on."""
     home = Path(__file__).parents[2]
     tyro = importlib.util.find_spec("tyro")
     files = [tyro.origin] if tyro is not None and tyro.origin else []

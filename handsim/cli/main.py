@@ -85,7 +85,7 @@ _SYSTEM_SENTENCES: Final = {
 
 
 def _target_of(command: str) -> str | Table:
-    """Where a command's function is, or the table of its sub-commands."""
+    """The "module:function" of a command, or the table of its sub-commands."""
     inner = [name for name in _HELP if name.startswith(f"{command} ")]
     if inner:
         return {name.split()[1]: (_target_of(name), _HELP[name]) for name in inner}
@@ -142,7 +142,7 @@ def run(commands: Table, args: Sequence[str]) -> int:
 
 
 def _with_home(arg: str) -> str:
-    """An argument with the home folder for ~, which shells leave alone in quotes and behind `=`."""
+    """Replace ~ in an argument by the home folder, as shells do not in quotes and after `=`."""
     option, equals, value = arg.partition("=") if arg.startswith("--") else ("", "", arg)
     return f"{option}{equals}{os.path.expanduser(value)}"
 
@@ -155,7 +155,7 @@ def load(target: str | Table) -> Any:
 
 
 def _chosen(commands: Table, args: Sequence[str]) -> tuple[tuple[Any, str], str, Sequence[str]]:
-    """The entry of the command that the first arguments name, the program's name and the other arguments."""
+    """The entry of the command in the first arguments, the name of the program, and the other arguments."""
     entry: tuple[Any, str] = (commands, "")
     prog = "handsim"
     while isinstance(entry[0], Mapping) and args and args[0] in entry[0]:
@@ -174,7 +174,7 @@ def _prepare_streams() -> None:
 
 
 def _exit_with_help(end: SystemExit) -> int:
-    """Flush the output of help or usage and exit; rich would exit with code 1 after a closed pipe."""
+    """Flush the output of help or usage, and exit; after a closed pipe rich would exit with code 1."""
     pipe: BaseException | None = end
     while pipe is not None and not isinstance(pipe, BrokenPipeError):
         pipe = pipe.__context__

@@ -37,9 +37,9 @@ _SPECIFICATION: Final = "COMPLETION_SPEC = "  # begins the line of a completion 
 
 @dataclass(frozen=True, slots=True)
 class PresetCommand:
-    """A command whose defaults depend on an option, so that its arguments are read before they are parsed.
+    """A command whose defaults depend on an option, which is read before the arguments are parsed.
 
-    After parsing, a given option that equals the usual default would look like one that was not given.
+    After parsing, an option with the usual default would look like one that was not given.
     """
 
     choose: Callable[[Sequence[str], str], Command]
@@ -80,7 +80,7 @@ def run_command(
 
 
 def _refusal(command: Command, unknown: Sequence[str], args: list[str]) -> str:
-    """A sentence on an option that a command does not have, or on a value too many."""
+    """A sentence on an unknown option, or on a value too many."""
     script = completion_script({"it": command}, "bash")
     table = next(line for line in script.splitlines() if line.startswith(_SPECIFICATION))
     (own,) = ast.literal_eval(table.removeprefix(_SPECIFICATION))["subcommands"].values()
@@ -94,7 +94,7 @@ def _refusal(command: Command, unknown: Sequence[str], args: list[str]) -> str:
 
 
 def outline(table: Mapping[str, tuple[Any, str]]) -> dict[str, Command]:
-    """Functions that stand for the sub-commands of a table in its help, so that none is loaded for it."""
+    """Functions that stand for the sub-commands of a table in its help, so that no module is loaded."""
 
     def named(help_line: str) -> Command:
         def stand_in() -> None:

@@ -1,8 +1,8 @@
-"""Studies: a command over several files, folders of them or a table; what is done already is skipped.
+"""Studies: a command over several files, folders or a table of files; finished files are skipped.
 
-The folder of the outputs has a record, `study.json`: the settings of each output, and checksums of the files
-that it was made of. Dates of files count for nothing. What the table says of a person stays in the record for
-the next command of the study.
+`study.json` in the folder of the outputs records the settings of each output, and checksums of its input
+files. Dates of files are ignored. The entries of the table on a person are recorded for the next command of
+the study.
 """
 
 from __future__ import annotations
@@ -43,10 +43,10 @@ class StudyFile:
     name: Path
     """The name of its outputs in their folder, but for the ending."""
     cells: Mapping[str, str]
-    """What the table says of it by `COLUMNS`, without blank cells; paths are absolute."""
+    """Cells of its row in the table by `COLUMNS`, without blank ones; paths are absolute."""
 
     def options(self, **given: Any) -> dict[str, Any]:
-        """Options of a command (`glove`, `hands`, `shape`); those of the table replace the given ones."""
+        """Options of a command (`glove`, `hands`, `shape`), replaced by the entries of the table."""
         own: dict[str, Any] = dict(self.cells)
         if "side" in own:
             own["hands"] = (own["side"],)
@@ -56,7 +56,7 @@ class StudyFile:
 
 
 class Step(NamedTuple):
-    """The work on one file of a study."""
+    """The outputs, inputs and options of a command on one file of a study."""
 
     outputs: tuple[Path, ...]
     inputs: tuple[object, ...]
@@ -66,7 +66,7 @@ class Step(NamedTuple):
 
 
 def is_study(sources: Sequence[Path], out: Path | None) -> bool:
-    """Whether a command has not one file to read and one to write."""
+    """Whether a command has anything but one file to read and one file to write."""
     folder = out is not None and out.is_dir()
     return len(sources) != 1 or folder or sources[0].is_dir() or _is_table(sources[0])
 
@@ -103,7 +103,7 @@ def run_study(
     done: str,
     on_end: Callable[[list[Step]], object] | None = None,
 ) -> None:
-    """Make the outputs of each file that are not there with the same inputs and settings.
+    """Make the outputs of each file, unless they exist and were made with the same inputs and settings.
 
     Args:
         files: The files of the study.
@@ -174,14 +174,14 @@ def _checksums(files: Sequence[object]) -> list[str]:
 
 
 def _named_by_side(file: StudyFile) -> StudyFile:
-    """A file whose outputs are named by the side, too, as the capture stands in the table more than once."""
+    """A file with the side in the names of its outputs, because the table has its capture more than once."""
     side = file.cells.get("side")
     name = file.name.with_stem(f"{file.name.stem}-{side}") if side else file.name
     return dataclasses.replace(file, name=name)
 
 
 def _recorded_files(folder: Path, endings: Sequence[str]) -> Iterator[StudyFile]:
-    """What the last command of a study made in a folder."""
+    """The outputs of the last command of a study in a folder."""
     record = load_json(folder / RECORD) if (folder / RECORD).is_file() else {"study": []}
     for key in record["study"]:
         entry = record["outputs"].get(key, {"names": [], "cells": {}})

@@ -1,6 +1,6 @@
-"""Arrays in files: sizes are checked before anything is allocated, nothing is unpickled.
+"""Files of arrays (.npz): sizes are checked before memory is allocated, and nothing is unpickled.
 
-What the reader refuses because of its size, the writer does not write.
+The writer writes no file that the reader would refuse because of its size.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from typing import IO, Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-_ALWAYS_ALLOWED: Final = 1 << 28  # bytes that any archive may hold
-_COMPRESSION_LEVEL: Final = 1  # of compression; level 6 makes takes 3 % smaller and is 2.4 times as slow
-_MAX_RATIO: Final = 20  # A larger archive may expand to this many times the size of its file.
+_ALWAYS_ALLOWED: Final = 1 << 28  # size to which every archive may expand [bytes]
+_COMPRESSION_LEVEL: Final = 1  # Level 6 makes takes 3 % smaller, and takes 2.4 times as long.
+_MAX_RATIO: Final = 20  # largest ratio of the expanded size of a larger archive to the size of its file
 _DAMAGE_ERRORS: Final = (
     AttributeError, EOFError, IndexError, KeyError, OverflowError, RuntimeError, SyntaxError, TypeError,
     tokenize.TokenError, lzma.LZMAError, zipfile.BadZipFile, zlib.error,
@@ -30,7 +30,7 @@ _DAMAGE_ERRORS: Final = (
 
 
 class Member(NamedTuple):
-    """An array of an archive; it may be larger than memory, because it is given part by part."""
+    """An array of an archive, given in parts, so that it may be larger than memory."""
 
     name: str
     dtype: np.dtype[Any]
@@ -47,8 +47,8 @@ class Member(NamedTuple):
 def write_npz(path: Path, members: Iterable[Member]) -> None:
     """Write arrays as an `.npz` that `read_npz` reads.
 
-    Arrays are compressed. The reader refuses an archive that expands too much; one that would, such as hours
-    in which nothing moves, is written again without compression.
+    Arrays are compressed. The reader refuses an archive that expands too much, such as hours in which nothing
+    moves; such an archive is written again without compression.
     """
     members = list(members)
     for method in (zipfile.ZIP_DEFLATED, zipfile.ZIP_STORED):
@@ -103,7 +103,7 @@ def _damage_as_value_error() -> Iterator[None]:
 
 
 def _check_archive(archive: zipfile.ZipFile, file: IO[bytes]) -> None:
-    """Raise a ValueError unless an archive holds plain arrays, of no more bytes than its size allows."""
+    """Raise a ValueError unless an archive holds plain arrays that expand to an allowed size."""
     check_members(archive, file.seek(0, io.SEEK_END))
     for member in archive.infolist():
         with archive.open(member) as array:

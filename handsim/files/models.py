@@ -1,9 +1,9 @@
-"""ONNX models from files: a checksum finds damage, and bounds keep a hostile model from filling the memory.
+"""ONNX models from files: a checksum detects damage, and limits keep a hostile model from filling the memory.
 
-Runtimes crash on some damaged models, and allocate what a model asks for. So a model is first read as a
-protobuf: its checksum must be right, and it may hold one plain graph with a bounded number of parts, without
-subgraphs (loops), functions, sparse tensors and files beside it. What a graph computes is bounded by the
-allocator of `bounded_session`.
+Runtimes crash on some damaged models, and allocate as much memory as a model demands. Therefore a model is
+first read as a protobuf. Its checksum must be right, and it may hold one plain graph with a limited number of
+parts, without subgraphs (loops), functions, sparse tensors and external files. The allocator of
+`bounded_session` limits the memory of its computations.
 """
 
 from __future__ import annotations

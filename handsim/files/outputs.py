@@ -1,7 +1,4 @@
-"""Files that are written whole or not at all, alone or together, and checks before the work.
-
-The checks are that outputs can be written, none over an input, and that disk and memory have room.
-"""
+"""Atomic writing of files, alone or together, and checks of outputs, disk and memory before long work."""
 
 from __future__ import annotations
 
@@ -61,11 +58,11 @@ def plain_path(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def atomic_write(path: str | Path) -> Iterator[Path]:
-    """A temporary path beside `path`, of the same suffix, that takes its name when the block ends well.
+    """Yield a temporary path beside `path`, with its suffix, and rename the file to `path` after the block.
 
-    If the block raises, the temporary file is removed and an older file at `path` stays as it was. Missing
-    folders are made, and what a killed process left of the same file is removed first. The finished file has
-    the mode that the umask asks for, whatever its writer chose.
+    If the block raises, the temporary file is removed, and an older file at `path` stays unchanged. Missing
+    folders are made. Temporary files that a killed process left are removed first. The mode of the file
+    follows from the umask.
     """
     check_type("path", path, (str, os.PathLike), "a path")
     final = Path(os.path.realpath(path)) if os.path.islink(path) else Path(path)
@@ -94,7 +91,7 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
 
 @contextmanager
 def _naming_final(final: Path, temporary: Path) -> Iterator[None]:
-    """Let errors name the final file; else they name the temporary one, or none if the disk is full."""
+    """Make errors of the block name the final file in place of the temporary one, or of none."""
     try:
         yield
     except OSError as error:
@@ -105,9 +102,9 @@ def _naming_final(final: Path, temporary: Path) -> Iterator[None]:
 
 @contextmanager
 def written_together() -> Iterator[None]:
-    """Files of `atomic_write` within the block take their names at its end, all of them or none.
+    """Rename all files of `atomic_write` in the block at its end, or none of them.
 
-    Only a process that is killed between two of the renames leaves new files beside older ones.
+    New files stand beside older ones only if the process is killed between two renames.
     """
     if _WAITING_FILES.get() is not None:
         yield
@@ -152,7 +149,7 @@ def _rename_all(files: Mapping[Path, Path]) -> None:
 
 
 def _keep_older(final: Path, older: Path) -> None:
-    """Keep a file under a second name."""
+    """Give a file a second name, under which it survives being replaced."""
     older.unlink(missing_ok=True)
     try:
         os.link(final, older)
@@ -169,7 +166,7 @@ def write_text(path: str | Path, text: str) -> None:
 
 @contextmanager
 def writing(path: str | Path, kind: type[HandSimError]) -> Iterator[None]:
-    """Within the block an error of the system becomes one of this kind: a file cannot be written."""
+    """Raise an error of this kind in place of the block's `OSError`s: a file cannot be written."""
     try:
         yield
     except OSError as error:
@@ -177,7 +174,7 @@ def writing(path: str | Path, kind: type[HandSimError]) -> Iterator[None]:
 
 
 def unwritten(path: Path) -> OSError:
-    """The system's error for a file that a library did not write whole, without saying why."""
+    """The system's error for a file that a library did not write completely, without a reason."""
     try:
         with path.open("ab") as file:
             file.write(bytes(1 << 20))
@@ -202,9 +199,10 @@ def temporary_beside(path: Path, mark: str = "") -> Path:
 
 
 def _temporary_prefix(path: Path) -> str:
-    """The beginning of temporary names, with a hash of this machine, since only there IDs are unique.
+    """The beginning of the temporary names of a file.
 
-    It has a hash in place of the end of a long name, as a name may have 255 bytes.
+    It has a hash of this machine, because process IDs are unique on one machine only. A hash replaces the end
+    of a long name, because names may have 255 bytes.
     """
     stem = path.stem
     if len(stem) > _MAX_STEM:
@@ -218,9 +216,9 @@ def _machine_hash() -> str:
 
 
 def remove_leftovers(folder: Path, names: str = "**/.*.tmp-*") -> None:
-    """Remove the files and folders that match a pattern, when not given all temporary ones at any depth.
+    """Remove files and folders that match a pattern: by default all temporary ones at any depth.
 
-    What another running process of this machine writes there stays.
+    Temporary files of another running process of this machine stay.
     """
     for leftover in folder.glob(names):
         writer = re.search(rf"\.tmp-{_machine_hash()}-(\d{{1,9}})", leftover.name)
@@ -233,7 +231,7 @@ def remove_leftovers(folder: Path, names: str = "**/.*.tmp-*") -> None:
 
 
 def remove_abandoned(final: Path) -> None:
-    """Remove temporary files of `final`, its new or its older content, whose process has ended."""
+    """Remove the temporary files of `final` whose process has ended."""
     prefix = _temporary_prefix(final)
     for leftover in final.parent.glob(f"{glob.escape(prefix)}*{glob.escape(final.suffix)}"):
         number = leftover.name.removeprefix(prefix).removesuffix(final.suffix).removesuffix(_OLDER_MARK)
@@ -254,7 +252,7 @@ def _is_running(process: int) -> bool:
 
 
 def _default_mode(temporary: Path) -> int:
-    """The mode of a new file here; some writers make theirs readable by the owner alone."""
+    """The mode of a new file in this folder; some writers make theirs readable by the owner only."""
     descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT, 0o666)
     try:
         return os.fstat(descriptor).st_mode & 0o777
@@ -264,7 +262,7 @@ def _default_mode(temporary: Path) -> int:
 
 
 def _flush(path: Path) -> None:
-    """Wait until the file is on the disk: a rename before that can leave an empty file after a power cut."""
+    """Wait until the file is on the disk; an earlier rename can leave an empty file after a power failure."""
     descriptor = os.open(path, os.O_RDWR)  # Windows flushes only what is open for writing
     try:
         os.fsync(descriptor)
@@ -273,9 +271,9 @@ def _flush(path: Path) -> None:
 
 
 def check_outputs(inputs: Iterable[object], outputs: Sequence[Path | None], *endings: str) -> None:
-    """Refuse an output that is an input or another output, in whatever spelling, or cannot be written.
+    """Refuse an output that cannot be written, or is the same file as an input or another output.
 
-    If `endings` are given, the first output is --out, whose name must have one of them.
+    If `endings` are given, the first output is --out, and its name must have one of them.
     """
     if endings:
         check_ending(cast("Path", outputs[0]), *endings)
@@ -300,7 +298,7 @@ def check_outputs(inputs: Iterable[object], outputs: Sequence[Path | None], *end
 
 
 def _check_links(output: Path) -> None:
-    """Refuse links on the way to an output that lead to themselves, or to no folder."""
+    """Refuse an output whose path has a link to itself, or to a folder that does not exist."""
     for path in (*reversed(output.absolute().parents), output):
         if not path.is_symlink() or path.exists():
             continue
@@ -318,13 +316,13 @@ def _check_links(output: Path) -> None:
 
 
 def check_ending(path: Path, *endings: str, option: str = "--out") -> None:
-    """Refuse an option's file whose name ends otherwise."""
+    """Refuse a file of an option whose name has none of these endings."""
     if path.suffix.lower() not in endings:
         raise ArgumentError(f"{option} is {path}, expected a file name that ends in {', '.join(endings)}")
 
 
 def write_starter(file: Path, text: str, *, error: type[HandSimError]) -> None:
-    """Write the text that a file of one's own begins with, under a new name in .toml."""
+    """Write a starter file to a new .toml file."""
     if file.suffix.lower() != ".toml":
         raise error(f"{file}: expected a file name that ends in .toml")
     if file.exists():
@@ -333,7 +331,7 @@ def write_starter(file: Path, text: str, *, error: type[HandSimError]) -> None:
 
 
 def check_free(folder: Path, needed: int, what: str, remedy: str, *, error: type[HandSimError]) -> None:
-    """Refuse work that the disk has no space for; the folder need not exist yet."""
+    """Refuse work that needs more space [bytes] than the disk of a folder has; the folder may be missing."""
     there = folder.absolute()
     while not there.exists():
         there = there.parent
@@ -346,7 +344,7 @@ def check_free(folder: Path, needed: int, what: str, remedy: str, *, error: type
 
 
 def check_memory(needed: int, what: str, remedy: str) -> None:
-    """Refuse work that the machine has no memory for by an `ArgumentError`; words as for `check_free`."""
+    """Refuse work that needs more memory [bytes] than is free; `what` and `remedy` as for `check_free`."""
     free = available_bytes()
     if needed > free:
         raise ArgumentError(
@@ -355,9 +353,9 @@ def check_memory(needed: int, what: str, remedy: str) -> None:
 
 
 def available_bytes() -> int:
-    """Memory that is free without swapping, at most what control groups allow [bytes].
+    """Memory that is free without swapping, and that control groups allow [bytes].
 
-    It is all memory if the system does not state what is free.
+    If the system does not state the free memory, all of its memory counts as free.
     """
     stated = re.search(r"^MemAvailable: *(\d{1,15}) kB$", text_of_system(Path("/proc/meminfo")), re.M)
     free = 1024 * int(stated[1]) if stated else os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
@@ -365,7 +363,7 @@ def available_bytes() -> int:
 
 
 def shown_bytes(count: float) -> str:
-    """A number of bytes with a unit that suits it."""
+    """A number of bytes in kB, MB or a larger unit."""
     unit = 0
     while count >= 1000.0 and unit < len(_BYTE_UNITS) - 1:
         count, unit = count / 1000.0, unit + 1
@@ -404,10 +402,11 @@ def claim(
     result: Path | None = None,
     shown: str = "",
 ) -> None:
-    """Claim a folder by a settings file, or check that its settings are equal; clear what a killed run left.
+    """Claim a folder by writing a settings file, or check that the settings in it are equal.
 
-    The setting `grows`, written like `train.samples`, may be larger than in the file. Then `result`, made
-    with the old settings, is removed, and the file takes the new ones. Settings that are `free` may differ.
+    Temporary files of a killed run are removed. The setting `grows`, written like `train.samples`, may be
+    larger than in the file; then the file gets the new settings, and `result` (made with the old ones) is
+    removed. Settings in `free` may differ.
     """
     out, shown = path.parent, shown or str(path.parent)
     if path.is_file():
@@ -439,7 +438,7 @@ def claim(
 
 
 def _flat_settings(table: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Settings by their path of names, `train.network.width`; lists are values."""
+    """Settings by their dotted names, such as `train.network.width`; lists are values."""
     flat: dict[str, Any] = {}
     for key, value in table.items():
         if isinstance(value, dict) and value:

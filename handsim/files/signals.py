@@ -24,7 +24,7 @@ class Stopped(KeyboardInterrupt):
     """A command was asked to end.
 
     Args:
-        kept: What is kept and how to go on, a sentence without a capital and a period.
+        kept: A sentence without a capital and a period: what was saved, and how to continue.
     """
 
     def __init__(self, number: int = signal.SIGINT, kept: str = "") -> None:
@@ -76,7 +76,7 @@ def interrupt_flag(flag: InterruptFlag | None = None, *, again: bool = True) -> 
 
 
 class _Block(Closing):
-    """Whether a block of code was left, and the last signal that came in it, 0 if none did."""
+    """Whether a block of code was left, and the last signal that came in it (0 if none did)."""
 
     left = False
     number = 0
@@ -91,24 +91,23 @@ class _Block(Closing):
 
 
 class _PersistentStop(Stopped):
-    """A `Stopped` that is raised again when it is lost, until a block is left."""
+    """A `Stopped` whose signal is sent again if the exception is lost, until a block is left."""
 
     def __init__(self, number: int, block: _Block) -> None:
         super().__init__(number)
         self._block = block
 
     def __del__(self) -> None:
-        if not self._block.left:  # what is raised in __del__ is lost: a thread sends the signal again
-            # A signal whose exception was lost is sent again.
+        if not self._block.left:  # A thread sends the signal, because an exception in __del__ would be lost.
             threading.Timer(0.05, self._block.send, (self.number,)).start()
 
 
 @contextmanager
 def signals_raise() -> Iterator[None]:
-    """Within the block a signal to end raises `Stopped`, so that a batch job cleans up as after Ctrl-C.
+    """Raise `Stopped` for a signal to end within the block, so that a batch job cleans up as after Ctrl-C.
 
-    Compiled code that calls back into Python may swallow the exception; then the signal is sent again. A
-    module that loads may keep it and fail with another error, which counts as the interrupt.
+    Compiled code that calls back into Python may swallow the exception; then the signal is sent again. An
+    import may catch it and fail with another error, which counts as the interrupt.
     """
     block = _Block()
 
@@ -139,10 +138,10 @@ def interrupts_bare() -> Iterator[None]:
 
 
 def interrupt_behind(error: BaseException) -> KeyboardInterrupt | None:
-    """The interrupt that an error comes from, if one does.
+    """The interrupt that caused an error, None if there was none.
 
-    Interrupted compiled code ends in a `SystemError`, and a module that loads in an `ImportError`. An error
-    that was met while the interrupt was handled, such as a full disk, counts as itself.
+    Interrupted compiled code raises a `SystemError`, and an interrupted import an `ImportError`. An error
+    that occurs while an interrupt is handled, such as a full disk, is not caused by it.
     """
     below: BaseException | None = error
     while below is not None and not isinstance(below, KeyboardInterrupt):
@@ -152,7 +151,7 @@ def interrupt_behind(error: BaseException) -> KeyboardInterrupt | None:
 
 @contextmanager
 def _lost_stops_hidden() -> Iterator[None]:
-    """Print no traceback of a lost `Stopped`, whose signal is sent again."""
+    """Suppress the traceback of a lost `Stopped`, because its signal is sent again."""
     others = sys.unraisablehook
 
     def hook(lost: sys.UnraisableHookArgs) -> None:
@@ -168,7 +167,7 @@ def _lost_stops_hidden() -> Iterator[None]:
 
 @contextmanager
 def _signal_handler(handler: Callable[[int, FrameType | None], None]) -> Iterator[None]:
-    """Give signals to end to a handler; only the main thread gets any, and ignored ones stay ignored."""
+    """Handle signals to end within the block; only the main thread gets signals, and ignored ones stay so."""
     with ExitStack() as stack:  # it restores every handler, even where one that is restored raises at once
         if threading.current_thread() is threading.main_thread():
             for number in ENDING:

@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from handsim.hand.shape import DIGITS, JOINT_NAMES, NUM_JOINTS, HandShape, Side
+from handsim.hand.shape import DIGITS, JOINT_NAMES, JOINTS_PER_DIGIT, HandShape, Side
 from handsim.space.transforms import MIRROR, axis_angle_matrix, euler_matrix
 
 Convention = Literal["model", "isb"]
@@ -47,20 +47,20 @@ _ISB_AXES: Final = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, 0.0, 0.0]
 def isb_angles(
     shape: HandShape, angles: Float[np.ndarray, "T 20"], neutral: Float[np.ndarray, "20"] | None = None
 ) -> Float[np.ndarray, "T 25"]:
-    """The angles of `ISB_NAMES` [rad] of a hand whose hinges have these angles; NaN stays NaN.
+    """The angles of `ISB_NAMES` [rad] from the angles of the model's hinges; NaN stays NaN.
 
-    In the pose `neutral` all of them are zero; if it is None, those of the fingers are zero in the flat hand,
-    and those of the first metacarpal where it points along the hand.
+    All of them are zero in the pose `neutral`. If it is None, the fingers' angles are zero in the flat hand,
+    and the first metacarpal's angles are zero where it points along the hand.
     """
     known = np.isfinite(angles[:, 0])
-    outer, turns = angles[known], _first_bone_rotations(shape, angles[known])
+    outer, rotations = angles[known], _first_bone_rotations(shape, angles[known])
     if neutral is not None:
         outer = outer - neutral
-        turns = turns @ np.swapaxes(_first_bone_rotations(shape, neutral[None]), -1, -2)
-    first = _cardan_angles(turns.reshape(-1, 3, 3)).reshape(-1, len(DIGITS), 3)
+        rotations = rotations @ np.swapaxes(_first_bone_rotations(shape, neutral[None]), -1, -2)
+    first = _cardan_angles(rotations.reshape(-1, 3, 3)).reshape(-1, len(DIGITS), 3)
     first[:, 0, 1] *= -1.0  # radial abduction of the thumb is the opposite of ulnar deviation
     found = np.full((len(angles), len(ISB_NAMES)), np.nan)
-    both = first, outer.reshape(-1, len(DIGITS), NUM_JOINTS // len(DIGITS))[..., 2:]
+    both = first, outer.reshape(-1, len(DIGITS), JOINTS_PER_DIGIT)[..., 2:]
     found[known] = np.concatenate(both, axis=2).reshape(-1, len(ISB_NAMES))
     return found
 
@@ -80,25 +80,25 @@ def wrist_angles(
     return np.column_stack([wrist_cardan(side, hands)[:, :2], wrist_cardan(side, forearms)[:, 2]])
 
 
-def wrist_cardan(side: Side, turns: Float[np.ndarray, "T 3 3"]) -> NDArray[np.float64]:
+def wrist_cardan(side: Side, rotations: Float[np.ndarray, "T 3 3"]) -> NDArray[np.float64]:
     """Flexion, radial deviation and pronation (T, 3) [rad] of rotations; NaN where a rotation is NaN."""
-    known, found = np.isfinite(turns[:, 0, 0]), np.full((len(turns), 3), np.nan)
-    turned = MIRROR @ turns[known] @ MIRROR if side == "left" else turns[known]
-    found[known] = _cardan_angles(turned) * [1.0, -1.0, 1.0]
-    return found
+    known, angles = np.isfinite(rotations[:, 0, 0]), np.full((len(rotations), 3), np.nan)
+    right = MIRROR @ rotations[known] @ MIRROR if side == "left" else rotations[known]
+    angles[known] = _cardan_angles(right) * [1.0, -1.0, 1.0]
+    return angles
 
 
-def _cardan_angles(turns: Float[np.ndarray, "K 3 3"]) -> NDArray[np.float64]:
+def _cardan_angles(rotations: Float[np.ndarray, "K 3 3"]) -> NDArray[np.float64]:
     """Flexion, ulnar deviation and pronation (K, 3) [rad] of rotations in our frame of the inner bone."""
     from scipy.spatial.transform import Rotation
 
-    return np.asarray(Rotation.from_matrix(_ISB_AXES.T @ turns @ _ISB_AXES).as_euler("ZXY"))
+    return np.asarray(Rotation.from_matrix(_ISB_AXES.T @ rotations @ _ISB_AXES).as_euler("ZXY"))
 
 
 def _first_bone_rotations(shape: HandShape, angles: Float[np.ndarray, "T 20"]) -> NDArray[np.float64]:
-    """Orientation (T, 5, 3, 3) of each digit's first bone on the right hand that every shape describes."""
-    by_digit = angles.reshape(-1, len(DIGITS), NUM_JOINTS // len(DIGITS))
+    """Orientation (T, 5, 3, 3) of each digit's first bone in the wrist's frame, as on a right hand."""
+    by_digit = angles.reshape(-1, len(DIGITS), JOINTS_PER_DIGIT)
     _, y, z = np.eye(3)
-    turns = axis_angle_matrix(z, by_digit[..., 0]) @ axis_angle_matrix(y, by_digit[..., 1])
-    turns[:, 0] = euler_matrix(shape.base_angles[0]) @ turns[:, 0]
-    return turns
+    rotations = axis_angle_matrix(z, by_digit[..., 0]) @ axis_angle_matrix(y, by_digit[..., 1])
+    rotations[:, 0] = euler_matrix(shape.base_angles[0]) @ rotations[:, 0]
+    return rotations

@@ -24,6 +24,7 @@ from handsim.hand.shape import (
     DIGIT_OF_BONE,
     DIGITS,
     JOINTS,
+    JOINTS_PER_DIGIT,
     NUM_BONES,
     NUM_JOINTS,
     NUM_QPOS,
@@ -48,7 +49,7 @@ _JOINT_COUNTS: Final = np.bincount(_JOINT_BONES, minlength=NUM_BONES)
 _BONE_CHAIN: Final = np.stack([[bone.parent for bone in BONES], _JOINT_COUNTS], axis=1)
 """Parent of each bone, and the number of its joints."""
 _JOINT_AXES: Final = np.array([joint.axis for joint in JOINTS])
-_JOINT_RANGES: Final = np.deg2rad([(joint.low, joint.high) for joint in JOINTS])
+_JOINT_RANGES: Final = np.deg2rad([(joint.low_deg, joint.high_deg) for joint in JOINTS])
 FLESH_DENSITY: Final = 1100.0
 """Density of the hand [kg/m^3], soft tissue and bone together."""
 CAPSULE_GROUP: Final = 0
@@ -74,21 +75,20 @@ SKELETON: Final[tuple[tuple[int, int], ...]] = tuple(
     for part in range(4)
 )
 """Pairs of keypoints that a drawing joins by a line."""
-_WRIST_THICKNESS: Final = 1.3  # thickness of the wrist over that of the palm
+_WRIST_THICKNESS: Final = 1.3  # ratio of the thickness of the wrist to that of the palm
 NUM_VELOCITIES: Final = 6 + NUM_JOINTS
 """MuJoCo's nv: wrist velocity in the world, wrist angular velocity in its own frame, joint rates."""
 # The first joint of a bone rotates about an axis of the parent, the second about one of the bone.
 _IS_FIRST_JOINT: Final = np.diff(_JOINT_BONES, prepend=-1) != 0
 _JOINT_PARENTS: Final = _BONE_CHAIN[_JOINT_BONES, 0]
-_HINGES: Final = NUM_JOINTS // len(DIGITS)  # joints of a digit
 _IS_BEYOND: Final = np.arange(NUM_BONES) >= _JOINT_BONES[:, None]
 _IS_MOVED: Final = _IS_BEYOND & (DIGIT_OF_BONE == DIGIT_OF_BONE[_JOINT_BONES, None])
 """Whether each joint moves each bone: its own, and those further out on its digit (J, L)."""
-_LIMIT_TOLERANCE: Final = 1e-9  # [rad] A metacarpal that is this near its limit does not flex further.
+_LIMIT_TOLERANCE: Final = 1e-9  # A metacarpal that is nearer to its limit [rad] does not flex further.
 _MAX_FRAMES: Final = 1 << 22
 _MAX_DRIFT: Final = 0.01  # largest deviation of times from a steady rate, in frames
-_MAX_GAP: Final = 0.1  # [s] that interpolation bridges
-_MAX_GAP_FRAMES: Final = 2.5  # old frames that interpolation bridges, if that is longer
+_MAX_GAP: Final = 0.1  # longest gap that interpolation bridges [s]
+_MAX_GAP_FRAMES: Final = 2.5  # longest gap that interpolation bridges in old frames, if that is longer
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -132,27 +132,21 @@ def build_skeleton(shape: HandShape) -> Skeleton:
     return Skeleton(offsets, rotations, axes, _JOINT_RANGES.copy(), lengths, arch)
 
 
-def bone_transforms(skeleton: Skeleton, qpos: Float[np.ndarray, "T 27"]) -> Float[np.ndarray, "T L 4 4"]:
-    """`T_world_bone` of every bone in every frame."""
-    parts = skeleton.offsets, skeleton.rotations, skeleton.axes, _BONE_CHAIN, skeleton.arch
-    return np.asarray(pose_bones(np.ascontiguousarray(qpos), *parts))
-
-
 def metacarpal_flexions(
     skeleton: Skeleton, T_world_bone: Float[np.ndarray, "T L 4 4"]
 ) -> Float[np.ndarray, "T 5"]:
-    """Flexion of each digit's metacarpal in the palm [rad], by where the digit begins."""
+    """Flexion of each digit's metacarpal in the palm [rad], computed from the position of its first joint."""
     wrist, rest = T_world_bone[:, PALM, :3, :3], (1.0 - CARPUS) * skeleton.offsets[1::3]
-    begins = T_world_bone[:, 1::3, :3, 3] - T_world_bone[:, None, PALM, :3, 3]
-    now = begins @ wrist - CARPUS * skeleton.offsets[1::3]
-    across = rest[:, 2] * now[..., 0] - rest[:, 0] * now[..., 2]
-    return np.asarray(np.arctan2(across, rest[:, 0] * now[..., 0] + rest[:, 2] * now[..., 2]))
+    knuckles = T_world_bone[:, 1::3, :3, 3] - T_world_bone[:, None, PALM, :3, 3]
+    posed = knuckles @ wrist - CARPUS * skeleton.offsets[1::3]
+    sine = rest[:, 2] * posed[..., 0] - rest[:, 0] * posed[..., 2]
+    return np.asarray(np.arctan2(sine, rest[:, 0] * posed[..., 0] + rest[:, 2] * posed[..., 2]))
 
 
 def metacarpal_rotations(
     skeleton: Skeleton, T_world_bone: Float[np.ndarray, "T L 4 4"]
 ) -> Float[np.ndarray, "T 5 3 3"]:
-    """Orientation in the world of each digit's metacarpal, which is the palm's where it does not flex."""
+    """Orientation of each digit's metacarpal in the world: that of the palm, turned by its flexion."""
     wrist = T_world_bone[:, PALM, None, :3, :3]
     if not skeleton.arch.any():
         return np.repeat(wrist, len(DIGITS), axis=1)
@@ -282,8 +276,9 @@ class HandModel:
         Raises:
             ArgumentError: `qpos` is not (T, 27) or not finite.
         """
-        values = check_array("qpos", qpos, (None, NUM_QPOS))
-        return bone_transforms(self.skeleton, values)
+        values, bones = check_array("qpos", qpos, (None, NUM_QPOS)), self.skeleton
+        rest = bones.offsets, bones.rotations, bones.axes, _BONE_CHAIN, bones.arch
+        return np.asarray(pose_bones(np.ascontiguousarray(values), *rest))
 
     def skin(self, qpos: Float[np.ndarray, "T 27"]) -> Float[np.ndarray, "T V 3"]:
         """Skin vertices [m] in the world, by linear blend skinning.
@@ -316,7 +311,7 @@ class HandModel:
 
 
 def load_model(model: HandModel | HandShape | str) -> HandModel:
-    """A model as it is, that of a shape, or a right hand of size XS to XL; else an `ArgumentError`."""
+    """Return a model as it is, make that of a shape, or that of a right hand of size XS to XL."""
     if isinstance(model, HandModel):
         return model
     if isinstance(model, HandShape):
@@ -371,7 +366,7 @@ def joint_axes(
     """Unit axes and anchors [m] of all joints in the world."""
     skeleton = model.skeleton
     parent = T_world_bone[:, _JOINT_PARENTS, :3, :3]
-    parent[:, ::_HINGES] = metacarpal_rotations(skeleton, T_world_bone)
+    parent[:, ::JOINTS_PER_DIGIT] = metacarpal_rotations(skeleton, T_world_bone)
     parent = parent @ skeleton.rotations[_JOINT_BONES]
     own = T_world_bone[:, _JOINT_BONES, :3, :3]
     frames = np.where(_IS_FIRST_JOINT[:, None, None], parent, own)
@@ -389,28 +384,37 @@ def skinned_jacobian(
     frames, count = len(T_world_bone), len(points)
     motion = T_world_bone @ np.linalg.inv(model.rest_transforms)
     homogeneous = np.concatenate([points, np.ones((count, 1))], axis=1)
-    carried = np.einsum("tmkij,mj->tmki", motion[:, bone_indices, :3], homogeneous)  # moved by one bone each
-    placed = np.einsum("mk,tmki->tmi", bone_weights, carried)
+    by_bone = np.einsum("tmkij,mj->tmki", motion[:, bone_indices, :3], homogeneous)  # as each bone moves it
+    placed = np.einsum("mk,tmki->tmi", bone_weights, by_bone)
     jacobian = np.zeros((frames, count, 3, NUM_VELOCITIES))
     jacobian[..., :3] = np.eye(3)
     wrist = T_world_bone[:, 0]
-    turning = np.swapaxes(wrist[:, :3, :3], 1, 2)  # rows are the wrist's own axes in the world
-    arms = placed - wrist[:, None, :3, 3]
-    jacobian[..., 3:6] = np.cross(turning[:, None], arms[:, :, None]).swapaxes(-1, -2)
+    wrist_axes = np.swapaxes(wrist[:, :3, :3], 1, 2)  # as rows, in the world
+    levers = placed - wrist[:, None, :3, 3]
+    jacobian[..., 3:6] = np.cross(wrist_axes[:, None], levers[:, :, None]).swapaxes(-1, -2)
     axes, anchors = joint_axes(model, T_world_bone)
-    # derivative by a joint, over the bones that it moves: axis x (sum of w (p - anchor))
+    # The derivative by a joint is axis x (sum of w (p - anchor)) over the bones that it moves.
     shares = bone_weights * _IS_MOVED[:, bone_indices]  # (J, M, 4)
-    lever = shares.swapaxes(0, 1) @ carried
+    lever = shares.swapaxes(0, 1) @ by_bone
     lever -= shares.sum(-1).T[..., None] * anchors[:, None]
     jacobian[..., 6:] = np.cross(axes[:, None], lever).swapaxes(-1, -2)
-    if model.skeleton.arch.any():  # The flexion of an MCP joint turns its metacarpal, too.
-        flexing, skeleton = slice(1, None, _HINGES), model.skeleton
+    if model.skeleton.arch.any():  # The flexion of an MCP joint also flexes its metacarpal.
+        flexing, skeleton = slice(1, None, JOINTS_PER_DIGIT), model.skeleton
         is_free = np.abs(metacarpal_flexions(skeleton, T_world_bone)) < MOST_METACARPAL - _LIMIT_TOLERANCE
-        bases, shares = CARPUS * skeleton.offsets[1::3] @ turning + wrist[:, None, :3, 3], shares[flexing]
-        lever = shares.swapaxes(0, 1) @ carried - shares.sum(-1).T[..., None] * bases[:, None]
+        bases, shares = CARPUS * skeleton.offsets[1::3] @ wrist_axes + wrist[:, None, :3, 3], shares[flexing]
+        lever = shares.swapaxes(0, 1) @ by_bone - shares.sum(-1).T[..., None] * bases[:, None]
         rates = (skeleton.arch * is_free)[..., None] * wrist[:, None, :3, 1]
         jacobian[..., 6:][..., flexing] += np.cross(rates[:, None], lever).swapaxes(-1, -2)
     return jacobian
+
+
+def _checked_frames(name: str, frames: NDArray[np.float64], shape: tuple[int, ...]) -> NDArray[np.float64]:
+    """`frames` (T, *shape) as finite float64; an `ArgumentError` if there is no frame."""
+    values = check_array(name, frames, (None, *shape))
+    if values.ndim != 1 + len(shape) or len(values) == 0:
+        sizes = ", ".join(map(str, shape))
+        raise ArgumentError(f"a motion needs frames: {name} has shape {values.shape}, expected (T, {sizes})")
+    return values
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -427,11 +431,7 @@ class HandMotion:
     """Frames per second [Hz]."""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "qpos", check_array("qpos", self.qpos, (None, NUM_QPOS)))
-        if self.qpos.ndim != 2 or len(self.qpos) == 0:
-            raise ArgumentError(
-                f"a motion needs frames: qpos has shape {self.qpos.shape}, expected (T, {NUM_QPOS})"
-            )
+        object.__setattr__(self, "qpos", _checked_frames("qpos", self.qpos, (NUM_QPOS,)))
         check_number("the rate [Hz]", self.rate, 0.0, above=True)
 
     @property
@@ -454,11 +454,7 @@ class BodyMotion:
     """Frames per second [Hz]."""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "T_world_body", check_array("T_world_body", self.T_world_body, (None, 4, 4)))
-        if self.T_world_body.ndim != 3 or len(self.T_world_body) == 0:
-            raise ArgumentError(
-                f"a motion needs frames: T_world_body has shape {self.T_world_body.shape}, expected (T, 4, 4)"
-            )
+        object.__setattr__(self, "T_world_body", _checked_frames("T_world_body", self.T_world_body, (4, 4)))
         if not are_rigid(self.T_world_body):
             raise ArgumentError("T_world_body is not rigid transforms, expected rotations and positions")
         check_number("the rate [Hz]", self.rate, 0.0, above=True)
@@ -470,11 +466,11 @@ class BodyMotion:
 
 
 def bridge_gaps(times: Float[np.ndarray, "T"], qpos: Float[np.ndarray, "T 27"], rate: float) -> HandMotion:
-    """A motion with linear interpolation over missing poses (NaN); at least one is present."""
-    there = np.flatnonzero(np.isfinite(qpos[:, 0]))
-    before, share, _ = _neighboring_frames(times[there], times)
-    bridged = _interpolated_rows(qpos[there], before, share)
-    bridged[there] = qpos[there]
+    """A motion in which missing poses (NaN) are interpolated linearly; at least one pose is present."""
+    present = np.flatnonzero(np.isfinite(qpos[:, 0]))
+    before, share, _ = _neighboring_frames(times[present], times)
+    bridged = _interpolated_rows(qpos[present], before, share)
+    bridged[present] = qpos[present]
     return HandMotion(bridged, rate)
 
 
@@ -496,9 +492,9 @@ def times_at(times: Float[np.ndarray, "T"], rate: float) -> Float[np.ndarray, "K
 def between_poses(
     times: Float[np.ndarray, "T"], new: Float[np.ndarray, "K"], poses: Float[np.ndarray, "T H W"], rate: float
 ) -> Float[np.ndarray, "K H W"]:
-    """Poses at new times, interpolated between old ones: position, quaternion (wxyz) and angles, if any.
+    """Interpolate poses (position, quaternion (wxyz), and angles if any) at new times.
 
-    They are NaN beside a missing old pose, and between old frames more than 0.1 s and 2.5 frames apart.
+    Poses are NaN beside a missing old pose, and in gaps longer than 0.1 s and 2.5 frames.
     """
     before, share, step = _neighboring_frames(times, new)
     exact = (share < 1e-6) | (share > 1.0 - 1e-6)
@@ -525,7 +521,7 @@ def _neighboring_frames(
 def _interpolated_rows(
     rows: NDArray[np.float64], before: NDArray[np.intp], share: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Rows interpolated between old frames; NaN where one with weight is NaN."""
+    """Interpolate rows between old frames; NaN where an old row with a weight is NaN."""
     from scipy.spatial.transform import Rotation
 
     quaternions = slice(3, 7)
@@ -536,7 +532,7 @@ def _interpolated_rows(
     there = np.isfinite(between[:, 0])
     starts = Rotation.from_quat(first[there, quaternions], scalar_first=True)
     ends = Rotation.from_quat(second[there, quaternions], scalar_first=True)
-    turns = Rotation.from_rotvec(share[there, None] * (starts.inv() * ends).as_rotvec())
-    between[there, quaternions] = (starts * turns).as_quat(scalar_first=True)
+    rotations = Rotation.from_rotvec(share[there, None] * (starts.inv() * ends).as_rotvec())
+    between[there, quaternions] = (starts * rotations).as_quat(scalar_first=True)
     between[~there] = np.nan
     return between

@@ -48,12 +48,12 @@ from handsim.space.transforms import (
     rigid,
 )
 
-_BETWEEN_SHARE: Final = 0.01  # share of a bone's mass for the link between its two joints
+_BETWEEN_SHARE: Final = 0.01  # share of a bone's mass that the link between its two joints has
 _MAX_TORQUE: Final = 2.0  # [N m], about that of a strong finger's first joint
 _MAX_SPEED: Final = 40.0  # [rad/s], above that of the fastest fingers
 _URDF_COLOR: Final = "0.85 0.65 0.55 1"
-_OSIM_VERSION: Final = "40000"  # document version that OpenSim 4.0 and later read
-_GRAVITY: Final = "0 -9.80665 0"  # OpenSim's world has y up
+_OSIM_VERSION: Final = "40000"  # version of documents that OpenSim 4.0 and later read
+_GRAVITY: Final = "0 -9.80665 0"  # in OpenSim's world, whose y axis points up
 _OSIM_COLOR: Final = "0.85 0.65 0.55"
 _MAX_POSITION: Final = 5.0  # range of the wrist's positions, both ways [m]
 _MAX_ROTATION: Final = 2.0 * np.pi  # range of the wrist's rotations, both ways [rad]
@@ -83,7 +83,7 @@ def hand_urdf(model: HandModel) -> str:
 
 
 def _add_link(root: ET.Element, model: HandModel, bone: int, name: str, share: float) -> None:
-    """A link with a share of its bone's mass; the shapes belong to the bone's own link."""
+    """Add a link with a share of its bone's mass; only the bone's own link has shapes."""
     link = ET.SubElement(root, "link", name=name)
     mass, center, moments = _inertia(model, bone)
     inertial = ET.SubElement(link, "inertial")
@@ -107,7 +107,7 @@ def _inertia(model: HandModel, bone: int) -> tuple[float, Float[np.ndarray, "3"]
 
 
 def _add_capsule(link: ET.Element, kind: str, capsules: Capsules, index: int) -> None:
-    """A cylinder and two spheres, since URDF has no capsule."""
+    """Add a capsule as a cylinder and two spheres, because URDF has no capsules."""
     start, end, radius = capsules.starts[index], capsules.ends[index], capsules.radii[index]
     length = np.linalg.norm(end - start)
     along = (end - start) / length
@@ -129,15 +129,15 @@ def _add_capsule(link: ET.Element, kind: str, capsules: Capsules, index: int) ->
 def _add_joint(
     root: ET.Element, model: HandModel, joint: int, parent: str, child: str, *, at_rest: bool
 ) -> None:
-    """A hinge; a bone's first hinge has the bone's pose at rest, its second one is in the same place."""
+    """Add a hinge: a bone's first one has the bone's pose at rest, and its second one the same origin."""
     skeleton, bone = model.skeleton, JOINTS[joint].bone
-    place, turn = np.zeros(3), np.zeros(3)
+    position, angles = np.zeros(3), np.zeros(3)
     if at_rest:
-        place, turn = skeleton.offsets[bone], euler_angles(skeleton.rotations[bone][None])[0, ::-1]
+        position, angles = skeleton.offsets[bone], euler_angles(skeleton.rotations[bone][None])[0, ::-1]
     element = ET.SubElement(root, "joint", name=JOINTS[joint].name, type="revolute")
     ET.SubElement(element, "parent", link=parent)
     ET.SubElement(element, "child", link=child)
-    ET.SubElement(element, "origin", xyz=vector_text(place), rpy=vector_text(turn))
+    ET.SubElement(element, "origin", xyz=vector_text(position), rpy=vector_text(angles))
     ET.SubElement(element, "axis", xyz=vector_text(skeleton.axes[joint]))
     low, high = skeleton.ranges[joint]
     limits = {"lower": low, "upper": high, "effort": _MAX_TORQUE, "velocity": _MAX_SPEED}
@@ -179,15 +179,15 @@ def forearm_names(side: Side) -> tuple[str, ...]:
 
 def forearm_values(side: Side, T_wrist_forearm: Float[np.ndarray, "T 4 4"]) -> NDArray[np.float64]:
     """Coordinates (T, 6) of a forearm's poses in OpenSim's model [rad, m]."""
-    turns = wrist_cardan(side, np.swapaxes(T_wrist_forearm[:, :3, :3], 1, 2))
-    return np.concatenate([turns, T_wrist_forearm[:, :3, 3]], axis=1)
+    angles = wrist_cardan(side, np.swapaxes(T_wrist_forearm[:, :3, :3], 1, 2))
+    return np.concatenate([angles, T_wrist_forearm[:, :3, 3]], axis=1)
 
 
 def coordinate_values(qpos: Float[np.ndarray, "T 27"], up: UpAxis) -> NDArray[np.float64]:
     """Coordinates (T, 26) of a hand's poses in OpenSim's model [m, rad]; angles never jump by a full turn."""
-    turn = file_axes(up)
-    turns = np.unwrap(body_fixed_angles(turn @ quaternion_matrix(qpos[:, 3:7])), axis=0)
-    return np.concatenate([qpos[:, :3] @ turn.T, turns, qpos[:, 7:]], axis=1)
+    axes = file_axes(up)
+    angles = np.unwrap(body_fixed_angles(axes @ quaternion_matrix(qpos[:, 3:7])), axis=0)
+    return np.concatenate([qpos[:, :3] @ axes.T, angles, qpos[:, 7:]], axis=1)
 
 
 def hand_osim(
@@ -241,7 +241,7 @@ def hand_osim(
 
 
 def _add_body(bodies: ET.Element, model: HandModel, bone: int) -> None:
-    """A bone with its mass and its capsules."""
+    """Add a bone with its mass and its capsules."""
     name = f"{model.shape.side}_{BONE_NAMES[bone]}"
     body = ET.SubElement(bodies, "Body", name=name)
     mass, center, moments = _inertia(model, bone)
@@ -254,7 +254,7 @@ def _add_body(bodies: ET.Element, model: HandModel, bone: int) -> None:
 
 
 def _add_osim_capsule(shapes: ET.Element, name: str, capsules: Capsules, index: int) -> None:
-    """A cylinder and two spheres, since OpenSim draws no capsule."""
+    """Add a capsule as a cylinder and two spheres, because OpenSim draws no capsules."""
     from scipy.spatial.transform import Rotation
 
     start, end, radius = capsules.starts[index], capsules.ends[index], capsules.radii[index]
@@ -357,7 +357,7 @@ def _add_forearm(
     _add_text(body, "mass_center", vector_text(0.5 * (start + end)))
     _add_text(body, "inertia", vector_text(mass * np.array([0.5 * radius**2, across, across, 0.0, 0.0, 0.0])))
     joint = _add_osim_joint(joints, name, f"/bodyset/{side}_{BONE_NAMES[PALM]}", name, np.eye(4))
-    # The palm's angles in the forearm, backwards; a left hand turns the other way about x and z.
+    # The order of the palm's angles is reversed; a left hand turns the other way about x and z.
     axes = np.diag([1.0, -1.0, -1.0] if side == "right" else [-1.0, -1.0, 1.0])[[0, 2, 1]]
     names, values = forearm_names(side), forearm_values(side, forearm.T_wrist_forearm[None])[0]
     coordinates = [*zip(names[2::-1], axes, strict=True), *zip(names[3:], np.eye(3), strict=True)]

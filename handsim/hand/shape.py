@@ -1,8 +1,9 @@
 """A hand: its bones and joints, its measures [m], five named sizes, and a population to sample from.
 
-Sixteen bones and twenty joints, four per digit, are with the free joint of the wrist the 26 degree-of-freedom
-hand of Han et al. 2018, section 4.1. Axes are given for the right hand in the frame of the joint's bone: x
-along the bone, y towards the thumb side, z out of the back (nail) side. Zero angles are the flat hand.
+With the free joint of the wrist, sixteen bones and twenty joints (four per digit) make the hand of Han et al.
+2018, section 4.1, which has 26 degrees of freedom. Axes are those of the right hand in the frame of the
+joint's bone: x along the bone, y towards the thumb side, z out of the back (nail) side. At zero angles the
+hand is flat.
 
 Sources, in docs/poses.md with their tables: bone lengths from Buryanov and Kotiuk 2010 (Int. J. Morphol.
 28:755), hand length and breadth from ANSUR II (2012), finger girths from Greiner 1991 (NATICK/TR-92/011).
@@ -31,9 +32,9 @@ _ABDUCTION_AXIS: Final = (0.0, 0.0, 1.0)
 _FLEXION_AXIS: Final = (0.0, 1.0, 0.0)
 """Positive flexion moves a digit towards the palm."""
 PALM: Final = 0
-# Ranges [deg]: active ranges of the AAOS and e-hand tables, MCP extension and PIP flexion as in the wider of
-# the published sets (docs/angles.md lists them side by side). The thumb's first two count from its rest.
-_JOINT_RANGES: Final = {
+# Active ranges of the AAOS and e-hand tables, with MCP extension and PIP flexion of the wider published set
+# (docs/angles.md lists the sets side by side). The thumb's first two angles count from its rest.
+_RANGES_DEG: Final = {
     "thumb": ((-33.0, 35.0), (-42.0, 45.0), (-15.0, 65.0), (-20.0, 85.0)),
     "index": ((-22.0, 22.0), (-25.0, 95.0), (-8.0, 112.0), (-12.0, 85.0)),
     "middle": ((-16.0, 16.0), (-25.0, 95.0), (-8.0, 112.0), (-12.0, 85.0)),
@@ -44,27 +45,28 @@ _JOINT_SUFFIXES: Final = {
     "thumb": ("metacarpal_abduction", "metacarpal_flexion", "MCP_flexion", "IP_flexion"),
     "finger": ("MCP_abduction", "MCP_flexion", "PIP_flexion", "DIP_flexion"),
 }
+_BONE_PARTS: Final = (("metacarpal", "proximal", "distal"), *[("proximal", "middle", "distal")] * 4)
 NUM_KEYPOINTS: Final = 1 + 4 * len(DIGITS)
 """Number of keypoints: the wrist, and three joints and the tip of each digit."""
 # A man of hand length 193.9 mm (Buryanov's middle ray on a 37 mm carpus) and breadth 88.3 mm (ANSUR II mean).
 REFERENCE_LENGTH: Final = 0.1939
 REFERENCE_BREADTH: Final = 0.0883
-# Moving bones [mm]: proximal, middle, distal with its soft tip; for the thumb metacarpal, proximal, distal.
-_BONE_LENGTHS: Final = np.array(
+# Moving bones: proximal, middle, distal with its soft tip; of the thumb metacarpal, proximal, distal.
+_BONE_LENGTHS_MM: Final = np.array(
     [[46.2, 31.6, 27.3], [39.8, 22.4, 19.7], [44.6, 26.3, 21.4], [41.4, 25.7, 21.3], [32.7, 18.1, 19.7]]
 )
-# Where each digit begins [mm], in the wrist frame: thumb CMC joint, then the four MCP joints. x follows the
+# First joint of each digit in the wrist frame: thumb CMC joint, then the four MCP joints. x follows the
 # metacarpal and carpus lengths, y spreads over the breadth, z is the transverse arch.
-_KNUCKLES: Final = np.array(
+_KNUCKLES_MM: Final = np.array(
     [[26.0, 25.5, -17.5], [97.5, 27.0, -2.0], [98.0, 5.0, 2.0], [90.5, -15.5, 0.0], [80.5, -35.0, -8.0]]
 )
-# Direction of each digit at zero angles [deg]: yaw about z, pitch towards the palm, roll about its length.
-# The rolls make flexed fingers converge on the scaphoid; the thumb's nail faces sideways.
-_BASE_ANGLES: Final = np.array(
+# Direction of each digit at zero angles: yaw about z, pitch towards the palm, roll about its length. With
+# these rolls, flexed fingers converge on the scaphoid, and the thumb's nail faces sideways.
+_BASE_ANGLES_DEG: Final = np.array(
     [[30.0, 32.0, -87.0], [-1.0, -8.0, -10.0], [-5.0, -2.0, -3.0], [-10.0, -2.0, 4.0], [-18.0, -2.0, 12.0]]
 )
-# Skin radius [mm] at a digit's base, second and third joint and behind the tip: Greiner's girths over 2 pi.
-_RADII: Final = np.array(
+# Skin radius at a digit's base, second and third joint and behind the tip: Greiner's girths over 2 pi.
+_RADII_MM: Final = np.array(
     [
         [14.5, 11.8, 11.5, 8.6],
         [12.6, 10.9, 9.1, 7.4],
@@ -73,26 +75,28 @@ _RADII: Final = np.array(
         [11.0, 9.2, 7.9, 6.5],
     ]
 )
-_PALM_THICKNESS: Final = 28.0  # [mm] at the metacarpals, without the thenar
-# ANSUR II [mm]: mean and SD of length and breadth, and their correlation, for women and men.
-_LENGTH_BREADTH: Final = {
+_PALM_THICKNESS_MM: Final = 28.0  # at the metacarpals, without the thenar
+# ANSUR II: mean and SD of length and breadth, and their correlation, for women and men.
+_MEASURES_MM: Final = {
     "female": ((181.1, 10.1), (78.2, 3.8), 0.57),
     "male": ((193.3, 9.9), (88.3, 4.4), 0.58),
 }
-# ANSUR II percentiles: women's p5 and p50, the even mixture's p50, men's p50 and p95 [mm].
-SIZES: Final[dict[str, tuple[float, float]]] = {
+# ANSUR II percentiles: women's p5 and p50, the even mixture's p50, men's p50 and p95.
+_SIZES_MM: Final = {
     "XS": (165.0, 72.0),
     "S": (180.0, 78.0),
     "M": (187.0, 83.0),
     "L": (193.0, 88.0),
     "XL": (210.0, 96.0),
 }
+SIZES: Final = {size: (1e-3 * length, 1e-3 * breadth) for size, (length, breadth) in _SIZES_MM.items()}
+"""Length and breadth of the named sizes [m]."""
 ADULT_LENGTH: Final = (0.187, 0.012)
 """Mean and standard deviation of the length of adults' hands, ANSUR II [m]."""
 FIRMNESS: Final = 0.8
 """Radius of the capsule that stands for a bone's flesh in collisions, over the skin's radius."""
 _MAX_DIGIT_OVERLAP: Final = 0.00079  # largest overlap at knuckles and across phalanges in every pose [m]
-_MAX_ARCH: Final = 4.0  # A metacarpal flexes less than four times as far as its finger.
+_MAX_ARCH: Final = 4.0  # largest ratio of a metacarpal's flexion to that of its MCP joint
 _MIN_LENGTH, _MAX_LENGTH = 1e-4, 1.0  # bounds of every length in a hand [m], far beyond those of people
 HAND_DTYPE: Final = np.dtype(
     [
@@ -117,16 +121,15 @@ class Bone(NamedTuple):
 
 
 class Joint(NamedTuple):
-    """A hinge joint: its name, the index in `BONES` of the bone it moves, its axis, its range [deg]."""
+    """A hinge joint: its name, the index in `BONES` of the bone that it moves, its axis, and its range."""
 
     name: str
     bone: int
     axis: tuple[float, float, float]
-    low: float
-    high: float
+    low_deg: float
+    high_deg: float
 
 
-_BONE_PARTS: Final = (("metacarpal", "proximal", "distal"), *[("proximal", "middle", "distal")] * 4)
 BONES: Final[tuple[Bone, ...]] = (
     Bone("palm", -1, -1),
     *(
@@ -146,13 +149,14 @@ JOINTS: Final[tuple[Joint, ...]] = tuple(
         f"{digit}_{suffix}",
         1 + 3 * number + max(0, index - 1),
         _ABDUCTION_AXIS if index == 0 else _FLEXION_AXIS,
-        *_JOINT_RANGES[digit][index],
+        *_RANGES_DEG[digit][index],
     )
     for number, digit in enumerate(DIGITS)
     for index, suffix in enumerate(_JOINT_SUFFIXES["thumb" if number == 0 else "finger"])
 )
 JOINT_NAMES: Final[tuple[str, ...]] = tuple(joint.name for joint in JOINTS)
 NUM_JOINTS: Final = len(JOINTS)
+JOINTS_PER_DIGIT: Final = NUM_JOINTS // len(DIGITS)
 NUM_QPOS: Final = 7 + NUM_JOINTS
 
 
@@ -213,7 +217,7 @@ class HandShape:
 
 
 def _check_measure(name: str, values: float | NDArray[np.float64], low: float, high: float) -> None:
-    """Refuse measures [m] beyond those of any hand, from which no model can be built."""
+    """Refuse measures [m] beyond those of any hand, because no model can be built from them."""
     measures = np.asarray(values)
     wrong = measures[~((measures >= low) & (measures <= high))]  # also NaN
     if len(wrong):
@@ -227,11 +231,11 @@ def shape_from_measures(length: float, breadth: float, *, side: Side = "right") 
         side=side,
         length=length,
         breadth=breadth,
-        bone_lengths=_BONE_LENGTHS * along,
-        knuckles=_KNUCKLES * np.array([along, across, across]),
-        base_angles=np.deg2rad(_BASE_ANGLES),
-        radii=_RADII * across,
-        palm_thickness=_PALM_THICKNESS * across,
+        bone_lengths=_BONE_LENGTHS_MM * along,
+        knuckles=_KNUCKLES_MM * np.array([along, across, across]),
+        base_angles=np.deg2rad(_BASE_ANGLES_DEG),
+        radii=_RADII_MM * across,
+        palm_thickness=_PALM_THICKNESS_MM * across,
     )
 
 
@@ -239,8 +243,7 @@ def named_shape(size: str, *, side: Side = "right") -> HandShape:
     """One of the five sizes XS, S, M, L, XL."""
     check_type("size", size, str, "the name of one", SIZES)
     check_choice(size, SIZES, noun="size")
-    length, breadth = SIZES[size]
-    return shape_from_measures(length * 1e-3, breadth * 1e-3, side=side)
+    return shape_from_measures(*SIZES[size], side=side)
 
 
 @dataclass(frozen=True, slots=True)
@@ -285,7 +288,7 @@ def sample_shape(
     check_type("population", population, Population, "a Population")
     check_rng(rng)
     sex = "female" if rng.random() < 0.5 else "male"
-    (length_mean, length_sd), (breadth_mean, breadth_sd), correlation = _LENGTH_BREADTH[sex]
+    (length_mean, length_sd), (breadth_mean, breadth_sd), correlation = _MEASURES_MM[sex]
     first, second = np.clip(rng.standard_normal(2), -2.5, 2.5)
     length = length_mean + length_sd * first
     breadth = breadth_mean + breadth_sd * (correlation * first + np.sqrt(1 - correlation**2) * second)
@@ -315,7 +318,7 @@ def sample_shape(
 def _slim_digits(
     knuckles: Float[np.ndarray, "5 3"], lengths: Float[np.ndarray, "5 3"], radii: Float[np.ndarray, "5 4"]
 ) -> None:
-    """Slim digits that would overlap whatever their pose [m]: at knuckles, and across a short phalanx."""
+    """Reduce radii of digits that overlap in every pose [m]: at knuckles, and across a short phalanx."""
     for finger in range(2, len(DIGITS)):
         pair = slice(finger - 1, finger + 1)
         room = np.linalg.norm(knuckles[finger] - knuckles[finger - 1]) + _MAX_DIGIT_OVERLAP

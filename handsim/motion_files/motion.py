@@ -68,8 +68,8 @@ NUMBERS: Final[tuple[str, ...]] = (
     *(f"{keypoint}_{axis}_m" for keypoint in KEYPOINT_NAMES[1:] for axis in "xyz"),
 )
 """Columns after `frame`, `time_s` and `hand`, with positions in the world."""
-_FORMER_NAMES: Final = {f"thumb_CMC_{n}_rad": f"thumb_metacarpal_{n}_rad" for n in ("abduction", "flexion")}
-"""Columns of earlier versions: markers on skin do not measure the carpometacarpal joint."""
+_OLD_NAMES: Final = {f"thumb_CMC_{n}_rad": f"thumb_metacarpal_{n}_rad" for n in ("abduction", "flexion")}
+"""Names of columns in earlier versions, and their names now."""
 _BVH_ROOT: Final = "world_cm"
 _CENTIMETERS: Final = 100.0
 _ROTATIONS: Final = "Zrotation Yrotation Xrotation"
@@ -139,7 +139,7 @@ class PosedHand(NamedTuple):
     def by_frame(
         self, compute: Callable[[HandModel, Float[np.ndarray, "K 27"]], NDArray[np.float64]]
     ) -> NDArray[np.float64]:
-        """What a function computes of a model and poses (K, ...), for all frames by the models of each."""
+        """Results (T, ...) of a function of a model and its poses, over all frames and their models."""
         first, parts = 0, []
         for stop, model in (*self.former, (len(self.qpos), self.model)):
             if stop > first:
@@ -184,10 +184,10 @@ class PosedBody(NamedTuple):
         return cls(name, shape, present, pose_matrices(_filled_rows(poses, present)))
 
     def as_forearm(self, hand: PosedHand, markers: Mapping[str, Float[np.ndarray, "3"]]) -> PosedBody:
-        """The forearm of a hand: the outline of its skin at the wrist, drawn out to the farthest marker."""
+        """The forearm of a hand: the outline of its skin at the wrist, extruded to the farthest marker."""
         import trimesh
 
-        # Landmarks may be the ends of a bar above the wrist, so the skin begins where the hand mostly is.
+        # The body's origin may be above the wrist, so the skin begins at the median position of the hand.
         away = hand.qpos[:, :3] - self.T_world_body[:, :3, 3]
         wrist = np.median(np.einsum("ti,tij->tj", away, self.T_world_body[:, :3, :3]), axis=0)
         loop = hand.model.surface.vertices[load_cage().wrist_loop] + wrist
@@ -242,12 +242,12 @@ def _offsets(model: HandModel, qpos: Float[np.ndarray, "T 27"]) -> Float[np.ndar
 
 
 def changes(present: Bool[np.ndarray, "T"]) -> Int[np.ndarray, "K"]:
-    """The first frame, and every frame in which `present` changes."""
+    """The numbers of the first frame and of each frame in which `present` changes."""
     return np.flatnonzero(np.diff(present, prepend=not present[0]))
 
 
 def _filled_rows(values: NDArray[np.float64], present: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Rows, with each missing row replaced by the last present one, or else by the first."""
+    """Replace each missing row by the last present one before it, or by the first present one."""
     last = np.maximum.accumulate(np.where(present, np.arange(len(present)), -1))
     return values[np.where(last < 0, np.argmax(present), last)]
 
@@ -271,7 +271,7 @@ def smooth_quaternions(rotations: Float[np.ndarray, "T *batch 3 3"]) -> Float[np
 def corner_normals(
     vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]
 ) -> Float[np.ndarray, "F 3 3"]:
-    """Outward unit normal at each corner of a face, over adjacent faces within 40 degrees of it."""
+    """Outward unit normal at each corner of a face: the mean of adjacent faces within 40 degrees."""
     from scipy import sparse  # takes a quarter of a second, which help does not need
 
     first, second, third = (vertices[faces[:, corner]] for corner in range(3))
@@ -290,7 +290,7 @@ def corner_normals(
 def split_vertices(
     faces: Int[np.ndarray, "F 3"], normals: Float[np.ndarray, "F 3 3"]
 ) -> tuple[Int[np.ndarray, "W"], Float[np.ndarray, "W 3"], Int[np.ndarray, "F 3"]]:
-    """Vertices with one normal each, from triangles with one at each corner: old indices, normals, faces."""
+    """Split vertices so that each has one normal; returns old indices, normals and new faces."""
     keys = np.column_stack([faces.ravel(), np.round(normals.reshape(-1, 3), 4)])
     _, index, inverse = np.unique(keys, axis=0, return_index=True, return_inverse=True)
     return faces.ravel()[index], normals.reshape(-1, 3)[index], inverse.reshape(-1, 3)
@@ -319,7 +319,7 @@ def read_joint_csv(path: Path) -> JointTable:
     text = read_bytes(path, error=CaptureError).decode("utf-8-sig", "replace")
     lines = csv.reader(text.splitlines())
     try:
-        titles = [_FORMER_NAMES.get(title.strip(), title.strip()) for title in next(lines, [])]
+        titles = [_OLD_NAMES.get(title.strip(), title.strip()) for title in next(lines, [])]
         wanted = [*_KEY_NAMES, *_QPOS_NAMES]
         missing = [name for name in wanted if name not in titles]
         if missing:
@@ -378,14 +378,14 @@ def write_joint_csv(path: Path, motion: Motion, up: UpAxis = "z") -> None:
 
 
 def _titles(motion: Motion) -> tuple[str, ...]:
-    """The columns `NUMBERS`, and the angles of the ISB, whose names say if a neutral pose is zero."""
+    """The columns `NUMBERS`, and ISB angles, whose names state whether a neutral pose is their zero."""
     isb = "isb" if motion.hands[0].neutral is None else "isb_neutral"
     names = ISB_NAMES if all(hand.wrist is None for hand in motion.hands) else (*ISB_NAMES, *WRIST_NAMES)
     return *NUMBERS, *(f"{name}_{isb}_rad" for name in names)
 
 
 def _numbers(hand: PosedHand, count: int) -> Float[np.ndarray, "T K"]:
-    """The `count` columns of `_titles`; NaN in frames without a pose, and of joints that nothing shows."""
+    """The `count` columns of `_titles`; NaN without a pose, and for joints that no marker shows."""
     qpos = hand.qpos
     keypoints = hand.keypoints()[:, 1:].reshape(len(qpos), -1)
     isb = hand.by_frame(lambda model, poses: isb_angles(model.shape, poses[:, 7:], hand.neutral))
@@ -474,22 +474,22 @@ def _euler_degrees(rotations: Float[np.ndarray, "T 3 3"]) -> NDArray[np.float64]
 
 
 def _bone_order(bone: int) -> Iterator[int]:
-    """Bones in the order of the file, each before its children."""
+    """Yield a bone and those below it, each before its children, as in the file."""
     yield bone
     for child in CHILDREN[bone]:
         yield from _bone_order(child)
 
 
-def _bone_lines(model: HandModel, side: str, bone: int, lay: Float[np.ndarray, "3 3"]) -> list[str]:
-    """A bone and its children; `lay` maps the wrist's frame [m] to the file's [cm]."""
+def _bone_lines(model: HandModel, side: str, bone: int, axes: Float[np.ndarray, "3 3"]) -> list[str]:
+    """The lines of a bone and its children; `axes` maps the wrist's frame [m] to the file's [cm]."""
     rest = model.rest_transforms
     offset = np.zeros(3) if bone == PALM else rest[bone, :3, 3] - rest[BONES[bone].parent, :3, 3]
-    joint = _joint_lines(lay @ offset, moves=bool(are_moved(model)[bone]))
+    joint = _joint_lines(axes @ offset, moves=bool(are_moved(model)[bone]))
     lines = [f"JOINT {side}_{BONE_NAMES[bone]}", "{", *_indented(joint)]
     for child in CHILDREN[bone]:
-        lines += _indented(_bone_lines(model, side, child, lay))
+        lines += _indented(_bone_lines(model, side, child, axes))
     if not CHILDREN[bone]:
-        lines += _indented(_end_lines(lay @ (model.skeleton.lengths[bone] * rest[bone, :3, 0])))
+        lines += _indented(_end_lines(axes @ (model.skeleton.lengths[bone] * rest[bone, :3, 0])))
     return [*lines, "}"]
 
 
@@ -548,10 +548,10 @@ def _palm_joints(model: HandModel) -> Float[np.ndarray, "6 4 4"]:
     bases = CARPUS * knuckles
     middle = 1  # among the four fingers
     starts = [0.5 * (bases[middle] + knuckles[middle]), np.zeros(3), *bases]
-    ways = [knuckles[middle] - bases[middle], bases[middle], *(knuckles - bases)]
+    directions = [knuckles[middle] - bases[middle], bases[middle], *(knuckles - bases)]
     joints = []
-    for start, way in zip(starts, ways, strict=True):
-        along = way / np.linalg.norm(way)
+    for start, direction in zip(starts, directions, strict=True):
+        along = direction / np.linalg.norm(direction)
         back = np.array([0.0, 0.0, 1.0]) - along[2] * along
         back /= np.linalg.norm(back)
         joints.append(rigid(np.stack([along, np.cross(back, along), back], axis=1) @ _OPENXR_AXES, start))

@@ -1,16 +1,16 @@
-"""Hands and things with their skins in motion, as glTF 2.0 (.glb) and as OpenUSD (.usda text, .usdc binary).
+"""Writers of moving hands and things with skins: glTF 2.0 (.glb) and OpenUSD (.usda text, .usdc binary).
 
-glTF has y up, in meters. At the top stand a node for each hand, `right_skeleton`, with its palm and the other
-bones below it, named `right_palm`, `right_index_proximal` ..., its skin `right_hand`, and the things. The
-node over the palm lets programs see two skeletons in two hands: Blender puts bones with nothing above them
-into one. Each bone has a key per frame. What has no pose in some frames has the scale 0 there, which every
-reader shows as nothing; its other keys stay as they were. The file is a JSON chunk and a chunk of arrays.
+glTF has y up, in meters. The top level has a node for each hand, `right_skeleton`, its skin `right_hand`, and
+the things. Below `right_skeleton` are the bones `right_palm`, `right_index_proximal` and so on; without this
+node, Blender would merge the bones of two hands into one skeleton. Each bone has a key per frame. A hand or
+thing without a pose in some frames has scale 0 there, so that nothing is shown; its other keys keep their
+values. The file is a JSON chunk and a chunk of arrays.
 
 OpenUSD is written with UsdSkel by the package usd-core. `/hands/right` is a SkelRoot with its skin
 `right_hand`, `right_skeleton` and `right_motion`; `/hands/things/pen` an Xform with its mesh; each has its
-material. Names have the side in them, since programs show the last part of a path alone. Lengths are meters,
-the up axis is the take's, a time code is a frame at the take's rate. What has no pose in some frames is
-invisible there.
+material. Names contain the side, because programs show only the last part of a path. Lengths are meters, the
+up axis is the take's, and a time code is a frame at the take's rate. A hand or thing without a pose in some
+frames is invisible there.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ class _Scene:
             self._add_thing(thing)
 
     def pack(self) -> bytes:
-        """The content of the file; an `ArgumentError` if it is larger than a .glb can be."""
+        """The content of the file; an `ArgumentError` if it exceeds the size of a .glb."""
         document: dict[str, Any] = {
             "asset": {"version": "2.0", "generator": f"handsim {full_version()}"},
             "scene": 0,
@@ -145,7 +145,7 @@ class _Scene:
             }
         )
         self._meshes.append(self._skin_mesh(hand.model, f"{hand.side}_hand"))
-        # At the top, as the bones: readers ignore the transform of a skinned mesh, and warn where it has one.
+        # The mesh is at the top level, because readers ignore, and warn of, transforms of skinned meshes.
         self._top += [root, len(self._nodes)]
         self._nodes.append(
             {"name": f"{hand.side}_hand", "mesh": len(self._meshes) - 1, "skin": len(self._skins) - 1}

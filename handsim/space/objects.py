@@ -1,7 +1,7 @@
-"""Rigid objects that a hand holds: the surface that cameras see, the parts that fingers touch, the markers.
+"""Rigid objects that a hand holds: their surfaces for cameras, convex parts for fingers, and markers.
 
-Five objects come with handsim, in `data/objects.npz`, which `benchmarks/rigid_objects.py` makes of simple
-solids; any closed mesh can be loaded.
+`data/objects.npz` has the five objects that come with handsim; `benchmarks/rigid_objects.py` builds them from
+simple solids. Any closed mesh can be loaded.
 """
 
 from __future__ import annotations
@@ -24,11 +24,10 @@ PartKind = Literal["sphere", "capsule", "cylinder", "box", "ellipsoid", "mesh"]
 _SHIPPED_OBJECTS: Final = ("pen", "controller", "ball", "box", "mug")
 _OBJECTS_FILE: Final = Path(__file__).parents[1] / "data" / "objects.npz"
 MARKER_RADIUS: Final = 0.0032
-"""Radius of the spheres of Han et al. 2018 (section 3) [m]: of strays, and of an object's own markers; their
-centers lie this far above the surface."""
+"""Radius of the spheres of Han et al. 2018 (section 3) [m], for strays and for markers of objects. Centers of
+the latter lie this far above the surface."""
 MESH_SUFFIXES: Final = (".stl", ".obj", ".ply", ".glb")
-_MAX_SIZE: Final = 1.0  # [m]
-_MIN_SIZE: Final = 0.002
+_MIN_SIZE, _MAX_SIZE = 0.002, 1.0  # bounds of the longest side of a mesh [m]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -103,10 +102,10 @@ def named_object(name: str) -> RigidObject:
 
 
 def load_object(path: str | Path, *, mass: float = 0.1) -> RigidObject:
-    """An object of your own, from a mesh file in meters.
+    """Load an object from a mesh file in meters.
 
     Cameras see the mesh as it is; fingers touch its convex hull, so they cannot reach into hollows. The
-    object carries no markers. A file with several meshes makes one object.
+    object has no markers. A file with several meshes makes one object.
     """
     path = Path(path)
     mesh = _read_mesh(path)
@@ -144,7 +143,7 @@ def _read_mesh(path: Path) -> Any:
 
 
 def _convex_hull(mesh: Any, path: Path) -> Part:
-    """Join a mesh's seams, make its faces look outwards, and return its convex hull; refuse an open mesh."""
+    """Merge a mesh's seams, orient its faces outwards, and return its convex hull; refuse an open mesh."""
     try:
         mesh.merge_vertices(merge_tex=True, merge_norm=True)  # a closed surface may come with seams
         closed = bool(mesh.is_watertight)

@@ -1,8 +1,8 @@
-"""Cameras as OpenCV calibrates them: a YAML or JSON file of one camera, a stereo pair, or many.
+"""Reader of OpenCV's calibrations: a YAML or JSON file of one camera, a stereo pair, or several cameras.
 
-ROS' CameraInfo is such a file, and so is the TOML of Pose2Sim and anipose with a table for each camera.
-YAML is read by PyYAML's own parser: OpenCV's may never return from a damaged file, and PyYAML's fast one ends
-the process where lists are nested deeply.
+It also reads ROS' CameraInfo, and the TOML of Pose2Sim and anipose with a table for each camera. YAML is
+parsed by PyYAML's Python parser, because OpenCV's may hang on a damaged file, and PyYAML's C parser crashes
+on deeply nested lists.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from handsim.space.transforms import quaternion_matrix, rigid, vector_quaternion
 _MAX_NUMBERS: Final = 16  # Longer lists of numbers, such as corners of a board, are ignored.
 _PIXEL_CENTER: Final = 0.5
 """Center of the first pixel [px], from which OpenCV counts; ours count from the picture's corner."""
-_MIN_FOCAL: Final = 0.02  # of the width; in shares of the picture's size a focal length is about 1
-_MAX_TURN: Final = 6.4  # longest rotation vector [rad]; longer ones are angles in degrees
+_MIN_FOCAL: Final = 0.02  # least focal length in pictures' widths; a smaller one is not in pixels
+_MAX_TURN: Final = 6.4  # longest rotation vector [rad]; longer ones are in degrees
 _MAX_BASELINE: Final = 5.0  # largest distance of the cameras of a pair [m]
 _LONG_LIST: Final = re.compile(r"\[[^\[\]]{2000,}\]")
 """A list of numbers that is too long for a camera, and takes long to parse."""
-_YAML_VERSION: Final = re.compile(r"^%YAML.*$", re.M)  # OpenCV writes it as no other program reads it
+_YAML_VERSION: Final = re.compile(r"^%YAML.*$", re.M)  # OpenCV writes it in a form that parsers refuse
 _K_KEYS: Final = ("camera_matrix", "cameraMatrix", "K", "mtx", "M")
 _D_KEYS: Final = ("distortion_coefficients", "dist_coeffs", "distCoef", "D", "dist", "distortions")
 _WIDTH_KEYS: Final = ("image_width", "img_width", "width")
@@ -45,7 +45,7 @@ _MODEL_KEY: Final = re.compile(
 )
 """Keys of the name of a lens, without signs and capital letters."""
 _LOOSE_MODEL_KEY: Final = re.compile(r"model|modelname|cameratype|lens|type")
-"""Keys of the name of a lens, or of the camera's maker."""
+"""Keys of the name of a lens or of the maker of a camera."""
 _BOOLEANS: Final = {"true": True, "yes": True, "on": True, "false": False, "no": False, "off": False}
 _EMPTY_TEXTS: Final = ("[]", "", "~", "null", "None")
 _LENS_KINDS: Final[dict[str, LensKind]] = {
@@ -74,19 +74,19 @@ _VALID_POSES: Final = (
 _VALID_LENSES: Final = "distortion_coefficients, dist_coeffs or D, or k1, k2, p1, p2, k3"
 _PICTURE_KEYS: Final = (*_K_KEYS, *_D_KEYS, *_WIDTH_KEYS, *_HEIGHT_KEYS, *_SIZE_KEYS, *_BROWN_KEYS)
 _KNOWN_KEYS: Final = (*_PICTURE_KEYS, *_R_KEYS, *_T_KEYS, _POSE_KEY, TOML_MATRIX)
-"""Keys with a meaning; single letters count as they are written, other names in any spelling."""
+"""Keys with a meaning; single letters are case-sensitive, other names match in any spelling."""
 _HARMLESS_KEY: Final = re.compile(
     "error|std|deviation|covariance|count|points|rectif|projection|new|optimal|essential|fundamental|homography"
     "|^[pqefh]$"
 )
-"""Keys, without signs and capital letters, of what is neither a pose nor a lens."""
+"""Keys, without signs and capital letters, that mean neither a pose nor a lens."""
 _BOARD_KEYS: Final = ("rvecs", "tvecs", "extrinsic_parameters")
-"""Keys of the poses of OpenCV's board, one for each of its pictures."""
+"""Keys of the poses of OpenCV's calibration board, one for each picture."""
 _MAYBE_POSE: Final = re.compile(
     "extr|pose|rot|transl|transf|[rt]vec|^rt$|world|[cw]2[cw]|position|location|orient|quat|euler"
     "|^t(cw|wc)$|^(yaw|pitch|roll)$"
 )
-"""Keys, without signs and capital letters, that may mean a pose; so may any of 9, 12 or 16 numbers."""
+"""Keys, without signs and capital letters, that may mean a pose; so may any key with 9, 12 or 16 numbers."""
 _POSE_COUNTS: Final = (9, 12, 16)
 _SHOWN_KEYS: Final = 8  # keys that a sentence names
 _MAYBE_LENS: Final = re.compile("distor|radial|tangential|coef|fisheye|^kc?[1-6]?$")
@@ -110,7 +110,7 @@ _KEY_PATTERN: Final = r"(?:^|[{{,])[ \t\n]{{0,99}}[\"']?{}[\"']?[ \t]*:"
 _MAX_CAMERAS: Final = 256
 _MAX_BYTES: Final = 1 << 22
 _MAX_DEPTH: Final = 64
-_MAX_PARTS: Final = 1000  # lists and numbers of a value that are looked at
+_MAX_PARTS: Final = 1000  # largest number of lists and numbers that are read of a value
 
 Values = dict[str, tuple[float, ...] | str]
 Sections = dict[str, Values]
@@ -145,7 +145,7 @@ def read_opencv_cameras(path: Path) -> tuple[Camera, ...]:
 
 
 def _several_cameras(values: Values, sections: Sections) -> list[Camera]:
-    """Cameras in one world; a size or a lens's name outside their sections holds for all."""
+    """Cameras in one world; a size or name of a lens outside their sections holds for all."""
     if len(sections) > _MAX_CAMERAS:
         raise RigError(f"{len(sections)} cameras, expected at most {_MAX_CAMERAS}")
     cameras = []
@@ -160,7 +160,7 @@ def _several_cameras(values: Values, sections: Sections) -> list[Camera]:
 
 
 def _without_rectification(path: Path, values: Values) -> Values:
-    """Values of ROS' CameraInfo as OpenCV's; in ROS 2 the keys K, D, R and P are in lower case."""
+    """Convert the values of ROS' CameraInfo to OpenCV's; ROS 2 writes K, D, R and P in lower case."""
     if {"k", "p", "distortion_model"} <= values.keys():
         values = {key.upper() if key in ("k", "d", "r", "p") else key: value for key, value in values.items()}
     if not {"K", "P", "R"} <= values.keys() or _find_key(values, (*_T_KEYS, _POSE_KEY)) is not None:
@@ -171,7 +171,7 @@ def _without_rectification(path: Path, values: Values) -> Values:
 
 
 def _numbered_sections(values: Values) -> Sections:
-    """A table for each camera with a translation among K_1, dist_1, R_1, T_1, K_2, ..."""
+    """A table for each camera of keys such as K_1, dist_1, R_1, T_1, K_2, if it has a translation."""
     found: Sections = {}
     for key, separator in itertools.product(list(values), ("_", "")):
         starts = (one for one in _K_KEYS if key.startswith(one + separator) and key != one + separator)
@@ -271,7 +271,7 @@ def _bare_key(key: str) -> str:
 
 
 def _named_lenses(values: Values, bent: bool) -> set[LensKind]:
-    """The kinds of lens that the values name; names that are not known are refused."""
+    """The kinds of lenses that the values name; unknown names are refused."""
     kinds: set[LensKind] = set()
     for key, value in values.items():
         plain = _bare_key(key)
@@ -317,7 +317,7 @@ def _size(values: Values) -> tuple[int, int]:
 
 
 def _pose(values: Values) -> NDArray[np.float64]:
-    """`T_world_camera`, or the inverse of R and T; without them the identity, where nothing may be a pose."""
+    """`T_world_camera`, or the inverse of R and T; the identity if no key may be a pose."""
     R, T, unread = _find_key(values, _R_KEYS), _find_key(values, _T_KEYS), _unread_poses(values)
     if _POSE_KEY in values or not (R or T or unread):
         return _own_pose(values)
@@ -327,13 +327,13 @@ def _pose(values: Values) -> NDArray[np.float64]:
 
 
 def _no_pose(unread: list[str]) -> RigError:
-    """The error for a camera whose pose is missing, or under keys that are not read."""
+    """The error for a camera whose pose is missing, or has unknown keys."""
     found = f"; unknown keys of a pose: {_listed(unread)}" if unread else ""
     return RigError(f"no R and T{found}; valid names: {_VALID_POSES}")
 
 
 def _warn_of_unread(path: Path, values: Values) -> None:
-    """Name keys that may mean a pose beside the one that was read, and poses of the calibration's board."""
+    """Warn of keys that may mean another pose, and of poses of the calibration's board."""
     boards = [key for key in values if _find_key({key: key}, _BOARD_KEYS)]
     boards = [] if _POSE_KEY in values or _find_key(values, _T_KEYS) else boards
     for keys, why in (
@@ -424,7 +424,7 @@ def _numbered(names: tuple[str, ...], number: int) -> tuple[str, ...]:
 
 
 def _find_key(values: Mapping[str, object], names: tuple[str, ...]) -> str | None:
-    """The key of a name; if it is no single letter, signs and capital letters do not count."""
+    """The key that matches one of these names; only names of one or two letters are case-sensitive."""
     plain = {word for word in map(_bare_key, names) if len(word) > 2}
     exact = next((name for name in names if name in values), None)
     return exact or next((key for key in values if _bare_key(key) in plain), None)
@@ -507,7 +507,7 @@ def _values(table: Mapping[str, object]) -> Values:
 
 
 def _value(value: object) -> tuple[float, ...] | str:
-    """A number, or the numbers of nested lists, if they are few; anything else as text."""
+    """A number, or the numbers of nested lists if they are few; other values as text."""
     if isinstance(value, dict) and "data" in value:
         value = value["data"]
     words: list[str] = []
@@ -521,5 +521,5 @@ def _value(value: object) -> tuple[float, ...] | str:
         else:
             words += str(float(first) if isinstance(first, bool) else first).split()
     found = words_numbers(words) if len(words) <= _MAX_NUMBERS else ()
-    # The text of lists that hold one list again and again would be endless.
+    # YAML lists may contain themselves, so their text may be endless.
     return found or ("[...]" if value and isinstance(value, dict | list) else str(value)[:80])

@@ -104,7 +104,7 @@ def checked_cameras(path: Path, cameras: Sequence[Camera]) -> tuple[Camera, ...]
 
 
 def check_names(owner: str, cameras: Sequence[Camera]) -> None:
-    """Refuse two cameras of one name, and names that cannot be part of a file's."""
+    """Refuse two cameras of one name, and names that cannot be part of a file name."""
     names = [camera.name for camera in cameras]
     for name in names:
         if not _VALID_NAME.fullmatch(name):
@@ -145,7 +145,7 @@ def check_near(owner: str, camera: Camera) -> None:
 
 
 def rig_lines(name: str, cameras: Sequence[Camera]) -> list[str]:
-    """The lines of a file, with exact numbers; picture keys that all cameras share stand at the top."""
+    """The lines of a rig's file, with exact numbers; picture keys that all cameras share are at the top."""
     pictures = [list(_picture_lines(one)) for one in cameras]
     shared = all(one == pictures[0] for one in pictures)
     lines = [f"name = {toml_string(name)}", *(pictures[0] if shared else ())]
@@ -173,7 +173,7 @@ def _toml_list(values: Sequence[float]) -> str:
 
 
 def foreign_cameras(table: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """The cameras in a TOML file of Pose2Sim, anipose or Caliscope by name; none in any other file."""
+    """The cameras by name in a TOML file of Pose2Sim, anipose or Caliscope; none in other files."""
     inner = table.get("cameras")
     named = {**table, **(inner if isinstance(inner, dict) else {})}
     return {key: one for key, one in named.items() if isinstance(one, dict) and TOML_MATRIX in one}
@@ -195,7 +195,7 @@ def _parse_rig(table: Mapping[str, Any], stem: str) -> RigFile:
 
 
 def _read_camera(top: Mapping[str, Any], own: Mapping[str, Any], number: int) -> Camera:
-    """A camera, whose own keys replace those at the top."""
+    """Read a camera; its own keys replace those at the top of the file."""
     owner = f"camera {number}"
     check_keys(own, owner, _CAMERA_KEYS, optional=_CAMERA_KEYS)
     pose = _pose(own, owner)
@@ -360,7 +360,7 @@ class CameraRig:
         return CameraRig(self.name, (*self.cameras[:number], *self.cameras[number + 1 :]))
 
     def pictures(self) -> str:
-        """The cameras' pictures in words: their sizes, and the angles that they show without lenses."""
+        """The sizes and fields of view (without lenses) of the cameras' pictures, in words."""
         sizes = dict.fromkeys(f"{width} x {height}" for width, height in (one.size for one in self.cameras))
         angles = np.rad2deg([one.angles for one in self.cameras]).T
         degrees = " x ".join(
@@ -382,7 +382,7 @@ class CameraRig:
         write_text(path, "\n".join(rig_lines(self.name, self.cameras)) + "\n")
 
     def digest(self) -> str:
-        """Beginning of the SHA-256 of its record to nine decimals: whether a name still means this rig."""
+        """The first digits of the SHA-256 of its rounded record: whether a name still means this rig."""
         rounded = json.loads(json.dumps(self.record()), parse_float=lambda text: round(float(text), 9) + 0.0)
         return hashlib.sha256(json.dumps(rounded, sort_keys=True).encode()).hexdigest()[:16]
 
@@ -443,7 +443,7 @@ def rig_setting(rig: CameraRig) -> str | dict[str, Any]:
 
 
 def check_outside(rig: CameraRig, points: Float[np.ndarray, "*batch 3"]) -> None:
-    """Refuse a rig with a camera inside or near a hand, of which these are points [m]."""
+    """Refuse a rig with a camera inside or near a hand with these points [m]."""
     flat = np.asarray(points, dtype=np.float64).reshape(-1, 3)
     flat = flat[~np.isnan(flat).any(axis=1)]
     for number, position in enumerate(rig.positions, 1):

@@ -1,8 +1,8 @@
-"""Readers of the camera calibration files of Vicon, Qualisys, Motive and COLMAP, whose axes docs/rigs.md has.
+"""Readers of camera calibrations of Vicon, Qualisys, Motive and COLMAP; docs/rigs.md describes their axes.
 
-Vicon's radial coefficients undistort points: a point at r pixels from the principal point belongs at
-r (1 + k1 r^2 + k2 r^4 + k3 r^6). Qualisys' lens is OpenCV's, v down, in 64ths of a pixel of the sensor. The
-lens of Motive's `IntrinsicStandardCameraModel` is OpenCV's; the one of its `Intrinsic` is Motive's own.
+Vicon's radial coefficients undistort points: a point at r pixels from the principal point moves to r (1 + k1
+r^2 + k2 r^4 + k3 r^6). Qualisys uses OpenCV's lens, with v down, in 64ths of a sensor pixel. Motive's
+`IntrinsicStandardCameraModel` has OpenCV's lens, and its `Intrinsic` a lens of Motive's own.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ from handsim.space.rig import (
     nearest_rotation,
     read_rig_file,
 )
-from handsim.space.transforms import UpAxis, quaternion_matrix, rigid, upright
+from handsim.space.transforms import UpAxis, quaternion_matrix, rigid, room_axes
 
 _MAX_VALUE: Final = 1e9  # largest number in a calibration, in any unit
-_MAX_XML_BYTES: Final = 1 << 25  # masks and thresholds of cameras lie in these files too
+_MAX_XML_BYTES: Final = 1 << 25  # These files also hold masks and thresholds of cameras.
 _MAX_ELEMENTS: Final = 200_000
 _MAX_DEPTH: Final = 64
 _XML_DECLARATION: Final = re.compile(r"^\s*<\?xml[^>]*\?>")
@@ -153,11 +153,11 @@ def read_xml(path: Path) -> ET.Element:
         raise RigError(
             f"{path}: not a calibration: it is no XML (line {error.position[0]}: {reason})"
         ) from error
-    return root  # its end comes last
+    return root  # the last event is the end of the root
 
 
 def _decoded(path: Path, data: bytes) -> str:
-    """The text without its XML declaration, in which some programs state a wrong encoding."""
+    """The text without its XML declaration, whose encoding is wrong in files of some programs."""
     try:
         text = data.decode(text_encoding(data))
     except UnicodeDecodeError as error:
@@ -194,7 +194,7 @@ def _vicon_camera(entry: ET.Element, number: int) -> LabCamera | Skipped:
 
 
 def _vicon_lens(frame: _Element, camera: Camera) -> Lens:
-    """Fit the inverse of Vicon's lens over the picture: ours distorts points, Vicon's undistorts them."""
+    """Fit the inverse of Vicon's lens over the picture, because our lens distorts points."""
     straighten = _vicon_coefficients(frame)
     if not any(straighten):
         return Lens()
@@ -303,14 +303,14 @@ def read_colmap_cameras(path: Path) -> tuple[Camera, ...]:
         cameras, images = cameras.with_suffix(".bin"), images.with_suffix(".bin")
         lines = [_binary_lines(cameras, _binary_lens), _binary_lines(images, _binary_image)]
     else:
-        # lines of points lie between those of images
+        # Each image has two lines, the second one with its points.
         lines = [_colmap_lines(cameras), _colmap_lines(images, keep_empty=True)[::2]]
     lenses = dict(_colmap_lens(cameras, line) for line in lines[0])
     return checked_cameras(images, [_colmap_image(images, line, lenses) for line in lines[1]])
 
 
 def _binary_lines(path: Path, read: Callable[[bytes, int], tuple[int, str]]) -> list[str]:
-    """The records of a binary file of COLMAP, as lines of its text."""
+    """The records of a binary file of COLMAP, in the form of lines of its text file."""
     data, at, lines = read_bytes(path, error=RigError, max_bytes=_MAX_COLMAP_BYTES), 8, []
     try:
         for _ in range(*struct.unpack_from("<Q", data)):
@@ -344,7 +344,7 @@ def _binary_image(data: bytes, at: int) -> tuple[int, str]:
 
 
 def _colmap_lines(path: Path, *, keep_empty: bool = False) -> list[str]:
-    """Lines without comments; an image without points has an empty line of points."""
+    """Lines without comments; with `keep_empty` also the empty lines of images without points."""
     try:
         text = read_bytes(path, error=RigError, max_bytes=_MAX_COLMAP_BYTES).decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -429,21 +429,21 @@ _XML_READERS: Final[dict[str, tuple[str, Callable[[ET.Element, int], LabCamera |
 
 
 def load_cameras(path: str | Path) -> tuple[Camera, ...]:
-    """The cameras of a file, by its ending."""
+    """Read the cameras of a file by its ending."""
     return tuple(one.camera for one in load_lab_cameras(path))
 
 
 def import_cameras(path: str | Path, up: UpAxis | None = None) -> tuple[Camera, ...]:
-    """The cameras of a calibration that see markers, in a world with z up."""
+    """The cameras of a calibration that see markers, in a world whose z axis points up."""
     found = load_lab_cameras(path)
     seeing = [one for one in found if not one.video] or list(found)
     if len(seeing) < len(found):
         named = ", ".join(one.camera.name for one in found if one.video)
         _warn(f"{path}: video cameras see no markers and are left out: {named}")
     axis: UpAxis = up or ("y" if all(one.y_up for one in seeing) else "z")
-    turn = rigid(upright(axis), np.zeros(3))
+    turn = rigid(room_axes(axis), np.zeros(3))
     cameras = tuple(one.camera.at(turn @ one.camera.T_world_camera) for one in seeing)
-    # a lab may turn its cameras on their sides, and a camera alone is often without a pose
+    # Labs may turn cameras on their sides, and a single camera often has no pose.
     guessed = len(seeing) > 1 and not (seeing[0].y_up and axis == "y")
     if guessed and -np.mean([one.T_world_camera[2, 1] for one in cameras]) < _MIN_UPRIGHT:
         _warn(
@@ -454,7 +454,7 @@ def import_cameras(path: str | Path, up: UpAxis | None = None) -> tuple[Camera, 
 
 
 def load_lab_cameras(path: str | Path) -> tuple[LabCamera, ...]:
-    """The cameras of a file, by its ending, with what the file states of each: video, y up."""
+    """Read the cameras of a file by its ending, with the facts that the file states on each: video, y up."""
     path, ending = Path(path), Path(path).suffix.lower()
     if ending == ".toml" and not foreign_cameras(read_toml(path, error=RigError)):
         return tuple(map(LabCamera, checked_cameras(path, read_rig_file(path).cameras)))

@@ -26,7 +26,7 @@ ForwardAxis = Literal["x", "-x", "y", "-y", "z", "-z"]
 FORWARD: Final = get_args(ForwardAxis)
 """Axes of the camera system that may be forward."""
 _OPPOSITES: Final = {"backward": "forward", "right": "left"}
-# Of each program: where its x, y and z point, the signs of a thing's own axes, and its unit of length.
+# Axes of each program: directions of x, y and z, signs of the axes of an object, and unit of length.
 _PROGRAM_AXES: Final = {
     "ros": (("forward", "left", "up"), (1, 1, 1), "m"),
     "openxr": (("right", "up", "backward"), (1, 1, 1), "m"),
@@ -73,22 +73,24 @@ def program_axes(name: str, up: UpAxis, unit: str = "auto", *, forward: str = "x
     directions, mirror, own_unit = _PROGRAM_AXES[name]
     room = dict(zip(DIRECTIONS, room_axes(up, forward), strict=True))
     turn = np.array([-room[_OPPOSITES[one]] if one in _OPPOSITES else room[one] for one in directions])
-    # A mirrored rotation keeps the part of its axis along the mirrored direction, and turns the other way.
+    # Mirroring keeps the component of a rotation's axis along the mirrored direction, and negates the others.
     mirrored = np.diag([1.0, *np.prod(mirror) * np.array(mirror)])
     return ProgramAxes(
         turn, _left_multiplication(turn @ np.diag(mirror)) @ mirrored, own_unit if unit == "auto" else unit
     )
 
 
-def _left_multiplication(turn: Float[np.ndarray, "3 3"]) -> NDArray[np.float64]:
-    """The matrix (4, 4) that turns an orientation, as a wxyz quaternion, by a rotation of the world."""
-    w, x, y, z = rotation_quaternions(turn[None])[0]
+def _left_multiplication(rotation: Float[np.ndarray, "3 3"]) -> NDArray[np.float64]:
+    """The matrix (4, 4) that rotates a wxyz quaternion by a rotation of the world."""
+    w, x, y, z = rotation_quaternions(rotation[None])[0]
     return np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
 
 
 @functools.cache
 def room_axes(up: UpAxis, forward: str = "x") -> Float[np.ndarray, "3 3"]:
     """The directions `DIRECTIONS` of a room in the axes of its camera system, as rows.
+
+    As a matrix they rotate a world in which the axis `up` points up to ours, in which z does.
 
     Raises:
         ArgumentError: The same axis points up and forward.
@@ -101,22 +103,17 @@ def room_axes(up: UpAxis, forward: str = "x") -> Float[np.ndarray, "3 3"]:
     return np.stack([ahead, np.cross(upward, ahead), upward])
 
 
-def upright(up: UpAxis) -> Float[np.ndarray, "3 3"]:
-    """Rotation of a world in which an axis points up to ours, with z up."""
-    return room_axes(up)
-
-
 def facing(up: UpAxis, forward: str) -> Float[np.ndarray, "3 3"]:
-    """Rotation about the axis `up` that lets `file_axes` turn the axis `forward` to -z, as in OpenXR."""
+    """Rotation about the axis `up`, after which `file_axes` maps the axis `forward` to -z, as in OpenXR."""
     return np.asarray(file_axes(up).T @ program_axes("openxr", up, forward=forward).turn)
 
 
-def turned_poses(poses: Float[np.ndarray, "*batch K"], turn: Float[np.ndarray, "3 3"]) -> NDArray[np.float64]:
+def rotated_poses(poses: Float[np.ndarray, "*batch K"], R: Float[np.ndarray, "3 3"]) -> NDArray[np.float64]:
     """Rotate the world of poses: positions and orientations (wxyz) change, later numbers and NaN stay."""
-    turned = np.array(poses, dtype=np.float64)
-    turned[..., :3] = poses[..., :3] @ turn.T
-    turned[..., 3:7] = poses[..., 3:7] @ _left_multiplication(turn).T
-    return turned
+    rotated = np.array(poses, dtype=np.float64)
+    rotated[..., :3] = poses[..., :3] @ R.T
+    rotated[..., 3:7] = poses[..., 3:7] @ _left_multiplication(R).T
+    return rotated
 
 
 def axis_angle_matrix(axis: Float[np.ndarray, "3"], angle: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -134,7 +131,7 @@ def cross(first: Float[np.ndarray, "3"], second: Float[np.ndarray, "3"]) -> NDAr
 
 
 def unit(vectors: Float[np.ndarray, "*batch K"]) -> NDArray[np.float64]:
-    """Vectors of length 1."""
+    """Vectors scaled to length 1."""
     return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
 
 
@@ -154,7 +151,7 @@ def quaternion_matrix(quaternion: Float[np.ndarray, "*batch 4"]) -> NDArray[np.f
 def frame_with_z(
     direction: Float[np.ndarray, "3"], down: Float[np.ndarray, "3"] | None = None
 ) -> NDArray[np.float64]:
-    """Any rotation (3, 3) whose z axis has this direction, or the one whose x axis is across `down`, too."""
+    """A rotation (3, 3) with this direction as z axis, and an x axis perpendicular to `down` if given."""
     z = direction / np.linalg.norm(direction)
     x = np.cross(np.eye(3)[np.abs(z).argmin()] if down is None else down, z)
     x /= np.linalg.norm(x)
@@ -184,7 +181,7 @@ def rotation_quaternions(rotations: Float[np.ndarray, "T 3 3"]) -> NDArray[np.fl
 
 
 def are_rigid(transforms: Float[np.ndarray, "*batch 4 4"]) -> bool:
-    """Whether transforms are rotations, to five decimals, and positions, with no reflection among them."""
+    """Whether all transforms are rigid to five decimals, and none is a reflection."""
     rotations, last_rows = transforms[..., :3, :3], transforms[..., 3, :]
     square = np.abs(rotations @ np.swapaxes(rotations, -1, -2) - np.eye(3)).max()
     return bool(

@@ -24,7 +24,7 @@ from handsim.hand.model import hand_keypoints
 from handsim.motion_files.motion import OPENXR_JOINTS, joint_poses
 from handsim.space.camera import pinhole, preset
 from handsim.space.objects import load_object
-from handsim.space.transforms import quaternion_matrix, rigid, turned_poses
+from handsim.space.transforms import quaternion_matrix, rigid, rotated_poses
 from poses import sample_poses
 from render import Backgrounds, DepthSensor, PictureStream, RenderConfig, ViewConfig, draw, render_take
 from render.config import resolve
@@ -227,8 +227,8 @@ def test_a_take_with_y_up_is_drawn_as_the_same_one_with_z_up(camera, tmp_path):
     to_y = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
     lying = dataclasses.replace(
         take,
-        qpos=turned_poses(take.qpos, to_y),
-        body_poses=turned_poses(take.body_poses, to_y),
+        qpos=rotated_poses(take.qpos, to_y),
+        body_poses=rotated_poses(take.body_poses, to_y),
         point_list=dataclasses.replace(take.point_list, points=take.point_list.points @ to_y.T),
     )
     own = None

@@ -94,7 +94,7 @@ def test_a_hand_that_comes_late_is_measured():
 
 def test_the_usual_breadth_is_that_of_the_five_sizes_and_goes_on():
     for length, breadth in SIZES.values():
-        assert usual_breadth(1e-3 * length) == pytest.approx(1e-3 * breadth)
+        assert usual_breadth(length) == pytest.approx(breadth)
     assert usual_breadth(0.13) / 0.13 == pytest.approx(72.0 / 165.0)
     assert usual_breadth(0.22) > usual_breadth(0.21)
 

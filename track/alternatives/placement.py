@@ -25,7 +25,7 @@ from track.calibration.energy import (
     user_hand,
 )
 from track.calibration.hand_parameters import attachment_at, shape_at
-from track.kinematics.pose_solver import MIN_MARKERS, PoseSolver
+from track.kinematics.pose_solver import FEWEST_MARKERS, PoseSolver
 
 NUM_COMPARED: Final = 10
 """Number of compared frames of a hand, whose errors are about independent."""
@@ -65,7 +65,7 @@ class Placement(NamedTuple):
 def are_complete(counts: Int[np.ndarray, "T"]) -> Bool[np.ndarray, "T"]:
     """Whether frames that show these numbers of a hand's markers are compared."""
     usual = float(np.median(counts[counts > 0])) if counts.any() else 0.0
-    return np.asarray(counts >= max(MIN_MARKERS, COMPLETE_SHARE * usual))
+    return np.asarray(counts >= max(FEWEST_MARKERS, COMPLETE_SHARE * usual))
 
 
 def place_markers(seen: Float[np.ndarray, "F M 3"], start: GloveFit, left_open: float = 1.0) -> Placement:

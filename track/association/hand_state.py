@@ -22,7 +22,7 @@ from track.association.digit_hypotheses import DigitModel, digit_ranges
 from track.association.frame_state import peak_log_odds
 from track.config import HandOrigin, TrackerConfig
 from track.frames import Spreads
-from track.kinematics.pose_solver import MIN_MARKERS, FramePriors, PoseSolver, priors_of_frame
+from track.kinematics.pose_solver import FEWEST_MARKERS, FramePriors, PoseSolver, priors_of_frame
 from track.kinematics.pose_spread import (
     HandErrors,
     JointPrior,
@@ -176,7 +176,7 @@ class HandState:
         self, targets: Float[np.ndarray, "M 3"], start: Float[np.ndarray, "27"], prediction: Prediction
     ) -> HandEstimate:
         """Fit the pose to at least four labeled markers; with fewer it stays the prediction."""
-        if np.count_nonzero(np.isfinite(targets[:, 0])) >= MIN_MARKERS:
+        if np.count_nonzero(np.isfinite(targets[:, 0])) >= FEWEST_MARKERS:
             fit = self.solver.solve_frame(targets, start, prediction.priors)
             qpos, rms, residuals = fit.qpos[0], float(fit.rms[0]), fit.residuals[0]
         else:

@@ -23,7 +23,7 @@ from poses.shapes import LIBRARIES, gestures_of
 from track.association.frame_state import match_log_odds, match_points, peak_log_odds, targets_of
 from track.association.hand_state import HandState
 from track.config import TrackerConfig
-from track.kinematics.pose_solver import MIN_MARKERS, PoseFit, PoseSolver
+from track.kinematics.pose_solver import FEWEST_MARKERS, PoseFit, PoseSolver
 from track.kinematics.pose_spread import resting_prior
 from train.labelers.protocol import MAX_POINTS, Labeler
 
@@ -226,7 +226,7 @@ class HandInitializer:
     def _fewest_labeled(self, index: int) -> int:
         """Fewest labeled points of a hand."""
         share = _LEAST_LABELED_SHARE * self._states[index].num_markers
-        return max(MIN_MARKERS, int(np.ceil(share)))
+        return max(FEWEST_MARKERS, int(np.ceil(share)))
 
     def _best(
         self, group: Integers, hands: Sequence[int], cuts: Integers, search: _Search
@@ -418,7 +418,7 @@ def _likelier(new: Sequence[InitializedHand | None], hands: list[InitializedHand
 def _is_same(before: Float[np.ndarray, "M 3"], markers: Float[np.ndarray, "M 3"]) -> bool:
     """Whether markers [m] of two calls, NaN where missing, are those of one hand."""
     both = np.isfinite(before[:, 0]) & np.isfinite(markers[:, 0])
-    if both.sum() < MIN_MARKERS:
+    if both.sum() < FEWEST_MARKERS:
         return False
     rotation, shift = rigid_fit(before[both], markers[both])
     off = before[both] @ rotation.T + shift - markers[both]
@@ -469,12 +469,12 @@ def _clouds_to_label(
 ) -> list[tuple[int, int, Int[np.ndarray, "C"]]]:
     """Points given to the labeler as one hand: frame, hand, and indices of the points."""
     most = num_markers + SPARE_POINTS
-    full = [bool(hands) for points, hands in zip(frames, found, strict=True) if len(points) >= MIN_MARKERS]
+    full = [bool(hands) for points, hands in zip(frames, found, strict=True) if len(points) >= FEWEST_MARKERS]
     sides = [hand.index for hands in found for hand in hands]
     usual = np.bincount(sides).argmax() if sides and np.mean(full) >= _USUAL_HAND_SHARE else None
     clouds = []
     for number, (points, hands) in enumerate(zip(frames, found, strict=True)):
-        small = MIN_MARKERS <= len(points) <= most
+        small = FEWEST_MARKERS <= len(points) <= most
         if small and len(hands) < 2 and (hands or usual is not None):
             clouds.append((number, hands[0].index if hands else int(usual), np.arange(len(points))))  # type: ignore[arg-type]
             continue

@@ -275,7 +275,7 @@ def layout_spreads(
     squares, count = np.zeros(NUM_JOINTS), 0
     limits = np.diag(free_spreads() ** -2.0)
     for fit, qpos, seen in poses:
-        good = seen.sum(axis=1) >= pose_solver.MIN_MARKERS
+        good = seen.sum(axis=1) >= pose_solver.FEWEST_MARKERS
         unseen, known = np.where(seen[good], 0.0, np.inf), known_hand(hand_arrays(fit).digits, NOISE)
         variances, _ = pose_spreads(with_keypoints(fit), limits, known, qpos[good], unseen, NOT_SMOOTHED)
         squares += variances[:, :NUM_JOINTS].sum(axis=(0, 2))
@@ -286,7 +286,7 @@ def layout_spreads(
 
 def free_spreads() -> Float[np.ndarray, "20"]:
     """Standard deviation of each joint without any marker: uniform in its range [rad]."""
-    ranges = np.deg2rad([joint.high - joint.low for joint in JOINTS])
+    ranges = np.deg2rad([joint.high_deg - joint.low_deg for joint in JOINTS])
     return np.asarray(ranges / np.sqrt(12.0))
 
 

@@ -34,7 +34,7 @@ from track.kinematics.marker_kinematics import (
     workspace,
 )
 
-MIN_MARKERS: Final = 4  # A pose needs this many markers in a frame.
+FEWEST_MARKERS: Final = 4  # A pose needs this many markers in a frame.
 FEWEST_ON_PART: Final = 3
 """This many markers determine a digit's joint angles, even if it is straight, or a palm's pose."""
 RESTING: Final = np.tile(np.deg2rad([0.0, 25.0, 35.0, 20.0]), 5)  # joint angles of a relaxed hand [rad]
@@ -193,9 +193,9 @@ def solve_pose(
     if targets.ndim != 3 or targets.shape[1:] != (count, 3):
         raise ArgumentError(f"targets have shape {targets.shape}, expected (T, {count}, 3)")
     present = np.isfinite(targets).all(axis=-1).sum(axis=1)
-    if (present < MIN_MARKERS).any():
-        wrong = int((present < MIN_MARKERS).argmax())
-        raise ArgumentError(f"frame {wrong} has {present[wrong]} markers, expected at least {MIN_MARKERS}")
+    if (present < FEWEST_MARKERS).any():
+        wrong = int((present < FEWEST_MARKERS).argmax())
+        raise ArgumentError(f"frame {wrong} has {present[wrong]} markers, expected at least {FEWEST_MARKERS}")
     if initial is not None:
         initial = check_array("initial", initial, (None, NUM_QPOS))
         if initial.shape != (len(targets), NUM_QPOS):

@@ -15,7 +15,7 @@ from gloves.takes.points import PointList
 from gloves.takes.take import LOST, Take
 from handsim.arrays import Doubles, Integers
 from handsim.hand.shape import NUM_JOINTS, NUM_KEYPOINTS
-from track.kinematics.pose_solver import MIN_MARKERS, PoseSolver
+from track.kinematics.pose_solver import FEWEST_MARKERS, PoseSolver
 from track.takes.smoothed_take import smooth_take, spread_model
 
 _ANGLE_SPREAD: Final = 0.3  # [rad] prior standard deviation of joint angles around the tracked ones
@@ -83,7 +83,7 @@ def _spreads(take: Take, points: PointList, qpos: Doubles) -> dict[str, Any]:
 def _fit_again(take: Take, hand: int, frames: Integers, targets: Doubles) -> tuple[Doubles, Doubles]:
     """Fit a hand that is not lost to labeled markers in some frames; poses and RMS [m]."""
     worn, qpos = take.hands_at(int(frames[0]))[hand], take.qpos[frames, hand]
-    enough = np.isfinite(targets[..., 0]).sum(axis=1) >= MIN_MARKERS
+    enough = np.isfinite(targets[..., 0]).sum(axis=1) >= FEWEST_MARKERS
     rms = np.full(len(frames), np.nan)
     if enough.any():
         bias = take.marker_bias(worn.side)

@@ -20,7 +20,7 @@ from handsim.hand.shape import JOINTS, Side
 from track.alternatives.alternatives import Doubt, doubts_of
 from track.alternatives.hands import other_hands_of
 from track.hand_size import glove_shifts
-from track.kinematics.pose_solver import MIN_MARKERS
+from track.kinematics.pose_solver import FEWEST_MARKERS
 from track.kinematics.pose_spread import are_still
 from track.settings import USUAL_SIZE
 
@@ -156,7 +156,7 @@ def _faults_of_hands(take: Take, *, is_last: bool, judges: bool) -> tuple[Suspec
         frames = frames[:: -(-len(frames) // _MOST_FRAMES)]
         some = frames[:: -(-len(frames) // _FITTED_FRAMES)]
         seen = take.point_list.labeled(take.hand_labels[number], some)
-        enough = np.isfinite(seen[..., 0]).sum(axis=1) >= MIN_MARKERS
+        enough = np.isfinite(seen[..., 0]).sum(axis=1) >= FEWEST_MARKERS
         offsets = take.marker_offsets(side, frames)
         hand = _Hand(take, side, take.hands[number], frames, offsets, some[enough], seen[enough])
         # Unmeasured hands, and hands before a change of user, do not fit, which looks like a slip.
@@ -239,8 +239,8 @@ def _joints_at_limits(hand: _Hand) -> Iterator[SuspectSpan]:
     """Joints at a limit of the model in many frames; the person's joint may have gone beyond it."""
     angles = np.rad2deg(hand.take.qpos[hand.frames, hand.take.hand_index(hand.side), 7:])
     for joint, values in zip(JOINTS, angles.T, strict=True):
-        low, high = values < joint.low + AT_LIMIT_DEG, values > joint.high - AT_LIMIT_DEG
-        for limit, there in ((joint.low, low), (joint.high, high)):
+        low, high = values < joint.low_deg + AT_LIMIT_DEG, values > joint.high_deg - AT_LIMIT_DEG
+        for limit, there in ((joint.low_deg, low), (joint.high_deg, high)):
             if there.mean() > _LIMIT_SHARE:
                 first = int(hand.frames[there.argmax()])
                 share, start = 100 * there.mean(), hand.take.times[first]

@@ -97,7 +97,7 @@ class HandFigures:
         if self.fitted.any():
             if self.angle_spread is not None:
                 found[:, -4] = np.median(self.angle_spread[self.fitted], axis=0)
-            low, high = np.array([(joint.low, joint.high) for joint in JOINTS]).T
+            low, high = np.array([(joint.low_deg, joint.high_deg) for joint in JOINTS]).T
             angles = self.angles[self.fitted]
             found[:, -3] = ((angles < low + AT_LIMIT_DEG) | (angles > high - AT_LIMIT_DEG)).mean(axis=0)
         found[:, -2] = measured.mean(axis=0)

@@ -273,7 +273,7 @@ def _range_section(title: str, take: Take, hand: HandFigures) -> Section:
     table = [["joint [deg]", *RANGE, "median SD", "model's range", *shares, "longest gap [s]"]]
     for joint, (*first, limits, measured, gap) in zip(JOINTS, hand.joints().tolist(), strict=True):
         cells = [NOTHING if np.isnan(one) else f"{one:.1f}" for one in first]
-        cells += [f"{joint.low:g} to {joint.high:g}", percent(limits) if limits > 0.0 else NOTHING]
+        cells += [f"{joint.low_deg:g} to {joint.high_deg:g}", percent(limits) if limits > 0.0 else NOTHING]
         cells += [percent(measured), f"{gap / take.rate:.3f}" if gap else NOTHING]
         table.append([joint.name.replace("_", " "), *cells])
     text = (

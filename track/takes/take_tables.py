@@ -127,7 +127,7 @@ def _joint_rows(take: Take, hands: Sequence[HandFigures]) -> _Rows:
         errors = joint_errors(take.settings, hand)[:, 1 + len(SOURCES) :].tolist()
         for joint, figures, error in zip(JOINTS, hand.joints().tolist(), errors, strict=True):
             *row, spread, limits, measured, gap = figures
-            cells = *row, joint.low, joint.high, spread, limits, measured, gap / take.rate, *error
+            cells = *row, joint.low_deg, joint.high_deg, spread, limits, measured, gap / take.rate, *error
             rows.append([hand.side, joint.name, *map(_number, cells)])
     return rows
 

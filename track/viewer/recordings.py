@@ -22,7 +22,7 @@ from handsim.hand.model import HandModel
 from handsim.hand.shape import NUM_QPOS
 from handsim.pages import distinct_colors
 from handsim.space.rig import CameraRig, list_rigs, load_rig
-from handsim.space.transforms import UpAxis, turned_poses, upright
+from handsim.space.transforms import UpAxis, room_axes, rotated_poses
 from track.bodies.rigid_body import RigidTemplate
 from track.frames import StreamedFrame, TrackedFrame
 from track.takes.take_faults import SuspectSpan
@@ -287,13 +287,13 @@ def write_video(
     The view contains the points `shown` [m]; `write_clip` of `render.illustrations` draws and encodes.
     """
     rate, frames = chosen_frames(recording.times)
-    turn = upright(up)
+    turn = room_axes(up)
     palette = label_colors(recording.label_names) / 255.0
 
     def pictures() -> Iterator[tuple[Any, ...]]:
         for number, index in enumerate(frames, start=1):
             frame = recording.frame(index)
-            hands = list(zip(frame.hands, turned_poses(frame.qpos, turn), strict=True))
+            hands = list(zip(frame.hands, rotated_poses(frame.qpos, turn), strict=True))
             points, labels = frame.points[frame.seen] @ turn.T, frame.labels[frame.seen]
             yield hands, points, palette[labels], f"frame {index}, {frame.time:.2f} s"
             progress(number, len(frames))

@@ -15,7 +15,7 @@ from handsim.hand.model import HandModel
 from handsim.hand.shape import NUM_QPOS
 from handsim.hand.skin import all_weights
 from handsim.space.rig import ROOM_CENTER, CameraRig
-from handsim.space.transforms import UpAxis, rotation_quaternions, upright
+from handsim.space.transforms import UpAxis, room_axes, rotation_quaternions
 from track.viewer.recordings import Recording, ShownFrame, label_colors
 
 if TYPE_CHECKING:
@@ -49,7 +49,7 @@ def set_stage(
     server: ViserServer, points: Float[np.ndarray, "N 3"], *, ground: float | None = None, up: UpAxis = "z"
 ) -> None:
     """Set light, ground and a first look at points [m]; the ground is at a height or below the points."""
-    turn = upright(up).T  # from the axes of the stage to those of the points
+    turn = room_axes(up).T  # from the axes of the stage to those of the points
     there = points[np.isfinite(points).all(axis=1)] @ turn
     low, high = np.percentile(there, [2, 98], axis=0) if len(there) else np.tile([[-0.1], [0.1]], 3)
     middle, size = (low + high) / 2, float(np.linalg.norm(high - low))

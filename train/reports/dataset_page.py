@@ -27,8 +27,8 @@ MAX_ROWS: Final = 50_000
 """Number of rows read for the plots; larger sets are sampled evenly."""
 _ANGLE_BINS: Final = 40
 _CHUNK: Final = 1024  # number of rows whose marker pairs are in memory together
-_LOW: Final = np.array([joint.low for joint in JOINTS])
-_HIGH: Final = np.array([joint.high for joint in JOINTS])
+_LOW: Final = np.array([joint.low_deg for joint in JOINTS])
+_HIGH: Final = np.array([joint.high_deg for joint in JOINTS])
 _PUBLISHED_MEDIAN: Final = (3, 4)  # [frames] median gap of real finger markers: lowest and highest take
 _PUBLISHED_P90: Final = (24, 43)  # [frames] the same for the 90th percentile
 
@@ -127,7 +127,7 @@ def _draw_angles(
             panel.sharex(panels[row, 1])
             panel.sharey(panels[row, 1])
         density = 100.0 * shares[number] / np.diff(edges[number])
-        panel.axvspan(joint.low, joint.high, color=Paint.BAND, linewidth=0)
+        panel.axvspan(joint.low_deg, joint.high_deg, color=Paint.BAND, linewidth=0)
         panel.stairs(density, edges[number], fill=True, color=Paint.BLUE)
         panel.set_title(joint_words(joint.name), loc="left", color=Paint.SOFT, fontsize=8.5)
         panel.margins(x=0.03, y=0.08)

@@ -167,7 +167,7 @@ def test_true_users_wear_what_was_worn_and_usual_ones_what_was_designed(take):
     assert (rms["true"] < 0.0005).all()
     assert (rms["usual"] > 0.001).all() and (rms["usual"] < 0.008).all()
     usual = nominal_users(take)[0].model.shape
-    assert usual.length == pytest.approx(1e-3 * SIZES[nearest_size(take.hands[0].shape.length)][0])
+    assert usual.length == pytest.approx(SIZES[nearest_size(take.hands[0].shape.length)][0])
 
 
 @pytest.mark.parametrize(("length", "size"), [(0.15, "XS"), (0.184, "M"), (0.183, "S"), (0.25, "XL")])

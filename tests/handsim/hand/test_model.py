@@ -99,8 +99,8 @@ def test_named_sizes_have_their_measures(size):
     model = HandModel(shape)
     tip = model.forward_kinematics(join_qpos(np.zeros((1, NUM_JOINTS))))[0, 9]
     reach = (tip[:3, :3] @ [shape.bone_lengths[2, 2], 0, 0] + tip[:3, 3])[0]
-    assert reach == pytest.approx(length * 1e-3, rel=0.03)
-    assert shape.breadth == pytest.approx(breadth * 1e-3)
+    assert reach == pytest.approx(length, rel=0.03)
+    assert shape.breadth == pytest.approx(breadth)
 
 
 @given(seed=st.integers(0, 2**32 - 1))

@@ -16,7 +16,7 @@ from handsim import HandSimWarning
 from handsim.hand.shape import JOINT_NAMES, JOINTS, PALM
 from track import find_suspect_spans, track_capture
 from track.alternatives.alternatives import _mirror_orders
-from track.kinematics.pose_solver import MIN_MARKERS, PoseSolver
+from track.kinematics.pose_solver import FEWEST_MARKERS, PoseSolver
 from track.takes import take_faults
 from track.takes.take_faults import find_faults
 from track.takes.take_figures import PageSettings, hand_figures
@@ -216,7 +216,7 @@ def test_a_slip_of_the_whole_glove_is_told_on_moving_skin(shift):
     between = GloveFit(hand.model, dataclasses.replace(worn, points=worn.points + moved))
     bones = hand.model.forward_kinematics(made.qpos[half:, made.hand_index("right")])
     seen[half:] += shift * bones[:, own][..., :3, 0]
-    seen = seen[np.isfinite(seen[..., 0]).sum(axis=1) >= MIN_MARKERS]
+    seen = seen[np.isfinite(seen[..., 0]).sum(axis=1) >= FEWEST_MARKERS]
     take = as_tracked([between], PoseSolver(between).solve(seen).qpos[:, None], seen)
     found = [fault for fault in find_faults(take) if "slips by" in fault.why]
     assert [fault.of for fault in found] == ["the right glove"] * (shift > 0.0)
@@ -244,7 +244,7 @@ def test_places_that_are_off_are_named(truth, across):
 def test_a_joint_at_its_limit_is_named(tracked, beyond):
     qpos = tracked.qpos.copy()
     joint = tracked.joint_names.index("ring_MCP_flexion")
-    qpos[HALF:, 0, 7 + joint] = np.deg2rad(JOINTS[joint].low - beyond)
+    qpos[HALF:, 0, 7 + joint] = np.deg2rad(JOINTS[joint].low_deg - beyond)
     take = dataclasses.replace(tracked, qpos=qpos)
     assert hand_figures(take)[0].joints()[joint, -3] >= 0.49
     (fault,) = (one for one in find_faults(take) if "limit" in one.why)

@@ -86,8 +86,8 @@ def test_the_range_of_motion_is_that_of_the_fitted_poses(take, report):
             "median": np.median(degrees, axis=0),
             "95th": np.percentile(degrees, 95.0, axis=0),
             "largest": degrees.max(axis=0),
-            "model_low": np.array([joint.low for joint in JOINTS]),
-            "model_high": np.array([joint.high for joint in JOINTS]),
+            "model_low": np.array([joint.low_deg for joint in JOINTS]),
+            "model_high": np.array([joint.high_deg for joint in JOINTS]),
         }
         for name, values in expected.items():
             np.testing.assert_allclose(numbers(rows, f"{name}_deg"), values, rtol=1e-5, atol=1e-5)

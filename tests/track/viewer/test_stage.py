@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from handsim.space.transforms import quaternion_matrix, turned_poses, upright
+from handsim.space.transforms import quaternion_matrix, room_axes, rotated_poses
 from track.viewer.contents import first_look, show_recording
 from track.viewer.recordings import TakeRecording, write_video
 from track.viewer.stage import FrameView
@@ -120,12 +120,12 @@ def test_a_slider_in_the_page_leads_to_a_frame(server, page_of, tracked):
 
 
 def test_a_take_with_y_up_stands_as_the_same_take_with_z_up(server, page_of, tracked):
-    back = upright("y").T
+    back = room_axes("y").T
     points = dataclasses.replace(tracked.point_list, points=tracked.point_list.points @ back.T)
     lying = dataclasses.replace(
         tracked,
-        qpos=turned_poses(tracked.qpos, back),
-        body_poses=turned_poses(tracked.body_poses, back),
+        qpos=rotated_poses(tracked.qpos, back),
+        body_poses=rotated_poses(tracked.body_poses, back),
         point_list=points,
     )
     looks, clips = [], []
@@ -133,7 +133,7 @@ def test_a_take_with_y_up_stands_as_the_same_take_with_z_up(server, page_of, tra
         recording = TakeRecording(take)
         show_recording(server, recording, up=up)
         page, camera = page_of(server), server.initial_camera
-        turn = upright(up)
+        turn = room_axes(up)
         looks.append([turn @ getattr(camera, name) for name in ("position", "look_at", "up")])
         looks[-1].append(turn @ page.places["/ground"])
         looks[-1].append(turn @ quaternion_matrix(page.turns.get("/ground", np.eye(4)[0]))[:, 2])

@@ -31,7 +31,7 @@ def rows():
 
 def test_angles_are_counted_over_the_joints_own_range(rows):
     index, low, high = JOINT_NAMES.index("index_MCP_flexion"), -25.0, 95.0
-    assert (JOINTS[index].low, JOINTS[index].high) == (low, high)
+    assert (JOINTS[index].low_deg, JOINTS[index].high_deg) == (low, high)
     rows["qpos"][:, 7 + index] = np.deg2rad([low, -16.0, 1.0, high])  # bins of 12 degrees
     shares = report.angle_shares(rows, bins=10)
     np.testing.assert_array_equal(shares[index], [0.5, 0, 0.25, 0, 0, 0, 0, 0, 0, 0.25])
