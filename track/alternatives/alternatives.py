@@ -304,10 +304,8 @@ def _columns_of(take: Take, side: Side) -> Columns | None:
     return Columns(worn.layout.names, np.concatenate([seen, *strays], axis=1) @ mirror, hand_like(worn))
 
 
-def _steady_points(
-    take: Take, worn: GloveFit, frames: Integers, seen: Doubles
-) -> Iterator[Float[np.ndarray, "F 3"]]:
-    """Yield unlabeled points that move with the palm or a digit while that digit lacks a marker."""
+def _steady_points(take: Take, worn: GloveFit, frames: Integers, seen: Doubles) -> Iterator[Doubles]:
+    """Yield unlabeled points (F, 3) that move with the palm or a digit while that digit lacks a marker."""
     missing = np.isnan(seen[..., 0])
     if missing.mean(axis=0).max() <= _MISSING_SHARE:
         return

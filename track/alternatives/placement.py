@@ -86,11 +86,10 @@ def place_markers(seen: Float[np.ndarray, "F M 3"], start: GloveFit, left_open: 
 def place_again(seen: Float[np.ndarray, "F M 3"], base: Placement) -> Placement:
     """Fit the same hand with other labels of the same points, starting from its shape."""
     shape = shape_at(base.problem.shape, base.estimate.parameters)
-    designed = attachment_at(base.start.layout, base.problem.design, shape)
+    start, design = base.estimate, base.problem.design
+    designed = attachment_at(base.start.layout, design, shape)
     qpos = PoseSolver(GloveFit(HandModel(shape), designed)).solve(seen).qpos
-    estimate = dataclasses.replace(
-        base.estimate, points=designed.points, coordinates=base.problem.design, qpos=qpos
-    )
+    estimate = dataclasses.replace(start, points=designed.points, coordinates=design, qpos=qpos)
     return _placed(base.problem.with_targets(seen), base.start, estimate)
 
 

@@ -274,10 +274,8 @@ def match_log_odds(
     innovation = points[:, None] - positions
     precision = np.linalg.inv(covariances)
     square = np.einsum("pki,kij,pkj->pk", innovation, precision, innovation)
-    log_odds: np.ndarray = (
-        0.5 * np.log(np.linalg.det(precision)) - 0.5 * square - _stray_log_density(stray_density)
-    )
-    return log_odds
+    log_odds: Doubles = 0.5 * np.log(np.linalg.det(precision)) - 0.5 * square
+    return log_odds - _stray_log_density(stray_density)
 
 
 def peak_log_odds(variances: Float[np.ndarray, "K"], stray_density: float) -> Float[np.ndarray, "K"]:

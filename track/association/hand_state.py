@@ -165,12 +165,10 @@ class HandState:
         )
         return self._prediction(moved, predict_joints(moved[7:], self._joint_covariance, span), wrist_spread)
 
-    def _prediction(
-        self, qpos: Doubles, joint_prior: JointPrior, wrist_spread: tuple[float, float]
-    ) -> Prediction:
+    def _prediction(self, qpos: Doubles, prior: JointPrior, wrist_spread: tuple[float, float]) -> Prediction:
         """Make a prediction from a pose with these uncertainties."""
-        priors = priors_of_frame(joint_prior.angles, joint_prior.spread, qpos[:7], wrist_spread)
-        return Prediction(qpos, self.solver.marker_positions(qpos), joint_prior, wrist_spread, priors)
+        priors = priors_of_frame(prior.angles, prior.spread, qpos[:7], wrist_spread)
+        return Prediction(qpos, self.solver.marker_positions(qpos), prior, wrist_spread, priors)
 
     def fit(
         self, targets: Float[np.ndarray, "M 3"], start: Float[np.ndarray, "27"], prediction: Prediction

@@ -23,7 +23,7 @@ from poses.shapes import LIBRARIES, gestures_of
 from track.association.frame_state import match_log_odds, match_points, peak_log_odds, targets_of
 from track.association.hand_state import HandState
 from track.config import TrackerConfig
-from track.kinematics.pose_solver import FEWEST_MARKERS, PoseFit, PoseSolver
+from track.kinematics.pose_solver import FEWEST_MARKERS, OUTLIER_DISTANCE, PoseFit, PoseSolver
 from track.kinematics.pose_spread import resting_prior
 from train.labelers.protocol import MAX_POINTS, Labeler
 
@@ -45,7 +45,6 @@ _FITS_AT_A_TIME: Final = 3  # number of labeled clouds fitted at once, the most 
 # Steps from each starting pose; enough to distinguish a hand from its mirror image.
 _FIRST_FIT_STEPS: Final = 6
 _REFIT_STEPS: Final = 8  # from a close pose; the final fit is solved again
-_OUTLIER_DISTANCE: Final = 0.01  # [m] Labels farther from a robust fit are wrong.
 # A robust fit must keep this share of the labels; that of a mirrored hand keeps fewer.
 _LEAST_KEPT_LABELS: Final = 0.75
 _POSE_WEIGHT: Final = 0.25  # log-odds lost per squared standard deviation beyond the expected sum
@@ -123,7 +122,7 @@ class HandInitializer:
         links = [_link_distance(one.hand) for one in states[:1]]  # The other hand is its mirror image.
         self._link_distance = max([_LINK_DISTANCE, *links])
         self._prior = resting_prior()
-        self._robust = [PoseSolver(one.hand, outlier_distance=_OUTLIER_DISTANCE) for one in states]
+        self._robust = [PoseSolver(one.hand, outlier_distance=OUTLIER_DISTANCE) for one in states]
         self._attempts = np.zeros(len(states), dtype=np.int64)
         self._spreads: list[float | None] = [None] * len(states)
         self._points: Doubles = np.empty((0, 3))  # of the current frame
@@ -194,9 +193,8 @@ class HandInitializer:
             return True
         # A hand that was found more often outlasts another one in between.
         outlasts = now.evidence == 0.0 < before.evidence
-        self._repeated[hand.index] = (
-            before._replace(evidence=before.evidence - _REPETITION) if outlasts else now
-        )
+        now = before._replace(evidence=before.evidence - _REPETITION) if outlasts else now
+        self._repeated[hand.index] = now
         return False
 
     def _sides_checked(self, hands: list[InitializedHand]) -> list[InitializedHand]:
@@ -343,9 +341,8 @@ class HandInitializer:
         points, digits = self._points, self._states[hands[0].index].solver.hand.digits
         for digit in range(len(DIGITS)):
             one, two = hands
-            ours, theirs = (
-                np.flatnonzero((hand.labels >= 0) & (digits[hand.labels] == digit)) for hand in (one, two)
-            )
+            on_digit = [(hand.labels >= 0) & (digits[hand.labels] == digit) for hand in (one, two)]
+            ours, theirs = map(np.flatnonzero, on_digit)
             if not len(ours) or not len(theirs):
                 continue
             if distances_to_nearest(points[ours], points[theirs]).min() > _DIGIT_EXCHANGE_DISTANCE:
@@ -387,7 +384,7 @@ class HandInitializer:
         targets = targets_of(self._points, first.labels, state.num_markers)
         fit = self._robust[first.index].solve(targets[None], iterations=_FIRST_FIT_STEPS)
         distances = np.linalg.norm(fit.residuals[0], axis=-1)
-        kept = (first.labels >= 0) & (distances[first.labels] < _OUTLIER_DISTANCE)
+        kept = (first.labels >= 0) & (distances[first.labels] < OUTLIER_DISTANCE)
         if kept.sum() < _LEAST_KEPT_LABELS * (first.labels >= 0).sum():
             return None
         return self._fit(first.index, np.where(kept, first.labels, -1), fit)

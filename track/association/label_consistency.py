@@ -250,9 +250,8 @@ class LabelerReview:
             return None
         proposal = _Proposal(proposed, confidence, estimate)
         gain = self._gain(frame, track, proposal)
-        changes = {
-            (int(frame.ids[row]), int(after[row])) for row in np.flatnonzero((after != before) & (after >= 0))
-        }
+        new = np.flatnonzero((after != before) & (after >= 0))
+        changes = {(int(frame.ids[row]), int(after[row])) for row in new}
         earlier = self._earlier[track.hand]
         times = min((earlier.get(change, 0) for change in changes), default=0)
         if gain + _REPEATED_REVIEW_LOG_ODDS * times >= _REVIEW_MARGIN:

@@ -315,15 +315,13 @@ class Problem:
         parts = zip(estimate.coordinates, self.design, pads, strict=True)
         return SkinCoordinates(*map(np.concatenate, parts))
 
-    def _add_priors(
-        self, estimate: Estimate, fit: Fit, design_jacobian: Doubles, result: NormalEquations
-    ) -> None:
-        """Add the priors; `design_jacobian` (M, 3, 53) is of marker minus design at fixed coordinates."""
+    def _add_priors(self, estimate: Estimate, fit: Fit, by_shape: Doubles, result: NormalEquations) -> None:
+        """Add the priors; `by_shape` (M, 3, 53) is the jacobian of marker minus design, coordinates fixed."""
         first, count = NUM_PARAMETERS, len(estimate.points)
         by_marker = np.eye(3 * count).reshape(count, 3, -1)
         result.shared[:first, :first] += self.precision
         result.shared_gradient[:first] += self.precision @ estimate.parameters
-        jacobian = np.concatenate([design_jacobian, by_marker], axis=2)
+        jacobian = np.concatenate([by_shape, by_marker], axis=2)
         weighted = self.position_precision(fit) @ jacobian
         result.shared[:] += np.einsum("mis,mir->sr", jacobian, weighted, optimize=True)
         result.shared_gradient[:] += np.einsum("mi,mis->s", fit.design_residuals, weighted)
@@ -386,9 +384,8 @@ class Problem:
         points = carried + shared_step[NUM_PARAMETERS:].reshape(-1, 3)
         qpos = move(estimate.qpos, np.clip(pose_step, -0.5, 0.5))
         coordinates = project_onto_skin(estimate.coordinates, points, skin)
-        return dataclasses.replace(
-            estimate, parameters=parameters, points=points, coordinates=coordinates, qpos=qpos
-        )
+        changes = {"parameters": parameters, "points": points, "coordinates": coordinates, "qpos": qpos}
+        return dataclasses.replace(estimate, **changes)
 
 
 def first_estimate(
@@ -489,10 +486,8 @@ def _nearest_skin_points(model: HandModel, bones: Doubles, finger: str) -> Doubl
     return np.asarray(ends + radii[:, None] * np.stack([direction, -direction]))
 
 
-def slide_contacts(
-    contacts: Contacts, model: HandModel, T_world_bone: Float[np.ndarray, "K L 4 4"]
-) -> Contacts:
-    """Slide the contact points on the skin to where thumb and finger are nearest."""
+def slide_contacts(contacts: Contacts, model: HandModel, T_world_bone: Doubles) -> Contacts:
+    """Slide contact points on the skin to where thumb and finger are nearest, in a pose (L, 4, 4) each."""
     # Each point moves to where its skin is nearest to a target inside the other pad. A target on the surface
     # of the other pad would fail if the pads overlap.
     skin, count = build_skin(model.shape), len(contacts.frames)

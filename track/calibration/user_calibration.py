@@ -461,9 +461,8 @@ def learn_arch(problem: Problem, estimate: Estimate) -> None:
         if min(weights[knuckle, [PALM, first]]) <= _KNUCKLE_WEIGHT or on_bone[outer] < 0.5 or not seen.any():
             continue
         ends = np.einsum("tij,tmj->tmi", turns, problem.targets[:, [knuckle, outer]]) + shifts[:, None]
-        flexions = [
-            np.arctan2(-link[:, 2], link[:, 0])[seen] for link in (ends[:, 0] - base, ends[:, 1] - ends[:, 0])
-        ]
+        links = ends[:, 0] - base, ends[:, 1] - ends[:, 0]
+        flexions = [np.arctan2(-link[:, 2], link[:, 0])[seen] for link in links]
         metacarpal, bone = (flexion - flexion.mean() for flexion in flexions)
         slope = (bone @ metacarpal) / max(float(bone @ bone), 1e-12)
         scatter = (metacarpal - slope * bone).var() + _LEAST_FLEXION_NOISE**2

@@ -24,11 +24,10 @@ if TYPE_CHECKING:
 _SCALE_END_DEG: Final = 15.0  # [deg] end of the color scale
 _TRIALS_TEXT: Final = (
     "A capture is wrong throughout if some marker is right in fewer than half of its frames; other captures "
-    "count with the probability of other labels that the take itself states. Shares of right slots "
-    "(mean, worst capture) and of completely right frames in short simulated captures of several people, "
-    "labeled and tracked as by `handsim label` and `handsim track`, with measured but uncalibrated hands. "
-    "Joints: root mean square error over all joints, of uncalibrated hands; the section on joints is on "
-    "calibrated ones."
+    "count with the probability of other labels that the take itself states. Shares of right slots (mean, "
+    "worst capture) and of completely right frames in short simulated captures of several people, as by "
+    "`handsim label` and `handsim track`. Joints: root mean square error over all joints of measured but "
+    "uncalibrated hands; the section on joints is on calibrated ones."
 )
 _MOST_PAIRS: Final = 5  # number of listed pairs of similar labels
 
@@ -138,9 +137,7 @@ def _markers_section(score: LayoutScore) -> Section:
 
 
 def _joints_section(score: LayoutScore) -> Section:
-    caption = (
-        "Markers are small rings, joints disks: the standard deviation of the worst angle there, in degrees."
-    )
+    caption = "Markers are small rings; disks show the standard deviation of the worst angle there [deg]."
     table = [["joints [deg]", "abduction", "first flexion", "second flexion", "last flexion"]]
     degrees = np.rad2deg(score.joints)
     rows = zip(DIGITS, degrees.reshape(len(DIGITS), -1), strict=True)

@@ -396,9 +396,8 @@ class _Search:
             yield slid
             if across == 0.0:
                 yield from (np.where(digits == digit, slid, places) for digit in np.unique(digits))
-        targets = [
-            np.where(digits >= 0, bones + 3 * (np.array(order)[digits] - digits), PALM) for order in orders
-        ]
+        shifts = [3 * (np.array(order)[digits] - digits) for order in orders]
+        targets = [np.where(digits >= 0, bones + shift, PALM) for shift in shifts]
         for digit, sign in itertools.product(range(count), (1, -1)):
             own = digits == digit
             aside = own & (sign * table.around[places] > _ASIDE_ANGLE)

@@ -80,9 +80,8 @@ def prove_glove(
         by_capture.append(float(right.mean()))
         slots.append(1.0 - float(wrong[:, list(columns.values())].mean()))
     shares = np.array([one.mean() for one in frames])
-    return Proof(
-        float(np.concatenate(frames).mean()), _interval(shares), float(np.mean(slots)), tuple(by_capture)
-    )
+    mean = float(np.concatenate(frames).mean())
+    return Proof(mean, _interval(shares), float(np.mean(slots)), tuple(by_capture))
 
 
 def _with_gaps(

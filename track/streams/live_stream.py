@@ -441,9 +441,8 @@ class FrameOrder:
     def _hold_confirmed(self, last: StreamedFrame, frame: StreamedFrame) -> None:
         """Hold frames of jumps that the stream's next frame confirms; drop old ones."""
         self._in_a_row = 0
-        right = [
-            one for one in self._jumping if last.time < one.time < frame.time and self._continues(one, frame)
-        ]
+        between = [one for one in self._jumping if last.time < one.time < frame.time]
+        right = [one for one in between if self._continues(one, frame)]
         for one in right:
             del self._jumping[one]
             self._hold(one)

@@ -163,9 +163,8 @@ def _events_of(frames: Integers, one: Integers, other: Integers) -> _Events:
         assume_unique=True,
         return_indices=True,
     )
-    links = np.concatenate(
-        [[order[:-1][follows], order[1:][follows]], [with_first[mine], with_second[others]]], axis=1
-    )
+    same, exchanged = [order[:-1][follows], order[1:][follows]], [with_first[mine], with_second[others]]
+    links = np.concatenate([same, exchanged], axis=1)
     return _Events(points, connected_components(links, len(rows)))
 
 

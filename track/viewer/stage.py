@@ -280,9 +280,8 @@ class FrameView:
                 self.bodies.append(server.scene.add_frame(name, axes_length=0.05, axes_radius=0.002))
             else:
                 surface = thing.vertices, thing.faces
-                self.bodies.append(
-                    server.scene.add_mesh_simple(name, *surface, color=_BODY_COLOR, opacity=0.6)
-                )
+                mesh = server.scene.add_mesh_simple(name, *surface, color=_BODY_COLOR, opacity=0.6)
+                self.bodies.append(mesh)
         self._clicked: frozenset[int] = frozenset()
         self._kept = np.empty(0, dtype=np.int64)  # indices of the shown points in the frame
         self.on_pick: Callable[[int], None] = lambda index: None
