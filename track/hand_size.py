@@ -26,7 +26,6 @@ from handsim.arrays import Doubles
 from handsim.errors import ArgumentError, HandSimError, HandSimWarning
 from handsim.hand.model import HandModel
 from handsim.hand.shape import ADULT_LENGTH, DIGITS, SIZES, HandShape, Side
-from handsim.space.transforms import MIRROR
 from track.association.hand_state import HandState
 from track.association.initialization import HandInitializer, distances_to_nearest
 from track.calibration.energy import (
@@ -40,7 +39,7 @@ from track.calibration.energy import (
     shared_covariance,
     user_hand,
 )
-from track.calibration.hand_parameters import LENGTH, NUM_PARAMETERS
+from track.calibration.hand_parameters import LENGTH, NUM_PARAMETERS, mirror_to_right
 from track.config import TrackerConfig
 from track.frames import StreamedFrame, TrackedHand
 from track.kinematics.pose_solver import FEWEST_MARKERS, PoseSolver
@@ -253,11 +252,8 @@ def _labeled_markers(
         for seen, some in zip(tracker.step(frame.points, frame.ids, frame.time).hands, found, strict=True):
             if _is_shown(seen, count):
                 some.append(seen.seen_markers)
-    return [
-        spread_out(np.array(some), _PROPORTION_FRAMES) @ (MIRROR if side == "left" else np.eye(3))
-        for side, some in zip(sides, found, strict=True)
-        if len(some) >= _FEWEST_FRAMES
-    ]
+    shown = [(side, some) for side, some in zip(sides, found, strict=True) if len(some) >= _FEWEST_FRAMES]
+    return [spread_out(np.array(some), _PROPORTION_FRAMES) @ mirror_to_right(side) for side, some in shown]
 
 
 class _Search:
@@ -327,7 +323,7 @@ def glove_shifts(
         worn: The hand as tracked.
     """
     right = worn.with_side("right")
-    problem, estimate = _first_proportions(seen @ (MIRROR if worn.side == "left" else np.eye(3)), right)
+    problem, estimate = _first_proportions(seen @ mirror_to_right(worn.side), right)
     estimate, fit, _ = levenberg_marquardt(problem, estimate, 0, _FEW_STEPS, None, QUICK_GAIN)
     _, by_shared, residuals, _ = jacobians = problem.weighted_jacobians(estimate, fit)
     equations = problem.normal_equations(estimate, fit, jacobians)

@@ -98,12 +98,8 @@ class Tracker:
         self.labeler = labeler_of(self.user.layout, labeler)
         self._intake = FrameValidator(config.silence)
         self._bodies = [BodyTracker(body) for body in self.bodies]
-        self._states = [
-            HandState(
-                hand, config, origin=self.user.origin(hand.side), errors=self.user.errors.get(hand.side)
-            )
-            for hand in self.hands
-        ]
+        known = [(hand, self.user.origin(hand.side), self.user.errors.get(hand.side)) for hand in self.hands]
+        self._states = [HandState(one, config, origin=origin, errors=errors) for one, origin, errors in known]
         counts = [*(one.num_markers for one in self._states), *(len(one.marker_names) for one in self.bodies)]
         self._numbering = Numbering(counts)
         self._history = PointHistory(self._numbering, config.silence)
@@ -182,17 +178,13 @@ class Tracker:
         started, outcomes = self._initialize_lost(updated, outcomes)
         final, outcomes = self._replace_doubted(started, outcomes)
         self._history.keep(final)
-        hands = tuple(
-            _tracked_hand(state, outcome, final, final.markers(hand))
-            for hand, (state, outcome) in enumerate(zip(self._states, outcomes, strict=True))
-        )
+        pairs = enumerate(zip(self._states, outcomes, strict=True))
+        hands = tuple(_tracked_hand(state, one, final, final.markers(hand)) for hand, (state, one) in pairs)
         all_labels, all_confidence = np.full(incoming.num_points, -1), np.ones(incoming.num_points)
         all_labels[incoming.kept] = labels
         all_labels[incoming.kept[free]], all_confidence[incoming.kept[free]] = final.labels, final.confidence
-        seconds = perf_counter() - began
-        return TrackedFrame(
-            float(incoming.stamp), hands, all_labels, all_confidence, bodies, incoming.notes, seconds
-        )
+        took = perf_counter() - began
+        return TrackedFrame(incoming.stamp, hands, all_labels, all_confidence, bodies, incoming.notes, took)
 
     def _track_bodies(self, incoming: IncomingFrame) -> tuple[tuple[TrackedBody, ...], Integers]:
         """Track every body; return also the labels (P,) of their points."""

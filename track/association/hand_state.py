@@ -159,11 +159,10 @@ class HandState:
         doubt[self._left_out & (self._bias_frames == 0.0)] = max(self._typical_bias, slip)
         self.variance = self._learned_variance + doubt**2
         moved: Doubles = move(self.qpos[None], min(span, _LONGEST_EXTRAPOLATION) * self.velocity[None])[0]
-        wrist_spread = (
-            _WRIST_SPREAD + 0.5 * _WRIST_ACCELERATION * span**2,
-            _WRIST_ROTATION_SPREAD + 0.5 * _WRIST_ANGULAR_ACCELERATION * span**2,
-        )
-        return self._prediction(moved, predict_joints(moved[7:], self._joint_covariance, span), wrist_spread)
+        position = _WRIST_SPREAD + 0.5 * _WRIST_ACCELERATION * span**2
+        rotation = _WRIST_ROTATION_SPREAD + 0.5 * _WRIST_ANGULAR_ACCELERATION * span**2
+        joints = predict_joints(moved[7:], self._joint_covariance, span)
+        return self._prediction(moved, joints, (position, rotation))
 
     def _prediction(self, qpos: Doubles, prior: JointPrior, wrist_spread: tuple[float, float]) -> Prediction:
         """Make a prediction from a pose with these uncertainties."""
@@ -179,30 +178,18 @@ class HandState:
             qpos, rms, residuals = fit.qpos[0], float(fit.rms[0]), fit.residuals[0]
         else:
             qpos, rms, residuals = prediction.qpos, np.nan, np.full_like(targets, np.nan)
-        predicted = predict_markers(
-            self.solver.hand,
-            self.solver.on_part,
-            qpos,
-            targets,
-            prediction.joint_prior,
-            prediction.wrist_spread,
-            self.variance,
-            self.config.marker_noise,
-        )
+        hand, on_part, noise = self.solver.hand, self.solver.on_part, self.config.marker_noise
+        prior = prediction.joint_prior, prediction.wrist_spread
+        predicted = predict_markers(hand, on_part, qpos, targets, *prior, self.variance, noise)
         return HandEstimate(predicted.qpos, rms, residuals, predicted)
 
     def digit_models(self, prediction: Prediction, estimate: HandEstimate) -> tuple[DigitModel, DigitModel]:
         """Models for new points of a digit: one for digits with settled labels, one for others."""
         # The second uses the resting prior, so that a pose bent by a wrong label cannot confirm it.
         slack = _BIAS_SLACK * np.sqrt(self.variance) + np.sqrt((self._bias**2).sum(axis=1))
-        confirmed = DigitModel(
-            prediction.joint_prior,
-            estimate.predicted,
-            self.variance,
-            peak_log_odds(self.variance, self.config.stray_density),
-            slack,
-            self._ranges,
-        )
+        peaks = peak_log_odds(self.variance, self.config.stray_density)
+        markers = self.variance, peaks, slack, self._ranges
+        confirmed = DigitModel(prediction.joint_prior, estimate.predicted, *markers)
         return confirmed, confirmed._replace(joint_prior=resting_prior())
 
     def pose_spread(self, time: float) -> Callable[[], Spreads]:
@@ -297,16 +284,11 @@ class HandState:
             change = velocity_of(self.qpos, qpos, span) - self.velocity
             self.velocity += _VELOCITY_SMOOTHING * change
         self._store(estimate, time)
-        _learn_bias(
-            estimate.residuals,
+        rotations, learned = (
             estimate.predicted.rotations,
-            settled,
-            self.digits,
-            self.confirmed,
-            self._bias_frames,
-            self._bias,
-            self._learned_variance,
+            (self._bias_frames, self._bias, self._learned_variance),
         )
+        _learn_bias(estimate.residuals, rotations, settled, self.digits, self.confirmed, *learned)
         self._apply_biases()
 
     def _store(self, estimate: HandEstimate, time: float) -> None:
@@ -323,14 +305,8 @@ class HandState:
 
     def _apply_biases(self) -> None:
         """Shift the hand's markers by their learned biases, and update the typical bias and the variances."""
-        self._typical_bias = _apply_biases(
-            self._bias_frames,
-            self._left_out,
-            self._bias,
-            self._designed,
-            self._learned_variance,
-            self.solver.hand.positions,
-        )
+        state = self._bias_frames, self._left_out, self._bias, self._designed, self._learned_variance
+        self._typical_bias = _apply_biases(*state, self.solver.hand.positions)
 
 
 class HandTrack(NamedTuple):

@@ -370,12 +370,9 @@ class HandInitializer:
             labels = hand.labels.copy()
             labels[labeled[squares.argmax()]] = -1
             hand = self._fit(hand.index, labels, hand.fit)
-        accepted = (
-            best is not None
-            and best.fit.rms[0] <= self._config.most_rms
-            and best.score >= share * self._needed(best.index)
-        )
-        return best if accepted else None
+        if best is None or not best.fit.rms[0] <= self._config.most_rms:
+            return None
+        return best if best.score >= share * self._needed(best.index) else None
 
     def _without_outliers(self, first: InitializedHand) -> InitializedHand | None:
         """Drop labels that are outliers of a robust fit; None if these are too many."""

@@ -280,13 +280,8 @@ class Problem:
         """
         by_pose, by_shared, residuals, moved = jacobians or self.weighted_jacobians(estimate, fit)
         transposed, flat = by_pose.swapaxes(1, 2), by_shared.reshape(-1, by_shared.shape[2])
-        result = NormalEquations(
-            transposed @ by_pose,
-            transposed @ by_shared,
-            flat.T @ flat,
-            (transposed @ residuals[..., None])[..., 0],
-            residuals.ravel() @ flat,
-        )
+        gradients = (transposed @ residuals[..., None])[..., 0], residuals.ravel() @ flat
+        result = NormalEquations(transposed @ by_pose, transposed @ by_shared, flat.T @ flat, *gradients)
         self._add_priors(estimate, fit, moved, result)
         return result
 
@@ -351,10 +346,8 @@ class Problem:
         rows, pads = np.arange(count), self._all_coordinates(estimate).part(-2 * count, None)
         points, _ = skin_points(pads, SkinPatch(pads.faces).corners(fit.model.surface.vertices))
         by = self._point_jacobians(fit, estimate, frames, points, skin_weights(pads), rest)
-        return [
-            np.einsum("ki,kis->ks", fit.geometry.directions, one[rows, count + rows] - one[rows, rows])
-            for one in by[:2]
-        ]
+        apart = (one[rows, count + rows] - one[rows, rows] for one in by[:2])
+        return [np.einsum("ki,kis->ks", fit.geometry.directions, one) for one in apart]
 
     def _point_jacobians(
         self,
@@ -419,11 +412,8 @@ def find_touches(
         good = (speed < _MOST_TOUCH_SPEED) & (gaps[:, number] < _MOST_TOUCH_GAP)
         good &= (gaps.argmin(axis=1) == number) & complete[:, 0] & complete[:, number + 1]
         shortest = max(2, round(_SHORTEST_HOLD * rate))
-        stillest = [
-            first + int(speed[first : last + 1].argmin())
-            for first, last in runs_of(good)
-            if last + 1 - first >= shortest
-        ]
+        holds = [(first, last) for first, last in runs_of(good) if last + 1 - first >= shortest]
+        stillest = [first + int(speed[first : last + 1].argmin()) for first, last in holds]
         stillest.sort(key=lambda frame, number=number: float(gaps[frame, number]))  # type: ignore[misc]
         touches += [(frame, finger) for frame in stillest[:_MOST_TOUCHES_PER_FINGER]]
     return sorted(touches)

@@ -53,6 +53,7 @@ from track.calibration.hand_parameters import (
     LENGTH,
     NUM_PARAMETERS,
     SkinPatch,
+    mirror_to_right,
     shape_at,
     shape_jacobian,
     skin_points,
@@ -255,7 +256,7 @@ def calibrate_hand(
     markers: Float[np.ndarray, "T M 3"], start: GloveFit, rate: float, *, progress: Progress | None = None
 ) -> Calibration:
     """Fit a hand and its glove to labeled markers of one user."""
-    mirror = MIRROR if start.side == "left" else np.eye(3)
+    mirror = mirror_to_right(start.side)
     markers, right = np.asarray(markers, dtype=np.float64) @ mirror, start.with_side("right")
     usable = usable_frames(markers, start)
     seen, complete = markers[usable], complete_digits(markers[usable], right.attachment)

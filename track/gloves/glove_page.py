@@ -42,11 +42,9 @@ def write_glove_page(path: Path, score: LayoutScore) -> None:
         _markers_section(score),
         _joints_section(score),
     ]
-    network = (
-        "a labeler trained on it"
-        if score.is_trained
-        else "the network for any layout, after a minute of learning this one"
-    )
+    network = "a labeler trained on it"
+    if not score.is_trained:
+        network = "the network for any layout, after a minute of learning this one"
     lead = (
         f"{layout.num_markers} markers of {1e3 * layout.radius:.1f} mm, on {score.observed.num_frames:,} "
         f"frames of {score.seen_by}. Points were labeled by {network}."
@@ -110,10 +108,9 @@ def _captures_section(score: LayoutScore) -> Section:
 def _labels_section(score: LayoutScore) -> Section:
     columns = (score.observed, score.corrupted, score.clean)
     table = [["labels [%]", "as the rig sees them", "the paper's drops and ghosts", "every marker seen"]]
-    table += [
-        [title, *(percent_between(report.figures[name], report.interval(name)) for report in columns)]
-        for title, name in (("slots right", "slot_accuracy"), ("whole frames right", "frame_accuracy"))
-    ]
+    for title, name in (("slots right", "slot_accuracy"), ("whole frames right", "frame_accuracy")):
+        shares = (percent_between(report.figures[name], report.interval(name)) for report in columns)
+        table.append([title, *shares])
     accuracy, arrows = score.observed.slot_accuracy_by_marker, mistakes(score.observed.confusion)
     caption = f"{HAND_CAPTION}Arrows lead from true to given labels, wider for more points."
     people = score.observed.num_groups

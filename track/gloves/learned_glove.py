@@ -94,12 +94,8 @@ class LearnedGlove:
     def users(self) -> tuple[User, ...]:
         """A user for each capture: the hands in it, with their own places."""
         captures = sorted({one.capture for one in self.hands})
-        return tuple(
-            User(
-                tuple(one.hand for one in self.hands if one.capture == number), "learned from a labeled trial"
-            )
-            for number in captures
-        )
+        hands = (tuple(one.hand for one in self.hands if one.capture == number) for number in captures)
+        return tuple(User(some, "learned from a labeled trial") for some in hands)
 
 
 class _ColumnGroup(NamedTuple):

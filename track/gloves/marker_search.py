@@ -126,10 +126,8 @@ class PlaceTable:
         self, places: Int[np.ndarray, "N"], names: Iterable[str], at: Float[np.ndarray, "N 3"] | None = None
     ) -> GloveFit:
         """A hand with markers at some places, or carried like these and `at` other points [m]."""
-        markers = tuple(
-            MarkerPlace(name, BONE_NAMES[self.bones[place]], 0.5, 0.0)
-            for name, place in zip(names, places, strict=True)
-        )
+        pairs = zip(names, places, strict=True)
+        markers = tuple(MarkerPlace(name, BONE_NAMES[self.bones[place]], 0.5, 0.0) for name, place in pairs)
         layout = MarkerLayout("learned", markers, self.radius)
         parts = (self.normals, self.bone_indices, self.bone_weights)
         points = self.points[places] if at is None else at

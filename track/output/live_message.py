@@ -267,12 +267,8 @@ def in_axes(message: LiveMessage, axes: ProgramAxes) -> LiveMessage:
         )
         for hand in message.hands
     )
-    return dataclasses.replace(
-        message,
-        hands=tuple(hands),
-        bodies=tuple(map(placed, message.bodies)),
-        points=axes.positions(message.points),
-    )
+    bodies, points = tuple(map(placed, message.bodies)), axes.positions(message.points)
+    return dataclasses.replace(message, hands=tuple(hands), bodies=bodies, points=points)
 
 
 class MessageFormat(NamedTuple):

@@ -289,9 +289,8 @@ class LiveStream(Closing, Iterator[StreamedFrame]):
         """A frame that stands for a silence, with the current time."""
         now, last = time.monotonic(), self._last
         number, shown = (last.number, last.time + now - last.arrived) if last is not None else (0, 0.0)
-        return StreamedFrame(
-            number, shown, np.empty((0, 3)), np.empty(0, dtype=np.int64), silent=True, arrived=now
-        )
+        points, ids = np.empty((0, 3)), np.empty(0, dtype=np.int64)
+        return StreamedFrame(number, shown, points, ids, silent=True, arrived=now)
 
 
 class FrameOrder:
@@ -563,9 +562,6 @@ def _increasing(ordered: list[StreamedFrame]) -> list[StreamedFrame]:
 
 def _usual_interval(ordered: list[StreamedFrame]) -> float | None:
     """Median time per frame number [s]; None if the numbers do not increase."""
-    intervals = [
-        (second.time - first.time) / (second.number - first.number)
-        for first, second in pairwise(ordered)
-        if second.number > first.number and second.time > first.time
-    ]
+    steps = [(second.time - first.time, second.number - first.number) for first, second in pairwise(ordered)]
+    intervals = [span / count for span, count in steps if count > 0 and span > 0.0]
     return float(np.median(intervals)) if intervals else None
