@@ -1,8 +1,8 @@
 """The filter state of one hand: pose, velocity, covariances, and the learned bias of each marker.
 
-If the model differs from the user's hand, each marker is off by the same few millimeters in every frame, in
-the frame of its bone. Once this bias is known, a marker is predicted from the pose and its bias, for an
-uncalibrated hand nearly as accurately as for a calibrated one.
+Where the model differs from the user's hand, each marker is off by the same few millimeters in every frame,
+in the frame of its bone. Once this bias is known, a marker is predicted from the pose and the bias: nearly as
+accurately for an uncalibrated hand as for a calibrated one.
 """
 
 from __future__ import annotations
@@ -47,23 +47,23 @@ _INITIAL_SPREAD_LEAST, _INITIAL_SPREAD_MOST = 0.0015, 0.006  # [m] bounds of it
 _LEAST_MARKER_SPREAD: Final = 0.0005  # [m] lower bound of a marker's noise, as few cameras may see it
 _BIAS_VARIATION: Final = 0.3  # variation of a bias with the pose, as share of the hand's typical bias
 _BIAS_DOUBT_TIME: Final = 0.5  # [s] unseen, after which a marker's bias is unknown again
-_LEFT_OUT_SPREAD: Final = 0.004  # [m] doubt of a marker that the first fit left out: it may have slipped
-_LEFT_OUT_TIME: Final = 0.2  # [s] time in which it grows to its full size; a wrong start is corrected earlier
+_LEFT_OUT_SPREAD: Final = 0.004  # [m] doubt of a marker that the first fit left out, as it may have slipped
+_LEFT_OUT_GROWTH: Final = 0.2  # [s] This doubt grows to its full size in this time; wrong starts end earlier.
 _AVERAGING_FRAMES: Final = 120.0  # averaging window of a bias; one second at 120 Hz
 _FORGETTING_FRAMES: Final = 2400.0  # time constant in which an unconfirmed bias decays
-_FORGOTTEN: Final = 1.7e-7  # [m] additional decay per frame; 0.02 mm in a second at 120 Hz
+_DECAY_PER_FRAME: Final = 1.7e-7  # [m] additional decay of a bias per frame: 0.02 mm in a second at 120 Hz
 _LEARNING_FRAMES: Final = 30.0  # number of frames after which the spread of a hand's markers is known
 _BIAS_REUSE_RMS: Final = 0.002  # [m] A hand initialized again with a smaller RMS keeps its biases.
 _FEWEST_ON_DIGIT, _FEWEST_ON_PALM = 2, 3  # markers needed for a variance estimate
 _BIAS_SLACK: Final = 2.5  # standard deviations allowed between a marker and its design
 # Reappearance of markers, and lifetime of strays.
-_RETURN_TIME: Final = 0.01  # [s] over the hidden time: a marker's probability to return in a frame
-_RETURN_LEAST, _RETURN_MOST = 0.01, 0.65  # bounds of that probability
+_RETURN_SCALE: Final = 0.01  # [s] over the hidden time: probability that a marker returns in a frame
+_RETURN_LEAST, _RETURN_MOST = 0.01, 0.65  # bounds of the probability that a marker returns in a frame
 SEEN_ELSEWHERE: Final = -7.0
 """Log probability that a point is a marker that was seen as another point at the same time."""
-# A point that stays unlabeled while a marker is seen elsewhere is hardly that marker: it loses one log-odds
-# per `_BESIDE_TIME` [s] of it, at most `_MOST_BESIDE`, which outweighs the labeler. The loss fades while the
-# marker is hidden.
+# A point that stays unlabeled while a marker is seen elsewhere is probably not that marker: it loses one
+# log-odds per `_BESIDE_TIME` [s], at most `_MOST_BESIDE`, which outweighs the labeler. The loss fades while
+# the marker is hidden.
 _BESIDE_TIME, _MOST_BESIDE = 0.01, 18.0
 STRAY_LIFETIME: Final = 0.1  # [s] mean lifetime of strays
 MOST_AGE_LOG_ODDS: Final = 3.0  # largest log-odds from a point's age
@@ -154,8 +154,8 @@ class HandState:
         self._now = time
         span = time - self.time
         doubt = self._typical_bias * np.minimum((time - self._last_seen) / _BIAS_DOUBT_TIME, 1.0)
-        # The first fit may leave a marker out because it slipped, so that the RMS does not bound its error.
-        slip = _LEFT_OUT_SPREAD * min((time - self._started) / _LEFT_OUT_TIME, 1.0)
+        # The RMS does not bound the error of a marker that the first fit left out, which may have slipped.
+        slip = _LEFT_OUT_SPREAD * min((time - self._started) / _LEFT_OUT_GROWTH, 1.0)
         doubt[self._left_out & (self._bias_frames == 0.0)] = max(self._typical_bias, slip)
         self.variance = self._learned_variance + doubt**2
         moved: Doubles = move(self.qpos[None], min(span, _LONGEST_EXTRAPOLATION) * self.velocity[None])[0]
@@ -213,8 +213,8 @@ class HandState:
     ) -> Float[np.ndarray, "P M"]:
         """Log-odds that a point is a marker, which returned when the point appeared, and not a stray.
 
-        A point that had no label while the marker was seen is likely foreign. This counts only for markers
-        that no point has now.
+        A point that had no label while the marker was seen is probably foreign. This counts only for markers
+        that currently have no point.
         """
         return np.asarray(_presence_log_odds(first_seen, free_since, markers, self._last_seen, self._now))
 
@@ -336,7 +336,7 @@ def _presence_log_odds(
         age = min(max(now - first_seen[point], 0.0) / STRAY_LIFETIME, MOST_AGE_LOG_ODDS)
         for marker in range(len(last_seen)):
             gap, beside = first_seen[point] - last_seen[marker], 0.0
-            share = min(max(_RETURN_TIME / max(gap, 1e-3), _RETURN_LEAST), _RETURN_MOST)
+            share = min(max(_RETURN_SCALE / max(gap, 1e-3), _RETURN_LEAST), _RETURN_MOST)
             if missing[marker] and last_seen[marker] > free_since[point]:
                 beside = min((last_seen[marker] - free_since[point]) / _BESIDE_TIME, _MOST_BESIDE)
                 beside -= (now - last_seen[marker]) / STRAY_LIFETIME
@@ -389,7 +389,7 @@ def _learn_bias(
         bias_frames[marker] = min(bias_frames[marker] + 1.0, _AVERAGING_FRAMES)
         # The pose also absorbs what all biases have in common; only the decay corrects that.
         length = np.sqrt(bias[marker, 0] ** 2 + bias[marker, 1] ** 2 + bias[marker, 2] ** 2)
-        kept = max(1.0 - 1.0 / _FORGETTING_FRAMES - _FORGOTTEN / length, 0.0)
+        kept = max(1.0 - 1.0 / _FORGETTING_FRAMES - _DECAY_PER_FRAME / length, 0.0)
         square = 0.0
         for i in range(3):
             residual[i] = 0.0

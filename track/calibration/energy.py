@@ -91,6 +91,8 @@ QUICK_OPTIONS: Final = {"noise": 0.003, "robust_scale": 0.015, "relinearize": 0.
 """Options of a `Problem` with few frames [m]; the noise is that of flesh, which repeats in similar frames."""
 QUICK_GAIN: Final = 1e-3
 """`SMALL_GAIN` of a problem with `QUICK_OPTIONS`; it may leave a hand's length off by 0.2 mm."""
+COARSE_RELINEARIZE: Final = 0.2
+"""`relinearize` of a search for marker places; less changes no probability by more than 0.01."""
 
 
 class Contacts(NamedTuple):
