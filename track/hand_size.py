@@ -59,8 +59,8 @@ _MARKER_SPREAD: Final = 0.002  # [m] standard deviation of glued markers per axi
 _INDEPENDENT_FRAMES: Final = 4.0  # All frames count as this many, because errors of glue and flesh repeat.
 _SEARCH_FRAMES: Final = 8  # frames of each hand in the search of length and breadth
 _PROPORTION_FRAMES: Final = 40  # frames of each hand in the fit of proportions
-_FOUND_SHARE: Final = 0.5  # A measured size is kept if its hands are found in this share of the frames,
-# or in this share if they fit well, because touching hands are seldom initialized.
+_FOUND_SHARE: Final = 0.5  # A measured size is kept if its hands are found in this share of the frames.
+# A size whose hands fit well needs this share only, because touching hands are seldom initialized.
 _LEAST_WELL_FITTED_SHARE: Final = 0.1
 # [m] largest median RMS distance of hands that fit well; false hands exceed it
 _WELL_FITTED_RMS: Final = 0.00175
@@ -76,8 +76,8 @@ _USUAL_CONFIG: Final = TrackerConfig()
 _LENIENT_CONFIG: Final = TrackerConfig(least_evidence=2.0)
 _FIT_STEPS, _FEW_STEPS = 15, 2  # steps to fit proportions, and to follow a slip from a tracked hand
 _LEAST_PRECISION: Final = 1.0  # [1/m^2] lower bound of a shift's precision; avoids a division by zero
-_COMPARED_PART: Final = 30  # Hands are compared in two parts of this many frames,
-_FEWEST_COMPARED: Final = 10  # and not at all in fewer frames than this.
+_COMPARED_PART: Final = 30  # Hands are compared in two parts of this many frames.
+_FEWEST_COMPARED: Final = 10  # Hands are compared in at least this many frames.
 AT_HAND: Final = 0.04
 """Distance from a hand's markers within which a point counts as its own [m]."""
 _UNEXPLAINED_PENALTY: Final = 3.0  # log-odds lost per unlabeled point at a hand, and per missing marker
@@ -87,8 +87,8 @@ _MOST_HIDDEN: Final = 0.35  # missing markers of a good fit, per marker, if ever
 _FEW_NEAR_POINTS: Final = 2.5  # number of nearby points that may be ghosts
 _MOST_RMS: Final = 0.004  # [m] median RMS distance of a good fit
 _SUGGESTED_SHARE: Final = 0.5  # Suggested hands must be found in this share of the frames.
-_GLOVE_RATIO: Final = 1.15  # Another glove is suggested if its log-odds are this many times ours,
-_SCALE_RATIO: Final = 2.0  # another scale if they are this many times ours.
+_GLOVE_RATIO: Final = 1.15  # Another glove is suggested if its log-odds are this many times ours.
+_SCALE_RATIO: Final = 2.0  # Another scale is suggested if its log-odds are this many times ours.
 _UNITS: Final = {"millimeters": 1e-3, "centimeters": 1e-2, "meters": 1.0, "inches": 0.0254, "feet": 0.3048}
 _STATED_UNITS: Final = ("millimeters", "centimeters", "meters")  # units that files can state
 _WAND_SCALES: Final = (2.0, 0.5)  # scales if the calibration wand's length was entered wrongly

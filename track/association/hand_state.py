@@ -39,7 +39,7 @@ _VELOCITY_SMOOTHING: Final = 0.6  # weight of the newest velocity in the smoothe
 _HIDDEN_DIGIT_DAMPING: Final = 0.7  # factor per frame of the velocity of a digit with missing markers
 _WRIST_SPREAD: Final = 0.001  # [m] standard deviation of the wrist's predicted position in the same frame
 _WRIST_ACCELERATION: Final = 10.0  # [m/s^2] process noise
-_WRIST_ROTATION_SPREAD: Final = float(np.deg2rad(1.5))  # [rad] the same of its predicted orientation
+_WRIST_ROTATION_SPREAD: Final = float(np.deg2rad(1.5))  # [rad] as `_WRIST_SPREAD`, of rotation
 _WRIST_ANGULAR_ACCELERATION: Final = 100.0  # [rad/s^2] process noise
 # Measurement model: standard deviations and biases of markers.
 _INITIAL_SPREAD: Final = 1.2  # initial standard deviation of markers over the RMS of the first fit

@@ -36,7 +36,7 @@ SPARE_POINTS: Final = 6
 markers. `_SPARE_SHARE` of the markers counts instead if that is less."""
 _SPARE_SHARE: Final = 0.3  # of a hand's markers, because ghosts resemble few markers
 _NUM_CUTS: Final = 12  # number of directions of cuts, even over half a sphere
-# number of these per search in continuous frames; the next search tries the others
+# number of directions per search in continuous frames; the next search tries the others
 _CUTS_OF_SEARCH: Final = 6
 _CUT_STRIDE: Final = 5  # step between successive directions, so that any few are spread evenly
 _CUTS_AT_FIRST: Final = 3  # number of directions in the first call; mostly one of them suffices

@@ -40,7 +40,7 @@ _RESTART_STEPS: Final = 8  # steps from each of these poses; the best result is 
 # [m] `CLOUD_RADIUS` for missing markers of a digit without labels, which may be bent or straight
 _DIGIT_CLOUD_RADIUS: Final = 0.13
 _FIRST_REVIEW_WAIT: Final = 0.01  # [s] from a review with changes to the next one
-_REVIEW_WAIT_FACTOR: Final = 1.6  # factor of that time after each review without changes
+_REVIEW_WAIT_FACTOR: Final = 1.6  # factor of the wait after each review without changes
 _DOUBTED_PRESENCE: Final = -2.0  # log probability of a marker that the track saw elsewhere at the same time
 _REVIEW_MARGIN: Final = 8.0  # log-odds by which the labeler's labels must be better than those of the track
 # A bias is doubted if a point's distance without it is less than this share of that with it.

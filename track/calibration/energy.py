@@ -179,7 +179,7 @@ class Problem:
         self._linearized_at = np.zeros(NUM_PARAMETERS)
 
     def with_targets(self, targets: Float[np.ndarray, "F M 3"]) -> Problem:
-        """The same problem for other labeled markers [m], NaN where missing."""
+        """Return a copy of this problem for other labeled markers [m], NaN where missing."""
         other = copy.copy(self)
         other._set_targets(targets)
         return other

@@ -119,9 +119,9 @@ class HeldOut(NamedTuple):
     before: float
     """Median over frames of the markers' RMS distance from the hand before calibration [m]."""
     after: float
-    """The same with the calibrated hand [m]."""
+    """Median over frames of the markers' RMS distance from the calibrated hand [m]."""
     num_frames: int
-    """Number of frames."""
+    """Number of held-out frames."""
     other_labels: str = ""
     """Labels that fit the points better than those that were given, such as "RH1 and RH6 are exchanged"."""
 
@@ -141,7 +141,7 @@ class Calibration:
     rms_before: float
     """Median over frames of the markers' RMS distance from the hand before [m]."""
     rms_after: float
-    """The same with the calibrated hand [m]."""
+    """Median over frames of the markers' RMS distance from the calibrated hand [m]."""
     shifts: Float[np.ndarray, "M"]
     """Distance of each marker from its designed position on this hand [m]."""
     position_errors: Float[np.ndarray, "M"]

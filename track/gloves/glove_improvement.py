@@ -183,7 +183,7 @@ class Columns(NamedTuple):
         return Columns(places, self.positions[:, rows], self.seen[:, rows], worn)
 
     def renamed(self, number: int, name: str) -> Columns:
-        """The same columns with one renamed."""
+        """Return these columns with another name of the one at `number`."""
         places = list(self.places)
         places[number] = dataclasses.replace(places[number], name=name)
         return self._replace(places=tuple(places))

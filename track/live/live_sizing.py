@@ -34,8 +34,8 @@ from track.tracker import Tracker
 from track.user import MEASURED, User
 
 _POINT_SHARE: Final = 0.8  # A frame has enough points if they suffice for this share of a hand's markers.
-_FIRST_DURATION: Final = 0.3  # [s] duration of frames with enough points before the first measurement,
-_FINAL_DURATION: Final = 10.0  # [s] and before the final measurement
+_FIRST_DURATION: Final = 0.3  # [s] A hand is first measured after this time with enough points.
+_FINAL_DURATION: Final = 10.0  # [s] A hand is measured for the last time after this time with enough points.
 _LATER_FACTOR: Final = 2.0  # If no hand was found, the next measurement waits this many times as long.
 _LONGEST_STEP: Final = 0.1  # [s] A longer gap between two frames counts as this much time with hands.
 _MOST_FRAMES: Final = 20_000  # largest number of kept frames; a stream may show no hand for hours

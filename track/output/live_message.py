@@ -125,7 +125,7 @@ class LiveMessage:
     """A tracked frame as it is sent."""
 
     header: LiveHeader
-    """The same object in every message of a stream until the size of its hands changes."""
+    """Description of the stream: one object for all messages until the size of its hands changes."""
     number: int
     """Frame number; numbers of a stream may have gaps and may start again."""
     time: float
