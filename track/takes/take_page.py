@@ -302,12 +302,13 @@ def _error_section(title: str, settings: Mapping[str, Any], hand: HandFigures) -
         "keeps half of its size. SD [deg]: standard deviation of the angle, the root of the sum of its five "
         "squared parts, each as root mean square over all frames. Gluing and person are constant errors; "
         "person: sizes and directions of bones, and gestures unlike other people's. Palm: the metacarpals of "
-        "ring and little finger flex with these, which the model takes for motion of their MCP joints. SEM: "
-        "standard error of measurement of the angle in a frame between sessions of a person, with the glove "
-        "put on again: the other four parts of hands that are calibrated in each session, of other hands "
-        f"{' and '.join(changing)}, and {palm}. MDD: minimal detectable difference of two sessions, 1.96 "
-        "times the root of two times the SEM; of the angle in a frame, its mean, its 5th or 95th percentile "
-        "(peak), and its range of motion between these, each with its own SEM."
+        "ring and little finger flex with these, which the model takes for motion of their MCP joints; zero "
+        "in a flat hand. SEM: standard error of measurement of the angle in a frame between sessions of a "
+        "person, with the glove put on again: the other four parts of hands that are calibrated in each "
+        f"session, of other hands {' and '.join(changing)}, and {palm}. MDD: minimal detectable "
+        "difference of two sessions, 1.96 times the root of two times the SEM; of the angle in a frame, its "
+        "mean, its 5th or 95th percentile (peak), and its range of motion between these, each with its own "
+        "SEM."
     )
     table = [["joint", "SD", *SOURCES, "SEM", *(f"MDD, {one}" for one in CHANGING), "cut-off [Hz]"]]
     for joint, cells in zip(JOINTS, errors.tolist(), strict=True):
