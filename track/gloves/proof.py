@@ -27,7 +27,7 @@ class Proof(NamedTuple):
     frames: float
     """Share of the frames in which every label is right."""
     interval: tuple[float, float]
-    """95 % interval of this share; the frames of a second count once."""
+    """95 % interval of this share, in which the frames of one second [s] count once."""
     slots: float
     """Share of the markers in all frames that are right."""
     by_capture: tuple[float, ...]
